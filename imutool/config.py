@@ -1,0 +1,91 @@
+"""Typed settings: a frozen `Settings` class per room, read from TOML and `key=value` words, checked by msgspec."""
+
+from __future__ import annotations
+
+import difflib
+import tomllib
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any, TypeVar
+
+import msgspec
+
+from imutool.errors import ConfigError
+
+
+class Settings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Base of all settings. Names end in their unit (`window_s`); limits stand in `Annotated[..., msgspec.Meta()]`."""
+
+
+S = TypeVar("S", bound=Settings)
+
+
+def load(cls: type[S], path: Path | None = None, overrides: Iterable[str] = ()) -> S:
+    """Settings of type `cls` from a TOML file, with `key=value` words (dots for tables) laid over it.
+
+    Raises:
+        ConfigError: file unreadable or not TOML, unknown key (the nearest is named), wrong type, out of range.
+    """
+    values: dict[str, Any] = {}
+    if path is not None:
+        try:
+            values = tomllib.loads(path.read_text(encoding="utf-8"))
+        except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+            raise ConfigError(f"settings cannot be read ({error})", where=path, expected="a TOML file") from error
+    for word in overrides:
+        _put(values, word)
+    return build(cls, values, where=path)
+
+
+def build(cls: type[S], values: dict[str, Any], where: str | Path | None = None) -> S:
+    """Settings of type `cls` from plain values, as they come from TOML or from a model file's header.
+
+    Raises:
+        ConfigError: unknown key (the nearest is named), wrong type, out of range.
+    """
+    _refuse_unknown(cls, values, where)
+    try:
+        return msgspec.convert(values, cls)
+    except msgspec.ValidationError as error:
+        raise ConfigError(str(error).rstrip("."), where=where or "settings") from error
+
+
+def plain(settings: Settings) -> dict[str, Any]:
+    """Settings as plain values, the inverse of `build`."""
+    values = msgspec.to_builtins(settings)
+    assert isinstance(values, dict)
+    return values
+
+
+def _put(values: dict[str, Any], word: str) -> None:
+    """Lays one `a.b=value` word into nested tables; the value is read as TOML, else taken as a string."""
+    key, equals, text = word.partition("=")
+    if not equals or not key:
+        raise ConfigError(f"{word!r} sets nothing", where="--set", expected="key=value")
+    try:
+        value = tomllib.loads(f"value = {text}")["value"]
+    except tomllib.TOMLDecodeError:
+        value = text
+    *tables, last = key.split(".")
+    for table in tables:
+        values = values.setdefault(table, {})
+        if not isinstance(values, dict):
+            raise ConfigError(f"{table!r} is a value, not a table", where=f"--set {word}")
+    values[last] = value
+
+
+def _refuse_unknown(cls: type[Settings], values: dict[str, Any], where: str | Path | None, prefix: str = "") -> None:
+    """msgspec names an unknown key; this also names the key that was probably meant, at any depth."""
+    fields = {field.encode_name: field.type for field in msgspec.structs.fields(cls)}
+    for key, value in values.items():
+        if key not in fields:
+            near = difflib.get_close_matches(key, fields, n=1)
+            raise ConfigError(
+                f"{prefix}{key} is not a setting",
+                where=where or "settings",
+                expected=f"one of {', '.join(sorted(fields))}",
+                fix=f"Did you mean {prefix}{near[0]}?" if near else "",
+            )
+        inner = fields[key]
+        if isinstance(value, dict) and isinstance(inner, type) and issubclass(inner, Settings):
+            _refuse_unknown(inner, value, where, f"{prefix}{key}.")

@@ -1,0 +1,84 @@
+"""Everything that can go wrong for a reason the user can act on, sorted by what the user can do about it.
+
+::
+
+    ImutoolError
+    ├── ConfigError    3   edit the command line or the settings file
+    ├── DataError      4   look at the data
+    ├── LogError       5   look at the log
+    ├── ModelError     6   choose another model
+    └── NumericsError  7   change the step, the window or the rate
+
+Wrong usage exits with 2, an interrupt with 130; anything else is a bug and shows its traceback with 1.
+`imutool.cli.main` is the one place that catches.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import ClassVar
+
+
+class ImutoolError(Exception):
+    """A failure with an address: where it happened, what was found, what was expected, what to do.
+
+    Args:
+        what: what happened, with the offending value in it.
+        where: the file, optionally with a line (``data.csv:17``), the topic, or the setting.
+        expected: what would have been right, as the end of "expected ...".
+        fix: what the user can do, as a sentence without its full stop.
+    """
+
+    exit_code: ClassVar[int] = 1
+
+    def __init__(self, what: str, *, where: str | Path | None = None, expected: str = "", fix: str = "") -> None:
+        self.what, self.where, self.expected, self.fix = what, where, expected, fix
+        super().__init__(str(self))
+
+    def __str__(self) -> str:
+        place = f"{self.where}: " if self.where is not None else ""
+        expected = f"; expected {self.expected}" if self.expected else ""
+        fix = f" {self.fix}." if self.fix else ""
+        return f"{place}{self.what}{expected}.{fix}"
+
+    def at(self, where: str | Path) -> ImutoolError:
+        """The same error with its address filled in, for a caller that knows the file when the raiser did not."""
+        return self if self.where is not None else type(self)(self.what, where=where, expected=self.expected, fix=self.fix)
+
+    def __reduce__(self) -> tuple[object, ...]:
+        """Errors cross process borders when many sequences convert at once; keyword arguments need saying how."""
+        return _rebuild, (type(self), self.what, self.where, self.expected, self.fix)
+
+
+def _rebuild(kind: type[ImutoolError], what: str, where: str | Path | None, expected: str, fix: str) -> ImutoolError:
+    return kind(what, where=where, expected=expected, fix=fix)
+
+
+class ConfigError(ImutoolError):
+    """The command line or a settings file asks for something that cannot be done."""
+
+    exit_code = 3
+
+
+class DataError(ImutoolError):
+    """The source data contradict themselves or their format."""
+
+    exit_code = 4
+
+
+class LogError(ImutoolError):
+    """An MCAP log cannot be read, or lacks what was asked of it."""
+
+    exit_code = 5
+
+
+class ModelError(ImutoolError):
+    """A model file is damaged, or was made for another sensor, rate or version."""
+
+    exit_code = 6
+
+
+class NumericsError(ImutoolError):
+    """A computation left the range in which its answer means something."""
+
+    exit_code = 7

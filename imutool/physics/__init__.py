@@ -1,0 +1,1 @@
+"""What an ideal simulation leaves out of an IMU."""
