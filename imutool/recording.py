@@ -20,7 +20,7 @@ from imutool.errors import DataError
 GRAVITY_M_S2 = 9.81
 UNIT_QUATERNION_TOLERANCE = 1e-6  # six printed decimals, as in the EuRoC truth after normalising
 GAP_FACTOR = 4.0  # a hole is this many median periods without truth
-MIN_GAP_S = 0.06  # but never shorter than this: a 20 Hz truth is not one long gap
+MIN_GAP_S = 0.08  # but never shorter than this: a 20 Hz truth, or the 70 ms jitter of FETCH, is no gap
 
 Times = Int64[np.ndarray, " n"]
 
@@ -151,7 +151,7 @@ class Poses(_Columns):
 
         Position (and velocity) linearly, orientation by slerp along the shorter arc. The mask is false before the first
         pose, after the last, and inside a gap longer than `max_gap_s` (by default four median periods, at least
-        60 ms). Masked rows hold the nearest pose, so that every row stays a valid one.
+        80 ms). Masked rows hold the nearest pose, so that every row stays a valid one.
 
         Raises:
             DataError: fewer than two poses.

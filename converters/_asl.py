@@ -1,0 +1,145 @@
+"""Makes a Recording of an ASL sequence (`mav0/imu0/data.csv` and its neighbours), the form all three data sets share.
+
+Repairs: a true pose whose stamp repeats the one before is dropped, the first is kept, and the number is written to the
+metadata record `imutool/repairs`. Nothing of the IMU is ever repaired: a defect there stops the sequence at its line.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from functools import partial
+from pathlib import PurePosixPath
+
+import numpy as np
+
+from converters import Sequence, _table
+from converters._source import Tree
+from imutool.errors import DataError
+from imutool.recording import Frames, Imu, Poses, Recording, Scalars, unit_quaternions
+
+IMU = "imu0"
+IMU_TOPIC = "/imu0"
+QUATERNION_TOLERANCE = 1e-2  # printed with six decimals the norm is off by 3e-4 at most in EuRoC; more is not a rotation
+REPEATED = "{} poses with a repeated stamp dropped, the first kept"
+IMAGE_FORMATS = {".png": "png", ".jpg": "jpeg", ".jpeg": "jpeg"}
+
+
+def float_stamps(tree: Tree) -> bool:
+    """Whether the IMU's stamps are in scientific notation, by which FETCH differs from the others."""
+    return b"e" in _table.first_row(tree.head(f"{IMU}/data.csv")).partition(b",")[0].lower()
+
+
+def recording(sequence: Sequence, *, dataset: str, sensor: str, truths: Mapping[str, str], images: bool = True) -> Recording:
+    """The sequence as a Recording; `truths` maps sensor folders to pose topics, the first is the truth.
+
+    Velocity and biases are kept where the table has them; rows of unknown bias (nan) are left out of the bias channels.
+
+    Raises:
+        DataError: no IMU table, or a defect in a table, with file and line.
+    """
+    tree = Tree(sequence)
+    if f"{IMU}/data.csv" not in tree:
+        raise DataError("is missing", where=tree.where(f"{IMU}/data.csv"), expected="the IMU's table")
+    folders = [folder for folder in truths if f"{folder}/data.csv" in tree]
+    tables = {folder: f"{folder}/data.csv" for folder in (IMU, *folders)}
+    cameras = [name for name in tree.sensors() if name.startswith("cam")] if images else []
+    lists = {camera: f"{camera}/data.csv" for camera in cameras}
+    texts = [name for name in tree.sizes if name == "body.yaml" or (name.count("/") == 1 and name.endswith("/sensor.yaml"))]
+    content = tree.load([*tables.values(), *lists.values(), *texts])
+
+    metadata: dict[str, dict[str, str]] = {
+        "imutool": {"dataset": dataset, "sequence": sequence.name, "sensor": sensor},
+    }
+    metadata.update({name: {"text": content[name].decode("utf-8", "backslashreplace")} for name in texts})
+    notes: dict[str, dict[str, str]] = {"imutool/repairs": {}, "imutool/skipped": {}}
+    samples = imu(_table.parse(content.pop(tables[IMU]), tree.where(tables[IMU]), "imu"))
+    poses: dict[str, Poses] = {}
+    scalars: dict[str, Scalars] = {}
+    for folder in folders:
+        table = _table.parse(content.pop(tables[folder]), tree.where(tables[folder]), "truth")
+        repeated = add_truth(table, truths[folder], poses, scalars)
+        if repeated:
+            notes["imutool/repairs"][truths[folder]] = REPEATED.format(repeated)
+    frames = {}
+    for camera, name in lists.items():
+        found = _frames(tree, camera, content[name])
+        if isinstance(found, str):
+            notes["imutool/skipped"][camera] = found
+        else:
+            frames[f"/{camera}/image_raw/compressed"] = found
+    for other in sorted(set(tree.sensors()) - {IMU, *folders, *cameras}):
+        if images or not other.startswith("cam"):
+            notes["imutool/skipped"][other] = "not read: holds no full poses"
+    metadata.update({name: note for name, note in notes.items() if note})
+    return Recording(sequence.name, samples, poses, scalars, frames, metadata, IMU_TOPIC, sequence.path.name)
+
+
+def imu(table: _table.Table) -> Imu:
+    """The IMU's samples.
+
+    Raises:
+        DataError: a value that is no finite number, or time not increasing, with its line.
+    """
+    table.require("gyro", "accel")
+    table.check_clock()
+    return Imu(table.t_ns, table.columns["gyro"], table.columns["accel"])
+
+
+def add_truth(table: _table.Table, topic: str, poses: dict[str, Poses], scalars: dict[str, Scalars]) -> int:
+    """Puts poses and bias channels under their topics and counts the repeated stamps it left out.
+
+    Raises:
+        DataError: a value that is no finite number, time going back, or a quaternion that is none, with its line.
+    """
+    velocity = table.columns.get("v_w")
+    known = velocity is not None and not np.isnan(velocity).all()
+    table.require("p_wb", "q_wb_wxyz", *(("v_w",) if known else ()))
+    q_wb_wxyz = table.columns["q_wb_wxyz"]
+    norm = np.linalg.norm(q_wb_wxyz, axis=1)
+    bad = np.abs(norm - 1.0) > QUATERNION_TOLERANCE
+    if bad.any():
+        row = int(np.argmax(bad))
+        raise table.fault(row, f"quaternion {q_wb_wxyz[row].tolist()} has norm {norm[row]:.6g}", "norm 1")
+    new = np.concatenate([[True], np.diff(table.t_ns) != 0])
+    kept = _table.Table(table.where, table.t_ns[new], {k: v[new] for k, v in table.columns.items()}, table.lines[new])
+    kept.check_clock()
+    columns = kept.columns
+    poses[topic] = Poses(kept.t_ns, columns["p_wb"], unit_quaternions(columns["q_wb_wxyz"]), columns["v_w"] if known else None)
+    for name, end, unit in (("b_g", "gyro", "rad/s"), ("b_a", "accel", "m/s^2")):
+        if name in columns and (finite := np.isfinite(columns[name]).all(axis=1)).any():
+            scalars[f"{topic.removesuffix('/pose')}/bias/{end}"] = Scalars(kept.t_ns[finite], columns[name][finite], unit)
+    return int(len(new) - new.sum())
+
+
+def _frames(tree: Tree, camera: str, content: bytes) -> Frames | str:
+    """The camera's images, left where they are; or why there are none.
+
+    Raises:
+        DataError: some images of the list are missing, listed twice, or of an unknown kind, with the line of the list.
+    """
+    where = tree.where(f"{camera}/data.csv")
+    stamps: dict[str, int] = {}
+    missing: tuple[int, str] | None = None
+    for t_ns, file, line in _table.pairs(content, where):
+        name = f"{camera}/data/{file}"
+        if name in stamps:
+            raise DataError(f"{file} is listed twice", where=f"{where}:{line}")
+        if PurePosixPath(file).suffix.lower() not in IMAGE_FORMATS:
+            raise DataError(f"{file} is no image", where=f"{where}:{line}", expected=f"one of {', '.join(IMAGE_FORMATS)}")
+        if name not in tree and missing is None:
+            missing = line, file
+        stamps[name] = t_ns
+    if not any(name in tree for name in stamps):
+        return "the source has none of the listed images"
+    if missing is not None:
+        line, file = missing
+        raise DataError(f"{file} is not in the source", where=f"{where}:{line}", fix="Leave images out with --no-images")
+    formats = {IMAGE_FORMATS[PurePosixPath(name).suffix.lower()] for name in stamps}
+    if len(formats) > 1:
+        raise DataError(f"lists {' and '.join(sorted(formats))} images", where=where, expected="one kind")
+    return Frames(formats.pop(), len(stamps), partial(_each, tree.sequence, stamps))
+
+
+def _each(sequence: Sequence, stamps: dict[str, int]) -> Iterator[tuple[int, bytes]]:
+    for name, image in Tree(sequence).each(stamps):
+        yield stamps[name], image

@@ -1,0 +1,175 @@
+"""Makes a Recording of a ROS 1 bag: topics are found by their type, the data sets' own names are preferred.
+
+The stamps are those of the message headers. Raw images (`sensor_msgs/Image`) and positions without orientation
+(`PointStamped`) are not carried over; the metadata record `imutool/skipped` names them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from converters import Sequence, _asl
+from converters._table import Table
+from imutool.errors import ConfigError, DataError, ImutoolError
+from imutool.recording import Frames, Imu, Poses, Recording, Scalars
+
+if TYPE_CHECKING:
+    from rosbags.rosbag1 import Reader
+
+IMU = "sensor_msgs/msg/Imu"
+POSES = ("geometry_msgs/msg/TransformStamped", "geometry_msgs/msg/PoseStamped", "nav_msgs/msg/Odometry")
+IMAGE = "sensor_msgs/msg/CompressedImage"
+SKIPPED = {
+    "sensor_msgs/msg/Image": "raw images are not carried over, only CompressedImage",
+    "geometry_msgs/msg/PointStamped": "a position without orientation is no pose",
+}
+
+
+def topics(path: Path) -> dict[str, str]:
+    """Message type by topic.
+
+    Raises:
+        ConfigError: rosbags is not installed.
+        DataError: the bag cannot be read.
+    """
+    with _open(path) as bag:
+        return {connection.topic: connection.msgtype for connection in bag.connections}
+
+
+def recording(sequence: Sequence, *, dataset: str, sensor: str, truths: tuple[str, ...], images: bool = True) -> Recording:
+    """The bag as a Recording; of several true trajectories the first of `truths` is the truth, then alphabetically.
+
+    Raises:
+        ConfigError: rosbags is not installed.
+        DataError: no IMU, several without a known name, or a defect in the data, with topic and message number.
+    """
+    kinds = topics(sequence.path)
+    imu_topic = _imu_topic(sequence.path, [topic for topic, kind in kinds.items() if kind == IMU])
+    pose_topics = sorted((t for t, kind in kinds.items() if kind in POSES), key=lambda t: (t not in truths, t))
+    skipped = {topic: SKIPPED[kind] for topic, kind in kinds.items() if kind in SKIPPED}
+    named = {_asl.IMU_TOPIC: imu_topic}
+    repairs: dict[str, str] = {}
+    poses: dict[str, Poses] = {}
+    scalars: dict[str, Scalars] = {}
+    tables = {topic: table for topic in pose_topics if (table := _poses(sequence.path, topic)) is not None}
+    for number, (topic, table) in enumerate(tables.items()):
+        target = "/ground_truth/pose" if number == 0 else f"/ground_truth_{topic.strip('/').replace('/', '_')}/pose"
+        named[target] = topic
+        if repeated := _asl.add_truth(table, target, poses, scalars):
+            repairs[target] = _asl.REPEATED.format(repeated)
+    metadata = {
+        "imutool": {"dataset": dataset, "sequence": sequence.name, "sensor": sensor},
+        "imutool/topics": named,
+        **({"imutool/repairs": repairs} if repairs else {}),
+        **({"imutool/skipped": skipped} if skipped else {}),
+    }
+    frames = {topic: _frames(sequence.path, topic) for topic, kind in kinds.items() if images and kind == IMAGE}
+    return Recording(
+        sequence.name,
+        _imu(sequence.path, imu_topic),
+        poses,
+        scalars,
+        {topic: found for topic, found in frames.items() if found.count},
+        metadata,
+        _asl.IMU_TOPIC,
+        sequence.path.name,
+    )
+
+
+def _imu_topic(path: Path, candidates: list[str]) -> str:
+    if _asl.IMU_TOPIC in candidates:
+        return _asl.IMU_TOPIC
+    if len(candidates) != 1:
+        raise DataError(
+            f"has {len(candidates)} IMU topics ({', '.join(candidates) or 'none'})",
+            where=path,
+            expected="one, or /imu0",
+        )
+    return candidates[0]
+
+
+def _imu(path: Path, topic: str) -> Imu:
+    rows = [
+        (t_ns, [w.x, w.y, w.z, a.x, a.y, a.z])
+        for t_ns, message in _messages(path, topic)
+        for w, a in [(message.angular_velocity, message.linear_acceleration)]
+    ]
+    table = _table(path, topic, rows, {"gyro": slice(0, 3), "accel": slice(3, 6)})
+    if table is None:
+        raise DataError("holds no messages", where=f"{path}{topic}", expected="an IMU's samples")
+    return _asl.imu(table)
+
+
+def _poses(path: Path, topic: str) -> Table | None:
+    rows = []
+    for t_ns, message in _messages(path, topic):
+        if hasattr(message, "transform"):
+            p, q = message.transform.translation, message.transform.rotation
+        else:
+            pose = message.pose.pose if hasattr(message.pose, "pose") else message.pose
+            p, q = pose.position, pose.orientation
+        rows.append((t_ns, [p.x, p.y, p.z, q.w, q.x, q.y, q.z]))
+    return _table(path, topic, rows, {"p_wb": slice(0, 3), "q_wb_wxyz": slice(3, 7)})
+
+
+def _table(path: Path, topic: str, rows: list[tuple[int, list[float]]], columns: dict[str, slice]) -> Table | None:
+    """The rows as a table whose "lines" are message numbers; nothing where there are none."""
+    if not rows:
+        return None
+    values = np.array([value for _, value in rows], np.float64)
+    return Table(
+        f"{path}{topic}",
+        np.array([t_ns for t_ns, _ in rows], np.int64),
+        {name: np.ascontiguousarray(values[:, place]) for name, place in columns.items()},
+        np.arange(1, len(rows) + 1, dtype=np.int64),
+    )
+
+
+def _frames(path: Path, topic: str) -> Frames:
+    first = next(_messages(path, topic), None)
+    with _open(path) as bag:
+        count = sum(connection.msgcount for connection in bag.connections if connection.topic == topic)
+    # "jpeg", "png", or as image_transport writes it: "bgr8; jpeg compressed bgr8"
+    known = (name for name in ("png", "jpeg") if first is not None and name in first[1].format.replace("jpg", "jpeg"))
+    return Frames(next(known, first[1].format if first else ""), count, partial(_each, path, topic))
+
+
+def _each(path: Path, topic: str) -> Iterator[tuple[int, bytes]]:
+    for t_ns, message in _messages(path, topic):
+        yield t_ns, message.data.tobytes()
+
+
+def _messages(path: Path, topic: str) -> Iterator[tuple[int, Any]]:
+    """Header stamp (ns) and message, in the order of their arrival."""
+    from rosbags.typesys import Stores, get_typestore  # noqa: PLC0415  extra `bags`; `_open` has said so if it is absent
+
+    with _open(path) as bag:
+        store = get_typestore(Stores.ROS1_NOETIC)
+        wanted = [connection for connection in bag.connections if connection.topic == topic]
+        for connection, _, raw in bag.messages(connections=wanted) if wanted else ():
+            message: Any = store.deserialize_ros1(raw, connection.msgtype)
+            yield message.header.stamp.sec * 10**9 + message.header.stamp.nanosec, message
+
+
+@contextmanager
+def _open(path: Path) -> Iterator[Reader]:
+    """The bag, open; whatever rosbags raises on damaged input becomes a DataError with the path in it."""
+    try:
+        from rosbags.rosbag1 import Reader  # noqa: PLC0415  extra `bags`
+    except ImportError as error:
+        raise ConfigError(
+            "reading ROS 1 bags needs rosbags", where=path, fix="Install it with: pip install 'imutool[bags]'"
+        ) from error
+    try:
+        with Reader(path) as bag:
+            yield bag
+    except (ImutoolError, GeneratorExit, KeyboardInterrupt):
+        raise
+    except Exception as error:  # struct, lz4, bz2, assertions and its own: a damaged bag shows in many ways
+        raise DataError(f"cannot be read as a ROS 1 bag ({error})", where=path) from error

@@ -1,0 +1,211 @@
+"""Finds sequences in folders and archives and reads their files.
+
+Nothing is ever unpacked on disk: members are read one by one, each under a bound, and a .tar.gz is streamed.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import zipfile
+from collections.abc import Collection, Iterator, Mapping
+from pathlib import Path, PurePosixPath
+
+from converters import Sequence
+from converters._archive import (
+    HEAD,
+    ROOT,
+    SUFFIXES,
+    check_size,
+    each_member,
+    is_packed,
+    is_zip,
+    list_members,
+    open_tar,
+    plain_name,
+    read_bounded,
+    refusing,
+)
+from imutool.errors import DataError
+
+BAG = ".bag"
+DEPTH = 4  # folders below the source that are searched
+
+
+def find(source: Path) -> list[Sequence]:
+    """The sequences in a folder, an archive, or a folder of these; unreadable archives in a folder are listed too.
+
+    Raises:
+        DataError: the source does not exist, or is itself an archive that cannot be read.
+    """
+    if source.is_dir():
+        folder = source.absolute() if ".." not in source.parts else source.resolve()
+        return [Sequence(folder.parent.name, folder.parent)] if folder.name == ROOT else list(_walk(folder, DEPTH))
+    if not source.exists():
+        raise DataError("does not exist", where=source, expected="a folder, an archive or a bag")
+    return _in_file(source)
+
+
+def is_bag(path: Path) -> bool:
+    """Whether a path is a ROS 1 bag by its name."""
+    return path.suffix.lower() == BAG
+
+
+def stem(path: Path) -> str:
+    """The name of an archive without its endings."""
+    for ending in (*SUFFIXES, BAG):
+        if path.name.lower().endswith(ending):
+            return path.name[: -len(ending)]
+    return path.name
+
+
+def _walk(folder: Path, depth: int) -> Iterator[Sequence]:
+    if (folder / ROOT).is_dir():
+        yield Sequence(folder.name, folder)
+        return
+    try:
+        children = sorted(folder.iterdir())
+    except OSError as error:
+        raise DataError(f"cannot be listed ({error.strerror})", where=folder) from error
+    for child in children:
+        if child.name.startswith((".", "__MACOSX")):
+            continue
+        if child.is_dir():
+            if depth > 0:
+                yield from _walk(child, depth - 1)
+            continue
+        try:
+            yield from _in_file(child)
+        except DataError:  # said again, with its reason, when the sequence is read: the others go on
+            yield Sequence(stem(child), child)
+
+
+def _in_file(path: Path) -> list[Sequence]:
+    name = path.name.lower()
+    if name.endswith(BAG):
+        return [Sequence(stem(path), path)]
+    if not name.endswith(SUFFIXES):
+        return []
+    members = list_members(path).sizes
+    folders = (member.split("/")[:-1] for member in members)
+    roots = {"/".join(parts[: parts.index(ROOT)]) for parts in folders if ROOT in parts and "__MACOSX" not in parts}
+    if not roots and (inner := sorted(m for m in members if m.lower().endswith((*SUFFIXES, BAG)))):
+        raise DataError(
+            f"holds archives, not recordings ({', '.join(inner[:3])}{', ...' if len(inner) > 3 else ''})",
+            where=path,
+            fix="Unpack the outer archive and convert the folder",
+        )
+    return [Sequence(PurePosixPath(root).name or stem(path), path, root) for root in sorted(roots)]
+
+
+class Tree:
+    """The files of one ASL sequence, named from its root (`imu0/data.csv`), wherever they lie."""
+
+    def __init__(self, sequence: Sequence) -> None:
+        self.sequence = sequence
+        self.path = sequence.path
+        self._prefix = f"{sequence.inside}/{ROOT}/".removeprefix("/")
+        if self.path.is_dir():
+            self.sizes: Mapping[str, int] = _folder_sizes(self.path / ROOT)
+        else:
+            self._listing = list_members(self.path)
+            cut = len(self._prefix)
+            self.sizes = {m[cut:]: size for m, size in self._listing.sizes.items() if m.startswith(self._prefix)}
+            if not self.sizes and not _in_file(self.path):  # which says more where it holds other archives
+                raise DataError(f"holds no {ROOT} folder", where=self.path)
+
+    def __contains__(self, name: str) -> bool:
+        return name in self.sizes
+
+    def where(self, name: str) -> str:
+        """The address of a file for messages: archive (or folder) and member."""
+        return f"{self.path}/{self._prefix}{name}"
+
+    def sensors(self) -> list[str]:
+        """The folders directly below the root that hold a table."""
+        return sorted(name.split("/")[0] for name in self.sizes if re.fullmatch(r"[^/]+/data\.csv", name))
+
+    def head(self, name: str) -> bytes:
+        """The first bytes of a table; none where there is no such table."""
+        if name not in self:
+            return b""
+        if self.path.is_dir():
+            with refusing(self.where(name)), (self.path / ROOT / name).open("rb") as file:
+                return file.read(HEAD)
+        if (kept := self._listing.heads.get(self._prefix + name)) is not None:
+            return kept
+        with refusing(self.path), zipfile.ZipFile(self.path) as archive, archive.open(self._prefix + name) as file:
+            return file.read(HEAD)
+
+    def load(self, names: Collection[str]) -> dict[str, bytes]:
+        """Some files whole."""
+        return dict(self.each(names))
+
+    def each(self, names: Collection[str]) -> Iterator[tuple[str, bytes]]:
+        """Name and content of some files, in the order in which the source holds them.
+
+        Raises:
+            DataError: a file is missing, damaged, or larger than its kind may be.
+        """
+        for name in names:
+            if name not in self:
+                raise DataError("is missing", where=self.where(name))
+            check_size(self.where(name), name, self.sizes[name])
+        if self.path.is_dir():
+            yield from self._each_in_folder(names)
+        elif is_zip(self.path):
+            yield from self._each_in_zip(names)
+        elif not is_packed(self.path):
+            yield from self._each_in_plain_tar(names)
+        else:
+            yield from self._each_in_tar(names)
+
+    def _each_in_folder(self, names: Collection[str]) -> Iterator[tuple[str, bytes]]:
+        for name in names:
+            with refusing(self.where(name)), (self.path / ROOT / name).open("rb") as file:
+                content = read_bounded(file.read, self.where(name), name)
+            yield name, content
+
+    def _each_in_zip(self, names: Collection[str]) -> Iterator[tuple[str, bytes]]:
+        with refusing(self.path), zipfile.ZipFile(self.path) as archive:
+            for name in names:
+                with refusing(self.where(name)), archive.open(self._prefix + name) as file:
+                    content = read_bounded(file.read, self.where(name), name)
+                yield name, content
+
+    def _each_in_plain_tar(self, names: Collection[str]) -> Iterator[tuple[str, bytes]]:
+        """In the order asked for: a tar's own is often the folder's hash order, and images should come in time."""
+        with refusing(self.path), self.path.open("rb") as file:
+            for name in names:
+                file.seek(self._listing.offsets[self._prefix + name])
+                content = file.read(self.sizes[name])
+                if len(content) < self.sizes[name]:
+                    raise DataError("is cut off", where=self.where(name))
+                yield name, content
+
+    def _each_in_tar(self, names: Collection[str]) -> Iterator[tuple[str, bytes]]:
+        wanted = {self._prefix + name: name for name in names}
+        with open_tar(self.path) as archive:
+            for member in each_member(archive):
+                name = wanted.pop(plain_name(member.name), None)
+                if name is None:
+                    continue
+                file = archive.extractfile(member)
+                assert file is not None  # a regular file, or the listing would have refused it
+                yield name, read_bounded(file.read, self.where(name), name)
+                if not wanted:
+                    return
+        if wanted:
+            raise DataError("changed while it was read", where=self.path)
+
+
+def _folder_sizes(root: Path, prefix: str = "") -> dict[str, int]:
+    """Sizes of the files below a folder by their names from it (four times as fast as `Path.rglob`)."""
+    sizes: dict[str, int] = {}
+    with refusing(root), os.scandir(root) as entries:
+        for entry in sorted(entries, key=lambda entry: entry.name):
+            if entry.is_dir():
+                sizes |= _folder_sizes(root / entry.name, f"{prefix}{entry.name}/")
+            elif entry.is_file():
+                sizes[prefix + entry.name] = entry.stat().st_size
+    return sizes

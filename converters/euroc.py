@@ -1,0 +1,53 @@
+"""EuRoC MAV (Burri et al., IJRR 2016): ADIS16448, 200 Hz, Leica or Vicon truth; ASL folder, .zip, .tar or .bag.
+
+Frames: the IMU frame is the body frame, `state_groundtruth_estimate0` holds R_world_imu (its T_BS is the identity).
+`vicon0` holds poses of the marker body, not of the IMU; they are kept as they are, their T_BS stands in the metadata.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+from converters import Sequence, _asl, _bag
+from converters._source import Tree, find, is_bag
+from imutool.recording import Recording
+
+DATASET, SENSOR = "euroc", "adis16448"
+TRUTHS = {
+    "state_groundtruth_estimate0": "/ground_truth/pose",
+    "state_groundtruth_recomputed0": "/ground_truth_recomputed/pose",
+    "vicon0": "/ground_truth_vicon/pose",
+}
+BAG_TRUTHS = ("/vicon/firefly_sbx/firefly_sbx",)
+
+
+def sequences(source: Path) -> list[Sequence]:
+    """Every ASL sequence and bag in the source, by the names of their folders or archives."""
+    return find(source)
+
+
+def recognises(sequence: Sequence) -> bool:
+    """ASL folders without motion capture of TUM-VI's kind and with whole-number stamps; bags with /imu0 but no vrpn."""
+    if is_bag(sequence.path):
+        topics = _bag.topics(sequence.path)
+        return _asl.IMU_TOPIC in topics and "/vrpn_client/raw_transform" not in topics
+    tree = Tree(sequence)
+    return "mocap0" not in tree.sensors() and not _asl.float_stamps(tree)
+
+
+def read_sequence(sequence: Sequence, *, images: bool = True) -> Recording:
+    """One sequence as a Recording.
+
+    Raises:
+        DataError: the sequence contradicts its format, with file and line.
+        ConfigError: it is a bag and rosbags is not installed.
+    """
+    if is_bag(sequence.path):
+        return _bag.recording(sequence, dataset=DATASET, sensor=SENSOR, truths=BAG_TRUTHS, images=images)
+    return _asl.recording(sequence, dataset=DATASET, sensor=SENSOR, truths=TRUTHS, images=images)
+
+
+def read(source: Path) -> Iterator[Recording]:
+    """Every sequence of the source, one after the other."""
+    return map(read_sequence, sequences(source))

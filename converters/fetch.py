@@ -1,0 +1,47 @@
+"""FETCH (mobile base, released with the neural-ODE bias paper): 100 Hz, motion capture; ASL folder, archive or .bag.
+
+The stamps are nanoseconds printed in scientific notation with 19 digits; they are read exactly, with no float between.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+from converters import Sequence, _asl, _bag
+from converters._source import Tree, find, is_bag
+from imutool.recording import Recording
+
+DATASET, SENSOR = "fetch", "fetch"
+TRUTHS = {"mocap0": "/ground_truth/pose"}
+
+
+def sequences(source: Path) -> list[Sequence]:
+    """Every ASL sequence and bag in the source, by the names of their folders or archives."""
+    return find(source)
+
+
+def recognises(sequence: Sequence) -> bool:
+    """ASL folders whose stamps are in scientific notation; bags with an IMU (not on /imu0) and PoseStamped truth."""
+    if is_bag(sequence.path):
+        topics = _bag.topics(sequence.path)
+        kinds = set(topics.values())
+        return _asl.IMU_TOPIC not in topics and {"sensor_msgs/msg/Imu", "geometry_msgs/msg/PoseStamped"} <= kinds
+    return _asl.float_stamps(Tree(sequence))
+
+
+def read_sequence(sequence: Sequence, *, images: bool = True) -> Recording:
+    """One sequence as a Recording.
+
+    Raises:
+        DataError: the sequence contradicts its format, with file and line.
+        ConfigError: it is a bag and rosbags is not installed.
+    """
+    if is_bag(sequence.path):
+        return _bag.recording(sequence, dataset=DATASET, sensor=SENSOR, truths=(), images=images)
+    return _asl.recording(sequence, dataset=DATASET, sensor=SENSOR, truths=TRUTHS, images=images)
+
+
+def read(source: Path) -> Iterator[Recording]:
+    """Every sequence of the source, one after the other."""
+    return map(read_sequence, sequences(source))

@@ -1,0 +1,54 @@
+"""TUM-VI (Schubert et al., IROS 2018): BMI160, 200 Hz, motion capture; ASL folder, .tar, .tar.gz, .zip or .bag.
+
+Frames: `mocap0` holds R_world_imu and the IMU's position; a bag's `/vrpn_client/raw_transform` holds the marker body.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+from converters import Sequence, _asl, _bag
+from converters._source import Tree, find, is_bag
+from imutool.recording import Recording
+
+DATASET, SENSOR = "tum_vi", "bmi160"
+TRUTHS = {"mocap0": "/ground_truth/pose"}
+BAG_TRUTHS = ("/vrpn_client/raw_transform",)
+
+
+def sequences(source: Path) -> list[Sequence]:
+    """Every ASL sequence and bag in the source; `dataset-room2_512_16` is named `room2`."""
+    return [replace(found, name=_short(found.name)) for found in find(source)]
+
+
+def _short(name: str) -> str:
+    official = re.fullmatch(r"dataset-(.+?)(_\d+_\d+)?", name)
+    return official[1] if official else name
+
+
+def recognises(sequence: Sequence) -> bool:
+    """ASL folders with motion capture and whole-number stamps; bags with the vrpn topic."""
+    if is_bag(sequence.path):
+        return "/vrpn_client/raw_transform" in _bag.topics(sequence.path)
+    tree = Tree(sequence)
+    return "mocap0" in tree.sensors() and not _asl.float_stamps(tree)
+
+
+def read_sequence(sequence: Sequence, *, images: bool = True) -> Recording:
+    """One sequence as a Recording.
+
+    Raises:
+        DataError: the sequence contradicts its format, with file and line.
+        ConfigError: it is a bag and rosbags is not installed.
+    """
+    if is_bag(sequence.path):
+        return _bag.recording(sequence, dataset=DATASET, sensor=SENSOR, truths=BAG_TRUTHS, images=images)
+    return _asl.recording(sequence, dataset=DATASET, sensor=SENSOR, truths=TRUTHS, images=images)
+
+
+def read(source: Path) -> Iterator[Recording]:
+    """Every sequence of the source, one after the other."""
+    return map(read_sequence, sequences(source))

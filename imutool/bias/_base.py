@@ -1,0 +1,94 @@
+"""What every bias model is: a causal map from measured samples and a rest bias to the bias at each sample.
+
+The *rest bias* is what differs from run to run (the turn-on bias): the state the dynamics start from. What the motion adds
+(scale, misalignment, curvature) belongs to the sensor. Models add the two, `bias = rest + ...`, so an error of the start is
+the same error at every sample, which is what lets `imutool.turn_on` solve for it with any model.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, ClassVar, Literal, Protocol
+
+import numpy as np
+import torch
+from jaxtyping import Float, Float64
+from torch import Tensor, nn
+
+from imutool.config import Settings
+
+Sensor = Literal["gyro", "accel"]
+SENSORS: tuple[Sensor, Sensor] = ("gyro", "accel")
+COLUMNS = {"gyro": slice(0, 3), "accel": slice(3, 6)}  # of every vector of six
+
+Vector6 = Float64[np.ndarray, "6"]  # gyro (rad/s) then accel (m/s²)
+
+
+@dataclass(frozen=True)
+class Segment:
+    """Samples a model is shown: `t` in seconds from the segment's first sample, and the bias it starts from."""
+
+    t: Float[Tensor, "batch n"]
+    gyro: Float[Tensor, "batch n 3"]
+    accel: Float[Tensor, "batch n 3"]
+    rest: Float[Tensor, "batch 6"]
+
+    def of(self, sensor: Sensor) -> tuple[Float[Tensor, "batch n 3"], Float[Tensor, "batch 3"]]:
+        """Samples and rest bias of one sensor."""
+        return (self.gyro if sensor == "gyro" else self.accel), self.rest[:, COLUMNS[sensor]]
+
+
+class Stream(Protocol):
+    """A model at work on samples as they arrive, in blocks of any size; it keeps what it must remember between them."""
+
+    def __call__(
+        self, t_s: Float64[np.ndarray, " n"], gyro: Float64[np.ndarray, "n 3"], accel: Float64[np.ndarray, "n 3"]
+    ) -> Float64[np.ndarray, "n 6"]:
+        """The bias at each sample, from this and earlier samples only; the blocks' borders change nothing."""
+
+
+class BiasModel(nn.Module, ABC):
+    """A bias model, with the statistics of its sensor's training runs that every start needs.
+
+    At work in float64 (`imutool.bias._file.load`, `imutool.train.fit`); at rest, in a file, in float32.
+
+    Attributes:
+        prior_mean, prior_std: rest bias over the training runs, and its spread from run to run.
+        truth_std: spread of a rest bias estimated from `imutool.turn_on.TRUTH_S` seconds of this data's own truth.
+        noise_std: white noise of a sample, as seen in the residuals, for the debiased message's covariance.
+    """
+
+    method: ClassVar[str]
+    iterative: ClassVar[bool] = True  # false where the closed form leaves nothing to descend on
+    prior_mean: Tensor
+    prior_std: Tensor
+    truth_std: Tensor
+    noise_std: Tensor
+
+    def __init__(self, config: Settings, rate_hz: float) -> None:
+        super().__init__()
+        self.config, self.rate_hz = config, rate_hz
+        self.card: Mapping[str, Any] = {}
+        for name in ("prior_mean", "prior_std", "truth_std", "noise_std"):
+            self.register_buffer(name, torch.zeros(6))
+
+    @abstractmethod
+    def sensor_bias(self, sensor: Sensor, segment: Segment) -> Float[Tensor, "batch n 3"]:
+        """The bias of one sensor at each sample; row k depends on samples up to k. Differentiable.
+
+        The two sensors are apart because training is: the gyro first, then the accelerometer on top of it.
+        """
+
+    def forward(self, segment: Segment) -> Float[Tensor, "batch n 6"]:
+        """The bias at each sample: gyro (rad/s), then accel (m/s²)."""
+        return torch.cat([self.sensor_bias(sensor, segment) for sensor in SENSORS], dim=-1)
+
+    @abstractmethod
+    def begin_at(self, sensor: Sensor, W: Float[Tensor, "3 3"]) -> None:
+        """Takes over a calibration solved in closed form, as the point the training starts from."""
+
+    @abstractmethod
+    def stream(self, rest: Vector6) -> Stream:
+        """The same map in numpy, from a start on, for logs of any length and for live use; equals `forward` to 1e-6."""

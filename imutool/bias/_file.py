@@ -1,0 +1,137 @@
+"""Model files: safetensors with a JSON header; every size and shape is checked before a number is used, nothing is executed."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save_file
+
+from imutool import registry
+from imutool.bias._base import BiasModel
+from imutool.config import build, plain
+from imutool.errors import ConfigError, ImutoolError, ModelError
+
+FORMAT = "imutool.model/1"
+MAX_BYTES = 64 << 20  # ours are under 2 MB; a file this large is no bias model
+RATE_TOLERANCE = 0.05  # a sensor's real rate differs from its name by a few per mille (BMI160: 199.4 for 200)
+
+
+def save(model: BiasModel, path: Path, *, overwrite: bool = False) -> None:
+    """Writes a model and its card, beside the target first.
+
+    Raises:
+        ConfigError: the target exists, or cannot be written.
+    """
+    header = {
+        "format": FORMAT,
+        "method": model.method,
+        "rate_hz": repr(model.rate_hz),
+        "settings": json.dumps(plain(model.config)),
+        "card": json.dumps(dict(model.card)),
+    }
+    weights = {name: value.detach().cpu().float().contiguous() for name, value in model.state_dict().items()}
+    write_tensors(weights, header, path, overwrite)
+
+
+def write_tensors(tensors: Mapping[str, torch.Tensor], header: Mapping[str, str], path: Path, overwrite: bool) -> None:
+    """Tensors and a header of strings, beside the target and then renamed.
+
+    Raises:
+        ConfigError: the target exists, or cannot be written.
+    """
+    if path.exists() and not overwrite:
+        raise ConfigError("exists already", where=path, fix="Choose another name or give --overwrite")
+    beside = path.with_name(f".{path.name}.{os.getpid()}.part")
+    try:
+        save_file(dict(tensors), beside, metadata=dict(header))
+        beside.replace(path)
+    except (OSError, SafetensorError) as error:
+        raise ConfigError(f"cannot be written ({error})", where=path, fix="Choose another place") from error
+    finally:
+        beside.unlink(missing_ok=True)
+
+
+def read_tensors(path: Path, kind: str) -> tuple[dict[str, torch.Tensor], dict[str, str]]:
+    """Tensors and header of a file of format `kind`.
+
+    Raises:
+        ModelError: no such file, too large, not safetensors, or of another format.
+    """
+    try:
+        if path.stat().st_size > MAX_BYTES:
+            raise ModelError(f"{path.stat().st_size} bytes", where=path, expected=f"a model of at most {MAX_BYTES}")
+        with safe_open(path, framework="pt") as file:
+            header = file.metadata() or {}
+            if header.get("format") != kind:
+                raise ModelError(
+                    f"format {header.get('format')!r}",
+                    where=path,
+                    expected=f"{kind!r}",
+                    fix="Train it again with this version of imutool",
+                )
+            return {name: file.get_tensor(name) for name in file.keys()}, header  # noqa: SIM118  not a dict
+    except (OSError, SafetensorError) as error:
+        raise ModelError(f"is no model file ({error})", where=path, expected="safetensors by imutool train") from error
+
+
+def load(path: Path) -> BiasModel:
+    """The model in a file.
+
+    Raises:
+        ModelError: damaged, of another version or unknown method, or with tensors that do not fit its settings.
+    """
+    tensors, header = read_tensors(path, FORMAT)
+    try:
+        module = registry.load("imutool.bias", header["method"])
+        model: BiasModel = module.Model(build(module.Config, json.loads(header["settings"])), float(header["rate_hz"]))
+        card = json.loads(header["card"])
+    except (KeyError, ValueError, ImutoolError) as error:
+        raise ModelError(f"has a header that cannot be used ({error})", where=path) from error
+    expected = {k: (tuple(v.shape), torch.float32) for k, v in model.state_dict().items()}
+    found = {k: (tuple(v.shape), v.dtype) for k, v in tensors.items()}
+    if found != expected:
+        odd = sorted(k for k in expected.keys() | found.keys() if expected.get(k) != found.get(k))
+        raise ModelError(f"tensors {', '.join(odd[:5])} do not fit", where=path, expected=f"those of {header['method']}")
+    if any(not bool(torch.isfinite(v).all()) for v in tensors.values()):
+        raise ModelError("holds numbers that are not finite", where=path)
+    model.load_state_dict(tensors)
+    model.card = {**card, "name": path.stem, "sha256": digest(path)}
+    model.requires_grad_(False)
+    return model.double().eval()
+
+
+def digest(path: Path) -> str:
+    """SHA-256 of a model file."""
+    return hashlib.sha256(path.read_bytes()).hexdigest()
+
+
+def check_rate(model: BiasModel, rate_hz: float, where: str | Path) -> None:
+    """Refuses a log sampled at another rate than the model's training logs.
+
+    Raises:
+        ModelError: the rates differ by more than 5 %.
+    """
+    if model.rate_hz and abs(rate_hz / model.rate_hz - 1) > RATE_TOLERANCE:
+        raise ModelError(
+            f"IMU at {rate_hz:.1f} Hz",
+            where=where,
+            expected=f"{model.rate_hz:.1f} Hz, at which model {model.card.get('name', model.method)!r} was trained",
+            fix="Choose or train a model for this sensor",
+        )
+
+
+def header_of(path: Path) -> dict[str, Any]:
+    """Method, rate, settings and card of a model file, without building it.
+
+    Raises:
+        ModelError: as `read_tensors`.
+    """
+    _, header = read_tensors(path, FORMAT)
+    return {"method": header["method"], "rate_hz": float(header["rate_hz"]), **json.loads(header["card"])}

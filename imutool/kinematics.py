@@ -1,0 +1,171 @@
+"""What an ideal IMU would read along a true trajectory: angular rate, angular acceleration, specific force at a point.
+
+The trajectory is a pair of splines, one for the position, one for the quaternion. The quaternion spline need not stay
+on the unit sphere: any positive multiple of a unit quaternion stands for the same rotation, so four free coordinates
+have no singularity to steer around, whatever the angles, and every derivative follows in closed form.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, Float64
+from scipy.interpolate import BSpline, make_interp_spline, make_lsq_spline
+from scipy.spatial.transform import Rotation
+
+from imutool.errors import DataError, NumericsError
+from imutool.recording import GRAVITY_M_S2, Imu, Poses, Times, seconds
+
+DEGREE = 5  # continuous angular acceleration needs 3; 5 also keeps its slope and the jerk continuous
+SMALLEST_NORM = 0.1  # a quaternion spline that comes nearer to zero has knots too far apart to mean a rotation
+G_W = np.array([0.0, 0.0, -GRAVITY_M_S2])
+G_W.flags.writeable = False
+
+Vectors = Float64[np.ndarray, "n 3"]
+
+
+@dataclass(frozen=True, eq=False)
+class Motion:
+    """A trajectory and its derivatives at some instants; the suffix names the frame, world or body."""
+
+    p_wb: Vectors
+    q_wb_wxyz: Float64[np.ndarray, "n 4"]
+    v_w: Vectors
+    a_w: Vectors
+    omega_b: Vectors
+    alpha_b: Vectors
+
+    def acceleration(self, r_b: Float[np.ndarray, "3"] | None = None) -> Vectors:
+        """World acceleration (m/s²) of the tracked point, or of the point `r_b` (m) away from it in the body.
+
+        a_w + R_wb (alpha x r + omega x (omega x r)), the rigid-body law.
+        """
+        if r_b is None:
+            return self.a_w
+        return self.a_w + self._rotation().apply(self._lever(r_b))
+
+    def specific_force(self, r_b: Float[np.ndarray, "3"] | None = None, g_w: Float[np.ndarray, "3"] = G_W) -> Vectors:
+        """What an ideal accelerometer at `r_b` reads, in the body frame (m/s²): R_wb^T (a_w - g_w); at rest +g up."""
+        felt = self._rotation().apply(self.a_w - g_w, inverse=True)
+        return felt if r_b is None else felt + self._lever(r_b)
+
+    def _lever(self, r_b: Float[np.ndarray, "3"]) -> Vectors:
+        return np.cross(self.alpha_b, r_b) + np.cross(self.omega_b, np.cross(self.omega_b, r_b))
+
+    def _rotation(self) -> Rotation:
+        return Rotation.from_quat(self.q_wb_wxyz, scalar_first=True)
+
+
+@dataclass(frozen=True, eq=False)
+class Trajectory:
+    """A smooth motion: splines from seconds since `start_ns` to position (m) and to a multiple of `q_wb_wxyz`."""
+
+    start_ns: int
+    position: BSpline
+    quaternion: BSpline
+
+    def at(self, t_ns: Times) -> Motion:
+        """The motion at some instants.
+
+        With Q the spline and n = |Q|², differentiating R(Q) gives omega_b = 2 Im(Q* Q') / n, and once more
+        alpha_b = 2 Im(Q* Q'') / n - omega_b n' / n: Im(Q'* Q') vanishes, so no further term is left.
+
+        Raises:
+            NumericsError: an instant outside the splines, or a quaternion too near zero to name a rotation.
+        """
+        t = seconds(t_ns, self.start_ns)
+        self._inside(t)
+        q, dq, ddq = (np.asarray(self.quaternion(t, order), dtype=np.float64) for order in range(3))
+        p, v, a = (np.asarray(self.position(t, order), dtype=np.float64) for order in range(3))
+        n = np.sum(q * q, axis=1, keepdims=True)
+        if len(n) and n.min() < SMALLEST_NORM**2:
+            raise NumericsError(
+                f"the quaternion spline shrinks to {float(np.sqrt(n.min())):.2g} at {t[int(np.argmin(n))]:.3f} s",
+                expected=f"a norm above {SMALLEST_NORM}",
+                fix="Put its knots closer together",
+            )
+        omega_b = 2.0 * _conjugate_product(q, dq) / n
+        alpha_b = 2.0 * _conjugate_product(q, ddq) / n - omega_b * (2.0 * np.sum(q * dq, axis=1, keepdims=True) / n)
+        return Motion(p, q / np.sqrt(n), v, a, omega_b, alpha_b)
+
+    def poses(self, t_ns: Times) -> Poses:
+        """The true poses and velocities at some instants.
+
+        Raises:
+            NumericsError: as `at`.
+        """
+        motion = self.at(t_ns)
+        return Poses(t_ns, motion.p_wb, motion.q_wb_wxyz, motion.v_w)
+
+    def imu(self, t_ns: Times, r_b: Float[np.ndarray, "3"] | None = None, g_w: Float[np.ndarray, "3"] = G_W) -> Imu:
+        """What an ideal IMU at `r_b` reads at some instants: no bias, no noise, no filter.
+
+        Raises:
+            NumericsError: as `at`.
+        """
+        motion = self.at(t_ns)
+        return Imu(t_ns, motion.omega_b, motion.specific_force(r_b, g_w))
+
+    def _inside(self, t: Float64[np.ndarray, " n"]) -> None:
+        for spline in (self.position, self.quaternion):
+            first, last = float(spline.t[spline.k]), float(spline.t[-spline.k - 1])
+            outside = (t < first - 1e-9) | (t > last + 1e-9)  # a nanosecond: the clock's own resolution
+            if outside.any():
+                raise NumericsError(
+                    f"{t[int(np.argmax(outside))]:.9f} s is outside the trajectory", expected=f"{first:g} to {last:g} s"
+                )
+
+
+def through(poses: Poses, knot_spacing_s: float | None = None, degree: int = DEGREE) -> Trajectory:
+    """The smooth trajectory through true poses, time counted from the first of them.
+
+    Without `knot_spacing_s` the splines pass through every pose, noise included: its second derivative is then noise
+    times 1/dt². With it they are the least-squares splines on knots that far apart, which is the smoothing.
+
+    Raises:
+        DataError: too few poses, or a gap that leaves knots without poses.
+    """
+    if len(poses) <= degree:
+        raise DataError(f"{len(poses)} true poses", expected=f"more than {degree} for a spline of degree {degree}")
+    t = seconds(poses.t_ns, int(poses.t_ns[0]))
+    columns = (poses.p_wb, continuous(poses.q_wb_wxyz))
+    if knot_spacing_s is None:
+        position, quaternion = (make_interp_spline(t, y, k=degree) for y in columns)
+        return Trajectory(int(poses.t_ns[0]), position, quaternion)
+    inner = np.linspace(t[0], t[-1], max(int(np.ceil((t[-1] - t[0]) / knot_spacing_s)), 1) + 1)
+    knots = np.concatenate([np.full(degree, t[0]), inner, np.full(degree, t[-1])])
+    try:
+        position, quaternion = (make_lsq_spline(t, y, knots, k=degree) for y in columns)
+    except (ValueError, np.linalg.LinAlgError) as error:
+        raise DataError(
+            f"true poses leave some of {len(inner)} knots without support ({error})",
+            expected="several poses between knots",
+            fix="Use a larger knot spacing, or a stretch of truth without gaps",
+        ) from error
+    return Trajectory(int(poses.t_ns[0]), position, quaternion)
+
+
+def rates_from_poses(poses: Poses) -> Vectors:
+    """Mean angular rate (rad/s, body frame) over each interval between consecutive poses: Log(R_k^T R_{k+1}) / dt.
+
+    One row less than there are poses. A turn of more than pi between two poses is read as its shorter complement.
+    """
+    rotations = Rotation.from_quat(poses.q_wb_wxyz, scalar_first=True)
+    dt = np.diff(poses.t_ns).astype(np.float64) * 1e-9
+    turned: Vectors = (rotations[:-1].inv() * rotations[1:]).as_rotvec() / dt[:, None]
+    return turned
+
+
+def _conjugate_product(a: Float64[np.ndarray, "n 4"], b: Float64[np.ndarray, "n 4"]) -> Vectors:
+    """Im(a* b) of wxyz quaternions."""
+    a_w, a_v, b_w, b_v = a[:, :1], a[:, 1:], b[:, :1], b[:, 1:]
+    imaginary: Vectors = a_w * b_v - b_w * a_v - np.cross(a_v, b_v)
+    return imaginary
+
+
+def continuous(q_wxyz: Float64[np.ndarray, "n 4"]) -> Float64[np.ndarray, "n 4"]:
+    """The same rotations with signs chosen so that neighbours lie in one hemisphere (q and -q are one rotation)."""
+    flips = np.where(np.sum(q_wxyz[1:] * q_wxyz[:-1], axis=1) < 0.0, -1.0, 1.0)
+    signed: Float64[np.ndarray, "n 4"] = q_wxyz * np.concatenate([[1.0], np.cumprod(flips)])[:, None]
+    return signed

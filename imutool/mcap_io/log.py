@@ -1,0 +1,391 @@
+"""A log opened for reading: whole columns at a time, one chunk in memory, every chunk's CRC checked.
+
+Topics are found by schema, not by name; messages come in file order.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Collection, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from types import MappingProxyType, TracebackType
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float64, Int64, UInt32
+from mcap.opcode import Opcode
+from mcap.records import Metadata
+
+from imutool.errors import DataError, LogError
+from imutool.mcap_io import records, schema
+from imutool.mcap_io.memory import keep_buffers
+from imutool.mcap_io.records import HEAD
+from imutool.mcap_io.structure import Block, Source, Span, Structure
+
+logger = logging.getLogger(__name__)
+
+ENCODINGS = ("cdr", "ros1")
+DERIVED_KEY = "imutool_source_topic"  # channel metadata: computed by imutool from this topic
+
+MESSAGE_POSES = (schema.POSE, schema.ODOMETRY, schema.TRANSFORM)
+SCALARS = {schema.FLOAT: 1, schema.VECTOR3: 3}
+
+
+@dataclass(frozen=True)
+class Topic:
+    """A topic as its Channel record describes it; several channels of one topic count as one."""
+
+    name: str
+    schema_name: str  # in ROS 2 spelling; empty where the channel has no schema
+    schema_encoding: str
+    message_encoding: str
+    count: int
+    metadata: Mapping[str, str]
+
+
+class ImuBatch(NamedTuple):
+    """Consecutive messages of one IMU; times in ns, rad/s, m/s²."""
+
+    log_time: Int64[np.ndarray, " n"]
+    publish_time: Int64[np.ndarray, " n"]
+    sequence: UInt32[np.ndarray, " n"]
+    stamp_ns: Int64[np.ndarray, " n"]
+    gyro: Float64[np.ndarray, "n 3"]
+    accel: Float64[np.ndarray, "n 3"]
+    frame_id: str
+
+
+class PoseBatch(NamedTuple):
+    """Consecutive poses of one frame in another; metres, quaternions as they stand in the log."""
+
+    log_time: Int64[np.ndarray, " n"]
+    publish_time: Int64[np.ndarray, " n"]
+    sequence: UInt32[np.ndarray, " n"]
+    stamp_ns: Int64[np.ndarray, " n"]
+    p_wb: Float64[np.ndarray, "n 3"]
+    q_wb_wxyz: Float64[np.ndarray, "n 4"]
+    frame_id: str
+    child_frame_id: str
+
+
+class ScalarBatch(NamedTuple):
+    """Consecutive messages of a numeric topic; `stamp_ns` is the log time where the message has no header."""
+
+    log_time: Int64[np.ndarray, " n"]
+    publish_time: Int64[np.ndarray, " n"]
+    sequence: UInt32[np.ndarray, " n"]
+    stamp_ns: Int64[np.ndarray, " n"]
+    values: Float64[np.ndarray, "n k"]
+    frame_id: str
+
+
+class Log:
+    """One MCAP file, open for reading: chunked or not, with or without a summary or message indexes.
+
+    Memory is bounded by its largest chunk. Times given to a method select by log time, both ends included.
+
+    Raises:
+        ConfigError: the file cannot be opened.
+        LogError: empty, not an MCAP log, cut short or damaged.
+    """
+
+    def __init__(self, path: Path) -> None:
+        keep_buffers()
+        self.path = path
+        self._source = Source(path)
+        try:
+            with self.named():
+                self.structure = Structure(self._source)
+                self.topics = MappingProxyType(self._topics())
+        except BaseException:
+            self._source.file.close()
+            raise
+
+    def __enter__(self) -> Log:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+        self._source.file.close()
+
+    @contextmanager
+    def named(self, topic: str = "") -> Iterator[None]:
+        """Gives errors from below their address."""
+        try:
+            yield
+        except (LogError, DataError) as error:
+            if isinstance(error, LogError) and error.where is not None:
+                raise
+            where = f"{self.path} {topic}" if topic else self.path
+            raise LogError(error.what, where=where, expected=error.expected, fix=error.fix) from error
+
+    def _topics(self) -> dict[str, Topic]:
+        found: dict[str, Topic] = {}
+        counts = self.structure.counts()
+        for identity, channel in sorted(self.structure.channels.items()):
+            kind = self.structure.schemas.get(channel.schema_id)
+            before = found.get(channel.topic)
+            found[channel.topic] = Topic(
+                channel.topic,
+                schema.canonical(kind.name) if kind else "",
+                kind.encoding if kind else "",
+                channel.message_encoding,
+                counts.get(identity, 0) + (before.count if before else 0),
+                MappingProxyType(dict(channel.metadata)),
+            )
+            if before and (before.schema_name, before.message_encoding) != (
+                found[channel.topic].schema_name,
+                found[channel.topic].message_encoding,
+            ):
+                raise LogError(f"{channel.topic} carries {before.schema_name} and {found[channel.topic].schema_name}")
+        return found
+
+    @property
+    def profile(self) -> str:
+        """What the header says the log follows: `ros2`, `ros1` or nothing."""
+        return str(self.structure.header.profile)
+
+    @property
+    def imu_topics(self) -> list[str]:
+        """Topics with IMU messages, without those that imutool computed itself."""
+        return [t.name for t in self.with_schema((schema.IMU,)) if DERIVED_KEY not in t.metadata]
+
+    @property
+    def pose_topics(self) -> list[str]:
+        """Topics with poses; /tf counts only where nothing else has any, and never the static one."""
+        dedicated = [t.name for t in self.with_schema(MESSAGE_POSES)]
+        return dedicated or [t.name for t in self.with_schema((schema.TF,)) if not t.name.endswith("tf_static")]
+
+    def with_schema(self, schema_names: Collection[str]) -> list[Topic]:
+        """The topics that carry one of these messages, in order of their channel ids."""
+        return [t for t in self.topics.values() if t.schema_name in schema_names]
+
+    def topic(self, name: str, schema_names: Collection[str]) -> Topic:
+        """A topic by name, which must carry one of these messages in an encoding that is read here.
+
+        Raises:
+            LogError: no such topic, other messages, or another encoding.
+        """
+        if name not in self.topics:
+            raise LogError(f"there is no topic {name}", where=self.path, expected=self.listing())
+        found = self.topics[name]
+        if found.schema_name not in schema_names:
+            raise LogError(
+                f"{name} carries {found.schema_name or 'messages without schema'}",
+                where=self.path,
+                expected=" or ".join(schema_names),
+            )
+        if found.message_encoding not in ENCODINGS:
+            raise LogError(f"{name} is encoded as {found.message_encoding!r}", where=self.path, expected=" or ".join(ENCODINGS))
+        return found
+
+    def listing(self) -> str:
+        """The topics there are, for a message."""
+        every = [f"{t.name} ({t.schema_name or 'no schema'})" for t in self.topics.values()]
+        return ", ".join(every) if every else "a log with topics (this one has none)"
+
+    def metadata(self) -> dict[str, dict[str, str]]:
+        """The metadata records by name; where a name comes twice, the later record's entries lie over the earlier's."""
+        found: dict[str, dict[str, str]] = {}
+        for name, values in self.metadata_records():
+            found.setdefault(name, {}).update(values)
+        return found
+
+    def metadata_records(self) -> list[tuple[str, dict[str, str]]]:
+        """Every metadata record, in file order.
+
+        Raises:
+            LogError: one of them is damaged.
+        """
+        found = []
+        with self.named():
+            for item in self.structure.items:
+                if isinstance(item, Span) and item.opcode == Opcode.METADATA:
+                    body = self._source.at(item.offset + HEAD.size, item.length - HEAD.size)
+                    record = records.parse(Metadata, body, item.offset)
+                    found.append((record.name, dict(record.metadata)))
+        return found
+
+    def stamps(self, topic: str) -> Iterator[Int64[np.ndarray, " n"]]:
+        """Log times of one topic in file order, from the message indexes where there are any: nothing is unpacked.
+
+        Raises:
+            LogError: no such topic, or a damaged log.
+        """
+        if topic not in self.topics:
+            raise LogError(f"there is no topic {topic}", where=self.path, expected=self.listing())
+        channels = self.channel_ids(topic)
+        with self.named(topic):
+            for block in self.structure.blocks:
+                if not block.holds(channels):
+                    continue
+                if block.indexes:
+                    entries = [self.structure.index(block, c) for c in sorted(channels & block.indexes.keys())]
+                    table = np.concatenate(entries)
+                    yield records.signed(table[np.argsort(table[:, 1], kind="stable"), 0])
+                else:
+                    found = self.structure.unpack(block)
+                    times = found.times()[np.isin(found.heads["channel"], list(channels))]
+                    if len(times):
+                        yield times
+
+    def imu_batches(self, topic: str, start_ns: int | None = None, end_ns: int | None = None) -> Iterator[ImuBatch]:
+        """The messages of an IMU topic in file order, a chunk at a time.
+
+        Raises:
+            LogError: no such IMU topic, another encoding, NaN or infinite values, stamps that do not increase, damage.
+        """
+        self.topic(topic, (schema.IMU,))
+        clock = Clock()
+        for rows in self.rows([topic], start_ns, end_ns):
+            with self.named(topic):
+                for batch in self.decode_imu(topic, rows[1]):
+                    clock.check(batch.stamp_ns, batch.sequence)
+                    yield batch
+
+    def decode_imu(self, topic: str, rows: records.Rows) -> Iterator[ImuBatch]:
+        """IMU messages from their bytes, one batch per stretch with one frame.
+
+        Raises:
+            LogError: a payload that is no such message, NaN or infinite values.
+        """
+        encoding = self.topics[topic].message_encoding
+        for part, layout in schema.runs(rows.payload, schema.IMU, encoding):
+            cut = rows.where(part)
+            columns = schema.decode_imu(cut.payload, encoding, layout)
+            _finite(cut.sequence, angular_velocity=columns.gyro, linear_acceleration=columns.accel)
+            yield ImuBatch(cut.log_time, cut.publish_time, cut.sequence, *columns)
+
+    def pose_batches(self, topic: str, start_ns: int | None = None, end_ns: int | None = None) -> Iterator[PoseBatch]:
+        """The poses of a topic in file order; of a TFMessage one batch per transform in it.
+
+        Raises:
+            LogError: no such pose topic, another encoding, NaN or infinite values, damage.
+        """
+        self.topic(topic, (*MESSAGE_POSES, schema.TF))
+        for rows in self.rows([topic], start_ns, end_ns):
+            with self.named(topic):
+                yield from self.decode_poses(topic, rows[1])
+
+    def decode_poses(self, topic: str, rows: records.Rows) -> Iterator[PoseBatch]:
+        """Poses from their bytes, one batch per stretch with the same frames, and per transform in a TFMessage.
+
+        Raises:
+            LogError: a payload that is no such message, NaN or infinite values.
+        """
+        kind, encoding = self.topics[topic].schema_name, self.topics[topic].message_encoding
+        for part, layout in schema.runs(rows.payload, kind, encoding):
+            cut = rows.where(part)
+            for columns in schema.decode_poses(cut.payload, kind, encoding, layout):
+                _finite(cut.sequence, position=columns.p_wb, orientation=columns.q_wb_wxyz)
+                yield PoseBatch(cut.log_time, cut.publish_time, cut.sequence, *columns)
+
+    def scalar_batches(self, topic: str, start_ns: int | None = None, end_ns: int | None = None) -> Iterator[ScalarBatch]:
+        """The messages of a Float64 or Vector3Stamped topic in file order.
+
+        Raises:
+            LogError: no such topic, another encoding, NaN or infinite values, damage.
+        """
+        self.topic(topic, SCALARS)
+        for rows in self.rows([topic], start_ns, end_ns):
+            with self.named(topic):
+                yield from self.decode_scalars(topic, rows[1])
+
+    def decode_scalars(self, topic: str, rows: records.Rows) -> Iterator[ScalarBatch]:
+        """Numbers from their bytes, one batch per stretch with one frame.
+
+        Raises:
+            LogError: a payload that is no such message, NaN or infinite values.
+        """
+        kind, encoding = self.topics[topic].schema_name, self.topics[topic].message_encoding
+        for part, layout in schema.runs(rows.payload, kind, encoding):
+            cut = rows.where(part)
+            columns = schema.decode_scalars(cut.payload, kind, encoding, layout)
+            _finite(cut.sequence, values=columns.values)
+            stamp_ns = cut.log_time if columns.stamp_ns is None else columns.stamp_ns
+            yield ScalarBatch(cut.log_time, cut.publish_time, cut.sequence, stamp_ns, columns.values, columns.frame_id)
+
+    def images(self, topic: str, start_ns: int | None = None, end_ns: int | None = None) -> Iterator[tuple[int, bytes]]:
+        """Stamp and encoded bytes of every image of a CompressedImage topic, in file order.
+
+        Raises:
+            LogError: no such topic, another encoding, damage.
+        """
+        encoding = self.topic(topic, (schema.IMAGE,)).message_encoding
+        for _, rows in self.rows([topic], start_ns, end_ns):
+            with self.named(topic):
+                for payload in rows.payload:
+                    stamp_ns, _, image = schema.decode_image(payload.tobytes(), encoding)
+                    yield stamp_ns, image
+
+    def channel_ids(self, topic: str) -> set[int]:
+        """The channels of a topic."""
+        return {i for i, channel in self.structure.channels.items() if channel.topic == topic}
+
+    def rows(
+        self, topics: Collection[str], start_ns: int | None = None, end_ns: int | None = None
+    ) -> Iterator[tuple[str, records.Rows]]:
+        """The messages of some topics in file order, every chunk unpacked once whatever the number of topics."""
+        wanted = {topic: self.channel_ids(topic) for topic in topics}
+        every = set().union(*wanted.values()) if wanted else set()
+        first = -1 if start_ns is None else start_ns
+        last = 2**63 - 1 if end_ns is None else end_ns
+        with self.named():
+            for block in self.structure.blocks:
+                if block.holds(every) and block.start_ns <= last and block.end_ns >= first:
+                    yield from self._rows_of(block, wanted, first, last)
+
+    _rows = rows  # its name for callers written before it became public
+
+    def _rows_of(
+        self, block: Block, wanted: Mapping[str, set[int]], first: int, last: int
+    ) -> Iterator[tuple[str, records.Rows]]:
+        found = self.structure.unpack(block)
+        times = found.times()
+        inside = (times >= first) & (times <= last)
+        for topic, channels in wanted.items():
+            mask = inside & np.isin(found.heads["channel"], list(channels))
+            for rows in records.rows(found, mask):
+                yield topic, rows
+
+
+def _finite(sequence: UInt32[np.ndarray, " n"], **fields: Float64[np.ndarray, "n _"]) -> None:
+    """Refuses NaN and infinity, naming the message."""
+    for name, values in fields.items():
+        good = np.isfinite(values).all(axis=1)
+        if not good.all():
+            row = int(np.argmin(good))
+            raise LogError(
+                f"message {sequence[row]} has {name} {values[row].tolist()}",
+                expected="finite numbers",
+                fix="Cut the log before or after it",
+            )
+
+
+@dataclass(slots=True)
+class Clock:
+    """Refuses stamps that repeat or go back, across batches."""
+
+    count: int = 0
+    last: int | None = None
+
+    def check(self, stamp_ns: Int64[np.ndarray, " n"], sequence: UInt32[np.ndarray, " n"]) -> None:
+        """Takes in the next stamps.
+
+        Raises:
+            LogError: one does not come after the one before it; the message names the message and both stamps.
+        """
+        if not len(stamp_ns):
+            return
+        before = np.concatenate([[stamp_ns[0] - 1 if self.last is None else self.last], stamp_ns[:-1]])
+        bad = stamp_ns <= before
+        if bad.any():
+            row = int(np.argmax(bad))
+            how = "repeats" if stamp_ns[row] == before[row] else "goes back"
+            raise LogError(
+                f"message {self.count + row} (sequence {sequence[row]}) has the stamp {stamp_ns[row]} ns, which {how}: "
+                f"the message before has {before[row]} ns",
+                expected="stamps that increase",
+            )
+        self.count, self.last = self.count + len(stamp_ns), int(stamp_ns[-1])

@@ -1,0 +1,256 @@
+"""Logs read back as recordings; what a topic means is decided here: the IMU, the true poses, the scalar channels."""
+
+from __future__ import annotations
+
+import json
+import logging
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float64, Int64, UInt32
+
+from imutool.errors import LogError
+from imutool.mcap_io import records, schema
+from imutool.mcap_io.log import (
+    DERIVED_KEY,
+    ENCODINGS,
+    MESSAGE_POSES,
+    SCALARS,
+    Clock,
+    ImuBatch,
+    Log,
+    PoseBatch,
+    ScalarBatch,
+    Topic,
+)
+from imutool.recording import UNIT_QUATERNION_TOLERANCE, Frames, Imu, Poses, Recording, Scalars, unit_quaternions
+
+__all__ = ["DERIVED_KEY", "ENCODINGS", "ImuBatch", "Log", "PoseBatch", "ScalarBatch", "Topic", "read"]
+
+logger = logging.getLogger(__name__)
+
+VELOCITY_KEY = "imutool_velocity_of"  # channel metadata: the world velocity of the poses on this topic
+UNIT_KEY = "unit"  # channel metadata of a scalar
+RECORD = "imutool"  # name of our metadata record
+SHADOWED_KEY = "shadowed"  # in that record: JSON of a recording's own entries under the keys we use
+OWN_KEYS = ("writer", "name", "source", "imu_topic", SHADOWED_KEY)
+
+
+def read(
+    path: Path,
+    *,
+    imu: str | None = None,
+    truth: str | None = None,
+    start_ns: int | None = None,
+    end_ns: int | None = None,
+) -> Recording:
+    """The recording in a log: `read(write(r)) == r`, bit for bit.
+
+    Of a log that imutool did not write, the name is that of the file, poses of every pose topic are truths (/tf, by child
+    frame, where there are no others), and Float64 and Vector3Stamped topics are scalars; one of these that a recording
+    cannot hold (time going back, NaN) is left out and logged as a warning. `start_ns` and `end_ns` select by log time.
+
+    Raises:
+        ConfigError: the file cannot be opened.
+        LogError: no IMU or several without `imu`, no such topic, values or stamps no recording can hold, a damaged log.
+    """
+    with Log(path) as log:
+        imu_topic = _choose_imu(log, imu)
+        own, metadata = _own_and_user_metadata(log)
+        truths = _choose_truths(log, truth)
+        velocities = {t.name: t.metadata[VELOCITY_KEY] for t in log.topics.values() if VELOCITY_KEY in t.metadata}
+        scalars = [t.name for t in log.with_schema(SCALARS) if t.name not in velocities and t.message_encoding in ENCODINGS]
+        gather = _Gather(log, imu_topic, truths, velocities, scalars)
+        with log.named():
+            for topic, rows in log.rows(gather.topics, start_ns, end_ns):
+                gather.take(topic, rows)
+        return Recording(
+            name=own.get("name", path.stem),
+            imu=gather.imu(),
+            truths=gather.truths(truth),
+            scalars=gather.scalars(),
+            frames=_frames(log, start_ns, end_ns),
+            metadata=metadata,
+            imu_topic=imu_topic,
+            source=own.get("source", ""),
+        )
+
+
+def _choose_imu(log: Log, imu: str | None) -> str:
+    if imu is not None:
+        return log.topic(imu, (schema.IMU,)).name
+    found = log.imu_topics
+    if not found:
+        raise LogError("the log has no IMU topic", where=log.path, expected=f"{schema.IMU} among {log.listing()}")
+    if len(found) > 1:
+        raise LogError(f"the log has {len(found)} IMU topics: {', '.join(found)}", where=log.path, fix="Choose one with --imu")
+    return log.topic(found[0], (schema.IMU,)).name
+
+
+def _choose_truths(log: Log, truth: str | None) -> list[str]:
+    """The topics to read poses from; a transform of /tf is chosen as TOPIC/CHILD_FRAME."""
+    kinds = (*MESSAGE_POSES, schema.TF)
+    if truth is None:
+        return [log.topic(name, kinds).name for name in log.pose_topics]
+    if truth in log.topics:
+        return [log.topic(truth, kinds).name]
+    trees = [t.name for t in log.with_schema((schema.TF,)) if truth.startswith(f"{t.name}/")]
+    if not trees:
+        raise LogError(f"there are no poses on {truth}", where=log.path, expected=", ".join(log.pose_topics) or "(none there)")
+    return trees
+
+
+class _Gather:
+    """Collects the columns of every wanted topic in one pass over the log."""
+
+    def __init__(self, log: Log, imu: str, truths: list[str], velocities: Mapping[str, str], scalars: list[str]) -> None:
+        self.log, self.imu_topic, self.truth_topics, self.scalar_topics = log, imu, truths, scalars
+        self.velocity_topics = {name: of for name, of in velocities.items() if of in truths}
+        self.clocks: dict[str, Clock] = {}
+        self.kept: dict[str, list[tuple[np.ndarray, ...]]] = {}  # columns, by topic
+        self.left_out: set[str] = set()
+
+    @property
+    def topics(self) -> list[str]:
+        return [self.imu_topic, *self.truth_topics, *self.velocity_topics, *self.scalar_topics]
+
+    def take(self, topic: str, rows: records.Rows) -> None:
+        if topic == self.imu_topic:
+            with self.log.named(topic):
+                for imu in self.log.decode_imu(topic, rows):
+                    self._keep(topic, imu.sequence, imu.stamp_ns, imu.gyro, imu.accel)
+        elif topic in self.truth_topics:
+            with self.log.named(topic):
+                for pose in self.log.decode_poses(topic, rows):
+                    tree = self.log.topics[topic].schema_name == schema.TF
+                    name = f"{topic}/{pose.child_frame_id.lstrip('/')}" if tree else topic
+                    self._keep(name, pose.sequence, pose.stamp_ns, pose.p_wb, pose.q_wb_wxyz)
+        elif topic in self.velocity_topics:
+            with self.log.named(topic):
+                for velocity in self.log.decode_scalars(topic, rows):
+                    self._keep(topic, velocity.sequence, velocity.stamp_ns, velocity.values)
+        elif topic not in self.left_out:
+            try:
+                for scalar in self.log.decode_scalars(topic, rows):
+                    self._keep(topic, scalar.sequence, scalar.stamp_ns, scalar.values)
+            except LogError as error:
+                logger.warning("%s %s is left out: %s", self.log.path, topic, error.what)
+                self.left_out.add(topic)
+
+    def _keep(
+        self,
+        name: str,
+        sequence: UInt32[np.ndarray, " n"],
+        stamp_ns: Int64[np.ndarray, " n"],
+        *columns: Float64[np.ndarray, "n _"],
+    ) -> None:
+        self.clocks.setdefault(name, Clock()).check(stamp_ns, sequence)
+        self.kept.setdefault(name, []).append((stamp_ns, *columns))
+
+    def columns(self, name: str, *widths: int) -> tuple[Int64[np.ndarray, " n"], list[Float64[np.ndarray, "n _"]]]:
+        parts = self.kept.get(name, [])
+        if not parts:
+            return np.zeros(0, np.int64), [np.zeros((0, width)) for width in widths]
+        stamp_ns, *columns = (np.concatenate(column) for column in zip(*parts, strict=True))
+        return stamp_ns, columns
+
+    def imu(self) -> Imu:
+        with self.log.named(self.imu_topic):
+            stamp_ns, (gyro, accel) = self.columns(self.imu_topic, 3, 3)
+            return Imu(stamp_ns, gyro, accel)
+
+    def truths(self, wanted: str | None) -> dict[str, Poses]:
+        names: list[str] = []
+        for topic in self.truth_topics:
+            if self.log.topics[topic].schema_name == schema.TF:
+                names += [name for name in self.kept if name.startswith(f"{topic}/")]
+            else:
+                names.append(topic)
+        if wanted is not None and wanted not in self.log.topics:
+            if wanted not in names:
+                raise LogError(
+                    f"there are no poses on {wanted}", where=self.log.path, expected=", ".join(names) or "a transform"
+                )
+            names = [wanted]
+        elif wanted is not None and len(names) > 1:
+            raise LogError(
+                f"{wanted} has {len(names)} child frames", where=self.log.path, fix=f"Choose one of {', '.join(names)}"
+            )
+        return {name: self._poses(name) for name in names}
+
+    def _poses(self, name: str) -> Poses:
+        with self.log.named(name):
+            stamp_ns, (p_wb, q_wb_wxyz) = self.columns(name, 3, 4)
+            away = np.abs(np.linalg.norm(q_wb_wxyz, axis=1) - 1.0) > UNIT_QUATERNION_TOLERANCE
+            if away.any():  # rows that a recording takes as they are keep every bit
+                q_wb_wxyz = np.where(away[:, None], unit_quaternions(q_wb_wxyz), q_wb_wxyz)
+            v_w = None
+            for topic in (t for t, of in self.velocity_topics.items() if of == name):
+                times, (v_w,) = self.columns(topic, 3)
+                if not np.array_equal(times, stamp_ns):
+                    raise LogError(f"the velocities on {topic} have other stamps than the poses")
+            return Poses(stamp_ns, p_wb, q_wb_wxyz, v_w)
+
+    def scalars(self) -> dict[str, Scalars]:
+        found = {}
+        for name in self.scalar_topics:
+            if name not in self.left_out:
+                described = self.log.topics[name]
+                stamp_ns, (values,) = self.columns(name, SCALARS[described.schema_name])
+                found[name] = Scalars(stamp_ns, values, described.metadata.get(UNIT_KEY, ""))
+        return found
+
+
+def _frames(log: Log, start_ns: int | None, end_ns: int | None) -> dict[str, Frames]:
+    """Image topics, to be opened again when somebody copies them."""
+    found = {}
+    for topic in log.with_schema((schema.IMAGE,)):
+        if topic.message_encoding in ENCODINGS:
+            first, last = start_ns or 0, 2**63 - 1 if end_ns is None else end_ns
+            count = sum(int(((t >= first) & (t <= last)).sum()) for t in log.stamps(topic.name))
+            found[topic.name] = Frames(_format(log, topic.name), count, _opener(log.path, topic.name, start_ns, end_ns))
+    return found
+
+
+def _format(log: Log, topic: str) -> str:
+    """What the first image says it is."""
+    for _, rows in log.rows([topic]):
+        with log.named(topic):
+            return schema.decode_image(rows.payload[0].tobytes(), log.topics[topic].message_encoding)[1]
+    return ""
+
+
+def _opener(path: Path, topic: str, start_ns: int | None, end_ns: int | None) -> Callable[[], Iterator[tuple[int, bytes]]]:
+    def each() -> Iterator[tuple[int, bytes]]:
+        with Log(path) as log:
+            yield from log.images(topic, start_ns, end_ns)
+
+    return each
+
+
+def _own_and_user_metadata(log: Log) -> tuple[dict[str, str], dict[str, dict[str, str]]]:
+    """What the writer noted about the recording, and the recording's own metadata, which it was laid over.
+
+    The writer's record is the first `imutool` that names what it shadows; later ones tell of what was done to the log.
+    """
+    own: dict[str, str] = {}
+    found: dict[str, dict[str, str]] = {}
+    for name, values in log.metadata_records():
+        entries = values
+        if name == RECORD and SHADOWED_KEY in values and not own:
+            own, shadowed = values, _shadowed(values[SHADOWED_KEY])
+            entries = {k: v for k, v in values.items() if k not in OWN_KEYS} | dict(shadowed or {})
+            if not entries and shadowed is None:
+                continue
+        found.setdefault(name, {}).update(entries)
+    return own, found
+
+
+def _shadowed(text: str) -> Mapping[str, str] | None:
+    """A recording's own entries under the keys the writer uses; None where it had no record `imutool` at all."""
+    try:
+        value = json.loads(text)
+    except ValueError:
+        value = None
+    return value if isinstance(value, dict) and all(isinstance(v, str) for v in value.values()) else None

@@ -1,0 +1,339 @@
+"""What lies where in a log: its definitions, its chunks and everything between them, in file order.
+
+The data section is always followed from its first byte to its end, so nothing in it can be overlooked; a chunk that the
+summary knows is stepped over without being touched, so this costs one dictionary look-up per chunk. Logs without
+summary, without message indexes or without chunks are charted the same way and only cost more reading.
+"""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from collections import Counter
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import BinaryIO, NamedTuple
+
+import numpy as np
+from jaxtyping import UInt64
+from mcap.opcode import Opcode
+from mcap.records import Channel, ChunkIndex, Footer, Header, Schema, Statistics
+
+from imutool.errors import ConfigError, LogError
+from imutool.mcap_io import records
+from imutool.mcap_io.records import FOOTER_SIZE, HEAD, MAGIC
+
+RUN_BYTES = 1 << 20  # messages outside chunks are taken in runs of about this size
+CUT_SHORT = "Copy it again from where it was recorded; salvage (`imutool repair`) is planned and not there yet"
+
+
+class Span(NamedTuple):
+    """A record between chunks, opcode and length included."""
+
+    opcode: int
+    offset: int
+    length: int
+
+
+@dataclass(slots=True)
+class Block:
+    """A stretch that holds messages: one Chunk record, or a run of messages outside chunks."""
+
+    offset: int
+    length: int
+    end: int  # behind the message indexes that follow a chunk
+    start_ns: int
+    end_ns: int
+    compression: str | None  # None: a run outside chunks
+    indexes: dict[int, int] = field(default_factory=dict)  # channel id to the offset of its MessageIndex record
+    counts: dict[int, int] | None = None  # messages per channel id, once known
+
+    def holds(self, channels: set[int]) -> bool:
+        """False when the block cannot hold a message of these channels."""
+        known = self.indexes or self.counts
+        return known is None or not channels.isdisjoint(known)
+
+
+class Source:
+    """The bytes of a file that is only ever read, with a refusal in place of a short read."""
+
+    def __init__(self, path: Path) -> None:
+        try:
+            self.file: BinaryIO = path.open("rb", buffering=0)
+            self.size = path.stat().st_size
+        except OSError as error:
+            raise ConfigError(f"cannot be opened ({error.strerror})", where=path, expected="an MCAP log") from error
+        self.path = path
+
+    def at(self, offset: int, length: int) -> bytes:
+        """Exactly these bytes.
+
+        Raises:
+            LogError: the file does not have them, or the disk does not give them.
+        """
+        try:
+            self.file.seek(offset)
+            parts = self.file.read(length)
+            while len(parts) < length and (part := self.file.read(length - len(parts))):
+                parts += part
+        except OSError as error:
+            raise LogError(f"cannot be read at byte {offset} ({error.strerror})") from error
+        if len(parts) != length:
+            raise LogError(f"the log is cut short at byte {offset + len(parts)}", fix=CUT_SHORT)
+        return parts
+
+    def head(self, offset: int) -> tuple[int, int]:
+        """Opcode and length of the record at an offset."""
+        opcode, length = HEAD.unpack(self.at(offset, HEAD.size))
+        return opcode, length
+
+
+class Structure:
+    """The chart of one log.
+
+    Raises:
+        LogError: empty, not an MCAP log, cut short, or damaged; the message says at which byte.
+    """
+
+    def __init__(self, source: Source) -> None:
+        self.source = source
+        self.schemas: dict[int, Schema] = {}
+        self.channels: dict[int, Channel] = {}
+        self.items: list[Block | Span] = []
+        self.statistics: Statistics | None = None
+        self.footer = self._ends()
+        index = self._summary()
+        self.data_end = self._chart(index)
+        self._complete()
+
+    @property
+    def blocks(self) -> list[Block]:
+        """Everything that holds messages, in file order."""
+        return [item for item in self.items if isinstance(item, Block)]
+
+    def counts(self) -> dict[int, int]:
+        """Messages per channel id."""
+        if self.statistics is not None:
+            return dict(self.statistics.channel_message_counts)
+        total: Counter[int] = Counter()
+        for block in self.blocks:
+            total.update(self._counts_of(block))
+        return dict(total)
+
+    def unpack(self, block: Block) -> records.Messages:
+        """The messages of a block, CRC checked.
+
+        Raises:
+            LogError: the block is damaged.
+        """
+        raw = self.source.at(block.offset, block.length)
+        return self.unpacked(block, raw)
+
+    def unpacked(self, block: Block, raw: bytes) -> records.Messages:
+        """The same, for a caller that has read the block's bytes already."""
+        if block.compression is None:
+            return records.messages(raw, block.offset)
+        opcode, length = HEAD.unpack_from(raw)
+        if opcode != Opcode.CHUNK or length != block.length - HEAD.size:
+            raise LogError(f"the summary says a chunk lies at byte {block.offset}, which it does not")
+        return records.messages(records.unpack(raw, block.offset), block.offset)
+
+    def index(self, block: Block, channel: int) -> UInt64[np.ndarray, "n 2"]:
+        """The (log time, offset) entries of one channel in one block, from its MessageIndex record.
+
+        Raises:
+            LogError: no such record where the log says it is.
+        """
+        offset = block.indexes[channel]
+        opcode, length = self.source.head(offset) if offset + HEAD.size <= block.end else (0, 0)
+        if opcode != Opcode.MESSAGE_INDEX or length < 6 or length > block.end - offset - HEAD.size:
+            raise LogError(f"the summary says a message index lies at byte {offset}, which it does not")
+        body = self.source.at(offset + HEAD.size, length)
+        identity, size = struct.unpack_from("<HI", body)
+        if identity != channel or size != length - 6 or size % 16:
+            raise LogError(f"the message index at byte {offset} is damaged")
+        return np.frombuffer(body, "<u8", offset=6).reshape(-1, 2)
+
+    # ── how the chart comes about ────────────────────────────────────────────────────────────────────────────────────
+
+    def _ends(self) -> Footer:
+        source = self.source
+        if source.size == 0:
+            raise LogError("the file is empty", expected="an MCAP log")
+        start = source.at(0, min(len(MAGIC), source.size))
+        if start != MAGIC[: len(start)]:
+            raise LogError(f"this is not an MCAP log: it starts with {start!r}", expected=repr(MAGIC))
+        at = source.size - len(MAGIC) - FOOTER_SIZE
+        if at < len(MAGIC) or source.at(source.size - len(MAGIC), len(MAGIC)) != MAGIC:
+            raise self._cut_short()
+        opcode, length = source.head(at)
+        if opcode != Opcode.FOOTER or length != FOOTER_SIZE - HEAD.size:
+            raise LogError(f"the footer at byte {at} is damaged", expected="a Footer record")
+        footer = records.parse(Footer, source.at(at + HEAD.size, length), at)
+        assert isinstance(footer, Footer), "parse returns the class it is given"
+        return footer
+
+    def _cut_short(self) -> LogError:
+        """Where a log without an end stops, found by following its records."""
+        position, size = len(MAGIC), self.source.size
+        inside = "inside its first record"
+        while size - position >= HEAD.size:
+            opcode, length = self.source.head(position)
+            if length > size - position - HEAD.size:
+                inside = f"inside the {records.name_of(opcode)} record that begins at byte {position}"
+                break
+            position += HEAD.size + length
+            inside = f"after the {records.name_of(opcode)} record that ends at byte {position}"
+        return LogError(f"the log is cut short at byte {size}, {inside}", expected="a log that ends", fix=CUT_SHORT)
+
+    def _summary(self) -> dict[int, ChunkIndex]:
+        """Definitions and statistics of the summary, and its chunk indexes by where their chunk begins."""
+        start, end = self.footer.summary_start, self.source.size - len(MAGIC) - FOOTER_SIZE
+        if start == 0:
+            return {}
+        if not len(MAGIC) <= start <= end:
+            raise LogError(f"the footer says the summary begins at byte {start}", expected=f"at most {end}")
+        raw = self.source.at(start, end - start + FOOTER_SIZE - 4)
+        if self.footer.summary_crc and zlib.crc32(raw) != self.footer.summary_crc:
+            raise LogError(f"the summary at byte {start} is damaged: its CRC is {zlib.crc32(raw):08x}")
+        position, stop, index = 0, end - start, {}
+        while position < stop:
+            opcode, length = HEAD.unpack_from(raw, position) if stop - position >= HEAD.size else (0, stop)
+            body = raw[position + HEAD.size : position + HEAD.size + length]
+            if length > stop - position - HEAD.size:
+                raise LogError(f"the summary is damaged at byte {start + position}: a record crosses its end")
+            if opcode == Opcode.CHUNK_INDEX:
+                entry = records.parse(ChunkIndex, body, start + position)
+                index[entry.chunk_start_offset] = entry
+            elif opcode == Opcode.STATISTICS:
+                self.statistics = records.parse(Statistics, body, start + position)
+            else:
+                self.define(opcode, body, start + position)
+            position += HEAD.size + length
+        return index
+
+    def define(self, opcode: int, body: bytes, offset: int) -> None:
+        """Takes in a Schema or Channel record; other records are left alone.
+
+        Raises:
+            LogError: damaged, or another definition under an id that is taken.
+        """
+        if opcode == Opcode.SCHEMA:
+            schema = records.parse(Schema, body, offset)
+            known = self.schemas.setdefault(schema.id, schema)
+            if (known.name, known.data) != (schema.name, schema.data):
+                raise LogError(f"schema {schema.id} is both {known.name} and, at byte {offset}, {schema.name}")
+        elif opcode == Opcode.CHANNEL:
+            channel = records.parse(Channel, body, offset)
+            taken = self.channels.setdefault(channel.id, channel)
+            if (taken.topic, taken.schema_id) != (channel.topic, channel.schema_id):
+                raise LogError(f"channel {channel.id} is both {taken.topic} and, at byte {offset}, {channel.topic}")
+
+    def _chart(self, index: dict[int, ChunkIndex]) -> int:
+        """Follows the data section; returns where its DataEnd record begins."""
+        source, position = self.source, len(MAGIC)
+        limit = self.footer.summary_start or source.size - len(MAGIC) - FOOTER_SIZE
+        opcode, length = source.head(position)
+        if opcode != Opcode.HEADER or length > limit - position - HEAD.size:
+            raise LogError(f"the record at byte {position} is {records.name_of(opcode)}", expected="a whole Header")
+        self.header: Header = records.parse(Header, source.at(position + HEAD.size, length), position)
+        position += HEAD.size + length
+        self.header_end = position
+        while position < limit:
+            if (known := index.get(position)) is not None:
+                block = _known(known, limit)
+                self.items.append(block)
+                position = block.end
+                continue
+            opcode, length = source.head(position) if limit - position >= HEAD.size else (0, limit)
+            if length > limit - position - HEAD.size:
+                raise LogError(
+                    f"the {records.name_of(opcode)} record at byte {position} is damaged: it says it has {length} bytes",
+                    expected=f"at most {max(0, limit - position - HEAD.size)}",
+                )
+            if opcode in (Opcode.DATA_END, Opcode.FOOTER):
+                return position
+            position = self._item(opcode, position, length, limit)
+        raise LogError(f"the data section does not end before byte {limit}", expected="a DataEnd record")
+
+    def _item(self, opcode: int, position: int, length: int, limit: int) -> int:
+        """Takes in one record of the data section, or one run of messages; returns where the next begins."""
+        whole = HEAD.size + length
+        if opcode == Opcode.CHUNK:
+            first = self.source.at(position, min(128, whole))
+            head = records.ChunkHead.of(first, whole, position)
+            self.items.append(
+                Block(position, whole, position + whole, head.start_ns, head.end_ns, head.compression, counts=None)
+            )
+        elif opcode == Opcode.MESSAGE:
+            return self._run(position, whole, limit)
+        elif opcode == Opcode.MESSAGE_INDEX and self.items and isinstance(self.items[-1], Block):
+            self._follow(self.items[-1], position, length)
+        else:
+            if opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
+                self.define(opcode, self.source.at(position + HEAD.size, length), position)
+            self.items.append(Span(opcode, position, whole))
+        return position + whole
+
+    def _follow(self, block: Block, position: int, length: int) -> None:
+        """A MessageIndex record behind its chunk."""
+        if length < 6 or block.compression is None:
+            raise LogError(f"the message index at byte {position} is damaged")
+        channel, size = struct.unpack("<HI", self.source.at(position + HEAD.size, 6))
+        block.end = position + HEAD.size + length
+        if size:
+            block.indexes[channel] = position
+
+    def _run(self, position: int, first: int, limit: int) -> int:
+        """A run of messages outside chunks, as one block."""
+        raw = self.source.at(position, max(first, min(RUN_BYTES, limit - position)))
+        _, _, end = records.scan(raw, bare=True)
+        found = records.messages(raw[:end], position)
+        times = found.times()
+        counts = Counter(found.heads["channel"].tolist())
+        self.items.append(Block(position, end, position + end, int(times.min()), int(times.max()), None, counts=dict(counts)))
+        return position + end
+
+    def _complete(self) -> None:
+        """Finds the definitions that only stand inside chunks, when the summary does not vouch for having them all."""
+        chunks = [block for block in self.blocks if block.compression is not None]
+        told = self.statistics
+        if told is None or (told.channel_count, told.schema_count) != (len(self.channels), len(self.schemas)):
+            for block in chunks:
+                if not block.indexes or not block.indexes.keys() <= self.channels.keys():
+                    self._learn(block)
+            for block in chunks:
+                if all(c.schema_id in self.schemas for c in self.channels.values() if c.schema_id):
+                    break
+                self._learn(block)
+        missing = {c for block in self.blocks for c in (block.indexes or block.counts or {})} - self.channels.keys()
+        if missing:
+            raise LogError(f"channel {min(missing)} has messages and no Channel record", expected="a definition")
+        for channel in self.channels.values():
+            if channel.schema_id and channel.schema_id not in self.schemas:
+                raise LogError(f"{channel.topic} has schema {channel.schema_id}, which no record defines")
+
+    def _learn(self, block: Block) -> None:
+        found = self.unpack(block)
+        block.counts = dict(Counter(found.heads["channel"].tolist()))
+        for opcode, first, length in found.definitions:
+            self.define(opcode, found.data[first : first + length].tobytes(), block.offset)
+
+    def _counts_of(self, block: Block) -> dict[int, int]:
+        if block.counts is None:
+            if block.indexes:
+                block.counts = {channel: len(self.index(block, channel)) for channel in block.indexes}
+            else:
+                self._learn(block)
+        assert block.counts is not None, "learning a block counts it"
+        return block.counts
+
+
+def _known(entry: ChunkIndex, limit: int) -> Block:
+    """A chunk as the summary describes it."""
+    offset, length = entry.chunk_start_offset, entry.chunk_length
+    end = offset + length + entry.message_index_length
+    if length < HEAD.size + records.CHUNK_HEAD.size or end > limit:
+        raise LogError(f"the summary says the chunk at byte {offset} ends at byte {end}", expected=f"at most {limit}")
+    indexes = dict(entry.message_index_offsets) if entry.message_index_length else {}
+    return Block(offset, length, end, entry.message_start_time, entry.message_end_time, entry.compression, indexes)

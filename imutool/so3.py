@@ -1,0 +1,240 @@
+"""Rotations on tensors: exponential, logarithm, Jacobians and quaternions, for any batch, in float32 and float64.
+
+Right convention throughout (`design.md`, Names): `R_wb` takes body vectors to world and dR/dt = R_wb [omega_b]x, hence
+d Exp(xi)/dt = Exp(xi) [J_r(xi) dxi/dt]x (Barfoot, State Estimation for Robotics, 2017, eq. 7.77a; Chirikjian 2012).
+
+Every function of the angle is written as a function of s = |xi|², which is analytic: no square root is differentiated
+at zero, so values and all derivatives are finite everywhere, xi = 0 included. Below `_SERIES[dtype].below` a Taylor
+series in s stands in for the closed form.
+
+Where the threshold comes from: the closed forms subtract nearly equal numbers. In the matrices the loss stays at one
+rounding (what is lost in the coefficient is multiplied by s), but their first derivative loses 1/angle and the second
+1/angle² roundings; at an angle of 0.5 that is 2 and 4. The series must reach there with a remainder under one rounding:
+the k-th term of the slowest one falls as (s / 4 pi²)^k, so 4 terms for float32 and 8 for float64, with one more each
+because a derivative costs one. So it is the number of terms that depends on the dtype. An angle of 1e-4 or less as
+threshold, as is common, is too small for float32: its derivatives are noise long before that. Both branches of every
+`torch.where` are fed arguments on which they are finite, so no NaN can leak through the branch not taken.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+Vectors = Float[Tensor, "*batch 3"]
+Rotations = Float[Tensor, "*batch 3 3"]
+Quaternions = Float[Tensor, "*batch 4"]
+Angles2 = Float[Tensor, "*batch"]
+
+
+class _Series(NamedTuple):
+    """Use the first `terms` of a Taylor series in the squared angle where that is under `below`."""
+
+    below: float
+    terms: int
+    atan_below: float  # the same for atan(r) / r, in r²
+    atan_terms: int
+
+
+_SERIES = {
+    torch.float32: _Series(below=0.25, terms=5, atan_below=1e-2, atan_terms=5),
+    torch.float64: _Series(below=0.25, terms=9, atan_below=1e-2, atan_terms=9),
+}
+
+# sin(x)/x, (1 - cos x)/x², (x - sin x)/x³ and 1/x² - cot(x/2)/(2x), each as a series in s = x².
+_SINC = (
+    1.0,
+    -1 / 6,
+    1 / 120,
+    -1 / 5040,
+    1 / 362880,
+    -1 / 39916800,
+    1 / 6227020800,
+    -1 / 1307674368000,
+    1 / 355687428096000,
+)
+_VERSINE = tuple(c / (2 * k + 2) for k, c in enumerate(_SINC))
+_DEFECT = tuple(c / ((2 * k + 2) * (2 * k + 3)) for k, c in enumerate(_SINC))
+_HALF_COT = (  # |B_2k+2| / (2k+2)!, Bernoulli numbers
+    1 / 12,
+    1 / 720,
+    1 / 30240,
+    1 / 1209600,
+    1 / 47900160,
+    691 / 1307674368000,
+    1 / 74724249600,
+    3617 / 10670622842880000,
+    43867 / 5109094217170944000,
+)
+_ATAN = tuple((-1) ** k / (2 * k + 1) for k in range(9))
+
+
+def hat(v: Vectors) -> Rotations:
+    """The skew matrix [v]x with [v]x a = v x a."""
+    x, y, z = v.unbind(-1)
+    zero = torch.zeros_like(x)
+    flat = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], dim=-1)
+    return flat.reshape(*v.shape[:-1], 3, 3)
+
+
+def vee(skew: Rotations) -> Vectors:
+    """The vector of a skew matrix; of any other matrix, that of its skew part."""
+    upper = torch.stack([skew[..., 2, 1], skew[..., 0, 2], skew[..., 1, 0]], dim=-1)
+    lower = torch.stack([skew[..., 1, 2], skew[..., 2, 0], skew[..., 0, 1]], dim=-1)
+    return 0.5 * (upper - lower)
+
+
+def exp(xi: Vectors) -> Rotations:
+    """The rotation Exp(xi) = I + sin(a)/a [xi]x + (1 - cos a)/a² [xi]x², a = |xi| (Rodrigues)."""
+    s = _squared(xi)
+    return _quadratic(xi, s, _sinc(s), _versine(s))
+
+
+def log(R: Rotations) -> Vectors:
+    """The rotation vector of R, 0 <= |xi| <= pi, accurate to a few roundings over the whole range.
+
+    Through the quaternion, whose vector part is well conditioned where the trace is not (near pi) and the other way
+    round. At exactly pi two opposite vectors are right and one of them is returned; approaching it from below the
+    derivative stays finite. R is taken to be a rotation: what is off the manifold is projected, not diagnosed.
+    """
+    q = quaternion_wxyz_from_matrix(R)
+    w, v = q[..., :1], q[..., 1:]
+    return 2.0 * _atan2_over(_squared(v).unsqueeze(-1), w) * v
+
+
+def right_jacobian(xi: Vectors) -> Rotations:
+    """J_r(xi) = I - (1 - cos a)/a² [xi]x + (a - sin a)/a³ [xi]x², which is the mean of Exp(-u xi) over u in [0, 1]."""
+    s = _squared(xi)
+    return _quadratic(xi, s, -_versine(s), _defect(s))
+
+
+def left_jacobian(xi: Vectors) -> Rotations:
+    """J_l(xi) = J_r(-xi) = J_r(xi)^T."""
+    s = _squared(xi)
+    return _quadratic(xi, s, _versine(s), _defect(s))
+
+
+def right_jacobian_inverse(xi: Vectors) -> Rotations:
+    """J_r^{-1}(xi) = I + [xi]x / 2 + (1/a² - cot(a/2) / (2a)) [xi]x², defined for |xi| < 2 pi.
+
+    It grows as 2 pi / (2 pi - |xi|) towards the edge, and is meaningless beyond it; `ode.integrate` watches for that.
+    """
+    s = _squared(xi)
+    return _quadratic(xi, s, torch.full_like(s, 0.5), _half_cot(s))
+
+
+def left_jacobian_inverse(xi: Vectors) -> Rotations:
+    """J_l^{-1}(xi) = J_r^{-1}(-xi), defined for |xi| < 2 pi."""
+    s = _squared(xi)
+    return _quadratic(xi, s, torch.full_like(s, -0.5), _half_cot(s))
+
+
+def chart_rate(xi: Vectors, omega_b: Vectors) -> Vectors:
+    """dxi/dt = J_r^{-1}(xi) omega_b (paper, eq. 15) without forming the matrix: what an integrator calls at each stage.
+
+    [xi]x² w = xi (xi . w) - s w, so one cross product is enough.
+    """
+    s, along = _squared(xi).unsqueeze(-1), (xi * omega_b).sum(dim=-1, keepdim=True)
+    half_turn: Tensor = 0.5 * torch.linalg.cross(xi, omega_b)
+    return omega_b + half_turn + _half_cot(s) * (xi * along - s * omega_b)
+
+
+def quaternion_wxyz_from_matrix(R: Rotations) -> Quaternions:
+    """The unit quaternion of a rotation, with w >= 0 (the shorter arc, and continuous up to half a turn).
+
+    4 q q^T is linear in R; its row with the largest diagonal is at least 2 long, so normalising it is safe and smooth
+    (the idea of Shepperd 1978, without his square roots).
+    """
+    outer = _quaternion_outer(R)
+    largest: Int[Tensor, "*batch"] = outer.diagonal(dim1=-2, dim2=-1).argmax(dim=-1)
+    row = outer.gather(-2, largest[..., None, None].expand(*largest.shape, 1, 4)).squeeze(-2)
+    unit = row / torch.linalg.vector_norm(row, dim=-1, keepdim=True)
+    return torch.where(unit[..., :1] < 0, -unit, unit)
+
+
+def matrix_from_quaternion_wxyz(q_wxyz: Quaternions) -> Rotations:
+    """The rotation of a quaternion, whose length does not matter but must not be zero."""
+    q: Tensor = q_wxyz / torch.linalg.vector_norm(q_wxyz, dim=-1, keepdim=True)
+    w, v = q[..., 0, None, None], q[..., 1:]
+    skew = hat(v)
+    return torch.eye(3, dtype=q.dtype, device=q.device) + 2.0 * w * skew + 2.0 * (skew @ skew)
+
+
+def _quadratic(xi: Vectors, s: Angles2, linear: Angles2, square: Angles2) -> Rotations:
+    """I + linear [xi]x + square [xi]x², with [xi]x² = xi xi^T - s I."""
+    eye = torch.eye(3, dtype=xi.dtype, device=xi.device)
+    outer = xi.unsqueeze(-1) * xi.unsqueeze(-2)
+    return (1.0 - square * s)[..., None, None] * eye + linear[..., None, None] * hat(xi) + square[..., None, None] * outer
+
+
+def _squared(v: Float[Tensor, "*batch n"]) -> Angles2:
+    return (v * v).sum(dim=-1)
+
+
+def _series_of(dtype: torch.dtype) -> _Series:
+    if dtype not in _SERIES:
+        raise TypeError(f"rotations are computed in float32 or float64, not {dtype}")
+    return _SERIES[dtype]
+
+
+def _horner(coefficients: tuple[float, ...], s: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
+    value = torch.full_like(s, coefficients[-1])
+    for coefficient in reversed(coefficients[:-1]):
+        value = value * s + coefficient
+    return value
+
+
+def _branches(s: Angles2, coefficients: tuple[float, ...]) -> tuple[Bool[Tensor, "*batch"], Angles2, Angles2]:
+    """Where to use the series, its value, and an angle for the closed form that is never small."""
+    series = _series_of(s.dtype)
+    small = s < series.below
+    value = _horner(coefficients[: series.terms], torch.where(small, s, torch.zeros_like(s)))
+    return small, value, torch.where(small, torch.ones_like(s), s).sqrt()
+
+
+def _sinc(s: Angles2) -> Angles2:
+    small, value, angle = _branches(s, _SINC)
+    return torch.where(small, value, angle.sin() / angle)
+
+
+def _versine(s: Angles2) -> Angles2:
+    small, value, angle = _branches(s, _VERSINE)
+    half = 0.5 * angle
+    return torch.where(small, value, 0.5 * (half.sin() / half).square())
+
+
+def _defect(s: Angles2) -> Angles2:
+    small, value, angle = _branches(s, _DEFECT)
+    return torch.where(small, value, (angle - angle.sin()) / angle**3)
+
+
+def _half_cot(s: Angles2) -> Angles2:
+    small, value, angle = _branches(s, _HALF_COT)
+    half = 0.5 * angle
+    return torch.where(small, value, (1.0 - half * half.cos() / half.sin()) / angle.square())
+
+
+def _atan2_over(n2: Float[Tensor, "*batch"], w: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
+    """atan2(n, w) / n from n² and w >= 0; for small n / w as (1 / w) (1 - r²/3 + r⁴/5 - ...)."""
+    series = _series_of(n2.dtype)
+    small = n2 < series.atan_below * w.square()
+    one = torch.ones_like(n2)
+    w_small = torch.where(small, w, one)
+    ratio2 = torch.where(small, n2, torch.zeros_like(n2)) / w_small.square()
+    n = torch.where(small, one, n2).sqrt()
+    return torch.where(small, _horner(_ATAN[: series.atan_terms], ratio2) / w_small, torch.atan2(n, w) / n)
+
+
+def _quaternion_outer(R: Rotations) -> Float[Tensor, "*batch 4 4"]:
+    """4 q q^T, component order wxyz."""
+    (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = (row.unbind(-1) for row in R.unbind(-2))
+    rows = [
+        torch.stack([1 + xx + yy + zz, zy - yz, xz - zx, yx - xy], dim=-1),
+        torch.stack([zy - yz, 1 + xx - yy - zz, xy + yx, xz + zx], dim=-1),
+        torch.stack([xz - zx, xy + yx, 1 - xx + yy - zz, yz + zy], dim=-1),
+        torch.stack([yx - xy, xz + zx, yz + zy, 1 - xx - yy + zz], dim=-1),
+    ]
+    return torch.stack(rows, dim=-2)

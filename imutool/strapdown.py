@@ -1,0 +1,180 @@
+"""Pure inertial integration at the IMU's own stamps, and the velocity of a truth that has only poses; numpy, no torch.
+
+The rule is the paper's Euler step, each sample held until the next::
+
+    R_{k+1} = R_k Exp(gyro_k dt_k)
+    v_{k+1} = v_k + (R_k accel_k + g_w) dt_k          dt_k = t_{k+1} - t_k
+    p_{k+1} = p_k + v_k dt_k
+
+so the last sample is not used, and sample k of the answer depends on samples before k only.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float64
+
+from imutool.errors import DataError, NumericsError
+from imutool.recording import GAP_FACTOR, GRAVITY_M_S2, MIN_GAP_S, Imu, Poses, seconds
+
+GRAVITY_W = (0.0, 0.0, -GRAVITY_M_S2)
+VELOCITY_WINDOW_S = 0.2
+VELOCITY_ORDER = 3
+SAMPLES_PER_COEFFICIENT = 3  # a stretch shorter than the window gets a lower order rather than its own noise
+
+Vectors = Float64[np.ndarray, "n 3"]
+Quaternions = Float64[np.ndarray, "n 4"]
+
+
+class Start(NamedTuple):
+    """Where an integration begins: orientation (body to world), position in m, world velocity in m/s."""
+
+    q_wb_wxyz: Float64[np.ndarray, "4"]
+    p_wb: Float64[np.ndarray, "3"]
+    v_w: Float64[np.ndarray, "3"]
+
+    @classmethod
+    def of(cls, poses: Poses, row: int = 0) -> Start:
+        """The start at one row of a trajectory.
+
+        Raises:
+            DataError: the trajectory has no velocity (`truth_velocity` derives one), or no such row.
+        """
+        if not -len(poses) <= row < len(poses):
+            raise DataError(f"no row {row} among {len(poses)} poses", expected="a pose to start from")
+        if poses.v_w is None:
+            raise DataError(
+                "the poses carry no velocity", expected="v_w", fix="Derive it with strapdown.truth_velocity"
+            )
+        return cls(poses.q_wb_wxyz[row], poses.p_wb[row], poses.v_w[row])
+
+
+def dead_reckon(
+    imu: Imu,
+    start: tuple[Float64[np.ndarray, "4"], Float64[np.ndarray, "3"], Float64[np.ndarray, "3"]],
+    g_w: tuple[float, float, float] = GRAVITY_W,
+) -> Poses:
+    """The trajectory that the IMU alone gives, at every one of its stamps, the first being `start` (a `Start`).
+
+    Rotations are a prefix product of quaternions in log depth, velocity and position cumulative sums; the rounding
+    grows with the logarithm of the length. 30 000 samples take about 10 ms.
+
+    Raises:
+        DataError: no samples.
+        NumericsError: the numbers overflow.
+    """
+    if not len(imu):
+        raise DataError("the IMU has no samples", expected="at least one")
+    q_0, p_0, v_0 = (np.asarray(part, dtype=np.float64) for part in start)
+    t = seconds(imu.t_ns, int(imu.t_ns[0]))
+    dt = np.diff(t)[:, None]
+    with np.errstate(over="ignore", invalid="ignore"):  # overflow is reported below, with its row
+        steps = _rotation_vector_to_quaternion(imu.gyro[:-1] * dt)
+        q_wb = _normalise(_prefix_product(np.concatenate([_normalise(q_0[None]), steps])))
+        a_w = _rotate(q_wb[:-1], imu.accel[:-1]) + np.asarray(g_w, dtype=np.float64)
+        v_w = np.cumsum(np.concatenate([v_0[None], a_w * dt]), axis=0)
+        p_wb = np.cumsum(np.concatenate([p_0[None], v_w[:-1] * dt]), axis=0)
+    finite = np.isfinite(np.concatenate([q_wb, v_w, p_wb], axis=1)).all(axis=1)
+    if not finite.all():
+        row = int(np.argmin(finite))
+        raise NumericsError(
+            f"integration overflows at sample {row}",
+            expected="rates and forces of a moving body",
+            fix="Look at gyro and accel just before that sample",
+        )
+    return Poses(imu.t_ns, p_wb, q_wb, v_w)
+
+
+def truth_velocity(
+    poses: Poses,
+    window_s: float = VELOCITY_WINDOW_S,
+    order: int = VELOCITY_ORDER,
+    max_gap_s: float | None = None,
+) -> Vectors:
+    """World velocity (m/s) at every pose, from positions: a Savitzky-Golay derivative on the poses' own stamps.
+
+    Recipe: around each pose the `window_s` worth of poses (an odd number m, by the median period, over `order`) is
+    fitted by a polynomial of degree `order` in time, by least squares on the true stamps, and its slope taken. On an
+    even clock this is `scipy.signal.savgol_filter(p, m, order, deriv=1, delta=period, mode="interp")`; jitter does no
+    harm. Windows never cross a gap longer than `max_gap_s` (default as in `Poses.at`: four median periods, at least
+    80 ms); near the ends of a stretch they stay inside and the slope is taken off their centre. A stretch shorter than
+    the window lowers the order to keep three poses per coefficient, at least 1; a pose alone between two gaps gets the
+    slope between its neighbours, the only thing known about it.
+
+    0.2 s and order 3 agree best with the accelerometer over a quarter second on TUM-VI (median 10 mm/s on room2 against
+    15 for 0.1 s and order 5) and FETCH; on EuRoC, which brings its own velocity, they are within 6-8 mm/s of that.
+
+    Raises:
+        DataError: fewer than two poses.
+    """
+    period_s = poses.period_s
+    gap_s = max(GAP_FACTOR * period_s, MIN_GAP_S) if max_gap_s is None else max_gap_s
+    t = seconds(poses.t_ns, int(poses.t_ns[0]))
+    window = max(2 * round(window_s / period_s / 2) + 1, order + 1 + order % 2)
+    breaks = np.flatnonzero(np.diff(t) > gap_s) + 1
+    v_w = np.empty_like(poses.p_wb)
+    for rows in np.split(np.arange(len(t)), breaks):
+        first, after = int(rows[0]), int(rows[-1]) + 1
+        if len(rows) == 1:
+            around = slice(max(first - 1, 0), min(first + 2, len(t)))
+            v_w[rows] = (poses.p_wb[around][-1] - poses.p_wb[around][0]) / (t[around][-1] - t[around][0])
+        else:
+            v_w[first:after] = _slopes(t[first:after], poses.p_wb[first:after], window, order)
+    return v_w
+
+
+def _slopes(t: Float64[np.ndarray, " n"], p: Vectors, window: int, order: int) -> Vectors:
+    """Slopes of moving least-squares polynomials over one stretch without gaps."""
+    n = len(t)
+    if n < window:
+        window, order = n, min(order, max(1, n // SAMPLES_PER_COEFFICIENT - 1))
+    first = np.clip(np.arange(n) - window // 2, 0, n - window)
+    rows = first[:, None] + np.arange(window)
+    span = t[rows[:, -1]] - t[rows[:, 0]]
+    u = (t[rows] - t[:, None]) / span[:, None]  # about the pose itself, so the slope is one coefficient
+    basis = np.stack([u**power for power in range(order + 1)], axis=-1)
+    weights = np.linalg.pinv(basis)[:, 1, :] / span[:, None]
+    slopes: Vectors = np.einsum("nm,nmk->nk", weights, p[rows])
+    return slopes
+
+
+def _prefix_product(q: Quaternions) -> Quaternions:
+    """q_0, q_0 q_1, q_0 q_1 q_2, ...: pairs are multiplied, their prefixes found likewise, the even ones filled in."""
+    if len(q) == 1:
+        return q
+    pairs = _prefix_product(_multiply(q[: len(q) // 2 * 2 : 2], q[1::2]))
+    out = np.empty_like(q)
+    out[0], out[1::2] = q[0], pairs
+    out[2::2] = _multiply(pairs[: (len(q) - 1) // 2], q[2::2])
+    return out
+
+
+def _multiply(a: Quaternions, b: Quaternions) -> Quaternions:
+    """Hamilton product, wxyz."""
+    aw, ax, ay, az = a.T
+    bw, bx, by, bz = b.T
+    out = np.empty((len(a), 4))
+    out[:, 0] = aw * bw - ax * bx - ay * by - az * bz
+    out[:, 1] = aw * bx + ax * bw + ay * bz - az * by
+    out[:, 2] = aw * by - ax * bz + ay * bw + az * bx
+    out[:, 3] = aw * bz + ax * by - ay * bx + az * bw
+    return out
+
+
+def _normalise(q: Quaternions) -> Quaternions:
+    unit: Quaternions = q / np.linalg.norm(q, axis=1, keepdims=True)
+    return unit
+
+
+def _rotation_vector_to_quaternion(xi: Vectors) -> Quaternions:
+    angle = np.linalg.norm(xi, axis=1, keepdims=True)
+    return np.concatenate([np.cos(0.5 * angle), 0.5 * np.sinc(angle / (2 * np.pi)) * xi], axis=1)
+
+
+def _rotate(q: Quaternions, v: Vectors) -> Vectors:
+    """R(q) v = v + 2 w (u x v) + 2 u x (u x v)."""
+    u = q[:, 1:]
+    turn = np.cross(u, v)
+    return v + 2.0 * (q[:, :1] * turn + np.cross(u, turn))

@@ -1,0 +1,174 @@
+"""The rest bias a run starts from: measured at rest or from the truth, weighed against what the sensor's other runs had.
+
+Every way gives a value and how sure it is; a measurement and the prior are combined by their variances, axis by axis (for a
+measurement along one direction, as a Kalman update). With a model that adds a motion-dependent part C(u), what is
+measured is what is left of the samples after that part.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from jaxtyping import Float64
+from torch import Tensor
+
+from imutool import so3
+from imutool.bias._base import BiasModel, Segment, Vector6
+from imutool.errors import ConfigError, DataError
+from imutool.recording import GRAVITY_M_S2, Imu, Recording, nanoseconds, seconds
+from imutool.stationary import stretches
+from imutool.strapdown import GRAVITY_W, truth_velocity
+from imutool.windows import attitudes, rotation_residual, velocity_residual
+
+TRUTH_S = 5.0  # how much of the truth a start takes: longer is surer, but less of a start
+AT_REST_STD = np.array([1e-4] * 3 + [0.03] * 3)  # earth's rotation; local gravity and what a tilt hides
+REST_BEGINS_WITHIN_S = 5.0  # later, its bias would be one of the future
+ITERATIONS = 4
+
+WAYS = ("auto", "stationary", "prior", "truth")
+
+
+@dataclass(frozen=True)
+class TurnOn:
+    """A rest bias (gyro rad/s, accel m/s²), its standard deviation, and how it came about in a few words."""
+
+    rest: Vector6
+    std: Vector6
+    how: str
+
+
+def find(way: str, model: BiasModel, recording: Recording) -> TurnOn:
+    """The start that `--init WAY` asks for; `auto` is the first seconds at rest where there are any, else the prior.
+
+    Raises:
+        ConfigError: an unknown way, or six numbers that are none.
+        DataError: `stationary` on a log that does not start at rest, `truth` without truth at its start, or `auto` with an
+            untrained model and no stationary stretch.
+    """
+    if way == "prior":
+        return prior(model)
+    if way == "truth":
+        return from_truth(model, recording)
+    if way == "stationary":
+        return at_rest(model, recording.imu)
+    if way == "auto":
+        try:
+            return at_rest(model, recording.imu)
+        except DataError:
+            if not model.card:
+                raise
+            return prior(model)
+    return given(way)
+
+
+def given(text: str) -> TurnOn:
+    """Six numbers from the command line: gx,gy,gz in rad/s, ax,ay,az in m/s².
+
+    Raises:
+        ConfigError: not six finite numbers, and not one of the ways either.
+    """
+    try:
+        rest = np.array([float(word) for word in text.split(",")])
+    except ValueError:
+        rest = np.zeros(0)
+    if rest.shape != (6,) or not np.isfinite(rest).all():
+        raise ConfigError(f"{text!r}", where="--init", expected=f"{', '.join(WAYS)} or gx,gy,gz,ax,ay,az")
+    return TurnOn(rest, np.zeros(6), "given")
+
+
+def prior(model: BiasModel) -> TurnOn:
+    """What the sensor had in its training runs."""
+    return TurnOn(_numpy(model.prior_mean), _numpy(model.prior_std), "prior of the training runs")
+
+
+def at_rest(model: BiasModel, imu: Imu) -> TurnOn:
+    """From the stretch at rest that the log starts with: true rate zero, specific force g along where it points.
+
+    The accelerometer's bias is seen only along gravity as long as the attitude is unknown; across it the prior stands.
+
+    Raises:
+        DataError: there is none.
+    """
+    starts_by = np.searchsorted(imu.t_ns, imu.t_ns[0] + nanoseconds(REST_BEGINS_WITHIN_S)) if len(imu) else 0
+    found = [stretch for stretch in stretches(imu) if stretch[0] <= starts_by]
+    if not found:
+        raise DataError(
+            "the log does not start at rest",
+            expected=f"one second or more without motion in the first {REST_BEGINS_WITHIN_S:g} s",
+            fix="Give --init prior with a trained model, or six numbers",
+        )
+    first, last = found[0]
+    still = imu.rows(slice(first, last))
+    left = np.concatenate([still.gyro, still.accel], axis=1) - _bias(model, still, _numpy(model.prior_mean))
+    start = prior(model)
+    rest, var = start.rest.copy(), start.std**2
+    mean, spread = left.mean(axis=0), left.std(axis=0) / np.sqrt(len(left))
+    gyro_var = AT_REST_STD[:3] ** 2 + spread[:3] ** 2
+    gain = var[:3] / (var[:3] + gyro_var)
+    rest[:3] += gain * mean[:3]
+    var[:3] *= 1 - gain
+    force = mean[3:] - 0.0
+    size = np.linalg.norm(force)
+    up = force / size
+    gain_accel = var[3:] * up / (up @ (var[3:] * up) + AT_REST_STD[3] ** 2)
+    rest[3:] += gain_accel * (size - GRAVITY_M_S2)
+    var[3:] *= 1 - gain_accel * up
+    at = seconds(imu.t_ns[[first, last - 1]], int(imu.t_ns[0]))
+    return TurnOn(rest, np.sqrt(var), f"at rest from {at[0]:.1f} to {at[1]:.1f} s")
+
+
+def from_truth(model: BiasModel, recording: Recording) -> TurnOn:
+    """From the first `TRUTH_S` of true poses (gaps in between do no harm: only the ends are used), and the prior.
+
+    Raises:
+        DataError: no truth, or none that reaches that far.
+    """
+    both = recording.overlap()
+    imu, truth = both.imu, both.truth
+    if truth.v_w is None:
+        truth = replace(truth, v_w=truth_velocity(truth))
+    poses, trusted = truth.at(imu.t_ns)
+    t = seconds(imu.t_ns, int(imu.t_ns[0]))
+    usable = np.flatnonzero(trusted)
+    ends = usable[t[usable] >= t[usable[0]] + TRUTH_S] if len(usable) else usable
+    if not len(ends):
+        raise DataError(f"less than {TRUTH_S:g} s of truth", where=recording.name, expected="truth at the start")
+    first, last = int(usable[0]), int(ends[0])
+    piece = imu.rows(slice(first, last + 1))
+    assert poses.v_w is not None
+    R = so3.matrix_from_quaternion_wxyz(torch.from_numpy(np.array(poses.q_wb_wxyz[[first, last]])))
+    dv = torch.from_numpy(poses.v_w[last] - poses.v_w[first])[None]
+    dt = torch.from_numpy(np.diff(t[first : last + 1]))[None]
+    start = prior(model)
+    offset = _solve_offset(piece, _bias(model, piece, start.rest), R[:1], R[1:], dv, dt)
+    var, measured = start.std**2, _numpy(model.truth_std) ** 2
+    gain = var / (var + measured)
+    how = f"truth over {t[last] - t[first]:.1f} s, weighed against the training runs" if model.card else "truth"
+    return TurnOn(start.rest + gain * offset, np.sqrt(var * (1 - gain)), how)
+
+
+def _solve_offset(
+    imu: Imu, bias: Float64[np.ndarray, "n 6"], R_start: Tensor, R_end: Tensor, dv: Tensor, dt: Tensor
+) -> Vector6:
+    """The constant that, taken off on top of `bias`, makes rotation and velocity end where the truth does."""
+    rate, force = (torch.from_numpy(u)[None] for u in (imu.gyro - bias[:, :3], imu.accel - bias[:, 3:]))
+    offset = torch.zeros(2, 3, dtype=torch.float64)
+    for _ in range(ITERATIONS):
+        e, A = rotation_residual(rate - offset[0], dt, R_start.mT @ R_end)
+        offset[0] -= torch.linalg.solve(A.sum(1), e)[0]
+    R_wb = attitudes(R_start, rate - offset[0], dt)
+    e, A = velocity_residual(force, dt, R_wb, dv, torch.tensor(GRAVITY_W, dtype=torch.float64))
+    offset[1] -= torch.linalg.solve(A.sum(1), e)[0]
+    return offset.flatten().numpy()
+
+
+def _bias(model: BiasModel, imu: Imu, rest: Vector6) -> Float64[np.ndarray, "n 6"]:
+    """The model's bias over some samples from a rest bias."""
+    return model.stream(rest)(seconds(imu.t_ns, int(imu.t_ns[0])), imu.gyro, imu.accel)
+
+
+def _numpy(buffer: Tensor) -> Vector6:
+    value: Vector6 = buffer.detach().cpu().double().numpy().copy()
+    return value

@@ -1,0 +1,399 @@
+"""Logs of other writers, in every layout and encoding; and logs that must be refused, with a reason."""
+
+from __future__ import annotations
+
+import logging
+import random
+import shutil
+import tracemalloc
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from imutool.errors import ConfigError, LogError
+from imutool.mcap_io import schema
+from imutool.mcap_io.read import DERIVED_KEY, VELOCITY_KEY, Log, read
+from imutool.mcap_io.structure import Structure
+from imutool.mcap_io.write import LogWriter, Series, chunks, write
+from imutool.recording import Imu, Recording
+
+START_NS = 1_403_638_128_245_096_960
+Message = tuple[str, str, int, int, int, bytes]
+Foreign = Callable[..., Path]
+Make = Callable[..., bytes]
+
+
+def imu_messages(make: Make, topic: str = "/imu", count: int = 20, **options: Any) -> list[Message]:
+    values = np.arange(3.0 * count).reshape(count, 3)
+    stamps = [START_NS + 10_000_000 * i for i in range(count)]
+    return [(topic, schema.IMU, t, t, i, make(schema.IMU, t, values[i], -values[i], **options)) for i, t in enumerate(stamps)]
+
+
+def poses(make: Make, topic: str, kind: str = schema.POSE, count: int = 5, **options: Any) -> list[Message]:
+    q = np.array([0.5, -0.5, 0.5, 0.5])
+    each = [(START_NS + 10_000_000 * i + 3, np.array([i, 2.0, 3.0])) for i in range(count)]
+    return [(topic, kind, t, t, i, make(kind, t, p, q, **options)) for i, (t, p) in enumerate(each)]
+
+
+def test_every_layout_reads_the_same(foreign: Foreign, flight: list[Message], layout: str) -> None:
+    path = foreign(flight, layout, metadata={"vehicle": {"id": "7"}}, attachments=(b"a" * 70_000, b""))
+    with Log(path) as log:
+        assert {t.name: t.count for t in log.topics.values()} == {"/imu/data": 900, "/mocap": 100, "/height": 180}
+        assert (log.profile, log.imu_topics, log.pose_topics) == ("ros2", ["/imu/data"], ["/mocap"])
+        assert log.topics["/imu/data"].schema_encoding == "ros2msg"
+        assert log.topics["/imu/data"].metadata == {"frame": "x"}
+        assert log.metadata() == {"vehicle": {"id": "7"}}
+        batches = list(log.imu_batches("/imu/data"))
+        mine = [message for message in flight if message[0] == "/imu/data"]
+        assert np.concatenate(list(log.stamps("/imu/data"))).tolist() == [m[2] for m in mine]
+        assert np.concatenate([b.log_time for b in batches]).tolist() == [m[2] for m in mine]
+        assert np.concatenate([b.publish_time for b in batches]).tolist() == [m[3] for m in mine]
+        assert np.concatenate([b.sequence for b in batches]).tolist() == [m[4] for m in mine]
+        assert {b.frame_id for b in batches} == {"imu"}
+        expected = np.concatenate([schema.decode_imu(np.frombuffer(m[5], np.uint8)[None]).gyro for m in mine])
+        assert np.concatenate([b.gyro for b in batches]).tobytes() == expected.tobytes()
+        assert sum(len(b.stamp_ns) for b in log.pose_batches("/mocap")) == 100
+        assert sum(len(b.stamp_ns) for b in log.scalar_batches("/height")) == 180
+    recording = read(path)
+    assert (recording.name, recording.imu_topic, recording.source) == ("foreign", "/imu/data", "")
+    assert recording.imu.gyro.tobytes() == expected.tobytes()
+    assert list(recording.truths) == ["/mocap"]
+    assert len(recording.scalars["/height"]) == 180
+    assert recording.metadata == {"vehicle": {"id": "7"}}
+
+
+def test_time_of_a_recording_is_the_stamp_and_selection_is_by_log_time(foreign: Foreign, flight: list[Message]) -> None:
+    path = foreign(flight)
+    imu = [message for message in flight if message[0] == "/imu/data"]
+    recording = read(path, start_ns=imu[100][2], end_ns=imu[199][2])
+    assert recording.imu.t_ns.tolist() == [START_NS + 5_000_000 * i for i in range(100, 200)]
+
+
+@pytest.mark.parametrize("kind", [schema.POSE, schema.ODOMETRY, schema.TRANSFORM])
+def test_truth_comes_from_any_pose_message(foreign: Foreign, make: Make, kind: str) -> None:
+    recording = read(foreign(imu_messages(make) + poses(make, "/odom", kind)))
+    truth = recording.truths["/odom"]
+    assert truth.p_wb[:, 0].tolist() == [0, 1, 2, 3, 4]
+    assert truth.q_wb_wxyz[0].tolist() == [0.5, -0.5, 0.5, 0.5]
+    assert truth.v_w is None
+
+
+def tree(make: Make, children: list[str], count: int = 4) -> list[Message]:
+    q = np.array([1.0, 0, 0, 0])
+    return [
+        ("/tf", schema.TF, t, t, 0, make(schema.TF, t, *[(np.array([k, 0.0, 0]), q, c) for k, c in enumerate(children)]))
+        for t in (START_NS + 1 + i for i in range(count))
+    ]
+
+
+def test_transforms_are_truths_by_child_frame_only_without_a_pose_topic(foreign: Foreign, make: Make) -> None:
+    several = foreign(imu_messages(make) + tree(make, ["base", "/arm"]), name="several")
+    recording = read(several)
+    assert list(recording.truths) == ["/tf/base", "/tf/arm"]
+    assert recording.truths["/tf/arm"].p_wb[:, 0].tolist() == [1, 1, 1, 1]
+    assert list(read(several, truth="/tf/arm").truths) == ["/tf/arm"]
+    with pytest.raises(LogError, match=r"/tf has 2 child frames.*/tf/base, /tf/arm"):
+        read(several, truth="/tf")
+    with pytest.raises(LogError, match=r"no poses on /tf/leg.*/tf/base, /tf/arm"):
+        read(several, truth="/tf/leg")
+    both = foreign(imu_messages(make) + poses(make, "/mocap") + tree(make, ["base"]), name="both")
+    assert list(read(both).truths) == ["/mocap"]
+    assert list(read(both, truth="/tf").truths) == ["/tf/base"]
+
+
+def test_ros1_messages_in_mcap_read_as_ros2_ones_do(foreign: Foreign, make: Make) -> None:
+    messages = imu_messages(make, ros1=True) + poses(make, "/vicon", schema.TRANSFORM, ros1=True)
+    path = foreign(messages, ros1=True)
+    twin = foreign(imu_messages(make) + poses(make, "/vicon", schema.TRANSFORM), name="twin")
+    with Log(path) as log:
+        assert (log.profile, log.imu_topics) == ("ros1", ["/imu"])
+        topic = log.topics["/imu"]
+        assert (topic.schema_name, topic.schema_encoding, topic.message_encoding) == (schema.IMU, "ros1msg", "ros1")
+    assert read(path).imu == read(twin).imu
+    assert read(path).truths == read(twin).truths
+
+
+def test_quaternions_off_by_more_than_a_recording_takes_are_made_unit(foreign: Foreign, make: Make) -> None:
+    q = [np.array([0.5, 0.5, 0.5, 0.5]) * (1 + e) for e in (0, 9e-7, 1e-4)]
+    messages = [
+        ("/p", schema.POSE, START_NS + i, START_NS + i, i, make(schema.POSE, START_NS + i, np.zeros(3), q[i])) for i in range(3)
+    ]
+    truth = read(foreign(imu_messages(make) + messages)).truths["/p"]
+    assert truth.q_wb_wxyz[:2].tobytes() == np.array(q[:2]).tobytes()
+    assert np.linalg.norm(truth.q_wb_wxyz[2]) == pytest.approx(1.0, abs=1e-15)
+    zero = ("/p", schema.POSE, START_NS + 9, 0, 9, make(schema.POSE, START_NS + 9, np.zeros(3), np.zeros(4)))
+    with pytest.raises(LogError, match=r"/p: quaternion \[0.0, 0.0, 0.0, 0.0\] in row 3"):
+        read(foreign([*imu_messages(make), *messages, zero], name="zero"))
+
+
+def test_our_own_derived_channels_are_no_imus_but_can_be_named(recording: Recording, tmp_path: Path) -> None:
+    path = tmp_path / "log.mcap"
+    imu = recording.imu
+    with LogWriter(path) as log:
+        for topic, metadata, gyro in (("/imu0", {}, imu.gyro), ("/imu0/debiased", {DERIVED_KEY: "/imu0"}, imu.gyro + 1)):
+            channel = log.channel(topic, schema.IMU, metadata)
+            series = Series(channel, imu.t_ns, (imu.t_ns, gyro, imu.accel), lambda t, g, a: schema.encode_imu(t, g, a, "b"))
+            for chunk in chunks([series]):
+                log.chunk(chunk)
+    assert read(path).imu == imu
+    assert np.array_equal(read(path, imu="/imu0/debiased").imu.gyro, imu.gyro + 1)
+
+
+def test_frames_that_change_within_a_topic_come_as_batches_of_their_own(foreign: Foreign, make: Make) -> None:
+    messages = imu_messages(make)
+    other = imu_messages(make, frames=("c", ""))
+    messages[5], messages[6] = other[5], other[6]
+    with Log(foreign(messages)) as log:
+        batches = list(log.imu_batches("/imu"))
+    assert [(b.frame_id, len(b.stamp_ns)) for b in batches] == [("a", 5), ("c", 2), ("a", 13)]
+
+
+def test_scalars_a_recording_cannot_hold_are_left_out_and_named(
+    foreign: Foreign, make: Make, caplog: pytest.LogCaptureFixture
+) -> None:
+    values = [1.0, float("nan"), 2.0]
+    bad = [("/battery", schema.FLOAT, START_NS + i, START_NS + i, i, make(schema.FLOAT, 0, v)) for i, v in enumerate(values)]
+    good = [("/height", schema.FLOAT, START_NS + i, START_NS + i, i, make(schema.FLOAT, 0, 1.0)) for i in range(3)]
+    with caplog.at_level(logging.WARNING):
+        recording = read(foreign(imu_messages(make) + bad + good))
+    assert list(recording.scalars) == ["/height"]
+    assert "/battery is left out: message 1 has values [nan]" in caplog.text
+
+
+# ── memory and what is not done ──────────────────────────────────────────────────────────────────────────────────────
+
+
+@pytest.fixture(scope="module")
+def long_log(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Forty chunks of IMU messages, 14 MB unpacked."""
+    rng = np.random.default_rng(0)
+    count = 120_000
+    imu = Imu(START_NS + 1_000_000 * np.arange(count), rng.normal(size=(count, 3)), rng.normal(size=(count, 3)))
+    path = tmp_path_factory.mktemp("long") / "log.mcap"
+    write(Recording("long", imu), path)
+    return path
+
+
+def test_reading_holds_one_chunk_and_batches_keep_no_chunk_alive(long_log: Path) -> None:
+    chunk = 1 << 20
+    with Log(long_log) as log:
+        tracemalloc.start()
+        try:
+            for _ in log.imu_batches("/imu0"):
+                pass
+            assert tracemalloc.get_traced_memory()[1] < 8 * chunk  # 43 MB unpacked in all
+            kept = list(log.imu_batches("/imu0"))
+            own = sum(column.nbytes for batch in kept for column in batch[:-1])
+            assert tracemalloc.get_traced_memory()[0] < 1.1 * own + chunk
+        finally:
+            tracemalloc.stop()
+
+
+def test_stamps_come_from_the_indexes_and_unpack_nothing(long_log: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(self: Structure, *_: object) -> None:
+        raise AssertionError("a chunk was unpacked")
+
+    monkeypatch.setattr(Structure, "unpack", refuse)
+    with Log(long_log) as log:
+        stamps = np.concatenate(list(log.stamps("/imu0")))
+    assert np.array_equal(stamps, START_NS + 1_000_000 * np.arange(120_000))
+
+
+def test_chunks_of_other_topics_are_not_unpacked(recording: Recording, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "log.mcap"
+    write(recording, path)
+    unpack, seen = Structure.unpack, []
+    monkeypatch.setattr(Structure, "unpack", lambda self, block: (seen.append(block), unpack(self, block))[1])
+    with Log(path) as log:
+        blocks = log.structure.blocks
+        (imu,) = log.channel_ids("/imu0")
+        for _ in log.imu_batches("/imu0"):
+            pass
+    assert seen == [block for block in blocks if imu in block.indexes]
+    assert 1 < len(seen) < len(blocks)
+
+
+# ── refusals ─────────────────────────────────────────────────────────────────────────────────────────────────────────
+
+
+def test_a_missing_file_and_a_folder_are_named(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"nothing.mcap: cannot be opened \(No such file"):
+        read(tmp_path / "nothing.mcap")
+    with pytest.raises(ConfigError, match="cannot be opened"):
+        read(tmp_path)
+
+
+def test_an_empty_file_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "empty.mcap"
+    path.touch()
+    with pytest.raises(LogError, match=r"empty.mcap: the file is empty; expected an MCAP log"):
+        read(path)
+
+
+@pytest.mark.parametrize("content", [b"t", b"time,gyro\n0,1\n" * 50])
+def test_a_text_file_is_refused(tmp_path: Path, content: bytes) -> None:
+    path = tmp_path / "text.mcap"
+    path.write_bytes(content)
+    with pytest.raises(LogError, match="this is not an MCAP log: it starts with b't"):
+        read(path)
+
+
+@pytest.mark.parametrize("layout", ["zstd", "no-summary", "unchunked"])
+def test_a_log_cut_anywhere_is_refused_with_the_byte(foreign: Foreign, flight: list[Message], layout: str) -> None:
+    path = foreign(flight, layout)
+    whole = path.read_bytes()
+    for cut in (*range(1, 60, 3), *range(60, len(whole), len(whole) // 20), *range(len(whole) - 40, len(whole))):
+        path.write_bytes(whole[:cut])
+        with pytest.raises(LogError, match=rf"cut short at byte {cut}\b"):
+            read(path)
+
+
+def test_a_cut_log_says_inside_which_record(foreign: Foreign, flight: list[Message]) -> None:
+    path = foreign(flight)
+    with Log(path) as log:
+        chunk = log.structure.blocks[1]
+    path.write_bytes(path.read_bytes()[: chunk.offset + 5000])
+    expected = rf"byte {chunk.offset + 5000}, inside the Chunk record that begins at byte {chunk.offset}; .*planned"
+    with pytest.raises(LogError, match=expected):
+        read(path)
+
+
+@pytest.mark.parametrize("layout", ["zstd", "lz4", "plain", "no-summary"])
+def test_a_flipped_bit_in_any_chunk_is_found(foreign: Foreign, flight: list[Message], layout: str) -> None:
+    path = foreign(flight, layout)
+    whole = bytearray(path.read_bytes())
+    with Log(path) as log:
+        blocks = log.structure.blocks
+    assert len(blocks) > 2
+    for block in blocks:
+        damaged = whole.copy()
+        damaged[block.offset + block.length - 40] ^= 1
+        path.write_bytes(damaged)
+        with pytest.raises(LogError, match=rf"the chunk at byte {block.offset} "):
+            read(path)
+
+
+@pytest.mark.parametrize("layout", ["zstd", "no-summary", "no-message-index", "unchunked", "lz4"])
+def test_random_damage_is_refused_or_harmless_but_never_a_traceback(
+    foreign: Foreign, flight: list[Message], layout: str
+) -> None:
+    path = foreign(flight[:150], layout, chunk_size=8000, metadata={"a": {"b": "c"}}, attachments=(b"data",))
+    whole, rng, refusals = path.read_bytes(), random.Random(5), []
+    for at in (*range(1, 60), *range(0, len(whole), len(whole) // 60), *range(len(whole) - 400, len(whole), 2)):
+        damaged = bytearray(whole)
+        if rng.random() < 0.5:
+            damaged[at] ^= rng.randrange(1, 256)
+        else:
+            damaged[at : at + 8] = (2 ** rng.randrange(8, 63)).to_bytes(8, "little")
+        path.write_bytes(damaged[: len(whole)])
+        try:
+            read(path)
+        except LogError as error:
+            refusals.append(str(error))
+    assert len(refusals) > 100
+    assert all(str(path) in refusal for refusal in refusals)
+
+
+def test_a_chunk_that_claims_to_unpack_to_an_enormous_size_is_refused(foreign: Foreign, flight: list[Message]) -> None:
+    path = foreign(flight, "no-summary")
+    with Log(path) as log:
+        block = log.structure.blocks[0]
+    whole = bytearray(path.read_bytes())
+    whole[block.offset + 25 : block.offset + 33] = (2**62).to_bytes(8, "little")
+    path.write_bytes(whole)
+    with pytest.raises(LogError, match=str(2**62)):
+        read(path)
+
+
+def test_a_log_without_imu_lists_its_topics(foreign: Foreign, make: Make) -> None:
+    with pytest.raises(LogError, match=r"no IMU topic; expected .* /mocap \(geometry_msgs/msg/PoseStamped\)"):
+        read(foreign(poses(make, "/mocap")))
+    with pytest.raises(LogError, match="no IMU topic"):
+        read(foreign([], name="nothing"))
+
+
+def test_several_imus_are_listed(foreign: Foreign, make: Make) -> None:
+    path = foreign(imu_messages(make, "/left") + imu_messages(make, "/right"))
+    with pytest.raises(LogError, match=r"2 IMU topics: /left, /right. Choose one with --imu"):
+        read(path)
+    assert read(path, imu="/right").imu_topic == "/right"
+
+
+def test_a_topic_that_is_not_there_or_is_something_else_is_refused(foreign: Foreign, make: Make) -> None:
+    path = foreign(imu_messages(make) + poses(make, "/mocap"))
+    with pytest.raises(LogError, match=r"no topic /imu9; expected /imu \(sensor_msgs/msg/Imu\), /mocap"):
+        read(path, imu="/imu9")
+    with pytest.raises(LogError, match="/mocap carries geometry_msgs/msg/PoseStamped"):
+        read(path, imu="/mocap")
+    with pytest.raises(LogError, match="no poses on /truth; expected /mocap"):
+        read(path, truth="/truth")
+    with pytest.raises(LogError, match="/imu carries"):
+        read(path, truth="/imu")
+    with Log(path) as log, pytest.raises(LogError, match="no topic /x"):
+        next(log.stamps("/x"))
+
+
+def test_an_unknown_encoding_is_named(foreign: Foreign, make: Make) -> None:
+    with pytest.raises(LogError, match="/imu is encoded as 'json'; expected cdr or ros1"):
+        read(foreign(imu_messages(make), encoding="json"))
+
+
+@pytest.mark.parametrize(("step", "word"), [(0, "repeats"), (-5, "goes back")])
+def test_a_stamp_that_does_not_increase_names_message_and_stamps(foreign: Foreign, make: Make, step: int, word: str) -> None:
+    messages = imu_messages(make, count=400)
+    for i in (350, 351):  # the second one is not to be named
+        topic, kind, log_time, publish_time, sequence, _ = messages[i]
+        stamp = START_NS + 10_000_000 * 349 + step
+        payload = make(kind, stamp, np.zeros(3), np.zeros(3))
+        messages[i] = (topic, kind, log_time, publish_time, sequence, payload)
+    path = foreign(messages, chunk_size=20_000)  # the pair lies in two batches or in one: it must not matter
+    before = START_NS + 10_000_000 * 349
+    expected = rf"/imu: message 350 \(sequence 350\) has the stamp {before + step} ns, which {word}: .* has {before} ns"
+    with pytest.raises(LogError, match=expected):
+        read(path)
+    with Log(path) as log, pytest.raises(LogError, match=expected):
+        list(log.imu_batches("/imu"))
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf])
+def test_nan_and_infinity_in_imu_or_truth_are_refused(foreign: Foreign, make: Make, bad: float) -> None:
+    messages = imu_messages(make)
+    t = messages[7][2]
+    messages[7] = ("/imu", schema.IMU, t, t, 7, make(schema.IMU, t, np.zeros(3), np.array([0, bad, 0])))
+    with pytest.raises(LogError, match=r"/imu: message 7 has linear_acceleration \[0.0, (nan|inf), 0.0\]"):
+        read(foreign(messages))
+    pose = ("/mocap", schema.POSE, t, t, 0, make(schema.POSE, t, np.array([bad, 0, 0]), np.ones(4) / 2))
+    with pytest.raises(LogError, match=r"/mocap: message 0 has position \[(nan|inf), 0.0, 0.0\]"):
+        read(foreign([*imu_messages(make), pose], name="pose"))
+
+
+def test_velocities_that_do_not_belong_to_their_poses_are_refused(tmp_path: Path) -> None:
+    path = tmp_path / "log.mcap"
+    t_ns, zeros, q_wxyz = np.array([1, 2, 3]), np.zeros((3, 3)), np.tile([1.0, 0, 0, 0], (3, 1))
+    with LogWriter(path) as log:
+        group = [
+            Series(log.channel("/imu", schema.IMU), t_ns, (t_ns, zeros, zeros), partial(schema.encode_imu, frame_id="b")),
+            Series(log.channel("/p", schema.POSE), t_ns, (t_ns, zeros, q_wxyz), partial(schema.encode_pose, frame_id="w")),
+            Series(
+                log.channel("/v", schema.VECTOR3, {VELOCITY_KEY: "/p"}),
+                t_ns,
+                (t_ns + 1, zeros),
+                partial(schema.encode_vector3, frame_id="w"),
+            ),
+        ]
+        for chunk in chunks(group):
+            log.chunk(chunk)
+    with pytest.raises(LogError, match="/p: the velocities on /v have other stamps than the poses"):
+        read(path)
+
+
+def test_reading_leaves_the_file_as_it_is(foreign: Foreign, flight: list[Message], tmp_path: Path) -> None:
+    path = foreign(flight)
+    copy = Path(shutil.copy2(path, tmp_path / "copy"))
+    read(path)
+    assert path.read_bytes() == copy.read_bytes()
+    assert path.stat().st_mtime_ns == copy.stat().st_mtime_ns
