@@ -147,7 +147,7 @@ def _each(path: Path, topic: str) -> Iterator[tuple[int, bytes]]:
 
 def _messages(path: Path, topic: str) -> Iterator[tuple[int, Any]]:
     """Header stamp (ns) and message, in the order of their arrival."""
-    from rosbags.typesys import Stores, get_typestore  # noqa: PLC0415  extra `bags`; `_open` has said so if it is absent
+    from rosbags.typesys import Stores, get_typestore
 
     with _open(path) as bag:
         store = get_typestore(Stores.ROS1_NOETIC)
@@ -161,7 +161,7 @@ def _messages(path: Path, topic: str) -> Iterator[tuple[int, Any]]:
 def _open(path: Path) -> Iterator[Reader]:
     """The bag, open; whatever rosbags raises on damaged input becomes a DataError with the path in it."""
     try:
-        from rosbags.rosbag1 import Reader  # noqa: PLC0415  extra `bags`
+        from rosbags.rosbag1 import Reader
     except ImportError as error:
         raise ConfigError(
             "reading ROS 1 bags needs rosbags", where=path, fix="Install it with: pip install 'imutool[bags]'"

@@ -152,9 +152,7 @@ def pairs_by_distance(
     i = np.arange(len(p) - 1)
     above = np.searchsorted(travelled, travelled[i] + distance_m, side="left")
     above = np.clip(above, i + 1, len(p) - 1)
-    below = np.searchsorted(
-        travelled, travelled[above - 1], side="left"
-    )  # first of the points that share that distance
+    below = np.searchsorted(travelled, travelled[above - 1], side="left")  # first of the points that share that distance
     below = np.clip(below, i + 1, above)
     miss_above = np.abs(travelled[above] - travelled[i] - distance_m)
     miss_below = np.abs(travelled[below] - travelled[i] - distance_m)
@@ -181,9 +179,7 @@ def consistency(
     if not samples or not dimension:
         raise DataError(f"errors are {list(errors.shape)}", expected="at least one row and column")
     if not (np.isfinite(errors).all() and np.isfinite(covariances).all()):
-        raise NumericsError(
-            "errors or covariances are not finite", expected="finite numbers", fix="Look for divergence"
-        )
+        raise NumericsError("errors or covariances are not finite", expected="finite numbers", fix="Look for divergence")
     try:
         whitening = np.linalg.cholesky(covariances)
     except np.linalg.LinAlgError as error:

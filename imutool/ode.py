@@ -9,7 +9,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable
-from typing import Literal
+from dataclasses import dataclass
+from typing import Any, Literal
 
 import torch
 from jaxtyping import Bool, Float, Num
@@ -23,9 +24,8 @@ Method = Literal["euler", "rk4", "dopri5"]
 Field = Callable[[Tensor, Tensor, Tensor], tuple[Tensor, Tensor]]
 
 FIXED_STEP: tuple[Method, ...] = ("euler", "rk4")
-STRETCH = (
-    64  # outputs per call of a fixed-step solver: a chart change wastes at most this many steps, a call costs about one
-)
+FIRST_STRETCH, LONGEST_STRETCH = 32, 128  # outputs per call of a fixed-step solver: a call costs a third of a step, a
+# chart change wastes the rest of its stretch; so stretches double while none is needed and are cut to fit when one is
 MAX_STEPS_PER_OUTPUT = 10_000  # an adaptive solver that needs more between two outputs is at a singularity
 REDUCE = "Reduce the step, or ask for output more often"
 
@@ -111,25 +111,25 @@ def integrate(
         max_angle: a chart is left at the first output where |xi| exceeds this; less than 2 pi, where it ends.
         rtol: relative tolerance of `dopri5`, on the root mean square over the batch.
         atol: absolute tolerance of `dopri5`, likewise.
-        parameters: tensors the field depends on beyond its own as an `nn.Module`; only the adjoint needs to know.
+        parameters: for the adjoint, tensors the field depends on beyond its own as an `nn.Module`, none computed from
+            another.
 
     Raises:
         NumericsError: |xi| reached 2 pi within a step, a state is not finite, or dopri5 could not keep its tolerance.
     """
+    solve = _Solver(field, tuple(parameters), method, adjoint, rtol, atol)
     rotations, states = [R0.unsqueeze(0)], [state0.unsqueeze(0)]
-    xi0, done = torch.zeros_like(R0[..., 0]), 0
-    longest = STRETCH if method in FIXED_STEP else 1
+    xi0, done, stretch = torch.zeros_like(R0[..., 0]), 0, solve.first_stretch
     while done < len(t) - 1:
-        times = t[done : done + longest + 1]
-        chart = _Chart(field, R0, times[0])
-        y0 = torch.cat([xi0, state0], dim=-1)
-        solve = _solver(chart, y0, parameters, method, adjoint, rtol, atol)
-        y = solve(times)
+        times = t[done : done + stretch + 1]
+        y = solve(times, R0, xi0, state0)
         leave, end = _first_leaving(y, max_angle)
-        if end < len(y) - 1 and adjoint:
-            y = solve(times[: end + 1])  # what lies past the change must not enter the backward solution
-        y = y[: end + 1]
-        _check(y, times[: end + 1])
+        if end == len(times) - 1:
+            stretch = solve.next_stretch(stretch)
+        else:  # what lies past the change is dropped, and must not enter a backward solution either
+            stretch, times = end, times[: end + 1]
+            y = solve(times, R0, xi0, state0) if adjoint else y[: end + 1]
+        _check(y, times)
         R = R0 @ so3.exp(y[1:, ..., :3])
         rotations.append(R)
         states.append(y[1:, ..., 3:])
@@ -143,60 +143,96 @@ class _Chart(nn.Module):
     """The right-hand side in one chart: state (xi, Euclidean states), time from the start of the stretch.
 
     Time is local because torchdiffeq casts it to the state's dtype, and float32 seconds blur the samples of a long log.
+
+    For the adjoint R0 rides along as nine constant states. It cannot be one of the adjoint's parameters: after a chart
+    change it depends on the field's own, and torch.autograd.grad would then count those twice.
     """
 
-    def __init__(self, field: Field, R0: Float[Tensor, "*batch 3 3"], start: Float[Tensor, ""]) -> None:
+    def __init__(self, field: Field, start: Float[Tensor, ""], R0: Float[Tensor, "*batch 3 3"] | None) -> None:
         super().__init__()
-        self.field, self.R0, self.start = field, R0, start
+        self.field, self.start, self.R0 = field, start, R0
 
     def forward(self, t: Float[Tensor, ""], y: Float[Tensor, "*batch m"]) -> Float[Tensor, "*batch m"]:
-        xi, state = y[..., :3], y[..., 3:]
-        omega_b, dstate = self.field(self.start + t.to(self.start.dtype), self.R0 @ so3.exp(xi), state)
-        return torch.cat([so3.chart_rate(xi, omega_b), dstate], dim=-1)
+        if self.R0 is not None:
+            R0, xi, state, carried = self.R0, y[..., :3], y[..., 3:], []
+        else:
+            R0, xi, state = y[..., -9:].reshape(*y.shape[:-1], 3, 3), y[..., :3], y[..., 3:-9]
+            carried = [torch.zeros_like(y[..., -9:])]
+        omega_b, dstate = self.field(self.start + t.to(self.start.dtype), R0 @ so3.exp(xi), state)
+        return torch.cat([so3.chart_rate(xi, omega_b), dstate, *carried], dim=-1)
 
 
-def _solver(
-    chart: _Chart,
-    y0: Float[Tensor, "*batch m"],
-    parameters: Iterable[Tensor],
-    method: Method,
-    adjoint: bool,
-    rtol: float,
-    atol: float,
-) -> Callable[[Float[Tensor, " n"]], Float[Tensor, "n *batch m"]]:
-    """A function from output times to solutions, with torchdiffeq's failures turned into ours."""
-    tensors = (*chart.parameters(), *parameters, chart.R0)
+@dataclass(frozen=True)
+class _Solver:
+    """torchdiffeq with our options, and its failures as ours."""
 
-    def solve(times: Float[Tensor, " n"]) -> Float[Tensor, "n *batch m"]:
+    field: Field
+    parameters: tuple[Tensor, ...]
+    method: Method
+    adjoint: bool
+    rtol: float
+    atol: float
+
+    @property
+    def first_stretch(self) -> int:
+        """Outputs of the first call. An adaptive solver must not run into the end of a chart, so it gets one at a time."""
+        return FIRST_STRETCH if self.method in FIXED_STEP else 1
+
+    def next_stretch(self, stretch: int) -> int:
+        """Outputs of the call after one that needed no chart change."""
+        return min(2 * stretch, LONGEST_STRETCH) if self.method in FIXED_STEP else 1
+
+    def __call__(
+        self,
+        times: Float[Tensor, " n"],
+        R0: Float[Tensor, "*batch 3 3"],
+        xi0: Float[Tensor, "*batch 3"],
+        state0: Float[Tensor, "*batch m"],
+    ) -> Float[Tensor, "n *batch k"]:
+        """(xi, state) at the times, in the chart at R0.
+
+        Raises:
+            NumericsError: dopri5 could not keep its tolerance.
+        """
         local = times - times[0]
-        options: dict[str, object] = {}
-        if method not in FIXED_STEP:
-            options = {"first_step": float(local[-1]), "max_num_steps": MAX_STEPS_PER_OUTPUT, "step_t": local[-1:]}
+        options, backward = self._options(local)
+        tolerances = {"rtol": self.rtol, "atol": self.atol}
         try:
-            if adjoint:
-                backward = {} if method in FIXED_STEP else {"max_num_steps": MAX_STEPS_PER_OUTPUT}
-                y: Tensor = odeint_adjoint(
-                    chart,
-                    y0,
-                    local,
-                    rtol=rtol,
-                    atol=atol,
-                    method=method,
-                    options=options,
-                    adjoint_options=backward,
-                    adjoint_params=tensors,
-                )
-            else:
-                y = odeint(chart, y0, local, rtol=rtol, atol=atol, method=method, options=options)
+            if not self.adjoint:
+                chart, y0 = _Chart(self.field, times[0], R0), torch.cat([xi0, state0], dim=-1)
+                plain: Tensor = odeint(chart, y0, local, method=self.method, options=options, **tolerances)
+                return plain
+            chart = _Chart(self.field, times[0], None)
+            y0 = torch.cat([xi0, state0, R0.flatten(-2)], dim=-1)
+            solution: Tensor = odeint_adjoint(
+                chart,
+                y0,
+                local,
+                method=self.method,
+                options=options,
+                adjoint_options=backward,
+                adjoint_params=(*chart.parameters(), *self.parameters),
+                **tolerances,
+            )
         except AssertionError as error:  # torchdiffeq's way to say that the step underflowed or the state is not finite
             raise NumericsError(
-                f"{method} failed after t = {float(times[0]):.6g} s ({str(error).splitlines()[0][:80]})",
+                f"{self.method} failed after t = {float(times[0]):.6g} s ({str(error).splitlines()[0][:80]})",
                 expected="a solution within tolerance",
                 fix=REDUCE,
             ) from error
-        return y
+        return solution[..., :-9]
 
-    return solve
+    def _options(self, local: Float[Tensor, " n"]) -> tuple[dict[str, Any], dict[str, Any]]:
+        """Forward and backward: try the whole interval first, stop at its end, measure errors on what can err."""
+        if self.method in FIXED_STEP:
+            return {}, {}
+        limit = {"max_num_steps": MAX_STEPS_PER_OUTPUT}
+        forward = {**limit, "first_step": float(local[-1]), "step_t": local[-1:]}
+        return ({**forward, "norm": _norm_without_chart}, limit) if self.adjoint else (forward, limit)
+
+
+def _norm_without_chart(y: Float[Tensor, "*batch m"]) -> Float[Tensor, ""]:
+    return y[..., :-9].square().mean().sqrt()
 
 
 def _first_leaving(y: Float[Tensor, "n *batch m"], max_angle: float) -> tuple[Bool[Tensor, "*batch"], int]:

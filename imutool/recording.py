@@ -156,7 +156,7 @@ class Poses(_Columns):
         Raises:
             DataError: fewer than two poses.
         """
-        from scipy.spatial.transform import Rotation, Slerp  # noqa: PLC0415  a tenth of a second that `info` need not pay
+        from scipy.spatial.transform import Rotation, Slerp
 
         gap_s = max(GAP_FACTOR * self.period_s, MIN_GAP_S) if max_gap_s is None else max_gap_s
         clipped = np.clip(t_ns, self.t_ns[0], self.t_ns[-1])

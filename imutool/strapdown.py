@@ -45,9 +45,7 @@ class Start(NamedTuple):
         if not -len(poses) <= row < len(poses):
             raise DataError(f"no row {row} among {len(poses)} poses", expected="a pose to start from")
         if poses.v_w is None:
-            raise DataError(
-                "the poses carry no velocity", expected="v_w", fix="Derive it with strapdown.truth_velocity"
-            )
+            raise DataError("the poses carry no velocity", expected="v_w", fix="Derive it with strapdown.truth_velocity")
         return cls(poses.q_wb_wxyz[row], poses.p_wb[row], poses.v_w[row])
 
 

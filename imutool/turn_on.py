@@ -7,7 +7,8 @@ measured is what is left of the samples after that part.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import torch
@@ -15,7 +16,7 @@ from jaxtyping import Float64
 from torch import Tensor
 
 from imutool import so3
-from imutool.bias._base import BiasModel, Segment, Vector6
+from imutool.bias._base import BiasModel, Vector6
 from imutool.errors import ConfigError, DataError
 from imutool.recording import GRAVITY_M_S2, Imu, Recording, nanoseconds, seconds
 from imutool.stationary import stretches
@@ -37,6 +38,7 @@ class TurnOn:
     rest: Vector6
     std: Vector6
     how: str
+    noise: Vector6 = field(default_factory=lambda: np.zeros(6))  # of a sample, where it could be measured
 
 
 def find(way: str, model: BiasModel, recording: Recording) -> TurnOn:
@@ -84,9 +86,7 @@ def prior(model: BiasModel) -> TurnOn:
 
 
 def at_rest(model: BiasModel, imu: Imu) -> TurnOn:
-    """From the stretch at rest that the log starts with: true rate zero, specific force g along where it points.
-
-    The accelerometer's bias is seen only along gravity as long as the attitude is unknown; across it the prior stands.
+    """From the stretch at rest that the log starts with.
 
     Raises:
         DataError: there is none.
@@ -96,27 +96,46 @@ def at_rest(model: BiasModel, imu: Imu) -> TurnOn:
     if not found:
         raise DataError(
             "the log does not start at rest",
-            expected=f"one second or more without motion in the first {REST_BEGINS_WITHIN_S:g} s",
+            expected=f"1.5 s or more without motion in the first {REST_BEGINS_WITHIN_S:g} s",
             fix="Give --init prior with a trained model, or six numbers",
         )
-    first, last = found[0]
-    still = imu.rows(slice(first, last))
-    left = np.concatenate([still.gyro, still.accel], axis=1) - _bias(model, still, _numpy(model.prior_mean))
+    return _from_rest(model, imu, found[:1])
+
+
+def over_all_rest(model: BiasModel, imu: Imu) -> TurnOn:
+    """From all the time at rest in a log, also what comes after the motion: a constant has no before and after.
+
+    Raises:
+        DataError: the log never rests.
+    """
+    found = stretches(imu)
+    if not found:
+        raise DataError("the log never rests", expected="1.5 s or more without motion")
+    return _from_rest(model, imu, found)
+
+
+def _from_rest(model: BiasModel, imu: Imu, found: Sequence[tuple[int, int]]) -> TurnOn:
+    """True rate zero; specific force g along where it points, so the accelerometer's bias is seen along gravity only."""
     start = prior(model)
     rest, var = start.rest.copy(), start.std**2
-    mean, spread = left.mean(axis=0), left.std(axis=0) / np.sqrt(len(left))
-    gyro_var = AT_REST_STD[:3] ** 2 + spread[:3] ** 2
-    gain = var[:3] / (var[:3] + gyro_var)
-    rest[:3] += gain * mean[:3]
+    rows = [imu.rows(slice(*stretch)) for stretch in found]
+    left = [np.concatenate([still.gyro, still.accel], axis=1) - _bias(model, still, start.rest) for still in rows]
+    everything = np.concatenate(left)
+    noise = np.concatenate([part - part.mean(axis=0) for part in left]).std(axis=0)
+
+    gain = var[:3] / (var[:3] + AT_REST_STD[:3] ** 2 + noise[:3] ** 2 / len(everything))
+    rest[:3] += gain * everything[:, :3].mean(axis=0)
     var[:3] *= 1 - gain
-    force = mean[3:] - 0.0
-    size = np.linalg.norm(force)
-    up = force / size
-    gain_accel = var[3:] * up / (up @ (var[3:] * up) + AT_REST_STD[3] ** 2)
-    rest[3:] += gain_accel * (size - GRAVITY_M_S2)
-    var[3:] *= 1 - gain_accel * up
-    at = seconds(imu.t_ns[[first, last - 1]], int(imu.t_ns[0]))
-    return TurnOn(rest, np.sqrt(var), f"at rest from {at[0]:.1f} to {at[1]:.1f} s")
+    for part in left:  # attitude may differ from stop to stop: each shows another direction
+        force = part[:, 3:].mean(axis=0) - (rest[3:] - start.rest[3:])
+        size = float(np.linalg.norm(force))
+        up = force / size
+        gain = var[3:] * up / (up @ (var[3:] * up) + AT_REST_STD[3] ** 2)
+        rest[3:] += gain * (size - GRAVITY_M_S2)
+        var[3:] *= 1 - gain * up
+    total = sum(still.duration_s for still in rows)
+    first = seconds(imu.t_ns[[found[0][0]]], int(imu.t_ns[0]))[0]
+    return TurnOn(rest, np.sqrt(var), f"{total:.1f} s at rest from {first:.1f} s on", noise)
 
 
 def from_truth(model: BiasModel, recording: Recording) -> TurnOn:

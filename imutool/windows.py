@@ -61,7 +61,7 @@ def rotation_residual(
 
     Returns:
         e = Log(R_hat^T R_true) in rad, and A with e(gyro + d) = e - sum_k A_k d_k to first order in a small e, d_k the
-        change of the rate over step k (`between`): it turns the step's end by d_k dt_k, seen through the rotation from there on.
+        change of the rate over step k (`between`): it turns the step's end by d_k dt_k, seen through what comes after.
     """
     running = running_product(so3.exp(between(gyro) * dt[..., None]))
     R_hat = running[:, -1]

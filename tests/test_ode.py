@@ -20,7 +20,7 @@ from imutool.ode import HermitePath, integrate
 F64 = torch.float64
 EXACT = 1e-12  # hundreds of float64 steps
 ORDER_TOLERANCE = 0.3  # design.md, Tests
-GRADIENT_TOLERANCE = 1e-6  # of two solutions each converged to 1e-9 or better
+GRADIENT_TOLERANCE = 1e-6  # of two solutions each converged to a few 1e-8
 EYE = torch.eye(3, dtype=F64)
 
 
@@ -284,14 +284,14 @@ FIELDS = [lambda: ConstantRate(torch.tensor([0.5, -0.9, 0.8], dtype=F64)), Conin
 
 @pytest.mark.parametrize("make", FIELDS)
 def test_a_chart_change_leaves_the_gradient_as_it_is(make: Callable[[], nn.Module]) -> None:
-    """Over a total of 1.3 to 1.7 pi one chart is enough; the same with changes at pi, at 1 and at 0.3."""
-    one_chart = gradients(make(), "rk4", n=400, max_angle=6.2)
+    """Up to 1.7 pi one chart is enough; the same with the chart changed at pi (the constant rate only), at 1 and at 0.3."""
+    one_chart = gradients(make(), "rk4", n=100, max_angle=6.2)
     for max_angle in (math.pi, 1.0, 0.3):
-        assert_close(gradients(make(), "rk4", n=400, max_angle=max_angle), one_chart, GRADIENT_TOLERANCE)
+        assert_close(gradients(make(), "rk4", n=100, max_angle=max_angle), one_chart, GRADIENT_TOLERANCE)
 
 
 @pytest.mark.parametrize("make", FIELDS)
-@pytest.mark.parametrize(("method", "n"), [("rk4", 200), ("dopri5", 20)])
+@pytest.mark.parametrize(("method", "n"), [("rk4", 60), ("dopri5", 8)])
 def test_the_adjoint_gives_the_gradient_of_backpropagation(make: Callable[[], nn.Module], method: str, n: int) -> None:
     expected = gradients(make(), method, n=n)
     assert_close(gradients(make(), method, n=n, adjoint=True), expected, GRADIENT_TOLERANCE)
@@ -299,7 +299,7 @@ def test_the_adjoint_gives_the_gradient_of_backpropagation(make: Callable[[], nn
 
 def test_the_adjoint_of_euler_comes_closer_to_backpropagation_with_the_step() -> None:
     make, gaps = FIELDS[0], []
-    for n in (100, 200):
+    for n in (40, 80):
         exact, adjoint = gradients(make(), "euler", n=n), gradients(make(), "euler", n=n, adjoint=True)
         gaps.append(max(float((a - b).abs().max()) for a, b in zip(adjoint, exact, strict=True)))
     assert abs(math.log2(gaps[0] / gaps[1]) - 1) < ORDER_TOLERANCE

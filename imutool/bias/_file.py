@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 import hashlib
 import json
 import os
@@ -105,6 +106,32 @@ def load(path: Path) -> BiasModel:
     model.card = {**card, "name": path.stem, "sha256": digest(path)}
     model.requires_grad_(False)
     return model.double().eval()
+
+
+def library() -> Path:
+    """The folder of models that ship: inside the installed package, or beside it in a checkout."""
+    inside = Path(__file__).parents[1] / "_models"
+    return inside if inside.is_dir() else Path(__file__).parents[2] / "models"
+
+
+def find_model(name: str | Path) -> BiasModel:
+    """The model in a file, or the one that ships under a name.
+
+    Raises:
+        ModelError: neither; the nearest name is given.
+    """
+    path = Path(name)
+    if path.suffix == ".safetensors" or path.exists():
+        return load(path)
+    shipped = {model.stem: model for model in library().glob("*.safetensors")}
+    if str(name) not in shipped:
+        near = difflib.get_close_matches(str(name), shipped, n=1)
+        raise ModelError(
+            f"no model {str(name)!r}",
+            expected=f"a file, or one of {', '.join(sorted(shipped)) or '(none ship)'}",
+            fix=f"Did you mean {near[0]!r}?" if near else "",
+        )
+    return load(shipped[str(name)])
 
 
 def digest(path: Path) -> str:

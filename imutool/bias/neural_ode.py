@@ -286,7 +286,7 @@ def _array(tensor: Tensor) -> Array:
 
 def _numpy(module: nn.Module) -> Callable[[Array], Array]:
     """A perceptron as a numpy function: torch's overhead for one sample is twenty times its arithmetic."""
-    from scipy.special import erf  # noqa: PLC0415  only needed once a model runs
+    from scipy.special import erf
 
     steps: list[Callable[[Array], Array]] = []
     for layer in module if isinstance(module, nn.Sequential) else [module]:

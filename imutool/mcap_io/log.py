@@ -336,8 +336,6 @@ class Log:
                 if block.holds(every) and block.start_ns <= last and block.end_ns >= first:
                     yield from self._rows_of(block, wanted, first, last)
 
-    _rows = rows  # its name for callers written before it became public
-
     def _rows_of(
         self, block: Block, wanted: Mapping[str, set[int]], first: int, last: int
     ) -> Iterator[tuple[str, records.Rows]]:

@@ -117,4 +117,5 @@ def _weight(e: Float[Tensor, "m 3"]) -> Float[Tensor, " m"]:
     """Huber's weights, scaled so that a component of an ordinary window has about unit noise, as the prior has."""
     size = e.norm(dim=1)
     delta = HUBER_MEDIANS * size.median().clamp_min(1e-12)
-    return huber_weight(size, delta) * 3 / delta**2 / CORRELATED
+    weight: Tensor = huber_weight(size, delta) * 3 / delta**2 / CORRELATED
+    return weight

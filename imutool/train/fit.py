@@ -89,21 +89,27 @@ class Tracks(nn.Module):
 
     def per_log(self) -> Float[Tensor, "logs 6"]:
         """The mean rest bias of each log."""
-        return torch.stack([part.mean(0) for part in self.knots.split(self.counts)]) * self.unit
+        means: Tensor = torch.stack([part.mean(0) for part in self._parts()]) * self.unit
+        return means
 
     def set(self, sensor: Sensor, rest: Float[Tensor, "logs 3"]) -> None:
         """Makes a sensor's tracks constant."""
         columns = COLUMNS[sensor]
         with torch.no_grad():
-            for part, value in zip(self.knots.split(self.counts), rest, strict=True):
+            for part, value in zip(self._parts(), rest, strict=True):
                 part[:, columns] = value / self.unit[columns]
+
+    def _parts(self) -> tuple[Tensor, ...]:
+        """The knots of each log."""
+        return torch.split(self.knots, self.counts)
 
     def wandering(self, sensor: Sensor) -> Float[Tensor, ""]:
         """Minus the log-likelihood of the tracks as random walks, summed over the logs."""
         columns = COLUMNS[sensor]
-        step = torch.cat([torch.diff(part[:, columns], dim=0) for part in self.knots.split(self.counts)])
+        step = torch.cat([torch.diff(part[:, columns], dim=0) for part in self._parts()])
         sigma = TRACK_WALK[sensor] * self.knot_s**0.5 / self.unit[columns]
-        return 0.5 * (step / sigma).square().sum()
+        cost: Tensor = 0.5 * (step / sigma).square().sum()
+        return cost
 
 
 @dataclass
@@ -149,7 +155,7 @@ class Training:
                 continue
             if self.stage is None:
                 self._closed_form(sensor)
-                self.stage = Stage(sensor, self._optimizer(sensor))
+                self.stage = Stage(sensor, self.optimizer(sensor))
             yield from self._descend(self.stage)
             self.model.load_state_dict(self.stage.best_state)
             self.done[sensor], self.stage = self.stage.best, None
@@ -161,7 +167,7 @@ class Training:
         """Error over the longest windows that fit the held-out parts: the mean without the worst tenth (rad or m/s)."""
         first, n = self._held_out_windows(sensor)
         with torch.no_grad():
-            errors = torch.cat([self._errors(sensor, part, n) for part in first.split(256)])
+            errors = torch.cat([self._errors(sensor, part, n) for part in torch.split(first, 256)])
         kept = errors.sort().values[: max(1, int(TRIM * len(errors)))]
         return float(kept.mean())
 
@@ -196,7 +202,8 @@ class Training:
         self.model.begin_at(sensor, solution.W)
         self.tracks.set(sensor, solution.rest)
 
-    def _optimizer(self, sensor: Sensor) -> torch.optim.Optimizer:
+    def optimizer(self, sensor: Sensor) -> torch.optim.Optimizer:
+        """A fresh optimiser for one stage: the sensor's weights and the tracks."""
         rate, decay = self.settings.learning_rate, self.settings.weight_decay
         weights = [w for name, w in self.model.named_parameters() if f".{sensor}" in f".{name}"]
         groups = [

@@ -94,9 +94,8 @@ class Pool:
     def starts(self, n: int, part: Part, *, hop: int = 1, ends_only: bool = False) -> Int[Tensor, " m"]:
         """First samples of all windows of n steps that stay in one log and one part and touch no gap in the truth.
 
-        Args:
-            hop: keep every `hop`-th.
-            ends_only: ask for truth at the window's two ends only, for validation over times longer than the gaps' spacing.
+        Of every `hop` one is kept. With `ends_only` the truth is asked for at the two ends alone: for validation over times
+        longer than the gaps are apart.
         """
         first = torch.arange(0, max(len(self.t) - n, 0), hop, device=self.t.device)
         last = first + n

@@ -37,13 +37,12 @@ def _run_to_run(sensor: Sensor, rest: Float[Tensor, "logs 3"]) -> Float[Tensor, 
     logs = len(rest)
     if logs < 2:
         return torch.full_like(rest[0], ONE_RUN_STD[sensor])
-    return (rest.std(0) * (1 + 1 / logs) ** 0.5).clamp_min(FLOOR_STD[sensor])
+    spread: Tensor = rest.std(0) * (1 + 1 / logs) ** 0.5
+    return spread.clamp_min(FLOOR_STD[sensor])
 
 
 @torch.no_grad()
-def _start_spread(
-    model: BiasModel, sensor: Sensor, pool: Pool, rest: Float[Tensor, "logs 6"]
-) -> Float[Tensor, "3"]:
+def _start_spread(model: BiasModel, sensor: Sensor, pool: Pool, rest: Float[Tensor, "logs 6"]) -> Float[Tensor, "3"]:
     """How far a rest bias from `TRUTH_S` of truth lies from its log's, as a robust standard deviation."""
     n = pool.samples(TRUTH_S)
     first = pool.starts(n, "all", hop=max(1, n // 4), ends_only=True)
@@ -51,7 +50,8 @@ def _start_spread(
         return torch.full_like(rest[0, :3], ONE_RUN_STD[sensor])
     e, A = closed_form.sensor_residual(model, sensor, pool.windows(first, n, rest[pool.log[first]]))
     off = torch.linalg.solve(A.sum(1), e)
-    return (MAD_TO_STD * off.abs().median(0).values).clamp_min(FLOOR_STD[sensor])
+    spread: Tensor = MAD_TO_STD * off.abs().median(0).values
+    return spread.clamp_min(FLOOR_STD[sensor])
 
 
 def _sample_noise(u: Float[Tensor, "n 3"]) -> Float[Tensor, "3"]:

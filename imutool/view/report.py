@@ -66,8 +66,8 @@ def png(data: RunData) -> bytes:
         raise DataError("there is neither truth nor a model, so there are no curves to draw", where=data.name)
     matplotlib = _matplotlib()
     with matplotlib.rc_context(STYLE):
-        from matplotlib.backends.backend_agg import FigureCanvasAgg  # noqa: PLC0415  optional
-        from matplotlib.figure import Figure  # noqa: PLC0415  optional; no pyplot: it keeps state and looks for a display
+        from matplotlib.backends.backend_agg import FigureCanvasAgg
+        from matplotlib.figure import Figure
 
         figure = Figure(figsize=SIZE_INCH, dpi=DOTS_PER_INCH)
         FigureCanvasAgg(figure)
@@ -102,7 +102,7 @@ def _draw_errors(figure: Any, data: RunData) -> None:
 
 
 def _draw_error(axes: Any, data: RunData, kind: str, figure_name: str, unit: str) -> None:
-    from matplotlib.ticker import FuncFormatter  # noqa: PLC0415  optional
+    from matplotlib.ticker import FuncFormatter
 
     tops = []
     for trace in data.traces:
@@ -166,7 +166,7 @@ def _matplotlib() -> Any:
         ConfigError: it is not installed.
     """
     try:
-        import matplotlib  # noqa: PLC0415  optional, and a third of a second
+        import matplotlib
     except ImportError as error:
         raise ConfigError(
             f"matplotlib is not installed ({error})",

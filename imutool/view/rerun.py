@@ -94,7 +94,7 @@ def rrd(data: RunData) -> bytes:
         ConfigError: Rerun is not installed.
     """
     _sdk()
-    import rerun as rr  # noqa: PLC0415  optional, and half a second
+    import rerun as rr
 
     recording = _stream(data)
     stream = rr.binary_stream(recording)
@@ -115,7 +115,7 @@ def log(data: RunData, to: rr.RecordingStream) -> None:
         ConfigError: Rerun is not installed.
     """
     _sdk()
-    import rerun as rr  # noqa: PLC0415  optional, and half a second
+    import rerun as rr
 
     to.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True, strict=True)
     to.log("report", rr.TextDocument(_report(data), media_type="text/markdown"), static=True, strict=True)
@@ -143,7 +143,7 @@ def blueprint(data: RunData) -> rrb.Blueprint:
         ConfigError: Rerun is not installed.
     """
     _sdk()
-    import rerun.blueprint as rrb  # noqa: PLC0415  optional, and half a second
+    import rerun.blueprint as rrb
 
     left: list[Any] = [rrb.Spatial3DView(origin="/world", name="Paths", eye_controls=_eye(data), background=(24, 26, 30))]
     if data.truth is not None:
@@ -186,7 +186,7 @@ def color_of(data: RunData, trace: Trace) -> Color:
 
 def _log_path(to: rr.RecordingStream, data: RunData, name: str, path: Poses, color: Color, size: float) -> None:
     """The whole path as lines, and the body that moves along it with the cursor."""
-    import rerun as rr  # noqa: PLC0415
+    import rerun as rr
 
     strips = [piece.p_wb[sparse(len(piece), MOST_IN_3D)] for piece in stretches(path)]
     lines = rr.LineStrips3D(strips, colors=[color] * len(strips), radii=rr.Radius.ui_points(PATH_RADIUS))
@@ -201,7 +201,7 @@ def _log_path(to: rr.RecordingStream, data: RunData, name: str, path: Poses, col
 
 def _log_signals(to: rr.RecordingStream, data: RunData, trace: Trace) -> None:
     """What the run reads, raw thin and faint, a model's bold; and what a model subtracted."""
-    import rerun as rr  # noqa: PLC0415
+    import rerun as rr
 
     run = trace.run
     bold = rr.SeriesLines(names=[f"{axis} {trace.name}" for axis in AXES], colors=_xyz(data, trace), widths=[BOLD_WIDTH] * 3)
@@ -218,7 +218,7 @@ def _log_signals(to: rr.RecordingStream, data: RunData, trace: Trace) -> None:
 
 def _log_errors(to: rr.RecordingStream, data: RunData, trace: Trace) -> None:
     """Orientation and position error of a run, per axis and in total."""
-    import rerun as rr  # noqa: PLC0415
+    import rerun as rr
 
     errors = trace.errors
     assert errors is not None, "asked only where there is truth"
@@ -242,7 +242,7 @@ def _log_scalars(
     style: rr.SeriesLines,
 ) -> None:
     """One curve per column; the style goes first, so that no curve is ever drawn in a colour of the viewer's choice."""
-    import rerun as rr  # noqa: PLC0415
+    import rerun as rr
 
     to.log(entity, style, static=True, strict=True)
     # strict: Rerun only warns of a length that does not match, and then the rows are missing.
@@ -251,7 +251,7 @@ def _log_scalars(
 
 def _time(data: RunData, t_ns: Times) -> list[rr.TimeColumn]:
     """Both clocks, exact to the nanosecond; `ros2_timestamp` is what Rerun's own MCAP reader calls header stamps."""
-    import rerun as rr  # noqa: PLC0415
+    import rerun as rr
 
     return [
         rr.TimeColumn("elapsed", duration=(t_ns - data.start_ns).astype("timedelta64[ns]")),
@@ -263,8 +263,8 @@ def _plot(
     data: RunData, origin: str, name: str, contents: str | list[str] = "$origin/**", limit: float | None = None
 ) -> rrb.TimeSeriesView:
     """A plot over the whole log: by default Rerun shows a minute around the cursor."""
-    import rerun as rr  # noqa: PLC0415
-    import rerun.blueprint as rrb  # noqa: PLC0415
+    import rerun as rr
+    import rerun.blueprint as rrb
 
     ends = [rr.TimeRangeBoundary.absolute(seconds=t) for t in (0.0, data.duration_s)]
     return rrb.TimeSeriesView(
@@ -298,7 +298,7 @@ def _limit(data: RunData, kind: str) -> float | None:
 
 def _eye(data: RunData) -> rrb.EyeControls3D:
     """A look at the truth (without it, at everything) from above one corner: raw paths often leave for kilometres."""
-    import rerun.blueprint as rrb  # noqa: PLC0415
+    import rerun.blueprint as rrb
 
     low, high = _box(data)
     centre, size = (low + high) / 2.0, _size(data)
@@ -349,7 +349,7 @@ def _number(value: float) -> str:
 
 def _entity(*parts: str) -> str:
     """An entity path of which every part may hold any character."""
-    import rerun as rr  # noqa: PLC0415
+    import rerun as rr
 
     return str(rr.new_entity_path(list(parts)))
 
@@ -363,7 +363,7 @@ def _mask(count: int, rows: Int64[np.ndarray, " m"]) -> np.ndarray:
 def _stream(data: RunData) -> rr.RecordingStream:
     """A recording of its own, in an application of its own: Rerun keeps one layout per application."""
     _sdk()
-    import rerun as rr  # noqa: PLC0415
+    import rerun as rr
 
     plain = re.sub(r"[^A-Za-z0-9_-]", "_", data.name)[:100]
     return rr.RecordingStream(f"imutool {plain}", recording_id=f"{plain}-{uuid.uuid4().hex[:8]}")
@@ -376,7 +376,7 @@ def _sdk() -> None:
         ConfigError: it is not installed.
     """
     try:
-        import rerun  # noqa: F401, PLC0415
+        import rerun  # noqa: F401
     except ImportError as error:
         raise ConfigError(
             f"the viewer is not installed ({error})", where="view", fix="Install it with: pip install 'imutool[view]'"

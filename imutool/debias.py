@@ -1,0 +1,210 @@
+"""A model at work: over a whole log, over a recording in memory, or one sample at a time; always the same numbers.
+
+Causal throughout: the bias at a sample comes from that sample and earlier ones, once the start is known (`imutool.turn_on`).
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float64, Int64, UInt8
+
+from imutool import __version__
+from imutool.bias import static
+from imutool.bias._base import BiasModel
+from imutool.bias._file import check_rate, find_model
+from imutool.config import plain
+from imutool.errors import DataError, LogError, ModelError
+from imutool.mcap_io import schema
+from imutool.mcap_io.log import ImuBatch, Log
+from imutool.mcap_io.read import read
+from imutool.mcap_io.rewrite import NewTopic, RewriteReport, rewrite, sha256
+from imutool.recording import Imu, Recording, nanoseconds, seconds
+from imutool.turn_on import TurnOn, find, over_all_rest
+
+HEAD_S = 60.0  # of a log, read to find the start: a constant, however long the log
+SUFFIX = "/debiased"
+
+
+class Debiased(NamedTuple):
+    """Corrected samples and what was subtracted: gyro (rad/s), then accel (m/s²)."""
+
+    imu: Imu
+    bias: Float64[np.ndarray, "n 6"]
+
+
+@dataclass(frozen=True)
+class DebiasReport:
+    """What was done to a log, one entry per IMU topic."""
+
+    models: Mapping[str, str]
+    starts: Mapping[str, TurnOn]
+    rewrite: RewriteReport
+
+
+def apply(model: BiasModel, start: TurnOn, imu: Imu) -> Debiased:
+    """A model over samples in memory, from their first on."""
+    bias = model.stream(start.rest)(seconds(imu.t_ns, int(imu.t_ns[0])), imu.gyro, imu.accel)
+    return Debiased(Imu(imu.t_ns, imu.gyro - bias[:, :3], imu.accel - bias[:, 3:]), bias)
+
+
+class OnlineDebiaser:
+    """One sample in, one corrected sample out: for a live node.
+
+    The start is a rest bias from `imutool.turn_on`, for instance `at_rest` over the first seconds, or `prior`.
+    """
+
+    def __init__(self, model: BiasModel, start: TurnOn) -> None:
+        self._stream, self._start_ns = model.stream(start.rest), -1
+
+    def __call__(
+        self, stamp_ns: int, gyro: Float64[np.ndarray, "3"], accel: Float64[np.ndarray, "3"]
+    ) -> tuple[Float64[np.ndarray, "3"], Float64[np.ndarray, "3"], Float64[np.ndarray, "6"]]:
+        """Corrected angular rate (rad/s) and specific force (m/s²), and the bias that was subtracted."""
+        if self._start_ns < 0:
+            self._start_ns = stamp_ns
+        t_s = np.array([(stamp_ns - self._start_ns) * 1e-9])
+        bias = self._stream(t_s, gyro[None], accel[None])[0]
+        return gyro - bias[:3], accel - bias[3:], bias
+
+
+class Debiaser:
+    """The channels a log gains, computed batch by batch as the log is copied (`mcap_io.rewrite.Derived`)."""
+
+    def __init__(self, source_topic: str, model: BiasModel, start: TurnOn) -> None:
+        self.source_topic = source_topic
+        self.topics: Sequence[NewTopic] = (
+            NewTopic(f"{source_topic}{SUFFIX}", schema.IMU),
+            NewTopic(f"{source_topic}/bias/gyro", schema.VECTOR3),
+            NewTopic(f"{source_topic}/bias/accel", schema.VECTOR3),
+        )
+        self._stream, self._start_ns = model.stream(start.rest), -1
+        noise = model.noise_std.detach().cpu().double().numpy()
+        variance = np.where(noise > 0, noise, start.noise) ** 2 + start.std**2
+        self._gyro_covariance, self._accel_covariance = np.diag(variance[:3]).ravel(), np.diag(variance[3:]).ravel()
+
+    def __call__(self, batch: ImuBatch) -> Sequence[UInt8[np.ndarray, "n L"]]:
+        """Payloads of the corrected messages and of the two biases."""
+        if self._start_ns < 0 and len(batch.stamp_ns):
+            self._start_ns = int(batch.stamp_ns[0])
+        bias = self._stream(seconds(batch.stamp_ns, self._start_ns), batch.gyro, batch.accel)
+        return (
+            schema.encode_imu(
+                batch.stamp_ns,
+                batch.gyro - bias[:, :3],
+                batch.accel - bias[:, 3:],
+                batch.frame_id,
+                self._gyro_covariance,
+                self._accel_covariance,
+            ),
+            _vector(batch.stamp_ns, bias[:, :3], batch.frame_id),
+            _vector(batch.stamp_ns, bias[:, 3:], batch.frame_id),
+        )
+
+
+def debias(
+    source: Path,
+    target: Path,
+    *,
+    model: str | Path | None = None,
+    imus: Sequence[str] = (),
+    init: str = "auto",
+    overwrite: bool = False,
+    progress: Callable[[int, int], None] | None = None,
+) -> DebiasReport:
+    """Writes `target`: all of `source` unchanged, and beside each IMU its debiased samples and the bias taken off.
+
+    Without a model: the one the log's metadata names, else the mean over time at rest.
+
+    Raises:
+        ConfigError: source or target cannot be opened, or `init` makes no sense.
+        LogError: the log is damaged, has no such IMU, or is debiased already.
+        ModelError: no model and no time at rest; a model for another rate; a damaged model file.
+    """
+    with Log(source) as log:
+        topics = list(imus) or [_only_imu(log)]
+        named = log.metadata().get("imutool", {}).get("model")
+    derived, starts, models, records = [], {}, {}, {}
+    origin = {"source_file": source.name, "source_sha256": sha256(source), "source_size": str(source.stat().st_size)}
+    for topic in topics:
+        chosen, start = _prepare(source, topic, model or named, init)
+        derived.append(Debiaser(topic, chosen, start))
+        starts[topic], models[topic] = start, str(chosen.card.get("name", chosen.method))
+        records[topic] = _provenance(topic, chosen, start, init) | origin
+    metadata = {"imutool" if len(records) == 1 else f"imutool{topic}": values for topic, values in records.items()}
+    report = rewrite(source, target, derived, metadata=metadata, overwrite=overwrite, progress=progress)
+    return DebiasReport(models, starts, report)
+
+
+def estimate_at_rest(imu: Imu, where: str | Path) -> tuple[BiasModel, TurnOn]:
+    """The static model with its bias: the mean over all time at rest, for a log nobody trained a model for.
+
+    Raises:
+        ModelError: the log never rests.
+    """
+    model = static.Model()
+    try:
+        return model, over_all_rest(model, imu)
+    except DataError as error:
+        raise ModelError(
+            "no model given, and the log holds no stretch at rest to measure a static bias on",
+            where=where,
+            expected="--model, or at least 1.5 s without motion",
+            fix="Give --model (imutool models lists those that ship), or train one with imutool train",
+        ) from error
+
+
+def _only_imu(log: Log) -> str:
+    """The log's IMU, if there is one and only one."""
+    found = log.imu_topics
+    if len(found) != 1:
+        listed = ", ".join(found) or "none"
+        raise LogError(f"IMU topics: {listed}", where=log.path, expected="one", fix="Choose with --imu" if found else "")
+    return found[0]
+
+
+def _prepare(source: Path, topic: str, name: str | Path | None, init: str) -> tuple[BiasModel, TurnOn]:
+    """Model and start for one IMU."""
+    if name is None or name == static.Model.method:
+        if init == "auto":
+            return estimate_at_rest(read(source, imu=topic).imu, source)
+        untrained = static.Model()
+        return untrained, find(init, untrained, _head(source, topic))
+    model = find_model(name)
+    head = _head(source, topic)
+    check_rate(model, 1.0 / head.imu.period_s, source)
+    return model, find(init, model, head)
+
+
+def _head(source: Path, topic: str) -> Recording:
+    """The first minute of a log."""
+    with Log(source) as log:
+        first = next((int(times.min()) for times in log.stamps(topic) if len(times)), None)
+    end = None if first is None else first + nanoseconds(HEAD_S)
+    return read(source, imu=topic, end_ns=end)
+
+
+def _provenance(topic: str, model: BiasModel, start: TurnOn, init: str) -> dict[str, str]:
+    return {
+        "version": __version__,
+        "command": "debias",
+        "source_topic": topic,
+        "model": str(model.card.get("name", model.method)),
+        "model_sha256": str(model.card.get("sha256", "")),
+        "method": model.method,
+        "settings": json.dumps(plain(model.config)),
+        "init": init,
+        "init_how": start.how,
+        "rest": json.dumps(start.rest.tolist()),
+        "rest_std": json.dumps(start.std.tolist()),
+        "causal": "true",
+    }
+
+
+def _vector(stamp_ns: Int64[np.ndarray, " n"], values: Float64[np.ndarray, "n 3"], frame_id: str) -> UInt8[np.ndarray, "n L"]:
+    return schema.encode_vector3(stamp_ns, np.ascontiguousarray(values), frame_id)

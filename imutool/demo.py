@@ -1,0 +1,87 @@
+"""The whole way on a made-up recording: raw files, logs, a model, a debiased log, its figures and its pictures."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from imutool.convert import convert
+from imutool.debias import debias
+from imutool.evaluate import evaluate
+from imutool.physics.flight import flight
+from imutool.recording import Recording
+from imutool.train.fit import TrainSettings
+from imutool.train.run import train
+from imutool.view import report, rerun
+from imutool.view.runs import load
+
+TRAINING_SEEDS = (1, 2, 3, 4)  # four flights of one sensor, each with a turn-on bias of its own
+TEST_SEED = 5
+STEPS = 120  # enough for a sensor with scale, misalignment and drift; about 20 s on two cores
+
+IMU_HEADER = "#timestamp [ns]," + ",".join(
+    [f"w_RS_S_{axis} [rad s^-1]" for axis in "xyz"] + [f"a_RS_S_{axis} [m s^-2]" for axis in "xyz"]
+)
+TRUTH_HEADER = "#timestamp," + ",".join(
+    [f" p_RS_R_{axis} [m]" for axis in "xyz"]
+    + [f" q_RS_{axis} []" for axis in "wxyz"]
+    + [f" v_RS_R_{axis} [m s^-1]" for axis in "xyz"]
+)
+
+
+@dataclass(frozen=True)
+class Demo:
+    """What the demo made, and the figures it found."""
+
+    log: Path
+    debiased: Path
+    model: Path
+    rrd: Path
+    png: Path
+    results: list[dict[str, Any]]
+
+
+def run(out: Path, say: Callable[[str], None], *, overwrite: bool = False) -> Demo:
+    """Runs every step in the folder `out`, saying each one.
+
+    Raises:
+        ConfigError: the folder holds an earlier demo, or view or report are not installed.
+    """
+    raw, logs = out / "raw", out / "logs"
+    say(f"1. Made-up flights as raw files: {raw}")
+    for seed in (*TRAINING_SEEDS, TEST_SEED):
+        write_asl(flight(seed), raw / f"flight_{seed}")
+    say(f"2. Converting them to MCAP: {logs}")
+    convert(raw, logs, format="euroc", overwrite=overwrite)
+    training = [logs / f"flight_{seed}.mcap" for seed in TRAINING_SEEDS]
+    log, model, debiased = logs / f"flight_{TEST_SEED}.mcap", out / "model.safetensors", out / "debiased.mcap"
+    say(f"3. Training on {len(training)} of them: {model}")
+    train(training, model, settings=TrainSettings(steps=STEPS), overwrite=overwrite)
+    say(f"4. Debiasing the one it has not seen: {debiased}")
+    debias(log, debiased, model=model, overwrite=overwrite)
+    say("5. Figures, pictures")
+    results = evaluate(log, models=["static", model])
+    data = load(log, models=["static", model])
+    rrd, png = out / "demo.rrd", out / "errors.png"
+    rerun.show([data], save=rrd, spawn=False, overwrite=overwrite)
+    report.error_curves(data, png, overwrite=overwrite)
+    return Demo(log, debiased, model, rrd, png, results)
+
+
+def write_asl(recording: Recording, folder: Path) -> None:
+    """A recording as an ASL sequence folder (mav0/imu0, mav0/state_groundtruth_estimate0), numbers exact to the last bit."""
+    imu, truth = recording.imu, recording.truth
+    assert truth.v_w is not None
+    _write_csv(folder / "mav0" / "imu0" / "data.csv", IMU_HEADER, imu.t_ns, imu.gyro, imu.accel)
+    place = folder / "mav0" / "state_groundtruth_estimate0" / "data.csv"
+    _write_csv(place, TRUTH_HEADER, truth.t_ns, truth.p_wb, truth.q_wb_wxyz, truth.v_w)
+
+
+def _write_csv(path: Path, header: str, t_ns: np.ndarray, *columns: np.ndarray) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    rows = zip(t_ns.tolist(), np.concatenate(columns, axis=1).tolist(), strict=True)
+    path.write_text("\n".join([header, *(f"{t},{','.join(map(repr, row))}" for t, row in rows)]) + "\n", encoding="ascii")
