@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import json
 import logging
+import math
+import os
+import re
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -12,30 +15,88 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 
 import typer
+from rich import box
 from rich.console import Console
-from rich.logging import RichHandler
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.progress import BarColumn, Progress, TextColumn
 from rich.table import Table
+from typer.core import TyperCommand, TyperGroup
 
 from imutool import __version__, registry
-from imutool.errors import ConfigError, ImutoolError
+from imutool.errors import ConfigError, DataError, ImutoolError
 
 if TYPE_CHECKING:
     from imutool.train.fit import Epoch
 
-USAGE, INTERRUPTED = 2, 130
+INTERRUPTED = 130
+PIPE_CLOSED = 141  # what a shell reports of a program that SIGPIPE ended
+NUMBER = re.compile(r"[-+]?[0-9.]+|[–?]")
+NOTHING_LEFT = "Nothing half-written is left"
+
+logger = logging.getLogger("imutool")
+
+
+class _Console(Console):
+    """Rich's console would end the program itself, with the code of a bug, when nobody reads on."""
+
+    def on_broken_pipe(self) -> None:
+        raise BrokenPipeError
+
+
+out, err = _Console(), _Console(stderr=True)
+
+
+class _Commands(TyperGroup):
+    """Commands whose interrupt is told here: typer would end the program without a word."""
+
+    def invoke(self, ctx: Any) -> Any:
+        with _caught():
+            result = super().invoke(ctx)
+            sys.stdout.flush()  # at the interpreter's end it would be too late to say anything
+        return result
+
+
+@contextmanager
+def _caught() -> Iterator[None]:
+    """The one place that catches: what went wrong becomes a sentence and an exit code."""
+    try:
+        yield
+    except ImutoolError as error:
+        _fail(str(error), error.exit_code)
+    except KeyboardInterrupt as interrupt:
+        _fail(f"interrupted. {str(interrupt) or NOTHING_LEFT}.", INTERRUPTED)
+    except BrokenPipeError:
+        _forget_stdout()
+        sys.exit(PIPE_CLOSED)
+    except OSError as error:
+        if error.filename is None:  # then it is a stream, and stdout the only one we fill
+            _forget_stdout()
+        place = f"{error.filename}: " if error.filename else ""
+        _fail(f"{place}{error.strerror or error}. Choose another place or make room.", ConfigError.exit_code)
+
+
+def _listing(group: str, option: str) -> type[TyperCommand]:
+    """A command whose help also lists what can be named, found (and nothing of it imported) when help is asked for."""
+
+    class Listing(TyperCommand):
+        def format_help(self, ctx: Any, formatter: Any) -> None:
+            lines = [f"[bold]{name}[/]  {_plain(registry.summary(group, name))}" for name in registry.names(group)]
+            self.epilog = "\n\n".join([f"Values of {option}:", *lines, self.epilog or ""])
+            super().format_help(ctx, formatter)
+
+    return Listing
+
 
 app = typer.Typer(
     name="imutool",
     help="Raw inertial data to MCAP, learned IMU bias dynamics, debiased logs, and a picture of what changed.",
+    cls=_Commands,
     no_args_is_help=True,
     rich_markup_mode="rich",
     pretty_exceptions_enable=False,
     add_completion=False,
 )
-out, err = Console(), Console(stderr=True)
 
-Logs = Annotated[list[Path], typer.Argument(help="MCAP logs.")]
+Logs = Annotated[list[Path], typer.Argument(metavar="LOG...", help="MCAP logs.")]
 Models = Annotated[list[str] | None, typer.Option("--model", help="Model file, a name that ships, or 'static'. Repeatable.")]
 Init = Annotated[str, typer.Option(help="Start bias: auto, stationary, prior, truth, or gx,gy,gz,ax,ay,az (rad/s, m/s²).")]
 Imu = Annotated[str | None, typer.Option(help="IMU topic, where a log has several.")]
@@ -55,21 +116,30 @@ class Compression(StrEnum):
 
 
 def main() -> None:
-    """Entry point of the `imutool` command: runs it and turns what went wrong into a sentence and an exit code."""
-    try:
+    """Entry point of the `imutool` command."""
+    # Idle OpenMP threads would spin: on a busy machine with two processors, training took 87 s of their time instead of 11
+    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+    with _caught():
         app()
-    except ImutoolError as error:
-        _fail(str(error), error.exit_code)
-    except KeyboardInterrupt:
-        _fail("interrupted; nothing half-written is left", INTERRUPTED)
-    except OSError as error:
-        place = f"{error.filename}: " if error.filename else ""
-        _fail(f"{place}{error.strerror or error}. Choose another place or make room.", ConfigError.exit_code)
 
 
 def _fail(message: str, code: int) -> NoReturn:
-    err.print(f"[bold red]error:[/] {_plain(message)}", highlight=False, soft_wrap=True)
+    _tell_error(message)
     sys.exit(code)
+
+
+def _tell_error(message: str) -> None:
+    err.print(f"[bold red]error:[/] {_plain(message)}", highlight=False, soft_wrap=True)
+
+
+def _say(line: str) -> None:
+    """A line of results, whole however long."""
+    out.print(_plain(line), highlight=False, soft_wrap=True)
+
+
+def _forget_stdout() -> None:
+    """What is still to be flushed into a closed pipe or a full disk goes nowhere, so that leaving raises nothing more."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def _plain(text: str) -> str:
@@ -78,11 +148,13 @@ def _plain(text: str) -> str:
     return shown.replace("[", r"\[")
 
 
-@app.command(epilog="Example: [bold]imutool convert MH_04_difficult.zip MH_04.mcap[/]")
+@app.command(
+    cls=_listing("imutool.converters", "--format"), epilog="Example: [bold]imutool convert MH_04_difficult.zip MH_04.mcap[/]"
+)
 def convert(
     source: Annotated[Path, typer.Argument(help="Sequence folder, .zip, .tar, .tar.gz, .bag, or a folder of them.")],
     target: Annotated[Path, typer.Argument(metavar="OUT", help="A file for one sequence, a folder for many.")],
-    format: Annotated[str, typer.Option(help="auto, or the data set's name.")] = "auto",
+    format: Annotated[str, typer.Option(help="auto, or one of those listed below.")] = "auto",
     sequence: Annotated[list[str] | None, typer.Option(help="Convert only this one. Repeatable.")] = None,
     compression: Annotated[Compression, typer.Option(help="How chunks are packed.")] = Compression.zstd,
     no_images: Annotated[bool, typer.Option("--no-images", help="Leave camera frames out.")] = False,
@@ -111,11 +183,11 @@ def convert(
     result = {"schema": "imutool.conversion/1", "written": [str(path) for path in report.written], "failures": failures}
     if not _json(result, json_to):
         for path in report.written:
-            out.print(_plain(str(path)), highlight=False, soft_wrap=True)
+            _say(str(path))
     for failure in report.failures:
-        err.print(f"[bold red]error:[/] {_plain(failure.message)}", highlight=False, soft_wrap=True)
+        _tell_error(failure.message)
     if report.failures:
-        raise typer.Exit(4)
+        raise typer.Exit(DataError.exit_code)
 
 
 @app.command(epilog="Example: [bold]imutool info MH_04.mcap[/]")
@@ -128,18 +200,24 @@ def info(logs: Logs, json_to: Json = None, verbose: Verbose = False, quiet: Quie
     if _json(reports[0] if len(reports) == 1 else {"schema": "imutool.infos/1", "logs": reports}, json_to):
         return
     for log, report in zip(logs, reports, strict=True):
-        _table(str(log), topic_rows(report))
-        _table("", imu_rows(report))
+        _say(str(log))
+        _table(topic_rows(report), keys=1)
+        _table(imu_rows(report), keys=2)
         for warning in report["warnings"]:
             out.print(f"[yellow]warning:[/] {_plain(warning)}", highlight=False, soft_wrap=True)
 
 
-@app.command(epilog="Example: [bold]imutool train MH_0[135]*.mcap -o adis.safetensors --method neural_ode[/]")
+@app.command(
+    cls=_listing("imutool.bias", "--method"),
+    epilog="Example: [bold]imutool train MH_01.mcap MH_03.mcap -o adis.safetensors --method neural_ode[/]",
+)
 def train(
     logs: Logs,
     model: Annotated[Path, typer.Option("-o", "--output", metavar="MODEL.safetensors", help="Where the model goes.")],
-    method: Annotated[str, typer.Option(help="The bias model: a file name of imutool/bias.")] = "neural_ode",
-    config: Annotated[Path | None, typer.Option(metavar="FILE.toml", help="Settings; see TrainSettings.")] = None,
+    method: Annotated[str, typer.Option(help="The bias model, one of those listed below.")] = "neural_ode",
+    config: Annotated[
+        Path | None, typer.Option(metavar="FILE.toml", help="Settings; imutool.train.fit.TrainSettings says which.")
+    ] = None,
     set_: Annotated[list[str] | None, typer.Option("--set", metavar="key=value", help="One setting. Repeatable.")] = None,
     device: Annotated[str, typer.Option(help="cpu or cuda.")] = "cpu",
     seed: Annotated[int | None, typer.Option(help="Seed of everything random.")] = None,
@@ -152,6 +230,7 @@ def train(
     quiet: Quiet = False,
 ) -> None:
     """Train a bias model on logs of one sensor with true poses."""
+    registry.load("imutool.bias", method)  # a slip of the pen is told before any log is read
     from imutool.config import load
     from imutool.train.fit import TrainSettings
     from imutool.train.run import train as run
@@ -172,7 +251,7 @@ def train(
             progress=lambda epoch: tell(*_epoch(epoch)),
         )
     if not _json({"schema": "imutool.training/1", "model": str(model), **trained.card}, json_to):
-        out.print(_plain(str(model)), highlight=False, soft_wrap=True)
+        _say(str(model))
 
 
 @app.command(epilog="Example: [bold]imutool debias MH_04.mcap MH_04_debiased.mcap --model adis.safetensors[/]")
@@ -217,9 +296,9 @@ def debias(
     for topic, entry in imus.items():
         bias = ", ".join(f"{b:+.5f}" for b in entry["gyro_bias"]), ", ".join(f"{b:+.4f}" for b in entry["accel_bias"])
         start = f"start bias {bias[0]} rad/s; {bias[1]} m/s² ({entry['init_how']})"
-        out.print(_plain(f"{topic}: {entry['model']}, {start}"), highlight=False, soft_wrap=True)
+        _say(f"{topic}: {entry['model']}, {start}")
     counts = ", ".join(f"{count} on {name}" for name, count in added.items())
-    out.print(_plain(f"{target}: {copied} messages as they were, {counts}"), highlight=False, soft_wrap=True)
+    _say(f"{target}: {copied} messages as they were, {counts}")
 
 
 @app.command(epilog="Example: [bold]imutool evaluate MH_04.mcap --model adis.safetensors --init truth[/]")
@@ -248,7 +327,7 @@ def evaluate(
             )
         tell(len(logs), len(logs), "")
     if not _json({"schema": SCHEMA, "results": results}, json_to):
-        _table("", _figures(results))
+        _figures(results)
 
 
 @app.command(epilog="Example: [bold]imutool view MH_04_debiased.mcap --save MH_04.rrd[/]")
@@ -277,7 +356,7 @@ def view(
         png.mkdir(parents=True, exist_ok=True)
         for log, one in zip(logs, data, strict=True):
             report.error_curves(one, png / f"{log.stem}.png", overwrite=overwrite)
-    out.print(_plain(rerun.show(data, save=save, overwrite=overwrite)), highlight=False, soft_wrap=True)
+    _say(rerun.show(data, save=save, overwrite=overwrite))
 
 
 @app.command(epilog="Example: [bold]imutool models --json -[/]")
@@ -294,12 +373,9 @@ def models(json_to: Json = None, verbose: Verbose = False, quiet: Quiet = False)
     if _json({"schema": "imutool.models/1", "models": found}, json_to):
         return
     if found:
-        _table("", [tuple(found[0]), *(tuple(str(value) for value in one.values()) for one in found)])
+        _table([tuple(found[0]), *(tuple(str(value) for value in one.values()) for one in found)], keys=1)
     else:
-        out.print("No model ships with this version; train one with: imutool train", highlight=False)
-    methods = ", ".join(f"{name} ({registry.summary('imutool.bias', name)})" for name in registry.names("imutool.bias"))
-    if verbose:
-        out.print(_plain(f"Methods: {methods}"), highlight=False)
+        _say("No model ships with this version; train one with: imutool train")
 
 
 @app.command(epilog="Example: [bold]imutool demo -o demo-out[/]")
@@ -313,96 +389,148 @@ def demo(
     """Go the whole way on a made-up recording: convert, train, debias, evaluate, view. No download."""
     from imutool.demo import run
 
-    _log_to_stderr(verbose, quiet)
-    done = run(folder, lambda line: None if quiet else err.print(_plain(line), highlight=False), overwrite=overwrite)
+    def say(line: str) -> None:
+        if not quiet:
+            err.print(_plain(line), highlight=False, soft_wrap=True)
+
+    with _progress("Training", verbose, quiet) as tell:
+        done = run(folder, say, overwrite=overwrite, progress=lambda epoch: tell(*_epoch(epoch)))
     files = {name: str(getattr(done, name)) for name in ("log", "debiased", "model", "rrd", "png")}
     if not _json({"schema": "imutool.demo/1", "results": done.results, **files}, json_to):
-        _table("Pure integration of a flight the model has not seen", _figures(done.results))
-        out.print(_plain(f"Look at {done.png}, or open the viewer: rerun {done.rrd}"), highlight=False, soft_wrap=True)
+        _say("Pure integration of a flight the model has not seen, from its true start:")
+        _figures(done.results)
+        _say(f"Error curves: {done.png}. In the viewer: rerun {done.rrd}")
 
 
-def version(show: bool) -> None:
-    """Prints the version and leaves."""
+def _version(show: bool) -> bool:
     if show:
-        out.print(f"imutool {__version__}", highlight=False)
+        _say(f"imutool {__version__}")
         raise typer.Exit
+    return show
 
 
 @app.callback()
 def options(
-    show_version: Annotated[bool, typer.Option("--version", callback=version, is_eager=True, help="Say the version.")] = False,
+    show_version: Annotated[bool, typer.Option("--version", callback=_version, is_eager=True, help="Say the version.")] = False,
 ) -> None:
     """Options of imutool itself."""
 
 
 def _epoch(epoch: Epoch) -> tuple[int, int, str]:
-    scale, unit = (180 / 3.141592653589793, "°") if epoch.sensor == "gyro" else (1.0, " m/s")
+    """A line of training as progress: steps done, steps in all, the figures in words."""
+    scale, unit = (180.0 / math.pi, "°") if epoch.sensor == "gyro" else (1.0, " m/s")
     held_out, best = epoch.held_out * scale, epoch.best * scale
-    text = f"{epoch.sensor}: loss {epoch.loss:.3f}, held out {held_out:.3f}{unit}, best {best:.3f}{unit}"
-    return epoch.step, max(epoch.steps, 1), text
+    minutes, seconds = divmod(round(epoch.left_s), 60)
+    loss = "" if math.isnan(epoch.loss) else f"loss {epoch.loss:.3f}, "  # before the first step there is none
+    text = f"{epoch.sensor} {epoch.step}/{epoch.steps}: {loss}held out {held_out:.3f}{unit} (best {best:.3f})"
+    return epoch.step, max(epoch.steps, 1), f"{text}, {minutes}:{seconds:02d} left" if epoch.step else text
 
 
-def _figures(results: Sequence[dict[str, Any]]) -> list[tuple[str, ...]]:
-    """Evaluation results as rows of text, the first row the header."""
+def _figures(results: Sequence[dict[str, Any]]) -> None:
+    """Evaluation results as two tables: over the whole path, and per metres flown."""
 
-    def number(value: float | None, form: str) -> str:
-        return "–" if value is None else format(value, form)
+    def number(value: float | None) -> str:
+        return "–" if value is None else format(value, ".2f")
 
     distances = list(results[0]["roe_deg"])
-    header = ("log", "model", "start", "AOE °", "AOE aligned °", "APE m", "velocity m/s")
-    rows = [(*header, *(f"ROE {d} m °" for d in distances), *(f"RPE {d} m m" for d in distances))]
+    names = ("aoe_deg", "aoe_aligned_deg", "ape_m", "ape_aligned_m", "velocity_rmse_m_s")
+    whole = [("log", "model", "AOE\n°", "aligned\n°", "APE\nm", "aligned\nm", "velocity\nm/s")]
+    roe = [("log", "model", *(f"ROE °\n{d} m" for d in distances))]
+    rpe = [("log", "model", *(f"RPE m\n{d} m" for d in distances))]
     for one in results:
-        figures = (one["aoe_deg"], one["aoe_aligned_deg"], one["ape_m"], one["velocity_rmse_m_s"])
-        forms = (".2f", ".2f", ".1f", ".2f")
-        relative = [*(one["roe_deg"][d] for d in distances), *(one["rpe_m"][d] for d in distances)]
-        texts = [number(value, form) for value, form in zip(figures, forms, strict=True)]
-        rows.append((one["log"], one["model"], one["init"] or "–", *texts, *(number(value, ".2f") for value in relative)))
-    return rows
+        whole.append((one["log"], one["model"], *(number(one[name]) for name in names)))
+        roe.append((one["log"], one["model"], *(number(one["roe_deg"][d]) for d in distances)))
+        rpe.append((one["log"], one["model"], *(number(one["rpe_m"][d]) for d in distances)))
+    for rows in (whole, roe, rpe):
+        _table(rows, keys=2)
 
 
-def _table(title: str, rows: Sequence[Sequence[str]]) -> None:
-    """Rows of text, the first one the header."""
-    table = Table(title=_plain(title) or None, title_justify="left")
-    for name in rows[0]:
-        table.add_column(_plain(name), overflow="fold")
-    for row in rows[1:]:
-        table.add_row(*(_plain(cell) for cell in row))
-    # a table wider than the terminal is cut by rich; where nobody looks at a terminal nothing must be cut
-    (out if out.is_terminal else Console(width=240)).print(table)
+def _table(rows: Sequence[Sequence[str]], *, keys: int) -> None:
+    """Rows of text, the first one the header; what is too wide goes on below, under the first `keys` columns again."""
+    columns = [[_plain(cell) for cell in column] for column in zip(*rows, strict=True)]
+    widths = [2 + max(len(line) for cell in column for line in cell.split("\n")) for column in columns]
+    room = out.width - sum(widths[:keys])
+    fewest = len(_split(widths[keys:], room))
+    even = next(w for w in range(room + 1) if len(_split(widths[keys:], w)) == fewest) if room > 0 else 0
+    first = keys
+    for count in _split(widths[keys:], even):
+        chosen = [*range(keys), *range(first, first + count)]
+        _print([columns[i] for i in chosen], sum(widths[i] for i in chosen))
+        first += count
+
+
+def _split(widths: Sequence[int], room: int) -> list[int]:
+    """How many columns go side by side, at least one at a time."""
+    counts, used = [0], 0
+    for width in widths:
+        if counts[-1] and used + width > room:
+            counts.append(0)
+            used = 0
+        counts[-1] += 1
+        used += width
+    return counts
+
+
+def _print(columns: Sequence[Sequence[str]], width: int) -> None:
+    table = Table(box=box.SIMPLE_HEAD, show_edge=False, pad_edge=False, padding=(0, 1, 0, 0))
+    for header, *cells in columns:
+        numbers = all(NUMBER.fullmatch(cell) for cell in cells)
+        table.add_column(header, overflow="fold", justify="right" if numbers else "left", vertical="bottom")
+    for row in zip(*(column[1:] for column in columns), strict=True):
+        table.add_row(*row)
+    # a terminal folds what does not fit; where nobody looks at a terminal, nothing may be folded
+    console = out if out.is_terminal else _Console(width=max(width, out.width))
+    console.print(table)
+    console.print()
 
 
 def _json(report: Any, where: str | None) -> bool:
-    """Writes the report where `--json` says; true if stdout is taken by it."""
+    """Writes the report where `--json` says; true if stdout is taken by it.
+
+    Raises:
+        ConfigError: the file cannot be written.
+    """
     if where is None:
         return False
     text = json.dumps(report, indent=2, allow_nan=False, ensure_ascii=False)
     if where == "-":
         sys.stdout.write(text + "\n")
         return True
-    beside = Path(where).with_name(f".{Path(where).name}.part")
+    beside = Path(where).with_name(f".{Path(where).name}.{os.getpid()}.part")
     try:
         beside.write_text(text + "\n", encoding="utf-8")
         beside.replace(where)
+    except OSError as error:
+        raise ConfigError(f"cannot be written ({error.strerror})", where=where, fix="Choose another --json") from error
     finally:
         beside.unlink(missing_ok=True)
     return False
 
 
+class _Lines(logging.Handler):
+    """Log records as lines on stderr, above the progress bar where there is one."""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        err.print(_plain(f"{record.levelname.lower()}: {record.getMessage()}"), highlight=False, soft_wrap=True)
+
+
 def _log_to_stderr(verbose: bool, quiet: bool) -> None:
-    level = logging.ERROR if quiet else logging.DEBUG if verbose else logging.WARNING
-    logging.basicConfig(level=level, format="%(message)s", handlers=[RichHandler(console=err, show_path=False)], force=True)
+    logging.basicConfig(level=logging.ERROR if quiet else logging.WARNING, handlers=[_Lines()], force=True)
+    logger.setLevel(logging.INFO if verbose else logging.NOTSET)
 
 
 @contextmanager
 def _progress(what: str, verbose: bool, quiet: bool) -> Iterator[Callable[[int, int, str], None]]:
-    """A bar on stderr, told how much is done, of how much, and a word on it."""
+    """A bar on stderr, told how much is done, of how much, and a word on it; with --verbose the words stay as lines."""
     _log_to_stderr(verbose, quiet)
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    columns = (TextColumn("{task.description}"), BarColumn(bar_width=16), TextColumn("{task.percentage:>3.0f} %"))
     with Progress(*columns, TextColumn("{task.fields[word]}"), console=err, disable=quiet, transient=True) as bar:
         task = bar.add_task(what, total=None, word="")
 
         def tell(done: int, total: int, word: str) -> None:
             bar.update(task, completed=done, total=total, word=_plain(word))
+            if word:
+                logger.info("%s %s", what, word)
 
         yield tell
 

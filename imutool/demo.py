@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,10 +12,11 @@ import numpy as np
 
 from imutool.convert import convert
 from imutool.debias import debias
+from imutool.errors import ConfigError
 from imutool.evaluate import evaluate
 from imutool.physics.flight import flight
 from imutool.recording import Recording
-from imutool.train.fit import TrainSettings
+from imutool.train.fit import Epoch, TrainSettings
 from imutool.train.run import train
 from imutool.view import report, rerun
 from imutool.view.runs import load
@@ -45,31 +47,52 @@ class Demo:
     results: list[dict[str, Any]]
 
 
-def run(out: Path, say: Callable[[str], None], *, overwrite: bool = False) -> Demo:
-    """Runs every step in the folder `out`, saying each one.
+def run(
+    out: Path,
+    say: Callable[[str], None] = print,
+    *,
+    overwrite: bool = False,
+    progress: Callable[[Epoch], None] | None = None,
+    seed: int = TEST_SEED,
+    settings: TrainSettings | None = None,
+) -> Demo:
+    """Runs every step in the folder `out`, saying each one; `seed` is that of the flight the model is tried on.
 
     Raises:
-        ConfigError: the folder holds an earlier demo, or view or report are not installed.
+        ConfigError: the folder holds an earlier demo, or the extras view and report are not installed.
     """
+    _check(out, overwrite)
     raw, logs = out / "raw", out / "logs"
-    say(f"1. Made-up flights as raw files: {raw}")
-    for seed in (*TRAINING_SEEDS, TEST_SEED):
-        write_asl(flight(seed), raw / f"flight_{seed}")
+    names = [f"flight_{number}" for number in (*TRAINING_SEEDS, seed)]
+    log, model, debiased = logs / f"{names[-1]}.mcap", out / "model.safetensors", out / "debiased.mcap"
+    rrd, png = out / "demo.rrd", out / "errors.png"
+    say(f"1. Making up {len(names)} flights, as raw files of the EuRoC layout: {raw}")
+    for number, name in zip((*TRAINING_SEEDS, seed), names, strict=True):
+        write_asl(flight(number), raw / name)
     say(f"2. Converting them to MCAP: {logs}")
-    convert(raw, logs, format="euroc", overwrite=overwrite)
-    training = [logs / f"flight_{seed}.mcap" for seed in TRAINING_SEEDS]
-    log, model, debiased = logs / f"flight_{TEST_SEED}.mcap", out / "model.safetensors", out / "debiased.mcap"
-    say(f"3. Training on {len(training)} of them: {model}")
-    train(training, model, settings=TrainSettings(steps=STEPS), overwrite=overwrite)
-    say(f"4. Debiasing the one it has not seen: {debiased}")
+    convert(raw, logs, format="euroc", sequences=names, overwrite=overwrite)
+    say(f"3. Training the neural ODE on {len(TRAINING_SEEDS)} of them: {model}")
+    training = [logs / f"{name}.mcap" for name in names[:-1]]
+    train(training, model, settings=settings or TrainSettings(steps=STEPS), overwrite=overwrite, progress=progress)
+    say(f"4. Debiasing the one it has not seen, without its truth: {debiased}")
     debias(log, debiased, model=model, overwrite=overwrite)
-    say("5. Figures, pictures")
+    say("5. Measuring against the truth, drawing")
     results = evaluate(log, models=["static", model])
     data = load(log, models=["static", model])
-    rrd, png = out / "demo.rrd", out / "errors.png"
     rerun.show([data], save=rrd, spawn=False, overwrite=overwrite)
     report.error_curves(data, png, overwrite=overwrite)
     return Demo(log, debiased, model, rrd, png, results)
+
+
+def _check(out: Path, overwrite: bool) -> None:
+    """What would stop the demo half-way stops it now."""
+    for module, extra in (("rerun", "view"), ("matplotlib", "report")):
+        if importlib.util.find_spec(module) is None:
+            raise ConfigError(f"{module} is not installed", where="demo", fix=f"pip install 'imutool[{extra}]'")
+    if out.exists() and not out.is_dir():
+        raise ConfigError("is a file", where=out, expected="a folder")
+    if out.exists() and any(out.iterdir()) and not overwrite:
+        raise ConfigError("is not empty", where=out, fix="Choose another -o, or add --overwrite")
 
 
 def write_asl(recording: Recording, folder: Path) -> None:

@@ -38,7 +38,7 @@ class ImutoolError(Exception):
     def __str__(self) -> str:
         place = f"{self.where}: " if self.where is not None else ""
         expected = f"; expected {self.expected}" if self.expected else ""
-        fix = f" {self.fix}." if self.fix else ""
+        fix = f" {self.fix}{'' if self.fix.endswith('?') else '.'}" if self.fix else ""
         return f"{place}{self.what}{expected}.{fix}"
 
     def at(self, where: str | Path) -> ImutoolError:

@@ -77,15 +77,15 @@ def absolute(estimate: Poses, truth: Poses, valid: Mask) -> dict[str, float | No
             turn, shift = motion
             aligned = (
                 _rms(np.degrees((R_true.inv() * (turn * R_est)).magnitude())),
-                _rms(turn.apply(np.array(p_est)) + shift - p_true),
+                _rms(p_est @ turn.as_matrix().T + shift - p_true),
             )
-        known = estimate.v_w is not None and truth.v_w is not None
+        v_est, v_true = estimate.v_w, truth.v_w
         figures = {
             "aoe_deg": _rms(np.degrees((R_true.inv() * R_est).magnitude())),
             "aoe_aligned_deg": aligned[0],
             "ape_m": _rms(p_est - p_true),
             "ape_aligned_m": aligned[1],
-            "velocity_rmse_m_s": _rms(np.subtract(estimate.v_w, truth.v_w)) if known else None,  # type: ignore[arg-type]  # known: neither is None
+            "velocity_rmse_m_s": None if v_est is None or v_true is None else _rms(v_est - v_true),
         }
     _check_finite(figures)
     return figures

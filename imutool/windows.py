@@ -83,12 +83,12 @@ def velocity_residual(
     return dv_true - (A @ accel[..., None]).sum(1)[..., 0] - g_w * dt.sum(1, keepdim=True), A
 
 
-def huber_weight(size: Float[Tensor, " m"], delta: float | Float[Tensor, ""]) -> Float[Tensor, " m"]:
+def huber_weight(size: Float[Tensor, " m"], delta: Float[Tensor, " m"]) -> Float[Tensor, " m"]:
     """Weights of iteratively reweighted least squares for Huber's loss: 1 up to `delta`, then falling as 1/size."""
     return torch.where(size <= delta, torch.ones_like(size), delta / size.clamp_min(1e-300))
 
 
-def huber(size: Float[Tensor, " m"], delta: float | Float[Tensor, ""]) -> Float[Tensor, " m"]:
+def huber(size: Float[Tensor, " m"], delta: Float[Tensor, " m"]) -> Float[Tensor, " m"]:
     """Huber's loss of normalised sizes: (size/delta)²/2 up to `delta`, then linear, so that outliers pull no harder."""
     x = size / delta
     return torch.where(x <= 1, 0.5 * x * x, x - 0.5)

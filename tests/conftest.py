@@ -1,11 +1,20 @@
-"""Shapes in annotations are checked while the tests run; real recordings are found here, or their absence is said."""
+"""Shapes in annotations are checked while the tests run; real recordings are found here, or their absence is said.
+
+The installed command, made-up logs and a model trained on them are here too, for the tests of the whole way.
+"""
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 from jaxtyping import install_import_hook
+
+os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # as the command does: idle threads must not spin while others test
 
 install_import_hook(["imutool", "converters"], "beartype.beartype").__enter__()
 
@@ -18,3 +27,45 @@ def data() -> Path:
     if not DATA.is_dir():
         pytest.skip(f"real recordings are not at {DATA}")
     return DATA
+
+
+@pytest.fixture(scope="session")
+def command() -> str:
+    """The installed `imutool` of the Python that runs the tests."""
+    return str(Path(sys.executable).with_name("imutool"))
+
+
+@pytest.fixture(scope="session")
+def imutool(command: str) -> Callable[..., subprocess.CompletedProcess[str]]:
+    """Runs the installed command in a folder of its own and returns what it printed and its exit code."""
+
+    def run(*words: str | Path, cwd: Path, **options: object) -> subprocess.CompletedProcess[str]:
+        line = [command, *map(str, words)]
+        env = {**os.environ, "COLUMNS": "80", **options.pop("env", {})}  # type: ignore[dict-item]
+        return subprocess.run(
+            line,
+            cwd=cwd,
+            env=env,
+            stdin=subprocess.DEVNULL,
+            capture_output=True,
+            text=True,
+            timeout=240,
+            check=False,
+            **options,
+        )  # type: ignore[call-overload]
+
+    return run
+
+
+@pytest.fixture(scope="session")
+def logs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with flight_1.mcap and flight_2.mcap (20 s, 200 Hz, 3 s at rest), linear.safetensors of the first."""
+    from imutool.mcap_io.write import write
+    from imutool.physics.flight import flight
+    from imutool.train.run import train
+
+    folder = tmp_path_factory.mktemp("logs")
+    for seed in (1, 2):
+        write(flight(seed, duration_s=20.0), folder / f"flight_{seed}.mcap")
+    train([folder / "flight_1.mcap"], folder / "linear.safetensors", method="linear")
+    return folder

@@ -20,7 +20,7 @@ from imutool.ode import HermitePath, integrate
 F64 = torch.float64
 EXACT = 1e-12  # hundreds of float64 steps
 ORDER_TOLERANCE = 0.3  # design.md, Tests
-GRADIENT_TOLERANCE = 1e-6  # of two solutions each converged to a few 1e-8
+GRADIENT_TOLERANCE = 2e-6  # of two solutions each converged to half of it
 EYE = torch.eye(3, dtype=F64)
 
 
@@ -87,7 +87,9 @@ def test_a_path_goes_on_straight_past_its_last_knot_and_stays_before_its_first()
 def test_integer_knots_are_an_index_used_as_time() -> None:
     _, u = knots()
     path = HermitePath(torch.arange(12), u)
-    assert torch.equal(path.value(torch.tensor(3.25)), HermitePath(torch.arange(12, dtype=F64), u).value(torch.tensor(3.25, dtype=F64)))
+    assert torch.equal(
+        path.value(torch.tensor(3.25)), HermitePath(torch.arange(12, dtype=F64), u).value(torch.tensor(3.25, dtype=F64))
+    )
 
 
 def test_gradients_flow_from_a_path_to_its_samples() -> None:
@@ -126,7 +128,11 @@ class ConstantRate(nn.Module):
 
 
 class Coning(nn.Module):
-    """R = Exp(spin t z) Exp(tilt (cos, sin, 0)(wobble t)): both factors in closed form, the rate of the product too."""
+    """R = Exp(spin t z) Exp(tilt e), e = (cos, sin, 0)(wobble t): a spinning body whose axis is tilted towards e.
+
+    Its body rate by hand, e' being e turned by a right angle: the spin seen from the tilted body is
+    spin (cos(tilt) z + sin(tilt) e'), the tilting gives wobble (sin(tilt) e' - (1 - cos(tilt)) z).
+    """
 
     spin, wobble = 0.7, 1.1
 
@@ -134,20 +140,15 @@ class Coning(nn.Module):
         super().__init__()
         self.tilt = nn.Parameter(torch.tensor(tilt, dtype=F64))
 
-    def axis(self, t: Tensor) -> Tensor:
-        return torch.stack([torch.cos(self.wobble * t), torch.sin(self.wobble * t), torch.zeros_like(t)], dim=-1)
-
-    def R(self, t: Tensor) -> Tensor:
-        z = torch.tensor([0.0, 0.0, 1.0], dtype=F64)
-        return so3.exp(self.spin * t[..., None] * z) @ so3.exp(self.tilt * self.axis(t))
+    def answer(self, t: Tensor) -> Tensor:
+        zero = torch.zeros_like(t)
+        axis = torch.stack([torch.cos(self.wobble * t), torch.sin(self.wobble * t), zero], dim=-1)
+        return so3.exp(torch.stack([zero, zero, self.spin * t], dim=-1)) @ so3.exp(self.tilt * axis)
 
     def rate(self, t: Tensor) -> Tensor:
-        """Body rate by hand: the spin seen from the tilted body, and d Exp(phi)/dt = Exp(phi) [J_r(phi) dphi/dt]x."""
-        z = torch.tensor([0.0, 0.0, 1.0], dtype=F64)
-        phi = self.tilt * self.axis(t)
-        change = self.wobble * self.tilt * torch.linalg.cross(z.expand_as(phi), self.axis(t))
-        spun = (so3.exp(phi).mT @ (self.spin * z)[..., None])[..., 0]
-        return spun + (so3.right_jacobian(phi) @ change[..., None])[..., 0]
+        across = (self.spin + self.wobble) * torch.sin(self.tilt)
+        along = self.spin * torch.cos(self.tilt) - self.wobble * (1 - torch.cos(self.tilt)) + 0 * t
+        return torch.stack([-across * torch.sin(self.wobble * t), across * torch.cos(self.wobble * t), along], dim=-1)
 
     def forward(self, t: Tensor, R_wb: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
         return self.rate(t).expand(*state.shape[:-1], 3), -state + t
@@ -160,7 +161,7 @@ def constant_answer(rate: Tensor, t: Tensor) -> Tensor:
 def test_the_coning_rate_is_that_of_the_coning_rotation() -> None:
     field, t, h = Coning(), torch.linspace(0, 5, 7, dtype=F64), 1e-5
     with torch.no_grad():
-        measured = so3.log(field.R(t - h).mT @ field.R(t + h)) / (2 * h)
+        measured = so3.log(field.answer(t - h).mT @ field.answer(t + h)) / (2 * h)
         assert (measured - field.rate(t)).abs().max() < 1e-8  # h²
 
 
@@ -169,9 +170,9 @@ def test_the_coning_rate_is_that_of_the_coning_rotation() -> None:
 def test_a_constant_rate_over_many_turns_is_exact_for_every_method(method: str, dtype: torch.dtype, tolerance: float) -> None:
     """The chart turns a constant rate into a constant vector, which Euler integrates exactly; 6.4 turns, 13 charts.
 
-    In float32 the outputs of dopri5 pass through its interpolant: a few roundings each, 400 times."""
+    In float32 the outputs of dopri5 pass through its interpolant: a few roundings each, 200 times."""
     rate = torch.tensor([1.0, -2.0, 3.3], dtype=dtype)
-    t = torch.linspace(0, 10, 401, dtype=F64)
+    t = torch.linspace(0, 10, 201, dtype=F64)
     with torch.no_grad():
         R, _ = integrate(ConstantRate(rate), torch.zeros(3, dtype=dtype), t, torch.eye(3, dtype=dtype), method=method)
     assert R.dtype == dtype
@@ -181,23 +182,25 @@ def test_a_constant_rate_over_many_turns_is_exact_for_every_method(method: str, 
 @pytest.mark.parametrize(("method", "order"), [("euler", 1), ("rk4", 4)])
 def test_fixed_step_methods_converge_at_their_order_through_chart_changes(method: str, order: int) -> None:
     field, errors = Coning(), []
-    for n in (40, 80, 160, 320):
+    for n in (40, 80, 160):
         t = torch.linspace(0, 8, n + 1, dtype=F64)
         with torch.no_grad():
-            R, state = integrate(field, torch.ones(1, dtype=F64), t, field.R(t[:1])[0], method=method)
+            R, state = integrate(field, torch.ones(1, dtype=F64), t, field.answer(t[:1])[0], method=method)
             exact = t - 1 + 2 * torch.exp(-t)
-            errors.append((float((R - field.R(t)).abs().max()), float((state[:, 0] - exact).abs().max())))
+            errors.append((float((R - field.answer(t)).abs().max()), float((state[:, 0] - exact).abs().max())))
     for rotation_or_state in zip(*errors, strict=True):
         measured = np.log2(np.array(rotation_or_state[:-1]) / np.array(rotation_or_state[1:]))
         assert abs(measured[-1] - order) < ORDER_TOLERANCE, (method, measured)
 
 
-@pytest.mark.parametrize("tolerance", [1e-5, 1e-8, 1e-11])
+@pytest.mark.parametrize("tolerance", [1e-5, 1e-8, 1e-10])
 def test_dopri5_meets_its_tolerance(tolerance: float) -> None:
     field, t = Coning(), torch.linspace(0, 8, 33, dtype=F64)
     with torch.no_grad():
-        R, _ = integrate(field, torch.ones(1, dtype=F64), t, field.R(t[:1])[0], method="dopri5", rtol=tolerance, atol=tolerance)
-        assert (R - field.R(t)).abs().max() < 10 * tolerance  # 32 intervals, each of which may use up the tolerance
+        R, _ = integrate(
+            field, torch.ones(1, dtype=F64), t, field.answer(t[:1])[0], method="dopri5", rtol=tolerance, atol=tolerance
+        )
+        assert (R - field.answer(t)).abs().max() < 10 * tolerance  # 32 intervals, each of which may use up the tolerance
 
 
 def test_states_follow_the_rotation_they_depend_on() -> None:
@@ -220,24 +223,23 @@ def test_elements_of_a_batch_change_charts_at_their_own_times_and_without_distur
         def forward(self, t: Tensor, R_wb: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
             return self.rate * (1 + 0.3 * torch.sin(t)), R_wb[..., 0]
 
-    t = torch.linspace(0, 12, 241, dtype=F64)
+    t = torch.linspace(0, 12, 121, dtype=F64)
     with torch.no_grad():
         R, state = integrate(Batch(rates), torch.zeros(4, 3, dtype=F64), t, EYE.expand(4, 3, 3), method="rk4")
         turned = t + 0.3 * (1 - torch.cos(t))
         for element, rate in enumerate(rates):
-            assert (R[:, element] - so3.exp(turned[:, None] * rate)).abs().max() < 1e-7
+            assert (R[:, element] - so3.exp(turned[:, None] * rate)).abs().max() < 1e-6
             alone_R, alone_state = integrate(Batch(rate), torch.zeros(3, dtype=F64), t, EYE, method="rk4")
             assert (alone_R - R[:, element]).abs().max() < EXACT
             assert (alone_state - state[:, element]).abs().max() < EXACT
 
 
-@pytest.mark.parametrize("method", ["euler", "rk4"])
-def test_where_the_chart_changes_does_not_matter_to_a_converged_answer(method: str) -> None:
-    field, t = Coning(), torch.linspace(0, 6, 3001, dtype=F64)
+def test_where_the_chart_changes_does_not_matter_to_a_converged_answer() -> None:
+    field, t = Coning(), torch.linspace(0, 6, 151, dtype=F64)
     with torch.no_grad():
-        often, _ = integrate(field, torch.ones(1, dtype=F64), t, EYE, method=method, max_angle=0.2)
-        seldom, _ = integrate(field, torch.ones(1, dtype=F64), t, EYE, method=method, max_angle=5.0)
-    assert (often - seldom).abs().max() < (5e-3 if method == "euler" else 1e-9)
+        often, _ = integrate(field, torch.ones(1, dtype=F64), t, EYE, method="rk4", max_angle=0.2)
+        seldom, _ = integrate(field, torch.ones(1, dtype=F64), t, EYE, method="rk4", max_angle=5.0)
+    assert (often - seldom).abs().max() < 1e-6  # (0.04 s x 1.5 rad/s)^4 / 120 a step, 150 steps
 
 
 def test_float32_states_meet_float64_times_a_day_into_a_log() -> None:
@@ -258,7 +260,9 @@ def test_float32_states_meet_float64_times_a_day_into_a_log() -> None:
 # --- gradients ---------------------------------------------------------------------------------------------------------
 
 
-def gradients(field: nn.Module, method: str, *, n: int, adjoint: bool = False, max_angle: float = math.pi, span: float = 4.0) -> list[Tensor]:
+def gradients(
+    field: nn.Module, method: str, *, n: int, adjoint: bool = False, max_angle: float = math.pi, span: float = 4.0
+) -> list[Tensor]:
     """Of a scalar of everything that comes back, by the field's parameters, the start rotation and the start state."""
     generator = torch.Generator().manual_seed(7)
     t = torch.linspace(0, span, n + 1, dtype=F64)
@@ -285,13 +289,13 @@ FIELDS = [lambda: ConstantRate(torch.tensor([0.5, -0.9, 0.8], dtype=F64)), Conin
 @pytest.mark.parametrize("make", FIELDS)
 def test_a_chart_change_leaves_the_gradient_as_it_is(make: Callable[[], nn.Module]) -> None:
     """Up to 1.7 pi one chart is enough; the same with the chart changed at pi (the constant rate only), at 1 and at 0.3."""
-    one_chart = gradients(make(), "rk4", n=100, max_angle=6.2)
+    one_chart = gradients(make(), "rk4", n=60, max_angle=6.2)
     for max_angle in (math.pi, 1.0, 0.3):
-        assert_close(gradients(make(), "rk4", n=100, max_angle=max_angle), one_chart, GRADIENT_TOLERANCE)
+        assert_close(gradients(make(), "rk4", n=60, max_angle=max_angle), one_chart, GRADIENT_TOLERANCE)
 
 
 @pytest.mark.parametrize("make", FIELDS)
-@pytest.mark.parametrize(("method", "n"), [("rk4", 60), ("dopri5", 8)])
+@pytest.mark.parametrize(("method", "n"), [("rk4", 60), ("dopri5", 4)])
 def test_the_adjoint_gives_the_gradient_of_backpropagation(make: Callable[[], nn.Module], method: str, n: int) -> None:
     expected = gradients(make(), method, n=n)
     assert_close(gradients(make(), method, n=n, adjoint=True), expected, GRADIENT_TOLERANCE)
@@ -306,7 +310,7 @@ def test_the_adjoint_of_euler_comes_closer_to_backpropagation_with_the_step() ->
 
 
 def test_the_gradient_is_the_derivative() -> None:
-    rate, t = torch.tensor([0.5, -0.9, 0.8], dtype=F64), torch.linspace(0, 4, 9, dtype=F64)
+    rate, t = torch.tensor([0.5, -0.9, 0.8], dtype=F64), torch.linspace(0, 3, 6, dtype=F64)
 
     def last(A: Tensor) -> Tensor:
         def field(t: Tensor, R_wb: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:

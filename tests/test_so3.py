@@ -87,11 +87,13 @@ def test_matrices_equal_independent_ones_across_every_threshold(function: Callab
 
 @pytest.mark.parametrize("dtype", DTYPES)
 def test_log_is_accurate_from_zero_to_pi(dtype: torch.dtype) -> None:
-    xi, exact = sweep(TO_PI, dtype)
+    _, exact = sweep(TO_PI, dtype)
     R = torch.from_numpy(Rotation.from_rotvec(exact).as_matrix()).to(dtype)
     got = so3.log(R).double().numpy()
     # The nearest of the two logarithms at pi. What R lost when it was rounded comes back in the vector, no more.
-    error = np.minimum(np.abs(got - exact), np.abs(got - exact * (1 - 2 * np.pi / np.maximum(np.linalg.norm(exact, axis=1), 1e-9))[:, None]))
+    error = np.minimum(
+        np.abs(got - exact), np.abs(got - exact * (1 - 2 * np.pi / np.maximum(np.linalg.norm(exact, axis=1), 1e-9))[:, None])
+    )
     assert error.max() <= ROUNDINGS[dtype], np.linalg.norm(exact, axis=1)[error.max(axis=1).argmax()]
 
 
@@ -135,7 +137,10 @@ def test_second_derivatives_agree_with_finite_differences_at_zero_and_either_sid
 
 
 def test_the_gradient_of_log_exp_is_the_identity_up_to_pi() -> None:
-    for dtype, tolerance in ((torch.float32, 2e-5), (torch.float64, 1e-12)):  # two Jacobians of norm up to pi/2 and their inverses
+    for dtype, tolerance in (
+        (torch.float32, 2e-5),
+        (torch.float64, 1e-12),
+    ):  # two Jacobians of norm up to pi/2 and their inverses
         for angle in (0.0, 1e-6, 0.3, 0.5, 2.0, 3.0, math.pi - 1e-3, math.pi - 1e-5):
             xi = torch.tensor([angle * c for c in AXES[2]], dtype=dtype)
             J = torch.autograd.functional.jacobian(lambda v: so3.log(so3.exp(v)), xi)
@@ -162,8 +167,8 @@ def test_float32_gradients_equal_float64_ones_at_every_angle(function: Callable)
 @pytest.mark.parametrize("dtype", DTYPES)
 def test_gradients_at_exactly_zero_and_exactly_half_a_turn_are_finite(dtype: torch.dtype) -> None:
     eye, half = torch.eye(3, dtype=dtype), torch.diag(torch.tensor([1.0, -1.0, -1.0], dtype=dtype))
-    for R in (eye, half):
-        R = R.clone().requires_grad_(True)
+    for matrix in (eye, half):
+        R = matrix.clone().requires_grad_(True)
         (gradient,) = torch.autograd.grad(so3.log(R).sum(), R)
         assert torch.isfinite(gradient).all()
     assert float(so3.log(half).norm()) == pytest.approx(math.pi, abs=1e-6)

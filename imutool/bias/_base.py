@@ -10,7 +10,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, ClassVar, Literal, Protocol
+from typing import Any, ClassVar, Literal, Protocol, runtime_checkable
 
 import numpy as np
 import torch
@@ -40,6 +40,7 @@ class Segment:
         return (self.gyro if sensor == "gyro" else self.accel), self.rest[:, COLUMNS[sensor]]
 
 
+@runtime_checkable
 class Stream(Protocol):
     """A model at work on samples as they arrive, in blocks of any size; it keeps what it must remember between them."""
 

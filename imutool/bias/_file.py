@@ -8,11 +8,11 @@ import json
 import os
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from safetensors import SafetensorError, safe_open
-from safetensors.torch import save_file
+from safetensors.torch import save as save_bytes
 
 from imutool import registry
 from imutool.bias._base import BiasModel
@@ -21,6 +21,7 @@ from imutool.errors import ConfigError, ImutoolError, ModelError
 
 FORMAT = "imutool.model/1"
 MAX_BYTES = 64 << 20  # ours are under 2 MB; a file this large is no bias model
+MAX_RATE_HZ = 1e6
 RATE_TOLERANCE = 0.05  # a sensor's real rate differs from its name by a few per mille (BMI160: 199.4 for 200)
 
 
@@ -51,12 +52,20 @@ def write_tensors(tensors: Mapping[str, torch.Tensor], header: Mapping[str, str]
         raise ConfigError("exists already", where=path, fix="Choose another name or give --overwrite")
     beside = path.with_name(f".{path.name}.{os.getpid()}.part")
     try:
-        save_file(dict(tensors), beside, metadata=dict(header))
+        beside.write_bytes(_in_order(save_bytes(dict(tensors), metadata=dict(header))))
         beside.replace(path)
     except (OSError, SafetensorError) as error:
         raise ConfigError(f"cannot be written ({error})", where=path, fix="Choose another place") from error
     finally:
         beside.unlink(missing_ok=True)
+
+
+def _in_order(raw: bytes) -> bytes:
+    """A safetensors file with its header sorted: the library's order is random, and equal models should be equal files."""
+    size = int.from_bytes(raw[:8], "little")
+    header = json.dumps(json.loads(raw[8 : 8 + size]), sort_keys=True, separators=(",", ":")).encode()
+    header += b" " * (-len(header) % 8)  # the format's alignment
+    return len(header).to_bytes(8, "little") + header + raw[8 + size :]
 
 
 def read_tensors(path: Path, kind: str) -> tuple[dict[str, torch.Tensor], dict[str, str]]:
@@ -88,22 +97,22 @@ def load(path: Path) -> BiasModel:
     Raises:
         ModelError: damaged, of another version or unknown method, or with tensors that do not fit its settings.
     """
-    tensors, header = read_tensors(path, FORMAT)
+    tensors, raw = read_tensors(path, FORMAT)
+    header = _header(raw, path)
     try:
-        module = registry.load("imutool.bias", header["method"])
-        model: BiasModel = module.Model(build(module.Config, json.loads(header["settings"])), float(header["rate_hz"]))
-        card = json.loads(header["card"])
-    except (KeyError, ValueError, ImutoolError) as error:
+        module = registry.load("imutool.bias", header.method)
+        model: BiasModel = module.Model(build(module.Config, header.settings), header.rate_hz)
+    except (ValueError, OverflowError, ImutoolError) as error:
         raise ModelError(f"has a header that cannot be used ({error})", where=path) from error
     expected = {k: (tuple(v.shape), torch.float32) for k, v in model.state_dict().items()}
     found = {k: (tuple(v.shape), v.dtype) for k, v in tensors.items()}
     if found != expected:
         odd = sorted(k for k in expected.keys() | found.keys() if expected.get(k) != found.get(k))
-        raise ModelError(f"tensors {', '.join(odd[:5])} do not fit", where=path, expected=f"those of {header['method']}")
+        raise ModelError(f"tensors {', '.join(odd[:5])} do not fit", where=path, expected=f"those of {header.method}")
     if any(not bool(torch.isfinite(v).all()) for v in tensors.values()):
         raise ModelError("holds numbers that are not finite", where=path)
     model.load_state_dict(tensors)
-    model.card = {**card, "name": path.stem, "sha256": digest(path)}
+    model.card = {**header.card, "name": path.stem, "sha256": digest(path)}
     model.requires_grad_(False)
     return model.double().eval()
 
@@ -158,7 +167,35 @@ def header_of(path: Path) -> dict[str, Any]:
     """Method, rate, settings and card of a model file, without building it.
 
     Raises:
-        ModelError: as `read_tensors`.
+        ModelError: as `read_tensors`, or the header makes no sense.
     """
-    _, header = read_tensors(path, FORMAT)
-    return {"method": header["method"], "rate_hz": float(header["rate_hz"]), **json.loads(header["card"])}
+    header = _header(read_tensors(path, FORMAT)[1], path)
+    return {**header.card, "method": header.method, "rate_hz": header.rate_hz}
+
+
+class _Header(NamedTuple):
+    """What a model file says of itself."""
+
+    method: str
+    rate_hz: float
+    settings: dict[str, Any]
+    card: dict[str, Any]
+
+
+def _header(raw: Mapping[str, str], path: Path) -> _Header:
+    """A model's header, read as what it must be; it may come from anybody.
+
+    Raises:
+        ModelError: an entry is missing, is not JSON, or is of another kind.
+    """
+    try:
+        rate_hz, settings, card = float(raw["rate_hz"]), json.loads(raw["settings"]), json.loads(raw["card"])
+        if not 0.0 <= rate_hz <= MAX_RATE_HZ:
+            raise ValueError(f"rate_hz {rate_hz}")
+        if not isinstance(settings, dict) or not isinstance(card, dict):
+            raise ValueError("settings and card are tables")
+        return _Header(raw["method"], rate_hz, settings, card)
+    except KeyError as error:
+        raise ModelError(f"has a header that cannot be used (no {error})", where=path) from error
+    except (ValueError, RecursionError) as error:
+        raise ModelError(f"has a header that cannot be used ({error})", where=path) from error

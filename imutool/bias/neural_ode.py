@@ -43,7 +43,7 @@ class Config(Settings, frozen=True):
     drift_step_s: Positive = 0.25
     solver: Literal["euler", "rk4", "dopri5"] = "euler"
     adjoint: bool = False
-    gyro_scale_rad_s: Positive = 0.5
+    gyro_scale_rad_s: Positive = 0.2
     gyro_curve_rad_s: Positive = 0.02
     gyro_drift_rad_s2: Positive = 1e-4
     accel_scale_m_s2: Positive = 10.0
@@ -167,12 +167,14 @@ class Model(BiasModel):
     ) -> Float[Tensor, "b n 3"]:
         """beta at each sample: the ODE is solved on a grid of `stride` samples, whose index is its time."""
         n, stride = u.shape[1], self.stride
-        steps = max(1, math.ceil((n - 1) / stride))
+        if n == 1:
+            return rest[:, None]
+        steps = math.ceil((n - 1) / stride)
         whole = (n - 1) // stride
         means = u[:, 1 : 1 + whole * stride].reshape(len(u), whole, stride, 3).mean(2)
         means = torch.cat([u[:, :1], means], dim=1)[:, :steps]
         path = HermitePath(torch.arange(steps + 1, device=u.device), torch.cat([means, means[:, -1:]], dim=1))
-        step_s = ((t[:, -1] - t[:, 0]) / max(n - 1, 1) * stride)[:, None]
+        step_s = ((t[:, -1] - t[:, 0]) / (n - 1) * stride)[:, None]
 
         beta = _solve(_OnGrid(drift, path, step_s), rest, steps, self.config.solver, self.config.adjoint)
         place = torch.arange(n, device=u.device) / stride

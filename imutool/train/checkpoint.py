@@ -9,6 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from imutool.bias._base import SENSORS
 from imutool.bias._file import read_tensors, write_tensors
 from imutool.config import plain
 from imutool.errors import ConfigError, ModelError
@@ -28,8 +29,10 @@ def save(training: Training, path: Path) -> None:
     tensors |= {"tracks": training.tracks.knots.detach(), "generator": training.generator.get_state()}
     about: dict[str, Any] = {"identity": _identity(training), "done": training.done}
     if stage := training.stage:
-        about["stage"] = {"sensor": stage.sensor, "step": stage.step, "best": stage.best, "medians": stage.loss.medians}
+        about["stage"] = {"sensor": stage.sensor, "step": stage.step, "best": stage.best}
         tensors |= {f"best.{name}": value for name, value in stage.best_state.items()}
+        tensors |= {f"mean.{name}": value for name, value in stage.mean.state_dict().items()}
+        tensors |= {f"usual.{n}": value for n, value in stage.loss.medians.items()}
         for index, state in stage.optimizer.state_dict()["state"].items():
             tensors |= {f"optimizer.{index}.{name}": value for name, value in state.items()}
     # clones: safetensors refuses tensors that share memory, as a model and its best state may
@@ -57,22 +60,25 @@ def restore(training: Training, path: Path) -> None:
         with torch.no_grad():
             training.tracks.knots.copy_(tensors["tracks"])
         training.generator.set_state(tensors["generator"])
-        training.done = about["done"]
+        training.done = {sensor: float(about["done"][sensor]) for sensor in SENSORS if sensor in about["done"]}
         if "stage" in about:
             training.stage = _stage(training, about["stage"], tensors)
-    except (KeyError, ValueError, RuntimeError) as error:
+    except (KeyError, ValueError, TypeError, AttributeError, RuntimeError) as error:
         raise ModelError(f"is no whole checkpoint ({error})", where=path, fix="Remove it to start afresh") from error
 
 
 def _stage(training: Training, about: dict[str, Any], tensors: dict[str, Tensor]) -> Stage:
-    optimizer = training.optimizer(about["sensor"])
+    stage = training.begin(about["sensor"])
+    stage.mean.load_state_dict(_part(tensors, "mean."))
     state: dict[int, dict[str, Tensor]] = {}
     for name, value in _part(tensors, "optimizer.").items():
         index, key = name.split(".", 1)
         state.setdefault(int(index), {})[key] = value
-    optimizer.load_state_dict({"state": state, "param_groups": optimizer.state_dict()["param_groups"]})
-    medians = {int(n): float(value) for n, value in about["medians"].items()}
-    return Stage(about["sensor"], optimizer, RobustLoss(medians), about["step"], about["best"], _part(tensors, "best."))
+    groups = stage.optimizer.state_dict()["param_groups"]
+    stage.optimizer.load_state_dict({"state": state, "param_groups": groups})
+    stage.loss = RobustLoss({int(n): value for n, value in _part(tensors, "usual.").items()})
+    stage.step, stage.best, stage.best_state = int(about["step"]), float(about["best"]), _part(tensors, "best.")
+    return stage
 
 
 def _part(tensors: dict[str, Tensor], prefix: str) -> dict[str, Tensor]:

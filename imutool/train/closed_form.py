@@ -17,24 +17,24 @@ from torch import Tensor
 from imutool.bias._base import COLUMNS, BiasModel, Sensor
 from imutool.errors import DataError
 from imutool.strapdown import GRAVITY_W
-from imutool.train.segments import Pool, Windows
+from imutool.train.segments import Part, Pool, Windows
 from imutool.windows import attitudes, between, huber_weight, rotation_residual, velocity_residual
 
 W_PRIOR = 0.05  # plausible misalignment; a scale error of 0.1 is two of these
 REST_PRIOR = {"gyro": 0.1, "accel": 1.0}  # rad/s, m/s²: plausible turn-on biases
 CORRELATED = 10.0  # errors of the truth last longer than a window: this many windows are taken to say the same once
 HUBER_MEDIANS = 1.5
-ITERATIONS = 8
-MAX_SAMPLES = 400_000  # of one window length, so that hours of logs cost no more memory than minutes
+LEAST_RESIDUAL = 1e-6  # rad or m/s: no truth is better, and perfect data must not outweigh the prior beyond float64's digits
+ITERATIONS, REST_ITERATIONS = 6, 3  # the rest alone is nearly linear
+MAX_SAMPLES = 120_000  # of one window length, so that hours of logs cost no more memory than minutes
 
 
 @dataclass(frozen=True)
 class Solution:
-    """W, the rest bias of each log, and the median residual of a window (rad, or m/s)."""
+    """W and the rest bias of each log (rad/s or m/s²)."""
 
     W: Float[Tensor, "3 3"]
     rest: Float[Tensor, "logs 3"]
-    residual: float
 
 
 def sensor_residual(
@@ -58,44 +58,54 @@ def sensor_residual(
 
 @torch.no_grad()
 def solve(
-    model: BiasModel, sensor: Sensor, pool: Pool, rest: Float[Tensor, "logs 6"], window_s: Sequence[float], *, matrix: bool
+    model: BiasModel,
+    sensor: Sensor,
+    pool: Pool,
+    rest: Float[Tensor, "logs 6"],
+    window_s: Sequence[float],
+    *,
+    matrix: bool,
+    part: Part = "train",
 ) -> Solution:
     """The rest biases of all logs, and with `matrix` a calibration on top of the model's, by Gauss-Newton.
 
     Windows of all lengths count together, each length against its own noise: short ones show the matrix, long ones the bias.
 
     Raises:
-        DataError: a log has no window of the training part that is free of gaps.
+        DataError: a log has no window of that part that is free of gaps.
     """
-    sets = [_some(pool.starts(n, "train", hop=max(1, n // 2)), n) for n in map(pool.samples, window_s)]
+    sets = [_some(pool.starts(n, part, hop=max(1, n // 2)), n) for n in map(pool.samples, window_s)]
     seen = torch.cat([pool.log[first] for first, _ in sets])
     missing = [name for i, name in enumerate(pool.names) if not bool((seen == i).any())]
     if missing:
         raise DataError(
-            f"no stretch of {min(window_s):g} s of truth without a gap in the training part of {', '.join(missing)}",
+            f"no stretch of {min(window_s):g} s of truth without a gap in the {part.replace('_', '-')} part of {', '.join(missing)}",
             expected="truth that covers at least one window",
             fix="Shorten the windows with --set, or leave the log out",
         )
-    rest, W, columns, residual = rest.clone(), torch.zeros(3, 3).to(rest), COLUMNS[sensor], 0.0
-    for _ in range(ITERATIONS):
-        now = torch.cat([W.flatten(), rest[:, columns].flatten()])
-        prior = torch.cat([torch.full_like(now[:9], W_PRIOR), torch.full_like(now[9:], REST_PRIOR[sensor])]) ** -2
+    rest, W, columns, known = rest.clone(), torch.zeros(3, 3).to(rest), COLUMNS[sensor], 9 if matrix else 0
+    for _ in range(ITERATIONS if matrix else REST_ITERATIONS):
+        now = torch.cat([W.flatten()[:known], rest[:, columns].flatten()])
+        prior = torch.full_like(now, REST_PRIOR[sensor] ** -2)
+        prior[:known] = W_PRIOR**-2
         H, g = torch.diag(prior), prior * now
         for first, n in sets:
             if not len(first):
                 continue
             windows = pool.windows(first, n, rest[pool.log[first]])
-            e, A = sensor_residual(model, sensor, windows, W)
-            u, _ = windows.segment.of(sensor)
-            u = between(u) if sensor == "gyro" else u
-            J = _derivative(A, u, windows.log, len(pool.names), matrix=matrix)
-            weight, residual = _weight(e), float(e.norm(dim=1).median())
+            e, A = sensor_residual(model, sensor, windows, W if matrix else None)
+            J = _by_rest(A, windows.log, len(pool.names))
+            if matrix:
+                u, _ = windows.segment.of(sensor)
+                J = torch.cat([_by_matrix(A, between(u) if sensor == "gyro" else u), J], dim=2)
+            weight = _weight(e, windows.log, len(pool.names))
             H += torch.einsum("m,mij,mik->jk", weight, J, J)
             g += torch.einsum("m,mij,mi->j", weight, J, e)
         step = -torch.linalg.solve(H, g)
-        W = W + step[:9].reshape(3, 3)
-        rest[:, columns] += step[9:].reshape(-1, 3)
-    return Solution(W, rest[:, columns].clone(), residual)
+        if matrix:
+            W = W + step[:9].reshape(3, 3)
+        rest[:, columns] += step[known:].reshape(-1, 3)
+    return Solution(W, rest[:, columns].clone())
 
 
 def _some(first: Int[Tensor, " m"], n: int) -> tuple[Int[Tensor, " k"], int]:
@@ -103,19 +113,27 @@ def _some(first: Int[Tensor, " m"], n: int) -> tuple[Int[Tensor, " k"], int]:
     return first[:: max(1, -(-len(first) * n // MAX_SAMPLES))], n
 
 
-def _derivative(
-    A: Float[Tensor, "m n 3 3"], u: Float[Tensor, "m n 3"], log: Int[Tensor, " m"], logs: int, *, matrix: bool
-) -> Float[Tensor, "m 3 k"]:
-    """d e / d (W row by row, rest of each log): taking `d` off sample k adds A_k d to the residual."""
-    of_W = torch.einsum("mkij,mkl->mijl", A, u).flatten(2)
-    of_rest = A.new_zeros(len(A), 3, logs, 3)
-    of_rest[torch.arange(len(A), device=A.device), :, log] = A.sum(1)
-    return torch.cat([of_W if matrix else torch.zeros_like(of_W), of_rest.flatten(2)], dim=2)
+def _by_matrix(A: Float[Tensor, "m n 3 3"], u: Float[Tensor, "m n 3"]) -> Float[Tensor, "m 3 9"]:
+    """d e / d W, row by row: taking W u off sample k adds A_k W u_k to the residual."""
+    return torch.einsum("mkij,mkl->mijl", A, u).flatten(2)
 
 
-def _weight(e: Float[Tensor, "m 3"]) -> Float[Tensor, " m"]:
-    """Huber's weights, scaled so that a component of an ordinary window has about unit noise, as the prior has."""
+def _by_rest(A: Float[Tensor, "m n 3 3"], log: Int[Tensor, " m"], logs: int) -> Float[Tensor, "m 3 k"]:
+    """d e / d (rest of each log): taking a constant off all samples adds the sum of A_k times it."""
+    J = A.new_zeros(len(A), 3, logs, 3)
+    J[torch.arange(len(A), device=A.device), :, log] = A.sum(1)
+    return J.flatten(2)
+
+
+def _weight(e: Float[Tensor, "m 3"], log: Int[Tensor, " m"], logs: int) -> Float[Tensor, " m"]:
+    """Huber's weights, scaled so that a component of an ordinary window of its log has about unit noise, as the prior has."""
     size = e.norm(dim=1)
-    delta = HUBER_MEDIANS * size.median().clamp_min(1e-12)
+    delta = HUBER_MEDIANS * median_per_log(size, log, logs)[log]
     weight: Tensor = huber_weight(size, delta) * 3 / delta**2 / CORRELATED
     return weight
+
+
+def median_per_log(size: Float[Tensor, " m"], log: Int[Tensor, " m"], logs: int) -> Float[Tensor, " logs"]:
+    """The median size of each log's windows: truths differ in quality by a factor of eight between rooms of one data set."""
+    medians = [size[log == i].median() if bool((log == i).any()) else size.median() for i in range(logs)]
+    return torch.stack(medians).clamp_min(LEAST_RESIDUAL)

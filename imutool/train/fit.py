@@ -2,12 +2,14 @@
 
 Every step draws windows of several lengths from all logs at once. Beside the sensor's weights each log has a track of its
 own rest bias, free but slow, so that what belongs to a run cannot be mistaken for what belongs to the sensor. The model kept is
-the one that drifts least over the longest windows of the held-out part, the closed form it started from included.
+the one that drifts least over the longest windows of the held-out part, the closed form it started from included. What is judged
+and kept is a running mean over the last steps, which a single step's draw of windows cannot throw off.
 """
 
 from __future__ import annotations
 
 import copy
+import math
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
@@ -17,6 +19,7 @@ import msgspec
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
+from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
 from imutool import registry
 from imutool.bias._base import COLUMNS, SENSORS, BiasModel, Sensor
@@ -24,6 +27,7 @@ from imutool.config import Settings, build
 from imutool.errors import ConfigError, DataError, NumericsError
 from imutool.recording import Recording
 from imutool.train import closed_form, statistics
+from imutool.train.closed_form import median_per_log
 from imutool.train.loss import RobustLoss, error
 from imutool.train.segments import Pool
 
@@ -33,6 +37,9 @@ Count = Annotated[int, msgspec.Meta(ge=1)]
 TRACK_UNIT = {"gyro": 1e-1, "accel": 1.0}  # one unit of a track's parameter, rad/s and m/s²
 TRACK_WALK = {"gyro": 1e-4, "accel": 2e-3}  # how far a rest bias may walk in a second^1/2, rad/s and m/s²
 LONGEST_HELD_OUT_S = {"gyro": 20.0, "accel": 5.0}
+HELD_OUT_HOP_S = 1.0
+USUAL_SAMPLES = 200_000  # enough for a median
+AVERAGE_STEPS = 30  # over which weights are averaged
 TRIM = 0.9  # the worst tenth of the held-out windows is where the truth has outliers
 
 
@@ -42,12 +49,13 @@ class TrainSettings(Settings, frozen=True):
     seed: int = 0
     gyro_window_s: tuple[Positive, ...] = (1.0, 4.0, 15.0)
     accel_window_s: tuple[Positive, ...] = (0.5, 2.0)
-    samples: Count = 10_000
+    samples: Count = 8_000
     steps: Count = 300
-    learning_rate: Positive = 3e-3
+    gyro_rate: Positive = 1e-2  # learning rates
+    accel_rate: Positive = 3e-3
     weight_decay: Annotated[float, msgspec.Meta(ge=0)] = 1e-4
     track_knot_s: Positive = 20.0
-    validate_every: Count = 20
+    validate_every: Count = 30
     model: dict[str, Any] = msgspec.field(default_factory=dict)
 
 
@@ -118,7 +126,8 @@ class Stage:
 
     sensor: Sensor
     optimizer: torch.optim.Optimizer
-    loss: RobustLoss = field(default_factory=RobustLoss)
+    mean: AveragedModel  # of the model
+    loss: RobustLoss
     step: int = 0
     best: float = float("inf")
     best_state: dict[str, Tensor] = field(default_factory=dict)
@@ -155,7 +164,7 @@ class Training:
                 continue
             if self.stage is None:
                 self._closed_form(sensor)
-                self.stage = Stage(sensor, self.optimizer(sensor))
+                self.stage = self.begin(sensor)
             yield from self._descend(self.stage)
             self.model.load_state_dict(self.stage.best_state)
             self.done[sensor], self.stage = self.stage.best, None
@@ -163,11 +172,19 @@ class Training:
         statistics.store(self.model, self.pool, self.tracks.per_log().detach(), lengths)
         self.model.requires_grad_(False).eval()
 
-    def held_out(self, sensor: Sensor) -> float:
-        """Error over the longest windows that fit the held-out parts: the mean without the worst tenth (rad or m/s)."""
+    def held_out(self, sensor: Sensor, model: BiasModel) -> float:
+        """Error over the longest windows that fit the held-out parts: the mean without the worst tenth (rad or m/s).
+
+        Each log's constant is solved for on that part first: it belongs to the run, and what is judged here is the sensor.
+        """
         first, n = self._held_out_windows(sensor)
+        rest, lengths = self.tracks.per_log().detach(), self._window_s(sensor)[:2]
+        columns = COLUMNS[sensor]
+        solved = closed_form.solve(model, sensor, self.pool, rest, lengths, matrix=False, part="held_out")
+        rest[:, columns] = solved.rest
         with torch.no_grad():
-            errors = torch.cat([self._errors(sensor, part, n) for part in torch.split(first, 256)])
+            parts = torch.split(first, 64)
+            errors = torch.cat([error(model, sensor, self.pool.windows(f, n, rest[self.pool.log[f]])) for f in parts])
         kept = errors.sort().values[: max(1, int(TRIM * len(errors)))]
         return float(kept.mean())
 
@@ -175,7 +192,7 @@ class Training:
         pool, window_s = self.pool, LONGEST_HELD_OUT_S[sensor]
         while window_s > 0.1:
             n = pool.samples(window_s)
-            first = pool.starts(n, "held_out", hop=max(1, pool.samples(0.25)), ends_only=True)
+            first = pool.starts(n, "held_out", hop=max(1, pool.samples(HELD_OUT_HOP_S)), ends_only=True)
             if len(torch.unique(pool.log[first])) == len(pool.names):
                 return first, n
             window_s *= 0.8
@@ -187,8 +204,8 @@ class Training:
         )
 
     def _errors(self, sensor: Sensor, first: Int[Tensor, " m"], n: int) -> Float[Tensor, " m"]:
-        windows = self.pool.windows(first, n, self.tracks.at(self.pool.log[first], self.pool.t[first]))
-        return error(self.model, sensor, windows)
+        rest = self.tracks.at(self.pool.log[first], self.pool.t[first])
+        return error(self.model, sensor, self.pool.windows(first, n, rest))
 
     def _closed_form(self, sensor: Sensor) -> None:
         """Calibration and rest biases, as far as windows and a matrix show them."""
@@ -202,21 +219,37 @@ class Training:
         self.model.begin_at(sensor, solution.W)
         self.tracks.set(sensor, solution.rest)
 
-    def optimizer(self, sensor: Sensor) -> torch.optim.Optimizer:
-        """A fresh optimiser for one stage: the sensor's weights and the tracks."""
-        rate, decay = self.settings.learning_rate, self.settings.weight_decay
+    def begin(self, sensor: Sensor) -> Stage:
+        """A fresh stage, from where model and tracks stand: it moves the sensor's weights and the tracks."""
+        rate, decay = self._rate(sensor), self.settings.weight_decay
         weights = [w for name, w in self.model.named_parameters() if f".{sensor}" in f".{name}"]
         groups = [
             {"params": weights, "weight_decay": decay},
             {"params": [self.tracks.knots], "weight_decay": 0.0},
         ]
-        return torch.optim.AdamW(groups, lr=rate)
+        average = get_ema_multi_avg_fn(1 - 1 / AVERAGE_STEPS)  # type: ignore[no-untyped-call]  # torch gives it no type
+        usual = RobustLoss({n: self._usual_errors(sensor, first, n) for n, first in self._pools(sensor)})
+        return Stage(sensor, torch.optim.AdamW(groups, lr=rate), AveragedModel(self.model, multi_avg_fn=average), usual)
+
+    def _pools(self, sensor: Sensor) -> list[tuple[int, Int[Tensor, " _"]]]:
+        """Steps of each window length, and the first samples of its windows in the training part."""
+        lengths = map(self.pool.samples, self._window_s(sensor))
+        return [(n, first) for n in lengths if len(first := self.pool.starts(n, "train"))]
+
+    @torch.no_grad()
+    def _usual_errors(self, sensor: Sensor, first: Int[Tensor, " m"], n: int) -> Float[Tensor, " logs"]:
+        """The median error of each log's windows; of a log that has none of this length, that of all."""
+        some = first[:: max(1, -(-len(first) * n // USUAL_SAMPLES))]
+        size = torch.cat([self._errors(sensor, part, n) for part in torch.split(some, 64)])
+        return median_per_log(size, self.pool.log[some], len(self.pool.names))
+
+    def _rate(self, sensor: Sensor) -> float:
+        return self.settings.gyro_rate if sensor == "gyro" else self.settings.accel_rate
 
     def _descend(self, stage: Stage) -> Iterator[Epoch]:
         settings, sensor = self.settings, stage.sensor
         steps = settings.steps if self.model.iterative else 0
-        lengths = map(self.pool.samples, self._window_s(sensor))
-        pools = [(n, first) for n in lengths if len(first := self.pool.starts(n, "train"))]
+        pools = self._pools(sensor)
         began, begun_at = time.monotonic(), stage.step
         loss = float("nan")
         while True:
@@ -228,8 +261,8 @@ class Training:
                 return
             loss = self._one_step(stage, pools, steps)
 
-    def _one_step(self, stage: Stage, pools: Sequence[tuple[int, Int[Tensor, " m"]]], steps: int) -> float:
-        rate = self.settings.learning_rate * 0.5 * (1 + torch.cos(torch.tensor(torch.pi * stage.step / steps)).item())
+    def _one_step(self, stage: Stage, pools: Sequence[tuple[int, Int[Tensor, " _"]]], steps: int) -> float:
+        rate = self._rate(stage.sensor) * 0.5 * (1 + torch.cos(torch.tensor(torch.pi * stage.step / steps)).item())
         for group in stage.optimizer.param_groups:
             group["lr"] = rate
         # the losses are means over windows; a second of data counts once against the walk
@@ -237,21 +270,25 @@ class Training:
         for n, first in pools:
             count = max(4, self.settings.samples // n)
             chosen = torch.randint(len(first), (count,), generator=self.generator).to(first.device)
-            total = total + stage.loss(self._errors(stage.sensor, first[chosen], n), n)
+            size = self._errors(stage.sensor, first[chosen], n)
+            total = total + stage.loss(size, self.pool.log[first[chosen]], n)
         stage.optimizer.zero_grad()
         total.backward()  # type: ignore[no-untyped-call]
         if not bool(torch.isfinite(total)):
             raise NumericsError(
-                f"the loss is {float(total)} at step {stage.step} of the {stage.sensor} stage",
+                f"the loss is {float(total.detach())} at step {stage.step} of the {stage.sensor} stage",
                 expected="a finite loss",
-                fix="Lower --set learning_rate",
+                fix=f"Lower --set {stage.sensor}_rate",
             )
         stage.optimizer.step()
+        stage.mean.update_parameters(self.model)
         stage.step += 1
         return float(total.detach())
 
     def _validate(self, stage: Stage) -> float:
-        score = self.held_out(stage.sensor)
+        model = stage.mean.module
+        assert isinstance(model, BiasModel)
+        score = self.held_out(stage.sensor, model)
         if score < stage.best:
-            stage.best, stage.best_state = score, copy.deepcopy(self.model.state_dict())
+            stage.best, stage.best_state = score, copy.deepcopy(model.state_dict())
         return score

@@ -1,8 +1,8 @@
 """The losses of both stages, robust and without a unit: what integration over a window misses of the truth.
 
-The paper's are mean squares (eq. 16, 17). Here a window's error is divided by what is usual for windows of its length and
+The paper's are mean squares (eq. 16, 17). Here a window's error is divided by what is usual for windows of its length and log and
 goes through Huber's function, so that an outlier of the motion capture pulls no harder than an ordinary window, and windows
-of every length count alike.
+of every length and every log count alike.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from imutool import so3
@@ -20,7 +20,6 @@ from imutool.train.segments import Windows
 from imutool.windows import attitudes, between, end_attitude, huber
 
 HUBER_MEDIANS = 1.5
-MEMORY = 0.95  # of the running median of each window length
 
 
 def orientation_error(model: BiasModel, windows: Windows) -> Float[Tensor, " batch"]:
@@ -54,16 +53,17 @@ def error(model: BiasModel, sensor: Sensor, windows: Windows) -> Float[Tensor, "
 
 
 class RobustLoss:
-    """Huber's loss with its width at 1.5 running medians of each window length's errors."""
+    """Huber's loss, its width 1.5 medians of the errors that windows of this length of this log had at the stage's start.
 
-    def __init__(self, medians: Mapping[int, float] | None = None) -> None:
-        self.medians = dict(medians or {})
+    Fixed during a stage, so that the loss can be followed; by log, because truths differ in quality by a factor of eight.
+    """
 
-    def __call__(self, size: Float[Tensor, " batch"], n: int) -> Float[Tensor, ""]:
-        """Mean loss of windows of n samples."""
-        now = float(size.detach().median())
-        self.medians[n] = MEMORY * self.medians.get(n, now) + (1 - MEMORY) * now
-        return huber(size, HUBER_MEDIANS * max(self.medians[n], 1e-12)).mean()
+    def __init__(self, medians: Mapping[int, Float[Tensor, " logs"]]) -> None:
+        self.medians = medians
+
+    def __call__(self, size: Float[Tensor, " batch"], log: Int[Tensor, " batch"], n: int) -> Float[Tensor, ""]:
+        """Mean loss of windows of n steps."""
+        return huber(size, HUBER_MEDIANS * self.medians[n][log]).mean()
 
 
 def _length(v: Float[Tensor, "batch k"]) -> Float[Tensor, " batch"]:

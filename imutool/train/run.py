@@ -54,16 +54,22 @@ def train(
     training = Training(recordings, method, settings, device)
     kept = checkpoint_path(out)
     if resume:
+        if not kept.exists():
+            raise ConfigError("there is no checkpoint", where=kept, fix="Train without --resume")
         checkpoint.restore(training, kept)
+    saved = resume
     try:
         for epoch in training.epochs():
             if progress is not None:
                 progress(epoch)
             if training.model.iterative and epoch.step:
                 checkpoint.save(training, kept)
-    except KeyboardInterrupt:
-        if training.model.iterative and training.stage and training.stage.step:
-            checkpoint.save(training, kept)
+                saved = True
+    except KeyboardInterrupt as interrupt:  # it may have struck in the middle of a step: what is kept is from before
+        if saved:
+            raise KeyboardInterrupt(
+                f"{kept} holds what is done; the same command with --resume goes on from there"
+            ) from interrupt
         raise
     model = training.model
     about = {log.metadata.get("imutool", {}).get(key) for log in recordings for key in ("sensor",)}

@@ -19,6 +19,7 @@ from imutool import so3
 from imutool.bias._base import Segment
 from imutool.errors import DataError
 from imutool.recording import Recording, seconds
+from imutool.stationary import GAP_PERIODS
 from imutool.strapdown import truth_velocity
 
 HELD_OUT = 0.2  # the last fifth of every training log validates (method.md, Arrangement)
@@ -32,7 +33,7 @@ class Windows:
     """Some windows of n samples, the true poses at the first and the last, and the log each comes from."""
 
     segment: Segment
-    dt: Float[Tensor, "batch n-1"]
+    dt: Float[Tensor, "batch steps"]
     R_start: Float[Tensor, "batch 3 3"]
     R_end: Float[Tensor, "batch 3 3"]
     v_start: Float[Tensor, "batch 3"]
@@ -57,6 +58,7 @@ class Pool:
     log: Int[Tensor, " n"]
     trusted: Bool[Tensor, " n"]
     held_out: Bool[Tensor, " n"]
+    late: Bool[Tensor, " n"]  # samples are missing just before this one
 
     @classmethod
     def of(cls, recordings: Sequence[Recording], dtype: torch.dtype = torch.float64, device: str = "cpu") -> Pool:
@@ -85,6 +87,7 @@ class Pool:
             log=torch.as_tensor(log, device=device),
             trusted=flags("trusted"),
             held_out=flags("held_out"),
+            late=flags("late"),
         )
 
     def samples(self, window_s: float) -> int:
@@ -92,10 +95,10 @@ class Pool:
         return max(1, round(window_s * self.rate_hz))
 
     def starts(self, n: int, part: Part, *, hop: int = 1, ends_only: bool = False) -> Int[Tensor, " m"]:
-        """First samples of all windows of n steps that stay in one log and one part and touch no gap in the truth.
+        """First samples of all windows of n steps that stay in one log and one part, and touch no gap in truth or samples.
 
         Of every `hop` one is kept. With `ends_only` the truth is asked for at the two ends alone: for validation over times
-        longer than the gaps are apart.
+        longer than its gaps are apart.
         """
         first = torch.arange(0, max(len(self.t) - n, 0), hop, device=self.t.device)
         last = first + n
@@ -104,6 +107,8 @@ class Pool:
             wanted = part == "held_out"
             keep &= (self.held_out[first] == wanted) & (self.held_out[last] == wanted)
         keep &= self.trusted[first] & self.trusted[last]
+        breaks = torch.cumsum(self.late, dim=0)
+        keep &= breaks[last] == breaks[first]
         if not ends_only:
             holes = torch.cumsum(~self.trusted, dim=0)
             keep &= holes[last] == holes[first]
@@ -140,6 +145,7 @@ class _Track:
     p_wb: np.ndarray
     trusted: np.ndarray
     held_out: np.ndarray
+    late: np.ndarray
 
     @classmethod
     def of(cls, recording: Recording) -> _Track:
@@ -165,4 +171,5 @@ class _Track:
             poses.p_wb,
             trusted,
             held_out,
+            np.diff(t, prepend=t[0]) > GAP_PERIODS * imu.period_s,
         )

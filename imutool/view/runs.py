@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from imutool.evaluate import runs
 from imutool.mcap_io import schema
 from imutool.mcap_io.log import DERIVED_KEY, Log
 from imutool.mcap_io.read import read
@@ -24,8 +23,15 @@ def load(
     recording = read(log, imu=imu, truth=truth)
     if recording.truths:
         recording = recording.with_truth(truth or next(iter(recording.truths)))
-    found = [Run(n, d.imu, d.bias[:, :3], d.bias[:, 3:]) for n, d, _ in runs(recording, models, init, log)]
+    found = _with_models(recording, models, init, log) if models else [Run.raw(recording.imu)]
     return build(recording, [*found, *_already_debiased(log, recording)])
+
+
+def _with_models(recording: Recording, models: Sequence[str | Path], init: str, log: Path) -> list[Run]:
+    """Raw, then as each model corrects it; only this needs torch."""
+    from imutool.evaluate import runs
+
+    return [Run(n, d.imu, d.bias[:, :3], d.bias[:, 3:]) for n, d, _ in runs(recording, models, init, log)]
 
 
 def _already_debiased(log: Path, recording: Recording) -> list[Run]:

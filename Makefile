@@ -1,0 +1,56 @@
+# Everything sets itself up: a virtual environment in .venv, filled again only when pyproject.toml or constraints.txt change.
+PYTHON ?= python3
+VENV ?= .venv
+DEMO ?= demo-out
+BIN := $(VENV)/bin
+PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt
+READY_DEMO := $(VENV)/.ready-demo
+READY_TEST := $(VENV)/.ready-test
+
+.DEFAULT_GOAL := help
+.PHONY: help demo test lint format bench clean
+.NOTPARALLEL:
+
+help:  ## say what there is
+	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "make %-8s %s\n", $$1, $$2 }' $(firstword $(MAKEFILE_LIST))
+
+demo: $(READY_DEMO)  ## the whole way on a made-up recording: convert, train, debias, evaluate, view (no download of data)
+	@echo "demo: runs on made-up flights; everything goes to $(DEMO)"
+	@$(BIN)/imutool demo --output $(DEMO) --overwrite
+
+test: lint  ## format, lint, types, then every test with warnings as errors
+	@echo "test: pytest"
+	@$(BIN)/python -m pytest
+
+lint: $(READY_TEST)  ## format, lint and types only
+	@echo "lint: ruff format, ruff check, mypy --strict"
+	@$(BIN)/ruff format --check .
+	@$(BIN)/ruff check .
+	@$(BIN)/python -m mypy
+
+format: $(READY_TEST)  ## put the source in its format
+	@$(BIN)/ruff check --fix .
+	@$(BIN)/ruff format .
+
+bench: $(READY_TEST)  ## the benchmarks of tests/bench, one after the other
+	@set -e; for bench in tests/bench/[a-z]*.py; do echo "bench: $$bench"; $(BIN)/python $$bench; done
+
+clean:  ## remove the virtual environment, the demo and all caches
+	rm -rf $(VENV) $(DEMO) build dist .mypy_cache .pytest_cache .ruff_cache .hypothesis
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +
+
+$(BIN)/python:
+	@$(PYTHON) -c 'import sys; sys.exit("imutool needs Python 3.11 or newer; this is %d.%d. Try: make PYTHON=python3.12" \
+		% sys.version_info[:2] if sys.version_info < (3, 11) else 0)'
+	@echo "set-up: a virtual environment in $(VENV)"
+	@$(PYTHON) -m venv $(VENV) || { rm -rf $(VENV); echo "on Debian and Ubuntu: apt install python3-venv" >&2; exit 1; }
+
+$(READY_TEST): pyproject.toml constraints.txt | $(BIN)/python
+	@echo "set-up: imutool and what its tests need, into $(VENV) (some minutes the first time: torch is large)"
+	@$(PIP) -e '.[dev]'
+	@touch $(READY_DEMO) $@  # what the demo needs is part of it
+
+$(READY_DEMO): pyproject.toml constraints.txt | $(BIN)/python
+	@echo "set-up: imutool with viewer and report, into $(VENV) (some minutes the first time: torch is large)"
+	@$(PIP) -e '.[view,report]'
+	@touch $@

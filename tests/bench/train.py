@@ -1,0 +1,354 @@
+"""Milliseconds per optimisation step: `python tests/bench/train.py [--released DIR]`, on a made-up flight.
+
+All contestants take 1000 segments of 16 samples (the paper's batch), gyro stage and accel stage:
+
+(a) fast path: what `imutool train` does with such windows. The rest bias is integrated on the grid of the drift, the
+    curve is one evaluation for all samples, rotations are a product taken as a tree (`imutool.train.loss`).
+(b) chart ODE: the paper's joint form through `imutool.ode.integrate` with Euler, one step a sample, of the same field with
+    the same parts of the same model: state (xi, beta_g), in the accel stage (xi, beta_g, beta_a, v, p) with the gyro frozen.
+(c) with `--released DIR`, the paper's own code, run by its own training functions. DIR holds its BiasDy, SO3diffeq and
+    Third_party; nothing in it is edited, and nothing of it is kept here:
+
+        git clone https://github.com/UMich-CURLY/Debias_IMU DIR      (or `git archive HEAD BiasDy SO3diffeq Third_party`)
+
+    The flight is given to it as EuRoC files, which it reads and caches itself. It asks for a GPU, so `Tensor.cuda` and three
+    memory statistics of `torch.cuda` are made to do nothing here; its device arguments are given as "cpu". Its
+    SummaryWriter is replaced by a stopwatch: a step is the time from one logged training loss to the next, the whole body
+    of its loop, with neither tensorboard's writing nor validation nor saving. "mended" is the same with one method
+    replaced: the interval of the spline comes from torch.searchsorted where it compares every time with every knot (the
+    losses must stay the same, or this stops).
+
+(a) is also timed as `imutool train` really arranges a step, with the default settings' long windows.
+Medians of interleaved rounds, after one that does not count. CPU seconds stand beside wall seconds because the machine
+may be shared. Ours runs in float64 as in training, the released code in float32 as it does.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import importlib
+import io
+import os
+import statistics
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from itertools import pairwise
+from pathlib import Path
+from types import ModuleType
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from imutool import so3
+from imutool.bias._base import COLUMNS, BiasModel, Sensor
+from imutool.demo import write_asl
+from imutool.ode import HermitePath, Method, integrate
+from imutool.physics.flight import flight
+from imutool.recording import Recording
+from imutool.strapdown import GRAVITY_W
+from imutool.train.fit import Training, TrainSettings
+from imutool.train.loss import RobustLoss, error
+from imutool.train.segments import Windows
+from imutool.windows import end_attitude
+
+STAGES: tuple[Sensor, Sensor] = ("gyro", "accel")
+UNITS = {"gyro": "rad", "accel": "m/s"}
+STEPS_A_ROUND = 8
+THEIR_STEPS = 4  # the first two are dropped: one warms up, the other's interval holds the validation
+SAME = {"gyro": 1e-4, "accel": 1e-3}  # rad, m/s: (a) and a fourth-order (b) are one problem; Euler's is half a sample late
+
+
+class Spent(NamedTuple):
+    """Seconds of one step."""
+
+    wall: float
+    cpu: float
+
+
+Round = Callable[[], list[Spent]]
+
+
+def now() -> Spent:
+    """Both clocks."""
+    return Spent(time.perf_counter(), time.process_time())
+
+
+def since(start: Spent, end: Spent) -> Spent:
+    """What lies between two readings."""
+    return Spent(end.wall - start.wall, end.cpu - start.cpu)
+
+
+def repeated(step: Callable[[], object], times: int) -> Round:
+    """A round of several steps, each timed by itself."""
+
+    def run() -> list[Spent]:
+        spent = []
+        for _ in range(times):
+            start = now()
+            step()
+            spent.append(since(start, now()))
+        return spent
+
+    return run
+
+
+# --- ours ---------------------------------------------------------------------------------------------------------------
+
+
+class Batch(NamedTuple):
+    """Where some windows of n steps may start, and how many of them a step takes."""
+
+    first: Tensor
+    n: int
+    count: int
+
+
+Error = Callable[[BiasModel, Sensor, Windows], Tensor]
+
+
+def drawn(training: Training, batch: Batch) -> Windows:
+    """Windows at random places, each with the rest bias of its log's track."""
+    chosen = batch.first[torch.randint(len(batch.first), (batch.count,), generator=training.generator)]
+    pool = training.pool
+    return pool.windows(chosen, batch.n, training.tracks.at(pool.log[chosen], pool.t[chosen]))
+
+
+def our_step(recording: Recording, sensor: Sensor, batches: list[Batch], measure: Error) -> Callable[[], float]:
+    """One optimisation step as `imutool train` takes it, with a given way to come by the error of a window."""
+    training = Training([recording], "neural_ode")
+    optimizer, loss = training.optimizer(sensor), RobustLoss()
+    if sensor == "accel":  # the paper's second stage leaves the gyro's network alone
+        for part in (training.model.curve, training.model.drift):
+            part["gyro"].requires_grad_(False)
+
+    def step() -> float:
+        total = training.tracks.wandering(sensor) / (len(training.pool.t) / training.pool.rate_hz)
+        for batch in batches:
+            total = total + loss(measure(training.model, sensor, drawn(training, batch)), batch.n)
+        optimizer.zero_grad()
+        total.backward()
+        optimizer.step()
+        return float(total.detach())
+
+    return step
+
+
+def chart_solution(model: BiasModel, sensor: Sensor, windows: Windows, method: Method) -> tuple[Tensor, Tensor]:
+    """Attitudes and states of all samples, by the ODE in the chart (`imutool.ode`): the segments share one clock."""
+    segment = windows.segment
+    t = segment.t[0]
+    gyro, accel = HermitePath(t, segment.gyro), HermitePath(t, segment.accel)
+    rest_g, rest_a = segment.rest[:, COLUMNS["gyro"]], segment.rest[:, COLUMNS["accel"]]
+    curve, drift = model.curve, model.drift
+
+    def rotating(t: Tensor, R_wb: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
+        """(omega, d beta_g/dt)."""
+        u, beta = gyro.value(t), state[:, :3]
+        return u - beta - curve["gyro"](u), drift["gyro"](beta, u, gyro.derivative(t))
+
+    def moving(t: Tensor, R_wb: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
+        """(omega, d (beta_g, beta_a, v, p)/dt)."""
+        omega, d_beta_g = rotating(t, R_wb, state)
+        u, beta, v = accel.value(t), state[:, 3:6], state[:, 6:9]
+        force = u - beta - curve["accel"](u)
+        a_w = (R_wb @ force[..., None])[..., 0] + force.new_tensor(GRAVITY_W)
+        return omega, torch.cat([d_beta_g, drift["accel"](beta, u, accel.derivative(t)), a_w, v], dim=-1)
+
+    if sensor == "gyro":
+        return integrate(rotating, rest_g, t, windows.R_start, method=method)
+    start = torch.cat([rest_g.detach(), rest_a, windows.v_start, windows.p_start], dim=-1)
+    return integrate(moving, start, t, windows.R_start, method=method)
+
+
+def chart_error(model: BiasModel, sensor: Sensor, windows: Windows, method: Method = "euler") -> Tensor:
+    """The error of `imutool.train.loss` at the end of each window, of the chart's solution."""
+    R_wb, state = chart_solution(model, sensor, windows, method)
+    if sensor == "gyro":
+        return (so3.log(R_wb[-1].mT @ windows.R_end).square().sum(1) + 1e-24).sqrt()
+    off_v, off_p = state[-1, :, 6:9] - windows.v_end, state[-1, :, 9:12] - windows.p_end
+    off = torch.cat([off_v, off_p / windows.dt.sum(1, keepdim=True)], dim=1)
+    return (off.square().sum(1) + 1e-24).sqrt()
+
+
+@torch.no_grad()
+def disagreement(recording: Recording, sensor: Sensor, batch: Batch, method: Method) -> float:
+    """Median distance between where (a) and (b) end on the same windows before any step: rad, or m/s."""
+    training = Training([recording], "neural_ode")
+    windows = drawn(training, batch)
+    model, segment = training.model, windows.segment
+    if sensor == "gyro":
+        R_wb, _ = chart_solution(model, sensor, windows, method)
+        R_fast = end_attitude(windows.R_start, segment.gyro - model.sensor_bias("gyro", segment), windows.dt)
+        apart = so3.log(R_wb[-1].mT @ R_fast).norm(dim=1)
+    else:
+        apart = (chart_error(model, sensor, windows, method) - error(model, sensor, windows)).abs()
+    return float(apart.median())
+
+
+# --- theirs -------------------------------------------------------------------------------------------------------------
+
+
+class Stopwatch:
+    """Stands in for tensorboard's SummaryWriter: notes when each training loss is logged, and its value."""
+
+    marks: list[tuple[Spent, float]] = []  # noqa: RUF012  the released functions make the object, so the class keeps the marks
+
+    def __init__(self, folder: str) -> None:
+        type(self).marks = []
+
+    def add_scalar(self, name: str, value: float, epoch: int) -> None:
+        if name == "train_loss":
+            self.marks.append((now(), value))
+
+    def close(self) -> None:
+        pass
+
+
+def nearest_knot(spline: object, t: Tensor) -> tuple[Tensor, Tensor]:
+    """The mended search: where in the spline's knots each time lies, and how far past that knot."""
+    times, last = spline._times, spline._b.size(-2) - 1  # type: ignore[attr-defined]
+    index = (torch.searchsorted(times, t.contiguous(), right=True) - 1).clamp(0, last)
+    return t - times[index], index
+
+
+class Released:
+    """The paper's code, imported from its folder with its GPU calls silenced."""
+
+    def __init__(self, folder: Path, recording: Recording, samples: int, segments: int, work: Path) -> None:
+        torch.Tensor.cuda = lambda self, *_, **__: self  # type: ignore[method-assign]
+        torch.cuda.reset_peak_memory_stats = torch.cuda.synchronize = lambda *_: None
+        torch.cuda.max_memory_allocated = lambda *_: 0
+        stub = ModuleType("torch.utils.tensorboard")
+        stub.SummaryWriter = Stopwatch  # type: ignore[attr-defined]
+        sys.modules["torch.utils.tensorboard"] = stub
+        sys.path[:0] = [str(folder), str(folder / "BiasDy")]
+        self.learning = importlib.import_module("learning")
+        self.network = importlib.import_module("network_for_BiadDy")
+        self.spline = importlib.import_module("Interpolation").CubicHermiteSpline
+        self.search, self.work = self.spline._interpret_t, work
+
+        write_asl(recording, work / "data" / recording.name)
+        (work / "cache").mkdir()
+        sequences = [recording.name]
+        settings = {
+            "dataset_name": "EUROC",
+            "data_dir": str(work / "data"),
+            "data_cache_dir": str(work / "cache"),
+            "train_seqs": sequences,
+            "val_seqs": sequences,
+            "test_seqs": [],
+            "dt": recording.imu.period_s,
+            "percent_for_val": 0.2,
+            "loss_window": samples,
+            "batch_size": segments,
+            "sg_window_bw": 1,
+            "sg_order_bw": 0,
+            "sg_window_ba": 1,
+            "sg_order_ba": 0,
+        }
+        dataset = importlib.import_module("dataset")
+        with contextlib.redirect_stdout(io.StringIO()):
+            self.train = dataset.EUROCDataset(**settings, mode="train")
+            self.validate = dataset.EUROCDataset(**settings, mode="val")
+
+    def run(self, sensor: Sensor, *, mended: bool) -> list[tuple[Spent, float]]:
+        """Its own training function for a few steps: when each loss was logged, and the losses (their seed is fixed)."""
+        self.spline._interpret_t = nearest_knot if mended else self.search
+        with contextlib.redirect_stdout(io.StringIO()):
+            out, common = str(self.work), {"device": "cpu", "epoch": THEIR_STEPS}
+            if sensor == "gyro":
+                self.learning.Gyro_train(self.train, self.validate, out, "bw_func_net", **common)
+            else:
+                torch.manual_seed(0)
+                gyro = self.network.bw_func_choose("bw_func_net", "cpu")
+                self.learning.Acc_train(self.train, self.validate, out, gyro, "ba_func_net", **common)
+        return list(Stopwatch.marks)
+
+    def round(self, sensor: Sensor, *, mended: bool) -> Round:
+        """The steps after the second: the one before holds the validation that the first step ends with."""
+
+        def run() -> list[Spent]:
+            marks = [mark for mark, _ in self.run(sensor, mended=mended)]
+            return [since(a, b) for a, b in pairwise(marks[1:])]
+
+        return run
+
+    def check(self, sensor: Sensor) -> None:
+        """The mended search changes no loss by a bit."""
+        as_is, mended = ([loss for _, loss in self.run(sensor, mended=how)] for how in (False, True))
+        assert as_is == mended, (as_is, mended)
+
+
+# --- the race -----------------------------------------------------------------------------------------------------------
+
+
+def contestants(
+    sensor: Sensor, recording: Recording, samples: int, segments: int, released: Released | None
+) -> tuple[dict[str, Round], list[str]]:
+    """Everyone who runs in a stage, and what was checked before."""
+    settings, pool = TrainSettings(), Training([recording], "neural_ode").pool
+    batch = Batch(pool.starts(samples - 1, "train"), samples - 1, segments)
+    lengths = [pool.samples(s) for s in (settings.gyro_window_s if sensor == "gyro" else settings.accel_window_s)]
+    arranged = [Batch(pool.starts(n, "train"), n, max(4, settings.samples // n)) for n in lengths]
+    racing = {
+        "(a) imutool, fast path": repeated(our_step(recording, sensor, [batch], error), STEPS_A_ROUND),
+        "(b) imutool, chart ODE, euler": repeated(our_step(recording, sensor, [batch], chart_error), STEPS_A_ROUND // 4),
+    }
+    if released:
+        released.check(sensor)
+        racing["(c) released, as it is"] = released.round(sensor, mended=False)
+        racing["(c) released, mended"] = released.round(sensor, mended=True)
+    words = "+".join(f"{b.count}x{b.n + 1}" for b in arranged)
+    racing[f"imutool train's own step: {words}"] = repeated(our_step(recording, sensor, arranged, error), STEPS_A_ROUND // 4)
+    apart = {method: disagreement(recording, sensor, batch, method) for method in ("euler", "rk4")}
+    assert apart["rk4"] < SAME[sensor], apart
+    unit = UNITS[sensor]
+    notes = [f"(a) and (b) end {apart['euler']:.1e} {unit} apart with euler, {apart['rk4']:.1e} with rk4 (medians)"]
+    return racing, notes
+
+
+def race(racing: dict[str, Round], rounds: int) -> dict[str, Spent]:
+    """Median step of each contestant; every round runs all of them, the first does not count."""
+    spent: dict[str, list[Spent]] = {name: [] for name in racing}
+    for count in range(rounds + 1):
+        for name, run in racing.items():
+            steps = run()
+            if count:
+                spent[name] += steps
+    return {name: Spent(*(statistics.median(column) for column in zip(*steps, strict=True))) for name, steps in spent.items()}
+
+
+def main() -> None:
+    """Prints a table for each stage."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--released", type=Path, metavar="DIR", help="the paper's released code")
+    parser.add_argument("--samples", type=int, default=16)
+    parser.add_argument("--segments", type=int, default=1000)
+    parser.add_argument("--seconds", type=float, default=120.0, help="length of the flight (EuRoC's training runs: 84 to 182)")
+    parser.add_argument("--rounds", type=int, default=5)
+    parser.add_argument("--threads", type=int, default=1)
+    args = parser.parse_args()
+    torch.set_num_threads(args.threads)
+    recording = flight(1, duration_s=args.seconds)
+    print(f"torch {torch.__version__} on the CPU, {torch.get_num_threads()} thread(s) of {os.cpu_count()} cores", end="")
+    print(f", load {os.getloadavg()[0]:.1f}; flight of {args.seconds:g} s at {1 / recording.imu.period_s:.0f} Hz", end="")
+    print(f"; {args.segments} segments of {args.samples} samples; medians of {args.rounds} interleaved rounds")
+    with tempfile.TemporaryDirectory() as work:
+        theirs = Released(args.released, recording, args.samples, args.segments, Path(work)) if args.released else None
+        for sensor in STAGES:
+            racing, notes = contestants(sensor, recording, args.samples, args.segments, theirs)
+            medians = race(racing, args.rounds)
+            base = next(iter(medians.values()))
+            print(f"\n{sensor + ' stage, ms per step':54}{'wall':>9}{'CPU':>9}{'against (a), CPU':>18}")
+            for name, step in medians.items():
+                print(f"{name:54}{1e3 * step.wall:9.1f}{1e3 * step.cpu:9.1f}{step.cpu / base.cpu:17.1f}x")
+            for note in notes:
+                print(note)
+
+
+if __name__ == "__main__":
+    main()

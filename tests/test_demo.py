@@ -1,0 +1,89 @@
+"""The demo: every artefact is there and holds something, the model wins, and its numbers are computed."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from imutool import demo
+from imutool.errors import ConfigError
+from imutool.evaluate import evaluate
+from imutool.mcap_io.log import Log
+from imutool.mcap_io.write import write
+from imutool.physics.flight import flight
+
+FLIGHT_SAMPLES = 12_001  # 60 s at 200 Hz, both ends included
+SMALLEST_PICTURE = 20_000  # bytes; an empty figure of this size has under 10 kB
+SMALLEST_RRD = 1_000_000
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory, imutool: Callable[..., Any]) -> tuple[Path, dict[str, Any]]:
+    """The folder in which `imutool demo` ran, and what it reported."""
+    folder = tmp_path_factory.mktemp("demo")
+    done = imutool("demo", "--json", "-", cwd=folder)
+    assert done.returncode == 0, done.stderr
+    steps = [line for line in done.stderr.splitlines() if line[:2] in ("1.", "2.", "3.", "4.", "5.")]
+    assert len(steps) == 5, done.stderr
+    return folder, json.loads(done.stdout)
+
+
+def figures(report: dict[str, Any]) -> dict[str, dict[str, Any]]:
+    return {result["model"]: result for result in report["results"]}
+
+
+def test_the_model_beats_raw_and_static_on_the_flight_it_has_not_seen(made: tuple[Path, dict[str, Any]]) -> None:
+    found = figures(made[1])
+    assert list(found) == ["raw", "static", "model"]
+    assert found["model"]["aoe_deg"] < 0.5 * found["static"]["aoe_deg"] < found["static"]["aoe_deg"] < found["raw"]["aoe_deg"]
+    assert found["model"]["velocity_rmse_m_s"] < found["raw"]["velocity_rmse_m_s"]
+
+
+def test_every_artefact_is_there_and_holds_something(made: tuple[Path, dict[str, Any]]) -> None:
+    folder, report = made
+    with Log(folder / report["debiased"]) as log:
+        for topic in ("/imu0", "/imu0/debiased", "/imu0/bias/gyro", "/imu0/bias/accel"):
+            assert log.topics[topic].count == FLIGHT_SAMPLES
+        assert log.metadata()["imutool"]["method"] == "neural_ode"
+    rrd, png = (folder / report["rrd"]).read_bytes(), (folder / report["png"]).read_bytes()
+    assert rrd.startswith(b"RRF2")
+    assert len(rrd) > SMALLEST_RRD
+    assert png.startswith(b"\x89PNG")
+    assert len(png) > SMALLEST_PICTURE
+    assert len(list((folder / "demo-out" / "logs").glob("*.mcap"))) == 5
+    assert not list(folder.rglob("*.checkpoint"))
+
+
+def test_the_numbers_are_those_of_the_files_and_change_with_the_flight(
+    made: tuple[Path, dict[str, Any]], tmp_path: Path
+) -> None:
+    folder, report = made
+    again = evaluate(folder / report["log"], models=["static", folder / report["model"]])
+    assert again == report["results"]
+    write(flight(demo.TEST_SEED + 1), tmp_path / "other.mcap")
+    other = figures({"results": evaluate(tmp_path / "other.mcap", models=["static", folder / report["model"]])})
+    found = figures(report)
+    for model in ("raw", "static", "model"):
+        assert other[model]["aoe_deg"] != found[model]["aoe_deg"]
+    assert other["model"]["aoe_deg"] < other["static"]["aoe_deg"]
+
+
+def test_an_earlier_demo_stays_without_overwrite(made: tuple[Path, dict[str, Any]]) -> None:
+    before = sorted(made[0].rglob("*"))
+    with pytest.raises(ConfigError, match="--overwrite"):
+        demo.run(made[0] / "demo-out", lambda _: None)
+    assert sorted(made[0].rglob("*")) == before
+
+
+def test_raw_files_of_a_flight_convert_back_to_the_same_bits(tmp_path: Path) -> None:
+    from converters import euroc
+
+    recording = flight(7, duration_s=1.0)
+    demo.write_asl(recording, tmp_path / "flight_7")
+    (back,) = euroc.read(tmp_path / "flight_7")
+    assert back.imu == recording.imu
+    assert back.truth == recording.truth

@@ -1,0 +1,261 @@
+"""The house stands: imports go one way, the command starts light, the wheel holds what it must."""
+
+from __future__ import annotations
+
+import ast
+import graphlib
+import json
+import os
+import re
+import subprocess
+import sys
+import time
+import venv
+import zipfile
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from imutool import __version__
+from imutool.demo import write_asl
+from imutool.physics.flight import flight
+
+ROOT = Path(__file__).parents[1]
+
+# design.md, Rooms, with what came since: lower never imports higher. A room is a module of imutool or a folder of them.
+TIERS = (
+    ("errors",),
+    ("config", "recording", "registry", "so3"),
+    ("kinematics", "ode", "metrics", "mcap_io", "stationary", "strapdown", "windows", "info"),
+    ("physics",),
+    ("bias",),
+    ("turn_on",),
+    ("debias",),
+    ("train", "evaluate", "convert"),
+    ("view", "fleet"),
+    ("demo",),
+    ("cli",),
+)
+LEVEL = {room: level for level, rooms in enumerate(TIERS) for room in rooms}
+FOR_CONVERTERS = {"errors", "recording"}
+
+HEAVY = {"torch", "torchdiffeq", "safetensors", "rerun", "ray", "matplotlib", "rosbags"}
+HELP_SHARE = 0.4  # of the time `import torch` takes; the command itself takes about a tenth of it
+ROUNDS = 3
+
+
+def modules(folder: Path) -> dict[str, ast.Module]:
+    """Every module below a package's folder, by its dotted name."""
+    found = {}
+    for path in sorted(folder.rglob("*.py")):
+        parts = path.relative_to(folder.parent).with_suffix("").parts
+        found[".".join(parts[:-1] if parts[-1] == "__init__" else parts)] = ast.parse(path.read_text(encoding="utf-8"))
+    return found
+
+
+def imports(tree: ast.Module, known: set[str]) -> set[str]:
+    """Modules that a module imports anywhere in it, also inside functions; `from package import module` names the module."""
+    found = set()
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            found |= {name.name for name in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, "imports are absolute"
+            of = [f"{node.module}.{name.name}" for name in node.names]
+            found |= {name if name in known else str(node.module) for name in of}
+    return found
+
+
+def room(module: str) -> str:
+    """`imutool.mcap_io.read` is in the room `mcap_io`; the package itself, which holds the version alone, in none."""
+    package, _, rest = module.partition(".")
+    return rest.partition(".")[0] if package == "imutool" else ""
+
+
+def against_the_order(found: dict[str, ast.Module]) -> list[str]:
+    """Every import of a higher room by a lower one."""
+    pairs = [(name, other) for name, tree in found.items() for other in imports(tree, set(found)) if room(name) and room(other)]
+    return sorted(f"{name} imports {other}" for name, other in pairs if LEVEL[room(other)] > LEVEL[room(name)])
+
+
+IMUTOOL, CONVERTERS = modules(ROOT / "imutool"), modules(ROOT / "converters")
+
+
+def test_every_room_has_its_place_in_the_order() -> None:
+    assert {room(name) for name in IMUTOOL} - {""} <= set(LEVEL)
+
+
+def test_lower_rooms_never_import_higher_ones() -> None:
+    assert against_the_order(IMUTOOL) == []
+
+
+def test_the_order_is_really_looked_at() -> None:
+    wrong = ast.parse(
+        "def f():\n    from imutool import debias\n    import imutool.cli\n    from imutool.view.runs import load\n"
+    )
+    planted = {**IMUTOOL, "imutool.metrics": wrong}
+    assert against_the_order(planted) == [
+        "imutool.metrics imports imutool.cli",
+        "imutool.metrics imports imutool.debias",
+        "imutool.metrics imports imutool.view.runs",
+    ]
+
+
+def test_no_two_modules_import_each_other() -> None:
+    everything = IMUTOOL | CONVERTERS
+    graph = {name: imports(tree, set(everything)) & set(everything) - {name} for name, tree in everything.items()}
+    graphlib.TopologicalSorter(graph).prepare()
+
+
+def test_converters_know_errors_and_recording_alone() -> None:
+    for name, tree in CONVERTERS.items():
+        ours = {room(other) for other in imports(tree, set(IMUTOOL)) if other.partition(".")[0] == "imutool"}
+        assert ours <= FOR_CONVERTERS, name
+
+
+def test_converters_are_never_imported_by_name() -> None:
+    for name, tree in IMUTOOL.items():
+        assert not {other for other in imports(tree, set()) if other.partition(".")[0] == "converters"}, name
+
+
+def test_no_room_is_a_drawer() -> None:
+    names = {name.rpartition(".")[2].strip("_") for name in IMUTOOL | CONVERTERS}
+    assert not names & {"utils", "util", "helpers", "common", "misc"}
+
+
+# ── what a command imports ──
+
+SPY = """
+import atexit, json, sys
+sys.argv = ["imutool", *sys.argv[1:]]
+from imutool.cli import main
+atexit.register(lambda: print("SEEN", json.dumps(sorted({m.partition(".")[0] for m in sys.modules})), file=sys.stderr))
+main()
+"""
+
+
+@pytest.fixture
+def imported(tmp_path: Path) -> Callable[..., set[str]]:
+    """The heavy packages that a command, run to its end, has imported."""
+
+    def run(*words: str | Path) -> set[str]:
+        line = [sys.executable, "-c", SPY, *map(str, words)]
+        done = subprocess.run(line, cwd=tmp_path, capture_output=True, text=True, timeout=120, check=False)
+        assert done.returncode == 0, done.stderr
+        return HEAVY & set(json.loads(re.findall(r"^SEEN (.*)$", done.stderr, re.MULTILINE)[0]))
+
+    return run
+
+
+@pytest.mark.parametrize("words", [["--help"], ["train", "--help"], ["convert", "--help"], ["--version"]], ids=" ".join)
+def test_help_imports_nothing_heavy(imported: Callable[..., set[str]], words: list[str]) -> None:
+    assert imported(*words) == set()
+
+
+def test_info_imports_nothing_heavy(imported: Callable[..., set[str]], logs: Path) -> None:
+    assert imported("info", logs / "flight_1.mcap") == set()
+
+
+def test_convert_imports_nothing_heavy(imported: Callable[..., set[str]], tmp_path: Path) -> None:
+    write_asl(flight(1, duration_s=1.0), tmp_path / "flight_1")
+    assert imported("convert", "flight_1", "out.mcap") == set()
+    assert (tmp_path / "out.mcap").is_file()
+
+
+def test_view_without_a_model_imports_the_viewer_alone(imported: Callable[..., set[str]], tmp_path: Path, logs: Path) -> None:
+    assert imported("view", logs / "flight_1.mcap", "--save", "out.rrd") == {"rerun"}
+    assert (tmp_path / "out.rrd").is_file()
+
+
+def test_evaluate_shows_that_the_spy_sees(imported: Callable[..., set[str]], logs: Path) -> None:
+    assert "torch" in imported("evaluate", logs / "flight_1.mcap")
+
+
+def test_help_is_quick(command: str) -> None:
+    def seconds(*line: str) -> float:
+        began = time.perf_counter()
+        subprocess.run(line, check=True, stdout=subprocess.DEVNULL)
+        return time.perf_counter() - began
+
+    seconds(command, "--help")
+    both = [(seconds(command, "--help"), seconds(sys.executable, "-c", "import torch")) for _ in range(ROUNDS)]
+    ours, torch = (min(times) for times in zip(*both, strict=True))
+    assert ours < HELP_SHARE * torch, f"imutool --help took {ours:.2f} s, import torch {torch:.2f} s"
+
+
+# ── the wheel ──
+
+
+@pytest.fixture(scope="module")
+def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The wheel, built by hatchling in an environment of its own as pip does for anybody."""
+    out = tmp_path_factory.mktemp("wheel")
+    line = [sys.executable, "-m", "pip", "wheel", "--quiet", "--no-deps", "--wheel-dir", str(out), str(ROOT)]
+    done = subprocess.run(line, capture_output=True, text=True, timeout=300, check=False)
+    if "No matching distribution found for hatchling" in done.stderr:
+        pytest.skip("no package index can be reached from here, and hatchling comes from one")
+    assert done.returncode == 0, done.stderr
+    (built,) = out.glob("*.whl")
+    return built
+
+
+def test_the_wheel_holds_both_packages_their_types_and_the_models(wheel: Path) -> None:
+    held = set(zipfile.ZipFile(wheel).namelist())
+    for package in ("imutool", "converters"):
+        sources = {path.relative_to(ROOT).as_posix() for path in (ROOT / package).rglob("*.py")}
+        assert sources <= held
+        assert f"{package}/py.typed" in held
+    models = {f"imutool/_models/{path.name}" for path in (ROOT / "models").iterdir()}
+    assert models <= held
+    assert "imutool/_models/README.md" in models
+    tops = {name.partition("/")[0] for name in held}
+    assert tops == {"imutool", "converters", f"imutool-{__version__}.dist-info"}
+
+
+def test_the_wheel_runs_in_a_fresh_environment(wheel: Path, tmp_path: Path, logs: Path) -> None:
+    """What it depends on is lent from here by PYTHONPATH, which takes no notice of our own editable install."""
+    venv.create(tmp_path / "venv", with_pip=False)
+    python = tmp_path / "venv" / "bin" / "python"
+    pip = [sys.executable, "-m", "pip", "--python", str(python), "install", "--quiet", "--no-deps", "--no-index", str(wheel)]
+    subprocess.run(pip, check=True, timeout=120)
+    lent = next(path for path in sys.path if path.endswith("site-packages"))
+
+    def run(*line: str | Path) -> Any:
+        env = {**os.environ, "PYTHONPATH": lent}
+        return subprocess.run(list(map(str, line)), cwd=tmp_path, env=env, check=True, capture_output=True, text=True).stdout
+
+    for package in ("imutool", "converters"):
+        assert Path(run(python, "-c", f"import {package}; print({package}.__file__)")).is_relative_to(tmp_path)
+    assert run(tmp_path / "venv" / "bin" / "imutool", "--version").strip() == f"imutool {__version__}"
+    report = json.loads(run(tmp_path / "venv" / "bin" / "imutool", "info", logs / "flight_1.mcap", "--json", "-"))
+    assert report["log"] == "flight_1"
+
+
+# ── the project's own files ──
+
+
+def pins() -> Iterator[tuple[str, str]]:
+    for line in (ROOT / "constraints.txt").read_text(encoding="utf-8").splitlines():
+        if line and not line.startswith("#"):
+            name, _, version = line.partition("==")
+            yield name, version
+
+
+def test_constraints_are_exact_and_hold_no_local_version() -> None:
+    found = dict(pins())
+    assert found["torch"] == "2.13.0"
+    assert list(found) == sorted(found)
+    assert all(re.fullmatch(r"[0-9][0-9a-z.]*", version) for version in found.values())
+    assert not found.keys() & {"imutool", "hatchling", "ahrs"}
+
+
+def test_constraints_hold_all_we_depend_on() -> None:
+    import tomllib
+
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    extras = project["optional-dependencies"]
+    wanted = [*project["dependencies"], *(line for name in extras if name != "fleet" for line in extras[name])]
+    names = {re.split(r"[<>=!~\[;]", line)[0].strip() for line in wanted}
+    assert names - {"imutool"} <= dict(pins()).keys()
