@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -14,7 +15,7 @@ from imutool.bias import static
 from imutool.bias._base import BiasModel
 from imutool.bias._file import check_rate, find_model
 from imutool.debias import Debiased, apply, estimate_at_rest
-from imutool.errors import DataError
+from imutool.errors import ConfigError, DataError
 from imutool.mcap_io.read import read
 from imutool.recording import Imu, Poses, Recording
 from imutool.strapdown import Start, dead_reckon, truth_velocity
@@ -43,6 +44,8 @@ def evaluate(
         LogError, DataError: no IMU, no truth, or the two share no time.
         ModelError: a model that cannot be used with this log.
     """
+    if trajectories is not None:
+        _refuse_twins(models)
     recording = read(log, imu=imu, truth=truth)
     if truth is None and recording.truths:
         recording = recording.with_truth(next(iter(recording.truths)))
@@ -56,9 +59,6 @@ def evaluate(
                 "model": name,
                 "init": init if start else None,
                 "init_how": start.how if start else None,
-                "samples": len(true),
-                "scored": int(valid.sum()),
-                "duration_s": round(true.duration_s, 3),
                 **figures,
                 "gyro_bias": start.rest[:3].tolist() if start else [0.0, 0.0, 0.0],
                 "accel_bias": start.rest[3:].tolist() if start else [0.0, 0.0, 0.0],
@@ -106,9 +106,18 @@ def _model_and_start(given: str | Path, recording: Recording, init: str, where: 
     return model, find(init, model, recording)
 
 
+def _refuse_twins(models: Sequence[str | Path]) -> None:
+    """Two models of one name would write one file."""
+    names = [Path(model).stem for model in models]
+    for name in names:
+        if names.count(name) > 1:
+            raise ConfigError(f"two models are called {name!r}", where="--trajectories", fix="Rename one of the files")
+
+
 def _write(folder: Path, log: str, model: str, estimate: Poses, true: Poses, valid: Any, *, overwrite: bool) -> None:
     """TUM-format files: LOG_truth.tum and LOG_MODEL.tum on the same stamps, those that are scored."""
     folder.mkdir(parents=True, exist_ok=True)
+    log = re.sub(r"[^\w.+-]", "_", log).lstrip(".") or "_"  # a log's name is its writer's, and must not lead elsewhere
     if model == RAW:
         metrics.write_tum(true.rows(valid), folder / f"{log}_truth.tum", overwrite)
     metrics.write_tum(estimate.rows(valid), folder / f"{log}_{model}.tum", overwrite)

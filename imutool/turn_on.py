@@ -163,9 +163,9 @@ def from_truth(model: BiasModel, recording: Recording) -> TurnOn:
     start = prior(model)
     offset = _solve_offset(piece, _bias(model, piece, start.rest), R[:1], R[1:], dv, dt)
     var, measured = start.std**2, _numpy(model.truth_std) ** 2
-    gain = var / (var + measured)
+    gain = np.divide(var, var + measured, out=np.zeros(6), where=var > 0)  # a prior without doubt stays
     how = f"truth over {t[last] - t[first]:.1f} s, weighed against the training runs" if model.card else "truth"
-    return TurnOn(start.rest + gain * offset, np.sqrt(var * (1 - gain)), how)
+    return TurnOn(start.rest + gain * offset, np.sqrt(gain * measured), how)
 
 
 def _solve_offset(

@@ -69,3 +69,14 @@ def logs(tmp_path_factory: pytest.TempPathFactory) -> Path:
         write(flight(seed, duration_s=20.0), folder / f"flight_{seed}.mcap")
     train([folder / "flight_1.mcap"], folder / "linear.safetensors", method="linear")
     return folder
+
+
+@pytest.fixture(scope="session")
+def demonstration(tmp_path_factory: pytest.TempPathFactory, imutool: Callable[..., subprocess.CompletedProcess[str]]) -> Path:
+    """The folder in which `imutool demo -o demo-out` ran (once for all tests: it trains), its report in `report.json`."""
+    folder = tmp_path_factory.mktemp("demo")
+    done = imutool("demo", "-o", "demo-out", "--json", "report.json", cwd=folder)
+    assert done.returncode == 0, done.stderr
+    (folder / "stdout.txt").write_text(done.stdout)
+    (folder / "stderr.txt").write_text(done.stderr)
+    return folder

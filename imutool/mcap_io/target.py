@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import os
 import secrets
+import weakref
 import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -29,6 +30,8 @@ class Target:
         self.position, self.crc = 0, 0
         self._refuse_existing()
         self.temporary = path.with_name(f".{path.name}.{os.getpid()}.{secrets.token_hex(4)}.partial")
+        # Ctrl-C may come between two lines, before anybody is there to call `abandon`: then the file goes with this object
+        self._remove = weakref.finalize(self, _unlink, self.temporary)
         with self._told():
             self.file: BinaryIO = self.temporary.open("xb")
 
@@ -86,6 +89,7 @@ class Target:
                 self.file.close()
                 self._refuse_existing()
                 self.temporary.replace(self.path)
+            self._remove.detach()
         except BaseException:
             self.abandon()
             raise
@@ -94,5 +98,9 @@ class Target:
         """Removes what was written."""
         with contextlib.suppress(OSError):  # a full disk refuses the last flush; the file goes all the same
             self.file.close()
-        with contextlib.suppress(OSError):
-            self.temporary.unlink(missing_ok=True)
+        self._remove()
+
+
+def _unlink(path: Path) -> None:
+    with contextlib.suppress(OSError):
+        path.unlink(missing_ok=True)

@@ -39,6 +39,7 @@ TRACK_WALK = {"gyro": 1e-4, "accel": 2e-3}  # how far a rest bias may walk in a 
 LONGEST_HELD_OUT_S = {"gyro": 20.0, "accel": 5.0}
 HELD_OUT_HOP_S = 1.0
 USUAL_SAMPLES = 200_000  # enough for a median
+WARM_UP_STEPS = 20
 AVERAGE_STEPS = 30  # over which weights are averaged
 TRIM = 0.9  # the worst tenth of the held-out windows is where the truth has outliers
 
@@ -262,7 +263,8 @@ class Training:
             loss = self._one_step(stage, pools, steps)
 
     def _one_step(self, stage: Stage, pools: Sequence[tuple[int, Int[Tensor, " _"]]], steps: int) -> float:
-        rate = self._rate(stage.sensor) * 0.5 * (1 + torch.cos(torch.tensor(torch.pi * stage.step / steps)).item())
+        warm, cool = min(1.0, (stage.step + 1) / WARM_UP_STEPS), 0.5 * (1 + math.cos(math.pi * stage.step / steps))
+        rate = self._rate(stage.sensor) * warm * cool
         for group in stage.optimizer.param_groups:
             group["lr"] = rate
         # the losses are means over windows; a second of data counts once against the walk
