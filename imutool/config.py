@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import math
 import tomllib
 from collections.abc import Iterable
 from pathlib import Path
@@ -41,9 +42,10 @@ def build(cls: type[S], values: dict[str, Any], where: str | Path | None = None)
     """Settings of type `cls` from plain values, as they come from TOML or from a model file's header.
 
     Raises:
-        ConfigError: unknown key (the nearest is named), wrong type, out of range.
+        ConfigError: unknown key (the nearest is named), wrong type, out of range, not finite.
     """
     _refuse_unknown(cls, values, where)
+    _refuse_infinite(values, where)
     try:
         return msgspec.convert(values, cls)
     except msgspec.ValidationError as error:
@@ -63,8 +65,8 @@ def _put(values: dict[str, Any], word: str) -> None:
     if not equals or not key:
         raise ConfigError(f"{word!r} sets nothing", where="--set", expected="key=value")
     try:
-        value = tomllib.loads(f"value = {text}")["value"]
-    except tomllib.TOMLDecodeError:
+        (value,) = tomllib.loads(f"value = {text}").values()
+    except ValueError:  # no TOML, or more than one line of it
         value = text
     *tables, last = key.split(".")
     for table in tables:
@@ -89,3 +91,15 @@ def _refuse_unknown(cls: type[Settings], values: dict[str, Any], where: str | Pa
         inner = fields[key]
         if isinstance(value, dict) and isinstance(inner, type) and issubclass(inner, Settings):
             _refuse_unknown(inner, value, where, f"{prefix}{key}.")
+
+
+def _refuse_infinite(value: Any, where: str | Path | None, place: str = "") -> None:
+    """No setting means anything when infinite or NaN, and TOML can spell both."""
+    if isinstance(value, float) and not math.isfinite(value):
+        raise ConfigError(f"{place} is {value}", where=where or "settings", expected="a finite number")
+    if isinstance(value, dict):
+        for key, inner in value.items():
+            _refuse_infinite(inner, where, f"{place}.{key}" if place else key)
+    elif isinstance(value, list | tuple):
+        for inner in value:
+            _refuse_infinite(inner, where, place)

@@ -52,9 +52,13 @@ def load(group: str, name: str) -> ModuleType:
 
 
 def summary(group: str, name: str) -> str:
-    """The first line of a module's docstring, read from its source so that nothing is imported."""
-    spec = importlib.util.find_spec(f"{GROUPS[group]}.{name}")
-    if spec is None or spec.origin is None:
+    """The first line of a module's docstring, read from its source so that it is not imported; empty where there is none."""
+    outside = {point.name: point.module for point in entry_points(group=group)}
+    try:
+        spec = importlib.util.find_spec(outside.get(name, f"{GROUPS[group]}.{name}"))
+    except ModuleNotFoundError:
+        return ""
+    if spec is None or spec.origin is None or not spec.origin.endswith(".py"):
         return ""
     doc = ast.get_docstring(ast.parse(Path(spec.origin).read_text(encoding="utf-8"))) or ""
     return doc.partition("\n")[0]
