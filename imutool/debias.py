@@ -210,7 +210,7 @@ def _samples(source: Path, topic: str, end_ns: int | None = None) -> Imu:
 
 
 def white_noise(imu: Imu) -> Float64[np.ndarray, "6"]:
-    """Standard deviation of a sample's white noise: second differences (variance 6 sigma²) of the calmest tenths of a second."""
+    """Standard deviation of a sample's white noise: second differences (variance 6 sigma²) of calm tenths of a second."""
     u = np.concatenate([imu.gyro, imu.accel], axis=1)
     second = np.diff(u, n=2, axis=0) ** 2
     if len(second) < NOISE_BLOCK:

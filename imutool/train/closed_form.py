@@ -78,8 +78,9 @@ def solve(
     seen = torch.cat([pool.log[first] for first, _ in sets])
     missing = [name for i, name in enumerate(pool.names) if not bool((seen == i).any())]
     if missing:
+        where = f"the {part.replace('_', '-')} part of {', '.join(missing)}"
         raise DataError(
-            f"no stretch of {min(window_s):g} s of truth without a gap in the {part.replace('_', '-')} part of {', '.join(missing)}",
+            f"no stretch of {min(window_s):g} s of truth without a gap in {where}",
             expected="truth that covers at least one window",
             fix="Shorten the windows with --set, or leave the log out",
         )

@@ -1,9 +1,9 @@
 """The training: a closed form to start from, then gradient descent, gyro first and the accelerometer on top of it.
 
 Every step draws windows of several lengths from all logs at once. Beside the sensor's weights each log has a track of its
-own rest bias, free but slow, so that what belongs to a run cannot be mistaken for what belongs to the sensor. The model kept is
-the one that drifts least over the longest windows of the held-out part, the closed form it started from included. What is judged
-and kept is a running mean over the last steps, which a single step's draw of windows cannot throw off.
+own rest bias, free but slow, so that what belongs to a run cannot be mistaken for what belongs to the sensor. The model
+kept is the one that drifts least over the longest windows of the held-out part, the closed form it started from included.
+What is judged and kept is a running mean over the last steps, which one step's draw of windows cannot throw off.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from typing import Annotated, Any
 import msgspec
 import torch
 from jaxtyping import Float, Int
-from torch import Tensor, nn
+from torch import Tensor
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
 from imutool import registry
@@ -30,12 +30,11 @@ from imutool.train import closed_form, statistics
 from imutool.train.closed_form import median_per_log
 from imutool.train.loss import RobustLoss, error
 from imutool.train.segments import Pool
+from imutool.train.tracks import Tracks
 
 Positive = Annotated[float, msgspec.Meta(gt=0)]
 Count = Annotated[int, msgspec.Meta(ge=1)]
 
-TRACK_UNIT = {"gyro": 1e-1, "accel": 1.0}  # one unit of a track's parameter, rad/s and m/s²
-TRACK_WALK = {"gyro": 1e-4, "accel": 2e-3}  # how far a rest bias may walk in a second^1/2, rad/s and m/s²
 LONGEST_HELD_OUT_S = {"gyro": 20.0, "accel": 5.0}
 HELD_OUT_HOP_S = 1.0
 USUAL_SAMPLES = 200_000  # enough for a median
@@ -73,54 +72,6 @@ class Epoch:
     left_s: float
 
 
-class Tracks(nn.Module):
-    """The rest bias of each log as a polyline in time, a knot every `knot_s`."""
-
-    def __init__(self, pool: Pool, knot_s: float) -> None:
-        super().__init__()
-        ends = [float(pool.t[pool.log == i].max()) for i in range(len(pool.names))]
-        self.counts = [max(2, round(end / knot_s) + 1) for end in ends]
-        self.knot_s = knot_s
-        device = pool.t.device
-        self.offset = torch.tensor([sum(self.counts[:i]) for i in range(len(ends))], device=device)
-        self.last = torch.tensor(self.counts, device=device) - 1
-        self.knots = nn.Parameter(torch.zeros(sum(self.counts), 6, dtype=pool.t.dtype, device=device))
-        unit = [TRACK_UNIT[sensor] for sensor in SENSORS for _ in range(3)]
-        self.unit = torch.tensor(unit, dtype=pool.t.dtype, device=device)
-
-    def at(self, log: Int[Tensor, " batch"], t: Float[Tensor, " batch"]) -> Float[Tensor, "batch 6"]:
-        """The rest bias of some logs at some times (s from the log's start)."""
-        place = (t / self.knot_s).clamp(min=0)
-        j = torch.minimum(place.long(), self.last[log] - 1)
-        weight = (place - j).clamp(max=1.0)[:, None]
-        first = self.offset[log] + j
-        return torch.lerp(self.knots[first], self.knots[first + 1], weight) * self.unit
-
-    def per_log(self) -> Float[Tensor, "logs 6"]:
-        """The mean rest bias of each log."""
-        means: Tensor = torch.stack([part.mean(0) for part in self._parts()]) * self.unit
-        return means
-
-    def set(self, sensor: Sensor, rest: Float[Tensor, "logs 3"]) -> None:
-        """Makes a sensor's tracks constant."""
-        columns = COLUMNS[sensor]
-        with torch.no_grad():
-            for part, value in zip(self._parts(), rest, strict=True):
-                part[:, columns] = value / self.unit[columns]
-
-    def _parts(self) -> tuple[Tensor, ...]:
-        """The knots of each log."""
-        return torch.split(self.knots, self.counts)
-
-    def wandering(self, sensor: Sensor) -> Float[Tensor, ""]:
-        """Minus the log-likelihood of the tracks as random walks, summed over the logs."""
-        columns = COLUMNS[sensor]
-        step = torch.cat([torch.diff(part[:, columns], dim=0) for part in self._parts()])
-        sigma = TRACK_WALK[sensor] * self.knot_s**0.5 / self.unit[columns]
-        cost: Tensor = 0.5 * (step / sigma).square().sum()
-        return cost
-
-
 @dataclass
 class Stage:
     """What one sensor's descent must remember to go on: also what a checkpoint holds."""
@@ -135,7 +86,7 @@ class Stage:
 
 
 class Training:
-    """Trains one model on the recordings of one sensor; `model` is the result, at any time the best so far.
+    """Trains one model on the recordings of one sensor; once `epochs` has ended, `model` is the best that was seen.
 
     Raises:
         DataError: recordings without truth, of different rates, too short, or standing still.

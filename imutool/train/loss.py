@@ -1,8 +1,8 @@
 """The losses of both stages, robust and without a unit: what integration over a window misses of the truth.
 
-The paper's are mean squares (eq. 16, 17). Here a window's error is divided by what is usual for windows of its length and log and
-goes through Huber's function, so that an outlier of the motion capture pulls no harder than an ordinary window, and windows
-of every length and every log count alike.
+The paper's are mean squares (eq. 16, 17). Here a window's error is divided by what is usual for windows of its length and log
+and goes through Huber's function, so that an outlier of the motion capture pulls no harder than an ordinary window, and
+windows of every length and every log count alike.
 """
 
 from __future__ import annotations
