@@ -24,7 +24,7 @@ from imutool.view.runs import load
 
 TRAINING_SEEDS = (1, 2, 3, 4)  # four flights of one sensor, each with a turn-on bias of its own
 TEST_SEED = 5
-STEPS = 120  # of each stage; half a minute in all on two cores
+STEPS = 60  # of each stage; some twenty seconds in all on two cores
 
 # A consumer's sensor: a factor of two per cent and a degree of misalignment outweigh what its bias drifts in a minute.
 SENSOR = FlightSettings(

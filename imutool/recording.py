@@ -44,7 +44,7 @@ class _Columns:
         for column in fields(self):  # type: ignore[arg-type]
             value = getattr(self, column.name)
             if isinstance(value, np.ndarray):
-                if value.flags.writeable or not value.flags.c_contiguous:
+                if not (value.flags.c_contiguous and _is_fixed(value)):
                     value = np.array(value, order="C")
                     value.flags.writeable = False
                 object.__setattr__(self, column.name, value)
@@ -84,6 +84,10 @@ class _Columns:
         return all(_same(getattr(self, c.name), getattr(other, c.name)) for c in fields(self))  # type: ignore[arg-type]
 
     __hash__ = None  # type: ignore[assignment]
+
+    def __reduce__(self) -> tuple[object, ...]:
+        """Arrays come out of a pickle writeable; the constructor fixes them again."""
+        return type(self), tuple(getattr(self, c.name) for c in fields(self))  # type: ignore[arg-type]
 
     def rows(self, index: slice | Bool[np.ndarray, " n"]) -> Any:
         """The same columns at some rows."""
@@ -199,7 +203,12 @@ class Frames:
 
 
 def _mapping(value: Mapping[str, Any]) -> Mapping[str, Any]:
-    return MappingProxyType(dict(value))
+    """A copy that cannot be changed, nor what mappings are in it."""
+    return MappingProxyType({k: _mapping(v) if isinstance(v, Mapping) else v for k, v in value.items()})
+
+
+def _dict(value: Any) -> Any:
+    return {k: _dict(v) for k, v in value.items()} if isinstance(value, MappingProxyType) else value
 
 
 @dataclass(frozen=True, eq=False)
@@ -233,8 +242,7 @@ class Recording:
 
     def __reduce__(self) -> tuple[object, ...]:
         """Mapping proxies do not pickle; plain dicts do (recordings cross to worker processes)."""
-        values = [getattr(self, f.name) for f in fields(self)]
-        return type(self), tuple(dict(v) if isinstance(v, MappingProxyType) else v for v in values)
+        return type(self), tuple(_dict(getattr(self, f.name)) for f in fields(self))
 
     @property
     def truth(self) -> Poses:
@@ -306,6 +314,18 @@ def _interpolate(
 
 def _same(a: object, b: object) -> bool:
     """Equal to the last bit (so that -0.0 and 0.0 differ, as they do in a file)."""
-    if isinstance(a, np.ndarray) and isinstance(b, np.ndarray):
+    if isinstance(a, np.ndarray) or isinstance(b, np.ndarray):
+        if not (isinstance(a, np.ndarray) and isinstance(b, np.ndarray)):
+            return False
         return a.dtype == b.dtype and a.shape == b.shape and a.tobytes() == b.tobytes()
     return bool(a == b)
+
+
+def _is_fixed(array: np.ndarray) -> bool:
+    """Whether nobody can write to an array, also not through the one it is a view of."""
+    owner: object = array
+    while isinstance(owner, np.ndarray):
+        if owner.flags.writeable:
+            return False
+        owner = owner.base
+    return owner is None or isinstance(owner, bytes)

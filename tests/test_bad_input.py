@@ -36,7 +36,7 @@ CONFIG, DATA, LOG, MODEL, INTERRUPTED = 3, 4, 5, 6, 130
 DISK_BYTES = 200_000  # less than any log here, more than any message
 WAIT_S = 120.0  # for the middle of a run, on a machine busy with other things
 TRIES = 20  # the middle may pass between two looks
-QUICK = [w for s in ("steps=400", "samples=400", "gyro_window_s=[0.5]", "accel_window_s=[0.5]") for w in ("--set", s)]
+QUICK = [w for s in ("steps=120", "samples=400", "gyro_window_s=[0.5]", "accel_window_s=[0.5]") for w in ("--set", s)]
 
 
 def digests(folder: Path) -> dict[str, str]:
@@ -421,7 +421,7 @@ def test_ctrl_c_in_the_middle_of_training_leaves_a_checkpoint_that_resume_takes_
     assert kept.name in told(other, other.stderr, CONFIG)
     done = imutool(*words, "--resume", "-v", "--json", "-", cwd=here)
     assert done.returncode == 0, done.stderr
-    steps = [int(step) for step in re.findall(r"gyro (\d+)/400", done.stderr)]
+    steps = [int(step) for step in re.findall(r"gyro (\d+)/120", done.stderr)]
     assert steps[0] >= 10  # it did not begin anew
     assert json.loads(done.stdout)["method"] == "neural_ode"
     assert set(digests(here)) == {*before, "m.safetensors"}

@@ -253,7 +253,7 @@ def test_what_two_converters_claim_must_be_decided(source, tmp_path, monkeypatch
 
 
 def test_converting_needs_no_torch():
-    import subprocess  # noqa: PLC0415
+    import subprocess
 
     heavy = "('torch', 'rosbags', 'rerun', 'matplotlib')"
     code = f"import imutool.convert, imutool.info, sys; print([m for m in {heavy} if m in sys.modules])"

@@ -50,7 +50,11 @@ def test_listing_imports_nothing() -> None:
 
 @pytest.mark.parametrize(
     ("group", "wrong", "near"),
-    [("imutool.bias", "linera", "linear"), ("imutool.bias", "neural-ode", "neural_ode"), ("imutool.converters", "tumvi", "tum_vi")],
+    [
+        ("imutool.bias", "linera", "linear"),
+        ("imutool.bias", "neural-ode", "neural_ode"),
+        ("imutool.converters", "tumvi", "tum_vi"),
+    ],
 )
 def test_a_wrong_name_suggests_the_nearest_and_lists_all(group: str, wrong: str, near: str) -> None:
     with pytest.raises(ConfigError) as caught:

@@ -15,8 +15,8 @@ from imutool import turn_on
 from imutool.bias import linear, static
 from imutool.bias._base import BiasModel
 from imutool.errors import ConfigError, DataError
-from imutool.physics.flight import TriadSettings, flight, trajectory
 from imutool.physics.flight import FlightSettings as Flight
+from imutool.physics.flight import TriadSettings, flight, trajectory
 from imutool.recording import GRAVITY_M_S2, Imu, Poses, Recording
 from imutool.turn_on import AT_REST_STD, TurnOn, at_rest, find, from_truth, given, over_all_rest, prior
 
@@ -35,7 +35,7 @@ def resting(
     t = np.arange(int(duration_s * RATE_HZ) + 1) / RATE_HZ
     still = np.zeros(len(t), bool)
     which = np.zeros(len(t), int)
-    for i, (start, end) in enumerate(stops):
+    for start, end in stops:
         still |= (t >= start) & (t <= end)
         which += t > end
     shake = np.where(still[:, None], 0.0, np.sin(t[:, None] * np.array([7.0, 9.0, 11.0]) + 1.0))
@@ -131,7 +131,7 @@ def test_a_models_own_part_is_taken_off_first() -> None:
 @pytest.mark.parametrize("stops", [[], [(8.0, 12.0)], [(0.0, 0.9)]])
 def test_a_log_that_does_not_start_at_rest_is_refused(stops: list[tuple[float, float]]) -> None:
     imu, _ = resting(stops)
-    with pytest.raises(DataError, match="the log does not start at rest.*--init prior"):
+    with pytest.raises(DataError, match=r"the log does not start at rest.*--init prior"):
         at_rest(static.Model(), imu)
 
 
@@ -243,11 +243,12 @@ def test_six_numbers_are_taken_as_they_are() -> None:
 
 
 @pytest.mark.parametrize(
-    "text", ["", "1,2,3", "1,2,3,4,5,6,7", "a,b,c,d,e,f", "nan,0,0,0,0,0", "0,0,0,inf,0,0", "Truth", "stationery", "1;2;3;4;5;6"]
+    "text",
+    ["", "1,2,3", "1,2,3,4,5,6,7", "a,b,c,d,e,f", "nan,0,0,0,0,0", "0,0,0,inf,0,0", "Truth", "stationery", "1;2;3;4;5;6"],
 )
 def test_other_words_are_refused_with_what_there_is(text: str) -> None:
     imu, _ = resting()
-    with pytest.raises(ConfigError, match="--init: .*expected auto, stationary, prior, truth or gx,gy,gz,ax,ay,az"):
+    with pytest.raises(ConfigError, match=r"--init: .*expected auto, stationary, prior, truth or gx,gy,gz,ax,ay,az"):
         find(text, static.Model(), Recording("r", imu))
 
 

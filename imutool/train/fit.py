@@ -242,6 +242,12 @@ class Training:
         model = stage.mean.module
         assert isinstance(model, BiasModel)
         score = self.held_out(stage.sensor, model)
+        if not (stage.best_state or math.isfinite(score)):
+            raise NumericsError(
+                f"the held-out error of the {stage.sensor} is {score} before the first step",
+                expected="a finite error",
+                fix="Look for absurd values in the logs with imutool info",
+            )
         if score < stage.best:
             stage.best, stage.best_state = score, copy.deepcopy(model.state_dict())
         return score

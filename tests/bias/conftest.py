@@ -30,7 +30,7 @@ def _build(method: str, seed: int = 0, **settings: object) -> BiasModel:
     model: BiasModel = module.Model(module.Config(**settings), RATE_HZ).double()
     with torch.no_grad():
         for value in model.parameters():
-            value += 0.05 * torch.randn(value.shape, generator=generator, dtype=value.dtype)
+            value.add_(0.05 * torch.randn(value.shape, generator=generator, dtype=value.dtype))
         for value in (model.prior_mean, model.prior_std, model.truth_std, model.noise_std):
             value.copy_(0.01 * torch.rand(6, generator=generator))
     return model.requires_grad_(False).eval()

@@ -6,6 +6,7 @@ import json
 import pickle
 from collections.abc import Callable
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -42,7 +43,7 @@ def streamed(model: BiasModel, seen: Segment, cuts: list[int]) -> np.ndarray:
     t, gyro, accel = (value[0].numpy() for value in (seen.t, seen.gyro, seen.accel))
     stream = model.stream(seen.rest[0].numpy())
     edges = [0, *cuts, len(t)]
-    return np.concatenate([stream(t[a:b], gyro[a:b], accel[a:b]) for a, b in zip(edges, edges[1:], strict=False)])
+    return np.concatenate([stream(t[a:b], gyro[a:b], accel[a:b]) for a, b in pairwise(edges)])
 
 
 def test_its_name_is_its_files_and_its_docstring_names_a_source(model: BiasModel) -> None:
@@ -114,7 +115,7 @@ def test_the_stream_is_the_forward_pass(model: BiasModel, segment: MakeSegment) 
 
 
 @given(cuts=st.lists(st.integers(0, 400), max_size=12).map(sorted))
-@settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=12, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 def test_the_streams_block_borders_change_nothing(model: BiasModel, cuts: list[int], segment: MakeSegment) -> None:
     seen = segment(8, 1, 400)
     np.testing.assert_allclose(streamed(model, seen, cuts), streamed(model, seen, []), rtol=0, atol=BLOCKS)
@@ -236,7 +237,7 @@ def test_another_format_is_refused_with_both_names(saved: Path) -> None:
 
 
 def test_an_unknown_method_is_refused_with_the_nearest(saved: Path) -> None:
-    with pytest.raises(ModelError, match="'lineal' is not known.*Did you mean 'linear'"):
+    with pytest.raises(ModelError, match=r"'lineal' is not known.*Did you mean 'linear'"):
         load(altered(saved, method="lineal"))
 
 

@@ -84,20 +84,14 @@ def test_at_half_the_step_the_drift_is_the_same_and_what_is_left_halves(
         assert np.abs(order - 1.0).max() < ORDER, sensor
 
 
-@pytest.mark.parametrize("solver", ["rk4", "dopri5"])
-def test_with_another_solver_the_drift_is_the_same(
-    build: MakeModel, seen: Segment, reference: dict[str, Tensor], solver: str
-) -> None:
-    path = rest_path(lively(build, solver=solver), seen)
-    for sensor in LEAST:
-        assert largest(path[sensor] - reference[sensor]) < SHARE * largest(reference[sensor]), sensor
-
-
-def test_rk4_and_dopri5_agree(build: MakeModel, seen: Segment) -> None:
-    """The path has a kink at every knot, on which rk4 stops and dopri5 does not: a hundredth of the drift."""
+def test_with_another_solver_the_drift_is_the_same(build: MakeModel, seen: Segment, reference: dict[str, Tensor]) -> None:
+    """And rk4 and dopri5 agree closer: the path has a kink at every knot, on which rk4 stops and dopri5 does not."""
     rk4, dopri5 = (rest_path(lively(build, solver=solver), seen) for solver in ("rk4", "dopri5"))
     for sensor in LEAST:
-        assert largest(rk4[sensor] - dopri5[sensor]) < 0.03 * largest(dopri5[sensor]), sensor
+        size = largest(reference[sensor])
+        assert largest(rk4[sensor] - reference[sensor]) < SHARE * size, sensor
+        assert largest(dopri5[sensor] - reference[sensor]) < SHARE * size, sensor
+        assert largest(rk4[sensor] - dopri5[sensor]) < 0.03 * size, sensor
 
 
 def test_the_curve_needs_no_solver(build: MakeModel, seen: Segment) -> None:
@@ -116,7 +110,9 @@ def gradients(build: MakeModel, seen: Segment, sensor: Sensor, *, adjoint: bool,
     return {name: value for name, value in named.items() if value is not None}
 
 
-@pytest.mark.parametrize(("solver", "sensor", "tolerance"), [("rk4", "gyro", 1e-3), ("rk4", "accel", 1e-3), ("dopri5", "gyro", 0.05)])
+@pytest.mark.parametrize(
+    ("solver", "sensor", "tolerance"), [("rk4", "gyro", 1e-3), ("rk4", "accel", 1e-3), ("dopri5", "gyro", 0.05)]
+)
 def test_the_adjoints_gradients_are_those_of_backpropagation(
     build: MakeModel, segment: MakeSegment, solver: str, sensor: Sensor, tolerance: float
 ) -> None:
@@ -139,11 +135,13 @@ def test_the_curve_of_no_motion_is_exactly_zero(scale: float) -> None:
     curve = Curve(64, 0.5, 0.02).double()
     with torch.no_grad():
         for value in curve.parameters():
-            value += scale * torch.randn(value.shape, dtype=value.dtype)
+            value.add_(scale * torch.randn(value.shape, dtype=value.dtype))
         assert torch.equal(curve(torch.zeros(3, dtype=torch.float64)), torch.zeros(3, dtype=torch.float64))
         assert not curve.numpy()(np.zeros(3)).any()
         for shape in ((1, 3), (7, 3), (5, 11, 3), (1000, 3)):  # a matrix product sums in another order: one rounding of N(0)
-            left = max(curve(torch.zeros(shape, dtype=torch.float64)).abs().max().item(), np.abs(curve.numpy()(np.zeros(shape))).max())
+            left = max(
+                curve(torch.zeros(shape, dtype=torch.float64)).abs().max().item(), np.abs(curve.numpy()(np.zeros(shape))).max()
+            )
             assert left <= curve.curve * 64 * 1e-16 * (1.0 + scale)
 
 
@@ -215,14 +213,14 @@ def at_a_high_rate(n: int, **settings: object) -> tuple[Model, Tensor, Tensor]:
     model = Model(Config(**settings), HIGH_RATE_HZ).double().requires_grad_(False).eval()  # type: ignore[arg-type]
     generator = torch.Generator().manual_seed(12)
     for value in model.parameters():
-        value += 0.05 * torch.randn(value.shape, generator=generator, dtype=value.dtype)
+        value.add_(0.05 * torch.randn(value.shape, generator=generator, dtype=value.dtype))
     t = torch.arange(n, dtype=torch.float64) / HIGH_RATE_HZ
     gyro = torch.stack([torch.sin(4.0 * t), torch.cos(7.0 * t), 0.5 * torch.sin(2.0 * t + 1.0)], dim=1)
     return model, t, gyro
 
 
 HIGH_RATE_HZ = 1000.0
-# The rule of the fast path leaves out |d²omega/dt²| dt² / 12 and as much again for the axis that turns: 50 * 1e-6 / 6 per second.
+# The fast path leaves out |d²omega/dt²| dt² / 12, and as much again for the axis that turns: 50 * 1e-6 / 6 per second.
 FAST_PATH_RAD_S = 1e-5
 
 
@@ -247,12 +245,12 @@ def test_the_papers_joint_equation_and_the_split_form_are_one_flow(build: MakeMo
     With rk4 for the drift the two solve the same equation and agree to a thousandth of what the drift does; the stream's
     Euler rule agrees to its own discretisation (`SHARE`).
     """
-    n, rest = 401, np.array([0.02, -0.01, 0.03, 0.0, 0.0, 0.0])
+    n, rest = 301, np.array([0.02, -0.01, 0.03, 0.0, 0.0, 0.0])
     model, t, gyro = at_a_high_rate(n, drift_step_s=0.02, solver="rk4")
     curve, drift = model.curve["gyro"], model.drift["gyro"]
     assert isinstance(curve, Curve)
     assert isinstance(drift, Drift)
-    drift.rate = 1e-2  # 0.4 s of it must be seen
+    drift.rate = 1e-2  # 0.3 s of it must be seen
     R_0, beta_0 = torch.eye(3, dtype=torch.float64), torch.from_numpy(rest[:3])
     R_joint, b_joint = integrate(Joint(model, t, gyro), beta_0 + curve(gyro[0]), t, R_0, method="dopri5")
 

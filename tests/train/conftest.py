@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 import torch
 
-from imutool.physics.flight import TriadSettings, flight, trajectory
 from imutool.physics.flight import FlightSettings as Flight
+from imutool.physics.flight import TriadSettings, flight, trajectory
 from imutool.recording import Imu, Poses, Recording
 
 PERFECT = TriadSettings(

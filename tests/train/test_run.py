@@ -20,7 +20,7 @@ from imutool.train.fit import Epoch, Training, TrainSettings
 from imutool.train.run import checkpoint_path, train
 
 TINY = TrainSettings(
-    gyro_window_s=(0.25, 1.0),
+    gyro_window_s=(0.25, 0.5),
     accel_window_s=(0.25,),
     samples=400,
     steps=6,
@@ -35,7 +35,7 @@ def logs(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
     folder = tmp_path_factory.mktemp("logs")
     made = []
     for seed in (1, 2):
-        recording = flight(seed, duration_s=8.0, still_s=1.0)
+        recording = flight(seed, duration_s=6.0, still_s=0.5)
         about = {"imutool": {"dataset": "euroc", "sensor": "adis16448"}}
         made.append(folder / f"{seed}.mcap")
         write(Recording(recording.name, recording.imu, recording.truths, metadata=about), made[-1])
@@ -80,7 +80,7 @@ def test_the_same_command_writes_the_same_bytes(logs: list[Path], expected: byte
     assert [epoch.step for epoch in said] == [0, 2, 4, 6] * 2
 
 
-@pytest.mark.parametrize("line", [3, 5, 8])
+@pytest.mark.parametrize("line", [4, 8])
 def test_ctrl_c_between_two_steps_leaves_a_checkpoint_that_resume_takes_up(
     logs: list[Path], expected: bytes, tmp_path: Path, line: int
 ) -> None:
@@ -170,7 +170,7 @@ def test_refusals_come_before_the_work_and_leave_nothing(
 ) -> None:
     there = tmp_path / "there.safetensors"
     there.write_bytes(b"mine")
-    with pytest.raises(ConfigError, match="exists already.*--overwrite"):
+    with pytest.raises(ConfigError, match=r"exists already.*--overwrite"):
         train(logs, there, settings=TINY)
     with pytest.raises(ConfigError, match="the folder does not exist"):
         train(logs, tmp_path / "no" / "m.safetensors", settings=TINY)

@@ -24,9 +24,9 @@ def size(png: bytes) -> tuple[int, int]:
 
 
 def pixels(png: bytes) -> np.ndarray:
-    import io  # noqa: PLC0415
+    import io
 
-    from matplotlib.image import imread  # noqa: PLC0415
+    from matplotlib.image import imread
 
     image: np.ndarray = imread(io.BytesIO(png))[:, :, :3]
     return image
