@@ -25,11 +25,11 @@ from imutool.mcap_io.log import ImuBatch, Log
 from imutool.mcap_io.read import read
 from imutool.mcap_io.rewrite import NewTopic, RewriteReport, rewrite, sha256
 from imutool.recording import Imu, Recording, nanoseconds, seconds
+from imutool.stationary import white_noise
 from imutool.turn_on import TurnOn, find, over_all_rest
 
 HEAD_S = 60.0  # of a log, read to find the start: a constant, however long the log
 SUFFIX = "/debiased"
-NOISE_BLOCK, CALMEST = 20, 0.25  # samples, and the share of blocks that are calm: of plain white noise it finds five sixths
 
 
 class Debiased(NamedTuple):
@@ -181,7 +181,7 @@ def _prepare(source: Path, topic: str, name: str | Path | None, init: str) -> tu
         head = _head(source, topic, init)
         check_rate(model, 1.0 / head.imu.period_s, source)
     start = find(init, model, head)
-    return model, start if start.noise.any() else replace(start, noise=white_noise(head.imu))
+    return model, start if start.noise.any() else replace(start, noise=_noise(head.imu))
 
 
 def _head(source: Path, topic: str, init: str) -> Recording:
@@ -209,15 +209,9 @@ def _samples(source: Path, topic: str, end_ns: int | None = None) -> Imu:
             return Imu(*(np.concatenate([getattr(batch, c) for batch in batches]) for c in ("stamp_ns", "gyro", "accel")))
 
 
-def white_noise(imu: Imu) -> Float64[np.ndarray, "6"]:
-    """Standard deviation of a sample's white noise: second differences (variance 6 sigma²) of calm tenths of a second."""
-    u = np.concatenate([imu.gyro, imu.accel], axis=1)
-    second = np.diff(u, n=2, axis=0) ** 2
-    if len(second) < NOISE_BLOCK:
-        return np.zeros(6)
-    blocks = second[: len(second) // NOISE_BLOCK * NOISE_BLOCK].reshape(-1, NOISE_BLOCK, 6).mean(axis=1)
-    noise: Float64[np.ndarray, "6"] = np.sqrt(np.quantile(blocks, CALMEST, axis=0) / 6.0)
-    return noise
+def _noise(imu: Imu) -> Float64[np.ndarray, "6"]:
+    """White noise of a sample, for a model that does not know it and a log that does not rest."""
+    return white_noise(np.concatenate([imu.gyro, imu.accel], axis=1))
 
 
 def _provenance(topic: str, model: BiasModel, start: TurnOn, init: str) -> dict[str, str]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,10 +14,10 @@ from imutool.bias import static
 from imutool.bias._base import BiasModel
 from imutool.bias._file import check_rate, find_model
 from imutool.debias import Debiased, apply, estimate_at_rest
-from imutool.errors import ConfigError, DataError
+from imutool.errors import ConfigError
 from imutool.mcap_io.read import read
-from imutool.recording import Imu, Poses, Recording
-from imutool.strapdown import Start, dead_reckon, truth_velocity
+from imutool.recording import Poses, Recording
+from imutool.strapdown import along_truth
 from imutool.turn_on import TurnOn, find
 
 RAW = "raw"
@@ -51,7 +50,7 @@ def evaluate(
         recording = recording.with_truth(next(iter(recording.truths)))
     results = []
     for name, found, start in runs(recording, models, init, log):
-        estimate, true, valid = integrate(recording, found.imu)
+        estimate, true, valid = along_truth(found.imu, recording.truth, recording.name)
         figures = metrics.evaluate(estimate, true, valid)
         results.append(
             {
@@ -77,22 +76,6 @@ def runs(
     for given in models:
         model, start = _model_and_start(given, recording, init, where)
         yield str(model.card.get("name", model.method)), apply(model, start, recording.imu), start
-
-
-def integrate(recording: Recording, imu: Imu) -> tuple[Poses, Poses, Any]:
-    """Dead reckoning from the true start over the stretch that has truth, the truth on the same stamps, and where it counts.
-
-    Raises:
-        DataError: no truth, or none that shares time with the IMU.
-    """
-    both = replace(recording, imu=imu, frames={}).overlap()
-    truth = both.truth
-    if truth.v_w is None:
-        truth = replace(truth, v_w=truth_velocity(truth))
-    true, valid = truth.at(both.imu.t_ns)
-    if not valid.any():
-        raise DataError("the truth has gaps at every sample", where=recording.name, expected="a stretch of poses")
-    return dead_reckon(both.imu, Start.of(true)), true, valid
 
 
 def _model_and_start(given: str | Path, recording: Recording, init: str, where: str | Path) -> tuple[BiasModel, TurnOn]:

@@ -24,6 +24,7 @@ from imutool.recording import Imu, nanoseconds
 WHITE_MARGIN = 1.3  # of block means over white noise; with 10 blocks of 3 axes its own scatter is 0.14
 FLOOR_MARGIN = 2.5  # over the calmest windows of the log
 FLOOR_RANK = 10  # the window that sets the floor, from the calmest: one stuck or lucky window must not
+NOISE_BLOCK, CALMEST = 20, 0.25
 GAP_PERIODS = 3.0  # a longer step between samples breaks a window
 
 Positive = Annotated[float, Meta(gt=0)]
@@ -79,6 +80,19 @@ def stretches(imu: Imu, settings: StationarySettings | None = None) -> list[tupl
     found = [(first * k, last * k) for first, last in _runs(resting_blocks)]
     least_ns = nanoseconds(settings.min_s - 2 * imu.period_s)
     return [(a, b) for a, b in found if imu.t_ns[b - 1] - imu.t_ns[a] >= least_ns]
+
+
+def white_noise(values: Float64[np.ndarray, "n k"]) -> Float64[np.ndarray, " k"]:
+    """Standard deviation of a sample's white noise, moving or not: second differences where they are calm.
+
+    Their variance is 6 sigma² and motion hardly shows in them; blocks of `NOISE_BLOCK` samples, the one a quarter from the
+    calmest. Of plain white noise this finds five sixths. Zero for fewer samples than a block.
+    """
+    second = np.diff(values, n=2, axis=0) ** 2
+    if len(second) < NOISE_BLOCK:
+        return np.zeros(values.shape[1])
+    blocks = second[: len(second) // NOISE_BLOCK * NOISE_BLOCK].reshape(-1, NOISE_BLOCK, values.shape[1]).mean(axis=1)
+    return np.asarray(np.sqrt(np.quantile(blocks, CALMEST, axis=0) / 6.0))
 
 
 def _window_statistics(

@@ -11,10 +11,11 @@ so the last sample is not used, and sample k of the answer depends on samples be
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Bool, Float64
 
 from imutool.errors import DataError, NumericsError
 from imutool.recording import GAP_FACTOR, GRAVITY_M_S2, MIN_GAP_S, Imu, Poses, seconds
@@ -83,6 +84,30 @@ def dead_reckon(
             fix="Look at gyro and accel just before that sample",
         )
     return Poses(imu.t_ns, p_wb, q_wb, v_w)
+
+
+def along_truth(imu: Imu, truth: Poses, where: str) -> tuple[Poses, Poses, Bool[np.ndarray, " n"]]:
+    """What the IMU alone makes of the stretch that has truth, the truth on the same stamps, and where it can be scored.
+
+    The stretch runs from the first sample at which the truth is known to the last; the start is the truth there, its velocity
+    derived where it has none.
+
+    Raises:
+        DataError: the truth is known at fewer than two samples.
+        NumericsError: the numbers overflow.
+    """
+    true, valid = with_velocity(truth).at(imu.t_ns)
+    known = np.flatnonzero(valid)
+    if len(known) < 2:
+        raise DataError("IMU and true poses share fewer than two samples", where=where, expected="an overlap")
+    rows = slice(int(known[0]), int(known[-1]) + 1)
+    true = true.rows(rows)
+    return dead_reckon(imu.rows(rows), Start.of(true)), true, valid[rows]
+
+
+def with_velocity(poses: Poses) -> Poses:
+    """The same trajectory with a velocity: its own, or `truth_velocity` where it has none."""
+    return poses if poses.v_w is not None else replace(poses, v_w=truth_velocity(poses))
 
 
 def truth_velocity(

@@ -8,7 +8,7 @@ measured is what is left of the samples after that part.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 import torch
@@ -20,7 +20,7 @@ from imutool.bias._base import BiasModel, Vector6
 from imutool.errors import ConfigError, DataError
 from imutool.recording import GRAVITY_M_S2, Imu, Recording, nanoseconds, seconds
 from imutool.stationary import stretches
-from imutool.strapdown import GRAVITY_W, truth_velocity
+from imutool.strapdown import GRAVITY_W, with_velocity
 from imutool.windows import attitudes, rotation_residual, velocity_residual
 
 TRUTH_S = 5.0  # how much of the truth a start takes: longer is surer, but less of a start
@@ -146,9 +146,7 @@ def from_truth(model: BiasModel, recording: Recording) -> TurnOn:
     """
     both = recording.overlap()
     imu, truth = both.imu, both.truth
-    if truth.v_w is None:
-        truth = replace(truth, v_w=truth_velocity(truth))
-    poses, trusted = truth.at(imu.t_ns)
+    poses, trusted = with_velocity(truth).at(imu.t_ns)
     t = seconds(imu.t_ns, int(imu.t_ns[0]))
     usable = np.flatnonzero(trusted)
     ends = usable[t[usable] >= t[usable[0]] + TRUTH_S] if len(usable) else usable

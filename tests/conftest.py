@@ -6,6 +6,7 @@ The installed command, made-up logs and a model trained on them are here too, fo
 from __future__ import annotations
 
 import os
+import signal
 import subprocess
 import sys
 from collections.abc import Callable
@@ -15,6 +16,9 @@ import pytest
 from jaxtyping import install_import_hook
 
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # as the command does: idle threads must not spin while others test
+
+# a shell starts background jobs with SIGINT ignored, and they pass that on: the tests of Ctrl-C would test nothing
+signal.signal(signal.SIGINT, signal.default_int_handler)
 
 install_import_hook(["imutool", "converters"], "beartype.beartype").__enter__()
 

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from converters import euroc, fetch, tum_vi
+from imutool.physics.flight import flight
 from imutool.recording import GRAVITY_M_S2, Imu
-from imutool.stationary import StationarySettings, stretches
+from imutool.stationary import StationarySettings, stretches, white_noise
 
 RATE_HZ = 200.0
 GYRO_NOISE, ACCEL_NOISE = 2.4e-3, 0.03  # rad/s and m/s² a sample and axis: an ADIS16448 at 200 Hz
@@ -145,3 +146,14 @@ def test_rest_agrees_with_the_true_poses_of_the_real_recordings(data, place, mod
     else:
         assert 1.0 - wrong / found_known > MIN_PRECISION
         assert hit / resting > MIN_RECALL
+
+
+def test_white_noise_is_found_under_the_motion() -> None:
+    """The calmer quarter of white noise is five sixths of it; a flight under whose motion it lies hardly differs."""
+    made = flight(1, duration_s=20.0).imu
+    sigma = np.array([0.1] * 3 + [2.0] * 3)
+    plain = sigma * np.random.default_rng(2).normal(size=(len(made), 6))
+    np.testing.assert_allclose(white_noise(plain), sigma * 5 / 6, rtol=0.1)
+    flown = white_noise(np.concatenate([made.gyro, made.accel], axis=1))
+    np.testing.assert_allclose(flown, [2.4e-3 * 5 / 6] * 3 + [0.0283 * 5 / 6] * 3, rtol=0.1)
+    assert not white_noise(plain[:10]).any()

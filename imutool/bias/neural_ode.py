@@ -28,6 +28,7 @@ from torchdiffeq import odeint, odeint_adjoint
 
 from imutool.bias._base import COLUMNS, SENSORS, BiasModel, Segment, Sensor, Stream, Vector6
 from imutool.config import Settings
+from imutool.errors import ConfigError
 from imutool.ode import HermitePath
 
 Positive = Annotated[float, msgspec.Meta(gt=0)]
@@ -133,6 +134,12 @@ class Model(BiasModel):
     def __init__(self, config: Settings | None = None, rate_hz: float = 200.0) -> None:
         chosen = config or Config()
         assert isinstance(chosen, Config)
+        if chosen.adjoint and chosen.solver == "euler":
+            raise ConfigError(
+                "the adjoint of Euler's coarse steps is off by its own order of error",
+                where="model.adjoint",
+                fix="Use model.solver=rk4 or dopri5 with it, or backpropagation",
+            )
         super().__init__(chosen, rate_hz)
         c = chosen
         self.stride = max(1, round(c.drift_step_s * rate_hz))

@@ -141,16 +141,17 @@ class Training:
         return float(kept.mean())
 
     def _held_out_windows(self, sensor: Sensor) -> tuple[Int[Tensor, " m"], int]:
-        pool, window_s = self.pool, LONGEST_HELD_OUT_S[sensor]
+        pool, window_s, of_log = self.pool, LONGEST_HELD_OUT_S[sensor], [torch.empty(0)] * len(self.pool.names)
         while window_s > 0.1:
             n = pool.samples(window_s)
-            first = pool.starts(n, "held_out", hop=max(1, pool.samples(HELD_OUT_HOP_S)), ends_only=True)
-            if len(torch.unique(pool.log[first])) == len(pool.names):
-                return first, n
+            first = pool.starts(n, "held_out", ends_only=True)
+            of_log = [first[pool.log[first] == i][:: pool.samples(HELD_OUT_HOP_S)] for i in range(len(pool.names))]
+            if all(len(part) for part in of_log):
+                return torch.cat(of_log), n
             window_s *= 0.8
         raise DataError(
-            "the last fifth of a training log holds no stretch of truth",
-            where=", ".join(pool.names),
+            "the last fifth of the log holds no stretch of truth",
+            where=", ".join(name for name, part in zip(pool.names, of_log, strict=True) if not len(part)),
             expected="truth to the end of each log",
             fix="Leave that log out or cut it",
         )

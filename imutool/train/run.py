@@ -15,6 +15,7 @@ from imutool.config import plain
 from imutool.errors import ConfigError
 from imutool.mcap_io.read import read
 from imutool.mcap_io.rewrite import sha256
+from imutool.recording import Recording
 from imutool.train import checkpoint
 from imutool.train.fit import Epoch, Training, TrainSettings
 
@@ -72,15 +73,16 @@ def train(
             ) from interrupt
         raise
     model = training.model
-    about = {log.metadata.get("imutool", {}).get(key) for log in recordings for key in ("sensor",)}
-    model.card = {
-        **_card(training, logs),
-        "sensor": about.pop() if len(about) == 1 else None,
-        "dataset": next((r.metadata.get("imutool", {}).get("dataset") for r in recordings), None),
-    }
+    model.card = {**_card(training, logs), **{key: _shared(recordings, key) for key in ("sensor", "dataset")}}
     _file.save(model, out, overwrite=overwrite)
     kept.unlink(missing_ok=True)
     return _file.load(out)
+
+
+def _shared(recordings: Sequence[Recording], key: str) -> str | None:
+    """What all logs say of themselves under a key, if they agree."""
+    said = {recording.metadata.get("imutool", {}).get(key) for recording in recordings}
+    return said.pop() if len(said) == 1 else None
 
 
 def _card(training: Training, logs: Sequence[Path]) -> dict[str, Any]:

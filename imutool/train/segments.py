@@ -20,7 +20,7 @@ from imutool.bias._base import Segment
 from imutool.errors import DataError
 from imutool.recording import Recording, seconds
 from imutool.stationary import GAP_PERIODS
-from imutool.strapdown import truth_velocity
+from imutool.strapdown import with_velocity
 
 HELD_OUT = 0.2  # the last fifth of every training log validates (method.md, Arrangement)
 MAX_RATE_SPREAD = 0.05
@@ -154,9 +154,7 @@ class _Track:
         except DataError as error:
             raise error.at(recording.name) from error
         imu, truth = both.imu, both.truth
-        if truth.v_w is None:
-            truth = type(truth)(truth.t_ns, truth.p_wb, truth.q_wb_wxyz, truth_velocity(truth))
-        poses, trusted = truth.at(imu.t_ns)
+        poses, trusted = with_velocity(truth).at(imu.t_ns)
         assert poses.v_w is not None
         t = seconds(imu.t_ns, int(imu.t_ns[0]))
         R_wb = so3.matrix_from_quaternion_wxyz(torch.from_numpy(np.array(poses.q_wb_wxyz))).numpy()

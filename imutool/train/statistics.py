@@ -9,6 +9,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from imutool.bias._base import COLUMNS, SENSORS, BiasModel, Sensor
+from imutool.stationary import white_noise
 from imutool.train import closed_form
 from imutool.train.segments import Pool
 from imutool.turn_on import TRUTH_S
@@ -16,7 +17,6 @@ from imutool.turn_on import TRUTH_S
 MAD_TO_STD = 1.4826
 ONE_RUN_STD = {"gyro": 5e-3, "accel": 0.1}  # run-to-run spread when there is one run to judge by, rad/s and m/s²
 FLOOR_STD = {"gyro": 5e-5, "accel": 2e-3}
-QUIET = 0.05  # the calmest twentieth of the data shows the noise of a sample
 
 
 def store(model: BiasModel, pool: Pool, rest: Float[Tensor, "logs 6"], window_s: Mapping[Sensor, Sequence[float]]) -> None:
@@ -29,7 +29,8 @@ def store(model: BiasModel, pool: Pool, rest: Float[Tensor, "logs 6"], window_s:
         model.prior_mean[columns] = solution.rest.mean(0)
         model.prior_std[columns] = _run_to_run(sensor, solution.rest)
         model.truth_std[columns] = _start_spread(model, sensor, pool, rest)
-        model.noise_std[columns] = _sample_noise(pool.gyro if sensor == "gyro" else pool.accel)
+        u = pool.gyro if sensor == "gyro" else pool.accel
+        model.noise_std[columns] = torch.from_numpy(white_noise(u.cpu().numpy())).to(rest)
 
 
 def _run_to_run(sensor: Sensor, rest: Float[Tensor, "logs 3"]) -> Float[Tensor, "3"]:
@@ -52,10 +53,3 @@ def _start_spread(model: BiasModel, sensor: Sensor, pool: Pool, rest: Float[Tens
     off = torch.linalg.solve(A.sum(1), e)
     spread: Tensor = MAD_TO_STD * off.abs().median(0).values
     return spread.clamp_min(FLOOR_STD[sensor])
-
-
-def _sample_noise(u: Float[Tensor, "n 3"]) -> Float[Tensor, "3"]:
-    """White noise of a sample: second differences (variance 6 sigma²), where they are smallest over a tenth of a second."""
-    second = torch.diff(u, n=2, dim=0).square()
-    blocks = second[: len(second) // 20 * 20].reshape(-1, 20, 3).mean(1)
-    return (torch.quantile(blocks, QUIET, dim=0) / 6).sqrt()

@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from imutool.errors import ConfigError, DataError
 from imutool.metrics import evaluate
 from imutool.recording import GAP_FACTOR, MIN_GAP_S, Imu, Poses, Recording, Scalars, Times, nanoseconds, seconds
-from imutool.strapdown import Start, dead_reckon, truth_velocity
+from imutool.strapdown import Start, along_truth, dead_reckon, with_velocity
 
 RAW = "raw"
 TRUTH = "truth"  # its place in the pictures; no run may take it
@@ -138,7 +138,7 @@ def build(recording: Recording, runs: Sequence[Run]) -> RunData:
         raise ConfigError(f"runs are called {names}", where=recording.name, expected="names of their own, not 'truth'")
     imu = recording.imu
     if recording.truths:
-        truth = _with_velocity(recording.truth)
+        truth = with_velocity(recording.truth)
         traces = tuple(_scored(run, truth, recording.name) for run in runs)
         started = seconds(traces[0].path.t_ns[:1], int(imu.t_ns[0]))[0]
         notes = (f"Paths start at the true pose, {started:.2f} s into the log; errors are without alignment.",)
@@ -201,22 +201,10 @@ def _true_bias(recording: Recording) -> Mapping[str, Scalars]:
     return MappingProxyType({kind: b.between(int(imu.t_ns[0]), int(imu.t_ns[-1])) for kind, b in known.items()})
 
 
-def _with_velocity(truth: Poses) -> Poses:
-    if truth.v_w is not None:
-        return truth
-    return Poses(truth.t_ns, truth.p_wb, truth.q_wb_wxyz, truth_velocity(truth))
-
-
 def _scored(run: Run, truth: Poses, where: str) -> Trace:
     """One run from the first sample with truth to the last, with its errors and figures."""
-    at, valid = truth.at(run.imu.t_ns)
-    known = np.flatnonzero(valid)
-    if len(known) < 2:
-        raise DataError("IMU and true poses share fewer than two samples", where=where, expected="an overlap")
-    rows = slice(int(known[0]), int(known[-1]) + 1)
-    at, valid = at.rows(rows), valid[rows]
-    path = dead_reckon(run.imu.rows(rows), Start.of(at))
-    return Trace(run, path, errors(path, at, valid), MappingProxyType(evaluate(path, at, valid)))
+    path, true, valid = along_truth(run.imu, truth, where)
+    return Trace(run, path, errors(path, true, valid), MappingProxyType(evaluate(path, true, valid)))
 
 
 def _numbers(figures: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, float]]:

@@ -15,9 +15,9 @@ from imutool import metrics
 from imutool.bias._file import load
 from imutool.debias import apply
 from imutool.errors import ConfigError, DataError, ModelError, NumericsError
-from imutool.evaluate import integrate
 from imutool.physics.flight import flight
 from imutool.recording import Imu, Recording
+from imutool.strapdown import along_truth
 from imutool.train import checkpoint
 from imutool.train.fit import Epoch, Training, TrainSettings
 from imutool.turn_on import from_truth
@@ -116,6 +116,18 @@ def test_interrupted_and_resumed_equals_uninterrupted(
     assert [without_clock(epoch) for epoch in epochs][1:] == expected[1:]
 
 
+@pytest.fixture(scope="module")
+def begun(recordings: list[Recording], tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The checkpoint of a training that has just begun its descent."""
+    path = tmp_path_factory.mktemp("begun") / "c"
+    training = Training(recordings, "neural_ode", TINY)
+    progress = training.epochs()
+    for _ in range(2):
+        next(progress)
+    checkpoint.save(training, path)
+    return path
+
+
 @pytest.mark.parametrize(
     "other",
     [
@@ -127,28 +139,17 @@ def test_interrupted_and_resumed_equals_uninterrupted(
         {"swapped": True},
     ],
 )
-def test_a_checkpoint_of_another_training_is_refused(
-    recordings: list[Recording], tmp_path: Path, other: dict[str, Any]
-) -> None:
-    first = Training(recordings, "neural_ode", TINY)
-    next(first.epochs())
-    checkpoint.save(first, tmp_path / "c")
+def test_a_checkpoint_of_another_training_is_refused(recordings: list[Recording], begun: Path, other: dict[str, Any]) -> None:
     logs = recordings[: other.get("logs", 2)]
     logs = logs[::-1] if other.get("swapped") else logs
     method = other.get("method", "neural_ode")
     chosen = settings(**({"model": {}} if method == "linear" else {}) | other.get("settings", {}))
     with pytest.raises(ConfigError, match="belongs to other logs, another method or other settings"):
-        checkpoint.restore(Training(logs, method, chosen), tmp_path / "c")
+        checkpoint.restore(Training(logs, method, chosen), begun)
 
 
-def test_a_damaged_checkpoint_is_refused(recordings: list[Recording], tmp_path: Path) -> None:
-    first = Training(recordings, "neural_ode", TINY)
-    progress = first.epochs()
-    for _ in range(2):
-        next(progress)
-    path = tmp_path / "c"
-    checkpoint.save(first, path)
-    whole = path.read_bytes()
+def test_a_damaged_checkpoint_is_refused(recordings: list[Recording], begun: Path, tmp_path: Path) -> None:
+    whole, path = begun.read_bytes(), tmp_path / "c"
     for spoiled in (b"", whole[: len(whole) // 2], b"text", whole.replace(b"generator", b"denerator")):
         path.write_bytes(spoiled)
         with pytest.raises(ModelError):
@@ -230,7 +231,7 @@ def test_a_truth_shorter_than_a_window_is_refused(recordings: list[Recording], p
 
 def test_a_log_whose_last_fifth_has_no_truth_is_refused(perfect: Make, without_truth: Make) -> None:
     holed = without_truth(perfect(3, duration_s=10.0), 7.8, 9.95)
-    with pytest.raises(DataError, match="exact_3: the last fifth of a training log holds no stretch of truth"):
+    with pytest.raises(DataError, match="exact_3: the last fifth of the log holds no stretch of truth"):
         finish(Training([holed], "linear", LINEAR))
 
 
@@ -278,7 +279,8 @@ def test_an_unseen_flight_drifts_far_less(sensor_flights: list[Recording], metho
     unseen = flight(14, duration_s=20.0)
     start = from_truth(training.model, unseen)
     raw, debiased = (
-        metrics.evaluate(*integrate(unseen, imu)) for imu in (unseen.imu, apply(training.model, start, unseen.imu).imu)
+        metrics.evaluate(*along_truth(imu, unseen.truth, unseen.name))
+        for imu in (unseen.imu, apply(training.model, start, unseen.imu).imu)
     )
     for figure in ("aoe_deg", "velocity_rmse_m_s", "ape_m"):
         assert debiased[figure] < raw[figure] / 20, figure
