@@ -120,7 +120,8 @@ def drawn(training: Training, batch: Batch) -> Windows:
 def our_step(recording: Recording, sensor: Sensor, batches: list[Batch], measure: Error) -> Callable[[], float]:
     """One optimisation step as `imutool train` takes it, with a given way to come by the error of a window."""
     training = Training([recording], "neural_ode")
-    optimizer, loss = training.optimizer(sensor), RobustLoss()
+    optimizer = training.begin(sensor).optimizer
+    loss = RobustLoss({batch.n: torch.ones(1, dtype=torch.float64) for batch in batches})
     if sensor == "accel":  # the paper's second stage leaves the gyro's network alone
         for part in (training.model.curve, training.model.drift):
             part["gyro"].requires_grad_(False)
@@ -128,7 +129,8 @@ def our_step(recording: Recording, sensor: Sensor, batches: list[Batch], measure
     def step() -> float:
         total = training.tracks.wandering(sensor) / (len(training.pool.t) / training.pool.rate_hz)
         for batch in batches:
-            total = total + loss(measure(training.model, sensor, drawn(training, batch)), batch.n)
+            windows = drawn(training, batch)
+            total = total + loss(measure(training.model, sensor, windows), windows.log, batch.n)
         optimizer.zero_grad()
         total.backward()
         optimizer.step()
