@@ -2,47 +2,28 @@
 
 from __future__ import annotations
 
-import json
-import logging
 import math
 import os
-import re
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 
 import typer
-from rich import box
-from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn
-from rich.table import Table
 from typer.core import TyperCommand, TyperGroup
 
 from imutool import __version__, registry
 from imutool.errors import ConfigError, DataError, ImutoolError
+from imutool.terminal import err, log_to_stderr, out, plain, progress, say, table, tell_error, write_json
 
 if TYPE_CHECKING:
     from imutool.train.fit import Epoch
 
 INTERRUPTED = 130
 PIPE_CLOSED = 141  # what a shell reports of a program that SIGPIPE ended
-NUMBER = re.compile(r"[-+]?[0-9.]+|[–?]")
 NOTHING_LEFT = "Nothing half-written is left"
-
-logger = logging.getLogger("imutool")
-
-
-class _Console(Console):
-    """Rich's console would end the program itself, with the code of a bug, when nobody reads on."""
-
-    def on_broken_pipe(self) -> None:
-        raise BrokenPipeError
-
-
-out, err = _Console(), _Console(stderr=True)
 
 
 class _Commands(TyperGroup):
@@ -79,7 +60,7 @@ def _listing(group: str, option: str) -> type[TyperCommand]:
 
     class Listing(TyperCommand):
         def format_help(self, ctx: Any, formatter: Any) -> None:
-            lines = [f"[bold]{name}[/]  {_plain(registry.summary(group, name))}" for name in registry.names(group)]
+            lines = [f"[bold]{name}[/]  {plain(registry.summary(group, name))}" for name in registry.names(group)]
             self.epilog = "\n\n".join([f"Values of {option}:", *lines, self.epilog or ""])
             super().format_help(ctx, formatter)
 
@@ -124,28 +105,13 @@ def main() -> None:
 
 
 def _fail(message: str, code: int) -> NoReturn:
-    _tell_error(message)
+    tell_error(message)
     sys.exit(code)
-
-
-def _tell_error(message: str) -> None:
-    err.print(f"[bold red]error:[/] {_plain(message)}", highlight=False, soft_wrap=True)
-
-
-def _say(line: str) -> None:
-    """A line of results, whole however long."""
-    out.print(_plain(line), highlight=False, soft_wrap=True)
 
 
 def _forget_stdout() -> None:
     """What is still to be flushed into a closed pipe or a full disk goes nowhere, so that leaving raises nothing more."""
     os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-
-
-def _plain(text: str) -> str:
-    """Text from logs and files as it is: no markup, no control characters that a terminal would obey."""
-    shown = "".join(c if c.isprintable() or c == "\n" else repr(c)[1:-1] for c in text)
-    return shown.replace("[", r"\[")
 
 
 @app.command(
@@ -167,7 +133,7 @@ def convert(
     """Convert a data set to MCAP logs, one a sequence."""
     from imutool.convert import convert as run
 
-    with _progress("Converting", verbose, quiet) as tell:
+    with progress("Converting", verbose, quiet) as tell:
         report = run(
             source,
             target,
@@ -181,11 +147,11 @@ def convert(
         )
     failures = [{"name": failure.name, "message": failure.message} for failure in report.failures]
     result = {"schema": "imutool.conversion/1", "written": [str(path) for path in report.written], "failures": failures}
-    if not _json(result, json_to):
+    if not write_json(result, json_to):
         for path in report.written:
-            _say(str(path))
+            say(str(path))
     for failure in report.failures:
-        _tell_error(failure.message)
+        tell_error(failure.message)
     if report.failures:
         raise typer.Exit(DataError.exit_code)
 
@@ -195,16 +161,16 @@ def info(logs: Logs, json_to: Json = None, verbose: Verbose = False, quiet: Quie
     """Say what is in a log and what looks wrong with it."""
     from imutool.info import imu_rows, inspect, topic_rows
 
-    _log_to_stderr(verbose, quiet)
+    log_to_stderr(verbose, quiet)
     reports = [inspect(log) for log in logs]
-    if _json(reports[0] if len(reports) == 1 else {"schema": "imutool.infos/1", "logs": reports}, json_to):
+    if write_json(reports[0] if len(reports) == 1 else {"schema": "imutool.infos/1", "logs": reports}, json_to):
         return
     for log, report in zip(logs, reports, strict=True):
-        _say(str(log))
-        _table(topic_rows(report), keys=1)
-        _table(imu_rows(report), keys=2)
+        say(str(log))
+        table(topic_rows(report), keys=1)
+        table(imu_rows(report), keys=2)
         for warning in report["warnings"]:
-            out.print(f"[yellow]warning:[/] {_plain(warning)}", highlight=False, soft_wrap=True)
+            out.print(f"[yellow]warning:[/] {plain(warning)}", highlight=False, soft_wrap=True)
 
 
 @app.command(
@@ -237,7 +203,7 @@ def train(
 
     words = [*(set_ or ()), *([f"seed={seed}"] if seed is not None else ())]
     settings = load(TrainSettings, config, words)
-    with _progress("Training", verbose, quiet) as tell:
+    with progress("Training", verbose, quiet) as tell:
         trained = run(
             logs,
             model,
@@ -250,8 +216,8 @@ def train(
             overwrite=overwrite,
             progress=lambda epoch: tell(*_epoch(epoch)),
         )
-    if not _json({"schema": "imutool.training/1", "model": str(model), **trained.card}, json_to):
-        _say(str(model))
+    if not write_json({"schema": "imutool.training/1", "model": str(model), **trained.card}, json_to):
+        say(str(model))
 
 
 @app.command(epilog="Example: [bold]imutool debias MH_04.mcap MH_04_debiased.mcap --model adis.safetensors[/]")
@@ -269,7 +235,7 @@ def debias(
     """Rewrite a log with a debiased IMU channel; everything else passes through unchanged."""
     from imutool.debias import debias as run
 
-    with _progress("Debiasing", verbose, quiet) as tell:
+    with progress("Debiasing", verbose, quiet) as tell:
         report = run(
             source,
             target,
@@ -291,14 +257,14 @@ def debias(
     }
     added, copied = dict(report.rewrite.added), report.rewrite.copied
     result = {"schema": "imutool.debias/1", "output": str(target), "imus": imus, "copied": copied, "added": added}
-    if _json(result, json_to):
+    if write_json(result, json_to):
         return
     for topic, entry in imus.items():
         bias = ", ".join(f"{b:+.5f}" for b in entry["gyro_bias"]), ", ".join(f"{b:+.4f}" for b in entry["accel_bias"])
         start = f"start bias {bias[0]} rad/s; {bias[1]} m/s² ({entry['init_how']})"
-        _say(f"{topic}: {entry['model']}, {start}")
+        say(f"{topic}: {entry['model']}, {start}")
     counts = ", ".join(f"{count} on {name}" for name, count in added.items())
-    _say(f"{target}: {copied} messages as they were, {counts}")
+    say(f"{target}: {copied} messages as they were, {counts}")
 
 
 @app.command(epilog="Example: [bold]imutool evaluate MH_04.mcap --model adis.safetensors --init truth[/]")
@@ -319,14 +285,14 @@ def evaluate(
     from imutool.evaluate import evaluate as run
 
     results = []
-    with _progress("Evaluating", verbose, quiet) as tell:
+    with progress("Evaluating", verbose, quiet) as tell:
         for done, log in enumerate(logs):
             tell(done, len(logs), log.name)
             results += run(
                 log, models=model or (), init=init, truth=truth, imu=imu, trajectories=trajectories, overwrite=overwrite
             )
         tell(len(logs), len(logs), "")
-    if not _json({"schema": SCHEMA, "results": results}, json_to):
+    if not write_json({"schema": SCHEMA, "results": results}, json_to):
         _figures(results)
 
 
@@ -347,7 +313,7 @@ def view(
     from imutool.view import report, rerun
     from imutool.view.runs import load
 
-    with _progress("Reading", verbose, quiet) as tell:
+    with progress("Reading", verbose, quiet) as tell:
         data = []
         for done, log in enumerate(logs):
             tell(done, len(logs), log.name)
@@ -356,7 +322,7 @@ def view(
         png.mkdir(parents=True, exist_ok=True)
         for log, one in zip(logs, data, strict=True):
             report.error_curves(one, png / f"{log.stem}.png", overwrite=overwrite)
-    _say(rerun.show(data, save=save, overwrite=overwrite))
+    say(rerun.show(data, save=save, overwrite=overwrite))
 
 
 @app.command(epilog="Example: [bold]imutool models --json -[/]")
@@ -364,18 +330,18 @@ def models(json_to: Json = None, verbose: Verbose = False, quiet: Quiet = False)
     """List the models that ship, their sensor and their card."""
     from imutool.bias._file import header_of, library
 
-    _log_to_stderr(verbose, quiet)
+    log_to_stderr(verbose, quiet)
     found = []
     for path in sorted(library().glob("*.safetensors")):
         about = header_of(path)
         keys = ("method", "sensor", "dataset", "rate_hz")
         found.append({"name": path.stem, **{key: about.get(key) for key in keys}})
-    if _json({"schema": "imutool.models/1", "models": found}, json_to):
+    if write_json({"schema": "imutool.models/1", "models": found}, json_to):
         return
     if found:
-        _table([tuple(found[0]), *(tuple(str(value) for value in one.values()) for one in found)], keys=1)
+        table([tuple(found[0]), *(tuple(str(value) for value in one.values()) for one in found)], keys=1)
     else:
-        _say("No model ships with this version; train one with: imutool train")
+        say("No model ships with this version; train one with: imutool train")
 
 
 @app.command(epilog="Example: [bold]imutool demo -o demo-out[/]")
@@ -389,22 +355,22 @@ def demo(
     """Go the whole way on a made-up recording: convert, train, debias, evaluate, view. No download."""
     from imutool.demo import run
 
-    def say(line: str) -> None:
+    def announce(line: str) -> None:
         if not quiet:
-            err.print(_plain(line), highlight=False, soft_wrap=True)
+            err.print(plain(line), highlight=False, soft_wrap=True)
 
-    with _progress("Training", verbose, quiet) as tell:
-        done = run(folder, say, overwrite=overwrite, progress=lambda epoch: tell(*_epoch(epoch)))
+    with progress("Training", verbose, quiet) as tell:
+        done = run(folder, announce, overwrite=overwrite, progress=lambda epoch: tell(*_epoch(epoch)))
     files = {name: str(getattr(done, name)) for name in ("log", "debiased", "model", "rrd", "png")}
-    if not _json({"schema": "imutool.demo/1", "results": done.results, **files}, json_to):
-        _say("Pure integration of a flight the model has not seen, from its true start:")
+    if not write_json({"schema": "imutool.demo/1", "results": done.results, **files}, json_to):
+        say("Pure integration of a flight the model has not seen, from its true start:")
         _figures(done.results)
-        _say(f"Error curves: {done.png}. In the viewer: rerun {done.rrd}")
+        say(f"Error curves: {done.png}. In the viewer: rerun {done.rrd}")
 
 
 def _version(show: bool) -> bool:
     if show:
-        _say(f"imutool {__version__}")
+        say(f"imutool {__version__}")
         raise typer.Exit
     return show
 
@@ -442,97 +408,7 @@ def _figures(results: Sequence[dict[str, Any]]) -> None:
         roe.append((one["log"], one["model"], *(number(one["roe_deg"][d]) for d in distances)))
         rpe.append((one["log"], one["model"], *(number(one["rpe_m"][d]) for d in distances)))
     for rows in (whole, roe, rpe):
-        _table(rows, keys=2)
-
-
-def _table(rows: Sequence[Sequence[str]], *, keys: int) -> None:
-    """Rows of text, the first one the header; what is too wide goes on below, under the first `keys` columns again."""
-    columns = [[_plain(cell) for cell in column] for column in zip(*rows, strict=True)]
-    widths = [2 + max(len(line) for cell in column for line in cell.split("\n")) for column in columns]
-    room = out.width - sum(widths[:keys])
-    fewest = len(_split(widths[keys:], room))
-    even = next(w for w in range(room + 1) if len(_split(widths[keys:], w)) == fewest) if room > 0 else 0
-    first = keys
-    for count in _split(widths[keys:], even):
-        chosen = [*range(keys), *range(first, first + count)]
-        _print([columns[i] for i in chosen], sum(widths[i] for i in chosen))
-        first += count
-
-
-def _split(widths: Sequence[int], room: int) -> list[int]:
-    """How many columns go side by side, at least one at a time."""
-    counts, used = [0], 0
-    for width in widths:
-        if counts[-1] and used + width > room:
-            counts.append(0)
-            used = 0
-        counts[-1] += 1
-        used += width
-    return counts
-
-
-def _print(columns: Sequence[Sequence[str]], width: int) -> None:
-    table = Table(box=box.SIMPLE_HEAD, show_edge=False, pad_edge=False, padding=(0, 1, 0, 0))
-    for header, *cells in columns:
-        numbers = all(NUMBER.fullmatch(cell) for cell in cells)
-        table.add_column(header, overflow="fold", justify="right" if numbers else "left", vertical="bottom")
-    for row in zip(*(column[1:] for column in columns), strict=True):
-        table.add_row(*row)
-    # a terminal folds what does not fit; where nobody looks at a terminal, nothing may be folded
-    console = out if out.is_terminal else _Console(width=max(width, out.width))
-    console.print(table)
-    console.print()
-
-
-def _json(report: Any, where: str | None) -> bool:
-    """Writes the report where `--json` says; true if stdout is taken by it.
-
-    Raises:
-        ConfigError: the file cannot be written.
-    """
-    if where is None:
-        return False
-    text = json.dumps(report, indent=2, allow_nan=False, ensure_ascii=False)
-    if where == "-":
-        sys.stdout.write(text + "\n")
-        return True
-    beside = Path(where).with_name(f".{Path(where).name}.{os.getpid()}.part")
-    try:
-        beside.write_text(text + "\n", encoding="utf-8")
-        beside.replace(where)
-    except OSError as error:
-        raise ConfigError(f"cannot be written ({error.strerror})", where=where, fix="Choose another --json") from error
-    finally:
-        beside.unlink(missing_ok=True)
-    return False
-
-
-class _Lines(logging.Handler):
-    """Log records as lines on stderr, above the progress bar where there is one."""
-
-    def emit(self, record: logging.LogRecord) -> None:
-        err.print(_plain(f"{record.levelname.lower()}: {record.getMessage()}"), highlight=False, soft_wrap=True)
-
-
-def _log_to_stderr(verbose: bool, quiet: bool) -> None:
-    logging.basicConfig(level=logging.ERROR if quiet else logging.WARNING, handlers=[_Lines()], force=True)
-    logger.setLevel(logging.INFO if verbose else logging.NOTSET)
-
-
-@contextmanager
-def _progress(what: str, verbose: bool, quiet: bool) -> Iterator[Callable[[int, int, str], None]]:
-    """A bar on stderr, told how much is done, of how much, and a word on it; with --verbose the words stay as lines."""
-    _log_to_stderr(verbose, quiet)
-    columns = (TextColumn("{task.description}"), BarColumn(bar_width=16), TextColumn("{task.percentage:>3.0f} %"))
-    with Progress(*columns, TextColumn("{task.fields[word]}"), console=err, disable=quiet, transient=True) as bar:
-        task = bar.add_task(what, total=None, word="")
-
-        def tell(done: int, total: int, word: str) -> None:
-            bar.update(task, completed=done, total=total, word=_plain(word))
-            if word:
-                logger.info("%s %s", what, word)
-
-        yield tell
+        table(rows, keys=2)
 
 
 if __name__ == "__main__":

@@ -234,7 +234,7 @@ def _rotations(poses: Poses) -> Rotation:
     return Rotation.from_quat(poses.q_wb_wxyz, scalar_first=True)
 
 
-def _rms(errors: Float64[np.ndarray, "n *k"]) -> float:
+def _rms(errors: Float64[np.ndarray, " n *k"]) -> float:
     """Root mean square over rows of the length of each row."""
     return float(np.sqrt((errors**2).reshape(len(errors), -1).sum(axis=1).mean()))
 

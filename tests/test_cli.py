@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from imutool import cli, errors, registry
+from imutool import cli, errors, registry, terminal
 from imutool.demo import write_asl
 from imutool.physics.flight import flight
 from imutool.train.fit import Epoch
@@ -218,7 +218,7 @@ def test_a_table_too_wide_goes_on_below_with_its_keys(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("COLUMNS", "30")
-    cli._table([("log", "aaaaaaaa", "bbbbbbbb", "cccccccc", "dddddddd"), ("x" * 8, *"1234")], keys=1)
+    terminal.table([("log", "aaaaaaaa", "bbbbbbbb", "cccccccc", "dddddddd"), ("x" * 8, *"1234")], keys=1)
     lines = [line.split() for line in capsys.readouterr().out.splitlines() if line.strip() and "─" not in line]
     assert lines == [["log", "aaaaaaaa", "bbbbbbbb"], ["x" * 8, "1", "2"], ["log", "cccccccc", "dddddddd"], ["x" * 8, "3", "4"]]
 
@@ -227,7 +227,7 @@ def test_nothing_is_folded_where_nobody_looks_at_a_terminal(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("COLUMNS", "30")
-    cli._table([("log", "figure"), ("x" * 70, "y" * 70)], keys=1)
+    terminal.table([("log", "figure"), ("x" * 70, "y" * 70)], keys=1)
     assert f"{'x' * 70}  {'y' * 70}" in capsys.readouterr().out
 
 

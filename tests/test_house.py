@@ -35,7 +35,7 @@ TIERS = (
     ("debias",),
     ("train", "evaluate", "convert"),
     ("view", "fleet"),
-    ("demo",),
+    ("demo", "terminal"),
     ("cli",),
 )
 LEVEL = {room: level for level, rooms in enumerate(TIERS) for room in rooms}

@@ -270,7 +270,7 @@ class Series(NamedTuple):
 
     channel: int
     t_ns: Int64[np.ndarray, " n"]
-    columns: tuple[Shaped[np.ndarray, "n *k"], ...]
+    columns: tuple[Shaped[np.ndarray, " n *k"], ...]
     encode: Callable[..., UInt8[np.ndarray, "n L"]]
 
     def records(self, part: slice) -> UInt8[np.ndarray, "n M"]:

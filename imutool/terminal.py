@@ -1,0 +1,141 @@
+"""What the command line shows: tables that fit the terminal, JSON, lines, and a progress bar; stdout for results alone."""
+
+from __future__ import annotations
+
+import json
+import logging
+import os
+import re
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from rich import box
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn
+from rich.table import Table
+
+from imutool.errors import ConfigError
+
+NUMBER = re.compile(r"[-+]?[0-9.]+|[–?]")
+
+logger = logging.getLogger("imutool")
+
+
+class _Console(Console):
+    """Rich's console would end the program itself, with the code of a bug, when nobody reads on."""
+
+    def on_broken_pipe(self) -> None:
+        raise BrokenPipeError
+
+
+out, err = _Console(), _Console(stderr=True)
+
+
+def plain(text: str) -> str:
+    """Text from logs and files as it is: no markup, no control characters that a terminal would obey."""
+    shown = "".join(c if c.isprintable() or c == "\n" else repr(c)[1:-1] for c in text)
+    return shown.replace("[", r"\[")
+
+
+def say(line: str) -> None:
+    """A line of results, whole however long."""
+    out.print(plain(line), highlight=False, soft_wrap=True)
+
+
+def tell_error(message: str) -> None:
+    """A line that begins with "error:", on stderr."""
+    err.print(f"[bold red]error:[/] {plain(message)}", highlight=False, soft_wrap=True)
+
+
+def table(rows: Sequence[Sequence[str]], *, keys: int) -> None:
+    """Rows of text, the first one the header; what is too wide goes on below, under the first `keys` columns again."""
+    columns = [[plain(cell) for cell in column] for column in zip(*rows, strict=True)]
+    widths = [2 + max(len(line) for cell in column for line in cell.split("\n")) for column in columns]
+    room = out.width - sum(widths[:keys])
+    fewest = len(_split(widths[keys:], room))
+    even = next(w for w in range(room + 1) if len(_split(widths[keys:], w)) == fewest) if room > 0 else 0
+    first = keys
+    for count in _split(widths[keys:], even):
+        chosen = [*range(keys), *range(first, first + count)]
+        _print([columns[i] for i in chosen], sum(widths[i] for i in chosen))
+        first += count
+
+
+def _split(widths: Sequence[int], room: int) -> list[int]:
+    """How many columns go side by side, at least one at a time."""
+    counts, used = [0], 0
+    for width in widths:
+        if counts[-1] and used + width > room:
+            counts.append(0)
+            used = 0
+        counts[-1] += 1
+        used += width
+    return counts
+
+
+def _print(columns: Sequence[Sequence[str]], width: int) -> None:
+    grid = Table(box=box.SIMPLE_HEAD, show_edge=False, pad_edge=False, padding=(0, 1, 0, 0))
+    for header, *cells in columns:
+        numbers = all(NUMBER.fullmatch(cell) for cell in cells)
+        grid.add_column(header, overflow="fold", justify="right" if numbers else "left", vertical="bottom")
+    for row in zip(*(column[1:] for column in columns), strict=True):
+        grid.add_row(*row)
+    # a terminal folds what does not fit; where nobody looks at a terminal, nothing may be folded
+    console = out if out.is_terminal else _Console(width=max(width, out.width))
+    console.print(grid)
+    console.print()
+
+
+def write_json(report: Any, where: str | None) -> bool:
+    """Writes the report where `--json` says; true if stdout is taken by it.
+
+    Raises:
+        ConfigError: the file cannot be written.
+    """
+    if where is None:
+        return False
+    text = json.dumps(report, indent=2, allow_nan=False, ensure_ascii=False)
+    if where == "-":
+        sys.stdout.write(text + "\n")
+        return True
+    beside = Path(where).with_name(f".{Path(where).name}.{os.getpid()}.part")
+    try:
+        beside.write_text(text + "\n", encoding="utf-8")
+        beside.replace(where)
+    except OSError as error:
+        raise ConfigError(f"cannot be written ({error.strerror})", where=where, fix="Choose another --json") from error
+    finally:
+        beside.unlink(missing_ok=True)
+    return False
+
+
+class _Lines(logging.Handler):
+    """Log records as lines on stderr, above the progress bar where there is one."""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        err.print(plain(f"{record.levelname.lower()}: {record.getMessage()}"), highlight=False, soft_wrap=True)
+
+
+def log_to_stderr(verbose: bool, quiet: bool) -> None:
+    """Sends warnings to stderr: with `verbose` what the tool does besides, with `quiet` errors alone."""
+    logging.basicConfig(level=logging.ERROR if quiet else logging.WARNING, handlers=[_Lines()], force=True)
+    logger.setLevel(logging.INFO if verbose else logging.NOTSET)
+
+
+@contextmanager
+def progress(what: str, verbose: bool, quiet: bool) -> Iterator[Callable[[int, int, str], None]]:
+    """A bar on stderr, told how much is done, of how much, and a word on it; with --verbose the words stay as lines."""
+    log_to_stderr(verbose, quiet)
+    columns = (TextColumn("{task.description}"), BarColumn(bar_width=16), TextColumn("{task.percentage:>3.0f} %"))
+    with Progress(*columns, TextColumn("{task.fields[word]}"), console=err, disable=quiet, transient=True) as bar:
+        task = bar.add_task(what, total=None, word="")
+
+        def tell(done: int, total: int, word: str) -> None:
+            bar.update(task, completed=done, total=total, word=plain(word))
+            if word:
+                logger.info("%s %s", what, word)
+
+        yield tell
