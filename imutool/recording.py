@@ -155,7 +155,8 @@ class Poses(_Columns):
 
         Position (and velocity) linearly, orientation by slerp along the shorter arc. The mask is false before the first
         pose, after the last, and inside a gap longer than `max_gap_s` (by default four median periods, at least
-        80 ms). Masked rows hold the nearest pose, so that every row stays a valid one.
+        80 ms). Masked rows hold the end's pose or what lies across the gap, so that
+        every row stays a valid one.
 
         Raises:
             DataError: fewer than two poses.

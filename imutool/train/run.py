@@ -51,12 +51,15 @@ def train(
         raise ConfigError("exists already", where=out, fix="Choose another name or give --overwrite")
     if not out.parent.is_dir():
         raise ConfigError("the folder does not exist", where=out.parent, fix="Create it first")
+    kept = checkpoint_path(out)
+    if resume and not kept.exists():
+        raise ConfigError("there is no checkpoint", where=kept, fix="Train without --resume")
+    if kept.exists() and not (resume or overwrite):
+        said = "an interrupted training left its checkpoint"
+        raise ConfigError(said, where=kept, fix="Give --resume to go on, or --overwrite to start afresh")
     recordings = [read(log, imu=imu, truth=truth) for log in logs]
     training = Training(recordings, method, settings, device)
-    kept = checkpoint_path(out)
     if resume:
-        if not kept.exists():
-            raise ConfigError("there is no checkpoint", where=kept, fix="Train without --resume")
         checkpoint.restore(training, kept)
     saved = resume
     try:

@@ -141,6 +141,16 @@ def test_to_resume_what_was_never_begun_is_refused(logs: list[Path], tmp_path: P
         train(logs, tmp_path / "m.safetensors", settings=TINY, resume=True)
 
 
+def test_a_checkpoint_is_not_trained_over_without_being_told(logs: list[Path], tmp_path: Path) -> None:
+    out = tmp_path / "m.safetensors"
+    checkpoint_path(out).write_bytes(b"hours of work")
+    with pytest.raises(ConfigError, match=r"interrupted training left its checkpoint.*--resume to go on"):
+        train(logs, out, settings=TINY)
+    assert checkpoint_path(out).read_bytes() == b"hours of work"
+    train(logs, out, settings=TINY, overwrite=True)
+    assert names(tmp_path) == [out.name]
+
+
 def test_to_resume_with_other_settings_is_refused_and_the_checkpoint_kept(logs: list[Path], tmp_path: Path) -> None:
     def stop(epoch: Epoch) -> None:
         if epoch.step == 4:
