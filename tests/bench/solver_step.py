@@ -1,0 +1,59 @@
+"""What the drift's step and solver do to the answer: `python tests/bench/solver_step.py MODEL.safetensors LOG...`.
+
+Prints the AOE (degrees, start from the truth) of a neural_ode model with its drift stepped as trained, at a half and a quarter of
+that, and with rk4 in place of Euler. The step also sets over how many samples the network's inputs are averaged.
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import msgspec
+import torch
+
+from imutool import metrics
+from imutool.bias._base import Segment
+from imutool.bias._file import load
+from imutool.bias.neural_ode import Model
+from imutool.debias import apply
+from imutool.mcap_io.read import read
+from imutool.recording import Imu, Recording, seconds
+from imutool.strapdown import along_truth
+from imutool.turn_on import TurnOn, from_truth
+
+
+def main() -> None:
+    """One line a log."""
+    path, *logs = map(Path, sys.argv[1:])
+    for log in logs:
+        recording, figures = read(log), []
+        for part in (1.0, 0.5, 0.25):
+            model = load(path)
+            assert isinstance(model, Model)
+            start = from_truth(model, recording)
+            model.stride = max(1, round(part * model.stride))
+            figures.append(aoe(recording, apply(model, start, recording.imu).imu))
+        figures.append(aoe(recording, by_rk4(load(path), start, recording.imu)))
+        print(
+            f"{recording.name:20} step 1: {figures[0]:.3f}  1/2: {figures[1]:.3f}  1/4: {figures[2]:.3f}  rk4: {figures[3]:.3f}"
+        )
+
+
+def aoe(recording: Recording, imu: Imu) -> float:
+    """Orientation error of pure integration, in degrees."""
+    return float(metrics.evaluate(*along_truth(imu, recording.truth, recording.name))["aoe_deg"])
+
+
+@torch.no_grad()
+def by_rk4(model: Model, start: TurnOn, imu: Imu) -> Imu:
+    """The debiased samples with the drift solved by rk4 over the whole log."""
+    model.config = msgspec.structs.replace(model.config, solver="rk4")
+    t = torch.from_numpy(seconds(imu.t_ns, int(imu.t_ns[0])))[None]
+    gyro, accel = (torch.from_numpy(u.copy())[None] for u in (imu.gyro, imu.accel))
+    bias = model(Segment(t, gyro, accel, torch.from_numpy(start.rest)[None]))[0].numpy()
+    return Imu(imu.t_ns, imu.gyro - bias[:, :3], imu.accel - bias[:, 3:])
+
+
+if __name__ == "__main__":
+    main()
