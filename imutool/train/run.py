@@ -61,16 +61,16 @@ def train(
     training = Training(recordings, method, settings, device)
     if resume:
         checkpoint.restore(training, kept)
-    saved = resume
+    else:
+        kept.unlink(missing_ok=True)
     try:
         for epoch in training.epochs():
             if progress is not None:
                 progress(epoch)
             if training.model.iterative and epoch.step:
                 checkpoint.save(training, kept)
-                saved = True
     except KeyboardInterrupt as interrupt:  # it may have struck in the middle of a step: what is kept is from before
-        if saved:
+        if kept.exists():
             raise KeyboardInterrupt(
                 f"{kept} holds what is done; the same command with --resume goes on from there"
             ) from interrupt
