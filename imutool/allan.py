@@ -1,0 +1,219 @@
+"""Allan deviation of samples at rest, and what its slopes say: density at -1/2, instability at 0, bias walk at +1/2.
+
+A stretch of T seconds shows averaging times up to T/4. Over these the variance is a sum of powers (IEEE 952, annex C)::
+
+    sigma²(tau) = 3 Q²/tau² + N²/tau + (2 ln 2/pi) B² + K² tau/3 + R² tau²/2
+
+(quantisation or vibration, white density, instability, bias walk, ramp; none negative), fitted to the relative deviations with
+Huber's weights. A power that the fit does without is taken out, one that another could stand in for or that nowhere makes up
+half of the variance is not said to have been seen. Where the shortest times do not follow any sum of powers (a sensor's own
+filter, a motor's vibration) they are left out one by one until the rest does.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+from types import ModuleType
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float64
+
+from imutool.errors import ConfigError
+
+LONGEST = 4  # averaging times up to the stretch over this: beyond, a single disagreement decides
+MODEL_ERROR = 0.1  # of the variance: no sensor is a sum of powers to better than this
+MISFIT = 3.5  # standard deviations at one averaging time that the sum may miss it by
+NEEDED = 12.0  # rise of chi² when a power is taken out, below which it was not needed
+TOLD_APART = 4.0  # rise of chi² when a power makes way for its neighbour, below which it could be either
+CORRELATED = 1.7  # standard deviations of slopes beyond the white one: neighbouring averaging times share their samples
+HUBER = 2.0
+HALF = 0.5
+LEAST_TIMES = 3  # averaging times, an octave apart, that anything is fitted to
+LEAST_TIMES_OF = {"quantisation": 1, "density": 3, "instability": 3, "walk": 2, "ramp": 2}  # over which it must be the half
+ITERATIONS = 8
+FLICKER = 2.0 * np.log(2.0) / np.pi
+
+POWERS = {
+    "quantisation": (3.0, -2),
+    "density": (1.0, -1),
+    "instability": (FLICKER, 0),
+    "walk": (1.0 / 3.0, 1),
+    "ramp": (0.5, 2),
+}
+
+Samples = Float64[np.ndarray, "_ 3"]
+
+
+@dataclass(frozen=True)
+class Curve:
+    """Allan deviation by averaging time (s) and axis, and how many independent differences each is worth."""
+
+    tau_s: Float64[np.ndarray, " m"]
+    deviation: Float64[np.ndarray, "m 3"]
+    freedom: Float64[np.ndarray, " m"]
+
+
+@dataclass(frozen=True)
+class Slopes:
+    """What one axis shows: a value for each of `POWERS` that was seen, its standard deviation, and where it holds.
+
+    `powers` holds all that was fitted, seen or not, for drawing. From `from_s` on the fit holds; `excess` is how many times
+    larger than fitted the variance is at worst below that (less than 1: smaller, as filters make it), 1 where nothing was
+    left out.
+    """
+
+    seen: dict[str, float] = field(default_factory=dict)
+    std: dict[str, float] = field(default_factory=dict)
+    powers: dict[str, float] = field(default_factory=dict)
+    from_s: float = 0.0
+    excess: float = 1.0
+
+
+def library() -> ModuleType:
+    """The library that computes the deviation.
+
+    Raises:
+        ConfigError: it is not installed.
+    """
+    try:
+        import allantools
+    except ImportError as error:
+        raise ConfigError(
+            "Allan deviations need the package allantools", where="--noise", fix="Install it with: pip install 'imutool[noise]'"
+        ) from error
+    module: ModuleType = allantools
+    return module
+
+
+def curve(stretches: Iterable[Samples], period_s: float) -> Curve:
+    """The overlapping Allan deviation over several stretches of one sensor, at averaging times an octave apart.
+
+    Squared differences of all stretches are averaged together; none reaches across from one stretch to the next. Empty
+    where no stretch has 8 samples.
+
+    Raises:
+        ConfigError: allantools is not installed.
+    """
+    tools = library()
+    parts = [part - part.mean(axis=0) for part in stretches if len(part) >= 2 * LONGEST]
+    longest = max((len(part) for part in parts), default=0)
+    octaves = 2 ** np.arange(max(0, int(np.log2(longest // LONGEST)) + 1)) if longest else np.zeros(0, int)
+    squares, counts, worth = np.zeros((len(octaves), 3)), np.zeros(len(octaves)), np.zeros(len(octaves))
+    for part in parts:
+        own = octaves[octaves * LONGEST <= len(part)]
+        for axis in range(3):
+            _, deviation, _, number = tools.oadev(part[:, axis], rate=1.0 / period_s, data_type="freq", taus=own * period_s)
+            squares[: len(own), axis] += number * deviation**2
+        counts[: len(own)] += number
+        worth[: len(own)] += [freedom(tools, len(part), int(m)) for m in own]
+    return Curve(octaves * period_s, np.sqrt(squares / np.maximum(counts, 1.0)[:, None]), worth)
+
+
+def freedom(tools: ModuleType, count: int, m: int) -> float:
+    """Equivalent degrees of freedom (NIST SP 1065, table 5): the smaller of those for white noise and for a random walk."""
+    return max(1.0, min(float(tools.edf_simple(count + 1, m, alpha)) for alpha in (0, -2)))
+
+
+def slopes(curve: Curve) -> list[Slopes]:
+    """What the curve shows of each axis."""
+    return [_slopes(curve.tau_s, curve.deviation[:, axis] ** 2, curve.freedom) for axis in range(3)]
+
+
+def _slopes(
+    tau_s: Float64[np.ndarray, " m"], variance: Float64[np.ndarray, " m"], freedom: Float64[np.ndarray, " m"]
+) -> Slopes:
+    if not (variance > 0).all():
+        return Slopes()  # a constant: no sensor, or one that is stuck
+    error = np.sqrt(2.0 / freedom + MODEL_ERROR**2)
+    for first in range(len(tau_s) - LEAST_TIMES + 1):
+        part = slice(first, None)
+        fit = _fit(tau_s[part], variance[part], error[part])
+        if fit.misfit <= MISFIT:
+            below = variance[:first] / _sum(fit.powers, tau_s[:first])
+            excess = float(below[np.argmax(np.abs(np.log(below)))]) if first else 1.0
+            seen = {k: v for k, v in fit.powers.items() if k not in fit.doubtful and _is_seen(k, fit.powers, tau_s[part])}
+            return Slopes(seen, {name: fit.std[name] for name in seen}, fit.powers, float(tau_s[first]), excess)
+    return Slopes()
+
+
+class _Fit(NamedTuple):
+    """The powers that are needed, their standard deviations, those that could be another, and the largest misfit."""
+
+    powers: dict[str, float]
+    std: dict[str, float]
+    doubtful: set[str]
+    misfit: float
+
+
+def _fit(tau_s: Float64[np.ndarray, " m"], variance: Float64[np.ndarray, " m"], error: Float64[np.ndarray, " m"]) -> _Fit:
+    """Backward elimination from all powers, or from as many as there are averaging times to tell them apart."""
+    names = list(POWERS)
+    if len(tau_s) < len(names) + 1:
+        names = names[: max(1, len(tau_s) - 1)]  # the longer a power needs, the less a short stretch can show it
+    best = _non_negative(names, tau_s, variance, error)
+    while len(names) > 1:
+        without = {name: _non_negative([n for n in names if n != name], tau_s, variance, error) for name in names}
+        least = min(without, key=lambda name: without[name][1])
+        if without[least][1] - best[1] >= NEEDED:
+            break
+        names.remove(least)
+        best = without[least]
+    coefficients, chi2, residual, std = best
+    powers, spread, doubtful = {}, {}, set()
+    order = list(POWERS)
+    for name, c, s in zip(names, coefficients, std, strict=True):
+        if c > 0:
+            powers[name] = float(np.sqrt(c))
+            spread[name] = float(s / (2.0 * np.sqrt(c))) * (CORRELATED if name != "density" else 1.0)
+            others = {n for n in order if abs(order.index(n) - order.index(name)) == 1} - set(names)
+            swapped = [[*(n for n in names if n != name), other] for other in others]
+            if any(_non_negative(s, tau_s, variance, error)[1] < chi2 + TOLD_APART for s in swapped):
+                doubtful.add(name)
+    return _Fit(powers, spread, doubtful, float(np.abs(residual).max()))
+
+
+def _non_negative(
+    names: Sequence[str],
+    tau_s: Float64[np.ndarray, " m"],
+    variance: Float64[np.ndarray, " m"],
+    error: Float64[np.ndarray, " m"],
+) -> tuple[Float64[np.ndarray, " k"], float, Float64[np.ndarray, " m"], Float64[np.ndarray, " k"]]:
+    """Squared strengths, robust chi², residuals and standard deviations of the strengths; relative to what is fitted."""
+    from scipy.optimize import nnls
+
+    columns = np.stack([POWERS[name][0] * tau_s ** float(POWERS[name][1]) for name in names], axis=1)
+    fitted, weight = variance, np.ones_like(variance)
+    x = np.zeros(len(names))
+    for _ in range(ITERATIONS):
+        scale = np.sqrt(weight) / (error * fitted)
+        design = columns * scale[:, None]
+        norm = np.linalg.norm(design, axis=0)
+        x = nnls(design / norm, variance * scale)[0] / norm
+        fitted = np.maximum(columns @ x, 1e-3 * variance)
+        residual = np.log(variance / fitted) / error  # of the logarithm: as strict below the fit as above it
+        weight = np.minimum(1.0, HUBER / np.maximum(np.abs(residual), 1e-12))
+    size = np.abs(residual)
+    chi2 = float(np.where(size <= HUBER, size**2, 2.0 * HUBER * size - HUBER**2).sum())
+    design = columns / (error * fitted)[:, None]
+    norm = np.linalg.norm(design, axis=0)
+    covariance = np.linalg.pinv((design / norm).T @ (design / norm)) / np.outer(norm, norm)
+    return x, chi2, residual, np.sqrt(np.diag(covariance))
+
+
+def _sum(powers: dict[str, float], tau_s: Float64[np.ndarray, " m"]) -> Float64[np.ndarray, " m"]:
+    parts = [part(name, value, tau_s) ** 2 for name, value in powers.items()]
+    return np.sum(parts, axis=0) if parts else np.zeros_like(tau_s)
+
+
+def part(name: str, value: float, tau_s: Float64[np.ndarray, " m"]) -> Float64[np.ndarray, " m"]:
+    """The Allan deviation that one power alone would have."""
+    factor, exponent = POWERS[name]
+    return np.asarray(value * np.sqrt(factor * tau_s ** float(exponent)))
+
+
+def _is_seen(name: str, powers: dict[str, float], tau_s: Float64[np.ndarray, " m"]) -> bool:
+    """Whether a power makes up half of the variance over as many averaging times as its slope needs to show."""
+    rules: Bool[np.ndarray, " m"] = part(name, powers[name], tau_s) ** 2 >= HALF * _sum(powers, tau_s)
+    return int(rules.sum()) >= LEAST_TIMES_OF[name]
