@@ -1,12 +1,13 @@
 """A model at work: over a whole log, over a recording in memory, or one sample at a time; always the same numbers.
 
-Causal throughout: the bias at a sample comes from that sample and earlier ones, once the start is known (`imutool.turn_on`).
+Causal throughout, unless `smooth` is asked for: the bias at a sample comes from that sample and earlier ones, once the start
+is known (`imutool.turn_on`). Smoothing reads the log twice; of the first pass it keeps thirteen numbers for each half second.
 """
 
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import NamedTuple
@@ -19,14 +20,16 @@ from imutool.bias import static
 from imutool.bias._base import BiasModel
 from imutool.bias._file import check_rate, find_model
 from imutool.config import plain
-from imutool.errors import DataError, LogError, ModelError
+from imutool.errors import ConfigError, DataError, LogError, ModelError
 from imutool.mcap_io import schema
 from imutool.mcap_io.log import ImuBatch, Log
 from imutool.mcap_io.read import read
 from imutool.mcap_io.rewrite import NewTopic, RewriteReport, rewrite, sha256
 from imutool.recording import Imu, Recording, nanoseconds, seconds
+from imutool.rest_track import Samples
 from imutool.stationary import white_noise
-from imutool.turn_on import TurnOn, find, over_all_rest
+from imutool.turn_on import NoRestError, TurnOn, find, following, over_all_rest
+from imutool.turn_on import smooth as smooth_rest
 
 HEAD_S = 60.0  # of a log, read to find the start: a constant, however long the log
 SUFFIX = "/debiased"
@@ -50,18 +53,19 @@ class DebiasReport:
 
 def apply(model: BiasModel, start: TurnOn, imu: Imu) -> Debiased:
     """A model over samples in memory, from their first on."""
-    bias = model.stream(start.rest)(seconds(imu.t_ns, int(imu.t_ns[0])), imu.gyro, imu.accel)
+    bias = start.stream(model)(seconds(imu.t_ns, int(imu.t_ns[0])), imu.gyro, imu.accel)
     return Debiased(Imu(imu.t_ns, imu.gyro - bias[:, :3], imu.accel - bias[:, 3:]), bias)
 
 
 class OnlineDebiaser:
     """One sample in, one corrected sample out: for a live node.
 
-    The start is a rest bias from `imutool.turn_on`, for instance `at_rest` over the first seconds, or `prior`.
+    The start is a rest bias from `imutool.turn_on`, for instance `at_rest` over the first seconds, or `prior`. Without one, it
+    begins at the prior and is followed by what the samples show, as by `--init auto`.
     """
 
-    def __init__(self, model: BiasModel, start: TurnOn) -> None:
-        self._stream, self._start_ns = model.stream(start.rest), -1
+    def __init__(self, model: BiasModel, start: TurnOn | None = None) -> None:
+        self._stream, self._start_ns = (start or following(model)).stream(model), -1
 
     def __call__(
         self, stamp_ns: int, gyro: Float64[np.ndarray, "3"], accel: Float64[np.ndarray, "3"]
@@ -84,7 +88,7 @@ class Debiaser:
             NewTopic(f"{source_topic}/bias/gyro", schema.VECTOR3),
             NewTopic(f"{source_topic}/bias/accel", schema.VECTOR3),
         )
-        self._stream, self._start_ns = model.stream(start.rest), -1
+        self._stream, self._start_ns = start.stream(model), -1
         noise = model.noise_std.detach().cpu().double().numpy()
         variance = np.where(noise > 0, noise, start.noise) ** 2 + start.std**2
         self._gyro_covariance, self._accel_covariance = np.diag(variance[:3]).ravel(), np.diag(variance[3:]).ravel()
@@ -115,31 +119,44 @@ def debias(
     model: str | Path | None = None,
     imus: Sequence[str] = (),
     init: str = "auto",
+    smooth: bool = False,
     overwrite: bool = False,
     progress: Callable[[int, int], None] | None = None,
 ) -> DebiasReport:
     """Writes `target`: all of `source` unchanged, and beside each IMU its debiased samples and the bias taken off.
 
-    Without a model: the one the log's metadata names, else the mean over time at rest.
+    Without a model: the one the log's metadata names, else the mean over time at rest. With `smooth` the start bias at every
+    time comes from the whole log, also from what follows.
 
     Raises:
-        ConfigError: source or target cannot be opened, or `init` makes no sense.
+        ConfigError: source or target cannot be opened, `init` makes no sense, or `smooth` is asked for with another `init`.
         LogError: the log is damaged, has no such IMU, or is debiased already.
         ModelError: no model and no time at rest; a model for another rate; a damaged model file.
     """
+    refuse_smooth(init, smooth)
     with Log(source) as log:
         topics = list(imus) or [_only_imu(log)]
         named = log.metadata().get("imutool", {}).get("model")
     derived, starts, models, records = [], {}, {}, {}
     origin = {"source_file": source.name, "source_sha256": sha256(source), "source_size": str(source.stat().st_size)}
     for topic in topics:
-        chosen, start = _prepare(source, topic, model or named, init)
+        chosen, start = _prepare(source, topic, model or named, init, smooth)
         derived.append(Debiaser(topic, chosen, start))
         starts[topic], models[topic] = start, str(chosen.card.get("name", chosen.method))
-        records[topic] = _provenance(topic, chosen, start, init) | origin
+        records[topic] = _provenance(topic, chosen, start, init, smooth) | origin
     metadata = {"imutool" if len(records) == 1 else f"imutool{topic}": values for topic, values in records.items()}
     report = rewrite(source, target, derived, metadata=metadata, overwrite=overwrite, progress=progress)
     return DebiasReport(models, starts, report)
+
+
+def refuse_smooth(init: str, smooth: bool) -> None:
+    """Smoothing finds the start by itself.
+
+    Raises:
+        ConfigError: it is asked for together with a start that is given.
+    """
+    if smooth and init != "auto":
+        raise ConfigError(f"--smooth with --init {init}", where="--smooth", expected="--init auto", fix="Give one of the two")
 
 
 def estimate_at_rest(imu: Imu, where: str | Path) -> tuple[BiasModel, TurnOn]:
@@ -152,12 +169,16 @@ def estimate_at_rest(imu: Imu, where: str | Path) -> tuple[BiasModel, TurnOn]:
     try:
         return model, over_all_rest(model, imu)
     except DataError as error:
-        raise ModelError(
-            "no model given, and the log holds no stretch at rest to measure a static bias on",
-            where=where,
-            expected="--model, or at least 1.5 s without motion",
-            fix="Give --model (imutool models lists those that ship), or train one with imutool train",
-        ) from error
+        raise _nothing_known(where) from error
+
+
+def _nothing_known(where: str | Path) -> ModelError:
+    return ModelError(
+        "no model given, and the log holds no stretch at rest to measure a static bias on",
+        where=where,
+        expected="--model, or at least 1.5 s without motion",
+        fix="Give --model (imutool models lists those that ship), or train one with imutool train",
+    )
 
 
 def _only_imu(log: Log) -> str:
@@ -169,19 +190,48 @@ def _only_imu(log: Log) -> str:
     return found[0]
 
 
-def _prepare(source: Path, topic: str, name: str | Path | None, init: str) -> tuple[BiasModel, TurnOn]:
+def _prepare(source: Path, topic: str, name: str | Path | None, init: str, smooth: bool) -> tuple[BiasModel, TurnOn]:
     """Model and start for one IMU."""
-    if name is None or str(name) == static.Model.method:
-        if init == "auto":
-            return estimate_at_rest(_samples(source, topic), source)
-        model: BiasModel = static.Model()
-        head = _head(source, topic, init)
-    else:
-        model = find_model(name)
-        head = _head(source, topic, init)
+    untrained = name is None or str(name) == static.Model.method
+    if untrained and init == "auto" and not smooth:
+        return estimate_at_rest(_samples(source, topic), source)
+    model: BiasModel = static.Model() if name is None or untrained else find_model(name)
+    head = _head(source, topic, init)
+    if not untrained:
         check_rate(model, 1.0 / head.imu.period_s, source)
-    start = find(init, model, head)
+    if smooth:
+        with Log(source) as log:  # a first pass, in constant memory but for the track
+            start = _smoothed(model, _batches(log, topic), source)
+    else:
+        start = find(init, model, head)
     return model, start if start.noise.any() else replace(start, noise=_noise(head.imu))
+
+
+def smooth_in_memory(model: BiasModel, imu: Imu, where: str | Path) -> TurnOn:
+    """The rest bias in time from all of some samples.
+
+    Raises:
+        DataError: too few samples.
+        ModelError: an untrained model, and no rest to measure a bias on.
+    """
+    t_s = seconds(imu.t_ns, int(imu.t_ns[0]) if len(imu) else 0)
+    return _smoothed(model, [(t_s, imu.gyro, imu.accel)], where)
+
+
+def _smoothed(model: BiasModel, batches: Iterable[Samples], where: str | Path) -> TurnOn:
+    try:
+        return smooth_rest(model, batches, str(where))
+    except NoRestError as error:
+        raise _nothing_known(where) from error
+
+
+def _batches(log: Log, topic: str) -> Iterator[Samples]:
+    """An IMU's samples, with seconds since the first."""
+    start_ns = None
+    for batch in log.imu_batches(topic):
+        if len(batch.stamp_ns):
+            start_ns = int(batch.stamp_ns[0]) if start_ns is None else start_ns
+            yield seconds(batch.stamp_ns, start_ns), batch.gyro, batch.accel
 
 
 def _head(source: Path, topic: str, init: str) -> Recording:
@@ -214,7 +264,7 @@ def _noise(imu: Imu) -> Float64[np.ndarray, "6"]:
     return white_noise(np.concatenate([imu.gyro, imu.accel], axis=1))
 
 
-def _provenance(topic: str, model: BiasModel, start: TurnOn, init: str) -> dict[str, str]:
+def _provenance(topic: str, model: BiasModel, start: TurnOn, init: str, smooth: bool) -> dict[str, str]:
     return {
         "version": __version__,
         "command": "debias",
@@ -227,7 +277,9 @@ def _provenance(topic: str, model: BiasModel, start: TurnOn, init: str) -> dict[
         "init_how": start.how,
         "rest": json.dumps(start.rest.tolist()),
         "rest_std": json.dumps(start.std.tolist()),
-        "causal": "false" if init == "auto" and model.method == static.Model.method else "true",  # all rest, also later
+        "smooth": "true" if smooth else "false",
+        # without a model: the mean over all rest, also later
+        "causal": "false" if smooth or (init == "auto" and model.method == static.Model.method) else "true",
     }
 
 

@@ -13,14 +13,19 @@ from imutool import metrics
 from imutool.bias import static
 from imutool.bias._base import BiasModel
 from imutool.bias._file import check_rate, find_model
-from imutool.debias import Debiased, apply, estimate_at_rest
+from imutool.debias import Debiased, apply, estimate_at_rest, refuse_smooth, smooth_in_memory
 from imutool.errors import ConfigError
 from imutool.mcap_io.read import read
-from imutool.recording import Poses, Recording
-from imutool.strapdown import along_truth
-from imutool.turn_on import TurnOn, find
+from imutool.recording import Imu, Poses, Recording
+from imutool.rest_track import Known
+from imutool.strapdown import Start, along_truth, drift
+from imutool.turn_on import AT_REST_STD, LEAST_STD, TurnOn, find
+from imutool.zero_velocity import with_stops
 
 RAW = "raw"
+DRIFT_S = 5.0
+PURE, ZUPT = "integration", "zupt"
+RAW_STD = (0.1, 0.1, 0.1, 0.5, 0.5, 0.5)  # rad/s and m/s²: biases of a consumer sensor nobody calibrated
 SCHEMA = "imutool.evaluation/1"
 
 
@@ -29,6 +34,8 @@ def evaluate(
     *,
     models: Sequence[str | Path] = (),
     init: str = "auto",
+    smooth: bool = False,
+    zupt: bool = False,
     truth: str | None = None,
     imu: str | None = None,
     trajectories: Path | None = None,
@@ -37,9 +44,11 @@ def evaluate(
     """One result for the raw samples and one for each model (contracts.md, evaluate).
 
     Every trajectory starts at the true pose and velocity at the first sample the truth covers, and is integrated by
-    `strapdown.dead_reckon`; only samples outside gaps of the truth are scored.
+    `strapdown.dead_reckon`; only samples outside gaps of the truth are scored. With `smooth` each bias comes from the whole
+    log; with `zupt` a second result each is dead reckoning that knows its stops (`zero_velocity`), of the same samples.
 
     Raises:
+        ConfigError: `smooth` with another `init` than auto; two models of one name, or files that exist.
         LogError, DataError: no IMU, no truth, or the two share no time.
         ModelError: a model that cannot be used with this log.
     """
@@ -49,43 +58,76 @@ def evaluate(
     if truth is None and recording.truths:
         recording = recording.with_truth(next(iter(recording.truths)))
     results = []
-    for name, found, start in runs(recording, models, init, log):
-        estimate, true, valid = along_truth(found.imu, recording.truth, recording.name)
-        figures = metrics.evaluate(estimate, true, valid)
-        results.append(
-            {
-                "log": recording.name,
-                "model": name,
-                "init": init if start else None,
-                "init_how": start.how if start else None,
-                **figures,
-                "gyro_bias": start.rest[:3].tolist() if start else [0.0, 0.0, 0.0],
-                "accel_bias": start.rest[3:].tolist() if start else [0.0, 0.0, 0.0],
-            }
-        )
-        if trajectories is not None:
-            _write(trajectories, recording.name, name, estimate, true, valid, overwrite=overwrite)
+    for name, found, start in runs(recording, models, init, log, smooth=smooth):
+        integrated, true, valid = along_truth(found.imu, recording.truth, recording.name)
+        drifted = _drift(found.imu, recording.truth)
+        estimates = {PURE: integrated}
+        if zupt:
+            estimates[ZUPT] = with_stops(_over(found.imu, true), Start.of(true), _left(start), smooth=smooth)
+        for kind, estimate in estimates.items():
+            results.append(
+                {
+                    "log": recording.name,
+                    "model": name,
+                    "estimate": kind,
+                    "init": init if start else None,
+                    "init_how": start.how if start else None,
+                    "smooth": smooth,
+                    **metrics.evaluate(estimate, true, valid),
+                    **drifted,
+                    "gyro_bias": start.rest[:3].tolist() if start else [0.0, 0.0, 0.0],
+                    "accel_bias": start.rest[3:].tolist() if start else [0.0, 0.0, 0.0],
+                }
+            )
+            if trajectories is not None:
+                label = name if kind == PURE else f"{name}_{kind}"
+                _write(trajectories, recording.name, label, estimate, true, valid, overwrite=overwrite)
     return results
 
 
+def _drift(imu: Imu, truth: Poses) -> dict[str, float | None]:
+    """What windows that each start from the truth drift by: root mean squares, none where no window fits."""
+    turned, faster = drift(imu, truth, DRIFT_S)
+    if not len(turned):
+        return {"drift_orientation_deg": None, "drift_velocity_m_s": None, "drift_window_s": DRIFT_S}
+    rms = [float(np.sqrt(np.mean(errors**2))) for errors in (turned, faster)]
+    return {"drift_orientation_deg": float(np.degrees(rms[0])), "drift_velocity_m_s": rms[1], "drift_window_s": DRIFT_S}
+
+
+def _over(imu: Imu, true: Poses) -> Imu:
+    """The samples of the stretch that is scored."""
+    rows: Imu = imu.between(int(true.t_ns[0]), int(true.t_ns[-1]))
+    return rows
+
+
+def _left(start: TurnOn | None) -> Known:
+    """What may be left of the bias after debiasing: the start's uncertainty, or anything where nothing was taken off."""
+    std = np.array(RAW_STD) if start is None else np.maximum(start.std, LEAST_STD)
+    return Known(np.zeros(6), std, AT_REST_STD)
+
+
 def runs(
-    recording: Recording, models: Sequence[str | Path], init: str, where: str | Path
+    recording: Recording, models: Sequence[str | Path], init: str, where: str | Path, *, smooth: bool = False
 ) -> Iterator[tuple[str, Debiased, TurnOn | None]]:
     """The samples as recorded, then as each model corrects them: name, samples and bias, and the start."""
+    refuse_smooth(init, smooth)
     yield RAW, Debiased(recording.imu, np.zeros((len(recording.imu), 6))), None
     for given in models:
-        model, start = _model_and_start(given, recording, init, where)
+        model, start = _model_and_start(given, recording, init, where, smooth)
         yield str(model.card.get("name", model.method)), apply(model, start, recording.imu), start
 
 
-def _model_and_start(given: str | Path, recording: Recording, init: str, where: str | Path) -> tuple[BiasModel, TurnOn]:
-    if str(given) == static.Model.method:
-        if init == "auto":
-            return estimate_at_rest(recording.imu, where)
-        untrained = static.Model()
-        return untrained, find(init, untrained, recording)
-    model = find_model(given)
-    check_rate(model, 1.0 / recording.imu.period_s, where)
+def _model_and_start(
+    given: str | Path, recording: Recording, init: str, where: str | Path, smooth: bool
+) -> tuple[BiasModel, TurnOn]:
+    untrained = str(given) == static.Model.method
+    if untrained and init == "auto" and not smooth:
+        return estimate_at_rest(recording.imu, where)
+    model: BiasModel = static.Model() if untrained else find_model(given)
+    if not untrained:
+        check_rate(model, 1.0 / recording.imu.period_s, where)
+    if smooth:
+        return model, smooth_in_memory(model, recording.imu, where)
     return model, find(init, model, recording)
 
 

@@ -57,6 +57,12 @@ def evaluate(estimate: Poses, truth: Poses, valid: Mask, distances_m: Sequence[f
     }
 
 
+def orientation_errors(estimate: Poses, truth: Poses) -> Float64[np.ndarray, " n"]:
+    """The angle between estimate and truth at every row, in rad."""
+    angles: Float64[np.ndarray, " n"] = (_rotations(truth).inv() * _rotations(estimate)).magnitude()
+    return angles
+
+
 def absolute(estimate: Poses, truth: Poses, valid: Mask) -> dict[str, float | None]:
     """`aoe_deg`, `aoe_aligned_deg`, `ape_m`, `ape_aligned_m`, `velocity_rmse_m_s`.
 

@@ -12,6 +12,8 @@ A steady turn about the vertical looks like a bias; only its disagreement with t
 
 from __future__ import annotations
 
+from bisect import insort
+from collections import deque
 from typing import Annotated
 
 import numpy as np
@@ -25,6 +27,7 @@ WHITE_MARGIN = 1.3  # of block means over white noise; with 10 blocks of 3 axes 
 FLOOR_MARGIN = 2.5  # over the calmest windows of the log
 FLOOR_RANK = 10  # the window that sets the floor, from the calmest: one stuck or lucky window must not
 NOISE_BLOCK, CALMEST = 20, 0.25
+KEPT_MEANS = 100  # of windows at rest, for the usual one
 GAP_PERIODS = 3.0  # a longer step between samples breaks a window
 
 Positive = Annotated[float, Meta(gt=0)]
@@ -80,6 +83,57 @@ def stretches(imu: Imu, settings: StationarySettings | None = None) -> list[tupl
     found = [(first * k, last * k) for first, last in _runs(resting_blocks)]
     least_ns = nanoseconds(settings.min_s - 2 * imu.period_s)
     return [(a, b) for a, b in found if imu.t_ns[b - 1] - imu.t_ns[a] >= least_ns]
+
+
+class Stillness:
+    """The same rule for samples as they come: told block after block, it says whether the sensor has rested until now.
+
+    What `stretches` takes from the whole log is taken from what there was of it so far: the calmest windows, and the usual
+    mean at rest. A block holds half a window; a longer or shorter one shifts the lengths in proportion.
+    """
+
+    def __init__(self, settings: StationarySettings | None = None) -> None:
+        self.settings = settings or StationarySettings()
+        self.parts = max(2, round(0.5 * self.settings.window_s / self.settings.block_s))
+        self.needed = max(1, round((self.settings.min_s - self.settings.window_s) / (0.5 * self.settings.window_s)) + 1)
+        self.blocks_needed = self.needed + 1
+        self._last: tuple[Float64[np.ndarray, "parts 6"], Float64[np.ndarray, "parts 6"], int] | None = None
+        self._calmest: list[float] = []
+        self._means: deque[Float64[np.ndarray, "3"]] = deque(maxlen=KEPT_MEANS)
+        self._windows, self._resting = 0, 0
+
+    def __call__(self, gyro: Float64[np.ndarray, "n 3"], accel: Float64[np.ndarray, "n 3"], *, whole: bool = True) -> bool:
+        """Whether the sensor has rested for `min_s` up to the end of these samples; `whole` if none is missing."""
+        k = len(gyro) // self.parts
+        if k < 2 or not whole:
+            self._last, self._resting = None, 0
+            return False
+        cut = np.concatenate([gyro, accel], axis=1)[: k * self.parts].reshape(self.parts, k, 6)
+        mean, var = cut.mean(axis=1), cut.var(axis=1, ddof=1)
+        before, self._last = self._last, (mean, var, k)
+        if before is None:
+            return False
+        rests = self._window(np.concatenate([before[0], mean]), np.concatenate([before[1], var]), min(before[2], k))
+        self._resting = self._resting + 1 if rests else 0
+        return self._resting >= self.needed
+
+    def _window(self, mean: Float64[np.ndarray, "w 6"], var: Float64[np.ndarray, "w 6"], k: int) -> bool:
+        s = self.settings
+        scatter = np.sqrt(mean.var(axis=0, ddof=1).reshape(2, 3).sum(axis=1))
+        noise = np.sqrt(var.mean(axis=0).reshape(2, 3).sum(axis=1))
+        centre = mean[:, :3].mean(axis=0)
+        insort(self._calmest, float(scatter[0]))
+        del self._calmest[FLOOR_RANK + 1 :]
+        self._windows += 1
+        floor = self._calmest[min(FLOOR_RANK, self._windows // 10, len(self._calmest) - 1)]
+        allowed = min(max(WHITE_MARGIN * noise[0] / np.sqrt(k), FLOOR_MARGIN * floor), s.gyro_scatter_rad_s)
+        calm = scatter[0] <= allowed and scatter[1] <= s.accel_scatter_m_s2
+        quiet = noise[0] <= s.gyro_noise_rad_s and noise[1] <= s.accel_noise_m_s2
+        if not (calm and quiet and np.linalg.norm(centre) <= s.gyro_mean_rad_s):
+            return False
+        self._means.append(centre)
+        usual = np.median(np.array(self._means), axis=0)
+        return bool(np.linalg.norm(centre - usual) <= s.gyro_agreement_rad_s)
 
 
 def white_noise(values: Float64[np.ndarray, "n k"]) -> Float64[np.ndarray, " k"]:

@@ -105,6 +105,36 @@ def along_truth(imu: Imu, truth: Poses, where: str) -> tuple[Poses, Poses, Bool[
     return dead_reckon(imu.rows(rows), Start.of(true)), true, valid[rows]
 
 
+def drift(imu: Imu, truth: Poses, window_s: float = 5.0) -> tuple[Float64[np.ndarray, " m"], Float64[np.ndarray, " m"]]:
+    """How far integration drifts in a window: errors of orientation (rad) and velocity (m/s) at the end of each.
+
+    Windows follow one another through the log; each starts from the truth and counts if the truth is known at both ends and the
+    IMU has no gap in between. Empty where none does.
+    """
+    true, valid = with_velocity(truth).at(imu.t_ns)
+    t = seconds(imu.t_ns, int(imu.t_ns[0]))
+    turned, faster = [], []
+    first = 0
+    while True:
+        known = np.flatnonzero(valid[first:])
+        if not len(known):
+            break
+        first += int(known[0])
+        last = int(np.searchsorted(t, t[first] + window_s))
+        if last >= len(t):
+            break
+        rows = slice(first, last + 1)
+        if valid[last] and np.diff(t[rows]).max() <= GAP_FACTOR * imu.period_s:
+            end, goal = dead_reckon(imu.rows(rows), Start.of(true, first)), true.rows(slice(last, last + 1))
+            assert end.v_w is not None and goal.v_w is not None
+            q, q_true = end.q_wb_wxyz[-1], goal.q_wb_wxyz[0]
+            apart = min(float(np.linalg.norm(q - q_true)), float(np.linalg.norm(q + q_true)))  # a quaternion is its negative
+            turned.append(4.0 * np.arcsin(0.5 * apart))
+            faster.append(float(np.linalg.norm(end.v_w[-1] - goal.v_w[0])))
+        first = last
+    return np.array(turned), np.array(faster)
+
+
 def with_velocity(poses: Poses) -> Poses:
     """The same trajectory with a velocity: its own, or `truth_velocity` where it has none."""
     return poses if poses.v_w is not None else replace(poses, v_w=truth_velocity(poses))

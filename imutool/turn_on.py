@@ -3,46 +3,75 @@
 Every way gives a value and how sure it is; a measurement and the prior are combined by their variances, axis by axis (for a
 measurement along one direction, as a Kalman update). With a model that adds a motion-dependent part C(u), what is
 measured is what is left of the samples after that part.
+
+`auto` is a start and more: from there on the rest bias is followed, by every stop and by gravity in motion
+(`imutool.rest_track`), so that the bias of a sample depends on that sample and earlier ones. The one exception is the stop that
+a log begins with: its samples get what the whole of it says. `smooth` takes the whole log for each sample.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 import torch
-from jaxtyping import Float64
+from jaxtyping import Bool, Float, Float64
 from torch import Tensor
 
 from imutool import so3
-from imutool.bias._base import BiasModel, Vector6
+from imutool.bias._base import BiasModel, Stream, Vector6
 from imutool.errors import ConfigError, DataError
 from imutool.recording import GRAVITY_M_S2, Imu, Recording, nanoseconds, seconds
-from imutool.stationary import stretches
+from imutool.rest_track import Along, Following, Known, Passed, Samples, Track, followed
+from imutool.rest_track import smooth as smooth_track
+from imutool.stationary import stretches, white_noise
 from imutool.strapdown import GRAVITY_W, with_velocity
-from imutool.windows import attitudes, rotation_residual, velocity_residual
+from imutool.windows import attitudes, between, huber_weight, running_product
 
-TRUTH_S = 5.0  # how much of the truth a start takes: longer is surer, but less of a start
+TRUTH_S = 15.0  # how much of the truth a start takes: of 3, 5, 8, 10 and 15 s the best on training logs left out in turn
 AT_REST_STD = np.array([1e-4] * 3 + [0.03] * 3)  # earth's rotation; local gravity and what a tilt hides
 REST_BEGINS_WITHIN_S = 5.0  # later, its bias would be one of the future
 ITERATIONS = 4
+MAD_TO_STD = 1.4826
+LEAST_STD = np.array([1e-6] * 3 + [1e-4] * 3)  # a prior without any doubt would leave nothing to estimate
+FOLLOWED = "gravity in motion and every stop"
 
 WAYS = ("auto", "stationary", "prior", "truth")
 
 
+class NoRestError(DataError):
+    """Nothing is known of the sensor, and nothing is shown by the log."""
+
+
 @dataclass(frozen=True)
 class TurnOn:
-    """A rest bias (gyro rad/s, accel m/s²), its standard deviation, and how it came about in a few words."""
+    """A rest bias (gyro rad/s, accel m/s²), its standard deviation, and how it came about in a few words.
+
+    It holds for the whole log, or is where something begins: `track`, the rest bias in time, or with `follows` what the samples
+    show from `hold_s` on (s from the first sample).
+    """
 
     rest: Vector6
     std: Vector6
     how: str
     noise: Vector6 = field(default_factory=lambda: np.zeros(6))  # of a sample, where it could be measured
+    track: Track | None = None
+    follows: bool = False
+    hold_s: float = 0.0
+
+    def stream(self, model: BiasModel) -> Stream:
+        """The model at work from this start on."""
+        if self.track is not None:
+            return Along(model, self.track)
+        if self.follows:
+            return Following(model, known(model), self.rest, self.hold_s, None)
+        return model.stream(self.rest)
 
 
 def find(way: str, model: BiasModel, recording: Recording) -> TurnOn:
-    """The start that `--init WAY` asks for; `auto` is the first seconds at rest where there are any, else the prior.
+    """The start that `--init WAY` asks for.
 
     Raises:
         ConfigError: an unknown way, or six numbers that are none.
@@ -51,18 +80,105 @@ def find(way: str, model: BiasModel, recording: Recording) -> TurnOn:
     """
     if way == "prior":
         return prior(model)
-    if way == "truth":
-        return from_truth(model, recording)
+    if way == "truth" or way.startswith("truth:"):
+        return from_truth(model, recording, _truth_s(way))
     if way == "stationary":
         return at_rest(model, recording.imu)
     if way == "auto":
-        try:
-            return at_rest(model, recording.imu)
-        except DataError:
-            if not model.card:
-                raise
-            return prior(model)
+        return auto(model, recording.imu)
     return given(way)
+
+
+def auto(model: BiasModel, imu: Imu) -> TurnOn:
+    """The stop that the log begins with, weighed against the training runs; from there on the rest bias is followed.
+
+    Only the samples up to the end of that stop are used.
+
+    Raises:
+        DataError: an untrained model, and the log does not start at rest.
+    """
+    rested: list[Passed] = []
+    for block in followed(model, [_samples(imu)], known(model), ahead=True):
+        if not block.resting:
+            break
+        rested.append(block)
+    if not rested:
+        if not model.card:
+            raise _no_rest()
+        return following(model)
+    end, state = rested[-1].end_s, rested[-1].step.after
+    std = np.sqrt(np.diag(state.covariance(False)))  # in motion, where it is to serve
+    still = imu.rows(slice(0, int(np.searchsorted(imu.t_ns, imu.t_ns[0] + nanoseconds(end)))))
+    noise = white_noise(np.concatenate([still.gyro, still.accel], axis=1))
+    used = f"{end - rested[0].start_s:.1f} s at rest from 0.0 s on"
+    if model.card:
+        used = f"{used}, {_from_training(model)}"
+    return TurnOn(state.rest_bias(True), std, f"{used}, {_sure(std)}, then {FOLLOWED}", noise, follows=True, hold_s=end)
+
+
+def following(model: BiasModel) -> TurnOn:
+    """The prior, and from the first sample on what the samples show: for a live node, which cannot look ahead."""
+    start = prior(model)
+    return TurnOn(start.rest, start.std, f"{_from_training(model)}, {_sure(start.std)}, then {FOLLOWED}", follows=True)
+
+
+def smooth(model: BiasModel, batches: Iterable[Samples], where: str = "") -> TurnOn:
+    """The rest bias in time from the whole of a log: all its stops, gravity in motion, and the training runs.
+
+    `batches` are seconds since the first sample, gyro and accel.
+
+    Raises:
+        DataError: less than half a second of samples.
+        NoRestError: an untrained model, and a log that never rests.
+    """
+    track, rested_s = smooth_track(model, batches, known(model))
+    if not len(track.t_s):
+        raise DataError("too short to be smoothed", where=where, expected="at least half a second of samples")
+    if not model.card and not rested_s:
+        raise NoRestError("the log never rests", where=where, expected="1.5 s or more without motion")
+    std = np.median(track.std, axis=0)
+    parts = [f"{rested_s:.1f} s at rest in all"] * (rested_s > 0) + ["gravity in motion"]
+    parts += [_from_training(model)] * bool(model.card)
+    return TurnOn(track.rest[0], std, f"{', '.join(parts)}, {_sure(std)}, forward and backward", track=track)
+
+
+def known(model: BiasModel) -> Known:
+    """What the training runs say of the next run's biases."""
+    ground = np.maximum(_numpy(model.rest_std), AT_REST_STD)
+    return Known(_numpy(model.prior_mean), np.maximum(_numpy(model.prior_std), LEAST_STD), ground)
+
+
+def rest_spread(model: BiasModel, logs: Sequence[Samples], rest: Float64[np.ndarray, "logs 6"]) -> Vector6:
+    """How far the bias at rest lies from the log's rest bias in motion, as a robust standard deviation about zero.
+
+    `rest` is each log's own, from its truth. The gyro's by axis; the accelerometer is seen along gravity alone, and its three
+    axes get the same. Never below `AT_REST_STD`; that itself where no log rests.
+    """
+    away = []
+    for (t_s, gyro, accel), own in zip(logs, rest, strict=True):
+        t_ns = np.round(t_s * 1e9).astype(np.int64)
+        left = np.concatenate([gyro, accel], axis=1) - model.stream(own)(t_s, gyro, accel)
+        for first, last in stretches(Imu(t_ns, gyro, accel)):
+            mean = left[first:last].mean(axis=0)
+            away.append([*mean[:3], *[np.linalg.norm(mean[3:]) - GRAVITY_M_S2] * 3])
+    if not away:
+        return AT_REST_STD.copy()
+    spread: Vector6 = np.maximum(MAD_TO_STD * np.median(np.abs(away), axis=0), AT_REST_STD)
+    return spread
+
+
+def _samples(imu: Imu) -> Samples:
+    return seconds(imu.t_ns, int(imu.t_ns[0]) if len(imu) else 0), imu.gyro, imu.accel
+
+
+def _from_training(model: BiasModel) -> str:
+    logs = model.card.get("logs", ())
+    return f"prior of {len(logs)} runs" if len(logs) > 1 else "prior of the training runs"
+
+
+def _sure(std: Vector6) -> str:
+    """The least sure axis of the gyro."""
+    return f"±{std[:3].max():.1g} rad/s"
 
 
 def given(text: str) -> TurnOn:
@@ -80,6 +196,22 @@ def given(text: str) -> TurnOn:
     return TurnOn(rest, np.zeros(6), "given")
 
 
+def _truth_s(way: str) -> float:
+    """Seconds of `truth:SECONDS`.
+
+    Raises:
+        ConfigError: not a positive number.
+    """
+    text = way.partition(":")[2] or str(TRUTH_S)
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not 0.0 < value < math.inf:
+        raise ConfigError(f"{way!r}", where="--init", expected="truth:SECONDS, for instance truth:5")
+    return value
+
+
 def prior(model: BiasModel) -> TurnOn:
     """What the sensor had in its training runs."""
     return TurnOn(_numpy(model.prior_mean), _numpy(model.prior_std), "prior of the training runs")
@@ -94,12 +226,16 @@ def at_rest(model: BiasModel, imu: Imu) -> TurnOn:
     starts_by = np.searchsorted(imu.t_ns, imu.t_ns[0] + nanoseconds(REST_BEGINS_WITHIN_S)) if len(imu) else 0
     found = [stretch for stretch in stretches(imu) if stretch[0] <= starts_by]
     if not found:
-        raise DataError(
-            "the log does not start at rest",
-            expected=f"1.5 s or more without motion in the first {REST_BEGINS_WITHIN_S:g} s",
-            fix="Give --init prior with a trained model, or six numbers",
-        )
+        raise _no_rest()
     return _from_rest(model, imu, found[:1])
+
+
+def _no_rest() -> DataError:
+    return DataError(
+        "the log does not start at rest",
+        expected=f"1.5 s or more without motion in the first {REST_BEGINS_WITHIN_S:g} s",
+        fix="Give --init prior with a trained model, or six numbers",
+    )
 
 
 def over_all_rest(model: BiasModel, imu: Imu) -> TurnOn:
@@ -138,8 +274,8 @@ def _from_rest(model: BiasModel, imu: Imu, found: Sequence[tuple[int, int]]) -> 
     return TurnOn(rest, np.sqrt(var), f"{total:.1f} s at rest from {first:.1f} s on", noise)
 
 
-def from_truth(model: BiasModel, recording: Recording) -> TurnOn:
-    """From the first `TRUTH_S` of true poses (gaps in between do no harm: only the ends are used), and the prior.
+def from_truth(model: BiasModel, recording: Recording, truth_s: float = TRUTH_S) -> TurnOn:
+    """From the first seconds of true poses, all of them (gaps in between do no harm), and the prior.
 
     Raises:
         DataError: no truth, or none that reaches that far.
@@ -149,36 +285,62 @@ def from_truth(model: BiasModel, recording: Recording) -> TurnOn:
     poses, trusted = with_velocity(truth).at(imu.t_ns)
     t = seconds(imu.t_ns, int(imu.t_ns[0]))
     usable = np.flatnonzero(trusted)
-    ends = usable[t[usable] >= t[usable[0]] + TRUTH_S] if len(usable) else usable
+    ends = usable[t[usable] >= t[usable[0]] + truth_s] if len(usable) else usable
     if not len(ends):
-        raise DataError(f"less than {TRUTH_S:g} s of truth", where=recording.name, expected="truth at the start")
-    first, last = int(usable[0]), int(ends[0])
-    piece = imu.rows(slice(first, last + 1))
+        raise DataError(f"less than {truth_s:g} s of truth", where=recording.name, expected="truth at the start")
+    rows = slice(int(usable[0]), int(ends[0]) + 1)
+    piece, poses = imu.rows(rows), poses.rows(rows)
     assert poses.v_w is not None
-    R = so3.matrix_from_quaternion_wxyz(torch.from_numpy(np.array(poses.q_wb_wxyz[[first, last]])))
-    dv = torch.from_numpy(poses.v_w[last] - poses.v_w[first])[None]
-    dt = torch.from_numpy(np.diff(t[first : last + 1]))[None]
     start = prior(model)
-    offset = _solve_offset(piece, _bias(model, piece, start.rest), R[:1], R[1:], dv, dt)
-    var, measured = start.std**2, _numpy(model.truth_std) ** 2
+    left = np.concatenate([piece.gyro, piece.accel], axis=1) - _bias(model, piece, start.rest)
+    R_wb = so3.matrix_from_quaternion_wxyz(torch.from_numpy(np.array(poses.q_wb_wxyz)))
+    offset = truth_offset(t[rows], left, R_wb, torch.from_numpy(np.array(poses.v_w)), trusted[rows])
+    var, measured = start.std**2, _numpy(model.truth_std) ** 2 * (TRUTH_S / truth_s) ** 2
     gain = np.divide(var, var + measured, out=np.zeros(6), where=var > 0)  # a prior without doubt stays
-    how = f"truth over {t[last] - t[first]:.1f} s, weighed against the training runs" if model.card else "truth"
+    how = f"truth over {t[rows][-1] - t[rows][0]:.1f} s"
+    how += ", weighed against the training runs" if model.card else ""
     return TurnOn(start.rest + gain * offset, np.sqrt(gain * measured), how)
 
 
-def _solve_offset(
-    imu: Imu, bias: Float64[np.ndarray, "n 6"], R_start: Tensor, R_end: Tensor, dv: Tensor, dt: Tensor
+def truth_offset(
+    t_s: Float64[np.ndarray, " n"],
+    samples: Float64[np.ndarray, "n 6"],
+    R_wb: Float[Tensor, "n 3 3"],
+    v_w: Float[Tensor, "n 3"],
+    trusted: Bool[np.ndarray, " n"],
 ) -> Vector6:
-    """The constant that, taken off on top of `bias`, makes rotation and velocity end where the truth does."""
-    rate, force = (torch.from_numpy(u)[None] for u in (imu.gyro - bias[:, :3], imu.accel - bias[:, 3:]))
+    """The constant in samples that the truth beside them shows: the slope, in time, of what integration misses.
+
+    Rotation and velocity are integrated from the first true pose; their misses e(t) = e_0 + (sum of A) b are fitted by all trusted
+    poses with Huber's weights, e_0 being the first pose's own error. The gyro comes first, and carries the attitude under the
+    accelerometer.
+    """
+    dt, seen = torch.from_numpy(np.diff(t_s))[None], torch.from_numpy(trusted)
+    rate, force = torch.from_numpy(samples[:, :3])[None], torch.from_numpy(samples[:, 3:])[None]
     offset = torch.zeros(2, 3, dtype=torch.float64)
     for _ in range(ITERATIONS):
-        e, A = rotation_residual(rate - offset[0], dt, R_start.mT @ R_end)
-        offset[0] -= torch.linalg.solve(A.sum(1), e)[0]
-    R_wb = attitudes(R_start, rate - offset[0], dt)
-    e, A = velocity_residual(force, dt, R_wb, dv, torch.tensor(GRAVITY_W, dtype=torch.float64))
-    offset[1] -= torch.linalg.solve(A.sum(1), e)[0]
+        running = running_product(so3.exp(between(rate - offset[0]) * dt[..., None]))[0]
+        missed = (running @ so3.log(running.mT @ (R_wb[0].mT @ R_wb[1:]))[..., None])[..., 0]
+        by_rate = torch.cumsum(running * dt[0, :, None, None], dim=0)
+        offset[0] -= _slope(missed, by_rate, seen[1:])
+    R_hat = attitudes(R_wb[:1], rate - offset[0], dt)[0]
+    a_w = (R_hat @ force[0, ..., None])[..., 0] + torch.tensor(GRAVITY_W, dtype=torch.float64)
+    risen = torch.cumsum(between(a_w[None])[0] * dt[0, :, None], dim=0)
+    by_force = torch.cumsum(0.5 * (R_hat[:-1] + R_hat[1:]) * dt[0, :, None, None], dim=0)
+    offset[1] = -_slope(v_w[1:] - v_w[0] - risen, by_force, seen[1:])
     return offset.flatten().numpy()
+
+
+def _slope(missed: Float[Tensor, "n 3"], by: Float[Tensor, "n 3 3"], seen: Bool[Tensor, " n"]) -> Float[Tensor, "3"]:
+    """b of missed = e_0 + by b, by least squares with Huber's weights."""
+    y, X = missed[seen], torch.cat([by[seen], torch.eye(3, dtype=by.dtype).expand(int(seen.sum()), 3, 3)], dim=2)
+    root = torch.ones(len(y), dtype=y.dtype)
+    for _ in range(ITERATIONS):
+        weighted = (X * root[:, None, None]).flatten(0, 1), (y * root[:, None]).reshape(-1, 1)
+        found = torch.linalg.lstsq(*weighted).solution[:, 0]
+        size = (y - X @ found).norm(dim=1)
+        root = huber_weight(size, (1.5 * size.median()).clamp_min(1e-9).expand(len(size))).sqrt()
+    return found[:3]
 
 
 def _bias(model: BiasModel, imu: Imu, rest: Vector6) -> Float64[np.ndarray, "n 6"]:

@@ -27,7 +27,7 @@ from imutool.mcap_io.rewrite import sha256
 from imutool.mcap_io.write import write
 from imutool.physics.flight import flight
 from imutool.recording import Frames, Recording, Scalars, seconds
-from imutool.turn_on import TurnOn, at_rest, from_truth, given, prior
+from imutool.turn_on import TurnOn, at_rest, auto, following, from_truth, given, prior, smooth
 
 RATE_HZ = 200.0
 ONLINE = 1e-6  # rad/s and m/s²: the contract's figure
@@ -175,7 +175,7 @@ def test_what_was_subtracted_is_raw_minus_debiased(target: Path) -> None:
 
 def test_the_streamed_log_holds_what_the_model_says_in_memory(target: Path, recording: Recording, model_file: Path) -> None:
     model = load(model_file)
-    expected = apply(model, at_rest(model, recording.imu), recording.imu)
+    expected = apply(model, auto(model, recording.imu), recording.imu)
     made = read(target, imu="/imu0/debiased")
     np.testing.assert_allclose(made.imu.gyro, expected.imu.gyro, rtol=0, atol=1e-12)
     np.testing.assert_allclose(made.imu.accel, expected.imu.accel, rtol=0, atol=1e-12)
@@ -245,7 +245,7 @@ def test_every_start_is_the_one_turn_on_finds(
     report = debias(source, tmp_path / "out.mcap", model=model_file, init=init)
     model = load(model_file)
     expected = {
-        "auto": lambda: at_rest(model, recording.imu),
+        "auto": lambda: auto(model, recording.imu),
         "stationary": lambda: at_rest(model, recording.imu),
         "prior": lambda: prior(model),
         "truth": lambda: from_truth(model, recording),
@@ -254,6 +254,37 @@ def test_every_start_is_the_one_turn_on_finds(
     assert start.how == expected.how
     np.testing.assert_allclose(start.rest, expected.rest, rtol=0, atol=1e-12)
     assert dict(report.models) == {"/imu0": "m"}
+
+
+@pytest.mark.parametrize("method", ["static", "linear", "neural_ode"])
+def test_smoothing_takes_the_whole_log_and_says_so(source: Path, recording: Recording, tmp_path: Path, method: str) -> None:
+    path: str | Path = method
+    model = static.Model() if method == "static" else make_model(method)
+    if method != "static":
+        path = tmp_path / "m.safetensors"
+        save(model, path)
+        model = load(path)
+    report = debias(source, tmp_path / "out.mcap", model=path, smooth=True)
+    imu = recording.imu
+    start = smooth(model, [(seconds(imu.t_ns, int(imu.t_ns[0])), imu.gyro, imu.accel)])
+    made = read(tmp_path / "out.mcap", imu="/imu0/debiased").imu
+    np.testing.assert_allclose(made.gyro, apply(model, start, imu).imu.gyro, rtol=0, atol=1e-12)
+    assert report.starts["/imu0"].how == start.how
+    assert start.how.endswith("forward and backward")
+    record = metadata(tmp_path / "out.mcap")[-1][1]
+    assert (record["smooth"], record["causal"], record["init"]) == ("true", "false", "auto")
+    assert metadata_of(source, tmp_path, path)["smooth"] == "false"
+
+
+def metadata_of(source: Path, tmp_path: Path, model: str | Path) -> dict[str, str]:
+    debias(source, tmp_path / "causal.mcap", model=model)
+    return metadata(tmp_path / "causal.mcap")[-1][1]
+
+
+def test_smoothing_finds_its_own_start(source: Path, model_file: Path, tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"--smooth: --smooth with --init prior; expected --init auto"):
+        debias(source, tmp_path / "out.mcap", model=model_file, init="prior", smooth=True)
+    assert not (tmp_path / "out.mcap").exists()
 
 
 def test_without_a_model_the_static_bias_is_the_mean_at_rest(source: Path, recording: Recording, tmp_path: Path) -> None:
@@ -296,6 +327,8 @@ def test_no_model_and_no_rest_is_a_refusal_that_says_what_to_do(tmp_path: Path) 
             ModelError, match=r"moving.mcap: no model given.*expected --model, or at least 1.5 s without motion"
         ):
             debias(log, tmp_path / "out.mcap", model=model)
+        with pytest.raises(ModelError, match=r"moving.mcap: no model given"):
+            debias(log, tmp_path / "out.mcap", model=model, smooth=True)
     assert ModelError.exit_code == 6
     assert [path.name for path in tmp_path.iterdir()] == ["moving.mcap"]
 
@@ -433,6 +466,18 @@ def test_one_sample_at_a_time_gives_the_batchs_numbers(recording: Recording, met
         np.testing.assert_allclose(gyro, batch.imu.gyro[k], rtol=0, atol=ONLINE)
         np.testing.assert_allclose(accel, batch.imu.accel[k], rtol=0, atol=ONLINE)
         np.testing.assert_allclose(bias, batch.bias[k], rtol=0, atol=ONLINE)
+
+
+@pytest.mark.parametrize("method", ["linear", "neural_ode"])
+def test_a_live_node_follows_the_rest_bias_as_a_log_does(recording: Recording, method: str) -> None:
+    """From the prior on, without a look at what is to come."""
+    model, imu = make_model(method), recording.imu.rows(slice(0, 1500))
+    online, batch = OnlineDebiaser(model), apply(model, following(model), imu)
+    found = np.array([online(int(t), w, a)[2] for t, w, a in zip(imu.t_ns, imu.gyro, imu.accel, strict=True)])
+    np.testing.assert_allclose(found, batch.bias, rtol=0, atol=ONLINE)
+    still = recording.imu.gyro[:600].mean(axis=0)
+    left = still - found[500:600, :3].mean(axis=0)
+    assert np.abs(left).max() < 0.1 * np.abs(still).max()
 
 
 def test_the_batch_path_is_the_models_forward_pass(recording: Recording) -> None:

@@ -47,6 +47,8 @@ FIELDS = {  # contracts.md, JSON of evaluate
     "log": str,
     "model": str,
     "init": (str, type(None)),
+    "estimate": str,
+    "smooth": bool,
     "samples": int,
     "duration_s": float,
     "aoe_deg": float,
@@ -203,6 +205,30 @@ def test_taking_off_the_true_bias_helps(log: Path, recording: Recording) -> None
     np.testing.assert_allclose([*static["gyro_bias"], *static["accel_bias"]], np.concatenate(bias), rtol=1e-12)
     assert static["init"] == words
     assert static["init_how"] == "given"
+
+
+def test_knowing_its_stops_is_a_row_beside_pure_integration(log: Path, model: Path, tmp_path: Path) -> None:
+    pure = evaluate(log, models=["static", model], init="auto")
+    both = evaluate(log, models=["static", model], init="auto", zupt=True, trajectories=tmp_path)
+    assert [(one["model"], one["estimate"]) for one in both] == [
+        (name, kind) for name in ("raw", "static", "linear_1") for kind in ("integration", "zupt")
+    ]
+    assert both[::2] == pure
+    for integrated, stopped in zip(both[::2], both[1::2], strict=True):
+        assert stopped["ape_m"] < 0.5 * integrated["ape_m"], stopped["model"]
+        assert stopped["samples"] == integrated["samples"]
+    assert {path.name for path in tmp_path.glob("*zupt*")} == {f"flight_1_{n}_zupt.tum" for n in ("raw", "static", "linear_1")}
+    json.dumps(both, allow_nan=False)
+
+
+def test_smoothing_is_said_and_finds_its_own_start(log: Path, model: Path) -> None:
+    _, causal = evaluate(log, models=[model])
+    _, smooth = evaluate(log, models=[model], smooth=True)
+    assert (causal["smooth"], smooth["smooth"]) == (False, True)
+    assert smooth["init_how"].endswith("forward and backward")
+    assert smooth["aoe_deg"] != causal["aoe_deg"]
+    with pytest.raises(ConfigError, match=r"--smooth with --init truth"):
+        evaluate(log, models=[model], init="truth", smooth=True)
 
 
 def test_masked_rows_count_nowhere(recording: Recording, log: Path, tmp_path: Path) -> None:

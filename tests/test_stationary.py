@@ -8,7 +8,7 @@ import pytest
 from converters import euroc, fetch, tum_vi
 from imutool.physics.flight import flight
 from imutool.recording import GRAVITY_M_S2, Imu
-from imutool.stationary import StationarySettings, stretches, white_noise
+from imutool.stationary import StationarySettings, Stillness, stretches, white_noise
 
 RATE_HZ = 200.0
 GYRO_NOISE, ACCEL_NOISE = 2.4e-3, 0.03  # rad/s and m/s² a sample and axis: an ADIS16448 at 200 Hz
@@ -157,3 +157,51 @@ def test_white_noise_is_found_under_the_motion() -> None:
     flown = white_noise(np.concatenate([made.gyro, made.accel], axis=1))
     np.testing.assert_allclose(flown, [2.4e-3 * 5 / 6] * 3 + [0.0283 * 5 / 6] * 3, rtol=0.1)
     assert not white_noise(plain[:10]).any()
+
+
+# ── as samples come ──────────────────────────────────────────────────────────────────────────────────────────────────
+
+
+def told(gyro: np.ndarray, accel: np.ndarray, block: int = 100) -> list[bool]:
+    still = Stillness()
+    return [still(gyro[a : a + block], accel[a : a + block]) for a in range(0, len(gyro) - block + 1, block)]
+
+
+def test_rest_is_known_a_second_and_a_half_after_it_begins_and_its_end_at_once():
+    t_ns, gyro, accel = made(20.0)
+    t = t_ns * 1e-9
+    moving = (t >= 8.0) & (t < 13.0)
+    gyro[moving] += 0.3 * np.sin(2 * np.pi * 0.7 * t[moving])[:, None]
+    found = told(gyro, accel)
+    assert found == [False] * 2 + [True] * 14 + [False] * 12 + [True] * 12
+
+
+def test_what_it_says_depends_on_nothing_later():
+    _, gyro, accel = made(20.0)
+    changed = gyro.copy()
+    changed[2000:] += 0.5
+    assert told(gyro, accel)[:20] == told(changed, accel)[:20]
+
+
+def test_missing_samples_and_short_blocks_begin_it_anew():
+    _, gyro, accel = made(4.0)
+    still = Stillness()
+    answers = [still(gyro[a : a + 100], accel[a : a + 100], whole=a != 400) for a in range(0, 800, 100)]
+    assert answers == [False, False, True, True, False, False, False, True]
+    assert not any(told(gyro, accel, block=5))
+
+
+def test_it_agrees_with_the_whole_log_on_real_recordings(data):
+    """Where the whole log says rest, it says rest within two seconds; where it does not, neither does this but for edges."""
+    recordings = [*euroc.read(data / "euroc" / "V2_01_easy.zip"), *fetch.read(data / "fetch" / "01_square")]
+    for recording in recordings:
+        imu = recording.imu
+        block = round(0.5 / imu.period_s)
+        mask = np.zeros(len(imu), bool)
+        for a, b in stretches(imu):
+            mask[a:b] = True
+        share = np.array([mask[a : a + block].mean() for a in range(0, len(imu) - block + 1, block)])
+        found = np.array(told(imu.gyro, imu.accel, block))
+        assert (share[found] > 0.0).all(), recording.name
+        inside = np.convolve(share == 1.0, np.ones(4), "full")[: len(share)] == 4  # two seconds in
+        assert found[inside].mean() > 0.9, recording.name

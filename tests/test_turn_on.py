@@ -17,8 +17,23 @@ from imutool.bias._base import BiasModel
 from imutool.errors import ConfigError, DataError
 from imutool.physics.flight import FlightSettings as Flight
 from imutool.physics.flight import TriadSettings, flight, trajectory
-from imutool.recording import GRAVITY_M_S2, Imu, Poses, Recording
-from imutool.turn_on import AT_REST_STD, TurnOn, at_rest, find, from_truth, given, over_all_rest, prior
+from imutool.recording import GRAVITY_M_S2, Imu, Poses, Recording, seconds
+from imutool.rest_track import Samples
+from imutool.turn_on import (
+    AT_REST_STD,
+    NoRestError,
+    TurnOn,
+    at_rest,
+    auto,
+    find,
+    from_truth,
+    given,
+    known,
+    over_all_rest,
+    prior,
+    rest_spread,
+    smooth,
+)
 
 RATE_HZ = 200.0
 NOISE = np.array([2.4e-3] * 3 + [0.03] * 3)  # of a sample: the ADIS16448 at 200 Hz
@@ -226,6 +241,98 @@ def test_a_truth_that_is_not_there_or_too_short_is_refused(biased: Recording) ->
         from_truth(static.Model(), replace(biased, truths={"/truth": short}))
 
 
+# ── followed, and from the whole log ─────────────────────────────────────────────────────────────────────────────────
+
+
+def trained(logs: int = 6, **std: float) -> BiasModel:
+    made = model(**std)
+    made.card = {"name": "m", "logs": [{}] * logs}
+    return made
+
+
+def samples(imu: Imu) -> Samples:
+    return seconds(imu.t_ns, int(imu.t_ns[0])), imu.gyro, imu.accel
+
+
+def test_auto_is_the_stop_the_log_begins_with_and_says_how_sure() -> None:
+    imu, _ = resting()
+    start = auto(trained(prior_std=0.05), imu)
+    np.testing.assert_allclose(start.rest[:3], GYRO_BIAS, atol=5e-4)
+    assert start.how == "4.0 s at rest from 0.0 s on, prior of 6 runs, ±0.0002 rad/s, then gravity in motion and every stop"
+    assert (start.hold_s, start.follows, start.track) == (pytest.approx(4.0, abs=0.01), True, None)
+    np.testing.assert_allclose(start.noise[:3], NOISE[:3], rtol=0.3)
+
+
+def test_only_the_first_stop_makes_the_start() -> None:
+    """Later samples, in motion or at rest again, change nothing in it."""
+    imu, _ = resting([(0.0, 4.0), (10.0, 15.0)])
+    other = Imu(imu.t_ns, np.where(np.arange(len(imu))[:, None] < 900, imu.gyro, 0.3), imu.accel)
+    one, two = auto(trained(), imu), auto(trained(), other)
+    np.testing.assert_array_equal(one.rest, two.rest)
+    np.testing.assert_array_equal(one.std, two.std)
+
+
+def test_during_that_stop_its_samples_get_what_the_whole_of_it_says() -> None:
+    imu, _ = resting()
+    made = trained(prior_std=0.05)
+    start = auto(made, imu)
+    bias = start.stream(made)(*samples(imu))
+    still = int(start.hold_s * RATE_HZ)
+    np.testing.assert_array_equal(bias[:still], np.tile(start.rest, (still, 1)))
+    assert len(np.unique(bias[still + 200 :, 0])) > 5, "and then it is followed"
+
+
+def test_an_untrained_model_has_no_prior_to_follow_from() -> None:
+    with pytest.raises(DataError, match="the log does not start at rest"):
+        auto(static.Model(), resting([])[0])
+
+
+def test_the_whole_log_is_surer_than_its_start_and_later_stops_count() -> None:
+    imu, _ = resting([(12.0, 18.0)])
+    made = trained(prior_std=0.02)
+    start = smooth(made, [samples(imu)])
+    assert start.track is not None
+    assert start.how.startswith(("5.", "6."))
+    assert "s at rest in all, gravity in motion, prior of 6 runs, ±0.000" in start.how
+    np.testing.assert_allclose(start.track.at(np.array([11.0, 14.0]))[:, :3], np.tile(GYRO_BIAS, (2, 1)), atol=1.5e-3)
+    assert (start.std[:3] < 0.2 * prior(made).std[:3]).all()
+
+
+def test_smoothing_needs_something_to_go_by() -> None:
+    imu, _ = resting([])
+    with pytest.raises(NoRestError, match="here: the log never rests"):
+        smooth(static.Model(), [samples(imu)], "here")
+    wide = smooth(trained(prior_std=0.05), [samples(imu)])
+    assert wide.std[:3].max() > 1e-4
+    with pytest.raises(DataError, match="too short to be smoothed"):
+        smooth(trained(), [samples(imu.rows(slice(0, 20)))])
+
+
+def test_what_differs_at_rest_is_told_from_the_logs_own_bias() -> None:
+    away = np.array([2e-3, -5e-4, 0.0])
+    logs, own = [], []
+    for seed in range(5):
+        imu, _ = resting([(0.0, 4.0), (15.0, 20.0)], seed=seed)
+        logs.append(samples(imu))
+        own.append(np.concatenate([GYRO_BIAS - away * (-1) ** seed, ACCEL_BIAS]))
+    spread = rest_spread(static.Model(), logs, np.array(own))
+    np.testing.assert_allclose(spread[:2], turn_on.MAD_TO_STD * np.abs(away[:2]), rtol=0.2)
+    assert spread[2] < 2.5 * AT_REST_STD[2]
+    assert (spread >= AT_REST_STD).all()
+    moving = samples(resting([])[0])
+    np.testing.assert_array_equal(rest_spread(static.Model(), [moving], np.zeros((1, 6))), AT_REST_STD)
+
+
+def test_a_model_that_says_how_rest_differs_is_believed() -> None:
+    made = trained(prior_std=3e-3)
+    before = auto(made, resting()[0])
+    made.register_buffer("rest_std", torch.tensor([2e-3] * 3 + [0.03] * 3))
+    np.testing.assert_allclose(known(made).ground_std[:3], 2e-3)
+    after = auto(made, resting()[0])
+    assert (after.std[:3] > 5 * before.std[:3]).all(), "in motion it is less sure"
+    np.testing.assert_allclose(after.rest[:3], before.rest[:3], atol=3e-4)  # at rest it is what it is
+
+
 # ── the words of --init ──────────────────────────────────────────────────────────────────────────────────────────────
 
 
@@ -259,10 +366,10 @@ def test_each_word_finds_its_way(biased: Recording) -> None:
     moving = Recording("moving", resting([])[0])
     how = {way: find(way, trained, still).how for way in ("auto", "stationary", "prior", "1,2,3,4,5,6")}
     assert "at rest" in how["auto"]
-    assert how["auto"] == how["stationary"]
+    assert how["auto"].startswith("4.0 s at rest from 0.0 s on, prior of the training runs, ±")
     assert how["1,2,3,4,5,6"] == "given"
     assert find("truth", trained, biased).how == "truth over 5.0 s, weighed against the training runs"
-    assert find("auto", trained, moving).how == prior(trained).how
+    assert find("auto", trained, moving).how.startswith("prior of the training runs, ±0.05 rad/s, then gravity in motion")
     with pytest.raises(DataError, match="does not start at rest"):
         find("stationary", trained, moving)
     with pytest.raises(DataError, match="does not start at rest"):

@@ -1,0 +1,142 @@
+"""What each way to know the rest bias is worth: `python tests/bench/starts.py FOLDER MODEL`.
+
+FOLDER holds logs of the training sequences (`imutool convert`), MODEL is of the same sensor and trained on others, as those of
+`python tests/bench/accuracy.py DATA --swap --keep FOLDER` are. Prints the AOE in degrees of pure integration from the true
+pose:
+
+    truth     start from 5 s of truth, weighed against the training runs      prior    mean of the training runs
+    rest      first stop, else the prior (the rule before there was a filter) VQF      its bias estimate, causal
+    VQF all   its offline estimate                                            auto     `--init auto`
+    smooth    `--smooth`                                                      oracle   each log's own constant, by truth
+
+VQF (Laidig and Seel, 2023) is given the same samples, less what the model says of the motion and less the prior's mean, and a
+clip of 20 instead of 2 deg/s. A model that does not say how its bias differs at rest is told, from the other logs. Below stands
+how consistent `auto` is: the mean NEES of its last gyro bias against the oracle's, 3 if it is as sure as it should be.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from pathlib import Path
+
+import numpy as np
+import torch
+import vqf
+from accuracy import TRAIN
+
+from imutool import metrics, turn_on
+from imutool.bias._base import BiasModel, Vector6
+from imutool.bias._file import load
+from imutool.errors import DataError
+from imutool.mcap_io.read import read
+from imutool.recording import Imu, Recording, seconds
+from imutool.rest_track import Samples, Track, followed
+from imutool.strapdown import along_truth
+from imutool.train import closed_form
+from imutool.train.segments import Pool
+from imutool.turn_on import TurnOn
+
+CLIP_DEG_S = 20.0
+WINDOW_S = {"gyro": (15.0,), "accel": (2.0,)}
+COLUMNS = ("truth", "prior", "rest", "VQF", "VQF all", "auto", "smooth", "oracle")
+
+
+def main() -> None:
+    """One row a training sequence, and their mean."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("model", type=Path)
+    options = parser.parse_args()
+    model = load(options.model)
+    names = [name for sequences in TRAIN.values() for name in sequences if (options.folder / f"{name}.mcap").exists()]
+    recordings = [read(options.folder / f"{name}.mcap", truth="/ground_truth/pose") for name in names]
+    oracle = own_bias(model, recordings)
+    told = getattr(model, "rest_std", None) is not None
+    print(f"{'':16}" + "".join(f"{column:>9}" for column in COLUMNS) + "   s: auto, smooth; how")
+    rows, nees = [], []
+    for i, recording in enumerate(recordings):
+        if not told:
+            others = [j for j in range(len(names)) if j != i]
+            spread = turn_on.rest_spread(model, [samples(recordings[j].imu) for j in others], oracle[others])
+            model.register_buffer("rest_std", torch.from_numpy(spread))
+        row, how, error, P = score(model, recording, oracle[i])
+        rows.append(row)
+        nees.append(error @ np.linalg.solve(P, error))
+        print(f"{names[i]:16}" + "".join(f"{value:9.2f}" for value in row) + how, flush=True)
+    print(f"{'mean':16}" + "".join(f"{value:9.2f}" for value in np.mean(rows, axis=0)))
+    print(f"NEES of auto's last gyro bias: mean {np.mean(nees):.1f}, each {np.round(nees, 1).tolist()}")
+
+
+def score(model: BiasModel, recording: Recording, own: Vector6) -> tuple[list[float], str, np.ndarray, np.ndarray]:
+    """AOE of each way, a word on time, and how far the filter's last gyro bias is from the log's own."""
+    imu = recording.imu
+    began = time.perf_counter()
+    auto = turn_on.auto(model, imu)
+    auto.stream(model)(*samples(imu))
+    halfway = time.perf_counter()
+    smooth = turn_on.smooth(model, [samples(imu)])
+    ended = time.perf_counter()
+    starts = {
+        "truth": turn_on.from_truth(model, recording),
+        "prior": turn_on.prior(model),
+        "rest": at_rest_else_prior(model, imu),
+        "VQF": by_vqf(model, imu, offline=False),
+        "VQF all": by_vqf(model, imu, offline=True),
+        "auto": auto,
+        "smooth": smooth,
+        "oracle": TurnOn(own, np.zeros(6), "oracle"),
+    }
+    last = list(followed(model, [samples(imu)], turn_on.known(model)))[-1].step.after
+    row = [aoe(model, starts[column], recording) for column in COLUMNS]
+    return row, f"   {halfway - began:.2f} {ended - halfway:.2f}; {auto.how}", (last.bias - own)[:3], last.P[9:12, 9:12]
+
+
+def aoe(model: BiasModel, start: TurnOn, recording: Recording) -> float:
+    """AOE in degrees of pure integration with this start."""
+    imu = recording.imu
+    bias = start.stream(model)(*samples(imu))
+    corrected = Imu(imu.t_ns, imu.gyro - bias[:, :3], imu.accel - bias[:, 3:])
+    return float(metrics.absolute(*along_truth(corrected, recording.truth, recording.name))["aoe_deg"] or 0.0)
+
+
+def own_bias(model: BiasModel, recordings: list[Recording]) -> np.ndarray:
+    """Each log's own constant, in closed form from all its truth."""
+    pool = Pool.of(recordings)
+    rest = model.prior_mean.double().expand(len(recordings), 6).clone()
+    for sensor, columns in (("gyro", slice(0, 3)), ("accel", slice(3, 6))):
+        solved = closed_form.solve(model, sensor, pool, rest, WINDOW_S[sensor], matrix=False, part="all")  # type: ignore[arg-type]
+        rest[:, columns] = solved.rest
+    return rest.numpy()
+
+
+def at_rest_else_prior(model: BiasModel, imu: Imu) -> TurnOn:
+    try:
+        return turn_on.at_rest(model, imu)
+    except DataError:
+        return turn_on.prior(model)
+
+
+def by_vqf(model: BiasModel, imu: Imu, *, offline: bool) -> TurnOn:
+    """VQF's bias at every sample, on top of the prior's mean."""
+    t_s, gyro, accel = samples(imu)
+    start = turn_on.prior(model)
+    bias = model.stream(start.rest)(t_s, gyro, accel)
+    rate, force = np.ascontiguousarray(gyro - bias[:, :3]), np.ascontiguousarray(accel - bias[:, 3:])
+    settings = {"biasClip": CLIP_DEG_S}
+    if offline:
+        found = vqf.offlineVQF(rate, force, None, imu.period_s, settings)["bias"]
+    else:
+        found = vqf.VQF(imu.period_s, **settings).updateBatch(rate, force)["bias"]
+    rest = np.tile(start.rest, (len(imu), 1))
+    rest[:, :3] += found
+    return TurnOn(rest[0], start.std, "VQF", track=Track(t_s, rest, np.tile(start.std, (len(imu), 1))))
+
+
+def samples(imu: Imu) -> Samples:
+    """Seconds from the first sample, rates and forces."""
+    return seconds(imu.t_ns, int(imu.t_ns[0])), imu.gyro, imu.accel
+
+
+if __name__ == "__main__":
+    main()
