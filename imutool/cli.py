@@ -19,6 +19,7 @@ from imutool.errors import ConfigError, DataError, ImutoolError
 from imutool.terminal import err, log_to_stderr, out, plain, progress, say, table, tell_error, write_json
 
 if TYPE_CHECKING:
+    from imutool.identify import Identified
     from imutool.train.fit import Epoch
 
 INTERRUPTED = 130
@@ -80,6 +81,7 @@ app = typer.Typer(
 Logs = Annotated[list[Path], typer.Argument(metavar="LOG...", help="MCAP logs.")]
 Models = Annotated[list[str] | None, typer.Option("--model", help="Model file, a name that ships, or 'static'. Repeatable.")]
 Init = Annotated[str, typer.Option(help="Start bias: auto, stationary, prior, truth, or gx,gy,gz,ax,ay,az (rad/s, m/s²).")]
+Smooth = Annotated[bool, typer.Option("--smooth", help="Take the whole log for every sample's bias: better, not causal.")]
 Imu = Annotated[str | None, typer.Option(help="IMU topic, where a log has several.")]
 Truth = Annotated[str | None, typer.Option(help="Topic of the true poses, where a log has several.")]
 Json = Annotated[str | None, typer.Option("--json", metavar="FILE|-", help="Write the report as JSON; - is stdout.")]
@@ -156,31 +158,72 @@ def convert(
         raise typer.Exit(DataError.exit_code)
 
 
-@app.command(epilog="Example: [bold]imutool info MH_04.mcap[/]")
-def info(logs: Logs, json_to: Json = None, verbose: Verbose = False, quiet: Quiet = False) -> None:
-    """Say what is in a log and what looks wrong with it."""
+@app.command(epilog="Example: [bold]imutool info MH_04.mcap[/] or [bold]imutool info still.mcap --noise --noise-toml i.toml[/]")
+def info(
+    logs: Logs,
+    noise: Annotated[bool, typer.Option("--noise", help="Identify the IMU's noise, at rest and against the truth.")] = False,
+    model: Annotated[str | None, typer.Option(help="For --noise: model that corrects the samples in motion.")] = None,
+    imu: Annotated[str | None, typer.Option(help="For --noise: IMU topic, where a log has several.")] = None,
+    truth: Annotated[str | None, typer.Option(help="For --noise: topic of the true poses, where a log has several.")] = None,
+    noise_plot: Annotated[Path | None, typer.Option(metavar="F.png", help="Draw the Allan deviations (with --noise).")] = None,
+    noise_toml: Annotated[Path | None, typer.Option(metavar="F.toml", help="Write the noise as TOML (with --noise).")] = None,
+    overwrite: Overwrite = False,
+    json_to: Json = None,
+    verbose: Verbose = False,
+    quiet: Quiet = False,
+) -> None:
+    """Say what is in a log and what looks wrong with it; with --noise, how noisy its IMU is."""
     from imutool.info import imu_rows, inspect, topic_rows
 
     log_to_stderr(verbose, quiet)
+    asked = {"--model": model, "--imu": imu, "--truth": truth, "--noise-plot": noise_plot, "--noise-toml": noise_toml}
+    if not noise and (idle := [name for name, value in asked.items() if value is not None]):
+        raise ConfigError(f"{idle[0]} says nothing without --noise", where="info", fix="Add --noise")
+    if len(logs) > 1 and (noise_plot or noise_toml):
+        raise ConfigError(f"{len(logs)} logs do not fit one file", where="--noise-plot, --noise-toml", expected="one log")
     reports = [inspect(log) for log in logs]
+    found = []
+    if noise:
+        from imutool import identify
+
+        found = [identify.identify(log, imu=imu, truth=truth, model=model) for log in logs]
+        for report, one in zip(reports, found, strict=True):
+            report["noise"] = identify.plain(one)
+        _write_noise(found[0], noise_plot, noise_toml, overwrite)
     if write_json(reports[0] if len(reports) == 1 else {"schema": "imutool.infos/1", "logs": reports}, json_to):
         return
-    for log, report in zip(logs, reports, strict=True):
+    for number, (log, report) in enumerate(zip(logs, reports, strict=True)):
         say(str(log))
         table(topic_rows(report), keys=1)
         table(imu_rows(report), keys=2)
+        if found:
+            table(identify.rows(found[number]), keys=1)
+            for remark in found[number].remarks:
+                out.print(f"[cyan]noise:[/] {plain(remark)}", highlight=False, soft_wrap=True)
         for warning in report["warnings"]:
             out.print(f"[yellow]warning:[/] {plain(warning)}", highlight=False, soft_wrap=True)
 
 
+def _write_noise(found: Identified, plot: Path | None, toml: Path | None, overwrite: bool) -> None:
+    """The files that were asked for."""
+    if plot is not None:
+        from imutool.view.allan import deviations
+
+        deviations(found, plot, overwrite=overwrite)
+    if toml is not None:
+        from imutool.noise import write
+
+        write(found.noise, toml, overwrite=overwrite)
+
+
 @app.command(
     cls=_listing("imutool.bias", "--method"),
-    epilog="Example: [bold]imutool train MH_01.mcap MH_03.mcap -o adis.safetensors --method neural_ode[/]",
+    epilog="Example: [bold]imutool train MH_01.mcap MH_03.mcap -o adis.safetensors[/]",
 )
 def train(
     logs: Logs,
     model: Annotated[Path, typer.Option("-o", "--output", metavar="MODEL.safetensors", help="Where the model goes.")],
-    method: Annotated[str, typer.Option(help="The bias model, one of those listed below.")] = "neural_ode",
+    method: Annotated[str, typer.Option(help="The bias model, one of those listed below.")] = "hybrid",
     config: Annotated[
         Path | None, typer.Option(metavar="FILE.toml", help="Settings; imutool.train.fit.TrainSettings says which.")
     ] = None,
@@ -198,11 +241,11 @@ def train(
     """Train a bias model on logs of one sensor with true poses."""
     registry.load("imutool.bias", method)  # a slip of the pen is told before any log is read
     from imutool.config import load
-    from imutool.train.fit import TrainSettings
     from imutool.train.run import train as run
+    from imutool.train.settings import settings_of
 
     words = [*(set_ or ()), *([f"seed={seed}"] if seed is not None else ())]
-    settings = load(TrainSettings, config, words)
+    settings = load(settings_of(method), config, words)
     with progress("Training", verbose, quiet) as tell:
         trained = run(
             logs,
@@ -227,6 +270,7 @@ def debias(
     model: Annotated[str | None, typer.Option(help="Model file or a name that ships; else a static estimate.")] = None,
     imu: Annotated[list[str] | None, typer.Option(help="IMU topic, where a log has several. Repeatable.")] = None,
     init: Init = "auto",
+    smooth: Smooth = False,
     overwrite: Overwrite = False,
     json_to: Json = None,
     verbose: Verbose = False,
@@ -242,6 +286,7 @@ def debias(
             model=model,
             imus=imu or (),
             init=init,
+            smooth=smooth,
             overwrite=overwrite,
             progress=lambda done, total: tell(done, total, ""),
         )
@@ -267,11 +312,40 @@ def debias(
     say(f"{target}: {copied} messages as they were, {counts}")
 
 
+@app.command(epilog="Example: [bold]imutool export MH_04_debiased.mcap MH_04_debiased --format euroc[/]")
+def export(
+    log: Annotated[Path, typer.Argument(metavar="LOG", help="An MCAP log.")],
+    target: Annotated[Path, typer.Argument(metavar="OUT", help="The folder that is made.")],
+    format: Annotated[str, typer.Option(help="euroc: an ASL folder; rosbag2: a folder around a copy of the log.")],
+    imu: Annotated[str | None, typer.Option(help="IMU topic of a EuRoC folder; by default the debiased one.")] = None,
+    noise: Annotated[
+        str | None, typer.Option(metavar="NAME|F.toml", help="Noise for its sensor.yaml: a data sheet or a file.")
+    ] = None,
+    overwrite: Overwrite = False,
+    json_to: Json = None,
+    verbose: Verbose = False,
+    quiet: Quiet = False,
+) -> None:
+    """Write a log as a EuRoC folder or a rosbag2 folder, for programs that read those."""
+    from imutool.export import export as run
+
+    with progress("Exporting", verbose, quiet) as tell:
+        report = run(log, target, format=format, imu=imu, sensor_noise=noise, overwrite=overwrite, progress=tell)
+    if write_json(report.plain(), json_to):
+        return
+    counts = ", ".join(f"{count} on {name}" for name, count in report.written.items())
+    say(f"{target}: {counts}" + (f"; IMU from {report.imu}" if report.imu else ""))
+    if report.left_out:
+        say(f"left out: {', '.join(report.left_out)}")
+
+
 @app.command(epilog="Example: [bold]imutool evaluate MH_04.mcap --model adis.safetensors --init truth[/]")
 def evaluate(
     logs: Logs,
     model: Models = None,
     init: Init = "auto",
+    smooth: Smooth = False,
+    zupt: Annotated[bool, typer.Option("--zupt", help="Also dead reckoning that knows when it stands still.")] = False,
     truth: Truth = None,
     imu: Imu = None,
     trajectories: Annotated[Path | None, typer.Option(metavar="DIR", help="Write TUM-format trajectories there.")] = None,
@@ -289,11 +363,19 @@ def evaluate(
         for done, log in enumerate(logs):
             tell(done, len(logs), log.name)
             results += run(
-                log, models=model or (), init=init, truth=truth, imu=imu, trajectories=trajectories, overwrite=overwrite
+                log,
+                models=model or (),
+                init=init,
+                smooth=smooth,
+                zupt=zupt,
+                truth=truth,
+                imu=imu,
+                trajectories=trajectories,
+                overwrite=overwrite,
             )
         tell(len(logs), len(logs), "")
     if not write_json({"schema": SCHEMA, "results": results}, json_to):
-        _figures(results)
+        _figures([{**one, "model": f"{one['model']} zupt"} if one["estimate"] == "zupt" else one for one in results])
 
 
 @app.command(epilog="Example: [bold]imutool view MH_04_debiased.mcap --save MH_04.rrd[/]")
@@ -323,6 +405,58 @@ def view(
         for log, one in zip(logs, data, strict=True):
             report.error_curves(one, png / f"{log.stem}.png", overwrite=overwrite)
     say(rerun.show(data, save=save, overwrite=overwrite))
+
+
+@app.command(epilog="Example: [bold]imutool vio MH_04.mcap --model adis.safetensors --blackout 3[/]")
+def vio(
+    logs: Logs,
+    model: Models = None,
+    init: Init = "auto",
+    truth: Truth = None,
+    imu: Imu = None,
+    bias_states: Annotated[
+        bool | None, typer.Option("--bias-states/--no-bias-states", help="Estimate biases, or trust the IMU; by default both.")
+    ] = None,
+    lag: Annotated[float, typer.Option(metavar="S", help="How far back the smoother still changes its mind.")] = 3.0,
+    keyframes: Annotated[float, typer.Option(metavar="HZ", help="Camera frames taken a second.")] = 4.0,
+    features: Annotated[int, typer.Option(help="Tracks in a frame.")] = 30,
+    pixel_noise: Annotated[float, typer.Option(metavar="PX", help="White noise of a pixel coordinate.")] = 1.0,
+    blackout: Annotated[float, typer.Option(metavar="S", help="The camera sees nothing so long of every 15 s.")] = 0.0,
+    duration: Annotated[float | None, typer.Option(metavar="S", help="Only so much of each log.")] = None,
+    seed: Annotated[int, typer.Option(help="Of landmarks, tracks and pixel noise.")] = 0,
+    set_: Annotated[
+        list[str] | None, typer.Option("--set", metavar="key=value", help="Another of imutool.vio.run.VioSettings. Repeatable.")
+    ] = None,
+    json_to: Json = None,
+    verbose: Verbose = False,
+    quiet: Quiet = False,
+) -> None:
+    """Score a visual-inertial estimate on the log's IMU, raw and with each model.
+
+    The camera is simulated: EuRoC's stereo pair along the log's true poses, on every data set.
+    """
+    from imutool.config import load
+    from imutool.vio.run import SCHEMA, VioSettings, tabulate
+    from imutool.vio.run import vio as run
+
+    given = {"smoother.lag_s": lag, "keyframes_hz": keyframes, "features": features, "pixel_noise": pixel_noise}
+    given |= {"blackout_s": blackout, "seed": seed} | ({} if duration is None else {"duration_s": duration})
+    settings = load(VioSettings, None, [*(f"{key}={value}" for key, value in given.items()), *(set_ or ())])
+    states = (True, False) if bias_states is None else (bias_states,)
+    results = []
+    with progress("Estimating", verbose, quiet) as tell:
+        for log in logs:
+            results += run(
+                log, models=model or (), init=init, truth=truth, imu=imu, bias_states=states, settings=settings, progress=tell
+            )
+    if write_json({"schema": SCHEMA, "results": results}, json_to):
+        return
+    for rows in tabulate(results):
+        table(rows, keys=3)
+    say(f"Camera, simulated along the truth: {results[0]['camera']}; {results[0]['tracks']} tracks in a frame")
+    for one in results:
+        if one["failed"]:
+            say(f"{one['log']}, {one['model']}, bias states {'on' if one['bias_states'] else 'off'}: {one['failed']}")
 
 
 @app.command(epilog="Example: [bold]imutool models --json -[/]")
@@ -384,6 +518,8 @@ def options(
 
 def _epoch(epoch: Epoch) -> tuple[int, int, str]:
     """A line of training as progress: steps done, steps in all, the figures in words."""
+    if epoch.note:
+        return 0, 1, epoch.note
     scale, unit = (180.0 / math.pi, "°") if epoch.sensor == "gyro" else (1.0, " m/s")
     held_out, best = epoch.held_out * scale, epoch.best * scale
     minutes, seconds = divmod(round(epoch.left_s), 60)

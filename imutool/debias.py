@@ -18,7 +18,8 @@ from jaxtyping import Float64, Int64, UInt8
 from imutool import __version__
 from imutool.bias import static
 from imutool.bias._base import BiasModel
-from imutool.bias._file import check_rate, find_model
+from imutool.bias._file import check_rate, find_model, shipped_for
+from imutool.certainty import Certainty
 from imutool.config import plain
 from imutool.errors import ConfigError, DataError, LogError, ModelError
 from imutool.mcap_io import schema
@@ -87,28 +88,36 @@ class Debiaser:
             NewTopic(f"{source_topic}{SUFFIX}", schema.IMU),
             NewTopic(f"{source_topic}/bias/gyro", schema.VECTOR3),
             NewTopic(f"{source_topic}/bias/accel", schema.VECTOR3),
+            NewTopic(f"{source_topic}/bias", schema.TWIST),
         )
         self._stream, self._start_ns = start.stream(model), -1
+        self._certainty = Certainty(model, start, self._stream)
         noise = model.noise_std.detach().cpu().double().numpy()
-        variance = np.where(noise > 0, noise, start.noise) ** 2 + start.std**2
-        self._gyro_covariance, self._accel_covariance = np.diag(variance[:3]).ravel(), np.diag(variance[3:]).ravel()
+        self._white = np.diag(np.where(noise > 0, noise, start.noise) ** 2)
 
     def __call__(self, batch: ImuBatch) -> Sequence[UInt8[np.ndarray, "n L"]]:
-        """Payloads of the corrected messages and of the two biases."""
+        """Payloads of the corrected messages, of the two biases, and of both with their covariance.
+
+        A corrected sample's covariance is that of its bias and the sensor's white noise.
+        """
         if self._start_ns < 0 and len(batch.stamp_ns):
             self._start_ns = int(batch.stamp_ns[0])
-        bias = self._stream(seconds(batch.stamp_ns, self._start_ns), batch.gyro, batch.accel)
+        t_s = seconds(batch.stamp_ns, self._start_ns)
+        bias = self._stream(t_s, batch.gyro, batch.accel)
+        unsure = self._certainty(t_s, batch.gyro, batch.accel)
+        total = unsure + self._white
         return (
             schema.encode_imu(
                 batch.stamp_ns,
                 batch.gyro - bias[:, :3],
                 batch.accel - bias[:, 3:],
                 batch.frame_id,
-                self._gyro_covariance,
-                self._accel_covariance,
+                total[:, :3, :3].reshape(-1, 9),
+                total[:, 3:, 3:].reshape(-1, 9),
             ),
             _vector(batch.stamp_ns, bias[:, :3], batch.frame_id),
             _vector(batch.stamp_ns, bias[:, 3:], batch.frame_id),
+            schema.encode_twist(batch.stamp_ns, bias[:, :3], bias[:, 3:], unsure, batch.frame_id),
         )
 
 
@@ -125,8 +134,8 @@ def debias(
 ) -> DebiasReport:
     """Writes `target`: all of `source` unchanged, and beside each IMU its debiased samples and the bias taken off.
 
-    Without a model: the one the log's metadata names, else the mean over time at rest. With `smooth` the start bias at every
-    time comes from the whole log, also from what follows.
+    Without a model: the one the log's metadata names, else the one that ships for its sensor, else the mean over time at rest.
+    With `smooth` the start bias at every time comes from the whole log, also from what follows.
 
     Raises:
         ConfigError: source or target cannot be opened, `init` makes no sense, or `smooth` is asked for with another `init`.
@@ -136,7 +145,8 @@ def debias(
     refuse_smooth(init, smooth)
     with Log(source) as log:
         topics = list(imus) or [_only_imu(log)]
-        named = log.metadata().get("imutool", {}).get("model")
+        about = log.metadata().get("imutool", {})
+    named = about.get("model") or shipped_for(about.get("sensor"), about.get("dataset"))
     derived, starts, models, records = [], {}, {}, {}
     origin = {"source_file": source.name, "source_sha256": sha256(source), "source_size": str(source.stat().st_size)}
     for topic in topics:
@@ -239,7 +249,7 @@ def _head(source: Path, topic: str, init: str) -> Recording:
     with Log(source) as log:
         first = next((int(times.min()) for times in log.stamps(topic) if len(times)), None)
     end_ns = None if first is None else first + nanoseconds(HEAD_S)
-    if init == "truth":
+    if init.partition(":")[0] == "truth":
         return read(source, imu=topic, end_ns=end_ns)
     return Recording(source.stem, _samples(source, topic, end_ns), imu_topic=topic, source=str(source))
 

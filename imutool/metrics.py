@@ -59,8 +59,7 @@ def evaluate(estimate: Poses, truth: Poses, valid: Mask, distances_m: Sequence[f
 
 def orientation_errors(estimate: Poses, truth: Poses) -> Float64[np.ndarray, " n"]:
     """The angle between estimate and truth at every row, in rad."""
-    angles: Float64[np.ndarray, " n"] = (_rotations(truth).inv() * _rotations(estimate)).magnitude()
-    return angles
+    return np.asarray((_rotations(truth).inv() * _rotations(estimate)).magnitude())
 
 
 def absolute(estimate: Poses, truth: Poses, valid: Mask) -> dict[str, float | None]:

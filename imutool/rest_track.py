@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Float64, Int64
 
 from imutool import inertial_filter
 from imutool.bias._base import BiasModel, Vector6
@@ -45,8 +45,15 @@ class Track(NamedTuple):
 
     def at(self, t_s: Float64[np.ndarray, " n"]) -> Float64[np.ndarray, "n 6"]:
         """The rest bias at some times."""
+        return np.asarray(self.rest[self._row(t_s)])
+
+    def std_at(self, t_s: Float64[np.ndarray, " n"]) -> Float64[np.ndarray, "n 6"]:
+        """How sure it is at some times, as a standard deviation."""
+        return np.asarray(self.std[self._row(t_s)])
+
+    def _row(self, t_s: Float64[np.ndarray, " n"]) -> Int64[np.ndarray, " n"]:
         row = np.searchsorted(self.t_s, t_s, side="right") - 1
-        return self.rest[np.clip(row, 0, len(self.rest) - 1)]
+        return np.clip(row, 0, len(self.rest) - 1)
 
 
 class Passed(NamedTuple):
@@ -147,19 +154,23 @@ class Following:
         self._motion, self._mean = model.stream(known.mean), known.mean
         self.filter = RestFilter(known, settings)
         self._rest, self._now, self._hold_s = rest, rest, hold_s
+        self._sure = np.diag(known.std**2)
+        self.covariance = np.zeros((0, 6, 6))  # of the rest bias, at each of the samples given last
 
     def __call__(
         self, t_s: Float64[np.ndarray, " n"], gyro: Float64[np.ndarray, "n 3"], accel: Float64[np.ndarray, "n 3"]
     ) -> Float64[np.ndarray, "n 6"]:
         """The bias at each sample."""
         bias = self._motion(t_s, gyro, accel) - self._mean
-        rest = np.empty_like(bias)
+        rest, covariance = np.empty_like(bias), np.empty((len(bias), 6, 6))
         done = 0
         for block in self.filter.feed(t_s, gyro - bias[:, :3], accel - bias[:, 3:]):
             known_from = int(np.searchsorted(t_s, block.end_s))
-            rest[done:known_from] = self._now
+            rest[done:known_from], covariance[done:known_from] = self._now, self._sure
             done, self._now = known_from, block.step.after.rest_bias(block.resting)
-        rest[done:] = self._now
+            self._sure = block.step.after.covariance(block.resting)
+        rest[done:], covariance[done:] = self._now, self._sure
+        self.covariance = covariance
         rest[t_s < self._hold_s] = self._rest
         total: Float64[np.ndarray, "n 6"] = bias + rest
         return total
@@ -169,14 +180,14 @@ class Along:
     """A model with a rest bias that is known in time, on the clock of the samples."""
 
     def __init__(self, model: BiasModel, track: Track) -> None:
-        self._track, self._mean = track, track.rest.mean(axis=0)
+        self.track, self._mean = track, track.rest.mean(axis=0)
         self._motion = model.stream(self._mean)
 
     def __call__(
         self, t_s: Float64[np.ndarray, " n"], gyro: Float64[np.ndarray, "n 3"], accel: Float64[np.ndarray, "n 3"]
     ) -> Float64[np.ndarray, "n 6"]:
         """The bias at each sample."""
-        total: Float64[np.ndarray, "n 6"] = self._motion(t_s, gyro, accel) - self._mean + self._track.at(t_s)
+        total: Float64[np.ndarray, "n 6"] = self._motion(t_s, gyro, accel) - self._mean + self.track.at(t_s)
         return total
 
 

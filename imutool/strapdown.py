@@ -126,7 +126,8 @@ def drift(imu: Imu, truth: Poses, window_s: float = 5.0) -> tuple[Float64[np.nda
         rows = slice(first, last + 1)
         if valid[last] and np.diff(t[rows]).max() <= GAP_FACTOR * imu.period_s:
             end, goal = dead_reckon(imu.rows(rows), Start.of(true, first)), true.rows(slice(last, last + 1))
-            assert end.v_w is not None and goal.v_w is not None
+            assert end.v_w is not None
+            assert goal.v_w is not None
             q, q_true = end.q_wb_wxyz[-1], goal.q_wb_wxyz[0]
             apart = min(float(np.linalg.norm(q - q_true)), float(np.linalg.norm(q + q_true)))  # a quaternion is its negative
             turned.append(4.0 * np.arcsin(0.5 * apart))

@@ -34,6 +34,7 @@ TRUTH_S = 15.0  # how much of the truth a start takes: of 3, 5, 8, 10 and 15 s t
 AT_REST_STD = np.array([1e-4] * 3 + [0.03] * 3)  # earth's rotation; local gravity and what a tilt hides
 REST_BEGINS_WITHIN_S = 5.0  # later, its bias would be one of the future
 ITERATIONS = 4
+HUBER_MEDIANS = 1.5
 MAD_TO_STD = 1.4826
 LEAST_STD = np.array([1e-6] * 3 + [1e-4] * 3)  # a prior without any doubt would leave nothing to estimate
 FOLLOWED = "gravity in motion and every stop"
@@ -311,9 +312,9 @@ def truth_offset(
 ) -> Vector6:
     """The constant in samples that the truth beside them shows: the slope, in time, of what integration misses.
 
-    Rotation and velocity are integrated from the first true pose; their misses e(t) = e_0 + (sum of A) b are fitted by all trusted
-    poses with Huber's weights, e_0 being the first pose's own error. The gyro comes first, and carries the attitude under the
-    accelerometer.
+    Rotation and velocity are integrated from the first true pose; their misses e(t) = e_0 + (sum of A) b are fitted by all
+    trusted poses with Huber's weights, e_0 being the first pose's own error. The gyro comes first, and carries the
+    attitude under the accelerometer.
     """
     dt, seen = torch.from_numpy(np.diff(t_s))[None], torch.from_numpy(trusted)
     rate, force = torch.from_numpy(samples[:, :3])[None], torch.from_numpy(samples[:, 3:])[None]
@@ -339,8 +340,8 @@ def _slope(missed: Float[Tensor, "n 3"], by: Float[Tensor, "n 3 3"], seen: Bool[
         weighted = (X * root[:, None, None]).flatten(0, 1), (y * root[:, None]).reshape(-1, 1)
         found = torch.linalg.lstsq(*weighted).solution[:, 0]
         size = (y - X @ found).norm(dim=1)
-        root = huber_weight(size, (1.5 * size.median()).clamp_min(1e-9).expand(len(size))).sqrt()
-    return found[:3]
+        root = huber_weight(size, (HUBER_MEDIANS * size.median()).clamp_min(1e-9).expand(len(size))).sqrt()
+    return torch.as_tensor(found[:3])
 
 
 def _bias(model: BiasModel, imu: Imu, rest: Vector6) -> Float64[np.ndarray, "n 6"]:

@@ -10,6 +10,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
+from types import MappingProxyType
 from typing import Any, ClassVar, Literal, Protocol, runtime_checkable
 
 import numpy as np
@@ -50,6 +51,16 @@ class Stream(Protocol):
         """The bias at each sample, from this and earlier samples only; the blocks' borders change nothing."""
 
 
+@runtime_checkable
+class Unsure(Protocol):
+    """The covariance of what the motion adds, for samples as they arrive: gyro, then accel."""
+
+    def __call__(
+        self, t_s: Float64[np.ndarray, " n"], gyro: Float64[np.ndarray, "n 3"], accel: Float64[np.ndarray, "n 3"]
+    ) -> Float64[np.ndarray, "n 6 6"]:
+        """One matrix a sample, from it and earlier ones."""
+
+
 class BiasModel(nn.Module, ABC):
     """A bias model, with the statistics of its sensor's training runs that every start needs.
 
@@ -58,22 +69,37 @@ class BiasModel(nn.Module, ABC):
     Attributes:
         prior_mean, prior_std: rest bias over the training runs, and its spread from run to run.
         truth_std: spread of a rest bias estimated from `imutool.turn_on.TRUTH_S` seconds of this data's own truth.
+        rest_std: how far the bias at rest lies from that in motion.
+        walk_std: how far a rest bias walks in a second^1/2.
         noise_std: white noise of a sample, as seen in the residuals, for the debiased message's covariance.
     """
 
     method: ClassVar[str]
     iterative: ClassVar[bool] = True  # false where the closed form leaves nothing to descend on
+    objective: ClassVar[Literal["window_ends", "increments"]] = "window_ends"  # what the descent minimises (imutool.train)
+    prefers: ClassVar[Mapping[str, Any]] = MappingProxyType({})  # TrainSettings that differ from the general defaults
+    undecayed: ClassVar[tuple[str, ...]] = ()  # beginnings of the names of parameters that weight decay leaves alone
+    context: int = 0  # samples from before a segment that the answer over it depends on; such a bias is rest + f(samples)
     prior_mean: Tensor
     prior_std: Tensor
     truth_std: Tensor
+    rest_std: Tensor
+    walk_std: Tensor
     noise_std: Tensor
 
     def __init__(self, config: Settings, rate_hz: float) -> None:
         super().__init__()
         self.config, self.rate_hz = config, rate_hz
         self.card: Mapping[str, Any] = {}
-        for name in ("prior_mean", "prior_std", "truth_std", "noise_std"):
+        for name in ("prior_mean", "prior_std", "truth_std", "rest_std", "walk_std", "noise_std"):
             self.register_buffer(name, torch.zeros(6))
+
+    def see(self, gyro: Float[Tensor, "n 3"], accel: Float[Tensor, "n 3"]) -> None:
+        """Shown every sample of the training part once, before the first step: the place to find the inputs' scales."""
+
+    def rest_at_work(self, sensor: Sensor, rest: Float[Tensor, "*logs 3"]) -> Float[Tensor, "*logs 3"]:
+        """Rest biases found beside the model in training mode, as they must be beside it at work: the same for most."""
+        return rest
 
     @abstractmethod
     def sensor_bias(self, sensor: Sensor, segment: Segment) -> Float[Tensor, "batch n 3"]:
@@ -85,6 +111,14 @@ class BiasModel(nn.Module, ABC):
     def forward(self, segment: Segment) -> Float[Tensor, "batch n 6"]:
         """The bias at each sample: gyro (rad/s), then accel (m/s²)."""
         return torch.cat([self.sensor_bias(sensor, segment) for sensor in SENSORS], dim=-1)
+
+    def rest_dynamics(self) -> Float64[np.ndarray, "6 6"]:
+        """d(drift of the rest bias) / d(rest bias), a second: how an error of the start grows or dies. Zero for most."""
+        return np.zeros((6, 6))
+
+    def calibration_covariance(self) -> Unsure | None:
+        """What is left open of the motion-dependent part: a covariance for each sample; none where it is not known."""
+        return None
 
     @abstractmethod
     def begin_at(self, sensor: Sensor, W: Float[Tensor, "3 3"]) -> None:

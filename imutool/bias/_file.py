@@ -22,6 +22,7 @@ from imutool.errors import ConfigError, ImutoolError, ModelError
 FORMAT = "imutool.model/1"
 MAX_BYTES = 64 << 20  # ours are under 2 MB; a file this large is no bias model
 MAX_RATE_HZ = 1e6
+BEST_FIRST = ("hybrid", "neural_ode", "linear")  # by the published and own tables (docs/accuracy.md)
 RATE_TOLERANCE = 0.05  # a sensor's real rate differs from its name by a few per mille (BMI160: 199.4 for 200)
 
 
@@ -141,6 +142,19 @@ def find_model(name: str | Path) -> BiasModel:
             fix=f"Did you mean {near[0]!r}?" if near else "",
         )
     return load(shipped[str(name)])
+
+
+def shipped_for(sensor: str | None, dataset: str | None) -> str | None:
+    """The name of the model that ships for a sensor as a data set holds it, the best method first; none for any other.
+
+    A calibration belongs to one unit of a sensor, not to its type: another ADIS16448 is another sensor.
+    """
+    for method in BEST_FIRST if sensor and dataset else ():
+        for path in sorted(library().glob(f"*{method}.safetensors")):
+            about = header_of(path)
+            if (about["method"], about.get("sensor"), about.get("dataset")) == (method, sensor, dataset):
+                return path.stem
+    return None
 
 
 def digest(path: Path) -> str:

@@ -6,17 +6,18 @@ is written in two parts whose time scales differ by four orders of magnitude::
 
     db/dt = dC(u)/dt + g(b - C(u), u, du/dt)
 
-*C*, the curve, is what the motion adds at once: scale, misalignment, curvature. Its term is the one the paper derives
+*C*, the curve, is what the motion adds: scale, misalignment, curvature. Its term is the one the paper derives
 for a linear sensor, (I - A^{-1}) du/dt (after eq. 31), for any smooth sensor; being a total derivative it integrates to
-C(u(t)) exactly, with every solver and step. *g*, the drift, moves the rest bias beta = b - C(u), the turn-on bias
-that a run starts with, and is slow by its scale; it is a residual perceptron of the paper's size, integrated by torchdiffeq
-along a causal Hermite path through means of the samples. So b(t) = beta(t) + C(u(t)).
+C exactly, with every solver and step. Beside the samples the curve sees them through a filter of 0.1 s (ds/dt = (u - s) / tau,
+a state solved exactly), for sensors whose error lags their motion. *g*, the drift, moves the rest bias beta = b - C, the
+turn-on bias that a run starts with, and is slow by its scale; it is a residual perceptron of the paper's size,
+integrated by torchdiffeq along a causal Hermite path through the samples filtered over half a second, so that the
+step of the solver changes neither what it sees nor, but for the step's own error, the answer. So b(t) = beta(t) + C(t).
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from typing import Annotated, ClassVar, Literal, TypeVar
 
 import msgspec
@@ -27,13 +28,17 @@ from torch import Tensor, nn
 from torchdiffeq import odeint, odeint_adjoint
 
 from imutool.bias._base import COLUMNS, SENSORS, BiasModel, Segment, Sensor, Stream, Vector6
+from imutool.bias._neural_stream import Array, Curves, CurveWeights, DriftRate, NeuralStream, perceptron
 from imutool.config import Settings
 from imutool.errors import ConfigError
 from imutool.ode import HermitePath
 
+SLOW_S, DRIFT_SEES_S = 0.1, 0.5  # time constants of what the curve and the drift see
+NEAR_ZERO = 10.0
+NEGLIGIBLE = 1e-15
+
 Positive = Annotated[float, msgspec.Meta(gt=0)]
 Width = Annotated[int, msgspec.Meta(ge=1, le=4096)]
-Array = Float64[np.ndarray, "..."]
 
 
 class Config(Settings, frozen=True):
@@ -53,35 +58,32 @@ class Config(Settings, frozen=True):
 
 
 class Curve(nn.Module):
-    """C(u) = W u + curve (N(u / scale) - N(0)), zero without motion; N a perceptron that starts at zero."""
+    """C(u, s) = W u + curve (N(u, s) - N(0, 0)), zero without motion; N a perceptron that starts at zero.
+
+    N sees its arguments in units of the scale, and once more through asinh(10 x), which resolves what happens near zero.
+    """
 
     def __init__(self, width: int, scale: float, curve: float) -> None:
         super().__init__()
         self.scale, self.curve = scale, curve
         self.W = nn.Parameter(torch.zeros(3, 3))
-        self.net = nn.Sequential(
-            nn.Linear(3, width), nn.GELU(), nn.Linear(width, width), nn.Tanh(), nn.Linear(width, 3, bias=False)
-        )
-        for layer in self.net:
-            if isinstance(layer, nn.Linear):
-                nn.init.normal_(layer.weight, 0.0, layer.in_features**-0.5)
-        nn.init.zeros_(self.net[-1].weight)  # type: ignore[arg-type]  # Sequential is typed to hold any module
+        layers = nn.Linear(9, width), nn.Linear(width, width), nn.Linear(width, 3, bias=False)
+        for layer in layers:
+            nn.init.normal_(layer.weight, 0.0, layer.in_features**-0.5)
+        nn.init.zeros_(layers[2].weight)
+        self.net = nn.Sequential(layers[0], nn.GELU(), layers[1], nn.Tanh(), layers[2])
 
-    def forward(self, u: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
-        """What the motion `u` adds to the bias."""
-        bend: Tensor = self.net(u / self.scale) - self.net(u.new_zeros(3))
+    def forward(self, u: Float[Tensor, "*batch 3"], slow: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
+        """What the motion adds to the bias: `u` the samples, `slow` the filtered ones."""
+        x, s = u / self.scale, slow / self.scale
+        seen = torch.cat([x, torch.asinh(NEAR_ZERO * x), torch.asinh(NEAR_ZERO * s)], dim=-1)
+        bend: Tensor = self.net(seen) - self.net(u.new_zeros(9))
         return u @ self.W.mT + self.curve * bend
 
-    def numpy(self) -> Callable[[Array], Array]:
-        """The same curve in float64 numpy."""
-        W, net = _array(self.W), _numpy(self.net)
-        at_rest = net(np.zeros(3))
-
-        def curve(u: Array) -> Array:
-            c: Array = u @ W.T + self.curve * (net(u / self.scale) - at_rest)
-            return c
-
-        return curve
+    def weights(self) -> CurveWeights:
+        """The same curve for numpy."""
+        first, second, last = (layer for layer in self.net if isinstance(layer, nn.Linear))
+        return CurveWeights(self.W.detach().cpu().double().numpy(), (first, second, last), self.scale, NEAR_ZERO, self.curve)
 
 
 class Drift(nn.Module):
@@ -108,16 +110,15 @@ class Drift(nn.Module):
         y: Tensor = self.rate * self.out(x)
         return y
 
-    def numpy(self) -> Callable[[Array, Array, Array], Array]:
+    def numpy(self) -> DriftRate:
         """The same rate in float64 numpy."""
-        block1, block2, out = _numpy(self.block1), _numpy(self.block2), _numpy(self.out)
-        centre, units = _array(self.centre), _array(self.units)
+        block1, block2, out = perceptron(self.block1), perceptron(self.block2), perceptron(self.out)
+        centre, units = (x.detach().cpu().double().numpy() for x in (self.centre, self.units))
 
         def rate(beta: Array, u: Array, du: Array) -> Array:
             x = np.concatenate([beta - centre, u, du]) / units
             x = x + block1(x)
-            y: Array = self.rate * out(x + block2(x))
-            return y
+            return self.rate * out(x + block2(x))
 
         return rate
 
@@ -159,7 +160,7 @@ class Model(BiasModel):
     def sensor_bias(self, sensor: Sensor, segment: Segment) -> Float[Tensor, "batch n 3"]:
         """beta + C(u) at each sample; beta goes on straight between the drift's steps."""
         u, rest = segment.of(sensor)
-        motion: Float[Tensor, "batch n 3"] = self.curve[sensor](u)
+        motion: Float[Tensor, "batch n 3"] = self.curve[sensor](u, self._filtered(u, SLOW_S))
         if not self.config.drift:
             return rest[:, None] + motion
         return self._rest_path(segment.t, u, rest, self.drift[sensor]) + motion
@@ -178,9 +179,8 @@ class Model(BiasModel):
             return rest[:, None]
         steps = math.ceil((n - 1) / stride)
         whole = (n - 1) // stride
-        means = u[:, 1 : 1 + whole * stride].reshape(len(u), whole, stride, 3).mean(2)
-        means = torch.cat([u[:, :1], means], dim=1)[:, :steps]
-        path = HermitePath(torch.arange(steps + 1, device=u.device), torch.cat([means, means[:, -1:]], dim=1))
+        seen = self._filtered(u, DRIFT_SEES_S)[:, : whole * stride + 1 : stride][:, :steps]
+        path = HermitePath(torch.arange(steps + 1, device=u.device), torch.cat([seen, seen[:, -1:]], dim=1))
         step_s = ((t[:, -1] - t[:, 0]) / (n - 1) * stride)[:, None]
 
         beta = _solve(_OnGrid(drift, path, step_s), rest, steps, self.config.solver, self.config.adjoint)
@@ -188,11 +188,35 @@ class Model(BiasModel):
         j = place.long().clamp(max=steps - 1)
         return torch.lerp(beta[j], beta[j + 1], (place - j)[:, None, None].to(u)).transpose(0, 1)
 
+    def rest_dynamics(self) -> Float64[np.ndarray, "6 6"]:
+        """d g / d beta without motion, at the prior: how fast an error of the start dies, a second."""
+        F = np.zeros((6, 6))
+        if self.config.drift:
+            still = self.prior_mean.new_zeros(1, 3)
+            for sensor in SENSORS:
+                at = COLUMNS[sensor]
+                drift = _part(self.drift, sensor, Drift)
+                by_rest = torch.autograd.functional.jacobian(  # type: ignore[no-untyped-call]  # torch gives it no type
+                    lambda beta, g=drift: g(beta, still, still)[0], self.prior_mean[None, at]
+                )
+                F[at, at] = by_rest[:, 0].detach().cpu().double().numpy()
+        return F
+
+    def _filtered(self, u: Float[Tensor, "b n 3"], tau_s: float) -> Float[Tensor, "b n 3"]:
+        """Samples through dy/dt = (u - y) / tau, from the first on, in log2(n) passes (a scan of the recurrence)."""
+        keep = math.exp(-1.0 / (self.rate_hz * tau_s))
+        y = torch.cat([u[:, :1], (1.0 - keep) * u[:, 1:]], dim=1)
+        shift = 1
+        while shift < u.shape[1] and keep > NEGLIGIBLE:
+            y = torch.cat([y[:, :shift], y[:, shift:] + keep * y[:, :-shift]], dim=1)
+            shift, keep = 2 * shift, keep * keep
+        return y
+
     def stream(self, rest: Vector6) -> Stream:
         """The same in numpy, one Euler step of the drift every `stride` samples."""
-        curves = tuple(_part(self.curve, sensor, Curve).numpy() for sensor in SENSORS)
-        drifts = tuple(_part(self.drift, sensor, Drift).numpy() for sensor in SENSORS) if self.config.drift else None
-        return _Stream(curves, drifts, self.stride, rest)
+        gyro, accel = (_part(self.curve, sensor, Curve).weights() for sensor in SENSORS)
+        drifts = [_part(self.drift, sensor, Drift).numpy() for sensor in SENSORS] if self.config.drift else []
+        return NeuralStream(Curves(gyro, accel), drifts, self.stride, self.rate_hz, (SLOW_S, DRIFT_SEES_S), rest)
 
 
 class _OnGrid(nn.Module):
@@ -214,60 +238,6 @@ def _solve(field: nn.Module, rest: Float[Tensor, "b 3"], steps: int, solver: str
     return solved
 
 
-class _Stream:
-    """Remembers the rest bias, its rate, and the running sum of samples since the last step of the drift."""
-
-    def __init__(
-        self,
-        curves: tuple[Callable[[Array], Array], ...],
-        drifts: tuple[Callable[[Array, Array, Array], Array], ...] | None,
-        stride: int,
-        rest: Vector6,
-    ) -> None:
-        self.curves, self.drifts, self.stride = curves, drifts, stride
-        self.beta, self.rate = rest.astype(np.float64), np.zeros(6)
-        self.mean, self.sum, self.count = np.zeros(6), np.zeros(6), -1  # -1: nothing seen yet
-        self.t_step = 0.0
-
-    def __call__(
-        self, t_s: Float64[np.ndarray, " n"], gyro: Float64[np.ndarray, "n 3"], accel: Float64[np.ndarray, "n 3"]
-    ) -> Float64[np.ndarray, "n 6"]:
-        motion = np.concatenate([self.curves[0](gyro), self.curves[1](accel)], axis=1)
-        if self.drifts is None or not len(t_s):
-            motion += self.beta
-            return motion
-        u, rest, k = np.concatenate([gyro, accel], axis=1), np.empty_like(motion), 0
-        if self.count < 0:
-            self._start(t_s[0], u[0])
-            rest[0], k = self.beta, 1
-        while k < len(t_s):
-            last = min(len(t_s), k + self.stride - self.count)
-            rest[k:last] = self.beta + (t_s[k:last, None] - self.t_step) * self.rate
-            self.sum += u[k:last].sum(axis=0)
-            self.count += last - k
-            if self.count == self.stride:
-                self._step(t_s[last - 1], rest[last - 1])
-            k = last
-        rest += motion
-        return rest
-
-    def _start(self, t: float, u: Array) -> None:
-        self.t_step, self.mean, self.count = t, u, 0
-        self._set_rate(u, np.zeros(6))
-
-    def _step(self, t: float, beta: Array) -> None:
-        mean = self.sum / self.stride
-        du = (mean - self.mean) / max(t - self.t_step, 1e-9)
-        self.t_step, self.beta, self.mean = t, beta.copy(), mean
-        self.sum, self.count = np.zeros(6), 0
-        self._set_rate(mean, du)
-
-    def _set_rate(self, u: Array, du: Array) -> None:
-        assert self.drifts is not None
-        halves = zip(self.drifts, COLUMNS.values(), strict=True)
-        self.rate = np.concatenate([g(self.beta[half], u[half], du[half]) for g, half in halves])
-
-
 P = TypeVar("P", bound=nn.Module)
 
 
@@ -286,31 +256,3 @@ def _perceptron(hidden: tuple[int, ...]) -> nn.Sequential:
         layers += [nn.Linear(before, width), nn.Tanh() if i == len(hidden) - 1 else nn.GELU()]
         before = width
     return nn.Sequential(*layers, nn.Linear(before, 9))
-
-
-def _array(tensor: Tensor) -> Array:
-    out: Array = tensor.detach().cpu().double().numpy()
-    return out
-
-
-def _numpy(module: nn.Module) -> Callable[[Array], Array]:
-    """A perceptron as a numpy function: torch's overhead for one sample is twenty times its arithmetic."""
-    from scipy.special import erf
-
-    steps: list[Callable[[Array], Array]] = []
-    for layer in module if isinstance(module, nn.Sequential) else [module]:
-        if isinstance(layer, nn.Linear):
-            W, b = _array(layer.weight).T.copy(), 0.0 if layer.bias is None else _array(layer.bias)
-            steps.append(lambda x, W=W, b=b: x @ W + b)  # type: ignore[misc]  # the defaults bind this layer
-        elif isinstance(layer, nn.Tanh):
-            steps.append(np.tanh)
-        else:
-            assert isinstance(layer, nn.GELU)
-            steps.append(lambda x: 0.5 * x * (1.0 + erf(x * math.sqrt(0.5))))
-
-    def run(x: Array) -> Array:
-        for step in steps:
-            x = step(x)
-        return x
-
-    return run

@@ -11,7 +11,6 @@ from torch import Tensor
 
 from imutool.bias._base import BiasModel, Segment, Sensor, Stream, Vector6
 from imutool.config import Settings
-from imutool.errors import ConfigError
 
 
 class Config(Settings, frozen=True):
@@ -37,12 +36,7 @@ class Model(BiasModel):
         return rest[:, None].expand_as(u)
 
     def begin_at(self, sensor: Sensor, W: Float[Tensor, "3 3"]) -> None:
-        """Nothing to take over.
-
-        Raises:
-            ConfigError: always; each log gives its own static bias.
-        """
-        raise ConfigError("static is not trained", where="--method", fix="Choose linear or neural_ode")
+        """Nothing to take over: what is left after a calibration, if anything, is not this model's to take off."""
 
     def stream(self, rest: Vector6) -> Stream:
         """The rest bias at every sample."""

@@ -24,6 +24,7 @@ from imutool.errors import DataError, LogError
 IMU = "sensor_msgs/msg/Imu"
 POSE = "geometry_msgs/msg/PoseStamped"
 VECTOR3 = "geometry_msgs/msg/Vector3Stamped"
+TWIST = "geometry_msgs/msg/TwistWithCovarianceStamped"
 TF = "tf2_msgs/msg/TFMessage"
 IMAGE = "sensor_msgs/msg/CompressedImage"
 FLOAT = "std_msgs/msg/Float64"
@@ -43,6 +44,9 @@ _FIELDS = {
     "geometry_msgs/Pose": "geometry_msgs/Point position\ngeometry_msgs/Quaternion orientation\n",
     "geometry_msgs/PoseStamped": "std_msgs/Header header\ngeometry_msgs/Pose pose\n",
     "geometry_msgs/Vector3Stamped": "std_msgs/Header header\ngeometry_msgs/Vector3 vector\n",
+    "geometry_msgs/Twist": "geometry_msgs/Vector3 linear\ngeometry_msgs/Vector3 angular\n",
+    "geometry_msgs/TwistWithCovariance": "geometry_msgs/Twist twist\nfloat64[36] covariance\n",
+    "geometry_msgs/TwistWithCovarianceStamped": "std_msgs/Header header\ngeometry_msgs/TwistWithCovariance twist\n",
     "geometry_msgs/Transform": "geometry_msgs/Vector3 translation\ngeometry_msgs/Quaternion rotation\n",
     "geometry_msgs/TransformStamped": ("std_msgs/Header header\nstring child_frame_id\ngeometry_msgs/Transform transform\n"),
     "tf2_msgs/TFMessage": "geometry_msgs/TransformStamped[] transforms\n",
@@ -60,6 +64,7 @@ TYPE_HASHES = {
     IMU: "RIHS01_7d9a00ff131080897a5ec7e26e315954b8eae3353c3f995c55faf71574000b5b",
     POSE: "RIHS01_10f3786d7d40fd2b54367835614bff85d4ad3b5dab62bf8bca0cc232d73b4cd8",
     VECTOR3: "RIHS01_d4829622288cbb443886e7ea94ea5671a3b1be6bab4ad04224432a65f7d7887a",
+    TWIST: "RIHS01_77b67434531e6529b7a0091357b186b6ebdb17fd9ffd3e0c7ce9d3fb11a44563",
     TF: "RIHS01_e369d0f05a23ae52508854b66f6aa0437f3449d652e8cbf22d5abe85d020f087",
     IMAGE: "RIHS01_15640771531571185e2efc8a100baf923961a4d15d5569652e6cb6691e8e371a",
     FLOAT: "RIHS01_705ba9c3d1a09df43737eb67095534de36fd426c0587779bda2bc51fe790182a",
@@ -93,6 +98,7 @@ _SHAPES: dict[str, tuple[str | int, ...]] = {
     IMU: ("header", 37),
     POSE: ("header", 7),
     VECTOR3: ("header", 3),
+    TWIST: ("header", 6 + 36),
     TF: ("count", "header", "text", 7),
     FLOAT: (1,),
     ODOMETRY: ("header", "text", 7 + 36 + 6 + 36),
@@ -439,6 +445,27 @@ def encode_vector3(
     rows = _blank(len(stamp_ns), layout)
     _put_stamp(rows, layout, stamp_ns)
     _numbers_of(rows, layout)[:] = vector
+    return rows
+
+
+def encode_twist(
+    stamp_ns: Int64[np.ndarray, " n"],
+    angular: Float64[np.ndarray, "n 3"],
+    linear: Float64[np.ndarray, "n 3"],
+    covariance: Float64[np.ndarray, "n 6 6"],
+    frame_id: str,
+) -> UInt8[np.ndarray, "n L"]:
+    """One TwistWithCovarianceStamped message per row; `covariance` is of angular then linear, in messages the other way round.
+
+    Raises:
+        DataError: a stamp beyond the 32-bit seconds of ROS 2.
+    """
+    layout = _layout(TWIST, "cdr", texts=[frame_id])
+    rows = _blank(len(stamp_ns), layout)
+    _put_stamp(rows, layout, stamp_ns)
+    numbers = _numbers_of(rows, layout)
+    numbers[:, :3], numbers[:, 3:6] = linear, angular
+    numbers[:, 6:] = np.roll(covariance, (3, 3), axis=(1, 2)).reshape(len(stamp_ns), 36)
     return rows
 
 

@@ -32,7 +32,7 @@ def save(training: Training, path: Path) -> None:
         about["stage"] = {"sensor": stage.sensor, "step": stage.step, "best": stage.best}
         tensors |= {f"best.{name}": value for name, value in stage.best_state.items()}
         tensors |= {f"mean.{name}": value for name, value in stage.mean.state_dict().items()}
-        tensors |= {f"usual.{n}": value for n, value in stage.loss.medians.items()}
+        tensors |= {f"usual.{n}": value for n, value in stage.objective.loss.medians.items()}
         for index, state in stage.optimizer.state_dict()["state"].items():
             tensors |= {f"optimizer.{index}.{name}": value for name, value in state.items()}
     # clones: safetensors refuses tensors that share memory, as a model and its best state may
@@ -76,7 +76,7 @@ def _stage(training: Training, about: dict[str, Any], tensors: dict[str, Tensor]
         state.setdefault(int(index), {})[key] = value
     groups = stage.optimizer.state_dict()["param_groups"]
     stage.optimizer.load_state_dict({"state": state, "param_groups": groups})
-    stage.loss = RobustLoss({int(n): value for n, value in _part(tensors, "usual.").items()})
+    stage.objective.loss = RobustLoss({int(n): value for n, value in _part(tensors, "usual.").items()})
     stage.step, stage.best, stage.best_state = int(about["step"]), float(about["best"]), _part(tensors, "best.")
     return stage
 

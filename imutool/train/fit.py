@@ -1,9 +1,10 @@
 """The training: a closed form to start from, then gradient descent, gyro first and the accelerometer on top of it.
 
-Every step draws windows of several lengths from all logs at once. Beside the sensor's weights each log has a track of its
-own rest bias, free but slow, so that what belongs to a run cannot be mistaken for what belongs to the sensor. The model
-kept is the one that drifts least over the longest windows of the held-out part, the closed form it started from included.
-What is judged and kept is a running mean over the last steps, which one step's draw of windows cannot throw off.
+What a step descends on is the objective's to say (`imutool.train.objective`), and it mixes all logs. Beside the sensor's
+weights each log has a track of its own rest bias, free but slow, so that what belongs to a run cannot be mistaken for what
+belongs to the sensor. The model kept is the one that drifts least over the longest windows of the held-out part, the closed
+form it started from included. What is judged and kept is a running mean over the last steps, which one step's draw of windows
+cannot throw off.
 """
 
 from __future__ import annotations
@@ -13,50 +14,35 @@ import math
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
-from typing import Annotated, Any
 
-import msgspec
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Int
 from torch import Tensor
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
 from imutool import registry
 from imutool.bias._base import COLUMNS, SENSORS, BiasModel, Sensor
-from imutool.config import Settings, build
+from imutool.config import build
 from imutool.errors import ConfigError, DataError, NumericsError
 from imutool.recording import Recording
 from imutool.train import closed_form, statistics
-from imutool.train.closed_form import median_per_log
-from imutool.train.loss import RobustLoss, error
+from imutool.train.corrected import corrected, up_to
+from imutool.train.increments import Increments
+from imutool.train.loss import error
+from imutool.train.objective import Objective, WindowEnds
 from imutool.train.segments import Pool
+from imutool.train.settings import TrainSettings, settings_for
 from imutool.train.tracks import Tracks
 
-Positive = Annotated[float, msgspec.Meta(gt=0)]
-Count = Annotated[int, msgspec.Meta(ge=1)]
+__all__ = ["Epoch", "Stage", "TrainSettings", "Training"]
 
+OBJECTIVES: dict[str, type[Objective]] = {"window_ends": WindowEnds, "increments": Increments}
 LONGEST_HELD_OUT_S = {"gyro": 20.0, "accel": 5.0}
 HELD_OUT_HOP_S = 1.0
-USUAL_SAMPLES = 200_000  # enough for a median
 WARM_UP_STEPS = 20
 AVERAGE_STEPS = 30  # over which weights are averaged
+SEED_STRIDE = 1_000_003  # between the seeds of two steps
 TRIM = 0.9  # the worst tenth of the held-out windows is where the truth has outliers
-
-
-class TrainSettings(Settings, frozen=True):
-    """How to train; `model` holds the settings of the method (`imutool/bias/METHOD.py`, class Config)."""
-
-    seed: int = 0
-    gyro_window_s: tuple[Positive, ...] = (1.0, 4.0, 15.0)
-    accel_window_s: tuple[Positive, ...] = (0.5, 2.0)
-    samples: Count = 8_000
-    steps: Count = 300
-    gyro_rate: Positive = 1e-2  # learning rates
-    accel_rate: Positive = 3e-3
-    weight_decay: Annotated[float, msgspec.Meta(ge=0)] = 1e-4
-    track_knot_s: Positive = 20.0
-    validate_every: Count = 30
-    model: dict[str, Any] = msgspec.field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -70,6 +56,7 @@ class Epoch:
     held_out: float
     best: float
     left_s: float
+    note: str = ""  # what is being done instead, where there are no steps to count
 
 
 @dataclass
@@ -79,7 +66,7 @@ class Stage:
     sensor: Sensor
     optimizer: torch.optim.Optimizer
     mean: AveragedModel  # of the model
-    loss: RobustLoss
+    objective: Objective
     step: int = 0
     best: float = float("inf")
     best_state: dict[str, Tensor] = field(default_factory=dict)
@@ -90,13 +77,13 @@ class Training:
 
     Raises:
         DataError: recordings without truth, of different rates, too short, or standing still.
-        ConfigError: a method that is not trained, or settings it does not know.
+        ConfigError: a method that is not trained, settings it does not know, or settings with another method's defaults.
     """
 
     def __init__(
         self, recordings: Sequence[Recording], method: str, settings: TrainSettings | None = None, device: str = "cpu"
     ) -> None:
-        self.settings = settings or TrainSettings()
+        self.settings = settings_for(method, settings)
         if device.startswith("cuda") and not torch.cuda.is_available():
             raise ConfigError("no CUDA device here", where="--device", fix="Use --device cpu")
         module = registry.load("imutool.bias", method)
@@ -104,6 +91,8 @@ class Training:
         torch.manual_seed(self.settings.seed)
         config = build(module.Config, self.settings.model, where=f"model settings of {method}")
         self.model: BiasModel = module.Model(config, self.pool.rate_hz).double().to(device)
+        learnt = ~self.pool.held_out
+        self.model.see(self.pool.gyro[learnt], self.pool.accel[learnt])
         self.tracks = Tracks(self.pool, self.settings.track_knot_s)
         self.generator = torch.Generator().manual_seed(self.settings.seed)
         self.done: dict[Sensor, float] = {}  # held-out error of each finished stage
@@ -119,10 +108,12 @@ class Training:
                 self.stage = self.begin(sensor)
             yield from self._descend(self.stage)
             self.model.load_state_dict(self.stage.best_state)
+            self.stage.objective.settle()
             self.done[sensor], self.stage = self.stage.best, None
         lengths: dict[Sensor, tuple[float, ...]] = {sensor: self._window_s(sensor) for sensor in SENSORS}
+        self.model.eval()
         statistics.store(self.model, self.pool, self.tracks.per_log().detach(), lengths)
-        self.model.requires_grad_(False).eval()
+        self.model.requires_grad_(False)
 
     def held_out(self, sensor: Sensor, model: BiasModel) -> float:
         """Error over the longest windows that fit the held-out parts: the mean without the worst tenth (rad or m/s).
@@ -132,11 +123,13 @@ class Training:
         first, n = self._held_out_windows(sensor)
         rest, lengths = self.tracks.per_log().detach(), self._window_s(sensor)[:2]
         columns = COLUMNS[sensor]
-        solved = closed_form.solve(model, sensor, self.pool, rest, lengths, matrix=False, part="held_out")
+        rest[:, columns] = model.rest_at_work(sensor, rest[:, columns])
+        scored, pool = corrected(model, self.pool, "held_out", up_to(sensor))
+        solved = closed_form.solve(scored, sensor, pool, rest, lengths, matrix=False, part="held_out")
         rest[:, columns] = solved.rest
         with torch.no_grad():
             parts = torch.split(first, 64)
-            errors = torch.cat([error(model, sensor, self.pool.windows(f, n, rest[self.pool.log[f]])) for f in parts])
+            errors = torch.cat([error(scored, sensor, pool.windows(f, n, rest[pool.log[f]])) for f in parts])
         kept = errors.sort().values[: max(1, int(TRIM * len(errors)))]
         return float(kept.mean())
 
@@ -156,14 +149,11 @@ class Training:
             fix="Leave that log out or cut it",
         )
 
-    def _errors(self, sensor: Sensor, first: Int[Tensor, " m"], n: int) -> Float[Tensor, " m"]:
-        rest = self.tracks.at(self.pool.log[first], self.pool.t[first])
-        return error(self.model, sensor, self.pool.windows(first, n, rest))
-
     def _closed_form(self, sensor: Sensor) -> None:
         """Calibration and rest biases, as far as windows and a matrix show them."""
         rest = self.tracks.per_log().detach()
-        self._take(sensor, closed_form.solve(self.model, sensor, self.pool, rest, self._window_s(sensor), matrix=True))
+        scored, pool = corrected(self.model.eval(), self.pool, "train", up_to(sensor))
+        self._take(sensor, closed_form.solve(scored, sensor, pool, rest, self._window_s(sensor), matrix=True))
 
     def _window_s(self, sensor: Sensor) -> tuple[float, ...]:
         return self.settings.gyro_window_s if sensor == "gyro" else self.settings.accel_window_s
@@ -175,26 +165,17 @@ class Training:
     def begin(self, sensor: Sensor) -> Stage:
         """A fresh stage, from where model and tracks stand: it moves the sensor's weights and the tracks."""
         rate, decay = self._rate(sensor), self.settings.weight_decay
-        weights = [w for name, w in self.model.named_parameters() if f".{sensor}" in f".{name}"]
+        weights = {name: w for name, w in self.model.named_parameters() if f".{sensor}" in f".{name}"}
+        free = [w for name, w in weights.items() if name.startswith(self.model.undecayed)]
         groups = [
-            {"params": weights, "weight_decay": decay},
-            {"params": [self.tracks.knots], "weight_decay": 0.0},
+            {"params": [w for name, w in weights.items() if not name.startswith(self.model.undecayed)], "weight_decay": decay},
+            {"params": [*free, self.tracks.knots], "weight_decay": 0.0},
         ]
         average = get_ema_multi_avg_fn(1 - 1 / AVERAGE_STEPS)  # type: ignore[no-untyped-call]  # torch gives it no type
-        usual = RobustLoss({n: self._usual_errors(sensor, first, n) for n, first in self._pools(sensor)})
-        return Stage(sensor, torch.optim.AdamW(groups, lr=rate), AveragedModel(self.model, multi_avg_fn=average), usual)
-
-    def _pools(self, sensor: Sensor) -> list[tuple[int, Int[Tensor, " _"]]]:
-        """Steps of each window length, and the first samples of its windows in the training part."""
-        lengths = map(self.pool.samples, self._window_s(sensor))
-        return [(n, first) for n in lengths if len(first := self.pool.starts(n, "train"))]
-
-    @torch.no_grad()
-    def _usual_errors(self, sensor: Sensor, first: Int[Tensor, " m"], n: int) -> Float[Tensor, " logs"]:
-        """The median error of each log's windows; of a log that has none of this length, that of all."""
-        some = first[:: max(1, -(-len(first) * n // USUAL_SAMPLES))]
-        size = torch.cat([self._errors(sensor, part, n) for part in torch.split(some, 64)])
-        return median_per_log(size, self.pool.log[some], len(self.pool.names))
+        # with its buffers: the running statistics of a batch norm belong to the weights they were seen with
+        mean = AveragedModel(self.model.eval(), multi_avg_fn=average, use_buffers=True)
+        objective = OBJECTIVES[self.model.objective](self.model, sensor, self.pool, self.tracks, self.settings)
+        return Stage(sensor, torch.optim.AdamW(groups, lr=rate), mean, objective)
 
     def _rate(self, sensor: Sensor) -> float:
         return self.settings.gyro_rate if sensor == "gyro" else self.settings.accel_rate
@@ -202,7 +183,6 @@ class Training:
     def _descend(self, stage: Stage) -> Iterator[Epoch]:
         settings, sensor = self.settings, stage.sensor
         steps = settings.steps if self.model.iterative else 0
-        pools = self._pools(sensor)
         began, begun_at = time.monotonic(), stage.step
         loss = float("nan")
         while True:
@@ -212,20 +192,18 @@ class Training:
                 yield Epoch(sensor, stage.step, steps, loss, score, stage.best, per_step * (steps - stage.step))
             if stage.step >= steps:
                 return
-            loss = self._one_step(stage, pools, steps)
+            loss = self._one_step(stage, steps)
 
-    def _one_step(self, stage: Stage, pools: Sequence[tuple[int, Int[Tensor, " _"]]], steps: int) -> float:
+    def _one_step(self, stage: Stage, steps: int) -> float:
         warm, cool = min(1.0, (stage.step + 1) / WARM_UP_STEPS), 0.5 * (1 + math.cos(math.pi * stage.step / steps))
         rate = self._rate(stage.sensor) * warm * cool
         for group in stage.optimizer.param_groups:
             group["lr"] = rate
+        self._set_training(stage)
         # the losses are means over windows; a second of data counts once against the walk
         total = self.tracks.wandering(stage.sensor) / (len(self.pool.t) / self.pool.rate_hz)
-        for n, first in pools:
-            count = max(4, self.settings.samples // n)
-            chosen = torch.randint(len(first), (count,), generator=self.generator).to(first.device)
-            size = self._errors(stage.sensor, first[chosen], n)
-            total = total + stage.loss(size, self.pool.log[first[chosen]], n)
+        for term in stage.objective.terms(self.generator):
+            total = total + term
         stage.optimizer.zero_grad()
         total.backward()  # type: ignore[no-untyped-call]
         if not bool(torch.isfinite(total)):
@@ -239,9 +217,20 @@ class Training:
         stage.step += 1
         return float(total.detach())
 
+    def _set_training(self, stage: Stage) -> None:
+        """Puts the parts of the stage's sensor, and no others, where batch norm and dropout do what they do in training.
+
+        What they draw follows from seed and step, so that a training taken up again goes on as if it had not been left.
+        """
+        self.model.eval()
+        for name, module in self.model.named_modules():
+            module.training = f".{stage.sensor}" in f".{name}"
+        torch.manual_seed((self.settings.seed + SEED_STRIDE * (stage.step + 1)) % 2**63)
+
     def _validate(self, stage: Stage) -> float:
         model = stage.mean.module
         assert isinstance(model, BiasModel)
+        model.eval()
         score = self.held_out(stage.sensor, model)
         if not (stage.best_state or math.isfinite(score)):
             raise NumericsError(

@@ -26,7 +26,7 @@ def orientation_error(model: BiasModel, windows: Windows) -> Float[Tensor, " bat
     """|Log(R_hat^T R)| at the end of each window, in rad (paper, eq. 16, at the last sample)."""
     gyro = windows.segment.gyro - model.sensor_bias("gyro", windows.segment)
     R_hat = end_attitude(windows.R_start, gyro, windows.dt)
-    return _length(so3.log(R_hat.mT @ windows.R_end))
+    return length(so3.log(R_hat.mT @ windows.R_end))
 
 
 def motion_error(model: BiasModel, windows: Windows) -> Float[Tensor, " batch"]:
@@ -44,7 +44,7 @@ def motion_error(model: BiasModel, windows: Windows) -> Float[Tensor, " batch"]:
     risen = torch.cat([torch.zeros_like(rise[:, :1]), rise], dim=1)
     moved = (windows.v_start[:, None] + between(risen)) * dt
     position = (windows.p_start + moved.sum(1) - windows.p_end) / windows.dt.sum(1, keepdim=True)
-    return _length(torch.cat([velocity, position], dim=1))
+    return length(torch.cat([velocity, position], dim=1))
 
 
 def error(model: BiasModel, sensor: Sensor, windows: Windows) -> Float[Tensor, " batch"]:
@@ -66,6 +66,6 @@ class RobustLoss:
         return huber(size, HUBER_MEDIANS * self.medians[n][log]).mean()
 
 
-def _length(v: Float[Tensor, "batch k"]) -> Float[Tensor, " batch"]:
+def length(v: Float[Tensor, "*batch k"]) -> Float[Tensor, "*batch"]:
     """Euclidean length with a finite gradient at zero."""
-    return (v.square().sum(dim=1) + 1e-24).sqrt()
+    return (v.square().sum(dim=-1) + 1e-24).sqrt()

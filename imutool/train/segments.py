@@ -114,6 +114,16 @@ class Pool:
             keep &= holes[last] == holes[first]
         return first[keep]
 
+    def around(self, first: Int[Tensor, " batch"], before: int, after: int) -> Int[Tensor, "batch _"]:
+        """Indices from `before` samples before some samples to `after` samples after them.
+
+        They stay in the log of the first: before its beginning its first sample repeats, after its end its last.
+        """
+        log = self.log[first]
+        begin, end = torch.searchsorted(self.log, log), torch.searchsorted(self.log, log, right=True) - 1
+        index = first[:, None] + torch.arange(-before, after + 1, device=first.device)
+        return torch.minimum(torch.maximum(index, begin[:, None]), end[:, None])
+
     def windows(self, first: Int[Tensor, " batch"], n: int, rest: Float[Tensor, "batch 6"]) -> Windows:
         """The windows of n steps that start at some samples, each from its own rest bias."""
         index = first[:, None] + torch.arange(n + 1, device=first.device)

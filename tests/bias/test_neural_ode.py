@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,7 +13,8 @@ from torch import Tensor, nn
 
 from imutool import so3
 from imutool.bias._base import COLUMNS, BiasModel, Segment, Sensor
-from imutool.bias.neural_ode import Config, Curve, Drift, Model
+from imutool.bias._neural_stream import Curves
+from imutool.bias.neural_ode import DRIFT_SEES_S, SLOW_S, Config, Curve, Drift, Model
 from imutool.ode import HermitePath, integrate
 from imutool.physics.flight import flight
 from imutool.recording import seconds
@@ -20,10 +22,10 @@ from imutool.windows import attitudes
 
 RATE_HZ = 200.0
 SECONDS = 20.0
-# Euler holds its rate for a step, and what it looks at is the mean over the step before: both late by half a step, so the
-# path moves in proportion to the step. In flight, whose motion changes within a third of a second, that is an eighth of
-# the drift's own size at the usual quarter second; the drift is there to take away a hundredth of a bias.
-SHARE = 0.15
+# Euler holds its rate for a step and is late by half of it, so the path moves in proportion to the step. The drift sees the
+# samples through a filter of half a second whatever the step; in flight, whose motion changes within a third of one, a quarter
+# second is then good to a twentieth of the drift's own size, and the drift is there to take away a hundredth of a bias.
+SHARE = 0.06  # between a step and its half; to no step at all it is twice as far
 ORDER = 0.3  # design.md: measured order of convergence within 0.3 of theory
 LEAST = {"gyro": 1e-3, "accel": 1e-2}  # rad/s, m/s²: the drift over 20 s with these weights, else there is nothing to compare
 MakeModel, MakeSegment = Callable[..., BiasModel], Callable[..., Segment]
@@ -45,8 +47,9 @@ def rest_path(model: BiasModel, seen: Segment) -> dict[str, Tensor]:
     out = {}
     for sensor in ("gyro", "accel"):
         u, rest = seen.of(sensor)
-        curve = model.curve[sensor]  # type: ignore[index]
-        out[sensor] = model.sensor_bias(sensor, seen) - curve(u) - rest[:, None]
+        assert isinstance(model, Model)
+        motion = model.curve[sensor](u, model._filtered(u, SLOW_S))
+        out[sensor] = model.sensor_bias(sensor, seen) - motion - rest[:, None]
     return out
 
 
@@ -89,9 +92,9 @@ def test_with_another_solver_the_drift_is_the_same(build: MakeModel, seen: Segme
     rk4, dopri5 = (rest_path(lively(build, solver=solver), seen) for solver in ("rk4", "dopri5"))
     for sensor in LEAST:
         size = largest(reference[sensor])
-        assert largest(rk4[sensor] - reference[sensor]) < SHARE * size, sensor
-        assert largest(dopri5[sensor] - reference[sensor]) < SHARE * size, sensor
-        assert largest(rk4[sensor] - dopri5[sensor]) < 0.03 * size, sensor
+        assert largest(rk4[sensor] - reference[sensor]) < 2 * SHARE * size, sensor
+        assert largest(dopri5[sensor] - reference[sensor]) < 2 * SHARE * size, sensor
+        assert largest(rk4[sensor] - dopri5[sensor]) < 0.01 * size, sensor
 
 
 def test_the_curve_needs_no_solver(build: MakeModel, seen: Segment) -> None:
@@ -136,12 +139,12 @@ def test_the_curve_of_no_motion_is_exactly_zero(scale: float) -> None:
     with torch.no_grad():
         for value in curve.parameters():
             value.add_(scale * torch.randn(value.shape, dtype=value.dtype))
-        assert torch.equal(curve(torch.zeros(3, dtype=torch.float64)), torch.zeros(3, dtype=torch.float64))
-        assert not curve.numpy()(np.zeros(3)).any()
-        for shape in ((1, 3), (7, 3), (5, 11, 3), (1000, 3)):  # a matrix product sums in another order: one rounding of N(0)
-            left = max(
-                curve(torch.zeros(shape, dtype=torch.float64)).abs().max().item(), np.abs(curve.numpy()(np.zeros(shape))).max()
-            )
+        still = torch.zeros(3, dtype=torch.float64)
+        assert torch.equal(curve(still, still), still)
+        at_work = Curves(curve.weights(), curve.weights())
+        for n in (1, 7, 63, 64, 65, 1000):  # a matrix product sums in another order: one rounding of N(0)
+            zeros = torch.zeros(n, 3, dtype=torch.float64)
+            left = max(curve(zeros, zeros).abs().max().item(), np.abs(at_work(np.zeros((n, 6)), np.zeros((n, 6)))).max())
             assert left <= curve.curve * 64 * 1e-16 * (1.0 + scale)
 
 
@@ -183,9 +186,10 @@ def test_the_stream_goes_by_real_stamps(build: MakeModel, segment: MakeSegment) 
 
 
 class Joint(nn.Module):
-    """dR/dt = R [gyro - b]x, db/dt = (dC/du) du/dt + g(b - C(u), u_mean, du_mean/dt): the paper's eq. 10 and 15 as they stand.
+    """dR/dt = R [gyro - b]x, db/dt = dC/dt + g(b - C(u, s), v, dv/dt): the paper's eq. 10 and 15 as they stand.
 
-    The samples are a causal Hermite path, their means (what the slow part looks at) another, whose time is the grid's index.
+    dC/dt = (dC/du) du/dt + (dC/ds) ds/dt. The samples u and what the curve's filter makes of them, s, are causal Hermite paths;
+    what the drift's filter makes of them, v, is another, through the grid's knots, whose time is the grid's index.
     """
 
     def __init__(self, model: Model, t: Tensor, gyro: Tensor) -> None:
@@ -194,16 +198,17 @@ class Joint(nn.Module):
         assert isinstance(curve, Curve)
         assert isinstance(drift, Drift)
         self.curve, self.drift, self.samples = curve, drift, HermitePath(t, gyro)
-        stride, whole = model.stride, (len(t) - 1) // model.stride
-        means = gyro[1 : 1 + whole * stride].reshape(whole, stride, 3).mean(1)
-        self.step_s = float(t[stride] - t[0])
-        self.means = HermitePath(torch.arange(whole + 1), torch.cat([gyro[:1], means]))
+        self.slow = HermitePath(t, model._filtered(gyro[None], SLOW_S)[0])
+        seen = model._filtered(gyro[None], DRIFT_SEES_S)[0, :: model.stride]
+        self.step_s = float(t[model.stride] - t[0])
+        self.seen = HermitePath(torch.arange(len(seen)), seen)
 
     def forward(self, t: Tensor, R_wb: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:
         u, du = self.samples.value(t), self.samples.derivative(t)
-        motion, rise = torch.autograd.functional.jvp(self.curve, u, du)  # rise = dC/du du/dt
+        s, ds = self.slow.value(t), self.slow.derivative(t)
+        motion, rise = torch.autograd.functional.jvp(self.curve, (u, s), (du, ds))  # rise = dC/dt
         index = t / self.step_s
-        slow = self.drift((b - motion)[None], self.means.value(index)[None], self.means.derivative(index)[None] / self.step_s)
+        slow = self.drift((b - motion)[None], self.seen.value(index)[None], self.seen.derivative(index)[None] / self.step_s)
         return u - b, rise + slow[0]
 
 
@@ -220,19 +225,24 @@ def at_a_high_rate(n: int, **settings: object) -> tuple[Model, Tensor, Tensor]:
 
 
 HIGH_RATE_HZ = 1000.0
+TIGHT: dict[str, Any] = {
+    "method": "dopri5",
+    "rtol": 1e-9,
+    "atol": 1e-12,
+}  # the curve bends within a sample, where a rate is zero
 # The fast path leaves out |d²omega/dt²| dt² / 12, and as much again for the axis that turns: 50 * 1e-6 / 6 per second.
 FAST_PATH_RAD_S = 1e-5
 
 
 def test_without_drift_the_joint_equation_and_the_fast_path_are_one(build: MakeModel) -> None:
-    n = 201
+    n = 101
     model, t, gyro = at_a_high_rate(n, drift_step_s=0.02, drift=False)
     curve, drift = model.curve["gyro"], model.drift["gyro"]
     assert isinstance(curve, Curve)
     assert isinstance(drift, Drift)
     drift.rate = 0.0
     R_0 = torch.eye(3, dtype=torch.float64)
-    R_joint, b_joint = integrate(Joint(model, t, gyro), curve(gyro[0]), t, R_0, method="dopri5")
+    R_joint, b_joint = integrate(Joint(model, t, gyro), curve(gyro[0], gyro[0]), t, R_0, **TIGHT)
     bias = torch.from_numpy(model.stream(np.zeros(6))(t.numpy(), gyro.numpy(), np.zeros((n, 3)))[:, :3])
     torch.testing.assert_close(b_joint, bias, rtol=0, atol=1e-9)  # the total derivative of C integrates to C
     R_split = attitudes(R_0[None], (gyro - bias)[None], torch.diff(t)[None])[0]
@@ -243,27 +253,29 @@ def test_the_papers_joint_equation_and_the_split_form_are_one_flow(build: MakeMo
     """dopri5 on (R, b) together, on the Hermite path of the samples, against the split form at the knots of its drift.
 
     With rk4 for the drift the two solve the same equation and agree to a thousandth of what the drift does; the stream's
-    Euler rule agrees to its own discretisation (`SHARE`).
+    Euler rule is late by no more than two steps: it holds its rate for one, and du/dt is that of the one before.
     """
-    n, rest = 301, np.array([0.02, -0.01, 0.03, 0.0, 0.0, 0.0])
+    n, rest = 161, np.array([0.02, -0.01, 0.03, 0.0, 0.0, 0.0])
     model, t, gyro = at_a_high_rate(n, drift_step_s=0.02, solver="rk4")
     curve, drift = model.curve["gyro"], model.drift["gyro"]
     assert isinstance(curve, Curve)
     assert isinstance(drift, Drift)
-    drift.rate = 1e-2  # 0.3 s of it must be seen
+    drift.rate = 0.1  # 0.16 s of it must be seen
     R_0, beta_0 = torch.eye(3, dtype=torch.float64), torch.from_numpy(rest[:3])
-    R_joint, b_joint = integrate(Joint(model, t, gyro), beta_0 + curve(gyro[0]), t, R_0, method="dopri5")
+    R_joint, b_joint = integrate(Joint(model, t, gyro), beta_0 + curve(gyro[0], gyro[0]), t, R_0, **TIGHT)
 
     segment = Segment(t[None], gyro[None], torch.zeros(1, n, 3, dtype=torch.float64), torch.from_numpy(rest)[None])
     split = model.sensor_bias("gyro", segment)[0]
-    drifted = float((split - curve(gyro) - beta_0).norm(dim=1).max())
+    motion = curve(gyro, model._filtered(gyro[None], SLOW_S)[0])
+    drifted = float((split - motion - beta_0).norm(dim=1).max())
     assert drifted > 1e-3, "the drift must be part of the comparison"
-    knots = slice(None, -model.stride, model.stride)  # in its last step the split form does not know the next mean
+    knots = slice(None, -model.stride, model.stride)  # in its last step the split form does not know the next knot
     assert (b_joint - split)[knots].norm(dim=1).max() < 1e-3 * drifted
 
     streamed = torch.from_numpy(model.stream(rest)(t.numpy(), gyro.numpy(), np.zeros((n, 3)))[:, :3])
     apart = float((b_joint - streamed).norm(dim=1).max())
-    assert apart < SHARE * drifted
+    fastest = float(torch.diff(split - motion, dim=0).norm(dim=1).max()) * HIGH_RATE_HZ
+    assert apart < 2 * fastest * model.config.drift_step_s
     R_stream = attitudes(R_0[None], (gyro - streamed)[None], torch.diff(t)[None])[0]
     turned = so3.log(R_joint.mT @ R_stream).norm(dim=1).max()
     assert turned < (FAST_PATH_RAD_S + apart) * float(t[-1])

@@ -1,1 +1,1 @@
-"""The catalogue of effects: one file an effect."""
+"""Effects an ideal IMU leaves out, one file each; the file's name is the key (`effect(sensor) -> Effect`, `SENSORS`)."""

@@ -1,0 +1,287 @@
+"""A convolutional correction: dilated causal convolutions over two and a half seconds of samples, beside a matrix.
+
+Brossard, Bonnabel and Barrau correct a gyro by omega_hat = C omega + net(last samples of gyro and accel); here, as a bias::
+
+    b_k = rest + (I - C) u_k - (N(x_{k-510..k}) - N(0))
+
+with x all six measured channels in units of their spread in the training data. N is four convolutions of kernel 7 and
+dilations 1, 4, 16, 64, each with batch norm, GELU and dropout, and a linear layer. The accelerometer has a network of its own
+of the same form, on the same six channels. N(0), the answer to no rate and no force for all time, is taken off so that a
+model adds nothing to the rest bias where there is no motion; being a constant, it goes into the rest bias of every run.
+
+Before the first sample of a segment or log that sample is taken to have stood for ever (replicate padding, as in the original).
+Samples are counted, not timed: a gap between them goes unnoticed, and a model belongs to one rate.
+
+In training the network computes in float32 (three times as fast; its weights stay float64), at work in float64 with the batch
+norm folded into the convolutions. The original is for the gyro alone and has no rest bias a run; it starts C at the identity,
+where this starts from the closed form unless told otherwise (`start`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from types import MappingProxyType
+from typing import Annotated, Any, ClassVar, Literal, NamedTuple
+
+import msgspec
+import numpy as np
+import torch
+from jaxtyping import Float, Float64
+from torch import Tensor, nn
+from torch.nn import functional
+
+from imutool.bias._base import COLUMNS, SENSORS, BiasModel, Segment, Sensor, Stream, Vector6
+from imutool.config import Settings
+from imutool.errors import ConfigError
+
+Positive = Annotated[float, msgspec.Meta(gt=0)]
+Channels = Annotated[tuple[Annotated[int, msgspec.Meta(ge=1, le=512)], ...], msgspec.Meta(min_length=1, max_length=8)]
+Dilations = Annotated[tuple[Annotated[int, msgspec.Meta(ge=1, le=1024)], ...], msgspec.Meta(min_length=1, max_length=8)]
+Array = Float64[np.ndarray, "..."]
+
+EPSILON = 1e-5  # under a variance's root, and the momentum of its running mean: batch norm's usual figures
+MOMENTUM = 0.1
+LEAST_SCALE = (1e-2, 1e-2, 1e-2, 1e-1, 1e-1, 1e-1)  # rad/s, m/s²: a channel that never moved is not blown up
+BLOCK = 2048  # samples a stream convolves at once, so that its memory does not grow with what it is given
+
+
+class Config(Settings, frozen=True):
+    """Sizes, and where a unit of the networks' output lies; channels and dilations one a layer, dilations in samples."""
+
+    channels: Channels = (16, 32, 64, 128)
+    dilations: Dilations = (1, 4, 16, 64)
+    kernel: Annotated[int, msgspec.Meta(ge=1, le=16)] = 7
+    dropout: Annotated[float, msgspec.Meta(ge=0, lt=1)] = 0.1
+    start: Literal["closed_form", "identity"] = "closed_form"  # of C
+    gyro_unit_rad_s: Positive = 0.02
+    accel_unit_m_s2: Positive = 0.2
+
+
+class Folded(NamedTuple):
+    """A layer at work, on deviations from what it gives without motion: y = GELU(weight * x + there) - GELU(there)."""
+
+    weight: Float[Tensor, "after before kernel"]
+    there: Float[Tensor, " after"]
+    dilation: int
+
+
+class Layer(nn.Module):
+    """Convolution, batch norm, GELU, dropout; the convolution has no constant, the batch norm brings one."""
+
+    def __init__(self, before: int, after: int, kernel: int, dilation: int, dropout: float) -> None:
+        super().__init__()
+        self.dilation, self.dropout, self.reach = dilation, dropout, (kernel - 1) * dilation
+        self.weight = nn.Parameter(torch.empty(after, before, kernel))
+        nn.init.normal_(self.weight, 0.0, (before * kernel) ** -0.5)
+        self.gain, self.shift = nn.Parameter(torch.ones(after)), nn.Parameter(torch.zeros(after))
+        self.mean: Tensor
+        self.var: Tensor
+        self.register_buffer("mean", torch.zeros(after))
+        self.register_buffer("var", torch.ones(after))
+
+    def forward(self, x: Float[Tensor, "batch before n"]) -> Float[Tensor, "batch after n"]:
+        """The layer as it is in training, in the precision of what it is given, or unfolded."""
+        y = functional.conv1d(causal(x, self.reach), self.weight.to(x), dilation=self.dilation)
+        mean, var = self.mean.to(x), self.var.to(x)
+        y = functional.batch_norm(y, mean, var, self.gain.to(x), self.shift.to(x), self.training, MOMENTUM, EPSILON)
+        if self.training:  # batch_norm has moved the two, which may be copies
+            self.mean.copy_(mean)
+            self.var.copy_(var)
+        return functional.dropout(functional.gelu(y), self.dropout, self.training)
+
+    def folded(self, x: Float[Tensor, " before"]) -> Folded:
+        """The layer at work, around what it gives for a constant input."""
+        gain = self.gain * (self.var + EPSILON).rsqrt()
+        weight = self.weight * gain[:, None, None]
+        return Folded(weight, weight.sum(2) @ x + self.shift - self.mean * gain, self.dilation)
+
+
+class Net(nn.Module):
+    """N: six channels in, a correction of three out; zero until it is trained."""
+
+    def __init__(self, config: Config, unit: float) -> None:
+        super().__init__()
+        self.unit = unit
+        sizes = zip((6, *config.channels), config.channels, config.dilations, strict=False)
+        self.layers = nn.ModuleList(Layer(a, b, config.kernel, d, config.dropout) for a, b, d in sizes)
+        self.out = nn.Parameter(torch.zeros(3, config.channels[-1]))  # no constant: the rest bias is one
+        self.centre: Tensor
+        self.scale: Tensor
+        self.register_buffer("centre", torch.zeros(6))
+        self.register_buffer("scale", torch.tensor([1.0, 1.0, 1.0, 10.0, 10.0, 10.0]))
+
+    def forward(self, u: Float[Tensor, "batch n 6"]) -> Float[Tensor, "batch n 3"]:
+        """N(x) in training, where N(0) would be the answer of weights that are not there yet; N(x) - N(0) at work."""
+        return self._in_training(u) if self.training else self._at_work(u)
+
+    def _in_training(self, u: Float[Tensor, "batch n 6"]) -> Float[Tensor, "batch n 3"]:
+        x = ((u - self.centre) / self.scale).mT.float()
+        for layer in self.layers:
+            x = layer(x)
+        y: Tensor = (self.unit * (self.out.to(x) @ x)).mT.to(u)
+        return y
+
+    def _at_work(self, u: Float[Tensor, "batch n 6"]) -> Float[Tensor, "batch n 3"]:
+        x = (u / self.scale).mT
+        for weight, there, dilation in self.folded():
+            reach = (weight.shape[2] - 1) * dilation
+            y = functional.conv1d(causal(x, reach), weight, there, dilation=dilation)
+            x = functional.gelu(y) - functional.gelu(there)[:, None]
+        return (self.unit * (self.out @ x)).mT
+
+    def at_rest(self) -> Float[Tensor, "3"]:
+        """N(0): the answer to no rate and no force, for all time."""
+        level: Tensor = self.unit * (self.out @ functional.gelu(self.folded()[-1].there))
+        return level
+
+    def folded(self) -> list[Folded]:
+        """The layers at work; the first is given u / scale, the deviation of its input from that of no motion."""
+        x, found = -self.centre / self.scale, []
+        for layer in self.layers:
+            assert isinstance(layer, Layer)
+            found.append(layer.folded(x))
+            x = functional.gelu(found[-1].there)
+        return found
+
+
+class Model(BiasModel):
+    """b = rest + (I - C) u - (N(x) - N(0)) for gyro and accel apart; see the module's head.
+
+    Source: Brossard, Bonnabel and Barrau, "Denoising IMU Gyroscopes with Deep Learning for Open-Loop Attitude Estimation",
+    RA-L 2020, arXiv:2002.10718, eq. 5 to 9 and fig. 2.
+    """
+
+    method: ClassVar[str] = "conv"
+    objective = "increments"
+    prefers: ClassVar[Mapping[str, Any]] = MappingProxyType(
+        {"steps": 500, "samples": 13_000, "gyro_rate": 1e-2, "accel_rate": 1e-2, "weight_decay": 0.1, "validate_every": 50}
+    )
+    undecayed: ClassVar[tuple[str, ...]] = ("W",)
+    config: Config
+
+    def __init__(self, config: Settings | None = None, rate_hz: float = 200.0) -> None:
+        chosen = config or Config()
+        assert isinstance(chosen, Config)
+        if len(chosen.channels) != len(chosen.dilations):
+            raise ConfigError(
+                f"{len(chosen.channels)} channels and {len(chosen.dilations)} dilations",
+                where="model.channels",
+                expected="one of each a layer",
+            )
+        super().__init__(chosen, rate_hz)
+        self.W = nn.ParameterDict({sensor: nn.Parameter(torch.zeros(3, 3)) for sensor in SENSORS})  # I - C
+        self.net = nn.ModuleDict({"gyro": Net(chosen, chosen.gyro_unit_rad_s), "accel": Net(chosen, chosen.accel_unit_m_s2)})
+        self.context = (chosen.kernel - 1) * sum(chosen.dilations)
+
+    def see(self, gyro: Float[Tensor, "n 3"], accel: Float[Tensor, "n 3"]) -> None:
+        """Takes the mean and the spread of each channel as its origin and unit."""
+        u = torch.cat([gyro, accel], dim=1)
+        scale = torch.maximum(u.std(0), u.new_tensor(LEAST_SCALE))
+        for sensor in SENSORS:
+            net = self._net(sensor)
+            net.centre.copy_(u.mean(0))
+            net.scale.copy_(scale)
+
+    def rest_at_work(self, sensor: Sensor, rest: Float[Tensor, "*logs 3"]) -> Float[Tensor, "*logs 3"]:
+        """Less N(0), which is not taken off the network in training but is at work."""
+        return rest - self._net(sensor).at_rest().detach()
+
+    def sensor_bias(self, sensor: Sensor, segment: Segment) -> Float[Tensor, "batch n 3"]:
+        """rest + W u - N at each sample."""
+        u, rest = segment.of(sensor)
+        W: Tensor = self.W[sensor]
+        correction: Tensor = self._net(sensor)(torch.cat([segment.gyro, segment.accel], dim=-1))
+        return rest[:, None] + u @ W.mT - correction
+
+    def begin_at(self, sensor: Sensor, W: Float[Tensor, "3 3"]) -> None:
+        """The matrix beside the network; with the original's start, nothing."""
+        if self.config.start == "closed_form":
+            with torch.no_grad():
+                self.W[sensor].copy_(W)
+
+    def stream(self, rest: Vector6) -> Stream:
+        """The same in numpy; each layer keeps the last of its inputs that its convolution reaches."""
+        return _Stream(self, rest)
+
+    def _net(self, sensor: Sensor) -> Net:
+        net = self.net[sensor]
+        assert isinstance(net, Net)
+        return net
+
+
+def causal(x: Float[Tensor, "batch channels n"], reach: int) -> Float[Tensor, "batch channels m"]:
+    """Padded on the left with its first sample, which equals padding the very first layer's input with its first sample.
+
+    All that a layer sees of the time before is then constant, and so is what it answers.
+    """
+    return functional.pad(x, (reach, 0), mode="replicate") if reach else x
+
+
+class _Stream:
+    """Both networks over samples as they come."""
+
+    def __init__(self, model: Model, rest: Vector6) -> None:
+        self.rest = rest.astype(np.float64)
+        nets = {sensor: model._net(sensor) for sensor in SENSORS}
+        self.W: dict[Sensor, Array] = {sensor: _array(model.W[sensor]).T.copy() for sensor in SENSORS}
+        self.scale = {sensor: _array(net.scale) for sensor, net in nets.items()}
+        self.layers = {sensor: [_Convolution(folded) for folded in net.folded()] for sensor, net in nets.items()}
+        self.out: dict[Sensor, Array] = {sensor: net.unit * _array(net.out).T for sensor, net in nets.items()}
+
+    def __call__(
+        self, t_s: Float64[np.ndarray, " n"], gyro: Float64[np.ndarray, "n 3"], accel: Float64[np.ndarray, "n 3"]
+    ) -> Float64[np.ndarray, "n 6"]:
+        u = np.concatenate([gyro, accel], axis=1)
+        bias: Float64[np.ndarray, "n 6"] = np.empty_like(u)
+        for start in range(0, len(u), BLOCK):
+            rows = slice(start, start + BLOCK)
+            for sensor, columns in zip(SENSORS, COLUMNS.values(), strict=True):
+                x: Array = u[rows] / self.scale[sensor]
+                for layer in self.layers[sensor]:
+                    x = layer(x)
+                bias[rows, columns] = self.rest[columns] + u[rows, columns] @ self.W[sensor] - x @ self.out[sensor]
+        return bias
+
+
+class _Convolution:
+    """One layer on samples as they come.
+
+    The past lies before the present in one buffer, where a sample's taps are rows at even distances; only when the buffer is
+    full is the past moved to its front, so that a single sample costs no copy of it.
+    """
+
+    def __init__(self, folded: Folded) -> None:
+        out, channels, self.kernel = folded.weight.shape
+        self.dilation, self.reach = folded.dilation, (self.kernel - 1) * folded.dilation
+        self.weight = _array(folded.weight).transpose(2, 1, 0).reshape(self.kernel * channels, out).copy()
+        self.there, self.level = _array(folded.there), _array(functional.gelu(folded.there))
+        self.buffer, self.end = np.empty((self.reach + BLOCK, channels)), -1  # -1: nothing seen yet
+
+    def __call__(self, x: Array) -> Array:
+        n = len(x)
+        if self.end < 0:
+            self.buffer[: self.reach], self.end = x[0], self.reach
+        if self.end + n > len(self.buffer):
+            self.buffer[: self.reach] = self.buffer[self.end - self.reach : self.end].copy()
+            self.end = self.reach
+        first = self.end - self.reach
+        self.end += n
+        self.buffer[self.end - n : self.end] = x
+        row, column = self.buffer.strides
+        taps = np.lib.stride_tricks.as_strided(
+            self.buffer[first:], (n, self.kernel, x.shape[1]), (row, self.dilation * row, column), writeable=False
+        )
+        y: Array = _gelu(taps.reshape(n, -1) @ self.weight + self.there) - self.level
+        return y
+
+
+def _gelu(x: Array) -> Array:
+    from scipy.special import erf
+
+    y: Array = 0.5 * x * (1.0 + erf(x * np.sqrt(0.5)))
+    return y
+
+
+def _array(tensor: Tensor) -> Array:
+    out: Array = tensor.detach().cpu().double().numpy()
+    return out

@@ -1,0 +1,175 @@
+"""Known physics first, a neural ODE for the rest: bias = rest + sum of effects + what the ODE finds in what they leave.
+
+The effects are those of `imutool.physics.effects` that the training logs support (`imutool.train.calibration`): each linear in
+its parameters, fitted together in closed form, chosen by how well logs predict one another, with the covariance of the
+answer. The neural ODE (`imutool.bias.neural_ode`) is shown samples that the effects have been taken off, and is left out
+where it does not help on the held-out part: then debiasing is a few products a sample.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import ClassVar
+
+import msgspec
+import numpy as np
+import torch
+from jaxtyping import Float, Float64
+from torch import Tensor
+
+from imutool.bias import neural_ode
+from imutool.bias._base import COLUMNS, SENSORS, BiasModel, Segment, Sensor, Stream, Unsure, Vector6
+from imutool.config import Settings
+from imutool.errors import ConfigError
+from imutool.physics.effects._base import AtWork, Effect, compiled, patterns
+from imutool.physics.effects._catalogue import named as effects_named
+from imutool.physics.signals import POWER_S, SignalFilter, Signals
+
+FORGOTTEN = 10.0  # time constants after which a filter's start no longer shows
+
+
+class Config(Settings, frozen=True):
+    """The effects of each sensor by name (none given: the training chooses), and the neural ODE on top of them."""
+
+    gyro_effects: tuple[str, ...] | None = None
+    accel_effects: tuple[str, ...] | None = None
+    remainder: bool = True
+    ode: neural_ode.Config = neural_ode.Config()
+
+
+class Model(BiasModel):
+    """b = rest + E_theta(signals) + C(u - E) + drift; see the module's head.
+
+    Sources: those of the effects' files; Rehder et al., ICRA 2016, for fitting them together; `imutool.bias.neural_ode`.
+
+    Raises:
+        ConfigError: an effect that is not known, or that does not act on its sensor.
+    """
+
+    method: ClassVar[str] = "hybrid"
+    config: Config
+
+    def __init__(self, config: Settings | None = None, rate_hz: float = 200.0) -> None:
+        chosen = config or Config()
+        assert isinstance(chosen, Config)
+        super().__init__(chosen, rate_hz)
+        self.effects: dict[Sensor, tuple[Effect, ...]] = {"gyro": (), "accel": ()}
+        for sensor in SENSORS:
+            self._hold(sensor, self.named(sensor) or ())
+        self.ode = neural_ode.Model(chosen.ode, rate_hz) if chosen.remainder else None
+
+    def named(self, sensor: Sensor) -> tuple[str, ...] | None:
+        """The effects the settings name for a sensor; none if they are for the training to choose."""
+        return self.config.gyro_effects if sensor == "gyro" else self.config.accel_effects
+
+    def take(self, sensor: Sensor, names: Sequence[str], theta: Float[Tensor, " p"], covariance: Float[Tensor, "p p"]) -> None:
+        """Takes over effects and their parameters, in the order of `names`, as the training found them."""
+        key = f"{sensor}_effects"
+        self.config = msgspec.structs.replace(self.config, **{key: tuple(names)})
+        self._hold(sensor, tuple(names))
+        with torch.no_grad():
+            getattr(self, f"theta_{sensor}").copy_(theta)
+            getattr(self, f"covariance_{sensor}").copy_(covariance)
+
+    def drop_remainder(self) -> None:
+        """Leaves the effects alone: the neural ODE has nothing to add."""
+        self.config, self.ode = msgspec.structs.replace(self.config, remainder=False), None
+
+    def begin_at(self, sensor: Sensor, W: Float[Tensor, "3 3"]) -> None:
+        """Nothing that could be taken over as it is: effects are fitted and chosen all together.
+
+        Raises:
+            ConfigError: always; `imutool.train.run.train` knows how a hybrid is trained.
+        """
+        raise ConfigError(
+            "hybrid does not start from a matrix",
+            where="training hybrid",
+            fix="Train it with imutool.train.run.train, or its parts with imutool.train.physics_first",
+        )
+
+    def error(self, sensor: Sensor, signals: Signals) -> Float64[np.ndarray, "n 3"]:
+        """What the effects make of some signals (rad/s or m/s²)."""
+        return self._compiled(sensor)(signals)
+
+    def sensor_bias(self, sensor: Sensor, segment: Segment) -> Float[Tensor, "batch n 3"]:
+        """Effects on the segment's signals, and the neural ODE on what they leave; the filters start at the first sample."""
+        error = self._on(sensor, segment)
+        if self.ode is None:
+            return segment.rest[:, None, COLUMNS[sensor]] + error
+        left = {"gyro": segment.gyro, "accel": segment.accel}
+        left[sensor] = left[sensor] - error
+        return error + self.ode.sensor_bias(sensor, Segment(segment.t, left["gyro"], left["accel"], segment.rest))
+
+    def stream(self, rest: Vector6) -> Stream:
+        """The same in numpy, from the log's first sample on."""
+        ode = None if self.ode is None else self.ode.stream(rest)
+        gyro, accel = (self._compiled(sensor) for sensor in SENSORS)
+        return _Stream(SignalFilter(self.rate_hz), gyro, accel, ode, rest.astype(np.float64))
+
+    def rest_dynamics(self) -> Float64[np.ndarray, "6 6"]:
+        """The neural ODE's."""
+        return np.zeros((6, 6)) if self.ode is None else self.ode.rest_dynamics()
+
+    def calibration_covariance(self) -> Unsure | None:
+        """Of the effects' error, from the covariance of their parameters: T Sigma T^T."""
+        roots: dict[Sensor, Float64[np.ndarray, "3 q p"]] = {}
+        for sensor in SENSORS:
+            covariance: Tensor = getattr(self, f"covariance_{sensor}")
+            values, vectors = np.linalg.eigh(covariance.detach().cpu().double().numpy())
+            root = vectors * np.sqrt(np.maximum(values, 0.0))
+            roots[sensor] = patterns(self.effects[sensor]) @ root
+        filter_ = SignalFilter(self.rate_hz)
+
+        def unsure(
+            t_s: Float64[np.ndarray, " n"], gyro: Float64[np.ndarray, "n 3"], accel: Float64[np.ndarray, "n 3"]
+        ) -> Float64[np.ndarray, "n 6 6"]:
+            signals, out = filter_(t_s, gyro, accel), np.zeros((len(t_s), 6, 6))
+            for sensor in SENSORS:
+                if self.effects[sensor]:
+                    terms = np.concatenate([effect.terms(signals) for effect in self.effects[sensor]], axis=1)
+                    T = np.einsum("nq,iqp->nip", terms, roots[sensor], optimize=True)
+                    out[:, COLUMNS[sensor], COLUMNS[sensor]] = T @ T.transpose(0, 2, 1)
+            return out
+
+        return unsure
+
+    def _on(self, sensor: Sensor, segment: Segment) -> Float[Tensor, "batch n 3"]:
+        rows = []
+        for t, gyro, accel in zip(segment.t, segment.gyro, segment.accel, strict=True):
+            arrays = (x.detach().cpu().double().numpy() for x in (t - t[0], gyro, accel))
+            rows.append(torch.from_numpy(self.error(sensor, SignalFilter(self.rate_hz)(*arrays))))
+        return torch.stack(rows).to(segment.t)
+
+    def _hold(self, sensor: Sensor, names: tuple[str, ...]) -> None:
+        self.effects[sensor] = effects_named(sensor, names)
+        size = sum(len(effect.parameters) for effect in self.effects[sensor])
+        like = self.prior_mean
+        self.register_buffer(f"theta_{sensor}", like.new_zeros(size))
+        self.register_buffer(f"covariance_{sensor}", like.new_zeros(size, size))
+        looks_back = any(self.effects.values())
+        self.context = math.ceil(FORGOTTEN * POWER_S * self.rate_hz) if looks_back else 0
+
+    def _compiled(self, sensor: Sensor) -> AtWork:
+        theta: Tensor = getattr(self, f"theta_{sensor}")
+        return compiled(self.effects[sensor], theta.detach().cpu().double().numpy())
+
+
+class _Stream:
+    """Effects, then the neural ODE on what they leave; remembers what the filters do."""
+
+    def __init__(self, signals: SignalFilter, gyro: AtWork, accel: AtWork, ode: Stream | None, rest: Vector6) -> None:
+        self.signals, self.gyro, self.accel, self.ode, self.rest, self.start_s = signals, gyro, accel, ode, rest, math.nan
+
+    def __call__(
+        self, t_s: Float64[np.ndarray, " n"], gyro: Float64[np.ndarray, "n 3"], accel: Float64[np.ndarray, "n 3"]
+    ) -> Float64[np.ndarray, "n 6"]:
+        if not len(t_s):
+            return np.zeros((0, 6))
+        if math.isnan(self.start_s):
+            self.start_s = float(t_s[0])
+        signals = self.signals(t_s - self.start_s, gyro, accel)
+        error = np.empty((len(t_s), 6))
+        error[:, :3], error[:, 3:] = self.gyro(signals), self.accel(signals)
+        error += self.rest if self.ode is None else self.ode(t_s, gyro - error[:, :3], accel - error[:, 3:])
+        return error

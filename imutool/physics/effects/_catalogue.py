@@ -1,0 +1,35 @@
+"""The effects there are: all that act on a sensor, or those a person names."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from imutool import registry
+from imutool.errors import ConfigError
+from imutool.physics.effects._base import Effect, Sensor
+
+GROUP = "imutool.effects"
+
+
+def known(sensor: Sensor) -> tuple[Effect, ...]:
+    """Every effect that acts on a sensor, by name."""
+    modules = [registry.load(GROUP, name) for name in registry.names(GROUP)]
+    return tuple(module.effect(sensor) for module in modules if sensor in module.SENSORS)
+
+
+def named(sensor: Sensor, names: Sequence[str]) -> tuple[Effect, ...]:
+    """Some effects on a sensor, in the order of their names.
+
+    Raises:
+        ConfigError: an unknown name (the nearest is given), one that acts on the other sensor alone, or one given twice.
+    """
+    where, found = f"effects of the {sensor}", []
+    for name in names:
+        module = registry.load(GROUP, name)
+        if sensor not in module.SENSORS:
+            listed = ", ".join(effect.name for effect in known(sensor))
+            raise ConfigError(f"{name} does not act on the {sensor}", where=where, expected=f"some of {listed}")
+        found.append(module.effect(sensor))
+    if len(set(names)) < len(names):
+        raise ConfigError(f"{', '.join(names)}: one stands there twice", where=where, expected="each at most once")
+    return tuple(found)

@@ -1,0 +1,14 @@
+"""Misalignment of the gyro's axes: off-diagonal 3x3 on omega."""
+
+from __future__ import annotations
+
+from imutool.physics.effects._base import Effect, Sensor, off_diagonal, per_pair
+from imutool.physics.signals import GYRO
+
+SENSORS: tuple[Sensor, ...] = ("gyro",)
+
+
+def effect(sensor: Sensor) -> Effect:
+    """m (-): seen where two axes turn. A rotation common to gyro and accelerometer is a mount rotation."""
+    pairs = per_pair("-", 0.05, diagonal=False)
+    return Effect("gyro_misalignment", sensor, "gyro += M omega, diag M = 0", pairs, GYRO, off_diagonal())

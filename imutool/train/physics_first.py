@@ -1,0 +1,129 @@
+"""How `hybrid` is trained: effects in closed form, then the neural ODE on recordings that they have been taken off.
+
+Effects are chosen on the training part, and then fitted to the whole logs.
+
+The ODE's training is the one of `neural_ode`, and does not know that its samples were corrected. It is kept where it takes
+at least `LEAST_GAIN` off the held-out error of either sensor, and left out of the model where it does not.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import msgspec
+import numpy as np
+import torch
+
+from imutool.bias import hybrid, neural_ode
+from imutool.bias._base import SENSORS, BiasModel, Sensor
+from imutool.config import build, plain
+from imutool.physics.effects._catalogue import named
+from imutool.physics.signals import SignalFilter, Signals
+from imutool.recording import Imu, Recording, seconds
+from imutool.train.calibration import Calibration, calibrate
+from imutool.train.fit import Epoch
+from imutool.train.segments import Pool
+from imutool.train.settings import TrainSettings
+
+LEAST_GAIN = 0.03  # of the held-out error, for an ODE to be worth its weights
+
+
+@dataclass(frozen=True)
+class PhysicsFirst:
+    """A hybrid model whose effects are found, and the recordings without them."""
+
+    model: hybrid.Model
+    found: dict[Sensor, Calibration]
+    recordings: list[Recording]
+
+    @classmethod
+    def of(
+        cls, recordings: Sequence[Recording], settings: TrainSettings, device: str, say: Callable[[Epoch], None]
+    ) -> PhysicsFirst:
+        """Finds the effects of gyro, then accelerometer.
+
+        Raises:
+            DataError: no truth, too little of it, or different rates.
+            ConfigError: unknown settings, or an effect that is not known.
+        """
+        pool = Pool.of(recordings, device=device)
+        torch.manual_seed(settings.seed)
+        model = hybrid.Model(config_of(settings), pool.rate_hz).double()
+        signals, found = _where_there_is_truth(recordings, pool), {}
+        gyro = pool.gyro
+        for sensor in SENSORS:
+            say(Epoch(sensor, 0, 0, math.nan, math.nan, math.nan, 0.0, f"looking for effects on the {sensor}"))
+            chosen = calibrate(pool, sensor, gyro, model.named(sensor), "train", signals)
+            whole = calibrate(pool, sensor, gyro, chosen.effects, "all", signals)  # nothing is left to be chosen
+            found[sensor] = replace(whole, gains=chosen.gains)
+            model.take(sensor, found[sensor].effects, found[sensor].theta, found[sensor].covariance)
+            if sensor == "gyro":
+                error = torch.from_numpy(model.error("gyro", signals)).to(pool.gyro)
+                gyro = pool.gyro - error - found[sensor].rest[pool.log]
+        return cls(model, found, _without(model, recordings))
+
+    def ode_settings(self, settings: TrainSettings) -> TrainSettings:
+        """The settings of the ODE's own training."""
+        ode: neural_ode.Config = self.model.config.ode
+        return msgspec.structs.replace(settings, model=plain(ode))
+
+    def finish(self, learnt: BiasModel) -> hybrid.Model:
+        """The whole model, with the ODE that was trained, or without one where a constant was enough."""
+        model = self.model
+        if isinstance(learnt, neural_ode.Model):
+            assert model.ode is not None
+            model.ode.load_state_dict(learnt.state_dict())
+        else:
+            model.drop_remainder()
+        for name, value in learnt.named_buffers(recurse=False):
+            getattr(model, name).copy_(value)
+        return model
+
+
+def helps(before: dict[Sensor, float], after: dict[Sensor, float]) -> bool:
+    """Whether a descent took enough off the held-out error of one sensor, and did no harm to the other."""
+    gains = [1 - after[sensor] / before[sensor] for sensor in SENSORS]
+    return max(gains) >= LEAST_GAIN and min(gains) > -LEAST_GAIN
+
+
+def config_of(settings: TrainSettings) -> hybrid.Config:
+    """The model's settings, with effects that are known.
+
+    Raises:
+        ConfigError: an unknown setting or effect (the nearest is named), or an effect on the wrong sensor.
+    """
+    config = build(hybrid.Config, settings.model, where="model settings of hybrid")
+    named("gyro", config.gyro_effects or ())
+    named("accel", config.accel_effects or ())
+    return config
+
+
+def _where_there_is_truth(recordings: Sequence[Recording], pool: Pool) -> Signals:
+    """The signals of a pool's samples as they are at work: their filters and their time start where the log does."""
+    parts: list[Signals] = []
+    for recording, count in zip(recordings, torch.bincount(pool.log).tolist(), strict=True):
+        first = int(np.searchsorted(recording.imu.t_ns, recording.overlap().imu.t_ns[0]))
+        parts.append(_signals(recording.imu, pool.rate_hz).rows(slice(first, first + count)))
+    return Signals(np.concatenate([part.t_s for part in parts]), np.concatenate([part.columns for part in parts]))
+
+
+def _signals(imu: Imu, rate_hz: float) -> Signals:
+    return SignalFilter(rate_hz)(seconds(imu.t_ns, int(imu.t_ns[0])), imu.gyro, imu.accel)
+
+
+def _without(model: hybrid.Model, recordings: Sequence[Recording]) -> list[Recording]:
+    """The recordings with the model's effects taken off their samples."""
+    return [replace(recording, imu=_corrected(model, recording.imu)) for recording in recordings]
+
+
+def _corrected(model: hybrid.Model, imu: Imu) -> Imu:
+    signals = _signals(imu, model.rate_hz)
+    return Imu(imu.t_ns, imu.gyro - model.error("gyro", signals), imu.accel - model.error("accel", signals))
+
+
+def described(found: dict[Sensor, Calibration]) -> Iterator[tuple[str, dict[str, object]]]:
+    """What a card says of the effects: what each took off the loss of logs that had no part in its fit, what was not seen."""
+    for sensor, one in found.items():
+        yield sensor, {"effects": list(one.effects), "gains": dict(one.gains), "unseen": list(one.unseen)}

@@ -1,0 +1,77 @@
+"""Puts the models that ship into a folder, each with its card: python tests/bench/ship.py TABLES models/
+
+TABLES is what `python examples/reproduce_tables.py DATA -o TABLES` left. Of the seeds of a method the one with the smallest
+held-out error of the gyro ships: the test sequences have no say.
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from imutool.bias._file import header_of
+
+PREFIX = {"euroc": "euroc-adis16448", "tumvi": "tum_vi-bmi160", "fetch": "fetch"}
+METHODS = ("linear", "conv", "neural_ode", "hybrid")
+MOST_BYTES = 2_000_000
+COMMAND = "imutool train {logs} -o {name}.safetensors --method {method} --seed {seed}"
+LIMITS = (
+    "A calibration of one unit: another sensor of the same type has another scale, misalignment and turn-on bias. Trained and "
+    "tested indoors, on runs of one to three minutes, at the temperatures of a laboratory."
+)
+
+
+def main() -> None:
+    """One line a model."""
+    tables, target = map(Path, sys.argv[1:3])
+    for data_set, prefix in PREFIX.items():
+        for method in METHODS:
+            found = sorted(tables.glob(f"{data_set}-{method}-[0-9].safetensors"))
+            if not found:
+                continue
+            best = min(found, key=lambda path: float(header_of(path)["held_out"]["gyro"]["error"]))
+            name = f"{prefix}-{method}"
+            if best.stat().st_size > MOST_BYTES:
+                raise SystemExit(f"{best} has {best.stat().st_size} bytes, more than {MOST_BYTES}")
+            shutil.copyfile(best, target / f"{name}.safetensors")
+            rows = [row for path in found for row in json.loads(path.with_suffix(".json").read_text(encoding="utf-8"))]
+            (target / f"{name}.md").write_text(card(name, header_of(best), rows, len(found)), encoding="utf-8")
+            print(f"{name}: seed {header_of(best)['training']['seed']} of {len(found)}, {best.stat().st_size} bytes")
+
+
+def card(name: str, about: dict[str, Any], rows: list[dict[str, Any]], seeds: int) -> str:
+    """The card: data, split, settings, command, figures, limits."""
+    logs, seed = [log["name"] for log in about["logs"]], about["training"]["seed"]
+    own = [row for row in rows if row["method"] == about["method"]]
+    files = " ".join(f"{log}.mcap" for log in logs)
+    command = COMMAND.format(logs=files, name=name, method=about["method"], seed=seed)
+    lines = [
+        f"# {name}",
+        "",
+        f"Method `{about['method']}`, sensor {about['sensor']}, data set {about['dataset']}, {about['rate_hz']:.1f} Hz.",
+        "",
+        f"- Trained on {', '.join(logs)}: the first 80 % of each; the last 20 % chose among steps and among {seeds} seed(s).",
+        f"- Settings: the defaults of imutool {about['imutool']}, torch {about['torch']}, seed {seed}.",
+        f"- Command: `{command}`",
+        f"- Held out: {about['held_out']['gyro']['error'] * 180 / np.pi:.3f}° (gyro, 20 s or what fits), "
+        f"{about['held_out']['accel']['error']:.3f} m/s (accelerometer, 5 s), each log's constant solved for.",
+    ]
+    if physics := about.get("physics"):
+        found = "; ".join(f"{sensor}: {', '.join(one['effects']) or 'none'}" for sensor, one in physics.items())
+        lines.append(f"- Effects found: {found}. Their fit uses the whole logs; they were chosen by leaving logs out in turn.")
+    lines += ["", "| test sequence | start from truth: AOE ° / APE m | auto: AOE ° | smooth: AOE ° |", "|---|---|---|---|"]
+    for log in dict.fromkeys(row["log"] for row in own):
+        this = {row["start"]: row for row in own if row["log"] == log and row["seed"] == seed}
+        truth = this["truth"]
+        others = f"{this['auto']['aoe_deg']:.2f} | {this['smooth']['aoe_deg']:.2f}"
+        lines.append(f"| {log} | {truth['aoe_deg']:.2f} / {truth['ape_m']:.0f} | {others} |")
+    return "\n".join([*lines, "", LIMITS, ""])
+
+
+if __name__ == "__main__":
+    main()
