@@ -80,7 +80,8 @@ def run(
     convert(raw, logs, format="euroc", sequences=names, overwrite=overwrite)
     say(f"3. Training the neural ODE on {len(TRAINING_SEEDS)} of them: {model}")
     training = [logs / f"{name}.mcap" for name in names[:-1]]
-    train(training, model, settings=settings or TrainSettings(steps=STEPS), overwrite=overwrite, progress=progress)
+    chosen = settings or TrainSettings(steps=STEPS)
+    train(training, model, method="neural_ode", settings=chosen, overwrite=overwrite, progress=progress)
     say(f"4. Debiasing the one it has not seen, without its truth: {debiased}")
     debias(log, debiased, model=model, overwrite=overwrite)
     say("5. Measuring against the truth, drawing")

@@ -31,6 +31,7 @@ from imutool.strapdown import GRAVITY_W, with_velocity
 from imutool.windows import attitudes, between, huber_weight, running_product
 
 TRUTH_S = 15.0  # how much of the truth a start takes: of 3, 5, 8, 10 and 15 s the best on training logs left out in turn
+LEAST_TRUTH_S = 1.0
 AT_REST_STD = np.array([1e-4] * 3 + [0.03] * 3)  # earth's rotation; local gravity and what a tilt hides
 REST_BEGINS_WITHIN_S = 5.0  # later, its bias would be one of the future
 ITERATIONS = 4
@@ -276,29 +277,32 @@ def _from_rest(model: BiasModel, imu: Imu, found: Sequence[tuple[int, int]]) -> 
 
 
 def from_truth(model: BiasModel, recording: Recording, truth_s: float = TRUTH_S) -> TurnOn:
-    """From the first seconds of true poses, all of them (gaps in between do no harm), and the prior.
+    """From the first seconds of true poses, as many as there are up to `truth_s` (gaps do no harm), and the prior.
 
     Raises:
-        DataError: no truth, or none that reaches that far.
+        DataError: no truth, or less than a second of it.
     """
     both = recording.overlap()
     imu, truth = both.imu, both.truth
     poses, trusted = with_velocity(truth).at(imu.t_ns)
     t = seconds(imu.t_ns, int(imu.t_ns[0]))
     usable = np.flatnonzero(trusted)
-    ends = usable[t[usable] >= t[usable[0]] + truth_s] if len(usable) else usable
-    if not len(ends):
-        raise DataError(f"less than {truth_s:g} s of truth", where=recording.name, expected="truth at the start")
-    rows = slice(int(usable[0]), int(ends[0]) + 1)
+    usable = usable[t[usable] <= t[usable[0]] + truth_s] if len(usable) else usable
+    found_s = float(t[usable[-1]] - t[usable[0]]) if len(usable) else 0.0
+    if found_s < LEAST_TRUTH_S:
+        raise DataError(
+            f"{found_s:.1f} s of truth", where=recording.name, expected=f"at least {LEAST_TRUTH_S:g} s of it at the start"
+        )
+    rows = slice(int(usable[0]), int(usable[-1]) + 1)
     piece, poses = imu.rows(rows), poses.rows(rows)
     assert poses.v_w is not None
     start = prior(model)
     left = np.concatenate([piece.gyro, piece.accel], axis=1) - _bias(model, piece, start.rest)
     R_wb = so3.matrix_from_quaternion_wxyz(torch.from_numpy(np.array(poses.q_wb_wxyz)))
     offset = truth_offset(t[rows], left, R_wb, torch.from_numpy(np.array(poses.v_w)), trusted[rows])
-    var, measured = start.std**2, _numpy(model.truth_std) ** 2 * (TRUTH_S / truth_s) ** 2
+    var, measured = start.std**2, _numpy(model.truth_std) ** 2 * (TRUTH_S / found_s) ** 2
     gain = np.divide(var, var + measured, out=np.zeros(6), where=var > 0)  # a prior without doubt stays
-    how = f"truth over {t[rows][-1] - t[rows][0]:.1f} s"
+    how = f"truth over {found_s:.1f} s"
     how += ", weighed against the training runs" if model.card else ""
     return TurnOn(start.rest + gain * offset, np.sqrt(gain * measured), how)
 
@@ -313,8 +317,8 @@ def truth_offset(
     """The constant in samples that the truth beside them shows: the slope, in time, of what integration misses.
 
     Rotation and velocity are integrated from the first true pose; their misses e(t) = e_0 + (sum of A) b are fitted by all
-    trusted poses with Huber's weights, e_0 being the first pose's own error. The gyro comes first, and carries the
-    attitude under the accelerometer.
+    trusted poses with Huber's weights, e_0 being the first pose's own error. The attitude under
+    the accelerometer is the true one (half a degree of drift would be a tenth of m/s²), carried through gaps by the gyro.
     """
     dt, seen = torch.from_numpy(np.diff(t_s))[None], torch.from_numpy(trusted)
     rate, force = torch.from_numpy(samples[:, :3])[None], torch.from_numpy(samples[:, 3:])[None]
@@ -324,12 +328,22 @@ def truth_offset(
         missed = (running @ so3.log(running.mT @ (R_wb[0].mT @ R_wb[1:]))[..., None])[..., 0]
         by_rate = torch.cumsum(running * dt[0, :, None, None], dim=0)
         offset[0] -= _slope(missed, by_rate, seen[1:])
-    R_hat = attitudes(R_wb[:1], rate - offset[0], dt)[0]
-    a_w = (R_hat @ force[0, ..., None])[..., 0] + torch.tensor(GRAVITY_W, dtype=torch.float64)
+    R_wb = _attitudes(t_s, rate - offset[0], R_wb, trusted)
+    a_w = (R_wb @ force[0, ..., None])[..., 0] + torch.tensor(GRAVITY_W, dtype=torch.float64)
     risen = torch.cumsum(between(a_w[None])[0] * dt[0, :, None], dim=0)
-    by_force = torch.cumsum(0.5 * (R_hat[:-1] + R_hat[1:]) * dt[0, :, None, None], dim=0)
+    by_force = torch.cumsum(0.5 * (R_wb[:-1] + R_wb[1:]) * dt[0, :, None, None], dim=0)
     offset[1] = -_slope(v_w[1:] - v_w[0] - risen, by_force, seen[1:])
     return offset.flatten().numpy()
+
+
+def _attitudes(
+    t_s: Float64[np.ndarray, " n"], rate: Float[Tensor, "1 n 3"], R_wb: Float[Tensor, "n 3 3"], trusted: Bool[np.ndarray, " n"]
+) -> Float[Tensor, "n 3 3"]:
+    """The integrated attitude, turned by what it misses of the trusted poses, and in gaps by what lies between."""
+    R_hat = attitudes(R_wb[:1], rate, torch.from_numpy(np.diff(t_s))[None])[0]
+    missed = so3.log(R_hat.mT @ R_wb).numpy()
+    filled = [np.interp(t_s, t_s[trusted], missed[trusted, axis]) for axis in range(3)]
+    return torch.as_tensor(R_hat @ so3.exp(torch.from_numpy(np.stack(filled, axis=1))))
 
 
 def _slope(missed: Float[Tensor, "n 3"], by: Float[Tensor, "n 3 3"], seen: Bool[Tensor, " n"]) -> Float[Tensor, "3"]:

@@ -21,6 +21,7 @@ from imutool.recording import GRAVITY_M_S2, Imu, Poses, Recording, seconds
 from imutool.rest_track import Samples
 from imutool.turn_on import (
     AT_REST_STD,
+    TRUTH_S,
     NoRestError,
     TurnOn,
     at_rest,
@@ -170,7 +171,7 @@ def test_too_few_samples_are_no_rest(count: int) -> None:
 PERFECT = TriadSettings(
     noise_density=0.0, walk_density=0.0, typical_bias=0.0, turn_on_bias=0.0, warm_up=0.0, scale=0.0, misalignment_rad=0.0
 )
-# Exact samples and truth: what is left over 5 s is the rule's second order, 1e-5 rad/s, and 1e-3 m/s² with its tilt.
+# Exact samples and truth: what is left over 12 s is the rule's second order, 1e-5 rad/s, and 1e-3 m/s² with its tilt.
 TRUTH = np.array([5e-5] * 3 + [5e-3] * 3)
 
 
@@ -188,17 +189,27 @@ def sees_everything() -> BiasModel:
     return model(prior_std=10.0, truth_std=1e-6)
 
 
-def test_five_seconds_of_truth_show_the_bias(biased: Recording) -> None:
+def test_twelve_seconds_of_truth_show_the_bias(biased: Recording) -> None:
     start = from_truth(sees_everything(), biased)
     assert (np.abs(start.rest - np.concatenate([GYRO_BIAS, ACCEL_BIAS])) < TRUTH).all()
-    np.testing.assert_allclose(start.std, 1e-6, rtol=1e-6)
-    assert start.how == "truth"
+    np.testing.assert_allclose(start.std, 1e-6 * TRUTH_S / 12.0, rtol=1e-6)  # less truth than the model's figure is of
+    assert start.how == "truth over 12.0 s"
+
+
+def test_a_shorter_truth_can_be_asked_for(biased: Recording) -> None:
+    start = find("truth:4", sees_everything(), biased)
+    assert (np.abs(start.rest - np.concatenate([GYRO_BIAS, ACCEL_BIAS])) < TRUTH).all()
+    assert start.how == "truth over 4.0 s"
+    np.testing.assert_allclose(start.std, 1e-6 * TRUTH_S / 4.0, rtol=1e-6)
+    for word in ("truth:0", "truth:nan", "truth:five"):
+        with pytest.raises(ConfigError, match="truth:SECONDS"):
+            find(word, sees_everything(), biased)
 
 
 def test_truth_and_prior_meet_by_their_variances(biased: Recording) -> None:
     """Equal variances: half-way; a model sure of its prior (or of nothing else) keeps to it."""
     full = from_truth(sees_everything(), biased)
-    half = from_truth(model(prior_std=0.1, truth_std=0.1), biased)
+    half = from_truth(model(prior_std=0.1, truth_std=0.1 * 12.0 / TRUTH_S), biased)
     np.testing.assert_allclose(half.rest, 0.5 * full.rest, rtol=1e-6)
     np.testing.assert_allclose(half.std, 0.1 / np.sqrt(2), rtol=1e-12)
     for truth_std in (1.0, 0.0):
@@ -218,7 +229,7 @@ def test_the_models_own_part_is_taken_off_the_samples_first(biased: Recording) -
     assert (np.abs(start.rest - np.concatenate([GYRO_BIAS, ACCEL_BIAS])) < TRUTH).all()
 
 
-def test_a_gap_inside_the_five_seconds_does_no_harm(biased: Recording) -> None:
+def test_a_gap_in_the_truth_does_no_harm(biased: Recording) -> None:
     t_s = (biased.truth.t_ns - biased.truth.t_ns[0]) * 1e-9
     holed = replace(biased, truths={"/truth": biased.truth.rows((t_s < 1.0) | (t_s > 4.0))})
     start = from_truth(sees_everything(), holed)
@@ -236,8 +247,8 @@ def test_a_truth_that_is_not_there_or_too_short_is_refused(biased: Recording) ->
     with pytest.raises(DataError, match="biased: no true poses"):
         from_truth(static.Model(), replace(biased, truths={}))
     begin = int(biased.imu.t_ns[0])
-    short: Poses = biased.truth.between(begin, begin + 4_000_000_000)
-    with pytest.raises(DataError, match="biased: less than 5 s of truth"):
+    short: Poses = biased.truth.between(begin, begin + 900_000_000)
+    with pytest.raises(DataError, match=r"biased: 0\.9 s of truth"):
         from_truth(static.Model(), replace(biased, truths={"/truth": short}))
 
 
@@ -368,7 +379,7 @@ def test_each_word_finds_its_way(biased: Recording) -> None:
     assert "at rest" in how["auto"]
     assert how["auto"].startswith("4.0 s at rest from 0.0 s on, prior of the training runs, ±")
     assert how["1,2,3,4,5,6"] == "given"
-    assert find("truth", trained, biased).how == "truth over 5.0 s, weighed against the training runs"
+    assert find("truth", trained, biased).how == "truth over 12.0 s, weighed against the training runs"
     assert find("auto", trained, moving).how.startswith("prior of the training runs, ±0.05 rad/s, then gravity in motion")
     with pytest.raises(DataError, match="does not start at rest"):
         find("stationary", trained, moving)

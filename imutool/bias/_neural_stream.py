@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,7 +12,7 @@ from jaxtyping import Float64
 from scipy.special import erf
 from torch import Tensor, nn
 
-from imutool.bias._base import COLUMNS, Vector6
+from imutool.bias._base import COLUMNS, Sensor, Vector6
 from imutool.physics.signals import low_pass
 
 ROWS = 64  # at a time: they stay in the cache, and a product this small is never handed to threads that must be woken first
@@ -105,7 +105,7 @@ class NeuralStream:
     def __init__(
         self,
         curves: Curves,
-        drifts: Sequence[DriftRate],
+        drifts: Mapping[Sensor, DriftRate],
         stride: int,
         rate_hz: float,
         tau_s: tuple[float, float],
@@ -175,8 +175,8 @@ class NeuralStream:
         self._set_slope(u, du)
 
     def _set_slope(self, u: Array, du: Array) -> None:
-        halves = zip(self._drifts, COLUMNS.values(), strict=True) if self._drifts else ()
-        for rate, half in halves:
+        for sensor, rate in self._drifts.items():
+            half = COLUMNS[sensor]
             self._slope[half] = rate(self._rest[half], u[half], du[half])
 
 

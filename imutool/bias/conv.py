@@ -154,7 +154,15 @@ class Model(BiasModel):
     method: ClassVar[str] = "conv"
     objective = "increments"
     prefers: ClassVar[Mapping[str, Any]] = MappingProxyType(
-        {"steps": 500, "samples": 13_000, "gyro_rate": 1e-2, "accel_rate": 1e-2, "weight_decay": 0.1, "validate_every": 50}
+        {
+            "steps": 500,
+            "samples": 13_000,
+            "gyro_rate": 1e-2,
+            "accel_rate": 1e-2,
+            "weight_decay": 0.1,
+            "validate_every": 50,
+            "patience": 500,
+        }
     )
     undecayed: ClassVar[tuple[str, ...]] = ("W",)
     config: Config

@@ -21,6 +21,7 @@ from imutool.bias._base import Sensor
 from imutool.physics.effects._base import Effect
 from imutool.physics.effects._catalogue import known, named
 from imutool.physics.signals import SignalFilter, Signals
+from imutool.train.closed_form import CORRELATED
 from imutool.train.linearised import Seen, linearise
 from imutool.train.normal_equations import Problem
 from imutool.train.segments import Part, Pool
@@ -130,12 +131,16 @@ def _choose(problem: Problem, effects: Sequence[Effect]) -> dict[str, float]:
 
 
 def _beyond_chance(problem: Problem, effects: Sequence[Effect], names: Sequence[str]) -> bool:
-    """Whether the last effect's parameters are further from zero than all candidates together come by chance (Wald's test)."""
+    """Whether the last effect's parameters are further from zero than all candidates together come by chance (Wald's test).
+
+    Windows count as independent here, where the covariance takes many to say the same once: this is to keep out what nothing
+    speaks for, not to let in what much does; that is for the held-out loss.
+    """
     columns = _columns(effects, names)
     theta, covariance = problem.solve(columns)
     own = [k for k, column in enumerate(columns) if column in _columns(effects, names[-1:])]
     found = theta[columns][own]
-    wald = float(found @ torch.linalg.solve(covariance[own][:, own], found))
+    wald = CORRELATED * float(found @ torch.linalg.solve(covariance[own][:, own], found))
     return wald > float(chi2.isf(BY_CHANCE / len(effects), len(own)))
 
 

@@ -29,7 +29,7 @@ def save(training: Training, path: Path) -> None:
     tensors |= {"tracks": training.tracks.knots.detach(), "generator": training.generator.get_state()}
     about: dict[str, Any] = {"identity": _identity(training), "done": training.done}
     if stage := training.stage:
-        about["stage"] = {"sensor": stage.sensor, "step": stage.step, "best": stage.best}
+        about["stage"] = {"sensor": stage.sensor, "step": stage.step, "best": stage.best, "best_step": stage.best_step}
         tensors |= {f"best.{name}": value for name, value in stage.best_state.items()}
         tensors |= {f"mean.{name}": value for name, value in stage.mean.state_dict().items()}
         tensors |= {f"usual.{n}": value for n, value in stage.objective.loss.medians.items()}
@@ -77,7 +77,8 @@ def _stage(training: Training, about: dict[str, Any], tensors: dict[str, Tensor]
     groups = stage.optimizer.state_dict()["param_groups"]
     stage.optimizer.load_state_dict({"state": state, "param_groups": groups})
     stage.objective.loss = RobustLoss({int(n): value for n, value in _part(tensors, "usual.").items()})
-    stage.step, stage.best, stage.best_state = int(about["step"]), float(about["best"]), _part(tensors, "best.")
+    stage.step, stage.best, stage.best_step = int(about["step"]), float(about["best"]), int(about["best_step"])
+    stage.best_state = _part(tensors, "best.")
     return stage
 
 

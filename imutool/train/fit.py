@@ -69,6 +69,7 @@ class Stage:
     objective: Objective
     step: int = 0
     best: float = float("inf")
+    best_step: int = 0
     best_state: dict[str, Tensor] = field(default_factory=dict)
 
 
@@ -190,7 +191,7 @@ class Training:
                 score = self._validate(stage)
                 per_step = (time.monotonic() - began) / max(stage.step - begun_at, 1)
                 yield Epoch(sensor, stage.step, steps, loss, score, stage.best, per_step * (steps - stage.step))
-            if stage.step >= steps:
+            if stage.step >= steps or stage.step - stage.best_step >= settings.patience:
                 return
             loss = self._one_step(stage, steps)
 
@@ -239,5 +240,5 @@ class Training:
                 fix="Look for absurd values in the logs with imutool info",
             )
         if score < stage.best:
-            stage.best, stage.best_state = score, copy.deepcopy(model.state_dict())
+            stage.best, stage.best_step, stage.best_state = score, stage.step, copy.deepcopy(model.state_dict())
         return score

@@ -33,7 +33,7 @@ MakeModel, MakeSegment = Callable[..., BiasModel], Callable[..., Segment]
 
 def lively(build: MakeModel, **settings: object) -> Model:
     """A drift as strong as training may make it, and motion it answers to."""
-    model = build("neural_ode", 3, **settings)
+    model = build("neural_ode", 3, **{"drift": ("gyro", "accel"), **settings})
     assert isinstance(model, Model)
     generator = torch.Generator().manual_seed(11)
     for drift in model.drift.values():
@@ -99,7 +99,7 @@ def test_with_another_solver_the_drift_is_the_same(build: MakeModel, seen: Segme
 
 def test_the_curve_needs_no_solver(build: MakeModel, seen: Segment) -> None:
     """Without drift, step and solver are nowhere in the answer."""
-    answers = [build("neural_ode", 3, drift=False, solver=s, drift_step_s=h)(seen) for s, h in (("euler", 0.25), ("rk4", 1.0))]
+    answers = [build("neural_ode", 3, drift=(), solver=s, drift_step_s=h)(seen) for s, h in (("euler", 0.25), ("rk4", 1.0))]
     assert torch.equal(*answers)
 
 
@@ -236,7 +236,7 @@ FAST_PATH_RAD_S = 1e-5
 
 def test_without_drift_the_joint_equation_and_the_fast_path_are_one(build: MakeModel) -> None:
     n = 101
-    model, t, gyro = at_a_high_rate(n, drift_step_s=0.02, drift=False)
+    model, t, gyro = at_a_high_rate(n, drift_step_s=0.02, drift=())
     curve, drift = model.curve["gyro"], model.drift["gyro"]
     assert isinstance(curve, Curve)
     assert isinstance(drift, Drift)

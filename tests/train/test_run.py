@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import msgspec
+import numpy as np
 import pytest
 import torch
 
@@ -18,7 +20,7 @@ from imutool.config import build
 from imutool.errors import ConfigError, DataError, LogError, ModelError, NumericsError
 from imutool.mcap_io.write import write
 from imutool.physics.flight import flight
-from imutool.recording import Recording
+from imutool.recording import Imu, Recording
 from imutool.train.fit import Epoch, TrainSettings
 from imutool.train.objective import WindowEnds
 from imutool.train.physics_first import helps
@@ -302,11 +304,16 @@ def test_ctrl_c_while_effects_are_looked_for_leaves_nothing(logs: list[Path], tm
     assert names(tmp_path) == []
 
 
-def test_an_ode_that_does_not_help_is_left_out(logs: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """No rate of learning, no gain: the model is its effects, with the held-out error of those."""
-    effects = {f"{sensor}_effects": [f"{sensor}_scale", f"{sensor}_misalignment"] for sensor in ("gyro", "accel")}
-    still = msgspec.structs.replace(HYBRID, gyro_rate=1e-12, accel_rate=1e-12, steps=2, model={**effects, "ode": SMALL_ODE})
-    model = train(logs, tmp_path / "m.safetensors", method="hybrid", settings=still)
+def test_an_ode_that_does_not_help_is_left_out(tmp_path: Path, perfect: Callable[..., Recording]) -> None:
+    """A sensor with noise and nothing else: the model is its effects, with the held-out error of those."""
+    noisy = []
+    for seed in (1, 2):
+        exact, rng = perfect(seed, duration_s=20.0, rate_hz=100.0), np.random.default_rng(seed)
+        gyro, accel = (u + size * rng.normal(size=u.shape) for u, size in ((exact.imu.gyro, 0.02), (exact.imu.accel, 0.2)))
+        noisy.append(tmp_path / f"{seed}.mcap")
+        write(replace(exact, imu=Imu(exact.imu.t_ns, gyro, accel)), noisy[-1])
+    chosen = msgspec.structs.replace(HYBRID, steps=20, gyro_window_s=(1.0, 4.0), model={"ode": SMALL_ODE})
+    model = train(noisy, tmp_path / "m.safetensors", settings=chosen)
     assert isinstance(model, hybrid.Model)
     assert model.ode is None
     assert not model.config.remainder
