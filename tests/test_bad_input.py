@@ -36,7 +36,8 @@ CONFIG, DATA, LOG, MODEL, INTERRUPTED = 3, 4, 5, 6, 130
 DISK_BYTES = 200_000  # less than any log here, more than any message
 WAIT_S = 120.0  # for the middle of a run, on a machine busy with other things
 TRIES = 20  # the middle may pass between two looks
-QUICK = [w for s in ("steps=120", "samples=400", "gyro_window_s=[0.5]", "accel_window_s=[0.5]") for w in ("--set", s)]
+QUICK_SETTINGS = ("steps=120", "samples=400", "gyro_window_s=[0.5]", "accel_window_s=[0.5]")
+QUICK = ["--method", "neural_ode", *(word for setting in QUICK_SETTINGS for word in ("--set", setting))]
 
 
 def digests(folder: Path) -> dict[str, str]:

@@ -1,7 +1,7 @@
 """What the drift's step and solver do to the answer: `python tests/bench/solver_step.py MODEL.safetensors LOG...`.
 
 Prints the AOE (degrees, start from the truth) of a neural_ode model, its drift stepped as trained, at a half and a quarter of
-that, and with rk4 in place of Euler. The step also sets over how many samples the network's inputs are averaged.
+that, and with rk4 in place of Euler.
 """
 
 from __future__ import annotations

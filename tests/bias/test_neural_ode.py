@@ -236,7 +236,7 @@ FAST_PATH_RAD_S = 1e-5
 
 def test_without_drift_the_joint_equation_and_the_fast_path_are_one(build: MakeModel) -> None:
     n = 101
-    model, t, gyro = at_a_high_rate(n, drift_step_s=0.02, drift=())
+    model, t, gyro = at_a_high_rate(n, drift_step_s=0.02)
     curve, drift = model.curve["gyro"], model.drift["gyro"]
     assert isinstance(curve, Curve)
     assert isinstance(drift, Drift)
