@@ -71,6 +71,23 @@ def test_a_debiased_log_is_read_without_imutool(tmp_path: Path, logs: Path, exam
     assert abs(corrected) < 0.01 < abs(raw)  # at rest; the bias of this sensor is some 0.04 rad/s
 
 
+def test_the_papers_tables_are_made_in_one_command(tmp_path: Path, data: Path, example: Example) -> None:
+    """On the smallest data set, by the quickest method; the raw column is the published one."""
+    words = ("--set", "fetch", "--method", "linear", "--seeds", "1", "--workers", "1")
+    printed = example("reproduce_tables.py", data, "-o", "out", *words)
+    row = next(line for line in printed.splitlines() if line.startswith("| 05_random"))
+    raw, linear = (re.search(r"\((\d+\.\d+) / \d+\) (\d+\.\d+) / ", cell) for cell in row.split("|")[2:4])
+    assert raw is not None
+    assert linear is not None
+    assert abs(float(raw[2]) - float(raw[1])) < 0.11
+    assert float(linear[2]) < 0.2 * float(raw[2])
+    page = (tmp_path / "out" / "tables.html").read_text(encoding="utf-8")
+    assert page.count("<table>") == 3
+    assert page.count("data:image/png;base64,") == 1
+    assert "http" not in page
+    assert example("reproduce_tables.py", data, "-o", "out", *words) == printed  # nothing is made twice
+
+
 def test_every_example_is_run_here() -> None:
     here = Path(__file__).read_text()
     assert all(f'"{path.name}"' in here for path in EXAMPLES.glob("*.py"))

@@ -1,7 +1,7 @@
 """What each way to know the rest bias is worth: `python tests/bench/starts.py FOLDER MODEL`.
 
 FOLDER holds logs of the training sequences (`imutool convert`), MODEL is of the same sensor and trained on others, as those of
-`python tests/bench/accuracy.py DATA --swap --keep FOLDER` are. Prints the AOE in degrees of pure integration from the true
+`python examples/reproduce_tables.py DATA -o FOLDER --swap` are. Prints the AOE in degrees of pure integration from the true
 pose:
 
     truth     start from 5 s of truth, weighed against the training runs      prior    mean of the training runs

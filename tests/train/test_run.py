@@ -350,3 +350,8 @@ def test_helps_asks_for_a_gain_on_one_sensor_and_no_harm_to_the_other() -> None:
     assert not helps(before, {"gyro": 0.99, "accel": 1.99}), "too little"
     assert not helps(before, {"gyro": 0.5, "accel": 2.2}), "harm"
     assert not helps(before, before)
+
+
+def test_static_is_not_trained(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="static is not trained"):
+        train([], tmp_path / "model.safetensors", method="static")
