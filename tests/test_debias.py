@@ -31,7 +31,7 @@ from imutool.turn_on import TurnOn, at_rest, auto, following, from_truth, given,
 
 RATE_HZ = 200.0
 ONLINE = 1e-6  # rad/s and m/s²: the contract's figure
-NEW = ("/imu0/debiased", "/imu0/bias/gyro", "/imu0/bias/accel")
+NEW = ("/imu0/debiased", "/imu0/bias/gyro", "/imu0/bias/accel", "/imu0/bias")
 IMAGES = [(1_700_003_600_100_000_000 + 100_000_000 * i, bytes([i]) * 5000) for i in range(20)]
 
 
@@ -158,7 +158,8 @@ def test_the_topics_their_schemas_and_where_they_come_from(target: Path) -> None
     found = {c.topic: (summary.schemas[c.schema_id].name, c.message_encoding, c) for c in summary.channels.values()}
     kinds = {topic: found[topic][:2] for topic in NEW}
     vector = ("geometry_msgs/msg/Vector3Stamped", "cdr")
-    assert kinds == {NEW[0]: ("sensor_msgs/msg/Imu", "cdr"), NEW[1]: vector, NEW[2]: vector}
+    twist = ("geometry_msgs/msg/TwistWithCovarianceStamped", "cdr")
+    assert kinds == {NEW[0]: ("sensor_msgs/msg/Imu", "cdr"), NEW[1]: vector, NEW[2]: vector, NEW[3]: twist}
     for topic in NEW:
         assert found[topic][2].metadata["imutool_source_topic"] == "/imu0"
         assert "offered_qos_profiles" in found[topic][2].metadata
@@ -201,9 +202,29 @@ def test_covariances_are_positive_and_as_large_as_the_noise(source: Path, tmp_pa
     orientation, *others = covariances(tmp_path / "out.mcap")
     assert (orientation[:, 0, 0] == -1).all()  # as REP 145 says: no orientation here
     for covariance, noise in zip(others, (2.4e-3, 0.028), strict=True):
-        assert (covariance == covariance[0]).all()
-        assert (np.linalg.eigvalsh(covariance[0]) > 0.5 * noise**2).all()
-        assert np.count_nonzero(covariance[0]) == 3
+        assert (np.linalg.eigvalsh(covariance) > 0.5 * noise**2).all()
+        np.testing.assert_allclose(covariance, covariance.transpose(0, 2, 1), rtol=1e-9, atol=1e-15)
+
+
+def test_the_bias_comes_with_its_covariance(target: Path) -> None:
+    """Angular is the gyro's, linear the accelerometer's, and a message's is that of its bias and white noise."""
+    with AnyReader([target]) as bag:
+        found: dict[str, list[Any]] = {topic: [] for topic in NEW}
+        for connection, _, raw in bag.messages([c for c in bag.connections if c.topic in NEW]):
+            found[connection.topic].append(bag.deserialize(raw, connection.msgtype))
+    for imu, gyro, accel, both in zip(*(found[topic] for topic in NEW), strict=True):
+        twist, P = both.twist.twist, both.twist.covariance.reshape(6, 6)
+        assert (twist.angular.x, twist.angular.z) == (gyro.vector.x, gyro.vector.z)
+        assert (twist.linear.x, twist.linear.z) == (accel.vector.x, accel.vector.z)
+        for covariance, unsure in (
+            (imu.angular_velocity_covariance, P[3:, 3:]),
+            (imu.linear_acceleration_covariance, P[:3, :3]),
+        ):
+            white = covariance.reshape(3, 3) - unsure
+            np.testing.assert_allclose(white, np.diag(np.diag(white)), atol=1e-12)
+            assert (np.diag(white) > 0).all()
+    first = found["/imu0/bias"][0].twist.covariance.reshape(6, 6)
+    assert (np.linalg.eigvalsh(first) > 0).all()
 
 
 def test_the_provenance_says_what_it_takes_to_do_it_again(source: Path, target: Path, model_file: Path) -> None:
@@ -347,7 +368,9 @@ def test_several_imus_each_get_their_own(recording: Recording, tmp_path: Path, m
     with pytest.raises(LogError, match=r"IMU topics: /imu0, /imu1; expected one.*--imu"):
         debias(log, tmp_path / "out.mcap", model=model_file)
     report = debias(log, tmp_path / "out.mcap", model=model_file, imus=["/imu0", "/imu1"])
-    assert set(report.rewrite.added) == {f"{imu}{name}" for imu in both for name in ("/debiased", "/bias/gyro", "/bias/accel")}
+    assert set(report.rewrite.added) == {
+        f"{imu}{name}" for imu in both for name in ("/debiased", "/bias/gyro", "/bias/accel", "/bias")
+    }
     assert [name for name, _ in metadata(tmp_path / "out.mcap")] == ["imutool/imu0", "imutool/imu1"]
     a, b = (read(tmp_path / "out.mcap", imu=f"{imu}/debiased").imu for imu in both)
     assert not np.array_equal(a.gyro, b.gyro)
@@ -511,7 +534,7 @@ def test_a_real_log_keeps_every_message_and_opens_elsewhere(data: Path, tmp_path
         summary = make_reader(file).get_summary()
     assert summary is not None
     assert summary.statistics is not None
-    assert summary.statistics.message_count == report.rewrite.copied + 3 * 20320
+    assert summary.statistics.message_count == report.rewrite.copied + 4 * 20320
     with AnyReader([out]) as bag:
         found = {c.topic: c.msgcount for c in bag.connections}
         assert {found[topic] for topic in NEW} == {20320}
