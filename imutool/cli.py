@@ -469,7 +469,8 @@ def models(json_to: Json = None, verbose: Verbose = False, quiet: Quiet = False)
     for path in sorted(library().glob("*.safetensors")):
         about = header_of(path)
         keys = ("method", "sensor", "dataset", "rate_hz")
-        found.append({"name": path.stem, **{key: about.get(key) for key in keys}})
+        one = {"name": path.stem, **{key: about.get(key) for key in keys}}
+        found.append({**one, "rate_hz": round(float(about["rate_hz"]), 1)})
     if write_json({"schema": "imutool.models/1", "models": found}, json_to):
         return
     if found:

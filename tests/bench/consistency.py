@@ -72,7 +72,7 @@ def windows(model: BiasModel, recording: Recording, start: str) -> tuple[np.ndar
     while (last := int(np.searchsorted(t_s, t_s[min(first, len(t_s) - 1)] + TRUTH_S))) < len(t_s):
         rows = slice(first, last + 1)
         if trusted[first] and trusted[rows].mean() >= LEAST_TRUSTED:
-            v_w = torch.from_numpy(poses.v_w[rows])
+            v_w = torch.from_numpy(np.array(poses.v_w[rows]))
             errors.append(truth_offset(t_s[rows], left[rows], R_wb[rows], v_w, trusted[rows])[:3])
             covariances.append(P[rows].mean(axis=0) + measured)
         first = last
