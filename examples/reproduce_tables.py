@@ -154,11 +154,12 @@ def table(rows: list[dict[str, Any]], methods: Iterable[str], start: str) -> str
             own = [row for row in chosen if row["log"] == log and row["method"] == method]
             aoe, ape = (np.array([row[key] for row in own]) for key in ("aoe_deg", "ape_m"))
             data_set = next(name for name in TRAIN if log in (*TRAIN[name], *TEST[name]))
-            means.setdefault(data_set, {}).setdefault(method, []).append(float(aoe.mean()))
+            if own:
+                means.setdefault(data_set, {}).setdefault(method, []).append(float(aoe.mean()))
             cells.append(f"{_published(log, method)}{_spread(aoe, '.2f')} / {_spread(ape, '.0f')}")
         lines.append(f"| {log} | " + " | ".join(cells) + " |")
     for data_set, by_method in means.items():
-        cells = [f"**{np.mean(by_method[method]):.2f}**" for method in ("raw", *methods)]
+        cells = [f"**{np.mean(by_method[method]):.2f}**" if method in by_method else "–" for method in ("raw", *methods)]
         lines.append(f"| **{data_set}, mean** | " + " | ".join(cells) + " |")
     return "\n".join(lines)
 
@@ -173,7 +174,8 @@ def _published(log: str, method: str) -> str:
 def _spread(values: np.ndarray, form: str) -> str:
     if not len(values):
         return "–"
-    return f"{values.mean():{form}}" + (f" ± {values.std(ddof=1):{form}}" if len(values) > 1 and values.std() > 0 else "")
+    mean, spread = f"{values.mean():{form}}", f"{values.std(ddof=1):{form}}" if len(values) > 1 else "0"
+    return f"{mean} ± {spread}" if float(spread) > 0 else mean
 
 
 def plots(jobs: list[Job]) -> list[tuple[str, str]]:
