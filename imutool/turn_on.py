@@ -28,14 +28,13 @@ from imutool.rest_track import Along, Following, Known, Passed, Samples, Track, 
 from imutool.rest_track import smooth as smooth_track
 from imutool.stationary import stretches, white_noise
 from imutool.strapdown import GRAVITY_W, with_velocity
-from imutool.windows import attitudes, between, huber_weight, running_product
+from imutool.windows import HUBER_MEDIANS, attitudes, between, huber_weight, running_product
 
 TRUTH_S = 15.0  # how much of the truth a start takes: of 3, 5, 8, 10 and 15 s the best on training logs left out in turn
 LEAST_TRUTH_S = 1.0
 AT_REST_STD = np.array([1e-4] * 3 + [0.03] * 3)  # earth's rotation; local gravity and what a tilt hides
 REST_BEGINS_WITHIN_S = 5.0  # later, its bias would be one of the future
 ITERATIONS = 4
-HUBER_MEDIANS = 1.5
 MAD_TO_STD = 1.4826
 LEAST_STD = np.array([1e-6] * 3 + [1e-4] * 3)  # a prior without any doubt would leave nothing to estimate
 FOLLOWED = "gravity in motion and every stop"

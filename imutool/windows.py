@@ -16,6 +16,8 @@ from torch import Tensor
 
 from imutool import so3
 
+HUBER_MEDIANS = 1.5  # where a residual begins to count as an outlier, in medians of its kind
+
 Samples = Float[Tensor, "batch n 3"]
 Steps = Float[Tensor, "batch n-1"]
 

@@ -18,12 +18,11 @@ from imutool.bias._base import COLUMNS, BiasModel, Sensor
 from imutool.errors import DataError
 from imutool.strapdown import GRAVITY_W
 from imutool.train.segments import Part, Pool, Windows
-from imutool.windows import attitudes, between, huber_weight, rotation_residual, velocity_residual
+from imutool.windows import HUBER_MEDIANS, attitudes, between, huber_weight, rotation_residual, velocity_residual
 
 W_PRIOR = 0.05  # plausible misalignment; a scale error of 0.1 is two of these
 REST_PRIOR = {"gyro": 0.1, "accel": 1.0}  # rad/s, m/s²: plausible turn-on biases
 CORRELATED = 10.0  # errors of the truth last longer than a window: this many windows are taken to say the same once
-HUBER_MEDIANS = 1.5
 LEAST_RESIDUAL = 1e-6  # rad or m/s: no truth is better, and perfect data must not outweigh the prior beyond float64's digits
 ITERATIONS, REST_ITERATIONS = 6, 3  # the rest alone is nearly linear
 MAX_SAMPLES = 120_000  # of one window length, so that hours of logs cost no more memory than minutes

@@ -20,10 +20,10 @@ from imutool.errors import DataError
 from imutool.physics.effects._base import Effect, patterns
 from imutool.physics.signals import Signals
 from imutool.strapdown import GRAVITY_W
-from imutool.train.closed_form import CORRELATED, HUBER_MEDIANS, REST_PRIOR, median_per_log
+from imutool.train.closed_form import CORRELATED, REST_PRIOR, median_per_log
 from imutool.train.normal_equations import Equations, Problem
 from imutool.train.segments import Part, Pool, Windows
-from imutool.windows import attitudes, huber_weight, rotation_residual, velocity_residual
+from imutool.windows import HUBER_MEDIANS, attitudes, huber_weight, rotation_residual, velocity_residual
 
 WINDOW_S: Mapping[Sensor, tuple[float, ...]] = {"gyro": (1.0, 4.0, 15.0, 40.0), "accel": (0.5, 2.0, 5.0)}
 JUDGED_FROM_S: Mapping[Sensor, float] = {"gyro": 4.0, "accel": 2.0}  # drift over short windows does not rank calibrations

@@ -17,9 +17,7 @@ from imutool import so3
 from imutool.bias._base import BiasModel, Sensor
 from imutool.strapdown import GRAVITY_W
 from imutool.train.segments import Windows
-from imutool.windows import attitudes, between, end_attitude, huber
-
-HUBER_MEDIANS = 1.5
+from imutool.windows import HUBER_MEDIANS, attitudes, between, end_attitude, huber
 
 
 def orientation_error(model: BiasModel, windows: Windows) -> Float[Tensor, " batch"]:
