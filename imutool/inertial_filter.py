@@ -52,13 +52,11 @@ Positive = Annotated[float, Meta(gt=0)]
 
 
 class FilterSettings(Settings, frozen=True, kw_only=True):
-    """Noise of the samples and their biases, and what motion and rest are like."""
+    """Noise of the samples, and what motion and rest are like."""
 
     gyro_density: Positive = 5e-4  # rad/s/sqrt(Hz)
     accel_density: Positive = 0.02  # m/s²/sqrt(Hz): of a calibration in motion rather than of the sensor
     gyro_scale: Positive = 2e-3  # error of a turn, as a share of it
-    gyro_walk: Positive = 1e-4  # rad/s/sqrt(s)
-    accel_walk: Positive = 2e-3  # m/s²/sqrt(s)
     speed_m_s: Positive = 1.0  # per axis
     speed_correlation_s: Positive = 0.5
     rest_m_s: Positive = 0.05  # of a block at rest
@@ -131,13 +129,13 @@ def level(accel: Vector3, bias: Vector6, ground: Vector6, P_bias: Float64[np.nda
     return State(exp(turn), np.zeros(3), np.zeros(3), bias, ground, P)
 
 
-def move(x: State, motion: Increment, missing_s: float, s: FilterSettings) -> Step:
-    """Through a block in motion, integrated with the bias of `x`; then the bounded velocity."""
+def move(x: State, motion: Increment, missing_s: float, walk: Vector6, s: FilterSettings) -> Step:
+    """Through a block in motion, integrated with the bias of `x`; then the bounded velocity. `walk` is b's in a second^1/2."""
     T = motion.duration_s
     R = x.R_wb @ motion.R
     turn = s.gyro_density**2 * T + (s.gyro_scale * motion.turned_rad) ** 2 + (MISSING_RAD_S * missing_s) ** 2
     push = s.accel_density**2 * T + (MISSING_M_S2 * missing_s) ** 2
-    step = _expect(x, R, motion.v, motion.p, motion.by_bias, T, (turn, push), s, resting=False)
+    step = _expect(x, R, motion.v, motion.p, motion.by_bias, T, (turn, push), walk, resting=False)
     noise = 2.0 * s.speed_m_s**2 * s.speed_correlation_s / T
     v = step.expected.v_w
     size = np.sqrt(v @ v / 3.0 / (np.trace(step.expected.P[VELOCITY, VELOCITY]) / 3.0 + noise))
@@ -145,13 +143,13 @@ def move(x: State, motion: Increment, missing_s: float, s: FilterSettings) -> St
     return step._replace(after=update(step.expected, STOPPED, v, np.full(3, noise)))
 
 
-def stand(x: State, mean: Vector6, variance: Float64[np.ndarray, "3"], T: float, s: FilterSettings) -> Step:
+def stand(x: State, mean: Vector6, variance: Float64[np.ndarray, "3"], T: float, walk: Vector6, s: FilterSettings) -> Step:
     """Through a block at rest, from the samples' mean and the variance of the gyro's: no velocity, no rate."""
     dv = (mean[3:] - x.bias[3:] - x.ground[3:]) * T
     by_bias = np.zeros((9, 6))
     by_bias[3:6, 3:], by_bias[6:, 3:] = -T * np.eye(3), -0.5 * T**2 * np.eye(3)
     push = s.accel_density**2 * T
-    step = _expect(x, x.R_wb, dv, 0.5 * T * dv, by_bias, T, (LEAST_VARIANCE, push), s, resting=True)
+    step = _expect(x, x.R_wb, dv, 0.5 * T * dv, by_bias, T, (LEAST_VARIANCE, push), walk, resting=True)
     after = update(step.expected, STOPPED, step.expected.v_w, np.full(3, s.rest_m_s**2))
     rate = after.rest_bias(True)[:3] - mean[:3]
     return step._replace(after=update(after, STILL, rate, variance + s.rest_rad_s**2))
@@ -165,7 +163,7 @@ def _expect(
     by_bias: Float64[np.ndarray, "9 6"],
     T: float,
     noise: tuple[float, float],
-    s: FilterSettings,
+    walk: Vector6,
     *,
     resting: bool,
 ) -> Step:
@@ -185,9 +183,8 @@ def _expect(
         np.concatenate([np.zeros((3, 3)), np.eye(3), 0.5 * T * np.eye(3)]),
     )
     P[POSE, POSE] += noise[0] * turn_noise @ turn_noise.T + noise[1] * push_noise @ push_noise.T
-    walk = np.concatenate([np.full(3, s.gyro_walk), np.full(3, s.accel_walk)]) ** 2 * T
     P[np.arange(SIZE), np.arange(SIZE)] += LEAST_VARIANCE
-    P[np.arange(9, 15), np.arange(9, 15)] += walk
+    P[np.arange(9, 15), np.arange(9, 15)] += walk**2 * T
     expected = State(R, v, p, x.bias, x.ground, 0.5 * (P + P.T))
     return Step(x, expected, F, expected)
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
@@ -21,6 +21,7 @@ from imutool.preintegration import integrate
 from imutool.stationary import GAP_PERIODS, Stillness
 
 BLOCK_S = 0.5
+USUAL_WALK = np.array([1e-4] * 3 + [2e-3] * 3)  # of a sensor nobody trained a model for
 LOST_S = 1.0  # without samples for longer, attitude and velocity are anybody's guess
 CHUNK_S, LOOK_AHEAD_S = 600.0, 600.0  # of smoothing: a bias has walked away from what it was ten minutes ago
 
@@ -29,11 +30,15 @@ Samples = tuple[Float64[np.ndarray, " n"], Float64[np.ndarray, "n 3"], Float64[n
 
 @dataclass(frozen=True)
 class Known:
-    """What is known of a run's biases before it: b in motion, and by how much it differs at rest (mean zero)."""
+    """What is known of a run's biases before it: b in motion, by how much it differs at rest (mean zero), how far b walks.
+
+    `walk` is in rad/s and m/s² per second^1/2.
+    """
 
     mean: Vector6
     std: Vector6
     ground_std: Vector6
+    walk: Vector6 = field(default_factory=lambda: USUAL_WALK.copy())
 
 
 class Track(NamedTuple):
@@ -137,9 +142,10 @@ class RestFilter:
         elif rests:
             still = u[:-1]
             variance = still[:, :3].var(axis=0) / len(still)
-            step = inertial_filter.stand(x, still.mean(axis=0), variance, float(t[-1] - t[0]), s)
+            step = inertial_filter.stand(x, still.mean(axis=0), variance, float(t[-1] - t[0]), self._known.walk, s)
         else:
-            step = inertial_filter.move(x, integrate(t, u[:, :3] - x.bias[:3], u[:, 3:] - x.bias[3:]), block.missing_s, s)
+            motion = integrate(t, u[:, :3] - x.bias[:3], u[:, 3:] - x.bias[3:])
+            step = inertial_filter.move(x, motion, block.missing_s, self._known.walk, s)
         self.state = step.after
         return Passed(float(t[0]), float(t[-1]), rests, step)
 
@@ -150,9 +156,9 @@ class Following:
     Until `hold_s` the start's own rest bias stands: the stop that the log begins with, seen whole.
     """
 
-    def __init__(self, model: BiasModel, known: Known, rest: Vector6, hold_s: float, settings: FilterSettings | None) -> None:
+    def __init__(self, model: BiasModel, known: Known, rest: Vector6, hold_s: float) -> None:
         self._motion, self._mean = model.stream(known.mean), known.mean
-        self.filter = RestFilter(known, settings)
+        self.filter = RestFilter(known)
         self._rest, self._now, self._hold_s = rest, rest, hold_s
         self._sure = np.diag(known.std**2)
         self.covariance = np.zeros((0, 6, 6))  # of the rest bias, at each of the samples given last

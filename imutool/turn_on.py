@@ -4,16 +4,17 @@ Every way gives a value and how sure it is; a measurement and the prior are comb
 measurement along one direction, as a Kalman update). With a model that adds a motion-dependent part C(u), what is
 measured is what is left of the samples after that part.
 
-`auto` is a start and more: from there on the rest bias is followed, by every stop and by gravity in motion
-(`imutool.rest_track`), so that the bias of a sample depends on that sample and earlier ones. The one exception is the stop that
-a log begins with: its samples get what the whole of it says. `smooth` takes the whole log for each sample.
+`auto` and `truth` are a start and more: from there on the rest bias is followed, by every stop and by gravity in motion
+(`imutool.rest_track`), so that the bias of a sample depends on that sample and earlier ones. The one exception is what the start
+was measured on, the stop that a log begins with or the first seconds of truth: its samples get what the whole of it says.
+`smooth` takes the whole log for each sample.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import torch
@@ -24,7 +25,7 @@ from imutool import so3
 from imutool.bias._base import BiasModel, Stream, Vector6
 from imutool.errors import ConfigError, DataError
 from imutool.recording import GRAVITY_M_S2, Imu, Recording, nanoseconds, seconds
-from imutool.rest_track import Along, Following, Known, Passed, Samples, Track, followed
+from imutool.rest_track import USUAL_WALK, Along, Following, Known, Passed, Samples, Track, followed
 from imutool.rest_track import smooth as smooth_track
 from imutool.stationary import stretches, white_noise
 from imutool.strapdown import GRAVITY_W, with_velocity
@@ -50,8 +51,8 @@ class NoRestError(DataError):
 class TurnOn:
     """A rest bias (gyro rad/s, accel m/s²), its standard deviation, and how it came about in a few words.
 
-    It holds for the whole log, or is where something begins: `track`, the rest bias in time, or with `follows` what the samples
-    show from `hold_s` on (s from the first sample).
+    It holds for the whole log, or is where something begins: `track`, the rest bias in time, or what the samples show from
+    `hold_s` on (s from the first sample), given that `follows` was known before them.
     """
 
     rest: Vector6
@@ -59,15 +60,15 @@ class TurnOn:
     how: str
     noise: Vector6 = field(default_factory=lambda: np.zeros(6))  # of a sample, where it could be measured
     track: Track | None = None
-    follows: bool = False
+    follows: Known | None = None
     hold_s: float = 0.0
 
     def stream(self, model: BiasModel) -> Stream:
         """The model at work from this start on."""
         if self.track is not None:
             return Along(model, self.track)
-        if self.follows:
-            return Following(model, known(model), self.rest, self.hold_s, None)
+        if self.follows is not None:
+            return Following(model, self.follows, self.rest, self.hold_s)
         return model.stream(self.rest)
 
 
@@ -99,7 +100,8 @@ def auto(model: BiasModel, imu: Imu) -> TurnOn:
         DataError: an untrained model, and the log does not start at rest.
     """
     rested: list[Passed] = []
-    for block in followed(model, [_samples(imu)], known(model), ahead=True):
+    before = known(model)
+    for block in followed(model, [_samples(imu)], before, ahead=True):
         if not block.resting:
             break
         rested.append(block)
@@ -114,13 +116,13 @@ def auto(model: BiasModel, imu: Imu) -> TurnOn:
     used = f"{end - rested[0].start_s:.1f} s at rest from 0.0 s on"
     if model.card:
         used = f"{used}, {_from_training(model)}"
-    return TurnOn(state.rest_bias(True), std, f"{used}, {_sure(std)}, then {FOLLOWED}", noise, follows=True, hold_s=end)
+    return TurnOn(state.rest_bias(True), std, f"{used}, {_sure(std)}, then {FOLLOWED}", noise, follows=before, hold_s=end)
 
 
 def following(model: BiasModel) -> TurnOn:
     """The prior, and from the first sample on what the samples show: for a live node, which cannot look ahead."""
     start = prior(model)
-    return TurnOn(start.rest, start.std, f"{_from_training(model)}, {_sure(start.std)}, then {FOLLOWED}", follows=True)
+    return TurnOn(start.rest, start.std, f"{_from_training(model)}, {_sure(start.std)}, then {FOLLOWED}", follows=known(model))
 
 
 def smooth(model: BiasModel, batches: Iterable[Samples], where: str = "") -> TurnOn:
@@ -144,9 +146,11 @@ def smooth(model: BiasModel, batches: Iterable[Samples], where: str = "") -> Tur
 
 
 def known(model: BiasModel) -> Known:
-    """What the training runs say of the next run's biases."""
+    """What the training runs say of the next run's biases; how far they walk is alike for the axes of a sensor."""
     ground = np.maximum(_numpy(model.rest_std), AT_REST_STD)
-    return Known(_numpy(model.prior_mean), np.maximum(_numpy(model.prior_std), LEAST_STD), ground)
+    walk = np.repeat(np.sqrt(np.mean(_numpy(model.walk_std).reshape(2, 3) ** 2, axis=1)), 3)
+    walk = np.where(walk > 0, walk, USUAL_WALK)
+    return Known(_numpy(model.prior_mean), np.maximum(_numpy(model.prior_std), LEAST_STD), ground, walk)
 
 
 def rest_spread(model: BiasModel, logs: Sequence[Samples], rest: Float64[np.ndarray, "logs 6"]) -> Vector6:
@@ -278,6 +282,8 @@ def _from_rest(model: BiasModel, imu: Imu, found: Sequence[tuple[int, int]]) -> 
 def from_truth(model: BiasModel, recording: Recording, truth_s: float = TRUTH_S) -> TurnOn:
     """From the first seconds of true poses, as many as there are up to `truth_s` (gaps do no harm), and the prior.
 
+    They hold for as long as they last; from there on the rest bias is followed.
+
     Raises:
         DataError: no truth, or less than a second of it.
     """
@@ -301,9 +307,13 @@ def from_truth(model: BiasModel, recording: Recording, truth_s: float = TRUTH_S)
     offset = truth_offset(t[rows], left, R_wb, torch.from_numpy(np.array(poses.v_w)), trusted[rows])
     var, measured = start.std**2, _numpy(model.truth_std) ** 2 * (TRUTH_S / found_s) ** 2
     gain = np.divide(var, var + measured, out=np.zeros(6), where=var > 0)  # a prior without doubt stays
-    how = f"truth over {found_s:.1f} s"
-    how += ", weighed against the training runs" if model.card else ""
-    return TurnOn(start.rest + gain * offset, np.sqrt(gain * measured), how)
+    rest, std = start.rest + gain * offset, np.sqrt(gain * measured)
+    how = f"truth over {found_s:.1f} s{', weighed against the training runs' if model.card else ''}, {_sure(std)}"
+    if not model.card:
+        return TurnOn(rest, std, how)
+    before = replace(known(model), mean=rest, std=np.maximum(std, LEAST_STD))
+    ends = seconds(piece.t_ns[-1:], int(recording.imu.t_ns[0]))[0]
+    return TurnOn(rest, std, f"{how}, then {FOLLOWED}", follows=before, hold_s=float(ends))
 
 
 def truth_offset(

@@ -13,6 +13,7 @@ from pathlib import Path
 import pytest
 
 from imutool import cli, errors, registry, terminal
+from imutool.cli._figures import epoch_line
 from imutool.demo import write_asl
 from imutool.physics.flight import flight
 from imutool.train.fit import Epoch
@@ -233,8 +234,8 @@ def test_nothing_is_folded_where_nobody_looks_at_a_terminal(
 
 def test_progress_tells_loss_held_out_error_and_time_left() -> None:
     epoch = Epoch("gyro", step=40, steps=120, loss=0.25, held_out=0.0174533, best=0.00872665, left_s=83.2)
-    assert cli._epoch(epoch) == (40, 120, "gyro 40/120: loss 0.250, held out 1.000° (best 0.500), 1:23 left")
-    done, total, text = cli._epoch(Epoch("accel", 0, 0, float("nan"), 0.5, 0.5, 0.0))
+    assert epoch_line(epoch) == (40, 120, "gyro 40/120: loss 0.250, held out 1.000° (best 0.500), 1:23 left")
+    done, total, text = epoch_line(Epoch("accel", 0, 0, float("nan"), 0.5, 0.5, 0.0))
     assert (done, total, text) == (0, 1, "accel 0/0: held out 0.500 m/s (best 0.500)")
 
 

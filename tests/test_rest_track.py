@@ -148,7 +148,7 @@ def test_nothing_later_changes_what_came_before() -> None:
         np.concatenate([imu.gyro[:cut], other.gyro[cut:]]),
         np.concatenate([imu.accel[:cut], 2.0 * other.accel[cut:]]),
     )
-    one, two = (Following(model(), KNOWN, np.zeros(6), 0.0, None)(*samples(some)) for some in (imu, changed))
+    one, two = (Following(model(), KNOWN, np.zeros(6), 0.0)(*samples(some)) for some in (imu, changed))
     np.testing.assert_array_equal(one[:cut], two[:cut])
     assert np.abs(one[cut + 200 :] - two[cut + 200 :]).max() > 1e-5
 
@@ -156,8 +156,8 @@ def test_nothing_later_changes_what_came_before() -> None:
 @pytest.mark.parametrize("size", [1, 7, 1000])
 def test_batches_of_any_size_give_the_same_numbers(size: int) -> None:
     t, gyro, accel = samples(biased(9, duration_s=12.0, still_s=3.0))
-    whole = Following(model(), KNOWN, np.zeros(6), 0.0, None)(t, gyro, accel)
-    stream = Following(model(), KNOWN, np.zeros(6), 0.0, None)
+    whole = Following(model(), KNOWN, np.zeros(6), 0.0)(t, gyro, accel)
+    stream = Following(model(), KNOWN, np.zeros(6), 0.0)
     parts = [stream(t[a : a + size], gyro[a : a + size], accel[a : a + size]) for a in range(0, len(t), size)]
     np.testing.assert_array_equal(np.concatenate(parts), whole)
     assert len(np.unique(whole[:, 0])) > 15

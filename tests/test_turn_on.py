@@ -19,6 +19,7 @@ from imutool.physics.flight import FlightSettings as Flight
 from imutool.physics.flight import TriadSettings, flight, trajectory
 from imutool.recording import GRAVITY_M_S2, Imu, Poses, Recording, seconds
 from imutool.rest_track import Samples
+from imutool.strapdown import dead_reckon
 from imutool.turn_on import (
     AT_REST_STD,
     TRUTH_S,
@@ -193,13 +194,31 @@ def test_twelve_seconds_of_truth_show_the_bias(biased: Recording) -> None:
     start = from_truth(sees_everything(), biased)
     assert (np.abs(start.rest - np.concatenate([GYRO_BIAS, ACCEL_BIAS])) < TRUTH).all()
     np.testing.assert_allclose(start.std, 1e-6 * TRUTH_S / 12.0, rtol=1e-6)  # less truth than the model's figure is of
-    assert start.how == "truth over 12.0 s"
+    assert start.how == "truth over 12.0 s, ±1e-06 rad/s"
+
+
+def test_after_the_truth_the_rest_bias_is_followed_from_what_it_showed() -> None:
+    """Four seconds of truth, and a stop after which the gyro is another; the start itself knows nothing of that."""
+    imu, attitude = resting([(5.0, 15.0)])
+    debiased = Imu(imu.t_ns, imu.gyro - GYRO_BIAS, imu.accel - ACCEL_BIAS)
+    poses = dead_reckon(debiased, (attitude[0].as_quat(scalar_first=True), np.zeros(3), np.zeros(3)))
+    truth = {"/truth": poses.rows(slice(0, int(4 * RATE_HZ) + 1))}
+    moved = np.where(np.arange(len(imu))[:, None] >= 5 * RATE_HZ, [2e-3, 0.0, 0.0], 0.0)
+    made = trained(prior_std=0.05, truth_std=1e-4)
+    before, after = (from_truth(made, Recording("one", Imu(imu.t_ns, imu.gyro + x, imu.accel), truth)) for x in (0.0, moved))
+    np.testing.assert_allclose(before.rest, after.rest, rtol=1e-12)
+    assert after.how.endswith("then gravity in motion and every stop")
+    bias = after.stream(made)(*samples(Imu(imu.t_ns, imu.gyro + moved, imu.accel)))
+    held = int(after.hold_s * RATE_HZ)
+    np.testing.assert_array_equal(bias[:held], np.tile(after.rest, (held, 1)))
+    assert held == int(4 * RATE_HZ)
+    np.testing.assert_allclose(bias[int(15 * RATE_HZ), :3], GYRO_BIAS + [2e-3, 0.0, 0.0], atol=5e-4)
 
 
 def test_a_shorter_truth_can_be_asked_for(biased: Recording) -> None:
     start = find("truth:4", sees_everything(), biased)
     assert (np.abs(start.rest - np.concatenate([GYRO_BIAS, ACCEL_BIAS])) < TRUTH).all()
-    assert start.how == "truth over 4.0 s"
+    assert start.how == "truth over 4.0 s, ±4e-06 rad/s"
     np.testing.assert_allclose(start.std, 1e-6 * TRUTH_S / 4.0, rtol=1e-6)
     for word in ("truth:0", "truth:nan", "truth:five"):
         with pytest.raises(ConfigError, match="truth:SECONDS"):
@@ -270,7 +289,8 @@ def test_auto_is_the_stop_the_log_begins_with_and_says_how_sure() -> None:
     start = auto(trained(prior_std=0.05), imu)
     np.testing.assert_allclose(start.rest[:3], GYRO_BIAS, atol=5e-4)
     assert start.how == "4.0 s at rest from 0.0 s on, prior of 6 runs, ±0.0002 rad/s, then gravity in motion and every stop"
-    assert (start.hold_s, start.follows, start.track) == (pytest.approx(4.0, abs=0.01), True, None)
+    assert (start.hold_s, start.follows, start.track) == (pytest.approx(4.0, abs=0.01), start.follows, None)
+    assert start.follows is not None and (start.follows.std[:3] == 0.05).all(), "from what was known before that stop"
     np.testing.assert_allclose(start.noise[:3], NOISE[:3], rtol=0.3)
 
 
@@ -379,7 +399,7 @@ def test_each_word_finds_its_way(biased: Recording) -> None:
     assert "at rest" in how["auto"]
     assert how["auto"].startswith("4.0 s at rest from 0.0 s on, prior of the training runs, ±")
     assert how["1,2,3,4,5,6"] == "given"
-    assert find("truth", trained, biased).how == "truth over 12.0 s, weighed against the training runs"
+    assert find("truth", trained, biased).how.startswith("truth over 12.0 s, weighed against the training runs, ±")
     assert find("auto", trained, moving).how.startswith("prior of the training runs, ±0.05 rad/s, then gravity in motion")
     with pytest.raises(DataError, match="does not start at rest"):
         find("stationary", trained, moving)

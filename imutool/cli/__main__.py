@@ -1,0 +1,5 @@
+"""`python -m imutool.cli`."""
+
+from imutool.cli import main
+
+main()

@@ -1,0 +1,73 @@
+"""`imutool info`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from imutool.cli._app import Json, Logs, Overwrite, Quiet, Verbose, app
+from imutool.errors import ConfigError
+from imutool.terminal import log_to_stderr, out, plain, say, table, write_json
+
+if TYPE_CHECKING:
+    from imutool.identify import Identified
+
+
+@app.command(epilog="Example: [bold]imutool info MH_04.mcap[/] or [bold]imutool info still.mcap --noise --noise-toml i.toml[/]")
+def info(
+    logs: Logs,
+    noise: Annotated[bool, typer.Option("--noise", help="Identify the IMU's noise, at rest and against the truth.")] = False,
+    model: Annotated[str | None, typer.Option(help="For --noise: model that corrects the samples in motion.")] = None,
+    imu: Annotated[str | None, typer.Option(help="For --noise: IMU topic, where a log has several.")] = None,
+    truth: Annotated[str | None, typer.Option(help="For --noise: topic of the true poses, where a log has several.")] = None,
+    noise_plot: Annotated[Path | None, typer.Option(metavar="F.png", help="Draw the Allan deviations (with --noise).")] = None,
+    noise_toml: Annotated[Path | None, typer.Option(metavar="F.toml", help="Write the noise as TOML (with --noise).")] = None,
+    overwrite: Overwrite = False,
+    json_to: Json = None,
+    verbose: Verbose = False,
+    quiet: Quiet = False,
+) -> None:
+    """Say what is in a log and what looks wrong with it; with --noise, how noisy its IMU is."""
+    from imutool.info import imu_rows, inspect, topic_rows
+
+    log_to_stderr(verbose, quiet)
+    asked = {"--model": model, "--imu": imu, "--truth": truth, "--noise-plot": noise_plot, "--noise-toml": noise_toml}
+    if not noise and (idle := [name for name, value in asked.items() if value is not None]):
+        raise ConfigError(f"{idle[0]} says nothing without --noise", where="info", fix="Add --noise")
+    if len(logs) > 1 and (noise_plot or noise_toml):
+        raise ConfigError(f"{len(logs)} logs do not fit one file", where="--noise-plot, --noise-toml", expected="one log")
+    reports = [inspect(log) for log in logs]
+    found = []
+    if noise:
+        from imutool import identify
+
+        found = [identify.identify(log, imu=imu, truth=truth, model=model) for log in logs]
+        for report, one in zip(reports, found, strict=True):
+            report["noise"] = identify.plain(one)
+        _write_noise(found[0], noise_plot, noise_toml, overwrite)
+    if write_json(reports[0] if len(reports) == 1 else {"schema": "imutool.infos/1", "logs": reports}, json_to):
+        return
+    for number, (log, report) in enumerate(zip(logs, reports, strict=True)):
+        say(str(log))
+        table(topic_rows(report), keys=1)
+        table(imu_rows(report), keys=2)
+        if found:
+            table(identify.rows(found[number]), keys=1)
+            for remark in found[number].remarks:
+                out.print(f"[cyan]noise:[/] {plain(remark)}", highlight=False, soft_wrap=True)
+        for warning in report["warnings"]:
+            out.print(f"[yellow]warning:[/] {plain(warning)}", highlight=False, soft_wrap=True)
+
+
+def _write_noise(found: Identified, plot: Path | None, toml: Path | None, overwrite: bool) -> None:
+    """The files that were asked for."""
+    if plot is not None:
+        from imutool.view.allan import deviations
+
+        deviations(found, plot, overwrite=overwrite)
+    if toml is not None:
+        from imutool.noise import write
+
+        write(found.noise, toml, overwrite=overwrite)

@@ -1,0 +1,60 @@
+"""`imutool train`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from imutool import registry
+from imutool.cli._app import Imu, Json, Logs, Overwrite, Quiet, Truth, Verbose, app, listing
+from imutool.cli._figures import epoch_line
+from imutool.terminal import progress, say, write_json
+
+
+@app.command(
+    cls=listing("imutool.bias", "--method"),
+    epilog="Example: [bold]imutool train MH_01.mcap MH_03.mcap -o adis.safetensors[/]",
+)
+def train(
+    logs: Logs,
+    model: Annotated[Path, typer.Option("-o", "--output", metavar="MODEL.safetensors", help="Where the model goes.")],
+    method: Annotated[str, typer.Option(help="The bias model, one of those listed below.")] = "hybrid",
+    config: Annotated[
+        Path | None, typer.Option(metavar="FILE.toml", help="Settings; imutool.train.fit.TrainSettings says which.")
+    ] = None,
+    set_: Annotated[list[str] | None, typer.Option("--set", metavar="key=value", help="One setting. Repeatable.")] = None,
+    device: Annotated[str, typer.Option(help="cpu or cuda.")] = "cpu",
+    seed: Annotated[int | None, typer.Option(help="Seed of everything random.")] = None,
+    imu: Imu = None,
+    truth: Truth = None,
+    resume: Annotated[bool, typer.Option("--resume", help="Go on from an interrupted training's checkpoint.")] = False,
+    overwrite: Overwrite = False,
+    json_to: Json = None,
+    verbose: Verbose = False,
+    quiet: Quiet = False,
+) -> None:
+    """Train a bias model on logs of one sensor with true poses."""
+    registry.load("imutool.bias", method)  # a slip of the pen is told before any log is read
+    from imutool.config import load
+    from imutool.train.run import train as run
+    from imutool.train.settings import settings_of
+
+    words = [*(set_ or ()), *([f"seed={seed}"] if seed is not None else ())]
+    settings = load(settings_of(method), config, words)
+    with progress("Training", verbose, quiet) as tell:
+        trained = run(
+            logs,
+            model,
+            method=method,
+            settings=settings,
+            device=device,
+            imu=imu,
+            truth=truth,
+            resume=resume,
+            overwrite=overwrite,
+            progress=lambda epoch: tell(*epoch_line(epoch)),
+        )
+    if not write_json({"schema": "imutool.training/1", "model": str(model), **trained.card}, json_to):
+        say(str(model))
