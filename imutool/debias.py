@@ -17,7 +17,7 @@ from jaxtyping import Float64, Int64, UInt8
 
 from imutool import __version__
 from imutool.bias import static
-from imutool.bias._base import BiasModel
+from imutool.bias._base import BiasModel, OneByOne, Stream, Vector6
 from imutool.bias._file import check_rate, find_model, shipped_for
 from imutool.certainty import Certainty
 from imutool.config import plain
@@ -66,7 +66,8 @@ class OnlineDebiaser:
     """
 
     def __init__(self, model: BiasModel, start: TurnOn | None = None) -> None:
-        self._stream, self._start_ns = (start or following(model)).stream(model), -1
+        stream = (start or following(model)).stream(model)
+        self._one, self._start_ns = stream.one if isinstance(stream, OneByOne) else _by_blocks(stream), -1
 
     def __call__(
         self, stamp_ns: int, gyro: Float64[np.ndarray, "3"], accel: Float64[np.ndarray, "3"]
@@ -74,9 +75,20 @@ class OnlineDebiaser:
         """Corrected angular rate (rad/s) and specific force (m/s²), and the bias that was subtracted."""
         if self._start_ns < 0:
             self._start_ns = stamp_ns
-        t_s = np.array([(stamp_ns - self._start_ns) * 1e-9])
-        bias = self._stream(t_s, gyro[None], accel[None])[0]
-        return gyro - bias[:3], accel - bias[3:], bias
+        u = np.concatenate((gyro, accel))
+        bias = self._one((stamp_ns - self._start_ns) * 1e-9, u)
+        clean = u - bias
+        return clean[:3], clean[3:], bias
+
+
+def _by_blocks(stream: Stream) -> Callable[[float, Vector6], Vector6]:
+    """One sample as a block of one, for a stream that knows no shorter way."""
+
+    def one(t_s: float, u: Vector6) -> Vector6:
+        bias: Vector6 = stream(np.array([t_s]), u[None, :3], u[None, 3:])[0]
+        return bias
+
+    return one
 
 
 class Debiaser:

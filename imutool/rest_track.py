@@ -38,7 +38,7 @@ class Known:
     mean: Vector6
     std: Vector6
     ground_std: Vector6
-    walk: Vector6 = field(default_factory=lambda: USUAL_WALK.copy())
+    walk: Vector6 = field(default_factory=USUAL_WALK.copy)
 
 
 class Track(NamedTuple):

@@ -52,13 +52,24 @@ class Stream(Protocol):
 
 
 @runtime_checkable
+class OneByOne(Stream, Protocol):
+    """A stream with a shorter way for a single sample, for live use: half of such a call is cutting and joining arrays."""
+
+    def one(self, t_s: float, u: Vector6) -> Vector6:
+        """The bias at one sample (gyro, then accel): what a block of it alone would give. The array is the caller's."""
+
+
+@runtime_checkable
 class Unsure(Protocol):
-    """The covariance of what the motion adds, for samples as they arrive: gyro, then accel."""
+    """Roots S of the covariance S S^T of what the motion adds, for samples as they arrive, by sensor.
+
+    The columns of S are the same unknowns at every sample: a mean over samples has the mean of S.
+    """
 
     def __call__(
         self, t_s: Float64[np.ndarray, " n"], gyro: Float64[np.ndarray, "n 3"], accel: Float64[np.ndarray, "n 3"]
-    ) -> Float64[np.ndarray, "n 6 6"]:
-        """One matrix a sample, from it and earlier ones."""
+    ) -> Mapping[Sensor, Float64[np.ndarray, "n 3 p"]]:
+        """One matrix a sample, from it and earlier ones; nothing for a sensor that nothing is known of."""
 
 
 class BiasModel(nn.Module, ABC):
@@ -117,7 +128,7 @@ class BiasModel(nn.Module, ABC):
         return np.zeros((6, 6))
 
     def calibration_covariance(self) -> Unsure | None:
-        """What is left open of the motion-dependent part: a covariance for each sample; none where it is not known."""
+        """What is left open of the motion-dependent part, for each sample as a root; none where it is not known."""
         return None
 
     @abstractmethod

@@ -17,6 +17,7 @@ from imutool.physics.signals import low_pass
 
 ROWS = 64  # at a time: they stay in the cache, and a product this small is never handed to threads that must be woken first
 HALF_ROOT = math.sqrt(0.5)
+ALWAYS = 8.0  # erf of it is one, to the last bit: GELU makes a constant of a constant
 
 Array = Float64[np.ndarray, "..."]
 DriftRate = Callable[[Array, Array, Array], Array]
@@ -34,66 +35,100 @@ class CurveWeights:
 
 
 class Curves:
-    """The curves of gyro and accelerometer side by side: networks of one shape cost half the calls when stacked.
+    """The curves of gyro and accelerometer side by side: two networks of one shape cost half the calls when stacked.
 
-    GELU(h) = h (1 + erf(h / sqrt 2)) / 2; its constants, the layers' own and N(0, 0) are folded into the matrices, each with a
-    row for an input that is always one.
+    GELU(h) = h (1 + erf(h / sqrt 2)) / 2; its constants, the layers' own and N(0, 0) are folded into the matrices. Features are
+    rows and samples columns, or there is one sample and no such axis: every part of a layer is then one piece of memory.
+    Rows of the hidden layer: gyro's, one that is always the same, accel's; each sensor's second matrix sees its own and the
+    one between. For a single sample the last matrix has the rest bias in it too.
     """
 
     def __init__(self, gyro: CurveWeights, accel: CurveWeights) -> None:
         both = (gyro, accel)
-        self._linear = np.zeros((6, 6))
-        self._linear[:3, :3], self._linear[3:, 3:] = gyro.W.T, accel.W.T
-        self._bent = any(bool(one.layers[2].weight.any()) for one in both)
         self._width = width = gyro.layers[0].out_features
-        self._units = np.array([one.near_zero / one.scale for one in both])[:, None, None]
-        self._first = np.stack([self._first_layer(one) for one in both])
-        self._second = np.stack([_with_constant(one.layers[1]) for one in both])
-        self._second[:, :width] *= HALF_ROOT
-        last = [np.concatenate([one.size * _array(one.layers[2].weight).T, one.W.T, np.zeros((1, 3))]) for one in both]
-        self._last = np.stack(last)
-        self._room: dict[int, tuple[Array, ...]] = {}
-        self._last[:, -1] -= self(np.zeros((1, 6)), np.zeros((1, 6))).reshape(2, 3)
-
-    @staticmethod
-    def _first_layer(one: CurveWeights) -> Array:
-        weight = _with_constant(one.layers[0])
-        weight[:3] /= one.scale
-        return HALF_ROOT * weight
+        self._units = np.repeat([one.near_zero / one.scale for one in both], 3)
+        self._bent = any(bool(one.layers[2].weight.any()) for one in both)
+        self._first = np.zeros((2 * width + 1, 19))
+        self._first[width, 6] = ALWAYS
+        self._second = np.empty((2, width, width + 1))
+        self._last = np.zeros((6, 2 * width + 8))
+        for k, one in enumerate(both):
+            unit, own = k * (width + 1), slice(3 * k, 3 * k + 3)
+            first, second, last = (_array(layer.weight) for layer in one.layers)
+            for part, start in enumerate((0, 7, 13)):  # u, asinh of u, asinh of s
+                seen = first[:, 3 * part : 3 * part + 3] / (1.0 if part else one.scale)
+                self._first[unit : unit + width, start + 3 * k : start + 3 * k + 3] = HALF_ROOT * seen
+            self._first[unit : unit + width, 6] = HALF_ROOT * _array(one.layers[0].bias)
+            always = _array(one.layers[1].bias)[:, None] / (2.0 * ALWAYS)
+            self._second[k] = np.concatenate([HALF_ROOT * second, always][:: 1 - 2 * k], axis=1)
+            self._last[own, k * width : (k + 1) * width] = one.size * last
+            self._last[own, 2 * width + 1 :][:, own] = one.W
+        self._rooms: dict[int, _Room] = {}
+        self._last_and_rest = self._last.copy()
+        self._last[:, -1] -= self.one(np.zeros(6), np.zeros(6), 0.0)
+        self.add_line(np.zeros(6), np.zeros(6))
 
     def __call__(self, u: Float64[np.ndarray, "n 6"], slow: Float64[np.ndarray, "n 6"]) -> Float64[np.ndarray, "n 6"]:
         """What the motion adds to both biases."""
-        if not self._bent:
-            return np.asarray(np.dot(u, self._linear))
-        if len(u) <= ROWS:
-            return self._rows(u, slow)
-        starts = range(0, len(u), ROWS)
-        return np.concatenate([self._rows(u[k : k + ROWS], slow[k : k + ROWS]) for k in starts])
+        out = np.empty((len(u), 6))
+        for k in range(0, len(u), ROWS):
+            rows = slice(k, k + ROWS)
+            out[rows] = self._last.dot(self._bend(u[rows].T, slow[rows].T, self._room(len(u[rows])))).T
+        return out
 
-    def _make_room(self, n: int) -> tuple[Array, ...]:
-        """Inputs of the layers with their constant one, the parts of them that change, and what lies between, for n rows."""
-        x, h, g = (np.ones((2, n, size + 1)) for size in (9, self._width, self._width + 3))
-        a, b, y = (np.empty((2, n, size)) for size in (self._width, self._width, 3))
-        parts = g[:, :, : self._width], g[:, :, self._width : -1]
-        self._room[n] = room = (x, x[:, :, 3:9], h, h[:, :, : self._width], g, *parts, a, b, y)
+    def add_line(self, rest: Vector6, slope: Vector6) -> None:
+        """From now on `one` adds rest + since_s slope."""
+        self._last_and_rest[:, -1] = self._last[:, -1] + rest
+        self._last_and_rest[:, 2 * self._width] = slope
+
+    def one(self, u: Vector6, slow: Vector6, since_s: float) -> Vector6:
+        """The bias at one sample: what the motion adds, and the rest bias."""
+        room = self._room(0)
+        room.z[2 * self._width] = since_s
+        out: Vector6 = self._last_and_rest.dot(self._bend(u, slow, room))
+        return out
+
+    def _room(self, n: int) -> _Room:
+        """Room for n samples, or for a single one without their axis (n = 0)."""
+        room = self._rooms.get(n)
+        if room is None:
+            room = self._rooms[n] = _Room(self._width, (n,) if n else (), self._units)
         return room
 
-    def _rows(self, u: Float64[np.ndarray, "n 6"], slow: Float64[np.ndarray, "n 6"]) -> Float64[np.ndarray, "n 6"]:
-        n = len(u)
-        x, near, h, bent, g, flat, tail, a, b, y = self._room.get(n) or self._make_room(n)
-        by_sensor = u.reshape(n, 2, 3).transpose(1, 0, 2)
-        x[:, :, :3] = near[:, :, :3] = tail[:] = by_sensor
-        near[:, :, 3:] = slow.reshape(n, 2, 3).transpose(1, 0, 2)
-        near *= self._units
-        np.arcsinh(near, out=near)
-        np.matmul(x, self._first, out=a)
-        erf(a, out=b)
-        b += 1.0
-        np.multiply(a, b, out=bent)
-        np.matmul(h, self._second, out=a)
-        np.tanh(a, out=flat)
-        np.matmul(g, self._last, out=y)
-        return y.transpose(1, 0, 2).copy().reshape(n, 6)
+    def _bend(self, u: Array, slow: Array, room: _Room) -> Array:
+        """The last layer's input."""
+        room.u[:] = u
+        if not self._bent:
+            return room.outs
+        a, b = room.a, room.b
+        np.multiply(u, room.units, room.near_u)
+        np.multiply(slow, room.units, room.near_slow)
+        np.arcsinh(room.near, room.near)
+        self._first.dot(room.seen, a)
+        erf(a, b)
+        b *= a
+        b += a
+        self._second[0].dot(room.b_gyro, room.c_gyro)
+        self._second[1].dot(room.b_accel, room.c_accel)
+        np.tanh(room.c, room.flat)
+        return room.outs
+
+
+class _Room:
+    """Where the layers' numbers lie, and its parts, cut once: numpy takes as long to cut as to add.
+
+    Rows of `z`: what tanh gives (gyro, accel), seconds on the rest bias's line, u, one, asinh of u, asinh of s.
+    """
+
+    def __init__(self, width: int, samples: tuple[int, ...], units: Vector6) -> None:
+        self.z, self.c, u = np.zeros((2 * width + 20, *samples)), np.empty((2 * width, *samples)), 2 * width + 1
+        self.z[u + 6] = 1.0
+        self.flat, self.u, self.outs, self.seen = self.z[: u - 1], self.z[u : u + 6], self.z[: u + 7], self.z[u:]
+        self.near, self.near_u, self.near_slow = self.z[-12:], self.z[-12:-6], self.z[-6:]
+        self.a, self.b = np.empty((2, 2 * width + 1, *samples))
+        self.b_gyro, self.b_accel = self.b[: width + 1], self.b[width:]
+        self.c_gyro, self.c_accel = self.c[:width], self.c[width:]
+        self.units = units.reshape(6, *(1 for _ in samples))
 
 
 class NeuralStream:
@@ -115,47 +150,44 @@ class NeuralStream:
         self._rest, self._slope = rest.astype(np.float64), np.zeros(6)
         self._gain = np.array([-math.expm1(-1.0 / (rate_hz * tau)) for tau in tau_s])[:, None]
         self._state, self._step_by = np.zeros((2, 6)), np.zeros((2, 6))  # what curve and drift see, and how it moves
-        self._before, self._t_step, self._count = np.zeros(6), 0.0, -1  # -1: nothing seen yet
+        self._slow, self._seen = self._state
+        self._before, self._t_step, self._count, self._began = np.zeros(6), 0.0, -1, False
 
     def __call__(
         self, t_s: Float64[np.ndarray, " n"], gyro: Float64[np.ndarray, "n 3"], accel: Float64[np.ndarray, "n 3"]
     ) -> Float64[np.ndarray, "n 6"]:
-        n = len(t_s)
-        u = np.empty((n, 6))
-        u[:, :3], u[:, 3:] = gyro, accel
-        if not n:
+        if len(t_s) == 1:
+            return self.one(float(t_s[0]), np.concatenate([gyro[0], accel[0]]))[None]
+        u = np.concatenate([gyro, accel], axis=1)
+        if not len(u):
             return u
-        began = self._count >= 0
-        if not began:
-            self._state[:] = u[0]
-        slow, seen = self._one(u) if n == 1 else self._many(u)
+        if not self._began:
+            self._begin(float(t_s[0]), u[0])
+        slow, seen = (low_pass(u, float(g), y) for g, y in zip(self._gain[:, 0], self._state, strict=True))
+        self._slow[:], self._seen[:] = slow[-1], seen[-1]
         bias = self._curves(u, slow)
-        if not began:
-            self._start(float(t_s[0]), seen[0])
-        bias += self._rest_path(t_s, seen, 0 if began else 1) if self._drifts else self._rest
+        bias += self._rest_path(t_s, seen) if self._drifts else self._rest
         return bias
 
-    def _one(self, u: Float64[np.ndarray, "1 6"]) -> Float64[np.ndarray, "2 1 6"]:
+    def one(self, t_s: float, u: Vector6) -> Vector6:
+        """The same for one sample."""
+        if not self._began:
+            self._begin(t_s, u)
         step = self._step_by
-        np.subtract(u, self._state, out=step)
+        np.subtract(u, self._state, step)
         step *= self._gain
         self._state += step
-        return self._state[:, None]
-
-    def _many(self, u: Float64[np.ndarray, "n 6"]) -> Float64[np.ndarray, "2 n 6"]:
-        both = np.stack([low_pass(u, float(g), y) for g, y in zip(self._gain[:, 0], self._state, strict=True)])
-        self._state = both[:, -1].copy()
-        return both
-
-    def _rest_path(
-        self, t_s: Float64[np.ndarray, " n"], seen: Float64[np.ndarray, "n 6"], k: int
-    ) -> Float64[np.ndarray, "_ 6"] | Vector6:
-        """The rest bias at each sample, the first `k` of them where the drift began."""
-        if len(t_s) == 1 and not k and self._count + 1 < self._stride:  # nothing but a straight line
+        since_s = t_s - self._t_step
+        bias = self._curves.one(u, self._slow, since_s)
+        if self._drifts:
             self._count += 1
-            return self._rest + (float(t_s[0]) - self._t_step) * self._slope
-        rest = np.empty((len(t_s), 6))
-        rest[:k] = self._rest
+            if self._count == self._stride:
+                self._step(t_s, self._rest + since_s * self._slope, self._seen)
+        return bias
+
+    def _rest_path(self, t_s: Float64[np.ndarray, " n"], seen: Float64[np.ndarray, "n 6"]) -> Float64[np.ndarray, "n 6"]:
+        """The rest bias at each sample."""
+        rest, k = np.empty((len(t_s), 6)), 0
         while k < len(t_s):
             last = min(len(t_s), k + self._stride - self._count)
             rest[k:last] = self._rest + (t_s[k:last, None] - self._t_step) * self._slope
@@ -165,8 +197,10 @@ class NeuralStream:
             k = last
         return rest
 
-    def _start(self, t_s: float, u: Array) -> None:
-        self._t_step, self._before, self._count = t_s, u.copy(), 0
+    def _begin(self, t_s: float, u: Array) -> None:
+        """The first sample is the drift's start, and not counted among those that follow it."""
+        self._began, self._state[:] = True, u
+        self._t_step, self._before = t_s, u.copy()
         self._set_slope(u, np.zeros(6))
 
     def _step(self, t_s: float, rest: Array, u: Array) -> None:
@@ -178,6 +212,7 @@ class NeuralStream:
         for sensor, rate in self._drifts.items():
             half = COLUMNS[sensor]
             self._slope[half] = rate(self._rest[half], u[half], du[half])
+        self._curves.add_line(self._rest, self._slope)
 
 
 def perceptron(module: nn.Module) -> Callable[[Array], Array]:

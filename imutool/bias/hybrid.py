@@ -19,10 +19,10 @@ from jaxtyping import Float, Float64
 from torch import Tensor
 
 from imutool.bias import neural_ode
-from imutool.bias._base import COLUMNS, SENSORS, BiasModel, Segment, Sensor, Stream, Unsure, Vector6
+from imutool.bias._base import COLUMNS, SENSORS, BiasModel, OneByOne, Segment, Sensor, Stream, Unsure, Vector6
 from imutool.config import Settings
 from imutool.errors import ConfigError
-from imutool.physics.effects._base import AtWork, Effect, compiled, patterns
+from imutool.physics.effects._base import Effect, Together, compiled, patterns
 from imutool.physics.effects._catalogue import named as effects_named
 from imutool.physics.signals import POWER_S, SignalFilter, Signals
 
@@ -105,14 +105,14 @@ class Model(BiasModel):
         """The same in numpy, from the log's first sample on."""
         ode = None if self.ode is None else self.ode.stream(rest)
         gyro, accel = (self._compiled(sensor) for sensor in SENSORS)
-        return _Stream(SignalFilter(self.rate_hz), gyro, accel, ode, rest.astype(np.float64))
+        return _Stream(self.rate_hz, gyro, accel, ode, rest.astype(np.float64))
 
     def rest_dynamics(self) -> Float64[np.ndarray, "6 6"]:
         """The neural ODE's."""
         return np.zeros((6, 6)) if self.ode is None else self.ode.rest_dynamics()
 
     def calibration_covariance(self) -> Unsure | None:
-        """Of the effects' error, from the covariance of their parameters: T Sigma T^T."""
+        """Of the effects' error, from the covariance of their parameters: T Sigma T^T, as its root T Sigma^1/2."""
         roots: dict[Sensor, Float64[np.ndarray, "3 q p"]] = {}
         for sensor in SENSORS:
             covariance: Tensor = getattr(self, f"covariance_{sensor}")
@@ -123,13 +123,12 @@ class Model(BiasModel):
 
         def unsure(
             t_s: Float64[np.ndarray, " n"], gyro: Float64[np.ndarray, "n 3"], accel: Float64[np.ndarray, "n 3"]
-        ) -> Float64[np.ndarray, "n 6 6"]:
-            signals, out = filter_(t_s, gyro, accel), np.zeros((len(t_s), 6, 6))
+        ) -> dict[Sensor, Float64[np.ndarray, "n 3 p"]]:
+            signals, out = filter_(t_s, gyro, accel), {}
             for sensor in SENSORS:
                 if self.effects[sensor]:
                     terms = np.concatenate([effect.terms(signals) for effect in self.effects[sensor]], axis=1)
-                    T = np.einsum("nq,iqp->nip", terms, roots[sensor], optimize=True)
-                    out[:, COLUMNS[sensor], COLUMNS[sensor]] = T @ T.transpose(0, 2, 1)
+                    out[sensor] = np.einsum("nq,iqp->nip", terms, roots[sensor], optimize=True)
             return out
 
         return unsure
@@ -150,7 +149,7 @@ class Model(BiasModel):
         looks_back = any(self.effects.values())
         self.context = math.ceil(FORGOTTEN * POWER_S * self.rate_hz) if looks_back else 0
 
-    def _compiled(self, sensor: Sensor) -> AtWork:
+    def _compiled(self, sensor: Sensor) -> Together:
         theta: Tensor = getattr(self, f"theta_{sensor}")
         return compiled(self.effects[sensor], theta.detach().cpu().double().numpy())
 
@@ -158,18 +157,38 @@ class Model(BiasModel):
 class _Stream:
     """Effects, then the neural ODE on what they leave; remembers what the filters do."""
 
-    def __init__(self, signals: SignalFilter, gyro: AtWork, accel: AtWork, ode: Stream | None, rest: Vector6) -> None:
-        self.signals, self.gyro, self.accel, self.ode, self.rest, self.start_s = signals, gyro, accel, ode, rest, math.nan
+    def __init__(self, rate_hz: float, gyro: Together, accel: Together, ode: OneByOne | None, rest: Vector6) -> None:
+        self._signals = SignalFilter(rate_hz, max(gyro.wanted, accel.wanted))
+        self._matrix = np.concatenate([gyro.matrix, accel.matrix], axis=1)
+        self._gyro, self._accel, self._product_alone = gyro, accel, not (gyro.others or accel.others)
+        self._ode, self._rest, self._start_s = ode, rest, math.nan
 
     def __call__(
         self, t_s: Float64[np.ndarray, " n"], gyro: Float64[np.ndarray, "n 3"], accel: Float64[np.ndarray, "n 3"]
     ) -> Float64[np.ndarray, "n 6"]:
+        if len(t_s) == 1:
+            return self.one(float(t_s[0]), np.concatenate([gyro[0], accel[0]]))[None]
         if not len(t_s):
             return np.zeros((0, 6))
-        if math.isnan(self.start_s):
-            self.start_s = float(t_s[0])
-        signals = self.signals(t_s - self.start_s, gyro, accel)
-        error = np.empty((len(t_s), 6))
-        error[:, :3], error[:, 3:] = self.gyro(signals), self.accel(signals)
-        error += self.rest if self.ode is None else self.ode(t_s, gyro - error[:, :3], accel - error[:, 3:])
+        if math.isnan(self._start_s):
+            self._start_s = float(t_s[0])
+        signals = self._signals(t_s - self._start_s, gyro, accel)
+        error: Float64[np.ndarray, "n 6"] = np.dot(signals.columns, self._matrix)
+        for columns, effects in ((COLUMNS["gyro"], self._gyro), (COLUMNS["accel"], self._accel)):
+            for other in effects.others:
+                error[:, columns] += other(signals)
+        error += self._rest if self._ode is None else self._ode(t_s, gyro - error[:, :3], accel - error[:, 3:])
+        return error
+
+    def one(self, t_s: float, u: Vector6) -> Vector6:
+        """The same for one sample."""
+        if math.isnan(self._start_s):
+            self._start_s = t_s
+        since_s = t_s - self._start_s
+        row = self._signals.one(since_s, u)
+        error: Vector6 = row.dot(self._matrix)
+        if not self._product_alone:
+            floats = row.tolist()
+            error += (*self._gyro.others_at(since_s, floats), *self._accel.others_at(since_s, floats))
+        error += self._rest if self._ode is None else self._ode.one(t_s, u - error)
         return error

@@ -27,7 +27,7 @@ from jaxtyping import Float, Float64
 from torch import Tensor, nn
 from torchdiffeq import odeint, odeint_adjoint
 
-from imutool.bias._base import COLUMNS, SENSORS, BiasModel, Segment, Sensor, Stream, Vector6
+from imutool.bias._base import COLUMNS, SENSORS, BiasModel, Segment, Sensor, Vector6
 from imutool.bias._neural_stream import Array, Curves, CurveWeights, DriftRate, NeuralStream, perceptron
 from imutool.config import Settings
 from imutool.errors import ConfigError
@@ -214,7 +214,7 @@ class Model(BiasModel):
             shift, keep = 2 * shift, keep * keep
         return y
 
-    def stream(self, rest: Vector6) -> Stream:
+    def stream(self, rest: Vector6) -> NeuralStream:
         """The same in numpy, one Euler step of the drift every `stride` samples."""
         gyro, accel = (_part(self.curve, sensor, Curve).weights() for sensor in SENSORS)
         drifts = {sensor: _part(self.drift, sensor, Drift).numpy() for sensor in self.config.drift}

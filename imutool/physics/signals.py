@@ -22,10 +22,11 @@ POWER_S = 0.5  # of the squared vibration
 TAU_S = np.array([SLOW_S] * 6 + [TURN_S] * 3 + [POWER_S] * 3)
 LEAST_PERIODS = 0.1
 
-# columns of the signals
+# columns of the signals: the samples, what the filters hold (their whole state), and derivatives
 GYRO, ACCEL, SAMPLES = slice(0, 3), slice(3, 6), slice(0, 6)
-GYRO_SLOW, GYRO_DOT, ACCEL_DOT, DOTS = slice(6, 9), slice(9, 12), slice(12, 15), slice(9, 15)
-ALPHA, VIBRATION, COUNT = slice(15, 18), slice(18, 21), 21
+GYRO_SLOW, ACCEL_SLOW, SLOW, TURN, VIBRATION = slice(6, 9), slice(9, 12), slice(6, 12), slice(12, 15), slice(15, 18)
+FILTERED = slice(6, 18)
+GYRO_DOT, ACCEL_DOT, DOTS, ALPHA, COUNT = slice(18, 21), slice(21, 24), slice(18, 24), slice(24, 27), 27
 
 Vectors = Float64[np.ndarray, "n 3"]
 
@@ -35,7 +36,7 @@ class Signals:
     """One row a sample: rad/s, m/s², their derivatives per second, and the vibration's power in (m/s²)² per axis."""
 
     t_s: Float64[np.ndarray, " n"]
-    columns: Float64[np.ndarray, "n 21"]
+    columns: Float64[np.ndarray, "n 27"]
 
     @property
     def gyro(self) -> Vectors:
@@ -78,61 +79,77 @@ class Signals:
 
 
 class SignalFilter:
-    """Signals from samples as they arrive, in blocks of any size."""
+    """Signals from samples as they arrive, in blocks of any size; all it remembers is the last row, and its time.
 
-    def __init__(self, rate_hz: float) -> None:
+    Of a row's columns the first `wanted` are made, and more where that is no extra work; the others are zero.
+    """
+
+    def __init__(self, rate_hz: float, wanted: int = COUNT) -> None:
+        self._filters, self._derives = wanted > FILTERED.start, wanted > DOTS.start
         self._gain = -np.expm1(-1.0 / (rate_hz * TAU_S))
         self._period_s = 1.0 / rate_hz
         self._lag_s = self._period_s / math.expm1(self._period_s / TURN_S)
-        self._t_s = 0.0
-        self._last: Float64[np.ndarray, "6"] | None = None
-        self._state = np.zeros(12)  # gyro and accel slow, gyro for its derivative, power
-        self._seen = np.zeros(12)  # what the next sample shows the filters
+        self._lead = np.full(3, (1.0 / self._gain[6] - 1.0) / self._lag_s)  # from the filter's last step to what it lags by
+        self._least_s = LEAST_PERIODS * self._period_s
+        self._t_s = math.nan
+        row, step = np.zeros(COUNT), np.zeros(12)  # numpy takes as long to cut a piece out as to add two: cut once
+        self._row, self._u, self._y, self._dots, self._alpha = row, row[SAMPLES], row[FILTERED], row[DOTS], row[ALPHA]
+        self._gyro, self._slow, self._turn, self._power = row[GYRO], row[SLOW], row[TURN], row[VIBRATION]
+        self._step, self._step_slow, self._step_turn, self._step_power = step, step[:6], step[6:9], step[9:]
+        self._fast = step[3:6]  # the force without its mean, until it is a step
 
     def __call__(self, t_s: Float64[np.ndarray, " n"], gyro: Vectors, accel: Vectors) -> Signals:
         """The signals at each sample of a block."""
-        columns = np.empty((len(t_s), COUNT))
-        if not len(t_s):
-            return Signals(t_s, columns)
-        columns[:, GYRO], columns[:, ACCEL] = gyro, accel
-        if self._last is None:
-            self._last, self._t_s = columns[0, SAMPLES].copy(), float(t_s[0]) - self._period_s
-            self._state = np.concatenate([self._last, self._last[:3], np.zeros(3)])
         if len(t_s) == 1:
-            self._one(float(t_s[0]), columns[0], self._last)
-        else:
-            self._many(t_s, columns, self._last)
-        self._last, self._t_s = columns[-1, SAMPLES].copy(), float(t_s[-1])
+            return Signals(t_s, self.one(float(t_s[0]), np.concatenate([gyro[0], accel[0]]))[None].copy())
+        columns = np.zeros((len(t_s), COUNT))
+        if len(t_s):
+            columns[:, GYRO], columns[:, ACCEL] = gyro, accel
+            self._many(t_s, columns)
         return Signals(t_s, columns)
 
-    def _one(self, t_s: float, row: Float64[np.ndarray, "21"], last: Float64[np.ndarray, "6"]) -> None:
-        """One sample: what the calls of `_many` cost would be ten times the arithmetic."""
-        seen, y, u = self._seen, self._state, row[SAMPLES]
-        seen[:6], seen[6:9] = u, row[GYRO]
-        np.subtract(row[ACCEL], y[3:6], out=seen[9:])
-        np.square(seen[9:], out=seen[9:])
-        seen -= y
-        seen *= self._gain
-        y += seen
-        row[GYRO_SLOW], row[VIBRATION] = y[:3], y[9:]
-        np.subtract(u, last, out=row[DOTS])
-        row[DOTS] *= 1.0 / max(t_s - self._t_s, LEAST_PERIODS * self._period_s)
-        np.subtract(row[GYRO], y[6:9], out=row[ALPHA])
-        row[ALPHA] *= 1.0 / self._lag_s
+    def one(self, t_s: float, u: Float64[np.ndarray, "6"]) -> Float64[np.ndarray, "27"]:
+        """The columns at one sample, in a row that the next one overwrites: `_many` would take ten times its arithmetic."""
+        if math.isnan(self._t_s):
+            self._begin(t_s, u)
+        if self._derives:
+            np.subtract(u, self._u, self._dots)
+            self._dots *= 1.0 / max(t_s - self._t_s, self._least_s)
+        self._u[:] = u
+        if self._filters:
+            step, power = self._step, self._step_power
+            np.subtract(u, self._slow, self._step_slow)
+            np.subtract(self._gyro, self._turn, self._step_turn)
+            np.multiply(self._fast, self._fast, power)
+            power -= self._power
+            step *= self._gain
+            self._y += step
+        if self._derives:
+            np.multiply(self._step_turn, self._lead, self._alpha)
+        self._t_s = t_s
+        return self._row
 
-    def _many(
-        self, t_s: Float64[np.ndarray, " n"], columns: Float64[np.ndarray, "n 21"], last: Float64[np.ndarray, "6"]
-    ) -> None:
-        u, gyro, before = columns[:, SAMPLES], columns[:, GYRO], self._state
-        step_s = np.maximum(np.diff(t_s, prepend=self._t_s), LEAST_PERIODS * self._period_s)[:, None]
-        slow = low_pass(u, self._gain[0], before[:6])
-        around = np.concatenate([before[None, 3:6], slow[:-1, 3:]])  # the mean before the sample: one filter waits for none
-        turn = low_pass(gyro, self._gain[6], before[6:9])
-        power = low_pass((columns[:, ACCEL] - around) ** 2, self._gain[9], before[9:])
-        columns[:, GYRO_SLOW], columns[:, VIBRATION] = slow[:, :3], power
-        columns[:, DOTS] = np.diff(u, axis=0, prepend=last[None]) / step_s
-        columns[:, ALPHA] = (gyro - turn) / self._lag_s
-        self._state = np.concatenate([slow[-1], turn[-1], power[-1]])
+    def _many(self, t_s: Float64[np.ndarray, " n"], columns: Float64[np.ndarray, "n 27"]) -> None:
+        u, gyro, gain = columns[:, SAMPLES], columns[:, GYRO], self._gain
+        if math.isnan(self._t_s):
+            self._begin(float(t_s[0]), u[0])
+        if self._filters:
+            columns[:, SLOW] = slow = low_pass(u, gain[0], self._slow)
+            columns[:, TURN] = low_pass(gyro, gain[6], self._turn)
+            # the mean before the sample: one filter waits for none
+            around = np.concatenate([self._slow[None, 3:], slow[:-1, 3:]])
+            columns[:, VIBRATION] = low_pass((columns[:, ACCEL] - around) ** 2, gain[9], self._power)
+        if self._derives:
+            step_s = np.maximum(np.diff(t_s, prepend=self._t_s), self._least_s)[:, None]
+            columns[:, DOTS] = np.diff(u, axis=0, prepend=self._u[None]) / step_s
+            columns[:, ALPHA] = (gyro - columns[:, TURN]) / self._lag_s
+        self._row[:], self._t_s = columns[-1], float(t_s[-1])
+
+    def _begin(self, t_s: float, u: Float64[np.ndarray, "6"]) -> None:
+        """As if the sensor had always read this."""
+        self._t_s, self._u[:] = t_s - self._period_s, u
+        if self._filters:
+            self._slow[:], self._turn[:] = u, self._gyro
 
 
 def low_pass(x: Float64[np.ndarray, "n k"], gain: float, before: Float64[np.ndarray, " k"]) -> Float64[np.ndarray, "n k"]:

@@ -2,19 +2,27 @@
 
     python tests/bench/consistency.py --model M.safetensors LOG... [--start truth] [--start auto] [--start smooth]
 
-Every `EVERY_S` seconds of a log the rest bias is measured from the truth around (the slope of what integration misses), and the
-difference to the bias in use is weighed by its covariance plus that of the measurement (the model's `truth_std`, of windows
-of the same length). Three degrees of freedom: honest covariances give a mean of 3; the bounds are chi-square's for as many
-independent windows. V1_01 is compared with its recomputed truth.
+Every `TRUTH_S` of a log the bias is measured from the truth around (the slope, in time, of what integration misses), and the
+difference to the bias in use is weighed by its covariance plus that of the measurement. Three degrees of freedom: honest
+covariances give a mean of 3; the bounds are chi-square's. V1_01 is compared with its recomputed truth.
+
+The calibration's share of a window's covariance is that of the slope: its unknowns are the same at every sample, and what goes
+with the motion mostly cancels over 15 s, which the samples' covariances one by one do not show. What a measurement is worth is
+seen in the log itself, for truths differ by a factor of eight from log to log: how far half windows differ from the next ones
+(Allan's variance), carried over to whole ones as errors of an attitude go, with T^-3/2. Where the truth's errors last for
+seconds that is too little, and too much is never forgiven. Errors of a rest bias last longer than a window: the bounds, for
+independent windows, are a little narrow.
 """
 
 from __future__ import annotations
 
 import argparse
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import torch
+from jaxtyping import Float64
 
 from imutool import metrics, so3
 from imutool.bias._base import BiasModel
@@ -25,9 +33,54 @@ from imutool.mcap_io.read import read
 from imutool.recording import Recording, seconds
 from imutool.strapdown import with_velocity
 from imutool.turn_on import TRUTH_S, find, truth_offset
+from imutool.windows import between, running_product
 
 LEAST_TRUSTED = 0.5
 RECOMPUTED = "/ground_truth_recomputed/pose"
+
+
+class Seen(NamedTuple):
+    """The samples of a log, and its truth at their times."""
+
+    t_s: Float64[np.ndarray, " n"]
+    samples: Float64[np.ndarray, "n 6"]
+    R_wb: torch.Tensor
+    v_w: torch.Tensor
+    trusted: np.ndarray
+
+    @classmethod
+    def of(cls, recording: Recording) -> Seen:
+        """A recording's own."""
+        imu = recording.imu
+        poses, trusted = with_velocity(recording.truth).at(imu.t_ns)
+        assert poses.v_w is not None
+        R_wb = so3.matrix_from_quaternion_wxyz(torch.from_numpy(np.array(poses.q_wb_wxyz)))
+        samples = np.concatenate([imu.gyro, imu.accel], axis=1)
+        v_w = torch.from_numpy(np.array(poses.v_w))
+        return cls(seconds(imu.t_ns, int(imu.t_ns[0])), samples, R_wb, v_w, trusted)
+
+    def window(self, from_s: float, length_s: float) -> slice | None:
+        """The samples from a time on, if the truth can be trusted there."""
+        first, last = (int(np.searchsorted(self.t_s, t)) for t in (from_s, from_s + length_s))
+        rows = slice(first, last + 1)
+        whole = last < len(self.t_s) and self.trusted[first] and self.trusted[rows].mean() >= LEAST_TRUSTED
+        return rows if whole else None
+
+    def gyro_offset(self, rows: slice, bias: Float64[np.ndarray, "n 6"]) -> Float64[np.ndarray, "3"]:
+        """What a bias leaves of the rest bias over a window."""
+        left = self.samples[rows] - bias[rows]
+        return truth_offset(self.t_s[rows], left, self.R_wb[rows], self.v_w[rows], self.trusted[rows])[:3]
+
+    def slope_of(
+        self, rows: slice, gyro: Float64[np.ndarray, "n 3"], S: Float64[np.ndarray, "n 3 p"]
+    ) -> Float64[np.ndarray, "3 p"]:
+        """What errors S of a window's debiased rate look like as an offset: the slope of their integral, by least squares."""
+        dt, seen = torch.from_numpy(np.diff(self.t_s[rows])), self.trusted[rows][1:]
+        R = running_product(so3.exp(between(torch.from_numpy(gyro[rows])[None]) * dt[None, :, None]))[0] * dt[:, None, None]
+        integral = torch.cumsum(R @ between(torch.from_numpy(S[rows]).movedim(2, 0)).movedim(0, 2), dim=0)[seen]
+        X = torch.cat([torch.cumsum(R, dim=0)[seen], torch.eye(3, dtype=R.dtype).expand(len(integral), 3, 3)], dim=2)
+        found = torch.linalg.lstsq(X.flatten(0, 1), integral.flatten(0, 1)).solution[:3]
+        return np.asarray(found)
 
 
 def main() -> None:
@@ -39,48 +92,57 @@ def main() -> None:
     options = parser.parse_args()
     model = load(options.model)
     for start in options.start or ("truth", "auto", "smooth"):
-        errors, covariances = [], []
+        logs = []
         for path in options.logs:
             recording = read(path)
             truths = list(recording.truths)
             recording = recording.with_truth(RECOMPUTED if RECOMPUTED in truths else truths[0])
-            e, P = windows(model, recording, start)
-            if len(e):
-                print(f"{start:7}{recording.name:18}", told(e, P), flush=True)
-                errors.append(e)
-                covariances.append(P)
-        print(f"{start:7}{'all':18}", told(np.concatenate(errors), np.concatenate(covariances)), flush=True)
+            one = windows(model, recording, start)
+            if len(one[0]):
+                print(f"{start:7}{recording.name:18}", told([one]), flush=True)
+                logs.append(one)
+        print(f"{start:7}{'all':18}", told(logs), flush=True)
 
 
-def windows(model: BiasModel, recording: Recording, start: str) -> tuple[np.ndarray, np.ndarray]:
+def windows(
+    model: BiasModel, recording: Recording, start: str
+) -> tuple[Float64[np.ndarray, "m 3"], Float64[np.ndarray, "m 3 3"]]:
     """Differences of the gyro's rest bias to what the truth says, window by window, and what covariance they should have."""
-    imu = recording.imu
-    t_s = seconds(imu.t_ns, int(imu.t_ns[0]))
+    imu, seen = recording.imu, Seen.of(recording)
     begun = smooth_in_memory(model, imu, recording.name) if start == "smooth" else find(start, model, recording)
     stream = begun.stream(model)
-    bias = stream(t_s, imu.gyro, imu.accel)
-    P = Certainty(model, begun, stream)(t_s, imu.gyro, imu.accel)[:, :3, :3]
-    poses, trusted = with_velocity(recording.truth).at(imu.t_ns)
-    assert poses.v_w is not None
-    R_wb = so3.matrix_from_quaternion_wxyz(torch.from_numpy(np.array(poses.q_wb_wxyz)))
-    left = np.concatenate([imu.gyro, imu.accel], axis=1) - bias
-    measured = np.diag(model.truth_std.double().numpy()[:3] ** 2)
+    bias = stream(seen.t_s, imu.gyro, imu.accel)
+    P, roots = Certainty(model, begun, stream).parts(seen.t_s, imu.gyro, imu.accel)
+    S = roots.get("gyro", np.zeros((len(bias), 3, 0)))
+    measured = np.diag(measured_variance(model, seen))
     errors, covariances = [], []
-    first = int(np.argmax(trusted))
+    from_s = float(seen.t_s[np.argmax(seen.trusted)])
     if start == "truth":  # what it was found from proves nothing
-        first = int(np.searchsorted(t_s, t_s[first] + TRUTH_S))
-    while (last := int(np.searchsorted(t_s, t_s[min(first, len(t_s) - 1)] + TRUTH_S))) < len(t_s):
-        rows = slice(first, last + 1)
-        if trusted[first] and trusted[rows].mean() >= LEAST_TRUSTED:
-            v_w = torch.from_numpy(np.array(poses.v_w[rows]))
-            errors.append(truth_offset(t_s[rows], left[rows], R_wb[rows], v_w, trusted[rows])[:3])
-            covariances.append(P[rows].mean(axis=0) + measured)
-        first = last
+        from_s += TRUTH_S
+    while from_s + TRUTH_S <= seen.t_s[-1]:
+        if rows := seen.window(from_s, TRUTH_S):
+            T = seen.slope_of(rows, imu.gyro - bias[:, :3], S)
+            errors.append(seen.gyro_offset(rows, bias))
+            covariances.append(P[rows, :3, :3].mean(axis=0) + T @ T.T + measured)
+        from_s += TRUTH_S
     return np.reshape(errors, (-1, 3)), np.reshape(covariances, (-1, 3, 3))
 
 
-def told(e: np.ndarray, P: np.ndarray) -> str:
+def measured_variance(model: BiasModel, seen: Seen) -> Float64[np.ndarray, "3"]:
+    """Of an offset from a window, by axis; the training logs' where a log is too short to show it."""
+    bias = model.stream(model.prior_mean.double().numpy())(seen.t_s, seen.samples[:, :3], seen.samples[:, 3:])
+    starts_s = np.arange(seen.t_s[np.argmax(seen.trusted)], seen.t_s[-1] - TRUTH_S / 2, TRUTH_S / 4)  # half overlapping
+    half = [seen.gyro_offset(rows, bias) if (rows := seen.window(t, TRUTH_S / 2)) else np.full(3, np.nan) for t in starts_s]
+    change = np.reshape(half[2:], (-1, 3)) - np.reshape(half[:-2], (-1, 3))
+    change = change[np.isfinite(change).all(axis=1)]
+    if not len(change):
+        return np.asarray(model.truth_std.double().numpy()[:3] ** 2)
+    return np.asarray(0.5 * (change**2).mean(axis=0) / 2.0**3)
+
+
+def told(logs: list[tuple[np.ndarray, np.ndarray]]) -> str:
     """The figures of `metrics.consistency` in a line."""
+    e, P = (np.concatenate(parts) for parts in zip(*logs, strict=True))
     found = metrics.consistency(e, P)
     bounds = f"95 % bounds {found['nees_lower']:.2f} to {found['nees_upper']:.2f}"
     return f"NEES {found['nees_mean']:6.2f}  {bounds}  windows {found['samples']:3.0f}  consistent: {found['consistent']}"

@@ -1,11 +1,14 @@
-"""How fast a log is debiased: `python tests/bench/debias.py [--seconds 150]`, on a made-up flight, against real time and `cp`.
+"""How fast a log is debiased: `python tests/bench/debias.py [MODEL...] [--seconds 150]`, on a made-up flight.
 
-In memory: a neural_ode model's stream over all samples, in blocks of a chunk's messages, and `OnlineDebiaser` one sample at a
-time (their numbers must agree). As a whole: `imutool debias` as a user types it, a process of its own with python and
-torch to start, beside `cp` of the same log, and beside a python that does nothing but import torch; the same work inside a
-running process is timed too, and shows what of it is the start. The weights are random: time does not depend on them.
-Medians of interleaved rounds after one that does not count, everything on one thread; CPU seconds stand beside wall seconds
-because the machine may be shared. The log is in the page cache, as it is for `cp`.
+In memory, for each model (all that ship, unless named): the stream over all samples in blocks of a chunk's messages, and
+`OnlineDebiaser` one sample at a time, from a given start (their numbers must agree) and with the rest bias followed, as a live
+node has it unless it gives a start. Times are the least of some rounds: what the machine does besides only adds.
+
+As a whole, unless `--in-memory`: `imutool debias` as a user types it, with a neural_ode of random weights (time does not depend
+on them), a process of its own with python and torch to start, beside `cp` of the same log, and beside a python that does
+nothing but import torch; the same work inside a running process is timed too, and shows what of it is the start. Medians of
+interleaved rounds after one that does not count; CPU seconds stand beside wall seconds because the machine may be shared. The
+log is in the page cache, as it is for `cp`. Everything on one thread.
 """
 
 from __future__ import annotations
@@ -19,7 +22,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import NamedTuple
 
@@ -32,14 +35,14 @@ from imutool.debias import OnlineDebiaser, debias
 from imutool.mcap_io.write import write
 from imutool.physics.flight import flight
 from imutool.recording import Imu, seconds
-from imutool.turn_on import TurnOn, at_rest
+from imutool.turn_on import TurnOn, following, prior
 
 BLOCK = 2900  # Imu messages in a chunk of 1 MiB
 SAME = 1e-9  # rad/s, m/s²: rounding alone separates a block from its samples
 
 
-def random_model(path: Path, rate_hz: float) -> BiasModel:
-    """A neural_ode of the default size, its drift set in motion, written to a file and read back."""
+def write_random_model(path: Path, rate_hz: float) -> None:
+    """A file with a neural_ode of the default size, its drift set in motion."""
     torch.manual_seed(0)
     model = neural_ode.Model(rate_hz=rate_hz)
     with torch.no_grad():
@@ -47,7 +50,6 @@ def random_model(path: Path, rate_hz: float) -> BiasModel:
             weight.add_(0.01 * torch.randn_like(weight))
         model.prior_std += 0.1
     _file.save(model, path)
-    return _file.load(path)
 
 
 def in_blocks(model: BiasModel, start: TurnOn, imu: Imu) -> np.ndarray:
@@ -76,8 +78,10 @@ def now() -> Spent:
     return Spent(time.perf_counter(), mine.ru_utime + mine.ru_stime + waited_for.ru_utime + waited_for.ru_stime)
 
 
-def race(racing: Mapping[str, Callable[[], object]], rounds: int) -> dict[str, Spent]:
-    """Median seconds of each; every round runs all of them, the first does not count."""
+def race(
+    racing: Mapping[str, Callable[[], object]], rounds: int, pick: Callable[[Iterable[float]], float] = statistics.median
+) -> dict[str, Spent]:
+    """Seconds of each, one picked of the rounds; every round runs all of them, the first does not count."""
     spent: dict[str, list[Spent]] = {name: [] for name in racing}
     for count in range(rounds + 1):
         for name, run in racing.items():
@@ -85,7 +89,7 @@ def race(racing: Mapping[str, Callable[[], object]], rounds: int) -> dict[str, S
             run()
             if count:
                 spent[name].append(Spent(*(b - a for a, b in zip(start, now(), strict=True))))
-    return {name: Spent(*(statistics.median(column) for column in zip(*runs, strict=True))) for name, runs in spent.items()}
+    return {name: Spent(*(pick(column) for column in zip(*runs, strict=True))) for name, runs in spent.items()}
 
 
 def process(*words: str | Path) -> Callable[[], object]:
@@ -100,49 +104,70 @@ def single_threaded() -> None:
         os.execve(sys.executable, [sys.executable, *sys.argv], os.environ | threads)
 
 
-def main() -> None:
-    """Prints a table of times and their ratios to real time and to `cp`."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--seconds", type=float, default=150.0)
-    parser.add_argument("--rounds", type=int, default=5)
-    args = parser.parse_args()
-    single_threaded()
+def in_memory(names: Iterable[str], imu: Imu, rounds: int) -> None:
+    """Prints a line a model: blocks, one by one, and their ratio."""
+    heads = ("in blocks", "real time", "in blocks", "one by one", "ratio", "followed", "apart")
+    units = ("s", "/ wall", "us/sample", "us/sample", "", "us/sample", "")
+    for first, row in (("", heads), (f"least of {rounds} rounds", units)):
+        print(f"{first:30}" + "".join(f"{word:>12}" for word in row))
+    for name in names:
+        model = _file.find_model(name)
+        start, followed = prior(model), following(model)
+        apart = float(np.abs(in_blocks(model, start, imu) - one_by_one(model, start, imu)).max())
+        assert apart < SAME, apart
+        racing = {
+            "blocks": lambda m=model, s=start: in_blocks(m, s, imu),
+            "one": lambda m=model, s=start: one_by_one(m, s, imu),
+            "followed": lambda m=model, s=followed: one_by_one(m, s, imu),
+        }
+        blocks, one, live = (1e6 * spent.wall / len(imu) for spent in race(racing, rounds, min).values())
+        block_s = blocks * len(imu) / 1e6
+        print(f"{Path(name).stem:30}{block_s:12.3f}{imu.duration_s / block_s:12,.0f}{blocks:12.2f}{one:12.1f}", end="")
+        print(f"{one / blocks:12.1f}{live:12.1f}{apart:12.1g}", flush=True)
+
+
+def as_a_command(seconds_long: float, rounds: int) -> None:
+    """Prints the times of the whole command, and their ratios to real time and to `cp`."""
     cp, imutool = shutil.which("cp"), Path(sys.executable).with_name("imutool")
     assert cp, "needs cp"
     assert imutool.exists(), "needs imutool installed beside this python"
-
     with tempfile.TemporaryDirectory() as name:
         work = Path(name)
-        recording = flight(5, duration_s=args.seconds)
-        imu, log, weights = recording.imu, work / "flight.mcap", work / "model.safetensors"
+        recording = flight(5, duration_s=seconds_long)
+        log, weights, inside = work / "flight.mcap", work / "model.safetensors", work / "inside.mcap"
         write(recording, log)
-        model = random_model(weights, 1.0 / imu.period_s)
-        start = at_rest(model, imu)
-        apart = float(np.abs(in_blocks(model, start, imu) - one_by_one(model, start, imu)).max())
-        assert apart < SAME, apart
-
+        write_random_model(weights, 1.0 / recording.imu.period_s)
         flags = ("--model", weights, "--init", "stationary", "--overwrite", "--quiet")
         racing = {
-            "stream, in blocks": lambda: in_blocks(model, start, imu),
-            "OnlineDebiaser, one by one": lambda: one_by_one(model, start, imu),
-            "debias() in a running process": lambda: debias(
-                log, work / "inside.mcap", model=weights, init="stationary", overwrite=True
-            ),
+            "debias() in a running process": lambda: debias(log, inside, model=weights, init="stationary", overwrite=True),
             "imutool debias": process(imutool, "debias", log, work / "out.mcap", *flags),
             "python -c 'import torch'": process(sys.executable, "-c", "import torch"),
             "cp": process(cp, log, work / "copy.mcap"),
         }
-        medians = race(racing, args.rounds)
+        medians = race(racing, rounds)
         size = {file.name: file.stat().st_size / 1e6 for file in (log, work / "out.mcap")}
-
-    print(f"torch {torch.__version__}, {torch.get_num_threads()} thread of {os.cpu_count()} cores", end="")
-    print(f", load {os.getloadavg()[0]:.1f}; ", end="")
-    print(f"{args.seconds:g} s at {1 / imu.period_s:.0f} Hz, {len(imu)} samples; ", end="")
-    print(f"log {size['flight.mcap']:.1f} MB, debiased {size['out.mcap']:.1f} MB; medians of {args.rounds} rounds")
+    print(f"log {size['flight.mcap']:.1f} MB, debiased {size['out.mcap']:.1f} MB; medians of {rounds} rounds")
     print(f"{'':32}{'wall s':>10}{'CPU s':>10}{'CPU us/sample':>15}{'real time / wall':>18}{'wall / cp':>11}")
     for what, taken in medians.items():
-        print(f"{what:32}{taken.wall:10.3f}{taken.cpu:10.3f}{1e6 * taken.cpu / len(imu):15.2f}", end="")
-        print(f"{args.seconds / taken.wall:18,.0f}{taken.wall / medians['cp'].wall:11.1f}")
+        print(f"{what:32}{taken.wall:10.3f}{taken.cpu:10.3f}{1e6 * taken.cpu / len(recording.imu):15.2f}", end="")
+        print(f"{seconds_long / taken.wall:18,.0f}{taken.wall / medians['cp'].wall:11.1f}")
+
+
+def main() -> None:
+    """Prints two tables: models in memory, and the whole command."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("models", nargs="*", metavar="MODEL", help="names or files (default: all that ship)")
+    parser.add_argument("--seconds", type=float, default=150.0)
+    parser.add_argument("--rounds", type=int, default=5)
+    parser.add_argument("--in-memory", action="store_true", help="leave the whole command out")
+    args = parser.parse_args()
+    single_threaded()
+    imu = flight(5, duration_s=args.seconds).imu
+    print(f"torch {torch.__version__}, {torch.get_num_threads()} thread of {os.cpu_count()} cores", end="")
+    print(f", load {os.getloadavg()[0]:.1f}; {args.seconds:g} s at {1 / imu.period_s:.0f} Hz, {len(imu)} samples")
+    in_memory(args.models or sorted(path.stem for path in _file.library().glob("*.safetensors")), imu, args.rounds)
+    if not args.in_memory:
+        as_a_command(args.seconds, args.rounds)
 
 
 if __name__ == "__main__":

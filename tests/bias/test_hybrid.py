@@ -10,13 +10,16 @@ import pytest
 import torch
 
 from imutool.bias import hybrid, neural_ode
-from imutool.bias._base import COLUMNS, SENSORS, BiasModel, Segment, Sensor
+from imutool.bias._base import COLUMNS, SENSORS, BiasModel, OneByOne, Segment, Sensor
 from imutool.bias._file import load, save
 from imutool.config import build as build_settings
+from imutool.debias import OnlineDebiaser, apply
 from imutool.errors import ConfigError, ModelError
 from imutool.physics.effects._base import compiled
 from imutool.physics.effects._catalogue import known, named
 from imutool.physics.signals import SignalFilter
+from imutool.recording import Imu
+from imutool.turn_on import prior
 
 MakeModel, MakeSegment = Callable[..., BiasModel], Callable[..., Segment]
 RATE_HZ = 200.0
@@ -29,7 +32,7 @@ FORGOTTEN = 1e-4  # exp(-10), and a little
 
 
 def theta_of(sensor: Sensor, names: tuple[str, ...], seed: int = 5) -> np.ndarray:
-    plausible = np.concatenate([effect.plausible for effect in named(sensor, names)])
+    plausible = np.concatenate([np.zeros(0), *(effect.plausible for effect in named(sensor, names))])
     return plausible * np.random.default_rng(seed).normal(size=len(plausible))
 
 
@@ -90,6 +93,45 @@ def test_one_sample_at_a_time_is_the_whole(build: MakeModel, seen: Segment, rema
     singles = [stream(t[k : k + 1] + 7.0, gyro[k : k + 1], accel[k : k + 1]) for k in range(len(t))]
     np.testing.assert_allclose(np.concatenate(singles), whole, rtol=0, atol=SAME)
     np.testing.assert_allclose(whole, model(seen)[0].numpy(), rtol=0, atol=1e-9)  # seconds since 7 are rounded
+
+
+@pytest.mark.parametrize("remainder", [True, False])
+@pytest.mark.parametrize(
+    "names",
+    [
+        NAMES,
+        {"gyro": ("gyro_scale",), "accel": ("accel_misalignment",)},  # needs no filter
+        {"gyro": ("vibration_rectification",), "accel": ()},  # needs no derivative
+        {"gyro": ("rate_curve", "gyro_quadratic"), "accel": ("accel_bias_drift",)},  # without a short way of their own
+        {"gyro": (), "accel": ("lever_arm", "accel_quadratic")},
+    ],
+)
+def test_single_samples_and_blocks_mix(
+    build: MakeModel, seen: Segment, names: dict[Sensor, tuple[str, ...]], remainder: bool
+) -> None:
+    """Each takes up what the other left, and what a single sample returned is its caller's."""
+    model = model_of(build, names, remainder=remainder)
+    t, gyro, accel = (value[0].numpy() for value in (seen.t, seen.gyro, seen.accel))
+    u = np.concatenate([gyro, accel], axis=1)
+    whole, stream = model.stream(seen.rest[0].numpy())(t, gyro, accel), model.stream(seen.rest[0].numpy())
+    assert isinstance(stream, OneByOne)
+    singles: list[np.ndarray] = []
+    for k in (0, 120, 240, 360):  # 50 samples of the drift's step do not divide them
+        singles.extend(stream.one(float(t[i]), u[i]) for i in range(k, k + 70))
+        singles.extend(stream(t[k + 70 : k + 120], gyro[k + 70 : k + 120], accel[k + 70 : k + 120]))
+    np.testing.assert_allclose(np.array(singles), whole[: len(singles)], rtol=0, atol=SAME)
+
+
+def test_a_live_node_gets_what_a_log_gets(build: MakeModel, seen: Segment) -> None:
+    model = model_of(build)
+    t_ns = 1_700_000_000_000_000_000 + np.round(seen.t[0].numpy() * 1e9).astype(np.int64)
+    imu = Imu(t_ns, seen.gyro[0].numpy(), seen.accel[0].numpy())
+    start = prior(model)
+    log, online = apply(model, start, imu), OnlineDebiaser(model, start)
+    lived = [online(int(stamp), gyro, accel) for stamp, gyro, accel in zip(t_ns, imu.gyro, imu.accel, strict=True)]
+    expected = (log.imu.gyro, log.imu.accel, log.bias)
+    for found, whole in zip(zip(*lived, strict=True), expected, strict=True):
+        np.testing.assert_allclose(np.array(found), whole, rtol=0, atol=1e-10)  # seconds come from nanoseconds in two ways
 
 
 @pytest.mark.parametrize("remainder", [True, False])

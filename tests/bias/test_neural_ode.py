@@ -26,6 +26,7 @@ SECONDS = 20.0
 # samples through a filter of half a second whatever the step; in flight, whose motion changes within a third of one, a quarter
 # second is then good to a twentieth of the drift's own size, and the drift is there to take away a hundredth of a bias.
 SHARE = 0.06  # between a step and its half; to no step at all it is twice as far
+SAME_CURVE = 1e-13  # rad/s, m/s²: sums of 16 terms in another order
 ORDER = 0.3  # design.md: measured order of convergence within 0.3 of theory
 LEAST = {"gyro": 1e-3, "accel": 1e-2}  # rad/s, m/s²: the drift over 20 s with these weights, else there is nothing to compare
 MakeModel, MakeSegment = Callable[..., BiasModel], Callable[..., Segment]
@@ -146,6 +147,31 @@ def test_the_curve_of_no_motion_is_exactly_zero(scale: float) -> None:
             zeros = torch.zeros(n, 3, dtype=torch.float64)
             left = max(curve(zeros, zeros).abs().max().item(), np.abs(at_work(np.zeros((n, 6)), np.zeros((n, 6)))).max())
             assert left <= curve.curve * 64 * 1e-16 * (1.0 + scale)
+        alone = np.abs(at_work.one(np.zeros(6), np.zeros(6), 3.0)).max()
+        assert alone <= curve.curve * 64 * 1e-16 * (1.0 + scale)
+
+
+@pytest.mark.parametrize("bent", [True, False])
+def test_the_curves_at_work_are_the_curves(bent: bool) -> None:
+    """Of both sensors, in blocks of any size, and of one sample with a line of the rest bias on top."""
+    torch.manual_seed(5)
+    both = [Curve(16, scale, size).double() for scale, size in ((0.2, 0.02), (10.0, 0.2))]
+    u, slow = 3.0 * torch.randn(2, 130, 6, dtype=torch.float64)
+    with torch.no_grad():
+        for curve in both:
+            for value in curve.parameters():
+                value.add_(0.3 * torch.randn(value.shape, dtype=value.dtype))
+            curve.net[4].weight.mul_(float(bent))
+        halves = (slice(0, 3), slice(3, 6))
+        expected = torch.cat([c(u[:, half], slow[:, half]) for c, half in zip(both, halves, strict=True)], dim=1).numpy()
+    at_work = Curves(both[0].weights(), both[1].weights())
+    rest, slope = np.arange(6.0), 0.1 * np.arange(6.0)
+    for n in (1, 2, 63, 64, 65, 130):
+        np.testing.assert_allclose(at_work(u[:n].numpy(), slow[:n].numpy()), expected[:n], rtol=0, atol=SAME_CURVE)
+    at_work.add_line(rest, slope)
+    for k in range(130):
+        one = at_work.one(u[k].numpy(), slow[k].numpy(), 0.5 * k)
+        np.testing.assert_allclose(one, expected[k] + rest + 0.5 * k * slope, rtol=0, atol=SAME_CURVE)
 
 
 def test_an_untrained_model_adds_nothing(seen: Segment) -> None:

@@ -9,7 +9,21 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from imutool.physics.signals import POWER_S, SLOW_S, TURN_S, SignalFilter, Signals
+from imutool.physics.signals import (
+    ACCEL,
+    ACCEL_DOT,
+    ALPHA,
+    COUNT,
+    GYRO,
+    GYRO_DOT,
+    GYRO_SLOW,
+    POWER_S,
+    SLOW_S,
+    TURN_S,
+    VIBRATION,
+    SignalFilter,
+    Signals,
+)
 
 RATE_HZ = 200.0
 SAME = 1e-12  # of the largest entry: the single sample's sums are in another order
@@ -42,6 +56,25 @@ def test_one_sample_at_a_time_is_the_block() -> None:
     close(in_blocks(list(range(1, 400)), *seen), in_blocks([], *seen))
 
 
+@pytest.mark.parametrize(("wanted", "made"), [(0, 6), (6, 6), (7, 18), (18, 18), (19, COUNT), (COUNT, COUNT)])
+@pytest.mark.parametrize("cuts", [[], list(range(1, 60)), [0, 7, 8, 9, 40]])
+def test_what_nobody_wants_is_left_at_zero_and_the_rest_is_the_same(wanted: int, made: int, cuts: list[int]) -> None:
+    t_s, gyro, accel = samples(6, 60)
+    whole, filter_ = in_blocks(cuts, t_s, gyro, accel), SignalFilter(RATE_HZ, wanted)
+    edges = [0, *cuts, 60]
+    some = np.concatenate([filter_(t_s[a:b], gyro[a:b], accel[a:b]).columns for a, b in pairwise(edges)])
+    assert made == COUNT or np.abs(whole[:, made:]).max() > 0
+    np.testing.assert_array_equal(some[:, :made], whole[:, :made])
+    assert not some[:, made:].any()
+
+
+def test_a_single_samples_short_way_is_the_block() -> None:
+    t_s, gyro, accel = samples(7, 100)
+    filter_ = SignalFilter(RATE_HZ)
+    rows = [filter_.one(float(t), u).copy() for t, u in zip(t_s, np.concatenate([gyro, accel], axis=1), strict=True)]
+    close(np.array(rows), in_blocks([], t_s, gyro, accel))
+
+
 def test_what_was_returned_stays_what_it_was() -> None:
     """Neither the filter nor its caller can reach the other's numbers."""
     t_s, gyro, accel = samples(2, 6)
@@ -58,7 +91,7 @@ def test_what_was_returned_stays_what_it_was() -> None:
 def test_nothing_in_nothing_out() -> None:
     filter_ = SignalFilter(RATE_HZ)
     none = np.zeros((0, 3))
-    assert filter_(np.zeros(0), none, none).columns.shape == (0, 21)
+    assert filter_(np.zeros(0), none, none).columns.shape == (0, COUNT)
     t_s, gyro, accel = samples(3, 5)
     close(filter_(t_s, gyro, accel).columns, in_blocks([], t_s, gyro, accel))
 
@@ -115,13 +148,15 @@ def test_stamps_that_stand_still_or_run_back_do_not_blow_up() -> None:
     t_s[10:] -= 0.02
     t_s[5] = t_s[4]
     for cuts in ([], list(range(1, 20))):
-        dot = in_blocks(cuts, t_s, gyro, accel)[:, 9:12]
+        dot = in_blocks(cuts, t_s, gyro, accel)[:, GYRO_DOT]
         np.testing.assert_allclose(dot[[5, 10]], (gyro[[5, 10]] - gyro[[4, 9]]) * RATE_HZ / 0.1, rtol=1e-12)
 
 
 def test_columns_have_names() -> None:
-    columns = np.arange(21.0)[None]
+    columns = np.arange(float(COUNT))[None]
     signals = Signals(np.zeros(1), columns)
     names = ("gyro", "accel", "gyro_slow", "gyro_dot", "accel_dot", "alpha", "vibration")
-    np.testing.assert_array_equal(np.concatenate([getattr(signals, name) for name in names], axis=1), columns)
-    assert signals.rows(np.array([0, 0])).columns.shape == (2, 21)
+    places = (GYRO, ACCEL, GYRO_SLOW, GYRO_DOT, ACCEL_DOT, ALPHA, VIBRATION)
+    for name, place in zip(names, places, strict=True):
+        np.testing.assert_array_equal(getattr(signals, name), columns[:, place])
+    assert signals.rows(np.array([0, 0])).columns.shape == (2, COUNT)

@@ -17,8 +17,8 @@ from jaxtyping import Float64
 from imutool.physics.signals import COUNT, Signals
 
 Sensor = Literal["gyro", "accel"]
-AtWork = Callable[[Signals], Float64[np.ndarray, "n 3"]]
 AXES = ("x", "y", "z")
+Three = tuple[float, float, float]
 
 
 @dataclass(frozen=True)
@@ -28,6 +28,21 @@ class Parameter:
     name: str
     unit: str
     plausible: float
+
+
+@dataclass(frozen=True, slots=True)
+class AtWork:
+    """An effect for given parameters: the error at each sample of a block, and at one, from its time and columns.
+
+    One sample is plain floats: numpy's calls would cost several times the arithmetic.
+    """
+
+    block: Callable[[Signals], Float64[np.ndarray, "n 3"]]
+    one: Callable[[float, list[float]], Three]
+
+    def __call__(self, signals: Signals) -> Float64[np.ndarray, "n 3"]:
+        """The error at each sample of a block."""
+        return self.block(signals)
 
 
 @dataclass(frozen=True)
@@ -61,7 +76,45 @@ class Effect:
         if self.at_work is not None:
             return self.at_work(theta)
         matrix = self.matrix(theta)
-        return lambda signals: np.asarray(self.terms(signals) @ matrix)
+
+        def block(signals: Signals) -> Float64[np.ndarray, "n 3"]:
+            return np.asarray(self.terms(signals) @ matrix)
+
+        def one(t_s: float, row: list[float]) -> Three:
+            x, y, z = block(Signals(np.array([t_s]), np.array([row])))[0].tolist()
+            return x, y, z
+
+        return AtWork(block, one)
+
+
+@dataclass(frozen=True)
+class Together:
+    """Several effects for given parameters: one product with all columns, and what cannot be had that way."""
+
+    matrix: Float64[np.ndarray, "27 3"]
+    others: tuple[AtWork, ...]
+
+    @property
+    def wanted(self) -> int:
+        """How many of the signals' columns must be there."""
+        if self.others:
+            return COUNT
+        return int(np.flatnonzero(self.matrix.any(axis=1)).max(initial=-1)) + 1
+
+    def __call__(self, signals: Signals) -> Float64[np.ndarray, "n 3"]:
+        """The error at each sample of a block."""
+        out: Float64[np.ndarray, "n 3"] = np.dot(signals.columns, self.matrix)
+        for other in self.others:
+            out += other(signals)
+        return out
+
+    def others_at(self, t_s: float, row: list[float]) -> Three:
+        """The error at one sample but for the product's."""
+        x, y, z = 0.0, 0.0, 0.0
+        for other in self.others:
+            dx, dy, dz = other.one(t_s, row)
+            x, y, z = x + dx, y + dy, z + dz
+        return x, y, z
 
 
 def patterns(effects: Sequence[Effect]) -> Float64[np.ndarray, "3 q p"]:
@@ -75,8 +128,8 @@ def patterns(effects: Sequence[Effect]) -> Float64[np.ndarray, "3 q p"]:
     return out
 
 
-def compiled(effects: Sequence[Effect], theta: Float64[np.ndarray, " p"]) -> AtWork:
-    """The error of some effects together, for given parameters in their order: one product with all columns, and the others."""
+def compiled(effects: Sequence[Effect], theta: Float64[np.ndarray, " p"]) -> Together:
+    """Some effects at work together, for given parameters in their order."""
     matrix, others = np.zeros((COUNT, 3)), []
     for effect in effects:
         size = len(effect.parameters)
@@ -85,14 +138,7 @@ def compiled(effects: Sequence[Effect], theta: Float64[np.ndarray, " p"]) -> AtW
             matrix[effect.sees] += effect.matrix(own)
         else:
             others.append(effect.compiled(own))
-
-    def error(signals: Signals) -> Float64[np.ndarray, "n 3"]:
-        out: Float64[np.ndarray, "n 3"] = np.dot(signals.columns, matrix)  # half the price of @ for one row
-        for other in others:
-            out += other(signals)
-        return out
-
-    return error
+    return Together(matrix, tuple(others))
 
 
 def per_axis(unit: str, plausible: float) -> tuple[Parameter, ...]:

@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from jaxtyping import Float64
 
-from imutool.physics.effects._base import AtWork, Effect, Sensor, per_axis
+from imutool.physics.effects._base import AtWork, Effect, Sensor, Three, per_axis
+from imutool.physics.effects._forward import Physics, Stage, Theta, each_axis
+from imutool.physics.effects.size_effect import levers
+from imutool.physics.readings import Felt
 from imutool.physics.signals import ALPHA, GYRO, Signals
 
 SENSORS: tuple[Sensor, ...] = ("accel",)
@@ -33,32 +38,43 @@ def _pattern() -> Float64[np.ndarray, "3 9 3"]:
 
 
 def _at_work(r_b: Float64[np.ndarray, "3"]) -> AtWork:
-    """alpha x r + omega (omega . r) - |omega|² r; for one sample in plain floats, a fifth of what numpy's calls would cost."""
+    """alpha x r + omega (omega . r) - |omega|² r."""
     x, y, z = r_b.tolist()
     r_x = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])  # rows: alpha x r = -[r]x alpha = alpha [r]x
 
-    def error(signals: Signals) -> Float64[np.ndarray, "n 3"]:
-        if len(signals.t_s) != 1:
-            w = signals.gyro
-            along, size = (w @ r_b)[:, None], np.einsum("na,na->n", w, w)[:, None]
-            return np.asarray(signals.alpha @ r_x + w * along - size * r_b)
-        row = signals.columns[0].tolist()
+    def block(signals: Signals) -> Float64[np.ndarray, "n 3"]:
+        w = signals.gyro
+        along, size = (w @ r_b)[:, None], np.einsum("na,na->n", w, w)[:, None]
+        return np.asarray(signals.alpha @ r_x + w * along - size * r_b)
+
+    def one(_: float, row: list[float]) -> Three:
         (wx, wy, wz), (ax, ay, az) = row[GYRO], row[ALPHA]
         along, size = wx * x + wy * y + wz * z, wx * wx + wy * wy + wz * wz
-        return np.array(
-            [
-                [
-                    ay * z - az * y + wx * along - size * x,
-                    az * x - ax * z + wy * along - size * y,
-                    ax * y - ay * x + wz * along - size * z,
-                ]
-            ]
+        return (
+            ay * z - az * y + wx * along - size * x,
+            az * x - ax * z + wy * along - size * y,
+            ax * y - ay * x + wz * along - size * z,
         )
 
-    return error
+    return AtWork(block, one)
 
 
 def effect(sensor: Sensor) -> Effect:
     """r (m): from the tracked point to the accelerometer; the part along a single turning axis is not seen."""
     equation = "accel += alpha x r + omega x (omega x r)"
     return Effect("lever_arm", sensor, equation, per_axis("m", 0.3), _terms, _pattern(), _at_work)
+
+
+def _forward(felt: Felt, r_b: Theta) -> Felt:
+    return replace(felt, accel=felt.accel + levers(felt, np.tile(r_b, (3, 1))))
+
+
+PHYSICS = Physics(
+    "lever_arm",
+    Stage.MOTION,
+    SENSORS,
+    "accel += alpha x r + omega x (omega x r)",
+    each_axis("m", 0.3),
+    "it turns; the part along a single turning axis is not seen",
+    _forward,
+)

@@ -12,7 +12,7 @@ from bisect import bisect_right
 import numpy as np
 from jaxtyping import Float64
 
-from imutool.physics.effects._base import AXES, AtWork, Effect, Parameter, Sensor
+from imutool.physics.effects._base import AXES, AtWork, Effect, Parameter, Sensor, Three
 from imutool.physics.signals import GYRO, GYRO_SLOW, Signals
 
 SENSORS: tuple[Sensor, ...] = ("gyro",)
@@ -37,26 +37,24 @@ def _terms(signals: Signals) -> Float64[np.ndarray, "n q"]:
 
 
 def _at_work(theta: Float64[np.ndarray, " p"]) -> AtWork:
-    """The curves by interpolation; for one sample as a line looked up: numpy's calls would cost ten times this."""
+    """The curves by interpolation; for one sample as a line looked up."""
     values = np.zeros((2, 3, len(KNOTS_RAD_S)))
     values[:, :, NONZERO] = theta.reshape(2, 3, -1)
     slope = np.pad(np.diff(values) / np.diff(KNOTS_RAD_S), ((0, 0), (0, 0), (1, 1)))  # level beyond the last knots
     at_zero = np.pad(values, ((0, 0), (0, 0), (1, 0)), mode="edge") - slope * np.pad(KNOTS_RAD_S, (1, 0), mode="edge")
     knots, lines = KNOTS_RAD_S.tolist(), np.stack([at_zero, slope], axis=-1).reshape(6, -1, 2).tolist()
 
-    def one(row: list[float]) -> Float64[np.ndarray, "1 3"]:
-        e = [(segment := line[bisect_right(knots, x)])[0] + segment[1] * x for line, x in zip(lines, row, strict=True)]
-        return np.array([[e[0] + e[3], e[1] + e[4], e[2] + e[5]]])
+    def one(_: float, row: list[float]) -> Three:
+        seen = zip(lines, row[GYRO] + row[GYRO_SLOW], strict=True)
+        e = [(segment := line[bisect_right(knots, x)])[0] + segment[1] * x for line, x in seen]
+        return e[0] + e[3], e[1] + e[4], e[2] + e[5]
 
-    def error(signals: Signals) -> Float64[np.ndarray, "n 3"]:
-        if len(signals.t_s) == 1:
-            row = signals.columns[0].tolist()
-            return one(row[GYRO] + row[GYRO_SLOW])
+    def block(signals: Signals) -> Float64[np.ndarray, "n 3"]:
         columns = zip((*signals.gyro.T, *signals.gyro_slow.T), values.reshape(6, -1), strict=True)
         both = [np.interp(x, KNOTS_RAD_S, value) for x, value in columns]
         return np.stack([a + b for a, b in zip(both[:3], both[3:], strict=True)], axis=1)
 
-    return error
+    return AtWork(block, one)
 
 
 def effect(sensor: Sensor) -> Effect:
