@@ -7,10 +7,10 @@ from __future__ import annotations
 
 import os
 
-from imutool.cli import convert, debias, demo, evaluate, export, info, models, train, view, vio
+from imutool.cli import conceal, convert, debias, demo, evaluate, export, info, models, simulate, train, view, vio
 from imutool.cli._app import app, caught
 
-COMMANDS = (convert, info, train, debias, evaluate, view, export, vio, models, demo)
+COMMANDS = (convert, info, train, debias, evaluate, view, export, vio, simulate, conceal, models, demo)
 
 
 def main() -> None:

@@ -92,7 +92,7 @@ class Unexplained:
 
 @dataclass(frozen=True, eq=False)
 class Traces:
-    """One log, for pictures: samples of gyro (rad/s) and accel (m/s²), what was expected before and after, and held-out time."""
+    """One log, for pictures: gyro (rad/s) and accel (m/s²), what was expected before and after, which samples were held out."""
 
     log: str
     t_s: Float64[np.ndarray, " n"]

@@ -13,11 +13,96 @@ from types import MappingProxyType
 
 import numpy as np
 from jaxtyping import Float64
-from scipy.interpolate import make_interp_spline
+from scipy.ndimage import spline_filter1d
+from scipy.sparse import csr_array
+
+from imutool.errors import DataError
 
 Vectors = Float64[np.ndarray, "n 3"]
 Times = Float64[np.ndarray, " n"]
+PAD = 12  # samples beyond the ends over which the spline forgets how it begins: 0.27^12 = 1e-7
+UNEVEN = 1e-2  # of a period: how far the even clock may be from even
+SAME_S = 1e-7  # a stamp's rounding; the fastest motion goes nowhere in it
 NOTHING: Mapping[str, Float64[np.ndarray, " n"]] = MappingProxyType({})
+Instants = tuple[Float64[np.ndarray, " n"], Float64[np.ndarray, " m"], csr_array | None]
+
+
+class Sampler:
+    """Cubic splines over one even clock, taken at some instants; it remembers the last ones, for much of them stays the same.
+
+    All that `replace` makes of a `Felt` shares one, so that what few effects change (instants, attitude, channels) is worked on
+    once. What it gives cannot be written to; each memory is replaced as a whole, so threads may share it.
+    """
+
+    def __init__(self) -> None:
+        self._instants: Instants | None = None
+        self._motion: tuple[tuple[Vectors, ...], object, Float64[np.ndarray, "m 9"]] | None = None
+        self._beside: tuple[object, object, object, Float64[np.ndarray, "m k"]] | None = None
+
+    def motion(self, felt: Felt, taken_s: Float64[np.ndarray, " m"]) -> Float64[np.ndarray, "m 9"]:
+        """gyro, accel, alpha."""
+        instants, now, last = self._at(felt.t_s, taken_s), (felt.gyro, felt.accel, felt.alpha), self._motion
+        same = last is not None and all(was is one for was, one in zip(last[0], now, strict=True))
+        if last is None or not same or (last[1] is None) != (instants[2] is None):
+            columns = np.concatenate(now, axis=1)
+            self._motion = last = (now, instants[2], columns if instants[2] is None else _coefficients(columns))
+        return _values(last[2], instants[2])
+
+    def beside(self, felt: Felt, taken_s: Float64[np.ndarray, " m"]) -> Float64[np.ndarray, "m k"]:
+        """R_wb row by row, where it is known, then the channels."""
+        instants, last = self._at(felt.t_s, taken_s), self._beside
+        if last is None or last[0] is not felt.R_wb or last[1] is not felt.channels or last[2] is not instants:
+            columns = [np.zeros((len(felt.t_s), 0))] if felt.R_wb is None else [felt.R_wb.reshape(-1, 9)]
+            columns += [values[:, None] for values in felt.channels.values()]
+            both = np.concatenate(columns, axis=1)
+            if instants[2] is not None:
+                both = _coefficients(both)
+            self._beside = last = (felt.R_wb, felt.channels, instants, _values(both, instants[2]))
+        return last[3]
+
+    def _at(self, t_s: Times, taken_s: Float64[np.ndarray, " m"]) -> Instants:
+        """Clock, instants, and what takes splines' coefficients to their values (None: the instants are the clock's own).
+
+        Raises:
+            DataError: a clock that is not even.
+        """
+        last = self._instants
+        if last is None or not (np.array_equal(last[0], t_s) and np.array_equal(last[1], taken_s)):
+            own = len(t_s) == len(taken_s) and bool(np.abs(t_s - taken_s).max() <= SAME_S)
+            self._instants = last = (t_s.copy(), taken_s.copy(), None if own else _weights(t_s, taken_s))
+        return last
+
+
+def _weights(t_s: Float64[np.ndarray, " n"], taken_s: Float64[np.ndarray, " m"]) -> csr_array:
+    """The four cubic B-splines at each instant."""
+    n, period_s = len(t_s), (t_s[-1] - t_s[0]) / (len(t_s) - 1)
+    off = np.abs(t_s - (t_s[0] + period_s * np.arange(n)))
+    if not off.max() <= UNEVEN * period_s:
+        row = int(off.argmax())
+        raise DataError(f"the clock of the motion is {off[row]:.3g} s off in row {row}", expected="an even clock")
+    at = np.clip((taken_s - t_s[0]) / period_s, 0.0, n - 1.0)
+    first = np.minimum(at.astype(np.int64), n - 2)
+    u = at - first
+    v = 1.0 - u
+    inner = [2.0 / 3.0 - x**2 + x**3 / 2.0 for x in (u, v)]
+    values = np.stack([v**3 / 6.0, *inner, u**3 / 6.0], axis=1)
+    columns = (first + PAD - 1)[:, None] + np.arange(4)
+    return csr_array((values.ravel(), columns.ravel(), 4 * np.arange(len(at) + 1)), shape=(len(at), n + 2 * PAD))
+
+
+def _coefficients(x: Float64[np.ndarray, "n k"]) -> Float64[np.ndarray, "m k"]:
+    """Beyond the ends the columns go on as they came, turned about their last point, so that they bend neither way there."""
+    beyond = np.minimum(np.arange(1, PAD + 1), len(x) - 1)
+    padded = np.concatenate([2.0 * x[0] - x[beyond[::-1]], x, 2.0 * x[-1] - x[len(x) - 1 - beyond]])
+    if not x.shape[1]:
+        return padded
+    return np.ascontiguousarray(spline_filter1d(np.ascontiguousarray(padded.T), 3, axis=1).T)
+
+
+def _values(columns: Float64[np.ndarray, "n k"], weights: csr_array | None) -> Float64[np.ndarray, "m k"]:
+    both = columns if weights is None else np.asarray(weights @ columns)
+    both.flags.writeable = False
+    return both
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,6 +120,7 @@ class Felt:
     alpha: Vectors
     R_wb: Float64[np.ndarray, "n 3 3"] | None = None
     channels: Mapping[str, Float64[np.ndarray, " n"]] = field(default_factory=lambda: NOTHING)
+    sampler: Sampler = field(default_factory=Sampler, repr=False)
 
     @property
     def rate_hz(self) -> float:
@@ -42,15 +128,15 @@ class Felt:
         return float((len(self.t_s) - 1) / (self.t_s[-1] - self.t_s[0]))
 
     def taken(self, taken_s: Float64[np.ndarray, " m"], stamp_s: Float64[np.ndarray, " m"]) -> Read:
-        """What is felt at other times (cubic splines; held beyond the ends), one row a sample."""
-        at = np.clip(taken_s, self.t_s[0], self.t_s[-1])
-        columns = [self.gyro, self.accel, self.alpha, *(values[:, None] for values in self.channels.values())]
-        if self.R_wb is not None:
-            columns.append(self.R_wb.reshape(-1, 9))
-        both = make_interp_spline(self.t_s, np.concatenate(columns, axis=1), k=3)(at)
-        names = {name: both[:, 9 + k] for k, name in enumerate(self.channels)}
-        R_wb = None if self.R_wb is None else both[:, -9:].reshape(-1, 3, 3)
-        return Read(stamp_s, both[:, :3], both[:, 3:6], both[:, 6:9], R_wb, names)
+        """What is felt at other times (cubic splines; held beyond the ends), one row a sample.
+
+        Raises:
+            DataError: `t_s` is not even.
+        """
+        both, beside = self.sampler.motion(self, taken_s), self.sampler.beside(self, taken_s)
+        R_wb = None if self.R_wb is None else beside[:, :9].reshape(-1, 3, 3)
+        names = {name: beside[:, k - len(self.channels)] for k, name in enumerate(self.channels)}
+        return Read(stamp_s, both[:, :3], both[:, 3:6], both[:, 6:], R_wb, names)
 
 
 @dataclass(frozen=True, eq=False)

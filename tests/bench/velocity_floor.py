@@ -2,11 +2,11 @@
 
     python tests/bench/velocity_floor.py LOG... [--model M.safetensors]...
 
-Every window starts from the true attitude and velocity, as `evaluate` scores it (`strapdown.drift`). To the windows of a log 27
+Every window starts from the true attitude and velocity, as `evaluate` scores it (`strapdown.drift`). To a log's windows 27
 constants are fitted, by least squares on the very figure that is reported: a matrix and a bias for the gyro, the same for the
-accelerometer, and gravity in the truth's world. A model that was learned on other logs cannot know them. What they leave is what
-changes within the log and the truth's own errors at the ends of windows (half a degree of attitude is g sin(0.5°) 5 s = 0.43
-m/s). V1_01 is compared with its recomputed truth.
+accelerometer, and gravity in the truth's world. A model that was learned on other logs cannot know them. What they leave is
+what changes within the log and the truth's own errors at the ends of windows (half a degree of attitude is g sin(0.5°) 5 s =
+0.43 m/s). V1_01 is compared with its recomputed truth.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The effects there are: all that act on a sensor, or those a person names."""
+"""The effects there are: all that act on a sensor, or those a person names; and all that can be simulated."""
 
 from __future__ import annotations
 
@@ -7,14 +7,15 @@ from collections.abc import Sequence
 from imutool import registry
 from imutool.errors import ConfigError
 from imutool.physics.effects._base import Effect, Sensor
+from imutool.physics.effects._forward import Physics
 
 GROUP = "imutool.effects"
 
 
 def known(sensor: Sensor) -> tuple[Effect, ...]:
-    """Every effect that acts on a sensor, by name."""
+    """Every effect with a closed form that acts on a sensor, by name."""
     modules = [registry.load(GROUP, name) for name in registry.names(GROUP)]
-    return tuple(module.effect(sensor) for module in modules if sensor in module.SENSORS)
+    return tuple(module.effect(sensor) for module in modules if sensor in getattr(module, "SENSORS", ()))
 
 
 def named(sensor: Sensor, names: Sequence[str]) -> tuple[Effect, ...]:
@@ -26,10 +27,25 @@ def named(sensor: Sensor, names: Sequence[str]) -> tuple[Effect, ...]:
     where, found = f"effects of the {sensor}", []
     for name in names:
         module = registry.load(GROUP, name)
-        if sensor not in module.SENSORS:
+        if sensor not in getattr(module, "SENSORS", ()):
             listed = ", ".join(effect.name for effect in known(sensor))
             raise ConfigError(f"{name} does not act on the {sensor}", where=where, expected=f"some of {listed}")
         found.append(module.effect(sensor))
     if len(set(names)) < len(names):
         raise ConfigError(f"{', '.join(names)}: one stands there twice", where=where, expected="each at most once")
     return tuple(found)
+
+
+def physics(names: Sequence[str] | None = None) -> tuple[Physics, ...]:
+    """Every effect that can be simulated, by name; or some, in the order of their names.
+
+    Raises:
+        ConfigError: an unknown name (the nearest is given), or that of an effect that is fitted alone and not simulated.
+    """
+    modules = [registry.load(GROUP, name) for name in (registry.names(GROUP) if names is None else names)]
+    found = tuple(module.PHYSICS for module in modules if hasattr(module, "PHYSICS"))
+    if names is not None and len(found) < len(names):
+        lacking = next(name for name, module in zip(names, modules, strict=True) if not hasattr(module, "PHYSICS"))
+        listed = ", ".join(one.name for one in physics())
+        raise ConfigError(f"{lacking} cannot be simulated", where="effects", expected=f"some of {listed}")
+    return found

@@ -23,10 +23,11 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float64
 
-from imutool.physics.effects._base import Sensor
+from imutool.errors import DataError
+from imutool.physics.effects._base import AXES, Sensor
 from imutool.physics.readings import Felt, Read, Times
 
-Theta = Float64[np.ndarray, " p"]
+Theta = Float64[np.ndarray, "_"]  # effects that act together have numbers of their own, so this length binds no other
 
 
 class Stage(IntEnum):
@@ -44,7 +45,9 @@ class Stage(IntEnum):
 class Number:
     """A parameter: name, unit, plausible size (one standard deviation of what is met), whether it is positive by nature.
 
-    `nothing` is the value at which the effect does nothing: 0, or infinity (a cut-off frequency, a limit).
+    `nothing` is the value at which the effect does nothing: 0, or infinity (a cut-off frequency, a limit). A number that
+    matters only beside an amplitude (a time constant, a frequency) has its plausible size there: any value would do.
+    `step`, where given, is the largest one whose difference is still a derivative, of the logarithm if `positive`.
     """
 
     name: str
@@ -52,6 +55,7 @@ class Number:
     plausible: float
     positive: bool = False
     nothing: float = 0.0
+    step: float | None = None
 
 
 @dataclass(frozen=True)
@@ -60,7 +64,8 @@ class Physics:
 
     forward: (Felt, theta) -> Felt up to BANDWIDTH; (taken_s, theta) -> taken_s at CLOCK; (Read, theta) -> Read after.
     linear: whether what it adds is proportional to theta (then a fit may start at zero).
-    starts: for the others, values of theta to start a fit from, given the ideal signals and the samples.
+    starts: for the others, values of theta to start a fit from, given the ideal signals and the samples: at least one, all
+        finite, and positive where a number is (a limit that is not reached instead of none).
     needs: channels without which it cannot be thought of, such as "temperature"; a channel whose name contains it serves.
     """
 
@@ -86,21 +91,63 @@ class Physics:
         return np.array([number.nothing for number in self.parameters])
 
 
+def each_axis(unit: str, plausible: float, before: str = "") -> tuple[Number, ...]:
+    """One number for each axis, its name perhaps with a word before."""
+    return tuple(Number(before + axis, unit, plausible) for axis in AXES)
+
+
+def each_pair(unit: str, plausible: float, *, diagonal: bool = True, before: str = "") -> tuple[Number, ...]:
+    """One number for each entry of a 3x3 matrix, row by row: `xy` is what y adds to x."""
+    return tuple(Number(before + a + b, unit, plausible) for a in AXES for b in AXES if diagonal or a != b)
+
+
+def matrix(theta: Float64[np.ndarray, "6"]) -> Float64[np.ndarray, "3 3"]:
+    """The matrix whose entries off the diagonal are these, row by row; the diagonal is zero."""
+    out = np.zeros((3, 3))
+    out[~np.eye(3, dtype=bool)] = theta
+    return out
+
+
+def attitude(felt: Felt, effect: str) -> Float64[np.ndarray, "n 3 3"]:
+    """R_wb, for an effect that needs it.
+
+    Raises:
+        DataError: it is not known.
+    """
+    if felt.R_wb is None:
+        raise DataError("the attitude is not known", where=effect, expected="a motion with orientations")
+    return felt.R_wb
+
+
+def misfit(felt: Felt, samples: Read) -> tuple[Float64[np.ndarray, "n 3"], Float64[np.ndarray, "n 3"]]:
+    """Samples minus the ideal at the same stamps: gyro (rad/s), accel (m/s²). Good enough to start a fit from."""
+    ideal = felt.taken(samples.stamp_s, samples.stamp_s)
+    return samples.gyro - ideal.gyro, samples.accel - ideal.accel
+
+
 CONVERTER_ORDER = {"saturation": 1, "quantization": 2}
 Acting = Sequence[tuple[Physics, Theta]]
 
 
 def read(felt: Felt, stamp_s: Times, acting: Acting) -> Read:
     """What a sensor with these effects reads at some stamps: the stages one after another, within a stage by name."""
-    order = sorted(acting, key=lambda pair: (pair[0].stage, CONVERTER_ORDER.get(pair[0].name, 0), pair[0].name))
+    order = _in_order(acting)
     taken_s = np.asarray(stamp_s, dtype=np.float64)
     for physics, theta in order:
         if physics.stage < Stage.CLOCK:
             felt = physics.forward(felt, theta)
         elif physics.stage == Stage.CLOCK:
             taken_s = physics.forward(taken_s, theta)
-    out = felt.taken(taken_s, stamp_s)
-    for physics, theta in order:
+    return sensed(felt.taken(taken_s, stamp_s), acting)
+
+
+def sensed(taken: Read, acting: Acting) -> Read:
+    """What a sensor makes of samples that are taken: the stages behind CLOCK alone."""
+    for physics, theta in _in_order(acting):
         if physics.stage > Stage.CLOCK:
-            out = physics.forward(out, theta)
-    return out
+            taken = physics.forward(taken, theta)
+    return taken
+
+
+def _in_order(acting: Acting) -> list[tuple[Physics, Theta]]:
+    return sorted(acting, key=lambda pair: (pair[0].stage, CONVERTER_ORDER.get(pair[0].name, 0), pair[0].name))

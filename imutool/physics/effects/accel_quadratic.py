@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from imutool.physics.effects._base import Effect, Sensor, diagonal, per_axis
+from imutool.physics.effects._forward import Physics, Stage, Theta, each_axis
+from imutool.physics.readings import Read
 
 SENSORS: tuple[Sensor, ...] = ("accel",)
 
@@ -10,3 +12,18 @@ SENSORS: tuple[Sensor, ...] = ("accel",)
 def effect(sensor: Sensor) -> Effect:
     """k (s²/m): seen where the attitude varies."""
     return Effect("accel_quadratic", sensor, "accel += k * f^2", per_axis("s²/m", 6e-3), lambda s: s.accel**2, diagonal())
+
+
+def _forward(read: Read, k: Theta) -> Read:
+    return read.but(accel=read.accel * (1.0 + k * read.accel))
+
+
+PHYSICS = Physics(
+    "accel_quadratic",
+    Stage.SENSOR,
+    SENSORS,
+    "accel += k * f^2",
+    each_axis("s²/m", 6e-3),
+    "the attitude varies; it rectifies vibration",
+    _forward,
+)

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from imutool.physics.effects._base import Effect, Sensor, diagonal, per_axis
+from imutool.physics.effects._forward import Physics, Stage, Theta, each_axis
+from imutool.physics.readings import Read
 from imutool.physics.signals import ACCEL
 
 SENSORS: tuple[Sensor, ...] = ("accel",)
@@ -11,3 +13,18 @@ SENSORS: tuple[Sensor, ...] = ("accel",)
 def effect(sensor: Sensor) -> Effect:
     """s (-): seen where the attitude varies; collinear with the bias otherwise."""
     return Effect("accel_scale", sensor, "accel += s * f", per_axis("-", 0.1), ACCEL, diagonal())
+
+
+def _forward(read: Read, s: Theta) -> Read:
+    return read.but(accel=read.accel * (1.0 + s))
+
+
+PHYSICS = Physics(
+    "accel_scale",
+    Stage.SENSOR,
+    SENSORS,
+    "accel += s * f",
+    each_axis("-", 0.05),
+    "the attitude varies",
+    _forward,
+)

@@ -5,6 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from imutool.physics.effects._base import Effect, Parameter, Sensor
+from imutool.physics.effects._forward import Number, Physics, Stage, Theta
+from imutool.physics.readings import Felt, Read, Times
 from imutool.physics.signals import ACCEL_DOT, GYRO_DOT
 
 SENSORS: tuple[Sensor, ...] = ("gyro", "accel")
@@ -15,3 +17,25 @@ def effect(sensor: Sensor) -> Effect:
     sees, name = (GYRO_DOT, "omega") if sensor == "gyro" else (ACCEL_DOT, "f")
     same = np.eye(3)[:, :, None]
     return Effect("clock_offset", sensor, f"{sensor} += tau d{name}/dt", (Parameter("tau", "s", 0.01),), sees, same)
+
+
+def _forward(taken_s: Times, tau_s: Theta) -> Times:
+    return np.asarray(taken_s + tau_s[0])
+
+
+def _starts(_felt: Felt, _samples: Read) -> list[Theta]:
+    """From no offset, and from beyond half a period of motion at a few hertz either way."""
+    return [np.array([tau_s]) for tau_s in (0.0, -0.05, 0.05)]
+
+
+PHYSICS = Physics(
+    "clock_offset",
+    Stage.CLOCK,
+    SENSORS,
+    "samples are taken at t + tau",
+    (Number("tau", "s", 0.05),),
+    "it moves",
+    _forward,
+    linear=False,
+    starts=_starts,
+)

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from imutool.physics.effects._base import Effect, Sensor, full, per_pair
+from imutool.physics.effects._forward import Physics, Stage, Theta, each_pair
+from imutool.physics.readings import Read
 from imutool.physics.signals import ACCEL
 
 SENSORS: tuple[Sensor, ...] = ("gyro",)
@@ -12,3 +14,18 @@ def effect(sensor: Sensor) -> Effect:
     """G (rad/s per m/s²): seen where attitude or acceleration varies; collinear with the bias at rest."""
     pairs = per_pair("rad/s per m/s²", 1e-3)
     return Effect("gyro_g_sensitivity", sensor, "gyro += G f", pairs, ACCEL, full())
+
+
+def _forward(read: Read, g: Theta) -> Read:
+    return read.but(gyro=read.gyro + read.accel @ g.reshape(3, 3).T)
+
+
+PHYSICS = Physics(
+    "gyro_g_sensitivity",
+    Stage.SENSOR,
+    SENSORS,
+    "gyro += G f",
+    each_pair("rad/s per m/s²", 3e-3),
+    "attitude or acceleration varies; collinear with the bias at rest",
+    _forward,
+)

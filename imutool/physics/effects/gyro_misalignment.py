@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from imutool.physics.effects._base import Effect, Sensor, off_diagonal, per_pair
+from imutool.physics.effects._forward import Physics, Stage, Theta, each_pair, matrix
+from imutool.physics.readings import Read
 from imutool.physics.signals import GYRO
 
 SENSORS: tuple[Sensor, ...] = ("gyro",)
@@ -12,3 +14,18 @@ def effect(sensor: Sensor) -> Effect:
     """m (-): seen where two axes turn. A rotation common to gyro and accelerometer is a mount rotation."""
     pairs = per_pair("-", 0.05, diagonal=False)
     return Effect("gyro_misalignment", sensor, "gyro += M omega, diag M = 0", pairs, GYRO, off_diagonal())
+
+
+def _forward(read: Read, m: Theta) -> Read:
+    return read.but(gyro=read.gyro + read.gyro @ matrix(m).T)
+
+
+PHYSICS = Physics(
+    "gyro_misalignment",
+    Stage.SENSOR,
+    SENSORS,
+    "gyro += M omega, diag M = 0",
+    each_pair("-", 0.05, diagonal=False),
+    "two axes turn",
+    _forward,
+)

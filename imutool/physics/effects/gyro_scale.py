@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from imutool.physics.effects._base import Effect, Sensor, diagonal, per_axis
+from imutool.physics.effects._forward import Physics, Stage, Theta, each_axis
+from imutool.physics.readings import Read
 from imutool.physics.signals import GYRO
 
 SENSORS: tuple[Sensor, ...] = ("gyro",)
@@ -11,3 +13,18 @@ SENSORS: tuple[Sensor, ...] = ("gyro",)
 def effect(sensor: Sensor) -> Effect:
     """s (-): seen where the axis turns."""
     return Effect("gyro_scale", sensor, "gyro += s * omega", per_axis("-", 0.1), GYRO, diagonal())
+
+
+def _forward(read: Read, s: Theta) -> Read:
+    return read.but(gyro=read.gyro * (1.0 + s))
+
+
+PHYSICS = Physics(
+    "gyro_scale",
+    Stage.SENSOR,
+    SENSORS,
+    "gyro += s * omega",
+    each_axis("-", 0.1),
+    "the axis turns",
+    _forward,
+)

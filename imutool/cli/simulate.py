@@ -1,0 +1,58 @@
+"""`imutool simulate`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from imutool.cli._app import Json, Overwrite, Quiet, Truth, Verbose, app
+from imutool.terminal import logger, progress, say, write_json
+
+
+@app.command(epilog="Example: [bold]imutool simulate V1_02.mcap sim.mcap --physics physics.toml --noise adis16448 --seed 1[/]")
+def simulate(
+    trajectory: Annotated[Path, typer.Argument(metavar="TRAJECTORY", help="An MCAP log with poses.")],
+    target: Annotated[Path, typer.Argument(metavar="OUT", help="The log with the simulated IMU beside the poses.")],
+    physics: Annotated[
+        Path | None, typer.Option(metavar="FILE.toml", help="What acts on the sensor; else it is ideal.")
+    ] = None,
+    noise: Annotated[str, typer.Option(metavar="NAME|FILE.toml", help="none, adis16448, bmi160, or a TOML file.")] = "none",
+    rate: Annotated[
+        float | None, typer.Option(metavar="HZ", help="Samples a second; else as the log's own IMU, or 200.")
+    ] = None,
+    seed: Annotated[int, typer.Option(help="Of the noise.")] = 0,
+    truth: Truth = None,
+    overwrite: Overwrite = False,
+    json_to: Json = None,
+    verbose: Verbose = False,
+    quiet: Quiet = False,
+) -> None:
+    """Simulate an IMU along the poses of a log, with the physics and the noise of a sensor."""
+    from imutool.physics.simulate import simulate as run
+
+    with progress("Simulating", verbose, quiet) as tell:
+        found = run(
+            trajectory,
+            target,
+            physics=physics,
+            noise=noise,
+            rate_hz=rate,
+            seed=seed,
+            truth=truth,
+            overwrite=overwrite,
+            progress=tell,
+        )
+        for remark in found.remarks:
+            logger.warning("%s", remark)
+    report = found.plain()
+    if write_json(report, json_to):
+        return
+    names = ", ".join(effect["name"] for effect in report["physics"]["effect"]) or "ideal"
+    pieces = len(found.motion.stretches)
+    where = f"{report['duration_s']:.1f} s" + (f" in {pieces} stretches" if pieces > 1 else "")
+    say(f"{target}: {report['samples']} samples at {report['rate_hz']:g} Hz over {where}; physics {names}; noise {noise}")
+    motion = report["motion"]
+    sure = f"{motion['gyro_std_rad_s']:.2g} rad/s and {motion['accel_std_m_s2']:.2g} m/s²"
+    say(f"the poses say what is felt to {sure}; {motion['glitches']} glitches dropped, {motion['steps']} steps levelled")

@@ -1,0 +1,308 @@
+"""From logs to an answer: paired with what was expected, weighed by the noise, searched, located, tested on unseen time.
+
+logs ─ pair ─> Pair[] ─ whitening ─> Weighed[] ─ discover ─> Judged[] ─ locate ─> Diagnosis
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float64
+
+from imutool.errors import DataError
+from imutool.mcap_io.read import read as read_log
+from imutool.physics import stamps, unnamed
+from imutool.physics.diagnosis import UNITS, Curve, Diagnosis, Estimate, Finding, HeldOut, Traces, Unexplained
+from imutool.physics.discover import Discovery, Judged, discover
+from imutool.physics.effects import _catalogue
+from imutool.physics.effects._forward import Physics
+from imutool.physics.fit import Chosen, Fit, Weighed, derivatives, expected
+from imutool.physics.locate import located
+from imutool.physics.motion import smooth_motion
+from imutool.physics.pair import LEAST_S, Pair, with_simulation, with_truth
+from imutool.physics.unnamed import unit
+from imutool.physics.whitening import level, whitener
+from imutool.recording import Recording
+
+ORDER_SIM, ORDER_TRUTH = 6, 30  # of the autoregression: a sensor's noise is nearly white, that of differentiated poses is not
+RIDGE = 1e-8
+SHOWN_BY_SAMPLES = {"saturation", "quantization"}  # without any fit: `stamps`
+SHOWN_KNOTS = 41  # of a curve without a name, as it is told
+WHITE = 1.15  # what is left over the noise, as a ratio, that still counts as noise
+Tell = Callable[[int, int, str], None]
+
+
+def diagnose(
+    reals: Sequence[Path],
+    sim: Path | None = None,
+    *,
+    imu: str | None = None,
+    truth: str | None = None,
+    tell: Tell | None = None,
+) -> Diagnosis:
+    """What separates recordings from a simulation, or from what their own true poses say.
+
+    Several recordings share the physics; each has a constant bias of its own.
+
+    Raises:
+        ConfigError, LogError: a log cannot be read, or has no such topic.
+        DataError: no truth and no simulation, too little shared time, another motion.
+    """
+    say = tell or (lambda done, total, text: None)
+    say(0, 4, "reading")
+    simulated = None if sim is None else read_log(sim, imu=imu)
+    pairs = [_unclipped(pair) for real in reals for pair in _pairs(read_log(real, imu=imu, truth=truth), simulated, truth)]
+    say(1, 4, "noise")
+    candidates = _candidates(pairs)
+    logs = [_weighed(pair, candidates) for pair in pairs]
+    say(2, 4, "searching")
+    found = discover(logs, candidates, later(pairs))
+    say(3, 4, "locating")
+    told = _told(logs, found, [str(real) for real in reals], None if sim is None else str(sim))
+    say(4, 4, "")
+    return told
+
+
+def _pairs(real: Recording, sim: Recording | None, truth: str | None) -> Iterator[Pair]:
+    """The recording beside the simulation, or each stretch of it beside its own poses."""
+    if sim is not None:
+        yield with_simulation(real, sim)
+        return
+    if not real.truths:
+        raise DataError("no simulation and no true poses", where=real.name, expected="--sim SIM.mcap, or poses in the log")
+    chosen = real if truth is not None else real.with_truth(next(iter(real.truths)))
+    motion = smooth_motion(chosen.truth)
+    parts = [felt for felt in motion.felt(1.0 / real.imu.period_s) if felt.t_s[-1] - felt.t_s[0] >= LEAST_S]
+    if not parts:
+        raise DataError(
+            f"the true poses have no stretch of {LEAST_S:g} s that can be differentiated",
+            where=real.name,
+            expected="poses at 40 Hz or more, without holes",
+            fix="Give a simulation with --sim",
+        )
+    for felt in parts:
+        yield with_truth(chosen, felt, motion.start_ns)
+
+
+def _unclipped(pair: Pair) -> Pair:
+    """Without rows in which a converter is at its end."""
+    keep = ~stamps.clipped(pair.real)
+    return replace(pair, fitted=pair.fitted & keep, held_out=pair.held_out & keep)
+
+
+def _candidates(pairs: Sequence[Pair]) -> tuple[Physics, ...]:
+    """What of the catalogue can be thought of here, and stamps that may be wrong."""
+    attitude = all(pair.felt.R_wb is not None for pair in pairs)
+    channels = set.intersection(*(set(pair.channels) for pair in pairs))
+
+    def thinkable(physics: Physics) -> bool:
+        return all(attitude if need == "attitude" else any(need in name for name in channels) for need in physics.needs)
+
+    found = [one for one in _catalogue.physics() if thinkable(one) and one.name not in SHOWN_BY_SAMPLES]
+    return (*found, *stamps.jitter(pairs))
+
+
+def later(pairs: Sequence[Pair]) -> list[tuple[Physics, ...]]:
+    """What is asked once the catalogue has nothing more to say: other channels, then curves and equations without a name."""
+    like = unnamed.like(pairs)
+    return [tuple(unnamed.driven(pairs)), (*unnamed.curves(like), *unnamed.terms(like))]
+
+
+def _weighed(pair: Pair, candidates: Sequence[Physics]) -> Weighed:
+    """The pair with its noise: what is left when everything linear in the catalogue has had its way."""
+    linear: Chosen = tuple((one, one.nothing.astype(float)) for one in candidates if one.linear)
+    base = expected(pair, linear)
+    J = derivatives(pair, linear, range(len(linear)), base)
+    left, usable = pair.real - base, pair.fitted | pair.held_out
+    for axis in range(6):
+        A = np.concatenate([J[:, axis], np.ones((len(J), 1))], axis=1)
+        size = np.linalg.norm(A[usable], axis=0)
+        A = A[:, size > 0] / size[size > 0]
+        N = A[usable].T @ A[usable] + RIDGE * np.eye(A.shape[1])
+        left[:, axis] -= A @ np.linalg.solve(N, A[usable].T @ left[usable, axis])
+    if pair.against == "simulation":
+        return Weighed(pair, level(left, usable, 1.0 / pair.period_s, ORDER_SIM))
+    return Weighed(pair, whitener(left, usable, ORDER_TRUTH))
+
+
+# ── what is told ──
+
+
+def _told(logs: Sequence[Weighed], found: Discovery, reals: Sequence[str], sim: str | None) -> Diagnosis:
+    """Findings with what they bring, where the misfit lies, and what is left."""
+    pairs = [log.pair for log in logs]
+    floor = _floor(logs)
+    before = [_with(pair, found, ()) for pair in pairs]
+    after = [_with(pair, found, found.whole.chosen) for pair in pairs]
+    findings = [_finding(logs, found, one, floor) for one in found.judged]
+    findings += stamps.saturated(pairs, after, found.tried) + stamps.dropped(pairs) + stamps.rounded(pairs, floor)
+    p_values = {
+        signal: min((one.p_value for one in found.judged if signal in _signals(one.physics)), default=1.0)
+        for signal in ("gyro", "accel")
+    }
+    places = [
+        place
+        for pair, b, a in zip(pairs[:1], before, after, strict=False)
+        for place in located(pair.stamp_s, a - b, floor, _variables(pair), p_values)
+    ]
+    return Diagnosis(
+        real=tuple(reals),
+        sim=sim,
+        located=tuple(places) if findings else (),
+        findings=tuple(findings),
+        bias=found.whole.bias,
+        not_identifiable=tuple(dict.fromkeys(name for one in found.judged for name in one.unidentified)),
+        unexplained=_unexplained(pairs, after, floor),
+        remarks=tuple(_remarks(pairs)),
+        closer={signal: _held_out(pairs, before, after, k, UNITS[signal]) for k, signal in enumerate(("gyro", "accel"))},
+        traces=tuple(
+            Traces(pair.name, pair.stamp_s, pair.real, b, a, pair.held_out, pair.q_wb_wxyz)
+            for pair, b, a in zip(pairs, before, after, strict=True)
+        ),
+    )
+
+
+def _with(pair: Pair, found: Discovery, chosen: Chosen) -> Float64[np.ndarray, "n 6"]:
+    """What is expected, with the constant that suits it best."""
+    there = expected(pair, chosen)
+    usable = pair.fitted | pair.held_out
+    return np.asarray(there + (pair.real - there)[usable].mean(axis=0))
+
+
+def _floor(logs: Sequence[Weighed]) -> Float64[np.ndarray, "6"]:
+    """The noise of a sample by axis, before it was made white."""
+    variances = []
+    for log in logs:
+        response = np.array([np.abs(np.fft.rfft(a, 512)) ** 2 for a in log.whiten.filters])
+        variances.append(log.whiten.std**2 * (1.0 / response).mean(axis=1))
+    return np.asarray(np.sqrt(np.mean(variances, axis=0)))
+
+
+def _signals(physics: Physics) -> tuple[str, ...]:
+    return tuple(physics.sensors)
+
+
+def _variables(pair: Pair) -> dict[str, tuple[str, Float64[np.ndarray, " n"]]]:
+    """What a regime can be of."""
+    read = pair.felt.taken(pair.stamp_s, pair.stamp_s)
+    rate, force = np.linalg.norm(read.gyro, axis=1), np.linalg.norm(read.accel, axis=1)
+    out = {
+        "angular rate": ("rad/s", rate),
+        "acceleration": ("m/s²", np.abs(force - 9.81)),
+        "angular acceleration": ("rad/s²", np.linalg.norm(read.alpha, axis=1)),
+        "time": ("s", pair.stamp_s),
+    }
+    if read.R_wb is not None:
+        out["tilt"] = ("rad", np.arccos(np.clip(read.R_wb[:, 2, 2], -1.0, 1.0)))
+    for k, axis in enumerate("xyz"):
+        out[f"rate about {axis}"] = ("rad/s", np.abs(read.gyro[:, k]))
+        out[f"force along {axis}"] = ("m/s²", np.abs(read.accel[:, k]))
+    return out | {name: ("", values) for name, values in pair.channels.items()}
+
+
+def _held_out(pairs: Sequence[Pair], before: Sequence[np.ndarray], after: Sequence[np.ndarray], k: int, unit_: str) -> HeldOut:
+    """Root mean squares over held-out samples and axes of a signal, and how long that was."""
+    part = slice(3 * k, 3 * k + 3)
+    power = [
+        np.concatenate(
+            [((pair.real - there)[pair.held_out, part] ** 2).ravel() for pair, there in zip(pairs, those, strict=True)]
+        )
+        for those in (before, after)
+    ]
+    length = sum(float(pair.held_out.sum()) * pair.period_s for pair in pairs)
+    return HeldOut(float(np.sqrt(power[0].mean())), float(np.sqrt(power[1].mean())), unit_, round(length, 1))
+
+
+def _finding(logs: Sequence[Weighed], found: Discovery, one: Judged, floor: Float64[np.ndarray, "6"]) -> Finding:
+    """One effect: what leaving it out costs on time that its parameters were not fitted to."""
+    pairs = [log.pair for log in logs]
+    fitted = found.fitted
+    names = [physics.name for physics, _ in fitted.chosen]
+    k = names.index(one.physics.name)
+    without: Chosen = (*fitted.chosen[:k], *fitted.chosen[k + 1 :])
+    with_ = [_with(pair, found, fitted.chosen) for pair in pairs]
+    alone = [_with(pair, found, without) for pair in pairs]
+    nothing = [_with(pair, found, ()) for pair in pairs]
+    shares = []
+    for j, signal in enumerate(("gyro", "accel")):
+        if signal in one.physics.sensors:
+            held = _held_out(pairs, alone, with_, j, UNITS[signal])
+            all_ = _held_out(pairs, nothing, with_, j, UNITS[signal])
+            noise = float(np.mean(floor[3 * j : 3 * j + 3] ** 2))
+            misfit = max(all_.rms_before**2 - noise, 1e-300)
+            excess = held.rms_before**2 - held.rms_after**2
+            shares.append((excess / noise, float(np.clip(excess / misfit, 0.0, 1.0)), signal, held))
+    _, share, signal, held = max(shares, key=lambda entry: entry[0])
+    told_signal = signal if len(one.physics.sensors) == 1 else "both"
+    name, _, rest = one.physics.name.partition(":")
+    return Finding(
+        effect=name,
+        signal=told_signal,
+        share=share,
+        p_value=one.p_value,
+        false_discovery_rate=one.false_discovery_rate,
+        parameters=_parameters(pairs, one),
+        equation=one.physics.equation,
+        held_out=held,
+        driver=rest.rpartition(":")[0] if name == "driven" else "",
+        similar=one.similar,
+        curve=_curve(logs[0].pair, one, found.whole),
+    )
+
+
+def _parameters(pairs: Sequence[Pair], one: Judged) -> dict[str, Estimate]:
+    """As they were fitted, but for what stamps and samples show exactly."""
+    if one.physics.name == "timestamp_jitter":
+        off = np.concatenate([pair.stamp_s - stamps.even(pair.stamp_s)[0] for pair in pairs])
+        std = float(off.std())
+        return {"std": Estimate(std, std / np.sqrt(2.0 * len(off)), "s")}
+    return {
+        number.name: Estimate(float(value), float(std), number.unit)
+        for number, value, std in zip(one.physics.parameters, one.theta, one.std, strict=True)
+    }
+
+
+def _curve(pair: Pair, one: Judged, whole: Fit) -> Curve | None:
+    """A curve without a name by its values, with what they are sure to."""
+    forward = one.physics.forward
+    if not isinstance(forward, unnamed.Curve):
+        return None
+    x = np.linspace(forward.first, forward.last, SHOWN_KNOTS)
+    basis = forward.basis(x)
+    first = 0
+    for physics, theta in whole.chosen:
+        if physics.name == one.physics.name:
+            break
+        first += len(theta)
+    covariance = whole.covariance[first : first + len(one.theta), first : first + len(one.theta)]
+    middle = float((basis @ one.theta).mean())  # a constant belongs to the bias
+    y, band = np.zeros((len(x), 3)), np.zeros((len(x), 3))
+    y[:, forward.axis] = basis @ one.theta - middle
+    centred = basis - basis.mean(axis=0)
+    band[:, forward.axis] = np.sqrt(np.einsum("nq,qp,np->n", centred, covariance, centred))
+    return Curve(forward.variable, unit(forward.variable), x, y, band)
+
+
+def _unexplained(
+    pairs: Sequence[Pair], after: Sequence[Float64[np.ndarray, "n 6"]], floor: Float64[np.ndarray, "6"]
+) -> dict[str, Unexplained]:
+    out = {}
+    for k, signal in enumerate(("gyro", "accel")):
+        held = _held_out(pairs, after, after, k, UNITS[signal])
+        noise = float(np.sqrt(np.mean(floor[3 * k : 3 * k + 3] ** 2)))
+        out[signal] = Unexplained(held.rms_after, noise, held.rms_after < WHITE * noise)
+    return out
+
+
+def _remarks(pairs: Sequence[Pair]) -> Iterator[str]:
+    for pair in pairs:
+        if pair.aligned_s:
+            yield (
+                f"{pair.name}: the two clocks share no epoch; aligned by the motion ({pair.aligned_s:+.3f} s), "
+                "so that a constant offset between them cannot be seen"
+            )
+        if pair.felt.R_wb is None:
+            yield f"{pair.name}: no attitude is known, so that gravity and the earth's rotation were not asked"

@@ -1,0 +1,283 @@
+"""Which effects separate recordings from what was expected of them: chosen singly and together, never guessed.
+
+Forward: each effect is tried beside those that were found, by one linear solve from each of its starts; the most promising are
+fitted together with the others, and the best comes in. Then back: one that the others have made superfluous goes, and one for
+which another serves better is exchanged. What may stay is decided on everything at once: dropping it must cost more than noise
+would, corrected for all that was tried, and on blocks of time that the fit has not seen it must help.
+
+Scores are logarithms of chi-square's tail: twenty squares for one parameter are worth more than twenty-five for nine.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from jaxtyping import Float64
+from scipy.special import gammaln
+from scipy.stats import chi2, wilcoxon
+from scipy.stats import t as student
+
+from imutool.physics import fit as fits
+from imutool.physics.effects._forward import Physics, Theta
+from imutool.physics.fit import Chosen, Fit, Weighed, derivatives, expected, fit
+from imutool.physics.readings import Read
+
+FALSE_DISCOVERY = 5e-3
+HELPS = 0.05  # chance of the gain on unseen blocks being none
+TRIED = 4  # candidates that are fitted in full in a round
+MOST, ROUNDS = 8, 20  # effects, and times that one comes in
+BLOCK_S = 2.0
+FAR_OUT = 300.0  # half the gain, above which the tail itself is less than a number can hold
+SUSPICIOUS, CLEARLY, NAMELESS = 3, 10.0, 15.0  # effects; squares by which an answer is better; what a missing name costs
+MOST_NAMELESS, NAMELESS_SHARE = 2, 0.03  # effects without a name, and how much of the misfit each has to take
+ALIKE = 4.0  # natural logarithms of chance within which two effects cannot be told apart
+
+
+@dataclass(frozen=True, eq=False)
+class Judged:
+    """An effect that was found, with what it costs to leave it out.
+
+    `p_value` is by chi-square over all rows, `gains` the squares that each unseen block loses by it, `similar` what would serve
+    as well in its place.
+    """
+
+    physics: Physics
+    theta: Theta
+    std: Theta
+    unidentified: tuple[str, ...]
+    p_value: float
+    false_discovery_rate: float
+    gain: float
+    similar: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class Discovery:
+    """What was found, the fit on fitted rows and the one on all."""
+
+    judged: tuple[Judged, ...]
+    fitted: Fit
+    whole: Fit
+    tried: int
+    remarks: tuple[str, ...] = field(default=())
+
+
+def discover(logs: Sequence[Weighed], candidates: Sequence[Physics], later: Sequence[Sequence[Physics]] = ()) -> Discovery:
+    """The effects that the logs show together; those of `later` are asked, in turn, when those before have nothing to say."""
+    path = _path(logs, tuple(candidates), (), list(later))
+    if len(path[1].chosen) >= SUSPICIOUS or any(":" in name for name in path[1].names):
+        # many small parts, or one without a name beside others that have one: perhaps one thing alone is the better answer
+        other = _path(logs, tuple(candidates), tuple(one for stage in later for one in stage), [])
+        if cost(other[1]) < cost(path[1]) - CLEARLY:
+            path = other
+    search, now = path
+    return search.judged(now)
+
+
+def _path(
+    logs: Sequence[Weighed], named: tuple[Physics, ...], others: tuple[Physics, ...], waiting: list[Sequence[Physics]]
+) -> tuple[_Search, Fit]:
+    """One effect after another comes in, until none of the candidates that there are by then explains more than chance."""
+    search, now = _Search(logs, named, others), fit(logs, ())
+    for _ in range(ROUNDS):
+        better = search.added(now) if len(now.chosen) < MOST else None
+        if better is not None:
+            now = search.pruned(search.exchanged(better))
+        elif waiting:
+            search = _Search(logs, search.named, (*search.others, *waiting.pop(0)))
+        else:
+            break
+    return search, now
+
+
+def cost(found: Fit) -> float:
+    """Squares that are left and what the parameters cost (Schwarz); without a name, or with a channel for one, costs more."""
+    count = sum(len(theta) for _, theta in found.chosen)
+    nameless = sum(":" in name for name in found.names)
+    return found.objective + count * float(np.log(6 * found.rows)) + NAMELESS * nameless
+
+
+@dataclass(eq=False)
+class _Search:
+    logs: Sequence[Weighed]
+    named: tuple[Physics, ...]
+    others: tuple[Physics, ...] = ()
+    starts: dict[str, list[Theta]] = field(init=False)
+    before: float = field(init=False)  # squares of white residuals with nothing but a constant bias
+
+    def __post_init__(self) -> None:
+        self.before = fit(self.logs, ()).objective
+        self.starts = {one.name: self._starts(one) for one in (*self.named, *self.others)}
+
+    @property
+    def tried(self) -> int:
+        """All starts of all candidates: what the chance of a false finding is multiplied by."""
+        return sum(len(starts) for starts in self.starts.values())
+
+    def _starts(self, physics: Physics) -> list[Theta]:
+        if physics.starts is None:
+            return [physics.nothing.astype(float)]
+        pair = self.logs[0].pair
+        real = Read(pair.stamp_s, pair.real[:, :3], pair.real[:, 3:], np.zeros((len(pair.real), 3)))
+        return [np.asarray(start, dtype=float) for start in physics.starts(pair.felt, real)]
+
+    def added(self, now: Fit) -> Fit | None:
+        """The best fit with one more effect, or none that chance would not explain."""
+        nameless = sum(":" in name for name in now.names)
+        ranked = self.ranked(now, (*self.named, *self.others) if nameless < MOST_NAMELESS else self.named)
+        best: tuple[float, Fit] | None = None
+        for _, physics, start in ranked[:TRIED]:
+            trial = fit(self.logs, (*now.chosen, (physics, start)), bias=now.bias)
+            score = chance(now.objective - trial.objective, len(start))
+            if best is None or score < best[0]:
+                best = score, trial
+        if best is None or best[0] > np.log(FALSE_DISCOVERY / self.tried):
+            return None
+        misfit = self.before - 6.0 * now.rows
+        if ":" in best[1].names[-1] and now.objective - best[1].objective < NAMELESS_SHARE * misfit:
+            return None  # the rim of something that is found already, which no name would make smaller
+        return best[1]
+
+    def ranked(self, now: Fit, candidates: Sequence[Physics]) -> list[tuple[float, Physics, Theta]]:
+        """Candidates by what one linear step promises, each from its best start."""
+        panel = _Panel(self.logs, now)
+        out = []
+        for physics in candidates:
+            if physics.name in now.names:
+                continue
+            gains = [(panel.gain(physics, start), start) for start in self.starts[physics.name]]
+            gain, start = max(gains, key=lambda pair: pair[0])
+            out.append((chance(gain, len(start)), physics, start))
+        return sorted(out, key=lambda entry: entry[0])
+
+    def exchanged(self, now: Fit) -> Fit:
+        """With an effect replaced by another of the catalogue that explains more, where there is one."""
+        for k in range(len(now.chosen) - 1):
+            others = (*now.chosen[:k], *now.chosen[k + 1 :])
+            without = fit(self.logs, others, bias=now.bias, iterations=2)
+            here = chance(without.objective - now.objective, len(now.chosen[k][1]))
+            for score, physics, start in self.ranked(without, self.named)[:2]:
+                if physics.name == now.chosen[k][0].name or score > here:
+                    continue
+                trial = fit(self.logs, (*others, (physics, start)), bias=now.bias)
+                if chance(without.objective - trial.objective, len(start)) < here - 1.0:
+                    return trial
+        return now
+
+    def pruned(self, now: Fit) -> Fit:
+        """Without effects that the others have made superfluous."""
+        for k in range(len(now.chosen) - 1):  # the last has just come in
+            without = fit(self.logs, (*now.chosen[:k], *now.chosen[k + 1 :]), bias=now.bias)
+            if chance(without.objective - now.objective, len(now.chosen[k][1])) > np.log(FALSE_DISCOVERY / self.tried):
+                return self.pruned(without)
+        return now
+
+    def judged(self, now: Fit) -> Discovery:
+        """What may stay: tested on all rows, and on blocks that were not fitted."""
+        while now.chosen:
+            other = fit(self.logs, now.chosen, part="held_out", bias=now.bias)
+            whole = fit(self.logs, now.chosen, part="all", bias=now.bias)
+            verdicts = [self._verdict(k, now, other, whole) for k in range(len(now.chosen))]
+            worst = max(range(len(verdicts)), key=lambda k: verdicts[k].false_discovery_rate)
+            if verdicts[worst].false_discovery_rate <= FALSE_DISCOVERY:
+                return Discovery(tuple(sorted(verdicts, key=lambda one: -one.gain)), now, whole, self.tried)
+            now = fit(self.logs, (*now.chosen[:worst], *now.chosen[worst + 1 :]), bias=now.bias)
+        return Discovery((), now, fit(self.logs, (), part="all"), self.tried)
+
+    def _verdict(self, k: int, fitted: Fit, other: Fit, whole: Fit) -> Judged:
+        physics, theta = whole.chosen[k]
+        without = fit(self.logs, (*whole.chosen[:k], *whole.chosen[k + 1 :]), part="all", bias=whole.bias)
+        gain = without.objective - whole.objective
+        log_p = chance(gain, len(theta))
+        blocks = np.concatenate(
+            [_gains(log, fitted, k, "held_out") for log in self.logs] + [_gains(log, other, k, "fitted") for log in self.logs]
+        )
+        helps = _helps(blocks)
+        rate = min(1.0, float(np.exp(min(0.0, log_p + np.log(self.tried)))))
+        if helps > HELPS:
+            rate = max(rate, helps)
+        std = whole.stds()[physics.name]
+        unseen = [
+            f"{physics.name}.{number.name}"
+            for number, s in zip(physics.parameters, std, strict=True)
+            if s > (fits.LOG_PRIOR if number.positive else number.plausible)
+        ]
+        return Judged(physics, theta, std, tuple(unseen), float(np.exp(max(log_p, -700.0))), rate, gain)
+
+
+def chance(gain: float, parameters: int) -> float:
+    """The logarithm of the chance that noise alone gains as much by so many parameters (far out, the tail's leading term)."""
+    half, k = 0.5 * max(gain, 0.0), 0.5 * parameters
+    return float(chi2.logsf(2.0 * half, parameters)) if half < FAR_OUT else float((k - 1.0) * np.log(half) - half - gammaln(k))
+
+
+def _helps(gains: Float64[np.ndarray, " b"]) -> float:
+    """The chance of blocks gaining so much when they gain nothing: by Student's test, or by ranks where a few gain most."""
+    if len(gains) < 3 or not gains.std():
+        return 1.0
+    z = gains.mean() / (gains.std(ddof=1) / np.sqrt(len(gains)))
+    ranks = float(wilcoxon(gains, alternative="greater").pvalue) if gains.mean() > 0 else 1.0
+    return min(float(student.sf(z, len(gains) - 1)), ranks)
+
+
+def _gains(log: Weighed, fitted: Fit, k: int, part: str) -> Float64[np.ndarray, " b"]:
+    """Squares by which each block of a part that was not fitted is better with an effect than without it."""
+    chosen = fitted.chosen
+    with_, without = (_white(log, one, part) for one in (chosen, (*chosen[:k], *chosen[k + 1 :])))
+    rows = log.rows(part)
+    block = np.floor(log.pair.stamp_s[rows] / BLOCK_S).astype(int)
+    gain = (without**2).sum(1) - (with_**2).sum(1)
+    names, inverse = np.unique(block, return_inverse=True)
+    return np.bincount(inverse, weights=gain, minlength=len(names))
+
+
+def _white(log: Weighed, chosen: Chosen, part: str) -> Float64[np.ndarray, "n 6"]:
+    """White residuals of a part, with the best constant for that part."""
+    rows = log.rows(part)
+    residual = log.whiten(log.pair.real - expected(log.pair, chosen))[rows]
+    one = fits.constants(log)[rows]
+    return np.asarray(residual - one * ((one * residual).sum(0) / (one * one).sum(0)))
+
+
+class _Panel:
+    """The normal equations of a fit, with a place left for one more effect."""
+
+    def __init__(self, logs: Sequence[Weighed], now: Fit) -> None:
+        self.logs, self.now, self.masks = logs, now, [log.rows("fitted") for log in logs]
+        self.bases = [expected(log.pair, now.chosen) for log in logs]
+        self.columns = []
+        for k, (log, base, mask) in enumerate(zip(logs, self.bases, self.masks, strict=True)):
+            J = log.whiten(derivatives(log.pair, now.chosen, range(len(now.chosen)), base))[mask]
+            ones = np.zeros((*J.shape[:2], 6 * len(logs)))
+            ones[:, range(6), range(6 * k, 6 * k + 6)] = fits.constants(log)[mask]
+            self.columns.append(np.concatenate([J, ones], axis=2).reshape(-1, J.shape[2] + ones.shape[2]))
+        self.N = sum(A.T @ A for A in self.columns) + 1e-9 * np.eye(self.columns[0].shape[1])
+        self.white = [
+            (log.whiten(log.pair.real - base)[mask] - fits.constants(log)[mask] * now.bias[k]).reshape(-1)
+            for k, (log, base, mask) in enumerate(zip(logs, self.bases, self.masks, strict=True))
+        ]
+        self.left = self._left(self.white)
+
+    def _left(self, white: Sequence[Float64[np.ndarray, " m"]]) -> float:
+        g = sum(A.T @ r for A, r in zip(self.columns, white, strict=True))
+        return float(sum(r @ r for r in white) - g @ np.linalg.solve(self.N, g))
+
+    def gain(self, physics: Physics, start: Theta) -> float:
+        """Squares that one linear step from a start takes off."""
+        chosen = (*self.now.chosen, (physics, start))
+        p, q, total = len(start), len(self.N), 0.0
+        N_bb, N_ab, g_b, g_a = np.zeros((p, p)), np.zeros((q, p)), np.zeros(p), np.zeros(q)
+        for log, base, mask, A, white in zip(self.logs, self.bases, self.masks, self.columns, self.white, strict=True):
+            r, there = white, expected(log.pair, chosen)
+            B = log.whiten(derivatives(log.pair, chosen, [len(chosen) - 1], there))[mask].reshape(-1, len(start))
+            if not physics.linear:
+                r = white - log.whiten(there - base)[mask].reshape(-1)
+            N_bb, N_ab = N_bb + B.T @ B, N_ab + A.T @ B
+            g_b, g_a, total = g_b + B.T @ r, g_a + A.T @ r, total + r @ r
+        _, std = fits.priors((chosen[-1],), (chosen[-1],))
+        S = N_bb + np.diag(1.0 / std**2) - N_ab.T @ np.linalg.solve(self.N, N_ab)
+        g = g_b - N_ab.T @ np.linalg.solve(self.N, g_a)
+        left = total - g_a @ np.linalg.solve(self.N, g_a) - g @ np.linalg.solve(S, g)
+        return float(self.left - left)

@@ -1,0 +1,162 @@
+"""What stamps and digits show without any simulation: samples that are missing, stamps that jitter, values on a grid."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Bool, Float64
+from scipy.ndimage import binary_dilation, median_filter
+from scipy.stats import binom
+
+from imutool.physics.diagnosis import UNITS, Estimate, Finding, HeldOut
+from imutool.physics.effects._forward import Number, Physics, Stage, Theta
+from imutool.physics.pair import Pair
+
+LAG, MEDIAN = 10, 15  # samples
+LEAST_MISSING, LEAST_AT_LIMIT = 3, 4
+NEARLY, EXACT = 0.995, 1e-3
+LEAST_JITTER_S = 2e-5
+LEAST_DIGITS = 0.3  # of the noise: finer steps leave no trace in it
+ON_GRID = 0.98  # of the samples
+
+
+def even(stamp_s: Float64[np.ndarray, " n"]) -> tuple[Float64[np.ndarray, " n"], int]:
+    """Stamps of an even clock through some stamps, and how many samples it misses.
+
+    A sample that is missing shifts all later ones by a period, which a running median of the departure from an even clock shows
+    though each stamp jitters.
+    """
+    k = np.arange(len(stamp_s), dtype=np.float64)
+    period = float(np.median(stamp_s[LAG:] - stamp_s[:-LAG])) / LAG
+    missing = np.zeros(len(stamp_s))
+    for _ in range(4):
+        slope, start = np.polyfit(k + missing, stamp_s, 1)
+        period = slope if missing.any() or abs(slope / period - 1.0) < 0.1 / len(k) else period
+        level = median_filter((stamp_s - start) / period - k, MEDIAN, mode="nearest")
+        missing = np.maximum.accumulate(np.rint(level - level[0]))
+    slope, start = np.polyfit(k + missing, stamp_s, 1)
+    return start + slope * (k + missing), int(missing[-1] - missing[0])
+
+
+def jitter(pairs: Sequence[Pair]) -> tuple[Physics, ...]:
+    """Samples taken evenly whose stamps are not: a share of one is all of it. None where the stamps are even."""
+    off = [pair.stamp_s - even(pair.stamp_s)[0] for pair in pairs]
+    if min(float(x.std()) for x in off) < LEAST_JITTER_S:
+        return ()
+
+    def forward(taken_s: Float64[np.ndarray, " n"], theta: Theta) -> Float64[np.ndarray, " n"]:
+        return np.asarray(taken_s + theta[0] * (even(taken_s)[0] - taken_s))
+
+    share = (Number("share", "-", 1.0),)
+    return (
+        Physics(
+            "timestamp_jitter",
+            Stage.CLOCK,
+            ("gyro", "accel"),
+            "stamps jitter, samples do not",
+            share,
+            "it moves, and stamps are uneven",
+            forward,
+        ),
+    )
+
+
+def dropped(pairs: Sequence[Pair]) -> list[Finding]:
+    """Samples that an even clock would have had."""
+    missing, total, length = 0, 0, 0.0
+    for pair in pairs:
+        missing, total = missing + even(pair.stamp_s)[1], total + len(pair.stamp_s)
+        length += float(pair.stamp_s[-1] - pair.stamp_s[0])
+    if missing < LEAST_MISSING:
+        return []
+    share = missing / (missing + total)
+    parameters = {
+        "share": Estimate(share, float(np.sqrt(missing)) / (missing + total), "-"),
+        "missing": Estimate(float(missing), 0.0, "samples"),
+    }
+    nothing = HeldOut(0.0, 0.0, "-", round(length, 1))
+    return [Finding("dropped_samples", "both", 0.0, 0.0, 0.0, parameters, "samples are missing", nothing)]
+
+
+def rounded(pairs: Sequence[Pair], floor: Float64[np.ndarray, "6"]) -> list[Finding]:
+    """Values on a grid as coarse as the noise."""
+    lsb = {}
+    for k, signal in enumerate(("gyro", "accel")):
+        grids = [grid(pair.real[:, a]) for pair in pairs for a in range(3 * k, 3 * k + 3)]
+        noise = float(np.sqrt(np.mean(floor[3 * k : 3 * k + 3] ** 2)))
+        if min(grids) > LEAST_DIGITS * noise and max(grids) < 1.5 * min(grids):
+            lsb[signal] = float(np.median(grids))
+    if not lsb:
+        return []
+    signal = next(iter(lsb)) if len(lsb) == 1 else "both"
+    parameters = {f"{name}_lsb": Estimate(value, 1e-3 * value, UNITS[name].replace("^2", "²")) for name, value in lsb.items()}
+    length = sum(float(pair.stamp_s[-1] - pair.stamp_s[0]) for pair in pairs)
+    nothing = HeldOut(0.0, 0.0, "-", round(length, 1))
+    return [Finding("quantization", signal, 0.0, 0.0, 0.0, parameters, "values are multiples of an LSB", nothing)]
+
+
+def grid(x: Float64[np.ndarray, " n"]) -> float:
+    """The step of the grid that values lie on; 0 where they lie on none, or take fewer than three values."""
+    values = np.unique(np.round(x, 12))
+    if len(values) < 3:
+        return 0.0
+    step = float(np.diff(values).min())
+    if step <= 0 or len(values) > 0.5 * len(x):
+        return 0.0
+    for _ in range(3):  # least squares on the multiples
+        k = np.rint((values - values[0]) / step)
+        step = float((k @ (values - values[0])) / (k @ k))
+    off = np.abs((x - values[0]) / step - np.rint((x - values[0]) / step))
+    return step if float((off < 0.05).mean()) > ON_GRID else 0.0
+
+
+def limits(real: Float64[np.ndarray, "n 6"]) -> dict[str, float]:
+    """The largest readings of a sensor that come again and again, to the last digit: where its converter ends."""
+    found = {}
+    for k, signal in enumerate(("gyro", "accel")):
+        values = np.abs(real[:, 3 * k : 3 * k + 3])
+        most = float(values.max())
+        if (values >= most * (1.0 - 1e-9)).sum() >= LEAST_AT_LIMIT:
+            found[signal] = most
+    return found
+
+
+def clipped(real: Float64[np.ndarray, "n 6"]) -> Bool[np.ndarray, " n"]:
+    """Rows in which a converter is at its end, and those beside them: what they would have read nobody knows."""
+    rows = np.zeros(len(real), bool)
+    for k, signal in enumerate(("gyro", "accel")):
+        most = limits(real).get(signal)
+        if most is not None:
+            rows |= (np.abs(real[:, 3 * k : 3 * k + 3]) >= NEARLY * most).any(axis=1)
+    return np.asarray(binary_dilation(rows, iterations=2)) if rows.any() else rows
+
+
+def saturated(pairs: Sequence[Pair], expected: Sequence[Float64[np.ndarray, "n 6"]], tried: int) -> list[Finding]:
+    """Clipping that the expectation, which knows no limit, exceeds: more than by chance (a sign test on clipped samples)."""
+    told: dict[str, Estimate] = {}
+    powers, signal_of, p = [0.0, 0.0, 0.0], "", 1.0
+    real, there = (np.concatenate(parts) for parts in ([pair.real for pair in pairs], expected))
+    for k, signal in enumerate(("gyro", "accel")):
+        most = limits(real).get(signal)
+        if most is None:
+            continue
+        part = slice(3 * k, 3 * k + 3)
+        at = np.abs(real[:, part]) >= most * (1.0 - 1e-9)
+        beyond = (there[:, part] * np.sign(real[:, part]))[at] > most
+        chance = float(binom.sf(beyond.sum() - 1, len(beyond), 0.5)) * tried
+        if chance > 1e-2 and beyond.mean() < 0.9:
+            continue
+        told[f"{signal}_limit"] = Estimate(most, EXACT * most, UNITS[signal].replace("^2", "²"))
+        before = ((real - there)[:, part] ** 2)[at]
+        after = ((real[:, part] - np.clip(there[:, part], -most, most)) ** 2)[at]
+        powers, signal_of, p = [float(before.sum()), float(after.sum()), float(at.size)], signal, min(p, chance)
+    if not told:
+        return []
+    signal = signal_of if len(told) == 1 else "both"
+    length = sum(float(pair.stamp_s[-1] - pair.stamp_s[0]) for pair in pairs)
+    held = HeldOut(
+        float(np.sqrt(powers[0] / powers[2])), float(np.sqrt(powers[1] / powers[2])), UNITS[signal_of], round(length, 1)
+    )
+    share = float(np.clip(1.0 - powers[1] / max(powers[0], 1e-300), 0.0, 1.0))
+    return [Finding("saturation", signal, share, min(p, 1.0), min(p, 1.0), told, "readings are clipped at +-limit", held)]

@@ -1,0 +1,100 @@
+"""The noise that a fit is weighed by: an autoregression for each axis, from what a rich model leaves.
+
+Poses that were differentiated leave noise of every colour; least squares on such residuals is sure of the wrong things. An
+autoregressive filter makes it white (Box and Jenkins; here by Burg's recursion over stretches that count), and what is
+correlated costs what it should.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float64
+from scipy.ndimage import median_filter
+from scipy.signal import lfilter, welch
+
+MAD_TO_STD = 1.4826
+LEAST_STD = 1e-12
+MOTION_HZ, REFERENCE_HZ = 15.0, 60.0  # where a body's motion has its power, and where noise is measured in its place
+SEGMENT, LINES = 512, 9  # samples of a spectrum; frequencies of the median that takes lines out of it
+
+
+@dataclass(frozen=True, eq=False)
+class Whitener:
+    """For each of the six axes a filter and the size of what comes out of it, so that it has unit variance."""
+
+    filters: Float64[np.ndarray, "6 order"]
+    std: Float64[np.ndarray, "6"]
+
+    def __call__(self, x: Float64[np.ndarray, "n 6 *k"]) -> Float64[np.ndarray, "n 6 *k"]:
+        """White rows from coloured ones; columns of zeros stay zeros."""
+        out = np.zeros_like(x)
+        for axis in range(6):
+            if x[:, axis].any():
+                out[:, axis] = lfilter(self.filters[axis] / self.std[axis], [1.0], x[:, axis], axis=0)
+        return out
+
+    @property
+    def order(self) -> int:
+        """Samples it looks back."""
+        return int(self.filters.shape[1] - 1)
+
+
+def whitener(residual: Float64[np.ndarray, "n 6"], usable: Bool[np.ndarray, " n"], order: int) -> Whitener:
+    """From a residual and the rows of it that count.
+
+    The size is robust (a few spikes are not the noise), but no less than half of what the plain one is.
+    """
+    filters, std = np.zeros((6, order + 1)), np.ones(6)
+    rows = settled(usable, order)
+    for axis in range(6):
+        filters[axis] = burg(residual[:, axis], usable, order)
+        white = lfilter(filters[axis], [1.0], residual[:, axis])[rows]
+        robust = MAD_TO_STD * float(np.median(np.abs(white)))
+        std[axis] = max(robust, 0.5 * float(np.sqrt(np.mean(white**2))), LEAST_STD)
+    return Whitener(filters, std)
+
+
+def level(residual: Float64[np.ndarray, "n 6"], usable: Bool[np.ndarray, " n"], rate_hz: float, order: int) -> Whitener:
+    """As `whitener`, for a sensor beside an exact simulation: below `MOTION_HZ` its noise is taken to be what it is above.
+
+    What is left down there may be physics that nobody thought of, and must not be taken for noise.
+    """
+    from scipy.linalg import solve_toeplitz
+
+    filters, std = np.zeros((6, order + 1)), np.ones(6)
+    for axis in range(6):
+        f_hz, power = welch(
+            np.where(usable, residual[:, axis], 0.0), rate_hz, nperseg=min(SEGMENT, len(residual)), average="median"
+        )
+        power = median_filter(power, LINES, mode="nearest") / max(float(usable.mean()), 1e-3)  # a line is no noise
+        low, high = min(MOTION_HZ, 0.3 * rate_hz), min(REFERENCE_HZ, 0.45 * rate_hz)
+        power[f_hz < low] = np.median(power[(f_hz >= low) & (f_hz <= high)])
+        covariance = np.fft.irfft(power * rate_hz / 2.0)[: order + 1] + np.concatenate([[LEAST_STD**2], np.zeros(order)])
+        a = -solve_toeplitz(covariance[:-1], covariance[1:]) if order else np.zeros(0)
+        filters[axis] = np.concatenate([[1.0], a])
+        std[axis] = np.sqrt(max(float(covariance[0] + a @ covariance[1:]), LEAST_STD**2))
+    return Whitener(filters, std)
+
+
+def settled(usable: Bool[np.ndarray, " n"], order: int) -> Bool[np.ndarray, " n"]:
+    """Rows whose last `order` rows count as well."""
+    if not order:
+        return usable
+    run = lfilter(np.ones(order + 1), [1.0], usable.astype(float))
+    return np.asarray(run > order + 0.5)
+
+
+def burg(x: Float64[np.ndarray, " n"], usable: Bool[np.ndarray, " n"], order: int) -> Float64[np.ndarray, " order+1"]:
+    """Burg's autoregression (1, a_1, ..., a_order), forward and backward errors counted where all their samples do."""
+    a = np.array([1.0])
+    f, b, ok = np.where(usable, x, 0.0), np.where(usable, x, 0.0), usable.copy()
+    for _ in range(order):
+        f, b, ok = f[1:], b[:-1], ok[1:] & ok[:-1]
+        energy = float((f[ok] ** 2).sum() + (b[ok] ** 2).sum())
+        k = -2.0 * float(f[ok] @ b[ok]) / energy if energy > 0 else 0.0
+        a = np.concatenate([a, [0.0]])
+        a = a + k * a[::-1]
+        f, b = f + k * b, b + k * f
+    return a
