@@ -217,10 +217,11 @@ def _prepare(source: Path, topic: str, name: str | Path | None, init: str, smoot
     untrained = name is None or str(name) == static.Model.method
     if untrained and init == "auto" and not smooth:
         return estimate_at_rest(_samples(source, topic), source)
-    model: BiasModel = static.Model() if name is None or untrained else find_model(name)
     head = _head(source, topic, init)
+    rate_hz = 1.0 / head.imu.period_s
+    model: BiasModel = static.Model() if name is None or untrained else find_model(name, rate_hz)
     if not untrained:
-        check_rate(model, 1.0 / head.imu.period_s, source)
+        check_rate(model, rate_hz, source)
     if smooth:
         with Log(source) as log:  # a first pass, in constant memory but for the track
             start = _smoothed(model, _batches(log, topic), source)

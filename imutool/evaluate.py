@@ -123,7 +123,7 @@ def _model_and_start(
     untrained = str(given) == static.Model.method
     if untrained and init == "auto" and not smooth:
         return estimate_at_rest(recording.imu, where)
-    model: BiasModel = static.Model() if untrained else find_model(given)
+    model: BiasModel = static.Model() if untrained else find_model(given, 1.0 / recording.imu.period_s)
     if not untrained:
         check_rate(model, 1.0 / recording.imu.period_s, where)
     if smooth:

@@ -177,6 +177,8 @@ def _samples(imu: Imu) -> Samples:
 
 
 def _from_training(model: BiasModel) -> str:
+    if "prior" in model.card:  # a file that was not trained says itself where its bias is from
+        return str(model.card["prior"])
     logs = model.card.get("logs", ())
     return f"prior of {len(logs)} runs" if len(logs) > 1 else "prior of the training runs"
 

@@ -48,6 +48,7 @@ TIERS = (
     ("debias", "zero_velocity"),
     ("train", "evaluate", "convert", "identify", "export"),
     ("view", "fleet", "vio"),
+    ("diagnosis_folder",),
     ("demo", "terminal"),
     ("cli",),
 )

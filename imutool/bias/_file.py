@@ -124,13 +124,22 @@ def library() -> Path:
     return inside if inside.is_dir() else Path(__file__).parents[2] / "models"
 
 
-def find_model(name: str | Path) -> BiasModel:
+def find_model(name: str | Path, rate_hz: float | None = None) -> BiasModel:
     """The model in a file, or the one that ships under a name.
 
+    A physics.toml is one as well: it knows no rate of its own, and becomes a model for samples at `rate_hz`.
+
     Raises:
-        ModelError: neither; the nearest name is given.
+        ModelError: neither (the nearest name is given); or a physics.toml without a rate, or of which nothing can be taken off.
+        ConfigError: a physics.toml that cannot be read.
     """
     path = Path(name)
+    if path.suffix == ".toml":
+        if rate_hz is None:
+            raise ModelError("a physics.toml says no rate", where=path, expected="samples to use it on")
+        from imutool.bias import _physics_file
+
+        return _physics_file.load(path, rate_hz)
     if path.suffix == ".safetensors" or path.exists():
         return load(path)
     shipped = {model.stem: model for model in library().glob("*.safetensors")}

@@ -15,7 +15,9 @@ from imutool.terminal import progress, say, write_json
 def debias(
     source: Annotated[Path, typer.Argument(metavar="IN", help="An MCAP log.")],
     target: Annotated[Path, typer.Argument(metavar="OUT", help="The log with the debiased IMU beside the raw one.")],
-    model: Annotated[str | None, typer.Option(help="Model file or a name that ships; else a static estimate.")] = None,
+    model: Annotated[
+        str | None, typer.Option(help="Model file, physics.toml or a name that ships; else a static estimate.")
+    ] = None,
     imu: Annotated[list[str] | None, typer.Option(help="IMU topic, where a log has several. Repeatable.")] = None,
     init: Init = "auto",
     smooth: Smooth = False,

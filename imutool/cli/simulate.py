@@ -49,7 +49,11 @@ def simulate(
     report = found.plain()
     if write_json(report, json_to):
         return
-    names = ", ".join(effect["name"] for effect in report["physics"]["effect"]) or "ideal"
+    physics_told = report["physics"]
+    acting = [effect["name"] for effect in physics_told["effect"]]
+    acting += [f"a curve of {curve['variable']}" for curve in physics_told["unknown"]]
+    acting += [term["term"] for term in physics_told["term"]] + ["bias"] * (physics_told["bias"] is not None)
+    names = ", ".join(acting) or "ideal"
     pieces = len(found.motion.stretches)
     where = f"{report['duration_s']:.1f} s" + (f" in {pieces} stretches" if pieces > 1 else "")
     say(f"{target}: {report['samples']} samples at {report['rate_hz']:g} Hz over {where}; physics {names}; noise {noise}")

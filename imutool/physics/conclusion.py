@@ -14,6 +14,7 @@ from imutool.physics.quantity import Quantity, grouped, symbol
 QUIET = "nothing else stands above the noise"
 NULL = "Nothing but a constant bias and noise separates the two."
 SHOWN = 3  # stretches of time in a line
+WITH_ALL = "With everything that was found"
 ABOVE = 1.1  # what remains may be this many times the noise before it is said to stand above it
 FULL = 3  # findings that the conclusion tells in full; the rest by name
 SMALLEST_P = 1e-300  # what is smaller has lost its digits
@@ -68,7 +69,7 @@ def _unknown(w: Words) -> str:
     curve = w.finding.curve
     if curve is not None:
         return f"{w.it} follows a smooth curve of {curve.variable} that has no name among the known effects"
-    return f"{w.it} follows {w.finding.equation}, which has no name among the known effects, with {w.main.labelled}"
+    return f"{w.finding.equation}, with {w.main.labelled}; this has no name among the known effects"
 
 
 SENTENCES: Mapping[str, str | Callable[[Words], str]] = {
@@ -135,8 +136,24 @@ def lines(d: Diagnosis) -> list[str]:
         brought = f"; {before_after(one.held_out)}" if measured(one) else ""
         out.append(f"{rank}. {name(one)} ({one.signal}): {parameters(one)}{brought}; {sure}")
     out += [f"Where: {where(one)}; {percent(one.share)} of the misfit, {p_value(one.p_value)}" for one in d.located]
-    out += [f"Simulated again with what was found: {signal} {rms(one)}" for signal, one in d.closer.items()]
+    if d.findings and d.closer:
+        closer = "; ".join(f"{signal} {came_closer(one)}" for signal, one in d.closer.items())
+        out.append(f"{WITH_ALL}{unseen(d)}: {closer}")
     return out + list(d.remarks)
+
+
+def unseen(d: Diagnosis) -> str:
+    """Over which time `closer` was measured, as it goes on after `WITH_ALL`."""
+    seconds = max((one.seconds for one in d.closer.values()), default=0.0)
+    return f", over {_seconds(seconds)} held out of the search" if seconds > 0.0 else ""
+
+
+def came_closer(one: HeldOut) -> str:
+    """`rms 0.52 to 0.19 m/s², 63 % closer`; what nothing was found for stays as it was."""
+    if one.rms_after == one.rms_before or not one.rms_before > 0.0:
+        return f"rms {one.rms_before:.3g} {symbol(one.unit)}, as before".replace(" ,", ",")
+    gain = 1.0 - one.rms_after / one.rms_before
+    return f"{rms(one)}, {percent(abs(gain))} {'closer' if gain > 0.0 else 'farther'}"
 
 
 def sentence(d: Diagnosis, one: Finding) -> str:

@@ -12,9 +12,11 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float64
 
-from imutool.errors import DataError
+from imutool.errors import ConfigError, DataError
+from imutool.mcap_io.fields import others, read_field
 from imutool.mcap_io.read import read as read_log
 from imutool.physics import stamps, unnamed
+from imutool.physics.any_signal import diagnose_signal
 from imutool.physics.diagnosis import UNITS, Curve, Diagnosis, Estimate, Finding, HeldOut, Traces, Unexplained
 from imutool.physics.discover import Discovery, Judged, discover
 from imutool.physics.effects import _catalogue
@@ -23,11 +25,13 @@ from imutool.physics.fit import Chosen, Fit, Weighed, derivatives, expected
 from imutool.physics.locate import located
 from imutool.physics.motion import smooth_motion
 from imutool.physics.pair import LEAST_S, Pair, with_simulation, with_truth
+from imutool.physics.reference import wrong_for_moments
 from imutool.physics.unnamed import unit
-from imutool.physics.whitening import level, whitener
+from imutool.physics.whitening import Band, level, whitener
 from imutool.recording import Recording
 
-ORDER_SIM, ORDER_TRUTH = 6, 30  # of the autoregression: a sensor's noise is nearly white, that of differentiated poses is not
+KNOWN_BAND = 0.45  # of where smoothing halves a motion: there it takes a per cent
+ORDER_SIM, ORDER_TRUTH = 6, 12  # of the autoregression: a sensor's noise is nearly white, that of differentiated poses is not
 RIDGE = 1e-8
 SHOWN_BY_SAMPLES = {"saturation", "quantization"}  # without any fit: `stamps`
 SHOWN_KNOTS = 41  # of a curve without a name, as it is told
@@ -41,17 +45,21 @@ def diagnose(
     *,
     imu: str | None = None,
     truth: str | None = None,
+    signals: Sequence[str] = (),
     tell: Tell | None = None,
 ) -> Diagnosis:
     """What separates recordings from a simulation, or from what their own true poses say.
 
-    Several recordings share the physics; each has a constant bias of its own.
+    Several recordings share the physics; each has a constant bias of its own. `signals` are other fields that one recording and
+    its simulation both hold (`TOPIC.field`), compared in the same way.
 
     Raises:
-        ConfigError, LogError: a log cannot be read, or has no such topic.
+        ConfigError, LogError: a log cannot be read, or has no such topic; signals without a simulation, or of several logs.
         DataError: no truth and no simulation, too little shared time, another motion.
     """
     say = tell or (lambda done, total, text: None)
+    if signals and (sim is None or len(reals) != 1):
+        raise ConfigError("--signal compares one recording with its simulation", where="--signal", fix="Give one log and --sim")
     say(0, 4, "reading")
     simulated = None if sim is None else read_log(sim, imu=imu)
     pairs = [_unclipped(pair) for real in reals for pair in _pairs(read_log(real, imu=imu, truth=truth), simulated, truth)]
@@ -59,11 +67,31 @@ def diagnose(
     candidates = _candidates(pairs)
     logs = [_weighed(pair, candidates) for pair in pairs]
     say(2, 4, "searching")
-    found = discover(logs, candidates, later(pairs))
+    moments = wrong_for_moments(logs)
+    found = discover(logs, () if moments[0] else candidates, () if moments[0] else later(pairs))
     say(3, 4, "locating")
     told = _told(logs, found, [str(real) for real in reals], None if sim is None else str(sim))
+    told = replace(told, findings=(*moments[0], *told.findings), located=(*moments[1], *told.located))
+    for signal in signals:
+        assert sim is not None
+        say(3, 4, signal)
+        told = _with_signal(told, reals[0], sim, signal)
     say(4, 4, "")
     return told
+
+
+def _with_signal(told: Diagnosis, real: Path, sim: Path, signal: str) -> Diagnosis:
+    """The answer with what another field of both logs says."""
+    one = diagnose_signal(read_field(real, signal), read_field(sim, signal), others(real, signal), signal)
+    return replace(
+        told,
+        located=(*told.located, *one.located),
+        findings=(*told.findings, *one.findings),
+        not_identifiable=(*told.not_identifiable, *one.not_identifiable),
+        unexplained={**told.unexplained, signal: one.unexplained},
+        closer={**told.closer, signal: one.closer},
+        remarks=(*told.remarks, *one.remarks),
+    )
 
 
 def _pairs(real: Recording, sim: Recording | None, truth: str | None) -> Iterator[Pair]:
@@ -84,7 +112,8 @@ def _pairs(real: Recording, sim: Recording | None, truth: str | None) -> Iterato
             fix="Give a simulation with --sim",
         )
     for felt in parts:
-        yield with_truth(chosen, felt, motion.start_ns)
+        stretch = next(one for one in motion.stretches if one.start_s <= felt.t_s[0] <= one.end_s)
+        yield with_truth(chosen, felt, motion.start_ns, KNOWN_BAND * min(stretch.cutoff_hz))
 
 
 def _unclipped(pair: Pair) -> Pair:
@@ -102,13 +131,15 @@ def _candidates(pairs: Sequence[Pair]) -> tuple[Physics, ...]:
         return all(attitude if need == "attitude" else any(need in name for name in channels) for need in physics.needs)
 
     found = [one for one in _catalogue.physics() if thinkable(one) and one.name not in SHOWN_BY_SAMPLES]
-    return (*found, *stamps.jitter(pairs))
+    biases = [np.median(pair.real - expected(pair, ()), axis=0) for pair in pairs]
+    return (*found, *stamps.jitter(pairs), *stamps.soft_limits(pairs, biases))
 
 
 def later(pairs: Sequence[Pair]) -> list[tuple[Physics, ...]]:
     """What is asked once the catalogue has nothing more to say: other channels, then curves and equations without a name."""
     like = unnamed.like(pairs)
-    return [tuple(unnamed.driven(pairs)), (*unnamed.curves(like), *unnamed.terms(like))]
+    exact = all(pair.against == "simulation" for pair in pairs)  # a term is told from a curve by less than poses can tell
+    return [tuple(unnamed.driven(pairs)), (*unnamed.curves(like), *(unnamed.terms(like) if exact else ()))]
 
 
 def _weighed(pair: Pair, candidates: Sequence[Physics]) -> Weighed:
@@ -125,7 +156,8 @@ def _weighed(pair: Pair, candidates: Sequence[Physics]) -> Weighed:
         left[:, axis] -= A @ np.linalg.solve(N, A[usable].T @ left[usable, axis])
     if pair.against == "simulation":
         return Weighed(pair, level(left, usable, 1.0 / pair.period_s, ORDER_SIM))
-    return Weighed(pair, whitener(left, usable, ORDER_TRUTH))
+    assert pair.band_hz is not None
+    return Weighed(pair, whitener(left, usable, ORDER_TRUTH, Band.below(pair.band_hz, 1.0 / pair.period_s)))
 
 
 # ── what is told ──
@@ -136,8 +168,8 @@ def _told(logs: Sequence[Weighed], found: Discovery, reals: Sequence[str], sim: 
     pairs = [log.pair for log in logs]
     floor = _floor(logs)
     before = [_with(pair, found, ()) for pair in pairs]
-    after = [_with(pair, found, found.whole.chosen) for pair in pairs]
-    findings = [_finding(logs, found, one, floor) for one in found.judged]
+    after = [_with(pair, found, found.fitted.chosen) for pair in pairs]  # held-out time stays unseen
+    findings = [one for one in (_finding(logs, found, one, floor) for one in found.judged) if one.share > 0.0]
     findings += stamps.saturated(pairs, after, found.tried) + stamps.dropped(pairs) + stamps.rounded(pairs, floor)
     p_values = {
         signal: min((one.p_value for one in found.judged if signal in _signals(one.physics)), default=1.0)
@@ -203,13 +235,20 @@ def _variables(pair: Pair) -> dict[str, tuple[str, Float64[np.ndarray, " n"]]]:
     return out | {name: ("", values) for name, values in pair.channels.items()}
 
 
+def _unseen(pair: Pair, there: Float64[np.ndarray, "n 6"]) -> Float64[np.ndarray, "m 6"]:
+    """What is left on held-out samples, up to where what is expected is known."""
+    left = pair.real - there
+    if pair.band_hz is None:
+        return np.asarray(left[pair.held_out])
+    band = Band.below(pair.band_hz, 1.0 / pair.period_s)
+    return np.asarray(band(left)[pair.held_out[:: band.every]])
+
+
 def _held_out(pairs: Sequence[Pair], before: Sequence[np.ndarray], after: Sequence[np.ndarray], k: int, unit_: str) -> HeldOut:
     """Root mean squares over held-out samples and axes of a signal, and how long that was."""
     part = slice(3 * k, 3 * k + 3)
     power = [
-        np.concatenate(
-            [((pair.real - there)[pair.held_out, part] ** 2).ravel() for pair, there in zip(pairs, those, strict=True)]
-        )
+        np.concatenate([(_unseen(pair, there)[:, part] ** 2).ravel() for pair, there in zip(pairs, those, strict=True)])
         for those in (before, after)
     ]
     length = sum(float(pair.held_out.sum()) * pair.period_s for pair in pairs)
@@ -237,7 +276,7 @@ def _finding(logs: Sequence[Weighed], found: Discovery, one: Judged, floor: Floa
             shares.append((excess / noise, float(np.clip(excess / misfit, 0.0, 1.0)), signal, held))
     _, share, signal, held = max(shares, key=lambda entry: entry[0])
     told_signal = signal if len(one.physics.sensors) == 1 else "both"
-    name, _, rest = one.physics.name.partition(":")
+    name, _, rest = one.physics.name.replace(" accel", "").partition(":")
     return Finding(
         effect=name,
         signal=told_signal,

@@ -11,12 +11,13 @@ Scores are logarithms of chi-square's tail: twenty squares for one parameter are
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float64
 from scipy.special import gammaln
-from scipy.stats import chi2, wilcoxon
+from scipy.stats import chi2, norm, wilcoxon
 from scipy.stats import t as student
 
 from imutool.physics import fit as fits
@@ -26,12 +27,15 @@ from imutool.physics.readings import Read
 
 FALSE_DISCOVERY = 5e-3
 HELPS = 0.05  # chance of the gain on unseen blocks being none
-TRIED = 4  # candidates that are fitted in full in a round
+TRIED = 3  # candidates that are fitted in full in a round
 MOST, ROUNDS = 8, 20  # effects, and times that one comes in
 BLOCK_S = 2.0
 FAR_OUT = 300.0  # half the gain, above which the tail itself is less than a number can hold
 SUSPICIOUS, CLEARLY, NAMELESS = 3, 10.0, 15.0  # effects; squares by which an answer is better; what a missing name costs
+WELL, HOPELESS = 1.03, 2.0  # squares left a row, below which all is said, and above which more of the same is no answer
 MOST_NAMELESS, NAMELESS_SHARE = 2, 0.03  # effects without a name, and how much of the misfit each has to take
+IN_BAND = 0.8
+IMPLAUSIBLE = 4.0  # times the plausible size
 ALIKE = 4.0  # natural logarithms of chance within which two effects cannot be told apart
 
 
@@ -66,13 +70,18 @@ class Discovery:
 
 def discover(logs: Sequence[Weighed], candidates: Sequence[Physics], later: Sequence[Sequence[Physics]] = ()) -> Discovery:
     """The effects that the logs show together; those of `later` are asked, in turn, when those before have nothing to say."""
-    path = _path(logs, tuple(candidates), (), list(later))
-    if len(path[1].chosen) >= SUSPICIOUS or any(":" in name for name in path[1].names):
-        # many small parts, or one without a name beside others that have one: perhaps one thing alone is the better answer
-        other = _path(logs, tuple(candidates), tuple(one for stage in later for one in stage), [])
-        if cost(other[1]) < cost(path[1]) - CLEARLY:
-            path = other
-    search, now = path
+    everything = tuple(one for stage in later for one in stage)
+    first = _Search(logs, tuple(candidates), everything)
+    start = fit(logs, ())
+    named, nameless = (max((r.gain for r in first.ranked(start, some)), default=0.0) for some in (first.named, first.others))
+    paths = [(first.others, []), ((), list(later))] if nameless > named + CLEARLY else [((), list(later)), (first.others, [])]
+    search, now = _path(logs, first.named, *paths[0])
+    churned = len(now.chosen) >= SUSPICIOUS or any(":" in name for name in now.names)
+    if everything and churned and now.objective > WELL * 6 * now.rows:
+        # many small parts that do not add up, or one without a name: perhaps one thing alone is the better answer
+        other = _path(logs, first.named, *paths[1])
+        if cost(other[1]) < cost(now) - CLEARLY:
+            search, now = other
     return search.judged(now)
 
 
@@ -82,7 +91,8 @@ def _path(
     """One effect after another comes in, until none of the candidates that there are by then explains more than chance."""
     search, now = _Search(logs, named, others), fit(logs, ())
     for _ in range(ROUNDS):
-        better = search.added(now) if len(now.chosen) < MOST else None
+        hopeless = len(now.chosen) > SUSPICIOUS and now.objective > HOPELESS * 6 * now.rows
+        better = search.added(now) if len(now.chosen) < MOST and not hopeless else None
         if better is not None:
             now = search.pruned(search.exchanged(better))
         elif waiting:
@@ -97,6 +107,15 @@ def cost(found: Fit) -> float:
     count = sum(len(theta) for _, theta in found.chosen)
     nameless = sum(":" in name for name in found.names)
     return found.objective + count * float(np.log(6 * found.rows)) + NAMELESS * nameless
+
+
+class _Ranked(NamedTuple):
+    """A candidate by what one linear step from its best start gains, and by the chance of that."""
+
+    score: float
+    physics: Physics
+    start: Theta
+    gain: float
 
 
 @dataclass(eq=False)
@@ -128,7 +147,7 @@ class _Search:
         nameless = sum(":" in name for name in now.names)
         ranked = self.ranked(now, (*self.named, *self.others) if nameless < MOST_NAMELESS else self.named)
         best: tuple[float, Fit] | None = None
-        for _, physics, start in ranked[:TRIED]:
+        for _, physics, start, _ in ranked[:TRIED]:
             trial = fit(self.logs, (*now.chosen, (physics, start)), bias=now.bias)
             score = chance(now.objective - trial.objective, len(start))
             if best is None or score < best[0]:
@@ -136,11 +155,11 @@ class _Search:
         if best is None or best[0] > np.log(FALSE_DISCOVERY / self.tried):
             return None
         misfit = self.before - 6.0 * now.rows
-        if ":" in best[1].names[-1] and now.objective - best[1].objective < NAMELESS_SHARE * misfit:
-            return None  # the rim of something that is found already, which no name would make smaller
+        if any(":" in name for name in best[1].names) and now.objective - best[1].objective < NAMELESS_SHARE * misfit:
+            return None  # the rim of something that has no name: a name for it would be wrong
         return best[1]
 
-    def ranked(self, now: Fit, candidates: Sequence[Physics]) -> list[tuple[float, Physics, Theta]]:
+    def ranked(self, now: Fit, candidates: Sequence[Physics]) -> list[_Ranked]:
         """Candidates by what one linear step promises, each from its best start."""
         panel = _Panel(self.logs, now)
         out = []
@@ -149,8 +168,8 @@ class _Search:
                 continue
             gains = [(panel.gain(physics, start), start) for start in self.starts[physics.name]]
             gain, start = max(gains, key=lambda pair: pair[0])
-            out.append((chance(gain, len(start)), physics, start))
-        return sorted(out, key=lambda entry: entry[0])
+            out.append(_Ranked(chance(gain, len(start)), physics, start, gain))
+        return sorted(out, key=lambda entry: entry.score)
 
     def exchanged(self, now: Fit) -> Fit:
         """With an effect replaced by another of the catalogue that explains more, where there is one."""
@@ -158,7 +177,7 @@ class _Search:
             others = (*now.chosen[:k], *now.chosen[k + 1 :])
             without = fit(self.logs, others, bias=now.bias, iterations=2)
             here = chance(without.objective - now.objective, len(now.chosen[k][1]))
-            for score, physics, start in self.ranked(without, self.named)[:2]:
+            for score, physics, start, _ in self.ranked(without, self.named)[:2]:
                 if physics.name == now.chosen[k][0].name or score > here:
                     continue
                 trial = fit(self.logs, (*others, (physics, start)), bias=now.bias)
@@ -179,12 +198,25 @@ class _Search:
         while now.chosen:
             other = fit(self.logs, now.chosen, part="held_out", bias=now.bias)
             whole = fit(self.logs, now.chosen, part="all", bias=now.bias)
+            held = tuple(_plausible(physics, theta) for physics, theta in whole.chosen)
+            if any(one is not physics for one, (physics, _) in zip(held, whole.chosen, strict=True)):
+                begun = tuple(
+                    (one, _kept(physics, one, theta)) for one, (physics, theta) in zip(held, whole.chosen, strict=True)
+                )
+                now = fit(self.logs, tuple(pair for pair in begun if len(pair[1])), bias=now.bias)
+                continue
             verdicts = [self._verdict(k, now, other, whole) for k in range(len(now.chosen))]
             worst = max(range(len(verdicts)), key=lambda k: verdicts[k].false_discovery_rate)
             if verdicts[worst].false_discovery_rate <= FALSE_DISCOVERY:
                 return Discovery(tuple(sorted(verdicts, key=lambda one: -one.gain)), now, whole, self.tried)
             now = fit(self.logs, (*now.chosen[:worst], *now.chosen[worst + 1 :]), bias=now.bias)
         return Discovery((), now, fit(self.logs, (), part="all"), self.tried)
+
+    def _beyond_the_band(self, physics: Physics, theta: Theta) -> bool:
+        """A frequency that what is expected does not reach up to: smoothed poses lag and lose there by themselves."""
+        bands = [log.pair.band_hz or 0.5 / log.pair.period_s for log in self.logs]
+        hertz = [value for number, value in zip(physics.parameters, theta, strict=True) if number.unit == "Hz"]
+        return bool(hertz) and max(hertz) > IN_BAND * min(bands)
 
     def _verdict(self, k: int, fitted: Fit, other: Fit, whole: Fit) -> Judged:
         physics, theta = whole.chosen[k]
@@ -194,17 +226,49 @@ class _Search:
         blocks = np.concatenate(
             [_gains(log, fitted, k, "held_out") for log in self.logs] + [_gains(log, other, k, "fitted") for log in self.logs]
         )
-        helps = _helps(blocks)
+        exact = all(log.pair.against == "simulation" for log in self.logs)
+        helps = min(_helps(blocks[:, 0]), _predicts(blocks) if exact else 1.0)
         rate = min(1.0, float(np.exp(min(0.0, log_p + np.log(self.tried)))))
-        if helps > HELPS:
-            rate = max(rate, helps)
+        if helps > HELPS or self._beyond_the_band(physics, theta):
+            rate = 1.0
         std = whole.stds()[physics.name]
         unseen = [
             f"{physics.name}.{number.name}"
             for number, s in zip(physics.parameters, std, strict=True)
             if s > (fits.LOG_PRIOR if number.positive else number.plausible)
         ]
+        if isinstance(physics.forward, _Held):
+            kept = {number.name for number in physics.parameters}
+            unseen += [f"{physics.name}.{n.name}" for n in physics.forward.physics.parameters if n.name not in kept]
         return Judged(physics, theta, std, tuple(unseen), float(np.exp(max(log_p, -700.0))), rate, gain)
+
+
+class _Held:
+    """An effect with some of its parameters held at nothing, because no motion showed them."""
+
+    def __init__(self, physics: Physics, free: Sequence[int]) -> None:
+        self.physics, self.free = physics, list(free)
+
+    def __call__(self, signals: Any, theta: Theta) -> Any:
+        every = self.physics.nothing.astype(float)
+        every[self.free] = theta
+        return self.physics.forward(signals, every)
+
+
+def _plausible(physics: Physics, theta: Theta) -> Physics:
+    """Itself, or without the parameters that came out many times larger than anything met: a fit to noise, not a number."""
+    if not physics.linear or ":" in physics.name:
+        return physics
+    free = [k for k, (n, v) in enumerate(zip(physics.parameters, theta, strict=True)) if abs(v) <= IMPLAUSIBLE * n.plausible]
+    if len(free) == len(theta):
+        return physics
+    return replace(physics, parameters=tuple(physics.parameters[k] for k in free), forward=_Held(physics, free))
+
+
+def _kept(physics: Physics, held: Physics, theta: Theta) -> Theta:
+    """The values of the parameters that are left."""
+    names = [number.name for number in held.parameters]
+    return np.array([value for number, value in zip(physics.parameters, theta, strict=True) if number.name in names])
 
 
 def chance(gain: float, parameters: int) -> float:
@@ -222,15 +286,21 @@ def _helps(gains: Float64[np.ndarray, " b"]) -> float:
     return min(float(student.sf(z, len(gains) - 1)), ranks)
 
 
-def _gains(log: Weighed, fitted: Fit, k: int, part: str) -> Float64[np.ndarray, " b"]:
-    """Squares by which each block of a part that was not fitted is better with an effect than without it."""
+def _predicts(blocks: Float64[np.ndarray, "b 2"]) -> float:
+    """The chance of unseen noise following what is predicted so well: 2 u.n - |u|² has mean -|u|² and variance 4 |u|²."""
+    gain, size = blocks.sum(axis=0)
+    return float(norm.sf((gain + size) / (2.0 * np.sqrt(size)))) if size > 0 else 1.0
+
+
+def _gains(log: Weighed, fitted: Fit, k: int, part: str) -> Float64[np.ndarray, "b 2"]:
+    """Squares by which each block of a part that was not fitted is better with an effect, and those of what it adds."""
     chosen = fitted.chosen
     with_, without = (_white(log, one, part) for one in (chosen, (*chosen[:k], *chosen[k + 1 :])))
     rows = log.rows(part)
-    block = np.floor(log.pair.stamp_s[rows] / BLOCK_S).astype(int)
-    gain = (without**2).sum(1) - (with_**2).sum(1)
+    block = np.floor(log.pair.stamp_s[:: log.whiten.every][rows] / BLOCK_S).astype(int)
+    each = np.stack([(without**2).sum(1) - (with_**2).sum(1), ((without - with_) ** 2).sum(1)], axis=1)
     names, inverse = np.unique(block, return_inverse=True)
-    return np.bincount(inverse, weights=gain, minlength=len(names))
+    return np.stack([np.bincount(inverse, weights=column, minlength=len(names)) for column in each.T], axis=1)
 
 
 def _white(log: Weighed, chosen: Chosen, part: str) -> Float64[np.ndarray, "n 6"]:
@@ -247,6 +317,7 @@ class _Panel:
     def __init__(self, logs: Sequence[Weighed], now: Fit) -> None:
         self.logs, self.now, self.masks = logs, now, [log.rows("fitted") for log in logs]
         self.bases = [expected(log.pair, now.chosen) for log in logs]
+        self.sampled = [fits.sampled(log.pair, now.chosen) for log in logs]
         self.columns = []
         for k, (log, base, mask) in enumerate(zip(logs, self.bases, self.masks, strict=True)):
             J = log.whiten(derivatives(log.pair, now.chosen, range(len(now.chosen)), base))[mask]
@@ -269,9 +340,11 @@ class _Panel:
         chosen = (*self.now.chosen, (physics, start))
         p, q, total = len(start), len(self.N), 0.0
         N_bb, N_ab, g_b, g_a = np.zeros((p, p)), np.zeros((q, p)), np.zeros(p), np.zeros(q)
-        for log, base, mask, A, white in zip(self.logs, self.bases, self.masks, self.columns, self.white, strict=True):
-            r, there = white, expected(log.pair, chosen)
-            B = log.whiten(derivatives(log.pair, chosen, [len(chosen) - 1], there))[mask].reshape(-1, len(start))
+        panel = zip(self.logs, self.bases, self.masks, self.columns, self.white, self.sampled, strict=True)
+        for log, base, mask, A, white, sampled in panel:
+            r, there = white, base if physics.linear else expected(log.pair, chosen)
+            J = derivatives(log.pair, chosen, [len(chosen) - 1], there, sampled)
+            B = log.whiten(J)[mask].reshape(-1, len(start))
             if not physics.linear:
                 r = white - log.whiten(there - base)[mask].reshape(-1)
             N_bb, N_ab = N_bb + B.T @ B, N_ab + A.T @ B

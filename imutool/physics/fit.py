@@ -38,10 +38,10 @@ class Weighed:
 
     def rows(self, part: str) -> Bool[np.ndarray, " n"]:
         """`fitted`, `held_out` or `all`, behind the filter's start."""
-        pair, order = self.pair, self.whiten.order
+        pair, order, every = self.pair, self.whiten.order, self.whiten.every
         if part == "all":
-            return np.asarray(settled(pair.fitted, order) | settled(pair.held_out, order))
-        return settled(pair.fitted if part == "fitted" else pair.held_out, order)
+            return np.asarray(settled(pair.fitted[::every], order) | settled(pair.held_out[::every], order))
+        return settled((pair.fitted if part == "fitted" else pair.held_out)[::every], order)
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,17 +78,17 @@ class Fit:
 
 def expected(pair: Pair, chosen: Chosen) -> Float64[np.ndarray, "n 6"]:
     """What the sensor would read, without bias."""
-    return _sensed(_sampled(pair, chosen), chosen)
+    return _sensed(sampled(pair, chosen), chosen)
 
 
-def _sampled(pair: Pair, chosen: Chosen) -> Read:
+def sampled(pair: Pair, chosen: Chosen) -> Read:
     """What arrives at the sensor when its samples are taken."""
     return read(pair.felt, pair.stamp_s, [one for one in chosen if one[0].stage <= Stage.CLOCK])
 
 
-def _sensed(sampled: Read, chosen: Chosen) -> Float64[np.ndarray, "n 6"]:
+def _sensed(taken: Read, chosen: Chosen) -> Float64[np.ndarray, "n 6"]:
     """What the sensor makes of it."""
-    got = sensed(sampled, [one for one in chosen if one[0].stage > Stage.CLOCK])
+    got = sensed(taken, [one for one in chosen if one[0].stage > Stage.CLOCK])
     return np.concatenate([got.gyro, got.accel], axis=1)
 
 
@@ -110,22 +110,22 @@ def step_of(number: Number) -> float:
 
 
 def derivatives(
-    pair: Pair, chosen: Chosen, of: Sequence[int], base: Float64[np.ndarray, "n 6"]
+    pair: Pair, chosen: Chosen, of: Sequence[int], base: Float64[np.ndarray, "n 6"], taken: Read | None = None
 ) -> Float64[np.ndarray, "n 6 p"]:
-    """d expected / d (free parameters) of some of the effects, by forward differences."""
-    columns, sampled = [], None
+    """d expected / d (free parameters) of some of the effects, by forward differences; `taken` is what is `sampled`."""
+    columns = []
     for k in of:
         physics, theta = chosen[k]
         x = free(physics, theta)
         late = physics.stage > Stage.CLOCK
-        if late and sampled is None:
-            sampled = _sampled(pair, chosen)
+        if late and taken is None:
+            taken = sampled(pair, chosen)
         for j, number in enumerate(physics.parameters):
             h = step_of(number)
             moved = x.copy()
             moved[j] += h
             others = (*chosen[:k], (physics, bound(physics, moved)), *chosen[k + 1 :])
-            there = _sensed(sampled, others) if late and sampled is not None else expected(pair, others)
+            there = _sensed(taken, others) if late and taken is not None else expected(pair, others)
             columns.append((there - base) / h)
     return np.stack(columns, axis=2) if columns else np.zeros((*base.shape, 0))
 

@@ -43,8 +43,8 @@ LEAST_NOISE = np.array([1e-4] * 3 + [1e-3] * 3)
 class Pair:
     """Ideal signals on an even clock, and real samples by their stamps on that clock (s from the first sample).
 
-    `fitted` and `held_out` are rows; rows in neither are borders, gaps and ends. `aligned_s` is what was added to the
-    recording's stamps because the two clocks share no epoch (0: they do).
+    `fitted` and `held_out` are rows; rows in neither are borders, gaps and ends. `band_hz` is where what is expected ends to be
+    known (none: nowhere), `aligned_s` what was added to the recording's stamps where the two clocks share no epoch.
     """
 
     name: str
@@ -57,6 +57,7 @@ class Pair:
     aligned_s: float = 0.0
     against: str = "simulation"
     start_ns: int = 0
+    band_hz: float | None = None
     sim_noise: Float64[np.ndarray, "6"] = field(default_factory=lambda: np.zeros(6))
     channels: Mapping[str, Float64[np.ndarray, " n"]] = field(default_factory=lambda: NOTHING)
 
@@ -81,15 +82,16 @@ def with_simulation(real: Recording, sim: Recording) -> Pair:
     return _pair(real, felt, stamp_s, inside, "simulation", shift_s, noise)
 
 
-def with_truth(real: Recording, felt: Felt, start_ns: int) -> Pair:
-    """The recording beside what its own true poses say, `felt` being on seconds since `start_ns`.
+def with_truth(real: Recording, felt: Felt, start_ns: int, band_hz: float) -> Pair:
+    """The recording beside what its own true poses say, `felt` being on seconds since `start_ns`, true up to `band_hz`.
 
     Raises:
         DataError: too little shared time.
     """
     stamp_s = seconds(real.imu.t_ns, start_ns)
     inside = (stamp_s >= felt.t_s[0]) & (stamp_s <= felt.t_s[-1])
-    return _pair(real, felt, stamp_s, inside, "true poses", 0.0, np.zeros(6))
+    felt = replace(felt, channels=_channels(real, start_ns + np.round(felt.t_s * 1e9).astype(np.int64)))
+    return replace(_pair(real, felt, stamp_s, inside, "true poses", 0.0, np.zeros(6)), band_hz=band_hz)
 
 
 def _pair(
@@ -130,8 +132,8 @@ def _pair(
         aligned_s,
         against,
         int(t_ns[0]),
-        sim_noise,
-        {name: values for name, values in _channels(real, t_ns).items() if np.ptp(values) > 0},
+        sim_noise=sim_noise,
+        channels={name: values for name, values in _channels(real, t_ns).items() if np.ptp(values) > 0},
     )
 
 

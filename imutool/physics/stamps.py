@@ -12,10 +12,12 @@ from scipy.stats import binom
 from imutool.physics.diagnosis import UNITS, Estimate, Finding, HeldOut
 from imutool.physics.effects._forward import Number, Physics, Stage, Theta
 from imutool.physics.pair import Pair
+from imutool.physics.readings import Felt, Read
 
 LAG, MEDIAN = 10, 15  # samples
 LEAST_MISSING, LEAST_AT_LIMIT = 3, 4
 NEARLY, EXACT = 0.995, 1e-3
+SHARES = (0.999, 0.99, 0.97, 0.9, 0.8)  # of the largest reading, where a soft limit is looked for
 LEAST_JITTER_S = 2e-5
 LEAST_DIGITS = 0.3  # of the noise: finer steps leave no trace in it
 ON_GRID = 0.98  # of the samples
@@ -120,6 +122,54 @@ def limits(real: Float64[np.ndarray, "n 6"]) -> dict[str, float]:
         if (values >= most * (1.0 - 1e-9)).sum() >= LEAST_AT_LIMIT:
             found[signal] = most
     return found
+
+
+def soft_limits(pairs: Sequence[Pair], biases: Sequence[Float64[np.ndarray, "6"]]) -> tuple[Physics, ...]:
+    """A limit whose readings still carry noise: one candidate a sensor, for a fit. What is clipped includes the bias."""
+    found = []
+    for k, signal in enumerate(("gyro", "accel")):
+        if any(signal in limits(pair.real) for pair in pairs):
+            continue
+        part = slice(3 * k, 3 * k + 3)
+        bias = np.mean([b[part] for b in biases], axis=0)
+        most = float(max(np.abs(pair.real[:, part]).max() for pair in pairs))
+        unit = UNITS[signal].replace("^2", "²")
+        found.append(
+            Physics(
+                "saturation" if k == 0 else "saturation accel",
+                Stage.CONVERTER,
+                ("gyro",) if k == 0 else ("accel",),
+                f"{signal} = clip({signal}, -L, L)",
+                (Number(f"{signal}_limit", unit, most, positive=True, nothing=np.inf, step=1e-4),),
+                "the limit is reached",
+                _Clip(k, bias),
+                linear=False,
+                starts=_Starts(most),
+            )
+        )
+    return tuple(found)
+
+
+class _Clip:
+    """Readings between two limits, the bias being part of what is read."""
+
+    def __init__(self, sensor: int, bias: Float64[np.ndarray, "3"]) -> None:
+        self.sensor, self.bias = sensor, bias
+
+    def __call__(self, read: Read, theta: Theta) -> Read:
+        x = read.gyro if self.sensor == 0 else read.accel
+        out = np.clip(x + self.bias, -theta[0], theta[0]) - self.bias
+        return read.but(gyro=out) if self.sensor == 0 else read.but(accel=out)
+
+
+class _Starts:
+    """A little below the largest reading, which noise has raised."""
+
+    def __init__(self, most: float) -> None:
+        self.most = most
+
+    def __call__(self, _felt: Felt, _samples: Read) -> list[Theta]:
+        return [np.array([share * self.most]) for share in SHARES]
 
 
 def clipped(real: Float64[np.ndarray, "n 6"]) -> Bool[np.ndarray, " n"]:

@@ -12,12 +12,35 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float64
 from scipy.ndimage import median_filter
-from scipy.signal import lfilter, welch
+from scipy.signal import firwin, lfilter, oaconvolve, welch
 
 MAD_TO_STD = 1.4826
 LEAST_STD = 1e-12
 MOTION_HZ, REFERENCE_HZ = 15.0, 60.0  # where a body's motion has its power, and where noise is measured in its place
+BAND_S, OVER = 0.33, 4.0  # length of the filter of a band, and how many samples a period of its edge gets
 SEGMENT, LINES = 512, 9  # samples of a spectrum; frequencies of the median that takes lines out of it
+
+
+@dataclass(frozen=True, eq=False)
+class Band:
+    """What is slower than a frequency, on every so many-th sample: smoothed poses know nothing of what is faster."""
+
+    taps: Float64[np.ndarray, " k"]
+    every: int
+
+    @staticmethod
+    def below(band_hz: float, rate_hz: float) -> Band:
+        """Up to `band_hz`, by a symmetric filter of a third of a second."""
+        count = 2 * round(0.5 * BAND_S * rate_hz) + 1
+        every = max(1, int(rate_hz / (OVER * band_hz)))
+        return Band(firwin(count, min(band_hz, 0.45 * rate_hz), fs=rate_hz), every)
+
+    def __call__(self, x: Float64[np.ndarray, "n 6 *k"]) -> Float64[np.ndarray, "m 6 *k"]:
+        """The slow part of some columns."""
+        if not x.size:
+            return np.zeros((len(x[:: self.every]), *x.shape[1:]))
+        taps = self.taps.reshape(-1, *[1] * (x.ndim - 1))
+        return np.asarray(oaconvolve(x, taps, mode="same", axes=0)[:: self.every])
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,9 +49,11 @@ class Whitener:
 
     filters: Float64[np.ndarray, "6 order"]
     std: Float64[np.ndarray, "6"]
+    band: Band | None = None
 
-    def __call__(self, x: Float64[np.ndarray, "n 6 *k"]) -> Float64[np.ndarray, "n 6 *k"]:
-        """White rows from coloured ones; columns of zeros stay zeros."""
+    def __call__(self, x: Float64[np.ndarray, "n 6 *k"]) -> Float64[np.ndarray, "m 6 *k"]:
+        """White rows from coloured ones (fewer, where only a band is looked at); columns of zeros stay zeros."""
+        x = x if self.band is None else self.band(x)
         out = np.zeros_like(x)
         for axis in range(6):
             if x[:, axis].any():
@@ -36,24 +61,33 @@ class Whitener:
         return out
 
     @property
+    def every(self) -> int:
+        """Samples for one row that comes out."""
+        return 1 if self.band is None else self.band.every
+
+    @property
     def order(self) -> int:
         """Samples it looks back."""
         return int(self.filters.shape[1] - 1)
 
 
-def whitener(residual: Float64[np.ndarray, "n 6"], usable: Bool[np.ndarray, " n"], order: int) -> Whitener:
+def whitener(
+    residual: Float64[np.ndarray, "n 6"], usable: Bool[np.ndarray, " n"], order: int, band: Band | None = None
+) -> Whitener:
     """From a residual and the rows of it that count.
 
     The size is robust (a few spikes are not the noise), but no less than half of what the plain one is.
     """
     filters, std = np.zeros((6, order + 1)), np.ones(6)
+    if band is not None:
+        residual, usable = band(residual), usable[:: band.every]
     rows = settled(usable, order)
     for axis in range(6):
         filters[axis] = burg(residual[:, axis], usable, order)
         white = lfilter(filters[axis], [1.0], residual[:, axis])[rows]
         robust = MAD_TO_STD * float(np.median(np.abs(white)))
         std[axis] = max(robust, 0.5 * float(np.sqrt(np.mean(white**2))), LEAST_STD)
-    return Whitener(filters, std)
+    return Whitener(filters, std, band)
 
 
 def level(residual: Float64[np.ndarray, "n 6"], usable: Bool[np.ndarray, " n"], rate_hz: float, order: int) -> Whitener:
@@ -86,7 +120,7 @@ def settled(usable: Bool[np.ndarray, " n"], order: int) -> Bool[np.ndarray, " n"
     return np.asarray(run > order + 0.5)
 
 
-def burg(x: Float64[np.ndarray, " n"], usable: Bool[np.ndarray, " n"], order: int) -> Float64[np.ndarray, " order+1"]:
+def burg(x: Float64[np.ndarray, " n"], usable: Bool[np.ndarray, " n"], order: int) -> Float64[np.ndarray, " _"]:
     """Burg's autoregression (1, a_1, ..., a_order), forward and backward errors counted where all their samples do."""
     a = np.array([1.0])
     f, b, ok = np.where(usable, x, 0.0), np.where(usable, x, 0.0), usable.copy()

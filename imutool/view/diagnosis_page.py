@@ -9,7 +9,20 @@ from pathlib import Path
 
 from imutool import __version__
 from imutool.mcap_io.target import Target
-from imutool.physics.conclusion import before_after, conclusion, does, measured, name, p_value, percent, remains, rms, where
+from imutool.physics.conclusion import (
+    WITH_ALL,
+    before_after,
+    came_closer,
+    conclusion,
+    does,
+    measured,
+    name,
+    p_value,
+    percent,
+    remains,
+    unseen,
+    where,
+)
 from imutool.physics.diagnosis import SCHEMA, UNITS, Diagnosis, Finding, Traces
 from imutool.physics.quantity import SHOWN, each, grouped, symbol
 from imutool.view import diagnosis_figures as figures
@@ -220,12 +233,10 @@ def _left(d: Diagnosis) -> Iterator[str]:
             cells = "".join(f"<td class=number>{text(number)}</td>" for number in numbers)
             rows.append(f"<tr><td>{text(signal)}</td>{cells}<td>{text(remains(one, unit))}</td></tr>")
         yield f"<table><thead><tr>{head}</tr></thead><tbody>{''.join(rows)}</tbody></table>"
-    if d.closer:
-        yield "<h2>Simulated again with what was found</h2><dl>"
+    if d.closer and d.findings:
+        yield f"<h2>How much closer it comes</h2><p class=note>{text(WITH_ALL + unseen(d))}.</p><dl>"
         for signal, again in d.closer.items():
-            gain = percent(1.0 - again.rms_after / again.rms_before) if again.rms_before > 0.0 else "–"
-            said = f"{rms(again)}: {gain} closer"
-            yield f"<dt>{text(signal)}</dt><dd>{text(said)}</dd>"
+            yield f"<dt>{text(signal)}</dt><dd>{text(came_closer(again))}</dd>"
         yield "</dl>"
 
 

@@ -99,7 +99,7 @@ def test_the_unknown_is_said_to_have_no_name() -> None:
     )
     equation = finding("unknown", {"a": Estimate(0.3, 0.01, "s²/m")}, equation="accel_x += a f_z^2")
     assert sentence(MADE.ARM, equation) == (
-        "it follows accel_x += a f_z^2, which has no name among the known effects, with a 0.300 ± 0.010 s²/m (unknown)"
+        "accel_x += a f_z^2, with a 0.300 ± 0.010 s²/m; this has no name among the known effects (unknown)"
     )
 
 
@@ -186,9 +186,12 @@ def test_lines_hold_each_finding_place_gain_and_remark() -> None:
         "p = 1e-12, false discovery rate 1 %"
     )
     assert said[3] == "Where: accel x, y, angular rate above 0.4 rad/s, 12.0 to 48.5 s; 83 % of the misfit, p = 1e-09"
-    assert said[5] == "Simulated again with what was found: gyro rms 0.02 to 0.0074 rad/s"
+    assert said[5] == (
+        "With everything that was found, over 90 s held out of the search: "
+        "gyro rms 0.02 to 0.0074 rad/s, 63 % closer; accel rms 0.52 to 0.19 m/s², 63 % closer"
+    )
     assert said[-1] == MADE.BOTH.remarks[0]
-    assert len(said) == 8
+    assert len(said) == 7
     assert lines(MADE.NOTHING) == [NULL]
 
 

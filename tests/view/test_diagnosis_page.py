@@ -120,7 +120,7 @@ def test_every_log_has_its_bias_its_samples_and_its_unseen_time(three: str) -> N
     assert "constant bias gyro (-0.01, +0.02, -0.003) rad/s, accel (-0.1, +0.2, -0.05) m/s²" in said
     assert "one: 18000 at 200 Hz, 0.0 to 90.0 s, 30 s of it unseen by any fit" in said
     assert "two: 14000 at 200 Hz, 100.0 to 170.0 s, 23 s of it unseen by any fit" in said
-    assert "gyro rms 0.02 to 0.0074 rad/s: 63 % closer" in said
+    assert "gyro rms 0.02 to 0.0074 rad/s, 63 % closer" in said
     assert MADE.THREE.remarks[0] in said
 
 

@@ -1,0 +1,54 @@
+"""`imutool diagnose`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from imutool.cli._app import Imu, Json, Overwrite, Quiet, Truth, Verbose, app
+from imutool.terminal import logger, progress, say, write_json
+
+
+@app.command(epilog="Example: [bold]imutool diagnose real.mcap --sim sim.mcap -o diagnosis[/]")
+def diagnose(
+    reals: Annotated[
+        list[Path], typer.Argument(metavar="REAL...", help="Recordings; several share the physics, with a bias each.")
+    ],
+    sim: Annotated[
+        Path | None, typer.Option(metavar="SIM", help="The simulation; else what the recording's own true poses say.")
+    ] = None,
+    signal: Annotated[
+        list[str] | None, typer.Option(metavar="TOPIC.field", help="Compare this field of both logs as well. Repeatable.")
+    ] = None,
+    folder: Annotated[
+        Path | None,
+        typer.Option("-o", "--output", metavar="DIR", help="For findings.json, physics.toml, report.html and view.rrd."),
+    ] = None,
+    imu: Imu = None,
+    truth: Truth = None,
+    overwrite: Overwrite = False,
+    json_to: Json = None,
+    verbose: Verbose = False,
+    quiet: Quiet = False,
+) -> None:
+    """Find where a recording differs from a simulation, name what physics was left out, model it, and show the gain."""
+    from imutool import diagnosis_folder
+    from imutool.physics.conclusion import lines
+    from imutool.physics.diagnose import diagnose as run
+
+    if folder is not None:
+        diagnosis_folder.refuse(folder, overwrite=overwrite)
+    with progress("Diagnosing", verbose, quiet) as tell:
+        found = run(reals, sim, imu=imu, truth=truth, signals=signal or (), tell=tell)
+        if folder is not None:
+            tell(0, 1, "writing")
+            for remark in diagnosis_folder.write(found, folder, overwrite=overwrite):
+                logger.warning("%s", remark)
+    if write_json(diagnosis_folder.plain(found), json_to):
+        return
+    for line in lines(found):
+        say(line)
+    if folder is not None:
+        say(f"{folder}: {', '.join(name for name in diagnosis_folder.FILES if (folder / name).exists())}")

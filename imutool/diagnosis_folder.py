@@ -1,0 +1,132 @@
+"""What a diagnosis leaves behind: findings.json, physics.toml, report.html and view.rrd in one folder.
+
+The files are made in a folder beside it and moved when all are there, so that a reader never finds half a diagnosis. Other
+files in the folder, the logs themselves for instance, stay as they are.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import math
+import os
+import secrets
+import shutil
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+from imutool.errors import ConfigError
+from imutool.physics import physics_file
+from imutool.physics.diagnosis import Diagnosis
+from imutool.physics.found import found
+
+FINDINGS, PHYSICS, REPORT, VIEW = "findings.json", "physics.toml", "report.html", "view.rrd"
+FILES = (FINDINGS, PHYSICS, REPORT, VIEW)
+NEEDS = {REPORT: ("matplotlib", "report"), VIEW: ("rerun", "view")}  # a file, the library that draws it, and its extra
+
+
+def refuse(folder: Path, *, overwrite: bool = False) -> None:
+    """Nothing, where a diagnosis may be written; to be asked before hours of work.
+
+    Raises:
+        ConfigError: a file of that name, or a diagnosis in it already (without `overwrite`).
+    """
+    if folder.exists() and not folder.is_dir():
+        raise ConfigError("is a file", where=folder, expected="a folder, which need not exist")
+    there = [name for name in FILES if (folder / name).exists()]
+    if there and not overwrite:
+        raise ConfigError(
+            f"holds a diagnosis already ({', '.join(there)})", where=folder, fix="Choose another folder, or add --overwrite"
+        )
+
+
+def write(d: Diagnosis, folder: Path, *, overwrite: bool = False) -> list[str]:
+    """Writes the folder; gives a remark for each file that was left out because an extra is not installed.
+
+    A diagnosis that is replaced goes whole: of its files none is kept.
+
+    Raises:
+        ConfigError: as `refuse`, or the system refuses to write.
+    """
+    refuse(folder, overwrite=overwrite)
+    place = folder.absolute()  # "." has no name of its own
+    beside = place.parent / f".{place.name}.{os.getpid()}.{secrets.token_hex(4)}.partial"
+    with _told(folder):
+        try:
+            beside.mkdir(parents=True)
+            remarks = _make(d, beside)
+            refuse(folder, overwrite=overwrite)
+            if folder.exists():
+                _move(beside, folder)
+            else:
+                beside.rename(folder)
+        finally:
+            with contextlib.suppress(FileNotFoundError):
+                shutil.rmtree(beside)
+    return remarks
+
+
+def plain(d: Diagnosis) -> dict[str, Any]:
+    """What findings.json holds; JSON has no word for infinity (a cut-off never reached) or for no number: null."""
+    values: dict[str, Any] = _finite(d.plain())
+    return values
+
+
+def _finite(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _finite(inner) for key, inner in value.items()}
+    if isinstance(value, list | tuple):
+        return [_finite(inner) for inner in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value
+
+
+def _make(d: Diagnosis, folder: Path) -> list[str]:
+    text = json.dumps(plain(d), indent=2, allow_nan=False, ensure_ascii=False)
+    (folder / FINDINGS).write_text(text + "\n", encoding="utf-8")
+    physics_file.write(found(d), folder / PHYSICS)
+    drawn: dict[str, Callable[[Path], None]] = {REPORT: lambda path: _page(d, path), VIEW: lambda path: _recording(d, path)}
+    remarks = []
+    for name, draw in drawn.items():
+        library, extra = NEEDS[name]
+        if find_spec(library) is None:
+            remarks.append(f"{name} is left out: {library} is not installed (pip install 'imutool[{extra}]')")
+        else:
+            draw(folder / name)
+    return remarks
+
+
+def _page(d: Diagnosis, path: Path) -> None:
+    from imutool.view.diagnosis_page import write as write_page
+
+    write_page(d, path)
+
+
+def _recording(d: Diagnosis, path: Path) -> None:
+    from imutool.view.diagnosis_rerun import save
+
+    save(d, path)
+
+
+def _move(beside: Path, folder: Path) -> None:
+    """Each file over the old one; an old one without a new one is a stranger's to the new diagnosis, and goes."""
+    for name in FILES:
+        if (beside / name).exists():
+            (beside / name).replace(folder / name)
+        else:
+            (folder / name).unlink(missing_ok=True)
+
+
+@contextmanager
+def _told(folder: Path) -> Iterator[None]:
+    try:
+        yield
+    except OSError as error:
+        reason = error.strerror or type(error).__name__
+        raise ConfigError(
+            f"cannot be written ({reason})", where=folder, fix="Choose a place that can be written and has room"
+        ) from error

@@ -1,0 +1,314 @@
+"""Any number of any ROS 2 message in a log, by topic and dotted path: `/joint_states.position[2]`.
+
+Nothing is known beforehand of a message but the definition that the log carries. A message is walked once; those after it that
+share its counts lie the same way and are cut out in one numpy pass. One chunk is in memory at a time.
+"""
+
+from __future__ import annotations
+
+import difflib
+import re
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from itertools import pairwise
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float64, Int64, UInt8
+
+from imutool.errors import LogError
+from imutool.mcap_io import ros2msg
+from imutool.mcap_io.log import DERIVED_KEY, Clock, Log, Topic
+from imutool.mcap_io.read import UNIT_KEY
+from imutool.mcap_io.records import Rows
+
+LISTED = 60  # fields named in a message
+LONGEST_ROW = 64  # of an array of numbers that is looked at as channels
+MOST_OTHERS, LOOKED_AT = 48, 4  # channels, and how many times as many fields are read to find those that vary
+_PATH = re.compile(r"[A-Za-z]\w*(\[\d{1,9}\])?(\.[A-Za-z]\w*(\[\d{1,9}\])?)*")
+_LAST = re.compile(r"(.*?)(?:\[(\d+)\])?")
+_NO_CHANNEL = re.compile(r"(^|\.)(\w*stamp|covariance|\w+_covariance)\b")
+
+
+@dataclass(frozen=True, eq=False)
+class Fields:
+    """One number of a log over time: stamps of the messages' headers (their log times where they have none), as float64."""
+
+    t_ns: Int64[np.ndarray, " n"]
+    values: Float64[np.ndarray, " n"]
+    unit: str = ""
+
+    def __len__(self) -> int:
+        return len(self.t_ns)
+
+
+def read_field(path: Path, signal: str) -> Fields:
+    """One signal of a log, named TOPIC.field.
+
+    Raises:
+        ConfigError: the file cannot be opened.
+        LogError: no such topic or field (the message lists what there is), another encoding, an array that is shorter in some
+            message, NaN or infinity, stamps that do not increase, damage.
+    """
+    return read_fields(path, [signal])[signal]
+
+
+def read_fields(path: Path, signals: Sequence[str]) -> dict[str, Fields]:
+    """Several signals of a log, in one pass over it.
+
+    Raises:
+        ConfigError, LogError: as `read_field`.
+    """
+    with Log(path) as log:
+        wanted: dict[str, list[str]] = {}
+        for signal in signals:
+            topic, inside = split(log, signal)
+            wanted.setdefault(topic, []).append(inside)
+        readers = {topic: _Reader(log, log.topics[topic], tuple(dict.fromkeys(paths))) for topic, paths in wanted.items()}
+        for topic, rows in log.rows(list(wanted)):
+            with log.named(topic):
+                readers[topic].take(rows)
+        out = {}
+        for signal in signals:
+            topic, inside = split(log, signal)
+            with log.named(topic):
+                out[signal] = readers[topic].whole(inside)
+        return out
+
+
+def split(log: Log, signal: str) -> tuple[str, str]:
+    """Topic and path of TOPIC.field; of topics that both fit, the longer.
+
+    Raises:
+        LogError: no such topic, or no path behind it.
+    """
+    topics = [topic for topic in log.topics if signal.startswith(f"{topic}.")]
+    if not topics:
+        expected = "TOPIC.field" if signal in log.topics else log.listing()
+        fields = f" It has {_listed(numeric_fields(log, signal))}" if signal in log.topics else ""
+        what = f"{signal} names no field" if signal in log.topics else f"there is no topic that {signal} begins with"
+        raise LogError(what, where=log.path, expected=expected, fix=fields.strip())
+    topic = max(topics, key=len)
+    inside = signal[len(topic) + 1 :]
+    if not _PATH.fullmatch(inside):
+        raise LogError(f"{inside!r} is no field's path", where=f"{log.path} {topic}", expected="names and dots: twist.linear.x")
+    return topic, inside
+
+
+def numeric_fields(log: Log, topic: str, *, long: bool = True) -> list[str]:
+    """Paths of the numbers in a topic's first message, `long` arrays by their first elements or not at all; without stamps.
+
+    Raises:
+        LogError: no definition or another encoding than ros2msg and cdr.
+    """
+    definition = _definition(log, log.topics[topic])
+    for _, rows in log.rows([topic]):
+        with log.named(topic):
+            return list(_paths(ros2msg.Walk(rows.payload[0].tobytes(), definition), long))
+    return []
+
+
+def others(path: Path, signal: str, most: int = MOST_OTHERS) -> dict[str, Fields]:
+    """Every other number of a log that varies, by TOPIC.field: what might drive a signal. Stamps and covariances are not asked.
+
+    What cannot serve is left out: constants, NaN, stamps that go back, long arrays (images), topics without a definition, what
+    imutool computed, and all fields behind the first `most` that vary, in the order of the log.
+
+    Raises:
+        ConfigError, LogError: the log cannot be opened, or is damaged.
+    """
+    with Log(path) as log:
+        readers = {}
+        left = LOOKED_AT * most
+        for name, topic in log.topics.items():
+            paths = [] if DERIVED_KEY in topic.metadata else _offered(log, name)
+            paths = [inside for inside in paths if f"{name}.{inside}" != signal and not _NO_CHANNEL.search(inside)][:left]
+            if paths:
+                readers[name], left = _Reader(log, topic, tuple(paths), strict=False), left - len(paths)
+        for name, rows in log.rows(list(readers)):
+            with log.named(name):
+                readers[name].take(rows)
+    found: dict[str, Fields] = {}
+    for name, reader in readers.items():
+        for inside in reader.paths:
+            one = reader.usable(inside)
+            if one is not None and len(found) < most:
+                found[f"{name}.{inside}"] = one
+    return found
+
+
+def _offered(log: Log, topic: str) -> list[str]:
+    """Its numeric fields, none where it has no definition that can be followed."""
+    try:
+        return numeric_fields(log, topic, long=False)
+    except LogError:
+        return []
+
+
+def _definition(log: Log, topic: Topic) -> ros2msg.Definition:
+    """What the log says of a topic's messages.
+
+    Raises:
+        LogError: it says nothing, or in another language.
+    """
+    where = f"{log.path} {topic.name}"
+    if (topic.schema_encoding, topic.message_encoding) != ("ros2msg", "cdr"):
+        raise LogError(
+            f"{topic.name} is described as {topic.schema_encoding or 'nothing'!r} and encoded as {topic.message_encoding!r}",
+            where=where,
+            expected="ros2msg and cdr",
+            fix="Record it with ROS 2's own MCAP plugin",
+        )
+    channel = next(c for c in log.structure.channels.values() if c.topic == topic.name)
+    with log.named(topic.name):
+        return ros2msg.parse(topic.schema_name, log.structure.schemas[channel.schema_id].data)
+
+
+def _paths(walk: ros2msg.Walk, long: bool = True) -> Iterator[str]:
+    for leaf in walk.leaves():
+        if re.search(r"(^|\.)\w*stamp\.(sec|nanosec)$", leaf.path):
+            continue
+        if leaf.length is None:
+            yield leaf.path
+        elif long or leaf.length <= LONGEST_ROW:
+            yield from (f"{leaf.path}[{k}]" for k in range(min(leaf.length, LONGEST_ROW)))
+
+
+def _listed(names: Collection[str]) -> str:
+    shown = list(names)[:LISTED]
+    return ", ".join(shown) + (f" and {len(names) - LISTED} more" if len(names) > LISTED else "") if shown else "no number"
+
+
+class _Place(NamedTuple):
+    offset: int
+    kind: str
+
+
+@dataclass(eq=False)
+class _Reader:
+    """Collects some fields of one topic; without `strict`, what a message lacks becomes NaN."""
+
+    log: Log
+    topic: Topic
+    paths: tuple[str, ...]
+    strict: bool = True
+    log_times: list[Int64[np.ndarray, " n"]] = field(default_factory=list)
+    stamps: list[Int64[np.ndarray, " n"]] = field(default_factory=list)  # of headers; zero without one
+    values: list[Float64[np.ndarray, "n k"]] = field(default_factory=list)
+    sequences: list[np.ndarray] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        self.definition = _definition(self.log, self.topic)
+
+    def take(self, rows: Rows) -> None:
+        """The next messages, all of one size."""
+        for part, places, order in self._runs(rows.payload):
+            cut = rows.where(part)
+            columns = np.full((len(cut.log_time), len(self.paths)), np.nan)
+            for k, path in enumerate(self.paths):
+                if path in places:
+                    columns[:, k] = _column(cut.payload, places[path], order)
+            self.log_times.append(cut.log_time)
+            self.stamps.append(_stamps(cut, places, order))
+            self.values.append(columns)
+            self.sequences.append(cut.sequence)
+
+    def _runs(self, payload: UInt8[np.ndarray, "n L"]) -> Iterator[tuple[slice, Mapping[str, _Place], str]]:
+        """Stretches of messages whose fields lie alike, found by one walk each."""
+        pending = [(0, len(payload))] if len(payload) else []
+        while pending:
+            first, last = pending.pop()
+            walk = ros2msg.Walk(payload[first].tobytes(), self.definition)
+            places = self._places(walk)
+            differ = np.zeros(last - first - 1, bool)
+            for at, raw in walk.constants:
+                column = payload[first:last, at : at + len(raw)]
+                if (column != column[0]).any():
+                    differ |= (column[1:] != column[:-1]).any(axis=1)
+            edges = [first, *(np.flatnonzero(differ) + first + 1).tolist(), last]
+            yield slice(first, edges[1]), places, walk.order
+            pending += reversed(list(pairwise(edges[1:])))
+
+    def _places(self, walk: ros2msg.Walk) -> dict[str, _Place]:
+        """Where the wanted fields lie, and the header's stamp (`sec`, `nanosec`); the walk ends at the last of them.
+
+        Raises:
+            LogError: there is no such number; the message lists those that there are.
+        """
+        asked: dict[str, list[tuple[str, int | None]]] = {}
+        for path in self.paths:
+            bare, index = _LAST.fullmatch(path).groups()  # type: ignore[union-attr]  # it matches any text
+            asked.setdefault(bare, []).append((path, None if index is None else int(index)))
+        found: dict[str, _Place] = {}
+        for leaf in walk.leaves():
+            if leaf.path in ("header.stamp.sec", "header.stamp.nanosec"):
+                found[f"stamp {leaf.path}"] = _Place(leaf.offset, leaf.kind)
+            for path, index in asked.get(leaf.path, ()):
+                inside = index is None if leaf.length is None else index is not None and index < leaf.length
+                if inside:
+                    found[path] = _Place(leaf.offset + int(leaf.kind[1]) * (index or 0), leaf.kind)
+            if all(path in found for path in self.paths):
+                break  # what comes behind need not lie alike
+        missing = [path for path in self.paths if path not in found]
+        if missing and self.strict:
+            raise self._none(missing[0], walk)
+        return found
+
+    def _none(self, path: str, walk: ros2msg.Walk) -> LogError:
+        there = list(_paths(ros2msg.Walk(walk.payload, self.definition)))
+        near = difflib.get_close_matches(path, there, n=1)
+        return LogError(
+            f"there is no number {path} in {self.topic.schema_name}",
+            expected=_listed(there),
+            fix=f"Did you mean {self.topic.name}.{near[0]}?" if near else "",
+        )
+
+    def t_ns(self) -> Int64[np.ndarray, " n"]:
+        """The headers' stamps; log times where there are no headers, or all of them say zero: nobody ever set those."""
+        stamp_ns = np.concatenate(self.stamps)
+        return stamp_ns if stamp_ns.any() else np.concatenate(self.log_times)
+
+    def whole(self, path: str) -> Fields:
+        """A field over the whole log.
+
+        Raises:
+            LogError: no messages, NaN or infinity, stamps that do not increase.
+        """
+        if not self.log_times:
+            raise LogError("there are no messages", expected="at least one")
+        t_ns, sequence = self.t_ns(), np.concatenate(self.sequences)
+        values = np.concatenate(self.values)[:, self.paths.index(path)]
+        finite = np.isfinite(values)
+        if not finite.all():
+            row = int(np.argmin(finite))
+            raise LogError(
+                f"message {row} (sequence {sequence[row]}) has {path} = {values[row]}",
+                expected="finite numbers",
+                fix="Choose another field, or cut the log before or after it",
+            )
+        Clock().check(t_ns, sequence)
+        return Fields(t_ns, values, self.topic.metadata.get(UNIT_KEY, ""))
+
+    def usable(self, path: str) -> Fields | None:
+        """A field over the whole log if it varies and can be a channel."""
+        if not self.log_times:
+            return None
+        t_ns, values = self.t_ns(), np.concatenate(self.values)[:, self.paths.index(path)]
+        if not np.isfinite(values).all() or (np.diff(t_ns) <= 0).any() or len(values) < 2 or np.ptp(values) == 0.0:
+            return None
+        return Fields(t_ns, values, self.topic.metadata.get(UNIT_KEY, ""))
+
+
+def _column(payload: UInt8[np.ndarray, "n L"], place: _Place, order: str) -> np.ndarray:
+    cut = np.ascontiguousarray(payload[:, place.offset : place.offset + int(place.kind[1])])
+    return cut.view(order + place.kind)[:, 0]
+
+
+def _stamps(rows: Rows, places: Mapping[str, _Place], order: str) -> Int64[np.ndarray, " n"]:
+    """Of the header, zeros where there is none."""
+    keys = ("stamp header.stamp.sec", "stamp header.stamp.nanosec")
+    if not all(key in places for key in keys):
+        return np.zeros(len(rows.log_time), np.int64)
+    sec, nanosec = (_column(rows.payload, places[key], order).astype(np.int64) for key in keys)
+    return np.asarray(sec * 1_000_000_000 + nanosec)

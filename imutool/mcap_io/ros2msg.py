@@ -1,0 +1,183 @@
+"""Where every number lies in a message of which only its `ros2msg` definition is known: one walk over its bytes.
+
+Grammar and alignment are those of ROS 2 (docs.ros.org, "About internal ROS 2 interfaces"; classic CDR: each primitive is
+aligned to its own size, counted from behind the 4-byte encapsulation). A log's definitions are taken for hostile: how deep they
+nest is bounded, and every count is checked against the bytes left, so that a walk costs no more than the message is long.
+"""
+
+from __future__ import annotations
+
+import re
+import struct
+from collections.abc import Iterator, Mapping
+from typing import NamedTuple
+
+from imutool.errors import LogError
+
+NUMBERS = {
+    **dict.fromkeys(("bool", "byte", "char", "uint8"), "u1"),
+    **{f"{kind}{bits}": f"{kind[0]}{bits // 8}" for kind in ("int", "uint") for bits in (8, 16, 32, 64)},
+    "float32": "f4",
+    "float64": "f8",
+}
+TEXT = "string"
+TIMES = ("builtin_interfaces/Time", "builtin_interfaces/Duration")
+DEEPEST = 24  # messages within messages; those of ROS are at most six deep
+MOST_TEXT = 1 << 20  # bytes of a definition
+MOST_COUNTED = 4096  # counts and texts before a number in one message
+
+_FIELD = re.compile(
+    r"(?P<type>[A-Za-z][\w/]*)(?:<=\d+)?(?P<array>\[(?P<bound><=)?(?P<count>\d*)\])?\s+(?P<name>[A-Za-z]\w*)(?P<rest>|\s.*|=.*)"
+)
+_SEPARATOR = re.compile(r"^=+\s*$", re.MULTILINE)
+
+
+class Field(NamedTuple):
+    """One line of a definition; `length` is None for a single value, 0 for a sequence of any length."""
+
+    name: str
+    kind: str
+    length: int | None
+
+
+class Leaf(NamedTuple):
+    """A number, or a row of `length` of them, in one message; `kind` is numpy's without byte order."""
+
+    path: str
+    offset: int
+    kind: str
+    length: int | None
+
+
+Definition = Mapping[str, tuple[Field, ...]]
+
+
+def parse(schema_name: str, text: bytes) -> Definition:
+    """The fields of a message and of all that it is made of, by `package/Name`.
+
+    Raises:
+        LogError: a line that is none of a definition, a message that is not defined, or one that contains itself.
+    """
+    if len(text) > MOST_TEXT:
+        raise LogError(f"the definition of {schema_name} has {len(text)} bytes", expected=f"at most {MOST_TEXT}")
+    root = _short(schema_name)
+    known: dict[str, tuple[Field, ...]] = {
+        TIMES[0]: (Field("sec", "int32", None), Field("nanosec", "uint32", None)),
+        TIMES[1]: (Field("sec", "int32", None), Field("nanosec", "uint32", None)),
+    }
+    for position, part in enumerate(_SEPARATOR.split(text.decode(errors="replace"))):
+        name, body = root, part
+        if position:
+            first, _, body = part.strip().partition("\n")
+            name = _short(first.removeprefix("MSG:").strip())
+        known[name] = tuple(_fields(name, body))
+    _check(root, known, {}, 0)
+    return {"": (Field("", root, None),), **known}
+
+
+def _short(name: str) -> str:
+    """`package/Name`, however it is spelt."""
+    return name.replace("/msg/", "/")
+
+
+def _fields(of: str, body: str) -> Iterator[Field]:
+    for line in body.splitlines():
+        bare = line.partition("#")[0].strip()
+        if not bare:
+            continue
+        found = _FIELD.fullmatch(bare)
+        if found is None:
+            raise LogError(f"the definition of {of} has the line {bare[:80]!r}", expected="TYPE name")
+        if found["rest"].lstrip().startswith("="):
+            continue  # a constant is in no message
+        kind = found["type"]
+        if kind not in NUMBERS and kind not in (TEXT, "wstring"):
+            kind = _short(kind) if "/" in kind else "std_msgs/Header" if kind == "Header" else f"{of.partition('/')[0]}/{kind}"
+        count = None if found["array"] is None else 0 if found["bound"] else int((found["count"] or "0")[:12])
+        yield Field(found["name"], kind, count)
+
+
+def _check(name: str, known: Definition, sound: dict[str, int], depth: int) -> int:
+    """How deep a message nests; each is looked at once.
+
+    Raises:
+        LogError: one is not defined, or they nest too deep (which one that contains itself does).
+    """
+    if depth > DEEPEST:
+        raise LogError(f"{name} nests more than {DEEPEST} messages deep", expected="a definition that ends")
+    if name not in known:
+        raise LogError(f"{name} is not defined in the log's schema", expected="every message that it is made of")
+    if name not in sound:
+        inner = [f.kind for f in known[name] if f.kind not in NUMBERS and f.kind not in (TEXT, "wstring")]
+        sound[name] = 1 + max((_check(kind, known, sound, depth + 1) for kind in dict.fromkeys(inner)), default=0)
+    if depth + sound[name] > DEEPEST + 1:
+        raise LogError(f"{name} nests more than {DEEPEST} messages deep", expected="a definition that ends")
+    return sound[name]
+
+
+class Walk:
+    """One message, gone through in order; `constants` are the bytes that another one must share to lie the same way.
+
+    Raises:
+        LogError: not plain CDR, or the message ends before its fields do.
+    """
+
+    def __init__(self, payload: bytes, definition: Definition) -> None:
+        if payload[:2] not in (b"\0\0", b"\0\1") or len(payload) < 4:
+            raise LogError(f"payload starts with {payload[:4].hex(' ')}", expected="plain CDR: 00 00 or 00 01")
+        self.payload, self.definition, self.position = payload, definition, 4
+        self.order = "<" if payload[1] else ">"
+        self.constants = [(0, payload[:2])]
+
+    def leaves(self) -> Iterator[Leaf]:
+        """Every number of the message, rows of numbers as one."""
+        yield from self._message(self.definition[""][0].kind, "")
+
+    def _message(self, kind: str, path: str) -> Iterator[Leaf]:
+        fields = self.definition[kind]
+        if not fields:
+            self._skip(1)  # what is empty is written as one byte
+        for field in fields:
+            yield from self._field(field, f"{path}.{field.name}" if path else field.name)
+
+    def _field(self, field: Field, path: str) -> Iterator[Leaf]:
+        count = field.length
+        if count == 0:
+            count = self._word()
+        if field.kind in NUMBERS:
+            kind = NUMBERS[field.kind]
+            if count is None or count:
+                self._align(int(kind[1]))
+            at = self._skip(int(kind[1]) * (1 if count is None else count))
+            yield Leaf(path, at, kind, count)
+        elif field.kind == TEXT:
+            for _ in range(self._bounded(1 if count is None else count)):
+                self._skip(self._word())
+        elif field.kind == "wstring":
+            raise LogError(f"{path} is a wide string, whose size ROS 2 leaves open", fix="Choose a field before it")
+        else:
+            for k in range(self._bounded(1 if count is None else count)):
+                yield from self._message(field.kind, path if count is None else f"{path}[{k}]")
+
+    def _bounded(self, count: int) -> int:
+        if count > len(self.payload) - self.position:
+            raise LogError(f"a count of {count} with {len(self.payload) - self.position} bytes left in the message")
+        return count
+
+    def _align(self, size: int) -> None:
+        self.position += -(self.position - 4) % size
+
+    def _skip(self, size: int) -> int:
+        at, self.position = self.position, self.position + size
+        if self.position > len(self.payload):
+            raise LogError(f"payload of {len(self.payload)} bytes ends before byte {self.position}")
+        return at
+
+    def _word(self) -> int:
+        self._align(4)
+        at = self._skip(4)
+        raw = self.payload[at : at + 4]
+        self.constants.append((at, raw))
+        if len(self.constants) > MOST_COUNTED:
+            raise LogError(f"more than {MOST_COUNTED} texts and counts in one message", fix="Choose a field before them")
+        return int(struct.unpack(self.order + "I", raw)[0])
