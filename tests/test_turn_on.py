@@ -212,7 +212,7 @@ def test_after_the_truth_the_rest_bias_is_followed_from_what_it_showed() -> None
     held = int(after.hold_s * RATE_HZ)
     np.testing.assert_array_equal(bias[:held], np.tile(after.rest, (held, 1)))
     assert held == int(4 * RATE_HZ)
-    np.testing.assert_allclose(bias[int(15 * RATE_HZ), :3], GYRO_BIAS + [2e-3, 0.0, 0.0], atol=5e-4)
+    np.testing.assert_allclose(bias[int(15 * RATE_HZ), :3], GYRO_BIAS + np.array([2e-3, 0.0, 0.0]), atol=5e-4)
 
 
 def test_a_shorter_truth_can_be_asked_for(biased: Recording) -> None:
@@ -290,7 +290,8 @@ def test_auto_is_the_stop_the_log_begins_with_and_says_how_sure() -> None:
     np.testing.assert_allclose(start.rest[:3], GYRO_BIAS, atol=5e-4)
     assert start.how == "4.0 s at rest from 0.0 s on, prior of 6 runs, ±0.0002 rad/s, then gravity in motion and every stop"
     assert (start.hold_s, start.follows, start.track) == (pytest.approx(4.0, abs=0.01), start.follows, None)
-    assert start.follows is not None and (start.follows.std[:3] == 0.05).all(), "from what was known before that stop"
+    assert start.follows is not None
+    assert (start.follows.std[:3] == 0.05).all(), "from what was known before that stop"
     np.testing.assert_allclose(start.noise[:3], NOISE[:3], rtol=0.3)
 
 

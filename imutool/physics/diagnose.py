@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float64
+from scipy.ndimage import uniform_filter1d
 
 from imutool.errors import ConfigError, DataError
 from imutool.mcap_io.fields import others, read_field
@@ -33,6 +34,7 @@ from imutool.recording import Recording
 KNOWN_BAND = 0.45  # of where smoothing halves a motion: there it takes a per cent
 ORDER_SIM, ORDER_TRUTH = 6, 12  # of the autoregression: a sensor's noise is nearly white, that of differentiated poses is not
 RIDGE = 1e-8
+SLOW = 9  # samples of a running mean
 SHOWN_BY_SAMPLES = {"saturation", "quantization"}  # without any fit: `stamps`
 SHOWN_KNOTS = 41  # of a curve without a name, as it is told
 WHITE = 1.15  # what is left over the noise, as a ratio, that still counts as noise
@@ -71,7 +73,7 @@ def diagnose(
     found = discover(logs, () if moments[0] else candidates, () if moments[0] else later(pairs))
     say(3, 4, "locating")
     told = _told(logs, found, [str(real) for real in reals], None if sim is None else str(sim))
-    told = replace(told, findings=(*moments[0], *told.findings), located=(*moments[1], *told.located))
+    told = replace(told, findings=(*moments[0], *told.findings), located=tuple(moments[1]) or told.located)
     for signal in signals:
         assert sim is not None
         say(3, 4, signal)
@@ -180,14 +182,19 @@ def _told(logs: Sequence[Weighed], found: Discovery, reals: Sequence[str], sim: 
         for pair, b, a in zip(pairs[:1], before, after, strict=False)
         for place in located(pair.stamp_s, a - b, floor, _variables(pair), p_values)
     ]
+    unexplained = _unexplained(pairs, after, floor)
+    if not findings:  # nothing has been found; where something is left all the same, it is said where
+        odd = {name for name, one in unexplained.items() if not one.white}
+        here = located(pairs[0].stamp_s, _slow(pairs[0].real - after[0]), floor / np.sqrt(SLOW), _variables(pairs[0]), {})
+        places = [place for place in here if place.signal in odd]
     return Diagnosis(
         real=tuple(reals),
         sim=sim,
-        located=tuple(places) if findings else (),
+        located=tuple(places),
         findings=tuple(findings),
         bias=found.whole.bias,
         not_identifiable=tuple(dict.fromkeys(name for one in found.judged for name in one.unidentified)),
-        unexplained=_unexplained(pairs, after, floor),
+        unexplained=unexplained,
         remarks=tuple(_remarks(pairs)),
         closer={signal: _held_out(pairs, before, after, k, UNITS[signal]) for k, signal in enumerate(("gyro", "accel"))},
         traces=tuple(
@@ -195,6 +202,11 @@ def _told(logs: Sequence[Weighed], found: Discovery, reals: Sequence[str], sim: 
             for pair, b, a in zip(pairs, before, after, strict=True)
         ),
     )
+
+
+def _slow(left: Float64[np.ndarray, "n 6"]) -> Float64[np.ndarray, "n 6"]:
+    """A running mean: what is left without most of its noise."""
+    return np.asarray(uniform_filter1d(left, SLOW, axis=0))
 
 
 def _with(pair: Pair, found: Discovery, chosen: Chosen) -> Float64[np.ndarray, "n 6"]:

@@ -250,7 +250,7 @@ def _shift(real: Imu, sim: Imu, where: str) -> float:
         DataError: not of one motion.
     """
     overlap = (min(real.t_ns[-1], sim.t_ns[-1]) - max(real.t_ns[0], sim.t_ns[0])) * 1e-9
-    shared = overlap > LEAST_S and overlap > 0.5 * min(real.duration_s, sim.duration_s)
+    shared = overlap > min(LEAST_S, 0.5 * min(real.duration_s, sim.duration_s))
     lag_s, alike = _lag(real, sim)
     if shared and abs(lag_s) < FARTHEST_S:
         return 0.0
@@ -274,7 +274,12 @@ def _lag(real: Imu, sim: Imu) -> tuple[float, float]:
         for grid, imu, first, row in zip(grids, (real, sim), start, rows, strict=True)
     )
     a, b = a - a.mean(), b - b.mean()
-    both = correlate(b, a, mode="full") / max(float(np.linalg.norm(a) * np.linalg.norm(b)), 1e-12)
-    lags = correlation_lags(len(b), len(a)) / ALIGN_HZ
+    lags = correlation_lags(len(b), len(a))
+    # b[i + lag] beside a[i]: only what both cover counts, or a short piece would be unlike the whole it comes from
+    first, last = np.maximum(0, -lags), np.minimum(len(a), len(b) - lags)
+    energy_a, energy_b = (np.concatenate([[0.0], np.cumsum(x * x)]) for x in (a, b))
+    shared = np.sqrt((energy_a[last] - energy_a[first]) * (energy_b[last + lags] - energy_b[first + lags]))
+    enough = last - first >= min(LEAST_S * ALIGN_HZ, 0.8 * min(len(a), len(b)))
+    both = np.where(enough, correlate(b, a, mode="full") / np.maximum(shared, 1e-12), -1.0)
     best = int(np.argmax(both))
-    return (start[1] - start[0]) * 1e-9 + float(lags[best]), float(both[best])
+    return (start[1] - start[0]) * 1e-9 + float(lags[best]) / ALIGN_HZ, float(both[best])

@@ -14,7 +14,9 @@ from imutool.physics.effects._forward import Number, Physics, Stage, Theta
 from imutool.physics.pair import Pair
 from imutool.physics.readings import Felt, Read
 
-LAG, MEDIAN = 10, 15  # samples
+MEDIAN, FEW = 15, 500  # samples: of a running median, and to find a period by first
+PERIOD_SPAN, PERIODS = 0.02, 201  # periods tried about the median step
+CLEAR = 0.25  # of a period
 LEAST_MISSING, LEAST_AT_LIMIT = 3, 4
 NEARLY, EXACT = 0.995, 1e-3
 SHARES = (0.999, 0.99, 0.97, 0.9, 0.8)  # of the largest reading, where a soft limit is looked for
@@ -26,29 +28,44 @@ ON_GRID = 0.98  # of the samples
 def even(stamp_s: Float64[np.ndarray, " n"]) -> tuple[Float64[np.ndarray, " n"], int]:
     """Stamps of an even clock through some stamps, and how many samples it misses.
 
-    A sample that is missing shifts all later ones by a period, which a running median of the departure from an even clock shows
-    though each stamp jitters.
+    The period is the one in which the stamps agree best, which samples that are missing do not change; a running median of what
+    each stamp counts, less its number, says which samples those are though every stamp jitters.
     """
     k = np.arange(len(stamp_s), dtype=np.float64)
-    period = float(np.median(stamp_s[LAG:] - stamp_s[:-LAG])) / LAG
-    missing = np.zeros(len(stamp_s))
-    for _ in range(4):
-        slope, start = np.polyfit(k + missing, stamp_s, 1)
-        period = slope if missing.any() or abs(slope / period - 1.0) < 0.1 / len(k) else period
-        level = median_filter((stamp_s - start) / period - k, MEDIAN, mode="nearest")
-        missing = np.maximum.accumulate(np.rint(level - level[0]))
+    since = stamp_s - stamp_s[0]
+    period, phase = _period(since)
+    counted = np.rint((since - phase) / period) - k
+    steady = median_filter(counted, MEDIAN, mode="nearest")
+    clear = np.abs((since - phase) / period - k - counted) < CLEAR  # a stamp well within its own period is taken at its word
+    missing = np.where(clear, counted, steady)
+    missing = np.where(np.abs(missing - steady) > 0.5, steady, missing) if not clear.all() else counted
     slope, start = np.polyfit(k + missing, stamp_s, 1)
     return start + slope * (k + missing), int(missing[-1] - missing[0])
 
 
+def _period(since_s: Float64[np.ndarray, " n"]) -> tuple[float, float]:
+    """The period near the median step in which the stamps agree best (s), and where they lie in it."""
+    best = float(np.median(np.diff(since_s)))
+    span = PERIOD_SPAN
+    for count in (FEW, len(since_s)):
+        some = since_s[:count]
+        tried = best * (1.0 + np.linspace(-span, span, PERIODS))
+        agree = np.array([abs(np.exp(2j * np.pi * some / one).sum()) for one in tried])
+        best, span = float(tried[int(np.argmax(agree))]), 4.0 * span / PERIODS
+    phase = float(np.angle(np.exp(2j * np.pi * since_s / best).sum())) / (2.0 * np.pi) * best
+    return best, phase
+
+
 def jitter(pairs: Sequence[Pair]) -> tuple[Physics, ...]:
     """Samples taken evenly whose stamps are not: a share of one is all of it. None where the stamps are even."""
-    off = [pair.stamp_s - even(pair.stamp_s)[0] for pair in pairs]
-    if min(float(x.std()) for x in off) < LEAST_JITTER_S:
+    late = [(pair.stamp_s, even(pair.stamp_s)[0] - pair.stamp_s) for pair in pairs]
+    if min(float(x.std()) for _, x in late) < LEAST_JITTER_S:
         return ()
 
     def forward(taken_s: Float64[np.ndarray, " n"], theta: Theta) -> Float64[np.ndarray, " n"]:
-        return np.asarray(taken_s + theta[0] * (even(taken_s)[0] - taken_s))
+        alike = (one for one in late if len(one[0]) == len(taken_s))
+        _, correction = min(alike, key=lambda one: abs(float(one[0][0] - taken_s[0])))
+        return np.asarray(taken_s + theta[0] * correction)
 
     share = (Number("share", "-", 1.0),)
     return (

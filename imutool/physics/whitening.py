@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float64
 from scipy.ndimage import median_filter
-from scipy.signal import firwin, lfilter, oaconvolve, welch
+from scipy.signal import firwin, lfilter, periodogram, upfirdn
 
 MAD_TO_STD = 1.4826
 LEAST_STD = 1e-12
@@ -39,8 +39,12 @@ class Band:
         """The slow part of some columns."""
         if not x.size:
             return np.zeros((len(x[:: self.every]), *x.shape[1:]))
-        taps = self.taps.reshape(-1, *[1] * (x.ndim - 1))
-        return np.asarray(oaconvolve(x, taps, mode="same", axes=0)[:: self.every])
+        half, count = len(self.taps) // 2, len(range(0, len(x), self.every))
+        pad = -half % self.every  # so that a row that is kept falls on the filter's middle
+        padded = np.concatenate([np.zeros((pad, *x.shape[1:])), x, np.zeros((half, *x.shape[1:]))])
+        first = (half + pad) // self.every
+        slow = upfirdn(self.taps, padded, down=self.every, axis=0)
+        return np.asarray(slow[first : first + count])
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,10 +103,8 @@ def level(residual: Float64[np.ndarray, "n 6"], usable: Bool[np.ndarray, " n"], 
 
     filters, std = np.zeros((6, order + 1)), np.ones(6)
     for axis in range(6):
-        f_hz, power = welch(
-            np.where(usable, residual[:, axis], 0.0), rate_hz, nperseg=min(SEGMENT, len(residual)), average="median"
-        )
-        power = median_filter(power, LINES, mode="nearest") / max(float(usable.mean()), 1e-3)  # a line is no noise
+        f_hz, power = spectrum(residual[:, axis], usable, rate_hz)
+        power = median_filter(power, LINES, mode="nearest")  # a line is no noise
         low, high = min(MOTION_HZ, 0.3 * rate_hz), min(REFERENCE_HZ, 0.45 * rate_hz)
         power[f_hz < low] = np.median(power[(f_hz >= low) & (f_hz <= high)])
         covariance = np.fft.irfft(power * rate_hz / 2.0)[: order + 1] + np.concatenate([[LEAST_STD**2], np.zeros(order)])
@@ -110,6 +112,24 @@ def level(residual: Float64[np.ndarray, "n 6"], usable: Bool[np.ndarray, " n"], 
         filters[axis] = np.concatenate([[1.0], a])
         std[axis] = np.sqrt(max(float(covariance[0] + a @ covariance[1:]), LEAST_STD**2))
     return Whitener(filters, std)
+
+
+def spectrum(
+    x: Float64[np.ndarray, " n"], usable: Bool[np.ndarray, " n"], rate_hz: float
+) -> tuple[Float64[np.ndarray, " f"], Float64[np.ndarray, " f"]]:
+    """Frequencies and power density, the median (Welch) over segments that count wholly, or mostly where none does."""
+    size = min(SEGMENT, len(x))
+    starts = range(0, len(x) - size + 1, max(1, size // 2))
+    whole = np.array([float(usable[s : s + size].mean()) for s in starts])
+    taken = [s for s, share in zip(starts, whole, strict=True) if share >= min(1.0, float(whole.max()))]
+    f_hz, each = periodogram(np.stack([x[s : s + size] for s in taken]), rate_hz, "hann", detrend="constant")
+    return f_hz, np.asarray(np.median(each, axis=0) / median_bias(len(taken)))
+
+
+def median_bias(count: int) -> float:
+    """The median of so many exponential variables of mean one (Allen et al., FINDCHIRP, appendix B; an odd count)."""
+    odd = count - (count + 1) % 2
+    return float(sum((-1.0) ** (k + 1) / k for k in range(1, max(odd, 1) + 1)))
 
 
 def settled(usable: Bool[np.ndarray, " n"], order: int) -> Bool[np.ndarray, " n"]:
