@@ -16,7 +16,7 @@ from imutool.physics.readings import Felt, Read
 
 MEDIAN, FEW = 15, 500  # samples: of a running median, and to find a period by first
 PERIOD_SPAN, PERIODS = 0.02, 201  # periods tried about the median step
-CLEAR = 0.25  # of a period
+CLEAR, AGREE, LAG = 0.25, 0.3, 10  # of a period; of stamps that all agree; samples
 LEAST_MISSING, LEAST_AT_LIMIT = 3, 4
 NEARLY, EXACT = 0.995, 1e-3
 SHARES = (0.999, 0.99, 0.97, 0.9, 0.8)  # of the largest reading, where a soft limit is looked for
@@ -33,7 +33,9 @@ def even(stamp_s: Float64[np.ndarray, " n"]) -> tuple[Float64[np.ndarray, " n"],
     """
     k = np.arange(len(stamp_s), dtype=np.float64)
     since = stamp_s - stamp_s[0]
-    period, phase = _period(since)
+    period, phase, agree = _period(since)
+    if agree < AGREE:
+        return _by_level(stamp_s, k)
     counted = np.rint((since - phase) / period) - k
     steady = median_filter(counted, MEDIAN, mode="nearest")
     clear = np.abs((since - phase) / period - k - counted) < CLEAR  # a stamp well within its own period is taken at its word
@@ -43,8 +45,21 @@ def even(stamp_s: Float64[np.ndarray, " n"]) -> tuple[Float64[np.ndarray, " n"],
     return start + slope * (k + missing), int(missing[-1] - missing[0])
 
 
-def _period(since_s: Float64[np.ndarray, " n"]) -> tuple[float, float]:
-    """The period near the median step in which the stamps agree best (s), and where they lie in it."""
+def _by_level(stamp_s: Float64[np.ndarray, " n"], k: Float64[np.ndarray, " n"]) -> tuple[Float64[np.ndarray, " n"], int]:
+    """For stamps that jitter by much of a period: a missing sample lifts the level of all later ones."""
+    period = float(np.median(stamp_s[LAG:] - stamp_s[:-LAG])) / LAG
+    missing = np.zeros(len(stamp_s))
+    for _ in range(4):
+        slope, start = np.polyfit(k + missing, stamp_s, 1)
+        period = slope if missing.any() or abs(slope / period - 1.0) < 0.1 / len(k) else period
+        level = median_filter((stamp_s - start) / period - k, MEDIAN, mode="nearest")
+        missing = np.maximum.accumulate(np.rint(level - level[0]))
+    slope, start = np.polyfit(k + missing, stamp_s, 1)
+    return start + slope * (k + missing), int(missing[-1] - missing[0])
+
+
+def _period(since_s: Float64[np.ndarray, " n"]) -> tuple[float, float, float]:
+    """The period near the median step in which the stamps agree best (s), where they lie in it, and how well they agree."""
     best = float(np.median(np.diff(since_s)))
     span = PERIOD_SPAN
     for count in (FEW, len(since_s)):
@@ -52,8 +67,8 @@ def _period(since_s: Float64[np.ndarray, " n"]) -> tuple[float, float]:
         tried = best * (1.0 + np.linspace(-span, span, PERIODS))
         agree = np.array([abs(np.exp(2j * np.pi * some / one).sum()) for one in tried])
         best, span = float(tried[int(np.argmax(agree))]), 4.0 * span / PERIODS
-    phase = float(np.angle(np.exp(2j * np.pi * since_s / best).sum())) / (2.0 * np.pi) * best
-    return best, phase
+    mean = np.exp(2j * np.pi * since_s / best).mean()
+    return best, float(np.angle(mean)) / (2.0 * np.pi) * best, float(abs(mean))
 
 
 def jitter(pairs: Sequence[Pair]) -> tuple[Physics, ...]:
