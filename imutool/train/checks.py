@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import torch
 
 from imutool import so3
-from imutool.errors import DataError
+from imutool.errors import ConfigError, DataError
 from imutool.recording import Recording
 from imutool.train.segments import Pool
 from imutool.windows import rotation_residual
@@ -16,6 +16,18 @@ LEAST_S = 10.0  # of truth without gaps, in all logs together
 LEAST_TURN_RAD_S = 0.02  # of the rate about its own mean: less is a sensor on a table
 WINDOW_S = 1.0
 WORST_MISS = 0.5  # of a log's largest turns; a scale error of a tenth misses by a tenth
+
+
+def refuse_device(device: str) -> None:
+    """Refuses a device that is not there.
+
+    Raises:
+        ConfigError: neither cpu nor cuda, or cuda where there is none.
+    """
+    if device.partition(":")[0] not in ("cpu", "cuda"):
+        raise ConfigError(f"{device!r} is no device", where="--device", expected="cpu or cuda")
+    if device.startswith("cuda") and not torch.cuda.is_available():
+        raise ConfigError("no CUDA device here", where="--device", fix="Use --device cpu")
 
 
 def refuse(recordings: Sequence[Recording], pool: Pool) -> None:

@@ -23,9 +23,10 @@ from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 from imutool import registry
 from imutool.bias._base import COLUMNS, SENSORS, BiasModel, Sensor
 from imutool.config import build
-from imutool.errors import ConfigError, DataError, NumericsError
+from imutool.errors import DataError, NumericsError
 from imutool.recording import Recording
 from imutool.train import closed_form, statistics
+from imutool.train.checks import refuse_device
 from imutool.train.corrected import corrected, up_to
 from imutool.train.increments import Increments
 from imutool.train.loss import error
@@ -85,8 +86,7 @@ class Training:
         self, recordings: Sequence[Recording], method: str, settings: TrainSettings | None = None, device: str = "cpu"
     ) -> None:
         self.settings = settings_for(method, settings)
-        if device.startswith("cuda") and not torch.cuda.is_available():
-            raise ConfigError("no CUDA device here", where="--device", fix="Use --device cpu")
+        refuse_device(device)
         module = registry.load("imutool.bias", method)
         self.pool = Pool.of(recordings, device=device)
         torch.manual_seed(self.settings.seed)

@@ -64,6 +64,7 @@ def train(
         raise ConfigError(said, where=kept, fix="Give --resume to go on, or --overwrite to start afresh")
     if method == static.Model.method:
         raise ConfigError("static is not trained", where="--method", fix="Choose hybrid, neural_ode, conv or linear")
+    checks.refuse_device(device)
     chosen = settings_for(method, settings)
     if resume and not registry.load("imutool.bias", method).Model.iterative:
         raise ConfigError(f"{method} has no steps to go on with", where="--resume", fix="Train it without --resume")

@@ -147,6 +147,14 @@ def test_ctrl_c_before_anything_is_done_leaves_nothing(logs: list[Path], tmp_pat
     assert names(tmp_path) == []
 
 
+@pytest.mark.parametrize("method", ["linear", "hybrid"])
+def test_a_device_that_is_not_there_is_refused_before_any_log_is_read(method: str, tmp_path: Path) -> None:
+    devices = ["tpu"] if torch.cuda.is_available() else ["tpu", "cuda"]
+    for device in devices:
+        with pytest.raises(ConfigError, match="--device"):
+            train([tmp_path / "absent.mcap"], tmp_path / "m.safetensors", method=method, device=device)
+
+
 def test_to_resume_what_was_never_begun_is_refused(logs: list[Path], tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=r"m.safetensors.checkpoint: there is no checkpoint.*without --resume"):
         train(logs, tmp_path / "m.safetensors", method="neural_ode", settings=TINY, resume=True)
