@@ -245,7 +245,10 @@ def test_what_needs_the_attitude_says_so(name: str) -> None:
 
 def test_a_line_has_its_frequency_and_amplitudes() -> None:
     felt = still(10.0)
-    out = act("vibration", felt, 7.0, 0.3, 0.0, 0.0, 0.4, 0.3, 0.4).accel - felt.accel
+    shaken = act("vibration", felt, 7.0, 0.3, 0.0, 0.0, 0.4, 0.3, 0.4, 0.02, 0.0, 0.0, 0.0, 0.0, 0.03)
+    turning = 2.0 * np.abs(np.fft.rfft(shaken.gyro - felt.gyro, axis=0)) / len(felt.t_s)
+    close(turning[70], np.array([0.02, 0.0, 0.03]))
+    out = shaken.accel - felt.accel
     spectrum = 2.0 * np.abs(np.fft.rfft(out, axis=0)) / len(out)
     assert np.argmax(spectrum, axis=0).tolist() == [70, 70, 70]  # of 0.1 Hz each
     close(spectrum[70], np.array([0.3, 0.4, 0.5]))
@@ -254,13 +257,14 @@ def test_a_line_has_its_frequency_and_amplitudes() -> None:
 
 def test_a_line_is_found_to_a_fiftieth_of_a_turn() -> None:
     felt, one = lively(60.0), only("vibration")
-    theta = np.array([31.4159, 0.3, 0.1, 0.0, 0.2, -0.1, 0.0])
-    noise = 0.05 * np.random.default_rng(2).normal(size=felt.accel.shape)
+    theta = np.array([31.4159, 0.3, 0.1, 0.0, 0.2, -0.1, 0.0, 0.03, 0.0, 0.0, -0.01, 0.0, 0.0])
+    noise = 0.05 * np.random.default_rng(2).normal(size=(2, *felt.accel.shape))
     real = read(felt, felt.t_s, [(one, theta)])
     assert one.starts is not None
-    start = one.starts(felt, real.but(accel=real.accel + noise + 0.1))[0]
+    start = one.starts(felt, real.but(gyro=real.gyro + 0.1 * noise[0], accel=real.accel + noise[1] + 0.1))[0]
     assert abs(start[0] - theta[0]) * felt.t_s[-1] < 0.02
-    np.testing.assert_allclose(start[1:], theta[1:], atol=0.03)
+    np.testing.assert_allclose(start[1:7], theta[1:7], atol=0.03)
+    np.testing.assert_allclose(start[7:], theta[7:], atol=0.003)
 
 
 # mount and bandwidth

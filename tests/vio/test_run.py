@@ -151,7 +151,7 @@ def test_the_command_writes_json_and_a_table(code: Callable[..., int], capsys: p
 
 
 def test_the_commands_defaults_are_the_settings() -> None:
-    given = {name: one.default for name, one in inspect.signature(cli.vio).parameters.items()}
+    given = {name: one.default for name, one in inspect.signature(cli.vio.vio).parameters.items()}
     settings = VioSettings()
     assert given["lag"] == settings.smoother.lag_s
     assert given["keyframes"] == settings.keyframes_hz
