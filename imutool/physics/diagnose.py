@@ -169,19 +169,15 @@ def _told(logs: Sequence[Weighed], found: Discovery, reals: Sequence[str], sim: 
     """Findings with what they bring, where the misfit lies, and what is left."""
     pairs = [log.pair for log in logs]
     floor = _floor(logs)
-    before = [_with(pair, found, ()) for pair in pairs]
-    after = [_with(pair, found, found.fitted.chosen) for pair in pairs]  # held-out time stays unseen
+    before = [_with(pair, ()) for pair in pairs]
+    after = [_with(pair, found.fitted.chosen) for pair in pairs]  # held-out time stays unseen
     findings = [one for one in (_finding(logs, found, one, floor) for one in found.judged) if one.share > 0.0]
     findings += stamps.saturated(pairs, after, found.tried) + stamps.dropped(pairs) + stamps.rounded(pairs, floor)
     p_values = {
-        signal: min((one.p_value for one in found.judged if signal in _signals(one.physics)), default=1.0)
+        signal: min((one.p_value for one in found.judged if signal in one.physics.sensors), default=1.0)
         for signal in ("gyro", "accel")
     }
-    places = [
-        place
-        for pair, b, a in zip(pairs[:1], before, after, strict=False)
-        for place in located(pair.stamp_s, a - b, floor, _variables(pair), p_values)
-    ]
+    places = located(pairs[0].stamp_s, after[0] - before[0], floor, _variables(pairs[0]), p_values)
     unexplained = _unexplained(pairs, after, floor)
     if not findings:  # nothing has been found; where something is left all the same, it is said where
         odd = {name for name, one in unexplained.items() if not one.white}
@@ -209,7 +205,7 @@ def _slow(left: Float64[np.ndarray, "n 6"]) -> Float64[np.ndarray, "n 6"]:
     return np.asarray(uniform_filter1d(left, SLOW, axis=0))
 
 
-def _with(pair: Pair, found: Discovery, chosen: Chosen) -> Float64[np.ndarray, "n 6"]:
+def _with(pair: Pair, chosen: Chosen) -> Float64[np.ndarray, "n 6"]:
     """What is expected, with the constant that suits it best."""
     there = expected(pair, chosen)
     usable = pair.fitted | pair.held_out
@@ -223,10 +219,6 @@ def _floor(logs: Sequence[Weighed]) -> Float64[np.ndarray, "6"]:
         response = np.array([np.abs(np.fft.rfft(a, 512)) ** 2 for a in log.whiten.filters])
         variances.append(log.whiten.std**2 * (1.0 / response).mean(axis=1))
     return np.asarray(np.sqrt(np.mean(variances, axis=0)))
-
-
-def _signals(physics: Physics) -> tuple[str, ...]:
-    return tuple(physics.sensors)
 
 
 def _variables(pair: Pair) -> dict[str, tuple[str, Float64[np.ndarray, " n"]]]:
@@ -274,9 +266,9 @@ def _finding(logs: Sequence[Weighed], found: Discovery, one: Judged, floor: Floa
     names = [physics.name for physics, _ in fitted.chosen]
     k = names.index(one.physics.name)
     without: Chosen = (*fitted.chosen[:k], *fitted.chosen[k + 1 :])
-    with_ = [_with(pair, found, fitted.chosen) for pair in pairs]
-    alone = [_with(pair, found, without) for pair in pairs]
-    nothing = [_with(pair, found, ()) for pair in pairs]
+    with_ = [_with(pair, fitted.chosen) for pair in pairs]
+    alone = [_with(pair, without) for pair in pairs]
+    nothing = [_with(pair, ()) for pair in pairs]
     shares = []
     for j, signal in enumerate(("gyro", "accel")):
         if signal in one.physics.sensors:
@@ -299,7 +291,6 @@ def _finding(logs: Sequence[Weighed], found: Discovery, one: Judged, floor: Floa
         equation=one.physics.equation,
         held_out=held,
         driver=rest.rpartition(":")[0] if name == "driven" else "",
-        similar=one.similar,
         curve=_curve(logs[0].pair, one, found.whole),
     )
 

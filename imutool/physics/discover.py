@@ -37,15 +37,14 @@ MOST_NAMELESS, NAMELESS_SHARE = 2, 0.03  # effects without a name, and how much 
 IN_BAND = 0.8
 EXCHANGED = 3  # effects among which each is asked whether another would do better
 IMPLAUSIBLE = 4.0  # times the plausible size
-ALIKE = 4.0  # natural logarithms of chance within which two effects cannot be told apart
 
 
 @dataclass(frozen=True, eq=False)
 class Judged:
     """An effect that was found, with what it costs to leave it out.
 
-    `p_value` is by chi-square over all rows, `gains` the squares that each unseen block loses by it, `similar` what would serve
-    as well in its place.
+    `p_value` is by chi-square over all rows, `gain` the squares that leaving it out adds there, `unidentified` what of it no
+    motion showed.
     """
 
     physics: Physics
@@ -55,7 +54,6 @@ class Judged:
     p_value: float
     false_discovery_rate: float
     gain: float
-    similar: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,7 +64,6 @@ class Discovery:
     fitted: Fit
     whole: Fit
     tried: int
-    remarks: tuple[str, ...] = field(default=())
 
 
 def discover(logs: Sequence[Weighed], candidates: Sequence[Physics], later: Sequence[Sequence[Physics]] = ()) -> Discovery:

@@ -9,7 +9,7 @@ import pytest
 
 from imutool import registry
 from imutool.errors import ConfigError
-from imutool.physics.effects import gyro_bias_drift, rate_curve
+from imutool.physics.effects import _warming, rate_curve
 from imutool.physics.effects._base import Effect, Sensor, compiled, patterns
 from imutool.physics.effects._catalogue import known, named
 from imutool.physics.effects.rate_curve import KNOTS_RAD_S, NONZERO, hats
@@ -239,7 +239,7 @@ def test_a_clock_offset_moves_the_samples_in_time() -> None:
 
 def test_warm_up_starts_at_zero_and_ends_at_the_amplitude() -> None:
     (effect,) = named("gyro", ["gyro_bias_drift"])
-    tau = gyro_bias_drift.TAU_S
+    tau = _warming.TAU_S
     at = Signals(np.array([0.0, tau, 100 * tau]), np.zeros((3, COUNT)))
     amplitude = np.array([1e-3, -2e-3, 3e-3])
     error = effect.compiled(amplitude)(at)
