@@ -23,9 +23,9 @@ from imutool.certainty import Certainty
 from imutool.config import plain
 from imutool.errors import ConfigError, DataError, LogError, ModelError
 from imutool.mcap_io import schema
-from imutool.mcap_io.log import ImuBatch, Log
+from imutool.mcap_io.log import Clock, ImuBatch, Log
 from imutool.mcap_io.read import read
-from imutool.mcap_io.rewrite import NewTopic, RewriteReport, rewrite, sha256
+from imutool.mcap_io.rewrite import Made, NewTopic, RewriteReport, rewrite, sha256
 from imutool.recording import Imu, Recording, nanoseconds, seconds
 from imutool.rest_track import Samples
 from imutool.stationary import white_noise
@@ -103,34 +103,41 @@ class Debiaser:
             NewTopic(f"{source_topic}/bias", schema.TWIST),
         )
         self._stream, self._start_ns = start.stream(model), -1
+        self._clock = Clock()
         self._certainty = Certainty(model, start, self._stream)
         noise = model.noise_std.detach().cpu().double().numpy()
         self._white = np.diag(np.where(noise > 0, noise, start.noise) ** 2)
 
-    def __call__(self, batch: ImuBatch) -> Sequence[UInt8[np.ndarray, "n L"]]:
+    def __call__(self, batch: ImuBatch) -> Made:
         """Payloads of the corrected messages, of the two biases, and of both with their covariance.
 
         A corrected sample's covariance is that of its bias and the sensor's white noise.
+
+        Raises:
+            LogError: samples no model can take: NaN, or stamps that do not increase.
         """
+        self._clock.take(batch)
         if self._start_ns < 0 and len(batch.stamp_ns):
             self._start_ns = int(batch.stamp_ns[0])
         t_s = seconds(batch.stamp_ns, self._start_ns)
         bias = self._stream(t_s, batch.gyro, batch.accel)
         unsure = self._certainty(t_s, batch.gyro, batch.accel)
         total = unsure + self._white
-        return (
-            schema.encode_imu(
-                batch.stamp_ns,
-                batch.gyro - bias[:, :3],
-                batch.accel - bias[:, 3:],
-                batch.frame_id,
-                total[:, :3, :3].reshape(-1, 9),
-                total[:, 3:, 3:].reshape(-1, 9),
-            ),
+        corrected = schema.encode_imu(
+            batch.stamp_ns,
+            batch.gyro - bias[:, :3],
+            batch.accel - bias[:, 3:],
+            batch.frame_id,
+            total[:, :3, :3].reshape(-1, 9),
+            total[:, 3:, 3:].reshape(-1, 9),
+        )
+        payloads = (
+            corrected,
             _vector(batch.stamp_ns, bias[:, :3], batch.frame_id),
             _vector(batch.stamp_ns, bias[:, 3:], batch.frame_id),
             schema.encode_twist(batch.stamp_ns, bias[:, :3], bias[:, 3:], unsure, batch.frame_id),
         )
+        return Made(batch, payloads)
 
 
 def debias(

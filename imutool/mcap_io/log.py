@@ -22,7 +22,8 @@ from imutool.errors import DataError, LogError
 from imutool.mcap_io import records, schema
 from imutool.mcap_io.memory import keep_buffers
 from imutool.mcap_io.records import HEAD
-from imutool.mcap_io.structure import Block, Source, Span, Structure
+from imutool.mcap_io.source import Source
+from imutool.mcap_io.structure import Block, Span, Structure
 
 logger = logging.getLogger(__name__)
 
@@ -241,20 +242,19 @@ class Log:
         for rows in self.rows([topic], start_ns, end_ns):
             with self.named(topic):
                 for batch in self.decode_imu(topic, rows[1]):
-                    clock.check(batch.stamp_ns, batch.sequence)
+                    clock.take(batch)
                     yield batch
 
     def decode_imu(self, topic: str, rows: records.Rows) -> Iterator[ImuBatch]:
-        """IMU messages from their bytes, one batch per stretch with one frame.
+        """IMU messages from their bytes, one batch per stretch with one frame; nothing is asked of their values.
 
         Raises:
-            LogError: a payload that is no such message, NaN or infinite values.
+            LogError: a payload that is no such message.
         """
         encoding = self.topics[topic].message_encoding
         for part, layout in schema.runs(rows.payload, schema.IMU, encoding):
             cut = rows.where(part)
             columns = schema.decode_imu(cut.payload, encoding, layout)
-            _finite(cut.sequence, angular_velocity=columns.gyro, linear_acceleration=columns.accel)
             yield ImuBatch(cut.log_time, cut.publish_time, cut.sequence, *columns)
 
     def pose_batches(self, topic: str, start_ns: int | None = None, end_ns: int | None = None) -> Iterator[PoseBatch]:
@@ -278,7 +278,7 @@ class Log:
         for part, layout in schema.runs(rows.payload, kind, encoding):
             cut = rows.where(part)
             for columns in schema.decode_poses(cut.payload, kind, encoding, layout):
-                _finite(cut.sequence, position=columns.p_wb, orientation=columns.q_wb_wxyz)
+                finite(cut.sequence, position=columns.p_wb, orientation=columns.q_wb_wxyz)
                 yield PoseBatch(cut.log_time, cut.publish_time, cut.sequence, *columns)
 
     def scalar_batches(self, topic: str, start_ns: int | None = None, end_ns: int | None = None) -> Iterator[ScalarBatch]:
@@ -302,7 +302,7 @@ class Log:
         for part, layout in schema.runs(rows.payload, kind, encoding):
             cut = rows.where(part)
             columns = schema.decode_scalars(cut.payload, kind, encoding, layout)
-            _finite(cut.sequence, values=columns.values)
+            finite(cut.sequence, values=columns.values)
             stamp_ns = cut.log_time if columns.stamp_ns is None else columns.stamp_ns
             yield ScalarBatch(cut.log_time, cut.publish_time, cut.sequence, stamp_ns, columns.values, columns.frame_id)
 
@@ -348,7 +348,7 @@ class Log:
                 yield topic, rows
 
 
-def _finite(sequence: UInt32[np.ndarray, " n"], **fields: Float64[np.ndarray, "n _"]) -> None:
+def finite(sequence: UInt32[np.ndarray, " n"], **fields: Float64[np.ndarray, "n _"]) -> None:
     """Refuses NaN and infinity, naming the message."""
     for name, values in fields.items():
         good = np.isfinite(values).all(axis=1)
@@ -387,3 +387,12 @@ class Clock:
                 expected="stamps that increase",
             )
         self.count, self.last = self.count + len(stamp_ns), int(stamp_ns[-1])
+
+    def take(self, batch: ImuBatch) -> None:
+        """Takes in the next samples of an IMU.
+
+        Raises:
+            LogError: NaN, infinity, or a stamp that does not come after the one before it.
+        """
+        finite(batch.sequence, angular_velocity=batch.gyro, linear_acceleration=batch.accel)
+        self.check(batch.stamp_ns, batch.sequence)

@@ -23,6 +23,7 @@ from imutool.mcap_io.log import (
     PoseBatch,
     ScalarBatch,
     Topic,
+    finite,
 )
 from imutool.recording import UNIT_QUATERNION_TOLERANCE, Frames, Imu, Poses, Recording, Scalars, unit_quaternions
 
@@ -119,6 +120,7 @@ class _Gather:
         if topic == self.imu_topic:
             with self.log.named(topic):
                 for imu in self.log.decode_imu(topic, rows):
+                    finite(imu.sequence, angular_velocity=imu.gyro, linear_acceleration=imu.accel)
                     self._keep(topic, imu.sequence, imu.stamp_ns, imu.gyro, imu.accel)
         elif topic in self.truth_topics:
             with self.log.named(topic):

@@ -24,7 +24,7 @@ from mcap.records import AttachmentIndex, ChunkIndex, DataEnd, Metadata, Metadat
 
 from imutool.errors import ConfigError, LogError
 from imutool.mcap_io import records, schema
-from imutool.mcap_io.log import DERIVED_KEY, Clock, ImuBatch, Log
+from imutool.mcap_io.log import DERIVED_KEY, ImuBatch, Log
 from imutool.mcap_io.records import HEAD
 from imutool.mcap_io.structure import Block, Span, Structure
 from imutool.mcap_io.write import CHUNK_BYTES, Chunk, LogWriter
@@ -40,6 +40,13 @@ class NewTopic(NamedTuple):
     schema_name: str
 
 
+class Made(NamedTuple):
+    """Messages computed from a batch: times and sequence of the source messages that have one, a payload row for each."""
+
+    batch: ImuBatch
+    payloads: Sequence[UInt8[np.ndarray, "n L"]]
+
+
 @runtime_checkable
 class Derived(Protocol):
     """Channels computed from one IMU topic of the source, which is fed in file order."""
@@ -52,8 +59,8 @@ class Derived(Protocol):
     def topics(self) -> Sequence[NewTopic]:
         """The topics to be added."""
 
-    def __call__(self, batch: ImuBatch) -> Sequence[UInt8[np.ndarray, "n L"]]:
-        """One array of CDR payloads per new topic, one row per message of the batch."""
+    def __call__(self, batch: ImuBatch) -> Made:
+        """What to write for a batch: which of its messages stay, and one array of CDR payloads per new topic."""
 
 
 @dataclass(frozen=True)
@@ -198,7 +205,6 @@ class _Stream:
     make: Derived
     sources: set[int]
     ids: list[int]
-    clock: Clock = field(default_factory=Clock)
     data: list[bytes] = field(default_factory=list)
     channels: list[UInt16[np.ndarray, " n"]] = field(default_factory=list)
     times: list[Int64[np.ndarray, " n"]] = field(default_factory=list)
@@ -207,7 +213,7 @@ class _Stream:
 
     def take(self, batch: ImuBatch) -> None:
         """Computes the new messages of a batch; those of one source message stand side by side."""
-        payloads = self.make(batch)
+        batch, payloads = self.make(batch)
         assert len(payloads) == len(self.ids), f"{len(payloads)} arrays for {len(self.ids)} topics"
         parts = [
             records.message_rows(i, batch.log_time, batch.publish_time, batch.sequence, payload)
@@ -305,7 +311,6 @@ class _Copy:
             for rows in records.rows(found, mask):
                 with self.log.named(stream.make.source_topic):
                     for batch in self.log.decode_imu(stream.make.source_topic, rows):
-                        stream.clock.check(batch.stamp_ns, batch.sequence)
                         stream.take(batch)
 
     def _chunk(self, block: Block, raw: bytes, found: records.Messages) -> None:

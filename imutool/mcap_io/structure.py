@@ -11,20 +11,19 @@ import struct
 import zlib
 from collections import Counter
 from dataclasses import dataclass, field
-from pathlib import Path
-from typing import BinaryIO, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import UInt64
 from mcap.opcode import Opcode
 from mcap.records import Channel, ChunkIndex, Footer, Header, Schema, Statistics
 
-from imutool.errors import ConfigError, LogError
+from imutool.errors import LogError
 from imutool.mcap_io import records
 from imutool.mcap_io.records import FOOTER_SIZE, HEAD, MAGIC
+from imutool.mcap_io.source import CUT_SHORT, Source
 
 RUN_BYTES = 1 << 20  # messages outside chunks are taken in runs of about this size
-CUT_SHORT = "Copy it again from where it was recorded; salvage (`imutool repair`) is planned and not there yet"
 
 
 class Span(NamedTuple):
@@ -52,40 +51,6 @@ class Block:
         """False when the block cannot hold a message of these channels."""
         known = self.indexes or self.counts
         return known is None or not channels.isdisjoint(known)
-
-
-class Source:
-    """The bytes of a file that is only ever read, with a refusal in place of a short read."""
-
-    def __init__(self, path: Path) -> None:
-        try:
-            self.file: BinaryIO = path.open("rb", buffering=0)
-            self.size = path.stat().st_size
-        except OSError as error:
-            raise ConfigError(f"cannot be opened ({error.strerror})", where=path, expected="an MCAP log") from error
-        self.path = path
-
-    def at(self, offset: int, length: int) -> bytes:
-        """Exactly these bytes.
-
-        Raises:
-            LogError: the file does not have them, or the disk does not give them.
-        """
-        try:
-            self.file.seek(offset)
-            parts = self.file.read(length)
-            while len(parts) < length and (part := self.file.read(length - len(parts))):
-                parts += part
-        except OSError as error:
-            raise LogError(f"cannot be read at byte {offset} ({error.strerror})") from error
-        if len(parts) != length:
-            raise LogError(f"the log is cut short at byte {offset + len(parts)}", fix=CUT_SHORT)
-        return parts
-
-    def head(self, offset: int) -> tuple[int, int]:
-        """Opcode and length of the record at an offset."""
-        opcode, length = HEAD.unpack(self.at(offset, HEAD.size))
-        return opcode, length
 
 
 class Structure:

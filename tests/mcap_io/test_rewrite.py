@@ -6,7 +6,7 @@ import hashlib
 import subprocess
 import sys
 import tracemalloc
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -18,8 +18,9 @@ from rosbags.highlevel import AnyReader
 
 from imutool.errors import ConfigError, LogError
 from imutool.mcap_io import schema
+from imutool.mcap_io.log import Clock
 from imutool.mcap_io.read import DERIVED_KEY, ImuBatch, Log, read
-from imutool.mcap_io.rewrite import NewTopic, rewrite, sha256, verify
+from imutool.mcap_io.rewrite import Made, NewTopic, rewrite, sha256, verify
 from imutool.mcap_io.write import write
 from imutool.recording import Imu, Recording
 
@@ -40,12 +41,14 @@ class Debias:
             NewTopic(f"{source_topic}/bias/gyro", schema.VECTOR3),
         ]
         self.stamps: list[int] = []
+        self.clock = Clock()
 
-    def __call__(self, batch: ImuBatch) -> Sequence[np.ndarray]:
+    def __call__(self, batch: ImuBatch) -> Made:
+        self.clock.take(batch)
         self.stamps += batch.stamp_ns.tolist()
         bias = np.tile(BIAS, (len(batch.stamp_ns), 1))
         imu = schema.encode_imu(batch.stamp_ns, batch.gyro - bias, batch.accel, batch.frame_id)
-        return [imu, schema.encode_vector3(batch.stamp_ns, bias, batch.frame_id)]
+        return Made(batch, [imu, schema.encode_vector3(batch.stamp_ns, bias, batch.frame_id)])
 
 
 def digest(path: Path, topics: set[str] | None = None) -> dict[str, str]:

@@ -6,18 +6,17 @@ import errno
 import os
 import resource
 import signal
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 
 from imutool.errors import ConfigError
 from imutool.mcap_io import schema
 from imutool.mcap_io.read import ImuBatch
-from imutool.mcap_io.rewrite import NewTopic, rewrite
+from imutool.mcap_io.rewrite import Made, NewTopic, rewrite
 from imutool.mcap_io.target import Target
 from imutool.mcap_io.write import write
 from imutool.recording import Frames, Recording
@@ -32,11 +31,11 @@ class Failing:
     def __init__(self, error: BaseException) -> None:
         self.error, self.seen = error, 0
 
-    def __call__(self, batch: ImuBatch) -> Sequence[np.ndarray]:
+    def __call__(self, batch: ImuBatch) -> Made:
         self.seen += 1
         if self.seen == 2:
             raise self.error
-        return [schema.encode_imu(batch.stamp_ns, batch.gyro, batch.accel, batch.frame_id)]
+        return Made(batch, [schema.encode_imu(batch.stamp_ns, batch.gyro, batch.accel, batch.frame_id)])
 
 
 @pytest.fixture
