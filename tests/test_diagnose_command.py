@@ -254,13 +254,13 @@ def test_a_term_without_a_name_acts_as_it_was_found() -> None:
 
 def test_a_curve_and_the_bias_add_up_to_what_was_fitted() -> None:
     """The curve is told about its mean, which goes to the bias: the coefficients' own curve is what both make together."""
-    shape = unnamed.Curve("omega_x", 1, 2, -1.0, 1.0)
+    shape = unnamed.Curve("omega_x", 1, 2, np.array([-1.0, -0.3, 0.0, 0.2, 1.0]))
     c, x = np.array([0.5, 0.1, 0.0, 0.2, 0.4, 0.9, 1.0]), np.linspace(-1.0, 1.0, 41)
     y = np.zeros((41, 3))
-    y[:, 2] = shape.basis(x) @ c - (shape.basis(x) @ c).mean()
-    curve = Curve("omega_x", "rad/s", x, y, np.full((41, 3), 0.01))
-    parameters = {f"c{k}": Estimate(value, 0.01, "m/s²") for k, value in enumerate(c.tolist())}
-    acting = found(only(finding("unknown", "accel", parameters, "accel.z += curve(omega_x)", curve=curve))).acting()
+    mean = float((shape.basis(x) @ c).mean())
+    y[:, 2] = shape.basis(x) @ c - mean
+    curve = Curve("omega_x", "rad/s", x, y, np.full((41, 3), 0.01), mean)
+    acting = found(only(finding("unknown", "accel", {}, "accel.z += curve(omega_x)", curve=curve))).acting()
     gyro = np.stack([x, np.zeros(41), np.zeros(41)], axis=1)
     there = Read(np.arange(41) * 0.01, gyro, np.zeros((41, 3)), gyro)
     for physics, theta in acting:

@@ -35,6 +35,7 @@ KNOWN_BAND = 0.45  # of where smoothing halves a motion: there it takes a per ce
 ORDER_SIM, ORDER_TRUTH = 6, 12  # of the autoregression: a sensor's noise is nearly white, that of differentiated poses is not
 RIDGE = 1e-8
 SLOW = 9  # samples of a running mean
+JITTER = "timestamp_jitter"
 SHOWN_BY_SAMPLES = {"saturation", "quantization"}  # without any fit: `stamps`
 SHOWN_KNOTS = 41  # of a curve without a name, as it is told
 WHITE = 1.15  # what is left over the noise, as a ratio, that still counts as noise
@@ -174,10 +175,12 @@ def _told(logs: Sequence[Weighed], found: Discovery, reals: Sequence[str], sim: 
     findings = [one for one in (_finding(logs, found, one, floor) for one in found.judged) if one.share > 0.0]
     findings += stamps.saturated(pairs, after, found.tried) + stamps.dropped(pairs) + stamps.rounded(pairs, floor)
     p_values = {
-        signal: min((one.p_value for one in found.judged if signal in one.physics.sensors), default=1.0)
+        signal: min((one.p_value for one in findings if one.effect != JITTER and one.signal in (signal, "both")), default=1.0)
         for signal in ("gyro", "accel")
     }
-    places = located(pairs[0].stamp_s, after[0] - before[0], floor, _variables(pairs[0]), p_values)
+    stamped = _with(pairs[0], tuple(one for one in found.fitted.chosen if one[0].name == JITTER))
+    misfit = _converted(after[0], findings) - stamped  # where stamps are wrong, signals are not
+    places = located(pairs[0].stamp_s, misfit, floor, _variables(pairs[0]), p_values)
     unexplained = _unexplained(pairs, after, floor)
     if not findings:  # nothing has been found; where something is left all the same, it is said where
         odd = {name for name, one in unexplained.items() if not one.white}
@@ -198,6 +201,19 @@ def _told(logs: Sequence[Weighed], found: Discovery, reals: Sequence[str], sim: 
             for pair, b, a in zip(pairs, before, after, strict=True)
         ),
     )
+
+
+def _converted(there: Float64[np.ndarray, "n 6"], findings: Sequence[Finding]) -> Float64[np.ndarray, "n 6"]:
+    """As a converter gives it whose limits and steps were found."""
+    out = there.copy()
+    told = {name: estimate.value for one in findings for name, estimate in one.parameters.items()}
+    for k, signal in enumerate(("gyro", "accel")):
+        part, limit, lsb = slice(3 * k, 3 * k + 3), told.get(f"{signal}_limit"), told.get(f"{signal}_lsb")
+        if limit is not None and np.isfinite(limit):
+            out[:, part] = np.clip(out[:, part], -limit, limit)
+        if lsb is not None:
+            out[:, part] = lsb * np.rint(out[:, part] / lsb)
+    return out
 
 
 def _slow(left: Float64[np.ndarray, "n 6"]) -> Float64[np.ndarray, "n 6"]:
@@ -296,8 +312,10 @@ def _finding(logs: Sequence[Weighed], found: Discovery, one: Judged, floor: Floa
 
 
 def _parameters(pairs: Sequence[Pair], one: Judged) -> dict[str, Estimate]:
-    """As they were fitted, but for what stamps and samples show exactly."""
-    if one.physics.name == "timestamp_jitter":
+    """As they were fitted, but for what stamps and samples show exactly; a curve is told by its values."""
+    if isinstance(one.physics.forward, unnamed.Curve):
+        return {}
+    if one.physics.name == JITTER:
         off = np.concatenate([pair.stamp_s - stamps.even(pair.stamp_s)[0] for pair in pairs])
         std = float(off.std())
         return {"std": Estimate(std, std / np.sqrt(2.0 * len(off)), "s")}
@@ -312,7 +330,7 @@ def _curve(pair: Pair, one: Judged, whole: Fit) -> Curve | None:
     forward = one.physics.forward
     if not isinstance(forward, unnamed.Curve):
         return None
-    x = np.linspace(forward.first, forward.last, SHOWN_KNOTS)
+    x = forward.points(SHOWN_KNOTS)
     basis = forward.basis(x)
     first = 0
     for physics, theta in whole.chosen:
@@ -325,7 +343,7 @@ def _curve(pair: Pair, one: Judged, whole: Fit) -> Curve | None:
     y[:, forward.axis] = basis @ one.theta - middle
     centred = basis - basis.mean(axis=0)
     band[:, forward.axis] = np.sqrt(np.einsum("nq,qp,np->n", centred, covariance, centred))
-    return Curve(forward.variable, unit(forward.variable), x, y, band)
+    return Curve(forward.variable, unit(forward.variable), x, y, band, middle)
 
 
 def _unexplained(

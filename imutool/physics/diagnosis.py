@@ -52,13 +52,17 @@ class HeldOut:
 
 @dataclass(frozen=True, eq=False)
 class Curve:
-    """A misfit without a name as a curve of one variable: values with a band (one standard deviation)."""
+    """A misfit without a name as a curve of one variable: values about their mean, with a band (one standard deviation).
+
+    The mean, which no motion tells from a bias, is apart.
+    """
 
     variable: str
     unit: str
     x: Float64[np.ndarray, " k"]
     y: Float64[np.ndarray, "k axes"]
     band: Float64[np.ndarray, "k axes"]
+    mean: float = 0.0
 
 
 @dataclass(frozen=True)

@@ -23,7 +23,9 @@ from scipy.stats import t as student
 from imutool.physics import fit as fits
 from imutool.physics.effects._forward import Physics, Theta
 from imutool.physics.fit import Chosen, Fit, Weighed, derivatives, expected, fit
+from imutool.physics.pair import Pair
 from imutool.physics.readings import Read
+from imutool.physics.unnamed import Curve
 
 FALSE_DISCOVERY = 5e-3
 HELPS = 0.05  # chance of the gain on unseen blocks being none
@@ -122,11 +124,13 @@ class _Search:
     named: tuple[Physics, ...]
     others: tuple[Physics, ...] = ()
     starts: dict[str, list[Theta]] = field(init=False)
+    luck: dict[str, float] = field(init=False)  # log of how much likelier chance looks like it, for being picked from many
     before: float = field(init=False)  # squares of white residuals with nothing but a constant bias
 
     def __post_init__(self) -> None:
         self.before = fit(self.logs, ()).objective
         self.starts = {one.name: self._starts(one) for one in (*self.named, *self.others)}
+        self.luck = {one.name: self._luck(one) for one in (*self.named, *self.others)}
 
     @property
     def tried(self) -> int:
@@ -137,8 +141,16 @@ class _Search:
         if physics.starts is None:
             return [physics.nothing.astype(float)]
         pair = self.logs[0].pair
-        real = Read(pair.stamp_s, pair.real[:, :3], pair.real[:, 3:], np.zeros((len(pair.real), 3)))
-        return [np.asarray(start, dtype=float) for start in physics.starts(pair.felt, real)]
+        return [np.asarray(start, dtype=float) for start in physics.starts(pair.felt, _as_read(pair))]
+
+    def _luck(self, physics: Physics) -> float:
+        if physics.alternatives is None:
+            return 0.0
+        return float(np.log(max(1.0, physics.alternatives(_as_read(self.logs[0].pair)) / len(self.starts[physics.name]))))
+
+    def chance(self, physics: Physics, gain: float) -> float:
+        """The logarithm of the chance that noise alone gains as much by an effect, at the best of its alternatives."""
+        return chance(gain, len(physics.parameters)) + self.luck[physics.name]
 
     def added(self, now: Fit) -> Fit | None:
         """The best fit with one more effect, or none that chance would not explain."""
@@ -146,8 +158,8 @@ class _Search:
         ranked = self.ranked(now, (*self.named, *self.others) if nameless < MOST_NAMELESS else self.named)
         best: tuple[float, Fit] | None = None
         for _, physics, start, _ in ranked[:TRIED]:
-            trial = fit(self.logs, (*now.chosen, (physics, start)), bias=now.bias)
-            score = chance(now.objective - trial.objective, len(start))
+            trial = fit(self.logs, (*now.chosen, (physics, start)))
+            score = self.chance(physics, now.objective - trial.objective)
             if best is None or score < best[0]:
                 best = score, trial
         if best is None or best[0] > np.log(FALSE_DISCOVERY / self.tried):
@@ -166,48 +178,49 @@ class _Search:
                 continue
             gains = [(panel.gain(physics, start), start) for start in self.starts[physics.name]]
             gain, start = max(gains, key=lambda pair: pair[0])
-            out.append(_Ranked(chance(gain, len(start)), physics, start, gain))
+            out.append(_Ranked(self.chance(physics, gain), physics, start, gain))
         return sorted(out, key=lambda entry: entry.score)
 
     def exchanged(self, now: Fit) -> Fit:
         """With an effect replaced by another of the catalogue that explains more, where there is one."""
         for k in range(len(now.chosen) - 1) if len(now.chosen) <= EXCHANGED else ():
             others = (*now.chosen[:k], *now.chosen[k + 1 :])
-            without = fit(self.logs, others, bias=now.bias, iterations=2)
-            here = chance(without.objective - now.objective, len(now.chosen[k][1]))
+            without = fit(self.logs, others, iterations=2)
+            here = self.chance(now.chosen[k][0], without.objective - now.objective)
             for score, physics, start, _ in self.ranked(without, self.named)[:2]:
                 if physics.name == now.chosen[k][0].name or score > here:
                     continue
-                trial = fit(self.logs, (*others, (physics, start)), bias=now.bias)
-                if chance(without.objective - trial.objective, len(start)) < here - 1.0:
+                trial = fit(self.logs, (*others, (physics, start)))
+                if self.chance(physics, without.objective - trial.objective) < here - 1.0:
                     return trial
         return now
 
     def pruned(self, now: Fit) -> Fit:
         """Without effects that the others have made superfluous."""
         for k in range(len(now.chosen) - 1):  # the last has just come in
-            without = fit(self.logs, (*now.chosen[:k], *now.chosen[k + 1 :]), bias=now.bias)
-            if chance(without.objective - now.objective, len(now.chosen[k][1])) > np.log(FALSE_DISCOVERY / self.tried):
+            without = fit(self.logs, (*now.chosen[:k], *now.chosen[k + 1 :]))
+            if self.chance(now.chosen[k][0], without.objective - now.objective) > np.log(FALSE_DISCOVERY / self.tried):
                 return self.pruned(without)
         return now
 
     def judged(self, now: Fit) -> Discovery:
         """What may stay: tested on all rows, and on blocks that were not fitted."""
         while now.chosen:
-            other = fit(self.logs, now.chosen, part="held_out", bias=now.bias)
-            whole = fit(self.logs, now.chosen, part="all", bias=now.bias)
+            other = fit(self.logs, now.chosen, part="held_out")
+            whole = fit(self.logs, now.chosen, part="all")
             held = tuple(_plausible(physics, theta) for physics, theta in whole.chosen)
             if any(one is not physics for one, (physics, _) in zip(held, whole.chosen, strict=True)):
                 begun = tuple(
                     (one, _kept(physics, one, theta)) for one, (physics, theta) in zip(held, whole.chosen, strict=True)
                 )
-                now = fit(self.logs, tuple(pair for pair in begun if len(pair[1])), bias=now.bias)
+                now = fit(self.logs, tuple(pair for pair in begun if len(pair[1])))
                 continue
             verdicts = [self._verdict(k, now, other, whole) for k in range(len(now.chosen))]
             worst = max(range(len(verdicts)), key=lambda k: verdicts[k].false_discovery_rate)
             if verdicts[worst].false_discovery_rate <= FALSE_DISCOVERY:
-                return Discovery(tuple(sorted(verdicts, key=lambda one: -one.gain)), now, whole, self.tried)
-            now = fit(self.logs, (*now.chosen[:worst], *now.chosen[worst + 1 :]), bias=now.bias)
+                fitted = replace(now, chosen=_set_in_as(now.chosen, whole.chosen))
+                return Discovery(tuple(sorted(verdicts, key=lambda one: -one.gain)), fitted, whole, self.tried)
+            now = fit(self.logs, (*now.chosen[:worst], *now.chosen[worst + 1 :]))
         return Discovery((), now, fit(self.logs, (), part="all"), self.tried)
 
     def _beyond_the_band(self, physics: Physics, theta: Theta) -> bool:
@@ -218,9 +231,9 @@ class _Search:
 
     def _verdict(self, k: int, fitted: Fit, other: Fit, whole: Fit) -> Judged:
         physics, theta = whole.chosen[k]
-        without = fit(self.logs, (*whole.chosen[:k], *whole.chosen[k + 1 :]), part="all", bias=whole.bias)
+        without = fit(self.logs, (*whole.chosen[:k], *whole.chosen[k + 1 :]), part="all")
         gain = without.objective - whole.objective
-        log_p = chance(gain, len(theta))
+        log_p = self.chance(physics, gain)
         blocks = np.concatenate(
             [_gains(log, fitted, k, "held_out") for log in self.logs] + [_gains(log, other, k, "fitted") for log in self.logs]
         )
@@ -233,12 +246,17 @@ class _Search:
         unseen = [
             f"{physics.name}.{number.name}"
             for number, s in zip(physics.parameters, std, strict=True)
-            if s > (fits.LOG_PRIOR if number.positive else number.plausible)
+            if s > (fits.LOG_PRIOR if number.positive else number.plausible) and not isinstance(physics.forward, Curve)
         ]
         if isinstance(physics.forward, _Held):
             kept = {number.name for number in physics.parameters}
             unseen += [f"{physics.name}.{n.name}" for n in physics.forward.physics.parameters if n.name not in kept]
         return Judged(physics, theta, std, tuple(unseen), float(np.exp(max(log_p, -700.0))), rate, gain)
+
+
+def _as_read(pair: Pair) -> Read:
+    """The samples as they were recorded."""
+    return Read(pair.stamp_s, pair.real[:, :3], pair.real[:, 3:], np.zeros((len(pair.real), 3)))
 
 
 class _Held:
@@ -261,6 +279,15 @@ def _plausible(physics: Physics, theta: Theta) -> Physics:
     if len(free) == len(theta):
         return physics
     return replace(physics, parameters=tuple(physics.parameters[k] for k in free), forward=_Held(physics, free))
+
+
+def _set_in_as(fitted: Chosen, whole: Chosen) -> Chosen:
+    """With the times at which effects set in as all rows show them: one that lies between fitted rows, those cannot."""
+    out = []
+    for (physics, theta), (_, seen) in zip(fitted, whole, strict=True):
+        begins = np.array([number.begins for number in physics.parameters])
+        out.append((physics, np.where(begins, seen, theta)))
+    return tuple(out)
 
 
 def _kept(physics: Physics, held: Physics, theta: Theta) -> Theta:

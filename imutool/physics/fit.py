@@ -1,15 +1,16 @@
 """Effects fitted to pairs, together, with a constant bias for each log, weighed by the noise.
 
-Gauss-Newton on whitened residuals; the derivatives are differences of the effects' own forward models, so that an effect is one
-function and nothing else. Every parameter has a weak prior, `PRIOR` times its plausible size: what the motion cannot show stays
-at nothing instead of becoming a large number, and its standard deviation says so. Positive parameters are fitted by their
-logarithm.
+Gauss-Newton on whitened residuals, and between its steps a look at all times at which an effect may set in. The derivatives
+are differences of the effects' own forward models, so that an effect is one function and nothing else. Every parameter has a
+weak prior, `PRIOR` times its plausible size: what the motion cannot show stays at nothing instead of becoming a large number,
+and its standard deviation says so. Positive parameters are fitted by their logarithm.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float64
@@ -145,41 +146,83 @@ def fit(
     logs: Sequence[Weighed],
     begun: Chosen,
     part: str = "fitted",
-    bias: Float64[np.ndarray, "logs 6"] | None = None,
     iterations: int = ITERATIONS,
 ) -> Fit:
     """The effects fitted together from where they begin, and a bias for each log."""
-    chosen = begun
-    b = np.zeros((len(logs), 6)) if bias is None else bias.copy()
-    mean, std = priors(chosen, begun)
+    mean, std = priors(begun, begun)
+    p, N_data = len(mean), np.zeros((len(mean), len(mean)))
     masks = [log.rows(part) for log in logs]
-    residuals = [_residual(log, chosen) for log in logs]
-    b, objective = _biases(logs, residuals, masks, _penalty(chosen, mean, std))
-    N_data = np.zeros((len(mean), len(mean)))
-    for _ in range(iterations if len(mean) else 0):
-        N, g = _normal(logs, chosen, residuals, b, masks)
-        p = len(mean)
+
+    def tried(chosen: Chosen) -> _State:
+        residuals = [_residual(log, chosen) for log in logs]
+        return _State(chosen, residuals, *_biases(logs, residuals, masks, _penalty(chosen, mean, std)))
+
+    now = tried(begun)
+    for _ in range(iterations if p else 0):
+        before = now.objective
+        for moved in _set_in(logs, now, masks):
+            now = min(now, tried(moved), key=_objective)
+        N, g = _normal(logs, now.chosen, now.residuals, now.bias, masks)
         N_data = _without_biases(N, p)
-        x = np.concatenate([free(physics, theta) for physics, theta in chosen]) if p else np.zeros(0)
+        x = np.concatenate([free(physics, theta) for physics, theta in now.chosen])
         N[:p, :p] += np.diag(1.0 / std**2)
         g[:p] -= (x - mean) / std**2
-        delta = _within(np.linalg.solve(N, g)[:p], chosen)
-        moved, better = chosen, False
-        for back in range(BACKTRACKS):
-            moved = _moved(chosen, x + delta * 0.5**back)
-            trial = [_residual(log, moved) for log in logs]
-            trial_b, trial_objective = _biases(logs, trial, masks, _penalty(moved, mean, std))
-            if trial_objective < objective:
-                better = True
-                break
-        if not better:
-            break
-        gained = objective - trial_objective
-        chosen, residuals, b, objective = moved, trial, trial_b, trial_objective
-        if gained < 1e-2 or not p:
+        delta = _within(_solved(N, g, now.chosen), now.chosen)
+        steps = (tried(_moved(now.chosen, x + delta * 0.5**back)) for back in range(BACKTRACKS))
+        now = next((one for one in steps if one.objective < now.objective), now)
+        if before - now.objective < 1e-2:
             break
     covariance = np.linalg.inv(N_data + np.diag(1.0 / std**2)) if len(mean) else np.zeros((0, 0))
-    return Fit(chosen, b, objective, covariance, N_data, int(sum(mask.sum() for mask in masks)))
+    return Fit(now.chosen, now.bias, now.objective, covariance, N_data, int(sum(mask.sum() for mask in masks)))
+
+
+class _State(NamedTuple):
+    """How far a fit has come."""
+
+    chosen: Chosen
+    residuals: list[Float64[np.ndarray, "n 6"]]
+    bias: Float64[np.ndarray, "logs 6"]
+    objective: float
+
+
+def _objective(state: _State) -> float:
+    return state.objective
+
+
+def _solved(N: Float64[np.ndarray, "q q"], g: Float64[np.ndarray, " q"], chosen: Chosen) -> Float64[np.ndarray, " p"]:
+    """The step of the parameters; times at which effects set in stay."""
+    begins = np.array([number.begins for physics, _ in chosen for number in physics.parameters], bool)
+    moves = np.concatenate([~begins, np.ones(len(g) - len(begins), bool)])
+    delta = np.zeros(len(g))
+    delta[moves] = np.linalg.solve(N[np.ix_(moves, moves)], g[moves])
+    return delta[: len(begins)]
+
+
+def _set_in(logs: Sequence[Weighed], now: _State, masks: Sequence[Bool[np.ndarray, " n"]]) -> Iterator[Chosen]:
+    """With one effect setting in at its best time: before it squares left without the effect count, behind it those with it."""
+    chosen = now.chosen
+    for k, (physics, _) in enumerate(chosen):
+        for j, number in enumerate(physics.parameters):
+            if not number.begins:
+                continue
+            at, excess = [], []
+            for log, mask, bias in zip(logs, masks, now.bias, strict=True):
+                ends = (_residual(log, _but(chosen, k, j, t)) - constants(log) * bias for t in (np.inf, -np.inf))
+                never, always = ((one[mask] ** 2).sum(1) for one in ends)
+                stamp_s = log.pair.stamp_s
+                at.append((stamp_s - stamp_s[0])[:: log.whiten.every][mask])
+                excess.append(never - always)
+            order = np.argsort(np.concatenate(at), kind="stable")
+            t_s, cost = np.concatenate(at)[order], np.cumsum(np.concatenate(excess)[order])
+            best = int(np.argmin(cost[:-1]))
+            yield _but(chosen, k, j, float(t_s[best] + t_s[best + 1]) / 2.0)
+
+
+def _but(chosen: Chosen, k: int, j: int, value: float) -> Chosen:
+    """With another value of one parameter."""
+    theta = chosen[k][1].copy()
+    theta[j] = value
+    return (*chosen[:k], (chosen[k][0], theta), *chosen[k + 1 :])
 
 
 def _within(delta: Theta, chosen: Chosen) -> Theta:

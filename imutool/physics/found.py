@@ -14,7 +14,6 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float64
 
-from imutool.physics import unnamed
 from imutool.physics.diagnosis import Diagnosis, Estimate, Finding
 from imutool.physics.effects._base import AXES
 from imutool.physics.physics_file import DRIVEN, Bias, Curve, Entry, PhysicsFile, Sensor, Term, Three, Value
@@ -83,15 +82,11 @@ def _curve(one: Finding) -> Curve:
 
 
 def _mean_of_curve(one: Finding) -> Float64[np.ndarray, "6"]:
-    """What the finding's coefficients give on average over the curve's own points, on its axis."""
+    """What the curve is on average, on its axis."""
     assert one.curve is not None
     sensor, axis, _ = _place(one)
-    x, column = one.curve.x, 3 * (sensor == "accel") + axis
-    coefficients = np.array([e.value for e in one.parameters.values()])
-    shape = unnamed.Curve(one.curve.variable, int(sensor == "accel"), axis, float(x[0]), float(x[-1]))
     out = np.zeros(6)
-    if len(coefficients) == unnamed.KNOTS:
-        out[column] = float((shape.basis(x) @ coefficients).mean())
+    out[3 * (sensor == "accel") + axis] = one.curve.mean
     return out
 
 

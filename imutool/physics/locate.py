@@ -35,6 +35,8 @@ def located(
 ) -> list[Located]:
     """One entry a signal in which there is a misfit: what was read less what was expected, without noise, sample by sample.
 
+    What has been found (`p_values`) and is too small for any one second to show it lies everywhere.
+
     `variables` are what a regime can be of, by how they are called, with unit and values at the samples.
     """
     found = []
@@ -46,6 +48,8 @@ def located(
         axes = [a for a in range(3) if axes_power[a] > max(CLEAR, AXIS_SHARE * axes_power.max())]
         power = np.bincount(window, weights=part.sum(axis=1))
         inside = power > CLEAR
+        if axes and not inside.any() and p_values.get(signal, 1.0) < CHANCE:
+            inside = np.ones(len(power), bool)  # found over all of the time, though no second shows it by itself
         if not axes or not inside.any():
             continue
         found.append(

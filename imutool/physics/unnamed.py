@@ -23,11 +23,12 @@ from imutool.physics.physics_file import VARIABLES
 from imutool.physics.readings import Read, Vectors
 
 LAGS_S = (-0.5, -0.2, -0.1, -0.05, 0.0, 0.05, 0.1, 0.2, 0.5)
-KNOTS = 7
+KNOTS = 9
 AXES = ("x", "y", "z")
 SIGNALS: tuple[tuple[Sensor, str], ...] = (("gyro", "rad/s"), ("accel", "m/s²"))
 PLAUSIBLE = {"gyro": 0.1, "accel": 1.0}
 INSIDE = 0.005  # of the values of a variable lie beyond its first knot, and as many beyond its last
+SPREAD = 1e-9  # relative: knots that lie closer are one
 
 Variable = Callable[[Read], Float64[np.ndarray, " n"]]
 
@@ -81,9 +82,8 @@ def unit(variable: str) -> str:
 def curves(like: Read) -> Iterator[Physics]:
     """A smooth curve of each variable, on each axis of each sensor."""
     for variable, of in VARIABLES.items():
-        values = of(like)
-        first, last = np.quantile(values, [INSIDE, 1 - INSIDE])
-        if last - first <= 1e-9 * max(1.0, abs(first)):
+        inner = np.quantile(of(like), np.linspace(INSIDE, 1 - INSIDE, KNOTS - 2))
+        if np.diff(inner).min() <= SPREAD * max(1.0, np.abs(inner).max()):
             continue
         for k, (signal, measured_in) in enumerate(SIGNALS):
             for axis in range(3):
@@ -95,23 +95,29 @@ def curves(like: Read) -> Iterator[Physics]:
                     f"{signal}.{AXES[axis]} += curve({variable})",
                     numbers,
                     f"{variable} varies",
-                    Curve(variable, k, axis, float(first), float(last)),
+                    Curve(variable, k, axis, inner),
                 )
 
 
 class Curve:
-    """+ a cubic spline of one variable on one axis, held beyond its ends."""
+    """+ a cubic spline of one variable on one axis, held beyond its ends.
 
-    def __init__(self, variable: str, sensor: int, axis: int, first: float, last: float) -> None:
-        self.variable, self.sensor, self.axis, self.first, self.last = variable, sensor, axis, first, last
+    As many samples lie between any two knots: at even distances, what the motion rarely does would bend all the rest.
+    """
+
+    def __init__(self, variable: str, sensor: int, axis: int, inner: Float64[np.ndarray, " p"]) -> None:
+        self.variable, self.sensor, self.axis, self.inner = variable, sensor, axis, inner
         self._last: tuple[np.ndarray, np.ndarray] | None = None
-        inner = np.linspace(first, last, KNOTS - 2)
-        self.knots = np.concatenate([[first] * 3, inner, [last] * 3])
+        self.knots = np.concatenate([[inner[0]] * 3, inner, [inner[-1]] * 3])
+
+    def points(self, count: int) -> Float64[np.ndarray, " k"]:
+        """Values to show the curve at: more where it can bend more."""
+        return np.asarray(np.interp(np.linspace(0.0, 1.0, count), np.linspace(0.0, 1.0, len(self.inner)), self.inner))
 
     def basis(self, x: Float64[np.ndarray, " n"]) -> Float64[np.ndarray, "n q"]:
         """The B-splines at some values."""
         if self._last is None or not np.array_equal(self._last[0], x):  # derivatives ask for the same again and again
-            inside = np.clip(x, self.first, self.last)
+            inside = np.clip(x, self.inner[0], self.inner[-1])
             self._last = x.copy(), np.asarray(BSpline.design_matrix(inside, self.knots, 3).toarray()[:, :KNOTS])
         return self._last[1]
 
@@ -176,6 +182,7 @@ def _on_axis(read: Read, sensor: int, axis: int, added: Float64[np.ndarray, " n"
 
 
 def like(pairs: Sequence[Pair]) -> Read:
-    """Ideal signals at the samples of the first log: what ranges there are."""
+    """Ideal signals at the samples of the first log that are fitted: what ranges there are."""
     pair = pairs[0]
-    return pair.felt.taken(pair.stamp_s, pair.stamp_s)
+    stamp_s = pair.stamp_s[pair.fitted]
+    return pair.felt.taken(stamp_s, stamp_s)

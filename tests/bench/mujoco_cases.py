@@ -88,6 +88,7 @@ def conceal_mujoco(folder: Path, *, seed: int, kind: str | None = None, duration
         "size": "middle",
         "effects": effects,
         "bias": {"gyro": bias[:3].tolist(), "accel": bias[3:].tolist()},
+        "noise_std": {"real": NOISE.tolist(), "sim": (SIM_SHARE * NOISE).tolist()},
         "place": place(real - ideal, sigma),
         "achievable": achievable(real - ideal, sigma),
     }

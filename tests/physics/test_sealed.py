@@ -588,6 +588,7 @@ def _truth(*effects: dict[str, Any], kind: str = "single") -> dict[str, Any]:
         "effects": list(effects),
         "place": {"window_s": 1.0, "gyro": something if effects else nothing, "accel": nothing},
         "achievable": {"gyro": {"rms_before": 0.5, "rms_after": 0.1} if effects else quiet, "accel": quiet},
+        "noise_std": {"real": [0.1] * 6, "sim": [0.03] * 6},
     }
 
 

@@ -47,7 +47,9 @@ class Number:
 
     `nothing` is the value at which the effect does nothing: 0, or infinity (a cut-off frequency, a limit). A number that
     matters only beside an amplitude (a time constant, a frequency) has its plausible size there: any value would do.
-    `step`, where given, is the largest one whose difference is still a derivative, of the logarithm if `positive`.
+    `step`, where given, is the largest one whose difference is still a derivative, of the logarithm if `positive`. `begins`: it
+    is the time (s from the first sample) at which the effect sets in, never if infinite; nothing is smooth in it, so all times
+    are gone through.
     """
 
     name: str
@@ -56,6 +58,7 @@ class Number:
     positive: bool = False
     nothing: float = 0.0
     step: float | None = None
+    begins: bool = False
 
 
 @dataclass(frozen=True)
@@ -66,6 +69,7 @@ class Physics:
     linear: whether what it adds is proportional to theta (then a fit may start at zero).
     starts: for the others, values of theta to start a fit from, given the ideal signals and the samples: at least one, all
         finite, and positive where a number is (a limit that is not reached instead of none).
+    alternatives: out of how many the starts are the best, given the samples; so many times likelier does chance look like one.
     needs: channels without which it cannot be thought of, such as "temperature"; a channel whose name contains it serves.
     """
 
@@ -78,6 +82,7 @@ class Physics:
     forward: Callable[[Any, Theta], Any]
     linear: bool = True
     starts: Callable[[Felt, Read], Sequence[Theta]] | None = None
+    alternatives: Callable[[Read], int] | None = None
     needs: tuple[str, ...] = ()
 
     @property

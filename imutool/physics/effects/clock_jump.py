@@ -38,7 +38,7 @@ PHYSICS = Physics(
     Stage.CLOCK,
     ("gyro", "accel"),
     "samples are taken at t + step from t_jump on",
-    (Number("t_jump", "s", 30.0), Number("step", "s", 0.05)),
+    (Number("t_jump", "s", 30.0, begins=True), Number("step", "s", 0.05)),
     "it moves before and after",
     _forward,
     linear=False,

@@ -69,4 +69,5 @@ PHYSICS = Physics(
     _forward,
     linear=False,
     starts=_starts,
+    alternatives=lambda samples: len(samples.stamp_s) // 2,  # frequencies that samples tell apart
 )
