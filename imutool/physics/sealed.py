@@ -216,7 +216,7 @@ def opened(folder: Path, findings: Path | None = None) -> dict[str, Any]:
 
 def _simulation(folder: Path, truth: Mapping[str, Any]) -> Recording | None:
     """The simulation of a case that was made here; another generator's motions are not ours to go along."""
-    return read(folder / SIM) if "noise_std" in truth else None
+    return None if "generator" in truth else read(folder / SIM)
 
 
 def _grade(noise: str | Path, rng: Generator) -> tuple[str, Noise]:

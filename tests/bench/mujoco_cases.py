@@ -82,6 +82,7 @@ def conceal_mujoco(folder: Path, *, seed: int, kind: str | None = None, duration
     told = {
         "schema": TRUTH_SCHEMA,
         "seed": seed,
+        "generator": "mujoco",
         "trajectory": "mujoco",
         "noise": "mujoco",
         "kind": {0: "null", 1: "single", 2: "pair"}[len(effects)],
