@@ -308,6 +308,7 @@ def _finding(logs: Sequence[Weighed], found: Discovery, one: Judged, floor: Floa
         held_out=held,
         driver=rest.rpartition(":")[0] if name == "driven" else "",
         curve=_curve(logs[0].pair, one, found.whole),
+        similar=one.similar,
     )
 
 

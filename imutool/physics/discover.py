@@ -38,6 +38,7 @@ WELL, HOPELESS = 1.03, 2.0  # squares left a row, below which all is said, and a
 MOST_NAMELESS, NAMELESS_SHARE = 2, 0.03  # effects without a name, and how much of the misfit each has to take
 IN_BAND = 0.8
 EXCHANGED = 3  # effects among which each is asked whether another would do better
+RIVALS, RIVAL_SHARE = 3, 0.5  # effects that are asked whether they would do as well, and of the gain what a step has to promise
 IMPLAUSIBLE = 4.0  # times the plausible size
 
 
@@ -46,7 +47,7 @@ class Judged:
     """An effect that was found, with what it costs to leave it out.
 
     `p_value` is by chi-square over all rows, `gain` the squares that leaving it out adds there, `unidentified` what of it no
-    motion showed.
+    motion showed, `similar` which other effects would have done as well in its place.
     """
 
     physics: Physics
@@ -56,6 +57,7 @@ class Judged:
     p_value: float
     false_discovery_rate: float
     gain: float
+    similar: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -218,10 +220,23 @@ class _Search:
             verdicts = [self._verdict(k, now, other, whole) for k in range(len(now.chosen))]
             worst = max(range(len(verdicts)), key=lambda k: verdicts[k].false_discovery_rate)
             if verdicts[worst].false_discovery_rate <= FALSE_DISCOVERY:
+                told = [replace(one, similar=self._similar(k, now)) for k, one in enumerate(verdicts)]
                 fitted = replace(now, chosen=_set_in_as(now.chosen, whole.chosen))
-                return Discovery(tuple(sorted(verdicts, key=lambda one: -one.gain)), fitted, whole, self.tried)
+                return Discovery(tuple(sorted(told, key=lambda one: -one.gain)), fitted, whole, self.tried)
             now = fit(self.logs, (*now.chosen[:worst], *now.chosen[worst + 1 :]))
         return Discovery((), now, fit(self.logs, (), part="all"), self.tried)
+
+    def _similar(self, k: int, now: Fit) -> tuple[str, ...]:
+        """Effects of the catalogue that in an effect's place leave about as little (Akaike's criterion)."""
+        others = (*now.chosen[:k], *now.chosen[k + 1 :])
+        without = fit(self.logs, others, iterations=2)
+        gain, found = without.objective - now.objective, []
+        for _, physics, start, promised in self.ranked(without, self.named)[:RIVALS]:
+            if physics.name != now.chosen[k][0].name and promised > RIVAL_SHARE * gain:
+                trial = fit(self.logs, (*others, (physics, start)))
+                if trial.objective + 2 * len(start) < now.objective + 2 * len(now.chosen[k][1]) + CLEARLY:
+                    found.append(physics.name.partition(" ")[0])
+        return tuple(dict.fromkeys(found))
 
     def _beyond_the_band(self, physics: Physics, theta: Theta) -> bool:
         """A frequency that what is expected does not reach up to: smoothed poses lag and lose there by themselves."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import runpy
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -184,3 +185,37 @@ def fit_cost(found: Discovery) -> tuple[float, float]:
     """Squares above the noise that the effects took, with those that are left; and those that are left."""
     left = max(found.whole.objective - 6.0 * found.whole.rows, 0.0)
     return left + sum(one.gain for one in found.judged), left
+
+
+# ── rivals, and what sets in ──
+
+
+def test_a_temperature_that_rises_as_the_bias_does_is_named_beside_the_drift() -> None:
+    """Both say the same with this channel, so that neither can be ruled out; with another course of it one of them can."""
+    felt = PLANTED.shaken(2, DURATION_S)
+    rising = 20.0 + 5.0 * (1.0 - np.exp(-felt.t_s / 8.0))
+    effects = {"gyro_bias_drift": [0.01, -0.02, 0.015, 8.0]}
+
+    def told(temperature: np.ndarray) -> dict[str, tuple[str, ...]]:
+        pair = PLANTED.pair(PLANTED.shaken(2, DURATION_S), effects, 5)
+        pair = replace(pair, felt=replace(pair.felt, channels={"/temperature.data": temperature}))
+        pair = replace(pair, channels={"/temperature.data": temperature})
+        drift, temp = (
+            PLANTED.acting({name: size})[0][0] for name, size in (("gyro_bias_drift", [0] * 4), ("temperature", [0] * 6))
+        )
+        return {one.physics.name: one.similar for one in discover([PLANTED.weighed(pair)], (drift, temp)).judged}
+
+    (name, rivals), *more = told(rising).items()
+    assert {name, *rivals} == {"gyro_bias_drift", "temperature"}
+    assert not more
+    assert told(20.0 + np.sin(felt.t_s)) == {"gyro_bias_drift": ()}
+
+
+@pytest.mark.parametrize("t_jump", [4.8, 9.1, 10.9, 15.2])
+def test_the_time_of_a_jump_is_found_also_beside_another_effect_and_between_fitted_rows(t_jump: float) -> None:
+    pair = PLANTED.pair(PLANTED.rich(3, DURATION_S), {"clock_jump": [t_jump, -0.02], "gyro_scale": [0.02, -0.03, 0.01]}, 3)
+    found = asked(pair, beyond=False)
+    assert sorted(names(found)) == ["clock_jump", "gyro_scale"]
+    jump = next(one for one in found.judged if one.physics.name == "clock_jump")
+    assert abs(jump.theta[0] - t_jump) < 0.05  # s: five samples, in which it may hardly move
+    assert jump.theta[1] == pytest.approx(-0.02, abs=2e-4)

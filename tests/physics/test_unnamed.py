@@ -13,6 +13,7 @@ import pytest
 from imutool.physics import unnamed
 from imutool.physics.effects._forward import Physics
 from imutool.physics.fit import fit
+from imutool.physics.readings import Read
 
 PLANTED = SimpleNamespace(**runpy.run_path(str(Path(__file__).with_name("planted.py"))))
 SURE = 4.0
@@ -151,3 +152,20 @@ def test_what_is_like_the_first_log_are_its_ideal_signals_at_its_samples() -> No
 )
 def test_units_of_variables(variable: str, unit: str) -> None:
     assert unnamed.unit(variable) == unit
+
+
+def test_a_curve_bends_where_the_samples_are() -> None:
+    """A step near zero, in a variable that is rarely far from it: knots at even distances would not see it."""
+    rng = np.random.default_rng(0)
+    x = np.where(rng.random(4000) < 0.02, 6.0, 0.5) * rng.standard_normal(4000)
+    gyro = np.stack([x, np.zeros_like(x), np.zeros_like(x)], axis=1)
+    like = Read(np.arange(len(x)) * 0.01, gyro, np.zeros_like(gyro), np.zeros_like(gyro))
+    curve = next(one for one in unnamed.curves(like) if one.name == "unknown:gyro.z(omega_x)").forward
+    assert isinstance(curve, unnamed.Curve)
+    y = np.tanh(x / 0.3)
+    basis = curve.basis(x)
+    left = y - basis @ np.linalg.lstsq(basis, y, rcond=None)[0]
+    assert left.std() < 0.05 * y.std()
+    shown = curve.points(41)
+    assert np.allclose(shown[[0, -1]], curve.inner[[0, -1]], rtol=0, atol=0)
+    assert (np.diff(shown) > 0).all()
