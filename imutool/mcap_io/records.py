@@ -7,7 +7,6 @@ goes through numpy. Format: https://mcap.dev/spec. Every length read from a file
 from __future__ import annotations
 
 import struct
-import zlib
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from io import BytesIO
@@ -24,6 +23,7 @@ from mcap.opcode import Opcode
 from mcap.records import McapRecord
 
 from imutool.errors import ConfigError, LogError
+from imutool.mcap_io.crc import crc32
 
 MAGIC = b"\x89MCAP0\r\n"
 HEAD = struct.Struct("<BQ")  # opcode and length, ahead of every record
@@ -252,9 +252,9 @@ def unpack(record: bytes, offset: int) -> bytes:
         raise LogError(f"{where} does not unpack ({error})") from error
     if len(data) != head.size:
         raise LogError(f"{where} unpacks to {len(data)} bytes", expected=str(head.size))
-    if head.crc and zlib.crc32(data) != head.crc:
+    if head.crc and crc32(data) != head.crc:
         raise LogError(
-            f"{where} is damaged: its contents have CRC {zlib.crc32(data):08x}",
+            f"{where} is damaged: its contents have CRC {crc32(data):08x}",
             expected=f"{head.crc:08x}",
             fix="Copy the log again from where it was recorded",
         )
@@ -342,6 +342,6 @@ def pack(compression: str) -> Callable[[bytes], bytes]:
 def chunk_head(data: bytes, packed: bytes, compression: str, start_ns: int, end_ns: int) -> bytes:
     """The bytes of a Chunk record ahead of its packed data; the CRC is that of the unpacked."""
     name = compression.encode()
-    body = CHUNK_HEAD.pack(start_ns, end_ns, len(data), zlib.crc32(data), len(name)) + name
+    body = CHUNK_HEAD.pack(start_ns, end_ns, len(data), crc32(data), len(name)) + name
     body += struct.pack("<Q", len(packed))
     return HEAD.pack(Opcode.CHUNK, len(body) + len(packed)) + body
