@@ -30,7 +30,7 @@ from mcap.records import AttachmentIndex, ChunkIndex, Metadata, MetadataIndex
 from imutool.errors import ConfigError, LogError
 from imutool.mcap_io import records, schema
 from imutool.mcap_io.crc import crc32
-from imutool.mcap_io.listing import Listing, head, listing
+from imutool.mcap_io.listing import Listing, described, head, listing
 from imutool.mcap_io.log import DERIVED_KEY, ImuBatch, Log
 from imutool.mcap_io.records import HEAD, ChunkHead
 from imutool.mcap_io.structure import Block, Span, Structure
@@ -38,6 +38,7 @@ from imutool.mcap_io.verify import MODES, Verified, check_data_crc, crc_of, stat
 from imutool.mcap_io.write import CHUNK_BYTES, Chunk, LogWriter
 
 RUN_BYTES = 16 << 20  # verbatim bytes are handed to the kernel in runs of about this size: between them progress is told
+FEED_BYTES = 1 << 17  # of IMU messages make a batch: one chunk holds a few among its images, too few for numpy to be quick
 
 
 class NewTopic(NamedTuple):
@@ -171,6 +172,8 @@ class _Stream:
     make: Derived
     sources: set[int]
     ids: list[int]
+    waiting: list[records.Rows] = field(default_factory=list)  # of the source, of equal size
+    waits: int = 0  # bytes of them
     data: list[bytes] = field(default_factory=list)
     channels: list[UInt16[np.ndarray, " n"]] = field(default_factory=list)
     times: list[Int64[np.ndarray, " n"]] = field(default_factory=list)
@@ -248,6 +251,7 @@ class _Rewrite:
                     self._settle()
                 self.tell(self.copied, 2 * size)
             for stream in self.streams:
+                self._decode(stream)
                 self._add(stream)
             self._settle()
             self._skip(self.structure.data_end)
@@ -296,7 +300,7 @@ class _Rewrite:
             self.crc = crc_of(self.source, self.copied, end, self.crc)
         self.copied = self.upto = end
 
-    def _put(self, raw: bytes) -> int:
+    def _put(self, raw: memoryview) -> int:
         """Copies bytes that were read already; returns where they went."""
         self._settle()
         at = self.out.target.position
@@ -319,13 +323,13 @@ class _Rewrite:
         if block.compression is None:
             self._run(block)
             return
-        about = head(self.source, block)
-        listed = listing(self.source, block, about.size)
-        if listed is None or not self.structure.vouched or not self.wanted.isdisjoint(listed.counts):
-            self._unpacked(block, about, listed)
-        else:
-            moved = self._verbatim(block.end)
-            self._enter(block, about, listed, moved)
+        if self.structure.vouched and block.indexes and self.wanted.isdisjoint(block.indexes):
+            about, listed = described(self.source, block)
+            if listed is not None:
+                moved = self._verbatim(block.end)
+                self._enter(block, about, listed, moved)
+                return
+        self._unpacked(block)
 
     def _run(self, block: Block) -> None:
         """Messages outside chunks, which become a chunk."""
@@ -337,11 +341,14 @@ class _Rewrite:
         self.out.chunk(Chunk(raw, found.heads["channel"], found.times(), found.offsets), "none")
         self._skip(block.end)
 
-    def _unpacked(self, block: Block, about: ChunkHead, listed: Listing | None) -> None:
+    def _unpacked(self, block: Block) -> None:
         """A chunk that is looked into; its own message indexes follow it if they list what is in it, else new ones."""
-        raw = self.source.at(block.offset, block.length)
+        everything = memoryview(self.source.at(block.offset, block.end - block.offset))
+        raw, behind = everything[: block.length], everything[block.length :]
         try:
-            found = self.structure.unpacked(block, raw)
+            about = head(raw, block)
+            listed, data = listing(behind, block, about.size), records.unpack(raw, block.offset)
+            found, right = listed.messages(data, block.offset) if listed else (records.messages(data, block.offset), False)
         except LogError as error:
             self.structure.lose(block, error)
             self._settle()
@@ -351,12 +358,10 @@ class _Rewrite:
             self._define(opcode, found.data[first : first + length].tobytes(), block.offset)
         self._feed(found)
         self.checked += 1
-        at = self._put(raw)
-        if listed is not None and listed.lists(found):
-            self._enter(block, about, listed, at - block.offset)
-            self._verbatim(block.end)
+        if listed is not None and right:
+            self._enter(block, about, listed, self._put(everything) - block.offset)
         else:
-            entry = self._entry(block, about, at)
+            entry = self._entry(block, about, self._put(raw))
             self.out.index(entry, found.heads["channel"].copy(), found.times(), found.offsets)
             self._skip(block.end)
 
@@ -397,11 +402,26 @@ class _Rewrite:
 
     def _feed(self, found: records.Messages) -> None:
         for stream in self.streams:
-            mask = np.isin(found.heads["channel"], list(stream.sources))
+            mask = np.zeros(len(found.offsets), bool)
+            for channel in stream.sources:
+                mask |= found.heads["channel"] == channel
             for rows in records.rows(found, mask):
-                with self.log.named(stream.make.source_topic):
-                    for batch in self.log.decode_imu(stream.make.source_topic, rows):
-                        stream.take(batch)
+                if stream.waiting and stream.waiting[-1].payload.shape[1] != rows.payload.shape[1]:
+                    self._decode(stream)
+                stream.waiting.append(rows)
+                stream.waits += rows.payload.size
+            if stream.waits >= FEED_BYTES:
+                self._decode(stream)
+
+    def _decode(self, stream: _Stream) -> None:
+        """Hands the messages that waited over."""
+        if stream.waiting:
+            rows = records.Rows(*(np.concatenate(column) for column in zip(*stream.waiting, strict=True)))
+            stream.waiting.clear()
+            stream.waits = 0
+            with self.log.named(stream.make.source_topic):
+                for batch in self.log.decode_imu(stream.make.source_topic, rows):
+                    stream.take(batch)
 
     def _span(self, span: Span) -> None:
         """Any other record, as it is; attachments and metadata are entered in the summary."""

@@ -18,7 +18,7 @@ from mcap.records import AttachmentIndex, DataEnd, MetadataIndex, SummaryOffset
 from imutool.errors import LogError
 from imutool.mcap_io import records
 from imutool.mcap_io.crc import crc32
-from imutool.mcap_io.listing import head, listing
+from imutool.mcap_io.listing import described
 from imutool.mcap_io.log import Log
 from imutool.mcap_io.records import FOOTER_SIZE, HEAD, MAGIC
 from imutool.mcap_io.source import Source
@@ -79,12 +79,13 @@ class _Sums:
         """Checks a block, and its messages if it is to be taken `whole`."""
         if block.compression is None:
             raise LogError(f"messages lie outside chunks at byte {block.offset}", expected="chunks alone")
-        listed = listing(structure.source, block, head(structure.source, block).size)
+        _, listed = described(structure.source, block)
         if listed is None:
             if structure.unpack(block).offsets.size:
                 raise LogError(f"the message indexes behind the chunk at byte {block.offset} are damaged")
             return
-        if whole and not listed.lists(structure.unpack(block)):
+        raw = structure.source.at(block.offset, block.length) if whole else b""
+        if whole and not listed.messages(records.unpack(raw, block.offset), block.offset)[1]:
             raise LogError(f"the message indexes behind the chunk at byte {block.offset} list other messages than are in it")
         if (block.start_ns, block.end_ns) != (listed.start_ns, listed.end_ns):
             raise LogError(

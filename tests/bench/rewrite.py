@@ -224,7 +224,9 @@ def logs(gb: float, folder: Path, chosen: list[str]) -> Iterator[tuple[str, Path
 def table(name: str, size: int, spent: dict[str, Spent]) -> None:
     """Prints the jobs of one log, ratios against `cp` in the same run."""
     nothing, cp = spent.pop("nothing"), spent["cp"]
-    print(f"\n{name}, {size / 1e6:.0f} MB; python and imports alone take {nothing.cpu:.2f} s of CPU and {nothing.peak_mb:.0f} MB")
+    print(
+        f"\n{name}, {size / 1e6:.0f} MB; python and imports alone take {nothing.cpu:.2f} s of CPU and {nothing.peak_mb:.0f} MB"
+    )
     print(f"{'':24}{'CPU s':>8}{'/ cp':>8}{'wall s':>9}{'/ cp':>8}{'peak MB':>10}")
     for job_name, taken in spent.items():
         mine = taken if job_name in ("cp", "cp, sync", "debias", "import torch") else taken.beyond(nothing)
