@@ -30,7 +30,7 @@ from imutool.mcap_io.rewrite import Made, NewTopic, RewriteReport, Values, rewri
 from imutool.mcap_io.verify import Verified
 from imutool.recording import Imu, Recording, nanoseconds, seconds
 from imutool.rest_track import Samples
-from imutool.stationary import white_noise
+from imutool.stationary import Blocks, in_blocks, white_noise
 from imutool.turn_on import NoRestError, TurnOn, find, following, over_all_rest
 from imutool.turn_on import smooth as smooth_rest
 
@@ -231,11 +231,16 @@ def estimate_at_rest(imu: Imu, where: str | Path) -> tuple[BiasModel, TurnOn]:
     """The static model with its bias: the mean over all time at rest, for a log nobody trained a model for.
 
     Raises:
+        DataError: fewer than two samples.
         ModelError: the log never rests.
     """
+    return _estimate(in_blocks([(imu.t_ns, imu.gyro, imu.accel)], imu.period_s), where)
+
+
+def _estimate(blocks: Blocks, where: str | Path) -> tuple[BiasModel, TurnOn]:
     model = static.Model()
     try:
-        return model, over_all_rest(model, imu)
+        return model, over_all_rest(model, blocks)
     except DataError as error:
         raise _nothing_known(where) from error
 
@@ -261,9 +266,11 @@ def _only_imu(log: Log) -> str:
 def _prepare(source: Path, topic: str, name: str | Path | None, init: str, smooth: bool) -> tuple[BiasModel, TurnOn]:
     """Model and start for one IMU."""
     untrained = name is None or str(name) == static.Model.method
-    if untrained and init == "auto" and not smooth:
-        return estimate_at_rest(_samples(source, topic), source)
     head = _head(source, topic, init)
+    if untrained and init == "auto" and not smooth:
+        with Log(source) as log:
+            batches = ((batch.stamp_ns, batch.gyro, batch.accel) for batch in log.imu_batches(topic))
+            return _estimate(in_blocks(batches, head.imu.period_s), source)
     rate_hz = 1.0 / head.imu.period_s
     model: BiasModel = static.Model() if name is None or untrained else find_model(name, rate_hz)
     if not untrained:
