@@ -22,8 +22,8 @@ from imutool.convert import convert
 from imutool.debias import OnlineDebiaser, apply, debias, estimate_at_rest
 from imutool.errors import ConfigError, LogError, ModelError
 from imutool.mcap_io import schema
+from imutool.mcap_io.digest import sha256
 from imutool.mcap_io.read import read
-from imutool.mcap_io.rewrite import sha256
 from imutool.mcap_io.write import write
 from imutool.physics.flight import flight
 from imutool.recording import Frames, Recording, Scalars, seconds
