@@ -73,32 +73,30 @@ class Discovery:
 def discover(logs: Sequence[Weighed], candidates: Sequence[Physics], later: Sequence[Sequence[Physics]] = ()) -> Discovery:
     """The effects that the logs show together; those of `later` are asked, in turn, when those before have nothing to say."""
     everything = tuple(one for stage in later for one in stage)
-    first = _Search(logs, tuple(candidates), everything)
     start = fit(logs, ())
+    first = _Search(logs, tuple(candidates), everything, start.objective)
     named, nameless = (max((r.gain for r in first.ranked(start, some)), default=0.0) for some in (first.named, first.others))
     paths = [(first.others, []), ((), list(later))] if nameless > named + CLEARLY else [((), list(later)), (first.others, [])]
-    search, now = _path(logs, first.named, *paths[0])
+    search, now = _path(first, start, *paths[0])
     churned = len(now.chosen) >= SUSPICIOUS or any(":" in name for name in now.names)
     if everything and churned and now.objective > WELL * 6 * now.rows:
         # many small parts that do not add up, or one without a name: perhaps one thing alone is the better answer
-        other = _path(logs, first.named, *paths[1])
+        other = _path(first, start, *paths[1])
         if cost(other[1]) < cost(now) - CLEARLY:
             search, now = other
     return search.judged(now)
 
 
-def _path(
-    logs: Sequence[Weighed], named: tuple[Physics, ...], others: tuple[Physics, ...], waiting: list[Sequence[Physics]]
-) -> tuple[_Search, Fit]:
+def _path(first: _Search, now: Fit, others: tuple[Physics, ...], waiting: list[Sequence[Physics]]) -> tuple[_Search, Fit]:
     """One effect after another comes in, until none of the candidates that there are by then explains more than chance."""
-    search, now = _Search(logs, named, others), fit(logs, ())
+    search = replace(first, others=others)
     for _ in range(ROUNDS):
         hopeless = len(now.chosen) > SUSPICIOUS and now.objective > HOPELESS * 6 * now.rows
         better = search.added(now) if len(now.chosen) < MOST and not hopeless else None
         if better is not None:
             now = search.pruned(search.exchanged(better))
         elif waiting:
-            search = _Search(logs, search.named, (*search.others, *waiting.pop(0)))
+            search = search.also(waiting.pop(0))
         else:
             break
     return search, now
@@ -124,20 +122,27 @@ class _Ranked(NamedTuple):
 class _Search:
     logs: Sequence[Weighed]
     named: tuple[Physics, ...]
-    others: tuple[Physics, ...] = ()
-    starts: dict[str, list[Theta]] = field(init=False)
-    luck: dict[str, float] = field(init=False)  # log of how much likelier chance looks like it, for being picked from many
-    before: float = field(init=False)  # squares of white residuals with nothing but a constant bias
+    others: tuple[Physics, ...]
+    before: float  # squares of white residuals with nothing but a constant bias
+    starts: dict[str, list[Theta]] = field(default_factory=dict)
+    luck: dict[str, float] = field(default_factory=dict)  # log of how much likelier chance looks like it: picked from many
+    known: dict[str, _Ranked] = field(default_factory=dict)  # beside the effects of one fit
+    known_for: Fit | None = None
 
     def __post_init__(self) -> None:
-        self.before = fit(self.logs, ()).objective
-        self.starts = {one.name: self._starts(one) for one in (*self.named, *self.others)}
-        self.luck = {one.name: self._luck(one) for one in (*self.named, *self.others)}
+        for one in (*self.named, *self.others):
+            if one.name not in self.starts:
+                self.starts[one.name] = self._starts(one)
+                self.luck[one.name] = self._luck(one)
+
+    def also(self, others: Sequence[Physics]) -> _Search:
+        """With more candidates; what is known of those there were stays known."""
+        return replace(self, others=(*self.others, *others))
 
     @property
     def tried(self) -> int:
         """All starts of all candidates: what the chance of a false finding is multiplied by."""
-        return sum(len(starts) for starts in self.starts.values())
+        return sum(len(self.starts[one.name]) for one in (*self.named, *self.others))
 
     def _starts(self, physics: Physics) -> list[Theta]:
         if physics.starts is None:
@@ -173,15 +178,17 @@ class _Search:
 
     def ranked(self, now: Fit, candidates: Sequence[Physics]) -> list[_Ranked]:
         """Candidates by what one linear step promises, each from its best start."""
-        panel = _Panel(self.logs, now)
-        out = []
-        for physics in candidates:
-            if physics.name in now.names:
-                continue
-            gains = [(panel.gain(physics, start), start) for start in self.starts[physics.name]]
-            gain, start = max(gains, key=lambda pair: pair[0])
-            out.append(_Ranked(self.chance(physics, gain), physics, start, gain))
-        return sorted(out, key=lambda entry: entry.score)
+        if self.known_for is not now:
+            self.known_for, self.known = now, {}
+        asked = [physics for physics in candidates if physics.name not in now.names]
+        panel = None
+        for physics in asked:
+            if physics.name not in self.known:
+                panel = panel or _Panel(self.logs, now)
+                gains = [(panel.gain(physics, start), start) for start in self.starts[physics.name]]
+                gain, start = max(gains, key=lambda pair: pair[0])
+                self.known[physics.name] = _Ranked(self.chance(physics, gain), physics, start, gain)
+        return sorted((self.known[physics.name] for physics in asked), key=lambda entry: entry.score)
 
     def exchanged(self, now: Fit) -> Fit:
         """With an effect replaced by another of the catalogue that explains more, where there is one."""
