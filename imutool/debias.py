@@ -27,7 +27,7 @@ from imutool.mcap_io.digest import Digest
 from imutool.mcap_io.log import Clock, ImuBatch, Log
 from imutool.mcap_io.read import read
 from imutool.mcap_io.rewrite import Made, NewTopic, RewriteReport, Values, rewrite
-from imutool.mcap_io.verify import Verified
+from imutool.mcap_io.verify import Verified, refuse_unknown
 from imutool.recording import Imu, Recording, nanoseconds, seconds
 from imutool.rest_track import Samples
 from imutool.stationary import Blocks, in_blocks, white_noise
@@ -169,6 +169,7 @@ def debias(
         ModelError: no model and no time at rest; a model for another rate; a damaged model file.
     """
     refuse_smooth(init, smooth)
+    refuse_unknown(check)
     given = dict(model) if isinstance(model, Mapping) else {} if model is None else {"": model}
     with Log(source) as log:
         topics = _chosen(log, imus, given)

@@ -34,7 +34,7 @@ from imutool.mcap_io.listing import Listing, described, head, listing
 from imutool.mcap_io.log import DERIVED_KEY, ImuBatch, Log
 from imutool.mcap_io.records import HEAD, ChunkHead
 from imutool.mcap_io.structure import Block, Span, Structure
-from imutool.mcap_io.verify import MODES, Verified, check_data_crc, crc_of, stated_crc, verify
+from imutool.mcap_io.verify import Verified, check_data_crc, crc_of, refuse_unknown, stated_crc, verify
 from imutool.mcap_io.write import CHUNK_BYTES, Chunk, LogWriter
 
 RUN_BYTES = 16 << 20  # verbatim bytes are handed to the kernel in runs of about this size: between them progress is told
@@ -115,8 +115,7 @@ def rewrite(
         LogError: the source is damaged, lacks a source topic, has a new topic already, changed meanwhile, or holds IMU
             messages that no model can take.
     """
-    if check not in MODES:
-        raise ConfigError(f"{check!r}", where="--verify", expected=", ".join(MODES))
+    refuse_unknown(check)
     if target is not None and target.exists() and source.exists() and target.samefile(source):
         raise ConfigError("the target is the source", where=target, fix="Choose another name")
     place = source.resolve() if target is None else target

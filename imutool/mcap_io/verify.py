@@ -15,7 +15,7 @@ from typing import NamedTuple
 from mcap.opcode import Opcode
 from mcap.records import AttachmentIndex, DataEnd, MetadataIndex, SummaryOffset
 
-from imutool.errors import LogError
+from imutool.errors import ConfigError, LogError
 from imutool.mcap_io import records
 from imutool.mcap_io.crc import crc32
 from imutool.mcap_io.listing import described
@@ -34,6 +34,16 @@ class Verified(NamedTuple):
     mode: str
     chunks_checked: int
     chunks: int
+
+
+def refuse_unknown(mode: str) -> None:
+    """Says what can be asked for.
+
+    Raises:
+        ConfigError: something else was.
+    """
+    if mode not in MODES:
+        raise ConfigError(f"{mode!r}", where="--verify", expected=", ".join(MODES))
 
 
 def verify(

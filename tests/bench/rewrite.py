@@ -113,15 +113,18 @@ def write_apart(path: Path, gb: float, packing: str, *, data_crc: bool) -> None:
     packed, plain = images()
     with LogWriter(path, compression=packing, data_crc=data_crc) as log:
         imu, camera = log.channel(IMU, schema.IMU), log.channel(CAMERA, schema.IMAGE)
-        each = 2_900
-        for k in range(int(gb * PER_GB)):
-            if k * IMU_PER_IMAGE % each < IMU_PER_IMAGE:
+        each, pairs = 2_900, 2  # messages of the IMU, and pairs of images, that make a chunk
+        for k in range(0, int(gb * PER_GB), pairs):
+            if k * IMU_PER_IMAGE % each < pairs * IMU_PER_IMAGE:
                 count = min(each, (int(gb * PER_GB) - k) * IMU_PER_IMAGE)
-                log.chunk(_chunk(imu, *imu_rows(IMU_PER_IMAGE * k, count)))
-            t_ns = START_NS + PERIOD_NS * IMU_PER_IMAGE * k
-            one = [message_record(camera, k, t_ns, data) for data in (packed[k % KEPT], plain[k % KEPT])]
-            offsets = np.array([0, len(one[0])])
-            log.chunk(Chunk(b"".join(one), np.full(2, camera, np.uint16), np.full(2, t_ns), offsets))
+                log.chunk(_chunk(imu, *imu_rows(k * IMU_PER_IMAGE // each * each, count)))
+            times = START_NS + PERIOD_NS * IMU_PER_IMAGE * np.arange(k, k + pairs).repeat(2)
+            data = [blob for j in range(k, k + pairs) for blob in (packed[j % KEPT], plain[j % KEPT])]
+            parts = [
+                message_record(camera, k + j // 2, int(t), blob) for j, (t, blob) in enumerate(zip(times, data, strict=True))
+            ]
+            offsets = np.cumsum([0, *map(len, parts[:-1])])
+            log.chunk(Chunk(b"".join(parts), np.full(len(parts), camera, np.uint16), times, offsets))
 
 
 def _chunk(channel: int, t_ns: np.ndarray, payloads: np.ndarray) -> Chunk:
