@@ -34,7 +34,7 @@ STORES = {
 }
 ACCOUNTS = ("az", "abfs")  # these say CONTAINER@ACCOUNT, which is no secret
 BLOCK_BYTES = 4 << 20
-BLOCKS = 4  # kept, least recently used first out: a scan, the message indexes behind its chunk, and the summary
+CACHE, CACHE_OPTIONS = "blockcache", {"maxblocks": 4}  # kept, least recently used first out: a scan, the message indexes behind its chunk, and the summary
 
 
 class Opened(NamedTuple):
@@ -121,7 +121,7 @@ def opened(where: Place) -> Opened:
         file = where.open("rb", buffering=0)
         return Opened(file, os.fstat(file.fileno()).st_size)
     remote = where.fs.open(
-        where.path, "rb", block_size=BLOCK_BYTES, cache_type="blockcache", cache_options={"maxblocks": BLOCKS}
+        where.path, "rb", block_size=BLOCK_BYTES, cache_type=CACHE, cache_options=dict(CACHE_OPTIONS)
     )
     if remote.size is None:
         raise OSError("the server does not say how long it is, so no part of it can be asked for")

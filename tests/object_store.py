@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import socket
 import threading
 from collections.abc import Callable, Iterable, Iterator
 from typing import Any, NamedTuple
@@ -63,6 +64,7 @@ class Store:
         if environ["REQUEST_METHOD"] == "GET":
             start("206 Partial Content", [("Content-Length", "100000"), ("Content-Type", "binary/octet-stream")])
             yield b"half of it"
+        environ["werkzeug.socket"].shutdown(socket.SHUT_RDWR)
         raise ConnectionResetError("as told")
 
     def stop(self) -> None:
