@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
     Place: TypeAlias = Path | UPath
 else:
-    Place = Union[Path, "upath.UPath"]  # noqa: UP007  beartype looks the name up, and imports upath, at the first URL it meets
+    Place = Union[Path, "upath.UPath"]
 
 CLOUD = "pip install 'imutool[cloud]'"
 STORES = {
@@ -34,7 +34,10 @@ STORES = {
 }
 ACCOUNTS = ("az", "abfs")  # these say CONTAINER@ACCOUNT, which is no secret
 BLOCK_BYTES = 4 << 20
-CACHE, CACHE_OPTIONS = "blockcache", {"maxblocks": 4}  # kept, least recently used first out: a scan, the message indexes behind its chunk, and the summary
+CACHE, CACHE_OPTIONS = (
+    "blockcache",
+    {"maxblocks": 4},
+)  # kept, least recently used first out: a scan, the message indexes behind its chunk, and the summary
 
 
 class Opened(NamedTuple):
@@ -120,9 +123,7 @@ def opened(where: Place) -> Opened:
     if isinstance(where, Path):
         file = where.open("rb", buffering=0)
         return Opened(file, os.fstat(file.fileno()).st_size)
-    remote = where.fs.open(
-        where.path, "rb", block_size=BLOCK_BYTES, cache_type=CACHE, cache_options=dict(CACHE_OPTIONS)
-    )
+    remote = where.fs.open(where.path, "rb", block_size=BLOCK_BYTES, cache_type=CACHE, cache_options=dict(CACHE_OPTIONS))
     if remote.size is None:
         raise OSError("the server does not say how long it is, so no part of it can be asked for")
     return Opened(remote, remote.size)

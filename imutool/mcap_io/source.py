@@ -12,11 +12,11 @@ CUT_SHORT = "Save what is there with `imutool repair`, or copy it again from whe
 class Source:
     """The bytes of a file or an object in a store that is only ever read, with a refusal in place of a short read."""
 
-    def __init__(self, path: Place) -> None:
+    def __init__(self, path: Place, expected: str = "an MCAP log") -> None:
         try:
             self.file, self.size = opened(path)
         except failures(path) as error:
-            raise ConfigError(f"cannot be opened ({reason(error)})", where=path, expected="an MCAP log") from error
+            raise ConfigError(f"cannot be opened ({reason(error)})", where=path, expected=expected) from error
         self.path = path
 
     def at(self, offset: int, length: int) -> bytes:
