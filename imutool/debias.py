@@ -18,7 +18,7 @@ from jaxtyping import Float64, Int64, UInt8
 from imutool import __version__
 from imutool.bias import static
 from imutool.bias._base import BiasModel, OneByOne, Stream, Vector6
-from imutool.bias._file import check_rate, find_model, shipped_for
+from imutool.bias._file import check_rate, find_model, shipped, shipped_for
 from imutool.certainty import Certainty
 from imutool.config import plain
 from imutool.errors import ConfigError, DataError, LogError, ModelError
@@ -166,11 +166,13 @@ def debias(
     with Log(source) as log:
         topics = list(imus) or [_only_imu(log)]
         about = log.metadata().get("imutool", {})
-    named = about.get("model") or shipped_for(about.get("sensor"), about.get("dataset"))
+    named = model
+    if model is None:  # what the log names must be one that ships: a log may come from anybody
+        named = shipped(about["model"]) if about.get("model") else shipped_for(about.get("sensor"), about.get("dataset"))
     derived, starts, models, records = [], {}, {}, {}
     origin = {"source_file": source.name, "source_sha256": sha256(source), "source_size": str(source.stat().st_size)}
     for topic in topics:
-        chosen, start = _prepare(source, topic, model or named, init, smooth)
+        chosen, start = _prepare(source, topic, named, init, smooth)
         derived.append(Debiaser(topic, chosen, start))
         starts[topic], models[topic] = start, str(chosen.card.get("name", chosen.method))
         records[topic] = _provenance(topic, chosen, start, init, smooth) | origin
