@@ -10,7 +10,7 @@ from __future__ import annotations
 import os
 import re
 from pathlib import Path
-from typing import TYPE_CHECKING, BinaryIO, NamedTuple, TypeAlias, Union
+from typing import TYPE_CHECKING, BinaryIO, ForwardRef, NamedTuple, TypeAlias
 from urllib.parse import urlsplit
 
 from imutool.errors import ConfigError
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
     Place: TypeAlias = Path | UPath
 else:
-    Place = Union[Path, "upath.UPath"]
+    Place = Path | ForwardRef("upath.UPath")  # beartype looks the name up, and imports upath, at the first URL it meets
 
 CLOUD = "pip install 'imutool[cloud]'"
 STORES = {

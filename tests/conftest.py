@@ -101,6 +101,7 @@ def store(store_server: Any, monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
     """The S3 store of tests/object_store.py with an empty bucket, found by the usual environment."""
     for name, value in store_server.environment.items():
         monkeypatch.setenv(name, value)
+    monkeypatch.setattr("s3fs.S3FileSystem.retries", 2)  # by itself it asks five times, for longer each time
     store_server.empty()
     yield store_server
     store_server.fault = lambda _: None

@@ -344,7 +344,7 @@ def test_a_log_cannot_name_a_file_as_its_model(
     (tmp_path / "physics.toml").touch()
     log = tmp_path / "log.mcap"
     write(Recording("r", recording.imu, metadata={"imutool": {"model": name.format(tmp_path)}}), log)
-    with pytest.raises(ModelError, match="no model .*expected a file, or one of"):
+    with pytest.raises(ModelError, match=r"no model .*expected a file, or one of"):
         debias(log, tmp_path / "out.mcap")
     assert not (tmp_path / "out.mcap").exists()
 

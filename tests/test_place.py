@@ -147,20 +147,28 @@ def test_a_large_object_goes_up_in_parts_and_comes_back(store: Any, monkeypatch:
     assert sum("partNumber" in request.query for request in store.requests) == 3
 
 
+def filled(url: str, pieces: int = 1, size: int = 4, then: Callable[[Target], object] = lambda _: None) -> None:
+    """Writes an object of some pieces, and does something to it before it is put in its place."""
+    with Target(place(url)) as target:
+        for _ in range(pieces):
+            target.write(bytes(size))
+        then(target)
+
+
 @pytest.mark.parametrize("error", [ValueError("a bug"), KeyboardInterrupt()])
+@pytest.mark.parametrize("complete", [False, True])
 def test_an_upload_that_is_given_up_leaves_neither_parts_nor_objects(
-    store: Any, monkeypatch: pytest.MonkeyPatch, error: BaseException
+    store: Any, monkeypatch: pytest.MonkeyPatch, error: BaseException, complete: bool
 ) -> None:
+    def give_up(target: Target) -> None:
+        if complete:
+            target.flush()
+        assert (store.keys() if complete else store.uploads()) == [target.temporary.name]
+        raise error
+
     monkeypatch.setattr(upload, "PART_BYTES", LEAST_PART)
-    with pytest.raises(type(error)), Target(place("s3://fleet/out")) as target:
-        target.write(bytes(6 * MIB))
-        assert store.uploads() == [target.temporary.name]
-        raise error
-    assert (store.uploads(), store.keys()) == ([], [])
-    with pytest.raises(type(error)), Target(place("s3://fleet/out")) as target:
-        target.write(bytes(6 * MIB))
-        target.flush()
-        raise error
+    with pytest.raises(type(error)):
+        filled("s3://fleet/out", 1, 6 * MIB, give_up)
     assert (store.uploads(), store.keys()) == ([], [])
 
 
@@ -172,18 +180,19 @@ def test_a_target_that_is_forgotten_leaves_nothing(store: Any) -> None:
 
 
 def test_an_object_that_appears_meanwhile_is_not_replaced(store: Any) -> None:
-    with pytest.raises(ConfigError, match=r"s3://fleet/out: the target exists"), Target(place("s3://fleet/out")) as target:
-        target.write(b"ours")
-        store.put("out", b"theirs")
+    with pytest.raises(ConfigError, match=r"s3://fleet/out: the target exists"):
+        filled("s3://fleet/out", then=lambda _: store.put("out", b"theirs"))
     assert store.keys() == ["out"]
     assert store.get("out") == b"theirs"
 
 
 def test_a_temporary_object_that_somebody_changed_is_not_published(store: Any) -> None:
-    with pytest.raises(ConfigError, match="was changed by somebody"), Target(place("s3://fleet/out")) as target:
-        target.write(b"ours")
+    def change(target: Target) -> None:
         target.flush()
         store.put(target.temporary.name, b"not!")
+
+    with pytest.raises(ConfigError, match="was changed by somebody"):
+        filled("s3://fleet/out", then=change)
     assert store.keys() == []
 
 
@@ -222,14 +231,17 @@ def test_a_store_that_fails_once_is_asked_again(store: Any, flight: bytes, wante
 def test_a_store_that_fails_for_good_while_a_log_is_read_is_said_and_nothing_is_left(
     store: Any, flight: bytes, how: str
 ) -> None:
-    source = place(store.put("in.mcap", flight))
-    with Log(source) as log:
-        store.fault = failing(of("GET", "in.mcap"), how)
-        with pytest.raises(LogError, match=r"s3://fleet/in.mcap.*cannot be read at byte") as raised:
-            log._source.file.cache._fetch_block_cached.cache_clear()
-            list(log.imu_batches("/imu0"))
+    url = store.put("in.mcap", flight + bytes(2 * BLOCK_BYTES))
+    source = Source(place(url))
+    assert source.at(0, 8) == flight[:8]
+    store.fault = failing(of("GET", "in.mcap"), how)
+    with pytest.raises(LogError, match=r"cannot be read at byte 5000000 \(.+\)") as raised:
+        source.at(5_000_000, 10)
+    source.file.close()
     assert store.secret not in str(raised.value)
-    assert store.keys() == ["in.mcap"]
+    with pytest.raises(LogError, match=r"s3://fleet/in.mcap: cannot be read at byte"):
+        rewrite(place(url), place("s3://fleet/out.mcap"), [], metadata={})
+    assert (store.keys(), store.uploads()) == (["in.mcap"], [])
 
 
 @pytest.mark.parametrize("how", ["500", "cut"])
@@ -241,12 +253,8 @@ def test_a_store_that_fails_for_good_while_a_log_is_written_is_said_and_nothing_
 ) -> None:
     monkeypatch.setattr(upload, "PART_BYTES", LEAST_PART)
     store.fault = failing(wanted, how)
-    with (
-        pytest.raises(ConfigError, match=r"s3://fleet/large: cannot be written \(.+\)") as raised,
-        Target(place("s3://fleet/large")) as target,
-    ):
-        target.write(bytes(6 * MIB))
-        target.write(bytes(6 * MIB))
+    with pytest.raises(ConfigError, match=r"s3://fleet/large: cannot be written \(.+\)") as raised:
+        filled("s3://fleet/large", 2, 6 * MIB)
     assert store.secret not in str(raised.value)
     assert (store.uploads(), store.keys()) == ([], [])
 
@@ -257,15 +265,14 @@ def test_what_the_store_refuses_is_said(store: Any, flight: bytes) -> None:
     with pytest.raises(ConfigError, match=r"s3://none/in.mcap: cannot be opened \(no such object, or no such bucket\)"):
         Log(place("s3://none/in.mcap"))
     with pytest.raises(ConfigError, match=r"s3://none/out: cannot be written \(no such object, or no such bucket\)"):
-        with Target(place("s3://none/out")) as target:
-            target.write(b"ours")
+        filled("s3://none/out")
     store.fault = failing(of("HEAD", "in.mcap"), "403")
+    url = store.put("in.mcap", flight)
     with pytest.raises(ConfigError, match=r"s3://fleet/in.mcap: cannot be opened \(the store refuses access: Forbidden\)"):
-        Log(place(store.put("in.mcap", flight)))
+        Log(place(url))
     store.fault = failing(of("PUT", "partial"), "403")
     with pytest.raises(ConfigError, match=r"s3://fleet/out: cannot be written \(the store refuses access"):
-        with Target(place("s3://fleet/out")) as target:
-            target.write(b"ours")
+        filled("s3://fleet/out")
     assert store.keys() == ["in.mcap"]
 
 
