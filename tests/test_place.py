@@ -196,6 +196,16 @@ def test_a_temporary_object_that_somebody_changed_is_not_published(store: Any) -
     assert store.keys() == []
 
 
+def test_a_large_object_that_cannot_be_copied_to_its_key_leaves_no_parts(store: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("s3fs.core.MANAGED_COPY_THRESHOLD", 1)  # from where s3fs copies in parts; else 150 MiB
+    filled("s3://fleet/large", 2, 6 * MIB)
+    assert (store.uploads(), store.keys()) == ([], ["large"])
+    store.fault = failing(of("PUT", "larger", "partNumber"), "500")
+    with pytest.raises(ConfigError, match=r"s3://fleet/larger: cannot be written"):
+        filled("s3://fleet/larger", 2, 6 * MIB)
+    assert (store.uploads(), store.keys()) == ([], ["large"])
+
+
 # ── a store that fails ──
 
 

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-import contextlib
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from typing import TYPE_CHECKING, Any
 
 from imutool.errors import ConfigError
@@ -44,9 +45,30 @@ class Upload:
         """
         if self._seal(self.temporary) != self.seal:
             raise ConfigError("was changed by somebody while it was written", where=self.temporary)
-        self.path.fs.cp_file(self.temporary.path, self.path.path)
+        with self._no_parts_left():
+            self.path.fs.cp_file(self.temporary.path, self.path.path)
         self._seal(self.path)
         self.path.fs.rm_file(self.temporary.path)
+
+    @contextmanager
+    def _no_parts_left(self) -> Iterator[None]:
+        """S3 copies large objects in parts, and s3fs leaves those of a copy that fails lying there: they are aborted here."""
+        before = self._uploads()
+        try:
+            yield
+        except BaseException:
+            with suppress(Exception):  # one thing after another can fail; the first is what is said
+                for upload in self._uploads() - before:  # the others are somebody else's
+                    self.path.fs.abort_mpu(*upload)
+            raise
+
+    def _uploads(self) -> set[tuple[str, str, str]]:
+        """Bucket, key and id of every unfinished upload to the target's key, in stores that tell."""
+        bucket, _, key = self.path.path.partition("/")
+        with suppress(Exception):  # no such call, or not allowed
+            found = self.path.fs.list_multipart_uploads(bucket)
+            return {(bucket, key, entry["UploadId"]) for entry in found if entry["Key"] == key}
+        return set()
 
     def _seal(self, place: UPath) -> str:
         """What identifies the contents of an object that must be as long as what was written."""
@@ -60,7 +82,7 @@ class Upload:
         if self.file is None:
             return
         self.file.closed = True  # else the file would complete the upload when it is collected
-        with contextlib.suppress(Exception):
+        with suppress(Exception):
             self.file.discard()
-        with contextlib.suppress(Exception):  # it is there if the upload was complete, or an answer was lost on its way
+        with suppress(Exception):  # it is there if the upload was complete, or an answer was lost on its way
             self.temporary.fs.rm_file(self.temporary.path)
