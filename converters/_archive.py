@@ -66,6 +66,7 @@ def _listing(path: Path, mtime_ns: int, size: int) -> Listing:  # the key notice
 def _list_zip(path: Path) -> Listing:
     listing = Listing()
     with refusing(path), zipfile.ZipFile(path) as archive:
+        total, most = 0, MAX_RATIO * path.stat().st_size + RATIO_FREE
         for number, info in enumerate(archive.infolist()):
             name = _checked_name(path, info.filename, number)
             if not name.isprintable():  # such as a Mac's "Icon\r": nothing that is read has such a name
@@ -86,6 +87,9 @@ def _list_zip(path: Path) -> Listing:
                         where=f"{path}/{name}",
                         expected=f"at most {MAX_RATIO} to 1",
                     )
+                total += info.file_size
+                if total > most:  # members may share their bytes, each of them within its own bound
+                    raise DataError(f"unpacks to more than {most} bytes", where=path, expected=f"at most {MAX_RATIO} to 1")
     return listing
 
 

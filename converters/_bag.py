@@ -1,26 +1,28 @@
 """Makes a Recording of a ROS 1 bag: topics are found by their type, the data sets' own names are preferred.
 
 The stamps are those of the message headers. Raw images (`sensor_msgs/Image`) and positions without orientation
-(`PointStamped`) are not carried over; the metadata record `imutool/skipped` names them.
+(`PointStamped`) are not carried over; the metadata record `imutool/skipped` names them. A bag that its recorder did not
+finish, or that is cut, has no index: what can be read of it is converted, and `imutool/repairs` says so.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import logging
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from functools import partial
+from functools import lru_cache, partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from converters import Sequence, _asl
 from converters._table import Table
-from imutool.errors import ConfigError, DataError, ImutoolError
+from imutool.bag.walk import Bag
+from imutool.errors import ConfigError, DataError, LogError
 from imutool.recording import Frames, Imu, Poses, Recording, Scalars
 
-if TYPE_CHECKING:
-    from rosbags.rosbag1 import Reader
+logger = logging.getLogger(__name__)
 
 IMU = "sensor_msgs/msg/Imu"
 POSES = ("geometry_msgs/msg/TransformStamped", "geometry_msgs/msg/PoseStamped", "nav_msgs/msg/Odometry")
@@ -32,14 +34,40 @@ SKIPPED = {
 
 
 def topics(path: Path) -> dict[str, str]:
-    """Message type by topic.
+    """Message type by topic, in ROS 2 spelling.
 
     Raises:
-        ConfigError: rosbags is not installed.
         DataError: the bag cannot be read.
     """
+    return _known(path)[0]
+
+
+def _known(path: Path) -> tuple[dict[str, str], str]:
+    """Message type by topic; and what is wrong with the bag, or nothing. Without an index, all of it is gone through."""
+    try:
+        status = path.stat()
+    except OSError as error:
+        raise DataError(f"cannot be read ({error.strerror})", where=path) from error
+    return _known_once(path, status.st_mtime_ns, status.st_size)
+
+
+@lru_cache(maxsize=64)  # three converters ask about the same bag
+def _known_once(path: Path, mtime_ns: int, size: int) -> tuple[dict[str, str], str]:  # the key notices a changed file
     with _open(path) as bag:
-        return {connection.topic: connection.msgtype for connection in bag.connections}
+        wrong = ""
+        if not bag.indexed:
+            count = sum(len(chunk.messages) for chunk in bag.chunks())
+            if not count:
+                raise DataError("cannot be read as a ROS 1 bag (no index, and not one message)", where=path)
+            lost = f"{bag.lost} stretches of it lost, the first: {bag.losses[0].reason}" if bag.lost else "nothing of it lost"
+            wrong = f"the bag has no index; {count} messages were found chunk by chunk, {lost}"
+        return {c.topic: _ros2(c.kind) for _, c in sorted(bag.connections.items())}, wrong
+
+
+def _ros2(kind: str) -> str:
+    """A message type as ROS 2 spells it."""
+    package, _, name = kind.partition("/")
+    return f"{package}/msg/{name}" if "/" not in name else kind
 
 
 def recording(sequence: Sequence, *, dataset: str, sensor: str, truths: tuple[str, ...], images: bool = True) -> Recording:
@@ -49,7 +77,7 @@ def recording(sequence: Sequence, *, dataset: str, sensor: str, truths: tuple[st
         ConfigError: rosbags is not installed.
         DataError: no IMU, several without a known name, or a defect in the data, with topic and message number.
     """
-    kinds = topics(sequence.path)
+    kinds, wrong = _known(sequence.path)
     imu_topic = _imu_topic(sequence.path, [topic for topic, kind in kinds.items() if kind == IMU])
     pose_topics = sorted((t for t, kind in kinds.items() if kind in POSES), key=lambda t: (t not in truths, t))
     skipped = {topic: SKIPPED[kind] for topic, kind in kinds.items() if kind in SKIPPED}
@@ -63,6 +91,9 @@ def recording(sequence: Sequence, *, dataset: str, sensor: str, truths: tuple[st
         named[target] = topic
         if repeated := _asl.add_truth(table, target, poses, scalars):
             repairs[target] = _asl.REPEATED.format(repeated)
+    if wrong:
+        logger.warning("%s: %s", sequence.path, wrong)
+        repairs["bag"] = wrong
     metadata = {
         "imutool": {"dataset": dataset, "sequence": sequence.name, "sensor": sensor},
         "imutool/topics": named,
@@ -132,12 +163,13 @@ def _table(path: Path, topic: str, rows: list[tuple[int, list[float]]], columns:
 
 
 def _frames(path: Path, topic: str) -> Frames:
-    first = next(_messages(path, topic), None)
-    with _open(path) as bag:
-        count = sum(connection.msgcount for connection in bag.connections if connection.topic == topic)
+    first, count = None, 0
+    for _, raw in _payloads(path, topic):
+        first, count = raw if first is None else first, count + 1
+    image = None if first is None else _decoder(path)(first, IMAGE)
     # "jpeg", "png", or as image_transport writes it: "bgr8; jpeg compressed bgr8"
-    known = (name for name in ("png", "jpeg") if first is not None and name in first[1].format.replace("jpg", "jpeg"))
-    return Frames(next(known, first[1].format if first else ""), count, partial(_each, path, topic))
+    known = (name for name in ("png", "jpeg") if image is not None and name in image.format.replace("jpg", "jpeg"))
+    return Frames(next(known, image.format if image else ""), count, partial(_each, path, topic))
 
 
 def _each(path: Path, topic: str) -> Iterator[tuple[int, bytes]]:
@@ -146,30 +178,52 @@ def _each(path: Path, topic: str) -> Iterator[tuple[int, bytes]]:
 
 
 def _messages(path: Path, topic: str) -> Iterator[tuple[int, Any]]:
-    """Header stamp (ns) and message, in the order of their arrival."""
-    from rosbags.typesys import Stores, get_typestore
+    """Header stamp (ns) and message, in the order of the file."""
+    decode = _decoder(path)
+    for kind, raw in _payloads(path, topic):
+        message = decode(raw, kind)
+        yield message.header.stamp.sec * 10**9 + message.header.stamp.nanosec, message
 
+
+def _payloads(path: Path, topic: str) -> Iterator[tuple[str, bytes]]:
+    """Type and bytes of every message of a topic."""
     with _open(path) as bag:
-        store = get_typestore(Stores.ROS1_NOETIC)
-        wanted = [connection for connection in bag.connections if connection.topic == topic]
-        for connection, _, raw in bag.messages(connections=wanted) if wanted else ():
-            message: Any = store.deserialize_ros1(raw, connection.msgtype)
-            yield message.header.stamp.sec * 10**9 + message.header.stamp.nanosec, message
+        for chunk in bag.chunks():
+            for message in chunk.messages:
+                of = bag.connections[message.connection]
+                if of.topic == topic:
+                    yield _ros2(of.kind), chunk.data[message.data_at : message.end]
 
 
-@contextmanager
-def _open(path: Path) -> Iterator[Reader]:
-    """The bag, open; whatever rosbags raises on damaged input becomes a DataError with the path in it."""
+def _decoder(path: Path) -> Callable[[bytes, str], Any]:
+    """What makes a message of its bytes and its type.
+
+    Raises:
+        ConfigError: rosbags is not installed.
+    """
     try:
-        from rosbags.rosbag1 import Reader
+        from rosbags.typesys import Stores, get_typestore
     except ImportError as error:
         raise ConfigError(
             "reading ROS 1 bags needs rosbags", where=path, fix="Install it with: pip install 'imutool[bags]'"
         ) from error
+    store = get_typestore(Stores.ROS1_NOETIC)
+
+    def decode(raw: bytes, kind: str) -> Any:
+        try:
+            return store.deserialize_ros1(raw, kind)
+        except Exception as error:  # struct, assertions and its own: a message that is none shows in many ways
+            raise DataError(f"holds a message that is no {kind} ({error})", where=path) from error
+
+    return decode
+
+
+@contextmanager
+def _open(path: Path) -> Iterator[Bag]:
+    """The bag, open; one with an index must be whole, of any other what can be read is taken."""
     try:
-        with Reader(path) as bag:
+        with Bag(path) as bag:
+            bag.salvage = not bag.indexed
             yield bag
-    except (ImutoolError, GeneratorExit, KeyboardInterrupt):
-        raise
-    except Exception as error:  # struct, lz4, bz2, assertions and its own: a damaged bag shows in many ways
-        raise DataError(f"cannot be read as a ROS 1 bag ({error})", where=path) from error
+    except (ConfigError, LogError) as error:
+        raise DataError(f"cannot be read as a ROS 1 bag ({error.what})", where=path, fix=error.fix) from error

@@ -18,7 +18,7 @@ from jaxtyping import Float64, Int64, UInt8
 from imutool import __version__
 from imutool.bias import static
 from imutool.bias._base import BiasModel, OneByOne, Stream, Vector6
-from imutool.bias._file import check_rate, find_model, shipped_for
+from imutool.bias._file import check_rate, find_model, shipped, shipped_for
 from imutool.certainty import Certainty
 from imutool.config import plain
 from imutool.errors import ConfigError, DataError, LogError, ModelError
@@ -28,6 +28,7 @@ from imutool.mcap_io.log import Clock, ImuBatch, Log
 from imutool.mcap_io.read import read
 from imutool.mcap_io.rewrite import Made, NewTopic, RewriteReport, Values, rewrite
 from imutool.mcap_io.verify import Verified, refuse_unknown
+from imutool.place import Place
 from imutool.recording import Imu, Recording, nanoseconds, seconds
 from imutool.rest_track import Samples
 from imutool.stationary import Blocks, in_blocks, white_noise
@@ -143,8 +144,8 @@ class Debiaser:
 
 
 def debias(
-    source: Path,
-    target: Path | None,
+    source: Place,
+    target: Place | None,
     *,
     model: str | Path | Mapping[str, str | Path] | None = None,
     imus: Sequence[str] = (),
@@ -174,11 +175,11 @@ def debias(
     with Log(source) as log:
         topics = _chosen(log, imus, given)
         about = log.metadata().get("imutool", {})
-    named = about.get("model") or shipped_for(about.get("sensor"), about.get("dataset"))
+    named = given.get("") or (None if all(topic in given for topic in topics) else _of_the_log(about))
     derived, starts, models, records = [], {}, {}, {}
     with Digest(source) as digest:
         for topic in topics:
-            chosen, start = _prepare(source, topic, given.get(topic, given.get("", named)), init, smooth)
+            chosen, start = _prepare(source, topic, given.get(topic, named), init, smooth)
             derived.append(Debiaser(topic, chosen, start))
             starts[topic], models[topic] = start, str(chosen.card.get("name", chosen.method))
             records[topic] = _provenance(topic, chosen, start, init, smooth)
@@ -190,6 +191,11 @@ def debias(
 
         report = rewrite(source, target, derived, metadata=metadata, overwrite=overwrite, check=check, progress=progress)
     return DebiasReport(models, starts, report)
+
+
+def _of_the_log(about: Mapping[str, str]) -> str | Path | None:
+    """The model that a log's metadata name, which must be one that ships: a log may come from anybody."""
+    return shipped(about["model"]) if about.get("model") else shipped_for(about.get("sensor"), about.get("dataset"))
 
 
 def _chosen(log: Log, imus: Sequence[str], given: Mapping[str, str | Path]) -> list[str]:
@@ -228,7 +234,7 @@ def refuse_smooth(init: str, smooth: bool) -> None:
         raise ConfigError(f"--smooth with --init {init}", where="--smooth", expected="--init auto", fix="Give one of the two")
 
 
-def estimate_at_rest(imu: Imu, where: str | Path) -> tuple[BiasModel, TurnOn]:
+def estimate_at_rest(imu: Imu, where: str | Place) -> tuple[BiasModel, TurnOn]:
     """The static model with its bias: the mean over all time at rest, for a log nobody trained a model for.
 
     Raises:
@@ -238,7 +244,7 @@ def estimate_at_rest(imu: Imu, where: str | Path) -> tuple[BiasModel, TurnOn]:
     return _estimate(in_blocks([(imu.t_ns, imu.gyro, imu.accel)], imu.period_s), where)
 
 
-def _estimate(blocks: Blocks, where: str | Path) -> tuple[BiasModel, TurnOn]:
+def _estimate(blocks: Blocks, where: str | Place) -> tuple[BiasModel, TurnOn]:
     model = static.Model()
     try:
         return model, over_all_rest(model, blocks)
@@ -246,7 +252,7 @@ def _estimate(blocks: Blocks, where: str | Path) -> tuple[BiasModel, TurnOn]:
         raise _nothing_known(where) from error
 
 
-def _nothing_known(where: str | Path) -> ModelError:
+def _nothing_known(where: str | Place) -> ModelError:
     return ModelError(
         "no model given, and the log holds no stretch at rest to measure a static bias on",
         where=where,
@@ -264,7 +270,7 @@ def _only_imu(log: Log) -> str:
     return found[0]
 
 
-def _prepare(source: Path, topic: str, name: str | Path | None, init: str, smooth: bool) -> tuple[BiasModel, TurnOn]:
+def _prepare(source: Place, topic: str, name: str | Path | None, init: str, smooth: bool) -> tuple[BiasModel, TurnOn]:
     """Model and start for one IMU."""
     untrained = name is None or str(name) == static.Model.method
     head = _head(source, topic, init)
@@ -284,7 +290,7 @@ def _prepare(source: Path, topic: str, name: str | Path | None, init: str, smoot
     return model, start if start.noise.any() else replace(start, noise=_noise(head.imu))
 
 
-def smooth_in_memory(model: BiasModel, imu: Imu, where: str | Path) -> TurnOn:
+def smooth_in_memory(model: BiasModel, imu: Imu, where: str | Place) -> TurnOn:
     """The rest bias in time from all of some samples.
 
     Raises:
@@ -295,7 +301,7 @@ def smooth_in_memory(model: BiasModel, imu: Imu, where: str | Path) -> TurnOn:
     return _smoothed(model, [(t_s, imu.gyro, imu.accel)], where)
 
 
-def _smoothed(model: BiasModel, batches: Iterable[Samples], where: str | Path) -> TurnOn:
+def _smoothed(model: BiasModel, batches: Iterable[Samples], where: str | Place) -> TurnOn:
     try:
         return smooth_rest(model, batches, str(where))
     except NoRestError as error:
@@ -311,7 +317,7 @@ def _batches(log: Log, topic: str) -> Iterator[Samples]:
             yield seconds(batch.stamp_ns, start_ns), batch.gyro, batch.accel
 
 
-def _head(source: Path, topic: str, init: str) -> Recording:
+def _head(source: Place, topic: str, init: str) -> Recording:
     """The first minute of a log; of its truth only what is asked for, since it may be no business of the IMU's."""
     with Log(source) as log:
         first = next((int(times.min()) for times in log.stamps(topic) if len(times)), None)
@@ -321,7 +327,7 @@ def _head(source: Path, topic: str, init: str) -> Recording:
     return Recording(source.stem, _samples(source, topic, end_ns), imu_topic=topic, source=str(source))
 
 
-def _samples(source: Path, topic: str, end_ns: int | None = None) -> Imu:
+def _samples(source: Place, topic: str, end_ns: int | None = None) -> Imu:
     """The samples of one IMU.
 
     Raises:

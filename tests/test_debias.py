@@ -403,6 +403,20 @@ def test_without_a_model_the_one_the_logs_metadata_names_is_used(
         debias(other, tmp_path / "out2.mcap")
 
 
+@pytest.mark.parametrize("name", ["{}/adis.safetensors", "{}/adis", "physics.toml", "/dev/zero"])
+def test_a_log_cannot_name_a_file_as_its_model(
+    recording: Recording, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    save(make_model("linear"), tmp_path / "adis.safetensors")
+    (tmp_path / "physics.toml").touch()
+    log = tmp_path / "log.mcap"
+    write(Recording("r", recording.imu, metadata={"imutool": {"model": name.format(tmp_path)}}), log)
+    with pytest.raises(ModelError, match=r"no model .*expected a file, or one of"):
+        debias(log, tmp_path / "out.mcap")
+    assert not (tmp_path / "out.mcap").exists()
+
+
 def moving(tmp_path: Path) -> Path:
     log = tmp_path / "moving.mcap"
     write(flight(2, duration_s=8.0, still_s=0.0), log)

@@ -7,6 +7,7 @@ import hashlib
 import json
 import os
 from collections.abc import Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -22,6 +23,8 @@ from imutool.errors import ConfigError, ImutoolError, ModelError
 FORMAT = "imutool.model/1"
 MAX_BYTES = 64 << 20  # ours are under 2 MB; a file this large is no bias model
 MAX_RATE_HZ = 1e6
+MAX_TOML = 1 << 20  # bytes of a physics.toml; ours have a few thousand
+MAX_SETTINGS = 16 << 10  # characters; ours have a few hundred
 BEST_FIRST = ("hybrid", "neural_ode", "linear")  # by the published and own tables (docs/accuracy.md)
 RATE_TOLERANCE = 0.05  # a sensor's real rate differs from its name by a few per mille (BMI160: 199.4 for 200)
 
@@ -76,8 +79,7 @@ def read_tensors(path: Path, kind: str) -> tuple[dict[str, torch.Tensor], dict[s
         ModelError: no such file, too large, not safetensors, or of another format.
     """
     try:
-        if path.stat().st_size > MAX_BYTES:
-            raise ModelError(f"{path.stat().st_size} bytes", where=path, expected=f"a model of at most {MAX_BYTES}")
+        _refuse_size(path, MAX_BYTES)
         with safe_open(path, framework="pt") as file:
             header = file.metadata() or {}
             if header.get("format") != kind:
@@ -92,6 +94,22 @@ def read_tensors(path: Path, kind: str) -> tuple[dict[str, torch.Tensor], dict[s
         raise ModelError(f"is no model file ({error})", where=path, expected="safetensors by imutool train") from error
 
 
+def _refuse_size(path: Path, most: int) -> None:
+    """Nothing is opened that is not a file of a sensible size; a pipe would be waited for.
+
+    Raises:
+        ModelError: too large, or there and no file.
+        OSError: not there.
+    """
+    size = path.stat().st_size
+    if not path.is_file():
+        raise ModelError(
+            "is no model file (it is a folder, a pipe or a device)", where=path, expected="safetensors by imutool train"
+        )
+    if size > most:
+        raise ModelError(f"{size} bytes", where=path, expected=f"a model of at most {most}")
+
+
 def load(path: Path) -> BiasModel:
     """The model in a file.
 
@@ -102,16 +120,19 @@ def load(path: Path) -> BiasModel:
     header = _header(raw, path)
     try:
         module = registry.load("imutool.bias", header.method)
-        model: BiasModel = module.Model(build(module.Config, header.settings), header.rate_hz)
-    except (ValueError, OverflowError, ImutoolError) as error:
+        settings = build(module.Config, header.settings)
+        with torch.device("meta"):  # shapes without memory: the settings may ask for any
+            shapes: BiasModel = module.Model(settings, header.rate_hz)
+    except (ValueError, OverflowError, RuntimeError, ImutoolError) as error:
         raise ModelError(f"has a header that cannot be used ({error})", where=path) from error
-    expected = {k: (tuple(v.shape), torch.float32) for k, v in model.state_dict().items()}
+    expected = {k: (tuple(v.shape), torch.float32) for k, v in shapes.state_dict().items()}
     found = {k: (tuple(v.shape), v.dtype) for k, v in tensors.items()}
     if found != expected:
         odd = sorted(k for k in expected.keys() | found.keys() if expected.get(k) != found.get(k))
         raise ModelError(f"tensors {', '.join(odd[:5])} do not fit", where=path, expected=f"those of {header.method}")
     if any(not bool(torch.isfinite(v).all()) for v in tensors.values()):
         raise ModelError("holds numbers that are not finite", where=path)
+    model: BiasModel = module.Model(settings, header.rate_hz)
     model.load_state_dict(tensors)
     model.card = {**header.card, "name": path.stem, "sha256": digest(path)}
     model.requires_grad_(False)
@@ -139,18 +160,29 @@ def find_model(name: str | Path, rate_hz: float | None = None) -> BiasModel:
             raise ModelError("a physics.toml says no rate", where=path, expected="samples to use it on")
         from imutool.bias import _physics_file
 
+        with suppress(OSError):  # said by whoever reads it
+            _refuse_size(path, MAX_TOML)
         return _physics_file.load(path, rate_hz)
     if path.suffix == ".safetensors" or path.exists():
         return load(path)
-    shipped = {model.stem: model for model in library().glob("*.safetensors")}
-    if str(name) not in shipped:
-        near = difflib.get_close_matches(str(name), shipped, n=1)
+    return load(shipped(str(name)))
+
+
+def shipped(name: str) -> Path:
+    """The file of a model that ships, by its name alone: the name may come from a log, and a log may name no other file.
+
+    Raises:
+        ModelError: no such model (the nearest is named).
+    """
+    every = {model.stem: model for model in library().glob("*.safetensors")}
+    if name not in every:
+        near = difflib.get_close_matches(name, every, n=1)
         raise ModelError(
-            f"no model {str(name)!r}",
-            expected=f"a file, or one of {', '.join(sorted(shipped)) or '(none ship)'}",
+            f"no model {name[:200]!r}",
+            expected=f"a file, or one of {', '.join(sorted(every)) or '(none ship)'}",
             fix=f"Did you mean {near[0]!r}?" if near else "",
         )
-    return load(shipped[str(name)])
+    return every[name]
 
 
 def shipped_for(sensor: str | None, dataset: str | None) -> str | None:
@@ -171,7 +203,7 @@ def digest(path: Path) -> str:
     return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
-def check_rate(model: BiasModel, rate_hz: float, where: str | Path) -> None:
+def check_rate(model: BiasModel, rate_hz: float, where: object) -> None:
     """Refuses a log sampled at another rate than the model's training logs.
 
     Raises:
@@ -212,6 +244,8 @@ def _header(raw: Mapping[str, str], path: Path) -> _Header:
         ModelError: an entry is missing, is not JSON, or is of another kind.
     """
     try:
+        if len(raw["settings"]) > MAX_SETTINGS:
+            raise ValueError(f"{len(raw['settings'])} characters of settings, at most {MAX_SETTINGS}")
         rate_hz, settings, card = float(raw["rate_hz"]), json.loads(raw["settings"]), json.loads(raw["card"])
         if not 0.0 <= rate_hz <= MAX_RATE_HZ:
             raise ValueError(f"rate_hz {rate_hz}")

@@ -10,6 +10,7 @@ import typer
 
 from imutool.cli._app import Init, Json, Overwrite, Quiet, Smooth, Verbose, app
 from imutool.errors import ConfigError
+from imutool.place import place
 from imutool.terminal import progress, say, write_json
 
 MODEL_HELP = (
@@ -20,9 +21,9 @@ VERIFY_HELP = "What of OUT is checked beside its structure: all chunks, those wi
 
 @app.command(epilog="Example: [bold]imutool debias MH_04.mcap MH_04_debiased.mcap --model adis.safetensors[/]")
 def debias(
-    source: Annotated[Path, typer.Argument(metavar="IN", help="An MCAP log.")],
+    source: Annotated[str, typer.Argument(metavar="IN", help="An MCAP log: a file, or a URL such as s3://bucket/log.mcap.")],
     target: Annotated[
-        Path | None,
+        str | None,
         typer.Argument(metavar="OUT", help="The log with the debiased IMU beside the raw one.", show_default=False),
     ] = None,
     model: Annotated[list[str] | None, typer.Option(help=MODEL_HELP)] = None,
@@ -43,8 +44,8 @@ def debias(
 
     with progress("Debiasing", verbose, quiet) as tell:
         report = run(
-            source,
-            target,
+            place(source),
+            None if target is None else place(target),
             model=models,
             imus=imu or (),
             init=init,
@@ -76,7 +77,7 @@ def debias(
     say(f"checked: every index, and the contents of {verified.chunks_checked} of {verified.chunks} chunks (--verify {verify})")
 
 
-def _refuse_contradictions(target: Path | None, in_place: bool, overwrite: bool) -> None:
+def _refuse_contradictions(target: str | None, in_place: bool, overwrite: bool) -> None:
     if in_place and target is not None:
         raise ConfigError(f"--in-place and {target}", where="--in-place", fix="Leave one of the two out")
     if in_place and overwrite:

@@ -4,26 +4,26 @@ from __future__ import annotations
 
 import hashlib
 import threading
-from pathlib import Path
 from types import TracebackType
 
 from imutool.errors import ConfigError, ImutoolError, LogError
 from imutool.mcap_io.source import Source
+from imutool.place import Place, failures, opened, reason
 
 BLOCK_BYTES = 1 << 20
 
 
-def sha256(path: Path) -> str:
+def sha256(path: Place) -> str:
     """The SHA-256 of a file, in hex, a block at a time.
 
     Raises:
         ConfigError: the file cannot be read.
     """
     try:
-        with path.open("rb") as file:
-            return hashlib.file_digest(file, "sha256").hexdigest()
-    except OSError as error:
-        raise ConfigError(f"cannot be read ({error.strerror})", where=path) from error
+        with opened(path).file as file:
+            return hashlib.file_digest(file, "sha256").hexdigest()  # type: ignore[arg-type]  # readinto: all that `opened` gives
+    except failures(path) as error:
+        raise ConfigError(f"cannot be read ({reason(error)})", where=path) from error
 
 
 class Digest:
@@ -32,7 +32,7 @@ class Digest:
     A context manager: leaving it ends the thread, whether or not anybody asked for the result.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Place) -> None:
         self._source, self._sum = Source(path), hashlib.sha256()
         self._error: ImutoolError | None = None
         self._left = threading.Event()

@@ -36,6 +36,7 @@ from imutool.mcap_io.records import HEAD, ChunkHead
 from imutool.mcap_io.structure import Block, Span, Structure
 from imutool.mcap_io.verify import Verified, check_data_crc, crc_of, refuse_unknown, stated_crc, verify
 from imutool.mcap_io.write import CHUNK_BYTES, Chunk, LogWriter
+from imutool.place import Place, identity, same
 
 RUN_BYTES = 16 << 20  # verbatim bytes are handed to the kernel in runs of about this size: between them progress is told
 FEED_BYTES = 1 << 17  # of IMU messages make a batch: one chunk holds a few among its images, too few for numpy to be quick
@@ -87,8 +88,8 @@ class RewriteReport:
 
 
 def rewrite(
-    source: Path,
-    target: Path | None,
+    source: Place,
+    target: Place | None,
     derived: Sequence[Derived],
     *,
     metadata: Values | Callable[[Verified], Values],
@@ -116,34 +117,31 @@ def rewrite(
             messages that no model can take.
     """
     refuse_unknown(check)
-    if target is not None and target.exists() and source.exists() and target.samefile(source):
+    if target is not None and same(source, target):
         raise ConfigError("the target is the source", where=target, fix="Choose another name")
-    place = source.resolve() if target is None else target
+    place = (source.resolve() if isinstance(source, Path) else source) if target is None else target
     with Log(source) as log:
         _refuse_taken(log, derived)
-        structure, before = log.structure, source.stat()
+        structure, before = log.structure, identity(source)
         start = len(records.MAGIC)
         header = structure.source.at(start, structure.header_end - start)
         crc = bool(stated_crc(structure))
         packing = _compression(structure)
         with LogWriter(place, compression=packing, overwrite=overwrite or target is None, header=header, data_crc=crc) as out:
             report = _Rewrite(log, out, derived, check, progress or (lambda done, total: None)).run(metadata)
-            if target is None:
-                _take_permissions(out.target.temporary, before)
-            if _changed(before, source.stat()):
+            if target is None and isinstance(source, Path) and isinstance(out.target.temporary, Path):
+                _take_permissions(out.target.temporary, source)
+            if identity(source) != before:
                 raise LogError("the log changed while it was copied", where=source, fix="Wait until its recorder is done")
             return report
 
 
-def _take_permissions(path: Path, of: os.stat_result) -> None:
+def _take_permissions(path: Path, of: Path) -> None:
     """Gives a file the mode of another, and its owner where that is allowed."""
+    there = of.stat()
     with suppress(PermissionError):
-        os.chown(path, of.st_uid, of.st_gid)
-    path.chmod(of.st_mode & 0o7777)
-
-
-def _changed(before: os.stat_result, after: os.stat_result) -> bool:
-    return (before.st_ino, before.st_size, before.st_mtime_ns) != (after.st_ino, after.st_size, after.st_mtime_ns)
+        os.chown(path, there.st_uid, there.st_gid)
+    path.chmod(there.st_mode & 0o7777)
 
 
 def _refuse_taken(log: Log, derived: Sequence[Derived]) -> None:

@@ -15,35 +15,64 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from types import TracebackType
-from typing import BinaryIO
+from typing import BinaryIO, Protocol
 
 from imutool.errors import ConfigError
 from imutool.mcap_io.crc import crc32
 from imutool.mcap_io.source import Source, descriptor
+from imutool.mcap_io.upload import Upload
+from imutool.place import Place, failures, reason
 
 COPY_BYTES = 1 << 20  # what passes through memory stays in the processor's cache
 # What a system call says that cannot copy between these two files: another file system, an old kernel, a special file
 UNABLE = {errno.EXDEV, errno.ENOSYS, errno.EINVAL, errno.EOPNOTSUPP, errno.EPERM, errno.ENOTSOCK}
 
 
+class _Medium(Protocol):
+    """What is being written under its temporary name."""
+
+    @property
+    def temporary(self) -> Place: ...
+
+    def open(self) -> None: ...
+
+    def write(self, data: bytes | bytearray | memoryview) -> None: ...
+
+    def copy(self, source: Source, start: int, end: int) -> int:
+        """Takes bytes over without their coming here, as far as that can be done; returns where it stopped."""
+
+    def complete(self) -> None:
+        """Makes all of it readable under the temporary name."""
+
+    def publish(self) -> None:
+        """Puts it in its place."""
+
+    def discard(self) -> None:
+        """Removes it; what cannot be removed is left without a word."""
+
+
 class Target:
     """Context manager over the file being written; leaving it without an error puts the file in its place.
 
-    Any error, Ctrl-C included, removes what was written. `crc` is the CRC-32 of everything written while `summing`.
+    Any error, Ctrl-C included, removes what was written. `crc` is the CRC-32 of everything written while `summing`. In a store
+    it is an object under another key, copied to its own by the store when it is complete; between the last look whether the
+    target exists and that copy lies a moment in which another writer's object would be replaced, as with a file.
 
     Raises:
         ConfigError: the target exists (without `overwrite`), is a folder, or the system refuses to write.
     """
 
-    def __init__(self, path: Path, *, overwrite: bool = False, summing: bool = True) -> None:
+    def __init__(self, path: Place, *, overwrite: bool = False, summing: bool = True) -> None:
         self.path, self.overwrite = path, overwrite
         self.position, self.crc, self.summing = 0, 0, summing
-        self._refuse_existing()
-        self.temporary = path.with_name(f".{path.name}.{os.getpid()}.{secrets.token_hex(4)}.partial")
+        name = f".{path.name}.{os.getpid()}.{secrets.token_hex(4)}.partial"
+        self._medium: _Medium = _File(path, name) if isinstance(path, Path) else Upload(path, name)
+        self.temporary = self._medium.temporary
         # Ctrl-C may come between two lines, before anybody is there to call `abandon`: then the file goes with this object
-        self._remove = weakref.finalize(self, _unlink, self.temporary)
+        self._remove = weakref.finalize(self, self._medium.discard)
         with self._told():
-            self.file: BinaryIO = self.temporary.open("xb")
+            self._refuse_existing()
+            self._medium.open()
 
     def _refuse_existing(self) -> None:
         if self.path.is_dir():
@@ -55,10 +84,11 @@ class Target:
     def _told(self) -> Iterator[None]:
         try:
             yield
-        except OSError as error:
-            reason = error.strerror or type(error).__name__
+        except ConfigError:
+            raise
+        except failures(self.path) as error:
             raise ConfigError(
-                f"cannot be written ({reason})", where=self.path, fix="Choose a place that can be written and has room"
+                f"cannot be written ({reason(error)})", where=self.path, fix="Choose a place that can be written and has room"
             ) from error
 
     def write(self, data: bytes | bytearray | memoryview) -> None:
@@ -68,7 +98,7 @@ class Target:
             ConfigError: the system refuses; the message gives its reason.
         """
         with self._told():
-            self.file.write(data)
+            self._medium.write(data)
         self.position += len(data)
         if self.summing:
             self.crc = crc32(data, self.crc)
@@ -81,31 +111,16 @@ class Target:
             LogError: the source does not have the bytes, or the disk does not give them.
         """
         if not self.summing:
-            start = self._by_the_kernel(source, start, end)
+            with self._told():
+                stopped = self._medium.copy(source, start, end)
+            self.position, start = self.position + stopped - start, stopped
         for at in range(start, end, COPY_BYTES):
             self.write(source.at(at, min(COPY_BYTES, end - at)))
 
-    def _by_the_kernel(self, source: Source, start: int, end: int) -> int:
-        """As much as the kernel copies; returns where it stopped, which is where it began if it cannot do it."""
-        theirs, ours = descriptor(source.file), descriptor(self.file)
-        if theirs is None or ours is None:
-            return start
-        calls: tuple[Callable[[int], int], ...] = (
-            lambda at: os.copy_file_range(theirs, ours, end - at, offset_src=at),
-            lambda at: os.sendfile(ours, theirs, at, end - at),
-        )
-        with self._told():
-            self.file.flush()
-            for call in calls:
-                while start < end and (count := _tried(call, start)):
-                    start, self.position = start + count, self.position + count
-            self.file.seek(self.position)
-        return start
-
     def flush(self) -> None:
-        """Hands everything to the system, so that the file can be read back under its temporary name."""
+        """Hands everything over, so that it can be read back under its temporary name; nothing can be written after."""
         with self._told():
-            self.file.flush()
+            self._medium.complete()
 
     def __enter__(self) -> Target:
         return self
@@ -124,12 +139,9 @@ class Target:
         """
         try:
             with self._told():
-                self.file.flush()
-                os.fsync(self.file.fileno())
-                self.file.close()
+                self._medium.complete()
                 self._refuse_existing()
-                self.temporary.replace(self.path)
-                _settle(self.path.parent)
+                self._medium.publish()
             self._remove.detach()
         except BaseException:
             self.abandon()
@@ -137,9 +149,53 @@ class Target:
 
     def abandon(self) -> None:
         """Removes what was written."""
-        with contextlib.suppress(OSError):  # a full disk refuses the last flush; the file goes all the same
-            self.file.close()
         self._remove()
+
+
+class _File:
+    """A file beside its place."""
+
+    file: BinaryIO
+
+    def __init__(self, path: Path, name: str) -> None:
+        self.path, self.temporary = path, path.with_name(name)
+
+    def open(self) -> None:
+        self.file = self.temporary.open("xb")
+
+    def write(self, data: bytes | bytearray | memoryview) -> None:
+        self.file.write(data)
+
+    def copy(self, source: Source, start: int, end: int) -> int:
+        """By the kernel; where it began, if the kernel cannot do it."""
+        theirs, ours = descriptor(source.file), descriptor(self.file)
+        if theirs is None or ours is None:
+            return start
+        calls: tuple[Callable[[int], int], ...] = (
+            lambda at: os.copy_file_range(theirs, ours, end - at, offset_src=at),
+            lambda at: os.sendfile(ours, theirs, at, end - at),
+        )
+        self.file.flush()
+        for call in calls:
+            while start < end and (count := _tried(call, start)):
+                start += count
+        self.file.seek(0, os.SEEK_END)
+        return start
+
+    def complete(self) -> None:
+        self.file.flush()
+
+    def publish(self) -> None:
+        os.fsync(self.file.fileno())
+        self.file.close()
+        self.temporary.replace(self.path)
+        _settle(self.path.parent)
+
+    def discard(self) -> None:
+        with contextlib.suppress(OSError, AttributeError):  # a full disk refuses the last flush; or it was never opened
+            self.file.close()
+        with contextlib.suppress(OSError):
+            self.temporary.unlink(missing_ok=True)
 
 
 def _settle(folder: Path) -> None:
@@ -160,8 +216,3 @@ def _tried(call: Callable[[int], int], at: int) -> int:
         if error.errno in UNABLE:
             return 0
         raise
-
-
-def _unlink(path: Path) -> None:
-    with contextlib.suppress(OSError):
-        path.unlink(missing_ok=True)

@@ -9,7 +9,6 @@ from __future__ import annotations
 import struct
 from collections import Counter
 from collections.abc import Callable, Collection, Mapping
-from pathlib import Path
 from typing import NamedTuple
 
 from mcap.opcode import Opcode
@@ -24,6 +23,7 @@ from imutool.mcap_io.records import FOOTER_SIZE, HEAD, MAGIC
 from imutool.mcap_io.source import Source
 from imutool.mcap_io.structure import Block, Span, Structure
 from imutool.mcap_io.target import COPY_BYTES
+from imutool.place import Place
 
 MODES = ("all", "imu", "none")
 
@@ -47,7 +47,7 @@ def refuse_unknown(mode: str) -> None:
 
 
 def verify(
-    path: Path,
+    path: Place,
     counts: Mapping[int, int],
     *,
     unpacked: Collection[int] | None = None,

@@ -142,16 +142,47 @@ def test_a_defect_is_named_with_topic_and_message_number(tmp_path):
         list(euroc.read(path))
 
 
-@pytest.mark.parametrize("part", [0.0, 0.5, 0.99])
-def test_a_truncated_bag_is_refused(tmp_path, part):
+def found_messages(recording):
+    return len(recording.imu), recording.metadata.get("imutool/repairs", {}).get("bag", "")
+
+
+def test_a_bag_that_is_cut_or_has_no_index_is_read_as_far_as_it_goes_and_says_so(tmp_path, caplog):
     path = write_bag(tmp_path / "one.bag", imu0=imu)
-    path.write_bytes(path.read_bytes()[: int(path.stat().st_size * part)])
+    raw = path.read_bytes()
+    (whole,) = euroc.read(path)
+    assert found_messages(whole) == (20, "")
+    assert not caplog.records
+    for size, count, said in ((len(raw) - 50, 20, "1 stretches of it lost"), (len(raw) // 2, 4, "2 stretches of it lost")):
+        path.write_bytes(raw[:size])
+        (recording,) = euroc.read(path)
+        found, why = found_messages(recording)
+        assert found == count
+        assert why.startswith(f"the bag has no index; {count} messages were found chunk by chunk, {said}")
+        assert np.array_equal(recording.imu.gyro, whole.imu.gyro[:count])
+        assert why in caplog.text
+    path.write_bytes(raw.replace(raw[(at := raw.index(b"index_pos=")) : at + 18], b"index_pos=" + bytes(8)))
+    (recording,) = euroc.read(path)
+    assert found_messages(recording) == (20, "the bag has no index; 20 messages were found chunk by chunk, nothing of it lost")
+
+
+@pytest.mark.parametrize("size", [0, 5, 13, 3000, 4200])
+def test_a_bag_of_which_nothing_is_left_is_refused(tmp_path, size):
+    path = write_bag(tmp_path / "one.bag", imu0=imu)
+    path.write_bytes(path.read_bytes()[:size])
     with pytest.raises(DataError, match=r"one\.bag: cannot be read as a ROS 1 bag"):
+        list(euroc.read(path))
+
+
+def test_a_bag_with_an_index_and_damage_is_refused_with_what_to_do(tmp_path):
+    path = write_bag(tmp_path / "one.bag", imu0=imu)
+    raw = path.read_bytes()
+    path.write_bytes(raw[:7000] + bytes(500) + raw[7500:])
+    with pytest.raises(DataError, match=r"one\.bag: cannot be read as a ROS 1 bag .* Save what is there with `imutool repair`"):
         list(euroc.read(path))
 
 
 def test_without_rosbags_the_message_says_how_to_get_it(tmp_path, monkeypatch):
     path = write_bag(tmp_path / "one.bag", imu0=imu)
-    monkeypatch.setitem(sys.modules, "rosbags.rosbag1", None)
+    monkeypatch.setitem(sys.modules, "rosbags.typesys", None)
     with pytest.raises(ConfigError, match=r"pip install 'imutool\[bags\]'"):
         list(euroc.read(path))

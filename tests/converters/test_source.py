@@ -113,6 +113,44 @@ def test_a_zip_bomb_is_refused_before_it_unpacks(make):
     assert peak < MEMORY_BOUND
 
 
+def test_members_that_share_their_bytes_are_refused_by_their_sum(make, monkeypatch):
+    """A directory whose entries all point at the same packed bytes: each is within its bound, together they never end."""
+    monkeypatch.setattr(_archive, "RATIO_FREE", 1 << 20)
+    source = make.zip("one.zip", {**make.files("euroc"), "mav0/cam0/data/1.png": b"0" * 900_000})
+    raw = source.read_bytes()
+    at = raw.rindex(b"PK\5\6")
+    entry = raw[raw.rindex(b"PK\1\2") : at]
+    entries = [entry.replace(b"1.png", f"{n % 10}.png".encode()) for n in range(2, 10)]
+    count = struct.unpack_from("<H", raw, at + 10)[0] + len(entries)
+    (start,) = struct.unpack_from("<I", raw, at + 16)
+    more = b"".join(entries)
+    end = raw[at : at + 8] + struct.pack("<HHII", count, count, at - start + len(more), start) + raw[at + 20 :]
+    source.write_bytes(raw[:at] + more + end)
+    refused(source, "unpacks to more than")
+
+
+def test_a_zip_with_a_password_is_refused(make):
+    source = make.zip("one.zip", make.files("euroc"))
+    raw = bytearray(source.read_bytes())
+    for sign, flags in ((b"PK\3\4", 6), (b"PK\1\2", 8)):
+        at = raw.find(sign)
+        while at >= 0:
+            raw[at + flags] |= 1
+            at = raw.find(sign, at + 1)
+    source.write_bytes(raw)
+    refused(source, "cannot be read .*(encrypted|password)")
+
+
+@pytest.mark.parametrize("form", ["zip", "tar"])
+@pytest.mark.parametrize("name", ["mav0/imu0/data\n.csv", "mav0/imu0/\x1b[31mdata.csv", "mav0/\u202egnp.csv"])
+def test_names_with_control_characters_are_never_read_nor_said(make, form, name):
+    pack = {"zip": make.zip, "tar": make.tar}[form]
+    (recording,) = euroc.read(pack(f"one.{form}", {**make.files("euroc"), name: b"#\n"}))
+    assert len(recording.imu)
+    error = refused(pack(f"two.{form}", {f"../{name}": b"#\n"}), "points outside the archive")
+    assert str(error).isprintable()
+
+
 def test_a_member_that_unpacks_to_more_than_it_declares_is_cut_at_its_declared_size(make, monkeypatch):
     """A zip whose directory lies about a size: zipfile stops there and the checksum gives it away."""
     files = make.files("euroc")

@@ -1,0 +1,211 @@
+"""The records of a ROS 1 bag, format 2.0: heads of named fields, chunks of messages, and what indexes them.
+
+Format: http://wiki.ros.org/Bags/Format/2.0. Every length read is held against the bytes there are. Nothing in the format
+proves that bytes are those that were recorded, but for the checks inside bz2 and some lz4 chunks.
+"""
+
+from __future__ import annotations
+
+import bz2
+import struct
+from collections.abc import Mapping, Sequence
+from enum import IntEnum
+from typing import NamedTuple
+
+import lz4.frame
+
+from imutool.errors import LogError
+
+MAGIC = b"#ROSBAG V2.0\n"
+FIRST_RECORD = 4096  # header and padding of the bag header record, so that it can be filled in at the end
+HEAD_LIMIT = 4096  # of a record's fields: a topic is the longest, and a definition's text is not among them
+CHUNK_LIMIT = 1 << 30  # unpacked bytes; rosbag's own are 768 KiB or one message
+U32 = struct.Struct("<I")
+
+
+class Op(IntEnum):
+    """Kinds of records."""
+
+    MESSAGE = 2
+    BAG = 3
+    INDEX = 4
+    CHUNK = 5
+    INFO = 6
+    CONNECTION = 7
+
+
+NEEDED: Mapping[int, Mapping[bytes, int]] = {  # fields with their sizes
+    Op.MESSAGE: {b"conn": 4, b"time": 8},
+    Op.BAG: {b"index_pos": 8, b"conn_count": 4, b"chunk_count": 4},
+    Op.INDEX: {b"conn": 4, b"count": 4},
+    Op.CHUNK: {b"size": 4},
+    Op.INFO: {b"chunk_pos": 8, b"count": 4},
+    Op.CONNECTION: {b"conn": 4},
+}
+# what writers put ahead of the field `op`: nothing, or some of the fields with their lengths
+AHEAD = {Op.CHUNK: (0, 13, 19, 20, 32, 33), Op.MESSAGE: (0, 13, 17, 30)}
+
+
+class Head(NamedTuple):
+    """A record without its data, which begin at `data_at` and may be cut off."""
+
+    op: int
+    fields: Mapping[bytes, bytes]
+    at: int
+    data_at: int
+    size: int
+
+    @property
+    def end(self) -> int:
+        """The byte behind the record."""
+        return self.data_at + self.size
+
+    def number(self, name: bytes) -> int:
+        """A field that is an unsigned number."""
+        return int.from_bytes(self.fields[name], "little")
+
+    @property
+    def time_ns(self) -> int:
+        """The time of a message record."""
+        seconds, nanoseconds = struct.unpack("<II", self.fields[b"time"])
+        return int(seconds) * 10**9 + int(nanoseconds)
+
+
+class Connection(NamedTuple):
+    """Who published what: a topic, its type in ROS 1 spelling, and the whole record."""
+
+    number: int
+    topic: str
+    kind: str
+    definition: bytes
+    record: bytes
+
+
+def fields(data: bytes, at: int, end: int) -> dict[bytes, bytes] | None:
+    """Named values that fill a stretch exactly; None where they do not."""
+    found: dict[bytes, bytes] = {}
+    while at < end:
+        if end - at < 4:
+            return None
+        (size,) = U32.unpack_from(data, at)
+        name, equals, value = data[at + 4 : at + 4 + size].partition(b"=") if size <= end - at - 4 else (b"", b"", b"")
+        if not equals:
+            return None
+        found[name] = value
+        at += 4 + size
+    return found
+
+
+def head(data: bytes, at: int) -> Head | None:
+    """The head of the record that begins there; None where none of the known kinds does, or it is cut off."""
+    if len(data) - at < 8:
+        return None
+    (size,) = U32.unpack_from(data, at)
+    if size > HEAD_LIMIT or size > len(data) - at - 8:
+        return None
+    found = fields(data, at + 4, at + 4 + size)
+    if found is None or len(op := found.get(b"op", b"")) != 1:
+        return None
+    needed = NEEDED.get(op[0])
+    if needed is None or any(len(found.get(name, b"")) != length for name, length in needed.items()):
+        return None
+    (length,) = U32.unpack_from(data, at + 4 + size)
+    return Head(op[0], found, at, at + 8 + size, length)
+
+
+def next_head(data: bytes, op: Op, start: int) -> Head | None:
+    """The first record of a kind at or behind a byte, found by what every such head has in it."""
+    sign = b"\4\0\0\0op=" + bytes([op])
+    at = data.find(sign, start)
+    while at >= 0:
+        for ahead in AHEAD[op]:
+            if at - 4 - ahead >= start and (found := head(data, at - 4 - ahead)) is not None and found.op == op:
+                return found
+        at = data.find(sign, at + 1)
+    return None
+
+
+def connection(found: Head, data: bytes, record: bytes) -> Connection:
+    """What a connection record defines.
+
+    Raises:
+        LogError: it lacks a topic or a type.
+    """
+    inner = fields(data, 0, len(data))
+    if inner is None or b"type" not in inner:
+        raise LogError("a connection record is damaged", expected="a type")
+    topic = found.fields.get(b"topic", inner.get(b"topic", b""))
+    try:
+        return Connection(
+            found.number(b"conn"), topic.decode(), inner[b"type"].decode(), inner.get(b"message_definition", b""), record
+        )
+    except UnicodeDecodeError as error:
+        raise LogError(f"a connection record is damaged ({error})", expected="names in UTF-8") from error
+
+
+def unpack(compression: str, packed: bytes, size: int, *, cut: bool = False) -> bytes:
+    """The bytes of a chunk, never more than it says it has; of one that is cut off those that are there.
+
+    Raises:
+        LogError: an unknown compression, damaged, or of another size than it says.
+    """
+    if compression == "none":
+        return packed
+    if compression not in ("bz2", "lz4"):
+        raise LogError(f"it is packed with {compression!r}", expected="bz2, lz4 or none")
+    if size > CHUNK_LIMIT:
+        raise LogError(f"it says it unpacks to {size} bytes", expected=f"at most {CHUNK_LIMIT}")
+    unpacker = bz2.BZ2Decompressor() if compression == "bz2" else lz4.frame.LZ4FrameDecompressor()
+    parts: list[bytes] = []
+    left, data = size + 1, packed  # one more than it says, to notice one that goes on
+    try:
+        while left and not unpacker.eof and (data or not unpacker.needs_input):
+            parts.append(unpacker.decompress(data, max_length=left))
+            left, data = left - len(parts[-1]), b""
+    except (OSError, ValueError, EOFError, RuntimeError) as error:
+        raise LogError(f"it does not unpack ({error})") from error
+    if cut:
+        return b"".join(parts)[:size]
+    if left != 1 or not unpacker.eof:
+        raise LogError(f"it does not unpack to the {size} bytes it says it has")
+    return b"".join(parts)
+
+
+# ── writing ──────────────────────────────────────────────────────────────────────────────────────────────────────────
+
+
+def record(op: Op, named: Mapping[bytes, bytes], data: bytes) -> bytes:
+    """The bytes of a record; its fields in order of their names, as rosbag writes them."""
+    every = sorted({**named, b"op": bytes([op])}.items())
+    inner = b"".join(U32.pack(len(name) + 1 + len(value)) + name + b"=" + value for name, value in every)
+    return U32.pack(len(inner)) + inner + U32.pack(len(data)) + data
+
+
+def stamp(time_ns: int) -> bytes:
+    """A time as the format has it."""
+    return struct.pack("<II", *divmod(time_ns, 10**9))
+
+
+def bag_header(index_pos: int, connections: int, chunks: int) -> bytes:
+    """The first record, padded to its fixed size."""
+    named = {b"index_pos": struct.pack("<Q", index_pos), b"conn_count": U32.pack(connections), b"chunk_count": U32.pack(chunks)}
+    empty = len(record(Op.BAG, named, b"")) - 8
+    return record(Op.BAG, named, b" " * (FIRST_RECORD - empty))
+
+
+def index(number: int, entries: Sequence[tuple[int, int]]) -> bytes:
+    """Times (ns) and offsets of one connection's messages in the chunk ahead of it."""
+    data = b"".join(stamp(time_ns) + U32.pack(offset) for time_ns, offset in sorted(entries))
+    return record(Op.INDEX, {b"ver": U32.pack(1), b"conn": U32.pack(number), b"count": U32.pack(len(entries))}, data)
+
+
+def chunk_info(position: int, first_ns: int, last_ns: int, counts: Mapping[int, int]) -> bytes:
+    """What the end of a bag says of a chunk."""
+    named = {
+        b"ver": U32.pack(1),
+        b"chunk_pos": struct.pack("<Q", position),
+        b"start_time": stamp(first_ns),
+        b"end_time": stamp(last_ns),
+        b"count": U32.pack(len(counts)),
+    }
+    return record(Op.INFO, named, b"".join(U32.pack(number) + U32.pack(count) for number, count in counts.items()))

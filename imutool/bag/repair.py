@@ -1,0 +1,161 @@
+"""A bag written anew from what can be read of another: its chunks as they are, with the index that the format asks for."""
+
+from __future__ import annotations
+
+import zlib
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+from imutool.bag import records
+from imutool.bag.records import FIRST_RECORD, MAGIC, U32, Op
+from imutool.bag.walk import Bag, Chunk, Loss
+from imutool.errors import ConfigError, LogError
+from imutool.mcap_io.target import Target
+from imutool.place import Place, same
+
+Progress = Callable[[int, int], None]
+PASSES = 3  # to plan, to write, to check
+
+
+@dataclass(frozen=True)
+class BagReport:
+    """What a repaired bag holds, and what of the source it does not."""
+
+    messages: Mapping[str, int]  # per topic
+    chunks: int
+    rebuilt: int  # of these, made anew because something in them was lost
+    was_indexed: bool
+    lost: int  # stretches, of which the first are listed
+    losses: Sequence[Loss]
+    source_bytes: int
+    target_bytes: int
+
+    @property
+    def whole(self) -> bool:
+        """Whether everything in the source is in the target."""
+        return self.lost == 0
+
+
+class _Entry(NamedTuple):
+    """A chunk of the target."""
+
+    position: int
+    first_ns: int
+    last_ns: int
+    counts: Mapping[int, int]
+
+
+def repair_bag(source: Place, target: Place, *, overwrite: bool = False, progress: Progress | None = None) -> BagReport:
+    """Writes `target`: every message of `source` that can be read, byte for byte, with its index.
+
+    A chunk of which nothing is lost keeps its bytes; any other is written unpacked with the messages found in it. The result
+    is read back and compared before it takes its place. The format has no checks of its own: a flipped byte in the payload of
+    an unpacked chunk is not noticed by anybody. `progress` is told the bytes done, of three times those of the source.
+
+    Raises:
+        ConfigError: source or target cannot be opened, the target exists or is the source.
+        LogError: the source is no ROS 1 bag or encrypted, or nothing in it can be read.
+    """
+    if same(source, target):
+        raise ConfigError("the target is the source", where=target, fix="Choose another name")
+    tell = progress or (lambda done, total: None)
+    with Bag(source, salvage=True) as bag, Target(target, overwrite=overwrite) as out:
+        size = bag.source.size
+        index_pos, count = _plan(bag, lambda done: tell(done, PASSES * size))
+        if not count and (bag.lost or bag.header is None):
+            raise LogError("not one message can be read", where=source, expected="a bag with messages")
+        used = sorted(bag.connections)
+        out.write(MAGIC + records.bag_header(index_pos, len(used), count))
+        with Bag(source, salvage=True) as again:
+            entries, crc, rebuilt = _write(again, out, lambda done: tell(size + done, PASSES * size))
+            if (out.position, len(entries), sorted(again.connections)) != (index_pos, count, used):
+                raise LogError("the bag changed while it was read", where=source)
+            for number in used:
+                out.write(again.connections[number].record)
+        for entry in entries:
+            out.write(records.chunk_info(*entry))
+        out.flush()
+        found = _read_back(out.temporary, lambda done: tell(2 * size + done * size // out.position, PASSES * size))
+        if found != crc:
+            raise LogError("what was written is not what was read", where=target)
+        messages: Counter[str] = Counter()
+        for entry in entries:
+            messages.update({bag.connections[number].topic: n for number, n in entry.counts.items()})
+        return BagReport(dict(messages), count, rebuilt, bag.indexed, bag.lost, tuple(bag.losses), size, out.position)
+
+
+def _plan(bag: Bag, tell: Callable[[int], None]) -> tuple[int, int]:
+    """Where the index will begin, and how many chunks there will be."""
+    position, count = len(MAGIC) + FIRST_RECORD + 8, 0
+    for chunk in bag.chunks():
+        position += _length(chunk) + sum(len(raw) for raw in _indexes(chunk, _offsets(chunk)))
+        count += 1
+        tell(chunk.offset + chunk.length)
+    return position, count
+
+
+def _write(bag: Bag, out: Target, tell: Callable[[int], None]) -> tuple[list[_Entry], int, int]:
+    """The chunks written, the CRC of their messages, and how many were made anew."""
+    entries, crc, rebuilt = [], 0, 0
+    for chunk in bag.chunks():
+        counts = Counter(message.connection for message in chunk.messages)
+        times = [message.time_ns for message in chunk.messages]
+        entries.append(_Entry(out.position, min(times), max(times), dict(sorted(counts.items()))))
+        if chunk.whole:
+            out.write(bag.source.at(chunk.offset, chunk.length))
+        else:
+            rebuilt += 1
+            data = b"".join(chunk.data[message.at : message.end] for message in chunk.messages)
+            out.write(records.record(Op.CHUNK, {b"compression": b"none", b"size": U32.pack(len(data))}, data))
+        for raw in _indexes(chunk, _offsets(chunk)):
+            out.write(raw)
+        crc = _crc(chunk, crc)
+        tell(chunk.offset + chunk.length)
+    return entries, crc, rebuilt
+
+
+def _length(chunk: Chunk) -> int:
+    """Bytes of the record that a chunk becomes."""
+    if chunk.whole:
+        return chunk.length
+    size = sum(message.end - message.at for message in chunk.messages)
+    return len(records.record(Op.CHUNK, {b"compression": b"none", b"size": U32.pack(size)}, b"")) + size
+
+
+def _offsets(chunk: Chunk) -> list[int]:
+    """Where each message begins in the chunk's bytes as they are written."""
+    if chunk.whole:
+        return [message.at for message in chunk.messages]
+    offsets, at = [], 0
+    for message in chunk.messages:
+        offsets.append(at)
+        at += message.end - message.at
+    return offsets
+
+
+def _indexes(chunk: Chunk, offsets: Sequence[int]) -> list[bytes]:
+    """The index records behind a chunk, one per connection."""
+    entries: dict[int, list[tuple[int, int]]] = {}
+    for message, offset in zip(chunk.messages, offsets, strict=True):
+        entries.setdefault(message.connection, []).append((message.time_ns, offset))
+    return [records.index(number, found) for number, found in sorted(entries.items())]
+
+
+def _crc(chunk: Chunk, crc: int) -> int:
+    for message in chunk.messages:
+        crc = zlib.crc32(chunk.data[message.at : message.end], crc)
+    return crc
+
+
+def _read_back(path: Place, tell: Callable[[int], None]) -> int:
+    """The CRC of all messages in a bag that must be whole."""
+    crc = 0
+    with Bag(path) as bag:
+        if not bag.indexed:
+            raise LogError("what was written has no index", where=path)
+        for chunk in bag.chunks():
+            crc = _crc(chunk, crc)
+            tell(chunk.offset + chunk.length)
+    return crc
