@@ -261,6 +261,7 @@ class _Rewrite:
         for name, values in (metadata(verified) if callable(metadata) else metadata).items():
             self.out.metadata(name, values)
         self.out.finish()
+        self.structure.items.clear()  # what grows with a log is its chart, and the look back makes another
         verify(
             self.out.target.temporary,
             contents.counts,
