@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import signal
 import subprocess
 import sys
+import threading
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from imutool.debias import debias
@@ -19,7 +23,9 @@ from imutool.mcap_io.digest import sha256
 from imutool.mcap_io.rewrite import rewrite
 from imutool.mcap_io.source import Source
 from imutool.mcap_io.target import Target
+from imutool.mcap_io.write import write
 from imutool.place import BLOCK_BYTES, place, same
+from imutool.recording import Frames, Imu, Recording
 
 MIB = 1 << 20
 LEAST_PART = 5 * MIB  # S3 takes no smaller ones, but for the last
@@ -146,6 +152,16 @@ def test_a_large_object_goes_up_in_parts_and_comes_back(store: Any, monkeypatch:
     assert (store.uploads(), store.keys()) == ([], ["large"])
     assert store.get("large") == data
     assert sum("partNumber" in request.query for request in store.requests) == 3
+
+
+def test_parts_grow_so_that_there_are_never_too_many_of_them(store: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(upload, "PART_BYTES", LEAST_PART)
+    monkeypatch.setattr(upload, "LARGE_AFTER", LEAST_PART)
+    monkeypatch.setattr(upload, "LARGE_PART_BYTES", 8 * MIB)
+    filled("s3://fleet/large", 22, MIB)
+    assert sum("partNumber" in request.query for request in store.requests) == 4  # of 5, 8, 8 and 1 MiB
+    assert len(store.get("large")) == 22 * MIB
+    assert upload.LARGE_AFTER / upload.PART_BYTES < 10_000
 
 
 def filled(url: str, pieces: int = 1, size: int = 4, then: Callable[[Target], object] = lambda _: None) -> None:
@@ -312,3 +328,30 @@ def test_a_log_is_described_as_the_file_is(store: Any, logs: Path, flight: bytes
     there, here = inspect(place(store.put("flight_1.mcap", flight))), inspect(logs / "flight_1.mcap")
     assert there.pop("path") == "s3://fleet/flight_1.mcap"
     assert there == {name: value for name, value in here.items() if name != "path"}
+
+
+def test_a_debias_that_is_terminated_in_the_middle_of_its_upload_leaves_nothing(
+    store: Any, command: str, tmp_path: Path
+) -> None:
+    t_ns = 10**18 + np.arange(400) * 5_000_000
+    images = Frames("png", 100, lambda: iter([(int(t_ns[4 * n]), bytes([n]) * 200_000) for n in range(100)]))
+    write(
+        Recording("r", Imu(t_ns, np.zeros((400, 3)), np.tile([0, 0, 9.81], (400, 1))), frames={"/cam0": images}),
+        tmp_path / "in.mcap",
+    )
+    url, half_way = store.put("in.mcap", (tmp_path / "in.mcap").read_bytes()), threading.Event()
+
+    def slow(request: Any) -> None:
+        if "partNumber=2" in request.query:
+            half_way.set()
+            time.sleep(2.0)
+
+    store.fault = slow
+    line = [command, "debias", url, "s3://fleet/out.mcap", "--model", "static", "-q"]
+    with subprocess.Popen(line, cwd=tmp_path, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE) as process:
+        assert half_way.wait(60)
+        assert len(store.uploads()) == 1
+        process.send_signal(signal.SIGTERM)
+        _, stderr = process.communicate(timeout=60)
+    assert (process.returncode, stderr) == (143, b"")
+    assert (store.uploads(), store.keys()) == ([], ["in.mcap"])

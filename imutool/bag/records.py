@@ -7,6 +7,7 @@ proves that bytes are those that were recorded, but for the checks inside bz2 an
 from __future__ import annotations
 
 import bz2
+import re
 import struct
 from collections.abc import Mapping, Sequence
 from enum import IntEnum
@@ -20,6 +21,7 @@ MAGIC = b"#ROSBAG V2.0\n"
 FIRST_RECORD = 4096  # header and padding of the bag header record, so that it can be filled in at the end
 HEAD_LIMIT = 4096  # of a record's fields: a topic is the longest, and a definition's text is not among them
 CHUNK_LIMIT = 1 << 30  # unpacked bytes; rosbag's own are 768 KiB or one message
+KIND = re.compile(r"\w+(/\w+)*", re.ASCII)
 U32 = struct.Struct("<I")
 
 
@@ -77,7 +79,6 @@ class Connection(NamedTuple):
     number: int
     topic: str
     kind: str
-    definition: bytes
     record: bytes
 
 
@@ -89,7 +90,7 @@ def fields(data: bytes, at: int, end: int) -> dict[bytes, bytes] | None:
             return None
         (size,) = U32.unpack_from(data, at)
         name, equals, value = data[at + 4 : at + 4 + size].partition(b"=") if size <= end - at - 4 else (b"", b"", b"")
-        if not equals:
+        if not (equals and name.isascii()):
             return None
         found[name] = value
         at += 4 + size
@@ -108,6 +109,8 @@ def head(data: bytes, at: int) -> Head | None:
         return None
     needed = NEEDED.get(op[0])
     if needed is None or any(len(found.get(name, b"")) != length for name, length in needed.items()):
+        return None
+    if op[0] == Op.CHUNK and b"compression" not in found:
         return None
     (length,) = U32.unpack_from(data, at + 4 + size)
     return Head(op[0], found, at, at + 8 + size, length)
@@ -129,18 +132,20 @@ def connection(found: Head, data: bytes, record: bytes) -> Connection:
     """What a connection record defines.
 
     Raises:
-        LogError: it lacks a topic or a type.
+        LogError: it lacks what every reader asks of it, or holds something else.
     """
     inner = fields(data, 0, len(data))
-    if inner is None or b"type" not in inner:
-        raise LogError("a connection record is damaged", expected="a type")
-    topic = found.fields.get(b"topic", inner.get(b"topic", b""))
+    if inner is None or not inner.keys() >= {b"type", b"md5sum", b"message_definition"}:
+        raise LogError("a connection record is damaged", expected="type, md5sum and message_definition")
     try:
-        return Connection(
-            found.number(b"conn"), topic.decode(), inner[b"type"].decode(), inner.get(b"message_definition", b""), record
-        )
+        topic = found.fields.get(b"topic", b"").decode()
+        kind, _, _ = (inner[name].decode() for name in (b"type", b"md5sum", b"message_definition"))
+        inner.get(b"callerid", b"").decode()
     except UnicodeDecodeError as error:
-        raise LogError(f"a connection record is damaged ({error})", expected="names in UTF-8") from error
+        raise LogError(f"a connection record is damaged ({error})", expected="text in UTF-8") from error
+    if not (topic.isprintable() and topic and KIND.fullmatch(kind) and inner.get(b"latching", b"") in (b"", b"0", b"1")):
+        raise LogError(f"a connection record is damaged: topic {topic!r} of type {kind!r}")
+    return Connection(found.number(b"conn"), topic, kind, record)
 
 
 def unpack(compression: str, packed: bytes, size: int, *, cut: bool = False) -> bytes:

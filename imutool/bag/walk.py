@@ -216,7 +216,7 @@ class Bag:
 
     def _chunk(self, found: Head, end: int) -> Chunk:
         """What can be read of a chunk; all that is wrong with it is one loss."""
-        compression = found.fields.get(b"compression", b"none").decode("ascii", "replace")
+        compression = found.fields[b"compression"].decode("ascii", "replace")
         wrong = end != found.end
         reasons = ["the chunk does not end where it says"] if wrong else []
         data, messages, told = b"", list[Message](), self._told(end)

@@ -6,6 +6,8 @@ A command is a file, and being imported here is what makes it one.
 from __future__ import annotations
 
 import os
+import signal
+import sys
 
 from imutool.cli import conceal, convert, debias, demo, diagnose, evaluate, export, info, models, simulate, train, view, vio
 from imutool.cli._app import app, caught
@@ -13,9 +15,14 @@ from imutool.cli._app import app, caught
 COMMANDS = (convert, info, train, debias, evaluate, view, export, vio, simulate, diagnose, conceal, models, demo)
 
 
+TERMINATED = 143  # what a shell reports of a program that SIGTERM ended
+
+
 def main() -> None:
     """Entry point of the `imutool` command."""
     # Idle OpenMP threads would spin: on a busy machine with two processors, training took 87 s of their time instead of 11
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+    # A scheduler's SIGTERM would end the process where it stands, with its temporary files and parts of uploads left behind
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(TERMINATED))
     with caught():
         app()

@@ -12,7 +12,8 @@ from imutool.mcap_io.source import Source
 if TYPE_CHECKING:
     from upath import UPath
 
-PART_BYTES = 16 << 20  # S3 takes 10 000 parts: up to 156 GiB, with one part and its copy in memory
+PART_BYTES = 8 << 20  # one part and its copies are what is in memory
+LARGE_AFTER, LARGE_PART_BYTES = 32 << 30, 64 << 20  # S3 takes 10 000 parts: so they are enough for 400 GiB
 
 
 class Upload:
@@ -29,6 +30,8 @@ class Upload:
 
     def write(self, data: bytes | bytearray | memoryview) -> None:
         """Takes in bytes, and sends a part whenever there is one."""
+        if self.size >= LARGE_AFTER:
+            self.file.blocksize = LARGE_PART_BYTES
         self.file.write(data)
         self.size += len(data)
 
