@@ -20,8 +20,10 @@ from mcap.records import Metadata
 
 from imutool.errors import DataError, LogError
 from imutool.mcap_io import records, schema
+from imutool.mcap_io.losses import Losses
 from imutool.mcap_io.memory import keep_buffers
 from imutool.mcap_io.records import HEAD
+from imutool.mcap_io.salvaged import Salvaged
 from imutool.mcap_io.source import Source
 from imutool.mcap_io.structure import Block, Span, Structure
 
@@ -87,18 +89,22 @@ class Log:
 
     Memory is bounded by its largest chunk. Times given to a method select by log time, both ends included.
 
+    With `salvage` a damaged log opens too: what cannot be proven is left out, and `losses` says what and why. It is complete once
+    everything was read (`check`), because the damage inside a chunk shows when that is unpacked.
+
     Raises:
         ConfigError: the file cannot be opened.
-        LogError: empty, not an MCAP log, cut short or damaged.
+        LogError: empty, not an MCAP log, cut short or damaged; with `salvage`, if there is nothing in it to be saved.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, *, salvage: bool = False) -> None:
         keep_buffers()
         self.path = path
+        self._set_aside: set[int] = set()  # channels of a damaged log that carry something else than their topic does
         self._source = Source(path)
         try:
             with self.named():
-                self.structure = Structure(self._source)
+                self.structure = Salvaged(self._source) if salvage else Structure(self._source)
                 self.topics = MappingProxyType(self._topics())
         except BaseException:
             self._source.file.close()
@@ -139,8 +145,17 @@ class Log:
                 found[channel.topic].schema_name,
                 found[channel.topic].message_encoding,
             ):
-                raise LogError(f"{channel.topic} carries {before.schema_name} and {found[channel.topic].schema_name}")
+                if self.losses is None:
+                    raise LogError(f"{channel.topic} carries {before.schema_name} and {found[channel.topic].schema_name}")
+                self.losses.mend(f"{channel.topic} carries {before.schema_name} and {found[channel.topic].schema_name}")
+                found[channel.topic] = before
+                self._set_aside.add(identity)
         return found
+
+    @property
+    def losses(self) -> Losses | None:
+        """What is lost so far, nothing of a whole log; None without salvage, where the first damage is an error."""
+        return self.structure.losses
 
     @property
     def profile(self) -> str:
@@ -221,12 +236,12 @@ class Log:
             for block in self.structure.blocks:
                 if not block.holds(channels):
                     continue
-                if block.indexes:
-                    entries = [self.structure.index(block, c) for c in sorted(channels & block.indexes.keys())]
+                indexed = sorted(channels & block.indexes.keys()) if block.vouched and not block.edited else []
+                entries = [self.structure.index(block, c) for c in indexed]
+                if indexed and all(len(entry) for entry in entries):
                     table = np.concatenate(entries)
                     yield records.signed(table[np.argsort(table[:, 1], kind="stable"), 0])
-                else:
-                    found = self.structure.unpack(block)
+                elif (found := self.structure.found(block)) is not None:
                     times = found.times()[np.isin(found.heads["channel"], list(channels))]
                     if len(times):
                         yield times
@@ -321,7 +336,7 @@ class Log:
 
     def channel_ids(self, topic: str) -> set[int]:
         """The channels of a topic."""
-        return {i for i, channel in self.structure.channels.items() if channel.topic == topic}
+        return {i for i, channel in self.structure.channels.items() if channel.topic == topic} - self._set_aside
 
     def rows(
         self, topics: Collection[str], start_ns: int | None = None, end_ns: int | None = None
@@ -339,7 +354,9 @@ class Log:
     def _rows_of(
         self, block: Block, wanted: Mapping[str, set[int]], first: int, last: int
     ) -> Iterator[tuple[str, records.Rows]]:
-        found = self.structure.unpack(block)
+        found = self.structure.found(block)
+        if found is None:
+            return
         times = found.times()
         inside = (times >= first) & (times <= last)
         for topic, channels in wanted.items():

@@ -119,7 +119,7 @@ def signed(times: UInt64[np.ndarray, " n"]) -> Int64[np.ndarray, " n"]:
 def scan(data: bytes, *, bare: bool = False) -> tuple[Int64[np.ndarray, " n"], list[tuple[int, int, int]], int]:
     """Where messages and definitions begin in a stretch of records, and the byte at which whole records end.
 
-    A `bare` stretch lies outside chunks and also ends before the first record that is no message. Stretches of equally
+    A `bare` stretch lies outside chunks and also ends before the first record that is no message, or none that can be. Stretches of equally
     long messages, which topic-grouped chunks consist of, are recognised as a matrix; the framing is still followed
     record by record, only not in Python.
     """
@@ -135,6 +135,8 @@ def scan(data: bytes, *, bare: bool = False) -> tuple[Int64[np.ndarray, " n"], l
             break
         if opcode == Opcode.MESSAGE:
             if length < FIXED:
+                if bare:
+                    break
                 raise LogError(f"a message has {length} bytes", expected=f"at least {FIXED}")
             equal, last = (equal + 1, last) if length == last else (0, length)
             if equal >= wait:

@@ -20,6 +20,7 @@ from mcap.records import Channel, ChunkIndex, Footer, Header, Schema, Statistics
 
 from imutool.errors import LogError
 from imutool.mcap_io import records
+from imutool.mcap_io.losses import Losses
 from imutool.mcap_io.records import FOOTER_SIZE, HEAD, MAGIC
 from imutool.mcap_io.source import CUT_SHORT, Source
 
@@ -46,10 +47,13 @@ class Block:
     compression: str | None  # None: a run outside chunks
     indexes: dict[int, int] = field(default_factory=dict)  # channel id to the offset of its MessageIndex record
     counts: dict[int, int] | None = None  # messages per channel id, once known
+    vouched: bool = True  # False: what is said of the block was found lying about, and only unpacking it proves it
+    edited: bool = False  # its messages are not those of its bytes: some are left out, or have other channel ids
+    lost: bool = False
 
     def holds(self, channels: set[int]) -> bool:
         """False when the block cannot hold a message of these channels."""
-        known = self.indexes or self.counts
+        known = (self.indexes if self.vouched else None) or self.counts
         return known is None or not channels.isdisjoint(known)
 
 
@@ -59,6 +63,8 @@ class Structure:
     Raises:
         LogError: empty, not an MCAP log, cut short, or damaged; the message says at which byte.
     """
+
+    losses: Losses | None = None  # nothing is ever lost here: the first damage is an error
 
     def __init__(self, source: Source) -> None:
         self.source = source
@@ -74,7 +80,20 @@ class Structure:
     @property
     def blocks(self) -> list[Block]:
         """Everything that holds messages, in file order."""
-        return [item for item in self.items if isinstance(item, Block)]
+        return [item for item in self.items if isinstance(item, Block) and not item.lost]
+
+    @property
+    def opening(self) -> bytes:
+        """The bytes of the Header record."""
+        return self.source.at(len(MAGIC), self.header_end - len(MAGIC))
+
+    def lose(self, item: Block | Span, error: LogError) -> None:
+        """Called where a part of the log cannot be used; here that is an error.
+
+        Raises:
+            LogError: `error`.
+        """
+        raise error
 
     def counts(self) -> dict[int, int]:
         """Messages per channel id."""
@@ -91,8 +110,19 @@ class Structure:
         Raises:
             LogError: the block is damaged.
         """
-        raw = self.source.at(block.offset, block.length)
-        return self.unpacked(block, raw)
+        return self.unpacked(block, self.read(block))
+
+    def read(self, block: Block) -> bytes:
+        """The bytes of a block, as they may stand in another log."""
+        return self.source.at(block.offset, block.length)
+
+    def found(self, block: Block) -> records.Messages | None:
+        """The messages of a block, or None if that block is lost now."""
+        try:
+            return self.unpack(block)
+        except LogError as error:
+            self.lose(block, error)
+            return None
 
     def unpacked(self, block: Block, raw: bytes) -> records.Messages:
         """The same, for a caller that has read the block's bytes already."""
@@ -206,7 +236,7 @@ class Structure:
         self.header_end = position
         while position < limit:
             if (known := index.get(position)) is not None:
-                block = _known(known, limit)
+                block = known_block(known, limit)
                 self.items.append(block)
                 position = block.end
                 continue
@@ -253,6 +283,10 @@ class Structure:
         """A run of messages outside chunks, as one block."""
         raw = self.source.at(position, max(first, min(RUN_BYTES, limit - position)))
         _, _, end = records.scan(raw, bare=True)
+        if not end:
+            raise LogError(
+                f"the message at byte {position} has {first - HEAD.size} bytes", expected=f"at least {records.FIXED}"
+            )
         found = records.messages(raw[:end], position)
         times = found.times()
         counts = Counter(found.heads["channel"].tolist())
@@ -294,7 +328,7 @@ class Structure:
         return block.counts
 
 
-def _known(entry: ChunkIndex, limit: int) -> Block:
+def known_block(entry: ChunkIndex, limit: int) -> Block:
     """A chunk as the summary describes it."""
     offset, length = entry.chunk_start_offset, entry.chunk_length
     end = offset + length + entry.message_index_length
