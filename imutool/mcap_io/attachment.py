@@ -52,8 +52,8 @@ class Attached:
             raise LogError(f"the attachment at byte {offset} is damaged: its data have {size} bytes")
         return Attached(offset, HEAD.size + length, log_time, create_time, name, media_type, size)
 
-    def check(self, source: Source) -> None:
-        """Reads it all and compares its CRC, where it states one.
+    def check(self, source: Source) -> bool:
+        """Reads it all and compares its CRC; false if it states none.
 
         Raises:
             LogError: another CRC.
@@ -61,8 +61,9 @@ class Attached:
         start, end = self.offset + HEAD.size, self.offset + self.length - 4
         stated, crc = struct.unpack("<I", source.at(end, 4))[0], 0
         if not stated:
-            return
+            return False
         for at in range(start, end, BLOCK):
             crc = zlib.crc32(source.at(at, min(BLOCK, end - at)), crc)
         if crc != stated:
             raise LogError(f"the attachment at byte {self.offset} is damaged: its CRC is {crc:08x}", expected=f"{stated:08x}")
+        return True

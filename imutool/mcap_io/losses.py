@@ -54,6 +54,7 @@ class Losses:
     mended: list[str] = field(default_factory=list)
     left_out: int = 0  # stretches beyond those listed
     bytes: int = 0
+    unproven: list[str] = field(default_factory=list)  # topics whose definition no CRC covers
     unchecked_in: dict[int, int] = field(default_factory=dict)  # messages without CRC, by the offset of their stretch
 
     def __bool__(self) -> bool:
@@ -103,6 +104,7 @@ class Losses:
             "stretches_not_listed": self.left_out,
             "mended": list(self.mended),
             "unchecked_messages": self.unchecked,
+            "unchecked_definitions": list(self.unproven),
         }
 
     def lines(self) -> list[str]:
@@ -113,4 +115,6 @@ class Losses:
         told += [f"mended: {what}" for what in self.mended]
         if self.unchecked:
             told.append(f"unchecked: {self.unchecked} messages lie where no CRC covers them")
+        if self.unproven:
+            told.append(f"unchecked: no CRC covers the definition of {', '.join(self.unproven)}")
         return told

@@ -1,17 +1,29 @@
-"""A chunk whose head is damaged and whose contents are not: what the head said can be known from elsewhere, and a CRC proves it."""
+"""What can be had of a chunk that is damaged: its contents where only its head is, else the definitions it begins with.
+
+What a damaged head said can be known from elsewhere, and the CRC proves it.
+"""
 
 from __future__ import annotations
 
+import contextlib
 import struct
 from collections.abc import Iterator
 
+import lz4.frame
 import zstandard
 from mcap.opcode import Opcode
-from mcap.records import ChunkIndex
+from mcap.records import Channel, ChunkIndex, Schema
 
 from imutool.errors import LogError
 from imutool.mcap_io import records
 from imutool.mcap_io.records import CHUNK_HEAD, HEAD
+
+FRAMES = (b"\x28\xb5\x2f\xfd", b"\x04\x22\x4d\x18")  # how what zstd and lz4 packed begins
+CHUNK_OPCODE = bytes([Opcode.CHUNK])
+DEFINITIONS = {int(Opcode.SCHEMA): Schema, int(Opcode.CHANNEL): Channel}
+MOST_SEARCHED = 1 << 20
+MOST_BEGUN = 4 << 20  # bytes to look for definitions in: they come first
+STEP = 4096
 
 
 def mended(raw: bytes, offset: int, known: ChunkIndex | None) -> bytes | None:
@@ -19,7 +31,7 @@ def mended(raw: bytes, offset: int, known: ChunkIndex | None) -> bytes | None:
 
     `known` is what a sound summary says of the chunk. The CRC itself must stand in the record as it was written.
     """
-    if len(raw) < HEAD.size + CHUNK_HEAD.size + 8 or _in_order(raw, offset, known):
+    if in_order(raw, offset, known) or len(raw) < HEAD.size + CHUNK_HEAD.size + 8:
         return None
     for candidate in _candidates(raw, known):
         try:
@@ -31,9 +43,9 @@ def mended(raw: bytes, offset: int, known: ChunkIndex | None) -> bytes | None:
     return None
 
 
-def _in_order(raw: bytes, offset: int, known: ChunkIndex | None) -> bool:
+def in_order(raw: bytes, offset: int, known: ChunkIndex | None) -> bool:
     """Whether the head agrees with itself, with its data and with what is known of it."""
-    if HEAD.unpack_from(raw) != (Opcode.CHUNK, len(raw) - HEAD.size):
+    if len(raw) < HEAD.size or HEAD.unpack_from(raw) != (Opcode.CHUNK, len(raw) - HEAD.size):
         return False
     try:
         head = records.ChunkHead.of(raw[:128], len(raw), offset)
@@ -70,3 +82,47 @@ def _candidates(raw: bytes, known: ChunkIndex | None) -> Iterator[bytes]:
         for size in sorted(sizes):
             body = CHUNK_HEAD.pack(start_ns, end_ns, size, crc, len(name.encode())) + name.encode()
             yield HEAD.pack(Opcode.CHUNK, len(raw) - HEAD.size) + body + struct.pack("<Q", len(packed)) + packed
+
+
+def definitions(raw: bytes) -> Iterator[tuple[int, bytes]]:
+    """Schema and Channel records (opcode and body) in what can still be unpacked of a damaged stretch: nothing proves them.
+
+    A writer may define its channels in its first chunk alone; without these few bytes all sound chunks behind it would mean nothing.
+    """
+    starts = [raw.find(magic, 0, MOST_SEARCHED) for magic in FRAMES] + ([_uncompressed(raw)] if raw[:1] == CHUNK_OPCODE else [])
+    for start in sorted(start for start in starts if start >= 0):
+        data, at = _begun(raw[start:]), 0
+        while len(data) - at >= HEAD.size:
+            opcode, length = HEAD.unpack_from(data, at)
+            whole = data[at : at + HEAD.size + length] if length <= len(data) - at - HEAD.size else b""
+            if not whole:
+                break
+            if opcode in DEFINITIONS:
+                with contextlib.suppress(LogError):
+                    if records.build(records.parse(DEFINITIONS[opcode], whole[HEAD.size :], 0)) == whole:
+                        yield opcode, whole[HEAD.size :]
+            at += len(whole)
+
+
+def _uncompressed(raw: bytes) -> int:
+    """Where the records of a chunk without compression begin."""
+    at = HEAD.size + CHUNK_HEAD.size
+    return at + 8 if raw[at - 4 : at] == bytes(4) else -1
+
+
+def _begun(packed: bytes) -> bytes:
+    """As much as unpacks before the damage, from a stretch that begins as its magic says; at most `MOST_BEGUN` bytes."""
+    if not packed.startswith(FRAMES):
+        return packed[:MOST_BEGUN]
+    zstd = packed.startswith(FRAMES[0])
+    stream = zstandard.ZstdDecompressor().decompressobj() if zstd else lz4.frame.LZ4FrameDecompressor()
+    data = b""
+    try:
+        for at in range(0, min(len(packed), MOST_BEGUN), STEP):
+            piece = packed[at : at + STEP]
+            data += stream.decompress(piece) if zstd else stream.decompress(piece, max_length=MOST_BEGUN)
+            if len(data) >= MOST_BEGUN:
+                break
+    except (zstandard.ZstdError, RuntimeError, EOFError, ValueError):
+        pass  # what came before is what there is
+    return data[:MOST_BEGUN]

@@ -103,6 +103,11 @@ class Frames:
         """Whether a log begins or ends there."""
         return position + len(MAGIC) <= self.limit and self.source.at(position, len(MAGIC)) == MAGIC
 
+    def holds(self, start: int, end: int, needle: bytes) -> bool:
+        """Whether some bytes stand anywhere in a stretch."""
+        over = len(needle) - 1
+        return any(needle in self.source.at(at, min(WINDOW + over, end - at)) for at in range(start, end, WINDOW))
+
     def leads_on(self, position: int) -> bool:
         """Whether what came before ended well: the file ends here, or what may be a record begins."""
         return position == self.limit or self.magic(position) or self.head(position) is not None

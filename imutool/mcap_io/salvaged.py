@@ -25,13 +25,14 @@ from imutool.errors import LogError
 from imutool.mcap_io import records
 from imutool.mcap_io.attachment import Attached
 from imutool.mcap_io.losses import Loss, Losses
-from imutool.mcap_io.mend import mended
+from imutool.mcap_io.mend import MOST_SEARCHED, definitions, in_order, mended
 from imutool.mcap_io.records import FIXED, FOOTER_SIZE, HEAD, MAGIC
-from imutool.mcap_io.resync import PRIVATE, SUMMARY, Frames
+from imutool.mcap_io.resync import LEAST, PRIVATE, SUMMARY, Frames
 from imutool.mcap_io.source import Source
 from imutool.mcap_io.structure import RUN_BYTES, Block, Span, Structure, known_block
 
 MOST_ITEMS = 5_000_000  # a 100 GB log has some 100 000 chunks; a file of nothing but empty ones is made to fill the memory
+ANOTHER = MAGIC + bytes([Opcode.HEADER])  # how a log begins
 MOST_AGREED = 1000
 MOST_SUMMARY = 1 << 28  # bytes; that of a 100 GB log has some 20 million
 LATEST_NS = 2**63  # log times from here on (the year 2262) are of no clock
@@ -273,20 +274,27 @@ class Salvaged(Structure):
         head = frames.head(position)
         if head is not None and head[0] == Opcode.MESSAGE:
             return self._messages(position, head[1])
-        if head is not None and frames.agrees(position, *head) and not self._swallows(position, *head):
-            return self._record(position, *head)
-        return self._damaged(position)
+        if head is None or not frames.agrees(position, *head):
+            return self._damaged(position)
+        return None if self._swallows(position, *head) else self._record(position, *head)
 
     def _swallows(self, position: int, opcode: int, length: int) -> bool:
-        """Whether a chunk was cut off, and what was written next lies where the rest of it should: its end leads nowhere."""
-        whole = HEAD.size + length
-        if opcode != Opcode.CHUNK or self._frames.leads_on(position + whole):
+        """Whether a record was cut off, and what was written next lies where the rest of it should.
+
+        Then another log begins inside it, or the end of a chunk leads nowhere; and its CRC does not prove it whole.
+        """
+        end = position + HEAD.size + length
+        astray = opcode == Opcode.CHUNK and not self._frames.leads_on(end)
+        if self._trusted or not (astray or self._frames.holds(position, end, ANOTHER)):
             return False
         try:
-            records.unpack(self.source.at(position, whole), position)
+            if opcode == Opcode.CHUNK:
+                records.unpack(self.source.at(position, end - position), position)
+            elif opcode == Opcode.ATTACHMENT:
+                return not Attached.of(self.source, position, length).check(self.source)
         except LogError:
             return True
-        return False
+        return opcode != Opcode.CHUNK
 
     def _border(self, position: int) -> None:
         """The magic inside the file: another log begins here, if a Header follows; else one has ended."""
@@ -404,6 +412,9 @@ class Salvaged(Structure):
         offsets, _, end = records.scan(raw, bare=True)
         if not self._bounded(position + end, raw, offsets):
             end = int(offsets[-1])
+        another = -1 if self._trusted else raw.find(ANOTHER, 0, end)
+        if another >= 0:
+            end = int(offsets[offsets <= another][-1])
         if not end:
             return None
         found = records.messages(raw[:end], position)
@@ -421,12 +432,18 @@ class Salvaged(Structure):
         if frames.leads_on(end):
             return True
         room = frames.limit - end
+        if room >= HEAD.size:
+            opcode, length = self.source.head(end)
+            if opcode in LEAST and opcode != Opcode.MESSAGE and length < 1 << 48:
+                return True  # a record of another kind, which goes on beyond the end of the file or is damaged
         if room < HEAD.size + 2:
             return self.source.at(end, 1)[0] == Opcode.MESSAGE or frames.limit < self.source.size or room <= 0
+        heads = [raw[at : at + HEAD.size + 2] for at in offsets[-256:].tolist()]
+        if heads[-1] in heads[:-1]:
+            return True  # as long as one before it on its channel
         following = self.source.at(end, HEAD.size + 2)
         opcode, length = HEAD.unpack_from(following)
-        channels = {raw[at + HEAD.size : at + HEAD.size + 2] for at in offsets[-64:].tolist()}
-        if opcode == Opcode.MESSAGE and following[HEAD.size :] in channels:
+        if opcode == Opcode.MESSAGE and following[HEAD.size :] in {head[HEAD.size :] for head in heads}:
             return True
         return bool(length <= room - HEAD.size and length >= FIXED and frames.leads_on(end + HEAD.size + length))
 
@@ -477,7 +494,9 @@ class Salvaged(Structure):
         for block in self.blocks:
             if lacking or not block.vouched:
                 self._learn(block)
+        self._search_definitions()
         self._number()
+        self._tell_unproven()
         for block in self.blocks:
             if block.counts is not None:
                 self._settle(block, block.counts)
@@ -529,6 +548,24 @@ class Salvaged(Structure):
                 except LogError as error:
                     self.losses.mend(_reason(error))
 
+    def _search_definitions(self) -> None:
+        """Where sound messages lack a definition, it is looked for in the damaged stretches of their log."""
+        for place, section in enumerate(self.sections):
+            stop = self.sections[place + 1].start if place + 1 < len(self.sections) else self.source.size
+            stretches = [(block.offset, block.length) for block, _ in self._failed]
+            stretches += [(gap.offset, gap.length) for gap in self._gaps]
+            for offset, length in sorted(stretch for stretch in stretches if section.start <= stretch[0] < stop):
+                if not self._lacking(section, stop):
+                    break
+                for opcode, body in definitions(self.source.at(offset, min(length, MOST_SEARCHED))):
+                    self.define(opcode, body, offset, vouched=False)
+
+    def _lacking(self, section: Section, stop: int) -> bool:
+        """Whether messages of a section are of channels that are not defined, or whose schema is not."""
+        used = {c for block in self.blocks if section.start <= block.offset < stop for c in block.counts or block.indexes}
+        found = {i for i, c in section.channels.items() if not c.schema_id or c.schema_id in section.schemas}
+        return not used <= found
+
     def _number(self) -> None:
         """Gives every section's schemas and channels an id in the whole: the first section keeps its own."""
         for section in self.sections:
@@ -549,6 +586,17 @@ class Salvaged(Structure):
                     lambda a, b: (a.topic, a.schema_id, a.message_encoding) == (b.topic, b.schema_id, b.message_encoding),
                     reuse=section is not self.sections[0],
                 )
+
+    def _tell_unproven(self) -> None:
+        """Names the topics that are called so, or are said to carry what they do, by bytes that may have changed."""
+        topics = set()
+        for section in self.sections:
+            for local, identity in section.ids.items():
+                channel = section.channels[local]
+                keys = {(int(Opcode.CHANNEL), local), (int(Opcode.SCHEMA), channel.schema_id)}
+                if not keys - {(int(Opcode.SCHEMA), 0)} <= section.vouched:
+                    topics.add(self.channels[identity].topic)
+        self.losses.unproven = sorted(topics)
 
     def _settle(self, block: Block, counts: dict[int, int]) -> None:
         """Counts by the ids of the whole, without the messages that mean nothing."""
@@ -598,6 +646,8 @@ class Salvaged(Structure):
         else:
             found = records.messages(records.unpack(raw, block.offset), block.offset)
             crc = records.ChunkHead.of(raw[:128], len(raw), block.offset).crc
+            if not crc and not in_order(raw, block.offset, self._index.get(block.offset)):
+                raise LogError(f"the head of the chunk at byte {block.offset} is damaged, and it has no CRC to tell by")
         if not crc and len(found.heads):
             self.losses.unchecked_in[block.offset] = len(found.heads)
         if block.offset in self._put_right:
@@ -637,7 +687,9 @@ class Salvaged(Structure):
             )
             if dropped:
                 why = "channels that no record defines" if (channels < 0).any() else "log times no clock shows"
-                self.losses.add(Loss(block.offset, 0, f"messages in the chunk here have {why}", self._by_topic(dropped), True))
+                self.losses.add(
+                    Loss(block.offset, block.length, f"messages in the chunk here have {why}", self._by_topic(dropped), True)
+                )
         return _edited(found, keep, channels[keep])
 
 
