@@ -50,7 +50,7 @@ def repair(
         "losses": report.losses.plain(),
     }
     if not write_json(result, json_to):
-        tell_losses(report.losses)
+        tell_losses(report.losses.plain())
         counts = ", ".join(f"{count} on {topic}" for topic, count in report.messages.items()) or "no message"
         state = "the log was whole" if report.whole else "saved"
         say(f"{target}: {state}, {counts}")

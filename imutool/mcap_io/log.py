@@ -89,8 +89,8 @@ class Log:
 
     Memory is bounded by its largest chunk. Times given to a method select by log time, both ends included.
 
-    With `salvage` a damaged log opens too: what cannot be proven is left out, and `losses` says what and why. It is complete once
-    everything was read (`check`), because the damage inside a chunk shows when that is unpacked.
+    With `salvage` a damaged log opens too: what cannot be proven is left out, and `losses` says what and why. It is complete
+    once everything was read (`check`), because the damage inside a chunk shows when that is unpacked.
 
     Raises:
         ConfigError: the file cannot be opened.
@@ -115,6 +115,15 @@ class Log:
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
         self._source.file.close()
+
+    def check(self) -> None:
+        """Reads every chunk and attachment and compares its CRC, so that `losses` is complete.
+
+        Raises:
+            LogError: without salvage, the first damage.
+        """
+        with self.named():
+            self.structure.check()
 
     @contextmanager
     def named(self, topic: str = "") -> Iterator[None]:

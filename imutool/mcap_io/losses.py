@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
+MOST_TOLD = 20  # lines to a person
 MOST_LISTED = 1000  # stretches; a hostile file could have one every few bytes, and nobody reads that many
 
 
@@ -32,14 +33,6 @@ class Loss:
             "first_ns": self.start_ns,
             "last_ns": self.end_ns,
         }
-
-    def __str__(self) -> str:
-        """One line: where, why, and which messages."""
-        counts = ", ".join(f"{count} on {topic}" for topic, count in self.counts.items())
-        known = counts or ("no message" if self.exact else "")
-        which = f"{known}{'' if self.exact or not known else ' and more'}" or "an unknown number of messages"
-        when = "" if self.start_ns is None or self.end_ns is None else f", {self.start_ns} to {self.end_ns} ns"
-        return f"byte {self.offset}, {self.length} bytes: {self.reason} (lost: {which}{when})"
 
 
 @dataclass
@@ -107,14 +100,30 @@ class Losses:
             "unchecked_definitions": list(self.unproven),
         }
 
-    def lines(self) -> list[str]:
-        """The same for a person."""
-        told = [f"lost: {entry}" for entry in self.entries]
-        if self.left_out:
-            told.append(f"lost: {self.left_out} more stretches")
-        told += [f"mended: {what}" for what in self.mended]
-        if self.unchecked:
-            told.append(f"unchecked: {self.unchecked} messages lie where no CRC covers them")
-        if self.unproven:
-            told.append(f"unchecked: no CRC covers the definition of {', '.join(self.unproven)}")
-        return told
+
+def told(losses: Mapping[str, Any]) -> list[str]:
+    """What `Losses.plain` says, for a person: one line a stretch, the first `MOST_TOLD` of them."""
+    stretches, mended = losses["stretches"], losses["mended"]
+    lines = [f"lost: {_stretch(entry)}" for entry in stretches[:MOST_TOLD]]
+    if (more := len(stretches) + losses["stretches_not_listed"] - len(lines)) > 0:
+        lines.append(f"lost: {more} more stretches")
+    lines += [f"mended: {what}" for what in mended[:MOST_TOLD]]
+    if len(mended) > MOST_TOLD:
+        lines.append(f"mended: {len(mended) - MOST_TOLD} more places")
+    if losses["unchecked_messages"]:
+        lines.append(f"unchecked: {losses['unchecked_messages']} messages lie where no CRC covers them")
+    if losses["unchecked_definitions"]:
+        lines.append(f"unchecked: no CRC covers the definition of {', '.join(losses['unchecked_definitions'])}")
+    return lines
+
+
+def _stretch(entry: Mapping[str, Any]) -> str:
+    """Where, why, and which messages."""
+    known = ", ".join(f"{count} on {topic}" for topic, count in entry["topics"].items())
+    if entry["messages"] is None:
+        which = f"{known} and more" if known else "an unknown number of messages"
+    else:
+        which = known or "no message"
+    first, last = entry["first_ns"], entry["last_ns"]
+    when = "" if first is None or last is None else f", log time {first * 1e-9:.3f} to {last * 1e-9:.3f} s"
+    return f"byte {entry['offset']}, {entry['bytes']} bytes: {entry['reason']} (lost: {which}{when})"

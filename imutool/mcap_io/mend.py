@@ -23,7 +23,7 @@ CHUNK_OPCODE = bytes([Opcode.CHUNK])
 DEFINITIONS = {int(Opcode.SCHEMA): Schema, int(Opcode.CHANNEL): Channel}
 MOST_SEARCHED = 1 << 20
 MOST_BEGUN = 4 << 20  # bytes to look for definitions in: they come first
-STEP = 4096
+STEP = 256
 
 
 def mended(raw: bytes, offset: int, known: ChunkIndex | None) -> bytes | None:
@@ -87,7 +87,7 @@ def _candidates(raw: bytes, known: ChunkIndex | None) -> Iterator[bytes]:
 def definitions(raw: bytes) -> Iterator[tuple[int, bytes]]:
     """Schema and Channel records (opcode and body) in what can still be unpacked of a damaged stretch: nothing proves them.
 
-    A writer may define its channels in its first chunk alone; without these few bytes all sound chunks behind it would mean nothing.
+    A writer may define its channels in its first chunk alone; without them every sound chunk behind it means nothing.
     """
     starts = [raw.find(magic, 0, MOST_SEARCHED) for magic in FRAMES] + ([_uncompressed(raw)] if raw[:1] == CHUNK_OPCODE else [])
     for start in sorted(start for start in starts if start >= 0):
@@ -114,15 +114,24 @@ def _begun(packed: bytes) -> bytes:
     """As much as unpacks before the damage, from a stretch that begins as its magic says; at most `MOST_BEGUN` bytes."""
     if not packed.startswith(FRAMES):
         return packed[:MOST_BEGUN]
-    zstd = packed.startswith(FRAMES[0])
-    stream = zstandard.ZstdDecompressor().decompressobj() if zstd else lz4.frame.LZ4FrameDecompressor()
     data = b""
     try:
-        for at in range(0, min(len(packed), MOST_BEGUN), STEP):
-            piece = packed[at : at + STEP]
-            data += stream.decompress(piece) if zstd else stream.decompress(piece, max_length=MOST_BEGUN)
+        for piece in _unpacked(packed):
+            data += piece
             if len(data) >= MOST_BEGUN:
                 break
     except (zstandard.ZstdError, RuntimeError, EOFError, ValueError):
         pass  # what came before is what there is
     return data[:MOST_BEGUN]
+
+
+def _unpacked(packed: bytes) -> Iterator[bytes]:
+    """The contents of a frame, bit by bit; a piece may be as long as a bomb makes it, but no longer than `MOST_BEGUN`."""
+    if packed.startswith(FRAMES[0]):
+        with zstandard.ZstdDecompressor().stream_reader(packed[:MOST_BEGUN]) as stream:
+            while piece := stream.read(STEP):
+                yield piece
+    else:
+        frame = lz4.frame.LZ4FrameDecompressor()
+        for at in range(0, min(len(packed), MOST_BEGUN), STEP):
+            yield frame.decompress(packed[at : at + STEP], max_length=MOST_BEGUN)

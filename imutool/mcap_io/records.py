@@ -119,9 +119,9 @@ def signed(times: UInt64[np.ndarray, " n"]) -> Int64[np.ndarray, " n"]:
 def scan(data: bytes, *, bare: bool = False) -> tuple[Int64[np.ndarray, " n"], list[tuple[int, int, int]], int]:
     """Where messages and definitions begin in a stretch of records, and the byte at which whole records end.
 
-    A `bare` stretch lies outside chunks and also ends before the first record that is no message, or none that can be. Stretches of equally
-    long messages, which topic-grouped chunks consist of, are recognised as a matrix; the framing is still followed
-    record by record, only not in Python.
+    A `bare` stretch lies outside chunks and also ends before the first record that is no message, or none that can be.
+    Stretches of equally long messages, which topic-grouped chunks consist of, are recognised as a matrix; the framing is still
+    followed record by record, only not in Python.
     """
     pieces: list[Int64[np.ndarray, " n"]] = []
     singles: list[int] = []

@@ -7,6 +7,7 @@ index, the texts of a definition with the definition); a message, which has none
 from __future__ import annotations
 
 import struct
+from typing import Any
 
 import numpy as np
 from mcap.opcode import Opcode
@@ -36,7 +37,7 @@ MOST_TRIED = 1 << 20  # candidates looked at closely; beyond, a file is made to 
 CHAIN = 3  # records in a row that a message needs to be believed after a gap
 PRIVATE = 0x80  # opcodes from here on belong to whoever writes them
 
-SMALL = {
+SMALL: dict[int, Any] = {
     Opcode.HEADER: Header,
     Opcode.FOOTER: Footer,
     Opcode.SCHEMA: Schema,
@@ -95,7 +96,7 @@ class Frames:
         if not 0 <= position <= self.limit - HEAD.size:
             return None
         opcode, length = self.source.head(position)
-        if length > self.limit - position - HEAD.size or (opcode < PRIVATE and length < LEAST.get(opcode, 2**63)):
+        if length > self.limit - position - HEAD.size or (opcode < PRIVATE and length < int(_LEAST[opcode])):
             return None
         return opcode, length
 
@@ -103,10 +104,18 @@ class Frames:
         """Whether a log begins or ends there."""
         return position + len(MAGIC) <= self.limit and self.source.at(position, len(MAGIC)) == MAGIC
 
-    def holds(self, start: int, end: int, needle: bytes) -> bool:
-        """Whether some bytes stand anywhere in a stretch."""
+    def find(self, start: int, end: int, needle: bytes) -> int:
+        """Where some bytes begin in a stretch, be it that they end behind it; -1 if they do not."""
         over = len(needle) - 1
-        return any(needle in self.source.at(at, min(WINDOW + over, end - at)) for at in range(start, end, WINDOW))
+        for at in range(start, end, WINDOW):
+            raw = self.source.at(at, min(WINDOW + over, end + over - at, self.limit - at))
+            if (found := raw.find(needle)) >= 0:
+                return at + found
+        return -1
+
+    def empty(self, start: int, end: int) -> bool:
+        """Whether all bytes of a stretch are zero."""
+        return not any(self.source.at(at, min(WINDOW, end - at)).strip(b"\0") for at in range(start, end, WINDOW))
 
     def leads_on(self, position: int) -> bool:
         """Whether what came before ended well: the file ends here, or what may be a record begins."""
@@ -119,16 +128,13 @@ class Frames:
         if opcode == Opcode.MESSAGE_INDEX:
             (size,) = struct.unpack("<I", self.source.at(position + HEAD.size + 2, 4))
             return bool(size == length - 6 and size % 16 == 0)
-        if opcode == Opcode.ATTACHMENT:
-            try:
-                return Attached.of(self.source, position, length) is not None
-            except LogError:
-                return False
-        kind = SMALL.get(Opcode(opcode)) if opcode in LEAST else None
-        if kind is None or length > MOST_SMALL:
-            return False
-        raw = self.source.at(position, HEAD.size + length)
         try:
+            if opcode == Opcode.ATTACHMENT:
+                return Attached.of(self.source, position, length).length == HEAD.size + length
+            kind = SMALL.get(opcode)
+            if kind is None or length > MOST_SMALL:
+                return False
+            raw = self.source.at(position, HEAD.size + length)
             return records.build(records.parse(kind, raw[HEAD.size :], position)) == raw
         except LogError:
             return False

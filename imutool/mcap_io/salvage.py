@@ -1,8 +1,8 @@
 """A damaged log written anew: what is sound as the bytes it is, every index rebuilt, and a record of what was lost.
 
-A sound chunk is copied verbatim. Its message indexes are made from its messages, which its CRC proves, never copied. Definitions
-stand in front of everything, so that the next damage costs less. Messages that no CRC covers go into chunks that state none: being
-saved must not make them look proven.
+A sound chunk is copied verbatim. Its message indexes are made from its messages, which its CRC proves, never copied.
+Definitions stand in front of everything, so that the next damage costs less. Messages that no CRC covers go into chunks that
+state none: being saved must not make them look proven.
 """
 
 from __future__ import annotations

@@ -20,6 +20,7 @@ from mcap.records import Channel, ChunkIndex, Footer, Header, Schema, Statistics
 
 from imutool.errors import LogError
 from imutool.mcap_io import records
+from imutool.mcap_io.attachment import Attached
 from imutool.mcap_io.losses import Losses
 from imutool.mcap_io.records import FOOTER_SIZE, HEAD, MAGIC
 from imutool.mcap_io.source import CUT_SHORT, Source
@@ -123,6 +124,22 @@ class Structure:
         except LogError as error:
             self.lose(block, error)
             return None
+
+    def check(self) -> None:
+        """Reads every chunk and attachment, and compares its CRC.
+
+        Raises:
+            LogError: one is damaged.
+        """
+        for item in self.items:
+            try:
+                if isinstance(item, Block):
+                    if not item.lost:
+                        self.unpack(item)
+                elif item.opcode == Opcode.ATTACHMENT:
+                    Attached.of(self.source, item.offset, item.length - HEAD.size).check(self.source)
+            except LogError as error:
+                self.lose(item, error)
 
     def unpacked(self, block: Block, raw: bytes) -> records.Messages:
         """The same, for a caller that has read the block's bytes already."""
