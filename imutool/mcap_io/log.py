@@ -100,7 +100,6 @@ class Log:
     def __init__(self, path: Path, *, salvage: bool = False) -> None:
         keep_buffers()
         self.path = path
-        self._set_aside: set[int] = set()  # channels of a damaged log that carry something else than their topic does
         self._source = Source(path)
         try:
             with self.named():
@@ -154,11 +153,7 @@ class Log:
                 found[channel.topic].schema_name,
                 found[channel.topic].message_encoding,
             ):
-                if self.losses is None:
-                    raise LogError(f"{channel.topic} carries {before.schema_name} and {found[channel.topic].schema_name}")
-                self.losses.mend(f"{channel.topic} carries {before.schema_name} and {found[channel.topic].schema_name}")
-                found[channel.topic] = before
-                self._set_aside.add(identity)
+                raise LogError(f"{channel.topic} carries {before.schema_name} and {found[channel.topic].schema_name}")
         return found
 
     @property
@@ -345,7 +340,7 @@ class Log:
 
     def channel_ids(self, topic: str) -> set[int]:
         """The channels of a topic."""
-        return {i for i, channel in self.structure.channels.items() if channel.topic == topic} - self._set_aside
+        return {i for i, channel in self.structure.channels.items() if channel.topic == topic}
 
     def rows(
         self, topics: Collection[str], start_ns: int | None = None, end_ns: int | None = None

@@ -270,12 +270,18 @@ def _decompress(compression: str, packed: memoryview, size: int) -> bytes:
     """Never allocates more than `size`, whatever the packed bytes say about themselves."""
     if compression == "zstd":
         if size == 0:
+            if _unpacker.stream_reader(packed).read(1):
+                raise ValueError("the zstd frame holds something, the chunk nothing")
             return b""
         if zstandard.frame_content_size(packed) not in (-1, size):
             raise ValueError(f"the zstd frame says {zstandard.frame_content_size(packed)} bytes, the chunk {size}")
         return bytes(_unpacker.decompress(packed, max_output_size=size))
     if compression == "lz4":
-        return bytes(lz4.frame.LZ4FrameDecompressor().decompress(packed, max_length=size))
+        frame = lz4.frame.LZ4FrameDecompressor()
+        data = bytes(frame.decompress(packed, max_length=size))
+        if not frame.eof and frame.decompress(b"", max_length=1):
+            raise ValueError(f"the lz4 frame goes on beyond the chunk's {size} bytes")
+        return data
     return bytes(packed)
 
 

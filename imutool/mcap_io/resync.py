@@ -33,7 +33,7 @@ from imutool.mcap_io.source import Source
 
 WINDOW = 1 << 20
 MOST_SMALL = 1 << 24  # bytes of a record that is parsed whole: a definition, metadata, an entry of the summary
-MOST_TRIED = 1 << 20  # candidates looked at closely; beyond, a file is made to be searched for ever
+MOST_TRIED = 1 << 17  # candidates looked at closely; beyond, a file is made to be searched for ever
 CHAIN = 3  # records in a row that a message needs to be believed after a gap
 PRIVATE = 0x80  # opcodes from here on belong to whoever writes them
 

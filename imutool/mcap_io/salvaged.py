@@ -164,6 +164,8 @@ class Salvaged(Structure):
         self._search_definitions()
         self.schemas, self.channels = self.sections.number()
         self.losses.unproven = self.sections.unproven()
+        for old, new in ((old, new) for section in self.sections.each for old, new in section.renamed.items()):
+            self.losses.mend(f"{old} carries messages of two types; those of the second are on {new}")
         for block in self.blocks:
             if block.counts is not None:
                 self._settle(block, block.counts)
@@ -305,7 +307,7 @@ class Salvaged(Structure):
         if (
             not late.any()
             and all(ids.get(channel) == channel for channel in local)
-            and not (section.start and found.definitions)
+            and not ((section.start or section.renamed) and found.definitions)
         ):
             return found
         table = np.full(1 << 16, -1, np.int64)

@@ -9,6 +9,7 @@ from __future__ import annotations
 from bisect import bisect_right
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from itertools import chain, count
 from typing import Any
 
 from mcap.opcode import Opcode
@@ -29,6 +30,7 @@ class Section:
     channels: dict[int, Channel] = field(default_factory=dict)
     vouched: set[tuple[int, int]] = field(default_factory=set)  # opcode and id of definitions that a CRC covers
     ids: dict[int, int] = field(default_factory=dict)  # its channels as those of the whole file
+    renamed: dict[str, str] = field(default_factory=dict)  # topics that carry another type elsewhere
 
     def known(self, opcode: int) -> dict[int, Any]:
         """Its schemas, or its channels."""
@@ -107,8 +109,18 @@ class Sections:
             for local in sorted(section.readable()):
                 channel = section.channels[local]
                 moved = replace(channel, schema_id=placed.get(channel.schema_id, 0))
+                moved = replace(moved, topic=self._name(section, moved, schemas, channels))
                 section.ids[local] = _place(channels, moved, _same_channel, reuse=not first)
         return schemas, channels
+
+    def _name(self, section: Section, channel: Channel, schemas: dict[int, Schema], channels: dict[int, Channel]) -> str:
+        """What a topic is called in the whole: a topic carries one type, so one of another type needs another name."""
+        taken = {other.topic: _type(other, schemas) for other in channels.values()}
+        names = chain([channel.topic], (f"{channel.topic}_{number}" for number in count(2)))
+        name = next(name for name in names if taken.get(name, _type(channel, schemas)) == _type(channel, schemas))
+        if name != channel.topic:
+            section.renamed[channel.topic] = name
+        return str(name)
 
     def unproven(self) -> list[str]:
         """Topics that are called so, or are said to carry what they do, by bytes that no CRC covers."""
@@ -130,6 +142,11 @@ def alike(a: Any, b: Any) -> bool:
 
 def _parsed(opcode: int, body: bytes, offset: int) -> Any:
     return records.parse(Schema if opcode == Opcode.SCHEMA else Channel, body, offset)
+
+
+def _type(channel: Channel, schemas: dict[int, Schema]) -> tuple[str, str]:
+    schema = schemas.get(channel.schema_id)
+    return (schema.name if schema else "", channel.message_encoding)
 
 
 def _same_schema(a: Schema, b: Schema) -> bool:

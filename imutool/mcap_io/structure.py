@@ -322,7 +322,13 @@ class Structure:
                 if all(c.schema_id in self.schemas for c in self.channels.values() if c.schema_id):
                     break
                 self._learn(block)
-        missing = {c for block in self.blocks for c in (block.indexes or block.counts or {})} - self.channels.keys()
+        used = {c for block in self.blocks for c in (block.indexes or block.counts or {})}
+        for block in chunks:  # a definition may also stand in a chunk that has no message of its channel
+            if used <= self.channels.keys():
+                break
+            if block.counts is None:
+                self._learn(block)
+        missing = used - self.channels.keys()
         if missing:
             raise LogError(f"channel {min(missing)} has messages and no Channel record", expected="a definition")
         for channel in self.channels.values():

@@ -65,6 +65,7 @@ class Walk:
         self.header: Header | None = None
         self._data_ends: list[int] = []
         self._seen: set[int] = set()  # channels of messages, whose definition may be lost
+        self._closed = False  # past a footer
         self._ended = False  # past the data section of a log
         self._last: Block | Gap | None = None  # what message indexes would belong to
         self._unframed: Gap | None = None  # behind this gap nothing shows yet whether we are inside a chunk
@@ -89,6 +90,8 @@ class Walk:
             position = after
         if self.trusted and not self._ended:
             self.losses.mend(f"the DataEnd record before byte {limit} is damaged; a new one can be made")
+        elif self._ended and not self._closed and not self.trusted:
+            self.losses.mend("the log ends inside its summary; a new one can be made")
         elif not self._ended and not (self.gaps and self.gaps[-1].offset + self.gaps[-1].length == limit):
             self.gaps.append(
                 Gap(limit, 0, "the log stops here without an end: the recorder did not finish it, or it was cut off")
@@ -163,7 +166,7 @@ class Walk:
                 self.gaps.append(Gap(position, 0, "a log stops here without an end, and another begins"))
             self.losses.mend(f"another log begins at byte {position}")
             self.sections.begin(position)
-            self._ended, self._last, self._unframed = False, None, None
+            self._ended, self._closed, self._last, self._unframed = False, False, None, None
 
     def _record(self, position: int, opcode: int, length: int) -> int:
         """Takes in a record that agrees with itself; returns where it ends."""
@@ -183,6 +186,7 @@ class Walk:
                 self.items.append(Span(opcode, position, end - position))
         elif opcode == Opcode.FOOTER:
             self._moved_summary(position)
+            self._closed = self.frames.magic(end)
         elif opcode == Opcode.DATA_END:
             self._data_ends.append(position)
             self._ended, self._last, self._unframed = True, None, None
@@ -327,6 +331,10 @@ class Walk:
             start_ns, end_ns = struct.unpack_from("<QQ", first, HEAD.size)
             if start_ns <= end_ns < LATEST_NS:
                 gap.start_ns, gap.end_ns = start_ns, end_ns
+        following = frames.head(after)
+        if self._ended and not self._closed and (following is None or following[0] in SUMMARY | {Opcode.FOOTER, *DEFINITIONS}):
+            self.losses.mend(f"{after - position} bytes of the summary at byte {position} are damaged; a new one can be made")
+            return after
         if self._ended and frames.empty(position, after):
             self.losses.mend(f"{after - position} zero bytes follow the end of the log, at byte {position}")
             return after
