@@ -317,7 +317,8 @@ class Walk:
             return True  # as long as one before it on its channel
         following = self.source.at(end, HEAD.size + 2)
         opcode, length = HEAD.unpack_from(following)
-        if opcode == Opcode.MESSAGE and following[HEAD.size :] in {head[HEAD.size :] for head in heads}:
+        known = self.sections.channels() | self._seen | {int.from_bytes(head[HEAD.size :], "little") for head in heads}
+        if opcode == Opcode.MESSAGE and int.from_bytes(following[HEAD.size :], "little") in known:
             return True
         return bool(length <= room - HEAD.size and length >= FIXED and frames.leads_on(end + HEAD.size + length))
 
