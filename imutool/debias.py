@@ -23,12 +23,14 @@ from imutool.certainty import Certainty
 from imutool.config import plain
 from imutool.errors import ConfigError, DataError, LogError, ModelError
 from imutool.mcap_io import schema
+from imutool.mcap_io.digest import Digest
 from imutool.mcap_io.log import Clock, ImuBatch, Log
 from imutool.mcap_io.read import read
-from imutool.mcap_io.rewrite import Made, NewTopic, RewriteReport, rewrite, sha256
+from imutool.mcap_io.rewrite import Made, NewTopic, RewriteReport, Values, rewrite
+from imutool.mcap_io.verify import Verified, refuse_unknown
 from imutool.recording import Imu, Recording, nanoseconds, seconds
 from imutool.rest_track import Samples
-from imutool.stationary import white_noise
+from imutool.stationary import Blocks, in_blocks, white_noise
 from imutool.turn_on import NoRestError, TurnOn, find, following, over_all_rest
 from imutool.turn_on import smooth as smooth_rest
 
@@ -142,40 +144,78 @@ class Debiaser:
 
 def debias(
     source: Path,
-    target: Path,
+    target: Path | None,
     *,
-    model: str | Path | None = None,
+    model: str | Path | Mapping[str, str | Path] | None = None,
     imus: Sequence[str] = (),
     init: str = "auto",
     smooth: bool = False,
+    check: str = "imu",
     overwrite: bool = False,
     progress: Callable[[int, int], None] | None = None,
 ) -> DebiasReport:
     """Writes `target`: all of `source` unchanged, and beside each IMU its debiased samples and the bias taken off.
 
-    Without a model: the one the log's metadata names, else the one that ships for its sensor, else the mean over time at rest.
+    One model serves every IMU, or each has its own by topic, "" being that of all others. An IMU without one gets the
+    one the log's metadata names, else the one that ships for its sensor, else the mean over time at rest. The IMUs are
+    those in `imus`, else those with a model of their own, else the log's only one.
     With `smooth` the start bias at every time comes from the whole log, also from what follows.
+    Without a target the log itself is replaced (`mcap_io.rewrite`, which also says what `check` checks).
 
     Raises:
-        ConfigError: source or target cannot be opened, `init` makes no sense, or `smooth` is asked for with another `init`.
+        ConfigError: source or target cannot be opened, `init` makes no sense, `smooth` is asked for with another `init`,
+            or a model is given for an IMU that is not to be debiased.
         LogError: the log is damaged, has no such IMU, or is debiased already.
         ModelError: no model and no time at rest; a model for another rate; a damaged model file.
     """
     refuse_smooth(init, smooth)
+    refuse_unknown(check)
+    given = dict(model) if isinstance(model, Mapping) else {} if model is None else {"": model}
     with Log(source) as log:
-        topics = list(imus) or [_only_imu(log)]
+        topics = _chosen(log, imus, given)
         about = log.metadata().get("imutool", {})
     named = about.get("model") or shipped_for(about.get("sensor"), about.get("dataset"))
     derived, starts, models, records = [], {}, {}, {}
-    origin = {"source_file": source.name, "source_sha256": sha256(source), "source_size": str(source.stat().st_size)}
-    for topic in topics:
-        chosen, start = _prepare(source, topic, model or named, init, smooth)
-        derived.append(Debiaser(topic, chosen, start))
-        starts[topic], models[topic] = start, str(chosen.card.get("name", chosen.method))
-        records[topic] = _provenance(topic, chosen, start, init, smooth) | origin
-    metadata = {"imutool" if len(records) == 1 else f"imutool{topic}": values for topic, values in records.items()}
-    report = rewrite(source, target, derived, metadata=metadata, overwrite=overwrite, progress=progress)
+    with Digest(source) as digest:
+        for topic in topics:
+            chosen, start = _prepare(source, topic, given.get(topic, given.get("", named)), init, smooth)
+            derived.append(Debiaser(topic, chosen, start))
+            starts[topic], models[topic] = start, str(chosen.card.get("name", chosen.method))
+            records[topic] = _provenance(topic, chosen, start, init, smooth)
+
+        def metadata(verified: Verified) -> Values:
+            origin = {"source_file": source.name, "source_sha256": digest.result(), "source_size": str(source.stat().st_size)}
+            checked = {"verified": json.dumps(verified._asdict())}
+            return {f"imutool{topic}" if len(records) > 1 else "imutool": v | origin | checked for topic, v in records.items()}
+
+        report = rewrite(source, target, derived, metadata=metadata, overwrite=overwrite, check=check, progress=progress)
     return DebiasReport(models, starts, report)
+
+
+def _chosen(log: Log, imus: Sequence[str], given: Mapping[str, str | Path]) -> list[str]:
+    """The IMUs to debias, each once.
+
+    Raises:
+        ConfigError: a model that none of them would use.
+        LogError: none is named, and the log has not exactly one.
+    """
+    own = [topic for topic in given if topic]
+    topics = list(dict.fromkeys(imus or own or [_only_imu(log)]))
+    for topic in own:
+        if topic not in topics:
+            raise ConfigError(
+                f"a model for {topic}, which is not to be debiased",
+                where="--model",
+                expected=", ".join(topics),
+                fix=f"Add --imu {topic}, or leave the model out",
+            )
+    if "" in given and all(topic in given for topic in topics):
+        raise ConfigError(
+            f"{given['']} is for all IMUs without a model of their own, and each has one",
+            where="--model",
+            fix="Leave it out, or name the other IMUs with --imu",
+        )
+    return topics
 
 
 def refuse_smooth(init: str, smooth: bool) -> None:
@@ -192,11 +232,16 @@ def estimate_at_rest(imu: Imu, where: str | Path) -> tuple[BiasModel, TurnOn]:
     """The static model with its bias: the mean over all time at rest, for a log nobody trained a model for.
 
     Raises:
+        DataError: fewer than two samples.
         ModelError: the log never rests.
     """
+    return _estimate(in_blocks([(imu.t_ns, imu.gyro, imu.accel)], imu.period_s), where)
+
+
+def _estimate(blocks: Blocks, where: str | Path) -> tuple[BiasModel, TurnOn]:
     model = static.Model()
     try:
-        return model, over_all_rest(model, imu)
+        return model, over_all_rest(model, blocks)
     except DataError as error:
         raise _nothing_known(where) from error
 
@@ -222,9 +267,11 @@ def _only_imu(log: Log) -> str:
 def _prepare(source: Path, topic: str, name: str | Path | None, init: str, smooth: bool) -> tuple[BiasModel, TurnOn]:
     """Model and start for one IMU."""
     untrained = name is None or str(name) == static.Model.method
-    if untrained and init == "auto" and not smooth:
-        return estimate_at_rest(_samples(source, topic), source)
     head = _head(source, topic, init)
+    if untrained and init == "auto" and not smooth:
+        with Log(source) as log:
+            batches = ((batch.stamp_ns, batch.gyro, batch.accel) for batch in log.imu_batches(topic))
+            return _estimate(in_blocks(batches, head.imu.period_s), source)
     rate_hz = 1.0 / head.imu.period_s
     model: BiasModel = static.Model() if name is None or untrained else find_model(name, rate_hz)
     if not untrained:

@@ -14,10 +14,11 @@ from __future__ import annotations
 
 from bisect import insort
 from collections import deque
-from typing import Annotated
+from collections.abc import Iterable
+from typing import Annotated, NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float64
+from jaxtyping import Bool, Float64, Int64
 from msgspec import Meta
 
 from imutool.config import Settings
@@ -30,6 +31,9 @@ NOISE_BLOCK, CALMEST = 20, 0.25
 KEPT_MEANS = 100  # of windows at rest, for the usual one
 GAP_PERIODS = 3.0  # a longer step between samples breaks a window
 
+AT_ONCE = 1 << 14  # windows
+
+Batch = tuple[Int64[np.ndarray, " n"], Float64[np.ndarray, "n 3"], Float64[np.ndarray, "n 3"]]  # stamps in ns, gyro, accel
 Positive = Annotated[float, Meta(gt=0)]
 
 
@@ -47,23 +51,67 @@ class StationarySettings(Settings, frozen=True, kw_only=True):
     gyro_agreement_rad_s: Positive = 0.02  # between a window's mean and the median of all that rest
 
 
+class Blocks(NamedTuple):
+    """Samples in blocks of `k`, as what rest is told by: 113 bytes for each, 4 MB an hour, whatever the rate."""
+
+    k: int
+    period_s: float
+    first_ns: Int64[np.ndarray, " m"]  # stamps of the first and last sample of each block
+    last_ns: Int64[np.ndarray, " m"]
+    mean: Float64[np.ndarray, "m 6"]  # gyro, then accel
+    var: Float64[np.ndarray, "m 6"]  # within the block
+    late: Bool[np.ndarray, " m"]  # samples are missing inside or before it
+
+
+def in_blocks(batches: Iterable[Batch], period_s: float, settings: StationarySettings | None = None) -> Blocks:
+    """The blocks of some samples, of which no more than a batch is held; what does not fill a block at the end is left out."""
+    k = max(2, round((settings or StationarySettings()).block_s / period_s))
+    parts = [_blocks_of(np.zeros(0, np.int64), np.zeros((0, 6)), k, 0, period_s)]
+    t_left, u_left = np.zeros(0, np.int64), np.zeros((0, 6))
+    before: int | None = None
+    for t_ns, gyro, accel in batches:
+        t, u = np.concatenate([t_left, t_ns]), np.concatenate([u_left, np.concatenate([gyro, accel], axis=1)])
+        if len(t) >= k:
+            whole = len(t) // k * k
+            parts.append(_blocks_of(t[:whole], u[:whole], k, int(t[0]) if before is None else before, period_s))
+            before = int(t[whole - 1])
+            t, u = t[whole:], u[whole:]
+        t_left, u_left = t, u
+    return Blocks(k, period_s, *(np.concatenate(column) for column in list(zip(*parts, strict=True))[2:]))
+
+
+def _blocks_of(t_ns: Int64[np.ndarray, " n"], u: Float64[np.ndarray, "n 6"], k: int, before_ns: int, period_s: float) -> Blocks:
+    """The blocks of samples that fill them exactly."""
+    t, cut = t_ns.reshape(-1, k), u.reshape(-1, k, 6)
+    late = np.diff(t_ns, prepend=np.int64(before_ns)) > nanoseconds(GAP_PERIODS * period_s)
+    inside: Bool[np.ndarray, " m"] = np.asarray(late.reshape(-1, k).any(axis=1))
+    return Blocks(k, period_s, t[:, 0].copy(), t[:, -1].copy(), np.asarray(cut.mean(axis=1)), cut.var(axis=1, ddof=1), inside)
+
+
 def stretches(imu: Imu, settings: StationarySettings | None = None) -> list[tuple[int, int]]:
     """Index ranges `[start, end)` in which the sensor rests for at least `min_s`, in order and apart.
 
-    Window statistics: block means m_j and variances s_j^2 over k samples each; rest when
-    std(m) <= max(1.3 sqrt(mean(s^2) / k), 2.5 floor) for the gyro, and all four figures are within their caps.
     An IMU with fewer samples than a window, or less than two a block, has no stretches.
     """
-    settings = settings or StationarySettings()
     if len(imu) < 2:
         return []
-    k = max(2, round(settings.block_s / imu.period_s))
-    blocks = max(4, round(settings.window_s / (k * imu.period_s)))
-    count = len(imu) // k
-    if count < blocks:
+    blocks = in_blocks([(imu.t_ns, imu.gyro, imu.accel)], imu.period_s, settings)
+    return [(first * blocks.k, last * blocks.k) for first, last in resting(blocks, settings)]
+
+
+def resting(blocks: Blocks, settings: StationarySettings | None = None) -> list[tuple[int, int]]:
+    """Ranges `[first, end)` of blocks over which the sensor rests for at least `min_s`, in order and apart.
+
+    Window statistics: block means m_j and variances s_j^2 over k samples each; rest when
+    std(m) <= max(1.3 sqrt(mean(s^2) / k), 2.5 floor) for the gyro, and all four figures are within their caps.
+    """
+    settings = settings or StationarySettings()
+    k, period_s, count = blocks.k, blocks.period_s, len(blocks.late)
+    width = max(4, round(settings.window_s / (k * period_s)))
+    if count < width:
         return []
-    gyro_scatter, gyro_noise, gyro_mean = _window_statistics(imu.gyro, k, blocks)
-    accel_scatter, accel_noise, _ = _window_statistics(imu.accel, k, blocks)
+    gyro_scatter, gyro_noise, gyro_mean = _window_statistics(blocks.mean[:, :3], blocks.var[:, :3], width)
+    accel_scatter, accel_noise, _ = _window_statistics(blocks.mean[:, 3:], blocks.var[:, 3:], width)
     calmest = np.sort(gyro_scatter)
     floor = calmest[min(FLOOR_RANK, len(calmest) // 10)]
     allowed = np.maximum(WHITE_MARGIN * gyro_noise / np.sqrt(k), FLOOR_MARGIN * floor)
@@ -73,16 +121,15 @@ def stretches(imu: Imu, settings: StationarySettings | None = None) -> list[tupl
         & (gyro_noise <= settings.gyro_noise_rad_s)
         & (accel_noise <= settings.accel_noise_m_s2)
         & (np.linalg.norm(gyro_mean, axis=1) <= settings.gyro_mean_rad_s)
-        & ~_broken(imu, k, blocks)
+        & ~np.lib.stride_tricks.sliding_window_view(blocks.late, width).any(axis=-1)
     )
     if rests.any():  # a turn-on bias does not jump: what disagrees with most of the rest is a steady turn
         rests &= np.linalg.norm(gyro_mean - np.median(gyro_mean[rests], axis=0), axis=1) <= settings.gyro_agreement_rad_s
     resting_blocks = np.zeros(count, bool)
-    for shift in range(blocks):
+    for shift in range(width):
         resting_blocks[shift : shift + len(rests)] |= rests
-    found = [(first * k, last * k) for first, last in _runs(resting_blocks)]
-    least_ns = nanoseconds(settings.min_s - 2 * imu.period_s)
-    return [(a, b) for a, b in found if imu.t_ns[b - 1] - imu.t_ns[a] >= least_ns]
+    least_ns = nanoseconds(settings.min_s - 2 * period_s)
+    return [(a, b) for a, b in _runs(resting_blocks) if blocks.last_ns[b - 1] - blocks.first_ns[a] >= least_ns]
 
 
 class Stillness:
@@ -150,22 +197,18 @@ def white_noise(values: Float64[np.ndarray, "n k"]) -> Float64[np.ndarray, " k"]
 
 
 def _window_statistics(
-    values: Float64[np.ndarray, "n 3"], k: int, blocks: int
+    mean: Float64[np.ndarray, "m 3"], var: Float64[np.ndarray, "m 3"], width: int
 ) -> tuple[Float64[np.ndarray, " w"], Float64[np.ndarray, " w"], Float64[np.ndarray, "w 3"]]:
     """Of each window of consecutive blocks: scatter of the block means, noise within blocks, and the mean."""
-    count = len(values) // k
-    cut = values[: count * k].reshape(count, k, 3)
-    means = np.lib.stride_tricks.sliding_window_view(cut.mean(axis=1), blocks, axis=0)
-    noise = np.lib.stride_tricks.sliding_window_view(cut.var(axis=1, ddof=1).sum(axis=1), blocks, axis=0)
-    return np.sqrt(means.var(axis=-1, ddof=1).sum(axis=1)), np.sqrt(noise.mean(axis=-1)), means.mean(axis=-1)
-
-
-def _broken(imu: Imu, k: int, blocks: int) -> Bool[np.ndarray, " w"]:
-    """Whether samples are missing inside a window."""
-    late = np.diff(imu.t_ns, prepend=imu.t_ns[0]) > nanoseconds(GAP_PERIODS * imu.period_s)
-    count = len(imu) // k
-    inside = late[: count * k].reshape(count, k).any(axis=1)
-    return np.asarray(np.lib.stride_tricks.sliding_window_view(inside, blocks).any(axis=-1))
+    scatter, noise, means = [], [], []
+    for first in range(0, len(mean) - width + 1, AT_ONCE):  # numpy holds ten times the windows it is given
+        part = slice(first, first + AT_ONCE + width - 1)
+        m = np.lib.stride_tricks.sliding_window_view(mean[part], width, axis=0)
+        v = np.lib.stride_tricks.sliding_window_view(var[part].sum(axis=1), width, axis=0)
+        scatter.append(np.sqrt(m.var(axis=-1, ddof=1).sum(axis=1)))
+        noise.append(np.sqrt(v.mean(axis=-1)))
+        means.append(m.mean(axis=-1))
+    return np.concatenate(scatter), np.concatenate(noise), np.concatenate(means)
 
 
 def _runs(mask: Bool[np.ndarray, " n"]) -> list[tuple[int, int]]:

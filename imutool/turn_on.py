@@ -15,6 +15,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -27,7 +28,7 @@ from imutool.errors import ConfigError, DataError
 from imutool.recording import GRAVITY_M_S2, Imu, Recording, nanoseconds, seconds
 from imutool.rest_track import USUAL_WALK, Along, Following, Known, Passed, Samples, Track, followed
 from imutool.rest_track import smooth as smooth_track
-from imutool.stationary import stretches, white_noise
+from imutool.stationary import Blocks, resting, stretches, white_noise
 from imutool.strapdown import GRAVITY_W, with_velocity
 from imutool.windows import HUBER_MEDIANS, attitudes, between, huber_weight, running_product
 
@@ -234,7 +235,7 @@ def at_rest(model: BiasModel, imu: Imu) -> TurnOn:
     found = [stretch for stretch in stretches(imu) if stretch[0] <= starts_by]
     if not found:
         raise _no_rest()
-    return _from_rest(model, imu, found[:1])
+    return _from_rest(model, imu, found[0])
 
 
 def _no_rest() -> DataError:
@@ -245,40 +246,65 @@ def _no_rest() -> DataError:
     )
 
 
-def over_all_rest(model: BiasModel, imu: Imu) -> TurnOn:
+def over_all_rest(model: BiasModel, blocks: Blocks) -> TurnOn:
     """From all the time at rest in a log, also what comes after the motion: a constant has no before and after.
+
+    For a model that takes nothing off but a constant: of the samples there is only what `stationary.in_blocks` keeps.
 
     Raises:
         DataError: the log never rests.
     """
-    found = stretches(imu)
+    found = resting(blocks)
     if not found:
         raise DataError("the log never rests", expected="1.5 s or more without motion")
-    return _from_rest(model, imu, found)
+    stills = []
+    for first, last in found:
+        part, mean = slice(first, last), blocks.mean[first:last].mean(axis=0)
+        apart = (blocks.k - 1) * blocks.var[part] + blocks.k * (blocks.mean[part] - mean) ** 2
+        ends_ns = int(blocks.first_ns[first]), int(blocks.last_ns[last - 1])
+        stills.append(_Still(mean, apart.sum(axis=0), (last - first) * blocks.k, *ends_ns))
+    return _weighed(prior(model), stills, int(blocks.first_ns[0]))
 
 
-def _from_rest(model: BiasModel, imu: Imu, found: Sequence[tuple[int, int]]) -> TurnOn:
+class _Still(NamedTuple):
+    """A stretch at rest: what the samples are on average, their squared distance from that in all, and how many there are."""
+
+    mean: Vector6
+    apart: Vector6
+    samples: int
+    start_ns: int
+    end_ns: int
+
+
+def _from_rest(model: BiasModel, imu: Imu, found: tuple[int, int]) -> TurnOn:
+    """From one stretch at rest, with what the model says of the motion taken off."""
+    start, still = prior(model), imu.rows(slice(*found))
+    left = np.concatenate([still.gyro, still.accel], axis=1) - _bias(model, still, start.rest) + start.rest
+    mean = left.mean(axis=0)
+    apart = ((left - mean) ** 2).sum(axis=0)
+    return _weighed(start, [_Still(mean, apart, len(still), int(still.t_ns[0]), int(still.t_ns[-1]))], int(imu.t_ns[0]))
+
+
+def _weighed(start: TurnOn, stills: Sequence[_Still], first_ns: int) -> TurnOn:
     """True rate zero; specific force g along where it points, so the accelerometer's bias is seen along gravity only."""
-    start = prior(model)
     rest, var = start.rest.copy(), start.std**2
-    rows = [imu.rows(slice(*stretch)) for stretch in found]
-    left = [np.concatenate([still.gyro, still.accel], axis=1) - _bias(model, still, start.rest) for still in rows]
-    everything = np.concatenate(left)
-    noise = np.concatenate([part - part.mean(axis=0) for part in left]).std(axis=0)
+    count = sum(still.samples for still in stills)
+    noise = np.sqrt(np.sum([still.apart for still in stills], axis=0) / count)
+    mean = np.sum([still.mean * still.samples for still in stills], axis=0) / count
 
-    gain = var[:3] / (var[:3] + AT_REST_STD[:3] ** 2 + noise[:3] ** 2 / len(everything))
-    rest[:3] += gain * everything[:, :3].mean(axis=0)
+    gain = var[:3] / (var[:3] + AT_REST_STD[:3] ** 2 + noise[:3] ** 2 / count)
+    rest[:3] += gain * (mean[:3] - start.rest[:3])
     var[:3] *= 1 - gain
-    for part in left:  # attitude may differ from stop to stop: each shows another direction
-        force = part[:, 3:].mean(axis=0) - (rest[3:] - start.rest[3:])
+    for still in stills:  # attitude may differ from stop to stop: each shows another direction
+        force = still.mean[3:] - rest[3:]
         size = float(np.linalg.norm(force))
         up = force / size
         gain = var[3:] * up / (up @ (var[3:] * up) + AT_REST_STD[3] ** 2)
         rest[3:] += gain * (size - GRAVITY_M_S2)
         var[3:] *= 1 - gain * up
-    total = sum(still.duration_s for still in rows)
-    first = seconds(imu.t_ns[[found[0][0]]], int(imu.t_ns[0]))[0]
-    return TurnOn(rest, np.sqrt(var), f"{total:.1f} s at rest from {first:.1f} s on", noise)
+    total_s = 1e-9 * sum(still.end_ns - still.start_ns for still in stills)
+    first_s = 1e-9 * (stills[0].start_ns - first_ns)
+    return TurnOn(rest, np.sqrt(var), f"{total_s:.1f} s at rest from {first_s:.1f} s on", noise)
 
 
 def from_truth(model: BiasModel, recording: Recording, truth_s: float = TRUTH_S) -> TurnOn:

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Iterator
+import subprocess
+import tracemalloc
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -18,12 +20,13 @@ from rosbags.highlevel import AnyReader
 from imutool.bias import linear, neural_ode, static
 from imutool.bias._base import BiasModel, Segment
 from imutool.bias._file import load, save
+from imutool.cli.debias import assigned
 from imutool.convert import convert
 from imutool.debias import OnlineDebiaser, apply, debias, estimate_at_rest
 from imutool.errors import ConfigError, LogError, ModelError
 from imutool.mcap_io import schema
+from imutool.mcap_io.digest import sha256
 from imutool.mcap_io.read import read
-from imutool.mcap_io.rewrite import sha256
 from imutool.mcap_io.write import write
 from imutool.physics.flight import flight
 from imutool.recording import Frames, Recording, Scalars, seconds
@@ -242,6 +245,71 @@ def test_the_provenance_says_what_it_takes_to_do_it_again(source: Path, target: 
     assert len(json.loads(record["rest"])) == len(json.loads(record["rest_std"])) == 6
 
 
+def test_what_was_checked_stands_in_the_log_and_in_the_report(source: Path, model_file: Path, tmp_path: Path) -> None:
+    for check in ("all", "imu", "none"):
+        out = tmp_path / f"{check}.mcap"
+        verified = debias(source, out, model=model_file, check=check).rewrite.verified
+        assert json.loads(metadata(out)[-1][1]["verified"]) == verified._asdict()
+        assert verified.mode == check
+        assert (verified.chunks_checked == verified.chunks) == (check == "all")
+    with pytest.raises(ConfigError, match="--verify: 'most'"):
+        debias(source, tmp_path / "out.mcap", model=model_file, check="most")
+
+
+def test_in_place_the_log_gains_its_channels_under_its_own_name(source: Path, target: Path, model_file: Path) -> None:
+    before = sha256(source)
+    source.chmod(0o600)
+    debias(source, None, model=model_file)
+    assert source.read_bytes() == target.read_bytes()
+    assert metadata(source)[-1][1]["source_sha256"] == before
+    assert source.stat().st_mode & 0o777 == 0o600
+    with pytest.raises(LogError, match="debiased is in this log already"):
+        debias(source, None, model=model_file, imus=["/imu0"])
+    assert source.read_bytes() == target.read_bytes()
+
+
+def test_the_static_bias_of_a_long_log_takes_no_more_memory(tmp_path: Path) -> None:
+    peaks = []
+    for seconds_long in (30.0, 240.0):
+        recording = flight(1, duration_s=seconds_long)
+        log = tmp_path / f"{seconds_long}.mcap"
+        write(recording, log, compression="none")
+        tracemalloc.start()
+        try:
+            debias(log, tmp_path / f"{seconds_long}.out.mcap")
+            peaks.append(tracemalloc.get_traced_memory()[1])
+        finally:
+            tracemalloc.stop()
+    samples = 210 * 200
+    assert peaks[1] - peaks[0] < 0.5 * samples * 7 * 8  # of the samples themselves there is not even half; a minute is held
+    assert peaks[1] < 40 << 20
+
+
+def test_the_command_in_place_and_what_contradicts_it(
+    source: Path, target: Path, tmp_path: Path, imutool: Callable[..., subprocess.CompletedProcess[str]]
+) -> None:
+    before = source.read_bytes()
+    for words, said in (
+        ([], "no OUT; expected a name for the new log. Give OUT, or --in-place"),
+        (["x.mcap", "--in-place"], "--in-place and x.mcap"),
+        (["--in-place", "--overwrite"], "--in-place and --overwrite"),
+        (["x.mcap", "--verify", "some"], "'some'; expected all, imu, none"),
+    ):
+        done = imutool("debias", source, *words, cwd=tmp_path)
+        assert done.returncode == 3
+        assert said in done.stderr
+    assert source.read_bytes() == before
+    done = imutool(
+        "debias", source, "--in-place", "--model", "/imu0=m.safetensors", "--verify", "all", "--json", "-", cwd=tmp_path
+    )
+    assert done.returncode == 0, done.stderr
+    report = json.loads(done.stdout)
+    assert report["output"] == str(source)
+    assert report["verified"]["mode"] == "all"
+    assert report["verified"]["chunks_checked"] == report["verified"]["chunks"] > 0
+    assert originals(source) == originals(target)
+
+
 def test_images_and_user_metadata_pass_through(target: Path, recording: Recording) -> None:
     back = read(target, imu="/imu0")
     assert [*back.frames["/cam0/image_raw/compressed"].each()] == IMAGES
@@ -374,6 +442,57 @@ def test_several_imus_each_get_their_own(recording: Recording, tmp_path: Path, m
     assert [name for name, _ in metadata(tmp_path / "out.mcap")] == ["imutool/imu0", "imutool/imu1"]
     a, b = (read(tmp_path / "out.mcap", imu=f"{imu}/debiased").imu for imu in both)
     assert not np.array_equal(a.gyro, b.gyro)
+
+
+def test_two_imus_with_a_model_each_are_what_each_alone_would_be(recording: Recording, tmp_path: Path) -> None:
+    log, out = tmp_path / "two.mcap", tmp_path / "out.mcap"
+    models = {}
+    for topic, method in zip(write_two_imus(recording, log), ("linear", "neural_ode"), strict=True):
+        models[topic] = tmp_path / f"{method}.safetensors"
+        save(make_model(method), models[topic])
+    report = debias(log, out, model=models)
+    assert dict(report.models) == {"/imu0": "linear", "/imu1": "neural_ode"}
+    for topic, path in models.items():
+        alone = tmp_path / f"alone{topic[-1]}.mcap"
+        debias(log, alone, model=path, imus=[topic])
+        names = [f"{topic}{name}" for name in ("/debiased", "/bias/gyro", "/bias/accel", "/bias")]
+        assert columns(out, *names) == columns(alone, *names)
+    found = dict(metadata(out))
+    assert [found[f"imutool{topic}"]["model"] for topic in models] == ["linear", "neural_ode"]
+    mixed = debias(
+        log, tmp_path / "mixed.mcap", model={"": "static", "/imu1": models["/imu1"]}, imus=["/imu0", "/imu1", "/imu0"]
+    )
+    assert dict(mixed.models) == {"/imu0": "static", "/imu1": "neural_ode"}
+
+
+def test_models_that_contradict_one_another_are_refused(recording: Recording, tmp_path: Path, model_file: Path) -> None:
+    log, out = tmp_path / "two.mcap", tmp_path / "out.mcap"
+    write_two_imus(recording, log)
+    with pytest.raises(ConfigError, match=r"--model: a model for /imu1, .* expected /imu0.*--imu /imu1"):
+        debias(log, out, model={"/imu1": model_file}, imus=["/imu0"])
+    with pytest.raises(ConfigError, match="each has one"):
+        debias(log, out, model={"": "static", "/imu0": model_file, "/imu1": model_file})
+    with pytest.raises(LogError, match="there is no topic /imu7"):
+        debias(log, out, model={"/imu7": model_file})
+    assert not out.exists()
+
+
+def test_models_on_the_command_line_are_for_all_or_for_a_topic(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("lr=0.1").mkdir()
+    Path("lr=0.1/m.safetensors").touch()
+    assert assigned([]) == {}
+    assert assigned(["adis"]) == {"": "adis"}
+    assert assigned(["/imu0=a", "/imu1=b=c", "d"]) == {"/imu0": "a", "/imu1": "b=c", "": "d"}
+    assert assigned(["lr=0.1/m.safetensors"]) == {"": "lr=0.1/m.safetensors"}
+    for words, said in (
+        (["a", "b"], "a and b for all IMUs"),
+        (["/imu0=a", "/imu0=b"], "a and b for /imu0"),
+        (["=a"], "expected MODEL or TOPIC=MODEL"),
+        (["/imu0="], "expected MODEL or TOPIC=MODEL"),
+    ):
+        with pytest.raises(ConfigError, match=said):
+            assigned(words)
 
 
 def write_two_imus(recording: Recording, log: Path) -> tuple[str, str]:

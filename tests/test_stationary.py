@@ -8,7 +8,7 @@ import pytest
 from converters import euroc, fetch, tum_vi
 from imutool.physics.flight import flight
 from imutool.recording import GRAVITY_M_S2, Imu
-from imutool.stationary import StationarySettings, Stillness, stretches, white_noise
+from imutool.stationary import StationarySettings, Stillness, in_blocks, resting, stretches, white_noise
 
 RATE_HZ = 200.0
 GYRO_NOISE, ACCEL_NOISE = 2.4e-3, 0.03  # rad/s and m/s² a sample and axis: an ADIS16448 at 200 Hz
@@ -205,3 +205,19 @@ def test_it_agrees_with_the_whole_log_on_real_recordings(data):
         assert (share[found] > 0.0).all(), recording.name
         inside = np.convolve(share == 1.0, np.ones(4), "full")[: len(share)] == 4  # two seconds in
         assert found[inside].mean() > 0.9, recording.name
+
+
+@pytest.mark.parametrize("size", [1, 7, 20, 333, 5000])
+def test_the_borders_of_batches_change_nothing(size):
+    t_ns, gyro, accel = made(12.0)
+    moving = (t_ns > 4_000_000_000) & (t_ns < 7_000_000_000)
+    gyro[moving] += 0.3 * np.sin(4.4e-9 * t_ns[moving])[:, None]
+    t_ns = t_ns + np.where(t_ns > 10_000_000_000, 700_000_000, 0)
+    imu = Imu(t_ns, gyro, accel)
+    parts = [slice(first, first + size) for first in range(0, len(imu), size)]
+    streamed = in_blocks(((t_ns[part], gyro[part], accel[part]) for part in parts), imu.period_s)
+    whole = in_blocks([(t_ns, gyro, accel)], imu.period_s)
+    for ours, theirs in zip(streamed, whole, strict=True):
+        np.testing.assert_array_equal(ours, theirs)
+    assert [(a * whole.k, b * whole.k) for a, b in resting(streamed)] == stretches(imu)
+    assert len(stretches(imu)) == 3

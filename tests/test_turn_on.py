@@ -19,6 +19,7 @@ from imutool.physics.flight import FlightSettings as Flight
 from imutool.physics.flight import TriadSettings, flight, trajectory
 from imutool.recording import GRAVITY_M_S2, Imu, Poses, Recording, seconds
 from imutool.rest_track import Samples
+from imutool.stationary import Blocks, in_blocks
 from imutool.strapdown import dead_reckon
 from imutool.turn_on import (
     AT_REST_STD,
@@ -62,6 +63,10 @@ def resting(
     accel = up_b + 4.0 * shake + ACCEL_BIAS + NOISE[3:] * rng.normal(size=(len(t), 3))
     t_ns = 10**18 + np.round(t * 1e9).astype(np.int64)
     return Imu(t_ns, gyro, accel), attitude
+
+
+def blocks_of(imu: Imu) -> Blocks:
+    return in_blocks([(imu.t_ns, imu.gyro, imu.accel)], imu.period_s)
 
 
 def model(mean: float = 0.0, **std: float) -> BiasModel:
@@ -126,7 +131,7 @@ def test_a_prior_that_is_sure_is_kept_and_one_that_knows_nothing_gives_way() -> 
 def test_stops_in_several_attitudes_show_the_accelerometer_from_all_sides() -> None:
     stops = [(0.0, 4.0), (6.0, 10.0), (12.0, 16.0), (18.0, 22.0)]
     imu, _ = resting(stops, duration_s=22.0, tilt=0.7)
-    one, all_of_them = at_rest(static.Model(), imu), over_all_rest(static.Model(), imu)
+    one, all_of_them = at_rest(static.Model(), imu), over_all_rest(static.Model(), blocks_of(imu))
     assert np.linalg.norm(all_of_them.rest[3:] - ACCEL_BIAS) < 0.5 * np.linalg.norm(one.rest[3:] - ACCEL_BIAS)
     assert (all_of_them.std <= one.std + 1e-12).all()
     np.testing.assert_allclose(all_of_them.rest[:3], GYRO_BIAS, atol=4e-4)
@@ -154,10 +159,10 @@ def test_a_log_that_does_not_start_at_rest_is_refused(stops: list[tuple[float, f
 
 def test_a_stop_later_in_the_log_serves_a_constant_only() -> None:
     imu, _ = resting([(8.0, 12.0)])
-    np.testing.assert_allclose(over_all_rest(static.Model(), imu).rest[:3], GYRO_BIAS, atol=1e-3)
+    np.testing.assert_allclose(over_all_rest(static.Model(), blocks_of(imu)).rest[:3], GYRO_BIAS, atol=1e-3)
     imu, _ = resting([])
     with pytest.raises(DataError, match="the log never rests"):
-        over_all_rest(static.Model(), imu)
+        over_all_rest(static.Model(), blocks_of(imu))
 
 
 @pytest.mark.parametrize("count", [0, 1, 20])

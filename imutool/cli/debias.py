@@ -2,41 +2,54 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from imutool.cli._app import Init, Json, Overwrite, Quiet, Smooth, Verbose, app
+from imutool.errors import ConfigError
 from imutool.terminal import progress, say, write_json
+
+MODEL_HELP = (
+    "Model file, physics.toml or a name that ships; else a static estimate. TOPIC=MODEL is for one IMU of several. Repeatable."
+)
+VERIFY_HELP = "What of OUT is checked beside its structure: all chunks, those with IMU messages (imu), or none."
 
 
 @app.command(epilog="Example: [bold]imutool debias MH_04.mcap MH_04_debiased.mcap --model adis.safetensors[/]")
 def debias(
     source: Annotated[Path, typer.Argument(metavar="IN", help="An MCAP log.")],
-    target: Annotated[Path, typer.Argument(metavar="OUT", help="The log with the debiased IMU beside the raw one.")],
-    model: Annotated[
-        str | None, typer.Option(help="Model file, physics.toml or a name that ships; else a static estimate.")
+    target: Annotated[
+        Path | None,
+        typer.Argument(metavar="[OUT]", help="The log with the debiased IMU beside the raw one.", show_default=False),
     ] = None,
+    model: Annotated[list[str] | None, typer.Option(help=MODEL_HELP)] = None,
     imu: Annotated[list[str] | None, typer.Option(help="IMU topic, where a log has several. Repeatable.")] = None,
     init: Init = "auto",
     smooth: Smooth = False,
+    verify: Annotated[str, typer.Option(metavar="all|imu|none", help=VERIFY_HELP)] = "imu",
+    in_place: Annotated[bool, typer.Option("--in-place", help="Put the result in the place of IN, when it is whole.")] = False,
     overwrite: Overwrite = False,
     json_to: Json = None,
     verbose: Verbose = False,
     quiet: Quiet = False,
 ) -> None:
     """Rewrite a log with a debiased IMU channel; everything else passes through unchanged."""
+    _refuse_contradictions(target, in_place, overwrite)
+    models = assigned(model or ())
     from imutool.debias import debias as run
 
     with progress("Debiasing", verbose, quiet) as tell:
         report = run(
             source,
             target,
-            model=model,
+            model=models,
             imus=imu or (),
             init=init,
             smooth=smooth,
+            check=verify,
             overwrite=overwrite,
             progress=lambda done, total: tell(done, total, ""),
         )
@@ -50,13 +63,45 @@ def debias(
         }
         for topic, start in report.starts.items()
     }
-    added, copied = dict(report.rewrite.added), report.rewrite.copied
-    result = {"schema": "imutool.debias/1", "output": str(target), "imus": imus, "copied": copied, "added": added}
-    if write_json(result, json_to):
+    added, copied, verified = dict(report.rewrite.added), report.rewrite.copied, report.rewrite.verified
+    result = {"schema": "imutool.debias/1", "output": str(target or source), "imus": imus, "copied": copied, "added": added}
+    if write_json(result | {"verified": verified._asdict()}, json_to):
         return
     for topic, entry in imus.items():
         bias = ", ".join(f"{b:+.5f}" for b in entry["gyro_bias"]), ", ".join(f"{b:+.4f}" for b in entry["accel_bias"])
         start = f"start bias {bias[0]} rad/s; {bias[1]} m/s² ({entry['init_how']})"
         say(f"{topic}: {entry['model']}, {start}")
     counts = ", ".join(f"{count} on {name}" for name, count in added.items())
-    say(f"{target}: {copied} messages as they were, {counts}")
+    say(f"{target or source}: {copied} messages as they were, {counts}")
+    say(f"checked: every index, and the contents of {verified.chunks_checked} of {verified.chunks} chunks (--verify {verify})")
+
+
+def _refuse_contradictions(target: Path | None, in_place: bool, overwrite: bool) -> None:
+    if in_place and target is not None:
+        raise ConfigError(f"--in-place and {target}", where="--in-place", fix="Leave one of the two out")
+    if in_place and overwrite:
+        raise ConfigError("--in-place and --overwrite", where="--in-place", fix="Leave --overwrite out: IN alone is replaced")
+    if target is None and not in_place:
+        raise ConfigError(
+            "no OUT", where="debias", expected="a name for the new log", fix="Give OUT, or --in-place to replace IN"
+        )
+
+
+def assigned(words: Sequence[str]) -> dict[str, str]:
+    """Models by IMU topic, "" for all that are not named: TOPIC=MODEL, where no file has that name as a whole, else MODEL.
+
+    Raises:
+        ConfigError: two models for the same IMUs, or nothing on one side of the sign.
+    """
+    found: dict[str, str] = {}
+    for word in words:
+        topic, sign, name = word.partition("=")
+        if not sign or Path(word).exists():
+            topic, name = "", word
+        elif not topic or not name:
+            raise ConfigError(f"{word!r}", where="--model", expected="MODEL or TOPIC=MODEL")
+        if topic in found:
+            whom = topic or "all IMUs"
+            raise ConfigError(f"{found[topic]} and {name} for {whom}", where="--model", expected="one model for each IMU")
+        found[topic] = name
+    return found

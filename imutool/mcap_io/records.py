@@ -7,7 +7,6 @@ goes through numpy. Format: https://mcap.dev/spec. Every length read from a file
 from __future__ import annotations
 
 import struct
-import zlib
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from io import BytesIO
@@ -24,6 +23,7 @@ from mcap.opcode import Opcode
 from mcap.records import McapRecord
 
 from imutool.errors import ConfigError, LogError
+from imutool.mcap_io.crc import crc32
 
 MAGIC = b"\x89MCAP0\r\n"
 HEAD = struct.Struct("<BQ")  # opcode and length, ahead of every record
@@ -116,7 +116,7 @@ def signed(times: UInt64[np.ndarray, " n"]) -> Int64[np.ndarray, " n"]:
     return times.astype(np.int64)
 
 
-def scan(data: bytes, *, bare: bool = False) -> tuple[Int64[np.ndarray, " n"], list[tuple[int, int, int]], int]:
+def scan(data: bytes | memoryview, *, bare: bool = False) -> tuple[Int64[np.ndarray, " n"], list[tuple[int, int, int]], int]:
     """Where messages and definitions begin in a stretch of records, and the byte at which whole records end.
 
     A `bare` stretch lies outside chunks and also ends before the first record that is no message, or none that can be.
@@ -164,7 +164,7 @@ def _run(view: UInt8[np.ndarray, " b"], position: int, stride: int) -> int:
     return count if same.all() else int(np.argmin(same))
 
 
-def messages(data: bytes, offset: int) -> Messages:
+def messages(data: bytes | memoryview, offset: int) -> Messages:
     """The messages in the unpacked bytes of a chunk, or in a run of records outside chunks.
 
     Raises:
@@ -180,11 +180,32 @@ def messages(data: bytes, offset: int) -> Messages:
     return Messages(view, offsets, _matrix(view, offsets, MESSAGE.itemsize).view(MESSAGE)[:, 0], definitions)
 
 
+def listed(data: bytes | memoryview, offsets: Int64[np.ndarray, " n"]) -> Messages | None:
+    """The messages that begin at these offsets, in order; None unless they, and nothing else, fill the bytes from end to end.
+
+    What `messages` finds by following the records one by one, for bytes of which an index is there: a tenth of the time
+    where lengths alternate.
+    """
+    view, count = np.frombuffer(data, np.uint8), len(offsets)
+    if not count or offsets[0] != 0 or offsets[-1] + MESSAGE.itemsize > len(view):
+        return None
+    sizes = np.empty(count, np.int64)
+    np.subtract(offsets[1:], offsets[:-1], out=sizes[:-1])
+    sizes[-1] = len(view) - offsets[-1]
+    if sizes.min() < MESSAGE.itemsize:
+        return None
+    heads = _matrix(view, offsets, MESSAGE.itemsize).view(MESSAGE)[:, 0]
+    wrong = (heads["opcode"] != Opcode.MESSAGE.value) | (heads["length"].view(np.int64) + HEAD.size != sizes)
+    return None if wrong.any() else Messages(view, offsets, heads, [])
+
+
 def _matrix(view: UInt8[np.ndarray, " b"], offsets: Int64[np.ndarray, " n"], width: int) -> UInt8[np.ndarray, "n w"]:
     """Copies of the `width` bytes at each offset; a view, where the spacing would allow one, made decoding slower."""
     if not len(offsets):
         return np.zeros((0, width), np.uint8)
-    cut: UInt8[np.ndarray, "n w"] = np.lib.stride_tricks.sliding_window_view(view, width)[offsets]
+    # a window on every byte; numpy's sliding_window_view makes the same, and takes longer than the copies out of one chunk
+    windows = np.ndarray((len(view) - width + 1, width), np.uint8, view, strides=(1, 1))
+    cut: UInt8[np.ndarray, "n w"] = windows[offsets]
     return cut
 
 
@@ -235,13 +256,13 @@ class ChunkHead:
         return ChunkHead(start_ns, end_ns, size, crc, compression, at + name + 8)
 
 
-def unpack(record: bytes, offset: int) -> bytes:
-    """The unpacked, CRC-checked bytes of a whole Chunk record.
+def unpack(record: bytes | memoryview, offset: int) -> bytes | memoryview:
+    """The unpacked, CRC-checked bytes of a whole Chunk record: a view of it, where it is not compressed.
 
     Raises:
         LogError: unknown compression, data that do not unpack to the stated size, or a wrong CRC.
     """
-    head = ChunkHead.of(record[:128], len(record), offset)
+    head = ChunkHead.of(bytes(record[:128]), len(record), offset)
     packed = memoryview(record)[head.data_at :]
     where = f"the chunk at byte {offset}"
     if head.size > CHUNK_LIMIT:
@@ -254,9 +275,9 @@ def unpack(record: bytes, offset: int) -> bytes:
         raise LogError(f"{where} does not unpack ({error})") from error
     if len(data) != head.size:
         raise LogError(f"{where} unpacks to {len(data)} bytes", expected=str(head.size))
-    if head.crc and zlib.crc32(data) != head.crc:
+    if head.crc and crc32(data) != head.crc:
         raise LogError(
-            f"{where} is damaged: its contents have CRC {zlib.crc32(data):08x}",
+            f"{where} is damaged: its contents have CRC {crc32(data):08x}",
             expected=f"{head.crc:08x}",
             fix="Copy the log again from where it was recorded",
         )
@@ -266,7 +287,7 @@ def unpack(record: bytes, offset: int) -> bytes:
 _unpacker = zstandard.ZstdDecompressor()
 
 
-def _decompress(compression: str, packed: memoryview, size: int) -> bytes:
+def _decompress(compression: str, packed: memoryview, size: int) -> bytes | memoryview:
     """Never allocates more than `size`, whatever the packed bytes say about themselves."""
     if compression == "zstd":
         if size == 0:
@@ -282,7 +303,7 @@ def _decompress(compression: str, packed: memoryview, size: int) -> bytes:
         if not frame.eof and frame.decompress(b"", max_length=1):
             raise ValueError(f"the lz4 frame goes on beyond the chunk's {size} bytes")
         return data
-    return bytes(packed)
+    return packed
 
 
 # ── writing ──────────────────────────────────────────────────────────────────────────────────────────────────────────
@@ -350,6 +371,6 @@ def pack(compression: str) -> Callable[[bytes], bytes]:
 def chunk_head(data: bytes, packed: bytes, compression: str, start_ns: int, end_ns: int) -> bytes:
     """The bytes of a Chunk record ahead of its packed data; the CRC is that of the unpacked."""
     name = compression.encode()
-    body = CHUNK_HEAD.pack(start_ns, end_ns, len(data), zlib.crc32(data), len(name)) + name
+    body = CHUNK_HEAD.pack(start_ns, end_ns, len(data), crc32(data), len(name)) + name
     body += struct.pack("<Q", len(packed))
     return HEAD.pack(Opcode.CHUNK, len(body) + len(packed)) + body

@@ -24,9 +24,9 @@ from imutool.mcap_io.attachment import Attached
 from imutool.mcap_io.log import Log
 from imutool.mcap_io.losses import Loss, Losses
 from imutool.mcap_io.records import CHUNK_HEAD, HEAD
-from imutool.mcap_io.rewrite import verify
 from imutool.mcap_io.source import Source
 from imutool.mcap_io.structure import Block, Span, Structure
+from imutool.mcap_io.verify import verify
 from imutool.mcap_io.write import LogWriter
 
 RECORD = "imutool_repair"  # name of the metadata record
@@ -97,7 +97,11 @@ def repair(
             if losses or losses.mended:
                 out.metadata(RECORD, _told(source, damaged, losses))
             out.finish()
-            verify(out.target.temporary, out.contents.counts, lambda done, total: tell(size + size * done // total, 2 * size))
+            verify(
+                out.target.temporary,
+                out.contents.counts,
+                progress=lambda done, total: tell(size + size * done // total, 2 * size),
+            )
             tell(2 * size, 2 * size)
             messages: dict[str, int] = {}
             for channel, count in sorted(out.contents.counts.items()):

@@ -43,3 +43,11 @@ class Source:
         """Opcode and length of the record at an offset."""
         opcode, length = HEAD.unpack(self.at(offset, HEAD.size))
         return opcode, length
+
+
+def descriptor(file: object) -> int | None:
+    """The number under which the system knows an open file; none for what only looks like one, as in an object store."""
+    try:
+        return int(file.fileno())  # type: ignore[attr-defined]  # asked for, not demanded
+    except (AttributeError, OSError):
+        return None

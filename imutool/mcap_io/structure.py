@@ -8,7 +8,6 @@ summary, without message indexes or without chunks are charted the same way and 
 from __future__ import annotations
 
 import struct
-import zlib
 from collections import Counter
 from dataclasses import dataclass, field
 from typing import NamedTuple
@@ -19,8 +18,9 @@ from mcap.opcode import Opcode
 from mcap.records import Channel, ChunkIndex, Footer, Header, Schema, Statistics
 
 from imutool.errors import LogError
-from imutool.mcap_io import records
+from imutool.mcap_io import chunk_index, records
 from imutool.mcap_io.attachment import Attached
+from imutool.mcap_io.crc import crc32
 from imutool.mcap_io.losses import Losses
 from imutool.mcap_io.records import FOOTER_SIZE, HEAD, MAGIC
 from imutool.mcap_io.source import CUT_SHORT, Source
@@ -95,6 +95,12 @@ class Structure:
             LogError: `error`.
         """
         raise error
+
+    @property
+    def vouched(self) -> bool:
+        """Whether the statistics say that all definitions are known, so that no chunk need be unpacked to find one."""
+        told = self.statistics
+        return told is not None and (told.channel_count, told.schema_count) == (len(self.channels), len(self.schemas))
 
     def counts(self) -> dict[int, int]:
         """Messages per channel id."""
@@ -206,8 +212,8 @@ class Structure:
         if not len(MAGIC) <= start <= end:
             raise LogError(f"the footer says the summary begins at byte {start}", expected=f"at most {end}")
         raw = self.source.at(start, end - start + FOOTER_SIZE - 4)
-        if self.footer.summary_crc and zlib.crc32(raw) != self.footer.summary_crc:
-            raise LogError(f"the summary at byte {start} is damaged: its CRC is {zlib.crc32(raw):08x}")
+        if self.footer.summary_crc and crc32(raw) != self.footer.summary_crc:
+            raise LogError(f"the summary at byte {start} is damaged: its CRC is {crc32(raw):08x}")
         position, stop, index = 0, end - start, {}
         while position < stop:
             opcode, length = HEAD.unpack_from(raw, position) if stop - position >= HEAD.size else (0, stop)
@@ -215,7 +221,7 @@ class Structure:
             if length > stop - position - HEAD.size:
                 raise LogError(f"the summary is damaged at byte {start + position}: a record crosses its end")
             if opcode == Opcode.CHUNK_INDEX:
-                entry = records.parse(ChunkIndex, body, start + position)
+                entry = chunk_index.parse(body, start + position)
                 index[entry.chunk_start_offset] = entry
             elif opcode == Opcode.STATISTICS:
                 self.statistics = records.parse(Statistics, body, start + position)
@@ -313,8 +319,7 @@ class Structure:
     def _complete(self) -> None:
         """Finds the definitions that only stand inside chunks, when the summary does not vouch for having them all."""
         chunks = [block for block in self.blocks if block.compression is not None]
-        told = self.statistics
-        if told is None or (told.channel_count, told.schema_count) != (len(self.channels), len(self.schemas)):
+        if not self.vouched:
             for block in chunks:
                 if not block.indexes or not block.indexes.keys() <= self.channels.keys():
                     self._learn(block)

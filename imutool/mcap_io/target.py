@@ -1,33 +1,43 @@
-"""A file that appears whole or not at all: written beside its place under another name, renamed when it is complete."""
+"""A file that appears whole or not at all: written beside its place under another name, renamed when it is complete.
+
+What another file holds is copied by the kernel where it can: the bytes never come here, and a file system that shares
+blocks between files copies nothing at all.
+"""
 
 from __future__ import annotations
 
 import contextlib
+import errno
 import os
 import secrets
 import weakref
-import zlib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from types import TracebackType
 from typing import BinaryIO
 
 from imutool.errors import ConfigError
+from imutool.mcap_io.crc import crc32
+from imutool.mcap_io.source import Source, descriptor
+
+COPY_BYTES = 1 << 20  # what passes through memory stays in the processor's cache
+# What a system call says that cannot copy between these two files: another file system, an old kernel, a special file
+UNABLE = {errno.EXDEV, errno.ENOSYS, errno.EINVAL, errno.EOPNOTSUPP, errno.EPERM, errno.ENOTSOCK}
 
 
 class Target:
     """Context manager over the file being written; leaving it without an error puts the file in its place.
 
-    Any error, Ctrl-C included, removes what was written. `crc` is the CRC-32 of everything written so far.
+    Any error, Ctrl-C included, removes what was written. `crc` is the CRC-32 of everything written while `summing`.
 
     Raises:
         ConfigError: the target exists (without `overwrite`), is a folder, or the system refuses to write.
     """
 
-    def __init__(self, path: Path, *, overwrite: bool = False) -> None:
+    def __init__(self, path: Path, *, overwrite: bool = False, summing: bool = True) -> None:
         self.path, self.overwrite = path, overwrite
-        self.position, self.crc = 0, 0
+        self.position, self.crc, self.summing = 0, 0, summing
         self._refuse_existing()
         self.temporary = path.with_name(f".{path.name}.{os.getpid()}.{secrets.token_hex(4)}.partial")
         # Ctrl-C may come between two lines, before anybody is there to call `abandon`: then the file goes with this object
@@ -51,7 +61,7 @@ class Target:
                 f"cannot be written ({reason})", where=self.path, fix="Choose a place that can be written and has room"
             ) from error
 
-    def write(self, data: bytes | memoryview) -> None:
+    def write(self, data: bytes | bytearray | memoryview) -> None:
         """Appends bytes.
 
         Raises:
@@ -60,7 +70,37 @@ class Target:
         with self._told():
             self.file.write(data)
         self.position += len(data)
-        self.crc = zlib.crc32(data, self.crc)
+        if self.summing:
+            self.crc = crc32(data, self.crc)
+
+    def copy(self, source: Source, start: int, end: int) -> None:
+        """Appends the bytes of another file from `start` to `end`, by the kernel unless their CRC is wanted.
+
+        Raises:
+            ConfigError: the system refuses to write.
+            LogError: the source does not have the bytes, or the disk does not give them.
+        """
+        if not self.summing:
+            start = self._by_the_kernel(source, start, end)
+        for at in range(start, end, COPY_BYTES):
+            self.write(source.at(at, min(COPY_BYTES, end - at)))
+
+    def _by_the_kernel(self, source: Source, start: int, end: int) -> int:
+        """As much as the kernel copies; returns where it stopped, which is where it began if it cannot do it."""
+        theirs, ours = descriptor(source.file), descriptor(self.file)
+        if theirs is None or ours is None:
+            return start
+        calls: tuple[Callable[[int], int], ...] = (
+            lambda at: os.copy_file_range(theirs, ours, end - at, offset_src=at),
+            lambda at: os.sendfile(ours, theirs, at, end - at),
+        )
+        with self._told():
+            self.file.flush()
+            for call in calls:
+                while start < end and (count := _tried(call, start)):
+                    start, self.position = start + count, self.position + count
+            self.file.seek(self.position)
+        return start
 
     def flush(self) -> None:
         """Hands everything to the system, so that the file can be read back under its temporary name."""
@@ -89,6 +129,7 @@ class Target:
                 self.file.close()
                 self._refuse_existing()
                 self.temporary.replace(self.path)
+                _settle(self.path.parent)
             self._remove.detach()
         except BaseException:
             self.abandon()
@@ -99,6 +140,26 @@ class Target:
         with contextlib.suppress(OSError):  # a full disk refuses the last flush; the file goes all the same
             self.file.close()
         self._remove()
+
+
+def _settle(folder: Path) -> None:
+    """Has the new name written to the disk, so that a power cut does not bring back the old file; Windows has no way."""
+    with contextlib.suppress(OSError):
+        handle = os.open(folder, os.O_RDONLY)
+        try:
+            os.fsync(handle)
+        finally:
+            os.close(handle)
+
+
+def _tried(call: Callable[[int], int], at: int) -> int:
+    """Bytes that were copied; 0 if this call cannot do it between these files."""
+    try:
+        return call(at)
+    except OSError as error:
+        if error.errno in UNABLE:
+            return 0
+        raise
 
 
 def _unlink(path: Path) -> None:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import heapq
 import json
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from itertools import pairwise
@@ -38,12 +38,14 @@ from mcap.records import (
 import imutool
 from imutool.errors import DataError
 from imutool.mcap_io import records, schema
+from imutool.mcap_io.chunk_index import ChunkIndexes
 from imutool.mcap_io.read import OWN_KEYS, RECORD, SHADOWED_KEY, UNIT_KEY, VELOCITY_KEY
 from imutool.mcap_io.records import FOOTER_SIZE, MAGIC
 from imutool.mcap_io.target import Target
 from imutool.recording import Frames, Recording
 
 CHUNK_BYTES = 1 << 20  # compression gains nothing beyond, memory grows tenfold by 32 MiB (mcap#1658)
+LARGEST_ID = 2**16 - 1  # of a channel or a schema
 WORLD, BODY = "world", "body"
 PACKED_IMAGES = ("png", "jpeg", "jpg", "webp")  # compressing these again costs time and saves nothing
 
@@ -75,7 +77,7 @@ class Contents:
 
     schemas: dict[int, Schema] = field(default_factory=dict)
     channels: dict[int, Channel] = field(default_factory=dict)
-    chunks: list[ChunkIndex] = field(default_factory=list)
+    chunks: ChunkIndexes = field(default_factory=ChunkIndexes)
     attachments: list[AttachmentIndex] = field(default_factory=list)
     metadata: list[MetadataIndex] = field(default_factory=list)
     counts: Counter[int] = field(default_factory=Counter)
@@ -102,29 +104,43 @@ class Contents:
             schema_count=len(self.schemas),
         )
 
-    def groups(self) -> Iterator[tuple[Opcode, Sequence[McapRecord]]]:
-        """The records of the summary section, grouped by opcode as the format demands."""
-        yield Opcode.SCHEMA, list(self.schemas.values())
-        yield Opcode.CHANNEL, list(self.channels.values())
-        yield Opcode.STATISTICS, [self.statistics()]
-        yield Opcode.CHUNK_INDEX, self.chunks
-        yield Opcode.ATTACHMENT_INDEX, self.attachments
-        yield Opcode.METADATA_INDEX, self.metadata
+    def groups(self) -> Iterator[tuple[Opcode, bytes | bytearray]]:
+        """The bytes of the summary section, its records grouped by opcode as the format demands."""
+        yield Opcode.SCHEMA, _built(self.schemas.values())
+        yield Opcode.CHANNEL, _built(self.channels.values())
+        yield Opcode.STATISTICS, _built([self.statistics()])
+        yield Opcode.CHUNK_INDEX, self.chunks.raw
+        yield Opcode.ATTACHMENT_INDEX, _built(self.attachments)
+        yield Opcode.METADATA_INDEX, _built(self.metadata)
+
+
+def _built(group: Iterable[McapRecord]) -> bytes:
+    return b"".join(records.build(record) for record in group)
 
 
 class LogWriter:
     """A log being written, as a context manager: complete and in its place on leaving, or gone after any error.
 
+    Without `data_crc` the log states no CRC of its data section, and bytes may pass into it that nobody has looked at.
+
     Raises:
         ConfigError: the target exists (without `overwrite`) or cannot be written, or an unknown compression.
     """
 
-    def __init__(self, path: Path, *, compression: str = "zstd", overwrite: bool = False, header: bytes | None = None) -> None:
+    def __init__(
+        self,
+        path: Path,
+        *,
+        compression: str = "zstd",
+        overwrite: bool = False,
+        header: bytes | None = None,
+        data_crc: bool = True,
+    ) -> None:
         self.compression = records.COMPRESSIONS.get(compression, compression)
         records.pack(compression)
         self.contents, self.finished = Contents(), False
         self.written: set[int] = set()  # schemas
-        self.target = Target(path, overwrite=overwrite)
+        self.target = Target(path, overwrite=overwrite, summing=data_crc)
         try:
             own = records.build(Header(profile="ros2", library=f"imutool {imutool.__version__}"))
             self.target.write(MAGIC + (own if header is None else header))
@@ -147,16 +163,16 @@ class LogWriter:
         self.target.commit()
 
     def channel(self, topic: str, schema_name: str, metadata: Mapping[str, str] | None = None) -> int:
-        """Defines a topic (and its schema, once), and returns its channel id.
+        """Defines a topic (and its schema, once), and returns its channel id, the largest there is plus one.
 
         Raises:
-            DataError: the topic is defined already.
+            DataError: the topic is defined already, or no id is left.
         """
         if any(channel.topic == topic for channel in self.contents.channels.values()):
             raise DataError(f"two channels would be written to {topic}", expected="one topic each")
         described = {"offered_qos_profiles": QOS, "topic_type_hash": schema.TYPE_HASHES[schema_name]}
         record = Channel(
-            id=max(self.contents.channels, default=0) + 1,
+            id=_next(self.contents.channels, "channel"),
             topic=topic,
             message_encoding="cdr",
             metadata=described | dict(metadata or {}),
@@ -173,7 +189,7 @@ class LogWriter:
             if known.name == schema_name and known.encoding == "ros2msg" and _bare(known.data) == _bare(text.encode()):
                 self._write_schema(known)  # once more: so far it may stand in a later chunk only
                 return int(known.id)
-        record = Schema(id=max(self.contents.schemas, default=0) + 1, name=schema_name, encoding="ros2msg", data=text.encode())
+        record = Schema(id=_next(self.contents.schemas, "schema"), name=schema_name, encoding="ros2msg", data=text.encode())
         self.contents.schemas[record.id] = record
         self._write_schema(record)
         return record.id
@@ -241,9 +257,8 @@ class LogWriter:
         self.finished = True
         self.target.write(records.build(DataEnd(data_section_crc=self.target.crc)))
         start, offsets = self.target.position, b""
-        self.target.crc = 0  # from here on it is the summary's
-        for opcode, group in self.contents.groups():
-            raw = b"".join(records.build(record) for record in group)
+        self.target.summing, self.target.crc = True, 0  # from here on it is the summary's
+        for opcode, raw in self.contents.groups():
             if raw:
                 at = self.target.position
                 offsets += records.build(SummaryOffset(group_opcode=opcode, group_start=at, group_length=len(raw)))
@@ -254,6 +269,14 @@ class LogWriter:
         footer.summary_crc = self.target.crc
         self.target.write(records.build(footer)[-4:] + MAGIC)
         self.target.flush()
+
+
+def _next(taken: Mapping[int, object], what: str) -> int:
+    """The largest id plus one, which keeps all ids there are."""
+    largest = max(taken, default=0)
+    if largest >= LARGEST_ID:
+        raise DataError(f"a {what} has the id {largest}", expected=f"less than {LARGEST_ID}, so that one more has room")
+    return largest + 1
 
 
 def _bare(definition: bytes) -> list[bytes]:

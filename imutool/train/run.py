@@ -15,8 +15,8 @@ from imutool.bias import _file, hybrid, neural_ode, static
 from imutool.bias._base import SENSORS, BiasModel
 from imutool.config import plain
 from imutool.errors import ConfigError
+from imutool.mcap_io.digest import sha256
 from imutool.mcap_io.read import read
-from imutool.mcap_io.rewrite import sha256
 from imutool.recording import Recording
 from imutool.train import checkpoint, checks
 from imutool.train.fit import Epoch, Training
