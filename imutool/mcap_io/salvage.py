@@ -8,9 +8,12 @@ state none: being saved must not make them look proven.
 from __future__ import annotations
 
 import json
+import os
+import secrets
 import struct
 import zlib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -83,7 +86,8 @@ def repair(
         compression = next((b.compression for b in structure.blocks if b.compression), "zstd")
         with LogWriter(target, compression=compression, overwrite=overwrite, header=structure.opening) as out:
             with log.named():
-                saved = _Saved(structure, out)
+                structure.prove()
+                saved = _Saved(structure, losses, out)
                 for item in structure.items:
                     saved.take(item)
                     tell(item.offset, 2 * size)
@@ -121,8 +125,8 @@ def _told(source: Path, damaged: str, losses: Losses) -> dict[str, str]:
 class _Saved:
     """The part of a log that goes on, item by item."""
 
-    def __init__(self, structure: Structure, out: LogWriter) -> None:
-        self.structure, self.source, self.out = structure, structure.source, out
+    def __init__(self, structure: Structure, losses: Losses, out: LogWriter) -> None:
+        self.structure, self.source, self.losses, self.out = structure, structure.source, losses, out
         out.contents.schemas.update(sorted(structure.schemas.items()))
         out.contents.channels.update(sorted(structure.channels.items()))
         for record in (*out.contents.schemas.values(), *out.contents.channels.values()):
@@ -143,12 +147,12 @@ class _Saved:
         found = self.structure.unpacked(block, raw)
         if block.compression is None or block.edited:
             if len(found.heads):
-                self._anew(block, raw, found)
+                self._anew(block, found)
             return
         head = records.ChunkHead.of(raw[:128], len(raw), block.offset)
         self._chunk(raw[: head.data_at], raw[head.data_at :], head, found)
 
-    def _anew(self, block: Block, raw: bytes, found: records.Messages) -> None:
+    def _anew(self, block: Block, found: records.Messages) -> None:
         """Messages that cannot go on in the chunk they came from, or came from none."""
         data, times = found.data.tobytes(), found.times()
         compression = block.compression or ""
@@ -156,8 +160,7 @@ class _Saved:
             compression = "zstd"
         packed = records.pack(compression)(data)
         start = records.chunk_head(data, packed, compression, int(times.min()), int(times.max()))
-        stated = block.compression is not None and records.ChunkHead.of(raw[:128], len(raw), block.offset).crc
-        if not stated:
+        if block.offset in self.losses.unchecked_in:
             start = start[:CRC_AT] + bytes(4) + start[CRC_AT + 4 :]
         self._chunk(start, packed, records.ChunkHead.of(start, len(start) + len(packed), block.offset), found)
 
@@ -233,3 +236,25 @@ def _keep(out: LogWriter, source: Source, loss: Loss) -> None:
                 media_type=media.decode(),
             )
         )
+
+
+@contextmanager
+def repaired(source: Path, beside: Path) -> Iterator[tuple[Path, Losses] | None]:
+    """A repaired copy of a damaged log in the folder of `beside`, for as long as it is needed; None if the log is whole.
+
+    Raises:
+        ConfigError: the copy cannot be written.
+        LogError: nothing in the log can be saved.
+    """
+    with Log(source, salvage=True) as log:
+        log.check()
+        losses = log.losses
+    assert losses is not None, "with salvage there are losses, if perhaps none"
+    if not losses and not losses.mended:
+        yield None
+        return
+    copy = beside.with_name(f".{source.name}.{os.getpid()}.{secrets.token_hex(4)}.partial")
+    try:
+        yield copy, repair(source, copy).losses
+    finally:
+        copy.unlink(missing_ok=True)

@@ -12,16 +12,18 @@ from collections import Counter
 import numpy as np
 from jaxtyping import Bool, Int64, UInt64
 from mcap.opcode import Opcode
-from mcap.records import ChunkIndex, Footer, Header
+from mcap.records import ChunkIndex, DataEnd, Footer, Header
 
 from imutool.errors import LogError
 from imutool.mcap_io import records
+from imutool.mcap_io.crc import crc32
 from imutool.mcap_io.losses import Loss, Losses
 from imutool.mcap_io.mend import MOST_SEARCHED, definitions, in_order, mended
 from imutool.mcap_io.records import FOOTER_SIZE, HEAD, MAGIC
+from imutool.mcap_io.resync import PRIVATE
 from imutool.mcap_io.sections import DEFINITIONS, Sections
 from imutool.mcap_io.source import Source
-from imutool.mcap_io.structure import Block, Span, Structure
+from imutool.mcap_io.structure import RUN_BYTES, Block, Span, Structure
 from imutool.mcap_io.walk import LATEST_NS, Gap, Walk, reason
 
 MOST_AGREED = 1000  # definitions that need no second look: some writers repeat all of theirs in every chunk
@@ -46,6 +48,7 @@ class Salvaged(Structure):
         self._lost_spans: set[int] = set()
         self._put_right: set[int] = set()
         self._agreed: set[bytes] = set()
+        self._proven = False  # all of it, by the CRC of the data section
         super().__init__(source)
 
     # ── what callers use ─────────────────────────────────────────────────────────────────────────────────────────────
@@ -107,6 +110,58 @@ class Salvaged(Structure):
             counts, exact = self._known_of(item)
             times = (item.start_ns, item.end_ns) if item.start_ns <= item.end_ns < LATEST_NS else (None, None)
             self.losses.add(Loss(item.offset, item.length, reason(error), self._by_topic(counts), exact, *times))
+
+    def check(self) -> None:
+        """Reads every chunk and attachment, and compares its CRC and that of the data section."""
+        super().check()
+        self.prove()
+
+    def prove(self) -> None:
+        """Compares the CRC of the data section, where one is stated and nothing is known to be damaged yet.
+
+        If it is right, it covers also what no other CRC does.
+        """
+        if self.losses or self._proven or self.data_end == self.source.size:
+            return
+        stated = records.parse(DataEnd, self.source.at(self.data_end + HEAD.size, 4), self.data_end).data_section_crc
+        crc = 0
+        for at in range(0, self.data_end if stated else 0, RUN_BYTES):
+            crc = crc32(self.source.at(at, min(RUN_BYTES, self.data_end - at)), crc)
+        if stated and crc == stated:
+            self._proven = True
+            self.losses.unchecked_in.clear()
+            self.losses.unproven.clear()
+        elif stated:
+            self._explain(f"the data section has CRC {crc:08x}, expected {stated:08x}")
+
+    def _explain(self, said: str) -> None:
+        """What was changed: a chunk, or an index that can be held against one, or else what no other CRC covers."""
+        super().check()
+        if self.losses:
+            return
+        wrong = [block.offset for block in self.blocks if block.indexes and not self._indexes_match(block)]
+        for offset in wrong:
+            self.losses.mend(f"a message index of the chunk at byte {offset} is damaged; the chunk itself is sound")
+        loose = {"messages outside chunks" for block in self.blocks if block.compression is None}
+        loose |= {"metadata" for item in self.items if isinstance(item, Span) and item.opcode == Opcode.METADATA}
+        loose |= {"private records" for item in self.items if isinstance(item, Span) and item.opcode >= PRIVATE}
+        if loose and not wrong and not self.losses.mended:
+            self.losses.add(Loss(0, 0, f"{said}: {' or '.join(sorted(loose))} may have changed, which no other CRC covers"))
+        else:
+            self.losses.mend(said)
+
+    def _indexes_match(self, block: Block) -> bool:
+        """Whether the message indexes of a chunk list what is in it."""
+        found = self.found(block)
+        if found is None or block.edited:
+            return True
+        for channel in block.indexes:
+            mine = found.heads["channel"] == channel
+            listed = self.index(block, channel)
+            actual = np.column_stack([found.heads["log_time"][mine], found.offsets[mine].astype(np.uint64)])
+            if listed.shape != actual.shape or not (listed[np.argsort(listed[:, 1])] == actual).all():
+                return False
+        return True
 
     def define(self, opcode: int, body: bytes, offset: int) -> None:
         """Takes in a Schema or Channel record that a CRC covers.
@@ -280,7 +335,7 @@ class Salvaged(Structure):
             crc = records.ChunkHead.of(raw[:128], len(raw), block.offset).crc
             if not crc and not in_order(raw, block.offset, self._known.get(block.offset)):
                 raise LogError(f"the head of the chunk at byte {block.offset} is damaged, and it has no CRC to tell by")
-        if not crc and len(found.heads):
+        if not crc and len(found.heads) and not self._proven:
             self.losses.unchecked_in[block.offset] = len(found.heads)
         if block.offset in self._put_right:
             self.losses.mend(f"the head of the chunk at byte {block.offset} was damaged, and is put right")

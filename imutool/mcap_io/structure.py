@@ -147,6 +147,9 @@ class Structure:
             except LogError as error:
                 self.lose(item, error)
 
+    def prove(self) -> None:
+        """Called before the log is written anew; a whole one is checked by who reads it."""
+
     def unpacked(self, block: Block, raw: bytes) -> records.Messages:
         """The same, for a caller that has read the block's bytes already."""
         if block.compression is None:

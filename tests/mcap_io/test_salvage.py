@@ -343,6 +343,22 @@ def test_the_contents_of_a_damaged_chunk_are_never_taken_for_messages_outside_ch
         assert log.losses.unchecked == 0
 
 
+@pytest.mark.parametrize("layout", ["data-crc"], indirect=True)
+def test_damage_that_only_the_crc_of_the_data_section_shows_is_told(foreign: Foreign, flight: Messages, layout: str) -> None:
+    path = foreign(flight, layout, metadata={"vehicle": {"id": "7777"}})
+    whole = path.read_bytes()
+    flip(path, blocks(path)[2].end - 3)  # in a message index: the chunk says the same
+    with Log(path, salvage=True) as log:
+        log.check()
+        assert not log.losses
+        assert any("message index" in line for line in log.losses.mended)
+    path.write_bytes(whole)
+    flip(path, whole.index(b"7777") + 1)  # in metadata: nothing says the same
+    with Log(path, salvage=True) as log:
+        log.check()
+        assert "metadata" in log.losses.entries[0].reason
+
+
 def test_a_damaged_attachment_is_left_out(foreign: Foreign, flight: Messages, tmp_path: Path) -> None:
     path, target = foreign(flight, attachments=(b"a" * 3000, b"b" * 3000)), tmp_path / "out.mcap"
     flip(path, path.read_bytes().index(b"b" * 100) + 5)
