@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -25,8 +26,10 @@ from imutool.errors import ConfigError, DataError, LogError, ModelError
 from imutool.mcap_io import schema
 from imutool.mcap_io.digest import Digest
 from imutool.mcap_io.log import Clock, ImuBatch, Log
+from imutool.mcap_io.losses import Losses
 from imutool.mcap_io.read import read
 from imutool.mcap_io.rewrite import Made, NewTopic, RewriteReport, Values, rewrite
+from imutool.mcap_io.salvage import repaired
 from imutool.mcap_io.verify import Verified, refuse_unknown
 from imutool.place import Place
 from imutool.recording import Imu, Recording, nanoseconds, seconds
@@ -53,6 +56,7 @@ class DebiasReport:
     models: Mapping[str, str]
     starts: Mapping[str, TurnOn]
     rewrite: RewriteReport
+    losses: Losses  # of a damaged source; empty as far as it was looked at (`check`)
 
 
 def apply(model: BiasModel, start: TurnOn, imu: Imu) -> Debiased:
@@ -162,24 +166,58 @@ def debias(
     those in `imus`, else those with a model of their own, else the log's only one.
     With `smooth` the start bias at every time comes from the whole log, also from what follows.
     Without a target the log itself is replaced (`mcap_io.rewrite`, which also says what `check` checks).
+    Of a damaged log, what is sound goes through a repaired copy beside the target (`mcap_io.salvage`), and `losses` says
+    what is missing; it is not replaced.
 
     Raises:
         ConfigError: source or target cannot be opened, `init` makes no sense, `smooth` is asked for with another `init`,
             or a model is given for an IMU that is not to be debiased.
-        LogError: the log is damaged, has no such IMU, or is debiased already.
+        LogError: nothing in the log can be saved, it has no such IMU, is debiased already, or is damaged and its own target.
         ModelError: no model and no time at rest; a model for another rate; a damaged model file.
     """
     refuse_smooth(init, smooth)
     refuse_unknown(check)
+    run = partial(_debias, target=target, model=model, imus=imus, init=init, smooth=smooth, check=check, overwrite=overwrite)
+    with Log(source, salvage=True) as log:
+        assert log.losses is not None, "with salvage there are losses, if perhaps none"
+        damaged = bool(log.losses or log.losses.mended)
+    if not damaged:
+        try:
+            return run(source, source, Losses(), progress=progress)
+        except LogError as error:  # damage inside a chunk shows only here
+            refusal = error
+    with repaired(source, target or source) as saved:
+        if saved is None:
+            raise refusal
+        if target is None:
+            raise LogError("the log is damaged", where=source, fix="Give OUT: put in its place, the damaged part would be gone")
+        return run(source, *saved, progress=progress)
+
+
+def _debias(
+    source: Place,
+    sound: Place,
+    losses: Losses,
+    *,
+    target: Place | None,
+    model: str | Path | Mapping[str, str | Path] | None,
+    imus: Sequence[str],
+    init: str,
+    smooth: bool,
+    check: str,
+    overwrite: bool,
+    progress: Callable[[int, int], None] | None,
+) -> DebiasReport:
+    """The same for a log that is whole, or for the `sound` copy of one that is not."""
     given = dict(model) if isinstance(model, Mapping) else {} if model is None else {"": model}
-    with Log(source) as log:
+    with Log(sound) as log:
         topics = _chosen(log, imus, given)
         about = log.metadata().get("imutool", {})
     named = given.get("") or (None if all(topic in given for topic in topics) else _of_the_log(about))
     derived, starts, models, records = [], {}, {}, {}
     with Digest(source) as digest:
         for topic in topics:
-            chosen, start = _prepare(source, topic, given.get(topic, named), init, smooth)
+            chosen, start = _prepare(sound, topic, given.get(topic, named), init, smooth)
             derived.append(Debiaser(topic, chosen, start))
             starts[topic], models[topic] = start, str(chosen.card.get("name", chosen.method))
             records[topic] = _provenance(topic, chosen, start, init, smooth)
@@ -189,8 +227,8 @@ def debias(
             checked = {"verified": json.dumps(verified._asdict())}
             return {f"imutool{topic}" if len(records) > 1 else "imutool": v | origin | checked for topic, v in records.items()}
 
-        report = rewrite(source, target, derived, metadata=metadata, overwrite=overwrite, check=check, progress=progress)
-    return DebiasReport(models, starts, report)
+        report = rewrite(sound, target, derived, metadata=metadata, overwrite=overwrite, check=check, progress=progress)
+    return DebiasReport(models, starts, report, losses)
 
 
 def _of_the_log(about: Mapping[str, str]) -> str | Path | None:

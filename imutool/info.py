@@ -41,17 +41,23 @@ SATURATION_RULE = (
 Report = dict[str, Any]
 
 
-def inspect(path: Place) -> Report:
+def inspect(path: Place, *, check: bool = True) -> Report:
     """Everything `imutool info` says about a log, as plain JSON values (schema `imutool.info/1`).
+
+    A damaged log is described by what of it is sound, and `losses` says what is not (`mcap_io.losses.Losses.plain`). For that
+    every chunk is read once; without `check` only those with IMU messages are, and damage elsewhere may go unnoticed.
 
     `rate_hz` is one over the median period, so that drop-outs do not lower it; `jitter_s` is the standard deviation of
     the periods. Both, and the largest gap, are null where a topic has fewer than two messages.
 
     Raises:
         ConfigError: the file cannot be opened.
-        LogError: it is no MCAP log, or damaged.
+        LogError: it is no MCAP log, or nothing in it is sound.
     """
-    with Log(path) as log:
+    with Log(path, salvage=True) as log:
+        assert log.losses is not None, "with salvage there are losses, if perhaps none"
+        if check:
+            log.check()
         clocks = {name: _joined(log.stamps(name)) for name in log.topics}
         imus = [_imu(log, topic) for topic in log.topics.values() if topic.schema_name == schema.IMU]
         own = [imu for imu in imus if "derived_from" not in imu]
@@ -75,6 +81,8 @@ def inspect(path: Place) -> Report:
             "truth": truths,
             "metadata": sorted(log.metadata()),
             "warnings": warnings,
+            "checked": check,
+            "losses": log.losses.plain(),
         }
 
 

@@ -7,7 +7,7 @@ import logging
 import os
 import re
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -18,6 +18,7 @@ from rich.progress import BarColumn, Progress, TextColumn
 from rich.table import Table
 
 from imutool.errors import ConfigError
+from imutool.mcap_io.losses import told
 
 NUMBER = re.compile(r"[-+]?[0-9.]+|[–?]")
 
@@ -48,6 +49,13 @@ def say(line: str) -> None:
 def tell_error(message: str) -> None:
     """A line that begins with "error:", on stderr."""
     err.print(f"[bold red]error:[/] {plain(message)}", highlight=False, soft_wrap=True)
+
+
+def tell_losses(losses: Mapping[str, Any]) -> None:
+    """What is wrong with a log (`mcap_io.losses.Losses.plain`), one line a stretch."""
+    for line in told(losses):
+        kind, _, rest = line.partition(": ")
+        out.print(f"[yellow]{kind}:[/] {plain(rest)}", highlight=False, soft_wrap=True)
 
 
 def table(rows: Sequence[Sequence[str]], *, keys: int) -> None:

@@ -33,6 +33,7 @@ Run = Callable[..., subprocess.CompletedProcess[str]]
 Refuse = Callable[..., str]
 
 CONFIG, DATA, LOG, MODEL, INTERRUPTED = 3, 4, 5, 6, 130
+LOST = 3  # something of a log is
 DISK_BYTES = 200_000  # less than any log here, more than any message
 WAIT_S = 120.0  # for the middle of a run, on a machine busy with other things
 TRIES = 20  # the middle may pass between two looks
@@ -100,26 +101,53 @@ def test_a_text_file_named_mcap_is_no_log(tmp_path: Path, refuse: Refuse) -> Non
     assert "notes.mcap" in refuse(LOG, "info", "notes.mcap")
 
 
-@pytest.mark.parametrize("share", [0.0, 0.02, 0.4, 0.8, 1.0])
-def test_a_log_cut_short_says_where(here: Path, refuse: Refuse, share: float) -> None:
+@pytest.mark.parametrize("share", [0.4, 0.8])
+@pytest.mark.parametrize(
+    "words", [["train", "cut.mcap", "-o", "m.safetensors"], ["evaluate", "cut.mcap"]], ids=lambda words: words[0]
+)
+def test_what_needs_a_whole_log_says_where_it_is_cut_short(
+    here: Path, refuse: Refuse, share: float, words: Sequence[str]
+) -> None:
     whole = (here / "flight_2.mcap").read_bytes()
-    (here / "cut.mcap").write_bytes(whole[: 8 + int(share * (len(whole) - 9))])
-    message = refuse(LOG, "info", "cut.mcap")
+    (here / "cut.mcap").write_bytes(whole[: int(share * len(whole))])
+    message = refuse(LOG, *words)
     assert message.startswith("cut.mcap: ")
-    assert re.search(r"cut short|damaged|byte \d+", message)
+    assert re.search(r"cut short at byte \d+.*imutool repair", message)
 
 
-def test_nothing_is_debiased_from_a_log_cut_short(here: Path, refuse: Refuse) -> None:
-    whole = (here / "flight_2.mcap").read_bytes()
-    (here / "cut.mcap").write_bytes(whole[: len(whole) // 2])
-    refuse(LOG, "debias", "cut.mcap", "out.mcap")
+def test_a_log_cut_before_its_first_record_holds_nothing(here: Path, refuse: Refuse) -> None:
+    (here / "cut.mcap").write_bytes((here / "flight_2.mcap").read_bytes()[:8])
+    for words in (["info", "cut.mcap"], ["repair", "cut.mcap", "out.mcap"], ["debias", "cut.mcap", "out.mcap"]):
+        assert "no record" in refuse(LOG, *words)
 
 
-def test_a_log_with_damage_in_a_chunk_leaves_no_target(here: Path, refuse: Refuse) -> None:
+@pytest.mark.parametrize("damage", ["cut short", "in a chunk"])
+def test_of_a_damaged_log_the_sound_part_is_described_debiased_and_saved(here: Path, imutool: Run, damage: str) -> None:
     content = bytearray((here / "flight_2.mcap").read_bytes())
-    content[len(content) // 2] ^= 0xFF
-    (here / "damaged.mcap").write_bytes(content)
-    refuse(LOG, "debias", "damaged.mcap", "out.mcap", "--model", "linear.safetensors")
+    with Log(here / "flight_2.mcap") as log:
+        blocks = [b for b in log.structure.blocks if b.holds(log.channel_ids("/imu0"))]
+    if damage == "cut short":
+        del content[blocks[-1].offset + 100 :]
+    else:
+        content[blocks[-1].offset + blocks[-1].length // 2] ^= 0xFF
+    (here / "bad.mcap").write_bytes(content)
+    before = digests(here)
+    info = imutool("info", "bad.mcap", "--json", "-", cwd=here)
+    debias = imutool("debias", "bad.mcap", "out.mcap", "--model", "linear.safetensors", "--json", "-", cwd=here)
+    repair = imutool("repair", "bad.mcap", "saved.mcap", "--json", "-", cwd=here)
+    reports = []
+    for done in (info, debias, repair):
+        assert done.returncode == LOST, done.stderr
+        reports.append(json.loads(done.stdout))
+    stretches = [[s["offset"] for s in report["losses"]["stretches"]] for report in reports]
+    assert stretches[0] == stretches[1] == stretches[2]
+    assert blocks[-1].offset in stretches[0]
+    counts = {topic["name"]: topic["count"] for topic in reports[0]["topics"]}
+    assert counts == {**dict.fromkeys(counts, 0), **reports[2]["messages"]}
+    assert reports[1]["added"]["/imu0/debiased"] == counts["/imu0"] < 4001
+    assert {name: digest for name, digest in digests(here).items() if name not in ("out.mcap", "saved.mcap")} == before
+    in_place = imutool("debias", "bad.mcap", "--in-place", "--model", "linear.safetensors", cwd=here)
+    assert "damaged" in told(in_place, in_place.stderr, LOG)
 
 
 def test_a_log_that_is_not_there_is_a_matter_of_the_command_line(tmp_path: Path, refuse: Refuse) -> None:

@@ -18,8 +18,8 @@ from imutool.debias import debias
 from imutool.errors import ConfigError, LogError
 from imutool.info import inspect
 from imutool.mcap_io import upload
-from imutool.mcap_io.log import Log
 from imutool.mcap_io.digest import sha256
+from imutool.mcap_io.log import Log
 from imutool.mcap_io.rewrite import rewrite
 from imutool.mcap_io.source import Source
 from imutool.mcap_io.target import Target

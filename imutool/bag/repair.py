@@ -12,6 +12,7 @@ from imutool.bag import records
 from imutool.bag.records import FIRST_RECORD, MAGIC, U32, Op
 from imutool.bag.walk import Bag, Chunk, Loss
 from imutool.errors import ConfigError, LogError
+from imutool.mcap_io.source import Source
 from imutool.mcap_io.target import Target
 from imutool.place import Place, same
 
@@ -45,6 +46,20 @@ class _Entry(NamedTuple):
     first_ns: int
     last_ns: int
     counts: Mapping[int, int]
+
+
+def is_bag(where: Place) -> bool:
+    """Whether a file begins as ROS 1 bags do.
+
+    Raises:
+        ConfigError: it cannot be opened.
+        LogError: it cannot be read.
+    """
+    source = Source(where, expected="an MCAP log or a ROS 1 bag")
+    try:
+        return source.at(0, min(len(MAGIC), source.size)) == MAGIC
+    finally:
+        source.file.close()
 
 
 def repair_bag(source: Place, target: Place, *, overwrite: bool = False, progress: Progress | None = None) -> BagReport:

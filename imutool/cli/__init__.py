@@ -9,10 +9,25 @@ import os
 import signal
 import sys
 
-from imutool.cli import conceal, convert, debias, demo, diagnose, evaluate, export, info, models, simulate, train, view, vio
+from imutool.cli import (
+    conceal,
+    convert,
+    debias,
+    demo,
+    diagnose,
+    evaluate,
+    export,
+    info,
+    models,
+    repair,
+    simulate,
+    train,
+    view,
+    vio,
+)
 from imutool.cli._app import app, caught
 
-COMMANDS = (convert, info, train, debias, evaluate, view, export, vio, simulate, diagnose, conceal, models, demo)
+COMMANDS = (convert, info, repair, train, debias, evaluate, view, export, vio, simulate, diagnose, conceal, models, demo)
 
 
 TERMINATED = 143  # what a shell reports of a program that SIGTERM ended

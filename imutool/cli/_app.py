@@ -17,6 +17,7 @@ from imutool.errors import ConfigError, ImutoolError
 from imutool.terminal import plain, say, tell_error
 
 INTERRUPTED = 130
+LOST = 3  # the command did what it could, and something of the log is lost
 PIPE_CLOSED = 141  # what a shell reports of a program that SIGPIPE ended
 NOTHING_LEFT = "Nothing half-written is left"
 

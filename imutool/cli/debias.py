@@ -4,14 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, NoReturn
 
 import typer
 
-from imutool.cli._app import Init, Json, Overwrite, Quiet, Smooth, Verbose, app
+from imutool.cli._app import LOST, Init, Json, Overwrite, Quiet, Smooth, Verbose, app
 from imutool.errors import ConfigError
+from imutool.mcap_io.losses import Losses
 from imutool.place import place
-from imutool.terminal import progress, say, write_json
+from imutool.terminal import progress, say, tell_losses, write_json
 
 MODEL_HELP = (
     "Model file, physics.toml or a name that ships; else a static estimate. TOPIC=MODEL is for one IMU of several. Repeatable."
@@ -66,8 +67,9 @@ def debias(
     }
     added, copied, verified = dict(report.rewrite.added), report.rewrite.copied, report.rewrite.verified
     result = {"schema": "imutool.debias/1", "output": str(target or source), "imus": imus, "copied": copied, "added": added}
-    if write_json(result | {"verified": verified._asdict()}, json_to):
-        return
+    result |= {"verified": verified._asdict(), "losses": report.losses.plain()}
+    if write_json(result, json_to):
+        _leave(report.losses)
     for topic, entry in imus.items():
         bias = ", ".join(f"{b:+.5f}" for b in entry["gyro_bias"]), ", ".join(f"{b:+.4f}" for b in entry["accel_bias"])
         start = f"start bias {bias[0]} rad/s; {bias[1]} m/s² ({entry['init_how']})"
@@ -75,6 +77,12 @@ def debias(
     counts = ", ".join(f"{count} on {name}" for name, count in added.items())
     say(f"{target or source}: {copied} messages as they were, {counts}")
     say(f"checked: every index, and the contents of {verified.chunks_checked} of {verified.chunks} chunks (--verify {verify})")
+    tell_losses(report.losses.plain())
+    _leave(report.losses)
+
+
+def _leave(losses: Losses) -> NoReturn:
+    raise typer.Exit(LOST if losses else 0)
 
 
 def _refuse_contradictions(target: str | None, in_place: bool, overwrite: bool) -> None:

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, NoReturn
 
 import typer
 
-from imutool.cli._app import Json, Overwrite, Quiet, Verbose, app
+from imutool.cli._app import LOST, Json, Overwrite, Quiet, Verbose, app
 from imutool.errors import ConfigError
 from imutool.place import place
-from imutool.terminal import log_to_stderr, out, plain, say, table, write_json
+from imutool.terminal import log_to_stderr, out, plain, say, table, tell_losses, write_json
 
 if TYPE_CHECKING:
     from imutool.identify import Identified
@@ -27,6 +27,7 @@ def info(
     truth: Annotated[str | None, typer.Option(help="For --noise: topic of the true poses, where a log has several.")] = None,
     noise_plot: Annotated[Path | None, typer.Option(metavar="F.png", help="Draw the Allan deviations (with --noise).")] = None,
     noise_toml: Annotated[Path | None, typer.Option(metavar="F.toml", help="Write the noise as TOML (with --noise).")] = None,
+    quick: Annotated[bool, typer.Option("--quick", help="Read no chunk without need: damage may go unnoticed.")] = False,
     overwrite: Overwrite = False,
     json_to: Json = None,
     verbose: Verbose = False,
@@ -42,7 +43,8 @@ def info(
     if len(logs) > 1 and (noise_plot or noise_toml):
         raise ConfigError(f"{len(logs)} logs do not fit one file", where="--noise-plot, --noise-toml", expected="one log")
     places = [place(log) for log in logs]
-    reports = [inspect(log) for log in places]
+    reports = [inspect(log, check=not quick) for log in places]
+    lost = any(report["losses"]["stretches"] for report in reports)
     found = []
     if noise:
         from imutool import identify
@@ -52,7 +54,7 @@ def info(
             report["noise"] = identify.plain(one)
         _write_noise(found[0], noise_plot, noise_toml, overwrite)
     if write_json(reports[0] if len(reports) == 1 else {"schema": "imutool.infos/1", "logs": reports}, json_to):
-        return
+        _leave(lost)
     for number, (log, report) in enumerate(zip(logs, reports, strict=True)):
         say(log)
         table(topic_rows(report), keys=1)
@@ -63,6 +65,12 @@ def info(
                 out.print(f"[cyan]noise:[/] {plain(remark)}", highlight=False, soft_wrap=True)
         for warning in report["warnings"]:
             out.print(f"[yellow]warning:[/] {plain(warning)}", highlight=False, soft_wrap=True)
+        tell_losses(report["losses"])
+    _leave(lost)
+
+
+def _leave(lost: bool) -> NoReturn:
+    raise typer.Exit(LOST if lost else 0)
 
 
 def _write_noise(found: Identified, plot: Path | None, toml: Path | None, overwrite: bool) -> None:

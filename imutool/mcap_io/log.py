@@ -19,8 +19,10 @@ from mcap.records import Metadata
 
 from imutool.errors import DataError, LogError
 from imutool.mcap_io import records, schema
+from imutool.mcap_io.losses import Losses
 from imutool.mcap_io.memory import keep_buffers
 from imutool.mcap_io.records import HEAD
+from imutool.mcap_io.salvaged import Salvaged
 from imutool.mcap_io.source import Source
 from imutool.mcap_io.structure import Block, Span, Structure
 from imutool.place import Place
@@ -87,18 +89,21 @@ class Log:
 
     Memory is bounded by its largest chunk. Times given to a method select by log time, both ends included.
 
+    With `salvage` a damaged log opens too: what cannot be proven is left out, and `losses` says what and why. It is complete
+    once everything was read (`check`), because the damage inside a chunk shows when that is unpacked.
+
     Raises:
         ConfigError: the file cannot be opened.
-        LogError: empty, not an MCAP log, cut short or damaged.
+        LogError: empty, not an MCAP log, cut short or damaged; with `salvage`, if there is nothing in it to be saved.
     """
 
-    def __init__(self, path: Place) -> None:
+    def __init__(self, path: Place, *, salvage: bool = False) -> None:
         keep_buffers()
         self.path = path
         self._source = Source(path)
         try:
             with self.named():
-                self.structure = Structure(self._source)
+                self.structure = Salvaged(self._source) if salvage else Structure(self._source)
                 self.topics = MappingProxyType(self._topics())
         except BaseException:
             self._source.file.close()
@@ -109,6 +114,15 @@ class Log:
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
         self._source.file.close()
+
+    def check(self) -> None:
+        """Reads every chunk and attachment and compares its CRC, so that `losses` is complete.
+
+        Raises:
+            LogError: without salvage, the first damage.
+        """
+        with self.named():
+            self.structure.check()
 
     @contextmanager
     def named(self, topic: str = "") -> Iterator[None]:
@@ -141,6 +155,11 @@ class Log:
             ):
                 raise LogError(f"{channel.topic} carries {before.schema_name} and {found[channel.topic].schema_name}")
         return found
+
+    @property
+    def losses(self) -> Losses | None:
+        """What is lost so far, nothing of a whole log; None without salvage, where the first damage is an error."""
+        return self.structure.losses
 
     @property
     def profile(self) -> str:
@@ -221,12 +240,12 @@ class Log:
             for block in self.structure.blocks:
                 if not block.holds(channels):
                     continue
-                if block.indexes:
-                    entries = [self.structure.index(block, c) for c in sorted(channels & block.indexes.keys())]
+                indexed = sorted(channels & block.indexes.keys()) if block.vouched and not block.edited else []
+                entries = [self.structure.index(block, c) for c in indexed]
+                if indexed and all(len(entry) for entry in entries):
                     table = np.concatenate(entries)
                     yield records.signed(table[np.argsort(table[:, 1], kind="stable"), 0])
-                else:
-                    found = self.structure.unpack(block)
+                elif (found := self.structure.found(block)) is not None:
                     times = found.times()[np.isin(found.heads["channel"], list(channels))]
                     if len(times):
                         yield times
@@ -339,7 +358,9 @@ class Log:
     def _rows_of(
         self, block: Block, wanted: Mapping[str, set[int]], first: int, last: int
     ) -> Iterator[tuple[str, records.Rows]]:
-        found = self.structure.unpack(block)
+        found = self.structure.found(block)
+        if found is None:
+            return
         times = found.times()
         inside = (times >= first) & (times <= last)
         for topic, channels in wanted.items():

@@ -119,9 +119,9 @@ def signed(times: UInt64[np.ndarray, " n"]) -> Int64[np.ndarray, " n"]:
 def scan(data: bytes | memoryview, *, bare: bool = False) -> tuple[Int64[np.ndarray, " n"], list[tuple[int, int, int]], int]:
     """Where messages and definitions begin in a stretch of records, and the byte at which whole records end.
 
-    A `bare` stretch lies outside chunks and also ends before the first record that is no message. Stretches of equally
-    long messages, which topic-grouped chunks consist of, are recognised as a matrix; the framing is still followed
-    record by record, only not in Python.
+    A `bare` stretch lies outside chunks and also ends before the first record that is no message, or none that can be.
+    Stretches of equally long messages, which topic-grouped chunks consist of, are recognised as a matrix; the framing is still
+    followed record by record, only not in Python.
     """
     pieces: list[Int64[np.ndarray, " n"]] = []
     singles: list[int] = []
@@ -135,6 +135,8 @@ def scan(data: bytes | memoryview, *, bare: bool = False) -> tuple[Int64[np.ndar
             break
         if opcode == Opcode.MESSAGE:
             if length < FIXED:
+                if bare:
+                    break
                 raise LogError(f"a message has {length} bytes", expected=f"at least {FIXED}")
             equal, last = (equal + 1, last) if length == last else (0, length)
             if equal >= wait:
@@ -289,14 +291,18 @@ def _decompress(compression: str, packed: memoryview, size: int) -> bytes | memo
     """Never allocates more than `size`, whatever the packed bytes say about themselves."""
     if compression == "zstd":
         if size == 0:
+            if _unpacker.stream_reader(packed).read(1):
+                raise ValueError("the zstd frame holds something, the chunk nothing")
             return b""
         if zstandard.frame_content_size(packed) not in (-1, size):
             raise ValueError(f"the zstd frame says {zstandard.frame_content_size(packed)} bytes, the chunk {size}")
         return bytes(_unpacker.decompress(packed, max_output_size=size))
     if compression == "lz4":
-        if lz4.frame.get_frame_info(packed)["content_size"] == size:  # the frame holds itself to it: two thirds of the time
-            return bytes(lz4.frame.decompress(packed))
-        return bytes(lz4.frame.LZ4FrameDecompressor().decompress(packed, max_length=size))
+        frame = lz4.frame.LZ4FrameDecompressor()
+        data = bytes(frame.decompress(packed, max_length=size))
+        if not frame.eof and frame.decompress(b"", max_length=1):
+            raise ValueError(f"the lz4 frame goes on beyond the chunk's {size} bytes")
+        return data
     return packed
 
 

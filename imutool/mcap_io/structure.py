@@ -19,7 +19,9 @@ from mcap.records import Channel, ChunkIndex, Footer, Header, Schema, Statistics
 
 from imutool.errors import LogError
 from imutool.mcap_io import chunk_index, records
+from imutool.mcap_io.attachment import Attached
 from imutool.mcap_io.crc import crc32
+from imutool.mcap_io.losses import Losses
 from imutool.mcap_io.records import FOOTER_SIZE, HEAD, MAGIC
 from imutool.mcap_io.source import CUT_SHORT, Source
 
@@ -46,10 +48,13 @@ class Block:
     compression: str | None  # None: a run outside chunks
     indexes: dict[int, int] = field(default_factory=dict)  # channel id to the offset of its MessageIndex record
     counts: dict[int, int] | None = None  # messages per channel id, once known
+    vouched: bool = True  # False: what is said of the block was found lying about, and only unpacking it proves it
+    edited: bool = False  # its messages are not those of its bytes: some are left out, or have other channel ids
+    lost: bool = False
 
     def holds(self, channels: set[int]) -> bool:
         """False when the block cannot hold a message of these channels."""
-        known = self.indexes or self.counts
+        known = (self.indexes if self.vouched else None) or self.counts
         return known is None or not channels.isdisjoint(known)
 
 
@@ -59,6 +64,8 @@ class Structure:
     Raises:
         LogError: empty, not an MCAP log, cut short, or damaged; the message says at which byte.
     """
+
+    losses: Losses | None = None  # nothing is ever lost here: the first damage is an error
 
     def __init__(self, source: Source) -> None:
         self.source = source
@@ -74,7 +81,20 @@ class Structure:
     @property
     def blocks(self) -> list[Block]:
         """Everything that holds messages, in file order."""
-        return [item for item in self.items if isinstance(item, Block)]
+        return [item for item in self.items if isinstance(item, Block) and not item.lost]
+
+    @property
+    def opening(self) -> bytes:
+        """The bytes of the Header record."""
+        return self.source.at(len(MAGIC), self.header_end - len(MAGIC))
+
+    def lose(self, item: Block | Span, error: LogError) -> None:
+        """Called where a part of the log cannot be used; here that is an error.
+
+        Raises:
+            LogError: `error`.
+        """
+        raise error
 
     @property
     def vouched(self) -> bool:
@@ -97,8 +117,38 @@ class Structure:
         Raises:
             LogError: the block is damaged.
         """
-        raw = self.source.at(block.offset, block.length)
-        return self.unpacked(block, raw)
+        return self.unpacked(block, self.read(block))
+
+    def read(self, block: Block) -> bytes:
+        """The bytes of a block, as they may stand in another log."""
+        return self.source.at(block.offset, block.length)
+
+    def found(self, block: Block) -> records.Messages | None:
+        """The messages of a block, or None if that block is lost now."""
+        try:
+            return self.unpack(block)
+        except LogError as error:
+            self.lose(block, error)
+            return None
+
+    def check(self) -> None:
+        """Reads every chunk and attachment, and compares its CRC.
+
+        Raises:
+            LogError: one is damaged.
+        """
+        for item in self.items:
+            try:
+                if isinstance(item, Block):
+                    if not item.lost:
+                        self.unpack(item)
+                elif item.opcode == Opcode.ATTACHMENT:
+                    Attached.of(self.source, item.offset, item.length - HEAD.size).check(self.source)
+            except LogError as error:
+                self.lose(item, error)
+
+    def prove(self) -> None:
+        """Called before the log is written anew; a whole one is checked by who reads it."""
 
     def unpacked(self, block: Block, raw: bytes) -> records.Messages:
         """The same, for a caller that has read the block's bytes already."""
@@ -108,10 +158,6 @@ class Structure:
         if opcode != Opcode.CHUNK or length != block.length - HEAD.size:
             raise LogError(f"the summary says a chunk lies at byte {block.offset}, which it does not")
         return records.messages(records.unpack(raw, block.offset), block.offset)
-
-    def lose(self, item: Block | Span, error: LogError) -> None:
-        """Called where a part of the log cannot be read."""
-        raise error
 
     def index(self, block: Block, channel: int) -> UInt64[np.ndarray, "n 2"]:
         """The (log time, offset) entries of one channel in one block, from its MessageIndex record.
@@ -216,7 +262,7 @@ class Structure:
         self.header_end = position
         while position < limit:
             if (known := index.get(position)) is not None:
-                block = _known(known, limit)
+                block = known_block(known, limit)
                 self.items.append(block)
                 position = block.end
                 continue
@@ -263,6 +309,10 @@ class Structure:
         """A run of messages outside chunks, as one block."""
         raw = self.source.at(position, max(first, min(RUN_BYTES, limit - position)))
         _, _, end = records.scan(raw, bare=True)
+        if not end:
+            raise LogError(
+                f"the message at byte {position} has {first - HEAD.size} bytes", expected=f"at least {records.FIXED}"
+            )
         found = records.messages(raw[:end], position)
         times = found.times()
         counts = Counter(found.heads["channel"].tolist())
@@ -280,7 +330,13 @@ class Structure:
                 if all(c.schema_id in self.schemas for c in self.channels.values() if c.schema_id):
                     break
                 self._learn(block)
-        missing = {c for block in self.blocks for c in (block.indexes or block.counts or {})} - self.channels.keys()
+        used = {c for block in self.blocks for c in (block.indexes or block.counts or {})}
+        for block in chunks:  # a definition may also stand in a chunk that has no message of its channel
+            if used <= self.channels.keys():
+                break
+            if block.counts is None:
+                self._learn(block)
+        missing = used - self.channels.keys()
         if missing:
             raise LogError(f"channel {min(missing)} has messages and no Channel record", expected="a definition")
         for channel in self.channels.values():
@@ -303,7 +359,7 @@ class Structure:
         return block.counts
 
 
-def _known(entry: ChunkIndex, limit: int) -> Block:
+def known_block(entry: ChunkIndex, limit: int) -> Block:
     """A chunk as the summary describes it."""
     offset, length = entry.chunk_start_offset, entry.chunk_length
     end = offset + length + entry.message_index_length

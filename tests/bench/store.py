@@ -22,8 +22,8 @@ from mcap.writer import CompressionType, Writer
 from imutool import place as places
 from imutool.debias import debias
 from imutool.mcap_io import schema
-from imutool.mcap_io.log import Log
 from imutool.mcap_io.digest import sha256
+from imutool.mcap_io.log import Log
 from imutool.mcap_io.rewrite import rewrite
 from imutool.place import place
 

@@ -1,0 +1,91 @@
+"""`imutool repair`."""
+
+from __future__ import annotations
+
+from enum import StrEnum
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from imutool.cli._app import LOST, Json, Overwrite, Quiet, Verbose, app
+from imutool.errors import ConfigError
+from imutool.place import place
+from imutool.terminal import progress, say, tell_losses, write_json
+
+if TYPE_CHECKING:
+    from imutool.bag.repair import BagReport
+    from imutool.bag.walk import Loss
+
+
+class Damaged(StrEnum):
+    """What becomes of bytes that are damaged."""
+
+    drop = "drop"
+    keep = "keep"
+
+
+@app.command(
+    epilog="Example: [bold]imutool repair crashed.mcap saved.mcap[/]. Exit code 0: the log was whole; 3: something is lost."
+)
+def repair(
+    source: Annotated[str, typer.Argument(metavar="IN", help="A damaged MCAP log or ROS 1 bag: a file or a URL.")],
+    target: Annotated[str, typer.Argument(metavar="OUT", help="The same with everything in it that is sound.")],
+    damaged: Annotated[
+        Damaged, typer.Option(help="Damaged stretches: drop them, or keep their bytes as attachments (MCAP).")
+    ] = Damaged.drop,
+    overwrite: Overwrite = False,
+    json_to: Json = None,
+    verbose: Verbose = False,
+    quiet: Quiet = False,
+) -> None:
+    """Save what is sound in a damaged log: cut short, overwritten, unfinished, joined; say what is lost."""
+    from imutool.bag.repair import is_bag, repair_bag
+    from imutool.mcap_io.salvage import repair as repair_log
+
+    here, there = place(source), place(target)
+    with progress("Repairing", verbose, quiet) as tell:
+        if is_bag(here):
+            if damaged is Damaged.keep:
+                raise ConfigError("a bag has no attachments", where="--damaged keep", fix="Leave --damaged out")
+            bag = repair_bag(here, there, overwrite=overwrite, progress=lambda done, total: tell(done, total, ""))
+            result: dict[str, Any] = {
+                "whole": bag.whole,
+                "messages": dict(bag.messages),
+                "chunks": bag.chunks,
+                "losses": _losses(bag),
+            }
+        else:
+            log = repair_log(
+                here, there, damaged=damaged.value, overwrite=overwrite, progress=lambda done, total: tell(done, total, "")
+            )
+            result = {"whole": log.whole, "messages": dict(log.messages), "chunks": log.chunks, "kept": log.kept}
+            result["losses"] = log.losses.plain()
+    if not write_json({"schema": "imutool.repair/1", "output": target, **result}, json_to):
+        tell_losses(result["losses"])
+        counts = ", ".join(f"{count} on {topic}" for topic, count in result["messages"].items()) or "no message"
+        state = "the log was whole" if result["whole"] else "saved"
+        say(f"{target}: {state}, {counts}")
+    if result["losses"]["stretches"]:
+        raise typer.Exit(LOST)
+
+
+def _losses(bag: BagReport) -> dict[str, Any]:
+    """What a bag lost, in the words for logs (`mcap_io.losses.Losses.plain`); its format has no CRCs, so nothing is proven."""
+    known = [loss.messages for loss in bag.losses if loss.messages is not None]
+    listed = len(known) == bag.lost
+    return {
+        "whole": bag.whole and bag.was_indexed,
+        "bytes": sum(loss.length for loss in bag.losses),
+        "messages": sum(known) if listed else None,
+        "topics": {},
+        "stretches": [_stretch(loss) for loss in bag.losses],
+        "stretches_not_listed": bag.lost - len(bag.losses),
+        "mended": [] if bag.was_indexed else ["the bag had no index: it was made anew"],
+        "unchecked_messages": 0,
+        "unchecked_definitions": [],
+    }
+
+
+def _stretch(loss: Loss) -> dict[str, Any]:
+    none: dict[str, Any] = {"topics": {}, "first_ns": None, "last_ns": None}
+    return {"offset": loss.offset, "bytes": loss.length, "reason": loss.reason, "messages": loss.messages, **none}
