@@ -57,7 +57,7 @@ def code(monkeypatch: pytest.MonkeyPatch) -> Code:
 def test_each_kind_of_error_has_its_code(
     code: Code, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], error: BaseException, expected: int
 ) -> None:
-    def inspect(_: Path) -> None:
+    def inspect(_: Path, *, check: bool) -> None:
         raise error
 
     monkeypatch.setattr("imutool.info.inspect", inspect)
@@ -68,7 +68,7 @@ def test_each_kind_of_error_has_its_code(
 
 
 def test_a_bug_is_a_traceback(monkeypatch: pytest.MonkeyPatch) -> None:
-    def inspect(_: Path) -> None:
+    def inspect(_: Path, *, check: bool) -> None:
         raise ZeroDivisionError
 
     monkeypatch.setattr("imutool.info.inspect", inspect)
