@@ -20,6 +20,7 @@ from imutool.bias import static
 from imutool.bias._base import BiasModel, OneByOne, Stream, Vector6
 from imutool.bias._file import check_rate, find_model, shipped_for
 from imutool.certainty import Certainty
+from imutool.clean import Cleaner, Rules, Survey, cleaned, survey
 from imutool.config import plain
 from imutool.errors import ConfigError, DataError, LogError, ModelError
 from imutool.mcap_io import schema
@@ -34,6 +35,7 @@ from imutool.turn_on import smooth as smooth_rest
 
 HEAD_S = 60.0  # of a log, read to find the start: a constant, however long the log
 SUFFIX = "/debiased"
+CLEAN_RECORD = "imutool_clean"
 
 
 class Debiased(NamedTuple):
@@ -50,6 +52,7 @@ class DebiasReport:
     models: Mapping[str, str]
     starts: Mapping[str, TurnOn]
     rewrite: RewriteReport
+    surveys: Mapping[str, Survey]  # of what was cleaned
 
 
 def apply(model: BiasModel, start: TurnOn, imu: Imu) -> Debiased:
@@ -92,10 +95,14 @@ def _by_blocks(stream: Stream) -> Callable[[float, Vector6], Vector6]:
 
 
 class Debiaser:
-    """The channels a log gains, computed batch by batch as the log is copied (`mcap_io.rewrite.Derived`)."""
+    """The channels a log gains, computed batch by batch as the log is copied (`mcap_io.rewrite.Derived`).
 
-    def __init__(self, source_topic: str, model: BiasModel, start: TurnOn) -> None:
+    With a survey, only of what is left of the samples when they are clean.
+    """
+
+    def __init__(self, source_topic: str, model: BiasModel, start: TurnOn, found: Survey | None = None) -> None:
         self.source_topic = source_topic
+        self._clean = None if found is None else Cleaner(found)
         self.topics: Sequence[NewTopic] = (
             NewTopic(f"{source_topic}{SUFFIX}", schema.IMU),
             NewTopic(f"{source_topic}/bias/gyro", schema.VECTOR3),
@@ -116,6 +123,8 @@ class Debiaser:
         Raises:
             LogError: samples no model can take: NaN, or stamps that do not increase.
         """
+        if self._clean is not None:
+            batch = self._clean(batch)
         self._clock.take(batch)
         if self._start_ns < 0 and len(batch.stamp_ns):
             self._start_ns = int(batch.stamp_ns[0])
@@ -148,17 +157,19 @@ def debias(
     imus: Sequence[str] = (),
     init: str = "auto",
     smooth: bool = False,
+    clean: Rules | None = None,
     overwrite: bool = False,
     progress: Callable[[int, int], None] | None = None,
 ) -> DebiasReport:
     """Writes `target`: all of `source` unchanged, and beside each IMU its debiased samples and the bias taken off.
 
     Without a model: the one the log's metadata names, else the one that ships for its sensor, else the mean over time at rest.
-    With `smooth` the start bias at every time comes from the whole log, also from what follows.
+    With `smooth` the start bias at every time comes from the whole log, also from what follows. With `clean` a first pass says
+    what is to be left out or converted (`imutool.clean`), and the record `imutool_clean` what it found.
 
     Raises:
         ConfigError: source or target cannot be opened, `init` makes no sense, or `smooth` is asked for with another `init`.
-        LogError: the log is damaged, has no such IMU, or is debiased already.
+        LogError: the log is damaged, has no such IMU, or is debiased already; or it cannot be trusted, with `clean`.
         ModelError: no model and no time at rest; a model for another rate; a damaged model file.
     """
     refuse_smooth(init, smooth)
@@ -167,15 +178,19 @@ def debias(
         about = log.metadata().get("imutool", {})
     named = about.get("model") or shipped_for(about.get("sensor"), about.get("dataset"))
     derived, starts, models, records = [], {}, {}, {}
+    surveys = {} if clean is None else {topic: survey(source, topic, clean).trusted() for topic in topics}
     origin = {"source_file": source.name, "source_sha256": sha256(source), "source_size": str(source.stat().st_size)}
     for topic in topics:
-        chosen, start = _prepare(source, topic, model or named, init, smooth)
-        derived.append(Debiaser(topic, chosen, start))
+        found = surveys.get(topic)
+        chosen, start = _prepare(source, topic, model or named, init, smooth, found)
+        derived.append(Debiaser(topic, chosen, start, found))
         starts[topic], models[topic] = start, str(chosen.card.get("name", chosen.method))
         records[topic] = _provenance(topic, chosen, start, init, smooth) | origin
     metadata = {"imutool" if len(records) == 1 else f"imutool{topic}": values for topic, values in records.items()}
+    for topic, found in surveys.items():
+        metadata[CLEAN_RECORD if len(surveys) == 1 else f"{CLEAN_RECORD}{topic}"] = found.record()
     report = rewrite(source, target, derived, metadata=metadata, overwrite=overwrite, progress=progress)
-    return DebiasReport(models, starts, report)
+    return DebiasReport(models, starts, report, surveys)
 
 
 def refuse_smooth(init: str, smooth: bool) -> None:
@@ -219,19 +234,21 @@ def _only_imu(log: Log) -> str:
     return found[0]
 
 
-def _prepare(source: Path, topic: str, name: str | Path | None, init: str, smooth: bool) -> tuple[BiasModel, TurnOn]:
+def _prepare(
+    source: Path, topic: str, name: str | Path | None, init: str, smooth: bool, found: Survey | None
+) -> tuple[BiasModel, TurnOn]:
     """Model and start for one IMU."""
     untrained = name is None or str(name) == static.Model.method
     if untrained and init == "auto" and not smooth:
-        return estimate_at_rest(_samples(source, topic), source)
-    head = _head(source, topic, init)
+        return estimate_at_rest(_samples(source, topic, found), source)
+    head = _head(source, topic, init, found)
     rate_hz = 1.0 / head.imu.period_s
     model: BiasModel = static.Model() if name is None or untrained else find_model(name, rate_hz)
     if not untrained:
         check_rate(model, rate_hz, source)
     if smooth:
         with Log(source) as log:  # a first pass, in constant memory but for the track
-            start = _smoothed(model, _batches(log, topic), source)
+            start = _smoothed(model, _batches(log, topic, found), source)
     else:
         start = find(init, model, head)
     return model, start if start.noise.any() else replace(start, noise=_noise(head.imu))
@@ -255,33 +272,41 @@ def _smoothed(model: BiasModel, batches: Iterable[Samples], where: str | Path) -
         raise _nothing_known(where) from error
 
 
-def _batches(log: Log, topic: str) -> Iterator[Samples]:
+def _imu_batches(log: Log, topic: str, found: Survey | None, end_ns: int | None = None) -> Iterator[ImuBatch]:
+    """An IMU's messages: as they must be, or as a survey says they are clean."""
+    return log.imu_batches(topic, end_ns=end_ns) if found is None else cleaned(log, found, end_ns)
+
+
+def _batches(log: Log, topic: str, found: Survey | None) -> Iterator[Samples]:
     """An IMU's samples, with seconds since the first."""
     start_ns = None
-    for batch in log.imu_batches(topic):
+    for batch in _imu_batches(log, topic, found):
         if len(batch.stamp_ns):
             start_ns = int(batch.stamp_ns[0]) if start_ns is None else start_ns
             yield seconds(batch.stamp_ns, start_ns), batch.gyro, batch.accel
 
 
-def _head(source: Path, topic: str, init: str) -> Recording:
+def _head(source: Path, topic: str, init: str, found: Survey | None) -> Recording:
     """The first minute of a log; of its truth only what is asked for, since it may be no business of the IMU's."""
     with Log(source) as log:
         first = next((int(times.min()) for times in log.stamps(topic) if len(times)), None)
     end_ns = None if first is None else first + nanoseconds(HEAD_S)
-    if init.partition(":")[0] == "truth":
+    if init.partition(":")[0] == "truth" and found is None:
         return read(source, imu=topic, end_ns=end_ns)
-    return Recording(source.stem, _samples(source, topic, end_ns), imu_topic=topic, source=str(source))
+    samples = _samples(source, topic, found, end_ns if found is None else found.start_ns + nanoseconds(HEAD_S))
+    if init.partition(":")[0] == "truth":
+        return read(source, imu=topic, end_ns=end_ns, samples=samples)
+    return Recording(source.stem, samples, imu_topic=topic, source=str(source))
 
 
-def _samples(source: Path, topic: str, end_ns: int | None = None) -> Imu:
-    """The samples of one IMU.
+def _samples(source: Path, topic: str, found: Survey | None, end_ns: int | None = None) -> Imu:
+    """The samples of one IMU, as a survey says they are clean where there is one; its end is then by stamp.
 
     Raises:
         LogError: fewer than two, or none that a recording could hold.
     """
     with Log(source) as log:
-        batches = list(log.imu_batches(topic, end_ns=end_ns))
+        batches = list(_imu_batches(log, topic, found, end_ns))
         count = sum(len(batch.stamp_ns) for batch in batches)
         if count < 2:
             raise LogError(f"{topic} holds {count} messages", where=source, expected="at least 2")

@@ -33,6 +33,7 @@ TIERS = (
         "ode",
         "metrics",
         "mcap_io",
+        "clean",
         "stationary",
         "strapdown",
         "windows",

@@ -21,12 +21,16 @@ def debias(
     imu: Annotated[list[str] | None, typer.Option(help="IMU topic, where a log has several. Repeatable.")] = None,
     init: Init = "auto",
     smooth: Smooth = False,
+    clean: Annotated[
+        bool, typer.Option("--clean", help="Leave out what is no measurement, convert units (imutool clean).")
+    ] = False,
     overwrite: Overwrite = False,
     json_to: Json = None,
     verbose: Verbose = False,
     quiet: Quiet = False,
 ) -> None:
     """Rewrite a log with a debiased IMU channel; everything else passes through unchanged."""
+    from imutool.clean import Rules
     from imutool.debias import debias as run
 
     with progress("Debiasing", verbose, quiet) as tell:
@@ -37,6 +41,7 @@ def debias(
             imus=imu or (),
             init=init,
             smooth=smooth,
+            clean=Rules() if clean else None,
             overwrite=overwrite,
             progress=lambda done, total: tell(done, total, ""),
         )
@@ -52,8 +57,12 @@ def debias(
     }
     added, copied = dict(report.rewrite.added), report.rewrite.copied
     result = {"schema": "imutool.debias/1", "output": str(target), "imus": imus, "copied": copied, "added": added}
+    if clean:
+        result["clean"] = [one.plain() for one in report.surveys.values()]
     if write_json(result, json_to):
         return
+    for topic, one in report.surveys.items():
+        say(f"{topic}: {one.verdict}, score {one.score:.3f}, {one.valid} of {one.messages} samples valid")
     for topic, entry in imus.items():
         bias = ", ".join(f"{b:+.5f}" for b in entry["gyro_bias"]), ", ".join(f"{b:+.4f}" for b in entry["accel_bias"])
         start = f"start bias {bias[0]} rad/s; {bias[1]} m/s² ({entry['init_how']})"
