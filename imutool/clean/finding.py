@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from itertools import pairwise
 from typing import Any, Literal
 
 import numpy as np
@@ -77,7 +78,7 @@ class Places:
             first, last = self.intervals[-1]
             self.intervals[-1] = min(first, int(part.min())), max(last, int(part.max()))
         starts = np.flatnonzero(far)
-        for start, end in zip(starts, [*starts[1:], len(far)], strict=True):
+        for start, end in pairwise([*starts, len(far)]):
             if len(self.intervals) == MAX_INTERVALS:
                 self.left_out += 1
             else:

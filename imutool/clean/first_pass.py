@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -148,11 +148,22 @@ def look(log: Log, topic: str, rules: Rules | None = None) -> Survey:
         ConfigError: a rule is not known.
         LogError: no such IMU topic, or damage.
     """
+    return examine(lambda: raw_batches(log, topic), read_truth(log), rules, where=str(log.path), topic=topic)
+
+
+def examine(
+    each: Callable[[], Iterable[ImuBatch]], truth: Truth | None, rules: Rules | None = None, *, where: str = "", topic: str = ""
+) -> Survey:
+    """As `survey`, of messages that can be gone through again (a clock that was set is only known of in the end).
+
+    Raises:
+        ConfigError: a rule is not known.
+    """
     rules = rules or Rules()
-    stations, whole = _through(log, topic, rules, None)
+    stations, whole = _through(each(), truth, rules, None)
     clock = next((one for one in stations if isinstance(one, TimeBack)), None)
     if clock is not None and len(clock.epochs) > 1:
-        stations, whole = _through(log, topic, rules, left_out(clock.epochs, whole.messages))
+        stations, whole = _through(each(), truth, rules, left_out(clock.epochs, whole.messages))
     findings = tuple(finding for station in stations for finding in station.findings(whole))
     dropped = np.zeros(whole.messages, bool)
     for station in stations:
@@ -160,23 +171,22 @@ def look(log: Log, topic: str, rules: Rules | None = None) -> Survey:
             dropped[numbers] = True
     missing = sum(one.count for one in findings if one.rule == "gaps")
     reasons = tuple(_reasons(rules, whole, dropped, findings))
-    start_ns = whole.motion.start_ns or 0
-    where = str(log.path)
-    return Survey(
-        where, topic, rules, whole.messages, start_ns, whole.motion.end_ns, missing, dropped, whole.scale, findings, reasons
-    )
+    start_ns, end_ns = whole.motion.start_ns or 0, whole.motion.end_ns
+    return Survey(where, topic, rules, whole.messages, start_ns, end_ns, missing, dropped, whole.scale, findings, reasons)
 
 
-def _through(log: Log, topic: str, rules: Rules, skip: Sequence[tuple[int, int]] | None) -> tuple[list[Rule], Whole]:
+def _through(
+    batches: Iterable[ImuBatch], truth: Truth | None, rules: Rules, skip: Sequence[tuple[int, int]] | None
+) -> tuple[list[Rule], Whole]:
     """One pass: the rules, each having seen what those before it left, and what is known in the end."""
     stations = sorted((_make(name, skip) for name in rules.names()), key=lambda rule: rule.place)
     motion, counter = Motion(), _Counter()
-    stream: Iterable[Samples] = counter(blocks(raw_batches(log, topic)))
+    stream: Iterable[Samples] = counter(blocks(batches))
     for station in stations:
         stream = station(stream)
     for samples in stream:
         motion.see(samples)
-    return stations, Whole(rules, counter.count, motion, _truth(log))
+    return stations, Whole(rules, counter.count, motion, truth)
 
 
 def _make(name: str, skip: Sequence[tuple[int, int]] | None) -> Rule:
@@ -212,10 +222,6 @@ def raw_batches(log: Log, topic: str, start_ns: int | None = None, end_ns: int |
     for _, rows in log.rows([topic], start_ns, end_ns):
         with log.named(topic):
             yield from log.decode_imu(topic, rows)
-
-
-def _truth(log: Log) -> Truth | None:
-    return read_truth(log)
 
 
 def _reasons(rules: Rules, whole: Whole, dropped: Bool[np.ndarray, " n"], findings: Sequence[Finding]) -> Iterator[str]:

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import ClassVar
 
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Float64, Int64
 
 from imutool.clean.finding import Finding
 from imutool.clean.motion import Motion
@@ -23,7 +23,9 @@ class Whole:
 
     Attributes:
         scale: what gyro and accel are to be multiplied by to be rad/s and m/s².
-        jumps: numbers of the samples before which the clock of the stamps stepped (to `clock_jumps`).
+        late_ns: stamps of samples that came too late, in order (from `time_back`): they are not missing.
+        jumps: numbers of the samples before which the clock of the stamps stepped (from `clock_jumps`).
+        other_rate_ns: stretches at another rate (from `changed_rate`).
     """
 
     rules: Rules
@@ -31,7 +33,9 @@ class Whole:
     motion: Motion
     truth: Truth | None
     scale: Float64[np.ndarray, "6"] = field(default_factory=lambda: np.ones(6))
+    late_ns: Int64[np.ndarray, " n"] = field(default_factory=lambda: np.zeros(0, np.int64))
     jumps: frozenset[int] = frozenset()
+    other_rate_ns: Sequence[tuple[int, int]] = ()
 
 
 class Rule(ABC):

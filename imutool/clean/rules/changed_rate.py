@@ -5,14 +5,15 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import numpy as np
+from jaxtyping import Float64, Int64
 
 from imutool.clean.finding import MAX_INTERVALS, Finding, runs
 from imutool.clean.rules._base import Rule, Whole
 from imutool.clean.samples import Samples
 
-PART = 256  # samples whose median period is one row
+PART = 64  # samples whose median period is one row
 CHANGE = 1.2  # times the usual period, or the usual period so many times this one
-LEAST_PARTS = 3  # in a row
+LEAST_PARTS = 4  # in a row
 DISTRUST = 0.02  # of the samples: a model knows one rate
 
 
@@ -23,43 +24,43 @@ class ChangedRate(Rule):
 
     def __init__(self) -> None:
         super().__init__()
-        self._rows: list[tuple[float, int, int, int]] = []
+        self._rows: list[Float64[np.ndarray, " m"]] = []  # median periods
+        self._ends: list[Int64[np.ndarray, "m 2"]] = []
         self._waiting = np.zeros(0, np.int64)
 
     def see(self, samples: Samples) -> None:
         """One median a part."""
         stamp = np.concatenate([self._waiting, samples.stamp_ns])
-        first = 0
-        while len(stamp) - first > PART:
-            self._row(stamp[first : first + PART + 1])
-            first += PART
-        self._waiting = stamp[first:]
-
-    def _row(self, stamp: np.ndarray) -> None:
-        self._rows.append((float(np.median(np.diff(stamp))), int(stamp[0]), int(stamp[-1]), len(stamp) - 1))
+        parts = max(len(stamp) - 1, 0) // PART
+        if parts:
+            self._rows.append(np.median(np.diff(stamp[: parts * PART + 1]).reshape(parts, PART), axis=1))
+            edges = stamp[: parts * PART + 1 : PART]
+            self._ends.append(np.column_stack([edges[:-1], edges[1:]]))
+        self._waiting = stamp[parts * PART :]
 
     def findings(self, whole: Whole) -> Iterator[Finding]:
-        """One, with the rates."""
-        if len(self._waiting) > PART // 4:
-            self._row(self._waiting)
+        """One, with the rates; where it begins and ends is known to within a part."""
         if not self._rows:
             return
-        table = np.array(self._rows)
-        usual = float(np.median(np.repeat(table[:, 0], table[:, 3].astype(int) // (PART // 4))))
-        other = (table[:, 0] > CHANGE * usual) | (table[:, 0] * CHANGE < usual)
-        stretches = [(a, b) for a, b in runs(other) if b - a >= min(LEAST_PARTS, len(table))]
+        period, ends = np.concatenate(self._rows), np.concatenate(self._ends)
+        usual = float(np.median(period))
+        other = (period > CHANGE * usual) | (period * CHANGE < usual)
+        stretches = [(a, b) for a, b in runs(other) if b - a >= LEAST_PARTS]
         if not stretches:
             return
-        count = int(sum(table[a:b, 3].sum() for a, b in stretches))
+        intervals = tuple((int(ends[a, 0]), int(ends[b - 1, 1])) for a, b in stretches)
+        last = len(ends) - 1  # the change itself lies in a part before or after
+        whole.other_rate_ns = [(int(ends[max(a - 1, 0), 0]), int(ends[min(b, last), 1])) for a, b in stretches]
+        count = PART * sum(b - a for a, b in stretches)
         share = count / whole.motion.samples
-        rates = [float(1e9 / np.median(table[a:b, 0])) for a, b in stretches]
+        rates = [float(1e9 / np.median(period[a:b])) for a, b in stretches]
         distrust = f"the rate changes, {100 * share:.0f} % of the samples have another" if share > DISTRUST else ""
         yield Finding(
             "changed_rate",
             "error" if distrust else "warning",
             "samples at another rate",
             count,
-            tuple((self._rows[a][1], self._rows[b - 1][2]) for a, b in stretches[:MAX_INTERVALS]),
+            intervals[:MAX_INTERVALS],
             max(0, len(stretches) - MAX_INTERVALS),
             {"usual_hz": 1e9 / usual, "rates_hz": rates[:MAX_INTERVALS], "share": share},
             sure=0.95,

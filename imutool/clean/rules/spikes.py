@@ -23,6 +23,7 @@ from imutool.clean.samples import Samples, padded
 NEARBY = 10  # samples on either side
 LONGEST = 3  # samples
 TIMES = 8.0  # the largest step nearby
+ORDINARY = 0.75  # quantile of the steps
 NO_SENSOR = 1e5  # in any unit in use: more than a thousand times a tactical sensor's range in rad/s
 
 
@@ -64,7 +65,8 @@ class Spikes(Rule):
 def spikes(values: Float64[np.ndarray, "n k"]) -> tuple[Bool[np.ndarray, "n k"], Float64[np.ndarray, "n k"]]:
     """Which samples are spikes, by axis, and the smaller of the two steps of each (0 elsewhere).
 
-    A step the size of the resolution, the smallest there is, is never small: it counts as the least step nearby.
+    Where the samples nearby hardly change (at rest, at the end of the range), an ordinary step must not stand out: three
+    quarters of the steps that are not zero, over the whole block, are the least that counts as a step nearby.
     """
     n = len(values)
     found, size = np.zeros(values.shape, bool), np.zeros(values.shape)
@@ -73,15 +75,14 @@ def spikes(values: Float64[np.ndarray, "n k"]) -> tuple[Bool[np.ndarray, "n k"],
     with np.errstate(over="ignore"):
         step = np.diff(values, axis=0)
     there = np.abs(step)
-    resolution = np.where(there > 0, there, np.inf).min(axis=0)
-    resolution[~np.isfinite(resolution)] = 0.0
+    ordinary = np.array([np.quantile(column[column > 0], ORDINARY) if column.any() else 0.0 for column in there.T])
     edge = np.zeros((NEARBY, values.shape[1]))
     largest = sliding_window_view(np.concatenate([edge, there, edge]), NEARBY, axis=0).max(axis=-1)  # of steps k-10..k-1
     for width in range(1, LONGEST + 1):
         first = np.arange(1, n - width)  # the step into it is first - 1, the step out of it first + width - 1
         into, out = step[first - 1], -step[first + width - 1]
         peak = np.where(into * out > 0, np.minimum(np.abs(into), np.abs(out)), 0.0)
-        other = np.maximum(np.maximum(largest[first - 1], largest[first + width + NEARBY]), resolution)
+        other = np.maximum(np.maximum(largest[first - 1], largest[first + width + NEARBY]), ordinary)
         rows, axes = np.nonzero(peak > TIMES * other)
         for shift in range(width):
             found[first[rows] + shift, axes] = True

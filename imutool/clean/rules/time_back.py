@@ -55,6 +55,7 @@ class TimeBack(Rule):
         self._late, self._ahead, self._other = Places(), Places(), Places()
         self._furthest_s, self._set_back = 0.0, 0
         self._last: int | None = None
+        self._late_ns: list[Int64[np.ndarray, " n"]] = []
 
     def __call__(self, stream: Iterable[Samples]) -> Iterator[Samples]:
         """The samples in order of time."""
@@ -65,6 +66,7 @@ class TimeBack(Rule):
             samples = samples.where(~ahead)
             late = self._judge(samples)
             self._drop(self._late, samples, late)
+            self._late_ns.append(samples.stamp_ns[late])
             yield samples.where(~late)
 
     def _without_skipped(self, stream: Iterable[Samples]) -> Iterator[Samples]:
@@ -126,6 +128,7 @@ class TimeBack(Rule):
     def findings(self, whole: Whole) -> Iterator[Finding]:
         """Late samples, samples ahead, and epochs left out."""
         if self._late.count:
+            whole.late_ns = np.sort(np.concatenate(self._late_ns))
             values = {"furthest_back_s": self._furthest_s}
             what = "samples whose stamp goes back"
             yield Finding("time_back", "warning", what, **self._late.where(), values=values, action="dropped")

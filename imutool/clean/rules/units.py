@@ -60,7 +60,7 @@ class Units(Rule):
             return
         if unit and at_rest and whole.rules.convert_units:
             whole.scale[3:] = factor = FACTORS[unit]
-            what = f"accel is in {unit}, not m/s^2: it reads {level:.4g} at rest"
+            what = f"accel is in {unit}, not m/s^2: it reads {level:.4g} when calm"
             yield Finding("units", "warning", what, 3, values=values | {"factor": factor}, action="converted", sure=0.98)
         elif unit:
             what = f"accel looks like {unit}, not m/s^2: it reads {level:.4g}"
@@ -71,7 +71,8 @@ class Units(Rule):
         else:
             off = abs(level / GRAVITY_M_S2 - 1.0)
             distrust = f"the unit of accel is unknown: it reads {level:.4g}" if off > MOVING_TOLERANCE else ""
-            what = f"accel reads {level:.4g} {'at rest' if at_rest else 'in the median'}, gravity is {GRAVITY_M_S2} m/s^2"
+            values["unit"] = "unknown" if distrust else "m/s^2"
+            what = f"accel reads {level:.4g} {'when calm' if at_rest else 'in the median'}, gravity is {GRAVITY_M_S2} m/s^2"
             severity: Severity = "error" if distrust else "warning" if off > BIASED else "note"
             yield Finding("units", severity, what, 3, values=values, sure=0.8, distrust=distrust)
 
@@ -114,8 +115,8 @@ def accel_unit(level: float, tolerance: float) -> str:
 def gravity_level(motion: Motion) -> tuple[float | None, bool]:
     """What the accelerometer reads of gravity, and whether in calm seconds; none without samples.
 
-    Calm are the tenth of the seconds whose means over 0.1 s scatter least, if that is less than 3 % of what they read. Without any it is the
-    median of all.
+    Calm are the tenth of the seconds whose means over 0.1 s scatter least, if that is less than 3 % of what they read.
+    Without any it is the median of all.
     """
     step, size, mean = motion.table()
     if not len(step):
