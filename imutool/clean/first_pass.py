@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cache, cached_property
 from pathlib import Path
 from typing import Any
 
@@ -191,13 +191,15 @@ def _through(
 
 def _make(name: str, skip: Sequence[tuple[int, int]] | None) -> Rule:
     """A rule by the name of its file."""
-    module = registry.load(GROUP, name)
-    kind = next(
-        one
-        for one in vars(module).values()
-        if isinstance(one, type) and issubclass(one, Rule) and one.__module__ == module.__name__
-    )
+    kind = _kind(name)
     return TimeBack(skip) if kind is TimeBack else kind()
+
+
+@cache
+def _kind(name: str) -> type[Rule]:
+    module = registry.load(GROUP, name)
+    own = (one for one in vars(module).values() if isinstance(one, type) and one.__module__ == module.__name__)
+    return next(one for one in own if issubclass(one, Rule))
 
 
 class _Counter:

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from functools import cache
 from typing import Annotated
 
-import msgspec
 from msgspec import Meta
 
 from imutool import registry
@@ -33,11 +33,17 @@ class Rules(Settings, frozen=True, kw_only=True):
         Raises:
             ConfigError: a name that is no rule; the message names the nearest.
         """
-        known = registry.names(GROUP)
+        known = every()
         for name in (*self.only, *self.without):
             if name not in known:
                 registry.load(GROUP, name)  # says what was meant
         return [name for name in known if (not self.only or name in self.only) and name not in self.without]
+
+
+@cache
+def every() -> tuple[str, ...]:
+    """All rules there are, sorted; the packages installed are asked once."""
+    return tuple(registry.names(GROUP))
 
 
 def chosen(only: Iterable[str], without: Iterable[str], force: bool = False) -> Rules:
@@ -51,8 +57,3 @@ def chosen(only: Iterable[str], without: Iterable[str], force: bool = False) -> 
     if both := set(rules.only) & set(rules.without):
         raise ConfigError(f"{min(both)} is asked for and left out", where="--rule", fix="Give --rule or --no-rule")
     return rules
-
-
-def laid_over(rules: Rules, **changes: object) -> Rules:
-    """The same rules with some settings changed."""
-    return msgspec.structs.replace(rules, **changes)

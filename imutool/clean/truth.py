@@ -9,6 +9,7 @@ from jaxtyping import Float64, Int64
 
 from imutool.clean.motion import STEP_NS
 from imutool.errors import LogError
+from imutool.kinematics import G_W
 from imutool.mcap_io.log import Log
 from imutool.recording import seconds
 
@@ -59,3 +60,14 @@ def turning(truth: Truth) -> tuple[Int64[np.ndarray, " m"], Int64[np.ndarray, " 
     R = Rotation.from_quat(truth.q_wb_wxyz, scalar_first=True)
     dt = seconds(truth.t_ns[1:], int(truth.t_ns[0])) - seconds(truth.t_ns[:-1], int(truth.t_ns[0]))
     return truth.t_ns[:-1], truth.t_ns[1:], (R[:-1].inv() * R[1:]).as_rotvec() / dt[:, None]
+
+
+def feeling(truth: Truth) -> tuple[Int64[np.ndarray, " m"], Float64[np.ndarray, "m 3"]]:
+    """Specific force (m/s², body frame) at each pose between two others, from second differences of their positions."""
+    from scipy.spatial.transform import Rotation
+
+    t_s = seconds(truth.t_ns, int(truth.t_ns[0]))
+    v_w = np.diff(truth.p_wb, axis=0) / np.diff(t_s)[:, None]
+    a_w = 2.0 * np.diff(v_w, axis=0) / (t_s[2:] - t_s[:-2])[:, None]
+    R = Rotation.from_quat(truth.q_wb_wxyz[1:-1], scalar_first=True)
+    return truth.t_ns[1:-1], R.inv().apply(a_w - G_W)

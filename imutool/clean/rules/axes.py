@@ -11,17 +11,17 @@ from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float64
+from jaxtyping import Bool, Float64, Int64
 
 from imutool.clean.finding import Finding
 from imutool.clean.frames import axis_names, signed_permutations, tilt_misfit
 from imutool.clean.rules._base import Rule, Whole
-from imutool.clean.truth import turning
-from imutool.recording import GRAVITY_M_S2, seconds
+from imutool.clean.truth import feeling, turning
+from imutool.recording import seconds
 
 CLEARLY = 0.5  # of the misfit as it is, that of another reading at most; and of what there is to be explained
 ALIKE = 1.3  # times the best misfit: readings that cannot be told from the best
-POSES_APART_NS = 300_000_000
+POSES_APART_NS, FEWEST_POSES = 300_000_000, 10
 
 
 class Fit(NamedTuple):
@@ -90,24 +90,27 @@ def _wrong(sensor: str, fit: Fit, readings: Float64[np.ndarray, "48 3 3"], again
 
 
 def _against_poses(whole: Whole, readings: Float64[np.ndarray, "48 3 3"]) -> tuple[Fit | None, Fit | None]:
-    """Rate against the turning of the poses, specific force against gravity in the body of the poses (its motion is noise)."""
-    from scipy.spatial.transform import Rotation
-
+    """Rate against the turning of the poses; specific force against gravity and the poses' acceleration, in their body."""
     step, _, raw = whole.motion.table()
     if whole.truth is None or len(step) < 2 or whole.motion.start_ns is None:
         return None, None
-    first, last, rate = turning(whole.truth)
-    at_s = seconds(first, whole.motion.start_ns) + 0.5e-9 * (last - first)
     t_s, mean = 0.1 * step + 0.05, raw * whole.scale
-    use = (at_s > t_s[0]) & (at_s < t_s[-1]) & (last - first < POSES_APART_NS)
-    if use.sum() < 10:
-        return None, None
-    here = np.stack([np.interp(at_s[use], t_s, column) for column in mean.T], axis=1)
-    R = Rotation.from_quat(whole.truth.q_wb_wxyz[:-1][use], scalar_first=True)
-    up = (R * Rotation.from_rotvec(0.5 * rate[use] * (last - first)[use, None] * 1e-9)).inv().apply([0.0, 0.0, GRAVITY_M_S2])
-    gyro = here[:, :3] - np.median(mean[:, :3], axis=0)
-    true = rate[use] - np.median(rate[use], axis=0)
-    return _fit(true, gyro, readings), _fit(up, here[:, 3:], readings)
+
+    def beside(
+        at_ns: Int64[np.ndarray, " n"], apart_ns: Int64[np.ndarray, " n"], true: Float64[np.ndarray, "n 3"], k: int
+    ) -> Fit | None:
+        at_s = seconds(at_ns, int(whole.motion.start_ns or 0))
+        use = (at_s > t_s[0]) & (at_s < t_s[-1]) & (apart_ns < POSES_APART_NS)
+        if use.sum() < FEWEST_POSES:
+            return None
+        read = np.stack([np.interp(at_s[use], t_s, column) for column in mean[:, k : k + 3].T], axis=1)
+        return _fit(true[use], read, readings)
+
+    first, last, rate = turning(whole.truth)
+    at_ns, force = feeling(whole.truth)
+    mean[:, :3] -= np.median(mean[:, :3], axis=0)
+    gyro = beside((first + last) // 2, last - first, rate - np.median(rate, axis=0), 0)
+    return gyro, beside(at_ns, np.maximum(np.diff(first), np.diff(last)), force, 3)
 
 
 def _fit(true: Float64[np.ndarray, "n 3"], read: Float64[np.ndarray, "n 3"], readings: Float64[np.ndarray, "48 3 3"]) -> Fit:

@@ -24,7 +24,6 @@ NEARBY = 10  # samples on either side
 LONGEST = 3  # samples
 TIMES = 8.0  # the largest step nearby
 ORDINARY = 0.75  # quantile of the steps
-NO_SENSOR = 1e5  # in any unit in use: more than a thousand times a tactical sensor's range in rad/s
 
 
 class Spikes(Rule):
@@ -40,8 +39,7 @@ class Spikes(Rule):
         """The samples without spikes."""
         for around, core in padded(stream, NEARBY + LONGEST + 1):
             spike, size = spikes(around.values)
-            beyond = np.abs(around.values) > NO_SENSOR
-            found = (spike | beyond)[core]
+            found = spike[core]
             samples, bad = around.where(core), found.any(axis=1)
             if bad.any():
                 self._by_axis += found.sum(axis=0)
@@ -72,8 +70,7 @@ def spikes(values: Float64[np.ndarray, "n k"]) -> tuple[Bool[np.ndarray, "n k"],
     found, size = np.zeros(values.shape, bool), np.zeros(values.shape)
     if n < NEARBY:
         return found, size
-    with np.errstate(over="ignore"):
-        step = np.diff(values, axis=0)
+    step = np.diff(values, axis=0)
     there = np.abs(step)
     ordinary = np.array([np.quantile(column[column > 0], ORDINARY) if column.any() else 0.0 for column in there.T])
     edge = np.zeros((NEARBY, values.shape[1]))
