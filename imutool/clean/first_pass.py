@@ -37,6 +37,7 @@ class Survey:
     Attributes:
         dropped: of every message, in file order, whether it is to be left out.
         scale: what gyro and accel are to be multiplied by.
+        surplus: messages that are another one once more, bit for bit: to leave them out costs nothing.
         reasons: why the log is not to be trusted; none where it is.
     """
 
@@ -47,6 +48,7 @@ class Survey:
     start_ns: int
     end_ns: int
     missing: int
+    surplus: int
     dropped: Bool[np.ndarray, " n"]
     scale: Float64[np.ndarray, "6"]
     findings: tuple[Finding, ...]
@@ -60,7 +62,7 @@ class Survey:
     @property
     def score(self) -> float:
         """Quality from 0 to 1 (`imutool.clean.score`)."""
-        return score(self.messages, self.valid, self.missing, self.findings)
+        return score(self.messages - self.surplus, self.valid, self.missing, self.findings)
 
     @property
     def verdict(self) -> Verdict:
@@ -170,9 +172,11 @@ def examine(
         for numbers in station.dropped:
             dropped[numbers] = True
     missing = sum(one.count for one in findings if one.rule == "gaps")
-    reasons = tuple(_reasons(rules, whole, dropped, findings))
+    surplus = sum(one.values["identical"] for one in findings if one.rule == "duplicates")
+    reasons = tuple(_reasons(rules, whole, int(dropped.sum()) - surplus, findings))
     start_ns, end_ns = whole.motion.start_ns or 0, whole.motion.end_ns
-    return Survey(where, topic, rules, whole.messages, start_ns, end_ns, missing, dropped, whole.scale, findings, reasons)
+    counts = whole.messages, start_ns, end_ns, missing, surplus
+    return Survey(where, topic, rules, *counts, dropped, whole.scale, findings, reasons)
 
 
 def _through(
@@ -226,12 +230,12 @@ def raw_batches(log: Log, topic: str, start_ns: int | None = None, end_ns: int |
             yield from log.decode_imu(topic, rows)
 
 
-def _reasons(rules: Rules, whole: Whole, dropped: Bool[np.ndarray, " n"], findings: Sequence[Finding]) -> Iterator[str]:
+def _reasons(rules: Rules, whole: Whole, invalid: int, findings: Sequence[Finding]) -> Iterator[str]:
     """Why not to trust the log."""
     if whole.motion.samples < FEWEST:
         yield f"{whole.motion.samples} of {whole.messages} samples are left"
         return
-    share = float(dropped.mean())
+    share = invalid / whole.messages
     if share > rules.max_invalid_share:
         yield f"{100 * share:.0f} % of the samples are invalid"
     yield from (finding.distrust for finding in findings if finding.distrust)

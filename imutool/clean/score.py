@@ -2,8 +2,9 @@
 
     score = share * prod(1 - penalty)
 
-`share` is that of valid samples among those received and missing; each *kind* of finding (rule and severity) costs once: a note
-nothing, a warning that was mended (dropped, converted) 0.02, one that could only be said 0.05, an error 0.3.
+`share` is that of valid samples among those received and missing (a message sent twice counts once). Each kind of finding (a
+rule, and what it cost) costs once: a note nothing, a warning that was mended (dropped, converted) 0.02, one that could only be
+said 0.05, an error 0.3.
 """
 
 from __future__ import annotations

@@ -40,7 +40,8 @@ class Spikes(Rule):
         for around, core in padded(stream, NEARBY + LONGEST + 1):
             spike, size = spikes(around.values)
             found = spike[core]
-            samples, bad = around.where(core), found.any(axis=1)
+            samples = around.where(core)
+            bad = np.asarray(found.any(axis=1))
             if bad.any():
                 self._by_axis += found.sum(axis=0)
                 self._largest = np.maximum(self._largest, np.where(found, size[core], 0.0).max(axis=0))

@@ -60,10 +60,10 @@ class TimeBack(Rule):
     def __call__(self, stream: Iterable[Samples]) -> Iterator[Samples]:
         """The samples in order of time."""
         for around, core in padded(self._without_skipped(stream), AHEAD):
-            samples = around.where(core)
-            ahead = _ahead(around.stamp_ns)[core]
-            self._drop(self._ahead, samples, ahead)
-            samples = samples.where(~ahead)
+            ahead = _ahead(around.stamp_ns)
+            place = around._replace(stamp_ns=_before(around.stamp_ns, ahead)).where(core)
+            self._drop(self._ahead, place, ahead[core])
+            samples = around.where(core).where(~ahead[core])
             late = self._judge(samples)
             self._drop(self._late, samples, late)
             self._late_ns.append(samples.stamp_ns[late])
@@ -160,6 +160,15 @@ def _ahead(stamp_ns: Int64[np.ndarray, " n"]) -> Bool[np.ndarray, " n"]:
         if first and end < n and stamp_ns[end] <= stamp_ns[first - 1]:
             ahead[first:end] = False
     return ahead
+
+
+def _before(stamp_ns: Int64[np.ndarray, " n"], ahead: Bool[np.ndarray, " n"]) -> Int64[np.ndarray, " n"]:
+    """The stamp of the last sample that is not ahead, for each: where in the log something far ahead of it stands."""
+    if not ahead.any() or ahead.all():
+        return stamp_ns
+    row = np.maximum.accumulate(np.where(ahead, 0, np.arange(len(ahead))))
+    row[: int(np.argmin(ahead))] = int(np.argmin(ahead))
+    return stamp_ns[row]
 
 
 def left_out(epochs: Sequence[Epoch], messages: int) -> list[tuple[int, int]]:
