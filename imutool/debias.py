@@ -20,7 +20,7 @@ from imutool.bias import static
 from imutool.bias._base import BiasModel, OneByOne, Stream, Vector6
 from imutool.bias._file import check_rate, find_model, shipped_for
 from imutool.certainty import Certainty
-from imutool.clean import Cleaner, Rules, Survey, cleaned, survey
+from imutool.clean import Cleaner, Rules, Survey, cleaned, look
 from imutool.config import plain
 from imutool.errors import ConfigError, DataError, LogError, ModelError
 from imutool.mcap_io import schema
@@ -176,9 +176,9 @@ def debias(
     with Log(source) as log:
         topics = list(imus) or [_only_imu(log)]
         about = log.metadata().get("imutool", {})
+        surveys = {} if clean is None else {topic: look(log, topic, clean).trusted() for topic in topics}
     named = about.get("model") or shipped_for(about.get("sensor"), about.get("dataset"))
     derived, starts, models, records = [], {}, {}, {}
-    surveys = {} if clean is None else {topic: survey(source, topic, clean).trusted() for topic in topics}
     origin = {"source_file": source.name, "source_sha256": sha256(source), "source_size": str(source.stat().st_size)}
     for topic in topics:
         found = surveys.get(topic)

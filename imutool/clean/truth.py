@@ -9,9 +9,8 @@ from jaxtyping import Float64, Int64
 
 from imutool.clean.motion import STEP_NS
 from imutool.errors import LogError
-from imutool.kinematics import G_W
 from imutool.mcap_io.log import Log
-from imutool.recording import seconds
+from imutool.recording import GRAVITY_M_S2, seconds
 
 
 class Truth(NamedTuple):
@@ -70,4 +69,4 @@ def feeling(truth: Truth) -> tuple[Int64[np.ndarray, " m"], Float64[np.ndarray, 
     v_w = np.diff(truth.p_wb, axis=0) / np.diff(t_s)[:, None]
     a_w = 2.0 * np.diff(v_w, axis=0) / (t_s[2:] - t_s[:-2])[:, None]
     R = Rotation.from_quat(truth.q_wb_wxyz[1:-1], scalar_first=True)
-    return truth.t_ns[1:-1], R.inv().apply(a_w - G_W)
+    return truth.t_ns[1:-1], R.inv().apply(a_w + np.array([0.0, 0.0, GRAVITY_M_S2]))
