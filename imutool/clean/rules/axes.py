@@ -91,7 +91,7 @@ def _wrong(sensor: str, fit: Fit, readings: Float64[np.ndarray, "48 3 3"], again
 
 def _against_poses(whole: Whole, readings: Float64[np.ndarray, "48 3 3"]) -> tuple[Fit | None, Fit | None]:
     """Rate against the turning of the poses; specific force against gravity and the poses' acceleration, in their body."""
-    step, _, raw = whole.motion.table()
+    step, raw = whole.motion.table()
     if whole.truth is None or len(step) < 2 or whole.motion.start_ns is None:
         return None, None
     t_s, mean = 0.1 * step + 0.05, raw * whole.scale
@@ -119,6 +119,6 @@ def _fit(true: Float64[np.ndarray, "n 3"], read: Float64[np.ndarray, "n 3"], rea
 
 
 def _against_gravity(whole: Whole, readings: Float64[np.ndarray, "48 3 3"]) -> Fit | None:
-    step, _, raw = whole.motion.table()
+    step, raw = whole.motion.table()
     misfit = tilt_misfit(step, raw * whole.scale, np.concatenate([readings, np.zeros((1, 3, 3))]))
     return None if misfit is None else Fit(misfit[:-1], float(misfit[-1]))

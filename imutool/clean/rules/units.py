@@ -84,7 +84,7 @@ class Units(Rule):
         elif share is not None and DEGREES_BAND[0] <= share * DEGREES <= DEGREES_BAND[1]:
             return
         else:
-            step, _, mean = whole.motion.table()
+            step, mean = whole.motion.table()
             fastest = float(np.abs(mean[:, :3]).max(initial=0.0))
             fits = tilt_misfit(step, mean * whole.scale, np.stack([np.eye(3), np.eye(3) / DEGREES]))
             turns = fits is not None and bool(fits[1] < CLEARLY * fits[0]) and bool(fits[0] > ASTRAY_RAD)
@@ -116,9 +116,9 @@ def gravity_level(motion: Motion) -> tuple[float | None, bool]:
     """What the accelerometer reads of gravity, and whether in calm seconds; none without samples.
 
     Calm are the tenth of the seconds whose means over 0.1 s scatter least, if that is less than 3 % of what they read.
-    Without any it is the median of all.
+    Without any it is the median of all, means of a second, in which vibration is gone.
     """
-    step, size, mean = motion.table()
+    step, mean = motion.table()
     if not len(step):
         return None, False
     count = len(step) // CALM_STEPS
@@ -130,7 +130,7 @@ def gravity_level(motion: Motion) -> tuple[float | None, bool]:
     calm = calm[scatter[calm] < CALM_SCATTER]
     if len(calm):
         return float(np.median(level[calm])), True
-    return float(np.median(size)), False
+    return float(np.median(level[whole] if whole.any() else np.linalg.norm(mean[:, 3:], axis=1))), False
 
 
 def spread(gyro: Float64[np.ndarray, "n 3"]) -> float:
@@ -141,7 +141,7 @@ def spread(gyro: Float64[np.ndarray, "n 3"]) -> float:
 def rate_ratio(motion: Motion, truth: Truth) -> float | None:
     """Measured over true rate; none where the truth hardly turns or shares no time with the samples."""
     first, last, rate = turning(truth)
-    step, _, mean = motion.table()
+    step, mean = motion.table()
     start = motion.start_ns or 0
     time = seconds(first, start) + 0.5 * seconds(last - first, 0)
     steps_s = 0.1 * step + 0.05
