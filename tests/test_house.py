@@ -173,6 +173,10 @@ def test_info_imports_nothing_heavy(imported: Callable[..., set[str]], logs: Pat
     assert imported("info", logs / "flight_1.mcap") == set()
 
 
+def test_clean_that_only_looks_imports_nothing_heavy(imported: Callable[..., set[str]], logs: Path) -> None:
+    assert imported("clean", logs / "flight_1.mcap") == set()
+
+
 def test_convert_imports_nothing_heavy(imported: Callable[..., set[str]], tmp_path: Path) -> None:
     write_asl(flight(1, duration_s=1.0), tmp_path / "flight_1")
     assert imported("convert", "flight_1", "out.mcap") == set()

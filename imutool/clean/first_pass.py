@@ -114,7 +114,7 @@ class Survey:
 
 
 def survey(path: Path, topic: str | None = None, rules: Rules | None = None) -> Survey:
-    """Looks through one IMU of a log, in memory that grows by a kilobyte and a byte a message for each second of it.
+    """Looks through one IMU of a log; memory grows by some 6 kB a second of it (`tests/bench/clean.py`).
 
     Raises:
         ConfigError: the file cannot be opened, or a rule is not known.

@@ -22,6 +22,7 @@ class Motion:
         self._steps: list[Int64[np.ndarray, " m"]] = []
         self._sums: list[Float64[np.ndarray, "m 7"]] = []
         self._open: tuple[int, Float64[np.ndarray, "7"]] | None = None
+        self._mean: tuple[Int64[np.ndarray, " m"], Float64[np.ndarray, "m 6"]] | None = None
 
     def see(self, samples: Samples) -> None:
         """The next samples, their stamps in order."""
@@ -46,12 +47,17 @@ class Motion:
         self._sums.append(sums[:-1])
 
     def table(self) -> tuple[Int64[np.ndarray, " m"], Float64[np.ndarray, "m 6"]]:
-        """Steps (tenths of a second since the first sample), and the mean of gyro and accel in each that has samples."""
-        steps, sums = list(self._steps), list(self._sums)
+        """Steps (tenths of a second since the first sample), and the mean of gyro and accel in each that has samples.
+
+        Once everything has been seen; the arrays are the same ones each time.
+        """
         if self._open is not None:
-            steps.append(np.array([self._open[0]]))
-            sums.append(self._open[1][None])
-        if not steps:
-            return np.zeros(0, np.int64), np.zeros((0, 6))
-        step, total = np.concatenate(steps), np.concatenate(sums)
-        return step, total[:, 1:] / total[:, :1]
+            self._steps.append(np.array([self._open[0]]))
+            self._sums.append(self._open[1][None])
+            self._open = None
+        if self._mean is None:
+            step = np.concatenate([np.zeros(0, np.int64), *self._steps])
+            total = np.concatenate([np.zeros((0, 7)), *self._sums])
+            self._steps, self._sums = [], []
+            self._mean = step, total[:, 1:] / total[:, :1]
+        return self._mean

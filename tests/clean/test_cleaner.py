@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from imutool.clean.cleaner import Cleaner
 from imutool.clean.first_pass import Survey, examine
 from imutool.clean.samples import BLOCK, blocks, padded
-from imutool.clean.settings import Rules
+from imutool.clean.settings import Rules, every
 from imutool.errors import LogError
 from imutool.mcap_io.log import Clock, ImuBatch
 from imutool.physics.flight import flight
@@ -105,6 +105,36 @@ def test_whatever_the_stamps_and_values_what_is_left_is_fit_for_a_model(data):
     survey.plain()
     Clock().take(Cleaner(survey)(made))
     assert 0.0 <= survey.score <= 1.0
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.lists(st.integers(1, 90), min_size=1, max_size=40, unique=True), st.randoms(use_true_random=False))
+def test_exactly_what_was_planted_is_dropped_wherever_it_is(places, random):
+    """Some sixty samples apart, so that no defect is another's neighbour; the borders of the blocks are among the places."""
+    batch, again, dropped = MADE, [], []
+    for row in (65 * place for place in sorted(places)):
+        kind = random.choice(["nan", "spike", "ahead", "again"])
+        if kind == "nan":
+            batch = with_values(batch, row, random.randrange(6), np.nan)
+        elif kind == "spike":
+            batch = with_values(batch, row, 3 + random.randrange(3), random.choice([-90.0, 90.0]), add=True)
+        elif kind == "ahead":
+            stamp_ns = batch.stamp_ns.copy()
+            stamp_ns[row] += 3_600_000_000_000
+            batch = batch._replace(stamp_ns=stamp_ns)
+        dropped.append(row + len(again) + (kind == "again"))
+        again += [row] * (kind == "again")
+    survey = look([repeated(batch, again)])
+    assert np.flatnonzero(survey.dropped).tolist() == dropped
+    assert sum(one.count for one in survey.findings) == len(dropped)
+
+
+@settings(max_examples=20, deadline=None)
+@given(st.sets(st.sampled_from(every())))
+def test_any_rule_can_be_left_out_without_a_warning(without_rules):
+    survey = look([SPOILED], Rules(without=tuple(sorted(without_rules))))
+    assert not {one.rule for one in survey.findings} & without_rules
+    survey.record()
 
 
 def test_a_log_that_has_grown_meanwhile_is_refused():

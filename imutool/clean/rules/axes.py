@@ -21,7 +21,8 @@ from imutool.recording import seconds
 
 CLEARLY = 0.5  # of the misfit as it is, that of another reading at most; and of what there is to be explained
 ALIKE = 1.3  # times the best misfit: readings that cannot be told from the best
-POSES_APART_NS, FEWEST_POSES = 300_000_000, 10
+POSES_APART_NS = 300_000_000
+FEWEST_POSES, MOST_POSES = 10, 20_000  # evenly taken from a longer log
 
 
 class Fit(NamedTuple):
@@ -100,9 +101,10 @@ def _against_poses(whole: Whole, readings: Float64[np.ndarray, "48 3 3"]) -> tup
         at_ns: Int64[np.ndarray, " n"], apart_ns: Int64[np.ndarray, " n"], true: Float64[np.ndarray, "n 3"], k: int
     ) -> Fit | None:
         at_s = seconds(at_ns, int(whole.motion.start_ns or 0))
-        use = (at_s > t_s[0]) & (at_s < t_s[-1]) & (apart_ns < POSES_APART_NS)
-        if use.sum() < FEWEST_POSES:
+        use = np.flatnonzero((at_s > t_s[0]) & (at_s < t_s[-1]) & (apart_ns < POSES_APART_NS))
+        if len(use) < FEWEST_POSES:
             return None
+        use = use[:: -(-len(use) // MOST_POSES)]
         read = np.stack([np.interp(at_s[use], t_s, column) for column in mean[:, k : k + 3].T], axis=1)
         return _fit(true[use], read, readings)
 
