@@ -27,6 +27,7 @@ def clean(
     rule: Annotated[list[str] | None, typer.Option("--rule", metavar="NAME", help="This rule alone. Repeatable.")] = None,
     no_rule: Annotated[list[str] | None, typer.Option("--no-rule", metavar="NAME", help="Not this rule. Repeatable.")] = None,
     force: Annotated[bool, typer.Option("--force", help="Write OUT even from a log that cannot be trusted.")] = False,
+    report_to: Annotated[Path | None, typer.Option("--report", metavar="F.html", help="Write the findings as a page.")] = None,
     init: Init = "auto",
     smooth: Smooth = False,
     overwrite: Overwrite = False,
@@ -37,11 +38,14 @@ def clean(
     """Say what is wrong inside a log's IMU and whether to trust it; with OUT, write the log with a clean IMU beside the raw."""
     from imutool.clean.first_pass import SCHEMA, imu_topics, survey
     from imutool.clean.settings import chosen
+    from imutool.mcap_io.target import Target
 
     rules = chosen(rule or (), no_rule or (), force)
-    given = {"--model": model, "--smooth": smooth, "--force": force, "--overwrite": overwrite}
+    given = {"--model": model, "--smooth": smooth, "--force": force, "--overwrite": overwrite and report_to is None}
     if target is None and (idle := [name for name, value in given.items() if value]):
         raise ConfigError(f"{idle[0]} says nothing without OUT", where="clean", fix="Name the log to be written")
+    if report_to is not None:
+        Target(report_to, overwrite=overwrite).abandon()  # a page that cannot be written is refused before the work is done
     if target is None:
         with progress("Looking through", verbose, quiet) as tell:
             topics = list(imu or ()) or imu_topics(source)
@@ -69,6 +73,10 @@ def clean(
     result: dict[str, Any] = {"schema": SCHEMA, "log": str(source), "imus": [one.plain() for one in surveys]}
     if target is not None:
         result |= {"output": str(target), "added": added}
+    if report_to is not None:
+        from imutool.view import clean_page
+
+        clean_page.write(surveys, report_to, overwrite=overwrite)
     if write_json(result, json_to):
         return
     for one in surveys:

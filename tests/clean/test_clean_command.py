@@ -6,6 +6,7 @@ import hashlib
 import json
 import subprocess
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +19,7 @@ from imutool.errors import LogError
 from imutool.mcap_io.log import Clock, ImuBatch, Log
 from imutool.mcap_io.write import write
 from imutool.physics.flight import flight
+from imutool.view import clean_page
 
 Command = Callable[..., subprocess.CompletedProcess[str]]
 
@@ -169,6 +171,27 @@ def test_a_log_with_two_imus_is_looked_at_whole_and_each_alone(folder: Path, imu
     assert {topic: imu["verdict"] for topic, imu in by_topic.items()} == {"/imu0": "good", "/imu1": "usable"}
     with pytest.raises(LogError, match=r"IMU topics: /imu., /imu."):
         survey(folder / "two.mcap")
+
+
+def test_the_page_holds_every_finding_and_asks_nobody_for_anything(folder: Path, imutool: Command, tmp_path: Path) -> None:
+    done = imutool("clean", folder / "spoiled.mcap", "--report", "page.html", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    page = (tmp_path / "page.html").read_text()
+    for rule, count in SPOILED.items():
+        assert f"<td>{rule}</td><td>{count}</td>" in page
+    assert page.count("<rect") == 3 + 1 + 1 + 1  # spikes, and one interval each of what lies close together
+    assert "http://" not in page
+    assert "https://" not in page
+    again = imutool("clean", folder / "spoiled.mcap", "--report", "page.html", cwd=tmp_path)
+    assert again.returncode == 3
+
+
+def test_a_page_escapes_what_comes_from_the_log(folder: Path) -> None:
+    found = replace(survey(folder / "spoiled.mcap"), topic="/<script>alert(1)</script>", log="<b>\u202elog.mcap")
+    page = clean_page.html([found])
+    assert "<script>" not in page
+    assert "<b>" not in page
+    assert "\u202e" not in page
 
 
 def test_rules_are_named_and_a_wrong_name_suggests_the_nearest(folder: Path, imutool: Command) -> None:
