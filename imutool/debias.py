@@ -9,7 +9,6 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -21,6 +20,7 @@ from imutool.bias import static
 from imutool.bias._base import BiasModel, OneByOne, Stream, Vector6
 from imutool.bias._file import check_rate, find_model, shipped, shipped_for
 from imutool.certainty import Certainty
+from imutool.clean import Cleaner, Rules, Survey, cleaned, look
 from imutool.config import plain
 from imutool.errors import ConfigError, DataError, LogError, ModelError
 from imutool.mcap_io import schema
@@ -40,6 +40,7 @@ from imutool.turn_on import smooth as smooth_rest
 
 HEAD_S = 60.0  # of a log, read to find the start: a constant, however long the log
 SUFFIX = "/debiased"
+CLEAN_RECORD = "imutool_clean"
 
 
 class Debiased(NamedTuple):
@@ -57,6 +58,7 @@ class DebiasReport:
     starts: Mapping[str, TurnOn]
     rewrite: RewriteReport
     losses: Losses  # of a damaged source; empty as far as it was looked at (`check`)
+    surveys: Mapping[str, Survey]  # of what was cleaned
 
 
 def apply(model: BiasModel, start: TurnOn, imu: Imu) -> Debiased:
@@ -99,10 +101,14 @@ def _by_blocks(stream: Stream) -> Callable[[float, Vector6], Vector6]:
 
 
 class Debiaser:
-    """The channels a log gains, computed batch by batch as the log is copied (`mcap_io.rewrite.Derived`)."""
+    """The channels a log gains, computed batch by batch as the log is copied (`mcap_io.rewrite.Derived`).
 
-    def __init__(self, source_topic: str, model: BiasModel, start: TurnOn) -> None:
+    With a survey, only of what is left of the samples when they are clean.
+    """
+
+    def __init__(self, source_topic: str, model: BiasModel, start: TurnOn, found: Survey | None = None) -> None:
         self.source_topic = source_topic
+        self._clean = None if found is None else Cleaner(found)
         self.topics: Sequence[NewTopic] = (
             NewTopic(f"{source_topic}{SUFFIX}", schema.IMU),
             NewTopic(f"{source_topic}/bias/gyro", schema.VECTOR3),
@@ -123,6 +129,8 @@ class Debiaser:
         Raises:
             LogError: samples no model can take: NaN, or stamps that do not increase.
         """
+        if self._clean is not None:
+            batch = self._clean(batch)
         self._clock.take(batch)
         if self._start_ns < 0 and len(batch.stamp_ns):
             self._start_ns = int(batch.stamp_ns[0])
@@ -156,6 +164,7 @@ def debias(
     init: str = "auto",
     smooth: bool = False,
     check: str = "imu",
+    clean: Rules | None = None,
     overwrite: bool = False,
     progress: Callable[[int, int], None] | None = None,
 ) -> DebiasReport:
@@ -167,23 +176,25 @@ def debias(
     With `smooth` the start bias at every time comes from the whole log, also from what follows.
     Without a target the log itself is replaced (`mcap_io.rewrite`, which also says what `check` checks).
     Of a damaged log, what is sound goes through a repaired copy beside the target (`mcap_io.salvage`), and `losses` says
-    what is missing; it is not replaced.
+    what is missing; it is not replaced. With `clean` a first pass says what is to be left out or converted
+    (`imutool.clean`), and the record `imutool_clean` what it found.
 
     Raises:
         ConfigError: source or target cannot be opened, `init` makes no sense, `smooth` is asked for with another `init`,
             or a model is given for an IMU that is not to be debiased.
-        LogError: nothing in the log can be saved, it has no such IMU, is debiased already, or is damaged and its own target.
+        LogError: nothing in the log can be saved, it has no such IMU, is debiased already, is damaged and its own target,
+            or cannot be trusted, with `clean`.
         ModelError: no model and no time at rest; a model for another rate; a damaged model file.
     """
     refuse_smooth(init, smooth)
     refuse_unknown(check)
-    run = partial(_debias, target=target, model=model, imus=imus, init=init, smooth=smooth, check=check, overwrite=overwrite)
+    asked = _Asked(model, imus, init, smooth, clean, check, overwrite)
     with Log(source, salvage=True) as log:
         assert log.losses is not None, "with salvage there are losses, if perhaps none"
         damaged = bool(log.losses or log.losses.mended)
     if not damaged:
         try:
-            return run(source, source, Losses(), progress=progress)
+            return _debias(source, source, Losses(), target, asked, progress)
         except LogError as error:  # damage inside a chunk shows only here
             refusal = error
     with repaired(source, target or source) as saved:
@@ -191,44 +202,61 @@ def debias(
             raise refusal
         if target is None:
             raise LogError("the log is damaged", where=source, fix="Give OUT: put in its place, the damaged part would be gone")
-        return run(source, *saved, progress=progress)
+        return _debias(source, *saved, target, asked, progress)
+
+
+@dataclass(frozen=True)
+class _Asked:
+    """What `debias` is to do."""
+
+    model: str | Path | Mapping[str, str | Path] | None
+    imus: Sequence[str]
+    init: str
+    smooth: bool
+    clean: Rules | None
+    check: str
+    overwrite: bool
 
 
 def _debias(
     source: Place,
     sound: Place,
     losses: Losses,
-    *,
     target: Place | None,
-    model: str | Path | Mapping[str, str | Path] | None,
-    imus: Sequence[str],
-    init: str,
-    smooth: bool,
-    check: str,
-    overwrite: bool,
+    asked: _Asked,
     progress: Callable[[int, int], None] | None,
 ) -> DebiasReport:
     """The same for a log that is whole, or for the `sound` copy of one that is not."""
+    model = asked.model
     given = dict(model) if isinstance(model, Mapping) else {} if model is None else {"": model}
     with Log(sound) as log:
-        topics = _chosen(log, imus, given)
+        topics = _chosen(log, asked.imus, given)
         about = log.metadata().get("imutool", {})
+        surveys = {} if asked.clean is None else {topic: look(log, topic, asked.clean).trusted() for topic in topics}
     named = given.get("") or (None if all(topic in given for topic in topics) else _of_the_log(about))
     derived, starts, models, records = [], {}, {}, {}
     with Digest(source) as digest:
         for topic in topics:
-            chosen, start = _prepare(sound, topic, given.get(topic, named), init, smooth)
-            derived.append(Debiaser(topic, chosen, start))
+            chosen, start = _prepare(sound, topic, given.get(topic, named), asked.init, asked.smooth, surveys.get(topic))
+            derived.append(Debiaser(topic, chosen, start, surveys.get(topic)))
             starts[topic], models[topic] = start, str(chosen.card.get("name", chosen.method))
-            records[topic] = _provenance(topic, chosen, start, init, smooth)
+            records[topic] = _provenance(topic, chosen, start, asked.init, asked.smooth)
 
         def metadata(verified: Verified) -> Values:
             origin = {"source_file": source.name, "source_sha256": digest.result(), "source_size": str(source.stat().st_size)}
             checked = {"verified": json.dumps(verified._asdict())}
-            return {f"imutool{topic}" if len(records) > 1 else "imutool": v | origin | checked for topic, v in records.items()}
+            told = {_record("imutool", topic, records): v | origin | checked for topic, v in records.items()}
+            return told | {_record(CLEAN_RECORD, topic, records): found.record() for topic, found in surveys.items()}
 
-        report = rewrite(sound, target, derived, metadata=metadata, overwrite=overwrite, check=check, progress=progress)
-    return DebiasReport(models, starts, report, losses)
+        report = rewrite(
+            sound, target, derived, metadata=metadata, overwrite=asked.overwrite, check=asked.check, progress=progress
+        )
+    return DebiasReport(models, starts, report, losses, surveys)
+
+
+def _record(name: str, topic: str, records: Mapping[str, object]) -> str:
+    """The name of a metadata record: with its topic where there are several."""
+    return f"{name}{topic}" if len(records) > 1 else name
 
 
 def _of_the_log(about: Mapping[str, str]) -> str | Path | None:
@@ -308,13 +336,15 @@ def _only_imu(log: Log) -> str:
     return found[0]
 
 
-def _prepare(source: Place, topic: str, name: str | Path | None, init: str, smooth: bool) -> tuple[BiasModel, TurnOn]:
+def _prepare(
+    source: Place, topic: str, name: str | Path | None, init: str, smooth: bool, found: Survey | None
+) -> tuple[BiasModel, TurnOn]:
     """Model and start for one IMU."""
     untrained = name is None or str(name) == static.Model.method
-    head = _head(source, topic, init)
+    head = _head(source, topic, init, found)
     if untrained and init == "auto" and not smooth:
         with Log(source) as log:
-            batches = ((batch.stamp_ns, batch.gyro, batch.accel) for batch in log.imu_batches(topic))
+            batches = ((batch.stamp_ns, batch.gyro, batch.accel) for batch in _imu_batches(log, topic, found))
             return _estimate(in_blocks(batches, head.imu.period_s), source)
     rate_hz = 1.0 / head.imu.period_s
     model: BiasModel = static.Model() if name is None or untrained else find_model(name, rate_hz)
@@ -322,7 +352,7 @@ def _prepare(source: Place, topic: str, name: str | Path | None, init: str, smoo
         check_rate(model, rate_hz, source)
     if smooth:
         with Log(source) as log:  # a first pass, in constant memory but for the track
-            start = _smoothed(model, _batches(log, topic), source)
+            start = _smoothed(model, _batches(log, topic, found), source)
     else:
         start = find(init, model, head)
     return model, start if start.noise.any() else replace(start, noise=_noise(head.imu))
@@ -346,33 +376,41 @@ def _smoothed(model: BiasModel, batches: Iterable[Samples], where: str | Place) 
         raise _nothing_known(where) from error
 
 
-def _batches(log: Log, topic: str) -> Iterator[Samples]:
+def _imu_batches(log: Log, topic: str, found: Survey | None, end_ns: int | None = None) -> Iterator[ImuBatch]:
+    """An IMU's messages: as they must be, or as a survey says they are clean."""
+    return log.imu_batches(topic, end_ns=end_ns) if found is None else cleaned(log, found, end_ns)
+
+
+def _batches(log: Log, topic: str, found: Survey | None) -> Iterator[Samples]:
     """An IMU's samples, with seconds since the first."""
     start_ns = None
-    for batch in log.imu_batches(topic):
+    for batch in _imu_batches(log, topic, found):
         if len(batch.stamp_ns):
             start_ns = int(batch.stamp_ns[0]) if start_ns is None else start_ns
             yield seconds(batch.stamp_ns, start_ns), batch.gyro, batch.accel
 
 
-def _head(source: Place, topic: str, init: str) -> Recording:
+def _head(source: Place, topic: str, init: str, found: Survey | None) -> Recording:
     """The first minute of a log; of its truth only what is asked for, since it may be no business of the IMU's."""
     with Log(source) as log:
         first = next((int(times.min()) for times in log.stamps(topic) if len(times)), None)
     end_ns = None if first is None else first + nanoseconds(HEAD_S)
-    if init.partition(":")[0] == "truth":
+    if init.partition(":")[0] == "truth" and found is None:
         return read(source, imu=topic, end_ns=end_ns)
-    return Recording(source.stem, _samples(source, topic, end_ns), imu_topic=topic, source=str(source))
+    samples = _samples(source, topic, found, end_ns if found is None else found.start_ns + nanoseconds(HEAD_S))
+    if init.partition(":")[0] == "truth":
+        return read(source, imu=topic, end_ns=end_ns, samples=samples)
+    return Recording(source.stem, samples, imu_topic=topic, source=str(source))
 
 
-def _samples(source: Place, topic: str, end_ns: int | None = None) -> Imu:
-    """The samples of one IMU.
+def _samples(source: Place, topic: str, found: Survey | None, end_ns: int | None = None) -> Imu:
+    """The samples of one IMU, as a survey says they are clean where there is one; its end is then by stamp.
 
     Raises:
         LogError: fewer than two, or none that a recording could hold.
     """
     with Log(source) as log:
-        batches = list(log.imu_batches(topic, end_ns=end_ns))
+        batches = list(_imu_batches(log, topic, found, end_ns))
         count = sum(len(batch.stamp_ns) for batch in batches)
         if count < 2:
             raise LogError(f"{topic} holds {count} messages", where=source, expected="at least 2")

@@ -12,6 +12,18 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float64, Int64
 
+from imutool.clean.rules import saturation
+from imutool.clean.rules.gaps import missing
+from imutool.clean.rules.units import (
+    DEGREES,
+    DEGREES_BAND,
+    FULL_SCALE_RAD_S,
+    MIN_TURN_RAD_S,
+    MOVING_TOLERANCE,
+    REST_TOLERANCE,
+    accel_unit,
+    spread,
+)
 from imutool.errors import LogError
 from imutool.mcap_io import schema
 from imutool.mcap_io.log import DERIVED_KEY, ENCODINGS, Log, Topic
@@ -20,23 +32,8 @@ from imutool.recording import GAP_FACTOR, GRAVITY_M_S2, MIN_GAP_S, Imu, nanoseco
 from imutool.stationary import stretches
 
 SCHEMA = "imutool.info/1"
-MISSING_STEP = 1.5  # a step of this many median periods or more has lost samples
-REST_TOLERANCE = 0.05  # of gravity: 0.5 m/s² covers bias and scale of a poor sensor
-UNITS = {1.0: "g", 1000.0: "mg", GRAVITY_M_S2 * 1000.0: "mm/s^2", GRAVITY_M_S2 / 0.3048: "ft/s^2"}  # by reading at rest
-FULL_SCALE_RAD_S = 35.0  # 2000 degrees a second, the widest range of common MEMS gyros
-DEGREES = 180.0 / np.pi
-DEGREES_BAND = (0.7, 1.4)  # of 180/pi, for the ratio of the measured to the true rate
-MIN_TURN_RAD_S = 0.05  # root mean square of the true rate below which that ratio means nothing
 CALM_SHARE = 0.25  # of the resting windows, the calmest, that give the noise: motors may idle in the others
 NOISE_WINDOW_S = 1.0
-SATURATED_SAMPLES = 5
-SATURATED_PILE = 2.0
-SATURATED_LEVELS = 10
-SATURATION_RULE = (
-    f"an axis is saturated at its own largest or smallest value where at least {SATURATED_SAMPLES} samples hold exactly "
-    f"that value, more than {SATURATED_PILE:g} times as many as either of the next two values, among at least "
-    f"{SATURATED_LEVELS} values, and it is not the median"
-)
 
 Report = dict[str, Any]
 
@@ -182,7 +179,7 @@ def _imu(log: Log, topic: Topic) -> Report:
         "missing": _missing(np.unique(t_ns)),
         "not_finite": int((~finite).sum()),
         "saturated": int(saturated.sum()),
-        "saturation_rule": SATURATION_RULE,
+        "saturation_rule": saturation.RULE,
         **_rest(imu),
     }
     report["warnings"] += _imu_warnings(report, imu)
@@ -204,23 +201,19 @@ def _columns(log: Log, topic: Topic) -> tuple[Int64[np.ndarray, " n"], Float64[n
 def _missing(ordered_ns: Int64[np.ndarray, " n"]) -> int:
     """How many samples would fill the steps of at least 1.5 median periods."""
     steps = np.diff(ordered_ns)
-    if not len(steps):
-        return 0
-    periods = steps / np.median(steps)
-    return int(np.round(periods[periods >= MISSING_STEP] - 1.0).sum())
+    return int(missing(steps, float(np.median(steps))).sum()) if len(steps) else 0
 
 
 def _saturated(values: Float64[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
-    """Samples with an axis at the end of its range, by `SATURATION_RULE`."""
+    """Samples with an axis at the end of its range, by `saturation.RULE`."""
     found = np.zeros(len(values), bool)
     for axis in values.T:
-        levels, counts = np.unique(axis[np.isfinite(axis)], return_counts=True)
-        if len(levels) < SATURATED_LEVELS:
-            continue
-        for end, near in ((0, counts[1:3]), (-1, counts[-3:-1])):
-            piled = counts[end] >= SATURATED_SAMPLES and counts[end] > SATURATED_PILE * near.max()
-            if piled and levels[end] != np.nanmedian(axis):
-                found |= axis == levels[end]
+        ends = saturation.Ends()
+        ends.see(axis)
+        for side in (-1, 1):
+            limit = ends.limit(side)
+            if limit is not None:
+                found |= axis == limit
     return found
 
 
@@ -280,12 +273,11 @@ def _imu_warnings(report: Report, imu: Imu) -> list[str]:
 
 def _accel_warnings(level: float, when: str) -> list[str]:
     """What a reading says about its unit."""
-    tolerance = REST_TOLERANCE if when == "at rest" else 0.4
-    if abs(level / GRAVITY_M_S2 - 1.0) <= tolerance:
+    unit = accel_unit(level, REST_TOLERANCE if when == "at rest" else MOVING_TOLERANCE)
+    if unit == "m/s^2":
         return []
-    for reading, unit in UNITS.items():
-        if abs(level / reading - 1.0) <= max(tolerance, 0.1):
-            return [f"accel magnitude {when} is {level:.4g}: the unit looks like {unit}, not m/s^2"]
+    if unit:
+        return [f"accel magnitude {when} is {level:.4g}: the unit looks like {unit}, not m/s^2"]
     return [f"accel magnitude {when} is {level:.4g} m/s^2, gravity is {GRAVITY_M_S2}"]
 
 
@@ -342,7 +334,7 @@ def _rate_warning(log: Log, imu_topic: str, truth_topic: str) -> list[str]:
     cosine = np.abs(np.einsum("ij,ij->i", q_wxyz[step:], q_wxyz[:-step])).clip(0.0, 1.0)
     rate = 2.0 * np.arccos(cosine) / (seconds(t_ns[step:], int(t_ns[0])) - seconds(t_ns[:-step], int(t_ns[0])))
     true_rms = float(np.sqrt(np.median(rate**2)))
-    ratio = float(np.sqrt(np.median(((gyro - np.median(gyro, axis=0)) ** 2).sum(axis=1)))) / max(true_rms, 1e-12)
+    ratio = spread(gyro) / max(true_rms, 1e-12)
     if true_rms < MIN_TURN_RAD_S or not DEGREES_BAND[0] <= ratio / DEGREES <= DEGREES_BAND[1]:
         return []
     return [f"{imu_topic}: gyro is {ratio:.3g} times the true rate: the unit looks like deg/s, not rad/s"]

@@ -17,6 +17,7 @@ GROUPS = {
     "imutool.converters": "converters",
     "imutool.bias": "imutool.bias",
     "imutool.effects": "imutool.physics.effects",
+    "imutool.clean": "imutool.clean.rules",
 }
 
 

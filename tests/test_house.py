@@ -34,6 +34,7 @@ TIERS = (
         "metrics",
         "mcap_io",
         "bag",
+        "clean",
         "stationary",
         "strapdown",
         "windows",
@@ -171,6 +172,10 @@ def test_help_imports_nothing_heavy(imported: Callable[..., set[str]], words: li
 
 def test_info_imports_nothing_heavy(imported: Callable[..., set[str]], logs: Path) -> None:
     assert imported("info", logs / "flight_1.mcap") == set()
+
+
+def test_clean_that_only_looks_imports_nothing_heavy(imported: Callable[..., set[str]], logs: Path) -> None:
+    assert imported("clean", logs / "flight_1.mcap") == set()
 
 
 def test_convert_imports_nothing_heavy(imported: Callable[..., set[str]], tmp_path: Path) -> None:

@@ -10,6 +10,7 @@ import signal
 import sys
 
 from imutool.cli import (
+    clean,
     conceal,
     convert,
     debias,
@@ -27,7 +28,7 @@ from imutool.cli import (
 )
 from imutool.cli._app import app, caught
 
-COMMANDS = (convert, info, repair, train, debias, evaluate, view, export, vio, simulate, diagnose, conceal, models, demo)
+COMMANDS = (convert, info, repair, train, debias, clean, evaluate, view, export, vio, simulate, diagnose, conceal, models, demo)
 
 
 TERMINATED = 143  # what a shell reports of a program that SIGTERM ended

@@ -33,6 +33,9 @@ def debias(
     smooth: Smooth = False,
     verify: Annotated[str, typer.Option(metavar="all|imu|none", help=VERIFY_HELP)] = "imu",
     in_place: Annotated[bool, typer.Option("--in-place", help="Put the result in the place of IN, when it is whole.")] = False,
+    clean: Annotated[
+        bool, typer.Option("--clean", help="Leave out what is no measurement, convert units (imutool clean).")
+    ] = False,
     overwrite: Overwrite = False,
     json_to: Json = None,
     verbose: Verbose = False,
@@ -41,6 +44,7 @@ def debias(
     """Rewrite a log with a debiased IMU channel; everything else passes through unchanged."""
     _refuse_contradictions(target, in_place, overwrite)
     models = assigned(model or ())
+    from imutool.clean import Rules
     from imutool.debias import debias as run
 
     with progress("Debiasing", verbose, quiet) as tell:
@@ -52,6 +56,7 @@ def debias(
             init=init,
             smooth=smooth,
             check=verify,
+            clean=Rules() if clean else None,
             overwrite=overwrite,
             progress=lambda done, total: tell(done, total, ""),
         )
@@ -68,8 +73,12 @@ def debias(
     added, copied, verified = dict(report.rewrite.added), report.rewrite.copied, report.rewrite.verified
     result = {"schema": "imutool.debias/1", "output": str(target or source), "imus": imus, "copied": copied, "added": added}
     result |= {"verified": verified._asdict(), "losses": report.losses.plain()}
+    if clean:
+        result["clean"] = [one.plain() for one in report.surveys.values()]
     if write_json(result, json_to):
         _leave(report.losses)
+    for topic, one in report.surveys.items():
+        say(f"{topic}: {one.verdict}, score {one.score:.3f}, {one.valid} of {one.messages} samples valid")
     for topic, entry in imus.items():
         bias = ", ".join(f"{b:+.5f}" for b in entry["gyro_bias"]), ", ".join(f"{b:+.4f}" for b in entry["accel_bias"])
         start = f"start bias {bias[0]} rad/s; {bias[1]} m/s² ({entry['init_how']})"

@@ -29,6 +29,7 @@ from imutool.place import Place
 
 logger = logging.getLogger(__name__)
 
+LEAVE_OUT = "See what is wrong with imutool clean LOG, and leave it out with imutool debias --clean"
 ENCODINGS = ("cdr", "ros1")
 DERIVED_KEY = "imutool_source_topic"  # channel metadata: computed by imutool from this topic
 
@@ -415,5 +416,8 @@ class Clock:
         Raises:
             LogError: NaN, infinity, or a stamp that does not come after the one before it.
         """
-        finite(batch.sequence, angular_velocity=batch.gyro, linear_acceleration=batch.accel)
-        self.check(batch.stamp_ns, batch.sequence)
+        try:
+            finite(batch.sequence, angular_velocity=batch.gyro, linear_acceleration=batch.accel)
+            self.check(batch.stamp_ns, batch.sequence)
+        except LogError as error:
+            raise LogError(error.what, expected=error.expected, fix=LEAVE_OUT) from error

@@ -45,12 +45,14 @@ def read(
     truth: str | None = None,
     start_ns: int | None = None,
     end_ns: int | None = None,
+    samples: Imu | None = None,
 ) -> Recording:
     """The recording in a log: `read(write(r)) == r`, bit for bit.
 
     Of a log that imutool did not write, the name is that of the file, poses of every pose topic are truths (/tf, by child
     frame, where there are no others), and Float64 and Vector3Stamped topics are scalars; one of these that a recording
     cannot hold (time going back, NaN) is left out and logged as a warning. `start_ns` and `end_ns` select by log time.
+    With `samples` those are the IMU's, and its messages are not read.
 
     Raises:
         ConfigError: the file cannot be opened.
@@ -64,11 +66,12 @@ def read(
         scalars = [t.name for t in log.with_schema(SCALARS) if t.name not in velocities and t.message_encoding in ENCODINGS]
         gather = _Gather(log, imu_topic, truths, velocities, scalars)
         with log.named():
-            for topic, rows in log.rows(gather.topics, start_ns, end_ns):
+            topics = gather.topics if samples is None else gather.topics[1:]
+            for topic, rows in log.rows(topics, start_ns, end_ns):
                 gather.take(topic, rows)
         return Recording(
             name=own.get("name", path.stem),
-            imu=gather.imu(),
+            imu=gather.imu() if samples is None else samples,
             truths=gather.truths(truth),
             scalars=gather.scalars(),
             frames=_frames(log, start_ns, end_ns),

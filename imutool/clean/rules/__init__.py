@@ -1,0 +1,1 @@
+"""The rules, one file each; the file's name is the rule's, and every file here is found (`imutool.registry`)."""

@@ -1,0 +1,59 @@
+"""What a clean-up looks for, and from when on it does not trust a log: settings, so that a fleet can carry them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from functools import cache
+from typing import Annotated
+
+from msgspec import Meta
+
+from imutool import registry
+from imutool.config import Settings
+from imutool.errors import ConfigError
+
+GROUP = "imutool.clean"  # of rules: one file each
+
+Share = Annotated[float, Meta(ge=0.0, le=1.0)]
+
+
+class Rules(Settings, frozen=True, kw_only=True):
+    """Which rules run (by name; all where none is named, less those left out), and the limits of trust."""
+
+    only: tuple[str, ...] = ()
+    without: tuple[str, ...] = ()
+    convert_units: bool = True  # where the unit is settled beyond doubt; else it is only said
+    max_invalid_share: Share = 0.1  # of the messages dropped, from which on the log is not trusted
+    max_missing_share: Share = 0.3  # of the samples its own rate would have brought
+    force: bool = False  # clean what cannot be trusted all the same
+
+    def names(self) -> list[str]:
+        """The rules that run, sorted.
+
+        Raises:
+            ConfigError: a name that is no rule; the message names the nearest.
+        """
+        known = every()
+        for name in (*self.only, *self.without):
+            if name not in known:
+                registry.load(GROUP, name)  # says what was meant
+        return [name for name in known if (not self.only or name in self.only) and name not in self.without]
+
+
+@cache
+def every() -> tuple[str, ...]:
+    """All rules there are, sorted; the packages installed are asked once."""
+    return tuple(registry.names(GROUP))
+
+
+def chosen(only: Iterable[str], without: Iterable[str], force: bool = False) -> Rules:
+    """The rules of a command line.
+
+    Raises:
+        ConfigError: a name that is no rule, or one both asked for and left out.
+    """
+    rules = Rules(only=tuple(only), without=tuple(without), force=force)
+    rules.names()
+    if both := set(rules.only) & set(rules.without):
+        raise ConfigError(f"{min(both)} is asked for and left out", where="--rule", fix="Give --rule or --no-rule")
+    return rules

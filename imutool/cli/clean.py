@@ -1,0 +1,113 @@
+"""`imutool clean`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from imutool.cli._app import Init, Json, Overwrite, Quiet, Smooth, Verbose, app, listing
+from imutool.errors import ConfigError
+from imutool.terminal import out, plain, progress, say, table, write_json
+
+if TYPE_CHECKING:
+    from imutool.clean import Survey
+
+COLORS = {"good": "green", "usable": "yellow", "quarantine": "red"}
+SHOWN = 3  # intervals of a finding in the table; all of them are in the JSON
+
+
+@app.command(cls=listing("imutool.clean", "--rule"), epilog="Example: [bold]imutool clean robot.mcap robot_clean.mcap[/]")
+def clean(
+    source: Annotated[Path, typer.Argument(metavar="LOG", help="An MCAP log.")],
+    target: Annotated[Path | None, typer.Argument(metavar="OUT", help="The log with a clean, debiased IMU beside it.")] = None,
+    model: Annotated[str | None, typer.Option(help="For OUT: model file, physics.toml or a name that ships.")] = None,
+    imu: Annotated[list[str] | None, typer.Option(help="IMU topic, where a log has several. Repeatable.")] = None,
+    rule: Annotated[list[str] | None, typer.Option("--rule", metavar="NAME", help="This rule alone. Repeatable.")] = None,
+    no_rule: Annotated[list[str] | None, typer.Option("--no-rule", metavar="NAME", help="Not this rule. Repeatable.")] = None,
+    force: Annotated[bool, typer.Option("--force", help="Write OUT even from a log that cannot be trusted.")] = False,
+    report_to: Annotated[Path | None, typer.Option("--report", metavar="F.html", help="Write the findings as a page.")] = None,
+    init: Init = "auto",
+    smooth: Smooth = False,
+    overwrite: Overwrite = False,
+    json_to: Json = None,
+    verbose: Verbose = False,
+    quiet: Quiet = False,
+) -> None:
+    """Say what is wrong inside a log's IMU and whether to trust it; with OUT, write the log with a clean IMU beside the raw."""
+    from imutool.clean.first_pass import SCHEMA, imu_topics, survey
+    from imutool.clean.settings import chosen
+    from imutool.mcap_io.target import Target
+
+    rules = chosen(rule or (), no_rule or (), force)
+    given = {"--model": model, "--smooth": smooth, "--force": force, "--overwrite": overwrite and report_to is None}
+    if target is None and (idle := [name for name, value in given.items() if value]):
+        raise ConfigError(f"{idle[0]} says nothing without OUT", where="clean", fix="Name the log to be written")
+    if report_to is not None:
+        Target(report_to, overwrite=overwrite).abandon()  # a page that cannot be written is refused before the work is done
+    if target is None:
+        with progress("Looking through", verbose, quiet) as tell:
+            topics = list(imu or ()) or imu_topics(source)
+            surveys = []
+            for done, topic in enumerate(topics):
+                tell(done, len(topics), topic)
+                surveys.append(survey(source, topic, rules))
+        added: dict[str, int] = {}
+    else:
+        from imutool.debias import debias
+
+        with progress("Cleaning", verbose, quiet) as tell:
+            report = debias(
+                source,
+                target,
+                model=model,
+                imus=imu or (),
+                init=init,
+                smooth=smooth,
+                overwrite=overwrite,
+                clean=rules,
+                progress=lambda done, total: tell(done, total, ""),
+            )
+        surveys, added = list(report.surveys.values()), dict(report.rewrite.added)
+    result: dict[str, Any] = {"schema": SCHEMA, "log": str(source), "imus": [one.plain() for one in surveys]}
+    if target is not None:
+        result |= {"output": str(target), "added": added}
+    if report_to is not None:
+        from imutool.view import clean_page
+
+        clean_page.write(surveys, report_to, overwrite=overwrite)
+    if write_json(result, json_to):
+        return
+    for one in surveys:
+        show(one)
+    if target is not None:
+        say(f"{target}: {', '.join(f'{count} on {name}' for name, count in added.items())}")
+
+
+def show(survey: Survey) -> None:
+    """Verdict, score and findings of one IMU, for a person."""
+    counts = f"{survey.valid} of {survey.messages} samples valid, {survey.missing} missing"
+    color = COLORS[survey.verdict]
+    line = f"{plain(survey.topic)}: [bold {color}]{survey.verdict}[/], score {survey.score:.3f}, {counts}"
+    out.print(line, highlight=False, soft_wrap=True)
+    if survey.findings:
+        table(finding_rows(survey), keys=1)
+    for reason in survey.reasons:
+        out.print(f"[red]not to be trusted:[/] {plain(reason)}", highlight=False, soft_wrap=True)
+
+
+def finding_rows(survey: Survey) -> list[tuple[str, ...]]:
+    """The findings as rows of text, the first row their header."""
+    rows: list[tuple[str, ...]] = [("rule", "count", "what was found", "done", "when s")]
+    for one in survey.findings:
+        times = [_span(first - survey.start_ns, last - survey.start_ns) for first, last in one.intervals_ns]
+        more = len(times) - SHOWN + one.intervals_left_out
+        when = ", ".join(times[:SHOWN]) + (f" and {more} more" if more > 0 else "")
+        rows.append((one.rule, str(one.count), one.what, one.action, when or "whole log"))
+    return rows
+
+
+def _span(first_ns: int, last_ns: int) -> str:
+    first, last = f"{first_ns * 1e-9:.3f}", f"{last_ns * 1e-9:.3f}"
+    return first if first == last else f"{first}–{last}"
