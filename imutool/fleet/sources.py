@@ -1,0 +1,180 @@
+"""Which logs a fleet has, and what each is called below OUT: never a place outside it, never one name for two logs."""
+
+from __future__ import annotations
+
+import glob as globs
+import os
+import re
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from imutool.errors import ConfigError
+from imutool.fleet.task import Source
+from imutool.place import Place, place
+
+LOG = ".mcap"
+PATTERN = re.compile(r"[*?\[]")
+LONGEST = 200  # bytes of one part of a name: room for what is written beside it under another, within the usual 255
+OWN = "fleet."  # how the names of what the fleet itself writes at the top of OUT begin
+
+
+class Found(NamedTuple):
+    """The logs of a fleet in order of their names, and the places of those that cannot be taken, with the reason."""
+
+    logs: list[Source]
+    refused: list[tuple[str, str]]
+
+
+def find(text: str, out: Place) -> Found:
+    """The logs that a path, a glob, a folder or a URL names; what lies below `out` is no source.
+
+    A log is called by its path from the folder, or from the last part of a pattern before its first wildcard; a log alone by
+    its own name. Links are followed. A log that cannot be called anything below OUT is refused, and the others go on.
+
+    Raises:
+        ConfigError: nothing there, or no log in it.
+    """
+    root, files = _files(text)
+    logs, refused, taken = [], [], dict[str, str]()
+    for file in files:
+        if _below(file, out):
+            continue
+        try:
+            name = relative(str(file), str(root))
+            before = taken.setdefault(name.casefold(), str(file))  # one file on some systems, two on others
+            if before != str(file):
+                raise ConfigError(f"would be called {name}, and so would {before}", fix="Rename one of the two")
+            logs.append(Source(str(file), name, *identity(file)))
+        except ConfigError as error:
+            refused.append((_shown(str(file)), str(error)))
+    if not logs and not refused:
+        raise ConfigError(f"no {LOG} log", where=text, expected="a log, a folder with logs, or a pattern that fits some")
+    logs.sort(key=lambda one: one.name)
+    return Found(logs, sorted(refused))
+
+
+def relative(file: str, root: str) -> str:
+    """What a file below a root is called below OUT.
+
+    Raises:
+        ConfigError: a name that leads elsewhere, or that a terminal or a file system would not take as it is.
+    """
+    if not file.startswith(f"{root.rstrip('/')}/"):
+        raise ConfigError("lies outside what was asked for", expected=f"something below {root}")
+    name = file[len(root.rstrip("/")) + 1 :]
+    parts = name.split("/")
+    if not name.isprintable() or _shown(name) != name:
+        raise ConfigError("has control characters in its name", expected="printable characters", fix="Rename the log")
+    if any(part in {"", ".", ".."} or "\\" in part for part in parts):
+        raise ConfigError("has a name that leads elsewhere", expected="plain folders and a plain name")
+    if parts[0].startswith(OWN) or any(part.startswith(".") for part in parts):
+        raise ConfigError("has a hidden name, or one that the fleet itself uses", fix="Rename the log")
+    if max(len(part.encode()) for part in parts) > LONGEST:
+        raise ConfigError(f"has a name of more than {LONGEST} bytes", fix="Rename the log")
+    return name
+
+
+def identity(file: Place) -> tuple[int, str]:
+    """Size in bytes, and the etag of a store or the time of the last change.
+
+    Raises:
+        ConfigError: it cannot be asked for.
+    """
+    try:
+        if isinstance(file, Path):
+            status = file.stat()
+            return status.st_size, str(status.st_mtime_ns)
+        about: dict[str, Any] = file.fs.info(file.path)
+    except OSError as error:
+        raise ConfigError(f"cannot be read ({error.strerror or error})", fix="See who may read it") from error
+    names = ("ETag", "etag", "md5Hash", "content_md5", "LastModified", "last_modified", "mtime", "created")
+    stamp = next((str(about[name]) for name in names if about.get(name)), "")
+    return int(about["size"]), stamp.strip('"')
+
+
+def _shown(name: str) -> str:
+    """A name as text that can be written anywhere: bytes that are no UTF-8 as escapes."""
+    return name.encode("utf-8", "surrogateescape").decode("utf-8", "backslashreplace")
+
+
+def _files(text: str) -> tuple[Place, Iterator[Place]]:
+    """Where names begin, and the files."""
+    if "://" in text:
+        return _in_store(text)
+    path = Path(text)
+    if path.is_dir():
+        root = path.absolute()
+        return root, _walk(root, frozenset())
+    if path.is_file():
+        return path.absolute().parent, iter([path.absolute()])
+    if not PATTERN.search(text):
+        raise ConfigError("is not there", where=text, expected="a log, a folder with logs, or a pattern")
+    root = Path.cwd()
+    for part in path.parts:
+        if PATTERN.search(part):
+            break
+        root /= part
+    named = (Path(os.path.abspath(one)) for one in globs.iglob(text, recursive=True))  # noqa: PTH100  # keeps links
+    return Path(os.path.abspath(root)), (one for one in named if one.suffix == LOG and one.is_file())  # noqa: PTH100
+
+
+def _walk(folder: Path, above: frozenset[tuple[int, int]]) -> Iterator[Path]:
+    """The logs below a folder, through links too, but never into a folder that one is in already."""
+    status = folder.stat()
+    here = (status.st_dev, status.st_ino)
+    if here in above:
+        return
+    try:
+        entries = sorted(os.scandir(folder), key=lambda entry: entry.name)
+    except OSError as error:
+        raise ConfigError(f"cannot be read ({error.strerror})", where=folder) from error
+    for entry in entries:
+        if entry.is_dir():
+            yield from _walk(folder / entry.name, above | {here})
+        elif entry.name.endswith(LOG):
+            yield folder / entry.name
+
+
+def _in_store(text: str) -> tuple[Place, Iterator[Place]]:
+    match = PATTERN.search(text)
+    fixed = text.rstrip("/") if match is None else text[: match.start()].rpartition("/")[0]
+    root = place(fixed)
+    if match is not None:
+        return root, (one for one in root.glob(text[len(fixed) :].lstrip("/")) if one.suffix == LOG and one.is_file())
+    if root.is_dir():
+        return root, (one for one in root.rglob(f"*{LOG}") if one.is_file())
+    if not root.exists():
+        raise ConfigError("is not there", where=text, expected="a log, a folder with logs, or a pattern")
+    return root.parent, iter([root])
+
+
+def _below(file: Place, out: Place) -> bool:
+    return f"{file}/".startswith(f"{out}/")
+
+
+def within(out: Place, name: str) -> Place:
+    """The target of a name below OUT.
+
+    Raises:
+        ConfigError: a link in OUT leads elsewhere.
+    """
+    target = out / name
+    if isinstance(target, Path) and isinstance(out, Path):
+        real = target.parent.resolve()
+        if not real.is_relative_to(out.resolve()):
+            raise ConfigError(f"leads to {real}, outside OUT", where=target.parent, fix="Remove the link")
+    return target
+
+
+def leftovers(out: Path, names: Iterable[str]) -> Iterator[Path]:
+    """Files that were being written beside these targets when somebody was killed: .NAME.PID.RANDOM.partial."""
+    partial = re.compile(r"\.(?P<name>.+)\.\d+\.[0-9a-f]{8}\.partial", re.DOTALL)
+    folders: dict[Path, set[str]] = {}
+    for name in names:
+        folders.setdefault((out / name).parent, set()).add(name.rpartition("/")[2])
+    for folder, ours in folders.items():
+        for path in folder.glob(".*.partial"):
+            match = partial.fullmatch(path.name)
+            if match is not None and match["name"] in ours:
+                yield path

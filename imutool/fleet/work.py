@@ -1,0 +1,130 @@
+"""What is done to one log, wherever that is: a task comes in, a result goes out. Nothing here knows of a cluster."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import platform
+import resource
+import sys
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from imutool.errors import ConfigError, ImutoolError, LogError
+from imutool.fleet.sources import identity, leftovers, within
+from imutool.fleet.task import Imu, Result, Settings, Task
+from imutool.mcap_io.log import Log
+from imutool.mcap_io.rewrite import sha256
+from imutool.mcap_io.target import Target
+from imutool.place import Place, place
+
+MAXRSS = 1 if sys.platform == "darwin" else 1024  # bytes in what the system counts memory in
+
+
+@dataclass(frozen=True)
+class _Job:
+    """A task with its places opened up."""
+
+    source: Place
+    target: Place
+    settings: Settings
+
+
+def work(task: Task) -> Result:
+    """Does one log. What fails for a reason a user can act on becomes a failed result; a bug is raised.
+
+    The target is there whole or not at all, and is the same, byte for byte, however often this is done. What an attempt
+    that was killed has left beside it is removed.
+    """
+    began = time.perf_counter()
+    result = Result(
+        key=task.key,
+        source=task.source.place,
+        target=task.target,
+        status="ok",
+        source_bytes=task.source.size,
+        host=platform.node(),
+    )
+    try:
+        job = _Job(place(task.source.place), within(place(task.out), task.target), task.settings)
+        if task.done is not None and stands(task.done, job.target, whole=task.recheck):
+            return msgspec.structs.replace(task.done, status="skipped", earlier=task.done.status)
+        _refuse_changed(task, job.source)
+        _clear(task, job.target)
+        told = COMMANDS[task.settings.command](job)
+        result = msgspec.structs.replace(result, **told, **_measured(job.target))
+    except ImutoolError as error:
+        result = msgspec.structs.replace(result, status="failed", error=str(error), exit_code=error.exit_code)
+    except OSError as error:
+        reason = f"{error.filename or task.source.place}: {error.strerror or error}"
+        result = msgspec.structs.replace(result, status="failed", error=reason, exit_code=ConfigError.exit_code)
+    except MemoryError:
+        result = msgspec.structs.replace(result, status="failed", error="out of memory", exit_code=LogError.exit_code)
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * MAXRSS
+    return msgspec.structs.replace(result, seconds=time.perf_counter() - began, peak_bytes=peak)
+
+
+def stands(done: Result, target: Place, *, whole: bool = False) -> bool:
+    """Whether a target is still what an earlier run left: of its size, and a log that opens; with `whole`, of its SHA-256."""
+    try:
+        if identity(target)[0] != done.target_bytes:
+            return False
+        if whole or target.suffix != ".mcap":
+            return sha256(target) == done.target_sha256
+        with Log(target):
+            return True
+    except ImutoolError:
+        return False
+
+
+def _refuse_changed(task: Task, source: Place) -> None:
+    """A log that is still being written is left for another time."""
+    if identity(source) != (task.source.size, task.source.stamp):
+        raise LogError("has changed since it was listed", where=source, fix="Go on with --resume when it is complete")
+
+
+def _clear(task: Task, target: Place) -> None:
+    """Makes the folder, and removes what a killed attempt at this target left in it."""
+    if isinstance(target, Path):
+        target.parent.mkdir(parents=True, exist_ok=True)
+        for path in leftovers(Path(task.out), [task.target]):
+            with contextlib.suppress(FileNotFoundError):
+                path.unlink()
+
+
+def _measured(target: Place) -> dict[str, Any]:
+    return {"target_bytes": identity(target)[0], "target_sha256": sha256(target)}
+
+
+def _debias(job: _Job) -> dict[str, Any]:
+    from imutool.debias import debias
+
+    s = job.settings
+    report = debias(job.source, job.target, model=s.model, init=s.init, smooth=s.smooth, overwrite=True)
+    imus = tuple(
+        Imu(topic, report.models[topic], start.how, tuple(start.rest[:3].tolist()), tuple(start.rest[3:].tolist()))
+        for topic, start in report.starts.items()
+    )
+    return {"messages": report.rewrite.copied, "imus": imus}
+
+
+def _info(job: _Job) -> dict[str, Any]:
+    from imutool.info import inspect
+
+    report = inspect(job.source)
+    _write(report, job.target)
+    return {"messages": report["messages"], "duration_s": report["duration_s"], "warnings": tuple(report["warnings"])}
+
+
+def _write(report: Mapping[str, Any], target: Place) -> None:
+    with Target(target, overwrite=True) as out:
+        out.write(json.dumps(report, indent=2, allow_nan=False, ensure_ascii=False).encode() + b"\n")
+
+
+COMMANDS: dict[str, Callable[[_Job], dict[str, Any]]] = {"debias": _debias, "info": _info}
+SUFFIX = {"debias": ".mcap", "repair": ".mcap", "info": ".json", "diagnose": ".json"}  # of what a command leaves of a log
