@@ -143,7 +143,7 @@ class Engine:
         )
 
     def _start(self, address: str | None, dashboard: bool) -> None:
-        wanted: dict[str, Any] = {"log_to_driver": False, "configure_logging": False, "runtime_env": {"env_vars": IN_WORKERS}}
+        wanted: dict[str, Any] = {"log_to_driver": False, "configure_logging": False, **({} if address is None else {"runtime_env": {"env_vars": IN_WORKERS}})}
         if address is None:
             self._folder = tempfile.mkdtemp(prefix="imutool-fleet.")
             wanted |= {

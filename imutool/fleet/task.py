@@ -28,6 +28,8 @@ class Settings(msgspec.Struct, frozen=True, kw_only=True):
     sim: str | None = None
     imu: str | None = None
     truth: str | None = None
+    robot_from: str | None = None  # a regular expression on the log's name, or metadata:RECORD.KEY; else its folder
+    quick: bool = False  # diagnose: the effects that robots are compared by, and no search for others
 
     @property
     def digest(self) -> str:
@@ -92,7 +94,9 @@ class Result(msgspec.Struct, frozen=True, kw_only=True, tag_field="line", tag="d
     losses: tuple[str, ...] = ()
     warnings: tuple[str, ...] = ()
     score: float | None = None
+    robot: str = ""
     parameters: tuple[Parameter, ...] = ()
+    effects: tuple[str, ...] | None = None  # that a search has found, where one was made
     error: str = ""
     exit_code: int = 0
     peak_bytes: int = 0  # the most memory that the worker has held so far

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import json
 import platform
+import re
 import resource
 import sys
 import time
@@ -15,9 +16,10 @@ from typing import Any
 
 import msgspec
 
+from imutool.diagnosis_folder import plain
 from imutool.errors import ConfigError, ImutoolError, LogError
 from imutool.fleet.sources import identity, leftovers, within
-from imutool.fleet.task import Imu, Result, Settings, Task
+from imutool.fleet.task import Imu, Parameter, Result, Settings, Task
 from imutool.mcap_io.log import Log
 from imutool.mcap_io.rewrite import sha256
 from imutool.mcap_io.target import Target
@@ -30,6 +32,7 @@ MAXRSS = 1 if sys.platform == "darwin" else 1024  # bytes in what the system cou
 class _Job:
     """A task with its places opened up."""
 
+    name: str
     source: Place
     target: Place
     settings: Settings
@@ -51,7 +54,7 @@ def work(task: Task) -> Result:
         host=platform.node(),
     )
     try:
-        job = _Job(place(task.source.place), within(place(task.out), task.target), task.settings)
+        job = _Job(task.source.name, place(task.source.place), within(place(task.out), task.target), task.settings)
         if task.done is not None and stands(task.done, job.target, whole=task.recheck):
             return msgspec.structs.replace(task.done, status="skipped", earlier=task.done.status)
         _refuse_changed(task, job.source)
@@ -121,10 +124,69 @@ def _info(job: _Job) -> dict[str, Any]:
     return {"messages": report["messages"], "duration_s": report["duration_s"], "warnings": tuple(report["warnings"])}
 
 
+def _diagnose(job: _Job) -> dict[str, Any]:
+    from imutool.physics.diagnose import diagnose, measured
+
+    s = job.settings
+    robot = robot_of(job.name, s.robot_from, job.source)
+    sim = None if s.sim is None else _simulation(place(s.sim), job.name)
+    fit = measured(job.source, sim, imu=s.imu, truth=s.truth)
+    stds = fit.stds()
+    parameters = tuple(
+        Parameter(physics.name, number.name, float(value), float(std), number.unit)
+        for physics, theta in fit.chosen
+        for number, value, std in zip(physics.parameters, theta, stds[physics.name], strict=True)
+    )
+    told: dict[str, Any] = {"robot": robot, "parameters": parameters}
+    report: dict[str, Any] = {"schema": "imutool.unit/1", "robot": robot, "bias": fit.bias.tolist()}
+    report["parameters"] = [msgspec.to_builtins(one) for one in parameters]
+    if not s.quick:
+        found = diagnose([job.source], sim, imu=s.imu, truth=s.truth)
+        report["diagnosis"] = plain(found)
+        told["effects"] = tuple(one.effect for one in found.findings)
+        told["warnings"] = found.remarks
+    _write(report, job.target)
+    return told
+
+
+def robot_of(name: str, pattern: str | None, log: Place) -> str:
+    """Whose log it is: as a pattern says of its name, or `metadata:RECORD.KEY` of what it holds; else its folder's name.
+
+    Raises:
+        ConfigError: the pattern is none, or fits neither.
+    """
+    if pattern is None:
+        folder, _, file = name.rpartition("/")
+        return folder or file.removesuffix(".mcap")
+    where = "--robot-from"
+    if pattern.startswith("metadata:"):
+        record, _, key = pattern.removeprefix("metadata:").rpartition(".")
+        with Log(log) as opened:
+            found = opened.metadata().get(record, {}).get(key, "")
+        if not found:
+            raise ConfigError(f"{name} has no {key!r} in its metadata {record!r}", where=where)
+        return found
+    try:
+        match = re.search(pattern, name)
+    except re.error as error:
+        raise ConfigError(f"{pattern!r} is no pattern ({error})", where=where) from error
+    if match is None:
+        raise ConfigError(f"{pattern!r} fits nothing in {name}", where=where)
+    return match[1] if match.re.groups else match[0]
+
+
+def _simulation(folder: Place, name: str) -> Place:
+    """The simulation of a log: of the same name in another folder; a file serves for all."""
+    found = folder if folder.suffix == ".mcap" else folder / name
+    if not found.is_file():
+        raise ConfigError("is not there", where=found, expected="the simulation of a log under the same name")
+    return found
+
+
 def _write(report: Mapping[str, Any], target: Place) -> None:
     with Target(target, overwrite=True) as out:
         out.write(json.dumps(report, indent=2, allow_nan=False, ensure_ascii=False).encode() + b"\n")
 
 
-COMMANDS: dict[str, Callable[[_Job], dict[str, Any]]] = {"debias": _debias, "info": _info}
+COMMANDS: dict[str, Callable[[_Job], dict[str, Any]]] = {"debias": _debias, "info": _info, "diagnose": _diagnose}
 SUFFIX = {"debias": ".mcap", "repair": ".mcap", "info": ".json", "diagnose": ".json"}  # of what a command leaves of a log

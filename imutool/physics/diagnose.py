@@ -22,7 +22,7 @@ from imutool.physics.diagnosis import UNITS, Curve, Diagnosis, Estimate, Finding
 from imutool.physics.discover import Discovery, Judged, discover
 from imutool.physics.effects import _catalogue
 from imutool.physics.effects._forward import Physics
-from imutool.physics.fit import Chosen, Fit, Weighed, derivatives, expected
+from imutool.physics.fit import Chosen, Fit, Weighed, derivatives, expected, fit
 from imutool.physics.locate import located
 from imutool.physics.motion import smooth_motion
 from imutool.physics.pair import LEAST_S, Pair, with_simulation, with_truth
@@ -37,6 +37,7 @@ RIDGE = 1e-8
 SLOW = 9  # samples of a running mean
 SHOWN_BY_SAMPLES = {"saturation", "quantization"}  # without any fit: `stamps`
 SHOWN_KNOTS = 41  # of a curve without a name, as it is told
+EVERY_UNIT = ("mount_rotation", "gyro_scale", "accel_scale", "lever_arm", "clock_offset")  # in which every unit differs a little
 WHITE = 1.15  # what is left over the noise, as a ratio, that still counts as noise
 Tell = Callable[[int, int, str], None]
 
@@ -80,6 +81,21 @@ def diagnose(
         told = _with_signal(told, reals[0], sim, signal)
     say(4, 4, "")
     return told
+
+
+def measured(
+    real: Path, sim: Path | None = None, *, imu: str | None = None, truth: str | None = None, effects: Sequence[str] = EVERY_UNIT
+) -> Fit:
+    """Some effects of the catalogue, fitted to a recording together whether they show or not: what units are compared by.
+
+    Raises:
+        ConfigError, LogError, DataError: as `diagnose`; or an effect that has nothing to be fitted to here.
+    """
+    simulated = None if sim is None else read_log(sim, imu=imu)
+    pairs = [_unclipped(pair) for pair in _pairs(read_log(real, imu=imu, truth=truth), simulated, truth)]
+    candidates = _candidates(pairs)
+    begun = tuple((one, one.nothing.astype(float)) for one in _catalogue.physics(effects))
+    return fit([_weighed(pair, candidates) for pair in pairs], begun, part="all")
 
 
 def _with_signal(told: Diagnosis, real: Path, sim: Path, signal: str) -> Diagnosis:
