@@ -26,6 +26,7 @@ from imutool.mcap_io import schema
 from imutool.mcap_io.log import Clock, ImuBatch, Log
 from imutool.mcap_io.read import read
 from imutool.mcap_io.rewrite import Made, NewTopic, RewriteReport, rewrite, sha256
+from imutool.place import Place
 from imutool.recording import Imu, Recording, nanoseconds, seconds
 from imutool.rest_track import Samples
 from imutool.stationary import white_noise
@@ -141,8 +142,8 @@ class Debiaser:
 
 
 def debias(
-    source: Path,
-    target: Path,
+    source: Place,
+    target: Place,
     *,
     model: str | Path | None = None,
     imus: Sequence[str] = (),
@@ -188,7 +189,7 @@ def refuse_smooth(init: str, smooth: bool) -> None:
         raise ConfigError(f"--smooth with --init {init}", where="--smooth", expected="--init auto", fix="Give one of the two")
 
 
-def estimate_at_rest(imu: Imu, where: str | Path) -> tuple[BiasModel, TurnOn]:
+def estimate_at_rest(imu: Imu, where: str | Place) -> tuple[BiasModel, TurnOn]:
     """The static model with its bias: the mean over all time at rest, for a log nobody trained a model for.
 
     Raises:
@@ -201,7 +202,7 @@ def estimate_at_rest(imu: Imu, where: str | Path) -> tuple[BiasModel, TurnOn]:
         raise _nothing_known(where) from error
 
 
-def _nothing_known(where: str | Path) -> ModelError:
+def _nothing_known(where: str | Place) -> ModelError:
     return ModelError(
         "no model given, and the log holds no stretch at rest to measure a static bias on",
         where=where,
@@ -219,7 +220,7 @@ def _only_imu(log: Log) -> str:
     return found[0]
 
 
-def _prepare(source: Path, topic: str, name: str | Path | None, init: str, smooth: bool) -> tuple[BiasModel, TurnOn]:
+def _prepare(source: Place, topic: str, name: str | Path | None, init: str, smooth: bool) -> tuple[BiasModel, TurnOn]:
     """Model and start for one IMU."""
     untrained = name is None or str(name) == static.Model.method
     if untrained and init == "auto" and not smooth:
@@ -237,7 +238,7 @@ def _prepare(source: Path, topic: str, name: str | Path | None, init: str, smoot
     return model, start if start.noise.any() else replace(start, noise=_noise(head.imu))
 
 
-def smooth_in_memory(model: BiasModel, imu: Imu, where: str | Path) -> TurnOn:
+def smooth_in_memory(model: BiasModel, imu: Imu, where: str | Place) -> TurnOn:
     """The rest bias in time from all of some samples.
 
     Raises:
@@ -248,7 +249,7 @@ def smooth_in_memory(model: BiasModel, imu: Imu, where: str | Path) -> TurnOn:
     return _smoothed(model, [(t_s, imu.gyro, imu.accel)], where)
 
 
-def _smoothed(model: BiasModel, batches: Iterable[Samples], where: str | Path) -> TurnOn:
+def _smoothed(model: BiasModel, batches: Iterable[Samples], where: str | Place) -> TurnOn:
     try:
         return smooth_rest(model, batches, str(where))
     except NoRestError as error:
@@ -264,7 +265,7 @@ def _batches(log: Log, topic: str) -> Iterator[Samples]:
             yield seconds(batch.stamp_ns, start_ns), batch.gyro, batch.accel
 
 
-def _head(source: Path, topic: str, init: str) -> Recording:
+def _head(source: Place, topic: str, init: str) -> Recording:
     """The first minute of a log; of its truth only what is asked for, since it may be no business of the IMU's."""
     with Log(source) as log:
         first = next((int(times.min()) for times in log.stamps(topic) if len(times)), None)
@@ -274,7 +275,7 @@ def _head(source: Path, topic: str, init: str) -> Recording:
     return Recording(source.stem, _samples(source, topic, end_ns), imu_topic=topic, source=str(source))
 
 
-def _samples(source: Path, topic: str, end_ns: int | None = None) -> Imu:
+def _samples(source: Place, topic: str, end_ns: int | None = None) -> Imu:
     """The samples of one IMU.
 
     Raises:

@@ -15,7 +15,6 @@ Wrong usage exits with 2, an interrupt with 130; anything else is a bug and show
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import ClassVar
 
 
@@ -24,15 +23,16 @@ class ImutoolError(Exception):
 
     Args:
         what: what happened, with the offending value in it.
-        where: the file, optionally with a line (``data.csv:17``), the topic, or the setting.
+        where: what names the place: a file or URL, optionally with a line (``data.csv:17``), the topic, or the setting.
         expected: what would have been right, as the end of "expected ...".
         fix: what the user can do, as a sentence without its full stop.
     """
 
     exit_code: ClassVar[int] = 1
 
-    def __init__(self, what: str, *, where: str | Path | None = None, expected: str = "", fix: str = "") -> None:
-        self.what, self.where, self.expected, self.fix = what, where, expected, fix
+    def __init__(self, what: str, *, where: object = None, expected: str = "", fix: str = "") -> None:
+        self.what, self.where = what, None if where is None else str(where)  # as text: errors cross process borders
+        self.expected, self.fix = expected, fix
         super().__init__(str(self))
 
     def __str__(self) -> str:
@@ -41,7 +41,7 @@ class ImutoolError(Exception):
         fix = f" {self.fix}{'' if self.fix.endswith('?') else '.'}" if self.fix else ""
         return f"{place}{self.what}{expected}.{fix}"
 
-    def at(self, where: str | Path) -> ImutoolError:
+    def at(self, where: object) -> ImutoolError:
         """The same error with its address filled in, for a caller that knows the file when the raiser did not."""
         return self if self.where is not None else type(self)(self.what, where=where, expected=self.expected, fix=self.fix)
 
@@ -50,7 +50,7 @@ class ImutoolError(Exception):
         return _rebuild, (type(self), self.what, self.where, self.expected, self.fix)
 
 
-def _rebuild(kind: type[ImutoolError], what: str, where: str | Path | None, expected: str, fix: str) -> ImutoolError:
+def _rebuild(kind: type[ImutoolError], what: str, where: str | None, expected: str, fix: str) -> ImutoolError:
     return kind(what, where=where, expected=expected, fix=fix)
 
 

@@ -20,6 +20,7 @@ from imutool.config import build
 from imutool.errors import DataError
 from imutool.mcap_io.read import read
 from imutool.noise import UNITS, Noise
+from imutool.place import Place
 from imutool.recording import Imu, Recording
 from imutool.stationary import stretches, white_noise
 
@@ -74,7 +75,7 @@ class Identified:
     remarks: list[str]
 
 
-def identify(path: Path, *, imu: str | None = None, truth: str | None = None, model: str | Path | None = None) -> Identified:
+def identify(path: Place, *, imu: str | None = None, truth: str | None = None, model: str | Path | None = None) -> Identified:
     """The noise of one IMU of a log, from its time at rest and, where there is truth, from its motion.
 
     In motion the samples are first corrected: by `model`, else by a matrix and a constant fitted to this log's own truth.
@@ -140,7 +141,7 @@ def _vibrates(one: Slopes) -> bool:
     return one.excess > VIBRATES or "quantisation" in one.seen or not one.powers
 
 
-def _in_motion(recording: Recording, model: str | Path | None, path: Path) -> Sight:
+def _in_motion(recording: Recording, model: str | Path | None, path: Place) -> Sight:
     """Deviation of what is left of the samples against the truth.
 
     Raises:
@@ -156,10 +157,10 @@ def _in_motion(recording: Recording, model: str | Path | None, path: Path) -> Si
     return Sight.of(f"{_duration(seconds)} in motion against {topic}, {by}", seconds, both)
 
 
-def _by_model(recording: Recording, model: str | Path, path: Path) -> tuple[Imu, str]:
+def _by_model(recording: Recording, model: str | Path, path: Place) -> tuple[Imu, str]:
     from imutool.evaluate import runs
 
-    *_, last = runs(recording, [model], "auto", path)
+    *_, last = runs(recording, [model], "auto", str(path))
     return last[1].imu, f"corrected by {last[0]}"
 
 

@@ -7,7 +7,6 @@ repeated stamps and values that are no numbers are counted, where reading the lo
 from __future__ import annotations
 
 from collections.abc import Iterable
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,6 +15,7 @@ from jaxtyping import Bool, Float64, Int64
 from imutool.errors import LogError
 from imutool.mcap_io import schema
 from imutool.mcap_io.log import DERIVED_KEY, ENCODINGS, Log, Topic
+from imutool.place import Place
 from imutool.recording import GAP_FACTOR, GRAVITY_M_S2, MIN_GAP_S, Imu, nanoseconds, seconds
 from imutool.stationary import stretches
 
@@ -41,7 +41,7 @@ SATURATION_RULE = (
 Report = dict[str, Any]
 
 
-def inspect(path: Path) -> Report:
+def inspect(path: Place) -> Report:
     """Everything `imutool info` says about a log, as plain JSON values (schema `imutool.info/1`).
 
     `rate_hz` is one over the median period, so that drop-outs do not lower it; `jitter_s` is the standard deviation of

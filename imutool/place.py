@@ -1,30 +1,135 @@
-"""Where files lie: `pathlib.Path` on this machine, `upath.UPath` for s3://, gs://, az:// and memory://."""
+"""Where a log lies: a file on this machine, or an object in a store, named by its URL.
+
+A store is read and written through fsspec, which is imported only when a URL is given. What opens it comes from the store's
+own usual chain (environment, profile, instance role; its endpoint from AWS_ENDPOINT_URL) and never from the URL, because a
+URL is written into reports, metadata and journals.
+"""
 
 from __future__ import annotations
 
+import os
+import re
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import TYPE_CHECKING, BinaryIO, NamedTuple, TypeAlias, Union
+from urllib.parse import urlsplit
 
 from imutool.errors import ConfigError
 
 if TYPE_CHECKING:
-    Place: TypeAlias = Path
+    from upath import UPath
+
+    Place: TypeAlias = Path | UPath
 else:
-    Place: TypeAlias = Any  # a UPath of a store is no pathlib.Path, though it does what one does
+    Place = Union[Path, "upath.UPath"]  # noqa: UP007  beartype looks the name up, and imports upath, at the first URL it meets
+
+CLOUD = "pip install 'imutool[cloud]'"
+STORES = {
+    "s3": CLOUD,
+    "gs": f"{CLOUD} gcsfs",
+    "az": f"{CLOUD} adlfs",
+    "abfs": f"{CLOUD} adlfs",
+    "http": CLOUD,
+    "https": CLOUD,
+    "memory": CLOUD,
+}
+ACCOUNTS = ("az", "abfs")  # these say CONTAINER@ACCOUNT, which is no secret
+BLOCK_BYTES = 4 << 20
+BLOCKS = 4  # kept, least recently used first out: a scan, the message indexes behind its chunk, and the summary
+
+
+class Opened(NamedTuple):
+    """What can be read of a place, from any byte, and how many bytes it has."""
+
+    file: BinaryIO
+    size: int
 
 
 def place(text: str) -> Place:
-    """The place that a path or URL names.
+    """The file or the object that a user names.
 
     Raises:
-        ConfigError: a URL, and universal-pathlib or the library of its store is not installed.
+        ConfigError: a store nobody here knows, one whose package is not installed, or a URL with a password or signature in it.
     """
-    if "://" not in text:
+    scheme, found, rest = text.partition("://")
+    if not found:
         return Path(text)
+    if scheme == "file":
+        return Path(rest)
+    if scheme not in STORES:
+        raise ConfigError("is no store known here", where=redacted(text), expected=", ".join(f"{name}://" for name in STORES))
+    _refuse_secrets(scheme, text)
     try:
         from upath import UPath
 
-        found: Place = UPath(text)
-    except (ImportError, ValueError) as error:
-        raise ConfigError(f"cannot be opened ({error})", where=text, fix="Install imutool[cloud]") from error
-    return found
+        found_place = UPath(text, use_listings_cache=False)  # a listing kept from before would hide what others write
+        found_place.fs  # noqa: B018  imports the store's package
+    except ImportError as error:
+        raise ConfigError(
+            f"needs a package that is not installed ({error})", where=text, fix=f"Install it with: {STORES[scheme]}"
+        ) from error
+    except Exception as error:  # whatever the store's own set-up trips over
+        raise ConfigError(f"cannot be opened ({reason(error)})", where=text) from error
+    return found_place
+
+
+def _refuse_secrets(scheme: str, text: str) -> None:
+    login, at, _ = urlsplit(text).netloc.rpartition("@")
+    if at and (scheme not in ACCOUNTS or ":" in login):
+        raise ConfigError(
+            "a user name or password stands in the URL",
+            where=redacted(text),
+            expected="none: URLs are written into reports and logs",
+            fix="Give it by the store's environment variables or profile",
+        )
+    if scheme.startswith("http") and urlsplit(text).query:
+        raise ConfigError(
+            "a query stands in the URL, which may be a signature",
+            where=text.partition("?")[0],
+            expected="none: URLs are written into reports and logs",
+            fix="Give the object by its store's own URL, such as s3://, or fetch it first",
+        )
+
+
+def redacted(text: str) -> str:
+    """Text that may hold URLs, without the users, passwords and signatures in them."""
+    return re.sub(r"(?i)((?:signature|sig|token|credential)=)[^&\s\"']+", r"\1***", re.sub(r"//[^/\s]*@", "//***@", text))
+
+
+def failures(where: Place) -> type[Exception]:
+    """What reading and writing there may raise: of a store whatever its library does, since they have no class in common."""
+    return OSError if isinstance(where, Path) else Exception
+
+
+def reason(error: Exception) -> str:
+    """What went wrong in the words of the system or the store, with nothing secret in it."""
+    if isinstance(error, OSError) and error.strerror:
+        return redacted(error.strerror)
+    if isinstance(error, FileNotFoundError):
+        return "no such object, or no such bucket"
+    if isinstance(error, PermissionError):
+        return redacted(f"the store refuses access: {error}")
+    return redacted(str(error)) or type(error).__name__
+
+
+def opened(where: Place) -> Opened:
+    """A place open for reading; of a store by ranges, in blocks, of which a few are kept.
+
+    Raises:
+        whatever `failures` names.
+    """
+    if isinstance(where, Path):
+        file = where.open("rb", buffering=0)
+        return Opened(file, os.fstat(file.fileno()).st_size)
+    remote = where.fs.open(
+        where.path, "rb", block_size=BLOCK_BYTES, cache_type="blockcache", cache_options={"maxblocks": BLOCKS}
+    )
+    if remote.size is None:
+        raise OSError("the server does not say how long it is, so no part of it can be asked for")
+    return Opened(remote, remote.size)
+
+
+def same(one: Place, other: Place) -> bool:
+    """Whether two places that exist are one; a link to a file is that file."""
+    if isinstance(one, Path) and isinstance(other, Path):
+        return one.exists() and other.exists() and one.samefile(other)
+    return one == other

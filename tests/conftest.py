@@ -6,11 +6,13 @@ The installed command, made-up logs and a model trained on them are here too, fo
 from __future__ import annotations
 
 import os
+import runpy
 import signal
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 from jaxtyping import install_import_hook
@@ -84,3 +86,21 @@ def demonstration(tmp_path_factory: pytest.TempPathFactory, imutool: Callable[..
     (folder / "stdout.txt").write_text(done.stdout)
     (folder / "stderr.txt").write_text(done.stderr)
     return folder
+
+
+@pytest.fixture(scope="session")
+def store_server() -> Iterator[Any]:
+    """One S3 server for all tests, since the clients of a process keep the address they first found."""
+    server = runpy.run_path(str(Path(__file__).with_name("object_store.py")))["Store"]()
+    yield server
+    server.stop()
+
+
+@pytest.fixture
+def store(store_server: Any, monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
+    """The S3 store of tests/object_store.py with an empty bucket, found by the usual environment."""
+    for name, value in store_server.environment.items():
+        monkeypatch.setenv(name, value)
+    store_server.empty()
+    yield store_server
+    store_server.fault = lambda _: None

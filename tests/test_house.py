@@ -27,7 +27,7 @@ ROOT = Path(__file__).parents[1]
 # design.md, Rooms, with what came since: lower never imports higher. A room is a module of imutool or a folder of them.
 TIERS = (
     ("errors",),
-    ("config", "recording", "registry", "so3"),
+    ("config", "place", "recording", "registry", "so3"),
     (
         "kinematics",
         "ode",
@@ -55,7 +55,7 @@ TIERS = (
 LEVEL = {room: level for level, rooms in enumerate(TIERS) for room in rooms}
 FOR_CONVERTERS = {"errors", "recording"}
 
-HEAVY = {"torch", "torchdiffeq", "safetensors", "rerun", "ray", "matplotlib", "rosbags"}
+HEAVY = {"torch", "torchdiffeq", "safetensors", "rerun", "ray", "matplotlib", "rosbags", "fsspec", "upath"}
 HELP_SHARE = 0.4  # of the time `import torch` takes; the command itself takes about a tenth of it
 ROUNDS = 3
 

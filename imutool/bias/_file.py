@@ -171,7 +171,7 @@ def digest(path: Path) -> str:
     return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
-def check_rate(model: BiasModel, rate_hz: float, where: str | Path) -> None:
+def check_rate(model: BiasModel, rate_hz: float, where: object) -> None:
     """Refuses a log sampled at another rate than the model's training logs.
 
     Raises:

@@ -2,19 +2,19 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from imutool.cli._app import Init, Json, Overwrite, Quiet, Smooth, Verbose, app
+from imutool.place import place
 from imutool.terminal import progress, say, write_json
 
 
 @app.command(epilog="Example: [bold]imutool debias MH_04.mcap MH_04_debiased.mcap --model adis.safetensors[/]")
 def debias(
-    source: Annotated[Path, typer.Argument(metavar="IN", help="An MCAP log.")],
-    target: Annotated[Path, typer.Argument(metavar="OUT", help="The log with the debiased IMU beside the raw one.")],
+    source: Annotated[str, typer.Argument(metavar="IN", help="An MCAP log: a file, or a URL such as s3://bucket/log.mcap.")],
+    target: Annotated[str, typer.Argument(metavar="OUT", help="The log with the debiased IMU beside the raw one.")],
     model: Annotated[
         str | None, typer.Option(help="Model file, physics.toml or a name that ships; else a static estimate.")
     ] = None,
@@ -31,8 +31,8 @@ def debias(
 
     with progress("Debiasing", verbose, quiet) as tell:
         report = run(
-            source,
-            target,
+            place(source),
+            place(target),
             model=model,
             imus=imu or (),
             init=init,

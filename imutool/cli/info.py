@@ -7,8 +7,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from imutool.cli._app import Json, Logs, Overwrite, Quiet, Verbose, app
+from imutool.cli._app import Json, Overwrite, Quiet, Verbose, app
 from imutool.errors import ConfigError
+from imutool.place import place
 from imutool.terminal import log_to_stderr, out, plain, say, table, write_json
 
 if TYPE_CHECKING:
@@ -17,7 +18,9 @@ if TYPE_CHECKING:
 
 @app.command(epilog="Example: [bold]imutool info MH_04.mcap[/] or [bold]imutool info still.mcap --noise --noise-toml i.toml[/]")
 def info(
-    logs: Logs,
+    logs: Annotated[
+        list[str], typer.Argument(metavar="LOG...", help="MCAP logs: files, or URLs such as s3://bucket/log.mcap.")
+    ],
     noise: Annotated[bool, typer.Option("--noise", help="Identify the IMU's noise, at rest and against the truth.")] = False,
     model: Annotated[str | None, typer.Option(help="For --noise: model that corrects the samples in motion.")] = None,
     imu: Annotated[str | None, typer.Option(help="For --noise: IMU topic, where a log has several.")] = None,
@@ -38,19 +41,20 @@ def info(
         raise ConfigError(f"{idle[0]} says nothing without --noise", where="info", fix="Add --noise")
     if len(logs) > 1 and (noise_plot or noise_toml):
         raise ConfigError(f"{len(logs)} logs do not fit one file", where="--noise-plot, --noise-toml", expected="one log")
-    reports = [inspect(log) for log in logs]
+    places = [place(log) for log in logs]
+    reports = [inspect(log) for log in places]
     found = []
     if noise:
         from imutool import identify
 
-        found = [identify.identify(log, imu=imu, truth=truth, model=model) for log in logs]
+        found = [identify.identify(log, imu=imu, truth=truth, model=model) for log in places]
         for report, one in zip(reports, found, strict=True):
             report["noise"] = identify.plain(one)
         _write_noise(found[0], noise_plot, noise_toml, overwrite)
     if write_json(reports[0] if len(reports) == 1 else {"schema": "imutool.infos/1", "logs": reports}, json_to):
         return
     for number, (log, report) in enumerate(zip(logs, reports, strict=True)):
-        say(str(log))
+        say(log)
         table(topic_rows(report), keys=1)
         table(imu_rows(report), keys=2)
         if found:

@@ -9,7 +9,6 @@ import logging
 from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
-from pathlib import Path
 from types import MappingProxyType, TracebackType
 from typing import NamedTuple
 
@@ -24,6 +23,7 @@ from imutool.mcap_io.memory import keep_buffers
 from imutool.mcap_io.records import HEAD
 from imutool.mcap_io.source import Source
 from imutool.mcap_io.structure import Block, Span, Structure
+from imutool.place import Place
 
 logger = logging.getLogger(__name__)
 
@@ -83,7 +83,7 @@ class ScalarBatch(NamedTuple):
 
 
 class Log:
-    """One MCAP file, open for reading: chunked or not, with or without a summary or message indexes.
+    """One MCAP file or object in a store, open for reading: chunked or not, with or without a summary or message indexes.
 
     Memory is bounded by its largest chunk. Times given to a method select by log time, both ends included.
 
@@ -92,7 +92,7 @@ class Log:
         LogError: empty, not an MCAP log, cut short or damaged.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Place) -> None:
         keep_buffers()
         self.path = path
         self._source = Source(path)

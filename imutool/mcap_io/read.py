@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import logging
 from collections.abc import Callable, Iterator, Mapping
-from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float64, Int64, UInt32
@@ -25,6 +24,7 @@ from imutool.mcap_io.log import (
     Topic,
     finite,
 )
+from imutool.place import Place
 from imutool.recording import UNIT_QUATERNION_TOLERANCE, Frames, Imu, Poses, Recording, Scalars, unit_quaternions
 
 __all__ = ["DERIVED_KEY", "ENCODINGS", "ImuBatch", "Log", "PoseBatch", "ScalarBatch", "Topic", "read"]
@@ -39,7 +39,7 @@ OWN_KEYS = ("writer", "name", "source", "imu_topic", SHADOWED_KEY)
 
 
 def read(
-    path: Path,
+    path: Place,
     *,
     imu: str | None = None,
     truth: str | None = None,
@@ -223,7 +223,7 @@ def _format(log: Log, topic: str) -> str:
     return ""
 
 
-def _opener(path: Path, topic: str, start_ns: int | None, end_ns: int | None) -> Callable[[], Iterator[tuple[int, bytes]]]:
+def _opener(path: Place, topic: str, start_ns: int | None, end_ns: int | None) -> Callable[[], Iterator[tuple[int, bytes]]]:
     def each() -> Iterator[tuple[int, bytes]]:
         with Log(path) as log:
             yield from log.images(topic, start_ns, end_ns)

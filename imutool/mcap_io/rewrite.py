@@ -14,7 +14,6 @@ import zlib
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
@@ -28,6 +27,7 @@ from imutool.mcap_io.log import DERIVED_KEY, ImuBatch, Log
 from imutool.mcap_io.records import HEAD
 from imutool.mcap_io.structure import Block, Span, Structure
 from imutool.mcap_io.write import CHUNK_BYTES, Chunk, LogWriter
+from imutool.place import Place, failures, opened, reason, same
 
 COPY_BYTES = 1 << 20
 DEFINITIONS = (Opcode.SCHEMA, Opcode.CHANNEL)
@@ -75,8 +75,8 @@ class RewriteReport:
 
 
 def rewrite(
-    source: Path,
-    target: Path,
+    source: Place,
+    target: Place,
     derived: Sequence[Derived],
     *,
     metadata: Mapping[str, Mapping[str, str]],
@@ -95,7 +95,7 @@ def rewrite(
         LogError: the source is damaged, lacks a source topic, has a new topic already, or holds IMU messages that no
             recording could: NaN, or stamps that do not increase.
     """
-    if target.exists() and source.exists() and target.samefile(source):
+    if same(source, target):
         raise ConfigError("the target is the source", where=target, fix="Choose another name")
     tell = progress or (lambda done, total: None)
     with Log(source) as log:
@@ -123,20 +123,20 @@ def rewrite(
             )
 
 
-def sha256(path: Path) -> str:
+def sha256(path: Place) -> str:
     """The SHA-256 of a file, in hex, a block at a time.
 
     Raises:
         ConfigError: the file cannot be read.
     """
     try:
-        with path.open("rb") as file:
-            return hashlib.file_digest(file, "sha256").hexdigest()
-    except OSError as error:
-        raise ConfigError(f"cannot be read ({error.strerror})", where=path) from error
+        with opened(path).file as file:
+            return hashlib.file_digest(file, "sha256").hexdigest()  # type: ignore[arg-type]  # readinto: all that `opened` gives
+    except failures(path) as error:
+        raise ConfigError(f"cannot be read ({reason(error)})", where=path) from error
 
 
-def verify(path: Path, counts: Mapping[int, int], progress: Callable[[int, int], None] | None = None) -> None:
+def verify(path: Place, counts: Mapping[int, int], progress: Callable[[int, int], None] | None = None) -> None:
     """Reads a whole log: the CRC of every chunk and of the data section, and the messages per channel id.
 
     Raises:

@@ -2,39 +2,36 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-from typing import BinaryIO
-
 from imutool.errors import ConfigError, LogError
 from imutool.mcap_io.records import HEAD
+from imutool.place import Place, failures, opened, reason
 
 CUT_SHORT = "Save what is there with `imutool repair`, or copy it again from where it was recorded"
 
 
 class Source:
-    """The bytes of a file that is only ever read, with a refusal in place of a short read."""
+    """The bytes of a file or an object in a store that is only ever read, with a refusal in place of a short read."""
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Place) -> None:
         try:
-            self.file: BinaryIO = path.open("rb", buffering=0)
-            self.size = path.stat().st_size
-        except OSError as error:
-            raise ConfigError(f"cannot be opened ({error.strerror})", where=path, expected="an MCAP log") from error
+            self.file, self.size = opened(path)
+        except failures(path) as error:
+            raise ConfigError(f"cannot be opened ({reason(error)})", where=path, expected="an MCAP log") from error
         self.path = path
 
     def at(self, offset: int, length: int) -> bytes:
         """Exactly these bytes.
 
         Raises:
-            LogError: the file does not have them, or the disk does not give them.
+            LogError: the file does not have them, or the disk or the store does not give them.
         """
         try:
             self.file.seek(offset)
             parts = self.file.read(length)
             while len(parts) < length and (part := self.file.read(length - len(parts))):
                 parts += part
-        except OSError as error:
-            raise LogError(f"cannot be read at byte {offset} ({error.strerror})") from error
+        except failures(self.path) as error:
+            raise LogError(f"cannot be read at byte {offset} ({reason(error)})") from error
         if len(parts) != length:
             raise LogError(f"the log is cut short at byte {offset + len(parts)}", fix=CUT_SHORT)
         return parts

@@ -11,29 +11,55 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from types import TracebackType
-from typing import BinaryIO
+from typing import BinaryIO, Protocol
 
 from imutool.errors import ConfigError
+from imutool.mcap_io.upload import Upload
+from imutool.place import Place, failures, reason
+
+
+class _Medium(Protocol):
+    """What is being written under its temporary name."""
+
+    @property
+    def temporary(self) -> Place: ...
+
+    def open(self) -> None: ...
+
+    def write(self, data: bytes | memoryview) -> None: ...
+
+    def complete(self) -> None:
+        """Makes all of it readable under the temporary name."""
+
+    def publish(self) -> None:
+        """Puts it in its place."""
+
+    def discard(self) -> None:
+        """Removes it; what cannot be removed is left without a word."""
 
 
 class Target:
     """Context manager over the file being written; leaving it without an error puts the file in its place.
 
-    Any error, Ctrl-C included, removes what was written. `crc` is the CRC-32 of everything written so far.
+    Any error, Ctrl-C included, removes what was written. `crc` is the CRC-32 of everything written so far. In a store it is
+    an object under another key, copied to its own by the store when it is complete; between the last look whether the target
+    exists and that copy lies a moment in which another writer's object would be replaced, as with a file.
 
     Raises:
         ConfigError: the target exists (without `overwrite`), is a folder, or the system refuses to write.
     """
 
-    def __init__(self, path: Path, *, overwrite: bool = False) -> None:
+    def __init__(self, path: Place, *, overwrite: bool = False) -> None:
         self.path, self.overwrite = path, overwrite
         self.position, self.crc = 0, 0
-        self._refuse_existing()
-        self.temporary = path.with_name(f".{path.name}.{os.getpid()}.{secrets.token_hex(4)}.partial")
+        name = f".{path.name}.{os.getpid()}.{secrets.token_hex(4)}.partial"
+        self._medium: _Medium = _File(path, name) if isinstance(path, Path) else Upload(path, name)
+        self.temporary = self._medium.temporary
         # Ctrl-C may come between two lines, before anybody is there to call `abandon`: then the file goes with this object
-        self._remove = weakref.finalize(self, _unlink, self.temporary)
+        self._remove = weakref.finalize(self, self._medium.discard)
         with self._told():
-            self.file: BinaryIO = self.temporary.open("xb")
+            self._refuse_existing()
+            self._medium.open()
 
     def _refuse_existing(self) -> None:
         if self.path.is_dir():
@@ -45,10 +71,11 @@ class Target:
     def _told(self) -> Iterator[None]:
         try:
             yield
-        except OSError as error:
-            reason = error.strerror or type(error).__name__
+        except ConfigError:
+            raise
+        except failures(self.path) as error:
             raise ConfigError(
-                f"cannot be written ({reason})", where=self.path, fix="Choose a place that can be written and has room"
+                f"cannot be written ({reason(error)})", where=self.path, fix="Choose a place that can be written and has room"
             ) from error
 
     def write(self, data: bytes | memoryview) -> None:
@@ -58,14 +85,14 @@ class Target:
             ConfigError: the system refuses; the message gives its reason.
         """
         with self._told():
-            self.file.write(data)
+            self._medium.write(data)
         self.position += len(data)
         self.crc = zlib.crc32(data, self.crc)
 
     def flush(self) -> None:
-        """Hands everything to the system, so that the file can be read back under its temporary name."""
+        """Hands everything over, so that it can be read back under its temporary name; nothing can be written after."""
         with self._told():
-            self.file.flush()
+            self._medium.complete()
 
     def __enter__(self) -> Target:
         return self
@@ -84,11 +111,9 @@ class Target:
         """
         try:
             with self._told():
-                self.file.flush()
-                os.fsync(self.file.fileno())
-                self.file.close()
+                self._medium.complete()
                 self._refuse_existing()
-                self.temporary.replace(self.path)
+                self._medium.publish()
             self._remove.detach()
         except BaseException:
             self.abandon()
@@ -96,11 +121,33 @@ class Target:
 
     def abandon(self) -> None:
         """Removes what was written."""
-        with contextlib.suppress(OSError):  # a full disk refuses the last flush; the file goes all the same
-            self.file.close()
         self._remove()
 
 
-def _unlink(path: Path) -> None:
-    with contextlib.suppress(OSError):
-        path.unlink(missing_ok=True)
+class _File:
+    """A file beside its place."""
+
+    file: BinaryIO
+
+    def __init__(self, path: Path, name: str) -> None:
+        self.path, self.temporary = path, path.with_name(name)
+
+    def open(self) -> None:
+        self.file = self.temporary.open("xb")
+
+    def write(self, data: bytes | memoryview) -> None:
+        self.file.write(data)
+
+    def complete(self) -> None:
+        self.file.flush()
+
+    def publish(self) -> None:
+        os.fsync(self.file.fileno())
+        self.file.close()
+        self.temporary.replace(self.path)
+
+    def discard(self) -> None:
+        with contextlib.suppress(OSError, AttributeError):  # a full disk refuses the last flush; or it was never opened
+            self.file.close()
+        with contextlib.suppress(OSError):
+            self.temporary.unlink(missing_ok=True)

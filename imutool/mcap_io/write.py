@@ -13,7 +13,6 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from itertools import pairwise
-from pathlib import Path
 from types import TracebackType
 from typing import NamedTuple
 
@@ -41,6 +40,7 @@ from imutool.mcap_io import records, schema
 from imutool.mcap_io.read import OWN_KEYS, RECORD, SHADOWED_KEY, UNIT_KEY, VELOCITY_KEY
 from imutool.mcap_io.records import FOOTER_SIZE, MAGIC
 from imutool.mcap_io.target import Target
+from imutool.place import Place
 from imutool.recording import Frames, Recording
 
 CHUNK_BYTES = 1 << 20  # compression gains nothing beyond, memory grows tenfold by 32 MiB (mcap#1658)
@@ -119,7 +119,7 @@ class LogWriter:
         ConfigError: the target exists (without `overwrite`) or cannot be written, or an unknown compression.
     """
 
-    def __init__(self, path: Path, *, compression: str = "zstd", overwrite: bool = False, header: bytes | None = None) -> None:
+    def __init__(self, path: Place, *, compression: str = "zstd", overwrite: bool = False, header: bytes | None = None) -> None:
         self.compression = records.COMPRESSIONS.get(compression, compression)
         records.pack(compression)
         self.contents, self.finished = Contents(), False
@@ -281,7 +281,7 @@ class Series(NamedTuple):
         return records.message_rows(self.channel, times, times, sequence, payload)
 
 
-def write(recording: Recording, path: Path, *, compression: str = "zstd", overwrite: bool = False) -> None:
+def write(recording: Recording, path: Place, *, compression: str = "zstd", overwrite: bool = False) -> None:
     """Writes a recording as a log, which `read` gives back bit for bit. Log time, publish time and stamp are one.
 
     Raises:

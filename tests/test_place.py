@@ -1,0 +1,296 @@
+"""Logs in object stores: read by ranges, written whole or not at all, and nothing secret said."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from imutool.debias import debias
+from imutool.errors import ConfigError, LogError
+from imutool.info import inspect
+from imutool.mcap_io import upload
+from imutool.mcap_io.log import Log
+from imutool.mcap_io.rewrite import rewrite, sha256
+from imutool.mcap_io.source import Source
+from imutool.mcap_io.target import Target
+from imutool.place import BLOCK_BYTES, place, same
+
+MIB = 1 << 20
+LEAST_PART = 5 * MIB  # S3 takes no smaller ones, but for the last
+
+# ── what a user names ──
+
+
+@pytest.mark.parametrize("text", ["log.mcap", "/data/log.mcap", "s3/log.mcap", "a:b.mcap"])
+def test_a_name_without_a_store_is_a_file(text: str) -> None:
+    assert place(text) == Path(text)
+    assert place(f"file://{text}") == Path(text)
+
+
+def test_a_url_is_an_object_in_a_store(store: Any) -> None:
+    found = place("s3://fleet/robot 7/log#1.mcap")
+    assert not isinstance(found, Path)
+    assert (str(found), found.name, found.stem) == ("s3://fleet/robot 7/log#1.mcap", "log#1.mcap", "log#1")
+    assert store.requests == []
+
+
+def test_an_unknown_store_is_refused_with_those_there_are() -> None:
+    with pytest.raises(ConfigError, match=r"ftp://host/log.mcap: is no store known here; expected s3://, gs://, az://"):
+        place("ftp://host/log.mcap")
+
+
+@pytest.mark.parametrize(("url", "package"), [("gs://bucket/log.mcap", "gcsfs"), ("az://container/log.mcap", "adlfs")])
+def test_a_store_without_its_package_says_how_to_get_it(monkeypatch: pytest.MonkeyPatch, url: str, package: str) -> None:
+    monkeypatch.setitem(sys.modules, package, None)
+    with pytest.raises(ConfigError, match=rf"needs a package .* pip install 'imutool\[cloud\]' {package}"):
+        place(url)
+
+
+def test_without_fsspec_the_message_says_how_to_get_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "upath", None)
+    with pytest.raises(ConfigError, match=r"pip install 'imutool\[cloud\]'"):
+        place("s3://bucket/log.mcap")
+
+
+@pytest.mark.parametrize(
+    "url",
+    [
+        "s3://AKIA:hush@bucket/log.mcap",
+        "https://me:hush@host/log.mcap",
+        "az://me:hush@account/log.mcap",
+        "ftp://me:hush@host/log.mcap",
+        "https://host/log.mcap?X-Amz-Signature=hush&X-Amz-Credential=hush",
+    ],
+)
+def test_a_url_with_something_secret_in_it_is_refused_and_not_repeated(url: str) -> None:
+    with pytest.raises(ConfigError) as raised:
+        place(url)
+    assert "hush" not in str(raised.value)
+
+
+def test_a_place_is_itself_and_no_other(tmp_path: Path, store: Any) -> None:
+    (tmp_path / "a").touch()
+    (tmp_path / "b").symlink_to(tmp_path / "a")
+    assert same(tmp_path / "a", tmp_path / "b")
+    assert same(place("s3://fleet/a"), place("s3://fleet/a"))
+    assert not same(place("s3://fleet/a"), place("s3://fleet/b"))
+    assert not same(place("s3://fleet/a"), Path("/fleet/a"))
+
+
+# ── a log in a store ──
+
+
+@pytest.fixture
+def flight(logs: Path) -> bytes:
+    return (logs / "flight_1.mcap").read_bytes()
+
+
+def test_debias_from_store_to_store_is_byte_for_byte_the_local_result(
+    store: Any, logs: Path, tmp_path: Path, flight: bytes
+) -> None:
+    url, model = store.put("in/flight_1.mcap", flight), logs / "linear.safetensors"
+    debias(place(url), place("s3://fleet/out/log.mcap"), model=model)
+    debias(logs / "flight_1.mcap", tmp_path / "log.mcap", model=model)
+    assert store.get("out/log.mcap") == (tmp_path / "log.mcap").read_bytes()
+    assert store.keys() == ["in/flight_1.mcap", "out/log.mcap"]
+    assert store.uploads() == []
+    assert store.get("in/flight_1.mcap") == flight
+
+
+def test_the_command_debiases_and_describes_logs_in_a_store_and_says_nothing_secret(
+    store: Any, imutool: Callable[..., subprocess.CompletedProcess[str]], tmp_path: Path, flight: bytes
+) -> None:
+    store.put("in.mcap", flight)
+    done = imutool(
+        "debias", "s3://fleet/in.mcap", "s3://fleet/out.mcap", "--model", "static", "--json", "report.json", "-v", cwd=tmp_path
+    )
+    assert done.returncode == 0, done.stderr
+    told = imutool("info", "s3://fleet/out.mcap", "--json", "info.json", cwd=tmp_path)
+    assert told.returncode == 0, told.stderr
+    written = [(tmp_path / name).read_bytes() for name in ("report.json", "info.json")] + [store.get("out.mcap")]
+    assert b"s3://fleet/out.mcap" in written[0]
+    assert b"/imu0/debiased" in written[1]
+    said = [text.encode() for run in (done, told) for text in (run.stdout, run.stderr)]
+    for secret in (store.key_id, store.secret):
+        assert not [text for text in [*said, *written] if secret.encode() in text]
+
+
+def test_a_key_that_is_taken_is_refused_without_overwrite(store: Any, flight: bytes) -> None:
+    source, taken = place(store.put("in.mcap", flight)), place(store.put("out.mcap", b"precious"))
+    with pytest.raises(ConfigError, match=r"s3://fleet/out.mcap: the target exists.*--overwrite"):
+        rewrite(source, taken, [], metadata={})
+    assert store.get("out.mcap") == b"precious"
+    with pytest.raises(ConfigError, match="the target is the source"):
+        rewrite(source, source, [], metadata={}, overwrite=True)
+    report = rewrite(source, taken, [], metadata={}, overwrite=True)
+    assert len(store.get("out.mcap")) == report.target_bytes
+    assert store.keys() == ["in.mcap", "out.mcap"]
+
+
+def test_a_large_object_goes_up_in_parts_and_comes_back(store: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    data = bytes(range(256)) * (11 * MIB // 256)
+    monkeypatch.setattr(upload, "PART_BYTES", LEAST_PART)
+    with Target(place("s3://fleet/large")) as target:
+        for at in range(0, len(data), MIB):
+            target.write(data[at : at + MIB])
+        assert store.uploads() == [target.temporary.name]
+        assert store.keys() == []
+        target.flush()
+        assert (store.uploads(), store.keys()) == ([], [target.temporary.name])
+    assert (store.uploads(), store.keys()) == ([], ["large"])
+    assert store.get("large") == data
+    assert sum("partNumber" in request.query for request in store.requests) == 3
+
+
+@pytest.mark.parametrize("error", [ValueError("a bug"), KeyboardInterrupt()])
+def test_an_upload_that_is_given_up_leaves_neither_parts_nor_objects(
+    store: Any, monkeypatch: pytest.MonkeyPatch, error: BaseException
+) -> None:
+    monkeypatch.setattr(upload, "PART_BYTES", LEAST_PART)
+    with pytest.raises(type(error)), Target(place("s3://fleet/out")) as target:
+        target.write(bytes(6 * MIB))
+        assert store.uploads() == [target.temporary.name]
+        raise error
+    assert (store.uploads(), store.keys()) == ([], [])
+    with pytest.raises(type(error)), Target(place("s3://fleet/out")) as target:
+        target.write(bytes(6 * MIB))
+        target.flush()
+        raise error
+    assert (store.uploads(), store.keys()) == ([], [])
+
+
+def test_a_target_that_is_forgotten_leaves_nothing(store: Any) -> None:
+    target = Target(place("s3://fleet/out"))
+    target.write(b"ours")
+    del target
+    assert (store.uploads(), store.keys()) == ([], [])
+
+
+def test_an_object_that_appears_meanwhile_is_not_replaced(store: Any) -> None:
+    with pytest.raises(ConfigError, match=r"s3://fleet/out: the target exists"), Target(place("s3://fleet/out")) as target:
+        target.write(b"ours")
+        store.put("out", b"theirs")
+    assert store.keys() == ["out"]
+    assert store.get("out") == b"theirs"
+
+
+def test_a_temporary_object_that_somebody_changed_is_not_published(store: Any) -> None:
+    with pytest.raises(ConfigError, match="was changed by somebody"), Target(place("s3://fleet/out")) as target:
+        target.write(b"ours")
+        target.flush()
+        store.put(target.temporary.name, b"not!")
+    assert store.keys() == []
+
+
+# ── a store that fails ──
+
+
+def of(method: str, key: str, query: str = "") -> Callable[[Any], bool]:
+    """Whether a request is of a kind."""
+    return lambda request: request.method == method and key in request.path and query in request.query
+
+
+def failing(wanted: Callable[[Any], bool], how: str, times: int = 10**9) -> Callable[[Any], str | None]:
+    """The first so many requests of a kind go wrong."""
+    left = [times]
+
+    def fault(request: Any) -> str | None:
+        if not wanted(request) or not left[0]:
+            return None
+        left[0] -= 1
+        return how
+
+    return fault
+
+
+@pytest.mark.parametrize("how", ["500", "503", "cut"])
+@pytest.mark.parametrize("wanted", [of("GET", "in.mcap"), of("PUT", "partial"), of("PUT", "out.mcap"), of("HEAD", "out.mcap")])
+def test_a_store_that_fails_once_is_asked_again(store: Any, flight: bytes, wanted: Any, how: str) -> None:
+    source = place(store.put("in.mcap", flight))
+    store.fault = failing(wanted, how, times=1)
+    report = rewrite(source, place("s3://fleet/out.mcap"), [], metadata={})
+    assert len(store.get("out.mcap")) == report.target_bytes
+    assert (store.keys(), store.uploads()) == (["in.mcap", "out.mcap"], [])
+
+
+@pytest.mark.parametrize("how", ["500", "cut"])
+def test_a_store_that_fails_for_good_while_a_log_is_read_is_said_and_nothing_is_left(
+    store: Any, flight: bytes, how: str
+) -> None:
+    source = place(store.put("in.mcap", flight))
+    with Log(source) as log:
+        store.fault = failing(of("GET", "in.mcap"), how)
+        with pytest.raises(LogError, match=r"s3://fleet/in.mcap.*cannot be read at byte") as raised:
+            log._source.file.cache._fetch_block_cached.cache_clear()
+            list(log.imu_batches("/imu0"))
+    assert store.secret not in str(raised.value)
+    assert store.keys() == ["in.mcap"]
+
+
+@pytest.mark.parametrize("how", ["500", "cut"])
+@pytest.mark.parametrize(
+    "wanted", [of("PUT", "partial", "partNumber=2"), of("POST", "partial", "uploadId"), of("PUT", "large")]
+)
+def test_a_store_that_fails_for_good_while_a_log_is_written_is_said_and_nothing_is_left(
+    store: Any, monkeypatch: pytest.MonkeyPatch, wanted: Any, how: str
+) -> None:
+    monkeypatch.setattr(upload, "PART_BYTES", LEAST_PART)
+    store.fault = failing(wanted, how)
+    with (
+        pytest.raises(ConfigError, match=r"s3://fleet/large: cannot be written \(.+\)") as raised,
+        Target(place("s3://fleet/large")) as target,
+    ):
+        target.write(bytes(6 * MIB))
+        target.write(bytes(6 * MIB))
+    assert store.secret not in str(raised.value)
+    assert (store.uploads(), store.keys()) == ([], [])
+
+
+def test_what_the_store_refuses_is_said(store: Any, flight: bytes) -> None:
+    with pytest.raises(ConfigError, match=r"s3://fleet/none.mcap: cannot be opened \(no such object, or no such bucket\)"):
+        Log(place("s3://fleet/none.mcap"))
+    with pytest.raises(ConfigError, match=r"s3://none/in.mcap: cannot be opened \(no such object, or no such bucket\)"):
+        Log(place("s3://none/in.mcap"))
+    with pytest.raises(ConfigError, match=r"s3://none/out: cannot be written \(no such object, or no such bucket\)"):
+        with Target(place("s3://none/out")) as target:
+            target.write(b"ours")
+    store.fault = failing(of("HEAD", "in.mcap"), "403")
+    with pytest.raises(ConfigError, match=r"s3://fleet/in.mcap: cannot be opened \(the store refuses access: Forbidden\)"):
+        Log(place(store.put("in.mcap", flight)))
+    store.fault = failing(of("PUT", "partial"), "403")
+    with pytest.raises(ConfigError, match=r"s3://fleet/out: cannot be written \(the store refuses access"):
+        with Target(place("s3://fleet/out")) as target:
+            target.write(b"ours")
+    assert store.keys() == ["in.mcap"]
+
+
+def test_without_credentials_the_message_says_so(store: Any, imutool: Any, tmp_path: Path, flight: bytes) -> None:
+    store.put("in.mcap", flight)
+    env = {"AWS_ACCESS_KEY_ID": "", "AWS_SECRET_ACCESS_KEY": "", "AWS_EC2_METADATA_DISABLED": "true", "HOME": str(tmp_path)}
+    done = imutool("info", "s3://fleet/in.mcap", cwd=tmp_path, env=env)
+    assert done.returncode == ConfigError.exit_code
+    assert "cannot be opened (Unable to locate credentials)" in " ".join(done.stderr.split())
+    assert "Traceback" not in done.stderr
+
+
+def test_an_object_that_changes_while_it_is_read_is_said(store: Any, flight: bytes) -> None:
+    source = Source(place(store.put("in.mcap", flight + bytes(2 * BLOCK_BYTES))))
+    store.put("in.mcap", flight[::-1] + bytes(2 * BLOCK_BYTES))
+    with pytest.raises(LogError, match="cannot be read at byte 5000000"):
+        source.at(5_000_000, 10)
+    source.file.close()
+
+
+def test_the_hash_of_an_object_is_that_of_its_bytes(store: Any, logs: Path, flight: bytes) -> None:
+    assert sha256(place(store.put("in.mcap", flight))) == sha256(logs / "flight_1.mcap")
+
+
+def test_a_log_is_described_as_the_file_is(store: Any, logs: Path, flight: bytes) -> None:
+    there, here = inspect(place(store.put("flight_1.mcap", flight))), inspect(logs / "flight_1.mcap")
+    assert there.pop("path") == "s3://fleet/flight_1.mcap"
+    assert there == {name: value for name, value in here.items() if name != "path"}
