@@ -2,14 +2,20 @@
 
 from __future__ import annotations
 
+import inspect
 import re
-from typing import Annotated
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from imutool.cli._app import Init, Json, Overwrite, Quiet, Smooth, Verbose, app
+from imutool.cli._app import Imu, Init, Json, Overwrite, Quiet, Smooth, Truth, Verbose, app
 from imutool.errors import ConfigError
-from imutool.terminal import progress, say, write_json
+from imutool.fleet.task import Settings
+from imutool.terminal import out, plain, progress, say, write_json
+
+if TYPE_CHECKING:
+    from imutool.fleet.run import FleetReport
 
 fleet = typer.Typer(
     name="fleet",
@@ -20,86 +26,157 @@ fleet = typer.Typer(
 app.add_typer(fleet)
 
 UNITS = {"": 1, "K": 1 << 10, "M": 1 << 20, "G": 1 << 30, "T": 1 << 40}
-
-Src = Annotated[str, typer.Argument(metavar="SRC", help="Folder, pattern, log or URL.")]
-Out = Annotated[str, typer.Argument(metavar="OUT", help="Folder or URL; each log keeps its path from SRC.")]
-Address = Annotated[str | None, typer.Option(help="Of a Ray cluster (or auto); without, this machine's cores.")]
-Resume = Annotated[bool, typer.Option("--resume", help="Go on: what is done and still stands is skipped.")]
-Recheck = Annotated[bool, typer.Option("--recheck", help="With --resume: read what is done again, whole.")]
-Workers = Annotated[int | None, typer.Option(min=1, help="Logs worked on at once; else one per core.")]
-Memory = Annotated[str, typer.Option("--memory-per-task", metavar="SIZE", help="Set aside for each log, as 800M or 2G.")]
-Retries = Annotated[int, typer.Option(min=0, help="How often a log is given to another worker when one dies.")]
+SHOWN = 10  # logs that are not whole; all are in fleet.parquet
+RESUME = "Go on: what is done and still stands is skipped."
+CODES = "\n\nExit code: 0 all whole; 3 something lost or quarantined; else the largest code of the logs that failed."
 
 
-@fleet.command(epilog="Example: [bold]imutool fleet debias logs/ clean/ --model euroc-adis16448-hybrid --resume[/]")
+def _common(
+    source: Annotated[str, typer.Argument(metavar="SRC", help="A folder, pattern, log or URL.")],
+    target: Annotated[str, typer.Argument(metavar="OUT", help="Folder or URL; every log keeps its path below SRC.")],
+    *,
+    address: Annotated[str | None, typer.Option(help="Of a Ray cluster, or auto; without, this machine's cores.")] = None,
+    resume: Annotated[bool, typer.Option("--resume", help=RESUME)] = False,
+    recheck: Annotated[bool, typer.Option("--recheck", help="With --resume: read all that is done again.")] = False,
+    report: Annotated[str | None, typer.Option(metavar="F.html", help="Write a page about the fleet.")] = None,
+    workers: Annotated[int | None, typer.Option(min=1, help="Logs worked on at once; else one per core.")] = None,
+    memory: Annotated[str, typer.Option("--memory-per-task", metavar="SIZE", help="Set aside for a log: 800M, 2G.")] = "1G",
+    retries: Annotated[int, typer.Option(min=0, help="Times a log is given to another worker when one dies.")] = 3,
+    dashboard: Annotated[bool, typer.Option("--dashboard", help="Start Ray's, on 127.0.0.1.")] = False,
+    overwrite: Overwrite = False,
+    json_to: Json = None,
+    verbose: Verbose = False,
+    quiet: Quiet = False,
+) -> None:
+    """The options of every fleet command."""
+
+
+def _command(example: str) -> Callable[[Callable[..., Settings]], Callable[..., Settings]]:
+    """A command made of a function from its own options to settings, with the options of all around them."""
+
+    def made(settings_of: Callable[..., Settings]) -> Callable[..., Settings]:
+        shared, own = (inspect.signature(f, eval_str=True).parameters for f in (_common, settings_of))
+
+        def command(**words: Any) -> None:
+            _run(settings_of(**{name: words.pop(name) for name in own}), **words)
+
+        order = [shared["source"], shared["target"], *own.values(), *list(shared.values())[2:]]
+        as_options = [one.replace(kind=inspect.Parameter.KEYWORD_ONLY) for one in order]
+        command.__name__, command.__doc__ = settings_of.__name__, settings_of.__doc__
+        command.__signature__ = inspect.Signature(as_options)  # type: ignore[attr-defined]
+        command.__annotations__ = {one.name: one.annotation for one in as_options}
+        fleet.command(epilog=f"Example: [bold]imutool fleet {example}[/]{CODES}")(command)
+        return settings_of
+
+    return made
+
+
+@_command("debias logs/ clean/ --model euroc-adis16448-hybrid --report clean.html")
 def debias(
-    source: Src,
-    out: Out,
     model: Annotated[str | None, typer.Option(help="Model file or a name that ships; else as each log's metadata say.")] = None,
     init: Init = "auto",
     smooth: Smooth = False,
-    address: Address = None,
-    resume: Resume = False,
-    recheck: Recheck = False,
-    workers: Workers = None,
-    memory: Memory = "1G",
-    retries: Retries = 3,
-    overwrite: Overwrite = False,
-    json_to: Json = None,
-    verbose: Verbose = False,
-    quiet: Quiet = False,
-) -> None:
-    """Debias every log."""
+) -> Settings:
+    """Debias every log, as `imutool debias` does."""
     from imutool.debias import refuse_smooth
     from imutool.fleet.models import settled
-    from imutool.fleet.task import Settings
 
     refuse_smooth(init, smooth)
-    _run(
-        source, out, settled(Settings(command="debias", model=model, init=init, smooth=smooth)), address, resume, recheck,
-        workers, memory, retries, overwrite, json_to, verbose, quiet
+    return settled(Settings(command="debias", model=model, init=init, smooth=smooth))
+
+
+@_command("info logs/ about/ --report logs.html")
+def info() -> Settings:
+    """Say of every log what is in it, as `imutool info --json` does."""
+    return Settings(command="info")
+
+
+@_command("diagnose logs/ diagnosis/ --robot-from '^([^/]+)/' --report robots.html")
+def diagnose(
+    sim: Annotated[
+        str | None, typer.Option(metavar="DIR", help="Simulations under the logs' names; else their own true poses.")
+    ] = None,
+    robot_from: Annotated[
+        str | None,
+        typer.Option("--robot-from", metavar="PATTERN", help="Regular expression on names, or metadata:RECORD.KEY; else folder."),
+    ] = None,
+    search: Annotated[bool, typer.Option(help="Also search each log for physics beyond what robots are compared by.")] = True,
+    imu: Imu = None,
+    truth: Truth = None,
+) -> Settings:
+    """One kind of sensor on many robots: what all share, and which robot is unlike the others."""
+    from pathlib import Path
+
+    from imutool.fleet.work import robot_pattern
+    from imutool.place import place
+
+    robot_pattern(robot_from)
+    there = None if sim is None else place(sim)
+    where = there.absolute() if isinstance(there, Path) else there
+    return Settings(
+        command="diagnose",
+        sim=None if where is None else str(where),
+        robot_from=robot_from,
+        quick=not search,
+        imu=imu,
+        truth=truth,
     )
 
 
-@fleet.command(epilog="Example: [bold]imutool fleet info logs/ about/[/]")
-def info(
-    source: Src,
-    out: Out,
-    address: Address = None,
-    resume: Resume = False,
-    recheck: Recheck = False,
-    workers: Workers = None,
-    memory: Memory = "1G",
-    retries: Retries = 3,
-    overwrite: Overwrite = False,
-    json_to: Json = None,
-    verbose: Verbose = False,
-    quiet: Quiet = False,
+def _run(
+    settings: Settings,
+    *,
+    source: str,
+    target: str,
+    address: str | None,
+    resume: bool,
+    recheck: bool,
+    report: str | None,
+    workers: int | None,
+    memory: str,
+    retries: int,
+    dashboard: bool,
+    overwrite: bool,
+    json_to: str | None,
+    verbose: bool,
+    quiet: bool,
 ) -> None:
-    """Say of every log what is in it, as `imutool info --json` does."""
-    from imutool.fleet.task import Settings
-
-    _run(source, out, Settings(command="info"), address, resume, recheck, workers, memory, retries, overwrite, json_to, verbose, quiet)
-
-
-def _run(source, out, settings, address, resume, recheck, workers, memory, retries, overwrite, json_to, verbose, quiet) -> None:  # type: ignore
     from imutool.fleet.engine import Engine
     from imutool.fleet.run import run
+    from imutool.place import place
 
     size = memory_bytes(memory)
-    with progress("Fleet", verbose, quiet) as tell:
-        report = run(
+    page = None if report is None else place(report)
+    with progress(f"Fleet {settings.command}", verbose, quiet) as tell:
+        done = run(
             source,
-            out,
+            target,
             settings,
-            lambda: Engine(address, workers=workers, memory_bytes=size, retries=retries),
+            lambda: Engine(address, workers=workers, memory_bytes=size, retries=retries, dashboard=dashboard),
             resume=resume,
             overwrite=overwrite,
             recheck=recheck,
+            page=page,
             tell=tell,
         )
-    say(report.tally.words())
-    raise typer.Exit(report.tally.exit_code)
+    if not write_json(done.plain(), json_to):
+        _show(done, report)
+    raise typer.Exit(done.tally.exit_code)
+
+
+def _show(done: FleetReport, report: str | None) -> None:
+    for one in done.trouble[:SHOWN]:
+        why = one.error or "; ".join(one.losses) or "; ".join(one.warnings)
+        line = f"[yellow]{one.earlier or one.status}:[/] {plain(why if one.source in why else f'{one.source}: {why}')}"
+        out.print(line, highlight=False, soft_wrap=True)
+    if len(done.trouble) > SHOWN:
+        say("and more")
+    if done.compared is not None:
+        say(done.compared.summary)
+        for outlier in done.compared.outliers:
+            say(outlier.sentence)
+    made = [str(done.out / "fleet.parquet"), *([report] if report else [])]
+    say(f"{done.tally.words()}; {', '.join(made)}")
 
 
 def memory_bytes(text: str) -> int:

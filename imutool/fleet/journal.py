@@ -3,6 +3,9 @@
 A line says that a target was begun (so that a later run knows it for the fleet's own), or what became of a log. One process
 writes, holding a lock that goes with it. A line that was torn when that process died is cut off; a line that is no longer
 readable is passed over, and its log done again.
+
+In an object store, where nothing can be appended to, OUT/fleet.journal/ holds pieces of it: each is written over with one line
+more until it is large enough for the next to begin, and what is read is a copy. Nobody there can hold a lock.
 """
 
 from __future__ import annotations
@@ -10,17 +13,21 @@ from __future__ import annotations
 import contextlib
 import fcntl
 import os
+import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 from types import TracebackType
+from typing import IO
 
 import msgspec
 
 from imutool import __version__
 from imutool.errors import ConfigError
 from imutool.fleet.task import Result, Settings
+from imutool.place import Place, failures, reason
 
 NAME = "fleet.journal"
+PIECE_BYTES = 256 << 10  # of a journal in a store
 
 
 class Run(msgspec.Struct, frozen=True, tag_field="line", tag="run"):
@@ -51,15 +58,20 @@ class Journal:
             `overwrite`); another process writes to it; or it cannot be written.
     """
 
-    def __init__(self, out: Path, settings: Settings, *, resume: bool = False, overwrite: bool = False) -> None:
+    def __init__(self, out: Place, settings: Settings, *, resume: bool = False, overwrite: bool = False) -> None:
         self.path = out / NAME
         self._begun: set[str] = set()
         self._done: dict[str, int] = {}
+        self._pieces: _Pieces | None = None
         try:
-            out.mkdir(parents=True, exist_ok=True)
-            self._file = self.path.open("a+b")
-        except OSError as error:
-            raise ConfigError(f"cannot be written ({error.strerror})", where=self.path, fix="Choose another OUT") from error
+            if isinstance(out, Path):
+                out.mkdir(parents=True, exist_ok=True)
+                self._file: IO[bytes] = (out / NAME).open("a+b")
+            else:
+                self._file = tempfile.TemporaryFile()
+                self._pieces = _Pieces(self.path, self._file)
+        except failures(out) as error:
+            raise ConfigError(f"cannot be written ({reason(error)})", where=self.path, fix="Choose another OUT") from error
         try:
             self._lock()
             known = self._read()
@@ -67,6 +79,8 @@ class Journal:
                 self._refuse(known, settings, resume, overwrite)
                 if not resume:
                     self._file.truncate(0)
+                    if self._pieces is not None:
+                        self._pieces.clear()
                     self._done.clear()  # but what was begun stays the fleet's own
             self._append(Run(settings, settings.digest))
         except BaseException:
@@ -109,12 +123,15 @@ class Journal:
         try:
             self._file.write(raw)
             self._file.flush()
-            os.fsync(self._file.fileno())
-        except OSError as error:
+            if self._pieces is None:
+                os.fsync(self._file.fileno())
+            else:
+                self._pieces.append(raw)
+        except failures(self.path) as error:
             with contextlib.suppress(OSError):
                 self._file.truncate(at)
             raise ConfigError(
-                f"cannot be written ({error.strerror})", where=self.path, fix="Make room, and go on with --resume"
+                f"cannot be written ({reason(error)})", where=self.path, fix="Make room, and go on with --resume"
             ) from error
         return at
 
@@ -166,6 +183,31 @@ class Journal:
                 where=self.path.parent,
                 fix="Give the same ones, choose another OUT, or add --overwrite to do all logs again",
             )
+
+
+class _Pieces:
+    """A journal in a store; `file` gets what is there."""
+
+    def __init__(self, folder: Place, file: IO[bytes]) -> None:
+        self._folder, self._held = folder, bytearray()
+        there = sorted(folder.glob("*.jsonl"))
+        for piece in there:
+            raw = piece.read_bytes()
+            file.write(raw if raw.endswith(b"\n") or not raw else raw + b"\n")
+        self._number = 1 + max((int(one.stem) for one in there if one.stem.isdecimal()), default=-1)
+
+    def append(self, raw: bytes) -> None:
+        """Writes the piece over with one line more."""
+        if len(self._held) > PIECE_BYTES:
+            self._held.clear()
+            self._number += 1
+        self._held += raw
+        (self._folder / f"{self._number:08d}.jsonl").write_bytes(bytes(self._held))
+
+    def clear(self) -> None:
+        """Removes all of them."""
+        for piece in self._folder.glob("*.jsonl"):
+            piece.unlink()
 
 
 def _difference(known: Run, settings: Settings) -> str:

@@ -11,11 +11,12 @@ from typing import Any, NamedTuple
 
 from imutool.errors import ConfigError
 from imutool.fleet.task import Source
-from imutool.place import Place, place
+from imutool.place import Place, failures, place, reason
 
 LOG = ".mcap"
 PATTERN = re.compile(r"[*?\[]")
 LONGEST = 200  # bytes of one part of a name: room for what is written beside it under another, within the usual 255
+PARTIAL = re.compile(r"\.(?P<name>.+)\.\d+\.[0-9a-f]{8}\.partial", re.DOTALL)
 OWN = "fleet."  # how the names of what the fleet itself writes at the top of OUT begin
 
 
@@ -24,6 +25,13 @@ class Found(NamedTuple):
 
     logs: list[Source]
     refused: list[tuple[str, str]]
+
+
+class _File(NamedTuple):
+    """A file as a listing gives it; what a store's listing says of it besides, so that it need not be asked again."""
+
+    where: str
+    about: dict[str, Any] | None = None
 
 
 def find(text: str, out: Place) -> Found:
@@ -37,17 +45,17 @@ def find(text: str, out: Place) -> Found:
     """
     root, files = _files(text)
     logs, refused, taken = [], [], dict[str, str]()
-    for file in files:
-        if _below(file, out):
+    for where, about in files:
+        if f"{where}/".startswith(f"{str(out).rstrip('/')}/"):
             continue
         try:
-            name = relative(str(file), str(root))
-            before = taken.setdefault(name.casefold(), str(file))  # one file on some systems, two on others
-            if before != str(file):
+            name = relative(where, root)
+            before = taken.setdefault(name.casefold(), where)  # one file on some systems, two on others
+            if before != where:
                 raise ConfigError(f"would be called {name}, and so would {before}", fix="Rename one of the two")
-            logs.append(Source(str(file), name, *identity(file)))
+            logs.append(Source(where, name, *(identity(Path(where)) if about is None else _seal(about))))
         except ConfigError as error:
-            refused.append((_shown(str(file)), str(error)))
+            refused.append((_shown(where), str(error)))
     if not logs and not refused:
         raise ConfigError(f"no {LOG} log", where=text, expected="a log, a folder with logs, or a pattern that fits some")
     logs.sort(key=lambda one: one.name)
@@ -85,9 +93,13 @@ def identity(file: Place) -> tuple[int, str]:
         if isinstance(file, Path):
             status = file.stat()
             return status.st_size, str(status.st_mtime_ns)
-        about: dict[str, Any] = file.fs.info(file.path)
-    except OSError as error:
-        raise ConfigError(f"cannot be read ({error.strerror or error})", fix="See who may read it") from error
+        return _seal(file.fs.info(file.path))
+    except failures(file) as error:
+        raise ConfigError(f"cannot be read ({reason(error)})", where=file, fix="See who may read it") from error
+
+
+def _seal(about: dict[str, Any]) -> tuple[int, str]:
+    """Size and etag as a store says them, by whatever name."""
     names = ("ETag", "etag", "md5Hash", "content_md5", "LastModified", "last_modified", "mtime", "created")
     stamp = next((str(about[name]) for name in names if about.get(name)), "")
     return int(about["size"]), stamp.strip('"')
@@ -98,59 +110,58 @@ def _shown(name: str) -> str:
     return name.encode("utf-8", "surrogateescape").decode("utf-8", "backslashreplace")
 
 
-def _files(text: str) -> tuple[Place, Iterator[Place]]:
+def _files(text: str) -> tuple[str, Iterator[_File]]:
     """Where names begin, and the files."""
-    if "://" in text:
+    where = place(text)
+    if not isinstance(where, Path):
         return _in_store(text)
-    path = Path(text)
-    if path.is_dir():
-        root = path.absolute()
-        return root, _walk(root, frozenset())
-    if path.is_file():
-        return path.absolute().parent, iter([path.absolute()])
-    if not PATTERN.search(text):
+    if where.is_dir():
+        root = where.absolute()
+        return str(root), _walk(root, frozenset())
+    if where.is_file():
+        return str(where.absolute().parent), iter([_File(str(where.absolute()))])
+    if not PATTERN.search(str(where)):
         raise ConfigError("is not there", where=text, expected="a log, a folder with logs, or a pattern")
     root = Path.cwd()
-    for part in path.parts:
+    for part in where.parts:
         if PATTERN.search(part):
             break
         root /= part
-    named = (Path(os.path.abspath(one)) for one in globs.iglob(text, recursive=True))  # noqa: PTH100  # keeps links
-    return Path(os.path.abspath(root)), (one for one in named if one.suffix == LOG and one.is_file())  # noqa: PTH100
+    named = sorted(globs.iglob(str(where), recursive=True))
+    return os.path.abspath(root), (_File(os.path.abspath(one)) for one in named if one.endswith(LOG) and Path(one).is_file())  # noqa: PTH100  # links stay
 
 
-def _walk(folder: Path, above: frozenset[tuple[int, int]]) -> Iterator[Path]:
+def _walk(folder: Path, above: frozenset[tuple[int, int]]) -> Iterator[_File]:
     """The logs below a folder, through links too, but never into a folder that one is in already."""
-    status = folder.stat()
-    here = (status.st_dev, status.st_ino)
-    if here in above:
-        return
     try:
-        entries = sorted(os.scandir(folder), key=lambda entry: entry.name)
+        status = folder.stat()
+        here = (status.st_dev, status.st_ino)
+        entries = [] if here in above else sorted(os.scandir(folder), key=lambda entry: entry.name)
     except OSError as error:
         raise ConfigError(f"cannot be read ({error.strerror})", where=folder) from error
     for entry in entries:
         if entry.is_dir():
             yield from _walk(folder / entry.name, above | {here})
         elif entry.name.endswith(LOG):
-            yield folder / entry.name
+            yield _File(str(folder / entry.name))
 
 
-def _in_store(text: str) -> tuple[Place, Iterator[Place]]:
+def _in_store(text: str) -> tuple[str, Iterator[_File]]:
+    """As `_files`, by listings alone: a thousand objects a request."""
     match = PATTERN.search(text)
     fixed = text.rstrip("/") if match is None else text[: match.start()].rpartition("/")[0]
     root = place(fixed)
-    if match is not None:
-        return root, (one for one in root.glob(text[len(fixed) :].lstrip("/")) if one.suffix == LOG and one.is_file())
-    if root.is_dir():
-        return root, (one for one in root.rglob(f"*{LOG}") if one.is_file())
-    if not root.exists():
-        raise ConfigError("is not there", where=text, expected="a log, a folder with logs, or a pattern")
-    return root.parent, iter([root])
-
-
-def _below(file: Place, out: Place) -> bool:
-    return f"{file}/".startswith(f"{out}/")
+    assert not isinstance(root, Path), "who calls has seen that it is none"
+    try:
+        if match is None:
+            found = root.fs.find(root.path, detail=True)
+        else:
+            found = root.fs.glob(root.path.rstrip("/") + text[len(fixed) :], detail=True)
+    except failures(root) as error:
+        raise ConfigError(f"cannot be listed ({reason(error)})", where=text) from error
+    whole = fixed.rpartition("/")[0] if list(found) == [root.path] else fixed  # a log alone, by its own name
+    files = [_File(fixed + path[len(root.path.rstrip("/")) :], about) for path, about in sorted(found.items())]
+    return whole, (one for one in files if one.where.endswith(LOG) and one.about and one.about.get("type", "file") == "file")
 
 
 def within(out: Place, name: str) -> Place:
@@ -167,14 +178,36 @@ def within(out: Place, name: str) -> Place:
     return target
 
 
-def leftovers(out: Path, names: Iterable[str]) -> Iterator[Path]:
+def leftovers(out: Place, names: Iterable[str]) -> Iterator[Place]:
     """Files that were being written beside these targets when somebody was killed: .NAME.PID.RANDOM.partial."""
-    partial = re.compile(r"\.(?P<name>.+)\.\d+\.[0-9a-f]{8}\.partial", re.DOTALL)
-    folders: dict[Path, set[str]] = {}
+    folders: dict[str, set[str]] = {}
     for name in names:
-        folders.setdefault((out / name).parent, set()).add(name.rpartition("/")[2])
+        folder, _, file = name.rpartition("/")
+        folders.setdefault(folder, set()).add(file)
     for folder, ours in folders.items():
-        for path in folder.glob(".*.partial"):
-            match = partial.fullmatch(path.name)
+        for path in _partial(out / folder if folder else out):
+            match = PARTIAL.fullmatch(path.name)
             if match is not None and match["name"] in ours:
                 yield path
+
+
+def remove(leftover: Iterable[Place]) -> None:
+    """Removes them, unless somebody else has meanwhile.
+
+    Raises:
+        ConfigError: the system refuses.
+    """
+    for path in leftover:
+        try:
+            path.unlink()
+        except FileNotFoundError:
+            continue
+        except failures(path) as error:
+            raise ConfigError(f"cannot be removed ({reason(error)})", where=path) from error
+
+
+def _partial(folder: Place) -> list[Place]:
+    try:
+        return list(folder.glob(".*.partial"))
+    except failures(folder) as error:
+        raise ConfigError(f"cannot be listed ({reason(error)})", where=folder) from error

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import json
 import platform
 import re
@@ -18,7 +17,7 @@ import msgspec
 
 from imutool.diagnosis_folder import plain
 from imutool.errors import ConfigError, ImutoolError, LogError
-from imutool.fleet.sources import identity, leftovers, within
+from imutool.fleet.sources import identity, leftovers, remove, within
 from imutool.fleet.task import Imu, Parameter, Result, Settings, Task
 from imutool.mcap_io.log import Log
 from imutool.mcap_io.rewrite import sha256
@@ -95,9 +94,7 @@ def _clear(task: Task, target: Place) -> None:
     """Makes the folder, and removes what a killed attempt at this target left in it."""
     if isinstance(target, Path):
         target.parent.mkdir(parents=True, exist_ok=True)
-        for path in leftovers(Path(task.out), [task.target]):
-            with contextlib.suppress(FileNotFoundError):
-                path.unlink()
+    remove(leftovers(place(task.out), [task.target]))
 
 
 def _measured(target: Place) -> dict[str, Any]:
@@ -120,7 +117,7 @@ def _info(job: _Job) -> dict[str, Any]:
     from imutool.info import inspect
 
     report = inspect(job.source)
-    _write(report, job.target)
+    write_json(report, job.target)
     return {"messages": report["messages"], "duration_s": report["duration_s"], "warnings": tuple(report["warnings"])}
 
 
@@ -145,7 +142,7 @@ def _diagnose(job: _Job) -> dict[str, Any]:
         report["diagnosis"] = plain(found)
         told["effects"] = tuple(one.effect for one in found.findings)
         told["warnings"] = found.remarks
-    _write(report, job.target)
+    write_json(report, job.target)
     return told
 
 
@@ -155,24 +152,39 @@ def robot_of(name: str, pattern: str | None, log: Place) -> str:
     Raises:
         ConfigError: the pattern is none, or fits neither.
     """
-    if pattern is None:
+    fits = robot_pattern(pattern)
+    if fits is None:
         folder, _, file = name.rpartition("/")
         return folder or file.removesuffix(".mcap")
-    where = "--robot-from"
-    if pattern.startswith("metadata:"):
-        record, _, key = pattern.removeprefix("metadata:").rpartition(".")
+    if isinstance(fits, str):
+        record, _, key = fits.rpartition(".")
         with Log(log) as opened:
             found = opened.metadata().get(record, {}).get(key, "")
         if not found:
-            raise ConfigError(f"{name} has no {key!r} in its metadata {record!r}", where=where)
+            raise ConfigError(f"has no {key!r} in its metadata {record!r}", where=log)
         return found
-    try:
-        match = re.search(pattern, name)
-    except re.error as error:
-        raise ConfigError(f"{pattern!r} is no pattern ({error})", where=where) from error
+    match = fits.search(name)
     if match is None:
-        raise ConfigError(f"{pattern!r} fits nothing in {name}", where=where)
-    return match[1] if match.re.groups else match[0]
+        raise ConfigError(f"{fits.pattern!r} fits nothing in {name}", where="--robot-from")
+    return str(match[1] if fits.groups else match[0])
+
+
+def robot_pattern(pattern: str | None) -> re.Pattern[str] | str | None:
+    """A regular expression on names, or RECORD.KEY of metadata.
+
+    Raises:
+        ConfigError: it is neither.
+    """
+    if pattern is None:
+        return None
+    if pattern.startswith("metadata:"):
+        if "." not in pattern:
+            raise ConfigError(f"{pattern!r} names no metadata", where="--robot-from", expected="metadata:RECORD.KEY")
+        return pattern.removeprefix("metadata:")
+    try:
+        return re.compile(pattern)
+    except re.error as error:
+        raise ConfigError(f"{pattern!r} is no pattern ({error})", where="--robot-from") from error
 
 
 def _simulation(folder: Place, name: str) -> Place:
@@ -183,7 +195,7 @@ def _simulation(folder: Place, name: str) -> Place:
     return found
 
 
-def _write(report: Mapping[str, Any], target: Place) -> None:
+def write_json(report: Mapping[str, Any], target: Place) -> None:
     with Target(target, overwrite=True) as out:
         out.write(json.dumps(report, indent=2, allow_nan=False, ensure_ascii=False).encode() + b"\n")
 
