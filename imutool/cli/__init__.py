@@ -7,7 +7,22 @@ from __future__ import annotations
 
 import os
 
-from imutool.cli import conceal, convert, debias, demo, diagnose, evaluate, export, fleet, info, models, simulate, train, view, vio
+from imutool.cli import (
+    conceal,
+    convert,
+    debias,
+    demo,
+    diagnose,
+    evaluate,
+    export,
+    fleet,
+    info,
+    models,
+    simulate,
+    train,
+    view,
+    vio,
+)
 from imutool.cli._app import app, caught
 
 COMMANDS = (convert, info, train, debias, evaluate, view, export, vio, simulate, diagnose, conceal, models, demo, fleet)

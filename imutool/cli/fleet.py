@@ -98,7 +98,9 @@ def diagnose(
     ] = None,
     robot_from: Annotated[
         str | None,
-        typer.Option("--robot-from", metavar="PATTERN", help="Regular expression on names, or metadata:RECORD.KEY; else folder."),
+        typer.Option(
+            "--robot-from", metavar="PATTERN", help="Regular expression on names, or metadata:RECORD.KEY; else folder."
+        ),
     ] = None,
     search: Annotated[bool, typer.Option(help="Also search each log for physics beyond what robots are compared by.")] = True,
     imu: Imu = None,

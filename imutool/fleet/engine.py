@@ -143,7 +143,11 @@ class Engine:
         )
 
     def _start(self, address: str | None, dashboard: bool) -> None:
-        wanted: dict[str, Any] = {"log_to_driver": False, "configure_logging": False, **({} if address is None else {"runtime_env": {"env_vars": IN_WORKERS}})}
+        wanted: dict[str, Any] = {
+            "log_to_driver": False,
+            "configure_logging": False,
+            **({} if address is None else {"runtime_env": {"env_vars": IN_WORKERS}}),
+        }
         if address is None:
             self._folder = tempfile.mkdtemp(prefix="imutool-fleet.")
             wanted |= {
@@ -188,4 +192,3 @@ def _ray(*, local: bool) -> Any:
     except ImportError as error:
         raise ConfigError("a fleet needs ray, which is not installed", fix="pip install 'imutool[fleet]'") from error
     return ray
-

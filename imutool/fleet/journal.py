@@ -68,7 +68,7 @@ class Journal:
                 out.mkdir(parents=True, exist_ok=True)
                 self._file: IO[bytes] = (out / NAME).open("a+b")
             else:
-                self._file = tempfile.TemporaryFile()
+                self._file = tempfile.TemporaryFile()  # noqa: SIM115  closed with the journal
                 self._pieces = _Pieces(self.path, self._file)
         except failures(out) as error:
             raise ConfigError(f"cannot be written ({reason(error)})", where=self.path, fix="Choose another OUT") from error
@@ -139,7 +139,9 @@ class Journal:
         try:
             fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError as error:
-            raise ConfigError("another run is at work here", where=self.path, fix="Wait for it, or choose another OUT") from error
+            raise ConfigError(
+                "another run is at work here", where=self.path, fix="Wait for it, or choose another OUT"
+            ) from error
 
     def _read(self) -> Run | None:
         """Takes in what is there, cuts a torn last line off, and returns the last run's line."""
@@ -190,7 +192,7 @@ class _Pieces:
 
     def __init__(self, folder: Place, file: IO[bytes]) -> None:
         self._folder, self._held = folder, bytearray()
-        there = sorted(folder.glob("*.jsonl"))
+        there: list[Place] = sorted(folder.glob("*.jsonl"), key=str)
         for piece in there:
             raw = piece.read_bytes()
             file.write(raw if raw.endswith(b"\n") or not raw else raw + b"\n")

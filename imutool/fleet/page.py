@@ -19,6 +19,7 @@ from imutool.view import diagnosis_figures as figures
 from imutool.view.diagnosis_page import POLICY, STYLE, text
 
 MOST_ROWS = 500  # in a table: more is for the Parquet file
+MOST_NAMED = 10  # robots with an effect
 BINS = 30
 COLORS = (figures.X, figures.Y, figures.Z)
 UNIT = {"gyro": "rad/s", "accel": "m/s²"}
@@ -98,7 +99,7 @@ def html(
         seen.take(one)
     body = [
         f"<h1>imutool fleet {text(settings.command)} of {text(source)}</h1>",
-        f'<p class="conclusion">{text(_conclusion(seen))}</p>',
+        f'<p class="conclusion">{text(_conclusion(seen, compared))}</p>',
         *_numbers(seen, seconds),
         *(_outliers(compared) if compared is not None else ()),
         *_trouble(seen),
@@ -111,10 +112,17 @@ def html(
         '<meta name="viewport" content="width=device-width, initial-scale=1">'
         f"<title>Fleet {text(settings.command)}: {text(source)}</title><style>{STYLE}{OWN_STYLE}</style>"
     )
-    return f'<!DOCTYPE html>\n<html lang="en"><head>{head}</head>\n<body><main>\n' + "\n".join(body) + "\n</main></body></html>\n"
+    return (
+        f'<!DOCTYPE html>\n<html lang="en"><head>{head}</head>\n<body><main>\n' + "\n".join(body) + "\n</main></body></html>\n"
+    )
 
 
-def _conclusion(seen: _Seen) -> str:
+def _conclusion(seen: _Seen, compared: Compared | None) -> str:
+    whole = _how_whole(seen)
+    return whole if compared is None else f"{compared.summary} {whole}"
+
+
+def _how_whole(seen: _Seen) -> str:
     logs = seen.statuses.total() - seen.statuses["skipped"]
     told = [f"{seen.statuses[name]} {name}" for name in TROUBLE if seen.statuses[name]]
     if not told:
@@ -128,16 +136,21 @@ def _numbers(seen: _Seen, seconds: float) -> Iterator[str]:
         (f"{seen.statuses.total() - seen.statuses['skipped']:,}", "logs"),
         (size(seen.bytes_in), "read"),
         (size(seen.bytes_out), "written"),
-        (f"{seen.messages:,}", "messages"),
         (duration(seconds), "this run"),
     ]
+    if seen.messages:
+        cards.append((f"{seen.messages:,}", "messages"))
     if seen.statuses["skipped"]:
         cards.append((f"{seen.statuses['skipped']:,}", "done by an earlier run"))
     if seen.seconds:
         cards.append((f"{np.median(seen.speeds):.3g} MB/s", "of one worker, in the middle"))
     if seen.peak_bytes:
         cards.append((size(seen.peak_bytes), "most memory of a worker"))
-    yield '<div class="numbers">' + "".join(f"<div><b>{text(n)}</b><span>{text(what)}</span></div>" for n, what in cards) + "</div>"
+    yield (
+        '<div class="numbers">'
+        + "".join(f"<div><b>{text(n)}</b><span>{text(what)}</span></div>" for n, what in cards)
+        + "</div>"
+    )
 
 
 def _trouble(seen: _Seen) -> Iterator[str]:
@@ -168,20 +181,28 @@ def _warnings(seen: _Seen) -> Iterator[str]:
 
 def _outliers(compared: Compared) -> Iterator[str]:
     yield "<h2>Robots unlike the others</h2>"
-    yield f'<p class="note">{text(compared.summary)}</p>'
-    if compared.outliers:
+    if not compared.outliers:
+        yield '<p class="note">None.</p>'
+    else:
         head = "".join(f"<th>{one}</th>" for one in ("Robot", "What", "Here", "The others", "Distance", "False discovery"))
         rows = "".join(_outlier(one) for one in compared.outliers[:MOST_ROWS])
         yield f'<div class="scroll"><table><thead><tr>{head}</tr></thead><tbody>{rows}</tbody></table></div>'
     if compared.shared:
         yield "<h2>What all share</h2>"
-        head = "".join(f"<th>{one}</th>" for one in ("Effect", "Middle", "Spread between robots", "Robots"))
+        head = "".join(f"<th>{one}</th>" for one in ("Effect", "Middle of the robots ± their spread", "Robots"))
         rows = "".join(
-            f"<tr><td>{text(one.label)}</td><td class=number>{text(one.told(one.middle))}</td>"
-            f"<td class=number>{text(one.told(one.spread))}</td><td class=number>{one.robots}</td></tr>"
+            f"<tr><td>{text(one.label)}</td><td class=number>{text(one.told)}</td><td class=number>{one.robots}</td></tr>"
             for one in compared.shared
         )
         yield f"<table><thead><tr>{head}</tr></thead><tbody>{rows}</tbody></table>"
+    if compared.effects:
+        yield "<h2>What else was found</h2>"
+        rows = "".join(
+            f"<tr><td>{text(name.replace('_', ' '))}</td><td class=number>{len(robots)} of {compared.robots}</td>"
+            f"<td>{text(', '.join(robots[:MOST_NAMED]))}{', …' if len(robots) > MOST_NAMED else ''}</td></tr>"
+            for name, robots in compared.effects.items()
+        )
+        yield f"<table><thead><tr><th>Effect</th><th>Robots</th><th>Which</th></tr></thead><tbody>{rows}</tbody></table>"
 
 
 def _outlier(one: Outlier) -> str:
@@ -230,6 +251,7 @@ def _one(columns: Sequence[tuple[Sequence[float], str]], name: str) -> str:
 def _histogram(axes: Any, values: Float64[np.ndarray, " n"], label: str, color: str) -> None:
     axes.hist(values, bins=min(BINS, max(5, len(values) // 2)), color=color, alpha=0.7)
     axes.set(xlabel=label, ylabel="logs")
+    axes.set_axisbelow(True)
     axes.locator_params(axis="x", nbins=5)
     axes.locator_params(axis="y", nbins=4, integer=True)
 
@@ -240,7 +262,11 @@ def _figure(svg: str, prefix: str, caption: str) -> str:
 
 def _provenance(settings: Settings) -> Iterator[str]:
     yield "<h2>What was done</h2><dl>"
-    entries = {"command": settings.command, "model": settings.model or "as each log says", "model sha256": settings.model_sha256}
+    entries = {
+        "command": settings.command,
+        "model": settings.model or "as each log says",
+        "model sha256": settings.model_sha256,
+    }
     entries |= {"init": settings.init, "smooth": "yes" if settings.smooth else "no"} if settings.command == "debias" else {}
     for name, value in entries.items():
         if value and (settings.command == "debias" or not name.startswith("model")):
@@ -250,13 +276,11 @@ def _provenance(settings: Settings) -> Iterator[str]:
 
 def size(count: float) -> str:
     """Bytes in a unit that suits them: `52.6 MB`."""
-    for unit in ("B", "kB", "MB", "GB", "TB"):
-        if count < 999.5:
-            break
-        count /= 1000.0
-    else:
-        unit = "PB"
-    return f"{count:.3g} {unit}"
+    units = ("B", "kB", "MB", "GB", "TB", "PB")
+    step = 0
+    while count >= 999.5 and step < len(units) - 1:
+        count, step = count / 1000.0, step + 1
+    return f"{count:.3g} {units[step]}"
 
 
 def duration(seconds: float) -> str:

@@ -44,9 +44,10 @@ class Shared(NamedTuple):
     spread: float
     robots: int
 
-    def told(self, number: float) -> str:
-        """A number of this parameter, in a unit that suits it."""
-        return told(Estimate(number, 0.0, self.unit))
+    @property
+    def told(self) -> str:
+        """`0.13 ± 0.19 %`: the middle, and the spread between robots."""
+        return told(Estimate(self.middle, self.spread, self.unit))
 
 
 class Outlier(NamedTuple):
@@ -87,14 +88,13 @@ class Outlier(NamedTuple):
 
 @dataclass(frozen=True)
 class Compared:
-    """What all robots share, and the outliers, the clearest first; `remarks` on what could not be compared."""
+    """What all robots share, and the outliers, the clearest first."""
 
     robots: int
     logs: int
     shared: tuple[Shared, ...]
     outliers: tuple[Outlier, ...]
     effects: Mapping[str, tuple[str, ...]]  # found by a search beyond what all are compared by: on which robots
-    remarks: tuple[str, ...]
 
     @property
     def summary(self) -> str:
@@ -116,7 +116,6 @@ class Compared:
             "outliers": [one._asdict() | {"sentence": one.sentence} for one in self.outliers],
             "shared": [one._asdict() for one in self.shared],
             "effects": {name: list(robots) for name, robots in self.effects.items()},
-            "remarks": list(self.remarks),
         }
 
 
@@ -134,7 +133,9 @@ def compare(results: Iterable[Result]) -> Compared:
     pooled = {robot: _pooled([one.parameters for one in own]) for robot, own in sorted(logs.items())}
     units = {(p.effect, p.name): p.unit for own in logs.values() for one in own for p in one.parameters}
     names = list(units)
-    values = np.array([[pooled[robot].get(name, (np.nan, np.nan)) for name in names] for robot in pooled]).reshape(-1, len(names), 2)
+    values = np.array([[pooled[robot].get(name, (np.nan, np.nan)) for name in names] for robot in pooled]).reshape(
+        -1, len(names), 2
+    )
     x, std = values[..., 0], values[..., 1]
     shared, found = [], []
     for k, name in enumerate(names):
@@ -153,7 +154,6 @@ def compare(results: Iterable[Result]) -> Compared:
         tuple(shared),
         tuple(found),
         {effect: tuple(sorted(robots)) for effect, robots in sorted(beyond.items())},
-        (),
     )
 
 

@@ -60,7 +60,9 @@ class Tally:
         """`12 of 40 done, 1 failed, 2 running, 35 MB/s, 1:20 left`."""
         elapsed = time.perf_counter() - self.began
         parts = [f"{self.statuses.total()} of {self.logs} done"]
-        parts += [f"{self.statuses[name]} {name}" for name in ("skipped", "lost", "quarantined", "failed") if self.statuses[name]]
+        parts += [
+            f"{self.statuses[name]} {name}" for name in ("skipped", "lost", "quarantined", "failed") if self.statuses[name]
+        ]
         if running:
             parts.append(f"{running} running")
         if self.bytes_worked and elapsed > 0.0:

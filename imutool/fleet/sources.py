@@ -127,8 +127,9 @@ def _files(text: str) -> tuple[str, Iterator[_File]]:
         if PATTERN.search(part):
             break
         root /= part
-    named = sorted(globs.iglob(str(where), recursive=True))
-    return os.path.abspath(root), (_File(os.path.abspath(one)) for one in named if one.endswith(LOG) and Path(one).is_file())  # noqa: PTH100  # links stay
+    named = sorted(globs.iglob(str(where), recursive=True))  # noqa: PTH207  Path.glob takes no absolute pattern
+    files = (os.path.abspath(one) for one in named)  # noqa: PTH100  Path.resolve would follow links
+    return os.path.abspath(root), (_File(one) for one in files if one.endswith(LOG) and Path(one).is_file())  # noqa: PTH100
 
 
 def _walk(folder: Path, above: frozenset[tuple[int, int]]) -> Iterator[_File]:

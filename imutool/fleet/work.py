@@ -196,6 +196,7 @@ def _simulation(folder: Place, name: str) -> Place:
 
 
 def write_json(report: Mapping[str, Any], target: Place) -> None:
+    """Writes values as JSON, in place of what is there."""
     with Target(target, overwrite=True) as out:
         out.write(json.dumps(report, indent=2, allow_nan=False, ensure_ascii=False).encode() + b"\n")
 
