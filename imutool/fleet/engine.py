@@ -66,7 +66,7 @@ class Engine:
         if not self._ray.is_initialized():
             try:
                 self._start(address, dashboard)
-                self._refuse_too_much()
+                self.refuse_too_much()
             except BaseException:
                 self.close()
                 raise
@@ -168,7 +168,12 @@ class Engine:
                 fix="Give the address of a cluster with --address, or set TMPDIR to a short path that can be written",
             ) from error
 
-    def _refuse_too_much(self) -> None:
+    def refuse_too_much(self) -> None:
+        """Refuses to wait for memory that no machine has.
+
+        Raises:
+            ConfigError: what was asked for, and what there is.
+        """
         most = max((node["Resources"].get("memory", 0.0) for node in self._ray.nodes() if node["Alive"]), default=0.0)
         if self._memory > most:
             raise ConfigError(

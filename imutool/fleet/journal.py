@@ -31,10 +31,11 @@ PIECE_BYTES = 256 << 10  # of a journal in a store
 
 
 class Run(msgspec.Struct, frozen=True, tag_field="line", tag="run"):
-    """A run begins: what it does to every log, and by which version of the tool."""
+    """A run begins: what it does to every log, by which version of the tool, and whether all logs are to be done anew."""
 
     settings: Settings
     digest: str
+    anew: bool = False
     version: str = __version__
 
 
@@ -77,12 +78,9 @@ class Journal:
             known = self._read()
             if known is not None:
                 self._refuse(known, settings, resume, overwrite)
-                if not resume:
-                    self._file.truncate(0)
-                    if self._pieces is not None:
-                        self._pieces.clear()
-                    self._done.clear()  # but what was begun stays the fleet's own
-            self._append(Run(settings, settings.digest))
+            if not resume:
+                self._done.clear()  # but what was begun stays the fleet's own
+            self._append(Run(settings, settings.digest, anew=not resume))
         except BaseException:
             self._file.close()
             raise
@@ -156,6 +154,8 @@ class Journal:
                 match line:
                     case Run():
                         run = line
+                        if line.anew:
+                            self._done.clear()
                     case Began():
                         self._begun.add(line.target)
                     case Result():
@@ -205,11 +205,6 @@ class _Pieces:
             self._number += 1
         self._held += raw
         (self._folder / f"{self._number:08d}.jsonl").write_bytes(bytes(self._held))
-
-    def clear(self) -> None:
-        """Removes all of them."""
-        for piece in self._folder.glob("*.jsonl"):
-            piece.unlink()
 
 
 def _difference(known: Run, settings: Settings) -> str:

@@ -274,13 +274,13 @@ def _provenance(settings: Settings) -> Iterator[str]:
     yield f"<dt>made by</dt><dd>imutool {text(__version__)}</dd></dl>"
 
 
-def size(count: float) -> str:
+def size(count: int) -> str:
     """Bytes in a unit that suits them: `52.6 MB`."""
     units = ("B", "kB", "MB", "GB", "TB", "PB")
-    step = 0
-    while count >= 999.5 and step < len(units) - 1:
-        count, step = count / 1000.0, step + 1
-    return f"{count:.3g} {units[step]}"
+    value, step = float(count), 0
+    while value >= 999.5 and step < len(units) - 1:
+        value, step = value / 1000.0, step + 1
+    return f"{value:.3g} {units[step]}"
 
 
 def duration(seconds: float) -> str:
