@@ -11,6 +11,7 @@ import logging
 import os
 import secrets
 import shutil
+import socket
 import tempfile
 from collections.abc import Callable, Iterable, Iterator
 from types import TracebackType
@@ -24,6 +25,7 @@ from imutool.fleet.work import work
 
 AHEAD = 2  # tasks in flight for each that can be worked on: the next one is there when one ends
 POLL_S = 0.5
+ANSWER_S = 5.0
 OBJECT_STORE_BYTES = 80 << 20  # tasks and results are a few kilobytes; Ray takes no less
 BUG = 1
 QUIET = {
@@ -100,6 +102,9 @@ class Engine:
         """Results as they come; `tick` is told now and then how many tasks are in flight.
 
         A worker that dies takes nothing with it: its task is given to another one, `retries` times.
+
+        Raises:
+            ConfigError: Ray itself has died.
         """
         waiting, flying = iter(tasks), dict[Any, Task]()
         try:
@@ -127,6 +132,8 @@ class Engine:
         except errors.RayTaskError as error:
             words, code = f"a bug, please report it: {error.cause!r}", BUG
             logging.getLogger("imutool").info("%s: %s", task.source.place, error)
+        except errors.LocalRayletDiedError as error:
+            raise ConfigError("Ray has died on this machine", fix="Go on with --resume") from error
         except errors.OutOfMemoryError:
             words, code = "its worker ran out of memory. Set more aside with --memory-per-task.", LogError.exit_code
         except errors.RayError as error:
@@ -156,6 +163,8 @@ class Engine:
                 "object_store_memory": OBJECT_STORE_BYTES,
                 "_temp_dir": self._folder,
             }
+        else:
+            _refuse_silence(address)
         logging.getLogger("ray").setLevel(logging.ERROR)
         try:
             self._ray.init(address=address or "local", **wanted)
@@ -181,6 +190,21 @@ class Engine:
                 where="--memory-per-task",
                 expected=f"at most {most / 2**30:.2f} GiB, which the largest machine has to give",
             )
+
+
+def _refuse_silence(address: str) -> None:
+    """Asks whether anybody listens at HOST:PORT; Ray itself would wait for minutes.
+
+    Raises:
+        ConfigError: nobody does.
+    """
+    host, _, port = address.rpartition("://")[2].rpartition(":")
+    if not host or not port.isdecimal():
+        return  # a word such as auto, which Ray itself makes out
+    try:
+        socket.create_connection((host.strip("[]"), int(port)), timeout=ANSWER_S).close()
+    except (OSError, OverflowError) as error:
+        raise ConfigError(f"nobody answers ({error})", where=f"--address {address}", expected="a Ray cluster") from error
 
 
 def _ray(*, local: bool) -> Any:
