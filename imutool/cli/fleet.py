@@ -85,6 +85,16 @@ def debias(
     return settled(Settings(command="debias", model=model, init=init, smooth=smooth))
 
 
+@_command("repair logs/ repaired/ --report repaired.html")
+def repair(
+    damaged: Annotated[str, typer.Option(metavar="drop|keep", help="Leave damaged bytes out, or keep them marked.")] = "drop",
+) -> Settings:
+    """Save of every log what can be saved, as `imutool repair` does; a whole log is copied."""
+    if damaged not in {"drop", "keep"}:
+        raise ConfigError(f"{damaged!r} is nothing to do with damage", where="--damaged", expected="drop or keep")
+    return Settings(command="repair", damaged=damaged)
+
+
 @_command("info logs/ about/ --report logs.html")
 def info() -> Settings:
     """Say of every log what is in it, as `imutool info --json` does."""

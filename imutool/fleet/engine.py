@@ -11,10 +11,14 @@ import logging
 import os
 import secrets
 import shutil
+import signal
 import socket
 import tempfile
+import threading
 from collections.abc import Callable, Iterable, Iterator
-from types import TracebackType
+from contextlib import contextmanager
+from pathlib import Path
+from types import FrameType, TracebackType
 from typing import Any
 
 import msgspec
@@ -26,6 +30,7 @@ from imutool.fleet.work import work
 AHEAD = 2  # tasks in flight for each that can be worked on: the next one is there when one ends
 POLL_S = 0.5
 ANSWER_S = 5.0
+FOLDER = "imutool-fleet."  # the process that started Ray follows
 OBJECT_STORE_BYTES = 80 << 20  # tasks and results are a few kilobytes; Ray takes no less
 BUG = 1
 QUIET = {
@@ -107,8 +112,19 @@ class Engine:
             ConfigError: Ray itself has died.
         """
         waiting, flying = iter(tasks), dict[Any, Task]()
+        with _interrupts_kept() as refuse_interrupted:
+            yield from self._run(waiting, flying, tick, refuse_interrupted)
+
+    def _run(
+        self,
+        waiting: Iterator[Task],
+        flying: dict[Any, Task],
+        tick: Callable[[int], None],
+        refuse_interrupted: Callable[[], None],
+    ) -> Iterator[Result]:
         try:
             while True:
+                refuse_interrupted()
                 room = AHEAD * self.slots if self._workers is None else self.slots
                 while len(flying) < room and (task := next(waiting, None)) is not None:
                     flying[self._task.remote(msgspec.json.encode(task))] = task
@@ -119,7 +135,10 @@ class Engine:
                 if self._ray.wait(refs, num_returns=1, timeout=POLL_S)[0]:
                     ready, _ = self._ray.wait(refs, num_returns=len(refs), timeout=0)
                     for ref in ready:
-                        yield self._result(ref, flying.pop(ref))
+                        result = self._result(ref, flying[ref])
+                        refuse_interrupted()  # Ctrl-C reaches the workers as well: what they say then is no result
+                        del flying[ref]
+                        yield result
         finally:
             for ref in flying:
                 with contextlib.suppress(self._ray.exceptions.RayError):
@@ -156,7 +175,8 @@ class Engine:
             **({} if address is None else {"runtime_env": {"env_vars": IN_WORKERS}}),
         }
         if address is None:
-            self._folder = tempfile.mkdtemp(prefix="imutool-fleet.")
+            _sweep()
+            self._folder = tempfile.mkdtemp(prefix=f"{FOLDER}{os.getpid()}.")
             wanted |= {
                 "num_cpus": self._workers or os.cpu_count(),
                 "include_dashboard": dashboard,
@@ -190,6 +210,47 @@ class Engine:
                 where="--memory-per-task",
                 expected=f"at most {most / 2**30:.2f} GiB, which the largest machine has to give",
             )
+
+
+@contextmanager
+def _interrupts_kept() -> Iterator[Callable[[], None]]:
+    """Gives a function that raises KeyboardInterrupt once Ctrl-C has come: one that comes while Ray calls back is lost in it."""
+    came: list[int] = []
+
+    def refuse() -> None:
+        if came:
+            raise KeyboardInterrupt
+
+    def handle(number: int, frame: FrameType | None) -> None:
+        came.append(number)
+        signal.default_int_handler(number, frame)
+
+    if threading.current_thread() is not threading.main_thread():
+        yield refuse
+        return
+    before = signal.signal(signal.SIGINT, handle)
+    try:
+        yield refuse
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+def _sweep() -> None:
+    """Removes the folders of runs on this machine that were killed and could not do it."""
+    for folder in Path(tempfile.gettempdir()).glob(f"{FOLDER}*"):
+        pid = folder.name.removeprefix(FOLDER).partition(".")[0]
+        if pid.isdecimal() and not _lives(int(pid)):
+            shutil.rmtree(folder, ignore_errors=True)
+
+
+def _lives(pid: int) -> bool:
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    except PermissionError:  # somebody else's, and so is the folder
+        return True
+    return True
 
 
 def _refuse_silence(address: str) -> None:

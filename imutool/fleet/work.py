@@ -24,6 +24,7 @@ from imutool.mcap_io.rewrite import sha256
 from imutool.mcap_io.target import Target
 from imutool.place import Place, place
 
+MOST_LOSSES = 20  # stretches told of a log; its metadata and its repair tell all
 MAXRSS = 1 if sys.platform == "darwin" else 1024  # bytes in what the system counts memory in
 
 
@@ -118,7 +119,29 @@ def _info(job: _Job) -> dict[str, Any]:
 
     report = inspect(job.source)
     write_json(report, job.target)
-    return {"messages": report["messages"], "duration_s": report["duration_s"], "warnings": tuple(report["warnings"])}
+    told = {"messages": report["messages"], "duration_s": report["duration_s"]}
+    lost = _lost(report.get("losses"))
+    return told | lost | {"warnings": (*lost.get("warnings", ()), *report["warnings"])}
+
+
+def _repair(job: _Job) -> dict[str, Any]:
+    from imutool.mcap_io.salvage import repair  # type: ignore[import-untyped, import-not-found, unused-ignore]
+
+    report = repair(job.source, job.target, damaged=job.settings.damaged, overwrite=True)
+    return {"messages": sum(report.messages.values()), **_lost(report.losses.plain())}
+
+
+def _lost(losses: Mapping[str, Any] | None) -> dict[str, Any]:
+    """What a result says of a log's losses, from the values that stand in JSON for them; the first of many."""
+    if not losses:
+        return {}
+    stretches, told = losses["stretches"], []
+    for one in stretches[:MOST_LOSSES]:
+        count = "an unknown number of" if one["messages"] is None else one["messages"]
+        told.append(f"byte {one['offset']}, {one['bytes']} bytes: {one['reason']} ({count} messages lost)")
+    more = len(stretches) - len(told) + losses["stretches_not_listed"]
+    status = {"status": "lost"} if stretches else {}
+    return {**status, "losses": (*told, *([f"{more} more stretches"] if more else ())), "warnings": tuple(losses["mended"])}
 
 
 def _diagnose(job: _Job) -> dict[str, Any]:
@@ -201,5 +224,10 @@ def write_json(report: Mapping[str, Any], target: Place) -> None:
         out.write(json.dumps(report, indent=2, allow_nan=False, ensure_ascii=False).encode() + b"\n")
 
 
-COMMANDS: dict[str, Callable[[_Job], dict[str, Any]]] = {"debias": _debias, "info": _info, "diagnose": _diagnose}
+COMMANDS: dict[str, Callable[[_Job], dict[str, Any]]] = {
+    "debias": _debias,
+    "repair": _repair,
+    "info": _info,
+    "diagnose": _diagnose,
+}
 SUFFIX = {"debias": ".mcap", "repair": ".mcap", "info": ".json", "diagnose": ".json"}  # of what a command leaves of a log
