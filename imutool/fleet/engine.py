@@ -15,7 +15,7 @@ import signal
 import socket
 import tempfile
 import threading
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Generator, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from types import FrameType, TracebackType
@@ -103,7 +103,7 @@ class Engine:
                 fits += int(min(has.get("CPU", 0.0), has.get("memory", 0.0) // max(self._memory, 1)))
         return max(1, fits if self._workers is None else min(fits, self._workers))
 
-    def run(self, tasks: Iterable[Task], tick: Callable[[int], None] = lambda running: None) -> Iterator[Result]:
+    def run(self, tasks: Iterable[Task], tick: Callable[[int], None] = lambda running: None) -> Generator[Result]:
         """Results as they come; `tick` is told now and then how many tasks are in flight.
 
         A worker that dies takes nothing with it: its task is given to another one, `retries` times.
@@ -214,7 +214,7 @@ class Engine:
 
 @contextmanager
 def _interrupts_kept() -> Iterator[Callable[[], None]]:
-    """Gives a function that raises KeyboardInterrupt once Ctrl-C has come: one that comes while Ray calls back is lost in it."""
+    """Gives a function that raises KeyboardInterrupt once Ctrl-C has come: while Ray calls back, one would be lost in it."""
     came: list[int] = []
 
     def refuse() -> None:

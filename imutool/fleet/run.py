@@ -6,6 +6,7 @@ import hashlib
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator
+from contextlib import closing
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -141,15 +142,18 @@ def run(
     found = find(source, target)
     tally = Tally(len(found.logs) + len(found.refused), sum(one.size for one in found.logs))
     fleet = _Fleet(found, target, settings, overwrite, recheck)
+
+    def tick(flying: int) -> None:
+        tell(tally.bytes_done, tally.total_bytes, tally.words(flying))
+
     with Journal(target, settings, resume=resume, overwrite=overwrite) as journal:
         fleet.sweep()
         try:
             for result in fleet.hopeless(journal):
                 journal.finish(result)
                 tally.take(result)
-            with engine() as workers:
-                tasks = fleet.tasks(journal)
-                for result in workers.run(tasks, lambda flying: tell(tally.bytes_done, tally.total_bytes, tally.words(flying))):
+            with engine() as workers, closing(workers.run(fleet.tasks(journal), tick)) as finished:
+                for result in finished:
                     if result.status == "skipped":
                         fleet.skipped.add(result.key)
                     else:

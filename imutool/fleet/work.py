@@ -44,7 +44,7 @@ def work(task: Task) -> Result:
     The target is there whole or not at all, and is the same, byte for byte, however often this is done. What an attempt
     that was killed has left beside it is removed.
     """
-    began = time.perf_counter()
+    began, cpu_began = time.perf_counter(), time.process_time()
     result = Result(
         key=task.key,
         source=task.source.place,
@@ -69,7 +69,8 @@ def work(task: Task) -> Result:
     except MemoryError:
         result = msgspec.structs.replace(result, status="failed", error="out of memory", exit_code=LogError.exit_code)
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * MAXRSS
-    return msgspec.structs.replace(result, seconds=time.perf_counter() - began, peak_bytes=peak)
+    spent = {"seconds": time.perf_counter() - began, "cpu_seconds": time.process_time() - cpu_began}
+    return msgspec.structs.replace(result, **spent, peak_bytes=peak)
 
 
 def stands(done: Result, target: Place, *, whole: bool = False) -> bool:
