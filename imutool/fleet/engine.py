@@ -43,9 +43,9 @@ _decode = msgspec.json.Decoder(Task).decode
 _decode_result = msgspec.json.Decoder(Result).decode
 
 
-def _work(raw: bytes) -> bytes:
+def _work(raw: bytes, model: bytes | None) -> bytes:
     """`work` with task and result as bytes that any version of Python reads."""
-    return msgspec.json.encode(work(_decode(raw)))
+    return msgspec.json.encode(work(_decode(raw), model))
 
 
 class Engine:
@@ -103,8 +103,10 @@ class Engine:
                 fits += int(min(has.get("CPU", 0.0), has.get("memory", 0.0) // max(self._memory, 1)))
         return max(1, fits if self._workers is None else min(fits, self._workers))
 
-    def run(self, tasks: Iterable[Task], tick: Callable[[int], None] = lambda running: None) -> Generator[Result]:
-        """Results as they come; `tick` is told now and then how many tasks are in flight.
+    def run(
+        self, tasks: Iterable[Task], tick: Callable[[int], None] = lambda running: None, model: bytes | None = None
+    ) -> Generator[Result]:
+        """Results as they come; `tick` is told now and then how many tasks are in flight, `model` goes to every worker.
 
         A worker that dies takes nothing with it: its task is given to another one, `retries` times.
 
@@ -112,6 +114,7 @@ class Engine:
             ConfigError: Ray itself has died.
         """
         waiting, flying = iter(tasks), dict[Any, Task]()
+        self._model = self._ray.put(model)
         with _interrupts_kept() as refuse_interrupted:
             yield from self._run(waiting, flying, tick, refuse_interrupted)
 
@@ -127,7 +130,7 @@ class Engine:
                 refuse_interrupted()
                 room = AHEAD * self.slots if self._workers is None else self.slots
                 while len(flying) < room and (task := next(waiting, None)) is not None:
-                    flying[self._task.remote(msgspec.json.encode(task))] = task
+                    flying[self._task.remote(msgspec.json.encode(task), self._model)] = task
                 tick(len(flying))
                 if not flying:
                     return

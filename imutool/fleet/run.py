@@ -139,6 +139,7 @@ def run(
     target = _out(out)
     if page is not None and page.exists() and not (overwrite or resume):
         raise ConfigError("the target exists", where=page, fix="Choose another --report, or add --overwrite")
+    model = None if settings.model is None or not Path(settings.model).is_absolute() else _bytes(Path(settings.model))
     found = find(source, target)
     tally = Tally(len(found.logs) + len(found.refused), sum(one.size for one in found.logs))
     fleet = _Fleet(found, target, settings, overwrite, recheck)
@@ -152,7 +153,7 @@ def run(
             for result in fleet.hopeless(journal):
                 journal.finish(result)
                 tally.take(result)
-            with engine() as workers, closing(workers.run(fleet.tasks(journal), tick)) as finished:
+            with engine() as workers, closing(workers.run(fleet.tasks(journal), tick, model)) as finished:
                 for result in finished:
                     if result.status == "skipped":
                         fleet.skipped.add(result.key)
@@ -252,6 +253,13 @@ class _Fleet:
     def _taken(self, source: Source, journal: Journal) -> bool:
         name = self._name(source)
         return not (self._overwrite or journal.ours(name)) and (self.out / name).exists()
+
+
+def _bytes(path: Path) -> bytes:
+    try:
+        return path.read_bytes()
+    except OSError as error:
+        raise ConfigError(f"cannot be read ({error.strerror})", where=path) from error
 
 
 def _key(where: str) -> str:

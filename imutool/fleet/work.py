@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
+import os
 import platform
 import re
 import resource
 import sys
+import tempfile
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -16,7 +19,7 @@ from typing import Any
 import msgspec
 
 from imutool.diagnosis_folder import plain
-from imutool.errors import ConfigError, ImutoolError, LogError
+from imutool.errors import ConfigError, ImutoolError, LogError, ModelError
 from imutool.fleet.sources import identity, leftovers, remove, within
 from imutool.fleet.task import Imu, Parameter, Result, Settings, Task
 from imutool.mcap_io.log import Log
@@ -38,10 +41,10 @@ class _Job:
     settings: Settings
 
 
-def work(task: Task) -> Result:
+def work(task: Task, model: bytes | None = None) -> Result:
     """Does one log. What fails for a reason a user can act on becomes a failed result; a bug is raised.
 
-    The target is there whole or not at all, and is the same, byte for byte, however often this is done. What an attempt
+    `model` is the content of the model file, where the settings name one: this machine may not have it. The target is there whole or not at all, and is the same, byte for byte, however often this is done. What an attempt
     that was killed has left beside it is removed.
     """
     began, cpu_began = time.perf_counter(), time.process_time()
@@ -54,7 +57,9 @@ def work(task: Task) -> Result:
         host=platform.node(),
     )
     try:
-        job = _Job(task.source.name, place(task.source.place), within(place(task.out), task.target), task.settings)
+        job = _Job(
+            task.source.name, place(task.source.place), within(place(task.out), task.target), _at_hand(task.settings, model)
+        )
         if task.done is not None and stands(task.done, job.target, whole=task.recheck):
             return msgspec.structs.replace(task.done, status="skipped", earlier=task.done.status)
         _refuse_changed(task, job.source)
@@ -84,6 +89,24 @@ def stands(done: Result, target: Place, *, whole: bool = False) -> bool:
             return True
     except ImutoolError:
         return False
+
+
+def _at_hand(settings: Settings, model: bytes | None) -> Settings:
+    """Settings that name a file here, with the model that the fleet began with: who planned it may sit at another machine.
+
+    Raises:
+        ModelError: what was sent is not what was meant.
+    """
+    if model is None or settings.model is None:
+        return settings
+    if hashlib.sha256(model).hexdigest() != settings.model_sha256:
+        raise ModelError("has changed since the fleet was begun", where=settings.model, fix="Begin again with --overwrite")
+    there = Path(tempfile.gettempdir(), f"imutool-models.{os.getuid()}", settings.model_sha256, Path(settings.model).name)
+    if not there.is_file() or sha256(there) != settings.model_sha256:
+        there.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
+        with Target(there, overwrite=True) as out:
+            out.write(model)
+    return msgspec.structs.replace(settings, model=str(there))
 
 
 def _refuse_changed(task: Task, source: Place) -> None:

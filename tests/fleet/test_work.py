@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import json
 import os
+import tempfile
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import pytest
 
 from imutool.debias import debias
 from imutool.errors import ConfigError
+from imutool.fleet.models import settled
 from imutool.fleet.sources import find
 from imutool.fleet.task import Result, Settings, Source, Task
 from imutool.fleet.work import robot_of, robot_pattern, work
@@ -52,6 +55,16 @@ def test_done_again_it_is_the_same_byte_for_byte(done: Result, logs: Path, tmp_p
     moved.write_bytes((logs / "flight_1.mcap").read_bytes())
     assert work(task(moved, tmp_path / "other", settings)).target_sha256 == done.target_sha256
     assert work(task(logs / "flight_1.mcap", tmp_path / "out", settings)).target_sha256 == done.target_sha256
+
+
+def test_a_machine_without_the_model_gets_it(done: Result, logs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    model = (logs / "linear.safetensors").read_bytes()
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    away = settled(Settings(command="debias", model=str(logs / "linear.safetensors")))
+    away = msgspec.structs.replace(away, model="/not/here/linear.safetensors")
+    assert work(task(logs / "flight_1.mcap", tmp_path / "far", away), model).target_sha256 == done.target_sha256
+    spoiled = work(task(logs / "flight_1.mcap", tmp_path / "far", away), model + b"more")
+    assert (spoiled.status, spoiled.exit_code) == ("failed", 6)
 
 
 def test_what_stands_is_skipped(done: Result, logs: Path, tmp_path: Path, settings: Settings) -> None:
