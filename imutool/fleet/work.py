@@ -44,8 +44,9 @@ class _Job:
 def work(task: Task, model: bytes | None = None) -> Result:
     """Does one log. What fails for a reason a user can act on becomes a failed result; a bug is raised.
 
-    `model` is the content of the model file, where the settings name one: this machine may not have it. The target is there whole or not at all, and is the same, byte for byte, however often this is done. What an attempt
-    that was killed has left beside it is removed.
+    `model` is the content of the model file, where the settings name one: this machine may not have it. The target is there
+    whole or not at all, and is the same, byte for byte, however often this is done. What an attempt that was killed has left
+    beside it is removed.
     """
     began, cpu_began = time.perf_counter(), time.process_time()
     result = Result(

@@ -15,7 +15,7 @@ from imutool.fleet.engine import Engine
 from imutool.mcap_io.write import write
 
 PLANTED = SimpleNamespace(**runpy.run_path(str(Path(__file__).parents[1] / "physics" / "planted.py")))
-LOG_S = 8.0
+LOG_S = 10.0  # below eight nothing is told
 Robot = Callable[[Path, int, Mapping[str, Sequence[float]]], None]
 
 
