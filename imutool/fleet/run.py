@@ -16,6 +16,7 @@ import msgspec
 from imutool.errors import ConfigError
 from imutool.fleet import results
 from imutool.fleet.engine import BUG, Engine
+from imutool.fleet.journal import NAME as JOURNAL
 from imutool.fleet.journal import Journal
 from imutool.fleet.robots import Compared, compare
 from imutool.fleet.sources import Found, find, leftovers, remove
@@ -25,6 +26,7 @@ from imutool.place import Place, place
 
 LOST = 3  # something of a log was lost, or a log was quarantined
 COMPARED = "fleet.json"
+TITLE = b"<title>Fleet "
 TOLD = 1000  # logs that are not whole, in JSON
 Tell = Callable[[int, int, str], None]
 
@@ -137,8 +139,8 @@ def run(
     began = time.perf_counter()
     results.arrow()  # before the work, not after
     target = _out(out)
-    if page is not None and page.exists() and not (overwrite or resume):
-        raise ConfigError("the target exists", where=page, fix="Choose another --report, or add --overwrite")
+    if not overwrite:
+        _refuse_strangers(target, page if page is None or not (resume and _is_page(page)) else None)
     model = None if settings.model is None or not Path(settings.model).is_absolute() else _bytes(Path(settings.model))
     found = find(source, target)
     tally = Tally(len(found.logs) + len(found.refused), sum(one.size for one in found.logs))
@@ -253,6 +255,27 @@ class _Fleet:
     def _taken(self, source: Source, journal: Journal) -> bool:
         name = self._name(source)
         return not (self._overwrite or journal.ours(name)) and (self.out / name).exists()
+
+
+def _refuse_strangers(out: Place, page: Place | None) -> None:
+    """Refuses to write over what no fleet has written.
+
+    Raises:
+        ConfigError: the page exists, or a table or comparison in an OUT that no fleet has begun.
+    """
+    if page is not None and page.exists():
+        raise ConfigError("the target exists", where=page, fix="Choose another --report, or add --overwrite")
+    for name in (results.NAME, COMPARED):
+        if not (out / JOURNAL).exists() and (out / name).exists():
+            raise ConfigError("the target exists", where=out / name, fix="Choose another OUT, or add --overwrite")
+
+
+def _is_page(path: Place) -> bool:
+    """Whether a file is a page about a fleet."""
+    if not path.is_file():
+        return False
+    with path.open("rb") as file:
+        return TITLE in file.read(4096)
 
 
 def _bytes(path: Path) -> bytes:

@@ -23,7 +23,6 @@ class Settings(msgspec.Struct, frozen=True, kw_only=True):
     model_sha256: str = ""
     init: str = "auto"
     smooth: bool = False
-    verify: str | None = None  # None: as the command does by itself
     damaged: str = "drop"
     sim: str | None = None
     imu: str | None = None

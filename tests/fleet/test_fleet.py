@@ -10,13 +10,14 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator, Iterable, Iterator
 from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
 
 import pyarrow.parquet as pq
 import pytest
+import ray
 from typer.testing import CliRunner
 
 from imutool.cli import app
@@ -25,9 +26,11 @@ from imutool.errors import ConfigError
 from imutool.fleet.engine import Engine
 from imutool.fleet.journal import NAME
 from imutool.fleet.models import settled
-from imutool.fleet.run import run
-from imutool.fleet.task import Settings
+from imutool.fleet.run import Tally, run
+from imutool.fleet.task import Result, Settings, Task
+from imutool.fleet.work import work
 from imutool.mcap_io.rewrite import sha256
+from imutool.place import place
 
 Workers = Callable[[], Engine]
 SOON_S = 60.0
@@ -133,6 +136,16 @@ def test_somebody_elses_file_stays(fleet: Path, engine: Workers, tmp_path: Path)
     assert theirs.read_text() != "theirs"
 
 
+@pytest.mark.parametrize("name", ["fleet.parquet", "fleet.json", "page.html"])
+def test_a_table_or_page_that_no_fleet_wrote_stays(fleet: Path, tmp_path: Path, name: str) -> None:
+    out = tmp_path / "out"
+    out.mkdir()
+    (out / name).write_text("theirs")
+    with pytest.raises(ConfigError, match=f"{name}: the target exists"):
+        run(str(fleet), str(out), INFO, never, resume=True, page=out / "page.html")
+    assert [(path.name, path.read_text()) for path in out.iterdir()] == [(name, "theirs")]
+
+
 def test_without_a_log_nothing_is_begun(tmp_path: Path) -> None:
     (tmp_path / "empty").mkdir()
     with pytest.raises(ConfigError, match=r"no \.mcap log"):
@@ -143,6 +156,27 @@ def test_without_a_log_nothing_is_begun(tmp_path: Path) -> None:
 def test_more_memory_than_there_is_is_refused(ray_started: None) -> None:
     with Engine(memory_bytes=1 << 60) as engine, pytest.raises(ConfigError, match=r"--memory-per-task: 1073741824\.00 GiB"):
         engine.refuse_too_much()
+
+
+def test_where_ray_cannot_start_the_message_says_what_to_do(monkeypatch: pytest.MonkeyPatch, ray_started: None) -> None:
+    def init(**_: object) -> None:
+        raise RuntimeError("bind: Operation not permitted\nmuch more")
+
+    monkeypatch.setattr(ray, "is_initialized", lambda: False)
+    monkeypatch.setattr(ray, "init", init)
+    with pytest.raises(ConfigError, match=r"cannot be started on this machine \(bind: Operation not permitted\).*--address"):
+        Engine()
+    with pytest.raises(ConfigError, match=r"--address 127\.0\.0\.1:1: nobody answers"):
+        Engine("127.0.0.1:1")
+
+
+@pytest.mark.parametrize("library", ["ray", "pyarrow"])
+def test_without_a_library_the_message_says_how_to_get_it(
+    monkeypatch: pytest.MonkeyPatch, library: str, fleet: Path, tmp_path: Path
+) -> None:
+    monkeypatch.setitem(sys.modules, library, None)
+    with pytest.raises(ConfigError, match=rf"needs {library}, which is not installed. pip install 'imutool\[fleet\]'"):
+        run(str(fleet), str(tmp_path / "out"), INFO, Engine)
 
 
 def test_workers_listen_on_loopback_alone(ray_started: None) -> None:
@@ -328,3 +362,55 @@ def test_a_wrong_word_is_told_before_anything_is_begun(
     assert done.exit_code == code
     assert why in done.stderr
     assert not (tmp_path / "out").exists()
+
+
+class Inline:
+    """The work done here and now: for what has nothing to do with workers."""
+
+    def __enter__(self) -> Inline:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Nothing was started."""
+
+    def run(self, tasks: Iterable[Task], tick: Callable[[int], None], model: bytes | None) -> Generator[Result]:
+        for task in tasks:
+            tick(1)
+            yield work(task, model)
+
+
+def test_a_fleet_in_a_store_is_that_of_a_folder(fleet: Path, store: Any, settings: Settings, tmp_path: Path) -> None:
+    for path in fleet.rglob("*.mcap"):
+        store.put(f"logs/{path.relative_to(fleet)}", path.read_bytes())
+    left = "out/robot_a/.log.mcap.12.0123abcd.partial"
+    run("s3://fleet/logs", "s3://fleet/out", settings, Inline, page=place("s3://fleet/out.html"))
+    store.put(left, b"half")
+    again = run("s3://fleet/logs", "s3://fleet/out", settings, Inline, resume=True, recheck=True)
+    assert dict(again.tally.statuses) == {"skipped": 2}
+    keys = store.keys()
+    assert left not in keys
+    assert {"out.html", "out/fleet.parquet", "out/fleet.journal/00000000.jsonl"} <= set(keys)
+    assert store.uploads() == []
+    run(str(fleet), str(tmp_path / "out"), settings, Inline)
+    for name in digests(tmp_path / "out"):
+        assert store.get(f"out/{name}") == (tmp_path / "out" / name).read_bytes()
+    assert store.secret.encode() not in b"".join(store.get(key) for key in keys if "fleet." in key)
+    store.client.delete_object(Bucket="fleet", Key="out/robot_b/log.mcap")
+    assert dict(run("s3://fleet/logs", "s3://fleet/out", settings, Inline, resume=True).tally.statuses) == {
+        "skipped": 1,
+        "ok": 1,
+    }
+
+
+def test_an_exit_code_tells_the_worst() -> None:
+    def ended(*results: tuple[str, int, str | None]) -> int:
+        tally = Tally(len(results), 0)
+        for status, code, earlier in results:
+            tally.take(Result(key="", source="", target="", status=status, exit_code=code, earlier=earlier))
+        return tally.exit_code
+
+    assert ended(("ok", 0, None), ("skipped", 0, "ok")) == 0
+    assert ended(("ok", 0, None), ("skipped", 0, "lost")) == 3
+    assert ended(("quarantined", 5, None), ("ok", 0, None)) == 3
+    assert ended(("lost", 0, None), ("failed", 5, None), ("failed", 4, None)) == 5
+    assert ended(("failed", 7, None), ("failed", 1, None)) == 1
