@@ -9,8 +9,9 @@ from __future__ import annotations
 
 import os
 import re
+from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, BinaryIO, ForwardRef, NamedTuple, TypeAlias
+from typing import TYPE_CHECKING, Any, BinaryIO, ForwardRef, NamedTuple, TypeAlias
 from urllib.parse import urlsplit
 
 from imutool.errors import ConfigError
@@ -136,14 +137,23 @@ def same(one: Place, other: Place) -> bool:
     return one == other
 
 
-def identity(where: Place) -> tuple[object, ...]:
-    """What changes when somebody writes there: file, length and time, or of an object length and the store's own mark.
+def identity(where: Place) -> tuple[int, str]:
+    """Size in bytes, and the etag of a store or the time of the last change: what changes when somebody writes there.
 
     Raises:
-        whatever `failures` names.
+        ConfigError: it cannot be asked for.
     """
-    if isinstance(where, Path):
-        there = where.stat()
-        return there.st_ino, there.st_size, there.st_mtime_ns
-    found = where.fs.info(where.path)
-    return found["size"], *(str(found.get(mark, "")) for mark in ("ETag", "etag", "mtime", "LastModified"))
+    try:
+        if isinstance(where, Path):
+            status = where.stat()
+            return status.st_size, str(status.st_mtime_ns)
+        return seal(where.fs.info(where.path))
+    except failures(where) as error:
+        raise ConfigError(f"cannot be read ({reason(error)})", where=where, fix="See who may read it") from error
+
+
+def seal(about: Mapping[str, Any]) -> tuple[int, str]:
+    """Size and etag as a store says them, by whatever name."""
+    names = ("ETag", "etag", "md5Hash", "content_md5", "LastModified", "last_modified", "mtime", "created")
+    stamp = next((str(about[name]) for name in names if about.get(name)), "")
+    return int(about["size"]), stamp.strip('"')

@@ -2,7 +2,7 @@
 
 from imutool.clean.cleaner import Cleaner, cleaned
 from imutool.clean.finding import Finding
-from imutool.clean.first_pass import Survey, look, raw_batches, survey
+from imutool.clean.first_pass import Survey, UntrustedError, look, raw_batches, survey
 from imutool.clean.settings import Rules
 
-__all__ = ["Cleaner", "Finding", "Rules", "Survey", "cleaned", "look", "raw_batches", "survey"]
+__all__ = ["Cleaner", "Finding", "Rules", "Survey", "UntrustedError", "cleaned", "look", "raw_batches", "survey"]

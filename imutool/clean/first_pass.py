@@ -30,6 +30,10 @@ RECORDED = 20  # intervals of a finding that go into a log's metadata
 FEWEST = 2  # samples that make a log
 
 
+class UntrustedError(LogError):
+    """A log whose IMU cannot be cleaned without guessing: it is left alone."""
+
+
 @dataclass(frozen=True, eq=False)
 class Survey:
     """What was found out about one IMU.
@@ -73,11 +77,11 @@ class Survey:
         """Itself, if the log is to be trusted or its rules say to use it all the same.
 
         Raises:
-            LogError: it is not; the message gives the reasons.
+            UntrustedError: it is not; the message gives the reasons.
         """
         if self.verdict != "quarantine" or self.rules.force:
             return self
-        raise LogError(
+        raise UntrustedError(
             f"cannot be trusted: {'; '.join(self.reasons)}",
             where=f"{self.log} {self.topic}",
             expected="a log whose IMU can be cleaned without guessing",

@@ -18,6 +18,7 @@ from imutool.cli import (
     diagnose,
     evaluate,
     export,
+    fleet,
     info,
     models,
     repair,
@@ -28,7 +29,24 @@ from imutool.cli import (
 )
 from imutool.cli._app import app, caught
 
-COMMANDS = (convert, info, repair, train, debias, clean, evaluate, view, export, vio, simulate, diagnose, conceal, models, demo)
+COMMANDS = (
+    convert,
+    info,
+    repair,
+    train,
+    debias,
+    clean,
+    evaluate,
+    view,
+    export,
+    vio,
+    simulate,
+    diagnose,
+    conceal,
+    fleet,
+    models,
+    demo,
+)
 
 
 TERMINATED = 143  # what a shell reports of a program that SIGTERM ended

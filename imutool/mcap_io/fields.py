@@ -11,7 +11,6 @@ import re
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -22,6 +21,7 @@ from imutool.mcap_io import ros2msg
 from imutool.mcap_io.log import DERIVED_KEY, Clock, Log, Topic
 from imutool.mcap_io.read import UNIT_KEY
 from imutool.mcap_io.records import Rows
+from imutool.place import Place
 
 LISTED = 60  # fields named in a message
 LONGEST_ROW = 64  # of an array of numbers that is looked at as channels
@@ -43,7 +43,7 @@ class Fields:
         return len(self.t_ns)
 
 
-def read_field(path: Path, signal: str) -> Fields:
+def read_field(path: Place, signal: str) -> Fields:
     """One signal of a log, named TOPIC.field.
 
     Raises:
@@ -54,7 +54,7 @@ def read_field(path: Path, signal: str) -> Fields:
     return read_fields(path, [signal])[signal]
 
 
-def read_fields(path: Path, signals: Sequence[str]) -> dict[str, Fields]:
+def read_fields(path: Place, signals: Sequence[str]) -> dict[str, Fields]:
     """Several signals of a log, in one pass over it.
 
     Raises:
@@ -109,7 +109,7 @@ def numeric_fields(log: Log, topic: str, *, long: bool = True) -> list[str]:
     return []
 
 
-def others(path: Path, signal: str, most: int = MOST_OTHERS) -> dict[str, Fields]:
+def others(path: Place, signal: str, most: int = MOST_OTHERS) -> dict[str, Fields]:
     """Every other number of a log that varies, by TOPIC.field: what might drive a signal. Stamps and covariances are not asked.
 
     What cannot serve is left out: constants, NaN, stamps that go back, long arrays (images), topics without a definition, what

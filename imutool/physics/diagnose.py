@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float64
@@ -22,13 +21,14 @@ from imutool.physics.diagnosis import UNITS, Curve, Diagnosis, Estimate, Finding
 from imutool.physics.discover import Discovery, Judged, discover
 from imutool.physics.effects import _catalogue
 from imutool.physics.effects._forward import Physics
-from imutool.physics.fit import Chosen, Fit, Weighed, derivatives, expected
+from imutool.physics.fit import Chosen, Fit, Weighed, derivatives, expected, fit
 from imutool.physics.locate import located
 from imutool.physics.motion import smooth_motion
 from imutool.physics.pair import LEAST_S, Pair, with_simulation, with_truth
 from imutool.physics.reference import wrong_for_moments
 from imutool.physics.unnamed import unit
 from imutool.physics.whitening import Band, level, whitener
+from imutool.place import Place
 from imutool.recording import Recording
 
 KNOWN_BAND = 0.45  # of where smoothing halves a motion: there it takes a per cent
@@ -38,13 +38,20 @@ SLOW = 9  # samples of a running mean
 JITTER = "timestamp_jitter"
 SHOWN_BY_SAMPLES = {"saturation", "quantization"}  # without any fit: `stamps`
 SHOWN_KNOTS = 41  # of a curve without a name, as it is told
+EVERY_UNIT = (
+    "mount_rotation",
+    "gyro_scale",
+    "accel_scale",
+    "lever_arm",
+    "clock_offset",
+)  # in which every unit differs a little
 WHITE = 1.15  # what is left over the noise, as a ratio, that still counts as noise
 Tell = Callable[[int, int, str], None]
 
 
 def diagnose(
-    reals: Sequence[Path],
-    sim: Path | None = None,
+    reals: Sequence[Place],
+    sim: Place | None = None,
     *,
     imu: str | None = None,
     truth: str | None = None,
@@ -83,7 +90,27 @@ def diagnose(
     return told
 
 
-def _with_signal(told: Diagnosis, real: Path, sim: Path, signal: str) -> Diagnosis:
+def measured(
+    real: Place,
+    sim: Place | None = None,
+    *,
+    imu: str | None = None,
+    truth: str | None = None,
+    effects: Sequence[str] = EVERY_UNIT,
+) -> Fit:
+    """Some effects of the catalogue, fitted to a recording together whether they show or not: what units are compared by.
+
+    Raises:
+        ConfigError, LogError, DataError: as `diagnose`; or an effect that has nothing to be fitted to here.
+    """
+    simulated = None if sim is None else read_log(sim, imu=imu)
+    pairs = [_unclipped(pair) for pair in _pairs(read_log(real, imu=imu, truth=truth), simulated, truth)]
+    candidates = _candidates(pairs)
+    begun = tuple((one, one.nothing.astype(float)) for one in _catalogue.physics(effects))
+    return fit([_weighed(pair, candidates) for pair in pairs], begun, part="all")
+
+
+def _with_signal(told: Diagnosis, real: Place, sim: Place, signal: str) -> Diagnosis:
     """The answer with what another field of both logs says."""
     one = diagnose_signal(read_field(real, signal), read_field(sim, signal), others(real, signal), signal)
     return replace(

@@ -1,0 +1,208 @@
+"""`imutool fleet`."""
+
+from __future__ import annotations
+
+import inspect
+import re
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from imutool.cli._app import Imu, Init, Json, Overwrite, Quiet, Smooth, Truth, Verbose, app
+from imutool.cli.debias import VERIFY_HELP
+from imutool.errors import ConfigError
+from imutool.fleet.task import Settings
+from imutool.terminal import out, plain, progress, say, write_json
+
+if TYPE_CHECKING:
+    from imutool.fleet.run import FleetReport
+
+fleet = typer.Typer(
+    name="fleet",
+    help="The same for many logs: on all cores of this machine, or on a Ray cluster.",
+    no_args_is_help=True,
+    rich_markup_mode="rich",
+)
+app.add_typer(fleet)
+
+UNITS = {"": 1, "K": 1 << 10, "M": 1 << 20, "G": 1 << 30, "T": 1 << 40}
+SHOWN = 10  # logs that are not whole; all are in fleet.parquet
+RESUME = "Go on: what is done and still stands is skipped."
+CODES = "\n\nExit code: 0 all whole; 3 something lost or quarantined; else the largest code of the logs that failed."
+
+
+def _common(
+    source: Annotated[str, typer.Argument(metavar="SRC", help="A folder, pattern, log or URL.")],
+    target: Annotated[str, typer.Argument(metavar="OUT", help="Folder or URL; every log keeps its path below SRC.")],
+    *,
+    address: Annotated[str | None, typer.Option(help="Of a Ray cluster, or auto; without, this machine's cores.")] = None,
+    resume: Annotated[bool, typer.Option("--resume", help=RESUME)] = False,
+    recheck: Annotated[bool, typer.Option("--recheck", help="With --resume: read all that is done again.")] = False,
+    report: Annotated[str | None, typer.Option(metavar="F.html", help="Write a page about the fleet.")] = None,
+    workers: Annotated[int | None, typer.Option(min=1, help="Logs worked on at once; else one per core.")] = None,
+    memory: Annotated[str, typer.Option("--memory-per-task", metavar="SIZE", help="Set aside for a log: 800M, 2G.")] = "1G",
+    retries: Annotated[int, typer.Option(min=0, help="Times a log is given to another worker when one dies.")] = 3,
+    dashboard: Annotated[bool, typer.Option("--dashboard", help="Start Ray's, on 127.0.0.1.")] = False,
+    overwrite: Overwrite = False,
+    json_to: Json = None,
+    verbose: Verbose = False,
+    quiet: Quiet = False,
+) -> None:
+    """The options of every fleet command."""
+
+
+def _command(example: str) -> Callable[[Callable[..., Settings]], Callable[..., Settings]]:
+    """A command made of a function from its own options to settings, with the options of all around them."""
+
+    def made(settings_of: Callable[..., Settings]) -> Callable[..., Settings]:
+        shared, own = (inspect.signature(f, eval_str=True).parameters for f in (_common, settings_of))
+
+        def command(**words: Any) -> None:
+            _run(settings_of(**{name: words.pop(name) for name in own}), **words)
+
+        order = [shared["source"], shared["target"], *own.values(), *list(shared.values())[2:]]
+        as_options = [one.replace(kind=inspect.Parameter.KEYWORD_ONLY) for one in order]
+        command.__name__, command.__doc__ = settings_of.__name__, settings_of.__doc__
+        command.__signature__ = inspect.Signature(as_options)  # type: ignore[attr-defined]
+        command.__annotations__ = {one.name: one.annotation for one in as_options}
+        fleet.command(epilog=f"Example: [bold]imutool fleet {example}[/]{CODES}")(command)
+        return settings_of
+
+    return made
+
+
+@_command("debias logs/ clean/ --model euroc-adis16448-hybrid --report clean.html")
+def debias(
+    model: Annotated[str | None, typer.Option(help="Model file or a name that ships; else as each log's metadata say.")] = None,
+    init: Init = "auto",
+    smooth: Smooth = False,
+    clean: Annotated[bool, typer.Option(help="Clean the IMU too, and leave alone what cannot be trusted.")] = True,
+    verify: Annotated[str, typer.Option(metavar="all|imu|none", help=VERIFY_HELP)] = "imu",
+) -> Settings:
+    """Debias every log, as `imutool debias --clean` does."""
+    from imutool.debias import refuse_smooth
+    from imutool.fleet.models import settled
+    from imutool.mcap_io.verify import refuse_unknown
+
+    refuse_smooth(init, smooth)
+    refuse_unknown(verify)
+    return settled(Settings(command="debias", model=model, init=init, smooth=smooth, clean=clean, check=verify))
+
+
+@_command("repair logs/ repaired/ --report repaired.html")
+def repair(
+    damaged: Annotated[str, typer.Option(metavar="drop|keep", help="Leave damaged bytes out, or keep them marked.")] = "drop",
+) -> Settings:
+    """Save of every log what can be saved, as `imutool repair` does; a whole log is copied."""
+    if damaged not in {"drop", "keep"}:
+        raise ConfigError(f"{damaged!r} is nothing to do with damage", where="--damaged", expected="drop or keep")
+    return Settings(command="repair", damaged=damaged)
+
+
+@_command("info logs/ about/ --report logs.html")
+def info() -> Settings:
+    """Say of every log what is in it, as `imutool info --json` does."""
+    return Settings(command="info")
+
+
+@_command("diagnose logs/ diagnosis/ --robot-from '^([^/]+)/' --report robots.html")
+def diagnose(
+    sim: Annotated[
+        str | None, typer.Option(metavar="DIR", help="Simulations under the logs' names; else their own true poses.")
+    ] = None,
+    robot_from: Annotated[
+        str | None,
+        typer.Option(
+            "--robot-from", metavar="PATTERN", help="Regular expression on names, or metadata:RECORD.KEY; else folder."
+        ),
+    ] = None,
+    search: Annotated[bool, typer.Option(help="Also search each log for physics beyond what robots are compared by.")] = True,
+    imu: Imu = None,
+    truth: Truth = None,
+) -> Settings:
+    """One kind of sensor on many robots: what all share, and which robot is unlike the others."""
+    from pathlib import Path
+
+    from imutool.fleet.work import robot_pattern
+    from imutool.place import place
+
+    robot_pattern(robot_from)
+    there = None if sim is None else place(sim)
+    where = there.absolute() if isinstance(there, Path) else there
+    return Settings(
+        command="diagnose",
+        sim=None if where is None else str(where),
+        robot_from=robot_from,
+        quick=not search,
+        imu=imu,
+        truth=truth,
+    )
+
+
+def _run(
+    settings: Settings,
+    *,
+    source: str,
+    target: str,
+    address: str | None,
+    resume: bool,
+    recheck: bool,
+    report: str | None,
+    workers: int | None,
+    memory: str,
+    retries: int,
+    dashboard: bool,
+    overwrite: bool,
+    json_to: str | None,
+    verbose: bool,
+    quiet: bool,
+) -> None:
+    from imutool.fleet.engine import Engine
+    from imutool.fleet.run import run
+    from imutool.place import place
+
+    size = memory_bytes(memory)
+    page = None if report is None else place(report)
+    with progress(f"Fleet {settings.command}", verbose, quiet) as tell:
+        done = run(
+            source,
+            target,
+            settings,
+            lambda: Engine(address, workers=workers, memory_bytes=size, retries=retries, dashboard=dashboard),
+            resume=resume,
+            overwrite=overwrite,
+            recheck=recheck,
+            page=page,
+            tell=tell,
+        )
+    if not write_json(done.plain(), json_to):
+        _show(done, report)
+    raise typer.Exit(done.tally.exit_code)
+
+
+def _show(done: FleetReport, report: str | None) -> None:
+    for one in done.trouble[:SHOWN]:
+        why = one.error or "; ".join(one.losses) or "; ".join(one.warnings)
+        line = f"[yellow]{one.earlier or one.status}:[/] {plain(why if one.source in why else f'{one.source}: {why}')}"
+        out.print(line, highlight=False, soft_wrap=True)
+    if len(done.trouble) > SHOWN:
+        say("and more")
+    if done.compared is not None:
+        say(done.compared.summary)
+        for outlier in done.compared.outliers:
+            say(outlier.sentence)
+    made = [str(done.out / "fleet.parquet"), *([report] if report else [])]
+    say(f"{done.tally.words()}; {', '.join(made)}")
+
+
+def memory_bytes(text: str) -> int:
+    """Bytes of `800M`, `2G` or `2GiB`.
+
+    Raises:
+        ConfigError: no such size.
+    """
+    match = re.fullmatch(r"(\d+(?:\.\d+)?)\s*([KMGT]?)(?:i?B)?", text.strip(), re.IGNORECASE)
+    if match is None:
+        raise ConfigError(f"{text!r} is no size", where="--memory-per-task", expected="bytes, or a number with K, M, G or T")
+    return int(float(match[1]) * UNITS[match[2].upper()])

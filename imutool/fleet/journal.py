@@ -1,0 +1,218 @@
+"""What a fleet has done, line by line in OUT/fleet.journal: it only grows, and what it says is on the disk.
+
+A line says that a target was begun (so that a later run knows it for the fleet's own), or what became of a log. One process
+writes, holding a lock that goes with it. A line that was torn when that process died is cut off; a line that is no longer
+readable is passed over, and its log done again.
+
+In an object store, where nothing can be appended to, OUT/fleet.journal/ holds pieces of it: each is written over with one line
+more until it is large enough for the next to begin, and what is read is a copy. Nobody there can hold a lock.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import os
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+from types import TracebackType
+from typing import IO
+
+import msgspec
+
+from imutool import __version__
+from imutool.errors import ConfigError
+from imutool.fleet.task import Result, Settings
+from imutool.place import Place, failures, reason
+
+NAME = "fleet.journal"
+PIECE_BYTES = 256 << 10  # of a journal in a store
+
+
+class Run(msgspec.Struct, frozen=True, tag_field="line", tag="run"):
+    """A run begins: what it does to every log, by which version of the tool, and whether all logs are to be done anew."""
+
+    settings: Settings
+    digest: str
+    anew: bool = False
+    version: str = __version__
+
+
+class Began(msgspec.Struct, frozen=True, tag_field="line", tag="began"):
+    """A target is about to be written."""
+
+    key: str
+    target: str
+
+
+_line = msgspec.json.Decoder(Run | Began | Result)
+
+
+class Journal:
+    """The journal of OUT, open for reading and appending; of what it says only keys and places in the file are held.
+
+    With `resume` it goes on where it ended. With `overwrite` it begins anew or, with both, goes on under other settings.
+
+    Raises:
+        ConfigError: there is one already (without `resume` or `overwrite`); it was made with other settings (without
+            `overwrite`); another process writes to it; or it cannot be written.
+    """
+
+    def __init__(self, out: Place, settings: Settings, *, resume: bool = False, overwrite: bool = False) -> None:
+        self.path = out / NAME
+        self._begun: set[str] = set()
+        self._done: dict[str, int] = {}
+        self._pieces: _Pieces | None = None
+        try:
+            if isinstance(out, Path):
+                out.mkdir(parents=True, exist_ok=True)
+                self._file: IO[bytes] = (out / NAME).open("a+b")
+            else:
+                self._file = tempfile.TemporaryFile()  # noqa: SIM115  closed with the journal
+                self._pieces = _Pieces(self.path, self._file)
+        except failures(out) as error:
+            raise ConfigError(f"cannot be written ({reason(error)})", where=self.path, fix="Choose another OUT") from error
+        try:
+            self._lock()
+            known = self._read()
+            if known is not None:
+                self._refuse(known, settings, resume, overwrite)
+            if not resume:
+                self._done.clear()  # but what was begun stays the fleet's own
+            self._append(Run(settings, settings.digest, anew=not resume))
+        except BaseException:
+            self._file.close()
+            raise
+
+    def __enter__(self) -> Journal:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+        self._file.close()
+
+    def ours(self, target: str) -> bool:
+        """Whether the fleet has begun this target, in this run or an earlier one."""
+        return target in self._begun
+
+    def done(self, key: str) -> Result | None:
+        """What the journal says of a log, if it says anything."""
+        at = self._done.get(key)
+        if at is None:
+            return None
+        self._file.seek(at)
+        found = _line.decode(self._file.readline())
+        assert isinstance(found, Result), "the offset is that of a result"
+        return found
+
+    def begin(self, key: str, target: str) -> None:
+        """Says, before anything is written, that a target will be the fleet's own."""
+        if target not in self._begun:
+            self._append(Began(key, target))
+            self._begun.add(target)
+
+    def finish(self, result: Result) -> None:
+        """Says what became of a log."""
+        self._done[result.key] = self._append(result)
+
+    def _append(self, line: Run | Began | Result) -> int:
+        raw = msgspec.json.encode(line) + b"\n"
+        at = self._file.seek(0, os.SEEK_END)
+        try:
+            self._file.write(raw)
+            self._file.flush()
+            if self._pieces is None:
+                os.fsync(self._file.fileno())
+            else:
+                self._pieces.append(raw)
+        except failures(self.path) as error:
+            with contextlib.suppress(OSError):
+                self._file.truncate(at)
+            raise ConfigError(
+                f"cannot be written ({reason(error)})", where=self.path, fix="Make room, and go on with --resume"
+            ) from error
+        return at
+
+    def _lock(self) -> None:
+        try:
+            fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            raise ConfigError(
+                "another run is at work here", where=self.path, fix="Wait for it, or choose another OUT"
+            ) from error
+
+    def _read(self) -> Run | None:
+        """Takes in what is there, cuts a torn last line off, and returns the last run's line."""
+        run, end = None, 0
+        for at, raw in self._lines():
+            if not raw.endswith(b"\n"):
+                self._file.truncate(at)
+                break
+            end = at + len(raw)
+            with contextlib.suppress(msgspec.DecodeError, UnicodeDecodeError):
+                line = _line.decode(raw)
+                match line:
+                    case Run():
+                        run = line
+                        if line.anew:
+                            self._done.clear()
+                    case Began():
+                        self._begun.add(line.target)
+                    case Result():
+                        self._begun.add(line.target)
+                        self._done[line.key] = at
+        return run if run is not None or end == 0 else Run(Settings(command="info"), "")
+
+    def _lines(self) -> Iterator[tuple[int, bytes]]:
+        self._file.seek(0)
+        at = 0
+        for raw in self._file:
+            yield at, raw
+            at += len(raw)
+
+    def _refuse(self, known: Run, settings: Settings, resume: bool, overwrite: bool) -> None:
+        if overwrite:
+            return
+        if not resume:
+            raise ConfigError(
+                "holds a fleet's results already",
+                where=self.path.parent,
+                fix="Go on with --resume, choose another OUT, or begin anew with --overwrite",
+            )
+        if known.digest != settings.digest:
+            raise ConfigError(
+                f"was begun with other settings ({_difference(known, settings)})",
+                where=self.path.parent,
+                fix="Give the same ones, choose another OUT, or add --overwrite to do all logs again",
+            )
+
+
+class _Pieces:
+    """A journal in a store; `file` gets what is there."""
+
+    def __init__(self, folder: Place, file: IO[bytes]) -> None:
+        self._folder, self._held = folder, bytearray()
+        there: list[Place] = sorted(folder.glob("*.jsonl"), key=str)
+        for piece in there:
+            raw = piece.read_bytes()
+            file.write(raw if raw.endswith(b"\n") or not raw else raw + b"\n")
+        self._number = 1 + max((int(one.stem) for one in there if one.stem.isdecimal()), default=-1)
+
+    def append(self, raw: bytes) -> None:
+        """Writes the piece over with one line more."""
+        if len(self._held) > PIECE_BYTES:
+            self._held.clear()
+            self._number += 1
+        self._held += raw
+        (self._folder / f"{self._number:08d}.jsonl").write_bytes(bytes(self._held))
+
+
+def _difference(known: Run, settings: Settings) -> str:
+    """The settings that differ, as then and now."""
+    then, now = msgspec.to_builtins(known.settings), msgspec.to_builtins(settings)
+    told = [f"{name} {then[name]!r}, now {now[name]!r}" for name in now if then[name] != now[name] and name != "model_sha256"]
+    if then["model_sha256"] != now["model_sha256"] and not told:
+        told.append("another content of the model")
+    if known.version != __version__:
+        told.append(f"imutool {known.version}, now {__version__}")
+    return "; ".join(told) or "unknown"

@@ -1,0 +1,223 @@
+"""One kind of sensor on many robots: what all share, and which robot is unlike the others.
+
+Each log says of each parameter how large it is, and how sure that is. Logs of a robot are pooled by their certainty. A robot's
+value x is compared with the middle m of all (the median) and the spread s between them (Qn of Rousseeuw and Croux 1993, section
+3, which half of the robots cannot spoil, and which knows a normal spread from half the robots that the median absolute
+deviation needs):
+
+    z = (x - m) / sqrt(s^2 + std^2)
+
+s is itself known from a few robots: z is held against Student's t with 0.7 (n - 1) degrees of freedom, the efficiency of Qn
+among a few dozen. An effect's most striking parameter stands for it, its chance multiplied by how many there are (Bonferroni);
+of all robots and effects those are told whose false discovery rate (Benjamini and Hochberg 1995) is below a limit.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Float64
+from scipy.stats import t as student
+
+from imutool.fleet.task import Parameter, Result
+from imutool.physics.diagnosis import Estimate
+from imutool.physics.quantity import value as told
+
+QN, MAD = 2.2219, 1.4826  # what makes them the standard deviation of normal numbers
+QN_OF_FEW = {2: 0.399, 3: 0.994, 4: 0.512, 5: 0.844, 6: 0.611, 7: 0.857, 8: 0.669, 9: 0.872}  # Croux and Rousseeuw 1992
+MANY = 1000  # robots, above which the median absolute deviation is sure enough; Qn takes every pair
+EFFICIENCY = 0.7
+FALSE_DISCOVERY = 0.01
+FEWEST = 5  # robots: among fewer the odd one cannot be told
+SMALLEST = 0.01  # of the median uncertainty: a spread of nothing at all is rounding
+
+
+class Shared(NamedTuple):
+    """A parameter over all robots: its median, the robust spread between them, and how many there are."""
+
+    label: str
+    unit: str
+    middle: float
+    spread: float
+    robots: int
+
+    @property
+    def told(self) -> str:
+        """`0.13 ± 0.19 %`: the middle, and the spread between robots."""
+        return told(Estimate(self.middle, self.spread, self.unit))
+
+
+class Outlier(NamedTuple):
+    """A robot that is unlike the others in an effect: in which parameter most, by how many sigmas, and how surely."""
+
+    robot: str
+    effect: str
+    parameter: str
+    value: float
+    std: float
+    middle: float
+    spread: float
+    unit: str
+    sigma: float
+    p_value: float
+    false_discovery_rate: float
+
+    @property
+    def label(self) -> str:
+        """The effect and the parameter, in words."""
+        return label(self.effect, self.parameter)
+
+    @property
+    def here(self) -> str:
+        """What this robot shows."""
+        return told(Estimate(self.value, self.std, self.unit))
+
+    @property
+    def others(self) -> str:
+        """What the others show: their middle and their spread."""
+        return told(Estimate(self.middle, self.spread, self.unit))
+
+    @property
+    def sentence(self) -> str:
+        """`robot 12: mount rotation phi x 2.1 ± 0.1° against 0.1 ± 0.2° of the others, 9 sigma`."""
+        return f"{self.robot}: {self.label} {self.here} against {self.others} of the others, {self.sigma:.1f} sigma"
+
+
+@dataclass(frozen=True)
+class Compared:
+    """What all robots share, and the outliers, the clearest first."""
+
+    robots: int
+    logs: int
+    shared: tuple[Shared, ...]
+    outliers: tuple[Outlier, ...]
+    effects: Mapping[str, tuple[str, ...]]  # found by a search beyond what all are compared by: on which robots
+
+    @property
+    def summary(self) -> str:
+        """In a sentence."""
+        if self.robots < FEWEST:
+            return f"{self.robots} robots are too few to tell which is unlike the others; {FEWEST} or more are needed."
+        odd = len({one.robot for one in self.outliers})
+        count = f"{odd} of {self.robots} robots {'is' if odd == 1 else 'are'}" if odd else f"None of {self.robots} robots is"
+        return f"{count} unlike the others (false discovery rate below {FALSE_DISCOVERY:.0%}, {self.logs} logs)."
+
+    def plain(self) -> dict[str, Any]:
+        """As JSON has it."""
+        return {
+            "schema": "imutool.fleet-diagnosis/1",
+            "robots": self.robots,
+            "logs": self.logs,
+            "summary": self.summary,
+            "false_discovery_rate": FALSE_DISCOVERY,
+            "outliers": [one._asdict() | {"sentence": one.sentence} for one in self.outliers],
+            "shared": [one._asdict() for one in self.shared],
+            "effects": {name: list(robots) for name, robots in self.effects.items()},
+        }
+
+
+def label(effect: str, parameter: str) -> str:
+    """An effect and its parameter, in words."""
+    return f"{effect} {parameter}".replace("_", " ")
+
+
+def compare(results: Iterable[Result]) -> Compared:
+    """What robots share and which are unlike the others, from what each log shows; failed logs say nothing."""
+    logs: dict[str, list[Result]] = {}
+    for one in results:
+        if one.parameters:
+            logs.setdefault(one.robot, []).append(one)
+    pooled = {robot: _pooled([one.parameters for one in own]) for robot, own in sorted(logs.items())}
+    units = {(p.effect, p.name): p.unit for own in logs.values() for one in own for p in one.parameters}
+    names = list(units)
+    values = np.array([[pooled[robot].get(name, (np.nan, np.nan)) for name in names] for robot in pooled]).reshape(
+        -1, len(names), 2
+    )
+    x, std = values[..., 0], values[..., 1]
+    shared, found = [], []
+    for k, name in enumerate(names):
+        there = np.isfinite(x[:, k])
+        middle, spread = _robust(x[there, k])
+        shared.append(Shared(label(*name), units[name], middle, spread, int(there.sum())))
+    if len(pooled) >= FEWEST:
+        found = _outliers(list(pooled), names, units, x, std)
+    beyond: dict[str, set[str]] = {}
+    for robot, own in logs.items():
+        for effect in {effect for one in own for effect in one.effects or ()} - {effect for effect, _ in names}:
+            beyond.setdefault(effect, set()).add(robot)
+    return Compared(
+        len(pooled),
+        sum(map(len, logs.values())),
+        tuple(shared),
+        tuple(found),
+        {effect: tuple(sorted(robots)) for effect, robots in sorted(beyond.items())},
+    )
+
+
+def _pooled(logs: Sequence[Sequence[Parameter]]) -> dict[tuple[str, str], tuple[float, float]]:
+    """Each parameter of a robot over its logs, weighed by their certainty; logs that disagree make it less sure."""
+    columns: dict[tuple[str, str], list[tuple[float, float]]] = {}
+    for parameters in logs:
+        for one in parameters:
+            if np.isfinite(one.value) and np.isfinite(one.std) and one.std > 0.0:
+                columns.setdefault((one.effect, one.name), []).append((one.value, one.std))
+    out = {}
+    for name, pairs in columns.items():
+        value, std = np.array(pairs).T
+        weight = 1.0 / std**2
+        mean = float((weight * value).sum() / weight.sum())
+        own = 1.0 / weight.sum()
+        among = 0.0 if len(pairs) < 2 else float((weight * (value - mean) ** 2).sum() / weight.sum() / (len(pairs) - 1))
+        out[name] = (mean, float(np.sqrt(max(own, among))))
+    return out
+
+
+def _robust(x: Float64[np.ndarray, " n"]) -> tuple[float, float]:
+    """Median and robust standard deviation; zero for fewer than two."""
+    n = len(x)
+    if not n:
+        return float("nan"), float("nan")
+    middle = float(np.median(x))
+    if n < 2 or n > MANY:
+        return middle, float(MAD * np.median(np.abs(x - middle)))
+    half = n // 2 + 1
+    apart = np.abs(x[:, None] - x[None, :])[np.triu_indices(n, 1)]
+    k = half * (half - 1) // 2 - 1
+    correction = QN_OF_FEW.get(n, n / (n + (1.4 if n % 2 else 3.8)))
+    return middle, float(QN * correction * np.partition(apart, k)[k])
+
+
+def _outliers(
+    robots: Sequence[str],
+    names: Sequence[tuple[str, str]],
+    units: Mapping[tuple[str, str], str],
+    x: Float64[np.ndarray, "robots names"],
+    std: Float64[np.ndarray, "robots names"],
+) -> list[Outlier]:
+    """By effect of each robot, the parameter that is farthest off; those that chance does not explain, clearest first."""
+    tested: list[Outlier] = []
+    known = [(np.isfinite(column), *_robust(column[np.isfinite(column)])) for column in x.T]
+    for r, robot in enumerate(robots):
+        by_effect: dict[str, list[Outlier]] = {}
+        for k, (effect, parameter) in enumerate(names):
+            there, middle, spread = known[k]
+            n = int(there.sum())
+            if not there[r] or n < FEWEST:
+                continue
+            spread = max(spread, SMALLEST * float(np.median(std[there, k])))
+            sigma = float(abs(x[r, k] - middle) / np.hypot(std[r, k], spread))
+            p = 2.0 * float(student.sf(sigma, EFFICIENCY * (n - 1)))
+            own = float(x[r, k]), float(std[r, k])
+            one = Outlier(robot, effect, parameter, *own, middle, spread, units[effect, parameter], sigma, p, 1.0)
+            by_effect.setdefault(effect, []).append(one)
+        for several in by_effect.values():
+            clearest = min(several, key=lambda one: one.p_value)
+            tested.append(clearest._replace(p_value=min(1.0, clearest.p_value * len(several))))
+    tested.sort(key=lambda one: one.p_value)
+    rates = np.array([one.p_value * len(tested) / (k + 1) for k, one in enumerate(tested)])
+    rates = np.minimum.accumulate(rates[::-1])[::-1]
+    told_ = [one._replace(false_discovery_rate=float(rate)) for one, rate in zip(tested, rates, strict=True)]
+    return sorted((one for one in told_ if one.false_discovery_rate <= FALSE_DISCOVERY), key=lambda one: -one.sigma)

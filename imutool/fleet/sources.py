@@ -1,0 +1,192 @@
+"""Which logs a fleet has, and what each is called below OUT: never a place outside it, never one name for two logs."""
+
+from __future__ import annotations
+
+import glob as globs
+import os
+import re
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from imutool.errors import ConfigError
+from imutool.fleet.task import Source
+from imutool.place import Place, failures, identity, place, reason, seal
+
+LOG = ".mcap"
+PATTERN = re.compile(r"[*?\[]")
+LONGEST = 200  # bytes of one part of a name: room for what is written beside it under another, within the usual 255
+PARTIAL = re.compile(r"\.(?P<name>.+)\.\d+\.[0-9a-f]{8}\.partial", re.DOTALL)
+OWN = "fleet."  # how the names of what the fleet itself writes at the top of OUT begin
+
+
+class Found(NamedTuple):
+    """The logs of a fleet in order of their names, and the places of those that cannot be taken, with the reason."""
+
+    logs: list[Source]
+    refused: list[tuple[str, str]]
+
+
+class _File(NamedTuple):
+    """A file as a listing gives it; what a store's listing says of it besides, so that it need not be asked again."""
+
+    where: str
+    about: dict[str, Any] | None = None
+
+
+def find(text: str, out: Place) -> Found:
+    """The logs that a path, a glob, a folder or a URL names; what lies below `out` is no source.
+
+    A log is called by its path from the folder, or from the last part of a pattern before its first wildcard; a log alone by
+    its own name. Links are followed. A log that cannot be called anything below OUT is refused, and the others go on.
+
+    Raises:
+        ConfigError: nothing there, or no log in it.
+    """
+    root, files = _files(text)
+    logs, refused, taken = [], [], dict[str, str]()
+    for where, about in files:
+        if f"{where}/".startswith(f"{str(out).rstrip('/')}/"):
+            continue
+        try:
+            name = relative(where, root)
+            before = taken.setdefault(name.casefold(), where)  # one file on some systems, two on others
+            if before != where:
+                raise ConfigError(f"would be called {name}, and so would {before}", fix="Rename one of the two")
+            logs.append(Source(where, name, *(identity(Path(where)) if about is None else seal(about))))
+        except ConfigError as error:
+            refused.append((_shown(where), str(error)))
+    if not logs and not refused:
+        raise ConfigError(f"no {LOG} log", where=text, expected="a log, a folder with logs, or a pattern that fits some")
+    logs.sort(key=lambda one: one.name)
+    return Found(logs, sorted(refused))
+
+
+def relative(file: str, root: str) -> str:
+    """What a file below a root is called below OUT.
+
+    Raises:
+        ConfigError: a name that leads elsewhere, or that a terminal or a file system would not take as it is.
+    """
+    if not file.startswith(f"{root.rstrip('/')}/"):
+        raise ConfigError("lies outside what was asked for", expected=f"something below {root}")
+    name = file[len(root.rstrip("/")) + 1 :]
+    parts = name.split("/")
+    if not name.isprintable() or _shown(name) != name:
+        raise ConfigError("has control characters in its name", expected="printable characters", fix="Rename the log")
+    if any(part in {"", ".", ".."} or "\\" in part for part in parts):
+        raise ConfigError("has a name that leads elsewhere", expected="plain folders and a plain name")
+    if parts[0].startswith(OWN) or any(part.startswith(".") for part in parts):
+        raise ConfigError("has a hidden name, or one that the fleet itself uses", fix="Rename the log")
+    if max(len(part.encode()) for part in parts) > LONGEST:
+        raise ConfigError(f"has a name of more than {LONGEST} bytes", fix="Rename the log")
+    return name
+
+
+def _shown(name: str) -> str:
+    """A name as text that can be written anywhere: bytes that are no UTF-8 as escapes."""
+    return name.encode("utf-8", "surrogateescape").decode("utf-8", "backslashreplace")
+
+
+def _files(text: str) -> tuple[str, Iterator[_File]]:
+    """Where names begin, and the files."""
+    where = place(text)
+    if not isinstance(where, Path):
+        return _in_store(text)
+    if where.is_dir():
+        root = where.absolute()
+        return str(root), _walk(root, frozenset())
+    if where.is_file():
+        return str(where.absolute().parent), iter([_File(str(where.absolute()))])
+    if not PATTERN.search(str(where)):
+        raise ConfigError("is not there", where=text, expected="a log, a folder with logs, or a pattern")
+    root = Path.cwd()
+    for part in where.parts:
+        if PATTERN.search(part):
+            break
+        root /= part
+    named = sorted(globs.iglob(str(where), recursive=True))  # noqa: PTH207  Path.glob takes no absolute pattern
+    files = (os.path.abspath(one) for one in named)  # noqa: PTH100  Path.resolve would follow links
+    return os.path.abspath(root), (_File(one) for one in files if one.endswith(LOG) and Path(one).is_file())  # noqa: PTH100
+
+
+def _walk(folder: Path, above: frozenset[tuple[int, int]]) -> Iterator[_File]:
+    """The logs below a folder, through links too, but never into a folder that one is in already."""
+    try:
+        status = folder.stat()
+        here = (status.st_dev, status.st_ino)
+        entries = [] if here in above else sorted(os.scandir(folder), key=lambda entry: entry.name)
+    except OSError as error:
+        raise ConfigError(f"cannot be read ({error.strerror})", where=folder) from error
+    for entry in entries:
+        if entry.is_dir():
+            yield from _walk(folder / entry.name, above | {here})
+        elif entry.name.endswith(LOG):
+            yield _File(str(folder / entry.name))
+
+
+def _in_store(text: str) -> tuple[str, Iterator[_File]]:
+    """As `_files`, by listings alone: a thousand objects a request."""
+    match = PATTERN.search(text)
+    fixed = text.rstrip("/") if match is None else text[: match.start()].rpartition("/")[0]
+    root = place(fixed)
+    assert not isinstance(root, Path), "who calls has seen that it is none"
+    try:
+        if match is None:
+            found = root.fs.find(root.path, detail=True)
+        else:
+            found = root.fs.glob(root.path.rstrip("/") + text[len(fixed) :], detail=True)
+    except failures(root) as error:
+        raise ConfigError(f"cannot be listed ({reason(error)})", where=text) from error
+    whole = fixed.rpartition("/")[0] if list(found) == [root.path] else fixed  # a log alone, by its own name
+    files = [_File(fixed + path[len(root.path.rstrip("/")) :], about) for path, about in sorted(found.items())]
+    return whole, (one for one in files if one.where.endswith(LOG) and one.about and one.about.get("type", "file") == "file")
+
+
+def within(out: Place, name: str) -> Place:
+    """The target of a name below OUT.
+
+    Raises:
+        ConfigError: a link in OUT leads elsewhere.
+    """
+    target = out / name
+    if isinstance(target, Path) and isinstance(out, Path):
+        real = target.parent.resolve()
+        if not real.is_relative_to(out.resolve()):
+            raise ConfigError(f"leads to {real}, outside OUT", where=target.parent, fix="Remove the link")
+    return target
+
+
+def leftovers(out: Place, names: Iterable[str]) -> Iterator[Place]:
+    """Files that were being written beside these targets when somebody was killed: .NAME.PID.RANDOM.partial."""
+    folders: dict[str, set[str]] = {}
+    for name in names:
+        folder, _, file = name.rpartition("/")
+        folders.setdefault(folder, set()).add(file)
+    for folder, ours in folders.items():
+        for path in _partial(out / folder if folder else out):
+            match = PARTIAL.fullmatch(path.name)
+            if match is not None and match["name"] in ours:
+                yield path
+
+
+def remove(leftover: Iterable[Place]) -> None:
+    """Removes them, unless somebody else has meanwhile.
+
+    Raises:
+        ConfigError: the system refuses.
+    """
+    for path in leftover:
+        try:
+            path.unlink()
+        except FileNotFoundError:
+            continue
+        except failures(path) as error:
+            raise ConfigError(f"cannot be removed ({reason(error)})", where=path) from error
+
+
+def _partial(folder: Place) -> list[Place]:
+    try:
+        return list(folder.glob(".*.partial"))
+    except failures(folder) as error:
+        raise ConfigError(f"cannot be listed ({reason(error)})", where=folder) from error

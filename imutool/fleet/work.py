@@ -1,0 +1,272 @@
+"""What is done to one log, wherever that is: a task comes in, a result goes out. Nothing here knows of a cluster."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import platform
+import re
+import resource
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from imutool.clean import UntrustedError
+from imutool.diagnosis_folder import plain
+from imutool.errors import ConfigError, ImutoolError, LogError, ModelError
+from imutool.fleet.sources import leftovers, remove, within
+from imutool.fleet.task import Imu, Parameter, Result, Settings, Task
+from imutool.mcap_io.digest import sha256
+from imutool.mcap_io.log import Log
+from imutool.mcap_io.target import Target
+from imutool.place import Place, identity, place
+
+MOST_LOSSES = 20  # stretches told of a log; its metadata and its repair tell all
+MAXRSS = 1 if sys.platform == "darwin" else 1024  # bytes in what the system counts memory in
+
+
+@dataclass(frozen=True)
+class _Job:
+    """A task with its places opened up."""
+
+    name: str
+    source: Place
+    target: Place
+    settings: Settings
+
+
+def work(task: Task, model: bytes | None = None) -> Result:
+    """Does one log. What fails for a reason a user can act on becomes a failed result; a bug is raised.
+
+    `model` is the content of the model file, where the settings name one: this machine may not have it. The target is there
+    whole or not at all, and is the same, byte for byte, however often this is done. What an attempt that was killed has left
+    beside it is removed.
+    """
+    began, cpu_began = time.perf_counter(), time.process_time()
+    result = Result(
+        key=task.key,
+        source=task.source.place,
+        target=task.target,
+        status="ok",
+        source_bytes=task.source.size,
+        host=platform.node(),
+    )
+    try:
+        job = _Job(
+            task.source.name, place(task.source.place), within(place(task.out), task.target), _at_hand(task.settings, model)
+        )
+        if task.done is not None and stands(task.done, job.target, whole=task.recheck):
+            return msgspec.structs.replace(task.done, status="skipped", earlier=task.done.status)
+        _refuse_changed(task, job.source)
+        _clear(task, job.target)
+        told = COMMANDS[task.settings.command](job)
+        result = msgspec.structs.replace(result, **told, **_measured(job.target))
+    except UntrustedError as error:
+        result = msgspec.structs.replace(result, status="quarantined", error=str(error), exit_code=error.exit_code)
+    except ImutoolError as error:
+        result = msgspec.structs.replace(result, status="failed", error=str(error), exit_code=error.exit_code)
+    except OSError as error:
+        reason = f"{error.filename or task.source.place}: {error.strerror or error}"
+        result = msgspec.structs.replace(result, status="failed", error=reason, exit_code=ConfigError.exit_code)
+    except MemoryError:
+        result = msgspec.structs.replace(result, status="failed", error="out of memory", exit_code=LogError.exit_code)
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * MAXRSS
+    spent = {"seconds": time.perf_counter() - began, "cpu_seconds": time.process_time() - cpu_began}
+    return msgspec.structs.replace(result, **spent, peak_bytes=peak)
+
+
+def stands(done: Result, target: Place, *, whole: bool = False) -> bool:
+    """Whether a target is still what an earlier run left: of its size, and a log that opens; with `whole`, of its SHA-256."""
+    if done.status == "quarantined":  # nothing was written
+        return True
+    try:
+        if identity(target)[0] != done.target_bytes:
+            return False
+        if whole or target.suffix != ".mcap":
+            return sha256(target) == done.target_sha256
+        with Log(target):
+            return True
+    except ImutoolError:
+        return False
+
+
+def _at_hand(settings: Settings, model: bytes | None) -> Settings:
+    """Settings that name a file here, with the model that the fleet began with: who planned it may sit at another machine.
+
+    Raises:
+        ModelError: what was sent is not what was meant.
+    """
+    if model is None or settings.model is None:
+        return settings
+    if hashlib.sha256(model).hexdigest() != settings.model_sha256:
+        raise ModelError("has changed since the fleet was begun", where=settings.model, fix="Begin again with --overwrite")
+    there = Path(tempfile.gettempdir(), f"imutool-models.{os.getuid()}", settings.model_sha256, Path(settings.model).name)
+    if not there.is_file() or sha256(there) != settings.model_sha256:
+        there.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
+        with Target(there, overwrite=True) as out:
+            out.write(model)
+    return msgspec.structs.replace(settings, model=str(there))
+
+
+def _refuse_changed(task: Task, source: Place) -> None:
+    """A log that is still being written is left for another time."""
+    if identity(source) != (task.source.size, task.source.stamp):
+        raise LogError("has changed since it was listed", where=source, fix="Go on with --resume when it is complete")
+
+
+def _clear(task: Task, target: Place) -> None:
+    """Makes the folder, and removes what a killed attempt at this target left in it."""
+    if isinstance(target, Path):
+        target.parent.mkdir(parents=True, exist_ok=True)
+    remove(leftovers(place(task.out), [task.target]))
+
+
+def _measured(target: Place) -> dict[str, Any]:
+    return {"target_bytes": identity(target)[0], "target_sha256": sha256(target)}
+
+
+def _debias(job: _Job) -> dict[str, Any]:
+    from imutool.clean import Rules
+    from imutool.debias import debias
+
+    s = job.settings
+    rules = Rules() if s.clean else None
+    report = debias(
+        job.source, job.target, model=s.model, init=s.init, smooth=s.smooth, clean=rules, check=s.check, overwrite=True
+    )
+    imus = tuple(
+        Imu(topic, report.models[topic], start.how, tuple(start.rest[:3].tolist()), tuple(start.rest[3:].tolist()))
+        for topic, start in report.starts.items()
+    )
+    told: dict[str, Any] = {"messages": report.rewrite.copied, "imus": imus, **_lost(report.losses.plain())}
+    if report.surveys:
+        told["score"] = min(one.score for one in report.surveys.values())
+        said = tuple(f"{topic}: {finding}" for topic, one in report.surveys.items() for finding in one.reasons)
+        told["warnings"] = (*told.get("warnings", ()), *said)
+    return told
+
+
+def _info(job: _Job) -> dict[str, Any]:
+    from imutool.info import inspect
+
+    report = inspect(job.source)
+    write_json(report, job.target)
+    told = {"messages": report["messages"], "duration_s": report["duration_s"]}
+    lost = _lost(report.get("losses"))
+    return told | lost | {"warnings": (*lost.get("warnings", ()), *report["warnings"])}
+
+
+def _repair(job: _Job) -> dict[str, Any]:
+    from imutool.mcap_io.salvage import repair
+
+    report = repair(job.source, job.target, damaged=job.settings.damaged, overwrite=True)
+    return {"messages": sum(report.messages.values()), **_lost(report.losses.plain())}
+
+
+def _lost(losses: Mapping[str, Any] | None) -> dict[str, Any]:
+    """What a result says of a log's losses, from the values that stand in JSON for them; the first of many."""
+    if not losses:
+        return {}
+    stretches, told = losses["stretches"], []
+    for one in stretches[:MOST_LOSSES]:
+        count = "an unknown number of" if one["messages"] is None else one["messages"]
+        told.append(f"byte {one['offset']}, {one['bytes']} bytes: {one['reason']} ({count} messages lost)")
+    more = len(stretches) - len(told) + losses["stretches_not_listed"]
+    status = {"status": "lost"} if stretches else {}
+    return {**status, "losses": (*told, *([f"{more} more stretches"] if more else ())), "warnings": tuple(losses["mended"])}
+
+
+def _diagnose(job: _Job) -> dict[str, Any]:
+    from imutool.physics.diagnose import diagnose, measured
+
+    s = job.settings
+    robot = robot_of(job.name, s.robot_from, job.source)
+    sim = None if s.sim is None else _simulation(place(s.sim), job.name)
+    fit = measured(job.source, sim, imu=s.imu, truth=s.truth)
+    stds = fit.stds()
+    parameters = tuple(
+        Parameter(physics.name, number.name, float(value), float(std), number.unit)
+        for physics, theta in fit.chosen
+        for number, value, std in zip(physics.parameters, theta, stds[physics.name], strict=True)
+    )
+    told: dict[str, Any] = {"robot": robot, "parameters": parameters}
+    report: dict[str, Any] = {"schema": "imutool.unit/1", "robot": robot, "bias": fit.bias.tolist()}
+    report["parameters"] = [msgspec.to_builtins(one) for one in parameters]
+    if not s.quick:
+        found = diagnose([job.source], sim, imu=s.imu, truth=s.truth)
+        report["diagnosis"] = plain(found)
+        told["effects"] = tuple(one.effect for one in found.findings)
+        told["warnings"] = found.remarks
+    write_json(report, job.target)
+    return told
+
+
+def robot_of(name: str, pattern: str | None, log: Place) -> str:
+    """Whose log it is: as a pattern says of its name, or `metadata:RECORD.KEY` of what it holds; else its folder's name.
+
+    Raises:
+        ConfigError: the pattern is none, or fits neither.
+    """
+    fits = robot_pattern(pattern)
+    if fits is None:
+        folder, _, file = name.rpartition("/")
+        return folder or file.removesuffix(".mcap")
+    if isinstance(fits, str):
+        record, _, key = fits.rpartition(".")
+        with Log(log) as opened:
+            found = opened.metadata().get(record, {}).get(key, "")
+        if not found:
+            raise ConfigError(f"has no {key!r} in its metadata {record!r}", where=log)
+        return found
+    match = fits.search(name)
+    if match is None:
+        raise ConfigError(f"{fits.pattern!r} fits nothing in {name}", where="--robot-from")
+    return str(match[1] if fits.groups else match[0])
+
+
+def robot_pattern(pattern: str | None) -> re.Pattern[str] | str | None:
+    """A regular expression on names, or RECORD.KEY of metadata.
+
+    Raises:
+        ConfigError: it is neither.
+    """
+    if pattern is None:
+        return None
+    if pattern.startswith("metadata:"):
+        if "." not in pattern:
+            raise ConfigError(f"{pattern!r} names no metadata", where="--robot-from", expected="metadata:RECORD.KEY")
+        return pattern.removeprefix("metadata:")
+    try:
+        return re.compile(pattern)
+    except re.error as error:
+        raise ConfigError(f"{pattern!r} is no pattern ({error})", where="--robot-from") from error
+
+
+def _simulation(folder: Place, name: str) -> Place:
+    """The simulation of a log: of the same name in another folder; a file serves for all."""
+    found = folder if folder.suffix == ".mcap" else folder / name
+    if not found.is_file():
+        raise ConfigError("is not there", where=found, expected="the simulation of a log under the same name")
+    return found
+
+
+def write_json(report: Mapping[str, Any], target: Place) -> None:
+    """Writes values as JSON, in place of what is there."""
+    with Target(target, overwrite=True) as out:
+        out.write(json.dumps(report, indent=2, allow_nan=False, ensure_ascii=False).encode() + b"\n")
+
+
+COMMANDS: dict[str, Callable[[_Job], dict[str, Any]]] = {
+    "debias": _debias,
+    "repair": _repair,
+    "info": _info,
+    "diagnose": _diagnose,
+}
+SUFFIX = {"debias": ".mcap", "repair": ".mcap", "info": ".json", "diagnose": ".json"}  # of what a command leaves of a log

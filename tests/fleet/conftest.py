@@ -1,0 +1,59 @@
+"""Workers for all tests of a fleet, started once; logs that robots of one kind would record."""
+
+from __future__ import annotations
+
+import os
+import runpy
+import shutil
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+
+from imutool.fleet.engine import Engine
+from imutool.mcap_io.write import write
+
+PLANTED = SimpleNamespace(**runpy.run_path(str(Path(__file__).parents[1] / "physics" / "planted.py")))
+LOG_S = 10.0  # below eight nothing is told
+Robot = Callable[[Path, int, Mapping[str, Sequence[float]]], None]
+
+
+@pytest.fixture(scope="session")
+def ray_started() -> Iterator[None]:
+    """Ray on two cores of this machine; every Engine of this process uses it."""
+    before = dict(os.environ)
+    with Engine(workers=2, memory_bytes=1 << 28):
+        yield
+    os.environ.clear()
+    os.environ.update(before)
+
+
+@pytest.fixture
+def engine(ray_started: None) -> Callable[[], Engine]:
+    """Two workers."""
+    return lambda: Engine(workers=2, memory_bytes=1 << 28, retries=3)
+
+
+@pytest.fixture
+def fleet(tmp_path: Path, logs: Path) -> Path:
+    """Two robots whose logs have the same name."""
+    folder = tmp_path / "fleet"
+    for robot, flight in (("robot_a", "flight_1"), ("robot_b", "flight_2")):
+        (folder / robot).mkdir(parents=True)
+        shutil.copy(logs / f"{flight}.mcap", folder / robot / "log.mcap")
+    return folder
+
+
+@pytest.fixture(scope="session")
+def robot() -> Robot:
+    """Writes a robot's log: a motion of its own, effects, noise, a bias, and its true poses."""
+
+    def make(path: Path, seed: int, effects: Mapping[str, Sequence[float]]) -> None:
+        felt, motion = PLANTED.rich(seed, LOG_S), PLANTED.moving(seed, LOG_S)
+        samples = PLANTED.ideal(felt, PLANTED.acting(effects)) + PLANTED.noise(len(felt.t_s), seed) + PLANTED.BIAS
+        poses = PLANTED.poses(motion, PLANTED.clock(LOG_S, rate_hz=200.0))
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write(PLANTED.recording(path.stem, felt.t_s, samples, poses=poses), path)
+
+    return make

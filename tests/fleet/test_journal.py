@@ -1,0 +1,123 @@
+"""The journal knows what is done, however it was cut off; nobody overwrites another's results by it."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import pytest
+
+from imutool.errors import ConfigError
+from imutool.fleet import journal as journals
+from imutool.fleet.journal import NAME, Journal
+from imutool.fleet.task import Result, Settings, Source
+from imutool.place import Place, place
+
+SETTINGS = Settings(command="debias", model="m", model_sha256="1")
+OTHER = msgspec.structs.replace(SETTINGS, init="prior")
+
+
+def result(key: str, **changes: Any) -> Result:
+    return Result(key=key, source=f"/logs/{key}.mcap", target=f"{key}.mcap", status="ok", **changes)
+
+
+def fill(out: Place, *keys: str) -> None:
+    with Journal(out, SETTINGS) as journal:
+        for key in keys:
+            journal.begin(key, f"{key}.mcap")
+            journal.finish(result(key, messages=7))
+
+
+def test_what_was_finished_is_known_to_the_next_run(tmp_path: Path) -> None:
+    fill(tmp_path, "a", "b")
+    with Journal(tmp_path, SETTINGS, resume=True) as journal:
+        assert journal.done("a") == result("a", messages=7)
+        assert journal.done("c") is None
+        assert journal.ours("b.mcap")
+        assert not journal.ours("c.mcap")
+        journal.finish(result("a", messages=8))
+        assert journal.done("a") == result("a", messages=8)
+
+
+def test_cut_off_anywhere_the_journal_knows_all_whole_lines(tmp_path: Path) -> None:
+    fill(tmp_path, "a", "b")
+    whole = (tmp_path / NAME).read_bytes()
+    first, last = whole.index(b'"messages":7') + 1, len(whole)
+    ends = [at + k for at, byte in enumerate(whole, 1) if byte == 10 for k in (-1, 0, 1)]
+    for cut in sorted({*range(whole.index(b"\n") + 1, last, 23), *(at for at in ends if at <= last)} - {*range(ends[1])}):
+        (tmp_path / NAME).write_bytes(whole[:cut])
+        with Journal(tmp_path, SETTINGS, resume=True) as journal:
+            known = [key for key in "ab" if journal.done(key)]
+            assert known == (["a", "b"] if cut == last else ["a"] if cut > whole.index(b"\n", first) else [])
+            journal.finish(result("c"))
+        with Journal(tmp_path, SETTINGS, resume=True) as journal:
+            assert journal.done("c") == result("c")
+
+
+def test_a_line_that_cannot_be_read_costs_that_log_alone(tmp_path: Path) -> None:
+    fill(tmp_path, "a", "b")
+    lines = (tmp_path / NAME).read_bytes().splitlines(keepends=True)
+    lines[2] = b"\x00" * 40 + b"\n"
+    (tmp_path / NAME).write_bytes(b"".join(lines))
+    with Journal(tmp_path, SETTINGS, resume=True) as journal:
+        assert (journal.done("a"), journal.done("b")) == (None, result("b", messages=7))
+        assert journal.ours("a.mcap")
+
+
+def test_results_that_are_there_are_not_begun_anew_without_a_word(tmp_path: Path) -> None:
+    fill(tmp_path, "a")
+    before = (tmp_path / NAME).read_bytes()
+    with pytest.raises(ConfigError, match="Go on with --resume"):
+        Journal(tmp_path, SETTINGS)
+    with pytest.raises(ConfigError, match=r"other settings \(init 'auto', now 'prior'\)"):
+        Journal(tmp_path, OTHER, resume=True)
+    assert (tmp_path / NAME).read_bytes() == before
+
+
+def test_overwrite_begins_anew_and_knows_its_own_targets(tmp_path: Path) -> None:
+    fill(tmp_path, "a")
+    with Journal(tmp_path, OTHER, overwrite=True) as journal:
+        assert journal.done("a") is None
+        assert journal.ours("a.mcap")
+    with Journal(tmp_path, OTHER, resume=True) as journal:  # killed before it began anything
+        assert journal.done("a") is None
+        assert journal.ours("a.mcap")
+
+
+def test_two_at_once_are_refused(tmp_path: Path) -> None:
+    line = f"from imutool.fleet.journal import *; Journal(Path({str(tmp_path)!r}), Settings(command='info'), resume=True)"
+    with Journal(tmp_path, SETTINGS):
+        done = subprocess.run([sys.executable, "-c", line], capture_output=True, text=True, timeout=60, check=False)
+    assert "another run is at work here" in done.stderr
+
+
+def test_a_key_is_of_the_content_the_model_and_the_settings() -> None:
+    one = Source("/logs/a.mcap", "a.mcap", 5, "1")
+    others = [
+        one.key(OTHER),
+        one.key(msgspec.structs.replace(SETTINGS, model_sha256="2")),
+        msgspec.structs.replace(one, size=6).key(SETTINGS),
+        msgspec.structs.replace(one, stamp="2").key(SETTINGS),
+        msgspec.structs.replace(one, place="/logs/b.mcap").key(SETTINGS),
+    ]
+    assert len({one.key(SETTINGS), *others}) == 6
+    assert msgspec.structs.replace(one, name="b/a.mcap").key(SETTINGS) == one.key(SETTINGS)
+
+
+def test_in_a_store_it_lies_in_pieces(store: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(journals, "PIECE_BYTES", 1000)
+    out = place("s3://fleet/out")
+    fill(out, *"abcdef")
+    pieces = len(store.keys())
+    assert pieces > 2
+    with pytest.raises(ConfigError, match="Go on with --resume"):
+        Journal(out, SETTINGS)
+    with Journal(out, SETTINGS, resume=True) as journal:
+        assert journal.done("f") == result("f", messages=7)
+        assert journal.ours("a.mcap")
+    assert len(store.keys()) == pieces + 1
+    with Journal(out, OTHER, overwrite=True) as journal:
+        assert journal.done("f") is None

@@ -1,0 +1,147 @@
+"""Logs are found and named: never outside OUT, never two alike, whatever they are called."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from imutool.errors import ConfigError
+from imutool.fleet.sources import LONGEST, find, leftovers, relative, remove, within
+from imutool.place import place
+
+NOWHERE = Path("/nowhere")
+
+
+def tree(folder: Path, *names: str) -> Path:
+    for name in names:
+        path = folder / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(name.encode())
+    return folder
+
+
+def names(text: str | Path, out: Path = NOWHERE) -> list[str]:
+    return [one.name for one in find(str(text), out).logs]
+
+
+def test_logs_of_the_same_name_keep_their_folders(tmp_path: Path) -> None:
+    tree(tmp_path, "a/log.mcap", "b/log.mcap", "b/c/log.mcap", "b/readme.txt")
+    assert names(tmp_path) == ["a/log.mcap", "b/c/log.mcap", "b/log.mcap"]
+    assert names(tmp_path / "a" / "log.mcap") == ["log.mcap"]
+    assert names(tmp_path / "*" / "log.mcap") == ["a/log.mcap", "b/log.mcap"]
+    assert names(tmp_path / "b" / "**" / "*.mcap") == ["c/log.mcap", "log.mcap"]
+
+
+def test_what_lies_in_out_is_no_source(tmp_path: Path) -> None:
+    tree(tmp_path, "a.mcap", "out/a.mcap", "outer/a.mcap")
+    assert names(tmp_path, tmp_path / "out") == ["a.mcap", "outer/a.mcap"]
+
+
+def test_links_to_logs_are_followed_but_not_in_circles(tmp_path: Path) -> None:
+    tree(tmp_path / "disk", "x/log.mcap")
+    fleet = tree(tmp_path / "fleet", "own.mcap")
+    (fleet / "robot").symlink_to(tmp_path / "disk")
+    (tmp_path / "disk" / "x" / "back").symlink_to(tmp_path / "disk")
+    assert names(fleet) == ["own.mcap", "robot/x/log.mcap"]
+
+
+@pytest.mark.parametrize("empty", ["", "*.mcap", "none", "none/*.mcap"])
+def test_no_logs_is_an_error_that_says_so(tmp_path: Path, empty: str) -> None:
+    with pytest.raises(ConfigError, match=r"no \.mcap log|is not there"):
+        find(str(tmp_path / empty), NOWHERE)
+
+
+HOSTILE = [
+    "bell\a.mcap",
+    "line\nbreak.mcap",
+    ".hidden.mcap",
+    "fleet.mcap",
+    "back\\slash.mcap",
+    f"{'x' * LONGEST}.mcap",
+    b"\xff.mcap",
+]
+
+
+@pytest.mark.parametrize("name", HOSTILE, ids=repr)
+def test_a_hostile_name_is_refused_and_the_others_go_on(tmp_path: Path, name: str | bytes) -> None:
+    tree(tmp_path, "good.mcap")
+    (tmp_path / os.fsdecode(name)).write_bytes(b"")
+    found = find(str(tmp_path), NOWHERE)
+    assert [one.name for one in found.logs] == ["good.mcap"]
+    ((where, why),) = found.refused
+    assert where.encode()  # it can be written down
+    assert "name" in why
+
+
+@pytest.mark.parametrize("file", ["/src/../etc/x.mcap", "/src//x.mcap", "/src/./x.mcap", "/etc/x.mcap", "/srcx/a.mcap", "/src"])
+def test_a_name_that_leads_elsewhere_is_refused(file: str) -> None:
+    with pytest.raises(ConfigError):
+        relative(file, "/src")
+
+
+@given(st.text(max_size=30))
+def test_no_name_leads_out_of_out(name: str) -> None:
+    try:
+        taken = relative(f"/src/{name}", "/src")
+    except ConfigError:
+        return
+    target = Path(os.path.normpath(Path("/out") / taken))
+    assert target.is_relative_to("/out")
+    assert target != Path("/out")
+    assert taken.isprintable()
+
+
+def test_names_that_differ_in_case_alone_are_one_on_some_systems(tmp_path: Path) -> None:
+    tree(tmp_path, "Log.mcap", "log.mcap")
+    found = find(str(tmp_path), NOWHERE)
+    assert len(found.logs) == 1
+    ((_, why),) = found.refused
+    assert "would be called" in why
+
+
+def test_a_link_in_out_is_not_followed_elsewhere(tmp_path: Path) -> None:
+    out = tree(tmp_path / "out", "there/x")
+    (tmp_path / "elsewhere").mkdir()
+    (out / "a").symlink_to(tmp_path / "elsewhere")
+    assert within(out, "there/b.mcap") == out / "there" / "b.mcap"
+    with pytest.raises(ConfigError, match="outside OUT"):
+        within(out, "a/b.mcap")
+
+
+def test_another_content_is_another_identity(tmp_path: Path) -> None:
+    path = tree(tmp_path, "a.mcap") / "a.mcap"
+    before = identity(path)
+    os.utime(path, ns=(1, 1))
+    assert identity(path) == (before[0], "1")
+    path.write_bytes(b"more than there was")
+    assert identity(path)[0] != before[0]
+
+
+def test_only_what_was_half_written_beside_these_targets_goes(tmp_path: Path) -> None:
+    ours = [".a.mcap.12.0123abcd.partial", "b/.c.mcap.1.ffffffff.partial"]
+    others = [".other.mcap.12.0123abcd.partial", ".a.mcap.partial", "a.mcap", "b/.c.mcap.1.ffffffff.partial.mcap"]
+    tree(tmp_path, *ours, *others)
+    remove(leftovers(tmp_path, ["a.mcap", "b/c.mcap", "gone/d.mcap"]))
+    assert sorted(str(one.relative_to(tmp_path)) for one in tmp_path.rglob("*") if one.is_file()) == sorted(others)
+
+
+def test_a_store_is_listed_in_one_request(store: Any) -> None:
+    for key in ("robots/a/log.mcap", "robots/b/log.mcap", "robots/b/notes.txt", "out/a/log.mcap"):
+        store.put(key, b"12345")
+    store.requests.clear()
+    found = find("s3://fleet/robots", place("s3://fleet/robots/out")).logs
+    assert [(one.place, one.name, one.size) for one in found] == [
+        ("s3://fleet/robots/a/log.mcap", "a/log.mcap", 5),
+        ("s3://fleet/robots/b/log.mcap", "b/log.mcap", 5),
+    ]
+    assert len(store.requests) <= 2
+    assert identity(place("s3://fleet/robots/a/log.mcap")) == (5, found[0].stamp)
+    assert [one.name for one in find("s3://fleet/*/b/*.mcap", NOWHERE).logs] == ["robots/b/log.mcap"]
+    assert [one.name for one in find("s3://fleet/robots/b/log.mcap", NOWHERE).logs] == ["log.mcap"]
+    with pytest.raises(ConfigError, match=r"no \.mcap log"):
+        find("s3://fleet/none", NOWHERE)

@@ -1,0 +1,155 @@
+"""One log, without any cluster: whole or not at all, the same every time, and an error is a result."""
+
+from __future__ import annotations
+
+import json
+import os
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import pytest
+
+from imutool.debias import debias
+from imutool.errors import ConfigError
+from imutool.fleet.models import settled
+from imutool.fleet.sources import find
+from imutool.fleet.task import Result, Settings, Source, Task
+from imutool.fleet.work import robot_of, robot_pattern, work
+from imutool.mcap_io.read import read
+from imutool.mcap_io.rewrite import sha256
+from imutool.mcap_io.write import write
+
+
+def task(source: Path, out: Path, settings: Settings, name: str = "a/log.mcap", **changes: Any) -> Task:
+    (one,) = find(str(source), Path("/nowhere")).logs
+    return Task(key="k", source=one, out=str(out), target=name, settings=settings, **changes)
+
+
+@pytest.fixture
+def settings(logs: Path) -> Settings:
+    return Settings(command="debias", model=str(logs / "linear.safetensors"))
+
+
+@pytest.fixture
+def done(logs: Path, tmp_path: Path, settings: Settings) -> Result:
+    return work(task(logs / "flight_1.mcap", tmp_path / "out", settings))
+
+
+def test_a_debiased_log_is_what_debias_makes_of_it(done: Result, logs: Path, tmp_path: Path, settings: Settings) -> None:
+    debias(logs / "flight_1.mcap", tmp_path / "alone.mcap", model=settings.model)
+    target = tmp_path / "out" / "a" / "log.mcap"
+    assert target.read_bytes() == (tmp_path / "alone.mcap").read_bytes()
+    assert (done.status, done.error, done.exit_code) == ("ok", "", 0)
+    assert (done.target_bytes, done.target_sha256) == (target.stat().st_size, sha256(target))
+    assert done.messages > 4000
+    (imu,) = done.imus
+    assert (imu.topic, imu.model) == ("/imu0", "linear")
+
+
+def test_done_again_it_is_the_same_byte_for_byte(done: Result, logs: Path, tmp_path: Path, settings: Settings) -> None:
+    """Nothing in it tells of the time, the machine or the place."""
+    moved = tmp_path / "elsewhere" / "flight_1.mcap"
+    moved.parent.mkdir()
+    moved.write_bytes((logs / "flight_1.mcap").read_bytes())
+    assert work(task(moved, tmp_path / "other", settings)).target_sha256 == done.target_sha256
+    assert work(task(logs / "flight_1.mcap", tmp_path / "out", settings)).target_sha256 == done.target_sha256
+
+
+def test_a_machine_without_the_model_gets_it(done: Result, logs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    model = (logs / "linear.safetensors").read_bytes()
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    away = settled(Settings(command="debias", model=str(logs / "linear.safetensors")))
+    away = msgspec.structs.replace(away, model="/not/here/linear.safetensors")
+    assert work(task(logs / "flight_1.mcap", tmp_path / "far", away), model).target_sha256 == done.target_sha256
+    spoiled = work(task(logs / "flight_1.mcap", tmp_path / "far", away), model + b"more")
+    assert (spoiled.status, spoiled.exit_code) == ("failed", 6)
+
+
+def test_what_stands_is_skipped(done: Result, logs: Path, tmp_path: Path, settings: Settings) -> None:
+    target = tmp_path / "out" / "a" / "log.mcap"
+    before = target.stat().st_mtime_ns
+    again = work(task(logs / "flight_1.mcap", tmp_path / "out", settings, done=done, recheck=True))
+    assert (again.status, again.earlier, again.target_sha256) == ("skipped", "ok", done.target_sha256)
+    assert target.stat().st_mtime_ns == before
+
+
+@pytest.mark.parametrize("harm", ["gone", "cut", "footer"])
+def test_what_no_longer_stands_is_done_again(done: Result, logs: Path, tmp_path: Path, settings: Settings, harm: str) -> None:
+    target = tmp_path / "out" / "a" / "log.mcap"
+    whole = target.read_bytes()
+    if harm == "gone":
+        target.unlink()
+    else:
+        target.write_bytes(whole[:-100] + (b"" if harm == "cut" else bytes(100)))
+    again = work(task(logs / "flight_1.mcap", tmp_path / "out", settings, done=done))
+    assert again.status == "ok"
+    assert target.read_bytes() == whole
+
+
+def test_a_flipped_byte_is_seen_when_all_is_read_again(done: Result, logs: Path, tmp_path: Path, settings: Settings) -> None:
+    target = tmp_path / "out" / "a" / "log.mcap"
+    whole = bytearray(target.read_bytes())
+    whole[len(whole) // 2] ^= 1
+    target.write_bytes(whole)
+    again = work(task(logs / "flight_1.mcap", tmp_path / "out", settings, done=done, recheck=True))
+    assert (again.status, sha256(target)) == ("ok", done.target_sha256)
+
+
+def test_what_a_killed_attempt_left_is_removed(logs: Path, tmp_path: Path) -> None:
+    left = tmp_path / "out" / "a" / ".log.json.123.0123abcd.partial"
+    left.parent.mkdir(parents=True)
+    left.write_bytes(b"half")
+    assert work(task(logs / "flight_1.mcap", tmp_path / "out", Settings(command="info"), "a/log.json")).status == "ok"
+    assert [one.name for one in left.parent.iterdir()] == ["log.json"]
+
+
+def test_a_damaged_log_is_a_result_and_leaves_nothing(logs: Path, tmp_path: Path, settings: Settings) -> None:
+    broken = tmp_path / "broken.mcap"
+    broken.write_bytes((logs / "flight_1.mcap").read_bytes()[:50_000])
+    for one in (settings, Settings(command="info")):
+        found = work(task(broken, tmp_path / "out", one))
+        assert (found.status, found.exit_code, found.target_sha256) == ("failed", 5, "")
+        assert "cut short" in found.error
+    assert not [one for one in (tmp_path / "out").rglob("*") if one.is_file()]
+
+
+def test_a_log_that_is_still_being_written_waits(logs: Path, tmp_path: Path, settings: Settings) -> None:
+    growing = tmp_path / "growing.mcap"
+    growing.write_bytes((logs / "flight_1.mcap").read_bytes())
+    listed = task(growing, tmp_path / "out", settings)
+    os.utime(growing, ns=(1, 1))
+    assert "has changed since it was listed" in work(listed).error
+
+
+def test_a_log_that_has_gone_is_a_result(tmp_path: Path) -> None:
+    source = Source(str(tmp_path / "gone.mcap"), "gone.mcap", 1, "1")
+    out = Task(key="k", source=source, out=str(tmp_path), target="gone.json", settings=Settings(command="info"))
+    assert (work(out).status, work(out).exit_code) == ("failed", ConfigError.exit_code)
+
+
+def test_info_is_what_info_says(logs: Path, tmp_path: Path) -> None:
+    found = work(task(logs / "flight_1.mcap", tmp_path, Settings(command="info"), "a.json"))
+    report = json.loads((tmp_path / "a.json").read_text())
+    assert (report["schema"], report["messages"]) == ("imutool.info/1", found.messages)
+    assert found.duration_s == report["duration_s"]
+
+
+def test_a_robot_is_its_folder_or_what_the_pattern_says(logs: Path, tmp_path: Path) -> None:
+    log = tmp_path / "log.mcap"
+    write(
+        read(logs / "flight_1.mcap").__class__(**{**vars(read(logs / "flight_1.mcap")), "metadata": {"unit": {"serial": "7"}}}),
+        log,
+    )
+    assert robot_of("site/robot 3/log.mcap", None, log) == "site/robot 3"
+    assert robot_of("robot_3.mcap", None, log) == "robot_3"
+    assert robot_of("site/r3_monday.mcap", r"(r\d+)_", log) == "r3"
+    assert robot_of("any.mcap", "metadata:unit.serial", log) == "7"
+    with pytest.raises(ConfigError, match="fits nothing"):
+        robot_of("site/monday.mcap", r"(r\d+)_", log)
+    with pytest.raises(ConfigError, match="has no 'name'"):
+        robot_of("any.mcap", "metadata:unit.name", log)
+    for wrong in ("(", "metadata:serial"):
+        with pytest.raises(ConfigError, match="--robot-from"):
+            robot_pattern(wrong)
