@@ -148,7 +148,12 @@ def _debias(job: _Job) -> dict[str, Any]:
     told: dict[str, Any] = {"messages": report.rewrite.copied, "imus": imus, **_lost(report.losses.plain())}
     if report.surveys:
         told["score"] = min(one.score for one in report.surveys.values())
-        said = tuple(f"{topic}: {finding}" for topic, one in report.surveys.items() for finding in one.reasons)
+        said = (
+            f"{topic}: {finding.count} {finding.what}, {finding.action}"
+            for topic, one in report.surveys.items()
+            for finding in one.findings
+            if finding.severity != "note"
+        )
         told["warnings"] = (*told.get("warnings", ()), *said)
     return told
 
