@@ -279,7 +279,7 @@ def unpack(record: bytes | memoryview, offset: int) -> bytes | memoryview:
         raise LogError(
             f"{where} is damaged: its contents have CRC {crc32(data):08x}",
             expected=f"{head.crc:08x}",
-            fix="Copy the log again from where it was recorded",
+            fix="Save the rest with `imutool repair`, or copy the log again from where it was recorded",
         )
     return data
 

@@ -62,6 +62,9 @@ class Salvaged(Structure):
         """Messages per channel id, of what is not lost so far."""
         if self.statistics is not None and not self.losses:
             return dict(self.statistics.channel_message_counts)
+        return self._total()
+
+    def _total(self) -> dict[int, int]:
         total: Counter[int] = Counter()
         for block in self.blocks:
             if block.counts is None and block.vouched and block.indexes:
@@ -229,6 +232,11 @@ class Salvaged(Structure):
         for gap in self._walk.gaps:
             self._close(gap)
         self._settle_header()
+        if told is not None and not self.losses and all(block.counts is not None for block in self.blocks):
+            missing = Counter(told.channel_message_counts) - Counter(self._total())
+            if missing:
+                why = "the statistics of the log count messages that are not there"
+                self.losses.add(Loss(0, 0, why, self._by_topic(missing), exact=True))
         del self._walk, self._failed
 
     def _give_up_doubtful(self) -> None:
