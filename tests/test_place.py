@@ -24,7 +24,7 @@ from imutool.mcap_io.rewrite import rewrite
 from imutool.mcap_io.source import Source
 from imutool.mcap_io.target import Target
 from imutool.mcap_io.write import write
-from imutool.place import BLOCK_BYTES, place, same
+from imutool.place import BLOCK_BYTES, place, reason, same
 from imutool.recording import Frames, Imu, Recording
 
 MIB = 1 << 20
@@ -223,6 +223,26 @@ def test_a_large_object_that_cannot_be_copied_to_its_key_leaves_no_parts(store: 
     assert (store.uploads(), store.keys()) == ([], ["large"])
 
 
+def test_any_store_of_fsspec_serves(logs: Path, tmp_path: Path) -> None:
+    fs = place("memory://").fs
+    fs.store.clear()
+    fs.pipe_file("/in/log.mcap", (logs / "flight_1.mcap").read_bytes())
+    rewrite(place("memory://in/log.mcap"), place("memory://out/log.mcap"), [], metadata={})
+    rewrite(logs / "flight_1.mcap", tmp_path / "log.mcap", [], metadata={})
+    assert fs.cat_file("/out/log.mcap") == (tmp_path / "log.mcap").read_bytes()
+    assert sorted(fs.store) == ["/in/log.mcap", "/out/log.mcap"]
+    with pytest.raises(ZeroDivisionError):
+        filled("memory://out/other.mcap", then=lambda _: 1 // 0)
+    assert sorted(fs.store) == ["/in/log.mcap", "/out/log.mcap"]
+
+
+def test_a_temporary_object_that_cannot_be_removed_spoils_nothing(store: Any, caplog: pytest.LogCaptureFixture) -> None:
+    store.fault = failing(of("DELETE", "partial"), "403")
+    filled("s3://fleet/out")
+    assert store.get("out") == bytes(4)
+    assert "could not be removed: the store refuses access" in caplog.text
+
+
 # ── a store that fails ──
 
 
@@ -355,3 +375,17 @@ def test_a_debias_that_is_terminated_in_the_middle_of_its_upload_leaves_nothing(
         _, stderr = process.communicate(timeout=60)
     assert (process.returncode, stderr) == (143, b"")
     assert (store.uploads(), store.keys()) == ([], ["in.mcap"])
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        'Could not connect to the endpoint URL: "http://me:hush@host:9000/fleet"',
+        "https://host/log?X-Amz-Credential=hush&X-Amz-Signature=hush failed",
+        "https://account.blob.core.windows.net/c/log?sv=1&sig=hush",
+    ],
+)
+def test_what_a_store_says_is_repeated_without_its_secrets(text: str) -> None:
+    for error in (ValueError(text), PermissionError(text), OSError(5, text)):
+        assert "hush" not in reason(error)
+        assert "host" in reason(error) or "account" in reason(error)

@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from typing import TYPE_CHECKING, Any
 
 from imutool.errors import ConfigError
 from imutool.mcap_io.source import Source
+from imutool.place import reason
 
 if TYPE_CHECKING:
     from upath import UPath
+
+logger = logging.getLogger(__name__)
 
 PART_BYTES = 8 << 20  # one part and its copies are what is in memory
 LARGE_AFTER, LARGE_PART_BYTES = 32 << 30, 64 << 20  # S3 takes 10 000 parts: so they are enough for 400 GiB
@@ -56,7 +60,10 @@ class Upload:
         with self._no_parts_left():
             self.path.fs.cp_file(self.temporary.path, self.path.path)
         self._seal(self.path)
-        self.path.fs.rm_file(self.temporary.path)
+        try:
+            self.path.fs.rm_file(self.temporary.path)
+        except Exception as error:  # the object is in its place, and whole: that is what was asked for  # noqa: BLE001
+            logger.warning("%s could not be removed: %s", self.temporary, reason(error))
 
     @contextmanager
     def _no_parts_left(self) -> Iterator[None]:
@@ -89,7 +96,8 @@ class Upload:
         """Aborts the upload and removes the temporary object, as far as the store can be reached."""
         if self.file is None:
             return
-        self.file.closed = True  # else the file would complete the upload when it is collected
+        with suppress(AttributeError):  # else the file would complete the upload when it is collected; some have no such way
+            self.file.closed = True
         with suppress(Exception):
             self.file.discard()
         with suppress(Exception):  # it is there if the upload was complete, or an answer was lost on its way
