@@ -29,7 +29,7 @@ from imutool.fleet.models import settled
 from imutool.fleet.run import Tally, run
 from imutool.fleet.task import Result, Settings, Task
 from imutool.fleet.work import work
-from imutool.mcap_io.rewrite import sha256
+from imutool.mcap_io.digest import sha256
 from imutool.place import place
 
 Workers = Callable[[], Engine]

@@ -17,8 +17,8 @@ from imutool.fleet.models import settled
 from imutool.fleet.sources import find
 from imutool.fleet.task import Result, Settings, Source, Task
 from imutool.fleet.work import robot_of, robot_pattern, work
+from imutool.mcap_io.digest import sha256
 from imutool.mcap_io.read import read
-from imutool.mcap_io.rewrite import sha256
 from imutool.mcap_io.write import write
 
 
