@@ -91,7 +91,7 @@ def repair(
                 for item in structure.items:
                     saved.take(item)
                     tell(item.offset, 2 * size)
-                if losses and not out.contents.counts and not out.contents.attachments and not out.contents.metadata:
+                if losses and not out.contents.counts and not out.contents.attachments:
                     raise LogError(
                         f"nothing in it can be saved: {losses.entries[0].reason}", expected="at least one sound chunk"
                     )
