@@ -24,7 +24,7 @@ def debias(
     source: Annotated[Path, typer.Argument(metavar="IN", help="An MCAP log.")],
     target: Annotated[
         Path | None,
-        typer.Argument(metavar="[OUT]", help="The log with the debiased IMU beside the raw one.", show_default=False),
+        typer.Argument(metavar="OUT", help="The log with the debiased IMU beside the raw one.", show_default=False),
     ] = None,
     model: Annotated[list[str] | None, typer.Option(help=MODEL_HELP)] = None,
     imu: Annotated[list[str] | None, typer.Option(help="IMU topic, where a log has several. Repeatable.")] = None,

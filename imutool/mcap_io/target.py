@@ -7,7 +7,6 @@ blocks between files copies nothing at all.
 from __future__ import annotations
 
 import contextlib
-import errno
 import os
 import secrets
 import weakref
@@ -22,8 +21,6 @@ from imutool.mcap_io.crc import crc32
 from imutool.mcap_io.source import Source, descriptor
 
 COPY_BYTES = 1 << 20  # what passes through memory stays in the processor's cache
-# What a system call says that cannot copy between these two files: another file system, an old kernel, a special file
-UNABLE = {errno.EXDEV, errno.ENOSYS, errno.EINVAL, errno.EOPNOTSUPP, errno.EPERM, errno.ENOTSOCK}
 
 
 class Target:
@@ -153,13 +150,11 @@ def _settle(folder: Path) -> None:
 
 
 def _tried(call: Callable[[int], int], at: int) -> int:
-    """Bytes that were copied; 0 if this call cannot do it between these files."""
+    """Bytes that were copied; 0 if this call cannot do it, whatever the reason: reading and writing then say which."""
     try:
         return call(at)
-    except OSError as error:
-        if error.errno in UNABLE:
-            return 0
-        raise
+    except OSError:
+        return 0
 
 
 def _unlink(path: Path) -> None:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import errno
 import os
+import resource
+import signal
 import stat
 import struct
 import subprocess
@@ -28,6 +30,7 @@ from imutool.mcap_io.digest import Digest, sha256
 from imutool.mcap_io.log import ImuBatch, Log
 from imutool.mcap_io.records import message_rows
 from imutool.mcap_io.rewrite import Made, NewTopic, Verified, rewrite
+from imutool.mcap_io.source import Source
 from imutool.mcap_io.verify import verify
 from imutool.mcap_io.write import Chunk, LogWriter, write
 from imutool.recording import Recording
@@ -161,6 +164,10 @@ def unable(*_: Any, **__: Any) -> int:
     raise OSError(errno.EXDEV, os.strerror(errno.EXDEV))
 
 
+def broken(*_: Any, **__: Any) -> int:
+    raise OSError(errno.EIO, os.strerror(errno.EIO))
+
+
 def stuck(*_: Any, **__: Any) -> int:
     return 0
 
@@ -169,20 +176,22 @@ def without_a_number(_: object) -> None:
     return None
 
 
+def without_data_crc(path: Path) -> None:
+    """Takes out the CRC of the data section, which most recorders leave out too."""
+    with Log(path) as log:
+        at = log.structure.data_end + 9
+    whole = bytearray(path.read_bytes())
+    whole[at : at + 4] = bytes(4)
+    path.write_bytes(whole)
+
+
 @pytest.fixture
 def source(recording: Recording, tmp_path: Path) -> Path:
-    """Images and an IMU in chunks of their own, without a CRC of the data section, as most recorders leave it out."""
+    """Images and an IMU in chunks of their own."""
     path = tmp_path / "in.mcap"
-    write(recording, tmp_path / "own.mcap")
-    with Log(tmp_path / "own.mcap") as log, LogWriter(path, data_crc=False) as out:
-        out.contents.schemas.update(log.structure.schemas)
-        out.contents.channels.update(log.structure.channels)
-        for block in log.structure.blocks:
-            found = log.structure.unpack(block)
-            out.chunk(
-                Chunk(found.data.tobytes(), found.heads["channel"].copy(), found.times(), found.offsets), block.compression
-            )
-        return path
+    write(recording, path)
+    without_data_crc(path)
+    return path
 
 
 CALLS = {
@@ -223,20 +232,41 @@ def test_a_kernel_that_copies_a_little_at_a_time_is_asked_again(
     assert sum(moved) > 0.9 * source.stat().st_size  # and hardly a byte came this way
 
 
-def test_an_error_of_the_kernel_is_told_and_leaves_nothing(
+def test_a_file_the_system_refuses_to_grow_is_said_and_leaves_nothing(source: Path, tmp_path: Path) -> None:
+    """The kernel copies by itself up to the limit, and its refusal is no traceback either."""
+    limits, handler = resource.getrlimit(resource.RLIMIT_FSIZE), signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (300_000, limits[1]))
+    try:
+        with pytest.raises(ConfigError, match=r"out.mcap: cannot be written \(File too large\)"):
+            rewrite(source, tmp_path / "out.mcap", [], metadata={})
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+        signal.signal(signal.SIGXFSZ, handler)
+    assert [path.name for path in tmp_path.iterdir()] == ["in.mcap"]
+
+
+def test_a_disk_that_cannot_be_read_is_not_called_a_disk_that_cannot_be_written(
     source: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def full(*_: Any, **__: Any) -> int:
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+    """The kernel says the same of both; what follows tells them apart."""
+    real = Source.at
 
-    monkeypatch.setattr(os, "copy_file_range", full)
+    def at(self: Source, offset: int, length: int) -> bytes:
+        if offset + length > 2_000_000 > offset and self.path == source:
+            raise LogError(f"cannot be read at byte {offset} (Input/output error)")
+        return real(self, offset, length)
+
+    for name in ("copy_file_range", "sendfile"):
+        monkeypatch.setattr(os, name, broken)
+    monkeypatch.setattr(Source, "at", at)
     before = sorted(path.name for path in tmp_path.iterdir())
-    with pytest.raises(ConfigError, match="cannot be written \\(No space left on device\\)"):
+    with pytest.raises(LogError, match=r"in.mcap: cannot be read at byte"):
         rewrite(source, tmp_path / "out.mcap", [], metadata={})
     assert sorted(path.name for path in tmp_path.iterdir()) == before
 
 
 def test_the_data_crc_is_stated_where_the_source_states_one(recording: Recording, source: Path, tmp_path: Path) -> None:
+    write(recording, tmp_path / "own.mcap")
     for path, states in ((source, False), (tmp_path / "own.mcap", True)):
         out = tmp_path / f"out_{path.name}"
         rewrite(path, out, [Half("/imu0")], metadata={})
