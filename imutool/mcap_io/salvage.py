@@ -21,7 +21,7 @@ from mcap.opcode import Opcode
 from mcap.records import AttachmentIndex, ChunkIndex, Metadata, MetadataIndex
 
 import imutool
-from imutool.errors import ConfigError, LogError
+from imutool.errors import ConfigError, ImutoolError, LogError
 from imutool.mcap_io import records
 from imutool.mcap_io.attachment import Attached
 from imutool.mcap_io.log import Log
@@ -256,5 +256,8 @@ def repaired(source: Path, beside: Path) -> Iterator[tuple[Path, Losses] | None]
     copy = beside.with_name(f".{source.name}.{os.getpid()}.{secrets.token_hex(4)}.partial")
     try:
         yield copy, repair(source, copy).losses
+    except ImutoolError as error:  # the user never heard of the copy
+        where = None if error.where is None else str(error.where).replace(str(copy), str(source))
+        raise type(error)(error.what, where=where, expected=error.expected, fix=error.fix) from error
     finally:
         copy.unlink(missing_ok=True)
