@@ -146,6 +146,8 @@ def test_of_a_damaged_log_the_sound_part_is_described_debiased_and_saved(here: P
     assert counts == {**dict.fromkeys(counts, 0), **reports[2]["messages"]}
     assert reports[1]["added"]["/imu0/debiased"] == counts["/imu0"] < 4001
     assert {name: digest for name, digest in digests(here).items() if name not in ("out.mcap", "saved.mcap")} == before
+    other = imutool("debias", "bad.mcap", "other.mcap", "--imu", "/imu9", cwd=here)
+    assert told(other, other.stderr, LOG).startswith("bad.mcap: there is no topic /imu9")
     in_place = imutool("debias", "bad.mcap", "--in-place", "--model", "linear.safetensors", cwd=here)
     assert "damaged" in told(in_place, in_place.stderr, LOG)
 

@@ -550,16 +550,23 @@ def test_poses_that_make_no_sense_are_no_business_of_an_imu(recording: Recording
 # ── refusals ─────────────────────────────────────────────────────────────────────────────────────────────────────────
 
 
-def test_a_truncated_log_is_refused_and_nothing_is_left(source: Path, model_file: Path, tmp_path: Path) -> None:
+def test_of_a_truncated_log_what_is_left_is_debiased_and_without_anything_left_nothing(
+    source: Path, model_file: Path, tmp_path: Path
+) -> None:
     whole = source.read_bytes()
     folder = tmp_path / "out"
     folder.mkdir()
-    for length in (0, 10, len(whole) // 3, len(whole) - 30):
+    for length in (0, 10):
         source.write_bytes(whole[:length])
         for model in (None, model_file):
             with pytest.raises(LogError):
                 debias(source, folder / "out.mcap", model=model)
             assert list(folder.iterdir()) == []
+    source.write_bytes(whole[:-30])  # the end of the summary
+    report = debias(source, folder / "out.mcap", model=model_file)
+    assert not report.losses
+    assert report.losses.mended
+    assert [path.name for path in folder.iterdir()] == ["out.mcap"]
 
 
 def test_a_debiased_log_is_not_debiased_again(target: Path, model_file: Path, tmp_path: Path) -> None:

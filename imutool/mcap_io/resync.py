@@ -50,6 +50,7 @@ SMALL: dict[int, Any] = {
     Opcode.SUMMARY_OFFSET: SummaryOffset,
     Opcode.DATA_END: DataEnd,
 }
+HELD = {Opcode.MESSAGE, Opcode.CHUNK, Opcode.MESSAGE_INDEX}  # what comes into memory as a whole
 SUMMARY = {
     Opcode.CHUNK_INDEX,
     Opcode.ATTACHMENT_INDEX,
@@ -97,6 +98,8 @@ class Frames:
             return None
         opcode, length = self.source.head(position)
         if length > self.limit - position - HEAD.size or (opcode < PRIVATE and length < int(_LEAST[opcode])):
+            return None
+        if opcode in HELD and length > records.CHUNK_LIMIT:
             return None
         return opcode, length
 

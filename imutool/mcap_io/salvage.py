@@ -20,7 +20,7 @@ from mcap.opcode import Opcode
 from mcap.records import AttachmentIndex, ChunkIndex, Metadata, MetadataIndex
 
 import imutool
-from imutool.errors import ConfigError, LogError
+from imutool.errors import ConfigError, ImutoolError, LogError
 from imutool.mcap_io import records
 from imutool.mcap_io.attachment import Attached
 from imutool.mcap_io.log import Log
@@ -91,7 +91,7 @@ def repair(
                 for item in structure.items:
                     saved.take(item)
                     tell(item.offset, 2 * size)
-                if losses and not out.contents.counts and not out.contents.attachments and not out.contents.metadata:
+                if losses and not out.contents.counts and not out.contents.attachments:
                     raise LogError(
                         f"nothing in it can be saved: {losses.entries[0].reason}", expected="at least one sound chunk"
                     )
@@ -256,6 +256,9 @@ def repaired(source: Place, beside: Place) -> Iterator[tuple[Place, Losses] | No
     copy = beside.with_name(f".{source.name}.{os.getpid()}.{secrets.token_hex(4)}.partial")
     try:
         yield copy, repair(source, copy).losses
+    except ImutoolError as error:  # the user never heard of the copy
+        where = None if error.where is None else str(error.where).replace(str(copy), str(source))
+        raise type(error)(error.what, where=where, expected=error.expected, fix=error.fix) from error
     finally:
         with suppress(failures(copy)):
             copy.unlink()

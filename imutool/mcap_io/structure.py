@@ -25,6 +25,7 @@ from imutool.mcap_io.losses import Losses
 from imutool.mcap_io.records import FOOTER_SIZE, HEAD, MAGIC
 from imutool.mcap_io.source import CUT_SHORT, Source
 
+MOST_SUMMARY = 1 << 29  # bytes; that of a 100 GB log has some 20 million
 RUN_BYTES = 1 << 20  # messages outside chunks are taken in runs of about this size
 
 
@@ -120,7 +121,15 @@ class Structure:
         return self.unpacked(block, self.read(block))
 
     def read(self, block: Block) -> bytes:
-        """The bytes of a block, as they may stand in another log."""
+        """The bytes of a block, as they may stand in another log.
+
+        Raises:
+            LogError: more than anybody should hold in memory, or the disk does not give them.
+        """
+        if block.length > records.CHUNK_LIMIT:
+            raise LogError(
+                f"the chunk at byte {block.offset} has {block.length} bytes", expected=f"at most {records.CHUNK_LIMIT}"
+            )
         return self.source.at(block.offset, block.length)
 
     def found(self, block: Block) -> records.Messages | None:
@@ -214,6 +223,8 @@ class Structure:
             return {}
         if not len(MAGIC) <= start <= end:
             raise LogError(f"the footer says the summary begins at byte {start}", expected=f"at most {end}")
+        if end - start > MOST_SUMMARY:
+            raise LogError(f"the summary at byte {start} has {end - start} bytes", expected=f"at most {MOST_SUMMARY}")
         raw = self.source.at(start, end - start + FOOTER_SIZE - 4)
         if self.footer.summary_crc and crc32(raw) != self.footer.summary_crc:
             raise LogError(f"the summary at byte {start} is damaged: its CRC is {crc32(raw):08x}")

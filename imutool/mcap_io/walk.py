@@ -24,13 +24,12 @@ from imutool.mcap_io import records
 from imutool.mcap_io.attachment import Attached
 from imutool.mcap_io.losses import Losses
 from imutool.mcap_io.records import FIXED, FOOTER_SIZE, HEAD, MAGIC
-from imutool.mcap_io.resync import LEAST, PRIVATE, SUMMARY, Frames
+from imutool.mcap_io.resync import LEAST, MOST_TRIED, PRIVATE, SUMMARY, Frames
 from imutool.mcap_io.sections import DEFINITIONS, Sections
 from imutool.mcap_io.source import Source
-from imutool.mcap_io.structure import RUN_BYTES, Block, Span, known_block
+from imutool.mcap_io.structure import MOST_SUMMARY, RUN_BYTES, Block, Span, known_block
 
 MOST_ITEMS = 5_000_000  # a 100 GB log has some 100 000 chunks; a file of nothing but empty ones is made to fill the memory
-MOST_SUMMARY = 1 << 28  # bytes; that of a 100 GB log has some 20 million
 LATEST_NS = 2**63  # log times from here on (the year 2262) are of no clock
 ANOTHER = MAGIC + bytes([Opcode.HEADER])  # how a log begins
 
@@ -327,6 +326,8 @@ class Walk:
         frames = self.frames
         after = frames.next(position + 1, limit, self.sections.channels() | self._seen)
         gap = Gap(position, after - position, self._what_broke(position))
+        if frames.tried > MOST_TRIED:
+            gap.reason += "; the search for what follows was given up after too many false starts"
         first = self.source.at(position, min(64, frames.limit - position))
         if len(first) >= HEAD.size + 16 and first[0] == Opcode.CHUNK:
             start_ns, end_ns = struct.unpack_from("<QQ", first, HEAD.size)

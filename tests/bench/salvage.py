@@ -11,6 +11,7 @@ from __future__ import annotations
 import hashlib
 import importlib.util
 import json
+import shutil
 import subprocess
 import sys
 import tempfile
@@ -19,14 +20,16 @@ from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 
 import numpy as np
+import zstandard
 from mcap.writer import CompressionType, Writer
 
-from imutool.mcap_io import schema
+from imutool.errors import LogError
+from imutool.mcap_io import records, schema
 from imutool.mcap_io.log import Log
 from imutool.mcap_io.records import HEAD
 
 COUNT = 2001
-LIMIT_S = 120
+LIMIT_S = 40
 PERIOD_NS = 5_000_000
 
 
@@ -104,12 +107,18 @@ def by_pybag(path: Path) -> Iterator[bytes]:
     """`pybag recover`, and what it wrote."""
     with tempfile.TemporaryDirectory() as folder:
         target = Path(folder) / "out.mcap"
-        subprocess.run(
-            [sys.executable, "-m", "pybag.cli.main", "recover", str(path), "-o", str(target)],
-            check=False,
-            stdout=subprocess.DEVNULL,
-        )
+        subprocess.run(["pybag", "recover", path, "-o", target], check=False, stdout=subprocess.DEVNULL)
         yield from by_mcap(target)
+
+
+def by_rerun(path: Path) -> Iterator[bytes]:
+    """Rerun's reader, told to recover."""
+    from rerun.chunk import McapReader
+
+    for chunk in McapReader(path, include_topic_regex=["^/imu0$"], decoders=["raw"], recover=True).stream():
+        batch = chunk.to_record_batch()
+        if "McapMessage:data" in batch.schema.names:
+            yield from (bytes(row[0]) for row in batch.column("McapMessage:data").to_pylist())
 
 
 READERS: dict[str, tuple[Callable[[Path], Iterator[bytes]], str]] = {
@@ -118,10 +127,25 @@ READERS: dict[str, tuple[Callable[[Path], Iterator[bytes]], str]] = {
     "mcap stream": (by_mcap_stream, "mcap"),
     "rosbags": (by_rosbags, "rosbags"),
     "pybag": (by_pybag, "pybag"),
+    "rerun": (by_rerun, "rerun"),
 }
 
 
 # ── the damage ──
+
+
+def hits(record: bytes, at: int) -> bool:
+    """Whether flipping a bit there changes an IMU message of a chunk that still unpacks."""
+    head = records.ChunkHead.of(record[:128], len(record), 0)
+    contents = []
+    for data in (record, record[:at] + bytes([record[at] ^ 1]) + record[at + 1 :]):
+        try:
+            unpacked = zstandard.ZstdDecompressor().decompress(data[head.data_at :], max_output_size=head.size)
+            found = records.messages(unpacked, 0)
+        except (zstandard.ZstdError, LogError):
+            return False
+        contents.append([rows.payload.tobytes() for rows in records.rows(found, found.heads["channel"] == 1)])
+    return contents[0] != contents[1] and [len(one) for one in contents[0]] == [len(one) for one in contents[1]]
 
 
 def damages(whole: bytes, chunks: list[tuple[int, int, int]]) -> dict[str, bytes]:
@@ -131,6 +155,7 @@ def damages(whole: bytes, chunks: list[tuple[int, int, int]]) -> dict[str, bytes
     def put(at: int, data: bytes) -> bytes:
         return whole[:at] + data + whole[at + len(data) :]
 
+    flipped = next(at for at in range(start + 60, start + length) if hits(whole[start : start + length], at - start))
     page = (start + 2048) // 4096 * 4096
     return {
         "whole": whole,
@@ -138,7 +163,7 @@ def damages(whole: bytes, chunks: list[tuple[int, int, int]]) -> dict[str, bytes
         "cut mid-MessageIndex": whole[: end - 20],
         "cut at a chunk's end": whole[:end],
         "cut in the summary": whole[: len(whole) - 200],
-        "one byte flipped in a chunk": put(start + length // 2, bytes([whole[start + length // 2] ^ 1])),
+        "one byte flipped in a chunk": put(flipped, bytes([whole[flipped] ^ 1])),
         "4 KiB zeroed over a chunk's head": put(page, bytes(4096))
         if page <= start < page + 4096
         else put(start - 100, bytes(4096)),
@@ -162,10 +187,9 @@ def ask(name: str, path: Path) -> tuple[list[str], str]:
 def main() -> None:
     """Prints the table."""
     megabytes = int(sys.argv[1]) if len(sys.argv) > 1 else 50
-    for name, (_, package) in READERS.items():
-        if importlib.util.find_spec(package) is None:
-            print(f"{name}: {package} is not installed, so it is left out")
-    there = [name for name, (_, package) in READERS.items() if importlib.util.find_spec(package) is not None]
+    there = [name for name, (_, package) in READERS.items() if importlib.util.find_spec(package) or shutil.which(package)]
+    for name in READERS.keys() - set(there):
+        print(f"{name} is not installed, so it is left out")
     with tempfile.TemporaryDirectory() as folder:
         log, damaged = Path(folder) / "log.mcap", Path(folder) / "damaged.mcap"
         made(log, megabytes)

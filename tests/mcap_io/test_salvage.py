@@ -26,7 +26,7 @@ from rosbags.highlevel import AnyReader
 
 from imutool.errors import ConfigError, LogError
 from imutool.info import inspect
-from imutool.mcap_io import records
+from imutool.mcap_io import records, structure
 from imutool.mcap_io.log import Log
 from imutool.mcap_io.records import HEAD, MAGIC
 from imutool.mcap_io.ros2msg import DEEPEST, parse
@@ -496,6 +496,21 @@ def test_huge_claims_of_metadata_and_attachments_cost_nothing(tmp_path: Path) ->
     hostile(path, attachment, metadata, channel)
     with in_time(), Log(path, salvage=True) as log:
         assert len(log.losses.entries) == 3
+
+
+def test_nothing_longer_than_a_chunk_may_be_comes_into_memory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(records, "CHUNK_LIMIT", 1 << 20)
+    monkeypatch.setattr(structure, "MOST_SUMMARY", 1 << 20)
+    size = 50 << 20
+    path, message = tmp_path / "log.mcap", struct.pack("<HIQQ", 1, 0, 0, 0)
+    for start in (HEAD.pack(5, size) + message, HEAD.pack(6, size + 49) + struct.pack("<QQQIIQ", 0, 1, size, 7, 0, size)):
+        hostile(path, start, bytes(size))
+        with in_time(), in_room(), Log(path, salvage=True) as log:
+            assert log.losses.bytes > size
+    footer = HEAD.pack(2, 20) + struct.pack("<QQI", 8, 0, 1) + MAGIC
+    path.write_bytes(MAGIC + HEAD.pack(1, 8) + bytes(8) + bytes(size) + footer)
+    with in_time(), in_room(), Log(path, salvage=True) as log:
+        assert log.losses
 
 
 def test_a_definition_that_contains_itself_is_refused() -> None:
