@@ -16,6 +16,7 @@ from imutool import registry
 from imutool.clean.finding import Finding
 from imutool.clean.motion import Motion
 from imutool.clean.rules._base import Rule, Whole
+from imutool.clean.rules.gaps import MISSING
 from imutool.clean.rules.time_back import TimeBack, left_out
 from imutool.clean.samples import Samples, blocks
 from imutool.clean.score import Verdict, score, verdict
@@ -175,7 +176,7 @@ def examine(
     for station in stations:
         for numbers in station.dropped:
             dropped[numbers] = True
-    missing = sum(one.count for one in findings if one.rule == "gaps")
+    missing = sum(one.count for one in findings if one.rule == "gaps" and one.what == MISSING)
     surplus = sum(one.values["identical"] for one in findings if one.rule == "duplicates")
     reasons = tuple(_reasons(rules, whole, int(dropped.sum()) - surplus, findings))
     start_ns, end_ns = whole.motion.start_ns or 0, whole.motion.end_ns

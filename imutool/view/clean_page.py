@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
 from imutool.clean import Finding, Survey
 from imutool.clean.rules.units import DEGREES
@@ -17,7 +17,7 @@ VERDICTS = {
     "quarantine": "it cannot be trusted, and is left alone",
 }
 COLORS = {"note": "var(--held)", "warning": "var(--mark)", "error": "var(--before)"}
-STRIP = "display: block; width: 100%; height: 14px; background: var(--panel)"
+STRIP = "display: block; width: 100%; min-width: 300px; height: 14px; background: var(--panel)"
 LEAST_SHARE = 0.002  # of the strip's width, so that one sample in an hour is seen
 
 
@@ -67,16 +67,19 @@ def _sentence(survey: Survey) -> str:
 
 
 def _row(finding: Finding, survey: Survey) -> str:
-    values = f'<div class="note">{text(json.dumps(finding.values))}</div>' if finding.values else ""
-    cells = (
-        text(finding.rule),
-        str(finding.count),
-        f"{text(finding.what)}{values}",
-        finding.action,
-        f"{finding.sure:.2f}",
-        _strip(finding, survey),
-    )
-    return f"<tr>{''.join(f'<td>{cell}</td>' for cell in cells)}</tr>"
+    values = f'<div class="note">{text(_told(finding.values))}</div>' if finding.values else ""
+    short = [text(finding.rule), str(finding.count), finding.action, f"{finding.sure:.2f}"]
+    rule, count, action, sure = (f'<td class="number">{cell}</td>' for cell in short)
+    return f"<tr>{rule}{count}<td>{text(finding.what)}{values}</td>{action}{sure}<td>{_strip(finding, survey)}</td></tr>"
+
+
+def _told(value: Any) -> str:
+    """Values as words, numbers to five digits."""
+    if isinstance(value, dict):
+        return ", ".join(f"{name.replace('_', ' ')} {_told(inner)}" for name, inner in value.items())
+    if isinstance(value, list | tuple):
+        return ", ".join(map(_told, value))
+    return f"{value:.5g}" if isinstance(value, float) else str(value)
 
 
 def _strip(finding: Finding, survey: Survey) -> str:

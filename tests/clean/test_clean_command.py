@@ -178,7 +178,7 @@ def test_the_page_holds_every_finding_and_asks_nobody_for_anything(folder: Path,
     assert done.returncode == 0, done.stderr
     page = (tmp_path / "page.html").read_text()
     for rule, count in SPOILED.items():
-        assert f"<td>{rule}</td><td>{count}</td>" in page
+        assert f'<td class="number">{rule}</td><td class="number">{count}</td>' in page
     assert page.count("<rect") == 3 + 1 + 1 + 1  # spikes, and one interval each of what lies close together
     assert "http://" not in page
     assert "https://" not in page

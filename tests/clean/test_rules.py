@@ -219,9 +219,10 @@ def test_of_two_settings_of_the_clock_the_longer_part_stays(part, by, made):
     survey = look(shifted(made, part, by))
     inside = np.zeros(len(made.stamp_ns), bool)
     inside[part] = True
-    if by == HOUR_NS and part.start:  # an hour's pause is a pause
+    if by == HOUR_NS and part.start:  # an hour forward may be true
         assert not survey.dropped.any()
         assert found(survey) == {"clock_jumps": 1}
+        assert survey.missing == 0
     else:
         assert (survey.dropped == inside).all()
         assert survey.verdict == "quarantine"
@@ -248,6 +249,12 @@ def test_a_gap_has_its_place_its_length_and_its_count(made):
     assert one.intervals_ns == ((int(made.stamp_ns[1999]), int(made.stamp_ns[2100])),)
     assert one.count == 100
     assert one.values["longest_s"] == pytest.approx(0.505)
+
+
+def test_a_pause_of_the_recording_is_said_and_nothing_is_missing(made):
+    later = np.where(np.arange(len(made.stamp_ns)) < 3000, 0, 20 * HOUR_NS)
+    survey = look(made._replace(stamp_ns=made.stamp_ns + later, log_time=made.log_time + later))
+    assert (only(survey, "gaps").count, survey.missing, survey.verdict, survey.score) == (1, 0, "good", 1.0)
 
 
 def test_a_log_with_half_of_it_missing_is_not_trusted(made):

@@ -11,11 +11,14 @@ from jaxtyping import Float64, Int64
 from imutool.clean.finding import MAX_INTERVALS, Finding
 from imutool.clean.rules._base import Rule, Whole
 from imutool.clean.samples import Samples
+from imutool.recording import nanoseconds
 
+MISSING = "samples missing"
 MISSING_STEP = 1.5  # a step of this many median periods or more has lost samples
 FEWEST_STEPS = 16  # for a median of their own
 MOST = 100_000  # gaps held in memory; of a log with more, the rest is only counted
 SERIOUS_SHARE, SERIOUS_S = 1e-3, 1.0
+PAUSE_NS = nanoseconds(60.0)  # nobody recorded: nothing is missing
 
 
 class Gap(NamedTuple):
@@ -41,6 +44,7 @@ class Gaps(Rule):
         self._last: tuple[int, int] | None = None
         self._period_ns = 0.0
         self._rows: list[Gap] = []
+        self._pauses: list[Gap] = []
 
     def see(self, samples: Samples) -> None:
         """Steps within a block are measured against the median of the block."""
@@ -57,12 +61,21 @@ class Gaps(Rule):
             return
         lost = missing(steps, self._period_ns)
         lost = np.where(lost > 0, np.maximum(lost - (np.diff(number) - 1), 0), 0)
+        paused = steps > PAUSE_NS
+        for row in np.flatnonzero(paused)[: MOST - len(self._pauses)]:
+            self._pauses.append(Gap(int(number[row + 1]), int(stamp[row]), int(stamp[row + 1]), 0))
+        lost[paused] = 0
         self.missing += int(lost.sum())
         for row in np.flatnonzero(lost)[: MOST - len(self._rows)]:
             self._rows.append(Gap(int(number[row + 1]), int(stamp[row]), int(stamp[row + 1]), int(lost[row])))
 
     def findings(self, whole: Whole) -> Iterator[Finding]:
-        """One, with the longest gaps."""
+        """One for what is missing, with the longest gaps, and one for pauses."""
+        pauses = [(row.first_ns, row.last_ns) for row in self._pauses if row.number not in whole.jumps]
+        if pauses:
+            what = f"pauses of more than {PAUSE_NS * 1e-9:g} s"
+            left_out = max(0, len(pauses) - MAX_INTERVALS)
+            yield Finding("gaps", "note", what, len(pauses), tuple(pauses[:MAX_INTERVALS]), left_out, sure=0.9)
         rows = [row for row in (self._left(row, whole) for row in self._rows) if row.missing]
         count = self.missing + sum(row.missing for row in rows) - sum(row.missing for row in self._rows)
         if not rows:
@@ -75,7 +88,7 @@ class Gaps(Rule):
         yield Finding(
             "gaps",
             "error" if distrust else "warning" if serious else "note",
-            "samples missing",
+            MISSING,
             count,
             tuple(sorted((row.first_ns, row.last_ns) for row in longest)),
             len(rows) - len(longest),
