@@ -13,6 +13,7 @@ import secrets
 import shutil
 import signal
 import socket
+import sys
 import tempfile
 import threading
 from collections.abc import Callable, Generator, Iterable, Iterator
@@ -190,8 +191,8 @@ class Engine:
             _refuse_silence(address)
         logging.getLogger("ray").setLevel(logging.ERROR)
         try:
+            self._own = True  # also of what is half started
             self._ray.init(address=address or "local", **wanted)
-            self._own = True
         except (RuntimeError, OSError, ValueError, self._ray.exceptions.RayError) as error:
             where = f"at {address}" if address else "on this machine"
             raise ConfigError(
@@ -272,8 +273,8 @@ def _refuse_silence(address: str) -> None:
 
 
 def _ray(*, local: bool) -> Any:
-    """Ray, told before it is imported to keep to itself."""
-    if local:
+    """Ray, told before it is imported to keep to itself; where somebody has imported it already, it is as it was told then."""
+    if local and "ray" not in sys.modules:
         for name, value in QUIET.items():
             os.environ.setdefault(name, value)
         os.environ.setdefault("RAY_AUTH_TOKEN", secrets.token_hex(32))

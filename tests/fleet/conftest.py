@@ -23,8 +23,15 @@ Robot = Callable[[Path, int, Mapping[str, Sequence[float]]], None]
 def ray_started() -> Iterator[None]:
     """Ray on two cores of this machine; every Engine of this process uses it."""
     before = dict(os.environ)
-    with Engine(workers=2, memory_bytes=1 << 28):
-        yield
+    engine = Engine(workers=2, memory_bytes=1 << 28)
+    yield
+    import ray  # not before Engine has told it how to start
+
+    node = ray._private.worker._global_node
+    started = [one.process for several in node.all_processes.values() for one in several]
+    engine.close()
+    for process in started:
+        process.wait(timeout=10)  # Ray itself does not, and a Popen that nobody waited for warns when it goes
     os.environ.clear()
     os.environ.update(before)
 

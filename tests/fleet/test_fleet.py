@@ -17,7 +17,6 @@ from typing import Any
 
 import pyarrow.parquet as pq
 import pytest
-import ray
 from typer.testing import CliRunner
 
 from imutool.cli import app
@@ -159,11 +158,14 @@ def test_more_memory_than_there_is_is_refused(ray_started: None) -> None:
 
 
 def test_where_ray_cannot_start_the_message_says_what_to_do(monkeypatch: pytest.MonkeyPatch, ray_started: None) -> None:
+    import ray
+
     def init(**_: object) -> None:
         raise RuntimeError("bind: Operation not permitted\nmuch more")
 
     monkeypatch.setattr(ray, "is_initialized", lambda: False)
     monkeypatch.setattr(ray, "init", init)
+    monkeypatch.setattr(ray, "shutdown", lambda: None)  # the other tests' workers go on
     with pytest.raises(ConfigError, match=r"cannot be started on this machine \(bind: Operation not permitted\).*--address"):
         Engine()
     with pytest.raises(ConfigError, match=r"--address 127\.0\.0\.1:1: nobody answers"):
