@@ -20,7 +20,8 @@ from imutool.errors import LogError
 MAGIC = b"#ROSBAG V2.0\n"
 FIRST_RECORD = 4096  # header and padding of the bag header record, so that it can be filled in at the end
 HEAD_LIMIT = 4096  # of a record's fields: a topic is the longest, and a definition's text is not among them
-CHUNK_LIMIT = 1 << 30  # unpacked bytes; rosbag's own are 768 KiB or one message
+CHUNK_LIMIT = 256 << 20  # bytes, packed and unpacked; rosbag's own are 768 KiB or one message
+DEFINITION_LIMIT = 4 << 20  # bytes of a message's definition; the longest common one has 10 000
 KIND = re.compile(r"\w+(/\w+)*", re.ASCII)
 U32 = struct.Struct("<I")
 

@@ -133,6 +133,8 @@ class Bag:
         return found and found._replace(at=at, data_at=found.data_at + at)
 
     def _define(self, found: Head) -> None:
+        if found.size > records.DEFINITION_LIMIT:
+            raise LogError(f"a connection record has {found.size} bytes", expected=f"at most {records.DEFINITION_LIMIT}")
         raw = self.source.at(found.at, found.end - found.at)
         self._learn(records.connection(found, raw[found.data_at - found.at :], raw))
 
@@ -182,6 +184,10 @@ class Bag:
                 if chunk.messages:
                     yield chunk
                 position = end
+            elif found.op == Op.MESSAGE or not self._lands(found.end):  # it would lead past the record behind it
+                position = self._next_chunk(found.data_at)
+                outside = "a message lies outside chunks" if found.op == Op.MESSAGE else "a record does not end where it says"
+                self.lose(found.at, position - found.at, outside)
             else:
                 if found.op == Op.CONNECTION:
                     self._try_define(found)
@@ -209,10 +215,14 @@ class Bag:
 
     def _end(self, found: Head) -> int:
         """Where a chunk ends: where it says, if a record follows there; else where the next one begins."""
-        size = self.source.size
-        if found.end == size or (found.end < size and (self._head(found.end) is not None or size - found.end < 8)):
-            return found.end
-        return self._next_chunk(found.data_at)
+        return found.end if self._lands(found.end) else self._next_chunk(found.data_at)
+
+    def _lands(self, end: int) -> bool:
+        """Whether a record may end there: another begins, or nothing is left that could be one, or another bag."""
+        left = self.source.size - end
+        if 0 <= left < 8 or (left > 0 and self._head(end) is not None):
+            return True
+        return left >= len(MAGIC) and self.source.at(end, len(MAGIC)) == MAGIC
 
     def _chunk(self, found: Head, end: int) -> Chunk:
         """What can be read of a chunk; all that is wrong with it is one loss."""
@@ -238,13 +248,17 @@ class Bag:
     def _unpacked(self, found: Head, end: int, compression: str) -> bytes:
         if compression == "none" and end == found.end and found.number(b"size") != found.size:
             raise LogError(f"it has {found.size} bytes", expected=str(found.number(b"size")))
-        cut = end != found.end
-        return records.unpack(compression, self.source.at(found.data_at, end - found.data_at), found.number(b"size"), cut=cut)
+        cut, packed = end != found.end, end - found.data_at
+        if packed > records.CHUNK_LIMIT:
+            raise LogError(f"it has {packed} bytes", expected=f"at most {records.CHUNK_LIMIT}")
+        return records.unpack(compression, self.source.at(found.data_at, packed), found.number(b"size"), cut=cut)
 
     def _told(self, position: int) -> int | None:
         """How many messages the index records behind a chunk say it has; None where there are none."""
         total: int | None = None
         while (found := self._head(position)) is not None and found.op == Op.INDEX:
+            if found.size != 12 * found.number(b"count"):
+                return None
             total = (total or 0) + found.number(b"count")
             position = found.end
         return total
