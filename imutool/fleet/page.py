@@ -228,7 +228,7 @@ def _spread(seen: _Seen) -> Iterator[str]:
     yield _figure(
         _one([(seen.seconds, "seconds a log"), (seen.speeds, "MB/s of one worker")], "times"), "t", "Time and speed by log"
     )
-    if len(seen.scores) > 1:
+    if len(seen.scores) > 1 and min(seen.scores) < max(seen.scores):
         yield _figure(_one([(seen.scores, "quality score")], "scores"), "q", "Quality")
 
 
@@ -267,7 +267,10 @@ def _provenance(settings: Settings) -> Iterator[str]:
         "model": settings.model or "as each log says",
         "model sha256": settings.model_sha256,
     }
-    entries |= {"init": settings.init, "smooth": "yes" if settings.smooth else "no"} if settings.command == "debias" else {}
+    if settings.command == "debias":
+        said = {True: "yes", False: "no"}
+        entries |= {"init": settings.init, "smooth": said[settings.smooth], "clean": said[settings.clean]}
+        entries["verified"] = f"structure, and contents: {settings.check}"
     for name, value in entries.items():
         if value and (settings.command == "debias" or not name.startswith("model")):
             yield f"<dt>{text(name)}</dt><dd>{text(value)}</dd>"
