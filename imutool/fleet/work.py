@@ -28,6 +28,7 @@ from imutool.mcap_io.log import Log
 from imutool.mcap_io.target import Target
 from imutool.place import Place, identity, place
 
+LOST = 3  # exit code: something of the log was lost
 MOST_LOSSES = 20  # stretches told of a log; its metadata and its repair tell all
 MAXRSS = 1 if sys.platform == "darwin" else 1024  # bytes in what the system counts memory in
 
@@ -184,7 +185,7 @@ def _lost(losses: Mapping[str, Any] | None) -> dict[str, Any]:
         count = "an unknown number of" if one["messages"] is None else one["messages"]
         told.append(f"byte {one['offset']}, {one['bytes']} bytes: {one['reason']} ({count} messages lost)")
     more = len(stretches) - len(told) + losses["stretches_not_listed"]
-    status = {"status": "lost"} if stretches else {}
+    status = {"status": "lost", "exit_code": LOST} if stretches else {}
     return {**status, "losses": (*told, *([f"{more} more stretches"] if more else ())), "warnings": tuple(losses["mended"])}
 
 

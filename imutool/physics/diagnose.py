@@ -219,7 +219,9 @@ def _told(logs: Sequence[Weighed], found: Discovery, reals: Sequence[str], sim: 
         located=tuple(places),
         findings=tuple(findings),
         bias=found.whole.bias,
-        not_identifiable=tuple(dict.fromkeys(name for one in found.judged for name in one.unidentified)),
+        not_identifiable=tuple(
+            dict.fromkeys(name for one in found.judged for name in one.unidentified if one.physics.name != JITTER)
+        ),
         unexplained=unexplained,
         remarks=tuple(_remarks(pairs)),
         closer={signal: _held_out(pairs, before, after, k, UNITS[signal]) for k, signal in enumerate(("gyro", "accel"))},

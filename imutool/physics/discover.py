@@ -25,7 +25,7 @@ from imutool.physics.effects._forward import Physics, Theta
 from imutool.physics.fit import Chosen, Fit, Weighed, derivatives, expected, fit
 from imutool.physics.pair import Pair
 from imutool.physics.readings import Read
-from imutool.physics.unnamed import Curve
+from imutool.physics.unnamed import Curve, finer, like
 
 FALSE_DISCOVERY = 5e-3
 HELPS = 0.05  # chance of the gain on unseen blocks being none
@@ -94,7 +94,7 @@ def _path(first: _Search, now: Fit, others: tuple[Physics, ...], waiting: list[S
         hopeless = len(now.chosen) > SUSPICIOUS and now.objective > HOPELESS * 6 * now.rows
         better = search.added(now) if len(now.chosen) < MOST and not hopeless else None
         if better is not None:
-            now = search.pruned(search.exchanged(better))
+            now = search.pruned(search.exchanged(search.refined(better)))
         elif waiting:
             search = search.also(waiting.pop(0))
         else:
@@ -189,6 +189,15 @@ class _Search:
                 gain, start = max(gains, key=lambda pair: pair[0])
                 self.known[physics.name] = _Ranked(self.chance(physics, gain), physics, start, gain)
         return sorted((self.known[physics.name] for physics in asked), key=lambda entry: entry.score)
+
+    def refined(self, now: Fit) -> Fit:
+        """With more knots in the curve that has just come in, where it has an edge that they pay for."""
+        others, (physics, _) = now.chosen[:-1], now.chosen[-1]
+        fine = finer(physics, like([log.pair for log in self.logs]))
+        if fine is None:
+            return now
+        trial = fit(self.logs, (*others, (fine, fine.nothing.astype(float))))
+        return trial if cost(trial) < cost(now) - CLEARLY else now
 
     def exchanged(self, now: Fit) -> Fit:
         """With an effect replaced by another of the catalogue that explains more, where there is one."""

@@ -80,9 +80,10 @@ def jitter(pairs: Sequence[Pair]) -> tuple[Physics, ...]:
     def forward(taken_s: Float64[np.ndarray, " n"], theta: Theta) -> Float64[np.ndarray, " n"]:
         alike = (one for one in late if len(one[0]) == len(taken_s))
         _, correction = min(alike, key=lambda one: abs(float(one[0][0] - taken_s[0])))
-        return np.asarray(taken_s + theta[0] * correction)
+        return np.asarray(taken_s + theta[0] * correction + theta[1] + theta[2] * np.linspace(-1.0, 1.0, len(taken_s)))
 
-    share = (Number("share", "-", 1.0),)
+    unsure = float(np.mean([x.std() / np.sqrt(len(x)) for _, x in late]))  # to which stamps show where the even clock begins
+    share = (Number("share", "-", 1.0), Number("begins_off", "s", unsure), Number("ends_off", "s", 2.0 * unsure))
     return (
         Physics(
             "timestamp_jitter",

@@ -23,7 +23,7 @@ from imutool.physics.physics_file import VARIABLES
 from imutool.physics.readings import Read, Vectors
 
 LAGS_S = (-0.5, -0.2, -0.1, -0.05, 0.0, 0.05, 0.1, 0.2, 0.5)
-KNOTS = 9
+KNOTS, FINE_KNOTS = 9, 33
 AXES = ("x", "y", "z")
 SIGNALS: tuple[tuple[Sensor, str], ...] = (("gyro", "rad/s"), ("accel", "m/s²"))
 PLAUSIBLE = {"gyro": 0.1, "accel": 1.0}
@@ -81,22 +81,38 @@ def unit(variable: str) -> str:
 
 def curves(like: Read) -> Iterator[Physics]:
     """A smooth curve of each variable, on each axis of each sensor."""
-    for variable, of in VARIABLES.items():
-        inner = np.quantile(of(like), np.linspace(INSIDE, 1 - INSIDE, KNOTS - 2))
-        if np.diff(inner).min() <= SPREAD * max(1.0, np.abs(inner).max()):
-            continue
-        for k, (signal, measured_in) in enumerate(SIGNALS):
-            for axis in range(3):
-                numbers = tuple(Number(f"c{j}", measured_in, PLAUSIBLE[signal]) for j in range(KNOTS))
-                yield Physics(
-                    f"unknown:{signal}.{AXES[axis]}({variable})",
-                    Stage.SENSOR,
-                    (signal,),
-                    f"{signal}.{AXES[axis]} += curve({variable})",
-                    numbers,
-                    f"{variable} varies",
-                    Curve(variable, k, axis, inner),
-                )
+    for variable in VARIABLES:
+        inner = _knots(like, variable, KNOTS)
+        if inner is not None:
+            yield from (_curve(variable, k, axis, inner) for k in range(len(SIGNALS)) for axis in range(3))
+
+
+def finer(physics: Physics, like: Read) -> Physics | None:
+    """The same curve with more knots, for what has an edge; nothing for what is no curve, or varies too little."""
+    coarse = physics.forward
+    if not isinstance(coarse, Curve):
+        return None
+    inner = _knots(like, coarse.variable, FINE_KNOTS)
+    return None if inner is None else _curve(coarse.variable, coarse.sensor, coarse.axis, inner)
+
+
+def _knots(like: Read, variable: str, count: int) -> Float64[np.ndarray, " p"] | None:
+    """As many samples between any two of them; none for what hardly varies."""
+    inner = np.quantile(VARIABLES[variable](like), np.linspace(INSIDE, 1 - INSIDE, count - 2))
+    return inner if np.diff(inner).min() > SPREAD * max(1.0, np.abs(inner).max()) else None
+
+
+def _curve(variable: str, sensor: int, axis: int, inner: Float64[np.ndarray, " p"]) -> Physics:
+    signal, measured_in = SIGNALS[sensor]
+    return Physics(
+        f"unknown:{signal}.{AXES[axis]}({variable})",
+        Stage.SENSOR,
+        (signal,),
+        f"{signal}.{AXES[axis]} += curve({variable})",
+        tuple(Number(f"c{j}", measured_in, PLAUSIBLE[signal]) for j in range(len(inner) + 2)),
+        f"{variable} varies",
+        Curve(variable, sensor, axis, inner),
+    )
 
 
 class Curve:
@@ -118,7 +134,7 @@ class Curve:
         """The B-splines at some values."""
         if self._last is None or not np.array_equal(self._last[0], x):  # derivatives ask for the same again and again
             inside = np.clip(x, self.inner[0], self.inner[-1])
-            self._last = x.copy(), np.asarray(BSpline.design_matrix(inside, self.knots, 3).toarray()[:, :KNOTS])
+            self._last = x.copy(), np.asarray(BSpline.design_matrix(inside, self.knots, 3).toarray()[:, : len(self.inner) + 2])
         return self._last[1]
 
     def __call__(self, read: Read, theta: Theta) -> Read:

@@ -109,11 +109,13 @@ def test_what_a_killed_attempt_left_is_removed(logs: Path, tmp_path: Path) -> No
 def test_a_damaged_log_is_a_result_and_leaves_nothing(logs: Path, tmp_path: Path, settings: Settings) -> None:
     broken = tmp_path / "broken.mcap"
     broken.write_bytes((logs / "flight_1.mcap").read_bytes()[:50_000])
-    for one in (settings, Settings(command="info")):
-        found = work(task(broken, tmp_path / "out", one))
-        assert (found.status, found.exit_code, found.target_sha256) == ("failed", 5, "")
-        assert "nothing in it can be saved" in found.error
+    found = work(task(broken, tmp_path / "out", settings))
+    assert (found.status, found.exit_code, found.target_sha256) == ("failed", 5, "")
+    assert "nothing in it can be saved" in found.error
     assert not [one for one in (tmp_path / "out").rglob("*") if one.is_file()]
+    told = work(task(broken, tmp_path / "out", Settings(command="info")))  # which says what of it is left
+    assert (told.status, told.exit_code, told.messages) == ("lost", 3, 0)
+    assert "235250 bytes" in told.losses[0]
 
 
 def test_a_log_that_is_still_being_written_waits(logs: Path, tmp_path: Path, settings: Settings) -> None:
