@@ -104,7 +104,7 @@ def test_whether_samples_jitter_with_their_stamps_is_seen_in_the_signals(share: 
     one = replace(one, real=PLANTED.ideal(felt, (), taken) + PLANTED.noise(N, 3) + PLANTED.BIAS)
     (physics,) = stamps.jitter([one])
     assert physics.name == "timestamp_jitter"
-    got = fit([PLANTED.weighed(one)], ((physics, np.zeros(1)),))
+    got = fit([PLANTED.weighed(one)], ((physics, np.zeros(3)),))
     assert abs(got.chosen[0][1][0] - share) < SURE * got.stds()["timestamp_jitter"][0]
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import runpy
-from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -41,7 +40,7 @@ def test_only_channels_of_all_logs_may_drive() -> None:
 def test_what_a_channel_adds_is_gain_times_its_departure_some_time_earlier(sensor: str, lag_s: float) -> None:
     pair = PLANTED.pair(PLANTED.rich(channels={"/motor": CURRENT}))
     physics = named(f"driven:/motor:{sensor}", unnamed.driven([pair]))
-    before = unnamed.like([pair])
+    before = pair.felt.taken(pair.stamp_s, pair.stamp_s)
     after = physics.forward(before, np.array([0.1, -0.2, 0.3, lag_s]))
     t = T - lag_s
     then = np.sin(0.7 * t) + 0.5 * np.cos(1.9 * t) - CURRENT.mean()
@@ -89,8 +88,8 @@ def test_every_curve_and_term_adds_on_one_axis_in_proportion_to_its_parameters_a
 def test_a_curve_is_held_beyond_its_ends() -> None:
     before = unnamed.like([PLANTED.pair(PLANTED.rich(duration_s=10.0))])
     curve = named("unknown:accel.y(omega_z)", unnamed.curves(before)).forward
-    x = np.array([curve.first - 5.0, curve.first, curve.last, curve.last + 5.0])
-    values = curve.basis(x) @ np.arange(1.0, 8.0)
+    first, last = curve.inner[0], curve.inner[-1]
+    values = curve.basis(np.array([first - 5.0, first, last, last + 5.0])) @ np.arange(1.0, unnamed.KNOTS + 1.0)
     assert values[0] == values[1]
     assert values[2] == values[3]
     assert np.isfinite(values).all()
@@ -102,7 +101,7 @@ def test_a_curve_finds_a_shape_that_has_no_name_within_its_band() -> None:
     added[:, 4] = 0.5 * np.tanh(felt.gyro[:, 2] / 0.6)
     pair = PLANTED.pair(felt, added=added)
     physics = named("unknown:accel.y(omega_z)", unnamed.curves(unnamed.like([pair])))
-    got = fit([PLANTED.weighed(pair)], ((physics, np.zeros(7)),))
+    got = fit([PLANTED.weighed(pair)], ((physics, np.zeros(unnamed.KNOTS)),))
     x = np.linspace(*np.quantile(felt.gyro[:, 2], [0.05, 0.95]), 30)
     basis = physics.forward.basis(x)
     centred = basis - basis.mean(axis=0)
@@ -139,12 +138,12 @@ def test_a_variable_that_never_changes_makes_no_curve_and_no_term() -> None:
     assert not any("omega_x" in one.name for one in unnamed.terms(like))
 
 
-def test_what_is_like_the_first_log_are_its_ideal_signals_at_its_samples() -> None:
+def test_what_is_like_the_first_log_are_its_ideal_signals_at_its_fitted_samples() -> None:
     felt = PLANTED.rich()
     pair = PLANTED.pair(felt, stamp_s=felt.t_s[100:-100])
     like = unnamed.like([pair, PLANTED.pair(PLANTED.planar())])
-    np.testing.assert_allclose(like.gyro, felt.gyro[100:-100], atol=1e-6)
-    assert replace(like).stamp_s is pair.stamp_s
+    np.testing.assert_allclose(like.gyro, felt.gyro[100:-100][pair.fitted], atol=1e-6)
+    assert np.array_equal(like.stamp_s, pair.stamp_s[pair.fitted])
 
 
 @pytest.mark.parametrize(
