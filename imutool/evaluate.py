@@ -13,8 +13,9 @@ from imutool import metrics
 from imutool.bias import static
 from imutool.bias._base import BiasModel
 from imutool.bias._file import check_rate, find_model
-from imutool.debias import Debiased, apply, estimate_at_rest, refuse_smooth, smooth_in_memory
+from imutool.debias import Debiased, apply
 from imutool.errors import ConfigError
+from imutool.log_start import estimate_at_rest, refuse_smooth, smooth_in_memory
 from imutool.mcap_io.read import read
 from imutool.recording import Imu, Poses, Recording
 from imutool.rest_track import Known

@@ -22,8 +22,9 @@ from imutool.bias._base import BiasModel, Segment
 from imutool.bias._file import load, save
 from imutool.cli.debias import assigned
 from imutool.convert import convert
-from imutool.debias import OnlineDebiaser, apply, debias, estimate_at_rest
+from imutool.debias import OnlineDebiaser, apply, debias
 from imutool.errors import ConfigError, LogError, ModelError
+from imutool.log_start import estimate_at_rest
 from imutool.mcap_io import schema
 from imutool.mcap_io.digest import sha256
 from imutool.mcap_io.read import read

@@ -46,7 +46,7 @@ TIERS = (
     ("preintegration", "inertial_filter", "physics"),
     ("bias",),
     ("rest_track", "turn_on"),
-    ("certainty",),
+    ("certainty", "log_start"),
     ("debias", "zero_velocity"),
     ("train", "evaluate", "convert", "identify", "export"),
     ("view", "vio"),

@@ -81,8 +81,8 @@ def debias(
     verify: Annotated[str, typer.Option(metavar="all|imu|none", help=VERIFY_HELP)] = "imu",
 ) -> Settings:
     """Debias every log, as `imutool debias --clean` does."""
-    from imutool.debias import refuse_smooth
     from imutool.fleet.models import settled
+    from imutool.log_start import refuse_smooth
     from imutool.mcap_io.verify import refuse_unknown
 
     refuse_smooth(init, smooth)

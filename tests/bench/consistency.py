@@ -28,7 +28,7 @@ from imutool import metrics, so3
 from imutool.bias._base import BiasModel
 from imutool.bias._file import load
 from imutool.certainty import Certainty
-from imutool.debias import smooth_in_memory
+from imutool.log_start import smooth_in_memory
 from imutool.mcap_io.read import read
 from imutool.recording import Recording, seconds
 from imutool.strapdown import with_velocity

@@ -17,7 +17,8 @@ import numpy as np
 from imutool import metrics
 from imutool.bias.hybrid import Model
 from imutool.config import load
-from imutool.debias import apply, smooth_in_memory
+from imutool.debias import apply
+from imutool.log_start import smooth_in_memory
 from imutool.mcap_io.read import read
 from imutool.recording import Recording
 from imutool.strapdown import along_truth
