@@ -36,6 +36,7 @@ ORDER_SIM, ORDER_TRUTH = 6, 12  # of the autoregression: a sensor's noise is nea
 RIDGE = 1e-8
 SLOW = 9  # samples of a running mean
 JITTER = "timestamp_jitter"
+INEXACT = 1e-5  # of a misfit's power: 0.3 % of its size, as which the inexactness of a much larger effect's model may pass
 SHOWN_BY_SAMPLES = {"saturation", "quantization"}  # without any fit: `stamps`
 SHOWN_KNOTS = 41  # of a curve without a name, as it is told
 EVERY_UNIT = (
@@ -199,7 +200,8 @@ def _told(logs: Sequence[Weighed], found: Discovery, reals: Sequence[str], sim: 
     floor = _floor(logs)
     before = [_with(pair, ()) for pair in pairs]
     after = [_with(pair, found.fitted.chosen) for pair in pairs]  # held-out time stays unseen
-    findings = [one for one in (_finding(logs, found, one, floor) for one in found.judged) if one.share > 0.0]
+    told = [_finding(logs, found, one, floor) for one in found.judged]
+    findings = [one for one in told if one.share > INEXACT]
     findings += stamps.saturated(pairs, after, found.tried) + stamps.dropped(pairs) + stamps.rounded(pairs, floor)
     p_values = {
         signal: min((one.p_value for one in findings if one.effect != JITTER and one.signal in (signal, "both")), default=1.0)
@@ -220,7 +222,10 @@ def _told(logs: Sequence[Weighed], found: Discovery, reals: Sequence[str], sim: 
         findings=tuple(findings),
         bias=found.whole.bias,
         not_identifiable=tuple(
-            dict.fromkeys(name for one in found.judged for name in one.unidentified if one.physics.name != JITTER)
+            dict.fromkeys(
+                [name for one in found.judged for name in one.unidentified if one.physics.name != JITTER]
+                + [one.effect for one in told if one.share <= INEXACT]
+            )
         ),
         unexplained=unexplained,
         remarks=tuple(_remarks(pairs)),
