@@ -6,7 +6,6 @@ import json
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cache, cached_property
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -25,6 +24,7 @@ from imutool.clean.truth import Truth, read_truth
 from imutool.errors import LogError
 from imutool.mcap_io import schema
 from imutool.mcap_io.log import ImuBatch, Log
+from imutool.place import Place
 
 SCHEMA = "imutool.clean/1"
 RECORDED = 20  # intervals of a finding that go into a log's metadata
@@ -118,7 +118,7 @@ class Survey:
         return {"schema": SCHEMA, **plain, "findings": json.dumps(findings)}
 
 
-def survey(path: Path, topic: str | None = None, rules: Rules | None = None) -> Survey:
+def survey(path: Place, topic: str | None = None, rules: Rules | None = None) -> Survey:
     """Looks through one IMU of a log; memory grows by some 6 kB a second of it (`tests/bench/clean.py`).
 
     Raises:
@@ -129,7 +129,7 @@ def survey(path: Path, topic: str | None = None, rules: Rules | None = None) -> 
         return look(log, topic or _only(log), rules)
 
 
-def imu_topics(path: Path) -> list[str]:
+def imu_topics(path: Place) -> list[str]:
     """The IMUs of a log.
 
     Raises:

@@ -9,6 +9,7 @@ import typer
 
 from imutool.cli._app import Init, Json, Overwrite, Quiet, Smooth, Verbose, app, listing
 from imutool.errors import ConfigError
+from imutool.place import place
 from imutool.terminal import out, plain, progress, say, table, write_json
 
 if TYPE_CHECKING:
@@ -20,8 +21,8 @@ SHOWN = 3  # intervals of a finding in the table; all of them are in the JSON
 
 @app.command(cls=listing("imutool.clean", "--rule"), epilog="Example: [bold]imutool clean robot.mcap robot_clean.mcap[/]")
 def clean(
-    source: Annotated[Path, typer.Argument(metavar="LOG", help="An MCAP log.")],
-    target: Annotated[Path | None, typer.Argument(metavar="OUT", help="The log with a clean, debiased IMU beside it.")] = None,
+    source: Annotated[str, typer.Argument(metavar="LOG", help="An MCAP log: a file, or a URL such as s3://bucket/log.mcap.")],
+    target: Annotated[str | None, typer.Argument(metavar="OUT", help="The log with a clean, debiased IMU beside it.")] = None,
     model: Annotated[str | None, typer.Option(help="For OUT: model file, physics.toml or a name that ships.")] = None,
     imu: Annotated[list[str] | None, typer.Option(help="IMU topic, where a log has several. Repeatable.")] = None,
     rule: Annotated[list[str] | None, typer.Option("--rule", metavar="NAME", help="This rule alone. Repeatable.")] = None,
@@ -48,19 +49,20 @@ def clean(
         Target(report_to, overwrite=overwrite).abandon()  # a page that cannot be written is refused before the work is done
     if target is None:
         with progress("Looking through", verbose, quiet) as tell:
-            topics = list(imu or ()) or imu_topics(source)
+            here = place(source)
+            topics = list(imu or ()) or imu_topics(here)
             surveys = []
             for done, topic in enumerate(topics):
                 tell(done, len(topics), topic)
-                surveys.append(survey(source, topic, rules))
+                surveys.append(survey(here, topic, rules))
         added: dict[str, int] = {}
     else:
         from imutool.debias import debias
 
         with progress("Cleaning", verbose, quiet) as tell:
             report = debias(
-                source,
-                target,
+                place(source),
+                place(target),
                 model=model,
                 imus=imu or (),
                 init=init,
