@@ -129,17 +129,6 @@ def survey(path: Place, topic: str | None = None, rules: Rules | None = None) ->
         return look(log, topic or _only(log), rules)
 
 
-def imu_topics(path: Place) -> list[str]:
-    """The IMUs of a log.
-
-    Raises:
-        ConfigError: the file cannot be opened.
-        LogError: it holds none, or is damaged.
-    """
-    with Log(path) as log:
-        return log.imu_topics or [_only(log)]
-
-
 def _only(log: Log) -> str:
     found = log.imu_topics
     if len(found) != 1:

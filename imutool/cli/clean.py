@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from imutool.cli._app import Init, Json, Overwrite, Quiet, Smooth, Verbose, app, listing
-from imutool.errors import ConfigError
+from imutool.cli._app import LOST, Init, Json, Overwrite, Quiet, Smooth, Verbose, app, listing
+from imutool.errors import ConfigError, LogError
 from imutool.place import place
-from imutool.terminal import out, plain, progress, say, table, write_json
+from imutool.terminal import out, plain, progress, say, table, tell_losses, write_json
 
 if TYPE_CHECKING:
-    from imutool.clean import Survey
+    from imutool.clean import Rules, Survey
+    from imutool.mcap_io.losses import Losses
 
 COLORS = {"good": "green", "usable": "yellow", "quarantine": "red"}
 SHOWN = 3  # intervals of a finding in the table; all of them are in the JSON
@@ -37,7 +39,7 @@ def clean(
     quiet: Quiet = False,
 ) -> None:
     """Say what is wrong inside a log's IMU and whether to trust it; with OUT, write the log with a clean IMU beside the raw."""
-    from imutool.clean.first_pass import SCHEMA, imu_topics, survey
+    from imutool.clean.first_pass import SCHEMA
     from imutool.clean.settings import chosen
     from imutool.mcap_io.target import Target
 
@@ -49,12 +51,7 @@ def clean(
         Target(report_to, overwrite=overwrite).abandon()  # a page that cannot be written is refused before the work is done
     if target is None:
         with progress("Looking through", verbose, quiet) as tell:
-            here = place(source)
-            topics = list(imu or ()) or imu_topics(here)
-            surveys = []
-            for done, topic in enumerate(topics):
-                tell(done, len(topics), topic)
-                surveys.append(survey(here, topic, rules))
+            surveys, losses = _looked(source, imu or (), rules, tell)
         added: dict[str, int] = {}
     else:
         from imutool.debias import debias
@@ -71,20 +68,46 @@ def clean(
                 clean=rules,
                 progress=lambda done, total: tell(done, total, ""),
             )
-        surveys, added = list(report.surveys.values()), dict(report.rewrite.added)
-    result: dict[str, Any] = {"schema": SCHEMA, "log": str(source), "imus": [one.plain() for one in surveys]}
+        surveys, added, losses = list(report.surveys.values()), dict(report.rewrite.added), report.losses
+    result: dict[str, Any] = {
+        "schema": SCHEMA,
+        "log": source,
+        "imus": [one.plain() for one in surveys],
+        "losses": losses.plain(),
+    }
     if target is not None:
         result |= {"output": str(target), "added": added}
     if report_to is not None:
         from imutool.view import clean_page
 
         clean_page.write(surveys, report_to, overwrite=overwrite)
-    if write_json(result, json_to):
-        return
-    for one in surveys:
-        show(one)
-    if target is not None:
-        say(f"{target}: {', '.join(f'{count} on {name}' for name, count in added.items())}")
+    if not write_json(result, json_to):
+        for one in surveys:
+            show(one)
+        if target is not None:
+            say(f"{target}: {', '.join(f'{count} on {name}' for name, count in added.items())}")
+        tell_losses(losses.plain())
+    if losses:
+        raise typer.Exit(LOST)
+
+
+def _looked(
+    source: str, imus: Sequence[str], rules: Rules, tell: Callable[[int, int, str], None]
+) -> tuple[list[Survey], Losses]:
+    """What is found in each IMU of a log, and what of a damaged log is lost."""
+    from imutool.clean import look
+    from imutool.mcap_io.log import Log
+
+    with Log(place(source), salvage=True) as log:
+        topics = list(imus) or log.imu_topics
+        if not topics:
+            raise LogError("no IMU topic", where=source, expected=log.listing())
+        surveys = []
+        for done, topic in enumerate(topics):
+            tell(done, len(topics), topic)
+            surveys.append(look(log, topic, rules))
+        assert log.losses is not None, "with salvage there are losses, if perhaps none"
+        return surveys, log.losses
 
 
 def show(survey: Survey) -> None:
