@@ -75,7 +75,7 @@ def discover(logs: Sequence[Weighed], candidates: Sequence[Physics], later: Sequ
     everything = tuple(one for stage in later for one in stage)
     start = fit(logs, ())
     first = _Search(logs, tuple(candidates), everything, start.objective)
-    named, nameless = (max((r.gain for r in first.ranked(start, some)), default=0.0) for some in (first.named, first.others))
+    named, nameless = (max((r.worth for r in first.ranked(start, some)), default=0.0) for some in (first.named, first.others))
     paths = [(first.others, []), ((), list(later))] if nameless > named + CLEARLY else [((), list(later)), (first.others, [])]
     search, now = _path(first, start, *paths[0])
     churned = len(now.chosen) >= SUSPICIOUS or any(":" in name for name in now.names)
@@ -116,6 +116,11 @@ class _Ranked(NamedTuple):
     physics: Physics
     start: Theta
     gain: float
+
+    @property
+    def worth(self) -> float:
+        """The gain less what as many numbers gain by chance (Akaike)."""
+        return self.gain - 2.0 * len(self.start)
 
 
 @dataclass(eq=False)

@@ -17,12 +17,13 @@ from imutool.physics.readings import Felt, Read
 MEDIAN, FEW = 15, 500  # samples: of a running median, and to find a period by first
 PERIOD_SPAN, PERIODS = 0.02, 201  # periods tried about the median step
 CLEAR, AGREE, LAG = 0.25, 0.3, 10  # of a period; of stamps that all agree; samples
-LEAST_MISSING, LEAST_AT_LIMIT = 3, 4
+LEAST_MISSING, LEAST_AT_LIMIT, PILED = 3, 4, 2.0
 NEARLY, EXACT = 0.995, 1e-3
 SHARES = (0.999, 0.99, 0.97, 0.9, 0.8)  # of the largest reading, where a soft limit is looked for
 LEAST_JITTER_S = 2e-5
 LEAST_DIGITS = 0.3  # of the noise: finer steps leave no trace in it
 ON_GRID = 0.98  # of the samples
+LEAST_VALUES = 3  # that a grid is told from
 
 
 def even(stamp_s: Float64[np.ndarray, " n"]) -> tuple[Float64[np.ndarray, " n"], int]:
@@ -118,7 +119,8 @@ def rounded(pairs: Sequence[Pair], floor: Float64[np.ndarray, "6"]) -> list[Find
     """Values on a grid as coarse as the noise."""
     lsb = {}
     for k, signal in enumerate(("gyro", "accel")):
-        grids = [grid(pair.real[:, a]) for pair in pairs for a in range(3 * k, 3 * k + 3)]
+        axes = [pair.real[:, a] for pair in pairs for a in range(3 * k, 3 * k + 3)]
+        grids = [grid(x) for x in axes if len(np.unique(x)) >= LEAST_VALUES] or [0.0]  # fewer lie on any grid
         noise = float(np.sqrt(np.mean(floor[3 * k : 3 * k + 3] ** 2)))
         if min(grids) > LEAST_DIGITS * noise and max(grids) < 1.5 * min(grids):
             lsb[signal] = float(np.median(grids))
@@ -134,10 +136,10 @@ def rounded(pairs: Sequence[Pair], floor: Float64[np.ndarray, "6"]) -> list[Find
 def grid(x: Float64[np.ndarray, " n"]) -> float:
     """The step of the grid that values lie on; 0 where they lie on none, or take fewer than three values."""
     values = np.unique(np.round(x, 12))
-    if len(values) < 3:
+    if len(values) < LEAST_VALUES:
         return 0.0
     step = float(np.diff(values).min())
-    if step <= 0 or len(values) > 0.5 * len(x):
+    if step <= 0:
         return 0.0
     for _ in range(3):  # least squares on the multiples
         k = np.rint((values - values[0]) / step)
@@ -152,7 +154,9 @@ def limits(real: Float64[np.ndarray, "n 6"]) -> dict[str, float]:
     for k, signal in enumerate(("gyro", "accel")):
         values = np.abs(real[:, 3 * k : 3 * k + 3])
         most = float(values.max())
-        if (values >= most * (1.0 - 1e-9)).sum() >= LEAST_AT_LIMIT:
+        below = values[values < most * (1.0 - 1e-9)]
+        at, next_to = values.size - below.size, int((below >= below.max(initial=0.0) * (1.0 - 1e-9)).sum())
+        if at >= LEAST_AT_LIMIT and at > PILED * next_to:  # values on a grid come again everywhere, and less at their ends
             found[signal] = most
     return found
 
