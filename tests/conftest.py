@@ -102,6 +102,7 @@ def store(store_server: Any, monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
     for name, value in store_server.environment.items():
         monkeypatch.setenv(name, value)
     monkeypatch.setattr("s3fs.S3FileSystem.retries", 2)  # by itself it asks five times, for longer each time
+    monkeypatch.setattr("s3fs.S3FileSystem.read_timeout", 4)  # s, of 15: what a silent store is given to answer
     store_server.empty()
     yield store_server
     store_server.fault = lambda _: None

@@ -64,6 +64,8 @@ class Store:
         if environ["REQUEST_METHOD"] == "GET":
             start("206 Partial Content", [("Content-Length", "100000"), ("Content-Type", "binary/octet-stream")])
             yield b"half of it"
+        # a client that is still sending may not notice that nobody listens before its own patience ends
+        environ["wsgi.input"].read(int(environ.get("CONTENT_LENGTH") or 0))
         environ["werkzeug.socket"].shutdown(socket.SHUT_RDWR)
         raise ConnectionResetError("as told")
 
