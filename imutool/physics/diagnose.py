@@ -148,9 +148,22 @@ def _pairs(real: Recording, sim: Recording | None, truth: str | None) -> Iterato
 
 
 def _unclipped(pair: Pair) -> Pair:
-    """Without rows in which a converter is at its end."""
-    keep = ~stamps.clipped(pair.real)
-    return replace(pair, fitted=pair.fitted & keep, held_out=pair.held_out & keep)
+    """Without rows in which a converter is at its end.
+
+    Raises:
+        DataError: hardly any other row is there.
+    """
+    clipped = stamps.clipped(pair.real)
+    rest = replace(pair, fitted=pair.fitted & ~clipped, held_out=pair.held_out & ~clipped)
+    if clipped.any() and (rest.fitted | rest.held_out).sum() * pair.period_s < LEAST_S:
+        told = ", ".join(f"{signal} {most:.4g} {UNITS[signal]}" for signal, most in stamps.limits(pair.real).items())
+        raise DataError(
+            f"the sensor is at its limit in {100.0 * clipped.mean():.0f} % of the samples ({told})",
+            where=pair.name,
+            expected=f"{LEAST_S:g} s away from it",
+            fix="Nobody knows what a sensor would have read beyond its range: record with a wider one",
+        )
+    return rest
 
 
 def _candidates(pairs: Sequence[Pair]) -> tuple[Physics, ...]:

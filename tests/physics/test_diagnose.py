@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import runpy
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -13,9 +14,11 @@ import numpy as np
 import pytest
 
 from imutool.errors import DataError, LogError
+from imutool.mcap_io.read import read
 from imutool.mcap_io.write import write
 from imutool.physics.diagnose import diagnose
 from imutool.physics.diagnosis import Diagnosis
+from imutool.recording import Imu
 
 PLANTED = SimpleNamespace(**runpy.run_path(str(Path(__file__).with_name("planted.py"))))
 SURE = 4.0
@@ -250,6 +253,16 @@ def test_a_simulation_of_another_motion_is_refused(made: Made) -> None:
     real, sim = made(sim_seed=7)
     with pytest.raises(DataError, match="motion"):
         diagnose([real], sim)
+
+
+def test_a_sensor_at_its_limit_throughout_is_refused_with_the_limit(made: Made, tmp_path: Path) -> None:
+    real, sim = made()
+    recording = read(real)
+    accel = np.clip(recording.imu.accel, -0.5, 0.5)
+    clipped = replace(recording, imu=Imu(recording.imu.t_ns, recording.imu.gyro, accel))
+    write(clipped, tmp_path / "clipped.mcap")
+    with pytest.raises(DataError, match=r"at its limit in \d+ % of the samples \(accel 0.5 m/s\^2\)"):
+        diagnose([tmp_path / "clipped.mcap"], sim)
 
 
 def test_what_is_no_log_is_refused(tmp_path: Path) -> None:
