@@ -268,7 +268,7 @@ def _chosen(log: Log, imus: Sequence[str], given: Mapping[str, str | Path]) -> l
         LogError: none is named, and the log has not exactly one.
     """
     own = [topic for topic in given if topic]
-    topics = list(dict.fromkeys(imus or own or [_only_imu(log)]))
+    topics = list(dict.fromkeys(imus or own or [log.only_imu()]))
     for topic in own:
         if topic not in topics:
             raise ConfigError(
@@ -284,15 +284,6 @@ def _chosen(log: Log, imus: Sequence[str], given: Mapping[str, str | Path]) -> l
             fix="Leave it out, or name the other IMUs with --imu",
         )
     return topics
-
-
-def _only_imu(log: Log) -> str:
-    """The log's IMU, if there is one and only one."""
-    found = log.imu_topics
-    if len(found) != 1:
-        listed = ", ".join(found) or "none"
-        raise LogError(f"IMU topics: {listed}", where=log.path, expected="one", fix="Choose with --imu" if found else "")
-    return found[0]
 
 
 def _provenance(topic: str, model: BiasModel, start: TurnOn, init: str, smooth: bool) -> dict[str, str]:

@@ -126,15 +126,7 @@ def survey(path: Place, topic: str | None = None, rules: Rules | None = None) ->
         LogError: no such IMU, several without `topic`, or a damaged log.
     """
     with Log(path) as log:
-        return look(log, topic or _only(log), rules)
-
-
-def _only(log: Log) -> str:
-    found = log.imu_topics
-    if len(found) != 1:
-        listed = ", ".join(found) or "none"
-        raise LogError(f"IMU topics: {listed}", where=log.path, expected="one", fix="Choose with --imu" if found else "")
-    return found[0]
+        return look(log, topic or log.only_imu(), rules)
 
 
 def look(log: Log, topic: str, rules: Rules | None = None) -> Survey:

@@ -172,6 +172,18 @@ class Log:
         """Topics with IMU messages, without those that imutool computed itself."""
         return [t.name for t in self.with_schema((schema.IMU,)) if DERIVED_KEY not in t.metadata]
 
+    def only_imu(self) -> str:
+        """The log's IMU, where there is one and only one.
+
+        Raises:
+            LogError: there are others, or none.
+        """
+        found = self.imu_topics
+        if len(found) != 1:
+            listed = ", ".join(found) or "none"
+            raise LogError(f"IMU topics: {listed}", where=self.path, expected="one", fix="Choose with --imu" if found else "")
+        return found[0]
+
     @property
     def pose_topics(self) -> list[str]:
         """Topics with poses; /tf counts only where nothing else has any, and never the static one."""
