@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import random
+import runpy
 import signal
 import struct
 import subprocess
@@ -15,6 +16,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from types import SimpleNamespace
 
 import lz4.frame
 import pytest
@@ -37,6 +39,8 @@ Message = tuple[str, int, int, int, bytes]  # topic, log time, publish time, seq
 Messages = list[tuple[str, str, int, int, int, bytes]]
 Foreign = Callable[..., Path]
 
+DAMAGE = SimpleNamespace(**runpy.run_path(str(Path(__file__).with_name("damage.py"))))  # reads logs message by message
+content, of_block, stretches, by_mcap = DAMAGE.content, DAMAGE.of_block, DAMAGE.stretches, DAMAGE.by_mcap
 ROOM_BYTES = 30 << 20
 BUDGET_S = 20.0  # for one file, with every annotation checked on a busy machine
 UNCHUNKED = ("unchunked", "unchunked-no-summary")
@@ -77,51 +81,6 @@ def some(seed: int, count: int, topics: tuple[str, str] = ("/a", "/b"), start_ns
         (topics[i % 3 > 1], EMPTY[i % 3 > 1], start_ns + 1000 * i, start_ns + i, i, rng.randbytes(rng.choice((5, 20, 20, 47))))
         for i in range(count)
     ]
-
-
-def content(log: Log) -> list[Message]:
-    """Every message, as it comes back."""
-    found = []
-    for block in log.structure.blocks:
-        each = log.structure.found(block)
-        if each is not None:
-            found += of_block(log, each)
-    return found
-
-
-def of_block(log: Log, each: records.Messages) -> list[Message]:
-    channels, data = log.structure.channels, each.data
-    return [
-        (
-            channels[int(head["channel"])].topic,
-            int(head["log_time"]),
-            int(head["publish_time"]),
-            int(head["sequence"]),
-            data[at + records.MESSAGE.itemsize : at + HEAD.size + int(head["length"])].tobytes(),
-        )
-        for at, head in zip(each.offsets.tolist(), each.heads, strict=True)
-    ]
-
-
-def stretches(path: Path) -> list[tuple[int, int, list[Message]]]:
-    """First and last byte of every chunk, or message outside chunks, of a whole log, with what is in it."""
-    found = []
-    with Log(path) as log:
-        for block in log.structure.blocks:
-            each = log.structure.unpack(block)
-            if block.compression is not None:
-                found.append((block.offset, block.offset + block.length, of_block(log, each)))
-                continue
-            for at, head, message in zip(each.offsets.tolist(), each.heads, of_block(log, each), strict=True):
-                found.append((block.offset + at, block.offset + at + HEAD.size + int(head["length"]), [message]))
-    return found
-
-
-def by_mcap(path: Path) -> list[Message]:
-    """The messages as the `mcap` package reads them by the index."""
-    with path.open("rb") as file:
-        found = make_reader(file, validate_crcs=True).iter_messages()
-        return [(c.topic, m.log_time, m.publish_time, m.sequence, bytes(m.data)) for _, c, m in found]
 
 
 def blocks(path: Path) -> list[Block]:
