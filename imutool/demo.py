@@ -19,7 +19,8 @@ from imutool.physics.flight import ACCEL, GYRO, FlightSettings, flight
 from imutool.recording import Recording
 from imutool.train.fit import Epoch, TrainSettings
 from imutool.train.run import train
-from imutool.view import report, rerun
+from imutool.view import report
+from imutool.view.rerun import viewer
 from imutool.view.runs import load
 
 TRAINING_SEEDS = (1, 2, 3, 4)  # four flights of one sensor, each with a turn-on bias of its own
@@ -87,7 +88,7 @@ def run(
     say("5. Measuring against the truth, drawing")
     results = evaluate(log, models=["static", model])
     data = load(log, models=["static", model])
-    rerun.show([data], save=rrd, spawn=False, overwrite=overwrite)
+    viewer.show([data], save=rrd, spawn=False, overwrite=overwrite)
     report.error_curves(data, png, overwrite=overwrite)
     return Demo(log, debiased, model, rrd, png, results)
 

@@ -25,7 +25,8 @@ def view(
     quiet: Quiet = False,
 ) -> None:
     """Show truth, raw and debiased in the Rerun viewer, or save them for it."""
-    from imutool.view import report, rerun
+    from imutool.view import report
+    from imutool.view.rerun import viewer
     from imutool.view.runs import load
 
     with progress("Reading", verbose, quiet) as tell:
@@ -37,4 +38,4 @@ def view(
         png.mkdir(parents=True, exist_ok=True)
         for log, one in zip(logs, data, strict=True):
             report.error_curves(one, png / f"{log.stem}.png", overwrite=overwrite)
-    say(rerun.show(data, save=save, overwrite=overwrite))
+    say(viewer.show(data, save=save, overwrite=overwrite))

@@ -15,7 +15,8 @@ from imutool.mcap_io.target import Target
 from imutool.physics.conclusion import lines, where
 from imutool.physics.diagnosis import Diagnosis, Located, Traces
 from imutool.view.diagnosis_figures import located_in, spans
-from imutool.view.rerun import AXES, BOLD_WIDTH, FLUSH_S, GREY, MODEL_COLORS, RAW_COLOR, RAW_WIDTH, _entity, _sdk
+from imutool.view.rerun.palette import AXES, BOLD_WIDTH, GREY, MODEL_COLORS, RAW_COLOR, RAW_WIDTH
+from imutool.view.rerun.sdk import FLUSH_S, entity_path, need_sdk
 
 if TYPE_CHECKING:
     import rerun as rr
@@ -46,7 +47,7 @@ def rrd(d: Diagnosis) -> bytes:
     Raises:
         ConfigError: Rerun is not installed.
     """
-    _sdk()
+    need_sdk()
     import rerun as rr
 
     plain = re.sub(r"[^A-Za-z0-9_-]", "_", Path(d.real[0]).stem if d.real else "")[:100]
@@ -69,7 +70,7 @@ def log(d: Diagnosis, to: rr.RecordingStream) -> None:
     Raises:
         ConfigError: Rerun is not installed.
     """
-    _sdk()
+    need_sdk()
     import rerun as rr
 
     to.log("report", rr.TextDocument(_report(d), media_type="text/markdown"), static=True, strict=True)
@@ -89,7 +90,7 @@ def blueprint(d: Diagnosis) -> rrb.Blueprint:
     Raises:
         ConfigError: Rerun is not installed.
     """
-    _sdk()
+    need_sdk()
     import rerun.blueprint as rrb
 
     report = rrb.TextDocumentView(origin="/report", name="Report")
@@ -103,8 +104,8 @@ def blueprint(d: Diagnosis) -> rrb.Blueprint:
             for of, title in (("left", "What is left"), ("samples", "Samples"))
         ]
         below: list[Any] = [
-            rrb.StateTimelineView(origin=_origin(_entity(name, "where")), name="Where it differs", time_view=_whole(trace)),
-            rrb.TextLogView(origin=_origin(_entity(name, "events")), name="Events"),
+            rrb.StateTimelineView(origin=_origin(entity_path(name, "where")), name="Where it differs", time_view=_whole(trace)),
+            rrb.TextLogView(origin=_origin(entity_path(name, "events")), name="Events"),
         ]
         above = rrb.Tabs(*kinds, active_tab=0)
         tabs.append(rrb.Vertical(above, rrb.Horizontal(*below), row_shares=[5, 2], name=name))
@@ -136,7 +137,7 @@ def _log_scalars(
     """One curve a column; the style goes first, so that no curve is ever drawn in a colour of the viewer's choice."""
     import rerun as rr
 
-    entity = _entity(*axis, kind)
+    entity = entity_path(*axis, kind)
     # by default the viewer draws the mean of what falls on a pixel: noise would look smaller than it is
     extremes = rr.components.AggregationPolicy.MinMax
     style = rr.SeriesLines(
@@ -161,7 +162,7 @@ def _log_places(to: rr.RecordingStream, d: Diagnosis, name: str, trace: Traces) 
             for axis in place.axes or ("",):
                 inside.setdefault((place.signal, axis) if axis else (place.signal,), []).append(stretch)
     for key, stretches in inside.items():
-        entity = _entity(name, "where", *key)
+        entity = entity_path(name, "where", *key)
         color = HELD_COLOR if key == ("unseen",) else MARK_COLOR
         style = rr.StateConfiguration(
             values=[INSIDE, OUTSIDE], labels=[" ".join(key), ""], colors=[color, GREY], visible=[True, False]
@@ -175,7 +176,7 @@ def _log_places(to: rr.RecordingStream, d: Diagnosis, name: str, trace: Traces) 
     if events:
         events.sort(key=lambda event: event[0])
         columns = rr.TextLog.columns(text=[text for _, _, text in events], level=[level for _, level, _ in events])
-        to.send_columns(_entity(name, "events"), [_time(np.array([t for t, _, _ in events]))], columns, strict=True)
+        to.send_columns(entity_path(name, "events"), [_time(np.array([t for t, _, _ in events]))], columns, strict=True)
 
 
 def _time(t_s: Float64[np.ndarray, " n"]) -> rr.TimeColumn:
@@ -192,7 +193,7 @@ def _axis(name: str, column: int) -> tuple[str, str, str]:
 
 def _plot(name: str, trace: Traces, column: int, kind: str) -> rrb.TimeSeriesView:
     _, signal, axis = _axis(name, column)
-    return _view(_entity(name, signal, axis, kind), f"{TITLES[signal]} {axis} ({UNITS[signal]})", trace)
+    return _view(entity_path(name, signal, axis, kind), f"{TITLES[signal]} {axis} ({UNITS[signal]})", trace)
 
 
 def _view(entity: str, title: str, trace: Traces) -> rrb.TimeSeriesView:

@@ -5,17 +5,21 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
+from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float64, Int64
+from jaxtyping import Float64, Int64
 from scipy.spatial.transform import Rotation
 
 from imutool.errors import ConfigError, DataError
 from imutool.metrics import evaluate
 from imutool.recording import GAP_FACTOR, MIN_GAP_S, Imu, Poses, Recording, Scalars, Times, nanoseconds, seconds
 from imutool.strapdown import Start, along_truth, dead_reckon, with_velocity
+from imutool.view.deviation import Alignment, Drift, Errors, Window, errors
+from imutool.view.events import Event
+from imutool.view.spectra import Spectrum, spectra
 
 RAW = "raw"
 TRUTH = "truth"  # its place in the pictures; no run may take it
@@ -27,17 +31,21 @@ Vectors = Float64[np.ndarray, "n 3"]
 
 @dataclass(frozen=True, eq=False)
 class Run:
-    """One way of reading the IMU: `raw`, or a model's name, with what it subtracted (zeros for raw)."""
+    """One way of reading the IMU: `raw`, or a model's name, with what it subtracted (zeros for raw).
+
+    `bias_std` is one standard deviation of what was subtracted, gyro (rad/s) then accel (m/s²), where the model states it.
+    """
 
     name: str
     imu: Imu
     gyro_bias: Float64[np.ndarray, "n 3"]
     accel_bias: Float64[np.ndarray, "n 3"]
+    bias_std: Float64[np.ndarray, "n 6"] | None = None
 
     def __post_init__(self) -> None:
-        for name in ("gyro_bias", "accel_bias"):
-            rows = len(getattr(self, name))
-            if rows != len(self.imu):
+        for name in ("gyro_bias", "accel_bias", "bias_std"):
+            value = getattr(self, name)
+            if value is not None and (rows := len(value)) != len(self.imu):
                 raise DataError(f"{name} has {rows} rows", where=self.name, expected=f"{len(self.imu)}, as the IMU")
 
     @classmethod
@@ -48,32 +56,19 @@ class Run:
 
 
 @dataclass(frozen=True, eq=False)
-class Errors:
-    """How far an estimate is from the truth at its own stamps; a row is NaN where there is no truth to compare with."""
-
-    t_ns: Times
-    orientation_deg: Float64[np.ndarray, "n 3"]  # Log(R_true^T R_estimated), in the true body frame
-    position_m: Float64[np.ndarray, "n 3"]  # estimated minus true, world
-
-    @property
-    def orientation_total_deg(self) -> Float64[np.ndarray, " n"]:
-        """The angle of the orientation error, 0 to 180 degrees."""
-        return _length(self.orientation_deg)
-
-    @property
-    def position_total_m(self) -> Float64[np.ndarray, " n"]:
-        """The length of the position error."""
-        return _length(self.position_m)
-
-
-@dataclass(frozen=True, eq=False)
 class Trace:
-    """A run and what follows from it: the dead-reckoned path, its errors and its figures (without truth: neither)."""
+    """A run and what follows from it: the dead-reckoned path, its errors and its figures (without truth: none of these).
+
+    `path` and `errors` are after the log's `alignment`; `drift`, `windows` and `figures` know none.
+    """
 
     run: Run
     path: Poses
     errors: Errors | None
+    drift: Drift | None = None  # each reset to the truth
+    windows: tuple[Window, ...] = ()  # how far windows of 1, 5, 10 and 30 s drift
     figures: Mapping[str, Any] = field(default_factory=dict)
+    spectra: Mapping[str, Spectrum] = field(default_factory=dict)  # `gyro` and `accel`, of the samples
 
     @property
     def name(self) -> str:
@@ -87,10 +82,28 @@ class Trace:
 
 
 @dataclass(frozen=True, eq=False)
+class Logged:
+    """Header stamps (strictly increasing) and the log time of the same messages, in ns."""
+
+    stamp_ns: Times
+    log_ns: Times
+
+    def at(self, t_ns: Times) -> Times:
+        """Log times at stamps: exact where a message has that stamp, in between and beyond with the nearest message's delay."""
+        right = np.clip(np.searchsorted(self.stamp_ns, t_ns), 0, len(self.stamp_ns) - 1)
+        left = np.maximum(right - 1, 0)
+        nearer = np.where(t_ns - self.stamp_ns[left] < self.stamp_ns[right] - t_ns, left, right)
+        times: Times = t_ns + (self.log_ns - self.stamp_ns)[nearer]
+        return times
+
+
+@dataclass(frozen=True, eq=False)
 class RunData:
     """A log, ready to be looked at: `traces` in the order of the runs, elapsed time counted from `start_ns`.
 
-    `true_bias` holds `gyro` (rad/s) and `accel` (m/s²) where the log knows them; `notes` are sentences for the reader.
+    `true_bias` holds `gyro` (rad/s) and `accel` (m/s²) where the log knows them; `notes` are sentences for the reader;
+    `provenance` says in words what this was made from: file, size, model, its digest, start, version.
+    `logged` pairs header stamps with the times at which the log says they were written; none where there is no log.
     """
 
     name: str
@@ -100,6 +113,11 @@ class RunData:
     true_bias: Mapping[str, Scalars]
     traces: tuple[Trace, ...]
     notes: tuple[str, ...]
+    alignment: Alignment = "none"
+    events: tuple[Event, ...] = ()
+    provenance: Mapping[str, str] = field(default_factory=dict)
+    source: Path | None = None
+    logged: Logged | None = None
 
     @property
     def duration_s(self) -> float:
@@ -109,6 +127,10 @@ class RunData:
     def elapsed_s(self, t_ns: Times) -> Float64[np.ndarray, " n"]:
         """Seconds since the first IMU sample."""
         return seconds(t_ns, self.start_ns)
+
+    def log_ns(self, t_ns: Times) -> Times:
+        """The log times that belong to header stamps; the stamps themselves where no log is known."""
+        return t_ns if self.logged is None else self.logged.at(t_ns)
 
     def table(self) -> list[tuple[str, list[float | None]]]:
         """The figures as rows: a label (`aoe_deg`, `roe_deg 5`) and one value per trace, `None` where it has none."""
@@ -144,7 +166,7 @@ def build(recording: Recording, runs: Sequence[Run]) -> RunData:
         notes = (f"Paths start at the true pose, {started:.2f} s into the log; errors are without alignment.",)
     else:
         truth = None
-        traces = tuple(Trace(run, dead_reckon(run.imu, level_start(run.imu)), None) for run in runs)
+        traces = tuple(Trace(run, dead_reckon(run.imu, level_start(run.imu)), None, spectra=spectra(run.imu)) for run in runs)
         notes = (
             f"This log has no truth, so there are no errors. Paths start at the origin, at rest, heading 0, "
             f"levelled by the first {LEVELLING_S:g} s of specific force.",
@@ -169,14 +191,6 @@ def level_start(imu: Imu) -> Start:
     f_x, f_y, f_z = first.accel.mean(axis=0)
     level = Rotation.from_euler("ZYX", [0.0, np.arctan2(-f_x, np.hypot(f_y, f_z)), np.arctan2(f_y, f_z)])
     return Start(level.as_quat(scalar_first=True), np.zeros(3), np.zeros(3))
-
-
-def errors(estimate: Poses, truth: Poses, valid: Bool[np.ndarray, " n"]) -> Errors:
-    """The error of an estimate against the truth at the same stamps, NaN where `valid` is false."""
-    true, found = (Rotation.from_quat(poses.q_wb_wxyz, scalar_first=True) for poses in (truth, estimate))
-    hole = np.where(valid, 0.0, np.nan)[:, None]
-    turned = np.rad2deg((true.inv() * found).as_rotvec())
-    return Errors(estimate.t_ns, turned + hole, estimate.p_wb - truth.p_wb + hole)
 
 
 def stretches(poses: Poses) -> list[Poses]:
@@ -204,7 +218,8 @@ def _true_bias(recording: Recording) -> Mapping[str, Scalars]:
 def _scored(run: Run, truth: Poses, where: str) -> Trace:
     """One run from the first sample with truth to the last, with its errors and figures."""
     path, true, valid = along_truth(run.imu, truth, where)
-    return Trace(run, path, errors(path, true, valid), MappingProxyType(evaluate(path, true, valid)))
+    figures = MappingProxyType(evaluate(path, true, valid))
+    return Trace(run, path, errors(path, true, valid), figures=figures, spectra=spectra(run.imu))
 
 
 def _numbers(figures: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, float]]:
@@ -215,8 +230,3 @@ def _numbers(figures: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str
             yield from _numbers(value, label)
         elif isinstance(value, int | float) and not isinstance(value, bool):
             yield label, float(value)
-
-
-def _length(rows: Vectors) -> Float64[np.ndarray, " n"]:
-    length: Float64[np.ndarray, " n"] = np.linalg.norm(rows, axis=1)
-    return length

@@ -20,7 +20,7 @@ from rerun.chunk import RrdReader
 from imutool.errors import ConfigError
 from imutool.physics.conclusion import conclusion
 from imutool.view import diagnosis_rerun as view
-from imutool.view.rerun import _binary
+from imutool.view.rerun.viewer import binary
 
 MADE = SimpleNamespace(**runpy.run_path(str(Path(__file__).parents[1] / "physics" / "diagnoses.py")))
 AXES = [(signal, axis) for signal in ("gyro", "accel") for axis in "xyz"]
@@ -191,7 +191,7 @@ def test_two_logs_of_one_name_stay_apart(folder: Path) -> None:
 @pytest.mark.parametrize("name", ["NOTHING", "BOTH", "THREE"])
 def test_reruns_own_verifier_accepts_the_file(folder: Path, name: str) -> None:
     run = subprocess.run(
-        [str(_binary()), "rrd", "verify", str(folder / f"{name}.rrd")], capture_output=True, text=True, check=False
+        [str(binary()), "rrd", "verify", str(folder / f"{name}.rrd")], capture_output=True, text=True, check=False
     )
     assert run.returncode == 0, run.stderr
 

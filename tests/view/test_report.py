@@ -89,7 +89,7 @@ def test_a_missing_matplotlib_says_how_to_get_it(data: RunData, monkeypatch: pyt
 
 def test_importing_the_views_costs_no_viewer_no_plotting_and_no_torch() -> None:
     code = (
-        "import sys, imutool.view.rundata, imutool.view.rerun, imutool.view.report\n"
+        "import sys, imutool.view.rundata, imutool.view.rerun.viewer, imutool.view.report\n"
         "print(sorted({'torch', 'rerun', 'matplotlib'} & set(sys.modules)))"
     )
     run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

@@ -21,7 +21,9 @@ from rerun.chunk import RrdReader
 
 from imutool.errors import ConfigError
 from imutool.recording import Poses, Recording
-from imutool.view import rerun as view
+from imutool.view.rerun import scene
+from imutool.view.rerun import viewer as view
+from imutool.view.rerun.layout import limit
 from imutool.view.rundata import Run, RunData, build, sparse
 
 NO_WAIT_S = 2.0
@@ -162,7 +164,7 @@ def test_the_true_path_breaks_at_a_gap(recording: Recording, runs: list[Run], tm
 
 
 def test_a_long_path_is_thinned_in_3d_only(data: RunData, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(view, "MOST_IN_3D", 100)
+    monkeypatch.setattr(scene, "MOST_IN_3D", 100)
     view.show([data], save=tmp_path / "long.rrd")
     entities = read(tmp_path / "long.rrd")
     rows = sparse(len(data.traces[0].path), 100)
@@ -212,7 +214,7 @@ def test_an_error_plot_keeps_the_models_readable_whatever_raw_does(data: RunData
         assert first.errors is not None
         grown = replace(first.errors, position_m=first.errors.position_m * (ratio * worst / raw))
         changed = replace(data, traces=(replace(first, errors=grown), *models))
-        assert view._limit(changed, "position") == pytest.approx(1.05 * height)
+        assert limit(changed, "position") == pytest.approx(1.05 * height)
 
 
 def test_without_truth_and_model_there_is_no_empty_panel(recording: Recording, runs: list[Run], tmp_path: Path) -> None:
@@ -236,7 +238,7 @@ def test_the_report_holds_the_figures(data: RunData, entities: dict[str, Entity]
 
 
 def test_reruns_own_verifier_accepts_the_file(saved: Path) -> None:
-    run = subprocess.run([str(view._binary()), "rrd", "verify", str(saved)], capture_output=True, text=True, check=False)
+    run = subprocess.run([str(view.binary()), "rrd", "verify", str(saved)], capture_output=True, text=True, check=False)
     assert run.returncode == 0, run.stderr
 
 
@@ -263,7 +265,7 @@ def test_a_viewer_that_does_not_start_is_given_up_at_once_and_the_log_saved(
     data: RunData, tmp_path: Path, display: None, monkeypatch: pytest.MonkeyPatch, binary: str
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(view, "_binary", lambda: Path(binary))
+    monkeypatch.setattr(view, "binary", lambda: Path(binary))
     start = time.monotonic()
     said = view.show([data])
     assert time.monotonic() - start < NO_WAIT_S
@@ -280,10 +282,10 @@ def stand_in(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, display: None) -> 
     script.write_text(
         f"#!/bin/sh\n"
         f'while [ $# -gt 0 ]; do [ "$1" = --port ] && port=$2; [ "$1" = --bind ] && bind=$2; shift; done\n'
-        f'exec {view._binary()} --save {received} --bind "$bind" --port "$port"\n'
+        f'exec {view.binary()} --save {received} --bind "$bind" --port "$port"\n'
     )
     script.chmod(script.stat().st_mode | stat.S_IXUSR)
-    monkeypatch.setattr(view, "_binary", lambda: script)
+    monkeypatch.setattr(view, "binary", lambda: script)
 
     def end() -> Path:
         viewer, size, still_s = view.VIEWERS[-1], -1, 0.0

@@ -13,7 +13,8 @@ from imutool.errors import ConfigError, DataError
 from imutool.physics.flight import ACCEL, GYRO, flight
 from imutool.recording import Imu, Poses, Recording, seconds
 from imutool.strapdown import Start, dead_reckon
-from imutool.view.rundata import RAW, Run, RunData, build, errors, level_start, sparse, stretches
+from imutool.view.deviation import errors
+from imutool.view.rundata import RAW, Run, RunData, build, level_start, sparse, stretches
 
 ROUNDING = 1e-9  # degrees and metres: some thousand float64 operations on numbers of size one
 NO_ERROR = dict.fromkeys(GYRO.__struct_fields__, 0.0)
