@@ -211,17 +211,27 @@ def _matrix(view: UInt8[np.ndarray, " b"], offsets: Int64[np.ndarray, " n"], wid
 
 def rows(found: Messages, mask: Bool[np.ndarray, " n"]) -> Iterator[Rows]:
     """The chosen messages as columns, one entry per stretch of equal size; file order is kept."""
-    heads, offsets = (found.heads, found.offsets) if mask.all() else (found.heads[mask], found.offsets[mask])
+    for heads, payload in cut(found, mask):
+        yield columns(heads, payload)
+
+
+def cut(found: Messages, mask: Bool[np.ndarray, " n"]) -> Iterator[tuple[Shaped[np.ndarray, " n"], UInt8[np.ndarray, "n L"]]]:
+    """Heads (of dtype MESSAGE) and payloads of the chosen messages, one pair per stretch of equal size, in file order."""
+    heads, offsets = found.heads[mask], found.offsets[mask]
     edges = np.flatnonzero(heads["length"][1:] != heads["length"][:-1]) + 1
     for first, last in pairwise([0, *edges.tolist(), len(heads)] if len(heads) else []):
-        cut = heads[first:last]
-        yield Rows(
-            cut["channel"].copy(),
-            signed(cut["log_time"]),
-            signed(cut["publish_time"]),
-            cut["sequence"].copy(),
-            _matrix(found.data, offsets[first:last] + MESSAGE.itemsize, int(cut["length"][0]) - FIXED),
-        )
+        size = int(heads["length"][first]) - FIXED
+        yield heads[first:last], _matrix(found.data, offsets[first:last] + MESSAGE.itemsize, size)
+
+
+def columns(heads: Shaped[np.ndarray, " n"], payload: UInt8[np.ndarray, "n L"]) -> Rows:
+    """Messages of one size as columns.
+
+    Raises:
+        LogError: a time beyond 2^63 ns.
+    """
+    times = signed(heads["log_time"]), signed(heads["publish_time"])
+    return Rows(heads["channel"].copy(), *times, heads["sequence"].copy(), payload)
 
 
 @dataclass(frozen=True, slots=True)
@@ -242,18 +252,21 @@ class ChunkHead:
         Raises:
             LogError: lengths that contradict one another.
         """
-        damaged = LogError(f"the chunk at byte {offset} is damaged: its lengths contradict one another")
         if len(record) < HEAD.size + CHUNK_HEAD.size:
-            raise damaged
+            raise _contradicting(offset)
         start_ns, end_ns, size, crc, name = CHUNK_HEAD.unpack_from(record, HEAD.size)
         at = HEAD.size + CHUNK_HEAD.size
         if name > 64 or len(record) < at + name + 8:
-            raise damaged
+            raise _contradicting(offset)
         compression = record[at : at + name].decode(errors="replace")
         (packed,) = struct.unpack_from("<Q", record, at + name)
         if packed != length - at - name - 8:
-            raise damaged
+            raise _contradicting(offset)
         return ChunkHead(start_ns, end_ns, size, crc, compression, at + name + 8)
+
+
+def _contradicting(offset: int) -> LogError:
+    return LogError(f"the chunk at byte {offset} is damaged: its lengths contradict one another")
 
 
 def unpack(record: bytes | memoryview, offset: int) -> bytes | memoryview:
@@ -315,10 +328,11 @@ def message_rows(
     publish_time: Int64[np.ndarray, " n"],
     sequence: UInt32[np.ndarray, " n"],
     payload: UInt8[np.ndarray, "n L"],
+    out: UInt8[np.ndarray, "n M"] | None = None,
 ) -> UInt8[np.ndarray, "n M"]:
-    """One Message record per row: opcode, length, channel, sequence, the two times, and the payload."""
+    """One Message record per row: opcode, length, channel, sequence, the two times, and the payload; in `out`, if given."""
     count, size = payload.shape
-    records = np.empty((count, MESSAGE.itemsize + size), np.uint8)
+    records = np.empty((count, MESSAGE.itemsize + size), np.uint8) if out is None else out
     heads = np.empty(count, MESSAGE)
     heads["opcode"], heads["length"], heads["channel"] = Opcode.MESSAGE, FIXED + size, channel
     heads["sequence"], heads["log_time"], heads["publish_time"] = sequence, log_time, publish_time
@@ -362,7 +376,8 @@ def pack(compression: str) -> Callable[[bytes], bytes]:
         compressor = zstandard.ZstdCompressor(level=ZSTD_LEVEL)
         return lambda data: bytes(compressor.compress(data))
     if name == "lz4":
-        return lambda data: bytes(lz4.frame.compress(data))
+        # blocks that know nothing of one another take 0.6 of the time, and of IMU messages no more room
+        return lambda data: bytes(lz4.frame.compress(data, block_linked=False))
     if name == "":
         return lambda data: data
     raise ConfigError(f"{compression!r} is no compression", where="--compression", expected=", ".join(COMPRESSIONS))

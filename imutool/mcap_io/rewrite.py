@@ -23,7 +23,7 @@ from pathlib import Path
 from typing import NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
-from jaxtyping import Int64, UInt8, UInt16
+from jaxtyping import Int64, Shaped, UInt8, UInt16
 from mcap.opcode import Opcode
 from mcap.records import AttachmentIndex, ChunkIndex, Metadata, MetadataIndex
 
@@ -40,7 +40,7 @@ from imutool.mcap_io.write import CHUNK_BYTES, Chunk, LogWriter
 from imutool.place import Place, identity, same
 
 RUN_BYTES = 16 << 20  # verbatim bytes are handed to the kernel in runs of about this size: between them progress is told
-FEED_BYTES = 1 << 17  # of IMU messages make a batch: one chunk holds a few among its images, too few for numpy to be quick
+FEED_BYTES = 1 << 18  # of IMU messages make a batch: one chunk holds a few among its images, too few for numpy to be quick
 
 
 class NewTopic(NamedTuple):
@@ -73,6 +73,8 @@ class Derived(Protocol):
         """What to write for a batch: which of its messages stay, and one array of CDR payloads per new topic."""
 
 
+Heads = Shaped[np.ndarray, " n"]  # of dtype records.MESSAGE
+Payload = UInt8[np.ndarray, "n L"]
 Values = Mapping[str, Mapping[str, str]]  # the entries of metadata records, by the records' names
 
 
@@ -170,7 +172,7 @@ class _Stream:
     make: Derived
     sources: set[int]
     ids: list[int]
-    waiting: list[records.Rows] = field(default_factory=list)  # of the source, of equal size
+    waiting: list[tuple[Heads, Payload]] = field(default_factory=list)  # of the source, of equal size
     waits: int = 0  # bytes of them
     data: list[UInt8[np.ndarray, "n M"]] = field(default_factory=list)
     channels: list[UInt16[np.ndarray, " n"]] = field(default_factory=list)
@@ -182,17 +184,16 @@ class _Stream:
         """Computes the new messages of a batch; those of one source message stand side by side."""
         batch, payloads = self.make(batch)
         assert len(payloads) == len(self.ids), f"{len(payloads)} arrays for {len(self.ids)} topics"
-        parts = [
-            records.message_rows(i, batch.log_time, batch.publish_time, batch.sequence, payload)
-            for i, payload in zip(self.ids, payloads, strict=True)
-        ]
-        widths = [part.shape[1] for part in parts]
-        count, stride = len(batch.log_time), sum(widths)
-        begins = np.cumsum([0, *widths[:-1]])
-        self.data.append(np.concatenate(parts, axis=1))
+        widths = [records.MESSAGE.itemsize + payload.shape[1] for payload in payloads]
+        count, stride, ends = len(batch.log_time), sum(widths), np.cumsum(widths)
+        data = np.empty((count, stride), np.uint8)
+        for channel, payload, width, end in zip(self.ids, payloads, widths, ends.tolist(), strict=True):
+            here = data[:, end - width : end]
+            records.message_rows(channel, batch.log_time, batch.publish_time, batch.sequence, payload, here)
+        self.data.append(data)
         self.channels.append(np.tile(np.array(self.ids, np.uint16), count))
-        self.times.append(np.repeat(batch.log_time, len(parts)))
-        self.offsets.append((self.size + stride * np.arange(count)[:, None] + begins).reshape(-1))
+        self.times.append(np.repeat(batch.log_time, len(widths)))
+        self.offsets.append((self.size + stride * np.arange(count)[:, None] + ends - widths).reshape(-1))
         self.size += count * stride
 
     def taken(self) -> Chunk:
@@ -405,21 +406,21 @@ class _Rewrite:
 
     def _feed(self, found: records.Messages) -> None:
         for stream in self.streams:
-            mask = np.zeros(len(found.offsets), bool)
-            for channel in stream.sources:
-                mask |= found.heads["channel"] == channel
-            for rows in records.rows(found, mask):
-                if stream.waiting and stream.waiting[-1].payload.shape[1] != rows.payload.shape[1]:
+            of = found.heads["channel"]
+            mask = np.logical_or.reduce([of == channel for channel in stream.sources])
+            for heads, payload in records.cut(found, mask):
+                if stream.waiting and stream.waiting[-1][1].shape[1] != payload.shape[1]:
                     self._decode(stream)
-                stream.waiting.append(rows)
-                stream.waits += rows.payload.size
+                stream.waiting.append((heads, payload))
+                stream.waits += payload.size
             if stream.waits >= FEED_BYTES:
                 self._decode(stream)
 
     def _decode(self, stream: _Stream) -> None:
         """Hands the messages that waited over."""
         if stream.waiting:
-            rows = records.Rows(*(np.concatenate(column) for column in zip(*stream.waiting, strict=True)))
+            heads, payloads = zip(*stream.waiting, strict=True)
+            rows = records.columns(np.concatenate(heads), np.concatenate(payloads))
             stream.waiting.clear()
             stream.waits = 0
             with self.log.named(stream.make.source_topic):

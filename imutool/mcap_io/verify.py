@@ -101,7 +101,8 @@ class _Sums:
             raise LogError(
                 f"the summary says the chunk at byte {block.offset} ends at {block.end_ns} ns", expected=str(listed.end_ns)
             )
-        self.counts.update(listed.counts)
+        for channel, count in listed.counts.items():
+            self.counts[channel] += count
         self.start_ns, self.end_ns = min(self.start_ns, listed.start_ns), max(self.end_ns, listed.end_ns)
 
     def compare(self, structure: Structure, counts: Mapping[int, int]) -> None:

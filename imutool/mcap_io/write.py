@@ -86,7 +86,8 @@ class Contents:
 
     def add(self, counts: Mapping[int, int], start_ns: int, end_ns: int) -> None:
         """Counts the messages of a chunk."""
-        self.counts.update(counts)
+        for channel, count in counts.items():  # `update` takes five times as long for the few there are
+            self.counts[channel] += count
         self.start_ns = start_ns if self.start_ns is None else min(self.start_ns, start_ns)
         self.end_ns = max(self.end_ns, end_ns)
 
