@@ -6,7 +6,7 @@ import zlib
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from imutool.bag import records
 from imutool.bag.records import FIRST_RECORD, MAGIC, U32, Op
@@ -17,6 +17,7 @@ from imutool.mcap_io.target import Target
 from imutool.place import Place, same
 
 Progress = Callable[[int, int], None]
+NO_ATTACHMENTS = "a bag has no attachments"  # to keep damaged bytes in
 PASSES = 3  # to plan, to write, to check
 
 
@@ -37,6 +38,26 @@ class BagReport:
     def whole(self) -> bool:
         """Whether everything in the source is in the target."""
         return self.lost == 0
+
+    def plain(self) -> dict[str, Any]:
+        """What was lost, as `mcap_io.losses.Losses.plain` says it of logs; the format has no CRCs, so nothing is proven."""
+        known = [loss.messages for loss in self.losses if loss.messages is not None]
+        return {
+            "whole": self.whole and self.was_indexed,
+            "bytes": sum(loss.length for loss in self.losses),
+            "messages": sum(known) if len(known) == self.lost else None,
+            "topics": {},
+            "stretches": [_stretch(loss) for loss in self.losses],
+            "stretches_not_listed": self.lost - len(self.losses),
+            "mended": [] if self.was_indexed else ["the bag had no index: it was made anew"],
+            "unchecked_messages": 0,
+            "unchecked_definitions": [],
+        }
+
+
+def _stretch(loss: Loss) -> dict[str, Any]:
+    none: dict[str, Any] = {"topics": {}, "first_ns": None, "last_ns": None}
+    return {"offset": loss.offset, "bytes": loss.length, "reason": loss.reason, "messages": loss.messages, **none}
 
 
 class _Entry(NamedTuple):

@@ -94,7 +94,7 @@ def debias(
 def repair(
     damaged: Annotated[str, typer.Option(metavar="drop|keep", help="Leave damaged bytes out, or keep them marked.")] = "drop",
 ) -> Settings:
-    """Save of every log what can be saved, as `imutool repair` does; a whole log is copied."""
+    """Save of every log and ROS 1 bag what can be saved, as `imutool repair` does; a whole one is copied."""
     if damaged not in {"drop", "keep"}:
         raise ConfigError(f"{damaged!r} is nothing to do with damage", where="--damaged", expected="drop or keep")
     return Settings(command="repair", damaged=damaged)

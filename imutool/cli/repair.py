@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from enum import StrEnum
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
 
@@ -11,10 +11,6 @@ from imutool.cli._app import LOST, Json, Overwrite, Quiet, Verbose, app
 from imutool.errors import ConfigError
 from imutool.place import place
 from imutool.terminal import progress, say, tell_losses, write_json
-
-if TYPE_CHECKING:
-    from imutool.bag.repair import BagReport
-    from imutool.bag.walk import Loss
 
 
 class Damaged(StrEnum):
@@ -39,20 +35,20 @@ def repair(
     quiet: Quiet = False,
 ) -> None:
     """Save what is sound in a damaged log: cut short, overwritten, unfinished, joined; say what is lost."""
-    from imutool.bag.repair import is_bag, repair_bag
+    from imutool.bag.repair import NO_ATTACHMENTS, is_bag, repair_bag
     from imutool.mcap_io.salvage import repair as repair_log
 
     here, there = place(source), place(target)
     with progress("Repairing", verbose, quiet) as tell:
         if is_bag(here):
             if damaged is Damaged.keep:
-                raise ConfigError("a bag has no attachments", where="--damaged keep", fix="Leave --damaged out")
+                raise ConfigError(NO_ATTACHMENTS, where="--damaged keep", fix="Leave --damaged out")
             bag = repair_bag(here, there, overwrite=overwrite, progress=lambda done, total: tell(done, total, ""))
             result: dict[str, Any] = {
                 "whole": bag.whole,
                 "messages": dict(bag.messages),
                 "chunks": bag.chunks,
-                "losses": _losses(bag),
+                "losses": bag.plain(),
             }
         else:
             log = repair_log(
@@ -67,25 +63,3 @@ def repair(
         say(f"{target}: {state}, {counts}")
     if result["losses"]["stretches"]:
         raise typer.Exit(LOST)
-
-
-def _losses(bag: BagReport) -> dict[str, Any]:
-    """What a bag lost, in the words for logs (`mcap_io.losses.Losses.plain`); its format has no CRCs, so nothing is proven."""
-    known = [loss.messages for loss in bag.losses if loss.messages is not None]
-    listed = len(known) == bag.lost
-    return {
-        "whole": bag.whole and bag.was_indexed,
-        "bytes": sum(loss.length for loss in bag.losses),
-        "messages": sum(known) if listed else None,
-        "topics": {},
-        "stretches": [_stretch(loss) for loss in bag.losses],
-        "stretches_not_listed": bag.lost - len(bag.losses),
-        "mended": [] if bag.was_indexed else ["the bag had no index: it was made anew"],
-        "unchecked_messages": 0,
-        "unchecked_definitions": [],
-    }
-
-
-def _stretch(loss: Loss) -> dict[str, Any]:
-    none: dict[str, Any] = {"topics": {}, "first_ns": None, "last_ns": None}
-    return {"offset": loss.offset, "bytes": loss.length, "reason": loss.reason, "messages": loss.messages, **none}

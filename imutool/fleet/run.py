@@ -21,7 +21,7 @@ from imutool.fleet.journal import Journal
 from imutool.fleet.robots import Compared, compare
 from imutool.fleet.sources import Found, find, leftovers, remove
 from imutool.fleet.task import FINAL, Result, Settings, Source, Task
-from imutool.fleet.work import SUFFIX, write_json
+from imutool.fleet.work import called, write_json
 from imutool.place import Place, place
 
 LOST = 3  # something of a log was lost, or a log was quarantined
@@ -142,7 +142,7 @@ def run(
     if not overwrite:
         _refuse_strangers(target, page if page is None or not (resume and _is_page(page)) else None)
     model = None if settings.model is None or not Path(settings.model).is_absolute() else _bytes(Path(settings.model))
-    found = find(source, target)
+    found = find(source, target, bags=settings.command == "repair")
     tally = Tally(len(found.logs) + len(found.refused), sum(one.size for one in found.logs))
     fleet = _Fleet(found, target, settings, overwrite, recheck)
 
@@ -250,7 +250,7 @@ class _Fleet:
 
     def _name(self, source: Source) -> str:
         """What the result of a log is called below OUT."""
-        return source.name.removesuffix(".mcap") + SUFFIX[self.settings.command]
+        return called(source.name, self.settings.command)
 
     def _taken(self, source: Source, journal: Journal) -> bool:
         name = self._name(source)

@@ -13,7 +13,7 @@ from imutool.errors import ConfigError
 from imutool.fleet.task import Source
 from imutool.place import Place, failures, identity, place, reason, seal
 
-LOG = ".mcap"
+LOG, BAG = ".mcap", ".bag"
 PATTERN = re.compile(r"[*?\[]")
 LONGEST = 200  # bytes of one part of a name: room for what is written beside it under another, within the usual 255
 PARTIAL = re.compile(r"\.(?P<name>.+)\.\d+\.[0-9a-f]{8}\.partial", re.DOTALL)
@@ -34,8 +34,8 @@ class _File(NamedTuple):
     about: dict[str, Any] | None = None
 
 
-def find(text: str, out: Place) -> Found:
-    """The logs that a path, a glob, a folder or a URL names; what lies below `out` is no source.
+def find(text: str, out: Place, *, bags: bool = False) -> Found:
+    """The logs that a path, a glob, a folder or a URL names, with `bags` ROS 1 bags too; what lies below `out` is no source.
 
     A log is called by its path from the folder, or from the last part of a pattern before its first wildcard; a log alone by
     its own name. Links are followed. A log that cannot be called anything below OUT is refused, and the others go on.
@@ -43,7 +43,8 @@ def find(text: str, out: Place) -> Found:
     Raises:
         ConfigError: nothing there, or no log in it.
     """
-    root, files = _files(text)
+    endings = (LOG, BAG) if bags else (LOG,)
+    root, files = _files(text, endings)
     logs, refused, taken = [], [], dict[str, str]()
     for where, about in files:
         if f"{where}/".startswith(f"{str(out).rstrip('/')}/"):
@@ -57,7 +58,9 @@ def find(text: str, out: Place) -> Found:
         except ConfigError as error:
             refused.append((_shown(where), str(error)))
     if not logs and not refused:
-        raise ConfigError(f"no {LOG} log", where=text, expected="a log, a folder with logs, or a pattern that fits some")
+        raise ConfigError(
+            f"no {' or '.join(endings)} log", where=text, expected="a log, a folder with logs, or a pattern that fits some"
+        )
     logs.sort(key=lambda one: one.name)
     return Found(logs, sorted(refused))
 
@@ -88,14 +91,14 @@ def _shown(name: str) -> str:
     return name.encode("utf-8", "surrogateescape").decode("utf-8", "backslashreplace")
 
 
-def _files(text: str) -> tuple[str, Iterator[_File]]:
+def _files(text: str, endings: tuple[str, ...]) -> tuple[str, Iterator[_File]]:
     """Where names begin, and the files."""
     where = place(text)
     if not isinstance(where, Path):
-        return _in_store(text)
+        return _in_store(text, endings)
     if where.is_dir():
         root = where.absolute()
-        return str(root), _walk(root, frozenset())
+        return str(root), _walk(root, endings, frozenset())
     if where.is_file():
         return str(where.absolute().parent), iter([_File(str(where.absolute()))])
     if not PATTERN.search(str(where)):
@@ -107,10 +110,10 @@ def _files(text: str) -> tuple[str, Iterator[_File]]:
         root /= part
     named = sorted(globs.iglob(str(where), recursive=True))  # noqa: PTH207  Path.glob takes no absolute pattern
     files = (os.path.abspath(one) for one in named)  # noqa: PTH100  Path.resolve would follow links
-    return os.path.abspath(root), (_File(one) for one in files if one.endswith(LOG) and Path(one).is_file())  # noqa: PTH100
+    return os.path.abspath(root), (_File(one) for one in files if one.endswith(endings) and Path(one).is_file())  # noqa: PTH100
 
 
-def _walk(folder: Path, above: frozenset[tuple[int, int]]) -> Iterator[_File]:
+def _walk(folder: Path, endings: tuple[str, ...], above: frozenset[tuple[int, int]]) -> Iterator[_File]:
     """The logs below a folder, through links too, but never into a folder that one is in already."""
     try:
         status = folder.stat()
@@ -120,12 +123,12 @@ def _walk(folder: Path, above: frozenset[tuple[int, int]]) -> Iterator[_File]:
         raise ConfigError(f"cannot be read ({error.strerror})", where=folder) from error
     for entry in entries:
         if entry.is_dir():
-            yield from _walk(folder / entry.name, above | {here})
-        elif entry.name.endswith(LOG):
+            yield from _walk(folder / entry.name, endings, above | {here})
+        elif entry.name.endswith(endings):
             yield _File(str(folder / entry.name))
 
 
-def _in_store(text: str) -> tuple[str, Iterator[_File]]:
+def _in_store(text: str, endings: tuple[str, ...]) -> tuple[str, Iterator[_File]]:
     """As `_files`, by listings alone: a thousand objects a request."""
     match = PATTERN.search(text)
     fixed = text.rstrip("/") if match is None else text[: match.start()].rpartition("/")[0]
@@ -140,7 +143,9 @@ def _in_store(text: str) -> tuple[str, Iterator[_File]]:
         raise ConfigError(f"cannot be listed ({reason(error)})", where=text) from error
     whole = fixed.rpartition("/")[0] if list(found) == [root.path] else fixed  # a log alone, by its own name
     files = [_File(fixed + path[len(root.path.rstrip("/")) :], about) for path, about in sorted(found.items())]
-    return whole, (one for one in files if one.where.endswith(LOG) and one.about and one.about.get("type", "file") == "file")
+    return whole, (
+        one for one in files if one.where.endswith(endings) and one.about and one.about.get("type", "file") == "file"
+    )
 
 
 def within(out: Place, name: str) -> Place:

@@ -170,8 +170,14 @@ def _info(job: _Job) -> dict[str, Any]:
 
 
 def _repair(job: _Job) -> dict[str, Any]:
+    from imutool.bag.repair import NO_ATTACHMENTS, is_bag, repair_bag
     from imutool.mcap_io.salvage import repair
 
+    if is_bag(job.source):
+        if job.settings.damaged == "keep":
+            raise ConfigError(NO_ATTACHMENTS, where=job.source, fix="Leave --damaged out")
+        bag = repair_bag(job.source, job.target, overwrite=True)
+        return {"messages": sum(bag.messages.values()), **_lost(bag.plain())}
     report = repair(job.source, job.target, damaged=job.settings.damaged, overwrite=True)
     return {"messages": sum(report.messages.values()), **_lost(report.losses.plain())}
 
@@ -275,4 +281,8 @@ COMMANDS: dict[str, Callable[[_Job], dict[str, Any]]] = {
     "info": _info,
     "diagnose": _diagnose,
 }
-SUFFIX = {"debias": ".mcap", "repair": ".mcap", "info": ".json", "diagnose": ".json"}  # of what a command leaves of a log
+
+
+def called(name: str, command: str) -> str:
+    """What a command calls what it makes of a log: a log keeps its name, and so does a bag, which is repaired as a bag."""
+    return name if command in {"debias", "repair"} else f"{name.removesuffix('.mcap')}.json"

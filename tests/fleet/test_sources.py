@@ -37,6 +37,15 @@ def test_logs_of_the_same_name_keep_their_folders(tmp_path: Path) -> None:
     assert names(tmp_path / "b" / "**" / "*.mcap") == ["c/log.mcap", "log.mcap"]
 
 
+def test_bags_are_taken_where_asked_for_and_keep_their_names(tmp_path: Path) -> None:
+    tree(tmp_path, "a/log.mcap", "a/log.bag", "b.bag")
+    assert names(tmp_path) == ["a/log.mcap"]
+    for every in (tmp_path, tmp_path / "**" / "*"):
+        assert [one.name for one in find(str(every), NOWHERE, bags=True).logs] == ["a/log.bag", "a/log.mcap", "b.bag"]
+    with pytest.raises(ConfigError, match=r"no \.mcap or \.bag log"):
+        find(str(tree(tmp_path / "none", "x.txt")), NOWHERE, bags=True)
+
+
 def test_what_lies_in_out_is_no_source(tmp_path: Path) -> None:
     tree(tmp_path, "a.mcap", "out/a.mcap", "outer/a.mcap")
     assert names(tmp_path, tmp_path / "out") == ["a.mcap", "outer/a.mcap"]

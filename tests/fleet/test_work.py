@@ -10,14 +10,17 @@ from typing import Any
 
 import msgspec
 import pytest
+from rosbags.rosbag1 import Reader, Writer
+from rosbags.typesys import Stores, get_typestore
 
+from imutool.bag.repair import repair_bag
 from imutool.clean import Rules
 from imutool.debias import debias
 from imutool.errors import ConfigError
 from imutool.fleet.models import settled
 from imutool.fleet.sources import find
 from imutool.fleet.task import Result, Settings, Source, Task
-from imutool.fleet.work import robot_of, robot_pattern, work
+from imutool.fleet.work import called, robot_of, robot_pattern, work
 from imutool.mcap_io.digest import sha256
 from imutool.mcap_io.read import read
 from imutool.mcap_io.write import write
@@ -116,6 +119,49 @@ def test_a_damaged_log_is_a_result_and_leaves_nothing(logs: Path, tmp_path: Path
     told = work(task(broken, tmp_path / "out", Settings(command="info")))  # which says what of it is left
     assert (told.status, told.exit_code, told.messages) == ("lost", 3, 0)
     assert "235250 bytes" in told.losses[0]
+
+
+@pytest.fixture
+def bag(tmp_path: Path) -> Path:
+    """A ROS 1 bag of forty messages in several chunks."""
+    store, path = get_typestore(Stores.ROS1_NOETIC), tmp_path / "log.bag"
+    text = store.types["std_msgs/msg/String"]
+    writer = Writer(path)
+    writer.chunk_threshold = 500
+    with writer as out:
+        connection = out.add_connection("/text", text.__msgtype__, typestore=store)
+        for n in range(40):
+            out.write(connection, 10**18 + n, bytes(store.serialize_ros1(text("x" * 100), text.__msgtype__)))
+    return path
+
+
+def bag_task(source: Path, out: Path, settings: Settings) -> Task:
+    (one,) = find(str(source), Path("/nowhere"), bags=True).logs
+    return Task(key="k", source=one, out=str(out), target=called(one.name, "repair"), settings=settings)
+
+
+def test_a_bag_is_repaired_as_a_bag(bag: Path, tmp_path: Path) -> None:
+    out, repair = tmp_path / "out", Settings(command="repair")
+    whole = work(bag_task(bag, out, repair))
+    assert (whole.status, whole.messages, whole.warnings) == ("ok", 40, ())
+    bag.write_bytes(bag.read_bytes()[:7000])
+    repair_bag(bag, tmp_path / "alone.bag")
+    found = work(bag_task(bag, out, repair))
+    assert (out / "log.bag").read_bytes() == (tmp_path / "alone.bag").read_bytes()
+    assert (found.status, found.exit_code) == ("lost", 3)
+    assert 0 < found.messages < 40
+    assert "index: it was made anew" in found.warnings[0]
+    with Reader(out / "log.bag") as reader:
+        assert len(list(reader.messages())) == found.messages
+    again = work(msgspec.structs.replace(bag_task(bag, out, repair), done=found))
+    assert (again.status, again.earlier) == ("skipped", "lost")
+
+
+def test_damaged_bytes_of_a_bag_cannot_be_kept(bag: Path, tmp_path: Path) -> None:
+    found = work(bag_task(bag, tmp_path / "out", Settings(command="repair", damaged="keep")))
+    assert (found.status, found.exit_code) == ("failed", ConfigError.exit_code)
+    assert "a bag has no attachments" in found.error
+    assert not [one for one in (tmp_path / "out").rglob("*") if one.is_file()]
 
 
 def test_a_log_that_is_still_being_written_waits(logs: Path, tmp_path: Path, settings: Settings) -> None:
