@@ -19,6 +19,7 @@ class Settings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
 
 
 S = TypeVar("S", bound=Settings)
+MOST_BYTES = 1 << 20  # of a TOML file: a physics.toml of twenty curves has 50 kB, and a megabyte takes a second to parse
 
 
 def load(cls: type[S], path: Path | None = None, overrides: Iterable[str] = ()) -> S:
@@ -27,15 +28,33 @@ def load(cls: type[S], path: Path | None = None, overrides: Iterable[str] = ()) 
     Raises:
         ConfigError: file unreadable or not TOML, unknown key (the nearest is named), wrong type, out of range.
     """
-    values: dict[str, Any] = {}
-    if path is not None:
-        try:
-            values = tomllib.loads(path.read_text(encoding="utf-8"))
-        except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
-            raise ConfigError(f"settings cannot be read ({error})", where=path, expected="a TOML file") from error
+    values = {} if path is None else toml(path, "settings")
     for word in overrides:
         _put(values, word)
     return build(cls, values, where=path)
+
+
+def toml(path: Path, what: str) -> dict[str, Any]:
+    """The values in a TOML file of settings, noise or physics; `what` names it in errors.
+
+    Raises:
+        ConfigError: file unreadable, not TOML, larger than a megabyte or nested without end.
+    """
+    try:
+        with path.open("rb") as file:
+            raw = file.read(MOST_BYTES + 1)
+        if len(raw) > MOST_BYTES:
+            raise ConfigError(
+                f"{what} cannot be read (more than {MOST_BYTES} bytes)",
+                where=path,
+                expected=f"a TOML file of at most {MOST_BYTES} bytes",
+                fix="See whether this is the file that was meant",
+            )
+        return tomllib.loads(raw.decode())
+    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+        raise ConfigError(f"{what} cannot be read ({error})", where=path, expected="a TOML file") from error
+    except RecursionError as error:
+        raise ConfigError(f"{what} cannot be read (nested too deeply)", where=path, expected="a TOML file") from error
 
 
 def build(cls: type[S], values: dict[str, Any], where: str | Path | None = None) -> S:
@@ -66,7 +85,7 @@ def _put(values: dict[str, Any], word: str) -> None:
         raise ConfigError(f"{word!r} sets nothing", where="--set", expected="key=value")
     try:
         (value,) = tomllib.loads(f"value = {text}").values()
-    except ValueError:  # no TOML, or more than one line of it
+    except (ValueError, RecursionError):  # no TOML, more than one line of it, or nested too deeply to be any setting's
         value = text
     *tables, last = key.split(".")
     for table in tables:

@@ -10,7 +10,6 @@ from __future__ import annotations
 import difflib
 import json
 import re
-import tomllib
 from collections.abc import Mapping
 from pathlib import Path
 from types import MappingProxyType
@@ -21,7 +20,7 @@ import numpy as np
 from jaxtyping import Float64
 from msgspec import Meta
 
-from imutool.config import Settings, build
+from imutool.config import Settings, build, toml
 from imutool.errors import ConfigError
 from imutool.mcap_io.target import Target
 
@@ -129,10 +128,7 @@ def read(name: str | Path) -> Noise:
             expected=f"{', '.join(SHEETS)} or a TOML file",
             fix=f"Did you mean {near[0]}?" if near else "",
         )
-    try:
-        values = tomllib.loads(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
-        raise ConfigError(f"noise cannot be read ({error})", where=path, expected="a TOML file") from error
+    values = toml(path, "noise")
     return build(Noise, {key: _axes(value) if key in UNITS else value for key, value in values.items()}, where=path)
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -11,9 +13,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from imutool import registry
-from imutool.config import Settings, build, load, plain
+from imutool.config import MOST_BYTES, Settings, build, load, plain
 from imutool.errors import ConfigError
+from imutool.noise import read as read_noise
 from imutool.physics.flight import FlightSettings
+from imutool.physics.physics_file import read as read_physics
 from imutool.stationary import StationarySettings
 from imutool.train.fit import TrainSettings
 
@@ -113,6 +117,24 @@ def test_a_file_that_is_no_toml_is_refused_by_name(tmp_path: Path, content: byte
     path.write_bytes(content)
     with pytest.raises(ConfigError, match=r"broken.toml: settings cannot be read \(.*; expected a TOML file"):
         load(Outer, path)
+
+
+@pytest.mark.parametrize("read", [partial(load, Outer), read_noise, read_physics], ids=["settings", "noise", "physics"])
+def test_a_file_too_large_or_nested_without_end_is_refused_before_it_costs_anything(
+    read: Callable[[Path], object], tmp_path: Path
+) -> None:
+    path = tmp_path / "huge.toml"
+    with path.open("wb") as file:
+        file.truncate(1 << 40)  # a terabyte that takes no room
+    with pytest.raises(ConfigError, match=rf"huge.toml: .* cannot be read \(more than {MOST_BYTES} bytes\); expected"):
+        read(path)
+    path.write_text("a = " + "[" * 100_000)
+    with pytest.raises(ConfigError, match="nested too deeply"):
+        read(path)
+
+
+def test_a_word_nested_without_end_is_text() -> None:
+    assert load(Inner, None, ["name=" + "[" * 100_000]).name == "[" * 100_000
 
 
 def test_a_file_that_is_not_there_or_a_folder_is_refused_by_name(tmp_path: Path) -> None:

@@ -37,7 +37,6 @@ from __future__ import annotations
 import difflib
 import json
 import re
-import tomllib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -48,7 +47,7 @@ import numpy as np
 from jaxtyping import Float64
 from msgspec import Meta
 
-from imutool.config import Settings, build
+from imutool.config import Settings, build, toml
 from imutool.errors import ConfigError, DataError, ImutoolError
 from imutool.mcap_io.target import Target
 from imutool.physics.effects import _catalogue
@@ -150,10 +149,7 @@ def read(path: Path) -> PhysicsFile:
     Raises:
         ConfigError: no such file, no TOML, an unknown or missing key, a wrong type, a number that is not finite.
     """
-    try:
-        values = tomllib.loads(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
-        raise ConfigError(f"physics cannot be read ({error})", where=path, expected="a TOML file") from error
+    values = toml(path, "physics")
     _refuse_infinite(values, path)
     file = build(PhysicsFile, values, where=path)
     for k, curve in enumerate(file.unknown):
