@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -39,7 +39,6 @@ def clean(
     quiet: Quiet = False,
 ) -> None:
     """Say what is wrong inside a log's IMU and whether to trust it; with OUT, write the log with a clean IMU beside the raw."""
-    from imutool.clean.first_pass import SCHEMA
     from imutool.clean.settings import chosen
     from imutool.mcap_io.target import Target
 
@@ -49,10 +48,10 @@ def clean(
         raise ConfigError(f"{idle[0]} says nothing without OUT", where="clean", fix="Name the log to be written")
     if report_to is not None:
         Target(report_to, overwrite=overwrite).abandon()  # a page that cannot be written is refused before the work is done
+    added: dict[str, int] = {}
     if target is None:
         with progress("Looking through", verbose, quiet) as tell:
             surveys, losses = _looked(source, imu or (), rules, tell)
-        added: dict[str, int] = {}
     else:
         from imutool.debias import debias
 
@@ -69,18 +68,23 @@ def clean(
                 progress=lambda done, total: tell(done, total, ""),
             )
         surveys, added, losses = list(report.surveys.values()), dict(report.rewrite.added), report.losses
-    result: dict[str, Any] = {
-        "schema": SCHEMA,
-        "log": source,
-        "imus": [one.plain() for one in surveys],
-        "losses": losses.plain(),
-    }
-    if target is not None:
-        result |= {"output": str(target), "added": added}
     if report_to is not None:
         from imutool.view import clean_page
 
         clean_page.write(surveys, report_to, overwrite=overwrite)
+    _tell(source, surveys, losses, target, added, json_to)
+
+
+def _tell(
+    source: str, surveys: Sequence[Survey], losses: Losses, target: str | None, added: Mapping[str, int], json_to: str | None
+) -> None:
+    """Says what was found and what was written, as JSON or for a person; something lost is an exit code."""
+    from imutool.clean.first_pass import SCHEMA
+
+    result: dict[str, Any] = {"schema": SCHEMA, "log": source, "imus": [one.plain() for one in surveys]}
+    result["losses"] = losses.plain()
+    if target is not None:
+        result |= {"output": target, "added": dict(added)}
     if not write_json(result, json_to):
         for one in surveys:
             show(one)
