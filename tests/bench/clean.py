@@ -1,4 +1,10 @@
-"""What the first pass of a clean-up costs: `python tests/bench/clean.py [--minutes 10 60]`, on made-up logs without images.
+"""What a clean-up finds in real logs, and what its first pass costs on made-up ones without images.
+
+`python tests/bench/clean.py --logs LOG...` says of each log what is found in it, by every rule, and at the end what of the
+whole: notes are what was seen and called nothing wrong. The logs are those that `imutool convert` makes of EuRoC, TUM-VI and
+FETCH.
+
+`python tests/bench/clean.py [--minutes 10 60]` measures the cost.
 
 For each length: CPU seconds of `imutool.clean.survey`, beside a pass that only reads and decodes the same IMU messages, and
 beside `imutool.info.inspect`, which holds the columns; each in a process of its own, with the memory it takes at most beyond
@@ -13,10 +19,12 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections import Counter
 from pathlib import Path
 
 import numpy as np
 
+from imutool.clean import survey
 from imutool.mcap_io.write import write
 from imutool.physics.flight import flight
 from imutool.recording import Imu, Poses, Recording
@@ -66,12 +74,30 @@ def run(what: str, log: Path) -> dict[str, float]:
     return found
 
 
+def findings(logs: list[Path]) -> None:
+    """Prints what is found in each log, and the sums."""
+    told: Counter[str] = Counter()
+    for path in sorted(logs):
+        one = survey(path)
+        told += Counter(finding.severity for finding in one.findings)
+        found = [f"{finding.severity}: {finding.count} {finding.what} ({finding.rule})" for finding in one.findings]
+        counts = f"{one.valid} of {one.messages} samples valid"
+        print(
+            f"{path.parent.name}/{path.stem}: {one.verdict}, score {one.score:.3f}, {counts}; {'; '.join(found) or 'nothing'}"
+        )
+    print(f"{len(logs)} logs: {told['error']} errors, {told['warning']} warnings, {told['note']} notes")
+
+
 def main() -> None:
-    """Prints one line a length and pass."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    """Prints one line a log, or one a length and pass."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--logs", type=Path, nargs="+", metavar="LOG", help="say what is found in these, and measure nothing")
     parser.add_argument("--minutes", type=float, nargs="+", default=[10.0, 60.0])
     parser.add_argument("--rounds", type=int, default=3)
     options = parser.parse_args()
+    if options.logs:
+        findings(options.logs)
+        return
     print(f"{time.strftime('%Y-%m-%d')}, least of {options.rounds} rounds")
     with tempfile.TemporaryDirectory() as folder:
         for minutes in options.minutes:
