@@ -1,7 +1,7 @@
 """A log with channels added to it: every record of the source passes through as the bytes it is.
 
-One pass, one chunk in memory. What no IMU message lies in is never looked into: its bytes go from file to file, by the
-kernel where it can, and its message indexes say what to enter in the summary. Only a chunk that holds messages of a source
+One pass, one chunk in memory. What no IMU message lies in is never looked into: its bytes go from file to file
+(`target.Target.copy`), and its message indexes say what to enter in the summary. Only a chunk that holds messages of a source
 IMU, or that its indexes do not describe, comes into memory to be unpacked, checked and read; what is written of it are the
 very bytes that were checked. Only what must change is made anew: the summary, and message indexes where the source has
 none or wrong ones. Messages outside chunks keep their bytes too and are wrapped into chunks, because a reader that goes
@@ -39,7 +39,7 @@ from imutool.mcap_io.verify import Verified, check_data_crc, crc_of, refuse_unkn
 from imutool.mcap_io.write import CHUNK_BYTES, Chunk, LogWriter
 from imutool.place import Place, identity, same
 
-RUN_BYTES = 16 << 20  # verbatim bytes are handed to the kernel in runs of about this size: between them progress is told
+RUN_BYTES = 16 << 20  # verbatim bytes are copied in runs of about this size: between them progress is told
 FEED_BYTES = 1 << 18  # of IMU messages make a batch: one chunk holds a few among its images, too few for numpy to be quick
 
 

@@ -1,7 +1,8 @@
 """A file that appears whole or not at all: written beside its place under another name, renamed when it is complete.
 
-What another file holds is copied by the kernel where it can: the bytes never come here, and a file system that shares
-blocks between files copies nothing at all.
+What another file holds is copied by the kernel where its blocks stay blocks: a file system that shares them between files
+copies nothing at all. Where they move by part of a block it could only cut each in two, and costs more than reading and
+writing do: 1.05 times in memory, 1.5 times on ext4.
 """
 
 from __future__ import annotations
@@ -23,6 +24,7 @@ from imutool.mcap_io.upload import Upload
 from imutool.place import Place, failures, reason
 
 COPY_BYTES = 1 << 20  # what passes through memory stays in the processor's cache
+BLOCK_BYTES = 1 << 12  # of a file system
 
 
 class _Medium(Protocol):
@@ -101,7 +103,7 @@ class Target:
             self.crc = crc32(data, self.crc)
 
     def copy(self, source: Source, start: int, end: int) -> None:
-        """Appends the bytes of another file from `start` to `end`, by the kernel unless their CRC is wanted.
+        """Appends the bytes of another file from `start` to `end`, by the kernel if that is quicker and their CRC not wanted.
 
         Raises:
             ConfigError: the system refuses to write.
@@ -164,9 +166,9 @@ class _File:
         self.file.write(data)
 
     def copy(self, source: Source, start: int, end: int) -> int:
-        """By the kernel; where it began, if the kernel cannot do it."""
+        """By the kernel; where it began, if the kernel cannot do it, or not without cutting blocks in two."""
         theirs, ours = descriptor(source.file), descriptor(self.file)
-        if theirs is None or ours is None:
+        if theirs is None or ours is None or (start - self.file.tell()) % BLOCK_BYTES:
             return start
         calls: tuple[Callable[[int], int], ...] = (
             lambda at: os.copy_file_range(theirs, ours, end - at, offset_src=at),
