@@ -72,7 +72,7 @@ def absent(what: str) -> NoReturn:
 # ── Rerun's own ──────────────────────────────────────────────────────────────────────────────────────────────────────
 
 
-class Died(Exception):
+class DiedError(Exception):
     """The viewer itself ended, which software drivers are known for; no statement about what it showed."""
 
 
@@ -154,7 +154,7 @@ def native(window: tuple[int, int] = WINDOW, memory: str = "2GiB") -> Iterator[N
     """Rerun's viewer without a window, on a port of its own on loopback, in a software Vulkan driver.
 
     Raises:
-        Died: it did not start.
+        DiedError: it did not start.
     """
     from imutool.view.rerun.viewer import binary
 
@@ -166,28 +166,27 @@ def native(window: tuple[int, int] = WINDOW, memory: str = "2GiB") -> Iterator[N
     with tempfile.TemporaryFile() as said:
         process = subprocess.Popen(line, env=environment, stdin=subprocess.DEVNULL, stdout=said, stderr=subprocess.STDOUT)
         try:
-            viewer = Native(process, f"rerun+http://127.0.0.1:{port}/proxy", said)
-            _await(viewer, port)
-            yield viewer
+            _await(process, port, said)
+            yield Native(process, f"rerun+http://127.0.0.1:{port}/proxy", said)
         finally:
             process.kill()
             process.wait()
 
 
-def _await(viewer: Native, port: int) -> None:
+def _await(process: subprocess.Popen[bytes], port: int, said: IO[bytes]) -> None:
     end = time.monotonic() + STARTS_S
-    while viewer.process.poll() is None and time.monotonic() < end:
+    while process.poll() is None and time.monotonic() < end:
         with socket.socket() as probe:
             if probe.connect_ex(("127.0.0.1", port)) == 0:
                 return
         time.sleep(0.05)
-    raise Died(last_words(viewer))
+    raise DiedError(last_words(said))
 
 
-def last_words(viewer: Native) -> str:
-    """What the viewer wrote before it ended."""
-    viewer.said.seek(0)
-    return viewer.said.read().decode(errors="replace")[-2000:]
+def last_words(said: IO[bytes]) -> str:
+    """What a viewer wrote before it ended."""
+    said.seek(0)
+    return said.read().decode(errors="replace")[-2000:]
 
 
 def seen(job: Callable[[Native], T], window: tuple[int, int] = WINDOW) -> T:
@@ -197,14 +196,25 @@ def seen(job: Callable[[Native], T], window: tuple[int, int] = WINDOW) -> T:
             with native(window) as viewer:
                 try:
                     return job(viewer)
+                except AssertionError:
+                    raise
                 except Exception as error:
-                    if viewer.process.poll() is None:
+                    if not _ended(viewer.process):
                         raise
-                    raise Died(last_words(viewer)) from error
-        except Died:
+                    raise DiedError(last_words(viewer.said)) from error
+        except DiedError:
             if last:
                 raise
     raise AssertionError("one of the two returned or raised")
+
+
+def _ended(process: subprocess.Popen[bytes]) -> bool:
+    """Whether it is at its end, which comes a moment after its connections break."""
+    try:
+        process.wait(1.0)
+    except subprocess.TimeoutExpired:
+        return False
+    return True
 
 
 # ── Chromium ─────────────────────────────────────────────────────────────────────────────────────────────────────────
