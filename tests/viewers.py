@@ -13,8 +13,8 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, Any, NoReturn, TypeVar
@@ -83,27 +83,34 @@ class Native:
     process: subprocess.Popen[bytes]
     url: str
     said: IO[bytes]
+    recording: Any = None
 
     def __post_init__(self) -> None:
         from rerun.experimental import ViewerClient
 
         self.client = ViewerClient.connect(self.url)
 
-    def show(self, log: Callable[[Any], None], blueprint: Any, name: str = "test") -> None:
+    def show(self, log: Callable[[Any], None], blueprint: Any) -> None:
         """A recording and its layout, in the place of what was shown before."""
         import rerun as rr
 
-        self.forget()
-        recording = rr.RecordingStream(f"imutool {name}")
-        recording.connect_grpc(self.url, default_blueprint=blueprint)
-        log(recording)
-        recording.flush(timeout_sec=ANSWERS_S)
-        recording.disconnect()
-
-    def forget(self) -> None:
-        """Closes every recording, so that none is taken for the next."""
+        self.leave()
         if self.client.get_state().recordings:
             self.client.close("all")
+        self.recording = rr.RecordingStream("imutool test")
+        self.recording.connect_grpc(self.url, default_blueprint=blueprint)
+        log(self.recording)
+        self.recording.flush(timeout_sec=ANSWERS_S)
+
+    def leave(self) -> None:
+        """Lets go of the recording: Rerun complains of a viewer that is gone before."""
+        if self.recording is not None:
+            self.recording.disconnect()
+
+    def lay_out(self, blueprint: Any) -> None:
+        """Another layout of the same recording."""
+        self.recording.send_blueprint(blueprint, make_active=True, make_default=True)
+        self.recording.flush(timeout_sec=ANSWERS_S)
 
     def views(self) -> dict[str, str]:
         """The views that are drawn now (a tab behind another is not): identifiers by name."""
@@ -116,6 +123,24 @@ class Native:
             TimeoutError: it goes on changing.
         """
         return steady(lambda: self.client.take_screenshot(view))
+
+    def pictures(self, views: Sequence[Any]) -> list[Picture]:
+        """Each of several views when the window has stopped changing, and all of them are in front.
+
+        Raises:
+            TimeoutError: it goes on changing, or one stays behind.
+        """
+        end = time.monotonic() + STEADY_S
+        while time.monotonic() < end:
+            with suppress(ConnectionError):  # "not found": a new layout, or a tab that was turned, takes a moment
+                for view in views:
+                    self.client.take_screenshot(view, max_size=16)
+                self.picture()
+                return [pixels(self.client.take_screenshot(view)) for view in views]
+            if self.process.poll() is not None:
+                break
+            time.sleep(0.1)
+        raise TimeoutError(f"not all of {len(views)} views came to the front within {STEADY_S:g} s")
 
     @property
     def resident_mib(self) -> float:
@@ -167,7 +192,11 @@ def native(window: tuple[int, int] = WINDOW, memory: str = "2GiB") -> Iterator[N
         process = subprocess.Popen(line, env=environment, stdin=subprocess.DEVNULL, stdout=said, stderr=subprocess.STDOUT)
         try:
             _await(process, port, said)
-            yield Native(process, f"rerun+http://127.0.0.1:{port}/proxy", said)
+            viewer = Native(process, f"rerun+http://127.0.0.1:{port}/proxy", said)
+            try:
+                yield viewer
+            finally:
+                viewer.leave()
         finally:
             process.kill()
             process.wait()

@@ -1,0 +1,129 @@
+"""What each view of a layout is to show, from the file that the viewer gets, and which of it cannot be seen in a picture."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import pyarrow as pa
+from rerun.chunk import RrdReader
+
+LEAST = 200  # pixels of a curve; its sample in a legend has some fifty
+WITHIN = 36.0  # in RGB: what an edge mixes of a line with its ground, and less than two colours of ours are apart
+COLORS = ("SeriesLines:colors", "LineStrips3D:colors", "LineStrips2D:colors")
+
+
+class Curve(NamedTuple):
+    """A line of an entity, in one colour or, where its pieces have their own, in any of several."""
+
+    entity: str
+    name: str
+    colors: np.ndarray
+
+
+def curves(path: Path) -> list[Curve]:
+    """Every line of a recording, by the styles in its .rrd."""
+    found: dict[str, dict[str, list[Any]]] = {}
+    reader = RrdReader(path)
+    (store,) = reader.recordings()
+    for chunk in reader.stream(store=store):
+        entity, batch = found.setdefault(chunk.entity_path, {}), chunk.to_record_batch()
+        for name, column in zip(batch.schema.names, batch.columns, strict=True):
+            if name in COLORS or name == "SeriesLines:names":
+                entity.setdefault(name, []).extend(flat(column))
+    return [curve for entity, styles in found.items() for curve in of_entity(entity, styles)]
+
+
+def flat(column: pa.Array) -> list[Any]:
+    while pa.types.is_list(column.type):
+        column = column.flatten()
+    return list(column.to_pylist())
+
+
+def of_entity(entity: str, styles: Mapping[str, list[Any]]) -> Iterator[Curve]:
+    for name, values in styles.items():
+        packed = np.array(values, dtype=np.uint32) if name in COLORS else np.zeros(0, dtype=np.uint32)
+        rgb = np.stack([packed >> 24, packed >> 16 & 255, packed >> 8 & 255], axis=-1)
+        if name.startswith("SeriesLines") and name in COLORS:
+            for series, color in zip(styles["SeriesLines:names"], rgb, strict=True):
+                yield Curve(entity, series, color[None])
+        elif name in COLORS:
+            yield Curve(entity, "line", np.unique(rgb, axis=0))
+
+
+# ── layouts ──
+
+
+def leaves(part: Any) -> list[Any]:
+    """The views of a layout or of a part of it."""
+    contents = getattr(part, "contents", ())
+    if hasattr(part, "class_identifier"):
+        return [part]
+    return [leaf for inner in contents for leaf in leaves(inner)]
+
+
+def faces(blueprint: Any) -> Iterator[list[Any]]:
+    """Turns the tabs of a layout until every view has been in front, and each time names those that are new."""
+    waiting = {leaf.id: leaf for leaf in leaves(blueprint.root_container)}
+    while waiting:
+        front = turn(blueprint.root_container, waiting)
+        new = [waiting.pop(leaf.id) for leaf in front if leaf.id in waiting]
+        assert new, "a view that no tab brings to the front"
+        yield new
+
+
+def turn(part: Any, waiting: Mapping[Any, Any]) -> list[Any]:
+    """Opens the first tab behind which something waits; the views that are in front then."""
+    if hasattr(part, "class_identifier"):
+        return [part]
+    parts = list(part.contents)
+    if type(part).__name__ == "Tabs":
+        part.active_tab = next((k for k, inner in enumerate(parts) if any(leaf.id in waiting for leaf in leaves(inner))), 0)
+        parts = [parts[part.active_tab]]
+    return [leaf for inner in parts for leaf in turn(inner, waiting)]
+
+
+def holds(view: Any, entity: str) -> bool:
+    """Whether a view's contents name an entity: of its rules the most specific one that fits decides."""
+    rules = [view.contents] if isinstance(view.contents, str) else list(view.contents)
+    fitting = []
+    for rule in (line.strip() for text in rules for line in text.splitlines() if line.strip()):
+        sign, words = (rule[0], rule[1:].strip()) if rule[0] in "+-" else ("+", rule)
+        words = f"/{words.replace('$origin', str(view.origin).rstrip('/')).lstrip('/')}"
+        base = words.removesuffix("/**")
+        if entity == base or (words.endswith("/**") and entity.startswith(f"{base}/")):
+            fitting.append((len(base), not words.endswith("/**"), sign))
+    return bool(fitting) and max(fitting)[2] == "+"
+
+
+# ── pictures ──
+
+
+def pictures(viewer: Any, blueprint: Any, log: Any, duration_s: float) -> dict[Any, np.ndarray]:
+    """Every view of a layout as it is drawn, the cursor at the end of the log, by the view's identifier."""
+    viewer.show(log, blueprint)
+    found = {}
+    for views in faces(blueprint):
+        viewer.lay_out(blueprint)
+        viewer.client.set_time("elapsed", duration=duration_s, play_state="paused")
+        found |= dict(zip([view.id for view in views], viewer.pictures([view.id for view in views]), strict=True))
+    return found
+
+
+def unseen(view: Any, picture: np.ndarray, wanted: Sequence[Curve]) -> list[str]:
+    """The curves that a view holds and its picture does not show."""
+    return [
+        f"{view.name}: {c.entity} {c.name} ({pixels(picture, c)} px)"
+        for c in wanted
+        if holds(view, c.entity) and pixels(picture, c) < LEAST
+    ]
+
+
+def pixels(picture: np.ndarray, curve: Curve) -> int:
+    """How many pixels have a curve's colour."""
+    near = np.zeros(picture.shape[:2], dtype=bool)
+    for color in curve.colors:
+        near |= np.linalg.norm(picture.astype(np.float32) - color, axis=-1) <= WITHIN
+    return int(near.sum())
