@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -16,7 +17,12 @@ if TYPE_CHECKING:
 READABLE = 10.0  # an error this many times smaller than the plot is high can still be read
 
 
-def blueprint(data: RunData) -> rrb.Blueprint:
+def blueprint(logs: Sequence[RunData]) -> rrb.Blueprint:
+    """The layout of the first log."""
+    return _of_one(logs[0])
+
+
+def _of_one(data: RunData) -> rrb.Blueprint:
     """The layout: paths over errors on the left, tabs for signals, biases and the report on the right; no empty panel.
 
     Raises:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -33,7 +34,13 @@ MOST_IN_3D = 20_000  # poses of one path; plots are never thinned
 Q_XYZW = [1, 2, 3, 0]  # columns of wxyz
 
 
-def log(data: RunData, to: rr.RecordingStream) -> None:
+def log(logs: Sequence[RunData], to: rr.RecordingStream, *, source: bool = True) -> None:
+    """Everything of each log."""
+    for data in logs:
+        _log_one(data, to)
+
+
+def _log_one(data: RunData, to: rr.RecordingStream) -> None:
     """Everything there is to see, into a Rerun recording: whole columns on timelines `elapsed` and `ros2_timestamp`.
 
     Entities: `/world/{truth,RUN}/{path,body}`, `/imu/{gyro,accel}/RUN`, `/bias/{gyro,accel}/{true,MODEL}`,
