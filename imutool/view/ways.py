@@ -113,12 +113,13 @@ class Ways:
 
     def _pages(self, logs: Sequence[RunData]) -> Iterator[Shown]:
         """What needs no Rerun."""
-        if (png := self.asked.png) is not None:
-            png.mkdir(parents=True, exist_ok=True)
+        if (page := self.asked.html) is not None:
+            yield _page(logs, page, self.asked.overwrite)
+        if (folder := self.asked.png) is not None:
             for data in logs:
-                path = png / f"{title([data])}.png"
-                report.error_curves(data, path, overwrite=self.asked.overwrite)
-                yield Shown("png", str(path), f"Drew {path}")
+                paths = report.write_pngs(data, folder, overwrite=self.asked.overwrite)
+                listed = ", ".join(map(str, paths))
+                yield Shown("png", str(folder), f"Drew {listed}" if paths else f"There is nothing to draw of {data.name}")
 
     def _recordings(self, logs: Sequence[RunData], at_s: float | None) -> Iterator[Shown]:
         """What needs Rerun."""
@@ -168,12 +169,23 @@ def cursor_s(logs: Sequence[RunData], at: str) -> float:
 
 
 def _open(logs: Sequence[RunData], asked: Asked, at_s: float | None) -> Shown:
-    """A viewer; without Rerun the next best thing, the pictures."""
+    """A viewer; without Rerun the next best thing, a page here."""
     if find_spec("rerun") is None:
-        raise ConfigError("the viewer is not installed", where="view", fix="Install it with: pip install 'imutool[view]'")
+        no_rerun = "The viewer is not installed (pip install 'imutool[view]')"
+        if find_spec("matplotlib") is None:
+            raise ConfigError(
+                no_rerun, where="view", expected="it, or matplotlib for a page", fix="pip install 'imutool[view,report]'"
+            )
+        page = _page(logs, Path(f"{title(logs)}.html"), asked.overwrite)
+        return page._replace(said=f"{no_rerun}. {page.said}")
     from imutool.view.rerun import viewer
 
     return viewer.show(logs, source=asked.source, at_s=at_s, overwrite=asked.overwrite)
+
+
+def _page(logs: Sequence[RunData], path: Path, overwrite: bool) -> Shown:
+    report.write_page(logs, path, overwrite=overwrite)
+    return Shown("html", str(path), f"Wrote {path}. Open it in a browser")
 
 
 def _refuse_contradictions(asked: Asked) -> None:

@@ -27,6 +27,7 @@ function setTime(timeline, ns) {
   return new Uint8Array(field(6, [...field(2, name), ...field(3, time), ...paused]));
 }
 
+// Until the recording has come, however slow the line, the viewer refuses to move a cursor in it.
 async function jump(handle) {
   if (canvas.dataset.atNs === "") return;
   for (;;) {
@@ -34,7 +35,7 @@ async function jump(handle) {
       await handle.viewer_control(setTime("elapsed", canvas.dataset.atNs));
       return;
     } catch (error) {
-      if (error.code !== "NOT_FOUND") throw error; // else the recording is still on its way
+      if (error.name !== "ViewerControlError" || error.code === "INVALID_ARGUMENT") throw error;
       await new Promise((resolve) => setTimeout(resolve, RETRY_MS));
     }
   }
@@ -68,7 +69,7 @@ async function start() {
   await handle.start(canvas);
   tell("");
   watch(handle);
-  await jump(handle);
+  jump(handle).catch((error) => console.warn(`The cursor cannot be set: ${error.message}`));
 }
 
 start().catch((error) => tell(`The viewer did not start: ${error.message ?? error}`));
