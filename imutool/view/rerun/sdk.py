@@ -31,6 +31,15 @@ def need_sdk() -> None:
 
 
 def stream(logs: Sequence[RunData]) -> rr.RecordingStream:
+    """A recording of its own for these logs.
+
+    Raises:
+        ConfigError: no log, or Rerun is not installed.
+    """
+    return named(title(logs))
+
+
+def named(name: str) -> rr.RecordingStream:
     """A recording of its own, in an application of its own: Rerun keeps one layout per application.
 
     It has no `log_time` and no `log_tick`: when we drew something is nothing to look at.
@@ -41,8 +50,8 @@ def stream(logs: Sequence[RunData]) -> rr.RecordingStream:
     need_sdk()
     import rerun as rr
 
-    name = title(logs)[:100]
-    recording = rr.RecordingStream(f"imutool {name}", recording_id=f"{name}-{uuid.uuid4().hex[:8]}")
+    short = plain(name)
+    recording = rr.RecordingStream(f"imutool {short}", recording_id=f"{short}-{uuid.uuid4().hex[:8]}")
     recording.set_log_time_enabled(False)
     recording.set_log_tick_enabled(False)
     return recording
@@ -57,7 +66,12 @@ def title(logs: Sequence[RunData]) -> str:
     if not logs:
         raise ConfigError("there is no log to show", where="view")
     more = f"_and_{len(logs) - 1}_more" if len(logs) > 1 else ""
-    return re.sub(r"[^A-Za-z0-9_-]", "_", logs[0].name) + more
+    return plain(logs[0].name) + more
+
+
+def plain(name: str) -> str:
+    """A name of which nothing is left that a file or an application may not be called, or that leads elsewhere."""
+    return re.sub(r"[^A-Za-z0-9_-]", "_", name)[:100] or "_"
 
 
 def version() -> str:

@@ -2,6 +2,7 @@
 const canvas = document.getElementById("viewer");
 const told = document.getElementById("told");
 const RETRY_MS = 200;
+const TRIES = 1500; // five minutes
 
 function tell(text) {
   told.textContent = text;
@@ -30,12 +31,12 @@ function setTime(timeline, ns) {
 // Until the recording has come, however slow the line, the viewer refuses to move a cursor in it.
 async function jump(handle) {
   if (canvas.dataset.atNs === "") return;
-  for (;;) {
+  for (let left = TRIES; ; left--) {
     try {
       await handle.viewer_control(setTime("elapsed", canvas.dataset.atNs));
       return;
     } catch (error) {
-      if (error.name !== "ViewerControlError" || error.code === "INVALID_ARGUMENT") throw error;
+      if (left === 0) throw error;
       await new Promise((resolve) => setTimeout(resolve, RETRY_MS));
     }
   }
