@@ -75,8 +75,8 @@ def rrd(data: RunData) -> bytes:
 
     recording = stream(data)
     written = rr.binary_stream(recording)
-    recording.send_blueprint(blueprint(data))
-    log(data, recording)
+    recording.send_blueprint(blueprint([data]))
+    log([data], recording)
     content = written.read(flush_timeout_sec=FLUSH_S)
     assert content, "a stream that was written to holds bytes"
     return bytes(content)
@@ -132,8 +132,8 @@ def _open(logs: Sequence[RunData]) -> str:
         return f"The viewer stopped at once (exit code {viewer.returncode})."
     for data in logs:
         recording = stream(data)
-        recording.connect_grpc(f"rerun+http://127.0.0.1:{port}/proxy", default_blueprint=blueprint(data))
-        log(data, recording)
+        recording.connect_grpc(f"rerun+http://127.0.0.1:{port}/proxy", default_blueprint=blueprint([data]))
+        log([data], recording)
         try:
             recording.flush(timeout_sec=FLUSH_S)
         except (RuntimeError, ValueError) as error:
