@@ -114,9 +114,18 @@ def runs(
     """The samples as recorded, then as each model corrects them: name, samples and bias, and the start."""
     refuse_smooth(init, smooth)
     yield RAW, Debiased(recording.imu, np.zeros((len(recording.imu), 6))), None
+    for name, model, start in started(recording, models, init, where, smooth=smooth):
+        yield name, apply(model, start, recording.imu), start
+
+
+def started(
+    recording: Recording, models: Sequence[str | Path], init: str, where: str | Path, *, smooth: bool = False
+) -> Iterator[tuple[str, BiasModel, TurnOn]]:
+    """Each model asked for, its name, and the start it gets in this recording."""
+    refuse_smooth(init, smooth)
     for given in models:
         model, start = _model_and_start(given, recording, init, where, smooth)
-        yield str(model.card.get("name", model.method)), apply(model, start, recording.imu), start
+        yield str(model.card.get("name", model.method)), model, start
 
 
 def _model_and_start(

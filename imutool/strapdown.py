@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Bool, Float64, Int64
 
 from imutool.errors import DataError, NumericsError
-from imutool.recording import GAP_FACTOR, GRAVITY_M_S2, MIN_GAP_S, Imu, Poses, seconds
+from imutool.recording import GAP_FACTOR, GRAVITY_M_S2, MIN_GAP_S, Imu, Poses, Times, seconds
 
 GRAVITY_W = (0.0, 0.0, -GRAVITY_M_S2)
 VELOCITY_WINDOW_S = 0.2
@@ -96,13 +96,22 @@ def along_truth(imu: Imu, truth: Poses, where: str) -> tuple[Poses, Poses, Bool[
         DataError: the truth is known at fewer than two samples.
         NumericsError: the numbers overflow.
     """
-    true, valid = with_velocity(truth).at(imu.t_ns)
+    rows, true, valid = stretch_with_truth(imu.t_ns, truth, where)
+    return dead_reckon(imu.rows(rows), Start.of(true)), true, valid
+
+
+def stretch_with_truth(t_ns: Times, truth: Poses, where: str) -> tuple[slice, Poses, Bool[np.ndarray, " n"]]:
+    """The rows from the first stamp at which the truth is known to the last, the truth with its velocity there, and where it is.
+
+    Raises:
+        DataError: the truth is known at fewer than two stamps.
+    """
+    true, valid = with_velocity(truth).at(t_ns)
     known = np.flatnonzero(valid)
     if len(known) < 2:
         raise DataError("IMU and true poses share fewer than two samples", where=where, expected="an overlap")
     rows = slice(int(known[0]), int(known[-1]) + 1)
-    true = true.rows(rows)
-    return dead_reckon(imu.rows(rows), Start.of(true)), true, valid[rows]
+    return rows, true.rows(rows), valid[rows]
 
 
 class Drifted(NamedTuple):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Literal, NamedTuple, get_args
 
 import numpy as np
@@ -106,16 +106,16 @@ def aligned(estimate: Poses, truth: Poses, valid: Bool[np.ndarray, " n"], alignm
     """
     if not valid.any():
         raise DataError("the truth is known at none of the estimate's stamps", expected="some overlap")
+    if alignment == "none":
+        return estimate, Motion(Rotation.identity(), np.zeros(3))
     motion = _motion(estimate, truth, valid, alignment)
-    v_w = None if estimate.v_w is None else motion.turn.apply(estimate.v_w)
+    R = motion.turn.as_matrix()
+    v_w = None if estimate.v_w is None else estimate.v_w @ R.T
     q_wb_wxyz = (motion.turn * Rotation.from_quat(estimate.q_wb_wxyz, scalar_first=True)).as_quat(scalar_first=True)
-    p_wb = motion.turn.apply(estimate.p_wb) + motion.shift_m
-    return replace(estimate, p_wb=p_wb, q_wb_wxyz=np.ascontiguousarray(q_wb_wxyz), v_w=v_w), motion
+    return Poses(estimate.t_ns, estimate.p_wb @ R.T + motion.shift_m, np.ascontiguousarray(q_wb_wxyz), v_w), motion
 
 
 def _motion(estimate: Poses, truth: Poses, valid: Bool[np.ndarray, " n"], alignment: Alignment) -> Motion:
-    if alignment == "none":
-        return Motion(Rotation.identity(), np.zeros(3))
     if alignment == "origin":
         row = int(np.argmax(valid))
         found, true = (Rotation.from_quat(poses.q_wb_wxyz[row], scalar_first=True) for poses in (estimate, truth))
@@ -136,7 +136,7 @@ def _motion(estimate: Poses, truth: Poses, valid: Bool[np.ndarray, " n"], alignm
 
 def _about(turn: Rotation, centre: Float64[np.ndarray, "3"], goal: Float64[np.ndarray, "3"]) -> Motion:
     """The turn that takes a point to another."""
-    return Motion(turn, goal - turn.apply(centre))
+    return Motion(turn, goal - turn.as_matrix() @ centre)
 
 
 def drift_since_reset(path: Poses, truth: Poses, valid: Bool[np.ndarray, " n"], reset_s: float = RESET_S) -> Drift:

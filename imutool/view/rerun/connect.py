@@ -10,7 +10,7 @@ from typing import NamedTuple
 from urllib.parse import SplitResult, urlsplit
 
 from imutool.errors import ConfigError
-from imutool.view.rerun import layout, scene
+from imutool.view.rerun import clock, layout, scene
 from imutool.view.rerun.sdk import FLUSH_S, need_sdk, stream, version
 from imutool.view.rundata import RunData
 from imutool.view.shown import Shown
@@ -20,7 +20,6 @@ MOVE_S = 1.5  # for a recording to arrive whose cursor is to be set
 PLAIN, SECURE = "rerun+http", ("rerun", "rerun+https")
 PATH = "/proxy"
 DEFAULT_PORT = 9876
-TIMELINE = "elapsed"
 
 # RFC 9113, 3.4: a client begins with these words and a SETTINGS frame, and whoever speaks HTTP/2 answers with one.
 PREFACE = b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n"
@@ -61,7 +60,7 @@ def send(logs: Sequence[RunData], peer: Peer, *, source: bool = True, at_s: floa
         ConfigError: it stopped listening.
     """
     recording = stream(logs)
-    recording.connect_grpc(peer.url, default_blueprint=layout.blueprint(logs))
+    recording.connect_grpc(peer.url, default_blueprint=layout.blueprint(logs, source=source))
     scene.log(logs, recording, source=source)
     try:
         recording.flush(timeout_sec=FLUSH_S)
@@ -85,7 +84,7 @@ def move(peer: Peer, at_s: float) -> None:
     end = time.monotonic() + MOVE_S
     while True:
         try:
-            ViewerClient.connect(peer.url).set_time(TIMELINE, duration=at_s, play_state="paused")
+            ViewerClient.connect(peer.url).set_time(clock.ELAPSED, duration=at_s, play_state="paused")
         except (ConnectionError, RuntimeError, ValueError) as error:
             if time.monotonic() > end:  # until then the recording may be on its way
                 raise ConfigError(f"the cursor cannot be set ({error})", where=peer.url, fix="Leave --at out") from error

@@ -36,7 +36,7 @@ def rrd(logs: Sequence[RunData], *, source: bool = True) -> bytes:
     import rerun as rr
 
     written = rr.binary_stream(recording)
-    recording.send_blueprint(layout.blueprint(logs))
+    recording.send_blueprint(layout.blueprint(logs, source=source))
     scene.log(logs, recording, source=source)
     content = written.read(flush_timeout_sec=FLUSH_S)
     assert content, "a stream that was written to holds bytes"
