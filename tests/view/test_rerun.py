@@ -23,7 +23,7 @@ from imutool.errors import ConfigError
 from imutool.recording import Poses, Recording
 from imutool.view.rerun import scene
 from imutool.view.rerun import viewer as view
-from imutool.view.rerun.layout import limit
+from imutool.view.rerun.plots import limit
 from imutool.view.rundata import Run, RunData, build, sparse
 
 NO_WAIT_S = 2.0
