@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -23,6 +23,7 @@ from imutool.strapdown import Start, dead_reckon
 from imutool.view.rerun import clock, connect, entities, live_layout, paths, styles, viewer
 from imutool.view.rerun.connect import Peer
 from imutool.view.rerun.entities import Role, Scope
+from imutool.view.rerun.live_layout import Box
 from imutool.view.rerun.palette import MODEL_COLORS, RAW_COLOR
 from imutool.view.rerun.sdk import FLUSH_S, named, need_sdk
 from imutool.view.rerun.signals import KINDS, SIGMAS
@@ -108,7 +109,7 @@ class Live:
                 self._watched[block.topic] = _Imu(scope, block)
                 for stream in streams:
                     self._watched[block.topic].begin(stream)
-                self._lay_out(streams, following=True)
+                self._lay_out(streams)
             self._watched[block.topic].log(block, streams)
         except TROUBLE as error:
             self._give_up(f"This cannot be shown as it goes ({error})")
@@ -119,7 +120,7 @@ class Live:
     def finish(self) -> None:
         """Everything was debiased: the whole of it is laid out, and whoever listens has all of it."""
         streams = [stream for stream in (self._viewer, self._file) if stream is not None]
-        self._lay_out(streams, following=False)
+        self._lay_out(streams, {topic: imu.box for topic, imu in self._watched.items()})
         if self._viewer is not None:
             try:
                 self._viewer.flush(timeout_sec=FLUSH_S)
@@ -129,10 +130,10 @@ class Live:
             if stream is not None:
                 stream.disconnect()
 
-    def _lay_out(self, streams: list[rr.RecordingStream], *, following: bool) -> None:
+    def _lay_out(self, streams: list[rr.RecordingStream], boxes: Mapping[str, Box] | None = None) -> None:
         scopes = {topic: imu.scope for topic, imu in self._watched.items()}
         for stream in streams if scopes else ():
-            stream.send_blueprint(live_layout.blueprint(scopes, following=following))
+            stream.send_blueprint(live_layout.blueprint(scopes, boxes))
 
     def _see_off(self) -> None:
         """Looks whether the viewer still takes what it is sent; waiting for it is kept short."""
@@ -163,6 +164,7 @@ class _Imu:
         self.scope = scope
         self._start_ns = self._last_ns = int(first.batch.stamp_ns[0])
         self._last_ns -= 1
+        self.box: Box = (np.full(3, np.inf), np.full(3, -np.inf))  # of the debiased path
         self._ways: dict[Role, _Way] = {"raw": _Way(), "debiased": _Way()}
 
     def begin(self, to: rr.RecordingStream) -> None:
@@ -205,6 +207,8 @@ class _Imu:
         for (role, way), samples in zip(self._ways.items(), (raw, raw - bias), strict=True):
             poses = way(Imu(t_ns, samples[:, :3].copy(), samples[:, 3:].copy()))
             self._log_path(self._path("world", role), poses, delay_ns, streams)
+        low, high = self.box
+        self.box = np.minimum(low, poses.p_wb.min(axis=0)), np.maximum(high, poses.p_wb.max(axis=0))  # the debiased come last
 
     def _log_path(self, home: str, poses: Poses, delay_ns: int, streams: list[rr.RecordingStream]) -> None:
         import rerun as rr

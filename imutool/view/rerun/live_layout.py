@@ -5,6 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
+import numpy as np
+from jaxtyping import Float64
+
 from imutool.view.rerun import clock, entities
 from imutool.view.rerun.entities import Scope
 from imutool.view.rerun.palette import GROUND
@@ -14,14 +17,17 @@ from imutool.view.rerun.plots import plot
 if TYPE_CHECKING:
     import rerun.blueprint as rrb
 
+Box = tuple[Float64[np.ndarray, "3"], Float64[np.ndarray, "3"]]  # the lowest and the highest corner, metres
+
+CORNER = np.array([-0.7, -0.7, 0.5])  # from where a whole path is looked at, in its diagonals
 LAST_S = 20.0  # seen in the plots while it goes on
 
 
-def blueprint(scopes: Mapping[str, Scope], *, following: bool) -> rrb.Blueprint:
-    """Paths beside signals and biases, a tab for each IMU where there are several."""
+def blueprint(scopes: Mapping[str, Scope], boxes: Mapping[str, Box] | None = None) -> rrb.Blueprint:
+    """Paths beside signals and biases, a tab for each IMU where there are several; the whole of them with their `boxes`."""
     import rerun.blueprint as rrb
 
-    shown = [_of_one(topic, scope, following) for topic, scope in scopes.items()]
+    shown = [_of_one(topic, scope, None if boxes is None else boxes[topic]) for topic, scope in scopes.items()]
     return rrb.Blueprint(
         shown[0] if len(shown) == 1 else rrb.Tabs(*shown, active_tab=0),
         rrb.BlueprintPanel(state="collapsed"),
@@ -32,7 +38,7 @@ def blueprint(scopes: Mapping[str, Scope], *, following: bool) -> rrb.Blueprint:
     )
 
 
-def _of_one(topic: str, scope: Scope, following: bool) -> rrb.Horizontal:
+def _of_one(topic: str, scope: Scope, box: Box | None) -> rrb.Horizontal:
     import rerun as rr
     import rerun.blueprint as rrb
 
@@ -41,11 +47,24 @@ def _of_one(topic: str, scope: Scope, following: bool) -> rrb.Horizontal:
         origin=entities.path(scope, "world"),
         name="Paths",
         background=GROUND,
+        eye_controls=_eye(scope, box),
         time_ranges=[rrb.VisibleTimeRange(timeline, start=begin, end=cursor) for timeline in clock.TIMELINES],
     )
+    following = box is None
     signals = [_plot(scope, ("imu", kind), ("raw", "debiased"), title, following) for kind, title in TITLES.items()]
     biases = [_plot(scope, ("bias", kind), ("sigma", "estimated"), title, following) for kind, title in BIAS_TITLES.items()]
     return rrb.Horizontal(paths, rrb.Vertical(*signals, *biases), column_shares=[1, 1], name=topic)
+
+
+def _eye(scope: Scope, box: Box | None) -> rrb.EyeControls3D:
+    """A look at the whole debiased path; while it grows, at the body: without truth, integration leaves for kilometres."""
+    import rerun.blueprint as rrb
+
+    if box is None:
+        return rrb.EyeControls3D(eye_up=(0.0, 0.0, 1.0), tracking_entity=entities.path(scope, "world", "debiased", "body"))
+    low, high = box
+    centre, size = (low + high) / 2.0, max(float(np.linalg.norm(high - low)), 1.0)
+    return rrb.EyeControls3D(position=centre + size * CORNER, look_target=centre, eye_up=(0.0, 0.0, 1.0))
 
 
 def _plot(scope: Scope, of: tuple[str, str], names: tuple[str, ...], title: str, following: bool) -> rrb.TimeSeriesView:
