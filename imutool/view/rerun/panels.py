@@ -42,9 +42,18 @@ def total_errors(data: RunData, scope: Scope) -> list[Panel]:
         contents = [entities.of(data, trace, scope, "error", kind, entities.role(trace)) for trace in scored]
         contents += [f"{path}/worst" for path, trace in zip(contents, scored, strict=True) if not trace.is_raw]
         if contents:
-            title = f"{kind.capitalize()} error ({errors.UNITS[kind]})"
-            found.append(plot(contents, title, height=upwards(error_limit(data, kind))))
+            title, legend = _totals_title(data, kind)
+            found.append(plot(contents, title, height=upwards(error_limit(data, kind)), legend=legend))
     return found
+
+
+def _totals_title(data: RunData, kind: str) -> tuple[str, str | None]:
+    """A title with the colours in it, and no legend that would cover them; of several models a legend with their names."""
+    title = f"{kind.capitalize()} error ({errors.UNITS[kind]})"
+    if len(data.models()) > 1:
+        return title, "RightTop"
+    colors = ["debiased blue", "its worst pink"] if data.models() else []
+    return f"{title}: {', '.join([*colors, *(['raw orange'] if len(data.traces) > len(data.models()) else [])])}", None
 
 
 def error_limit(data: RunData, kind: str) -> float | None:
@@ -55,7 +64,7 @@ def error_limit(data: RunData, kind: str) -> float | None:
 def _signals(data: RunData, scope: Scope) -> Panel:
     import rerun.blueprint as rrb
 
-    shown = [plot(_of_all(data, scope, "imu", kind), title) for kind, title in TITLES.items()]
+    shown = [_three(data, _of_all(data, scope, "imu", kind), title) for kind, title in TITLES.items()]
     return rrb.Vertical(*shown, name="Signals")
 
 
@@ -93,7 +102,7 @@ def _bias_of(data: RunData, scope: Scope, kind: str, axis: int) -> rrb.TimeSerie
     if any(trace.run.bias_std is not None for trace in data.models()):
         words.insert(1, f"thin: ±{signals.SIGMAS:g}σ")
     name = f"{AXES[axis]} ({', '.join(words)})"
-    return plot(list(overrides), name, height=_bias_range(data, kind, axis), legend=False, overrides=overrides)
+    return plot(list(overrides), name, height=_bias_range(data, kind, axis), legend=None, overrides=overrides)
 
 
 def _only(axis: int, count: int) -> list[bool]:
@@ -150,8 +159,10 @@ def _orientation(data: RunData, scope: Scope) -> list[Panel]:
     by_axis = limit(data, _by_run(data, lambda found: found.orientation_deg))
     by_angle = limit(data, _by_run(data, lambda found: found.roll_pitch_yaw_deg))
     return [
-        plot(_of_scored(data, scope, "orientation", "axes"), "By axis of the true body (deg)", height=both_ways(by_axis)),
-        plot(_of_scored(data, scope, "orientation", "rpy"), "Roll, pitch, yaw (deg)", height=both_ways(by_angle)),
+        _three(data, _of_scored(data, scope, "orientation", "axes"), "About the true body's axes (deg)", both_ways(by_axis)),
+        _three(
+            data, _of_scored(data, scope, "orientation", "rpy"), "Roll, pitch, yaw (deg)", both_ways(by_angle), errors.ANGLES
+        ),
         *_drift(data, scope, "orientation", lambda drift: drift.orientation_deg),
     ]
 
@@ -161,7 +172,7 @@ def _position(data: RunData, scope: Scope) -> list[Panel]:
     contents = [*_of_scored(data, scope, "position", "horizontal"), *_of_scored(data, scope, "position", "vertical")]
     reach = both_ways(error_limit(data, "position"))
     return [
-        plot(_of_scored(data, scope, "position", "axes"), "By axis of the world (m)", height=both_ways(by_axis)),
+        _three(data, _of_scored(data, scope, "position", "axes"), "Along the world's axes (m)", both_ways(by_axis)),
         plot(contents, "Horizontal (length) and vertical (m)", height=reach),
         *_drift(data, scope, "position", lambda drift: drift.position_m),
     ]
@@ -176,7 +187,8 @@ def _drift(data: RunData, scope: Scope, kind: str, of: Callable[[Drift], np.ndar
     contents = [entities.of(data, trace, scope, "error", "drift", kind, entities.role(trace)) for trace in drifted]
     reset_s = next(iter(drifts.values())).reset_s
     title = f"Since the last reset to the truth, every {reset_s:g} s ({errors.UNITS[kind]})"
-    return [plot(contents, title, height=upwards(limit(data, {name: of(drift) for name, drift in drifts.items()})))]
+    height = upwards(limit(data, {name: of(drift) for name, drift in drifts.items()}))
+    return [plot(contents, title, height=height, legend="RightTop" if len(data.models()) > 1 else None)]
 
 
 def _events(data: RunData, scope: Scope) -> Panel | None:
@@ -194,7 +206,8 @@ def _event_list(contents: list[str], origin: str) -> rrb.TextLogView:
     """Time, level and words; a click on a time takes the cursor there."""
     import rerun.blueprint as rrb
 
-    return rrb.TextLogView(origin=origin, contents=contents, name="What")
+    columns = rrb.TextLogColumns(text_log_columns=["loglevel", "body"])
+    return rrb.TextLogView(origin=origin, contents=contents, name="What", columns=columns)
 
 
 def _report(scope: Scope) -> Panel:
@@ -209,6 +222,24 @@ def _cameras(data: RunData, scope: Scope) -> Panel | None:
     cameras = source.plan(data, scope).cameras
     shown = [rrb.Spatial2DView(origin=camera, name=camera.removeprefix("/")) for camera in cameras]
     return rrb.Grid(*shown, name="Cameras") if shown else None
+
+
+def _three(
+    data: RunData,
+    contents: list[str],
+    title: str,
+    height: tuple[float, float] | None = None,
+    names: tuple[str, ...] = AXES,
+) -> rrb.TimeSeriesView:
+    """A plot of curves about or along x, y and z, with their colours in the title: a legend of six lines would cover them.
+
+    Several models are told apart by a legend only.
+    """
+    if len(data.models()) > 1:
+        return plot(contents, title, height=height)
+    colors = ", ".join(f"{name} {color}" for name, color in zip(names, ("red", "green", "blue"), strict=True))
+    widths = "; debiased bold, raw faint" if data.models() else ""
+    return plot(contents, f"{title}: {colors}{widths}", height=height, legend=None)
 
 
 def _by_run(data: RunData, of: Callable[[Errors], np.ndarray]) -> dict[str, np.ndarray]:

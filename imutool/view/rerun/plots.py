@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     import rerun.blueprint as rrb
 
 READABLE = 10.0  # an error this many times smaller than the plot is high can still be read
+SHOWN = 2.5  # times the models' largest error: how high a plot reaches that raw leaves
 
 
 def plot(
@@ -20,13 +21,13 @@ def plot(
     name: str,
     *,
     height: tuple[float, float] | None = None,
-    legend: bool = True,
+    legend: str | None = "RightTop",
     overrides: Mapping[Any, Any] | None = None,
 ) -> rrb.TimeSeriesView:
     """A plot of these entities."""
     import rerun.blueprint as rrb
 
-    corner: Any = rrb.PlotLegend(rrb.Corner2D.LeftTop, visible=legend)
+    corner = rrb.PlotLegend(visible=False) if legend is None else rrb.PlotLegend(rrb.Corner2D[legend])
     axis_y = None if height is None else rrb.ScalarAxis(range=height)
     return rrb.TimeSeriesView(
         origin="/", contents=list(contents), name=name, axis_x=whole(), axis_y=axis_y, plot_legend=corner, overrides=overrides
@@ -51,7 +52,7 @@ def limit(data: RunData, values: Mapping[str, np.ndarray]) -> float | None:
     models = [tops[trace.name] for trace in data.models() if trace.name in tops]
     highest = max(tops.values(), default=0.0)
     cut = bool(models) and highest > READABLE * max(models) > 0.0
-    reach = READABLE / 2.0 * max(models) if cut else highest
+    reach = SHOWN * max(models) if cut else highest
     return 1.05 * reach if reach > 0.0 else None
 
 

@@ -15,12 +15,6 @@ if TYPE_CHECKING:
     import rerun as rr
 
 MOST_EVENTS = 40  # in the list; the lanes and their texts hold all
-ALIGNMENTS = {
-    "none": "Paths and errors are as they came out, without any alignment.",
-    "origin": "Paths and errors are after alignment by the first pose that both have.",
-    "yaw": "Paths and errors are after alignment by a turn about the vertical and a shift.",
-    "se3": "Paths and errors are after alignment by a turn and a shift.",
-}
 
 
 def log(data: RunData, to: rr.RecordingStream, scope: Scope, more: Sequence[str] = ()) -> None:
@@ -42,7 +36,7 @@ def markdown(data: RunData, more: Sequence[str] = ()) -> str:
     """All the words about one log."""
     lines = [f"# {escape(data.name)}", ""]
     lines += [f"{data.duration_s:.1f} s, read {' and '.join(escape(trace.name) for trace in data.traces)}.", ""]
-    for note in (*data.notes, *_alignment(data), *_colors(data), *more):
+    for note in (*data.notes, *_colors(data), *more):
         lines += [escape(note), ""]
     lines += _figures(data) + _windows(data) + _events(data)
     if data.provenance:
@@ -62,10 +56,6 @@ def comparison(logs: Sequence[RunData]) -> str:
             rows.append([escape(data.name), escape(trace.name), f"{data.duration_s:.1f}", *cells])
     heads = ["log", "run", "seconds", *(escape(label) for label in labels)]
     return "\n".join([f"# {len(logs)} logs", "", *table(heads, rows)])
-
-
-def _alignment(data: RunData) -> list[str]:
-    return [ALIGNMENTS[data.alignment]] if data.truth is not None else []
 
 
 def _colors(data: RunData) -> list[str]:

@@ -55,7 +55,7 @@ def plan(data: RunData, scope: Scope) -> Import:
             topics, imus = tuple(log.topics.values()), log.imu_topics
     except (OSError, LogError) as error:
         return Import(sentence=f"{SENTENCE}: {error}")
-    drawn = set(imus) if len(imus) == 1 else set()  # which of several is drawn, its own name does not say
+    drawn = set(imus) & {data.provenance.get("IMU", "")}
     left_out = tuple(topic.name for topic in topics if topic.name in drawn or topic.metadata.get(DERIVED_KEY) in drawn)
     cameras = tuple(_camera(topic, data, scope) for topic in topics if topic.schema_name == schema.IMAGE and topic.count)
     return Import(left_out, cameras)
