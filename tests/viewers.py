@@ -125,22 +125,19 @@ class Native:
         return steady(lambda: self.client.take_screenshot(view))
 
     def pictures(self, views: Sequence[Any]) -> list[Picture]:
-        """Each of several views when the window has stopped changing, and all of them are in front.
+        """Each of several views that are in front together, when the first of them has stopped changing.
 
         Raises:
-            TimeoutError: it goes on changing, or one stays behind.
+            TimeoutError: it goes on changing, or stays behind.
         """
         end = time.monotonic() + STEADY_S
-        while time.monotonic() < end:
-            with suppress(ConnectionError):  # "not found": a new layout, or a tab that was turned, takes a moment
-                for view in views:
-                    self.client.take_screenshot(view, max_size=16)
-                self.picture()
-                return [pixels(self.client.take_screenshot(view)) for view in views]
-            if self.process.poll() is not None:
-                break
-            time.sleep(0.1)
-        raise TimeoutError(f"not all of {len(views)} views came to the front within {STEADY_S:g} s")
+        while True:
+            try:
+                return [self.picture(views[0]), *(pixels(self.client.take_screenshot(view)) for view in views[1:])]
+            except ConnectionError as error:  # "not found": a new layout, or a tab that was turned, takes a moment
+                if self.process.poll() is not None or time.monotonic() > end:
+                    raise TimeoutError(f"not all of {len(views)} views came to the front within {STEADY_S:g} s") from error
+                time.sleep(0.1)
 
     @property
     def resident_mib(self) -> float:

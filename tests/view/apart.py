@@ -10,7 +10,8 @@ from imutool.physics.flight import ACCEL_BIAS, GYRO_BIAS, flight
 from imutool.recording import Imu, Recording, Scalars
 from imutool.view.rundata import Run
 
-OFF = np.array([0.10, -0.12, 0.14, 1.5, -1.8, 2.1])  # rad/s, m/s²: what raw is off by, beside the flight's own bias
+OFF = np.array([0.06, -0.12, 0.18, 1.2, -1.8, 2.4])  # rad/s, m/s²: what raw is off by, beside the flight's own bias
+NOISE = np.array([0.01, 0.01, 0.01, 0.1, 0.1, 0.1])  # rad/s, m/s²: of raw alone, so that its spectrum lies above
 LEFT, SIGMA = 0.2, 0.1  # of that: what a model leaves, and what it says that it may be wrong by
 DURATION_S = 8.0
 
@@ -29,7 +30,9 @@ def recording(seed: int = 3) -> Recording:
 
 def runs(made: Recording, models: int = 1) -> list[Run]:
     """Raw, and models of which each further one leaves half as much again."""
-    return [Run.raw(made.imu), *(model(made, f"model {k}", LEFT * 1.5**k) for k in range(models))]
+    noise = np.random.default_rng(0).normal(0.0, NOISE, (len(made.imu), 6))
+    raw = Imu(made.imu.t_ns, made.imu.gyro + noise[:, :3], made.imu.accel + noise[:, 3:])
+    return [Run.raw(raw), *(model(made, f"model {k}", LEFT * 1.5**k) for k in range(models))]
 
 
 def model(made: Recording, name: str, left: float) -> Run:

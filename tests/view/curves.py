@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from itertools import islice
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -12,6 +13,8 @@ from rerun.chunk import RrdReader
 
 LEAST = 200  # pixels of a curve; its sample in a legend has some fifty
 WITHIN = 36.0  # in RGB: what an edge mixes of a line with its ground, and less than two colours of ours are apart
+MOST_COLORS = 12  # of one path: its neighbours are near each other
+MARK = "/worst"  # a mark and no curve: a body may hide it
 COLORS = ("SeriesLines:colors", "LineStrips3D:colors", "LineStrips2D:colors")
 
 
@@ -33,7 +36,7 @@ def curves(path: Path) -> list[Curve]:
         for name, column in zip(batch.schema.names, batch.columns, strict=True):
             if name in COLORS or name == "SeriesLines:names":
                 entity.setdefault(name, []).extend(flat(column))
-    return [curve for entity, styles in found.items() for curve in of_entity(entity, styles)]
+    return [curve for entity, styles in found.items() if not entity.endswith(MARK) for curve in of_entity(entity, styles)]
 
 
 def flat(column: pa.Array) -> list[Any]:
@@ -44,13 +47,17 @@ def flat(column: pa.Array) -> list[Any]:
 
 def of_entity(entity: str, styles: Mapping[str, list[Any]]) -> Iterator[Curve]:
     for name, values in styles.items():
-        packed = np.array(values, dtype=np.uint32) if name in COLORS else np.zeros(0, dtype=np.uint32)
-        rgb = np.stack([packed >> 24, packed >> 16 & 255, packed >> 8 & 255], axis=-1)
-        if name.startswith("SeriesLines") and name in COLORS:
-            for series, color in zip(styles["SeriesLines:names"], rgb, strict=True):
+        if name == "SeriesLines:colors":
+            for series, color in zip(styles["SeriesLines:names"], unpacked(values), strict=True):
                 yield Curve(entity, series, color[None])
         elif name in COLORS:
-            yield Curve(entity, "line", np.unique(rgb, axis=0))
+            yield Curve(entity, "line", np.unique(unpacked(values), axis=0))
+
+
+def unpacked(rgba: Sequence[int]) -> np.ndarray:
+    """Red, green and blue of packed colours."""
+    packed = np.array(rgba, dtype=np.uint32)
+    return np.stack([packed >> 24, packed >> 16 & 255, packed >> 8 & 255], axis=-1)
 
 
 # ── layouts ──
@@ -98,32 +105,49 @@ def holds(view: Any, entity: str) -> bool:
     return bool(fitting) and max(fitting)[2] == "+"
 
 
+def shown(view: Any, curves: Sequence[Curve]) -> list[Curve]:
+    """The curves that a view holds, as it has them drawn: it may leave some of an entity out, and colour others anew."""
+    found = []
+    for entity in dict.fromkeys(curve.entity for curve in curves if holds(view, curve.entity)):
+        mine = [curve for curve in curves if curve.entity == entity]
+        style = view.visualizer_overrides.get(entity)
+        visible, colors = (column(style, name) for name in ("visible_series", "colors"))
+        for k, curve in enumerate(mine):
+            if not visible or visible[k]:
+                found.append(curve._replace(colors=unpacked(colors[k : k + 1])) if colors else curve)
+    return found
+
+
+def column(style: Any, name: str) -> list[Any]:
+    """What a style says of each curve; nothing where it does not."""
+    batch = getattr(style, name, None)
+    return [] if batch is None else batch.as_arrow_array().to_pylist()
+
+
 # ── pictures ──
 
 
-def pictures(viewer: Any, blueprint: Any, log: Any, duration_s: float) -> dict[Any, np.ndarray]:
-    """Every view of a layout as it is drawn, the cursor at the end of the log, by the view's identifier."""
+def pictures(viewer: Any, blueprint: Any, log: Any, duration_s: float, most: int | None = None) -> dict[Any, np.ndarray]:
+    """Views of a layout as they are drawn, the cursor at the end of the log, by identifier: all, or of so many tabs."""
     viewer.show(log, blueprint)
     found = {}
-    for views in faces(blueprint):
+    for views in islice(faces(blueprint), most):
         viewer.lay_out(blueprint)
         viewer.client.set_time("elapsed", duration=duration_s, play_state="paused")
         found |= dict(zip([view.id for view in views], viewer.pictures([view.id for view in views]), strict=True))
     return found
 
 
-def unseen(view: Any, picture: np.ndarray, wanted: Sequence[Curve]) -> list[str]:
-    """The curves that a view holds and its picture does not show."""
-    return [
-        f"{view.name}: {c.entity} {c.name} ({pixels(picture, c)} px)"
-        for c in wanted
-        if holds(view, c.entity) and pixels(picture, c) < LEAST
-    ]
+def unseen(view: Any, picture: np.ndarray, curves: Sequence[Curve]) -> list[str]:
+    """The curves that a view is to show and its picture does not."""
+    counted = [(curve, pixels(picture, curve)) for curve in shown(view, curves)]
+    return [f"{view.name}: {curve.entity} {curve.name} ({count} px)" for curve, count in counted if count < LEAST]
 
 
 def pixels(picture: np.ndarray, curve: Curve) -> int:
     """How many pixels have a curve's colour."""
     near = np.zeros(picture.shape[:2], dtype=bool)
-    for color in curve.colors:
-        near |= np.linalg.norm(picture.astype(np.float32) - color, axis=-1) <= WITHIN
+    for color in curve.colors[:: 1 + len(curve.colors) // MOST_COLORS]:
+        off = [picture[..., k].astype(np.int32) - int(color[k]) for k in range(3)]
+        near |= sum(part * part for part in off) <= WITHIN**2
     return int(near.sum())

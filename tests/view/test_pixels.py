@@ -12,8 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from imutool.recording import Recording
-from imutool.view.rerun import layout, scene, viewer
+from imutool.view.rerun import files, layout, scene
 from imutool.view.rundata import RunData, build
 
 HERE = Path(__file__).parent
@@ -21,7 +20,7 @@ VIEWERS = SimpleNamespace(**runpy.run_path(str(HERE.parent / "viewers.py")))
 CURVES = SimpleNamespace(**runpy.run_path(str(HERE / "curves.py")))
 APART = SimpleNamespace(**runpy.run_path(str(HERE / "apart.py")))
 
-WINDOW = (1600, 1000)
+WINDOW, WIDE = (1280, 800), (1600, 1000)  # the second for what lies close together
 INK = 400  # pixels that differ from the ground, the least of a view that says anything
 
 
@@ -33,20 +32,40 @@ def one_model() -> list[RunData]:
 def nothing_known() -> list[RunData]:
     """A log without truth, read as it is."""
     made = replace(APART.recording(), truths={}, scalars={})
-    return [build(made, APART.runs(APART.recording())[:1])]
+    return [build(made, APART.runs(made, models=0))]
 
 
-@pytest.mark.parametrize("case", [one_model, nothing_known], ids=lambda case: case.__name__)
-def test_every_view_draws_every_curve_it_holds(case: Callable[[], list[RunData]], tmp_path: Path) -> None:
+def two_models() -> list[RunData]:
+    made = APART.recording()
+    return [build(made, APART.runs(made, models=2))]
+
+
+def two_logs() -> list[RunData]:
+    made = [APART.recording(seed) for seed in (3, 4)]
+    return [build(one, APART.runs(one)) for one in made]
+
+
+EVERYTHING = None  # tabs
+CASES = {one_model: EVERYTHING, nothing_known: EVERYTHING, two_models: 2, two_logs: 2}
+
+
+def drawn(case: Callable[[], list[RunData]], folder: Path) -> tuple[list[Any], dict[Any, np.ndarray], list[Any]]:
+    """The views that were in front, their pictures, and the curves that there are."""
     logs = case()
-    viewer.show(logs, save=tmp_path / "drawn.rrd")
-    curves, blueprint = CURVES.curves(tmp_path / "drawn.rrd"), layout.blueprint(logs[0])
+    (folder / "drawn.rrd").write_bytes(files.rrd(logs))
+    blueprint = layout.blueprint(logs)
 
     def look(running: Any) -> dict[Any, np.ndarray]:
-        return CURVES.pictures(running, blueprint, lambda to: scene.log(logs[0], to), logs[0].duration_s)
+        return CURVES.pictures(running, blueprint, lambda to: scene.log(logs, to), logs[0].duration_s, CASES[case])
 
-    seen = VIEWERS.seen(look, WINDOW)
-    views = CURVES.leaves(blueprint.root_container)
+    seen = VIEWERS.seen(look, WINDOW if CASES[case] is EVERYTHING else WIDE)
+    views = [view for view in CURVES.leaves(blueprint.root_container) if view.id in seen]
+    return views, seen, CURVES.curves(folder / "drawn.rrd")
+
+
+@pytest.mark.parametrize("case", CASES, ids=lambda case: case.__name__)
+def test_every_view_draws_every_curve_it_holds(case: Callable[[], list[RunData]], tmp_path: Path) -> None:
+    views, seen, curves = drawn(case, tmp_path)
     assert [fault for view in views for fault in CURVES.unseen(view, seen[view.id], curves)] == []
     assert [view.name for view in views if ink(seen[view.id]) < INK] == []
 

@@ -1,4 +1,4 @@
-"""In a real browser: `--web` and the folder of `--export-web` draw the log, in light and dark, and ask nobody but their server."""
+"""In a real browser `--web` and the folder of `--export-web` draw the log, light and dark, and ask nobody but their server."""
 
 from __future__ import annotations
 
