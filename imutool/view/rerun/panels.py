@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -10,9 +10,9 @@ import numpy as np
 from imutool.view.deviation import Drift, Errors
 from imutool.view.rerun import entities, errors, events, signals, source, spectrum
 from imutool.view.rerun.entities import Scope
-from imutool.view.rerun.palette import AXES, GROUND, color_of
+from imutool.view.rerun.palette import AXES, GROUND, color_name, color_of
 from imutool.view.rerun.plots import both_ways, limit, plot, upwards, whole
-from imutool.view.rundata import RunData
+from imutool.view.rundata import RunData, Trace
 
 if TYPE_CHECKING:
     import rerun.blueprint as rrb
@@ -42,18 +42,18 @@ def total_errors(data: RunData, scope: Scope) -> list[Panel]:
         contents = [entities.of(data, trace, scope, "error", kind, entities.role(trace)) for trace in scored]
         contents += [f"{path}/worst" for path, trace in zip(contents, scored, strict=True) if not trace.is_raw]
         if contents:
-            title, legend = _totals_title(data, kind)
-            found.append(plot(contents, title, height=upwards(error_limit(data, kind)), legend=legend))
+            title = f"{kind.capitalize()} error ({errors.UNITS[kind]}): {_colors(data, _models_first(data))}"
+            found.append(plot(contents, title, height=upwards(error_limit(data, kind))))
     return found
 
 
-def _totals_title(data: RunData, kind: str) -> tuple[str, str | None]:
-    """A title with the colours in it, and no legend that would cover them; of several models a legend with their names."""
-    title = f"{kind.capitalize()} error ({errors.UNITS[kind]})"
-    if len(data.models()) > 1:
-        return title, "RightTop"
-    colors = ["debiased blue", "its worst pink"] if data.models() else []
-    return f"{title}: {', '.join([*colors, *(['raw orange'] if len(data.traces) > len(data.models()) else [])])}", None
+def _colors(data: RunData, of: Sequence[Trace]) -> str:
+    """Which colour stands for which run: said in titles, because a legend would cover curves."""
+    return ", ".join(f"{entities.label(data, trace)} {color_name(data, trace)}" for trace in of)
+
+
+def _models_first(data: RunData) -> list[Trace]:
+    return [*data.models(), *(trace for trace in data.traces if trace.is_raw)]
 
 
 def error_limit(data: RunData, kind: str) -> float | None:
@@ -101,8 +101,8 @@ def _bias_of(data: RunData, scope: Scope, kind: str, axis: int) -> rrb.TimeSerie
         words.insert(0, "bold: estimated")
     if any(trace.run.bias_std is not None for trace in data.models()):
         words.insert(1, f"thin: ±{signals.SIGMAS:g}σ")
-    name = f"{AXES[axis]} ({', '.join(words)})"
-    return plot(list(overrides), name, height=_bias_range(data, kind, axis), legend=None, overrides=overrides)
+    name = f"{AXES[axis]} ({', '.join(words)}){f': {_colors(data, data.models())}' if several else ''}"
+    return plot(list(overrides), name, height=_bias_range(data, kind, axis), overrides=overrides)
 
 
 def _only(axis: int, count: int) -> list[bool]:
@@ -186,9 +186,10 @@ def _drift(data: RunData, scope: Scope, kind: str, of: Callable[[Drift], np.ndar
     drifted = [trace for trace in data.traces if trace.name in drifts]
     contents = [entities.of(data, trace, scope, "error", "drift", kind, entities.role(trace)) for trace in drifted]
     reset_s = next(iter(drifts.values())).reset_s
-    title = f"Since the last reset to the truth, every {reset_s:g} s ({errors.UNITS[kind]})"
-    height = upwards(limit(data, {name: of(drift) for name, drift in drifts.items()}))
-    return [plot(contents, title, height=height, legend="RightTop" if len(data.models()) > 1 else None)]
+    title = (
+        f"Since the last reset to the truth, every {reset_s:g} s ({errors.UNITS[kind]}): {_colors(data, _models_first(data))}"
+    )
+    return [plot(contents, title, height=upwards(limit(data, {name: of(drift) for name, drift in drifts.items()})))]
 
 
 def _events(data: RunData, scope: Scope) -> Panel | None:
@@ -231,15 +232,14 @@ def _three(
     height: tuple[float, float] | None = None,
     names: tuple[str, ...] = AXES,
 ) -> rrb.TimeSeriesView:
-    """A plot of curves about or along x, y and z, with their colours in the title: a legend of six lines would cover them.
-
-    Several models are told apart by a legend only.
-    """
-    if len(data.models()) > 1:
-        return plot(contents, title, height=height)
-    colors = ", ".join(f"{name} {color}" for name, color in zip(names, ("red", "green", "blue"), strict=True))
-    widths = "; debiased bold, raw faint" if data.models() else ""
-    return plot(contents, f"{title}: {colors}{widths}", height=height, legend=None)
+    """A plot of curves about or along x, y and z, with their colours in the title: a legend of six lines would cover them."""
+    said = ", ".join(f"{name} {color}" for name, color in zip(names, ("red", "green", "blue"), strict=True))
+    models = [entities.label(data, trace) for trace in data.models()]
+    if models:
+        said += (
+            f"; {', paler '.join([f'{models[0]} bold', *models[1:]])}{', raw faint' if len(models) < len(data.traces) else ''}"
+        )
+    return plot(contents, f"{title}: {said}", height=height)
 
 
 def _by_run(data: RunData, of: Callable[[Errors], np.ndarray]) -> dict[str, np.ndarray]:

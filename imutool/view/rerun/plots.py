@@ -21,13 +21,13 @@ def plot(
     name: str,
     *,
     height: tuple[float, float] | None = None,
-    legend: str | None = "RightTop",
+    legend: bool = False,
     overrides: Mapping[Any, Any] | None = None,
 ) -> rrb.TimeSeriesView:
-    """A plot of these entities."""
+    """A plot of these entities; without a legend its title says what is what."""
     import rerun.blueprint as rrb
 
-    corner = rrb.PlotLegend(visible=False) if legend is None else rrb.PlotLegend(rrb.Corner2D[legend])
+    corner = rrb.PlotLegend(rrb.Corner2D.RightTop, visible=legend)
     axis_y = None if height is None else rrb.ScalarAxis(range=height)
     return rrb.TimeSeriesView(
         origin="/", contents=list(contents), name=name, axis_x=whole(), axis_y=axis_y, plot_legend=corner, overrides=overrides

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 from imutool.view.rerun import entities
 from imutool.view.rerun.entities import Scope
 from imutool.view.rerun.markdown import escape, table
+from imutool.view.rerun.palette import color_name
 from imutool.view.rerun.paths import heat_top
 from imutool.view.rundata import RunData
 
@@ -53,8 +54,8 @@ def comparison(logs: Sequence[RunData]) -> str:
         values = dict(data.table())
         for place, trace in enumerate(data.traces):
             cells = [_cell(values[label][place]) if label in values else "" for label in labels]
-            rows.append([escape(data.name), escape(trace.name), f"{data.duration_s:.1f}", *cells])
-    heads = ["log", "run", "seconds", *(escape(label) for label in labels)]
+            rows.append([escape(data.name), escape(trace.name), *cells])
+    heads = ["log", "run", *(escape(label) for label in labels)]
     return "\n".join([f"# {len(logs)} logs", "", *table(heads, rows)])
 
 
@@ -66,7 +67,8 @@ def _colors(data: RunData) -> list[str]:
             f"The debiased path is coloured by its orientation error: dark blue is none, yellow is {top:g} degrees and more."
         ]
     if len(data.models()) > 1:
-        return ["Each model's path has a colour of its own, the same as in the plots of total errors."]
+        colors = ", ".join(f"{trace.name} {color_name(data, trace)}" for trace in data.models())
+        return [f"Each model's path has a colour of its own, the same as in the plots of total errors: {colors}."]
     return []
 
 
