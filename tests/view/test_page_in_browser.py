@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 import runpy
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -13,10 +13,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from imutool.view import diagnosis_page
+from imutool.view import diagnosis_page, report
+from imutool.view.rundata import build
 
 TESTS = Path(__file__).parents[1]
 VIEWERS = SimpleNamespace(**runpy.run_path(str(TESTS / "viewers.py")))
+APART = SimpleNamespace(**runpy.run_path(str(TESTS / "view" / "apart.py")))
 MADE = SimpleNamespace(**runpy.run_path(str(TESTS / "physics" / "diagnoses.py")))
 
 WIDE, NARROW, PAPER = 1280, 400, 794  # CSS pixels; the last is A4 at 96 dots per inch
@@ -24,7 +26,8 @@ HEIGHT = 720
 READABLE = 4.5  # contrast of text, the least that WCAG 2 calls AA
 INKED = 0.002  # of a figure's area: frame and labels alone reach it, an empty box does not
 ADDRESSED = "http://127.0.0.1:9/elsewhere.png"  # nobody listens there
-PAGES = ("diagnosis",)
+PAGES = ("one model", "nothing known", "two logs", "diagnosis")
+HOSTILE = "<img src=x onerror=alert(1)>"  # a log may be called anything
 
 
 @pytest.fixture(scope="module")
@@ -37,6 +40,15 @@ def browser() -> Iterator[Any]:
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Each page as NAME.html."""
     folder = tmp_path_factory.mktemp("pages")
+    flights = [APART.recording(seed) for seed in (3, 4)]
+    hostile = replace(flights[1], name=HOSTILE)
+    logs = {
+        "one model": [build(flights[0], APART.runs(flights[0]))],
+        "nothing known": [build(replace(flights[0], truths={}, scalars={}), APART.runs(flights[0], models=0))],
+        "two logs": [build(one, APART.runs(one, models=2)) for one in (flights[0], hostile)],
+    }
+    for name, shown in logs.items():
+        report.write_page(shown, folder / f"{name}.html")
     diagnosis_page.write(MADE.THREE, folder / "diagnosis.html")
     return folder
 
@@ -99,18 +111,29 @@ def test_what_says_asks_and_does_not_fit_is_seen(visit: Any, tmp_path: Path) -> 
     assert not fits(one)
 
 
+@pytest.mark.parametrize(("scheme", "darkest", "lightest"), [("light", 0.8, 1.0), ("dark", 0.0, 0.1)])
 @pytest.mark.parametrize("name", PAGES)
-def test_light_and_dark_differ_and_both_can_be_read(visit: Any, folder: Path, name: str) -> None:
-    grounds = []
-    for scheme in ("light", "dark"):
-        one = visit(folder / f"{name}.html", scheme=scheme)
-        ink, ground = (color(one, prop) for prop in ("color", "backgroundColor"))
-        assert contrast(ink, ground) > READABLE, scheme
-        corner = VIEWERS.pixels(one.page.screenshot())[2, 2]
-        np.testing.assert_array_equal(corner, ground)  # it is painted as it says
-        grounds.append(luminance(ground))
-    assert grounds[0] > 0.8
-    assert grounds[1] < 0.1
+def test_its_words_can_be_read_and_every_figure_is_drawn(
+    visit: Any, folder: Path, name: str, scheme: str, darkest: float, lightest: float
+) -> None:
+    one = visit(folder / f"{name}.html", scheme=scheme)
+    ink, ground = (color(one, prop) for prop in ("color", "backgroundColor"))
+    assert darkest <= luminance(ground) <= lightest
+    assert contrast(ink, ground) > READABLE
+    one.page.evaluate("document.querySelectorAll('details').forEach(d => d.open = true)")
+    boxes = one.page.evaluate(
+        "[...document.querySelectorAll('svg, img')].map(f => f.getBoundingClientRect())"
+        ".map(b => [b.x + scrollX, b.y + scrollY, b.width, b.height])"
+    )
+    whole = VIEWERS.pixels(one.page.screenshot(full_page=True)).astype(np.int16)
+    np.testing.assert_array_equal(whole[2, 2], ground)  # it is painted as it says
+    assert boxes
+    for k, (x, y, width, height) in enumerate(boxes):
+        figure = whole[round(y) : round(y + height), round(x) : round(x + width)]
+        assert figure.size, f"figure {k} has no room"
+        empty = np.median(figure[::5, ::5], axis=(0, 1))  # most of a figure is
+        inked = (np.abs(figure - empty).max(axis=-1) > 40).mean()
+        assert inked > INKED, f"figure {k} of {len(boxes)} is empty"
 
 
 def color(one: Visit, prop: str) -> np.ndarray:
@@ -131,25 +154,6 @@ def contrast(one: np.ndarray, other: np.ndarray) -> float:
     """Contrast ratio of WCAG 2, 1 to 21."""
     low, high = sorted((luminance(one), luminance(other)))
     return (high + 0.05) / (low + 0.05)
-
-
-@pytest.mark.parametrize("scheme", ["light", "dark"])
-@pytest.mark.parametrize("name", PAGES)
-def test_every_figure_is_drawn(visit: Any, folder: Path, name: str, scheme: str) -> None:
-    one = visit(folder / f"{name}.html", scheme=scheme)
-    one.page.evaluate("document.querySelectorAll('details').forEach(d => d.open = true)")
-    boxes = one.page.evaluate(
-        "[...document.querySelectorAll('svg, img')].map(f => f.getBoundingClientRect())"
-        ".map(b => [b.x + scrollX, b.y + scrollY, b.width, b.height])"
-    )
-    whole = VIEWERS.pixels(one.page.screenshot(full_page=True)).astype(np.int16)
-    assert boxes
-    for k, (x, y, width, height) in enumerate(boxes):
-        figure = whole[round(y) : round(y + height), round(x) : round(x + width)]
-        assert figure.size, f"figure {k} has no room"
-        ground = np.median(figure[::5, ::5], axis=(0, 1))  # most of a figure is empty
-        inked = (np.abs(figure - ground).max(axis=-1) > 40).mean()
-        assert inked > INKED, f"figure {k} of {len(boxes)} is empty"
 
 
 @pytest.mark.parametrize("name", PAGES)
