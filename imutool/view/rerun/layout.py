@@ -112,7 +112,7 @@ def _comparison(logs: Sequence[RunData], scopes: Sequence[Scope]) -> rrb.Vertica
         if overrides:
             reach = max((panels.error_limit(data, kind) or 0.0 for data in logs), default=0.0)
             title = f"{kind.capitalize()} error ({errors.UNITS[kind]})"
-            rows.append(plot(list(overrides), title, height=(0.0, reach) if reach else None, legend=True, overrides=overrides))
+            rows.append(plot(list(overrides), title, height=(0.0, reach) if reach else None, overrides=overrides))
     figures = rrb.TextDocumentView(origin="/compare", name="Figures")
     return rrb.Vertical(*([rrb.Horizontal(*rows)] if rows else []), figures, name="Compare")
 

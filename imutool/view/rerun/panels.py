@@ -42,8 +42,8 @@ def total_errors(data: RunData, scope: Scope) -> list[Panel]:
         contents = [entities.of(data, trace, scope, "error", kind, entities.role(trace)) for trace in scored]
         contents += [f"{path}/worst" for path, trace in zip(contents, scored, strict=True) if not trace.is_raw]
         if contents:
-            title = f"{kind.capitalize()} error ({errors.UNITS[kind]}): {_colors(data, _models_first(data))}"
-            found.append(plot(contents, title, height=upwards(error_limit(data, kind))))
+            title, key = f"{kind.capitalize()} error ({errors.UNITS[kind]})", _colors(data, _models_first(data))
+            found.append(plot(contents, title, key, height=upwards(error_limit(data, kind))))
     return found
 
 
@@ -90,7 +90,7 @@ def _bias_of(data: RunData, scope: Scope, kind: str, axis: int) -> rrb.TimeSerie
     words = []
     if kind in data.true_bias:
         overrides[entities.path(scope, "bias", kind, "true")] = rr.SeriesLines(visible_series=_only(axis, 3))
-        words.append("broad and pale: true")
+        words.append("true broad and pale")
     for trace in data.models():
         home = entities.of(data, trace, scope, "bias", kind)
         colors = [color_of(data, trace)] if several else None
@@ -98,11 +98,13 @@ def _bias_of(data: RunData, scope: Scope, kind: str, axis: int) -> rrb.TimeSerie
         if trace.run.bias_std is not None:
             overrides[f"{home}/sigma"] = rr.SeriesLines(visible_series=_only(axis, 6), colors=colors and colors * 6)
     if data.models():
-        words.insert(0, "bold: estimated")
+        words.insert(0, "estimated bold")
     if any(trace.run.bias_std is not None for trace in data.models()):
-        words.insert(1, f"thin: ±{signals.SIGMAS:g}σ")
-    name = f"{AXES[axis]} ({', '.join(words)}){f': {_colors(data, data.models())}' if several else ''}"
-    return plot(list(overrides), name, height=_bias_range(data, kind, axis), overrides=overrides)
+        words.insert(1, f"±{signals.SIGMAS:g}σ thin")
+    key = ", ".join([*words, *([_colors(data, data.models())] if several else [])])
+    return plot(
+        list(overrides), f"{AXES[axis]} ({signals.UNITS[kind]})", key, height=_bias_range(data, kind, axis), overrides=overrides
+    )
 
 
 def _only(axis: int, count: int) -> list[bool]:
@@ -159,7 +161,7 @@ def _orientation(data: RunData, scope: Scope) -> list[Panel]:
     by_axis = limit(data, _by_run(data, lambda found: found.orientation_deg))
     by_angle = limit(data, _by_run(data, lambda found: found.roll_pitch_yaw_deg))
     return [
-        _three(data, _of_scored(data, scope, "orientation", "axes"), "About the true body's axes (deg)", both_ways(by_axis)),
+        _three(data, _of_scored(data, scope, "orientation", "axes"), "About the body's axes (deg)", both_ways(by_axis)),
         _three(
             data, _of_scored(data, scope, "orientation", "rpy"), "Roll, pitch, yaw (deg)", both_ways(by_angle), errors.ANGLES
         ),
@@ -186,10 +188,8 @@ def _drift(data: RunData, scope: Scope, kind: str, of: Callable[[Drift], np.ndar
     drifted = [trace for trace in data.traces if trace.name in drifts]
     contents = [entities.of(data, trace, scope, "error", "drift", kind, entities.role(trace)) for trace in drifted]
     reset_s = next(iter(drifts.values())).reset_s
-    title = (
-        f"Since the last reset to the truth, every {reset_s:g} s ({errors.UNITS[kind]}): {_colors(data, _models_first(data))}"
-    )
-    return [plot(contents, title, height=upwards(limit(data, {name: of(drift) for name, drift in drifts.items()})))]
+    title, key = f"Since the last reset, every {reset_s:g} s ({errors.UNITS[kind]})", _colors(data, _models_first(data))
+    return [plot(contents, title, key, height=upwards(limit(data, {name: of(drift) for name, drift in drifts.items()})))]
 
 
 def _events(data: RunData, scope: Scope) -> Panel | None:
@@ -233,13 +233,13 @@ def _three(
     names: tuple[str, ...] = AXES,
 ) -> rrb.TimeSeriesView:
     """A plot of curves about or along x, y and z, with their colours in the title: a legend of six lines would cover them."""
-    said = ", ".join(f"{name} {color}" for name, color in zip(names, ("red", "green", "blue"), strict=True))
+    key = ", ".join(f"{name} {color}" for name, color in zip(names, ("red", "green", "blue"), strict=True))
     models = [entities.label(data, trace) for trace in data.models()]
-    if models:
-        said += (
-            f"; {', paler '.join([f'{models[0]} bold', *models[1:]])}{', raw faint' if len(models) < len(data.traces) else ''}"
-        )
-    return plot(contents, f"{title}: {said}", height=height)
+    if len(models) == 1:
+        key += f"; {models[0]} bold{', raw faint' if len(data.traces) > 1 else ''}"
+    elif models:
+        key += f"; {models[0]} bold, {', '.join(f'{name} paler' for name in models[1:])}"
+    return plot(contents, title, key, height=height)
 
 
 def _by_run(data: RunData, of: Callable[[Errors], np.ndarray]) -> dict[str, np.ndarray]:

@@ -55,7 +55,7 @@ def comparison(logs: Sequence[RunData]) -> str:
         for place, trace in enumerate(data.traces):
             cells = [_cell(values[label][place]) if label in values else "" for label in labels]
             rows.append([escape(data.name), escape(trace.name), *cells])
-    heads = ["log", "run", *(escape(label) for label in labels)]
+    heads = ["log", "run", *labels]
     return "\n".join([f"# {len(logs)} logs", "", *table(heads, rows)])
 
 

@@ -11,12 +11,13 @@ from imutool.recording import Times
 from imutool.view.rerun import clock, entities, styles
 from imutool.view.rerun.entities import Scope
 from imutool.view.rundata import RunData, Trace
-from imutool.view.thin import curve_rows
+from imutool.view.thin import MOST, curve_rows
 
 if TYPE_CHECKING:
     import rerun as rr
 
 KINDS = ("gyro", "accel")
+UNITS = {"gyro": "rad/s", "accel": "m/s²"}
 SIGMAS = 3.0
 
 
@@ -63,5 +64,5 @@ def scalars(
 
     to.log(entity, style, static=True, strict=True)
     # strict: Rerun only warns of a length that does not match, and then the rows are missing
-    rows = curve_rows(values)
+    rows = curve_rows(values, MOST)
     to.send_columns(entity, clock.at(data, t_ns[rows]), rr.Scalars.columns(scalars=values[rows]), strict=True)
