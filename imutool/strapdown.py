@@ -76,9 +76,8 @@ def dead_reckon(
         a_w = quaternion.rotate(q_wb[:-1], imu.accel[:-1]) + np.asarray(g_w, dtype=np.float64)
         v_w = np.cumsum(np.concatenate([v_0[None], a_w * dt]), axis=0)
         p_wb = np.cumsum(np.concatenate([p_0[None], v_w[:-1] * dt]), axis=0)
-    finite = np.isfinite(np.concatenate([q_wb, v_w, p_wb], axis=1)).all(axis=1)
-    if not finite.all():
-        row = int(np.argmin(finite))
+    if not all(np.isfinite(column).all() for column in (q_wb, v_w, p_wb)):
+        row = int(np.argmin(np.isfinite(np.concatenate([q_wb, v_w, p_wb], axis=1)).all(axis=1)))
         raise NumericsError(
             f"integration overflows at sample {row}",
             expected="rates and forces of a moving body",
@@ -123,7 +122,7 @@ class Drifted(NamedTuple):
     position_m: Float64[np.ndarray, " m"]
 
 
-def drifted(path: Poses, truth: Poses, first: Int64[np.ndarray, " m"], last: Int64[np.ndarray, " m"]) -> Drifted:
+def drifted(path: Poses, truth: Poses, first: Int64[np.ndarray, " m"], last: Int64[np.ndarray, " m"] | slice) -> Drifted:
     """How far integrations that start from the truth at rows `first` are from it at rows `last`, all from one integration.
 
     `path` is that of the same samples from any start, on the stamps of `truth`. Had it started from the truth at row s, all of
@@ -150,7 +149,7 @@ def drifted(path: Poses, truth: Poses, first: Int64[np.ndarray, " m"], last: Int
     further = p_true[first] - p_true[last] + v_true[first] * T + g_S
     further += quaternion.rotate(q_c, p[last] - p[first] - v[first] * T - g_S)
     turned = quaternion.angle_between(quaternion.multiply(q_c, q[last]), q_true[last])
-    return Drifted(turned, np.linalg.norm(faster, axis=1), np.linalg.norm(further, axis=1))
+    return Drifted(turned, quaternion.length(faster), quaternion.length(further))
 
 
 def drift(path: Poses, truth: Poses, valid: Bool[np.ndarray, " n"], window_s: float) -> Drifted:

@@ -96,7 +96,7 @@ def _read(path: Path, imu: str | None, truth: str | None, notes: list[str], *, s
         derived = [one.name for one in log.with_schema((schema.IMU,)) if one.metadata.get(DERIVED_KEY) == topic]
         biases = [one.name for one in log.with_schema((schema.TWIST,)) if one.metadata.get(DERIVED_KEY) == topic]
         batches, beliefs = _messages(log, [topic, *derived], biases)
-        rest = recording_in(log, imu=topic, truth=truth, samples=NONE, refused=None if truth else refused)
+        rest = recording_in(log, imu=topic, truth=truth, samples=NONE, derived=False, refused=None if truth else refused)
         metadata = log.metadata_records()
         if log.losses is not None:
             notes += [f"The log is damaged; {line}." for line in told(log.losses.plain())]
