@@ -101,7 +101,7 @@ def along_truth(imu: Imu, truth: Poses, where: str) -> tuple[Poses, Poses, Bool[
 
 
 def stretch_with_truth(t_ns: Times, truth: Poses, where: str) -> tuple[slice, Poses, Bool[np.ndarray, " m"]]:
-    """The rows from the first stamp at which the truth is known to the last, the truth with its velocity there, and where it is.
+    """The rows from the first stamp at which the truth is known to the last, the truth with velocity there, and where it is.
 
     Raises:
         DataError: the truth is known at fewer than two stamps.
@@ -137,13 +137,14 @@ def drifted(path: Poses, truth: Poses, first: Int64[np.ndarray, " m"], last: Int
     Raises:
         DataError: one of the two carries no velocity, or they are on different stamps.
     """
-    if path.v_w is None or truth.v_w is None or not np.array_equal(path.t_ns, truth.t_ns):
+    v, v_true = path.v_w, truth.v_w
+    if v is None or v_true is None or not np.array_equal(path.t_ns, truth.t_ns):
         raise DataError("path and truth do not match", expected="poses with velocity on the same stamps")
     t = seconds(path.t_ns, int(path.t_ns[0]))
     squares = np.concatenate([[0.0], np.cumsum(np.diff(t) ** 2)])
     T = (t[last] - t[first])[:, None]
     g_T, g_S = np.array(GRAVITY_W) * T, np.array(GRAVITY_W) * (0.5 * (T**2 - (squares[last] - squares[first])[:, None]))
-    (q, p, v), (q_true, p_true, v_true) = ((poses.q_wb_wxyz, poses.p_wb, poses.v_w) for poses in (path, truth))
+    (q, p), (q_true, p_true) = ((poses.q_wb_wxyz, poses.p_wb) for poses in (path, truth))
     q_c = quaternion.multiply(q_true[first], quaternion.inverse(q[first]))
     faster = v_true[first] - v_true[last] + g_T + quaternion.rotate(q_c, v[last] - v[first] - g_T)
     further = p_true[first] - p_true[last] + v_true[first] * T + g_S

@@ -74,9 +74,10 @@ def recording_in(
     derived: bool = True,
     refused: Callable[[str, LogError], None] | None = None,
 ) -> Recording:
-    """As `read`, in a log that is open; poses that a recording cannot hold are left out where somebody is to be told (`refused`).
+    """As `read`, in a log that is open.
 
-    Without `derived` the scalars that imutool computed are not read.
+    Where somebody is to be told (`refused`), poses that a recording cannot hold are left out. Without `derived` the scalars that
+    imutool computed are not read.
 
     Raises:
         LogError: as `read`.
