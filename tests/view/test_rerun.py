@@ -2,14 +2,7 @@
 
 from __future__ import annotations
 
-import errno
-import os
-import signal
-import stat
 import subprocess
-import sys
-import time
-from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -19,7 +12,6 @@ import pyarrow as pa
 import pytest
 from rerun.chunk import RrdReader
 
-from imutool.errors import ConfigError
 from imutool.recording import Poses, Recording
 from imutool.view.rerun import scene
 from imutool.view.rerun import viewer as view
@@ -85,19 +77,6 @@ def saved(data: RunData, tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def entities(saved: Path) -> dict[str, Entity]:
     return read(saved)
-
-
-@pytest.fixture
-def no_display(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(sys, "platform", "linux")
-    for name in ("DISPLAY", "WAYLAND_DISPLAY"):
-        monkeypatch.delenv(name, raising=False)
-
-
-@pytest.fixture
-def display(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(sys, "platform", "linux")
-    monkeypatch.setenv("DISPLAY", ":99")
 
 
 def expected_scalars(data: RunData) -> dict[str, tuple[np.ndarray, np.ndarray]]:
@@ -240,134 +219,3 @@ def test_the_report_holds_the_figures(data: RunData, entities: dict[str, Entity]
 def test_reruns_own_verifier_accepts_the_file(saved: Path) -> None:
     run = subprocess.run([str(view.binary()), "rrd", "verify", str(saved)], capture_output=True, text=True, check=False)
     assert run.returncode == 0, run.stderr
-
-
-def test_without_a_display_it_saves_at_once_and_says_how_to_open(
-    data: RunData, tmp_path: Path, no_display: None, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    start = time.monotonic()
-    said = view.show([data])
-    assert time.monotonic() - start < NO_WAIT_S
-    assert said == "There is no display here. Saved flight_3.rrd. Open with: rerun flight_3.rrd"
-    assert set(read(tmp_path / "flight_3.rrd")) >= {"/world/raw/path"}
-
-
-def test_insisting_on_a_viewer_without_a_display_is_refused_at_once(data: RunData, no_display: None) -> None:
-    start = time.monotonic()
-    with pytest.raises(ConfigError, match="no display"):
-        view.show([data], spawn=True)
-    assert time.monotonic() - start < NO_WAIT_S
-
-
-@pytest.mark.parametrize("binary", ["/bin/false", "/nowhere/rerun"])
-def test_a_viewer_that_does_not_start_is_given_up_at_once_and_the_log_saved(
-    data: RunData, tmp_path: Path, display: None, monkeypatch: pytest.MonkeyPatch, binary: str
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(view, "binary", lambda: Path(binary))
-    start = time.monotonic()
-    said = view.show([data])
-    assert time.monotonic() - start < NO_WAIT_S
-    assert said.startswith("The viewer ")
-    assert "Saved flight_3.rrd" in said
-    with pytest.raises(ConfigError, match="The viewer"):
-        view.show([data], spawn=True)
-
-
-@pytest.fixture
-def stand_in(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, display: None) -> Iterator[Callable[[], Path]]:
-    """A viewer without a window: Rerun's own server, which writes all it receives to a file; call it to end it."""
-    script, received = tmp_path / "viewer", tmp_path / "received.rrd"
-    script.write_text(
-        f"#!/bin/sh\n"
-        f'while [ $# -gt 0 ]; do [ "$1" = --port ] && port=$2; [ "$1" = --bind ] && bind=$2; shift; done\n'
-        f'exec {view.binary()} --save {received} --bind "$bind" --port "$port"\n'
-    )
-    script.chmod(script.stat().st_mode | stat.S_IXUSR)
-    monkeypatch.setattr(view, "binary", lambda: script)
-
-    def end() -> Path:
-        viewer, size, still_s = view.VIEWERS[-1], -1, 0.0
-        while still_s < SETTLED_S and viewer.poll() is None:  # it writes behind what it has received
-            time.sleep(0.1)
-            now = received.stat().st_size if received.exists() else 0
-            size, still_s = now, still_s + 0.1 if now == size and now else 0.0
-        if viewer.poll() is None:
-            viewer.send_signal(signal.SIGINT)
-        viewer.wait(10.0)
-        return received
-
-    yield end
-    end()
-
-
-@pytest.mark.filterwarnings("ignore:RRD file has no footer")  # the stand-in is interrupted, which leaves none
-def test_an_opened_viewer_receives_everything_with_the_layout(data: RunData, stand_in: Callable[[], Path], saved: Path) -> None:
-    assert view.show([data]) == "The viewer is open."
-    received = stand_in()
-    sent, kept = read(received), read(saved)
-    assert set(sent) == set(kept)
-    np.testing.assert_array_equal(
-        sent["/imu/gyro/raw"].numbers("Scalars:scalars"), kept["/imu/gyro/raw"].numbers("Scalars:scalars")
-    )
-    assert "'Paths'" in layout(received)
-
-
-def test_several_logs_are_several_files_in_a_folder(data: RunData, tmp_path: Path) -> None:
-    other = replace(data, name="other log")
-    said = view.show([data, other], save=tmp_path / "out")
-    assert sorted(p.name for p in (tmp_path / "out").iterdir()) == ["flight_3.rrd", "other_log.rrd"]
-    assert "flight_3.rrd" in said
-    assert "other_log.rrd" in said
-    stores = [RrdReader(path).recordings()[0] for path in (tmp_path / "out").iterdir()]
-    assert len({store.application_id for store in stores}) == 2  # a layout each
-    with pytest.raises(ConfigError, match="do not fit one"):
-        view.show([data, other], save=tmp_path / "both.rrd")
-    with pytest.raises(ConfigError, match="exists"):  # one of two is taken: neither is written
-        view.show([replace(data, name="new"), other], save=tmp_path / "out")
-    assert len(list((tmp_path / "out").iterdir())) == 2
-    (tmp_path / "file").write_bytes(b"")
-    with pytest.raises(ConfigError, match="folder"):
-        view.show([data, other], save=tmp_path / "file" / "out")
-    with pytest.raises(ConfigError, match="same name"):
-        view.show([data, data], save=tmp_path / "twice")
-
-
-def test_an_existing_file_is_kept_unless_told_otherwise(data: RunData, tmp_path: Path) -> None:
-    target = tmp_path / "a.rrd"
-    target.write_bytes(b"mine")
-    with pytest.raises(ConfigError, match="exists"):
-        view.show([data], save=target)
-    assert target.read_bytes() == b"mine"
-    view.show([data], save=target, overwrite=True)
-    assert [p.name for p in tmp_path.iterdir()] == ["a.rrd"]
-    assert read(target)
-
-
-@pytest.mark.parametrize("failure", [KeyboardInterrupt(), OSError(errno.ENOSPC, "No space left on device")])
-def test_a_failure_on_the_way_leaves_the_old_file_and_no_other(
-    data: RunData, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, failure: BaseException
-) -> None:
-    target = tmp_path / "a.rrd"
-    target.write_bytes(b"mine")
-
-    def fail(_: int) -> None:
-        raise failure
-
-    monkeypatch.setattr(os, "fsync", fail)
-    with pytest.raises((KeyboardInterrupt, ConfigError)):
-        view.show([data], save=target, overwrite=True)
-    assert target.read_bytes() == b"mine"
-    assert [p.name for p in tmp_path.iterdir()] == ["a.rrd"]
-
-
-def test_a_missing_rerun_says_how_to_get_it(data: RunData, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "rerun", None)
-    with pytest.raises(ConfigError, match=r"pip install 'imutool\[view\]'"):
-        view.show([data])
-
-
-def test_no_log_is_refused() -> None:
-    with pytest.raises(ConfigError, match="no log"):
-        view.show([])
