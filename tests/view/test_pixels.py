@@ -59,7 +59,7 @@ def drawn(case: Callable[[], list[RunData]], folder: Path) -> tuple[list[Any], d
         return CURVES.pictures(running, blueprint, lambda to: scene.log(logs, to), logs[0].duration_s, CASES[case])
 
     seen = VIEWERS.seen(look, WINDOW if CASES[case] is EVERYTHING else WIDE)
-    views = [view for view in CURVES.leaves(blueprint.root_container) if view.id in seen]
+    views = [view for view in CURVES.RRD.views(blueprint) if view.id in seen]
     return views, seen, CURVES.curves(folder / "drawn.rrd")
 
 
