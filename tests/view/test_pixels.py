@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from imutool.view.rerun import files, layout, scene
+from imutool.view.rerun import layout, scene
 from imutool.view.rundata import RunData, build
 
 HERE = Path(__file__).parent
@@ -49,23 +49,29 @@ EVERYTHING = None  # tabs
 CASES = {one_model: EVERYTHING, nothing_known: EVERYTHING, two_models: 2, two_logs: 2}
 
 
-def drawn(case: Callable[[], list[RunData]], folder: Path) -> tuple[list[Any], dict[Any, np.ndarray], list[Any]]:
-    """The views that were in front, their pictures, and the curves that there are."""
+def curves_of(case: Callable[[], list[RunData]], folder: Path) -> list[Any]:
+    """Every curve that is logged."""
+    path = CURVES.RRD.written(case(), folder / "logged.rrd")
+    found: list[Any] = CURVES.curves(path)
+    return found
+
+
+def drawn(case: Callable[[], list[RunData]], tabs: int | None) -> tuple[list[Any], dict[Any, np.ndarray]]:
+    """The views behind the first so many tabs, and their pictures."""
     logs = case()
-    (folder / "drawn.rrd").write_bytes(files.rrd(logs))
     blueprint = layout.blueprint(logs)
 
     def look(running: Any) -> dict[Any, np.ndarray]:
-        return CURVES.pictures(running, blueprint, lambda to: scene.log(logs, to), logs[0].duration_s, CASES[case])
+        return CURVES.pictures(running, blueprint, lambda to: scene.log(logs, to), logs[0].duration_s, tabs)
 
-    seen = VIEWERS.seen(look, WINDOW if CASES[case] is EVERYTHING else WIDE)
-    views = [view for view in CURVES.RRD.views(blueprint) if view.id in seen]
-    return views, seen, CURVES.curves(folder / "drawn.rrd")
+    seen = VIEWERS.seen(look, WINDOW if tabs is EVERYTHING else WIDE)
+    return [view for view in CURVES.RRD.views(blueprint) if view.id in seen], seen
 
 
 @pytest.mark.parametrize("case", CASES, ids=lambda case: case.__name__)
 def test_every_view_draws_every_curve_it_holds(case: Callable[[], list[RunData]], tmp_path: Path) -> None:
-    views, seen, curves = drawn(case, tmp_path)
+    curves = curves_of(case, tmp_path)
+    views, seen = drawn(case, CASES[case])
     assert [fault for view in views for fault in CURVES.unseen(view, seen[view.id], curves)] == []
     assert [view.name for view in views if ink(seen[view.id]) < INK] == []
 
