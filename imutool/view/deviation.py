@@ -161,7 +161,15 @@ def windows(path: Poses, truth: Poses, valid: Bool[np.ndarray, " n"]) -> tuple[W
     for length_s in WINDOWS_S:
         ends = drift(path, truth, valid, length_s)
         if count := len(ends.position_m):
-            found.append(Window(length_s, count, float(np.rad2deg(_rms(ends.orientation_rad))), _rms(ends.velocity_m_s), _rms(ends.position_m)))
+            found.append(
+                Window(
+                    length_s,
+                    count,
+                    float(np.rad2deg(_rms(ends.orientation_rad))),
+                    _rms(ends.velocity_m_s),
+                    _rms(ends.position_m),
+                )
+            )
     return tuple(found)
 
 

@@ -144,7 +144,8 @@ def apart(drawn: str, prefix: str) -> str:
 def legend(figure: Any, artists: Sequence[Any]) -> None:
     """The artists' names in rows above everything: inside the axes they would cover a curve sooner or later."""
     names = [short(str(artist.get_label())) for artist in artists]
-    columns = max(1, min(len(names), LEGEND_LETTERS // (max(map(len, names)) + HANDLE_LETTERS)))
+    widths = [len(name) + HANDLE_LETTERS for name in names]
+    columns = len(names) if sum(widths) <= LEGEND_LETTERS else max(1, min(len(names), LEGEND_LETTERS // max(widths)))
     figure.legend(artists, names, loc="outside upper left", ncols=columns, handlelength=1.6, fontsize=8.5)
 
 

@@ -90,10 +90,10 @@ def gathered(events: Iterable[Event], start_ns: int, end_ns: int) -> tuple[tuple
         longest = sorted(inside, key=lambda event: event.start_ns - event.end_ns)[:MOST_PER_KIND]
         named = kind.replace("_", " ")
         if len(every) > len(inside):
-            notes.append(f"Events of kind {named}: {len(every) - len(inside)} lie outside the log's own time and are not shown.")
+            notes.append(
+                f"Events of kind {named}: {len(every) - len(inside)} lie outside the log's own time and are not shown."
+            )
         if len(inside) > len(longest):
             notes.append(f"Events of kind {named}: the {len(longest)} longest are shown, {len(inside) - len(longest)} are not.")
-        kept += (
-            Event(kind, max(one.start_ns, start_ns), min(one.end_ns, end_ns), one.text[:LONGEST_TEXT]) for one in longest
-        )
+        kept += (Event(kind, max(one.start_ns, start_ns), min(one.end_ns, end_ns), one.text[:LONGEST_TEXT]) for one in longest)
     return tuple(sorted(kept, key=lambda event: (event.start_ns, event.end_ns))), tuple(notes)

@@ -39,6 +39,7 @@ h3 { font-size: 17px; margin: 30px 0 4px; break-after: avoid; }
 nav { display: flex; flex-wrap: wrap; gap: 4px 16px; font-size: 14px; margin: 10px 0; }
 .pair { display: grid; grid-template-columns: repeat(auto-fit, minmax(min(100%, 440px), 1fr)); gap: 14px 24px; }
 .pair > * { min-width: 0; }
+.numeric { width: auto; min-width: min(100%, 620px); }
 .numeric th:not(:first-child), .numeric td:not(:first-child) { text-align: right; }
 .numeric th { white-space: normal; vertical-align: bottom; overflow-wrap: anywhere; }
 .numeric td:first-child { min-width: 130px; }
@@ -48,6 +49,7 @@ summary { cursor: pointer; font-size: 15px; padding: 8px 0; color: var(--soft); 
 @media print { @page { size: A4; margin: 12mm; } body { font-size: 12px; } nav, summary { display: none; }
   .pair { grid-template-columns: 1fr 1fr; gap: 8px 12px; } h2.log { break-before: page; } .conclusion { font-size: 16px; }
   table { font-size: 11px; } th, td { padding: 3px 8px 3px 0; } h3 { margin-top: 16px; }
+  section > .note, section > h3 { break-after: avoid; } .note { font-size: 11px; }
   details::details-content { content-visibility: visible; display: block; block-size: auto; } a { color: inherit; } }
 """
 

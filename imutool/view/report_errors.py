@@ -11,13 +11,13 @@ from jaxtyping import Float64
 
 from imutool.view.drawing import Panel, Picture, extremes, legend, plain_numbers
 from imutool.view.report_paths import color_of
-from imutool.view.report_words import aligned, number
+from imutool.view.report_words import aligned
 from imutool.view.rundata import RunData, Trace
 from imutool.view.theme import INK
 
 DECADES = 2.5  # shown below the largest error of the best run: nothing is decided further down
 APART = 8.0  # times between the largest errors of two runs: beyond, one scale for both is logarithmic, or leaves one out
-HEIGHTS_INCH = {1: 2.6, 3: 5.0, 4: 6.0}
+HEIGHTS_INCH = {1: 2.6, 3: 5.6, 4: 5.6}  # of one and of several rows: what stands side by side is of one height
 
 Line = Float64[np.ndarray, " n"]
 
@@ -58,7 +58,7 @@ def drift(data: RunData) -> Picture | None:
         _panel(data, scored, times, {"total": [one.orientation_deg for one in drifts]}, "Orientation drift", "°"),
         _panel(data, scored, times, {"total": [one.position_m for one in drifts]}, "Position drift", "m"),
     )
-    return Picture("drift", "Drift since the last reset", f"Set to the truth every {number(drifts[0].reset_s)} s.", panels)
+    return Picture("drift", "Drift since the last reset", f"Set to the truth every {drifts[0].reset_s:g} s.", panels)
 
 
 def _of(trace: Trace) -> Any:

@@ -32,22 +32,23 @@ def color_of(data: RunData, trace: Trace) -> str:
 
 def paths(data: RunData) -> Picture:
     """Truth and all runs from above and from the side, in one scale; what leaves the picture is said."""
-    side = _long_side(_reference(data))
     shown, far = _near(data)
-    panels = (
+    views = [((0, 1), "From above", shown), ((_long_side(_box(data, shown)), 2), "From the side", shown)]
+    if models := [trace for trace in far if not trace.is_raw]:
+        side = _long_side(_box(data, models))
+        views += [((0, 1), "All of it from above", models), ((side, 2), "All of it from the side", models)]
+    panels = tuple(
         Panel(
-            partial(_draw_paths, data=data, shown=shown, axes_of=(0, 1), title="From above"), HEIGHT_INCH, "Paths from above"
-        ),
-        Panel(
-            partial(_draw_paths, data=data, shown=shown, axes_of=(side, 2), title="From the side"),
-            HEIGHT_INCH,
-            "Paths from the side",
-        ),
+            partial(_draw_paths, data=data, shown=traces, axes_of=axes_of, title=title), HEIGHT_INCH, f"Paths: {title.lower()}"
+        )
+        for axes_of, title, traces in views
     )
-    left = [f"{trace.name} leaves the picture: it ends {measure(_end_m(data, trace), 'm')} away" for trace in far]
-    where = "from the true end" if data.truth is not None else "from the start"
-    marks = "Circle: start; square: end of the truth" if data.truth is not None else "Circle: start"
-    return Picture("paths", "Paths", ". ".join([marks, *(f"{one} {where}" for one in left)]) + ".", panels)
+    start = "start" if data.truth is None else "true end"
+    told = ["Circle: start" if data.truth is None else "Circle: start; square: end of the truth"]
+    for trace in far:
+        out_of = "the first two pictures" if models and not trace.is_raw else "every picture" if models else "the picture"
+        told.append(f"{trace.name} leaves {out_of} and ends {measure(_end_m(data, trace), 'm')} from the {start}")
+    return Picture("paths", "Paths", f"{'. '.join(told)}.", panels)
 
 
 def heat(data: RunData) -> Picture | None:
@@ -83,8 +84,7 @@ def _draw_paths(figure: Any, *, data: RunData, shown: Sequence[Trace], axes_of: 
         axes.plot(*data.truth.p_wb[-1, [across, up]], marker="s", ms=5, color=INK, ls="")
     start = (data.truth if data.truth is not None else data.traces[0].path).p_wb[0]
     axes.plot(*start[[across, up]], marker="o", ms=5, color=INK, ls="")
-    boxes = np.concatenate([_reference(data), *(trace.path.p_wb for trace in shown)])
-    _equal(axes, boxes[:, [across, up]])
+    _equal(axes, _box(data, shown)[:, [across, up]])
     axes.set(xlabel=f"{AXES[across]} (m)", ylabel=f"{AXES[up]} (m)")
     axes.set_title(title)
     legend(figure, lines)
@@ -155,6 +155,11 @@ def _reference(data: RunData) -> Points:
     if data.truth is not None:
         return data.truth.p_wb
     return min((trace.path.p_wb for trace in data.traces), key=_extent)
+
+
+def _box(data: RunData, shown: Sequence[Trace]) -> Points:
+    """What is to be seen when these runs are shown beside the truth."""
+    return np.concatenate([_reference(data), *(trace.path.p_wb for trace in shown)])
 
 
 def _extent(points: Points) -> float:

@@ -42,7 +42,7 @@ def zoom(data: RunData) -> Picture | None:
         return None
     assert chosen is not None, "then nothing was found"
     first = min(max(found[1] - ZOOM_S / 2.0, 0.0), data.duration_s - ZOOM_S)
-    caption = f"Every sample of {number(ZOOM_S)} s around the largest orientation error of {chosen.name}."
+    caption = f"Every sample of {ZOOM_S:g} s around the largest orientation error of {chosen.name}."
     return _samples(data, "zoom", "Signals where the error is largest", caption, (first, first + ZOOM_S))
 
 
@@ -113,7 +113,7 @@ def _by_axis(figure: Any, sensor: str, title: str, unit: str) -> Sequence[Any]:
     """Three panels under each other, x, y and z in their colours."""
     panels: Sequence[Any] = figure.subplots(3, 1, sharex=True)
     for axis, axes in enumerate(panels):
-        axes.set_ylabel(f"{AXES[axis]} ({unit})", color=AXIS_COLORS[axis], fontweight="bold")
+        axes.set_ylabel(f"{AXES[axis]} ({unit})" if unit else AXES[axis], color=AXIS_COLORS[axis], fontweight="bold")
     panels[0].set_title(title)
     figure.align_ylabels(panels)
     return panels

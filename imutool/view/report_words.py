@@ -89,17 +89,18 @@ def conclusion(data: RunData) -> str:
 
 def compared(chosen: Trace, before: Trace) -> str:
     """How a model stands to raw: orientation first, then position."""
-    parts = []
+    parts: list[tuple[str, str]] = []
     for figure, what, unit in (("aoe_deg", "orientation", "°"), ("ape_m", "position", "m")):
         old, new = float(before.figures[figure]), float(chosen.figures[figure])
-        span = f"from {measure(old, unit)} to {measure(new, unit)}"
+        span = f"the {what} error from {measure(old, unit)} to {measure(new, unit)}"
         if abs(new - old) <= SAME * max(old, new):
-            parts.append(f"leaves the {what} error about as it was ({measure(old, unit)}, now {measure(new, unit)})")
+            parts.append(("leaves", f"the {what} error about as it was ({measure(old, unit)}, now {measure(new, unit)})"))
         elif new < old:
-            parts.append(f"cuts the {what} error {span} ({times(old, new)})")
+            parts.append(("cuts", f"{span} ({times(old, new)})"))
         else:
-            parts.append(f"raises the {what} error {span} ({times(new, old)})")
-    return f"{chosen.name} {' and '.join(parts)}"
+            parts.append(("raises", f"{span} ({times(new, old)})"))
+    (does, first), (also, second) = parts
+    return f"{chosen.name} {does} {first} and {second if also == does else f'{also} {second}'}"
 
 
 def times(large: float, small: float) -> str:

@@ -236,7 +236,11 @@ def _scored(runs: Sequence[Run], truth: Poses, where: str, align: Alignment) -> 
             rows, true, valid = stretch_with_truth(stamps, truth, where)
         path = dead_reckon(run.imu.rows(rows), Start.of(true))
         moved, motion = aligned(path, true, valid, align)
-        of_truth = drift_since_reset(path, true, valid), windows(path, true, valid), MappingProxyType(evaluate(path, true, valid))
+        of_truth = (
+            drift_since_reset(path, true, valid),
+            windows(path, true, valid),
+            MappingProxyType(evaluate(path, true, valid)),
+        )
         traces.append(Trace(run, moved, errors(moved, true, valid), *of_truth, spectra=spectra(run.imu)))
         if align != "none":
             away_m = np.linalg.norm(moved.p_wb[valid].mean(axis=0) - path.p_wb[valid].mean(axis=0))
