@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, NoReturn
 
@@ -11,7 +12,7 @@ import typer
 from imutool.cli._app import LOST, Init, Json, Overwrite, Quiet, Smooth, Verbose, app
 from imutool.errors import ConfigError
 from imutool.mcap_io.losses import Losses
-from imutool.place import place
+from imutool.place import Place, place
 from imutool.terminal import progress, say, tell_losses, write_json
 
 MODEL_HELP = (
@@ -36,6 +37,9 @@ def debias(
     clean: Annotated[
         bool, typer.Option("--clean", help="Leave out what is no measurement, convert units (imutool clean).")
     ] = False,
+    report_to: Annotated[
+        Path | None, typer.Option("--report", metavar="F.html", help="Write a page about the debiased log.")
+    ] = None,
     overwrite: Overwrite = False,
     json_to: Json = None,
     verbose: Verbose = False,
@@ -44,6 +48,10 @@ def debias(
     """Rewrite a log with a debiased IMU channel; everything else passes through unchanged."""
     _refuse_contradictions(target, in_place, overwrite)
     models = assigned(model or ())
+    if report_to is not None:
+        from imutool.view import report as pages
+
+        pages.refuse(report_to, overwrite=overwrite)
     from imutool.clean import Rules
     from imutool.debias import debias as run
 
@@ -60,6 +68,9 @@ def debias(
             overwrite=overwrite,
             progress=lambda done, total: tell(done, total, ""),
         )
+        if report_to is not None:
+            tell(1, 1, "drawing")
+            _draw(place(target or source), list(report.starts), report_to, overwrite)
     imus = {
         topic: {
             "model": report.models[topic],
@@ -86,8 +97,21 @@ def debias(
     counts = ", ".join(f"{count} on {name}" for name, count in added.items())
     say(f"{target or source}: {copied} messages as they were, {counts}")
     say(f"checked: every index, and the contents of {verified.chunks_checked} of {verified.chunks} chunks (--verify {verify})")
+    if report_to is not None:
+        say(f"Report: {report_to}")
     tell_losses(report.losses.plain())
     _leave(report.losses)
+
+
+def _draw(log: Place, topics: Sequence[str], page: Path, overwrite: bool) -> None:
+    """A page about the debiased log, each of its IMUs under its own topic where there are several."""
+    from imutool.view.report import write_page
+    from imutool.view.runs import load
+
+    logs = [load(log, imu=topic) for topic in topics]
+    if len(logs) > 1:
+        logs = [replace(one, name=f"{one.name} {topic}") for one, topic in zip(logs, topics, strict=True)]
+    write_page(logs, page, overwrite=overwrite)
 
 
 def _leave(losses: Losses) -> NoReturn:

@@ -19,7 +19,7 @@ def view(
     truth: Truth = None,
     imu: Imu = None,
     save: Annotated[Path | None, typer.Option(metavar="F.rrd", help="Save instead of opening the viewer.")] = None,
-    png: Annotated[Path | None, typer.Option(metavar="DIR", help="Also draw error curves, LOG.png each.")] = None,
+    png: Annotated[Path | None, typer.Option(metavar="DIR", help="Also draw its pictures, LOG-errors.png and so on.")] = None,
     overwrite: Overwrite = False,
     verbose: Verbose = False,
     quiet: Quiet = False,
@@ -35,7 +35,6 @@ def view(
             tell(done, len(logs), log.name)
             data.append(load(log, models=model or (), init=init, imu=imu, truth=truth))
     if png is not None:
-        png.mkdir(parents=True, exist_ok=True)
-        for log, one in zip(logs, data, strict=True):
-            report.error_curves(one, png / f"{log.stem}.png", overwrite=overwrite)
+        for one in data:
+            report.write_pngs(one, png, overwrite=overwrite)
     say(viewer.show(data, save=save, overwrite=overwrite))

@@ -237,7 +237,7 @@ def _curves(figure: Any) -> dict[str, str]:
     from matplotlib.collections import Collection
     from matplotlib.lines import Line2D
 
-    titles = {}
+    titles: dict[str, str] = {}
     for axes in figure.get_axes():
         for artist in (*axes.lines, *axes.collections):
             name = str(artist.get_label())

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
 
@@ -16,6 +15,7 @@ from imutool.mcap_io import schema
 from imutool.mcap_io.log import DERIVED_KEY, ImuBatch, Log
 from imutool.mcap_io.losses import told
 from imutool.mcap_io.read import recording_in
+from imutool.place import Place
 from imutool.recording import Imu, Recording
 from imutool.view.rundata import Logged, Run
 
@@ -38,7 +38,7 @@ class Recorded:
     notes: tuple[str, ...]
 
 
-def recorded(path: Path, *, imu: str | None = None, truth: str | None = None) -> Recorded:
+def recorded(path: Place, *, imu: str | None = None, truth: str | None = None) -> Recorded:
     """Reads a log for looking at it.
 
     An IMU that cannot be held as it is (stamps that repeat or go back, values that are no numbers) is read as `debias --clean`

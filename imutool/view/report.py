@@ -39,7 +39,6 @@ h3 { font-size: 17px; margin: 30px 0 4px; break-after: avoid; }
 nav { display: flex; flex-wrap: wrap; gap: 4px 16px; font-size: 14px; margin: 10px 0; }
 .pair { display: grid; grid-template-columns: repeat(auto-fit, minmax(min(100%, 440px), 1fr)); gap: 14px 24px; }
 .pair > * { min-width: 0; }
-.numeric { width: auto; min-width: min(100%, 620px); }
 .numeric th:not(:first-child), .numeric td:not(:first-child) { text-align: right; }
 .numeric th { white-space: normal; vertical-align: bottom; overflow-wrap: anywhere; }
 .numeric td:first-child { min-width: 130px; }
@@ -112,6 +111,16 @@ def file_name(name: str) -> str:
     return re.sub(r"[^\w.+-]", "_", name).lstrip(".-")[:100] or "_"
 
 
+def refuse(path: Place, *, overwrite: bool = False) -> None:
+    """Nothing, where a page can be written; to be asked before the work is done.
+
+    Raises:
+        ConfigError: matplotlib is not installed, or the file exists (without `overwrite`) or cannot be written.
+    """
+    library()
+    Target(path, overwrite=overwrite).abandon()
+
+
 def _pictures(data: RunData) -> Iterator[Picture | None]:
     for make in PICTURES:
         yield make(data)
@@ -126,8 +135,7 @@ def _log(data: RunData, key: str, *, alone: bool) -> Iterator[str]:
     links = [("figures", "Figures")] * bool(data.table()) + list(entries.items()) + [("provenance", "Provenance")]
     yield f'<nav aria-label="Parts of the report about {text(data.name)}">'
     yield "".join(f'<a href="#{key}-{name}">{text(title)}</a>' for name, title in links) + "</nav>"
-    yield from _figures(data, key)
-    yield from _windows(data)
+    yield f'<div class="pair">{"".join((*_figures(data, key), *_windows(data)))}</div>'
     if not alone:
         yield "<details><summary>Pictures, events and provenance</summary>"
     for picture in pictures:
@@ -189,7 +197,7 @@ def _windows(data: RunData) -> Iterator[str]:
     runs = [trace for trace in data.traces if trace.windows]
     quantities = (("orientation_deg", "°"), ("velocity_m_s", "m/s"), ("position_m", "m"))
     head = "".join(f"<th>{text(name)}</th>" for name in ("", *(trace.name for trace in runs)))
-    yield "<h3>Drift from a true start</h3>"
+    yield "<section><h3>Drift from a true start</h3>"
     yield f'<div class="scroll"><table class="numeric"><thead><tr>{head}</tr></thead><tbody>'
     for name, unit in quantities:
         for length in lengths:
@@ -198,7 +206,7 @@ def _windows(data: RunData) -> Iterator[str]:
             values = [value if value is not None and np.isfinite(value) else None for value in values]
             words = f"{name.split('_')[0].capitalize()} after {length:g} s ({unit})"
             yield f"<tr><td>{words}</td>{_cells(values, lowest(values, name))}</tr>"
-    yield '</tbody></table></div><p class="note">Root mean squares at the ends of windows that each start from the truth.</p>'
+    yield '</tbody></table></div><p class="note">Root mean squares at the ends of windows that each start from the truth.</p></section>'
 
 
 def _compared(logs: Sequence[RunData]) -> Iterator[str]:

@@ -99,7 +99,7 @@ def _draw_heat(figure: Any, *, points: Points, error: Float64[np.ndarray, " _"],
     rows = sparse(len(points), MOST_POINTS)
     points, error = points[rows], error[rows]
     top = float(np.nanmax(error))
-    edges = MaxNLocator(len(LEVELS), min_n_ticks=3).tick_values(0.0, top if top > 0.0 else 1.0)
+    edges = np.asarray(MaxNLocator(len(LEVELS), min_n_ticks=3).tick_values(0.0, top if top > 0.0 else 1.0))
     edges = edges[edges >= 0.0][: len(LEVELS) + 1]
     level = np.clip(np.searchsorted(edges, error, side="right") - 1, 0, len(edges) - 2)
     axes.plot(points[:, 0], points[:, 1], color=HELD, lw=0.6)  # where there is no truth to compare with

@@ -90,8 +90,9 @@ def at_rest(data: RunData) -> Picture | None:
     rest_s = sum(b - a for a, b in ranges) * imu.period_s
     curves: dict[str, list[Any]] = {sensor: [] for sensor in SENSORS}
     for trace in data.traces:
-        for sensor, values in _both(trace.run.imu).items():
-            curve = allan.curve([values[a:b] for a, b in ranges], imu.period_s)
+        still = [trace.run.imu.between(int(imu.t_ns[a]), int(imu.t_ns[b - 1])) for a, b in ranges]
+        for sensor in SENSORS:
+            curve = allan.curve([_both(one)[sensor] for one in still], imu.period_s)
             curves[sensor].append((trace, curve.tau_s, curve.deviation))
     panels = [
         Panel(partial(_draw_allan, data=data, sensor=one, curves=curves[one]), HEIGHT_INCH, f"{TITLES[one]} Allan deviation")
