@@ -11,7 +11,7 @@ from jaxtyping import Float64
 
 from imutool.recording import Poses
 from imutool.view.drawing import Panel, Picture, legend
-from imutool.view.report_words import best, measure
+from imutool.view.report_words import best, measure, spoken
 from imutool.view.rundata import RunData, Trace, sparse, stretches
 from imutool.view.theme import AXES, BEFORE, HELD, INK, LEVELS, MODELS
 
@@ -47,7 +47,7 @@ def paths(data: RunData) -> Picture:
     told = ["Circle: start" if data.truth is None else "Circle: start; square: end of the truth"]
     for trace in far:
         out_of = "the first two pictures" if models and not trace.is_raw else "every picture" if models else "the picture"
-        told.append(f"{trace.name} leaves {out_of} and ends {measure(_end_m(data, trace), 'm')} from the {start}")
+        told.append(f"{spoken(trace)} leaves {out_of} and ends {measure(_end_m(data, trace), 'm')} from the {start}")
     return Picture("paths", "Paths", f"{'. '.join(told)}.", panels)
 
 
@@ -56,19 +56,17 @@ def heat(data: RunData) -> Picture | None:
     trace = best(data)
     if trace is None or trace.errors is None or data.truth is None:
         return None
-    along = trace.path if trace in _near(data)[0] else data.truth
-    rows = np.isin(trace.errors.t_ns, along.t_ns) if along is trace.path else slice(None)
+    fits = trace in _near(data)[0]
+    points = trace.path.p_wb if fits else data.truth.at(trace.path.t_ns)[0].p_wb
     kinds = {"Position": (trace.errors.position_total_m, "m"), "Orientation": (trace.errors.orientation_total_deg, "°")}
     panels = []
     for kind, (error, unit) in kinds.items():
-        at = np.interp(along.t_ns.astype(float), trace.errors.t_ns.astype(float), error) if along is data.truth else error[rows]
-        points, worst = along.p_wb, float(np.nanmax(error))
-        draw = partial(_draw_heat, points=points, error=at, title=f"{kind} error (max. {measure(worst, unit)})", unit=unit)
-        panels.append(Panel(draw, HEIGHT_INCH, f"Path of {trace.name} from above, coloured by its {kind.lower()} error"))
-    caption = (
-        f"Path of {trace.name} from above" if along is trace.path else f"The true path, with the error that {trace.name} has"
-    )
-    return Picture("error-map", "Where the error grows", f"{caption}; colours by its error.", tuple(panels))
+        title = f"{kind} error, at most {measure(float(np.nanmax(error)), unit)}"
+        draw = partial(_draw_heat, points=points, error=error, title=title, unit=unit)
+        panels.append(Panel(draw, HEIGHT_INCH, f"{kind} error of {trace.name} along the path from above, in colours"))
+    whose = f"Path of {spoken(trace)}" if fits else "The true path"
+    caption = f"{whose} from above, coloured by the error that {spoken(trace)} has there."
+    return Picture("error-map", "Where the error grows", caption, tuple(panels))
 
 
 def _draw_paths(figure: Any, *, data: RunData, shown: Sequence[Trace], axes_of: tuple[int, int], title: str) -> None:
@@ -96,8 +94,8 @@ def _draw_heat(figure: Any, *, points: Points, error: Float64[np.ndarray, " _"],
     from matplotlib.ticker import MaxNLocator
 
     axes = figure.subplots()
-    rows = sparse(len(points), MOST_POINTS)
-    points, error = points[rows], error[rows]
+    starts = np.unique(np.linspace(0, len(points) - 1, min(len(points), MOST_POINTS)).astype(int))
+    points, error = points[starts], np.fmax.reduceat(error, starts)  # the largest of each step
     top = float(np.nanmax(error))
     edges = np.asarray(MaxNLocator(len(LEVELS), min_n_ticks=3).tick_values(0.0, top if top > 0.0 else 1.0))
     edges = edges[edges >= 0.0][: len(LEVELS) + 1]
