@@ -136,6 +136,7 @@ def _log(data: RunData, key: str, *, alone: bool) -> Iterator[str]:
     yield f'<nav aria-label="Parts of the report about {text(data.name)}">'
     yield "".join(f'<a href="#{key}-{name}">{text(title)}</a>' for name, title in links) + "</nav>"
     yield f'<div class="pair">{"".join((*_figures(data, key), *_windows(data)))}</div>'
+    yield from (f'<p class="note">{text(note)}</p>' for note in data.notes)
     if not alone:
         yield "<details><summary>Pictures, events and provenance</summary>"
     for picture in pictures:
@@ -206,7 +207,8 @@ def _windows(data: RunData) -> Iterator[str]:
             values = [value if value is not None and np.isfinite(value) else None for value in values]
             words = f"{name.split('_')[0].capitalize()} after {length:g} s ({unit})"
             yield f"<tr><td>{words}</td>{_cells(values, lowest(values, name))}</tr>"
-    yield '</tbody></table></div><p class="note">Root mean squares at the ends of windows that each start from the truth.</p></section>'
+    yield '</tbody></table></div><p class="note">Root mean squares at the ends of windows that each start from the truth.</p>'
+    yield "</section>"
 
 
 def _compared(logs: Sequence[RunData]) -> Iterator[str]:
@@ -227,7 +229,6 @@ def _compared(logs: Sequence[RunData]) -> Iterator[str]:
 
 def _provenance(data: RunData, key: str) -> Iterator[str]:
     yield f'<section id="{key}-provenance"><h3>Provenance</h3>'
-    yield from (f"<p>{text(note)}</p>" for note in data.notes)
     yield "<dl>"
     for name, words in data.provenance.items():
         yield f"<dt>{text(name)}</dt><dd>{text(words)}</dd>"

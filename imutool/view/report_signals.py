@@ -13,7 +13,7 @@ from imutool import allan, stationary
 from imutool.recording import Imu
 from imutool.view.drawing import Panel, Picture, averaged, extremes, legend, plain_numbers
 from imutool.view.report_paths import color_of
-from imutool.view.report_words import best, number, worst
+from imutool.view.report_words import best, number, spoken, worst
 from imutool.view.rundata import RunData, Trace
 from imutool.view.theme import AXES, AXIS_COLORS, INK, TITLES, UNITS
 
@@ -42,7 +42,7 @@ def zoom(data: RunData) -> Picture | None:
         return None
     assert chosen is not None, "then nothing was found"
     first = min(max(found[1] - ZOOM_S / 2.0, 0.0), data.duration_s - ZOOM_S)
-    caption = f"Every sample of {ZOOM_S:g} s around the largest orientation error of {chosen.name}."
+    caption = f"Every sample of {ZOOM_S:g} s around the largest orientation error of {spoken(chosen)}."
     return _samples(data, "zoom", "Signals where the error is largest", caption, (first, first + ZOOM_S))
 
 

@@ -15,8 +15,8 @@ LABELS = {
     "ape_m": "Position error (APE, m)",
     "ape_aligned_m": "Position error, aligned (m)",
     "velocity_rmse_m_s": "Velocity error (m/s)",
-    "roe_deg": "Turned wrongly over {} m (ROE, °)",
-    "rpe_m": "Moved wrongly over {} m (RPE, m)",
+    "roe_deg": "Turn over {} m (ROE, °)",
+    "rpe_m": "Motion over {} m (RPE, m)",
 }
 SAME = 0.05  # closer than that, two errors are about the same
 COUNTS = ("samples", "duration_s")  # no errors
@@ -32,6 +32,11 @@ def best(data: RunData) -> Trace | None:
 def raw(data: RunData) -> Trace | None:
     """The run as recorded, where it is among those shown."""
     return next((trace for trace in data.traces if trace.is_raw), None)
+
+
+def spoken(trace: Trace) -> str:
+    """A run's name within a sentence."""
+    return trace.name.removeprefix("in the log: ")
 
 
 def number(value: float | None) -> str:
@@ -79,7 +84,7 @@ def conclusion(data: RunData) -> str:
     if chosen is None:
         return _without_truth(data)
     if chosen.is_raw or before is None:
-        told = f"{chosen.name} is wrong by {_errors(chosen)} over {number(data.duration_s)} s, {aligned(data)}"
+        told = f"{spoken(chosen)} is wrong by {_errors(chosen)} over {number(data.duration_s)} s, {aligned(data)}"
     else:
         told = f"{compared(chosen, before)} over {number(chosen.figures['duration_s'])} s, {aligned(data)}"
     found = worst(chosen, data)
@@ -100,7 +105,7 @@ def compared(chosen: Trace, before: Trace) -> str:
         else:
             parts.append(("raises", f"{span} ({times(new, old)})"))
     (does, first), (also, second) = parts
-    return f"{chosen.name} {does} {first} and {second if also == does else f'{also} {second}'}"
+    return f"{spoken(chosen)} {does} {first} and {second if also == does else f'{also} {second}'}"
 
 
 def times(large: float, small: float) -> str:
@@ -131,10 +136,10 @@ def cards(data: RunData) -> list[tuple[str, str]]:
     told = [(f"{number(data.duration_s)} s", f"{len(data.traces[0].run.imu):,} samples at {rate_hz(data):.0f} Hz")]
     chosen, before = best(data), raw(data)
     for trace in dict.fromkeys(one for one in (before, chosen) if one is not None and one.figures):
-        told.append((measure(float(trace.figures["aoe_deg"]), "°"), f"orientation error, {trace.name}"))
-        told.append((measure(float(trace.figures["ape_m"]), "m"), f"position error, {trace.name}"))
+        told.append((measure(float(trace.figures["aoe_deg"]), "°"), f"orientation error, {spoken(trace)}"))
+        told.append((measure(float(trace.figures["ape_m"]), "m"), f"position error, {spoken(trace)}"))
     if chosen is not None and (window := _window(chosen, 10.0)) is not None:
-        told.append((measure(window, "°"), f"drift in 10 s, {chosen.name}"))
+        told.append((measure(window, "°"), f"drift in 10 s, {spoken(chosen)}"))
     if (count := sum(event.kind != "worst" for event in data.events)) > 0:
         told.append((f"{count:,}", "events"))
     return told
@@ -170,7 +175,5 @@ def _without_truth(data: RunData) -> str:
     told = f"{data.name}: {number(data.duration_s)} s without truth, so nothing says how wrong it is."
     for trace in data.models():
         gyro, accel = (np.linalg.norm(bias.mean(axis=0)) for bias in (trace.run.gyro_bias, trace.run.accel_bias))
-        told += (
-            f" {trace.name} takes {np.degrees(gyro):.3g}°/s off the angular rate and {accel:.3g} m/s² off the specific force."
-        )
+        told += f" {spoken(trace)} takes {np.degrees(gyro):.3g}°/s off the angular rate and {accel:.3g} m/s² off the specific force."
     return told

@@ -38,7 +38,7 @@ def load(
     recording = found.recording
     if recording.truths:
         recording = recording.with_truth(truth or next(iter(recording.truths)))
-    with_models, told = _with_models(recording, models, init, log, smooth) if models else ([], {})
+    with_models, told = _with_models(recording, models, init, str(log), smooth) if models else ([], {})
     events, notes = of_survey(found.survey)
     if findings is not None:
         start_ns, end_ns = int(recording.imu.t_ns[0]), int(recording.imu.t_ns[-1])
@@ -61,7 +61,7 @@ def load(
 
 
 def _with_models(
-    recording: Recording, models: Sequence[str | Path], init: str, log: Place, smooth: bool
+    recording: Recording, models: Sequence[str | Path], init: str, log: str, smooth: bool
 ) -> tuple[list[Run], dict[str, str]]:
     """As each model corrects the samples, and in words which file that is and how it started; only this needs torch."""
     from imutool.debias import apply_with_std
