@@ -28,11 +28,8 @@ if TYPE_CHECKING:
 
 FINDINGS, PHYSICS, REPORT, LOG, VIEW = "findings.json", "physics.toml", "report.html", "log.html", "view.rrd"
 FILES = (FINDINGS, PHYSICS, REPORT, LOG, VIEW)
-NEEDS = {
-    LOG: ("matplotlib", "report"),
-    REPORT: ("matplotlib", "report"),
-    VIEW: ("rerun", "view"),
-}  # a file, the library that draws it, and its extra
+DRAWN = ("matplotlib", "report")  # the library that draws a file, and its extra
+NEEDS = {LOG: DRAWN, REPORT: DRAWN, VIEW: ("rerun", "view")}
 
 
 def refuse(folder: Path, *, overwrite: bool = False) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, NoReturn
 
@@ -105,13 +104,10 @@ def debias(
 
 def _draw(log: Place, topics: Sequence[str], page: Path, overwrite: bool) -> None:
     """A page about the debiased log, each of its IMUs under its own topic where there are several."""
-    from imutool.view.report import write_page
+    from imutool.view.report import by_topic, write_page
     from imutool.view.runs import load
 
-    logs = [load(log, imu=topic) for topic in topics]
-    if len(logs) > 1:
-        logs = [replace(one, name=f"{one.name} {topic}") for one, topic in zip(logs, topics, strict=True)]
-    write_page(logs, page, overwrite=overwrite)
+    write_page(by_topic([load(log, imu=topic) for topic in topics], topics), page, overwrite=overwrite)
 
 
 def _leave(losses: Losses) -> NoReturn:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import platform
 import re
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -109,6 +110,13 @@ def write_pngs(data: RunData, folder: Path, *, overwrite: bool = False) -> list[
 def file_name(name: str) -> str:
     """What files about a log are called: its name without anything that leads elsewhere or hides the file."""
     return re.sub(r"[^\w.+-]", "_", name).lstrip(".-")[:100] or "_"
+
+
+def by_topic(logs: Sequence[RunData], topics: Sequence[str]) -> list[RunData]:
+    """Several IMUs of one log, each called by its topic too; a single one keeps the log's name."""
+    if len(logs) < 2:
+        return list(logs)
+    return [replace(data, name=f"{data.name} {topic}") for data, topic in zip(logs, topics, strict=True)]
 
 
 def refuse(path: Place, *, overwrite: bool = False) -> None:

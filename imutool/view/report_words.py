@@ -175,5 +175,6 @@ def _without_truth(data: RunData) -> str:
     told = f"{data.name}: {number(data.duration_s)} s without truth, so nothing says how wrong it is."
     for trace in data.models():
         gyro, accel = (np.linalg.norm(bias.mean(axis=0)) for bias in (trace.run.gyro_bias, trace.run.accel_bias))
-        told += f" {spoken(trace)} takes {np.degrees(gyro):.3g}°/s off the angular rate and {accel:.3g} m/s² off the specific force."
+        off = f"{np.degrees(gyro):.3g}°/s off the angular rate and {accel:.3g} m/s² off the specific force"
+        told += f" {spoken(trace)} takes {off}."
     return told
