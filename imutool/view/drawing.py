@@ -55,6 +55,7 @@ STYLE = {
     "svg.fonttype": "none",
     "text.parse_math": False,  # a dollar in the name of a channel is a dollar
     "axes.formatter.useoffset": False,  # an axis that says +1.2e-3 in a corner is misread
+    "axes.formatter.limits": (-6, 9),  # nor is a power of ten above an axis seen
     "axes.formatter.use_mathtext": False,
     "axes.unicode_minus": True,
 }

@@ -20,6 +20,7 @@ MOST_POINTS = 1500  # of a path
 FAR = 3.0  # times the truth's extent, beyond which a path leaves the picture
 MARGIN = 0.06
 SHAPE = 1.25  # a panel is about so much wider than high
+KILOMETRES_M = 5000.0  # from which on a picture counts in kilometres
 LEAST_M = 0.5  # of a picture: a log at rest is not blown up to its millimetres
 
 Points = Float64[np.ndarray, "_ 3"]
@@ -71,19 +72,21 @@ def heat(data: RunData) -> Picture | None:
 
 def _draw_paths(figure: Any, *, data: RunData, shown: Sequence[Trace], axes_of: tuple[int, int], title: str) -> None:
     axes = figure.subplots()
-    across, up = axes_of
+    sides = list(axes_of)
+    box = _box(data, shown)
+    scale, unit = _unit_of(_extent(box))
     lines = []
     for trace in data.traces:
         style = {"lw": 0.9 if trace.is_raw else 1.3, "color": color_of(data, trace), "label": trace.name}
-        lines += axes.plot(*_broken(trace.path, across, up), **style)
+        lines += axes.plot(*(_broken(trace.path)[:, sides] * scale).T, **style)
     if data.truth is not None:
-        true = axes.plot(*_broken(data.truth, across, up), lw=1.1, color=INK, ls=(0, (4, 2)), label="truth")
+        true = axes.plot(*(_broken(data.truth)[:, sides] * scale).T, lw=1.1, color=INK, ls=(0, (4, 2)), label="truth")
         lines = [*true, *lines]
-        axes.plot(*data.truth.p_wb[-1, [across, up]], marker="s", ms=5, color=INK, ls="")
+        axes.plot(*data.truth.p_wb[-1, sides] * scale, marker="s", ms=5, color=INK, ls="")
     start = (data.truth if data.truth is not None else data.traces[0].path).p_wb[0]
-    axes.plot(*start[[across, up]], marker="o", ms=5, color=INK, ls="")
-    _equal(axes, _box(data, shown)[:, [across, up]])
-    axes.set(xlabel=f"{AXES[across]} (m)", ylabel=f"{AXES[up]} (m)")
+    axes.plot(*start[sides] * scale, marker="o", ms=5, color=INK, ls="")
+    _equal(axes, box[:, sides] * scale, LEAST_M * scale)
+    axes.set(xlabel=f"{AXES[sides[0]]} ({unit})", ylabel=f"{AXES[sides[1]]} ({unit})")
     axes.set_title(title)
     legend(figure, lines)
 
@@ -96,6 +99,8 @@ def _draw_heat(figure: Any, *, points: Points, error: Float64[np.ndarray, " _"],
     axes = figure.subplots()
     starts = np.unique(np.linspace(0, len(points) - 1, min(len(points), MOST_POINTS)).astype(int))
     points, error = points[starts], np.fmax.reduceat(error, starts)  # the largest of each step
+    scale, unit = _unit_of(float(np.nanmax(error))) if unit == "m" else (1.0, unit)
+    error = error * scale
     top = float(np.nanmax(error))
     edges = np.asarray(MaxNLocator(len(LEVELS), min_n_ticks=3).tick_values(0.0, top if top > 0.0 else 1.0))
     edges = edges[edges >= 0.0][: len(LEVELS) + 1]
@@ -106,11 +111,11 @@ def _draw_heat(figure: Any, *, points: Points, error: Float64[np.ndarray, " _"],
         here = (level == k) & np.isfinite(error)
         x, y = _pieces(points, here)
         axes.plot(x, y, color=color, lw=2.2, label=f"{edges[k]:g} to {edges[k + 1]:g} {unit}", solid_capstyle="round")
-    _equal(axes, points[:, :2])
+    _equal(axes, points[:, :2], LEAST_M)
     axes.set(xlabel="x (m)", ylabel="y (m)")
     axes.set_title(title)
-    scale = ScalarMappable(BoundaryNorm(edges, len(colors)), ListedColormap(colors))
-    bar = figure.colorbar(scale, ax=axes, shrink=0.8, pad=0.02)
+    colored = ScalarMappable(BoundaryNorm(edges, len(colors)), ListedColormap(colors))
+    bar = figure.colorbar(colored, ax=axes, shrink=0.8, pad=0.02)
     bar.set_label(f"error ({unit})")
     bar.outline.set_visible(False)
     bar.ax.grid(visible=False)
@@ -128,23 +133,28 @@ def _pieces(points: Points, here: Any) -> tuple[Any, Any]:
     return out[:, 0], out[:, 1]
 
 
-def _broken(poses: Poses, across: int, up: int) -> tuple[Any, Any]:
+def _broken(poses: Poses) -> Points:
     """A path as one line that is broken where poses are missing."""
     parts = stretches(poses)
     share = max(2, MOST_POINTS // max(len(parts), 1))
     hole = np.full((1, 3), np.nan)
     rows = [piece for part in parts for piece in (part.p_wb[sparse(len(part), share)], hole)][:-1]
-    line = np.concatenate(rows)
-    return line[:, across], line[:, up]
+    return np.concatenate(rows)
 
 
-def _equal(axes: Any, box: Float64[np.ndarray, "_ 2"]) -> None:
+def _unit_of(extent_m: float) -> tuple[float, str]:
+    """What metres are multiplied by to be read easily, and what they are then."""
+    return (1e-3, "km") if extent_m >= KILOMETRES_M else (1.0, "m")
+
+
+def _equal(axes: Any, box: Float64[np.ndarray, "_ 2"], least: float) -> None:
     """Limits around what is to be seen, a metre as long upwards as across."""
     low, high = np.nanmin(box, axis=0), np.nanmax(box, axis=0)
-    middle, half = (low + high) / 2.0, np.maximum((high - low) * (0.5 + MARGIN), LEAST_M / 2.0)
+    middle, half = (low + high) / 2.0, np.maximum((high - low) * (0.5 + MARGIN), least / 2.0)
     half = np.maximum(half, half[::-1] * [SHAPE, 1.0 / SHAPE])  # no wider or higher than the room that there is
     axes.set_xlim(middle[0] - half[0], middle[0] + half[0])
     axes.set_ylim(middle[1] - half[1], middle[1] + half[1])
+    axes.locator_params(nbins=7)
     axes.set_aspect("equal", adjustable="box")
 
 

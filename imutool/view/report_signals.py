@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from functools import partial
+from importlib.util import find_spec
 from typing import Any
 
 import numpy as np
@@ -22,7 +23,7 @@ HEIGHT_INCH = 4.2
 ZOOM_S = 4.0
 SIGMAS = 3.0
 BAND_POINTS = 300
-LEAST_REST_S = 5.0  # in one piece, from which an Allan deviation says something
+LEAST_REST_S = 4.0  # in one piece, from which an Allan deviation says something
 NOUNS = {"gyro": "Angular rate", "accel": "Specific force"}
 
 Vectors = Float64[np.ndarray, "_ 3"]
@@ -78,11 +79,12 @@ def spectrum(data: RunData) -> Picture | None:
 
 
 def at_rest(data: RunData) -> Picture | None:
-    """Allan deviations, raw and corrected, over the time in which the log rests; nothing where it does not rest for long.
+    """Allan deviations, raw and corrected, over the time in which the log rests.
 
-    Raises:
-        ConfigError: allantools is not installed.
+    Nothing where it does not rest for long, or where allantools is not installed (`left_out` says so).
     """
+    if find_spec("allantools") is None:
+        return None
     imu = data.traces[0].run.imu
     ranges = [(a, b) for a, b in stationary.stretches(imu) if (b - a) * imu.period_s >= LEAST_REST_S]
     if not ranges:
@@ -100,6 +102,13 @@ def at_rest(data: RunData) -> Picture | None:
     ]
     caption = f"Over {number(rest_s)} s at rest in {len(ranges)} stretch{'es' * (len(ranges) > 1)}; overlapping."
     return Picture("allan", "Allan deviation at rest", caption, tuple(panels))
+
+
+def left_out() -> list[str]:
+    """Sentences about pictures that there could be if more were installed."""
+    if find_spec("allantools") is not None:
+        return []
+    return ["Allan deviations are left out: allantools is not installed (pip install 'imutool[report]')."]
 
 
 def _samples(data: RunData, name: str, title: str, caption: str, span_s: tuple[float, float]) -> Picture:
@@ -127,8 +136,8 @@ def _draw_samples(figure: Any, *, data: RunData, sensor: str, span_s: tuple[floa
         t = data.elapsed_s(trace.run.imu.t_ns)
         part = slice(*np.searchsorted(t, span_s, side="left") + np.array([0, 1]))
         values = _both(trace.run.imu)[sensor][part]
-        style: dict[str, Any] = {"color": color_of(data, trace), "lw": 1.8 if trace.is_raw else 0.8}
-        style["alpha"] = 0.55 if trace.is_raw else 1.0
+        under = trace.is_raw and bool(data.models())
+        style: dict[str, Any] = {"color": color_of(data, trace), "lw": 1.8 if under else 0.8, "alpha": 0.55 if under else 1.0}
         drawn = [_line(axes, t[part], values[:, k], trace.name, k, style) for k, axes in enumerate(panels)]
         lines.append(drawn[0])
     panels[-1].set(xlabel="time (s)", xlim=span_s)
@@ -195,9 +204,9 @@ def _line(axes: Any, t: Any, y: Any, name: str, axis: int, style: Mapping[str, A
 def _log_line(axes: Any, x: Any, y: Any, data: RunData, trace: Trace, axis: int) -> Any:
     name = trace.name if axis == 0 else f"{trace.name}, {AXES[axis]}"
     shown = np.where(y > 0.0, y, np.nan)  # a constant has no density
-    return axes.plot(
-        x, shown, color=color_of(data, trace), lw=1.8 if trace.is_raw else 1.0, alpha=0.55 if trace.is_raw else 1.0, label=name
-    )[0]
+    under = trace.is_raw and bool(data.models())
+    style: dict[str, Any] = {"color": color_of(data, trace), "lw": 1.8 if under else 1.0, "alpha": 0.55 if under else 1.0}
+    return axes.plot(x, shown, label=name, **style)[0]
 
 
 def _decades(panels: Sequence[Any]) -> None:

@@ -43,6 +43,7 @@ def number(value: float | None) -> str:
     """A number as people read it: three digits, thousands as they are."""
     if value is None or not np.isfinite(value):
         return "–"
+    value = float(f"{value:.2e}") if abs(value) < 999.5 else value  # 0.9996 has two digits behind the point, as 1.00
     size = abs(value)
     if size >= 999.5:
         return f"{value:,.0f}"
@@ -79,16 +80,17 @@ def worst(trace: Trace, data: RunData) -> tuple[float, float] | None:
 
 
 def conclusion(data: RunData) -> str:
-    """What a reader is to know first, in a sentence or two."""
+    """What a reader is to know first, in a sentence or two; figures are without alignment, whatever the pictures are."""
     chosen, before = best(data), raw(data)
     if chosen is None:
         return _without_truth(data)
     if chosen.is_raw or before is None:
-        told = f"{spoken(chosen)} is wrong by {_errors(chosen)} over {number(data.duration_s)} s, {aligned(data)}"
+        told = f"{spoken(chosen)} is wrong by {_errors(chosen)} over {number(data.duration_s)} s, without alignment"
     else:
-        told = f"{compared(chosen, before)} over {number(chosen.figures['duration_s'])} s, {aligned(data)}"
+        told = f"{compared(chosen, before)} over {number(chosen.figures['duration_s'])} s, without alignment"
     found = worst(chosen, data)
     at = "" if found is None else f"; at worst by {measure(found[0], '°')}, {number(found[1])} s after the start"
+    at += f" ({aligned(data)})" * (found is not None and data.alignment != "none")
     return f"{data.name}: {told}{at}."
 
 
@@ -126,8 +128,8 @@ def overall(logs: Sequence[RunData]) -> str:
     better = sum(float(a.figures["aoe_deg"]) < float(b.figures["aoe_deg"]) for a, b in scored)
     new, old = (float(np.median([run.figures["aoe_deg"] for run in side])) for side in zip(*scored, strict=True))
     return (
-        f"In {better} of {len(scored)} logs the model turns out better than raw: in the middle, the orientation error is "
-        f"{measure(new, '°')} instead of {measure(old, '°')} ({times(max(old, new), min(old, new))}), {aligned(logs[0])}."
+        f"In {better} of {len(scored)} logs the best model has a smaller orientation error than raw: "
+        f"{measure(new, '°')} instead of {measure(old, '°')} in the middle (median), without alignment."
     )
 
 
