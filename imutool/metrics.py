@@ -27,6 +27,7 @@ from jaxtyping import Bool, Float64, Int64
 from scipy.spatial.transform import Rotation
 from scipy.special import gammaincinv
 
+from imutool import quaternion
 from imutool.errors import ConfigError, DataError, NumericsError
 from imutool.recording import Poses
 
@@ -59,7 +60,7 @@ def evaluate(estimate: Poses, truth: Poses, valid: Mask, distances_m: Sequence[f
 
 def orientation_errors(estimate: Poses, truth: Poses) -> Float64[np.ndarray, " n"]:
     """The angle between estimate and truth at every row, in rad."""
-    return np.asarray((_rotations(truth).inv() * _rotations(estimate)).magnitude())
+    return quaternion.angle_between(_unit(estimate), _unit(truth))
 
 
 def absolute(estimate: Poses, truth: Poses, valid: Mask) -> dict[str, float | None]:
@@ -73,20 +74,21 @@ def absolute(estimate: Poses, truth: Poses, valid: Mask) -> dict[str, float | No
         NumericsError: a figure is not finite.
     """
     estimate, truth = _scored(estimate, truth, valid)
-    R_est, R_true = _rotations(estimate), _rotations(truth)
+    q_est, q_true = _unit(estimate), _unit(truth)
     p_est, p_true = estimate.p_wb, truth.p_wb
     with np.errstate(over="ignore", invalid="ignore"):  # judged at the end, by the figures themselves
         motion = align(p_est, p_true)
         aligned: tuple[float | None, float | None] = (None, None)
         if motion is not None:
             turn, shift = motion
+            q_turn = turn.as_quat(scalar_first=True)[None]
             aligned = (
-                _rms(np.degrees((R_true.inv() * (turn * R_est)).magnitude())),
+                _rms(np.degrees(quaternion.angle_between(quaternion.multiply(q_turn, q_est), q_true))),
                 _rms(p_est @ turn.as_matrix().T + shift - p_true),
             )
         v_est, v_true = estimate.v_w, truth.v_w
         figures = {
-            "aoe_deg": _rms(np.degrees((R_true.inv() * R_est).magnitude())),
+            "aoe_deg": _rms(np.degrees(quaternion.angle_between(q_est, q_true))),
             "aoe_aligned_deg": aligned[0],
             "ape_m": _rms(p_est - p_true),
             "ape_aligned_m": aligned[1],
@@ -106,7 +108,9 @@ def relative(
         NumericsError: a figure is not finite.
     """
     estimate, truth = _scored(estimate, truth, valid)
-    R_est, R_true = _rotations(estimate), _rotations(truth)
+    # With C = R_true R_est^T, R_true,i^T (dp_true - C_i dp_est) is the difference of motions, and C_i C_j^T that of their turns
+    # seen from elsewhere: the length and the angle are the same, for a fraction of the products.
+    C = quaternion.multiply(_unit(truth), quaternion.inverse(_unit(estimate)))
     roe: dict[str, float | None] = {}
     rpe: dict[str, float | None] = {}
     for distance_m in distances_m:
@@ -116,11 +120,9 @@ def relative(
             roe[key] = rpe[key] = None
             continue
         with np.errstate(over="ignore", invalid="ignore"):
-            motion_est = R_est[i].inv().apply(estimate.p_wb[j] - estimate.p_wb[i])
-            motion_true = R_true[i].inv().apply(truth.p_wb[j] - truth.p_wb[i])
-            rpe[key] = float(np.linalg.norm(motion_est - motion_true, axis=1).mean())
-        turn_true, turn_est = R_true[i].inv() * R_true[j], R_est[i].inv() * R_est[j]
-        roe[key] = float(np.degrees((turn_true.inv() * turn_est).magnitude()).mean())
+            moved_est, moved_true = (poses.p_wb[j] - poses.p_wb[i] for poses in (estimate, truth))
+            rpe[key] = float(np.linalg.norm(quaternion.rotate(C[i], moved_est) - moved_true, axis=1).mean())
+        roe[key] = float(np.degrees(quaternion.angle_between(C[i], C[j])).mean())
     _check_finite({f"rpe_m {k}": v for k, v in rpe.items()} | {f"roe_deg {k}": v for k, v in roe.items()})
     return {"roe_deg": roe, "rpe_m": rpe}
 
@@ -235,8 +237,9 @@ def _scored(estimate: Poses, truth: Poses, valid: Mask) -> tuple[Poses, Poses]:
     return estimate.rows(valid), truth.rows(valid)
 
 
-def _rotations(poses: Poses) -> Rotation:
-    return Rotation.from_quat(poses.q_wb_wxyz, scalar_first=True)
+def _unit(poses: Poses) -> Float64[np.ndarray, "n 4"]:
+    """Orientations as unit as float64 can; a file's six decimals would count as an angle."""
+    return quaternion.unit(poses.q_wb_wxyz)
 
 
 def _rms(errors: Float64[np.ndarray, " n *k"]) -> float:

@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Bool, Float64
 from scipy.spatial.transform import Rotation
 
+from imutool import quaternion
 from imutool.errors import DataError
 from imutool.metrics import align
 from imutool.recording import Poses, Times, nanoseconds
@@ -78,12 +79,12 @@ class Window:
 
 def errors(estimate: Poses, truth: Poses, valid: Bool[np.ndarray, " n"]) -> Errors:
     """The error of an estimate against the truth at the same stamps, NaN where `valid` is false."""
-    true, found = (Rotation.from_quat(poses.q_wb_wxyz, scalar_first=True) for poses in (truth, estimate))
+    q_true, q = truth.q_wb_wxyz, estimate.q_wb_wxyz
+    back = quaternion.inverse(q_true)
     hole = np.where(valid, 0.0, np.nan)[:, None]
-    turned = np.rad2deg((true.inv() * found).as_rotvec())
-    yaw_pitch_roll = (found * true.inv()).as_euler("ZYX", degrees=True)
-    position = estimate.p_wb - truth.p_wb
-    return Errors(estimate.t_ns, turned + hole, yaw_pitch_roll[:, ::-1] + hole, position + hole)
+    turned = np.rad2deg(quaternion.log(quaternion.multiply(back, q)))
+    roll_pitch_yaw = np.rad2deg(quaternion.roll_pitch_yaw(quaternion.multiply(q, back)))
+    return Errors(estimate.t_ns, turned + hole, roll_pitch_yaw + hole, estimate.p_wb - truth.p_wb + hole)
 
 
 class Motion(NamedTuple):
@@ -111,8 +112,8 @@ def aligned(estimate: Poses, truth: Poses, valid: Bool[np.ndarray, " n"], alignm
     motion = _motion(estimate, truth, valid, alignment)
     R = motion.turn.as_matrix()
     v_w = None if estimate.v_w is None else estimate.v_w @ R.T
-    q_wb_wxyz = (motion.turn * Rotation.from_quat(estimate.q_wb_wxyz, scalar_first=True)).as_quat(scalar_first=True)
-    return Poses(estimate.t_ns, estimate.p_wb @ R.T + motion.shift_m, np.ascontiguousarray(q_wb_wxyz), v_w), motion
+    q_wb_wxyz = quaternion.multiply(motion.turn.as_quat(scalar_first=True)[None], estimate.q_wb_wxyz)
+    return Poses(estimate.t_ns, estimate.p_wb @ R.T + motion.shift_m, q_wb_wxyz, v_w), motion
 
 
 def _motion(estimate: Poses, truth: Poses, valid: Bool[np.ndarray, " n"], alignment: Alignment) -> Motion:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -16,6 +16,7 @@ from imutool.mcap_io import schema
 from imutool.mcap_io.log import DERIVED_KEY, ImuBatch, Log
 from imutool.mcap_io.losses import told
 from imutool.mcap_io.read import recording_in
+from imutool.place import Place
 from imutool.recording import Imu, Recording
 from imutool.view.rundata import Logged, Run
 
@@ -38,7 +39,18 @@ class Recorded:
     notes: tuple[str, ...]
 
 
-def recorded(path: Path, *, imu: str | None = None, truth: str | None = None) -> Recorded:
+class _Read(NamedTuple):
+    """What one pass over the log brings: messages as they are, and a recording of all but the IMU."""
+
+    topic: str
+    derived: list[str]
+    batches: dict[str, list[ImuBatch]]
+    beliefs: dict[str, list[schema.TwistColumns]]
+    rest: Recording
+    metadata: list[tuple[str, dict[str, str]]]
+
+
+def recorded(path: Place, *, imu: str | None = None, truth: str | None = None) -> Recorded:
     """Reads a log for looking at it.
 
     An IMU that cannot be held as it is (stamps that repeat or go back, values that are no numbers) is read as `debias --clean`
@@ -50,19 +62,12 @@ def recorded(path: Path, *, imu: str | None = None, truth: str | None = None) ->
         LogError: nothing in it can be saved, no IMU or several without `imu`, fewer than two samples, no such topic.
     """
     notes: list[str] = []
-    with Log(path, salvage=True) as log:
-        topic = log.only_imu() if imu is None else log.topic(imu, (schema.IMU,)).name
-        derived = [one.name for one in log.with_schema((schema.IMU,)) if one.metadata.get(DERIVED_KEY) == topic]
-        biases = [one.name for one in log.with_schema((schema.TWIST,)) if one.metadata.get(DERIVED_KEY) == topic]
-        batches, beliefs = _messages(log, [topic, *derived], biases)
-
-        def refused(name: str, error: LogError) -> None:
-            notes.append(f"The true poses on {name} are left out: {error.what}.")
-
-        rest = recording_in(log, imu=topic, truth=truth, samples=NONE, refused=None if truth else refused)
-        metadata, losses = log.metadata_records(), log.losses
-    assert losses is not None, "with salvage there are losses, if perhaps none"
-    notes += [f"The log is damaged; {line}." for line in told(losses.plain())]
+    try:
+        found = _read(path, imu, truth, notes, salvage=False)
+    except LogError:  # a sound log is read faster than one that nothing vouches for; what is no damage is refused again
+        notes.clear()
+        found = _read(path, imu, truth, notes, salvage=True)
+    topic, derived, batches, beliefs, rest, metadata = found
     where = f"{path} {topic}"
     survey = examine(lambda: batches[topic], _true(rest), Rules(), where=str(path), topic=topic)
     samples, logged, why = _held(batches[topic], survey, where)
@@ -80,6 +85,22 @@ def recorded(path: Path, *, imu: str | None = None, truth: str | None = None) ->
         else:
             debiased.append(run)
     return Recorded(replace(rest, imu=samples), logged, tuple(debiased), survey, metadata, tuple(notes))
+
+
+def _read(path: Place, imu: str | None, truth: str | None, notes: list[str], *, salvage: bool) -> _Read:
+    def refused(name: str, error: LogError) -> None:
+        notes.append(f"The true poses on {name} are left out: {error.what}.")
+
+    with Log(path, salvage=salvage) as log:
+        topic = log.only_imu() if imu is None else log.topic(imu, (schema.IMU,)).name
+        derived = [one.name for one in log.with_schema((schema.IMU,)) if one.metadata.get(DERIVED_KEY) == topic]
+        biases = [one.name for one in log.with_schema((schema.TWIST,)) if one.metadata.get(DERIVED_KEY) == topic]
+        batches, beliefs = _messages(log, [topic, *derived], biases)
+        rest = recording_in(log, imu=topic, truth=truth, samples=NONE, refused=None if truth else refused)
+        metadata = log.metadata_records()
+        if log.losses is not None:
+            notes += [f"The log is damaged; {line}." for line in told(log.losses.plain())]
+    return _Read(topic, derived, batches, beliefs, rest, metadata)
 
 
 def _messages(
