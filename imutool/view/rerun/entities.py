@@ -38,8 +38,17 @@ def role(trace: Trace) -> Role:
 
 
 def label(data: RunData, trace: Trace) -> str:
-    """What a trace is called in a legend: by its model's name only where there are several."""
-    return role(trace) if trace.is_raw or len(data.models()) < 2 else trace.name
+    """What a trace is called in a title: by its model's name where there are several, without the words they all begin with."""
+    if trace.is_raw or len(data.models()) < 2:
+        return role(trace)
+    return trace.name[_shared([model.name for model in data.models()]) :] or trace.name
+
+
+def _shared(names: Sequence[str]) -> int:
+    """The letters of the words, each ended by a hyphen, that all names begin with."""
+    shortest = min(map(len, names))
+    same = next((k for k in range(shortest) if len({name[k] for name in names}) > 1), shortest)
+    return names[0].rfind("-", 0, same) + 1
 
 
 def path(scope: Scope, *parts: str) -> str:

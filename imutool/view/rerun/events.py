@@ -58,10 +58,13 @@ def states(events: Sequence[Event], data: RunData) -> list[tuple[int, str]]:
     least_ns = round(LEAST_SHARE * (data.end_ns - data.start_ns))
     spans: list[tuple[int, int]] = []
     for event in events:
-        end_ns = max(event.end_ns, event.start_ns + least_ns)
-        if spans and event.start_ns <= spans[-1][1]:
+        start_ns, end_ns = event.start_ns, event.end_ns
+        if end_ns - start_ns < least_ns:  # backwards, if the log ends before
+            start_ns = min(start_ns, data.end_ns - least_ns)
+            end_ns = start_ns + least_ns
+        if spans and start_ns <= spans[-1][1]:
             spans[-1] = (spans[-1][0], max(spans[-1][1], end_ns))
         else:
-            spans.append((event.start_ns, end_ns))
+            spans.append((start_ns, end_ns))
     turns = [(data.start_ns, OUTSIDE)] if spans[0][0] > data.start_ns else []
     return turns + [turn for first, last in spans for turn in ((first, INSIDE), (last, OUTSIDE))]

@@ -12,7 +12,7 @@ from jaxtyping import Float64
 from imutool.view.rerun import clock, entities, errors, panels, styles
 from imutool.view.rerun.entities import Scope
 from imutool.view.rerun.palette import GROUND, MODEL_COLORS, RAW_FADE, Color, faded
-from imutool.view.rerun.paths import LEGEND_WIDTH, heat_top
+from imutool.view.rerun.paths import LEGEND_X, LEGEND_Y, heat_top
 from imutool.view.rerun.plots import plot
 from imutool.view.rerun.sdk import need_sdk
 from imutool.view.rundata import RunData, Trace
@@ -20,8 +20,7 @@ from imutool.view.rundata import RunData, Trace
 if TYPE_CHECKING:
     import rerun.blueprint as rrb
 
-LEGEND_X, LEGEND_Y = (-0.08 * LEGEND_WIDTH, 1.08 * LEGEND_WIDTH), (-2.0, 6.0)
-SHARES = {"paths": 6.0, "legend": 1.0, "error": 3.0}
+SHARES = {"paths": 6.0, "legend": 0.9, "error": 2.6}
 
 
 def blueprint(logs: Sequence[RunData], *, source: bool = True) -> rrb.Blueprint:
@@ -91,6 +90,7 @@ def _legend(scope: Scope) -> rrb.Spatial2DView:
     return rrb.Spatial2DView(
         origin=entities.path(scope, "legend"),
         name="Orientation error of the debiased path",
+        titlebar=False,
         background=GROUND,
         visual_bounds=rrb.VisualBounds2D(x_range=LEGEND_X, y_range=LEGEND_Y),
     )
@@ -148,7 +148,7 @@ def _eye(data: RunData) -> rrb.EyeControls3D:
 
     low, high = box(data)
     centre, size = (low + high) / 2.0, size_m(data)
-    return rrb.EyeControls3D(position=centre + size * np.array([-0.6, -0.6, 0.4]), look_target=centre, eye_up=[0.0, 0.0, 1.0])
+    return rrb.EyeControls3D(position=centre + size * np.array([-0.7, -0.7, 0.5]), look_target=centre, eye_up=[0.0, 0.0, 1.0])
 
 
 def box(data: RunData) -> tuple[Float64[np.ndarray, "3"], Float64[np.ndarray, "3"]]:

@@ -16,6 +16,7 @@ TRUTH_COLOR: Color = (150, 150, 150)
 RAW_COLOR: Color = (230, 110, 20)
 # Okabe and Ito's palette, told apart by colour-blind eyes too; orange belongs to raw.
 MODEL_COLORS: tuple[Color, ...] = ((30, 140, 230), (0, 158, 115), (204, 121, 167), (190, 160, 0))
+COLOR_NAMES = ("blue", "green", "pink", "yellow")
 WORST_COLOR: Color = (240, 60, 140)
 EVENT_COLOR: Color = (230, 167, 0)
 GROUND: Color = (24, 26, 30)  # of drawings in space, in a light viewer too: the colours of errors are chosen for it
@@ -35,6 +36,11 @@ def color_of(data: RunData, trace: Trace) -> Color:
     if trace.is_raw:
         return RAW_COLOR
     return MODEL_COLORS[data.models().index(trace) % len(MODEL_COLORS)]
+
+
+def color_name(data: RunData, trace: Trace) -> str:
+    """The same in a word, for titles."""
+    return "orange" if trace.is_raw else COLOR_NAMES[data.models().index(trace) % len(COLOR_NAMES)]
 
 
 def axis_colors(rank: int = 0) -> list[Color]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -10,9 +10,9 @@ import numpy as np
 from imutool.view.deviation import Drift, Errors
 from imutool.view.rerun import entities, errors, events, signals, source, spectrum
 from imutool.view.rerun.entities import Scope
-from imutool.view.rerun.palette import AXES, GROUND, color_of
+from imutool.view.rerun.palette import AXES, GROUND, color_name, color_of
 from imutool.view.rerun.plots import both_ways, limit, plot, upwards, whole
-from imutool.view.rundata import RunData
+from imutool.view.rundata import RunData, Trace
 
 if TYPE_CHECKING:
     import rerun.blueprint as rrb
@@ -42,9 +42,18 @@ def total_errors(data: RunData, scope: Scope) -> list[Panel]:
         contents = [entities.of(data, trace, scope, "error", kind, entities.role(trace)) for trace in scored]
         contents += [f"{path}/worst" for path, trace in zip(contents, scored, strict=True) if not trace.is_raw]
         if contents:
-            title = f"{kind.capitalize()} error ({errors.UNITS[kind]})"
-            found.append(plot(contents, title, height=upwards(error_limit(data, kind))))
+            title, key = f"{kind.capitalize()} error ({errors.UNITS[kind]})", _colors(data, _models_first(data))
+            found.append(plot(contents, title, key, height=upwards(error_limit(data, kind))))
     return found
+
+
+def _colors(data: RunData, of: Sequence[Trace]) -> str:
+    """Which colour stands for which run: said in titles, because a legend would cover curves."""
+    return ", ".join(f"{entities.label(data, trace)} {color_name(data, trace)}" for trace in of)
+
+
+def _models_first(data: RunData) -> list[Trace]:
+    return [*data.models(), *(trace for trace in data.traces if trace.is_raw)]
 
 
 def error_limit(data: RunData, kind: str) -> float | None:
@@ -55,7 +64,7 @@ def error_limit(data: RunData, kind: str) -> float | None:
 def _signals(data: RunData, scope: Scope) -> Panel:
     import rerun.blueprint as rrb
 
-    shown = [plot(_of_all(data, scope, "imu", kind), title) for kind, title in TITLES.items()]
+    shown = [_three(data, _of_all(data, scope, "imu", kind), title) for kind, title in TITLES.items()]
     return rrb.Vertical(*shown, name="Signals")
 
 
@@ -81,7 +90,7 @@ def _bias_of(data: RunData, scope: Scope, kind: str, axis: int) -> rrb.TimeSerie
     words = []
     if kind in data.true_bias:
         overrides[entities.path(scope, "bias", kind, "true")] = rr.SeriesLines(visible_series=_only(axis, 3))
-        words.append("broad and pale: true")
+        words.append("true broad and pale")
     for trace in data.models():
         home = entities.of(data, trace, scope, "bias", kind)
         colors = [color_of(data, trace)] if several else None
@@ -89,11 +98,13 @@ def _bias_of(data: RunData, scope: Scope, kind: str, axis: int) -> rrb.TimeSerie
         if trace.run.bias_std is not None:
             overrides[f"{home}/sigma"] = rr.SeriesLines(visible_series=_only(axis, 6), colors=colors and colors * 6)
     if data.models():
-        words.insert(0, "bold: estimated")
+        words.insert(0, "estimated bold")
     if any(trace.run.bias_std is not None for trace in data.models()):
-        words.insert(1, f"thin: ±{signals.SIGMAS:g}σ")
-    name = f"{AXES[axis]} ({', '.join(words)})"
-    return plot(list(overrides), name, height=_bias_range(data, kind, axis), legend=False, overrides=overrides)
+        words.insert(1, f"±{signals.SIGMAS:g}σ thin")
+    key = ", ".join([*words, *([_colors(data, data.models())] if several else [])])
+    return plot(
+        list(overrides), f"{AXES[axis]} ({signals.UNITS[kind]})", key, height=_bias_range(data, kind, axis), overrides=overrides
+    )
 
 
 def _only(axis: int, count: int) -> list[bool]:
@@ -150,8 +161,10 @@ def _orientation(data: RunData, scope: Scope) -> list[Panel]:
     by_axis = limit(data, _by_run(data, lambda found: found.orientation_deg))
     by_angle = limit(data, _by_run(data, lambda found: found.roll_pitch_yaw_deg))
     return [
-        plot(_of_scored(data, scope, "orientation", "axes"), "By axis of the true body (deg)", height=both_ways(by_axis)),
-        plot(_of_scored(data, scope, "orientation", "rpy"), "Roll, pitch, yaw (deg)", height=both_ways(by_angle)),
+        _three(data, _of_scored(data, scope, "orientation", "axes"), "About the body's axes (deg)", both_ways(by_axis)),
+        _three(
+            data, _of_scored(data, scope, "orientation", "rpy"), "Roll, pitch, yaw (deg)", both_ways(by_angle), errors.ANGLES
+        ),
         *_drift(data, scope, "orientation", lambda drift: drift.orientation_deg),
     ]
 
@@ -161,7 +174,7 @@ def _position(data: RunData, scope: Scope) -> list[Panel]:
     contents = [*_of_scored(data, scope, "position", "horizontal"), *_of_scored(data, scope, "position", "vertical")]
     reach = both_ways(error_limit(data, "position"))
     return [
-        plot(_of_scored(data, scope, "position", "axes"), "By axis of the world (m)", height=both_ways(by_axis)),
+        _three(data, _of_scored(data, scope, "position", "axes"), "Along the world's axes (m)", both_ways(by_axis)),
         plot(contents, "Horizontal (length) and vertical (m)", height=reach),
         *_drift(data, scope, "position", lambda drift: drift.position_m),
     ]
@@ -175,8 +188,8 @@ def _drift(data: RunData, scope: Scope, kind: str, of: Callable[[Drift], np.ndar
     drifted = [trace for trace in data.traces if trace.name in drifts]
     contents = [entities.of(data, trace, scope, "error", "drift", kind, entities.role(trace)) for trace in drifted]
     reset_s = next(iter(drifts.values())).reset_s
-    title = f"Since the last reset to the truth, every {reset_s:g} s ({errors.UNITS[kind]})"
-    return [plot(contents, title, height=upwards(limit(data, {name: of(drift) for name, drift in drifts.items()})))]
+    title, key = f"Since the last reset, every {reset_s:g} s ({errors.UNITS[kind]})", _colors(data, _models_first(data))
+    return [plot(contents, title, key, height=upwards(limit(data, {name: of(drift) for name, drift in drifts.items()})))]
 
 
 def _events(data: RunData, scope: Scope) -> Panel | None:
@@ -194,7 +207,8 @@ def _event_list(contents: list[str], origin: str) -> rrb.TextLogView:
     """Time, level and words; a click on a time takes the cursor there."""
     import rerun.blueprint as rrb
 
-    return rrb.TextLogView(origin=origin, contents=contents, name="What")
+    columns = rrb.TextLogColumns(text_log_columns=["loglevel", "body"])
+    return rrb.TextLogView(origin=origin, contents=contents, name="What", columns=columns)
 
 
 def _report(scope: Scope) -> Panel:
@@ -209,6 +223,23 @@ def _cameras(data: RunData, scope: Scope) -> Panel | None:
     cameras = source.plan(data, scope).cameras
     shown = [rrb.Spatial2DView(origin=camera, name=camera.removeprefix("/")) for camera in cameras]
     return rrb.Grid(*shown, name="Cameras") if shown else None
+
+
+def _three(
+    data: RunData,
+    contents: list[str],
+    title: str,
+    height: tuple[float, float] | None = None,
+    names: tuple[str, ...] = AXES,
+) -> rrb.TimeSeriesView:
+    """A plot of curves about or along x, y and z, with their colours in the title: a legend of six lines would cover them."""
+    key = ", ".join(f"{name} {color}" for name, color in zip(names, ("red", "green", "blue"), strict=True))
+    models = [entities.label(data, trace) for trace in data.models()]
+    if len(models) == 1:
+        key += f"; {models[0]} bold{', raw faint' if len(data.traces) > 1 else ''}"
+    elif models:
+        key += f"; {models[0]} bold, {', '.join(f'{name} paler' for name in models[1:])}"
+    return plot(contents, title, key, height=height)
 
 
 def _by_run(data: RunData, of: Callable[[Errors], np.ndarray]) -> dict[str, np.ndarray]:

@@ -13,18 +13,19 @@ from imutool.recording import Poses, Times, nanoseconds
 from imutool.view.rerun import clock, entities, styles
 from imutool.view.rerun.entities import Scope
 from imutool.view.rerun.palette import INK, TRUTH_COLOR, WORST_COLOR, Color, color_of, end_of_scale, heat
-from imutool.view.rundata import TRUTH, RunData, Trace, sparse, stretches
+from imutool.view.rundata import TRUTH, RunData, Trace, stretches
+from imutool.view.thin import path_rows
 
 if TYPE_CHECKING:
     import rerun as rr
 
 ROW_S = 1.0  # of path in one row: with a row per sample the viewer slows down
-PIECE_S = 0.05  # of path in one straight piece
-MOST_ROWS, MOST_PIECES = 3_600, 20_000  # of one path; longer logs have longer ones
-MOST_POSES = 20_000  # of one body
+MOST_ROWS = 3_600  # of one path; longer logs have longer ones
 Q_XYZW = [1, 2, 3, 0]  # columns of wxyz
 LEGEND_STEPS, LEGEND_WIDTH, LEGEND_TICKS = 60, 100.0, 5
-WORST_RADIUS = 5.0
+LEGEND_X, LEGEND_Y = (-50.0, 1.08 * LEGEND_WIDTH), (-3.0, 8.0)  # what is shown of the drawing
+LEGEND_WORDS = "debiased: orientation error"
+WORST_RADIUS, POLE_SHARE = 5.0, 0.2  # in points of the screen; of the size of the scene, so that labels do not meet
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,23 +42,22 @@ class Pieces:
 
 
 def pieces(poses: Poses) -> Pieces:
-    """A path cut into pieces of PIECE_S in rows of ROW_S, longer ones where it would be too many."""
-    duration_s = (int(poses.t_ns[-1]) - int(poses.t_ns[0])) * 1e-9 if len(poses) else 0.0
-    piece_ns = nanoseconds(max(PIECE_S, duration_s / MOST_PIECES))
-    row_ns = nanoseconds(max(ROW_S, duration_s / MOST_ROWS))
-    first, last, begin = [], [], 0
-    for stretch in stretches(poses):
-        since_ns = stretch.t_ns - poses.t_ns[0]
-        kept = np.flatnonzero(np.diff(since_ns // piece_ns, prepend=-1))
-        kept = begin + np.unique(np.append(kept, len(stretch) - 1))
-        first.append(kept[:-1])
-        last.append(kept[1:])
-        begin += len(stretch)
-    ends = np.concatenate(last)
-    since_ns = poses.t_ns[ends] - poses.t_ns[:1]
+    """A path cut into straight pieces, in rows of ROW_S; longer ones where there would be too many."""
+    if len(poses) < 2:
+        nothing = np.zeros(0, dtype=np.int64)
+        return Pieces(nothing, nothing, nothing, nothing)
+    lengths = [len(stretch) for stretch in stretches(poses)]
+    of_stretch = np.repeat(np.arange(len(lengths)), lengths)
+    ends = np.cumsum(lengths)
+    rows = np.union1d(path_rows(poses.p_wb), np.concatenate([ends - lengths, ends - 1]))
+    first, last = rows[:-1], rows[1:]
+    whole = of_stretch[first] == of_stretch[last]
+    first, last = first[whole], last[whole]
+    since_ns = poses.t_ns[last] - poses.t_ns[0]
+    row_ns = nanoseconds(max(ROW_S, (int(poses.t_ns[-1]) - int(poses.t_ns[0])) * 1e-9 / MOST_ROWS))
     starts = np.flatnonzero(np.diff((since_ns - 1) // row_ns, prepend=-1))  # of each row among the pieces
-    counts = np.diff(np.append(starts, len(ends)))
-    return Pieces(np.concatenate(first), ends, counts, poses.t_ns[ends[starts + counts - 1]])
+    counts = np.diff(np.append(starts, len(last)))
+    return Pieces(first, last, counts, poses.t_ns[last[starts + counts - 1]])
 
 
 def log(data: RunData, to: rr.RecordingStream, scope: Scope, size: float) -> None:
@@ -76,7 +76,7 @@ def log(data: RunData, to: rr.RecordingStream, scope: Scope, size: float) -> Non
         colors = None if error is None or top is None else (error, top)
         _log_path(to, data, home, trace.path, colors, role, color)
         _log_body(to, data, home, trace.path, styles.body(role, entities.label(data, trace), color, size))
-        _log_worst(to, data, trace, home)
+        _log_worst(to, data, trace, home, size)
     if top is not None:
         _log_legend(to, scope, top)
 
@@ -129,7 +129,7 @@ def _log_body(to: rr.RecordingStream, data: RunData, home: str, path: Poses, sty
     """Poses over time, and what is drawn at them."""
     import rerun as rr
 
-    rows = sparse(len(path), MOST_POSES)
+    rows = path_rows(path.p_wb)
     to.log(f"{home}/body", *style, static=True, strict=True)
     columns = rr.Transform3D.columns(translation=path.p_wb[rows], quaternion=path.q_wb_wxyz[rows][:, Q_XYZW])
     to.send_columns(f"{home}/body", clock.at(data, path.t_ns[rows]), columns, strict=True)
@@ -140,36 +140,38 @@ def worst(t_ns: Times, values: Float64[np.ndarray, " n"]) -> int | None:
     return int(np.nanargmax(values)) if len(t_ns) and np.isfinite(values).any() else None
 
 
-def _log_worst(to: rr.RecordingStream, data: RunData, trace: Trace, home: str) -> None:
-    """The place of a model's largest orientation error, with its value and time in words."""
+def _log_worst(to: rr.RecordingStream, data: RunData, trace: Trace, home: str, size: float) -> None:
+    """Where on the true path a model's orientation was furthest off, by how much and when: its own path may be far off."""
     import rerun as rr
 
-    if trace.is_raw or trace.errors is None:
+    if trace.is_raw or trace.errors is None or data.truth is None:
         return
     errors = trace.errors
     row = worst(errors.t_ns, errors.orientation_total_deg)
     if row is None:
         return
     at_s = data.elapsed_s(errors.t_ns[row : row + 1])[0]
-    words = f"worst: {errors.orientation_total_deg[row]:.2f}° at {at_s:.1f} s"
-    dot = rr.Points3D(
-        trace.path.p_wb[row : row + 1], labels=[words], colors=[WORST_COLOR], radii=rr.Radius.ui_points(WORST_RADIUS),
-        show_labels=True,
-    )  # fmt: skip
-    to.log(f"{home}/worst", dot, static=True, strict=True)
+    rank = data.models().index(trace)
+    whose = f"{entities.label(data, trace)} " if len(data.models()) > 1 else ""
+    words = f"{whose}worst: {errors.orientation_total_deg[row]:.2f}° at {at_s:.1f} s"
+    place, _ = data.truth.at(errors.t_ns[row : row + 1])
+    foot, top = place.p_wb[0], place.p_wb[0] + [0.0, 0.0, POLE_SHARE * (1 + rank) * size]
+    pole = rr.LineStrips3D([[foot, top]], colors=[WORST_COLOR], radii=rr.Radius.ui_points(1.0))
+    radii = rr.Radius.ui_points([WORST_RADIUS, 0.0])
+    dots = rr.Points3D([foot, top], labels=["", words], colors=[WORST_COLOR] * 2, radii=radii, show_labels=True)
+    to.log(f"{home}/worst", pole, dots, static=True, strict=True)
 
 
 def _log_legend(to: rr.RecordingStream, scope: Scope, top: float) -> None:
-    """A strip of the path's colours with numbers under it, LEGEND_WIDTH wide."""
+    """A strip of the path's colours with numbers under it, LEGEND_WIDTH wide, and what they mean left of it."""
     import rerun as rr
 
-    edges = np.linspace(0.0, LEGEND_WIDTH, LEGEND_STEPS + 1)
-    strips = [[[left, 0.0], [right, 0.0]] for left, right in pairwise(edges)]
-    middles = np.linspace(0.5 / LEGEND_STEPS, 1.0 - 0.5 / LEGEND_STEPS, LEGEND_STEPS)
-    bar = rr.LineStrips2D(strips, colors=heat(middles, 1.0), radii=rr.Radius.ui_points(6.0))
+    strips = [[[left, 0.0], [right, 0.0]] for left, right in pairwise(np.linspace(0.0, LEGEND_WIDTH, LEGEND_STEPS + 1))]
+    shares = (np.arange(LEGEND_STEPS) + 0.5) / LEGEND_STEPS
+    bar = rr.LineStrips2D(strips, colors=heat(shares, 1.0), radii=rr.Radius.ui_points(6.0))
     to.log(entities.path(scope, "legend", "colors"), bar, static=True, strict=True)
     ticks = np.linspace(0.0, 1.0, LEGEND_TICKS)
-    words = [f"{share * top:g}°" for share in ticks]
-    places = [[share * LEGEND_WIDTH, 0.0] for share in ticks]
-    dots = rr.Points2D(places, labels=words, colors=[INK] * LEGEND_TICKS, radii=rr.Radius.ui_points(1.0), show_labels=True)
+    words = [f"{share * top:g}°" for share in ticks] + [LEGEND_WORDS]
+    places = [[share * LEGEND_WIDTH, 1.0] for share in ticks] + [[LEGEND_X[0] / 2.0, -2.5]]
+    dots = rr.Points2D(places, labels=words, colors=[INK] * len(words), radii=rr.Radius.ui_points(0.0), show_labels=True)
     to.log(entities.path(scope, "legend", "ticks"), dots, static=True, strict=True)

@@ -12,24 +12,38 @@ from imutool.view.rundata import RunData
 if TYPE_CHECKING:
     import rerun.blueprint as rrb
 
+LONGEST_TITLE = 90  # letters that fit over half of a window of 1280 pixels
 READABLE = 10.0  # an error this many times smaller than the plot is high can still be read
+SHOWN = 2.5  # times the models' largest error: how high a plot reaches that raw leaves
 
 
 def plot(
     contents: Sequence[str],
-    name: str,
+    title: str,
+    key: str = "",
     *,
     height: tuple[float, float] | None = None,
-    legend: bool = True,
+    legend: bool | None = None,
     overrides: Mapping[Any, Any] | None = None,
 ) -> rrb.TimeSeriesView:
-    """A plot of these entities."""
+    """A plot of these entities; the `key` says in its title what is what.
+
+    A legend covers curves, wherever it is: unless it is asked for or refused, there is one where the title cannot say it.
+    """
     import rerun.blueprint as rrb
 
-    corner: Any = rrb.PlotLegend(rrb.Corner2D.LeftTop, visible=legend)
+    name = f"{title}: {key}" if key else title
+    in_title = bool(key) and len(name) <= LONGEST_TITLE
+    corner = rrb.PlotLegend(rrb.Corner2D.RightTop, visible=not in_title if legend is None else legend)
     axis_y = None if height is None else rrb.ScalarAxis(range=height)
     return rrb.TimeSeriesView(
-        origin="/", contents=list(contents), name=name, axis_x=whole(), axis_y=axis_y, plot_legend=corner, overrides=overrides
+        origin="/",
+        contents=list(contents),
+        name=name if in_title else title,
+        axis_x=whole(),
+        axis_y=axis_y,
+        plot_legend=corner,
+        overrides=overrides,
     )
 
 
@@ -51,7 +65,7 @@ def limit(data: RunData, values: Mapping[str, np.ndarray]) -> float | None:
     models = [tops[trace.name] for trace in data.models() if trace.name in tops]
     highest = max(tops.values(), default=0.0)
     cut = bool(models) and highest > READABLE * max(models) > 0.0
-    reach = READABLE / 2.0 * max(models) if cut else highest
+    reach = SHOWN * max(models) if cut else highest
     return 1.05 * reach if reach > 0.0 else None
 
 

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 from imutool.view.rerun import entities
 from imutool.view.rerun.entities import Scope
 from imutool.view.rerun.markdown import escape, table
+from imutool.view.rerun.palette import color_name
 from imutool.view.rerun.paths import heat_top
 from imutool.view.rundata import RunData
 
@@ -15,12 +16,6 @@ if TYPE_CHECKING:
     import rerun as rr
 
 MOST_EVENTS = 40  # in the list; the lanes and their texts hold all
-ALIGNMENTS = {
-    "none": "Paths and errors are as they came out, without any alignment.",
-    "origin": "Paths and errors are after alignment by the first pose that both have.",
-    "yaw": "Paths and errors are after alignment by a turn about the vertical and a shift.",
-    "se3": "Paths and errors are after alignment by a turn and a shift.",
-}
 
 
 def log(data: RunData, to: rr.RecordingStream, scope: Scope, more: Sequence[str] = ()) -> None:
@@ -42,7 +37,7 @@ def markdown(data: RunData, more: Sequence[str] = ()) -> str:
     """All the words about one log."""
     lines = [f"# {escape(data.name)}", ""]
     lines += [f"{data.duration_s:.1f} s, read {' and '.join(escape(trace.name) for trace in data.traces)}.", ""]
-    for note in (*data.notes, *_alignment(data), *_colors(data), *more):
+    for note in (*data.notes, *_colors(data), *more):
         lines += [escape(note), ""]
     lines += _figures(data) + _windows(data) + _events(data)
     if data.provenance:
@@ -59,13 +54,9 @@ def comparison(logs: Sequence[RunData]) -> str:
         values = dict(data.table())
         for place, trace in enumerate(data.traces):
             cells = [_cell(values[label][place]) if label in values else "" for label in labels]
-            rows.append([escape(data.name), escape(trace.name), f"{data.duration_s:.1f}", *cells])
-    heads = ["log", "run", "seconds", *(escape(label) for label in labels)]
+            rows.append([escape(data.name), escape(trace.name), *cells])
+    heads = ["log", "run", *labels]
     return "\n".join([f"# {len(logs)} logs", "", *table(heads, rows)])
-
-
-def _alignment(data: RunData) -> list[str]:
-    return [ALIGNMENTS[data.alignment]] if data.truth is not None else []
 
 
 def _colors(data: RunData) -> list[str]:
@@ -76,7 +67,8 @@ def _colors(data: RunData) -> list[str]:
             f"The debiased path is coloured by its orientation error: dark blue is none, yellow is {top:g} degrees and more."
         ]
     if len(data.models()) > 1:
-        return ["Each model's path has a colour of its own, the same as in the plots of total errors."]
+        colors = ", ".join(f"{trace.name} {color_name(data, trace)}" for trace in data.models())
+        return [f"Each model's path has a colour of its own, the same as in the plots of total errors: {colors}."]
     return []
 
 

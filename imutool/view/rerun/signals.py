@@ -11,11 +11,13 @@ from imutool.recording import Times
 from imutool.view.rerun import clock, entities, styles
 from imutool.view.rerun.entities import Scope
 from imutool.view.rundata import RunData, Trace
+from imutool.view.thin import MOST, curve_rows
 
 if TYPE_CHECKING:
     import rerun as rr
 
 KINDS = ("gyro", "accel")
+UNITS = {"gyro": "rad/s", "accel": "m/s²"}
 SIGMAS = 3.0
 
 
@@ -57,9 +59,10 @@ def rank(data: RunData, trace: Trace) -> int:
 def scalars(
     to: rr.RecordingStream, data: RunData, entity: str, t_ns: Times, values: Float64[np.ndarray, "n k"], style: rr.AsComponents
 ) -> None:
-    """One curve per column, its style first."""
+    """One curve per column, its style first; of very many rows those with its extremes."""
     import rerun as rr
 
     to.log(entity, style, static=True, strict=True)
     # strict: Rerun only warns of a length that does not match, and then the rows are missing
-    to.send_columns(entity, clock.at(data, t_ns), rr.Scalars.columns(scalars=values), strict=True)
+    rows = curve_rows(values, MOST)
+    to.send_columns(entity, clock.at(data, t_ns[rows]), rr.Scalars.columns(scalars=values[rows]), strict=True)

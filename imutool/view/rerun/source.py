@@ -36,6 +36,7 @@ SENTENCE = "The log's other topics are not shown"
 class Import:
     """What of a log Rerun reads: every topic but those that are drawn already, cameras among them; and why not, in words."""
 
+    wanted: bool = False
     left_out: tuple[str, ...] = ()
     cameras: tuple[str, ...] = ()  # entities
     sentence: str = ""
@@ -55,10 +56,14 @@ def plan(data: RunData, scope: Scope) -> Import:
             topics, imus = tuple(log.topics.values()), log.imu_topics
     except (OSError, LogError) as error:
         return Import(sentence=f"{SENTENCE}: {error}")
-    drawn = set(imus) if len(imus) == 1 else set()  # which of several is drawn, its own name does not say
+    drawn = set(imus) & {data.provenance.get("IMU", "")}
     left_out = tuple(topic.name for topic in topics if topic.name in drawn or topic.metadata.get(DERIVED_KEY) in drawn)
+    sentence = ""
+    if scope and (frames := tuple(topic.name for topic in topics if topic.schema_name in (schema.TF, schema.TRANSFORM))):
+        left_out += frames  # a viewer has one set of frames, and both logs would move the same
+        sentence = f"Its transforms ({', '.join(frames)}) are not shown: other logs are, which may name the same frames."
     cameras = tuple(_camera(topic, data, scope) for topic in topics if topic.schema_name == schema.IMAGE and topic.count)
-    return Import(left_out, cameras)
+    return Import(True, left_out, cameras, sentence)
 
 
 def log(data: RunData, to: rr.RecordingStream, scope: Scope) -> list[str]:
@@ -68,8 +73,9 @@ def log(data: RunData, to: rr.RecordingStream, scope: Scope) -> list[str]:
     the log time where a message has none on the IMU's clock.
     """
     what = plan(data, scope)
-    if what.sentence or data.source is None:
-        return [what.sentence] if what.sentence else []
+    said = [what.sentence] if what.sentence else []
+    if not what.wanted or data.source is None:
+        return said
     from rerun.chunk import McapReader
 
     exclude = [f"^{re.escape(topic)}$" for topic in what.left_out]
@@ -78,8 +84,8 @@ def log(data: RunData, to: rr.RecordingStream, scope: Scope) -> list[str]:
         to.send_chunks(_placed(reader.stream(), data, scope))
     except (ValueError, RuntimeError, OSError) as error:
         logger.debug("%s", error, exc_info=True)
-        return [f"{SENTENCE}: Rerun cannot read them ({error})."]
-    return []
+        return [*said, f"{SENTENCE}: Rerun cannot read them ({error})."]
+    return said
 
 
 def _camera(topic: Topic, data: RunData, scope: Scope) -> str:
@@ -109,7 +115,7 @@ def _timed(chunk: Chunk, data: RunData) -> list[Chunk]:
     from rerun.chunk import Chunk
 
     batch = chunk.to_record_batch()
-    elapsed = _elapsed(_ns(batch, clock.STAMP), _ns(batch, clock.LOG_TIME), data)
+    elapsed = elapsed_ns(_ns(batch, clock.STAMP), _ns(batch, clock.LOG_TIME), data)
     fields, columns = [], []
     for field, column in zip(batch.schema, batch.columns, strict=True):
         if field.name == "message_publish_time":
@@ -124,7 +130,7 @@ def _timed(chunk: Chunk, data: RunData) -> list[Chunk]:
     return Chunk.from_record_batch(pa.record_batch(columns, schema=pa.schema(fields, metadata=batch.schema.metadata)))
 
 
-def _elapsed(stamp_ns: Times | None, log_ns: Times | None, data: RunData) -> Times:
+def elapsed_ns(stamp_ns: Times | None, log_ns: Times | None, data: RunData) -> Times:
     """Time since the first IMU sample, by header stamps if all are on its clock, else by log times."""
     if stamp_ns is not None:
         inside = (stamp_ns > data.start_ns - MARGIN_NS) & (stamp_ns < data.end_ns + MARGIN_NS)

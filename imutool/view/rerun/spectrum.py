@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from jaxtyping import Float64
 
-from imutool.view.rerun import entities, styles
+from imutool.view.rerun import entities
 from imutool.view.rerun.entities import Scope
 from imutool.view.rerun.palette import BOLD_WIDTH, GRID, INK, RAW_FADE, XYZ, axis_colors, faded
 from imutool.view.rerun.signals import rank
@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 WIDTH, HEIGHT = 200.0, 90.0  # of the drawing, which the viewer scales as a whole
 SHOWN_X, SHOWN_Y = (-24.0, WIDTH + 8.0), (-6.0, HEIGHT + 14.0)  # with room for numbers
 KINDS = ("gyro", "accel")
+SLACK = 0.02  # of a decade: 100.1 Hz need no decade of their own
 MOST_POINTS = 400  # of a curve: about two a pixel, of each bucket its lowest and its highest
 
 
@@ -65,7 +66,7 @@ def frame_of(data: RunData, kind: str) -> Frame:
     root = root[root > 0.0]
     high = int(np.ceil(np.log10(root.max()))) if len(root) else 0
     low = max(int(np.floor(np.log10(root.min()))), high - 5) if len(root) else -1
-    low_hz, high_hz = int(np.floor(np.log10(hz.min()))), int(np.ceil(np.log10(hz.max())))
+    low_hz, high_hz = int(np.floor(np.log10(hz.min()))), int(np.ceil(np.log10(hz.max()) - SLACK))
     return Frame(low_hz, max(high_hz, low_hz + 1), low, max(high, low + 1))
 
 
@@ -87,7 +88,7 @@ def _log_curves(data: RunData, to: rr.RecordingStream, entity: str, trace: Trace
     strips = [thinned(frame.at(spectrum.frequency_hz, np.sqrt(column))) for column in spectrum.density.T]
     faint = trace.is_raw and bool(data.models())
     colors = [faded(color, RAW_FADE) for color in XYZ] if faint else axis_colors(rank(data, trace))
-    radius = styles.PATH_RADII["raw"] if faint else BOLD_WIDTH / 2.0
+    radius = 0.9 * BOLD_WIDTH if faint else BOLD_WIDTH / 2.0  # of what did not change, raw is the rim
     lines = rr.LineStrips2D(strips, colors=colors, radii=rr.Radius.ui_points(radius), draw_order=1.0 if faint else 2.0)
     to.log(entity, lines, static=True, strict=True)
 
