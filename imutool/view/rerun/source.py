@@ -115,7 +115,7 @@ def _timed(chunk: Chunk, data: RunData) -> list[Chunk]:
     from rerun.chunk import Chunk
 
     batch = chunk.to_record_batch()
-    elapsed = _elapsed(_ns(batch, clock.STAMP), _ns(batch, clock.LOG_TIME), data)
+    elapsed = elapsed_ns(_ns(batch, clock.STAMP), _ns(batch, clock.LOG_TIME), data)
     fields, columns = [], []
     for field, column in zip(batch.schema, batch.columns, strict=True):
         if field.name == "message_publish_time":
@@ -130,7 +130,7 @@ def _timed(chunk: Chunk, data: RunData) -> list[Chunk]:
     return Chunk.from_record_batch(pa.record_batch(columns, schema=pa.schema(fields, metadata=batch.schema.metadata)))
 
 
-def _elapsed(stamp_ns: Times | None, log_ns: Times | None, data: RunData) -> Times:
+def elapsed_ns(stamp_ns: Times | None, log_ns: Times | None, data: RunData) -> Times:
     """Time since the first IMU sample, by header stamps if all are on its clock, else by log times."""
     if stamp_ns is not None:
         inside = (stamp_ns > data.start_ns - MARGIN_NS) & (stamp_ns < data.end_ns + MARGIN_NS)
