@@ -3,6 +3,10 @@
 A made-up log of that length at 200 Hz, truth at 200 Hz too and a debiased channel in it, in a temporary folder. Prints seconds
 of `imutool.view.runs.load` (all of it), of `rundata.build` (its last part: paths, errors, drift, windows, spectra, events), and
 how much memory the process took at most beyond what the imports take. On one core, the log in the page cache.
+
+Then the viewer, Rerun's own without a window and drawing in software (the slowest that there is): seconds until everything is
+sent (`sent_s`), and until every curve of gyro and accel, raw and debiased, stands on the screen and stays (`drawn_s`, from the
+same moment: the data being ready), and the memory of the viewer's process then (`viewer_mb`).
 """
 
 from __future__ import annotations
@@ -12,18 +16,27 @@ import cProfile
 import json
 import pstats
 import re
+import runpy
 import subprocess
 import sys
 import tempfile
 import time
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 from imutool.mcap_io.read import read
 from imutool.mcap_io.write import write
 from imutool.physics.flight import flight
 from imutool.view import rundata, runs
+from imutool.view.rerun import layout, scene
+
+TESTS = Path(__file__).parents[1]
+VIEWERS = SimpleNamespace(**runpy.run_path(str(TESTS / "viewers.py")))
+CURVES = SimpleNamespace(**runpy.run_path(str(TESTS / "view" / "curves.py")))
 
 RATE_HZ = 200.0
+GIVE_UP_S = 120.0
 
 
 def write_long(folder: Path, minutes: float) -> Path:
@@ -58,7 +71,34 @@ def measure(log: Path, profile: bool) -> dict[str, float]:
     began = time.perf_counter()
     rundata.build(recording, read_only)
     built_s = time.perf_counter() - began
-    return {"samples": len(recording.imu), "runs": len(read_only), "load_s": loaded_s, "build_s": built_s, "more_mb": more_mb}
+    costs = {"samples": len(recording.imu), "runs": len(read_only), "load_s": loaded_s, "build_s": built_s, "more_mb": more_mb}
+    return costs | look(data)
+
+
+def look(data: rundata.RunData) -> dict[str, float]:
+    """Seconds and memory of the viewer; nothing where there is no driver to draw with."""
+    if VIEWERS.driver() is None:
+        print(f"no viewer: apt-get install {' '.join(VIEWERS.PACKAGES['driver'])}", file=sys.stderr)
+        return {}
+    with tempfile.TemporaryDirectory() as folder:
+        curves = CURVES.curves(CURVES.RRD.written([data], Path(folder) / "log.rrd", source=False))
+    blueprint = layout.blueprint([data])
+    signals = [view for view in CURVES.RRD.views(blueprint) if CURVES.RRD.held(view, ["/imu/gyro/raw", "/imu/accel/raw"])]
+
+    def time_it(viewer: Any) -> dict[str, float]:
+        began = time.perf_counter()
+        viewer.show(lambda to: scene.log([data], to, source=False), blueprint)
+        sent_s = time.perf_counter() - began
+        while True:
+            seen = dict(zip([view.id for view in signals], viewer.pictures([view.id for view in signals]), strict=True))
+            missing = [fault for view in signals for fault in CURVES.unseen(view, seen[view.id], curves)]
+            if not missing:
+                return {"sent_s": sent_s, "drawn_s": time.perf_counter() - began, "viewer_mb": viewer.resident_mib}
+            if time.perf_counter() - began > GIVE_UP_S:
+                raise SystemExit(f"not drawn: {missing}")
+
+    found: dict[str, float] = VIEWERS.seen(time_it, (1920, 1080))
+    return found
 
 
 def main() -> None:
