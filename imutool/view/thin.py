@@ -23,18 +23,18 @@ def curve_rows(values: Float64[np.ndarray, "n k"], most: int = MOST) -> Rows:
     buckets = max(1, (most - 2) // (2 * columns + 1))
     size = -(-n // buckets)
     starts = np.arange(0, n, size)
-    chosen = [np.array([0, n - 1])]
-    padded = np.full((len(starts) * size, columns), np.nan)
-    padded[:n] = values
-    cut = padded.reshape(len(starts), size, columns)
+    padded = np.full((columns, len(starts) * size), np.nan)  # by column: what lies side by side is searched many times faster
+    padded[:, :n] = values.T
+    cut = padded.reshape(columns, len(starts), size)
     hole = np.isnan(cut)
-    for of, least in ((cut, np.inf), (-cut, np.inf)):
-        of = np.where(hole, least, of)
-        chosen.append((starts[:, None] + of.argmin(axis=1)).ravel())
-    holes = hole.any(axis=2)
-    chosen.append((starts + holes.argmax(axis=1))[holes.any(axis=1)])
-    rows: Rows = np.unique(np.concatenate(chosen))
-    return rows[rows < n]
+    drawn = np.zeros(padded.shape[1], dtype=bool)
+    drawn[[0, n - 1]] = True
+    for least in (np.where(hole, np.inf, cut).argmin(axis=2), np.where(hole, -np.inf, cut).argmax(axis=2)):
+        drawn[starts + least] = True
+    holes = hole.any(axis=0)
+    drawn[(starts + holes.argmax(axis=1))[holes.any(axis=1)]] = True
+    rows: Rows = np.flatnonzero(drawn[:n])
+    return rows
 
 
 def path_rows(p_wb: Float64[np.ndarray, "n 3"], most: int = MOST_IN_3D) -> Rows:
