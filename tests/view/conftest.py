@@ -12,7 +12,6 @@ from imutool.physics.flight import ACCEL_BIAS, GYRO_BIAS, flight
 from imutool.recording import Imu, Recording
 from imutool.view.rundata import Run, RunData, build
 
-
 sys.path.insert(0, str(Path(__file__).parents[1] / "clean"))  # for the planting of defects
 
 

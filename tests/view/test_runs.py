@@ -17,7 +17,7 @@ from imutool.mcap_io.log import Log
 from imutool.mcap_io.read import read
 from imutool.mcap_io.write import write
 from imutool.physics.flight import flight
-from imutool.recording import Imu, Poses, Recording
+from imutool.recording import Imu, Recording
 from imutool.view.findings import FINDINGS
 from imutool.view.provenance import LONGEST, MOST_ENTRIES, provenance
 from imutool.view.runs import load
