@@ -1,10 +1,11 @@
-"""What a log holds that can be looked at: its IMU, also where that is not sound, what was derived from it, and what is wrong."""
+"""What a log holds that can be looked at: its IMU, also where that is not sound, and what was derived from it."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -38,6 +39,17 @@ class Recorded:
     notes: tuple[str, ...]
 
 
+class _Read(NamedTuple):
+    """What one pass over the log brings: messages as they are, and a recording of all but the IMU."""
+
+    topic: str
+    derived: list[str]
+    batches: dict[str, list[ImuBatch]]
+    beliefs: dict[str, list[schema.TwistColumns]]
+    rest: Recording
+    metadata: list[tuple[str, dict[str, str]]]
+
+
 def recorded(path: Path, *, imu: str | None = None, truth: str | None = None) -> Recorded:
     """Reads a log for looking at it.
 
@@ -50,19 +62,12 @@ def recorded(path: Path, *, imu: str | None = None, truth: str | None = None) ->
         LogError: nothing in it can be saved, no IMU or several without `imu`, fewer than two samples, no such topic.
     """
     notes: list[str] = []
-    with Log(path, salvage=True) as log:
-        topic = log.only_imu() if imu is None else log.topic(imu, (schema.IMU,)).name
-        derived = [one.name for one in log.with_schema((schema.IMU,)) if one.metadata.get(DERIVED_KEY) == topic]
-        biases = [one.name for one in log.with_schema((schema.TWIST,)) if one.metadata.get(DERIVED_KEY) == topic]
-        batches, beliefs = _messages(log, [topic, *derived], biases)
-
-        def refused(name: str, error: LogError) -> None:
-            notes.append(f"The true poses on {name} are left out: {error.what}.")
-
-        rest = recording_in(log, imu=topic, truth=truth, samples=NONE, refused=None if truth else refused)
-        metadata, losses = log.metadata_records(), log.losses
-    assert losses is not None, "with salvage there are losses, if perhaps none"
-    notes += [f"The log is damaged; {line}." for line in told(losses.plain())]
+    try:
+        found = _read(path, imu, truth, notes, salvage=False)
+    except LogError:  # a sound log is read faster than one that nothing vouches for; what is no damage is refused again
+        notes.clear()
+        found = _read(path, imu, truth, notes, salvage=True)
+    topic, derived, batches, beliefs, rest, metadata = found
     where = f"{path} {topic}"
     survey = examine(lambda: batches[topic], _true(rest), Rules(), where=str(path), topic=topic)
     samples, logged, why = _held(batches[topic], survey, where)
@@ -80,6 +85,22 @@ def recorded(path: Path, *, imu: str | None = None, truth: str | None = None) ->
         else:
             debiased.append(run)
     return Recorded(replace(rest, imu=samples), logged, tuple(debiased), survey, metadata, tuple(notes))
+
+
+def _read(path: Path, imu: str | None, truth: str | None, notes: list[str], *, salvage: bool) -> _Read:
+    def refused(name: str, error: LogError) -> None:
+        notes.append(f"The true poses on {name} are left out: {error.what}.")
+
+    with Log(path, salvage=salvage) as log:
+        topic = log.only_imu() if imu is None else log.topic(imu, (schema.IMU,)).name
+        derived = [one.name for one in log.with_schema((schema.IMU,)) if one.metadata.get(DERIVED_KEY) == topic]
+        biases = [one.name for one in log.with_schema((schema.TWIST,)) if one.metadata.get(DERIVED_KEY) == topic]
+        batches, beliefs = _messages(log, [topic, *derived], biases)
+        rest = recording_in(log, imu=topic, truth=truth, samples=NONE, derived=False, refused=None if truth else refused)
+        metadata = log.metadata_records()
+        if log.losses is not None:
+            notes += [f"The log is damaged; {line}." for line in told(log.losses.plain())]
+    return _Read(topic, derived, batches, beliefs, rest, metadata)
 
 
 def _messages(
@@ -137,16 +158,16 @@ def _model(metadata: Sequence[tuple[str, Mapping[str, str]]], topic: str) -> str
 def _run(
     name: str, model: str, raw: Imu, batches: Sequence[ImuBatch], beliefs: Mapping[str, Sequence[schema.TwistColumns]]
 ) -> Run | None:
-    """A debiased channel, with the bias and certainty beside it in the log; else the bias by subtraction, where stamps agree."""
+    """A debiased channel with the bias and its certainty beside it in the log; else the bias by subtraction at equal stamps."""
     try:
         imu, _ = _columns(batches)
     except DataError:
         return None
     called = f"in the log: {model}" if model else name.rpartition("/")[2]
-    for parts in beliefs.values():
+    for parts in filter(None, beliefs.values()):
         stamp_ns, angular, linear, variance = (np.concatenate(column) for column in list(zip(*parts, strict=True))[:4])
         if np.array_equal(stamp_ns, imu.t_ns):
-            return Run(called, imu, angular, linear, np.sqrt(variance))
+            return Run(called, imu, angular, linear, np.sqrt(np.maximum(variance, 0.0)))
     rows = np.minimum(np.searchsorted(raw.t_ns, imu.t_ns), len(raw) - 1)
     if len(imu) < FEWEST or not np.array_equal(raw.t_ns[rows], imu.t_ns):
         return None
