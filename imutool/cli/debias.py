@@ -12,7 +12,7 @@ import typer
 from imutool.cli._app import LOST, Init, Json, Overwrite, Quiet, Smooth, Verbose, app
 from imutool.errors import ConfigError
 from imutool.mcap_io.losses import Losses
-from imutool.place import place
+from imutool.place import Place, place
 from imutool.terminal import progress, say, tell_losses, write_json
 
 if TYPE_CHECKING:
@@ -43,6 +43,9 @@ def debias(
     view: Annotated[bool, typer.Option("--view", help="Show it in a viewer as it goes.")] = False,
     connect: Annotated[str | None, typer.Option(metavar="URL", help="Show it in a viewer that runs: HOST:PORT.")] = None,
     save_view: Annotated[Path | None, typer.Option(metavar="F.rrd", help="Keep what a viewer would show in a file.")] = None,
+    report_to: Annotated[
+        Path | None, typer.Option("--report", metavar="F.html", help="Write a page about the debiased log.")
+    ] = None,
     overwrite: Overwrite = False,
     json_to: Json = None,
     verbose: Verbose = False,
@@ -51,6 +54,10 @@ def debias(
     """Rewrite a log with a debiased IMU channel; everything else passes through unchanged."""
     _refuse_contradictions(target, in_place, overwrite)
     models = assigned(model or ())
+    if report_to is not None:
+        from imutool.view import report as pages
+
+        pages.refuse(report_to, overwrite=overwrite)
     from imutool.clean import Rules
     from imutool.debias import debias as run
 
@@ -69,6 +76,9 @@ def debias(
             progress=lambda done, total: tell(done, total, ""),
             watch=watch,
         )
+        if report_to is not None:
+            tell(1, 1, "drawing")
+            _draw(place(target or source), list(report.starts), report_to, overwrite)
     imus = {
         topic: {
             "model": report.models[topic],
@@ -99,6 +109,8 @@ def debias(
     say(f"checked: every index, and the contents of {verified.chunks_checked} of {verified.chunks} chunks (--verify {verify})")
     for shown in () if watch is None else watch.shown:
         say(shown.said)
+    if report_to is not None:
+        say(f"Report: {report_to}")
     tell_losses(report.losses.plain())
     _leave(report.losses)
 
@@ -113,6 +125,14 @@ def _watching(
 
     out = Path(target or source)
     return watching(out.stem, connect_to=connect, save=save, instead=Path(f"{out.stem}.rrd"), overwrite=overwrite)
+
+
+def _draw(log: Place, topics: Sequence[str], page: Path, overwrite: bool) -> None:
+    """A page about the debiased log, each of its IMUs under its own topic where there are several."""
+    from imutool.view.report import by_topic, write_page
+    from imutool.view.runs import load
+
+    write_page(by_topic([load(log, imu=topic) for topic in topics], topics), page, overwrite=overwrite)
 
 
 def _leave(losses: Losses) -> NoReturn:

@@ -35,7 +35,9 @@ def view(
     export_web: Annotated[
         Path | None, typer.Option(metavar="DIR", help="Write a folder that any web server can serve.")
     ] = None,
-    png: Annotated[Path | None, typer.Option(metavar="DIR", help="Draw pictures, without Rerun.")] = None,
+    png: Annotated[
+        Path | None, typer.Option(metavar="DIR", help="Draw pictures, LOG-errors.png and so on; without Rerun.")
+    ] = None,
     html: Annotated[Path | None, typer.Option(metavar="F.html", help="Write a page of its own, without Rerun.")] = None,
     overwrite: Overwrite = False,
     json_to: Json = None,

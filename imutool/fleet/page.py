@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import os
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
+from urllib.parse import quote
 
 import numpy as np
 from jaxtyping import Float64
@@ -28,6 +31,21 @@ OWN_STYLE = """
 """
 
 
+@dataclass(frozen=True)
+class Links:
+    """The way from the page to what lies below OUT: relative where both are on one disk, so that both can be moved together."""
+
+    page: Place
+    out: Place | None
+
+    def to(self, name: str) -> str:
+        """An address that a browser takes as it is, whatever the log is called."""
+        if isinstance(self.page, Path) and isinstance(self.out, Path):
+            there = os.path.relpath(self.out / name, self.page.parent.absolute())
+            return quote(Path(there).as_posix())
+        return quote(str(self.out / name if self.out is not None else name), safe="/:")
+
+
 @dataclass
 class _Seen:
     """What one pass over the results gathers: numbers for the pictures, and the rows that are told."""
@@ -43,6 +61,8 @@ class _Seen:
     warnings: Counter[str] = field(default_factory=Counter)
     trouble: list[Result] = field(default_factory=list)
     peak_bytes: int = 0
+    drawn: list[Result] = field(default_factory=list)
+    pages: int = 0
 
     def take(self, one: Result) -> None:
         status = one.earlier if one.status == "skipped" and one.earlier else one.status
@@ -55,6 +75,9 @@ class _Seen:
             return
         self.bytes_in, self.bytes_out = self.bytes_in + one.source_bytes, self.bytes_out + one.target_bytes
         self.messages += one.messages
+        self.pages += bool(one.page)
+        if one.page and len(self.drawn) < MOST_ROWS:
+            self.drawn.append(one)
         self.seconds.append(one.seconds)
         self.speeds.append(one.source_bytes / 1e6 / max(one.seconds, 1e-9))
         if one.score is not None:
@@ -70,6 +93,7 @@ def write(
     settings: Settings,
     path: Place,
     *,
+    out: Place | None = None,
     seconds: float,
     source: str,
     compared: Compared | None = None,
@@ -81,13 +105,20 @@ def write(
         ConfigError: matplotlib is not installed, or the file exists (without `overwrite`) or cannot be written.
     """
     with Target(path, overwrite=overwrite) as target:
-        target.write(html(results, settings, seconds=seconds, source=source, compared=compared).encode())
+        link = Links(path, out)
+        target.write(html(results, settings, link=link, seconds=seconds, source=source, compared=compared).encode())
 
 
 def html(
-    results: Iterable[Result], settings: Settings, *, seconds: float, source: str, compared: Compared | None = None
+    results: Iterable[Result],
+    settings: Settings,
+    *,
+    seconds: float,
+    source: str,
+    link: Links | None = None,
+    compared: Compared | None = None,
 ) -> str:
-    """The page of `write` as text."""
+    """The page of `write` as text; with `link` it leads to the pages of the logs."""
     seen = _Seen()
     for one in results:
         seen.take(one)
@@ -97,6 +128,7 @@ def html(
         *_numbers(seen, seconds),
         *(_outliers(compared) if compared is not None else ()),
         *_trouble(seen),
+        *(_logs(seen, link) if link is not None else ()),
         *_warnings(seen),
         *_spread(seen),
         *_provenance(settings),
@@ -150,6 +182,21 @@ def _trouble(seen: _Seen) -> Iterator[str]:
     more = sum(seen.statuses[name] for name in TROUBLE) - len(seen.trouble)
     if more:
         yield f'<p class="note">{more:,} more are in fleet.parquet.</p>'
+
+
+def _logs(seen: _Seen, link: Links) -> Iterator[str]:
+    """A line for each log that has a page, and the way there."""
+    if not seen.drawn:
+        return
+    yield "<h2>Logs</h2>"
+    rows = "".join(
+        f'<tr><td><a href="{text(link.to(one.page))}">{text(one.page.removesuffix(".html"))}</a></td>'
+        f"<td>{text(one.page_says)}</td></tr>"
+        for one in seen.drawn
+    )
+    yield f"<table><thead><tr><th>Log</th><th>What its page says</th></tr></thead><tbody>{rows}</tbody></table>"
+    if seen.pages > len(seen.drawn):
+        yield f'<p class="note">{seen.pages - len(seen.drawn):,} more pages lie beside their logs.</p>'
 
 
 def _warnings(seen: _Seen) -> Iterator[str]:

@@ -36,32 +36,33 @@ DIFFERENCE = '<span class="key" style="background: var(--before)"></span>real mi
 HELD = '<span class="key" style="background: var(--held); opacity: 0.5"></span>time that no fit has seen'
 
 
-def write(d: Diagnosis, path: Path, *, overwrite: bool = False) -> None:
+def write(d: Diagnosis, path: Path, *, logs: str | None = None, overwrite: bool = False) -> None:
     """Writes the page: one file without any request to elsewhere, for light and dark screens and for paper.
 
     Raises:
         ConfigError: matplotlib is not installed, or the file exists (without `overwrite`) or cannot be written.
     """
     with Target(path, overwrite=overwrite) as target:  # refuses before the work is done, leaves nothing after a failure
-        target.write(html(d).encode())
+        target.write(html(d, logs=logs).encode())
 
 
-def html(d: Diagnosis) -> str:
-    """The page of `write` as text.
+def html(d: Diagnosis, *, logs: str | None = None) -> str:
+    """The page of `write` as text; `logs` is the name of a page about the logs themselves, in the same folder.
 
     Raises:
         ConfigError: matplotlib is not installed.
     """
-    logs = ", ".join(Path(one).name for one in d.real)
+    names = ", ".join(Path(one).name for one in d.real)
     against = (
         f"against {Path(d.sim).name}"
         if d.sim is not None
         else f"against {'its' if len(d.real) == 1 else 'their'} own true poses"
     )
     body = [
-        f"<h1>{text(logs)} {text(against)}</h1>",
+        f"<h1>{text(names)} {text(against)}</h1>",
         f'<p class="conclusion">{text(conclusion(d))}</p>',
         *(f'<p class="note">{text(one)}</p>' for one in d.remarks),
+        *([f'<p><a href="{text(logs)}">The recordings themselves</a>: signals, spectra, events.</p>'] if logs else []),
         *_findings(d),
         *_places(d),
         *_before_and_after(d),
@@ -69,7 +70,7 @@ def html(d: Diagnosis) -> str:
         *_left(d),
         *_provenance(d),
     ]
-    return document(f"Diagnosis of {logs}", body)
+    return document(f"Diagnosis of {names}", body)
 
 
 def _findings(d: Diagnosis) -> Iterator[str]:

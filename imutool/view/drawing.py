@@ -55,6 +55,7 @@ STYLE = {
     "svg.fonttype": "none",
     "text.parse_math": False,  # a dollar in the name of a channel is a dollar
     "axes.formatter.useoffset": False,  # an axis that says +1.2e-3 in a corner is misread
+    "axes.formatter.limits": (-6, 9),  # nor is a power of ten above an axis seen
     "axes.formatter.use_mathtext": False,
     "axes.unicode_minus": True,
 }
@@ -144,7 +145,8 @@ def apart(drawn: str, prefix: str) -> str:
 def legend(figure: Any, artists: Sequence[Any]) -> None:
     """The artists' names in rows above everything: inside the axes they would cover a curve sooner or later."""
     names = [short(str(artist.get_label())) for artist in artists]
-    columns = max(1, min(len(names), LEGEND_LETTERS // (max(map(len, names)) + HANDLE_LETTERS)))
+    widths = [len(name) + HANDLE_LETTERS for name in names]
+    columns = len(names) if sum(widths) <= LEGEND_LETTERS else max(1, min(len(names), LEGEND_LETTERS // max(widths)))
     figure.legend(artists, names, loc="outside upper left", ncols=columns, handlelength=1.6, fontsize=8.5)
 
 
@@ -236,7 +238,7 @@ def _curves(figure: Any) -> dict[str, str]:
     from matplotlib.collections import Collection
     from matplotlib.lines import Line2D
 
-    titles = {}
+    titles: dict[str, str] = {}
     for axes in figure.get_axes():
         for artist in (*axes.lines, *axes.collections):
             name = str(artist.get_label())

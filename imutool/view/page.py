@@ -5,8 +5,10 @@ from __future__ import annotations
 from collections.abc import Iterable
 from html import escape
 
+from imutool.place import Place
 from imutool.view.theme import STYLE
 
+GENERATOR = '<meta name="generator" content="imutool">'
 POLICY = "default-src 'none'; style-src 'unsafe-inline'"  # whatever a log is called, no request leaves the page
 
 
@@ -15,10 +17,17 @@ def document(title: str, body: Iterable[str], style: str = "") -> str:
     head = (
         f'<meta charset="utf-8"><meta http-equiv="Content-Security-Policy" content="{POLICY}">'
         '<meta name="viewport" content="width=device-width, initial-scale=1">'
+        f"{GENERATOR}"
         f"<title>{text(title)}</title><style>{STYLE}{style}</style>"
     )
     lines = "\n".join(body)
     return f'<!DOCTYPE html>\n<html lang="en"><head>{head}</head>\n<body><main>\n{lines}\n</main></body></html>\n'
+
+
+def is_ours(path: Place) -> bool:
+    """Whether a file begins like a page that imutool has written."""
+    with path.open("rb") as file:
+        return GENERATOR.encode() in file.read(1024)
 
 
 def text(words: str) -> str:

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import platform
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 
 import numpy as np
 
 from imutool import __version__
+from imutool.place import Place
 from imutool.recording import Recording
 
 OURS = "imutool"  # with it begin the names of the metadata records that imutool writes
@@ -17,7 +17,7 @@ LONGEST = 200  # letters of a value
 
 
 def provenance(
-    log: Path,
+    log: Place,
     recording: Recording,
     metadata: Sequence[tuple[str, Mapping[str, str]]],
     models: Mapping[str, str],

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -17,6 +16,7 @@ from imutool.mcap_io import schema
 from imutool.mcap_io.log import DERIVED_KEY, ImuBatch, Log
 from imutool.mcap_io.losses import told
 from imutool.mcap_io.read import recording_in
+from imutool.place import Place
 from imutool.recording import Imu, Recording
 from imutool.view.rundata import Logged, Run
 
@@ -50,7 +50,7 @@ class _Read(NamedTuple):
     metadata: list[tuple[str, dict[str, str]]]
 
 
-def recorded(path: Path, *, imu: str | None = None, truth: str | None = None) -> Recorded:
+def recorded(path: Place, *, imu: str | None = None, truth: str | None = None) -> Recorded:
     """Reads a log for looking at it.
 
     An IMU that cannot be held as it is (stamps that repeat or go back, values that are no numbers) is read as `debias --clean`
@@ -87,7 +87,7 @@ def recorded(path: Path, *, imu: str | None = None, truth: str | None = None) ->
     return Recorded(replace(rest, imu=samples), logged, tuple(debiased), survey, metadata, tuple(notes))
 
 
-def _read(path: Path, imu: str | None, truth: str | None, notes: list[str], *, salvage: bool) -> _Read:
+def _read(path: Place, imu: str | None, truth: str | None, notes: list[str], *, salvage: bool) -> _Read:
     def refused(name: str, error: LogError) -> None:
         notes.append(f"The true poses on {name} are left out: {error.what}.")
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import platform
 import re
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -41,13 +42,15 @@ nav { display: flex; flex-wrap: wrap; gap: 4px 16px; font-size: 14px; margin: 10
 .pair > * { min-width: 0; }
 .numeric th:not(:first-child), .numeric td:not(:first-child) { text-align: right; }
 .numeric th { white-space: normal; vertical-align: bottom; overflow-wrap: anywhere; }
-.numeric td:first-child { min-width: 130px; }
+.numeric td:first-child { min-width: 130px; } .numeric .word { text-align: left !important; }
+@media screen and (min-width: 900px) { .numeric td:first-child { white-space: nowrap; } }
 td.best { font-weight: 700; color: var(--after); }
 summary { cursor: pointer; font-size: 15px; padding: 8px 0; color: var(--soft); }
 @media (max-width: 600px) { main { padding: 14px 12px 40px; } .conclusion { font-size: 17px; } }
 @media print { @page { size: A4; margin: 12mm; } body { font-size: 12px; } nav, summary { display: none; }
   .pair { grid-template-columns: 1fr 1fr; gap: 8px 12px; } h2.log { break-before: page; } .conclusion { font-size: 16px; }
-  table { font-size: 11px; } th, td { padding: 3px 8px 3px 0; } h3 { margin-top: 16px; }
+  table, dl { font-size: 11px; } th, td { padding: 3px 8px 3px 0; } h3 { margin-top: 16px; }
+  section > .note, section > h3 { break-after: avoid; } .note { font-size: 11px; }
   details::details-content { content-visibility: visible; display: block; block-size: auto; } a { color: inherit; } }
 """
 
@@ -110,6 +113,23 @@ def file_name(name: str) -> str:
     return re.sub(r"[^\w.+-]", "_", name).lstrip(".-")[:100] or "_"
 
 
+def by_topic(logs: Sequence[RunData], topics: Sequence[str]) -> list[RunData]:
+    """Several IMUs of one log, each called by its topic too; a single one keeps the log's name."""
+    if len(logs) < 2:
+        return list(logs)
+    return [replace(data, name=f"{data.name} {topic}") for data, topic in zip(logs, topics, strict=True)]
+
+
+def refuse(path: Place, *, overwrite: bool = False) -> None:
+    """Nothing, where a page can be written; to be asked before the work is done.
+
+    Raises:
+        ConfigError: matplotlib is not installed, or the file exists (without `overwrite`) or cannot be written.
+    """
+    library()
+    Target(path, overwrite=overwrite).abandon()
+
+
 def _pictures(data: RunData) -> Iterator[Picture | None]:
     for make in PICTURES:
         yield make(data)
@@ -124,8 +144,8 @@ def _log(data: RunData, key: str, *, alone: bool) -> Iterator[str]:
     links = [("figures", "Figures")] * bool(data.table()) + list(entries.items()) + [("provenance", "Provenance")]
     yield f'<nav aria-label="Parts of the report about {text(data.name)}">'
     yield "".join(f'<a href="#{key}-{name}">{text(title)}</a>' for name, title in links) + "</nav>"
-    yield from _figures(data, key)
-    yield from _windows(data)
+    yield f'<div class="pair">{"".join((*_figures(data, key), *_windows(data)))}</div>'
+    yield from (f'<p class="note">{text(note)}</p>' for note in (*data.notes, *report_signals.left_out()))
     if not alone:
         yield "<details><summary>Pictures, events and provenance</summary>"
     for picture in pictures:
@@ -187,7 +207,7 @@ def _windows(data: RunData) -> Iterator[str]:
     runs = [trace for trace in data.traces if trace.windows]
     quantities = (("orientation_deg", "°"), ("velocity_m_s", "m/s"), ("position_m", "m"))
     head = "".join(f"<th>{text(name)}</th>" for name in ("", *(trace.name for trace in runs)))
-    yield "<h3>Drift from a true start</h3>"
+    yield "<section><h3>Drift from a true start</h3>"
     yield f'<div class="scroll"><table class="numeric"><thead><tr>{head}</tr></thead><tbody>'
     for name, unit in quantities:
         for length in lengths:
@@ -197,27 +217,27 @@ def _windows(data: RunData) -> Iterator[str]:
             words = f"{name.split('_')[0].capitalize()} after {length:g} s ({unit})"
             yield f"<tr><td>{words}</td>{_cells(values, lowest(values, name))}</tr>"
     yield '</tbody></table></div><p class="note">Root mean squares at the ends of windows that each start from the truth.</p>'
+    yield "</section>"
 
 
 def _compared(logs: Sequence[RunData]) -> Iterator[str]:
     """Every run of every log in one row."""
     head = ("Log", "Run", "Seconds", "Orientation error (°)", "Position error (m)", "Velocity error (m/s)", "Largest (°)")
     yield '<div class="scroll"><table class="numeric"><thead><tr>'
-    yield "".join(f"<th>{one}</th>" for one in head) + "</tr></thead><tbody>"
+    yield "".join(f"<th{' class=word' * (one == 'Run')}>{one}</th>" for one in head) + "</tr></thead><tbody>"
     for k, data in enumerate(logs, start=1):
         chosen = best(data)
         for trace in data.traces:
             found = worst(trace, data)
             values = [trace.figures.get(name) for name in ("aoe_deg", "ape_m", "velocity_rmse_m_s")]
             cells = _cells([*values, None if found is None else found[0]], 0 if trace is chosen else None)
-            name = f'<td><a href="#log{k}">{text(data.name)}</a></td><td>{text(trace.name)}</td>'
+            name = f'<td><a href="#log{k}">{text(data.name)}</a></td><td class=word>{text(trace.name)}</td>'
             yield f"<tr>{name}<td class=number>{number(data.duration_s)}</td>{cells}</tr>"
     yield "</tbody></table></div>"
 
 
 def _provenance(data: RunData, key: str) -> Iterator[str]:
     yield f'<section id="{key}-provenance"><h3>Provenance</h3>'
-    yield from (f"<p>{text(note)}</p>" for note in data.notes)
     yield "<dl>"
     for name, words in data.provenance.items():
         yield f"<dt>{text(name)}</dt><dd>{text(words)}</dd>"

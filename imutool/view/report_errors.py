@@ -7,17 +7,19 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Float64, Int64
 
+from imutool.view.deviation import Drift
 from imutool.view.drawing import Panel, Picture, extremes, legend, plain_numbers
 from imutool.view.report_paths import color_of
-from imutool.view.report_words import aligned, number
+from imutool.view.report_words import aligned
 from imutool.view.rundata import RunData, Trace
 from imutool.view.theme import INK
 
 DECADES = 2.5  # shown below the largest error of the best run: nothing is decided further down
 APART = 8.0  # times between the largest errors of two runs: beyond, one scale for both is logarithmic, or leaves one out
-HEIGHTS_INCH = {1: 2.6, 3: 5.0, 4: 6.0}
+MOST_RESETS = 60  # that can be told apart in a picture
+HEIGHTS_INCH = {1: 2.6, 3: 5.6, 4: 5.6}  # of one and of several rows: what stands side by side is of one height
 
 Line = Float64[np.ndarray, " n"]
 
@@ -53,12 +55,28 @@ def drift(data: RunData) -> Picture | None:
     if not with_drift:
         return None
     scored, drifts = [trace for trace, _ in with_drift], [drift for _, drift in with_drift]
-    times = [data.elapsed_s(one.t_ns) for one in drifts]
+    caption = f"Set to the truth every {drifts[0].reset_s:g} s."
+    curves = [(data.elapsed_s(one.t_ns), one.orientation_deg, one.position_m) for one in drifts]
+    if any(len(_resets(one)) > MOST_RESETS for one in drifts):
+        curves = [_largest(one, *rows) for one, rows in zip(drifts, curves, strict=True)]
+        caption += " Drawn is the largest drift of each such stretch."
+    times, turned, moved = (list(rows) for rows in zip(*curves, strict=True))
     panels = (
-        _panel(data, scored, times, {"total": [one.orientation_deg for one in drifts]}, "Orientation drift", "°"),
-        _panel(data, scored, times, {"total": [one.position_m for one in drifts]}, "Position drift", "m"),
+        _panel(data, scored, times, {"total": turned}, "Orientation drift", "°"),
+        _panel(data, scored, times, {"total": moved}, "Position drift", "m"),
     )
-    return Picture("drift", "Drift since the last reset", f"Set to the truth every {number(drifts[0].reset_s)} s.", panels)
+    return Picture("drift", "Drift since the last reset", caption, panels)
+
+
+def _resets(drift: Drift) -> Int64[np.ndarray, " k"]:
+    """The rows at which integration begins anew."""
+    return np.flatnonzero(np.diff(drift.since_s, prepend=np.inf) <= 0.0)
+
+
+def _largest(drift: Drift, t: Line, turned: Line, moved: Line) -> tuple[Line, Line, Line]:
+    """The largest of each stretch between resets, at its beginning."""
+    starts = _resets(drift)
+    return t[starts], np.fmax.reduceat(turned, starts), np.fmax.reduceat(moved, starts)
 
 
 def _of(trace: Trace) -> Any:

@@ -11,7 +11,7 @@ from jaxtyping import Float64
 
 from imutool.recording import Poses
 from imutool.view.drawing import Panel, Picture, legend
-from imutool.view.report_words import best, measure
+from imutool.view.report_words import best, measure, spoken
 from imutool.view.rundata import RunData, Trace, sparse, stretches
 from imutool.view.theme import AXES, BEFORE, HELD, INK, LEVELS, MODELS
 
@@ -20,6 +20,7 @@ MOST_POINTS = 1500  # of a path
 FAR = 3.0  # times the truth's extent, beyond which a path leaves the picture
 MARGIN = 0.06
 SHAPE = 1.25  # a panel is about so much wider than high
+KILOMETRES_M = 5000.0  # from which on a picture counts in kilometres
 LEAST_M = 0.5  # of a picture: a log at rest is not blown up to its millimetres
 
 Points = Float64[np.ndarray, "_ 3"]
@@ -32,22 +33,23 @@ def color_of(data: RunData, trace: Trace) -> str:
 
 def paths(data: RunData) -> Picture:
     """Truth and all runs from above and from the side, in one scale; what leaves the picture is said."""
-    side = _long_side(_reference(data))
     shown, far = _near(data)
-    panels = (
+    views = [((0, 1), "From above", shown), ((_long_side(_box(data, shown)), 2), "From the side", shown)]
+    if models := [trace for trace in far if not trace.is_raw]:
+        side = _long_side(_box(data, models))
+        views += [((0, 1), "All of it from above", models), ((side, 2), "All of it from the side", models)]
+    panels = tuple(
         Panel(
-            partial(_draw_paths, data=data, shown=shown, axes_of=(0, 1), title="From above"), HEIGHT_INCH, "Paths from above"
-        ),
-        Panel(
-            partial(_draw_paths, data=data, shown=shown, axes_of=(side, 2), title="From the side"),
-            HEIGHT_INCH,
-            "Paths from the side",
-        ),
+            partial(_draw_paths, data=data, shown=traces, axes_of=axes_of, title=title), HEIGHT_INCH, f"Paths: {title.lower()}"
+        )
+        for axes_of, title, traces in views
     )
-    left = [f"{trace.name} leaves the picture: it ends {measure(_end_m(data, trace), 'm')} away" for trace in far]
-    where = "from the true end" if data.truth is not None else "from the start"
-    marks = "Circle: start; square: end of the truth" if data.truth is not None else "Circle: start"
-    return Picture("paths", "Paths", ". ".join([marks, *(f"{one} {where}" for one in left)]) + ".", panels)
+    start = "start" if data.truth is None else "true end"
+    told = ["Circle: start" if data.truth is None else "Circle: start; square: end of the truth"]
+    for trace in far:
+        out_of = "the first two pictures" if models and not trace.is_raw else "every picture" if models else "the picture"
+        told.append(f"{spoken(trace)} leaves {out_of} and ends {measure(_end_m(data, trace), 'm')} from the {start}")
+    return Picture("paths", "Paths", f"{'. '.join(told)}.", panels)
 
 
 def heat(data: RunData) -> Picture | None:
@@ -55,37 +57,36 @@ def heat(data: RunData) -> Picture | None:
     trace = best(data)
     if trace is None or trace.errors is None or data.truth is None:
         return None
-    along = trace.path if trace in _near(data)[0] else data.truth
-    rows = np.isin(trace.errors.t_ns, along.t_ns) if along is trace.path else slice(None)
+    fits = trace in _near(data)[0]
+    points = trace.path.p_wb if fits else data.truth.at(trace.path.t_ns)[0].p_wb
     kinds = {"Position": (trace.errors.position_total_m, "m"), "Orientation": (trace.errors.orientation_total_deg, "°")}
     panels = []
     for kind, (error, unit) in kinds.items():
-        at = np.interp(along.t_ns.astype(float), trace.errors.t_ns.astype(float), error) if along is data.truth else error[rows]
-        points, worst = along.p_wb, float(np.nanmax(error))
-        draw = partial(_draw_heat, points=points, error=at, title=f"{kind} error (max. {measure(worst, unit)})", unit=unit)
-        panels.append(Panel(draw, HEIGHT_INCH, f"Path of {trace.name} from above, coloured by its {kind.lower()} error"))
-    caption = (
-        f"Path of {trace.name} from above" if along is trace.path else f"The true path, with the error that {trace.name} has"
-    )
-    return Picture("error-map", "Where the error grows", f"{caption}; colours by its error.", tuple(panels))
+        title = f"{kind} error, at most {measure(float(np.nanmax(error)), unit)}"
+        draw = partial(_draw_heat, points=points, error=error, title=title, unit=unit)
+        panels.append(Panel(draw, HEIGHT_INCH, f"{kind} error of {trace.name} along the path from above, in colours"))
+    whose = f"Path of {spoken(trace)}" if fits else "The true path"
+    caption = f"{whose} from above, coloured by the error that {spoken(trace)} has there."
+    return Picture("error-map", "Where the error grows", caption, tuple(panels))
 
 
 def _draw_paths(figure: Any, *, data: RunData, shown: Sequence[Trace], axes_of: tuple[int, int], title: str) -> None:
     axes = figure.subplots()
-    across, up = axes_of
+    sides = list(axes_of)
+    box = _box(data, shown)
+    scale, unit = _unit_of(_extent(box))
     lines = []
     for trace in data.traces:
         style = {"lw": 0.9 if trace.is_raw else 1.3, "color": color_of(data, trace), "label": trace.name}
-        lines += axes.plot(*_broken(trace.path, across, up), **style)
+        lines += axes.plot(*(_broken(trace.path)[:, sides] * scale).T, **style)
     if data.truth is not None:
-        true = axes.plot(*_broken(data.truth, across, up), lw=1.1, color=INK, ls=(0, (4, 2)), label="truth")
+        true = axes.plot(*(_broken(data.truth)[:, sides] * scale).T, lw=1.1, color=INK, ls=(0, (4, 2)), label="truth")
         lines = [*true, *lines]
-        axes.plot(*data.truth.p_wb[-1, [across, up]], marker="s", ms=5, color=INK, ls="")
+        axes.plot(*data.truth.p_wb[-1, sides] * scale, marker="s", ms=5, color=INK, ls="")
     start = (data.truth if data.truth is not None else data.traces[0].path).p_wb[0]
-    axes.plot(*start[[across, up]], marker="o", ms=5, color=INK, ls="")
-    boxes = np.concatenate([_reference(data), *(trace.path.p_wb for trace in shown)])
-    _equal(axes, boxes[:, [across, up]])
-    axes.set(xlabel=f"{AXES[across]} (m)", ylabel=f"{AXES[up]} (m)")
+    axes.plot(*start[sides] * scale, marker="o", ms=5, color=INK, ls="")
+    _equal(axes, box[:, sides] * scale, LEAST_M * scale)
+    axes.set(xlabel=f"{AXES[sides[0]]} ({unit})", ylabel=f"{AXES[sides[1]]} ({unit})")
     axes.set_title(title)
     legend(figure, lines)
 
@@ -96,10 +97,12 @@ def _draw_heat(figure: Any, *, points: Points, error: Float64[np.ndarray, " _"],
     from matplotlib.ticker import MaxNLocator
 
     axes = figure.subplots()
-    rows = sparse(len(points), MOST_POINTS)
-    points, error = points[rows], error[rows]
+    starts = np.unique(np.linspace(0, len(points) - 1, min(len(points), MOST_POINTS)).astype(int))
+    points, error = points[starts], np.fmax.reduceat(error, starts)  # the largest of each step
+    scale, unit = _unit_of(float(np.nanmax(error))) if unit == "m" else (1.0, unit)
+    error = error * scale
     top = float(np.nanmax(error))
-    edges = MaxNLocator(len(LEVELS), min_n_ticks=3).tick_values(0.0, top if top > 0.0 else 1.0)
+    edges = np.asarray(MaxNLocator(len(LEVELS), min_n_ticks=3).tick_values(0.0, top if top > 0.0 else 1.0))
     edges = edges[edges >= 0.0][: len(LEVELS) + 1]
     level = np.clip(np.searchsorted(edges, error, side="right") - 1, 0, len(edges) - 2)
     axes.plot(points[:, 0], points[:, 1], color=HELD, lw=0.6)  # where there is no truth to compare with
@@ -108,11 +111,11 @@ def _draw_heat(figure: Any, *, points: Points, error: Float64[np.ndarray, " _"],
         here = (level == k) & np.isfinite(error)
         x, y = _pieces(points, here)
         axes.plot(x, y, color=color, lw=2.2, label=f"{edges[k]:g} to {edges[k + 1]:g} {unit}", solid_capstyle="round")
-    _equal(axes, points[:, :2])
+    _equal(axes, points[:, :2], LEAST_M)
     axes.set(xlabel="x (m)", ylabel="y (m)")
     axes.set_title(title)
-    scale = ScalarMappable(BoundaryNorm(edges, len(colors)), ListedColormap(colors))
-    bar = figure.colorbar(scale, ax=axes, shrink=0.8, pad=0.02)
+    colored = ScalarMappable(BoundaryNorm(edges, len(colors)), ListedColormap(colors))
+    bar = figure.colorbar(colored, ax=axes, shrink=0.8, pad=0.02)
     bar.set_label(f"error ({unit})")
     bar.outline.set_visible(False)
     bar.ax.grid(visible=False)
@@ -130,23 +133,28 @@ def _pieces(points: Points, here: Any) -> tuple[Any, Any]:
     return out[:, 0], out[:, 1]
 
 
-def _broken(poses: Poses, across: int, up: int) -> tuple[Any, Any]:
+def _broken(poses: Poses) -> Points:
     """A path as one line that is broken where poses are missing."""
     parts = stretches(poses)
     share = max(2, MOST_POINTS // max(len(parts), 1))
     hole = np.full((1, 3), np.nan)
     rows = [piece for part in parts for piece in (part.p_wb[sparse(len(part), share)], hole)][:-1]
-    line = np.concatenate(rows)
-    return line[:, across], line[:, up]
+    return np.concatenate(rows)
 
 
-def _equal(axes: Any, box: Float64[np.ndarray, "_ 2"]) -> None:
+def _unit_of(extent_m: float) -> tuple[float, str]:
+    """What metres are multiplied by to be read easily, and what they are then."""
+    return (1e-3, "km") if extent_m >= KILOMETRES_M else (1.0, "m")
+
+
+def _equal(axes: Any, box: Float64[np.ndarray, "_ 2"], least: float) -> None:
     """Limits around what is to be seen, a metre as long upwards as across."""
     low, high = np.nanmin(box, axis=0), np.nanmax(box, axis=0)
-    middle, half = (low + high) / 2.0, np.maximum((high - low) * (0.5 + MARGIN), LEAST_M / 2.0)
+    middle, half = (low + high) / 2.0, np.maximum((high - low) * (0.5 + MARGIN), least / 2.0)
     half = np.maximum(half, half[::-1] * [SHAPE, 1.0 / SHAPE])  # no wider or higher than the room that there is
     axes.set_xlim(middle[0] - half[0], middle[0] + half[0])
     axes.set_ylim(middle[1] - half[1], middle[1] + half[1])
+    axes.locator_params(nbins=7)
     axes.set_aspect("equal", adjustable="box")
 
 
@@ -155,6 +163,11 @@ def _reference(data: RunData) -> Points:
     if data.truth is not None:
         return data.truth.p_wb
     return min((trace.path.p_wb for trace in data.traces), key=_extent)
+
+
+def _box(data: RunData, shown: Sequence[Trace]) -> Points:
+    """What is to be seen when these runs are shown beside the truth."""
+    return np.concatenate([_reference(data), *(trace.path.p_wb for trace in shown)])
 
 
 def _extent(points: Points) -> float:

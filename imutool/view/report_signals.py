@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from functools import partial
+from importlib.util import find_spec
 from typing import Any
 
 import numpy as np
@@ -13,7 +14,7 @@ from imutool import allan, stationary
 from imutool.recording import Imu
 from imutool.view.drawing import Panel, Picture, averaged, extremes, legend, plain_numbers
 from imutool.view.report_paths import color_of
-from imutool.view.report_words import best, number, worst
+from imutool.view.report_words import best, number, spoken, worst
 from imutool.view.rundata import RunData, Trace
 from imutool.view.theme import AXES, AXIS_COLORS, INK, TITLES, UNITS
 
@@ -22,7 +23,7 @@ HEIGHT_INCH = 4.2
 ZOOM_S = 4.0
 SIGMAS = 3.0
 BAND_POINTS = 300
-LEAST_REST_S = 5.0  # in one piece, from which an Allan deviation says something
+LEAST_REST_S = 4.0  # in one piece, from which an Allan deviation says something
 NOUNS = {"gyro": "Angular rate", "accel": "Specific force"}
 
 Vectors = Float64[np.ndarray, "_ 3"]
@@ -42,7 +43,7 @@ def zoom(data: RunData) -> Picture | None:
         return None
     assert chosen is not None, "then nothing was found"
     first = min(max(found[1] - ZOOM_S / 2.0, 0.0), data.duration_s - ZOOM_S)
-    caption = f"Every sample of {number(ZOOM_S)} s around the largest orientation error of {chosen.name}."
+    caption = f"Every sample of {ZOOM_S:g} s around the largest orientation error of {spoken(chosen)}."
     return _samples(data, "zoom", "Signals where the error is largest", caption, (first, first + ZOOM_S))
 
 
@@ -78,11 +79,12 @@ def spectrum(data: RunData) -> Picture | None:
 
 
 def at_rest(data: RunData) -> Picture | None:
-    """Allan deviations, raw and corrected, over the time in which the log rests; nothing where it does not rest for long.
+    """Allan deviations, raw and corrected, over the time in which the log rests.
 
-    Raises:
-        ConfigError: allantools is not installed.
+    Nothing where it does not rest for long, or where allantools is not installed (`left_out` says so).
     """
+    if find_spec("allantools") is None:
+        return None
     imu = data.traces[0].run.imu
     ranges = [(a, b) for a, b in stationary.stretches(imu) if (b - a) * imu.period_s >= LEAST_REST_S]
     if not ranges:
@@ -90,8 +92,9 @@ def at_rest(data: RunData) -> Picture | None:
     rest_s = sum(b - a for a, b in ranges) * imu.period_s
     curves: dict[str, list[Any]] = {sensor: [] for sensor in SENSORS}
     for trace in data.traces:
-        for sensor, values in _both(trace.run.imu).items():
-            curve = allan.curve([values[a:b] for a, b in ranges], imu.period_s)
+        still = [trace.run.imu.between(int(imu.t_ns[a]), int(imu.t_ns[b - 1])) for a, b in ranges]
+        for sensor in SENSORS:
+            curve = allan.curve([_both(one)[sensor] for one in still], imu.period_s)
             curves[sensor].append((trace, curve.tau_s, curve.deviation))
     panels = [
         Panel(partial(_draw_allan, data=data, sensor=one, curves=curves[one]), HEIGHT_INCH, f"{TITLES[one]} Allan deviation")
@@ -99,6 +102,13 @@ def at_rest(data: RunData) -> Picture | None:
     ]
     caption = f"Over {number(rest_s)} s at rest in {len(ranges)} stretch{'es' * (len(ranges) > 1)}; overlapping."
     return Picture("allan", "Allan deviation at rest", caption, tuple(panels))
+
+
+def left_out() -> list[str]:
+    """Sentences about pictures that there could be if more were installed."""
+    if find_spec("allantools") is not None:
+        return []
+    return ["Allan deviations are left out: allantools is not installed (pip install 'imutool[report]')."]
 
 
 def _samples(data: RunData, name: str, title: str, caption: str, span_s: tuple[float, float]) -> Picture:
@@ -113,7 +123,7 @@ def _by_axis(figure: Any, sensor: str, title: str, unit: str) -> Sequence[Any]:
     """Three panels under each other, x, y and z in their colours."""
     panels: Sequence[Any] = figure.subplots(3, 1, sharex=True)
     for axis, axes in enumerate(panels):
-        axes.set_ylabel(f"{AXES[axis]} ({unit})", color=AXIS_COLORS[axis], fontweight="bold")
+        axes.set_ylabel(f"{AXES[axis]} ({unit})" if unit else AXES[axis], color=AXIS_COLORS[axis], fontweight="bold")
     panels[0].set_title(title)
     figure.align_ylabels(panels)
     return panels
@@ -126,8 +136,8 @@ def _draw_samples(figure: Any, *, data: RunData, sensor: str, span_s: tuple[floa
         t = data.elapsed_s(trace.run.imu.t_ns)
         part = slice(*np.searchsorted(t, span_s, side="left") + np.array([0, 1]))
         values = _both(trace.run.imu)[sensor][part]
-        style: dict[str, Any] = {"color": color_of(data, trace), "lw": 1.8 if trace.is_raw else 0.8}
-        style["alpha"] = 0.55 if trace.is_raw else 1.0
+        under = trace.is_raw and bool(data.models())
+        style: dict[str, Any] = {"color": color_of(data, trace), "lw": 1.8 if under else 0.8, "alpha": 0.55 if under else 1.0}
         drawn = [_line(axes, t[part], values[:, k], trace.name, k, style) for k, axes in enumerate(panels)]
         lines.append(drawn[0])
     panels[-1].set(xlabel="time (s)", xlim=span_s)
@@ -194,9 +204,9 @@ def _line(axes: Any, t: Any, y: Any, name: str, axis: int, style: Mapping[str, A
 def _log_line(axes: Any, x: Any, y: Any, data: RunData, trace: Trace, axis: int) -> Any:
     name = trace.name if axis == 0 else f"{trace.name}, {AXES[axis]}"
     shown = np.where(y > 0.0, y, np.nan)  # a constant has no density
-    return axes.plot(
-        x, shown, color=color_of(data, trace), lw=1.8 if trace.is_raw else 1.0, alpha=0.55 if trace.is_raw else 1.0, label=name
-    )[0]
+    under = trace.is_raw and bool(data.models())
+    style: dict[str, Any] = {"color": color_of(data, trace), "lw": 1.8 if under else 1.0, "alpha": 0.55 if under else 1.0}
+    return axes.plot(x, shown, label=name, **style)[0]
 
 
 def _decades(panels: Sequence[Any]) -> None:

@@ -15,8 +15,8 @@ LABELS = {
     "ape_m": "Position error (APE, m)",
     "ape_aligned_m": "Position error, aligned (m)",
     "velocity_rmse_m_s": "Velocity error (m/s)",
-    "roe_deg": "Turned wrongly over {} m (ROE, °)",
-    "rpe_m": "Moved wrongly over {} m (RPE, m)",
+    "roe_deg": "Turn over {} m (ROE, °)",
+    "rpe_m": "Motion over {} m (RPE, m)",
 }
 SAME = 0.05  # closer than that, two errors are about the same
 COUNTS = ("samples", "duration_s")  # no errors
@@ -34,10 +34,16 @@ def raw(data: RunData) -> Trace | None:
     return next((trace for trace in data.traces if trace.is_raw), None)
 
 
+def spoken(trace: Trace) -> str:
+    """A run's name within a sentence."""
+    return trace.name.removeprefix("in the log: ")
+
+
 def number(value: float | None) -> str:
     """A number as people read it: three digits, thousands as they are."""
     if value is None or not np.isfinite(value):
         return "–"
+    value = float(f"{value:.2e}") if abs(value) < 999.5 else value  # 0.9996 has two digits behind the point, as 1.00
     size = abs(value)
     if size >= 999.5:
         return f"{value:,.0f}"
@@ -74,32 +80,34 @@ def worst(trace: Trace, data: RunData) -> tuple[float, float] | None:
 
 
 def conclusion(data: RunData) -> str:
-    """What a reader is to know first, in a sentence or two."""
+    """What a reader is to know first, in a sentence or two; figures are without alignment, whatever the pictures are."""
     chosen, before = best(data), raw(data)
     if chosen is None:
         return _without_truth(data)
     if chosen.is_raw or before is None:
-        told = f"{chosen.name} is wrong by {_errors(chosen)} over {number(data.duration_s)} s, {aligned(data)}"
+        told = f"{spoken(chosen)} is wrong by {_errors(chosen)} over {number(data.duration_s)} s, without alignment"
     else:
-        told = f"{compared(chosen, before)} over {number(chosen.figures['duration_s'])} s, {aligned(data)}"
+        told = f"{compared(chosen, before)} over {number(chosen.figures['duration_s'])} s, without alignment"
     found = worst(chosen, data)
     at = "" if found is None else f"; at worst by {measure(found[0], '°')}, {number(found[1])} s after the start"
+    at += f" ({aligned(data)})" * (found is not None and data.alignment != "none")
     return f"{data.name}: {told}{at}."
 
 
 def compared(chosen: Trace, before: Trace) -> str:
     """How a model stands to raw: orientation first, then position."""
-    parts = []
+    parts: list[tuple[str, str]] = []
     for figure, what, unit in (("aoe_deg", "orientation", "°"), ("ape_m", "position", "m")):
         old, new = float(before.figures[figure]), float(chosen.figures[figure])
-        span = f"from {measure(old, unit)} to {measure(new, unit)}"
+        span = f"the {what} error from {measure(old, unit)} to {measure(new, unit)}"
         if abs(new - old) <= SAME * max(old, new):
-            parts.append(f"leaves the {what} error about as it was ({measure(old, unit)}, now {measure(new, unit)})")
+            parts.append(("leaves", f"the {what} error about as it was ({measure(old, unit)}, now {measure(new, unit)})"))
         elif new < old:
-            parts.append(f"cuts the {what} error {span} ({times(old, new)})")
+            parts.append(("cuts", f"{span} ({times(old, new)})"))
         else:
-            parts.append(f"raises the {what} error {span} ({times(new, old)})")
-    return f"{chosen.name} {' and '.join(parts)}"
+            parts.append(("raises", f"{span} ({times(new, old)})"))
+    (does, first), (also, second) = parts
+    return f"{spoken(chosen)} {does} {first} and {second if also == does else f'{also} {second}'}"
 
 
 def times(large: float, small: float) -> str:
@@ -120,8 +128,8 @@ def overall(logs: Sequence[RunData]) -> str:
     better = sum(float(a.figures["aoe_deg"]) < float(b.figures["aoe_deg"]) for a, b in scored)
     new, old = (float(np.median([run.figures["aoe_deg"] for run in side])) for side in zip(*scored, strict=True))
     return (
-        f"In {better} of {len(scored)} logs the model turns out better than raw: in the middle, the orientation error is "
-        f"{measure(new, '°')} instead of {measure(old, '°')} ({times(max(old, new), min(old, new))}), {aligned(logs[0])}."
+        f"In {better} of {len(scored)} logs the best model has a smaller orientation error than raw: "
+        f"{measure(new, '°')} instead of {measure(old, '°')} in the middle (median), without alignment."
     )
 
 
@@ -130,10 +138,10 @@ def cards(data: RunData) -> list[tuple[str, str]]:
     told = [(f"{number(data.duration_s)} s", f"{len(data.traces[0].run.imu):,} samples at {rate_hz(data):.0f} Hz")]
     chosen, before = best(data), raw(data)
     for trace in dict.fromkeys(one for one in (before, chosen) if one is not None and one.figures):
-        told.append((measure(float(trace.figures["aoe_deg"]), "°"), f"orientation error, {trace.name}"))
-        told.append((measure(float(trace.figures["ape_m"]), "m"), f"position error, {trace.name}"))
+        told.append((measure(float(trace.figures["aoe_deg"]), "°"), f"orientation error, {spoken(trace)}"))
+        told.append((measure(float(trace.figures["ape_m"]), "m"), f"position error, {spoken(trace)}"))
     if chosen is not None and (window := _window(chosen, 10.0)) is not None:
-        told.append((measure(window, "°"), f"drift in 10 s, {chosen.name}"))
+        told.append((measure(window, "°"), f"drift in 10 s, {spoken(chosen)}"))
     if (count := sum(event.kind != "worst" for event in data.events)) > 0:
         told.append((f"{count:,}", "events"))
     return told
@@ -169,7 +177,6 @@ def _without_truth(data: RunData) -> str:
     told = f"{data.name}: {number(data.duration_s)} s without truth, so nothing says how wrong it is."
     for trace in data.models():
         gyro, accel = (np.linalg.norm(bias.mean(axis=0)) for bias in (trace.run.gyro_bias, trace.run.accel_bias))
-        told += (
-            f" {trace.name} takes {np.degrees(gyro):.3g}°/s off the angular rate and {accel:.3g} m/s² off the specific force."
-        )
+        off = f"{np.degrees(gyro):.3g}°/s off the angular rate and {accel:.3g} m/s² off the specific force"
+        told += f" {spoken(trace)} takes {off}."
     return told

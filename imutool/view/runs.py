@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
+from imutool.place import Place
 from imutool.recording import Recording
 from imutool.view.deviation import Alignment
 from imutool.view.events import of_survey
@@ -16,7 +17,7 @@ from imutool.view.rundata import Run, RunData, build
 
 
 def load(
-    log: Path,
+    log: Place,
     *,
     models: Sequence[str | Path] = (),
     init: str = "auto",
@@ -37,7 +38,7 @@ def load(
     recording = found.recording
     if recording.truths:
         recording = recording.with_truth(truth or next(iter(recording.truths)))
-    with_models, told = _with_models(recording, models, init, log, smooth) if models else ([], {})
+    with_models, told = _with_models(recording, models, init, str(log), smooth) if models else ([], {})
     events, notes = of_survey(found.survey)
     if findings is not None:
         start_ns, end_ns = int(recording.imu.t_ns[0]), int(recording.imu.t_ns[-1])
@@ -51,11 +52,16 @@ def load(
         notes=[*found.notes, *notes],
     )
     asked = {"start": init, "smooth": "yes"} if smooth else {"start": init} if models else {}
-    return replace(data, provenance=provenance(log, recording, found.metadata, told, asked), source=log, logged=found.logged)
+    return replace(
+        data,
+        provenance=provenance(log, recording, found.metadata, told, asked),
+        source=log if isinstance(log, Path) else None,
+        logged=found.logged,
+    )
 
 
 def _with_models(
-    recording: Recording, models: Sequence[str | Path], init: str, log: Path, smooth: bool
+    recording: Recording, models: Sequence[str | Path], init: str, log: str, smooth: bool
 ) -> tuple[list[Run], dict[str, str]]:
     """As each model corrects the samples, and in words which file that is and how it started; only this needs torch."""
     from imutool.debias import apply_with_std

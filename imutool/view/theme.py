@@ -109,8 +109,9 @@ figcaption, .note { color: var(--soft); font-size: 13px; margin: 4px 0; overflow
 .key { display: inline-block; width: 14px; height: 10px; border-radius: 2px; margin: 0 5px 0 10px; }
 .bar { display: inline-block; height: 8px; background: var(--after); border-radius: 2px; margin-left: 8px; }
 .bar, .key { print-color-adjust: exact; -webkit-print-color-adjust: exact; }
-dl { display: grid; grid-template-columns: max-content 1fr; gap: 4px 18px; font-size: 14px; margin: 6px 0; }
+dl { display: grid; grid-template-columns: fit-content(40%) 1fr; gap: 4px 18px; font-size: 14px; margin: 6px 0; }
 dt { color: var(--soft); } dd { margin: 0; overflow-wrap: anywhere; }
+@media (max-width: 600px) { dl { display: block; } dd { margin-bottom: 4px; } }
 @media print { tr { break-inside: avoid; } }
 """
 )

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import queue
 import socket
 import ssl
+import threading
 import time
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -15,7 +17,7 @@ from imutool.view.rerun.sdk import FLUSH_S, need_sdk, stream, version
 from imutool.view.rundata import RunData
 from imutool.view.shown import Shown
 
-REACH_S = 0.8  # for a connection to open, and again for the first words of whoever is there
+REACH_S = 0.6  # for a connection to open, for the first words of whoever is there, and for a viewer to say what it is
 MOVE_S = 1.5  # for a recording to arrive whose cursor is to be set
 PLAIN, SECURE = "rerun+http", ("rerun", "rerun+https")
 PATH = "/proxy"
@@ -28,7 +30,7 @@ FRAME_HEAD_BYTES, SETTINGS = 9, 4
 
 
 class Peer(NamedTuple):
-    """Who listens at a URL: `version` is that of the viewer, None for a server that has none and passes on what it gets."""
+    """Who listens at a URL: `version` is that of the viewer, None where none answered (a server without one, for instance)."""
 
     url: str
     version: str | None
@@ -41,16 +43,9 @@ def probe(url: str) -> Peer:
         ConfigError: Rerun is not installed, the URL is none of a viewer, nobody listens, or somebody else does.
     """
     need_sdk()
-    full, parts = _parsed(url)
-    _speaks(full, parts)
-    from rerun.experimental import ViewerClient
-
-    try:
-        return Peer(full, ViewerClient.connect(full).get_state().viewer_version)
-    except ConnectionError as error:
-        if "Unimplemented" in str(error):  # a server without a viewer, or a viewer older than this question
-            return Peer(full, None)
-        raise _foreign(full) from error
+    place = full(url)
+    _speaks(place)
+    return Peer(place, _version(place))
 
 
 def send(logs: Sequence[RunData], peer: Peer, *, source: bool = True, at_s: float | None = None) -> Shown:
@@ -59,8 +54,10 @@ def send(logs: Sequence[RunData], peer: Peer, *, source: bool = True, at_s: floa
     Raises:
         ConfigError: it stopped listening.
     """
+    _speaks(peer.url)  # logs may have taken minutes to read
     recording = stream(logs)
-    recording.connect_grpc(peer.url, default_blueprint=layout.blueprint(logs, source=source))
+    recording.connect_grpc(peer.url)
+    recording.send_blueprint(layout.blueprint(logs, source=source))
     scene.log(logs, recording, source=source)
     try:
         recording.flush(timeout_sec=FLUSH_S)
@@ -85,7 +82,7 @@ def move(peer: Peer, at_s: float) -> None:
     while True:
         try:
             ViewerClient.connect(peer.url).set_time(clock.ELAPSED, duration=at_s, play_state="paused")
-        except (ConnectionError, RuntimeError, ValueError) as error:
+        except (ConnectionError, TimeoutError, RuntimeError, ValueError) as error:
             if time.monotonic() > end:  # until then the recording may be on its way
                 raise ConfigError(f"the cursor cannot be set ({error})", where=peer.url, fix="Leave --at out") from error
             time.sleep(0.05)
@@ -100,8 +97,8 @@ def told(peer: Peer) -> str:
     return f", which is Rerun {peer.version}, not {version()} as here: if something is missing, start that one with `rerun`"
 
 
-def _parsed(url: str) -> tuple[str, SplitResult]:
-    """A URL of a viewer; HOST:PORT and PORT alone are taken for one.
+def full(url: str) -> str:
+    """The whole URL of a viewer; HOST, HOST:PORT and PORT alone are taken for one.
 
     Raises:
         ConfigError: it is none.
@@ -110,22 +107,22 @@ def _parsed(url: str) -> tuple[str, SplitResult]:
     expected = f"{PLAIN}://HOST:PORT{PATH}, HOST:PORT or PORT"
     try:
         parts = urlsplit(words)
-        port = parts.port
+        port = parts.port  # refuses what is no number
     except ValueError as error:
         raise ConfigError(f"{url!r} ({error})", where="--connect", expected=expected) from error
     if parts.scheme not in (PLAIN, *SECURE) or not parts.hostname or parts.path.rstrip("/") not in ("", PATH) or parts.query:
         raise ConfigError(f"{url!r}", where="--connect", expected=expected)
     place = parts.netloc if port else f"{parts.netloc}:{DEFAULT_PORT}"
-    parts = parts._replace(netloc=place, path=PATH)
-    return parts.geturl(), parts
+    return parts._replace(netloc=place, path=PATH).geturl()
 
 
-def _speaks(url: str, parts: SplitResult) -> None:
+def _speaks(url: str) -> None:
     """Nothing, if somebody is there who speaks HTTP/2; Rerun's own client would wait for a silent one without an end.
 
     Raises:
         ConfigError: nobody, or somebody else.
     """
+    parts = urlsplit(url)
     try:
         plain = socket.create_connection((parts.hostname, parts.port), timeout=REACH_S)
     except OSError as error:
@@ -152,6 +149,37 @@ def _dressed(plain: socket.socket, parts: SplitResult) -> socket.socket:
     context = ssl.create_default_context()
     context.set_alpn_protocols(["h2"])
     return context.wrap_socket(plain, server_hostname=parts.hostname)
+
+
+def _version(url: str) -> str | None:
+    """What a viewer says it is; None for a server without one, and for one that is too old or too busy to answer at once.
+
+    Raises:
+        ConfigError: it is no viewer.
+    """
+    from rerun.experimental import ViewerClient
+
+    answers: queue.Queue[str | ConnectionError | None] = queue.Queue()
+
+    def ask() -> None:
+        try:
+            answers.put(ViewerClient.connect(url).get_state().viewer_version)
+        except ConnectionError as error:
+            answers.put(error)
+        except (RuntimeError, TimeoutError):
+            answers.put(None)
+
+    # A server that passes on what it gets holds the question for fifteen seconds: nobody waits for that thread.
+    threading.Thread(target=ask, daemon=True).start()
+    try:
+        answer = answers.get(timeout=REACH_S)
+    except queue.Empty:
+        return None
+    if isinstance(answer, ConnectionError):
+        if "Unimplemented" in str(answer):
+            return None
+        raise _foreign(url) from answer
+    return answer
 
 
 def _foreign(url: str) -> ConfigError:

@@ -9,7 +9,6 @@ import urllib.request
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
-from urllib.parse import urlsplit
 
 from imutool.errors import ConfigError
 from imutool.recording import nanoseconds
@@ -138,9 +137,9 @@ def _handler(server: Server) -> type[http.server.BaseHTTPRequestHandler]:
         protocol_version = "HTTP/1.1"
 
         def do_GET(self) -> None:
-            name = urlsplit(self.path).path.lstrip("/")
+            name = self.path.partition("?")[0].lstrip("/")
             # A page from elsewhere whose name was made to lead here would still say its own name: it gets nothing.
-            known = urlsplit(f"//{self.headers.get('Host', '')}").hostname in LOCAL
+            known = self.headers.get("Host", "").partition(":")[0] in LOCAL
             content = server.file(name) if known else None
             self.send_response(200 if content is not None else 404)
             self.send_header("Content-Length", str(len(content or b"")))
