@@ -31,8 +31,8 @@ def curve_rows(values: Float64[np.ndarray, "n k"], most: int = MOST) -> Rows:
     drawn[[0, n - 1]] = True
     for least in (np.where(hole, np.inf, cut).argmin(axis=2), np.where(hole, -np.inf, cut).argmax(axis=2)):
         drawn[starts + least] = True
-    holes = hole.any(axis=0)
-    drawn[(starts + holes.argmax(axis=1))[holes.any(axis=1)]] = True
+    holes = np.any(hole, axis=0)
+    drawn[(starts + holes.argmax(axis=1))[np.any(holes, axis=1)]] = True
     rows: Rows = np.flatnonzero(drawn[:n])
     return rows
 
