@@ -177,20 +177,25 @@ def test_the_worst_moment_is_marked_where_it_is(one: RunData, entities: SimpleNa
     )
     assert one.truth is not None
     foot = np.array(static["Points3D:positions"][0])
-    np.testing.assert_array_equal(foot, one.truth.at(errors.t_ns[row : row + 1])[0].p_wb[0].astype(np.float32))
+    np.testing.assert_array_equal(foot, one.truth.p_wb[np.abs(one.truth.t_ns - errors.t_ns[row]).argmin()].astype(np.float32))
 
 
+@pytest.mark.parametrize(
+    ("limit", "path", "most"), [("MOST", "/imu/accel/raw", 200), ("MOST_DERIVED", "/error/position/raw/axes", 100)]
+)
 def test_a_very_long_curve_is_thinned_with_its_extremes_kept(
-    one: RunData, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    one: RunData, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, limit: str, path: str, most: int
 ) -> None:
-    monkeypatch.setattr(signals, "MOST", 200)
-    found = RRD.read(RRD.written([one], tmp_path / "thin.rrd"))["/imu/accel/raw"]
-    values, accel = found.numbers(SCALARS), one.traces[0].run.imu.accel
-    assert len(values) <= 200 < len(accel)
-    np.testing.assert_array_equal(values.min(axis=0), accel.min(axis=0))
-    np.testing.assert_array_equal(values.max(axis=0), accel.max(axis=0))
-    rows = np.searchsorted(one.traces[0].run.imu.t_ns, found.times(SCALARS, "ros2_timestamp"))
-    np.testing.assert_array_equal(values, accel[rows])
+    monkeypatch.setattr(signals, limit, most)
+    found = RRD.read(RRD.written([one], tmp_path / "thin.rrd"))
+    t_ns, whole = expected(one)[path]
+    values = found[path].numbers(SCALARS)
+    assert len(values) <= most < len(whole)
+    np.testing.assert_array_equal(values.min(axis=0), whole.min(axis=0))
+    np.testing.assert_array_equal(values.max(axis=0), whole.max(axis=0))
+    np.testing.assert_array_equal(values, whole[np.searchsorted(t_ns, found[path].times(SCALARS, "ros2_timestamp"))])
+    (text,) = found["/report"].static["TextDocument:text"]
+    assert ("Of errors and biases at most 100 rows" in text) == (limit == "MOST_DERIVED")
 
 
 # ── space ──

@@ -58,7 +58,9 @@ def test_files_and_pages_are_made_together_and_each_is_said(data: RunData, tmp_p
     assert all(one.place in one.said for one in shown)
 
 
-def test_without_rerun_a_page_is_written_here_and_said(data: RunData, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_rerun_a_page_is_written_here_and_said(
+    data: RunData, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, report: None
+) -> None:
     there = ways.find_spec
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(ways, "find_spec", lambda name: None if name == "rerun" else there(name))

@@ -64,17 +64,21 @@ def watching(
         try:
             peer = viewer.start().peer
         except ConfigError as error:
-            save, said = instead, f"{error.what[0].upper()}{error.what[1:]}. "
+            save, said = instead, viewer.sentence(error)
     live = Live(name, peer, said)
     if save is None:
         yield live
         live.finish()
         return
-    with Target(save, overwrite=overwrite, summing=False) as target:
-        assert isinstance(target.temporary, Path)
+    target = Target(save, overwrite=overwrite, summing=False)
+    try:
+        assert isinstance(target.temporary, Path), "not in a store"
         live.record(save, target.temporary)
         yield live
-        live.finish()
+        if live.finish():
+            target.commit()
+    finally:
+        target.abandon()
 
 
 class Live:
@@ -112,13 +116,13 @@ class Live:
                 self._lay_out(streams)
             self._watched[block.topic].log(block, streams)
         except TROUBLE as error:
-            self._give_up(f"This cannot be shown as it goes ({error})")
-            self._file = None
+            self._file, self.shown = None, []
+            self._give_up(f"It cannot be shown as it goes ({error})")
             return
         self._see_off()
 
-    def finish(self) -> None:
-        """Everything was debiased: the whole of it is laid out, and whoever listens has all of it."""
+    def finish(self) -> bool:
+        """Everything was debiased: the whole of it is laid out, whoever listens has all of it; whether a file does."""
         streams = [stream for stream in (self._viewer, self._file) if stream is not None]
         self._lay_out(streams, {topic: imu.box for topic, imu in self._watched.items()})
         if self._viewer is not None:
@@ -129,6 +133,7 @@ class Live:
         for stream in (self._viewer, self._file):
             if stream is not None:
                 stream.disconnect()
+        return self._file is not None
 
     def _lay_out(self, streams: list[rr.RecordingStream], boxes: Mapping[str, Box] | None = None) -> None:
         scopes = {topic: imu.scope for topic, imu in self._watched.items()}

@@ -154,8 +154,9 @@ def _log_worst(to: rr.RecordingStream, data: RunData, trace: Trace, home: str, s
     rank = data.models().index(trace)
     whose = f"{entities.label(data, trace)} " if len(data.models()) > 1 else ""
     words = f"{whose}worst: {errors.orientation_total_deg[row]:.2f}° at {at_s:.1f} s"
-    place, _ = data.truth.at(errors.t_ns[row : row + 1])
-    foot, top = place.p_wb[0], place.p_wb[0] + [0.0, 0.0, POLE_SHARE * (1 + rank) * size]
+    nearest = int(np.abs(data.truth.t_ns - errors.t_ns[row]).argmin())
+    foot = data.truth.p_wb[nearest]
+    top = foot + np.array([0.0, 0.0, POLE_SHARE * (1 + rank) * size])
     pole = rr.LineStrips3D([[foot, top]], colors=[WORST_COLOR], radii=rr.Radius.ui_points(1.0))
     radii = rr.Radius.ui_points([WORST_RADIUS, 0.0])
     dots = rr.Points3D([foot, top], labels=["", words], colors=[WORST_COLOR] * 2, radii=radii, show_labels=True)

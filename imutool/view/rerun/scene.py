@@ -42,4 +42,4 @@ def _log_one(data: RunData, to: rr.RecordingStream, scope: entities.Scope, with_
     spectrum.log(data, to, scope)
     events.log(data, to, scope)
     said = other_topics.log(data, to, scope) if with_source else []
-    report.log(data, to, scope, said)
+    report.log(data, to, scope, [*signals.thinning(data), *said])

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 KINDS = ("gyro", "accel")
 UNITS = {"gyro": "rad/s", "accel": "m/s²"}
 SIGMAS = 3.0
+MOST_DERIVED = 50_000  # rows of a curve that is computed: four minutes at 200 Hz; a sample is only left out above MOST
 
 
 def log(data: RunData, to: rr.RecordingStream, scope: Scope) -> None:
@@ -36,7 +37,7 @@ def _log_samples(data: RunData, to: rr.RecordingStream, scope: Scope, trace: Tra
     alone = not data.models()
     style = styles.axes(role, entities.label(data, trace), rank=rank(data, trace), alone=alone)
     for kind, values in zip(KINDS, (imu.gyro, imu.accel), strict=True):
-        scalars(to, data, entities.of(data, trace, scope, "imu", kind, role), imu.t_ns, values, style)
+        scalars(to, data, entities.of(data, trace, scope, "imu", kind, role), imu.t_ns, values, style, most=MOST)
 
 
 def _log_bias(data: RunData, to: rr.RecordingStream, scope: Scope, trace: Trace) -> None:
@@ -57,12 +58,26 @@ def rank(data: RunData, trace: Trace) -> int:
 
 
 def scalars(
-    to: rr.RecordingStream, data: RunData, entity: str, t_ns: Times, values: Float64[np.ndarray, "n k"], style: rr.AsComponents
+    to: rr.RecordingStream,
+    data: RunData,
+    entity: str,
+    t_ns: Times,
+    values: Float64[np.ndarray, "n k"],
+    style: rr.AsComponents,
+    *,
+    most: int | None = None,
 ) -> None:
-    """One curve per column, its style first; of very many rows those with its extremes."""
+    """One curve per column, its style first; of more than `most` rows (MOST_DERIVED) those with the extremes."""
     import rerun as rr
 
     to.log(entity, style, static=True, strict=True)
+    rows = curve_rows(values, MOST_DERIVED if most is None else most)
     # strict: Rerun only warns of a length that does not match, and then the rows are missing
-    rows = curve_rows(values, MOST)
     to.send_columns(entity, clock.at(data, t_ns[rows]), rr.Scalars.columns(scalars=values[rows]), strict=True)
+
+
+def thinning(data: RunData) -> list[str]:
+    """A sentence, if computed curves of this log are thinned."""
+    if all(len(trace.run.imu) <= MOST_DERIVED for trace in data.traces):
+        return []
+    return [f"Of errors and biases at most {MOST_DERIVED} rows are drawn, the lowest and highest of every stretch among them."]
