@@ -33,6 +33,7 @@ from imutool.recording import Poses
 
 DISTANCES_M = (5.0, 10.0, 15.0, 20.0)
 PAIR_TOLERANCE = 0.1  # a pair counts when its distance is within this share of the one asked for: evo's default
+AT_ONCE = 1 << 13  # pairs, so that what is made of them stays near the processor
 FLAT = np.finfo(
     np.float64
 ).eps  # singular value (m²) under which positions lie on a line for evo, and rotation about it is free
@@ -119,10 +120,14 @@ def relative(
         if not len(i):
             roe[key] = rpe[key] = None
             continue
-        with np.errstate(over="ignore", invalid="ignore"):
-            moved_est, moved_true = (poses.p_wb[j] - poses.p_wb[i] for poses in (estimate, truth))
-            rpe[key] = float(np.linalg.norm(quaternion.rotate(C[i], moved_est) - moved_true, axis=1).mean())
-        roe[key] = float(np.degrees(quaternion.angle_between(C[i], C[j])).mean())
+        apart_m = turned = 0.0
+        for first in range(0, len(i), AT_ONCE):
+            a, b = i[first : first + AT_ONCE], j[first : first + AT_ONCE]
+            with np.errstate(over="ignore", invalid="ignore"):
+                moved_est, moved_true = (poses.p_wb[b] - poses.p_wb[a] for poses in (estimate, truth))
+                apart_m += float(quaternion.length(quaternion.rotate(C[a], moved_est) - moved_true).sum())
+            turned += float(quaternion.angle_between(C[a], C[b]).sum())
+        rpe[key], roe[key] = apart_m / len(i), float(np.degrees(turned / len(i)))
     _check_finite({f"rpe_m {k}": v for k, v in rpe.items()} | {f"roe_deg {k}": v for k, v in roe.items()})
     return {"roe_deg": roe, "rpe_m": rpe}
 
@@ -155,7 +160,7 @@ def pairs_by_distance(
     The rule of evo's `--all_pairs`: of equally near points the first. Found by bisection, since distance along a path
     only grows (evo searches every pair; 30 000 poses would take it minutes).
     """
-    travelled = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(p, axis=0), axis=1))])
+    travelled = np.concatenate([[0.0], np.cumsum(quaternion.length(np.diff(p, axis=0)))])
     i = np.arange(len(p) - 1)
     above = np.searchsorted(travelled, travelled[i] + distance_m, side="left")
     above = np.clip(above, i + 1, len(p) - 1)
@@ -234,7 +239,7 @@ def _scored(estimate: Poses, truth: Poses, valid: Mask) -> tuple[Poses, Poses]:
         )
     if not valid.any():
         raise DataError("the truth is known at none of the estimate's stamps", expected="some overlap")
-    return estimate.rows(valid), truth.rows(valid)
+    return (estimate, truth) if valid.all() else (estimate.rows(valid), truth.rows(valid))
 
 
 def _unit(poses: Poses) -> Float64[np.ndarray, "n 4"]:

@@ -64,9 +64,8 @@ class _Columns:
                     f"{kind}.{name} is {value.dtype}{list(value.shape)}",
                     expected=f"float64{[len(self.t_ns), *tail]}",
                 )
-            finite = np.isfinite(value).reshape(len(value), -1).all(axis=1) if value.size else np.ones(0, bool)
-            if not finite.all():
-                row = int(np.argmin(finite))
+            if not np.isfinite(value).all():
+                row = int(np.argmin(np.isfinite(value).reshape(len(value), -1).all(axis=1)))
                 raise DataError(f"{kind}.{name} row {row} is {value[row].tolist()}", expected="finite numbers")
         backward = np.flatnonzero(np.diff(self.t_ns) <= 0)
         if len(backward):
@@ -146,7 +145,7 @@ class Poses(_Columns):
     def __post_init__(self) -> None:
         self._freeze()
         self._check(p_wb=(3,), q_wb_wxyz=(4,), v_w=(3,))
-        error = np.abs(np.linalg.norm(self.q_wb_wxyz, axis=1) - 1.0)
+        error = np.abs(quaternion.length(self.q_wb_wxyz) - 1.0)
         if len(error) and error.max() > UNIT_QUATERNION_TOLERANCE:
             row = int(np.argmax(error))
             raise DataError(f"Poses.q_wb_wxyz row {row} is {self.q_wb_wxyz[row].tolist()}", expected="norm 1")

@@ -76,9 +76,8 @@ def dead_reckon(
         a_w = quaternion.rotate(q_wb[:-1], imu.accel[:-1]) + np.asarray(g_w, dtype=np.float64)
         v_w = np.cumsum(np.concatenate([v_0[None], a_w * dt]), axis=0)
         p_wb = np.cumsum(np.concatenate([p_0[None], v_w[:-1] * dt]), axis=0)
-    finite = np.isfinite(np.concatenate([q_wb, v_w, p_wb], axis=1)).all(axis=1)
-    if not finite.all():
-        row = int(np.argmin(finite))
+    if not all(np.isfinite(column).all() for column in (q_wb, v_w, p_wb)):
+        row = int(np.argmin(np.isfinite(np.concatenate([q_wb, v_w, p_wb], axis=1)).all(axis=1)))
         raise NumericsError(
             f"integration overflows at sample {row}",
             expected="rates and forces of a moving body",
@@ -102,7 +101,7 @@ def along_truth(imu: Imu, truth: Poses, where: str) -> tuple[Poses, Poses, Bool[
 
 
 def stretch_with_truth(t_ns: Times, truth: Poses, where: str) -> tuple[slice, Poses, Bool[np.ndarray, " m"]]:
-    """The rows from the first stamp at which the truth is known to the last, the truth with its velocity there, and where it is.
+    """The rows from the first stamp at which the truth is known to the last, the truth with velocity there, and where it is.
 
     Raises:
         DataError: the truth is known at fewer than two stamps.
@@ -123,7 +122,7 @@ class Drifted(NamedTuple):
     position_m: Float64[np.ndarray, " m"]
 
 
-def drifted(path: Poses, truth: Poses, first: Int64[np.ndarray, " m"], last: Int64[np.ndarray, " m"]) -> Drifted:
+def drifted(path: Poses, truth: Poses, first: Int64[np.ndarray, " m"], last: Int64[np.ndarray, " m"] | slice) -> Drifted:
     """How far integrations that start from the truth at rows `first` are from it at rows `last`, all from one integration.
 
     `path` is that of the same samples from any start, on the stamps of `truth`. Had it started from the truth at row s, all of
@@ -138,19 +137,20 @@ def drifted(path: Poses, truth: Poses, first: Int64[np.ndarray, " m"], last: Int
     Raises:
         DataError: one of the two carries no velocity, or they are on different stamps.
     """
-    if path.v_w is None or truth.v_w is None or not np.array_equal(path.t_ns, truth.t_ns):
+    v, v_true = path.v_w, truth.v_w
+    if v is None or v_true is None or not np.array_equal(path.t_ns, truth.t_ns):
         raise DataError("path and truth do not match", expected="poses with velocity on the same stamps")
     t = seconds(path.t_ns, int(path.t_ns[0]))
     squares = np.concatenate([[0.0], np.cumsum(np.diff(t) ** 2)])
     T = (t[last] - t[first])[:, None]
     g_T, g_S = np.array(GRAVITY_W) * T, np.array(GRAVITY_W) * (0.5 * (T**2 - (squares[last] - squares[first])[:, None]))
-    (q, p, v), (q_true, p_true, v_true) = ((poses.q_wb_wxyz, poses.p_wb, poses.v_w) for poses in (path, truth))
+    (q, p), (q_true, p_true) = ((poses.q_wb_wxyz, poses.p_wb) for poses in (path, truth))
     q_c = quaternion.multiply(q_true[first], quaternion.inverse(q[first]))
     faster = v_true[first] - v_true[last] + g_T + quaternion.rotate(q_c, v[last] - v[first] - g_T)
     further = p_true[first] - p_true[last] + v_true[first] * T + g_S
     further += quaternion.rotate(q_c, p[last] - p[first] - v[first] * T - g_S)
     turned = quaternion.angle_between(quaternion.multiply(q_c, q[last]), q_true[last])
-    return Drifted(turned, np.linalg.norm(faster, axis=1), np.linalg.norm(further, axis=1))
+    return Drifted(turned, quaternion.length(faster), quaternion.length(further))
 
 
 def drift(path: Poses, truth: Poses, valid: Bool[np.ndarray, " n"], window_s: float) -> Drifted:

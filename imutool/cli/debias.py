@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
-from typing import Annotated, NoReturn
+from typing import TYPE_CHECKING, Annotated, NoReturn
 
 import typer
 
@@ -13,6 +14,9 @@ from imutool.errors import ConfigError
 from imutool.mcap_io.losses import Losses
 from imutool.place import Place, place
 from imutool.terminal import progress, say, tell_losses, write_json
+
+if TYPE_CHECKING:
+    from imutool.view.rerun.live import Live
 
 MODEL_HELP = (
     "Model file, physics.toml or a name that ships; else a static estimate. TOPIC=MODEL is for one IMU of several. Repeatable."
@@ -36,6 +40,9 @@ def debias(
     clean: Annotated[
         bool, typer.Option("--clean", help="Leave out what is no measurement, convert units (imutool clean).")
     ] = False,
+    view: Annotated[bool, typer.Option("--view", help="Show it in a viewer as it goes.")] = False,
+    connect: Annotated[str | None, typer.Option(metavar="URL", help="Show it in a viewer that runs: HOST:PORT.")] = None,
+    save_view: Annotated[Path | None, typer.Option(metavar="F.rrd", help="Keep what a viewer would show in a file.")] = None,
     report_to: Annotated[
         Path | None, typer.Option("--report", metavar="F.html", help="Write a page about the debiased log.")
     ] = None,
@@ -54,7 +61,8 @@ def debias(
     from imutool.clean import Rules
     from imutool.debias import debias as run
 
-    with progress("Debiasing", verbose, quiet) as tell:
+    live = _watching(source, target, view, connect, save_view, overwrite)
+    with progress("Debiasing", verbose, quiet) as tell, live as watch:
         report = run(
             place(source),
             None if target is None else place(target),
@@ -66,6 +74,7 @@ def debias(
             clean=Rules() if clean else None,
             overwrite=overwrite,
             progress=lambda done, total: tell(done, total, ""),
+            watch=watch,
         )
         if report_to is not None:
             tell(1, 1, "drawing")
@@ -83,6 +92,8 @@ def debias(
     added, copied, verified = dict(report.rewrite.added), report.rewrite.copied, report.rewrite.verified
     result = {"schema": "imutool.debias/1", "output": str(target or source), "imus": imus, "copied": copied, "added": added}
     result |= {"verified": verified._asdict(), "losses": report.losses.plain()}
+    if watch is not None:
+        result["shown"] = [one.plain() for one in watch.shown]
     if clean:
         result["clean"] = [one.plain() for one in report.surveys.values()]
     if write_json(result, json_to):
@@ -96,10 +107,24 @@ def debias(
     counts = ", ".join(f"{count} on {name}" for name, count in added.items())
     say(f"{target or source}: {copied} messages as they were, {counts}")
     say(f"checked: every index, and the contents of {verified.chunks_checked} of {verified.chunks} chunks (--verify {verify})")
+    for shown in () if watch is None else watch.shown:
+        say(shown.said)
     if report_to is not None:
         say(f"Report: {report_to}")
     tell_losses(report.losses.plain())
     _leave(report.losses)
+
+
+def _watching(
+    source: str, target: str | None, view: bool, connect: str | None, save: Path | None, overwrite: bool
+) -> AbstractContextManager[Live | None]:
+    """Whoever is to watch; without that nothing of the viewer is imported."""
+    if not view and connect is None and save is None:
+        return nullcontext()
+    from imutool.view.rerun.live import watching
+
+    out = Path(target or source)
+    return watching(out.stem, connect_to=connect, save=save, instead=Path(f"{out.stem}.rrd"), overwrite=overwrite)
 
 
 def _draw(log: Place, topics: Sequence[str], page: Path, overwrite: bool) -> None:

@@ -71,9 +71,13 @@ def recording_in(
     start_ns: int | None = None,
     end_ns: int | None = None,
     samples: Imu | None = None,
+    derived: bool = True,
     refused: Callable[[str, LogError], None] | None = None,
 ) -> Recording:
-    """As `read`, in a log that is open; poses that a recording cannot hold are left out where somebody is to be told (`refused`).
+    """As `read`, in a log that is open.
+
+    Where somebody is to be told (`refused`), poses that a recording cannot hold are left out. Without `derived` the scalars that
+    imutool computed are not read.
 
     Raises:
         LogError: as `read`.
@@ -82,7 +86,11 @@ def recording_in(
     own, metadata = _own_and_user_metadata(log)
     truths = _choose_truths(log, truth)
     velocities = {t.name: t.metadata[VELOCITY_KEY] for t in log.topics.values() if VELOCITY_KEY in t.metadata}
-    scalars = [t.name for t in log.with_schema(SCALARS) if t.name not in velocities and t.message_encoding in ENCODINGS]
+    scalars = [
+        t.name
+        for t in log.with_schema(SCALARS)
+        if t.name not in velocities and t.message_encoding in ENCODINGS and (derived or DERIVED_KEY not in t.metadata)
+    ]
     gather = _Gather(log, imu_topic, truths, velocities, scalars, refused)
     with log.named():
         topics = gather.topics if samples is None else gather.topics[1:]

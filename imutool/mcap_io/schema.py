@@ -339,9 +339,9 @@ def decode_twist(rows: UInt8[np.ndarray, "n L"], encoding: str = "cdr", layout: 
         LogError: no rows, more than one layout, a payload too short, an unknown encoding.
     """
     layout = layout or _one_layout(rows, TWIST, encoding)
-    numbers = _numbers(rows, layout, slice(0, 42))
-    variance = numbers[:, 6:].reshape(-1, 6, 6).diagonal(axis1=1, axis2=2)
-    return TwistColumns(_stamp(rows, layout), numbers[:, 3:6], numbers[:, :3], np.roll(variance, 3, axis=1), layout.texts[0])
+    linear, angular = _numbers(rows, layout, slice(0, 3)), _numbers(rows, layout, slice(3, 6))
+    variance = _numbers(rows, layout, slice(6, 42))[:, ::7]  # the diagonal, of linear then angular
+    return TwistColumns(_stamp(rows, layout), angular, linear, np.roll(variance, 3, axis=1), layout.texts[0])
 
 
 def decode_image(message: bytes, encoding: str = "cdr") -> tuple[int, str, bytes]:

@@ -20,9 +20,6 @@ ALIGNMENTS: tuple[Alignment, ...] = get_args(Alignment)
 RESET_S = 10.0
 WINDOWS_S = (1.0, 5.0, 10.0, 30.0)
 
-Vectors = Float64[np.ndarray, "n 3"]
-Line = Float64[np.ndarray, " n"]
-
 
 @dataclass(frozen=True, eq=False)
 class Errors:
@@ -36,17 +33,17 @@ class Errors:
     @property
     def orientation_total_deg(self) -> Float64[np.ndarray, " n"]:
         """The angle of the orientation error, 0 to 180 degrees."""
-        return _length(self.orientation_deg)
+        return quaternion.length(self.orientation_deg)
 
     @property
     def position_total_m(self) -> Float64[np.ndarray, " n"]:
         """The length of the position error."""
-        return _length(self.position_m)
+        return quaternion.length(self.position_m)
 
     @property
     def horizontal_m(self) -> Float64[np.ndarray, " n"]:
         """The length of the position error in the world's horizontal plane."""
-        return _length(self.position_m[:, :2])
+        return quaternion.length(self.position_m[:, :2])
 
     @property
     def vertical_m(self) -> Float64[np.ndarray, " n"]:
@@ -147,10 +144,11 @@ def drift_since_reset(path: Poses, truth: Poses, valid: Bool[np.ndarray, " n"], 
     """
     known = np.flatnonzero(valid)
     turn_of = (path.t_ns[known] - path.t_ns[0]) // nanoseconds(reset_s)
-    _, first, of = np.unique(turn_of, return_index=True, return_inverse=True)
-    found = drifted(path, truth, known[first][of], known)
+    resets = np.diff(turn_of, prepend=-1) > 0
+    last_reset = known[resets][np.cumsum(resets) - 1]
+    found = drifted(path, truth, last_reset, slice(None) if valid.all() else known)
     since_s, *errors = (np.full(len(path), np.nan) for _ in range(4))
-    since_s[known] = (path.t_ns[known] - path.t_ns[known[first]][of]) * 1e-9
+    since_s[known] = (path.t_ns[known] - path.t_ns[last_reset]) * 1e-9
     for column, values in zip(errors, found._replace(orientation_rad=np.rad2deg(found.orientation_rad)), strict=True):
         column[known] = values
     return Drift(reset_s, path.t_ns, since_s, *errors)
@@ -162,21 +160,9 @@ def windows(path: Poses, truth: Poses, valid: Bool[np.ndarray, " n"]) -> tuple[W
     for length_s in WINDOWS_S:
         ends = drift(path, truth, valid, length_s)
         if count := len(ends.position_m):
-            found.append(
-                Window(
-                    length_s,
-                    count,
-                    float(np.rad2deg(_rms(ends.orientation_rad))),
-                    _rms(ends.velocity_m_s),
-                    _rms(ends.position_m),
-                )
-            )
+            turned_deg = float(np.rad2deg(_rms(ends.orientation_rad)))
+            found.append(Window(length_s, count, turned_deg, _rms(ends.velocity_m_s), _rms(ends.position_m)))
     return tuple(found)
-
-
-def _length(rows: Float64[np.ndarray, "n k"]) -> Line:
-    length: Line = np.linalg.norm(rows, axis=1)
-    return length
 
 
 def _rms(values: Float64[np.ndarray, " n"]) -> float:

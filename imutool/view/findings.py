@@ -1,4 +1,4 @@
-"""Where the findings of a diagnosis act in a log: read from the folder that `imutool diagnose -o` leaves, which may be anybody's."""
+"""Where the findings of a diagnosis act in a log: from the folder that `imutool diagnose -o` leaves, which may be anybody's."""
 
 from __future__ import annotations
 

@@ -28,8 +28,9 @@ def provenance(
     No digest of the log itself, which may be terabytes. Long values are cut, many entries counted.
     """
     told = {"file": log.name, "size": f"{log.stat().st_size} bytes", "IMU": recording.imu_topic}
-    told |= {"truth": topic for topic in list(recording.truths)[:1]}
-    told |= asked | {f"model {name}": how for name, how in models.items()}
+    if recording.truths:
+        told["truth"] = next(iter(recording.truths))
+    told |= {**asked, **{f"model {name}": how for name, how in models.items()}}
     told |= {"imutool": __version__, "numpy": np.__version__, "python": platform.python_version()}
     noted = [(name, key, value) for name, values in metadata if name.startswith(OURS) for key, value in values.items()]
     told |= {_cut(f"{name}: {key}"): value for name, key, value in noted[:MOST_ENTRIES]}

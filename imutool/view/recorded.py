@@ -1,4 +1,4 @@
-"""What a log holds that can be looked at: its IMU, also where that is not sound, what was derived from it, and what is wrong."""
+"""What a log holds that can be looked at: its IMU, also where that is not sound, and what was derived from it."""
 
 from __future__ import annotations
 
@@ -96,7 +96,7 @@ def _read(path: Place, imu: str | None, truth: str | None, notes: list[str], *, 
         derived = [one.name for one in log.with_schema((schema.IMU,)) if one.metadata.get(DERIVED_KEY) == topic]
         biases = [one.name for one in log.with_schema((schema.TWIST,)) if one.metadata.get(DERIVED_KEY) == topic]
         batches, beliefs = _messages(log, [topic, *derived], biases)
-        rest = recording_in(log, imu=topic, truth=truth, samples=NONE, refused=None if truth else refused)
+        rest = recording_in(log, imu=topic, truth=truth, samples=NONE, derived=False, refused=None if truth else refused)
         metadata = log.metadata_records()
         if log.losses is not None:
             notes += [f"The log is damaged; {line}." for line in told(log.losses.plain())]
@@ -158,16 +158,16 @@ def _model(metadata: Sequence[tuple[str, Mapping[str, str]]], topic: str) -> str
 def _run(
     name: str, model: str, raw: Imu, batches: Sequence[ImuBatch], beliefs: Mapping[str, Sequence[schema.TwistColumns]]
 ) -> Run | None:
-    """A debiased channel, with the bias and certainty beside it in the log; else the bias by subtraction, where stamps agree."""
+    """A debiased channel with the bias and its certainty beside it in the log; else the bias by subtraction at equal stamps."""
     try:
         imu, _ = _columns(batches)
     except DataError:
         return None
     called = f"in the log: {model}" if model else name.rpartition("/")[2]
-    for parts in beliefs.values():
+    for parts in filter(None, beliefs.values()):
         stamp_ns, angular, linear, variance = (np.concatenate(column) for column in list(zip(*parts, strict=True))[:4])
         if np.array_equal(stamp_ns, imu.t_ns):
-            return Run(called, imu, angular, linear, np.sqrt(variance))
+            return Run(called, imu, angular, linear, np.sqrt(np.maximum(variance, 0.0)))
     rows = np.minimum(np.searchsorted(raw.t_ns, imu.t_ns), len(raw) - 1)
     if len(imu) < FEWEST or not np.array_equal(raw.t_ns[rows], imu.t_ns):
         return None

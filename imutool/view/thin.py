@@ -28,13 +28,12 @@ def curve_rows(values: Float64[np.ndarray, "n k"], most: int = MOST) -> Rows:
     padded[:n] = values
     cut = padded.reshape(len(starts), size, columns)
     hole = np.isnan(cut)
-    for of, least in ((cut, np.inf), (-cut, np.inf)):
-        of = np.where(hole, least, of)
-        chosen.append((starts[:, None] + of.argmin(axis=1)).ravel())
-    holes = hole.any(axis=2)
-    chosen.append((starts + holes.argmax(axis=1))[holes.any(axis=1)])
-    rows: Rows = np.unique(np.concatenate(chosen))
-    return rows[rows < n]
+    lowest, highest = np.where(hole, np.inf, cut).argmin(axis=1), np.where(hole, -np.inf, cut).argmax(axis=1)
+    chosen += [(starts[:, None] + lowest).ravel(), (starts[:, None] + highest).ravel()]
+    holes = np.any(hole, axis=2)
+    chosen.append((starts + holes.argmax(axis=1))[np.any(holes, axis=1)])
+    rows = np.unique(np.concatenate(chosen))
+    return np.asarray(rows[rows < n])
 
 
 def path_rows(p_wb: Float64[np.ndarray, "n 3"], most: int = MOST_IN_3D) -> Rows:
