@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float64, Int64
 
 from imutool.view.deviation import Drift
-from imutool.view.drawing import Panel, Picture, extremes, legend, plain_numbers
+from imutool.view.drawing import Panel, Picture, Thin, extremes, legend, plain_numbers
 from imutool.view.report_paths import color_of
 from imutool.view.report_words import aligned
 from imutool.view.rundata import RunData, Trace
@@ -73,7 +73,7 @@ def _resets(drift: Drift) -> Int64[np.ndarray, " k"]:
     return np.flatnonzero(np.diff(drift.since_s, prepend=np.inf) <= 0.0)
 
 
-def _largest(drift: Drift, t: Line, turned: Line, moved: Line) -> tuple[Line, Line, Line]:
+def _largest(drift: Drift, t: Line, turned: Line, moved: Line) -> tuple[Thin, Thin, Thin]:
     """The largest of each stretch between resets, at its beginning."""
     starts = _resets(drift)
     return t[starts], np.fmax.reduceat(turned, starts), np.fmax.reduceat(moved, starts)

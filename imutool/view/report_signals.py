@@ -119,9 +119,9 @@ def _samples(data: RunData, name: str, title: str, caption: str, span_s: tuple[f
     return Picture(name, title, caption, tuple(panels))
 
 
-def _by_axis(figure: Any, sensor: str, title: str, unit: str) -> Sequence[Any]:
+def _by_axis(figure: Any, sensor: str, title: str, unit: str) -> list[Any]:
     """Three panels under each other, x, y and z in their colours."""
-    panels: Sequence[Any] = figure.subplots(3, 1, sharex=True)
+    panels: list[Any] = list(figure.subplots(3, 1, sharex=True))
     for axis, axes in enumerate(panels):
         axes.set_ylabel(f"{AXES[axis]} ({unit})" if unit else AXES[axis], color=AXIS_COLORS[axis], fontweight="bold")
     panels[0].set_title(title)

@@ -8,7 +8,6 @@ import runpy
 import sys
 from collections.abc import Iterator
 from dataclasses import replace
-from html.parser import HTMLParser
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -25,50 +24,11 @@ from imutool.view.diagnosis_page import html, write
 from imutool.view.page import text
 
 MADE = SimpleNamespace(**runpy.run_path(str(Path(__file__).parents[1] / "physics" / "diagnoses.py")))
+MARKUP = SimpleNamespace(**runpy.run_path(str(Path(__file__).parent / "markup.py")))
+Page, svgs = MARKUP.Page, MARKUP.svgs
 MOST_BYTES = 3_000_000
-VOID = {"meta", "br", "img", "link", "input", "hr"}
 # Welch's estimate over 30 s has about 14 independent windows and three axes, and a bin at the top averages many frequencies.
 DENSITY = 0.05
-
-
-class Page(HTMLParser):
-    """Tags in balance, visible words, and everything that an address or an identifier could be in."""
-
-    def __init__(self, content: str) -> None:
-        super().__init__()
-        self.open: list[str] = []
-        self.tags: set[str] = set()
-        self.words: list[str] = []
-        self.ids: list[str] = []
-        self.addresses: list[str] = []
-        self.handlers: list[str] = []
-        self.feed(content)
-        self.close()
-        assert self.open == []
-
-    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        self.handle_startendtag(tag, attrs)
-        if tag not in VOID:
-            self.open.append(tag)
-
-    def handle_startendtag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        self.tags.add(tag)
-        for name, value in attrs:
-            self.handlers += [name] if name.startswith("on") else []
-            self.ids += [value or ""] if name == "id" else []
-            self.addresses += [value or ""] if name in {"src", "href", "xlink:href", "action", "data"} else []
-            self.addresses += re.findall(r"url\(([^)]*)\)", value or "")
-
-    def handle_endtag(self, tag: str) -> None:
-        assert self.open.pop() == tag
-
-    def handle_data(self, data: str) -> None:
-        if not self.open or self.open[-1] != "style":
-            self.words.append(data)
-
-    @property
-    def text(self) -> str:
-        return " ".join(" ".join(self.words).split())
 
 
 @pytest.fixture(scope="module")
@@ -79,10 +39,6 @@ def three() -> str:
 @pytest.fixture(scope="module")
 def nothing() -> str:
     return html(MADE.NOTHING)
-
-
-def svgs(content: str) -> list[str]:
-    return re.findall(r"<svg.*?</svg>", content, flags=re.DOTALL)
 
 
 # ── what it says ──
