@@ -88,7 +88,7 @@ def test_the_cursor_starts_at_a_time_or_at_the_worst_error_of_a_model(
     peaks = {}
     for trace in data.models():
         assert trace.errors is not None
-        total = trace.errors.position_total_m
+        total = trace.errors.orientation_total_deg
         peaks[float(np.nanmax(total))] = float(data.elapsed_s(trace.errors.t_ns)[int(np.nanargmax(total))])
     assert cursor_s([data], "worst") == peaks[max(peaks)]
     for at, error, what in (("soon", ConfigError, "soon"), ("-1", DataError, "outside"), ("nan", DataError, "outside")):
