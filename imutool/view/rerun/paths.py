@@ -159,7 +159,7 @@ def _log_worst(to: rr.RecordingStream, data: RunData, trace: Trace, home: str, s
     top = foot + np.array([0.0, 0.0, POLE_SHARE * (1 + rank) * size])
     pole = rr.LineStrips3D([[foot, top]], colors=[WORST_COLOR], radii=rr.Radius.ui_points(1.0))
     radii = rr.Radius.ui_points([WORST_RADIUS, 0.0])
-    dots = rr.Points3D([foot, top], labels=["", words], colors=[WORST_COLOR] * 2, radii=radii, show_labels=True)
+    dots = rr.Points3D([foot, top], labels=["", words], colors=[WORST_COLOR, INK], radii=radii, show_labels=True)
     to.log(f"{home}/worst", pole, dots, static=True, strict=True)
 
 

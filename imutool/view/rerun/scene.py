@@ -29,10 +29,10 @@ def log(logs: Sequence[RunData], to: rr.RecordingStream, *, source: bool = True)
     need_sdk()
     to.set_log_time_enabled(False)
     to.set_log_tick_enabled(False)
+    if len(logs) > 1:  # first: it is what is seen first, and a page receives slowly
+        report.log_comparison(logs, to)
     for data, scope in zip(logs, entities.scopes(logs), strict=True):
         _log_one(data, to, scope, source)
-    if len(logs) > 1:
-        report.log_comparison(logs, to)
 
 
 def _log_one(data: RunData, to: rr.RecordingStream, scope: entities.Scope, with_source: bool) -> None:

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from imutool.view.rerun.entities import Role
-from imutool.view.rerun.palette import AXES, BOLD_WIDTH, RAW_FADE, RAW_WIDTH, TRUE_FADE, XYZ, Color, axis_colors, faded
+from imutool.view.rerun.palette import AXES, BOLD_WIDTH, INK, RAW_FADE, RAW_WIDTH, TRUE_FADE, XYZ, Color, axis_colors, faded
 
 if TYPE_CHECKING:
     import rerun as rr
@@ -64,7 +64,7 @@ def body(role: str, name: str, color: Color, size_m: float) -> list[rr.AsCompone
     label = [0.0, 0.0, 1.3 * length * LABEL_SIDES[role]]
     dots = rr.Points3D(
         [[0.0, 0.0, 0.0], label],
-        colors=[color] * 2,
+        colors=[color, INK],
         radii=rr.Radius.ui_points([4.0, 0.0]),
         labels=["", name],
         show_labels=True,
