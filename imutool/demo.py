@@ -20,7 +20,7 @@ from imutool.recording import Recording
 from imutool.train.fit import Epoch, TrainSettings
 from imutool.train.run import train
 from imutool.view import report
-from imutool.view.rerun import viewer
+from imutool.view.rerun import files
 from imutool.view.runs import load
 
 TRAINING_SEEDS = (1, 2, 3, 4)  # four flights of one sensor, each with a turn-on bias of its own
@@ -89,7 +89,7 @@ def run(
     say("5. Measuring against the truth, drawing")
     results = evaluate(log, models=["static", model])
     data = load(log, models=["static", model])
-    viewer.show([data], save=rrd, spawn=False, overwrite=overwrite)
+    files.save([data], rrd, overwrite=overwrite)
     pictures = report.write_pngs(data, out / "pictures", overwrite=overwrite)
     report.write_page([data], page, overwrite=overwrite)
     png = next(path for path in pictures if path.stem.endswith("-errors"))

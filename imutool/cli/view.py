@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 from typing import Annotated
 
@@ -11,7 +12,7 @@ from imutool.cli._app import Imu, Init, Json, Logs, Models, Overwrite, Quiet, Sm
 from imutool.errors import ConfigError
 from imutool.terminal import progress, say, write_json
 
-AT_HELP = "Where the cursor starts: seconds, or worst, the largest position error."
+AT_HELP = "Where the cursor starts: seconds, or worst, the largest orientation error of a model."
 ALIGN_HELP = "Move each path onto the truth before its errors are taken: by its start, its heading, or as a whole."
 SOURCE_HELP = "Also show what else the log holds, cameras for instance."
 
@@ -78,4 +79,5 @@ def view(
         if not write_json(result | ways.versions(), json_to):
             for one in shown:
                 say(one.said)
+        sys.stdout.flush()  # whoever reads it through a pipe wants the address now
         ways.serve()

@@ -143,7 +143,7 @@ class Ways:
 def cursor_s(logs: Sequence[RunData], at: str) -> float:
     """A time since the first IMU sample: as it says, or where the first log with truth has its largest error.
 
-    That is the position error of a model, without models of what was recorded.
+    That is the orientation error of a model, of what was recorded where there is no model.
 
     Raises:
         ConfigError: neither a number nor `worst`.
@@ -155,8 +155,8 @@ def cursor_s(logs: Sequence[RunData], at: str) -> float:
             raise DataError("no log has truth, so nobody knows its worst error", where="--at", fix="Give the time in seconds")
         data = found[0][0]
         peaks = [trace.errors for one, trace in found if one is data and trace.errors is not None]
-        worst = max(peaks, key=lambda errors: float(np.nanmax(errors.position_total_m)))
-        row = int(np.nanargmax(worst.position_total_m))
+        worst = max(peaks, key=lambda errors: float(np.nanmax(errors.orientation_total_deg)))
+        row = int(np.nanargmax(worst.orientation_total_deg))
         return float(data.elapsed_s(worst.t_ns[row : row + 1])[0])
     longest = max(data.duration_s for data in logs)
     try:

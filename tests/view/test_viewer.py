@@ -50,13 +50,13 @@ def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
-def waited(logs: list[RunData], **asked: bool) -> tuple[float, str]:
+def waited(logs: list[RunData]) -> tuple[float, str]:
     """How much longer than saving a file the next best thing takes, and what is said."""
     start = time.monotonic()
     files.rrd(logs)
     saving_s = time.monotonic() - start
     start = time.monotonic()
-    said = viewer.show(logs, **asked).said
+    said = viewer.show(logs).said
     return time.monotonic() - start - saving_s, said
 
 
@@ -69,10 +69,10 @@ def test_without_a_display_it_saves_at_once_and_says_how_to_open(data: RunData, 
     assert entities(here / "flight_3.rrd") >= {"/world/raw/path"}
 
 
-def test_insisting_on_a_viewer_without_a_display_is_refused_at_once(data: RunData, no_display: None) -> None:
+def test_a_viewer_without_a_display_is_refused_at_once(data: RunData, no_display: None) -> None:
     start = time.monotonic()
     with pytest.raises(ConfigError, match="no display"):
-        viewer.show([data], spawn=True)
+        viewer.open_viewer([data])
     assert time.monotonic() - start < NO_WAIT_S
 
 
@@ -86,7 +86,7 @@ def test_a_viewer_that_does_not_start_is_given_up_at_once_and_the_log_saved(
     assert said.startswith("The viewer ")
     assert "Saved flight_3.rrd" in said
     with pytest.raises(ConfigError, match="the viewer"):
-        viewer.show([data], spawn=True)
+        viewer.open_viewer([data])
 
 
 def test_the_real_viewer_that_finds_no_window_is_noticed_though_it_listened(
@@ -154,7 +154,7 @@ def test_a_viewer_listens_on_this_machine_only(stand_in: Callable[[], Path]) -> 
 
 def test_several_logs_are_one_file(data: RunData, tmp_path: Path) -> None:
     other = replace(data, name="other log")
-    shown = viewer.show([data, other], save=tmp_path)
+    shown = files.save([data, other], tmp_path)
     assert shown.place == str(tmp_path / "flight_3_and_1_more.rrd")
     found = entities(Path(shown.place))
     assert found >= {"/run/flight_3/imu/gyro/raw", r"/run/other\ log/imu/gyro/raw"}
@@ -164,9 +164,9 @@ def test_an_existing_file_is_kept_unless_told_otherwise(data: RunData, tmp_path:
     target = tmp_path / "a.rrd"
     target.write_bytes(b"mine")
     with pytest.raises(ConfigError, match="exists"):
-        viewer.show([data], save=target)
+        files.save([data], target)
     assert target.read_bytes() == b"mine"
-    viewer.show([data], save=target, overwrite=True)
+    files.save([data], target, overwrite=True)
     assert [p.name for p in tmp_path.iterdir()] == ["a.rrd"]
     assert entities(target)
 
@@ -183,7 +183,7 @@ def test_a_failure_on_the_way_leaves_the_old_file_and_no_other(
 
     monkeypatch.setattr(os, "fsync", fail)
     with pytest.raises((KeyboardInterrupt, ConfigError)):
-        viewer.show([data], save=target, overwrite=True)
+        files.save([data], target, overwrite=True)
     assert target.read_bytes() == b"mine"
     assert [p.name for p in tmp_path.iterdir()] == ["a.rrd"]
 
@@ -195,7 +195,7 @@ def test_a_name_that_leads_elsewhere_stays_here(data: RunData, here: Path, no_di
 
 
 def test_reruns_own_verifier_accepts_the_file(data: RunData, tmp_path: Path) -> None:
-    saved = viewer.show([data], save=tmp_path / "a.rrd").place
+    saved = files.save([data], tmp_path / "a.rrd").place
     run = subprocess.run([str(viewer.binary()), "rrd", "verify", saved], capture_output=True, text=True, check=False)
     assert run.returncode == 0, run.stderr
 

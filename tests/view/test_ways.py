@@ -58,7 +58,9 @@ def test_files_and_pages_are_made_together_and_each_is_said(data: RunData, tmp_p
     assert all(one.place in one.said for one in shown)
 
 
-def test_without_rerun_a_page_is_written_here_and_said(data: RunData, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_rerun_a_page_is_written_here_and_said(
+    data: RunData, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, report: None
+) -> None:
     there = ways.find_spec
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(ways, "find_spec", lambda name: None if name == "rerun" else there(name))
@@ -86,7 +88,7 @@ def test_the_cursor_starts_at_a_time_or_at_the_worst_error_of_a_model(
     peaks = {}
     for trace in data.models():
         assert trace.errors is not None
-        total = trace.errors.position_total_m
+        total = trace.errors.orientation_total_deg
         peaks[float(np.nanmax(total))] = float(data.elapsed_s(trace.errors.t_ns)[int(np.nanargmax(total))])
     assert cursor_s([data], "worst") == peaks[max(peaks)]
     for at, error, what in (("soon", ConfigError, "soon"), ("-1", DataError, "outside"), ("nan", DataError, "outside")):
@@ -107,7 +109,12 @@ def test_the_command_says_in_json_what_it_wrote(
     assert (told["schema"], told["logs"]) == ("imutool.view/1", ["log.mcap"])
     assert [(one["how"], one["place"]) for one in told["shown"]] == [("rrd", "a.rrd")]
     assert told["rerun"].startswith("0.41.")
-    refused = imutool("view", "log.mcap", "--connect", "127.0.0.1:1", "--html", "a.html", cwd=tmp_path)
+
+
+def test_nobody_to_connect_to_is_known_before_anything_is_read_or_written(
+    tmp_path: Path, imutool: Callable[..., subprocess.CompletedProcess[str]]
+) -> None:
+    refused = imutool("view", "no-such.mcap", "--connect", "127.0.0.1:1", "--html", "a.html", cwd=tmp_path)
     assert refused.returncode == ConfigError.exit_code
     assert "nobody listens there" in refused.stderr
-    assert not (tmp_path / "a.html").exists()
+    assert list(tmp_path.iterdir()) == []

@@ -56,47 +56,53 @@ def watching(
             cannot be written.
     """
     need_sdk()
-    peer: Peer | None = None
-    said = ""
+    live = Live(name)
     if connect_to is not None:
         peer = connect.probe(connect_to)
+        live.send(peer, Shown("connect", peer.url, f"Shown as it went: {peer.url}{connect.told(peer)}."))
     elif save is None:
         try:
-            peer = viewer.start().peer
+            peer = viewer.open_empty()
+            live.send(peer, Shown("viewer", peer.url, "The viewer is open, and showed it as it went."))
         except ConfigError as error:
-            save, said = instead, f"{error.what[0].upper()}{error.what[1:]}. "
-    live = Live(name, peer, said)
+            save, live.trouble = instead, viewer.sentence(error)
     if save is None:
         yield live
         live.finish()
         return
-    with Target(save, overwrite=overwrite, summing=False) as target:
-        assert isinstance(target.temporary, Path)
+    target = Target(save, overwrite=overwrite, summing=False)
+    try:
+        assert isinstance(target.temporary, Path), "not in a store"
         live.record(save, target.temporary)
         yield live
-        live.finish()
+        if live.finish():
+            target.commit()
+    finally:
+        target.abandon()
 
 
 class Live:
     """Takes each block of a debiasing and shows it; `shown` says where, and what became of it."""
 
-    def __init__(self, name: str, peer: Peer | None = None, said: str = "") -> None:
-        self._name, self._said = name, said
+    def __init__(self, name: str) -> None:
+        self._name, self.trouble = name, ""
         self._watched: dict[str, _Imu] = {}
         self._viewer: rr.RecordingStream | None = None
         self._file: rr.RecordingStream | None = None
         self._left_at = time.monotonic()
         self.shown: list[Shown] = []
-        if peer is not None:
-            self._viewer = named(name)
-            self._viewer.connect_grpc(peer.url)
-            self.shown.append(Shown("connect", peer.url, f"Shown as it went: {peer.url}{connect.told(peer)}."))
+
+    def send(self, peer: Peer, shown: Shown) -> None:
+        """Sends everything to a viewer, which is `shown` unless it goes away."""
+        self._viewer = named(self._name)
+        self._viewer.connect_grpc(peer.url)
+        self.shown.append(shown)
 
     def record(self, path: Path, temporary: Path) -> None:
         """Also writes everything to a file, which is to become `path`."""
         self._file = named(self._name)
         self._file.save(temporary)
-        self.shown.append(Shown("rrd", str(path), f"{self._said}Saved {path}. Open with: rerun {path}"))
+        self.shown.append(Shown("rrd", str(path), f"{self.trouble}Saved {path}. Open with: rerun {path}"))
 
     def __call__(self, block: Block) -> None:
         """Shows a block; what cannot be shown is said once, and the rest goes on without it."""
@@ -112,13 +118,13 @@ class Live:
                 self._lay_out(streams)
             self._watched[block.topic].log(block, streams)
         except TROUBLE as error:
-            self._give_up(f"This cannot be shown as it goes ({error})")
-            self._file = None
+            self._file, self.shown = None, []
+            self._give_up(f"It cannot be shown as it goes ({error})")
             return
         self._see_off()
 
-    def finish(self) -> None:
-        """Everything was debiased: the whole of it is laid out, and whoever listens has all of it."""
+    def finish(self) -> bool:
+        """Everything was debiased: the whole of it is laid out, whoever listens has all of it; whether a file does."""
         streams = [stream for stream in (self._viewer, self._file) if stream is not None]
         self._lay_out(streams, {topic: imu.box for topic, imu in self._watched.items()})
         if self._viewer is not None:
@@ -129,6 +135,7 @@ class Live:
         for stream in (self._viewer, self._file):
             if stream is not None:
                 stream.disconnect()
+        return self._file is not None
 
     def _lay_out(self, streams: list[rr.RecordingStream], boxes: Mapping[str, Box] | None = None) -> None:
         scopes = {topic: imu.scope for topic, imu in self._watched.items()}
@@ -152,7 +159,7 @@ class Live:
     def _give_up(self, why: str) -> None:
         """Leaves the viewer to itself, and says so once."""
         if self._viewer is not None:
-            self.shown = [one for one in self.shown if one.how != "connect"]
+            self.shown = [one for one in self.shown if one.how == "rrd"]
         self._viewer = None
         logger.warning("%s; debiasing goes on without it", why)
 

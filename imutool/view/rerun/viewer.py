@@ -27,35 +27,20 @@ SETTLES_S = 0.7  # within which one that finds no window or no graphics has died
 VIEWERS: list[subprocess.Popen[bytes]] = []  # they outlive us; held so that Python does not warn of a lost child
 
 
-def show(
-    logs: Sequence[RunData],
-    *,
-    save: Path | None = None,
-    spawn: bool | None = None,
-    source: bool = True,
-    at_s: float | None = None,
-    overwrite: bool = False,
-) -> Shown:
-    """Opens a viewer or saves an .rrd, and says which and how to go on.
-
-    Without `save` and `spawn` a viewer opens; where there is no display or the viewer does not start, the logs are
-    saved as NAME.rrd here instead.
+def show(logs: Sequence[RunData], *, source: bool = True, at_s: float | None = None, overwrite: bool = False) -> Shown:
+    """Opens a viewer; where there is no display or the viewer does not start, saves NAME.rrd here, and says so.
 
     Raises:
-        ConfigError: no log, Rerun is not installed, no viewer though `spawn` is true, or the target cannot be written.
+        ConfigError: no log, Rerun is not installed, or the file exists (without `overwrite`) or cannot be written.
     """
     title(logs)  # refuses where there is no log
     need_sdk()
-    if spawn or (spawn is None and save is None):
-        try:
-            return open_viewer(logs, source=source, at_s=at_s)
-        except ConfigError as error:
-            if spawn:
-                raise
-            trouble = error.what
-        saved = files.save(logs, source=source, overwrite=overwrite)
-        return saved._replace(said=f"{trouble[0].upper()}{trouble[1:]}. {saved.said}, or look in a browser: imutool view --web")
-    return files.save(logs, save, source=source, overwrite=overwrite)
+    try:
+        return open_viewer(logs, source=source, at_s=at_s)
+    except ConfigError as error:
+        trouble = sentence(error)
+    saved = files.save(logs, source=source, overwrite=overwrite)
+    return saved._replace(said=f"{trouble}{saved.said}, or look in a browser: imutool view --web")
 
 
 def open_viewer(logs: Sequence[RunData], *, source: bool = True, at_s: float | None = None) -> Shown:
@@ -72,6 +57,18 @@ def open_viewer(logs: Sequence[RunData], *, source: bool = True, at_s: float | N
     if trouble := viewer.trouble():
         raise trouble
     return Shown("viewer", viewer.peer.url, "The viewer is open.")
+
+
+def open_empty() -> Peer:
+    """Opens a viewer of our own for what is still to come.
+
+    Raises:
+        ConfigError: no display, no viewer, or it dies at once.
+    """
+    viewer = start()
+    if trouble := viewer.trouble():
+        raise trouble
+    return viewer.peer
 
 
 def has_display() -> bool:
@@ -150,6 +147,11 @@ def binary() -> Path:
     spec = importlib.util.find_spec("rerun_cli")  # comes with rerun-sdk
     folders = list(spec.submodule_search_locations or ()) if spec else [""]
     return Path(folders[0]) / ("rerun.exe" if sys.platform == "win32" else "rerun")
+
+
+def sentence(error: ConfigError) -> str:
+    """What went wrong as the beginning of what is said."""
+    return f"{error.what[0].upper()}{error.what[1:]}. "
 
 
 def _trouble(what: str) -> ConfigError:
