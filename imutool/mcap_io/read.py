@@ -76,8 +76,8 @@ def recording_in(
 ) -> Recording:
     """As `read`, in a log that is open.
 
-    Where somebody is to be told (`refused`), poses that a recording cannot hold are left out. Without `derived` the scalars that
-    imutool computed are not read.
+    Where somebody is to be told (`refused`), poses that a recording cannot hold are left out. Without `derived` the scalars
+    that imutool computed are not read.
 
     Raises:
         LogError: as `read`.

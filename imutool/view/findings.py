@@ -46,7 +46,7 @@ def of_findings(folder: Path, log: str, start_ns: int, end_ns: int) -> tuple[lis
     """Where in a log (by its file's name) what a diagnosis located acts, and sentences for what cannot be marked.
 
     Times of a diagnosis count from the start of its first log; only that one can be marked. What is located without a time acts
-    everywhere. Of a place with more stretches than are ever shown, the first.
+    everywhere. Of a place with more stretches than are ever shown, the longest.
 
     Raises:
         ConfigError: the folder holds no diagnosis, or it cannot be read.
@@ -56,15 +56,17 @@ def of_findings(folder: Path, log: str, start_ns: int, end_ns: int) -> tuple[lis
     if not found.real or Path(found.real[0]).name != log:
         first = found.real[0] if found.real else "no log"
         return [], [f"The findings of {folder.name} are on the clock of {Path(first).name} and are not marked in {log}."]
-    events = []
+    events, notes = [], []
     for place in found.located:
         text = _words(place, found.findings)
-        whole = [(0.0, (end_ns - start_ns) * 1e-9)]
-        for first_s, last_s in (place.intervals_s or whole)[: MOST_PER_KIND + 1]:
+        longest = sorted(place.intervals_s, key=lambda one: one[0] - one[1])
+        if len(longest) > MOST_PER_KIND:
+            notes.append(f"{text}: {len(longest) - MOST_PER_KIND} shorter stretches are not marked.")
+        for first_s, last_s in longest[:MOST_PER_KIND] or [(0.0, (end_ns - start_ns) * 1e-9)]:
             low, high = sorted((start_ns + nanoseconds(first_s), start_ns + nanoseconds(last_s)))
             events.append(Event("finding", low, high, text))
     unplaced = found.findings if not found.located else []
-    notes = [f"Diagnosis: {one.effect} on {one.signal}, at no time of its own." for one in unplaced[:MOST_PER_KIND]]
+    notes += [f"Diagnosis: {one.effect} on {one.signal}, at no time of its own." for one in unplaced[:MOST_PER_KIND]]
     return events, notes
 
 
