@@ -2,21 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, NoReturn
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from imutool.cli._app import LOST, Init, Json, Overwrite, Quiet, Smooth, Verbose, app
 from imutool.errors import ConfigError
-from imutool.mcap_io.losses import Losses
 from imutool.place import Place, place
 from imutool.terminal import progress, say, tell_losses, write_json
 
 if TYPE_CHECKING:
+    from imutool.debias import DebiasReport
     from imutool.view.rerun.live import Live
+    from imutool.view.shown import Shown
 
 MODEL_HELP = (
     "Model file, physics.toml or a name that ships; else a static estimate. TOPIC=MODEL is for one IMU of several. Repeatable."
@@ -76,9 +77,6 @@ def debias(
             progress=lambda done, total: tell(done, total, ""),
             watch=watch,
         )
-        if report_to is not None:
-            tell(1, 1, "drawing")
-            _draw(place(target or source), list(report.starts), report_to, overwrite)
     imus = {
         topic: {
             "model": report.models[topic],
@@ -94,25 +92,36 @@ def debias(
     result |= {"verified": verified._asdict(), "losses": report.losses.plain()}
     if watch is not None:
         result["shown"] = [one.plain() for one in watch.shown]
+    if report_to is not None:
+        result["report"] = str(report_to)
     if clean:
         result["clean"] = [one.plain() for one in report.surveys.values()]
-    if write_json(result, json_to):
-        _leave(report.losses)
+    told = write_json(result, json_to)
+    if not told:
+        _say(report, str(target or source), imus, verify, () if watch is None else watch.shown)
+    if report_to is not None:  # last: should it fail, the log is there all the same, and that has been said
+        with progress("Drawing", verbose, quiet):
+            _draw(place(target or source), list(report.starts), report_to, overwrite)
+        if not told:
+            say(f"Report: {report_to}")
+    raise typer.Exit(LOST if report.losses else 0)
+
+
+def _say(report: DebiasReport, target: str, imus: Mapping[str, Mapping[str, Any]], verify: str, shown: Sequence[Shown]) -> None:
+    """What was done, in lines."""
     for topic, one in report.surveys.items():
         say(f"{topic}: {one.verdict}, score {one.score:.3f}, {one.valid} of {one.messages} samples valid")
     for topic, entry in imus.items():
         bias = ", ".join(f"{b:+.5f}" for b in entry["gyro_bias"]), ", ".join(f"{b:+.4f}" for b in entry["accel_bias"])
         start = f"start bias {bias[0]} rad/s; {bias[1]} m/s² ({entry['init_how']})"
         say(f"{topic}: {entry['model']}, {start}")
-    counts = ", ".join(f"{count} on {name}" for name, count in added.items())
-    say(f"{target or source}: {copied} messages as they were, {counts}")
+    counts = ", ".join(f"{count} on {name}" for name, count in report.rewrite.added.items())
+    say(f"{target}: {report.rewrite.copied} messages as they were, {counts}")
+    verified = report.rewrite.verified
     say(f"checked: every index, and the contents of {verified.chunks_checked} of {verified.chunks} chunks (--verify {verify})")
-    for shown in () if watch is None else watch.shown:
-        say(shown.said)
-    if report_to is not None:
-        say(f"Report: {report_to}")
+    for way in shown:
+        say(way.said)
     tell_losses(report.losses.plain())
-    _leave(report.losses)
 
 
 def _watching(
@@ -133,10 +142,6 @@ def _draw(log: Place, topics: Sequence[str], page: Path, overwrite: bool) -> Non
     from imutool.view.runs import load
 
     write_page(by_topic([load(log, imu=topic) for topic in topics], topics), page, overwrite=overwrite)
-
-
-def _leave(losses: Losses) -> NoReturn:
-    raise typer.Exit(LOST if losses else 0)
 
 
 def _refuse_contradictions(target: str | None, in_place: bool, overwrite: bool) -> None:

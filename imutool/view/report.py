@@ -104,7 +104,7 @@ def write_pngs(data: RunData, folder: Path, *, overwrite: bool = False) -> list[
         raise ConfigError(f"cannot be written ({error.strerror})", where=folder, expected="a folder") from error
     for path, picture in zip(paths, pictures, strict=True):
         with Target(path, overwrite=overwrite) as target:
-            target.write(png(picture, f"{data.name}: {picture.title.lower()}"))
+            target.write(png(picture, f"{data.name}: {picture.title}"))
     return paths
 
 

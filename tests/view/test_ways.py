@@ -109,7 +109,12 @@ def test_the_command_says_in_json_what_it_wrote(
     assert (told["schema"], told["logs"]) == ("imutool.view/1", ["log.mcap"])
     assert [(one["how"], one["place"]) for one in told["shown"]] == [("rrd", "a.rrd")]
     assert told["rerun"].startswith("0.41.")
-    refused = imutool("view", "log.mcap", "--connect", "127.0.0.1:1", "--html", "a.html", cwd=tmp_path)
+
+
+def test_nobody_to_connect_to_is_known_before_anything_is_read_or_written(
+    tmp_path: Path, imutool: Callable[..., subprocess.CompletedProcess[str]]
+) -> None:
+    refused = imutool("view", "no-such.mcap", "--connect", "127.0.0.1:1", "--html", "a.html", cwd=tmp_path)
     assert refused.returncode == ConfigError.exit_code
     assert "nobody listens there" in refused.stderr
-    assert not (tmp_path / "a.html").exists()
+    assert list(tmp_path.iterdir()) == []

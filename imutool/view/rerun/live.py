@@ -56,16 +56,16 @@ def watching(
             cannot be written.
     """
     need_sdk()
-    peer: Peer | None = None
-    said = ""
+    live = Live(name)
     if connect_to is not None:
         peer = connect.probe(connect_to)
+        live.send(peer, Shown("connect", peer.url, f"Shown as it went: {peer.url}{connect.told(peer)}."))
     elif save is None:
         try:
-            peer = viewer.start().peer
+            peer = viewer.open_empty()
+            live.send(peer, Shown("viewer", peer.url, "The viewer is open, and showed it as it went."))
         except ConfigError as error:
-            save, said = instead, viewer.sentence(error)
-    live = Live(name, peer, said)
+            save, live.trouble = instead, viewer.sentence(error)
     if save is None:
         yield live
         live.finish()
@@ -84,23 +84,25 @@ def watching(
 class Live:
     """Takes each block of a debiasing and shows it; `shown` says where, and what became of it."""
 
-    def __init__(self, name: str, peer: Peer | None = None, said: str = "") -> None:
-        self._name, self._said = name, said
+    def __init__(self, name: str) -> None:
+        self._name, self.trouble = name, ""
         self._watched: dict[str, _Imu] = {}
         self._viewer: rr.RecordingStream | None = None
         self._file: rr.RecordingStream | None = None
         self._left_at = time.monotonic()
         self.shown: list[Shown] = []
-        if peer is not None:
-            self._viewer = named(name)
-            self._viewer.connect_grpc(peer.url)
-            self.shown.append(Shown("connect", peer.url, f"Shown as it went: {peer.url}{connect.told(peer)}."))
+
+    def send(self, peer: Peer, shown: Shown) -> None:
+        """Sends everything to a viewer, which is `shown` unless it goes away."""
+        self._viewer = named(self._name)
+        self._viewer.connect_grpc(peer.url)
+        self.shown.append(shown)
 
     def record(self, path: Path, temporary: Path) -> None:
         """Also writes everything to a file, which is to become `path`."""
         self._file = named(self._name)
         self._file.save(temporary)
-        self.shown.append(Shown("rrd", str(path), f"{self._said}Saved {path}. Open with: rerun {path}"))
+        self.shown.append(Shown("rrd", str(path), f"{self.trouble}Saved {path}. Open with: rerun {path}"))
 
     def __call__(self, block: Block) -> None:
         """Shows a block; what cannot be shown is said once, and the rest goes on without it."""
@@ -157,7 +159,7 @@ class Live:
     def _give_up(self, why: str) -> None:
         """Leaves the viewer to itself, and says so once."""
         if self._viewer is not None:
-            self.shown = [one for one in self.shown if one.how != "connect"]
+            self.shown = [one for one in self.shown if one.how == "rrd"]
         self._viewer = None
         logger.warning("%s; debiasing goes on without it", why)
 

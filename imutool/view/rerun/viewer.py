@@ -59,6 +59,18 @@ def open_viewer(logs: Sequence[RunData], *, source: bool = True, at_s: float | N
     return Shown("viewer", viewer.peer.url, "The viewer is open.")
 
 
+def open_empty() -> Peer:
+    """Opens a viewer of our own for what is still to come.
+
+    Raises:
+        ConfigError: no display, no viewer, or it dies at once.
+    """
+    viewer = start()
+    if trouble := viewer.trouble():
+        raise trouble
+    return viewer.peer
+
+
 def has_display() -> bool:
     """Whether a window can open here: always asked before a viewer is, since Rerun finds out only after 18 s."""
     if sys.platform in ("darwin", "win32"):
