@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import json
+import os
 import re
+import shutil
 import subprocess
 import sys
 from collections.abc import Callable
@@ -128,7 +131,32 @@ def test_a_stream_is_shown_as_it_is_corrected(tmp_path: Path, example: Example) 
     assert {"/world/debiased/path", "/imu/gyro/raw", "/bias/accel/estimated"} <= entities(tmp_path / "live.rrd")
 
 
+CELLS = """
+import json, sys
+from IPython.core.interactiveshell import InteractiveShell
+shell = InteractiveShell.instance()
+for cell in json.load(open(sys.argv[1], encoding="utf-8"))["cells"]:
+    if cell["cell_type"] == "code":
+        done = shell.run_cell("".join(cell["source"]))
+        done.raise_error()
+        print("SHOWN", type(done.result).__name__)
+"""
+
+
+def test_a_notebook_shows_the_viewer_and_the_page(tmp_path: Path, logs: Path) -> None:
+    """Its cells are run one after the other as a notebook's server runs them; what a browser makes of it is not seen here."""
+    shutil.copy(logs / "flight_1.mcap", tmp_path / "log.mcap")
+    line = [sys.executable, "-c", CELLS, str(EXAMPLES / "notebook.ipynb")]
+    env = {**os.environ, "IPYTHONDIR": str(tmp_path / "ipython")}
+    done = subprocess.run(line, cwd=tmp_path, env=env, capture_output=True, text=True, timeout=240, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert re.findall(r"^SHOWN (\w+)", done.stdout, re.MULTILINE) == ["NoneType", "NoneType", "Viewer", "Page"]
+    assert re.search(r"aoe_deg +[\d.]+ +[\d.]+", done.stdout)
+    notebook = json.loads((EXAMPLES / "notebook.ipynb").read_text(encoding="utf-8"))
+    assert not any(cell.get("outputs") for cell in notebook["cells"])  # what was seen on one machine is no part of it
+
+
 def test_every_example_is_run_here() -> None:
     here = Path(__file__).read_text()
-    assert all(f'"{path.name}"' in here for path in EXAMPLES.glob("*.py"))
+    assert all(f'"{path.name}"' in here for path in [*EXAMPLES.glob("*.py"), *EXAMPLES.glob("*.ipynb")])
     assert len(list(EXAMPLES.glob("*.py"))) >= 4
