@@ -2,13 +2,14 @@
 PYTHON ?= python3
 VENV ?= .venv
 DEMO ?= demo-out
+WORKERS ?= auto
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt
 READY_DEMO := $(VENV)/.ready-demo
 READY_TEST := $(VENV)/.ready-test
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test lint format bench clean
+.PHONY: help demo test viewers lint format bench clean
 .NOTPARALLEL:
 
 help:  ## say what there is
@@ -18,9 +19,12 @@ demo: $(READY_DEMO)  ## the whole way on a made-up recording: convert, train, de
 	@echo "demo: runs on made-up flights; everything goes to $(DEMO)"
 	@$(BIN)/imutool demo --output $(DEMO) --overwrite
 
-test: lint  ## format, lint, types, then every test with warnings as errors
-	@echo "test: pytest"
-	@$(BIN)/python -m pytest
+test: lint viewers  ## format, lint, types, then every test with warnings as errors
+	@echo "test: pytest, side by side"
+	@$(BIN)/python -m pytest -n $(WORKERS) --maxprocesses 4 --dist worksteal
+
+viewers: $(READY_TEST)  ## a browser and a software graphics driver for the tests that look, where apt-get may bring them
+	@$(BIN)/python tests/viewers.py
 
 lint: $(READY_TEST)  ## format, lint and types only
 	@echo "lint: ruff format, ruff check, mypy --strict"

@@ -36,6 +36,7 @@ from imutool.recording import Imu, seconds
 from imutool.turn_on import TurnOn, following
 
 SUFFIX = "/debiased"
+BLOCK = 1 << 14  # samples
 CLEAN_RECORD = "imutool_clean"
 
 
@@ -61,6 +62,35 @@ def apply(model: BiasModel, start: TurnOn, imu: Imu) -> Debiased:
     """A model over samples in memory, from their first on."""
     bias = start.stream(model)(seconds(imu.t_ns, int(imu.t_ns[0])), imu.gyro, imu.accel)
     return Debiased(Imu(imu.t_ns, imu.gyro - bias[:, :3], imu.accel - bias[:, 3:]), bias)
+
+
+class Block(NamedTuple):
+    """Consecutive samples of one IMU as they are debiased, for whoever watches: gyro (rad/s), then accel (m/s²)."""
+
+    topic: str
+    batch: ImuBatch  # raw
+    bias: Float64[np.ndarray, "n 6"]  # what is subtracted
+    std: Float64[np.ndarray, "n 6"]  # one standard deviation of it
+
+
+Watch = Callable[[Block], None]
+
+
+def apply_with_std(model: BiasModel, start: TurnOn, imu: Imu) -> tuple[Debiased, Float64[np.ndarray, "n 6"]]:
+    """As `apply`, and one standard deviation of the bias at each sample, gyro (rad/s) then accel (m/s²): `imutool.certainty`.
+
+    In blocks, as a log is debiased: a covariance is 288 bytes.
+    """
+    stream = start.stream(model)
+    certainty = Certainty(model, start, stream)
+    t_s = seconds(imu.t_ns, int(imu.t_ns[0]))
+    bias, std = np.empty((len(imu), 6)), np.empty((len(imu), 6))
+    for first in range(0, len(imu), BLOCK):
+        rows = slice(first, first + BLOCK)
+        bias[rows] = stream(t_s[rows], imu.gyro[rows], imu.accel[rows])
+        covariance = certainty(t_s[rows], imu.gyro[rows], imu.accel[rows])
+        std[rows] = np.sqrt(covariance.diagonal(axis1=1, axis2=2))
+    return Debiased(Imu(imu.t_ns, imu.gyro - bias[:, :3], imu.accel - bias[:, 3:]), bias), std
 
 
 class OnlineDebiaser:
@@ -99,11 +129,13 @@ def _by_blocks(stream: Stream) -> Callable[[float, Vector6], Vector6]:
 class Debiaser:
     """The channels a log gains, computed batch by batch as the log is copied (`mcap_io.rewrite.Derived`).
 
-    With a survey, only of what is left of the samples when they are clean.
+    With a survey, only of what is left of the samples when they are clean. Who watches is told every batch.
     """
 
-    def __init__(self, source_topic: str, model: BiasModel, start: TurnOn, found: Survey | None = None) -> None:
-        self.source_topic = source_topic
+    def __init__(
+        self, source_topic: str, model: BiasModel, start: TurnOn, found: Survey | None = None, watch: Watch | None = None
+    ) -> None:
+        self.source_topic, self._watch = source_topic, watch
         self._clean = None if found is None else Cleaner(found)
         self.topics: Sequence[NewTopic] = (
             NewTopic(f"{source_topic}{SUFFIX}", schema.IMU),
@@ -148,6 +180,9 @@ class Debiaser:
             _vector(batch.stamp_ns, bias[:, 3:], batch.frame_id),
             schema.encode_twist(batch.stamp_ns, bias[:, :3], bias[:, 3:], unsure, batch.frame_id),
         )
+        if self._watch is not None and len(batch.stamp_ns):
+            std = np.sqrt(unsure.diagonal(axis1=1, axis2=2))
+            self._watch(Block(self.source_topic, batch, bias, std))
         return Made(batch, payloads)
 
 
@@ -163,6 +198,7 @@ def debias(
     clean: Rules | None = None,
     overwrite: bool = False,
     progress: Callable[[int, int], None] | None = None,
+    watch: Watch | None = None,
 ) -> DebiasReport:
     """Writes `target`: all of `source` unchanged, and beside each IMU its debiased samples and the bias taken off.
 
@@ -174,6 +210,7 @@ def debias(
     Of a damaged log, what is sound goes through a repaired copy beside the target (`mcap_io.salvage`), and `losses` says
     what is missing; it is not replaced. With `clean` a first pass says what is to be left out or converted
     (`imutool.clean`), and the record `imutool_clean` what it found.
+    `watch` is told every batch of samples as it is debiased, those of a damaged log again when its repaired copy is.
 
     Raises:
         ConfigError: source or target cannot be opened, `init` makes no sense, `smooth` is asked for with another `init`,
@@ -184,7 +221,7 @@ def debias(
     """
     refuse_smooth(init, smooth)
     refuse_unknown(check)
-    asked = _Asked(model, imus, init, smooth, clean, check, overwrite)
+    asked = _Asked(model, imus, init, smooth, clean, check, overwrite, watch)
     with Log(source, salvage=True) as log:
         assert log.losses is not None, "with salvage there are losses, if perhaps none"
         damaged = bool(log.losses or log.losses.mended)
@@ -212,6 +249,7 @@ class _Asked:
     clean: Rules | None
     check: str
     overwrite: bool
+    watch: Watch | None
 
 
 def _debias(
@@ -234,7 +272,7 @@ def _debias(
     with Digest(source) as digest:
         for topic in topics:
             chosen, start = prepare(sound, topic, given.get(topic, named), asked.init, asked.smooth, surveys.get(topic))
-            derived.append(Debiaser(topic, chosen, start, surveys.get(topic)))
+            derived.append(Debiaser(topic, chosen, start, surveys.get(topic), asked.watch))
             starts[topic], models[topic] = start, str(chosen.card.get("name", chosen.method))
             records[topic] = _provenance(topic, chosen, start, asked.init, asked.smooth)
 

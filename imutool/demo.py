@@ -20,7 +20,7 @@ from imutool.recording import Recording
 from imutool.train.fit import Epoch, TrainSettings
 from imutool.train.run import train
 from imutool.view import report
-from imutool.view.rerun import viewer
+from imutool.view.rerun import files
 from imutool.view.runs import load
 
 TRAINING_SEEDS = (1, 2, 3, 4)  # four flights of one sensor, each with a turn-on bias of its own
@@ -52,6 +52,7 @@ class Demo:
     model: Path
     rrd: Path
     png: Path
+    report: Path
     results: list[dict[str, Any]]
 
 
@@ -73,7 +74,7 @@ def run(
     raw, logs = out / "raw", out / "logs"
     names = [f"flight_{number}" for number in (*TRAINING_SEEDS, seed)]
     log, model, debiased = logs / f"{names[-1]}.mcap", out / "model.safetensors", out / "debiased.mcap"
-    rrd, png = out / "demo.rrd", out / "errors.png"
+    rrd, page = out / "demo.rrd", out / "report.html"
     say(f"1. Making up {len(names)} flights, as raw files of the EuRoC layout: {raw}")
     for number, name in zip((*TRAINING_SEEDS, seed), names, strict=True):
         write_asl(made_up(number), raw / name)
@@ -88,9 +89,11 @@ def run(
     say("5. Measuring against the truth, drawing")
     results = evaluate(log, models=["static", model])
     data = load(log, models=["static", model])
-    viewer.show([data], save=rrd, spawn=False, overwrite=overwrite)
-    report.error_curves(data, png, overwrite=overwrite)
-    return Demo(log, debiased, model, rrd, png, results)
+    files.save([data], rrd, overwrite=overwrite)
+    pictures = report.write_pngs(data, out / "pictures", overwrite=overwrite)
+    report.write_page([data], page, overwrite=overwrite)
+    png = next(path for path in pictures if path.stem.endswith("-errors"))
+    return Demo(log, debiased, model, rrd, png, page, results)
 
 
 def made_up(seed: int) -> Recording:

@@ -1,4 +1,4 @@
-"""What a diagnosis leaves behind: findings.json, physics.toml, report.html and view.rrd in one folder.
+"""What a diagnosis leaves behind: findings.json, physics.toml, report.html, log.html and view.rrd in one folder.
 
 The files are made in a folder beside it and moved when all are there, so that a reader never finds half a diagnosis. Other
 files in the folder, the logs themselves for instance, stay as they are.
@@ -16,16 +16,20 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from imutool.errors import ConfigError
+from imutool.errors import ConfigError, ImutoolError
 from imutool.physics import physics_file
 from imutool.physics.diagnosis import Diagnosis
 from imutool.physics.found import found
 
-FINDINGS, PHYSICS, REPORT, VIEW = "findings.json", "physics.toml", "report.html", "view.rrd"
-FILES = (FINDINGS, PHYSICS, REPORT, VIEW)
-NEEDS = {REPORT: ("matplotlib", "report"), VIEW: ("rerun", "view")}  # a file, the library that draws it, and its extra
+if TYPE_CHECKING:
+    from imutool.view.rundata import RunData
+
+FINDINGS, PHYSICS, REPORT, LOG, VIEW = "findings.json", "physics.toml", "report.html", "log.html", "view.rrd"
+FILES = (FINDINGS, PHYSICS, REPORT, LOG, VIEW)
+DRAWN = ("matplotlib", "report")  # the library that draws a file, and its extra
+NEEDS = {LOG: DRAWN, REPORT: DRAWN, VIEW: ("rerun", "view")}
 
 
 def refuse(folder: Path, *, overwrite: bool = False) -> None:
@@ -43,9 +47,12 @@ def refuse(folder: Path, *, overwrite: bool = False) -> None:
         )
 
 
-def write(d: Diagnosis, folder: Path, *, overwrite: bool = False) -> list[str]:
+def write(
+    d: Diagnosis, folder: Path, *, logs: Callable[[Path], list[RunData]] | None = None, overwrite: bool = False
+) -> list[str]:
     """Writes the folder; gives a remark for each file that was left out because an extra is not installed.
 
+    With `logs`, which looks at the logs again with the folder's findings in hand, there is a page of them too.
     A diagnosis that is replaced goes whole: of its files none is kept.
 
     Raises:
@@ -53,11 +60,12 @@ def write(d: Diagnosis, folder: Path, *, overwrite: bool = False) -> list[str]:
     """
     refuse(folder, overwrite=overwrite)
     place = folder.absolute()  # "." has no name of its own
-    beside = place.parent / f".{place.name}.{os.getpid()}.{secrets.token_hex(4)}.partial"
+    partial = place.parent / f".{place.name}.{os.getpid()}.{secrets.token_hex(4)}.partial"
+    beside = partial / place.name  # what is written names the folder as it will be called
     with _told(folder):
         try:
             beside.mkdir(parents=True)
-            remarks = _make(d, beside)
+            remarks = _make(d, beside, logs)
             refuse(folder, overwrite=overwrite)
             if folder.exists():
                 _move(beside, folder)
@@ -65,7 +73,7 @@ def write(d: Diagnosis, folder: Path, *, overwrite: bool = False) -> list[str]:
                 beside.rename(folder)
         finally:
             with contextlib.suppress(FileNotFoundError):
-                shutil.rmtree(beside)
+                shutil.rmtree(partial)
     return remarks
 
 
@@ -85,25 +93,38 @@ def _finite(value: Any) -> Any:
     return value
 
 
-def _make(d: Diagnosis, folder: Path) -> list[str]:
+def _make(d: Diagnosis, folder: Path, logs: Callable[[Path], list[RunData]] | None) -> list[str]:
     text = json.dumps(plain(d), indent=2, allow_nan=False, ensure_ascii=False)
     (folder / FINDINGS).write_text(text + "\n", encoding="utf-8")
     physics_file.write(found(d), folder / PHYSICS)
     drawn: dict[str, Callable[[Path], None]] = {REPORT: lambda path: _page(d, path), VIEW: lambda path: _recording(d, path)}
+    if logs is not None:  # before the report, which says where it is
+        drawn = {LOG: lambda path: _logs(logs(folder), path)} | drawn
     remarks = []
     for name, draw in drawn.items():
         library, extra = NEEDS[name]
         if find_spec(library) is None:
             remarks.append(f"{name} is left out: {library} is not installed (pip install 'imutool[{extra}]')")
         else:
-            draw(folder / name)
+            try:
+                draw(folder / name)
+            except ImutoolError as error:
+                if name != LOG:
+                    raise
+                remarks.append(f"{name} is left out: {error}")  # for a picture of the logs no diagnosis is thrown away
     return remarks
 
 
 def _page(d: Diagnosis, path: Path) -> None:
     from imutool.view.diagnosis_page import write as write_page
 
-    write_page(d, path)
+    write_page(d, path, logs=LOG if (path.parent / LOG).exists() else None)
+
+
+def _logs(logs: list[RunData], path: Path) -> None:
+    from imutool.view.report import write_page
+
+    write_page(logs, path)
 
 
 def _recording(d: Diagnosis, path: Path) -> None:

@@ -27,11 +27,13 @@ from jaxtyping import Bool, Float64, Int64
 from scipy.spatial.transform import Rotation
 from scipy.special import gammaincinv
 
+from imutool import quaternion
 from imutool.errors import ConfigError, DataError, NumericsError
 from imutool.recording import Poses
 
 DISTANCES_M = (5.0, 10.0, 15.0, 20.0)
 PAIR_TOLERANCE = 0.1  # a pair counts when its distance is within this share of the one asked for: evo's default
+AT_ONCE = 1 << 13  # pairs, so that what is made of them stays near the processor
 FLAT = np.finfo(
     np.float64
 ).eps  # singular value (m²) under which positions lie on a line for evo, and rotation about it is free
@@ -59,7 +61,7 @@ def evaluate(estimate: Poses, truth: Poses, valid: Mask, distances_m: Sequence[f
 
 def orientation_errors(estimate: Poses, truth: Poses) -> Float64[np.ndarray, " n"]:
     """The angle between estimate and truth at every row, in rad."""
-    return np.asarray((_rotations(truth).inv() * _rotations(estimate)).magnitude())
+    return quaternion.angle_between(_unit(estimate), _unit(truth))
 
 
 def absolute(estimate: Poses, truth: Poses, valid: Mask) -> dict[str, float | None]:
@@ -73,20 +75,21 @@ def absolute(estimate: Poses, truth: Poses, valid: Mask) -> dict[str, float | No
         NumericsError: a figure is not finite.
     """
     estimate, truth = _scored(estimate, truth, valid)
-    R_est, R_true = _rotations(estimate), _rotations(truth)
+    q_est, q_true = _unit(estimate), _unit(truth)
     p_est, p_true = estimate.p_wb, truth.p_wb
     with np.errstate(over="ignore", invalid="ignore"):  # judged at the end, by the figures themselves
         motion = align(p_est, p_true)
         aligned: tuple[float | None, float | None] = (None, None)
         if motion is not None:
             turn, shift = motion
+            q_turn = turn.as_quat(scalar_first=True)[None]
             aligned = (
-                _rms(np.degrees((R_true.inv() * (turn * R_est)).magnitude())),
+                _rms(np.degrees(quaternion.angle_between(quaternion.multiply(q_turn, q_est), q_true))),
                 _rms(p_est @ turn.as_matrix().T + shift - p_true),
             )
         v_est, v_true = estimate.v_w, truth.v_w
         figures = {
-            "aoe_deg": _rms(np.degrees((R_true.inv() * R_est).magnitude())),
+            "aoe_deg": _rms(np.degrees(quaternion.angle_between(q_est, q_true))),
             "aoe_aligned_deg": aligned[0],
             "ape_m": _rms(p_est - p_true),
             "ape_aligned_m": aligned[1],
@@ -106,7 +109,9 @@ def relative(
         NumericsError: a figure is not finite.
     """
     estimate, truth = _scored(estimate, truth, valid)
-    R_est, R_true = _rotations(estimate), _rotations(truth)
+    # With C = R_true R_est^T, R_true,i^T (dp_true - C_i dp_est) is the difference of motions, and C_i C_j^T that of their turns
+    # seen from elsewhere: the length and the angle are the same, for a fraction of the products.
+    C = quaternion.multiply(_unit(truth), quaternion.inverse(_unit(estimate)))
     roe: dict[str, float | None] = {}
     rpe: dict[str, float | None] = {}
     for distance_m in distances_m:
@@ -115,12 +120,14 @@ def relative(
         if not len(i):
             roe[key] = rpe[key] = None
             continue
-        with np.errstate(over="ignore", invalid="ignore"):
-            motion_est = R_est[i].inv().apply(estimate.p_wb[j] - estimate.p_wb[i])
-            motion_true = R_true[i].inv().apply(truth.p_wb[j] - truth.p_wb[i])
-            rpe[key] = float(np.linalg.norm(motion_est - motion_true, axis=1).mean())
-        turn_true, turn_est = R_true[i].inv() * R_true[j], R_est[i].inv() * R_est[j]
-        roe[key] = float(np.degrees((turn_true.inv() * turn_est).magnitude()).mean())
+        apart_m = turned = 0.0
+        for first in range(0, len(i), AT_ONCE):
+            a, b = i[first : first + AT_ONCE], j[first : first + AT_ONCE]
+            with np.errstate(over="ignore", invalid="ignore"):
+                moved_est, moved_true = (poses.p_wb[b] - poses.p_wb[a] for poses in (estimate, truth))
+                apart_m += float(quaternion.length(quaternion.rotate(C[a], moved_est) - moved_true).sum())
+            turned += float(quaternion.angle_between(C[a], C[b]).sum())
+        rpe[key], roe[key] = apart_m / len(i), float(np.degrees(turned / len(i)))
     _check_finite({f"rpe_m {k}": v for k, v in rpe.items()} | {f"roe_deg {k}": v for k, v in roe.items()})
     return {"roe_deg": roe, "rpe_m": rpe}
 
@@ -153,7 +160,7 @@ def pairs_by_distance(
     The rule of evo's `--all_pairs`: of equally near points the first. Found by bisection, since distance along a path
     only grows (evo searches every pair; 30 000 poses would take it minutes).
     """
-    travelled = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(p, axis=0), axis=1))])
+    travelled = np.concatenate([[0.0], np.cumsum(quaternion.length(np.diff(p, axis=0)))])
     i = np.arange(len(p) - 1)
     above = np.searchsorted(travelled, travelled[i] + distance_m, side="left")
     above = np.clip(above, i + 1, len(p) - 1)
@@ -232,11 +239,12 @@ def _scored(estimate: Poses, truth: Poses, valid: Mask) -> tuple[Poses, Poses]:
         )
     if not valid.any():
         raise DataError("the truth is known at none of the estimate's stamps", expected="some overlap")
-    return estimate.rows(valid), truth.rows(valid)
+    return (estimate, truth) if valid.all() else (estimate.rows(valid), truth.rows(valid))
 
 
-def _rotations(poses: Poses) -> Rotation:
-    return Rotation.from_quat(poses.q_wb_wxyz, scalar_first=True)
+def _unit(poses: Poses) -> Float64[np.ndarray, "n 4"]:
+    """Orientations as unit as float64 can; a file's six decimals would count as an angle."""
+    return quaternion.unit(poses.q_wb_wxyz)
 
 
 def _rms(errors: Float64[np.ndarray, " n *k"]) -> float:

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float64, Int64
 
+from imutool import quaternion
 from imutool.errors import DataError
 
 GRAVITY_M_S2 = 9.81
@@ -63,9 +64,8 @@ class _Columns:
                     f"{kind}.{name} is {value.dtype}{list(value.shape)}",
                     expected=f"float64{[len(self.t_ns), *tail]}",
                 )
-            finite = np.isfinite(value).reshape(len(value), -1).all(axis=1) if value.size else np.ones(0, bool)
-            if not finite.all():
-                row = int(np.argmin(finite))
+            if not np.isfinite(value).all():
+                row = int(np.argmin(np.isfinite(value).reshape(len(value), -1).all(axis=1)))
                 raise DataError(f"{kind}.{name} row {row} is {value[row].tolist()}", expected="finite numbers")
         backward = np.flatnonzero(np.diff(self.t_ns) <= 0)
         if len(backward):
@@ -145,7 +145,7 @@ class Poses(_Columns):
     def __post_init__(self) -> None:
         self._freeze()
         self._check(p_wb=(3,), q_wb_wxyz=(4,), v_w=(3,))
-        error = np.abs(np.linalg.norm(self.q_wb_wxyz, axis=1) - 1.0)
+        error = np.abs(quaternion.length(self.q_wb_wxyz) - 1.0)
         if len(error) and error.max() > UNIT_QUATERNION_TOLERANCE:
             row = int(np.argmax(error))
             raise DataError(f"Poses.q_wb_wxyz row {row} is {self.q_wb_wxyz[row].tolist()}", expected="norm 1")
@@ -161,8 +161,6 @@ class Poses(_Columns):
         Raises:
             DataError: fewer than two poses.
         """
-        from scipy.spatial.transform import Rotation, Slerp
-
         gap_s = max(GAP_FACTOR * self.period_s, MIN_GAP_S) if max_gap_s is None else max_gap_s
         clipped = np.clip(t_ns, self.t_ns[0], self.t_ns[-1])
         after = np.clip(np.searchsorted(self.t_ns, clipped, side="left"), 1, len(self.t_ns) - 1)
@@ -173,10 +171,11 @@ class Poses(_Columns):
 
         start = int(self.t_ns[0])
         knots, wanted = seconds(self.t_ns, start), seconds(clipped, start)
-        rotations = Slerp(knots, Rotation.from_quat(self.q_wb_wxyz, scalar_first=True))(wanted)
+        share = (clipped - self.t_ns[after - 1]) / span_ns
+        q_wb_wxyz = quaternion.unit(quaternion.slerp(self.q_wb_wxyz[after - 1], self.q_wb_wxyz[after], share))
         p_wb = _interpolate(wanted, knots, self.p_wb)
         v_w = None if self.v_w is None else _interpolate(wanted, knots, self.v_w)
-        return Poses(t_ns, p_wb, np.ascontiguousarray(rotations.as_quat(scalar_first=True)), v_w), valid
+        return Poses(t_ns, p_wb, q_wb_wxyz, v_w), valid
 
 
 @dataclass(frozen=True, eq=False)

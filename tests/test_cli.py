@@ -218,7 +218,7 @@ def test_tables_hold_every_figure_and_no_line_is_wider_than_the_terminal(
 def test_a_table_too_wide_goes_on_below_with_its_keys(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setenv("COLUMNS", "30")
+    monkeypatch.setattr(terminal, "out", type(terminal.out)(width=30))  # it asks for COLUMNS once, when it is made
     terminal.table([("log", "aaaaaaaa", "bbbbbbbb", "cccccccc", "dddddddd"), ("x" * 8, *"1234")], keys=1)
     lines = [line.split() for line in capsys.readouterr().out.splitlines() if line.strip() and "─" not in line]
     assert lines == [["log", "aaaaaaaa", "bbbbbbbb"], ["x" * 8, "1", "2"], ["log", "cccccccc", "dddddddd"], ["x" * 8, "3", "4"]]

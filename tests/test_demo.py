@@ -45,6 +45,7 @@ def test_each_step_is_said_and_the_figures_are_shown(made: tuple[Path, dict[str,
     for result in made[1]["results"]:
         assert f"{result['aoe_deg']:.2f}" in shown
     assert made[1]["png"] in shown
+    assert made[1]["report"] in shown
 
 
 def test_every_artefact_is_there_and_holds_something(made: tuple[Path, dict[str, Any]]) -> None:
@@ -58,6 +59,8 @@ def test_every_artefact_is_there_and_holds_something(made: tuple[Path, dict[str,
     assert len(rrd) > SMALLEST_RRD
     assert png.startswith(b"\x89PNG")
     assert len(png) > SMALLEST_PICTURE
+    page = (folder / report["report"]).read_text()
+    assert all(repr(result["aoe_deg"]) in page for result in report["results"])
     assert len(list((folder / "demo-out" / "logs").glob("*.mcap"))) == 5
     assert not list(folder.rglob("*.checkpoint"))
 

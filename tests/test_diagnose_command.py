@@ -78,6 +78,10 @@ def diagnosed(folder: Path, imutool: Command) -> tuple[Path, Done]:
 def test_the_planted_lever_arm_is_found_and_written(diagnosed: tuple[Path, Done]) -> None:
     place, _ = diagnosed
     assert sorted(path.name for path in place.iterdir()) == sorted(diagnosis_folder.FILES)
+    assert f'href="{diagnosis_folder.LOG}"' in (place / diagnosis_folder.REPORT).read_text()
+    page = (place / diagnosis_folder.LOG).read_text()
+    assert "lever_arm" in page  # its finding, where it acts
+    assert ".partial" not in page
     told = json.loads((place / "findings.json").read_text())
     assert told["schema"] == "imutool.diagnosis/1"
     assert told["mismatch"]
@@ -101,7 +105,7 @@ def test_the_conclusion_comes_first(diagnosed: tuple[Path, Done]) -> None:
     lines = said.stdout.splitlines()
     assert lines[0].startswith("The accel differs")
     assert "(lever_arm)" in lines[0]
-    assert lines[-1] == f"{place}: findings.json, physics.toml, report.html, view.rrd"
+    assert lines[-1] == f"{place}: findings.json, physics.toml, report.html, log.html, view.rrd"
     (closer,) = [line for line in lines if line.startswith("With everything that was found")]
     assert "accel rms" in closer
     assert "% closer" in closer
@@ -174,7 +178,8 @@ def test_other_files_in_the_folder_stay(tmp_path: Path) -> None:
     assert diagnosis_folder.write(MADE.NOTHING, tmp_path) == []
     assert diagnosis_folder.write(MADE.ARM, tmp_path, overwrite=True) == []
     assert (tmp_path / "real.mcap").read_bytes() == b"mine"
-    assert sorted(path.name for path in tmp_path.iterdir()) == sorted([*diagnosis_folder.FILES, "real.mcap"])
+    without_logs = {*diagnosis_folder.FILES, "real.mcap"} - {diagnosis_folder.LOG}
+    assert {path.name for path in tmp_path.iterdir()} == without_logs
     assert json.loads((tmp_path / "findings.json").read_text()) == diagnosis_folder.plain(MADE.ARM)
 
 

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import json
+import os
 import re
+import shutil
 import subprocess
 import sys
 from collections.abc import Callable
@@ -88,7 +91,72 @@ def test_the_papers_tables_are_made_in_one_command(tmp_path: Path, data: Path, e
     assert example("reproduce_tables.py", data, "-o", "out", *words) == printed  # nothing is made twice
 
 
+def entities(path: Path) -> set[str]:
+    """What an .rrd holds."""
+    from rerun.chunk import RrdReader
+
+    reader = RrdReader(path)
+    (store,) = reader.recordings()
+    return {chunk.entity_path for chunk in reader.stream(store=store)}
+
+
+def test_a_log_is_looked_at_and_a_page_is_left(
+    tmp_path: Path, logs: Path, example: Example, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in ("DISPLAY", "WAYLAND_DISPLAY"):
+        monkeypatch.delenv(name, raising=False)
+    printed = example("view_a_log.py", logs / "flight_1.mcap")
+    raw, static = (
+        float(re.findall(rf"^{name}: at the end ([\d.]+) deg", printed, re.MULTILINE)[0]) for name in ("raw", "static")
+    )
+    assert static < raw
+    assert "worst: static: largest orientation error" in printed
+    assert "<svg" in (tmp_path / "flight_1.html").read_text(encoding="utf-8")
+    assert {"/world/debiased/path", "/error/orientation/raw"} <= entities(tmp_path / "flight_1.rrd")
+
+
+def test_models_are_compared_on_one_log(tmp_path: Path, logs: Path, example: Example) -> None:
+    printed = example("compare_models.py", logs / "flight_2.mcap", "both.rrd", "static", logs / "linear.safetensors")
+    figures = next(line.split() for line in printed.splitlines() if line.startswith("aoe_deg"))
+    raw, static, linear = map(float, figures[1:])
+    assert max(static, linear) < raw
+    assert "linear: over 5 s from the truth it drifts by" in printed
+    held = entities(tmp_path / "both.rrd")
+    assert {"/run/static/world/debiased/path", "/run/linear/world/debiased/path", "/world/raw/path"} <= held
+
+
+def test_a_stream_is_shown_as_it_is_corrected(tmp_path: Path, example: Example) -> None:
+    printed = example("live_stream.py", "live.rrd", "5")
+    assert "1001 samples in batches of 100" in printed
+    assert {"/world/debiased/path", "/imu/gyro/raw", "/bias/accel/estimated"} <= entities(tmp_path / "live.rrd")
+
+
+CELLS = """
+import json, sys
+from IPython.core.interactiveshell import InteractiveShell
+shell = InteractiveShell.instance()
+for cell in json.load(open(sys.argv[1], encoding="utf-8"))["cells"]:
+    if cell["cell_type"] == "code":
+        done = shell.run_cell("".join(cell["source"]))
+        done.raise_error()
+        print("SHOWN", type(done.result).__name__)
+"""
+
+
+def test_a_notebook_shows_the_viewer_and_the_page(tmp_path: Path, logs: Path) -> None:
+    """Its cells are run one after the other as a notebook's server runs them; what a browser makes of it is not seen here."""
+    shutil.copy(logs / "flight_1.mcap", tmp_path / "log.mcap")
+    line = [sys.executable, "-c", CELLS, str(EXAMPLES / "notebook.ipynb")]
+    env = {**os.environ, "IPYTHONDIR": str(tmp_path / "ipython")}
+    done = subprocess.run(line, cwd=tmp_path, env=env, capture_output=True, text=True, timeout=240, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert re.findall(r"^SHOWN (\w+)", done.stdout, re.MULTILINE) == ["NoneType", "NoneType", "Viewer", "Page"]
+    assert re.search(r"aoe_deg +[\d.]+ +[\d.]+", done.stdout)
+    notebook = json.loads((EXAMPLES / "notebook.ipynb").read_text(encoding="utf-8"))
+    assert not any(cell.get("outputs") for cell in notebook["cells"])  # what was seen on one machine is no part of it
+
+
 def test_every_example_is_run_here() -> None:
     here = Path(__file__).read_text()
-    assert all(f'"{path.name}"' in here for path in EXAMPLES.glob("*.py"))
+    assert all(f'"{path.name}"' in here for path in [*EXAMPLES.glob("*.py"), *EXAMPLES.glob("*.ipynb")])
     assert len(list(EXAMPLES.glob("*.py"))) >= 4

@@ -27,7 +27,7 @@ ROOT = Path(__file__).parents[1]
 # design.md, Rooms, with what came since: lower never imports higher. A room is a module of imutool or a folder of them.
 TIERS = (
     ("errors",),
-    ("config", "place", "recording", "registry", "so3"),
+    ("config", "place", "quaternion", "recording", "registry", "so3"),
     (
         "kinematics",
         "ode",

@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 from imutool.errors import DataError, NumericsError
 from imutool.metrics import absolute
 from imutool.recording import Imu, Poses, unit_quaternions
-from imutool.strapdown import GRAVITY_W, Start, dead_reckon, truth_velocity
+from imutool.strapdown import GRAVITY_W, Start, dead_reckon, drift, drifted, truth_velocity
 
 RATE_NS = 5_000_000
 LOOP_TOLERANCE = 1e-9  # both round once a sample; the prefix product in another order
@@ -109,6 +109,52 @@ def test_a_log_of_30_000_samples_takes_less_than_the_budget() -> None:
         return time.process_time() - begin
 
     assert min(once() for _ in range(5)) < BUDGET_S
+
+
+def turned_away(n: int, seed: int) -> tuple[Imu, Poses, Poses]:
+    """Samples, what they integrate to from a start of their own, and another motion on the same stamps as the truth."""
+    imu, other = made_up(n, seed), made_up(n, seed + 1)
+    truth = dead_reckon(Imu(imu.t_ns, other.gyro, other.accel), LEVEL)
+    return imu, dead_reckon(imu, Start(np.array([0.1, 0.7, -0.1, 0.7]), np.array([5.0, 6.0, 7.0]), np.ones(3))), truth
+
+
+def test_one_integration_tells_where_each_from_the_truth_would_have_ended() -> None:
+    imu, path, truth = turned_away(2000, 3)
+    first, last = np.array([0, 17, 500, 1999]), np.array([1999, 18, 1300, 1999])
+    got = drifted(path, truth, first, last)
+    for row, (a, b) in enumerate(zip(first, last, strict=True)):
+        again = dead_reckon(imu.rows(slice(a, b + 1)), Start.of(truth, int(a)))
+        assert again.v_w is not None
+        assert truth.v_w is not None
+        turns = [Rotation.from_quat(q.copy(), scalar_first=True) for q in (truth.q_wb_wxyz[b], again.q_wb_wxyz[-1])]
+        assert got.orientation_rad[row] == pytest.approx((turns[0].inv() * turns[1]).magnitude(), abs=LOOP_TOLERANCE)
+        assert got.velocity_m_s[row] == pytest.approx(np.linalg.norm(again.v_w[-1] - truth.v_w[b]), abs=LOOP_TOLERANCE)
+        assert got.position_m[row] == pytest.approx(np.linalg.norm(again.p_wb[-1] - truth.p_wb[b]), abs=LOOP_TOLERANCE)
+    assert max(got.position_m[3], got.orientation_rad[3], got.velocity_m_s[3]) < LOOP_TOLERANCE  # a window of no length
+    assert got.position_m[0] > 1.0
+
+
+def test_windows_begin_where_there_is_truth_and_never_hold_a_gap() -> None:
+    _, path, truth = turned_away(2000, 5)
+    valid = np.ones(2000, bool)
+    assert len(drift(path, truth, valid, 1.0).position_m) == 9  # of ten seconds less one sample
+    valid[150:250] = False  # the first window ends here, and does not count; the next begins at 250
+    assert len(drift(path, truth, valid, 1.0).position_m) == 8
+    gappy = np.delete(np.arange(2000), np.arange(1010, 1030))
+    cut = [
+        Poses(p.t_ns[gappy], p.p_wb[gappy], p.q_wb_wxyz[gappy], None if p.v_w is None else p.v_w[gappy]) for p in (path, truth)
+    ]
+    assert len(drift(cut[0], cut[1], np.ones(len(gappy), bool), 1.0).position_m) == 8
+    assert len(drift(path, truth, valid, 60.0).position_m) == 0
+
+
+def test_paths_of_other_stamps_or_without_velocity_have_no_drift() -> None:
+    _, path, truth = turned_away(50, 7)
+    rows = np.array([0]), np.array([9])
+    with pytest.raises(DataError, match="do not match"):
+        drifted(path, truth.rows(slice(0, 40)), *rows)
+    with pytest.raises(DataError, match="do not match"):
+        drifted(path, Poses(truth.t_ns, truth.p_wb, truth.q_wb_wxyz), *rows)
 
 
 def test_overflow_and_missing_samples_are_refused() -> None:

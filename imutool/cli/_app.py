@@ -80,6 +80,7 @@ Smooth = Annotated[bool, typer.Option("--smooth", help="Take the whole log for e
 Imu = Annotated[str | None, typer.Option(help="IMU topic, where a log has several.")]
 Truth = Annotated[str | None, typer.Option(help="Topic of the true poses, where a log has several.")]
 Json = Annotated[str | None, typer.Option("--json", metavar="FILE|-", help="Write the report as JSON; - is stdout.")]
+Report = Annotated[Path | None, typer.Option(metavar="F.html", help="Write a page: figures, paths, errors, biases, spectra.")]
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace what is there.")]
 Verbose = Annotated[bool, typer.Option("-v", "--verbose", help="Say more.")]
 Quiet = Annotated[bool, typer.Option("-q", "--quiet", help="Say only results and errors.")]

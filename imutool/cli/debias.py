@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
-from typing import Annotated, NoReturn
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from imutool.cli._app import LOST, Init, Json, Overwrite, Quiet, Smooth, Verbose, app
 from imutool.errors import ConfigError
-from imutool.mcap_io.losses import Losses
-from imutool.place import place
+from imutool.place import Place, place
 from imutool.terminal import progress, say, tell_losses, write_json
+
+if TYPE_CHECKING:
+    from imutool.debias import DebiasReport
+    from imutool.view.rerun.live import Live
+    from imutool.view.shown import Shown
 
 MODEL_HELP = (
     "Model file, physics.toml or a name that ships; else a static estimate. TOPIC=MODEL is for one IMU of several. Repeatable."
@@ -36,6 +41,12 @@ def debias(
     clean: Annotated[
         bool, typer.Option("--clean", help="Leave out what is no measurement, convert units (imutool clean).")
     ] = False,
+    view: Annotated[bool, typer.Option("--view", help="Show it in a viewer as it goes.")] = False,
+    connect: Annotated[str | None, typer.Option(metavar="URL", help="Show it in a viewer that runs: HOST:PORT.")] = None,
+    save_view: Annotated[Path | None, typer.Option(metavar="F.rrd", help="Keep what a viewer would show in a file.")] = None,
+    report_to: Annotated[
+        Path | None, typer.Option("--report", metavar="F.html", help="Write a page about the debiased log.")
+    ] = None,
     overwrite: Overwrite = False,
     json_to: Json = None,
     verbose: Verbose = False,
@@ -44,10 +55,15 @@ def debias(
     """Rewrite a log with a debiased IMU channel; everything else passes through unchanged."""
     _refuse_contradictions(target, in_place, overwrite)
     models = assigned(model or ())
+    if report_to is not None:
+        from imutool.view import report as pages
+
+        pages.refuse(report_to, overwrite=overwrite)
     from imutool.clean import Rules
     from imutool.debias import debias as run
 
-    with progress("Debiasing", verbose, quiet) as tell:
+    live = _watching(source, target, view, connect, save_view, overwrite)
+    with progress("Debiasing", verbose, quiet) as tell, live as watch:
         report = run(
             place(source),
             None if target is None else place(target),
@@ -59,6 +75,7 @@ def debias(
             clean=Rules() if clean else None,
             overwrite=overwrite,
             progress=lambda done, total: tell(done, total, ""),
+            watch=watch,
         )
     imus = {
         topic: {
@@ -73,25 +90,58 @@ def debias(
     added, copied, verified = dict(report.rewrite.added), report.rewrite.copied, report.rewrite.verified
     result = {"schema": "imutool.debias/1", "output": str(target or source), "imus": imus, "copied": copied, "added": added}
     result |= {"verified": verified._asdict(), "losses": report.losses.plain()}
+    if watch is not None:
+        result["shown"] = [one.plain() for one in watch.shown]
+    if report_to is not None:
+        result["report"] = str(report_to)
     if clean:
         result["clean"] = [one.plain() for one in report.surveys.values()]
-    if write_json(result, json_to):
-        _leave(report.losses)
+    told = write_json(result, json_to)
+    if not told:
+        _say(report, str(target or source), imus, verify, () if watch is None else watch.shown)
+    if report_to is not None:  # last: should it fail, the log is there all the same, and that has been said
+        with progress("Drawing", verbose, quiet):
+            _draw(place(target or source), list(report.starts), report_to, overwrite)
+        if not told:
+            say(f"Report: {report_to}")
+    raise typer.Exit(LOST if report.losses else 0)
+
+
+def _say(report: DebiasReport, target: str, imus: Mapping[str, Mapping[str, Any]], verify: str, shown: Sequence[Shown]) -> None:
+    """What was done, in lines."""
     for topic, one in report.surveys.items():
         say(f"{topic}: {one.verdict}, score {one.score:.3f}, {one.valid} of {one.messages} samples valid")
     for topic, entry in imus.items():
         bias = ", ".join(f"{b:+.5f}" for b in entry["gyro_bias"]), ", ".join(f"{b:+.4f}" for b in entry["accel_bias"])
         start = f"start bias {bias[0]} rad/s; {bias[1]} m/s² ({entry['init_how']})"
         say(f"{topic}: {entry['model']}, {start}")
-    counts = ", ".join(f"{count} on {name}" for name, count in added.items())
-    say(f"{target or source}: {copied} messages as they were, {counts}")
+    counts = ", ".join(f"{count} on {name}" for name, count in report.rewrite.added.items())
+    say(f"{target}: {report.rewrite.copied} messages as they were, {counts}")
+    verified = report.rewrite.verified
     say(f"checked: every index, and the contents of {verified.chunks_checked} of {verified.chunks} chunks (--verify {verify})")
+    for way in shown:
+        say(way.said)
     tell_losses(report.losses.plain())
-    _leave(report.losses)
 
 
-def _leave(losses: Losses) -> NoReturn:
-    raise typer.Exit(LOST if losses else 0)
+def _watching(
+    source: str, target: str | None, view: bool, connect: str | None, save: Path | None, overwrite: bool
+) -> AbstractContextManager[Live | None]:
+    """Whoever is to watch; without that nothing of the viewer is imported."""
+    if not view and connect is None and save is None:
+        return nullcontext()
+    from imutool.view.rerun.live import watching
+
+    out = Path(target or source)
+    return watching(out.stem, connect_to=connect, save=save, instead=Path(f"{out.stem}.rrd"), overwrite=overwrite)
+
+
+def _draw(log: Place, topics: Sequence[str], page: Path, overwrite: bool) -> None:
+    """A page about the debiased log, each of its IMUs under its own topic where there are several."""
+    from imutool.view.report import by_topic, write_page
+    from imutool.view.runs import load
+
+    write_page(by_topic([load(log, imu=topic) for topic in topics], topics), page, overwrite=overwrite)
 
 
 def _refuse_contradictions(target: str | None, in_place: bool, overwrite: bool) -> None:

@@ -29,8 +29,8 @@ def demo(
 
     with progress("Training", verbose, quiet) as tell:
         done = run(folder, announce, overwrite=overwrite, progress=lambda epoch: tell(*epoch_line(epoch)))
-    files = {name: str(getattr(done, name)) for name in ("log", "debiased", "model", "rrd", "png")}
+    files = {name: str(getattr(done, name)) for name in ("log", "debiased", "model", "rrd", "png", "report")}
     if not write_json({"schema": "imutool.demo/1", "results": done.results, **files}, json_to):
         say("Pure integration of a flight the model has not seen, from its true start:")
         figures(done.results)
-        say(f"Error curves: {done.png}. In the viewer: rerun {done.rrd}")
+        say(f"Report: {done.report}. Error curves: {done.png}. In the viewer: rerun {done.rrd}")

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from imutool.cli._app import Imu, Json, Overwrite, Quiet, Truth, Verbose, app
 from imutool.terminal import logger, progress, say, write_json
+
+if TYPE_CHECKING:
+    from imutool.view.rundata import RunData
 
 
 @app.command(epilog="Example: [bold]imutool diagnose real.mcap --sim sim.mcap -o diagnosis[/]")
@@ -24,7 +27,9 @@ def diagnose(
     ] = None,
     folder: Annotated[
         Path | None,
-        typer.Option("-o", "--output", metavar="DIR", help="For findings.json, physics.toml, report.html and view.rrd."),
+        typer.Option(
+            "-o", "--output", metavar="DIR", help="For findings.json, physics.toml, report.html, log.html and view.rrd."
+        ),
     ] = None,
     imu: Imu = None,
     truth: Truth = None,
@@ -37,6 +42,10 @@ def diagnose(
     from imutool import diagnosis_folder
     from imutool.physics.conclusion import lines
     from imutool.physics.diagnose import diagnose as run
+    from imutool.view.runs import load
+
+    def look(findings: Path) -> list[RunData]:
+        return [load(real, imu=imu, truth=truth, findings=findings) for real in reals]
 
     if folder is not None:
         diagnosis_folder.refuse(folder, overwrite=overwrite)
@@ -44,7 +53,7 @@ def diagnose(
         found = run(reals, sim, imu=imu, truth=truth, signals=signal or (), tell=tell)
         if folder is not None:
             tell(0, 1, "writing")
-            for remark in diagnosis_folder.write(found, folder, overwrite=overwrite):
+            for remark in diagnosis_folder.write(found, folder, logs=look, overwrite=overwrite):
                 logger.warning("%s", remark)
     if write_json(diagnosis_folder.plain(found), json_to):
         return

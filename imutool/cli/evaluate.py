@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
-from imutool.cli._app import Imu, Init, Json, Logs, Models, Overwrite, Quiet, Smooth, Truth, Verbose, app
+from imutool.cli._app import Imu, Init, Json, Logs, Models, Overwrite, Quiet, Report, Smooth, Truth, Verbose, app
 from imutool.cli._figures import figures
-from imutool.terminal import progress, write_json
+from imutool.terminal import progress, say, write_json
 
 
 @app.command(epilog="Example: [bold]imutool evaluate MH_04.mcap --model adis.safetensors --init truth[/]")
@@ -22,6 +24,7 @@ def evaluate(
     truth: Truth = None,
     imu: Imu = None,
     trajectories: Annotated[Path | None, typer.Option(metavar="DIR", help="Write TUM-format trajectories there.")] = None,
+    report: Report = None,
     overwrite: Overwrite = False,
     json_to: Json = None,
     verbose: Verbose = False,
@@ -30,11 +33,17 @@ def evaluate(
     """Integrate the IMU alone from the true start, raw and with each model, and score it against the truth."""
     from imutool.evaluate import SCHEMA
     from imutool.evaluate import evaluate as run
+    from imutool.view import report as pages
+    from imutool.view.runs import load
 
-    results = []
+    if report is not None:
+        pages.refuse(report, overwrite=overwrite)
+    results: list[dict[str, Any]] = []
+    logs_seen = []
     with progress("Evaluating", verbose, quiet) as tell:
         for done, log in enumerate(logs):
             tell(done, len(logs), log.name)
+            told = len(results)
             results += run(
                 log,
                 models=model or (),
@@ -46,6 +55,24 @@ def evaluate(
                 trajectories=trajectories,
                 overwrite=overwrite,
             )
+            if report is not None:
+                seen = load(log, models=model or (), init=init, smooth=smooth, truth=truth, imu=imu)
+                logs_seen.append(replace(seen, notes=(*seen.notes, *_stops(results[told:]))))
+        if report is not None:
+            tell(len(logs), len(logs), "drawing")
+            pages.write_page(logs_seen, report, overwrite=overwrite)
         tell(len(logs), len(logs), "")
     if not write_json({"schema": SCHEMA, "results": results}, json_to):
         figures([{**one, "model": f"{one['model']} zupt"} if one["estimate"] == "zupt" else one for one in results])
+        if report is not None:
+            say(f"Report: {report}")
+
+
+def _stops(results: Sequence[dict[str, Any]]) -> list[str]:
+    """What the table says of dead reckoning that knows its stops, in sentences: the report draws pure integration."""
+    return [
+        f"With zero-velocity updates {one['model']} has an orientation error of {one['aoe_deg']:.2f}° and a position error of "
+        f"{one['ape_m']:.2f} m."
+        for one in results
+        if one["estimate"] == "zupt"
+    ]

@@ -28,6 +28,7 @@ app.add_typer(fleet)
 
 UNITS = {"": 1, "K": 1 << 10, "M": 1 << 20, "G": 1 << 30, "T": 1 << 40}
 SHOWN = 10  # logs that are not whole; all are in fleet.parquet
+PAGES_HELP = "Also a page about each log beside it, which the --report links to; five to ten seconds a log of minutes."
 RESUME = "Go on: what is done and still stands is skipped."
 CODES = "\n\nExit code: 0 all whole; 3 something lost or quarantined; else the largest code of the logs that failed."
 
@@ -79,6 +80,7 @@ def debias(
     smooth: Smooth = False,
     clean: Annotated[bool, typer.Option(help="Clean the IMU too, and leave alone what cannot be trusted.")] = True,
     verify: Annotated[str, typer.Option(metavar="all|imu|none", help=VERIFY_HELP)] = "imu",
+    pages: Annotated[bool, typer.Option("--pages", help=PAGES_HELP)] = False,
 ) -> Settings:
     """Debias every log, as `imutool debias --clean` does."""
     from imutool.fleet.models import settled
@@ -87,7 +89,11 @@ def debias(
 
     refuse_smooth(init, smooth)
     refuse_unknown(verify)
-    return settled(Settings(command="debias", model=model, init=init, smooth=smooth, clean=clean, check=verify))
+    if pages:
+        from imutool.view.drawing import library
+
+        library()
+    return settled(Settings(command="debias", model=model, init=init, smooth=smooth, clean=clean, check=verify, pages=pages))
 
 
 @_command("repair logs/ repaired/ --report repaired.html")

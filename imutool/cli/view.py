@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from imutool.cli._app import Imu, Init, Logs, Models, Overwrite, Quiet, Truth, Verbose, app
-from imutool.terminal import progress, say
+from imutool.cli._app import Imu, Init, Json, Logs, Models, Overwrite, Quiet, Smooth, Truth, Verbose, app
+from imutool.errors import ConfigError
+from imutool.terminal import progress, say, write_json
+
+AT_HELP = "Where the cursor starts: seconds, or worst, the largest orientation error of a model."
+ALIGN_HELP = "Move each path onto the truth before its errors are taken: by its start, its heading, or as a whole."
+SOURCE_HELP = "Also show what else the log holds, cameras for instance."
 
 
 @app.command(epilog="Example: [bold]imutool view MH_04_debiased.mcap --save MH_04.rrd[/]")
@@ -16,26 +22,62 @@ def view(
     logs: Logs,
     model: Models = None,
     init: Init = "auto",
+    smooth: Smooth = False,
     truth: Truth = None,
     imu: Imu = None,
-    save: Annotated[Path | None, typer.Option(metavar="F.rrd", help="Save instead of opening the viewer.")] = None,
-    png: Annotated[Path | None, typer.Option(metavar="DIR", help="Also draw error curves, LOG.png each.")] = None,
+    align: Annotated[str, typer.Option(metavar="none|origin|yaw|se3", help=ALIGN_HELP)] = "none",
+    findings: Annotated[Path | None, typer.Option(metavar="DIR", help="Mark what a diagnosis found, where it acts.")] = None,
+    source: Annotated[bool, typer.Option("--source/--no-source", help=SOURCE_HELP)] = True,
+    at: Annotated[str | None, typer.Option(metavar="SECONDS|worst", help=AT_HELP)] = None,
+    save: Annotated[Path | None, typer.Option(metavar="F.rrd", help="Save a file for the viewer.")] = None,
+    connect: Annotated[str | None, typer.Option(metavar="URL", help="Send to a viewer that runs: HOST:PORT.")] = None,
+    web: Annotated[bool, typer.Option("--web", help="Serve to a browser on this machine, until Ctrl-C.")] = False,
+    port: Annotated[int | None, typer.Option(min=1, max=65535, help="Port of --web; else a free one.")] = None,
+    export_web: Annotated[
+        Path | None, typer.Option(metavar="DIR", help="Write a folder that any web server can serve.")
+    ] = None,
+    png: Annotated[
+        Path | None, typer.Option(metavar="DIR", help="Draw pictures, LOG-errors.png and so on; without Rerun.")
+    ] = None,
+    html: Annotated[Path | None, typer.Option(metavar="F.html", help="Write a page of its own, without Rerun.")] = None,
     overwrite: Overwrite = False,
+    json_to: Json = None,
     verbose: Verbose = False,
     quiet: Quiet = False,
 ) -> None:
-    """Show truth, raw and debiased in the Rerun viewer, or save them for it."""
-    from imutool.view import report
-    from imutool.view.rerun import viewer
-    from imutool.view.runs import load
+    """Show truth, raw and debiased in the Rerun viewer, in a browser, or as files to look at later.
 
-    with progress("Reading", verbose, quiet) as tell:
-        data = []
-        for done, log in enumerate(logs):
-            tell(done, len(logs), log.name)
-            data.append(load(log, models=model or (), init=init, imu=imu, truth=truth))
-    if png is not None:
-        png.mkdir(parents=True, exist_ok=True)
-        for log, one in zip(logs, data, strict=True):
-            report.error_curves(one, png / f"{log.stem}.png", overwrite=overwrite)
-    say(viewer.show(data, save=save, overwrite=overwrite))
+    Without one of --save, --connect, --web, --export-web, --png and --html a viewer opens; where it cannot, an .rrd is
+    saved.
+    """
+    from imutool.view.deviation import ALIGNMENTS
+    from imutool.view.runs import load
+    from imutool.view.ways import Asked, Ways
+
+    chosen = next((name for name in ALIGNMENTS if name == align), None)
+    if chosen is None:
+        raise ConfigError(f"{align!r}", where="--align", expected=", ".join(ALIGNMENTS))
+    asked = Asked(save, connect, web, port, export_web, png, html, at, source, overwrite)
+    with Ways(asked) as ways:
+        with progress("Reading", verbose, quiet) as tell:
+            data = []
+            for done, log in enumerate(logs):
+                tell(done, len(logs), log.name)
+                read = load(
+                    log,
+                    models=model or (),
+                    init=init,
+                    smooth=smooth,
+                    imu=imu,
+                    truth=truth,
+                    align=chosen,
+                    findings=findings,
+                )
+                data.append(read)
+        shown = ways.show(data)
+        result = {"schema": "imutool.view/1", "logs": [str(log) for log in logs], "shown": [one.plain() for one in shown]}
+        if not write_json(result | ways.versions(), json_to):
+            for one in shown:
+                say(one.said)
+        sys.stdout.flush()  # whoever reads it through a pipe wants the address now
+        ways.serve()

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import os
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
+from urllib.parse import quote
 
 import numpy as np
 from jaxtyping import Float64
@@ -15,23 +18,32 @@ from imutool.fleet.robots import Compared, Outlier
 from imutool.fleet.task import Result, Settings
 from imutool.mcap_io.target import Target
 from imutool.place import Place
-from imutool.view import diagnosis_figures as figures
-from imutool.view.diagnosis_page import POLICY, STYLE, text
+from imutool.view.drawing import apart, svg
+from imutool.view.page import cards, document, text
+from imutool.view.theme import AFTER, AXIS_COLORS, UNITS
 
 MOST_ROWS = 500  # in a table: more is for the Parquet file
 MOST_NAMED = 10  # robots with an effect
 BINS = 30
-COLORS = (figures.X, figures.Y, figures.Z)
-UNIT = {"gyro": "rad/s", "accel": "m/s²"}
 TROUBLE = ("failed", "quarantined", "lost")
 OWN_STYLE = """
-.numbers { display: flex; flex-wrap: wrap; gap: 10px; margin: 12px 0; }
-.numbers div { background: var(--panel); border: 1px solid var(--grid); border-radius: 6px; padding: 8px 14px; }
-.numbers b { display: block; font-size: 20px; font-weight: 600; font-variant-numeric: tabular-nums; }
-.numbers span { color: var(--soft); font-size: 13px; }
 .failed { color: var(--before); font-weight: 600; } .quarantined, .lost { color: var(--mark); font-weight: 600; }
-@media print { tr { break-inside: avoid; } }
 """
+
+
+@dataclass(frozen=True)
+class Links:
+    """The way from the page to what lies below OUT: relative where both are on one disk, so that both can be moved together."""
+
+    page: Place
+    out: Place | None
+
+    def to(self, name: str) -> str:
+        """An address that a browser takes as it is, whatever the log is called."""
+        if isinstance(self.page, Path) and isinstance(self.out, Path):
+            there = os.path.relpath(self.out / name, self.page.parent.absolute())
+            return quote(Path(there).as_posix())
+        return quote(str(self.out / name if self.out is not None else name), safe="/:")
 
 
 @dataclass
@@ -49,6 +61,8 @@ class _Seen:
     warnings: Counter[str] = field(default_factory=Counter)
     trouble: list[Result] = field(default_factory=list)
     peak_bytes: int = 0
+    drawn: list[Result] = field(default_factory=list)
+    pages: int = 0
 
     def take(self, one: Result) -> None:
         status = one.earlier if one.status == "skipped" and one.earlier else one.status
@@ -61,6 +75,9 @@ class _Seen:
             return
         self.bytes_in, self.bytes_out = self.bytes_in + one.source_bytes, self.bytes_out + one.target_bytes
         self.messages += one.messages
+        self.pages += bool(one.page)
+        if one.page and len(self.drawn) < MOST_ROWS:
+            self.drawn.append(one)
         self.seconds.append(one.seconds)
         self.speeds.append(one.source_bytes / 1e6 / max(one.seconds, 1e-9))
         if one.score is not None:
@@ -76,6 +93,7 @@ def write(
     settings: Settings,
     path: Place,
     *,
+    out: Place | None = None,
     seconds: float,
     source: str,
     compared: Compared | None = None,
@@ -87,13 +105,20 @@ def write(
         ConfigError: matplotlib is not installed, or the file exists (without `overwrite`) or cannot be written.
     """
     with Target(path, overwrite=overwrite) as target:
-        target.write(html(results, settings, seconds=seconds, source=source, compared=compared).encode())
+        link = Links(path, out)
+        target.write(html(results, settings, link=link, seconds=seconds, source=source, compared=compared).encode())
 
 
 def html(
-    results: Iterable[Result], settings: Settings, *, seconds: float, source: str, compared: Compared | None = None
+    results: Iterable[Result],
+    settings: Settings,
+    *,
+    seconds: float,
+    source: str,
+    link: Links | None = None,
+    compared: Compared | None = None,
 ) -> str:
-    """The page of `write` as text."""
+    """The page of `write` as text; with `link` it leads to the pages of the logs."""
     seen = _Seen()
     for one in results:
         seen.take(one)
@@ -103,18 +128,12 @@ def html(
         *_numbers(seen, seconds),
         *(_outliers(compared) if compared is not None else ()),
         *_trouble(seen),
+        *(_logs(seen, link) if link is not None else ()),
         *_warnings(seen),
         *_spread(seen),
         *_provenance(settings),
     ]
-    head = (
-        f'<meta charset="utf-8"><meta http-equiv="Content-Security-Policy" content="{POLICY}">'
-        '<meta name="viewport" content="width=device-width, initial-scale=1">'
-        f"<title>Fleet {text(settings.command)}: {text(source)}</title><style>{STYLE}{OWN_STYLE}</style>"
-    )
-    return (
-        f'<!DOCTYPE html>\n<html lang="en"><head>{head}</head>\n<body><main>\n' + "\n".join(body) + "\n</main></body></html>\n"
-    )
+    return document(f"Fleet {settings.command}: {source}", body, OWN_STYLE)
 
 
 def _conclusion(seen: _Seen, compared: Compared | None) -> str:
@@ -132,25 +151,21 @@ def _how_whole(seen: _Seen) -> str:
 
 
 def _numbers(seen: _Seen, seconds: float) -> Iterator[str]:
-    cards = [
+    told = [
         (f"{seen.statuses.total() - seen.statuses['skipped']:,}", "logs"),
         (size(seen.bytes_in), "read"),
         (size(seen.bytes_out), "written"),
         (duration(seconds), "this run"),
     ]
     if seen.messages:
-        cards.append((f"{seen.messages:,}", "messages"))
+        told.append((f"{seen.messages:,}", "messages"))
     if seen.statuses["skipped"]:
-        cards.append((f"{seen.statuses['skipped']:,}", "done by an earlier run"))
+        told.append((f"{seen.statuses['skipped']:,}", "done by an earlier run"))
     if seen.seconds:
-        cards.append((f"{np.median(seen.speeds):.3g} MB/s", "of one worker, in the middle"))
+        told.append((f"{np.median(seen.speeds):.3g} MB/s", "of one worker, in the middle"))
     if seen.peak_bytes:
-        cards.append((size(seen.peak_bytes), "most memory of a worker"))
-    yield (
-        '<div class="numbers">'
-        + "".join(f"<div><b>{text(n)}</b><span>{text(what)}</span></div>" for n, what in cards)
-        + "</div>"
-    )
+        told.append((size(seen.peak_bytes), "most memory of a worker"))
+    yield cards(told)
 
 
 def _trouble(seen: _Seen) -> Iterator[str]:
@@ -167,6 +182,21 @@ def _trouble(seen: _Seen) -> Iterator[str]:
     more = sum(seen.statuses[name] for name in TROUBLE) - len(seen.trouble)
     if more:
         yield f'<p class="note">{more:,} more are in fleet.parquet.</p>'
+
+
+def _logs(seen: _Seen, link: Links) -> Iterator[str]:
+    """A line for each log that has a page, and the way there."""
+    if not seen.drawn:
+        return
+    yield "<h2>Logs</h2>"
+    rows = "".join(
+        f'<tr><td><a href="{text(link.to(one.page))}">{text(one.page.removesuffix(".html"))}</a></td>'
+        f"<td>{text(one.page_says)}</td></tr>"
+        for one in seen.drawn
+    )
+    yield f"<table><thead><tr><th>Log</th><th>What its page says</th></tr></thead><tbody>{rows}</tbody></table>"
+    if seen.pages > len(seen.drawn):
+        yield f'<p class="note">{seen.pages - len(seen.drawn):,} more pages lie beside their logs.</p>'
 
 
 def _warnings(seen: _Seen) -> Iterator[str]:
@@ -224,7 +254,7 @@ def _spread(seen: _Seen) -> Iterator[str]:
         if len(values) > 1:
             rows = np.array(values)
             caption = f"Start bias of the {signal} over {len(rows)} IMUs, by axis"
-            yield _figure(_axes(rows, f"{signal} bias ({UNIT[signal]})"), f"b{k}", caption)
+            yield _figure(_axes(rows, f"{signal} bias ({UNITS[signal]})"), f"b{k}", caption)
     yield _figure(
         _one([(seen.seconds, "seconds a log"), (seen.speeds, "MB/s of one worker")], "times"), "t", "Time and speed by log"
     )
@@ -235,17 +265,17 @@ def _spread(seen: _Seen) -> Iterator[str]:
 def _axes(rows: Float64[np.ndarray, "n 3"], label: str) -> str:
     def draw(figure: Any) -> None:
         for k, axes in enumerate(figure.subplots(1, 3)):
-            _histogram(axes, rows[:, k], f"{'xyz'[k]}: {label}", COLORS[k])
+            _histogram(axes, rows[:, k], f"{'xyz'[k]}: {label}", AXIS_COLORS[k])
 
-    return figures.svg(draw, 2.2, label)
+    return svg(draw, 2.2, label)
 
 
 def _one(columns: Sequence[tuple[Sequence[float], str]], name: str) -> str:
     def draw(figure: Any) -> None:
         for axes, (values, label) in zip(np.atleast_1d(figure.subplots(1, len(columns))), columns, strict=True):
-            _histogram(axes, np.array(values), label, figures.AFTER)
+            _histogram(axes, np.array(values), label, AFTER)
 
-    return figures.svg(draw, 2.2, name)
+    return svg(draw, 2.2, name)
 
 
 def _histogram(axes: Any, values: Float64[np.ndarray, " n"], label: str, color: str) -> None:
@@ -256,8 +286,8 @@ def _histogram(axes: Any, values: Float64[np.ndarray, " n"], label: str, color: 
     axes.locator_params(axis="y", nbins=4, integer=True)
 
 
-def _figure(svg: str, prefix: str, caption: str) -> str:
-    return f"<figure>{figures.apart(svg, prefix)}<figcaption>{text(caption)}</figcaption></figure>"
+def _figure(drawn: str, prefix: str, caption: str) -> str:
+    return f"<figure>{apart(drawn, prefix)}<figcaption>{text(caption)}</figcaption></figure>"
 
 
 def _provenance(settings: Settings) -> Iterator[str]:

@@ -21,7 +21,7 @@ from imutool.fleet.journal import Journal
 from imutool.fleet.robots import Compared, compare
 from imutool.fleet.sources import Found, find, leftovers, remove
 from imutool.fleet.task import FINAL, Result, Settings, Source, Task
-from imutool.fleet.work import called, write_json
+from imutool.fleet.work import called, page_name, write_json
 from imutool.place import Place, place
 
 LOST = 3  # something of a log was lost, or a log was quarantined
@@ -183,7 +183,7 @@ def _told(fleet: _Fleet, journal: Journal, source: str, tally: Tally, began: flo
         from imutool.fleet import page as pages
 
         every = fleet.results(journal)
-        pages.write(every, settings, page, seconds=seconds, source=source, compared=compared, overwrite=True)
+        pages.write(every, settings, page, out=out, seconds=seconds, source=source, compared=compared, overwrite=True)
     trouble = (one for one in fleet.results(journal) if (one.earlier or one.status) != "ok")
     first = tuple(one for one, _ in zip(trouble, range(TOLD), strict=False))
     return FleetReport(source, out, settings.command, tally, seconds, first, compared)
@@ -199,7 +199,9 @@ class _Fleet:
 
     def sweep(self) -> None:
         """Removes what was half-written when somebody was killed."""
-        remove(leftovers(self.out, map(self._name, self.found.logs)))
+        names = [self._name(one) for one in self.found.logs]
+        pages = [page_name(name) for name in names] if self.settings.pages else []
+        remove(leftovers(self.out, [*names, *pages]))
 
     def hopeless(self, journal: Journal) -> Iterator[Result]:
         """Logs that cannot be taken, and those for which somebody else's file is in the way."""

@@ -24,6 +24,7 @@ class Settings(msgspec.Struct, frozen=True, kw_only=True):
     init: str = "auto"
     smooth: bool = False
     clean: bool = True
+    pages: bool = False  # debias: a page about each log beside it
     check: str = "imu"  # what of a new log is read back: all, imu or none
     damaged: str = "drop"
     sim: str | None = None
@@ -99,6 +100,8 @@ class Result(msgspec.Struct, frozen=True, kw_only=True, tag_field="line", tag="d
     robot: str = ""
     parameters: tuple[Parameter, ...] = ()
     effects: tuple[str, ...] | None = None  # that a search has found, where one was made
+    page: str = ""  # about this log, relative to OUT
+    page_says: str = ""  # its first sentence
     error: str = ""
     exit_code: int = 0
     peak_bytes: int = 0  # the most memory that the worker has held so far

@@ -11,7 +11,7 @@ import resource
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -30,6 +30,7 @@ from imutool.place import Place, identity, place
 
 LOST = 3  # exit code: something of the log was lost
 MOST_LOSSES = 20  # stretches told of a log; its metadata and its repair tell all
+MOST_LETTERS = 300  # of what a page says
 MAXRSS = 1 if sys.platform == "darwin" else 1024  # bytes in what the system counts memory in
 
 
@@ -83,12 +84,17 @@ def work(task: Task, model: bytes | None = None) -> Result:
     return msgspec.structs.replace(result, **spent, peak_bytes=peak)
 
 
+def page_name(log: str) -> str:
+    """What the page about a log is called: as the log."""
+    return log.removesuffix(".mcap") + ".html"
+
+
 def stands(done: Result, target: Place, *, whole: bool = False) -> bool:
     """Whether a target is still what an earlier run left: of its size, and a log that opens; with `whole`, of its SHA-256."""
     if done.status == "quarantined":  # nothing was written
         return True
     try:
-        if identity(target)[0] != done.target_bytes:
+        if identity(target)[0] != done.target_bytes or (done.page and not target.with_name(page_name(target.name)).is_file()):
             return False
         if whole or target.suffix != ".mcap":
             return sha256(target) == done.target_sha256
@@ -126,7 +132,7 @@ def _clear(task: Task, target: Place) -> None:
     """Makes the folder, and removes what a killed attempt at this target left in it."""
     if isinstance(target, Path):
         target.parent.mkdir(parents=True, exist_ok=True)
-    remove(leftovers(place(task.out), [task.target]))
+    remove(leftovers(place(task.out), [task.target, page_name(task.target)]))
 
 
 def _measured(target: Place) -> dict[str, Any]:
@@ -156,7 +162,27 @@ def _debias(job: _Job) -> dict[str, Any]:
             if finding.severity != "note"
         )
         told["warnings"] = (*told.get("warnings", ()), *said)
+    if s.pages:
+        told |= _page(job, list(report.starts), told.get("warnings", ()))
     return told
+
+
+def _page(job: _Job, topics: Sequence[str], warnings: tuple[str, ...]) -> dict[str, Any]:
+    """Writes a page about a debiased log beside it. A log that cannot be drawn is whole all the same, and is warned of."""
+    from imutool.view import report
+    from imutool.view.page import is_ours
+    from imutool.view.report_words import conclusion
+    from imutool.view.runs import load
+
+    path = job.target.with_name(page_name(job.target.name))
+    try:
+        if path.exists() and not is_ours(path):
+            raise ConfigError("the page exists, and no fleet has written it", where=path, fix="Move it, or choose another OUT")
+        logs = [load(job.target, imu=topic) for topic in topics]
+        report.write_page(report.by_topic(logs, topics), path, overwrite=True)
+    except ImutoolError as error:
+        return {"warnings": (*warnings, f"no page: {error}")}
+    return {"page": page_name(job.name), "page_says": conclusion(logs[0])[:MOST_LETTERS]}
 
 
 def _info(job: _Job) -> dict[str, Any]:

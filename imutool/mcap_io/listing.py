@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import struct
 from typing import NamedTuple
 
 import numpy as np
@@ -13,9 +12,8 @@ from imutool.errors import LogError
 from imutool.mcap_io import records
 from imutool.mcap_io.records import HEAD, MESSAGE, ChunkHead, Messages
 from imutool.mcap_io.source import Source
-from imutool.mcap_io.structure import Block
+from imutool.mcap_io.structure import INDEX_HEAD, Block
 
-FIRST = struct.Struct("<BQHI")  # of a MessageIndex record: opcode, length, channel id and bytes of its entries
 HEAD_BYTES = 128  # hold a Chunk record up to its packed data, whatever its compression is called
 
 
@@ -68,15 +66,15 @@ def listing(raw: bytes | memoryview, block: Block, unpacked: int) -> Listing | N
     parts: list[bytes | memoryview] = []
     seen: dict[int, int] = {}
     at, start = 0, block.offset + block.length
-    while len(raw) - at >= FIRST.size:
-        opcode, length, channel, size = FIRST.unpack_from(raw, at)
+    while len(raw) - at >= INDEX_HEAD.size:
+        opcode, length, channel, size = INDEX_HEAD.unpack_from(raw, at)
         following = at + HEAD.size + length
         if opcode != Opcode.MESSAGE_INDEX or size % 16 or length != size + 6 or following > len(raw) or channel in seen:
             return None
         seen[channel] = start + at
         if size:
             counts[channel] = size // 16
-            parts.append(raw[at + FIRST.size : following])
+            parts.append(raw[at + INDEX_HEAD.size : following])
         at = following
     named = block.indexes
     if at != len(raw) or not seen.keys() >= named.keys() >= counts.keys() or any(seen[c] != named[c] for c in named):

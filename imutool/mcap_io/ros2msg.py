@@ -72,7 +72,7 @@ def parse(schema_name: str, text: bytes) -> Definition:
             name = _short(first.removeprefix("MSG:").strip())
         known[name] = tuple(_fields(name, body))
     _check(root, known, {}, 0)
-    return {"": (Field("", root, None),), **known}
+    return {**known, "": (Field("", root, None),)}  # last: a separator with nothing after it defines "" too
 
 
 def _short(name: str) -> str:

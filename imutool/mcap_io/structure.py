@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import UInt64
+from jaxtyping import Int64, UInt64
 from mcap.opcode import Opcode
 from mcap.records import Channel, ChunkIndex, Footer, Header, Schema, Statistics
 
@@ -26,6 +26,7 @@ from imutool.mcap_io.records import FOOTER_SIZE, HEAD, MAGIC
 from imutool.mcap_io.source import CUT_SHORT, Source
 
 MOST_SUMMARY = 1 << 29  # bytes; that of a 100 GB log has some 20 million
+INDEX_HEAD = struct.Struct("<BQHI")  # of a MessageIndex record: opcode, length, channel id and bytes of its entries
 RUN_BYTES = 1 << 20  # messages outside chunks are taken in runs of about this size
 
 
@@ -166,7 +167,24 @@ class Structure:
         opcode, length = HEAD.unpack_from(raw)
         if opcode != Opcode.CHUNK or length != block.length - HEAD.size:
             raise LogError(f"the summary says a chunk lies at byte {block.offset}, which it does not")
-        return records.messages(records.unpack(raw, block.offset), block.offset)
+        data, offsets = records.unpack(raw, block.offset), self._listed(block)
+        found = None if offsets is None else records.listed(data, offsets)
+        return found or records.messages(data, block.offset)
+
+    def _listed(self, block: Block) -> Int64[np.ndarray, " n"] | None:
+        """Where the messages of a chunk begin, by the message indexes behind it; None where there are none, or other records.
+
+        A hint: who uses it sees whether messages lie there.
+        """
+        raw = self.source.at(block.offset + block.length, block.end - block.offset - block.length)
+        parts, at = [], 0
+        while len(raw) - at >= INDEX_HEAD.size:
+            opcode, length, _, size = INDEX_HEAD.unpack_from(raw, at)
+            if opcode != Opcode.MESSAGE_INDEX or size % 16 or length != size + 6 or length > len(raw) - at - HEAD.size:
+                return None
+            parts.append(np.frombuffer(raw, "<u8", size // 8, at + INDEX_HEAD.size)[1::2])
+            at += HEAD.size + length
+        return np.sort(np.concatenate(parts)).view(np.int64) if parts else None
 
     def index(self, block: Block, channel: int) -> UInt64[np.ndarray, "n 2"]:
         """The (log time, offset) entries of one channel in one block, from its MessageIndex record.

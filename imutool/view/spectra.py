@@ -35,6 +35,7 @@ def spectra(imu: Imu) -> Mapping[str, Spectrum]:
     length = min(len(imu), max(FEWEST, round(WINDOW_S * rate_hz)))
     found = {}
     for kind, values in (("gyro", imu.gyro), ("accel", imu.accel)):
-        frequency_hz, density = welch(values, rate_hz, nperseg=length, axis=0, detrend="constant")
-        found[kind] = Spectrum(frequency_hz[1:], density[1:])  # what does not change is no part of a spectrum
+        along = np.ascontiguousarray(values.T)  # twice as fast
+        frequency_hz, density = welch(along, rate_hz, nperseg=length, detrend="constant")
+        found[kind] = Spectrum(frequency_hz[1:], density.T[1:])  # what does not change is no part of a spectrum
     return MappingProxyType(found)

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from mcap.writer import CompressionType, Writer
 from mcap_ros2.writer import Writer as Ros2Writer
@@ -288,6 +288,7 @@ def test_hostile_definitions_and_messages_are_refused_in_bounded_work(
 
 @settings(max_examples=150, deadline=None)
 @given(st.binary(max_size=120), st.binary(max_size=60))
+@example(b"=", b"")  # a separator with nothing after it
 def test_random_definitions_and_payloads_raise_nothing_but_our_own(definition: bytes, payload: bytes) -> None:
     size = len(payload)
     with suppress(LogError):

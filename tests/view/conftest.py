@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+import sys
+from pathlib import Path
+
 import numpy as np
 import pytest
 
 from imutool.physics.flight import ACCEL_BIAS, GYRO_BIAS, flight
 from imutool.recording import Imu, Recording
 from imutool.view.rundata import Run, RunData, build
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "clean"))  # for the planting of defects
 
 
 @pytest.fixture(scope="session")

@@ -8,7 +8,6 @@ import runpy
 import sys
 from collections.abc import Iterator
 from dataclasses import replace
-from html.parser import HTMLParser
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -20,53 +19,16 @@ from hypothesis import strategies as st
 from imutool.errors import ConfigError
 from imutool.physics.conclusion import conclusion
 from imutool.view import diagnosis_figures as figures
-from imutool.view.diagnosis_page import html, text, write
+from imutool.view import drawing
+from imutool.view.diagnosis_page import html, write
+from imutool.view.page import text
 
 MADE = SimpleNamespace(**runpy.run_path(str(Path(__file__).parents[1] / "physics" / "diagnoses.py")))
+MARKUP = SimpleNamespace(**runpy.run_path(str(Path(__file__).parent / "markup.py")))
+Page, svgs = MARKUP.Page, MARKUP.svgs
 MOST_BYTES = 3_000_000
-VOID = {"meta", "br", "img", "link", "input", "hr"}
 # Welch's estimate over 30 s has about 14 independent windows and three axes, and a bin at the top averages many frequencies.
 DENSITY = 0.05
-
-
-class Page(HTMLParser):
-    """Tags in balance, visible words, and everything that an address or an identifier could be in."""
-
-    def __init__(self, content: str) -> None:
-        super().__init__()
-        self.open: list[str] = []
-        self.tags: set[str] = set()
-        self.words: list[str] = []
-        self.ids: list[str] = []
-        self.addresses: list[str] = []
-        self.handlers: list[str] = []
-        self.feed(content)
-        self.close()
-        assert self.open == []
-
-    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        self.handle_startendtag(tag, attrs)
-        if tag not in VOID:
-            self.open.append(tag)
-
-    def handle_startendtag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        self.tags.add(tag)
-        for name, value in attrs:
-            self.handlers += [name] if name.startswith("on") else []
-            self.ids += [value or ""] if name == "id" else []
-            self.addresses += [value or ""] if name in {"src", "href", "xlink:href", "action", "data"} else []
-            self.addresses += re.findall(r"url\(([^)]*)\)", value or "")
-
-    def handle_endtag(self, tag: str) -> None:
-        assert self.open.pop() == tag
-
-    def handle_data(self, data: str) -> None:
-        if not self.open or self.open[-1] != "style":
-            self.words.append(data)
-
-    @property
-    def text(self) -> str:
-        return " ".join(" ".join(self.words).split())
 
 
 @pytest.fixture(scope="module")
@@ -77,10 +39,6 @@ def three() -> str:
 @pytest.fixture(scope="module")
 def nothing() -> str:
     return html(MADE.NOTHING)
-
-
-def svgs(content: str) -> list[str]:
-    return re.findall(r"<svg.*?</svg>", content, flags=re.DOTALL)
 
 
 # ── what it says ──
@@ -191,9 +149,9 @@ def test_it_is_drawn_in_the_pages_own_colours_for_light_dark_and_paper(three: st
         assert set(re.findall(r"#[0-9a-fA-F]{6}\b", svg)) == set()
         used = set(re.findall(r"var\(--(\w+)\)", svg))
         assert used >= {"ink", "grid"} or "where" in svg or used >= {"ink"}
-        assert used <= set(figures.VARIABLES.values())
+        assert used <= set(drawing.VARIABLES.values())
     style = three[three.index("<style>") : three.index("</style>")]
-    for variable in figures.VARIABLES.values():
+    for variable in drawing.VARIABLES.values():
         assert style.count(f"--{variable}:") >= 1
     for variable in ("ink", "before", "after", "paper", "grid"):
         assert style.count(f"--{variable}:") == 3, "light, dark and print"
@@ -311,7 +269,7 @@ def test_located_time_is_on_the_first_logs_clock_unless_each_log_has_its_own() -
 @given(st.lists(st.floats(-1e3, 1e3), min_size=1, max_size=400), st.integers(1, 50))
 def test_thinning_a_line_keeps_its_ends_of_scale_its_order_and_its_length_in_bounds(values: list[float], buckets: int) -> None:
     t, y = np.arange(len(values), dtype=float), np.array(values)
-    thin_t, thin_y = figures.extremes(t, y, buckets)
+    thin_t, thin_y = drawing.extremes(t, y, buckets)
     assert len(thin_t) <= 2 * buckets
     assert (np.diff(thin_t) > 0).all()
     assert thin_y.min() == y.min()
@@ -321,8 +279,8 @@ def test_thinning_a_line_keeps_its_ends_of_scale_its_order_and_its_length_in_bou
 
 def test_a_mask_becomes_stretches_of_time() -> None:
     t = np.arange(6) / 2.0
-    assert figures.spans(t, np.array([True, True, False, True, False, True])) == [(0.0, 0.5), (1.5, 1.5), (2.5, 2.5)]
-    assert figures.spans(t, np.zeros(6, dtype=bool)) == []
+    assert drawing.spans(t, np.array([True, True, False, True, False, True])) == [(0.0, 0.5), (1.5, 1.5), (2.5, 2.5)]
+    assert drawing.spans(t, np.zeros(6, dtype=bool)) == []
 
 
 def test_white_noise_has_the_density_of_the_dashed_line() -> None:

@@ -13,7 +13,9 @@ from imutool.errors import ConfigError, DataError
 from imutool.physics.flight import ACCEL, GYRO, flight
 from imutool.recording import Imu, Poses, Recording, seconds
 from imutool.strapdown import Start, dead_reckon
-from imutool.view.deviation import errors
+from imutool.view import rundata
+from imutool.view.deviation import Alignment, errors
+from imutool.view.events import Event
 from imutool.view.rundata import RAW, Run, RunData, build, level_start, sparse, stretches
 
 ROUNDING = 1e-9  # degrees and metres: some thousand float64 operations on numbers of size one
@@ -135,6 +137,66 @@ def test_true_bias_is_shown_where_the_log_knows_it(recording: Recording, runs: l
     assert data.true_bias["gyro"] == recording.scalars["/ground_truth/bias/gyro"]
     assert data.true_bias["accel"].unit == "m/s^2"
     assert not build(replace(recording, scalars={}), runs).true_bias
+
+
+@pytest.mark.parametrize("align", ["origin", "yaw", "se3"])
+def test_alignment_moves_paths_and_errors_alone_and_is_said(
+    recording: Recording, runs: list[Run], data: RunData, align: Alignment
+) -> None:
+    turned = build(recording, runs, align=align)
+    assert (data.alignment, turned.alignment) == ("none", align)
+    for before, after in zip(data.traces, turned.traces, strict=True):
+        assert dict(before.figures) == dict(after.figures)
+        assert before.windows == after.windows
+        assert before.drift is not None
+        assert after.drift is not None
+        np.testing.assert_array_equal(before.drift.position_m, after.drift.position_m)
+        assert after.errors is not None
+        rms_m = float(np.sqrt(np.mean(after.errors.position_total_m**2)))
+        if align == "se3":
+            assert rms_m == pytest.approx(after.figures["ape_aligned_m"], rel=1e-9)
+        else:
+            assert rms_m >= after.figures["ape_aligned_m"]
+        assert any(note.startswith(f"{after.name}: alignment {align} turned the path by") for note in turned.notes)
+    assert not any("turned" in note for note in data.notes)
+
+
+def test_without_truth_nothing_is_aligned(recording: Recording, runs: list[Run]) -> None:
+    blind = build(replace(recording, truths={}), runs, align="se3")
+    assert blind.alignment == "none"
+    assert "nothing to align with" in blind.notes[0]
+    assert all(trace.drift is None and trace.windows == () for trace in blind.traces)
+    assert {event.kind for event in blind.events} <= {"stop"}
+
+
+def test_events_are_those_given_stops_and_the_worst_of_each_model(recording: Recording, runs: list[Run]) -> None:
+    start_ns = int(recording.imu.t_ns[0])
+    gap = Event("gap", start_ns + 1_000_000_000, start_ns + 2_000_000_000, "here")
+    data = build(recording, runs, events=[gap], notes=["A word."])
+    assert gap in data.events
+    assert "A word." in data.notes
+    worst = [event.text.partition(":")[0] for event in data.events if event.kind == "worst"]
+    assert sorted(worst) == ["my model/v1", "my model/v1", "static", "static"]
+    alone = build(recording, runs[:1])
+    assert [event.text.partition(":")[0] for event in alone.events if event.kind == "worst"] == ["raw", "raw"]
+
+
+def test_runs_of_other_stamps_are_each_scored_on_their_own(recording: Recording, runs: list[Run]) -> None:
+    fewer = runs[1].imu.rows(slice(200, None, 2))
+    half = Run("half", fewer, runs[1].gyro_bias[200::2].copy(), runs[1].accel_bias[200::2].copy())
+    data = build(recording, [runs[0], half, runs[2]])
+    alone = build(recording, [half]).traces[0]
+    assert data.traces[1].path == alone.path
+    assert dict(data.traces[1].figures) == dict(alone.figures)
+    assert len(data.traces[2].path) == len(data.traces[0].path) != len(alone.path)
+
+
+def test_a_log_too_long_to_be_drawn_whole_says_so(
+    recording: Recording, runs: list[Run], data: RunData, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert not any("are drawn" in note for note in data.notes)
+    monkeypatch.setattr(rundata, "MOST", 1000)
+    assert any("at most 1000 are drawn" in note for note in build(recording, runs).notes)
 
 
 def test_the_table_has_a_row_per_figure_and_a_column_per_run(data: RunData) -> None:

@@ -1,23 +1,32 @@
-"""How the viewer is laid out: paths over errors on the left; signals, biases and the report in tabs on the right."""
+"""How the viewer is laid out: paths over errors on the left, all else in tabs on the right; several logs side by side first."""
 
 from __future__ import annotations
 
+import colorsys
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jaxtyping import Float64
 
-from imutool.view.rerun.sdk import entity_path, need_sdk
-from imutool.view.rundata import RunData
+from imutool.view.rerun import clock, entities, errors, panels, styles
+from imutool.view.rerun.entities import Scope
+from imutool.view.rerun.palette import GROUND, MODEL_COLORS, RAW_FADE, Color, faded
+from imutool.view.rerun.paths import LEGEND_X, LEGEND_Y, heat_top
+from imutool.view.rerun.plots import plot
+from imutool.view.rerun.sdk import need_sdk
+from imutool.view.rundata import RunData, Trace
 
 if TYPE_CHECKING:
     import rerun.blueprint as rrb
 
-READABLE = 10.0  # an error this many times smaller than the plot is high can still be read
+SHARES = {"paths": 6.0, "legend": 0.9, "error": 2.6}
 
 
-def blueprint(data: RunData) -> rrb.Blueprint:
-    """The layout: paths over errors on the left, tabs for signals, biases and the report on the right; no empty panel.
+def blueprint(logs: Sequence[RunData], *, source: bool = True) -> rrb.Blueprint:
+    """The layout of what `scene.log` logs of the same logs with the same `source`; no empty panel.
+
+    It opens at the end of the log, on `elapsed`, so that whole paths are seen.
 
     Raises:
         ConfigError: Rerun is not installed.
@@ -25,73 +34,112 @@ def blueprint(data: RunData) -> rrb.Blueprint:
     need_sdk()
     import rerun.blueprint as rrb
 
-    left: list[Any] = [rrb.Spatial3DView(origin="/world", name="Paths", eye_controls=_eye(data), background=(24, 26, 30))]
-    if data.truth is not None:
-        left += [
-            _plot(
-                data, "/error/orientation", "Orientation error (deg)", _totals(data, "orientation"), limit(data, "orientation")
-            ),
-            _plot(data, "/error/position", "Position error (m)", _totals(data, "position"), limit(data, "position")),
-        ]
-    tabs: list[Any] = [
-        rrb.Vertical(
-            _plot(data, "/imu/gyro", "Angular rate (rad/s)"),
-            _plot(data, "/imu/accel", "Specific force (m/s²)"),
-            name="Signals",
-        )
-    ]
-    if data.models() or data.true_bias:
-        units = {"gyro": "Gyro bias (rad/s)", "accel": "Accel bias (m/s²)"}
-        shown = units if data.models() else {kind: units[kind] for kind in data.true_bias}
-        tabs.append(rrb.Vertical(*(_plot(data, f"/bias/{k}", title) for k, title in shown.items()), name="Bias"))
-    tabs.append(rrb.TextDocumentView(origin="/report", name="Report"))
+    scopes = entities.scopes(logs)
+    shown = [_of_one(data, scope, source) for data, scope in zip(logs, scopes, strict=True)]
+    whole: Any = shown[0] if len(logs) == 1 else rrb.Tabs(_comparison(logs, scopes), *shown, active_tab=0)
     return rrb.Blueprint(
-        rrb.Horizontal(
-            rrb.Vertical(*left, row_shares=[2, 1, 1][: len(left)]), rrb.Tabs(*tabs, active_tab=0), column_shares=[1, 1]
-        ),
+        whole,
         rrb.BlueprintPanel(state="collapsed"),
         rrb.SelectionPanel(state="collapsed"),
-        rrb.TimePanel(state="collapsed", timeline="elapsed"),
+        rrb.TimePanel(state="collapsed", timeline=clock.ELAPSED, play_state="following"),
         auto_layout=False,
         auto_views=False,
     )
 
 
-def _plot(
-    data: RunData, origin: str, name: str, contents: str | list[str] = "$origin/**", limit: float | None = None
-) -> rrb.TimeSeriesView:
-    """A plot over the whole log: by default Rerun shows a minute around the cursor."""
-    import rerun as rr
+def _of_one(data: RunData, scope: Scope, source: bool) -> rrb.Horizontal:
+    """One log: what it is about on the left, all the rest on the right."""
     import rerun.blueprint as rrb
 
-    ends = [rr.TimeRangeBoundary.absolute(seconds=t) for t in (0.0, data.duration_s)]
-    return rrb.TimeSeriesView(
-        origin=origin,
-        contents=contents,
-        name=name,
-        axis_x=rrb.TimeAxis(link="Independent", view_range=rr.TimeRange(start=ends[0], end=ends[1])),
-        axis_y=None if limit is None else rrb.ScalarAxis(range=(0.0, limit)),
-        plot_legend=rrb.Corner2D.LeftTop,
+    left: list[Any] = [paths_view(data, scope)]
+    shares = [SHARES["paths"]]
+    if heat_top(data) is not None:
+        left.append(_legend(scope))
+        shares.append(SHARES["legend"])
+    curves = panels.total_errors(data, scope)
+    left += curves
+    shares += [SHARES["error"]] * len(curves)
+    right = rrb.Tabs(*panels.tabs(data, scope, source), active_tab=0)
+    return rrb.Horizontal(
+        rrb.Vertical(*left, row_shares=shares), right, column_shares=[1, 1], name=scope[-1] if scope else None
     )
 
 
-def _totals(data: RunData, kind: str) -> list[str]:
-    """The entities of the total errors."""
-    return [entity_path("error", kind, trace.name, "total") for trace in data.traces if trace.errors is not None]
+def paths_view(data: RunData, scope: Scope) -> rrb.Spatial3DView:
+    """Paths up to the cursor on every timeline, and the bodies at it."""
+    import rerun as rr
+    import rerun.blueprint as rrb
+
+    begin, cursor = rr.TimeRangeBoundary.infinite(), rr.TimeRangeBoundary.cursor_relative()
+    homes = [entities.of(data, trace, scope, "world", entities.role(trace)) for trace in data.traces]
+    homes += [entities.path(scope, "world", "gt")] if data.truth is not None else []
+    return rrb.Spatial3DView(
+        origin=entities.path(scope, "world"),
+        contents=[f"{home}/**" for home in homes],
+        name="Paths",
+        background=GROUND,
+        eye_controls=_eye(data),
+        time_ranges=[rrb.VisibleTimeRange(timeline, start=begin, end=cursor) for timeline in clock.TIMELINES],
+    )
 
 
-def limit(data: RunData, kind: str) -> float | None:
-    """How high an error plot reaches: a raw error that would make the models' flat lines leaves the plot."""
-    tops = {}
-    for trace in data.traces:
-        if trace.errors is not None:
-            total = trace.errors.orientation_total_deg if kind == "orientation" else trace.errors.position_total_m
-            tops[trace.name] = float(np.nanmax(total))
-    models = [tops[trace.name] for trace in data.models() if trace.name in tops]
-    highest = max(tops.values(), default=0.0)
-    cut = bool(models) and highest > READABLE * max(models) > 0.0
-    limit = READABLE / 2.0 * max(models) if cut else highest
-    return 1.05 * limit if limit > 0.0 else None
+def _legend(scope: Scope) -> rrb.Spatial2DView:
+    """What the colours of the debiased path mean, in numbers."""
+    import rerun.blueprint as rrb
+
+    return rrb.Spatial2DView(
+        origin=entities.path(scope, "legend"),
+        name="Orientation error of the debiased path",
+        titlebar=False,
+        background=GROUND,
+        visual_bounds=rrb.VisualBounds2D(x_range=LEGEND_X, y_range=LEGEND_Y),
+    )
+
+
+def _comparison(logs: Sequence[RunData], scopes: Sequence[Scope]) -> rrb.Vertical:
+    """The errors of all logs over elapsed time, and their figures side by side."""
+    import rerun.blueprint as rrb
+
+    rows: list[Any] = []
+    scored = _scored(logs, scopes)
+    for kind in errors.KINDS:
+        overrides = {}
+        for (data, trace, scope), color in zip(scored, _colors(scored), strict=True):
+            name = f"{scope[-1]}: {entities.label(data, trace)}"
+            overrides[entities.of(data, trace, scope, "error", kind, entities.role(trace))] = styles.total(
+                entities.role(trace), name, color
+            )
+        if overrides:
+            reach = max((panels.error_limit(data, kind) or 0.0 for data in logs), default=0.0)
+            title = f"{kind.capitalize()} error ({errors.UNITS[kind]})"
+            rows.append(plot(list(overrides), title, height=(0.0, reach) if reach else None, overrides=overrides))
+    figures = rrb.TextDocumentView(origin="/compare", name="Figures")
+    return rrb.Vertical(*([rrb.Horizontal(*rows)] if rows else []), figures, name="Compare")
+
+
+def _scored(logs: Sequence[RunData], scopes: Sequence[Scope]) -> list[tuple[RunData, Trace, Scope]]:
+    """Every run of every log that has errors."""
+    return [
+        (data, trace, scope)
+        for data, scope in zip(logs, scopes, strict=True)
+        for trace in data.traces
+        if trace.errors is not None
+    ]
+
+
+def _colors(scored: Sequence[tuple[RunData, Trace, Scope]]) -> list[Color]:
+    """A colour for each model of each log, told apart by colour-blind eyes while they last; raw has its log's, greyed."""
+    models = [(scope, trace.name) for data, trace, scope in scored if not trace.is_raw or not data.models()]
+    hues = MODEL_COLORS if len(models) <= len(MODEL_COLORS) else _circle(len(models))
+    by_model = dict(zip(models, hues, strict=False))
+    by_log = {scope: color for (scope, _), color in reversed(by_model.items())}
+    return [by_model.get((scope, trace.name)) or faded(by_log[scope], RAW_FADE) for _, trace, scope in scored]
+
+
+def _circle(count: int) -> list[Color]:
+    """As many colours as that, as far from each other as they can be, all of about one brightness."""
+    turns = [colorsys.hls_to_rgb((0.55 + k / count) % 1.0, 0.55, 0.65) for k in range(count)]
+    return [(round(255 * red), round(255 * green), round(255 * blue)) for red, green, blue in turns]
 
 
 def _eye(data: RunData) -> rrb.EyeControls3D:
@@ -100,7 +148,7 @@ def _eye(data: RunData) -> rrb.EyeControls3D:
 
     low, high = box(data)
     centre, size = (low + high) / 2.0, size_m(data)
-    return rrb.EyeControls3D(position=centre + size * np.array([-0.6, -0.6, 0.4]), look_target=centre, eye_up=[0.0, 0.0, 1.0])
+    return rrb.EyeControls3D(position=centre + size * np.array([-0.7, -0.7, 0.5]), look_target=centre, eye_up=[0.0, 0.0, 1.0])
 
 
 def box(data: RunData) -> tuple[Float64[np.ndarray, "3"], Float64[np.ndarray, "3"]]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import uuid
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from imutool.errors import ConfigError
@@ -29,13 +30,55 @@ def need_sdk() -> None:
         ) from error
 
 
-def stream(data: RunData) -> rr.RecordingStream:
-    """A recording of its own, in an application of its own: Rerun keeps one layout per application."""
+def stream(logs: Sequence[RunData]) -> rr.RecordingStream:
+    """A recording of its own for these logs.
+
+    Raises:
+        ConfigError: no log, or Rerun is not installed.
+    """
+    return named(title(logs))
+
+
+def named(name: str) -> rr.RecordingStream:
+    """A recording of its own, in an application of its own: Rerun keeps one layout per application.
+
+    It has no `log_time` and no `log_tick`: when we drew something is nothing to look at.
+
+    Raises:
+        ConfigError: Rerun is not installed.
+    """
     need_sdk()
     import rerun as rr
 
-    plain = re.sub(r"[^A-Za-z0-9_-]", "_", data.name)[:100]
-    return rr.RecordingStream(f"imutool {plain}", recording_id=f"{plain}-{uuid.uuid4().hex[:8]}")
+    short = plain(name)
+    recording = rr.RecordingStream(f"imutool {short}", recording_id=f"{short}-{uuid.uuid4().hex[:8]}")
+    recording.set_log_time_enabled(False)
+    recording.set_log_tick_enabled(False)
+    return recording
+
+
+def title(logs: Sequence[RunData]) -> str:
+    """A name for one or several logs, of letters that files and applications may have.
+
+    Raises:
+        ConfigError: no log.
+    """
+    if not logs:
+        raise ConfigError("there is no log to show", where="view")
+    more = f"_and_{len(logs) - 1}_more" if len(logs) > 1 else ""
+    return plain(logs[0].name) + more
+
+
+def plain(name: str) -> str:
+    """A name of which nothing is left that a file or an application may not be called, or that leads elsewhere."""
+    return re.sub(r"[^A-Za-z0-9_-]", "_", name)[:100] or "_"
+
+
+def version() -> str:
+    """The version of the installed Rerun, which is also that of the viewer beside it."""
+    import rerun as rr
+
+    return str(rr.__version__)
 
 
 def entity_path(*parts: str) -> str:

@@ -1,60 +1,74 @@
-"""The ways to look: a viewer of our own, or .rrd files for one."""
+"""A viewer of our own: started, given the logs, and left to the person; or the next best thing."""
 
 from __future__ import annotations
 
+import contextlib
 import importlib.util
 import os
-import re
 import socket
 import subprocess
 import sys
 import time
 from collections.abc import Mapping, Sequence
-from contextlib import ExitStack
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from imutool.errors import ConfigError
-from imutool.mcap_io.target import Target
-from imutool.view.rerun.layout import blueprint
-from imutool.view.rerun.scene import log
-from imutool.view.rerun.sdk import FLUSH_S, need_sdk, stream
+from imutool.view.rerun import connect, files
+from imutool.view.rerun.connect import Peer
+from imutool.view.rerun.sdk import need_sdk, title, version
 from imutool.view.rundata import RunData
+from imutool.view.shown import Shown
 
 MEMORY_LIMIT = "50%"  # of the machine, for a viewer of our own: by default it takes three quarters
-VIEWER_STARTS_S = 10.0
+STARTS_S = 10.0  # for a viewer that lives but does not listen yet, as from a slow disk; one that dies is seen at once
+SETTLES_S = 0.7  # within which one that finds no window or no graphics has died, though it listened
 
 VIEWERS: list[subprocess.Popen[bytes]] = []  # they outlive us; held so that Python does not warn of a lost child
 
 
-def show(logs: Sequence[RunData], *, save: Path | None = None, spawn: bool | None = None, overwrite: bool = False) -> str:
-    """Opens the viewer or saves .rrd files, and returns a sentence that says which and how to go on.
-
-    Without `save` and `spawn`, the viewer opens if there is a display, else the logs are saved as NAME.rrd here.
-    Several logs are several recordings in one viewer, or several files in the folder `save`. A display is looked for
-    before anything is sent, and a viewer that does not start is given up after ten seconds, at once if it dies; if
-    nobody insisted on it with `spawn`, the logs are then saved instead.
+def show(logs: Sequence[RunData], *, source: bool = True, at_s: float | None = None, overwrite: bool = False) -> Shown:
+    """Opens a viewer; where there is no display or the viewer does not start, saves NAME.rrd here, and says so.
 
     Raises:
-        ConfigError: no log, Rerun is not installed, no display though `spawn` is true, or the target cannot be written.
+        ConfigError: no log, Rerun is not installed, or the file exists (without `overwrite`) or cannot be written.
     """
-    if not logs:
-        raise ConfigError("there is no log to show", where="view")
+    title(logs)  # refuses where there is no log
     need_sdk()
-    wants_viewer = spawn if spawn is not None else save is None and has_display()
-    if wants_viewer and not has_display():
-        raise ConfigError("there is no display (DISPLAY and WAYLAND_DISPLAY are not set)", where="view", fix="Use --save")
-    said = []
-    if wants_viewer:
-        trouble = _open(logs)
-        if trouble and spawn:
-            raise ConfigError(trouble, where="view", fix="Use --save")
-        said.append(trouble or "The viewer is open.")
-    elif save is None:
-        said.append("There is no display here.")
-    if save is not None or not wants_viewer or trouble:
-        said.append(_save(logs, save, overwrite))
-    return " ".join(said)
+    try:
+        return open_viewer(logs, source=source, at_s=at_s)
+    except ConfigError as error:
+        trouble = sentence(error)
+    saved = files.save(logs, source=source, overwrite=overwrite)
+    return saved._replace(said=f"{trouble}{saved.said}, or look in a browser: imutool view --web")
+
+
+def open_viewer(logs: Sequence[RunData], *, source: bool = True, at_s: float | None = None) -> Shown:
+    """Opens a viewer of our own with all logs, the cursor at `at_s` seconds.
+
+    Raises:
+        ConfigError: no display, no viewer, or it does not live long enough to take the logs.
+    """
+    viewer = start()
+    try:
+        connect.send(logs, viewer.peer, source=source, at_s=at_s)
+    except ConfigError as error:
+        raise viewer.trouble() or error from error
+    if trouble := viewer.trouble():
+        raise trouble
+    return Shown("viewer", viewer.peer.url, "The viewer is open.")
+
+
+def open_empty() -> Peer:
+    """Opens a viewer of our own for what is still to come.
+
+    Raises:
+        ConfigError: no display, no viewer, or it dies at once.
+    """
+    viewer = start()
+    if trouble := viewer.trouble():
+        raise trouble
+    return viewer.peer
 
 
 def has_display() -> bool:
@@ -64,94 +78,68 @@ def has_display() -> bool:
     return bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
 
 
-def rrd(data: RunData) -> bytes:
-    """The log and its layout as the content of an .rrd file.
+class Viewer(NamedTuple):
+    """A viewer of our own that was started, and where it listens."""
+
+    process: subprocess.Popen[bytes]
+    peer: Peer
+
+    def trouble(self) -> ConfigError | None:
+        """What became of it, if it has died or does so now: one that finds no window listens before it notices."""
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            self.process.wait(SETTLES_S)
+        return None if self.process.returncode is None else _stopped(self.process)
+
+
+def start() -> Viewer:
+    """Starts a viewer of our own, on loopback and a free port.
 
     Raises:
-        ConfigError: Rerun is not installed.
+        ConfigError: no display, no viewer, or it dies at once or does not listen.
     """
-    need_sdk()
-    import rerun as rr
-
-    recording = stream(data)
-    written = rr.binary_stream(recording)
-    recording.send_blueprint(blueprint(data))
-    log(data, recording)
-    content = written.read(flush_timeout_sec=FLUSH_S)
-    assert content, "a stream that was written to holds bytes"
-    return bytes(content)
-
-
-def _save(logs: Sequence[RunData], save: Path | None, overwrite: bool) -> str:
-    """Saves one file, or a file per log in a folder, and says how to open them."""
-    names = [re.sub(r"[^\w.-]", "_", data.name) + ".rrd" for data in logs]
-    if len(logs) > 1:
-        folder = save or Path()
-        if folder.suffix == ".rrd" or folder.is_file():
-            raise ConfigError(f"{len(logs)} logs do not fit one .rrd", where=folder, expected="a folder")
-        targets = [folder / name for name in names]
-    elif save is not None and save.is_dir():
-        targets = [save / names[0]]
-    else:
-        targets = [save or Path(names[0])]
-    if len(set(targets)) < len(targets):
-        raise ConfigError("two logs have the same name", where=save or Path(), expected="names of their own")
-    if len(logs) > 1:
-        _make(targets[0].parent)
-    with ExitStack() as stack:  # every target is refused before the first is written, and none is left alone
-        opened = [stack.enter_context(Target(target, overwrite=overwrite)) for target in targets]
-        for data, target in zip(logs, opened, strict=True):
-            target.write(rrd(data))
-    listed = " ".join(str(target) for target in targets)
-    return f"Saved {listed}. Open with: rerun {listed}"
+    if not has_display():
+        raise _trouble("there is no display here")
+    port = free_port()
+    process = run("--port", str(port), "--memory-limit", MEMORY_LIMIT, "--hide-welcome-screen")
+    VIEWERS.append(process)
+    if not listens(process, port, STARTS_S):
+        if process.poll() is not None:
+            raise _stopped(process)
+        process.terminate()
+        raise _trouble(f"the viewer did not listen within {STARTS_S:g} s")
+    return Viewer(process, Peer(f"{connect.PLAIN}://127.0.0.1:{port}{connect.PATH}", version()))
 
 
-def _make(folder: Path) -> None:
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise ConfigError(f"the folder cannot be made ({error.strerror})", where=folder) from error
+def run(*arguments: str) -> subprocess.Popen[bytes]:
+    """Rerun's own program, silent, reachable from this machine only and alive after us.
 
-
-def _open(logs: Sequence[RunData]) -> str:
-    """Opens a viewer of our own and sends the logs; an empty string, or what went wrong."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port = probe.getsockname()[1]
-    arguments = ["--bind", "127.0.0.1", "--port", str(port), "--memory-limit", MEMORY_LIMIT, "--hide-welcome-screen"]
+    Raises:
+        ConfigError: it is missing or the system does not run it.
+    """
     quiet: Mapping[str, Any] = {"stdin": subprocess.DEVNULL, "stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
     try:
-        viewer = subprocess.Popen([str(binary()), *arguments], **quiet, start_new_session=True)
+        return subprocess.Popen([str(binary()), "--bind", "127.0.0.1", *arguments], **quiet, start_new_session=True)
     except OSError as error:
-        return f"The viewer cannot be started ({error.strerror})."
-    VIEWERS.append(viewer)
-    if not _answers(viewer, port):
-        if viewer.poll() is None:
-            viewer.terminate()
-            return f"The viewer did not answer within {VIEWER_STARTS_S:g} s."
-        return f"The viewer stopped at once (exit code {viewer.returncode})."
-    for data in logs:
-        recording = stream(data)
-        recording.connect_grpc(f"rerun+http://127.0.0.1:{port}/proxy", default_blueprint=blueprint(data))
-        log(data, recording)
-        try:
-            recording.flush(timeout_sec=FLUSH_S)
-        except (RuntimeError, ValueError) as error:
-            return f"The viewer stopped listening ({error})."
-        recording.disconnect()
-    return ""
+        raise _trouble(f"the viewer cannot be started ({error.strerror})") from error
 
 
-def _answers(viewer: subprocess.Popen[bytes], port: int) -> bool:
-    """Whether the viewer listens before it dies or the time is up."""
-    end = time.monotonic() + VIEWER_STARTS_S
-    while time.monotonic() < end and viewer.poll() is None:
-        with socket.socket() as probe:
-            probe.settimeout(0.2)
-            if probe.connect_ex(("127.0.0.1", port)) == 0:
+def listens(process: subprocess.Popen[bytes], port: int, within_s: float) -> bool:
+    """Whether a program listens on a port of this machine before it dies or the time is up."""
+    end = time.monotonic() + within_s
+    while time.monotonic() < end and process.poll() is None:
+        with socket.socket() as line:
+            line.settimeout(0.2)
+            if line.connect_ex(("127.0.0.1", port)) == 0:
                 return True
-        time.sleep(0.05)
+        time.sleep(0.02)
     return False
+
+
+def free_port() -> int:
+    """A port of this machine on which nobody listened a moment ago."""
+    with socket.socket() as line:
+        line.bind(("127.0.0.1", 0))
+        return int(line.getsockname()[1])
 
 
 def binary() -> Path:
@@ -159,3 +147,16 @@ def binary() -> Path:
     spec = importlib.util.find_spec("rerun_cli")  # comes with rerun-sdk
     folders = list(spec.submodule_search_locations or ()) if spec else [""]
     return Path(folders[0]) / ("rerun.exe" if sys.platform == "win32" else "rerun")
+
+
+def sentence(error: ConfigError) -> str:
+    """What went wrong as the beginning of what is said."""
+    return f"{error.what[0].upper()}{error.what[1:]}. "
+
+
+def _trouble(what: str) -> ConfigError:
+    return ConfigError(what, where="view", fix="Use --save for a file, or --web for a browser")
+
+
+def _stopped(process: subprocess.Popen[bytes]) -> ConfigError:
+    return _trouble(f"the viewer stopped at once (exit code {process.returncode})")

@@ -1,0 +1,54 @@
+"""Which rows of a long curve or path to draw, so that nothing a person would see is lost."""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Float64, Int64
+
+MOST = 2_000_000  # rows of a curve: up to here it is drawn whole (two hours and three quarters at 200 Hz)
+MOST_IN_3D = 20_000  # rows of a path: the screen has no more pixels along it
+
+Rows = Int64[np.ndarray, " m"]
+
+
+def curve_rows(values: Float64[np.ndarray, "n k"], most: int = MOST) -> Rows:
+    """Rows of a curve to draw, at most `most`, in order: all, or of equal buckets the lowest and highest of every column.
+
+    The first and the last row are always among them; of a bucket with rows that are not a number one such row, so that a hole
+    stays a hole. `most` is at least 2 k + 3.
+    """
+    n, columns = values.shape
+    if n <= most:
+        return np.arange(n)
+    buckets = max(1, (most - 2) // (2 * columns + 1))
+    size = -(-n // buckets)
+    starts = np.arange(0, n, size)
+    padded = np.full((columns, len(starts) * size), np.nan)  # by column: what lies side by side is searched many times faster
+    padded[:, :n] = values.T
+    cut = padded.reshape(columns, len(starts), size)
+    hole = np.isnan(cut)
+    drawn = np.zeros(padded.shape[1], dtype=bool)
+    drawn[[0, n - 1]] = True
+    for least in (np.where(hole, np.inf, cut).argmin(axis=2), np.where(hole, -np.inf, cut).argmax(axis=2)):
+        drawn[starts + least] = True
+    holes = np.any(hole, axis=0)
+    drawn[(starts + holes.argmax(axis=1))[np.any(holes, axis=1)]] = True
+    rows: Rows = np.flatnonzero(drawn[:n])
+    return rows
+
+
+def path_rows(p_wb: Float64[np.ndarray, "n 3"], most: int = MOST_IN_3D) -> Rows:
+    """Rows of a path to draw, at most `most`, in order: all, or half of them even in time and half even along the path.
+
+    So a row left out follows one that is drawn by less than 2 / (most - 2) of the path's length and of its rows: a fast stretch
+    keeps its shape, and so does a small one beside a path that left for kilometres. The first and the last row are always among
+    them.
+    """
+    n = len(p_wb)
+    if n <= most:
+        return np.arange(n)
+    travelled = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(p_wb, axis=0), axis=1))])
+    half = most // 2
+    along = np.searchsorted(travelled, np.linspace(0.0, travelled[-1], half))
+    rows: Rows = np.unique(np.concatenate([np.linspace(0, n - 1, most - half).round().astype(np.int64), along]))
+    return rows

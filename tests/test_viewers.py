@@ -1,0 +1,64 @@
+"""A viewer that is not there is said: a test that cannot look fails in CI and is skipped, loudly, elsewhere."""
+
+from __future__ import annotations
+
+import runpy
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+VIEWERS = SimpleNamespace(**runpy.run_path(str(Path(__file__).with_name("viewers.py"))))
+
+
+@pytest.fixture(params=["browser", "driver"])
+def hidden(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> str:
+    """What tests look with, out of their sight."""
+    monkeypatch.setenv("PATH", str(tmp_path))
+    monkeypatch.setenv("VK_ICD_FILENAMES", str(tmp_path / "no_driver.json"))
+    monkeypatch.delenv("VK_DRIVER_FILES", raising=False)
+    return str(request.param)
+
+
+def look(what: str) -> None:
+    with {"browser": VIEWERS.chromium, "driver": VIEWERS.native}[what]():
+        raise AssertionError("there is nothing to look with")
+
+
+def test_in_ci_a_missing_viewer_fails_the_test_and_names_the_package(hidden: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("CI", "true")
+    with pytest.raises(pytest.fail.Exception, match=rf"no {hidden} .*apt-get install .*{VIEWERS.PACKAGES[hidden][0]}"):
+        look(hidden)
+
+
+def test_elsewhere_a_missing_viewer_skips_the_test_and_names_the_package(hidden: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("CI", raising=False)
+    with pytest.raises(pytest.skip.Exception, match=rf"NOT LOOKED AT: .*apt-get install .*{VIEWERS.PACKAGES[hidden][0]}"):
+        look(hidden)
+
+
+def test_a_driver_that_the_environment_chooses_is_taken(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    (tmp_path / "mine.json").touch()
+    monkeypatch.setenv("VK_DRIVER_FILES", str(tmp_path / "mine.json"))
+    assert VIEWERS.driver() == tmp_path / "mine.json"
+
+
+def test_a_viewer_that_dies_is_asked_once_more_and_one_that_shows_the_wrong_thing_never(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def die(viewer: Any) -> None:
+        asked.append(viewer)
+        viewer.process.kill()
+        viewer.process.wait()
+        raise ConnectionError
+
+    def wrong(viewer: Any) -> None:
+        asked.append(viewer)
+        raise AssertionError("no such curve")
+
+    for job, raises, times in ((die, VIEWERS.DiedError, 2), (wrong, AssertionError, 1)):
+        asked: list[Any] = []
+        with pytest.raises(raises):
+            VIEWERS.seen(job)
+        assert len(asked) == times
