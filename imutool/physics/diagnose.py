@@ -17,6 +17,7 @@ from imutool.mcap_io.fields import others, read_field
 from imutool.mcap_io.read import read as read_log
 from imutool.physics import stamps, unnamed
 from imutool.physics.any_signal import diagnose_signal
+from imutool.physics.apart import ANOTHER_MOTION, remarks, shared
 from imutool.physics.diagnosis import UNITS, Curve, Diagnosis, Estimate, Finding, HeldOut, Traces, Unexplained
 from imutool.physics.discover import Discovery, Judged, discover
 from imutool.physics.effects import _catalogue
@@ -24,7 +25,7 @@ from imutool.physics.effects._forward import Physics
 from imutool.physics.fit import Chosen, Fit, Weighed, derivatives, expected, fit
 from imutool.physics.locate import located
 from imutool.physics.motion import smooth_motion
-from imutool.physics.pair import LEAST_S, Pair, with_simulation, with_truth
+from imutool.physics.pair import LEAST_S, Pair, of_one_motion, with_simulation, with_truth
 from imutool.physics.reference import wrong_for_moments
 from imutool.physics.unnamed import unit
 from imutool.physics.whitening import Band, level, whitener
@@ -62,7 +63,8 @@ def diagnose(
     """What separates recordings from a simulation, or from what their own true poses say.
 
     Several recordings share the physics; each has a constant bias of its own. `signals` are other fields that one recording and
-    its simulation both hold (`TOPIC.field`), compared in the same way.
+    its simulation both hold (`TOPIC.field`), compared in the same way. A simulation of another motion is compared by what its
+    own true poses say of it (`imutool.physics.apart`).
 
     Raises:
         ConfigError, LogError: a log cannot be read, or has no such topic; signals without a simulation, or of several logs.
@@ -72,8 +74,14 @@ def diagnose(
     if signals and (sim is None or len(reals) != 1):
         raise ConfigError("--signal compares one recording with its simulation", where="--signal", fix="Give one log and --sim")
     say(0, 4, "reading")
+    recordings = [read_log(real, imu=imu, truth=truth) for real in reals]
     simulated = None if sim is None else read_log(sim, imu=imu)
-    pairs = [_unclipped(pair) for real in reals for pair in _pairs(read_log(real, imu=imu, truth=truth), simulated, truth)]
+    known: tuple[Finding, ...] = ()
+    if sim is not None and simulated is not None and simulated.truths and _moves_apart(recordings, simulated, signals):
+        say(0, 4, "the simulation, of another motion")
+        known, simulated = diagnose([sim], imu=imu).findings, None
+    apart = sim is not None and simulated is None
+    pairs = [_unclipped(pair) for recording in recordings for pair in _pairs(recording, simulated, truth)]
     say(1, 4, "noise")
     candidates = _candidates(pairs)
     logs = [_weighed(pair, candidates) for pair in pairs]
@@ -81,7 +89,9 @@ def diagnose(
     moments = wrong_for_moments(logs)
     found = discover(logs, () if moments[0] else candidates, () if moments[0] else later(pairs))
     say(3, 4, "locating")
-    told = _told(logs, found, [str(real) for real in reals], None if sim is None else str(sim))
+    told = _told(logs, found, [str(real) for real in reals], None if sim is None else str(sim), known)
+    if apart:
+        told = replace(told, remarks=(ANOTHER_MOTION, *told.remarks))
     told = replace(told, findings=(*moments[0], *told.findings), located=tuple(moments[1]) or told.located)
     for signal in signals:
         assert sim is not None
@@ -109,6 +119,29 @@ def measured(
     candidates = _candidates(pairs)
     begun = tuple((one, one.nothing.astype(float)) for one in _catalogue.physics(effects))
     return fit([_weighed(pair, candidates) for pair in pairs], begun, part="all")
+
+
+def _moves_apart(reals: Sequence[Recording], sim: Recording, signals: Sequence[str]) -> bool:
+    """Whether the simulation is of another motion than every recording, which all have true poses.
+
+    Raises:
+        DataError: it is of the motion of some only, or other signals are to be compared with it.
+    """
+    of_one = [of_one_motion(real.imu, sim.imu) for real in reals]
+    if all(of_one) or not all(real.truths for real in reals):
+        return False
+    if any(of_one):
+        raise DataError(
+            "the simulation is of the same motion as some recordings only",
+            where=sim.name,
+            expected="one motion, or as many as logs",
+            fix=f"Diagnose apart: {', '.join(real.name for real, same in zip(reals, of_one, strict=True) if same)}",
+        )
+    if signals:
+        raise DataError(
+            "--signal compares one motion, and the simulation is of another", where=sim.name, fix="Leave --signal out"
+        )
+    return True
 
 
 def _with_signal(told: Diagnosis, real: Place, sim: Place, signal: str) -> Diagnosis:
@@ -207,21 +240,27 @@ def _weighed(pair: Pair, candidates: Sequence[Physics]) -> Weighed:
 # ── what is told ──
 
 
-def _told(logs: Sequence[Weighed], found: Discovery, reals: Sequence[str], sim: str | None) -> Diagnosis:
-    """Findings with what they bring, where the misfit lies, and what is left."""
+def _told(
+    logs: Sequence[Weighed], found: Discovery, reals: Sequence[str], sim: str | None, known: Sequence[Finding]
+) -> Diagnosis:
+    """Findings with what they bring, where the misfit lies, and what is left; what is `known` of a simulation is expected."""
     pairs = [log.pair for log in logs]
     floor = _floor(logs)
-    before = [_with(pair, ()) for pair in pairs]
     after = [_with(pair, found.fitted.chosen) for pair in pairs]  # held-out time stays unseen
     told = [_finding(logs, found, one, floor) for one in found.judged]
-    findings = [one for one in told if one.share > INEXACT]
-    findings += stamps.saturated(pairs, after, found.tried) + stamps.dropped(pairs) + stamps.rounded(pairs, floor)
+    all_found = [one for one in told if one.share > INEXACT]
+    all_found += stamps.saturated(pairs, after, found.tried) + stamps.dropped(pairs) + stamps.rounded(pairs, floor)
+    findings = [one for one in all_found if not shared(one, known)]
+    expected_too = {judged.physics.name for judged, one in zip(found.judged, told, strict=True) if shared(one, known)}
+    before = [_with(pair, tuple(one for one in found.fitted.chosen if one[0].name in expected_too)) for pair in pairs]
     p_values = {
         signal: min((one.p_value for one in findings if one.effect != JITTER and one.signal in (signal, "both")), default=1.0)
         for signal in ("gyro", "accel")
     }
     stamped = _with(pairs[0], tuple(one for one in found.fitted.chosen if one[0].name == JITTER))
-    misfit = _converted(after[0], findings) - stamped  # where stamps are wrong, signals are not
+    misfit = _converted(after[0], findings) - (
+        before[0] if expected_too else stamped
+    )  # where stamps are wrong, signals are not
     places = located(pairs[0].stamp_s, misfit, floor, _variables(pairs[0]), p_values)
     unexplained = _unexplained(pairs, after, floor)
     if not findings:  # nothing has been found; where something is left all the same, it is said where
@@ -241,7 +280,7 @@ def _told(logs: Sequence[Weighed], found: Discovery, reals: Sequence[str], sim: 
             )
         ),
         unexplained=unexplained,
-        remarks=tuple(_remarks(pairs)),
+        remarks=(*_remarks(pairs), *remarks(all_found, known)),
         closer={signal: _held_out(pairs, before, after, k, UNITS[signal]) for k, signal in enumerate(("gyro", "accel"))},
         traces=tuple(
             Traces(pair.name, pair.stamp_s, pair.real, b, a, pair.held_out, pair.q_wb_wxyz)

@@ -73,13 +73,25 @@ def with_simulation(real: Recording, sim: Recording) -> Pair:
     Raises:
         DataError: the two share too little time, or are not of one motion.
     """
-    shift_s = _shift(real.imu, sim.imu, real.name)
+    shift_s = _shift(real.imu, sim.imu)
+    if shift_s is None:
+        raise DataError(
+            "the simulation turns otherwise than the recording",
+            where=real.name,
+            expected="one motion, or true poses in both logs",
+            fix="Leave --sim out to compare the recording with its own true poses",
+        )
     start_ns = int(real.imu.t_ns[0])
     t_sim = seconds(sim.imu.t_ns, start_ns) - shift_s  # on the recording's clock
     stamp_s = seconds(real.imu.t_ns, start_ns)
     felt, noise = _simulated(t_sim, sim, shift_s, start_ns, real)
     inside = (stamp_s >= felt.t_s[0]) & (stamp_s <= felt.t_s[-1])
     return _pair(real, felt, stamp_s, inside, "simulation", shift_s, noise)
+
+
+def of_one_motion(real: Imu, sim: Imu) -> bool:
+    """Whether a recording and a simulation turn alike, whatever their clocks say."""
+    return _shift(real, sim) is not None
 
 
 def with_truth(real: Recording, felt: Felt, start_ns: int, band_hz: float) -> Pair:
@@ -243,25 +255,17 @@ def wiener(x: Float64[np.ndarray, " n"]) -> Float64[np.ndarray, " n"]:
     return line + np.fft.irfft(gain * spectrum, n=len(mirrored))[:n]
 
 
-def _shift(real: Imu, sim: Imu, where: str) -> float:
+def _shift(real: Imu, sim: Imu) -> float | None:
     """What has to be added to the recording's times to get the simulation's (s): 0 where the two clocks share an epoch.
 
-    Raises:
-        DataError: not of one motion.
+    None where the two are not of one motion.
     """
     overlap = (min(real.t_ns[-1], sim.t_ns[-1]) - max(real.t_ns[0], sim.t_ns[0])) * 1e-9
     shared = overlap > min(LEAST_S, 0.5 * min(real.duration_s, sim.duration_s))
     lag_s, alike = _lag(real, sim)
     if shared and abs(lag_s) < FARTHEST_S:
         return 0.0
-    if alike < ALIKE:
-        raise DataError(
-            f"the simulation turns otherwise than the recording (correlation {alike:.2f} at best)",
-            where=where,
-            expected="one motion",
-            fix="Leave --sim out to compare the recording with its own true poses",
-        )
-    return lag_s
+    return lag_s if alike >= ALIKE else None
 
 
 def _lag(real: Imu, sim: Imu) -> tuple[float, float]:
