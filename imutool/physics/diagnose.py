@@ -283,7 +283,7 @@ def _told(
         remarks=(*_remarks(pairs), *remarks(all_found, known)),
         closer={signal: _held_out(pairs, before, after, k, UNITS[signal]) for k, signal in enumerate(("gyro", "accel"))},
         traces=tuple(
-            Traces(pair.name, pair.stamp_s, pair.real, b, a, pair.held_out, pair.q_wb_wxyz)
+            Traces(pair.name, pair.stamp_s, pair.real, b, a, pair.held_out, pair.truth, expected(pair, ()))
             for pair, b, a in zip(pairs, before, after, strict=True)
         ),
     )

@@ -12,6 +12,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float64
 
+from imutool.recording import Poses
+
 SCHEMA = "imutool.diagnosis/1"
 UNITS = {"gyro": "rad/s", "accel": "m/s^2"}
 
@@ -104,7 +106,8 @@ class Traces:
     before: Float64[np.ndarray, "n 6"]  # the simulation and a constant bias
     after: Float64[np.ndarray, "n 6"]  # with the findings modelled
     held_out: Bool[np.ndarray, " n"]
-    q_wb_wxyz: Float64[np.ndarray, "n 4"] | None = None
+    truth: Poses | None = None  # at these samples
+    ideal: Float64[np.ndarray, "n 6"] | None = None  # what a perfect sensor would have read
 
 
 @dataclass(frozen=True, eq=False)

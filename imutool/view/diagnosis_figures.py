@@ -144,12 +144,12 @@ def against_attitude(d: Diagnosis) -> str | None:
     """Mean residual in bins of how far its axis rises above the horizon; nothing where no attitude is known."""
 
     def variable(trace: Traces, signal: str, axis: int) -> Line:
-        assert trace.q_wb_wxyz is not None, "looked at before"
-        up_b = Rotation.from_quat(trace.q_wb_wxyz, scalar_first=True).apply([0.0, 0.0, 1.0], inverse=True)
+        assert trace.truth is not None, "looked at before"
+        up_b = Rotation.from_quat(trace.truth.q_wb_wxyz, scalar_first=True).apply([0.0, 0.0, 1.0], inverse=True)
         rise: Line = np.degrees(np.arcsin(np.clip(up_b[:, axis], -1.0, 1.0)))
         return rise
 
-    if any(trace.q_wb_wxyz is None for trace in d.traces):
+    if any(trace.truth is None for trace in d.traces):
         return None
     return _binned(d, variable, dict.fromkeys(SIGNALS, "{} above the horizon (°)"), "attitude")
 

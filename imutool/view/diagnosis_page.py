@@ -26,6 +26,7 @@ from imutool.physics.conclusion import (
 from imutool.physics.diagnosis import SCHEMA, UNITS, Diagnosis, Finding, Traces
 from imutool.physics.quantity import SHOWN, each, grouped, symbol
 from imutool.view import diagnosis_figures as figures
+from imutool.view import diagnosis_paths
 
 BAR_PIXELS = 80.0
 MOST_LOGS = 4  # that are drawn one by one; what is pooled takes all
@@ -203,6 +204,12 @@ def _before_and_after(d: Diagnosis) -> Iterator[str]:
         )
     else:
         yield '<p class="note">No unseen stretch is long enough for a spectrum.</p>'
+    paths = diagnosis_paths.paths(d)
+    if paths is not None:
+        true = '<span class="key" style="background: var(--ink); opacity: 0.4"></span>true'
+        yield _figure(
+            paths, "p", f"Integrated from the true start of each stretch of {over}; drift as root mean square.{true}{both}"
+        )
     bands = "means in bins, with two standard errors"
     if rate is not None:
         yield _figure(rate, "t", f"Against turning rate over {over}: {bands}. {both}")

@@ -262,7 +262,7 @@ def test_spectra_and_means_are_over_unseen_time_alone(figure: object) -> None:
 def test_without_attitude_or_a_long_enough_stretch_it_says_so() -> None:
     (trace,) = MADE.LATE.traces
     held_out = np.arange(len(trace.t_s)) % 100 < 20  # a tenth of a second at a time
-    d = replace(MADE.LATE, traces=(replace(trace, q_wb_wxyz=None, held_out=held_out),))
+    d = replace(MADE.LATE, traces=(replace(trace, truth=None, held_out=held_out),))
     said = Page(html(d)).text
     assert "No attitude is known" in said
     assert "No unseen stretch is long enough for a spectrum" in said
