@@ -10,7 +10,6 @@ from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Float64
-from scipy.ndimage import uniform_filter1d
 
 from imutool.errors import ConfigError, DataError
 from imutool.mcap_io.fields import others, read_field
@@ -23,9 +22,9 @@ from imutool.physics.discover import Discovery, Judged, discover
 from imutool.physics.effects import _catalogue
 from imutool.physics.effects._forward import Physics
 from imutool.physics.fit import Chosen, Fit, Weighed, derivatives, expected, fit
-from imutool.physics.locate import located
 from imutool.physics.motion import smooth_motion
 from imutool.physics.pair import LEAST_S, Pair, of_one_motion, with_simulation, with_truth
+from imutool.physics.places import of_findings, of_what_is_left
 from imutool.physics.reference import wrong_for_moments
 from imutool.physics.unnamed import unit
 from imutool.physics.whitening import Band, level, whitener
@@ -35,7 +34,6 @@ from imutool.recording import Recording
 KNOWN_BAND = 0.45  # of where smoothing halves a motion: there it takes a per cent
 ORDER_SIM, ORDER_TRUTH = 6, 12  # of the autoregression: a sensor's noise is nearly white, that of differentiated poses is not
 RIDGE = 1e-8
-SLOW = 9  # samples of a running mean
 JITTER = "timestamp_jitter"
 INEXACT = 1e-5  # of a misfit's power: 0.3 % of its size, as which the inexactness of a much larger effect's model may pass
 SHOWN_BY_SAMPLES = {"saturation", "quantization"}  # without any fit: `stamps`
@@ -257,16 +255,14 @@ def _told(
         signal: min((one.p_value for one in findings if one.effect != JITTER and one.signal in (signal, "both")), default=1.0)
         for signal in ("gyro", "accel")
     }
-    stamped = _with(pairs[0], tuple(one for one in found.fitted.chosen if one[0].name == JITTER))
-    misfit = _converted(after[0], findings) - (
-        before[0] if expected_too else stamped
-    )  # where stamps are wrong, signals are not
-    places = located(pairs[0].stamp_s, misfit, floor, _variables(pairs[0]), p_values)
+    quiet = expected_too | {JITTER}  # where stamps are wrong, signals are not
+    still = [_with(pair, tuple(one for one in found.fitted.chosen if one[0].name in quiet)) for pair in pairs]
     unexplained = _unexplained(pairs, after, floor)
-    if not findings:  # nothing has been found; where something is left all the same, it is said where
+    if findings:
+        places = of_findings(pairs, still, after, floor, findings, p_values)
+    else:  # where something is left all the same, it is said where
         odd = {name for name, one in unexplained.items() if not one.white}
-        here = located(pairs[0].stamp_s, _slow(pairs[0].real - after[0]), floor / np.sqrt(SLOW), _variables(pairs[0]), {})
-        places = [place for place in here if place.signal in odd]
+        places = [place for place in of_what_is_left(pairs, after, floor) if place.signal in odd]
     return Diagnosis(
         real=tuple(reals),
         sim=sim,
@@ -289,24 +285,6 @@ def _told(
     )
 
 
-def _converted(there: Float64[np.ndarray, "n 6"], findings: Sequence[Finding]) -> Float64[np.ndarray, "n 6"]:
-    """As a converter gives it whose limits and steps were found."""
-    out = there.copy()
-    told = {name: estimate.value for one in findings for name, estimate in one.parameters.items()}
-    for k, signal in enumerate(("gyro", "accel")):
-        part, limit, lsb = slice(3 * k, 3 * k + 3), told.get(f"{signal}_limit"), told.get(f"{signal}_lsb")
-        if limit is not None and np.isfinite(limit):
-            out[:, part] = np.clip(out[:, part], -limit, limit)
-        if lsb is not None:
-            out[:, part] = lsb * np.rint(out[:, part] / lsb)
-    return out
-
-
-def _slow(left: Float64[np.ndarray, "n 6"]) -> Float64[np.ndarray, "n 6"]:
-    """A running mean: what is left without most of its noise."""
-    return np.asarray(uniform_filter1d(left, SLOW, axis=0))
-
-
 def _with(pair: Pair, chosen: Chosen) -> Float64[np.ndarray, "n 6"]:
     """What is expected, with the constant that suits it best."""
     there = expected(pair, chosen)
@@ -321,24 +299,6 @@ def _floor(logs: Sequence[Weighed]) -> Float64[np.ndarray, "6"]:
         response = np.array([np.abs(np.fft.rfft(a, 512)) ** 2 for a in log.whiten.filters])
         variances.append(log.whiten.std**2 * (1.0 / response).mean(axis=1))
     return np.asarray(np.sqrt(np.mean(variances, axis=0)))
-
-
-def _variables(pair: Pair) -> dict[str, tuple[str, Float64[np.ndarray, " n"]]]:
-    """What a regime can be of."""
-    read = pair.felt.taken(pair.stamp_s, pair.stamp_s)
-    rate, force = np.linalg.norm(read.gyro, axis=1), np.linalg.norm(read.accel, axis=1)
-    out = {
-        "angular rate": ("rad/s", rate),
-        "acceleration": ("m/s²", np.abs(force - 9.81)),
-        "angular acceleration": ("rad/s²", np.linalg.norm(read.alpha, axis=1)),
-        "time": ("s", pair.stamp_s),
-    }
-    if read.R_wb is not None:
-        out["tilt"] = ("rad", np.arccos(np.clip(read.R_wb[:, 2, 2], -1.0, 1.0)))
-    for k, axis in enumerate("xyz"):
-        out[f"rate about {axis}"] = ("rad/s", np.abs(read.gyro[:, k]))
-        out[f"force along {axis}"] = ("m/s²", np.abs(read.accel[:, k]))
-    return out | {name: ("", values) for name, values in pair.channels.items()}
 
 
 def _unseen(pair: Pair, there: Float64[np.ndarray, "n 6"]) -> Float64[np.ndarray, "m 6"]:
