@@ -36,6 +36,7 @@ from imutool.recording import Imu, seconds
 from imutool.turn_on import TurnOn, following
 
 SUFFIX = "/debiased"
+BLOCK = 1 << 14  # samples
 CLEAN_RECORD = "imutool_clean"
 
 
@@ -61,6 +62,23 @@ def apply(model: BiasModel, start: TurnOn, imu: Imu) -> Debiased:
     """A model over samples in memory, from their first on."""
     bias = start.stream(model)(seconds(imu.t_ns, int(imu.t_ns[0])), imu.gyro, imu.accel)
     return Debiased(Imu(imu.t_ns, imu.gyro - bias[:, :3], imu.accel - bias[:, 3:]), bias)
+
+
+def apply_with_std(model: BiasModel, start: TurnOn, imu: Imu) -> tuple[Debiased, Float64[np.ndarray, "n 6"]]:
+    """As `apply`, and one standard deviation of the bias at each sample, gyro (rad/s) then accel (m/s²): `imutool.certainty`.
+
+    In blocks, as a log is debiased: a covariance is 288 bytes.
+    """
+    stream = start.stream(model)
+    certainty = Certainty(model, start, stream)
+    t_s = seconds(imu.t_ns, int(imu.t_ns[0]))
+    bias, std = np.empty((len(imu), 6)), np.empty((len(imu), 6))
+    for first in range(0, len(imu), BLOCK):
+        rows = slice(first, first + BLOCK)
+        bias[rows] = stream(t_s[rows], imu.gyro[rows], imu.accel[rows])
+        covariance = certainty(t_s[rows], imu.gyro[rows], imu.accel[rows])
+        std[rows] = np.sqrt(covariance.diagonal(axis1=1, axis2=2))
+    return Debiased(Imu(imu.t_ns, imu.gyro - bias[:, :3], imu.accel - bias[:, 3:]), bias), std
 
 
 class OnlineDebiaser:

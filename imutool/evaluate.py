@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from jaxtyping import Bool
 
 from imutool import metrics
 from imutool.bias import static
@@ -61,7 +62,7 @@ def evaluate(
     results = []
     for name, found, start in runs(recording, models, init, log, smooth=smooth):
         integrated, true, valid = along_truth(found.imu, recording.truth, recording.name)
-        drifted = _drift(found.imu, recording.truth)
+        drifted = _drift(integrated, true, valid)
         estimates = {PURE: integrated}
         if zupt:
             estimates[ZUPT] = with_stops(_over(found.imu, true), Start.of(true), _left(start), smooth=smooth)
@@ -86,12 +87,12 @@ def evaluate(
     return results
 
 
-def _drift(imu: Imu, truth: Poses) -> dict[str, float | None]:
+def _drift(path: Poses, truth: Poses, valid: Bool[np.ndarray, " n"]) -> dict[str, float | None]:
     """What windows that each start from the truth drift by: root mean squares, none where no window fits."""
-    turned, faster = drift(imu, truth, DRIFT_S)
-    if not len(turned):
+    found = drift(path, truth, valid, DRIFT_S)
+    if not len(found.orientation_rad):
         return {"drift_orientation_deg": None, "drift_velocity_m_s": None, "drift_window_s": DRIFT_S}
-    rms = [float(np.sqrt(np.mean(errors**2))) for errors in (turned, faster)]
+    rms = [float(np.sqrt(np.mean(errors**2))) for errors in (found.orientation_rad, found.velocity_m_s)]
     return {"drift_orientation_deg": float(np.degrees(rms[0])), "drift_velocity_m_s": rms[1], "drift_window_s": DRIFT_S}
 
 
@@ -113,9 +114,18 @@ def runs(
     """The samples as recorded, then as each model corrects them: name, samples and bias, and the start."""
     refuse_smooth(init, smooth)
     yield RAW, Debiased(recording.imu, np.zeros((len(recording.imu), 6))), None
+    for name, model, start in started(recording, models, init, where, smooth=smooth):
+        yield name, apply(model, start, recording.imu), start
+
+
+def started(
+    recording: Recording, models: Sequence[str | Path], init: str, where: str | Path, *, smooth: bool = False
+) -> Iterator[tuple[str, BiasModel, TurnOn]]:
+    """Each model asked for, its name, and the start it gets in this recording."""
+    refuse_smooth(init, smooth)
     for given in models:
         model, start = _model_and_start(given, recording, init, where, smooth)
-        yield str(model.card.get("name", model.method)), apply(model, start, recording.imu), start
+        yield str(model.card.get("name", model.method)), model, start
 
 
 def _model_and_start(

@@ -15,10 +15,10 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float64
+from jaxtyping import Bool, Float64, Int64
 
 from imutool.errors import DataError, NumericsError
-from imutool.recording import GAP_FACTOR, GRAVITY_M_S2, MIN_GAP_S, Imu, Poses, seconds
+from imutool.recording import GAP_FACTOR, GRAVITY_M_S2, MIN_GAP_S, Imu, Poses, Times, seconds
 
 GRAVITY_W = (0.0, 0.0, -GRAVITY_M_S2)
 VELOCITY_WINDOW_S = 0.2
@@ -96,44 +96,88 @@ def along_truth(imu: Imu, truth: Poses, where: str) -> tuple[Poses, Poses, Bool[
         DataError: the truth is known at fewer than two samples.
         NumericsError: the numbers overflow.
     """
-    true, valid = with_velocity(truth).at(imu.t_ns)
+    rows, true, valid = stretch_with_truth(imu.t_ns, truth, where)
+    return dead_reckon(imu.rows(rows), Start.of(true)), true, valid
+
+
+def stretch_with_truth(t_ns: Times, truth: Poses, where: str) -> tuple[slice, Poses, Bool[np.ndarray, " n"]]:
+    """The rows from the first stamp at which the truth is known to the last, the truth with its velocity there, and where it is.
+
+    Raises:
+        DataError: the truth is known at fewer than two stamps.
+    """
+    true, valid = with_velocity(truth).at(t_ns)
     known = np.flatnonzero(valid)
     if len(known) < 2:
         raise DataError("IMU and true poses share fewer than two samples", where=where, expected="an overlap")
     rows = slice(int(known[0]), int(known[-1]) + 1)
-    true = true.rows(rows)
-    return dead_reckon(imu.rows(rows), Start.of(true)), true, valid[rows]
+    return rows, true.rows(rows), valid[rows]
 
 
-def drift(imu: Imu, truth: Poses, window_s: float = 5.0) -> tuple[Float64[np.ndarray, " m"], Float64[np.ndarray, " m"]]:
-    """How far integration drifts in a window: errors of orientation (rad) and velocity (m/s) at the end of each.
+class Drifted(NamedTuple):
+    """Errors of integrations that each start from the truth: orientation (rad), velocity (m/s) and position (m)."""
+
+    orientation_rad: Float64[np.ndarray, " m"]
+    velocity_m_s: Float64[np.ndarray, " m"]
+    position_m: Float64[np.ndarray, " m"]
+
+
+def drifted(path: Poses, truth: Poses, first: Int64[np.ndarray, " m"], last: Int64[np.ndarray, " m"]) -> Drifted:
+    """How far integrations that start from the truth at rows `first` are from it at rows `last`, all from one integration.
+
+    `path` is that of the same samples from any start, on the stamps of `truth`. Had it started from the truth at row s, all of
+    it from there on would be turned by C = R_true,s R_s^T, so that none of it is integrated again::
+
+        R'_k = C R_k
+        v'_k = v_true,s + C (v_k - v_s - g_w T) + g_w T                             T = t_k - t_s
+        p'_k = p_true,s + v_true,s T + C (p_k - p_s - v_s T - g_w S) + g_w S        S = (T^2 - sum dt^2) / 2
+
+    S being the rule's own double sum of dt, so that the answer is that of `dead_reckon` over each window, to rounding.
+
+    Raises:
+        DataError: one of the two carries no velocity, or they are on different stamps.
+    """
+    if path.v_w is None or truth.v_w is None or not np.array_equal(path.t_ns, truth.t_ns):
+        raise DataError("path and truth do not match", expected="poses with velocity on the same stamps")
+    t = seconds(path.t_ns, int(path.t_ns[0]))
+    squares = np.concatenate([[0.0], np.cumsum(np.diff(t) ** 2)])
+    T = (t[last] - t[first])[:, None]
+    g_T, g_S = np.array(GRAVITY_W) * T, np.array(GRAVITY_W) * (0.5 * (T**2 - (squares[last] - squares[first])[:, None]))
+    (q, p, v), (q_true, p_true, v_true) = ((poses.q_wb_wxyz, poses.p_wb, poses.v_w) for poses in (path, truth))
+    q_c = _multiply(q_true[first], _inverse(q[first]))
+    apart = _multiply(_inverse(q_true[last]), _multiply(q_c, q[last]))
+    faster = v_true[first] - v_true[last] + g_T + _rotate(q_c, v[last] - v[first] - g_T)
+    further = p_true[first] - p_true[last] + v_true[first] * T + g_S
+    further += _rotate(q_c, p[last] - p[first] - v[first] * T - g_S)
+    turned = 2.0 * np.arctan2(np.linalg.norm(apart[:, 1:], axis=1), np.abs(apart[:, 0]))  # a quaternion is its negative
+    return Drifted(turned, np.linalg.norm(faster, axis=1), np.linalg.norm(further, axis=1))
+
+
+def drift(path: Poses, truth: Poses, valid: Bool[np.ndarray, " n"], window_s: float) -> Drifted:
+    """How far integration drifts in a window, at the end of each, of what `along_truth` gives.
 
     Windows follow one another through the log; each starts from the truth and counts if the truth is known at both ends and the
     IMU has no gap in between. Empty where none does.
+
+    Raises:
+        DataError: as `drifted`.
     """
-    true, valid = with_velocity(truth).at(imu.t_ns)
-    t = seconds(imu.t_ns, int(imu.t_ns[0]))
-    turned, faster = [], []
+    t = seconds(path.t_ns, int(path.t_ns[0]))
+    dt = np.diff(t)
+    gaps = np.concatenate([[0], np.cumsum(dt > GAP_FACTOR * np.median(dt))])
+    known = np.flatnonzero(valid)
+    pairs = []
     first = 0
-    while True:
-        known = np.flatnonzero(valid[first:])
-        if not len(known):
-            break
-        first += int(known[0])
+    while (next_known := np.searchsorted(known, first)) < len(known):
+        first = int(known[next_known])
         last = int(np.searchsorted(t, t[first] + window_s))
         if last >= len(t):
             break
-        rows = slice(first, last + 1)
-        if valid[last] and np.diff(t[rows]).max() <= GAP_FACTOR * imu.period_s:
-            end, goal = dead_reckon(imu.rows(rows), Start.of(true, first)), true.rows(slice(last, last + 1))
-            assert end.v_w is not None
-            assert goal.v_w is not None
-            q, q_true = end.q_wb_wxyz[-1], goal.q_wb_wxyz[0]
-            apart = min(float(np.linalg.norm(q - q_true)), float(np.linalg.norm(q + q_true)))  # a quaternion is its negative
-            turned.append(4.0 * np.arcsin(0.5 * apart))
-            faster.append(float(np.linalg.norm(end.v_w[-1] - goal.v_w[0])))
+        if valid[last] and gaps[last] == gaps[first]:
+            pairs.append((first, last))
         first = last
-    return np.array(turned), np.array(faster)
+    rows = np.array(pairs, np.int64).reshape(-1, 2)
+    return drifted(path, truth, rows[:, 0], rows[:, 1])
 
 
 def with_velocity(poses: Poses) -> Poses:
@@ -215,6 +259,11 @@ def _multiply(a: Quaternions, b: Quaternions) -> Quaternions:
     out[:, 2] = aw * by - ax * bz + ay * bw + az * bx
     out[:, 3] = aw * bz + ax * by - ay * bx + az * bw
     return out
+
+
+def _inverse(q: Quaternions) -> Quaternions:
+    """Of unit quaternions."""
+    return q * np.array([1.0, -1.0, -1.0, -1.0])
 
 
 def _normalise(q: Quaternions) -> Quaternions:

@@ -10,7 +10,7 @@ from jaxtyping import Float64, Int64
 from imutool.clean.motion import STEP_NS
 from imutool.errors import LogError
 from imutool.mcap_io.log import Log
-from imutool.recording import GRAVITY_M_S2, seconds
+from imutool.recording import GRAVITY_M_S2, Poses, seconds
 
 
 class Truth(NamedTuple):
@@ -43,6 +43,14 @@ def read_truth(log: Log) -> Truth | None:
             good = norm > 0.5
             return Truth(topic, np.concatenate(times)[good], np.concatenate(places)[good], q_wxyz[good] / norm[good, None])
     return None
+
+
+def of_poses(topic: str, poses: Poses) -> Truth | None:
+    """The same of poses that are in memory; none of fewer than three."""
+    if len(poses) < 3:
+        return None
+    keep = _thinned(poses.t_ns, -(2**62))
+    return Truth(topic, poses.t_ns[keep], poses.p_wb[keep], poses.q_wb_wxyz[keep])
 
 
 def _thinned(stamp_ns: Int64[np.ndarray, " n"], last_ns: int) -> Int64[np.ndarray, " m"]:

@@ -15,22 +15,16 @@ from imutool.fleet.robots import Compared, Outlier
 from imutool.fleet.task import Result, Settings
 from imutool.mcap_io.target import Target
 from imutool.place import Place
-from imutool.view import diagnosis_figures as figures
-from imutool.view.diagnosis_page import POLICY, STYLE, text
+from imutool.view.drawing import apart, svg
+from imutool.view.page import cards, document, text
+from imutool.view.theme import AFTER, AXIS_COLORS, UNITS
 
 MOST_ROWS = 500  # in a table: more is for the Parquet file
 MOST_NAMED = 10  # robots with an effect
 BINS = 30
-COLORS = (figures.X, figures.Y, figures.Z)
-UNIT = {"gyro": "rad/s", "accel": "m/s²"}
 TROUBLE = ("failed", "quarantined", "lost")
 OWN_STYLE = """
-.numbers { display: flex; flex-wrap: wrap; gap: 10px; margin: 12px 0; }
-.numbers div { background: var(--panel); border: 1px solid var(--grid); border-radius: 6px; padding: 8px 14px; }
-.numbers b { display: block; font-size: 20px; font-weight: 600; font-variant-numeric: tabular-nums; }
-.numbers span { color: var(--soft); font-size: 13px; }
 .failed { color: var(--before); font-weight: 600; } .quarantined, .lost { color: var(--mark); font-weight: 600; }
-@media print { tr { break-inside: avoid; } }
 """
 
 
@@ -107,14 +101,7 @@ def html(
         *_spread(seen),
         *_provenance(settings),
     ]
-    head = (
-        f'<meta charset="utf-8"><meta http-equiv="Content-Security-Policy" content="{POLICY}">'
-        '<meta name="viewport" content="width=device-width, initial-scale=1">'
-        f"<title>Fleet {text(settings.command)}: {text(source)}</title><style>{STYLE}{OWN_STYLE}</style>"
-    )
-    return (
-        f'<!DOCTYPE html>\n<html lang="en"><head>{head}</head>\n<body><main>\n' + "\n".join(body) + "\n</main></body></html>\n"
-    )
+    return document(f"Fleet {settings.command}: {source}", body, OWN_STYLE)
 
 
 def _conclusion(seen: _Seen, compared: Compared | None) -> str:
@@ -132,25 +119,21 @@ def _how_whole(seen: _Seen) -> str:
 
 
 def _numbers(seen: _Seen, seconds: float) -> Iterator[str]:
-    cards = [
+    told = [
         (f"{seen.statuses.total() - seen.statuses['skipped']:,}", "logs"),
         (size(seen.bytes_in), "read"),
         (size(seen.bytes_out), "written"),
         (duration(seconds), "this run"),
     ]
     if seen.messages:
-        cards.append((f"{seen.messages:,}", "messages"))
+        told.append((f"{seen.messages:,}", "messages"))
     if seen.statuses["skipped"]:
-        cards.append((f"{seen.statuses['skipped']:,}", "done by an earlier run"))
+        told.append((f"{seen.statuses['skipped']:,}", "done by an earlier run"))
     if seen.seconds:
-        cards.append((f"{np.median(seen.speeds):.3g} MB/s", "of one worker, in the middle"))
+        told.append((f"{np.median(seen.speeds):.3g} MB/s", "of one worker, in the middle"))
     if seen.peak_bytes:
-        cards.append((size(seen.peak_bytes), "most memory of a worker"))
-    yield (
-        '<div class="numbers">'
-        + "".join(f"<div><b>{text(n)}</b><span>{text(what)}</span></div>" for n, what in cards)
-        + "</div>"
-    )
+        told.append((size(seen.peak_bytes), "most memory of a worker"))
+    yield cards(told)
 
 
 def _trouble(seen: _Seen) -> Iterator[str]:
@@ -224,7 +207,7 @@ def _spread(seen: _Seen) -> Iterator[str]:
         if len(values) > 1:
             rows = np.array(values)
             caption = f"Start bias of the {signal} over {len(rows)} IMUs, by axis"
-            yield _figure(_axes(rows, f"{signal} bias ({UNIT[signal]})"), f"b{k}", caption)
+            yield _figure(_axes(rows, f"{signal} bias ({UNITS[signal]})"), f"b{k}", caption)
     yield _figure(
         _one([(seen.seconds, "seconds a log"), (seen.speeds, "MB/s of one worker")], "times"), "t", "Time and speed by log"
     )
@@ -235,17 +218,17 @@ def _spread(seen: _Seen) -> Iterator[str]:
 def _axes(rows: Float64[np.ndarray, "n 3"], label: str) -> str:
     def draw(figure: Any) -> None:
         for k, axes in enumerate(figure.subplots(1, 3)):
-            _histogram(axes, rows[:, k], f"{'xyz'[k]}: {label}", COLORS[k])
+            _histogram(axes, rows[:, k], f"{'xyz'[k]}: {label}", AXIS_COLORS[k])
 
-    return figures.svg(draw, 2.2, label)
+    return svg(draw, 2.2, label)
 
 
 def _one(columns: Sequence[tuple[Sequence[float], str]], name: str) -> str:
     def draw(figure: Any) -> None:
         for axes, (values, label) in zip(np.atleast_1d(figure.subplots(1, len(columns))), columns, strict=True):
-            _histogram(axes, np.array(values), label, figures.AFTER)
+            _histogram(axes, np.array(values), label, AFTER)
 
-    return figures.svg(draw, 2.2, name)
+    return svg(draw, 2.2, name)
 
 
 def _histogram(axes: Any, values: Float64[np.ndarray, " n"], label: str, color: str) -> None:
@@ -256,8 +239,8 @@ def _histogram(axes: Any, values: Float64[np.ndarray, " n"], label: str, color: 
     axes.locator_params(axis="y", nbins=4, integer=True)
 
 
-def _figure(svg: str, prefix: str, caption: str) -> str:
-    return f"<figure>{figures.apart(svg, prefix)}<figcaption>{text(caption)}</figcaption></figure>"
+def _figure(drawn: str, prefix: str, caption: str) -> str:
+    return f"<figure>{apart(drawn, prefix)}<figcaption>{text(caption)}</figcaption></figure>"
 
 
 def _provenance(settings: Settings) -> Iterator[str]:

@@ -338,6 +338,19 @@ class Log:
             stamp_ns = cut.log_time if columns.stamp_ns is None else columns.stamp_ns
             yield ScalarBatch(cut.log_time, cut.publish_time, cut.sequence, stamp_ns, columns.values, columns.frame_id)
 
+    def decode_twist(self, topic: str, rows: records.Rows) -> Iterator[schema.TwistColumns]:
+        """Biases with their covariance from their bytes, one batch per stretch with one frame.
+
+        Raises:
+            LogError: a payload that is no such message, NaN or infinite values.
+        """
+        encoding = self.topics[topic].message_encoding
+        for part, layout in schema.runs(rows.payload, schema.TWIST, encoding):
+            cut = rows.where(part)
+            columns = schema.decode_twist(cut.payload, encoding, layout)
+            finite(cut.sequence, angular=columns.angular, linear=columns.linear, variance=columns.variance)
+            yield columns
+
     def images(self, topic: str, start_ns: int | None = None, end_ns: int | None = None) -> Iterator[tuple[int, bytes]]:
         """Stamp and encoded bytes of every image of a CompressedImage topic, in file order.
 

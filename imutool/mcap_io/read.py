@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import logging
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 
 import numpy as np
 from jaxtyping import Float64, Int64, UInt32
@@ -59,26 +60,44 @@ def read(
         LogError: no IMU or several without `imu`, no such topic, values or stamps no recording can hold, a damaged log.
     """
     with Log(path) as log:
-        imu_topic = _choose_imu(log, imu)
-        own, metadata = _own_and_user_metadata(log)
-        truths = _choose_truths(log, truth)
-        velocities = {t.name: t.metadata[VELOCITY_KEY] for t in log.topics.values() if VELOCITY_KEY in t.metadata}
-        scalars = [t.name for t in log.with_schema(SCALARS) if t.name not in velocities and t.message_encoding in ENCODINGS]
-        gather = _Gather(log, imu_topic, truths, velocities, scalars)
-        with log.named():
-            topics = gather.topics if samples is None else gather.topics[1:]
-            for topic, rows in log.rows(topics, start_ns, end_ns):
-                gather.take(topic, rows)
-        return Recording(
-            name=own.get("name", path.stem),
-            imu=gather.imu() if samples is None else samples,
-            truths=gather.truths(truth),
-            scalars=gather.scalars(),
-            frames=_frames(log, start_ns, end_ns),
-            metadata=metadata,
-            imu_topic=imu_topic,
-            source=own.get("source", ""),
-        )
+        return recording_in(log, imu=imu, truth=truth, start_ns=start_ns, end_ns=end_ns, samples=samples)
+
+
+def recording_in(
+    log: Log,
+    *,
+    imu: str | None = None,
+    truth: str | None = None,
+    start_ns: int | None = None,
+    end_ns: int | None = None,
+    samples: Imu | None = None,
+    refused: Callable[[str, LogError], None] | None = None,
+) -> Recording:
+    """As `read`, in a log that is open; poses that a recording cannot hold are left out where somebody is to be told (`refused`).
+
+    Raises:
+        LogError: as `read`.
+    """
+    imu_topic = _choose_imu(log, imu)
+    own, metadata = _own_and_user_metadata(log)
+    truths = _choose_truths(log, truth)
+    velocities = {t.name: t.metadata[VELOCITY_KEY] for t in log.topics.values() if VELOCITY_KEY in t.metadata}
+    scalars = [t.name for t in log.with_schema(SCALARS) if t.name not in velocities and t.message_encoding in ENCODINGS]
+    gather = _Gather(log, imu_topic, truths, velocities, scalars, refused)
+    with log.named():
+        topics = gather.topics if samples is None else gather.topics[1:]
+        for topic, rows in log.rows(topics, start_ns, end_ns):
+            gather.take(topic, rows)
+    return Recording(
+        name=own.get("name", log.path.stem),
+        imu=gather.imu() if samples is None else samples,
+        truths=gather.truths(truth),
+        scalars=gather.scalars(),
+        frames=_frames(log, start_ns, end_ns),
+        metadata=metadata,
+        imu_topic=imu_topic,
+        source=own.get("source", ""),
+    )
 
 
 def _choose_imu(log: Log, imu: str | None) -> str:
@@ -108,12 +127,21 @@ def _choose_truths(log: Log, truth: str | None) -> list[str]:
 class _Gather:
     """Collects the columns of every wanted topic in one pass over the log."""
 
-    def __init__(self, log: Log, imu: str, truths: list[str], velocities: Mapping[str, str], scalars: list[str]) -> None:
+    def __init__(
+        self,
+        log: Log,
+        imu: str,
+        truths: list[str],
+        velocities: Mapping[str, str],
+        scalars: list[str],
+        refused: Callable[[str, LogError], None] | None,
+    ) -> None:
         self.log, self.imu_topic, self.truth_topics, self.scalar_topics = log, imu, truths, scalars
         self.velocity_topics = {name: of for name, of in velocities.items() if of in truths}
         self.clocks: dict[str, Clock] = {}
         self.kept: dict[str, list[tuple[np.ndarray, ...]]] = {}  # columns, by topic
         self.left_out: set[str] = set()
+        self.refused = refused
 
     @property
     def topics(self) -> list[str]:
@@ -126,11 +154,9 @@ class _Gather:
                     finite(imu.sequence, angular_velocity=imu.gyro, linear_acceleration=imu.accel)
                     self._keep(topic, imu.sequence, imu.stamp_ns, imu.gyro, imu.accel)
         elif topic in self.truth_topics:
-            with self.log.named(topic):
-                for pose in self.log.decode_poses(topic, rows):
-                    tree = self.log.topics[topic].schema_name == schema.TF
-                    name = f"{topic}/{pose.child_frame_id.lstrip('/')}" if tree else topic
-                    self._keep(name, pose.sequence, pose.stamp_ns, pose.p_wb, pose.q_wb_wxyz)
+            if topic not in self.left_out:
+                with self._told(topic), self.log.named(topic):
+                    self._take_poses(topic, rows)
         elif topic in self.velocity_topics:
             with self.log.named(topic):
                 for velocity in self.log.decode_scalars(topic, rows):
@@ -142,6 +168,23 @@ class _Gather:
             except LogError as error:
                 logger.warning("%s %s is left out: %s", self.log.path, topic, error.what)
                 self.left_out.add(topic)
+
+    def _take_poses(self, topic: str, rows: records.Rows) -> None:
+        tree = self.log.topics[topic].schema_name == schema.TF
+        for pose in self.log.decode_poses(topic, rows):
+            name = f"{topic}/{pose.child_frame_id.lstrip('/')}" if tree else topic
+            self._keep(name, pose.sequence, pose.stamp_ns, pose.p_wb, pose.q_wb_wxyz)
+
+    @contextmanager
+    def _told(self, topic: str) -> Iterator[None]:
+        """Leaves a topic out that cannot be held, where somebody is to be told of it."""
+        try:
+            yield
+        except LogError as error:
+            if self.refused is None:
+                raise
+            self.left_out.add(topic)
+            self.refused(topic, error)
 
     def _keep(
         self,
@@ -168,6 +211,8 @@ class _Gather:
     def truths(self, wanted: str | None) -> dict[str, Poses]:
         names: list[str] = []
         for topic in self.truth_topics:
+            if topic in self.left_out:
+                continue
             if self.log.topics[topic].schema_name == schema.TF:
                 names += [name for name in self.kept if name.startswith(f"{topic}/")]
             else:
@@ -182,7 +227,12 @@ class _Gather:
             raise LogError(
                 f"{wanted} has {len(names)} child frames", where=self.log.path, fix=f"Choose one of {', '.join(names)}"
             )
-        return {name: self._poses(name) for name in names}
+        found = {}
+        for name in names:
+            if name not in self.left_out:
+                with self._told(name):
+                    found[name] = self._poses(name)
+        return found
 
     def _poses(self, name: str) -> Poses:
         with self.log.named(name):

@@ -258,6 +258,16 @@ class ScalarColumns(NamedTuple):
     frame_id: str
 
 
+class TwistColumns(NamedTuple):
+    """Consecutive TwistWithCovarianceStamped of one frame; `variance` is of angular then linear, in messages the other way."""
+
+    stamp_ns: Int64[np.ndarray, " n"]
+    angular: Float64[np.ndarray, "n 3"]
+    linear: Float64[np.ndarray, "n 3"]
+    variance: Float64[np.ndarray, "n 6"]
+    frame_id: str
+
+
 def _stamp(rows: UInt8[np.ndarray, "n L"], layout: Layout, which: int = 0) -> Int64[np.ndarray, " n"]:
     at = layout.stamps[which]
     seconds = rows[:, at : at + 4].view(layout.order + layout.seconds)[:, 0].astype(np.int64)
@@ -320,6 +330,18 @@ def decode_scalars(
     stamp_ns = _stamp(rows, layout) if layout.stamps else None
     frame_id = layout.texts[0] if layout.texts else ""
     return ScalarColumns(stamp_ns, _numbers(rows, layout, slice(0, layout.numbers[0][1])), frame_id)
+
+
+def decode_twist(rows: UInt8[np.ndarray, "n L"], encoding: str = "cdr", layout: Layout | None = None) -> TwistColumns:
+    """The columns of TwistWithCovarianceStamped.
+
+    Raises:
+        LogError: no rows, more than one layout, a payload too short, an unknown encoding.
+    """
+    layout = layout or _one_layout(rows, TWIST, encoding)
+    numbers = _numbers(rows, layout, slice(0, 42))
+    variance = numbers[:, 6:].reshape(-1, 6, 6).diagonal(axis1=1, axis2=2)
+    return TwistColumns(_stamp(rows, layout), numbers[:, 3:6], numbers[:, :3], np.roll(variance, 3, axis=1), layout.texts[0])
 
 
 def decode_image(message: bytes, encoding: str = "cdr") -> tuple[int, str, bytes]:

@@ -153,6 +153,7 @@ def _with_signal(told: Diagnosis, real: Place, sim: Place, signal: str) -> Diagn
         unexplained={**told.unexplained, signal: one.unexplained},
         closer={**told.closer, signal: one.closer},
         remarks=(*told.remarks, *one.remarks),
+        signals={**told.signals, signal: one.traces},
     )
 
 

@@ -111,6 +111,18 @@ class Traces:
 
 
 @dataclass(frozen=True, eq=False)
+class SignalTraces:
+    """One other signal, for pictures: what was recorded, what was expected before and after, which samples were held out."""
+
+    t_s: Float64[np.ndarray, " n"]
+    real: Float64[np.ndarray, " n"]
+    before: Float64[np.ndarray, " n"]
+    after: Float64[np.ndarray, " n"]
+    held_out: Bool[np.ndarray, " n"]
+    unit: str
+
+
+@dataclass(frozen=True, eq=False)
 class Diagnosis:
     """The answer. Findings come strongest first; `bias` is each log's own constant, that of the first log in the JSON."""
 
@@ -124,6 +136,7 @@ class Diagnosis:
     remarks: tuple[str, ...] = ()
     closer: Mapping[str, HeldOut] = field(default_factory=dict)  # of each signal, once simulated again with the findings
     traces: tuple[Traces, ...] = ()
+    signals: Mapping[str, SignalTraces] = field(default_factory=dict)  # by TOPIC.field
 
     @property
     def mismatch(self) -> bool:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import io
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -11,9 +11,10 @@ import numpy as np
 from imutool import allan
 from imutool.identify import SENSORS, Identified, Sensor, Sight
 from imutool.mcap_io.target import Target
-from imutool.view.report import DOTS_PER_INCH, SIZE_INCH, STYLE, UNITS, _matplotlib
+from imutool.view.drawing import Panel, Picture, legend, plain_numbers
+from imutool.view.drawing import png as drawn
+from imutool.view.theme import AXES, AXIS_COLORS, SOFT, TITLES, UNITS
 
-AXIS_COLORS = ("#d55e00", "#009e73", "#0072b2")
 LINES = {
     "quantisation": (0, (1, 3)),
     "density": (0, (6, 2)),
@@ -21,11 +22,11 @@ LINES = {
     "walk": (0, (1, 1)),
     "ramp": (0, (1, 3)),
 }
-TITLES = {"gyro": "Gyro", "accel": "Accel"}
+HEIGHT_INCH = 3.8
 
 
 def deviations(found: Identified, path: Path, *, overwrite: bool = False) -> None:
-    """Writes a PNG of 2560 x 1440: the deviation of each axis as points, the fitted sum as a line, each slope seen as its own.
+    """Writes a PNG: the deviation of each axis as points, the fitted sum as a line, each slope seen as its own.
 
     Above what was seen at rest, below what was left in motion; only one of them where there is only one.
 
@@ -42,29 +43,21 @@ def png(found: Identified) -> bytes:
     Raises:
         ConfigError: matplotlib is not installed.
     """
-    matplotlib = _matplotlib()
-    with matplotlib.rc_context(STYLE):
-        from matplotlib.backends.backend_agg import FigureCanvasAgg
-        from matplotlib.figure import Figure
-
-        figure = Figure(figsize=SIZE_INCH, dpi=DOTS_PER_INCH)
-        FigureCanvasAgg(figure)
-        figure.suptitle(f"{found.log} {found.topic}", x=0.01, ha="left", fontsize=14, fontweight="bold")
-        sights = [sight for sight in (found.at_rest, found.in_motion) if sight is not None]
-        panels = figure.subplots(len(sights), 2, squeeze=False)
-        for row, sight in zip(panels, sights, strict=True):
-            for axes, sensor in zip(row, SENSORS, strict=True):
-                _draw(axes, sight, sensor)
-        buffer = io.BytesIO()
-        figure.savefig(buffer, format="png", metadata={"Software": None})
-    return buffer.getvalue()
+    sights = [sight for sight in (found.at_rest, found.in_motion) if sight is not None]
+    panels = [
+        Panel(partial(_draw, sight=sight, sensor=sensor), HEIGHT_INCH, f"{TITLES[sensor]}: {sight.how}")
+        for sight in sights
+        for sensor in SENSORS
+    ]
+    return drawn(Picture("allan", "Allan deviation", "", tuple(panels)), f"{found.log} {found.topic}")
 
 
-def _draw(axes: Any, sight: Sight, sensor: Sensor) -> None:
+def _draw(figure: Any, *, sight: Sight, sensor: Sensor) -> None:
+    axes = figure.subplots()
     curve = sight.curves[sensor]
     for axis, (slopes, color) in enumerate(zip(sight.slopes[sensor], AXIS_COLORS, strict=True)):
         error = curve.deviation[:, axis] / np.sqrt(2.0 * curve.freedom)
-        axes.errorbar(curve.tau_s, curve.deviation[:, axis], error, fmt="o", ms=4, color=color, lw=0.8, label="xyz"[axis])
+        axes.errorbar(curve.tau_s, curve.deviation[:, axis], error, fmt="o", ms=4, color=color, lw=0.8, label=AXES[axis])
         if not slopes.powers:
             continue
         tau_s = np.geomspace(slopes.from_s, curve.tau_s[-1], 200)
@@ -79,8 +72,8 @@ def _draw(axes: Any, sight: Sight, sensor: Sensor) -> None:
     axes.set_title(f"{TITLES[sensor]}: {sight.how}".replace(", ", ",\n"), fontsize=9)
     axes.set_xlabel("averaging time (s)")
     axes.set_ylabel(f"Allan deviation ({UNITS[sensor]})")
-    axes.grid(True, which="major", color="#dddddd", linewidth=0.6)
+    plain_numbers(axes.xaxis, axes.yaxis)
     named = sorted({name for slopes in sight.slopes[sensor] for name in slopes.seen}, key=list(LINES).index)
     for name in named:
-        axes.plot([], [], color="#555555", lw=0.9, ls=LINES[name], label=name)
-    axes.legend(loc="best", fontsize=8, ncols=2)
+        axes.plot([], [], color=SOFT, lw=0.9, ls=LINES[name], label=name)
+    legend(figure, axes.get_legend_handles_labels()[0])

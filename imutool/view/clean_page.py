@@ -9,7 +9,7 @@ from typing import Any
 from imutool.clean import Finding, Survey
 from imutool.clean.rules.units import DEGREES
 from imutool.mcap_io.target import Target
-from imutool.view.diagnosis_page import POLICY, STYLE, text
+from imutool.view.page import document, text
 
 VERDICTS = {
     "good": "nothing is wrong with it",
@@ -34,14 +34,7 @@ def write(surveys: Sequence[Survey], path: Path, *, overwrite: bool = False) -> 
 def html(surveys: Sequence[Survey]) -> str:
     """The page of `write` as text."""
     logs = ", ".join(sorted({Path(one.log).name for one in surveys}))
-    body = "\n".join(line for one in surveys for line in _imu(one))
-    head = (
-        f'<meta charset="utf-8"><meta http-equiv="Content-Security-Policy" content="{POLICY}">'
-        '<meta name="viewport" content="width=device-width, initial-scale=1">'
-        f"<title>{text(logs)}</title><style>{STYLE}</style>"
-    )
-    start = f'<!DOCTYPE html>\n<html lang="en"><head>{head}</head>\n<body><main>\n<h1>{text(logs)}</h1>\n'
-    return f"{start}{body}\n</main></body></html>\n"
+    return document(logs, [f"<h1>{text(logs)}</h1>", *(line for one in surveys for line in _imu(one))])
 
 
 def _imu(survey: Survey) -> Iterator[str]:

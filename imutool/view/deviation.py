@@ -3,16 +3,21 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal, get_args
+from typing import Literal, NamedTuple, get_args
 
 import numpy as np
 from jaxtyping import Bool, Float64
 from scipy.spatial.transform import Rotation
 
-from imutool.recording import Poses, Times
+from imutool.errors import DataError
+from imutool.metrics import align
+from imutool.recording import Poses, Times, nanoseconds
+from imutool.strapdown import drift, drifted
 
 Alignment = Literal["none", "origin", "yaw", "se3"]
 ALIGNMENTS: tuple[Alignment, ...] = get_args(Alignment)
+RESET_S = 10.0
+WINDOWS_S = (1.0, 5.0, 10.0, 30.0)
 
 Vectors = Float64[np.ndarray, "n 3"]
 Line = Float64[np.ndarray, " n"]
@@ -81,6 +86,97 @@ def errors(estimate: Poses, truth: Poses, valid: Bool[np.ndarray, " n"]) -> Erro
     return Errors(estimate.t_ns, turned + hole, yaw_pitch_roll[:, ::-1] + hole, position + hole)
 
 
+class Motion(NamedTuple):
+    """The rigid motion that brought an estimate nearest to the truth: a turn, then a shift, both in the world."""
+
+    turn: Rotation
+    shift_m: Float64[np.ndarray, "3"]
+
+
+def aligned(estimate: Poses, truth: Poses, valid: Bool[np.ndarray, " n"], alignment: Alignment) -> tuple[Poses, Motion]:
+    """The estimate after a rigid motion of all of it, found over the rows where the truth is known, and that motion.
+
+    `origin`: its first pose becomes the true one. `yaw`: positions are nearest by least squares among turns about the vertical,
+    theta = atan2(sum (p x p_true)_z, sum (p . p_true)_xy) about the means, the four directions an inertial sensor cannot know.
+    `se3`: among all rigid motions (Umeyama 1991, `metrics.align`).
+
+    Raises:
+        DataError: no row has truth, or positions that leave the motion of `se3` open.
+        NumericsError: positions overflow.
+    """
+    if not valid.any():
+        raise DataError("the truth is known at none of the estimate's stamps", expected="some overlap")
+    if alignment == "none":
+        return estimate, Motion(Rotation.identity(), np.zeros(3))
+    motion = _motion(estimate, truth, valid, alignment)
+    R = motion.turn.as_matrix()
+    v_w = None if estimate.v_w is None else estimate.v_w @ R.T
+    q_wb_wxyz = (motion.turn * Rotation.from_quat(estimate.q_wb_wxyz, scalar_first=True)).as_quat(scalar_first=True)
+    return Poses(estimate.t_ns, estimate.p_wb @ R.T + motion.shift_m, np.ascontiguousarray(q_wb_wxyz), v_w), motion
+
+
+def _motion(estimate: Poses, truth: Poses, valid: Bool[np.ndarray, " n"], alignment: Alignment) -> Motion:
+    if alignment == "origin":
+        row = int(np.argmax(valid))
+        found, true = (Rotation.from_quat(poses.q_wb_wxyz[row], scalar_first=True) for poses in (estimate, truth))
+        return _about(true * found.inv(), estimate.p_wb[row], truth.p_wb[row])
+    p, p_true = estimate.p_wb[valid], truth.p_wb[valid]
+    centre, centre_true = p.mean(axis=0), p_true.mean(axis=0)
+    if alignment == "yaw":
+        (x, y, _), (x_true, y_true, _) = (p - centre).T, (p_true - centre_true).T
+        angle = np.arctan2(x @ y_true - y @ x_true, x @ x_true + y @ y_true)
+        return _about(Rotation.from_rotvec([0.0, 0.0, angle]), centre, centre_true)
+    motion = align(p, p_true)
+    if motion is None:
+        raise DataError(
+            "positions lie on a line and leave the turn about it open", where="--align", fix="Use --align yaw, origin or none"
+        )
+    return Motion(*motion)
+
+
+def _about(turn: Rotation, centre: Float64[np.ndarray, "3"], goal: Float64[np.ndarray, "3"]) -> Motion:
+    """The turn that takes a point to another."""
+    return Motion(turn, goal - turn.as_matrix() @ centre)
+
+
+def drift_since_reset(path: Poses, truth: Poses, valid: Bool[np.ndarray, " n"], reset_s: float = RESET_S) -> Drift:
+    """How far the integration of `path` would have drifted, had it been set to the truth every `reset_s`, at every sample.
+
+    A reset that falls where the truth is unknown happens as soon as it is known again.
+    """
+    known = np.flatnonzero(valid)
+    turn_of = (path.t_ns[known] - path.t_ns[0]) // nanoseconds(reset_s)
+    _, first, of = np.unique(turn_of, return_index=True, return_inverse=True)
+    found = drifted(path, truth, known[first][of], known)
+    since_s, *errors = (np.full(len(path), np.nan) for _ in range(4))
+    since_s[known] = (path.t_ns[known] - path.t_ns[known[first]][of]) * 1e-9
+    for column, values in zip(errors, found._replace(orientation_rad=np.rad2deg(found.orientation_rad)), strict=True):
+        column[known] = values
+    return Drift(reset_s, path.t_ns, since_s, *errors)
+
+
+def windows(path: Poses, truth: Poses, valid: Bool[np.ndarray, " n"]) -> tuple[Window, ...]:
+    """The drift over windows of each length in `WINDOWS_S` of which at least one fits (`strapdown.drift`)."""
+    found = []
+    for length_s in WINDOWS_S:
+        ends = drift(path, truth, valid, length_s)
+        if count := len(ends.position_m):
+            found.append(
+                Window(
+                    length_s,
+                    count,
+                    float(np.rad2deg(_rms(ends.orientation_rad))),
+                    _rms(ends.velocity_m_s),
+                    _rms(ends.position_m),
+                )
+            )
+    return tuple(found)
+
+
 def _length(rows: Float64[np.ndarray, "n k"]) -> Line:
     length: Line = np.linalg.norm(rows, axis=1)
     return length
+
+
+def _rms(values: Float64[np.ndarray, " n"]) -> float:
+    return float(np.sqrt(np.mean(values**2)))

@@ -5,9 +5,6 @@ Colours are left to the page: each stands for a variable of its style sheet, so 
 
 from __future__ import annotations
 
-import io
-import re
-import warnings
 from collections.abc import Callable, Iterator, Sequence
 from itertools import pairwise
 from typing import Any
@@ -18,42 +15,20 @@ from scipy.signal import welch
 from scipy.spatial.transform import Rotation
 
 from imutool.physics.conclusion import signals
-from imutool.physics.diagnosis import Curve, Diagnosis, Traces
-from imutool.view.report import AXES, STYLE, UNITS, _matplotlib
+from imutool.physics.diagnosis import Curve, Diagnosis, SignalTraces, Traces
+from imutool.view.drawing import Line, Thin, averaged, extremes, plain_numbers, spans, svg
+from imutool.view.theme import AFTER, AXES, BEFORE, HELD, INK, MARK, TITLES, UNITS
 
-# what is drawn -> the page's variable; no two of these may be equal, and none may be a colour of matplotlib's own
-INK, GRID, BEFORE, AFTER, MARK, HELD = "#010203", "#040506", "#070809", "#0a0b0c", "#0d0e0f", "#101112"
-X, Y, Z = "#131415", "#161718", "#191a1b"
-VARIABLES = {INK: "ink", GRID: "grid", BEFORE: "before", AFTER: "after", MARK: "mark", HELD: "held", X: "x", Y: "y", Z: "z"}
 SIGNALS = {"gyro": slice(0, 3), "accel": slice(3, 6)}
-TITLES = {"gyro": "Gyro", "accel": "Accel"}
 
-WIDTH_INCH = 11.5  # at the page's 1150 pixels a letter of 9 points is 12 pixels high
 BUCKETS = 600  # a column of the page each: its lowest and its highest sample are drawn
 STRIP_BINS = 400
 WELCH_S = 8.0  # the longest window; shorter where unseen stretches are
 FEWEST = 32  # samples in a window, below which there is no spectrum
-PER_DECADE = 40  # points of a spectrum
 BINS = 16
 LEAST_BLOCKS = 3  # in a bin
 BLOCK_S = 0.5  # one independent value each: misfits of a motion last about so long
 GAP = 1.5  # periods without a sample that end a stretch
-
-Line = Float64[np.ndarray, " n"]
-Thin = Float64[np.ndarray, " m"]  # of another length than what it was made of
-THEME = {
-    **STYLE,
-    "font.size": 9,
-    "axes.titlesize": 10,
-    "grid.color": GRID,
-    "text.color": INK,
-    "axes.labelcolor": INK,
-    "axes.edgecolor": INK,
-    "xtick.color": INK,
-    "ytick.color": INK,
-    "svg.fonttype": "none",
-    "text.parse_math": False,  # a dollar in the name of a channel is a dollar
-}
 
 
 def where(d: Diagnosis, trace: Traces) -> str:
@@ -103,6 +78,25 @@ def residual(trace: Traces, *, found: bool) -> str:
     return svg(draw, 4.4, "residual")
 
 
+def signal(beside: SignalTraces, *, found: bool) -> str:
+    """Another signal as it was recorded and expected, and real minus expected before and (if `found`) after, over time."""
+
+    def draw(figure: Any) -> None:
+        above, below = figure.subplots(2, 1, sharex=True)
+        above.plot(*extremes(beside.t_s, beside.real, BUCKETS), color=INK, lw=0.9)
+        for expected, color in [(beside.before, BEFORE), (beside.after, AFTER)][: 1 + found]:
+            above.plot(*extremes(beside.t_s, expected, BUCKETS), color=color, lw=0.8)
+            below.plot(*extremes(beside.t_s, beside.real - expected, BUCKETS), color=color, lw=0.6)
+        for axes, title in ((above, "Recorded (ink) and expected"), (below, "Real minus expected")):
+            for first, last in spans(beside.t_s, beside.held_out):
+                axes.axvspan(first, last, color=HELD, alpha=0.15, lw=0)
+            axes.set_title(title)
+            axes.set_ylabel(f"({beside.unit})" if beside.unit else "value")
+        below.set(xlabel="time (s)", xlim=(beside.t_s[0], beside.t_s[-1]))
+
+    return svg(draw, 3.6, "signal")
+
+
 def spectrum(d: Diagnosis) -> str | None:
     """Welch's estimate of the residual's amplitude density (root mean square over axes and logs); nothing if too short."""
     density = {signal: [_density(d.traces, part, after) for after in (False, True)] for signal, part in SIGNALS.items()}
@@ -110,8 +104,6 @@ def spectrum(d: Diagnosis) -> str | None:
         return None
 
     def draw(figure: Any) -> None:
-        from matplotlib.ticker import FuncFormatter, NullFormatter
-
         for axes, (signal, both) in zip(figure.subplots(1, 2), density.items(), strict=True):
             for found, color in list(zip(both, (BEFORE, AFTER), strict=True))[: 1 + bool(d.findings)]:
                 assert found is not None, "looked at above"
@@ -119,9 +111,7 @@ def spectrum(d: Diagnosis) -> str | None:
             if signal in d.unexplained:
                 floor = d.unexplained[signal].noise_floor * np.sqrt(2.0 / rate_hz(d.traces[0]))
                 axes.axhline(floor, color=INK, lw=1.0, ls=(0, (4, 3)))
-            for ruler in (axes.xaxis, axes.yaxis):
-                ruler.set_major_formatter(FuncFormatter(lambda number, _: f"{number:g}"))
-                ruler.set_minor_formatter(NullFormatter())
+            plain_numbers(axes.xaxis, axes.yaxis)
             low, high = axes.get_ylim()
             axes.set_ylim(10.0 ** np.floor(np.log10(low)), 10.0 ** np.ceil(np.log10(high)))  # whole decades have labels
             axes.set(xlabel="frequency (Hz)", ylabel=f"density ({UNITS[signal]}/√Hz)", title=TITLES[signal])
@@ -174,27 +164,6 @@ def curve(found: Curve, signal: str) -> str:
     return svg(draw, 2.6, "curve")
 
 
-def extremes(t: Line, y: Line, buckets: int) -> tuple[Thin, Thin]:
-    """A line of at most two points a bucket, the lowest and the highest sample of each in their order; gaps stay gaps."""
-    if len(t) <= 2 * buckets:
-        return t, y
-    edges = np.unique(np.linspace(0, len(t), buckets + 1).astype(int))
-    keep = []
-    for first, last in pairwise(edges):
-        part = y[first:last]
-        if np.isnan(part).all():
-            keep.append(first)
-        else:
-            keep += sorted({first + int(np.nanargmin(part)), first + int(np.nanargmax(part))})
-    return t[keep], y[keep]
-
-
-def spans(t: Line, mask: Bool[np.ndarray, " n"]) -> list[tuple[float, float]]:
-    """Where a mask is true, as stretches of time."""
-    turns = np.flatnonzero(np.diff(np.concatenate([[False], mask, [False]]).astype(int)))
-    return [(float(t[first]), float(t[last - 1])) for first, last in zip(turns[::2], turns[1::2], strict=True)]
-
-
 def own_clocks(traces: Sequence[Traces]) -> bool:
     """Whether each log counts from a start of its own: then their times overlap, and what is located is in the first."""
     ends = sorted((float(trace.t_s[0]), float(trace.t_s[-1])) for trace in traces)
@@ -221,39 +190,6 @@ def unseen(trace: Traces) -> Bool[np.ndarray, " n"]:
 def rate_hz(trace: Traces) -> float:
     """Samples a second, by the median step."""
     return 1.0 / float(np.median(np.diff(trace.t_s)))
-
-
-def svg(draw: Callable[[Any], None], height_inch: float, name: str) -> str:
-    """What `draw` draws on a figure, as an `<svg>` element: colours are variables, identifiers its own, two decimals.
-
-    Raises:
-        ConfigError: matplotlib is not installed.
-    """
-    matplotlib = _matplotlib()
-    with matplotlib.rc_context({**THEME, "svg.hashsalt": name}):
-        from matplotlib.backends.backend_svg import FigureCanvasSVG
-        from matplotlib.figure import Figure
-
-        figure = Figure(figsize=(WIDTH_INCH, height_inch))
-        FigureCanvasSVG(figure)
-        buffer = io.StringIO()
-        with warnings.catch_warnings():  # letters that this font lacks are the browser's to draw
-            warnings.filterwarnings("ignore", message="Glyph .* missing from")
-            draw(figure)
-            figure.savefig(buffer, format="svg", transparent=True, metadata={"Date": None})
-    text = buffer.getvalue()
-    text = text[text.index("<svg") :]
-    text = re.sub(r"<metadata>.*?</metadata>|<style.*?</style>|<!--.*?-->", "", text, flags=re.DOTALL)
-    text = re.sub(r' (?:width|height)="[\d.]+pt"', "", text, count=2)
-    text = re.sub(r'(?<= d=")[^"]*', lambda path: re.sub(r"(\.\d\d)\d+", r"\1", path[0]), text)
-    for color, variable in VARIABLES.items():
-        text = text.replace(color, f"var(--{variable})")
-    return text
-
-
-def apart(text: str, prefix: str) -> str:
-    """An `<svg>` element whose identifiers begin with a prefix: a page holds several, and `use` finds the first of a name."""
-    return re.sub(r'(?<=id=")|(?<=href="#)|(?<=url\(#)', f"{prefix}-", text)
 
 
 def _sides(trace: Traces, found: bool) -> list[tuple[Float64[np.ndarray, "n 6"], str]]:
@@ -287,11 +223,8 @@ def _density(traces: Sequence[Traces], part: slice, after: bool) -> tuple[Line, 
         at, power = welch(piece, fs=rate, nperseg=round(window_s * rate), axis=0)
         total += len(piece) * np.interp(frequency, at, power.mean(axis=1))
         weight += len(piece)
-    # further up than there is room for, neighbours are averaged: a line of noise would be as broad as it is high
-    decade = np.round(PER_DECADE * np.log10(frequency * window_s)).astype(int)
-    groups = np.unique(decade, return_inverse=True)[1]
-    count = np.bincount(groups)
-    return np.bincount(groups, frequency) / count, np.sqrt(np.bincount(groups, total / weight) / count)
+    at, density = averaged(frequency, total / weight, 1.0 / window_s)
+    return at, np.sqrt(density)
 
 
 def _stretches(trace: Traces, part: slice, after: bool) -> Iterator[Float64[np.ndarray, "m 3"]]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from html import escape
 from pathlib import Path
 
 from imutool import __version__
@@ -27,46 +26,11 @@ from imutool.physics.diagnosis import SCHEMA, UNITS, Diagnosis, Finding, Traces
 from imutool.physics.quantity import SHOWN, each, grouped, symbol
 from imutool.view import diagnosis_figures as figures
 from imutool.view import diagnosis_paths
+from imutool.view.drawing import apart
+from imutool.view.page import document, text
 
 BAR_PIXELS = 80.0
 MOST_LOGS = 4  # that are drawn one by one; what is pooled takes all
-# Okabe and Ito's palette, on dark a little lighter; red, green and blue are the axes as in the viewer
-STYLE = """
-:root { color-scheme: light dark; --paper: #fff; --ink: #1a1a1a; --soft: #666; --grid: #ddd; --panel: #f4f5f7;
-  --before: #d55e00; --after: #0072b2; --mark: #e6a700; --held: #7a7a7a; --x: #d33; --y: #2a9d4a; --z: #36c; }
-@media (prefers-color-scheme: dark) { :root { --paper: #15181c; --ink: #e6e6e6; --soft: #a0a4aa; --grid: #3a3f46;
-  --panel: #20242a; --before: #ff8c3a; --after: #56b4e9; --mark: #f0c040; --held: #9a9a9a; } }
-@media print { :root { --paper: #fff; --ink: #000; --soft: #444; --grid: #ccc; --panel: #fff; --before: #d55e00;
-  --after: #0072b2; --mark: #e6a700; --held: #7a7a7a; } main { max-width: none; padding: 0; }
-  .findings { min-width: 0 !important; font-size: 11px; } }
-* { box-sizing: border-box; }
-body { margin: 0; background: var(--paper); color: var(--ink);
-  font: 15px/1.45 system-ui, "Segoe UI", "DejaVu Sans", sans-serif; }
-main { max-width: 1200px; margin: 0 auto; padding: 20px 25px 60px; }
-h1 { font-size: 15px; font-weight: 600; color: var(--soft); margin: 0 0 6px; overflow-wrap: anywhere; }
-h2 { font-size: 18px; margin: 34px 0 6px; break-after: avoid; }
-.conclusion { font-size: 20px; line-height: 1.4; margin: 0 0 14px; overflow-wrap: anywhere; }
-.scroll { overflow-x: auto; }
-table { border-collapse: collapse; width: 100%; font-size: 14px; }
-th, td { text-align: left; vertical-align: top; padding: 6px 12px 6px 0; border-bottom: 1px solid var(--grid);
-  overflow-wrap: anywhere; }
-th { font-weight: 600; color: var(--soft); white-space: nowrap; }
-.findings { table-layout: fixed; min-width: 900px; }
-.findings th:nth-child(1) { width: 26%; } .findings th:nth-child(2) { width: 19%; }
-.findings th:nth-child(4) { width: 15%; } .findings th:nth-child(5) { width: 13%; }
-td.number, .entry { white-space: nowrap; font-variant-numeric: tabular-nums; }
-code { font: 13px/1.4 ui-monospace, "DejaVu Sans Mono", monospace; }
-figure { margin: 10px 0 0; break-inside: avoid; }
-figure svg { display: block; width: 100%; height: auto; }
-figure svg * { stroke-linejoin: round; stroke-linecap: butt; }
-figcaption, .note { color: var(--soft); font-size: 13px; margin: 4px 0; overflow-wrap: anywhere; }
-.key { display: inline-block; width: 14px; height: 10px; border-radius: 2px; margin: 0 5px 0 10px; }
-.bar { display: inline-block; height: 8px; background: var(--after); border-radius: 2px; margin-left: 8px; }
-.bar, .key { print-color-adjust: exact; -webkit-print-color-adjust: exact; }
-dl { display: grid; grid-template-columns: max-content 1fr; gap: 4px 18px; font-size: 14px; margin: 6px 0; }
-dt { color: var(--soft); } dd { margin: 0; overflow-wrap: anywhere; }
-"""
-POLICY = "default-src 'none'; style-src 'unsafe-inline'"  # the page asks nobody for anything, whatever a log is called
 BEFORE = '<span class="key" style="background: var(--before)"></span>before'
 AFTER = '<span class="key" style="background: var(--after)"></span>with what was found'
 DIFFERENCE = '<span class="key" style="background: var(--before)"></span>real minus expected'
@@ -106,19 +70,7 @@ def html(d: Diagnosis) -> str:
         *_left(d),
         *_provenance(d),
     ]
-    head = (
-        f'<meta charset="utf-8"><meta http-equiv="Content-Security-Policy" content="{POLICY}">'
-        '<meta name="viewport" content="width=device-width, initial-scale=1">'
-        f"<title>Diagnosis of {text(logs)}</title><style>{STYLE}</style>"
-    )
-    return (
-        f'<!DOCTYPE html>\n<html lang="en"><head>{head}</head>\n<body><main>\n' + "\n".join(body) + "\n</main></body></html>\n"
-    )
-
-
-def text(words: str) -> str:
-    """Words from anywhere, logs included, as text of the page: no markup, no letter that hides or turns others."""
-    return escape("".join(c if c.isprintable() else repr(c)[1:-1] for c in words))
+    return document(f"Diagnosis of {logs}", body)
 
 
 def _findings(d: Diagnosis) -> Iterator[str]:
@@ -195,6 +147,9 @@ def _before_and_after(d: Diagnosis) -> Iterator[str]:
     yield f"<h2>{'Before and after' if found else 'What separates the two'}</h2>"
     for k, trace in enumerate(d.traces[:MOST_LOGS]):
         yield _figure(figures.residual(trace, found=found), f"r{k}", f"{text(trace.log)}: over time. {both}{HELD}")
+    for k, (signal, beside) in enumerate(d.signals.items()):
+        drawn = figures.signal(beside, found=any(one.signal == signal for one in d.findings))
+        yield _figure(drawn, f"g{k}", f"{text(signal)}: over time. {both}{HELD}")
     if len(d.traces) > MOST_LOGS:
         yield f'<p class="note">The first {MOST_LOGS} of {len(d.traces)} logs are drawn; all are in the .rrd.</p>'
     spectrum, rate, attitude = figures.spectrum(d), figures.against_rate(d), figures.against_attitude(d)
@@ -269,4 +224,4 @@ def _samples(trace: Traces) -> str:
 
 
 def _figure(svg: str, prefix: str, caption: str) -> str:
-    return f"<figure>{figures.apart(svg, prefix)}<figcaption>{caption}</figcaption></figure>"
+    return f"<figure>{apart(svg, prefix)}<figcaption>{caption}</figcaption></figure>"

@@ -16,7 +16,9 @@ from scipy.spatial.transform import Rotation
 from imutool.physics.diagnosis import Diagnosis, Traces
 from imutool.recording import Imu, Poses
 from imutool.strapdown import Start, dead_reckon
-from imutool.view.diagnosis_figures import AFTER, BEFORE, GAP, INK, rate_hz, svg, unseen
+from imutool.view.diagnosis_figures import GAP, rate_hz, unseen
+from imutool.view.drawing import svg
+from imutool.view.theme import AFTER, BEFORE, INK
 
 LEAST_S, MOST_S = 2.0, 10.0  # of a stretch; a longer one is cut
 GRID_S = 0.05  # of the drift's clock

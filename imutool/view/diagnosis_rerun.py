@@ -14,7 +14,8 @@ from jaxtyping import Float64
 from imutool.mcap_io.target import Target
 from imutool.physics.conclusion import lines, where
 from imutool.physics.diagnosis import Diagnosis, Located, Traces
-from imutool.view.diagnosis_figures import located_in, spans
+from imutool.view.diagnosis_figures import located_in
+from imutool.view.drawing import spans
 from imutool.view.rerun.palette import AXES, BOLD_WIDTH, GREY, MODEL_COLORS, RAW_COLOR, RAW_WIDTH
 from imutool.view.rerun.sdk import FLUSH_S, entity_path, need_sdk
 

@@ -16,10 +16,11 @@ from scipy.spatial.transform import Rotation
 from imutool.errors import ConfigError, DataError
 from imutool.metrics import evaluate
 from imutool.recording import GAP_FACTOR, MIN_GAP_S, Imu, Poses, Recording, Scalars, Times, nanoseconds, seconds
-from imutool.strapdown import Start, along_truth, dead_reckon, with_velocity
-from imutool.view.deviation import Alignment, Drift, Errors, Window, errors
-from imutool.view.events import Event
+from imutool.strapdown import Start, dead_reckon, stretch_with_truth, with_velocity
+from imutool.view.deviation import Alignment, Drift, Errors, Window, aligned, drift_since_reset, errors, windows
+from imutool.view.events import Event, gathered, of_stops, of_worst
 from imutool.view.spectra import Spectrum, spectra
+from imutool.view.thin import MOST
 
 RAW = "raw"
 TRUTH = "truth"  # its place in the pictures; no run may take it
@@ -143,42 +144,53 @@ class RunData:
         return tuple(trace for trace in self.traces if not trace.is_raw)
 
 
-def build(recording: Recording, runs: Sequence[Run]) -> RunData:
-    """What there is to see of a log read in one or several ways.
+def build(
+    recording: Recording,
+    runs: Sequence[Run],
+    *,
+    align: Alignment = "none",
+    events: Sequence[Event] = (),
+    notes: Sequence[str] = (),
+) -> RunData:
+    """What there is to see of a log read in one or several ways, with the events and notes that are known beforehand.
 
-    With truth every path starts at the true pose and velocity of the first sample that has one, ends with the last
-    such sample, and errors are without any alignment. Without, a path starts at the origin, at rest, level by the
-    first half second of its own specific force and with heading zero, and there are no errors.
+    With truth every path starts at the true pose and velocity of the first sample that has one and ends with the last such
+    sample; figures, drift and windows are of that path, errors after the alignment asked for. Without, a path starts at the
+    origin, at rest, level by the first half second of its own specific force and with heading zero, and there are no errors.
 
     Raises:
         ConfigError: no run, or two of one name.
-        DataError: IMU and truth share fewer than two samples.
+        DataError: IMU and truth share fewer than two samples, or leave the alignment open.
         NumericsError: an integration overflows.
     """
     names = [run.name for run in runs]
     if not names or len(set(names)) < len(names) or TRUTH in names:
         raise ConfigError(f"runs are called {names}", where=recording.name, expected="names of their own, not 'truth'")
     imu = recording.imu
+    start_ns, end_ns = int(imu.t_ns[0]), int(imu.t_ns[-1])
     if recording.truths:
         truth = with_velocity(recording.truth)
-        traces = tuple(_scored(run, truth, recording.name) for run in runs)
-        started = seconds(traces[0].path.t_ns[:1], int(imu.t_ns[0]))[0]
-        notes = (f"Paths start at the true pose, {started:.2f} s into the log; errors are without alignment.",)
+        traces, of_paths = _scored(runs, truth, recording.name, align)
     else:
-        truth = None
+        truth, align = None, "none"
         traces = tuple(Trace(run, dead_reckon(run.imu, level_start(run.imu)), None, spectra=spectra(run.imu)) for run in runs)
-        notes = (
-            f"This log has no truth, so there are no errors. Paths start at the origin, at rest, heading 0, "
-            f"levelled by the first {LEVELLING_S:g} s of specific force.",
-        )
+        of_paths = [
+            f"This log has no truth, so there are no errors and nothing to align with. Paths start at the origin, at rest, "
+            f"heading 0, levelled by the first {LEVELLING_S:g} s of specific force."
+        ]
+    judged = [trace for trace in traces if not trace.is_raw] or traces
+    worst = [one for trace in judged if trace.errors is not None for one in of_worst(trace.name, trace.errors)]
+    shown, of_events = gathered([*events, *of_stops(imu), *worst], start_ns, end_ns)
     return RunData(
         name=recording.name,
-        start_ns=int(imu.t_ns[0]),
-        end_ns=int(imu.t_ns[-1]),
-        truth=None if truth is None else truth.between(int(imu.t_ns[0]), int(imu.t_ns[-1])),
+        start_ns=start_ns,
+        end_ns=end_ns,
+        truth=None if truth is None else truth.between(start_ns, end_ns),
         true_bias=_true_bias(recording),
         traces=traces,
-        notes=notes,
+        notes=(*of_paths, *_thinned(imu), *notes, *of_events),
+        alignment=align,
+        events=shown,
     )
 
 
@@ -215,11 +227,39 @@ def _true_bias(recording: Recording) -> Mapping[str, Scalars]:
     return MappingProxyType({kind: b.between(int(imu.t_ns[0]), int(imu.t_ns[-1])) for kind, b in known.items()})
 
 
-def _scored(run: Run, truth: Poses, where: str) -> Trace:
-    """One run from the first sample with truth to the last, with its errors and figures."""
-    path, true, valid = along_truth(run.imu, truth, where)
-    figures = MappingProxyType(evaluate(path, true, valid))
-    return Trace(run, path, errors(path, true, valid), figures=figures, spectra=spectra(run.imu))
+def _scored(runs: Sequence[Run], truth: Poses, where: str, align: Alignment) -> tuple[tuple[Trace, ...], list[str]]:
+    """Each run from the first sample with truth to the last, with its errors and figures; and what is to be said of that."""
+    traces, notes, stamps = [], [], None
+    for run in runs:
+        if stamps is None or not np.array_equal(run.imu.t_ns, stamps):
+            stamps = run.imu.t_ns
+            rows, true, valid = stretch_with_truth(stamps, truth, where)
+        path = dead_reckon(run.imu.rows(rows), Start.of(true))
+        moved, motion = aligned(path, true, valid, align)
+        of_truth = (
+            drift_since_reset(path, true, valid),
+            windows(path, true, valid),
+            MappingProxyType(evaluate(path, true, valid)),
+        )
+        traces.append(Trace(run, moved, errors(moved, true, valid), *of_truth, spectra=spectra(run.imu)))
+        if align != "none":
+            away_m = np.linalg.norm(moved.p_wb[valid].mean(axis=0) - path.p_wb[valid].mean(axis=0))
+            turned = np.rad2deg(motion.turn.magnitude())
+            notes.append(f"{run.name}: alignment {align} turned the path by {turned:.3g} deg, its centre moved {away_m:.3g} m.")
+    started = seconds(traces[0].path.t_ns[:1], int(runs[0].imu.t_ns[0]))[0]
+    how = "errors are without alignment" if align == "none" else f"paths and errors are shown after alignment {align}"
+    return tuple(traces), [
+        f"Paths start at the true pose, {started:.2f} s into the log; {how}.",
+        *(["The figures, drift and windows are without alignment."] if notes else []),
+        *notes,
+    ]
+
+
+def _thinned(imu: Imu) -> list[str]:
+    """What is to be said of a log too long to be drawn whole."""
+    if len(imu) <= MOST:
+        return []
+    return [f"Of curves with {len(imu)} samples at most {MOST} are drawn, the lowest and highest of every stretch among them."]
 
 
 def _numbers(figures: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, float]]:

@@ -3,49 +3,68 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
-from imutool.mcap_io import schema
-from imutool.mcap_io.log import DERIVED_KEY, Log
-from imutool.mcap_io.read import read
 from imutool.recording import Recording
+from imutool.view.deviation import Alignment
+from imutool.view.events import of_survey
+from imutool.view.findings import of_findings
+from imutool.view.provenance import provenance
+from imutool.view.recorded import recorded
 from imutool.view.rundata import Run, RunData, build
 
 
 def load(
-    log: Path, *, models: Sequence[str | Path] = (), init: str = "auto", imu: str | None = None, truth: str | None = None
+    log: Path,
+    *,
+    models: Sequence[str | Path] = (),
+    init: str = "auto",
+    smooth: bool = False,
+    imu: str | None = None,
+    truth: str | None = None,
+    align: Alignment = "none",
+    findings: Path | None = None,
 ) -> RunData:
-    """Everything to be shown of one log.
+    """Everything to be shown of one log; with `findings`, the folder of a diagnosis, also where they act in it.
 
     Raises:
-        LogError, DataError, ModelError: as `imutool.evaluate`.
+        ConfigError: the log or the folder cannot be read; two models of one name; `smooth` with another `init` than auto.
+        LogError, DataError: no IMU, a log in which nothing can be saved, findings that are none, or as `rundata.build`.
+        ModelError: a model that cannot be used with this log.
     """
-    recording = read(log, imu=imu, truth=truth)
+    found = recorded(log, imu=imu, truth=truth)
+    recording = found.recording
     if recording.truths:
         recording = recording.with_truth(truth or next(iter(recording.truths)))
-    found = _with_models(recording, models, init, log) if models else [Run.raw(recording.imu)]
-    return build(recording, [*found, *_already_debiased(log, recording)])
+    with_models, told = _with_models(recording, models, init, log, smooth) if models else ([], {})
+    events, notes = of_survey(found.survey)
+    if findings is not None:
+        start_ns, end_ns = int(recording.imu.t_ns[0]), int(recording.imu.t_ns[-1])
+        more = of_findings(findings, log.name, start_ns, end_ns)
+        events, notes = [*events, *more[0]], [*notes, *more[1]]
+    data = build(
+        recording,
+        [Run.raw(recording.imu), *with_models, *found.debiased],
+        align=align,
+        events=events,
+        notes=[*found.notes, *notes],
+    )
+    asked = {"start": init, "smooth": "yes"} if smooth else {"start": init} if models else {}
+    return replace(data, provenance=provenance(log, recording, found.metadata, told, asked), source=log, logged=found.logged)
 
 
-def _with_models(recording: Recording, models: Sequence[str | Path], init: str, log: Path) -> list[Run]:
-    """Raw, then as each model corrects it; only this needs torch."""
-    from imutool.evaluate import runs
+def _with_models(
+    recording: Recording, models: Sequence[str | Path], init: str, log: Path, smooth: bool
+) -> tuple[list[Run], dict[str, str]]:
+    """As each model corrects the samples, and in words which file that is and how it started; only this needs torch."""
+    from imutool.debias import apply_with_std
+    from imutool.evaluate import started
 
-    return [Run(n, d.imu, d.bias[:, :3], d.bias[:, 3:]) for n, d, _ in runs(recording, models, init, log)]
-
-
-def _already_debiased(log: Path, recording: Recording) -> list[Run]:
-    """The debiased channels that the log holds of this IMU."""
-    with Log(log) as opened:
-        topics = [
-            topic.name for topic in opened.with_schema((schema.IMU,)) if topic.metadata.get(DERIVED_KEY) == recording.imu_topic
-        ]
-        named = [values.get("model") for name, values in opened.metadata_records() if name.startswith("imutool")]
-    model = next((name for name in reversed(named) if name), None)
-    runs_found = []
-    for topic in topics:
-        imu = read(log, imu=topic, start_ns=None).imu
-        raw = recording.imu
-        name = f"in the log: {model}" if model else topic.rpartition("/")[2]
-        runs_found.append(Run(name, imu, raw.gyro - imu.gyro, raw.accel - imu.accel))
-    return runs_found
+    runs, told = [], {}
+    for name, model, start in started(recording, models, init, log, smooth=smooth):
+        debiased, std = apply_with_std(model, start, recording.imu)
+        runs.append(Run(name, debiased.imu, debiased.bias[:, :3], debiased.bias[:, 3:], std))
+        digest = model.card.get("sha256")
+        told[name] = f"{f'sha256 {digest}, ' if digest else ''}{model.method}, start: {start.how}"
+    return runs, told

@@ -21,7 +21,7 @@ from imutool.bias._file import load
 from imutool.debias import apply
 from imutool.mcap_io.read import read
 from imutool.recording import Imu, Poses, Recording, seconds
-from imutool.strapdown import GRAVITY_W, Start, dead_reckon, drift, with_velocity
+from imutool.strapdown import GRAVITY_W, Start, along_truth, dead_reckon, drift, with_velocity
 from imutool.turn_on import find
 
 WINDOW_S, EVERY_S = 5.0, 1.0
@@ -45,7 +45,8 @@ def main() -> None:
         truths = list(recording.truths)
         recording = recording.with_truth(RECOMPUTED if RECOMPUTED in truths else truths[0])
         debiased = [apply(model, find("truth", model, recording), recording.imu).imu for model in models]
-        cells = [float(np.sqrt(np.mean(drift(imu, recording.truth, WINDOW_S)[1] ** 2))) for imu in debiased]
+        drifts = [drift(*along_truth(imu, recording.truth, recording.name), WINDOW_S) for imu in debiased]
+        cells = [float(np.sqrt(np.mean(one.velocity_m_s**2))) for one in drifts]
         print(f"| {recording.name} | {' | '.join(f'{cell:.2f}' for cell in (*cells, floor(recording)))} |", flush=True)
 
 

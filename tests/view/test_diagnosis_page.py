@@ -19,8 +19,11 @@ from hypothesis import strategies as st
 
 from imutool.errors import ConfigError
 from imutool.physics.conclusion import conclusion
+from imutool.physics.diagnosis import SignalTraces
 from imutool.view import diagnosis_figures as figures
-from imutool.view.diagnosis_page import html, text, write
+from imutool.view import drawing
+from imutool.view.diagnosis_page import html, write
+from imutool.view.page import text
 
 MADE = SimpleNamespace(**runpy.run_path(str(Path(__file__).parents[1] / "physics" / "diagnoses.py")))
 MOST_BYTES = 3_000_000
@@ -191,9 +194,9 @@ def test_it_is_drawn_in_the_pages_own_colours_for_light_dark_and_paper(three: st
         assert set(re.findall(r"#[0-9a-fA-F]{6}\b", svg)) == set()
         used = set(re.findall(r"var\(--(\w+)\)", svg))
         assert used >= {"ink", "grid"} or "where" in svg or used >= {"ink"}
-        assert used <= set(figures.VARIABLES.values())
+        assert used <= set(drawing.VARIABLES.values())
     style = three[three.index("<style>") : three.index("</style>")]
-    for variable in figures.VARIABLES.values():
+    for variable in drawing.VARIABLES.values():
         assert style.count(f"--{variable}:") >= 1
     for variable in ("ink", "before", "after", "paper", "grid"):
         assert style.count(f"--{variable}:") == 3, "light, dark and print"
@@ -259,6 +262,20 @@ def test_spectra_and_means_are_over_unseen_time_alone(figure: object) -> None:
     assert figure(changed(MADE.LATE, unseen=True)) != drawn
 
 
+def test_another_signal_is_drawn_as_recorded_and_expected_and_what_is_left() -> None:
+    t_s = np.arange(500) / 50.0
+    there, held_out = np.sin(t_s), t_s > 5.0
+    beside = SignalTraces(t_s, 1.2 * there, there, 1.2 * there, held_out, "m/s")
+    with_it = replace(MADE.BOTH, signals={"/odom.<x>": beside})
+    content = html(with_it)
+    assert len(svgs(content)) == len(svgs(html(MADE.BOTH))) + 1
+    assert "/odom.&lt;x&gt;: over time" in content
+    svg = figures.signal(beside, found=True)
+    assert "(m/s)" in axes_labels(svg)
+    assert "var(--after)" in svg
+    assert "var(--after)" not in figures.signal(beside, found=False)
+
+
 def test_without_attitude_or_a_long_enough_stretch_it_says_so() -> None:
     (trace,) = MADE.LATE.traces
     held_out = np.arange(len(trace.t_s)) % 100 < 20  # a tenth of a second at a time
@@ -311,7 +328,7 @@ def test_located_time_is_on_the_first_logs_clock_unless_each_log_has_its_own() -
 @given(st.lists(st.floats(-1e3, 1e3), min_size=1, max_size=400), st.integers(1, 50))
 def test_thinning_a_line_keeps_its_ends_of_scale_its_order_and_its_length_in_bounds(values: list[float], buckets: int) -> None:
     t, y = np.arange(len(values), dtype=float), np.array(values)
-    thin_t, thin_y = figures.extremes(t, y, buckets)
+    thin_t, thin_y = drawing.extremes(t, y, buckets)
     assert len(thin_t) <= 2 * buckets
     assert (np.diff(thin_t) > 0).all()
     assert thin_y.min() == y.min()
@@ -321,8 +338,8 @@ def test_thinning_a_line_keeps_its_ends_of_scale_its_order_and_its_length_in_bou
 
 def test_a_mask_becomes_stretches_of_time() -> None:
     t = np.arange(6) / 2.0
-    assert figures.spans(t, np.array([True, True, False, True, False, True])) == [(0.0, 0.5), (1.5, 1.5), (2.5, 2.5)]
-    assert figures.spans(t, np.zeros(6, dtype=bool)) == []
+    assert drawing.spans(t, np.array([True, True, False, True, False, True])) == [(0.0, 0.5), (1.5, 1.5), (2.5, 2.5)]
+    assert drawing.spans(t, np.zeros(6, dtype=bool)) == []
 
 
 def test_white_noise_has_the_density_of_the_dashed_line() -> None:

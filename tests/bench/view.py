@@ -1,0 +1,80 @@
+"""What it costs to make a log ready to be looked at: `python tests/bench/view.py [--minutes 60] [--profile]`.
+
+A made-up log of that length at 200 Hz, truth at 200 Hz too and a debiased channel in it, in a temporary folder. Prints seconds
+of `imutool.view.runs.load` (all of it), of `rundata.build` (its last part: paths, errors, drift, windows, spectra, events), and
+how much memory the process took at most beyond what the imports take. On one core, the log in the page cache.
+"""
+
+from __future__ import annotations
+
+import argparse
+import cProfile
+import json
+import pstats
+import re
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+from imutool.mcap_io.read import read
+from imutool.mcap_io.write import write
+from imutool.physics.flight import flight
+from imutool.view import rundata, runs
+
+RATE_HZ = 200.0
+
+
+def write_long(folder: Path, minutes: float) -> Path:
+    """A made-up log so long, debiased by its means at rest."""
+    from imutool.debias import debias
+
+    write(flight(1, duration_s=60.0 * minutes, rate_hz=RATE_HZ, truth_rate_hz=RATE_HZ), folder / "raw.mcap")
+    debias(folder / "raw.mcap", folder / "long.mcap", model="static")
+    return folder / "long.mcap"
+
+
+def peak_mb() -> float:
+    """The most memory this process has held."""
+    found = re.search(r"VmHWM:\s+(\d+) kB", Path("/proc/self/status").read_text())
+    assert found is not None
+    return int(found[1]) / 1024
+
+
+def measure(log: Path, profile: bool) -> dict[str, float]:
+    """Seconds and memory, in a process that has done nothing else but import."""
+    before, profiler = peak_mb(), cProfile.Profile()
+    began = time.perf_counter()
+    if profile:
+        profiler.enable()
+    data = runs.load(log)
+    profiler.disable()
+    loaded_s, more_mb = time.perf_counter() - began, peak_mb() - before
+    if profile:
+        pstats.Stats(profiler).sort_stats("cumulative").print_stats(45)
+    read_only = [trace.run for trace in data.traces]
+    recording = read(log)
+    began = time.perf_counter()
+    rundata.build(recording, read_only)
+    built_s = time.perf_counter() - began
+    return {"samples": len(recording.imu), "runs": len(read_only), "load_s": loaded_s, "build_s": built_s, "more_mb": more_mb}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--minutes", type=float, default=60.0)
+    parser.add_argument("--profile", action="store_true", help="also say where the time of `load` goes")
+    parser.add_argument("--log", type=Path, help="measure this log instead")
+    options = parser.parse_args()
+    if options.log is not None:
+        print(json.dumps(measure(options.log, options.profile)))
+        return
+    with tempfile.TemporaryDirectory() as folder:
+        log = write_long(Path(folder), options.minutes)
+        words = [sys.executable, __file__, "--log", str(log), *(["--profile"] if options.profile else [])]
+        print(subprocess.run(words, check=True, stdout=subprocess.PIPE, text=True).stdout, end="")
+
+
+if __name__ == "__main__":
+    main()
