@@ -20,7 +20,8 @@ def diagnose(
         list[Path], typer.Argument(metavar="REAL...", help="Recordings; several share the physics, with a bias each.")
     ],
     sim: Annotated[
-        Path | None, typer.Option(metavar="SIM", help="The simulation; else what the recording's own true poses say.")
+        Path | None,
+        typer.Option(metavar="SIM", help="The simulation, of any motion if both have poses; else the recording's own poses."),
     ] = None,
     signal: Annotated[
         list[str] | None, typer.Option(metavar="TOPIC.field", help="Compare this field of both logs as well. Repeatable.")

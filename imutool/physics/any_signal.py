@@ -19,7 +19,7 @@ from imutool.physics.any_fit import Fit, Weighed
 from imutool.physics.any_pair import Beside, beside
 from imutool.physics.any_search import Found, Judged, Search
 from imutool.physics.diagnosis import Curve as ToldCurve
-from imutool.physics.diagnosis import Estimate, Finding, HeldOut, Located, Unexplained
+from imutool.physics.diagnosis import Estimate, Finding, HeldOut, Located, SignalTraces, Unexplained
 from imutool.physics.locate import regime
 from imutool.physics.stamps import LEAST_DIGITS, grid
 
@@ -31,18 +31,6 @@ EXACT = 1e-3
 SAME_GRID = 0.01
 RIDGE = 1e-8
 RICH_KNOTS = 12
-
-
-@dataclass(frozen=True, eq=False)
-class SignalTraces:
-    """For pictures: what was recorded, what was expected before and after, which samples were held out; s from `start_ns`."""
-
-    t_s: Samples
-    real: Samples
-    before: Samples
-    after: Samples
-    held_out: Bool[np.ndarray, " n"]
-    start_ns: int
 
 
 @dataclass(frozen=True, eq=False)
@@ -166,7 +154,7 @@ def _told(pair: Beside, signal: Weighed, found: Found, always: int, name: str, u
         unexplained=Unexplained(rms, level, rms < WHITE * floor),
         closer=_held_out(pair, before, after, unit),
         remarks=_remarks(pair, name),
-        traces=SignalTraces(pair.ideal.t_s, pair.real, before, after, held, pair.start_ns),
+        traces=SignalTraces(pair.ideal.t_s, pair.real, before, after, held, unit),
     )
 
 

@@ -10,21 +10,21 @@ from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Float64
-from scipy.ndimage import uniform_filter1d
 
 from imutool.errors import ConfigError, DataError
 from imutool.mcap_io.fields import others, read_field
 from imutool.mcap_io.read import read as read_log
 from imutool.physics import stamps, unnamed
 from imutool.physics.any_signal import diagnose_signal
+from imutool.physics.apart import ANOTHER_MOTION, remarks, shared
 from imutool.physics.diagnosis import UNITS, Curve, Diagnosis, Estimate, Finding, HeldOut, Traces, Unexplained
 from imutool.physics.discover import Discovery, Judged, discover
 from imutool.physics.effects import _catalogue
 from imutool.physics.effects._forward import Physics
 from imutool.physics.fit import Chosen, Fit, Weighed, derivatives, expected, fit
-from imutool.physics.locate import located
 from imutool.physics.motion import smooth_motion
-from imutool.physics.pair import LEAST_S, Pair, with_simulation, with_truth
+from imutool.physics.pair import LEAST_S, Pair, of_one_motion, with_simulation, with_truth
+from imutool.physics.places import of_findings, of_what_is_left
 from imutool.physics.reference import wrong_for_moments
 from imutool.physics.unnamed import unit
 from imutool.physics.whitening import Band, level, whitener
@@ -34,7 +34,6 @@ from imutool.recording import Recording
 KNOWN_BAND = 0.45  # of where smoothing halves a motion: there it takes a per cent
 ORDER_SIM, ORDER_TRUTH = 6, 12  # of the autoregression: a sensor's noise is nearly white, that of differentiated poses is not
 RIDGE = 1e-8
-SLOW = 9  # samples of a running mean
 JITTER = "timestamp_jitter"
 INEXACT = 1e-5  # of a misfit's power: 0.3 % of its size, as which the inexactness of a much larger effect's model may pass
 SHOWN_BY_SAMPLES = {"saturation", "quantization"}  # without any fit: `stamps`
@@ -62,7 +61,8 @@ def diagnose(
     """What separates recordings from a simulation, or from what their own true poses say.
 
     Several recordings share the physics; each has a constant bias of its own. `signals` are other fields that one recording and
-    its simulation both hold (`TOPIC.field`), compared in the same way.
+    its simulation both hold (`TOPIC.field`), compared in the same way. A simulation of another motion is compared by what its
+    own true poses say of it (`imutool.physics.apart`).
 
     Raises:
         ConfigError, LogError: a log cannot be read, or has no such topic; signals without a simulation, or of several logs.
@@ -72,8 +72,14 @@ def diagnose(
     if signals and (sim is None or len(reals) != 1):
         raise ConfigError("--signal compares one recording with its simulation", where="--signal", fix="Give one log and --sim")
     say(0, 4, "reading")
+    recordings = [read_log(real, imu=imu, truth=truth) for real in reals]
     simulated = None if sim is None else read_log(sim, imu=imu)
-    pairs = [_unclipped(pair) for real in reals for pair in _pairs(read_log(real, imu=imu, truth=truth), simulated, truth)]
+    known: tuple[Finding, ...] = ()
+    if sim is not None and simulated is not None and simulated.truths and _moves_apart(recordings, simulated, signals):
+        say(0, 4, "the simulation, of another motion")
+        known, simulated = diagnose([sim], imu=imu).findings, None
+    apart = sim is not None and simulated is None
+    pairs = [_unclipped(pair) for recording in recordings for pair in _pairs(recording, simulated, truth)]
     say(1, 4, "noise")
     candidates = _candidates(pairs)
     logs = [_weighed(pair, candidates) for pair in pairs]
@@ -81,7 +87,9 @@ def diagnose(
     moments = wrong_for_moments(logs)
     found = discover(logs, () if moments[0] else candidates, () if moments[0] else later(pairs))
     say(3, 4, "locating")
-    told = _told(logs, found, [str(real) for real in reals], None if sim is None else str(sim))
+    told = _told(logs, found, [str(real) for real in reals], None if sim is None else str(sim), known)
+    if apart:
+        told = replace(told, remarks=(ANOTHER_MOTION, *told.remarks))
     told = replace(told, findings=(*moments[0], *told.findings), located=tuple(moments[1]) or told.located)
     for signal in signals:
         assert sim is not None
@@ -111,6 +119,29 @@ def measured(
     return fit([_weighed(pair, candidates) for pair in pairs], begun, part="all")
 
 
+def _moves_apart(reals: Sequence[Recording], sim: Recording, signals: Sequence[str]) -> bool:
+    """Whether the simulation is of another motion than every recording, which all have true poses.
+
+    Raises:
+        DataError: it is of the motion of some only, or other signals are to be compared with it.
+    """
+    of_one = [of_one_motion(real.imu, sim.imu) for real in reals]
+    if all(of_one) or not all(real.truths for real in reals):
+        return False
+    if any(of_one):
+        raise DataError(
+            "the simulation is of the same motion as some recordings only",
+            where=sim.name,
+            expected="one motion, or as many as logs",
+            fix=f"Diagnose apart: {', '.join(real.name for real, same in zip(reals, of_one, strict=True) if same)}",
+        )
+    if signals:
+        raise DataError(
+            "--signal compares one motion, and the simulation is of another", where=sim.name, fix="Leave --signal out"
+        )
+    return True
+
+
 def _with_signal(told: Diagnosis, real: Place, sim: Place, signal: str) -> Diagnosis:
     """The answer with what another field of both logs says."""
     one = diagnose_signal(read_field(real, signal), read_field(sim, signal), others(real, signal), signal)
@@ -122,6 +153,7 @@ def _with_signal(told: Diagnosis, real: Place, sim: Place, signal: str) -> Diagn
         unexplained={**told.unexplained, signal: one.unexplained},
         closer={**told.closer, signal: one.closer},
         remarks=(*told.remarks, *one.remarks),
+        signals={**told.signals, signal: one.traces},
     )
 
 
@@ -207,27 +239,31 @@ def _weighed(pair: Pair, candidates: Sequence[Physics]) -> Weighed:
 # ── what is told ──
 
 
-def _told(logs: Sequence[Weighed], found: Discovery, reals: Sequence[str], sim: str | None) -> Diagnosis:
-    """Findings with what they bring, where the misfit lies, and what is left."""
+def _told(
+    logs: Sequence[Weighed], found: Discovery, reals: Sequence[str], sim: str | None, known: Sequence[Finding]
+) -> Diagnosis:
+    """Findings with what they bring, where the misfit lies, and what is left; what is `known` of a simulation is expected."""
     pairs = [log.pair for log in logs]
     floor = _floor(logs)
-    before = [_with(pair, ()) for pair in pairs]
     after = [_with(pair, found.fitted.chosen) for pair in pairs]  # held-out time stays unseen
     told = [_finding(logs, found, one, floor) for one in found.judged]
-    findings = [one for one in told if one.share > INEXACT]
-    findings += stamps.saturated(pairs, after, found.tried) + stamps.dropped(pairs) + stamps.rounded(pairs, floor)
+    all_found = [one for one in told if one.share > INEXACT]
+    all_found += stamps.saturated(pairs, after, found.tried) + stamps.dropped(pairs) + stamps.rounded(pairs, floor)
+    findings = [one for one in all_found if not shared(one, known)]
+    expected_too = {judged.physics.name for judged, one in zip(found.judged, told, strict=True) if shared(one, known)}
+    before = [_with(pair, tuple(one for one in found.fitted.chosen if one[0].name in expected_too)) for pair in pairs]
     p_values = {
         signal: min((one.p_value for one in findings if one.effect != JITTER and one.signal in (signal, "both")), default=1.0)
         for signal in ("gyro", "accel")
     }
-    stamped = _with(pairs[0], tuple(one for one in found.fitted.chosen if one[0].name == JITTER))
-    misfit = _converted(after[0], findings) - stamped  # where stamps are wrong, signals are not
-    places = located(pairs[0].stamp_s, misfit, floor, _variables(pairs[0]), p_values)
+    quiet = expected_too | {JITTER}  # where stamps are wrong, signals are not
+    still = [_with(pair, tuple(one for one in found.fitted.chosen if one[0].name in quiet)) for pair in pairs]
     unexplained = _unexplained(pairs, after, floor)
-    if not findings:  # nothing has been found; where something is left all the same, it is said where
+    if findings:
+        places = of_findings(pairs, still, after, floor, findings, p_values)
+    else:  # where something is left all the same, it is said where
         odd = {name for name, one in unexplained.items() if not one.white}
-        here = located(pairs[0].stamp_s, _slow(pairs[0].real - after[0]), floor / np.sqrt(SLOW), _variables(pairs[0]), {})
-        places = [place for place in here if place.signal in odd]
+        places = [place for place in of_what_is_left(pairs, after, floor) if place.signal in odd]
     return Diagnosis(
         real=tuple(reals),
         sim=sim,
@@ -241,31 +277,13 @@ def _told(logs: Sequence[Weighed], found: Discovery, reals: Sequence[str], sim: 
             )
         ),
         unexplained=unexplained,
-        remarks=tuple(_remarks(pairs)),
+        remarks=(*_remarks(pairs), *remarks(all_found, known)),
         closer={signal: _held_out(pairs, before, after, k, UNITS[signal]) for k, signal in enumerate(("gyro", "accel"))},
         traces=tuple(
-            Traces(pair.name, pair.stamp_s, pair.real, b, a, pair.held_out, pair.q_wb_wxyz)
+            Traces(pair.name, pair.stamp_s, pair.real, b, a, pair.held_out, pair.truth, expected(pair, ()))
             for pair, b, a in zip(pairs, before, after, strict=True)
         ),
     )
-
-
-def _converted(there: Float64[np.ndarray, "n 6"], findings: Sequence[Finding]) -> Float64[np.ndarray, "n 6"]:
-    """As a converter gives it whose limits and steps were found."""
-    out = there.copy()
-    told = {name: estimate.value for one in findings for name, estimate in one.parameters.items()}
-    for k, signal in enumerate(("gyro", "accel")):
-        part, limit, lsb = slice(3 * k, 3 * k + 3), told.get(f"{signal}_limit"), told.get(f"{signal}_lsb")
-        if limit is not None and np.isfinite(limit):
-            out[:, part] = np.clip(out[:, part], -limit, limit)
-        if lsb is not None:
-            out[:, part] = lsb * np.rint(out[:, part] / lsb)
-    return out
-
-
-def _slow(left: Float64[np.ndarray, "n 6"]) -> Float64[np.ndarray, "n 6"]:
-    """A running mean: what is left without most of its noise."""
-    return np.asarray(uniform_filter1d(left, SLOW, axis=0))
 
 
 def _with(pair: Pair, chosen: Chosen) -> Float64[np.ndarray, "n 6"]:
@@ -282,24 +300,6 @@ def _floor(logs: Sequence[Weighed]) -> Float64[np.ndarray, "6"]:
         response = np.array([np.abs(np.fft.rfft(a, 512)) ** 2 for a in log.whiten.filters])
         variances.append(log.whiten.std**2 * (1.0 / response).mean(axis=1))
     return np.asarray(np.sqrt(np.mean(variances, axis=0)))
-
-
-def _variables(pair: Pair) -> dict[str, tuple[str, Float64[np.ndarray, " n"]]]:
-    """What a regime can be of."""
-    read = pair.felt.taken(pair.stamp_s, pair.stamp_s)
-    rate, force = np.linalg.norm(read.gyro, axis=1), np.linalg.norm(read.accel, axis=1)
-    out = {
-        "angular rate": ("rad/s", rate),
-        "acceleration": ("m/s²", np.abs(force - 9.81)),
-        "angular acceleration": ("rad/s²", np.linalg.norm(read.alpha, axis=1)),
-        "time": ("s", pair.stamp_s),
-    }
-    if read.R_wb is not None:
-        out["tilt"] = ("rad", np.arccos(np.clip(read.R_wb[:, 2, 2], -1.0, 1.0)))
-    for k, axis in enumerate("xyz"):
-        out[f"rate about {axis}"] = ("rad/s", np.abs(read.gyro[:, k]))
-        out[f"force along {axis}"] = ("m/s²", np.abs(read.accel[:, k]))
-    return out | {name: ("", values) for name, values in pair.channels.items()}
 
 
 def _unseen(pair: Pair, there: Float64[np.ndarray, "n 6"]) -> Float64[np.ndarray, "m 6"]:

@@ -12,6 +12,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float64
 
+from imutool.recording import Poses
+
 SCHEMA = "imutool.diagnosis/1"
 UNITS = {"gyro": "rad/s", "accel": "m/s^2"}
 
@@ -104,7 +106,20 @@ class Traces:
     before: Float64[np.ndarray, "n 6"]  # the simulation and a constant bias
     after: Float64[np.ndarray, "n 6"]  # with the findings modelled
     held_out: Bool[np.ndarray, " n"]
-    q_wb_wxyz: Float64[np.ndarray, "n 4"] | None = None
+    truth: Poses | None = None  # at these samples
+    ideal: Float64[np.ndarray, "n 6"] | None = None  # what a perfect sensor would have read
+
+
+@dataclass(frozen=True, eq=False)
+class SignalTraces:
+    """One other signal, for pictures: what was recorded, what was expected before and after, which samples were held out."""
+
+    t_s: Float64[np.ndarray, " n"]
+    real: Float64[np.ndarray, " n"]
+    before: Float64[np.ndarray, " n"]
+    after: Float64[np.ndarray, " n"]
+    held_out: Bool[np.ndarray, " n"]
+    unit: str
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,6 +136,7 @@ class Diagnosis:
     remarks: tuple[str, ...] = ()
     closer: Mapping[str, HeldOut] = field(default_factory=dict)  # of each signal, once simulated again with the findings
     traces: tuple[Traces, ...] = ()
+    signals: Mapping[str, SignalTraces] = field(default_factory=dict)  # by TOPIC.field
 
     @property
     def mismatch(self) -> bool:

@@ -35,13 +35,14 @@ def located(
 ) -> list[Located]:
     """One entry a signal in which there is a misfit: what was read less what was expected, without noise, sample by sample.
 
+    Samples may be of several stretches of one log; seconds without any are nowhere.
     What has been found (`p_values`) and is too small for any one second to show it lies everywhere.
 
     `variables` are what a regime can be of, by how they are called, with unit and values at the samples.
     """
     found = []
     scaled = (misfit - np.median(misfit, axis=0)) / noise
-    window = np.floor((t_s - t_s[0]) / WINDOW_S).astype(int)
+    seconds, window = np.unique(np.floor((t_s - t_s[0]) / WINDOW_S), return_inverse=True)
     for k, signal in enumerate(SIGNALS):
         part = scaled[:, 3 * k : 3 * k + 3] ** 2
         axes_power = part.sum(axis=0)
@@ -56,7 +57,7 @@ def located(
             Located(
                 signal,
                 tuple(AXES[a] for a in axes),
-                tuple(_intervals(inside, float(t_s[0]))),
+                tuple(_intervals(float(t_s[0]) + WINDOW_S * seconds[inside])),
                 regime(inside, power, window, variables),
                 float(power[inside].sum() / max(power.sum(), 1e-300)),
                 p_values.get(signal, float(chi2.sf(axes_power.sum(), 3))),
@@ -65,16 +66,14 @@ def located(
     return sorted(found, key=lambda one: one.p_value)
 
 
-def _intervals(inside: Bool[np.ndarray, " w"], start_s: float) -> list[tuple[float, float]]:
-    """Stretches of windows, those close to one another joined."""
-    edges = np.diff(np.concatenate([[0], inside.astype(int), [0]]))
+def _intervals(begins_s: Float64[np.ndarray, " w"]) -> list[tuple[float, float]]:
+    """Stretches of windows, by where each begins; those close to one another are joined."""
     out: list[tuple[float, float]] = []
-    for first, last in zip(np.flatnonzero(edges == 1), np.flatnonzero(edges == -1), strict=True):
-        begin, end = start_s + float(first) * WINDOW_S, start_s + float(last) * WINDOW_S
+    for begin in begins_s.tolist():
         if out and begin - out[-1][1] < JOIN_S - WINDOW_S:
-            out[-1] = out[-1][0], end
+            out[-1] = out[-1][0], begin + WINDOW_S
         else:
-            out.append((begin, end))
+            out.append((begin, begin + WINDOW_S))
     return out
 
 

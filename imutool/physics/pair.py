@@ -23,6 +23,7 @@ from imutool.kinematics import through
 from imutool.physics.readings import NOTHING, Felt
 from imutool.recording import Imu, Poses, Recording, seconds
 from imutool.stationary import white_noise
+from imutool.strapdown import with_velocity
 
 LEAST_S = 8.0  # below, nothing can be learned and tested
 ALIGN_HZ = 100.0
@@ -33,6 +34,7 @@ BUFFER_S = 0.3  # around a border between blocks, counted for neither
 NOISE_BAND = 0.8  # of Nyquist: above, a simulated motion has nothing
 SMOOTHED_BINS = 15
 GAP_PERIODS = 3.0
+KNOWN_SHARE = 0.5  # of the samples that have a true pose, from which on the poses are worth drawing
 MOST_OF_IT = 0.9  # of the simulation that its poses must cover to stand for it
 POSES_HZ = 40.0  # slower poses cannot be differentiated twice
 COARSE, TOLERATED = 5, 1.3
@@ -44,7 +46,8 @@ class Pair:
     """Ideal signals on an even clock, and real samples by their stamps on that clock (s from the first sample).
 
     `fitted` and `held_out` are rows; rows in neither are borders, gaps and ends. `band_hz` is where what is expected ends to be
-    known (none: nowhere), `aligned_s` what was added to the recording's stamps where the two clocks share no epoch.
+    known (none: nowhere), `truth` the true poses at its stamps, `aligned_s` what was added to the stamps where the
+    two clocks share no epoch.
     """
 
     name: str
@@ -53,7 +56,7 @@ class Pair:
     real: Float64[np.ndarray, "n 6"]
     fitted: Bool[np.ndarray, " n"]
     held_out: Bool[np.ndarray, " n"]
-    q_wb_wxyz: Float64[np.ndarray, "n 4"] | None = None
+    truth: Poses | None = None
     aligned_s: float = 0.0
     against: str = "simulation"
     start_ns: int = 0
@@ -73,13 +76,25 @@ def with_simulation(real: Recording, sim: Recording) -> Pair:
     Raises:
         DataError: the two share too little time, or are not of one motion.
     """
-    shift_s = _shift(real.imu, sim.imu, real.name)
+    shift_s = _shift(real.imu, sim.imu)
+    if shift_s is None:
+        raise DataError(
+            "the simulation turns otherwise than the recording",
+            where=real.name,
+            expected="one motion, or true poses in both logs",
+            fix="Leave --sim out to compare the recording with its own true poses",
+        )
     start_ns = int(real.imu.t_ns[0])
     t_sim = seconds(sim.imu.t_ns, start_ns) - shift_s  # on the recording's clock
     stamp_s = seconds(real.imu.t_ns, start_ns)
     felt, noise = _simulated(t_sim, sim, shift_s, start_ns, real)
     inside = (stamp_s >= felt.t_s[0]) & (stamp_s <= felt.t_s[-1])
     return _pair(real, felt, stamp_s, inside, "simulation", shift_s, noise)
+
+
+def of_one_motion(real: Imu, sim: Imu) -> bool:
+    """Whether a recording and a simulation turn alike, whatever their clocks say."""
+    return _shift(real, sim) is not None
 
 
 def with_truth(real: Recording, felt: Felt, start_ns: int, band_hz: float) -> Pair:
@@ -117,10 +132,10 @@ def _pair(
     samples = np.concatenate([real.imu.gyro, real.imu.accel], axis=1)[part]
     held_out, usable = split(stamp_s)
     t_ns = real.imu.t_ns[part]
-    q_wb = None
+    truth = None
     if real.truths:
-        poses, known = real.truth.at(t_ns)
-        q_wb = poses.q_wb_wxyz if known.mean() > 0.5 else None
+        poses, known = with_velocity(real.truth).at(t_ns)
+        truth = poses if known.mean() > KNOWN_SHARE else None
     return Pair(
         real.name,
         felt,
@@ -128,7 +143,7 @@ def _pair(
         samples,
         usable & ~held_out,
         usable & held_out,
-        q_wb,
+        truth,
         aligned_s,
         against,
         int(t_ns[0]),
@@ -243,25 +258,17 @@ def wiener(x: Float64[np.ndarray, " n"]) -> Float64[np.ndarray, " n"]:
     return line + np.fft.irfft(gain * spectrum, n=len(mirrored))[:n]
 
 
-def _shift(real: Imu, sim: Imu, where: str) -> float:
+def _shift(real: Imu, sim: Imu) -> float | None:
     """What has to be added to the recording's times to get the simulation's (s): 0 where the two clocks share an epoch.
 
-    Raises:
-        DataError: not of one motion.
+    None where the two are not of one motion.
     """
     overlap = (min(real.t_ns[-1], sim.t_ns[-1]) - max(real.t_ns[0], sim.t_ns[0])) * 1e-9
     shared = overlap > min(LEAST_S, 0.5 * min(real.duration_s, sim.duration_s))
     lag_s, alike = _lag(real, sim)
     if shared and abs(lag_s) < FARTHEST_S:
         return 0.0
-    if alike < ALIKE:
-        raise DataError(
-            f"the simulation turns otherwise than the recording (correlation {alike:.2f} at best)",
-            where=where,
-            expected="one motion",
-            fix="Leave --sim out to compare the recording with its own true poses",
-        )
-    return lag_s
+    return lag_s if alike >= ALIKE else None
 
 
 def _lag(real: Imu, sim: Imu) -> tuple[float, float]:

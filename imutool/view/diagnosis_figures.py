@@ -15,7 +15,7 @@ from scipy.signal import welch
 from scipy.spatial.transform import Rotation
 
 from imutool.physics.conclusion import signals
-from imutool.physics.diagnosis import Curve, Diagnosis, Traces
+from imutool.physics.diagnosis import Curve, Diagnosis, SignalTraces, Traces
 from imutool.view.drawing import Line, Thin, averaged, extremes, plain_numbers, spans, svg
 from imutool.view.theme import AFTER, AXES, BEFORE, HELD, INK, MARK, TITLES, UNITS
 
@@ -78,6 +78,25 @@ def residual(trace: Traces, *, found: bool) -> str:
     return svg(draw, 4.4, "residual")
 
 
+def signal(beside: SignalTraces, *, found: bool) -> str:
+    """Another signal as it was recorded and expected, and real minus expected before and (if `found`) after, over time."""
+
+    def draw(figure: Any) -> None:
+        above, below = figure.subplots(2, 1, sharex=True)
+        above.plot(*extremes(beside.t_s, beside.real, BUCKETS), color=INK, lw=0.9)
+        for expected, color in [(beside.before, BEFORE), (beside.after, AFTER)][: 1 + found]:
+            above.plot(*extremes(beside.t_s, expected, BUCKETS), color=color, lw=0.8)
+            below.plot(*extremes(beside.t_s, beside.real - expected, BUCKETS), color=color, lw=0.6)
+        for axes, title in ((above, "Recorded (ink) and expected"), (below, "Real minus expected")):
+            for first, last in spans(beside.t_s, beside.held_out):
+                axes.axvspan(first, last, color=HELD, alpha=0.15, lw=0)
+            axes.set_title(title)
+            axes.set_ylabel(f"({beside.unit})" if beside.unit else "value")
+        below.set(xlabel="time (s)", xlim=(beside.t_s[0], beside.t_s[-1]))
+
+    return svg(draw, 3.6, "signal")
+
+
 def spectrum(d: Diagnosis) -> str | None:
     """Welch's estimate of the residual's amplitude density (root mean square over axes and logs); nothing if too short."""
     density = {signal: [_density(d.traces, part, after) for after in (False, True)] for signal, part in SIGNALS.items()}
@@ -115,12 +134,12 @@ def against_attitude(d: Diagnosis) -> str | None:
     """Mean residual in bins of how far its axis rises above the horizon; nothing where no attitude is known."""
 
     def variable(trace: Traces, signal: str, axis: int) -> Line:
-        assert trace.q_wb_wxyz is not None, "looked at before"
-        up_b = Rotation.from_quat(trace.q_wb_wxyz, scalar_first=True).apply([0.0, 0.0, 1.0], inverse=True)
+        assert trace.truth is not None, "looked at before"
+        up_b = Rotation.from_quat(trace.truth.q_wb_wxyz, scalar_first=True).apply([0.0, 0.0, 1.0], inverse=True)
         rise: Line = np.degrees(np.arcsin(np.clip(up_b[:, axis], -1.0, 1.0)))
         return rise
 
-    if any(trace.q_wb_wxyz is None for trace in d.traces):
+    if any(trace.truth is None for trace in d.traces):
         return None
     return _binned(d, variable, dict.fromkeys(SIGNALS, "{} above the horizon (°)"), "attitude")
 

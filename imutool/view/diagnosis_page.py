@@ -25,6 +25,7 @@ from imutool.physics.conclusion import (
 from imutool.physics.diagnosis import SCHEMA, UNITS, Diagnosis, Finding, Traces
 from imutool.physics.quantity import SHOWN, each, grouped, symbol
 from imutool.view import diagnosis_figures as figures
+from imutool.view import diagnosis_paths
 from imutool.view.drawing import apart
 from imutool.view.page import document, text
 
@@ -147,6 +148,9 @@ def _before_and_after(d: Diagnosis) -> Iterator[str]:
     yield f"<h2>{'Before and after' if found else 'What separates the two'}</h2>"
     for k, trace in enumerate(d.traces[:MOST_LOGS]):
         yield _figure(figures.residual(trace, found=found), f"r{k}", f"{text(trace.log)}: over time. {both}{HELD}")
+    for k, (signal, beside) in enumerate(d.signals.items()):
+        drawn = figures.signal(beside, found=any(one.signal == signal for one in d.findings))
+        yield _figure(drawn, f"g{k}", f"{text(signal)}: over time. {both}{HELD}")
     if len(d.traces) > MOST_LOGS:
         yield f'<p class="note">The first {MOST_LOGS} of {len(d.traces)} logs are drawn; all are in the .rrd.</p>'
     spectrum, rate, attitude = figures.spectrum(d), figures.against_rate(d), figures.against_attitude(d)
@@ -156,6 +160,12 @@ def _before_and_after(d: Diagnosis) -> Iterator[str]:
         )
     else:
         yield '<p class="note">No unseen stretch is long enough for a spectrum.</p>'
+    paths = diagnosis_paths.paths(d)
+    if paths is not None:
+        true = '<span class="key" style="background: var(--ink); opacity: 0.4"></span>true'
+        yield _figure(
+            paths, "p", f"Integrated from the true start of each stretch of {over}; drift as root mean square.{true}{both}"
+        )
     bands = "means in bins, with two standard errors"
     if rate is not None:
         yield _figure(rate, "t", f"Against turning rate over {over}: {bands}. {both}")

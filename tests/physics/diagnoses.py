@@ -17,6 +17,8 @@ from imutool.physics.diagnosis import (
     Traces,
     Unexplained,
 )
+from imutool.recording import Imu
+from imutool.strapdown import dead_reckon
 
 RATE_HZ, DURATION_S, HELD_OUT_S = 200.0, 90.0, 30.0
 GYRO_NOISE, ACCEL_NOISE = 0.004, 0.05
@@ -69,7 +71,9 @@ def traces(
     rng = np.random.default_rng(seed + 100)
     noise = np.concatenate([rng.normal(0.0, GYRO_NOISE, (count, 3)), rng.normal(0.0, ACCEL_NOISE, (count, 3))], axis=1)
     held_out = (t >= duration_s / 3.0) & (t < 2.0 * duration_s / 3.0)
-    return Traces(log, t + start_s, after + noise, before, after, held_out, q_wb_wxyz)
+    t_ns = np.round((t + start_s) * 1e9).astype(np.int64)
+    truth = dead_reckon(Imu(t_ns, gyro, accel), (q_wb_wxyz[0], np.zeros(3), np.zeros(3)))
+    return Traces(log, t + start_s, after + noise, before, after, held_out, truth, before)
 
 
 def unexplained(white: bool = True, accel_rms: float = ACCEL_NOISE) -> dict[str, Unexplained]:

@@ -109,3 +109,10 @@ def test_a_variable_that_never_changes_is_no_regime() -> None:
     rows = (T >= 12.0) & (T < 19.0)
     (one,) = located(T, acting(4, rows), NOISE, {"tilt": ("rad", np.zeros(len(T)))}, {})
     assert "tilt" not in one.regime
+
+
+def test_stretches_of_one_log_are_placed_on_its_clock_and_the_hole_between_them_is_nowhere() -> None:
+    there = (T < 10.0) | (T >= 30.0)
+    t_s, misfit = T[there], acting(1, np.ones(len(T), bool))[there]
+    (one,) = located(t_s, misfit, NOISE, {}, {"gyro": 1e-9})
+    assert one.intervals_s == ((0.0, 10.0), (30.0, DURATION_S))

@@ -18,6 +18,7 @@ from hypothesis import strategies as st
 
 from imutool.errors import ConfigError
 from imutool.physics.conclusion import conclusion
+from imutool.physics.diagnosis import SignalTraces
 from imutool.view import diagnosis_figures as figures
 from imutool.view import drawing
 from imutool.view.diagnosis_page import html, write
@@ -217,10 +218,24 @@ def test_spectra_and_means_are_over_unseen_time_alone(figure: object) -> None:
     assert figure(changed(MADE.LATE, unseen=True)) != drawn
 
 
+def test_another_signal_is_drawn_as_recorded_and_expected_and_what_is_left() -> None:
+    t_s = np.arange(500) / 50.0
+    there, held_out = np.sin(t_s), t_s > 5.0
+    beside = SignalTraces(t_s, 1.2 * there, there, 1.2 * there, held_out, "m/s")
+    with_it = replace(MADE.BOTH, signals={"/odom.<x>": beside})
+    content = html(with_it)
+    assert len(svgs(content)) == len(svgs(html(MADE.BOTH))) + 1
+    assert "/odom.&lt;x&gt;: over time" in content
+    svg = figures.signal(beside, found=True)
+    assert "(m/s)" in axes_labels(svg)
+    assert "var(--after)" in svg
+    assert "var(--after)" not in figures.signal(beside, found=False)
+
+
 def test_without_attitude_or_a_long_enough_stretch_it_says_so() -> None:
     (trace,) = MADE.LATE.traces
     held_out = np.arange(len(trace.t_s)) % 100 < 20  # a tenth of a second at a time
-    d = replace(MADE.LATE, traces=(replace(trace, q_wb_wxyz=None, held_out=held_out),))
+    d = replace(MADE.LATE, traces=(replace(trace, truth=None, held_out=held_out),))
     said = Page(html(d)).text
     assert "No attitude is known" in said
     assert "No unseen stretch is long enough for a spectrum" in said
