@@ -173,7 +173,7 @@ class Structure:
         return found or records.messages(data, block.offset)
 
     def _listed(self, block: Block, size: int) -> Int64[np.ndarray, " n"] | None:
-        """Where the messages of a chunk of `size` bytes begin, by the message indexes behind it; None where these must be wrong.
+        """Where the messages of a chunk of `size` bytes begin, by the message indexes behind it; None where they must be wrong.
 
         A hint: who uses it sees whether messages lie there.
         """
