@@ -137,8 +137,8 @@ def test_colours_in_titles_are_those_of_the_curves(recording: Recording, runs: l
     def titles(case: str) -> list[str]:
         return [view.name for view in RRD.views(layout.blueprint(CASES[case](recording, runs)))]
 
-    assert "Orientation error (deg): debiased blue, raw orange" in titles("one model")
-    assert "Position error (m): static blue, my model/v1 green, raw orange" in titles("two models")
+    assert "Orientation error (deg): debiased blue, raw orange, worst pink" in titles("one model")
+    assert "Position error (m): static blue, my model/v1 green, raw orange, worst pink" in titles("two models")
     assert "Angular rate (rad/s): x red, y green, z blue; debiased bold, raw faint" in titles("one model")
     assert "Angular rate (rad/s): x red, y green, z blue" in titles("raw alone")
     assert "Angular rate (rad/s): x red, y green, z blue; static bold, my model/v1 paler" in titles("two models")

@@ -82,9 +82,19 @@ def test_nothing_is_on_any_other_timeline(entities: SimpleNamespace) -> None:
 
 
 def test_what_is_drawn_already_is_left_out_and_all_else_is_there(entities: SimpleNamespace) -> None:
-    assert "/imu0" not in entities.all
-    assert {"/ground_truth/pose", "/tf", "/wind"} <= set(entities.all)
+    assert not {"/imu0", "/ground_truth/pose"} & set(entities.all)
+    assert {"/ground_truth/velocity", "/tf", "/wind"} <= set(entities.all)
     assert not [path for path in entities.all if path.startswith("/__mcap")]
+
+
+def test_a_log_without_truth_has_its_other_topics_too(
+    recording: Recording, frames: list[tuple[int, bytes]], tmp_path: Path
+) -> None:
+    images = {CAMERA: Frames("png", len(frames), lambda: iter(frames))}
+    write(replace(recording, truths={}, scalars={}, frames=images), tmp_path / "bare.mcap")
+    found = RRD.read(RRD.written([load(tmp_path / "bare.mcap")], tmp_path / "bare.rrd"))
+    assert CAMERA in found
+    assert "/imu0" not in found
 
 
 def test_a_topic_that_is_called_like_something_of_ours_lies_below_source(entities: SimpleNamespace) -> None:

@@ -43,6 +43,7 @@ def total_errors(data: RunData, scope: Scope) -> list[Panel]:
         contents += [f"{path}/worst" for path, trace in zip(contents, scored, strict=True) if not trace.is_raw]
         if contents:
             title, key = f"{kind.capitalize()} error ({errors.UNITS[kind]})", _colors(data, _models_first(data))
+            key += ", worst pink" if any(not trace.is_raw for trace in scored) else ""
             found.append(plot(contents, title, key, height=upwards(error_limit(data, kind))))
     return found
 

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from imutool.view.rerun.palette import end_of_scale
 from imutool.view.rundata import RunData
 
 if TYPE_CHECKING:
@@ -14,7 +15,7 @@ if TYPE_CHECKING:
 
 LONGEST_TITLE = 90  # letters that fit over half of a window of 1280 pixels
 READABLE = 10.0  # an error this many times smaller than the plot is high can still be read
-SHOWN = 2.5  # times the models' largest error: how high a plot reaches that raw leaves
+SHOWN = 2.0  # times the models' largest error, and up to a number that can be read: how high a plot reaches that raw leaves
 
 
 def plot(
@@ -65,7 +66,7 @@ def limit(data: RunData, values: Mapping[str, np.ndarray]) -> float | None:
     models = [tops[trace.name] for trace in data.models() if trace.name in tops]
     highest = max(tops.values(), default=0.0)
     cut = bool(models) and highest > READABLE * max(models) > 0.0
-    reach = SHOWN * max(models) if cut else highest
+    reach = end_of_scale(SHOWN * max(models)) if cut else highest
     return 1.05 * reach if reach > 0.0 else None
 
 

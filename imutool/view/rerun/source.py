@@ -17,7 +17,7 @@ from imutool.mcap_io.log import DERIVED_KEY, Log, Topic
 from imutool.recording import Times
 from imutool.view.rerun import clock
 from imutool.view.rerun.entities import Scope, path
-from imutool.view.rundata import RunData
+from imutool.view.rundata import TRUE_BIAS, RunData
 
 if TYPE_CHECKING:
     import rerun as rr
@@ -53,10 +53,11 @@ def plan(data: RunData, scope: Scope) -> Import:
                 sentence=f"{SENTENCE}: it has {size / 1e6:.0f} MB, and {SOURCE_LIMIT / 1e6:.0f} is the most that is read."
             )
         with Log(data.source, salvage=True) as log:
-            topics, imus = tuple(log.topics.values()), log.imu_topics
+            topics = tuple(log.topics.values())
     except (OSError, LogError) as error:
         return Import(sentence=f"{SENTENCE}: {error}")
-    drawn = set(imus) & {data.provenance.get("IMU", "")}
+    drawn = {data.provenance[key] for key in ("IMU", "truth") if key in data.provenance}
+    drawn |= {TRUE_BIAS[kind] for kind in data.true_bias}
     left_out = tuple(topic.name for topic in topics if topic.name in drawn or topic.metadata.get(DERIVED_KEY) in drawn)
     sentence = ""
     if scope and (frames := tuple(topic.name for topic in topics if topic.schema_name in (schema.TF, schema.TRANSFORM))):
