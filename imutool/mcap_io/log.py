@@ -339,17 +339,14 @@ class Log:
             yield ScalarBatch(cut.log_time, cut.publish_time, cut.sequence, stamp_ns, columns.values, columns.frame_id)
 
     def decode_twist(self, topic: str, rows: records.Rows) -> Iterator[schema.TwistColumns]:
-        """Biases with their covariance from their bytes, one batch per stretch with one frame.
+        """Biases with their covariance from their bytes, a batch per stretch with one frame; nothing is asked of their values.
 
         Raises:
-            LogError: a payload that is no such message, NaN or infinite values.
+            LogError: a payload that is no such message.
         """
         encoding = self.topics[topic].message_encoding
         for part, layout in schema.runs(rows.payload, schema.TWIST, encoding):
-            cut = rows.where(part)
-            columns = schema.decode_twist(cut.payload, encoding, layout)
-            finite(cut.sequence, angular=columns.angular, linear=columns.linear, variance=columns.variance)
-            yield columns
+            yield schema.decode_twist(rows.where(part).payload, encoding, layout)
 
     def images(self, topic: str, start_ns: int | None = None, end_ns: int | None = None) -> Iterator[tuple[int, bytes]]:
         """Stamp and encoded bytes of every image of a CompressedImage topic, in file order.

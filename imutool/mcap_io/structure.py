@@ -167,12 +167,13 @@ class Structure:
         opcode, length = HEAD.unpack_from(raw)
         if opcode != Opcode.CHUNK or length != block.length - HEAD.size:
             raise LogError(f"the summary says a chunk lies at byte {block.offset}, which it does not")
-        data, offsets = records.unpack(raw, block.offset), self._listed(block)
+        data = records.unpack(raw, block.offset)
+        offsets = self._listed(block, len(data))
         found = None if offsets is None else records.listed(data, offsets)
         return found or records.messages(data, block.offset)
 
-    def _listed(self, block: Block) -> Int64[np.ndarray, " n"] | None:
-        """Where the messages of a chunk begin, by the message indexes behind it; None where there are none, or other records.
+    def _listed(self, block: Block, size: int) -> Int64[np.ndarray, " n"] | None:
+        """Where the messages of a chunk of `size` bytes begin, by the message indexes behind it; None where they must be wrong.
 
         A hint: who uses it sees whether messages lie there.
         """
@@ -184,7 +185,8 @@ class Structure:
                 return None
             parts.append(np.frombuffer(raw, "<u8", size // 8, at + INDEX_HEAD.size)[1::2])
             at += HEAD.size + length
-        return np.sort(np.concatenate(parts)).view(np.int64) if parts else None
+        offsets = np.sort(np.concatenate([np.zeros(0, np.uint64), *parts]))
+        return offsets.view(np.int64) if len(offsets) and offsets[-1] < size else None
 
     def index(self, block: Block, channel: int) -> UInt64[np.ndarray, "n 2"]:
         """The (log time, offset) entries of one channel in one block, from its MessageIndex record.

@@ -166,8 +166,9 @@ def _run(
     called = f"in the log: {model}" if model else name.rpartition("/")[2]
     for parts in filter(None, beliefs.values()):
         stamp_ns, angular, linear, variance = (np.concatenate(column) for column in list(zip(*parts, strict=True))[:4])
-        if np.array_equal(stamp_ns, imu.t_ns):
-            return Run(called, imu, angular, linear, np.sqrt(np.maximum(variance, 0.0)))
+        sound = all(np.isfinite(column).all() for column in (angular, linear, variance)) and (variance >= 0.0).all()
+        if sound and np.array_equal(stamp_ns, imu.t_ns):
+            return Run(called, imu, angular, linear, np.sqrt(variance))
     rows = np.minimum(np.searchsorted(raw.t_ns, imu.t_ns), len(raw) - 1)
     if len(imu) < FEWEST or not np.array_equal(raw.t_ns[rows], imu.t_ns):
         return None

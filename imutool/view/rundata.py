@@ -27,8 +27,6 @@ TRUTH = "truth"  # its place in the pictures; no run may take it
 LEVELLING_S = 0.5  # without truth the first half second of specific force says where up is
 TRUE_BIAS = {"gyro": "/ground_truth/bias/gyro", "accel": "/ground_truth/bias/accel"}
 
-Vectors = Float64[np.ndarray, "n 3"]
-
 
 @dataclass(frozen=True, eq=False)
 class Run:

@@ -9,11 +9,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 from defects import batch_of, late, pick, repeated, with_values, write_log
+from mcap.reader import make_reader
+from mcap.writer import Writer
 
 from imutool.debias import apply, apply_with_std, debias
 from imutool.errors import ConfigError, DataError, LogError
 from imutool.evaluate import started
-from imutool.mcap_io.log import Log
+from imutool.mcap_io import schema
+from imutool.mcap_io.log import DERIVED_KEY, ImuBatch, Log
 from imutool.mcap_io.read import read
 from imutool.mcap_io.write import write
 from imutool.physics.flight import flight
@@ -104,23 +107,32 @@ def test_a_channel_without_its_bias_in_the_log_is_subtracted_at_equal_stamps(deb
     assert any("/imu0/debiased is left out" in note for note in data.notes)
 
 
-def write_both(raw: object, derived: object, path: Path) -> None:
+def write_both(raw: ImuBatch, derived: ImuBatch, path: Path) -> None:
     """An IMU and what claims to be derived from it, without anything else."""
-    from mcap.writer import Writer
-
-    from imutool.mcap_io import schema
-    from imutool.mcap_io.log import DERIVED_KEY
-
     with path.open("wb") as file:
         writer = Writer(file)
         writer.start("ros2", "test")
         kind = writer.register_schema(schema.IMU, "ros2msg", schema.definition(schema.IMU).encode())
         for topic, batch, about in (("/imu0", raw, {}), ("/imu0/debiased", derived, {DERIVED_KEY: "/imu0"})):
             channel = writer.register_channel(topic, "cdr", kind, about)
-            payload = schema.encode_imu(batch.stamp_ns, batch.gyro, batch.accel, batch.frame_id)  # type: ignore[attr-defined]
-            for stamp_ns, data in zip(batch.stamp_ns, payload, strict=True):  # type: ignore[attr-defined]
+            payload = schema.encode_imu(batch.stamp_ns, batch.gyro, batch.accel, batch.frame_id)
+            for stamp_ns, data in zip(batch.stamp_ns, payload, strict=True):
                 writer.add_message(channel, int(stamp_ns), data.tobytes(), int(stamp_ns))
         writer.finish()
+
+
+def test_a_bias_in_the_log_that_is_no_number_is_found_by_subtraction(debiased: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    sound = load(debiased).traces[1].run
+    decode = schema.decode_twist
+
+    def spoiled(*words: object) -> schema.TwistColumns:
+        columns = decode(*words)  # type: ignore[arg-type]
+        return columns._replace(variance=np.full_like(columns.variance, np.nan))
+
+    monkeypatch.setattr(schema, "decode_twist", spoiled)
+    run = load(debiased).traces[1].run
+    assert run.bias_std is None
+    np.testing.assert_allclose(run.gyro_bias, sound.gyro_bias, atol=LAST_BITS)
 
 
 def test_models_come_with_their_certainty_and_say_how_they_started(made: Recording, log: Path) -> None:
@@ -190,9 +202,6 @@ def test_true_poses_that_cannot_be_held_are_left_out_unless_asked_for(made: Reco
 
 def spoil_stamps(source: Path, target: Path, topic: str) -> None:
     """The same log with the messages of a topic written twice."""
-    from mcap.reader import make_reader
-    from mcap.writer import Writer
-
     with source.open("rb") as opened, target.open("wb") as file:
         writer = Writer(file)
         writer.start("ros2", "test")
