@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     import rerun as rr
 
 WIDTH, HEIGHT = 200.0, 90.0  # of the drawing, which the viewer scales as a whole
-SHOWN_X, SHOWN_Y = (-24.0, WIDTH + 8.0), (-6.0, HEIGHT + 14.0)  # with room for numbers
+SHOWN_X, SHOWN_Y = (-24.0, WIDTH + 8.0), (-8.0, HEIGHT + 17.0)  # with room for numbers
 KINDS = ("gyro", "accel")
 SLACK = 0.02  # of a decade: 100.1 Hz need no decade of their own
 MOST_POINTS = 400  # of a curve: about two a pixel, of each bucket its lowest and its highest
@@ -103,8 +103,8 @@ def _log_frame(to: rr.RecordingStream, entity: str, frame: Frame) -> None:
     y = HEIGHT - (up - frame.low) / (frame.high - frame.low) * HEIGHT
     lines = [[[at, 0.0], [at, HEIGHT]] for at in x] + [[[0.0, at], [WIDTH, at]] for at in y]
     to.log(entity, rr.LineStrips2D(lines, colors=[GRID] * len(lines), radii=rr.Radius.ui_points(0.5)), static=True, strict=True)
-    _log_numbers(to, f"{entity}/hz", [[at, HEIGHT + 1.0] for at in x], [f"{_power(power)} Hz" for power in across.tolist()])
-    _log_numbers(to, f"{entity}/density", [[-9.0, at - 3.0] for at in y], [_power(power) for power in up.tolist()])
+    _log_numbers(to, f"{entity}/hz", [[at, HEIGHT + 4.0] for at in x], [f"{_power(power)} Hz" for power in across.tolist()])
+    _log_numbers(to, f"{entity}/density", [[-11.0, at - 5.5] for at in y], [_power(power) for power in up.tolist()])
 
 
 def _log_numbers(to: rr.RecordingStream, entity: str, places: Sequence[Sequence[float]], words: Sequence[str]) -> None:
