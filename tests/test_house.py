@@ -233,6 +233,7 @@ def test_the_wheel_holds_both_packages_their_types_and_the_models(wheel: Path) -
     assert "imutool/_models/README.md" in models
     tops = {name.partition("/")[0] for name in held}
     assert tops == {"imutool", "converters", f"imutool-{__version__}.dist-info"}
+    assert {f"imutool/view/rerun/site/{name}" for name in ("index.html", "start.js")} <= held
 
 
 def test_the_wheel_runs_in_a_fresh_environment(wheel: Path, tmp_path: Path, logs: Path) -> None:

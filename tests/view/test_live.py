@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import logging
+import os
 import runpy
 import subprocess
 import sys
@@ -152,6 +153,25 @@ def test_what_cannot_be_shown_does_not_stop_the_debiasing(
     assert out.read_bytes() == unwatched.read_bytes()
     assert watch.shown == []
     assert not (tmp_path / "live.rrd").exists()
+
+
+def test_a_file_that_lost_its_end_is_no_file(
+    log: Path, unwatched: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    finish = live.Live.finish
+
+    def and_lose_the_end(self: live.Live) -> None:
+        finish(self)
+        (partial,) = tmp_path.glob(".live.rrd.*.partial")
+        os.truncate(partial, partial.stat().st_size // 2)
+
+    monkeypatch.setattr(live.Live, "finish", and_lose_the_end)
+    with caplog.at_level(logging.WARNING, "imutool"):
+        out, watch = watched(log, tmp_path, save=tmp_path / "live.rrd")
+    assert len(caplog.records) == 1
+    assert "could not be written whole" in caplog.text
+    assert (watch.shown, [path.name for path in tmp_path.iterdir()]) == ([], ["out.mcap"])
+    assert out.read_bytes() == unwatched.read_bytes()
 
 
 def test_samples_that_come_again_from_a_repaired_log_are_shown_once(log: Path, tmp_path: Path) -> None:

@@ -36,6 +36,7 @@ if TYPE_CHECKING:
 PATIENCE_S = 0.05  # for a batch to leave
 STALLED_S = 5.0  # without one that did: the viewer does not keep up, and what waits for it fills our memory
 SIZE_M = 5.0  # of a scene of which nobody knows yet how large it becomes
+END, END_BYTES = b"RRF2FOOT", 16  # the last words of an .rrd
 COLUMNS = (slice(0, 3), slice(3, 6))  # of the gyroscope and the accelerometer
 TROUBLE = (ImutoolError, RuntimeError, ValueError, TypeError, OSError)
 
@@ -75,10 +76,18 @@ def watching(
         assert isinstance(target.temporary, Path), "not in a store"
         live.record(save, target.temporary)
         yield live
-        if live.finish():
+        live.finish()
+        if live.kept(target.temporary):
             target.commit()
     finally:
         target.abandon()
+
+
+def whole(path: Path) -> bool:
+    """Whether an .rrd has its end: Rerun, which writes it, tells nobody that a disk is full."""
+    with path.open("rb") as file:
+        file.seek(max(0, path.stat().st_size - END_BYTES))
+        return END in file.read()
 
 
 class Live:
@@ -123,8 +132,18 @@ class Live:
             return
         self._see_off()
 
-    def finish(self) -> bool:
-        """Everything was debiased: the whole of it is laid out, whoever listens has all of it; whether a file does."""
+    def kept(self, path: Path) -> bool:
+        """Whether what was written there is all of it; said where it is not and nothing else was said."""
+        if self._file is None:
+            return False
+        if not whole(path):
+            self.shown = [one for one in self.shown if one.how != "rrd"]
+            logger.warning("What was to be shown could not be written whole, perhaps for lack of room; there is no such file")
+            return False
+        return True
+
+    def finish(self) -> None:
+        """Everything was debiased: the whole of it is laid out, and whoever listens has all of it."""
         streams = [stream for stream in (self._viewer, self._file) if stream is not None]
         self._lay_out(streams, {topic: imu.box for topic, imu in self._watched.items()})
         if self._viewer is not None:
@@ -135,7 +154,6 @@ class Live:
         for stream in (self._viewer, self._file):
             if stream is not None:
                 stream.disconnect()
-        return self._file is not None
 
     def _lay_out(self, streams: list[rr.RecordingStream], boxes: Mapping[str, Box] | None = None) -> None:
         scopes = {topic: imu.scope for topic, imu in self._watched.items()}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 import uuid
 from collections.abc import Sequence
@@ -14,6 +15,8 @@ if TYPE_CHECKING:
     import rerun as rr
 
 FLUSH_S = 30.0
+LOGGING = "RUST_LOG"
+ONLY_NEW = "warn,re_grpc_client=off,re_sdk=off,re_log_encoding=off"  # of Rerun's own lines, those that say what we do not say
 
 
 def need_sdk() -> None:
@@ -22,6 +25,7 @@ def need_sdk() -> None:
     Raises:
         ConfigError: it is not installed.
     """
+    os.environ.setdefault(LOGGING, ONLY_NEW)  # read when Rerun is first imported
     try:
         import rerun  # noqa: F401
     except ImportError as error:

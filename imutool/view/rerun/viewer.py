@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 from imutool.errors import ConfigError
 from imutool.view.rerun import connect, files
 from imutool.view.rerun.connect import Peer
-from imutool.view.rerun.sdk import need_sdk, title, version
+from imutool.view.rerun.sdk import LOGGING, ONLY_NEW, need_sdk, title, version
 from imutool.view.rundata import RunData
 from imutool.view.shown import Shown
 
@@ -116,7 +116,13 @@ def run(*arguments: str) -> subprocess.Popen[bytes]:
     Raises:
         ConfigError: it is missing or the system does not run it.
     """
-    quiet: Mapping[str, Any] = {"stdin": subprocess.DEVNULL, "stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+    env = {name: value for name, value in os.environ.items() if (name, value) != (LOGGING, ONLY_NEW)}  # it may say all
+    quiet: Mapping[str, Any] = {
+        "env": env,
+        "stdin": subprocess.DEVNULL,
+        "stdout": subprocess.DEVNULL,
+        "stderr": subprocess.DEVNULL,
+    }
     try:
         return subprocess.Popen([str(binary()), "--bind", "127.0.0.1", *arguments], **quiet, start_new_session=True)
     except OSError as error:
