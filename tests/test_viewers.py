@@ -62,3 +62,23 @@ def test_a_viewer_that_dies_is_asked_once_more_and_one_that_shows_the_wrong_thin
         with pytest.raises(raises):
             VIEWERS.seen(job)
         assert len(asked) == times
+
+
+@pytest.mark.parametrize("works", [True, False])
+def test_what_is_missing_is_fetched_three_times_before_it_is_given_up(
+    hidden: str, works: bool, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    asked = tmp_path / "asked"
+    for name, body in (("apt-get", f'echo "$@" >> {asked}; {"true" if works else "false"}'), ("sudo", 'shift; exec "$@"')):
+        (tmp_path / name).write_text(f"#!/bin/sh\n{body}\n")
+        (tmp_path / name).chmod(0o755)
+    for name in ("env", "true", "false", "sh"):
+        (tmp_path / name).symlink_to(f"/usr/bin/{name}")
+    monkeypatch.setitem(VIEWERS.main.__globals__, "PAUSE_S", 0.0)
+    VIEWERS.main()
+    lines = asked.read_text().splitlines()
+    assert len(lines) == (2 if works else VIEWERS.ATTEMPTS)
+    assert ("NOT LOOKED AT" in capfd.readouterr().err) == (not works)
+    if works:
+        assert lines[0].endswith("update")
+        assert all(package in lines[1] for package in VIEWERS.PACKAGES[hidden])

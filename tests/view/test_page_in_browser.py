@@ -45,11 +45,11 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     logs = {
         "one model": [build(flights[0], APART.runs(flights[0]))],
         "nothing known": [build(replace(flights[0], truths={}, scalars={}), APART.runs(flights[0], models=0))],
-        "two logs": [build(one, APART.runs(one, models=2)) for one in (flights[0], hostile)],
+        "two logs": [build(one, APART.runs(one)) for one in (flights[0], hostile)],
     }
     for name, shown in logs.items():
         report.write_page(shown, folder / f"{name}.html")
-    diagnosis_page.write(MADE.THREE, folder / "diagnosis.html")
+    diagnosis_page.write(MADE.LATE, folder / "diagnosis.html")
     return folder
 
 
