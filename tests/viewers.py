@@ -146,6 +146,14 @@ class Native:
 
         return float(psutil.Process(self.process.pid).memory_info().rss / 2**20)
 
+    @property
+    def cpu_s(self) -> float:
+        """Seconds of a core that the process has used."""
+        import psutil
+
+        times = psutil.Process(self.process.pid).cpu_times()
+        return float(times.user + times.system)
+
 
 def steady(
     shoot: Callable[[], bytes], enough: Callable[[Picture], bool] = lambda _: True, seconds: float = STEADY_S
