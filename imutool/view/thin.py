@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float64, Int64
 
-MOST = 2_000_000  # rows of a curve: up to here it is drawn whole (two hours and three quarters at 200 Hz)
+MOST = 300_000  # rows of a curve: up to here it is drawn whole (25 minutes at 200 Hz); an hour would take a viewer over 1 GB
 MOST_IN_3D = 20_000  # rows of a path: the screen has no more pixels along it
 
 Rows = Int64[np.ndarray, " m"]
