@@ -12,8 +12,9 @@ from jaxtyping import Float64
 from imutool.recording import Poses
 from imutool.view.drawing import Panel, Picture, legend
 from imutool.view.report_words import best, measure, spoken
-from imutool.view.rundata import RunData, Trace, sparse, stretches
+from imutool.view.rundata import RunData, Trace, stretches
 from imutool.view.theme import AXES, BEFORE, HELD, INK, LEVELS, MODELS
+from imutool.view.thin import path_rows
 
 HEIGHT_INCH = 4.3
 MOST_POINTS = 1500  # of a path
@@ -138,7 +139,7 @@ def _broken(poses: Poses) -> Points:
     parts = stretches(poses)
     share = max(2, MOST_POINTS // max(len(parts), 1))
     hole = np.full((1, 3), np.nan)
-    rows = [piece for part in parts for piece in (part.p_wb[sparse(len(part), share)], hole)][:-1]
+    rows = [piece for part in parts for piece in (part.p_wb[path_rows(part.p_wb, share)], hole)][:-1]
     return np.concatenate(rows)
 
 

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Float64, Int64
+from jaxtyping import Bool, Float64
 from scipy.spatial.transform import Rotation
 
 from imutool.errors import ConfigError, DataError
@@ -212,12 +214,6 @@ def stretches(poses: Poses) -> list[Poses]:
     return [poses.rows(slice(first, last)) for first, last in pairwise(edges)]
 
 
-def sparse(count: int, most: int) -> Int64[np.ndarray, " m"]:
-    """Rows to draw when there are more than `most`: evenly strided, the last one always among them."""
-    stride = max(1, -(-count // most))
-    return np.unique(np.append(np.arange(0, count, stride), max(count - 1, 0)))
-
-
 def _true_bias(recording: Recording) -> Mapping[str, Scalars]:
     """The true biases that the log knows, while the IMU runs."""
     imu = recording.imu
@@ -227,30 +223,46 @@ def _true_bias(recording: Recording) -> Mapping[str, Scalars]:
 
 def _scored(runs: Sequence[Run], truth: Poses, where: str, align: Alignment) -> tuple[tuple[Trace, ...], list[str]]:
     """Each run from the first sample with truth to the last, with its errors and figures; and what is to be said of that."""
-    traces, notes, stamps = [], [], None
-    for run in runs:
-        if stamps is None or not np.array_equal(run.imu.t_ns, stamps):
-            stamps = run.imu.t_ns
-            rows, true, valid = stretch_with_truth(stamps, truth, where)
-        path = dead_reckon(run.imu.rows(rows), Start.of(true))
-        moved, motion = aligned(path, true, valid, align)
-        of_truth = (
-            drift_since_reset(path, true, valid),
-            windows(path, true, valid),
-            MappingProxyType(evaluate(path, true, valid)),
-        )
-        traces.append(Trace(run, moved, errors(moved, true, valid), *of_truth, spectra=spectra(run.imu)))
-        if align != "none":
-            away_m = np.linalg.norm(moved.p_wb[valid].mean(axis=0) - path.p_wb[valid].mean(axis=0))
-            turned = np.rad2deg(motion.turn.magnitude())
-            notes.append(f"{run.name}: alignment {align} turned the path by {turned:.3g} deg, its centre moved {away_m:.3g} m.")
+    known: list[Known] = []
+    for k, run in enumerate(runs):
+        alike = k > 0 and np.array_equal(run.imu.t_ns, runs[k - 1].imu.t_ns)
+        known.append(known[-1] if alike else Known(*stretch_with_truth(run.imu.t_ns, truth, where)))
+    with ThreadPoolExecutor() as pool:  # nearly all of it is numpy's, which lets other threads work
+        scored = list(pool.map(partial(_score, align=align), runs, known))
+    traces, motions = tuple(trace for trace, _ in scored), [motion for _, motion in scored if motion]
     started = seconds(traces[0].path.t_ns[:1], int(runs[0].imu.t_ns[0]))[0]
     how = "errors are without alignment" if align == "none" else f"paths and errors are shown after alignment {align}"
-    return tuple(traces), [
+    return traces, [
         f"Paths start at the true pose, {started:.2f} s into the log; {how}.",
-        *(["The figures, drift and windows are without alignment."] if notes else []),
-        *notes,
+        *(["The figures, drift and windows are without alignment."] if motions else []),
+        *motions,
     ]
+
+
+class Known(NamedTuple):
+    """Where the truth is known: rows of the IMU, the true poses at them, and a mask of those between which there is no gap."""
+
+    rows: slice
+    true: Poses
+    valid: Bool[np.ndarray, " n"]
+
+
+def _score(run: Run, known: Known, align: Alignment) -> tuple[Trace, str]:
+    """One run, and how it was aligned (nothing where it was not)."""
+    rows, true, valid = known
+    path = dead_reckon(run.imu.rows(rows), Start.of(true))
+    moved, motion = aligned(path, true, valid, align)
+    of_truth = (
+        drift_since_reset(path, true, valid),
+        windows(path, true, valid),
+        MappingProxyType(evaluate(path, true, valid)),
+    )
+    trace = Trace(run, moved, errors(moved, true, valid), *of_truth, spectra=spectra(run.imu))
+    if align == "none":
+        return trace, ""
+    away_m = np.linalg.norm(moved.p_wb[valid].mean(axis=0) - path.p_wb[valid].mean(axis=0))
+    turned = np.rad2deg(motion.turn.magnitude())
+    return trace, f"{run.name}: alignment {align} turned the path by {turned:.3g} deg, its centre moved {away_m:.3g} m."
 
 
 def _thinned(imu: Imu) -> list[str]:

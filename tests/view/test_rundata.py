@@ -16,7 +16,7 @@ from imutool.strapdown import Start, dead_reckon
 from imutool.view import rundata
 from imutool.view.deviation import Alignment, errors
 from imutool.view.events import Event
-from imutool.view.rundata import RAW, Run, RunData, build, level_start, sparse, stretches
+from imutool.view.rundata import RAW, Run, RunData, build, level_start, stretches
 
 ROUNDING = 1e-9  # degrees and metres: some thousand float64 operations on numbers of size one
 NO_ERROR = dict.fromkeys(GYRO.__struct_fields__, 0.0)
@@ -230,15 +230,6 @@ def test_truth_and_imu_that_never_meet_are_refused(recording: Recording, runs: l
     elsewhere = flight(4, duration_s=4.0).truths  # another hour
     with pytest.raises(DataError, match="share fewer than two samples"):
         build(replace(recording, truths=elsewhere), runs)
-
-
-@pytest.mark.parametrize(("count", "most"), [(1, 10), (10, 10), (11, 10), (100_001, 1000)])
-def test_sparse_rows_keep_the_first_and_the_last(count: int, most: int) -> None:
-    rows = sparse(count, most)
-    assert rows[0] == 0
-    assert rows[-1] == count - 1
-    assert len(rows) <= most + 1
-    assert (np.diff(rows) > 0).all()
 
 
 def test_the_settings_of_a_triad_are_all_switched_off_here() -> None:
