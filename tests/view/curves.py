@@ -18,7 +18,7 @@ RRD = SimpleNamespace(**runpy.run_path(str(Path(__file__).with_name("rrd.py"))))
 LEAST = 200  # pixels of a curve; its sample in a legend has some fifty
 WITHIN = 36.0  # in RGB: what an edge mixes of a line with its ground, and less than two colours of ours are apart
 MOST_COLORS = 12  # of one path: its neighbours are near each other
-MARK = "/worst"  # a mark and no curve: a body may hide it
+MARKS = ("/worst", "/error_vec")  # no curves: a body may hide a mark, and where nothing is wrong a vector has no length
 COLORS = ("SeriesLines:colors", "LineStrips3D:colors", "LineStrips2D:colors")
 
 
@@ -40,7 +40,7 @@ def curves(path: Path) -> list[Curve]:
         for name, column in zip(batch.schema.names, batch.columns, strict=True):
             if name in COLORS or name == "SeriesLines:names":
                 entity.setdefault(name, []).extend(flat(column))
-    return [curve for entity, styles in found.items() if not entity.endswith(MARK) for curve in of_entity(entity, styles)]
+    return [curve for entity, styles in found.items() if not entity.endswith(MARKS) for curve in of_entity(entity, styles)]
 
 
 def flat(column: pa.Array) -> list[Any]:

@@ -126,7 +126,7 @@ def test_the_file_holds_exactly_the_entities_it_should(one: RunData, entities: S
     drawn = {f"/spectrum/{kind}/{part}" for kind in ("gyro", "accel") for part in ("raw", "debiased", "frame")}
     drawn |= {f"/spectrum/{kind}/frame/{part}" for kind in ("gyro", "accel") for part in ("hz", "density")}
     events = {f"/events/{kind}" for kind in ("gap", "stop", "worst", "saturation")}
-    other = {"/world", "/report", "/legend/colors", "/legend/ticks", "/__properties"}
+    other = {"/world", "/world/error_vec", "/report", "/legend/colors", "/legend/ticks", "/__properties"}
     assert set(entities.all) == set(expected(one)) | bodies | worst | drawn | events | other
 
 
@@ -248,6 +248,16 @@ def test_the_debiased_path_has_the_colour_of_its_error_and_the_legend_its_scale(
     np.testing.assert_array_equal(found, palette.heat(np.maximum(total[:-1], total[1:]), top))
     assert entities.all["/legend/ticks"].static["Points2D:labels"][0] == "0°"
     assert entities.all["/legend/ticks"].static["Points2D:labels"][4] == f"{top:g}°"
+
+
+def test_an_error_vector_goes_from_the_true_place_to_the_estimated_one(one: RunData, entities: SimpleNamespace) -> None:
+    path, errors = one.models()[0].path, one.models()[0].errors
+    assert errors is not None
+    entity = entities.all["/world/error_vec"]
+    ends = np.concatenate(strips(entity))
+    np.testing.assert_array_equal(ends[:, 1], path.p_wb.astype(np.float32))
+    np.testing.assert_array_equal(ends[:, 0], (path.p_wb - errors.position_m).astype(np.float32))
+    np.testing.assert_array_equal(entity.times("LineStrips3D:strips", "ros2_timestamp"), path.t_ns)
 
 
 @pytest.mark.parametrize(("highest", "top"), [(0.3, 0.5), (1.0, 1.0), (1.1, 2.0), (5.0, 5.0), (130.0, 200.0), (0.0, 1.0)])

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import colorsys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -12,12 +12,13 @@ from jaxtyping import Float64
 from imutool.view.rerun import clock, entities, errors, panels, styles
 from imutool.view.rerun.entities import Scope
 from imutool.view.rerun.palette import GROUND, MODEL_COLORS, RAW_FADE, Color, faded
-from imutool.view.rerun.paths import LEGEND_X, LEGEND_Y, heat_top
+from imutool.view.rerun.paths import LEGEND_X, LEGEND_Y, error_rows, heat_top
 from imutool.view.rerun.plots import plot
 from imutool.view.rerun.sdk import need_sdk
 from imutool.view.rundata import RunData, Trace
 
 if TYPE_CHECKING:
+    import rerun as rr
     import rerun.blueprint as rrb
 
 SHARES = {"paths": 6.0, "legend": 0.9, "error": 2.6}
@@ -73,14 +74,31 @@ def paths_view(data: RunData, scope: Scope) -> rrb.Spatial3DView:
     begin, cursor = rr.TimeRangeBoundary.infinite(), rr.TimeRangeBoundary.cursor_relative()
     homes = [entities.of(data, trace, scope, "world", entities.role(trace)) for trace in data.traces]
     homes += [entities.path(scope, "world", "gt")] if data.truth is not None else []
+    vectors = _error_vectors(data, scope)
     return rrb.Spatial3DView(
         origin=entities.path(scope, "world"),
-        contents=[f"{home}/**" for home in homes],
+        contents=[*(f"{home}/**" for home in homes), *map(str, vectors)],
+        overrides=vectors,
         name="Paths",
         background=GROUND,
         eye_controls=_eye(data),
         time_ranges=[rrb.VisibleTimeRange(timeline, start=begin, end=cursor) for timeline in clock.TIMELINES],
     )
+
+
+def _error_vectors(data: RunData, scope: Scope) -> Mapping[rr.EntityPath | str, rrb.VisibleTimeRanges]:
+    """Where each model's error vectors are, and that of those the one at the cursor is seen."""
+    import rerun as rr
+    import rerun.blueprint as rrb
+
+    found: dict[rr.EntityPath | str, rrb.VisibleTimeRanges] = {}
+    for trace in data.models():
+        if trace.errors is not None and len(rows := error_rows(trace, trace.errors)) > 1:
+            step_s = float(np.diff(trace.path.t_ns[rows]).max()) * 1e-9
+            begin, cursor = (rr.TimeRangeBoundary.cursor_relative(seconds=s) for s in (-step_s, 0.0))
+            ranges = [rrb.VisibleTimeRange(timeline, start=begin, end=cursor) for timeline in clock.TIMELINES]
+            found[entities.of(data, trace, scope, "world", "error_vec")] = rrb.VisibleTimeRanges(ranges)
+    return found
 
 
 def _legend(scope: Scope) -> rrb.Spatial2DView:

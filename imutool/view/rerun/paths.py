@@ -10,11 +10,12 @@ import numpy as np
 from jaxtyping import Float64, Int64
 
 from imutool.recording import Poses, Times, nanoseconds
+from imutool.view.deviation import Errors
 from imutool.view.rerun import clock, entities, styles
 from imutool.view.rerun.entities import Scope
 from imutool.view.rerun.palette import INK, TRUTH_COLOR, WORST_COLOR, Color, color_of, end_of_scale, heat
 from imutool.view.rundata import TRUTH, RunData, Trace, stretches
-from imutool.view.thin import path_rows
+from imutool.view.thin import Rows, path_rows
 
 if TYPE_CHECKING:
     import rerun as rr
@@ -25,6 +26,7 @@ Q_XYZW = [1, 2, 3, 0]  # columns of wxyz
 LEGEND_STEPS, LEGEND_WIDTH, LEGEND_TICKS = 60, 100.0, 5
 LEGEND_X, LEGEND_Y = (-50.0, 1.08 * LEGEND_WIDTH), (-3.0, 8.0)  # what is shown of the drawing
 LEGEND_WORDS = "debiased: orientation error"
+ERROR_RADIUS = 0.8  # in points of the screen
 WORST_RADIUS, POLE_SHARE = 5.0, 0.2  # in points of the screen; of the size of the scene, so that labels do not meet
 
 
@@ -77,6 +79,8 @@ def log(data: RunData, to: rr.RecordingStream, scope: Scope, size: float) -> Non
         _log_path(to, data, home, trace.path, colors, role, color)
         _log_body(to, data, home, trace.path, styles.body(role, entities.label(data, trace), color, size))
         _log_worst(to, data, trace, home, size)
+        if not trace.is_raw and trace.errors is not None:
+            _log_error_vectors(to, data, trace, trace.errors, entities.of(data, trace, scope, "world", "error_vec"))
     if top is not None:
         _log_legend(to, scope, top)
 
@@ -133,6 +137,28 @@ def _log_body(to: rr.RecordingStream, data: RunData, home: str, path: Poses, sty
     to.log(f"{home}/body", *style, static=True, strict=True)
     columns = rr.Transform3D.columns(translation=path.p_wb[rows], quaternion=path.q_wb_wxyz[rows][:, Q_XYZW])
     to.send_columns(f"{home}/body", clock.at(data, path.t_ns[rows]), columns, strict=True)
+
+
+def error_rows(trace: Trace, errors: Errors) -> Rows:
+    """The rows of a path at which its error is drawn in space."""
+    rows = path_rows(trace.path.p_wb)
+    known: Rows = rows[np.isfinite(errors.position_m[rows]).all(axis=1)]
+    return known
+
+
+def _log_error_vectors(to: rr.RecordingStream, data: RunData, trace: Trace, errors: Errors, entity: str) -> None:
+    """From the true place to the estimated one, at the cursor."""
+    import rerun as rr
+
+    rows = error_rows(trace, errors)
+    if not len(rows):
+        return
+    found = trace.path.p_wb[rows]
+    strips = np.stack([found - errors.position_m[rows], found], axis=1)
+    style = rr.LineStrips3D.from_fields(radii=rr.Radius.ui_points([ERROR_RADIUS]), colors=[WORST_COLOR])
+    to.log(entity, style, static=True, strict=True)
+    columns = rr.LineStrips3D.columns(strips=strips)
+    to.send_columns(entity, clock.at(data, trace.path.t_ns[rows]), columns, strict=True)
 
 
 def worst(t_ns: Times, values: Float64[np.ndarray, " n"]) -> int | None:
