@@ -80,4 +80,6 @@ def view(
             for one in shown:
                 say(one.said)
         sys.stdout.flush()  # whoever reads it through a pipe wants the address now
+        if ways.refused is not None:
+            raise ways.refused
         ways.serve()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
@@ -22,6 +23,8 @@ from imutool.view.shown import Shown
 if TYPE_CHECKING:
     from imutool.view.rerun.connect import Peer
     from imutool.view.rerun.web import Server
+
+logger = logging.getLogger(__name__)
 
 WORST = "worst"
 
@@ -63,12 +66,15 @@ class Asked:
 class Ways:
     """Everything that can be known before the logs are read: who listens, which port is free; context manager.
 
+    Where nobody listens at `connect`, that is said at once, an .rrd is saved instead, and `refused` is what to end with.
+
     Raises:
-        ConfigError: contradictory wishes, nobody at `connect`, or Rerun is needed and not installed.
+        ConfigError: contradictory wishes, `connect` is no address, or Rerun is needed and not installed.
     """
 
     def __init__(self, asked: Asked) -> None:
         self.asked = asked
+        self.refused: ConfigError | None = None
         self._peer: Peer | None = None
         self._server: Server | None = None
         self._stack = ExitStack()
@@ -81,9 +87,18 @@ class Ways:
         if asked.export is not None:
             export.refuse(asked.export, overwrite=asked.overwrite)
         if asked.connect is not None:
-            self._peer = connect.probe(asked.connect)
+            self._connect(connect.full(asked.connect))
         if asked.web:
             self._server = self._stack.enter_context(web.Server(asked.port))
+
+    def _connect(self, url: str) -> None:
+        from imutool.view.rerun import connect
+
+        try:
+            self._peer = connect.probe(url)
+        except ConfigError as error:
+            self.refused = error
+            logger.warning("%s", error)
 
     def show(self, logs: Sequence[RunData]) -> list[Shown]:
         """Takes every way that was asked for, in an order that leaves the longest for last.
@@ -130,7 +145,7 @@ class Ways:
             return
         from imutool.view.rerun import connect, export, files, web
 
-        if asked.save is not None:
+        if asked.save is not None or self.refused is not None:
             yield files.save(logs, asked.save, source=asked.source, overwrite=asked.overwrite)
         if asked.export is not None:
             yield export.export(logs, asked.export, source=asked.source, at_s=at_s, overwrite=asked.overwrite)

@@ -111,10 +111,21 @@ def test_the_command_says_in_json_what_it_wrote(
     assert told["rerun"].startswith("0.41.")
 
 
-def test_nobody_to_connect_to_is_known_before_anything_is_read_or_written(
+def test_where_nobody_listens_a_file_is_saved_and_the_command_fails_all_the_same(
+    recording: Recording, tmp_path: Path, imutool: Callable[..., subprocess.CompletedProcess[str]]
+) -> None:
+    write(recording, tmp_path / "log.mcap")
+    done = imutool("view", "log.mcap", "--connect", "127.0.0.1:1", "--quiet", cwd=tmp_path)
+    assert done.returncode == ConfigError.exit_code
+    assert done.stderr.count("nobody listens there") == 2  # before the log is read, and at the end
+    assert done.stdout == "Saved flight_3.rrd. Open with: rerun flight_3.rrd\n"
+    assert {path.name for path in tmp_path.iterdir()} == {"log.mcap", "flight_3.rrd"}
+
+
+def test_what_is_no_address_is_refused_before_anything_is_read_or_written(
     tmp_path: Path, imutool: Callable[..., subprocess.CompletedProcess[str]]
 ) -> None:
-    refused = imutool("view", "no-such.mcap", "--connect", "127.0.0.1:1", "--html", "a.html", cwd=tmp_path)
+    refused = imutool("view", "no-such.mcap", "--connect", "http://127.0.0.1:1", "--html", "a.html", cwd=tmp_path)
     assert refused.returncode == ConfigError.exit_code
-    assert "nobody listens there" in refused.stderr
+    assert "HOST:PORT" in refused.stderr
     assert list(tmp_path.iterdir()) == []
