@@ -1,4 +1,4 @@
-"""Makes the README's pictures of what is seen: `python tests/bench/pictures.py LOG [--model M] [-o docs/images]`.
+"""Makes the README's pictures of what is seen: `python tests/bench/pictures.py LOG [--model M] [--init auto] [-o docs/images]`.
 
 Rerun's own viewer (dark: the theme of a viewer without a window), its web page in light and dark, the report in light and dark,
 each as it comes up of a real log; PNGs of at most 256 colours. Takes Chromium and a Vulkan driver (`make viewers`).
@@ -86,10 +86,11 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("log", type=Path)
     parser.add_argument("--model", default="static")
+    parser.add_argument("--init", default="auto", help="start bias, as of imutool view")
     parser.add_argument("-o", "--output", type=Path, default=Path("docs/images"))
     options = parser.parse_args()
     options.output.mkdir(parents=True, exist_ok=True)
-    logs = [load(options.log, models=[options.model])]
+    logs = [load(options.log, models=[options.model], init=options.init)]
     duration_s = logs[0].duration_s
     for tab in ("Signals", "Bias", "Errors", "Spectrum"):
         save(native(logs, tab), options.output / f"viewer-{tab.lower()}.png")
