@@ -42,9 +42,11 @@ def total_errors(data: RunData, scope: Scope) -> list[Panel]:
         contents = [entities.of(data, trace, scope, "error", kind, entities.role(trace)) for trace in scored]
         contents += [f"{path}/worst" for path, trace in zip(contents, scored, strict=True) if not trace.is_raw]
         if contents:
-            title, key = f"{kind.capitalize()} error ({errors.UNITS[kind]})", _colors(data, _models_first(data))
+            reach = error_limit(data, kind)
+            top = "" if reach is None else f", top {reach:.3g}"  # a low plot may have no room for its axis to say it
+            title, key = f"{kind.capitalize()} error ({errors.UNITS[kind]}){top}", _colors(data, _models_first(data))
             key += ", worst pink" if any(not trace.is_raw for trace in scored) else ""
-            found.append(plot(contents, title, key, height=upwards(error_limit(data, kind))))
+            found.append(plot(contents, title, key, height=upwards(reach)))
     return found
 
 

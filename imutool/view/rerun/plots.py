@@ -66,8 +66,8 @@ def limit(data: RunData, values: Mapping[str, np.ndarray]) -> float | None:
     models = [tops[trace.name] for trace in data.models() if trace.name in tops]
     highest = max(tops.values(), default=0.0)
     cut = bool(models) and highest > READABLE * max(models) > 0.0
-    reach = end_of_scale(SHOWN * max(models)) if cut else highest
-    return 1.05 * reach if reach > 0.0 else None
+    reach = end_of_scale(SHOWN * max(models)) if cut else 1.05 * highest
+    return reach if reach > 0.0 else None
 
 
 def upwards(reach: float | None) -> tuple[float, float] | None:
