@@ -15,12 +15,17 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from hypothesis import settings
 from jaxtyping import install_import_hook
 
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # as the command does: idle threads must not spin while others test
 
 # a shell starts background jobs with SIGINT ignored, and they pass that on: the tests of Ctrl-C would test nothing
 signal.signal(signal.SIGINT, signal.default_int_handler)
+
+if not os.environ.get("CI"):  # there hypothesis has a profile of its own, which has no deadline and always draws the same
+    settings.register_profile("side by side", deadline=None)  # a wall clock says little where tests share the cores
+    settings.load_profile("side by side")
 
 install_import_hook(["imutool", "converters"], "beartype.beartype").__enter__()
 
