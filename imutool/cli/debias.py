@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 MODEL_HELP = (
     "Model file, physics.toml or a name that ships; else a static estimate. TOPIC=MODEL is for one IMU of several. Repeatable."
 )
+CLEAN_HELP = "Leave out what is no measurement, convert units (imutool clean)."
 VERIFY_HELP = "What of OUT is checked beside its structure: all chunks, those with IMU messages (imu), or none."
 
 
@@ -38,9 +39,7 @@ def debias(
     smooth: Smooth = False,
     verify: Annotated[str, typer.Option(metavar="all|imu|none", help=VERIFY_HELP)] = "imu",
     in_place: Annotated[bool, typer.Option("--in-place", help="Put the result in the place of IN, when it is whole.")] = False,
-    clean: Annotated[
-        bool, typer.Option("--clean", help="Leave out what is no measurement, convert units (imutool clean).")
-    ] = False,
+    clean: Annotated[bool, typer.Option("--clean", help=CLEAN_HELP)] = False,
     view: Annotated[bool, typer.Option("--view", help="Show it in a viewer as it goes.")] = False,
     connect: Annotated[str | None, typer.Option(metavar="URL", help="Show it in a viewer that runs: HOST:PORT.")] = None,
     save_view: Annotated[Path | None, typer.Option(metavar="F.rrd", help="Keep what a viewer would show in a file.")] = None,
@@ -77,6 +76,21 @@ def debias(
             progress=lambda done, total: tell(done, total, ""),
             watch=watch,
         )
+    output, shown = str(target or source), None if watch is None else watch.shown
+    result = _result(report, output, shown, report_to, clean)
+    told = write_json(result, json_to)
+    if not told:
+        _say(report, output, result["imus"], verify, shown or ())
+    if report_to is not None:  # last: should it fail, the log is there all the same, and that has been said
+        with progress("Drawing", verbose, quiet):
+            _draw(place(target or source), list(report.starts), report_to, overwrite)
+        if not told:
+            say(f"Report: {report_to}")
+    raise typer.Exit(LOST if report.losses else 0)
+
+
+def _result(report: DebiasReport, output: str, shown: Sequence[Shown] | None, page: Path | None, clean: bool) -> dict[str, Any]:
+    """What was done, for programs."""
     imus = {
         topic: {
             "model": report.models[topic],
@@ -87,24 +101,22 @@ def debias(
         }
         for topic, start in report.starts.items()
     }
-    added, copied, verified = dict(report.rewrite.added), report.rewrite.copied, report.rewrite.verified
-    result = {"schema": "imutool.debias/1", "output": str(target or source), "imus": imus, "copied": copied, "added": added}
-    result |= {"verified": verified._asdict(), "losses": report.losses.plain()}
-    if watch is not None:
-        result["shown"] = [one.plain() for one in watch.shown]
-    if report_to is not None:
-        result["report"] = str(report_to)
+    result = {
+        "schema": "imutool.debias/1",
+        "output": output,
+        "imus": imus,
+        "copied": report.rewrite.copied,
+        "added": dict(report.rewrite.added),
+        "verified": report.rewrite.verified._asdict(),
+        "losses": report.losses.plain(),
+    }
+    if shown is not None:
+        result["shown"] = [one.plain() for one in shown]
+    if page is not None:
+        result["report"] = str(page)
     if clean:
         result["clean"] = [one.plain() for one in report.surveys.values()]
-    told = write_json(result, json_to)
-    if not told:
-        _say(report, str(target or source), imus, verify, () if watch is None else watch.shown)
-    if report_to is not None:  # last: should it fail, the log is there all the same, and that has been said
-        with progress("Drawing", verbose, quiet):
-            _draw(place(target or source), list(report.starts), report_to, overwrite)
-        if not told:
-            say(f"Report: {report_to}")
-    raise typer.Exit(LOST if report.losses else 0)
+    return result
 
 
 def _say(report: DebiasReport, target: str, imus: Mapping[str, Mapping[str, Any]], verify: str, shown: Sequence[Shown]) -> None:

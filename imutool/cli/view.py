@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 import sys
+from functools import partial
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from imutool.cli._app import Imu, Init, Json, Logs, Models, Overwrite, Quiet, Smooth, Truth, Verbose, app
 from imutool.errors import ConfigError
 from imutool.terminal import progress, say, write_json
+
+if TYPE_CHECKING:
+    from imutool.view.deviation import Alignment
 
 AT_HELP = "Where the cursor starts: seconds, or worst, the largest orientation error of a model."
 ALIGN_HELP = "Move each path onto the truth before its errors are taken: by its start, its heading, or as a whole."
@@ -50,30 +54,18 @@ def view(
     Without one of --save, --connect, --web, --export-web, --png and --html a viewer opens; where it cannot, an .rrd is
     saved.
     """
-    from imutool.view.deviation import ALIGNMENTS
     from imutool.view.runs import load
     from imutool.view.ways import Asked, Ways
 
-    chosen = next((name for name in ALIGNMENTS if name == align), None)
-    if chosen is None:
-        raise ConfigError(f"{align!r}", where="--align", expected=", ".join(ALIGNMENTS))
+    aligned = _alignment(align)
+    read = partial(load, models=model or (), init=init, smooth=smooth, imu=imu, truth=truth, align=aligned, findings=findings)
     asked = Asked(save, connect, web, port, export_web, png, html, at, source, overwrite)
     with Ways(asked) as ways:
         with progress("Reading", verbose, quiet) as tell:
             data = []
             for done, log in enumerate(logs):
                 tell(done, len(logs), log.name)
-                read = load(
-                    log,
-                    models=model or (),
-                    init=init,
-                    smooth=smooth,
-                    imu=imu,
-                    truth=truth,
-                    align=chosen,
-                    findings=findings,
-                )
-                data.append(read)
+                data.append(read(log))
         shown = ways.show(data)
         result = {"schema": "imutool.view/1", "logs": [str(log) for log in logs], "shown": [one.plain() for one in shown]}
         if not write_json(result | ways.versions(), json_to):
@@ -83,3 +75,17 @@ def view(
         if ways.refused is not None:
             raise ways.refused
         ways.serve()
+
+
+def _alignment(word: str) -> Alignment:
+    """The alignment of that name.
+
+    Raises:
+        ConfigError: there is none.
+    """
+    from imutool.view.deviation import ALIGNMENTS
+
+    for name in ALIGNMENTS:
+        if name == word:
+            return name
+    raise ConfigError(f"{word!r}", where="--align", expected=", ".join(ALIGNMENTS))
