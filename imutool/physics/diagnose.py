@@ -176,7 +176,9 @@ def _pairs(real: Recording, sim: Recording | None, truth: str | None) -> Iterato
         )
     for felt in parts:
         stretch = next(one for one in motion.stretches if one.start_s <= felt.t_s[0] <= one.end_s)
-        yield with_truth(chosen, felt, motion.start_ns, KNOWN_BAND * min(stretch.cutoff_hz))
+        started_ns = int(chosen.imu.t_ns[0])  # times are told from the log's start, also where its poses begin later
+        since = replace(felt, t_s=felt.t_s + (motion.start_ns - started_ns) * 1e-9)
+        yield with_truth(chosen, since, started_ns, KNOWN_BAND * min(stretch.cutoff_hz))
 
 
 def _unclipped(pair: Pair) -> Pair:

@@ -116,6 +116,18 @@ def test_noise_and_a_constant_bias_are_no_mismatch_beside_true_poses_either(made
     assert not diagnose([real]).mismatch
 
 
+def test_times_count_from_the_start_of_the_log_also_where_its_poses_begin_later(made: Made, tmp_path: Path) -> None:
+    real, _ = made({"lever_arm": ARM}, real_poses=True)
+    recording = read(real)
+    late_s = 3.0
+    truth = recording.truth.between(int(recording.imu.t_ns[0]) + int(late_s * 1e9), int(recording.imu.t_ns[-1]))
+    write(replace(recording, truths={"/ground_truth/pose": truth}), tmp_path / "late.mcap")
+    found = diagnose([tmp_path / "late.mcap"])
+    assert effects(found) == ["lever_arm"]
+    assert late_s <= found.traces[0].t_s[0] < late_s + 1.0
+    assert min(first for place in found.located for first, _ in place.intervals_s) >= late_s
+
+
 # ── the JSON ──
 
 KEYS = {"schema", "real", "sim", "mismatch", "located", "findings", "bias", "not_identifiable", "unexplained"}
