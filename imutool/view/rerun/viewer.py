@@ -22,7 +22,7 @@ from imutool.view.shown import Shown
 
 MEMORY_LIMIT = "50%"  # of the machine, for a viewer of our own: by default it takes three quarters
 STARTS_S = 10.0  # for a viewer that lives but does not listen yet, as from a slow disk; one that dies is seen at once
-SETTLES_S = 0.7  # within which one that finds no window or no graphics has died, though it listened
+SETTLES_S = 1.0  # within which one that finds no window or no graphics has died, though it listened
 
 VIEWERS: list[subprocess.Popen[bytes]] = []  # they outlive us; held so that Python does not warn of a lost child
 
@@ -50,11 +50,13 @@ def open_viewer(logs: Sequence[RunData], *, source: bool = True, at_s: float | N
         ConfigError: no display, no viewer, or it does not live long enough to take the logs.
     """
     viewer = start()
+    if trouble := viewer.trouble():  # before anything is sent: Rerun's client tries for 40 s to reach one that has died
+        raise trouble
     try:
         connect.send(logs, viewer.peer, source=source, at_s=at_s)
     except ConfigError as error:
         raise viewer.trouble() or error from error
-    if trouble := viewer.trouble():
+    if trouble := viewer.trouble(wait_s=0.0):
         raise trouble
     return Shown("viewer", viewer.peer.url, "The viewer is open.")
 
@@ -84,10 +86,10 @@ class Viewer(NamedTuple):
     process: subprocess.Popen[bytes]
     peer: Peer
 
-    def trouble(self) -> ConfigError | None:
+    def trouble(self, wait_s: float = SETTLES_S) -> ConfigError | None:
         """What became of it, if it has died or does so now: one that finds no window listens before it notices."""
         with contextlib.suppress(subprocess.TimeoutExpired):
-            self.process.wait(SETTLES_S)
+            self.process.wait(wait_s)
         return None if self.process.returncode is None else _stopped(self.process)
 
 
