@@ -205,8 +205,8 @@ def test_a_flight_of_150_seconds_takes_well_under_a_second() -> None:
     imu = biased(1, duration_s=150.0)
     best = np.inf
     for _ in range(3):
-        began = time.perf_counter()
+        began = time.process_time()
         blocks = forward(imu)
-        best = min(best, time.perf_counter() - began)
+        best = min(best, time.process_time() - began)
     assert len(blocks) == 300
     assert best < 1.5, f"{best:.2f} s, with shapes checked at every call"

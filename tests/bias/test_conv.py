@@ -199,9 +199,9 @@ def test_a_sample_is_done_long_before_the_next(model: Model, segment: MakeSegmen
     t, gyro, accel = (value[0].numpy() for value in (seen.t, seen.gyro, seen.accel))
     stream, spent = model.stream(np.zeros(6)), []
     for k in range(400):
-        began = time.perf_counter()
+        began = time.process_time()
         stream(t[k : k + 1], gyro[k : k + 1], accel[k : k + 1])
-        spent.append(time.perf_counter() - began)
+        spent.append(time.process_time() - began)
     assert np.median(spent) < ONLINE_S
 
 

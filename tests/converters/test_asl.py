@@ -45,9 +45,9 @@ def test_numbers_are_read_as_the_nearest_float64(values):
 def test_a_long_wide_table_parses_quickly():
     row = ",".join(["{}"] + ["-0.0123456789"] * 16)
     content = "\n".join(row.format(1403636579758560000 + n * 5_000_000) for n in range(30_000)).encode()
-    start = time.perf_counter()
+    start = time.process_time()
     parsed = _table.parse(content, "t.csv", "truth")
-    assert time.perf_counter() - start < PARSE_LIMIT_S
+    assert time.process_time() - start < PARSE_LIMIT_S
     assert len(parsed.t_ns) == 30_000
 
 
