@@ -32,11 +32,12 @@ from imutool.mcap_io import records, schema
 from imutool.mcap_io.crc import crc32
 from imutool.mcap_io.listing import Listing, described, head, listing
 from imutool.mcap_io.log import DERIVED_KEY, ImuBatch, Log
+from imutool.mcap_io.log_writer import Chunk, LogWriter
 from imutool.mcap_io.records import HEAD, ChunkHead
 from imutool.mcap_io.structure import Block, Span, Structure
 from imutool.mcap_io.target import COPY_BYTES
 from imutool.mcap_io.verify import Verified, check_data_crc, crc_of, refuse_unknown, stated_crc, verify
-from imutool.mcap_io.write import CHUNK_BYTES, Chunk, LogWriter
+from imutool.mcap_io.write import CHUNK_BYTES
 from imutool.place import Place, identity, same
 
 RUN_BYTES = 16 << 20  # verbatim bytes are copied in runs of about this size: between them progress is told

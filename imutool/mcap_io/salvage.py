@@ -24,12 +24,12 @@ from imutool.errors import ConfigError, ImutoolError, LogError
 from imutool.mcap_io import records
 from imutool.mcap_io.attachment import Attached
 from imutool.mcap_io.log import Log
+from imutool.mcap_io.log_writer import LogWriter
 from imutool.mcap_io.losses import Loss, Losses
 from imutool.mcap_io.records import CHUNK_HEAD, HEAD
 from imutool.mcap_io.source import Source
 from imutool.mcap_io.structure import Block, Span, Structure
 from imutool.mcap_io.verify import verify
-from imutool.mcap_io.write import LogWriter
 from imutool.place import Place, failures, same
 
 RECORD = "imutool_repair"  # name of the metadata record

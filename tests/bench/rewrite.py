@@ -34,9 +34,9 @@ from mcap.writer import CompressionType, Writer
 from imutool.mcap_io import schema
 from imutool.mcap_io.digest import sha256
 from imutool.mcap_io.log import ImuBatch
+from imutool.mcap_io.log_writer import Chunk, LogWriter
 from imutool.mcap_io.records import message_record, message_rows
 from imutool.mcap_io.rewrite import Made, NewTopic, rewrite
-from imutool.mcap_io.write import Chunk, LogWriter
 
 IMU, CAMERA, MONO = "/imu0", "/cam0/image_raw/compressed", "/cam1/image_raw"
 IMAGE = "sensor_msgs/msg/Image"

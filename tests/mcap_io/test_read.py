@@ -16,9 +16,10 @@ import pytest
 
 from imutool.errors import ConfigError, LogError
 from imutool.mcap_io import schema
+from imutool.mcap_io.log_writer import LogWriter
 from imutool.mcap_io.read import DERIVED_KEY, VELOCITY_KEY, Log, read
 from imutool.mcap_io.structure import Structure
-from imutool.mcap_io.write import LogWriter, Series, chunks, write
+from imutool.mcap_io.write import Series, chunks, write
 from imutool.recording import Imu, Recording
 
 START_NS = 1_403_638_128_245_096_960

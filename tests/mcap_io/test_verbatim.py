@@ -28,11 +28,12 @@ from imutool.errors import ConfigError, DataError, LogError
 from imutool.mcap_io import schema, target
 from imutool.mcap_io.digest import Digest, sha256
 from imutool.mcap_io.log import ImuBatch, Log
+from imutool.mcap_io.log_writer import Chunk, LogWriter
 from imutool.mcap_io.records import message_rows
 from imutool.mcap_io.rewrite import Made, NewTopic, Verified, rewrite
 from imutool.mcap_io.source import Source
 from imutool.mcap_io.verify import verify
-from imutool.mcap_io.write import Chunk, LogWriter, write
+from imutool.mcap_io.write import write
 from imutool.recording import Recording
 
 Message = tuple[str, int, int, int, bytes]  # topic, log time, publish time, sequence, payload

@@ -16,8 +16,9 @@ from scipy.spatial.transform import Rotation
 from imutool import noise as noises
 from imutool.errors import ConfigError, DataError, LogError
 from imutool.mcap_io import schema
+from imutool.mcap_io.log_writer import LogWriter
 from imutool.mcap_io.read import read
-from imutool.mcap_io.write import LogWriter, write
+from imutool.mcap_io.write import write
 from imutool.physics.effects import _catalogue
 from imutool.physics.effects._forward import Physics, Stage, Theta
 from imutool.physics.physics_file import PhysicsFile
