@@ -28,7 +28,7 @@ from imutool import noise
 from imutool.convert import convert
 from imutool.debias import debias
 from imutool.errors import ConfigError, ImutoolError, LogError
-from imutool.export import export
+from imutool.export.run import export
 from imutool.mcap_io.log import Log
 from imutool.mcap_io.read import read
 from imutool.mcap_io.write import write

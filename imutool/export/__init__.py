@@ -1,0 +1,1 @@
+"""A log for programs that do not read MCAP as it is."""
