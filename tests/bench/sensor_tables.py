@@ -152,7 +152,8 @@ def findings_table(diagnoses: Mapping[str, Mapping[str, Any]]) -> str:
     for name, shares in sorted(by_effect.items(), key=lambda entry: (-len(entry[1]), entry[0])):
         where, lacking = how_often(len(shares), len(diagnoses)), [one for one in diagnoses if one not in shares]
         listed = {"all": "", "most": f"not {', '.join(lacking)}"}.get(where, ", ".join(shares))
-        removed = f"{100.0 * float(np.median(list(shares.values()))):.0f} %"
+        share = float(np.median(list(shares.values())))
+        removed = f"{100.0 * share:.0f} %" if share > 0.0 else "–"  # digits and stamps take nothing off
         rows.append([name, f"{where} ({len(shares)} of {len(diagnoses)})", removed, listed])
     return markdown(["found", "in", "of the misfit (median)", "sequences"], rows)
 
