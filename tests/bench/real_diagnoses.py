@@ -181,7 +181,7 @@ def as_file(values: Mapping[str, float]) -> PhysicsFile:
 def gained(log: Log, physics: Path) -> dict[str, Any]:
     """What the physics of other sequences brings on this one: rms beside its own poses, and the orientation it integrates to.
 
-    A bias alone and the physics start from the truth's first fifteen seconds alike, and keep that bias: no stop or gravity helps.
+    A bias alone and the physics both start from the truth's first fifteen seconds and keep that bias: no stop or gravity helps.
     """
     chosen = tuple(physics_file.read(physics).acting(where=physics))
     told: dict[str, Any] = {
