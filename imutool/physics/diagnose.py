@@ -119,6 +119,20 @@ def measured(
     return fit([_weighed(pair, candidates) for pair in pairs], begun, part="all")
 
 
+def remaining(real: Place, chosen: Chosen = (), *, imu: str | None = None, truth: str | None = None) -> dict[str, HeldOut]:
+    """How far a recording is from what its own true poses say, all of it: without and with some physics, by signal.
+
+    The best constant of its own is in both; compared is as far up in frequency as the poses are known.
+
+    Raises:
+        ConfigError, LogError, DataError: as `diagnose`.
+    """
+    every = [_unclipped(pair) for pair in _pairs(read_log(real, imu=imu, truth=truth), None, truth)]
+    pairs = [replace(pair, fitted=np.zeros_like(pair.fitted), held_out=pair.fitted | pair.held_out) for pair in every]
+    before, after = ([_with(pair, one) for pair in pairs] for one in ((), chosen))
+    return {signal: _held_out(pairs, before, after, k, UNITS[signal]) for k, signal in enumerate(("gyro", "accel"))}
+
+
 def _moves_apart(reals: Sequence[Recording], sim: Recording, signals: Sequence[str]) -> bool:
     """Whether the simulation is of another motion than every recording, which all have true poses.
 

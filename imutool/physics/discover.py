@@ -210,7 +210,8 @@ class _Search:
             others = (*now.chosen[:k], *now.chosen[k + 1 :])
             without = fit(self.logs, others, iterations=2)
             here = self.chance(now.chosen[k][0], without.objective - now.objective)
-            for score, physics, start, _ in self.ranked(without, self.named)[:2]:
+            held = fit(self.logs, others, iterations=0)  # alone, what is not linear runs away to where no step leads back from
+            for score, physics, start, _ in self.ranked(held, self.named)[:2]:
                 if physics.name == now.chosen[k][0].name or score > here:
                     continue
                 trial = fit(self.logs, (*others, (physics, start)))

@@ -28,6 +28,7 @@ AXES = ("x", "y", "z")
 SIGNALS: tuple[tuple[Sensor, str], ...] = (("gyro", "rad/s"), ("accel", "m/s²"))
 PLAUSIBLE = {"gyro": 0.1, "accel": 1.0}
 INSIDE = 0.005  # of the values of a variable lie beyond its first knot, and as many beyond its last
+QUANTILES = 1001
 SPREAD = 1e-9  # relative: knots that lie closer are one
 
 Variable = Callable[[Read], Float64[np.ndarray, " n"]]
@@ -97,8 +98,13 @@ def finer(physics: Physics, like: Read) -> Physics | None:
 
 
 def _knots(like: Read, variable: str, count: int) -> Float64[np.ndarray, " p"] | None:
-    """As many samples between any two of them; none for what hardly varies."""
-    inner = np.quantile(VARIABLES[variable](like), np.linspace(INSIDE, 1 - INSIDE, count - 2))
+    """Half of them by samples, half by the range they go through; none for what hardly varies.
+
+    By samples alone, a robot that stands most of the time has all its knots where it stands.
+    """
+    at = np.quantile(VARIABLES[variable](like), np.linspace(INSIDE, 1 - INSIDE, QUANTILES))
+    reached = 0.5 * (np.linspace(0.0, 1.0, QUANTILES) + (at - at[0]) / max(at[-1] - at[0], np.finfo(np.float64).tiny))
+    inner = np.interp(np.linspace(0.0, 1.0, count - 2), reached, at)
     return inner if np.diff(inner).min() > SPREAD * max(1.0, np.abs(inner).max()) else None
 
 
@@ -118,7 +124,7 @@ def _curve(variable: str, sensor: int, axis: int, inner: Float64[np.ndarray, " p
 class Curve:
     """+ a cubic spline of one variable on one axis, held beyond its ends.
 
-    As many samples lie between any two knots: at even distances, what the motion rarely does would bend all the rest.
+    Where samples are many, knots are close: at even distances, what the motion rarely does would bend all the rest.
     """
 
     def __init__(self, variable: str, sensor: int, axis: int, inner: Float64[np.ndarray, " p"]) -> None:

@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float64
 from numpy.random import Generator, default_rng
+from scipy.interpolate import make_interp_spline
 
 from imutool.physics.sealed import TRUTH_SCHEMA, log, write_case
 from imutool.physics.sealing import unnamed
@@ -138,17 +139,32 @@ def fly(mounted: Mounted, duration_s: float, rng: Generator) -> Flown:
     model = mujoco.MjModel.from_xml_string(_xml(mounted))
     data = mujoco.MjData(model)
     count = int((duration_s + SETTLE_S) / STEP_S) + 1
-    push, twist = _smooth(rng, count, 2.0, 6.0), _smooth(rng, count, 4.0, 1.5)
+    push, twist = _halved(_smooth(rng, count, 2.0, 6.0)), _halved(_smooth(rng, count, 4.0, 1.5))
     p, q, sensors = np.zeros((count, 3)), np.zeros((count, 4)), np.zeros((count, 12))
-    for k in range(count):
-        attitude = data.qpos[3:7] * (1.0 if data.qpos[3] >= 0.0 else -1.0)
-        data.qfrc_applied[:3] = MASS * (push[k] + [0.0, 0.0, GRAVITY_M_S2] - 0.5 * data.qpos[:3] - 0.8 * data.qvel[:3])
-        data.qfrc_applied[3:6] = INERTIA * (twist[k] - 30.0 * attitude[1:] - 4.0 * data.qvel[3:6])
-        p[k], q[k] = data.qpos[:3], data.qpos[3:7]
-        mujoco.mj_step(model, data)  # sensors are those of the state it began with
-        sensors[k] = data.sensordata
+
+    def force(_model: Any, now: Any) -> None:
+        """At the beginning, in the middle and at the end of a step."""
+        k = round(2.0 * now.time / STEP_S)
+        attitude = now.qpos[3:7] * (1.0 if now.qpos[3] >= 0.0 else -1.0)
+        now.qfrc_applied[:3] = MASS * (push[k] + [0.0, 0.0, GRAVITY_M_S2] - 0.5 * now.qpos[:3] - 0.8 * now.qvel[:3])
+        now.qfrc_applied[3:6] = INERTIA * (twist[k] - 30.0 * attitude[1:] - 4.0 * now.qvel[3:6])
+
+    mujoco.set_mjcb_control(force)
+    try:
+        for k in range(count):
+            p[k], q[k] = data.qpos[:3], data.qpos[3:7]
+            mujoco.mj_step(model, data)  # sensors are those of the state it began with
+            sensors[k] = data.sensordata
+    finally:
+        mujoco.set_mjcb_control(None)
     q /= np.linalg.norm(q, axis=1, keepdims=True)
     return Flown(np.arange(count) * STEP_S, p, q, sensors[:, :6], sensors[:, 6:])
+
+
+def _halved(curves: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "m 3"]:
+    """With the middles of steps between, and the end of the last."""
+    at = np.arange(len(curves), dtype=np.float64)
+    return np.asarray(make_interp_spline(at, curves, k=3)(np.arange(2 * len(curves) + 1) / 2.0))
 
 
 def _smooth(rng: Generator, count: int, size: float, fastest_hz: float) -> Float64[np.ndarray, "n 3"]:
