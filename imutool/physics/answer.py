@@ -12,14 +12,15 @@ from imutool.physics.apart import remarks, shared
 from imutool.physics.diagnosis import UNITS, Curve, Diagnosis, Estimate, Finding, HeldOut, Traces, Unexplained
 from imutool.physics.discover import Discovery, Judged
 from imutool.physics.fit import Chosen, Fit, Weighed, expected
-from imutool.physics.pair import Pair
+from imutool.physics.pair import LEAST_NOISE, Pair
 from imutool.physics.places import of_findings, of_what_is_left
+from imutool.physics.quantity import AXES, symbol
 from imutool.physics.unnamed import unit
-from imutool.physics.whitening import Band
 
 JITTER = "timestamp_jitter"
 INEXACT = 1e-5  # of a misfit's power: 0.3 % of its size, as which the inexactness of a much larger effect's model may pass
 SHOWN_KNOTS = 41  # of a curve without a name, as it is told
+SOME = 0.05  # of the samples of an axis at its limit, from which on that is told
 WHITE = 1.15  # what is left over the noise, as a ratio, that still counts as noise
 
 
@@ -42,7 +43,7 @@ def told(
     }
     quiet = expected_too | {JITTER}  # where stamps are wrong, signals are not
     still = [_with(pair, tuple(one for one in found.fitted.chosen if one[0].name in quiet)) for pair in pairs]
-    unexplained = _unexplained(pairs, after, floor)
+    unexplained = _unexplained(logs, after, floor)
     if findings:
         places = of_findings(pairs, still, after, floor, findings, p_values)
     else:  # where something is left all the same, it is said where
@@ -62,7 +63,7 @@ def told(
         ),
         unexplained=unexplained,
         remarks=(*_remarks(pairs), *remarks(all_found, known)),
-        closer={signal: _held_out(pairs, before, after, k, UNITS[signal]) for k, signal in enumerate(("gyro", "accel"))},
+        closer={signal: _held_out(logs, before, after, k, UNITS[signal]) for signal, k in _known(pairs).items()},
         traces=tuple(
             Traces(pair.name, pair.stamp_s, pair.real, b, a, pair.held_out, pair.truth, expected(pair, ()))
             for pair, b, a in zip(pairs, before, after, strict=True)
@@ -71,39 +72,43 @@ def told(
 
 
 def _with(pair: Pair, chosen: Chosen) -> Float64[np.ndarray, "n 6"]:
-    """What is expected, with the constant that suits it best."""
+    """What is expected, with the constant that suits it best; none for an axis of which nothing is known."""
     there = expected(pair, chosen)
-    usable = pair.fitted | pair.held_out
-    return np.asarray(there + (pair.real - there)[usable].mean(axis=0))
+    counts = pair.usable
+    constant = np.where(counts, pair.real - there, 0.0).sum(axis=0) / np.maximum(counts.sum(axis=0), 1)
+    return np.asarray(there + constant)
 
 
 def _floor(logs: Sequence[Weighed]) -> Float64[np.ndarray, "6"]:
-    """The noise of a sample by axis, before it was made white."""
+    """The noise of a sample by axis, before it was made white; of an axis nobody knows, that of those beside it."""
     variances = []
     for log in logs:
         response = np.array([np.abs(np.fft.rfft(a, 512)) ** 2 for a in log.whiten.filters])
-        variances.append(log.whiten.std**2 * (1.0 / response).mean(axis=1))
-    return np.asarray(np.sqrt(np.mean(variances, axis=0)))
+        variances.append(np.where(log.pair.axes, log.whiten.std**2 * (1.0 / response).mean(axis=1), np.nan))
+    masked = np.ma.masked_invalid(np.ma.masked_invalid(variances).mean(axis=0).filled(np.nan)).reshape(2, 3)
+    beside = masked.mean(axis=1).filled(np.nan)
+    beside = np.where(np.isnan(beside), LEAST_NOISE[::3] ** 2, beside)
+    return np.asarray(np.sqrt(np.where(masked.mask, beside[:, None], masked.filled(0.0)).ravel()))
 
 
-def _unseen(pair: Pair, there: Float64[np.ndarray, "n 6"]) -> Float64[np.ndarray, "m 6"]:
-    """What is left on held-out samples, up to where what is expected is known."""
-    left = pair.real - there
-    if pair.band_hz is None:
-        return np.asarray(left[pair.held_out])
-    band = Band.below(pair.band_hz, 1.0 / pair.period_s)
-    return np.asarray(band(left)[pair.held_out[:: band.every]])
+def _unseen(log: Weighed, there: Float64[np.ndarray, "n 6"], part: slice) -> Float64[np.ndarray, " m"]:
+    """What is left on held-out samples that tell anything, up to where what is expected is known."""
+    pair, counts = log.pair, log.whiten.counts
+    left, rows = pair.real - there, pair.held_out[:: log.whiten.every]
+    if log.whiten.band is not None:
+        left = log.whiten.band(left)
+    return np.asarray(left[rows, part].ravel() if counts is None else left[rows, part][counts[rows, part]])
 
 
-def _held_out(pairs: Sequence[Pair], before: Sequence[np.ndarray], after: Sequence[np.ndarray], k: int, unit_: str) -> HeldOut:
-    """Root mean squares over held-out samples and axes of a signal, and how long that was."""
+def _held_out(logs: Sequence[Weighed], before: Sequence[np.ndarray], after: Sequence[np.ndarray], k: int, unit_: str) -> HeldOut:
+    """Root mean squares over held-out samples and axes of a signal, and how long that was; no numbers where none are known."""
     part = slice(3 * k, 3 * k + 3)
-    power = [
-        np.concatenate([(_unseen(pair, there)[:, part] ** 2).ravel() for pair, there in zip(pairs, those, strict=True)])
-        for those in (before, after)
-    ]
-    length = sum(float(pair.held_out.sum()) * pair.period_s for pair in pairs)
-    return HeldOut(float(np.sqrt(power[0].mean())), float(np.sqrt(power[1].mean())), unit_, round(length, 1))
+    rms = []
+    for those in (before, after):
+        left = np.concatenate([_unseen(log, there, part) for log, there in zip(logs, those, strict=True)])
+        rms.append(float(np.sqrt((left**2).mean())) if len(left) else float("nan"))
+    length = sum(float(log.pair.held_out.sum()) * log.pair.period_s for log in logs)
+    return HeldOut(rms[0], rms[1], unit_, round(length, 1))
 
 
 def _finding(logs: Sequence[Weighed], found: Discovery, one: Judged, floor: Float64[np.ndarray, "6"]) -> Finding:
@@ -116,11 +121,11 @@ def _finding(logs: Sequence[Weighed], found: Discovery, one: Judged, floor: Floa
     with_ = [_with(pair, fitted.chosen) for pair in pairs]
     alone = [_with(pair, without) for pair in pairs]
     nothing = [_with(pair, ()) for pair in pairs]
-    shares = []
+    shares, known = [], _known(pairs)
     for j, signal in enumerate(("gyro", "accel")):
-        if signal in one.physics.sensors:
-            held = _held_out(pairs, alone, with_, j, UNITS[signal])
-            all_ = _held_out(pairs, nothing, with_, j, UNITS[signal])
+        if signal in one.physics.sensors and signal in known:
+            held = _held_out(logs, alone, with_, j, UNITS[signal])
+            all_ = _held_out(logs, nothing, with_, j, UNITS[signal])
             noise = float(np.mean(floor[3 * j : 3 * j + 3] ** 2))
             misfit = max(all_.rms_before**2 - noise, 1e-300)
             excess = held.rms_before**2 - held.rms_after**2
@@ -179,18 +184,43 @@ def _curve(pair: Pair, one: Judged, whole: Fit) -> Curve | None:
 
 
 def _unexplained(
-    pairs: Sequence[Pair], after: Sequence[Float64[np.ndarray, "n 6"]], floor: Float64[np.ndarray, "6"]
+    logs: Sequence[Weighed], after: Sequence[Float64[np.ndarray, "n 6"]], floor: Float64[np.ndarray, "6"]
 ) -> dict[str, Unexplained]:
-    out = {}
-    for k, signal in enumerate(("gyro", "accel")):
-        held = _held_out(pairs, after, after, k, UNITS[signal])
-        noise = float(np.sqrt(np.mean(floor[3 * k : 3 * k + 3] ** 2)))
+    """Of the sensors of which anything is known."""
+    out, axes = {}, np.any([log.pair.axes for log in logs], axis=0)
+    for signal, k in _known([log.pair for log in logs]).items():
+        held = _held_out(logs, after, after, k, UNITS[signal])
+        part = slice(3 * k, 3 * k + 3)
+        noise = float(np.sqrt(np.mean(floor[part][axes[part]] ** 2)))
         out[signal] = Unexplained(held.rms_after, noise, held.rms_after < WHITE * noise)
+    return out
+
+
+def _known(pairs: Sequence[Pair]) -> dict[str, int]:
+    """Sensors of which an axis at least tells anything, with their places."""
+    axes = np.any([pair.axes for pair in pairs], axis=0)
+    return {signal: k for k, signal in enumerate(UNITS) if axes[3 * k : 3 * k + 3].any()}
+
+
+def silent(pair: Pair) -> list[str]:
+    """What of a log tells nothing, and why."""
+    stuck, clipped, most, out = stamps.stuck(pair.real), stamps.clipped(pair.real), stamps.limits(pair.real), []
+    for k, signal in enumerate(UNITS):
+        ended = [a for a in range(3 * k, 3 * k + 3) if clipped[:, a].mean() > SOME or not (pair.axes[a] or stuck[a])]
+        for a in range(3 * k, 3 * k + 3):
+            if stuck[a] and a not in ended:
+                out.append(f"{signal} {AXES[a - 3 * k]} reads {pair.real[0, a]:.4g} {symbol(UNITS[signal])} in every sample")
+        if ended:
+            at = f"its limit of {most[signal]:.4g} {symbol(UNITS[signal])}"
+            share = ", ".join(f"{AXES[a - 3 * k]} in {percent(float(clipped[:, a].mean()))}" for a in ended)
+            out.append(f"{signal} is at {at}: {share} of the samples")
     return out
 
 
 def _remarks(pairs: Sequence[Pair]) -> Iterator[str]:
     for pair in pairs:
+        if lost := silent(pair):
+            yield f"{pair.name}: {'; '.join(lost)}. What was felt there nobody knows, so the answer rests on all other samples"
         if pair.aligned_s:
             yield (
                 f"{pair.name}: the two clocks share no epoch; aligned by the motion ({pair.aligned_s:+.3f} s), "

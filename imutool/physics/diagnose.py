@@ -31,6 +31,7 @@ from imutool.recording import Recording
 KNOWN_BAND = 0.45  # of where smoothing halves a motion: there it takes a per cent
 ORDER_SIM, ORDER_TRUTH = 6, 12  # of the autoregression: a sensor's noise is nearly white, that of differentiated poses is not
 RIDGE = 1e-8
+LEAST_KNOWN_S = 2.0  # of an axis, to fit it and again to test it, away from where its converter ends
 SHOWN_BY_SAMPLES = {"saturation", "quantization"}  # without any fit: `stamps`
 EVERY_UNIT = (
     "mount_rotation",
@@ -72,7 +73,7 @@ def diagnose(
         say(0, 4, "the simulation, of another motion")
         known, simulated = diagnose([sim], imu=imu).findings, None
     apart = sim is not None and simulated is None
-    pairs = [_unclipped(pair) for recording in recordings for pair in _pairs(recording, simulated, truth)]
+    pairs = [_telling(pair) for recording in recordings for pair in _pairs(recording, simulated, truth)]
     say(1, 4, "noise")
     candidates = _candidates(pairs)
     logs = [_weighed(pair, candidates) for pair in pairs]
@@ -106,7 +107,7 @@ def measured(
         ConfigError, LogError, DataError: as `diagnose`; or an effect that has nothing to be fitted to here.
     """
     simulated = None if sim is None else read_log(sim, imu=imu)
-    pairs = [_unclipped(pair) for pair in _pairs(read_log(real, imu=imu, truth=truth), simulated, truth)]
+    pairs = [_telling(pair) for pair in _pairs(read_log(real, imu=imu, truth=truth), simulated, truth)]
     candidates = _candidates(pairs)
     begun = tuple((one, one.nothing.astype(float)) for one in _catalogue.physics(effects))
     return fit([_weighed(pair, candidates) for pair in pairs], begun, part="all")
@@ -174,20 +175,23 @@ def _pairs(real: Recording, sim: Recording | None, truth: str | None) -> Iterato
         yield with_truth(chosen, since, started_ns, KNOWN_BAND * min(stretch.cutoff_hz))
 
 
-def _unclipped(pair: Pair) -> Pair:
-    """Without rows in which a converter is at its end.
+def _telling(pair: Pair) -> Pair:
+    """With what is known: no sample of a converter at its end, no axis that hardly has others, or that is stuck.
 
     Raises:
-        DataError: hardly any other row is there.
+        DataError: no axis is left.
     """
-    clipped = stamps.clipped(pair.real)
-    rest = replace(pair, fitted=pair.fitted & ~clipped, held_out=pair.held_out & ~clipped)
-    if clipped.any() and (rest.fitted | rest.held_out).sum() * pair.period_s < LEAST_S:
-        told = ", ".join(f"{signal} {most:.4g} {UNITS[signal]}" for signal, most in stamps.limits(pair.real).items())
+    known = ~(stamps.clipped(pair.real) | stamps.stuck(pair.real))
+    if known.all():
+        return pair
+    rest = replace(pair, known=known)
+    for part in (pair.fitted, pair.held_out):
+        known &= (known[part].sum(axis=0) * pair.period_s >= LEAST_KNOWN_S) | (known[part].all(axis=0))
+    if not known.any():
         raise DataError(
-            f"the sensor is at its limit in {100.0 * clipped.mean():.0f} % of the samples ({told})",
+            "; ".join(answer.silent(rest)),
             where=pair.name,
-            expected=f"{LEAST_S:g} s away from it",
+            expected=f"{LEAST_KNOWN_S:g} s or more away from it",
             fix="Nobody knows what a sensor would have read beyond its range: record with a wider one",
         )
     return rest
@@ -218,14 +222,16 @@ def _weighed(pair: Pair, candidates: Sequence[Physics]) -> Weighed:
     linear: Chosen = tuple((one, one.nothing.astype(float)) for one in candidates if one.linear)
     base = expected(pair, linear)
     J = derivatives(pair, linear, range(len(linear)), base)
-    left, usable = pair.real - base, pair.fitted | pair.held_out
-    for axis in range(6):
+    left, usable = pair.real - base, pair.usable
+    for axis, rows in enumerate(usable.T):
         A = np.concatenate([J[:, axis], np.ones((len(J), 1))], axis=1)
-        size = np.linalg.norm(A[usable], axis=0)
+        size = np.linalg.norm(A[rows], axis=0)
         A = A[:, size > 0] / size[size > 0]
-        N = A[usable].T @ A[usable] + RIDGE * np.eye(A.shape[1])
-        left[:, axis] -= A @ np.linalg.solve(N, A[usable].T @ left[usable, axis])
+        N = A[rows].T @ A[rows] + RIDGE * np.eye(A.shape[1])
+        left[:, axis] -= A @ np.linalg.solve(N, A[rows].T @ left[rows, axis])
     if pair.against == "simulation":
-        return Weighed(pair, level(left, usable, 1.0 / pair.period_s, ORDER_SIM))
-    assert pair.band_hz is not None
-    return Weighed(pair, whitener(left, usable, ORDER_TRUTH, Band.below(pair.band_hz, 1.0 / pair.period_s)))
+        white = level(left, usable, 1.0 / pair.period_s, ORDER_SIM)
+    else:
+        assert pair.band_hz is not None
+        white = whitener(left, usable, ORDER_TRUTH, Band.below(pair.band_hz, 1.0 / pair.period_s))
+    return Weighed(pair, white if pair.known is None else white.counting(pair.known))

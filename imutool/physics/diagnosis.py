@@ -144,7 +144,8 @@ class Diagnosis:
         return bool(self.findings) or bool(self.located)
 
     def plain(self) -> dict[str, Any]:
-        """As JSON has it."""
+        """As JSON has it; nothing is said of what is left of a sensor that told nothing."""
+        left = dict.fromkeys(UNITS) | dict(self.unexplained)
         return {
             "schema": SCHEMA,
             "real": list(self.real),
@@ -156,8 +157,8 @@ class Diagnosis:
             "biases": [{"gyro": one[:3].tolist(), "accel": one[3:].tolist()} for one in self.bias],
             "not_identifiable": list(self.not_identifiable),
             "unexplained": {
-                **{f"{name}_rms": one.rms for name, one in self.unexplained.items()},
-                "noise_floor": {name: one.noise_floor for name, one in self.unexplained.items()},
+                **{f"{name}_rms": None if one is None else one.rms for name, one in left.items()},
+                "noise_floor": {name: None if one is None else one.noise_floor for name, one in left.items()},
                 "white": all(one.white for one in self.unexplained.values()),
             },
             "closer": {name: _held_out(one) for name, one in self.closer.items()},

@@ -79,7 +79,7 @@ def discover(logs: Sequence[Weighed], candidates: Sequence[Physics], later: Sequ
     paths = [(first.others, []), ((), list(later))] if nameless > named + CLEARLY else [((), list(later)), (first.others, [])]
     search, now = _path(first, start, *paths[0])
     churned = len(now.chosen) >= SUSPICIOUS or any(":" in name for name in now.names)
-    if everything and churned and now.objective > WELL * 6 * now.rows:
+    if everything and churned and now.objective > WELL * now.numbers:
         # many small parts that do not add up, or one without a name: perhaps one thing alone is the better answer
         other = _path(first, start, *paths[1])
         if cost(other[1]) < cost(now) - CLEARLY:
@@ -91,7 +91,7 @@ def _path(first: _Search, now: Fit, others: tuple[Physics, ...], waiting: list[S
     """One effect after another comes in, until none of the candidates that there are by then explains more than chance."""
     search = replace(first, others=others)
     for _ in range(ROUNDS):
-        hopeless = len(now.chosen) > SUSPICIOUS and now.objective > HOPELESS * 6 * now.rows
+        hopeless = len(now.chosen) > SUSPICIOUS and now.objective > HOPELESS * now.numbers
         better = search.added(now) if len(now.chosen) < MOST and not hopeless else None
         if better is not None:
             now = search.pruned(search.exchanged(search.refined(better)))
@@ -106,7 +106,7 @@ def cost(found: Fit) -> float:
     """Squares that are left and what the parameters cost (Schwarz); without a name, or with a channel for one, costs more."""
     count = sum(len(theta) for _, theta in found.chosen)
     nameless = sum(":" in name for name in found.names)
-    return found.objective + count * float(np.log(6 * found.rows)) + NAMELESS * nameless
+    return found.objective + count * float(np.log(found.numbers)) + NAMELESS * nameless
 
 
 class _Ranked(NamedTuple):
@@ -176,7 +176,7 @@ class _Search:
                 best = score, trial
         if best is None or best[0] > np.log(FALSE_DISCOVERY / self.tried):
             return None
-        misfit = self.before - 6.0 * now.rows
+        misfit = self.before - now.numbers
         if any(":" in name for name in best[1].names) and now.objective - best[1].objective < NAMELESS_SHARE * misfit:
             return None  # the rim of something that has no name: a name for it would be wrong
         return best[1]
@@ -369,7 +369,7 @@ def _white(log: Weighed, chosen: Chosen, part: str) -> Float64[np.ndarray, "n 6"
     rows = log.rows(part)
     residual = log.whiten(log.pair.real - expected(log.pair, chosen))[rows]
     one = fits.constants(log)[rows]
-    return np.asarray(residual - one * ((one * residual).sum(0) / (one * one).sum(0)))
+    return np.asarray(residual - one * ((one * residual).sum(0) / np.maximum((one * one).sum(0), 1e-300)))
 
 
 class _Panel:

@@ -47,7 +47,8 @@ class Pair:
 
     `fitted` and `held_out` are rows; rows in neither are borders, gaps and ends. `band_hz` is where what is expected ends to be
     known (none: nowhere), `truth` the true poses at its stamps, `aligned_s` what was added to the stamps where the
-    two clocks share no epoch.
+    two clocks share no epoch. `known` says which samples tell what an axis felt (none: all): a converter at its end, an axis that
+    is stuck do not.
     """
 
     name: str
@@ -63,6 +64,18 @@ class Pair:
     band_hz: float | None = None
     sim_noise: Float64[np.ndarray, "6"] = field(default_factory=lambda: np.zeros(6))
     channels: Mapping[str, Float64[np.ndarray, " n"]] = field(default_factory=lambda: NOTHING)
+    known: Bool[np.ndarray, "n 6"] | None = None
+
+    @property
+    def usable(self) -> Bool[np.ndarray, "n 6"]:
+        """Samples that count, fitted or held out."""
+        rows = (self.fitted | self.held_out)[:, None]
+        return np.asarray(np.broadcast_to(rows, self.real.shape) if self.known is None else rows & self.known)
+
+    @property
+    def axes(self) -> Bool[np.ndarray, "6"]:
+        """Of which anything is known at all."""
+        return np.ones(6, bool) if self.known is None else np.asarray(self.known.any(axis=0))
 
     @property
     def period_s(self) -> float:
