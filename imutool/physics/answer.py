@@ -2,38 +2,51 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Bool, Float64
 
 from imutool.physics import stamps, unnamed
 from imutool.physics.apart import remarks, shared
-from imutool.physics.diagnosis import UNITS, Curve, Diagnosis, Estimate, Finding, HeldOut, Traces, Unexplained
+from imutool.physics.diagnosis import UNITS, Closer, Curve, Diagnosis, Estimate, Finding, HeldOut, Located, Traces, Unexplained
 from imutool.physics.discover import Discovery, Judged
 from imutool.physics.fit import Chosen, Fit, Weighed, expected
+from imutool.physics.found import found as physics_file
 from imutool.physics.pair import LEAST_NOISE, Pair
+from imutool.physics.physics_file import PhysicsFile
 from imutool.physics.places import of_findings, of_what_is_left
-from imutool.physics.quantity import AXES, symbol
+from imutool.physics.quantity import AXES, percent, symbol
 from imutool.physics.unnamed import unit
 
-JITTER = "timestamp_jitter"
+SIGNALS = tuple(UNITS)
+JITTER, QUANTIZATION = "timestamp_jitter", "quantization"
 INEXACT = 1e-5  # of a misfit's power: 0.3 % of its size, as which the inexactness of a much larger effect's model may pass
 SHOWN_KNOTS = 41  # of a curve without a name, as it is told
 SOME = 0.05  # of the samples of an axis at its limit, from which on that is told
+MOVES = 5.0  # times its noise by which an axis should have moved before it is called stuck
 WHITE = 1.15  # what is left over the noise, as a ratio, that still counts as noise
 
 
 def told(
-    logs: Sequence[Weighed], found: Discovery, reals: Sequence[str], sim: str | None, known: Sequence[Finding]
+    logs: Sequence[Weighed],
+    found: Discovery,
+    reals: Mapping[str, str],
+    sim: str | None,
+    known: Sequence[Finding],
+    hidden: Sequence[str],
 ) -> Diagnosis:
-    """Findings with what they bring, where the misfit lies, and what is left; what is `known` of a simulation is expected."""
+    """Findings with what they bring, where the misfit lies, and what is left; what is `known` of a simulation is expected.
+
+    `reals` are paths by the name of a log, `hidden` what of the catalogue no motion shows.
+    """
     pairs = [log.pair for log in logs]
-    floor = _floor(logs)
+    noise = floor(logs)
     after = [_with(pair, found.fitted.chosen) for pair in pairs]  # held-out time stays unseen
-    named = [_finding(logs, found, one, floor) for one in found.judged]
+    named = [_finding(logs, found, one, noise) for one in found.judged]
     all_found = [one for one in named if one.share > INEXACT]
-    all_found += stamps.saturated(pairs, after, found.tried) + stamps.dropped(pairs) + stamps.rounded(pairs, floor)
+    all_found += stamps.saturated(pairs, after, found.tried) + stamps.dropped(pairs) + stamps.rounded(pairs, noise)
     findings = [one for one in all_found if not shared(one, known)]
     expected_too = {judged.physics.name for judged, one in zip(found.judged, named, strict=True) if shared(one, known)}
     before = [_with(pair, tuple(one for one in found.fitted.chosen if one[0].name in expected_too)) for pair in pairs]
@@ -43,52 +56,91 @@ def told(
     }
     quiet = expected_too | {JITTER}  # where stamps are wrong, signals are not
     still = [_with(pair, tuple(one for one in found.fitted.chosen if one[0].name in quiet)) for pair in pairs]
-    unexplained = _unexplained(logs, after, floor)
+    unexplained = _unexplained(logs, after, noise)
     if findings:
-        places = of_findings(pairs, still, after, floor, findings, p_values)
+        places = of_findings(pairs, still, after, noise, findings, p_values)
     else:  # where something is left all the same, it is said where
         odd = {name for name, one in unexplained.items() if not one.white}
-        places = [place for place in of_what_is_left(pairs, after, floor) if place.signal in odd]
+        places = [place for place in of_what_is_left(pairs, after, noise) if place.signal in odd]
+    places += [place for pair in pairs for place in _stuck(pair, noise, several=len(reals) > 1)]
     return Diagnosis(
-        real=tuple(reals),
+        real=tuple(reals.values()),
         sim=sim,
-        located=tuple(places),
+        located=tuple(replace(one, log=reals[one.log]) if one.log else one for one in places),
         findings=tuple(findings),
         bias=found.whole.bias,
-        not_identifiable=tuple(
-            dict.fromkeys(
-                [name for one in found.judged for name in one.unidentified if one.physics.name != JITTER]
-                + [one.effect for one in named if one.share <= INEXACT]
-            )
-        ),
+        not_identifiable=_not_identifiable(found, named, hidden),
         unexplained=unexplained,
         remarks=(*_remarks(pairs), *remarks(all_found, known)),
-        closer={signal: _held_out(logs, before, after, k, UNITS[signal]) for signal, k in _known(pairs).items()},
+        closer=closer(logs, before, after),
         traces=tuple(
-            Traces(pair.name, pair.stamp_s, pair.real, b, a, pair.held_out, pair.truth, expected(pair, ()))
+            Traces(pair.name, pair.stamp_s, pair.real, b, a, pair.held_out, pair.truth, expected(pair, ()), reals[pair.name])
             for pair, b, a in zip(pairs, before, after, strict=True)
         ),
     )
 
 
+def without_held_out(logs: Sequence[Weighed], found: Discovery, d: Diagnosis) -> PhysicsFile:
+    """What was found as physics.toml has it, with the numbers that the fitted time alone says; digits are no motion's."""
+    theta = {physics.name: value for physics, value in found.fitted.chosen}
+    judged = {(_effect(one), one.physics.equation): replace(one, theta=theta[one.physics.name]) for one in found.judged}
+    findings = []
+    for one in d.findings:
+        fitted = judged.get((one.effect, one.equation))
+        if fitted is not None:
+            parameters = _parameters([log.pair for log in logs], fitted)
+            one = replace(one, parameters=parameters, curve=_curve(logs[0].pair, fitted, found.fitted))
+        findings.append(one)
+    return physics_file(replace(d, findings=tuple(one for one in findings if one.effect != QUANTIZATION)))
+
+
+def _not_identifiable(found: Discovery, named: Sequence[Finding], hidden: Sequence[str]) -> tuple[str, ...]:
+    """Of what was found, the numbers that nothing shows; of the rest of the catalogue what could not be seen."""
+    told = [name for one in found.judged for name in one.unidentified if one.physics.name != JITTER]
+    told += [one.effect for one in named if one.share <= INEXACT]
+    there = {one.physics.name.partition(" ")[0] for one in found.judged}
+    return tuple(dict.fromkeys([*told, *(name for name in hidden if name.partition(".")[0] not in there)]))
+
+
+def _stuck(pair: Pair, floor: Float64[np.ndarray, "6"], *, several: bool) -> Iterator[Located]:
+    """Axes that read the same in every sample though more was expected than that."""
+    stuck, there = stamps.stuck(pair.real), expected(pair, ())
+    for a in np.flatnonzero(stuck & ~_ended(pair) & (there.std(axis=0) > MOVES * floor)):
+        signal = SIGNALS[a // 3]
+        regime = f"always: it reads {pair.real[0, a]:.4g} {symbol(UNITS[signal])} in every sample"
+        span = ((float(pair.stamp_s[0]), float(pair.stamp_s[-1])),)
+        yield Located(signal, (AXES[a % 3],), span, regime, 1.0, 0.0, pair.name if several else "")
+
+
+def _ended(pair: Pair) -> Bool[np.ndarray, "6"]:
+    """Axes that are at their converter's end so often that it is worth telling."""
+    return np.asarray(stamps.clipped(pair.real).mean(axis=0) > SOME)
+
+
 def _with(pair: Pair, chosen: Chosen) -> Float64[np.ndarray, "n 6"]:
-    """What is expected, with the constant that suits it best; none for an axis of which nothing is known."""
-    there = expected(pair, chosen)
+    """What is expected with some effects and the constant that suits them best."""
+    return with_constant(pair, expected(pair, chosen))
+
+
+def with_constant(pair: Pair, there: Float64[np.ndarray, "n 6"]) -> Float64[np.ndarray, "n 6"]:
+    """What is expected with the constant that suits it best; none for an axis of which nothing is known."""
     counts = pair.usable
     constant = np.where(counts, pair.real - there, 0.0).sum(axis=0) / np.maximum(counts.sum(axis=0), 1)
     return np.asarray(there + constant)
 
 
-def _floor(logs: Sequence[Weighed]) -> Float64[np.ndarray, "6"]:
+def floor(logs: Sequence[Weighed]) -> Float64[np.ndarray, "6"]:
     """The noise of a sample by axis, before it was made white; of an axis nobody knows, that of those beside it."""
-    variances = []
+    total, count = np.zeros(6), np.zeros(6)
     for log in logs:
         response = np.array([np.abs(np.fft.rfft(a, 512)) ** 2 for a in log.whiten.filters])
-        variances.append(np.where(log.pair.axes, log.whiten.std**2 * (1.0 / response).mean(axis=1), np.nan))
-    masked = np.ma.masked_invalid(np.ma.masked_invalid(variances).mean(axis=0).filled(np.nan)).reshape(2, 3)
-    beside = masked.mean(axis=1).filled(np.nan)
-    beside = np.where(np.isnan(beside), LEAST_NOISE[::3] ** 2, beside)
-    return np.asarray(np.sqrt(np.where(masked.mask, beside[:, None], masked.filled(0.0)).ravel()))
+        total += log.pair.axes * log.whiten.std**2 * (1.0 / response).mean(axis=1)
+        count += log.pair.axes
+    variance = total / np.maximum(count, 1.0)
+    for part in (slice(0, 3), slice(3, 6)):
+        there = count[part] > 0
+        variance[part][~there] = variance[part][there].mean() if there.any() else LEAST_NOISE[part][0] ** 2
+    return np.asarray(np.sqrt(variance))
 
 
 def _unseen(log: Weighed, there: Float64[np.ndarray, "n 6"], part: slice) -> Float64[np.ndarray, " m"]:
@@ -100,7 +152,23 @@ def _unseen(log: Weighed, there: Float64[np.ndarray, "n 6"], part: slice) -> Flo
     return np.asarray(left[rows, part].ravel() if counts is None else left[rows, part][counts[rows, part]])
 
 
-def _held_out(logs: Sequence[Weighed], before: Sequence[np.ndarray], after: Sequence[np.ndarray], k: int, unit_: str) -> HeldOut:
+def closer(logs: Sequence[Weighed], before: Sequence[np.ndarray], after: Sequence[np.ndarray]) -> dict[str, Closer]:
+    """What all findings together bring to each sensor, on held-out time."""
+    noise, out = floor(logs), {}
+    for signal, k in _known([log.pair for log in logs]).items():
+        out[signal] = Closer.of(_held_out(logs, before, after, k, UNITS[signal]), _noise(logs, noise, k))
+    return out
+
+
+def _noise(logs: Sequence[Weighed], floor: Float64[np.ndarray, "6"], k: int) -> float:
+    """Of a sensor, over the axes of which anything is known."""
+    part, axes = slice(3 * k, 3 * k + 3), np.any([log.pair.axes for log in logs], axis=0)
+    return float(np.sqrt(np.mean(floor[part][axes[part]] ** 2)))
+
+
+def _held_out(
+    logs: Sequence[Weighed], before: Sequence[np.ndarray], after: Sequence[np.ndarray], k: int, unit_: str
+) -> HeldOut:
     """Root mean squares over held-out samples and axes of a signal, and how long that was; no numbers where none are known."""
     part = slice(3 * k, 3 * k + 3)
     rms = []
@@ -132,9 +200,9 @@ def _finding(logs: Sequence[Weighed], found: Discovery, one: Judged, floor: Floa
             shares.append((excess / noise, float(np.clip(excess / misfit, 0.0, 1.0)), signal, held))
     _, share, signal, held = max(shares, key=lambda entry: entry[0])
     told_signal = signal if len(one.physics.sensors) == 1 else "both"
-    name, _, rest = one.physics.name.replace(" accel", "").partition(":")
+    name, _, rest = one.physics.name.partition(":")
     return Finding(
-        effect=name,
+        effect=_effect(one),
         signal=told_signal,
         share=share,
         p_value=one.p_value,
@@ -146,6 +214,11 @@ def _finding(logs: Sequence[Weighed], found: Discovery, one: Judged, floor: Floa
         curve=_curve(logs[0].pair, one, found.whole),
         similar=one.similar,
     )
+
+
+def _effect(one: Judged) -> str:
+    """Its name in the catalogue: `saturation accel` is the accelerometer's, `driven:` and `unknown:` are of something."""
+    return one.physics.name.replace(" accel", "").partition(":")[0]
 
 
 def _parameters(pairs: Sequence[Pair], one: Judged) -> dict[str, Estimate]:
@@ -184,14 +257,12 @@ def _curve(pair: Pair, one: Judged, whole: Fit) -> Curve | None:
 
 
 def _unexplained(
-    logs: Sequence[Weighed], after: Sequence[Float64[np.ndarray, "n 6"]], floor: Float64[np.ndarray, "6"]
+    logs: Sequence[Weighed], after: Sequence[Float64[np.ndarray, "n 6"]], noises: Float64[np.ndarray, "6"]
 ) -> dict[str, Unexplained]:
     """Of the sensors of which anything is known."""
-    out, axes = {}, np.any([log.pair.axes for log in logs], axis=0)
+    out = {}
     for signal, k in _known([log.pair for log in logs]).items():
-        held = _held_out(logs, after, after, k, UNITS[signal])
-        part = slice(3 * k, 3 * k + 3)
-        noise = float(np.sqrt(np.mean(floor[part][axes[part]] ** 2)))
+        held, noise = _held_out(logs, after, after, k, UNITS[signal]), _noise(logs, noises, k)
         out[signal] = Unexplained(held.rms_after, noise, held.rms_after < WHITE * noise)
     return out
 
@@ -199,21 +270,20 @@ def _unexplained(
 def _known(pairs: Sequence[Pair]) -> dict[str, int]:
     """Sensors of which an axis at least tells anything, with their places."""
     axes = np.any([pair.axes for pair in pairs], axis=0)
-    return {signal: k for k, signal in enumerate(UNITS) if axes[3 * k : 3 * k + 3].any()}
+    return {signal: k for k, signal in enumerate(SIGNALS) if axes[3 * k : 3 * k + 3].any()}
 
 
 def silent(pair: Pair) -> list[str]:
     """What of a log tells nothing, and why."""
-    stuck, clipped, most, out = stamps.stuck(pair.real), stamps.clipped(pair.real), stamps.limits(pair.real), []
-    for k, signal in enumerate(UNITS):
-        ended = [a for a in range(3 * k, 3 * k + 3) if clipped[:, a].mean() > SOME or not (pair.axes[a] or stuck[a])]
-        for a in range(3 * k, 3 * k + 3):
-            if stuck[a] and a not in ended:
-                out.append(f"{signal} {AXES[a - 3 * k]} reads {pair.real[0, a]:.4g} {symbol(UNITS[signal])} in every sample")
-        if ended:
-            at = f"its limit of {most[signal]:.4g} {symbol(UNITS[signal])}"
-            share = ", ".join(f"{AXES[a - 3 * k]} in {percent(float(clipped[:, a].mean()))}" for a in ended)
-            out.append(f"{signal} is at {at}: {share} of the samples")
+    stuck, clipped, ended, out = stamps.stuck(pair.real), stamps.clipped(pair.real).mean(axis=0), _ended(pair), []
+    for a in np.flatnonzero(stuck & ~ended):
+        signal = SIGNALS[a // 3]
+        out.append(f"{signal} {AXES[a % 3]} reads {pair.real[0, a]:.4g} {symbol(UNITS[signal])} in every sample")
+    for signal, most in stamps.limits(pair.real).items():
+        k = 3 * SIGNALS.index(signal)
+        share = ", ".join(f"{AXES[a - k]} in {percent(float(clipped[a]))}" for a in range(k, k + 3) if ended[a])
+        if share:
+            out.append(f"{signal} is at its limit of {most:.4g} {symbol(UNITS[signal])}: {share} of the samples")
     return out
 
 

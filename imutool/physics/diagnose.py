@@ -10,20 +10,23 @@ from dataclasses import replace
 
 import numpy as np
 
-from imutool.errors import ConfigError, DataError
+from imutool.errors import ConfigError, DataError, ImutoolError
 from imutool.mcap_io.fields import others, read_field
 from imutool.mcap_io.read import read as read_log
 from imutool.physics import answer, stamps, unnamed
+from imutool.physics.again import simulated_again
 from imutool.physics.any_signal import diagnose_signal
 from imutool.physics.apart import ANOTHER_MOTION
-from imutool.physics.diagnosis import UNITS, Diagnosis, Finding
-from imutool.physics.discover import discover
+from imutool.physics.diagnosis import Closer, Diagnosis, Finding
+from imutool.physics.discover import Discovery, discover
 from imutool.physics.effects import _catalogue
 from imutool.physics.effects._forward import Physics
 from imutool.physics.fit import Chosen, Fit, Weighed, derivatives, expected, fit
+from imutool.physics.found import NO_EFFECT
 from imutool.physics.motion import smooth_motion
 from imutool.physics.pair import LEAST_S, Pair, of_one_motion, with_simulation, with_truth
 from imutool.physics.reference import wrong_for_moments
+from imutool.physics.visible import unseen
 from imutool.physics.whitening import Band, level, whitener
 from imutool.place import Place
 from imutool.recording import Recording
@@ -66,7 +69,7 @@ def diagnose(
     if signals and (sim is None or len(reals) != 1):
         raise ConfigError("--signal compares one recording with its simulation", where="--signal", fix="Give one log and --sim")
     say(0, 4, "reading")
-    recordings = [read_log(real, imu=imu, truth=truth) for real in reals]
+    recordings = _by_names([read_log(real, imu=imu, truth=truth) for real in reals])
     simulated = None if sim is None else read_log(sim, imu=imu)
     known: tuple[Finding, ...] = ()
     if sim is not None and simulated is not None and simulated.truths and _moves_apart(recordings, simulated, signals):
@@ -81,7 +84,11 @@ def diagnose(
     moments = wrong_for_moments(logs)
     found = discover(logs, () if moments[0] else candidates, () if moments[0] else later(pairs))
     say(3, 4, "locating")
-    told = answer.told(logs, found, [str(real) for real in reals], None if sim is None else str(sim), known)
+    paths = {recording.name: str(real) for recording, real in zip(recordings, reals, strict=True)}
+    told = answer.told(logs, found, paths, None if sim is None else str(sim), known, unseen(logs, candidates))
+    if simulated is not None and any(one.effect not in NO_EFFECT for one in told.findings):
+        say(3, 4, "simulating again")
+        told = _again(told, logs, found, simulated)
     if apart:
         told = replace(told, remarks=(ANOTHER_MOTION, *told.remarks))
     told = replace(told, findings=(*moments[0], *told.findings), located=tuple(moments[1]) or told.located)
@@ -91,6 +98,29 @@ def diagnose(
         told = _with_signal(told, reals[0], sim, signal)
     say(4, 4, "")
     return told
+
+
+def _again(told: Diagnosis, logs: Sequence[Weighed], found: Discovery, sim: Recording) -> Diagnosis:
+    """With what a second simulation says of the findings; where there can be none, with the reason."""
+    if any(one.effect == answer.JITTER for one in told.findings):  # stamps that jitter are no physics to simulate
+        return told
+    try:
+        closer = simulated_again(logs, sim, answer.without_held_out(logs, found, told))
+    except ImutoolError as error:
+        why = f"how much closer it comes is computed, not simulated again: {error}"
+        return replace(told, remarks=(*told.remarks, why))
+    return replace(told, closer=closer)
+
+
+def _by_names(recordings: Sequence[Recording]) -> list[Recording]:
+    """With a name each: logs of several folders may be called alike."""
+    out: list[Recording] = []
+    for one in recordings:
+        name, number, taken = one.name, 2, {other.name for other in out}
+        while name in taken:
+            name, number = f"{one.name} ({number})", number + 1
+        out.append(one if name == one.name else replace(one, name=name))
+    return out
 
 
 def measured(
@@ -145,7 +175,7 @@ def _with_signal(told: Diagnosis, real: Place, sim: Place, signal: str) -> Diagn
         findings=(*told.findings, *one.findings),
         not_identifiable=(*told.not_identifiable, *one.not_identifiable),
         unexplained={**told.unexplained, signal: one.unexplained},
-        closer={**told.closer, signal: one.closer},
+        closer={**told.closer, signal: Closer.of(one.closer, one.unexplained.noise_floor)},
         remarks=(*told.remarks, *one.remarks),
         signals={**told.signals, signal: one.traces},
     )

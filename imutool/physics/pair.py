@@ -47,8 +47,8 @@ class Pair:
 
     `fitted` and `held_out` are rows; rows in neither are borders, gaps and ends. `band_hz` is where what is expected ends to be
     known (none: nowhere), `truth` the true poses at its stamps, `aligned_s` what was added to the stamps where the
-    two clocks share no epoch. `known` says which samples tell what an axis felt (none: all): a converter at its end, an axis that
-    is stuck do not.
+    two clocks share no epoch. `known` says which samples tell what an axis felt (none: all): those of a converter at its end
+    and of an axis that is stuck do not.
     """
 
     name: str

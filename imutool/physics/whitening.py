@@ -88,7 +88,7 @@ class Whitener:
 
 
 def whitener(
-    residual: Float64[np.ndarray, "n 6"], usable: Bool[np.ndarray, "n *six"], order: int, band: Band | None = None
+    residual: Float64[np.ndarray, "n 6"], usable: Bool[np.ndarray, "n ..."], order: int, band: Band | None = None
 ) -> Whitener:
     """From a residual and the rows of it that count, or the samples; an axis without any is left as it is.
 
@@ -109,7 +109,7 @@ def whitener(
     return Whitener(filters, std, band)
 
 
-def level(residual: Float64[np.ndarray, "n 6"], usable: Bool[np.ndarray, "n *six"], rate_hz: float, order: int) -> Whitener:
+def level(residual: Float64[np.ndarray, "n 6"], usable: Bool[np.ndarray, "n ..."], rate_hz: float, order: int) -> Whitener:
     """As `whitener`, for a sensor beside an exact simulation: below `MOTION_HZ` its noise is taken to be what it is above.
 
     What is left down there may be physics that nobody thought of, and must not be taken for noise.
@@ -132,7 +132,7 @@ def level(residual: Float64[np.ndarray, "n 6"], usable: Bool[np.ndarray, "n *six
     return Whitener(filters, std)
 
 
-def _by_axis(usable: Bool[np.ndarray, "n *six"]) -> Bool[np.ndarray, "6 n"]:
+def _by_axis(usable: Bool[np.ndarray, "n ..."]) -> Bool[np.ndarray, "6 n"]:
     return np.asarray(np.broadcast_to(usable.reshape(len(usable), -1).T, (6, len(usable))))
 
 
