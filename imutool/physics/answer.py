@@ -71,7 +71,7 @@ def told(
         bias=found.whole.bias,
         not_identifiable=_not_identifiable(found, named, hidden),
         unexplained=unexplained,
-        remarks=(*_remarks(pairs), *remarks(all_found, known)),
+        remarks=(*_remarks(pairs), *_resting(pairs, hidden), *remarks(all_found, known)),
         closer=closer(logs, before, after),
         traces=tuple(
             Traces(pair.name, pair.stamp_s, pair.real, b, a, pair.held_out, pair.truth, expected(pair, ()), reals[pair.name])
@@ -285,6 +285,13 @@ def silent(pair: Pair) -> list[str]:
         if share:
             out.append(f"{signal} is at its limit of {most:.4g} {symbol(UNITS[signal])}: {share} of the samples")
     return out
+
+
+def _resting(pairs: Sequence[Pair], hidden: Sequence[str]) -> Iterator[str]:
+    """That nothing moves, where not even a late clock would show."""
+    if "clock_offset" in hidden:
+        names = ", ".join(dict.fromkeys(pair.name for pair in pairs))
+        yield f"{names}: too little motion for anything but a bias, its drift, noise, digits and vibration"
 
 
 def _remarks(pairs: Sequence[Pair]) -> Iterator[str]:

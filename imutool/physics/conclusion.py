@@ -8,11 +8,13 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import groupby
 from pathlib import Path
+from textwrap import fill
 
-from imutool.physics.diagnosis import Closer, Diagnosis, Finding, HeldOut, Located, Unexplained
+from imutool.physics.diagnosis import Diagnosis, Finding, HeldOut, Located, Unexplained
 from imutool.physics.quantity import Quantity, grouped, percent, symbol
 
 QUIET = "nothing else stands above the noise"
+UNKNOWN = "What should have been read is not known, and by themselves the samples show nothing amiss."
 NULL = "Nothing but a constant bias and noise separates the two."
 SHOWN = 3  # stretches of time in a line
 WITH_ALL = "With everything that was found"
@@ -21,6 +23,7 @@ ABOVE = 1.1  # what remains may be this many times the noise before it is said t
 ITSELF = "always: "
 FULL = 3  # findings that the conclusion tells in full; the rest by name
 LISTED = 4  # effects that cannot be seen; the rest are counted
+WIDE = 46  # letters of a value in a table
 AS_BEFORE = 2e-3  # by which a root mean square may change and still be called the same
 CERTAIN = 1e-9  # a chance below which nobody asks how much
 COUNTS = ("No", "One thing was", "Two things were", "Three things were", "Four things were", "Five things were")
@@ -122,13 +125,15 @@ SENTENCES: Mapping[str, str | Callable[[Words], str]] = {
 
 def conclusion(d: Diagnosis) -> str:
     """The answer in a few sentences: findings by signal, strongest first, then what remains and what cannot be seen."""
-    said = _found(d) if d.mismatch else [NULL]
+    said = _found(d) if d.mismatch else [NULL if d.unexplained else UNKNOWN]
     left = _remains(d)
     if 0 < len(d.findings) <= FULL and len({one.signal for one in d.findings}) == 1 and len(left) == 1:
         said[-1] = f"{said[-1][:-1]}; {left[0][0].lower()}{left[0][1:]}"  # one thought, one sentence
     elif d.mismatch or not all(one.white for one in d.unexplained.values()):
         said += left
-    again = [f"{percent(one.share)} of the misfit of {_the(signal)}" for signal, one in d.closer.items() if _gone(one)]
+    touched = {part for one in d.findings for part in signals(one.signal)}
+    gone = {signal: one.share for signal, one in d.closer.items() if signal in touched and one.by == "second simulation"}
+    again = [f"{percent(share)} of the misfit of {_the(signal)}" for signal, share in gone.items() if share is not None]
     if again:
         seconds = max(one.seconds for one in d.closer.values())
         said.append(f"Simulated again with this, {' and '.join(again)} is gone on {_seconds(seconds)} of unseen time.")
@@ -136,11 +141,6 @@ def conclusion(d: Diagnosis) -> str:
         more = [f"{len(hidden) - LISTED} more effects in whole or part"] if len(hidden) > LISTED + 1 else hidden[LISTED:]
         said.append(f"These logs cannot show: {', '.join([*hidden[:LISTED], *more])}.")
     return " ".join(said)
-
-
-def _gone(one: Closer) -> bool:
-    """Whether a second simulation has something to say of a signal."""
-    return one.by == "second simulation" and one.share is not None and one.rms_before != one.rms_after
 
 
 def cannot_show(d: Diagnosis) -> list[str]:
@@ -162,13 +162,15 @@ def lines(d: Diagnosis) -> list[str]:
 
 
 def table(d: Diagnosis) -> list[list[str]]:
-    """The findings in rows of a table, the first one the header."""
-    rows = [["What", "Value", "Removes", "By chance"]]
+    """The findings in rows of a table, the first one the header; the chance of one that is not beyond all doubt."""
+    rows = [["What", "Removes", "Value"]]
     for one in d.findings:
         what = name(one) if one.signal in name(one) else f"{name(one)} ({one.signal})"
-        removes = percent(one.share) if measured(one) else "–"
-        values = "\n".join(q.labelled for q in grouped(one.parameters)) if one.curve is None else parameters(one)
-        rows.append([what, values or one.equation, removes, by_chance(one.false_discovery_rate, short=True)])
+        removes = percent(one.share).replace("less than", "<").replace("more than", ">") if measured(one) else "–"
+        values = [q.labelled for q in grouped(one.parameters)] if one.curve is None else [parameters(one)]
+        if one.false_discovery_rate >= CERTAIN:
+            values.append(by_chance(one.false_discovery_rate))
+        rows.append([what, removes, "\n".join(fill(text, WIDE) for text in values or [one.equation])])
     return rows
 
 

@@ -10,11 +10,12 @@ from dataclasses import replace
 
 import numpy as np
 
-from imutool.errors import ConfigError, DataError, ImutoolError
+from imutool.errors import ConfigError, DataError, ImutoolError, NumericsError
 from imutool.mcap_io.fields import others, read_field
 from imutool.mcap_io.read import read as read_log
 from imutool.physics import answer, stamps, unnamed
 from imutool.physics.again import simulated_again
+from imutool.physics.alone import by_samples
 from imutool.physics.any_signal import diagnose_signal
 from imutool.physics.apart import ANOTHER_MOTION
 from imutool.physics.diagnosis import Closer, Diagnosis, Finding
@@ -31,9 +32,11 @@ from imutool.physics.whitening import Band, level, whitener
 from imutool.place import Place
 from imutool.recording import Recording
 
+LEAST_BAND_HZ = 1.0  # and no less: what rests, smoothing makes straight, and it is known all the same
 KNOWN_BAND = 0.45  # of where smoothing halves a motion: there it takes a per cent
 ORDER_SIM, ORDER_TRUTH = 6, 12  # of the autoregression: a sensor's noise is nearly white, that of differentiated poses is not
 RIDGE = 1e-8
+MOST_OF_IT = 0.9  # of a recording: what is covered less is told
 LEAST_KNOWN_S = 2.0  # of an axis, to fit it and again to test it, away from where its converter ends
 SHOWN_BY_SAMPLES = {"saturation", "quantization"}  # without any fit: `stamps`
 EVERY_UNIT = (
@@ -63,7 +66,7 @@ def diagnose(
 
     Raises:
         ConfigError, LogError: a log cannot be read, or has no such topic; signals without a simulation, or of several logs.
-        DataError: no truth and no simulation, too little shared time, another motion.
+        DataError: no truth and no simulation, too little shared time, another motion, no axis that tells anything.
     """
     say = tell or (lambda done, total, text: None)
     if signals and (sim is None or len(reals) != 1):
@@ -76,21 +79,23 @@ def diagnose(
         say(0, 4, "the simulation, of another motion")
         known, simulated = diagnose([sim], imu=imu).findings, None
     apart = sim is not None and simulated is None
-    pairs = [_telling(pair) for recording in recordings for pair in _pairs(recording, simulated, truth)]
+    pairs, left_out = _paired(recordings, simulated, truth)
+    if not pairs:
+        return by_samples(recordings[0], str(reals[0]), left_out[0])
     say(1, 4, "noise")
     candidates = _candidates(pairs)
     logs = [_weighed(pair, candidates) for pair in pairs]
     say(2, 4, "searching")
     moments = wrong_for_moments(logs)
-    found = discover(logs, () if moments[0] else candidates, () if moments[0] else later(pairs))
+    asked, unnamed_too = ((), ()) if moments[0] else (candidates, later(pairs))
+    found = discover(logs, asked, unnamed_too, lambda word: say(2, 4, f"trying {word}"))
     say(3, 4, "locating")
     paths = {recording.name: str(real) for recording, real in zip(recordings, reals, strict=True)}
     told = answer.told(logs, found, paths, None if sim is None else str(sim), known, unseen(logs, candidates))
     if simulated is not None and any(one.effect not in NO_EFFECT for one in told.findings):
         say(3, 4, "simulating again")
         told = _again(told, logs, found, simulated)
-    if apart:
-        told = replace(told, remarks=(ANOTHER_MOTION, *told.remarks))
+    told = replace(told, remarks=(*([ANOTHER_MOTION] if apart else []), *left_out, *told.remarks))
     told = replace(told, findings=(*moments[0], *told.findings), located=tuple(moments[1]) or told.located)
     for signal in signals:
         assert sim is not None
@@ -110,6 +115,35 @@ def _again(told: Diagnosis, logs: Sequence[Weighed], found: Discovery, sim: Reco
         why = f"how much closer it comes is computed, not simulated again: {error}"
         return replace(told, remarks=(*told.remarks, why))
     return replace(told, closer=closer)
+
+
+def _paired(recordings: Sequence[Recording], sim: Recording | None, truth: str | None) -> tuple[list[Pair], list[str]]:
+    """Each recording beside what it should have read; and remarks on what is left out, for poses that do not say that.
+
+    Raises:
+        DataError: as `_pairs` and `_telling`; of poses that are too poor only where none of several logs has better ones.
+    """
+    pairs: list[Pair] = []
+    refused: list[ImutoolError] = []
+    said: list[str] = []
+    for recording in recordings:
+        try:
+            here = list(_pairs(recording, sim, truth))
+        except (DataError, NumericsError) as error:
+            if sim is not None or not recording.truths:
+                raise
+            refused.append(error.at(recording.name))
+            continue
+        pairs += [_telling(pair) for pair in here]
+        covered = sum(float(pair.stamp_s[-1] - pair.stamp_s[0]) for pair in here)
+        if covered < MOST_OF_IT * recording.imu.duration_s:
+            what = "its true poses cover" if sim is None else "the simulation covers"
+            said.append(
+                f"{recording.name}: {what} {covered:.0f} of {recording.imu.duration_s:.0f} s; the rest was not looked at"
+            )
+    if refused and not pairs and len(recordings) > 1:
+        raise refused[0]
+    return pairs, said + [f"left out, {error}" if pairs else str(error) for error in refused]
 
 
 def _by_names(recordings: Sequence[Recording]) -> list[Recording]:
@@ -202,7 +236,7 @@ def _pairs(real: Recording, sim: Recording | None, truth: str | None) -> Iterato
         stretch = next(one for one in motion.stretches if one.start_s <= felt.t_s[0] <= one.end_s)
         started_ns = int(chosen.imu.t_ns[0])  # times are told from the log's start, also where its poses begin later
         since = replace(felt, t_s=felt.t_s + (motion.start_ns - started_ns) * 1e-9)
-        yield with_truth(chosen, since, started_ns, KNOWN_BAND * min(stretch.cutoff_hz))
+        yield with_truth(chosen, since, started_ns, max(KNOWN_BAND * min(stretch.cutoff_hz), LEAST_BAND_HZ))
 
 
 def _telling(pair: Pair) -> Pair:
@@ -221,8 +255,8 @@ def _telling(pair: Pair) -> Pair:
         raise DataError(
             "; ".join(answer.silent(rest)),
             where=pair.name,
-            expected=f"{LEAST_KNOWN_S:g} s or more away from it",
-            fix="Nobody knows what a sensor would have read beyond its range: record with a wider one",
+            expected=f"{LEAST_KNOWN_S:g} s or more of an axis that moves within its range",
+            fix="Record with a sensor that works, of a wider range or of finer digits",
         )
     return rest
 

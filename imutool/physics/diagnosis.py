@@ -177,8 +177,8 @@ class Diagnosis:
             "mismatch": self.mismatch,
             "located": [_located(one) for one in self.located],
             "findings": [_finding(one) for one in self.findings],
-            "bias": {"gyro": self.bias[0, :3].tolist(), "accel": self.bias[0, 3:].tolist()},
-            "biases": [{"gyro": one[:3].tolist(), "accel": one[3:].tolist()} for one in self.bias],
+            "bias": _bias(self.bias[0]),
+            "biases": [_bias(one) for one in self.bias],
             "not_identifiable": list(self.not_identifiable),
             "unexplained": {
                 **{f"{name}_rms": None if one is None else one.rms for name, one in left.items()},
@@ -188,6 +188,12 @@ class Diagnosis:
             "closer": {name: _held_out(one) | {"share": one.share, "by": one.by} for name, one in self.closer.items()},
             "remarks": list(self.remarks),
         }
+
+
+def _bias(one: Float64[np.ndarray, "6"]) -> dict[str, Any]:
+    """Nothing where nobody knows it."""
+    parts = {"gyro": one[:3], "accel": one[3:]}
+    return {signal: part.tolist() if np.isfinite(part).all() else None for signal, part in parts.items()}
 
 
 def _located(one: Located) -> dict[str, Any]:

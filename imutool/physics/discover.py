@@ -10,7 +10,7 @@ Scores are logarithms of chi-square's tail: twenty squares for one parameter are
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
@@ -70,11 +70,19 @@ class Discovery:
     tried: int
 
 
-def discover(logs: Sequence[Weighed], candidates: Sequence[Physics], later: Sequence[Sequence[Physics]] = ()) -> Discovery:
-    """The effects that the logs show together; those of `later` are asked, in turn, when those before have nothing to say."""
+def discover(
+    logs: Sequence[Weighed],
+    candidates: Sequence[Physics],
+    later: Sequence[Sequence[Physics]] = (),
+    tell: Callable[[str], None] | None = None,
+) -> Discovery:
+    """The effects that the logs show together; those of `later` are asked, in turn, when those before have nothing to say.
+
+    `tell` hears what is being tried beside what.
+    """
     everything = tuple(one for stage in later for one in stage)
     start = fit(logs, ())
-    first = _Search(logs, tuple(candidates), everything, start.objective)
+    first = _Search(logs, tuple(candidates), everything, start.objective, tell or (lambda word: None))
     named, nameless = (max((r.worth for r in first.ranked(start, some)), default=0.0) for some in (first.named, first.others))
     paths = [(first.others, []), ((), list(later))] if nameless > named + CLEARLY else [((), list(later)), (first.others, [])]
     search, now = _path(first, start, *paths[0])
@@ -91,6 +99,8 @@ def _path(first: _Search, now: Fit, others: tuple[Physics, ...], waiting: list[S
     """One effect after another comes in, until none of the candidates that there are by then explains more than chance."""
     search = replace(first, others=others)
     for _ in range(ROUNDS):
+        beside = f" beside {', '.join(now.names)}" if now.names else ""
+        search.tell(f"{len(search.named) + len(search.others)} effects{beside}")
         hopeless = len(now.chosen) > SUSPICIOUS and now.objective > HOPELESS * now.numbers
         better = search.added(now) if len(now.chosen) < MOST and not hopeless else None
         if better is not None:
@@ -129,6 +139,7 @@ class _Search:
     named: tuple[Physics, ...]
     others: tuple[Physics, ...]
     before: float  # squares of white residuals with nothing but a constant bias
+    tell: Callable[[str], None]
     starts: dict[str, list[Theta]] = field(default_factory=dict)
     luck: dict[str, float] = field(default_factory=dict)  # log of how much likelier chance looks like it: picked from many
     known: dict[str, _Ranked] = field(default_factory=dict)  # beside the effects of one fit
@@ -229,6 +240,7 @@ class _Search:
     def judged(self, now: Fit) -> Discovery:
         """What may stay: tested on all rows, and on blocks that were not fitted."""
         while now.chosen:
+            self.tell(f"on unseen time: {', '.join(now.names)}")
             other = fit(self.logs, now.chosen, part="held_out")
             whole = fit(self.logs, now.chosen, part="all")
             held = tuple(_plausible(physics, theta) for physics, theta in whole.chosen)

@@ -11,11 +11,11 @@ from collections.abc import Iterator, Mapping, Sequence
 import numpy as np
 from jaxtyping import Float64
 
-from imutool.physics import fit as fits
 from imutool.physics.effects._forward import Physics
-from imutool.physics.fit import Chosen, Weighed, derivatives, expected
+from imutool.physics.fit import Weighed, expected
 
 ENOUGH = 36.0  # squares: six standard deviations, as what is tried some thousand times has to be
+SMALL = 1e-2  # of the plausible size, at which an effect is still proportional to it
 BEHIND: Mapping[str, tuple[str, ...]] = {"clock_offset": ("clock_skew", "clock_jump", "low_pass", "mount_resonance")}
 """What delays, swings or jumps needs the motion that shows a delay."""
 
@@ -46,12 +46,12 @@ def _behind(physics: Physics, candidates: Sequence[Physics]) -> Iterator[str]:
 
 def _gains(logs: Sequence[Weighed], physics: Physics) -> Float64[np.ndarray, " p"]:
     """Squares that each number adds at its plausible size, less those of the constant that hides most of it."""
-    chosen: Chosen = ((physics, physics.nothing.astype(float)),)
     total = np.zeros(len(physics.parameters))
     for log in logs:
-        rows = log.rows("all")
-        B = log.whiten(derivatives(log.pair, chosen, [0], expected(log.pair, chosen)))[rows]
-        one = fits.constants(log)[rows]
+        rows, nothing = log.rows("all"), expected(log.pair, ())
+        added = [expected(log.pair, ((physics, theta),)) - nothing for theta in np.diag(SMALL * physics.plausible)]
+        B = log.whiten(np.stack(added, axis=2))[rows] / SMALL
+        one = log.whiten(np.ones_like(log.pair.real))[rows]
         cross = np.einsum("na,nap->ap", one, B)
         total += (B**2).sum(axis=(0, 1)) - (cross**2 / np.maximum((one**2).sum(axis=0), 1e-300)[:, None]).sum(axis=0)
-    return np.asarray(total * physics.plausible**2)
+    return total

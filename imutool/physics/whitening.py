@@ -18,6 +18,7 @@ MAD_TO_STD = 1.4826
 LEAST_STD = 1e-12
 MOTION_HZ, REFERENCE_HZ = 15.0, 60.0  # where a body's motion has its power, and where noise is measured in its place
 BAND_S, OVER = 0.33, 4.0  # length of the filter of a band, and how many samples a period of its edge gets
+LEAST_SEGMENT, LEAST_SEGMENTS = 64, 8  # of a short log: the median of one or two says too little
 SEGMENT, LINES = 512, 9  # samples of a spectrum; frequencies of the median that takes lines out of it
 
 
@@ -140,7 +141,7 @@ def spectrum(
     x: Float64[np.ndarray, " n"], usable: Bool[np.ndarray, " n"], rate_hz: float
 ) -> tuple[Float64[np.ndarray, " f"], Float64[np.ndarray, " f"]]:
     """Frequencies and power density, the median (Welch) over segments that count wholly, or mostly where none does."""
-    size = min(SEGMENT, len(x))
+    size = min(SEGMENT, max(len(x) // LEAST_SEGMENTS, LEAST_SEGMENT), len(x))
     starts = range(0, len(x) - size + 1, max(1, size // 2))
     whole = np.array([float(usable[s : s + size].mean()) for s in starts])
     taken = [s for s, share in zip(starts, whole, strict=True) if share >= min(1.0, float(whole.max()))]
