@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from imutool.cli._app import Imu, Json, Overwrite, Quiet, Truth, Verbose, app
-from imutool.terminal import logger, progress, say, write_json
+from imutool.terminal import logger, progress, say, table, write_json
 
 if TYPE_CHECKING:
     from imutool.view.rundata import RunData
@@ -41,7 +41,8 @@ def diagnose(
 ) -> None:
     """Find where a recording differs from a simulation, name what physics was left out, model it, and show the gain."""
     from imutool import diagnosis_folder
-    from imutool.physics.conclusion import lines
+    from imutool.physics.conclusion import below, conclusion
+    from imutool.physics.conclusion import table as findings_table
     from imutool.physics.diagnose import diagnose as run
     from imutool.view.runs import load
 
@@ -58,7 +59,11 @@ def diagnose(
                 logger.warning("%s", remark)
     if write_json(diagnosis_folder.plain(found), json_to):
         return
-    for line in lines(found):
+    say(conclusion(found))
+    if found.findings:
+        say("")
+        table(findings_table(found), keys=1)
+    for line in below(found):
         say(line)
     if folder is not None:
         say(f"{folder}: {', '.join(name for name in diagnosis_folder.FILES if (folder / name).exists())}")

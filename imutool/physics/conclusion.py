@@ -7,17 +7,25 @@ import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import groupby
+from pathlib import Path
+from textwrap import fill
 
 from imutool.physics.diagnosis import Diagnosis, Finding, HeldOut, Located, Unexplained
-from imutool.physics.quantity import Quantity, grouped, symbol
+from imutool.physics.quantity import Quantity, grouped, percent, symbol
 
 QUIET = "nothing else stands above the noise"
+UNKNOWN = "What should have been read is not known, and by themselves the samples show nothing amiss."
 NULL = "Nothing but a constant bias and noise separates the two."
 SHOWN = 3  # stretches of time in a line
 WITH_ALL = "With everything that was found"
+AGAIN = "Simulated again with everything that was found"
 ABOVE = 1.1  # what remains may be this many times the noise before it is said to stand above it
+ITSELF = "always: "
 FULL = 3  # findings that the conclusion tells in full; the rest by name
-SMALLEST_P = 1e-300  # what is smaller has lost its digits
+LISTED = 4  # effects that cannot be seen; the rest are counted
+WIDE = 46  # letters of a value in a table
+AS_BEFORE = 2e-3  # by which a root mean square may change and still be called the same
+CERTAIN = 1e-9  # a chance below which nobody asks how much
 COUNTS = ("No", "One thing was", "Two things were", "Three things were", "Four things were", "Five things were")
 
 
@@ -117,29 +125,67 @@ SENTENCES: Mapping[str, str | Callable[[Words], str]] = {
 
 def conclusion(d: Diagnosis) -> str:
     """The answer in a few sentences: findings by signal, strongest first, then what remains and what cannot be seen."""
-    said = _found(d) if d.mismatch else [NULL]
+    said = _found(d) if d.mismatch else [NULL if d.unexplained else UNKNOWN]
     left = _remains(d)
     if 0 < len(d.findings) <= FULL and len({one.signal for one in d.findings}) == 1 and len(left) == 1:
         said[-1] = f"{said[-1][:-1]}; {left[0][0].lower()}{left[0][1:]}"  # one thought, one sentence
     elif d.mismatch or not all(one.white for one in d.unexplained.values()):
         said += left
-    if d.not_identifiable:
-        said.append(f"The motion cannot show: {', '.join(d.not_identifiable)}.")
+    touched = {part for one in d.findings for part in signals(one.signal)}
+    gone = {signal: one.share for signal, one in d.closer.items() if signal in touched and one.by == "second simulation"}
+    again = [f"{percent(share)} of the misfit of {_the(signal)}" for signal, share in gone.items() if share is not None]
+    if again:
+        seconds = max(one.seconds for one in d.closer.values())
+        said.append(f"Simulated again with this, {' and '.join(again)} is gone on {_seconds(seconds)} of unseen time.")
+    if hidden := cannot_show(d):
+        more = [f"{len(hidden) - LISTED} more effects in whole or part"] if len(hidden) > LISTED + 1 else hidden[LISTED:]
+        said.append(f"These logs cannot show: {', '.join([*hidden[:LISTED], *more])}.")
     return " ".join(said)
 
 
+def cannot_show(d: Diagnosis) -> list[str]:
+    """What cannot be seen, by effect: `gyro_scale (x, y)`, or `lever_arm` for all of it."""
+    parts: dict[str, list[str]] = {}
+    for name in d.not_identifiable:
+        effect, _, part = (name, "", "") if name.startswith("/") else name.partition(".")
+        parts.setdefault(effect, []).extend([part] if part else [])
+    return [f"{effect} ({', '.join(some)})" if some else effect for effect, some in parts.items()]
+
+
 def lines(d: Diagnosis) -> list[str]:
-    """A few lines for a terminal: the conclusion, each finding with its numbers, places, what came closer, remarks."""
+    """A few lines: the conclusion, each finding with its numbers, places, what came closer, remarks."""
     out = [conclusion(d)]
     for rank, one in enumerate(d.findings, start=1):
-        sure = f"{p_value(one.p_value)}, false discovery rate {percent(one.false_discovery_rate)}"
         brought = f"; {before_after(one.held_out)}" if measured(one) else ""
-        out.append(f"{rank}. {name(one)} ({one.signal}): {parameters(one)}{brought}; {sure}")
-    out += [f"Where: {where(one)}; {percent(one.share)} of the misfit, {p_value(one.p_value)}" for one in d.located]
+        out.append(f"{rank}. {name(one)} ({one.signal}): {parameters(one)}{brought}; {by_chance(one.false_discovery_rate)}")
+    return out + below(d)
+
+
+def table(d: Diagnosis) -> list[list[str]]:
+    """The findings in rows of a table, the first one the header; the chance of one that is not beyond all doubt."""
+    rows = [["What", "Removes", "Value"]]
+    for one in d.findings:
+        what = name(one) if one.signal in name(one) else f"{name(one)} ({one.signal})"
+        removes = percent(one.share).replace("less than", "<").replace("more than", ">") if measured(one) else "–"
+        values = [q.labelled for q in grouped(one.parameters)] if one.curve is None else [parameters(one)]
+        if one.false_discovery_rate >= CERTAIN:
+            values.append(by_chance(one.false_discovery_rate))
+        rows.append([what, removes, "\n".join(fill(text, WIDE) for text in values or [one.equation])])
+    return rows
+
+
+def below(d: Diagnosis) -> list[str]:
+    """What goes below the findings: places, what came closer, remarks."""
+    out = [f"Where: {where(one)}; {percent(one.share)} of the misfit" for one in d.located]
     if d.findings and d.closer:
         closer = "; ".join(f"{signal} {came_closer(one)}" for signal, one in d.closer.items())
-        out.append(f"{WITH_ALL}{unseen(d)}: {closer}")
+        out.append(f"{with_all(d)}{unseen(d)}: {closer}")
     return out + list(d.remarks)
+
+
+def with_all(d: Diagnosis) -> str:
+    """How what came closer is known."""
+    return AGAIN if any(one.by == "second simulation" for one in d.closer.values()) else WITH_ALL
 
 
 def unseen(d: Diagnosis) -> str:
@@ -150,7 +196,7 @@ def unseen(d: Diagnosis) -> str:
 
 def came_closer(one: HeldOut) -> str:
     """`rms 0.52 to 0.19 m/s², 63 % closer`; what nothing was found for stays as it was."""
-    if one.rms_after == one.rms_before or not one.rms_before > 0.0:
+    if not one.rms_before > 0.0 or abs(one.rms_after / one.rms_before - 1.0) < AS_BEFORE:
         return f"rms {one.rms_before:.3g} {symbol(one.unit)}, as before".replace(" ,", ",")
     gain = 1.0 - one.rms_after / one.rms_before
     return f"{rms(one)}, {percent(abs(gain))} {'closer' if gain > 0.0 else 'farther'}"
@@ -206,7 +252,8 @@ def where(place: Located) -> str:
     """Signal, axes, regime and stretches of time: `accel x, y, angular rate above 0.4 rad/s, 12.0 to 48.5 s`."""
     spans = [f"{first:.1f} to {last:.1f} s" for first, last in place.intervals_s]
     shown = spans if len(spans) <= SHOWN else [*spans[: SHOWN - 1], f"{len(spans) - SHOWN + 1} more stretches"]
-    return ", ".join(part for part in (f"{place.signal} {', '.join(place.axes)}", place.regime, *shown) if part)
+    parts = (Path(place.log).stem, f"{place.signal} {', '.join(place.axes)}", place.regime, *shown)
+    return ", ".join(part for part in parts if part)
 
 
 def signals(signal: str) -> tuple[str, ...]:
@@ -221,18 +268,15 @@ def before_after(one: HeldOut) -> str:
     return rms(one) + (f" on {_seconds(one.seconds)} of unseen data" if one.seconds > 0.0 else "")
 
 
-def percent(share: float) -> str:
-    """`63 %`; never a 0 or 100 that it is not."""
-    if math.isnan(share):
-        return "an unknown share"
-    if 0.0 < share < 0.005:
-        return "less than 1 %" if share >= 1e-3 else "less than 0.1 %"
-    return "more than 99 %" if 0.995 < share < 1.0 else f"{100.0 * share:.0f} %"
-
-
-def p_value(p: float) -> str:
-    """`p = 1e-09`, and a bound where the digits are lost."""
-    return f"p = {p:.1g}" if p >= SMALLEST_P or math.isnan(p) else f"p < {SMALLEST_P:g}"
+def by_chance(p: float, *, short: bool = False) -> str:
+    """How often noise alone would look like it, all that was tried counted: `1 in 2 000 by chance`."""
+    if p < CERTAIN:
+        said = "below 10⁻⁹" if short else "less than 1 in 10⁹"
+    elif p < 0.1:
+        said = f"1 in {float(f'{1.0 / p:.2g}'):,.0f}".replace(",", " ")
+    else:
+        said = "an unknown part" if math.isnan(p) else percent(p)
+    return said if short else f"{said} by chance"
 
 
 def remains(one: Unexplained, unit: str, of: str = "") -> str:
@@ -267,10 +311,19 @@ def _found(d: Diagnosis) -> list[str]:
         said.append(f"Smaller: {', '.join(f'{name(one)} ({one.signal})' for one in d.findings[FULL:])}.")
     named = {part for one in d.findings for part in signals(one.signal)}
     for place in d.located:
-        if place.signal not in named and not set(signals(place.signal)) & named:
-            text = f"{_differs(place.signal)}{_regime([place], place.signal)} ({p_value(place.p_value)})"
+        if not _told_by_place(place) and place.signal not in named and not set(signals(place.signal)) & named:
+            text = f"{_differs(place.signal)}{_regime([place], place.signal)}"
             said.append(f"{text}, and what was left out could not be named.")
-    return said
+    return [*(_known_place(one) for one in d.located if _told_by_place(one)), *said]
+
+
+def _told_by_place(place: Located) -> bool:
+    """Whether a place says itself what is the matter there: `always: it reads 0 in every sample`."""
+    return place.regime.startswith(ITSELF)
+
+
+def _known_place(place: Located) -> str:
+    return f"{_upper(_the(place.signal))}'s {', '.join(place.axes)} is no measurement: {place.regime.removeprefix(ITSELF)}."
 
 
 def _remains(d: Diagnosis) -> list[str]:
@@ -304,7 +357,11 @@ def _other(d: Diagnosis) -> str:
 
 def _regime(located: Sequence[Located], signal: str) -> str:
     """Where the largest share of a signal's misfit lies, as it goes on after `differs`."""
-    here = [place for place in located if place.regime and set(signals(place.signal)) & set(signals(signal))]
+    here = [
+        place
+        for place in located
+        if place.regime and not _told_by_place(place) and set(signals(place.signal)) & set(signals(signal))
+    ]
     if not here:
         return ""
     regime = max(here, key=lambda place: place.share).regime

@@ -9,35 +9,36 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
-from jaxtyping import Float64
 
-from imutool.errors import ConfigError, DataError
+from imutool.errors import ConfigError, DataError, ImutoolError, NumericsError
 from imutool.mcap_io.fields import others, read_field
 from imutool.mcap_io.read import read as read_log
-from imutool.physics import stamps, unnamed
+from imutool.physics import answer, stamps, unnamed
+from imutool.physics.again import simulated_again
+from imutool.physics.alone import by_samples
 from imutool.physics.any_signal import diagnose_signal
-from imutool.physics.apart import ANOTHER_MOTION, remarks, shared
-from imutool.physics.diagnosis import UNITS, Curve, Diagnosis, Estimate, Finding, HeldOut, Traces, Unexplained
-from imutool.physics.discover import Discovery, Judged, discover
+from imutool.physics.apart import ANOTHER_MOTION
+from imutool.physics.diagnosis import Closer, Diagnosis, Finding
+from imutool.physics.discover import Discovery, discover
 from imutool.physics.effects import _catalogue
 from imutool.physics.effects._forward import Physics
 from imutool.physics.fit import Chosen, Fit, Weighed, derivatives, expected, fit
+from imutool.physics.found import NO_EFFECT
 from imutool.physics.motion import smooth_motion
 from imutool.physics.pair import LEAST_S, Pair, of_one_motion, with_simulation, with_truth
-from imutool.physics.places import of_findings, of_what_is_left
 from imutool.physics.reference import wrong_for_moments
-from imutool.physics.unnamed import unit
+from imutool.physics.visible import unseen
 from imutool.physics.whitening import Band, level, whitener
 from imutool.place import Place
 from imutool.recording import Recording
 
+LEAST_BAND_HZ = 1.0  # and no less: what rests, smoothing makes straight, and it is known all the same
 KNOWN_BAND = 0.45  # of where smoothing halves a motion: there it takes a per cent
 ORDER_SIM, ORDER_TRUTH = 6, 12  # of the autoregression: a sensor's noise is nearly white, that of differentiated poses is not
 RIDGE = 1e-8
-JITTER = "timestamp_jitter"
-INEXACT = 1e-5  # of a misfit's power: 0.3 % of its size, as which the inexactness of a much larger effect's model may pass
+MOST_OF_IT = 0.9  # of a recording: what is covered less is told
+LEAST_KNOWN_S = 2.0  # of an axis, to fit it and again to test it, away from where its converter ends
 SHOWN_BY_SAMPLES = {"saturation", "quantization"}  # without any fit: `stamps`
-SHOWN_KNOTS = 41  # of a curve without a name, as it is told
 EVERY_UNIT = (
     "mount_rotation",
     "gyro_scale",
@@ -45,7 +46,6 @@ EVERY_UNIT = (
     "lever_arm",
     "clock_offset",
 )  # in which every unit differs a little
-WHITE = 1.15  # what is left over the noise, as a ratio, that still counts as noise
 Tell = Callable[[int, int, str], None]
 
 
@@ -66,30 +66,36 @@ def diagnose(
 
     Raises:
         ConfigError, LogError: a log cannot be read, or has no such topic; signals without a simulation, or of several logs.
-        DataError: no truth and no simulation, too little shared time, another motion.
+        DataError: no truth and no simulation, too little shared time, another motion, no axis that tells anything.
     """
     say = tell or (lambda done, total, text: None)
     if signals and (sim is None or len(reals) != 1):
         raise ConfigError("--signal compares one recording with its simulation", where="--signal", fix="Give one log and --sim")
     say(0, 4, "reading")
-    recordings = [read_log(real, imu=imu, truth=truth) for real in reals]
+    recordings = _by_names([read_log(real, imu=imu, truth=truth) for real in reals])
     simulated = None if sim is None else read_log(sim, imu=imu)
     known: tuple[Finding, ...] = ()
     if sim is not None and simulated is not None and simulated.truths and _moves_apart(recordings, simulated, signals):
         say(0, 4, "the simulation, of another motion")
         known, simulated = diagnose([sim], imu=imu).findings, None
     apart = sim is not None and simulated is None
-    pairs = [_unclipped(pair) for recording in recordings for pair in _pairs(recording, simulated, truth)]
+    pairs, left_out = _paired(recordings, simulated, truth)
+    if not pairs:
+        return by_samples(recordings[0], str(reals[0]), left_out[0])
     say(1, 4, "noise")
     candidates = _candidates(pairs)
     logs = [_weighed(pair, candidates) for pair in pairs]
     say(2, 4, "searching")
     moments = wrong_for_moments(logs)
-    found = discover(logs, () if moments[0] else candidates, () if moments[0] else later(pairs))
+    asked, unnamed_too = ((), ()) if moments[0] else (candidates, later(pairs))
+    found = discover(logs, asked, unnamed_too, lambda word: say(2, 4, f"trying {word}"))
     say(3, 4, "locating")
-    told = _told(logs, found, [str(real) for real in reals], None if sim is None else str(sim), known)
-    if apart:
-        told = replace(told, remarks=(ANOTHER_MOTION, *told.remarks))
+    paths = {recording.name: str(real) for recording, real in zip(recordings, reals, strict=True)}
+    told = answer.told(logs, found, paths, None if sim is None else str(sim), known, unseen(logs, candidates))
+    if simulated is not None and any(one.effect not in NO_EFFECT for one in told.findings):
+        say(3, 4, "simulating again")
+        told = _again(told, logs, found, simulated)
+    told = replace(told, remarks=(*([ANOTHER_MOTION] if apart else []), *left_out, *told.remarks))
     told = replace(told, findings=(*moments[0], *told.findings), located=tuple(moments[1]) or told.located)
     for signal in signals:
         assert sim is not None
@@ -97,6 +103,58 @@ def diagnose(
         told = _with_signal(told, reals[0], sim, signal)
     say(4, 4, "")
     return told
+
+
+def _again(told: Diagnosis, logs: Sequence[Weighed], found: Discovery, sim: Recording) -> Diagnosis:
+    """With what a second simulation says of the findings; where there can be none, with the reason."""
+    if any(one.effect == answer.JITTER for one in told.findings):  # stamps that jitter are no physics to simulate
+        return told
+    try:
+        closer = simulated_again(logs, sim, answer.without_held_out(logs, found, told))
+    except ImutoolError as error:
+        why = f"how much closer it comes is computed, not simulated again: {error}"
+        return replace(told, remarks=(*told.remarks, why))
+    return replace(told, closer=closer)
+
+
+def _paired(recordings: Sequence[Recording], sim: Recording | None, truth: str | None) -> tuple[list[Pair], list[str]]:
+    """Each recording beside what it should have read; and remarks on what is left out, for poses that do not say that.
+
+    Raises:
+        DataError: as `_pairs` and `_telling`; of poses that are too poor only where none of several logs has better ones.
+    """
+    pairs: list[Pair] = []
+    refused: list[ImutoolError] = []
+    said: list[str] = []
+    for recording in recordings:
+        try:
+            here = list(_pairs(recording, sim, truth))
+        except (DataError, NumericsError) as error:
+            if sim is not None or not recording.truths:
+                raise
+            refused.append(error.at(recording.name))
+            continue
+        pairs += [_telling(pair) for pair in here]
+        covered = sum(float(pair.stamp_s[-1] - pair.stamp_s[0]) for pair in here)
+        if covered < MOST_OF_IT * recording.imu.duration_s:
+            what = "its true poses cover" if sim is None else "the simulation covers"
+            said.append(
+                f"{recording.name}: {what} {covered:.0f} of {recording.imu.duration_s:.0f} s; the rest was not looked at"
+            )
+    if refused and not pairs and len(recordings) > 1:
+        raise refused[0]
+    return pairs, said + [f"left out, {error}" if pairs else str(error) for error in refused]
+
+
+def _by_names(recordings: Sequence[Recording]) -> list[Recording]:
+    """With a name each: logs of several folders may be called alike."""
+    out: list[Recording] = []
+    for one in recordings:
+        name, number, taken = one.name, 2, {other.name for other in out}
+        while name in taken:
+            name, number = f"{one.name} ({number})", number + 1
+        out.append(one if name == one.name else replace(one, name=name))
+    return out
 
 
 def measured(
@@ -113,7 +171,7 @@ def measured(
         ConfigError, LogError, DataError: as `diagnose`; or an effect that has nothing to be fitted to here.
     """
     simulated = None if sim is None else read_log(sim, imu=imu)
-    pairs = [_unclipped(pair) for pair in _pairs(read_log(real, imu=imu, truth=truth), simulated, truth)]
+    pairs = [_telling(pair) for pair in _pairs(read_log(real, imu=imu, truth=truth), simulated, truth)]
     candidates = _candidates(pairs)
     begun = tuple((one, one.nothing.astype(float)) for one in _catalogue.physics(effects))
     return fit([_weighed(pair, candidates) for pair in pairs], begun, part="all")
@@ -165,7 +223,7 @@ def _with_signal(told: Diagnosis, real: Place, sim: Place, signal: str) -> Diagn
         findings=(*told.findings, *one.findings),
         not_identifiable=(*told.not_identifiable, *one.not_identifiable),
         unexplained={**told.unexplained, signal: one.unexplained},
-        closer={**told.closer, signal: one.closer},
+        closer={**told.closer, signal: Closer.of(one.closer, one.unexplained.noise_floor)},
         remarks=(*told.remarks, *one.remarks),
         signals={**told.signals, signal: one.traces},
     )
@@ -192,24 +250,27 @@ def _pairs(real: Recording, sim: Recording | None, truth: str | None) -> Iterato
         stretch = next(one for one in motion.stretches if one.start_s <= felt.t_s[0] <= one.end_s)
         started_ns = int(chosen.imu.t_ns[0])  # times are told from the log's start, also where its poses begin later
         since = replace(felt, t_s=felt.t_s + (motion.start_ns - started_ns) * 1e-9)
-        yield with_truth(chosen, since, started_ns, KNOWN_BAND * min(stretch.cutoff_hz))
+        yield with_truth(chosen, since, started_ns, max(KNOWN_BAND * min(stretch.cutoff_hz), LEAST_BAND_HZ))
 
 
-def _unclipped(pair: Pair) -> Pair:
-    """Without rows in which a converter is at its end.
+def _telling(pair: Pair) -> Pair:
+    """With what is known: no sample of a converter at its end, no axis that hardly has others, or that is stuck.
 
     Raises:
-        DataError: hardly any other row is there.
+        DataError: no axis is left.
     """
-    clipped = stamps.clipped(pair.real)
-    rest = replace(pair, fitted=pair.fitted & ~clipped, held_out=pair.held_out & ~clipped)
-    if clipped.any() and (rest.fitted | rest.held_out).sum() * pair.period_s < LEAST_S:
-        told = ", ".join(f"{signal} {most:.4g} {UNITS[signal]}" for signal, most in stamps.limits(pair.real).items())
+    known = ~(stamps.clipped(pair.real) | stamps.stuck(pair.real))
+    if known.all():
+        return pair
+    rest = replace(pair, known=known)
+    for part in (pair.fitted, pair.held_out):
+        known &= (known[part].sum(axis=0) * pair.period_s >= LEAST_KNOWN_S) | (known[part].all(axis=0))
+    if not known.any():
         raise DataError(
-            f"the sensor is at its limit in {100.0 * clipped.mean():.0f} % of the samples ({told})",
+            "; ".join(answer.silent(rest)),
             where=pair.name,
-            expected=f"{LEAST_S:g} s away from it",
-            fix="Nobody knows what a sensor would have read beyond its range: record with a wider one",
+            expected=f"{LEAST_KNOWN_S:g} s or more of an axis that moves within its range",
+            fix="Record with a sensor that works, of a wider range or of finer digits",
         )
     return rest
 
@@ -239,194 +300,16 @@ def _weighed(pair: Pair, candidates: Sequence[Physics]) -> Weighed:
     linear: Chosen = tuple((one, one.nothing.astype(float)) for one in candidates if one.linear)
     base = expected(pair, linear)
     J = derivatives(pair, linear, range(len(linear)), base)
-    left, usable = pair.real - base, pair.fitted | pair.held_out
-    for axis in range(6):
+    left, usable = pair.real - base, pair.usable
+    for axis, rows in enumerate(usable.T):
         A = np.concatenate([J[:, axis], np.ones((len(J), 1))], axis=1)
-        size = np.linalg.norm(A[usable], axis=0)
+        size = np.linalg.norm(A[rows], axis=0)
         A = A[:, size > 0] / size[size > 0]
-        N = A[usable].T @ A[usable] + RIDGE * np.eye(A.shape[1])
-        left[:, axis] -= A @ np.linalg.solve(N, A[usable].T @ left[usable, axis])
+        N = A[rows].T @ A[rows] + RIDGE * np.eye(A.shape[1])
+        left[:, axis] -= A @ np.linalg.solve(N, A[rows].T @ left[rows, axis])
     if pair.against == "simulation":
-        return Weighed(pair, level(left, usable, 1.0 / pair.period_s, ORDER_SIM))
-    assert pair.band_hz is not None
-    return Weighed(pair, whitener(left, usable, ORDER_TRUTH, Band.below(pair.band_hz, 1.0 / pair.period_s)))
-
-
-# ── what is told ──
-
-
-def _told(
-    logs: Sequence[Weighed], found: Discovery, reals: Sequence[str], sim: str | None, known: Sequence[Finding]
-) -> Diagnosis:
-    """Findings with what they bring, where the misfit lies, and what is left; what is `known` of a simulation is expected."""
-    pairs = [log.pair for log in logs]
-    floor = _floor(logs)
-    after = [_with(pair, found.fitted.chosen) for pair in pairs]  # held-out time stays unseen
-    told = [_finding(logs, found, one, floor) for one in found.judged]
-    all_found = [one for one in told if one.share > INEXACT]
-    all_found += stamps.saturated(pairs, after, found.tried) + stamps.dropped(pairs) + stamps.rounded(pairs, floor)
-    findings = [one for one in all_found if not shared(one, known)]
-    expected_too = {judged.physics.name for judged, one in zip(found.judged, told, strict=True) if shared(one, known)}
-    before = [_with(pair, tuple(one for one in found.fitted.chosen if one[0].name in expected_too)) for pair in pairs]
-    p_values = {
-        signal: min((one.p_value for one in findings if one.effect != JITTER and one.signal in (signal, "both")), default=1.0)
-        for signal in ("gyro", "accel")
-    }
-    quiet = expected_too | {JITTER}  # where stamps are wrong, signals are not
-    still = [_with(pair, tuple(one for one in found.fitted.chosen if one[0].name in quiet)) for pair in pairs]
-    unexplained = _unexplained(pairs, after, floor)
-    if findings:
-        places = of_findings(pairs, still, after, floor, findings, p_values)
-    else:  # where something is left all the same, it is said where
-        odd = {name for name, one in unexplained.items() if not one.white}
-        places = [place for place in of_what_is_left(pairs, after, floor) if place.signal in odd]
-    return Diagnosis(
-        real=tuple(reals),
-        sim=sim,
-        located=tuple(places),
-        findings=tuple(findings),
-        bias=found.whole.bias,
-        not_identifiable=tuple(
-            dict.fromkeys(
-                [name for one in found.judged for name in one.unidentified if one.physics.name != JITTER]
-                + [one.effect for one in told if one.share <= INEXACT]
-            )
-        ),
-        unexplained=unexplained,
-        remarks=(*_remarks(pairs), *remarks(all_found, known)),
-        closer={signal: _held_out(pairs, before, after, k, UNITS[signal]) for k, signal in enumerate(("gyro", "accel"))},
-        traces=tuple(
-            Traces(pair.name, pair.stamp_s, pair.real, b, a, pair.held_out, pair.truth, expected(pair, ()))
-            for pair, b, a in zip(pairs, before, after, strict=True)
-        ),
-    )
-
-
-def _with(pair: Pair, chosen: Chosen) -> Float64[np.ndarray, "n 6"]:
-    """What is expected, with the constant that suits it best."""
-    there = expected(pair, chosen)
-    usable = pair.fitted | pair.held_out
-    return np.asarray(there + (pair.real - there)[usable].mean(axis=0))
-
-
-def _floor(logs: Sequence[Weighed]) -> Float64[np.ndarray, "6"]:
-    """The noise of a sample by axis, before it was made white."""
-    variances = []
-    for log in logs:
-        response = np.array([np.abs(np.fft.rfft(a, 512)) ** 2 for a in log.whiten.filters])
-        variances.append(log.whiten.std**2 * (1.0 / response).mean(axis=1))
-    return np.asarray(np.sqrt(np.mean(variances, axis=0)))
-
-
-def _unseen(pair: Pair, there: Float64[np.ndarray, "n 6"]) -> Float64[np.ndarray, "m 6"]:
-    """What is left on held-out samples, up to where what is expected is known."""
-    left = pair.real - there
-    if pair.band_hz is None:
-        return np.asarray(left[pair.held_out])
-    band = Band.below(pair.band_hz, 1.0 / pair.period_s)
-    return np.asarray(band(left)[pair.held_out[:: band.every]])
-
-
-def _held_out(pairs: Sequence[Pair], before: Sequence[np.ndarray], after: Sequence[np.ndarray], k: int, unit_: str) -> HeldOut:
-    """Root mean squares over held-out samples and axes of a signal, and how long that was."""
-    part = slice(3 * k, 3 * k + 3)
-    power = [
-        np.concatenate([(_unseen(pair, there)[:, part] ** 2).ravel() for pair, there in zip(pairs, those, strict=True)])
-        for those in (before, after)
-    ]
-    length = sum(float(pair.held_out.sum()) * pair.period_s for pair in pairs)
-    return HeldOut(float(np.sqrt(power[0].mean())), float(np.sqrt(power[1].mean())), unit_, round(length, 1))
-
-
-def _finding(logs: Sequence[Weighed], found: Discovery, one: Judged, floor: Float64[np.ndarray, "6"]) -> Finding:
-    """One effect: what leaving it out costs on time that its parameters were not fitted to."""
-    pairs = [log.pair for log in logs]
-    fitted = found.fitted
-    names = [physics.name for physics, _ in fitted.chosen]
-    k = names.index(one.physics.name)
-    without: Chosen = (*fitted.chosen[:k], *fitted.chosen[k + 1 :])
-    with_ = [_with(pair, fitted.chosen) for pair in pairs]
-    alone = [_with(pair, without) for pair in pairs]
-    nothing = [_with(pair, ()) for pair in pairs]
-    shares = []
-    for j, signal in enumerate(("gyro", "accel")):
-        if signal in one.physics.sensors:
-            held = _held_out(pairs, alone, with_, j, UNITS[signal])
-            all_ = _held_out(pairs, nothing, with_, j, UNITS[signal])
-            noise = float(np.mean(floor[3 * j : 3 * j + 3] ** 2))
-            misfit = max(all_.rms_before**2 - noise, 1e-300)
-            excess = held.rms_before**2 - held.rms_after**2
-            shares.append((excess / noise, float(np.clip(excess / misfit, 0.0, 1.0)), signal, held))
-    _, share, signal, held = max(shares, key=lambda entry: entry[0])
-    told_signal = signal if len(one.physics.sensors) == 1 else "both"
-    name, _, rest = one.physics.name.replace(" accel", "").partition(":")
-    return Finding(
-        effect=name,
-        signal=told_signal,
-        share=share,
-        p_value=one.p_value,
-        false_discovery_rate=one.false_discovery_rate,
-        parameters=_parameters(pairs, one),
-        equation=one.physics.equation,
-        held_out=held,
-        driver=rest.rpartition(":")[0] if name == "driven" else "",
-        curve=_curve(logs[0].pair, one, found.whole),
-        similar=one.similar,
-    )
-
-
-def _parameters(pairs: Sequence[Pair], one: Judged) -> dict[str, Estimate]:
-    """As they were fitted, but for what stamps and samples show exactly; a curve is told by its values."""
-    if isinstance(one.physics.forward, unnamed.Curve):
-        return {}
-    if one.physics.name == JITTER:
-        off = np.concatenate([pair.stamp_s - stamps.even(pair.stamp_s)[0] for pair in pairs])
-        std = float(off.std())
-        return {"std": Estimate(std, std / np.sqrt(2.0 * len(off)), "s")}
-    return {
-        number.name: Estimate(float(value), float(std), number.unit)
-        for number, value, std in zip(one.physics.parameters, one.theta, one.std, strict=True)
-    }
-
-
-def _curve(pair: Pair, one: Judged, whole: Fit) -> Curve | None:
-    """A curve without a name by its values, with what they are sure to."""
-    forward = one.physics.forward
-    if not isinstance(forward, unnamed.Curve):
-        return None
-    x = forward.points(SHOWN_KNOTS)
-    basis = forward.basis(x)
-    first = 0
-    for physics, theta in whole.chosen:
-        if physics.name == one.physics.name:
-            break
-        first += len(theta)
-    covariance = whole.covariance[first : first + len(one.theta), first : first + len(one.theta)]
-    middle = float((basis @ one.theta).mean())  # a constant belongs to the bias
-    y, band = np.zeros((len(x), 3)), np.zeros((len(x), 3))
-    y[:, forward.axis] = basis @ one.theta - middle
-    centred = basis - basis.mean(axis=0)
-    band[:, forward.axis] = np.sqrt(np.einsum("nq,qp,np->n", centred, covariance, centred))
-    return Curve(forward.variable, unit(forward.variable), x, y, band, middle)
-
-
-def _unexplained(
-    pairs: Sequence[Pair], after: Sequence[Float64[np.ndarray, "n 6"]], floor: Float64[np.ndarray, "6"]
-) -> dict[str, Unexplained]:
-    out = {}
-    for k, signal in enumerate(("gyro", "accel")):
-        held = _held_out(pairs, after, after, k, UNITS[signal])
-        noise = float(np.sqrt(np.mean(floor[3 * k : 3 * k + 3] ** 2)))
-        out[signal] = Unexplained(held.rms_after, noise, held.rms_after < WHITE * noise)
-    return out
-
-
-def _remarks(pairs: Sequence[Pair]) -> Iterator[str]:
-    for pair in pairs:
-        if pair.aligned_s:
-            yield (
-                f"{pair.name}: the two clocks share no epoch; aligned by the motion ({pair.aligned_s:+.3f} s), "
-                "so that a constant offset between them cannot be seen"
-            )
-        if pair.felt.R_wb is None:
-            yield f"{pair.name}: no attitude is known, so that gravity and the earth's rotation were not asked"
+        white = level(left, usable, 1.0 / pair.period_s, ORDER_SIM)
+    else:
+        assert pair.band_hz is not None
+        white = whitener(left, usable, ORDER_TRUTH, Band.below(pair.band_hz, 1.0 / pair.period_s))
+    return Weighed(pair, white if pair.known is None else white.counting(pair.known))

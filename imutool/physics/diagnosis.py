@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Bool, Float64
@@ -15,14 +15,16 @@ from jaxtyping import Bool, Float64
 from imutool.recording import Poses
 
 SCHEMA = "imutool.diagnosis/1"
+WORTH = 0.1  # of the noise, in power, that a misfit must have for a share of it to mean anything
 UNITS = {"gyro": "rad/s", "accel": "m/s^2"}
 
 
 @dataclass(frozen=True)
 class Located:
-    """Where the misfit lies: axes of a signal, stretches of time (s from the start of the first log), and in which regime.
+    """Where the misfit lies: axes of a signal, stretches of time (s from the start of the log), and in which regime.
 
     `share` is how much of that signal's misfit above the noise lies there; `p_value` is that of noise alone doing the same.
+    `log` is which of several it is, as `Diagnosis.real` has it.
     """
 
     signal: str
@@ -31,6 +33,7 @@ class Located:
     regime: str
     share: float
     p_value: float
+    log: str = ""
 
 
 @dataclass(frozen=True)
@@ -50,6 +53,26 @@ class HeldOut:
     rms_after: float
     unit: str
     seconds: float
+
+
+@dataclass(frozen=True)
+class Closer(HeldOut):
+    """As `HeldOut` for all findings together; `share` of the misfit above the noise is gone, in power (none where none was).
+
+    `by` a second simulation with what was found on the other time, or as the search computes it.
+    """
+
+    share: float | None = None
+    by: Literal["second simulation", "computed"] = "computed"
+
+    @classmethod
+    def of(cls, one: HeldOut, noise_floor: float) -> Closer:
+        """As it is computed, over noise of some root mean square."""
+        misfit = one.rms_before**2 - noise_floor**2
+        gone = None
+        if misfit > WORTH * noise_floor**2:
+            gone = max(-1.0, min(1.0, (one.rms_before**2 - one.rms_after**2) / misfit))
+        return cls(one.rms_before, one.rms_after, one.unit, one.seconds, gone)
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,6 +131,7 @@ class Traces:
     held_out: Bool[np.ndarray, " n"]
     truth: Poses | None = None  # at these samples
     ideal: Float64[np.ndarray, "n 6"] | None = None  # what a perfect sensor would have read
+    path: str = ""  # of the log, as `Diagnosis.real` has it
 
 
 @dataclass(frozen=True, eq=False)
@@ -134,7 +158,7 @@ class Diagnosis:
     not_identifiable: tuple[str, ...]
     unexplained: Mapping[str, Unexplained]
     remarks: tuple[str, ...] = ()
-    closer: Mapping[str, HeldOut] = field(default_factory=dict)  # of each signal, once simulated again with the findings
+    closer: Mapping[str, Closer] = field(default_factory=dict)  # of each signal, once simulated again with the findings
     traces: tuple[Traces, ...] = ()
     signals: Mapping[str, SignalTraces] = field(default_factory=dict)  # by TOPIC.field
 
@@ -144,7 +168,8 @@ class Diagnosis:
         return bool(self.findings) or bool(self.located)
 
     def plain(self) -> dict[str, Any]:
-        """As JSON has it."""
+        """As JSON has it; nothing is said of what is left of a sensor that told nothing."""
+        left = dict.fromkeys(UNITS) | dict(self.unexplained)
         return {
             "schema": SCHEMA,
             "real": list(self.real),
@@ -152,21 +177,27 @@ class Diagnosis:
             "mismatch": self.mismatch,
             "located": [_located(one) for one in self.located],
             "findings": [_finding(one) for one in self.findings],
-            "bias": {"gyro": self.bias[0, :3].tolist(), "accel": self.bias[0, 3:].tolist()},
-            "biases": [{"gyro": one[:3].tolist(), "accel": one[3:].tolist()} for one in self.bias],
+            "bias": _bias(self.bias[0]),
+            "biases": [_bias(one) for one in self.bias],
             "not_identifiable": list(self.not_identifiable),
             "unexplained": {
-                **{f"{name}_rms": one.rms for name, one in self.unexplained.items()},
-                "noise_floor": {name: one.noise_floor for name, one in self.unexplained.items()},
+                **{f"{name}_rms": None if one is None else one.rms for name, one in left.items()},
+                "noise_floor": {name: None if one is None else one.noise_floor for name, one in left.items()},
                 "white": all(one.white for one in self.unexplained.values()),
             },
-            "closer": {name: _held_out(one) for name, one in self.closer.items()},
+            "closer": {name: _held_out(one) | {"share": one.share, "by": one.by} for name, one in self.closer.items()},
             "remarks": list(self.remarks),
         }
 
 
+def _bias(one: Float64[np.ndarray, "6"]) -> dict[str, Any]:
+    """Nothing where nobody knows it."""
+    parts = {"gyro": one[:3], "accel": one[3:]}
+    return {signal: part.tolist() if np.isfinite(part).all() else None for signal, part in parts.items()}
+
+
 def _located(one: Located) -> dict[str, Any]:
-    return {
+    out = {
         "signal": one.signal,
         "axes": list(one.axes),
         "intervals_s": [list(interval) for interval in one.intervals_s],
@@ -174,6 +205,7 @@ def _located(one: Located) -> dict[str, Any]:
         "share": one.share,
         "p_value": one.p_value,
     }
+    return out | {"log": one.log} if one.log else out
 
 
 def _finding(one: Finding) -> dict[str, Any]:

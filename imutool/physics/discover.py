@@ -10,7 +10,7 @@ Scores are logarithms of chi-square's tail: twenty squares for one parameter are
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
@@ -70,16 +70,24 @@ class Discovery:
     tried: int
 
 
-def discover(logs: Sequence[Weighed], candidates: Sequence[Physics], later: Sequence[Sequence[Physics]] = ()) -> Discovery:
-    """The effects that the logs show together; those of `later` are asked, in turn, when those before have nothing to say."""
+def discover(
+    logs: Sequence[Weighed],
+    candidates: Sequence[Physics],
+    later: Sequence[Sequence[Physics]] = (),
+    tell: Callable[[str], None] | None = None,
+) -> Discovery:
+    """The effects that the logs show together; those of `later` are asked, in turn, when those before have nothing to say.
+
+    `tell` hears what is being tried beside what.
+    """
     everything = tuple(one for stage in later for one in stage)
     start = fit(logs, ())
-    first = _Search(logs, tuple(candidates), everything, start.objective)
+    first = _Search(logs, tuple(candidates), everything, start.objective, tell or (lambda word: None))
     named, nameless = (max((r.worth for r in first.ranked(start, some)), default=0.0) for some in (first.named, first.others))
     paths = [(first.others, []), ((), list(later))] if nameless > named + CLEARLY else [((), list(later)), (first.others, [])]
     search, now = _path(first, start, *paths[0])
     churned = len(now.chosen) >= SUSPICIOUS or any(":" in name for name in now.names)
-    if everything and churned and now.objective > WELL * 6 * now.rows:
+    if everything and churned and now.objective > WELL * now.numbers:
         # many small parts that do not add up, or one without a name: perhaps one thing alone is the better answer
         other = _path(first, start, *paths[1])
         if cost(other[1]) < cost(now) - CLEARLY:
@@ -91,7 +99,9 @@ def _path(first: _Search, now: Fit, others: tuple[Physics, ...], waiting: list[S
     """One effect after another comes in, until none of the candidates that there are by then explains more than chance."""
     search = replace(first, others=others)
     for _ in range(ROUNDS):
-        hopeless = len(now.chosen) > SUSPICIOUS and now.objective > HOPELESS * 6 * now.rows
+        beside = f" beside {', '.join(now.names)}" if now.names else ""
+        search.tell(f"{len(search.named) + len(search.others)} effects{beside}")
+        hopeless = len(now.chosen) > SUSPICIOUS and now.objective > HOPELESS * now.numbers
         better = search.added(now) if len(now.chosen) < MOST and not hopeless else None
         if better is not None:
             now = search.pruned(search.exchanged(search.refined(better)))
@@ -106,7 +116,7 @@ def cost(found: Fit) -> float:
     """Squares that are left and what the parameters cost (Schwarz); without a name, or with a channel for one, costs more."""
     count = sum(len(theta) for _, theta in found.chosen)
     nameless = sum(":" in name for name in found.names)
-    return found.objective + count * float(np.log(6 * found.rows)) + NAMELESS * nameless
+    return found.objective + count * float(np.log(found.numbers)) + NAMELESS * nameless
 
 
 class _Ranked(NamedTuple):
@@ -129,6 +139,7 @@ class _Search:
     named: tuple[Physics, ...]
     others: tuple[Physics, ...]
     before: float  # squares of white residuals with nothing but a constant bias
+    tell: Callable[[str], None]
     starts: dict[str, list[Theta]] = field(default_factory=dict)
     luck: dict[str, float] = field(default_factory=dict)  # log of how much likelier chance looks like it: picked from many
     known: dict[str, _Ranked] = field(default_factory=dict)  # beside the effects of one fit
@@ -176,7 +187,7 @@ class _Search:
                 best = score, trial
         if best is None or best[0] > np.log(FALSE_DISCOVERY / self.tried):
             return None
-        misfit = self.before - 6.0 * now.rows
+        misfit = self.before - now.numbers
         if any(":" in name for name in best[1].names) and now.objective - best[1].objective < NAMELESS_SHARE * misfit:
             return None  # the rim of something that has no name: a name for it would be wrong
         return best[1]
@@ -230,6 +241,7 @@ class _Search:
     def judged(self, now: Fit) -> Discovery:
         """What may stay: tested on all rows, and on blocks that were not fitted."""
         while now.chosen:
+            self.tell(f"on unseen time: {', '.join(now.names)}")
             other = fit(self.logs, now.chosen, part="held_out")
             whole = fit(self.logs, now.chosen, part="all")
             held = tuple(_plausible(physics, theta) for physics, theta in whole.chosen)
@@ -370,7 +382,7 @@ def _white(log: Weighed, chosen: Chosen, part: str) -> Float64[np.ndarray, "n 6"
     rows = log.rows(part)
     residual = log.whiten(log.pair.real - expected(log.pair, chosen))[rows]
     one = fits.constants(log)[rows]
-    return np.asarray(residual - one * ((one * residual).sum(0) / (one * one).sum(0)))
+    return np.asarray(residual - one * ((one * residual).sum(0) / np.maximum((one * one).sum(0), 1e-300)))
 
 
 class _Panel:

@@ -37,6 +37,11 @@ class Weighed:
     pair: Pair
     whiten: Whitener
 
+    def numbers(self, part: str) -> int:
+        """White values of a part that tell anything."""
+        rows, counts = self.rows(part), self.whiten.counts
+        return int(6 * rows.sum() if counts is None else counts[rows].sum())
+
     def rows(self, part: str) -> Bool[np.ndarray, " n"]:
         """`fitted`, `held_out` or `all`, behind the filter's start."""
         pair, order, every = self.pair, self.whiten.order, self.whiten.every
@@ -50,7 +55,8 @@ class Fit:
     """Effects with their parameters, each log's bias, and how well they fit.
 
     `objective` is the sum of squares of white residuals and of the prior; `covariance` is of the parameters of all effects in
-    order (logarithms for positive ones), biases taken out; `information` is the data's alone, without the prior.
+    order (logarithms for positive ones), biases taken out; `information` is the data's alone, without the prior; `numbers` are
+    the white values that were weighed, in so many rows.
     """
 
     chosen: Chosen
@@ -59,6 +65,7 @@ class Fit:
     covariance: Float64[np.ndarray, "p p"]
     information: Float64[np.ndarray, "p p"]
     rows: int
+    numbers: int
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -173,7 +180,8 @@ def fit(
         if before - now.objective < 1e-2:
             break
     covariance = np.linalg.inv(N_data + np.diag(1.0 / std**2)) if len(mean) else np.zeros((0, 0))
-    return Fit(now.chosen, now.bias, now.objective, covariance, N_data, int(sum(mask.sum() for mask in masks)))
+    rows, numbers = int(sum(mask.sum() for mask in masks)), sum(log.numbers(part) for log in logs)
+    return Fit(now.chosen, now.bias, now.objective, covariance, N_data, rows, numbers)
 
 
 class _State(NamedTuple):

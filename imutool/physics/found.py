@@ -24,7 +24,7 @@ ON_AXIS = re.compile(r"(gyro|accel)\.([xyz]) \+= (?:c (?P<term>.+)|curve\(.+\))"
 
 
 def found(d: Diagnosis) -> PhysicsFile:
-    """What was found, and the constant bias of the first log beside it.
+    """What was found, and the constant bias of the first log beside it, if it is known.
 
     A curve without a name is told about its mean; the mean belongs to the bias, and is added to it.
     """
@@ -52,7 +52,7 @@ def found(d: Diagnosis) -> PhysicsFile:
             terms.append(_term(one))
     return PhysicsFile(
         effect=tuple(entries),
-        bias=Bias(gyro=_three(bias[:3]), accel=_three(bias[3:])),
+        bias=Bias(gyro=_three(bias[:3]), accel=_three(bias[3:])) if np.isfinite(bias).all() else None,
         unknown=tuple(curves),
         term=tuple(terms),
     )

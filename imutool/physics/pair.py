@@ -37,6 +37,8 @@ GAP_PERIODS = 3.0
 KNOWN_SHARE = 0.5  # of the samples that have a true pose, from which on the poses are worth drawing
 MOST_OF_IT = 0.9  # of the simulation that its poses must cover to stand for it
 POSES_HZ = 40.0  # slower poses cannot be differentiated twice
+MEANS, LEAST_MEANS = (20, 200), 8  # samples of a mean, and how many means there are at least
+TOLERATED_MEAN = 1.8  # by which they may scatter more than noise is measured, which finds five sixths of it
 COARSE, TOLERATED = 5, 1.3
 LEAST_NOISE = np.array([1e-4] * 3 + [1e-3] * 3)
 
@@ -47,7 +49,8 @@ class Pair:
 
     `fitted` and `held_out` are rows; rows in neither are borders, gaps and ends. `band_hz` is where what is expected ends to be
     known (none: nowhere), `truth` the true poses at its stamps, `aligned_s` what was added to the stamps where the
-    two clocks share no epoch.
+    two clocks share no epoch. `known` says which samples tell what an axis felt (none: all): those of a converter at its end
+    and of an axis that is stuck do not.
     """
 
     name: str
@@ -63,6 +66,18 @@ class Pair:
     band_hz: float | None = None
     sim_noise: Float64[np.ndarray, "6"] = field(default_factory=lambda: np.zeros(6))
     channels: Mapping[str, Float64[np.ndarray, " n"]] = field(default_factory=lambda: NOTHING)
+    known: Bool[np.ndarray, "n 6"] | None = None
+
+    @property
+    def usable(self) -> Bool[np.ndarray, "n 6"]:
+        """Samples that count, fitted or held out."""
+        rows = (self.fitted | self.held_out)[:, None]
+        return np.asarray(np.broadcast_to(rows, self.real.shape) if self.known is None else rows & self.known)
+
+    @property
+    def axes(self) -> Bool[np.ndarray, "6"]:
+        """Of which anything is known at all."""
+        return np.ones(6, bool) if self.known is None else np.asarray(self.known.any(axis=0))
 
     @property
     def period_s(self) -> float:
@@ -248,6 +263,8 @@ def matrices(poses: Poses) -> Float64[np.ndarray, "n 3 3"]:
 def wiener(x: Float64[np.ndarray, " n"]) -> Float64[np.ndarray, " n"]:
     """A signal without the white noise that the top of its spectrum shows: each frequency by 1 - noise / power."""
     n = len(x)
+    if nothing_but_noise(x):  # its ends would be taken for a ramp
+        return np.full(n, x.mean())
     line = np.linspace(x[0], x[-1], n)  # its ends meet, so that the spectrum of a ramp is not in the noise's band
     mirrored = np.concatenate([x - line, -(x - line)[-2:0:-1]])
     spectrum = np.fft.rfft(mirrored)
@@ -265,10 +282,25 @@ def _shift(real: Imu, sim: Imu) -> float | None:
     """
     overlap = (min(real.t_ns[-1], sim.t_ns[-1]) - max(real.t_ns[0], sim.t_ns[0])) * 1e-9
     shared = overlap > min(LEAST_S, 0.5 * min(real.duration_s, sim.duration_s))
+    if _rests(real) and _rests(sim):
+        return 0.0 if shared else None
     lag_s, alike = _lag(real, sim)
     if shared and abs(lag_s) < FARTHEST_S:
         return 0.0
     return lag_s if alike >= ALIKE else None
+
+
+def _rests(imu: Imu) -> bool:
+    """Whether it turns by no more than its noise: then nothing can be aligned, and nothing has to be."""
+    return all(nothing_but_noise(column, least) for column, least in zip(imu.gyro.T, LEAST_NOISE, strict=False))
+
+
+def nothing_but_noise(x: Float64[np.ndarray, " n"], least: float = 0.0) -> bool:
+    """Whether means of a signal, over a few samples and over much of it, scatter no more than those of white noise."""
+    noise = max(float(white_noise(x[:, None])[0]), least)
+    sizes = [size for size in (*MEANS, len(x) // LEAST_MEANS) if 0 < size <= len(x) // LEAST_MEANS]
+    means = (x[: len(x) // size * size].reshape(-1, size).mean(axis=1) for size in sizes)
+    return all(float(mean.std()) <= TOLERATED_MEAN * noise / np.sqrt(size) for mean, size in zip(means, sizes, strict=True))
 
 
 def _lag(real: Imu, sim: Imu) -> tuple[float, float]:

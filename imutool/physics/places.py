@@ -1,8 +1,9 @@
-"""Where the misfit of a diagnosis lies: in the stretches of its first log, by what was found or by what is left."""
+"""Where the misfit of a diagnosis lies: in the stretches of each log, by what was found or by what is left."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Float64
@@ -38,11 +39,23 @@ def of_what_is_left(pairs: Sequence[Pair], after: Sequence[Samples], floor: Floa
 def _places(
     pairs: Sequence[Pair], misfits: Sequence[Samples], floor: Float64[np.ndarray, "6"], p_values: Mapping[str, float]
 ) -> list[Located]:
+    """Strongest first, log by log: `log` is the pair's name where there are several."""
+    logs = list(dict.fromkeys(pair.name for pair in pairs))
+    out = []
+    for log in logs:
+        stretches = [(pair, misfit) for pair, misfit in zip(pairs, misfits, strict=True) if pair.name == log]
+        places = _of_one(stretches, floor, p_values)
+        out += [replace(one, log=log) if len(logs) > 1 else one for one in places]
+    return sorted(out, key=lambda one: one.p_value)
+
+
+def _of_one(
+    stretches: Sequence[tuple[Pair, Samples]], floor: Float64[np.ndarray, "6"], p_values: Mapping[str, float]
+) -> list[Located]:
     """Stretches of one log share its clock; the constant of each is its own."""
-    first = [(pair, misfit) for pair, misfit in zip(pairs, misfits, strict=True) if pair.name == pairs[0].name]
-    t_s = np.concatenate([pair.stamp_s for pair, _ in first])
-    misfit = np.concatenate([misfit - np.median(misfit, axis=0) for _, misfit in first])
-    each = [_variables(pair) for pair, _ in first]
+    t_s = np.concatenate([pair.stamp_s for pair, _ in stretches])
+    misfit = np.concatenate([misfit - np.median(misfit, axis=0) for _, misfit in stretches])
+    each = [_variables(pair) for pair, _ in stretches]
     variables = {name: (unit, np.concatenate([one[name][1] for one in each])) for name, (unit, _) in each[0].items()}
     return located(t_s, misfit, floor, variables, p_values)
 

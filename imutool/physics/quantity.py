@@ -124,6 +124,15 @@ def symbol(unit: str) -> str:
     return "" if unit in {"-", "1", ""} else unit.replace("^2", "²").replace("^3", "³")
 
 
+def percent(share: float) -> str:
+    """`63 %`; never a 0 or 100 that it is not."""
+    if math.isnan(share):
+        return "an unknown share"
+    if 0.0 < share < 0.005:
+        return "less than 1 %" if share >= 1e-3 else "less than 0.1 %"
+    return "more than 99 %" if 0.995 < share < 1.0 else f"{100.0 * share:.0f} %"
+
+
 def _clearness(one: Estimate) -> float:
     """How many standard deviations it is from zero."""
     return abs(one.value) / one.std if one.std > 0.0 else math.inf

@@ -30,6 +30,8 @@ def wrong_for_moments(logs: Sequence[Weighed]) -> tuple[list[Finding], list[Loca
         return [], []
     (log,) = logs
     rows = log.rows("all")
+    if not rows.any():
+        return [], []
     t_s = log.pair.stamp_s[:: log.whiten.every][rows]
     white = log.whiten(log.pair.real - expected(log.pair, ()))[rows]
     one = fits.constants(log)[rows]

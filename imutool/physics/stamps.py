@@ -209,14 +209,19 @@ class _Starts:
         return [np.array([share * self.most]) for share in SHARES]
 
 
-def clipped(real: Float64[np.ndarray, "n 6"]) -> Bool[np.ndarray, " n"]:
-    """Rows in which a converter is at its end, and those beside them: what they would have read nobody knows."""
-    rows = np.zeros(len(real), bool)
+def clipped(real: Float64[np.ndarray, "n 6"]) -> Bool[np.ndarray, "n 6"]:
+    """Samples of an axis whose converter is at its end, and those beside them: what they would have been nobody knows."""
+    at, most = np.zeros(real.shape, bool), limits(real)
     for k, signal in enumerate(("gyro", "accel")):
-        most = limits(real).get(signal)
-        if most is not None:
-            rows |= (np.abs(real[:, 3 * k : 3 * k + 3]) >= NEARLY * most).any(axis=1)
-    return np.asarray(binary_dilation(rows, iterations=2)) if rows.any() else rows
+        if signal in most:
+            part = slice(3 * k, 3 * k + 3)
+            at[:, part] = np.abs(real[:, part]) >= NEARLY * most[signal]
+    return np.asarray(binary_dilation(at, np.ones((5, 1)))) if at.any() else at
+
+
+def stuck(real: Float64[np.ndarray, "n 6"]) -> Bool[np.ndarray, "6"]:
+    """Axes that read the same in every sample."""
+    return np.asarray(np.ptp(real, axis=0) == 0.0)
 
 
 def saturated(pairs: Sequence[Pair], expected: Sequence[Float64[np.ndarray, "n 6"]], tried: int) -> list[Finding]:

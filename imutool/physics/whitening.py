@@ -7,17 +7,18 @@ correlated costs what it should.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Bool, Float64
-from scipy.ndimage import median_filter
+from scipy.ndimage import median_filter, minimum_filter1d
 from scipy.signal import firwin, lfilter, periodogram, upfirdn
 
 MAD_TO_STD = 1.4826
 LEAST_STD = 1e-12
 MOTION_HZ, REFERENCE_HZ = 15.0, 60.0  # where a body's motion has its power, and where noise is measured in its place
 BAND_S, OVER = 0.33, 4.0  # length of the filter of a band, and how many samples a period of its edge gets
+LEAST_SEGMENT, LEAST_SEGMENTS = 64, 8  # of a short log: the median of one or two says too little
 SEGMENT, LINES = 512, 9  # samples of a spectrum; frequencies of the median that takes lines out of it
 
 
@@ -49,11 +50,15 @@ class Band:
 
 @dataclass(frozen=True, eq=False)
 class Whitener:
-    """For each of the six axes a filter and the size of what comes out of it, so that it has unit variance."""
+    """For each of the six axes a filter and the size of what comes out of it, so that it has unit variance.
+
+    `counts` are the values that come out and tell anything (none: all); the others come out as zero, whatever goes in.
+    """
 
     filters: Float64[np.ndarray, "6 order"]
     std: Float64[np.ndarray, "6"]
     band: Band | None = None
+    counts: Bool[np.ndarray, "m 6"] | None = None
 
     def __call__(self, x: Float64[np.ndarray, "n 6 *k"]) -> Float64[np.ndarray, "m 6 *k"]:
         """White rows from coloured ones (fewer, where only a band is looked at); columns of zeros stay zeros."""
@@ -62,7 +67,15 @@ class Whitener:
         for axis in range(6):
             if x[:, axis].any():
                 out[:, axis] = lfilter(self.filters[axis] / self.std[axis], [1.0], x[:, axis], axis=0)
+        if self.counts is not None:
+            out[~self.counts] = 0.0
         return out
+
+    def counting(self, known: Bool[np.ndarray, "n 6"]) -> Whitener:
+        """Where only some samples tell anything: neither do values that others have gone into."""
+        if self.band is not None:
+            known = np.asarray(minimum_filter1d(known, len(self.band.taps), axis=0, mode="nearest"))[:: self.every]
+        return replace(self, counts=np.stack([settled(column, self.order) for column in known.T], axis=1))
 
     @property
     def every(self) -> int:
@@ -76,25 +89,28 @@ class Whitener:
 
 
 def whitener(
-    residual: Float64[np.ndarray, "n 6"], usable: Bool[np.ndarray, " n"], order: int, band: Band | None = None
+    residual: Float64[np.ndarray, "n 6"], usable: Bool[np.ndarray, "n ..."], order: int, band: Band | None = None
 ) -> Whitener:
-    """From a residual and the rows of it that count.
+    """From a residual and the rows of it that count, or the samples; an axis without any is left as it is.
 
     The size is robust (a few spikes are not the noise), but no less than half of what the plain one is.
     """
     filters, std = np.zeros((6, order + 1)), np.ones(6)
     if band is not None:
         residual, usable = band(residual), usable[:: band.every]
-    rows = settled(usable, order)
-    for axis in range(6):
-        filters[axis] = burg(residual[:, axis], usable, order)
+    filters[:, 0] = 1.0
+    for axis, counts in enumerate(_by_axis(usable)):
+        rows = settled(counts, order)
+        if not rows.any():
+            continue
+        filters[axis] = burg(residual[:, axis], counts, order)
         white = lfilter(filters[axis], [1.0], residual[:, axis])[rows]
         robust = MAD_TO_STD * float(np.median(np.abs(white)))
         std[axis] = max(robust, 0.5 * float(np.sqrt(np.mean(white**2))), LEAST_STD)
     return Whitener(filters, std, band)
 
 
-def level(residual: Float64[np.ndarray, "n 6"], usable: Bool[np.ndarray, " n"], rate_hz: float, order: int) -> Whitener:
+def level(residual: Float64[np.ndarray, "n 6"], usable: Bool[np.ndarray, "n ..."], rate_hz: float, order: int) -> Whitener:
     """As `whitener`, for a sensor beside an exact simulation: below `MOTION_HZ` its noise is taken to be what it is above.
 
     What is left down there may be physics that nobody thought of, and must not be taken for noise.
@@ -102,8 +118,11 @@ def level(residual: Float64[np.ndarray, "n 6"], usable: Bool[np.ndarray, " n"], 
     from scipy.linalg import solve_toeplitz
 
     filters, std = np.zeros((6, order + 1)), np.ones(6)
-    for axis in range(6):
-        f_hz, power = spectrum(residual[:, axis], usable, rate_hz)
+    filters[:, 0] = 1.0
+    for axis, counts in enumerate(_by_axis(usable)):
+        if not counts.any():
+            continue
+        f_hz, power = spectrum(residual[:, axis], counts, rate_hz)
         power = median_filter(power, LINES, mode="nearest")  # a line is no noise
         low, high = min(MOTION_HZ, 0.3 * rate_hz), min(REFERENCE_HZ, 0.45 * rate_hz)
         power[f_hz < low] = np.median(power[(f_hz >= low) & (f_hz <= high)])
@@ -114,11 +133,15 @@ def level(residual: Float64[np.ndarray, "n 6"], usable: Bool[np.ndarray, " n"], 
     return Whitener(filters, std)
 
 
+def _by_axis(usable: Bool[np.ndarray, "n ..."]) -> Bool[np.ndarray, "6 n"]:
+    return np.asarray(np.broadcast_to(usable.reshape(len(usable), -1).T, (6, len(usable))))
+
+
 def spectrum(
     x: Float64[np.ndarray, " n"], usable: Bool[np.ndarray, " n"], rate_hz: float
 ) -> tuple[Float64[np.ndarray, " f"], Float64[np.ndarray, " f"]]:
     """Frequencies and power density, the median (Welch) over segments that count wholly, or mostly where none does."""
-    size = min(SEGMENT, len(x))
+    size = min(SEGMENT, max(len(x) // LEAST_SEGMENTS, LEAST_SEGMENT), len(x))
     starts = range(0, len(x) - size + 1, max(1, size // 2))
     whole = np.array([float(usable[s : s + size].mean()) for s in starts])
     taken = [s for s, share in zip(starts, whole, strict=True) if share >= min(1.0, float(whole.max()))]

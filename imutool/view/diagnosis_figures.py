@@ -6,7 +6,6 @@ Colours are left to the page: each stands for a variable of its style sheet, so 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -15,7 +14,7 @@ from scipy.signal import welch
 from scipy.spatial.transform import Rotation
 
 from imutool.physics.conclusion import signals
-from imutool.physics.diagnosis import Curve, Diagnosis, SignalTraces, Traces
+from imutool.physics.diagnosis import Curve, Diagnosis, Located, SignalTraces, Traces
 from imutool.view.drawing import Line, Thin, averaged, extremes, plain_numbers, spans, svg
 from imutool.view.theme import AFTER, AXES, BEFORE, HELD, INK, MARK, TITLES, UNITS
 
@@ -47,7 +46,7 @@ def where(d: Diagnosis, trace: Traces) -> str:
                 axes.fill_between(edges[:-1], -row, -row + area, step="post", color=INK, alpha=0.55, lw=0)
             for place in d.located:
                 if axis in place.axes and signal in signals(place.signal):
-                    for first, last in located_in(d.traces, trace, place.intervals_s):
+                    for first, last in located_in(trace, place):
                         axes.fill_between([first, last], -row, -row + 0.94, color=MARK, alpha=0.3, lw=0)
         for first, last in spans(trace.t_s, trace.held_out):
             axes.fill_between([first, last], -6.0, -5.3, color=HELD, alpha=0.5, lw=0)
@@ -164,19 +163,11 @@ def curve(found: Curve, signal: str) -> str:
     return svg(draw, 2.6, "curve")
 
 
-def own_clocks(traces: Sequence[Traces]) -> bool:
-    """Whether each log counts from a start of its own: then their times overlap, and what is located is in the first."""
-    ends = sorted((float(trace.t_s[0]), float(trace.t_s[-1])) for trace in traces)
-    return any(later[0] < earlier[1] for earlier, later in pairwise(ends))
-
-
-def located_in(
-    traces: Sequence[Traces], trace: Traces, intervals: Sequence[tuple[float, float]]
-) -> Iterator[tuple[float, float]]:
-    """What of located stretches lies in a log: they are on the first log's clock, which all share unless `own_clocks`."""
-    if own_clocks(traces) and trace is not traces[0]:
+def located_in(trace: Traces, place: Located) -> Iterator[tuple[float, float]]:
+    """What of a place lies in a stretch of a log; a place of no log in particular is on the clock of all."""
+    if place.log not in ("", trace.path):
         return
-    for first, last in intervals:
+    for first, last in place.intervals_s:
         low, high = max(first, float(trace.t_s[0])), min(last, float(trace.t_s[-1]))
         if low < high:
             yield low, high

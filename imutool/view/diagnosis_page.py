@@ -9,21 +9,21 @@ from pathlib import Path
 from imutool import __version__
 from imutool.mcap_io.target import Target
 from imutool.physics.conclusion import (
-    WITH_ALL,
     before_after,
+    by_chance,
     came_closer,
+    cannot_show,
     conclusion,
     does,
     measured,
     name,
-    p_value,
-    percent,
     remains,
     unseen,
     where,
+    with_all,
 )
 from imutool.physics.diagnosis import SCHEMA, UNITS, Diagnosis, Finding, Traces
-from imutool.physics.quantity import SHOWN, each, grouped, symbol
+from imutool.physics.quantity import SHOWN, each, grouped, percent, symbol
 from imutool.view import diagnosis_figures as figures
 from imutool.view import diagnosis_paths
 from imutool.view.drawing import apart
@@ -77,7 +77,7 @@ def html(d: Diagnosis, *, logs: str | None = None) -> str:
 def _findings(d: Diagnosis) -> Iterator[str]:
     if not d.findings:
         return
-    head = "".join(f"<th>{one}</th>" for one in ("What", "Equation", "Value", "Removes", "How sure"))
+    head = "".join(f"<th>{one}</th>" for one in ("What", "Equation", "Value", "Removes", "By chance"))
     yield "<h2>What was left out</h2>"
     yield f'<div class="scroll"><table class="findings"><thead><tr>{head}</tr></thead><tbody>'
     for one in d.findings:
@@ -86,7 +86,7 @@ def _findings(d: Diagnosis) -> Iterator[str]:
             f"<code>{text(one.equation)}</code>",
             _values(one),
             _gain(one),
-            f"{text(p_value(one.p_value))}<br>false discovery <span class=entry>{percent(one.false_discovery_rate)}</span>",
+            f"<span class=entry>{text(by_chance(one.false_discovery_rate, short=True))}</span>",
         ]
         yield f"<tr>{''.join(f'<td>{cell}</td>' for cell in cells)}</tr>"
     yield "</tbody></table></div>"
@@ -124,12 +124,8 @@ def _places(d: Diagnosis) -> Iterator[str]:
     if not d.located:
         return
     yield "<h2>Where it lies</h2>"
-    rows = "".join(
-        f"<tr><td>{text(where(one))}</td><td class=number>{percent(one.share)}</td>"
-        f"<td class=number>{text(p_value(one.p_value))}</td></tr>"
-        for one in d.located
-    )
-    head = "<tr><th>Signal, regime, time</th><th>Share of the misfit</th><th>Chance</th></tr>"
+    rows = "".join(f"<tr><td>{text(where(one))}</td><td class=number>{percent(one.share)}</td></tr>" for one in d.located)
+    head = "<tr><th>Signal, regime, time</th><th>Share of the misfit</th></tr>"
     yield f'<div class="scroll"><table><thead>{head}</thead><tbody>{rows}</tbody></table></div>'
     for k, trace in enumerate(d.traces[:MOST_LOGS]):
         caption = (
@@ -197,7 +193,7 @@ def _left(d: Diagnosis) -> Iterator[str]:
             rows.append(f"<tr><td>{text(signal)}</td>{cells}<td>{text(remains(one, unit))}</td></tr>")
         yield f"<table><thead><tr>{head}</tr></thead><tbody>{''.join(rows)}</tbody></table>"
     if d.closer and d.findings:
-        yield f"<h2>How much closer it comes</h2><p class=note>{text(WITH_ALL + unseen(d))}.</p><dl>"
+        yield f"<h2>How much closer it comes</h2><p class=note>{text(with_all(d) + unseen(d))}.</p><dl>"
         for signal, again in d.closer.items():
             yield f"<dt>{text(signal)}</dt><dd>{text(came_closer(again))}</dd>"
         yield "</dl>"
@@ -214,7 +210,7 @@ def _provenance(d: Diagnosis) -> Iterator[str]:
         gyro, accel = (", ".join(f"{b:+.4g}" for b in part) for part in (bias[:3], bias[3:]))
         yield f"<dt>constant bias</dt><dd>gyro ({gyro}) rad/s, accel ({accel}) m/s²</dd>"
     if d.not_identifiable:
-        yield f"<dt>the motion cannot show</dt><dd>{text(', '.join(d.not_identifiable))}</dd>"
+        yield f"<dt>these logs cannot show</dt><dd>{text(', '.join(cannot_show(d)))}</dd>"
     yield f"<dt>made by</dt><dd>imutool {text(__version__)}, {SCHEMA}</dd></dl>"
 
 

@@ -158,7 +158,7 @@ def _log_places(to: rr.RecordingStream, d: Diagnosis, name: str, trace: Traces) 
     for first, last in inside["unseen",]:
         events += [(first, "INFO", "unseen by any fit from here"), (last, "INFO", "seen again from here")]
     for place in d.located:
-        for stretch in located_in(d.traces, trace, place.intervals_s):
+        for stretch in located_in(trace, place):
             events += [(stretch[0], "WARN", f"begins: {_place(place)}"), (stretch[1], "INFO", f"ends: {_place(place)}")]
             for axis in place.axes or ("",):
                 inside.setdefault((place.signal, axis) if axis else (place.signal,), []).append(stretch)

@@ -27,6 +27,7 @@ class _Located(msgspec.Struct):
     intervals_s: list[tuple[Time, Time]] = []
     regime: str = ""
     share: float | None = None
+    log: str = ""
 
 
 class _Finding(msgspec.Struct):
@@ -45,7 +46,7 @@ class _Diagnosis(msgspec.Struct):
 def of_findings(folder: Path, log: str, start_ns: int, end_ns: int) -> tuple[list[Event], list[str]]:
     """Where in a log (by its file's name) what a diagnosis located acts, and sentences for what cannot be marked.
 
-    Times of a diagnosis count from the start of its first log; only that one can be marked. What is located without a time acts
+    Times of a place count from the start of its log, or of the first where it names none. What is located without a time acts
     everywhere. Of a place with more stretches than are ever shown, the longest.
 
     Raises:
@@ -53,11 +54,12 @@ def of_findings(folder: Path, log: str, start_ns: int, end_ns: int) -> tuple[lis
         DataError: its findings.json is not one.
     """
     found = _read(folder / FINDINGS)
-    if not found.real or Path(found.real[0]).name != log:
-        first = found.real[0] if found.real else "no log"
+    first = found.real[0] if found.real else "no log"
+    here = [place for place in found.located if Path(place.log or first).name == log]
+    if Path(first).name != log and not here:
         return [], [f"The findings of {folder.name} are on the clock of {Path(first).name} and are not marked in {log}."]
     events, notes = [], []
-    for place in found.located:
+    for place in here:
         text = _words(place, found.findings)
         longest = sorted(place.intervals_s, key=lambda one: one[0] - one[1])
         if len(longest) > MOST_PER_KIND:
