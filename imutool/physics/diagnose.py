@@ -21,19 +21,20 @@ from imutool.physics.diagnosis import UNITS, Curve, Diagnosis, Estimate, Finding
 from imutool.physics.discover import Discovery, Judged, discover
 from imutool.physics.effects import _catalogue
 from imutool.physics.effects._forward import Physics
-from imutool.physics.fit import Chosen, Fit, Weighed, derivatives, expected, fit
+from imutool.physics.fit import Chosen, Fit, Weighed, expected, fit
+from imutool.physics.late_stamps import late_stamps
 from imutool.physics.motion import smooth_motion
 from imutool.physics.pair import LEAST_S, Pair, of_one_motion, with_simulation, with_truth
 from imutool.physics.places import of_findings, of_what_is_left
 from imutool.physics.reference import wrong_for_moments
 from imutool.physics.unnamed import unit
-from imutool.physics.whitening import Band, level, whitener
+from imutool.physics.weighing import noise_std, weighed
+from imutool.physics.whitening import Band
 from imutool.place import Place
 from imutool.recording import Recording
+from imutool.stationary import white_noise
 
 KNOWN_BAND = 0.45  # of where smoothing halves a motion: there it takes a per cent
-ORDER_SIM, ORDER_TRUTH = 6, 12  # of the autoregression: a sensor's noise is nearly white, that of differentiated poses is not
-RIDGE = 1e-8
 JITTER = "timestamp_jitter"
 INEXACT = 1e-5  # of a misfit's power: 0.3 % of its size, as which the inexactness of a much larger effect's model may pass
 SHOWN_BY_SAMPLES = {"saturation", "quantization"}  # without any fit: `stamps`
@@ -82,7 +83,8 @@ def diagnose(
     pairs = [_unclipped(pair) for recording in recordings for pair in _pairs(recording, simulated, truth)]
     say(1, 4, "noise")
     candidates = _candidates(pairs)
-    logs = [_weighed(pair, candidates) for pair in pairs]
+    logs = [weighed(pair, (*candidates, *unnamed.driven([pair]))) for pair in pairs]
+    pairs = [log.pair for log in logs]
     say(2, 4, "searching")
     moments = wrong_for_moments(logs)
     found = discover(logs, () if moments[0] else candidates, () if moments[0] else later(pairs))
@@ -116,7 +118,7 @@ def measured(
     pairs = [_unclipped(pair) for pair in _pairs(read_log(real, imu=imu, truth=truth), simulated, truth)]
     candidates = _candidates(pairs)
     begun = tuple((one, one.nothing.astype(float)) for one in _catalogue.physics(effects))
-    return fit([_weighed(pair, candidates) for pair in pairs], begun, part="all")
+    return fit([weighed(pair, candidates) for pair in pairs], begun, part="all")
 
 
 def _moves_apart(reals: Sequence[Recording], sim: Recording, signals: Sequence[str]) -> bool:
@@ -210,32 +212,14 @@ def _candidates(pairs: Sequence[Pair]) -> tuple[Physics, ...]:
 
     found = [one for one in _catalogue.physics() if thinkable(one) and one.name not in SHOWN_BY_SAMPLES]
     biases = [np.median(pair.real - expected(pair, ()), axis=0) for pair in pairs]
-    return (*found, *stamps.jitter(pairs), *stamps.soft_limits(pairs, biases))
+    exact = all(pair.against == "simulation" for pair in pairs)  # poses know nothing of a millisecond: `late_stamps`
+    return (*found, *(stamps.jitter(pairs) if exact else ()), *stamps.soft_limits(pairs, biases))
 
 
 def later(pairs: Sequence[Pair]) -> list[tuple[Physics, ...]]:
     """What is asked once the catalogue has nothing more to say: other channels, then curves and equations without a name."""
     like = unnamed.like(pairs)
-    exact = all(pair.against == "simulation" for pair in pairs)  # a term is told from a curve by less than poses can tell
-    return [tuple(unnamed.driven(pairs)), (*unnamed.curves(like), *(unnamed.terms(like) if exact else ()))]
-
-
-def _weighed(pair: Pair, candidates: Sequence[Physics]) -> Weighed:
-    """The pair with its noise: what is left when everything linear in the catalogue has had its way."""
-    linear: Chosen = tuple((one, one.nothing.astype(float)) for one in candidates if one.linear)
-    base = expected(pair, linear)
-    J = derivatives(pair, linear, range(len(linear)), base)
-    left, usable = pair.real - base, pair.fitted | pair.held_out
-    for axis in range(6):
-        A = np.concatenate([J[:, axis], np.ones((len(J), 1))], axis=1)
-        size = np.linalg.norm(A[usable], axis=0)
-        A = A[:, size > 0] / size[size > 0]
-        N = A[usable].T @ A[usable] + RIDGE * np.eye(A.shape[1])
-        left[:, axis] -= A @ np.linalg.solve(N, A[usable].T @ left[usable, axis])
-    if pair.against == "simulation":
-        return Weighed(pair, level(left, usable, 1.0 / pair.period_s, ORDER_SIM))
-    assert pair.band_hz is not None
-    return Weighed(pair, whitener(left, usable, ORDER_TRUTH, Band.below(pair.band_hz, 1.0 / pair.period_s)))
+    return [tuple(unnamed.driven(pairs)), (*unnamed.curves(like), *unnamed.terms(like))]
 
 
 # ── what is told ──
@@ -249,8 +233,13 @@ def _told(
     floor = _floor(logs)
     after = [_with(pair, found.fitted.chosen) for pair in pairs]  # held-out time stays unseen
     told = [_finding(logs, found, one, floor) for one in found.judged]
+    exact = all(pair.against == "simulation" for pair in pairs)
     all_found = [one for one in told if one.share > INEXACT]
-    all_found += stamps.saturated(pairs, after, found.tried) + stamps.dropped(pairs) + stamps.rounded(pairs, floor)
+    # digits are a sample's, and a row beside poses is the mean of many
+    noise = floor if exact else np.asarray(np.median([white_noise(pair.real) for pair in pairs], axis=0))
+    all_found += stamps.saturated(pairs, after, found.tried) + stamps.dropped(pairs) + stamps.rounded(pairs, noise)
+    if not exact:
+        all_found += late_stamps(pairs)
     findings = [one for one in all_found if not shared(one, known)]
     expected_too = {judged.physics.name for judged, one in zip(found.judged, told, strict=True) if shared(one, known)}
     before = [_with(pair, tuple(one for one in found.fitted.chosen if one[0].name in expected_too)) for pair in pairs]
@@ -297,11 +286,7 @@ def _with(pair: Pair, chosen: Chosen) -> Float64[np.ndarray, "n 6"]:
 
 def _floor(logs: Sequence[Weighed]) -> Float64[np.ndarray, "6"]:
     """The noise of a sample by axis, before it was made white."""
-    variances = []
-    for log in logs:
-        response = np.array([np.abs(np.fft.rfft(a, 512)) ** 2 for a in log.whiten.filters])
-        variances.append(log.whiten.std**2 * (1.0 / response).mean(axis=1))
-    return np.asarray(np.sqrt(np.mean(variances, axis=0)))
+    return np.asarray(np.sqrt(np.mean([noise_std(log.whiten) ** 2 for log in logs], axis=0)))
 
 
 def _unseen(pair: Pair, there: Float64[np.ndarray, "n 6"]) -> Float64[np.ndarray, "m 6"]:
