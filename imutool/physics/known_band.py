@@ -1,13 +1,14 @@
 """Up to which frequency the poses know the motion: where their own errors stand out, what is expected is wrong, not the sensor.
 
-Poses come smoothed by whoever made them, and with errors that a second derivative makes large. An error of what is *expected* does
-two things together: the recording shares less of it (coherence), and follows it with a gain that is too small by as much (regression
-dilution; Fuller, Measurement Error Models, 1987, eq. 1.1.7: gain = true gain x reliability). Noise of the sensor lowers the coherence
-alone, a sensor too slow the gain alone. Motion that smoothing took from the poses is in the recording and nowhere else:
-the gain is too large.
+Poses come smoothed by whoever made them, and with errors that a second derivative makes large. An error of what is expected
+does two things together: the recording shares less of it (coherence), and follows it with a gain that is too small by as much
+(regression dilution; Fuller, Measurement Error Models, 1987, eq. 1.1.7: gain = true gain x reliability), which passes for a
+scale. Noise of the sensor lowers the coherence alone, a sensor too slow the gain alone.
 """
 
 from __future__ import annotations
+
+from itertools import pairwise
 
 import numpy as np
 from jaxtyping import Float64
@@ -32,7 +33,7 @@ def known_below(pair: Pair, left: Float64[np.ndarray, "n 6"], most_hz: float) ->
     f_hz, power = welch(there, rate_hz, nperseg=size, axis=0)
     _, read = welch(pair.real, rate_hz, nperseg=size, axis=0)
     _, both = csd(there, pair.real, rate_hz, nperseg=size, axis=0)
-    for low, high in zip(EDGES_HZ[:-1], EDGES_HZ[1:], strict=True):
+    for low, high in pairwise(EDGES_HZ):
         if low >= most_hz:
             break
         band = (f_hz >= low) & (f_hz < high)

@@ -1,7 +1,7 @@
 """Stamps that jitter while samples do not, told from a recording alone.
 
-A sample taken late reads what the motion is by then: it is off the line through its neighbours by slope times delay. Samples that were
-taken evenly lie on that line, whatever their stamps say. No poses are asked, which know nothing of a millisecond.
+A sample taken late reads what the motion is by then: it is off the line through its neighbours by slope times delay. Samples
+that were taken evenly lie on that line, whatever their stamps say. Poses are not asked: they know nothing of a millisecond.
 """
 
 from __future__ import annotations
@@ -47,9 +47,7 @@ def late_stamps(pairs: Sequence[Pair]) -> list[Finding]:
     return [Finding("timestamp_jitter", "both", 0.0, chance, chance, told, "stamps jitter, samples do not", nothing)]
 
 
-def _followed(
-    column: Float64[np.ndarray, " n"], late_s: Float64[np.ndarray, " n"], period_s: float
-) -> tuple[float, float]:
+def _followed(column: Float64[np.ndarray, " n"], late_s: Float64[np.ndarray, " n"], period_s: float) -> tuple[float, float]:
     """How much of their stamps' lateness samples took part in, between 0 and 1, and one over the variance of that."""
     if len(column) < LEAST_ROWS:
         return 0.0, 0.0

@@ -1,10 +1,10 @@
 """How sure a fit is by its own residuals: what blocks of time say of each number, and how far they are of one mind.
 
-A fit's information holds where its white residuals are white. Beside poses they seldom are: the poses' errors come with the motion
-and last. The sum of J^T r over a block of some seconds scatters by what is really there, and a covariance made of those sums
-("sandwich": Liang and Zeger, Biometrika 1986) is right whatever the residuals are within a block. So few blocks flatter themselves,
-for the fit went through each; that is taken off (CR2: Bell and McCaffrey, Survey Methodology 2002). A gain in squares is
-divided by the mean of the ratio of the two covariances (the design effect: Rao and Scott, JASA 1981) and becomes an F.
+A fit's information holds where its white residuals are white. Beside poses they seldom are: the poses' errors come with the
+motion and last. The sum of J^T r over a block of some seconds scatters by what is really there, and a covariance made of those
+sums ("sandwich": Liang and Zeger, Biometrika 1986) is right whatever the residuals are within a block. So few blocks flatter
+themselves, for the fit went through each; that is taken off (CR2: Bell and McCaffrey, Survey Methodology 2002). A gain in
+squares is divided by the mean ratio of the two covariances (the design effect: Rao and Scott, JASA 1981) and becomes an F.
 """
 
 from __future__ import annotations
@@ -90,14 +90,14 @@ def _by_effect(found: Fit, by_blocks: Matrix, by_information: Matrix, shares: Se
     return Scatter(std, inflation, count)
 
 
-def _effective(shares: Float64[np.ndarray, "b *k"]) -> Float64[np.ndarray, "*k"]:
+def _effective(shares: Float64[np.ndarray, "b ..."]) -> Float64[np.ndarray, "..."]:
     """How many blocks of one size are worth as much as these, of which a few may hold most."""
     return np.asarray(shares.sum(axis=0) ** 2 / np.maximum((shares**2).sum(axis=0), 1e-300))
 
 
 def _moderated(
-    ratio: Float64[np.ndarray, "*k"], blocks: Float64[np.ndarray, "*k"], usual: float
-) -> tuple[Float64[np.ndarray, "*k"], Float64[np.ndarray, "*k"]]:
+    ratio: Float64[np.ndarray, "..."], blocks: Float64[np.ndarray, "..."], usual: float
+) -> tuple[Float64[np.ndarray, "..."], Float64[np.ndarray, "..."]]:
     """A ratio of variances that few blocks know, drawn to that of all rows, and what both together rest on (Smyth 2004)."""
     own = np.maximum(blocks - 1.0, 0.0)
     return np.asarray((own * ratio + BEFORE * usual) / (own + BEFORE)), np.asarray(own + BEFORE)

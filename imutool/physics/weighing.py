@@ -1,8 +1,8 @@
 """Recordings with the noise they are weighed by: what is left when everything in the catalogue has had its way.
 
 Beside poses nobody states the noise: that of the poses, differentiated, has every colour, and that of the sensor lies under it.
-It is taken from what a rich model leaves: every effect of the catalogue, the ones that are not linear by their derivatives where a
-fit of them would start. An effect left out here would be taken for noise, and never be seen again.
+It is taken from what a rich model leaves: every effect of the catalogue, those that are not linear by their derivatives where
+a fit of them would start. An effect left out here would be taken for noise, and never be seen again.
 """
 
 from __future__ import annotations
@@ -52,8 +52,8 @@ def weighed(pair: Pair, candidates: Sequence[Physics]) -> Weighed:
 def alike(found: Whitener) -> Whitener:
     """With no axis much noisier than the quiet ones of its sensor.
 
-    Poses err alike in all directions, and a sensor's axes are noisy alike; an axis in which much more is left holds physics that the
-    catalogue has no name for.
+    Poses err alike in all directions, and a sensor's axes are noisy alike; an axis in which much more is left holds what
+    the catalogue has no name for.
     """
     filters, std = found.filters.copy(), found.std.copy()
     total = noise_std(found)
@@ -82,7 +82,8 @@ def _left(pair: Pair, candidates: Sequence[Physics]) -> Float64[np.ndarray, "n 6
     linear: Chosen = tuple((one, one.nothing.astype(float)) for one in candidates if one.linear)
     base = expected(pair, linear)
     J = derivatives(pair, linear, range(len(linear)), base)
-    left, usable = pair.real - base, pair.fitted | pair.held_out
+    usable = pair.fitted | pair.held_out
+    left: Float64[np.ndarray, "n 6"] = pair.real - base
     for axis in range(6):
         A = np.concatenate([J[:, axis], np.ones((len(J), 1))], axis=1)
         size = np.linalg.norm(A[usable], axis=0)
@@ -112,7 +113,7 @@ def _rich(pair: Pair, candidates: Sequence[Physics]) -> Columns:
 def _explained(
     columns: Columns, misfit: Float64[np.ndarray, "m 6"], usable: Bool[np.ndarray, " m"], shown: Columns | None = None
 ) -> tuple[Float64[np.ndarray, "m 6"], Float64[np.ndarray, "6"]]:
-    """What the columns explain of each axis by least squares (as it is `shown`, if otherwise than fitted), and by how many numbers."""
+    """What columns explain of each axis by least squares (as it is `shown`, if otherwise), and by how many numbers."""
     out, spent = np.zeros_like(misfit), np.zeros(6)
     for axis in range(6):
         A = columns[usable, axis]
