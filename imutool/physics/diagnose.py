@@ -22,20 +22,18 @@ from imutool.physics.diagnosis import Closer, Diagnosis, Finding
 from imutool.physics.discover import Discovery, discover
 from imutool.physics.effects import _catalogue
 from imutool.physics.effects._forward import Physics
-from imutool.physics.fit import Chosen, Fit, Weighed, derivatives, expected, fit
+from imutool.physics.fit import Chosen, Fit, Weighed, expected, fit
 from imutool.physics.found import NO_EFFECT
 from imutool.physics.motion import smooth_motion
 from imutool.physics.pair import LEAST_S, Pair, of_one_motion, with_simulation, with_truth
 from imutool.physics.reference import wrong_for_moments
 from imutool.physics.visible import unseen
-from imutool.physics.whitening import Band, level, whitener
+from imutool.physics.weighing import weighed
 from imutool.place import Place
 from imutool.recording import Recording
 
 LEAST_BAND_HZ = 1.0  # and no less: what rests, smoothing makes straight, and it is known all the same
 KNOWN_BAND = 0.45  # of where smoothing halves a motion: there it takes a per cent
-ORDER_SIM, ORDER_TRUTH = 6, 12  # of the autoregression: a sensor's noise is nearly white, that of differentiated poses is not
-RIDGE = 1e-8
 MOST_OF_IT = 0.9  # of a recording: what is covered less is told
 LEAST_KNOWN_S = 2.0  # of an axis, to fit it and again to test it, away from where its converter ends
 SHOWN_BY_SAMPLES = {"saturation", "quantization"}  # without any fit: `stamps`
@@ -84,7 +82,8 @@ def diagnose(
         return by_samples(recordings[0], str(reals[0]), left_out[0])
     say(1, 4, "noise")
     candidates = _candidates(pairs)
-    logs = [_weighed(pair, candidates) for pair in pairs]
+    logs = [weighed(pair, (*candidates, *unnamed.driven([pair]))) for pair in pairs]
+    pairs = [log.pair for log in logs]
     say(2, 4, "searching")
     moments = wrong_for_moments(logs)
     asked, unnamed_too = ((), ()) if moments[0] else (candidates, later(pairs))
@@ -174,10 +173,10 @@ def measured(
     pairs = [_telling(pair) for pair in _pairs(read_log(real, imu=imu, truth=truth), simulated, truth)]
     candidates = _candidates(pairs)
     begun = tuple((one, one.nothing.astype(float)) for one in _catalogue.physics(effects))
-    return fit([_weighed(pair, candidates) for pair in pairs], begun, part="all")
+    return fit([weighed(pair, candidates) for pair in pairs], begun, part="all")
 
 
-def remaining(real: Place, chosen: Chosen = (), *, imu: str | None = None, truth: str | None = None) -> dict[str, HeldOut]:
+def remaining(real: Place, chosen: Chosen = (), *, imu: str | None = None, truth: str | None = None) -> dict[str, Closer]:
     """How far a recording is from what its own true poses say, all of it: without and with some physics, by signal.
 
     The best constant of its own is in both; compared is as far up in frequency as the poses are known.
@@ -185,10 +184,14 @@ def remaining(real: Place, chosen: Chosen = (), *, imu: str | None = None, truth
     Raises:
         ConfigError, LogError, DataError: as `diagnose`.
     """
-    every = [_unclipped(pair) for pair in _pairs(read_log(real, imu=imu, truth=truth), None, truth)]
-    pairs = [replace(pair, fitted=np.zeros_like(pair.fitted), held_out=pair.fitted | pair.held_out) for pair in every]
-    before, after = ([_with(pair, one) for pair in pairs] for one in ((), chosen))
-    return {signal: _held_out(pairs, before, after, k, UNITS[signal]) for k, signal in enumerate(("gyro", "accel"))}
+    pairs = [_telling(pair) for pair in _pairs(read_log(real, imu=imu, truth=truth), None, truth)]
+    candidates = _candidates(pairs)
+    logs = []
+    for log in (weighed(pair, candidates) for pair in pairs):
+        unseen = replace(log.pair, fitted=np.zeros_like(log.pair.fitted), held_out=log.pair.fitted | log.pair.held_out)
+        logs.append(replace(log, pair=unseen))
+    before, after = ([answer.with_constant(log.pair, expected(log.pair, one)) for log in logs] for one in ((), chosen))
+    return answer.closer(logs, before, after)
 
 
 def _moves_apart(reals: Sequence[Recording], sim: Recording, signals: Sequence[str]) -> bool:
@@ -285,31 +288,11 @@ def _candidates(pairs: Sequence[Pair]) -> tuple[Physics, ...]:
 
     found = [one for one in _catalogue.physics() if thinkable(one) and one.name not in SHOWN_BY_SAMPLES]
     biases = [np.median(pair.real - expected(pair, ()), axis=0) for pair in pairs]
-    return (*found, *stamps.jitter(pairs), *stamps.soft_limits(pairs, biases))
+    exact = all(pair.against == "simulation" for pair in pairs)  # poses know nothing of a millisecond: `late_stamps`
+    return (*found, *(stamps.jitter(pairs) if exact else ()), *stamps.soft_limits(pairs, biases))
 
 
 def later(pairs: Sequence[Pair]) -> list[tuple[Physics, ...]]:
     """What is asked once the catalogue has nothing more to say: other channels, then curves and equations without a name."""
     like = unnamed.like(pairs)
-    exact = all(pair.against == "simulation" for pair in pairs)  # a term is told from a curve by less than poses can tell
-    return [tuple(unnamed.driven(pairs)), (*unnamed.curves(like), *(unnamed.terms(like) if exact else ()))]
-
-
-def _weighed(pair: Pair, candidates: Sequence[Physics]) -> Weighed:
-    """The pair with its noise: what is left when everything linear in the catalogue has had its way."""
-    linear: Chosen = tuple((one, one.nothing.astype(float)) for one in candidates if one.linear)
-    base = expected(pair, linear)
-    J = derivatives(pair, linear, range(len(linear)), base)
-    left, usable = pair.real - base, pair.usable
-    for axis, rows in enumerate(usable.T):
-        A = np.concatenate([J[:, axis], np.ones((len(J), 1))], axis=1)
-        size = np.linalg.norm(A[rows], axis=0)
-        A = A[:, size > 0] / size[size > 0]
-        N = A[rows].T @ A[rows] + RIDGE * np.eye(A.shape[1])
-        left[:, axis] -= A @ np.linalg.solve(N, A[rows].T @ left[rows, axis])
-    if pair.against == "simulation":
-        white = level(left, usable, 1.0 / pair.period_s, ORDER_SIM)
-    else:
-        assert pair.band_hz is not None
-        white = whitener(left, usable, ORDER_TRUTH, Band.below(pair.band_hz, 1.0 / pair.period_s))
-    return Weighed(pair, white if pair.known is None else white.counting(pair.known))
+    return [tuple(unnamed.driven(pairs)), (*unnamed.curves(like), *unnamed.terms(like))]

@@ -25,6 +25,7 @@ from imutool.physics.effects._forward import Physics, Theta
 from imutool.physics.fit import Chosen, Fit, Weighed, derivatives, expected, fit
 from imutool.physics.pair import Pair
 from imutool.physics.readings import Read
+from imutool.physics.scatter import Scatter, scatter
 from imutool.physics.unnamed import Curve, finer, like
 
 FALSE_DISCOVERY = 5e-3
@@ -37,6 +38,7 @@ SUSPICIOUS, CLEARLY, NAMELESS = 3, 10.0, 15.0  # effects; squares by which an an
 WELL, HOPELESS = 1.03, 2.0  # squares left a row, below which all is said, and above which more of the same is no answer
 MOST_NAMELESS, NAMELESS_SHARE = 2, 0.03  # effects without a name, and how much of the misfit each has to take
 IN_BAND = 0.8
+NOISE_ONLY = 1.15  # squares left a row, up to which a simulation's noise is taken at its word
 EXCHANGED = 3  # effects among which each is asked whether another would do better
 RIVALS, RIVAL_SHARE = 3, 0.5  # effects that are asked whether they would do as well, and of the gain what a step has to promise
 IMPLAUSIBLE = 4.0  # times the plausible size
@@ -144,6 +146,7 @@ class _Search:
     luck: dict[str, float] = field(default_factory=dict)  # log of how much likelier chance looks like it: picked from many
     known: dict[str, _Ranked] = field(default_factory=dict)  # beside the effects of one fit
     known_for: Fit | None = None
+    asked: tuple[Fit, Scatter] | None = None
 
     def __post_init__(self) -> None:
         for one in (*self.named, *self.others):
@@ -260,6 +263,15 @@ class _Search:
             now = fit(self.logs, (*now.chosen[:worst], *now.chosen[worst + 1 :]))
         return Discovery((), now, fit(self.logs, (), part="all"), self.tried)
 
+    def scattered(self, found: Fit, part: str) -> Scatter | None:
+        """How far the blocks are of one mind; nothing where the noise is known, and what is left is as white as it."""
+        exact = all(log.pair.against == "simulation" for log in self.logs)
+        if exact and found.objective < NOISE_ONLY * 6 * found.rows:
+            return None
+        if self.asked is None or self.asked[0] is not found:
+            self.asked = found, scatter(self.logs, found, part)
+        return self.asked[1]
+
     def _similar(self, k: int, now: Fit) -> tuple[str, ...]:
         """Effects of the catalogue that in an effect's place leave about as little (Akaike's criterion)."""
         others = (*now.chosen[:k], *now.chosen[k + 1 :])
@@ -282,7 +294,10 @@ class _Search:
         physics, theta = whole.chosen[k]
         without = fit(self.logs, (*whole.chosen[:k], *whole.chosen[k + 1 :]), part="all")
         gain = without.objective - whole.objective
+        scattered = self.scattered(whole, "all")
         log_p = self.chance(physics, gain)
+        if scattered is not None:
+            log_p = max(log_p, scattered.chance(physics.name, gain, len(theta)) + self.luck[physics.name])
         blocks = np.concatenate(
             [_gains(log, fitted, k, "held_out") for log in self.logs] + [_gains(log, other, k, "fitted") for log in self.logs]
         )
@@ -291,7 +306,7 @@ class _Search:
         rate = min(1.0, float(np.exp(min(0.0, log_p + np.log(self.tried)))))
         if helps > HELPS or self._beyond_the_band(physics, theta):
             rate = 1.0
-        std = whole.stds()[physics.name]
+        std = (whole.stds() if scattered is None else scattered.std)[physics.name]
         unseen = [
             f"{physics.name}.{number.name}"
             for number, s in zip(physics.parameters, std, strict=True)

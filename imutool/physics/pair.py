@@ -84,6 +84,10 @@ class Pair:
         """Median time between real samples."""
         return float(np.median(np.diff(self.stamp_s)))
 
+    def within(self, band_hz: float) -> Pair:
+        """Where what is expected is known to less: the poses turn out to be worse than their noise says."""
+        return replace(self, band_hz=band_hz)
+
 
 def with_simulation(real: Recording, sim: Recording) -> Pair:
     """The recording beside a simulation of the same motion.

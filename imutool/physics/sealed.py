@@ -69,11 +69,34 @@ def conceal(
             raise ConfigError("a case lies there already", where=folder / name, fix="Choose another folder")
     recording = read(trajectory, truth=truth)
     chosen = secrets.randbits(64) if seed is None else seed
-    rngs = [default_rng(one) for one in SeedSequence([chosen, len(recording.truth), len(recording.imu)]).spawn(4)]
+    scene, what, rngs, grade = _planned(recording, chosen, kind, size, noise, effects, longest_s)
+    _write(folder, scene, what, rngs, pose_noise, {"seed": chosen, "trajectory": recording.name, "noise": grade})
+
+
+def shown_by_poses(trajectory: Path, truth: Mapping[str, Any], effects: Sequence[str] = ()) -> bool:
+    """Whether a case that was opened, made of this trajectory with these `effects` asked for, can be seen from its poses alone.
+
+    The case is planned again by its seed, and looked at beside poses with their noise instead of a simulation: is all of it as
+    clear as `draw` asks of a case beside a simulation?
+
+    Raises:
+        DataError: another trajectory, or other effects, than the case was made with.
+    """
+    recording = read(trajectory)
+    scene, what, _, _ = _planned(recording, truth["seed"], truth["kind"], truth["size"], truth["noise"], effects, LONGEST_S)
+    if [model.name for model, _ in what.acting] != [one["effect"] for one in truth["effects"]]:
+        raise DataError("the case was not made of this", where=trajectory, expected=truth["trajectory"])
+    return draw.shown(sight(scene, POSE_NOISE), what)
+
+
+def _planned(
+    recording: Recording, seed: int, kind: str, size: str, noise: str | Path, effects: Sequence[str], longest_s: float
+) -> tuple[Scene, draw.Concealed, list[Generator], str]:
+    """Scene, what acts in it, the generators of the rest, and the grade of the noise."""
+    rngs = [default_rng(one) for one in SeedSequence([seed, len(recording.truth), len(recording.imu)]).spawn(4)]
     grade, of_noise = _grade(noise, rngs[0])
     scene = set_up(smoother(recording.truth), of_noise, rngs[0], longest_s)
-    what = _draw(scene, rngs[0], kind, size, effects)
-    _write(folder, scene, what, rngs, pose_noise, {"seed": chosen, "trajectory": recording.name, "noise": grade})
+    return scene, _draw(scene, rngs[0], kind, size, effects), rngs, grade
 
 
 def _draw(scene: Scene, rng: Generator, kind: str, size: str, effects: Sequence[str]) -> draw.Concealed:

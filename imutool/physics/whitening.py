@@ -17,7 +17,7 @@ from scipy.signal import firwin, lfilter, periodogram, upfirdn
 MAD_TO_STD = 1.4826
 LEAST_STD = 1e-12
 MOTION_HZ, REFERENCE_HZ = 15.0, 60.0  # where a body's motion has its power, and where noise is measured in its place
-BAND_S, OVER = 0.33, 4.0  # length of the filter of a band, and how many samples a period of its edge gets
+BAND_S, OVER = 0.6, 2.5  # length of the filter of a band, and samples a period of its edge: whitening undoes what it can
 LEAST_SEGMENT, LEAST_SEGMENTS = 64, 8  # of a short log: the median of one or two says too little
 SEGMENT, LINES = 512, 9  # samples of a spectrum; frequencies of the median that takes lines out of it
 
@@ -31,7 +31,7 @@ class Band:
 
     @staticmethod
     def below(band_hz: float, rate_hz: float) -> Band:
-        """Up to `band_hz`, by a symmetric filter of a third of a second."""
+        """Up to `band_hz`, by a symmetric filter of `BAND_S`."""
         count = 2 * round(0.5 * BAND_S * rate_hz) + 1
         every = max(1, int(rate_hz / (OVER * band_hz)))
         return Band(firwin(count, min(band_hz, 0.45 * rate_hz), fs=rate_hz), every)

@@ -31,7 +31,7 @@ FIXED_SMALL = {"dropped_samples": 1 / 16, "timestamp_jitter": 1 / 16, "quantizat
 CLEAR = 3.5  # times the smallest visible size
 UNNAMED_SHARE = 0.3  # of an unknown's misfit that nothing in the catalogue takes over
 TRIES, STEPS = 12, 8
-TINY = 1e-9
+TINY, CLOSE = 1e-9, 0.9  # as near to what is wanted as `_sized` comes
 GYRO_BIAS, ACCEL_BIAS = 0.03, 0.3  # rad/s, m/s²: spread of the constant bias every real log has
 
 # two of one row are never concealed together: by definition they are parts of the same thing
@@ -82,6 +82,20 @@ def concealed(seen: Sight, rng: Generator, kind: Kind, size: Size, effects: Sequ
             if sized is not None and (kind != "unknown" or _has_no_name(seen, model, sized[0])):
                 return Concealed(kind, size, ((model, sized[0]),), (sized[1],))
     raise _hidden(kind, size, effects)
+
+
+def shown(seen: Sight, what: Concealed) -> bool:
+    """Whether a case could be drawn on this sight of its scene: everything in it as clear as a case has to be.
+
+    What stamps, digits and lost poses show needs no sight.
+    """
+    plain = [(model, theta) for model, theta in what.acting if model.stage != Stage.STAMPS and model.name not in FIXED_SMALL]
+    for model, theta in plain:
+        wanted = CLEAR**2 * visible(max(int(model.amounts.sum()), 1))
+        clear = seen.told_apart(model, theta)[0] >= wanted * CLOSE
+        if not clear or (what.kind == "unknown" and not _has_no_name(seen, model, theta)):
+            return False
+    return len(plain) < 2 or _both_seen(seen, plain[0], plain[1])
 
 
 def _pair(seen: Sight, rng: Generator, size: Size, effects: Sequence[str]) -> Concealed:

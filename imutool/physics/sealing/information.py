@@ -16,7 +16,8 @@ from scipy.optimize import brentq
 from scipy.stats import chi2, ncx2
 
 from imutool.physics.sealing.effects import CATALOGUE, Model, Six, Stage, Theta, Times
-from imutool.physics.sealing.scene import Acting, Scene
+from imutool.physics.sealing.scene import POSE_RATE_HZ, RATE_HZ, Acting, Scene
+from imutool.recording import GRAVITY_M_S2
 
 FALSE_ALARM, POWER = 1e-3, 0.5
 EVERY = 4  # sample that is looked at: the misfit is slow against 200 Hz
@@ -35,17 +36,23 @@ def visible(parameters: int) -> float:
 class Sight:
     """A scene with what every effect of the catalogue would do to it, as orthonormal columns beside the bias.
 
-    An effect with a parameter that is no amount has one set of columns for each of some values of it.
+    An effect with a parameter that is no amount has one set of columns for each of some values of it. `pose_noise` (m, rad) is
+    that of poses which stand in for the simulation, none where there is one.
     """
 
     scene: Scene
     t_s: Times
     columns: dict[str, list[Float64[np.ndarray, "m _"]]]
+    pose_noise: tuple[float, float] | None = None
 
     def whitened(self, misfit: Six) -> Float64[np.ndarray, " m"]:
         """Over the noise, without what a bias explains, counted for all samples."""
-        over = (misfit - misfit.mean(axis=0)) / self.scene.sigma
-        return np.asarray(over.ravel() * np.sqrt(EVERY))
+        over = misfit - misfit.mean(axis=0)
+        if self.pose_noise is None:
+            return np.asarray((over / self.scene.sigma).ravel() * np.sqrt(EVERY))
+        dt = EVERY / RATE_HZ
+        power = poses_power(np.fft.rfftfreq(len(over), dt), self.scene.noise, self.pose_noise)
+        return np.asarray(np.fft.irfft(np.fft.rfft(over, axis=0) * np.sqrt(dt / power), n=len(over), axis=0).ravel())
 
     def misfit(self, acting: Acting) -> Float64[np.ndarray, " m"]:
         """What some effects do."""
@@ -76,10 +83,19 @@ class Sight:
         return min(left)
 
 
-def sight(scene: Scene) -> Sight:
-    """The scene, looked at."""
+def poses_power(
+    f_hz: Float64[np.ndarray, " f"], noise: Float64[np.ndarray, "6"], pose_noise: tuple[float, float]
+) -> Float64[np.ndarray, "f 6"]:
+    """Power density (two-sided, per Hz) of a sensor's noise and of white poses: differentiated, and as a tilt of gravity."""
+    sensor, omega = noise**2 / RATE_HZ, (2.0 * np.pi * f_hz)[:, None] * np.ones(3)
+    p, q = (one**2 / POSE_RATE_HZ for one in pose_noise)
+    return np.asarray(sensor + np.concatenate([omega**2 * q, omega**4 * p + GRAVITY_M_S2**2 * q], axis=1))
+
+
+def sight(scene: Scene, pose_noise: tuple[float, float] | None = None) -> Sight:
+    """The scene, looked at beside a simulation, or beside poses with white noise (m, rad)."""
     t_s = scene.t_s[::EVERY]
-    out = Sight(scene, t_s, {})
+    out = Sight(scene, t_s, {}, pose_noise)
     for name, model in CATALOGUE.items():
         sets = [[out.misfit([(model, theta)]) for theta in together] for together in _small(model, scene.duration_s)]
         if sets:

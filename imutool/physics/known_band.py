@@ -1,0 +1,45 @@
+"""Up to which frequency the poses know the motion: where their own errors stand out, what is expected is wrong, not the sensor.
+
+Poses come smoothed by whoever made them, and with errors that a second derivative makes large. An error of what is expected
+does two things together: the recording shares less of it (coherence), and follows it with a gain that is too small by as much
+(regression dilution; Fuller, Measurement Error Models, 1987, eq. 1.1.7: gain = true gain x reliability), which passes for a
+scale. Noise of the sensor lowers the coherence alone, a sensor too slow the gain alone.
+"""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import numpy as np
+from jaxtyping import Float64
+from scipy.signal import csd, welch
+
+from imutool.physics.pair import Pair
+
+SEGMENT_S = 4.0
+EDGES_HZ = (0.5, 0.8, 1.25, 2.0, 3.0, 4.5, 6.5, 9.0, 13.0, 18.0, 25.0)  # bands that are looked at, slow to fast
+DILUTED = 0.04  # share of what is expected that is its own error, from which on it is not known
+LEAST_HZ = 1.25  # below, nothing would be left to look at
+
+
+def known_below(pair: Pair, left: Float64[np.ndarray, "n 6"], most_hz: float) -> float:
+    """The frequency (Hz, up to `most_hz`) below which hardly any of what is expected is an error of the poses.
+
+    `left` is what a rich model of the sensor leaves of the misfit: what is expected is the rest of the recording.
+    """
+    rate_hz = 1.0 / pair.period_s
+    size = min(int(SEGMENT_S * rate_hz), len(left))
+    there = pair.real - left
+    f_hz, power = welch(there, rate_hz, nperseg=size, axis=0)
+    _, read = welch(pair.real, rate_hz, nperseg=size, axis=0)
+    _, both = csd(there, pair.real, rate_hz, nperseg=size, axis=0)
+    for low, high in pairwise(EDGES_HZ):
+        if low >= most_hz:
+            break
+        band = (f_hz >= low) & (f_hz < high)
+        for part in (slice(0, 3), slice(3, 6)):
+            e, r, x = (float(one[band, part].real.sum()) for one in (power, read, both))
+            gain, coherence = x / e, x * x / (e * r)
+            if low >= LEAST_HZ and min(1.0 - gain, 1.0 - coherence) > DILUTED:
+                return low
+    return most_hz
