@@ -17,7 +17,7 @@ from imutool.physics.pair import Pair
 from imutool.physics.weighing import MUCH, noise_std, weighed
 
 PLANTED = SimpleNamespace(**runpy.run_path(str(Path(__file__).with_name("planted.py"))))
-FELT = PLANTED.rich(duration_s=60.0)
+FELT = PLANTED.rich(duration_s=45.0)
 BAND_HZ = 6.0
 NEAR = 1.35  # of the noise: three axes of a few hundred rows, and what a rich model spends
 WITHOUT = PLANTED.catalogue()
@@ -39,7 +39,7 @@ QUIET = noise(weighed(beside_poses(), WITHOUT))
     [
         {"gyro_bias_drift": [0.02, -0.02, 0.02, 12.0]},
         {"gravity": [0.05, 0.05, -0.05]},
-        {"clock_jump": [31.0, 0.02]},
+        {"clock_jump": [21.0, 0.02]},
         {"mount_rotation": [0.1, -0.1, 0.05]},
         {"lever_arm": [0.3, 0.1, -0.2]},
     ],
