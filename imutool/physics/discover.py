@@ -23,6 +23,7 @@ from scipy.stats import t as student
 from imutool.physics import fit as fits
 from imutool.physics.effects._forward import Physics, Theta
 from imutool.physics.fit import Chosen, Fit, Weighed, derivatives, expected, fit
+from imutool.physics.onset import onsets
 from imutool.physics.pair import Pair
 from imutool.physics.readings import Read
 from imutool.physics.scatter import Scatter, scatter
@@ -147,6 +148,7 @@ class _Search:
     known: dict[str, _Ranked] = field(default_factory=dict)  # beside the effects of one fit
     known_for: Fit | None = None
     asked: tuple[Fit, Scatter] | None = None
+    onsets: dict[tuple[str, int], float] = field(default_factory=dict)  # standard deviations of times at which effects set in
 
     def __post_init__(self) -> None:
         for one in (*self.named, *self.others):
@@ -254,6 +256,7 @@ class _Search:
                 )
                 now = fit(self.logs, tuple(pair for pair in begun if len(pair[1])))
                 continue
+            whole, self.onsets = onsets(self.logs, whole, "all", max(1.0, whole.objective / (6.0 * whole.rows)))
             verdicts = [self._verdict(k, now, other, whole) for k in range(len(now.chosen))]
             worst = max(range(len(verdicts)), key=lambda k: verdicts[k].false_discovery_rate)
             if verdicts[worst].false_discovery_rate <= FALSE_DISCOVERY:
@@ -307,6 +310,7 @@ class _Search:
         if helps > HELPS or self._beyond_the_band(physics, theta):
             rate = 1.0
         std = (whole.stds() if scattered is None else scattered.std)[physics.name]
+        std = np.array([self.onsets.get((physics.name, j), float(s)) for j, s in enumerate(std)])
         unseen = [
             f"{physics.name}.{number.name}"
             for number, s in zip(physics.parameters, std, strict=True)

@@ -19,6 +19,7 @@ from imutool.physics.pair import Pair
 SEGMENT_S = 4.0
 EDGES_HZ = (0.5, 0.8, 1.25, 2.0, 3.0, 4.5, 6.5, 9.0, 13.0, 18.0, 25.0)  # bands that are looked at, slow to fast
 DILUTED = 0.04  # share of what is expected that is its own error, from which on it is not known
+SURE = 3.0  # standard deviations of a gain (Bendat and Piersol, Random Data, 4th ed., eq. 9.89) beyond that
 LEAST_HZ = 1.25  # below, nothing would be left to look at
 
 
@@ -33,13 +34,15 @@ def known_below(pair: Pair, left: Float64[np.ndarray, "n 6"], most_hz: float) ->
     f_hz, power = welch(there, rate_hz, nperseg=size, axis=0)
     _, read = welch(pair.real, rate_hz, nperseg=size, axis=0)
     _, both = csd(there, pair.real, rate_hz, nperseg=size, axis=0)
+    duration_s = len(left) / rate_hz
     for low, high in pairwise(EDGES_HZ):
         if low >= most_hz:
             break
         band = (f_hz >= low) & (f_hz < high)
         for part in (slice(0, 3), slice(3, 6)):
-            e, r, x = (float(one[band, part].real.sum()) for one in (power, read, both))
+            e, r, x = (float(abs(one[band, part].sum())) for one in (power, read, both))
             gain, coherence = x / e, x * x / (e * r)
-            if low >= LEAST_HZ and min(1.0 - gain, 1.0 - coherence) > DILUTED:
+            unsure = np.sqrt((1.0 - coherence) / (2.0 * 3.0 * duration_s * (high - low))) * np.sqrt(r / e)
+            if low >= LEAST_HZ and min(1.0 - gain - SURE * unsure, 1.0 - coherence) > DILUTED:
                 return low
     return most_hz

@@ -83,7 +83,7 @@ def _by_effect(found: Fit, by_blocks: Matrix, by_information: Matrix, shares: Se
         each = np.array([np.diag(one)[part] for one in shares]) / np.diag(own)
         ratio, blocks = _moderated(np.diag(seen) / np.diag(own), _effective(each), usual)
         std[physics.name] = stated[physics.name] * np.sqrt(np.maximum(1.0, np.where(_begins(found)[part], 1.0, ratio)))
-        mean = np.trace(np.linalg.solve(own, seen)) / len(theta)
+        mean = np.asarray(np.trace(np.linalg.solve(own, seen)) / len(theta))
         taken = np.array([np.trace(np.linalg.solve(own, one[part, part])) for one in shares])
         ratio, blocks = _moderated(mean, _effective(taken), usual)
         inflation[physics.name], count[physics.name] = max(1.0, float(ratio)), float(blocks)
