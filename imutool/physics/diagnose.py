@@ -17,11 +17,12 @@ from imutool.mcap_io.read import read as read_log
 from imutool.physics import stamps, unnamed
 from imutool.physics.any_signal import diagnose_signal
 from imutool.physics.apart import ANOTHER_MOTION, remarks, shared
+from imutool.physics.course import Chosen, Course
 from imutool.physics.diagnosis import UNITS, Curve, Diagnosis, Estimate, Finding, HeldOut, Traces, Unexplained
 from imutool.physics.discover import Discovery, Judged, discover
 from imutool.physics.effects import _catalogue
 from imutool.physics.effects._forward import Physics
-from imutool.physics.fit import Chosen, Fit, Weighed, derivatives, expected, fit
+from imutool.physics.fit import Fit, Weighed, expected, fit
 from imutool.physics.motion import smooth_motion
 from imutool.physics.pair import LEAST_S, Pair, of_one_motion, with_simulation, with_truth
 from imutool.physics.places import of_findings, of_what_is_left
@@ -223,11 +224,14 @@ def later(pairs: Sequence[Pair]) -> list[tuple[Physics, ...]]:
 def _weighed(pair: Pair, candidates: Sequence[Physics]) -> Weighed:
     """The pair with its noise: what is left when everything linear in the catalogue has had its way."""
     linear: Chosen = tuple((one, one.nothing.astype(float)) for one in candidates if one.linear)
-    base = expected(pair, linear)
-    J = derivatives(pair, linear, range(len(linear)), base)
-    left, usable = pair.real - base, pair.fitted | pair.held_out
+    course = Course(pair, linear)
+    left, usable = pair.real - course.expected, pair.fitted | pair.held_out
+    columns: list[list[np.ndarray]] = [[np.ones(len(left))] for _ in range(6)]
+    for one, _ in linear:
+        for axis, _, row in course.slope(one):
+            columns[axis].append(row)
     for axis in range(6):
-        A = np.concatenate([J[:, axis], np.ones((len(J), 1))], axis=1)
+        A = np.stack(columns[axis], axis=1)
         size = np.linalg.norm(A[usable], axis=0)
         A = A[:, size > 0] / size[size > 0]
         N = A[usable].T @ A[usable] + RIDGE * np.eye(A.shape[1])

@@ -16,13 +16,14 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float64
-from scipy.special import gammaln
-from scipy.stats import chi2, norm, wilcoxon
+from scipy.special import gammaincc, gammaln
+from scipy.stats import norm, wilcoxon
 from scipy.stats import t as student
 
 from imutool.physics import fit as fits
+from imutool.physics.course import Chosen
 from imutool.physics.effects._forward import Physics, Theta
-from imutool.physics.fit import Chosen, Fit, Weighed, expected, fit
+from imutool.physics.fit import Fit, Weighed, expected, fit
 from imutool.physics.pair import Pair
 from imutool.physics.panel import Panel
 from imutool.physics.readings import Read
@@ -336,7 +337,7 @@ def _kept(physics: Physics, held: Physics, theta: Theta) -> Theta:
 def chance(gain: float, parameters: int) -> float:
     """The logarithm of the chance that noise alone gains as much by so many parameters (far out, the tail's leading term)."""
     half, k = 0.5 * max(gain, 0.0), 0.5 * parameters
-    return float(chi2.logsf(2.0 * half, parameters)) if half < FAR_OUT else float((k - 1.0) * np.log(half) - half - gammaln(k))
+    return float(np.log(gammaincc(k, half))) if half < FAR_OUT else float((k - 1.0) * np.log(half) - half - gammaln(k))
 
 
 def _helps(gains: Float64[np.ndarray, " b"]) -> float:
@@ -369,5 +370,5 @@ def _white(log: Weighed, chosen: Chosen, part: str) -> Float64[np.ndarray, "n 6"
     """White residuals of a part, with the best constant for that part."""
     rows = log.rows(part)
     residual = log.whiten(log.pair.real - expected(log.pair, chosen))[rows]
-    one = fits.constants(log)[rows]
+    one = log.constants[rows]
     return np.asarray(residual - one * ((one * residual).sum(0) / (one * one).sum(0)))

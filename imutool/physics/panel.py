@@ -3,55 +3,75 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Float64, Int64
 
-from imutool.physics import fit as fits
+from imutool.physics.course import Course
 from imutool.physics.effects._forward import Physics, Theta
-from imutool.physics.fit import Fit, Weighed, derivatives, expected
+from imutool.physics.fit import Fit, Weighed, priors
+from imutool.physics.slopes import on_axis, slope
+
+RIDGE = 1e-9
+
+
+class _Axis(NamedTuple):
+    """White rows of one axis of a log that are fitted, zero elsewhere, without what the bias takes of them."""
+
+    counts: Float64[np.ndarray, " m"]  # 1 for rows that are fitted
+    bias: Float64[np.ndarray, " m"]  # a constant as it is behind the filter, of length 1
+    where: Int64[np.ndarray, " q"]
+    A: Float64[np.ndarray, "q m"]
+    r: Float64[np.ndarray, " m"]
+
+    def free(self, x: Float64[np.ndarray, "*k m"]) -> Float64[np.ndarray, "*k m"]:
+        """What is left of some rows beside the bias."""
+        x = x * self.counts
+        return np.asarray(x - (x @ self.bias)[..., None] * self.bias)
 
 
 class Panel:
     """The normal equations of a fit, with a place left for one more effect."""
 
     def __init__(self, logs: Sequence[Weighed], now: Fit) -> None:
-        self.logs, self.now, self.masks = logs, now, [log.rows("fitted") for log in logs]
-        self.bases = [expected(log.pair, now.chosen) for log in logs]
-        self.sampled = [fits.sampled(log.pair, now.chosen) for log in logs]
-        self.columns = []
-        for k, (log, base, mask) in enumerate(zip(logs, self.bases, self.masks, strict=True)):
-            J = log.whiten(derivatives(log.pair, now.chosen, range(len(now.chosen)), base))[mask]
-            ones = np.zeros((*J.shape[:2], 6 * len(logs)))
-            ones[:, range(6), range(6 * k, 6 * k + 6)] = fits.constants(log)[mask]
-            self.columns.append(np.concatenate([J, ones], axis=2).reshape(-1, J.shape[2] + ones.shape[2]))
-        self.N = sum(A.T @ A for A in self.columns) + 1e-9 * np.eye(self.columns[0].shape[1])
-        self.white = [
-            (log.whiten(log.pair.real - base)[mask] - fits.constants(log)[mask] * now.bias[k]).reshape(-1)
-            for k, (log, base, mask) in enumerate(zip(logs, self.bases, self.masks, strict=True))
-        ]
-        self.left = self._left(self.white)
-
-    def _left(self, white: Sequence[Float64[np.ndarray, " m"]]) -> float:
-        g = sum(A.T @ r for A, r in zip(self.columns, white, strict=True))
-        return float(sum(r @ r for r in white) - g @ np.linalg.solve(self.N, g))
+        self.logs, self.now = logs, now
+        q = sum(len(theta) for _, theta in now.chosen)
+        self.N, self.g, self.total, self.axes = RIDGE * np.eye(q), np.zeros(q), 0.0, []
+        for log, course, slopes in zip(logs, now.courses, now.slopes, strict=True):
+            counts, residual = log.rows("fitted").astype(float), log.residual(course)
+            everything = np.ones(len(counts), bool)
+            for k in range(6):
+                bias = log.constants[:, k] * counts
+                where, A = on_axis(slopes, k, everything)
+                one = _Axis(counts, bias / np.linalg.norm(bias), where, A, residual[:, k])
+                one = one._replace(A=one.free(A), r=one.free(residual[:, k]))
+                self.axes.append(one)
+                self.N[np.ix_(where, where)] += one.A @ one.A.T
+                self.g[where] += one.A @ one.r
+                self.total += float(one.r @ one.r)
+        self.left = self.total - float(self.g @ np.linalg.solve(self.N, self.g))
 
     def gain(self, physics: Physics, start: Theta) -> float:
         """Squares that one linear step from a start takes off."""
-        chosen = (*self.now.chosen, (physics, start))
-        p, q, total = len(start), len(self.N), 0.0
-        N_bb, N_ab, g_b, g_a = np.zeros((p, p)), np.zeros((q, p)), np.zeros(p), np.zeros(q)
-        panel = zip(self.logs, self.bases, self.masks, self.columns, self.white, self.sampled, strict=True)
-        for log, base, mask, A, white, sampled in panel:
-            r, there = white, base if physics.linear else expected(log.pair, chosen)
-            J = derivatives(log.pair, chosen, [len(chosen) - 1], there, sampled)
-            B = log.whiten(J)[mask].reshape(-1, len(start))
-            if not physics.linear:
-                r = white - log.whiten(there - base)[mask].reshape(-1)
-            N_bb, N_ab = N_bb + B.T @ B, N_ab + A.T @ B
-            g_b, g_a, total = g_b + B.T @ r, g_a + A.T @ r, total + r @ r
-        _, std = fits.priors((chosen[-1],), (chosen[-1],))
-        S = N_bb + np.diag(1.0 / std**2) - N_ab.T @ np.linalg.solve(self.N, N_ab)
-        g = g_b - N_ab.T @ np.linalg.solve(self.N, g_a)
-        left = total - g_a @ np.linalg.solve(self.N, g_a) - g @ np.linalg.solve(S, g)
-        return float(self.left - left)
+        chosen, p = (*self.now.chosen, (physics, start)), len(start)
+        N_bb, N_ab, g_b = np.zeros((p, p)), np.zeros((len(self.N), p)), np.zeros(p)
+        g_a, total = self.g.copy(), self.total
+        for k, (log, course) in enumerate(zip(self.logs, self.now.courses, strict=True)):
+            with_it = course if physics.linear else Course(log.pair, chosen, course)
+            B, added = slope(log.whiten, with_it, physics), with_it.added(course)
+            for axis, one in enumerate(self.axes[6 * k : 6 * k + 6]):
+                js, r = np.flatnonzero(B.on[axis]), one.r
+                if axis in added:
+                    r = r - one.free(log.whiten.one(added[axis], axis))
+                    total += float(r @ r - one.r @ one.r)
+                    g_a[one.where] += one.A @ (r - one.r)
+                if len(js):
+                    b = one.free(B.white[axis, js])
+                    N_bb[np.ix_(js, js)] += b @ b.T
+                    N_ab[np.ix_(one.where, js)] += one.A @ b.T
+                    g_b[js] += b @ r
+        _, std = priors((chosen[-1],), (chosen[-1],))
+        beside = np.linalg.solve(self.N, np.concatenate([N_ab, g_a[:, None]], axis=1))
+        S, g = N_bb + np.diag(1.0 / std**2) - N_ab.T @ beside[:, :p], g_b - N_ab.T @ beside[:, p]
+        return float(self.left - total + g_a @ beside[:, p] + g @ np.linalg.solve(S, g))
