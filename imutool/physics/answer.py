@@ -10,9 +10,10 @@ from jaxtyping import Bool, Float64
 
 from imutool.physics import stamps, unnamed
 from imutool.physics.apart import remarks, shared
+from imutool.physics.course import Chosen
 from imutool.physics.diagnosis import UNITS, Closer, Curve, Diagnosis, Estimate, Finding, HeldOut, Located, Traces, Unexplained
 from imutool.physics.discover import Discovery, Judged
-from imutool.physics.fit import Chosen, Fit, Weighed, expected
+from imutool.physics.fit import Fit, Weighed, expected
 from imutool.physics.found import found as physics_file
 from imutool.physics.late_stamps import late_stamps
 from imutool.physics.pair import LEAST_NOISE, Pair

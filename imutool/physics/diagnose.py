@@ -18,11 +18,12 @@ from imutool.physics.again import simulated_again
 from imutool.physics.alone import by_samples
 from imutool.physics.any_signal import diagnose_signal
 from imutool.physics.apart import ANOTHER_MOTION
+from imutool.physics.course import Chosen
 from imutool.physics.diagnosis import Closer, Diagnosis, Finding
 from imutool.physics.discover import Discovery, discover
 from imutool.physics.effects import _catalogue
 from imutool.physics.effects._forward import Physics
-from imutool.physics.fit import Chosen, Fit, Weighed, expected, fit
+from imutool.physics.fit import Fit, Weighed, expected, fit
 from imutool.physics.found import NO_EFFECT
 from imutool.physics.motion import smooth_motion
 from imutool.physics.pair import LEAST_S, Pair, of_one_motion, with_simulation, with_truth

@@ -18,7 +18,7 @@ from scipy.linalg import solve_triangular
 from scipy.stats import f as fisher
 
 from imutool.physics import fit as fits
-from imutool.physics.fit import Fit, Weighed, derivatives, expected
+from imutool.physics.fit import Fit, Weighed
 
 BLOCK_S = 5.0
 LEAST_BLOCKS = 6
@@ -113,11 +113,11 @@ def _seen_from(lower: Matrix, H: Matrix) -> Matrix:
 def _blocks(log: Weighed, found: Fit, k: int, part: str) -> list[tuple[Matrix, Float64[np.ndarray, " p"]]]:
     """Each block's information on the effects, and the sum of its J^T r, a constant taken out of all the log."""
     rows = log.rows(part)
-    base = expected(log.pair, found.chosen)
-    J = log.whiten(derivatives(log.pair, found.chosen, range(len(found.chosen)), base))[rows]
-    one = fits.constants(log)[rows]
-    left = log.whiten(log.pair.real - base)[rows] - one * found.bias[k]
-    size = (one * one).sum(0)
+    slopes = found.slopes[k]
+    J = np.concatenate([one.white[:, :, rows] for one in slopes], axis=1).transpose(2, 0, 1)
+    one = log.constants[rows]
+    left = log.residual(found.courses[k])[rows] - one * found.bias[k]
+    size = np.maximum((one * one).sum(0), 1e-300)
     J[:, :, _begins(found)] = 0.0
     J = J - one[:, :, None] * (np.einsum("nap,na->ap", J, one) / size[:, None])
     t_s = log.pair.stamp_s[:: log.whiten.every][rows]

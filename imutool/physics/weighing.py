@@ -12,8 +12,9 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Bool, Float64
 
+from imutool.physics.course import Chosen, Course
 from imutool.physics.effects._forward import Physics, Theta
-from imutool.physics.fit import Chosen, Weighed, derivatives, expected
+from imutool.physics.fit import Weighed, expected
 from imutool.physics.known_band import known_below
 from imutool.physics.pair import Pair
 from imutool.physics.readings import Read
@@ -85,11 +86,14 @@ def _scaled(found: Whitener, rows: Bool[np.ndarray, "m 6"], spent: Float64[np.nd
 def _left(pair: Pair, candidates: Sequence[Physics]) -> Float64[np.ndarray, "n 6"]:
     """What is left of a simulation's misfit when everything linear has had its way."""
     linear: Chosen = tuple((one, one.nothing.astype(float)) for one in candidates if one.linear)
-    base = expected(pair, linear)
-    J = derivatives(pair, linear, range(len(linear)), base)
-    left: Float64[np.ndarray, "n 6"] = pair.real - base
+    course = Course(pair, linear)
+    left: Float64[np.ndarray, "n 6"] = pair.real - course.expected
+    columns: list[list[np.ndarray]] = [[np.ones(len(left))] for _ in range(6)]
+    for one, _ in linear:
+        for axis, _, row in course.slope(one):
+            columns[axis].append(row)
     for axis, rows in enumerate(pair.usable.T):
-        A = np.concatenate([J[:, axis], np.ones((len(J), 1))], axis=1)
+        A = np.stack(columns[axis], axis=1)
         size = np.linalg.norm(A[rows], axis=0)
         A = A[:, size > 0] / size[size > 0]
         N = A[rows].T @ A[rows] + RIDGE * np.eye(A.shape[1])
@@ -101,16 +105,18 @@ def _rich(pair: Pair, candidates: Sequence[Physics]) -> Columns:
     """Derivatives of everything in the catalogue at the places where fits begin, and a constant."""
     columns = [np.ones((*pair.real.shape, 1))]
     samples = Read(pair.stamp_s, pair.real[:, :3], pair.real[:, 3:], np.zeros((len(pair.real), 3)))
-    nothing = expected(pair, ())
+    nothing = Course(pair, ())
     for physics in candidates:
         starts: Sequence[Theta] = [physics.nothing.astype(float)]
         if physics.starts is not None and not physics.linear:
             starts = physics.starts(pair.felt, samples)
         moves = np.array([not number.begins for number in physics.parameters])
         for start in starts:
-            chosen: Chosen = ((physics, np.asarray(start, dtype=float)),)
-            base = nothing if physics.linear else expected(pair, chosen)
-            columns.append(derivatives(pair, chosen, [0], base)[:, :, moves])
+            course = nothing if physics.linear else Course(pair, ((physics, np.asarray(start, dtype=float)),), nothing)
+            slopes = np.zeros((*pair.real.shape, len(moves)))
+            for axis, j, row in course.slope(physics):
+                slopes[:, axis, j] = row
+            columns.append(slopes[:, :, moves])
     return np.concatenate(columns, axis=2)
 
 
