@@ -148,6 +148,7 @@ class _Search:
     starts: dict[str, list[Theta]] = field(default_factory=dict)
     luck: dict[str, float] = field(default_factory=dict)  # log of how much likelier chance looks like it: picked from many
     known: dict[str, _Ranked] = field(default_factory=dict)  # beside the effects of one fit
+    trials: dict[str, Fit] = field(default_factory=dict)  # with one of them, likewise
     known_for: Fit | None = None
     asked: tuple[Fit, Scatter] | None = None
     onsets: dict[tuple[str, int], float] = field(default_factory=dict)  # standard deviations of times at which effects set in
@@ -187,8 +188,13 @@ class _Search:
         nameless = sum(":" in name for name in now.names)
         ranked = self.ranked(now, (*self.named, *self.others) if nameless < MOST_NAMELESS else self.named)
         best: tuple[float, Fit] | None = None
-        for _, physics, start, _ in ranked[:TRIED]:
-            trial = fit(self.logs, (*now.chosen, (physics, start)))
+        for promised, physics, start, _ in ranked[:TRIED]:
+            if best is not None and promised > best[0] * (1.0 if physics.linear else RIVAL_SHARE):
+                continue  # what one step promises of a linear effect is what it gains
+            if physics.name not in self.trials:
+                hopeful = now.objective - (0.0 if best is None else RIVAL_SHARE * (now.objective - best[1].objective))
+                self.trials[physics.name] = fit(self.logs, (*now.chosen, (physics, start)), near=now, hopeful=hopeful)
+            trial = self.trials[physics.name]
             score = self.chance(physics, now.objective - trial.objective)
             if best is None or score < best[0]:
                 best = score, trial
@@ -202,7 +208,7 @@ class _Search:
     def ranked(self, now: Fit, candidates: Sequence[Physics]) -> list[_Ranked]:
         """Candidates by what one linear step promises, each from its best start."""
         if self.known_for is not now:
-            self.known_for, self.known = now, {}
+            self.known_for, self.known, self.trials = now, {}, {}
         asked = [physics for physics in candidates if physics.name not in now.names]
         panel = None
         for physics in asked:
@@ -219,20 +225,21 @@ class _Search:
         fine = finer(physics, like([log.pair for log in self.logs]))
         if fine is None:
             return now
-        trial = fit(self.logs, (*others, (fine, fine.nothing.astype(float))))
+        trial = fit(self.logs, (*others, (fine, fine.nothing.astype(float))), near=now)
         return trial if cost(trial) < cost(now) - CLEARLY else now
 
     def exchanged(self, now: Fit) -> Fit:
         """With an effect replaced by another of the catalogue that explains more, where there is one."""
         for k in range(len(now.chosen) - 1) if len(now.chosen) <= EXCHANGED else ():
             others = (*now.chosen[:k], *now.chosen[k + 1 :])
-            without = fit(self.logs, others, iterations=2)
+            without = fit(self.logs, others, iterations=2, near=now)
             here = self.chance(now.chosen[k][0], without.objective - now.objective)
             held = fit(self.logs, others, iterations=0)  # alone, what is not linear runs away to where no step leads back from
             for score, physics, start, _ in self.ranked(held, self.named)[:2]:
                 if physics.name == now.chosen[k][0].name or score > here:
                     continue
-                trial = fit(self.logs, (*others, (physics, start)))
+                halfway = without.objective - RIVAL_SHARE * (without.objective - now.objective)
+                trial = fit(self.logs, (*others, (physics, start)), near=without, hopeful=halfway)
                 if self.chance(physics, without.objective - trial.objective) < here - 1.0:
                     return trial
         return now
@@ -240,7 +247,7 @@ class _Search:
     def pruned(self, now: Fit) -> Fit:
         """Without effects that the others have made superfluous."""
         for k in range(len(now.chosen) - 1):  # the last has just come in
-            without = fit(self.logs, (*now.chosen[:k], *now.chosen[k + 1 :]))
+            without = fit(self.logs, (*now.chosen[:k], *now.chosen[k + 1 :]), near=now)
             if self.chance(now.chosen[k][0], without.objective - now.objective) > np.log(FALSE_DISCOVERY / self.tried):
                 return self.pruned(without)
         return now
@@ -249,8 +256,8 @@ class _Search:
         """What may stay: tested on all rows, and on blocks that were not fitted."""
         while now.chosen:
             self.tell(f"on unseen time: {', '.join(now.names)}")
-            other = fit(self.logs, now.chosen, part="held_out")
-            whole = fit(self.logs, now.chosen, part="all")
+            other = fit(self.logs, now.chosen, part="held_out", near=now)
+            whole = fit(self.logs, now.chosen, part="all", near=now)
             held = tuple(_plausible(physics, theta) for physics, theta in whole.chosen)
             if any(one is not physics for one, (physics, _) in zip(held, whole.chosen, strict=True)):
                 begun = tuple(
@@ -265,7 +272,7 @@ class _Search:
                 told = [replace(one, similar=self._similar(k, now)) for k, one in enumerate(verdicts)]
                 fitted = replace(now, chosen=_set_in_as(now.chosen, whole.chosen))
                 return Discovery(tuple(sorted(told, key=lambda one: -one.gain)), fitted, whole, self.tried)
-            now = fit(self.logs, (*now.chosen[:worst], *now.chosen[worst + 1 :]))
+            now = fit(self.logs, (*now.chosen[:worst], *now.chosen[worst + 1 :]), near=now)
         return Discovery((), now, fit(self.logs, (), part="all"), self.tried)
 
     def scattered(self, found: Fit, part: str) -> Scatter | None:
@@ -280,11 +287,13 @@ class _Search:
     def _similar(self, k: int, now: Fit) -> tuple[str, ...]:
         """Effects of the catalogue that in an effect's place leave about as little (Akaike's criterion)."""
         others = (*now.chosen[:k], *now.chosen[k + 1 :])
-        without = fit(self.logs, others, iterations=2)
+        without = fit(self.logs, others, iterations=2, near=now)
         gain, found = without.objective - now.objective, []
         for _, physics, start, promised in self.ranked(without, self.named)[:RIVALS]:
             if physics.name != now.chosen[k][0].name and promised > RIVAL_SHARE * gain:
-                trial = fit(self.logs, (*others, (physics, start)))
+                trial = fit(
+                    self.logs, (*others, (physics, start)), near=without, hopeful=without.objective - RIVAL_SHARE * gain
+                )
                 if trial.objective + 2 * len(start) < now.objective + 2 * len(now.chosen[k][1]) + CLEARLY:
                     found.append(physics.name.partition(" ")[0])
         return tuple(dict.fromkeys(found))
@@ -297,7 +306,7 @@ class _Search:
 
     def _verdict(self, k: int, fitted: Fit, other: Fit, whole: Fit) -> Judged:
         physics, theta = whole.chosen[k]
-        without = fit(self.logs, (*whole.chosen[:k], *whole.chosen[k + 1 :]), part="all")
+        without = fit(self.logs, (*whole.chosen[:k], *whole.chosen[k + 1 :]), part="all", near=whole)
         gain = without.objective - whole.objective
         scattered = self.scattered(whole, "all")
         log_p = self.chance(physics, gain)

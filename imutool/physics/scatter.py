@@ -113,8 +113,10 @@ def _seen_from(lower: Matrix, H: Matrix) -> Matrix:
 def _blocks(log: Weighed, found: Fit, k: int, part: str) -> list[tuple[Matrix, Float64[np.ndarray, " p"]]]:
     """Each block's information on the effects, and the sum of its J^T r, a constant taken out of all the log."""
     rows = log.rows(part)
-    slopes = found.slopes[k]
-    J = np.concatenate([one.white[:, :, rows] for one in slopes], axis=1).transpose(2, 0, 1)
+    J = np.zeros((int(rows.sum()), 6, len(found.prior)))
+    for axis in range(6):
+        where, slopes = found.slopes.on_axis(k, axis, rows)
+        J[:, axis, where] = slopes.T
     one = log.constants[rows]
     left = log.residual(found.courses[k])[rows] - one * found.bias[k]
     size = np.maximum((one * one).sum(0), 1e-300)
