@@ -7,7 +7,7 @@ import difflib
 import importlib
 import importlib.util
 import pkgutil
-from importlib.metadata import entry_points
+from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 from types import ModuleType
 
@@ -23,10 +23,14 @@ GROUPS = {
 
 def names(group: str) -> list[str]:
     """The keys of a group, sorted, without importing any of them (so listing the bias models costs no torch)."""
+    return sorted(_own(group) | {point.name for point in entry_points(group=group)})
+
+
+def _own(group: str) -> set[str]:
+    """The keys that are files of this package."""
     spec = importlib.util.find_spec(GROUPS[group])
     places = list(spec.submodule_search_locations or ()) if spec else []
-    own = {module.name for module in pkgutil.iter_modules(places) if not module.name.startswith("_")}
-    return sorted(own | {point.name for point in entry_points(group=group)})
+    return {module.name for module in pkgutil.iter_modules(places) if not module.name.startswith("_")}
 
 
 def load(group: str, name: str) -> ModuleType:
@@ -44,12 +48,21 @@ def load(group: str, name: str) -> ModuleType:
             expected=f"one of {', '.join(known)}",
             fix=f"Did you mean {near[0]!r}?" if near else "",
         )
-    for point in entry_points(group=group):
-        if point.name == name:
-            module = point.load()
-            assert isinstance(module, ModuleType), f"entry point {group}:{name} must name a module"
-            return module
-    return importlib.import_module(f"{GROUPS[group]}.{name}")
+    return _loaded(group, name, {point.name: point for point in entry_points(group=group)})
+
+
+def every(group: str) -> dict[str, ModuleType]:
+    """All modules of a group by key, sorted: what is installed is searched for entry points once, not for each key."""
+    points = {point.name: point for point in entry_points(group=group)}
+    return {name: _loaded(group, name, points) for name in sorted(_own(group) | set(points))}
+
+
+def _loaded(group: str, name: str, points: dict[str, EntryPoint]) -> ModuleType:
+    if name not in points:
+        return importlib.import_module(f"{GROUPS[group]}.{name}")
+    module = points[name].load()
+    assert isinstance(module, ModuleType), f"entry point {group}:{name} must name a module"
+    return module
 
 
 def summary(group: str, name: str) -> str:

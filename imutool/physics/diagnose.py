@@ -17,11 +17,12 @@ from imutool.mcap_io.read import read as read_log
 from imutool.physics import stamps, unnamed
 from imutool.physics.any_signal import diagnose_signal
 from imutool.physics.apart import ANOTHER_MOTION, remarks, shared
+from imutool.physics.course import Chosen
 from imutool.physics.diagnosis import UNITS, Curve, Diagnosis, Estimate, Finding, HeldOut, Traces, Unexplained
 from imutool.physics.discover import Discovery, Judged, discover
 from imutool.physics.effects import _catalogue
 from imutool.physics.effects._forward import Physics
-from imutool.physics.fit import Chosen, Fit, Weighed, expected, fit
+from imutool.physics.fit import Fit, Weighed, expected, fit
 from imutool.physics.late_stamps import late_stamps
 from imutool.physics.motion import smooth_motion
 from imutool.physics.pair import LEAST_S, Pair, of_one_motion, with_simulation, with_truth

@@ -1,33 +1,35 @@
 """Effects fitted to pairs, together, with a constant bias for each log, weighed by the noise.
 
-Gauss-Newton on whitened residuals, and between its steps a look at all times at which an effect may set in. The derivatives
-are differences of the effects' own forward models, so that an effect is one function and nothing else. Every parameter has a
-weak prior, `PRIOR` times its plausible size: what the motion cannot show stays at nothing instead of becoming a large number,
-and its standard deviation says so. Positive parameters are fitted by their logarithm.
+Gauss-Newton on whitened residuals, and between its steps a look at all times at which an effect may set in. Derivatives cost as
+many evaluations as there are parameters, and a step one: they stay as long as steps do what they say (`STRAIGHT`), and a fit
+may begin with those of another nearby. Every parameter has a weak prior, `PRIOR` times its plausible size: what the motion
+cannot show stays at nothing instead of becoming a large number, and its standard deviation says so. Positive parameters are
+fitted by their logarithm.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float64
 
-from imutool.physics.effects._forward import Number, Physics, Stage, Theta, read, sensed
+from imutool.physics.course import Chosen, Course, bound, free
+from imutool.physics.effects._forward import Theta
 from imutool.physics.pair import Pair
-from imutool.physics.readings import Read
+from imutool.physics.slopes import Slopes, on_axis, slope
 from imutool.physics.whitening import Whitener, settled
 
 PRIOR = 3.0
 LOG_PRIOR = 1.5  # of a positive parameter about where its fit began, in powers of e
-STEP, LOG_STEP = 1e-3, 1e-3
-ITERATIONS = 6
+ITERATIONS = 8
 BIAS_PRIOR = np.array([0.5] * 3 + [5.0] * 3)
 BACKTRACKS = 4
-
-Chosen = tuple[tuple[Physics, Theta], ...]
+SETTLED = 1e-2  # squares: less is no step any more
+STRAIGHT = 0.05  # of a step's length in white samples: by how much it may miss what the derivatives say of it
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,31 +41,63 @@ class Weighed:
 
     def rows(self, part: str) -> Bool[np.ndarray, " n"]:
         """`fitted`, `held_out` or `all`, behind the filter's start."""
-        pair, order, every = self.pair, self.whiten.order, self.whiten.every
-        if part == "all":
-            return np.asarray(settled(pair.fitted[::every], order) | settled(pair.held_out[::every], order))
-        return settled((pair.fitted if part == "fitted" else pair.held_out)[::every], order)
+        fitted, held_out = self._rows
+        return fitted | held_out if part == "all" else fitted if part == "fitted" else held_out
+
+    @cached_property
+    def _rows(self) -> tuple[Bool[np.ndarray, " n"], Bool[np.ndarray, " n"]]:
+        every, order = self.whiten.every, self.whiten.order
+        return settled(self.pair.fitted[::every], order), settled(self.pair.held_out[::every], order)
+
+    @cached_property
+    def constants(self) -> Float64[np.ndarray, "n 6"]:
+        """What a constant on each axis becomes behind the filter."""
+        return self.whiten(np.ones_like(self.pair.real))
+
+    def residual(self, course: Course) -> Float64[np.ndarray, "n 6"]:
+        """White residuals, with the bias."""
+        return self.whiten(self.pair.real - course.expected)
 
 
 @dataclass(frozen=True, eq=False)
 class Fit:
     """Effects with their parameters, each log's bias, and how well they fit.
 
-    `objective` is the sum of squares of white residuals and of the prior; `covariance` is of the parameters of all effects in
-    order (logarithms for positive ones), biases taken out; `information` is the data's alone, without the prior.
+    `objective` is the sum of squares of white residuals and of the prior.
     """
 
     chosen: Chosen
     bias: Float64[np.ndarray, "logs 6"]
     objective: float
-    covariance: Float64[np.ndarray, "p p"]
-    information: Float64[np.ndarray, "p p"]
     rows: int
+    logs: tuple[Weighed, ...]
+    part: str
+    courses: tuple[Course, ...]
+    prior: Float64[np.ndarray, " p"]
 
     @property
     def names(self) -> tuple[str, ...]:
         """The effects."""
         return tuple(physics.name for physics, _ in self.chosen)
+
+    @cached_property
+    def slopes(self) -> tuple[Slopes, ...]:
+        """Derivatives of the white samples of each log, where the fit ended."""
+        return _slopes(self.logs, self.chosen, self.courses)
+
+    @cached_property
+    def information(self) -> Float64[np.ndarray, "p p"]:
+        """The data's alone, without the prior, biases taken out."""
+        p, masks = len(self.prior), [log.rows(self.part) for log in self.logs]
+        nothing = [np.zeros((len(mask), 6)) for mask in masks]
+        N, _ = _normal(self.logs, self.slopes, nothing, np.zeros((len(self.logs), 6)), masks)
+        out: Float64[np.ndarray, "p p"] = N[:p, :p] - N[:p, p:] @ np.linalg.solve(N[p:, p:], N[p:, :p])
+        return out
+
+    @cached_property
+    def covariance(self) -> Float64[np.ndarray, "p p"]:
+        """Of the parameters of all effects in order (logarithms for positive ones), biases taken out."""
+        return np.linalg.inv(self.information + np.diag(1.0 / self.prior**2)) if len(self.prior) else np.zeros((0, 0))
 
     def stds(self) -> dict[str, Float64[np.ndarray, " p"]]:
         """Standard deviations by effect, in the parameters' units."""
@@ -79,56 +113,7 @@ class Fit:
 
 def expected(pair: Pair, chosen: Chosen) -> Float64[np.ndarray, "n 6"]:
     """What the sensor would read, without bias."""
-    return _sensed(sampled(pair, chosen), chosen)
-
-
-def sampled(pair: Pair, chosen: Chosen) -> Read:
-    """What arrives at the sensor when its samples are taken."""
-    return read(pair.felt, pair.stamp_s, [one for one in chosen if one[0].stage <= Stage.CLOCK])
-
-
-def _sensed(taken: Read, chosen: Chosen) -> Float64[np.ndarray, "n 6"]:
-    """What the sensor makes of it."""
-    got = sensed(taken, [one for one in chosen if one[0].stage > Stage.CLOCK])
-    return np.concatenate([got.gyro, got.accel], axis=1)
-
-
-def free(physics: Physics, theta: Theta) -> Theta:
-    """Parameters as they are fitted: logarithms of the positive ones."""
-    return np.array([np.log(t) if n.positive else t for t, n in zip(theta, physics.parameters, strict=True)])
-
-
-def bound(physics: Physics, x: Theta) -> Theta:
-    """Back from there."""
-    return np.array([np.exp(np.clip(v, -50, 50)) if n.positive else v for v, n in zip(x, physics.parameters, strict=True)])
-
-
-def step_of(number: Number) -> float:
-    """For differences."""
-    if number.step is not None:
-        return number.step
-    return LOG_STEP if number.positive else STEP * number.plausible
-
-
-def derivatives(
-    pair: Pair, chosen: Chosen, of: Sequence[int], base: Float64[np.ndarray, "n 6"], taken: Read | None = None
-) -> Float64[np.ndarray, "n 6 p"]:
-    """d expected / d (free parameters) of some of the effects, by forward differences; `taken` is what is `sampled`."""
-    columns = []
-    for k in of:
-        physics, theta = chosen[k]
-        x = free(physics, theta)
-        late = physics.stage > Stage.CLOCK
-        if late and taken is None:
-            taken = sampled(pair, chosen)
-        for j, number in enumerate(physics.parameters):
-            h = step_of(number)
-            moved = x.copy()
-            moved[j] += h
-            others = (*chosen[:k], (physics, bound(physics, moved)), *chosen[k + 1 :])
-            there = _sensed(taken, others) if late and taken is not None else expected(pair, others)
-            columns.append((there - base) / h)
-    return np.stack(columns, axis=2) if columns else np.zeros((*base.shape, 0))
+    return Course(pair, chosen).expected
 
 
 def priors(chosen: Chosen, begun: Chosen) -> tuple[Float64[np.ndarray, " p"], Float64[np.ndarray, " p"]]:
@@ -147,42 +132,107 @@ def fit(
     begun: Chosen,
     part: str = "fitted",
     iterations: int = ITERATIONS,
+    near: Fit | None = None,
 ) -> Fit:
-    """The effects fitted together from where they begin, and a bias for each log."""
+    """The effects fitted together from where they begin, and a bias for each log.
+
+    `near` is a fit of the same logs whose derivatives serve for the first step, as far as its effects are the same.
+    """
     mean, std = priors(begun, begun)
-    p, N_data = len(mean), np.zeros((len(mean), len(mean)))
     masks = [log.rows(part) for log in logs]
 
-    def tried(chosen: Chosen) -> _State:
-        residuals = [_residual(log, chosen) for log in logs]
-        return _State(chosen, residuals, *_biases(logs, residuals, masks, _penalty(chosen, mean, std)))
+    def tried(chosen: Chosen, like: _State | None) -> _State:
+        courses = [Course(log.pair, chosen, None if like is None else like.courses[k]) for k, log in enumerate(logs)]
+        residuals = [log.residual(course) for log, course in zip(logs, courses, strict=True)]
+        return _State(chosen, courses, residuals, *_biases(logs, residuals, masks, _penalty(chosen, mean, std)))
 
-    now = tried(begun)
-    for _ in range(iterations if p else 0):
+    now, slopes, steps = tried(begun, None), None, 0
+    if near is not None and len(mean):
+        slopes = _slopes(logs, begun, now.courses, near)
+    while len(mean) and steps < iterations:
         before = now.objective
         for moved in _set_in(logs, now, masks):
-            now = min(now, tried(moved), key=_objective)
-        N, g = _normal(logs, now.chosen, now.residuals, now.bias, masks)
-        N_data = _without_biases(N, p)
+            now = min(now, tried(moved, now), key=_objective)
+        fresh = slopes is None or now.objective < before
+        if slopes is None or fresh:
+            slopes = _slopes(logs, now.chosen, now.courses)
+        N, g = _normal(logs, slopes, now.residuals, now.bias, masks)
         x = np.concatenate([free(physics, theta) for physics, theta in now.chosen])
+        p = len(x)
         N[:p, :p] += np.diag(1.0 / std**2)
         g[:p] -= (x - mean) / std**2
         delta = _within(_solved(N, g, now.chosen), now.chosen)
-        steps = (tried(_moved(now.chosen, x + delta * 0.5**back)) for back in range(BACKTRACKS))
-        now = next((one for one in steps if one.objective < now.objective), now)
-        if before - now.objective < 1e-2:
+        sizes = (0.5**back for back in range(BACKTRACKS))
+        steps_down = ((size * delta, tried(_moved(now.chosen, x + size * delta), now)) for size in sizes)
+        step, better = next((one for one in steps_down if one[1].objective < now.objective), (delta, None))
+        if better is None:
+            if fresh:
+                break
+            slopes = None
+            continue
+        steps += 1
+        straight = _straight(logs, slopes, now, better, step, masks)
+        now = better
+        if before - now.objective < SETTLED and (fresh or straight):
             break
-    covariance = np.linalg.inv(N_data + np.diag(1.0 / std**2)) if len(mean) else np.zeros((0, 0))
-    return Fit(now.chosen, now.bias, now.objective, covariance, N_data, int(sum(mask.sum() for mask in masks)))
+        slopes = slopes if straight else None
+    rows = int(sum(mask.sum() for mask in masks))
+    return Fit(now.chosen, now.bias, now.objective, rows, tuple(logs), part, tuple(now.courses), std)
 
 
 class _State(NamedTuple):
     """How far a fit has come."""
 
     chosen: Chosen
+    courses: list[Course]
     residuals: list[Float64[np.ndarray, "n 6"]]
     bias: Float64[np.ndarray, "logs 6"]
     objective: float
+
+
+def _slopes(logs: Sequence[Weighed], chosen: Chosen, courses: Sequence[Course], near: Fit | None = None) -> tuple[Slopes, ...]:
+    """Of each log those of each effect, of what another fit has had already its own."""
+    known = {} if near is None else {id(physics): k for k, (physics, _) in enumerate(near.chosen)}
+    return tuple(
+        tuple(
+            near.slopes[log_k][known[id(physics)]]
+            if near is not None and id(physics) in known
+            else slope(log.whiten, course, physics)
+            for physics, _ in chosen
+        )
+        for log_k, (log, course) in enumerate(zip(logs, courses, strict=True))
+    )
+
+
+def _straight(
+    logs: Sequence[Weighed],
+    slopes: Sequence[Slopes],
+    before: _State,
+    after: _State,
+    step: Theta,
+    masks: Sequence[Bool[np.ndarray, " n"]],
+) -> bool:
+    """Whether a step went where the derivatives said: else they are to be taken anew."""
+    missed = length = 0.0
+    for k, (log, mask) in enumerate(zip(logs, masks, strict=True)):
+        said = _said(slopes[k], step, mask)
+        done = (before.residuals[k] - after.residuals[k])[mask]
+        one = log.constants[mask]
+        for x, axis in zip(said.T, range(6), strict=True):
+            u, c = done[:, axis] - x, one[:, axis]
+            missed += float(u @ u - (u @ c) ** 2 / (c @ c))
+            length += float(x @ x - (x @ c) ** 2 / (c @ c))
+    return missed <= STRAIGHT**2 * max(length, 1.0)
+
+
+def _said(slopes: Slopes, step: Theta, mask: Bool[np.ndarray, " n"]) -> Float64[np.ndarray, "m 6"]:
+    """By how much derivatives say that white samples change in a step."""
+    out, first = np.zeros((6, int(mask.sum()))), 0
+    for one in slopes:
+        for axis, j in np.argwhere(one.on):
+            out[axis] += step[first + j] * one.white[axis, j][mask]
+        first += one.white.shape[1]
+    return out.T
 
 
 def _objective(state: _State) -> float:
@@ -206,8 +256,9 @@ def _set_in(logs: Sequence[Weighed], now: _State, masks: Sequence[Bool[np.ndarra
             if not number.begins:
                 continue
             at, excess = [], []
-            for log, mask, bias in zip(logs, masks, now.bias, strict=True):
-                ends = (_residual(log, _but(chosen, k, j, t)) - constants(log) * bias for t in (np.inf, -np.inf))
+            for log, mask, bias, course in zip(logs, masks, now.bias, now.courses, strict=True):
+                courses = (Course(log.pair, _but(chosen, k, j, t), course) for t in (np.inf, -np.inf))
+                ends = (log.residual(one) - log.constants * bias for one in courses)
                 never, always = ((one[mask] ** 2).sum(1) for one in ends)
                 stamp_s = log.pair.stamp_s
                 at.append((stamp_s - stamp_s[0])[:: log.whiten.every][mask])
@@ -247,15 +298,6 @@ def _penalty(chosen: Chosen, mean: Theta, std: Theta) -> float:
     return float((((x - mean) / std) ** 2).sum())
 
 
-def _residual(log: Weighed, chosen: Chosen) -> Float64[np.ndarray, "n 6"]:
-    return log.whiten(log.pair.real - expected(log.pair, chosen))
-
-
-def constants(log: Weighed) -> Float64[np.ndarray, "n 6"]:
-    """What a constant on each axis becomes behind the filter."""
-    return log.whiten(np.ones_like(log.pair.real))
-
-
 def _biases(
     logs: Sequence[Weighed],
     residuals: Sequence[Float64[np.ndarray, "n 6"]],
@@ -265,7 +307,7 @@ def _biases(
     """The best constants for some residuals, and the objective with them."""
     b, total = np.zeros((len(logs), 6)), penalty
     for k, (log, residual, mask) in enumerate(zip(logs, residuals, masks, strict=True)):
-        one, r = constants(log)[mask], residual[mask]
+        one, r = log.constants[mask], residual[mask]
         b[k] = (one * r).sum(0) / ((one * one).sum(0) + 1.0 / BIAS_PRIOR**2)
         total += float(((r - one * b[k]) ** 2).sum() + ((b[k] / BIAS_PRIOR) ** 2).sum())
     return b, total
@@ -273,31 +315,22 @@ def _biases(
 
 def _normal(
     logs: Sequence[Weighed],
-    chosen: Chosen,
+    slopes: Sequence[Slopes],
     residuals: Sequence[Float64[np.ndarray, "n 6"]],
     b: Float64[np.ndarray, "logs 6"],
     masks: Sequence[Bool[np.ndarray, " n"]],
 ) -> tuple[Float64[np.ndarray, "q q"], Float64[np.ndarray, " q"]]:
     """Normal equations of all free parameters, then each log's bias."""
-    p = sum(len(theta) for _, theta in chosen)
+    p = sum(one.white.shape[1] for one in slopes[0])
     N, g = np.zeros((p + 6 * len(logs),) * 2), np.zeros(p + 6 * len(logs))
-    for k, (log, residual, mask) in enumerate(zip(logs, residuals, masks, strict=True)):
-        base = expected(log.pair, chosen)
-        J = log.whiten(derivatives(log.pair, chosen, range(len(chosen)), base))[mask]
-        one = constants(log)[mask]
-        r = residual[mask] - one * b[k]
-        flat = J.reshape(J.shape[0] * 6, p)
-        here = slice(p + 6 * k, p + 6 * k + 6)
-        N[:p, :p] += flat.T @ flat
-        cross = np.einsum("nap,na->pa", J, one)
-        N[:p, here] += cross
-        N[here, :p] += cross.T
-        N[here, here] += np.diag((one * one).sum(0) + 1.0 / BIAS_PRIOR**2)
-        g[:p] += flat.T @ r.reshape(-1)
+    for k, (log, mine, residual, mask) in enumerate(zip(logs, slopes, residuals, masks, strict=True)):
+        for axis in range(6):
+            where, A = on_axis(mine, axis, mask)
+            one, bias = log.constants[mask, axis], p + 6 * k + axis
+            r = residual[mask, axis] - one * b[k, axis]
+            N[np.ix_(where, where)] += A @ A.T
+            N[where, bias] += A @ one
+            N[bias, where] += A @ one
+            N[bias, bias] += one @ one + 1.0 / BIAS_PRIOR[axis] ** 2
+            g[where] += A @ r
     return N, g
-
-
-def _without_biases(N: Float64[np.ndarray, "q q"], p: int) -> Float64[np.ndarray, "p p"]:
-    """The information on the parameters once biases are free as well."""
-    out: Float64[np.ndarray, "p p"] = N[:p, :p] - N[:p, p:] @ np.linalg.solve(N[p:, p:], N[p:, :p])
-    return out

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Float64
 
-from imutool.physics.fit import Chosen, Fit, Weighed, fit
+from imutool.physics.course import Chosen
+from imutool.physics.fit import Fit, Weighed, fit
 
 NEAR_S, MOST_TIMES = 0.4, 41  # around where a fit put it: as far as the filter of a band smears it
 
@@ -31,7 +31,7 @@ def onsets(logs: Sequence[Weighed], found: Fit, part: str, inflation: float) -> 
             likely /= likely.sum()
             mean = float(likely @ t_s)
             spread[physics.name, j] = float(np.sqrt(likely @ (t_s - mean) ** 2 + step_s**2 / 12.0))
-            found = replace(found, chosen=_at(found, k, j, mean))
+            found = fit(logs, _at(found, k, j, mean), part=part, iterations=0)
     return found, spread
 
 

@@ -7,7 +7,7 @@ Three clocks meet here. `t_s` is even and belongs to the motion; effects of the 
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from types import MappingProxyType
 
@@ -23,42 +23,44 @@ Times = Float64[np.ndarray, " n"]
 PAD = 12  # samples beyond the ends over which the spline forgets how it begins: 0.27^12 = 1e-7
 UNEVEN = 1e-2  # of a period: how far the even clock may be from even
 SAME_S = 1e-7  # a stamp's rounding; the fastest motion goes nowhere in it
+INSTANTS, RECENT = 3, 8  # that a sampler remembers: sets of instants, and columns
 NOTHING: Mapping[str, Float64[np.ndarray, " n"]] = MappingProxyType({})
 Instants = tuple[Float64[np.ndarray, " n"], Float64[np.ndarray, " m"], csr_array | None]
 
 
 class Sampler:
-    """Cubic splines over one even clock, taken at some instants; it remembers the last ones, for much of them stays the same.
+    """Cubic splines over one even clock, taken at some instants; it remembers a few, for most of them stay the same.
 
-    All that `replace` makes of a `Felt` shares one, so that what few effects change (instants, attitude, channels) is worked on
-    once. What it gives cannot be written to; each memory is replaced as a whole, so threads may share it.
+    All that `replace` makes of a `Felt` shares one, so that what an effect leaves alone is worked on once. What it gives cannot
+    be written to; each memory is replaced as a whole, so threads may share it.
     """
 
     def __init__(self) -> None:
-        self._instants: Instants | None = None
-        self._motion: tuple[tuple[Vectors, ...], object, Float64[np.ndarray, "m 9"]] | None = None
-        self._beside: tuple[object, object, object, Float64[np.ndarray, "m k"]] | None = None
+        self._instants: tuple[Instants, ...] = ()
+        self._coefficients, self._values, self._beside = _Recent(), _Recent(), _Recent()
 
-    def motion(self, felt: Felt, taken_s: Float64[np.ndarray, " m"]) -> Float64[np.ndarray, "m 9"]:
+    def motion(self, felt: Felt, taken_s: Float64[np.ndarray, " m"]) -> tuple[Vectors, ...]:
         """gyro, accel, alpha."""
-        instants, now, last = self._at(felt.t_s, taken_s), (felt.gyro, felt.accel, felt.alpha), self._motion
-        same = last is not None and all(was is one for was, one in zip(last[0], now, strict=True))
-        if last is None or not same or (last[1] is None) != (instants[2] is None):
-            columns = np.concatenate(now, axis=1)
-            self._motion = last = (now, instants[2], columns if instants[2] is None else _coefficients(columns))
-        return _values(last[2], instants[2])
+        instants = self._at(felt.t_s, taken_s)
+        return tuple(self._at_instants(x, instants) for x in (felt.gyro, felt.accel, felt.alpha))
 
     def beside(self, felt: Felt, taken_s: Float64[np.ndarray, " m"]) -> Float64[np.ndarray, "m k"]:
         """R_wb row by row, where it is known, then the channels."""
-        instants, last = self._at(felt.t_s, taken_s), self._beside
-        if last is None or last[0] is not felt.R_wb or last[1] is not felt.channels or last[2] is not instants:
-            columns = [np.zeros((len(felt.t_s), 0))] if felt.R_wb is None else [felt.R_wb.reshape(-1, 9)]
-            columns += [values[:, None] for values in felt.channels.values()]
-            both = np.concatenate(columns, axis=1)
-            if instants[2] is not None:
-                both = _coefficients(both)
-            self._beside = last = (felt.R_wb, felt.channels, instants, _values(both, instants[2]))
-        return last[3]
+        instants = self._at(felt.t_s, taken_s)
+
+        def columns() -> Float64[np.ndarray, "n k"]:
+            first = [np.zeros((len(felt.t_s), 0))] if felt.R_wb is None else [felt.R_wb.reshape(-1, 9)]
+            return np.concatenate([*first, *(values[:, None] for values in felt.channels.values())], axis=1)
+
+        both = self._beside((felt.R_wb, felt.channels), columns)
+        return self._at_instants(both, instants)
+
+    def _at_instants(self, x: Float64[np.ndarray, "n k"], instants: Instants) -> Float64[np.ndarray, "m k"]:
+        weights = instants[2]
+        if weights is None:
+            return self._values((x, instants), lambda: _fixed(x.view()))
+        coefficients = self._coefficients((x,), lambda: _coefficients(x))
+        return self._values((x, instants), lambda: _fixed(np.asarray(weights @ coefficients)))
 
     def _at(self, t_s: Times, taken_s: Float64[np.ndarray, " m"]) -> Instants:
         """Clock, instants, and what takes splines' coefficients to their values (None: the instants are the clock's own).
@@ -66,11 +68,38 @@ class Sampler:
         Raises:
             DataError: a clock that is not even.
         """
-        last = self._instants
-        if last is None or not (np.array_equal(last[0], t_s) and np.array_equal(last[1], taken_s)):
-            own = len(t_s) == len(taken_s) and bool(np.abs(t_s - taken_s).max() <= SAME_S)
-            self._instants = last = (t_s.copy(), taken_s.copy(), None if own else _weights(t_s, taken_s))
-        return last
+        for last in self._instants:
+            if np.array_equal(last[0], t_s) and np.array_equal(last[1], taken_s):
+                return last
+        own = len(t_s) == len(taken_s) and bool(np.abs(t_s - taken_s).max() <= SAME_S)
+        found: Instants = (t_s.copy(), taken_s.copy(), None if own else _weights(t_s, taken_s))
+        self._instants = (found, *self._instants[: INSTANTS - 1])
+        return found
+
+
+class _Recent:
+    """The last few things that were worked out, by the very objects they were worked out from."""
+
+    def __init__(self) -> None:
+        self._known: tuple[tuple[tuple[object, ...], Float64[np.ndarray, "n k"]], ...] = ()
+
+    def __call__(
+        self, of: tuple[object, ...], work_out: Callable[[], Float64[np.ndarray, "n k"]]
+    ) -> Float64[np.ndarray, "n k"]:
+        known = self._known
+        for k, (objects, value) in enumerate(known):
+            if all(was is one for was, one in zip(objects, of, strict=True)):
+                if k:  # what is asked for again and again stays
+                    self._known = (known[k], *known[:k], *known[k + 1 :])
+                return value
+        value = work_out()
+        self._known = ((of, value), *known[: RECENT - 1])
+        return value
+
+
+def _fixed(x: Float64[np.ndarray, "n k"]) -> Float64[np.ndarray, "n k"]:
+    x.flags.writeable = False
+    return x
 
 
 def _weights(t_s: Float64[np.ndarray, " n"], taken_s: Float64[np.ndarray, " m"]) -> csr_array:
@@ -97,12 +126,6 @@ def _coefficients(x: Float64[np.ndarray, "n k"]) -> Float64[np.ndarray, "m k"]:
     if not x.shape[1]:
         return padded
     return np.ascontiguousarray(spline_filter1d(np.ascontiguousarray(padded.T), 3, axis=1).T)
-
-
-def _values(columns: Float64[np.ndarray, "n k"], weights: csr_array | None) -> Float64[np.ndarray, "m k"]:
-    both = columns if weights is None else np.asarray(weights @ columns)
-    both.flags.writeable = False
-    return both
 
 
 @dataclass(frozen=True, eq=False)
@@ -133,10 +156,11 @@ class Felt:
         Raises:
             DataError: `t_s` is not even.
         """
-        both, beside = self.sampler.motion(self, taken_s), self.sampler.beside(self, taken_s)
+        gyro, accel, alpha = self.sampler.motion(self, taken_s)
+        beside = self.sampler.beside(self, taken_s)
         R_wb = None if self.R_wb is None else beside[:, :9].reshape(-1, 3, 3)
         names = {name: beside[:, k - len(self.channels)] for k, name in enumerate(self.channels)}
-        return Read(stamp_s, both[:, :3], both[:, 3:6], both[:, 6:], R_wb, names)
+        return Read(stamp_s, gyro, accel, alpha, R_wb, names)
 
 
 @dataclass(frozen=True, eq=False)

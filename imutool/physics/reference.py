@@ -12,7 +12,6 @@ import numpy as np
 from jaxtyping import Float64
 from scipy.stats import chi2
 
-from imutool.physics import fit as fits
 from imutool.physics.diagnosis import UNITS, Estimate, Finding, HeldOut, Located
 from imutool.physics.fit import Weighed, expected
 
@@ -32,7 +31,7 @@ def wrong_for_moments(logs: Sequence[Weighed]) -> tuple[list[Finding], list[Loca
     rows = log.rows("all")
     t_s = log.pair.stamp_s[:: log.whiten.every][rows]
     white = log.whiten(log.pair.real - expected(log.pair, ()))[rows]
-    one = fits.constants(log)[rows]
+    one = log.constants[rows]
     white = white - np.median(white / np.where(one == 0, 1.0, one), axis=0) * one  # a mean would carry the moments' own misfit
     block = np.floor((t_s - t_s[0]) / BLOCK_S).astype(int)
     count = np.maximum(np.bincount(block), 1)

@@ -18,7 +18,8 @@ from scipy.linalg import solve_triangular
 from scipy.stats import f as fisher
 
 from imutool.physics import fit as fits
-from imutool.physics.fit import Fit, Weighed, derivatives, expected
+from imutool.physics.fit import Fit, Weighed
+from imutool.physics.slopes import on_axis
 
 BLOCK_S = 5.0
 LEAST_BLOCKS = 6
@@ -112,20 +113,20 @@ def _seen_from(lower: Matrix, H: Matrix) -> Matrix:
 
 def _blocks(log: Weighed, found: Fit, k: int, part: str) -> list[tuple[Matrix, Float64[np.ndarray, " p"]]]:
     """Each block's information on the effects, and the sum of its J^T r, a constant taken out of all the log."""
-    rows = log.rows(part)
-    base = expected(log.pair, found.chosen)
-    J = log.whiten(derivatives(log.pair, found.chosen, range(len(found.chosen)), base))[rows]
-    one = fits.constants(log)[rows]
-    left = log.whiten(log.pair.real - base)[rows] - one * found.bias[k]
-    size = (one * one).sum(0)
-    J[:, :, _begins(found)] = 0.0
-    J = J - one[:, :, None] * (np.einsum("nap,na->ap", J, one) / size[:, None])
+    rows, begins = log.rows(part), _begins(found)
+    left = log.residual(found.courses[k])[rows] - log.constants[rows] * found.bias[k]
+    J = np.zeros((6, len(begins), int(rows.sum())))
+    for axis in range(6):
+        where, J_axis = on_axis(found.slopes[k], axis, rows)
+        one = log.constants[rows, axis]
+        J[axis, where] = J_axis - np.outer(J_axis @ one, one) / (one @ one)
+    J[:, begins] = 0.0
     t_s = log.pair.stamp_s[:: log.whiten.every][rows]
     duration_s = float(t_s[-1] - t_s[0])
     block = np.floor((t_s - t_s[0]) / min(BLOCK_S, duration_s / LEAST_BLOCKS)).astype(int)
     out = []
     for which in np.unique(block):
         here = block == which
-        flat = J[here].reshape(-1, J.shape[2])
-        out.append((flat.T @ flat, flat.T @ left[here].reshape(-1)))
+        flat = J[:, :, here].transpose(1, 0, 2).reshape(len(begins), -1)
+        out.append((flat @ flat.T, flat @ left[here].T.reshape(-1)))
     return out

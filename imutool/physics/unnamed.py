@@ -150,7 +150,7 @@ def library() -> Iterator[tuple[str, Variable]]:
         yield name, x
         yield f"|{name}|", partial(_of, x, np.abs)
         yield f"{name} |{name}|", partial(_of, x, lambda v: v * np.abs(v))
-        yield f"{name}^3", partial(_of, x, lambda v: v**3)
+        yield f"{name}^3", partial(_of, x, lambda v: v * v * v)
         yield f"sign({name})", partial(_of, x, np.sign)
         for other in names[: k + 1]:
             yield f"{other} {name}", partial(_product, VARIABLES[other], x)

@@ -14,7 +14,7 @@ GROUP = "imutool.effects"
 
 def known(sensor: Sensor) -> tuple[Effect, ...]:
     """Every effect with a closed form that acts on a sensor, by name."""
-    modules = [registry.load(GROUP, name) for name in registry.names(GROUP)]
+    modules = registry.every(GROUP).values()
     return tuple(module.effect(sensor) for module in modules if sensor in getattr(module, "SENSORS", ()))
 
 
@@ -42,7 +42,7 @@ def physics(names: Sequence[str] | None = None) -> tuple[Physics, ...]:
     Raises:
         ConfigError: an unknown name (the nearest is given), or that of an effect that is fitted alone and not simulated.
     """
-    modules = [registry.load(GROUP, name) for name in (registry.names(GROUP) if names is None else names)]
+    modules = list(registry.every(GROUP).values()) if names is None else [registry.load(GROUP, name) for name in names]
     found = tuple(module.PHYSICS for module in modules if hasattr(module, "PHYSICS"))
     if names is not None and len(found) < len(names):
         lacking = next(name for name, module in zip(names, modules, strict=True) if not hasattr(module, "PHYSICS"))

@@ -16,7 +16,7 @@ is needed to simulate it, and the estimator differentiates it by differences. Ef
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import IntEnum
 from typing import Any
 
@@ -134,25 +134,53 @@ CONVERTER_ORDER = {"saturation": 1, "quantization": 2}
 Acting = Sequence[tuple[Physics, Theta]]
 
 
+@dataclass(frozen=True, eq=False)
+class Way:
+    """How far signals have come: what is felt and when samples are taken of it, or, behind the clock, what is read."""
+
+    felt: Felt
+    taken_s: Times
+    stamp_s: Times
+    taken: Read | None = None
+
+    def through(self, physics: Physics, theta: Theta) -> Way:
+        """Behind one more effect, whose turn it is."""
+        if physics.stage < Stage.CLOCK:
+            return replace(self, felt=physics.forward(self.felt, theta), taken=None)
+        if physics.stage == Stage.CLOCK:
+            return replace(self, taken_s=physics.forward(self.taken_s, theta), taken=None)
+        return replace(self, taken=physics.forward(self.arrived(), theta))
+
+    def taking(self) -> Way:
+        """With the samples taken: behind this, the clock and what is felt do not matter any more."""
+        return self if self.taken is not None else replace(self, taken=self.arrived())
+
+    def arrived(self) -> Read:
+        """One row a sample."""
+        return self.felt.taken(self.taken_s, self.stamp_s) if self.taken is None else self.taken
+
+
 def read(felt: Felt, stamp_s: Times, acting: Acting) -> Read:
     """What a sensor with these effects reads at some stamps: the stages one after another, within a stage by name."""
-    order = _in_order(acting)
-    taken_s = np.asarray(stamp_s, dtype=np.float64)
-    for physics, theta in order:
-        if physics.stage < Stage.CLOCK:
-            felt = physics.forward(felt, theta)
-        elif physics.stage == Stage.CLOCK:
-            taken_s = physics.forward(taken_s, theta)
-    return sensed(felt.taken(taken_s, stamp_s), acting)
+    way = Way(felt, np.asarray(stamp_s, dtype=np.float64), stamp_s)
+    for physics, theta in in_order(acting):
+        way = way.through(physics, theta)
+    return way.arrived()
 
 
 def sensed(taken: Read, acting: Acting) -> Read:
     """What a sensor makes of samples that are taken: the stages behind CLOCK alone."""
-    for physics, theta in _in_order(acting):
+    for physics, theta in in_order(acting):
         if physics.stage > Stage.CLOCK:
             taken = physics.forward(taken, theta)
     return taken
 
 
-def _in_order(acting: Acting) -> list[tuple[Physics, Theta]]:
-    return sorted(acting, key=lambda pair: (pair[0].stage, CONVERTER_ORDER.get(pair[0].name, 0), pair[0].name))
+def in_order(acting: Acting) -> list[tuple[Physics, Theta]]:
+    """As they act."""
+    return sorted(acting, key=lambda pair: turn(pair[0]))
+
+
+def turn(physics: Physics) -> tuple[int, int, str]:
+    """By which it is told when an effect acts."""
+    return physics.stage, CONVERTER_ORDER.get(physics.name, 0), physics.name
