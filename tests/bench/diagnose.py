@@ -6,10 +6,10 @@ asked for passes it on to the next. Each case is concealed, diagnosed by the com
 a case in DIR/cases.jsonl, one Markdown table at the end (`--table` prints that of the lines there are).
 
 --resume goes on where it stopped; --again diagnoses the cases that are there anew, for whoever works on the estimator, and its
-lines say so. --no-sim gives diagnose the recording alone, against its own poses; the table then also parts cases that poses with
-their noise can show to an optimal test, as clearly as a case has to be shown beside a simulation, from those that they cannot
-(sizes are drawn for a simulation). --mujoco takes cases of the second generator.
-Do not choose settings of the estimator by cases on trajectories that are kept for testing.
+lines say so. --no-sim gives diagnose the recording alone, against its own poses; sizes are drawn for a simulation, so the table
+then parts the cases that poses with their noise show to an optimal test, as clearly as a simulation has to, from the others.
+--mujoco takes cases of the second generator. Do not choose settings of the estimator by cases on trajectories that are kept for
+testing.
 """
 
 from __future__ import annotations
