@@ -259,7 +259,7 @@ def _set_in(logs: Sequence[Weighed], now: _State, masks: Sequence[Bool[np.ndarra
                 ends = (log.residual(one) - log.constants * bias for one in courses)
                 never, always = ((one[mask] ** 2).sum(1) for one in ends)
                 stamp_s = log.pair.stamp_s
-                at.append((stamp_s - stamp_s[0])[:: log.whiten.every][mask])
+                at.append(stamp_s[:: log.whiten.every][mask])
                 excess.append(never - always)
             order = np.argsort(np.concatenate(at), kind="stable")
             t_s, cost = np.concatenate(at)[order], np.cumsum(np.concatenate(excess)[order])

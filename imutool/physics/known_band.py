@@ -14,8 +14,6 @@ import numpy as np
 from jaxtyping import Float64
 from scipy.signal import csd, welch
 
-from imutool.physics.pair import Pair
-
 SEGMENT_S = 4.0
 EDGES_HZ = (0.5, 0.8, 1.25, 2.0, 3.0, 4.5, 6.5, 9.0, 13.0, 18.0, 25.0)  # bands that are looked at, slow to fast
 DILUTED = 0.04  # share of what is expected that is its own error, from which on it is not known
@@ -23,17 +21,15 @@ SURE = 3.0  # standard deviations of a gain (Bendat and Piersol, Random Data, 4t
 LEAST_HZ = 1.25  # below, nothing would be left to look at
 
 
-def known_below(pair: Pair, left: Float64[np.ndarray, "n 6"], most_hz: float) -> float:
+def known_below(real: Float64[np.ndarray, "m 6"], left: Float64[np.ndarray, "m 6"], rate_hz: float, most_hz: float) -> float:
     """The frequency (Hz, up to `most_hz`) below which hardly any of what is expected is an error of the poses.
 
-    `left` is what a rich model of the sensor leaves of the misfit: what is expected is the rest of the recording.
+    `left` is what a rich model of the sensor leaves of what is read; what is expected is the rest.
     """
-    rate_hz = 1.0 / pair.period_s
-    size = min(int(SEGMENT_S * rate_hz), len(left))
-    there = pair.real - left
+    there, size = real - left, min(int(SEGMENT_S * rate_hz), len(left))
     f_hz, power = welch(there, rate_hz, nperseg=size, axis=0)
-    _, read = welch(pair.real, rate_hz, nperseg=size, axis=0)
-    _, both = csd(there, pair.real, rate_hz, nperseg=size, axis=0)
+    _, read = welch(real, rate_hz, nperseg=size, axis=0)
+    _, both = csd(there, real, rate_hz, nperseg=size, axis=0)
     duration_s = len(left) / rate_hz
     for low, high in pairwise(EDGES_HZ):
         if low >= most_hz:

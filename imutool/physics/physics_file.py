@@ -339,7 +339,7 @@ VARIABLES: dict[str, Variable] = {
     **{f"alpha_{axis}": _column("alpha", k) for k, axis in enumerate(AXES)},
     "|omega|": lambda read: np.asarray(np.linalg.norm(read.gyro, axis=1)),
     "|f|": lambda read: np.asarray(np.linalg.norm(read.accel, axis=1)),
-    "t": lambda read: read.stamp_s - read.stamp_s[0],
+    "t": lambda read: read.stamp_s,
 }
 
 

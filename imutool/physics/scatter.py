@@ -112,22 +112,20 @@ def _seen_from(lower: Matrix, H: Matrix) -> Matrix:
 
 def _blocks(log: Weighed, found: Fit, k: int, part: str) -> list[tuple[Matrix, Float64[np.ndarray, " p"]]]:
     """Each block's information on the effects, and the sum of its J^T r, a constant taken out of all the log."""
-    rows = log.rows(part)
-    J = np.zeros((int(rows.sum()), 6, len(found.prior)))
+    rows, begins = log.rows(part), _begins(found)
+    left = log.residual(found.courses[k])[rows] - log.constants[rows] * found.bias[k]
+    J = np.zeros((6, len(begins), int(rows.sum())))
     for axis in range(6):
-        where, slopes = found.slopes.on_axis(k, axis, rows)
-        J[:, axis, where] = slopes.T
-    one = log.constants[rows]
-    left = log.residual(found.courses[k])[rows] - one * found.bias[k]
-    size = np.maximum((one * one).sum(0), 1e-300)
-    J[:, :, _begins(found)] = 0.0
-    J = J - one[:, :, None] * (np.einsum("nap,na->ap", J, one) / size[:, None])
+        where, J_axis = found.slopes.on_axis(k, axis, rows)
+        one = log.constants[rows, axis]
+        J[axis, where] = J_axis - np.outer(J_axis @ one, one) / max(float(one @ one), 1e-300)
+    J[:, begins] = 0.0
     t_s = log.pair.stamp_s[:: log.whiten.every][rows]
     duration_s = float(t_s[-1] - t_s[0])
     block = np.floor((t_s - t_s[0]) / min(BLOCK_S, duration_s / LEAST_BLOCKS)).astype(int)
     out = []
     for which in np.unique(block):
         here = block == which
-        flat = J[here].reshape(-1, J.shape[2])
-        out.append((flat.T @ flat, flat.T @ left[here].reshape(-1)))
+        flat = J[:, :, here].transpose(1, 0, 2).reshape(len(begins), -1)
+        out.append((flat @ flat.T, flat @ left[here].T.reshape(-1)))
     return out

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from jaxtyping import Bool, Float64
+from jaxtyping import Float64
 
 from imutool.physics.course import Chosen, Course
 from imutool.physics.effects._forward import Physics, Theta
@@ -26,33 +26,44 @@ TURNS = 2  # of noise and model beside poses, each asked of the other
 MUCH = 3.0  # times the noise of another axis
 SAME = 1e-3  # of a column, left when those before it are taken out: it says nothing of its own
 
-Columns = Float64[np.ndarray, "m 6 p"]
-
 
 def weighed(pair: Pair, candidates: Sequence[Physics]) -> Weighed:
     """The pair with its noise; beside poses also with the band up to which they are seen to know the motion."""
     if pair.against == "simulation":
         return _counting(pair, level(_left(pair, candidates), pair.usable, 1.0 / pair.period_s, ORDER_SIM))
     assert pair.band_hz is not None
-    columns, misfit, usable = _rich(pair, candidates), pair.real - expected(pair, ()), pair.usable
-    band_hz = known_below(pair, misfit - _explained(columns, misfit, usable)[0], pair.band_hz)
+    found, left = _in_band(pair, candidates, pair.band_hz)
+    assert found.band is not None
+    rate_hz = 1.0 / (pair.period_s * found.every)
+    band_hz = known_below(found.band(pair.real), left, rate_hz, pair.band_hz)
     if band_hz < pair.band_hz:
         pair = pair.within(band_hz)
-    band = Band.below(band_hz, 1.0 / pair.period_s)
-    slow, rows = band(columns), usable[:: band.every]
-    left, spent = _explained(slow, band(misfit), rows)
-    found = _scaled(whitener(band(misfit) - left, rows, ORDER_TRUTH), rows, spent)
-    for _ in range(TURNS - 1):
-        settled_rows = np.stack([settled(column, ORDER_TRUTH) for column in rows.T], axis=1)
-        white = found(band(misfit))
-        fitted, spent = _explained(found(slow), white, settled_rows, slow)
-        found = _scaled(whitener(band(misfit) - fitted, rows, ORDER_TRUTH), rows, spent)
-    return _counting(pair, alike(Whitener(found.filters, found.std, band)))
+        found, _ = _in_band(pair, candidates, band_hz)
+    return _counting(pair, alike(found))
 
 
 def _counting(pair: Pair, white: Whitener) -> Weighed:
     """Without the values into which samples that tell nothing have gone."""
     return Weighed(pair, white if pair.known is None else white.counting(pair.known))
+
+
+def _in_band(pair: Pair, candidates: Sequence[Physics], band_hz: float) -> tuple[Whitener, Float64[np.ndarray, "m 6"]]:
+    """The noise of rows up to a frequency, and what a rich model leaves there."""
+    band = Band.below(band_hz, 1.0 / pair.period_s)
+    columns, misfit = _rich(pair, candidates, band), band(pair.real - expected(pair, ()))
+    usable = pair.usable[:: band.every]
+    found = Whitener(np.ones((6, 1)), np.ones(6))
+    for _ in range(TURNS):
+        left, spent = misfit.copy(), np.zeros(6)
+        for axis in np.flatnonzero(usable.any(axis=0)).tolist():
+            rows = settled(usable[:, axis], found.order)
+            white = np.stack([found.one(row, axis) for row in columns[axis]])
+            x, spent[axis] = _solved(white[:, rows], found.one(misfit[:, axis], axis)[rows])
+            left[:, axis] -= x @ columns[axis]
+        found = whitener(left, usable, ORDER_TRUTH)
+        count = np.maximum(usable.sum(axis=0), 1.0)  # the noise before so many numbers were fitted to it
+        found = Whitener(found.filters, found.std * np.sqrt(count / np.maximum(count - spent, 0.5 * count)))
+    return Whitener(found.filters, found.std, band), left
 
 
 def alike(found: Whitener) -> Whitener:
@@ -77,12 +88,6 @@ def noise_std(found: Whitener) -> Float64[np.ndarray, "6"]:
     return np.asarray(found.std * np.sqrt((1.0 / response).mean(axis=1)))
 
 
-def _scaled(found: Whitener, rows: Bool[np.ndarray, "m 6"], spent: Float64[np.ndarray, "6"]) -> Whitener:
-    """With the size that the rows' noise had before so many numbers were fitted to it."""
-    count = np.maximum(rows.sum(axis=0), 1.0)
-    return Whitener(found.filters, found.std * np.sqrt(count / np.maximum(count - spent, 0.5 * count)), found.band)
-
-
 def _left(pair: Pair, candidates: Sequence[Physics]) -> Float64[np.ndarray, "n 6"]:
     """What is left of a simulation's misfit when everything linear has had its way."""
     linear: Chosen = tuple((one, one.nothing.astype(float)) for one in candidates if one.linear)
@@ -101,39 +106,27 @@ def _left(pair: Pair, candidates: Sequence[Physics]) -> Float64[np.ndarray, "n 6
     return left
 
 
-def _rich(pair: Pair, candidates: Sequence[Physics]) -> Columns:
-    """Derivatives of everything in the catalogue at the places where fits begin, and a constant."""
-    columns = [np.ones((*pair.real.shape, 1))]
+def _rich(pair: Pair, candidates: Sequence[Physics], band: Band) -> list[Float64[np.ndarray, "_ m"]]:
+    """For each axis a constant, and derivatives of everything in the catalogue at the places where fits begin, in a band."""
     samples = Read(pair.stamp_s, pair.real[:, :3], pair.real[:, 3:], np.zeros((len(pair.real), 3)))
+    columns = [[band.one(np.ones(len(pair.real)))] for _ in range(6)]
     nothing = Course(pair, ())
     for physics in candidates:
-        starts: Sequence[Theta] = [physics.nothing.astype(float)]
+        starts: Sequence[Theta] = ()
         if physics.starts is not None and not physics.linear:
             starts = physics.starts(pair.felt, samples)
-        moves = np.array([not number.begins for number in physics.parameters])
-        for start in starts:
-            course = nothing if physics.linear else Course(pair, ((physics, np.asarray(start, dtype=float)),), nothing)
-            slopes = np.zeros((*pair.real.shape, len(moves)))
+        courses = [Course(pair, ((physics, np.asarray(start, dtype=float)),), nothing) for start in starts] or [nothing]
+        for course in courses:
             for axis, j, row in course.slope(physics):
-                slopes[:, axis, j] = row
-            columns.append(slopes[:, :, moves])
-    return np.concatenate(columns, axis=2)
+                if not physics.parameters[j].begins:
+                    columns[axis].append(band.one(row))
+    return [np.stack(rows) for rows in columns]
 
 
-def _explained(
-    columns: Columns, misfit: Float64[np.ndarray, "m 6"], usable: Bool[np.ndarray, "m 6"], shown: Columns | None = None
-) -> tuple[Float64[np.ndarray, "m 6"], Float64[np.ndarray, "6"]]:
-    """What columns explain of each axis by least squares (as it is `shown`, if otherwise), and by how many numbers."""
-    out, spent = np.zeros_like(misfit), np.zeros(6)
-    for axis, rows in enumerate(usable.T):
-        if not rows.any():
-            continue
-        A = columns[rows, axis]
-        size = np.linalg.norm(A, axis=0)
-        some = size > 0
-        left, singular, right = np.linalg.svd(A[:, some] / size[some], full_matrices=False)
-        told = singular > SAME * singular[0]
-        x = right[told].T @ ((left[:, told].T @ misfit[rows, axis]) / singular[told])
-        out[:, axis] = (columns if shown is None else shown)[:, axis][:, some] @ (x / size[some])
-        spent[axis] = told.sum()
-    return out, spent
+def _solved(A: Float64[np.ndarray, "q m"], y: Float64[np.ndarray, " m"]) -> tuple[Float64[np.ndarray, " q"], float]:
+    """Least squares by the columns that say something of their own, and how many that are."""
+    size = np.linalg.norm(A, axis=1)
+    size = np.where(size > 0, size, 1.0)
+    left, singular, right = np.linalg.svd((A / size[:, None]).T, full_matrices=False)
+    told = singular > SAME * singular[0]
+    return right[told].T @ ((left[:, told].T @ y) / singular[told]) / size, float(told.sum())

@@ -6,8 +6,10 @@ asked for passes it on to the next. Each case is concealed, diagnosed by the com
 a case in DIR/cases.jsonl, one Markdown table at the end (`--table` prints that of the lines there are).
 
 --resume goes on where it stopped; --again diagnoses the cases that are there anew, for whoever works on the estimator, and its
-lines say so. --no-sim gives diagnose the recording alone, against its own poses. --mujoco takes cases of the second generator.
-Do not choose settings of the estimator by cases on trajectories that are kept for testing.
+lines say so. --no-sim gives diagnose the recording alone, against its own poses; sizes are drawn for a simulation, so the table
+then parts the cases that poses with their noise show to an optimal test, as clearly as a simulation has to, from the others.
+--mujoco takes cases of the second generator. Do not choose settings of the estimator by cases on trajectories that are kept for
+testing.
 """
 
 from __future__ import annotations
@@ -27,7 +29,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from imutool.errors import DataError, ImutoolError
-from imutool.physics.sealed import OPENED, conceal, opened
+from imutool.physics.sealed import OPENED, conceal, opened, shown_by_poses
 from imutool.physics.sealing.draw import SIZES
 from imutool.physics.sealing.effects import CATALOGUE
 from imutool.physics.sealing.unnamed import FORMS
@@ -106,13 +108,23 @@ def diagnose(folder: Path, with_sim: bool) -> tuple[Path, float, str]:
     return out / "findings.json", time.perf_counter() - began, failed
 
 
-def one(number: int, folder: Path, task: Task, with_sim: bool) -> dict[str, Any]:
+def shown(line: dict[str, Any], task: Task, trajectories: Sequence[Path]) -> bool | None:
+    """Whether poses alone show an opened case; unknown without its trajectory."""
+    truth = line["truth"]
+    made_of = [path for path in trajectories if path.stem == truth.get("trajectory")]
+    return shown_by_poses(made_of[0], truth, task.effects) if made_of else None
+
+
+def one(number: int, folder: Path, task: Task, options: argparse.Namespace) -> dict[str, Any]:
     """Diagnosed, opened and scored."""
+    with_sim = not options.no_sim
     findings, took, failed = diagnose(folder, with_sim)
     line: dict[str, Any] = {"case": number, **task._asdict(), "seconds": took, "failed": failed}
     if not failed:
         try:
             line |= opened(folder, findings)
+            if options.no_sim:
+                line["shown"] = shown(line, task, options.trajectories)
         except ImutoolError as error:
             line["failed"] = str(error)
     if line["failed"]:  # no answer is a wrong one, whatever was concealed
@@ -138,7 +150,7 @@ def run(options: argparse.Namespace) -> list[dict[str, Any]]:
         folder = options.out / f"{number:04d}"
         line = _made(number, task, folder, options)
         if line is None:
-            line = one(number, folder, task, not options.no_sim)
+            line = one(number, folder, task, options)
         line["again"] = bool(options.again)
         done[number] = line
         with lines_at.open("a", encoding="utf-8") as file:
@@ -218,18 +230,20 @@ HEAD = (
 
 def table(lines: Sequence[dict[str, Any]]) -> str:
     """Markdown: kinds by size, then single effects."""
-    shown = [line for line in lines if not line.get("hidden")]
-    rows = [row("all", shown)]
+    seen = [line for line in lines if not line.get("hidden")]
+    rows = [row("all", seen)]
     for kind in ("single", "pair", "driven", "unknown", "null"):
         for size in SIZES if kind != "null" else ("middle",):
-            mine = [line for line in shown if (line["kind"], line["size"]) == (kind, size)]
+            mine = [line for line in seen if (line["kind"], line["size"]) == (kind, size)]
             rows += [row(kind if kind == "null" else f"{kind}, {size}", mine)]
-    singles = [line for line in shown if line["kind"] == "single" and line["effects"]]
+    for name, told in (("shown by the poses", True), ("not shown by the poses", False)):
+        rows += [row(name, [line for line in seen if line.get("shown") is told])]
+    singles = [line for line in seen if line["kind"] == "single" and line["effects"]]
     for name in sorted({line["effects"][0] for line in singles}):
         rows += [row(name, [line for line in singles if line["effects"][0] == name])]
     text = ["| " + " | ".join(HEAD) + " |", "|" + "---|" * len(HEAD)]
     text += ["| " + " | ".join(cells) + " |" for cells in rows if cells[1] != "0"]
-    failed = [line for line in shown if line["failed"]]
+    failed = [line for line in seen if line["failed"]]
     hidden = [f"{'+'.join(line['effects'])} {line['kind']} {line['size']}" for line in lines if line.get("hidden")]
     text.append(f"\n{len(failed)} cases failed: {sorted({line['failed'][:100] for line in failed})[:5]}")
     text.append(f"{len(hidden)} were shown by no motion: {', '.join(sorted(hidden))}")

@@ -348,14 +348,14 @@ def test_a_skewed_clock_takes_a_sine_of_another_frequency() -> None:
     felt, eps = sine(2.0), 1e-3
     stamp_s = felt.t_s[200:-200]
     out = read(felt, stamp_s, [(only("clock_skew"), np.array([eps]))])
-    close(out.accel[:, 1], np.sin(4.0 * np.pi * (stamp_s + eps * (stamp_s - stamp_s[0]))), SPLINE)
+    close(out.accel[:, 1], np.sin(4.0 * np.pi * (stamp_s + eps * stamp_s)), SPLINE)
 
 
 def test_a_clock_jumps_once() -> None:
     felt, step = sine(2.0), 0.02
     stamp_s = felt.t_s[200:-200]
-    out = read(felt, stamp_s, [(only("clock_jump"), np.array([5.0 - 1e-9, step]))])
-    late = stamp_s - stamp_s[0] >= 5.0 - 1e-9
+    out = read(felt, stamp_s, [(only("clock_jump"), np.array([6.0 - 1e-9, step]))])
+    late = stamp_s >= 6.0 - 1e-9  # of the log, whatever part of it is looked at
     assert np.count_nonzero(~late) == 1000
     close(out.gyro[:, 2], np.sin(4.0 * np.pi * (stamp_s + step * late)), SPLINE)
 
@@ -393,7 +393,7 @@ def test_force_turns_a_gyro_by_its_sensitivity() -> None:
 
 @pytest.mark.parametrize("sensor", ["gyro", "accel"])
 def test_a_warm_up_reaches_what_its_time_constant_says(sensor: str) -> None:
-    taken = still(20.0).taken(clock(20.0), clock(20.0) + 100.0)
+    taken = still(20.0).taken(clock(20.0), clock(20.0))
     more = getattr(act(f"{sensor}_bias_drift", taken, 0.1, 0.2, -0.3, 4.0), sensor) - getattr(taken, sensor)
     close(more[0], np.zeros(3))
     close(more[round(4.0 * RATE_HZ)], (1.0 - math.exp(-1.0)) * np.array([0.1, 0.2, -0.3]))

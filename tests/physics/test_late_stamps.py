@@ -20,7 +20,7 @@ INNER = slice(5, -5)
 def stamped(late_s: np.ndarray, taken_late: bool) -> Pair:
     """Samples of a flight whose stamps are late, taken then or at even times."""
     stamp_s = FELT.t_s[INNER] + late_s[INNER]
-    pair = PLANTED.pair(FELT, stamp_s=stamp_s)
+    pair: Pair = PLANTED.pair(FELT, stamp_s=stamp_s)
     if taken_late:
         return pair
     even = PLANTED.ideal(FELT)[INNER] + PLANTED.noise(len(stamp_s), 3) + PLANTED.BIAS

@@ -24,7 +24,8 @@ WITHOUT = PLANTED.catalogue()
 
 
 def beside_poses(effects: dict[str, list[float]] | None = None, added: np.ndarray | None = None) -> Pair:
-    return replace(PLANTED.pair(FELT, effects, added=added), against="true poses", band_hz=BAND_HZ)
+    pair: Pair = PLANTED.pair(FELT, effects, added=added)
+    return replace(pair, against="true poses", band_hz=BAND_HZ)
 
 
 def noise(log: Weighed) -> np.ndarray:
@@ -76,18 +77,18 @@ def errors(above_hz: float, size: float) -> np.ndarray:
 def test_a_sensor_noisier_than_the_motion_leaves_the_band_as_it_is() -> None:
     pair = beside_poses(added=10.0 * PLANTED.noise(len(FELT.t_s), 9))
     left = pair.real - PLANTED.ideal(FELT)
-    assert known_below(pair, left, BAND_HZ) == BAND_HZ
+    assert known_below(pair.real, left, PLANTED.RATE_HZ, BAND_HZ) == BAND_HZ
 
 
 def test_poses_that_err_faster_than_a_frequency_end_the_band_there() -> None:
     pair = beside_poses()
     wrong = PLANTED.ideal(FELT)
     wrong[:, 3:] += errors(3.0, 5.0)
-    ends_hz = known_below(pair, pair.real - wrong, BAND_HZ)
+    ends_hz = known_below(pair.real, pair.real - wrong, PLANTED.RATE_HZ, BAND_HZ)
     assert 1.25 <= ends_hz <= 3.0
     assert ends_hz < BAND_HZ
 
 
 def test_a_sensor_that_is_too_slow_leaves_the_band_as_it_is() -> None:
     pair = beside_poses({"low_pass": [6.0]})
-    assert known_below(pair, pair.real - PLANTED.ideal(FELT), BAND_HZ) == BAND_HZ
+    assert known_below(pair.real, pair.real - PLANTED.ideal(FELT), PLANTED.RATE_HZ, BAND_HZ) == BAND_HZ

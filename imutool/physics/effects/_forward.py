@@ -48,7 +48,7 @@ class Number:
     `nothing` is the value at which the effect does nothing: 0, or infinity (a cut-off frequency, a limit). A number that
     matters only beside an amplitude (a time constant, a frequency) has its plausible size there: any value would do.
     `step`, where given, is the largest one whose difference is still a derivative, of the logarithm if `positive`. `begins`: it
-    is the time (s from the first sample) at which the effect sets in, never if infinite; nothing is smooth in it, so all times
+    is the time (s from the log's start) at which the effect sets in, never if infinite; nothing is smooth in it, so all times
     are gone through.
     """
 

@@ -1,4 +1,4 @@
-"""Warm-up as both sensors have it: + A (1 - exp(-t/tau)), t from the first sample."""
+"""Warm-up as both sensors have it: + A (1 - exp(-t/tau)), t from the log's start."""
 
 from __future__ import annotations
 
@@ -55,4 +55,4 @@ def _warm(signals: Signals) -> Float64[np.ndarray, "n 1"]:
 
 
 def _warming(stamp_s: Float64[np.ndarray, " n"], tau_s: float) -> Float64[np.ndarray, " n"]:
-    return np.asarray(-np.expm1((stamp_s[0] - stamp_s) / tau_s))
+    return np.asarray(-np.expm1(-stamp_s / tau_s))

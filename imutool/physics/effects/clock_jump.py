@@ -11,8 +11,8 @@ PARTS, STARTS = 12, 4  # of the log, and the best times of how many of them
 
 
 def _forward(taken_s: Times, theta: Theta) -> Times:
-    """t_jump (s from the first sample), then the step (s): a sample at that very time is already beyond it."""
-    return np.asarray(taken_s + theta[1] * (taken_s - taken_s[0] >= theta[0]))
+    """t_jump (s from the log's start), then the step (s): a sample at that very time is already beyond it."""
+    return np.asarray(taken_s + theta[1] * (taken_s >= theta[0]))
 
 
 def _starts(felt: Felt, samples: Read) -> list[Theta]:
@@ -29,7 +29,7 @@ def _starts(felt: Felt, samples: Read) -> list[Theta]:
     gain = before**2 * power[:-1] + after**2 * (power[-1] - power[:-1])
     best = [int(part[np.argmax(gain[part])]) for part in np.array_split(np.arange(len(gain)), PARTS) if len(part)]
     best = sorted(best, key=lambda row: -gain[row])[:STARTS]
-    t_s = samples.stamp_s - samples.stamp_s[0]
+    t_s = samples.stamp_s
     return [np.array([(t_s[row] + t_s[row + 1]) / 2.0, after[row] - before[row]]) for row in best]
 
 

@@ -9,8 +9,8 @@ from imutool.physics.readings import Felt, Read, Times
 
 
 def _forward(taken_s: Times, eps: Theta) -> Times:
-    """t from the first sample; further in, the log's clock and that of the motion are eps t apart."""
-    return np.asarray(taken_s + eps[0] * (taken_s - taken_s[0]))
+    """t from the log's start; further in, the log's clock and that of the motion are eps t apart."""
+    return np.asarray(taken_s + eps[0] * taken_s)
 
 
 def _starts(_felt: Felt, _samples: Read) -> list[Theta]:
