@@ -212,7 +212,11 @@ class _Search:
             here = self.chance(now.chosen[k][0], without.objective - now.objective)
             held = fit(self.logs, others, iterations=0)  # alone, what is not linear runs away to where no step leads back from
             for score, physics, start, _ in self.ranked(held, self.named)[:2]:
-                if physics.name == now.chosen[k][0].name or score > here:
+                if physics.name == now.chosen[k][0].name:
+                    if physics.linear:  # what its own step promises is all there is to gain
+                        break
+                    continue
+                if score > here and not now.chosen[k][0].linear:
                     continue
                 trial = fit(self.logs, (*others, (physics, start)))
                 if self.chance(physics, without.objective - trial.objective) < here - 1.0:
