@@ -266,9 +266,9 @@ class _Search:
 
     def _beyond_the_band(self, physics: Physics, theta: Theta) -> bool:
         """A frequency that what is expected does not reach up to: smoothed poses lag and lose there by themselves."""
-        bands = [log.pair.band_hz or 0.5 / log.pair.period_s for log in self.logs]
+        bands = [log.pair.band_hz for log in self.logs if log.pair.band_hz is not None]
         hertz = [value for number, value in zip(physics.parameters, theta, strict=True) if number.unit == "Hz"]
-        return bool(hertz and max(hertz) > IN_BAND * min(bands))
+        return bool(bands and hertz and max(hertz) > IN_BAND * min(bands))
 
     def _verdict(self, k: int, fitted: Fit, other: Fit, whole: Fit) -> Judged:
         physics, theta = whole.chosen[k]
