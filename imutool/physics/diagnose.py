@@ -35,7 +35,6 @@ KNOWN_BAND = 0.45  # of where smoothing halves a motion: there it takes a per ce
 ORDER_SIM, ORDER_TRUTH = 6, 12  # of the autoregression: a sensor's noise is nearly white, that of differentiated poses is not
 RIDGE = 1e-8
 JITTER = "timestamp_jitter"
-INEXACT = 1e-5  # of a misfit's power: 0.3 % of its size, as which the inexactness of a much larger effect's model may pass
 SHOWN_BY_SAMPLES = {"saturation", "quantization"}  # without any fit: `stamps`
 SHOWN_KNOTS = 41  # of a curve without a name, as it is told
 EVERY_UNIT = (
@@ -249,7 +248,7 @@ def _told(
     floor = _floor(logs)
     after = [_with(pair, found.fitted.chosen) for pair in pairs]  # held-out time stays unseen
     told = [_finding(logs, found, one, floor) for one in found.judged]
-    all_found = [one for one in told if one.share > INEXACT]
+    all_found = [one for one in told if one.share > 0.0]
     all_found += stamps.saturated(pairs, after, found.tried) + stamps.dropped(pairs) + stamps.rounded(pairs, floor)
     findings = [one for one in all_found if not shared(one, known)]
     expected_too = {judged.physics.name for judged, one in zip(found.judged, told, strict=True) if shared(one, known)}
@@ -275,7 +274,7 @@ def _told(
         not_identifiable=tuple(
             dict.fromkeys(
                 [name for one in found.judged for name in one.unidentified if one.physics.name != JITTER]
-                + [one.effect for one in told if one.share <= INEXACT]
+                + [one.effect for one in told if one.share <= 0.0]
             )
         ),
         unexplained=unexplained,

@@ -22,6 +22,7 @@ from scipy.stats import t as student
 
 from imutool.physics import fit as fits
 from imutool.physics.effects._forward import Physics, Theta
+from imutool.physics.faint import faint
 from imutool.physics.fit import Chosen, Fit, Weighed, derivatives, expected, fit
 from imutool.physics.pair import Pair
 from imutool.physics.readings import Read
@@ -243,7 +244,7 @@ class _Search:
                 )
                 now = fit(self.logs, tuple(pair for pair in begun if len(pair[1])))
                 continue
-            verdicts = [self._verdict(k, now, other, whole) for k in range(len(now.chosen))]
+            verdicts = _but_faint([self._verdict(k, now, other, whole) for k in range(len(now.chosen))], self.logs)
             worst = max(range(len(verdicts)), key=lambda k: verdicts[k].false_discovery_rate)
             if verdicts[worst].false_discovery_rate <= FALSE_DISCOVERY:
                 told = [replace(one, similar=self._similar(k, now)) for k, one in enumerate(verdicts)]
@@ -293,6 +294,13 @@ class _Search:
             kept = {number.name for number in physics.parameters}
             unseen += [f"{physics.name}.{n.name}" for n in physics.forward.physics.parameters if n.name not in kept]
         return Judged(physics, theta, std, tuple(unseen), float(np.exp(max(log_p, -700.0))), rate, gain)
+
+
+def _but_faint(verdicts: Sequence[Judged], logs: Sequence[Weighed]) -> list[Judged]:
+    """Without trust in what may be the inexactness of a far larger effect."""
+    exact = not any(log.pair.sim_noise.any() for log in logs)
+    hidden = faint({one.physics.name: one.gain for one in verdicts}, exact)
+    return [replace(one, false_discovery_rate=1.0) if one.physics.name in hidden else one for one in verdicts]
 
 
 def _as_read(pair: Pair) -> Read:
