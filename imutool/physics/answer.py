@@ -26,7 +26,6 @@ from imutool.stationary import white_noise
 
 SIGNALS = tuple(UNITS)
 JITTER, QUANTIZATION = "timestamp_jitter", "quantization"
-INEXACT = 1e-5  # of a misfit's power: 0.3 % of its size, as which the inexactness of a much larger effect's model may pass
 SHOWN_KNOTS = 41  # of a curve without a name, as it is told
 SOME = 0.05  # of the samples of an axis at its limit, from which on that is told
 MOVES = 5.0  # times its noise by which an axis should have moved before it is called stuck
@@ -49,7 +48,7 @@ def told(
     noise = floor(logs)
     after = [_with(pair, found.fitted.chosen) for pair in pairs]  # held-out time stays unseen
     named = [_finding(logs, found, one, noise) for one in found.judged]
-    all_found = [one for one in named if one.share > INEXACT]
+    all_found = [one for one in named if one.share > 0.0]
     exact = all(pair.against == "simulation" for pair in pairs)
     # digits are a sample's, and a row beside poses is the mean of many
     sample = noise if exact else np.asarray(np.median([white_noise(pair.real) for pair in pairs], axis=0))
@@ -107,7 +106,7 @@ def without_held_out(logs: Sequence[Weighed], found: Discovery, d: Diagnosis) ->
 def _not_identifiable(found: Discovery, named: Sequence[Finding], hidden: Sequence[str]) -> tuple[str, ...]:
     """Of what was found, the numbers that nothing shows; of the rest of the catalogue what could not be seen."""
     told = [name for one in found.judged for name in one.unidentified if one.physics.name != JITTER]
-    told += [one.effect for one in named if one.share <= INEXACT]
+    told += [one.effect for one in named if one.share <= 0.0]
     there = {one.physics.name.partition(" ")[0] for one in found.judged}
     return tuple(dict.fromkeys([*told, *(name for name in hidden if name.partition(".")[0] not in there)]))
 

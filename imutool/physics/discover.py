@@ -23,6 +23,7 @@ from scipy.stats import t as student
 from imutool.physics import fit as fits
 from imutool.physics.course import Chosen
 from imutool.physics.effects._forward import Physics, Theta
+from imutool.physics.faint import faint
 from imutool.physics.fit import Fit, Weighed, expected, fit
 from imutool.physics.onset import onsets
 from imutool.physics.pair import Pair
@@ -236,7 +237,11 @@ class _Search:
             here = self.chance(now.chosen[k][0], without.objective - now.objective)
             held = fit(self.logs, others, iterations=0)  # alone, what is not linear runs away to where no step leads back from
             for score, physics, start, _ in self.ranked(held, self.named)[:2]:
-                if physics.name == now.chosen[k][0].name or score > here:
+                if physics.name == now.chosen[k][0].name:
+                    if physics.linear:  # what its own step promises is all there is to gain
+                        break
+                    continue
+                if score > here and not now.chosen[k][0].linear:
                     continue
                 halfway = without.objective - RIVAL_SHARE * (without.objective - now.objective)
                 trial = fit(self.logs, (*others, (physics, start)), near=without, hopeful=halfway)
@@ -266,7 +271,7 @@ class _Search:
                 now = fit(self.logs, tuple(pair for pair in begun if len(pair[1])))
                 continue
             whole, self.onsets = onsets(self.logs, whole, "all", max(1.0, whole.objective / (6.0 * whole.rows)))
-            verdicts = [self._verdict(k, now, other, whole) for k in range(len(now.chosen))]
+            verdicts = _but_faint([self._verdict(k, now, other, whole) for k in range(len(now.chosen))], self.logs)
             worst = max(range(len(verdicts)), key=lambda k: verdicts[k].false_discovery_rate)
             if verdicts[worst].false_discovery_rate <= FALSE_DISCOVERY:
                 told = [replace(one, similar=self._similar(k, now)) for k, one in enumerate(verdicts)]
@@ -300,9 +305,9 @@ class _Search:
 
     def _beyond_the_band(self, physics: Physics, theta: Theta) -> bool:
         """A frequency that what is expected does not reach up to: smoothed poses lag and lose there by themselves."""
-        bands = [log.pair.band_hz or 0.5 / log.pair.period_s for log in self.logs]
+        bands = [log.pair.band_hz for log in self.logs if log.pair.band_hz is not None]
         hertz = [value for number, value in zip(physics.parameters, theta, strict=True) if number.unit == "Hz"]
-        return bool(hertz and max(hertz) > IN_BAND * min(bands))
+        return bool(bands and hertz and max(hertz) > IN_BAND * min(bands))
 
     def _verdict(self, k: int, fitted: Fit, other: Fit, whole: Fit) -> Judged:
         physics, theta = whole.chosen[k]
@@ -331,6 +336,13 @@ class _Search:
             kept = {number.name for number in physics.parameters}
             unseen += [f"{physics.name}.{n.name}" for n in physics.forward.physics.parameters if n.name not in kept]
         return Judged(physics, theta, std, tuple(unseen), float(np.exp(max(log_p, -700.0))), rate, gain)
+
+
+def _but_faint(verdicts: Sequence[Judged], logs: Sequence[Weighed]) -> list[Judged]:
+    """Without trust in what may be the inexactness of a far larger effect."""
+    exact = not any(log.pair.sim_noise.any() for log in logs)
+    hidden = faint({one.physics.name: one.gain for one in verdicts}, exact)
+    return [replace(one, false_discovery_rate=1.0) if one.physics.name in hidden else one for one in verdicts]
 
 
 def _as_read(pair: Pair) -> Read:

@@ -48,9 +48,10 @@ class Pair:
     """Ideal signals on an even clock, and real samples by their stamps on that clock (s from the first sample).
 
     `fitted` and `held_out` are rows; rows in neither are borders, gaps and ends. `band_hz` is where what is expected ends to be
-    known (none: nowhere), `truth` the true poses at its stamps, `aligned_s` what was added to the stamps where the
-    two clocks share no epoch. `known` says which samples tell what an axis felt (none: all): those of a converter at its end
-    and of an axis that is stuck do not.
+    known (none: nowhere), `sim_noise` what was filtered out of a simulation's samples (nothing where its poses stand in for
+    them), `truth` the true poses at its stamps, `aligned_s` what was added to the stamps where the two clocks share no epoch.
+    `known` says which samples tell what an axis felt (none: all): those of a converter at its end and of an axis that is
+    stuck do not.
     """
 
     name: str
@@ -203,7 +204,7 @@ def _channels(recording: Recording, t_ns: np.ndarray) -> dict[str, Float64[np.nd
 def _simulated(
     t_sim: Float64[np.ndarray, " m"], sim: Recording, shift_s: float, start_ns: int, real: Recording
 ) -> tuple[Felt, Float64[np.ndarray, "6"]]:
-    """The simulation without its noise on an even clock, and how noisy it was."""
+    """The simulation without its noise on an even clock, and how noisy it was where that had to be filtered out."""
     samples = np.concatenate([sim.imu.gyro, sim.imu.accel], axis=1)
     noise = white_noise(samples)
     period_s = float(np.median(np.diff(t_sim)))
@@ -211,7 +212,7 @@ def _simulated(
     if felt is not None:
         t_s = seconds(sim.truth.t_ns[:1], start_ns)[0] - shift_s + felt.t_s
         t_ns = start_ns + np.round(t_s * 1e9).astype(np.int64)
-        return replace(felt, t_s=t_s, channels=_channels(real, t_ns)), noise
+        return replace(felt, t_s=t_s, channels=_channels(real, t_ns)), np.zeros(6)
     t_s = t_sim[0] + period_s * np.arange(int((t_sim[-1] - t_sim[0]) / period_s) + 1)
     even = np.asarray(make_interp_spline(t_sim, samples, k=3)(t_s))
     clean = np.stack([wiener(column) for column in even.T], axis=1)
