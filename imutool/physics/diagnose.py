@@ -16,7 +16,7 @@ from imutool.mcap_io.read import read as read_log
 from imutool.physics import answer, stamps, unnamed
 from imutool.physics.again import simulated_again
 from imutool.physics.alone import by_samples
-from imutool.physics.any_signal import diagnose_signal
+from imutool.physics.any_signal import SignalDiagnosis, diagnose_signal
 from imutool.physics.apart import ANOTHER_MOTION
 from imutool.physics.diagnosis import Closer, Diagnosis, Finding
 from imutool.physics.discover import Discovery, discover
@@ -72,6 +72,7 @@ def diagnose(
     if signals and (sim is None or len(reals) != 1):
         raise ConfigError("--signal compares one recording with its simulation", where="--signal", fix="Give one log and --sim")
     say(0, 4, "reading")
+    beside = [] if sim is None else [(one, read_field(reals[0], one), read_field(sim, one)) for one in signals]
     recordings = _by_names([read_log(real, imu=imu, truth=truth) for real in reals])
     simulated = None if sim is None else read_log(sim, imu=imu)
     known: tuple[Finding, ...] = ()
@@ -97,10 +98,9 @@ def diagnose(
         told = _again(told, logs, found, simulated)
     told = replace(told, remarks=(*([ANOTHER_MOTION] if apart else []), *left_out, *told.remarks))
     told = replace(told, findings=(*moments[0], *told.findings), located=tuple(moments[1]) or told.located)
-    for signal in signals:
-        assert sim is not None
+    for signal, real, there in beside:
         say(3, 4, signal)
-        told = _with_signal(told, reals[0], sim, signal)
+        told = _with_signal(told, diagnose_signal(real, there, others(reals[0], signal), signal))
     say(4, 4, "")
     return told
 
@@ -200,9 +200,9 @@ def _moves_apart(reals: Sequence[Recording], sim: Recording, signals: Sequence[s
     return True
 
 
-def _with_signal(told: Diagnosis, real: Place, sim: Place, signal: str) -> Diagnosis:
+def _with_signal(told: Diagnosis, one: SignalDiagnosis) -> Diagnosis:
     """The answer with what another field of both logs says."""
-    one = diagnose_signal(read_field(real, signal), read_field(sim, signal), others(real, signal), signal)
+    signal = one.signal
     return replace(
         told,
         located=(*told.located, *one.located),
