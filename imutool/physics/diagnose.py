@@ -24,6 +24,7 @@ from imutool.physics.effects import _catalogue
 from imutool.physics.effects._forward import Physics
 from imutool.physics.fit import Chosen, Fit, Weighed, derivatives, expected, fit
 from imutool.physics.found import NO_EFFECT
+from imutool.physics.held import only
 from imutool.physics.motion import smooth_motion
 from imutool.physics.pair import LEAST_S, Pair, of_one_motion, with_simulation, with_truth
 from imutool.physics.reference import wrong_for_moments
@@ -165,7 +166,9 @@ def measured(
     truth: str | None = None,
     effects: Sequence[str] = EVERY_UNIT,
 ) -> Fit:
-    """Some effects of the catalogue, fitted to a recording together whether they show or not: what units are compared by.
+    """Some effects of the catalogue, fitted to a recording together whether they are there or not: what units are compared by.
+
+    Left out is what could not be seen even if it were there: the scale of a gyro's axis that never turns.
 
     Raises:
         ConfigError, LogError, DataError: as `diagnose`; or an effect that has nothing to be fitted to here.
@@ -173,8 +176,14 @@ def measured(
     simulated = None if sim is None else read_log(sim, imu=imu)
     pairs = [_telling(pair) for pair in _pairs(read_log(real, imu=imu, truth=truth), simulated, truth)]
     candidates = _candidates(pairs)
-    begun = tuple((one, one.nothing.astype(float)) for one in _catalogue.physics(effects))
-    return fit([_weighed(pair, candidates) for pair in pairs], begun, part="all")
+    logs = [_weighed(pair, candidates) for pair in pairs]
+    asked = _catalogue.physics(effects)
+    hidden = set(unseen(logs, asked))
+    shown = []
+    for one in asked:
+        free = [k for k, number in enumerate(one.parameters) if not {one.name, f"{one.name}.{number.name}"} & hidden]
+        shown += [only(one, free)] if free else []
+    return fit(logs, tuple((one, one.nothing.astype(float)) for one in shown), part="all")
 
 
 def _moves_apart(reals: Sequence[Recording], sim: Recording, signals: Sequence[str]) -> bool:
