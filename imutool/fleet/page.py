@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from imutool import __version__
-from imutool.fleet.robots import Compared, Outlier
+from imutool.fleet.robots import FEWEST, Compared, Outlier
 from imutool.fleet.task import Result, Settings
 from imutool.mcap_io.target import Target
 from imutool.place import Place
@@ -212,7 +212,7 @@ def _warnings(seen: _Seen) -> Iterator[str]:
 def _outliers(compared: Compared) -> Iterator[str]:
     yield "<h2>Robots unlike the others</h2>"
     if not compared.outliers:
-        yield '<p class="note">None.</p>'
+        yield f'<p class="note">{"None." if compared.robots >= FEWEST else "Nobody can tell among so few."}</p>'
     else:
         head = "".join(f"<th>{one}</th>" for one in ("Robot", "What", "Here", "The others", "Distance", "False discovery"))
         rows = "".join(_outlier(one) for one in compared.outliers[:MOST_ROWS])

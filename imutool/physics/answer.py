@@ -81,10 +81,14 @@ def told(
         unexplained=unexplained,
         remarks=(*_remarks(pairs), *_resting(pairs, hidden), *remarks(all_found, known)),
         closer=closer(logs, before, after),
-        traces=tuple(
-            Traces(pair.name, pair.stamp_s, pair.real, b, a, pair.held_out, pair.truth, expected(pair, ()), reals[pair.name])
-            for pair, b, a in zip(pairs, before, after, strict=True)
-        ),
+        traces=tuple(_traces(pair, b, a, reals[pair.name]) for pair, b, a in zip(pairs, before, after, strict=True)),
+    )
+
+
+def _traces(pair: Pair, before: Float64[np.ndarray, "n 6"], after: Float64[np.ndarray, "n 6"], path: str) -> Traces:
+    ideal = expected(pair, ())
+    return Traces(
+        pair.name, pair.stamp_s, pair.real, before, after, pair.held_out, pair.truth, ideal, band_hz=pair.band_hz, path=path
     )
 
 
@@ -92,15 +96,15 @@ def without_held_out(logs: Sequence[Weighed], found: Discovery, d: Diagnosis) ->
     """What was found as physics.toml has it, with the numbers that the fitted time alone says; digits are no motion's."""
     theta = {physics.name: value for physics, value in found.fitted.chosen}
     judged = {(_effect(one), one.physics.equation): replace(one, theta=theta[one.physics.name]) for one in found.judged}
-    findings = []
-    for one in d.findings:
-        fitted = judged.get((one.effect, one.equation))
-        if fitted is not None:
-            parameters = _parameters([log.pair for log in logs], fitted)
-            findings.append(replace(one, parameters=parameters, curve=_curve(logs[0].pair, fitted, found.fitted)))
-        else:
-            findings.append(one)
-    return physics_file(replace(d, findings=tuple(one for one in findings if one.effect != QUANTIZATION)))
+    pairs = [log.pair for log in logs]
+
+    def fitted(one: Finding) -> Finding:
+        there = judged.get((one.effect, one.equation))
+        if there is None:
+            return one
+        return replace(one, parameters=_parameters(pairs, there), curve=_curve(pairs[0], there, found.fitted))
+
+    return physics_file(replace(d, findings=tuple(fitted(one) for one in d.findings if one.effect != QUANTIZATION)))
 
 
 def _not_identifiable(found: Discovery, named: Sequence[Finding], hidden: Sequence[str]) -> tuple[str, ...]:

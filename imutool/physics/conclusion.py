@@ -125,12 +125,23 @@ SENTENCES: Mapping[str, str | Callable[[Words], str]] = {
 
 def conclusion(d: Diagnosis) -> str:
     """The answer in a few sentences: findings by signal, strongest first, then what remains and what cannot be seen."""
+    return " ".join([*answer(d), *besides(d)])
+
+
+def answer(d: Diagnosis) -> list[str]:
+    """The sentences that matter most: what was found, and what is left."""
     said = _found(d) if d.mismatch else [NULL if d.unexplained else UNKNOWN]
     left = _remains(d)
     if 0 < len(d.findings) <= FULL and len({one.signal for one in d.findings}) == 1 and len(left) == 1:
         said[-1] = f"{said[-1][:-1]}; {left[0][0].lower()}{left[0][1:]}"  # one thought, one sentence
     elif d.mismatch or not all(one.white for one in d.unexplained.values()):
         said += left
+    return said
+
+
+def besides(d: Diagnosis) -> list[str]:
+    """What else there is to say: how much closer a second simulation came, and what cannot be seen."""
+    said = []
     touched = {part for one in d.findings for part in signals(one.signal)}
     gone = {signal: one.share for signal, one in d.closer.items() if signal in touched and one.by == "second simulation"}
     again = [f"{percent(share)} of the misfit of {_the(signal)}" for signal, share in gone.items() if share is not None]
@@ -140,7 +151,7 @@ def conclusion(d: Diagnosis) -> str:
     if hidden := cannot_show(d):
         more = [f"{len(hidden) - LISTED} more effects in whole or part"] if len(hidden) > LISTED + 1 else hidden[LISTED:]
         said.append(f"These logs cannot show: {', '.join([*hidden[:LISTED], *more])}.")
-    return " ".join(said)
+    return said
 
 
 def cannot_show(d: Diagnosis) -> list[str]:

@@ -16,7 +16,7 @@ from imutool.mcap_io.read import read as read_log
 from imutool.physics import answer, stamps, unnamed
 from imutool.physics.again import simulated_again
 from imutool.physics.alone import by_samples
-from imutool.physics.any_signal import diagnose_signal
+from imutool.physics.any_signal import SignalDiagnosis, diagnose_signal
 from imutool.physics.apart import ANOTHER_MOTION
 from imutool.physics.course import Chosen
 from imutool.physics.diagnosis import Closer, Diagnosis, Finding
@@ -25,6 +25,7 @@ from imutool.physics.effects import _catalogue
 from imutool.physics.effects._forward import Physics
 from imutool.physics.fit import Fit, Weighed, expected, fit
 from imutool.physics.found import NO_EFFECT
+from imutool.physics.held import only
 from imutool.physics.motion import smooth_motion
 from imutool.physics.pair import LEAST_S, Pair, of_one_motion, with_simulation, with_truth
 from imutool.physics.reference import wrong_for_moments
@@ -71,6 +72,7 @@ def diagnose(
     if signals and (sim is None or len(reals) != 1):
         raise ConfigError("--signal compares one recording with its simulation", where="--signal", fix="Give one log and --sim")
     say(0, 4, "reading")
+    beside = [] if sim is None else [(one, read_field(reals[0], one), read_field(sim, one)) for one in signals]
     recordings = _by_names([read_log(real, imu=imu, truth=truth) for real in reals])
     simulated = None if sim is None else read_log(sim, imu=imu)
     known: tuple[Finding, ...] = ()
@@ -97,10 +99,9 @@ def diagnose(
         told = _again(told, logs, found, simulated)
     told = replace(told, remarks=(*([ANOTHER_MOTION] if apart else []), *left_out, *told.remarks))
     told = replace(told, findings=(*moments[0], *told.findings), located=tuple(moments[1]) or told.located)
-    for signal in signals:
-        assert sim is not None
+    for signal, real, there in beside:
         say(3, 4, signal)
-        told = _with_signal(told, reals[0], sim, signal)
+        told = _with_signal(told, diagnose_signal(real, there, others(reals[0], signal), signal))
     say(4, 4, "")
     return told
 
@@ -165,7 +166,9 @@ def measured(
     truth: str | None = None,
     effects: Sequence[str] = EVERY_UNIT,
 ) -> Fit:
-    """Some effects of the catalogue, fitted to a recording together whether they show or not: what units are compared by.
+    """Some effects of the catalogue, fitted to a recording together whether they are there or not: what units are compared by.
+
+    Left out is what could not be seen even if it were there: the scale of a gyro's axis that never turns.
 
     Raises:
         ConfigError, LogError, DataError: as `diagnose`; or an effect that has nothing to be fitted to here.
@@ -173,8 +176,14 @@ def measured(
     simulated = None if sim is None else read_log(sim, imu=imu)
     pairs = [_telling(pair) for pair in _pairs(read_log(real, imu=imu, truth=truth), simulated, truth)]
     candidates = _candidates(pairs)
-    begun = tuple((one, one.nothing.astype(float)) for one in _catalogue.physics(effects))
-    return fit([weighed(pair, candidates) for pair in pairs], begun, part="all")
+    logs = [weighed(pair, candidates) for pair in pairs]
+    asked = _catalogue.physics(effects)
+    hidden = set(unseen(logs, asked))
+    shown = []
+    for one in asked:
+        free = [k for k, number in enumerate(one.parameters) if not {one.name, f"{one.name}.{number.name}"} & hidden]
+        shown += [only(one, free)] if free else []
+    return fit(logs, tuple((one, one.nothing.astype(float)) for one in shown), part="all")
 
 
 def remaining(real: Place, chosen: Chosen = (), *, imu: str | None = None, truth: str | None = None) -> dict[str, Closer]:
@@ -218,9 +227,9 @@ def _moves_apart(reals: Sequence[Recording], sim: Recording, signals: Sequence[s
     return True
 
 
-def _with_signal(told: Diagnosis, real: Place, sim: Place, signal: str) -> Diagnosis:
+def _with_signal(told: Diagnosis, one: SignalDiagnosis) -> Diagnosis:
     """The answer with what another field of both logs says."""
-    one = diagnose_signal(read_field(real, signal), read_field(sim, signal), others(real, signal), signal)
+    signal = one.signal
     return replace(
         told,
         located=(*told.located, *one.located),

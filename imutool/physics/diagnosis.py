@@ -131,6 +131,7 @@ class Traces:
     held_out: Bool[np.ndarray, " n"]
     truth: Poses | None = None  # at these samples
     ideal: Float64[np.ndarray, "n 6"] | None = None  # what a perfect sensor would have read
+    band_hz: float | None = None  # above it what was expected is not known
     path: str = ""  # of the log, as `Diagnosis.real` has it
 
 

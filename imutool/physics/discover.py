@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float64
@@ -25,6 +25,7 @@ from imutool.physics.course import Chosen
 from imutool.physics.effects._forward import Physics, Theta
 from imutool.physics.faint import faint
 from imutool.physics.fit import Fit, Weighed, expected, fit
+from imutool.physics.held import Held, only
 from imutool.physics.onset import onsets
 from imutool.physics.pair import Pair
 from imutool.physics.panel import Panel
@@ -332,7 +333,7 @@ class _Search:
             for number, s in zip(physics.parameters, std, strict=True)
             if s > (fits.LOG_PRIOR if number.positive else number.plausible) and not isinstance(physics.forward, Curve)
         ]
-        if isinstance(physics.forward, _Held):
+        if isinstance(physics.forward, Held):
             kept = {number.name for number in physics.parameters}
             unseen += [f"{physics.name}.{n.name}" for n in physics.forward.physics.parameters if n.name not in kept]
         return Judged(physics, theta, std, tuple(unseen), float(np.exp(max(log_p, -700.0))), rate, gain)
@@ -350,18 +351,6 @@ def _as_read(pair: Pair) -> Read:
     return Read(pair.stamp_s, pair.real[:, :3], pair.real[:, 3:], np.zeros((len(pair.real), 3)))
 
 
-class _Held:
-    """An effect with some of its parameters held at nothing, because no motion showed them."""
-
-    def __init__(self, physics: Physics, free: Sequence[int]) -> None:
-        self.physics, self.free = physics, list(free)
-
-    def __call__(self, signals: Any, theta: Theta) -> Any:
-        every = self.physics.nothing.astype(float)
-        every[self.free] = theta
-        return self.physics.forward(signals, every)
-
-
 def _plausible(physics: Physics, theta: Theta) -> Physics:
     """Itself, or without the parameters that came out many times larger than anything met: a fit to noise, not a number."""
     if not physics.linear or ":" in physics.name:
@@ -369,7 +358,7 @@ def _plausible(physics: Physics, theta: Theta) -> Physics:
     free = [k for k, (n, v) in enumerate(zip(physics.parameters, theta, strict=True)) if abs(v) <= IMPLAUSIBLE * n.plausible]
     if len(free) == len(theta):
         return physics
-    return replace(physics, parameters=tuple(physics.parameters[k] for k in free), forward=_Held(physics, free))
+    return only(physics, free)
 
 
 def _set_in_as(fitted: Chosen, whole: Chosen) -> Chosen:

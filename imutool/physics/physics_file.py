@@ -38,7 +38,6 @@ import difflib
 import json
 import re
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -54,6 +53,7 @@ from imutool.physics.effects import _catalogue
 from imutool.physics.effects._base import AXES
 from imutool.physics.effects._forward import Number, Physics, Stage, Theta
 from imutool.physics.readings import Read
+from imutool.physics.variables import VARIABLES, factor, words
 
 SCHEMA = "imutool.physics/1"
 DRIVEN = "driven"
@@ -309,77 +309,17 @@ def _curve(curve: Curve, k: int, where: str | Path) -> Physics:
 
 def _term(term: Term, k: int, where: str | Path) -> Physics:
     """Factors are variables, |variable|, variable^n or sign(variable), with a space or a bar between them."""
-    factors = [_factor(word) for word in _words(term.term)]
+    factors = [factor(word) for word in words(term.term)]
     if not factors or None in factors:
         raise _unknown(f"term[{k}].term", term.term, [f"products of {', '.join(VARIABLES)}"], where)
 
     def forward(read: Read, _: Theta) -> Read:
-        size = np.prod([factor(read) for factor in factors if factor is not None], axis=0)
+        size = np.prod([one(read) for one in factors if one is not None], axis=0)
         return _added(read, term.signal, np.outer(size, term.value))
 
     return Physics(
         f"{UNKNOWN}[term {k}]", Stage.SENSOR, (term.signal,), f"{term.signal} += c {term.term}", (), "it varies", forward
     )
-
-
-Variable = Callable[[Read], Float64[np.ndarray, " n"]]
-
-
-def _column(name: str, axis: int) -> Variable:
-    def column(read: Read) -> Float64[np.ndarray, " n"]:
-        values: Float64[np.ndarray, "n 3"] = getattr(read, name)
-        return values[:, axis]
-
-    return column
-
-
-VARIABLES: dict[str, Variable] = {
-    **{f"omega_{axis}": _column("gyro", k) for k, axis in enumerate(AXES)},
-    **{f"f_{axis}": _column("accel", k) for k, axis in enumerate(AXES)},
-    **{f"alpha_{axis}": _column("alpha", k) for k, axis in enumerate(AXES)},
-    "|omega|": lambda read: np.asarray(np.linalg.norm(read.gyro, axis=1)),
-    "|f|": lambda read: np.asarray(np.linalg.norm(read.accel, axis=1)),
-    "t": lambda read: read.stamp_s,
-}
-
-
-def _words(text: str) -> list[str]:
-    """`omega_x|omega_x|` is two factors, `omega_x omega_y` as well."""
-    return re.findall(r"\|[^|]*\||sign\([^()]*\)|[^\s|]+", text)
-
-
-def _factor(word: str) -> Variable | None:
-    """A variable, its size, its sign, or a power of it; None where it is none of these."""
-    for pattern, change in CHANGES:
-        found = re.fullmatch(pattern, word)
-        if found and found[1] in VARIABLES:
-            power = float(found[2]) if found.lastindex == 2 else 1.0
-            return _Factor(VARIABLES[found[1]], change, power)
-    return None
-
-
-@dataclass(frozen=True)
-class _Factor:
-    """sign, size or a power of a variable."""
-
-    variable: Variable
-    change: Callable[[Any], Any]
-    power: float
-
-    def __call__(self, read: Read) -> Float64[np.ndarray, " n"]:
-        return np.asarray(self.change(self.variable(read)) ** self.power)
-
-
-def _same(x: Any) -> Any:
-    return x
-
-
-CHANGES: tuple[tuple[str, Callable[[Any], Any]], ...] = (
-    (r"(.+)", _same),
-    (r"\|(.+)\|", np.abs),
-    (r"sign\((.+)\)", np.sign),
-    (r"(.+)\^([1-9])", _same),
-)
 
 
 def _channel(read: Read, name: str) -> Float64[np.ndarray, " n"]:

@@ -19,8 +19,8 @@ from imutool.physics.effects import _catalogue
 from imutool.physics.effects._base import Sensor
 from imutool.physics.effects._forward import Number, Physics, Stage, Theta
 from imutool.physics.pair import Pair
-from imutool.physics.physics_file import VARIABLES
 from imutool.physics.readings import Read, Vectors
+from imutool.physics.variables import VARIABLES
 
 LAGS_S = (-0.5, -0.2, -0.1, -0.05, 0.0, 0.05, 0.1, 0.2, 0.5)
 KNOTS, FINE_KNOTS = 9, 33

@@ -10,11 +10,12 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float64
-from scipy.signal import welch
+from scipy.signal import fftconvolve, welch
 from scipy.spatial.transform import Rotation
 
 from imutool.physics.conclusion import signals
 from imutool.physics.diagnosis import Curve, Diagnosis, Located, SignalTraces, Traces
+from imutool.physics.whitening import Band
 from imutool.view.drawing import Line, Thin, averaged, extremes, plain_numbers, spans, svg
 from imutool.view.theme import AFTER, AXES, BEFORE, HELD, INK, MARK, TITLES, UNITS
 
@@ -66,7 +67,7 @@ def residual(trace: Traces, *, found: bool) -> str:
         for column, (signal, part) in enumerate(SIGNALS.items()):
             for row, axes in enumerate(panels[:, column]):
                 for expected, color in _sides(trace, found):
-                    left = (trace.real - expected)[:, part][:, row]
+                    left = known(trace, expected)[:, part][:, row]
                     axes.plot(*extremes(trace.t_s, left, BUCKETS), color=color, lw=0.6)
                 for first, last in spans(trace.t_s, trace.held_out):
                     axes.axvspan(first, last, color=HELD, alpha=0.15, lw=0)
@@ -173,6 +174,15 @@ def located_in(trace: Traces, place: Located) -> Iterator[tuple[float, float]]:
             yield low, high
 
 
+def known(trace: Traces, expected: Float64[np.ndarray, "n 6"]) -> Float64[np.ndarray, "n 6"]:
+    """Real minus expected, without what is faster than the expected is known."""
+    left = trace.real - expected
+    if trace.band_hz is None:
+        return left
+    taps = Band.below(trace.band_hz, rate_hz(trace)).taps
+    return np.asarray(fftconvolve(left, taps[:, None], mode="same", axes=0))
+
+
 def unseen(trace: Traces) -> Bool[np.ndarray, " n"]:
     """Samples that no fit has seen; all of them where none was held out."""
     return trace.held_out if trace.held_out.any() else np.ones_like(trace.held_out)
@@ -189,12 +199,12 @@ def _sides(trace: Traces, found: bool) -> list[tuple[Float64[np.ndarray, "n 6"],
 
 def _local_rms(trace: Traces, edges: Line) -> Float64[np.ndarray, "bins 6"]:
     """Root mean square of the misfit before, a row each between edges; NaN where there is no sample."""
-    squares = (trace.real - trace.before) ** 2
-    known = np.isfinite(squares)
+    squares = known(trace, trace.before) ** 2
+    there = np.isfinite(squares)
     bins = np.clip(np.searchsorted(edges, trace.t_s, side="right") - 1, 0, len(edges) - 2)
     sums, counts = np.zeros((2, len(edges) - 1, 6))
-    np.add.at(sums, bins, np.where(known, squares, 0.0))
-    np.add.at(counts, bins, known)
+    np.add.at(sums, bins, np.where(there, squares, 0.0))
+    np.add.at(counts, bins, there)
     out: Float64[np.ndarray, "bins 6"] = np.sqrt(np.where(counts > 0, sums, np.nan) / np.maximum(counts, 1))
     return out
 
@@ -241,7 +251,7 @@ def _binned(d: Diagnosis, variable: Callable[[Traces, str, int], Line], names: d
                 x = np.concatenate([variable(trace, signal, axis)[unseen(trace)] for trace in d.traces])
                 blocks = np.concatenate([_blocks(trace, k)[unseen(trace)] for k, trace in enumerate(d.traces)])
                 for side, color in enumerate((BEFORE, AFTER)[: 1 + bool(d.findings)]):
-                    left = [trace.real - (trace.after if side else trace.before) for trace in d.traces]
+                    left = [known(trace, trace.after if side else trace.before) for trace in d.traces]
                     y = np.concatenate([one[unseen(t), part][:, axis] for one, t in zip(left, d.traces, strict=True)])
                     centre, mean, band = means(x, y, blocks)
                     axes.fill_between(centre, mean - band, mean + band, color=color, alpha=0.25, lw=0)

@@ -9,11 +9,12 @@ from pathlib import Path
 from imutool import __version__
 from imutool.mcap_io.target import Target
 from imutool.physics.conclusion import (
+    answer,
     before_after,
+    besides,
     by_chance,
     came_closer,
     cannot_show,
-    conclusion,
     does,
     measured,
     name,
@@ -61,7 +62,8 @@ def html(d: Diagnosis, *, logs: str | None = None) -> str:
     )
     body = [
         f"<h1>{text(names)} {text(against)}</h1>",
-        f'<p class="conclusion">{text(conclusion(d))}</p>',
+        f'<p class="conclusion">{text(" ".join(answer(d)))}</p>',
+        *(f'<p class="note">{text(one)}</p>' for one in besides(d)),
         *(f'<p class="note">{text(one)}</p>' for one in d.remarks),
         *([f'<p><a href="{text(logs)}">The recordings themselves</a>: signals, spectra, events.</p>'] if logs else []),
         *_findings(d),
@@ -77,14 +79,13 @@ def html(d: Diagnosis, *, logs: str | None = None) -> str:
 def _findings(d: Diagnosis) -> Iterator[str]:
     if not d.findings:
         return
-    head = "".join(f"<th>{one}</th>" for one in ("What", "Equation", "Value", "Removes", "By chance"))
+    head = "".join(f"<th>{one}</th>" for one in ("What", "Equation", "Removes", "By chance"))
     yield "<h2>What was left out</h2>"
     yield f'<div class="scroll"><table class="findings"><thead><tr>{head}</tr></thead><tbody>'
     for one in d.findings:
         cells = [
             f"<strong>{text(name(one))}</strong> {text(one.signal)}<br>{text(does(d, one))}{_similar(one)}",
-            f"<code>{text(one.equation)}</code>",
-            _values(one),
+            f"<code>{text(one.equation)}</code>{_entries(one)}",
             _gain(one),
             f"<span class=entry>{text(by_chance(one.false_discovery_rate, short=True))}</span>",
         ]
@@ -105,19 +106,17 @@ def _similar(one: Finding) -> str:
     return f"<br>could as well be {text(' or '.join(one.similar))}" if one.similar else ""
 
 
-def _values(one: Finding) -> str:
-    """Every parameter, all entries of a matrix too; a curve is drawn instead."""
+def _entries(one: Finding) -> str:
+    """All entries of a matrix, of which the sentence tells the clearest; a curve is drawn instead."""
     if one.curve is not None:
-        return f"a curve of {text(one.curve.variable)}, drawn below"
+        return f"<br>a curve of {text(one.curve.variable)}, drawn below"
     out = []
     for quantity in grouped(one.parameters):
-        if len(quantity.estimates) <= SHOWN:
-            out.append(text(quantity.labelled))
-        else:
+        if len(quantity.estimates) > SHOWN:
             entries, unit = each(quantity.estimates, quantity.axes)
             listed = "; ".join(f"<span class=entry>{text(entry)}</span>" for entry in entries)
-            out.append(f"{text(quantity.label)} {listed} {text(unit)}".strip())
-    return "<br>".join(out)
+            out.append(f"<br>{text(quantity.label)} {listed} {text(unit)}".rstrip())
+    return "".join(out)
 
 
 def _places(d: Diagnosis) -> Iterator[str]:
@@ -129,7 +128,7 @@ def _places(d: Diagnosis) -> Iterator[str]:
     yield f'<div class="scroll"><table><thead>{head}</thead><tbody>{rows}</tbody></table></div>'
     for k, trace in enumerate(d.traces[:MOST_LOGS]):
         caption = (
-            f"{text(trace.log)}: local size of the misfit, by axis (each sensor to its own largest). "
+            f"{text(trace.log)}: local size of the misfit{_band(trace)}, by axis (each sensor to its own largest). "
             '<span class="key" style="background: var(--mark)"></span>where it was located' + HELD
         )
         yield _figure(figures.where(d, trace), f"w{k}", caption)
@@ -143,7 +142,8 @@ def _before_and_after(d: Diagnosis) -> Iterator[str]:
     over = "unseen time of all logs" if any(one.held_out.any() for one in d.traces) else "all time: none was held out"
     yield f"<h2>{'Before and after' if found else 'What separates the two'}</h2>"
     for k, trace in enumerate(d.traces[:MOST_LOGS]):
-        yield _figure(figures.residual(trace, found=found), f"r{k}", f"{text(trace.log)}: over time. {both}{HELD}")
+        drawn = figures.residual(trace, found=found)
+        yield _figure(drawn, f"r{k}", f"{text(trace.log)}: over time{_band(trace)}. {both}{HELD}")
     for k, (signal, beside) in enumerate(d.signals.items()):
         drawn = figures.signal(beside, found=any(one.signal == signal for one in d.findings))
         yield _figure(drawn, f"g{k}", f"{text(signal)}: over time. {both}{HELD}")
@@ -218,6 +218,11 @@ def _samples(trace: Traces) -> str:
     unseen = float(trace.held_out.mean()) * float(trace.t_s[-1] - trace.t_s[0])
     span = f"{trace.t_s[0]:.1f} to {trace.t_s[-1]:.1f} s"
     return f"{trace.log}: {len(trace.t_s)} at {figures.rate_hz(trace):.0f} Hz, {span}, {unseen:.0f} s of it unseen by any fit"
+
+
+def _band(trace: Traces) -> str:
+    """Up to where what is expected is known."""
+    return "" if trace.band_hz is None else f" below {trace.band_hz:.2g} Hz, up to where the poses know the motion"
 
 
 def _figure(svg: str, prefix: str, caption: str) -> str:

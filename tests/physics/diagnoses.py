@@ -8,6 +8,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from imutool.physics.diagnosis import (
+    Closer,
     Curve,
     Diagnosis,
     Estimate,
@@ -145,7 +146,7 @@ BOTH = replace(
     located=(FAST, TURNING),
     findings=(LEVER_ARM, LAG),
     not_identifiable=("gyro_scale.x", "gravity.tilt"),
-    closer={"gyro": HeldOut(0.02, 0.0074, "rad/s", 90.0), "accel": HeldOut(0.52, 0.19, "m/s^2", 90.0)},
+    closer={"gyro": Closer(0.02, 0.0074, "rad/s", 90.0, 0.9), "accel": Closer(0.52, 0.19, "m/s^2", 90.0, 0.87)},
     remarks=("The truth ends 2 s before the log.",),
     traces=(traces(arm=True, late=True),),
 )

@@ -16,7 +16,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import imutool.physics.effects
-from imutool.physics.conclusion import NULL, SENTENCES, conclusion, lines, p_value, percent, rms, sentence, signals
+from imutool.physics.conclusion import NULL, SENTENCES, by_chance, conclusion, lines, percent, rms, sentence, signals, table
 from imutool.physics.diagnosis import Estimate, Finding, HeldOut, Located, Unexplained
 from imutool.physics.quantity import grouped, value, vector
 
@@ -55,8 +55,8 @@ def test_a_lever_arm_is_a_vector_and_a_regime_without_a_preposition_gets_one() -
 
 def test_nothing_is_said_plainly_and_what_cannot_be_seen_with_it() -> None:
     assert conclusion(MADE.NOTHING) == NULL == "Nothing but a constant bias and noise separates the two."
-    still = replace(MADE.NOTHING, not_identifiable=("gyro_scale.x", "lever_arm.z"))
-    assert conclusion(still) == f"{NULL} The motion cannot show: gyro_scale.x, lever_arm.z."
+    still = replace(MADE.NOTHING, not_identifiable=("gyro_scale.x", "gyro_scale.y", "lever_arm", "/odom.v.delay"))
+    assert conclusion(still) == f"{NULL} These logs cannot show: gyro_scale (x, y), lever_arm, /odom.v.delay."
 
 
 def test_several_findings_come_strongest_first_by_signal_compared_with_the_poses_if_nothing_was_simulated() -> None:
@@ -64,7 +64,7 @@ def test_several_findings_come_strongest_first_by_signal_compared_with_the_poses
     assert said.startswith("Two things were left out. The accel differs ")
     assert said.index("lever_arm") < said.index("The gyro differs when turning: it lags the true poses by 12.4 ± 0.3 ms")
     assert said.count("of unseen data") == 1  # the same 30 s
-    assert said.endswith("Nothing else stands above the noise. The motion cannot show: gyro_scale.x, gravity.tilt.")
+    assert said.endswith("Nothing else stands above the noise. These logs cannot show: gyro_scale (x), gravity (tilt).")
 
 
 def test_two_findings_on_one_signal_share_its_sentence() -> None:
@@ -110,7 +110,7 @@ def test_what_cannot_be_told_apart_is_said_beside_the_name() -> None:
 
 def test_a_place_without_a_name_is_not_passed_over() -> None:
     said = conclusion(MADE.UNEXPLAINED)
-    assert "The accel differs at angular rate above 0.4 rad/s (p = 1e-09), and what was left out could not be named." in said
+    assert "The accel differs at angular rate above 0.4 rad/s, and what was left out could not be named." in said
     assert "What remains of the accel is 0.2 against 0.05 m/s² of noise, and has no explanation yet." in said
 
 
@@ -183,9 +183,9 @@ def test_lines_hold_each_finding_place_gain_and_remark() -> None:
     assert said[0] == conclusion(MADE.BOTH)
     assert said[1] == (
         "1. lever_arm (accel): (0.213, -0.051, 0.120) ± 0.004 m; rms 0.52 to 0.19 m/s² on 30 s of unseen data; "
-        "p = 1e-12, false discovery rate 1 %"
+        "1 in 100 by chance"
     )
-    assert said[3] == "Where: accel x, y, angular rate above 0.4 rad/s, 12.0 to 48.5 s; 83 % of the misfit, p = 1e-09"
+    assert said[3] == "Where: accel x, y, angular rate above 0.4 rad/s, 12.0 to 48.5 s; 83 % of the misfit"
     assert said[5] == (
         "With everything that was found, over 90 s held out of the search: "
         "gyro rms 0.02 to 0.0074 rad/s, 63 % closer; accel rms 0.52 to 0.19 m/s², 63 % closer"
@@ -198,7 +198,7 @@ def test_lines_hold_each_finding_place_gain_and_remark() -> None:
 def test_many_stretches_are_counted_not_listed() -> None:
     many = Located("gyro", ("x",), tuple((float(k), k + 0.5) for k in range(9)), "", 0.5, 0.01)
     assert lines(replace(MADE.NOTHING, located=(many,)))[1] == (
-        "Where: gyro x, 0.0 to 0.5 s, 1.0 to 1.5 s, 7 more stretches; 50 % of the misfit, p = 0.01"
+        "Where: gyro x, 0.0 to 0.5 s, 1.0 to 1.5 s, 7 more stretches; 50 % of the misfit"
     )
 
 
@@ -332,8 +332,44 @@ def test_a_share_is_never_nothing_or_all_unless_it_is(share: float, words: str) 
 
 
 def test_a_chance_too_small_for_a_float_is_a_bound() -> None:
-    assert p_value(0.0) == "p < 1e-300"
-    assert p_value(2.5e-12) == "p = 2e-12"
+    assert by_chance(0.0) == "less than 1 in 10⁹ by chance"
+    assert by_chance(5e-7) == "1 in 2 000 000 by chance"
+    assert by_chance(0.25) == "25 % by chance"
+    assert by_chance(1e-12, short=True) == "below 10⁻⁹"
+
+
+def test_a_second_simulation_is_told_with_the_share_of_the_misfit_that_is_gone() -> None:
+    again = {signal: replace(one, by="second simulation") for signal, one in MADE.BOTH.closer.items()}
+    d = replace(MADE.BOTH, closer=again)
+    words = "90 % of the misfit of the gyro and 87 % of the misfit of the accel is gone on 90 s of unseen time."
+    assert f"Simulated again with this, {words}" in conclusion(d)
+    assert any(line.startswith("Simulated again with everything that was found, over 90 s held") for line in lines(d))
+    assert "Simulated again" not in conclusion(MADE.BOTH)
+    only_gyro = conclusion(replace(d, findings=(MADE.LAG,)))
+    assert "90 % of the misfit of the gyro is gone" in only_gyro
+
+
+def test_many_things_that_cannot_be_seen_are_counted() -> None:
+    many = replace(MADE.NOTHING, not_identifiable=tuple("abcdefgh"))
+    assert conclusion(many).endswith("These logs cannot show: a, b, c, d, 4 more effects in whole or part.")
+
+
+def test_an_axis_that_is_no_measurement_comes_first() -> None:
+    stuck = Located("accel", ("y",), ((0.0, 90.0),), "always: it reads 3.25 m/s² in every sample", 1.0, 0.0)
+    said = conclusion(replace(MADE.LATE, located=(MADE.TURNING, stuck)))
+    assert said.startswith("The accel's y is no measurement: it reads 3.25 m/s² in every sample. The gyro differs when turning")
+
+
+def test_the_table_has_a_row_for_each_finding_no_wider_than_a_terminal() -> None:
+    head, *rows = table(MADE.BOTH)
+    assert head == ["What", "Removes", "Value"]
+    assert rows[0] == ["lever_arm (accel)", "71 %", "(0.213, -0.051, 0.120) ± 0.004 m\n1 in 100 by chance"]
+    assert all(max(map(len, row[2].split("\n"))) <= 46 for row in rows)
+
+
+def test_a_place_of_one_of_several_logs_names_it() -> None:
+    place = replace(MADE.FAST, log="folder/second.mcap")
+    assert lines(replace(MADE.NOTHING, located=(place,)))[1].startswith("Where: second, accel x, y, angular rate above 0.4")
 
 
 def test_no_unseen_time_is_not_called_unseen() -> None:

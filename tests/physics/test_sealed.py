@@ -25,7 +25,8 @@ from imutool.mcap_io.write import write
 from imutool.physics.flight import flight
 from imutool.physics.sealed import ENVELOPE, FINDINGS, KEY, OPENED, REAL, SIM, conceal, opened
 from imutool.physics.sealing import draw, unnamed
-from imutool.physics.sealing.effects import ACCEL, CATALOGUE, EARTH_RAD_S, GYRO, NO_LIMIT, Reading, drawn
+from imutool.physics.sealing.amounts import drawn
+from imutool.physics.sealing.effects import ACCEL, CATALOGUE, EARTH_RAD_S, GYRO, NO_LIMIT, Reading
 from imutool.physics.sealing.envelope import unsealed
 from imutool.physics.sealing.filters import first_order, mount
 from imutool.physics.sealing.information import FALSE_ALARM, bounds, sight, visible

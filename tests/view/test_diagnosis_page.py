@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 
 from imutool.errors import ConfigError
 from imutool.physics.conclusion import conclusion
-from imutool.physics.diagnosis import SignalTraces
+from imutool.physics.diagnosis import Closer, SignalTraces
 from imutool.view import diagnosis_figures as figures
 from imutool.view import drawing
 from imutool.view.diagnosis_page import html, write
@@ -59,8 +59,8 @@ def test_the_table_holds_effect_signal_equation_value_share_unseen_time_and_chan
     said = Page(three).text
     row = said[said.index("lever_arm accel it sits") :]
     for words in (
-        "accel += alpha x r + omega x (omega x r)", "(0.213, -0.051, 0.120) ± 0.004 m", "71 %",
-        "rms 0.52 to 0.19 m/s² on 30 s", "p = 1e-12", "false discovery 1 %", "clock_offset",
+        "(0.213, -0.051, 0.120) ± 0.004 m", "accel += alpha x r + omega x (omega x r)", "71 %",
+        "rms 0.52 to 0.19 m/s² on 30 s", "1 in 100", "clock_offset",
     ):  # fmt: skip
         at = row.index(words)
         row = row[at + len(words) :]
@@ -133,7 +133,7 @@ def test_what_a_log_is_called_never_becomes_markup(three: str) -> None:
     hostile = replace(
         MADE.THREE, sim=MADE.HOSTILE, findings=(driver, nameless), located=(place,), remarks=(MADE.HOSTILE,),
         not_identifiable=(MADE.HOSTILE,), unexplained={MADE.HOSTILE: MADE.unexplained()["gyro"]}, traces=(),
-        closer={MADE.HOSTILE: MADE.LAG.held_out},
+        closer={MADE.HOSTILE: Closer.of(MADE.LAG.held_out, 0.001)},
     )  # fmt: skip
     page = Page(html(hostile))
     assert not page.tags & {"img", "script"}
@@ -271,14 +271,22 @@ def test_located_stretches_shade_the_axes_they_name_alone() -> None:
     assert shaded(("x", "y")) == 2 * shaded(("x",)) > 0
 
 
-def test_located_time_is_on_the_first_logs_clock_unless_each_log_has_its_own() -> None:
-    stretch = ((80.0, 120.0),)
-    apart = [MADE.traces("a", duration_s=90.0), MADE.traces("b", start_s=100.0, duration_s=90.0)]
-    assert list(figures.located_in(apart, apart[0], stretch)) == [(80.0, apart[0].t_s[-1])]
-    assert list(figures.located_in(apart, apart[1], stretch)) == [(100.0, 120.0)]
-    both = [MADE.traces("a"), MADE.traces("b")]
-    assert list(figures.located_in(both, both[0], stretch)) == [(80.0, both[0].t_s[-1])]
-    assert list(figures.located_in(both, both[1], stretch)) == []
+def test_a_place_is_shaded_in_its_own_log_and_in_every_stretch_of_it() -> None:
+    place = replace(MADE.FAST, intervals_s=((80.0, 120.0),))
+    first, second = MADE.traces("a", duration_s=90.0), MADE.traces("a", start_s=100.0, duration_s=90.0)
+    assert list(figures.located_in(first, place)) == [(80.0, first.t_s[-1])]
+    assert list(figures.located_in(second, place)) == [(100.0, 120.0)]
+    of_b = replace(place, log="b.mcap")
+    assert list(figures.located_in(replace(first, path="a.mcap"), of_b)) == []
+    assert list(figures.located_in(replace(first, path="b.mcap"), of_b)) == [(80.0, first.t_s[-1])]
+
+
+def test_beside_poses_a_misfit_is_drawn_as_far_as_they_know_the_motion() -> None:
+    trace = MADE.traces("a")
+    assert (figures.known(trace, trace.after) == trace.real - trace.after).all()
+    slow = figures.known(replace(trace, band_hz=4.0), trace.after)
+    away = slice(100, -100)  # a filter's length from the ends
+    assert slow[away].std() < 0.3 * (trace.real - trace.after)[away].std()  # white noise, of which 4 % of the band is left
 
 
 @given(st.lists(st.floats(-1e3, 1e3), min_size=1, max_size=400), st.integers(1, 50))

@@ -19,7 +19,8 @@ from numpy.random import Generator
 from imutool.errors import ConfigError, DataError
 from imutool.noise import SHEETS, Noise
 from imutool.physics.sealing import unnamed
-from imutool.physics.sealing.effects import CATALOGUE, Model, Stage, Theta, drawn
+from imutool.physics.sealing.amounts import drawn
+from imutool.physics.sealing.effects import CATALOGUE, Model, Stage, Theta
 from imutool.physics.sealing.information import Sight, visible
 
 Kind = Literal["single", "pair", "null", "driven", "unknown"]

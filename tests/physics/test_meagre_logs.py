@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 
-from imutool.errors import DataError
+from imutool.errors import DataError, LogError
 from imutool.mcap_io.write import write
 from imutool.physics.conclusion import conclusion
 from imutool.physics.diagnose import diagnose
@@ -171,6 +171,22 @@ def test_too_little_shared_time_is_refused_with_how_much_there_is(tmp_path: Path
     logs = moving(tmp_path, {}, sim_from_s=19.0)
     with pytest.raises(DataError, match=r"(4.9|5.0) s shared with the simulation.*at least 8 s"):
         diagnose([logs.real], logs.sim)
+
+
+# ── names ──
+
+
+def test_a_field_that_no_log_has_is_refused_before_anything_is_searched(tmp_path: Path) -> None:
+    logs, told = moving(tmp_path, {}), []
+    with pytest.raises(LogError, match=r"no topic /odom|/odom"):
+        diagnose([logs.real], logs.sim, signals=["/odom.twist"], tell=lambda done, total, word: told.append(word))
+    assert told == ["reading"]
+
+
+def test_an_imu_that_the_log_does_not_have_is_refused_with_those_there_are(tmp_path: Path) -> None:
+    real = moving(tmp_path, {}).real
+    with pytest.raises(LogError, match="/imu0"):
+        diagnose([real], imu="/imu7")
 
 
 # ── poses ──
