@@ -31,7 +31,7 @@ Signal = Float64[np.ndarray, "n 3"]
 
 
 class Slopes(NamedTuple):
-    """Of readings over what is expected, by axis: as it is (noise of the latter makes it small), and by the reverse regression."""
+    """Of readings over what is expected, by axis: as they are (noise of the latter makes them small), and reversed."""
 
     forward: Float64[np.ndarray, "3"]
     reverse: Float64[np.ndarray, "3"]
