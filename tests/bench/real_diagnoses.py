@@ -199,15 +199,16 @@ def gained(log: Log, physics: Path) -> dict[str, Any]:
 
 
 class Sensor:
-    """What is known of one sensor, made or read from the folder."""
+    """What is known of one sensor, made or read from the folder; `only` some sequences are run, or all."""
 
     def __init__(self, data_set: str, logs: Sequence[Log], out: Path, options: argparse.Namespace) -> None:
         self.data_set, self.logs, self.out, self.options = data_set, logs, out, options
+        self.only = options.sequences or [log.name for log in logs]
         self.effects = dict.fromkeys((EVERY_UNIT, MATRICES) if data_set in published() else (EVERY_UNIT,))
 
     def run(self) -> None:
         """Every sequence apart; then the training sequences' physics on the test sequences."""
-        for log in self.logs:
+        for log in (one for one in self.logs if one.name in self.only):
             kept(self.out / "diagnoses" / f"{log.name}.json", diagnosed, [log.path])
             for effects in self.effects:
                 kept(self._fixed(log, effects), fixed, log.path, effects)
@@ -237,9 +238,9 @@ class Sensor:
         return {name: path for name, path in paths.items() if path.exists()}
 
     def _learned(self) -> PhysicsFile | None:
-        """From the training sequences alone."""
+        """From the training sequences alone, once all of them have been diagnosed."""
         training = [log for log in self.logs if not log.test]
-        if not training:
+        if not all((self.out / "diagnoses" / f"{log.name}.json").exists() for log in training):
             return None
         if self.options.together:
             folder = self.out / "together" / self.data_set
@@ -340,16 +341,13 @@ def main() -> None:
     parser.add_argument("data", type=Path)
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--set", dest="sets", action="append", choices=sorted(TRAIN), help="data set; default all")
-    parser.add_argument("--sequence", dest="sequences", action="append", help="of these alone; default all")
+    parser.add_argument("--sequence", dest="sequences", action="append", help="run this one alone; default all")
     parser.add_argument("--together", action="store_true", help="search all training sequences at once")
     parser.add_argument("--tables", action="store_true", help="only tell what there is")
     options = parser.parse_args()
     sensors = []
     for data_set in options.sets or ("fetch", "tumvi", "euroc"):
-        logs = logs_of(options.data, options.out, data_set)
-        sensors.append(
-            Sensor(data_set, [log for log in logs if log.name in (options.sequences or {log.name})], options.out, options)
-        )
+        sensors.append(Sensor(data_set, logs_of(options.data, options.out, data_set), options.out, options))
         if not options.tables:
             sensors[-1].run()
     options.out.mkdir(parents=True, exist_ok=True)

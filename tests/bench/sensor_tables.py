@@ -212,6 +212,11 @@ def picture(
         axes[-1][column].set_xticks(
             range(len(sequences)), [name.split("_")[0] if sensor != "euroc" else name[:5] for name in sequences], fontsize=6
         )
+    colored = [
+        plt.Line2D([], [], color=color, marker="o", ms=3.5, lw=0.8, label=axis)
+        for axis, color in zip("xyz", COLORS, strict=True)
+    ]
+    axes[0][0].legend(handles=colored, fontsize=6, ncols=3, frameon=False)
     figure.tight_layout(pad=0.6)
     figure.savefig(path, dpi=85)
     plt.close(figure)

@@ -21,6 +21,8 @@ EXACT = 1e-12
 DRAWS = 2000
 OF_ONE = 0.05  # z of so many honest draws lies as near to 1: its own deviation is 1 / sqrt(2 * 2000)
 ARM_M = (0.3, -0.2, 0.25)
+DRAWN = 0.06  # of a slope from so many draws
+LAG_S = 5e-4  # of a lag: a matrix of all windows takes a little of what a mean lag does
 POSE_NOISE = 0.05  # of what the lever arm adds: how inexact splines through exact poses may be
 
 
@@ -42,6 +44,11 @@ def tables() -> Any:
 @pytest.fixture(scope="module")
 def bench(tables: Any) -> Any:
     return _load("real_diagnoses")
+
+
+@pytest.fixture(scope="module")
+def check(tables: Any) -> Any:
+    return _load("reference_check")
 
 
 def test_equal_deviations_make_the_mean_plain_and_z_the_spread_in_sigmas(tables: Any) -> None:
@@ -138,6 +145,27 @@ def test_only_what_the_sequences_agree_on_is_carried_over(bench: Any) -> None:
     assert [(entry.name, list(entry.parameters)) for entry in file.effect] == [("gyro_scale", ["z"])]
     assert file.effect[0].parameters["z"].value == pytest.approx(0.02)
     assert left == ["lever_arm.x", "lever_arm.y"]  # the sequences contradict each other; it is nothing
+
+
+def test_the_true_scale_lies_between_both_slopes_whichever_signal_is_noisy(check: Any) -> None:
+    rng = np.random.default_rng(2)
+    f = rng.normal(size=(DRAWS, 3))
+    noisy = f + 0.5 * rng.normal(size=(DRAWS, 3))
+    diluted, swollen = check.slopes(noisy, 1.05 * f), check.slopes(f, 1.05 * noisy)
+    np.testing.assert_allclose(diluted.forward, 1.05 / 1.25, atol=DRAWN)  # reliability var f / var E of 0.8
+    np.testing.assert_allclose(diluted.reverse, 1.05, atol=DRAWN)
+    np.testing.assert_allclose(swollen.forward, 1.05, atol=DRAWN)
+    np.testing.assert_allclose(swollen.reverse, 1.05 * 1.25, atol=DRAWN)
+
+
+def test_a_lag_that_changes_is_told_window_by_window_whatever_the_scale(check: Any) -> None:
+    t, rate_hz = np.arange(3200) / 100.0, 100.0
+    late_s = np.where(t < 16.0, 0.003, -0.002)
+    turning = [
+        np.stack([np.sin(2.0 * at + k) + np.cos(3.3 * at * (k + 1)) for k in range(3)], axis=1) for at in (t, t + late_s)
+    ]
+    lags = check.lags_s(turning[0], turning[1] @ np.diag([1.06, 0.91, 0.98]), rate_hz)
+    np.testing.assert_allclose(lags, [0.003, 0.003, -0.002, -0.002], atol=LAG_S)
 
 
 def test_physics_of_one_recording_removes_its_misfit_of_another(tmp_path: Path) -> None:
