@@ -178,7 +178,7 @@ def known(trace: Traces, expected: Float64[np.ndarray, "n 6"]) -> Float64[np.nda
     """Real minus expected, without what is faster than the expected is known."""
     left = trace.real - expected
     if trace.band_hz is None:
-        return left
+        return np.asarray(left)
     taps = Band.below(trace.band_hz, rate_hz(trace)).taps
     return np.asarray(fftconvolve(left, taps[:, None], mode="same", axes=0))
 
