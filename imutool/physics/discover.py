@@ -263,7 +263,9 @@ class _Search:
         gain, found = without.objective - now.objective, []
         for _, physics, start, promised in self.ranked(without, self.named)[:RIVALS]:
             if physics.name != now.chosen[k][0].name and promised > RIVAL_SHARE * gain:
-                trial = fit(self.logs, (*others, (physics, start)), near=without, hopeful=without.objective - RIVAL_SHARE * gain)
+                trial = fit(
+                    self.logs, (*others, (physics, start)), near=without, hopeful=without.objective - RIVAL_SHARE * gain
+                )
                 if trial.objective + 2 * len(start) < now.objective + 2 * len(now.chosen[k][1]) + CLEARLY:
                     found.append(physics.name.partition(" ")[0])
         return tuple(dict.fromkeys(found))
