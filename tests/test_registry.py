@@ -83,5 +83,11 @@ def test_packages_outside_register_through_entry_points(monkeypatch: pytest.Monk
     assert "theirs" in registry.names("imutool.bias")
     assert registry.load("imutool.bias", "theirs").__name__ == "json"
     assert registry.load("imutool.bias", "linear").__name__ == "imutool.bias.linear"
+    assert registry.every("imutool.bias")["theirs"].__name__ == "json"
     assert "theirs" not in registry.names("imutool.converters")
     assert registry.summary("imutool.bias", "theirs") != ""
+
+
+@pytest.mark.parametrize("group", list(registry.GROUPS))
+def test_every_module_is_the_one_that_its_key_loads(group: str) -> None:
+    assert registry.every(group) == {name: registry.load(group, name) for name in registry.names(group)}

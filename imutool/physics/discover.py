@@ -16,7 +16,7 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float64
-from scipy.special import gammaincc, gammaln
+from scipy.special import gammaincc, gammainccinv, gammaln
 from scipy.stats import norm, wilcoxon
 from scipy.stats import t as student
 
@@ -45,6 +45,7 @@ MOST_NAMELESS, NAMELESS_SHARE = 2, 0.03  # effects without a name, and how much 
 IN_BAND = 0.8
 NOISE_ONLY = 1.15  # squares left a row, up to which a simulation's noise is taken at its word
 EXCHANGED = 3  # effects among which each is asked whether another would do better
+MISSED = 4.0  # times the squares that an effect needs: a fit without it that is as far off after a few steps gets no nearer
 RIVALS, RIVAL_SHARE = 3, 0.5  # effects that are asked whether they would do as well, and of the gain what a step has to promise
 IMPLAUSIBLE = 4.0  # times the plausible size
 
@@ -252,9 +253,11 @@ class _Search:
 
     def pruned(self, now: Fit) -> Fit:
         """Without effects that the others have made superfluous."""
-        for k in range(len(now.chosen) - 1):  # the last has just come in
-            without = fit(self.logs, (*now.chosen[:k], *now.chosen[k + 1 :]), near=now)
-            if self.chance(now.chosen[k][0], without.objective - now.objective) > np.log(FALSE_DISCOVERY / self.tried):
+        for k, (physics, theta) in enumerate(now.chosen[:-1]):  # the last has just come in
+            needed = _needed(np.log(FALSE_DISCOVERY / self.tried) - self.luck[physics.name], len(theta))
+            hopeful = now.objective + MISSED * needed  # so much is left of what is superfluous after a few steps, and less
+            without = fit(self.logs, (*now.chosen[:k], *now.chosen[k + 1 :]), near=now, hopeful=hopeful)
+            if self.chance(physics, without.objective - now.objective) > np.log(FALSE_DISCOVERY / self.tried):
                 return self.pruned(without)
         return now
 
@@ -380,6 +383,11 @@ def chance(gain: float, parameters: int) -> float:
     """The logarithm of the chance that noise alone gains as much by so many parameters (far out, the tail's leading term)."""
     half, k = 0.5 * max(gain, 0.0), 0.5 * parameters
     return float(np.log(gammaincc(k, half))) if half < FAR_OUT else float((k - 1.0) * np.log(half) - half - gammaln(k))
+
+
+def _needed(log_chance: float, parameters: int) -> float:
+    """The squares that so many parameters gain with such a chance."""
+    return float(2.0 * gammainccinv(0.5 * parameters, np.exp(max(log_chance, -FAR_OUT))))
 
 
 def _helps(gains: Float64[np.ndarray, " b"]) -> float:

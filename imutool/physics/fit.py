@@ -157,7 +157,7 @@ def fit(
         return _State(chosen, courses, residuals, *_biases(logs, residuals, masks, _penalty(chosen, mean, std)))
 
     now, steps = tried(begun, None), 0
-    known, straight = None if near is None else near.slopes, True
+    known = None if near is None else near.slopes
     while len(mean) and steps < iterations:
         before = now.objective
         for moved in _set_in(logs, now, masks):
@@ -172,12 +172,12 @@ def fit(
                 break
             known = None
             continue
-        bent, straight = not straight, _straight(logs, slopes, now, better, step, masks)
+        straight = _straight(logs, slopes, now, better, step, masks)
         now, steps = better, steps + 1
         settled = before - now.objective < SETTLED and (slopes.fresh or straight)
         if settled or (steps == PATIENCE and now.objective >= hopeful):
             break
-        known = slopes if straight else None if bent else slopes.linear()
+        known = slopes if straight else slopes.linear()
     rows, numbers = int(sum(mask.sum() for mask in masks)), sum(log.numbers(part) for log in logs)
     return Fit(now.chosen, now.bias, now.objective, rows, numbers, tuple(logs), part, tuple(now.courses), std)
 

@@ -64,7 +64,7 @@ class Panel:
             for axis, one in enumerate(self.axes[6 * k : 6 * k + 6]):
                 js, r = np.flatnonzero(B.on[axis] & moves), one.r
                 if axis in added:
-                    r = r - one.free(log.whiten.one(added[axis], axis))
+                    r = r - one.free(log.whiten.rows(added[axis][None], np.array([axis]))[0])
                     total += float(r @ r - one.r @ one.r)
                     g_a[one.where] += one.A @ (r - one.r)
                 if len(js):

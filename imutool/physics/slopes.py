@@ -28,8 +28,10 @@ def slope(whiten: Whitener, course: Course, physics: Physics) -> Slope:
     """Of an effect on a course, or of a linear one that is not."""
     shape = 6, len(physics.parameters)
     white, on = np.zeros((*shape, len(range(0, len(course.pair.stamp_s), whiten.every)))), np.zeros(shape, bool)
-    for axis, j, row in course.slope(physics):
-        white[axis, j], on[axis, j] = whiten.one(row, axis), True
+    found = list(course.slope(physics))
+    if found:
+        axes, js = np.array([axis for axis, _, _ in found]), np.array([j for _, j, _ in found])
+        white[axes, js], on[axes, js] = whiten.rows(np.stack([row for _, _, row in found]), axes), True
     return Slope(white, on)
 
 

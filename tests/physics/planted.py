@@ -9,9 +9,10 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from imutool.kinematics import Trajectory
+from imutool.physics.course import Chosen
 from imutool.physics.effects import _catalogue
 from imutool.physics.effects._forward import Physics, read
-from imutool.physics.fit import Chosen, Weighed
+from imutool.physics.fit import Weighed
 from imutool.physics.flight import FlightSettings, trajectory
 from imutool.physics.pair import Pair, split
 from imutool.physics.readings import Felt

@@ -9,12 +9,15 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from imutool.physics.course import bound, free
 from imutool.physics.effects import _catalogue
-from imutool.physics.fit import PRIOR, Fit, bound, expected, fit, free
+from imutool.physics.fit import PATIENCE, PRIOR, Fit, expected, fit
+from imutool.physics.slopes import Slopes
 
 PLANTED = SimpleNamespace(**runpy.run_path(str(Path(__file__).with_name("planted.py"))))
 SURE = 4.0  # standard deviations: 1 in 16 000 outside
 SEEDS = 20
+SAME = 0.1  # of a standard deviation, or a square: kept derivatives are right to a few per cent of what noise does
 CALIBRATED = (0.7, 1.4)  # root mean square of z-scores; a hundred of them scatter by 0.07
 
 EFFECTS: dict[str, dict[str, tuple[list[float], list[float]]]] = {  # what is planted, and where the fit starts
@@ -161,3 +164,39 @@ def test_parameters_come_back_from_how_they_are_fitted(physics: _catalogue.Physi
         physics.plausible > 0, physics.plausible, 1.0
     )
     np.testing.assert_allclose(bound(physics, free(physics, theta)), theta, rtol=1e-12)
+
+
+@pytest.mark.parametrize("name", ["low pass", "arm and clock", "gyro drift"])
+def test_derivatives_of_a_fit_nearby_lead_to_the_same_answer(name: str) -> None:
+    effects = EFFECTS[name]
+    pair = PLANTED.pair(PLANTED.rich(), {one: truth for one, (truth, _) in effects.items()}, 12)
+    log, begun = PLANTED.weighed(pair), PLANTED.acting({one: start for one, (_, start) in effects.items()})
+    scale = PLANTED.acting({"gyro_scale": [0.0] * 3})
+    alone = fit([log], (*begun, *scale))
+    near = fit([log], (*begun, *scale), near=fit([log], begun))
+    assert near.objective == pytest.approx(alone.objective, abs=SAME)
+    for one, std in alone.stds().items():
+        both = ({p.name: theta for p, theta in got.chosen}[one] for got in (near, alone))
+        assert (np.abs(np.subtract(*both)) < SAME * std).all()
+        np.testing.assert_allclose(near.stds()[one], std, rtol=SAME)
+
+
+def test_derivatives_that_were_kept_end_where_new_ones_end(monkeypatch: pytest.MonkeyPatch) -> None:
+    pair = PLANTED.pair(PLANTED.rich(), {"low_pass": [6.0], "lever_arm": [0.3, -0.2, 0.1]}, 13)
+    log, begun = PLANTED.weighed(pair), PLANTED.acting({"low_pass": [15.0], "lever_arm": [0.0] * 3})
+    kept = fit([log], begun)
+    monkeypatch.setattr("imutool.physics.fit.STRAIGHT", 0.0)  # so that every step asks for new ones
+    monkeypatch.setattr(Slopes, "linear", lambda self: None)
+    anew = fit([log], begun)
+    for (_, one), (physics, other) in zip(kept.chosen, anew.chosen, strict=True):
+        assert (np.abs(one - other) < SAME * anew.stds()[physics.name]).all()
+
+
+def test_a_fit_that_falls_short_of_what_was_hoped_for_goes_no_further() -> None:
+    pair = PLANTED.pair(PLANTED.rich(), {"low_pass": [3.0]}, 14)
+    log, begun = PLANTED.weighed(pair), PLANTED.acting({"low_pass": [80.0]})
+    whole = fit([log], begun)
+    short = fit([log], begun, iterations=PATIENCE)
+    assert whole.objective < short.objective - 1.0
+    np.testing.assert_array_equal(fit([log], begun, hopeful=0.0).chosen[0][1], short.chosen[0][1])
+    np.testing.assert_array_equal(fit([log], begun, hopeful=np.inf).chosen[0][1], whole.chosen[0][1])

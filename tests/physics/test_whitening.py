@@ -76,6 +76,19 @@ def test_it_is_linear_and_acts_on_each_column_alike() -> None:
     assert not out[:, :, 2].any()
 
 
+@pytest.mark.parametrize("banded", [False, True])
+def test_rows_are_filtered_as_the_books_filters_do(banded: bool) -> None:
+    x, axes = white(11, 701)[:, :4].T.copy(), np.array([5, 0, 0, 2])
+    band = Band.below(8.0, 200.0) if banded else None
+    w = Whitener(np.random.default_rng(12).normal(size=(6, 8)), np.arange(1.0, 7.0), band)
+    for row, axis, got in zip(x, axes, w.rows(x, axes), strict=True):
+        slow = row
+        if band is not None:
+            half = len(band.taps) // 2
+            slow = np.convolve(row, band.taps)[half : half + len(row)][:: band.every]
+        np.testing.assert_allclose(got, lfilter(w.filters[axis], [w.std[axis]], slow), atol=1e-12)
+
+
 # ── beside an exact simulation ──
 
 
