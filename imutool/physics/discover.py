@@ -40,7 +40,7 @@ FAR_OUT = 300.0  # half the gain, above which the tail itself is less than a num
 SUSPICIOUS, CLEARLY, NAMELESS = 3, 10.0, 15.0  # effects; squares by which an answer is better; what a missing name costs
 WELL, HOPELESS = 1.03, 2.0  # squares left a row, below which all is said, and above which more of the same is no answer
 MOST_NAMELESS, NAMELESS_SHARE = 2, 0.03  # effects without a name, and how much of the misfit each has to take
-IN_BAND = 0.8
+IN_BAND, BEYOND = 0.8, 3.0  # of the rate's half; of the band of poses: there a low-pass takes 5 %, and their smoothing 1 %
 NOISE_ONLY = 1.15  # squares left a row, up to which a simulation's noise is taken at its word
 EXCHANGED = 3  # effects among which each is asked whether another would do better
 RIVALS, RIVAL_SHARE = 3, 0.5  # effects that are asked whether they would do as well, and of the gain what a step has to promise
@@ -277,10 +277,13 @@ class _Search:
         return tuple(dict.fromkeys(found))
 
     def _beyond_the_band(self, physics: Physics, theta: Theta) -> bool:
-        """A frequency that what is expected does not reach up to: smoothed poses lag and lose there by themselves."""
-        bands = [log.pair.band_hz or 0.5 / log.pair.period_s for log in self.logs]
+        """A frequency so far above what is expected that smoothed poses, which lose and lag by themselves, look alike."""
+        reach = [
+            IN_BAND * 0.5 / pair.period_s if pair.band_hz is None else BEYOND * pair.band_hz
+            for pair in (log.pair for log in self.logs)
+        ]
         hertz = [value for number, value in zip(physics.parameters, theta, strict=True) if number.unit == "Hz"]
-        return bool(hertz and max(hertz) > IN_BAND * min(bands))
+        return bool(hertz and max(hertz) > min(reach))
 
     def _verdict(self, k: int, fitted: Fit, other: Fit, whole: Fit) -> Judged:
         physics, theta = whole.chosen[k]
