@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float64
-from scipy.special import gammaincc, gammaln
+from scipy.special import gammaincc, gammainccinv, gammaln
 from scipy.stats import norm, wilcoxon
 from scipy.stats import t as student
 
@@ -43,6 +43,7 @@ MOST_NAMELESS, NAMELESS_SHARE = 2, 0.03  # effects without a name, and how much 
 IN_BAND, BEYOND = 0.8, 3.0  # of the rate's half; of the band of poses: there a low-pass takes 5 %, and their smoothing 1 %
 NOISE_ONLY = 1.15  # squares left a row, up to which a simulation's noise is taken at its word
 EXCHANGED = 3  # effects among which each is asked whether another would do better
+MISSED = 4.0  # times the squares that an effect needs: a fit without it that is as far off after a few steps gets no nearer
 RIVALS, RIVAL_SHARE = 3, 0.5  # effects that are asked whether they would do as well, and of the gain what a step has to promise
 IMPLAUSIBLE = 4.0  # times the plausible size
 
@@ -137,6 +138,7 @@ class _Search:
     starts: dict[str, list[Theta]] = field(default_factory=dict)
     luck: dict[str, float] = field(default_factory=dict)  # log of how much likelier chance looks like it: picked from many
     known: dict[str, _Ranked] = field(default_factory=dict)  # beside the effects of one fit
+    trials: dict[str, Fit] = field(default_factory=dict)  # with one of them, likewise
     known_for: Fit | None = None
     asked: tuple[Fit, Scatter] | None = None
     onsets: dict[tuple[str, int], float] = field(default_factory=dict)  # standard deviations of times at which effects set in
@@ -176,8 +178,13 @@ class _Search:
         nameless = sum(":" in name for name in now.names)
         ranked = self.ranked(now, (*self.named, *self.others) if nameless < MOST_NAMELESS else self.named)
         best: tuple[float, Fit] | None = None
-        for _, physics, start, _ in ranked[:TRIED]:
-            trial = fit(self.logs, (*now.chosen, (physics, start)))
+        for promised, physics, start, _ in ranked[:TRIED]:
+            if best is not None and promised > best[0] * (1.0 if physics.linear else RIVAL_SHARE):
+                continue  # what one step promises of a linear effect is what it gains
+            if physics.name not in self.trials:
+                hopeful = now.objective - (0.0 if best is None else RIVAL_SHARE * (now.objective - best[1].objective))
+                self.trials[physics.name] = fit(self.logs, (*now.chosen, (physics, start)), near=now, hopeful=hopeful)
+            trial = self.trials[physics.name]
             score = self.chance(physics, now.objective - trial.objective)
             if best is None or score < best[0]:
                 best = score, trial
@@ -191,7 +198,7 @@ class _Search:
     def ranked(self, now: Fit, candidates: Sequence[Physics]) -> list[_Ranked]:
         """Candidates by what one linear step promises, each from its best start."""
         if self.known_for is not now:
-            self.known_for, self.known = now, {}
+            self.known_for, self.known, self.trials = now, {}, {}
         asked = [physics for physics in candidates if physics.name not in now.names]
         panel = None
         for physics in asked:
@@ -208,36 +215,39 @@ class _Search:
         fine = finer(physics, like([log.pair for log in self.logs]))
         if fine is None:
             return now
-        trial = fit(self.logs, (*others, (fine, fine.nothing.astype(float))))
+        trial = fit(self.logs, (*others, (fine, fine.nothing.astype(float))), near=now)
         return trial if cost(trial) < cost(now) - CLEARLY else now
 
     def exchanged(self, now: Fit) -> Fit:
         """With an effect replaced by another of the catalogue that explains more, where there is one."""
         for k in range(len(now.chosen) - 1) if len(now.chosen) <= EXCHANGED else ():
             others = (*now.chosen[:k], *now.chosen[k + 1 :])
-            without = fit(self.logs, others, iterations=2)
+            without = fit(self.logs, others, iterations=2, near=now)
             here = self.chance(now.chosen[k][0], without.objective - now.objective)
             for score, physics, start, _ in self.ranked(without, self.named)[:2]:
                 if physics.name == now.chosen[k][0].name or score > here:
                     continue
-                trial = fit(self.logs, (*others, (physics, start)))
+                halfway = without.objective - RIVAL_SHARE * (without.objective - now.objective)
+                trial = fit(self.logs, (*others, (physics, start)), near=without, hopeful=halfway)
                 if self.chance(physics, without.objective - trial.objective) < here - 1.0:
                     return trial
         return now
 
     def pruned(self, now: Fit) -> Fit:
         """Without effects that the others have made superfluous."""
-        for k in range(len(now.chosen) - 1):  # the last has just come in
-            without = fit(self.logs, (*now.chosen[:k], *now.chosen[k + 1 :]))
-            if self.chance(now.chosen[k][0], without.objective - now.objective) > np.log(FALSE_DISCOVERY / self.tried):
+        for k, (physics, theta) in enumerate(now.chosen[:-1]):  # the last has just come in
+            needed = _needed(np.log(FALSE_DISCOVERY / self.tried) - self.luck[physics.name], len(theta))
+            hopeful = now.objective + MISSED * needed  # so much is left of what is superfluous after a few steps, and less
+            without = fit(self.logs, (*now.chosen[:k], *now.chosen[k + 1 :]), near=now, hopeful=hopeful)
+            if self.chance(physics, without.objective - now.objective) > np.log(FALSE_DISCOVERY / self.tried):
                 return self.pruned(without)
         return now
 
     def judged(self, now: Fit) -> Discovery:
         """What may stay: tested on all rows, and on blocks that were not fitted."""
         while now.chosen:
-            other = fit(self.logs, now.chosen, part="held_out")
-            whole = fit(self.logs, now.chosen, part="all")
+            other = fit(self.logs, now.chosen, part="held_out", near=now)
+            whole = fit(self.logs, now.chosen, part="all", near=now)
             held = tuple(_plausible(physics, theta) for physics, theta in whole.chosen)
             if any(one is not physics for one, (physics, _) in zip(held, whole.chosen, strict=True)):
                 begun = tuple(
@@ -252,7 +262,7 @@ class _Search:
                 told = [replace(one, similar=self._similar(k, now)) for k, one in enumerate(verdicts)]
                 fitted = replace(now, chosen=_set_in_as(now.chosen, whole.chosen))
                 return Discovery(tuple(sorted(told, key=lambda one: -one.gain)), fitted, whole, self.tried)
-            now = fit(self.logs, (*now.chosen[:worst], *now.chosen[worst + 1 :]))
+            now = fit(self.logs, (*now.chosen[:worst], *now.chosen[worst + 1 :]), near=now)
         return Discovery((), now, fit(self.logs, (), part="all"), self.tried)
 
     def scattered(self, found: Fit, part: str) -> Scatter | None:
@@ -267,11 +277,13 @@ class _Search:
     def _similar(self, k: int, now: Fit) -> tuple[str, ...]:
         """Effects of the catalogue that in an effect's place leave about as little (Akaike's criterion)."""
         others = (*now.chosen[:k], *now.chosen[k + 1 :])
-        without = fit(self.logs, others, iterations=2)
+        without = fit(self.logs, others, iterations=2, near=now)
         gain, found = without.objective - now.objective, []
         for _, physics, start, promised in self.ranked(without, self.named)[:RIVALS]:
             if physics.name != now.chosen[k][0].name and promised > RIVAL_SHARE * gain:
-                trial = fit(self.logs, (*others, (physics, start)))
+                trial = fit(
+                    self.logs, (*others, (physics, start)), near=without, hopeful=without.objective - RIVAL_SHARE * gain
+                )
                 if trial.objective + 2 * len(start) < now.objective + 2 * len(now.chosen[k][1]) + CLEARLY:
                     found.append(physics.name.partition(" ")[0])
         return tuple(dict.fromkeys(found))
@@ -287,7 +299,7 @@ class _Search:
 
     def _verdict(self, k: int, fitted: Fit, other: Fit, whole: Fit) -> Judged:
         physics, theta = whole.chosen[k]
-        without = fit(self.logs, (*whole.chosen[:k], *whole.chosen[k + 1 :]), part="all")
+        without = fit(self.logs, (*whole.chosen[:k], *whole.chosen[k + 1 :]), part="all", near=whole)
         gain = without.objective - whole.objective
         scattered = self.scattered(whole, "all")
         log_p = self.chance(physics, gain)
@@ -360,6 +372,11 @@ def chance(gain: float, parameters: int) -> float:
     """The logarithm of the chance that noise alone gains as much by so many parameters (far out, the tail's leading term)."""
     half, k = 0.5 * max(gain, 0.0), 0.5 * parameters
     return float(np.log(gammaincc(k, half))) if half < FAR_OUT else float((k - 1.0) * np.log(half) - half - gammaln(k))
+
+
+def _needed(log_chance: float, parameters: int) -> float:
+    """The squares that so many parameters gain with such a chance."""
+    return float(2.0 * gammainccinv(0.5 * parameters, np.exp(max(log_chance, -FAR_OUT))))
 
 
 def _helps(gains: Float64[np.ndarray, " b"]) -> float:

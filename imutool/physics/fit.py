@@ -20,7 +20,7 @@ from jaxtyping import Bool, Float64
 from imutool.physics.course import Chosen, Course, bound, free
 from imutool.physics.effects._forward import Theta
 from imutool.physics.pair import Pair
-from imutool.physics.slopes import Slopes, on_axis, slope
+from imutool.physics.slopes import Slopes
 from imutool.physics.whitening import Whitener, settled
 
 PRIOR = 3.0
@@ -29,6 +29,7 @@ ITERATIONS = 8
 BIAS_PRIOR = np.array([0.5] * 3 + [5.0] * 3)
 BACKTRACKS = 4
 SETTLED = 1e-2  # squares: less is no step any more
+PATIENCE = 3  # steps, after which a fit has to be below what was hoped for
 STRAIGHT = 0.05  # of a step's length in white samples: by how much it may miss what the derivatives say of it
 
 
@@ -81,9 +82,9 @@ class Fit:
         return tuple(physics.name for physics, _ in self.chosen)
 
     @cached_property
-    def slopes(self) -> tuple[Slopes, ...]:
-        """Derivatives of the white samples of each log, where the fit ended."""
-        return _slopes(self.logs, self.chosen, self.courses)
+    def slopes(self) -> Slopes:
+        """Derivatives of the white samples, where the fit ended."""
+        return Slopes([log.whiten for log in self.logs], self.courses, self.chosen)
 
     @cached_property
     def information(self) -> Float64[np.ndarray, "p p"]:
@@ -133,49 +134,43 @@ def fit(
     part: str = "fitted",
     iterations: int = ITERATIONS,
     near: Fit | None = None,
+    hopeful: float = np.inf,
 ) -> Fit:
     """The effects fitted together from where they begin, and a bias for each log.
 
-    `near` is a fit of the same logs whose derivatives serve for the first step, as far as its effects are the same.
+    `near` is a fit of the same logs whose derivatives serve for the first step, as far as its effects are the same. A fit whose
+    objective is not below `hopeful` after a few steps goes no further.
     """
     mean, std = priors(begun, begun)
-    masks = [log.rows(part) for log in logs]
+    masks, whiteners = [log.rows(part) for log in logs], [log.whiten for log in logs]
 
     def tried(chosen: Chosen, like: _State | None) -> _State:
         courses = [Course(log.pair, chosen, None if like is None else like.courses[k]) for k, log in enumerate(logs)]
         residuals = [log.residual(course) for log, course in zip(logs, courses, strict=True)]
         return _State(chosen, courses, residuals, *_biases(logs, residuals, masks, _penalty(chosen, mean, std)))
 
-    now, slopes, steps = tried(begun, None), None, 0
-    if near is not None and len(mean):
-        slopes = _slopes(logs, begun, now.courses, near)
+    now, steps = tried(begun, None), 0
+    known = None if near is None else near.slopes
     while len(mean) and steps < iterations:
         before = now.objective
         for moved in _set_in(logs, now, masks):
             now = min(now, tried(moved, now), key=_objective)
-        fresh = slopes is None or now.objective < before
-        if slopes is None or fresh:
-            slopes = _slopes(logs, now.chosen, now.courses)
-        N, g = _normal(logs, slopes, now.residuals, now.bias, masks)
+        slopes = Slopes(whiteners, now.courses, now.chosen, known)
+        sizes = (_step(logs, slopes, now, masks, mean, std) * 0.5**back for back in range(BACKTRACKS))
         x = np.concatenate([free(physics, theta) for physics, theta in now.chosen])
-        p = len(x)
-        N[:p, :p] += np.diag(1.0 / std**2)
-        g[:p] -= (x - mean) / std**2
-        delta = _within(_solved(N, g, now.chosen), now.chosen)
-        sizes = (0.5**back for back in range(BACKTRACKS))
-        steps_down = ((size * delta, tried(_moved(now.chosen, x + size * delta), now)) for size in sizes)
-        step, better = next((one for one in steps_down if one[1].objective < now.objective), (delta, None))
-        if better is None:
-            if fresh:
+        tries = ((step, tried(_moved(now.chosen, x + step), now)) for step in sizes)
+        step, better = next((one for one in tries if one[1].objective < now.objective), (x, now))
+        if better is now:
+            if slopes.fresh:
                 break
-            slopes = None
+            known = None
             continue
-        steps += 1
         straight = _straight(logs, slopes, now, better, step, masks)
-        now = better
-        if before - now.objective < SETTLED and (fresh or straight):
+        now, steps = better, steps + 1
+        settled = before - now.objective < SETTLED and (slopes.fresh or straight)
+        if settled or (steps == PATIENCE and now.objective >= hopeful):
             break
-        slopes = slopes if straight else None
+        known = slopes if straight else slopes.linear()
     rows = int(sum(mask.sum() for mask in masks))
     return Fit(now.chosen, now.bias, now.objective, rows, tuple(logs), part, tuple(now.courses), std)
 
@@ -190,23 +185,25 @@ class _State(NamedTuple):
     objective: float
 
 
-def _slopes(logs: Sequence[Weighed], chosen: Chosen, courses: Sequence[Course], near: Fit | None = None) -> tuple[Slopes, ...]:
-    """Of each log those of each effect, of what another fit has had already its own."""
-    known = {} if near is None else {id(physics): k for k, (physics, _) in enumerate(near.chosen)}
-    return tuple(
-        tuple(
-            near.slopes[log_k][known[id(physics)]]
-            if near is not None and id(physics) in known
-            else slope(log.whiten, course, physics)
-            for physics, _ in chosen
-        )
-        for log_k, (log, course) in enumerate(zip(logs, courses, strict=True))
-    )
+def _step(
+    logs: Sequence[Weighed],
+    slopes: Slopes,
+    now: _State,
+    masks: Sequence[Bool[np.ndarray, " n"]],
+    mean: Float64[np.ndarray, " p"],
+    std: Float64[np.ndarray, " p"],
+) -> Theta:
+    """Gauss and Newton's, of the free parameters."""
+    N, g = _normal(logs, slopes, now.residuals, now.bias, masks)
+    x = np.concatenate([free(physics, theta) for physics, theta in now.chosen])
+    N[: len(x), : len(x)] += np.diag(1.0 / std**2)
+    g[: len(x)] -= (x - mean) / std**2
+    return _within(_solved(N, g, now.chosen), now.chosen)
 
 
 def _straight(
     logs: Sequence[Weighed],
-    slopes: Sequence[Slopes],
+    slopes: Slopes,
     before: _State,
     after: _State,
     step: Theta,
@@ -215,24 +212,13 @@ def _straight(
     """Whether a step went where the derivatives said: else they are to be taken anew."""
     missed = length = 0.0
     for k, (log, mask) in enumerate(zip(logs, masks, strict=True)):
-        said = _said(slopes[k], step, mask)
-        done = (before.residuals[k] - after.residuals[k])[mask]
-        one = log.constants[mask]
-        for x, axis in zip(said.T, range(6), strict=True):
-            u, c = done[:, axis] - x, one[:, axis]
-            missed += float(u @ u - (u @ c) ** 2 / (c @ c))
-            length += float(x @ x - (x @ c) ** 2 / (c @ c))
+        done, one = (before.residuals[k] - after.residuals[k])[mask], log.constants[mask]
+        for axis in range(6):
+            said, bias = slopes.along(k, axis, step, mask), one[:, axis] / np.linalg.norm(one[:, axis])
+            off = done[:, axis] - said
+            missed += float(off @ off - (off @ bias) ** 2)
+            length += float(said @ said - (said @ bias) ** 2)
     return missed <= STRAIGHT**2 * max(length, 1.0)
-
-
-def _said(slopes: Slopes, step: Theta, mask: Bool[np.ndarray, " n"]) -> Float64[np.ndarray, "m 6"]:
-    """By how much derivatives say that white samples change in a step."""
-    out, first = np.zeros((6, int(mask.sum()))), 0
-    for one in slopes:
-        for axis, j in np.argwhere(one.on):
-            out[axis] += step[first + j] * one.white[axis, j][mask]
-        first += one.white.shape[1]
-    return out.T
 
 
 def _objective(state: _State) -> float:
@@ -315,22 +301,21 @@ def _biases(
 
 def _normal(
     logs: Sequence[Weighed],
-    slopes: Sequence[Slopes],
+    slopes: Slopes,
     residuals: Sequence[Float64[np.ndarray, "n 6"]],
     b: Float64[np.ndarray, "logs 6"],
     masks: Sequence[Bool[np.ndarray, " n"]],
 ) -> tuple[Float64[np.ndarray, "q q"], Float64[np.ndarray, " q"]]:
     """Normal equations of all free parameters, then each log's bias."""
-    p = sum(one.white.shape[1] for one in slopes[0])
+    p = sum(len(theta) for _, theta in slopes.chosen)
     N, g = np.zeros((p + 6 * len(logs),) * 2), np.zeros(p + 6 * len(logs))
-    for k, (log, mine, residual, mask) in enumerate(zip(logs, slopes, residuals, masks, strict=True)):
+    for k, (log, residual, mask) in enumerate(zip(logs, residuals, masks, strict=True)):
         for axis in range(6):
-            where, A = on_axis(mine, axis, mask)
+            where, A = slopes.on_axis(k, axis, mask)
             one, bias = log.constants[mask, axis], p + 6 * k + axis
-            r = residual[mask, axis] - one * b[k, axis]
             N[np.ix_(where, where)] += A @ A.T
             N[where, bias] += A @ one
             N[bias, where] += A @ one
             N[bias, bias] += one @ one + 1.0 / BIAS_PRIOR[axis] ** 2
-            g[where] += A @ r
+            g[where] += A @ (residual[mask, axis] - one * b[k, axis])
     return N, g

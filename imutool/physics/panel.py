@@ -11,7 +11,7 @@ from jaxtyping import Float64, Int64
 from imutool.physics.course import Course
 from imutool.physics.effects._forward import Physics, Theta
 from imutool.physics.fit import Fit, Weighed, priors
-from imutool.physics.slopes import on_axis, slope
+from imutool.physics.slopes import slope
 
 RIDGE = 1e-9
 
@@ -38,12 +38,12 @@ class Panel:
         self.logs, self.now = logs, now
         q = sum(len(theta) for _, theta in now.chosen)
         self.N, self.g, self.total, self.axes = RIDGE * np.eye(q), np.zeros(q), 0.0, []
-        for log, course, slopes in zip(logs, now.courses, now.slopes, strict=True):
+        for number, (log, course) in enumerate(zip(logs, now.courses, strict=True)):
             counts, residual = log.rows("fitted").astype(float), log.residual(course)
             everything = np.ones(len(counts), bool)
             for k in range(6):
                 bias = log.constants[:, k] * counts
-                where, A = on_axis(slopes, k, everything)
+                where, A = now.slopes.on_axis(number, k, everything)
                 one = _Axis(counts, bias / np.linalg.norm(bias), where, A, residual[:, k])
                 one = one._replace(A=one.free(A), r=one.free(residual[:, k]))
                 self.axes.append(one)
@@ -53,17 +53,18 @@ class Panel:
         self.left = self.total - float(self.g @ np.linalg.solve(self.N, self.g))
 
     def gain(self, physics: Physics, start: Theta) -> float:
-        """Squares that one linear step from a start takes off."""
+        """Squares that one linear step from a start takes off, no positive parameter changing by more than a factor of e."""
         chosen, p = (*self.now.chosen, (physics, start)), len(start)
+        moves = np.array([not number.begins for number in physics.parameters])  # the others are gone through, not stepped
         N_bb, N_ab, g_b = np.zeros((p, p)), np.zeros((len(self.N), p)), np.zeros(p)
         g_a, total = self.g.copy(), self.total
         for k, (log, course) in enumerate(zip(self.logs, self.now.courses, strict=True)):
             with_it = course if physics.linear else Course(log.pair, chosen, course)
             B, added = slope(log.whiten, with_it, physics), with_it.added(course)
             for axis, one in enumerate(self.axes[6 * k : 6 * k + 6]):
-                js, r = np.flatnonzero(B.on[axis]), one.r
+                js, r = np.flatnonzero(B.on[axis] & moves), one.r
                 if axis in added:
-                    r = r - one.free(log.whiten.one(added[axis], axis))
+                    r = r - one.free(log.whiten.rows(added[axis][None], np.array([axis]))[0])
                     total += float(r @ r - one.r @ one.r)
                     g_a[one.where] += one.A @ (r - one.r)
                 if len(js):
@@ -74,4 +75,6 @@ class Panel:
         _, std = priors((chosen[-1],), (chosen[-1],))
         beside = np.linalg.solve(self.N, np.concatenate([N_ab, g_a[:, None]], axis=1))
         S, g = N_bb + np.diag(1.0 / std**2) - N_ab.T @ beside[:, :p], g_b - N_ab.T @ beside[:, p]
-        return float(self.left - total + g_a @ beside[:, p] + g @ np.linalg.solve(S, g))
+        step = np.linalg.solve(S, g)
+        far = float(np.abs(step[[number.positive for number in physics.parameters]]).max(initial=1.0))
+        return float(self.left - total + g_a @ beside[:, p] + (2.0 / far - 1.0 / far**2) * (g @ step))

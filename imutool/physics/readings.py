@@ -8,7 +8,7 @@ Three clocks meet here. `t_s` is even and belongs to the motion; effects of the 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from types import MappingProxyType
 
 import numpy as np
@@ -19,6 +19,7 @@ from scipy.sparse import csr_array
 from imutool.errors import DataError
 
 Vectors = Float64[np.ndarray, "n 3"]
+Columns = Float64[np.ndarray, "_ _"]
 Times = Float64[np.ndarray, " n"]
 PAD = 12  # samples beyond the ends over which the spline forgets how it begins: 0.27^12 = 1e-7
 UNEVEN = 1e-2  # of a period: how far the even clock may be from even
@@ -52,15 +53,15 @@ class Sampler:
             first = [np.zeros((len(felt.t_s), 0))] if felt.R_wb is None else [felt.R_wb.reshape(-1, 9)]
             return np.concatenate([*first, *(values[:, None] for values in felt.channels.values())], axis=1)
 
-        both = self._beside((felt.R_wb, felt.channels), columns)
+        both = self._beside(felt.R_wb, felt.channels, columns)
         return self._at_instants(both, instants)
 
     def _at_instants(self, x: Float64[np.ndarray, "n k"], instants: Instants) -> Float64[np.ndarray, "m k"]:
         weights = instants[2]
         if weights is None:
-            return self._values((x, instants), lambda: _fixed(x.view()))
-        coefficients = self._coefficients((x,), lambda: _coefficients(x))
-        return self._values((x, instants), lambda: _fixed(np.asarray(weights @ coefficients)))
+            return self._values(x, instants, lambda: _fixed(x.view()))
+        coefficients = self._coefficients(x, None, lambda: _coefficients(x))
+        return self._values(x, instants, lambda: _fixed(np.asarray(weights @ coefficients)))
 
     def _at(self, t_s: Times, taken_s: Float64[np.ndarray, " m"]) -> Instants:
         """Clock, instants, and what takes splines' coefficients to their values (None: the instants are the clock's own).
@@ -69,10 +70,10 @@ class Sampler:
             DataError: a clock that is not even.
         """
         for last in self._instants:
-            if np.array_equal(last[0], t_s) and np.array_equal(last[1], taken_s):
+            if _same(last[0], t_s) and _same(last[1], taken_s):
                 return last
         own = len(t_s) == len(taken_s) and bool(np.abs(t_s - taken_s).max() <= SAME_S)
-        found: Instants = (t_s.copy(), taken_s.copy(), None if own else _weights(t_s, taken_s))
+        found: Instants = (t_s, taken_s, None if own else _weights(t_s, taken_s))
         self._instants = (found, *self._instants[: INSTANTS - 1])
         return found
 
@@ -81,20 +82,24 @@ class _Recent:
     """The last few things that were worked out, by the very objects they were worked out from."""
 
     def __init__(self) -> None:
-        self._known: tuple[tuple[tuple[object, ...], Float64[np.ndarray, "n k"]], ...] = ()
+        self._known: tuple[tuple[object, object, Columns], ...] = ()
 
     def __call__(
-        self, of: tuple[object, ...], work_out: Callable[[], Float64[np.ndarray, "n k"]]
+        self, of: object, at: object, work_out: Callable[[], Float64[np.ndarray, "n k"]]
     ) -> Float64[np.ndarray, "n k"]:
         known = self._known
-        for k, (objects, value) in enumerate(known):
-            if all(was is one for was, one in zip(objects, of, strict=True)):
+        for k, entry in enumerate(known):
+            if entry[0] is of and entry[1] is at:
                 if k:  # what is asked for again and again stays
-                    self._known = (known[k], *known[:k], *known[k + 1 :])
-                return value
+                    self._known = (entry, *known[:k], *known[k + 1 :])
+                return entry[2]
         value = work_out()
-        self._known = ((of, value), *known[: RECENT - 1])
+        self._known = ((of, at, value), *known[: RECENT - 1])
         return value
+
+
+def _same(a: Float64[np.ndarray, " n"], b: Float64[np.ndarray, " m"]) -> bool:
+    return a is b or np.array_equal(a, b)
 
 
 def _fixed(x: Float64[np.ndarray, "n k"]) -> Float64[np.ndarray, "n k"]:
@@ -176,4 +181,5 @@ class Read:
 
     def but(self, gyro: Vectors | None = None, accel: Vectors | None = None) -> Read:
         """With one of the sensors, or both, reading something else."""
-        return replace(self, gyro=self.gyro if gyro is None else gyro, accel=self.accel if accel is None else accel)
+        kept = self.gyro if gyro is None else gyro, self.accel if accel is None else accel
+        return Read(self.stamp_s, *kept, self.alpha, self.R_wb, self.channels)

@@ -16,7 +16,7 @@ is needed to simulate it, and the estimator differentiates it by differences. Ef
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from enum import IntEnum
 from typing import Any
 
@@ -146,14 +146,14 @@ class Way:
     def through(self, physics: Physics, theta: Theta) -> Way:
         """Behind one more effect, whose turn it is."""
         if physics.stage < Stage.CLOCK:
-            return replace(self, felt=physics.forward(self.felt, theta), taken=None)
+            return Way(physics.forward(self.felt, theta), self.taken_s, self.stamp_s)
         if physics.stage == Stage.CLOCK:
-            return replace(self, taken_s=physics.forward(self.taken_s, theta), taken=None)
-        return replace(self, taken=physics.forward(self.arrived(), theta))
+            return Way(self.felt, physics.forward(self.taken_s, theta), self.stamp_s)
+        return Way(self.felt, self.taken_s, self.stamp_s, physics.forward(self.arrived(), theta))
 
     def taking(self) -> Way:
         """With the samples taken: behind this, the clock and what is felt do not matter any more."""
-        return self if self.taken is not None else replace(self, taken=self.arrived())
+        return self if self.taken is not None else Way(self.felt, self.taken_s, self.stamp_s, self.arrived())
 
     def arrived(self) -> Read:
         """One row a sample."""
