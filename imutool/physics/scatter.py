@@ -19,7 +19,6 @@ from scipy.stats import f as fisher
 
 from imutool.physics import fit as fits
 from imutool.physics.fit import Fit, Weighed
-from imutool.physics.slopes import on_axis
 
 BLOCK_S = 5.0
 LEAST_BLOCKS = 6
@@ -117,7 +116,7 @@ def _blocks(log: Weighed, found: Fit, k: int, part: str) -> list[tuple[Matrix, F
     left = log.residual(found.courses[k])[rows] - log.constants[rows] * found.bias[k]
     J = np.zeros((6, len(begins), int(rows.sum())))
     for axis in range(6):
-        where, J_axis = on_axis(found.slopes[k], axis, rows)
+        where, J_axis = found.slopes.on_axis(k, axis, rows)
         one = log.constants[rows, axis]
         J[axis, where] = J_axis - np.outer(J_axis @ one, one) / (one @ one)
     J[:, begins] = 0.0
