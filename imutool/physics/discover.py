@@ -40,7 +40,8 @@ FAR_OUT = 300.0  # half the gain, above which the tail itself is less than a num
 SUSPICIOUS, CLEARLY, NAMELESS = 3, 10.0, 15.0  # effects; squares by which an answer is better; what a missing name costs
 WELL, HOPELESS = 1.03, 2.0  # squares left a row, below which all is said, and above which more of the same is no answer
 MOST_NAMELESS, NAMELESS_SHARE = 2, 0.03  # effects without a name, and how much of the misfit each has to take
-IN_BAND, BEYOND = 0.8, 3.0  # of the rate's half; of the band of poses: there a low-pass takes 5 %, and their smoothing 1 %
+IN_BAND = 0.8  # of the rate's half: what is faster nobody sees
+BEYOND, BEYOND_LOW_PASS = 3.0, 6.0  # of the poses' band: their smoothing looks like a mount that rings, but delays nothing
 NOISE_ONLY = 1.15  # squares left a row, up to which a simulation's noise is taken at its word
 EXCHANGED = 3  # effects among which each is asked whether another would do better
 MISSED = 4.0  # times the squares that an effect needs: a fit without it that is as far off after a few steps gets no nearer
@@ -185,6 +186,8 @@ class _Search:
                 hopeful = now.objective - (0.0 if best is None else RIVAL_SHARE * (now.objective - best[1].objective))
                 self.trials[physics.name] = fit(self.logs, (*now.chosen, (physics, start)), near=now, hopeful=hopeful)
             trial = self.trials[physics.name]
+            if self._beyond_the_band(physics, trial.chosen[-1][1]):
+                continue
             score = self.chance(physics, now.objective - trial.objective)
             if best is None or score < best[0]:
                 best = score, trial
@@ -290,10 +293,8 @@ class _Search:
 
     def _beyond_the_band(self, physics: Physics, theta: Theta) -> bool:
         """A frequency so far above what is expected that smoothed poses, which lose and lag by themselves, look alike."""
-        reach = [
-            IN_BAND * 0.5 / pair.period_s if pair.band_hz is None else BEYOND * pair.band_hz
-            for pair in (log.pair for log in self.logs)
-        ]
+        more, pairs = BEYOND_LOW_PASS if physics.name == "low_pass" else BEYOND, [log.pair for log in self.logs]
+        reach = [IN_BAND * 0.5 / pair.period_s if pair.band_hz is None else more * pair.band_hz for pair in pairs]
         hertz = [value for number, value in zip(physics.parameters, theta, strict=True) if number.unit == "Hz"]
         return bool(hertz and max(hertz) > min(reach))
 
