@@ -42,7 +42,8 @@ FAR_OUT = 300.0  # half the gain, above which the tail itself is less than a num
 SUSPICIOUS, CLEARLY, NAMELESS = 3, 10.0, 15.0  # effects; squares by which an answer is better; what a missing name costs
 WELL, HOPELESS = 1.03, 2.0  # squares left a row, below which all is said, and above which more of the same is no answer
 MOST_NAMELESS, NAMELESS_SHARE = 2, 0.03  # effects without a name, and how much of the misfit each has to take
-IN_BAND = 0.8
+IN_BAND = 0.8  # of the rate's half: what is faster nobody sees
+BEYOND, BEYOND_LOW_PASS = 3.0, 6.0  # of the poses' band: their smoothing looks like a mount that rings, but delays nothing
 NOISE_ONLY = 1.15  # squares left a row, up to which a simulation's noise is taken at its word
 EXCHANGED = 3  # effects among which each is asked whether another would do better
 MISSED = 4.0  # times the squares that an effect needs: a fit without it that is as far off after a few steps gets no nearer
@@ -198,6 +199,8 @@ class _Search:
                 hopeful = now.objective - (0.0 if best is None else RIVAL_SHARE * (now.objective - best[1].objective))
                 self.trials[physics.name] = fit(self.logs, (*now.chosen, (physics, start)), near=now, hopeful=hopeful)
             trial = self.trials[physics.name]
+            if self._beyond_the_band(physics, trial.chosen[-1][1]):
+                continue
             score = self.chance(physics, now.objective - trial.objective)
             if best is None or score < best[0]:
                 best = score, trial
@@ -308,10 +311,11 @@ class _Search:
         return tuple(dict.fromkeys(found))
 
     def _beyond_the_band(self, physics: Physics, theta: Theta) -> bool:
-        """A frequency that what is expected does not reach up to: smoothed poses lag and lose there by themselves."""
-        bands = [log.pair.band_hz for log in self.logs if log.pair.band_hz is not None]
+        """A frequency so far above what is expected that smoothed poses, which lose and lag by themselves, look alike."""
+        more = BEYOND_LOW_PASS if physics.name == "low_pass" else BEYOND
+        reach = [more * log.pair.band_hz for log in self.logs if log.pair.band_hz is not None]
         hertz = [value for number, value in zip(physics.parameters, theta, strict=True) if number.unit == "Hz"]
-        return bool(bands and hertz and max(hertz) > IN_BAND * min(bands))
+        return bool(reach and hertz and max(hertz) > min(reach))
 
     def _verdict(self, k: int, fitted: Fit, other: Fit, whole: Fit) -> Judged:
         physics, theta = whole.chosen[k]

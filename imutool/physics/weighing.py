@@ -57,8 +57,9 @@ def _in_band(pair: Pair, candidates: Sequence[Physics], band_hz: float) -> tuple
         left, spent = misfit.copy(), np.zeros(6)
         for axis in np.flatnonzero(usable.any(axis=0)).tolist():
             rows = settled(usable[:, axis], found.order)
-            white = np.stack([found.one(row, axis) for row in columns[axis]])
-            x, spent[axis] = _solved(white[:, rows], found.one(misfit[:, axis], axis)[rows])
+            both = np.concatenate([columns[axis], misfit[:, axis][None]])
+            white = found.rows(both, np.full(len(both), axis))[:, rows]
+            x, spent[axis] = _solved(white[:-1], white[-1])
             left[:, axis] -= x @ columns[axis]
         found = whitener(left, usable, ORDER_TRUTH)
         count = np.maximum(usable.sum(axis=0), 1.0)  # the noise before so many numbers were fitted to it
@@ -109,7 +110,7 @@ def _left(pair: Pair, candidates: Sequence[Physics]) -> Float64[np.ndarray, "n 6
 def _rich(pair: Pair, candidates: Sequence[Physics], band: Band) -> list[Float64[np.ndarray, "_ m"]]:
     """For each axis a constant, and derivatives of everything in the catalogue at the places where fits begin, in a band."""
     samples = Read(pair.stamp_s, pair.real[:, :3], pair.real[:, 3:], np.zeros((len(pair.real), 3)))
-    columns = [[band.one(np.ones(len(pair.real)))] for _ in range(6)]
+    columns = [[np.ones(len(pair.real))] for _ in range(6)]
     nothing = Course(pair, ())
     for physics in candidates:
         starts: Sequence[Theta] = ()
@@ -119,8 +120,8 @@ def _rich(pair: Pair, candidates: Sequence[Physics], band: Band) -> list[Float64
         for course in courses:
             for axis, j, row in course.slope(physics):
                 if not physics.parameters[j].begins:
-                    columns[axis].append(band.one(row))
-    return [np.stack(rows) for rows in columns]
+                    columns[axis].append(row)
+    return [band.rows(np.stack(rows)) for rows in columns]
 
 
 def _solved(A: Float64[np.ndarray, "q m"], y: Float64[np.ndarray, " m"]) -> tuple[Float64[np.ndarray, " q"], float]:

@@ -23,15 +23,15 @@ from imutool.mcap_io.log import Log
 from imutool.mcap_io.read import read
 from imutool.mcap_io.write import write
 from imutool.physics.flight import flight
-from imutool.physics.sealed import ENVELOPE, FINDINGS, KEY, OPENED, REAL, SIM, conceal, opened
+from imutool.physics.sealed import ENVELOPE, FINDINGS, KEY, OPENED, REAL, SIM, conceal, opened, shown_by_poses
 from imutool.physics.sealing import draw, unnamed
 from imutool.physics.sealing.amounts import drawn
 from imutool.physics.sealing.effects import ACCEL, CATALOGUE, EARTH_RAD_S, GYRO, NO_LIMIT, Reading
 from imutool.physics.sealing.envelope import unsealed
 from imutool.physics.sealing.filters import first_order, mount
-from imutool.physics.sealing.information import FALSE_ALARM, bounds, sight, visible
+from imutool.physics.sealing.information import FALSE_ALARM, bounds, poses_power, sight, visible
 from imutool.physics.sealing.motion import Felt, smoother
-from imutool.physics.sealing.scene import RATE_HZ, SIM_SHARE, Scene, set_up
+from imutool.physics.sealing.scene import POSE_RATE_HZ, RATE_HZ, SIM_SHARE, Scene, set_up
 from imutool.physics.sealing.score import score
 from imutool.recording import GRAVITY_M_S2, Poses
 
@@ -304,6 +304,32 @@ def test_what_cannot_be_seen_is_not_drawn(scene: Scene) -> None:
         draw.concealed(sight(scene), default_rng(0), "single", "large", ["earth_rotation"])
 
 
+def test_poses_without_noise_show_what_a_simulation_shows_and_noisy_ones_less(scene: Scene) -> None:
+    model = CATALOGUE["lever_arm"]
+    acting = [(model, np.array([0.05, -0.02, 0.03]))]
+    noiseless, good, bad = (sight(scene, size).seen(acting) for size in ((0.0, 0.0), (1e-4, 1e-4), (2e-3, 5e-3)))
+    beside_simulation = sight(scene).seen(acting) * (1.0 + SIM_SHARE**2)  # whose own noise the poses do not have
+    assert noiseless == pytest.approx(beside_simulation, rel=1e-6)
+    assert noiseless > 1.5 * good > 10.0 * bad
+
+
+def test_power_of_poses_is_that_of_their_derivatives(scene: Scene) -> None:
+    f_hz, noise, size = np.array([0.0, 5.0]), np.zeros(6), (1e-3, 2e-3)
+    still, fast = poses_power(f_hz, noise, size)
+    omega = 2.0 * np.pi * 5.0
+    assert still[:3] == pytest.approx(0.0)
+    assert fast[:3] == pytest.approx(omega**2 * 4e-6 / POSE_RATE_HZ)
+    assert still[3:] == pytest.approx(GRAVITY_M_S2**2 * 4e-6 / POSE_RATE_HZ)
+    assert fast[3:] - still[3:] == pytest.approx(omega**4 * 1e-6 / POSE_RATE_HZ)
+
+
+def test_a_case_drawn_beside_a_simulation_is_shown_by_good_poses_and_not_by_bad_ones(scene: Scene) -> None:
+    what = draw.concealed(sight(scene), default_rng(0), "single", "small", ["accel_scale"])
+    assert draw.shown(sight(scene, (1e-6, 1e-7)), what)
+    assert not draw.shown(sight(scene, (5e-3, 1e-1)), what)
+    assert draw.shown(sight(scene, (5e-3, 1e-1)), draw.Concealed("null", "middle"))
+
+
 def test_pairs_hold_two_different_things(scene: Scene) -> None:
     seen = sight(scene)
     for seed in range(5):
@@ -415,6 +441,14 @@ def case(cases: list[Path], tmp_path: Path) -> Path:
         (tmp_path / name).write_bytes((cases[5] / name).read_bytes())
     (tmp_path / FINDINGS).write_text(json.dumps(_findings([])))
     return tmp_path
+
+
+def test_an_opened_case_is_planned_again_by_its_seed(cases: list[Path], trajectory: Path) -> None:
+    for k in (0, 5):
+        truth = unsealed(cases[k] / ENVELOPE, cases[k] / KEY)
+        assert isinstance(shown_by_poses(trajectory, truth, CASES[k].get("effects", ())), bool)
+    with pytest.raises(DataError, match="not made of this"):
+        shown_by_poses(trajectory, {**truth, "effects": [{"effect": "none"}]}, CASES[k].get("effects", ()))
 
 
 def _findings(findings: list[dict[str, Any]], located: list[dict[str, Any]] | None = None, **more: Any) -> dict[str, Any]:
