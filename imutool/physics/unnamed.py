@@ -28,7 +28,7 @@ AXES = ("x", "y", "z")
 SIGNALS: tuple[tuple[Sensor, str], ...] = (("gyro", "rad/s"), ("accel", "m/s²"))
 PLAUSIBLE = {"gyro": 0.1, "accel": 1.0}
 INSIDE = 0.005  # of the values of a variable lie beyond its first knot, and as many beyond its last
-QUANTILES = 1001
+QUANTILES, BY_RANGE = 1001, 0.35  # places between which knots are found, and how many of them by the range alone
 SPREAD = 1e-9  # relative: knots that lie closer are one
 
 Variable = Callable[[Read], Float64[np.ndarray, " n"]]
@@ -98,12 +98,13 @@ def finer(physics: Physics, like: Read) -> Physics | None:
 
 
 def _knots(like: Read, variable: str, count: int) -> Float64[np.ndarray, " p"] | None:
-    """Half of them by samples, half by the range they go through; none for what hardly varies.
+    """Most of them by samples, some by the range they go through; none for what hardly varies.
 
     By samples alone, a robot that stands most of the time has all its knots where it stands.
     """
     at = np.quantile(VARIABLES[variable](like), np.linspace(INSIDE, 1 - INSIDE, QUANTILES))
-    reached = 0.5 * (np.linspace(0.0, 1.0, QUANTILES) + (at - at[0]) / max(at[-1] - at[0], np.finfo(np.float64).tiny))
+    along = (at - at[0]) / max(at[-1] - at[0], np.finfo(np.float64).tiny)
+    reached = (1.0 - BY_RANGE) * np.linspace(0.0, 1.0, QUANTILES) + BY_RANGE * along
     inner = np.interp(np.linspace(0.0, 1.0, count - 2), reached, at)
     return inner if np.diff(inner).min() > SPREAD * max(1.0, np.abs(inner).max()) else None
 

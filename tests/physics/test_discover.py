@@ -219,3 +219,18 @@ def test_the_time_of_a_jump_is_found_also_beside_another_effect_and_between_fitt
     jump = next(one for one in found.judged if one.physics.name == "clock_jump")
     assert abs(jump.theta[0] - t_jump) < 0.05  # s: five samples, in which it may hardly move
     assert jump.theta[1] == pytest.approx(-0.02, abs=2e-4)
+
+
+def test_a_lever_arm_beside_a_resonance_is_not_called_a_size_effect() -> None:
+    """On level ground nine numbers do what three do, and a little more as long as nobody thinks of the resonance."""
+    pair = PLANTED.pair(PLANTED.planar(), {"lever_arm": [-0.4, -0.9, 0.0], "mount_resonance": [3.0, 0.2, 0.3, 1.0, 0.0]})
+    assert set(names(asked(pair, beyond=False))) == {"lever_arm", "mount_resonance"}
+
+
+def test_a_low_pass_above_what_samples_can_show_is_told_by_its_delay() -> None:
+    """Beside an exact simulation; what smoothed poses say ends at their band."""
+    pair = PLANTED.pair(PLANTED.shaken(), {"low_pass": [48.0]})
+    found = asked(pair, beyond=False)
+    assert names(found) == ["low_pass"]
+    assert sure(found, "low_pass", [48.0])
+    assert not names(asked(replace(pair, against="true poses", band_hz=40.0), beyond=False))

@@ -118,6 +118,7 @@ def test_poses_of_the_simulation_stand_in_for_its_samples_and_bring_the_attitude
     assert np.abs(there.gyro - exact.gyro)[inner].max() < PLANTED.NOISE[0] / 10.0
     assert np.abs(there.accel - exact.accel)[inner].max() < PLANTED.NOISE[3] / 3.0
     assert pair.felt.R_wb is not None
+    assert not pair.sim_noise.any()  # nothing had to be filtered
 
 
 def test_poses_that_disagree_with_the_simulations_samples_do_not_stand_in_for_them() -> None:

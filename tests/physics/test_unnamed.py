@@ -168,3 +168,22 @@ def test_a_curve_bends_where_the_samples_are() -> None:
     shown = curve.points(41)
     assert np.allclose(shown[[0, -1]], curve.inner[[0, -1]], rtol=0, atol=0)
     assert (np.diff(shown) > 0).all()
+
+
+def test_a_curve_follows_the_range_of_a_robot_that_stands_most_of_the_time() -> None:
+    """A dead band, passed on the way to a turn: knots by samples alone would all lie where it stands, and where it turns."""
+    rng = np.random.default_rng(0)
+    turning = np.clip(np.concatenate([np.zeros(7000), np.linspace(0.0, 0.5, 200), np.full(3000, 0.5)]), 0.0, 0.5)
+    x = turning + 1e-3 * rng.standard_normal(len(turning))
+    gyro = np.stack([x, np.zeros_like(x), np.zeros_like(x)], axis=1)
+    like = Read(np.arange(len(x)) * 0.01, gyro, np.zeros_like(gyro), np.zeros_like(gyro))
+    coarse = next(one for one in unnamed.curves(like) if one.name == "unknown:gyro.x(omega_x)")
+    fine = unnamed.finer(coarse, like)
+    assert fine is not None
+    assert isinstance(fine.forward, unnamed.Curve)
+    assert np.diff(fine.forward.inner).max() < 1.1 * 0.5 / (unnamed.FINE_KNOTS - 3) / unnamed.BY_RANGE
+    passing = (x > 0.05) & (x < 0.45)
+    y = np.where(np.abs(x) < 0.3, -x, 0.0)
+    basis = fine.forward.basis(x)
+    left = y - basis @ np.linalg.lstsq(basis, y, rcond=None)[0]
+    assert left[passing].std() < 0.4 * y[passing].std()  # by samples alone: 0.58
