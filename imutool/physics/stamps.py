@@ -216,7 +216,7 @@ def clipped(real: Float64[np.ndarray, "n 6"]) -> Bool[np.ndarray, "n 6"]:
         if signal in most:
             part = slice(3 * k, 3 * k + 3)
             at[:, part] = np.abs(real[:, part]) >= NEARLY * most[signal]
-    return np.asarray(binary_dilation(at, np.ones((5, 1)))) if at.any() else at
+    return np.asarray(binary_dilation(at, np.ones((5, 1), bool))) if at.any() else at
 
 
 def stuck(real: Float64[np.ndarray, "n 6"]) -> Bool[np.ndarray, "6"]:

@@ -16,9 +16,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import imutool.physics.effects
-from imutool.physics.conclusion import NULL, SENTENCES, by_chance, conclusion, lines, percent, rms, sentence, signals, table
+from imutool.physics.conclusion import NULL, SENTENCES, by_chance, conclusion, lines, rms, sentence, signals, table
 from imutool.physics.diagnosis import Estimate, Finding, HeldOut, Located, Unexplained
-from imutool.physics.quantity import grouped, value, vector
+from imutool.physics.quantity import grouped, percent, value, vector
 
 MADE = SimpleNamespace(**runpy.run_path(str(Path(__file__).with_name("diagnoses.py"))))
 CATALOGUE = [  # of physics: what an ideal simulation leaves out, and what any signal can have
