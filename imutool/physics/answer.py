@@ -207,7 +207,8 @@ def _finding(logs: Sequence[Weighed], found: Discovery, one: Judged, floor: Floa
             held = _held_out(logs, alone, with_, j, UNITS[signal])
             all_ = _held_out(logs, nothing, with_, j, UNITS[signal])
             noise = float(np.mean(floor[3 * j : 3 * j + 3] ** 2))
-            misfit = max(all_.rms_before**2 - noise, 1e-300)
+            most = max(all_.rms_before, held.rms_before)  # effects may make up for one another
+            misfit = max(most**2 - noise, 1e-300)
             excess = held.rms_before**2 - held.rms_after**2
             shares.append((excess / noise, float(np.clip(excess / misfit, 0.0, 1.0)), signal, held))
     _, share, signal, held = max(shares, key=lambda entry: entry[0])

@@ -23,7 +23,8 @@ ABOVE = 1.1  # what remains may be this many times the noise before it is said t
 ITSELF = "always: "
 FULL = 3  # findings that the conclusion tells in full; the rest by name
 LISTED = 4  # effects that cannot be seen; the rest are counted
-WIDE = 46  # letters of a value in a table
+ENTRIES = 6  # of an effect that are listed one by one
+WIDE = 40  # letters of a value in a table
 AS_BEFORE = 2e-3  # by which a root mean square may change and still be called the same
 CERTAIN = 1e-9  # a chance below which nobody asks how much
 COUNTS = ("No", "One thing was", "Two things were", "Three things were", "Four things were", "Five things were")
@@ -155,12 +156,15 @@ def besides(d: Diagnosis) -> list[str]:
 
 
 def cannot_show(d: Diagnosis) -> list[str]:
-    """What cannot be seen, by effect: `gyro_scale (x, y)`, or `lever_arm` for all of it."""
+    """What cannot be seen, by effect: `gyro_scale (x, y)`, or `lever_arm` for all of it; of many entries how many."""
     parts: dict[str, list[str]] = {}
     for name in d.not_identifiable:
         effect, _, part = (name, "", "") if name.startswith("/") else name.partition(".")
         parts.setdefault(effect, []).extend([part] if part else [])
-    return [f"{effect} ({', '.join(some)})" if some else effect for effect, some in parts.items()]
+    told = {
+        effect: ", ".join(some) if len(some) <= ENTRIES else f"{len(some)} of its numbers" for effect, some in parts.items()
+    }
+    return [f"{effect} ({some})" if some else effect for effect, some in told.items()]
 
 
 def lines(d: Diagnosis) -> list[str]:

@@ -176,7 +176,7 @@ def located_in(trace: Traces, place: Located) -> Iterator[tuple[float, float]]:
 
 def known(trace: Traces, expected: Float64[np.ndarray, "n 6"]) -> Float64[np.ndarray, "n 6"]:
     """Real minus expected, without what is faster than the expected is known."""
-    left = trace.real - expected
+    left: Float64[np.ndarray, "n 6"] = trace.real - expected
     if trace.band_hz is None:
         return np.asarray(left)
     taps = Band.below(trace.band_hz, rate_hz(trace)).taps

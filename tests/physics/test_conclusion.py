@@ -16,9 +16,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import imutool.physics.effects
-from imutool.physics.conclusion import NULL, SENTENCES, by_chance, conclusion, lines, percent, rms, sentence, signals, table
+from imutool.physics.conclusion import NULL, SENTENCES, by_chance, conclusion, lines, rms, sentence, signals, table
 from imutool.physics.diagnosis import Estimate, Finding, HeldOut, Located, Unexplained
-from imutool.physics.quantity import grouped, value, vector
+from imutool.physics.quantity import grouped, percent, value, vector
 
 MADE = SimpleNamespace(**runpy.run_path(str(Path(__file__).with_name("diagnoses.py"))))
 CATALOGUE = [  # of physics: what an ideal simulation leaves out, and what any signal can have
@@ -364,7 +364,12 @@ def test_the_table_has_a_row_for_each_finding_no_wider_than_a_terminal() -> None
     head, *rows = table(MADE.BOTH)
     assert head == ["What", "Removes", "Value"]
     assert rows[0] == ["lever_arm (accel)", "71 %", "(0.213, -0.051, 0.120) ± 0.004 m\n1 in 100 by chance"]
-    assert all(max(map(len, row[2].split("\n"))) <= 46 for row in rows)
+    assert all(max(map(len, row[2].split("\n"))) <= 40 for row in rows)
+
+
+def test_many_entries_of_one_effect_that_cannot_be_seen_are_counted() -> None:
+    hidden = tuple(f"gyro_misalignment.{k}" for k in range(9))
+    assert conclusion(replace(MADE.NOTHING, not_identifiable=hidden)).endswith("show: gyro_misalignment (9 of its numbers).")
 
 
 def test_a_place_of_one_of_several_logs_names_it() -> None:
