@@ -53,10 +53,14 @@ TRAIN: dict[str, tuple[str, ...]] = PAPER["TRAIN"]
 TEST: dict[str, tuple[str, ...]] = PAPER["TEST"]
 OTHER_TRUTH: dict[str, str] = PAPER["OTHER_TRUTH"]
 MATRICES = ("gyro_scale", "gyro_misalignment", "accel_scale", "accel_misalignment", "lever_arm", "clock_offset")
-LASTING = (*MATRICES, "mount_rotation", "size_effect", "gyro_g_sensitivity", "gyro_quadratic", "accel_quadratic")
+# What a sensor keeps from one recording to the next; its clock is set anew, as its bias is.
+LASTING = (
+    *(name for name in MATRICES if name != "clock_offset"),
+    *("mount_rotation", "size_effect", "gyro_g_sensitivity", "gyro_quadratic", "accel_quadratic"),
+)
 SURE = 3.0  # sigmas, widened by the sequences' disagreement, from which on a number is carried over to other recordings
-# true = M read - b: numbers of the data set's page, https://vision.in.tum.de/data/datasets/visual-inertial-dataset, defined by
-# equations 1 and 2 of Schubert et al., The TUM VI Benchmark for Evaluating Visual-Inertial Odometry, IROS 2018.
+# true = M read - b: numbers of the data set's page, https://vision.in.tum.de/data/datasets/visual-inertial-dataset, as several
+# public programs quote it; defined by equations 1 and 2 of Schubert et al., The TUM VI Benchmark, IROS 2018, arXiv 1804.06120.
 TUM_VI = {
     "gyro": [[0.943611, 0.00148681, 0.000824366], [0.000369694, 1.09413, -0.00273521], [-0.00175252, 0.00834754, 1.01588]],
     "accel": [[1.00422, 0.0, 0.0], [-7.82123e-05, 1.00136, 0.0], [-0.0097745, -0.000976476, 0.970467]],

@@ -4,7 +4,7 @@ Poses that an estimator made from the same IMU agree with it whatever its errors
 scale look too small (regression dilution: with noise n in the expected signal E = f + n, the slope of the readings over E is
 var f / var E, and that of E over the readings, turned over, is above the true one by as much as the readings' own noise). The
 true scale lies between the two. Compared are turning and specific force between `SLOW_HZ` and `FAST_HZ`, in the longest
-stretch that can be differentiated; the lag of the gyro behind the poses, in windows, with its scale and misalignment fitted.
+stretch that can be differentiated; and by how much readings come before the poses, in windows, scale and misalignment fitted.
 """
 
 from __future__ import annotations
@@ -75,9 +75,11 @@ def row(log: Path, truth: str | None) -> list[str]:
     for part in (slice(0, 3), slice(3, 6)):
         told = slopes(there[:, part], real[:, part])
         cells.append(", ".join(f"{100 * (a - 1):+.1f} … {100 * (b - 1):+.1f}" for a, b in zip(*told, strict=True)))
-    lags = 1e3 * lags_s(there[:, :3], real[:, :3], rate_hz)
-    third = max(1, len(lags) // 3)
-    return [*cells, f"{np.median(lags[:third]):+.2f}, {np.median(lags[-third:]):+.2f}"]
+    for part in (slice(0, 3), slice(3, 6)):
+        lags = 1e3 * lags_s(there[:, part], real[:, part], rate_hz)
+        third = max(1, len(lags) // 3)
+        cells.append(f"{np.median(lags[:third]):+.2f}, {np.median(lags[-third:]):+.2f}")
+    return cells
 
 
 def main() -> None:
@@ -87,7 +89,7 @@ def main() -> None:
     parser.add_argument("--truth")
     options = parser.parse_args()
     head = ["log", "s", "turning, rms (mrad/s)", "gyro less poses (mrad/s)", "gyro scale x, y, z between (%)"]
-    head += ["accel scale x, y, z between (%)", "lag, first and last third (ms)"]
+    head += ["accel scale x, y, z between (%)", "gyro ahead, first and last third (ms)", "accel ahead (ms)"]
     print(markdown(head, (row(log, options.truth) for log in options.logs)))
 
 

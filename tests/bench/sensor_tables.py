@@ -193,6 +193,7 @@ def picture(
 
     mpl.use("Agg")
     import matplotlib.pyplot as plt
+    from matplotlib.lines import Line2D
 
     aside = set(tests)
     figure, axes = plt.subplots(len(PICTURED), len(sensors), figsize=(4.0 * len(sensors), 7.2), squeeze=False, sharex="col")
@@ -213,8 +214,7 @@ def picture(
             range(len(sequences)), [name.split("_")[0] if sensor != "euroc" else name[:5] for name in sequences], fontsize=6
         )
     colored = [
-        plt.Line2D([], [], color=color, marker="o", ms=3.5, lw=0.8, label=axis)
-        for axis, color in zip("xyz", COLORS, strict=True)
+        Line2D([], [], color=color, marker="o", ms=3.5, lw=0.8, label=axis) for axis, color in zip("xyz", COLORS, strict=True)
     ]
     axes[0][0].legend(handles=colored, fontsize=6, ncols=3, frameon=False)
     figure.tight_layout(pad=0.6)
