@@ -42,7 +42,6 @@ FAR_OUT = 300.0  # half the gain, above which the tail itself is less than a num
 SUSPICIOUS, CLEARLY, NAMELESS = 3, 10.0, 15.0  # effects; squares by which an answer is better; what a missing name costs
 WELL, HOPELESS = 1.03, 2.0  # squares left a row, below which all is said, and above which more of the same is no answer
 MOST_NAMELESS, NAMELESS_SHARE = 2, 0.03  # effects without a name, and how much of the misfit each has to take
-IN_BAND = 0.8  # of the rate's half: what is faster nobody sees
 BEYOND, BEYOND_LOW_PASS = 3.0, 6.0  # of the poses' band: their smoothing looks like a mount that rings, but delays nothing
 NOISE_ONLY = 1.15  # squares left a row, up to which a simulation's noise is taken at its word
 EXCHANGED = 3  # effects among which each is asked whether another would do better
