@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Bool, Float64
+from scipy.stats import f as fisher
 
 from imutool.physics import stamps, unnamed
 from imutool.physics.apart import remarks, shared
@@ -30,6 +31,7 @@ SHOWN_KNOTS = 41  # of a curve without a name, as it is told
 SOME = 0.05  # of the samples of an axis at its limit, from which on that is told
 MOVES = 5.0  # times its noise by which an axis should have moved before it is called stuck
 WHITE = 1.15  # what is left over the noise, as a ratio, that still counts as noise
+BY_CHANCE = 1e-3  # or more, where so few values are left that noise alone exceeds that
 
 
 def told(
@@ -276,7 +278,11 @@ def _unexplained(
     out = {}
     for signal, k in _known([log.pair for log in logs]).items():
         held, noise = _held_out(logs, after, after, k, UNITS[signal]), _noise(logs, noises, k)
-        out[signal] = Unexplained(held.rms_after, noise, held.rms_after < WHITE * noise)
+        part = slice(3 * k, 3 * k + 3)
+        unseen = sum(len(_unseen(log, there, part)) for log, there in zip(logs, after, strict=True))
+        seen = sum(log.numbers("fitted") for log in logs) / 2.0  # of both sensors
+        most = max(WHITE, float(np.sqrt(fisher.isf(BY_CHANCE, unseen, max(seen, 1.0))))) if unseen else WHITE
+        out[signal] = Unexplained(held.rms_after, noise, held.rms_after < most * noise)
     return out
 
 

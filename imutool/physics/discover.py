@@ -196,11 +196,12 @@ class _Search:
                 continue  # what one step promises of a linear effect is what it gains
             if physics.name not in self.trials:
                 hopeful = now.objective - (0.0 if best is None else RIVAL_SHARE * (now.objective - best[1].objective))
-                self.trials[physics.name] = fit(self.logs, (*now.chosen, (physics, start)), near=now, hopeful=hopeful)
+                self.trials[physics.name] = self.tried_with(now.chosen, physics, start, now, hopeful)
             trial = self.trials[physics.name]
-            if self._beyond_the_band(physics, trial.chosen[-1][1]):
+            it, theta = trial.chosen[-1]
+            if not it.parameters or self._beyond_the_band(it, theta):
                 continue
-            score = self.chance(physics, now.objective - trial.objective)
+            score = self.chance(it, now.objective - trial.objective)
             if best is None or score < best[0]:
                 best = score, trial
         if best is None or best[0] > np.log(FALSE_DISCOVERY / self.tried):
@@ -209,6 +210,15 @@ class _Search:
         if any(":" in name for name in best[1].names) and now.objective - best[1].objective < NAMELESS_SHARE * misfit:
             return None  # the rim of something that has no name: a name for it would be wrong
         return best[1]
+
+    def tried_with(self, others: Chosen, physics: Physics, start: Theta, near: Fit, hopeful: float) -> Fit:
+        """The fit with one more effect, without those of its numbers that would be many times larger than anything met."""
+        trial = fit(self.logs, (*others, (physics, start)), near=near, hopeful=hopeful)
+        held = _plausible(physics, trial.chosen[-1][1])
+        if held is physics:
+            return trial
+        kept = _kept(physics, held, trial.chosen[-1][1])
+        return fit(self.logs, (*others, (held, kept)), near=near, hopeful=hopeful)
 
     def ranked(self, now: Fit, candidates: Sequence[Physics]) -> list[_Ranked]:
         """Candidates by what one linear step promises, each from its best start."""
@@ -248,8 +258,8 @@ class _Search:
                 if score > here and not now.chosen[k][0].linear:
                     continue
                 halfway = without.objective - RIVAL_SHARE * (without.objective - now.objective)
-                trial = fit(self.logs, (*others, (physics, start)), near=without, hopeful=halfway)
-                if self.chance(physics, without.objective - trial.objective) < here - 1.0:
+                trial = self.tried_with(others, physics, start, without, halfway)
+                if self.chance(trial.chosen[-1][0], without.objective - trial.objective) < here - 1.0:
                     return trial
         return now
 
