@@ -12,7 +12,8 @@ from scipy.stats import wilcoxon
 
 from imutool.physics.any_effects import Chosen, Effect, Samples, differ
 from imutool.physics.any_fit import BETWEEN_SAMPLES, Fit, Panel, Weighed, fit
-from imutool.physics.discover import BLOCK_S, FALSE_DISCOVERY, HELPS, chance
+from imutool.physics.discover import FALSE_DISCOVERY, HELPS
+from imutool.physics.evidence import BLOCK_S, chance
 
 ALIKE = 4.0  # natural logarithms of chance within which two effects cannot be told apart
 TRIED = 5  # candidates that are fitted in full in a round

@@ -15,17 +15,14 @@ from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float64
-from scipy.special import gammaincc, gammainccinv, gammaln
-from scipy.stats import norm, wilcoxon
-from scipy.stats import t as student
 
 from imutool.physics import fit as fits
 from imutool.physics.course import Chosen
 from imutool.physics.effects._forward import Physics, Theta
+from imutool.physics.evidence import chance, gains, helps, needed, predicts
 from imutool.physics.faint import faint
-from imutool.physics.fit import Fit, Weighed, expected, fit
-from imutool.physics.held import Held, only
+from imutool.physics.fit import Fit, Weighed, fit
+from imutool.physics.held import Held, kept, plausible
 from imutool.physics.onset import onsets
 from imutool.physics.pair import Pair
 from imutool.physics.panel import Panel
@@ -37,8 +34,6 @@ FALSE_DISCOVERY = 5e-3
 HELPS = 0.05  # chance of the gain on unseen blocks being none
 TRIED = 3  # candidates that are fitted in full in a round
 MOST, ROUNDS = 8, 20  # effects, and times that one comes in
-BLOCK_S = 2.0
-FAR_OUT = 300.0  # half the gain, above which the tail itself is less than a number can hold
 SUSPICIOUS, CLEARLY, NAMELESS = 3, 10.0, 15.0  # effects; squares by which an answer is better; what a missing name costs
 WELL, HOPELESS = 1.03, 2.0  # squares left a row, below which all is said, and above which more of the same is no answer
 MOST_NAMELESS, NAMELESS_SHARE = 2, 0.03  # effects without a name, and how much of the misfit each has to take
@@ -47,7 +42,6 @@ NOISE_ONLY = 1.15  # squares left a row, up to which a simulation's noise is tak
 EXCHANGED = 3  # effects among which each is asked whether another would do better
 MISSED = 4.0  # times the squares that an effect needs: a fit without it that is as far off after a few steps gets no nearer
 RIVALS, RIVAL_SHARE = 3, 0.5  # effects that are asked whether they would do as well, and of the gain what a step has to promise
-IMPLAUSIBLE = 4.0  # times the plausible size
 
 
 @dataclass(frozen=True, eq=False)
@@ -214,11 +208,11 @@ class _Search:
     def tried_with(self, others: Chosen, physics: Physics, start: Theta, near: Fit, hopeful: float) -> Fit:
         """The fit with one more effect, without those of its numbers that would be many times larger than anything met."""
         trial = fit(self.logs, (*others, (physics, start)), near=near, hopeful=hopeful)
-        held = _plausible(physics, trial.chosen[-1][1])
+        held = plausible(physics, trial.chosen[-1][1])
         if held is physics:
             return trial
-        kept = _kept(physics, held, trial.chosen[-1][1])
-        return fit(self.logs, (*others, (held, kept)), near=near, hopeful=hopeful)
+        left = kept(physics, held, trial.chosen[-1][1])
+        return fit(self.logs, (*others, (held, left)), near=near, hopeful=hopeful)
 
     def ranked(self, now: Fit, candidates: Sequence[Physics]) -> list[_Ranked]:
         """Candidates by what one linear step promises, each from its best start."""
@@ -229,8 +223,8 @@ class _Search:
         for physics in asked:
             if physics.name not in self.known:
                 panel = panel or Panel(self.logs, now)
-                gains = [(panel.gain(physics, start), start) for start in self.starts[physics.name]]
-                gain, start = max(gains, key=lambda pair: pair[0])
+                promises = [(panel.gain(physics, start), start) for start in self.starts[physics.name]]
+                gain, start = max(promises, key=lambda pair: pair[0])
                 self.known[physics.name] = _Ranked(self.chance(physics, gain), physics, start, gain)
         return sorted((self.known[physics.name] for physics in asked), key=lambda entry: entry.score)
 
@@ -266,8 +260,8 @@ class _Search:
     def pruned(self, now: Fit) -> Fit:
         """Without effects that the others have made superfluous."""
         for k, (physics, theta) in enumerate(now.chosen[:-1]):  # the last has just come in
-            needed = _needed(np.log(FALSE_DISCOVERY / self.tried) - self.luck[physics.name], len(theta))
-            hopeful = now.objective + MISSED * needed  # so much is left of what is superfluous after a few steps, and less
+            least = needed(np.log(FALSE_DISCOVERY / self.tried) - self.luck[physics.name], len(theta))
+            hopeful = now.objective + MISSED * least  # so much is left of what is superfluous after a few steps, and less
             without = fit(self.logs, (*now.chosen[:k], *now.chosen[k + 1 :]), near=now, hopeful=hopeful)
             if self.chance(physics, without.objective - now.objective) > np.log(FALSE_DISCOVERY / self.tried):
                 return self.pruned(without)
@@ -279,10 +273,10 @@ class _Search:
             self.tell(f"on unseen time: {', '.join(now.names)}")
             other = fit(self.logs, now.chosen, part="held_out", near=now)
             whole = fit(self.logs, now.chosen, part="all", near=now)
-            held = tuple(_plausible(physics, theta) for physics, theta in whole.chosen)
+            held = tuple(plausible(physics, theta) for physics, theta in whole.chosen)
             if any(one is not physics for one, (physics, _) in zip(held, whole.chosen, strict=True)):
                 begun = tuple(
-                    (one, _kept(physics, one, theta)) for one, (physics, theta) in zip(held, whole.chosen, strict=True)
+                    (one, kept(physics, one, theta)) for one, (physics, theta) in zip(held, whole.chosen, strict=True)
                 )
                 now = fit(self.logs, tuple(pair for pair in begun if len(pair[1])))
                 continue
@@ -335,12 +329,12 @@ class _Search:
         if scattered is not None:
             log_p = max(log_p, scattered.chance(physics.name, gain, len(theta)) + self.luck[physics.name])
         blocks = np.concatenate(
-            [_gains(log, fitted, k, "held_out") for log in self.logs] + [_gains(log, other, k, "fitted") for log in self.logs]
+            [gains(log, fitted, k, "held_out") for log in self.logs] + [gains(log, other, k, "fitted") for log in self.logs]
         )
         exact = all(log.pair.against == "simulation" for log in self.logs)
-        helps = min(_helps(blocks[:, 0]), _predicts(blocks) if exact else 1.0)
+        helping = min(helps(blocks[:, 0]), predicts(blocks) if exact else 1.0)
         rate = min(1.0, float(np.exp(min(0.0, log_p + np.log(self.tried)))))
-        if helps > HELPS or self._beyond_the_band(physics, theta):
+        if helping > HELPS or self._beyond_the_band(physics, theta):
             rate = 1.0
         std = (whole.stds() if scattered is None else scattered.std)[physics.name]
         std = np.array([self.onsets.get((physics.name, j), float(s)) for j, s in enumerate(std)])
@@ -367,16 +361,6 @@ def _as_read(pair: Pair) -> Read:
     return Read(pair.stamp_s, pair.real[:, :3], pair.real[:, 3:], np.zeros((len(pair.real), 3)))
 
 
-def _plausible(physics: Physics, theta: Theta) -> Physics:
-    """Itself, or without the parameters that came out many times larger than anything met: a fit to noise, not a number."""
-    if not physics.linear or ":" in physics.name:
-        return physics
-    free = [k for k, (n, v) in enumerate(zip(physics.parameters, theta, strict=True)) if abs(v) <= IMPLAUSIBLE * n.plausible]
-    if len(free) == len(theta):
-        return physics
-    return only(physics, free)
-
-
 def _set_in_as(fitted: Chosen, whole: Chosen) -> Chosen:
     """With the times at which effects set in as all rows show them: one that lies between fitted rows, those cannot."""
     out = []
@@ -384,54 +368,3 @@ def _set_in_as(fitted: Chosen, whole: Chosen) -> Chosen:
         begins = np.array([number.begins for number in physics.parameters])
         out.append((physics, np.where(begins, seen, theta)))
     return tuple(out)
-
-
-def _kept(physics: Physics, held: Physics, theta: Theta) -> Theta:
-    """The values of the parameters that are left."""
-    names = [number.name for number in held.parameters]
-    return np.array([value for number, value in zip(physics.parameters, theta, strict=True) if number.name in names])
-
-
-def chance(gain: float, parameters: int) -> float:
-    """The logarithm of the chance that noise alone gains as much by so many parameters (far out, the tail's leading term)."""
-    half, k = 0.5 * max(gain, 0.0), 0.5 * parameters
-    return float(np.log(gammaincc(k, half))) if half < FAR_OUT else float((k - 1.0) * np.log(half) - half - gammaln(k))
-
-
-def _needed(log_chance: float, parameters: int) -> float:
-    """The squares that so many parameters gain with such a chance."""
-    return float(2.0 * gammainccinv(0.5 * parameters, np.exp(max(log_chance, -FAR_OUT))))
-
-
-def _helps(gains: Float64[np.ndarray, " b"]) -> float:
-    """The chance of blocks gaining so much when they gain nothing: by Student's test, or by ranks where a few gain most."""
-    if len(gains) < 3 or not gains.std():
-        return 1.0
-    z = gains.mean() / (gains.std(ddof=1) / np.sqrt(len(gains)))
-    ranks = float(wilcoxon(gains, alternative="greater").pvalue)  # also where one block asks a curve what it has never seen
-    return min(float(student.sf(z, len(gains) - 1)), ranks)
-
-
-def _predicts(blocks: Float64[np.ndarray, "b 2"]) -> float:
-    """The chance of unseen noise following what is predicted so well: 2 u.n - |u|² has mean -|u|² and variance 4 |u|²."""
-    gain, size = blocks.sum(axis=0)
-    return float(norm.sf((gain + size) / (2.0 * np.sqrt(size)))) if size > 0 else 1.0
-
-
-def _gains(log: Weighed, fitted: Fit, k: int, part: str) -> Float64[np.ndarray, "b 2"]:
-    """Squares by which each block of a part that was not fitted is better with an effect, and those of what it adds."""
-    chosen = fitted.chosen
-    with_, without = (_white(log, one, part) for one in (chosen, (*chosen[:k], *chosen[k + 1 :])))
-    rows = log.rows(part)
-    block = np.floor(log.pair.stamp_s[:: log.whiten.every][rows] / BLOCK_S).astype(int)
-    each = np.stack([(without**2).sum(1) - (with_**2).sum(1), ((without - with_) ** 2).sum(1)], axis=1)
-    names, inverse = np.unique(block, return_inverse=True)
-    return np.stack([np.bincount(inverse, weights=column, minlength=len(names)) for column in each.T], axis=1)
-
-
-def _white(log: Weighed, chosen: Chosen, part: str) -> Float64[np.ndarray, "n 6"]:
-    """White residuals of a part, with the best constant for that part."""
-    rows = log.rows(part)
-    residual = log.whiten(log.pair.real - expected(log.pair, chosen))[rows]
-    one = log.constants[rows]
-    return np.asarray(residual - one * ((one * residual).sum(0) / np.maximum((one * one).sum(0), 1e-300)))

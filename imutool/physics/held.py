@@ -6,7 +6,11 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
+import numpy as np
+
 from imutool.physics.effects._forward import Physics, Theta
+
+IMPLAUSIBLE = 4.0  # times the plausible size
 
 
 class Held:
@@ -27,3 +31,19 @@ def only(physics: Physics, free: Sequence[int]) -> Physics:
     if len(free) == len(physics.parameters):
         return physics
     return replace(physics, parameters=tuple(physics.parameters[k] for k in free), forward=Held(physics, free))
+
+
+def plausible(physics: Physics, theta: Theta) -> Physics:
+    """Itself, or without the parameters that came out many times larger than anything met: a fit to noise, not a number."""
+    if not physics.linear or ":" in physics.name:
+        return physics
+    free = [k for k, (n, v) in enumerate(zip(physics.parameters, theta, strict=True)) if abs(v) <= IMPLAUSIBLE * n.plausible]
+    if len(free) == len(theta):
+        return physics
+    return only(physics, free)
+
+
+def kept(physics: Physics, held: Physics, theta: Theta) -> Theta:
+    """The values of the parameters that are left."""
+    names = [number.name for number in held.parameters]
+    return np.array([value for number, value in zip(physics.parameters, theta, strict=True) if number.name in names])

@@ -153,15 +153,16 @@ def learned(fits: Sequence[Mapping[str, Any]]) -> tuple[PhysicsFile, list[str]]:
 
     A parameter stays if the sequences that show it agree, within `SURE` deviations, that it is not nothing.
     """
-    names = list(fits[0]["values"])
-    mean, covariance = together(
-        [np.array([one["values"][name][0] for name in names]) for one in fits],
-        [np.array(one["information"]) for one in fits],
-    )
+    names = list(dict.fromkeys(name for one in fits for name in one["values"]))
+    thetas, informations = np.zeros((len(fits), len(names))), np.zeros((len(fits), len(names), len(names)))
+    for k, one in enumerate(fits):  # what a motion does not show, it says nothing of
+        at = [names.index(name) for name in one["values"]]
+        thetas[k, at], informations[k][np.ix_(at, at)] = [row[0] for row in one["values"].values()], one["information"]
+    mean, covariance = together(list(thetas), list(informations))
     entries: dict[str, dict[str, Written]] = {}
     left = []
     for k, name in enumerate(names):
-        values = [Value(*one["values"][name]) for one in fits]
+        values = [Value(*one["values"][name]) for one in fits if name in one["values"]]
         told = consistency([(one.value, one.std) for one in values if one.seen])
         std = float(np.sqrt(covariance[k, k])) * max(1.0, told.z if told.count > 1 else 1.0)
         if told.count < 0.5 * len(fits) or abs(mean[k]) < SURE * std or abs(mean[k]) > UNSEEN * values[0].plausible:
