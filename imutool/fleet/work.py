@@ -227,15 +227,14 @@ def _diagnose(job: _Job) -> dict[str, Any]:
     s = job.settings
     robot = robot_of(job.name, s.robot_from, job.source)
     sim = None if s.sim is None else _simulation(place(s.sim), job.name)
-    fit = measured(job.source, sim, imu=s.imu, truth=s.truth)
-    stds = fit.stds()
+    fixed = measured(job.source, sim, imu=s.imu, truth=s.truth)
     parameters = tuple(
         Parameter(physics.name, number.name, float(value), float(std), number.unit)
-        for physics, theta in fit.chosen
-        for number, value, std in zip(physics.parameters, theta, stds[physics.name], strict=True)
+        for physics, theta in fixed.chosen
+        for number, value, std in zip(physics.parameters, theta, fixed.std[physics.name], strict=True)
     )
     told: dict[str, Any] = {"robot": robot, "parameters": parameters}
-    report: dict[str, Any] = {"schema": "imutool.unit/1", "robot": robot, "bias": fit.bias.tolist()}
+    report: dict[str, Any] = {"schema": "imutool.unit/1", "robot": robot, "bias": fixed.bias.tolist()}
     report["parameters"] = [msgspec.to_builtins(one) for one in parameters]
     if not s.quick:
         found = diagnose([job.source], sim, imu=s.imu, truth=s.truth)

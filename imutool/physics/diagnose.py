@@ -7,8 +7,10 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
+from jaxtyping import Float64
 
 from imutool.errors import ConfigError, DataError, ImutoolError, NumericsError
 from imutool.mcap_io.fields import others, read_field
@@ -23,12 +25,13 @@ from imutool.physics.diagnosis import Closer, Diagnosis, Finding
 from imutool.physics.discover import Discovery, discover
 from imutool.physics.effects import _catalogue
 from imutool.physics.effects._forward import Physics
-from imutool.physics.fit import Fit, Weighed, expected, fit
+from imutool.physics.fit import Weighed, expected, fit
 from imutool.physics.found import NO_EFFECT
 from imutool.physics.held import only
 from imutool.physics.motion import smooth_motion
 from imutool.physics.pair import LEAST_S, Pair, of_one_motion, with_simulation, with_truth
 from imutool.physics.reference import wrong_for_moments
+from imutool.physics.scatter import scatter
 from imutool.physics.visible import unseen
 from imutool.physics.weighing import weighed
 from imutool.place import Place
@@ -158,6 +161,18 @@ def _by_names(recordings: Sequence[Recording]) -> list[Recording]:
     return out
 
 
+class Measured(NamedTuple):
+    """Effects with their parameters, by effect how sure those are (as blocks of time scatter), and the stretches' biases.
+
+    `information` is the noise's alone, of all parameters in order.
+    """
+
+    chosen: Chosen
+    std: dict[str, Float64[np.ndarray, " p"]]
+    information: Float64[np.ndarray, "q q"]
+    bias: Float64[np.ndarray, "stretches 6"]
+
+
 def measured(
     real: Place,
     sim: Place | None = None,
@@ -165,7 +180,7 @@ def measured(
     imu: str | None = None,
     truth: str | None = None,
     effects: Sequence[str] = EVERY_UNIT,
-) -> Fit:
+) -> Measured:
     """Some effects of the catalogue, fitted to a recording together whether they are there or not: what units are compared by.
 
     Left out is what could not be seen even if it were there: the scale of a gyro's axis that never turns.
@@ -183,7 +198,9 @@ def measured(
     for one in asked:
         free = [k for k, number in enumerate(one.parameters) if not {one.name, f"{one.name}.{number.name}"} & hidden]
         shown += [only(one, free)] if free else []
-    return fit(logs, tuple((one, one.nothing.astype(float)) for one in shown), part="all")
+    found = fit(logs, tuple((one, one.nothing.astype(float)) for one in shown), part="all")
+    std = scatter(logs, found, "all").std if shown else {}
+    return Measured(found.chosen, {name: np.asarray(one) for name, one in std.items()}, found.information, found.bias)
 
 
 def remaining(real: Place, chosen: Chosen = (), *, imu: str | None = None, truth: str | None = None) -> dict[str, Closer]:

@@ -131,11 +131,10 @@ def diagnosed(logs: Sequence[Path], words: Sequence[str] = ()) -> dict[str, Any]
 def fixed(log: Path, effects: Sequence[str], truth: str | None = None) -> dict[str, Any]:
     """Effects fitted together to one sequence: parameters with deviations, and their information."""
     found = measured(log, truth=truth, effects=effects)
-    std = found.stds()
     values = {
         f"{physics.name}.{number.name}": [float(value), float(s), number.unit, float(number.plausible)]
         for physics, theta in found.chosen
-        for number, value, s in zip(physics.parameters, theta, std[physics.name], strict=True)
+        for number, value, s in zip(physics.parameters, theta, found.std[physics.name], strict=True)
     }
     return {"values": values, "information": found.information.tolist()}
 
