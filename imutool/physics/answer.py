@@ -14,7 +14,7 @@ from imutool.physics.apart import remarks, shared
 from imutool.physics.course import Chosen
 from imutool.physics.diagnosis import UNITS, Closer, Curve, Diagnosis, Estimate, Finding, HeldOut, Located, Traces, Unexplained
 from imutool.physics.discover import Discovery, Judged
-from imutool.physics.fit import Fit, Weighed, expected
+from imutool.physics.fit import Fit, Weighed, expected, fit
 from imutool.physics.found import found as physics_file
 from imutool.physics.late_stamps import late_stamps
 from imutool.physics.pair import LEAST_NOISE, Pair
@@ -48,9 +48,9 @@ def told(
     """
     pairs = [log.pair for log in logs]
     noise = floor(logs)
+    found, named, idle = _worthwhile(logs, found, noise)
     after = [_with(pair, found.fitted.chosen) for pair in pairs]  # held-out time stays unseen
-    named = [_finding(logs, found, one, noise) for one in found.judged]
-    all_found = [one for one in named if one.share > 0.0]
+    all_found = list(named)
     exact = all(pair.against == "simulation" for pair in pairs)
     # digits are a sample's, and a row beside poses is the mean of many
     sample = noise if exact else np.asarray(np.median([white_noise(pair.real) for pair in pairs], axis=0))
@@ -79,7 +79,7 @@ def told(
         located=tuple(replace(one, log=reals[one.log]) if one.log else one for one in places),
         findings=tuple(findings),
         bias=found.whole.bias,
-        not_identifiable=_not_identifiable(found, named, hidden),
+        not_identifiable=_not_identifiable(found, idle, hidden),
         unexplained=unexplained,
         remarks=(*_remarks(pairs), *_resting(pairs, hidden), *remarks(all_found, known)),
         closer=closer(logs, before, after),
@@ -109,10 +109,31 @@ def without_held_out(logs: Sequence[Weighed], found: Discovery, d: Diagnosis) ->
     return physics_file(replace(d, findings=tuple(fitted(one) for one in d.findings if one.effect != QUANTIZATION)))
 
 
-def _not_identifiable(found: Discovery, named: Sequence[Finding], hidden: Sequence[str]) -> tuple[str, ...]:
+def _worthwhile(
+    logs: Sequence[Weighed], found: Discovery, noise: Float64[np.ndarray, "6"]
+) -> tuple[Discovery, list[Finding], list[str]]:
+    """A discovery without effects that bring nothing on unseen time beside the others, its findings, and those effects."""
+    named, idle = [_finding(logs, found, one, noise) for one in found.judged], []
+    while any(one.share <= 0.0 for one in named):
+        least = min(range(len(named)), key=lambda k: named[k].share)
+        idle.append(named[least].effect)
+        name = found.judged[least].physics.name
+        fitted, whole = (
+            fit(logs, tuple(one for one in those.chosen if one[0].name != name), part=those.part, near=those)
+            for those in (found.fitted, found.whole)
+        )
+        theta = {physics.name: value for physics, value in whole.chosen}
+        rest = (one for one in found.judged if one.physics.name != name)
+        judged = tuple(replace(one, theta=theta[one.physics.name]) for one in rest)
+        found = replace(found, judged=judged, fitted=fitted, whole=whole)
+        named = [_finding(logs, found, one, noise) for one in found.judged]
+    return found, named, idle
+
+
+def _not_identifiable(found: Discovery, idle: Sequence[str], hidden: Sequence[str]) -> tuple[str, ...]:
     """Of what was found, the numbers that nothing shows; of the rest of the catalogue what could not be seen."""
     told = [name for one in found.judged for name in one.unidentified if one.physics.name != JITTER]
-    told += [one.effect for one in named if one.share <= 0.0]
+    told += idle
     there = {one.physics.name.partition(" ")[0] for one in found.judged}
     return tuple(dict.fromkeys([*told, *(name for name in hidden if name.partition(".")[0] not in there)]))
 
@@ -214,6 +235,8 @@ def _finding(logs: Sequence[Weighed], found: Discovery, one: Judged, floor: Floa
             excess = held.rms_before**2 - held.rms_after**2
             shares.append((excess / noise, float(np.clip(excess / misfit, 0.0, 1.0)), signal, held))
     _, share, signal, held = max(shares, key=lambda entry: entry[0])
+    if sum(brought for brought, *_ in shares) <= 0.0:  # what it takes from one sensor it adds to the other
+        share = 0.0
     told_signal = signal if len(one.physics.sensors) == 1 else "both"
     name, _, rest = one.physics.name.partition(":")
     return Finding(

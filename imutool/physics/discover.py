@@ -38,6 +38,7 @@ SUSPICIOUS, CLEARLY, NAMELESS = 3, 10.0, 15.0  # effects; squares by which an an
 WELL, HOPELESS = 1.03, 2.0  # squares left a row, below which all is said, and above which more of the same is no answer
 MOST_NAMELESS, NAMELESS_SHARE = 2, 0.03  # effects without a name, and how much of the misfit each has to take
 BEYOND, BEYOND_LOW_PASS = 3.0, 6.0  # of the poses' band: their smoothing looks like a mount that rings, but delays nothing
+SLOWEST_HZ = 0.5  # of a filter or a mount; what lags by more is motion that the poses have lost
 NOISE_ONLY = 1.15  # squares left a row, up to which a simulation's noise is taken at its word
 EXCHANGED = 3  # effects among which each is asked whether another would do better
 MISSED = 4.0  # times the squares that an effect needs: a fit without it that is as far off after a few steps gets no nearer
@@ -314,11 +315,11 @@ class _Search:
         return tuple(dict.fromkeys(found))
 
     def _beyond_the_band(self, physics: Physics, theta: Theta) -> bool:
-        """A frequency so far above what is expected that smoothed poses, which lose and lag by themselves, look alike."""
+        """A frequency at which smoothed poses, which lose and lag by themselves, look alike; or slower than anything met."""
         more = BEYOND_LOW_PASS if physics.name == "low_pass" else BEYOND
         reach = [more * log.pair.band_hz for log in self.logs if log.pair.band_hz is not None]
         hertz = [value for number, value in zip(physics.parameters, theta, strict=True) if number.unit == "Hz"]
-        return bool(reach and hertz and max(hertz) > min(reach))
+        return bool(reach and hertz and (max(hertz) > min(reach) or min(hertz) < SLOWEST_HZ))
 
     def _verdict(self, k: int, fitted: Fit, other: Fit, whole: Fit) -> Judged:
         physics, theta = whole.chosen[k]
