@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from pathlib import Path
 from typing import Annotated
 
@@ -10,6 +11,7 @@ import typer
 from imutool import registry
 from imutool.cli._app import Imu, Json, Logs, Overwrite, Quiet, Truth, Verbose, app, listing
 from imutool.cli._figures import epoch_line
+from imutool.errors import ConfigError
 from imutool.terminal import progress, say, write_json
 
 
@@ -25,6 +27,10 @@ def train(
         Path | None, typer.Option(metavar="FILE.toml", help="Settings; imutool.train.fit.TrainSettings says which.")
     ] = None,
     set_: Annotated[list[str] | None, typer.Option("--set", metavar="key=value", help="One setting. Repeatable.")] = None,
+    physics: Annotated[
+        Path | None,
+        typer.Option(metavar="physics.toml", help="For hybrid: the effects that it names; the neural ODE learns the rest."),
+    ] = None,
     device: Annotated[str, typer.Option(help="cpu or cuda.")] = "cpu",
     seed: Annotated[int | None, typer.Option(help="Seed of everything random.")] = None,
     imu: Imu = None,
@@ -41,7 +47,12 @@ def train(
     from imutool.train.run import train as run
     from imutool.train.settings import settings_of
 
-    words = [*(set_ or ()), *([f"seed={seed}"] if seed is not None else ())]
+    words: list[str] = []
+    if physics is not None:
+        words, left = _named_by(physics, method)
+        if left:
+            logging.getLogger("imutool").warning("left to the neural ODE: %s", ", ".join(left))
+    words += [*(set_ or ()), *([f"seed={seed}"] if seed is not None else ())]
     settings = load(settings_of(method), config, words)
     with progress("Training", verbose, quiet) as tell:
         trained = run(
@@ -58,3 +69,16 @@ def train(
         )
     if not write_json({"schema": "imutool.training/1", "model": str(model), **trained.card}, json_to):
         say(str(model))
+
+
+def _named_by(physics: Path, method: str) -> tuple[list[str], tuple[str, ...]]:
+    """Settings with the effects of a physics.toml, and what is left of it.
+
+    Raises:
+        ConfigError: another method than `hybrid`, or a file that says nothing to it.
+    """
+    if method != "hybrid":
+        raise ConfigError(f"{method} knows no effects", where="--physics", fix="Leave it out, or train --method hybrid")
+    from imutool.train.physics_first import settings_for
+
+    return settings_for(physics)

@@ -8,9 +8,11 @@ at least `LEAST_GAIN` off the held-out error of either sensor, and left out of t
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import msgspec
 import numpy as np
@@ -19,7 +21,9 @@ import torch
 from imutool.bias import hybrid, neural_ode
 from imutool.bias._base import SENSORS, BiasModel, Sensor
 from imutool.config import build, plain
-from imutool.physics.effects._catalogue import named
+from imutool.errors import ConfigError
+from imutool.physics import physics_file
+from imutool.physics.effects._catalogue import known, named
 from imutool.physics.signals import SignalFilter, Signals
 from imutool.recording import Imu, Recording, seconds
 from imutool.train.calibration import Calibration, calibrate
@@ -80,6 +84,23 @@ class PhysicsFirst:
         for name, value in learnt.named_buffers(recurse=False):
             getattr(model, name).copy_(value)
         return model
+
+
+def settings_for(physics: Path) -> tuple[list[str], tuple[str, ...]]:
+    """Settings for `hybrid` with the effects that a physics.toml names, and of those what it has no correction for.
+
+    Their numbers are fitted anew to the logs; the latter, and all that has no name, is left to the neural ODE.
+
+    Raises:
+        ConfigError: the file cannot be read, or names no effect that `hybrid` can take off.
+    """
+    names = tuple(dict.fromkeys(entry.name for entry in physics_file.read(physics).effect))
+    by_sensor = {sensor: [one.name for one in known(sensor) if one.name in names] for sensor in SENSORS}
+    taken = {name for some in by_sensor.values() for name in some}
+    if not taken:
+        raise ConfigError("no effect that a bias model can take off", where=physics, expected="for instance gyro_scale")
+    words = [f"model.{sensor}_effects={json.dumps(some)}" for sensor, some in by_sensor.items()]
+    return words, tuple(name for name in names if name not in taken)
 
 
 def helps(before: dict[Sensor, float], after: dict[Sensor, float]) -> bool:

@@ -12,19 +12,23 @@ import msgspec
 import numpy as np
 import pytest
 import torch
+from typer.testing import CliRunner
 
 from imutool.bias import hybrid
 from imutool.bias._base import Sensor
 from imutool.bias._file import load
+from imutool.cli._app import app
 from imutool.config import build
+from imutool.config import load as load_settings
 from imutool.errors import ConfigError, DataError, LogError, ModelError, NumericsError
 from imutool.mcap_io.write import write
 from imutool.physics.flight import flight
 from imutool.recording import Imu, Recording
 from imutool.train.fit import Epoch, TrainSettings
 from imutool.train.objective import WindowEnds
-from imutool.train.physics_first import helps
+from imutool.train.physics_first import config_of, helps, settings_for
 from imutool.train.run import checkpoint_path, train
+from imutool.train.settings import settings_of
 
 TINY = TrainSettings(
     gyro_window_s=(0.25, 0.5),
@@ -363,3 +367,28 @@ def test_helps_asks_for_a_gain_on_one_sensor_and_no_harm_to_the_other() -> None:
 def test_static_is_not_trained(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="static is not trained"):
         train([], tmp_path / "model.safetensors", method="static")
+
+
+def entry(name: str, parameter: str, unit: str) -> str:
+    return f'[[effect]]\nname = "{name}"\n[effect.parameters.{parameter}]\nvalue = 0.01\nunit = "{unit}"\n'
+
+
+def test_a_physics_file_says_which_effects_hybrid_takes_off_and_what_is_left(tmp_path: Path) -> None:
+    file = tmp_path / "physics.toml"
+    some = (("gyro_scale", "x", "-"), ("saturation", "gyro", "rad/s"), ("lever_arm", "x", "m"), ("clock_offset", "tau", "s"))
+    file.write_text("".join(entry(*one) for one in some))
+    words, left = settings_for(file)
+    config = load_settings(settings_of("hybrid"), None, words)
+    assert config_of(config).gyro_effects == ("clock_offset", "gyro_scale")
+    assert "lever_arm" in (config_of(config).accel_effects or ())
+    assert left == ("saturation",)
+
+
+def test_a_physics_file_of_which_hybrid_knows_nothing_is_refused(tmp_path: Path) -> None:
+    file = tmp_path / "physics.toml"
+    file.write_text(entry("saturation", "gyro", "rad/s"))
+    with pytest.raises(ConfigError, match="no effect that a bias model can take off"):
+        settings_for(file)
+    said = CliRunner().invoke(app, ["train", "a.mcap", "-o", str(tmp_path / "m"), "--method", "linear", "--physics", str(file)])
+    assert said.exit_code == 3
+    assert "linear knows no effects" in said.output
