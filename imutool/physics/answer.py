@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Bool, Float64
 from scipy.stats import f as fisher
+from scipy.stats import ttest_1samp
 
 from imutool.physics import stamps, unnamed
 from imutool.physics.apart import remarks, shared
@@ -31,6 +32,7 @@ SHOWN_KNOTS = 41  # of a curve without a name, as it is told
 SOME = 0.05  # of the samples of an axis at its limit, from which on that is told
 MOVES = 5.0  # times its noise by which an axis should have moved before it is called stuck
 WHITE = 1.15  # what is left over the noise, as a ratio, that still counts as noise
+BLOCK_S, DOUBTED = 3.0, 0.01  # of held-out time; a chance below which more than noise is left beside poses
 BY_CHANCE = 1e-3  # or more, where so few values are left that noise alone exceeds that
 
 
@@ -297,16 +299,35 @@ def _curve(pair: Pair, one: Judged, whole: Fit) -> Curve | None:
 def _unexplained(
     logs: Sequence[Weighed], after: Sequence[Float64[np.ndarray, "n 6"]], noises: Float64[np.ndarray, "6"]
 ) -> dict[str, Unexplained]:
-    """Of the sensors of which anything is known."""
-    out = {}
+    """Of the sensors of which anything is known; beside poses, whose errors come and go, by blocks that are of one mind."""
+    out, beside_poses = {}, any(log.whiten.band is not None for log in logs)
     for signal, k in _known([log.pair for log in logs]).items():
         held, noise = _held_out(logs, after, after, k, UNITS[signal]), _noise(logs, noises, k)
         part = slice(3 * k, 3 * k + 3)
         unseen = sum(len(_unseen(log, there, part)) for log, there in zip(logs, after, strict=True))
         seen = sum(log.numbers("fitted") for log in logs) / 2.0  # of both sensors
         most = max(WHITE, float(np.sqrt(fisher.isf(BY_CHANCE, unseen, max(seen, 1.0))))) if unseen else WHITE
-        out[signal] = Unexplained(held.rms_after, noise, held.rms_after < most * noise)
+        white = held.rms_after < most * noise
+        if not white and beside_poses:
+            white = _by_chance(logs, after, k, noise) > DOUBTED
+        out[signal] = Unexplained(held.rms_after, noise, white)
     return out
+
+
+def _by_chance(logs: Sequence[Weighed], after: Sequence[Float64[np.ndarray, "n 6"]], k: int, noise: float) -> float:
+    """The chance of blocks of held-out time having so much more power than noise, as far as they differ among themselves."""
+    powers: list[float] = []
+    for log, there in zip(logs, after, strict=True):
+        if not log.pair.axes[3 * k : 3 * k + 3].any():
+            continue
+        rows = log.pair.held_out[:: log.whiten.every]
+        left = log.pair.real - there if log.whiten.band is None else log.whiten.band(log.pair.real - there)
+        power = (left[rows, 3 * k : 3 * k + 3][:, log.pair.axes[3 * k : 3 * k + 3]] ** 2).mean(axis=1)
+        block = np.floor(log.pair.stamp_s[:: log.whiten.every][rows] / BLOCK_S).astype(int)
+        powers += [float(power[block == one].mean()) for one in np.unique(block)]
+    if len(powers) < 2:
+        return 1.0
+    return float(ttest_1samp(powers, (WHITE * noise) ** 2, alternative="greater").pvalue)
 
 
 def _known(pairs: Sequence[Pair]) -> dict[str, int]:
