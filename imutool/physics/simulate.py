@@ -151,8 +151,10 @@ def simulated(source: Recording, acting: Acting, noise: noises.Noise, rate_hz: f
     if needed:
         felts = [replace(felt, channels=_channels(source, motion.start_ns, felt.t_s)) for felt in felts]
     stamps = [_stamps(felt, rate_hz) for felt in felts]
-    out = read_all(felts, stamps, [*acting, (_noise(noise, rate_hz, seed), np.zeros(0))])
-    imu = Imu(motion.start_ns + np.round(out.stamp_s * 1e9).astype(np.int64), out.gyro, out.accel)
+    begins_s = float(stamps[0][0])  # effects count time from the first sample that is written
+    since = [replace(felt, t_s=felt.t_s - begins_s) for felt in felts]
+    out = read_all(since, [part - begins_s for part in stamps], [*acting, (_noise(noise, rate_hz, seed), np.zeros(0))])
+    imu = Imu(_nanoseconds(motion, out.stamp_s + begins_s), out.gyro, out.accel)
     inside = motion.covers(source.truth.t_ns)
     return Simulation(
         Recording(
