@@ -35,11 +35,11 @@ HELPS = 0.05  # chance of the gain on unseen blocks being none
 TRIED = 3  # candidates that are fitted in full in a round
 MOST, ROUNDS = 8, 20  # effects, and times that one comes in
 SUSPICIOUS, CLEARLY, NAMELESS = 3, 10.0, 15.0  # effects; squares by which an answer is better; what a missing name costs
-WELL, HOPELESS = 1.03, 2.0  # squares left a row, below which all is said, and above which more of the same is no answer
+WELL, HOPELESS = 1.03, 2.0  # squares left a white value, below which all is said, and above which more of the same is no answer
 MOST_NAMELESS, NAMELESS_SHARE = 2, 0.03  # effects without a name, and how much of the misfit each has to take
 BEYOND, BEYOND_LOW_PASS = 3.0, 6.0  # of the poses' band: their smoothing looks like a mount that rings, but delays nothing
 SLOWEST_HZ = 0.5  # of a filter or a mount; what lags by more is motion that the poses have lost
-NOISE_ONLY = 1.15  # squares left a row, up to which a simulation's noise is taken at its word
+NOISE_ONLY = 1.15  # squares left a white value, up to which a simulation's noise is taken at its word
 EXCHANGED = 3  # effects among which each is asked whether another would do better
 MISSED = 4.0  # times the squares that an effect needs: a fit without it that is as far off after a few steps gets no nearer
 RIVALS, RIVAL_SHARE = 3, 0.5  # effects that are asked whether they would do as well, and of the gain what a step has to promise
@@ -281,7 +281,7 @@ class _Search:
                 )
                 now = fit(self.logs, tuple(pair for pair in begun if len(pair[1])))
                 continue
-            whole, self.onsets = onsets(self.logs, whole, "all", max(1.0, whole.objective / (6.0 * whole.rows)))
+            whole, self.onsets = onsets(self.logs, whole, "all", max(1.0, whole.objective / max(whole.numbers, 1)))
             verdicts = _but_faint([self._verdict(k, now, other, whole) for k in range(len(now.chosen))], self.logs)
             worst = max(range(len(verdicts)), key=lambda k: verdicts[k].false_discovery_rate)
             if verdicts[worst].false_discovery_rate <= FALSE_DISCOVERY:
@@ -294,7 +294,7 @@ class _Search:
     def scattered(self, found: Fit, part: str) -> Scatter | None:
         """How far the blocks are of one mind; nothing where the noise is known, and what is left is as white as it."""
         exact = all(log.pair.against == "simulation" for log in self.logs)
-        if exact and found.objective < NOISE_ONLY * 6 * found.rows:
+        if exact and found.objective < NOISE_ONLY * found.numbers:
             return None
         if self.asked is None or self.asked[0] is not found:
             self.asked = found, scatter(self.logs, found, part)

@@ -74,7 +74,7 @@ def _begins(found: Fit) -> Bool[np.ndarray, " p"]:
 
 def _by_effect(found: Fit, by_blocks: Matrix, by_information: Matrix, shares: Sequence[Matrix]) -> Scatter:
     std, inflation, count, first = {}, {}, {}, 0
-    usual = max(1.0, found.objective / (6.0 * found.rows))
+    usual = max(1.0, found.objective / max(found.numbers, 1))
     stated = found.stds()
     for physics, theta in found.chosen:
         part = slice(first, first + len(theta))
