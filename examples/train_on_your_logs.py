@@ -16,7 +16,7 @@ from imutool.train.run import train
 
 
 def show(epoch: Epoch) -> None:
-    print(f"{epoch.sensor:>5} {epoch.step:4d}/{epoch.steps}: held out {epoch.held_out:.4f}, best {epoch.best:.4f}")
+    print(f"{epoch.sensor:>5} {epoch.step:4d}/{epoch.steps}: held out {epoch.held_out:.4f}, closed form {epoch.before:.4f}")
 
 
 def main(model: Path, logs: Sequence[Path], words: Sequence[str] = ()) -> None:

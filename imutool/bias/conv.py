@@ -161,7 +161,6 @@ class Model(BiasModel):
             "accel_rate": 1e-2,
             "weight_decay": 0.1,
             "validate_every": 50,
-            "patience": 500,
         }
     )
     undecayed: ClassVar[tuple[str, ...]] = ("W",)

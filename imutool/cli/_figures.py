@@ -17,10 +17,10 @@ def epoch_line(epoch: Epoch) -> tuple[int, int, str]:
     if epoch.note:
         return 0, 1, epoch.note
     scale, unit = (180.0 / math.pi, "°") if epoch.sensor == "gyro" else (1.0, " m/s")
-    held_out, best = epoch.held_out * scale, epoch.best * scale
+    held_out, before = epoch.held_out * scale, epoch.before * scale
     minutes, seconds = divmod(round(epoch.left_s), 60)
     loss = "" if math.isnan(epoch.loss) else f"loss {epoch.loss:.3f}, "  # before the first step there is none
-    text = f"{epoch.sensor} {epoch.step}/{epoch.steps}: {loss}held out {held_out:.3f}{unit} (best {best:.3f})"
+    text = f"{epoch.sensor} {epoch.step}/{epoch.steps}: {loss}held out {held_out:.3f}{unit} (closed form {before:.3f})"
     return epoch.step, max(epoch.steps, 1), f"{text}, {minutes}:{seconds:02d} left" if epoch.step else text
 
 

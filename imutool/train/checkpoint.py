@@ -16,7 +16,7 @@ from imutool.errors import ConfigError, ModelError
 from imutool.train.fit import Stage, Training
 from imutool.train.loss import RobustLoss
 
-FORMAT = "imutool.training/1"
+FORMAT = "imutool.training/2"
 
 
 def save(training: Training, path: Path) -> None:
@@ -29,8 +29,8 @@ def save(training: Training, path: Path) -> None:
     tensors |= {"tracks": training.tracks.knots.detach(), "generator": training.generator.get_state()}
     about: dict[str, Any] = {"identity": _identity(training), "done": training.done}
     if stage := training.stage:
-        about["stage"] = {"sensor": stage.sensor, "step": stage.step, "best": stage.best, "best_step": stage.best_step}
-        tensors |= {f"best.{name}": value for name, value in stage.best_state.items()}
+        about["stage"] = {"sensor": stage.sensor, "step": stage.step, "before": stage.before}
+        tensors |= {f"closed_form.{name}": value for name, value in stage.closed_form.items()}
         tensors |= {f"mean.{name}": value for name, value in stage.mean.state_dict().items()}
         tensors |= {f"usual.{n}": value for n, value in stage.objective.loss.medians.items()}
         for index, state in stage.optimizer.state_dict()["state"].items():
@@ -77,8 +77,7 @@ def _stage(training: Training, about: dict[str, Any], tensors: dict[str, Tensor]
     groups = stage.optimizer.state_dict()["param_groups"]
     stage.optimizer.load_state_dict({"state": state, "param_groups": groups})
     stage.objective.loss = RobustLoss({int(n): value for n, value in _part(tensors, "usual.").items()})
-    stage.step, stage.best, stage.best_step = int(about["step"]), float(about["best"]), int(about["best_step"])
-    stage.best_state = _part(tensors, "best.")
+    stage.step, stage.before, stage.closed_form = int(about["step"]), float(about["before"]), _part(tensors, "closed_form.")
     return stage
 
 

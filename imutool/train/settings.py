@@ -39,7 +39,6 @@ class TrainSettings(Settings, frozen=True):
     weight_decay: Annotated[float, msgspec.Meta(ge=0)] = 1e-4
     track_knot_s: Positive = 20.0
     validate_every: Count = 30
-    patience: Count = 150  # steps without a better held-out error after which a stage ends
     increments: IncrementSettings = IncrementSettings()
     model: dict[str, Any] = msgspec.field(default_factory=dict)
 
