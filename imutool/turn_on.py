@@ -19,7 +19,7 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Float64
+from jaxtyping import Float64
 from torch import Tensor
 
 from imutool import so3
@@ -29,14 +29,14 @@ from imutool.recording import GRAVITY_M_S2, Imu, Recording, nanoseconds, seconds
 from imutool.rest_track import USUAL_WALK, Along, Following, Known, Passed, Samples, Track, followed
 from imutool.rest_track import smooth as smooth_track
 from imutool.stationary import Blocks, resting, stretches, white_noise
-from imutool.strapdown import GRAVITY_W, with_velocity
-from imutool.windows import HUBER_MEDIANS, attitudes, between, huber_weight, running_product
+from imutool.strapdown import with_velocity
+from imutool.truth_offset import truth_offset
 
 TRUTH_S = 15.0  # how much of the truth a start takes: of 3, 5, 8, 10 and 15 s the best on training logs left out in turn
 LEAST_TRUTH_S = 1.0
+WORLD_TILT_STD = np.array([0.0] * 3 + [0.1] * 3)  # m/s²: half a degree, as of EuRoC's second Vicon room (docs/diagnosis.md)
 AT_REST_STD = np.array([1e-4] * 3 + [0.03] * 3)  # earth's rotation; local gravity and what a tilt hides
 REST_BEGINS_WITHIN_S = 5.0  # later, its bias would be one of the future
-ITERATIONS = 4
 MAD_TO_STD = 1.4826
 LEAST_STD = np.array([1e-6] * 3 + [1e-4] * 3)  # a prior without any doubt would leave nothing to estimate
 FOLLOWED = "gravity in motion and every stop"
@@ -310,7 +310,8 @@ def _weighed(start: TurnOn, stills: Sequence[_Still], first_ns: int) -> TurnOn:
 def from_truth(model: BiasModel, recording: Recording, truth_s: float = TRUTH_S) -> TurnOn:
     """From the first seconds of true poses, as many as there are up to `truth_s` (gaps do no harm), and the prior.
 
-    They hold for as long as they last; from there on the rest bias is followed.
+    They hold for as long as they last; from there on the rest bias is followed. What follows goes by gravity, from which the
+    truth's world may lean: beside true poses that is a bias of the accelerometer, and afterwards it is an error.
 
     Raises:
         DataError: no truth, or less than a second of it.
@@ -333,66 +334,22 @@ def from_truth(model: BiasModel, recording: Recording, truth_s: float = TRUTH_S)
     left = np.concatenate([piece.gyro, piece.accel], axis=1) - _bias(model, piece, start.rest)
     R_wb = so3.matrix_from_quaternion_wxyz(torch.from_numpy(np.array(poses.q_wb_wxyz)))
     offset = truth_offset(t[rows], left, R_wb, torch.from_numpy(np.array(poses.v_w)), trusted[rows])
-    var, measured = start.std**2, _numpy(model.truth_std) ** 2 * (TRUTH_S / found_s) ** 2
-    gain = np.divide(var, var + measured, out=np.zeros(6), where=var > 0)  # a prior without doubt stays
-    rest, std = start.rest + gain * offset, np.sqrt(gain * measured)
+    measured = _numpy(model.truth_std) ** 2 * (TRUTH_S / found_s) ** 2
+    rest, std = _moved(start, offset, measured)
     how = f"truth over {found_s:.1f} s{', weighed against the training runs' if model.card else ''}, {_sure(std)}"
     if not model.card:
         return TurnOn(rest, std, how)
-    before = replace(known(model), mean=rest, std=np.maximum(std, LEAST_STD))
+    upright, unsure = _moved(start, offset, measured + WORLD_TILT_STD**2)
+    before = replace(known(model), mean=upright, std=np.maximum(unsure, LEAST_STD))
     ends = seconds(piece.t_ns[-1:], int(recording.imu.t_ns[0]))[0]
     return TurnOn(rest, std, f"{how}, then {FOLLOWED}", follows=before, hold_s=float(ends))
 
 
-def truth_offset(
-    t_s: Float64[np.ndarray, " n"],
-    samples: Float64[np.ndarray, "n 6"],
-    R_wb: Float[Tensor, "n 3 3"],
-    v_w: Float[Tensor, "n 3"],
-    trusted: Bool[np.ndarray, " n"],
-) -> Vector6:
-    """The constant in samples that the truth beside them shows: the slope, in time, of what integration misses.
-
-    Rotation and velocity are integrated from the first true pose; their misses e(t) = e_0 + (sum of A) b are fitted by all
-    trusted poses with Huber's weights, e_0 being the first pose's own error. The attitude under
-    the accelerometer is the true one (half a degree of drift would be a tenth of m/s²), carried through gaps by the gyro.
-    """
-    dt, seen = torch.from_numpy(np.diff(t_s))[None], torch.from_numpy(trusted)
-    rate, force = torch.from_numpy(samples[:, :3])[None], torch.from_numpy(samples[:, 3:])[None]
-    offset = torch.zeros(2, 3, dtype=torch.float64)
-    for _ in range(ITERATIONS):
-        running = running_product(so3.exp(between(rate - offset[0]) * dt[..., None]))[0]
-        missed = (running @ so3.log(running.mT @ (R_wb[0].mT @ R_wb[1:]))[..., None])[..., 0]
-        by_rate = torch.cumsum(running * dt[0, :, None, None], dim=0)
-        offset[0] -= _slope(missed, by_rate, seen[1:])
-    R_wb = _attitudes(t_s, rate - offset[0], R_wb, trusted)
-    a_w = (R_wb @ force[0, ..., None])[..., 0] + torch.tensor(GRAVITY_W, dtype=torch.float64)
-    risen = torch.cumsum(between(a_w[None])[0] * dt[0, :, None], dim=0)
-    by_force = torch.cumsum(0.5 * (R_wb[:-1] + R_wb[1:]) * dt[0, :, None, None], dim=0)
-    offset[1] = -_slope(v_w[1:] - v_w[0] - risen, by_force, seen[1:])
-    return offset.flatten().numpy()
-
-
-def _attitudes(
-    t_s: Float64[np.ndarray, " n"], rate: Float[Tensor, "1 n 3"], R_wb: Float[Tensor, "n 3 3"], trusted: Bool[np.ndarray, " n"]
-) -> Float[Tensor, "n 3 3"]:
-    """The integrated attitude, turned by what it misses of the trusted poses, and in gaps by what lies between."""
-    R_hat = attitudes(R_wb[:1], rate, torch.from_numpy(np.diff(t_s))[None])[0]
-    missed = so3.log(R_hat.mT @ R_wb).numpy()
-    filled = [np.interp(t_s, t_s[trusted], missed[trusted, axis]) for axis in range(3)]
-    return torch.as_tensor(R_hat @ so3.exp(torch.from_numpy(np.stack(filled, axis=1))))
-
-
-def _slope(missed: Float[Tensor, "n 3"], by: Float[Tensor, "n 3 3"], seen: Bool[Tensor, " n"]) -> Float[Tensor, "3"]:
-    """b of missed = e_0 + by b, by least squares with Huber's weights."""
-    y, X = missed[seen], torch.cat([by[seen], torch.eye(3, dtype=by.dtype).expand(int(seen.sum()), 3, 3)], dim=2)
-    root = torch.ones(len(y), dtype=y.dtype)
-    for _ in range(ITERATIONS):
-        weighted = (X * root[:, None, None]).flatten(0, 1), (y * root[:, None]).reshape(-1, 1)
-        found = torch.linalg.lstsq(*weighted).solution[:, 0]
-        size = (y - X @ found).norm(dim=1)
-        root = huber_weight(size, (HUBER_MEDIANS * size.median()).clamp_min(1e-9).expand(len(size))).sqrt()
-    return torch.as_tensor(found[:3])
+def _moved(start: TurnOn, offset: Vector6, variance: Vector6) -> tuple[Vector6, Vector6]:
+    """A start moved towards where a measurement of this variance says it is off by `offset`: rest bias and its deviation."""
+    var = start.std**2
+    gain = np.divide(var, var + variance, out=np.zeros(6), where=var > 0)  # a prior without doubt stays
+    return start.rest + gain * offset, np.sqrt(gain * variance)
 
 
 def _bias(model: BiasModel, imu: Imu, rest: Vector6) -> Float64[np.ndarray, "n 6"]:

@@ -45,7 +45,7 @@ TIERS = (
     ),
     ("preintegration", "inertial_filter", "physics"),
     ("bias",),
-    ("rest_track", "turn_on"),
+    ("rest_track", "truth_offset", "turn_on"),
     ("certainty", "log_start"),
     ("debias", "zero_velocity"),
     ("train", "evaluate", "convert", "identify", "export"),

@@ -15,7 +15,8 @@ from imutool.stationary import white_noise
 from imutool.train import closed_form
 from imutool.train.corrected import corrected
 from imutool.train.segments import Pool
-from imutool.turn_on import TRUTH_S, rest_spread, truth_offset
+from imutool.truth_offset import truth_offset
+from imutool.turn_on import TRUTH_S, rest_spread
 
 MAD_TO_STD = 1.4826
 ONE_RUN_STD = {"gyro": 5e-3, "accel": 0.1}  # run-to-run spread when there is one run to judge by, rad/s and m/s²

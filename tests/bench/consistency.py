@@ -32,7 +32,8 @@ from imutool.log_start import smooth_in_memory
 from imutool.mcap_io.read import read
 from imutool.recording import Recording, seconds
 from imutool.strapdown import with_velocity
-from imutool.turn_on import TRUTH_S, find, truth_offset
+from imutool.truth_offset import truth_offset
+from imutool.turn_on import TRUTH_S, find
 from imutool.windows import between, running_product
 
 LEAST_TRUSTED = 0.5
