@@ -1,17 +1,16 @@
-"""What each way to know the rest bias is worth: `python tests/bench/starts.py FOLDER MODEL`.
+"""What each way to know the rest bias is worth: `python tests/bench/starts.py LOG... --model MODEL`.
 
-FOLDER holds logs of the training sequences (`imutool convert`), MODEL is of the same sensor and trained on others, as those of
-`python examples/reproduce_tables.py DATA -o FOLDER --swap` are. Prints the AOE in degrees of pure integration from the true
-pose:
+MODEL is of the same sensor and trained on other logs than these, as those of `python examples/reproduce_tables.py DATA -o OUT
+--swap` are for the training sequences. Prints the AOE in degrees of pure integration from the true pose:
 
-    truth     start from 5 s of truth, weighed against the training runs      prior    mean of the training runs
+    truth     `--init truth`: its first seconds, then followed                prior    mean of the training runs
     rest      first stop, else the prior (the rule before there was a filter) VQF      its bias estimate, causal
     VQF all   its offline estimate                                            auto     `--init auto`
     smooth    `--smooth`                                                      oracle   each log's own constant, by truth
 
 VQF (Laidig and Seel, 2023) is given the same samples, less what the model says of the motion and less the prior's mean, and a
-clip of 20 instead of 2 deg/s. A model that does not say how its bias differs at rest is told, from the other logs. Below stands
-how consistent `auto` is: the mean NEES of its last gyro bias against the oracle's, 3 if it is as sure as it should be.
+clip of 20 instead of 2 deg/s. Below stands how consistent `auto` is: the mean NEES of its last gyro bias against the oracle's,
+3 if it is as sure as it should be.
 """
 
 from __future__ import annotations
@@ -21,9 +20,7 @@ import time
 from pathlib import Path
 
 import numpy as np
-import torch
 import vqf
-from accuracy import TRAIN
 
 from imutool import metrics, turn_on
 from imutool.bias._base import BiasModel, Vector6
@@ -34,6 +31,7 @@ from imutool.recording import Imu, Recording, seconds
 from imutool.rest_track import Samples, Track, followed
 from imutool.strapdown import along_truth
 from imutool.train import closed_form
+from imutool.train.corrected import corrected
 from imutool.train.segments import Pool
 from imutool.turn_on import TurnOn
 
@@ -45,25 +43,20 @@ COLUMNS = ("truth", "prior", "rest", "VQF", "VQF all", "auto", "smooth", "oracle
 def main() -> None:
     """One row a training sequence, and their mean."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("folder", type=Path)
-    parser.add_argument("model", type=Path)
+    parser.add_argument("logs", type=Path, nargs="+", metavar="LOG")
+    parser.add_argument("--model", type=Path, required=True)
     options = parser.parse_args()
     model = load(options.model)
-    names = [name for sequences in TRAIN.values() for name in sequences if (options.folder / f"{name}.mcap").exists()]
-    recordings = [read(options.folder / f"{name}.mcap", truth="/ground_truth/pose") for name in names]
+    recordings = [read(log, truth="/ground_truth/pose") for log in options.logs]
+    recordings = [recording.with_truth("/ground_truth/pose") for recording in recordings]
     oracle = own_bias(model, recordings)
-    told = getattr(model, "rest_std", None) is not None
     print(f"{'':16}" + "".join(f"{column:>9}" for column in COLUMNS) + "   s: auto, smooth; how")
     rows, nees = [], []
     for i, recording in enumerate(recordings):
-        if not told:
-            others = [j for j in range(len(names)) if j != i]
-            spread = turn_on.rest_spread(model, [samples(recordings[j].imu) for j in others], oracle[others])
-            model.register_buffer("rest_std", torch.from_numpy(spread))
         row, how, error, P = score(model, recording, oracle[i])
         rows.append(row)
         nees.append(error @ np.linalg.solve(P, error))
-        print(f"{names[i]:16}" + "".join(f"{value:9.2f}" for value in row) + how, flush=True)
+        print(f"{recording.name:16}" + "".join(f"{value:9.2f}" for value in row) + how, flush=True)
     print(f"{'mean':16}" + "".join(f"{value:9.2f}" for value in np.mean(rows, axis=0)))
     print(f"NEES of auto's last gyro bias: mean {np.mean(nees):.1f}, each {np.round(nees, 1).tolist()}")
 
@@ -104,8 +97,9 @@ def own_bias(model: BiasModel, recordings: list[Recording]) -> np.ndarray:
     """Each log's own constant, in closed form from all its truth."""
     pool = Pool.of(recordings)
     rest = model.prior_mean.double().expand(len(recordings), 6).clone()
+    scored, pool = corrected(model, pool)
     for sensor, columns in (("gyro", slice(0, 3)), ("accel", slice(3, 6))):
-        solved = closed_form.solve(model, sensor, pool, rest, WINDOW_S[sensor], matrix=False, part="all")  # type: ignore[arg-type]
+        solved = closed_form.solve(scored, sensor, pool, rest, WINDOW_S[sensor], matrix=False, part="all")  # type: ignore[arg-type]
         rest[:, columns] = solved.rest
     return rest.numpy()
 
