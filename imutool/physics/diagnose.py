@@ -116,7 +116,7 @@ def _again(told: Diagnosis, logs: Sequence[Weighed], found: Discovery, sim: Reco
     try:
         closer = simulated_again(logs, sim, answer.without_held_out(logs, found, told))
     except ImutoolError as error:
-        why = f"how much closer it comes is computed, not simulated again: {error}"
+        why = f"How much closer it comes is computed, not simulated again: {error}"
         return replace(told, remarks=(*told.remarks, why))
     return replace(told, closer=closer)
 
