@@ -55,7 +55,8 @@ def card(name: str, about: dict[str, Any], rows: list[dict[str, Any]], seeds: in
         "",
         f"Method `{about['method']}`, sensor {about['sensor']}, data set {about['dataset']}, {about['rate_hz']:.1f} Hz.",
         "",
-        f"- Trained on {', '.join(logs)}: the first 80 % of each; the last 20 % chose among steps and among {seeds} seed(s).",
+        f"- Trained on {', '.join(logs)}: the first 80 % of each; by the last 20 % the end of the "
+        f"descent was kept and not the closed form it began with, or the other way round, and one of {seeds} seed(s) chosen.",
         f"- Settings: the defaults of imutool {about['imutool']}, torch {about['torch']}, seed {seed}.",
         f"- Command: `{command}`",
         f"- Held out: {about['held_out']['gyro']['error'] * 180 / np.pi:.3f}° (gyro, 20 s or what fits), "
