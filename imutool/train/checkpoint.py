@@ -76,7 +76,8 @@ def _stage(training: Training, about: dict[str, Any], tensors: dict[str, Tensor]
         state.setdefault(int(index), {})[key] = value
     groups = stage.optimizer.state_dict()["param_groups"]
     stage.optimizer.load_state_dict({"state": state, "param_groups": groups})
-    stage.objective.loss = RobustLoss({int(n): value for n, value in _part(tensors, "usual.").items()})
+    device = training.pool.t.device
+    stage.objective.loss = RobustLoss({int(n): value.to(device) for n, value in _part(tensors, "usual.").items()})
     stage.step, stage.before, stage.closed_form = int(about["step"]), float(about["before"]), _part(tensors, "closed_form.")
     return stage
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import Any
 
 import msgspec
@@ -13,6 +15,8 @@ import torch
 from imutool.physics.flight import FlightSettings as Flight
 from imutool.physics.flight import TriadSettings, flight, trajectory
 from imutool.recording import Imu, Poses, Recording
+
+sys.path.insert(0, str(Path(__file__).parent))  # for the simulated GPU
 
 PERFECT = TriadSettings(
     noise_density=0.0, walk_density=0.0, typical_bias=0.0, turn_on_bias=0.0, warm_up=0.0, scale=0.0, misalignment_rad=0.0
