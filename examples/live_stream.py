@@ -14,7 +14,7 @@ import numpy as np
 
 from imutool.bias import static
 from imutool.debias import Block, OnlineDebiaser
-from imutool.mcap_io.log import ImuBatch
+from imutool.mcap_io.batches import ImuBatch
 from imutool.physics.flight import flight
 from imutool.recording import Imu, nanoseconds
 from imutool.turn_on import at_rest

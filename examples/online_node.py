@@ -15,7 +15,8 @@ import numpy as np
 from imutool.bias import static
 from imutool.bias._file import find_model
 from imutool.debias import OnlineDebiaser
-from imutool.mcap_io.read import Log, read
+from imutool.mcap_io.log import Log
+from imutool.mcap_io.read import read
 from imutool.recording import nanoseconds
 from imutool.turn_on import at_rest
 

@@ -25,10 +25,13 @@ from imutool.config import plain
 from imutool.errors import ConfigError, LogError
 from imutool.log_start import prepare, refuse_smooth
 from imutool.mcap_io import schema
+from imutool.mcap_io.batches import Clock, ImuBatch
+from imutool.mcap_io.derived import Made, NewTopic
 from imutool.mcap_io.digest import Digest
-from imutool.mcap_io.log import Clock, ImuBatch, Log
+from imutool.mcap_io.encode import encode_imu, encode_twist, encode_vector3
+from imutool.mcap_io.log import Log
 from imutool.mcap_io.losses import Losses
-from imutool.mcap_io.rewrite import Made, NewTopic, RewriteReport, Values, rewrite
+from imutool.mcap_io.rewrite import RewriteReport, Values, rewrite
 from imutool.mcap_io.salvage import repaired
 from imutool.mcap_io.verify import Verified, refuse_unknown
 from imutool.place import Place
@@ -127,7 +130,7 @@ def _by_blocks(stream: Stream) -> Callable[[float, Vector6], Vector6]:
 
 
 class Debiaser:
-    """The channels a log gains, computed batch by batch as the log is copied (`mcap_io.rewrite.Derived`).
+    """The channels a log gains, computed batch by batch as the log is copied (`mcap_io.derived.Derived`).
 
     With a survey, only of what is left of the samples when they are clean. Who watches is told every batch.
     """
@@ -166,7 +169,7 @@ class Debiaser:
         bias = self._stream(t_s, batch.gyro, batch.accel)
         unsure = self._certainty(t_s, batch.gyro, batch.accel)
         total = unsure + self._white
-        corrected = schema.encode_imu(
+        corrected = encode_imu(
             batch.stamp_ns,
             batch.gyro - bias[:, :3],
             batch.accel - bias[:, 3:],
@@ -178,7 +181,7 @@ class Debiaser:
             corrected,
             _vector(batch.stamp_ns, bias[:, :3], batch.frame_id),
             _vector(batch.stamp_ns, bias[:, 3:], batch.frame_id),
-            schema.encode_twist(batch.stamp_ns, bias[:, :3], bias[:, 3:], unsure, batch.frame_id),
+            encode_twist(batch.stamp_ns, bias[:, :3], bias[:, 3:], unsure, batch.frame_id),
         )
         if self._watch is not None and len(batch.stamp_ns):
             std = np.sqrt(unsure.diagonal(axis1=1, axis2=2))
@@ -344,4 +347,4 @@ def _provenance(topic: str, model: BiasModel, start: TurnOn, init: str, smooth: 
 
 
 def _vector(stamp_ns: Int64[np.ndarray, " n"], values: Float64[np.ndarray, "n 3"], frame_id: str) -> UInt8[np.ndarray, "n L"]:
-    return schema.encode_vector3(stamp_ns, np.ascontiguousarray(values), frame_id)
+    return encode_vector3(stamp_ns, np.ascontiguousarray(values), frame_id)

@@ -26,7 +26,9 @@ from imutool.clean.rules.units import (
 )
 from imutool.errors import LogError
 from imutool.mcap_io import schema
-from imutool.mcap_io.log import DERIVED_KEY, ENCODINGS, Log, Topic
+from imutool.mcap_io.decode import decode_imu
+from imutool.mcap_io.log import Log
+from imutool.mcap_io.topics import DERIVED_KEY, ENCODINGS, Topic
 from imutool.place import Place
 from imutool.recording import GAP_FACTOR, GRAVITY_M_S2, MIN_GAP_S, Imu, nanoseconds, seconds
 from imutool.stationary import stretches
@@ -191,7 +193,7 @@ def _columns(log: Log, topic: Topic) -> tuple[Int64[np.ndarray, " n"], Float64[n
     stamps, gyro, accel = [np.empty(0, np.int64)], [np.empty((0, 3))], [np.empty((0, 3))]
     for _, rows in log.rows([topic.name], None, None):
         for part, layout in schema.runs(rows.payload, schema.IMU, topic.message_encoding):
-            columns = schema.decode_imu(rows.payload[part], topic.message_encoding, layout)
+            columns = decode_imu(rows.payload[part], topic.message_encoding, layout)
             stamps.append(columns.stamp_ns)
             gyro.append(columns.gyro)
             accel.append(columns.accel)

@@ -17,7 +17,8 @@ from imutool.bias._base import BiasModel
 from imutool.bias._file import check_rate, find_model
 from imutool.clean import Survey, cleaned
 from imutool.errors import ConfigError, DataError, LogError, ModelError
-from imutool.mcap_io.log import ImuBatch, Log
+from imutool.mcap_io.batches import ImuBatch
+from imutool.mcap_io.log import Log
 from imutool.mcap_io.read import read
 from imutool.place import Place
 from imutool.recording import Imu, Recording, nanoseconds, seconds

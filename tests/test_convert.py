@@ -17,7 +17,8 @@ from imutool import convert as convert_module
 from imutool import registry
 from imutool.convert import ConvertReport, convert
 from imutool.errors import ConfigError, DataError
-from imutool.mcap_io.read import Log, read
+from imutool.mcap_io.log import Log
+from imutool.mcap_io.read import read
 from imutool.recording import Imu, Recording
 
 START_NS = 1403636579758560000

@@ -26,7 +26,9 @@ from imutool.debias import OnlineDebiaser, apply, debias
 from imutool.errors import ConfigError, LogError, ModelError
 from imutool.log_start import estimate_at_rest
 from imutool.mcap_io import schema
+from imutool.mcap_io.decode import decode_imu, decode_scalars
 from imutool.mcap_io.digest import sha256
+from imutool.mcap_io.encode import encode_imu, encode_pose
 from imutool.mcap_io.read import read
 from imutool.mcap_io.write import write
 from imutool.physics.flight import flight
@@ -143,14 +145,10 @@ def test_every_original_message_is_unchanged_and_so_is_the_source(source: Path, 
 
 def test_the_new_messages_have_their_sources_times_sequence_stamp_and_frame(target: Path) -> None:
     found = columns(target, "/imu0", *NEW)
-    stamps = schema.decode_imu(rows(found["/imu0"]))
+    stamps = decode_imu(rows(found["/imu0"]))
     for topic in NEW:
         assert [row[:3] for row in found[topic]] == [row[:3] for row in found["/imu0"]], topic
-        kind = (
-            schema.decode_imu(rows(found[topic]))
-            if topic == NEW[0]
-            else schema.decode_scalars(rows(found[topic]), schema.VECTOR3)
-        )
+        kind = decode_imu(rows(found[topic])) if topic == NEW[0] else decode_scalars(rows(found[topic]), schema.VECTOR3)
         np.testing.assert_array_equal(kind.stamp_ns, stamps.stamp_ns)
         assert kind.frame_id == stamps.frame_id
 
@@ -171,9 +169,9 @@ def test_the_topics_their_schemas_and_where_they_come_from(target: Path) -> None
 
 def test_what_was_subtracted_is_raw_minus_debiased(target: Path) -> None:
     found = columns(target, "/imu0", *NEW)
-    raw, made = schema.decode_imu(rows(found["/imu0"])), schema.decode_imu(rows(found[NEW[0]]))
+    raw, made = decode_imu(rows(found["/imu0"])), decode_imu(rows(found[NEW[0]]))
     for topic, values, left in ((NEW[1], raw.gyro, made.gyro), (NEW[2], raw.accel, made.accel)):
-        bias = schema.decode_scalars(rows(found[topic]), schema.VECTOR3).values
+        bias = decode_scalars(rows(found[topic]), schema.VECTOR3).values
         np.testing.assert_allclose(bias, values - left, rtol=0, atol=1e-14)
         assert np.ptp(bias, axis=0).min() > 1e-4  # and it is no constant
 
@@ -518,7 +516,7 @@ def write_two_imus(recording: Recording, log: Path) -> tuple[str, str]:
         kind = writer.register_schema(schema.IMU, "ros2msg", schema.definition(schema.IMU).encode())
         for topic, change in (("/imu0", 0.0), ("/imu1", 0.1)):
             channel = writer.register_channel(topic, "cdr", kind)
-            payloads = schema.encode_imu(imu.t_ns, imu.gyro + change, imu.accel, "body")
+            payloads = encode_imu(imu.t_ns, imu.gyro + change, imu.accel, "body")
             for k, (stamp, payload) in enumerate(zip(imu.t_ns.tolist(), payloads, strict=True)):
                 writer.add_message(channel, stamp, payload.tobytes(), stamp, k)
         writer.finish()
@@ -533,8 +531,8 @@ def test_poses_that_make_no_sense_are_no_business_of_an_imu(recording: Recording
         writer = Writer(file)
         writer.start("ros2", "test")
         for name, topic, rows, times in (
-            (schema.IMU, "/imu0", schema.encode_imu(imu.t_ns, imu.gyro, imu.accel, "b"), imu.t_ns),
-            (schema.POSE, "/pose", schema.encode_pose(few, np.zeros((50, 3)), np.zeros((50, 4)), "w"), few),
+            (schema.IMU, "/imu0", encode_imu(imu.t_ns, imu.gyro, imu.accel, "b"), imu.t_ns),
+            (schema.POSE, "/pose", encode_pose(few, np.zeros((50, 3)), np.zeros((50, 4)), "w"), few),
         ):
             kind = writer.register_schema(name, "ros2msg", schema.definition(name).encode())
             channel = writer.register_channel(topic, "cdr", kind)

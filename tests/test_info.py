@@ -13,7 +13,7 @@ import pytest
 from converters import fetch, tum_vi
 from imutool.errors import LogError
 from imutool.info import imu_rows, inspect, topic_rows
-from imutool.mcap_io import schema
+from imutool.mcap_io.decode import decode_imu
 from imutool.mcap_io.write import write
 from imutool.recording import GRAVITY_M_S2, Frames, Imu, Poses, Recording
 
@@ -92,17 +92,16 @@ def test_disorder_repeats_and_values_that_are_no_numbers_are_counted_not_refused
     imu = resting(1000)
     path = tmp_path / "log.mcap"
     write(Recording("log", imu), path)
-    real = schema.decode_imu
 
     def spoiled(rows, encoding="cdr", layout=None):
-        columns = real(rows, encoding, layout)
+        columns = decode_imu(rows, encoding, layout)
         stamps, gyro = columns.stamp_ns.copy(), columns.gyro.copy()
         stamps[[10, 11]] = stamps[[11, 10]]
         stamps[500] = stamps[499]
         gyro[700, 1] = np.nan
         return columns._replace(stamp_ns=stamps, gyro=gyro)
 
-    monkeypatch.setattr(schema, "decode_imu", spoiled)
+    monkeypatch.setattr("imutool.info.decode_imu", spoiled)
     (found,) = inspect(path)["imu"]
     assert (found["out_of_order"], found["duplicated"], found["not_finite"]) == (1, 1, 1)
     assert found["samples"] == 1000

@@ -9,7 +9,8 @@ from jaxtyping import Bool
 
 from imutool.clean.first_pass import Survey, raw_batches
 from imutool.errors import LogError
-from imutool.mcap_io.log import ImuBatch, Log
+from imutool.mcap_io.batches import ImuBatch
+from imutool.mcap_io.log import Log
 
 
 class Cleaner:

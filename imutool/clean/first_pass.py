@@ -23,7 +23,8 @@ from imutool.clean.settings import GROUP, Rules
 from imutool.clean.truth import Truth, read_truth
 from imutool.errors import LogError
 from imutool.mcap_io import schema
-from imutool.mcap_io.log import ImuBatch, Log
+from imutool.mcap_io.batches import ImuBatch
+from imutool.mcap_io.log import Log
 from imutool.place import Place
 
 SCHEMA = "imutool.clean/1"

@@ -15,8 +15,9 @@ from imutool.errors import LogError
 from imutool.export.folder import SIGNATURE, ExportFolder, writing
 from imutool.export.report import ExportReport, Progress
 from imutool.mcap_io import schema
-from imutool.mcap_io.log import DERIVED_KEY, Log
+from imutool.mcap_io.log import Log
 from imutool.mcap_io.read import VELOCITY_KEY, read
+from imutool.mcap_io.topics import DERIVED_KEY
 from imutool.noise import Noise
 from imutool.recording import Frames, Poses, Recording, Scalars, unit_quaternions
 

@@ -18,9 +18,11 @@ from jaxtyping import Float64, Int64, UInt8
 
 from imutool.errors import LogError
 from imutool.mcap_io import ros2msg
-from imutool.mcap_io.log import DERIVED_KEY, Clock, Log, Topic
+from imutool.mcap_io.batches import Clock
+from imutool.mcap_io.log import Log
 from imutool.mcap_io.read import UNIT_KEY
 from imutool.mcap_io.records import Rows
+from imutool.mcap_io.topics import DERIVED_KEY, Topic
 from imutool.place import Place
 
 LISTED = 60  # fields named in a message

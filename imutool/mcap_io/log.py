@@ -5,84 +5,27 @@ Topics are found by schema, not by name; messages come in file order.
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
 from types import MappingProxyType, TracebackType
-from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float64, Int64, UInt32
+from jaxtyping import Int64
 from mcap.opcode import Opcode
 from mcap.records import Metadata
 
 from imutool.errors import DataError, LogError
 from imutool.mcap_io import records, schema
+from imutool.mcap_io.batches import Clock, ImuBatch, PoseBatch, ScalarBatch, finite
+from imutool.mcap_io.decode import TwistColumns, decode_image, decode_imu, decode_poses, decode_scalars, decode_twist
 from imutool.mcap_io.losses import Losses
 from imutool.mcap_io.memory import keep_buffers
 from imutool.mcap_io.records import HEAD
 from imutool.mcap_io.salvaged import Salvaged
 from imutool.mcap_io.source import Source
 from imutool.mcap_io.structure import Block, Span, Structure
+from imutool.mcap_io.topics import DERIVED_KEY, ENCODINGS, MESSAGE_POSES, SCALARS, Topic, topics_of
 from imutool.place import Place
-
-logger = logging.getLogger(__name__)
-
-LEAVE_OUT = "See what is wrong with imutool clean LOG, and leave it out with imutool debias --clean"
-ENCODINGS = ("cdr", "ros1")
-DERIVED_KEY = "imutool_source_topic"  # channel metadata: computed by imutool from this topic
-
-MESSAGE_POSES = (schema.POSE, schema.ODOMETRY, schema.TRANSFORM)
-SCALARS = {schema.FLOAT: 1, schema.VECTOR3: 3}
-
-
-@dataclass(frozen=True)
-class Topic:
-    """A topic as its Channel record describes it; several channels of one topic count as one."""
-
-    name: str
-    schema_name: str  # in ROS 2 spelling; empty where the channel has no schema
-    schema_encoding: str
-    message_encoding: str
-    count: int
-    metadata: Mapping[str, str]
-
-
-class ImuBatch(NamedTuple):
-    """Consecutive messages of one IMU; times in ns, rad/s, m/s²."""
-
-    log_time: Int64[np.ndarray, " n"]
-    publish_time: Int64[np.ndarray, " n"]
-    sequence: UInt32[np.ndarray, " n"]
-    stamp_ns: Int64[np.ndarray, " n"]
-    gyro: Float64[np.ndarray, "n 3"]
-    accel: Float64[np.ndarray, "n 3"]
-    frame_id: str
-
-
-class PoseBatch(NamedTuple):
-    """Consecutive poses of one frame in another; metres, quaternions as they stand in the log."""
-
-    log_time: Int64[np.ndarray, " n"]
-    publish_time: Int64[np.ndarray, " n"]
-    sequence: UInt32[np.ndarray, " n"]
-    stamp_ns: Int64[np.ndarray, " n"]
-    p_wb: Float64[np.ndarray, "n 3"]
-    q_wb_wxyz: Float64[np.ndarray, "n 4"]
-    frame_id: str
-    child_frame_id: str
-
-
-class ScalarBatch(NamedTuple):
-    """Consecutive messages of a numeric topic; `stamp_ns` is the log time where the message has no header."""
-
-    log_time: Int64[np.ndarray, " n"]
-    publish_time: Int64[np.ndarray, " n"]
-    sequence: UInt32[np.ndarray, " n"]
-    stamp_ns: Int64[np.ndarray, " n"]
-    values: Float64[np.ndarray, "n k"]
-    frame_id: str
 
 
 class Log:
@@ -105,7 +48,7 @@ class Log:
         try:
             with self.named():
                 self.structure = Salvaged(self._source) if salvage else Structure(self._source)
-                self.topics = MappingProxyType(self._topics())
+                self.topics = MappingProxyType(topics_of(self.structure))
         except BaseException:
             self._source.file.close()
             raise
@@ -135,27 +78,6 @@ class Log:
                 raise
             where = f"{self.path} {topic}" if topic else self.path
             raise LogError(error.what, where=where, expected=error.expected, fix=error.fix) from error
-
-    def _topics(self) -> dict[str, Topic]:
-        found: dict[str, Topic] = {}
-        counts = self.structure.counts()
-        for identity, channel in sorted(self.structure.channels.items()):
-            kind = self.structure.schemas.get(channel.schema_id)
-            before = found.get(channel.topic)
-            found[channel.topic] = Topic(
-                channel.topic,
-                schema.canonical(kind.name) if kind else "",
-                kind.encoding if kind else "",
-                channel.message_encoding,
-                counts.get(identity, 0) + (before.count if before else 0),
-                MappingProxyType(dict(channel.metadata)),
-            )
-            if before and (before.schema_name, before.message_encoding) != (
-                found[channel.topic].schema_name,
-                found[channel.topic].message_encoding,
-            ):
-                raise LogError(f"{channel.topic} carries {before.schema_name} and {found[channel.topic].schema_name}")
-        return found
 
     @property
     def losses(self) -> Losses | None:
@@ -286,7 +208,7 @@ class Log:
         encoding = self.topics[topic].message_encoding
         for part, layout in schema.runs(rows.payload, schema.IMU, encoding):
             cut = rows.where(part)
-            columns = schema.decode_imu(cut.payload, encoding, layout)
+            columns = decode_imu(cut.payload, encoding, layout)
             yield ImuBatch(cut.log_time, cut.publish_time, cut.sequence, *columns)
 
     def pose_batches(self, topic: str, start_ns: int | None = None, end_ns: int | None = None) -> Iterator[PoseBatch]:
@@ -309,7 +231,7 @@ class Log:
         kind, encoding = self.topics[topic].schema_name, self.topics[topic].message_encoding
         for part, layout in schema.runs(rows.payload, kind, encoding):
             cut = rows.where(part)
-            for columns in schema.decode_poses(cut.payload, kind, encoding, layout):
+            for columns in decode_poses(cut.payload, kind, encoding, layout):
                 finite(cut.sequence, position=columns.p_wb, orientation=columns.q_wb_wxyz)
                 yield PoseBatch(cut.log_time, cut.publish_time, cut.sequence, *columns)
 
@@ -333,12 +255,12 @@ class Log:
         kind, encoding = self.topics[topic].schema_name, self.topics[topic].message_encoding
         for part, layout in schema.runs(rows.payload, kind, encoding):
             cut = rows.where(part)
-            columns = schema.decode_scalars(cut.payload, kind, encoding, layout)
+            columns = decode_scalars(cut.payload, kind, encoding, layout)
             finite(cut.sequence, values=columns.values)
             stamp_ns = cut.log_time if columns.stamp_ns is None else columns.stamp_ns
             yield ScalarBatch(cut.log_time, cut.publish_time, cut.sequence, stamp_ns, columns.values, columns.frame_id)
 
-    def decode_twist(self, topic: str, rows: records.Rows) -> Iterator[schema.TwistColumns]:
+    def decode_twist(self, topic: str, rows: records.Rows) -> Iterator[TwistColumns]:
         """Biases with their covariance from their bytes, a batch per stretch with one frame; nothing is asked of their values.
 
         Raises:
@@ -346,7 +268,7 @@ class Log:
         """
         encoding = self.topics[topic].message_encoding
         for part, layout in schema.runs(rows.payload, schema.TWIST, encoding):
-            yield schema.decode_twist(rows.where(part).payload, encoding, layout)
+            yield decode_twist(rows.where(part).payload, encoding, layout)
 
     def images(self, topic: str, start_ns: int | None = None, end_ns: int | None = None) -> Iterator[tuple[int, bytes]]:
         """Stamp and encoded bytes of every image of a CompressedImage topic, in file order.
@@ -358,7 +280,7 @@ class Log:
         for _, rows in self.rows([topic], start_ns, end_ns):
             with self.named(topic):
                 for payload in rows.payload:
-                    stamp_ns, _, image = schema.decode_image(payload.tobytes(), encoding)
+                    stamp_ns, _, image = decode_image(payload.tobytes(), encoding)
                     yield stamp_ns, image
 
     def channel_ids(self, topic: str) -> set[int]:
@@ -390,56 +312,3 @@ class Log:
             mask = inside & np.isin(found.heads["channel"], list(channels))
             for rows in records.rows(found, mask):
                 yield topic, rows
-
-
-def finite(sequence: UInt32[np.ndarray, " n"], **fields: Float64[np.ndarray, "n _"]) -> None:
-    """Refuses NaN and infinity, naming the message."""
-    for name, values in fields.items():
-        good = np.isfinite(values).all(axis=1)
-        if not good.all():
-            row = int(np.argmin(good))
-            raise LogError(
-                f"message {sequence[row]} has {name} {values[row].tolist()}",
-                expected="finite numbers",
-                fix="Cut the log before or after it",
-            )
-
-
-@dataclass(slots=True)
-class Clock:
-    """Refuses stamps that repeat or go back, across batches."""
-
-    count: int = 0
-    last: int | None = None
-
-    def check(self, stamp_ns: Int64[np.ndarray, " n"], sequence: UInt32[np.ndarray, " n"]) -> None:
-        """Takes in the next stamps.
-
-        Raises:
-            LogError: one does not come after the one before it; the message names the message and both stamps.
-        """
-        if not len(stamp_ns):
-            return
-        before = np.concatenate([[stamp_ns[0] - 1 if self.last is None else self.last], stamp_ns[:-1]])
-        bad = stamp_ns <= before
-        if bad.any():
-            row = int(np.argmax(bad))
-            how = "repeats" if stamp_ns[row] == before[row] else "goes back"
-            raise LogError(
-                f"message {self.count + row} (sequence {sequence[row]}) has the stamp {stamp_ns[row]} ns, which {how}: "
-                f"the message before has {before[row]} ns",
-                expected="stamps that increase",
-            )
-        self.count, self.last = self.count + len(stamp_ns), int(stamp_ns[-1])
-
-    def take(self, batch: ImuBatch) -> None:
-        """Takes in the next samples of an IMU.
-
-        Raises:
-            LogError: NaN, infinity, or a stamp that does not come after the one before it.
-        """
-        try:
-            finite(batch.sequence, angular_velocity=batch.gyro, linear_acceleration=batch.accel)
-            self.check(batch.stamp_ns, batch.sequence)
-        except LogError as error:
-            raise LogError(error.what, expected=error.expected, fix=LEAVE_OUT) from error

@@ -12,23 +12,12 @@ from jaxtyping import Float64, Int64, UInt32
 
 from imutool.errors import LogError
 from imutool.mcap_io import records, schema
-from imutool.mcap_io.log import (
-    DERIVED_KEY,
-    ENCODINGS,
-    MESSAGE_POSES,
-    SCALARS,
-    Clock,
-    ImuBatch,
-    Log,
-    PoseBatch,
-    ScalarBatch,
-    Topic,
-    finite,
-)
+from imutool.mcap_io.batches import Clock, finite
+from imutool.mcap_io.decode import decode_image
+from imutool.mcap_io.log import Log
+from imutool.mcap_io.topics import DERIVED_KEY, ENCODINGS, MESSAGE_POSES, SCALARS
 from imutool.place import Place
 from imutool.recording import UNIT_QUATERNION_TOLERANCE, Frames, Imu, Poses, Recording, Scalars, unit_quaternions
-
-__all__ = ["DERIVED_KEY", "ENCODINGS", "ImuBatch", "Log", "PoseBatch", "ScalarBatch", "Topic", "read"]
 
 logger = logging.getLogger(__name__)
 
@@ -280,7 +269,7 @@ def _format(log: Log, topic: str) -> str:
     """What the first image says it is."""
     for _, rows in log.rows([topic]):
         with log.named(topic):
-            return schema.decode_image(rows.payload[0].tobytes(), log.topics[topic].message_encoding)[1]
+            return decode_image(rows.payload[0].tobytes(), log.topics[topic].message_encoding)[1]
     return ""
 
 

@@ -18,64 +18,29 @@ import os
 import struct
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple, Protocol, runtime_checkable
 
-import numpy as np
-from jaxtyping import Int64, Shaped, UInt8, UInt16
 from mcap.opcode import Opcode
 from mcap.records import AttachmentIndex, ChunkIndex, Metadata, MetadataIndex
 
 from imutool.errors import ConfigError, LogError
 from imutool.mcap_io import records, schema
-from imutool.mcap_io.crc import crc32
+from imutool.mcap_io.derived import Derived, Stream
 from imutool.mcap_io.listing import Listing, described, head, listing
-from imutool.mcap_io.log import DERIVED_KEY, ImuBatch, Log
+from imutool.mcap_io.log import Log
 from imutool.mcap_io.log_writer import Chunk, LogWriter
+from imutool.mcap_io.passage import Passage
 from imutool.mcap_io.records import HEAD, ChunkHead
 from imutool.mcap_io.structure import Block, Span, Structure
-from imutool.mcap_io.target import COPY_BYTES
-from imutool.mcap_io.verify import Verified, check_data_crc, crc_of, refuse_unknown, stated_crc, verify
+from imutool.mcap_io.topics import DERIVED_KEY
+from imutool.mcap_io.verify import Verified, check_data_crc, refuse_unknown, stated_crc, verify
 from imutool.mcap_io.write import CHUNK_BYTES
 from imutool.place import Place, identity, same
 
 RUN_BYTES = 16 << 20  # verbatim bytes are copied in runs of about this size: between them progress is told
-FEED_BYTES = 1 << 18  # of IMU messages make a batch: one chunk holds a few among its images, too few for numpy to be quick
 
 
-class NewTopic(NamedTuple):
-    """A topic to be added, and its message."""
-
-    name: str
-    schema_name: str
-
-
-class Made(NamedTuple):
-    """Messages computed from a batch: times and sequence of the source messages that have one, a payload row for each."""
-
-    batch: ImuBatch
-    payloads: Sequence[UInt8[np.ndarray, "n L"]]
-
-
-@runtime_checkable
-class Derived(Protocol):
-    """Channels computed from one IMU topic of the source, which is fed in file order."""
-
-    @property
-    def source_topic(self) -> str:
-        """The IMU topic."""
-
-    @property
-    def topics(self) -> Sequence[NewTopic]:
-        """The topics to be added."""
-
-    def __call__(self, batch: ImuBatch) -> Made:
-        """What to write for a batch: which of its messages stay, and one array of CDR payloads per new topic."""
-
-
-Heads = Shaped[np.ndarray, " n"]  # of dtype records.MESSAGE
-Payload = UInt8[np.ndarray, "n L"]
 Values = Mapping[str, Mapping[str, str]]  # the entries of metadata records, by the records' names
 
 
@@ -166,47 +131,6 @@ def _compression(structure: Structure) -> str:
     return next((b.compression for b in structure.blocks if b.compression is not None), "none")
 
 
-@dataclass
-class _Stream:
-    """One `Derived`, the ids of its channels, and what waits to be written."""
-
-    make: Derived
-    sources: set[int]
-    ids: list[int]
-    waiting: list[tuple[Heads, Payload]] = field(default_factory=list)  # of the source, of equal size
-    waits: int = 0  # bytes of them
-    data: list[UInt8[np.ndarray, "n M"]] = field(default_factory=list)
-    channels: list[UInt16[np.ndarray, " n"]] = field(default_factory=list)
-    times: list[Int64[np.ndarray, " n"]] = field(default_factory=list)
-    offsets: list[Int64[np.ndarray, " n"]] = field(default_factory=list)
-    size: int = 0
-
-    def take(self, batch: ImuBatch) -> None:
-        """Computes the new messages of a batch; those of one source message stand side by side."""
-        batch, payloads = self.make(batch)
-        assert len(payloads) == len(self.ids), f"{len(payloads)} arrays for {len(self.ids)} topics"
-        widths = [records.MESSAGE.itemsize + payload.shape[1] for payload in payloads]
-        count, stride, ends = len(batch.log_time), sum(widths), np.cumsum(widths)
-        data = np.empty((count, stride), np.uint8)
-        for channel, payload, width, end in zip(self.ids, payloads, widths, ends.tolist(), strict=True):
-            here = data[:, end - width : end]
-            records.message_rows(channel, batch.log_time, batch.publish_time, batch.sequence, payload, here)
-        self.data.append(data)
-        self.channels.append(np.tile(np.array(self.ids, np.uint16), count))
-        self.times.append(np.repeat(batch.log_time, len(widths)))
-        self.offsets.append((self.size + stride * np.arange(count)[:, None] + ends - widths).reshape(-1))
-        self.size += count * stride
-
-    def taken(self) -> Chunk:
-        """What waits, as one chunk."""
-        times, offsets = np.concatenate(self.times), np.concatenate(self.offsets)
-        chunk = Chunk(b"".join(part.data for part in self.data), np.concatenate(self.channels), times, offsets)
-        for column in (self.data, self.channels, self.times, self.offsets):
-            column.clear()
-        self.size = 0
-        return chunk
-
-
 class _Rewrite:
     """The pass over the source, and the look back."""
 
@@ -218,7 +142,8 @@ class _Rewrite:
         out.contents.schemas.update(sorted(self.structure.schemas.items()))
         out.contents.channels.update(sorted(self.structure.channels.items()))
         self.streams = [
-            _Stream(
+            Stream(
+                log,
                 make,
                 log.channel_ids(make.source_topic),
                 [out.channel(t.name, t.schema_name, {DERIVED_KEY: make.source_topic}) for t in make.topics],
@@ -226,8 +151,7 @@ class _Rewrite:
             for make in derived
         ]
         self.wanted = set().union(*(stream.sources for stream in self.streams)) if self.streams else set()
-        self.copied = self.crc = 0  # bytes of the source so far, and their CRC if it states one
-        self.upto = 0  # what lies between `copied` and here is to be copied, but not yet
+        self.passage = Passage(self.source, out.target)
         self.checked, self.made = 0, set[int]()  # chunks unpacked on the way; where new ones begin
 
     def run(self, metadata: Values | Callable[[Verified], Values]) -> RewriteReport:
@@ -238,7 +162,7 @@ class _Rewrite:
         """
         size = self.source.size
         with self.log.named():
-            self._skip(self.structure.header_end)
+            self.passage.skip(self.structure.header_end)
             for item in self.structure.items:
                 if isinstance(item, Block):
                     self._block(item)
@@ -247,16 +171,16 @@ class _Rewrite:
                 for stream in self.streams:
                     if stream.size >= CHUNK_BYTES:
                         self._add(stream)
-                if self.upto - self.copied >= RUN_BYTES:
-                    self._settle()
-                self.tell(self.copied, 2 * size)
+                if self.passage.upto - self.passage.copied >= RUN_BYTES:
+                    self.passage.settle()
+                self.tell(self.passage.copied, 2 * size)
             for stream in self.streams:
-                self._decode(stream)
+                stream.decode()
                 self._add(stream)
-            self._settle()
-            self._skip(self.structure.data_end)
+            self.passage.settle()
+            self.passage.skip(self.structure.data_end)
             if self.out.target.summing:
-                check_data_crc(self.structure, self.crc)
+                check_data_crc(self.structure, self.passage.crc)
         contents = self.out.contents
         verified = self._verified()
         for name, values in (metadata(verified) if callable(metadata) else metadata).items():
@@ -280,49 +204,12 @@ class _Rewrite:
         checked = {"all": chunks, "imu": self.checked + len(self.made), "none": self.checked}[self.check]
         return Verified(self.check, checked, chunks)
 
-    # ── where the bytes go ───────────────────────────────────────────────────────────────────────────────────────────
-
-    def _verbatim(self, end: int) -> int:
-        """Has the source copied up to here, now or later; returns by how much it moves."""
-        self.upto = end
-        return self.out.target.position - self.copied
-
-    def _settle(self) -> None:
-        """Copies what was to be copied later."""
-        start, end, out = self.copied, self.upto, self.out.target
-        self.copied = end
-        if not out.summing:
-            out.copy(self.source, start, end)
-            return
-        for at in range(start, end, COPY_BYTES):  # read once for the CRC of the source and that of the copy
-            raw = self.source.at(at, min(COPY_BYTES, end - at))
-            self.crc = crc32(raw, self.crc)
-            out.write(raw)
-
-    def _skip(self, end: int) -> None:
-        """Leaves out the bytes of the source up to here, which are written in another form or not at all."""
-        if self.out.target.summing:
-            self.crc = crc_of(self.source, self.copied, end, self.crc)
-        self.copied = self.upto = end
-
-    def _put(self, raw: memoryview) -> int:
-        """Copies bytes that were read already; returns where they went."""
-        self._settle()
-        at = self.out.target.position
-        if self.out.target.summing:
-            self.crc = crc32(raw, self.crc)
-        self.out.target.write(raw)
-        self.copied = self.upto = self.copied + len(raw)
-        return at
-
-    def _add(self, stream: _Stream) -> None:
+    def _add(self, stream: Stream) -> None:
         """Writes what a stream holds as a chunk of its own."""
         if stream.size:
-            self._settle()
+            self.passage.settle()
             self.made.add(self.out.target.position)
             self.out.chunk(stream.taken())
-
-    # ── what is in them ──────────────────────────────────────────────────────────────────────────────────────────────
 
     def _block(self, block: Block) -> None:
         if block.compression is None:
@@ -331,7 +218,7 @@ class _Rewrite:
         if self.structure.vouched and block.indexes and self.wanted.isdisjoint(block.indexes):
             about, listed = described(self.source, block)
             if listed is not None:
-                moved = self._verbatim(block.end)
+                moved = self.passage.verbatim(block.end)
                 self._enter(block, about, listed, moved)
                 return
         self._unpacked(block)
@@ -340,11 +227,12 @@ class _Rewrite:
         """Messages outside chunks, which become a chunk."""
         raw = self.source.at(block.offset, block.length)
         found = self.structure.unpacked(block, raw)
-        self._feed(found)
-        self._settle()
+        for stream in self.streams:
+            stream.feed(found)
+        self.passage.settle()
         self.checked += 1
         self.out.chunk(Chunk(raw, found.heads["channel"], found.times(), found.offsets), "none")
-        self._skip(block.end)
+        self.passage.skip(block.end)
 
     def _unpacked(self, block: Block) -> None:
         """A chunk that is looked into; its own message indexes follow it if they list what is in it, else new ones."""
@@ -356,19 +244,20 @@ class _Rewrite:
             found, right = listed.messages(data, block.offset) if listed else (records.messages(data, block.offset), False)
         except LogError as error:
             self.structure.lose(block, error)
-            self._settle()
-            self._skip(block.end)
+            self.passage.settle()
+            self.passage.skip(block.end)
             return
         for opcode, first, length in found.definitions:
             self._define(opcode, found.data[first : first + length].tobytes(), block.offset)
-        self._feed(found)
+        for stream in self.streams:
+            stream.feed(found)
         self.checked += 1
         if listed is not None and right:
-            self._enter(block, about, listed, self._put(everything) - block.offset)
+            self._enter(block, about, listed, self.passage.put(everything) - block.offset)
         else:
-            entry = self._entry(block, about, self._put(raw))
+            entry = self._entry(block, about, self.passage.put(raw))
             self.out.index(entry, found.heads["channel"].copy(), found.times(), found.offsets)
-            self._skip(block.end)
+            self.passage.skip(block.end)
 
     def _enter(self, block: Block, about: ChunkHead, listed: Listing, moved: int) -> None:
         """Enters a chunk that has its own message indexes behind it in the summary."""
@@ -405,37 +294,14 @@ class _Rewrite:
         contents.schemas.update({i: structure.schemas[i] for i in new_schemas})
         contents.channels.update({i: structure.channels[i] for i in new_channels})
 
-    def _feed(self, found: records.Messages) -> None:
-        for stream in self.streams:
-            of = found.heads["channel"]
-            mask = np.logical_or.reduce([of == channel for channel in stream.sources])
-            for heads, payload in records.cut(found, mask):
-                if stream.waiting and stream.waiting[-1][1].shape[1] != payload.shape[1]:
-                    self._decode(stream)
-                stream.waiting.append((heads, payload))
-                stream.waits += payload.size
-            if stream.waits >= FEED_BYTES:
-                self._decode(stream)
-
-    def _decode(self, stream: _Stream) -> None:
-        """Hands the messages that waited over."""
-        if stream.waiting:
-            heads, payloads = zip(*stream.waiting, strict=True)
-            rows = records.columns(np.concatenate(heads), np.concatenate(payloads))
-            stream.waiting.clear()
-            stream.waits = 0
-            with self.log.named(stream.make.source_topic):
-                for batch in self.log.decode_imu(stream.make.source_topic, rows):
-                    stream.take(batch)
-
     def _span(self, span: Span) -> None:
         """Any other record, as it is; attachments and metadata are entered in the summary."""
         end = span.offset + span.length
         if span.opcode == Opcode.MESSAGE_INDEX:  # of no chunk: it can only mislead
-            self._settle()
-            self._skip(end)
+            self.passage.settle()
+            self.passage.skip(end)
             return
-        at = span.offset + self._verbatim(end)
+        at = span.offset + self.passage.verbatim(end)
         if span.opcode == Opcode.METADATA:
             body = self.source.at(span.offset + HEAD.size, span.length - HEAD.size)
             name = records.parse(Metadata, body, span.offset).name

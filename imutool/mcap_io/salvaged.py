@@ -2,7 +2,7 @@
 
 Believed is what a CRC covers: a summary, the contents of a chunk. Message indexes are believed only as far as the summary
 vouches for them. The data section is followed by `walk`; two logs in one file are two sections with definitions of their own
-(`sections`).
+(`sections`), which `meaning` learns and goes by.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections import Counter
 
 import numpy as np
-from jaxtyping import Bool, Int64, UInt64
+from jaxtyping import UInt64
 from mcap.opcode import Opcode
 from mcap.records import ChunkIndex, DataEnd, Footer, Header
 
@@ -18,15 +18,14 @@ from imutool.errors import LogError
 from imutool.mcap_io import records
 from imutool.mcap_io.crc import crc32
 from imutool.mcap_io.losses import Loss, Losses
-from imutool.mcap_io.mend import MOST_SEARCHED, definitions, in_order, mended
+from imutool.mcap_io.meaning import by_the_whole, counted, edited, learn, refuse_others, search
+from imutool.mcap_io.mend import in_order, mended
 from imutool.mcap_io.records import FOOTER_SIZE, HEAD, MAGIC
 from imutool.mcap_io.resync import PRIVATE
 from imutool.mcap_io.sections import DEFINITIONS, Sections
 from imutool.mcap_io.source import Source
 from imutool.mcap_io.structure import RUN_BYTES, Block, Span, Structure
 from imutool.mcap_io.walk import LATEST_NS, Gap, Walk, reason
-
-MOST_AGREED = 1000  # definitions that need no second look: some writers repeat all of theirs in every chunk
 
 
 class Salvaged(Structure):
@@ -219,14 +218,16 @@ class Salvaged(Structure):
         for block in self.blocks:
             if lacking or not block.vouched:
                 self._learn(block)
-        self._search_definitions()
+        damaged = [(block.offset, block.length) for block, _ in self._failed]
+        damaged += [(gap.offset, gap.length) for gap in self._walk.gaps]
+        search(self.sections, self.source, self.blocks, damaged)
         self.schemas, self.channels = self.sections.number()
         self.losses.unproven = self.sections.unproven()
         for old, new in ((old, new) for section in self.sections.each for old, new in section.renamed.items()):
             self.losses.mend(f"{old} carries messages of two types; those of the second are on {new}")
         for block in self.blocks:
             if block.counts is not None:
-                self._settle(block, block.counts)
+                block.counts = counted(self.sections.at(block.offset), block.counts)
         for block, error in self._failed:
             self.lose(block, error)
         for gap in self._walk.gaps:
@@ -256,51 +257,11 @@ class Salvaged(Structure):
         except LogError as error:
             self._failed.append((block, error))
             return
-        self._learn_definitions(found, block)
+        learn(self.sections, self.losses, found, block)
         good = found.heads[found.heads["log_time"] < LATEST_NS]
         block.counts = dict(Counter(found.heads["channel"].tolist()))
         if len(good):
             block.start_ns, block.end_ns = int(good["log_time"].min()), int(good["log_time"].max())
-
-    def _learn_definitions(self, found: records.Messages, block: Block) -> None:
-        """The definitions in a chunk; if they contradict what is vouched for, another log has begun."""
-        each = [(opcode, found.data[first : first + length].tobytes()) for opcode, first, length in found.definitions]
-        proven = block.offset not in self.losses.unchecked_in
-        for again in (False, True):
-            try:
-                for opcode, body in each:
-                    said = self.sections.define(opcode, body, block.offset, vouched=proven)
-                    if said:
-                        self.losses.mend(said)
-                return
-            except LogError as error:
-                if again or not self.sections.begin(block.offset):
-                    self.losses.mend(reason(error))
-                    return
-                self.losses.mend(f"another log begins at byte {block.offset}: the chunk there defines ids anew")
-
-    def _search_definitions(self) -> None:
-        """Where sound messages lack a definition, it is looked for in the damaged stretches of their log."""
-        damaged = [(block.offset, block.length) for block, _ in self._failed]
-        damaged += [(gap.offset, gap.length) for gap in self._walk.gaps]
-        for section in self.sections.each:
-            stop = self.sections.end(section) or self.source.size + 1
-            for offset, length in sorted(stretch for stretch in damaged if section.start <= stretch[0] < stop):
-                used = {
-                    c for block in self.blocks if section.start <= block.offset < stop for c in block.counts or block.indexes
-                }
-                if used <= section.readable():
-                    break
-                for opcode, body in definitions(self.source.at(offset, min(length, MOST_SEARCHED))):
-                    self.sections.define(opcode, body, offset, vouched=False)
-
-    def _settle(self, block: Block, counts: dict[int, int]) -> None:
-        """Counts by the ids of the whole, without the messages that mean nothing."""
-        ids, settled = self.sections.at(block.offset).ids, Counter[int]()
-        for local, count in counts.items():
-            if local in ids:
-                settled[ids[local]] += count
-        block.counts = dict(settled)
 
     def _settle_header(self) -> None:
         header = self._walk.header
@@ -349,59 +310,25 @@ class Salvaged(Structure):
             self.losses.mend(f"the head of the chunk at byte {block.offset} was damaged, and is put right")
         return found
 
-    def _refuse_others(self, found: records.Messages, block: Block) -> None:
-        """A chunk that a CRC proves, and that defines ids otherwise than the log it lies in, is another log's."""
-        for opcode, first, length in found.definitions:
-            body = found.data[first : first + length].tobytes()
-            if body in self._agreed:
-                continue
-            if self.sections.contradicts(opcode, body, block.offset):
-                raise LogError(f"the chunk at byte {block.offset} defines another {records.name_of(opcode)} under an id in use")
-            if len(self._agreed) < MOST_AGREED:
-                self._agreed.add(body)
-
     def _fitted(self, block: Block, found: records.Messages) -> records.Messages:
         """The same without what nobody defines and no clock shows, by the ids of the whole."""
-        self._refuse_others(found, block)
-        section = self.sections.at(block.offset)
-        ids, heads = section.ids, found.heads
-        local = np.unique(heads["channel"]).tolist()
-        late = heads["log_time"] >= LATEST_NS
-        if (
-            not late.any()
-            and all(ids.get(channel) == channel for channel in local)
-            and not ((section.start or section.renamed) and found.definitions)
-        ):
+        refuse_others(self.sections, found, block, self._agreed)
+        placed = by_the_whole(self.sections.at(block.offset), found)
+        if placed is None:
             return found
-        table = np.full(1 << 16, -1, np.int64)
-        table[list(ids)] = list(ids.values())
-        channels = table[heads["channel"]]
-        keep = ~late & (channels >= 0)
+        channels, keep = placed
         if not block.edited:
             block.edited = True
             dropped = Counter(
                 int(new) if new >= 0 else -1 - int(old)
-                for new, old in zip(channels[~keep], heads["channel"][~keep], strict=True)
+                for new, old in zip(channels[~keep], found.heads["channel"][~keep], strict=True)
             )
             if dropped:
                 why = "channels that no record defines" if (channels < 0).any() else "log times no clock shows"
                 self.losses.add(
                     Loss(block.offset, block.length, f"messages in the chunk here have {why}", self._by_topic(dropped), True)
                 )
-        return _edited(found, keep, channels[keep])
-
-
-def _edited(found: records.Messages, keep: Bool[np.ndarray, " n"], channels: Int64[np.ndarray, " k"]) -> records.Messages:
-    """Some of the messages, one behind the other, with other channel ids."""
-    offsets, heads = found.offsets[keep], found.heads[keep].copy()
-    sizes = heads["length"].astype(np.int64) + HEAD.size
-    data = b"".join(found.data[a : a + n].tobytes() for a, n in zip(offsets.tolist(), sizes.tolist(), strict=True))
-    view = np.frombuffer(data, np.uint8).copy()
-    places = np.cumsum(sizes) - sizes
-    heads["channel"] = channels
-    for byte in range(2):
-        view[places + HEAD.size + byte] = channels >> (8 * byte) & 0xFF
-    return records.Messages(view, places, heads, [])
+        return edited(found, keep, channels[keep])
 
 
 def _indexed(block: Block) -> dict[int, int]:

@@ -1,25 +1,22 @@
-"""Message definitions, and whole columns of messages to and from their bytes in one numpy pass.
+"""What messages look like: their definitions, and where in their bytes the fields lie.
 
 A message is walked once, field by field, to find where its numbers lie (a `Layout`); every further message with the same
-texts lies the same way, so the columns are then cut out of a byte matrix, or written into one. Two encodings are known:
-`cdr` as ROS 2 writes it (a 4-byte encapsulation, then fields aligned to their own size; both byte orders are read, little
-endian is written) and `ros1` (no encapsulation, no alignment, a sequence number ahead of the stamp).
-
-Quaternions are xyzw in messages and wxyz in memory. This file is where they change.
+texts lies the same way, so whole columns are then cut out of a byte matrix (`decode`), or written into one (`encode`). Two
+encodings are known: `cdr` as ROS 2 writes it (a 4-byte encapsulation, then fields aligned to their own size; both byte orders
+are read, little endian is written) and `ros1` (no encapsulation, no alignment, a sequence number ahead of the stamp).
 """
 
 from __future__ import annotations
 
 import struct
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float64, Int64, UInt8
+from jaxtyping import UInt8
 
-from imutool.errors import DataError, LogError
+from imutool.errors import LogError
 
 IMU = "sensor_msgs/msg/Imu"
 POSE = "geometry_msgs/msg/PoseStamped"
@@ -32,7 +29,6 @@ ODOMETRY = "nav_msgs/msg/Odometry"
 TRANSFORM = "geometry_msgs/msg/TransformStamped"
 
 NS_PER_S = 1_000_000_000
-NO_ORIENTATION = -1.0  # sensor_msgs/Imu: element 0 of a covariance of something that was not measured
 
 _FIELDS = {
     "builtin_interfaces/Time": "int32 sec\nuint32 nanosec\n",
@@ -94,7 +90,7 @@ def canonical(schema_name: str) -> str:
 
 
 # What a message is made of, in order. "count" heads a sequence whose elements are the rest of the shape.
-_SHAPES: dict[str, tuple[str | int, ...]] = {
+SHAPES: dict[str, tuple[str | int, ...]] = {
     IMU: ("header", 37),
     POSE: ("header", 7),
     VECTOR3: ("header", 3),
@@ -105,12 +101,11 @@ _SHAPES: dict[str, tuple[str | int, ...]] = {
     TRANSFORM: ("header", "text", 7),
     IMAGE: ("header", "text", "bytes"),
 }
-_ORIENTATION, _ORIENTATION_COVARIANCE = slice(0, 4), slice(4, 13)
-_GYRO, _GYRO_COVARIANCE = slice(13, 16), slice(16, 25)
-_ACCEL, _ACCEL_COVARIANCE = slice(25, 28), slice(28, 37)
-_POSITION, _XYZW = slice(0, 3), slice(3, 7)
-_WXYZ_FROM_XYZW = [3, 0, 1, 2]
-_XYZW_FROM_WXYZ = [1, 2, 3, 0]
+# Where the fields stand among the numbers of an Imu, and those of a pose.
+ORIENTATION, ORIENTATION_COVARIANCE = slice(0, 4), slice(4, 13)
+GYRO, GYRO_COVARIANCE = slice(13, 16), slice(16, 25)
+ACCEL, ACCEL_COVARIANCE = slice(25, 28), slice(28, 37)
+POSITION, XYZW = slice(0, 3), slice(3, 7)
 
 
 @dataclass(frozen=True, slots=True)
@@ -174,7 +169,7 @@ class _Walk:
         self.texts.append(raw.removesuffix(b"\0").decode(errors="replace"))
 
 
-def _layout(
+def layout_of(
     schema_name: str, encoding: str, *, message: bytes | None = None, texts: Sequence[str] = (), data_size: int = 0
 ) -> Layout:
     """The layout of one message: of the given one, or of the one to be written with the given texts.
@@ -182,7 +177,7 @@ def _layout(
     Raises:
         LogError: the message is shorter than its fields, or its encoding is not known.
     """
-    walk, shape, count = _Walk(encoding, message, texts), _SHAPES[schema_name], 1
+    walk, shape, count = _Walk(encoding, message, texts), SHAPES[schema_name], 1
     stamps: list[int] = []
     numbers: list[tuple[int, int]] = []
     data: tuple[int, int] | None = None
@@ -217,7 +212,7 @@ def runs(rows: UInt8[np.ndarray, "n L"], schema_name: str, encoding: str = "cdr"
     pending = [(0, len(rows))] if len(rows) else []
     while pending:
         first, last = pending.pop()
-        layout = _layout(schema_name, encoding, message=rows[first].tobytes())
+        layout = layout_of(schema_name, encoding, message=rows[first].tobytes())
         differ = np.zeros(last - first - 1, bool)
         for at, value in layout.constants:
             column = rows[first:last, at : at + len(value)]
@@ -226,292 +221,3 @@ def runs(rows: UInt8[np.ndarray, "n L"], schema_name: str, encoding: str = "cdr"
         edges = [first, *(np.flatnonzero(differ) + first + 1).tolist(), last]
         yield slice(first, edges[1]), layout
         pending += reversed(list(pairwise(edges[1:])))
-
-
-# ── reading ──────────────────────────────────────────────────────────────────────────────────────────────────────────
-
-
-class ImuColumns(NamedTuple):
-    """Consecutive Imu messages of one frame: stamps in ns, rad/s, m/s²."""
-
-    stamp_ns: Int64[np.ndarray, " n"]
-    gyro: Float64[np.ndarray, "n 3"]
-    accel: Float64[np.ndarray, "n 3"]
-    frame_id: str
-
-
-class PoseColumns(NamedTuple):
-    """Consecutive poses of one frame in another; `child_frame_id` is empty where the message names none."""
-
-    stamp_ns: Int64[np.ndarray, " n"]
-    p_wb: Float64[np.ndarray, "n 3"]
-    q_wb_wxyz: Float64[np.ndarray, "n 4"]
-    frame_id: str
-    child_frame_id: str
-
-
-class ScalarColumns(NamedTuple):
-    """Consecutive numbers; `stamp_ns` is None for a message without a header, which the log's own time then carries."""
-
-    stamp_ns: Int64[np.ndarray, " n"] | None
-    values: Float64[np.ndarray, "n k"]
-    frame_id: str
-
-
-class TwistColumns(NamedTuple):
-    """Consecutive TwistWithCovarianceStamped of one frame; `variance` is of angular then linear, in messages the other way."""
-
-    stamp_ns: Int64[np.ndarray, " n"]
-    angular: Float64[np.ndarray, "n 3"]
-    linear: Float64[np.ndarray, "n 3"]
-    variance: Float64[np.ndarray, "n 6"]
-    frame_id: str
-
-
-def _stamp(rows: UInt8[np.ndarray, "n L"], layout: Layout, which: int = 0) -> Int64[np.ndarray, " n"]:
-    at = layout.stamps[which]
-    seconds = rows[:, at : at + 4].view(layout.order + layout.seconds)[:, 0].astype(np.int64)
-    return seconds * NS_PER_S + rows[:, at + 4 : at + 8].view(layout.order + "u4")[:, 0].astype(np.int64)
-
-
-def _numbers(rows: UInt8[np.ndarray, "n L"], layout: Layout, columns: slice, which: int = 0) -> Float64[np.ndarray, "n k"]:
-    at = layout.numbers[which][0] + 8 * columns.start
-    cut = rows[:, at : at + 8 * (columns.stop - columns.start)]
-    return cut.view(layout.order + "f8").astype(np.float64)
-
-
-def _one_layout(rows: UInt8[np.ndarray, "n L"], schema_name: str, encoding: str) -> Layout:
-    every = list(runs(rows, schema_name, encoding))
-    if len(every) != 1:
-        raise LogError(f"{len(every)} different frames in one batch", expected="one; split it with `runs`")
-    return every[0][1]
-
-
-def decode_imu(rows: UInt8[np.ndarray, "n L"], encoding: str = "cdr", layout: Layout | None = None) -> ImuColumns:
-    """The columns of Imu messages that share one layout (`runs` splits those that do not).
-
-    Raises:
-        LogError: no rows, more than one layout, a payload too short, an unknown encoding.
-    """
-    layout = layout or _one_layout(rows, IMU, encoding)
-    gyro, accel = _numbers(rows, layout, _GYRO), _numbers(rows, layout, _ACCEL)
-    return ImuColumns(_stamp(rows, layout), gyro, accel, layout.texts[0])
-
-
-def decode_poses(
-    rows: UInt8[np.ndarray, "n L"], schema_name: str = POSE, encoding: str = "cdr", layout: Layout | None = None
-) -> list[PoseColumns]:
-    """The columns of PoseStamped, Odometry, TransformStamped or TFMessage: one entry per transform in a message.
-
-    Raises:
-        LogError: no rows, more than one layout, a payload too short, an unknown encoding.
-    """
-    layout = layout or _one_layout(rows, schema_name, encoding)
-    named = 2 if "text" in _SHAPES[schema_name] else 1
-    found = []
-    for which in range(len(layout.stamps)):
-        names = layout.texts[named * which : named * (which + 1)]
-        q_wxyz = _numbers(rows, layout, _XYZW, which)[:, _WXYZ_FROM_XYZW]
-        p_wb = _numbers(rows, layout, _POSITION, which)
-        child = names[1] if named == 2 else ""
-        found.append(PoseColumns(_stamp(rows, layout, which), p_wb, np.ascontiguousarray(q_wxyz), names[0], child))
-    return found
-
-
-def decode_scalars(
-    rows: UInt8[np.ndarray, "n L"], schema_name: str, encoding: str = "cdr", layout: Layout | None = None
-) -> ScalarColumns:
-    """The columns of Float64 (one) or Vector3Stamped (three).
-
-    Raises:
-        LogError: no rows, more than one layout, a payload too short, an unknown encoding.
-    """
-    layout = layout or _one_layout(rows, schema_name, encoding)
-    stamp_ns = _stamp(rows, layout) if layout.stamps else None
-    frame_id = layout.texts[0] if layout.texts else ""
-    return ScalarColumns(stamp_ns, _numbers(rows, layout, slice(0, layout.numbers[0][1])), frame_id)
-
-
-def decode_twist(rows: UInt8[np.ndarray, "n L"], encoding: str = "cdr", layout: Layout | None = None) -> TwistColumns:
-    """The columns of TwistWithCovarianceStamped.
-
-    Raises:
-        LogError: no rows, more than one layout, a payload too short, an unknown encoding.
-    """
-    layout = layout or _one_layout(rows, TWIST, encoding)
-    linear, angular = _numbers(rows, layout, slice(0, 3)), _numbers(rows, layout, slice(3, 6))
-    variance = _numbers(rows, layout, slice(6, 42))[:, ::7]  # the diagonal, of linear then angular
-    return TwistColumns(_stamp(rows, layout), angular, linear, np.roll(variance, 3, axis=1), layout.texts[0])
-
-
-def decode_image(message: bytes, encoding: str = "cdr") -> tuple[int, str, bytes]:
-    """Stamp in ns, format and the encoded image of one CompressedImage message.
-
-    Raises:
-        LogError: the payload is too short, or its encoding is not known.
-    """
-    layout = _layout(IMAGE, encoding, message=message)
-    assert layout.data is not None, "an image has bytes"
-    row = np.frombuffer(message, np.uint8)[None, :]
-    at, length = layout.data
-    return int(_stamp(row, layout)[0]), layout.texts[1], message[at : at + length]
-
-
-# ── writing ──────────────────────────────────────────────────────────────────────────────────────────────────────────
-
-
-def _blank(count: int, layout: Layout) -> UInt8[np.ndarray, "n L"]:
-    """As many messages as asked for, with everything filled in that they share."""
-    one = np.zeros(layout.size, np.uint8)
-    for at, value in layout.constants:
-        one[at : at + len(value)] = np.frombuffer(value, np.uint8)
-    return np.repeat(one[None, :], count, axis=0)
-
-
-def _put_stamp(rows: UInt8[np.ndarray, "n L"], layout: Layout, stamp_ns: Int64[np.ndarray, " n"]) -> None:
-    if len(stamp_ns) and not -(2**31) <= stamp_ns.min() // NS_PER_S <= stamp_ns.max() // NS_PER_S < 2**31:
-        raise DataError(
-            f"stamps run from {stamp_ns.min()} to {stamp_ns.max()} ns",
-            expected="seconds that fit 32 bits, as ROS 2 stores them",
-        )
-    at = layout.stamps[0]
-    seconds = stamp_ns // NS_PER_S
-    rows[:, at : at + 4].view("<i4")[:, 0] = seconds
-    rows[:, at + 4 : at + 8].view("<u4")[:, 0] = stamp_ns - seconds * NS_PER_S
-
-
-def _numbers_of(rows: UInt8[np.ndarray, "n L"], layout: Layout) -> Float64[np.ndarray, "n k"]:
-    at, count = layout.numbers[0]
-    return rows[:, at : at + 8 * count].view("<f8")
-
-
-def encode_imu(
-    stamp_ns: Int64[np.ndarray, " n"],
-    gyro: Float64[np.ndarray, "n 3"],
-    accel: Float64[np.ndarray, "n 3"],
-    frame_id: str,
-    gyro_covariance: Float64[np.ndarray, "9"] | Float64[np.ndarray, "n 9"] | None = None,
-    accel_covariance: Float64[np.ndarray, "9"] | Float64[np.ndarray, "n 9"] | None = None,
-) -> UInt8[np.ndarray, "n L"]:
-    """One Imu message per row. Orientation is (0, 0, 0, 1) and marked as not measured; covariances, row-major, are one
-    for all or one per row, and all zeros ("unknown", says the message's definition) where not given.
-
-    Raises:
-        DataError: a stamp beyond the 32-bit seconds of ROS 2.
-    """
-    layout = _layout(IMU, "cdr", texts=[frame_id])
-    rows = _blank(len(stamp_ns), layout)
-    _put_stamp(rows, layout, stamp_ns)
-    numbers = _numbers_of(rows, layout)
-    numbers[:, _ORIENTATION.stop - 1] = 1.0
-    numbers[:, _ORIENTATION_COVARIANCE.start] = NO_ORIENTATION
-    numbers[:, _GYRO], numbers[:, _ACCEL] = gyro, accel
-    if gyro_covariance is not None:
-        numbers[:, _GYRO_COVARIANCE] = gyro_covariance
-    if accel_covariance is not None:
-        numbers[:, _ACCEL_COVARIANCE] = accel_covariance
-    return rows
-
-
-def _encode_pose(
-    layout: Layout,
-    stamp_ns: Int64[np.ndarray, " n"],
-    p_wb: Float64[np.ndarray, "n 3"],
-    q_wb_wxyz: Float64[np.ndarray, "n 4"],
-) -> UInt8[np.ndarray, "n L"]:
-    rows = _blank(len(stamp_ns), layout)
-    _put_stamp(rows, layout, stamp_ns)
-    numbers = _numbers_of(rows, layout)
-    numbers[:, _POSITION], numbers[:, _XYZW] = p_wb, q_wb_wxyz[:, _XYZW_FROM_WXYZ]
-    return rows
-
-
-def encode_pose(
-    stamp_ns: Int64[np.ndarray, " n"],
-    p_wb: Float64[np.ndarray, "n 3"],
-    q_wb_wxyz: Float64[np.ndarray, "n 4"],
-    frame_id: str,
-) -> UInt8[np.ndarray, "n L"]:
-    """One PoseStamped message per row.
-
-    Raises:
-        DataError: a stamp beyond the 32-bit seconds of ROS 2.
-    """
-    return _encode_pose(_layout(POSE, "cdr", texts=[frame_id]), stamp_ns, p_wb, q_wb_wxyz)
-
-
-def encode_transform(
-    stamp_ns: Int64[np.ndarray, " n"],
-    p_wb: Float64[np.ndarray, "n 3"],
-    q_wb_wxyz: Float64[np.ndarray, "n 4"],
-    frame_id: str,
-    child_frame_id: str,
-) -> UInt8[np.ndarray, "n L"]:
-    """One TFMessage per row, with one transform in it.
-
-    Raises:
-        DataError: a stamp beyond the 32-bit seconds of ROS 2.
-    """
-    return _encode_pose(_layout(TF, "cdr", texts=[frame_id, child_frame_id]), stamp_ns, p_wb, q_wb_wxyz)
-
-
-def encode_vector3(
-    stamp_ns: Int64[np.ndarray, " n"], vector: Float64[np.ndarray, "n 3"], frame_id: str
-) -> UInt8[np.ndarray, "n L"]:
-    """One Vector3Stamped message per row.
-
-    Raises:
-        DataError: a stamp beyond the 32-bit seconds of ROS 2.
-    """
-    layout = _layout(VECTOR3, "cdr", texts=[frame_id])
-    rows = _blank(len(stamp_ns), layout)
-    _put_stamp(rows, layout, stamp_ns)
-    _numbers_of(rows, layout)[:] = vector
-    return rows
-
-
-def encode_twist(
-    stamp_ns: Int64[np.ndarray, " n"],
-    angular: Float64[np.ndarray, "n 3"],
-    linear: Float64[np.ndarray, "n 3"],
-    covariance: Float64[np.ndarray, "n 6 6"],
-    frame_id: str,
-) -> UInt8[np.ndarray, "n L"]:
-    """One TwistWithCovarianceStamped message per row; `covariance` is of angular then linear, in messages the other way round.
-
-    Raises:
-        DataError: a stamp beyond the 32-bit seconds of ROS 2.
-    """
-    layout = _layout(TWIST, "cdr", texts=[frame_id])
-    rows = _blank(len(stamp_ns), layout)
-    _put_stamp(rows, layout, stamp_ns)
-    numbers = _numbers_of(rows, layout)
-    numbers[:, :3], numbers[:, 3:6] = linear, angular
-    numbers[:, 6:] = np.roll(covariance, (3, 3), axis=(1, 2)).reshape(len(stamp_ns), 36)
-    return rows
-
-
-def encode_float(values: Float64[np.ndarray, " n"]) -> UInt8[np.ndarray, "n L"]:
-    """One Float64 message per row; it has no stamp, so the log's own time carries it."""
-    layout = _layout(FLOAT, "cdr")
-    rows = _blank(len(values), layout)
-    _numbers_of(rows, layout)[:, 0] = values
-    return rows
-
-
-def encode_image(stamp_ns: int, image: bytes, frame_id: str, image_format: str) -> bytes:
-    """One CompressedImage message around the image's own bytes.
-
-    Raises:
-        DataError: a stamp beyond the 32-bit seconds of ROS 2.
-    """
-    layout = _layout(IMAGE, "cdr", texts=[frame_id, image_format], data_size=len(image))
-    assert layout.data is not None, "an image has bytes"
-    rows = np.zeros((1, layout.data[0]), np.uint8)
-    for at, value in layout.constants:
-        rows[0, at : at + len(value)] = np.frombuffer(value, np.uint8)
-    _put_stamp(rows, layout, np.array([stamp_ns], np.int64))
-    return rows.tobytes() + image
-
-
-Encoder = Callable[[slice], UInt8[np.ndarray, "n L"]]

@@ -19,6 +19,7 @@ from jaxtyping import Int64, Shaped, UInt8
 import imutool
 from imutool.errors import DataError
 from imutool.mcap_io import records, schema
+from imutool.mcap_io.encode import encode_float, encode_image, encode_imu, encode_pose, encode_transform, encode_vector3
 from imutool.mcap_io.log_writer import Chunk, LogWriter
 from imutool.mcap_io.read import OWN_KEYS, RECORD, SHADOWED_KEY, UNIT_KEY, VELOCITY_KEY
 from imutool.place import Place
@@ -81,7 +82,7 @@ def _write_metadata(log: LogWriter, recording: Recording) -> None:
 def _imu(log: LogWriter, recording: Recording) -> list[Series]:
     imu = recording.imu
     channel = log.channel(recording.imu_topic, schema.IMU)
-    return [Series(channel, imu.t_ns, (imu.t_ns, imu.gyro, imu.accel), partial(schema.encode_imu, frame_id=BODY))]
+    return [Series(channel, imu.t_ns, (imu.t_ns, imu.gyro, imu.accel), partial(encode_imu, frame_id=BODY))]
 
 
 def _poses(log: LogWriter, recording: Recording) -> list[Series]:
@@ -90,14 +91,14 @@ def _poses(log: LogWriter, recording: Recording) -> list[Series]:
     for which, (topic, poses) in enumerate(recording.truths.items()):
         t_ns, columns = poses.t_ns, (poses.t_ns, poses.p_wb, poses.q_wb_wxyz)
         channel = log.channel(topic, schema.POSE)
-        found.append(Series(channel, t_ns, columns, partial(schema.encode_pose, frame_id=WORLD)))
+        found.append(Series(channel, t_ns, columns, partial(encode_pose, frame_id=WORLD)))
         if which == 0:
-            encode = partial(schema.encode_transform, frame_id=WORLD, child_frame_id=BODY)
+            encode = partial(encode_transform, frame_id=WORLD, child_frame_id=BODY)
             found.append(Series(log.channel("/tf", schema.TF), t_ns, columns, encode))
         if poses.v_w is not None:
             velocity = f"{topic.removesuffix('/pose')}/velocity"
             channel = log.channel(velocity, schema.VECTOR3, {VELOCITY_KEY: topic, UNIT_KEY: "m/s"})
-            found.append(Series(channel, t_ns, (t_ns, poses.v_w), partial(schema.encode_vector3, frame_id=WORLD)))
+            found.append(Series(channel, t_ns, (t_ns, poses.v_w), partial(encode_vector3, frame_id=WORLD)))
     return found
 
 
@@ -107,10 +108,10 @@ def _scalars(log: LogWriter, recording: Recording) -> list[Series]:
         t_ns, values, unit = scalars.t_ns, scalars.values, {UNIT_KEY: scalars.unit}
         if values.shape[1] == 1:
             channel = log.channel(topic, schema.FLOAT, unit)
-            found.append(Series(channel, t_ns, (values[:, 0],), schema.encode_float))
+            found.append(Series(channel, t_ns, (values[:, 0],), encode_float))
         else:
             channel = log.channel(topic, schema.VECTOR3, unit)
-            found.append(Series(channel, t_ns, (t_ns, values), partial(schema.encode_vector3, frame_id="")))
+            found.append(Series(channel, t_ns, (t_ns, values), partial(encode_vector3, frame_id="")))
     return found
 
 
@@ -162,7 +163,7 @@ def _image_chunks(channel: int, topic: str, frames: Frames) -> Iterator[Chunk]:
     for sequence, (t_ns, image) in enumerate(frames.each()):
         if t_ns < 0:
             raise DataError(f"an image of {topic} has the time {t_ns} ns", expected="no time before 1970")
-        payload = schema.encode_image(t_ns, image, frame_id, frames.format)
+        payload = encode_image(t_ns, image, frame_id, frames.format)
         parts.append(records.message_record(channel, sequence, t_ns, payload))
         times.append(t_ns)
         offsets.append(size)

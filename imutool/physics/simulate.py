@@ -19,7 +19,8 @@ from jaxtyping import Float64, Int64
 
 from imutool import noise as noises
 from imutool.errors import ConfigError, DataError, ImutoolError, LogError
-from imutool.mcap_io.read import Log, PoseBatch
+from imutool.mcap_io.batches import PoseBatch
+from imutool.mcap_io.log import Log
 from imutool.mcap_io.read import read as read_log
 from imutool.mcap_io.write import write
 from imutool.physics import physics_file

@@ -13,9 +13,12 @@ from imutool.clean.first_pass import examine
 from imutool.clean.truth import Truth, of_poses
 from imutool.errors import DataError, LogError
 from imutool.mcap_io import schema
-from imutool.mcap_io.log import DERIVED_KEY, ImuBatch, Log
+from imutool.mcap_io.batches import ImuBatch
+from imutool.mcap_io.decode import TwistColumns
+from imutool.mcap_io.log import Log
 from imutool.mcap_io.losses import told
 from imutool.mcap_io.read import recording_in
+from imutool.mcap_io.topics import DERIVED_KEY
 from imutool.place import Place
 from imutool.recording import Imu, Recording
 from imutool.view.rundata import Logged, Run
@@ -45,7 +48,7 @@ class _Read(NamedTuple):
     topic: str
     derived: list[str]
     batches: dict[str, list[ImuBatch]]
-    beliefs: dict[str, list[schema.TwistColumns]]
+    beliefs: dict[str, list[TwistColumns]]
     rest: Recording
     metadata: list[tuple[str, dict[str, str]]]
 
@@ -105,10 +108,10 @@ def _read(path: Place, imu: str | None, truth: str | None, notes: list[str], *, 
 
 def _messages(
     log: Log, imus: Sequence[str], biases: Sequence[str]
-) -> tuple[dict[str, list[ImuBatch]], dict[str, list[schema.TwistColumns]]]:
+) -> tuple[dict[str, list[ImuBatch]], dict[str, list[TwistColumns]]]:
     """The messages of some IMUs and biases in one pass, as they are."""
     samples: dict[str, list[ImuBatch]] = {name: [] for name in imus}
-    beliefs: dict[str, list[schema.TwistColumns]] = {name: [] for name in biases}
+    beliefs: dict[str, list[TwistColumns]] = {name: [] for name in biases}
     for topic, rows in log.rows([*imus, *biases]):
         with log.named(topic):
             if topic in samples:
@@ -156,7 +159,7 @@ def _model(metadata: Sequence[tuple[str, Mapping[str, str]]], topic: str) -> str
 
 
 def _run(
-    name: str, model: str, raw: Imu, batches: Sequence[ImuBatch], beliefs: Mapping[str, Sequence[schema.TwistColumns]]
+    name: str, model: str, raw: Imu, batches: Sequence[ImuBatch], beliefs: Mapping[str, Sequence[TwistColumns]]
 ) -> Run | None:
     """A debiased channel with the bias and its certainty beside it in the log; else the bias by subtraction at equal stamps."""
     try:

@@ -19,7 +19,8 @@ from defects import late, messages, repeated, with_values, without
 from imutool.clean import survey
 from imutool.clean.first_pass import examine
 from imutool.clean.truth import read_truth
-from imutool.mcap_io.log import ImuBatch, Log
+from imutool.mcap_io.batches import ImuBatch
+from imutool.mcap_io.log import Log
 
 HOUR_NS, HALF_A_SECOND_NS, DELAY_NS, JITTER_NS = 3_600_000_000_000, 500_000_000, 3_000_000, 200_000
 

@@ -16,6 +16,8 @@ from mcap.records import Message
 from mcap_ros2._dynamic import generate_dynamic, serialize_dynamic
 
 from imutool.mcap_io import records, schema
+from imutool.mcap_io.decode import ImuColumns, decode_imu
+from imutool.mcap_io.encode import encode_imu
 
 REPEATS = 7
 THEIR_COUNT = 3000  # enough for a rate; the whole column would take minutes
@@ -37,20 +39,20 @@ def encode(t_ns: np.ndarray, gyro: np.ndarray, accel: np.ndarray) -> list[bytes]
     chunks = []
     for first in range(0, len(t_ns), CHUNK):
         part = slice(first, first + CHUNK)
-        payload = schema.encode_imu(t_ns[part], gyro[part], accel[part], "body")
+        payload = encode_imu(t_ns[part], gyro[part], accel[part], "body")
         sequence = np.arange(first, first + len(payload), dtype=np.uint32)
         chunks.append(records.message_rows(1, t_ns[part], t_ns[part], sequence, payload).tobytes())
     return chunks
 
 
-def decode(chunks: list[bytes]) -> list[schema.ImuColumns]:
+def decode(chunks: list[bytes]) -> list[ImuColumns]:
     """The columns in chunks of message records."""
     found = []
     for chunk in chunks:
         messages = records.messages(chunk, 0)
         for rows in records.rows(messages, messages.heads["channel"] == 1):
             for part, layout in schema.runs(rows.payload, schema.IMU):
-                found.append(schema.decode_imu(rows.payload[part], "cdr", layout))
+                found.append(decode_imu(rows.payload[part], "cdr", layout))
     return found
 
 

@@ -28,6 +28,7 @@ import pyarrow.parquet as pq
 from mcap.writer import CompressionType, Writer
 
 from imutool.mcap_io import schema
+from imutool.mcap_io.encode import encode_imu
 from imutool.mcap_io.log import Log
 from imutool.physics.flight import flight
 
@@ -100,7 +101,7 @@ def make(path: Path, mb: float, compression: str) -> None:
     """A log of images and IMU messages side by side."""
     images = max(2, round(mb * 1e6 / (IMAGE_BYTES + IMU_PER_IMAGE * 350)))
     imu = flight(1, duration_s=images * IMU_PER_IMAGE / 200.0).imu
-    payloads = schema.encode_imu(imu.t_ns, imu.gyro, imu.accel, "imu0")
+    payloads = encode_imu(imu.t_ns, imu.gyro, imu.accel, "imu0")
     rng = np.random.default_rng(0)
     with path.open("wb") as file:
         out = Writer(file, compression=CompressionType[compression.upper()], chunk_size=1 << 20)

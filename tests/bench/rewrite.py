@@ -32,11 +32,13 @@ from mcap.reader import make_reader
 from mcap.writer import CompressionType, Writer
 
 from imutool.mcap_io import schema
+from imutool.mcap_io.batches import ImuBatch
+from imutool.mcap_io.derived import Made, NewTopic
 from imutool.mcap_io.digest import sha256
-from imutool.mcap_io.log import ImuBatch
+from imutool.mcap_io.encode import encode_imu, encode_twist, encode_vector3
 from imutool.mcap_io.log_writer import Chunk, LogWriter
 from imutool.mcap_io.records import message_record, message_rows
-from imutool.mcap_io.rewrite import Made, NewTopic, rewrite
+from imutool.mcap_io.rewrite import rewrite
 
 IMU, CAMERA, MONO = "/imu0", "/cam0/image_raw/compressed", "/cam1/image_raw"
 IMAGE = "sensor_msgs/msg/Image"
@@ -62,9 +64,9 @@ class Constant:
     def __call__(self, batch: ImuBatch) -> Made:
         """The same bias for every sample."""
         bias, eye = np.tile(BIAS, (len(batch.stamp_ns), 1)), np.tile(np.eye(6), (len(batch.stamp_ns), 1, 1))
-        imu = schema.encode_imu(batch.stamp_ns, batch.gyro - bias, batch.accel - bias, batch.frame_id)
-        vector = schema.encode_vector3(batch.stamp_ns, bias, batch.frame_id)
-        return Made(batch, [imu, vector, vector, schema.encode_twist(batch.stamp_ns, bias, bias, eye, batch.frame_id)])
+        imu = encode_imu(batch.stamp_ns, batch.gyro - bias, batch.accel - bias, batch.frame_id)
+        vector = encode_vector3(batch.stamp_ns, bias, batch.frame_id)
+        return Made(batch, [imu, vector, vector, encode_twist(batch.stamp_ns, bias, bias, eye, batch.frame_id)])
 
 
 # ── the logs ─────────────────────────────────────────────────────────────────────────────────────────────────────────
@@ -84,7 +86,7 @@ def imu_rows(first: int, count: int) -> tuple[np.ndarray, np.ndarray]:
     """Stamps and payloads of some IMU messages."""
     rng = np.random.default_rng(first)
     t_ns = START_NS + PERIOD_NS * np.arange(first, first + count)
-    return t_ns, schema.encode_imu(t_ns, rng.normal(size=(count, 3)), rng.normal(size=(count, 3)), "imu")
+    return t_ns, encode_imu(t_ns, rng.normal(size=(count, 3)), rng.normal(size=(count, 3)), "imu")
 
 
 def write_mixed(path: Path, gb: float, packing: str) -> None:

@@ -25,6 +25,7 @@ from mcap.writer import CompressionType, Writer
 
 from imutool.errors import LogError
 from imutool.mcap_io import records, schema
+from imutool.mcap_io.encode import encode_image, encode_imu
 from imutool.mcap_io.log import Log
 from imutool.mcap_io.records import HEAD
 
@@ -45,10 +46,10 @@ def made(path: Path, megabytes: int, **options: object) -> None:
         channels = writer.register_channel("/imu0", "cdr", imu), writer.register_channel("/cam0", "cdr", camera)
         for row in range(COUNT):
             t_ns = 10**18 + PERIOD_NS * row
-            payload = schema.encode_imu(np.array([t_ns]), rng.normal(size=(1, 3)), rng.normal(size=(1, 3)), "imu").tobytes()
+            payload = encode_imu(np.array([t_ns]), rng.normal(size=(1, 3)), rng.normal(size=(1, 3)), "imu").tobytes()
             writer.add_message(channels[0], t_ns, payload, t_ns, row)
             if row % 10 == 0:
-                data = schema.encode_image(t_ns, rng.bytes(image), "cam0", "jpeg")
+                data = encode_image(t_ns, rng.bytes(image), "cam0", "jpeg")
                 writer.add_message(channels[1], t_ns, data, t_ns, row)
         writer.finish()
 

@@ -23,6 +23,7 @@ from imutool import place as places
 from imutool.debias import debias
 from imutool.mcap_io import schema
 from imutool.mcap_io.digest import sha256
+from imutool.mcap_io.encode import encode_imu
 from imutool.mcap_io.log import Log
 from imutool.mcap_io.rewrite import rewrite
 from imutool.place import place
@@ -35,7 +36,7 @@ def mixed(path: Path) -> Path:
     """A log whose every chunk holds both: the usual and the worst."""
     rng = np.random.default_rng(1)
     t_ns = 10**18 + np.arange(SECONDS * RATE_HZ) * 5_000_000
-    payload = schema.encode_imu(
+    payload = encode_imu(
         t_ns, 0.01 * rng.normal(size=(len(t_ns), 3)), rng.normal(size=(len(t_ns), 3)) * 0.05 + [0, 0, 9.81], "imu"
     )
     with path.open("wb") as file:

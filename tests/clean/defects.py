@@ -10,7 +10,9 @@ from mcap.reader import make_reader
 from mcap.writer import Writer
 
 from imutool.mcap_io import schema
-from imutool.mcap_io.log import ImuBatch, Log
+from imutool.mcap_io.batches import ImuBatch
+from imutool.mcap_io.encode import encode_imu
+from imutool.mcap_io.log import Log
 from imutool.recording import Imu
 
 JITTER_NS = 200_000  # of the recorder's clock
@@ -75,7 +77,7 @@ def without(batch: ImuBatch, rows: np.ndarray | slice) -> ImuBatch:
 
 def write_log(batch: ImuBatch, path: Path, beside: Path | None = None, topic: str = "/imu0") -> None:
     """A log with these messages on its IMU topic, and with everything else of the log `beside`."""
-    payload = schema.encode_imu(batch.stamp_ns, batch.gyro, batch.accel, batch.frame_id)
+    payload = encode_imu(batch.stamp_ns, batch.gyro, batch.accel, batch.frame_id)
     with path.open("wb") as file:
         writer = Writer(file)
         writer.start("ros2", "test")

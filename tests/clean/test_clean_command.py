@@ -16,7 +16,8 @@ from defects import messages, repeated, with_values, without, write_log
 from imutool.clean import Rules, survey
 from imutool.debias import debias
 from imutool.errors import LogError
-from imutool.mcap_io.log import Clock, ImuBatch, Log
+from imutool.mcap_io.batches import Clock, ImuBatch
+from imutool.mcap_io.log import Log
 from imutool.mcap_io.write import write
 from imutool.physics.flight import flight
 from imutool.view import clean_page

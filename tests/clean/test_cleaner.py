@@ -13,7 +13,7 @@ from imutool.clean.first_pass import Survey, examine
 from imutool.clean.samples import BLOCK, blocks, padded
 from imutool.clean.settings import Rules, every
 from imutool.errors import LogError
-from imutool.mcap_io.log import Clock, ImuBatch
+from imutool.mcap_io.batches import Clock, ImuBatch
 from imutool.physics.flight import flight
 
 MADE = batch_of(flight(3, duration_s=30.0).imu)

@@ -12,7 +12,7 @@ from defects import batch_of, late, repeated, with_values, without
 from converters import euroc, fetch, tum_vi
 from imutool.clean.first_pass import Survey, examine
 from imutool.clean.truth import Truth
-from imutool.mcap_io.log import ImuBatch
+from imutool.mcap_io.batches import ImuBatch
 from imutool.recording import Recording
 
 SOURCES = {

@@ -13,7 +13,7 @@ from imutool.clean.finding import Finding
 from imutool.clean.first_pass import Survey, examine
 from imutool.clean.settings import Rules
 from imutool.clean.truth import Truth
-from imutool.mcap_io.log import ImuBatch
+from imutool.mcap_io.batches import ImuBatch
 from imutool.physics.flight import flight
 from imutool.recording import GRAVITY_M_S2, Poses
 

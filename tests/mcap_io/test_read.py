@@ -16,9 +16,13 @@ import pytest
 
 from imutool.errors import ConfigError, LogError
 from imutool.mcap_io import schema
+from imutool.mcap_io.decode import decode_imu
+from imutool.mcap_io.encode import encode_imu, encode_pose, encode_vector3
+from imutool.mcap_io.log import Log
 from imutool.mcap_io.log_writer import LogWriter
-from imutool.mcap_io.read import DERIVED_KEY, VELOCITY_KEY, Log, read
+from imutool.mcap_io.read import VELOCITY_KEY, read
 from imutool.mcap_io.structure import Structure
+from imutool.mcap_io.topics import DERIVED_KEY
 from imutool.mcap_io.write import Series, chunks, write
 from imutool.recording import Imu, Recording
 
@@ -55,7 +59,7 @@ def test_every_layout_reads_the_same(foreign: Foreign, flight: list[Message], la
         assert np.concatenate([b.publish_time for b in batches]).tolist() == [m[3] for m in mine]
         assert np.concatenate([b.sequence for b in batches]).tolist() == [m[4] for m in mine]
         assert {b.frame_id for b in batches} == {"imu"}
-        expected = np.concatenate([schema.decode_imu(np.frombuffer(m[5], np.uint8)[None]).gyro for m in mine])
+        expected = np.concatenate([decode_imu(np.frombuffer(m[5], np.uint8)[None]).gyro for m in mine])
         assert np.concatenate([b.gyro for b in batches]).tobytes() == expected.tobytes()
         assert sum(len(b.stamp_ns) for b in log.pose_batches("/mocap")) == 100
         assert sum(len(b.stamp_ns) for b in log.scalar_batches("/height")) == 180
@@ -137,7 +141,7 @@ def test_our_own_derived_channels_are_no_imus_but_can_be_named(recording: Record
     with LogWriter(path) as log:
         for topic, metadata, gyro in (("/imu0", {}, imu.gyro), ("/imu0/debiased", {DERIVED_KEY: "/imu0"}, imu.gyro + 1)):
             channel = log.channel(topic, schema.IMU, metadata)
-            series = Series(channel, imu.t_ns, (imu.t_ns, gyro, imu.accel), lambda t, g, a: schema.encode_imu(t, g, a, "b"))
+            series = Series(channel, imu.t_ns, (imu.t_ns, gyro, imu.accel), lambda t, g, a: encode_imu(t, g, a, "b"))
             for chunk in chunks([series]):
                 log.chunk(chunk)
     assert read(path).imu == imu
@@ -377,13 +381,13 @@ def test_velocities_that_do_not_belong_to_their_poses_are_refused(tmp_path: Path
     t_ns, zeros, q_wxyz = np.array([1, 2, 3]), np.zeros((3, 3)), np.tile([1.0, 0, 0, 0], (3, 1))
     with LogWriter(path) as log:
         group = [
-            Series(log.channel("/imu", schema.IMU), t_ns, (t_ns, zeros, zeros), partial(schema.encode_imu, frame_id="b")),
-            Series(log.channel("/p", schema.POSE), t_ns, (t_ns, zeros, q_wxyz), partial(schema.encode_pose, frame_id="w")),
+            Series(log.channel("/imu", schema.IMU), t_ns, (t_ns, zeros, zeros), partial(encode_imu, frame_id="b")),
+            Series(log.channel("/p", schema.POSE), t_ns, (t_ns, zeros, q_wxyz), partial(encode_pose, frame_id="w")),
             Series(
                 log.channel("/v", schema.VECTOR3, {VELOCITY_KEY: "/p"}),
                 t_ns,
                 (t_ns + 1, zeros),
-                partial(schema.encode_vector3, frame_id="w"),
+                partial(encode_vector3, frame_id="w"),
             ),
         ]
         for chunk in chunks(group):

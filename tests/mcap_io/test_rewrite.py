@@ -18,10 +18,15 @@ from rosbags.highlevel import AnyReader
 
 from imutool.errors import ConfigError, LogError
 from imutool.mcap_io import schema
+from imutool.mcap_io.batches import Clock, ImuBatch
+from imutool.mcap_io.decode import decode_imu
+from imutool.mcap_io.derived import Made, NewTopic
 from imutool.mcap_io.digest import sha256
-from imutool.mcap_io.log import Clock
-from imutool.mcap_io.read import DERIVED_KEY, ImuBatch, Log, read
-from imutool.mcap_io.rewrite import Made, NewTopic, rewrite
+from imutool.mcap_io.encode import encode_imu, encode_vector3
+from imutool.mcap_io.log import Log
+from imutool.mcap_io.read import read
+from imutool.mcap_io.rewrite import rewrite
+from imutool.mcap_io.topics import DERIVED_KEY
 from imutool.mcap_io.verify import verify
 from imutool.mcap_io.write import write
 from imutool.recording import Imu, Recording
@@ -49,8 +54,8 @@ class Debias:
         self.clock.take(batch)
         self.stamps += batch.stamp_ns.tolist()
         bias = np.tile(BIAS, (len(batch.stamp_ns), 1))
-        imu = schema.encode_imu(batch.stamp_ns, batch.gyro - bias, batch.accel, batch.frame_id)
-        return Made(batch, [imu, schema.encode_vector3(batch.stamp_ns, bias, batch.frame_id)])
+        imu = encode_imu(batch.stamp_ns, batch.gyro - bias, batch.accel, batch.frame_id)
+        return Made(batch, [imu, encode_vector3(batch.stamp_ns, bias, batch.frame_id)])
 
 
 def digest(path: Path, topics: set[str] | None = None) -> dict[str, str]:
@@ -311,7 +316,7 @@ def test_imu_messages_no_model_can_take_are_refused(
 ) -> None:
     imu = [i for i, message in enumerate(flight) if message[0] == "/imu/data"]
     before, (topic, kind, log_time, publish_time, sequence, _) = flight[imu[which - 1]], flight[imu[which]]
-    stamp = schema.decode_imu(np.frombuffer(before[5], np.uint8)[None]).stamp_ns[0]
+    stamp = decode_imu(np.frombuffer(before[5], np.uint8)[None]).stamp_ns[0]
     payload = make(kind, int(stamp) + (0 if said == "repeats" else 1), np.full(3, value), np.zeros(3))
     flight[imu[which]] = (topic, kind, log_time, publish_time, sequence, payload)
     with pytest.raises(LogError, match=f"/imu/data: message .*{said}"):

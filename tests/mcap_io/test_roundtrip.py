@@ -14,7 +14,8 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from imutool.errors import ConfigError, DataError
-from imutool.mcap_io.read import Log, read
+from imutool.mcap_io.log import Log
+from imutool.mcap_io.read import read
 from imutool.mcap_io.write import write
 from imutool.recording import Frames, Imu, Poses, Recording, Scalars
 

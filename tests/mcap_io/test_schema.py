@@ -11,6 +11,8 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from imutool.errors import DataError, LogError
 from imutool.mcap_io import schema
+from imutool.mcap_io.decode import decode_image, decode_imu, decode_poses, decode_scalars
+from imutool.mcap_io.encode import encode_float, encode_image, encode_imu, encode_pose, encode_transform, encode_vector3
 
 STAMPS = np.array([0, 1, 999_999_999, 1_000_000_000, 1_403_638_128_245_096_960, 2**31 * 10**9 - 1])
 COUNT = len(STAMPS)
@@ -46,7 +48,7 @@ def test_definitions_parse_to_the_types_ros_has(name: str) -> None:
 @pytest.mark.parametrize("frame_id", FRAMES)
 def test_imu_bytes_are_those_of_rosbags_and_read_back_exactly(frame_id: str) -> None:
     gyro, accel, gyro_covariance, accel_covariance = columns(3), columns(3) + 1, columns(9), columns(9)[0]
-    rows = schema.encode_imu(STAMPS, gyro, accel, frame_id, gyro_covariance, accel_covariance)
+    rows = encode_imu(STAMPS, gyro, accel, frame_id, gyro_covariance, accel_covariance)
     decoder = generate_dynamic(schema.IMU, schema.definition(schema.IMU))[schema.IMU]
     for i, row in enumerate(rows):
         theirs = ROS2.deserialize_cdr(row.tobytes(), schema.IMU)
@@ -60,14 +62,14 @@ def test_imu_bytes_are_those_of_rosbags_and_read_back_exactly(frame_id: str) -> 
         assert np.array_equal(message.angular_velocity_covariance, gyro_covariance[i])
         assert np.array_equal(message.linear_acceleration_covariance, accel_covariance)
         assert (message.orientation.w, message.orientation_covariance[0]) == (1.0, -1.0)
-    back = schema.decode_imu(rows)
+    back = decode_imu(rows)
     assert back.frame_id == frame_id
     for ours, given in zip(back[:3], (STAMPS, gyro, accel), strict=True):
         assert ours.tobytes() == given.tobytes()
 
 
 def test_imu_without_covariance_says_unknown() -> None:
-    message = ROS2.deserialize_cdr(schema.encode_imu(STAMPS, columns(3), columns(3), "b")[0].tobytes(), schema.IMU)
+    message = ROS2.deserialize_cdr(encode_imu(STAMPS, columns(3), columns(3), "b")[0].tobytes(), schema.IMU)
     assert not message.angular_velocity_covariance.any()
     assert not message.linear_acceleration_covariance.any()
 
@@ -75,14 +77,14 @@ def test_imu_without_covariance_says_unknown() -> None:
 @pytest.mark.parametrize("frame_id", FRAMES)
 def test_pose_is_wxyz_in_memory_and_xyzw_in_the_message(frame_id: str) -> None:
     p_wb, q_wxyz = columns(3), columns(4)
-    rows = schema.encode_pose(STAMPS, p_wb, q_wxyz, frame_id)
+    rows = encode_pose(STAMPS, p_wb, q_wxyz, frame_id)
     for i, row in enumerate(rows):
         message = ROS2.deserialize_cdr(row.tobytes(), schema.POSE)
         q = message.pose.orientation
         assert [q.w, q.x, q.y, q.z] == q_wxyz[i].tolist()
         assert [message.pose.position.x, message.pose.position.y, message.pose.position.z] == p_wb[i].tolist()
         assert bytes(ROS2.serialize_cdr(message, schema.POSE)) == row.tobytes()
-    (back,) = schema.decode_poses(rows)
+    (back,) = decode_poses(rows)
     assert (back.frame_id, back.child_frame_id) == (frame_id, "")
     assert back.q_wb_wxyz.tobytes() == q_wxyz.tobytes()
     assert back.p_wb.tobytes() == p_wb.tobytes()
@@ -92,10 +94,10 @@ def test_pose_is_wxyz_in_memory_and_xyzw_in_the_message(frame_id: str) -> None:
 def test_transform_vector_float_and_image_are_those_of_rosbags() -> None:
     p_wb, q_wxyz = columns(3), columns(4)
     cases = {
-        schema.TF: schema.encode_transform(STAMPS, p_wb, q_wxyz, "world", "body"),
-        schema.VECTOR3: schema.encode_vector3(STAMPS, p_wb, "world"),
-        schema.FLOAT: schema.encode_float(p_wb[:, 0]),
-        schema.IMAGE: [np.frombuffer(schema.encode_image(int(s), b"\x89PNG...", "cam0", "png"), np.uint8) for s in STAMPS],
+        schema.TF: encode_transform(STAMPS, p_wb, q_wxyz, "world", "body"),
+        schema.VECTOR3: encode_vector3(STAMPS, p_wb, "world"),
+        schema.FLOAT: encode_float(p_wb[:, 0]),
+        schema.IMAGE: [np.frombuffer(encode_image(int(s), b"\x89PNG...", "cam0", "png"), np.uint8) for s in STAMPS],
     }
     for name, rows in cases.items():
         for i, row in enumerate(rows):
@@ -107,13 +109,13 @@ def test_transform_vector_float_and_image_are_those_of_rosbags() -> None:
                 assert [q.w, q.x, q.y, q.z] == q_wxyz[i].tolist()
                 assert (stamp_of(transform.header), transform.child_frame_id) == (STAMPS[i], "body")
             elif name == schema.IMAGE:
-                assert schema.decode_image(row.tobytes()) == (STAMPS[i], "png", b"\x89PNG...")
+                assert decode_image(row.tobytes()) == (STAMPS[i], "png", b"\x89PNG...")
                 assert (bytes(message.data), message.format) == (b"\x89PNG...", "png")
-    (back,) = schema.decode_poses(cases[schema.TF], schema.TF)
+    (back,) = decode_poses(cases[schema.TF], schema.TF)
     assert (back.frame_id, back.child_frame_id) == ("world", "body")
     assert back.q_wb_wxyz.tobytes() == q_wxyz.tobytes()
-    assert schema.decode_scalars(cases[schema.VECTOR3], schema.VECTOR3).values.tobytes() == p_wb.tobytes()
-    floats = schema.decode_scalars(cases[schema.FLOAT], schema.FLOAT)
+    assert decode_scalars(cases[schema.VECTOR3], schema.VECTOR3).values.tobytes() == p_wb.tobytes()
+    floats = decode_scalars(cases[schema.FLOAT], schema.FLOAT)
     assert floats.stamp_ns is None
     assert floats.values[:, 0].tobytes() == p_wb[:, 0].tobytes()
 
@@ -123,21 +125,21 @@ def test_transform_vector_float_and_image_are_those_of_rosbags() -> None:
 def test_other_writers_messages_decode_exactly(make: Callable[..., bytes], frame_id: str, ros1: bool) -> None:
     encoding, frames = ("ros1", (frame_id, "bodies")) if ros1 else ("cdr", (frame_id, "bodies"))
     a, b, q = columns(3), columns(3) + 1, columns(4)
-    imu = schema.decode_imu(
+    imu = decode_imu(
         matrix([make(schema.IMU, int(s), a[i], b[i], ros1=ros1, frames=frames) for i, s in enumerate(STAMPS)]), encoding
     )
     assert (imu.gyro.tobytes(), imu.accel.tobytes(), imu.frame_id) == (a.tobytes(), b.tobytes(), frame_id)
     assert np.array_equal(imu.stamp_ns, STAMPS)
     for kind in (schema.POSE, schema.ODOMETRY, schema.TRANSFORM):
         rows = matrix([make(kind, int(s), a[i], q[i], ros1=ros1, frames=frames) for i, s in enumerate(STAMPS)])
-        (pose,) = schema.decode_poses(rows, kind, encoding)
+        (pose,) = decode_poses(rows, kind, encoding)
         assert (pose.p_wb.tobytes(), pose.q_wb_wxyz.tobytes()) == (a.tobytes(), q.tobytes())
         assert pose.child_frame_id == ("" if kind == schema.POSE else "bodies")
         assert np.array_equal(pose.stamp_ns, STAMPS)
     rows = matrix([make(schema.VECTOR3, int(s), a[i], ros1=ros1, frames=frames) for i, s in enumerate(STAMPS)])
-    assert schema.decode_scalars(rows, schema.VECTOR3, encoding).values.tobytes() == a.tobytes()
+    assert decode_scalars(rows, schema.VECTOR3, encoding).values.tobytes() == a.tobytes()
     rows = matrix([make(schema.FLOAT, int(s), a[i, 0], ros1=ros1) for i, s in enumerate(STAMPS)])
-    assert schema.decode_scalars(rows, schema.FLOAT, encoding).values[:, 0].tobytes() == a[:, 0].tobytes()
+    assert decode_scalars(rows, schema.FLOAT, encoding).values[:, 0].tobytes() == a[:, 0].tobytes()
 
 
 @pytest.mark.parametrize("ros1", [False, True])
@@ -150,7 +152,7 @@ def test_any_number_of_transforms_decodes(make: Callable[..., bytes], count: int
             for i, s in enumerate(STAMPS)
         ]
     )
-    found = schema.decode_poses(rows, schema.TF, "ros1" if ros1 else "cdr")
+    found = decode_poses(rows, schema.TF, "ros1" if ros1 else "cdr")
     assert [pose.child_frame_id for pose in found] == children
     for k, pose in enumerate(found):
         assert np.array_equal(pose.p_wb, p + k)
@@ -164,7 +166,7 @@ def test_big_endian_cdr_decodes(make: Callable[..., bytes]) -> None:
     for i, s in enumerate(STAMPS):
         message = ROS2.deserialize_cdr(make(schema.IMU, int(s), a[i], b[i]), schema.IMU)
         swapped.append(bytes(ROS2.serialize_cdr(message, schema.IMU, little_endian=False)))
-    back = schema.decode_imu(matrix(swapped))
+    back = decode_imu(matrix(swapped))
     assert (back.gyro.tobytes(), back.accel.tobytes(), back.frame_id) == (a.tobytes(), b.tobytes(), "a")
     assert np.array_equal(back.stamp_ns, STAMPS)
 
@@ -172,44 +174,44 @@ def test_big_endian_cdr_decodes(make: Callable[..., bytes]) -> None:
 def test_frames_of_equal_length_are_told_apart_and_order_is_kept() -> None:
     names = ["a", "b", "b", "cc", "a", "a"]  # all pad to one size
     gyro = columns(3)
-    each = [schema.encode_imu(STAMPS[i : i + 1], gyro[i : i + 1], gyro[i : i + 1], n) for i, n in enumerate(names)]
+    each = [encode_imu(STAMPS[i : i + 1], gyro[i : i + 1], gyro[i : i + 1], n) for i, n in enumerate(names)]
     rows = np.concatenate(each)
     found = [(part, layout.texts[0]) for part, layout in schema.runs(rows, schema.IMU)]
     assert [name for _, name in found] == ["a", "b", "cc", "a"]
-    pieces = [schema.decode_imu(rows[part]) for part, _ in found]
+    pieces = [decode_imu(rows[part]) for part, _ in found]
     assert np.concatenate([piece.gyro for piece in pieces]).tobytes() == gyro.tobytes()
     with pytest.raises(LogError, match="4 different frames"):
-        schema.decode_imu(rows)
+        decode_imu(rows)
 
 
 @pytest.mark.parametrize("cut", [0, 3, 8, 15, 20, 100, -1])
 def test_a_payload_too_short_is_refused(cut: int) -> None:
-    rows = schema.encode_imu(STAMPS, columns(3), columns(3), "imu0")
+    rows = encode_imu(STAMPS, columns(3), columns(3), "imu0")
     with pytest.raises(LogError, match="payload"):
-        schema.decode_imu(rows[:, :cut])
+        decode_imu(rows[:, :cut])
 
 
 def test_a_text_length_beyond_the_payload_is_refused() -> None:
-    rows = schema.encode_imu(STAMPS, columns(3), columns(3), "imu0")
+    rows = encode_imu(STAMPS, columns(3), columns(3), "imu0")
     rows[:, 12:16] = 255
     with pytest.raises(LogError, match="ends before byte"):
-        schema.decode_imu(rows)
+        decode_imu(rows)
 
 
 def test_parameter_list_cdr_is_refused() -> None:
-    rows = schema.encode_imu(STAMPS, columns(3), columns(3), "imu0")
+    rows = encode_imu(STAMPS, columns(3), columns(3), "imu0")
     rows[:, 1] = 3
     with pytest.raises(LogError, match="00 03"):
-        schema.decode_imu(rows)
+        decode_imu(rows)
 
 
 @pytest.mark.parametrize("stamp_ns", [-(2**31) * 10**9 - 1, 2**31 * 10**9])
 def test_stamps_beyond_32_bit_seconds_are_refused(stamp_ns: int) -> None:
     with pytest.raises(DataError, match="32 bits"):
-        schema.encode_vector3(np.array([stamp_ns]), np.zeros((1, 3)), "b")
+        encode_vector3(np.array([stamp_ns]), np.zeros((1, 3)), "b")
 
 
 def test_no_messages_encode_to_no_rows() -> None:
-    rows = schema.encode_imu(np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 3)), "imu0")
+    rows = encode_imu(np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 3)), "imu0")
     assert rows.shape == (0, 4 + 24 + 37 * 8)
     assert list(schema.runs(rows, schema.IMU)) == []

@@ -15,8 +15,10 @@ import pytest
 
 from imutool.errors import ConfigError
 from imutool.mcap_io import schema
-from imutool.mcap_io.read import ImuBatch
-from imutool.mcap_io.rewrite import Made, NewTopic, rewrite
+from imutool.mcap_io.batches import ImuBatch
+from imutool.mcap_io.derived import Made, NewTopic
+from imutool.mcap_io.encode import encode_imu
+from imutool.mcap_io.rewrite import rewrite
 from imutool.mcap_io.target import Target
 from imutool.mcap_io.write import write
 from imutool.recording import Frames, Recording
@@ -35,7 +37,7 @@ class Failing:
         self.seen += 1
         if self.seen == 2:
             raise self.error
-        return Made(batch, [schema.encode_imu(batch.stamp_ns, batch.gyro, batch.accel, batch.frame_id)])
+        return Made(batch, [encode_imu(batch.stamp_ns, batch.gyro, batch.accel, batch.frame_id)])
 
 
 @pytest.fixture

@@ -26,13 +26,16 @@ from mcap.writer import CompressionType, IndexType, Writer
 
 from imutool.errors import ConfigError, DataError, LogError
 from imutool.mcap_io import schema, target
+from imutool.mcap_io.batches import ImuBatch
+from imutool.mcap_io.derived import Made, NewTopic
 from imutool.mcap_io.digest import Digest, sha256
-from imutool.mcap_io.log import ImuBatch, Log
+from imutool.mcap_io.encode import encode_imu
+from imutool.mcap_io.log import Log
 from imutool.mcap_io.log_writer import Chunk, LogWriter
 from imutool.mcap_io.records import message_rows
-from imutool.mcap_io.rewrite import Made, NewTopic, Verified, rewrite
+from imutool.mcap_io.rewrite import rewrite
 from imutool.mcap_io.source import Source
-from imutool.mcap_io.verify import verify
+from imutool.mcap_io.verify import Verified, verify
 from imutool.mcap_io.write import write
 from imutool.recording import Recording
 
@@ -49,7 +52,7 @@ class Half:
         self.topics = [NewTopic(f"{source_topic}/half", schema.IMU)]
 
     def __call__(self, batch: ImuBatch) -> Made:
-        return Made(batch, [schema.encode_imu(batch.stamp_ns, 0.5 * batch.gyro, batch.accel, batch.frame_id)])
+        return Made(batch, [encode_imu(batch.stamp_ns, 0.5 * batch.gyro, batch.accel, batch.frame_id)])
 
 
 def data_records(path: Path) -> list[tuple[int, bytes]]:
@@ -109,7 +112,7 @@ def write_mix(path: Path, mix: list[tuple[str, int, int]], layout: dict[str, Any
         for number, (topic, log_time, size) in enumerate(mix):
             stamps = np.array([1_000_000 * (number + 1)])
             frame = "x" * (size % 7)  # payloads of several lengths, and not all of one layout
-            payload = schema.encode_imu(stamps, rng.normal(size=(1, 3)), np.ones((1, 3)), frame)[0].tobytes()
+            payload = encode_imu(stamps, rng.normal(size=(1, 3)), np.ones((1, 3)), frame)[0].tobytes()
             rows.append((topic, log_time, log_time + 1, number, payload if "imu" in topic else rng.bytes(size)))
             writer.add_message(ids[topic], *(rows[-1][k] for k in (1, 4, 2, 3)))
             if number == 5:
@@ -373,7 +376,7 @@ def test_a_log_whose_ids_are_used_up_is_refused(tmp_path: Path) -> None:
         channel = out.channel("/imu0", schema.IMU)
         out.contents.channels[65535] = out.contents.channels.pop(channel)
         out.contents.channels[65535].id = 65535
-        payload = schema.encode_imu(np.array([1]), np.zeros((1, 3)), np.zeros((1, 3)), "x")
+        payload = encode_imu(np.array([1]), np.zeros((1, 3)), np.zeros((1, 3)), "x")
         rows = message_rows(65535, np.array([1]), np.array([1]), np.zeros(1, np.uint32), payload)
         out.chunk(Chunk(rows.tobytes(), np.array([65535], np.uint16), np.array([1]), np.array([0])))
     with pytest.raises(DataError, match="a channel has the id 65535"):

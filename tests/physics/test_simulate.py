@@ -16,6 +16,7 @@ from scipy.spatial.transform import Rotation
 from imutool import noise as noises
 from imutool.errors import ConfigError, DataError, LogError
 from imutool.mcap_io import schema
+from imutool.mcap_io.encode import encode_pose
 from imutool.mcap_io.log_writer import LogWriter
 from imutool.mcap_io.read import read
 from imutool.mcap_io.write import write
@@ -272,11 +273,11 @@ def test_poses_alone_are_enough(tmp_path: Path) -> None:
     truth = circling()
     with LogWriter(tmp_path / "poses.mcap") as log:
         channel = log.channel("/mocap/pose", schema.POSE)
-        payload = schema.encode_pose(truth.t_ns, truth.p_wb, truth.q_wb_wxyz, frame_id="world")
+        payload = encode_pose(truth.t_ns, truth.p_wb, truth.q_wb_wxyz, frame_id="world")
         from imutool.mcap_io.write import Series, chunks
 
         series = Series(
-            channel, truth.t_ns, (truth.t_ns, truth.p_wb, truth.q_wb_wxyz), lambda *c: schema.encode_pose(*c, frame_id="w")
+            channel, truth.t_ns, (truth.t_ns, truth.p_wb, truth.q_wb_wxyz), lambda *c: encode_pose(*c, frame_id="w")
         )
         assert len(payload) == len(truth)
         for chunk in chunks([series]):

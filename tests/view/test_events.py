@@ -7,7 +7,7 @@ import pytest
 from defects import batch_of, late, repeated, with_values, without
 
 from imutool.clean.first_pass import examine
-from imutool.mcap_io.log import ImuBatch
+from imutool.mcap_io.batches import ImuBatch
 from imutool.physics.flight import flight
 from imutool.recording import Imu, Recording
 from imutool.view.deviation import Errors

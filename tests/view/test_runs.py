@@ -16,8 +16,12 @@ from imutool.debias import apply, apply_with_std, debias
 from imutool.errors import ConfigError, DataError, LogError
 from imutool.evaluate import started
 from imutool.mcap_io import schema
-from imutool.mcap_io.log import DERIVED_KEY, ImuBatch, Log
+from imutool.mcap_io.batches import ImuBatch
+from imutool.mcap_io.decode import TwistColumns, decode_twist
+from imutool.mcap_io.encode import encode_imu
+from imutool.mcap_io.log import Log
 from imutool.mcap_io.read import read
+from imutool.mcap_io.topics import DERIVED_KEY
 from imutool.mcap_io.write import write
 from imutool.physics.flight import flight
 from imutool.recording import Imu, Recording
@@ -115,7 +119,7 @@ def write_both(raw: ImuBatch, derived: ImuBatch, path: Path) -> None:
         kind = writer.register_schema(schema.IMU, "ros2msg", schema.definition(schema.IMU).encode())
         for topic, batch, about in (("/imu0", raw, {}), ("/imu0/debiased", derived, {DERIVED_KEY: "/imu0"})):
             channel = writer.register_channel(topic, "cdr", kind, about)
-            payload = schema.encode_imu(batch.stamp_ns, batch.gyro, batch.accel, batch.frame_id)
+            payload = encode_imu(batch.stamp_ns, batch.gyro, batch.accel, batch.frame_id)
             for stamp_ns, data in zip(batch.stamp_ns, payload, strict=True):
                 writer.add_message(channel, int(stamp_ns), data.tobytes(), int(stamp_ns))
         writer.finish()
@@ -123,13 +127,12 @@ def write_both(raw: ImuBatch, derived: ImuBatch, path: Path) -> None:
 
 def test_a_bias_in_the_log_that_is_no_number_is_found_by_subtraction(debiased: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     sound = load(debiased).traces[1].run
-    decode = schema.decode_twist
 
-    def spoiled(*words: object) -> schema.TwistColumns:
-        columns = decode(*words)  # type: ignore[arg-type]
+    def spoiled(*words: object) -> TwistColumns:
+        columns = decode_twist(*words)  # type: ignore[arg-type]
         return columns._replace(variance=np.full_like(columns.variance, np.nan))
 
-    monkeypatch.setattr(schema, "decode_twist", spoiled)
+    monkeypatch.setattr("imutool.mcap_io.log.decode_twist", spoiled)
     run = load(debiased).traces[1].run
     assert run.bias_std is None
     np.testing.assert_allclose(run.gyro_bias, sound.gyro_bias, atol=LAST_BITS)

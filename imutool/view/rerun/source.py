@@ -13,7 +13,8 @@ import numpy as np
 
 from imutool.errors import LogError
 from imutool.mcap_io import schema
-from imutool.mcap_io.log import DERIVED_KEY, Log, Topic
+from imutool.mcap_io.log import Log
+from imutool.mcap_io.topics import DERIVED_KEY, Topic
 from imutool.recording import Times
 from imutool.view.rerun import clock
 from imutool.view.rerun.entities import Scope, path
