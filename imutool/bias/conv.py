@@ -160,7 +160,6 @@ class Model(BiasModel):
             "gyro_rate": 1e-2,
             "accel_rate": 1e-2,
             "weight_decay": 0.1,
-            "validate_every": 50,
         }
     )
     undecayed: ClassVar[tuple[str, ...]] = ("W",)

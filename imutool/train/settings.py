@@ -38,7 +38,7 @@ class TrainSettings(Settings, frozen=True):
     accel_rate: Positive = 3e-3
     weight_decay: Annotated[float, msgspec.Meta(ge=0)] = 1e-4
     track_knot_s: Positive = 20.0
-    validate_every: Count = 30
+    validate_every: Count = 100  # steps between two lines of progress, each with a checkpoint
     increments: IncrementSettings = IncrementSettings()
     model: dict[str, Any] = msgspec.field(default_factory=dict)
 
