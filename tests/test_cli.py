@@ -159,7 +159,7 @@ def test_results_go_to_stdout_and_the_rest_to_stderr_as_much_as_is_asked_for(tmp
     loud, quiet = (imutool(*words, option, cwd=tmp_path) for option in ("-v", "-q"))
     assert loud.stdout == quiet.stdout == "m.safetensors\n"
     assert quiet.stderr == ""
-    assert re.search(r"^info: Training gyro 0/0: held out [\d.]+° \(best [\d.]+\)", loud.stderr, re.MULTILINE)
+    assert re.search(r"^info: Training gyro 0/0: held out [\d.]+° \(closed form [\d.]+\)", loud.stderr, re.MULTILINE)
 
 
 def test_warnings_of_a_log_are_results(tmp_path: Path, imutool: Run) -> None:
@@ -233,10 +233,10 @@ def test_nothing_is_folded_where_nobody_looks_at_a_terminal(
 
 
 def test_progress_tells_loss_held_out_error_and_time_left() -> None:
-    epoch = Epoch("gyro", step=40, steps=120, loss=0.25, held_out=0.0174533, best=0.00872665, left_s=83.2)
-    assert epoch_line(epoch) == (40, 120, "gyro 40/120: loss 0.250, held out 1.000° (best 0.500), 1:23 left")
+    epoch = Epoch("gyro", step=40, steps=120, loss=0.25, held_out=0.0174533, before=0.00872665, left_s=83.2)
+    assert epoch_line(epoch) == (40, 120, "gyro 40/120: loss 0.250, held out 1.000° (closed form 0.500), 1:23 left")
     done, total, text = epoch_line(Epoch("accel", 0, 0, float("nan"), 0.5, 0.5, 0.0))
-    assert (done, total, text) == (0, 1, "accel 0/0: held out 0.500 m/s (best 0.500)")
+    assert (done, total, text) == (0, 1, "accel 0/0: held out 0.500 m/s (closed form 0.500)")
 
 
 def test_threads_that_wait_do_not_spin(code: Code, monkeypatch: pytest.MonkeyPatch) -> None:
