@@ -75,7 +75,7 @@ class Stage:
 
 
 class Training:
-    """Trains one model on the recordings of one sensor; once `epochs` has ended, `model` is the best that was seen.
+    """Trains one model on the recordings of one sensor; once `epochs` has ended, `model` is what is kept.
 
     Raises:
         DataError: recordings without truth, of different rates, too short, or standing still.
