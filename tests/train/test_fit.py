@@ -1,4 +1,4 @@
-"""A training gives the same bits every time, goes on where it was left, keeps its end if that is better, and helps on an unseen flight."""
+"""A training gives the same bits every time, goes on where it was left, keeps the better end, and helps on an unseen flight."""
 
 from __future__ import annotations
 
