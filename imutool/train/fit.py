@@ -4,8 +4,7 @@ What a step descends on is the objective's to say (`imutool.train.objective`), a
 weights each log has a track of its own rest bias, free but slow, so that what belongs to a run cannot be mistaken for what
 belongs to the sensor. What is kept is the end of the descent, as a running mean over its last steps, which one step's draw of
 windows cannot throw off; or the closed form it started from, if that drifts less over the longest windows of the held-out
-part. A choice among many steps would be made by the noise of that part: on FETCH's training logs left out in turn the end
-scatters by a tenth from seed to seed, the best of ten steps by half.
+part. A choice among many steps would be made by the noise of that part, which may be seconds long.
 """
 
 from __future__ import annotations
