@@ -12,10 +12,11 @@ from pathlib import PurePosixPath
 
 import numpy as np
 
-from converters import Sequence, _table
-from converters._source import Tree
 from imutool.errors import DataError
 from imutool.recording import Frames, Imu, Poses, Recording, Scalars, unit_quaternions
+
+from . import Sequence, _table
+from ._source import Tree
 
 IMU = "imu0"
 IMU_TOPIC = "/imu0"

@@ -16,11 +16,12 @@ from typing import Any
 
 import numpy as np
 
-from converters import Sequence, _asl
-from converters._table import Table
-from imutool.bag.walk import Bag
+from imutool.bag.scan import Bag
 from imutool.errors import ConfigError, DataError, LogError
 from imutool.recording import Frames, Imu, Poses, Recording, Scalars
+
+from . import Sequence, _asl
+from ._table import Table
 
 logger = logging.getLogger(__name__)
 

@@ -11,8 +11,10 @@ import zipfile
 from collections.abc import Collection, Iterator, Mapping
 from pathlib import Path, PurePosixPath
 
-from converters import Sequence
-from converters._archive import (
+from imutool.errors import DataError
+
+from . import Sequence
+from ._archive import (
     HEAD,
     ROOT,
     SUFFIXES,
@@ -26,7 +28,6 @@ from converters._archive import (
     read_bounded,
     refusing,
 )
-from imutool.errors import DataError
 
 BAG = ".bag"
 DEPTH = 4  # folders below the source that are searched

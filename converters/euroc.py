@@ -9,9 +9,10 @@ from __future__ import annotations
 from collections.abc import Iterator
 from pathlib import Path
 
-from converters import Sequence, _asl, _bag
-from converters._source import Tree, find, is_bag
 from imutool.recording import Recording
+
+from . import Sequence, _asl, _bag
+from ._source import Tree, find, is_bag
 
 DATASET, SENSOR = "euroc", "adis16448"
 TRUTHS = {

@@ -8,9 +8,10 @@ from __future__ import annotations
 from collections.abc import Iterator
 from pathlib import Path
 
-from converters import Sequence, _asl, _bag
-from converters._source import Tree, find, is_bag
 from imutool.recording import Recording
+
+from . import Sequence, _asl, _bag
+from ._source import Tree, find, is_bag
 
 DATASET, SENSOR = "fetch", "fetch"
 TRUTHS = {"mocap0": "/ground_truth/pose"}

@@ -10,9 +10,10 @@ from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
-from converters import Sequence, _asl, _bag
-from converters._source import Tree, find, is_bag
 from imutool.recording import Recording
+
+from . import Sequence, _asl, _bag
+from ._source import Tree, find, is_bag
 
 DATASET, SENSOR = "tum_vi", "bmi160"
 TRUTHS = {"mocap0": "/ground_truth/pose"}

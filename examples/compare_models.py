@@ -8,9 +8,9 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
-from imutool import terminal
-from imutool.view.rerun import files
-from imutool.view.runs import load
+from imutool.cli import terminal
+from imutool.viewing.model.runs import load
+from imutool.viewing.rerun import files
 
 
 def main(log: Path, target: Path, models: list[str]) -> None:

@@ -8,9 +8,9 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
-from imutool.convert import convert
-from imutool.debias import debias
-from imutool.evaluate import evaluate
+from imutool.conversion import convert
+from imutool.debiasing import debias
+from imutool.evaluation import evaluate
 
 
 def main(source: Path, folder: Path, model: str = "static") -> None:

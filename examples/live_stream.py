@@ -13,12 +13,12 @@ from pathlib import Path
 import numpy as np
 
 from imutool.bias import static
-from imutool.debias import Block, OnlineDebiaser
+from imutool.bias_start.initial_bias import at_rest
+from imutool.debiasing import Block, OnlineDebiaser
 from imutool.mcap_io.batches import ImuBatch
-from imutool.physics.flight import flight
 from imutool.recording import Imu, nanoseconds
-from imutool.turn_on import at_rest
-from imutool.view.rerun.live import watching
+from imutool.sensor.flight import flight
+from imutool.viewing.rerun.live import watching
 
 REST_S = 2.0  # how long the sensor is known to stand still after it is switched on
 BATCH = 100  # samples that are shown together: half a second

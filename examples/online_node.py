@@ -13,12 +13,12 @@ from pathlib import Path
 import numpy as np
 
 from imutool.bias import static
-from imutool.bias._file import find_model
-from imutool.debias import OnlineDebiaser
+from imutool.bias.io import find_model
+from imutool.bias_start.initial_bias import at_rest
+from imutool.debiasing import OnlineDebiaser
 from imutool.mcap_io.log import Log
 from imutool.mcap_io.read import read
 from imutool.recording import nanoseconds
-from imutool.turn_on import at_rest
 
 REST_S = 2.0  # how long the sensor is known to stand still after it is switched on
 

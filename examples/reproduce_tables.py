@@ -27,12 +27,12 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from imutool.convert import convert
-from imutool.debias import apply
-from imutool.evaluate import evaluate
+from imutool.conversion import convert
+from imutool.debiasing import apply
+from imutool.evaluation import evaluate
+from imutool.inertial.metrics import orientation_errors
+from imutool.inertial.strapdown import along_truth
 from imutool.mcap_io.read import read
-from imutool.metrics import orientation_errors
-from imutool.strapdown import along_truth
 
 TRAIN = {
     "euroc": ("MH_01_easy", "MH_03_medium", "MH_05_difficult", "V1_02_medium", "V2_01_easy", "V2_03_difficult"),
@@ -126,8 +126,8 @@ def figures(job: Job) -> list[dict[str, Any]]:
     model, logs = job.folder / f"{job.name}.safetensors", job.folder / job.data_set
     began = time.process_time()
     if not model.exists():
-        from imutool.train.run import train
-        from imutool.train.settings import settings_of
+        from imutool.training.run import train
+        from imutool.training.settings import settings_of
 
         settings = msgspec.structs.replace(settings_of(job.method)(), seed=job.seed)
         train([logs / f"{name}.mcap" for name in learn], model, method=job.method, settings=settings)
@@ -185,8 +185,8 @@ def plots(jobs: list[Job]) -> list[tuple[str, str]]:
     mpl.use("Agg")
     from matplotlib import pyplot as plt
 
-    from imutool.bias._file import load
-    from imutool.turn_on import find
+    from imutool.bias.io import load
+    from imutool.bias_start.initial_bias import find
 
     drawn = []
     for data_set in dict.fromkeys(job.data_set for job in jobs):

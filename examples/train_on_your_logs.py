@@ -10,9 +10,9 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from imutool.config import load
-from imutool.info import inspect
-from imutool.train.fit import Epoch, TrainSettings
-from imutool.train.run import train
+from imutool.log_info import inspect
+from imutool.training.fit import Epoch, TrainSettings
+from imutool.training.run import train
 
 
 def show(epoch: Epoch) -> None:

@@ -8,9 +8,9 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
-from imutool.view import report
-from imutool.view.rerun import viewer
-from imutool.view.runs import load
+from imutool.viewing.html import report
+from imutool.viewing.model.runs import load
+from imutool.viewing.rerun import viewer
 
 
 def main(log: Path, model: str = "static") -> None:

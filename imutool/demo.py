@@ -11,17 +11,17 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from imutool.convert import convert
-from imutool.debias import debias
+from imutool.conversion import convert
+from imutool.debiasing import debias
 from imutool.errors import ConfigError
-from imutool.evaluate import evaluate
-from imutool.physics.flight import ACCEL, GYRO, FlightSettings, flight
+from imutool.evaluation import evaluate
 from imutool.recording import Recording
-from imutool.train.fit import Epoch, TrainSettings
-from imutool.train.run import train
-from imutool.view import report
-from imutool.view.rerun import files
-from imutool.view.runs import load
+from imutool.sensor.flight import ACCEL, GYRO, FlightSettings, flight
+from imutool.training.fit import Epoch, TrainSettings
+from imutool.training.run import train
+from imutool.viewing.html import report
+from imutool.viewing.model.runs import load
+from imutool.viewing.rerun import files
 
 TRAINING_SEEDS = (1, 2, 3, 4)  # four flights of one sensor, each with a turn-on bias of its own
 TEST_SEED = 5

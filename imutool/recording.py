@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float64, Int64
 
-from imutool import quaternion
 from imutool.errors import DataError
+from imutool.geometry import quaternion
 
 GRAVITY_M_S2 = 9.81
 UNIT_QUATERNION_TOLERANCE = 1e-6  # six printed decimals, as in the EuRoC truth after normalising

@@ -14,11 +14,12 @@ from types import ModuleType
 from imutool.errors import ConfigError
 
 GROUPS = {
-    "imutool.converters": "converters",
+    "imutool.converters": "imutool.converters",
     "imutool.bias": "imutool.bias",
-    "imutool.effects": "imutool.physics.effects",
-    "imutool.clean": "imutool.clean.rules",
+    "imutool.effects": "imutool.sensor.effects",
+    "imutool.clean": "imutool.cleaning.rules",
 }
+NOT_PLUGINS = {"imutool.bias": frozenset({"io", "model", "neural_stream", "ode", "physics_model"})}
 
 
 def names(group: str) -> list[str]:
@@ -30,7 +31,8 @@ def _own(group: str) -> set[str]:
     """The keys that are files of this package."""
     spec = importlib.util.find_spec(GROUPS[group])
     places = list(spec.submodule_search_locations or ()) if spec else []
-    return {module.name for module in pkgutil.iter_modules(places) if not module.name.startswith("_")}
+    found = {module.name for module in pkgutil.iter_modules(places) if not module.name.startswith("_")}
+    return found - NOT_PLUGINS.get(group, frozenset())
 
 
 def load(group: str, name: str) -> ModuleType:

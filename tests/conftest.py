@@ -27,7 +27,7 @@ if not os.environ.get("CI"):  # there hypothesis has a profile of its own, which
     settings.register_profile("side by side", deadline=None)  # a wall clock says little where tests share the cores
     settings.load_profile("side by side")
 
-install_import_hook(["imutool", "converters"], "beartype.beartype").__enter__()
+install_import_hook(["imutool"], "beartype.beartype").__enter__()
 
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 
@@ -72,8 +72,8 @@ def imutool(command: str) -> Callable[..., subprocess.CompletedProcess[str]]:
 def logs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with flight_1.mcap and flight_2.mcap (20 s, 200 Hz, 3 s at rest), linear.safetensors of the first."""
     from imutool.mcap_io.write import write
-    from imutool.physics.flight import flight
-    from imutool.train.run import train
+    from imutool.sensor.flight import flight
+    from imutool.training.run import train
 
     folder = tmp_path_factory.mktemp("logs")
     for seed in (1, 2):

@@ -20,14 +20,14 @@ import numpy as np
 import pytest
 from mcap_ros2.writer import Writer
 
-from imutool.bias import _file
+from imutool.bias import io
 from imutool.demo import write_asl
 from imutool.errors import ConfigError
-from imutool.mcap_io import schema
+from imutool.mcap_io.codec import schemas
 from imutool.mcap_io.log import Log
-from imutool.mcap_io.target import Target
+from imutool.mcap_io.storage.target import Target
 from imutool.mcap_io.write import write
-from imutool.physics.flight import flight
+from imutool.sensor.flight import flight
 
 Run = Callable[..., subprocess.CompletedProcess[str]]
 Refuse = Callable[..., str]
@@ -182,7 +182,7 @@ def test_a_log_without_imu_is_described_with_a_warning(tmp_path: Path, imutool: 
 def imu_log(path: Path, stamps_ns: Sequence[int], odd: Mapping[int, float] | None = None) -> None:
     """A log by a foreign writer, at rest; `odd` puts a value in place of the x rate of some messages."""
     with path.open("wb") as file, Writer(file) as writer:
-        definition = writer.register_msgdef("sensor_msgs/msg/Imu", schema.definition(schema.IMU))
+        definition = writer.register_msgdef("sensor_msgs/msg/Imu", schemas.definition(schemas.IMU))
         for row, stamp in enumerate(stamps_ns):
             rate = {"x": (odd or {}).get(row, 0.01), "y": 0.02, "z": 0.03}
             header = {"stamp": {"sec": stamp // 10**9, "nanosec": stamp % 10**9}, "frame_id": "imu"}
@@ -285,8 +285,8 @@ def test_a_model_for_another_rate_is_refused(here: Path, refuse: Refuse) -> None
 
 
 def test_a_model_of_another_version_is_refused(here: Path, refuse: Refuse) -> None:
-    tensors, header = _file.read_tensors(here / "linear.safetensors", _file.FORMAT)
-    _file.write_tensors(tensors, header | {"format": "imutool.model/99"}, here / "future.safetensors", overwrite=False)
+    tensors, header = io.read_tensors(here / "linear.safetensors", io.FORMAT)
+    io.write_tensors(tensors, header | {"format": "imutool.model/99"}, here / "future.safetensors", overwrite=False)
     message = refuse(MODEL, "debias", "flight_2.mcap", "out.mcap", "--model", "future.safetensors")
     assert "imutool.model/99" in message
 

@@ -15,11 +15,11 @@ from hypothesis import strategies as st
 from imutool import registry
 from imutool.config import MOST_BYTES, Settings, build, load, plain
 from imutool.errors import ConfigError
-from imutool.noise import read as read_noise
-from imutool.physics.flight import FlightSettings
-from imutool.physics.physics_file import read as read_physics
-from imutool.stationary import StationarySettings
-from imutool.train.fit import TrainSettings
+from imutool.inertial.stationary import StationarySettings
+from imutool.noise.datasheet import read as read_noise
+from imutool.sensor.flight import FlightSettings
+from imutool.sensor.physics_file import read as read_physics
+from imutool.training.fit import TrainSettings
 
 
 class Inner(Settings, frozen=True):

@@ -10,10 +10,10 @@ import pytest
 
 from imutool import demo
 from imutool.errors import ConfigError
-from imutool.evaluate import evaluate
+from imutool.evaluation import evaluate
 from imutool.mcap_io.log import Log
 from imutool.mcap_io.write import write
-from imutool.physics.flight import flight
+from imutool.sensor.flight import flight
 
 FLIGHT_SAMPLES = 12_001  # 60 s at 200 Hz, both ends included
 SMALLEST_PICTURE = 20_000  # bytes; an empty figure of this size has under 10 kB
@@ -89,7 +89,7 @@ def test_an_earlier_demo_stays_without_overwrite(made: tuple[Path, dict[str, Any
 
 
 def test_raw_files_of_a_flight_convert_back_to_the_same_bits(tmp_path: Path) -> None:
-    from converters import euroc
+    from imutool.converters import euroc
 
     recording = flight(7, duration_s=1.0)
     demo.write_asl(recording, tmp_path / "flight_7")

@@ -13,9 +13,9 @@ from pathlib import Path
 
 import pytest
 
-from imutool.debias import debias
+from imutool.debiasing import debias
 from imutool.demo import write_asl
-from imutool.physics.flight import flight
+from imutool.sensor.flight import flight
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
 SAMPLES = 4001  # 20 s at 200 Hz, both ends included

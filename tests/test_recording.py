@@ -17,16 +17,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from imutool.errors import DataError
-from imutool.recording import (
-    Frames,
-    Imu,
-    Poses,
-    Recording,
-    Scalars,
-    nanoseconds,
-    seconds,
-    unit_quaternions,
-)
+from imutool.recording import Frames, Imu, Poses, Recording, Scalars, nanoseconds, seconds, unit_quaternions
 
 EPOCH_NS = 1_403_638_128_245_096_960  # in EuRoC's MH_04
 SECONDS = 2.0**-52  # relative: one rounding of the difference, one of the product

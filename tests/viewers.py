@@ -188,7 +188,7 @@ def native(window: tuple[int, int] = WINDOW, memory: str = "2GiB") -> Iterator[N
     Raises:
         DiedError: it did not start.
     """
-    from imutool.view.rerun.viewer import binary
+    from imutool.viewing.rerun.viewer import binary
 
     found = driver() or absent("driver")
     port = free_port()

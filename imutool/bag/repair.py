@@ -10,11 +10,11 @@ from typing import Any, NamedTuple
 
 from imutool.bag import records
 from imutool.bag.records import FIRST_RECORD, MAGIC, U32, Op
-from imutool.bag.walk import Bag, Chunk, Loss
+from imutool.bag.scan import Bag, Chunk, Loss
 from imutool.errors import ConfigError, LogError
-from imutool.mcap_io.source import Source
-from imutool.mcap_io.target import Target
-from imutool.place import Place, same
+from imutool.location import Place, same
+from imutool.mcap_io.storage.source import Source
+from imutool.mcap_io.storage.target import Target
 
 Progress = Callable[[int, int], None]
 NO_ATTACHMENTS = "a bag has no attachments"  # to keep damaged bytes in

@@ -30,7 +30,7 @@ from jaxtyping import Float, Float64
 from torch import Tensor, nn
 from torch.nn import functional
 
-from imutool.bias._base import COLUMNS, SENSORS, BiasModel, Segment, Sensor, Stream, Vector6
+from imutool.bias.model import COLUMNS, SENSORS, BiasModel, Segment, Sensor, Stream, Vector6
 from imutool.config import Settings
 from imutool.errors import ConfigError
 

@@ -1,6 +1,6 @@
 """Known physics first, a neural ODE for the rest: bias = rest + sum of effects + what the ODE finds in what they leave.
 
-The effects are those of `imutool.physics.effects` that the training logs support (`imutool.train.calibration`): each linear in
+The effects are those of `imutool.sensor.effects` that the training logs support (`imutool.training.calibration`): each linear in
 its parameters, fitted together in closed form, chosen by how well logs predict one another, with the covariance of the
 answer. The neural ODE (`imutool.bias.neural_ode`) is shown samples that the effects have been taken off, and is left out
 where it does not help on the held-out part: then debiasing is a few products a sample.
@@ -19,12 +19,12 @@ from jaxtyping import Float, Float64
 from torch import Tensor
 
 from imutool.bias import neural_ode
-from imutool.bias._base import COLUMNS, SENSORS, BiasModel, OneByOne, Segment, Sensor, Stream, Unsure, Vector6
+from imutool.bias.model import COLUMNS, SENSORS, BiasModel, OneByOne, Segment, Sensor, Stream, Unsure, Vector6
 from imutool.config import Settings
 from imutool.errors import ConfigError
-from imutool.physics.effects._base import Effect, Together, compiled, patterns
-from imutool.physics.effects._catalogue import named as effects_named
-from imutool.physics.signals import POWER_S, SignalFilter, Signals
+from imutool.sensor.catalogue import named as effects_named
+from imutool.sensor.linear_effect import Effect, Together, compiled, patterns
+from imutool.sensor.signals import POWER_S, SignalFilter, Signals
 
 FORGOTTEN = 10.0  # time constants after which a filter's start no longer shows
 
@@ -80,12 +80,12 @@ class Model(BiasModel):
         """Nothing that could be taken over as it is: effects are fitted and chosen all together.
 
         Raises:
-            ConfigError: always; `imutool.train.run.train` knows how a hybrid is trained.
+            ConfigError: always; `imutool.training.run.train` knows how a hybrid is trained.
         """
         raise ConfigError(
             "hybrid does not start from a matrix",
             where="training hybrid",
-            fix="Train it with imutool.train.run.train, or its parts with imutool.train.physics_first",
+            fix="Train it with imutool.training.run.train, or its parts with imutool.training.physics_first",
         )
 
     def error(self, sensor: Sensor, signals: Signals) -> Float64[np.ndarray, "n 3"]:

@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float, Float64
 from torch import Tensor, nn
 
-from imutool.bias._base import SENSORS, BiasModel, Segment, Sensor, Stream, Vector6
+from imutool.bias.model import SENSORS, BiasModel, Segment, Sensor, Stream, Vector6
 from imutool.config import Settings
 
 

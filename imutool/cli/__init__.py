@@ -27,7 +27,7 @@ from imutool.cli import (
     view,
     vio,
 )
-from imutool.cli._app import app, caught
+from imutool.cli.app import app, caught
 
 COMMANDS = (
     convert,

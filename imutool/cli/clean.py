@@ -8,13 +8,13 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from imutool.cli._app import LOST, Init, Json, Overwrite, Quiet, Smooth, Verbose, app, listing
+from imutool.cli.app import LOST, Init, Json, Overwrite, Quiet, Smooth, Verbose, app, listing
+from imutool.cli.terminal import out, plain, progress, say, table, tell_losses, write_json
 from imutool.errors import ConfigError, LogError
-from imutool.place import place
-from imutool.terminal import out, plain, progress, say, table, tell_losses, write_json
+from imutool.location import place
 
 if TYPE_CHECKING:
-    from imutool.clean import Rules, Survey
+    from imutool.cleaning import Rules, Survey
     from imutool.mcap_io.losses import Losses
 
 COLORS = {"good": "green", "usable": "yellow", "quarantine": "red"}
@@ -39,8 +39,8 @@ def clean(
     quiet: Quiet = False,
 ) -> None:
     """Say what is wrong inside a log's IMU and whether to trust it; with OUT, write the log with a clean IMU beside the raw."""
-    from imutool.clean.settings import chosen
-    from imutool.mcap_io.target import Target
+    from imutool.cleaning.settings import chosen
+    from imutool.mcap_io.storage.target import Target
 
     rules = chosen(rule or (), no_rule or (), force)
     given = {"--model": model, "--smooth": smooth, "--force": force, "--overwrite": overwrite and report_to is None}
@@ -53,7 +53,7 @@ def clean(
         with progress("Looking through", verbose, quiet) as tell:
             surveys, losses = _looked(source, imu or (), rules, tell)
     else:
-        from imutool.debias import debias
+        from imutool.debiasing import debias
 
         with progress("Cleaning", verbose, quiet) as tell:
             report = debias(
@@ -69,9 +69,9 @@ def clean(
             )
         surveys, added, losses = list(report.surveys.values()), dict(report.rewrite.added), report.losses
     if report_to is not None:
-        from imutool.view import clean_page
+        from imutool.viewing.html import cleaning_page
 
-        clean_page.write(surveys, report_to, overwrite=overwrite)
+        cleaning_page.write(surveys, report_to, overwrite=overwrite)
     _tell(source, surveys, losses, target, added, json_to)
 
 
@@ -79,7 +79,7 @@ def _tell(
     source: str, surveys: Sequence[Survey], losses: Losses, target: str | None, added: Mapping[str, int], json_to: str | None
 ) -> None:
     """Says what was found and what was written, as JSON or for a person; something lost is an exit code."""
-    from imutool.clean.first_pass import SCHEMA
+    from imutool.cleaning.first_pass import SCHEMA
 
     result: dict[str, Any] = {"schema": SCHEMA, "log": source, "imus": [one.plain() for one in surveys]}
     result["losses"] = losses.plain()
@@ -99,7 +99,7 @@ def _looked(
     source: str, imus: Sequence[str], rules: Rules, tell: Callable[[int, int, str], None]
 ) -> tuple[list[Survey], Losses]:
     """What is found in each IMU of a log, and what of a damaged log is lost."""
-    from imutool.clean import look
+    from imutool.cleaning import look
     from imutool.mcap_io.log import Log
 
     with Log(place(source), salvage=True) as log:

@@ -7,9 +7,9 @@ from typing import Annotated, Any
 
 import typer
 
-from imutool.cli._app import Json, Quiet, Verbose, app
+from imutool.cli.app import Json, Quiet, Verbose, app
+from imutool.cli.terminal import log_to_stderr, say, write_json
 from imutool.errors import ConfigError
-from imutool.terminal import log_to_stderr, say, write_json
 
 
 @app.command(epilog="Example: [bold]imutool conceal MH_03.mcap case/ --seed 7[/], then [bold]imutool conceal --open case/[/]")
@@ -37,7 +37,7 @@ def conceal(
         return
     if findings is not None or json_to is not None:
         raise ConfigError("--findings and --json say nothing without --open", where="conceal", fix="Add --open")
-    from imutool.physics.sealed import conceal as run
+    from imutool.blind_cases.cases import conceal as run
 
     run(places[0], places[1], seed=seed, kind=kind, size=size, noise=noise, longest_s=longest, truth=truth)
     say(f"{places[1]}: sim.mcap, real.mcap, envelope.json and its key")
@@ -46,7 +46,7 @@ def conceal(
 
 
 def _open(folder: Path, findings: Path | None, json_to: str | None) -> None:
-    from imutool.physics.sealed import opened
+    from imutool.blind_cases.cases import opened
 
     result = opened(folder, findings)
     if write_json(result, json_to):

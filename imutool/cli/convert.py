@@ -8,9 +8,9 @@ from typing import Annotated
 
 import typer
 
-from imutool.cli._app import Json, Overwrite, Quiet, Verbose, app, listing
+from imutool.cli.app import Json, Overwrite, Quiet, Verbose, app, listing
+from imutool.cli.terminal import progress, say, tell_error, write_json
 from imutool.errors import DataError
-from imutool.terminal import progress, say, tell_error, write_json
 
 
 class Compression(StrEnum):
@@ -38,7 +38,7 @@ def convert(
     quiet: Quiet = False,
 ) -> None:
     """Convert a data set to MCAP logs, one a sequence."""
-    from imutool.convert import convert as run
+    from imutool.conversion import convert as run
 
     with progress("Converting", verbose, quiet) as tell:
         report = run(

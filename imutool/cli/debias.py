@@ -9,15 +9,15 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from imutool.cli._app import LOST, Init, Json, Overwrite, Quiet, Smooth, Verbose, app
+from imutool.cli.app import LOST, Init, Json, Overwrite, Quiet, Smooth, Verbose, app
+from imutool.cli.terminal import progress, say, tell_losses, write_json
 from imutool.errors import ConfigError
-from imutool.place import Place, place
-from imutool.terminal import progress, say, tell_losses, write_json
+from imutool.location import Place, place
 
 if TYPE_CHECKING:
-    from imutool.debias import DebiasReport
-    from imutool.view.rerun.live import Live
-    from imutool.view.shown import Shown
+    from imutool.debiasing import DebiasReport
+    from imutool.viewing.model.output import Shown
+    from imutool.viewing.rerun.live import Live
 
 MODEL_HELP = (
     "Model file, physics.toml or a name that ships; else a static estimate. TOPIC=MODEL is for one IMU of several. Repeatable."
@@ -55,11 +55,11 @@ def debias(
     _refuse_contradictions(target, in_place, overwrite)
     models = assigned(model or ())
     if report_to is not None:
-        from imutool.view import report as pages
+        from imutool.viewing.html import report as pages
 
         pages.refuse(report_to, overwrite=overwrite)
-    from imutool.clean import Rules
-    from imutool.debias import debias as run
+    from imutool.cleaning import Rules
+    from imutool.debiasing import debias as run
 
     live = _watching(source, target, view, connect, save_view, overwrite)
     with progress("Debiasing", verbose, quiet) as tell, live as watch:
@@ -142,7 +142,7 @@ def _watching(
     """Whoever is to watch; without that nothing of the viewer is imported."""
     if not view and connect is None and save is None:
         return nullcontext()
-    from imutool.view.rerun.live import watching
+    from imutool.viewing.rerun.live import watching
 
     out = Path(target or source)
     return watching(out.stem, connect_to=connect, save=save, instead=Path(f"{out.stem}.rrd"), overwrite=overwrite)
@@ -150,8 +150,8 @@ def _watching(
 
 def _draw(log: Place, topics: Sequence[str], page: Path, overwrite: bool) -> None:
     """A page about the debiased log, each of its IMUs under its own topic where there are several."""
-    from imutool.view.report import by_topic, write_page
-    from imutool.view.runs import load
+    from imutool.viewing.html.report import by_topic, write_page
+    from imutool.viewing.model.runs import load
 
     write_page(by_topic([load(log, imu=topic) for topic in topics], topics), page, overwrite=overwrite)
 

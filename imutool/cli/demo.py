@@ -7,9 +7,9 @@ from typing import Annotated
 
 import typer
 
-from imutool.cli._app import Json, Overwrite, Quiet, Verbose, app
-from imutool.cli._figures import epoch_line, figures
-from imutool.terminal import err, plain, progress, say, write_json
+from imutool.cli.app import Json, Overwrite, Quiet, Verbose, app
+from imutool.cli.figures import epoch_line, figures
+from imutool.cli.terminal import err, plain, progress, say, write_json
 
 
 @app.command(epilog="Example: [bold]imutool demo -o demo-out[/]")

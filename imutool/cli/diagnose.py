@@ -7,11 +7,11 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from imutool.cli._app import Imu, Json, Overwrite, Quiet, Truth, Verbose, app
-from imutool.terminal import logger, progress, say, table, write_json
+from imutool.cli.app import Imu, Json, Overwrite, Quiet, Truth, Verbose, app
+from imutool.cli.terminal import logger, progress, say, table, write_json
 
 if TYPE_CHECKING:
-    from imutool.view.rundata import RunData
+    from imutool.viewing.model.run_data import RunData
 
 
 @app.command(epilog="Example: [bold]imutool diagnose real.mcap --sim sim.mcap -o diagnosis[/]")
@@ -40,24 +40,24 @@ def diagnose(
     quiet: Quiet = False,
 ) -> None:
     """Find where a recording differs from a simulation, name what physics was left out, model it, and show the gain."""
-    from imutool import diagnosis_folder
-    from imutool.physics.conclusion import below, conclusion
-    from imutool.physics.conclusion import table as findings_table
-    from imutool.physics.diagnose import diagnose as run
-    from imutool.view.runs import load
+    from imutool import diagnosis_output
+    from imutool.diagnosis.diagnose import diagnose as run
+    from imutool.diagnosis.wording import below, conclusion
+    from imutool.diagnosis.wording import table as findings_table
+    from imutool.viewing.model.runs import load
 
     def look(findings: Path) -> list[RunData]:
         return [load(real, imu=imu, truth=truth, findings=findings) for real in reals]
 
     if folder is not None:
-        diagnosis_folder.refuse(folder, overwrite=overwrite)
+        diagnosis_output.refuse(folder, overwrite=overwrite)
     with progress("Diagnosing", verbose, quiet) as tell:
         found = run(reals, sim, imu=imu, truth=truth, signals=signal or (), tell=tell)
         if folder is not None:
             tell(0, 1, "writing")
-            for remark in diagnosis_folder.write(found, folder, logs=look, overwrite=overwrite):
+            for remark in diagnosis_output.write(found, folder, logs=look, overwrite=overwrite):
                 logger.warning("%s", remark)
-    if write_json(diagnosis_folder.plain(found), json_to):
+    if write_json(diagnosis_output.plain(found), json_to):
         return
     say(conclusion(found))
     if found.findings:
@@ -66,4 +66,4 @@ def diagnose(
     for line in below(found):
         say(line)
     if folder is not None:
-        say(f"{folder}: {', '.join(name for name in diagnosis_folder.FILES if (folder / name).exists())}")
+        say(f"{folder}: {', '.join(name for name in diagnosis_output.FILES if (folder / name).exists())}")

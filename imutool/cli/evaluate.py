@@ -9,9 +9,9 @@ from typing import Annotated, Any
 
 import typer
 
-from imutool.cli._app import Imu, Init, Json, Logs, Models, Overwrite, Quiet, Report, Smooth, Truth, Verbose, app
-from imutool.cli._figures import figures
-from imutool.terminal import progress, say, write_json
+from imutool.cli.app import Imu, Init, Json, Logs, Models, Overwrite, Quiet, Report, Smooth, Truth, Verbose, app
+from imutool.cli.figures import figures
+from imutool.cli.terminal import progress, say, write_json
 
 
 @app.command(epilog="Example: [bold]imutool evaluate MH_04.mcap --model adis.safetensors --init truth[/]")
@@ -31,10 +31,10 @@ def evaluate(
     quiet: Quiet = False,
 ) -> None:
     """Integrate the IMU alone from the true start, raw and with each model, and score it against the truth."""
-    from imutool.evaluate import SCHEMA
-    from imutool.evaluate import evaluate as run
-    from imutool.view import report as pages
-    from imutool.view.runs import load
+    from imutool.evaluation import SCHEMA
+    from imutool.evaluation import evaluate as run
+    from imutool.viewing.html import report as pages
+    from imutool.viewing.model.runs import load
 
     if report is not None:
         pages.refuse(report, overwrite=overwrite)

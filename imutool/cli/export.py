@@ -7,8 +7,8 @@ from typing import Annotated
 
 import typer
 
-from imutool.cli._app import Json, Overwrite, Quiet, Verbose, app
-from imutool.terminal import progress, say, write_json
+from imutool.cli.app import Json, Overwrite, Quiet, Verbose, app
+from imutool.cli.terminal import progress, say, write_json
 
 
 @app.command(epilog="Example: [bold]imutool export MH_04_debiased.mcap MH_04_debiased --format euroc[/]")
@@ -26,7 +26,7 @@ def export(
     quiet: Quiet = False,
 ) -> None:
     """Write a log as a EuRoC folder or a rosbag2 folder, for programs that read those."""
-    from imutool.export.run import export as run
+    from imutool.exporting.run import export as run
 
     with progress("Exporting", verbose, quiet) as tell:
         report = run(log, target, format=format, imu=imu, sensor_noise=noise, overwrite=overwrite, progress=tell)

@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from imutool.cli._app import Imu, Init, Json, Overwrite, Quiet, Smooth, Truth, Verbose, app
+from imutool.cli.app import Imu, Init, Json, Overwrite, Quiet, Smooth, Truth, Verbose, app
 from imutool.cli.debias import VERIFY_HELP
+from imutool.cli.terminal import out, plain, progress, say, write_json
 from imutool.errors import ConfigError
 from imutool.fleet.task import Settings
-from imutool.terminal import out, plain, progress, say, write_json
 
 if TYPE_CHECKING:
     from imutool.fleet.run import FleetReport
@@ -83,14 +83,14 @@ def debias(
     pages: Annotated[bool, typer.Option("--pages", help=PAGES_HELP)] = False,
 ) -> Settings:
     """Debias every log, as `imutool debias --clean` does."""
+    from imutool.bias_start.model_choice import refuse_smooth
     from imutool.fleet.models import settled
-    from imutool.log_start import refuse_smooth
     from imutool.mcap_io.verify import refuse_unknown
 
     refuse_smooth(init, smooth)
     refuse_unknown(verify)
     if pages:
-        from imutool.view.drawing import library
+        from imutool.viewing.html.drawing import library
 
         library()
     return settled(Settings(command="debias", model=model, init=init, smooth=smooth, clean=clean, check=verify, pages=pages))
@@ -131,7 +131,7 @@ def diagnose(
     from pathlib import Path
 
     from imutool.fleet.work import robot_pattern
-    from imutool.place import place
+    from imutool.location import place
 
     robot_pattern(robot_from)
     there = None if sim is None else place(sim)
@@ -166,7 +166,7 @@ def _run(
 ) -> None:
     from imutool.fleet.engine import Engine
     from imutool.fleet.run import run
-    from imutool.place import place
+    from imutool.location import place
 
     size = memory_bytes(memory)
     page = None if report is None else place(report)

@@ -7,13 +7,13 @@ from typing import TYPE_CHECKING, Annotated, NoReturn
 
 import typer
 
-from imutool.cli._app import LOST, Json, Overwrite, Quiet, Verbose, app
+from imutool.cli.app import LOST, Json, Overwrite, Quiet, Verbose, app
+from imutool.cli.terminal import log_to_stderr, out, plain, say, table, tell_losses, write_json
 from imutool.errors import ConfigError
-from imutool.place import place
-from imutool.terminal import log_to_stderr, out, plain, say, table, tell_losses, write_json
+from imutool.location import place
 
 if TYPE_CHECKING:
-    from imutool.identify import Identified
+    from imutool.noise_identification import Identified
 
 
 @app.command(epilog="Example: [bold]imutool info MH_04.mcap[/] or [bold]imutool info still.mcap --noise --noise-toml i.toml[/]")
@@ -34,7 +34,7 @@ def info(
     quiet: Quiet = False,
 ) -> None:
     """Say what is in a log and what looks wrong with it; with --noise, how noisy its IMU is."""
-    from imutool.info import imu_rows, inspect, topic_rows
+    from imutool.log_info import imu_rows, inspect, topic_rows
 
     log_to_stderr(verbose, quiet)
     asked = {"--model": model, "--imu": imu, "--truth": truth, "--noise-plot": noise_plot, "--noise-toml": noise_toml}
@@ -47,11 +47,11 @@ def info(
     lost = any(report["losses"]["stretches"] for report in reports)
     found = []
     if noise:
-        from imutool import identify
+        from imutool import noise_identification
 
-        found = [identify.identify(log, imu=imu, truth=truth, model=model) for log in places]
+        found = [noise_identification.identify(log, imu=imu, truth=truth, model=model) for log in places]
         for report, one in zip(reports, found, strict=True):
-            report["noise"] = identify.plain(one)
+            report["noise"] = noise_identification.plain(one)
         _write_noise(found[0], noise_plot, noise_toml, overwrite)
     if write_json(reports[0] if len(reports) == 1 else {"schema": "imutool.infos/1", "logs": reports}, json_to):
         _leave(lost)
@@ -60,7 +60,7 @@ def info(
         table(topic_rows(report), keys=1)
         table(imu_rows(report), keys=2)
         if found:
-            table(identify.rows(found[number]), keys=1)
+            table(noise_identification.rows(found[number]), keys=1)
             for remark in found[number].remarks:
                 out.print(f"[cyan]noise:[/] {plain(remark)}", highlight=False, soft_wrap=True)
         for warning in report["warnings"]:
@@ -76,10 +76,10 @@ def _leave(lost: bool) -> NoReturn:
 def _write_noise(found: Identified, plot: Path | None, toml: Path | None, overwrite: bool) -> None:
     """The files that were asked for."""
     if plot is not None:
-        from imutool.view.allan import deviations
+        from imutool.viewing.html.allan_plot import deviations
 
         deviations(found, plot, overwrite=overwrite)
     if toml is not None:
-        from imutool.noise import write
+        from imutool.noise.datasheet import write
 
         write(found.noise, toml, overwrite=overwrite)

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from imutool.cli._app import Json, Quiet, Verbose, app
-from imutool.terminal import log_to_stderr, say, table, write_json
+from imutool.cli.app import Json, Quiet, Verbose, app
+from imutool.cli.terminal import log_to_stderr, say, table, write_json
 
 
 @app.command(epilog="Example: [bold]imutool models --json -[/]")
 def models(json_to: Json = None, verbose: Verbose = False, quiet: Quiet = False) -> None:
     """List the models that ship, their sensor and their card."""
-    from imutool.bias._file import header_of, library
+    from imutool.bias.io import header_of, library
 
     log_to_stderr(verbose, quiet)
     found = []

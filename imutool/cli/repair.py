@@ -7,10 +7,10 @@ from typing import Annotated, Any
 
 import typer
 
-from imutool.cli._app import LOST, Json, Overwrite, Quiet, Verbose, app
+from imutool.cli.app import LOST, Json, Overwrite, Quiet, Verbose, app
+from imutool.cli.terminal import progress, say, tell_losses, write_json
 from imutool.errors import ConfigError
-from imutool.place import place
-from imutool.terminal import progress, say, tell_losses, write_json
+from imutool.location import place
 
 
 class Damaged(StrEnum):
@@ -36,7 +36,7 @@ def repair(
 ) -> None:
     """Save what is sound in a damaged log: cut short, overwritten, unfinished, joined; say what is lost."""
     from imutool.bag.repair import NO_ATTACHMENTS, is_bag, repair_bag
-    from imutool.mcap_io.salvage import repair as repair_log
+    from imutool.mcap_io.repair import repair as repair_log
 
     here, there = place(source), place(target)
     with progress("Repairing", verbose, quiet) as tell:

@@ -7,8 +7,8 @@ from typing import Annotated
 
 import typer
 
-from imutool.cli._app import Json, Overwrite, Quiet, Truth, Verbose, app
-from imutool.terminal import logger, progress, say, write_json
+from imutool.cli.app import Json, Overwrite, Quiet, Truth, Verbose, app
+from imutool.cli.terminal import logger, progress, say, write_json
 
 
 @app.command(epilog="Example: [bold]imutool simulate V1_02.mcap sim.mcap --physics physics.toml --noise adis16448 --seed 1[/]")
@@ -30,7 +30,7 @@ def simulate(
     quiet: Quiet = False,
 ) -> None:
     """Simulate an IMU along the poses of a log, with the physics and the noise of a sensor."""
-    from imutool.physics.simulate import simulate as run
+    from imutool.sensor.simulate import simulate as run
 
     with progress("Simulating", verbose, quiet) as tell:
         found = run(

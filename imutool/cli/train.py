@@ -9,10 +9,10 @@ from typing import Annotated
 import typer
 
 from imutool import registry
-from imutool.cli._app import Imu, Json, Logs, Overwrite, Quiet, Truth, Verbose, app, listing
-from imutool.cli._figures import epoch_line
+from imutool.cli.app import Imu, Json, Logs, Overwrite, Quiet, Truth, Verbose, app, listing
+from imutool.cli.figures import epoch_line
+from imutool.cli.terminal import progress, say, write_json
 from imutool.errors import ConfigError
-from imutool.terminal import progress, say, write_json
 
 
 @app.command(
@@ -24,7 +24,7 @@ def train(
     model: Annotated[Path, typer.Option("-o", "--output", metavar="MODEL.safetensors", help="Where the model goes.")],
     method: Annotated[str, typer.Option(help="The bias model, one of those listed below.")] = "hybrid",
     config: Annotated[
-        Path | None, typer.Option(metavar="FILE.toml", help="Settings; imutool.train.fit.TrainSettings says which.")
+        Path | None, typer.Option(metavar="FILE.toml", help="Settings; imutool.training.fit.TrainSettings says which.")
     ] = None,
     set_: Annotated[list[str] | None, typer.Option("--set", metavar="key=value", help="One setting. Repeatable.")] = None,
     physics: Annotated[
@@ -44,8 +44,8 @@ def train(
     """Train a bias model on logs of one sensor with true poses."""
     registry.load("imutool.bias", method)  # a slip of the pen is told before any log is read
     from imutool.config import load
-    from imutool.train.run import train as run
-    from imutool.train.settings import settings_of
+    from imutool.training.run import train as run
+    from imutool.training.settings import settings_of
 
     words: list[str] = []
     if physics is not None:
@@ -79,6 +79,6 @@ def _named_by(physics: Path, method: str) -> tuple[list[str], tuple[str, ...]]:
     """
     if method != "hybrid":
         raise ConfigError(f"{method} knows no effects", where="--physics", fix="Leave it out, or train --method hybrid")
-    from imutool.train.physics_first import settings_for
+    from imutool.training.physics_first import settings_for
 
     return settings_for(physics)

@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from imutool.cli._app import Imu, Init, Json, Logs, Models, Overwrite, Quiet, Smooth, Truth, Verbose, app
+from imutool.cli.app import Imu, Init, Json, Logs, Models, Overwrite, Quiet, Smooth, Truth, Verbose, app
+from imutool.cli.terminal import progress, say, write_json
 from imutool.errors import ConfigError
-from imutool.terminal import progress, say, write_json
 
 if TYPE_CHECKING:
-    from imutool.view.deviation import Alignment
+    from imutool.viewing.model.trajectory_error import Alignment
 
 AT_HELP = "Where the cursor starts: seconds, or worst, the largest orientation error of a model."
 ALIGN_HELP = "Move each path onto the truth before its errors are taken: by its start, its heading, or as a whole."
@@ -54,8 +54,8 @@ def view(
     Without one of --save, --connect, --web, --export-web, --png and --html a viewer opens; where it cannot, an .rrd is
     saved.
     """
-    from imutool.view.runs import load
-    from imutool.view.ways import Asked, Ways
+    from imutool.viewing.model.runs import load
+    from imutool.viewing.outputs import Asked, Ways
 
     aligned = _alignment(align)
     read = partial(load, models=model or (), init=init, smooth=smooth, imu=imu, truth=truth, align=aligned, findings=findings)
@@ -83,7 +83,7 @@ def _alignment(word: str) -> Alignment:
     Raises:
         ConfigError: there is none.
     """
-    from imutool.view.deviation import ALIGNMENTS
+    from imutool.viewing.model.trajectory_error import ALIGNMENTS
 
     for name in ALIGNMENTS:
         if name == word:

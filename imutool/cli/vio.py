@@ -6,8 +6,8 @@ from typing import Annotated
 
 import typer
 
-from imutool.cli._app import Imu, Init, Json, Logs, Models, Quiet, Truth, Verbose, app
-from imutool.terminal import progress, say, table, write_json
+from imutool.cli.app import Imu, Init, Json, Logs, Models, Quiet, Truth, Verbose, app
+from imutool.cli.terminal import progress, say, table, write_json
 
 
 @app.command(epilog="Example: [bold]imutool vio MH_04.mcap --model adis.safetensors --blackout 3[/]")

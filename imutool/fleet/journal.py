@@ -24,7 +24,7 @@ import msgspec
 from imutool import __version__
 from imutool.errors import ConfigError
 from imutool.fleet.task import Result, Settings
-from imutool.place import Place, failures, reason
+from imutool.location import Place, failures, reason
 
 NAME = "fleet.journal"
 PIECE_BYTES = 256 << 10  # of a journal in a store

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import msgspec
 
-from imutool.bias._file import digest, find_model, library
+from imutool.bias.io import digest, find_model, library
 from imutool.fleet.task import Settings
 
 

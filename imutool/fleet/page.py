@@ -16,11 +16,11 @@ from jaxtyping import Float64
 from imutool import __version__
 from imutool.fleet.robots import FEWEST, Compared, Outlier
 from imutool.fleet.task import Result, Settings
-from imutool.mcap_io.target import Target
-from imutool.place import Place
-from imutool.view.drawing import apart, svg
-from imutool.view.page import cards, document, text
-from imutool.view.theme import AFTER, AXIS_COLORS, UNITS
+from imutool.location import Place
+from imutool.mcap_io.storage.target import Target
+from imutool.viewing.html.drawing import apart, svg
+from imutool.viewing.html.page import cards, document, text
+from imutool.viewing.html.theme import AFTER, AXIS_COLORS, UNITS
 
 MOST_ROWS = 500  # in a table: more is for the Parquet file
 MOST_NAMED = 10  # robots with an effect

@@ -9,8 +9,8 @@ from typing import Any
 from imutool import __version__
 from imutool.errors import ConfigError
 from imutool.fleet.task import Result
-from imutool.mcap_io.target import Target
-from imutool.place import Place
+from imutool.location import Place
+from imutool.mcap_io.storage.target import Target
 
 NAME = "fleet.parquet"
 ROWS = 4096  # in a group; of a million logs no more are held

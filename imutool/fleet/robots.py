@@ -22,9 +22,9 @@ import numpy as np
 from jaxtyping import Float64
 from scipy.stats import t as student
 
+from imutool.diagnosis.quantity import value as told
+from imutool.diagnosis.result import Estimate
 from imutool.fleet.task import Parameter, Result
-from imutool.physics.diagnosis import Estimate
-from imutool.physics.quantity import value as told
 
 QN, MAD = 2.2219, 1.4826  # what makes them the standard deviation of normal numbers
 QN_OF_FEW = {2: 0.399, 3: 0.994, 4: 0.512, 5: 0.844, 6: 0.611, 7: 0.857, 8: 0.669, 9: 0.872}  # Croux and Rousseeuw 1992

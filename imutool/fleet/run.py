@@ -22,7 +22,7 @@ from imutool.fleet.robots import Compared, compare
 from imutool.fleet.sources import Found, find, leftovers, remove
 from imutool.fleet.task import FINAL, Result, Settings, Source, Task
 from imutool.fleet.work import called, page_name, write_json
-from imutool.place import Place, place
+from imutool.location import Place, place
 
 LOST = 3  # something of a log was lost, or a log was quarantined
 COMPARED = "fleet.json"

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 from imutool.errors import ConfigError
 from imutool.fleet.task import Source
-from imutool.place import Place, failures, identity, place, reason, seal
+from imutool.location import Place, failures, identity, place, reason, seal
 
 LOG, BAG = ".mcap", ".bag"
 PATTERN = re.compile(r"[*?\[]")

@@ -18,15 +18,15 @@ from typing import Any
 
 import msgspec
 
-from imutool.clean import UntrustedError
-from imutool.diagnosis_folder import plain
+from imutool.cleaning import UntrustedError
+from imutool.diagnosis_output import plain
 from imutool.errors import ConfigError, ImutoolError, LogError, ModelError
 from imutool.fleet.sources import leftovers, remove, within
 from imutool.fleet.task import Imu, Parameter, Result, Settings, Task
-from imutool.mcap_io.digest import sha256
+from imutool.location import Place, identity, place
 from imutool.mcap_io.log import Log
-from imutool.mcap_io.target import Target
-from imutool.place import Place, identity, place
+from imutool.mcap_io.storage.digest import sha256
+from imutool.mcap_io.storage.target import Target
 
 LOST = 3  # exit code: something of the log was lost
 MOST_LOSSES = 20  # stretches told of a log; its metadata and its repair tell all
@@ -140,8 +140,8 @@ def _measured(target: Place) -> dict[str, Any]:
 
 
 def _debias(job: _Job) -> dict[str, Any]:
-    from imutool.clean import Rules
-    from imutool.debias import debias
+    from imutool.cleaning import Rules
+    from imutool.debiasing import debias
 
     s = job.settings
     rules = Rules() if s.clean else None
@@ -169,10 +169,10 @@ def _debias(job: _Job) -> dict[str, Any]:
 
 def _page(job: _Job, topics: Sequence[str], warnings: tuple[str, ...]) -> dict[str, Any]:
     """Writes a page about a debiased log beside it. A log that cannot be drawn is whole all the same, and is warned of."""
-    from imutool.view import report
-    from imutool.view.page import is_ours
-    from imutool.view.report_words import conclusion
-    from imutool.view.runs import load
+    from imutool.viewing.html import report
+    from imutool.viewing.html.page import is_ours
+    from imutool.viewing.html.report_wording import conclusion
+    from imutool.viewing.model.runs import load
 
     path = job.target.with_name(page_name(job.target.name))
     try:
@@ -186,7 +186,7 @@ def _page(job: _Job, topics: Sequence[str], warnings: tuple[str, ...]) -> dict[s
 
 
 def _info(job: _Job) -> dict[str, Any]:
-    from imutool.info import inspect
+    from imutool.log_info import inspect
 
     report = inspect(job.source)
     write_json(report, job.target)
@@ -197,7 +197,7 @@ def _info(job: _Job) -> dict[str, Any]:
 
 def _repair(job: _Job) -> dict[str, Any]:
     from imutool.bag.repair import NO_ATTACHMENTS, is_bag, repair_bag
-    from imutool.mcap_io.salvage import repair
+    from imutool.mcap_io.repair import repair
 
     if is_bag(job.source):
         if job.settings.damaged == "keep":
@@ -222,7 +222,7 @@ def _lost(losses: Mapping[str, Any] | None) -> dict[str, Any]:
 
 
 def _diagnose(job: _Job) -> dict[str, Any]:
-    from imutool.physics.diagnose import diagnose, measured
+    from imutool.diagnosis.diagnose import diagnose, measured
 
     s = job.settings
     robot = robot_of(job.name, s.robot_from, job.source)

@@ -17,13 +17,13 @@ import numpy as np
 from jaxtyping import Float64, Int64, UInt8
 
 from imutool.errors import LogError
-from imutool.mcap_io import ros2msg
+from imutool.location import Place
 from imutool.mcap_io.batches import Clock
+from imutool.mcap_io.codec import ros2_definition
+from imutool.mcap_io.codec.records import Rows
 from imutool.mcap_io.log import Log
 from imutool.mcap_io.read import UNIT_KEY
-from imutool.mcap_io.records import Rows
 from imutool.mcap_io.topics import DERIVED_KEY, Topic
-from imutool.place import Place
 
 LISTED = 60  # fields named in a message
 LONGEST_ROW = 64  # of an array of numbers that is looked at as channels
@@ -107,7 +107,7 @@ def numeric_fields(log: Log, topic: str, *, long: bool = True) -> list[str]:
     definition = _definition(log, log.topics[topic])
     for _, rows in log.rows([topic]):
         with log.named(topic):
-            return list(_paths(ros2msg.Walk(rows.payload[0].tobytes(), definition), long))
+            return list(_paths(ros2_definition.Walk(rows.payload[0].tobytes(), definition), long))
     return []
 
 
@@ -148,7 +148,7 @@ def _offered(log: Log, topic: str) -> list[str]:
         return []
 
 
-def _definition(log: Log, topic: Topic) -> ros2msg.Definition:
+def _definition(log: Log, topic: Topic) -> ros2_definition.Definition:
     """What the log says of a topic's messages.
 
     Raises:
@@ -164,10 +164,10 @@ def _definition(log: Log, topic: Topic) -> ros2msg.Definition:
         )
     channel = next(c for c in log.structure.channels.values() if c.topic == topic.name)
     with log.named(topic.name):
-        return ros2msg.parse(topic.schema_name, log.structure.schemas[channel.schema_id].data)
+        return ros2_definition.parse(topic.schema_name, log.structure.schemas[channel.schema_id].data)
 
 
-def _paths(walk: ros2msg.Walk, long: bool = True) -> Iterator[str]:
+def _paths(walk: ros2_definition.Walk, long: bool = True) -> Iterator[str]:
     for leaf in walk.leaves():
         if re.search(r"(^|\.)\w*stamp\.(sec|nanosec)$", leaf.path):
             continue
@@ -221,7 +221,7 @@ class _Reader:
         pending = [(0, len(payload))] if len(payload) else []
         while pending:
             first, last = pending.pop()
-            walk = ros2msg.Walk(payload[first].tobytes(), self.definition)
+            walk = ros2_definition.Walk(payload[first].tobytes(), self.definition)
             places = self._places(walk)
             differ = np.zeros(last - first - 1, bool)
             for at, raw in walk.constants:
@@ -232,7 +232,7 @@ class _Reader:
             yield slice(first, edges[1]), places, walk.order
             pending += reversed(list(pairwise(edges[1:])))
 
-    def _places(self, walk: ros2msg.Walk) -> dict[str, _Place]:
+    def _places(self, walk: ros2_definition.Walk) -> dict[str, _Place]:
         """Where the wanted fields lie, and the header's stamp (`sec`, `nanosec`); the walk ends at the last of them.
 
         Raises:
@@ -257,8 +257,8 @@ class _Reader:
             raise self._none(missing[0], walk)
         return found
 
-    def _none(self, path: str, walk: ros2msg.Walk) -> LogError:
-        there = list(_paths(ros2msg.Walk(walk.payload, self.definition)))
+    def _none(self, path: str, walk: ros2_definition.Walk) -> LogError:
+        there = list(_paths(ros2_definition.Walk(walk.payload, self.definition)))
         near = difflib.get_close_matches(path, there, n=1)
         return LogError(
             f"there is no number {path} in {self.topic.schema_name}",

@@ -9,10 +9,10 @@ from jaxtyping import UInt64
 from mcap.opcode import Opcode
 
 from imutool.errors import LogError
-from imutool.mcap_io import records
-from imutool.mcap_io.records import HEAD, MESSAGE, ChunkHead, Messages
-from imutool.mcap_io.source import Source
-from imutool.mcap_io.structure import INDEX_HEAD, Block
+from imutool.mcap_io.codec import records
+from imutool.mcap_io.codec.records import HEAD, MESSAGE, ChunkHead, Messages
+from imutool.mcap_io.index import INDEX_HEAD, Block
+from imutool.mcap_io.storage.source import Source
 
 HEAD_BYTES = 128  # hold a Chunk record up to its packed data, whatever its compression is called
 

@@ -15,17 +15,17 @@ from mcap.opcode import Opcode
 from mcap.records import Metadata
 
 from imutool.errors import DataError, LogError
-from imutool.mcap_io import records, schema
+from imutool.location import Place
 from imutool.mcap_io.batches import Clock, ImuBatch, PoseBatch, ScalarBatch, finite
-from imutool.mcap_io.decode import TwistColumns, decode_image, decode_imu, decode_poses, decode_scalars, decode_twist
+from imutool.mcap_io.codec import records, schemas
+from imutool.mcap_io.codec.decode import TwistColumns, decode_image, decode_imu, decode_poses, decode_scalars, decode_twist
+from imutool.mcap_io.codec.records import HEAD
+from imutool.mcap_io.index import Block, Span, Structure
 from imutool.mcap_io.losses import Losses
-from imutool.mcap_io.memory import keep_buffers
-from imutool.mcap_io.records import HEAD
-from imutool.mcap_io.salvaged import Salvaged
-from imutool.mcap_io.source import Source
-from imutool.mcap_io.structure import Block, Span, Structure
+from imutool.mcap_io.recovery.recovered_index import Salvaged
+from imutool.mcap_io.storage.memory import keep_buffers
+from imutool.mcap_io.storage.source import Source
 from imutool.mcap_io.topics import DERIVED_KEY, ENCODINGS, MESSAGE_POSES, SCALARS, Topic, topics_of
-from imutool.place import Place
 
 
 class Log:
@@ -92,7 +92,7 @@ class Log:
     @property
     def imu_topics(self) -> list[str]:
         """Topics with IMU messages, without those that imutool computed itself."""
-        return [t.name for t in self.with_schema((schema.IMU,)) if DERIVED_KEY not in t.metadata]
+        return [t.name for t in self.with_schema((schemas.IMU,)) if DERIVED_KEY not in t.metadata]
 
     def only_imu(self) -> str:
         """The log's IMU, where there is one and only one.
@@ -110,7 +110,7 @@ class Log:
     def pose_topics(self) -> list[str]:
         """Topics with poses; /tf counts only where nothing else has any, and never the static one."""
         dedicated = [t.name for t in self.with_schema(MESSAGE_POSES)]
-        return dedicated or [t.name for t in self.with_schema((schema.TF,)) if not t.name.endswith("tf_static")]
+        return dedicated or [t.name for t in self.with_schema((schemas.TF,)) if not t.name.endswith("tf_static")]
 
     def with_schema(self, schema_names: Collection[str]) -> list[Topic]:
         """The topics that carry one of these messages, in order of their channel ids."""
@@ -191,7 +191,7 @@ class Log:
         Raises:
             LogError: no such IMU topic, another encoding, NaN or infinite values, stamps that do not increase, damage.
         """
-        self.topic(topic, (schema.IMU,))
+        self.topic(topic, (schemas.IMU,))
         clock = Clock()
         for rows in self.rows([topic], start_ns, end_ns):
             with self.named(topic):
@@ -206,7 +206,7 @@ class Log:
             LogError: a payload that is no such message.
         """
         encoding = self.topics[topic].message_encoding
-        for part, layout in schema.runs(rows.payload, schema.IMU, encoding):
+        for part, layout in schemas.runs(rows.payload, schemas.IMU, encoding):
             cut = rows.where(part)
             columns = decode_imu(cut.payload, encoding, layout)
             yield ImuBatch(cut.log_time, cut.publish_time, cut.sequence, *columns)
@@ -217,7 +217,7 @@ class Log:
         Raises:
             LogError: no such pose topic, another encoding, NaN or infinite values, damage.
         """
-        self.topic(topic, (*MESSAGE_POSES, schema.TF))
+        self.topic(topic, (*MESSAGE_POSES, schemas.TF))
         for rows in self.rows([topic], start_ns, end_ns):
             with self.named(topic):
                 yield from self.decode_poses(topic, rows[1])
@@ -229,7 +229,7 @@ class Log:
             LogError: a payload that is no such message, NaN or infinite values.
         """
         kind, encoding = self.topics[topic].schema_name, self.topics[topic].message_encoding
-        for part, layout in schema.runs(rows.payload, kind, encoding):
+        for part, layout in schemas.runs(rows.payload, kind, encoding):
             cut = rows.where(part)
             for columns in decode_poses(cut.payload, kind, encoding, layout):
                 finite(cut.sequence, position=columns.p_wb, orientation=columns.q_wb_wxyz)
@@ -253,7 +253,7 @@ class Log:
             LogError: a payload that is no such message, NaN or infinite values.
         """
         kind, encoding = self.topics[topic].schema_name, self.topics[topic].message_encoding
-        for part, layout in schema.runs(rows.payload, kind, encoding):
+        for part, layout in schemas.runs(rows.payload, kind, encoding):
             cut = rows.where(part)
             columns = decode_scalars(cut.payload, kind, encoding, layout)
             finite(cut.sequence, values=columns.values)
@@ -267,7 +267,7 @@ class Log:
             LogError: a payload that is no such message.
         """
         encoding = self.topics[topic].message_encoding
-        for part, layout in schema.runs(rows.payload, schema.TWIST, encoding):
+        for part, layout in schemas.runs(rows.payload, schemas.TWIST, encoding):
             yield decode_twist(rows.where(part).payload, encoding, layout)
 
     def images(self, topic: str, start_ns: int | None = None, end_ns: int | None = None) -> Iterator[tuple[int, bytes]]:
@@ -276,7 +276,7 @@ class Log:
         Raises:
             LogError: no such topic, another encoding, damage.
         """
-        encoding = self.topic(topic, (schema.IMAGE,)).message_encoding
+        encoding = self.topic(topic, (schemas.IMAGE,)).message_encoding
         for _, rows in self.rows([topic], start_ns, end_ns):
             with self.named(topic):
                 for payload in rows.payload:

@@ -11,12 +11,12 @@ import numpy as np
 from jaxtyping import Float64, Int64, UInt32
 
 from imutool.errors import LogError
-from imutool.mcap_io import records, schema
+from imutool.location import Place
 from imutool.mcap_io.batches import Clock, finite
-from imutool.mcap_io.decode import decode_image
+from imutool.mcap_io.codec import records, schemas
+from imutool.mcap_io.codec.decode import decode_image
 from imutool.mcap_io.log import Log
 from imutool.mcap_io.topics import DERIVED_KEY, ENCODINGS, MESSAGE_POSES, SCALARS
-from imutool.place import Place
 from imutool.recording import UNIT_QUATERNION_TOLERANCE, Frames, Imu, Poses, Recording, Scalars, unit_quaternions
 
 logger = logging.getLogger(__name__)
@@ -99,23 +99,23 @@ def recording_in(
 
 def _choose_imu(log: Log, imu: str | None) -> str:
     if imu is not None:
-        return log.topic(imu, (schema.IMU,)).name
+        return log.topic(imu, (schemas.IMU,)).name
     found = log.imu_topics
     if not found:
-        raise LogError("the log has no IMU topic", where=log.path, expected=f"{schema.IMU} among {log.listing()}")
+        raise LogError("the log has no IMU topic", where=log.path, expected=f"{schemas.IMU} among {log.listing()}")
     if len(found) > 1:
         raise LogError(f"the log has {len(found)} IMU topics: {', '.join(found)}", where=log.path, fix="Choose one with --imu")
-    return log.topic(found[0], (schema.IMU,)).name
+    return log.topic(found[0], (schemas.IMU,)).name
 
 
 def _choose_truths(log: Log, truth: str | None) -> list[str]:
     """The topics to read poses from; a transform of /tf is chosen as TOPIC/CHILD_FRAME."""
-    kinds = (*MESSAGE_POSES, schema.TF)
+    kinds = (*MESSAGE_POSES, schemas.TF)
     if truth is None:
         return [log.topic(name, kinds).name for name in log.pose_topics]
     if truth in log.topics:
         return [log.topic(truth, kinds).name]
-    trees = [t.name for t in log.with_schema((schema.TF,)) if truth.startswith(f"{t.name}/")]
+    trees = [t.name for t in log.with_schema((schemas.TF,)) if truth.startswith(f"{t.name}/")]
     if not trees:
         raise LogError(f"there are no poses on {truth}", where=log.path, expected=", ".join(log.pose_topics) or "(none there)")
     return trees
@@ -167,7 +167,7 @@ class _Gather:
                 self.left_out.add(topic)
 
     def _take_poses(self, topic: str, rows: records.Rows) -> None:
-        tree = self.log.topics[topic].schema_name == schema.TF
+        tree = self.log.topics[topic].schema_name == schemas.TF
         for pose in self.log.decode_poses(topic, rows):
             name = f"{topic}/{pose.child_frame_id.lstrip('/')}" if tree else topic
             self._keep(name, pose.sequence, pose.stamp_ns, pose.p_wb, pose.q_wb_wxyz)
@@ -210,7 +210,7 @@ class _Gather:
         for topic in self.truth_topics:
             if topic in self.left_out:
                 continue
-            if self.log.topics[topic].schema_name == schema.TF:
+            if self.log.topics[topic].schema_name == schemas.TF:
                 names += [name for name in self.kept if name.startswith(f"{topic}/")]
             else:
                 names.append(topic)
@@ -257,7 +257,7 @@ class _Gather:
 def _frames(log: Log, start_ns: int | None, end_ns: int | None) -> dict[str, Frames]:
     """Image topics, to be opened again when somebody copies them."""
     found = {}
-    for topic in log.with_schema((schema.IMAGE,)):
+    for topic in log.with_schema((schemas.IMAGE,)):
         if topic.message_encoding in ENCODINGS:
             first, last = start_ns or 0, 2**63 - 1 if end_ns is None else end_ns
             count = sum(int(((t >= first) & (t <= last)).sum()) for t in log.stamps(topic.name))

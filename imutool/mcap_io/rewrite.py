@@ -25,18 +25,19 @@ from mcap.opcode import Opcode
 from mcap.records import AttachmentIndex, ChunkIndex, Metadata, MetadataIndex
 
 from imutool.errors import ConfigError, LogError
-from imutool.mcap_io import records, schema
-from imutool.mcap_io.derived import Derived, Stream
+from imutool.location import Place, identity, same
+from imutool.mcap_io.added_topics import Derived, Stream
+from imutool.mcap_io.codec import records
+from imutool.mcap_io.codec import schemas as schema
+from imutool.mcap_io.codec.records import HEAD, ChunkHead
+from imutool.mcap_io.index import Block, Span, Structure
 from imutool.mcap_io.listing import Listing, described, head, listing
 from imutool.mcap_io.log import Log
-from imutool.mcap_io.log_writer import Chunk, LogWriter
-from imutool.mcap_io.passage import Passage
-from imutool.mcap_io.records import HEAD, ChunkHead
-from imutool.mcap_io.structure import Block, Span, Structure
+from imutool.mcap_io.passthrough import Passage
 from imutool.mcap_io.topics import DERIVED_KEY
 from imutool.mcap_io.verify import Verified, check_data_crc, refuse_unknown, stated_crc, verify
 from imutool.mcap_io.write import CHUNK_BYTES
-from imutool.place import Place, identity, same
+from imutool.mcap_io.writer import Chunk, LogWriter
 
 RUN_BYTES = 16 << 20  # verbatim bytes are copied in runs of about this size: between them progress is told
 

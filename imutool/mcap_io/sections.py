@@ -16,7 +16,7 @@ from mcap.opcode import Opcode
 from mcap.records import Channel, Schema
 
 from imutool.errors import LogError
-from imutool.mcap_io import records
+from imutool.mcap_io.codec import records
 
 DEFINITIONS = (Opcode.SCHEMA, Opcode.CHANNEL)
 

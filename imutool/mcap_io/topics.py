@@ -7,14 +7,14 @@ from dataclasses import dataclass
 from types import MappingProxyType
 
 from imutool.errors import LogError
-from imutool.mcap_io import schema
-from imutool.mcap_io.structure import Structure
+from imutool.mcap_io.codec import schemas
+from imutool.mcap_io.index import Structure
 
 ENCODINGS = ("cdr", "ros1")
 DERIVED_KEY = "imutool_source_topic"  # channel metadata: computed by imutool from this topic
 
-MESSAGE_POSES = (schema.POSE, schema.ODOMETRY, schema.TRANSFORM)
-SCALARS = {schema.FLOAT: 1, schema.VECTOR3: 3}
+MESSAGE_POSES = (schemas.POSE, schemas.ODOMETRY, schemas.TRANSFORM)
+SCALARS = {schemas.FLOAT: 1, schemas.VECTOR3: 3}
 
 
 @dataclass(frozen=True)
@@ -42,7 +42,7 @@ def topics_of(structure: Structure) -> dict[str, Topic]:
         before = found.get(channel.topic)
         found[channel.topic] = Topic(
             channel.topic,
-            schema.canonical(kind.name) if kind else "",
+            schemas.canonical(kind.name) if kind else "",
             kind.encoding if kind else "",
             channel.message_encoding,
             counts.get(identity, 0) + (before.count if before else 0),

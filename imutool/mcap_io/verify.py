@@ -15,15 +15,15 @@ from mcap.opcode import Opcode
 from mcap.records import AttachmentIndex, DataEnd, MetadataIndex, SummaryOffset
 
 from imutool.errors import ConfigError, LogError
-from imutool.mcap_io import records
-from imutool.mcap_io.crc import crc32
+from imutool.location import Place
+from imutool.mcap_io.codec import records
+from imutool.mcap_io.codec.crc import crc32
+from imutool.mcap_io.codec.records import FOOTER_SIZE, HEAD, MAGIC
+from imutool.mcap_io.index import Block, Span, Structure
 from imutool.mcap_io.listing import described
 from imutool.mcap_io.log import Log
-from imutool.mcap_io.records import FOOTER_SIZE, HEAD, MAGIC
-from imutool.mcap_io.source import Source
-from imutool.mcap_io.structure import Block, Span, Structure
-from imutool.mcap_io.target import COPY_BYTES
-from imutool.place import Place
+from imutool.mcap_io.storage.source import Source
+from imutool.mcap_io.storage.target import COPY_BYTES
 
 MODES = ("all", "imu", "none")
 

@@ -18,11 +18,11 @@ from jaxtyping import Int64, Shaped, UInt8
 
 import imutool
 from imutool.errors import DataError
-from imutool.mcap_io import records, schema
-from imutool.mcap_io.encode import encode_float, encode_image, encode_imu, encode_pose, encode_transform, encode_vector3
-from imutool.mcap_io.log_writer import Chunk, LogWriter
+from imutool.location import Place
+from imutool.mcap_io.codec import records, schemas
+from imutool.mcap_io.codec.encode import encode_float, encode_image, encode_imu, encode_pose, encode_transform, encode_vector3
 from imutool.mcap_io.read import OWN_KEYS, RECORD, SHADOWED_KEY, UNIT_KEY, VELOCITY_KEY
-from imutool.place import Place
+from imutool.mcap_io.writer import Chunk, LogWriter
 from imutool.recording import Frames, Recording
 
 CHUNK_BYTES = 1 << 20  # compression gains nothing beyond, memory grows tenfold by 32 MiB (mcap#1658)
@@ -81,7 +81,7 @@ def _write_metadata(log: LogWriter, recording: Recording) -> None:
 
 def _imu(log: LogWriter, recording: Recording) -> list[Series]:
     imu = recording.imu
-    channel = log.channel(recording.imu_topic, schema.IMU)
+    channel = log.channel(recording.imu_topic, schemas.IMU)
     return [Series(channel, imu.t_ns, (imu.t_ns, imu.gyro, imu.accel), partial(encode_imu, frame_id=BODY))]
 
 
@@ -90,14 +90,14 @@ def _poses(log: LogWriter, recording: Recording) -> list[Series]:
     found: list[Series] = []
     for which, (topic, poses) in enumerate(recording.truths.items()):
         t_ns, columns = poses.t_ns, (poses.t_ns, poses.p_wb, poses.q_wb_wxyz)
-        channel = log.channel(topic, schema.POSE)
+        channel = log.channel(topic, schemas.POSE)
         found.append(Series(channel, t_ns, columns, partial(encode_pose, frame_id=WORLD)))
         if which == 0:
             encode = partial(encode_transform, frame_id=WORLD, child_frame_id=BODY)
-            found.append(Series(log.channel("/tf", schema.TF), t_ns, columns, encode))
+            found.append(Series(log.channel("/tf", schemas.TF), t_ns, columns, encode))
         if poses.v_w is not None:
             velocity = f"{topic.removesuffix('/pose')}/velocity"
-            channel = log.channel(velocity, schema.VECTOR3, {VELOCITY_KEY: topic, UNIT_KEY: "m/s"})
+            channel = log.channel(velocity, schemas.VECTOR3, {VELOCITY_KEY: topic, UNIT_KEY: "m/s"})
             found.append(Series(channel, t_ns, (t_ns, poses.v_w), partial(encode_vector3, frame_id=WORLD)))
     return found
 
@@ -107,10 +107,10 @@ def _scalars(log: LogWriter, recording: Recording) -> list[Series]:
     for topic, scalars in recording.scalars.items():
         t_ns, values, unit = scalars.t_ns, scalars.values, {UNIT_KEY: scalars.unit}
         if values.shape[1] == 1:
-            channel = log.channel(topic, schema.FLOAT, unit)
+            channel = log.channel(topic, schemas.FLOAT, unit)
             found.append(Series(channel, t_ns, (values[:, 0],), encode_float))
         else:
-            channel = log.channel(topic, schema.VECTOR3, unit)
+            channel = log.channel(topic, schemas.VECTOR3, unit)
             found.append(Series(channel, t_ns, (t_ns, values), partial(encode_vector3, frame_id="")))
     return found
 
@@ -149,7 +149,7 @@ def chunks(group: Sequence[Series]) -> Iterator[Chunk]:
 
 def _images(log: LogWriter, topic: str, frames: Frames) -> Iterator[tuple[Chunk, str | None]]:
     """The chunks of one camera; its channel is defined at once, its images are fetched when their chunk is due."""
-    channel = log.channel(topic, schema.IMAGE)
+    channel = log.channel(topic, schemas.IMAGE)
     packing = "none" if frames.format.lower() in PACKED_IMAGES else None
     return ((chunk, packing) for chunk in _image_chunks(channel, topic, frames))
 

@@ -18,12 +18,13 @@ from jaxtyping import Bool, Int64
 from msgspec import Meta
 from scipy.spatial.transform import Rotation
 
-from imutool import config, metrics
+from imutool import config
 from imutool.errors import DataError, NumericsError
-from imutool.evaluate import runs
+from imutool.evaluation import runs
+from imutool.inertial import metrics
+from imutool.inertial.strapdown import Start, with_velocity
 from imutool.mcap_io.read import read
 from imutool.recording import Imu, Poses, Recording, nanoseconds, seconds
-from imutool.strapdown import Start, with_velocity
 from imutool.vio import features, rig, smoother
 from imutool.vio.features import Frame
 from imutool.vio.smoother import Positive, SmootherSettings
@@ -146,7 +147,7 @@ def score(
     bias_states: bool,
     progress: Callable[[int, int], None] | None = None,
 ) -> dict[str, Any]:
-    """Figures of one run (`imutool.metrics`, aligned in heading and position at the first keyframe), or why it failed."""
+    """Figures of one run (`imutool.inertial.metrics`, aligned in heading and position at the first keyframe), or why it failed."""
     began = time.process_time()
     start = Start.of(course.true)
     try:

@@ -3,7 +3,7 @@
 States at each keyframe: pose, velocity and, where they are wanted, the biases of gyro and accelerometer. Between keyframes one
 preintegrated factor (Forster et al., TRO 2017); at each, one stereo factor a track. Landmarks are states too and leave the lag
 after their last sighting. Gravity is `recording.GRAVITY_M_S2` along -z. Samples are points of the signal, so a step sees
-the mean of its two ends, as in `imutool.windows`.
+the mean of its two ends, as in `imutool.inertial.windows`.
 
 The window is solved by Levenberg-Marquardt at every keyframe (`BatchFixedLagSmoother`). Its incremental sister takes
 Gauss-Newton steps: as quick here, but after a few seconds without a camera it diverged on real IMUs, raw or debiased, unless
@@ -22,8 +22,8 @@ from scipy.spatial.transform import Rotation
 
 from imutool import config
 from imutool.errors import ConfigError, NumericsError
+from imutool.inertial.strapdown import Start
 from imutool.recording import GRAVITY_M_S2, Imu, Poses, seconds
-from imutool.strapdown import Start
 from imutool.vio.features import Frame
 from imutool.vio.rig import EUROC, StereoRig
 

@@ -21,9 +21,9 @@ from rosbags.typesys import Stores, get_typestore
 from imutool.bag import records
 from imutool.bag.records import Op
 from imutool.bag.repair import repair_bag
-from imutool.bag.walk import Bag
+from imutool.bag.scan import Bag
 from imutool.errors import ConfigError, LogError
-from imutool.place import place
+from imutool.location import place
 
 STORE = get_typestore(Stores.ROS1_NOETIC)
 TEXT = STORE.types["std_msgs/msg/String"]

@@ -53,10 +53,10 @@ def one(logs: list[Path], test: list[Path], what: dict[str, int | bool]) -> dict
     """One training, its figures."""
     import torch
 
-    from imutool.evaluate import evaluate
+    from imutool.evaluation import evaluate
     from imutool.mcap_io.read import read
-    from imutool.train.run import train
-    from imutool.train.settings import TrainSettings
+    from imutool.training.run import train
+    from imutool.training.settings import TrainSettings
 
     torch.set_num_threads(1)
     rate_hz = 1.0 / read(logs[0]).imu.period_s

@@ -6,8 +6,8 @@ FETCH.
 
 `python tests/bench/clean.py [--minutes 10 60]` measures the cost.
 
-For each length: CPU seconds of `imutool.clean.survey`, beside a pass that only reads and decodes the same IMU messages, and
-beside `imutool.info.inspect`, which holds the columns; each in a process of its own, with the memory it takes at most beyond
+For each length: CPU seconds of `imutool.cleaning.survey`, beside a pass that only reads and decodes the same IMU messages, and
+beside `imutool.log_info.inspect`, which holds the columns; each in a process of its own, with the memory it takes at most beyond
 what the imports take. The log is in the page cache. Poses stand beside the IMU at 20 Hz.
 """
 
@@ -24,10 +24,10 @@ from pathlib import Path
 
 import numpy as np
 
-from imutool.clean import survey
+from imutool.cleaning import survey
 from imutool.mcap_io.write import write
-from imutool.physics.flight import flight
 from imutool.recording import Imu, Poses, Recording
+from imutool.sensor.flight import flight
 
 RATE_HZ = 200.0
 PIECE_S = 60.0  # of motion, again and again
@@ -37,7 +37,7 @@ import json, re, sys, time
 from pathlib import Path
 from imutool import clean, info
 from imutool.mcap_io.log import Log
-import scipy.spatial.transform, imutool.clean.rules.axes
+import scipy.spatial.transform, imutool.cleaning.rules.axes
 
 def peak_mb():  # not ru_maxrss, which a process takes over from the one that started it
     return int(re.search(r"VmHWM:\\s+(\\d+) kB", Path("/proc/self/status").read_text())[1]) / 1024

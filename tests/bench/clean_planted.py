@@ -12,13 +12,13 @@ from pathlib import Path
 
 import numpy as np
 
-sys.path.insert(0, str(Path(__file__).parents[1] / "clean"))
+sys.path.insert(0, str(Path(__file__).parents[1] / "cleaning"))
 
 from defects import late, messages, repeated, with_values, without
 
-from imutool.clean import survey
-from imutool.clean.first_pass import examine
-from imutool.clean.truth import read_truth
+from imutool.cleaning import survey
+from imutool.cleaning.first_pass import examine
+from imutool.cleaning.truth import read_truth
 from imutool.mcap_io.batches import ImuBatch
 from imutool.mcap_io.log import Log
 

@@ -15,9 +15,9 @@ from mcap.data_stream import RecordBuilder
 from mcap.records import Message
 from mcap_ros2._dynamic import generate_dynamic, serialize_dynamic
 
-from imutool.mcap_io import records, schema
-from imutool.mcap_io.decode import ImuColumns, decode_imu
-from imutool.mcap_io.encode import encode_imu
+from imutool.mcap_io.codec import records, schemas
+from imutool.mcap_io.codec.decode import ImuColumns, decode_imu
+from imutool.mcap_io.codec.encode import encode_imu
 
 REPEATS = 7
 THEIR_COUNT = 3000  # enough for a rate; the whole column would take minutes
@@ -51,7 +51,7 @@ def decode(chunks: list[bytes]) -> list[ImuColumns]:
     for chunk in chunks:
         messages = records.messages(chunk, 0)
         for rows in records.rows(messages, messages.heads["channel"] == 1):
-            for part, layout in schema.runs(rows.payload, schema.IMU):
+            for part, layout in schemas.runs(rows.payload, schemas.IMU):
                 found.append(decode_imu(rows.payload[part], "cdr", layout))
     return found
 
@@ -83,9 +83,9 @@ def main() -> None:
     back = decode(chunks)
     assert np.concatenate([columns.gyro for columns in back]).tobytes() == gyro.tobytes()
 
-    text = schema.definition(schema.IMU)
-    serialize = serialize_dynamic(schema.IMU, text)[schema.IMU]
-    deserialize = generate_dynamic(schema.IMU, text)[schema.IMU]
+    text = schemas.definition(schemas.IMU)
+    serialize = serialize_dynamic(schemas.IMU, text)[schemas.IMU]
+    deserialize = generate_dynamic(schemas.IMU, text)[schemas.IMU]
     messages = their_messages(t_ns, gyro, accel)
     payloads = [serialize(message) for message in messages]
     assert payloads[0] == chunks[0][31 : 31 + len(payloads[0])]

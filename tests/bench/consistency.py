@@ -24,17 +24,18 @@ import numpy as np
 import torch
 from jaxtyping import Float64
 
-from imutool import metrics, so3
-from imutool.bias._base import BiasModel
-from imutool.bias._file import load
-from imutool.certainty import Certainty
-from imutool.log_start import smooth_in_memory
+from imutool.bias.io import load
+from imutool.bias.model import BiasModel
+from imutool.bias_start.bias_covariance import Certainty
+from imutool.bias_start.bias_from_truth import truth_offset
+from imutool.bias_start.initial_bias import TRUTH_S, find
+from imutool.bias_start.model_choice import smooth_in_memory
+from imutool.geometry import so3
+from imutool.inertial import metrics
+from imutool.inertial.strapdown import with_velocity
+from imutool.inertial.windows import between, running_product
 from imutool.mcap_io.read import read
 from imutool.recording import Recording, seconds
-from imutool.strapdown import with_velocity
-from imutool.truth_offset import truth_offset
-from imutool.turn_on import TRUTH_S, find
-from imutool.windows import between, running_product
 
 LEAST_TRUSTED = 0.5
 RECOMPUTED = "/ground_truth_recomputed/pose"

@@ -29,13 +29,13 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
-from imutool.bias import _file, neural_ode
-from imutool.bias._base import BiasModel
-from imutool.debias import OnlineDebiaser, debias
+from imutool.bias import io, neural_ode
+from imutool.bias.model import BiasModel
+from imutool.bias_start.initial_bias import TurnOn, following, prior
+from imutool.debiasing import OnlineDebiaser, debias
 from imutool.mcap_io.write import write
-from imutool.physics.flight import flight
 from imutool.recording import Imu, seconds
-from imutool.turn_on import TurnOn, following, prior
+from imutool.sensor.flight import flight
 
 BLOCK = 2900  # Imu messages in a chunk of 1 MiB
 SAME = 1e-9  # rad/s, m/s²: rounding alone separates a block from its samples
@@ -49,7 +49,7 @@ def write_random_model(path: Path, rate_hz: float) -> None:
         for weight in model.parameters():
             weight.add_(0.01 * torch.randn_like(weight))
         model.prior_std += 0.1
-    _file.save(model, path)
+    io.save(model, path)
 
 
 def in_blocks(model: BiasModel, start: TurnOn, imu: Imu) -> np.ndarray:
@@ -111,7 +111,7 @@ def in_memory(names: Iterable[str], imu: Imu, rounds: int) -> None:
     for first, row in (("", heads), (f"least of {rounds} rounds", units)):
         print(f"{first:30}" + "".join(f"{word:>12}" for word in row))
     for name in names:
-        model = _file.find_model(name)
+        model = io.find_model(name)
         start, followed = prior(model), following(model)
         apart = float(np.abs(in_blocks(model, start, imu) - one_by_one(model, start, imu)).max())
         assert apart < SAME, apart
@@ -165,7 +165,7 @@ def main() -> None:
     imu = flight(5, duration_s=args.seconds).imu
     print(f"torch {torch.__version__}, {torch.get_num_threads()} thread of {os.cpu_count()} cores", end="")
     print(f", load {os.getloadavg()[0]:.1f}; {args.seconds:g} s at {1 / imu.period_s:.0f} Hz, {len(imu)} samples")
-    in_memory(args.models or sorted(path.stem for path in _file.library().glob("*.safetensors")), imu, args.rounds)
+    in_memory(args.models or sorted(path.stem for path in io.library().glob("*.safetensors")), imu, args.rounds)
     if not args.in_memory:
         as_a_command(args.seconds, args.rounds)
 

@@ -28,11 +28,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from imutool.blind_cases.cases import OPENED, conceal, opened, shown_by_poses
+from imutool.blind_cases.draw import SIZES
+from imutool.blind_cases.effects import CATALOGUE
+from imutool.blind_cases.unnamed import FORMS
 from imutool.errors import DataError, ImutoolError
-from imutool.physics.sealed import OPENED, conceal, opened, shown_by_poses
-from imutool.physics.sealing.draw import SIZES
-from imutool.physics.sealing.effects import CATALOGUE
-from imutool.physics.sealing.unnamed import FORMS
 
 PAIRS, DRIVEN, NOTHING = 36, 15, 20  # in the deck, beside one of each effect and form at each size
 NAVIGATION = {"earth_rotation"}  # shown to no other grade
@@ -89,7 +89,7 @@ def diagnose(folder: Path, with_sim: bool) -> tuple[Path, float, str]:
     """The findings of the command, its seconds, and what it said if it failed."""
     import typer
 
-    from imutool.cli._app import app
+    from imutool.cli.app import app
 
     out = folder / (FOUND if with_sim else f"{FOUND}_alone")
     line = ["diagnose", str(folder / "real.mcap"), "-o", str(out)]

@@ -27,10 +27,10 @@ import numpy as np
 import pyarrow.parquet as pq
 from mcap.writer import CompressionType, Writer
 
-from imutool.mcap_io import schema
-from imutool.mcap_io.encode import encode_imu
+from imutool.mcap_io.codec import schemas
+from imutool.mcap_io.codec.encode import encode_imu
 from imutool.mcap_io.log import Log
-from imutool.physics.flight import flight
+from imutool.sensor.flight import flight
 
 IMAGE_BYTES, IMU_PER_IMAGE = 250_000, 20  # 10 images a second beside 200 Hz
 MODEL = "euroc-adis16448-hybrid"
@@ -107,10 +107,11 @@ def make(path: Path, mb: float, compression: str) -> None:
         out = Writer(file, compression=CompressionType[compression.upper()], chunk_size=1 << 20)
         out.start("ros2")
         kinds = {
-            name: out.register_schema(name, "ros2msg", schema.definition(name).encode()) for name in (schema.IMU, schema.IMAGE)
+            name: out.register_schema(name, "ros2msg", schemas.definition(name).encode())
+            for name in (schemas.IMU, schemas.IMAGE)
         }
-        imu_id = out.register_channel("/imu0", "cdr", kinds[schema.IMU])
-        image_id = out.register_channel("/cam0/image_raw/compressed", "cdr", kinds[schema.IMAGE])
+        imu_id = out.register_channel("/imu0", "cdr", kinds[schemas.IMU])
+        image_id = out.register_channel("/cam0/image_raw/compressed", "cdr", kinds[schemas.IMAGE])
         for k in range(images):
             for row in range(k * IMU_PER_IMAGE, min((k + 1) * IMU_PER_IMAGE, len(imu))):
                 t_ns = int(imu.t_ns[row])

@@ -14,18 +14,18 @@ from pathlib import Path
 
 import numpy as np
 
-from imutool import metrics
 from imutool.bias.hybrid import Model
+from imutool.bias_start.initial_bias import find
+from imutool.bias_start.model_choice import smooth_in_memory
 from imutool.config import load
-from imutool.debias import apply
-from imutool.log_start import smooth_in_memory
+from imutool.debiasing import apply
+from imutool.inertial import metrics
+from imutool.inertial.strapdown import along_truth
 from imutool.mcap_io.read import read
 from imutool.recording import Recording
-from imutool.strapdown import along_truth
-from imutool.train.fit import Training
-from imutool.train.physics_first import PhysicsFirst
-from imutool.train.settings import settings_of
-from imutool.turn_on import find
+from imutool.training.fit import Training
+from imutool.training.physics_first import PhysicsFirst
+from imutool.training.settings import settings_of
 
 STARTS = ("prior", "truth:2", "truth:5", "truth:10", "truth:15", "auto", "smooth")
 

@@ -21,10 +21,10 @@ from jaxtyping import Float64
 from numpy.random import Generator, default_rng
 from scipy.interpolate import make_interp_spline
 
-from imutool.physics.sealed import TRUTH_SCHEMA, log, write_case
-from imutool.physics.sealing import unnamed
-from imutool.physics.sealing.place import achievable, place
-from imutool.physics.sealing.scene import POSE_RATE_HZ, RATE_HZ, SIM_SHARE, stamps_ns
+from imutool.blind_cases import unnamed
+from imutool.blind_cases.cases import TRUTH_SCHEMA, log, write_case
+from imutool.blind_cases.place import achievable, place
+from imutool.blind_cases.scene import POSE_RATE_HZ, RATE_HZ, SIM_SHARE, stamps_ns
 from imutool.recording import GRAVITY_M_S2, Imu, Poses, Scalars
 
 STEP_S = 0.5e-3

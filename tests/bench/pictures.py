@@ -19,11 +19,11 @@ from typing import Any
 
 from PIL import Image
 
-from imutool.view import report
-from imutool.view.rerun import export, layout, scene
-from imutool.view.rerun.palette import RAW_FADE, XYZ, faded
-from imutool.view.rundata import RunData
-from imutool.view.runs import load
+from imutool.viewing.html import report
+from imutool.viewing.model.run_data import RunData
+from imutool.viewing.model.runs import load
+from imutool.viewing.rerun import export, layout, scene
+from imutool.viewing.rerun.entities.palette import RAW_FADE, XYZ, faded
 
 VIEWERS = SimpleNamespace(**runpy.run_path(str(Path(__file__).parents[1] / "viewers.py")))
 

@@ -40,13 +40,13 @@ from sensor_tables import (
     values_table,
 )
 
-from imutool.convert import convert
+from imutool.conversion import convert
+from imutool.diagnosis.diagnose import EVERY_UNIT, measured, remaining
 from imutool.errors import ImutoolError
-from imutool.evaluate import evaluate
-from imutool.physics import physics_file
-from imutool.physics.diagnose import EVERY_UNIT, measured, remaining
-from imutool.physics.physics_file import Entry, PhysicsFile
-from imutool.physics.physics_file import Value as Written
+from imutool.evaluation import evaluate
+from imutool.sensor import physics_file
+from imutool.sensor.physics_file import Entry, PhysicsFile
+from imutool.sensor.physics_file import Value as Written
 
 PAPER = runpy.run_path(str(Path(__file__).parents[2] / "examples/reproduce_tables.py"))
 TRAIN: dict[str, tuple[str, ...]] = PAPER["TRAIN"]

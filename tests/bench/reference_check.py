@@ -18,10 +18,10 @@ from jaxtyping import Float64
 from scipy.signal import butter, sosfiltfilt
 from sensor_tables import markdown
 
+from imutool.diagnosis.alignment import with_truth
+from imutool.diagnosis.gauss_newton import expected
 from imutool.mcap_io.read import read
-from imutool.physics.fit import expected
-from imutool.physics.motion import smooth_motion
-from imutool.physics.pair import with_truth
+from imutool.sensor.trajectory import smooth_motion
 
 SLOW_HZ, FAST_HZ = 0.3, 4.0
 END_S = 3.0  # left out at either end, where a filter that runs both ways has not settled

@@ -31,14 +31,14 @@ import numpy as np
 from mcap.reader import make_reader
 from mcap.writer import CompressionType, Writer
 
-from imutool.mcap_io import schema
+from imutool.mcap_io.added_topics import Made, NewTopic
 from imutool.mcap_io.batches import ImuBatch
-from imutool.mcap_io.derived import Made, NewTopic
-from imutool.mcap_io.digest import sha256
-from imutool.mcap_io.encode import encode_imu, encode_twist, encode_vector3
-from imutool.mcap_io.log_writer import Chunk, LogWriter
-from imutool.mcap_io.records import message_record, message_rows
+from imutool.mcap_io.codec import schemas
+from imutool.mcap_io.codec.encode import encode_imu, encode_twist, encode_vector3
+from imutool.mcap_io.codec.records import message_record, message_rows
 from imutool.mcap_io.rewrite import rewrite
+from imutool.mcap_io.storage.digest import sha256
+from imutool.mcap_io.writer import Chunk, LogWriter
 
 IMU, CAMERA, MONO = "/imu0", "/cam0/image_raw/compressed", "/cam1/image_raw"
 IMAGE = "sensor_msgs/msg/Image"
@@ -55,10 +55,10 @@ class Constant:
 
     source_topic = IMU
     topics = (
-        NewTopic(f"{IMU}/debiased", schema.IMU),
-        NewTopic(f"{IMU}/bias/gyro", schema.VECTOR3),
-        NewTopic(f"{IMU}/bias/accel", schema.VECTOR3),
-        NewTopic(f"{IMU}/bias", schema.TWIST),
+        NewTopic(f"{IMU}/debiased", schemas.IMU),
+        NewTopic(f"{IMU}/bias/gyro", schemas.VECTOR3),
+        NewTopic(f"{IMU}/bias/accel", schemas.VECTOR3),
+        NewTopic(f"{IMU}/bias", schemas.TWIST),
     )
 
     def __call__(self, batch: ImuBatch) -> Made:
@@ -95,9 +95,9 @@ def write_mixed(path: Path, gb: float, packing: str) -> None:
     with path.open("wb") as file:
         writer = Writer(file, compression=PACKINGS[packing])
         writer.start("ros2")
-        kind = writer.register_schema(schema.IMU, "ros2msg", schema.definition(schema.IMU).encode())
+        kind = writer.register_schema(schemas.IMU, "ros2msg", schemas.definition(schemas.IMU).encode())
         imu = writer.register_channel(IMU, "cdr", kind)
-        camera = writer.register_channel(CAMERA, "cdr", writer.register_schema(schema.IMAGE, "ros2msg", b"uint8[] data"))
+        camera = writer.register_channel(CAMERA, "cdr", writer.register_schema(schemas.IMAGE, "ros2msg", b"uint8[] data"))
         mono = writer.register_channel(MONO, "cdr", writer.register_schema(IMAGE, "ros2msg", b"uint8[] data"))
         for k in range(int(gb * PER_GB)):
             t_ns, payloads = imu_rows(IMU_PER_IMAGE * k, IMU_PER_IMAGE)
@@ -114,7 +114,7 @@ def write_apart(path: Path, gb: float, packing: str, *, data_crc: bool) -> None:
     """IMU in chunks of its own, as we write logs."""
     packed, plain = images()
     with LogWriter(path, compression=packing, data_crc=data_crc) as log:
-        imu, camera = log.channel(IMU, schema.IMU), log.channel(CAMERA, schema.IMAGE)
+        imu, camera = log.channel(IMU, schemas.IMU), log.channel(CAMERA, schemas.IMAGE)
         each, pairs = 2_900, 2  # messages of the IMU, and pairs of images, that make a chunk
         for k in range(0, int(gb * PER_GB), pairs):
             if k * IMU_PER_IMAGE % each < pairs * IMU_PER_IMAGE:

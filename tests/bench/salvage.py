@@ -24,10 +24,10 @@ import zstandard
 from mcap.writer import CompressionType, Writer
 
 from imutool.errors import LogError
-from imutool.mcap_io import records, schema
-from imutool.mcap_io.encode import encode_image, encode_imu
+from imutool.mcap_io.codec import records, schemas
+from imutool.mcap_io.codec.encode import encode_image, encode_imu
+from imutool.mcap_io.codec.records import HEAD
 from imutool.mcap_io.log import Log
-from imutool.mcap_io.records import HEAD
 
 COUNT = 2001
 LIMIT_S = 40
@@ -41,8 +41,8 @@ def made(path: Path, megabytes: int, **options: object) -> None:
     with path.open("wb") as file:
         writer = Writer(file, chunk_size=1 << 20, **{"compression": CompressionType.ZSTD, **options})  # type: ignore[arg-type]
         writer.start("ros2")
-        imu = writer.register_schema(schema.IMU, "ros2msg", schema.definition(schema.IMU).encode())
-        camera = writer.register_schema(schema.IMAGE, "ros2msg", schema.definition(schema.IMAGE).encode())
+        imu = writer.register_schema(schemas.IMU, "ros2msg", schemas.definition(schemas.IMU).encode())
+        camera = writer.register_schema(schemas.IMAGE, "ros2msg", schemas.definition(schemas.IMAGE).encode())
         channels = writer.register_channel("/imu0", "cdr", imu), writer.register_channel("/cam0", "cdr", camera)
         for row in range(COUNT):
             t_ns = 10**18 + PERIOD_NS * row

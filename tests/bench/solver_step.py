@@ -13,15 +13,15 @@ from pathlib import Path
 import msgspec
 import torch
 
-from imutool import metrics
-from imutool.bias._base import Segment
-from imutool.bias._file import load
+from imutool.bias.io import load
+from imutool.bias.model import Segment
 from imutool.bias.neural_ode import Model
-from imutool.debias import apply
+from imutool.bias_start.initial_bias import TurnOn, from_truth
+from imutool.debiasing import apply
+from imutool.inertial import metrics
+from imutool.inertial.strapdown import along_truth
 from imutool.mcap_io.read import read
 from imutool.recording import Imu, Recording, seconds
-from imutool.strapdown import along_truth
-from imutool.turn_on import TurnOn, from_truth
 
 
 def main() -> None:

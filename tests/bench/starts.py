@@ -22,18 +22,19 @@ from pathlib import Path
 import numpy as np
 import vqf
 
-from imutool import metrics, turn_on
-from imutool.bias._base import BiasModel, Vector6
-from imutool.bias._file import load
+from imutool.bias.io import load
+from imutool.bias.model import BiasModel, Vector6
+from imutool.bias_start import initial_bias
+from imutool.bias_start.bias_tracking import Samples, Track, followed
+from imutool.bias_start.initial_bias import TurnOn
 from imutool.errors import DataError
+from imutool.inertial import metrics
+from imutool.inertial.strapdown import along_truth
 from imutool.mcap_io.read import read
 from imutool.recording import Imu, Recording, seconds
-from imutool.rest_track import Samples, Track, followed
-from imutool.strapdown import along_truth
-from imutool.train import closed_form
-from imutool.train.corrected import corrected
-from imutool.train.segments import Pool
-from imutool.turn_on import TurnOn
+from imutool.training import closed_form
+from imutool.training.corrected import corrected
+from imutool.training.segments import Pool
 
 CLIP_DEG_S = 20.0
 WINDOW_S = {"gyro": (15.0,), "accel": (2.0,)}
@@ -71,14 +72,14 @@ def score(model: BiasModel, recording: Recording, own: Vector6) -> tuple[list[fl
     """AOE of each way, a word on time, and how far the filter's last gyro bias is from the log's own."""
     imu = recording.imu
     began = time.perf_counter()
-    auto = turn_on.auto(model, imu)
+    auto = initial_bias.auto(model, imu)
     auto.stream(model)(*samples(imu))
     halfway = time.perf_counter()
-    smooth = turn_on.smooth(model, [samples(imu)])
+    smooth = initial_bias.smooth(model, [samples(imu)])
     ended = time.perf_counter()
     starts = {
-        "truth": turn_on.from_truth(model, recording),
-        "prior": turn_on.prior(model),
+        "truth": initial_bias.from_truth(model, recording),
+        "prior": initial_bias.prior(model),
         "rest": at_rest_else_prior(model, imu),
         "VQF": by_vqf(model, imu, offline=False),
         "VQF all": by_vqf(model, imu, offline=True),
@@ -86,7 +87,7 @@ def score(model: BiasModel, recording: Recording, own: Vector6) -> tuple[list[fl
         "smooth": smooth,
         "oracle": TurnOn(own, np.zeros(6), "oracle"),
     }
-    last = list(followed(model, [samples(imu)], turn_on.known(model)))[-1].step.after
+    last = list(followed(model, [samples(imu)], initial_bias.known(model)))[-1].step.after
     row = [aoe(model, starts[column], recording) for column in COLUMNS]
     return row, f"   {halfway - began:.2f} {ended - halfway:.2f}; {auto.how}", (last.bias - own)[:3], last.P[9:12, 9:12]
 
@@ -112,15 +113,15 @@ def own_bias(model: BiasModel, recordings: list[Recording]) -> np.ndarray:
 
 def at_rest_else_prior(model: BiasModel, imu: Imu) -> TurnOn:
     try:
-        return turn_on.at_rest(model, imu)
+        return initial_bias.at_rest(model, imu)
     except DataError:
-        return turn_on.prior(model)
+        return initial_bias.prior(model)
 
 
 def by_vqf(model: BiasModel, imu: Imu, *, offline: bool) -> TurnOn:
     """VQF's bias at every sample, on top of the prior's mean."""
     t_s, gyro, accel = samples(imu)
-    start = turn_on.prior(model)
+    start = initial_bias.prior(model)
     bias = model.stream(start.rest)(t_s, gyro, accel)
     rate, force = np.ascontiguousarray(gyro - bias[:, :3]), np.ascontiguousarray(accel - bias[:, 3:])
     settings = {"biasClip": CLIP_DEG_S}

@@ -19,14 +19,14 @@ from pathlib import Path
 import numpy as np
 from mcap.writer import CompressionType, Writer
 
-from imutool import place as places
-from imutool.debias import debias
-from imutool.mcap_io import schema
-from imutool.mcap_io.digest import sha256
-from imutool.mcap_io.encode import encode_imu
+from imutool import location as places
+from imutool.debiasing import debias
+from imutool.location import place
+from imutool.mcap_io.codec import schemas
+from imutool.mcap_io.codec.encode import encode_imu
 from imutool.mcap_io.log import Log
 from imutool.mcap_io.rewrite import rewrite
-from imutool.place import place
+from imutool.mcap_io.storage.digest import sha256
 
 MIB = 1 << 20
 SECONDS, RATE_HZ, IMAGE_BYTES = 6, 200, 200_000
@@ -43,7 +43,7 @@ def mixed(path: Path) -> Path:
         writer = Writer(file, compression=CompressionType.LZ4)
         writer.start("ros2")
         imu = writer.register_channel(
-            "/imu0", "cdr", writer.register_schema(schema.IMU, "ros2msg", schema.definition(schema.IMU).encode())
+            "/imu0", "cdr", writer.register_schema(schemas.IMU, "ros2msg", schemas.definition(schemas.IMU).encode())
         )
         images = writer.register_channel("/cam0", "raw", 0)
         for row, time_ns in enumerate(t_ns.tolist()):

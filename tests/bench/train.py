@@ -3,8 +3,8 @@
 All contestants take 1000 segments of 16 samples (the paper's batch), gyro stage and accel stage:
 
 (a) fast path: what `imutool train` does with such windows. The rest bias is integrated on the grid of the drift, the
-    curve is one evaluation for all samples, rotations are a product taken as a tree (`imutool.train.loss`).
-(b) chart ODE: the paper's joint form through `imutool.ode.integrate` with Euler, one step a sample, of the same field with
+    curve is one evaluation for all samples, rotations are a product taken as a tree (`imutool.training.loss`).
+(b) chart ODE: the paper's joint form through `imutool.bias.ode.integrate` with Euler, one step a sample, of the same field with
     the same parts of the same model: state (xi, beta_g), in the accel stage (xi, beta_g, beta_a, v, p) with the gyro frozen.
 (c) with `--released DIR`, the paper's own code, run by its own training functions. DIR holds its BiasDy, SO3diffeq and
     Third_party; nothing in it is edited, and nothing of it is kept here:
@@ -43,17 +43,17 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from imutool import so3
-from imutool.bias._base import COLUMNS, BiasModel, Sensor
+from imutool.bias.model import COLUMNS, BiasModel, Sensor
+from imutool.bias.ode import HermitePath, Method, integrate
 from imutool.demo import write_asl
-from imutool.ode import HermitePath, Method, integrate
-from imutool.physics.flight import flight
+from imutool.geometry import so3
+from imutool.inertial.strapdown import GRAVITY_W
+from imutool.inertial.windows import end_attitude
 from imutool.recording import Recording
-from imutool.strapdown import GRAVITY_W
-from imutool.train.fit import Training, TrainSettings
-from imutool.train.loss import RobustLoss, error
-from imutool.train.segments import Windows
-from imutool.windows import end_attitude
+from imutool.sensor.flight import flight
+from imutool.training.fit import Training, TrainSettings
+from imutool.training.loss import RobustLoss, error
+from imutool.training.segments import Windows
 
 STAGES: tuple[Sensor, Sensor] = ("gyro", "accel")
 UNITS = {"gyro": "rad", "accel": "m/s"}
@@ -141,7 +141,7 @@ def our_step(recording: Recording, sensor: Sensor, batches: list[Batch], measure
 
 
 def chart_solution(model: BiasModel, sensor: Sensor, windows: Windows, method: Method) -> tuple[Tensor, Tensor]:
-    """Attitudes and states of all samples, by the ODE in the chart (`imutool.ode`): the segments share one clock."""
+    """Attitudes and states of all samples, by the ODE in the chart (`imutool.bias.ode`): the segments share one clock."""
     segment = windows.segment
     t = segment.t[0]
     gyro, accel = HermitePath(t, segment.gyro), HermitePath(t, segment.accel)
@@ -168,7 +168,7 @@ def chart_solution(model: BiasModel, sensor: Sensor, windows: Windows, method: M
 
 
 def chart_error(model: BiasModel, sensor: Sensor, windows: Windows, method: Method = "euler") -> Tensor:
-    """The error of `imutool.train.loss` at the end of each window, of the chart's solution."""
+    """The error of `imutool.training.loss` at the end of each window, of the chart's solution."""
     R_wb, state = chart_solution(model, sensor, windows, method)
     if sensor == "gyro":
         return (so3.log(R_wb[-1].mT @ windows.R_end).square().sum(1) + 1e-24).sqrt()

@@ -1,6 +1,6 @@
 """How late the truth is behind the gyro, under two rules of integration: `python tests/bench/truth_delay.py LOG...`.
 
-Held: each sample holds until the next (Euler). Mean: a step sees the mean of its two ends (`imutool.windows`). A truth that
+Held: each sample holds until the next (Euler). Mean: a step sees the mean of its two ends (`imutool.inertial.windows`). A truth that
 is late by tau adds omega_end tau - dR^T omega_start tau to the residual of a window; tau is fitted robustly over windows of
 one second, each log's bias solved for first. Prints tau in ms and the median residual in degrees with tau taken out.
 """
@@ -13,12 +13,12 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from imutool import so3
 from imutool.bias.linear import Model
+from imutool.geometry import so3
+from imutool.inertial.windows import rotation_residual, whole_product
 from imutool.mcap_io.read import read
-from imutool.train import closed_form
-from imutool.train.segments import Pool
-from imutool.windows import rotation_residual, whole_product
+from imutool.training import closed_form
+from imutool.training.segments import Pool
 
 WINDOW_S = 1.0
 

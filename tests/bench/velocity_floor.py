@@ -17,12 +17,12 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float64
 
-from imutool.bias._file import load
-from imutool.debias import apply
+from imutool.bias.io import load
+from imutool.bias_start.initial_bias import find
+from imutool.debiasing import apply
+from imutool.inertial.strapdown import GRAVITY_W, Start, along_truth, dead_reckon, drift, with_velocity
 from imutool.mcap_io.read import read
 from imutool.recording import Imu, Poses, Recording, seconds
-from imutool.strapdown import GRAVITY_W, Start, along_truth, dead_reckon, drift, with_velocity
-from imutool.turn_on import find
 
 WINDOW_S, EVERY_S = 5.0, 1.0
 CONSTANTS = 27

@@ -1,7 +1,7 @@
 """What it costs to make a log ready to be looked at: `python tests/bench/view.py [--minutes 60] [--profile]`.
 
 A made-up log of that length at 200 Hz, truth at 200 Hz too and a debiased channel in it, in a temporary folder. Prints seconds
-of `imutool.view.runs.load` (all of it), of `rundata.build` (its last part: paths, errors, drift, windows, spectra, events), and
+of `imutool.viewing.model.runs.load` (all of it), of `rundata.build` (its last part: paths, errors, drift, windows, spectra, events), and
 how much memory the process took at most beyond what the imports take. On one core, the log in the page cache.
 
 Then the viewer, Rerun's own without a window and drawing in software (the slowest that there is): seconds until everything is
@@ -28,13 +28,13 @@ from typing import Any
 
 from imutool.mcap_io.read import read
 from imutool.mcap_io.write import write
-from imutool.physics.flight import flight
-from imutool.view import rundata, runs
-from imutool.view.rerun import layout, scene
+from imutool.sensor.flight import flight
+from imutool.viewing.model import run_data, runs
+from imutool.viewing.rerun import layout, scene
 
 TESTS = Path(__file__).parents[1]
 VIEWERS = SimpleNamespace(**runpy.run_path(str(TESTS / "viewers.py")))
-VIEWS = SimpleNamespace(**runpy.run_path(str(TESTS / "view" / "rrd.py")))
+VIEWS = SimpleNamespace(**runpy.run_path(str(TESTS / "viewing" / "rrd.py")))
 
 RATE_HZ = 200.0
 GIVE_UP_S = 120.0
@@ -43,7 +43,7 @@ DRAWN = 5000  # pixels in colour, of a plot of some 400 000: an hour of six curv
 
 def write_long(folder: Path, minutes: float) -> Path:
     """A made-up log so long, debiased by its means at rest."""
-    from imutool.debias import debias
+    from imutool.debiasing import debias
 
     write(flight(1, duration_s=60.0 * minutes, rate_hz=RATE_HZ, truth_rate_hz=RATE_HZ), folder / "raw.mcap")
     debias(folder / "raw.mcap", folder / "long.mcap", model="static")
@@ -71,13 +71,13 @@ def measure(log: Path, profile: bool) -> dict[str, float]:
     read_only = [trace.run for trace in data.traces]
     recording = read(log)
     began = time.perf_counter()
-    rundata.build(recording, read_only)
+    run_data.build(recording, read_only)
     built_s = time.perf_counter() - began
     costs = {"samples": len(recording.imu), "runs": len(read_only), "load_s": loaded_s, "build_s": built_s, "more_mb": more_mb}
     return costs | look(data)
 
 
-def look(data: rundata.RunData) -> dict[str, float]:
+def look(data: run_data.RunData) -> dict[str, float]:
     """Seconds and memory of the viewer; nothing where there is no driver to draw with."""
     if VIEWERS.driver() is None:
         print(f"no viewer: apt-get install {' '.join(VIEWERS.PACKAGES['driver'])}", file=sys.stderr)

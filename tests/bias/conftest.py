@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from imutool import registry
-from imutool.bias._base import BiasModel, Segment
+from imutool.bias.model import BiasModel, Segment
 
 RATE_HZ = 200.0
 

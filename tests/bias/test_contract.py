@@ -19,9 +19,9 @@ from safetensors import safe_open
 from safetensors.torch import save_file
 
 from imutool import registry
-from imutool.bias import _file
-from imutool.bias._base import SENSORS, BiasModel, Segment
-from imutool.bias._file import MAX_BYTES, check_rate, find_model, header_of, load, save
+from imutool.bias import io
+from imutool.bias.io import MAX_BYTES, check_rate, find_model, header_of, load, save
+from imutool.bias.model import SENSORS, BiasModel, Segment
 from imutool.errors import ConfigError, ModelError
 
 MakeSegment = Callable[..., Segment]
@@ -177,7 +177,7 @@ def test_it_comes_back_from_its_file_in_single_precision(model: BiasModel, saved
         assert torch.equal(kept, value.float().double()), name
     assert not any(weight.requires_grad for weight in back.parameters())
     assert not back.training
-    assert (back.card["name"], back.card["sha256"]) == (model.method, _file.digest(saved))
+    assert (back.card["name"], back.card["sha256"]) == (model.method, io.digest(saved))
     seen = segment(11, 2, 300)
     torch.testing.assert_close(back(seen), model(seen), rtol=1e-5, atol=1e-6)  # float32 keeps seven digits
 
@@ -349,9 +349,9 @@ def test_a_header_cannot_name_a_module_outside_the_models(saved: Path) -> None:
 
 
 def test_models_that_ship_are_found_by_name(saved: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.setattr(_file, "library", lambda: saved.parent)
+    monkeypatch.setattr(io, "library", lambda: saved.parent)
     monkeypatch.chdir("/")
-    assert find_model(saved.stem).card["sha256"] == _file.digest(saved)
+    assert find_model(saved.stem).card["sha256"] == io.digest(saved)
     assert find_model(saved).card["name"] == saved.stem
     with pytest.raises(ModelError, match=f"no model '{saved.stem}x'.*Did you mean '{saved.stem}'"):
         find_model(f"{saved.stem}x")

@@ -15,9 +15,9 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from imutool.bias._base import COLUMNS, SENSORS, BiasModel, Segment, Sensor
-from imutool.bias._file import load, save
 from imutool.bias.conv import BLOCK, LEAST_SCALE, Config, Layer, Model, Net
+from imutool.bias.io import load, save
+from imutool.bias.model import COLUMNS, SENSORS, BiasModel, Segment, Sensor
 from imutool.errors import ConfigError
 
 MakeSegment = Callable[..., Segment]

@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 from imutool.bias import linear
-from imutool.bias._file import MAX_SETTINGS, find_model, header_of, load, save
+from imutool.bias.io import MAX_SETTINGS, find_model, header_of, load, save
 from imutool.errors import ModelError
 
 MEMORY_BOUND = 200 << 20  # of address space beyond what is used; the models asked for here would take gigabytes

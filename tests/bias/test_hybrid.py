@@ -10,16 +10,16 @@ import pytest
 import torch
 
 from imutool.bias import hybrid, neural_ode
-from imutool.bias._base import COLUMNS, SENSORS, BiasModel, OneByOne, Segment, Sensor
-from imutool.bias._file import load, save
+from imutool.bias.io import load, save
+from imutool.bias.model import COLUMNS, SENSORS, BiasModel, OneByOne, Segment, Sensor
+from imutool.bias_start.initial_bias import prior
 from imutool.config import build as build_settings
-from imutool.debias import OnlineDebiaser, apply
+from imutool.debiasing import OnlineDebiaser, apply
 from imutool.errors import ConfigError, ModelError
-from imutool.physics.effects._base import compiled
-from imutool.physics.effects._catalogue import known, named
-from imutool.physics.signals import SignalFilter
 from imutool.recording import Imu
-from imutool.turn_on import prior
+from imutool.sensor.catalogue import known, named
+from imutool.sensor.linear_effect import compiled
+from imutool.sensor.signals import SignalFilter
 
 MakeModel, MakeSegment = Callable[..., BiasModel], Callable[..., Segment]
 RATE_HZ = 200.0
@@ -207,7 +207,7 @@ def test_the_context_is_as_long_as_the_filters_remember(build: MakeModel, segmen
 
 
 def test_it_does_not_start_from_a_matrix(build: MakeModel) -> None:
-    with pytest.raises(ConfigError, match=r"does not start from a matrix.*imutool.train.run.train"):
+    with pytest.raises(ConfigError, match=r"does not start from a matrix.*imutool.training.run.train"):
         build("hybrid").begin_at("gyro", torch.eye(3, dtype=torch.float64))
 
 

@@ -11,14 +11,14 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from imutool import so3
-from imutool.bias._base import COLUMNS, BiasModel, Segment, Sensor
-from imutool.bias._neural_stream import Curves
+from imutool.bias.model import COLUMNS, BiasModel, Segment, Sensor
 from imutool.bias.neural_ode import DRIFT_SEES_S, SLOW_S, Config, Curve, Drift, Model
-from imutool.ode import HermitePath, integrate
-from imutool.physics.flight import flight
+from imutool.bias.neural_stream import Curves
+from imutool.bias.ode import HermitePath, integrate
+from imutool.geometry import so3
+from imutool.inertial.windows import attitudes
 from imutool.recording import seconds
-from imutool.windows import attitudes
+from imutool.sensor.flight import flight
 
 RATE_HZ = 200.0
 SECONDS = 20.0

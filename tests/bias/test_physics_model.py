@@ -10,20 +10,19 @@ import numpy as np
 import pytest
 import torch
 
-from imutool.bias._base import Segment
-from imutool.bias._file import find_model
-from imutool.bias._physics_file import MOST_TAU_S, Model
-from imutool.debias import apply, debias
+from imutool.bias.io import find_model
+from imutool.bias.model import Segment
+from imutool.bias.physics_model import MOST_TAU_S, Model
+from imutool.bias_start.initial_bias import prior
+from imutool.debiasing import apply, debias
 from imutool.errors import ConfigError, ModelError
 from imutool.mcap_io.read import read
 from imutool.mcap_io.write import write
-from imutool.physics import physics_file
-from imutool.physics.effects import _catalogue
-from imutool.physics.flight import flight
-from imutool.physics.physics_file import Bias, Curve, Entry, PhysicsFile, Term, Value
-from imutool.physics.simulate import simulate
 from imutool.recording import Imu, Recording, seconds
-from imutool.turn_on import prior
+from imutool.sensor import catalogue, physics_file
+from imutool.sensor.flight import flight
+from imutool.sensor.physics_file import Bias, Curve, Entry, PhysicsFile, Term, Value
+from imutool.sensor.simulate import simulate
 
 RATE_HZ = 200.0
 BIAS = Bias(gyro=(0.05, -0.03, 0.02), accel=(0.2, -0.1, 0.3))
@@ -49,7 +48,7 @@ EFFECTS: Mapping[str, tuple[Mapping[str, float], float]] = {
 
 
 def entry(name: str, values: Mapping[str, float], std: float | None = None) -> Entry:
-    (physics,) = _catalogue.physics([name])
+    (physics,) = catalogue.physics([name])
     units = {number.name: number.unit for number in physics.parameters}
     return Entry(name=name, parameters={key: Value(value=v, std=std, unit=units[key]) for key, v in values.items()})
 

@@ -7,10 +7,10 @@ from pathlib import Path
 
 import pytest
 
-from imutool.bias._file import find_model, header_of, library, load, shipped_for
-from imutool.convert import convert
-from imutool.debias import debias
-from imutool.evaluate import evaluate
+from imutool.bias.io import find_model, header_of, library, load, shipped_for
+from imutool.conversion import convert
+from imutool.debiasing import debias
+from imutool.evaluation import evaluate
 from imutool.mcap_io.log import Log
 
 MODELS = sorted(library().glob("*.safetensors"))

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from converters import _table, euroc, fetch, tum_vi
+from imutool.converters import _table, euroc, fetch, tum_vi
 from imutool.errors import DataError
 
 PARSE_LIMIT_S = 1.0  # 30 000 rows of 17 columns take about 0.1 s here; ten times that would be felt on every conversion

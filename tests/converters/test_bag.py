@@ -12,7 +12,7 @@ import pytest
 from rosbags.rosbag1 import Writer
 from rosbags.typesys import Stores, get_typestore
 
-from converters import euroc, fetch, tum_vi
+from imutool.converters import euroc, fetch, tum_vi
 from imutool.errors import ConfigError, DataError
 
 STORE = get_typestore(Stores.ROS1_NOETIC)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from converters import euroc, fetch, tum_vi
+from imutool.converters import euroc, fetch, tum_vi
 
 # name: IMU rows, true poses, first IMU stamp (ns) as printed in the file, whether the truth has velocity and biases
 EXPECTED = {

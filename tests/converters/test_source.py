@@ -12,8 +12,8 @@ from pathlib import Path
 
 import pytest
 
-from converters import _archive, euroc
-from converters._source import find
+from imutool.converters import _archive, euroc
+from imutool.converters._source import find
 from imutool.errors import DataError
 
 MEMORY_BOUND = 64 << 20  # far below what the bombs here unpack to, well above what reading a small archive takes

@@ -14,7 +14,7 @@ import pytest
 from imutool.fleet.engine import Engine
 from imutool.mcap_io.write import write
 
-PLANTED = SimpleNamespace(**runpy.run_path(str(Path(__file__).parents[1] / "physics" / "planted.py")))
+PLANTED = SimpleNamespace(**runpy.run_path(str(Path(__file__).parents[1] / "diagnosis" / "planted.py")))
 LOG_S = 10.0  # below eight nothing is told
 Robot = Callable[[Path, int, Mapping[str, Sequence[float]]], None]
 

@@ -19,9 +19,9 @@ import pyarrow.parquet as pq
 import pytest
 from typer.testing import CliRunner
 
-from imutool.clean import Rules
+from imutool.cleaning import Rules
 from imutool.cli import app
-from imutool.debias import debias
+from imutool.debiasing import debias
 from imutool.errors import ConfigError
 from imutool.fleet.engine import Engine
 from imutool.fleet.journal import NAME
@@ -29,8 +29,8 @@ from imutool.fleet.models import settled
 from imutool.fleet.run import Tally, run
 from imutool.fleet.task import Result, Settings, Task
 from imutool.fleet.work import work
-from imutool.mcap_io.digest import sha256
-from imutool.place import place
+from imutool.location import place
+from imutool.mcap_io.storage.digest import sha256
 
 Workers = Callable[[], Engine]
 SOON_S = 60.0

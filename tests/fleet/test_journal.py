@@ -14,7 +14,7 @@ from imutool.errors import ConfigError
 from imutool.fleet import journal as journals
 from imutool.fleet.journal import NAME, Journal
 from imutool.fleet.task import Result, Settings, Source
-from imutool.place import Place, place
+from imutool.location import Place, place
 
 SETTINGS = Settings(command="debias", model="m", model_sha256="1")
 OTHER = msgspec.structs.replace(SETTINGS, init="prior")

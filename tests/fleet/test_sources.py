@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from imutool.errors import ConfigError
 from imutool.fleet.sources import LONGEST, find, leftovers, relative, remove, within
-from imutool.place import identity, place
+from imutool.location import identity, place
 
 NOWHERE = Path("/nowhere")
 

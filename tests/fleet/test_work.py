@@ -14,15 +14,15 @@ from rosbags.rosbag1 import Reader, Writer
 from rosbags.typesys import Stores, get_typestore
 
 from imutool.bag.repair import repair_bag
-from imutool.clean import Rules
-from imutool.debias import debias
+from imutool.cleaning import Rules
+from imutool.debiasing import debias
 from imutool.errors import ConfigError
 from imutool.fleet.models import settled
 from imutool.fleet.sources import find
 from imutool.fleet.task import Result, Settings, Source, Task
 from imutool.fleet.work import called, robot_of, robot_pattern, work
-from imutool.mcap_io.digest import sha256
 from imutool.mcap_io.read import read
+from imutool.mcap_io.storage.digest import sha256
 from imutool.mcap_io.write import write
 
 

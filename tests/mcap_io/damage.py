@@ -17,11 +17,11 @@ from pathlib import Path
 from mcap.reader import make_reader
 
 from imutool.errors import LogError
-from imutool.mcap_io import records
+from imutool.mcap_io.codec import records
+from imutool.mcap_io.codec.records import HEAD
 from imutool.mcap_io.log import Log
 from imutool.mcap_io.losses import told
-from imutool.mcap_io.records import HEAD
-from imutool.mcap_io.salvage import repair
+from imutool.mcap_io.repair import repair
 
 Message = tuple[str, int, int, int, bytes]  # topic, log time, publish time, sequence, payload
 

@@ -16,11 +16,11 @@ from mcap.writer import CompressionType, Writer
 from mcap_ros2.writer import Writer as Ros2Writer
 from rosbags.typesys import Stores, get_typestore
 
+from imutool.diagnosis.scalar.diagnose import diagnose_signal
 from imutool.errors import LogError
-from imutool.mcap_io import ros2msg
+from imutool.mcap_io.codec import ros2_definition
 from imutool.mcap_io.fields import numeric_fields, others, read_field, read_fields
 from imutool.mcap_io.log import Log
-from imutool.physics.any_signal import diagnose_signal
 
 START_NS = 1_700_000_000_123_456_789
 PERIOD_NS = 20_000_000
@@ -292,7 +292,9 @@ def test_hostile_definitions_and_messages_are_refused_in_bounded_work(
 def test_random_definitions_and_payloads_raise_nothing_but_our_own(definition: bytes, payload: bytes) -> None:
     size = len(payload)
     with suppress(LogError):
-        for leaf in ros2msg.Walk(CDR + payload, ros2msg.parse("a/msg/A", b"float64[] q\n" + definition)).leaves():
+        for leaf in ros2_definition.Walk(
+            CDR + payload, ros2_definition.parse("a/msg/A", b"float64[] q\n" + definition)
+        ).leaves():
             assert 4 <= leaf.offset <= leaf.offset + int(leaf.kind[1]) * (leaf.length or 0) <= 4 + size
 
 
@@ -314,7 +316,7 @@ string frame_id
 MSG: a/Inner
 float32 v
 """
-    fields = ros2msg.parse("a/msg/A", text)["a/A"]
+    fields = ros2_definition.parse("a/msg/A", text)["a/A"]
     assert [tuple(field) for field in fields] == [
         ("header", "std_msgs/Header", None),
         ("few", "float64", 0),

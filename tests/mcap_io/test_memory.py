@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from imutool.mcap_io.memory import keep_buffers
+from imutool.mcap_io.storage.memory import keep_buffers
 from imutool.mcap_io.write import write
 from imutool.recording import Frames, Imu, Recording
 

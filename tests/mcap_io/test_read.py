@@ -15,15 +15,15 @@ import numpy as np
 import pytest
 
 from imutool.errors import ConfigError, LogError
-from imutool.mcap_io import schema
-from imutool.mcap_io.decode import decode_imu
-from imutool.mcap_io.encode import encode_imu, encode_pose, encode_vector3
+from imutool.mcap_io.codec import schemas
+from imutool.mcap_io.codec.decode import decode_imu
+from imutool.mcap_io.codec.encode import encode_imu, encode_pose, encode_vector3
+from imutool.mcap_io.index import Structure
 from imutool.mcap_io.log import Log
-from imutool.mcap_io.log_writer import LogWriter
 from imutool.mcap_io.read import VELOCITY_KEY, read
-from imutool.mcap_io.structure import Structure
 from imutool.mcap_io.topics import DERIVED_KEY
 from imutool.mcap_io.write import Series, chunks, write
+from imutool.mcap_io.writer import LogWriter
 from imutool.recording import Imu, Recording
 
 START_NS = 1_403_638_128_245_096_960
@@ -35,10 +35,10 @@ Make = Callable[..., bytes]
 def imu_messages(make: Make, topic: str = "/imu", count: int = 20, **options: Any) -> list[Message]:
     values = np.arange(3.0 * count).reshape(count, 3)
     stamps = [START_NS + 10_000_000 * i for i in range(count)]
-    return [(topic, schema.IMU, t, t, i, make(schema.IMU, t, values[i], -values[i], **options)) for i, t in enumerate(stamps)]
+    return [(topic, schemas.IMU, t, t, i, make(schemas.IMU, t, values[i], -values[i], **options)) for i, t in enumerate(stamps)]
 
 
-def poses(make: Make, topic: str, kind: str = schema.POSE, count: int = 5, **options: Any) -> list[Message]:
+def poses(make: Make, topic: str, kind: str = schemas.POSE, count: int = 5, **options: Any) -> list[Message]:
     q = np.array([0.5, -0.5, 0.5, 0.5])
     each = [(START_NS + 10_000_000 * i + 3, np.array([i, 2.0, 3.0])) for i in range(count)]
     return [(topic, kind, t, t, i, make(kind, t, p, q, **options)) for i, (t, p) in enumerate(each)]
@@ -78,7 +78,7 @@ def test_time_of_a_recording_is_the_stamp_and_selection_is_by_log_time(foreign: 
     assert recording.imu.t_ns.tolist() == [START_NS + 5_000_000 * i for i in range(100, 200)]
 
 
-@pytest.mark.parametrize("kind", [schema.POSE, schema.ODOMETRY, schema.TRANSFORM])
+@pytest.mark.parametrize("kind", [schemas.POSE, schemas.ODOMETRY, schemas.TRANSFORM])
 def test_truth_comes_from_any_pose_message(foreign: Foreign, make: Make, kind: str) -> None:
     recording = read(foreign(imu_messages(make) + poses(make, "/odom", kind)))
     truth = recording.truths["/odom"]
@@ -90,7 +90,7 @@ def test_truth_comes_from_any_pose_message(foreign: Foreign, make: Make, kind: s
 def tree(make: Make, children: list[str], count: int = 4) -> list[Message]:
     q = np.array([1.0, 0, 0, 0])
     return [
-        ("/tf", schema.TF, t, t, 0, make(schema.TF, t, *[(np.array([k, 0.0, 0]), q, c) for k, c in enumerate(children)]))
+        ("/tf", schemas.TF, t, t, 0, make(schemas.TF, t, *[(np.array([k, 0.0, 0]), q, c) for k, c in enumerate(children)]))
         for t in (START_NS + 1 + i for i in range(count))
     ]
 
@@ -111,13 +111,13 @@ def test_transforms_are_truths_by_child_frame_only_without_a_pose_topic(foreign:
 
 
 def test_ros1_messages_in_mcap_read_as_ros2_ones_do(foreign: Foreign, make: Make) -> None:
-    messages = imu_messages(make, ros1=True) + poses(make, "/vicon", schema.TRANSFORM, ros1=True)
+    messages = imu_messages(make, ros1=True) + poses(make, "/vicon", schemas.TRANSFORM, ros1=True)
     path = foreign(messages, ros1=True)
-    twin = foreign(imu_messages(make) + poses(make, "/vicon", schema.TRANSFORM), name="twin")
+    twin = foreign(imu_messages(make) + poses(make, "/vicon", schemas.TRANSFORM), name="twin")
     with Log(path) as log:
         assert (log.profile, log.imu_topics) == ("ros1", ["/imu"])
         topic = log.topics["/imu"]
-        assert (topic.schema_name, topic.schema_encoding, topic.message_encoding) == (schema.IMU, "ros1msg", "ros1")
+        assert (topic.schema_name, topic.schema_encoding, topic.message_encoding) == (schemas.IMU, "ros1msg", "ros1")
     assert read(path).imu == read(twin).imu
     assert read(path).truths == read(twin).truths
 
@@ -125,12 +125,13 @@ def test_ros1_messages_in_mcap_read_as_ros2_ones_do(foreign: Foreign, make: Make
 def test_quaternions_off_by_more_than_a_recording_takes_are_made_unit(foreign: Foreign, make: Make) -> None:
     q = [np.array([0.5, 0.5, 0.5, 0.5]) * (1 + e) for e in (0, 9e-7, 1e-4)]
     messages = [
-        ("/p", schema.POSE, START_NS + i, START_NS + i, i, make(schema.POSE, START_NS + i, np.zeros(3), q[i])) for i in range(3)
+        ("/p", schemas.POSE, START_NS + i, START_NS + i, i, make(schemas.POSE, START_NS + i, np.zeros(3), q[i]))
+        for i in range(3)
     ]
     truth = read(foreign(imu_messages(make) + messages)).truths["/p"]
     assert truth.q_wb_wxyz[:2].tobytes() == np.array(q[:2]).tobytes()
     assert np.linalg.norm(truth.q_wb_wxyz[2]) == pytest.approx(1.0, abs=1e-15)
-    zero = ("/p", schema.POSE, START_NS + 9, 0, 9, make(schema.POSE, START_NS + 9, np.zeros(3), np.zeros(4)))
+    zero = ("/p", schemas.POSE, START_NS + 9, 0, 9, make(schemas.POSE, START_NS + 9, np.zeros(3), np.zeros(4)))
     with pytest.raises(LogError, match=r"/p: quaternion \[0.0, 0.0, 0.0, 0.0\] in row 3"):
         read(foreign([*imu_messages(make), *messages, zero], name="zero"))
 
@@ -140,7 +141,7 @@ def test_our_own_derived_channels_are_no_imus_but_can_be_named(recording: Record
     imu = recording.imu
     with LogWriter(path) as log:
         for topic, metadata, gyro in (("/imu0", {}, imu.gyro), ("/imu0/debiased", {DERIVED_KEY: "/imu0"}, imu.gyro + 1)):
-            channel = log.channel(topic, schema.IMU, metadata)
+            channel = log.channel(topic, schemas.IMU, metadata)
             series = Series(channel, imu.t_ns, (imu.t_ns, gyro, imu.accel), lambda t, g, a: encode_imu(t, g, a, "b"))
             for chunk in chunks([series]):
                 log.chunk(chunk)
@@ -161,8 +162,8 @@ def test_scalars_a_recording_cannot_hold_are_left_out_and_named(
     foreign: Foreign, make: Make, caplog: pytest.LogCaptureFixture
 ) -> None:
     values = [1.0, float("nan"), 2.0]
-    bad = [("/battery", schema.FLOAT, START_NS + i, START_NS + i, i, make(schema.FLOAT, 0, v)) for i, v in enumerate(values)]
-    good = [("/height", schema.FLOAT, START_NS + i, START_NS + i, i, make(schema.FLOAT, 0, 1.0)) for i in range(3)]
+    bad = [("/battery", schemas.FLOAT, START_NS + i, START_NS + i, i, make(schemas.FLOAT, 0, v)) for i, v in enumerate(values)]
+    good = [("/height", schemas.FLOAT, START_NS + i, START_NS + i, i, make(schemas.FLOAT, 0, 1.0)) for i in range(3)]
     with caplog.at_level(logging.WARNING):
         recording = read(foreign(imu_messages(make) + bad + good))
     assert list(recording.scalars) == ["/height"]
@@ -368,10 +369,10 @@ def test_a_stamp_that_does_not_increase_names_message_and_stamps(foreign: Foreig
 def test_nan_and_infinity_in_imu_or_truth_are_refused(foreign: Foreign, make: Make, bad: float) -> None:
     messages = imu_messages(make)
     t = messages[7][2]
-    messages[7] = ("/imu", schema.IMU, t, t, 7, make(schema.IMU, t, np.zeros(3), np.array([0, bad, 0])))
+    messages[7] = ("/imu", schemas.IMU, t, t, 7, make(schemas.IMU, t, np.zeros(3), np.array([0, bad, 0])))
     with pytest.raises(LogError, match=r"/imu: message 7 has linear_acceleration \[0.0, (nan|inf), 0.0\]"):
         read(foreign(messages))
-    pose = ("/mocap", schema.POSE, t, t, 0, make(schema.POSE, t, np.array([bad, 0, 0]), np.ones(4) / 2))
+    pose = ("/mocap", schemas.POSE, t, t, 0, make(schemas.POSE, t, np.array([bad, 0, 0]), np.ones(4) / 2))
     with pytest.raises(LogError, match=r"/mocap: message 0 has position \[(nan|inf), 0.0, 0.0\]"):
         read(foreign([*imu_messages(make), pose], name="pose"))
 
@@ -381,10 +382,10 @@ def test_velocities_that_do_not_belong_to_their_poses_are_refused(tmp_path: Path
     t_ns, zeros, q_wxyz = np.array([1, 2, 3]), np.zeros((3, 3)), np.tile([1.0, 0, 0, 0], (3, 1))
     with LogWriter(path) as log:
         group = [
-            Series(log.channel("/imu", schema.IMU), t_ns, (t_ns, zeros, zeros), partial(encode_imu, frame_id="b")),
-            Series(log.channel("/p", schema.POSE), t_ns, (t_ns, zeros, q_wxyz), partial(encode_pose, frame_id="w")),
+            Series(log.channel("/imu", schemas.IMU), t_ns, (t_ns, zeros, zeros), partial(encode_imu, frame_id="b")),
+            Series(log.channel("/p", schemas.POSE), t_ns, (t_ns, zeros, q_wxyz), partial(encode_pose, frame_id="w")),
             Series(
-                log.channel("/v", schema.VECTOR3, {VELOCITY_KEY: "/p"}),
+                log.channel("/v", schemas.VECTOR3, {VELOCITY_KEY: "/p"}),
                 t_ns,
                 (t_ns + 1, zeros),
                 partial(encode_vector3, frame_id="w"),

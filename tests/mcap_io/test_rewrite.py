@@ -17,15 +17,15 @@ from mcap.stream_reader import StreamReader
 from rosbags.highlevel import AnyReader
 
 from imutool.errors import ConfigError, LogError
-from imutool.mcap_io import schema
+from imutool.mcap_io.added_topics import Made, NewTopic
 from imutool.mcap_io.batches import Clock, ImuBatch
-from imutool.mcap_io.decode import decode_imu
-from imutool.mcap_io.derived import Made, NewTopic
-from imutool.mcap_io.digest import sha256
-from imutool.mcap_io.encode import encode_imu, encode_vector3
+from imutool.mcap_io.codec import schemas as schema
+from imutool.mcap_io.codec.decode import decode_imu
+from imutool.mcap_io.codec.encode import encode_imu, encode_vector3
 from imutool.mcap_io.log import Log
 from imutool.mcap_io.read import read
 from imutool.mcap_io.rewrite import rewrite
+from imutool.mcap_io.storage.digest import sha256
 from imutool.mcap_io.topics import DERIVED_KEY
 from imutool.mcap_io.verify import verify
 from imutool.mcap_io.write import write

@@ -27,13 +27,14 @@ from mcap.stream_reader import StreamReader
 from rosbags.highlevel import AnyReader
 
 from imutool.errors import ConfigError, LogError
-from imutool.info import inspect
-from imutool.mcap_io import records, structure
+from imutool.log_info import inspect
+from imutool.mcap_io import index
+from imutool.mcap_io.codec import records
+from imutool.mcap_io.codec.records import HEAD, MAGIC
+from imutool.mcap_io.codec.ros2_definition import DEEPEST, parse
+from imutool.mcap_io.index import Block
 from imutool.mcap_io.log import Log
-from imutool.mcap_io.records import HEAD, MAGIC
-from imutool.mcap_io.ros2msg import DEEPEST, parse
-from imutool.mcap_io.salvage import RECORD, repair
-from imutool.mcap_io.structure import Block
+from imutool.mcap_io.repair import RECORD, repair
 
 Message = tuple[str, int, int, int, bytes]  # topic, log time, publish time, sequence, payload
 Messages = list[tuple[str, str, int, int, int, bytes]]
@@ -459,7 +460,7 @@ def test_huge_claims_of_metadata_and_attachments_cost_nothing(tmp_path: Path) ->
 
 def test_nothing_longer_than_a_chunk_may_be_comes_into_memory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(records, "CHUNK_LIMIT", 1 << 20)
-    monkeypatch.setattr(structure, "MOST_SUMMARY", 1 << 20)
+    monkeypatch.setattr(index, "MOST_SUMMARY", 1 << 20)
     size = 50 << 20
     path, message = tmp_path / "log.mcap", struct.pack("<HIQQ", 1, 0, 0, 0)
     for start in (HEAD.pack(5, size) + message, HEAD.pack(6, size + 49) + struct.pack("<QQQIIQ", 0, 1, size, 7, 0, size)):
@@ -530,7 +531,7 @@ def test_info_describes_what_is_sound_and_says_what_is_lost(foreign: Foreign, fl
 
 
 def test_real_logs_are_saved_but_for_the_damage(data: Path, tmp_path: Path) -> None:
-    from converters import tum_vi
+    from imutool.converters import tum_vi
     from imutool.mcap_io.write import write
 
     (recording,) = tum_vi.read(data / "tumvi" / "dataset-room2.tar.gz")

@@ -10,9 +10,9 @@ from mcap_ros2._dynamic import generate_dynamic
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from imutool.errors import DataError, LogError
-from imutool.mcap_io import schema
-from imutool.mcap_io.decode import decode_image, decode_imu, decode_poses, decode_scalars
-from imutool.mcap_io.encode import encode_float, encode_image, encode_imu, encode_pose, encode_transform, encode_vector3
+from imutool.mcap_io.codec import schemas
+from imutool.mcap_io.codec.decode import decode_image, decode_imu, decode_poses, decode_scalars
+from imutool.mcap_io.codec.encode import encode_float, encode_image, encode_imu, encode_pose, encode_transform, encode_vector3
 
 STAMPS = np.array([0, 1, 999_999_999, 1_000_000_000, 1_403_638_128_245_096_960, 2**31 * 10**9 - 1])
 COUNT = len(STAMPS)
@@ -36,23 +36,23 @@ def stamp_of(header: object) -> int:
     return header.stamp.sec * 10**9 + header.stamp.nanosec
 
 
-@pytest.mark.parametrize("name", schema.TYPE_HASHES)
+@pytest.mark.parametrize("name", schemas.TYPE_HASHES)
 def test_definitions_parse_to_the_types_ros_has(name: str) -> None:
-    ours = get_types_from_msg(schema.definition(name), name)
+    ours = get_types_from_msg(schemas.definition(name), name)
     for nested, fields in ours.items():
         assert fields == ROS2.fielddefs[nested]
-    assert schema.TYPE_HASHES[name] == ROS2.hash_rihs01(name)
-    assert schema.definition(name) == ROS2.generate_msgdef(name, ros_version=2)[0]
+    assert schemas.TYPE_HASHES[name] == ROS2.hash_rihs01(name)
+    assert schemas.definition(name) == ROS2.generate_msgdef(name, ros_version=2)[0]
 
 
 @pytest.mark.parametrize("frame_id", FRAMES)
 def test_imu_bytes_are_those_of_rosbags_and_read_back_exactly(frame_id: str) -> None:
     gyro, accel, gyro_covariance, accel_covariance = columns(3), columns(3) + 1, columns(9), columns(9)[0]
     rows = encode_imu(STAMPS, gyro, accel, frame_id, gyro_covariance, accel_covariance)
-    decoder = generate_dynamic(schema.IMU, schema.definition(schema.IMU))[schema.IMU]
+    decoder = generate_dynamic(schemas.IMU, schemas.definition(schemas.IMU))[schemas.IMU]
     for i, row in enumerate(rows):
-        theirs = ROS2.deserialize_cdr(row.tobytes(), schema.IMU)
-        assert bytes(ROS2.serialize_cdr(theirs, schema.IMU)) == row.tobytes()
+        theirs = ROS2.deserialize_cdr(row.tobytes(), schemas.IMU)
+        assert bytes(ROS2.serialize_cdr(theirs, schemas.IMU)) == row.tobytes()
         message = decoder(row.tobytes())
         assert stamp_of(message.header) == STAMPS[i]
         assert message.header.frame_id == frame_id
@@ -69,7 +69,7 @@ def test_imu_bytes_are_those_of_rosbags_and_read_back_exactly(frame_id: str) -> 
 
 
 def test_imu_without_covariance_says_unknown() -> None:
-    message = ROS2.deserialize_cdr(encode_imu(STAMPS, columns(3), columns(3), "b")[0].tobytes(), schema.IMU)
+    message = ROS2.deserialize_cdr(encode_imu(STAMPS, columns(3), columns(3), "b")[0].tobytes(), schemas.IMU)
     assert not message.angular_velocity_covariance.any()
     assert not message.linear_acceleration_covariance.any()
 
@@ -79,11 +79,11 @@ def test_pose_is_wxyz_in_memory_and_xyzw_in_the_message(frame_id: str) -> None:
     p_wb, q_wxyz = columns(3), columns(4)
     rows = encode_pose(STAMPS, p_wb, q_wxyz, frame_id)
     for i, row in enumerate(rows):
-        message = ROS2.deserialize_cdr(row.tobytes(), schema.POSE)
+        message = ROS2.deserialize_cdr(row.tobytes(), schemas.POSE)
         q = message.pose.orientation
         assert [q.w, q.x, q.y, q.z] == q_wxyz[i].tolist()
         assert [message.pose.position.x, message.pose.position.y, message.pose.position.z] == p_wb[i].tolist()
-        assert bytes(ROS2.serialize_cdr(message, schema.POSE)) == row.tobytes()
+        assert bytes(ROS2.serialize_cdr(message, schemas.POSE)) == row.tobytes()
     (back,) = decode_poses(rows)
     assert (back.frame_id, back.child_frame_id) == (frame_id, "")
     assert back.q_wb_wxyz.tobytes() == q_wxyz.tobytes()
@@ -94,28 +94,28 @@ def test_pose_is_wxyz_in_memory_and_xyzw_in_the_message(frame_id: str) -> None:
 def test_transform_vector_float_and_image_are_those_of_rosbags() -> None:
     p_wb, q_wxyz = columns(3), columns(4)
     cases = {
-        schema.TF: encode_transform(STAMPS, p_wb, q_wxyz, "world", "body"),
-        schema.VECTOR3: encode_vector3(STAMPS, p_wb, "world"),
-        schema.FLOAT: encode_float(p_wb[:, 0]),
-        schema.IMAGE: [np.frombuffer(encode_image(int(s), b"\x89PNG...", "cam0", "png"), np.uint8) for s in STAMPS],
+        schemas.TF: encode_transform(STAMPS, p_wb, q_wxyz, "world", "body"),
+        schemas.VECTOR3: encode_vector3(STAMPS, p_wb, "world"),
+        schemas.FLOAT: encode_float(p_wb[:, 0]),
+        schemas.IMAGE: [np.frombuffer(encode_image(int(s), b"\x89PNG...", "cam0", "png"), np.uint8) for s in STAMPS],
     }
     for name, rows in cases.items():
         for i, row in enumerate(rows):
             message = ROS2.deserialize_cdr(row.tobytes(), name)
             assert bytes(ROS2.serialize_cdr(message, name)) == row.tobytes()
-            if name == schema.TF:
+            if name == schemas.TF:
                 transform = message.transforms[0]
                 q = transform.transform.rotation
                 assert [q.w, q.x, q.y, q.z] == q_wxyz[i].tolist()
                 assert (stamp_of(transform.header), transform.child_frame_id) == (STAMPS[i], "body")
-            elif name == schema.IMAGE:
+            elif name == schemas.IMAGE:
                 assert decode_image(row.tobytes()) == (STAMPS[i], "png", b"\x89PNG...")
                 assert (bytes(message.data), message.format) == (b"\x89PNG...", "png")
-    (back,) = decode_poses(cases[schema.TF], schema.TF)
+    (back,) = decode_poses(cases[schemas.TF], schemas.TF)
     assert (back.frame_id, back.child_frame_id) == ("world", "body")
     assert back.q_wb_wxyz.tobytes() == q_wxyz.tobytes()
-    assert decode_scalars(cases[schema.VECTOR3], schema.VECTOR3).values.tobytes() == p_wb.tobytes()
-    floats = decode_scalars(cases[schema.FLOAT], schema.FLOAT)
+    assert decode_scalars(cases[schemas.VECTOR3], schemas.VECTOR3).values.tobytes() == p_wb.tobytes()
+    floats = decode_scalars(cases[schemas.FLOAT], schemas.FLOAT)
     assert floats.stamp_ns is None
     assert floats.values[:, 0].tobytes() == p_wb[:, 0].tobytes()
 
@@ -126,20 +126,20 @@ def test_other_writers_messages_decode_exactly(make: Callable[..., bytes], frame
     encoding, frames = ("ros1", (frame_id, "bodies")) if ros1 else ("cdr", (frame_id, "bodies"))
     a, b, q = columns(3), columns(3) + 1, columns(4)
     imu = decode_imu(
-        matrix([make(schema.IMU, int(s), a[i], b[i], ros1=ros1, frames=frames) for i, s in enumerate(STAMPS)]), encoding
+        matrix([make(schemas.IMU, int(s), a[i], b[i], ros1=ros1, frames=frames) for i, s in enumerate(STAMPS)]), encoding
     )
     assert (imu.gyro.tobytes(), imu.accel.tobytes(), imu.frame_id) == (a.tobytes(), b.tobytes(), frame_id)
     assert np.array_equal(imu.stamp_ns, STAMPS)
-    for kind in (schema.POSE, schema.ODOMETRY, schema.TRANSFORM):
+    for kind in (schemas.POSE, schemas.ODOMETRY, schemas.TRANSFORM):
         rows = matrix([make(kind, int(s), a[i], q[i], ros1=ros1, frames=frames) for i, s in enumerate(STAMPS)])
         (pose,) = decode_poses(rows, kind, encoding)
         assert (pose.p_wb.tobytes(), pose.q_wb_wxyz.tobytes()) == (a.tobytes(), q.tobytes())
-        assert pose.child_frame_id == ("" if kind == schema.POSE else "bodies")
+        assert pose.child_frame_id == ("" if kind == schemas.POSE else "bodies")
         assert np.array_equal(pose.stamp_ns, STAMPS)
-    rows = matrix([make(schema.VECTOR3, int(s), a[i], ros1=ros1, frames=frames) for i, s in enumerate(STAMPS)])
-    assert decode_scalars(rows, schema.VECTOR3, encoding).values.tobytes() == a.tobytes()
-    rows = matrix([make(schema.FLOAT, int(s), a[i, 0], ros1=ros1) for i, s in enumerate(STAMPS)])
-    assert decode_scalars(rows, schema.FLOAT, encoding).values[:, 0].tobytes() == a[:, 0].tobytes()
+    rows = matrix([make(schemas.VECTOR3, int(s), a[i], ros1=ros1, frames=frames) for i, s in enumerate(STAMPS)])
+    assert decode_scalars(rows, schemas.VECTOR3, encoding).values.tobytes() == a.tobytes()
+    rows = matrix([make(schemas.FLOAT, int(s), a[i, 0], ros1=ros1) for i, s in enumerate(STAMPS)])
+    assert decode_scalars(rows, schemas.FLOAT, encoding).values[:, 0].tobytes() == a[:, 0].tobytes()
 
 
 @pytest.mark.parametrize("ros1", [False, True])
@@ -148,11 +148,11 @@ def test_any_number_of_transforms_decodes(make: Callable[..., bytes], count: int
     p, q, children = columns(3), columns(4), ["base", "camera_left", "x"][:count]
     rows = matrix(
         [
-            make(schema.TF, int(s), *[(p[i] + k, q[i], child) for k, child in enumerate(children)], ros1=ros1)
+            make(schemas.TF, int(s), *[(p[i] + k, q[i], child) for k, child in enumerate(children)], ros1=ros1)
             for i, s in enumerate(STAMPS)
         ]
     )
-    found = decode_poses(rows, schema.TF, "ros1" if ros1 else "cdr")
+    found = decode_poses(rows, schemas.TF, "ros1" if ros1 else "cdr")
     assert [pose.child_frame_id for pose in found] == children
     for k, pose in enumerate(found):
         assert np.array_equal(pose.p_wb, p + k)
@@ -164,8 +164,8 @@ def test_big_endian_cdr_decodes(make: Callable[..., bytes]) -> None:
     a, b = columns(3), columns(3) + 1
     swapped = []
     for i, s in enumerate(STAMPS):
-        message = ROS2.deserialize_cdr(make(schema.IMU, int(s), a[i], b[i]), schema.IMU)
-        swapped.append(bytes(ROS2.serialize_cdr(message, schema.IMU, little_endian=False)))
+        message = ROS2.deserialize_cdr(make(schemas.IMU, int(s), a[i], b[i]), schemas.IMU)
+        swapped.append(bytes(ROS2.serialize_cdr(message, schemas.IMU, little_endian=False)))
     back = decode_imu(matrix(swapped))
     assert (back.gyro.tobytes(), back.accel.tobytes(), back.frame_id) == (a.tobytes(), b.tobytes(), "a")
     assert np.array_equal(back.stamp_ns, STAMPS)
@@ -176,7 +176,7 @@ def test_frames_of_equal_length_are_told_apart_and_order_is_kept() -> None:
     gyro = columns(3)
     each = [encode_imu(STAMPS[i : i + 1], gyro[i : i + 1], gyro[i : i + 1], n) for i, n in enumerate(names)]
     rows = np.concatenate(each)
-    found = [(part, layout.texts[0]) for part, layout in schema.runs(rows, schema.IMU)]
+    found = [(part, layout.texts[0]) for part, layout in schemas.runs(rows, schemas.IMU)]
     assert [name for _, name in found] == ["a", "b", "cc", "a"]
     pieces = [decode_imu(rows[part]) for part, _ in found]
     assert np.concatenate([piece.gyro for piece in pieces]).tobytes() == gyro.tobytes()
@@ -214,4 +214,4 @@ def test_stamps_beyond_32_bit_seconds_are_refused(stamp_ns: int) -> None:
 def test_no_messages_encode_to_no_rows() -> None:
     rows = encode_imu(np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 3)), "imu0")
     assert rows.shape == (0, 4 + 24 + 37 * 8)
-    assert list(schema.runs(rows, schema.IMU)) == []
+    assert list(schemas.runs(rows, schemas.IMU)) == []

@@ -14,12 +14,12 @@ from typing import Any
 import pytest
 
 from imutool.errors import ConfigError
-from imutool.mcap_io import schema
+from imutool.mcap_io.added_topics import Made, NewTopic
 from imutool.mcap_io.batches import ImuBatch
-from imutool.mcap_io.derived import Made, NewTopic
-from imutool.mcap_io.encode import encode_imu
+from imutool.mcap_io.codec import schemas
+from imutool.mcap_io.codec.encode import encode_imu
 from imutool.mcap_io.rewrite import rewrite
-from imutool.mcap_io.target import Target
+from imutool.mcap_io.storage.target import Target
 from imutool.mcap_io.write import write
 from imutool.recording import Frames, Recording
 
@@ -28,7 +28,7 @@ class Failing:
     """A derived channel that fails in the middle of the log."""
 
     source_topic = "/imu0"
-    topics = (NewTopic("/imu0/debiased", schema.IMU),)
+    topics = (NewTopic("/imu0/debiased", schemas.IMU),)
 
     def __init__(self, error: BaseException) -> None:
         self.error, self.seen = error, 0

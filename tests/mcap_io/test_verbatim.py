@@ -25,18 +25,19 @@ from mcap.stream_reader import StreamReader
 from mcap.writer import CompressionType, IndexType, Writer
 
 from imutool.errors import ConfigError, DataError, LogError
-from imutool.mcap_io import schema, target
+from imutool.mcap_io.added_topics import Made, NewTopic
 from imutool.mcap_io.batches import ImuBatch
-from imutool.mcap_io.derived import Made, NewTopic
-from imutool.mcap_io.digest import Digest, sha256
-from imutool.mcap_io.encode import encode_imu
+from imutool.mcap_io.codec import schemas
+from imutool.mcap_io.codec.encode import encode_imu
+from imutool.mcap_io.codec.records import message_rows
 from imutool.mcap_io.log import Log
-from imutool.mcap_io.log_writer import Chunk, LogWriter
-from imutool.mcap_io.records import message_rows
 from imutool.mcap_io.rewrite import rewrite
-from imutool.mcap_io.source import Source
+from imutool.mcap_io.storage import target
+from imutool.mcap_io.storage.digest import Digest, sha256
+from imutool.mcap_io.storage.source import Source
 from imutool.mcap_io.verify import Verified, verify
 from imutool.mcap_io.write import write
+from imutool.mcap_io.writer import Chunk, LogWriter
 from imutool.recording import Recording
 
 Message = tuple[str, int, int, int, bytes]  # topic, log time, publish time, sequence, payload
@@ -49,7 +50,7 @@ class Half:
 
     def __init__(self, source_topic: str) -> None:
         self.source_topic = source_topic
-        self.topics = [NewTopic(f"{source_topic}/half", schema.IMU)]
+        self.topics = [NewTopic(f"{source_topic}/half", schemas.IMU)]
 
     def __call__(self, batch: ImuBatch) -> Made:
         return Made(batch, [encode_imu(batch.stamp_ns, 0.5 * batch.gyro, batch.accel, batch.frame_id)])
@@ -106,8 +107,8 @@ def write_mix(path: Path, mix: list[tuple[str, int, int]], layout: dict[str, Any
     with path.open("wb") as file:
         writer = Writer(file, **layout)
         writer.start("ros2")
-        imu = writer.register_schema(schema.IMU, "ros2msg", schema.definition(schema.IMU).encode())
-        image = writer.register_schema(schema.IMAGE, "ros2msg", b"uint8[] data")
+        imu = writer.register_schema(schemas.IMU, "ros2msg", schemas.definition(schemas.IMU).encode())
+        image = writer.register_schema(schemas.IMAGE, "ros2msg", b"uint8[] data")
         ids = {topic: writer.register_channel(topic, "cdr", imu if "imu" in topic else image) for topic in TOPICS}
         for number, (topic, log_time, size) in enumerate(mix):
             stamps = np.array([1_000_000 * (number + 1)])
@@ -373,7 +374,7 @@ def test_metadata_is_asked_for_when_it_is_known_what_is_checked(source: Path, tm
 def test_a_log_whose_ids_are_used_up_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "in.mcap"
     with LogWriter(path) as out:
-        channel = out.channel("/imu0", schema.IMU)
+        channel = out.channel("/imu0", schemas.IMU)
         out.contents.channels[65535] = out.contents.channels.pop(channel)
         out.contents.channels[65535].id = 65535
         payload = encode_imu(np.array([1]), np.zeros((1, 3)), np.zeros((1, 3)), "x")
@@ -498,6 +499,8 @@ def test_a_file_that_shrinks_has_no_digest(tmp_path: Path, threads: None, monkey
     path.write_bytes(bytes(1000))
     with Digest(path) as digest:
         assert digest.result()
-    monkeypatch.setattr("imutool.mcap_io.digest.Source.at", lambda self, at, n: (_ for _ in ()).throw(LogError("cut short")))
+    monkeypatch.setattr(
+        "imutool.mcap_io.storage.digest.Source.at", lambda self, at, n: (_ for _ in ()).throw(LogError("cut short"))
+    )
     with Digest(path) as digest, pytest.raises(LogError, match="x: cut short"):
         digest.result()

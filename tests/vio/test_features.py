@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from imutool.physics.flight import FlightSettings, flight
 from imutool.recording import Poses
+from imutool.sensor.flight import FlightSettings, flight
 from imutool.vio.features import FAR_M, NEAR_M, Frame, blackouts, observe, room
 from imutool.vio.rig import EUROC, StereoRig
 

@@ -14,9 +14,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from imutool import cli, metrics
+from imutool import cli
 from imutool.config import plain
 from imutool.errors import DataError
+from imutool.inertial import metrics
 from imutool.mcap_io.write import write
 from imutool.recording import Imu, Poses, Recording
 from imutool.vio.run import SCHEMA, VioSettings, from_first_pose, plan, tabulate, vio

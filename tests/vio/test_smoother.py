@@ -11,8 +11,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from imutool.errors import ConfigError, NumericsError
+from imutool.inertial.strapdown import Start
 from imutool.recording import Imu, Recording
-from imutool.strapdown import Start
 from imutool.vio import smoother
 from imutool.vio.features import Frame
 from imutool.vio.run import Course, VioSettings, plan, score

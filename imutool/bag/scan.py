@@ -1,0 +1,321 @@
+"""A bag followed from its first byte to its last, chunk by chunk, whatever its index says or whether it has one.
+
+Where the framing is broken, the walk goes on at the next chunk, and inside an unpacked chunk at the next message. A message
+counts as found when what follows it is a record, or the end of its chunk.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import NamedTuple
+
+from imutool.bag import records
+from imutool.bag.records import HEAD_LIMIT, MAGIC, Connection, Head, Op
+from imutool.errors import LogError
+from imutool.location import Place
+from imutool.mcap_io.storage.source import Source
+
+SCAN_BYTES = 4096, 1 << 20  # looked through at once, first and at most: what is sought may be near
+HEAD_BYTES = 256  # of a record, read at first; most heads are shorter
+MOST_LOSSES = 10_000  # that are listed one by one
+MOST_REASONS = 5  # for one chunk
+
+
+@dataclass(frozen=True)
+class Loss:
+    """A stretch of the bag that could not be read, why, and how many messages its index says it held."""
+
+    offset: int
+    length: int
+    reason: str
+    messages: int | None = None
+
+
+class Message(NamedTuple):
+    """Where one message lies in the bytes of its chunk."""
+
+    connection: int
+    time_ns: int
+    at: int
+    data_at: int
+    end: int
+
+
+class Chunk(NamedTuple):
+    """One chunk's bytes, unpacked, and its messages; `whole` when nothing in it was lost."""
+
+    offset: int
+    length: int
+    data: bytes
+    messages: list[Message]
+    whole: bool
+
+
+class Bag:
+    """A bag open for reading. With `salvage` what cannot be read is noted in `losses`; without, it is refused.
+
+    Memory is bounded by the largest chunk.
+
+    Raises:
+        ConfigError: the file cannot be opened.
+        LogError: empty, no ROS 1 bag, or encrypted.
+    """
+
+    def __init__(self, path: Place, *, salvage: bool = False) -> None:
+        self.path, self.salvage = path, salvage
+        self.connections: dict[int, Connection] = {}
+        self.doubtful: set[int] = set()  # numbers that may mean something else by now
+        self.losses: list[Loss] = []
+        self.lost = 0  # how many losses there are, also those that are not listed
+        self.source = Source(path, expected="a ROS 1 bag")
+        try:
+            self.header = self._begin()
+            self.indexed = self._index(self.header)
+        except LogError as error:
+            self.source.file.close()
+            raise error.at(path) from error
+        except BaseException:
+            self.source.file.close()
+            raise
+
+    def __enter__(self) -> Bag:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.source.file.close()
+
+    def _begin(self) -> Head | None:
+        """The bag header record, if it can be read."""
+        size = self.source.size
+        start = self.source.at(0, min(len(MAGIC), size))
+        if start != MAGIC:
+            what = "the file is empty" if not size else f"this is not a ROS 1 bag: it starts with {start!r}"
+            raise LogError(what, expected=repr(MAGIC))
+        found = self._head(len(MAGIC))
+        if found is not None and found.op == Op.BAG and found.fields.get(b"encryptor"):
+            raise LogError(f"the bag is encrypted with {found.fields[b'encryptor'][:80]!r}", expected="one that is not")
+        return found if found is not None and found.op == Op.BAG and found.end <= size else None
+
+    def _index(self, header: Head | None) -> bool:
+        """Whether the bag has its index; its connections are then known from the start, also of chunks that are lost."""
+        if header is None or not (position := header.number(b"index_pos")):
+            return False
+        for _ in range(header.number(b"conn_count")):
+            found = self._head(position)
+            if found is None or found.op != Op.CONNECTION or found.end > self.source.size:
+                return False
+            try:
+                self._define(found)
+            except LogError:
+                return False
+            position = found.end
+        for _ in range(header.number(b"chunk_count")):
+            found = self._head(position)
+            if found is None or found.op != Op.INFO or found.end > self.source.size:
+                return False
+            position = found.end
+        return position <= self.source.size
+
+    def _head(self, at: int) -> Head | None:
+        """The head of the record at a byte of the file."""
+        left = self.source.size - at
+        if left < 8:
+            return None
+        raw = self.source.at(at, min(HEAD_BYTES, left))
+        size = int.from_bytes(raw[:4], "little")
+        if size > HEAD_LIMIT or size > left - 8:
+            return None
+        if size + 8 > len(raw):
+            raw = self.source.at(at, size + 8)
+        found = records.head(raw, 0)
+        return found and found._replace(at=at, data_at=found.data_at + at)
+
+    def _define(self, found: Head) -> None:
+        if found.size > records.DEFINITION_LIMIT:
+            raise LogError(f"a connection record has {found.size} bytes", expected=f"at most {records.DEFINITION_LIMIT}")
+        raw = self.source.at(found.at, found.end - found.at)
+        self._learn(records.connection(found, raw[found.data_at - found.at :], raw))
+
+    def _learn(self, new: Connection) -> None:
+        known = self.connections.setdefault(new.number, new)
+        if (known.topic, known.kind) != (new.topic, new.kind):
+            self.doubtful.add(new.number)
+            raise LogError(f"connection {new.number} is both {known.topic} and {new.topic}")
+        self.doubtful.discard(new.number)
+
+    def lose(self, offset: int, length: int, reason: str, messages: int | None = None) -> None:
+        """Notes a loss, or refuses the bag.
+
+        Raises:
+            LogError: without `salvage`.
+        """
+        if not self.salvage:
+            raise LogError(
+                f"the bag is damaged at byte {offset}: {reason}",
+                where=self.path,
+                fix="Save what is there with `imutool repair`",
+            )
+        self.lost += 1
+        if len(self.losses) < MOST_LOSSES:
+            self.losses.append(Loss(offset, length, reason, messages))
+
+    def chunks(self) -> Iterator[Chunk]:
+        """Every chunk with messages in it, in file order.
+
+        Raises:
+            LogError: damage, without `salvage`; or the disk does not give the bytes.
+        """
+        position, size = len(MAGIC), self.source.size
+        while position < size:
+            found = self._head(position)
+            if found is None and self.source.at(position, min(len(MAGIC), size - position)) == MAGIC:
+                self.doubtful |= self.connections.keys()  # another bag, which gives the same numbers again
+                position += len(MAGIC)
+            elif found is None or (found.end > size and found.op != Op.CHUNK):
+                following = self._next_chunk(position + 1)
+                cut = following == size
+                self.lose(position, following - position, "the bag ends inside a record" if cut else "no record begins here")
+                position = following
+            elif found.op == Op.CHUNK:
+                end = self._end(found)
+                chunk = self._chunk(found, end)
+                if chunk.messages:
+                    yield chunk
+                position = end
+            elif found.op == Op.MESSAGE or not self._lands(found.end):  # it would lead past the record behind it
+                position = self._next_chunk(found.data_at)
+                outside = "a message lies outside chunks" if found.op == Op.MESSAGE else "a record does not end where it says"
+                self.lose(found.at, position - found.at, outside)
+            else:
+                if found.op == Op.CONNECTION:
+                    self._try_define(found)
+                position = found.end
+        if self.header is not None and (told := self.header.number(b"index_pos")) > size:
+            self.lose(size, told - size, f"the bag's header says its index begins at byte {told}")
+
+    def _try_define(self, found: Head) -> None:
+        try:
+            self._define(found)
+        except LogError as error:
+            self.lose(found.at, found.end - found.at, error.what)
+
+    def _next_chunk(self, start: int) -> int:
+        """Where the next chunk or another bag begins at or behind a byte; the end of the file if none does."""
+        size, (scan, most) = self.source.size, SCAN_BYTES
+        while start < size:
+            raw = self.source.at(start, min(scan + HEAD_BYTES, size - start))
+            found = records.next_head(raw, Op.CHUNK, 0)
+            nearest = [at for at in (found.at if found else -1, raw.find(MAGIC)) if at >= 0]
+            if nearest:
+                return start + min(nearest)
+            start, scan = start + scan, min(2 * scan, most)
+        return size
+
+    def _end(self, found: Head) -> int:
+        """Where a chunk ends: where it says, if a record follows there; else where the next one begins."""
+        return found.end if self._lands(found.end) else self._next_chunk(found.data_at)
+
+    def _lands(self, end: int) -> bool:
+        """Whether a record may end there: another begins, or nothing is left that could be one, or another bag."""
+        left = self.source.size - end
+        if 0 <= left < 8 or (left > 0 and self._head(end) is not None):
+            return True
+        return left >= len(MAGIC) and self.source.at(end, len(MAGIC)) == MAGIC
+
+    def _chunk(self, found: Head, end: int) -> Chunk:
+        """What can be read of a chunk; all that is wrong with it is one loss."""
+        compression = found.fields[b"compression"].decode("ascii", "replace")
+        wrong = end != found.end
+        reasons = ["the chunk does not end where it says"] if wrong else []
+        data, messages, told = b"", list[Message](), self._told(end)
+        try:
+            data = self._unpacked(found, end, compression)
+        except LogError as error:
+            reasons.append(f"the chunk cannot be unpacked: {error.what}")
+        else:
+            inside = _Inside(self, data, wrong)
+            messages = inside.messages()
+            reasons += inside.reasons
+        missing = None if told is None else max(0, told - len(messages))
+        if missing and not reasons:
+            reasons.append("its index tells of more messages than are in it")
+        if reasons:
+            self.lose(found.at, end - found.at, "; ".join(reasons), missing)
+        return Chunk(found.at, end - found.at, data, messages, not reasons)
+
+    def _unpacked(self, found: Head, end: int, compression: str) -> bytes:
+        if compression == "none" and end == found.end and found.number(b"size") != found.size:
+            raise LogError(f"it has {found.size} bytes", expected=str(found.number(b"size")))
+        cut, packed = end != found.end, end - found.data_at
+        if packed > records.CHUNK_LIMIT:
+            raise LogError(f"it has {packed} bytes", expected=f"at most {records.CHUNK_LIMIT}")
+        return records.unpack(compression, self.source.at(found.data_at, packed), found.number(b"size"), cut=cut)
+
+    def _told(self, position: int) -> int | None:
+        """How many messages the index records behind a chunk say it has; None where there are none."""
+        total: int | None = None
+        while (found := self._head(position)) is not None and found.op == Op.INDEX:
+            if found.size != 12 * found.number(b"count"):
+                return None
+            total = (total or 0) + found.number(b"count")
+            position = found.end
+        return total
+
+
+class _Inside:
+    """The records of one chunk."""
+
+    def __init__(self, bag: Bag, data: bytes, loose: bool) -> None:
+        self.bag, self.data, self.loose = bag, data, loose
+        self.reasons: list[str] = []  # why something is lost, the first few
+
+    def _lose(self, reason: str) -> None:
+        if len(self.reasons) < MOST_REASONS:
+            self.reasons.append(reason)
+
+    def messages(self) -> list[Message]:
+        """Those of known connections, each followed by a record or the end."""
+        found: list[Message] = []
+        unknown: Counter[int] = Counter()
+        position, end, bag = 0, len(self.data), self.bag
+        head = records.head(self.data, 0)
+        while position < end:
+            if head is not None and head.op not in (Op.MESSAGE, Op.CONNECTION):
+                if not self.loose:
+                    self._lose(f"a record of kind {head.op} lies inside the chunk, at its byte {position}")
+                break  # the chunk ended ahead of it
+            following = records.head(self.data, head.end) if head is not None and head.end < end else None
+            if head is None or not (head.end == end or following is not None or self._cut(head.end)):
+                head = self._resume(position, end)
+                position = end if head is None else head.at
+                continue
+            number = head.number(b"conn")
+            if head.op == Op.CONNECTION:
+                self._define(head)
+            elif number in bag.connections and number not in bag.doubtful:
+                found.append(Message(number, head.time_ns, head.at, head.data_at, head.end))
+            else:
+                unknown[number] += 1
+            position, head = head.end, following
+        for number, count in unknown.items():
+            self._lose(f"{count} messages are of connection {number}, which nothing defines for sure")
+        return found
+
+    def _cut(self, position: int) -> bool:
+        """Whether the chunk was cut off inside the head that begins there, so that the record ahead of it can be trusted."""
+        left = len(self.data) - position
+        return self.loose and 0 < left < HEAD_BYTES and records.next_head(self.data, Op.MESSAGE, position) is None
+
+    def _resume(self, position: int, end: int) -> Head | None:
+        """The next message behind damage."""
+        following = records.next_head(self.data, Op.MESSAGE, position + 1)
+        self._lose(f"no whole record at its bytes {position} to {end if following is None else following.at}")
+        return following
+
+    def _define(self, head: Head) -> None:
+        try:
+            self.bag._learn(records.connection(head, self.data[head.data_at : head.end], self.data[head.at : head.end]))
+        except LogError as error:
+            self._lose(error.what)

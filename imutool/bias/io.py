@@ -1,0 +1,258 @@
+"""Model files: safetensors with a JSON header; every size and shape is checked before a number is used, nothing is executed."""
+
+from __future__ import annotations
+
+import difflib
+import hashlib
+import json
+import os
+from collections.abc import Mapping
+from contextlib import suppress
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save as save_bytes
+
+from imutool import registry
+from imutool.bias.model import BiasModel
+from imutool.config import build, plain
+from imutool.errors import ConfigError, ImutoolError, ModelError
+
+FORMAT = "imutool.model/1"
+MAX_BYTES = 64 << 20  # ours are under 2 MB; a file this large is no bias model
+MAX_RATE_HZ = 1e6
+MAX_TOML = 1 << 20  # bytes of a physics.toml; ours have a few thousand
+MAX_SETTINGS = 16 << 10  # characters; ours have a few hundred
+BEST_FIRST = ("hybrid", "neural_ode", "linear")  # by the published and own tables (docs/accuracy.md)
+RATE_TOLERANCE = 0.05  # a sensor's real rate differs from its name by a few per mille (BMI160: 199.4 for 200)
+
+
+def save(model: BiasModel, path: Path, *, overwrite: bool = False) -> None:
+    """Writes a model and its card, beside the target first.
+
+    Raises:
+        ConfigError: the target exists, or cannot be written.
+    """
+    header = {
+        "format": FORMAT,
+        "method": model.method,
+        "rate_hz": repr(model.rate_hz),
+        "settings": json.dumps(plain(model.config)),
+        "card": json.dumps(dict(model.card)),
+    }
+    weights = {name: value.detach().cpu().float().contiguous() for name, value in model.state_dict().items()}
+    write_tensors(weights, header, path, overwrite)
+
+
+def write_tensors(tensors: Mapping[str, torch.Tensor], header: Mapping[str, str], path: Path, overwrite: bool) -> None:
+    """Tensors and a header of strings, beside the target and then renamed.
+
+    Raises:
+        ConfigError: the target exists, or cannot be written.
+    """
+    if path.exists() and not overwrite:
+        raise ConfigError("exists already", where=path, fix="Choose another name or give --overwrite")
+    beside = path.with_name(f".{path.name}.{os.getpid()}.part")
+    try:
+        beside.write_bytes(_in_order(save_bytes(dict(tensors), metadata=dict(header))))
+        beside.replace(path)
+    except (OSError, SafetensorError) as error:
+        raise ConfigError(f"cannot be written ({error})", where=path, fix="Choose another place") from error
+    finally:
+        beside.unlink(missing_ok=True)
+
+
+def _in_order(raw: bytes) -> bytes:
+    """A safetensors file with its header sorted: the library's order is random, and equal models should be equal files."""
+    size = int.from_bytes(raw[:8], "little")
+    header = json.dumps(json.loads(raw[8 : 8 + size]), sort_keys=True, separators=(",", ":")).encode()
+    header += b" " * (-len(header) % 8)  # the format's alignment
+    return len(header).to_bytes(8, "little") + header + raw[8 + size :]
+
+
+def read_tensors(path: Path, kind: str) -> tuple[dict[str, torch.Tensor], dict[str, str]]:
+    """Tensors and header of a file of format `kind`.
+
+    Raises:
+        ModelError: no such file, too large, not safetensors, or of another format.
+    """
+    try:
+        _refuse_size(path, MAX_BYTES)
+        with safe_open(path, framework="pt") as file:
+            header = file.metadata() or {}
+            if header.get("format") != kind:
+                raise ModelError(
+                    f"format {header.get('format')!r}",
+                    where=path,
+                    expected=f"{kind!r}",
+                    fix="Train it again with this version of imutool",
+                )
+            return {name: file.get_tensor(name) for name in file.keys()}, header  # noqa: SIM118  not a dict
+    except (OSError, SafetensorError) as error:
+        raise ModelError(f"is no model file ({error})", where=path, expected="safetensors by imutool train") from error
+
+
+def _refuse_size(path: Path, most: int) -> None:
+    """Nothing is opened that is not a file of a sensible size; a pipe would be waited for.
+
+    Raises:
+        ModelError: too large, or there and no file.
+        OSError: not there.
+    """
+    size = path.stat().st_size
+    if not path.is_file():
+        raise ModelError(
+            "is no model file (it is a folder, a pipe or a device)", where=path, expected="safetensors by imutool train"
+        )
+    if size > most:
+        raise ModelError(f"{size} bytes", where=path, expected=f"a model of at most {most}")
+
+
+def load(path: Path) -> BiasModel:
+    """The model in a file.
+
+    Raises:
+        ModelError: damaged, of another version or unknown method, or with tensors that do not fit its settings.
+    """
+    tensors, raw = read_tensors(path, FORMAT)
+    header = _header(raw, path)
+    try:
+        module = registry.load("imutool.bias", header.method)
+        settings = build(module.Config, header.settings)
+        with torch.device("meta"):  # shapes without memory: the settings may ask for any
+            shapes: BiasModel = module.Model(settings, header.rate_hz)
+    except (ValueError, OverflowError, RuntimeError, ImutoolError) as error:
+        raise ModelError(f"has a header that cannot be used ({error})", where=path) from error
+    expected = {k: (tuple(v.shape), torch.float32) for k, v in shapes.state_dict().items()}
+    found = {k: (tuple(v.shape), v.dtype) for k, v in tensors.items()}
+    if found != expected:
+        odd = sorted(k for k in expected.keys() | found.keys() if expected.get(k) != found.get(k))
+        raise ModelError(f"tensors {', '.join(odd[:5])} do not fit", where=path, expected=f"those of {header.method}")
+    if any(not bool(torch.isfinite(v).all()) for v in tensors.values()):
+        raise ModelError("holds numbers that are not finite", where=path)
+    model: BiasModel = module.Model(settings, header.rate_hz)
+    model.load_state_dict(tensors)
+    model.card = {**header.card, "name": path.stem, "sha256": digest(path)}
+    model.requires_grad_(False)
+    return model.double().eval()
+
+
+def library() -> Path:
+    """The folder of models that ship: inside the installed package, or beside it in a checkout."""
+    inside = Path(__file__).parents[1] / "_models"
+    return inside if inside.is_dir() else Path(__file__).parents[2] / "models"
+
+
+def find_model(name: str | Path, rate_hz: float | None = None) -> BiasModel:
+    """The model in a file, or the one that ships under a name.
+
+    A physics.toml is one as well: it knows no rate of its own, and becomes a model for samples at `rate_hz`.
+
+    Raises:
+        ModelError: neither (the nearest name is given); or a physics.toml without a rate, or of which nothing can be taken off.
+        ConfigError: a physics.toml that cannot be read.
+    """
+    path = Path(name)
+    if path.suffix == ".toml":
+        if rate_hz is None:
+            raise ModelError("a physics.toml says no rate", where=path, expected="samples to use it on")
+        from imutool.bias import physics_model
+
+        with suppress(OSError):  # said by whoever reads it
+            _refuse_size(path, MAX_TOML)
+        return physics_model.load(path, rate_hz)
+    if path.suffix == ".safetensors" or path.exists():
+        return load(path)
+    return load(shipped(str(name)))
+
+
+def shipped(name: str) -> Path:
+    """The file of a model that ships, by its name alone: the name may come from a log, and a log may name no other file.
+
+    Raises:
+        ModelError: no such model (the nearest is named).
+    """
+    every = {model.stem: model for model in library().glob("*.safetensors")}
+    if name not in every:
+        near = difflib.get_close_matches(name, every, n=1)
+        raise ModelError(
+            f"no model {name[:200]!r}",
+            expected=f"a file, or one of {', '.join(sorted(every)) or '(none ship)'}",
+            fix=f"Did you mean {near[0]!r}?" if near else "",
+        )
+    return every[name]
+
+
+def shipped_for(sensor: str | None, dataset: str | None) -> str | None:
+    """The name of the model that ships for a sensor as a data set holds it, the best method first; none for any other.
+
+    A calibration belongs to one unit of a sensor, not to its type: another ADIS16448 is another sensor.
+    """
+    for method in BEST_FIRST if sensor and dataset else ():
+        for path in sorted(library().glob(f"*{method}.safetensors")):
+            about = header_of(path)
+            if (about["method"], about.get("sensor"), about.get("dataset")) == (method, sensor, dataset):
+                return path.stem
+    return None
+
+
+def digest(path: Path) -> str:
+    """SHA-256 of a model file."""
+    return hashlib.sha256(path.read_bytes()).hexdigest()
+
+
+def check_rate(model: BiasModel, rate_hz: float, where: object) -> None:
+    """Refuses a log sampled at another rate than the model's training logs.
+
+    Raises:
+        ModelError: the rates differ by more than 5 %.
+    """
+    if model.rate_hz and abs(rate_hz / model.rate_hz - 1) > RATE_TOLERANCE:
+        raise ModelError(
+            f"IMU at {rate_hz:.1f} Hz",
+            where=where,
+            expected=f"{model.rate_hz:.1f} Hz, at which model {model.card.get('name', model.method)!r} was trained",
+            fix="Choose or train a model for this sensor",
+        )
+
+
+def header_of(path: Path) -> dict[str, Any]:
+    """Method, rate, settings and card of a model file, without building it.
+
+    Raises:
+        ModelError: as `read_tensors`, or the header makes no sense.
+    """
+    header = _header(read_tensors(path, FORMAT)[1], path)
+    return {**header.card, "method": header.method, "rate_hz": header.rate_hz}
+
+
+class _Header(NamedTuple):
+    """What a model file says of itself."""
+
+    method: str
+    rate_hz: float
+    settings: dict[str, Any]
+    card: dict[str, Any]
+
+
+def _header(raw: Mapping[str, str], path: Path) -> _Header:
+    """A model's header, read as what it must be; it may come from anybody.
+
+    Raises:
+        ModelError: an entry is missing, is not JSON, or is of another kind.
+    """
+    try:
+        if len(raw["settings"]) > MAX_SETTINGS:
+            raise ValueError(f"{len(raw['settings'])} characters of settings, at most {MAX_SETTINGS}")
+        rate_hz, settings, card = float(raw["rate_hz"]), json.loads(raw["settings"]), json.loads(raw["card"])
+        if not 0.0 <= rate_hz <= MAX_RATE_HZ:
+            raise ValueError(f"rate_hz {rate_hz}")
+        if not isinstance(settings, dict) or not isinstance(card, dict):
+            raise ValueError("settings and card are tables")
+        return _Header(raw["method"], rate_hz, settings, card)
+    except KeyError as error:
+        raise ModelError(f"has a header that cannot be used (no {error})", where=path) from error
+    except (ValueError, RecursionError) as error:
+        raise ModelError(f"has a header that cannot be used ({error})", where=path) from error

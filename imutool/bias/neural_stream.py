@@ -1,0 +1,254 @@
+"""The neural ODE at work in numpy: torch's overhead for one sample is twenty times its arithmetic."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float64
+from scipy.special import erf
+from torch import Tensor, nn
+
+from imutool.bias.model import COLUMNS, Sensor, Vector6
+from imutool.sensor.signals import low_pass
+
+ROWS = 64  # at a time: they stay in the cache, and a product this small is never handed to threads that must be woken first
+HALF_ROOT = math.sqrt(0.5)
+ALWAYS = 8.0  # erf of it is one, to the last bit: GELU makes a constant of a constant
+
+Array = Float64[np.ndarray, "..."]
+DriftRate = Callable[[Array, Array, Array], Array]
+
+
+@dataclass(frozen=True)
+class CurveWeights:
+    """One sensor's C(u, s) = W u + size (N(u, s) - N(0, 0)); N sees u, asinh(near_zero u) and asinh(near_zero s)."""
+
+    W: Float64[np.ndarray, "3 3"]
+    layers: tuple[nn.Linear, nn.Linear, nn.Linear]
+    scale: float
+    near_zero: float
+    size: float
+
+
+class Curves:
+    """The curves of gyro and accelerometer side by side: two networks of one shape cost half the calls when stacked.
+
+    GELU(h) = h (1 + erf(h / sqrt 2)) / 2; its constants, the layers' own and N(0, 0) are folded into the matrices. Features are
+    rows and samples columns, or there is one sample and no such axis: every part of a layer is then one piece of memory.
+    Rows of the hidden layer: gyro's, one that is always the same, accel's; each sensor's second matrix sees its own and the
+    one between. For a single sample the last matrix has the rest bias in it too.
+    """
+
+    def __init__(self, gyro: CurveWeights, accel: CurveWeights) -> None:
+        both = (gyro, accel)
+        self._width = width = gyro.layers[0].out_features
+        self._units = np.repeat([one.near_zero / one.scale for one in both], 3)
+        self._bent = any(bool(one.layers[2].weight.any()) for one in both)
+        self._first = np.zeros((2 * width + 1, 19))
+        self._first[width, 6] = ALWAYS
+        self._second = np.empty((2, width, width + 1))
+        self._last = np.zeros((6, 2 * width + 8))
+        for k, one in enumerate(both):
+            unit, own = k * (width + 1), slice(3 * k, 3 * k + 3)
+            first, second, last = (_array(layer.weight) for layer in one.layers)
+            for part, start in enumerate((0, 7, 13)):  # u, asinh of u, asinh of s
+                seen = first[:, 3 * part : 3 * part + 3] / (1.0 if part else one.scale)
+                self._first[unit : unit + width, start + 3 * k : start + 3 * k + 3] = HALF_ROOT * seen
+            self._first[unit : unit + width, 6] = HALF_ROOT * _array(one.layers[0].bias)
+            always = _array(one.layers[1].bias)[:, None] / (2.0 * ALWAYS)
+            self._second[k] = np.concatenate([HALF_ROOT * second, always][:: 1 - 2 * k], axis=1)
+            self._last[own, k * width : (k + 1) * width] = one.size * last
+            self._last[own, 2 * width + 1 :][:, own] = one.W
+        self._rooms: dict[int, _Room] = {}
+        self._last_and_rest = self._last.copy()
+        self._last[:, -1] -= self.one(np.zeros(6), np.zeros(6), 0.0)
+        self.add_line(np.zeros(6), np.zeros(6))
+
+    def __call__(self, u: Float64[np.ndarray, "n 6"], slow: Float64[np.ndarray, "n 6"]) -> Float64[np.ndarray, "n 6"]:
+        """What the motion adds to both biases."""
+        out = np.empty((len(u), 6))
+        for k in range(0, len(u), ROWS):
+            rows = slice(k, k + ROWS)
+            out[rows] = self._last.dot(self._bend(u[rows].T, slow[rows].T, self._room(len(u[rows])))).T
+        return out
+
+    def add_line(self, rest: Vector6, slope: Vector6) -> None:
+        """From now on `one` adds rest + since_s slope."""
+        self._last_and_rest[:, -1] = self._last[:, -1] + rest
+        self._last_and_rest[:, 2 * self._width] = slope
+
+    def one(self, u: Vector6, slow: Vector6, since_s: float) -> Vector6:
+        """The bias at one sample: what the motion adds, and the rest bias."""
+        room = self._room(0)
+        room.z[2 * self._width] = since_s
+        out: Vector6 = self._last_and_rest.dot(self._bend(u, slow, room))
+        return out
+
+    def _room(self, n: int) -> _Room:
+        """Room for n samples, or for a single one without their axis (n = 0)."""
+        room = self._rooms.get(n)
+        if room is None:
+            room = self._rooms[n] = _Room(self._width, (n,) if n else (), self._units)
+        return room
+
+    def _bend(self, u: Array, slow: Array, room: _Room) -> Array:
+        """The last layer's input."""
+        room.u[:] = u
+        if not self._bent:
+            return room.outs
+        a, b = room.a, room.b
+        np.multiply(u, room.units, room.near_u)
+        np.multiply(slow, room.units, room.near_slow)
+        np.arcsinh(room.near, room.near)
+        self._first.dot(room.seen, a)
+        erf(a, b)
+        b *= a
+        b += a
+        self._second[0].dot(room.b_gyro, room.c_gyro)
+        self._second[1].dot(room.b_accel, room.c_accel)
+        np.tanh(room.c, room.flat)
+        return room.outs
+
+
+class _Room:
+    """Where the layers' numbers lie, and its parts, cut once: numpy takes as long to cut as to add.
+
+    Rows of `z`: what tanh gives (gyro, accel), seconds on the rest bias's line, u, one, asinh of u, asinh of s.
+    """
+
+    def __init__(self, width: int, samples: tuple[int, ...], units: Vector6) -> None:
+        self.z, self.c, u = np.zeros((2 * width + 20, *samples)), np.empty((2 * width, *samples)), 2 * width + 1
+        self.z[u + 6] = 1.0
+        self.flat, self.u, self.outs, self.seen = self.z[: u - 1], self.z[u : u + 6], self.z[: u + 7], self.z[u:]
+        self.near, self.near_u, self.near_slow = self.z[-12:], self.z[-12:-6], self.z[-6:]
+        self.a, self.b = np.empty((2, 2 * width + 1, *samples))
+        self.b_gyro, self.b_accel = self.b[: width + 1], self.b[width:]
+        self.c_gyro, self.c_accel = self.c[:width], self.c[width:]
+        self.units = units.reshape(6, *(1 for _ in samples))
+
+
+class NeuralStream:
+    """Curves on the samples, and the drift's rest bias by one Euler step every `stride` samples.
+
+    Remembers the rest bias, its rate, the filtered samples, and how many there were since the drift's last step.
+    """
+
+    def __init__(
+        self,
+        curves: Curves,
+        drifts: Mapping[Sensor, DriftRate],
+        stride: int,
+        rate_hz: float,
+        tau_s: tuple[float, float],
+        rest: Vector6,
+    ) -> None:
+        self._curves, self._drifts, self._stride = curves, drifts, stride
+        self._rest, self._slope = rest.astype(np.float64), np.zeros(6)
+        self._gain = np.array([-math.expm1(-1.0 / (rate_hz * tau)) for tau in tau_s])[:, None]
+        self._state, self._step_by = np.zeros((2, 6)), np.zeros((2, 6))  # what curve and drift see, and how it moves
+        self._slow, self._seen = self._state
+        self._before, self._t_step, self._count, self._began = np.zeros(6), 0.0, -1, False
+
+    def __call__(
+        self, t_s: Float64[np.ndarray, " n"], gyro: Float64[np.ndarray, "n 3"], accel: Float64[np.ndarray, "n 3"]
+    ) -> Float64[np.ndarray, "n 6"]:
+        if len(t_s) == 1:
+            return self.one(float(t_s[0]), np.concatenate([gyro[0], accel[0]]))[None]
+        u = np.concatenate([gyro, accel], axis=1)
+        if not len(u):
+            return u
+        if not self._began:
+            self._begin(float(t_s[0]), u[0])
+        slow, seen = (low_pass(u, float(g), y) for g, y in zip(self._gain[:, 0], self._state, strict=True))
+        self._slow[:], self._seen[:] = slow[-1], seen[-1]
+        bias = self._curves(u, slow)
+        bias += self._rest_path(t_s, seen) if self._drifts else self._rest
+        return bias
+
+    def one(self, t_s: float, u: Vector6) -> Vector6:
+        """The same for one sample."""
+        if not self._began:
+            self._begin(t_s, u)
+        step = self._step_by
+        np.subtract(u, self._state, step)
+        step *= self._gain
+        self._state += step
+        since_s = t_s - self._t_step
+        bias = self._curves.one(u, self._slow, since_s)
+        if self._drifts:
+            self._count += 1
+            if self._count == self._stride:
+                self._step(t_s, self._rest + since_s * self._slope, self._seen)
+        return bias
+
+    def _rest_path(self, t_s: Float64[np.ndarray, " n"], seen: Float64[np.ndarray, "n 6"]) -> Float64[np.ndarray, "n 6"]:
+        """The rest bias at each sample."""
+        rest, k = np.empty((len(t_s), 6)), 0
+        while k < len(t_s):
+            last = min(len(t_s), k + self._stride - self._count)
+            rest[k:last] = self._rest + (t_s[k:last, None] - self._t_step) * self._slope
+            self._count += last - k
+            if self._count == self._stride:
+                self._step(float(t_s[last - 1]), rest[last - 1], seen[last - 1])
+            k = last
+        return rest
+
+    def _begin(self, t_s: float, u: Array) -> None:
+        """The first sample is the drift's start, and not counted among those that follow it."""
+        self._began, self._state[:] = True, u
+        self._t_step, self._before = t_s, u.copy()
+        self._set_slope(u, np.zeros(6))
+
+    def _step(self, t_s: float, rest: Array, u: Array) -> None:
+        du = (u - self._before) / max(t_s - self._t_step, 1e-9)
+        self._t_step, self._rest, self._before, self._count = t_s, rest.copy(), u.copy(), 0
+        self._set_slope(u, du)
+
+    def _set_slope(self, u: Array, du: Array) -> None:
+        for sensor, rate in self._drifts.items():
+            half = COLUMNS[sensor]
+            self._slope[half] = rate(self._rest[half], u[half], du[half])
+        self._curves.add_line(self._rest, self._slope)
+
+
+def perceptron(module: nn.Module) -> Callable[[Array], Array]:
+    """Linear layers with tanh and GELU between them, as a numpy function."""
+    steps: list[Callable[[Array], Array]] = []
+    for layer in module if isinstance(module, nn.Sequential) else [module]:
+        if isinstance(layer, nn.Linear):
+            steps.append(_affine(_array(layer.weight).T.copy(), _array(layer.bias)))
+        elif isinstance(layer, nn.Tanh):
+            steps.append(np.tanh)
+        else:
+            assert isinstance(layer, nn.GELU)
+            steps.append(_gelu)
+
+    def run(x: Array) -> Array:
+        for step in steps:
+            x = step(x)
+        return x
+
+    return run
+
+
+def _affine(W: Array, b: Array) -> Callable[[Array], Array]:
+    return lambda x: np.asarray(np.dot(x, W) + b)
+
+
+def _gelu(x: Array) -> Array:
+    y: Array = 0.5 * x * (1.0 + erf(x * HALF_ROOT))
+    return y
+
+
+def _with_constant(layer: nn.Linear) -> Array:
+    """A layer's matrix for rows from the left, and its constant as one more row."""
+    return np.concatenate([_array(layer.weight).T, _array(layer.bias)[None]])
+
+
+def _array(tensor: Tensor) -> Array:
+    out: Array = tensor.detach().to("cpu", torch.float64).numpy()
+    return out

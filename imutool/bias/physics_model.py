@@ -1,0 +1,256 @@
+"""A physics.toml run backwards: what it says acts on a sensor, taken off the samples, with its bias as the prior.
+
+Scale, misalignment and the rotation of the mount are one matrix, reading = T f + b with T = (I + S)(I + M) R^T (they act in
+this order), and its inverse is exact: f = (u - b) - (I - T^-1)(u - b). Everything else in closed form is of the measured
+signals without the bias, where it should be of the true ones: right to first order in its size. A rotation of the mount
+is undone, so that samples are in the body's axes and no longer in the sensor's.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import logging
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import ClassVar
+
+import msgspec
+import numpy as np
+import torch
+from jaxtyping import Float, Float64
+from scipy.spatial.transform import Rotation
+from torch import Tensor
+
+from imutool import registry
+from imutool.bias import hybrid
+from imutool.bias.model import COLUMNS, SENSORS, OneByOne, Segment, Sensor, Stream, Unsure, Vector6
+from imutool.errors import ModelError
+from imutool.sensor import catalogue, physics_file
+from imutool.sensor.effect import Physics, Theta
+from imutool.sensor.linear_effect import AXES, Effect, Parameter, full, per_pair
+from imutool.sensor.physics_file import Bias, Entry, PhysicsFile
+from imutool.sensor.readings import Read
+from imutool.sensor.signals import POWER_S, Signals
+
+# How far a bias lies from run to run: of the ADIS16448 in EuRoC's training sequences, 2 mrad/s and 0.02 m/s². Where the file
+# says nothing of the bias: data sheet of a consumer sensor, as in `imutool.bias.static`.
+TURN_ON_STD, UNKNOWN_STD = (2e-3, 0.02), (0.05, 0.4)
+MOST_TAU_S = 0.01  # a clock's offset beyond is no small error: the derivative's noise would be more than what it removes
+MOUNT = "mount_rotation"
+MATRIX = {  # by entry, what it is of each sensor's matrix
+    "gyro_scale": "gyro",
+    "gyro_misalignment": "gyro",
+    "accel_scale": "accel",
+    "accel_misalignment": "accel",
+}
+DRIFTS = {"gyro_bias_drift", "accel_bias_drift"}
+
+logger = logging.getLogger(__name__)
+Part = tuple[Effect, Theta, Theta]  # an effect, its parameters, their standard deviations
+
+
+class Model(hybrid.Model):
+    """b = rest + E(u - b_0), b_0 the file's own bias: an error of the start stays the same error at every sample."""
+
+    method: ClassVar[str] = "physics"
+
+    def __init__(self, parts: Mapping[Sensor, Sequence[Part]], bias: Bias | None, rate_hz: float) -> None:
+        super().__init__(hybrid.Config(gyro_effects=(), accel_effects=(), remainder=False), rate_hz)
+        self.double()
+        for sensor in SENSORS:
+            of = parts[sensor]
+            self._hold(sensor, ())
+            self.effects[sensor] = tuple(effect for effect, _, _ in of)
+            theta, std = (np.concatenate([np.zeros(0), *(part[k] for part in of)]) for k in (1, 2))
+            self.register_buffer(f"theta_{sensor}", torch.from_numpy(theta))
+            self.register_buffer(f"covariance_{sensor}", torch.from_numpy(np.diag(std**2)))
+        self.config = msgspec.structs.replace(
+            self.config,
+            gyro_effects=tuple(effect.name for effect in self.effects["gyro"]),
+            accel_effects=tuple(effect.name for effect in self.effects["accel"]),
+        )
+        looks_back = any(not isinstance(effect.sees, slice) for of in self.effects.values() for effect in of)
+        self.context = int(np.ceil(hybrid.FORGOTTEN * POWER_S * rate_hz)) if looks_back else 0
+        self._b = np.zeros(6) if bias is None else np.array([*bias.gyro, *bias.accel])
+        self.prior_mean.copy_(torch.from_numpy(self._b))
+        self.prior_std.copy_(torch.tensor(np.repeat(UNKNOWN_STD if bias is None else TURN_ON_STD, 3)))
+        self.truth_std.copy_(torch.tensor([2e-3] * 3 + [0.1] * 3))  # as `imutool.bias.static`
+
+    def sensor_bias(self, sensor: Sensor, segment: Segment) -> Float[Tensor, "batch n 3"]:
+        """The effects on the samples without the file's bias, and the rest bias."""
+        b = torch.from_numpy(self._b).to(segment.gyro)
+        less = Segment(segment.t, segment.gyro - b[:3], segment.accel - b[3:], segment.rest)
+        return super().sensor_bias(sensor, less)
+
+    def stream(self, rest: Vector6) -> Stream:
+        """The same in numpy."""
+        inner = super().stream(rest)
+        assert isinstance(inner, OneByOne)
+        return _Less(inner, self._b)
+
+    def calibration_covariance(self) -> Unsure | None:
+        """From the parameters' standard deviations, taken as independent."""
+        unsure = super().calibration_covariance()
+        assert unsure is not None
+
+        def less(
+            t_s: Float64[np.ndarray, " n"], gyro: Float64[np.ndarray, "n 3"], accel: Float64[np.ndarray, "n 3"]
+        ) -> Mapping[Sensor, Float64[np.ndarray, "n 3 p"]]:
+            return unsure(t_s, gyro - self._b[:3], accel - self._b[3:])
+
+        return less
+
+
+class _Less:
+    """A stream that is shown samples without a constant."""
+
+    def __init__(self, inner: OneByOne, b: Vector6) -> None:
+        self._inner, self._b = inner, b
+
+    def __call__(
+        self, t_s: Float64[np.ndarray, " n"], gyro: Float64[np.ndarray, "n 3"], accel: Float64[np.ndarray, "n 3"]
+    ) -> Float64[np.ndarray, "n 6"]:
+        return self._inner(t_s, gyro - self._b[:3], accel - self._b[3:])
+
+    def one(self, t_s: float, u: Vector6) -> Vector6:
+        return self._inner.one(t_s, u - self._b)
+
+
+def load(path: Path, rate_hz: float) -> Model:
+    """The model that a physics.toml is, for samples at a rate. What cannot be taken off is told in a warning.
+
+    Raises:
+        ConfigError: the file cannot be read, or names what there is not.
+        ModelError: nothing in it can be taken off.
+    """
+    file = physics_file.read(path)
+    acting = file.acting(where=path)
+    parts: dict[Sensor, list[Part]] = {"gyro": [], "accel": []}
+    kept = [entry.name for entry in file.effect if not _taken(entry, parts)]
+    without_name = acting[len(file.effect) : len(acting) - (file.bias is not None)]
+    for (physics, theta), words in zip(without_name, _words(file), strict=True):
+        if _needs_more(words):
+            kept.append(f"{physics.equation}")
+        else:
+            for sensor in physics.sensors:
+                parts[sensor].append(_as_effect(physics, theta, sensor))
+    for sensor in SENSORS:
+        part = _matrix(file, sensor)
+        if part is not None:
+            parts[sensor].append(part)
+    if not any(parts.values()) and file.bias is None:
+        listed = ", ".join(kept) or "nothing at all"
+        raise ModelError(
+            f"nothing in it can be taken off ({listed})", where=path, expected="a bias, or an effect in closed form"
+        )
+    if kept:
+        logger.warning("%s: not taken off, for they cannot be: %s", path, ", ".join(kept))
+    if any(entry.name == MOUNT for entry in file.effect):
+        logger.warning("%s: mount_rotation is undone, so that samples are in the body's axes, not the sensor's", path)
+    model = Model(parts, file.bias, rate_hz)
+    sha256 = hashlib.sha256(path.read_bytes()).hexdigest()
+    model.card = {"name": path.stem, "sha256": sha256, "prior": f"bias of {path.name}", "not_taken": kept}
+    model.requires_grad_(False)
+    return model.eval()
+
+
+def _taken(entry: Entry, parts: Mapping[Sensor, list[Part]]) -> bool:
+    """Whether an effect can be taken off; one in closed form is added to the parts, those of the matrix come later."""
+    if entry.name in MATRIX or entry.name == MOUNT:
+        return True
+    if entry.name == physics_file.DRIVEN:
+        return False
+    module = registry.load(catalogue.GROUP, entry.name)
+    sensors: tuple[Sensor, ...] = getattr(module, "SENSORS", ())
+    if entry.name == "clock_offset" and abs(_value(entry, "tau")) > MOST_TAU_S:
+        return False
+    for sensor in sensors:
+        effect: Effect = module.effect(sensor)
+        if entry.name in DRIFTS:
+            effect = replace(effect, sees=_warming(_value(entry, "tau")))
+        names = [_named(entry, sensor, parameter) for parameter in effect.parameters]
+        theta, std = (np.array([of(entry, name) for name in names]) for of in (_value, _std))
+        parts[sensor].append((effect, theta, std))
+    return bool(sensors)
+
+
+def _named(entry: Entry, sensor: Sensor, parameter: Parameter) -> str:
+    """What the file calls an effect's parameter: by the sensor as well where the effect acts on both."""
+    both = f"{sensor}_{parameter.name}"
+    return both if both in entry.parameters else parameter.name
+
+
+def _value(entry: Entry, name: str) -> float:
+    """What the file leaves out does nothing; a drift's time constant has to be there."""
+    return entry.parameters[name].value if name in entry.parameters else _nothing(entry, name)
+
+
+def _std(entry: Entry, name: str) -> float:
+    return (entry.parameters[name].std or 0.0) if name in entry.parameters else 0.0
+
+
+def _nothing(entry: Entry, name: str) -> float:
+    (physics,) = catalogue.physics([entry.name])
+    return next((number.nothing for number in physics.parameters if number.name == name), 0.0)
+
+
+def _warming(tau_s: float) -> Callable[[Signals], Float64[np.ndarray, "n 1"]]:
+    """The drift's course with the time constant that was found instead of the usual one."""
+
+    def course(signals: Signals) -> Float64[np.ndarray, "n 1"]:
+        return np.asarray(-np.expm1(-signals.t_s[:, None] / tau_s))
+
+    return course
+
+
+def _words(file: PhysicsFile) -> list[str]:
+    """What each part without a name depends on, in the order in which they act."""
+    return [*(curve.variable for curve in file.unknown), *(term.term for term in file.term)]
+
+
+def _needs_more(words: str) -> bool:
+    """Whether it takes more than the sensor's own signals: another channel, or the time since a log's start."""
+    return words.startswith("/") or "t" in words.replace("|", " ").split()
+
+
+def _as_effect(physics: Physics, theta: Theta, sensor: Sensor) -> Part:
+    """What has no name, as an effect of size one that is made of what it adds to a reading."""
+    column = COLUMNS[sensor]
+
+    def added(signals: Signals) -> Float64[np.ndarray, "n 3"]:
+        read = Read(signals.t_s, signals.gyro, signals.accel, signals.alpha)
+        out = physics.forward(read, theta)
+        both = np.concatenate([out.gyro - read.gyro, out.accel - read.accel], axis=1)
+        return np.asarray(both[:, column])
+
+    size = (Parameter("size", "-", 1.0),)
+    effect = Effect(physics.name, sensor, physics.equation, size, added, np.eye(3)[:, :, None])
+    return effect, np.ones(1), np.zeros(1)
+
+
+def _matrix(file: PhysicsFile, sensor: Sensor) -> Part | None:
+    """I - T^-1 as an effect of nine parameters, with the standard deviations of what T is made of; none where T is I."""
+    entries = {entry.name: entry for entry in file.effect if MATRIX.get(entry.name) == sensor or entry.name == MOUNT}
+    if not entries:
+        return None
+    factors, variance = [], np.zeros((3, 3))
+    for name in (f"{sensor}_scale", f"{sensor}_misalignment"):
+        if name in entries:
+            M, std = np.zeros((3, 3)), np.zeros((3, 3))
+            for i, j in np.ndindex(3, 3):
+                key = AXES[i] if i == j else AXES[i] + AXES[j]
+                M[i, j], std[i, j] = _value(entries[name], key), _std(entries[name], key)
+            factors.append(np.eye(3) + M)
+            variance += std**2
+    if MOUNT in entries:
+        phi, std = (np.array([of(entries[MOUNT], f"phi_{axis}") for axis in AXES]) for of in (_value, _std))
+        factors.append(Rotation.from_rotvec(phi).as_matrix().T)
+        variance += np.array([[0.0, std[2], std[1]], [std[2], 0.0, std[0]], [std[1], std[0], 0.0]]) ** 2
+    T = np.linalg.multi_dot([np.eye(3), np.eye(3), *factors])
+    return _full(sensor), (np.eye(3) - np.linalg.inv(T)).ravel(), np.sqrt(variance).ravel()
+
+
+def _full(sensor: Sensor) -> Effect:
+    """A matrix on the sensor's own reading."""
+    return Effect(f"{sensor}_matrix", sensor, f"{sensor} += A {sensor}", per_pair("-", 0.1), COLUMNS[sensor], full())

@@ -1,0 +1,1 @@
+"""The bias a run starts with, and how it is tracked from there."""

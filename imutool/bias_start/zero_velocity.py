@@ -1,0 +1,80 @@
+"""Dead reckoning that knows when it stands: debiased samples through the inertial filter, from a known pose.
+
+At every stop velocity and rate are zero, in between speed is bounded (`imutool.inertial.inertial_filter`); each correction also moves
+the position as far as it had drifted with the velocity. Without a stop, what remains is the bounded speed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from imutool.bias.model import Vector6
+from imutool.bias_start.bias_tracking import Known, Passed, RestFilter, smoothed
+from imutool.inertial.inertial_filter import SIZE, State
+from imutool.inertial.strapdown import Start, dead_reckon
+from imutool.recording import Imu, Poses, seconds
+
+START_STD = np.array([1e-3] * 3 + [1e-2] * 3 + [1e-3] * 3)  # rad, m/s, m: of the pose it starts from
+
+
+def with_stops(imu: Imu, start: Start, known: Known, *, smooth: bool = False) -> Poses:
+    """The trajectory at the IMU's stamps, from `start` at its first; with `smooth` each pose is given all samples.
+
+    `imu` is debiased, `known` what may be left of the bias. Between the filter's blocks of half a second the samples are
+    integrated as in pure integration. A recording shorter than a block is pure integration.
+
+    Raises:
+        DataError: no samples.
+        NumericsError: the numbers overflow.
+    """
+    filter_ = RestFilter(known, ahead=smooth)
+    filter_.state = _state(start, known)
+    t_s = seconds(imu.t_ns, int(imu.t_ns[0]) if len(imu) else 0)
+    estimates = _estimates(filter_, imu, t_s, smooth)
+    pieces, first, state = [], 0, filter_.state
+    for end_s, resting, over, after in estimates:
+        last = int(np.searchsorted(t_s, end_s))
+        pieces.append(_between(imu.rows(slice(first, last + 1)), over, resting).rows(slice(0, last - first)))
+        first, state = last, after
+    pieces.append(_between(imu.rows(slice(first, len(imu))), state, False))
+    columns = [np.concatenate([getattr(piece, name) for piece in pieces]) for name in ("p_wb", "q_wb_wxyz", "v_w")]
+    return Poses(imu.t_ns, *columns)
+
+
+def _estimates(filter_: RestFilter, imu: Imu, t_s: np.ndarray, smooth: bool) -> Iterator[tuple[float, bool, State, State]]:
+    """Of each block: its end, whether at rest, the estimate at its start and at its end."""
+
+    def blocks() -> Iterator[Passed]:
+        yield from filter_.feed(t_s, imu.gyro, imu.accel)
+        yield from filter_.finish()
+
+    if not smooth:
+        for block in blocks():
+            yield block.end_s, block.resting, block.step.before, block.step.after
+        return
+    held: tuple[Passed, State] | None = None
+    for block, state in smoothed(blocks()):
+        if held is not None:
+            yield held[0].end_s, held[0].resting, held[1], state
+        held = block, state
+    if held is not None:
+        yield held[0].end_s, held[0].resting, held[1], held[0].step.after  # at the end there is nothing later
+
+
+def _state(start: Start, known: Known) -> State:
+    R_wb = Rotation.from_quat(start.q_wb_wxyz, scalar_first=True).as_matrix()
+    P = np.zeros((SIZE, SIZE))
+    # the errors are the invariant ones: an error of the attitude turns velocity and position about the origin with it
+    P[range(SIZE), range(SIZE)] = np.concatenate([START_STD, known.std, known.ground_std]) ** 2
+    return State(R_wb, start.v_w.copy(), start.p_wb.copy(), known.mean.copy(), np.zeros(6), P)
+
+
+def _between(imu: Imu, state: State, resting: bool) -> Poses:
+    """Pure integration over a block, with what the filter knows of the bias at its start."""
+    left: Vector6 = state.rest_bias(resting)
+    q_wb_wxyz = Rotation.from_matrix(state.R_wb).as_quat(scalar_first=True)
+    corrected = Imu(imu.t_ns, imu.gyro - left[:3], imu.accel - left[3:])
+    return dead_reckon(corrected, (q_wb_wxyz, state.p_wb, state.v_w))

@@ -1,0 +1,183 @@
+"""A motion with a start, a length, noise and other channels; what a sensor reads along it with some effects acting."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from jaxtyping import Float64, Int64
+from numpy.random import Generator
+from scipy.interpolate import make_interp_spline
+
+from imutool.blind_cases import unnamed
+from imutool.blind_cases.effects import Model, Reading, Six, Stage, Theta, Times
+from imutool.blind_cases.motion import Felt, Motion, Smoother
+from imutool.errors import ConfigError
+from imutool.noise.datasheet import Noise
+from imutool.recording import Imu, Poses
+
+RATE_HZ, POSE_RATE_HZ, GRID_HZ = 200.0, 100.0, 1000.0
+MARGIN_S = 2.5  # of motion before and after what a log shows: filters settle in it, shifted clocks read from it
+SETTLE_S = 2.0
+EPOCH_NS = 1_700_000_000_000_000_000  # of every case: when it starts says nothing
+SIM_SHARE = 0.3  # of the real sensor's noise
+FILTERS = {"low_pass", "mount_resonance"}
+JITTER_MAX_S = 2.4e-3  # neighbours 5 ms apart keep their order
+
+Acting = Sequence[tuple[Model, Theta]]
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """Seconds count from the log's start. `noise`: standard deviation of a real sample, by column."""
+
+    smoother: Smoother
+    motion: Motion
+    start_s: float
+    duration_s: float
+    noise: Float64[np.ndarray, "6"]
+    channel_t_s: Times
+    channels: dict[str, Times] = field(default_factory=dict)
+
+    @property
+    def t_s(self) -> Times:
+        """When samples are taken, were the clock true."""
+        return np.arange(int(self.duration_s * RATE_HZ) + 1) / RATE_HZ
+
+    @property
+    def sigma(self) -> Float64[np.ndarray, "6"]:
+        """Of the difference of a real and a simulated sample."""
+        return np.asarray(self.noise * np.hypot(1.0, SIM_SHARE))
+
+    def felt(self, t_s: Times) -> Felt:
+        """What the tracked point feels."""
+        return replace(self.motion.felt(t_s + self.start_s), t_s=np.asarray(t_s, dtype=np.float64))
+
+    def ideal(self, t_s: Times) -> Six:
+        """What an ideal sensor reads."""
+        felt = self.felt(t_s)
+        return np.concatenate([felt.omega, felt.f], axis=1)
+
+    def at(self, t_s: Times) -> dict[str, Times]:
+        """The channels at some times."""
+        return {topic: np.interp(t_s, self.channel_t_s, values) for topic, values in self.channels.items()}
+
+    def arriving(self, acting: Acting, t_s: Times) -> Six:
+        """What the converter gets without noise, one row for each true-clock time of a sample."""
+        order = sorted(acting, key=lambda pair: (pair[0].stage, pair[0].name))
+        taken = np.asarray(t_s, dtype=np.float64)
+        for model, theta in order:
+            if model.stage == Stage.CLOCK:
+                taken = model.act(taken, theta)
+        mounted = [(m, theta) for m, theta in order if m.stage in (Stage.MOUNT, Stage.BANDWIDTH)]
+        signal = self._felt_with(order, mounted, taken)
+        for model, theta in order:
+            if model.stage == Stage.SENSOR:
+                signal = model.act(Reading(t_s, signal, self.at(t_s)), theta)
+        return signal
+
+    def _felt_with(self, order: Acting, mounted: Acting, taken: Times) -> Six:
+        dynamic = any(model.name in FILTERS for model, _ in mounted)
+        first = min(float(taken[0]), 0.0) - SETTLE_S
+        count = int((float(taken[-1]) + 0.2 - first) * GRID_HZ)
+        grid = first + np.arange(count) / GRID_HZ if dynamic else taken
+        felt = self.felt(grid)
+        signal = np.concatenate([felt.omega, felt.f], axis=1)
+        signal = signal + sum((m.act(felt, theta) for m, theta in order if m.stage == Stage.FELT), np.zeros(6))
+        for model, theta in mounted:
+            signal = model.act(GRID_HZ, signal, theta)
+        return np.asarray(make_interp_spline(grid, signal, k=3)(taken)) if dynamic else signal
+
+    def converted(self, acting: Acting, signal: Six) -> Six:
+        """What comes out of the converter: clipped, then rounded."""
+        rank = {"saturation": 0, "quantization": 1}
+        for model, theta in sorted(acting, key=lambda pair: rank.get(pair[0].name, 0)):
+            if model.stage == Stage.CONVERTER:
+                signal = model.act(signal, theta)
+        return signal
+
+    def reference(self, acting: Acting) -> Motion:
+        """The motion as the reference has it: without the poses it lost, bridged."""
+        for model, theta in acting:
+            if model.stage == Stage.REFERENCE:
+                return self.smoother.motion(self.lost(theta))
+        return self.motion
+
+    def lost(self, theta: Theta) -> tuple[tuple[float, float], ...]:
+        """Stretches the reference lost, on the clock of its poses."""
+        return tuple((self.start_s + start, self.start_s + start + float(theta[0])) for start in theta[1:].tolist())
+
+    def expected(self, acting: Acting, t_s: Times) -> Six:
+        """What the simulation says: ideal, along the reference."""
+        return replace(self, motion=self.reference(acting)).ideal(t_s)
+
+    def misfit(self, acting: Acting, t_s: Times) -> Six:
+        """Real less simulated, without any noise and bias."""
+        return np.asarray(self.converted(acting, self.arriving(acting, t_s)) - self.expected(acting, t_s))
+
+    # ── logs ──
+
+    def real(self, acting: Acting, bias: Theta, rng: Generator) -> tuple[Imu, dict[str, float]]:
+        """Samples with effects, bias and noise; and what the effects of the stamps came to."""
+        t_s = self.t_s
+        signal = self.arriving(acting, t_s) + bias + self.noise * rng.standard_normal((len(t_s), 6))
+        signal = self.converted(acting, signal)
+        kept, stamps, came_to = np.ones(len(t_s), dtype=bool), t_s, {}
+        for model, theta in acting:
+            if model.name == "dropped_samples":
+                kept[1:-1] = rng.random(len(t_s) - 2) >= theta[0]
+                came_to = {"share": float(1.0 - kept.mean()), "count": float(np.sum(~kept))}
+            if model.name == "timestamp_jitter":
+                late = np.clip(theta[0] * rng.standard_normal(len(t_s)), -JITTER_MAX_S, JITTER_MAX_S)
+                late[[0, -1]] = 0.0
+                stamps, came_to = t_s + late, {"std": float(late.std())}
+        return _imu(stamps[kept], signal[kept]), came_to
+
+    def simulated(self, acting: Acting, rng: Generator) -> Imu:
+        """Ideal samples along the reference, with the simulation's own small noise."""
+        ideal = self.expected(acting, self.t_s)
+        return _imu(self.t_s, ideal + SIM_SHARE * self.noise * rng.standard_normal(ideal.shape))
+
+    def poses(self, acting: Acting, noise: tuple[float, float], rng: Generator) -> Poses:
+        """The reference's poses, with noise of its own (m, rad)."""
+        t_s = np.arange(int(self.duration_s * POSE_RATE_HZ) + 1) / POSE_RATE_HZ
+        p_wb, q = self.reference(acting).pose(t_s + self.start_s)
+        p_wb = p_wb + noise[0] * rng.standard_normal(p_wb.shape)
+        half = 0.5 * noise[1] * rng.standard_normal(p_wb.shape)
+        w, v = q[:, :1], q[:, 1:]
+        turned = np.concatenate([w - np.sum(v * half, axis=1)[:, None], v + w * half + np.cross(v, half)], axis=1)
+        turned /= np.linalg.norm(turned, axis=1, keepdims=True)
+        return Poses(stamps_ns(t_s), p_wb, turned)
+
+
+def stamps_ns(t_s: Times) -> Int64[np.ndarray, " n"]:
+    """Nanoseconds of the log's clock."""
+    out: Int64[np.ndarray, " n"] = EPOCH_NS + np.round(t_s * 1e9).astype(np.int64)
+    return out
+
+
+def set_up(smoother: Smoother, noise: Noise, rng: Generator, longest_s: float) -> Scene:
+    """A scene somewhere in a trajectory, as long as may be.
+
+    Raises:
+        ConfigError: noise that is not known, or none.
+    """
+    density = np.concatenate([noise.values("gyro_density"), noise.values("accel_density")])
+    if not (np.isfinite(density).all() and (density > 0.0).all()):
+        raise ConfigError(
+            "sizes are told against noise, and this has none or an unknown one",
+            where="--noise",
+            expected="gyro_density and accel_density of every axis above zero",
+        )
+    motion = smoother.motion()
+    room = motion.last_s - motion.first_s - 2.0 * MARGIN_S
+    duration = np.floor(min(longest_s, room))
+    start = motion.first_s + MARGIN_S + rng.uniform(0.0, max(room - duration, 0.0))
+    channel_t = np.arange(int(duration * unnamed.RATE_HZ) + 1) / unnamed.RATE_HZ
+    scene = Scene(smoother, motion, float(start), float(duration), density * np.sqrt(RATE_HZ), channel_t)
+    return replace(scene, channels=unnamed.channels(rng, channel_t, scene.ideal(channel_t)))
+
+
+def _imu(t_s: Times, signal: Six) -> Imu:
+    return Imu(stamps_ns(t_s), np.ascontiguousarray(signal[:, :3]), np.ascontiguousarray(signal[:, 3:]))

@@ -1,0 +1,8 @@
+"""What is wrong inside a log's IMU, and the log without it: `survey` looks, a `Cleaner` leaves out and converts."""
+
+from imutool.cleaning.cleaner import Cleaner, cleaned
+from imutool.cleaning.finding import Finding
+from imutool.cleaning.first_pass import Survey, UntrustedError, look, raw_batches, survey
+from imutool.cleaning.settings import Rules
+
+__all__ = ["Cleaner", "Finding", "Rules", "Survey", "UntrustedError", "cleaned", "look", "raw_batches", "survey"]

@@ -1,0 +1,126 @@
+"""Swapped or flipped axes: a signed permutation by which the sensors fit gravity or the true poses clearly better.
+
+Only said, never mended. That both sensors are turned alike against the poses is a mount, and no defect. Of two sensors that
+contradict one another gravity cannot say which has the wrong axes. And in level flight the specific force stays along the
+thrust, so that gravity says nothing at all: then no turn of the gyro fits worse than every other.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float64, Int64
+
+from imutool.cleaning.finding import Finding
+from imutool.cleaning.frames import axis_names, signed_permutations, tilt_misfit
+from imutool.cleaning.rule import Rule, Whole
+from imutool.cleaning.truth import feeling, turning
+from imutool.recording import seconds
+
+CLEARLY = 0.5  # of the misfit as it is, that of another reading at most; and of what there is to be explained
+ALIKE = 1.3  # times the best misfit: readings that cannot be told from the best
+POSES_APART_NS = 300_000_000
+FEWEST_POSES, MOST_POSES = 10, 20_000  # evenly taken from a longer log
+
+
+class Fit(NamedTuple):
+    """Misfit of each of the 48 readings of a sensor's axes, the present one first, and of a sensor that reads nothing."""
+
+    misfit: Float64[np.ndarray, "48"]
+    nothing: float
+
+    @property
+    def explains(self) -> bool:
+        """Whether any reading fits better than none."""
+        return float(self.misfit.min()) < CLEARLY * self.nothing
+
+    @property
+    def wrong(self) -> bool:
+        """Whether another reading fits clearly better than the present one, and better than none."""
+        return self.explains and float(self.misfit.min()) < CLEARLY * float(self.misfit[0])
+
+    def within(self, times: float) -> Bool[np.ndarray, "48"]:
+        """The readings that fit nearly as well as the best."""
+        return np.asarray(self.misfit <= times * self.misfit.min())
+
+
+class Axes(Rule):
+    """Looked for after units. Against the poses where they settle it, else the one sensor against the other."""
+
+    place = 130
+
+    def findings(self, whole: Whole) -> Iterator[Finding]:
+        """At most one for each sensor."""
+        readings = signed_permutations()
+        gyro, accel = _against_poses(whole, readings)
+        fits = {name: fit for name, fit in (("gyro", gyro), ("accel", accel)) if fit is not None and fit.explains}
+        wrong = {name: fit for name, fit in fits.items() if fit.wrong}
+        turned = np.linalg.det(readings) > 0
+        for fit in wrong.values():
+            turned &= fit.within(1.0 / CLEARLY)
+        if len(wrong) == 2 and turned.any():
+            names = axis_names(readings[np.argmax(turned)])
+            what = f"the body of the true poses is not the IMU's: its x, y, z seem to be the IMU's {names}"
+            yield Finding("axes", "note", what, 3, values={"mount": names}, sure=0.8)
+            return
+        for name, fit in wrong.items():  # where nothing is known of the other sensor, it may still be the mount
+            yield _wrong(name, fit, readings, "the true poses", alone=len(fits) == 1)
+        if "gyro" not in fits:
+            beside = _against_gravity(whole, readings)
+            if beside is not None and beside.wrong:
+                yield _wrong("gyro", beside, readings, "gravity as accel reads it", alone=False)
+
+
+def _wrong(sensor: str, fit: Fit, readings: Float64[np.ndarray, "48 3 3"], against: str, *, alone: bool) -> Finding:
+    """Of the readings that fit alike, the one with most axes as they are."""
+    alike = np.flatnonzero(fit.within(ALIKE))
+    chosen = readings[alike[np.argmax(np.trace(readings[alike], axis1=1, axis2=2))]]
+    names = axis_names(chosen)
+    best, present = float(fit.misfit[alike].min()), float(fit.misfit[0])
+    return Finding(
+        "axes",
+        "warning" if alone else "error",
+        f"{sensor} contradicts {against}: its true x, y, z seem to be its {names}",
+        int((np.abs(chosen - np.eye(3)).sum(axis=1) > 0).sum()),
+        values={"sensor": sensor, "reading": names, "as_good": len(alike), "misfit": best, "misfit_as_is": present},
+        sure=0.5 if alone else 0.95 if len(alike) == 1 else 0.7,
+        distrust="" if alone else f"the axes of {sensor} contradict {against}",
+    )
+
+
+def _against_poses(whole: Whole, readings: Float64[np.ndarray, "48 3 3"]) -> tuple[Fit | None, Fit | None]:
+    """Rate against the turning of the poses; specific force against gravity and the poses' acceleration, in their body."""
+    step, raw = whole.motion.table()
+    if whole.truth is None or len(step) < 2 or whole.motion.start_ns is None:
+        return None, None
+    t_s, mean = 0.1 * step + 0.05, raw * whole.scale
+
+    def beside(
+        at_ns: Int64[np.ndarray, " n"], apart_ns: Int64[np.ndarray, " n"], true: Float64[np.ndarray, "n 3"], k: int
+    ) -> Fit | None:
+        at_s = seconds(at_ns, int(whole.motion.start_ns or 0))
+        use = np.flatnonzero((at_s > t_s[0]) & (at_s < t_s[-1]) & (apart_ns < POSES_APART_NS))
+        if len(use) < FEWEST_POSES:
+            return None
+        use = use[:: -(-len(use) // MOST_POSES)]
+        read = np.stack([np.interp(at_s[use], t_s, column) for column in mean[:, k : k + 3].T], axis=1)
+        return _fit(true[use], read, readings)
+
+    first, last, rate = turning(whole.truth)
+    at_ns, force = feeling(whole.truth)
+    mean[:, :3] -= np.median(mean[:, :3], axis=0)
+    gyro = beside((first + last) // 2, last - first, rate - np.median(rate, axis=0), 0)
+    return gyro, beside(at_ns, np.maximum(np.diff(first), np.diff(last)), force, 3)
+
+
+def _fit(true: Float64[np.ndarray, "n 3"], read: Float64[np.ndarray, "n 3"], readings: Float64[np.ndarray, "48 3 3"]) -> Fit:
+    misfit = [float(np.sqrt(np.median(((true - read @ P.T) ** 2).sum(axis=1)))) for P in readings]
+    return Fit(np.array(misfit), float(np.sqrt(np.median((true**2).sum(axis=1)))))
+
+
+def _against_gravity(whole: Whole, readings: Float64[np.ndarray, "48 3 3"]) -> Fit | None:
+    step, raw = whole.motion.table()
+    misfit = tilt_misfit(step, raw * whole.scale, np.concatenate([readings, np.zeros((1, 3, 3))]))
+    return None if misfit is None else Fit(misfit[:-1], float(misfit[-1]))

@@ -1,0 +1,48 @@
+"""Messages that come again: a stamp that one of the last messages had already."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+
+import numpy as np
+
+from imutool.cleaning.finding import Finding, Places
+from imutool.cleaning.rule import Rule, Whole
+from imutool.cleaning.samples import Samples, joined
+
+MEMORY = 1024  # messages: what a recorder sends again, it sends soon
+
+
+class Duplicates(Rule):
+    """The first of equal stamps stays; one sent again out of its place is a duplicate too, not time going back."""
+
+    place = 10
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._places, self._same = Places(), 0
+
+    def __call__(self, stream: Iterable[Samples]) -> Iterator[Samples]:
+        """The samples without the repeated ones."""
+        before: Samples | None = None
+        for samples in stream:
+            both = samples if before is None else joined([before, samples])
+            seen = 0 if before is None else len(before.number)
+            _, first, which = np.unique(both.stamp_ns, return_index=True, return_inverse=True)
+            original = first[which]
+            again = original[seen:] != np.arange(seen, len(both.number))
+            if again.any():
+                same = both.values[seen:][again].view(np.int64) == both.values[original[seen:][again]].view(np.int64)
+                self._same += int(same.all(axis=1).sum())
+                self._places.add(samples.number[again], samples.stamp_ns[again])
+                self.dropped.append(samples.number[again])
+            left = samples.where(~again)
+            before = both.where(slice(max(0, len(both.number) - MEMORY), None))
+            yield left
+
+    def findings(self, whole: Whole) -> Iterator[Finding]:
+        """One, with how many were the same to the last bit."""
+        if self._places.count:
+            what = "samples with a stamp that an earlier one has"
+            values = {"identical": self._same}
+            yield Finding("duplicates", "warning", what, **self._places.where(), values=values, action="dropped")

@@ -1,0 +1,111 @@
+"""Missing samples: steps between stamps that are longer than the sensor's period."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float64, Int64
+
+from imutool.cleaning.finding import MAX_INTERVALS, Finding
+from imutool.cleaning.rule import Rule, Whole
+from imutool.cleaning.samples import Samples
+from imutool.recording import nanoseconds
+
+MISSING = "samples missing"
+MISSING_STEP = 1.5  # a step of this many median periods or more has lost samples
+FEWEST_STEPS = 16  # for a median of their own
+MOST = 100_000  # gaps held in memory; of a log with more, the rest is only counted
+SERIOUS_SHARE, SERIOUS_S = 1e-3, 1.0
+PAUSE_NS = nanoseconds(60.0)  # nobody recorded: nothing is missing
+
+
+class Gap(NamedTuple):
+    """Between two neighbours: the second one's number, their stamps, and how many samples are missing."""
+
+    number: int
+    first_ns: int
+    last_ns: int
+    missing: int
+
+
+class Gaps(Rule):
+    """Counts what is missing between neighbours that are left; what another rule dropped there is not missing.
+
+    Nor are samples that came too late, nor anything where the clock of the stamps stepped or the rate is another.
+    """
+
+    place = 100
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.missing = 0
+        self._last: tuple[int, int] | None = None
+        self._period_ns = 0.0
+        self._rows: list[Gap] = []
+        self._pauses: list[Gap] = []
+
+    def see(self, samples: Samples) -> None:
+        """Steps within a block are measured against the median of the block."""
+        if not len(samples.number):
+            return
+        number, stamp = samples.number, samples.stamp_ns
+        if self._last is not None:
+            number, stamp = np.append(self._last[0], number), np.append(self._last[1], stamp)
+        self._last = int(number[-1]), int(stamp[-1])
+        steps = np.diff(stamp)
+        if len(steps) >= FEWEST_STEPS or (len(steps) and not self._period_ns):
+            self._period_ns = float(np.median(steps))
+        if not self._period_ns:
+            return
+        lost = missing(steps, self._period_ns)
+        lost = np.where(lost > 0, np.maximum(lost - (np.diff(number) - 1), 0), 0)
+        paused = steps > PAUSE_NS
+        for row in np.flatnonzero(paused)[: MOST - len(self._pauses)]:
+            self._pauses.append(Gap(int(number[row + 1]), int(stamp[row]), int(stamp[row + 1]), 0))
+        lost[paused] = 0
+        self.missing += int(lost.sum())
+        for row in np.flatnonzero(lost)[: MOST - len(self._rows)]:
+            self._rows.append(Gap(int(number[row + 1]), int(stamp[row]), int(stamp[row + 1]), int(lost[row])))
+
+    def findings(self, whole: Whole) -> Iterator[Finding]:
+        """One for what is missing, with the longest gaps, and one for pauses."""
+        pauses = [(row.first_ns, row.last_ns) for row in self._pauses if row.number not in whole.jumps]
+        if pauses:
+            what = f"pauses of more than {PAUSE_NS * 1e-9:g} s"
+            left_out = max(0, len(pauses) - MAX_INTERVALS)
+            yield Finding("gaps", "note", what, len(pauses), tuple(pauses[:MAX_INTERVALS]), left_out, sure=0.9)
+        rows = [row for row in (self._left(row, whole) for row in self._rows) if row.missing]
+        count = self.missing + sum(row.missing for row in rows) - sum(row.missing for row in self._rows)
+        if not rows:
+            return
+        longest = sorted(rows, key=lambda row: row.first_ns - row.last_ns)[:MAX_INTERVALS]
+        longest_s = (longest[0].last_ns - longest[0].first_ns) * 1e-9
+        share = count / (count + whole.motion.samples)
+        distrust = f"{100 * share:.0f} % of the samples are missing" if share > whole.rules.max_missing_share else ""
+        serious = share > SERIOUS_SHARE or longest_s > SERIOUS_S
+        yield Finding(
+            "gaps",
+            "error" if distrust else "warning" if serious else "note",
+            MISSING,
+            count,
+            tuple(sorted((row.first_ns, row.last_ns) for row in longest)),
+            len(rows) - len(longest),
+            {"gaps": len(rows), "longest_s": longest_s, "share": share},
+            distrust=distrust,
+        )
+
+    def _left(self, gap: Gap, whole: Whole) -> Gap:
+        """A gap less what is explained otherwise."""
+        at_other_rate = any(first <= gap.first_ns and gap.last_ns <= last for first, last in whole.other_rate_ns)
+        if gap.number in whole.jumps or at_other_rate:
+            return gap._replace(missing=0)
+        late = int(np.diff(np.searchsorted(whole.late_ns, [gap.first_ns + 1, gap.last_ns]))[0])
+        return gap._replace(missing=max(gap.missing - late, 0))
+
+
+def missing(steps_ns: Int64[np.ndarray, " n"], period_ns: float) -> Float64[np.ndarray, " n"]:
+    """How many samples would fill each step; none where it is shorter than 1.5 periods."""
+    periods = steps_ns / period_ns
+    return np.where(periods >= MISSING_STEP, np.round(periods - 1.0), 0.0)

@@ -1,0 +1,42 @@
+"""Values that are no measurement: no finite numbers, or beyond what any sensor reads in any unit."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+
+import numpy as np
+
+from imutool.cleaning.finding import Finding, Places
+from imutool.cleaning.rule import Rule, Whole
+from imutool.cleaning.samples import Samples
+
+NO_SENSOR = 1e7  # 1000 g in mm/s², the smallest unit in use
+AXES = tuple(f"{sensor}.{axis}" for sensor in ("gyro", "accel") for axis in "xyz")
+
+
+class NotFinite(Rule):
+    """A sample with such a value among its six is left out."""
+
+    place = 30
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._places, self._by_axis = Places(), np.zeros(6, np.int64)
+
+    def __call__(self, stream: Iterable[Samples]) -> Iterator[Samples]:
+        """The samples that are all numbers."""
+        for samples in stream:
+            finite = np.abs(samples.values) <= NO_SENSOR  # false of NaN
+            good = finite.all(axis=1)
+            if not good.all():
+                self._by_axis += (~finite).sum(axis=0)
+                self._places.add(samples.number[~good], samples.stamp_ns[~good])
+                self.dropped.append(samples.number[~good])
+            yield samples.where(good)
+
+    def findings(self, whole: Whole) -> Iterator[Finding]:
+        """One, with the count by axis."""
+        if self._places.count:
+            by_axis = {name: int(count) for name, count in zip(AXES, self._by_axis, strict=True) if count}
+            what = "samples that are no measurement: not finite, or beyond any sensor"
+            yield Finding("not_finite", "warning", what, **self._places.where(), values=by_axis, action="dropped")

@@ -1,0 +1,94 @@
+"""Axes at the end of their range."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from itertools import product
+
+import numpy as np
+from jaxtyping import Float64
+
+from imutool.cleaning.finding import Finding, Places
+from imutool.cleaning.rule import Rule, Whole
+from imutool.cleaning.rules.not_finite import AXES
+from imutool.cleaning.samples import Samples
+
+SAMPLES = 5
+PILE = 2.0
+LEVELS = 10
+RULE = (
+    f"an axis is saturated at its own largest or smallest value where at least {SAMPLES} samples hold exactly "
+    f"that value, more than {PILE:g} times as many as either of the next two values, among at least "
+    f"{LEVELS} values, and it is not the median"
+)
+KEPT = 3  # values at either end: the last one, and the two it is compared with
+
+
+class Ends:
+    """The largest and smallest values of an axis and how often each came, over samples that come in parts."""
+
+    def __init__(self) -> None:
+        self._few = np.zeros(0)  # distinct values, until there are enough of them
+        self._ends = {-1: (np.zeros(0), np.zeros(0, np.int64)), 1: (np.zeros(0), np.zeros(0, np.int64))}
+        self._samples = 0
+
+    def see(self, values: Float64[np.ndarray, " n"]) -> None:
+        """The next values; those that are no finite numbers are passed over."""
+        levels, counts = np.unique(values[np.isfinite(values)], return_counts=True)
+        self._samples += int(counts.sum())
+        if len(self._few) < LEVELS:
+            self._few = np.union1d(self._few, levels)[:LEVELS]
+        for side, (known, times) in self._ends.items():
+            near = slice(None, KEPT) if side < 0 else slice(-KEPT, None)
+            both, which = np.unique(np.concatenate([known, levels[near]]), return_inverse=True)
+            total = np.bincount(which, np.concatenate([times, counts[near]])).astype(np.int64)
+            self._ends[side] = both[near], total[near]
+
+    def limit(self, side: int) -> float | None:
+        """The value at which the axis is saturated (`RULE`), at its low (-1) or high (1) end."""
+        if len(self._few) < LEVELS:
+            return None
+        levels, counts = self._ends[side]
+        end, near = (0, counts[1:]) if side < 0 else (-1, counts[:-1])
+        piled = counts[end] >= SAMPLES and counts[end] > PILE * near.max()
+        median = 2 * counts[end] > self._samples
+        return float(levels[end]) if piled and not median else None
+
+    def extreme(self, side: int) -> float:
+        """The last value at an end so far."""
+        levels = self._ends[side][0]
+        return float(levels[0 if side < 0 else -1]) if len(levels) else np.nan
+
+
+class Saturation(Rule):
+    """Saturated samples stay: that they are at least this large is worth knowing, and a bias model cannot mend them."""
+
+    place = 110
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._ends = [Ends() for _ in AXES]
+        self._places: dict[tuple[int, int], tuple[float, Places]] = {}
+
+    def see(self, samples: Samples) -> None:
+        """Places are those of the extreme so far: a larger value makes those before it ordinary."""
+        for axis, ends in enumerate(self._ends):
+            values = samples.values[:, axis]
+            ends.see(values)
+            for side in (-1, 1):
+                level = ends.extreme(side)
+                known = self._places.get((axis, side))
+                if known is None or known[0] != level:
+                    known = self._places[axis, side] = level, Places()
+                at = values == level
+                known[1].add(samples.number[at], samples.stamp_ns[at])
+
+    def findings(self, whole: Whole) -> Iterator[Finding]:
+        """One for each axis and end."""
+        for axis, side in product(range(6), (-1, 1)):
+            limit = self._ends[axis].limit(side)
+            if limit is not None:
+                places = self._places[axis, side][1]
+                what = f"samples with {AXES[axis]} at the end of its range"
+                values = {"axis": AXES[axis], "limit": limit * float(whole.scale[axis])}
+                yield Finding("saturation", "warning", what, **places.where(), values=values, sure=0.9)

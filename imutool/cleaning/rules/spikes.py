@@ -1,0 +1,88 @@
+"""Single samples, or up to three in a row, that stand far out of what surrounds them.
+
+A spike of w samples leaves by one step and comes back by another of the opposite sign, and both are many times larger than
+every other step nearby. Real shocks ring: over the training recordings of EuRoC (motors), TUM-VI (hand-held) and FETCH
+(wheels on a floor), the smaller of the two steps is at most 4.8 times the largest other step within ten samples (FETCH; 2.2
+on EuRoC, 2.1 on TUM-VI), whatever its size. A steep start of a motion comes back too late, and two spikes within ten samples
+of one another hide each other: then they stay.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+
+import numpy as np
+from jaxtyping import Bool, Float64
+from numpy.lib.stride_tricks import sliding_window_view
+
+from imutool.cleaning.finding import Finding, Places
+from imutool.cleaning.rule import Rule, Whole
+from imutool.cleaning.rules.not_finite import AXES
+from imutool.cleaning.samples import Samples, padded
+
+NEARBY = 10  # samples on either side
+LONGEST = 3  # samples
+TIMES = 8.0  # the largest step nearby
+ORDINARY = 0.75  # quantile of the steps
+
+
+class Spikes(Rule):
+    """Leaves spikes out; the whole sample goes, whichever of its axes has it."""
+
+    place = 50
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._places, self._by_axis, self._largest = Places(), np.zeros(6, np.int64), np.zeros(6)
+
+    def __call__(self, stream: Iterable[Samples]) -> Iterator[Samples]:
+        """The samples without spikes."""
+        for around, core in padded(stream, NEARBY + LONGEST + 1):
+            spike, size = spikes(around.values)
+            found = spike[core]
+            samples = around.where(core)
+            bad = np.asarray(found.any(axis=1))
+            if bad.any():
+                self._by_axis += found.sum(axis=0)
+                self._largest = np.maximum(self._largest, np.where(found, size[core], 0.0).max(axis=0))
+                self._places.add(samples.number[bad], samples.stamp_ns[bad])
+                self.dropped.append(samples.number[bad])
+            yield samples.where(~bad)
+
+    def findings(self, whole: Whole) -> Iterator[Finding]:
+        """One, with count and largest step by axis."""
+        if self._places.count:
+            axes = [i for i in range(6) if self._by_axis[i]]
+            values = {
+                "axes": {AXES[i]: int(self._by_axis[i]) for i in axes},
+                "largest_step": {AXES[i]: float(self._largest[i]) for i in axes},
+            }
+            what = f"samples that stand out by {TIMES:g} times the largest step near them"
+            yield Finding("spikes", "warning", what, **self._places.where(), values=values, action="dropped", sure=0.95)
+
+
+def spikes(values: Float64[np.ndarray, "n k"]) -> tuple[Bool[np.ndarray, "n k"], Float64[np.ndarray, "n k"]]:
+    """Which samples are spikes, by axis, and the smaller of the two steps of each (0 elsewhere).
+
+    Where the samples nearby hardly change (at rest, at the end of the range), an ordinary step must not stand out: three
+    quarters of the steps that are not zero, over the whole block, are the least that counts as a step nearby.
+    """
+    n = len(values)
+    found, size = np.zeros(values.shape, bool), np.zeros(values.shape)
+    if n < NEARBY:
+        return found, size
+    step = np.diff(values, axis=0)
+    there = np.abs(step)
+    ordinary = np.array([np.quantile(column[column > 0], ORDINARY) if column.any() else 0.0 for column in there.T])
+    edge = np.zeros((NEARBY, values.shape[1]))
+    largest = sliding_window_view(np.concatenate([edge, there, edge]), NEARBY, axis=0).max(axis=-1)  # of steps k-10..k-1
+    for width in range(1, LONGEST + 1):
+        first = np.arange(1, n - width)  # the step into it is first - 1, the step out of it first + width - 1
+        into, out = step[first - 1], -step[first + width - 1]
+        peak = np.where(into * out > 0, np.minimum(np.abs(into), np.abs(out)), 0.0)
+        other = np.maximum(np.maximum(largest[first - 1], largest[first + width + NEARBY]), ordinary)
+        rows, axes = np.nonzero(peak > TIMES * other)
+        for shift in range(width):
+            found[first[rows] + shift, axes] = True
+            size[first[rows] + shift, axes] = np.maximum(size[first[rows] + shift, axes], peak[rows, axes])
+    return found, size

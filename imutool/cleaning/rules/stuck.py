@@ -1,0 +1,129 @@
+"""Values that stand still: a sensor that repeats its last sample, an axis that no longer moves.
+
+A sensor with noise does not give six equal numbers twice; in 23 real recordings two samples in a row are the longest such
+run. In a noise-free simulation at rest it does, so repeats are only dropped where the samples that do change show noise:
+third differences then exceed second ones (by sqrt(20/6) for white noise), and in smooth motion they are far smaller.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+
+import numpy as np
+from jaxtyping import Bool, Float64
+
+from imutool.cleaning.finding import Finding, Places, runs
+from imutool.cleaning.rule import Rule, Whole
+from imutool.cleaning.rules.not_finite import AXES
+from imutool.cleaning.samples import Samples, padded
+
+LEAST = 10  # equal samples in a row
+AXIS_LEAST, AXIS_LEAST_S = 100, 1.0  # of one axis alone; the longest in real recordings is 17, or 0.17 s
+HELD_SHARE = 0.3  # of neighbours that are equal: the topic is faster than its sensor
+AXIS_DISTRUST = 0.1  # of the time
+
+
+class Stuck(Rule):
+    """Of equal samples in a row the first stays. An axis that alone stands still is only said."""
+
+    place = 40
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._places, self._quiet = Places(), Places()
+        self._noisy = True
+        self._equal, self._pairs = 0, 0
+        self._axes = [_Axis() for _ in AXES]
+
+    def __call__(self, stream: Iterable[Samples]) -> Iterator[Samples]:
+        """The samples without repeats."""
+        for around, core in padded(stream, LEAST):
+            same = np.concatenate([[False], (np.diff(around.values, axis=0) == 0).all(axis=1)])
+            self._noisy = _noisy(around.values[~same], self._noisy)
+            again = np.zeros(len(same), bool)
+            for first, end in runs(same):
+                again[first:end] = end - first >= LEAST - 1
+            samples, repeated = around.where(core), again[core]
+            self._equal += int(same[core].sum())
+            self._pairs += len(repeated)
+            if repeated.any():
+                places = self._places if self._noisy else self._quiet
+                places.add(samples.number[repeated], samples.stamp_ns[repeated])
+            if self._noisy:
+                self.dropped.append(samples.number[repeated])
+                samples = samples.where(~repeated)
+            for axis, values in zip(self._axes, samples.values.T, strict=True):
+                axis.see(values, samples)
+            yield samples
+
+    def findings(self, whole: Whole) -> Iterator[Finding]:
+        """Repeats, values held by a topic faster than its sensor, and axes that stand still."""
+        if self._places.count:
+            what = f"samples that repeat the one before, in runs of {LEAST} and more: the sensor was stuck"
+            yield Finding("stuck", "warning", what, **self._places.where(), action="dropped", sure=0.95)
+        if self._quiet.count:
+            what = "samples that repeat the one before, of a sensor without noise: simulated, or stuck"
+            yield Finding("stuck", "note", what, **self._quiet.where(), sure=0.5)
+        if self._equal - self._places.count - self._quiet.count > HELD_SHARE * self._pairs:
+            share = self._equal / self._pairs
+            what = "samples equal to the one before: the topic is faster than its sensor"
+            yield Finding("stuck", "warning", what, self._equal, values={"share": share}, sure=0.9)
+        total_s = (whole.motion.end_ns - (whole.motion.start_ns or 0)) * 1e-9
+        for name, axis in zip(AXES, self._axes, strict=True):
+            axis.close()
+            if axis.places.count:
+                share = min(axis.still_s / total_s, 1.0) if total_s > 0 else 0.0
+                distrust = f"{name} stands still for {100 * share:.0f} % of the time" if share > AXIS_DISTRUST else ""
+                what = f"samples with {name} unchanged for {AXIS_LEAST_S:g} s and more"
+                values = {"axis": name, "share": share}
+                yield Finding(
+                    "stuck", "error" if distrust else "warning", what, **axis.places.where(), values=values, distrust=distrust
+                )
+
+
+class _Axis:
+    """Runs of one value on one axis, across blocks."""
+
+    def __init__(self) -> None:
+        self.places, self.still_s = Places(), 0.0
+        self._value, self._numbers, self._stamps, self._count = np.nan, (0, 0), (0, 0), 0
+
+    def see(self, values: Float64[np.ndarray, " n"], samples: Samples) -> None:
+        if not len(values):
+            return
+        changes: Bool[np.ndarray, " n"] = np.diff(values, prepend=self._value) != 0
+        starts = np.flatnonzero(changes)
+        ends = np.concatenate([starts, [len(values)]])
+        if ends[0]:  # goes on from the block before
+            self._take(samples, 0, int(ends[0]), new=False)
+        lengths = np.diff(ends)
+        long = np.flatnonzero(lengths >= AXIS_LEAST)
+        for start, end in [(int(starts[i]), int(ends[i + 1])) for i in long if i + 1 < len(starts)]:
+            self._take(samples, start, end, new=True)
+        if len(starts):
+            self._take(samples, int(starts[-1]), len(values), new=True)
+        self._value = float(values[-1])
+
+    def _take(self, samples: Samples, start: int, end: int, *, new: bool) -> None:
+        if new:
+            self.close()
+            self._numbers, self._stamps = (int(samples.number[start]), 0), (int(samples.stamp_ns[start]), 0)
+        self._count += end - start
+        self._numbers = self._numbers[0], int(samples.number[end - 1])
+        self._stamps = self._stamps[0], int(samples.stamp_ns[end - 1])
+
+    def close(self) -> None:
+        """The run so far ends."""
+        lasted_s = (self._stamps[1] - self._stamps[0]) * 1e-9
+        if self._count >= AXIS_LEAST and lasted_s >= AXIS_LEAST_S:
+            self.places.add_run(self._numbers, self._stamps, self._count)
+            self.still_s += lasted_s
+        self._count = 0
+
+
+def _noisy(values: Float64[np.ndarray, "n 6"], before: bool) -> bool:
+    """Whether samples show noise; what was known before where there are too few."""
+    if len(values) < 4 * LEAST:
+        return before
+    second, third = np.diff(values, n=2, axis=0), np.diff(values, n=3, axis=0)
+    return bool((np.median(np.abs(third), axis=0) > np.median(np.abs(second), axis=0)).any())

@@ -1,0 +1,80 @@
+"""True poses beside an IMU, thinned to ten a second: what they say of angular rate and specific force."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float64, Int64
+
+from imutool.cleaning.motion import STEP_NS
+from imutool.errors import LogError
+from imutool.mcap_io.log import Log
+from imutool.recording import GRAVITY_M_S2, Poses, seconds
+
+
+class Truth(NamedTuple):
+    """Poses at least a tenth of a second apart, in order."""
+
+    topic: str
+    t_ns: Int64[np.ndarray, " n"]
+    p_wb: Float64[np.ndarray, "n 3"]
+    q_wb_wxyz: Float64[np.ndarray, "n 4"]
+
+
+def read_truth(log: Log) -> Truth | None:
+    """The first pose topic of a log; none where it has none that can be read, or fewer than three poses."""
+    for topic in log.pose_topics:
+        times, places, turns = [], [], []
+        last = -(2**62)
+        try:
+            for batch in log.pose_batches(topic):
+                keep = _thinned(batch.stamp_ns, last)
+                if len(keep):
+                    last = int(batch.stamp_ns[keep[-1]])
+                    times.append(batch.stamp_ns[keep])
+                    places.append(batch.p_wb[keep])
+                    turns.append(batch.q_wb_wxyz[keep])
+        except LogError:  # poses are a help here, not what is cleaned: `imutool info` says what is wrong with them
+            continue
+        if sum(map(len, times)) >= 3:
+            q_wxyz = np.concatenate(turns)
+            norm = np.linalg.norm(q_wxyz, axis=1)
+            good = norm > 0.5
+            return Truth(topic, np.concatenate(times)[good], np.concatenate(places)[good], q_wxyz[good] / norm[good, None])
+    return None
+
+
+def of_poses(topic: str, poses: Poses) -> Truth | None:
+    """The same of poses that are in memory; none of fewer than three."""
+    if len(poses) < 3:
+        return None
+    keep = _thinned(poses.t_ns, -(2**62))
+    return Truth(topic, poses.t_ns[keep], poses.p_wb[keep], poses.q_wb_wxyz[keep])
+
+
+def _thinned(stamp_ns: Int64[np.ndarray, " n"], last_ns: int) -> Int64[np.ndarray, " m"]:
+    """The first row of each tenth of a second after that of `last_ns`; what goes back in time is left out."""
+    step = stamp_ns // STEP_NS
+    before = np.maximum.accumulate(np.concatenate([[last_ns // STEP_NS], step]))[:-1]
+    return np.flatnonzero(step > before)
+
+
+def turning(truth: Truth) -> tuple[Int64[np.ndarray, " m"], Int64[np.ndarray, " m"], Float64[np.ndarray, "m 3"]]:
+    """Start, end and mean angular rate (rad/s, body frame) between neighbouring poses."""
+    from scipy.spatial.transform import Rotation
+
+    R = Rotation.from_quat(truth.q_wb_wxyz, scalar_first=True)
+    dt = seconds(truth.t_ns[1:], int(truth.t_ns[0])) - seconds(truth.t_ns[:-1], int(truth.t_ns[0]))
+    return truth.t_ns[:-1], truth.t_ns[1:], (R[:-1].inv() * R[1:]).as_rotvec() / dt[:, None]
+
+
+def feeling(truth: Truth) -> tuple[Int64[np.ndarray, " m"], Float64[np.ndarray, "m 3"]]:
+    """Specific force (m/s², body frame) at each pose between two others, from second differences of their positions."""
+    from scipy.spatial.transform import Rotation
+
+    t_s = seconds(truth.t_ns, int(truth.t_ns[0]))
+    v_w = np.diff(truth.p_wb, axis=0) / np.diff(t_s)[:, None]
+    a_w = 2.0 * np.diff(v_w, axis=0) / (t_s[2:] - t_s[:-2])[:, None]
+    R = Rotation.from_quat(truth.q_wb_wxyz[1:-1], scalar_first=True)
+    return truth.t_ns[1:-1], R.inv().apply(a_w + np.array([0.0, 0.0, GRAVITY_M_S2]))

@@ -1,0 +1,110 @@
+"""What the commands share: the application, options, and the one place that catches."""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Annotated, Any, NoReturn
+
+import typer
+from typer.core import TyperCommand, TyperGroup
+
+from imutool import __version__, registry
+from imutool.cli.terminal import plain, say, tell_error
+from imutool.errors import ConfigError, ImutoolError
+
+INTERRUPTED = 130
+LOST = 3  # the command did what it could, and something of the log is lost
+PIPE_CLOSED = 141  # what a shell reports of a program that SIGPIPE ended
+NOTHING_LEFT = "Nothing half-written is left"
+
+
+class _Commands(TyperGroup):
+    """Commands whose interrupt is told here: typer would end the program without a word."""
+
+    def invoke(self, ctx: Any) -> Any:
+        with caught():
+            result = super().invoke(ctx)
+            sys.stdout.flush()  # at the interpreter's end it would be too late to say anything
+        return result
+
+
+@contextmanager
+def caught() -> Iterator[None]:
+    """The one place that catches: what went wrong becomes a sentence and an exit code."""
+    try:
+        yield
+    except ImutoolError as error:
+        _fail(str(error), error.exit_code)
+    except KeyboardInterrupt as interrupt:
+        _fail(f"interrupted. {str(interrupt) or NOTHING_LEFT}.", INTERRUPTED)
+    except BrokenPipeError:
+        _forget_stdout()
+        sys.exit(PIPE_CLOSED)
+    except OSError as error:
+        if error.filename is None:  # then it is a stream, and stdout the only one we fill
+            _forget_stdout()
+        place = f"{error.filename}: " if error.filename else ""
+        _fail(f"{place}{error.strerror or error}. Choose another place or make room.", ConfigError.exit_code)
+
+
+def listing(group: str, option: str) -> type[TyperCommand]:
+    """A command whose help also lists what can be named, found (and nothing of it imported) when help is asked for."""
+
+    class Listing(TyperCommand):
+        def format_help(self, ctx: Any, formatter: Any) -> None:
+            lines = [f"[bold]{name}[/]  {plain(registry.summary(group, name))}" for name in registry.names(group)]
+            self.epilog = "\n\n".join([f"Values of {option}:", *lines, self.epilog or ""])
+            super().format_help(ctx, formatter)
+
+    return Listing
+
+
+app = typer.Typer(
+    name="imutool",
+    help="Raw inertial data to MCAP, learned IMU bias dynamics, debiased logs, and a picture of what changed.",
+    cls=_Commands,
+    no_args_is_help=True,
+    rich_markup_mode="rich",
+    pretty_exceptions_enable=False,
+    add_completion=False,
+)
+
+Logs = Annotated[list[Path], typer.Argument(metavar="LOG...", help="MCAP logs.")]
+Models = Annotated[list[str] | None, typer.Option("--model", help="Model file, a name that ships, or 'static'. Repeatable.")]
+Init = Annotated[str, typer.Option(help="Start bias: auto, stationary, prior, truth, or gx,gy,gz,ax,ay,az (rad/s, m/s²).")]
+Smooth = Annotated[bool, typer.Option("--smooth", help="Take the whole log for every sample's bias: better, not causal.")]
+Imu = Annotated[str | None, typer.Option(help="IMU topic, where a log has several.")]
+Truth = Annotated[str | None, typer.Option(help="Topic of the true poses, where a log has several.")]
+Json = Annotated[str | None, typer.Option("--json", metavar="FILE|-", help="Write the report as JSON; - is stdout.")]
+Report = Annotated[Path | None, typer.Option(metavar="F.html", help="Write a page: figures, paths, errors, biases, spectra.")]
+Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace what is there.")]
+Verbose = Annotated[bool, typer.Option("-v", "--verbose", help="Say more.")]
+Quiet = Annotated[bool, typer.Option("-q", "--quiet", help="Say only results and errors.")]
+
+
+def _fail(message: str, code: int) -> NoReturn:
+    tell_error(message)
+    sys.exit(code)
+
+
+def _forget_stdout() -> None:
+    """What is still to be flushed into a closed pipe or a full disk goes nowhere, so that leaving raises nothing more."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+
+
+def _version(show: bool) -> bool:
+    if show:
+        say(f"imutool {__version__}")
+        raise typer.Exit
+    return show
+
+
+@app.callback()
+def options(
+    show_version: Annotated[bool, typer.Option("--version", callback=_version, is_eager=True, help="Say the version.")] = False,
+) -> None:
+    """Options of imutool itself."""

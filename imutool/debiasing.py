@@ -1,0 +1,350 @@
+"""A model at work: over a whole log, over a recording in memory, or one sample at a time; always the same numbers.
+
+Causal throughout, unless `smooth` is asked for: the bias at a sample comes from that sample and earlier ones, once the start
+is known (`imutool.bias_start.initial_bias`). Smoothing reads the log twice; of the first pass it keeps thirteen numbers for each half second.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float64, Int64, UInt8
+
+from imutool import __version__
+from imutool.bias import static
+from imutool.bias.io import shipped, shipped_for
+from imutool.bias.model import BiasModel, OneByOne, Stream, Vector6
+from imutool.bias_start.bias_covariance import Certainty
+from imutool.bias_start.initial_bias import TurnOn, following
+from imutool.bias_start.model_choice import prepare, refuse_smooth
+from imutool.cleaning import Cleaner, Rules, Survey, look
+from imutool.config import plain
+from imutool.errors import ConfigError, LogError
+from imutool.location import Place
+from imutool.mcap_io.added_topics import Made, NewTopic
+from imutool.mcap_io.batches import Clock, ImuBatch
+from imutool.mcap_io.codec import schemas
+from imutool.mcap_io.codec.encode import encode_imu, encode_twist, encode_vector3
+from imutool.mcap_io.log import Log
+from imutool.mcap_io.losses import Losses
+from imutool.mcap_io.repair import repaired
+from imutool.mcap_io.rewrite import RewriteReport, Values, rewrite
+from imutool.mcap_io.storage.digest import Digest
+from imutool.mcap_io.verify import Verified, refuse_unknown
+from imutool.recording import Imu, seconds
+
+SUFFIX = "/debiased"
+BLOCK = 1 << 14  # samples
+CLEAN_RECORD = "imutool_clean"
+
+
+class Debiased(NamedTuple):
+    """Corrected samples and what was subtracted: gyro (rad/s), then accel (m/s²)."""
+
+    imu: Imu
+    bias: Float64[np.ndarray, "n 6"]
+
+
+@dataclass(frozen=True)
+class DebiasReport:
+    """What was done to a log, one entry per IMU topic."""
+
+    models: Mapping[str, str]
+    starts: Mapping[str, TurnOn]
+    rewrite: RewriteReport
+    losses: Losses  # of a damaged source; empty as far as it was looked at (`check`)
+    surveys: Mapping[str, Survey]  # of what was cleaned
+
+
+def apply(model: BiasModel, start: TurnOn, imu: Imu) -> Debiased:
+    """A model over samples in memory, from their first on."""
+    bias = start.stream(model)(seconds(imu.t_ns, int(imu.t_ns[0])), imu.gyro, imu.accel)
+    return Debiased(Imu(imu.t_ns, imu.gyro - bias[:, :3], imu.accel - bias[:, 3:]), bias)
+
+
+class Block(NamedTuple):
+    """Consecutive samples of one IMU as they are debiased, for whoever watches: gyro (rad/s), then accel (m/s²)."""
+
+    topic: str
+    batch: ImuBatch  # raw
+    bias: Float64[np.ndarray, "n 6"]  # what is subtracted
+    std: Float64[np.ndarray, "n 6"]  # one standard deviation of it
+
+
+Watch = Callable[[Block], None]
+
+
+def apply_with_std(model: BiasModel, start: TurnOn, imu: Imu) -> tuple[Debiased, Float64[np.ndarray, "n 6"]]:
+    """As `apply`, and one standard deviation of the bias at each sample, gyro (rad/s) then accel (m/s²): `imutool.bias_start.bias_covariance`.
+
+    In blocks, as a log is debiased: a covariance is 288 bytes.
+    """
+    stream = start.stream(model)
+    certainty = Certainty(model, start, stream)
+    t_s = seconds(imu.t_ns, int(imu.t_ns[0]))
+    bias, std = np.empty((len(imu), 6)), np.empty((len(imu), 6))
+    for first in range(0, len(imu), BLOCK):
+        rows = slice(first, first + BLOCK)
+        bias[rows] = stream(t_s[rows], imu.gyro[rows], imu.accel[rows])
+        covariance = certainty(t_s[rows], imu.gyro[rows], imu.accel[rows])
+        std[rows] = np.sqrt(covariance.diagonal(axis1=1, axis2=2))
+    return Debiased(Imu(imu.t_ns, imu.gyro - bias[:, :3], imu.accel - bias[:, 3:]), bias), std
+
+
+class OnlineDebiaser:
+    """One sample in, one corrected sample out: for a live node.
+
+    The start is a rest bias from `imutool.bias_start.initial_bias`, for instance `at_rest` over the first seconds, or `prior`. Without one, it
+    begins at the prior and is followed by what the samples show, as by `--init auto`.
+    """
+
+    def __init__(self, model: BiasModel, start: TurnOn | None = None) -> None:
+        stream = (start or following(model)).stream(model)
+        self._one, self._start_ns = stream.one if isinstance(stream, OneByOne) else _by_blocks(stream), -1
+
+    def __call__(
+        self, stamp_ns: int, gyro: Float64[np.ndarray, "3"], accel: Float64[np.ndarray, "3"]
+    ) -> tuple[Float64[np.ndarray, "3"], Float64[np.ndarray, "3"], Float64[np.ndarray, "6"]]:
+        """Corrected angular rate (rad/s) and specific force (m/s²), and the bias that was subtracted."""
+        if self._start_ns < 0:
+            self._start_ns = stamp_ns
+        u = np.concatenate((gyro, accel))
+        bias = self._one((stamp_ns - self._start_ns) * 1e-9, u)
+        clean = u - bias
+        return clean[:3], clean[3:], bias
+
+
+def _by_blocks(stream: Stream) -> Callable[[float, Vector6], Vector6]:
+    """One sample as a block of one, for a stream that knows no shorter way."""
+
+    def one(t_s: float, u: Vector6) -> Vector6:
+        bias: Vector6 = stream(np.array([t_s]), u[None, :3], u[None, 3:])[0]
+        return bias
+
+    return one
+
+
+class Debiaser:
+    """The channels a log gains, computed batch by batch as the log is copied (`mcap_io.derived.Derived`).
+
+    With a survey, only of what is left of the samples when they are clean. Who watches is told every batch.
+    """
+
+    def __init__(
+        self, source_topic: str, model: BiasModel, start: TurnOn, found: Survey | None = None, watch: Watch | None = None
+    ) -> None:
+        self.source_topic, self._watch = source_topic, watch
+        self._clean = None if found is None else Cleaner(found)
+        self.topics: Sequence[NewTopic] = (
+            NewTopic(f"{source_topic}{SUFFIX}", schemas.IMU),
+            NewTopic(f"{source_topic}/bias/gyro", schemas.VECTOR3),
+            NewTopic(f"{source_topic}/bias/accel", schemas.VECTOR3),
+            NewTopic(f"{source_topic}/bias", schemas.TWIST),
+        )
+        self._stream, self._start_ns = start.stream(model), -1
+        self._clock = Clock()
+        self._certainty = Certainty(model, start, self._stream)
+        noise = model.noise_std.detach().cpu().double().numpy()
+        self._white = np.diag(np.where(noise > 0, noise, start.noise) ** 2)
+
+    def __call__(self, batch: ImuBatch) -> Made:
+        """Payloads of the corrected messages, of the two biases, and of both with their covariance.
+
+        A corrected sample's covariance is that of its bias and the sensor's white noise.
+
+        Raises:
+            LogError: samples no model can take: NaN, or stamps that do not increase.
+        """
+        if self._clean is not None:
+            batch = self._clean(batch)
+        self._clock.take(batch)
+        if self._start_ns < 0 and len(batch.stamp_ns):
+            self._start_ns = int(batch.stamp_ns[0])
+        t_s = seconds(batch.stamp_ns, self._start_ns)
+        bias = self._stream(t_s, batch.gyro, batch.accel)
+        unsure = self._certainty(t_s, batch.gyro, batch.accel)
+        total = unsure + self._white
+        corrected = encode_imu(
+            batch.stamp_ns,
+            batch.gyro - bias[:, :3],
+            batch.accel - bias[:, 3:],
+            batch.frame_id,
+            total[:, :3, :3].reshape(-1, 9),
+            total[:, 3:, 3:].reshape(-1, 9),
+        )
+        payloads = (
+            corrected,
+            _vector(batch.stamp_ns, bias[:, :3], batch.frame_id),
+            _vector(batch.stamp_ns, bias[:, 3:], batch.frame_id),
+            encode_twist(batch.stamp_ns, bias[:, :3], bias[:, 3:], unsure, batch.frame_id),
+        )
+        if self._watch is not None and len(batch.stamp_ns):
+            std = np.sqrt(unsure.diagonal(axis1=1, axis2=2))
+            self._watch(Block(self.source_topic, batch, bias, std))
+        return Made(batch, payloads)
+
+
+def debias(
+    source: Place,
+    target: Place | None,
+    *,
+    model: str | Path | Mapping[str, str | Path] | None = None,
+    imus: Sequence[str] = (),
+    init: str = "auto",
+    smooth: bool = False,
+    check: str = "imu",
+    clean: Rules | None = None,
+    overwrite: bool = False,
+    progress: Callable[[int, int], None] | None = None,
+    watch: Watch | None = None,
+) -> DebiasReport:
+    """Writes `target`: all of `source` unchanged, and beside each IMU its debiased samples and the bias taken off.
+
+    One model serves every IMU, or each has its own by topic, "" being that of all others. An IMU without one gets the
+    one the log's metadata names, else the one that ships for its sensor, else the mean over time at rest. The IMUs are
+    those in `imus`, else those with a model of their own, else the log's only one.
+    With `smooth` the start bias at every time comes from the whole log, also from what follows.
+    Without a target the log itself is replaced (`mcap_io.rewrite`, which also says what `check` checks).
+    Of a damaged log, what is sound goes through a repaired copy beside the target (`mcap_io.salvage`), and `losses` says
+    what is missing; it is not replaced. With `clean` a first pass says what is to be left out or converted
+    (`imutool.cleaning`), and the record `imutool_clean` what it found.
+    `watch` is told every batch of samples as it is debiased, those of a damaged log again when its repaired copy is.
+
+    Raises:
+        ConfigError: source or target cannot be opened, `init` makes no sense, `smooth` is asked for with another `init`,
+            or a model is given for an IMU that is not to be debiased.
+        LogError: nothing in the log can be saved, it has no such IMU, is debiased already, is damaged and its own target,
+            or cannot be trusted, with `clean`.
+        ModelError: no model and no time at rest; a model for another rate; a damaged model file.
+    """
+    refuse_smooth(init, smooth)
+    refuse_unknown(check)
+    asked = _Asked(model, imus, init, smooth, clean, check, overwrite, watch)
+    with Log(source, salvage=True) as log:
+        assert log.losses is not None, "with salvage there are losses, if perhaps none"
+        damaged = bool(log.losses or log.losses.mended)
+    if not damaged:
+        try:
+            return _debias(source, source, Losses(), target, asked, progress)
+        except LogError as error:  # damage inside a chunk shows only here
+            refusal = error
+    with repaired(source, target or source) as saved:
+        if saved is None:
+            raise refusal
+        if target is None:
+            raise LogError("the log is damaged", where=source, fix="Give OUT: put in its place, the damaged part would be gone")
+        return _debias(source, *saved, target, asked, progress)
+
+
+@dataclass(frozen=True)
+class _Asked:
+    """What `debias` is to do."""
+
+    model: str | Path | Mapping[str, str | Path] | None
+    imus: Sequence[str]
+    init: str
+    smooth: bool
+    clean: Rules | None
+    check: str
+    overwrite: bool
+    watch: Watch | None
+
+
+def _debias(
+    source: Place,
+    sound: Place,
+    losses: Losses,
+    target: Place | None,
+    asked: _Asked,
+    progress: Callable[[int, int], None] | None,
+) -> DebiasReport:
+    """The same for a log that is whole, or for the `sound` copy of one that is not."""
+    model = asked.model
+    given = dict(model) if isinstance(model, Mapping) else {} if model is None else {"": model}
+    with Log(sound) as log:
+        topics = _chosen(log, asked.imus, given)
+        about = log.metadata().get("imutool", {})
+        surveys = {} if asked.clean is None else {topic: look(log, topic, asked.clean).trusted() for topic in topics}
+    named = given.get("") or (None if all(topic in given for topic in topics) else _of_the_log(about))
+    derived, starts, models, records = [], {}, {}, {}
+    with Digest(source) as digest:
+        for topic in topics:
+            chosen, start = prepare(sound, topic, given.get(topic, named), asked.init, asked.smooth, surveys.get(topic))
+            derived.append(Debiaser(topic, chosen, start, surveys.get(topic), asked.watch))
+            starts[topic], models[topic] = start, str(chosen.card.get("name", chosen.method))
+            records[topic] = _provenance(topic, chosen, start, asked.init, asked.smooth)
+
+        def metadata(verified: Verified) -> Values:
+            origin = {"source_file": source.name, "source_sha256": digest.result(), "source_size": str(source.stat().st_size)}
+            checked = {"verified": json.dumps(verified._asdict())}
+            told = {_record("imutool", topic, records): v | origin | checked for topic, v in records.items()}
+            return told | {_record(CLEAN_RECORD, topic, records): found.record() for topic, found in surveys.items()}
+
+        report = rewrite(
+            sound, target, derived, metadata=metadata, overwrite=asked.overwrite, check=asked.check, progress=progress
+        )
+    return DebiasReport(models, starts, report, losses, surveys)
+
+
+def _record(name: str, topic: str, records: Mapping[str, object]) -> str:
+    """The name of a metadata record: with its topic where there are several."""
+    return f"{name}{topic}" if len(records) > 1 else name
+
+
+def _of_the_log(about: Mapping[str, str]) -> str | Path | None:
+    """The model that a log's metadata name, which must be one that ships: a log may come from anybody."""
+    return shipped(about["model"]) if about.get("model") else shipped_for(about.get("sensor"), about.get("dataset"))
+
+
+def _chosen(log: Log, imus: Sequence[str], given: Mapping[str, str | Path]) -> list[str]:
+    """The IMUs to debias, each once.
+
+    Raises:
+        ConfigError: a model that none of them would use.
+        LogError: none is named, and the log has not exactly one.
+    """
+    own = [topic for topic in given if topic]
+    topics = list(dict.fromkeys(imus or own or [log.only_imu()]))
+    for topic in own:
+        if topic not in topics:
+            raise ConfigError(
+                f"a model for {topic}, which is not to be debiased",
+                where="--model",
+                expected=", ".join(topics),
+                fix=f"Add --imu {topic}, or leave the model out",
+            )
+    if "" in given and all(topic in given for topic in topics):
+        raise ConfigError(
+            f"{given['']} is for all IMUs without a model of their own, and each has one",
+            where="--model",
+            fix="Leave it out, or name the other IMUs with --imu",
+        )
+    return topics
+
+
+def _provenance(topic: str, model: BiasModel, start: TurnOn, init: str, smooth: bool) -> dict[str, str]:
+    return {
+        "version": __version__,
+        "command": "debias",
+        "source_topic": topic,
+        "model": str(model.card.get("name", model.method)),
+        "model_sha256": str(model.card.get("sha256", "")),
+        "method": model.method,
+        "settings": json.dumps(plain(model.config)),
+        "init": init,
+        "init_how": start.how,
+        "rest": json.dumps(start.rest.tolist()),
+        "rest_std": json.dumps(start.std.tolist()),
+        "smooth": "true" if smooth else "false",
+        # without a model: the mean over all rest, also later
+        "causal": "false" if smooth or (init == "auto" and model.method == static.Model.method) else "true",
+    }
+
+
+def _vector(stamp_ns: Int64[np.ndarray, " n"], values: Float64[np.ndarray, "n 3"], frame_id: str) -> UInt8[np.ndarray, "n L"]:
+    return encode_vector3(stamp_ns, np.ascontiguousarray(values), frame_id)

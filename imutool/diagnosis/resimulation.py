@@ -1,0 +1,86 @@
+"""The simulation once more, with the physics that was found: how much closer to the recording it comes.
+
+Nothing of the search is used but its answer, as physics.toml says it, fitted without the time that it is compared on. The
+simulation's own poses become a smooth motion as `imutool simulate` makes it, the effects act on that, and samples are taken at
+the recording's stamps, without noise. Times count from the recording's start, as those of the findings do.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+from jaxtyping import Float64
+
+from imutool.diagnosis.alignment import Pair
+from imutool.diagnosis.gauss_newton import Weighed, expected
+from imutool.diagnosis.result import Closer
+from imutool.diagnosis.summarize import closer, floor, with_constant
+from imutool.errors import DataError
+from imutool.recording import Recording
+from imutool.sensor.effect import Acting
+from imutool.sensor.physics_file import PhysicsFile
+from imutool.sensor.readings import Felt
+from imutool.sensor.simulate import FELT_HZ, read_all
+from imutool.sensor.trajectory import smooth_motion
+
+AS_GOOD = 0.3  # of the noise: how far a simulation along the poses may be from the one that was given, and still stand for it
+MOST_OF_IT = 0.8  # of the held-out samples that the poses have to cover
+
+
+def simulated_again(logs: Sequence[Weighed], sim: Recording, physics: PhysicsFile) -> Mapping[str, Closer]:
+    """By signal, the misfit of the simulation as it was given and as it is with some physics, on held-out time.
+
+    Raises:
+        DataError: the simulation has no poses that stand for its samples, or they cover too little of a log.
+        ImutoolError: its poses are no motion, or the physics cannot act on it.
+    """
+    if not sim.truths:
+        raise DataError("it has no poses", where=sim.name, expected="poses to simulate along")
+    motion = smooth_motion(sim.truth)
+    rate_hz = 1.0 / sim.imu.period_s
+    felts = motion.felt(rate_hz * max(1, int(np.ceil(FELT_HZ / rate_hz))))
+    acting = physics.acting()
+    there, before, after = [], [], []
+    for log in logs:
+        on_its_clock = [_felt(one, motion.start_ns, log.pair) for one in felts]
+        plain, found = (_read(log.pair, on_its_clock, some) for some in ((), acting))
+        good = np.isfinite(plain).all(axis=1) & np.isfinite(found).all(axis=1)
+        pair = replace(log.pair, fitted=log.pair.fitted & good, held_out=log.pair.held_out & good)
+        if pair.held_out.sum() < MOST_OF_IT * log.pair.held_out.sum():
+            raise DataError("its poses cover too little of the recording", where=sim.name)
+        there.append(Weighed(pair, log.whiten))
+        before.append(with_constant(pair, expected(pair, ())))
+        after.append(with_constant(pair, found))
+        _refuse_unlike(there[-1], before[-1], with_constant(pair, plain), sim)
+    return {signal: replace(one, by="second simulation") for signal, one in closer(there, before, after).items()}
+
+
+def _felt(felt: Felt, start_ns: int, pair: Pair) -> Felt:
+    """On the recording's clock, with its channels."""
+    first_ns = pair.start_ns - round(float(pair.stamp_s[0]) * 1e9)
+    t_s = felt.t_s + (start_ns - first_ns) * 1e-9 - pair.aligned_s
+    channels = {name: np.interp(t_s, pair.felt.t_s, values) for name, values in pair.felt.channels.items()}
+    return replace(felt, t_s=t_s, channels=channels)
+
+
+def _read(pair: Pair, felts: Sequence[Felt], acting: Acting) -> Float64[np.ndarray, "n 6"]:
+    """What the second simulation reads at the recording's stamps; NaN where it has no motion."""
+    stamps = [pair.stamp_s[(pair.stamp_s >= one.t_s[0]) & (pair.stamp_s <= one.t_s[-1])] for one in felts]
+    got = read_all(felts, stamps, acting)
+    out = np.full(pair.real.shape, np.nan)
+    out[np.searchsorted(pair.stamp_s, got.stamp_s)] = np.concatenate([got.gyro, got.accel], axis=1)
+    return out
+
+
+def _refuse_unlike(log: Weighed, given: Float64[np.ndarray, "n 6"], plain: Float64[np.ndarray, "n 6"], sim: Recording) -> None:
+    """Poses that are too coarse or too noisy give another simulation than the one that was given, whatever the physics.
+
+    Raises:
+        DataError: so it is here.
+    """
+    rows = log.pair.held_out
+    off = np.sqrt(((given - plain)[rows] ** 2).mean(axis=0))
+    if (off > AS_GOOD * floor([log])).any():
+        raise DataError("a simulation along its poses is not the simulation that was given", where=sim.name)

@@ -1,0 +1,170 @@
+"""A number of a recording beside that of a simulation: one clock, the simulation without its noise, rows that count."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float64
+from scipy.interpolate import make_interp_spline
+from scipy.signal import correlate, correlation_lags, welch
+
+from imutool.diagnosis.alignment import BUFFER_S, FARTHEST_S, GAP_PERIODS, split, wiener
+from imutool.diagnosis.scalar.effects import Column, Ideal, Samples
+from imutool.diagnosis.scalar.fit import SEGMENT, TOP
+from imutool.errors import DataError
+from imutool.mcap_io.fields import Fields
+from imutool.recording import seconds
+
+LEAST_S, LEAST_SAMPLES = 15.0, 300  # two blocks to fit and one to test, and a spectrum
+OVERSAMPLED = 4.0  # so that a straight line between fine samples is the signal
+ALIGN_HZ = 100.0
+ALIKE = 0.3  # correlation below which nothing says that the two are one motion
+MOVES = 1e-9  # of its largest value, below which a signal is constant
+TOP_BAND = 0.4  # of the rate: above, a simulation's spectrum is its noise
+MOST_FINE = 20_000_000  # samples
+
+
+@dataclass(frozen=True, eq=False)
+class Beside:
+    """What the estimator is given.
+
+    `aligned_s` is what was added to the recording's stamps because the clocks share no epoch (None: they do), `lag_s` how much
+    later the recording follows the simulation at first sight, `simulated` the density of the simulation's own noise.
+    """
+
+    ideal: Ideal
+    real: Samples
+    fitted: Bool[np.ndarray, " n"]
+    held_out: Bool[np.ndarray, " n"]
+    rate_hz: float
+    lag_s: float
+    aligned_s: float | None
+    simulated: float
+    start_ns: int
+
+
+def beside(real: Fields, sim: Fields, others: Mapping[str, Fields], name: str) -> Beside:
+    """Both on the recording's clock, in seconds from its first sample that the simulation covers.
+
+    Raises:
+        DataError: constant, too short or too few, or nothing alike in the two.
+    """
+    for one, what in ((real, "recording"), (sim, "simulation")):
+        _check(one, what, name)
+    start_ns = int(real.t_ns[0])
+    t_real, t_sim = seconds(real.t_ns, start_ns), seconds(sim.t_ns, start_ns)
+    lag_s, aligned_s = _lag(t_real, real.values, t_sim, sim.values, name)
+    if aligned_s is not None:
+        t_sim, lag_s = t_sim - aligned_s, 0.0
+    period_real, period_sim = float(np.median(np.diff(t_real))), float(np.median(np.diff(t_sim)))
+    early, late = min(0.0, lag_s), max(0.0, lag_s)
+    rows = np.flatnonzero((t_real - late >= t_sim[0]) & (t_real - early <= t_sim[-1]))
+    shared_s = float(t_real[rows[-1]] - t_real[rows[0]]) if len(rows) > 1 else 0.0
+    if shared_s < LEAST_S or len(rows) < LEAST_SAMPLES:
+        raise DataError(
+            f"{shared_s:.1f} s and {len(rows)} samples of {name} are shared with the simulation",
+            where=name,
+            expected=f"at least {LEAST_S:g} s and {LEAST_SAMPLES} samples",
+            fix="Give logs of the same time, or longer ones",
+        )
+    part = slice(int(rows[0]), int(rows[-1]) + 1)
+    ideal, simulated = _ideal(t_sim, sim.values, period_sim, period_real, t_real[part])
+    ideal.channels = {other: (seconds(one.t_ns, start_ns), one.values) for other, one in others.items() if len(one) > 1}
+    held_out, usable = split(t_real[part])
+    step = np.diff(t_sim)
+    for k in np.flatnonzero(step > max(GAP_PERIODS * period_sim, 0.1)):  # what was never simulated
+        usable &= (t_real[part] < t_sim[k] + early - BUFFER_S) | (t_real[part] > t_sim[k + 1] + late + BUFFER_S)
+    return Beside(
+        ideal,
+        real.values[part],
+        usable & ~held_out,
+        usable & held_out,
+        1.0 / period_real,
+        lag_s,
+        aligned_s,
+        simulated,
+        start_ns,
+    )
+
+
+def _check(one: Fields, what: str, name: str) -> None:
+    """Refuses what holds nothing to compare.
+
+    Raises:
+        DataError: too short, not finite, stamps that do not increase, constant.
+    """
+    length = float(one.t_ns[-1] - one.t_ns[0]) * 1e-9 if len(one) else 0.0
+    if length < LEAST_S or len(one) < LEAST_SAMPLES:
+        raise DataError(
+            f"the {what} has {len(one)} samples of {name} in {length:.1f} s",
+            where=name,
+            expected=f"at least {LEAST_S:g} s and {LEAST_SAMPLES} samples",
+            fix="Give a longer log",
+        )
+    if not np.isfinite(one.values).all() or (np.diff(one.t_ns) <= 0).any():
+        raise DataError(
+            f"the {what} of {name} has values that are not finite, or stamps that do not increase",
+            where=name,
+            expected="finite values and increasing stamps",
+            fix="Cut the log where it is sound",
+        )
+    if np.ptp(one.values) <= MOVES * float(np.abs(one.values).max()):
+        why = "the sensor may be dead or not connected" if what == "recording" else "it may not be simulated at all"
+        raise DataError(
+            f"{name} is {one.values[0]:g} throughout the {what}",
+            where=name,
+            expected="a signal that varies",
+            fix=f"Choose another field: {why}",
+        )
+
+
+def _ideal(t_sim: Column, values: Column, period_sim: float, period_real: float, t_s: Samples) -> tuple[Ideal, float]:
+    """The simulation without white noise on a fine clock, and the density of that noise."""
+    t_even = t_sim[0] + period_sim * np.arange(int((t_sim[-1] - t_sim[0]) / period_sim) + 1)
+    even = np.interp(t_even, t_sim, values) if _jumps(values) else np.asarray(make_interp_spline(t_sim, values, k=3)(t_even))
+    f_hz, power = welch(even, 1.0 / period_sim, nperseg=min(SEGMENT, len(even)), average="median")
+    top = (f_hz >= TOP_BAND / period_sim) & (f_hz <= TOP / period_sim)
+    rate_hz = min(OVERSAMPLED / min(period_sim, period_real), MOST_FINE / (t_even[-1] - t_even[0]))
+    t_fine = t_even[0] + np.arange(int((t_even[-1] - t_even[0]) * rate_hz) + 1) / rate_hz
+    clean = wiener(even)
+    fine = np.interp(t_fine, t_even, clean) if _jumps(values) else np.asarray(make_interp_spline(t_even, clean, k=3)(t_fine))
+    return Ideal(float(t_fine[0]), rate_hz, fine, t_s, {}), float(np.median(power[top]))
+
+
+def _jumps(values: Column) -> bool:
+    """Whether a signal stands still for most of its samples, as a command does: a spline would ring about its steps."""
+    return float((np.diff(values) == 0.0).mean()) > 0.5
+
+
+def _lag(t_real: Column, real: Column, t_sim: Column, sim: Column, name: str) -> tuple[float, float | None]:
+    """How much later the recording is at first sight, and what is between the clocks where they share no epoch (s).
+
+    Raises:
+        DataError: nowhere are the two alike.
+    """
+    a, b = _smooth(t_real, real), _smooth(t_sim, sim)
+    both = correlate(a, b, mode="full") / max(float(np.linalg.norm(a) * np.linalg.norm(b)), 1e-300)
+    lags = correlation_lags(len(a), len(b)) / ALIGN_HZ + float(t_real[0] - t_sim[0])
+    shared = min(t_real[-1], t_sim[-1]) - max(t_real[0], t_sim[0])
+    length = min(t_real[-1] - t_real[0], t_sim[-1] - t_sim[0])
+    here = np.abs(lags) <= FARTHEST_S
+    if shared > max(LEAST_S, 0.5 * length) and here.any() and np.abs(both[here]).max() > ALIKE:
+        return float(lags[here][np.argmax(np.abs(both[here]))]), None
+    best = int(np.argmax(both))
+    if both[best] < ALIKE:
+        raise DataError(
+            f"recording and simulation of {name} are not alike (correlation {both[best]:.2f} at best)",
+            where=name,
+            expected="one motion",
+            fix="Simulate what was recorded, or choose another field",
+        )
+    return 0.0, -float(lags[best])
+
+
+def _smooth(t_s: Column, values: Column) -> Float64[np.ndarray, " _"]:
+    """On an even clock, without its mean."""
+    at = np.arange(t_s[0], t_s[-1], 1.0 / ALIGN_HZ)
+    there = np.interp(at, t_s, values)
+    return np.asarray(there - there.mean())

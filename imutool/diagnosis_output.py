@@ -1,0 +1,153 @@
+"""What a diagnosis leaves behind: findings.json, physics.toml, report.html, log.html and view.rrd in one folder.
+
+The files are made in a folder beside it and moved when all are there, so that a reader never finds half a diagnosis. Other
+files in the folder, the logs themselves for instance, stay as they are.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import math
+import os
+import secrets
+import shutil
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from importlib.util import find_spec
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from imutool.diagnosis.result import Diagnosis
+from imutool.diagnosis.to_physics_file import found
+from imutool.errors import ConfigError, ImutoolError
+from imutool.sensor import physics_file
+
+if TYPE_CHECKING:
+    from imutool.viewing.model.run_data import RunData
+
+FINDINGS, PHYSICS, REPORT, LOG, VIEW = "findings.json", "physics.toml", "report.html", "log.html", "view.rrd"
+FILES = (FINDINGS, PHYSICS, REPORT, LOG, VIEW)
+DRAWN = ("matplotlib", "report")  # the library that draws a file, and its extra
+NEEDS = {LOG: DRAWN, REPORT: DRAWN, VIEW: ("rerun", "view")}
+
+
+def refuse(folder: Path, *, overwrite: bool = False) -> None:
+    """Nothing, where a diagnosis may be written; to be asked before hours of work.
+
+    Raises:
+        ConfigError: a file of that name, or a diagnosis in it already (without `overwrite`).
+    """
+    if folder.exists() and not folder.is_dir():
+        raise ConfigError("is a file", where=folder, expected="a folder, which need not exist")
+    there = [name for name in FILES if (folder / name).exists()]
+    if there and not overwrite:
+        raise ConfigError(
+            f"holds a diagnosis already ({', '.join(there)})", where=folder, fix="Choose another folder, or add --overwrite"
+        )
+
+
+def write(
+    d: Diagnosis, folder: Path, *, logs: Callable[[Path], list[RunData]] | None = None, overwrite: bool = False
+) -> list[str]:
+    """Writes the folder; gives a remark for each file that was left out because an extra is not installed.
+
+    With `logs`, which looks at the logs again with the folder's findings in hand, there is a page of them too.
+    A diagnosis that is replaced goes whole: of its files none is kept.
+
+    Raises:
+        ConfigError: as `refuse`, or the system refuses to write.
+    """
+    refuse(folder, overwrite=overwrite)
+    place = folder.absolute()  # "." has no name of its own
+    partial = place.parent / f".{place.name}.{os.getpid()}.{secrets.token_hex(4)}.partial"
+    beside = partial / place.name  # what is written names the folder as it will be called
+    with _told(folder):
+        try:
+            beside.mkdir(parents=True)
+            remarks = _make(d, beside, logs)
+            refuse(folder, overwrite=overwrite)
+            if folder.exists():
+                _move(beside, folder)
+            else:
+                beside.rename(folder)
+        finally:
+            with contextlib.suppress(FileNotFoundError):
+                shutil.rmtree(partial)
+    return remarks
+
+
+def plain(d: Diagnosis) -> dict[str, Any]:
+    """What findings.json holds; JSON has no word for infinity (a cut-off never reached) or for no number: null."""
+    values: dict[str, Any] = _finite(d.plain())
+    return values
+
+
+def _finite(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _finite(inner) for key, inner in value.items()}
+    if isinstance(value, list | tuple):
+        return [_finite(inner) for inner in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value
+
+
+def _make(d: Diagnosis, folder: Path, logs: Callable[[Path], list[RunData]] | None) -> list[str]:
+    text = json.dumps(plain(d), indent=2, allow_nan=False, ensure_ascii=False)
+    (folder / FINDINGS).write_text(text + "\n", encoding="utf-8")
+    physics_file.write(found(d), folder / PHYSICS)
+    drawn: dict[str, Callable[[Path], None]] = {REPORT: lambda path: _page(d, path), VIEW: lambda path: _recording(d, path)}
+    if logs is not None:  # before the report, which says where it is
+        drawn = {LOG: lambda path: _logs(logs(folder), path)} | drawn
+    remarks = []
+    for name, draw in drawn.items():
+        library, extra = NEEDS[name]
+        if find_spec(library) is None:
+            remarks.append(f"{name} is left out: {library} is not installed (pip install 'imutool[{extra}]')")
+        else:
+            try:
+                draw(folder / name)
+            except ImutoolError as error:
+                if name != LOG:
+                    raise
+                remarks.append(f"{name} is left out: {error}")  # for a picture of the logs no diagnosis is thrown away
+    return remarks
+
+
+def _page(d: Diagnosis, path: Path) -> None:
+    from imutool.viewing.html.diagnosis_page import write as write_page
+
+    write_page(d, path, logs=LOG if (path.parent / LOG).exists() else None)
+
+
+def _logs(logs: list[RunData], path: Path) -> None:
+    from imutool.viewing.html.report import write_page
+
+    write_page(logs, path)
+
+
+def _recording(d: Diagnosis, path: Path) -> None:
+    from imutool.viewing.rerun.diagnosis import save
+
+    save(d, path)
+
+
+def _move(beside: Path, folder: Path) -> None:
+    """Each file over the old one; an old one without a new one is a stranger's to the new diagnosis, and goes."""
+    for name in FILES:
+        if (beside / name).exists():
+            (beside / name).replace(folder / name)
+        else:
+            (folder / name).unlink(missing_ok=True)
+
+
+@contextmanager
+def _told(folder: Path) -> Iterator[None]:
+    try:
+        yield
+    except OSError as error:
+        reason = error.strerror or type(error).__name__
+        raise ConfigError(
+            f"cannot be written ({reason})", where=folder, fix="Choose a place that can be written and has room"
+        ) from error

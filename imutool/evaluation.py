@@ -1,0 +1,159 @@
+"""How far pure integration drifts, raw and with each model: the figures of the paper's tables, for any log with true poses."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool
+
+from imutool.bias import static
+from imutool.bias.io import check_rate, find_model
+from imutool.bias.model import BiasModel
+from imutool.bias_start.bias_tracking import Known
+from imutool.bias_start.initial_bias import AT_REST_STD, LEAST_STD, TurnOn, find
+from imutool.bias_start.model_choice import estimate_at_rest, refuse_smooth, smooth_in_memory
+from imutool.bias_start.zero_velocity import with_stops
+from imutool.debiasing import Debiased, apply
+from imutool.errors import ConfigError
+from imutool.inertial import metrics
+from imutool.inertial.strapdown import Start, along_truth, drift
+from imutool.mcap_io.read import read
+from imutool.recording import Imu, Poses, Recording
+
+RAW = "raw"
+DRIFT_S = 5.0
+PURE, ZUPT = "integration", "zupt"
+RAW_STD = (0.1, 0.1, 0.1, 0.5, 0.5, 0.5)  # rad/s and m/s²: biases of a consumer sensor nobody calibrated
+SCHEMA = "imutool.evaluation/1"
+
+
+def evaluate(
+    log: Path,
+    *,
+    models: Sequence[str | Path] = (),
+    init: str = "auto",
+    smooth: bool = False,
+    zupt: bool = False,
+    truth: str | None = None,
+    imu: str | None = None,
+    trajectories: Path | None = None,
+    overwrite: bool = False,
+) -> list[dict[str, Any]]:
+    """One result for the raw samples and one for each model (contracts.md, evaluate).
+
+    Every trajectory starts at the true pose and velocity at the first sample the truth covers, and is integrated by
+    `strapdown.dead_reckon`; only samples outside gaps of the truth are scored. With `smooth` each bias comes from the whole
+    log; with `zupt` a second result each is dead reckoning that knows its stops (`zero_velocity`), of the same samples.
+
+    Raises:
+        ConfigError: `smooth` with another `init` than auto; two models of one name, or files that exist.
+        LogError, DataError: no IMU, no truth, or the two share no time.
+        ModelError: a model that cannot be used with this log.
+    """
+    if trajectories is not None:
+        _refuse_twins(models)
+    recording = read(log, imu=imu, truth=truth)
+    if truth is None and recording.truths:
+        recording = recording.with_truth(next(iter(recording.truths)))
+    results = []
+    for name, found, start in runs(recording, models, init, log, smooth=smooth):
+        integrated, true, valid = along_truth(found.imu, recording.truth, recording.name)
+        drifted = _drift(integrated, true, valid)
+        estimates = {PURE: integrated}
+        if zupt:
+            estimates[ZUPT] = with_stops(_over(found.imu, true), Start.of(true), _left(start), smooth=smooth)
+        for kind, estimate in estimates.items():
+            results.append(
+                {
+                    "log": recording.name,
+                    "model": name,
+                    "estimate": kind,
+                    "init": init if start else None,
+                    "init_how": start.how if start else None,
+                    "smooth": smooth,
+                    **metrics.evaluate(estimate, true, valid),
+                    **drifted,
+                    "gyro_bias": start.rest[:3].tolist() if start else [0.0, 0.0, 0.0],
+                    "accel_bias": start.rest[3:].tolist() if start else [0.0, 0.0, 0.0],
+                }
+            )
+            if trajectories is not None:
+                label = name if kind == PURE else f"{name}_{kind}"
+                _write(trajectories, recording.name, label, estimate, true, valid, overwrite=overwrite)
+    return results
+
+
+def _drift(path: Poses, truth: Poses, valid: Bool[np.ndarray, " n"]) -> dict[str, float | None]:
+    """What windows that each start from the truth drift by: root mean squares, none where no window fits."""
+    found = drift(path, truth, valid, DRIFT_S)
+    if not len(found.orientation_rad):
+        return {"drift_orientation_deg": None, "drift_velocity_m_s": None, "drift_window_s": DRIFT_S}
+    rms = [float(np.sqrt(np.mean(errors**2))) for errors in (found.orientation_rad, found.velocity_m_s)]
+    return {"drift_orientation_deg": float(np.degrees(rms[0])), "drift_velocity_m_s": rms[1], "drift_window_s": DRIFT_S}
+
+
+def _over(imu: Imu, true: Poses) -> Imu:
+    """The samples of the stretch that is scored."""
+    rows: Imu = imu.between(int(true.t_ns[0]), int(true.t_ns[-1]))
+    return rows
+
+
+def _left(start: TurnOn | None) -> Known:
+    """What may be left of the bias after debiasing: the start's uncertainty, or anything where nothing was taken off."""
+    std = np.array(RAW_STD) if start is None else np.maximum(start.std, LEAST_STD)
+    return Known(np.zeros(6), std, AT_REST_STD)
+
+
+def runs(
+    recording: Recording, models: Sequence[str | Path], init: str, where: str | Path, *, smooth: bool = False
+) -> Iterator[tuple[str, Debiased, TurnOn | None]]:
+    """The samples as recorded, then as each model corrects them: name, samples and bias, and the start."""
+    refuse_smooth(init, smooth)
+    yield RAW, Debiased(recording.imu, np.zeros((len(recording.imu), 6))), None
+    for name, model, start in started(recording, models, init, where, smooth=smooth):
+        yield name, apply(model, start, recording.imu), start
+
+
+def started(
+    recording: Recording, models: Sequence[str | Path], init: str, where: str | Path, *, smooth: bool = False
+) -> Iterator[tuple[str, BiasModel, TurnOn]]:
+    """Each model asked for, its name, and the start it gets in this recording."""
+    refuse_smooth(init, smooth)
+    for given in models:
+        model, start = _model_and_start(given, recording, init, where, smooth)
+        yield str(model.card.get("name", model.method)), model, start
+
+
+def _model_and_start(
+    given: str | Path, recording: Recording, init: str, where: str | Path, smooth: bool
+) -> tuple[BiasModel, TurnOn]:
+    untrained = str(given) == static.Model.method
+    if untrained and init == "auto" and not smooth:
+        return estimate_at_rest(recording.imu, where)
+    model: BiasModel = static.Model() if untrained else find_model(given, 1.0 / recording.imu.period_s)
+    if not untrained:
+        check_rate(model, 1.0 / recording.imu.period_s, where)
+    if smooth:
+        return model, smooth_in_memory(model, recording.imu, where)
+    return model, find(init, model, recording)
+
+
+def _refuse_twins(models: Sequence[str | Path]) -> None:
+    """Two models of one name would write one file."""
+    names = [Path(model).stem for model in models]
+    for name in names:
+        if names.count(name) > 1:
+            raise ConfigError(f"two models are called {name!r}", where="--trajectories", fix="Rename one of the files")
+
+
+def _write(folder: Path, log: str, model: str, estimate: Poses, true: Poses, valid: Any, *, overwrite: bool) -> None:
+    """TUM-format files: LOG_truth.tum and LOG_MODEL.tum on the same stamps, those that are scored."""
+    folder.mkdir(parents=True, exist_ok=True)
+    log = re.sub(r"[^\w.+-]", "_", log).lstrip(".") or "_"  # a log's name is its writer's, and must not lead elsewhere
+    if model == RAW:
+        metrics.write_tum(true.rows(valid), folder / f"{log}_truth.tum", overwrite)
+    metrics.write_tum(estimate.rows(valid), folder / f"{log}_{model}.tum", overwrite)

@@ -1,0 +1,126 @@
+"""A log as a rosbag2 folder: a copy of it, byte for byte, and the metadata.yaml that rosbag2 asks for."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import re
+from pathlib import Path
+
+from imutool.errors import ConfigError, LogError
+from imutool.exporting.folder import SIGNATURE, ExportFolder, writing
+from imutool.exporting.report import ExportReport, Progress
+from imutool.mcap_io.log import Log
+
+COPY_BYTES = 1 << 20
+VERSION = 5  # of metadata.yaml: the oldest with a list of files, so that Humble plays it, and every later one too
+QOS_NUMBERS = {  # as rmw numbers them; names came with version 9
+    "history": ("system_default", "keep_last", "keep_all", "unknown"),
+    "reliability": ("system_default", "reliable", "best_effort", "unknown", "best_available"),
+    "durability": ("system_default", "transient_local", "volatile", "unknown", "best_available"),
+    "liveliness": ("system_default", "automatic", "manual_by_node", "manual_by_topic", "unknown", "best_available"),
+}
+
+
+def write(log: Path, out: Path, overwrite: bool, tell: Progress) -> ExportReport:
+    """Writes the folder `out`; the arguments are those of `imutool.exporting.run.export`."""
+    with Log(log) as opened:
+        _refuse_what_rosbag2_cannot(opened)
+        name = f"{out.absolute().name}_0.mcap"
+        text = _metadata_yaml(opened, name)
+        counts = {topic.name: topic.count for topic in opened.topics.values()}
+    holds = r"metadata\.yaml|.*_\d+\.mcap"
+    with ExportFolder(out, log, signed="metadata.yaml", holds=holds, overwrite=overwrite) as folder, writing(out):
+        _copy(log, folder / name, tell)
+        (folder / "metadata.yaml").write_text(text, encoding="utf-8", newline="\n")
+    return ExportReport(out, "rosbag2", None, counts)
+
+
+def _refuse_what_rosbag2_cannot(log: Log) -> None:
+    """The log is copied as it is, so it must be one already.
+
+    Raises:
+        LogError: the profile is another, or a topic is not in CDR or has no schema.
+    """
+    if log.profile != "ros2":
+        raise LogError(f"the log's profile is {log.profile!r}", where=log.path, expected="'ros2', the only one rosbag2 holds")
+    for topic in log.topics.values():
+        if topic.message_encoding != "cdr" or not topic.schema_name:
+            what = (
+                f"{topic.name} is encoded as {topic.message_encoding!r}" if topic.schema_name else f"{topic.name} has no schema"
+            )
+            raise LogError(what, where=log.path, expected="CDR messages of ROS 2", fix="Use --format euroc")
+
+
+def _copy(log: Path, copy: Path, tell: Progress) -> None:
+    """The log's bytes in a file of its own (no link: what happens to one must not happen to the other), read back and compared.
+
+    Raises:
+        LogError: the log changed while it was copied.
+        ConfigError: what was written does not read back the same.
+    """
+    size, done, told = log.stat().st_size, 0, hashlib.sha256()
+    with log.open("rb") as source, copy.open("xb") as target:
+        while block := source.read(COPY_BYTES):
+            told.update(block)
+            target.write(block)
+            done += len(block)
+            tell(done, 2 * size, copy.name)
+        target.flush()
+        os.fsync(target.fileno())
+    if done != size:
+        raise LogError("changed while it was copied", where=log, fix="Wait until it is complete")
+    again = hashlib.sha256()
+    with copy.open("rb") as written:
+        while block := written.read(COPY_BYTES):
+            again.update(block)
+            done += len(block)
+            tell(done, 2 * size, copy.name)
+    if again.digest() != told.digest():
+        raise ConfigError("does not read back as it was written", where=copy.parent, fix="Look at the disk")
+
+
+def _metadata_yaml(log: Log, name: str) -> str:
+    """What rosbag2 wants to know of the folder; JSON strings are YAML strings."""
+    ends = [(int(t.min()), int(t.max())) for topic in log.topics for t in log.stamps(topic) if len(t)]
+    start = min((first for first, _ in ends), default=0)
+    duration = max((last for _, last in ends), default=0) - start
+    total = sum(topic.count for topic in log.topics.values())
+    times = (
+        f"{{}}starting_time:\n{{}}  nanoseconds_since_epoch: {start}\n{{}}duration:\n{{}}  nanoseconds: {duration}\n"
+        f"{{}}message_count: {total}\n"
+    )
+    text = f"{SIGNATURE}\nrosbag2_bagfile_information:\n  version: {VERSION}\n  storage_identifier: mcap\n" + _indented(
+        times, 2
+    )
+    text += "  topics_with_message_count:" + ("\n" if log.topics else " []\n")
+    for topic in log.topics.values():
+        text += (
+            "    - topic_metadata:\n"
+            f"        name: {_quoted(topic.name)}\n"
+            f"        type: {_quoted(topic.schema_name)}\n"
+            "        serialization_format: cdr\n"
+            f"        offered_qos_profiles: {_quoted(_qos(topic.metadata.get('offered_qos_profiles', '')))}\n"
+            f"      message_count: {topic.count}\n"
+        )
+    text += f'  compression_format: ""\n  compression_mode: ""\n  relative_file_paths:\n    - {_quoted(name)}\n'
+    return text + f"  files:\n    - path: {_quoted(name)}\n" + _indented(times, 6)
+
+
+def _indented(text: str, by: int) -> str:
+    return text.replace("{}", " " * by)
+
+
+def _qos(text: str) -> str:
+    """Offered qualities of service with numbers in place of names."""
+
+    def number(found: re.Match[str]) -> str:
+        names = QOS_NUMBERS[found[2]]
+        return f"{found[1]}{names.index(found[3])}" if found[3] in names else found[0]
+
+    return re.sub(r"^([-\s]*(history|reliability|durability|liveliness): *)(\w+)", number, text, flags=re.MULTILINE)
+
+
+def _quoted(text: str) -> str:
+    return json.dumps(text, ensure_ascii=True)

@@ -1,0 +1,1 @@
+"""Inertial navigation: kinematics, strapdown integration, preintegration, rest detection, error metrics."""

@@ -1,0 +1,241 @@
+"""Attitude, velocity, position and the biases of an inertial sensor from its own samples: an invariant Kalman filter.
+
+Errors are right-invariant on SE_2(3), with the biases beside them (Barrau and Bonnabel, "The invariant extended Kalman filter
+as a stable observer", TAC 2017; the "imperfect" filter with biases: Hartley et al., IJRR 2020, section 5)::
+
+    (R^, v^, p^) = Exp(xi_R, xi_v, xi_p) (R, v, p)        zeta = b^ - b
+    d xi_R/dt = -R zeta_g        d xi_v/dt = g x xi_R - [v]x R zeta_g - R zeta_a        d xi_p/dt = xi_v - [p]x R zeta_g
+
+Without biases the estimate enters no Jacobian, and "the body does not move" observes xi_v alone, by a constant matrix: a
+heading that nothing shows cannot be taken for one that is known. Heading starts at zero with no uncertainty, which only names
+the horizontal axes: the equations do not depend on it.
+
+The bias in motion is b; at rest on the ground it is b + d. The two differ (motors; on EuRoC by 1e-3 rad/s), and d is unknown
+but stays for the run. Measured are: at rest, that velocity and rate are zero; in motion, that velocity is bounded,
+v ~ N(0, speed²) forgotten after `speed_correlation_s`, which over tens of seconds shows tilt, and with it the bias across
+gravity, by gravity itself. A body that travels at several times `speed_m_s` has the measurement weakened (Huber).
+
+Settings: some two dozen were compared on the training sequences, one changed at a time, with models trained on the test
+sequences; `tests/bench/starts.py` shows on the same sequences what came of it, which is therefore a little optimistic.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Annotated, NamedTuple
+
+import numpy as np
+from jaxtyping import Float64
+from msgspec import Meta
+
+from imutool.config import Settings
+from imutool.inertial.preintegration import SMALL_RAD2, Increment, Matrix3, Vector3, exp, hat
+from imutool.recording import GRAVITY_M_S2
+
+TURN, VELOCITY, POSITION = slice(0, 3), slice(3, 6), slice(6, 9)
+POSE, BIAS, GROUND = slice(0, 9), slice(9, 15), slice(15, 21)
+SIZE = 21
+G_W = np.array([0.0, 0.0, -GRAVITY_M_S2])
+STOPPED = np.zeros((3, SIZE))  # rows of d(velocity)/d(error)
+STOPPED[:, VELOCITY] = np.eye(3)
+STILL = np.zeros((3, SIZE))  # rows of d(gyro bias at rest)/d(error)
+STILL[:, 9:12] = STILL[:, 15:18] = np.eye(3)
+HUBER = 2.0  # standard deviations of a speed, above which it counts less
+LEAST_VARIANCE = 1e-14  # of every error a step adds: keeps the covariance invertible
+MISSING_RAD_S, MISSING_M_S2 = 2.0, 10.0  # what motion may do unseen where samples are missing
+
+Covariance = Float64[np.ndarray, "21 21"]
+Vector6 = Float64[np.ndarray, "6"]
+Error = Float64[np.ndarray, "21"]
+Positive = Annotated[float, Meta(gt=0)]
+
+
+class FilterSettings(Settings, frozen=True, kw_only=True):
+    """Noise of the samples, and what motion and rest are like."""
+
+    gyro_density: Positive = 5e-4  # rad/s/sqrt(Hz)
+    accel_density: Positive = 0.02  # m/s²/sqrt(Hz): of a calibration in motion rather than of the sensor
+    gyro_scale: Positive = 2e-3  # error of a turn, as a share of it
+    speed_m_s: Positive = 1.0  # per axis
+    speed_correlation_s: Positive = 0.5
+    rest_m_s: Positive = 0.05  # of a block at rest
+    rest_rad_s: Positive = 2e-4  # motion that is taken for rest: a stop begins and ends slowly
+    start_m_s2: Positive = 1.5  # mean acceleration over the first block: how far it tilts "up"
+
+
+@dataclass(frozen=True)
+class State:
+    """An estimate: pose, the bias b in motion (gyro rad/s, accel m/s²), d to be added at rest, and the covariance."""
+
+    R_wb: Matrix3
+    v_w: Vector3
+    p_wb: Vector3
+    bias: Vector6
+    ground: Vector6
+    P: Covariance
+
+    def rest_bias(self, resting: bool) -> Vector6:
+        """The sensor's bias now."""
+        return self.bias + self.ground if resting else self.bias
+
+    def covariance(self, resting: bool) -> Float64[np.ndarray, "6 6"]:
+        """Of `rest_bias`."""
+        P = self.P
+        both = P[BIAS, BIAS] + P[BIAS, GROUND] + P[GROUND, BIAS] + P[GROUND, GROUND]
+        return both if resting else P[BIAS, BIAS]
+
+    def moved(self, e: Error, P: Covariance) -> State:
+        """The estimate with an error of e put on top: Exp(e) of the pose, and sums."""
+        E, J = exp(e[TURN]), _left_jacobian(e[TURN])
+        return State(
+            E @ self.R_wb,
+            E @ self.v_w + J @ e[VELOCITY],
+            E @ self.p_wb + J @ e[POSITION],
+            self.bias + e[BIAS],
+            self.ground + e[GROUND],
+            P,
+        )
+
+    def minus(self, other: State) -> Error:
+        """The error e for which this is `other.moved(e)`."""
+        E = self.R_wb @ other.R_wb.T
+        xi = _log(E)
+        J = _left_jacobian(xi)
+        v, p = (np.linalg.solve(J, a - E @ b) for a, b in ((self.v_w, other.v_w), (self.p_wb, other.p_wb)))
+        return np.concatenate([xi, v, p, self.bias - other.bias, self.ground - other.ground])
+
+
+class Step(NamedTuple):
+    """One block: the estimate before it, what was expected after it, the transition, and the estimate after it."""
+
+    before: State
+    expected: State
+    F: Covariance
+    after: State
+
+
+def level(accel: Vector3, bias: Vector6, ground: Vector6, P_bias: Float64[np.ndarray, "12 12"], s: FilterSettings) -> State:
+    """An estimate from nothing but the direction of the mean specific force: heading 0, some velocity, at the origin."""
+    up_b = (accel - bias[3:]) / np.linalg.norm(accel - bias[3:])
+    axis = np.array([up_b[1], -up_b[0], 0.0])  # up_b x z
+    sine = float(np.linalg.norm(axis))
+    turn = axis / sine * np.arctan2(sine, up_b[2]) if sine > SMALL_RAD2 else np.array([0.0 if up_b[2] > 0 else np.pi, 0.0, 0.0])
+    P = np.zeros((SIZE, SIZE))
+    tilt = (s.start_m_s2**2 + np.diag(P_bias)[3:6].max()) / GRAVITY_M_S2**2
+    P[0, 0] = P[1, 1] = tilt
+    P[VELOCITY, VELOCITY] = np.eye(3) * s.speed_m_s**2
+    P[9:, 9:] = P_bias
+    return State(exp(turn), np.zeros(3), np.zeros(3), bias, ground, P)
+
+
+def move(x: State, motion: Increment, missing_s: float, walk: Vector6, s: FilterSettings) -> Step:
+    """Through a block in motion, integrated with the bias of `x`; then the bounded velocity. `walk` is b's in a second^1/2."""
+    T = motion.duration_s
+    R = x.R_wb @ motion.R
+    turn = s.gyro_density**2 * T + (s.gyro_scale * motion.turned_rad) ** 2 + (MISSING_RAD_S * missing_s) ** 2
+    push = s.accel_density**2 * T + (MISSING_M_S2 * missing_s) ** 2
+    step = _expect(x, R, motion.v, motion.p, motion.by_bias, T, (turn, push), walk, resting=False)
+    noise = 2.0 * s.speed_m_s**2 * s.speed_correlation_s / T
+    v = step.expected.v_w
+    size = np.sqrt(v @ v / 3.0 / (np.trace(step.expected.P[VELOCITY, VELOCITY]) / 3.0 + noise))
+    noise *= max(1.0, size / HUBER) ** 2
+    return step._replace(after=update(step.expected, STOPPED, v, np.full(3, noise)))
+
+
+def stand(x: State, mean: Vector6, variance: Float64[np.ndarray, "3"], T: float, walk: Vector6, s: FilterSettings) -> Step:
+    """Through a block at rest, from the samples' mean and the variance of the gyro's: no velocity, no rate."""
+    dv = (mean[3:] - x.bias[3:] - x.ground[3:]) * T
+    by_bias = np.zeros((9, 6))
+    by_bias[3:6, 3:], by_bias[6:, 3:] = -T * np.eye(3), -0.5 * T**2 * np.eye(3)
+    push = s.accel_density**2 * T
+    step = _expect(x, x.R_wb, dv, 0.5 * T * dv, by_bias, T, (LEAST_VARIANCE, push), walk, resting=True)
+    after = update(step.expected, STOPPED, step.expected.v_w, np.full(3, s.rest_m_s**2))
+    rate = after.rest_bias(True)[:3] - mean[:3]
+    return step._replace(after=update(after, STILL, rate, variance + s.rest_rad_s**2))
+
+
+def _expect(
+    x: State,
+    R: Matrix3,
+    dv: Vector3,
+    dp: Vector3,
+    by_bias: Float64[np.ndarray, "9 6"],
+    T: float,
+    noise: tuple[float, float],
+    walk: Vector6,
+    *,
+    resting: bool,
+) -> Step:
+    """The estimate after a block, before anything is measured."""
+    v = x.v_w + G_W * T + x.R_wb @ dv
+    p = x.p_wb + x.v_w * T + 0.5 * T**2 * G_W + x.R_wb @ dp
+    F = np.eye(SIZE)
+    g, V, X = hat(G_W), hat(v), hat(p)
+    F[VELOCITY, TURN], F[POSITION, TURN], F[POSITION, VELOCITY] = T * g, 0.5 * T**2 * g, T * np.eye(3)
+    turned = R @ by_bias[:3]
+    F[POSE, BIAS] = np.concatenate([turned, x.R_wb @ by_bias[3:6] + V @ turned, x.R_wb @ by_bias[6:] + X @ turned])
+    if resting:
+        F[POSE, GROUND] = F[POSE, BIAS]
+    P = F @ x.P @ F.T
+    turn_noise, push_noise = (
+        np.concatenate([np.eye(3), V, X]),
+        np.concatenate([np.zeros((3, 3)), np.eye(3), 0.5 * T * np.eye(3)]),
+    )
+    P[POSE, POSE] += noise[0] * turn_noise @ turn_noise.T + noise[1] * push_noise @ push_noise.T
+    P[np.arange(SIZE), np.arange(SIZE)] += LEAST_VARIANCE
+    P[np.arange(9, 15), np.arange(9, 15)] += walk**2 * T
+    expected = State(R, v, p, x.bias, x.ground, 0.5 * (P + P.T))
+    return Step(x, expected, F, expected)
+
+
+def update(x: State, H: Float64[np.ndarray, "k 21"], z: Float64[np.ndarray, " k"], noise: Float64[np.ndarray, " k"]) -> State:
+    """The Kalman update by z = H e + n, where e is the error of the estimate and n has these variances."""
+    PH = x.P @ H.T
+    K = np.linalg.solve(H @ PH + np.diag(noise), PH.T).T
+    I_KH = np.eye(SIZE) - K @ H
+    P = I_KH @ x.P @ I_KH.T + (K * noise) @ K.T
+    return x.moved(-K @ z, 0.5 * (P + P.T))
+
+
+def smooth(steps: Sequence[Step]) -> list[State]:
+    """Rauch, Tung and Striebel's backward pass: the estimates before the first block and after each, given all blocks."""
+    later = steps[-1].after
+    found = [later]
+    for step in reversed(steps):
+        scale = np.sqrt(np.diag(step.expected.P))  # units of rad/s beside metres: solved in units of one
+        scaled = step.expected.P / scale[:, None] / scale
+        C = np.linalg.solve(scaled, (step.F @ step.before.P) / scale[:, None]).T / scale
+        P = step.before.P + C @ (later.P - step.expected.P) @ C.T
+        later = step.before.moved(C @ later.minus(step.expected), 0.5 * (P + P.T))
+        found.append(later)
+    return found[::-1]
+
+
+def again(x: State, accel: Vector3, s: FilterSettings) -> Step:
+    """Pose anew, biases kept: after a time without samples, in which anything may have happened."""
+    fresh = level(accel, x.bias, x.ground, x.P[9:, 9:], s)
+    P = fresh.P + LEAST_VARIANCE * np.eye(SIZE)
+    F = np.zeros((SIZE, SIZE))
+    F[9:, 9:] = np.eye(12)
+    fresh = replace(fresh, P=P)
+    return Step(x, fresh, F, fresh)
+
+
+def _left_jacobian(xi: Vector3) -> Matrix3:
+    square = float(xi @ xi)
+    X = hat(xi)
+    if square < SMALL_RAD2:
+        first, second = 0.5 - square / 24.0, 1.0 / 6.0 - square / 120.0
+    else:
+        angle = np.sqrt(square)
+        first, second = (1.0 - np.cos(angle)) / square, (angle - np.sin(angle)) / (square * angle)
+    J: Matrix3 = np.eye(3) + first * X + second * X @ X
+    return J
+
+
+def _log(R: Matrix3) -> Vector3:
+    from scipy.spatial.transform import Rotation
+
+    xi: Vector3 = Rotation.from_matrix(R).as_rotvec()
+    return xi

@@ -1,0 +1,260 @@
+"""How far an estimated trajectory is from the truth: plain dicts, the unit in every key, ready for JSON.
+
+Definitions are the paper's (section "Evaluation Metric"), which are those of evo; equality with evo's command line is
+tested. Both trajectories are on the same stamps, with a mask of the rows where the truth is known; masked rows count
+nowhere, as if they had been left out of exported files. A figure that the data do not determine is None (JSON null).
+
+==================  ===================================================================================================
+aoe_deg, ape_m      root mean square of the rotation angle and of the distance between estimate and truth, not aligned:
+                    both start from the true pose, so all of the error is the estimate's (`evo_ape tum -r angle_deg`)
+aoe_aligned_deg,    the same after the rigid motion of the estimate that brings its positions nearest to the true ones
+ape_aligned_m       (Umeyama 1991, no scale; `evo_ape tum --align`)
+velocity_rmse_m_s   root mean square of the velocity difference, not aligned
+roe_deg, rpe_m      mean rotation angle and mean length of the difference of motions over stretches of 5, 10, 15 and
+                    20 m of the true path (`evo_rpe tum -d D -u m --all_pairs --pairs_from_reference`)
+==================  ===================================================================================================
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float64, Int64
+from scipy.spatial.transform import Rotation
+from scipy.special import gammaincinv
+
+from imutool.errors import ConfigError, DataError, NumericsError
+from imutool.geometry import quaternion
+from imutool.recording import Poses
+
+DISTANCES_M = (5.0, 10.0, 15.0, 20.0)
+PAIR_TOLERANCE = 0.1  # a pair counts when its distance is within this share of the one asked for: evo's default
+AT_ONCE = 1 << 13  # pairs, so that what is made of them stays near the processor
+FLAT = np.finfo(
+    np.float64
+).eps  # singular value (m²) under which positions lie on a line for evo, and rotation about it is free
+
+Mask = Bool[np.ndarray, " n"]
+Points = Float64[np.ndarray, "n 3"]
+
+
+def evaluate(estimate: Poses, truth: Poses, valid: Mask, distances_m: Sequence[float] = DISTANCES_M) -> dict[str, Any]:
+    """All figures of the module's table, with `samples` (rows that count) and `duration_s` (first such row to last).
+
+    Raises:
+        DataError: stamps differ, or no row is valid.
+        NumericsError: a figure is not finite.
+    """
+    rows = _scored(estimate, truth, valid)
+    stamps = rows[1].t_ns
+    return {
+        "samples": len(stamps),
+        "duration_s": float(stamps[-1] - stamps[0]) * 1e-9,
+        **absolute(estimate, truth, valid),
+        **relative(estimate, truth, valid, distances_m),
+    }
+
+
+def orientation_errors(estimate: Poses, truth: Poses) -> Float64[np.ndarray, " n"]:
+    """The angle between estimate and truth at every row, in rad."""
+    return quaternion.angle_between(_unit(estimate), _unit(truth))
+
+
+def absolute(estimate: Poses, truth: Poses, valid: Mask) -> dict[str, float | None]:
+    """`aoe_deg`, `aoe_aligned_deg`, `ape_m`, `ape_aligned_m`, `velocity_rmse_m_s`.
+
+    The aligned figures are None where positions (of either) do not span a plane, the velocity figure where a
+    velocity is missing.
+
+    Raises:
+        DataError: stamps differ, or no row is valid.
+        NumericsError: a figure is not finite.
+    """
+    estimate, truth = _scored(estimate, truth, valid)
+    q_est, q_true = _unit(estimate), _unit(truth)
+    p_est, p_true = estimate.p_wb, truth.p_wb
+    with np.errstate(over="ignore", invalid="ignore"):  # judged at the end, by the figures themselves
+        motion = align(p_est, p_true)
+        aligned: tuple[float | None, float | None] = (None, None)
+        if motion is not None:
+            turn, shift = motion
+            q_turn = turn.as_quat(scalar_first=True)[None]
+            aligned = (
+                _rms(np.degrees(quaternion.angle_between(quaternion.multiply(q_turn, q_est), q_true))),
+                _rms(p_est @ turn.as_matrix().T + shift - p_true),
+            )
+        v_est, v_true = estimate.v_w, truth.v_w
+        figures = {
+            "aoe_deg": _rms(np.degrees(quaternion.angle_between(q_est, q_true))),
+            "aoe_aligned_deg": aligned[0],
+            "ape_m": _rms(p_est - p_true),
+            "ape_aligned_m": aligned[1],
+            "velocity_rmse_m_s": None if v_est is None or v_true is None else _rms(v_est - v_true),
+        }
+    _check_finite(figures)
+    return figures
+
+
+def relative(
+    estimate: Poses, truth: Poses, valid: Mask, distances_m: Sequence[float] = DISTANCES_M
+) -> dict[str, dict[str, float | None]]:
+    """`roe_deg` and `rpe_m`, each keyed by the distance in metres ("5"); None where the true path is too short.
+
+    Raises:
+        DataError: stamps differ, or no row is valid.
+        NumericsError: a figure is not finite.
+    """
+    estimate, truth = _scored(estimate, truth, valid)
+    # With C = R_true R_est^T, R_true,i^T (dp_true - C_i dp_est) is the difference of motions, and C_i C_j^T that of their turns
+    # seen from elsewhere: the length and the angle are the same, for a fraction of the products.
+    C = quaternion.multiply(_unit(truth), quaternion.inverse(_unit(estimate)))
+    roe: dict[str, float | None] = {}
+    rpe: dict[str, float | None] = {}
+    for distance_m in distances_m:
+        key = f"{distance_m:g}"
+        i, j = pairs_by_distance(truth.p_wb, distance_m)
+        if not len(i):
+            roe[key] = rpe[key] = None
+            continue
+        apart_m = turned = 0.0
+        for first in range(0, len(i), AT_ONCE):
+            a, b = i[first : first + AT_ONCE], j[first : first + AT_ONCE]
+            with np.errstate(over="ignore", invalid="ignore"):
+                moved_est, moved_true = (poses.p_wb[b] - poses.p_wb[a] for poses in (estimate, truth))
+                apart_m += float(quaternion.length(quaternion.rotate(C[a], moved_est) - moved_true).sum())
+            turned += float(quaternion.angle_between(C[a], C[b]).sum())
+        rpe[key], roe[key] = apart_m / len(i), float(np.degrees(turned / len(i)))
+    _check_finite({f"rpe_m {k}": v for k, v in rpe.items()} | {f"roe_deg {k}": v for k, v in roe.items()})
+    return {"roe_deg": roe, "rpe_m": rpe}
+
+
+def align(p: Points, p_target: Points) -> tuple[Rotation, Float64[np.ndarray, "3"]] | None:
+    """Rotation and shift that bring points nearest to others by least squares (Umeyama 1991, eq. 40-42, scale 1).
+
+    None where the points leave the rotation free: fewer than two directions in their covariance.
+
+    Raises:
+        NumericsError: the covariance of the positions overflows.
+    """
+    centre, centre_target = p.mean(axis=0), p_target.mean(axis=0)
+    covariance = (p_target - centre_target).T @ (p - centre) / len(p)
+    if not np.isfinite(covariance).all():
+        raise NumericsError("positions overflow when aligned", expected="positions within range", fix="Shorten the log")
+    u, size, vt = np.linalg.svd(covariance)
+    if np.count_nonzero(size > FLAT) < 2:
+        return None
+    mirror = np.diag([1.0, 1.0, np.sign(np.linalg.det(u) * np.linalg.det(vt))])  # a rotation, not a reflection
+    turn = Rotation.from_matrix(u @ mirror @ vt)
+    return turn, centre_target - turn.apply(centre)
+
+
+def pairs_by_distance(
+    p: Points, distance_m: float, tolerance: float = PAIR_TOLERANCE
+) -> tuple[Int64[np.ndarray, " m"], Int64[np.ndarray, " m"]]:
+    """For each point i the later point j nearest to `distance_m` further along the path, where one is within tolerance.
+
+    The rule of evo's `--all_pairs`: of equally near points the first. Found by bisection, since distance along a path
+    only grows (evo searches every pair; 30 000 poses would take it minutes).
+    """
+    travelled = np.concatenate([[0.0], np.cumsum(quaternion.length(np.diff(p, axis=0)))])
+    i = np.arange(len(p) - 1)
+    above = np.searchsorted(travelled, travelled[i] + distance_m, side="left")
+    above = np.clip(above, i + 1, len(p) - 1)
+    below = np.searchsorted(travelled, travelled[above - 1], side="left")  # first of the points that share that distance
+    below = np.clip(below, i + 1, above)
+    miss_above = np.abs(travelled[above] - travelled[i] - distance_m)
+    miss_below = np.abs(travelled[below] - travelled[i] - distance_m)
+    j = np.where(miss_below <= miss_above, below, above)
+    near = np.minimum(miss_below, miss_above) <= distance_m * tolerance
+    return i[near], j[near]
+
+
+def consistency(
+    errors: Float64[np.ndarray, "n k"], covariances: Float64[np.ndarray, "n k k"], confidence: float = 0.95
+) -> dict[str, float | bool]:
+    """Whether errors are as large as their claimed covariances say: the mean normalised estimation error squared.
+
+    NEES_k = e_k^T P_k^{-1} e_k has mean `dimension` for honest covariances; n times the mean of n independent ones is
+    chi-square with n k degrees of freedom (Bar-Shalom, Li, Kirubarajan 2001, section 5.4.2), which gives the two-sided
+    bounds. Above the upper bound the covariances are too small (overconfident). Errors correlated in time make the
+    bounds too narrow: pass one per correlation time.
+
+    Raises:
+        DataError: no errors, or a covariance that is not positive definite.
+        NumericsError: an error or covariance is not finite.
+    """
+    samples, dimension = errors.shape
+    if not samples or not dimension:
+        raise DataError(f"errors are {list(errors.shape)}", expected="at least one row and column")
+    if not (np.isfinite(errors).all() and np.isfinite(covariances).all()):
+        raise NumericsError("errors or covariances are not finite", expected="finite numbers", fix="Look for divergence")
+    try:
+        whitening = np.linalg.cholesky(covariances)
+    except np.linalg.LinAlgError as error:
+        raise DataError("a covariance is not positive definite", expected="symmetric positive definite") from error
+    nees = (np.linalg.solve(whitening, errors[..., None])[..., 0] ** 2).sum(axis=1)
+    mean, freedom, tail = float(nees.mean()), samples * dimension, (1.0 - confidence) / 2.0
+    lower, upper = (2.0 * float(gammaincinv(freedom / 2.0, q)) / samples for q in (tail, 1.0 - tail))
+    return {
+        "nees_mean": mean,
+        "nees_lower": lower,
+        "nees_upper": upper,
+        "dimension": dimension,
+        "samples": samples,
+        "consistent": lower <= mean <= upper,
+    }
+
+
+def write_tum(poses: Poses, path: Path, overwrite: bool = False) -> None:
+    """Writes `t x y z qx qy qz qw` lines (TUM RGB-D format): stamps with nine decimals, numbers that read back exactly.
+
+    Raises:
+        ConfigError: the target exists and `overwrite` is false, or cannot be written.
+    """
+    if path.exists() and not overwrite:
+        raise ConfigError("the file exists", where=path, expected="a new file", fix="Add --overwrite to replace it")
+    columns = np.concatenate([poses.p_wb, poses.q_wb_wxyz[:, [1, 2, 3, 0]]], axis=1).tolist()
+    stamps = (f"{'-' * (t < 0)}{abs(t) // 10**9}.{abs(t) % 10**9:09d}" for t in poses.t_ns.tolist())
+    text = "".join(f"{stamp} {' '.join(map(repr, row))}\n" for stamp, row in zip(stamps, columns, strict=True))
+    beside = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    try:
+        beside.write_text(text, encoding="ascii")
+        beside.replace(path)
+    except OSError as error:
+        raise ConfigError(f"cannot be written ({error.strerror})", where=path, expected="a writable folder") from error
+    finally:
+        beside.unlink(missing_ok=True)
+
+
+def _scored(estimate: Poses, truth: Poses, valid: Mask) -> tuple[Poses, Poses]:
+    """Both trajectories at the rows that count."""
+    if not np.array_equal(estimate.t_ns, truth.t_ns) or len(valid) != len(truth):
+        raise DataError(
+            f"an estimate of {len(estimate)}, a truth of {len(truth)} poses and a mask of {len(valid)} do not match",
+            expected="the same stamps (Poses.at)",
+        )
+    if not valid.any():
+        raise DataError("the truth is known at none of the estimate's stamps", expected="some overlap")
+    return (estimate, truth) if valid.all() else (estimate.rows(valid), truth.rows(valid))
+
+
+def _unit(poses: Poses) -> Float64[np.ndarray, "n 4"]:
+    """Orientations as unit as float64 can; a file's six decimals would count as an angle."""
+    return quaternion.unit(poses.q_wb_wxyz)
+
+
+def _rms(errors: Float64[np.ndarray, " n *k"]) -> float:
+    """Root mean square over rows of the length of each row."""
+    return float(np.sqrt((errors**2).reshape(len(errors), -1).sum(axis=1).mean()))
+
+
+def _check_finite(figures: dict[str, float | None]) -> None:
+    for name, value in figures.items():
+        if value is not None and not np.isfinite(value):
+            raise NumericsError(
+                f"{name} is {value}", expected="a finite error", fix="The estimate diverged; look at its inputs"
+            )

@@ -1,0 +1,85 @@
+"""What a stretch of inertial samples adds to attitude, velocity and position, and how a bias changes that; numpy, no torch.
+
+Forster, Carlone, Dellaert, Scaramuzza, "On-Manifold Preintegration", TRO 2017, eq. 33-36 and 44, here with the mean of two
+samples over the step between them (`imutool.inertial.windows` says why) and with sums in place of the recursions, so that a block of a
+hundred samples costs a few dozen array operations.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float64
+
+Vector3 = Float64[np.ndarray, "3"]
+Matrix3 = Float64[np.ndarray, "3 3"]
+Vectors = Float64[np.ndarray, "n 3"]
+SMALL_RAD2 = 1e-8  # below, two terms of the series are exact to 1e-17
+
+
+class Increment(NamedTuple):
+    """The motion over a block, seen from the body at its start and without gravity.
+
+    `by_bias` is the derivative of (turn in rad seen from the body at the end, v, p) by a constant added to the bias.
+    """
+
+    duration_s: float
+    R: Matrix3
+    v: Vector3
+    p: Vector3
+    by_bias: Float64[np.ndarray, "9 6"]
+    turned_rad: float  # the length of the way, not of the chord
+
+
+def hat(x: Float64[np.ndarray, "*batch 3"]) -> Float64[np.ndarray, "*batch 3 3"]:
+    """The matrix of `x ×`."""
+    out = np.zeros((*x.shape, 3))
+    out[..., 0, 1], out[..., 0, 2], out[..., 1, 2] = -x[..., 2], x[..., 1], -x[..., 0]
+    out[..., 1, 0], out[..., 2, 0], out[..., 2, 1] = x[..., 2], -x[..., 1], x[..., 0]
+    return out
+
+
+def exp(xi: Float64[np.ndarray, "*batch 3"]) -> Float64[np.ndarray, "*batch 3 3"]:
+    """The rotation by a rotation vector (Rodrigues)."""
+    square = (xi * xi).sum(-1)[..., None, None]
+    small = square < SMALL_RAD2
+    angle = np.sqrt(np.where(small, 1.0, square))
+    first = np.where(small, 1.0 - square / 6.0, np.sin(angle) / angle)
+    second = np.where(small, 0.5 - square / 24.0, 2.0 * (np.sin(0.5 * angle) / angle) ** 2)
+    X = hat(xi)
+    R: Float64[np.ndarray, "*batch 3 3"] = np.eye(3) + first * X + second * (X @ X)
+    return R
+
+
+def integrate(t_s: Float64[np.ndarray, " n"], gyro: Vectors, accel: Vectors) -> Increment:
+    """The increment from the first sample to the last, of samples that a bias has been taken off already."""
+    dt = np.diff(t_s)
+    step = 0.5 * (gyro[:-1] + gyro[1:]) * dt[:, None]
+    R = np.concatenate([np.eye(3)[None], _running_product(exp(step))])  # body at each sample to body at the first
+    # a constant c added to the bias turns step k by -Jr c dt, seen through what comes after
+    right_jacobian = (np.eye(3) - 0.5 * hat(step)) * dt[:, None, None]
+    turned = np.concatenate([np.zeros((1, 3, 3)), np.cumsum(R[1:] @ right_jacobian, axis=0)])
+    R_by_bias = -R.swapaxes(-1, -2) @ turned
+    force = (R @ accel[..., None])[..., 0]
+    force_by_gyro_bias = -R @ hat(accel) @ R_by_bias
+
+    to_velocity = 0.5 * (np.append(dt, 0.0) + np.append(0.0, dt))  # trapezoidal weights
+    left = t_s[-1] - 0.5 * (t_s[:-1] + t_s[1:])
+    to_position = 0.5 * (np.append(dt * left, 0.0) + np.append(0.0, dt * left))
+    by_bias = np.zeros((9, 6))
+    by_bias[:3, :3] = R_by_bias[-1]
+    for rows, weights in ((slice(3, 6), to_velocity), (slice(6, 9), to_position)):
+        by_bias[rows, :3] = np.einsum("n,nij->ij", weights, force_by_gyro_bias)
+        by_bias[rows, 3:] = -np.einsum("n,nij->ij", weights, R)
+    way = float(np.sqrt((step * step).sum(axis=1)).sum())
+    return Increment(float(t_s[-1] - t_s[0]), R[-1], to_velocity @ force, to_position @ force, by_bias, way)
+
+
+def _running_product(R: Float64[np.ndarray, "n 3 3"]) -> Float64[np.ndarray, "n 3 3"]:
+    """R_0, R_0 R_1, ..., in log2(n) passes."""
+    shift = 1
+    while shift < len(R):
+        R = np.concatenate([R[:shift], R[:-shift] @ R[shift:]])
+        shift *= 2
+    return R

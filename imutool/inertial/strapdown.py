@@ -1,0 +1,249 @@
+"""Pure inertial integration at the IMU's own stamps, and the velocity of a truth that has only poses; numpy, no torch.
+
+The rule is the paper's Euler step, each sample held until the next::
+
+    R_{k+1} = R_k Exp(gyro_k dt_k)
+    v_{k+1} = v_k + (R_k accel_k + g_w) dt_k          dt_k = t_{k+1} - t_k
+    p_{k+1} = p_k + v_k dt_k
+
+so the last sample is not used, and sample k of the answer depends on samples before k only.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float64, Int64
+
+from imutool.errors import DataError, NumericsError
+from imutool.geometry import quaternion
+from imutool.recording import GAP_FACTOR, GRAVITY_M_S2, MIN_GAP_S, Imu, Poses, Times, seconds
+
+GRAVITY_W = (0.0, 0.0, -GRAVITY_M_S2)
+VELOCITY_WINDOW_S = 0.2
+VELOCITY_ORDER = 3
+SAMPLES_PER_COEFFICIENT = 3  # a stretch shorter than the window gets a lower order rather than its own noise
+
+Vectors = Float64[np.ndarray, "n 3"]
+Quaternions = Float64[np.ndarray, "n 4"]
+
+
+class Start(NamedTuple):
+    """Where an integration begins: orientation (body to world), position in m, world velocity in m/s."""
+
+    q_wb_wxyz: Float64[np.ndarray, "4"]
+    p_wb: Float64[np.ndarray, "3"]
+    v_w: Float64[np.ndarray, "3"]
+
+    @classmethod
+    def of(cls, poses: Poses, row: int = 0) -> Start:
+        """The start at one row of a trajectory.
+
+        Raises:
+            DataError: the trajectory has no velocity (`truth_velocity` derives one), or no such row.
+        """
+        if not -len(poses) <= row < len(poses):
+            raise DataError(f"no row {row} among {len(poses)} poses", expected="a pose to start from")
+        if poses.v_w is None:
+            raise DataError("the poses carry no velocity", expected="v_w", fix="Derive it with strapdown.truth_velocity")
+        return cls(poses.q_wb_wxyz[row], poses.p_wb[row], poses.v_w[row])
+
+
+def dead_reckon(
+    imu: Imu,
+    start: tuple[Float64[np.ndarray, "4"], Float64[np.ndarray, "3"], Float64[np.ndarray, "3"]],
+    g_w: tuple[float, float, float] = GRAVITY_W,
+) -> Poses:
+    """The trajectory that the IMU alone gives, at every one of its stamps, the first being `start` (a `Start`).
+
+    Rotations are a prefix product of quaternions in log depth, velocity and position cumulative sums; the rounding
+    grows with the logarithm of the length. 30 000 samples take about 10 ms.
+
+    Raises:
+        DataError: no samples.
+        NumericsError: the numbers overflow.
+    """
+    if not len(imu):
+        raise DataError("the IMU has no samples", expected="at least one")
+    q_0, p_0, v_0 = (np.asarray(part, dtype=np.float64) for part in start)
+    t = seconds(imu.t_ns, int(imu.t_ns[0]))
+    dt = np.diff(t)[:, None]
+    with np.errstate(over="ignore", invalid="ignore"):  # overflow is reported below, with its row
+        steps = quaternion.exp(imu.gyro[:-1] * dt)
+        q_wb = quaternion.unit(_prefix_product(np.concatenate([quaternion.unit(q_0[None]), steps])))
+        a_w = quaternion.rotate(q_wb[:-1], imu.accel[:-1]) + np.asarray(g_w, dtype=np.float64)
+        v_w = np.cumsum(np.concatenate([v_0[None], a_w * dt]), axis=0)
+        p_wb = np.cumsum(np.concatenate([p_0[None], v_w[:-1] * dt]), axis=0)
+    if not all(np.isfinite(column).all() for column in (q_wb, v_w, p_wb)):
+        row = int(np.argmin(np.isfinite(np.concatenate([q_wb, v_w, p_wb], axis=1)).all(axis=1)))
+        raise NumericsError(
+            f"integration overflows at sample {row}",
+            expected="rates and forces of a moving body",
+            fix="Look at gyro and accel just before that sample",
+        )
+    return Poses(imu.t_ns, p_wb, q_wb, v_w)
+
+
+def along_truth(imu: Imu, truth: Poses, where: str) -> tuple[Poses, Poses, Bool[np.ndarray, " n"]]:
+    """What the IMU alone makes of the stretch that has truth, the truth on the same stamps, and where it can be scored.
+
+    The stretch runs from the first sample at which the truth is known to the last; the start is the truth there, its velocity
+    derived where it has none.
+
+    Raises:
+        DataError: the truth is known at fewer than two samples.
+        NumericsError: the numbers overflow.
+    """
+    rows, true, valid = stretch_with_truth(imu.t_ns, truth, where)
+    return dead_reckon(imu.rows(rows), Start.of(true)), true, valid
+
+
+def stretch_with_truth(t_ns: Times, truth: Poses, where: str) -> tuple[slice, Poses, Bool[np.ndarray, " m"]]:
+    """The rows from the first stamp at which the truth is known to the last, the truth with velocity there, and where it is.
+
+    Raises:
+        DataError: the truth is known at fewer than two stamps.
+    """
+    true, valid = with_velocity(truth).at(t_ns)
+    known = np.flatnonzero(valid)
+    if len(known) < 2:
+        raise DataError("IMU and true poses share fewer than two samples", where=where, expected="an overlap")
+    rows = slice(int(known[0]), int(known[-1]) + 1)
+    return rows, true.rows(rows), valid[rows]
+
+
+class Drifted(NamedTuple):
+    """Errors of integrations that each start from the truth: orientation (rad), velocity (m/s) and position (m)."""
+
+    orientation_rad: Float64[np.ndarray, " m"]
+    velocity_m_s: Float64[np.ndarray, " m"]
+    position_m: Float64[np.ndarray, " m"]
+
+
+def drifted(path: Poses, truth: Poses, first: Int64[np.ndarray, " m"], last: Int64[np.ndarray, " m"] | slice) -> Drifted:
+    """How far integrations that start from the truth at rows `first` are from it at rows `last`, all from one integration.
+
+    `path` is that of the same samples from any start, on the stamps of `truth`. Had it started from the truth at row s, all of
+    it from there on would be turned by C = R_true,s R_s^T, so that none of it is integrated again::
+
+        R'_k = C R_k
+        v'_k = v_true,s + C (v_k - v_s - g_w T) + g_w T                             T = t_k - t_s
+        p'_k = p_true,s + v_true,s T + C (p_k - p_s - v_s T - g_w S) + g_w S        S = (T^2 - sum dt^2) / 2
+
+    S being the rule's own double sum of dt, so that the answer is that of `dead_reckon` over each window, to rounding.
+
+    Raises:
+        DataError: one of the two carries no velocity, or they are on different stamps.
+    """
+    v, v_true = path.v_w, truth.v_w
+    if v is None or v_true is None or not np.array_equal(path.t_ns, truth.t_ns):
+        raise DataError("path and truth do not match", expected="poses with velocity on the same stamps")
+    t = seconds(path.t_ns, int(path.t_ns[0]))
+    squares = np.concatenate([[0.0], np.cumsum(np.diff(t) ** 2)])
+    T = (t[last] - t[first])[:, None]
+    g_T, g_S = np.array(GRAVITY_W) * T, np.array(GRAVITY_W) * (0.5 * (T**2 - (squares[last] - squares[first])[:, None]))
+    (q, p), (q_true, p_true) = ((poses.q_wb_wxyz, poses.p_wb) for poses in (path, truth))
+    q_c = quaternion.multiply(q_true[first], quaternion.inverse(q[first]))
+    faster = v_true[first] - v_true[last] + g_T + quaternion.rotate(q_c, v[last] - v[first] - g_T)
+    further = p_true[first] - p_true[last] + v_true[first] * T + g_S
+    further += quaternion.rotate(q_c, p[last] - p[first] - v[first] * T - g_S)
+    turned = quaternion.angle_between(quaternion.multiply(q_c, q[last]), q_true[last])
+    return Drifted(turned, quaternion.length(faster), quaternion.length(further))
+
+
+def drift(path: Poses, truth: Poses, valid: Bool[np.ndarray, " n"], window_s: float) -> Drifted:
+    """How far integration drifts in a window, at the end of each, of what `along_truth` gives.
+
+    Windows follow one another through the log; each starts from the truth and counts if the truth is known at both ends and the
+    IMU has no gap in between. Empty where none does.
+
+    Raises:
+        DataError: as `drifted`.
+    """
+    t = seconds(path.t_ns, int(path.t_ns[0]))
+    dt = np.diff(t)
+    gaps = np.concatenate([[0], np.cumsum(dt > GAP_FACTOR * np.median(dt))])
+    known = np.flatnonzero(valid)
+    pairs = []
+    first = 0
+    while (next_known := np.searchsorted(known, first)) < len(known):
+        first = int(known[next_known])
+        last = int(np.searchsorted(t, t[first] + window_s))
+        if last >= len(t):
+            break
+        if valid[last] and gaps[last] == gaps[first]:
+            pairs.append((first, last))
+        first = last
+    rows = np.array(pairs, np.int64).reshape(-1, 2)
+    return drifted(path, truth, rows[:, 0], rows[:, 1])
+
+
+def with_velocity(poses: Poses) -> Poses:
+    """The same trajectory with a velocity: its own, or `truth_velocity` where it has none."""
+    return poses if poses.v_w is not None else replace(poses, v_w=truth_velocity(poses))
+
+
+def truth_velocity(
+    poses: Poses,
+    window_s: float = VELOCITY_WINDOW_S,
+    order: int = VELOCITY_ORDER,
+    max_gap_s: float | None = None,
+) -> Vectors:
+    """World velocity (m/s) at every pose, from positions: a Savitzky-Golay derivative on the poses' own stamps.
+
+    Recipe: around each pose the `window_s` worth of poses (an odd number m, by the median period, over `order`) is
+    fitted by a polynomial of degree `order` in time, by least squares on the true stamps, and its slope taken. On an
+    even clock this is `scipy.signal.savgol_filter(p, m, order, deriv=1, delta=period, mode="interp")`; jitter does no
+    harm. Windows never cross a gap longer than `max_gap_s` (default as in `Poses.at`: four median periods, at least
+    80 ms); near the ends of a stretch they stay inside and the slope is taken off their centre. A stretch shorter than
+    the window lowers the order to keep three poses per coefficient, at least 1; a pose alone between two gaps gets the
+    slope between its neighbours, the only thing known about it.
+
+    0.2 s and order 3 agree best with the accelerometer over a quarter second on TUM-VI (median 10 mm/s on room2 against
+    15 for 0.1 s and order 5) and FETCH; on EuRoC, which brings its own velocity, they are within 6-8 mm/s of that.
+
+    Raises:
+        DataError: fewer than two poses.
+    """
+    period_s = poses.period_s
+    gap_s = max(GAP_FACTOR * period_s, MIN_GAP_S) if max_gap_s is None else max_gap_s
+    t = seconds(poses.t_ns, int(poses.t_ns[0]))
+    window = max(2 * round(window_s / period_s / 2) + 1, order + 1 + order % 2)
+    breaks = np.flatnonzero(np.diff(t) > gap_s) + 1
+    v_w = np.empty_like(poses.p_wb)
+    for rows in np.split(np.arange(len(t)), breaks):
+        first, after = int(rows[0]), int(rows[-1]) + 1
+        if len(rows) == 1:
+            around = slice(max(first - 1, 0), min(first + 2, len(t)))
+            v_w[rows] = (poses.p_wb[around][-1] - poses.p_wb[around][0]) / (t[around][-1] - t[around][0])
+        else:
+            v_w[first:after] = _slopes(t[first:after], poses.p_wb[first:after], window, order)
+    return v_w
+
+
+def _slopes(t: Float64[np.ndarray, " n"], p: Vectors, window: int, order: int) -> Vectors:
+    """Slopes of moving least-squares polynomials over one stretch without gaps."""
+    n = len(t)
+    if n < window:
+        window, order = n, min(order, max(1, n // SAMPLES_PER_COEFFICIENT - 1))
+    first = np.clip(np.arange(n) - window // 2, 0, n - window)
+    rows = first[:, None] + np.arange(window)
+    span = t[rows[:, -1]] - t[rows[:, 0]]
+    u = (t[rows] - t[:, None]) / span[:, None]  # about the pose itself, so the slope is one coefficient
+    basis = np.stack([u**power for power in range(order + 1)], axis=-1)
+    weights = np.linalg.pinv(basis)[:, 1, :] / span[:, None]
+    slopes: Vectors = np.einsum("nm,nmk->nk", weights, p[rows])
+    return slopes
+
+
+def _prefix_product(q: Quaternions) -> Quaternions:
+    """q_0, q_0 q_1, q_0 q_1 q_2, ...: pairs are multiplied, their prefixes found likewise, the even ones filled in."""
+    if len(q) == 1:
+        return q
+    pairs = _prefix_product(quaternion.multiply(q[: len(q) // 2 * 2 : 2], q[1::2]))
+    out = np.empty_like(q)
+    out[0], out[1::2] = q[0], pairs
+    out[2::2] = quaternion.multiply(pairs[: (len(q) - 1) // 2], q[2::2])
+    return out

@@ -1,0 +1,1 @@
+"""MCAP records and message payloads to and from bytes."""

@@ -1,0 +1,156 @@
+"""Columns of messages from their bytes: every number of a stretch of messages in one numpy pass.
+
+Quaternions are xyzw in messages and wxyz in memory; here they change.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float64, Int64, UInt8
+
+from imutool.errors import LogError
+from imutool.mcap_io.codec.schemas import (
+    ACCEL,
+    GYRO,
+    IMAGE,
+    IMU,
+    NS_PER_S,
+    POSE,
+    POSITION,
+    SHAPES,
+    TWIST,
+    XYZW,
+    Layout,
+    layout_of,
+    runs,
+)
+
+_WXYZ_FROM_XYZW = [3, 0, 1, 2]
+
+
+class ImuColumns(NamedTuple):
+    """Consecutive Imu messages of one frame: stamps in ns, rad/s, m/s²."""
+
+    stamp_ns: Int64[np.ndarray, " n"]
+    gyro: Float64[np.ndarray, "n 3"]
+    accel: Float64[np.ndarray, "n 3"]
+    frame_id: str
+
+
+class PoseColumns(NamedTuple):
+    """Consecutive poses of one frame in another; `child_frame_id` is empty where the message names none."""
+
+    stamp_ns: Int64[np.ndarray, " n"]
+    p_wb: Float64[np.ndarray, "n 3"]
+    q_wb_wxyz: Float64[np.ndarray, "n 4"]
+    frame_id: str
+    child_frame_id: str
+
+
+class ScalarColumns(NamedTuple):
+    """Consecutive numbers; `stamp_ns` is None for a message without a header, which the log's own time then carries."""
+
+    stamp_ns: Int64[np.ndarray, " n"] | None
+    values: Float64[np.ndarray, "n k"]
+    frame_id: str
+
+
+class TwistColumns(NamedTuple):
+    """Consecutive TwistWithCovarianceStamped of one frame; `variance` is of angular then linear, in messages the other way."""
+
+    stamp_ns: Int64[np.ndarray, " n"]
+    angular: Float64[np.ndarray, "n 3"]
+    linear: Float64[np.ndarray, "n 3"]
+    variance: Float64[np.ndarray, "n 6"]
+    frame_id: str
+
+
+def _stamp(rows: UInt8[np.ndarray, "n L"], layout: Layout, which: int = 0) -> Int64[np.ndarray, " n"]:
+    at = layout.stamps[which]
+    seconds = rows[:, at : at + 4].view(layout.order + layout.seconds)[:, 0].astype(np.int64)
+    return seconds * NS_PER_S + rows[:, at + 4 : at + 8].view(layout.order + "u4")[:, 0].astype(np.int64)
+
+
+def _numbers(rows: UInt8[np.ndarray, "n L"], layout: Layout, columns: slice, which: int = 0) -> Float64[np.ndarray, "n k"]:
+    at = layout.numbers[which][0] + 8 * columns.start
+    cut = rows[:, at : at + 8 * (columns.stop - columns.start)]
+    return cut.view(layout.order + "f8").astype(np.float64)
+
+
+def _one_layout(rows: UInt8[np.ndarray, "n L"], schema_name: str, encoding: str) -> Layout:
+    every = list(runs(rows, schema_name, encoding))
+    if len(every) != 1:
+        raise LogError(f"{len(every)} different frames in one batch", expected="one; split it with `runs`")
+    return every[0][1]
+
+
+def decode_imu(rows: UInt8[np.ndarray, "n L"], encoding: str = "cdr", layout: Layout | None = None) -> ImuColumns:
+    """The columns of Imu messages that share one layout (`runs` splits those that do not).
+
+    Raises:
+        LogError: no rows, more than one layout, a payload too short, an unknown encoding.
+    """
+    layout = layout or _one_layout(rows, IMU, encoding)
+    gyro, accel = _numbers(rows, layout, GYRO), _numbers(rows, layout, ACCEL)
+    return ImuColumns(_stamp(rows, layout), gyro, accel, layout.texts[0])
+
+
+def decode_poses(
+    rows: UInt8[np.ndarray, "n L"], schema_name: str = POSE, encoding: str = "cdr", layout: Layout | None = None
+) -> list[PoseColumns]:
+    """The columns of PoseStamped, Odometry, TransformStamped or TFMessage: one entry per transform in a message.
+
+    Raises:
+        LogError: no rows, more than one layout, a payload too short, an unknown encoding.
+    """
+    layout = layout or _one_layout(rows, schema_name, encoding)
+    named = 2 if "text" in SHAPES[schema_name] else 1
+    found = []
+    for which in range(len(layout.stamps)):
+        names = layout.texts[named * which : named * (which + 1)]
+        q_wxyz = _numbers(rows, layout, XYZW, which)[:, _WXYZ_FROM_XYZW]
+        p_wb = _numbers(rows, layout, POSITION, which)
+        child = names[1] if named == 2 else ""
+        found.append(PoseColumns(_stamp(rows, layout, which), p_wb, np.ascontiguousarray(q_wxyz), names[0], child))
+    return found
+
+
+def decode_scalars(
+    rows: UInt8[np.ndarray, "n L"], schema_name: str, encoding: str = "cdr", layout: Layout | None = None
+) -> ScalarColumns:
+    """The columns of Float64 (one) or Vector3Stamped (three).
+
+    Raises:
+        LogError: no rows, more than one layout, a payload too short, an unknown encoding.
+    """
+    layout = layout or _one_layout(rows, schema_name, encoding)
+    stamp_ns = _stamp(rows, layout) if layout.stamps else None
+    frame_id = layout.texts[0] if layout.texts else ""
+    return ScalarColumns(stamp_ns, _numbers(rows, layout, slice(0, layout.numbers[0][1])), frame_id)
+
+
+def decode_twist(rows: UInt8[np.ndarray, "n L"], encoding: str = "cdr", layout: Layout | None = None) -> TwistColumns:
+    """The columns of TwistWithCovarianceStamped.
+
+    Raises:
+        LogError: no rows, more than one layout, a payload too short, an unknown encoding.
+    """
+    layout = layout or _one_layout(rows, TWIST, encoding)
+    linear, angular = _numbers(rows, layout, slice(0, 3)), _numbers(rows, layout, slice(3, 6))
+    variance = _numbers(rows, layout, slice(6, 42))[:, ::7]  # the diagonal, of linear then angular
+    return TwistColumns(_stamp(rows, layout), angular, linear, np.roll(variance, 3, axis=1), layout.texts[0])
+
+
+def decode_image(message: bytes, encoding: str = "cdr") -> tuple[int, str, bytes]:
+    """Stamp in ns, format and the encoded image of one CompressedImage message.
+
+    Raises:
+        LogError: the payload is too short, or its encoding is not known.
+    """
+    layout = layout_of(IMAGE, encoding, message=message)
+    assert layout.data is not None, "an image has bytes"
+    row = np.frombuffer(message, np.uint8)[None, :]
+    at, length = layout.data
+    return int(_stamp(row, layout)[0]), layout.texts[1], message[at : at + length]

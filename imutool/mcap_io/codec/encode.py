@@ -1,0 +1,188 @@
+"""Columns into the bytes of messages, as ROS 2 writes them: every number of all of them in one numpy pass.
+
+Quaternions are wxyz in memory and xyzw in messages; here they change.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Float64, Int64, UInt8
+
+from imutool.errors import DataError
+from imutool.mcap_io.codec.schemas import (
+    ACCEL,
+    ACCEL_COVARIANCE,
+    FLOAT,
+    GYRO,
+    GYRO_COVARIANCE,
+    IMAGE,
+    IMU,
+    NS_PER_S,
+    ORIENTATION,
+    ORIENTATION_COVARIANCE,
+    POSE,
+    POSITION,
+    TF,
+    TWIST,
+    VECTOR3,
+    XYZW,
+    Layout,
+    layout_of,
+)
+
+NO_ORIENTATION = -1.0  # sensor_msgs/Imu: element 0 of a covariance of something that was not measured
+_XYZW_FROM_WXYZ = [1, 2, 3, 0]
+
+
+def _blank(count: int, layout: Layout) -> UInt8[np.ndarray, "n L"]:
+    """As many messages as asked for, with everything filled in that they share."""
+    one = np.zeros(layout.size, np.uint8)
+    for at, value in layout.constants:
+        one[at : at + len(value)] = np.frombuffer(value, np.uint8)
+    return np.repeat(one[None, :], count, axis=0)
+
+
+def _put_stamp(rows: UInt8[np.ndarray, "n L"], layout: Layout, stamp_ns: Int64[np.ndarray, " n"]) -> None:
+    if len(stamp_ns) and not -(2**31) <= stamp_ns.min() // NS_PER_S <= stamp_ns.max() // NS_PER_S < 2**31:
+        raise DataError(
+            f"stamps run from {stamp_ns.min()} to {stamp_ns.max()} ns",
+            expected="seconds that fit 32 bits, as ROS 2 stores them",
+        )
+    at = layout.stamps[0]
+    seconds = stamp_ns // NS_PER_S
+    rows[:, at : at + 4].view("<i4")[:, 0] = seconds
+    rows[:, at + 4 : at + 8].view("<u4")[:, 0] = stamp_ns - seconds * NS_PER_S
+
+
+def _numbers_of(rows: UInt8[np.ndarray, "n L"], layout: Layout) -> Float64[np.ndarray, "n k"]:
+    at, count = layout.numbers[0]
+    return rows[:, at : at + 8 * count].view("<f8")
+
+
+def encode_imu(
+    stamp_ns: Int64[np.ndarray, " n"],
+    gyro: Float64[np.ndarray, "n 3"],
+    accel: Float64[np.ndarray, "n 3"],
+    frame_id: str,
+    gyro_covariance: Float64[np.ndarray, "9"] | Float64[np.ndarray, "n 9"] | None = None,
+    accel_covariance: Float64[np.ndarray, "9"] | Float64[np.ndarray, "n 9"] | None = None,
+) -> UInt8[np.ndarray, "n L"]:
+    """One Imu message per row. Orientation is (0, 0, 0, 1) and marked as not measured; covariances, row-major, are one
+    for all or one per row, and all zeros ("unknown", says the message's definition) where not given.
+
+    Raises:
+        DataError: a stamp beyond the 32-bit seconds of ROS 2.
+    """
+    layout = layout_of(IMU, "cdr", texts=[frame_id])
+    rows = _blank(len(stamp_ns), layout)
+    _put_stamp(rows, layout, stamp_ns)
+    numbers = _numbers_of(rows, layout)
+    numbers[:, ORIENTATION.stop - 1] = 1.0
+    numbers[:, ORIENTATION_COVARIANCE.start] = NO_ORIENTATION
+    numbers[:, GYRO], numbers[:, ACCEL] = gyro, accel
+    if gyro_covariance is not None:
+        numbers[:, GYRO_COVARIANCE] = gyro_covariance
+    if accel_covariance is not None:
+        numbers[:, ACCEL_COVARIANCE] = accel_covariance
+    return rows
+
+
+def _encode_pose(
+    layout: Layout,
+    stamp_ns: Int64[np.ndarray, " n"],
+    p_wb: Float64[np.ndarray, "n 3"],
+    q_wb_wxyz: Float64[np.ndarray, "n 4"],
+) -> UInt8[np.ndarray, "n L"]:
+    rows = _blank(len(stamp_ns), layout)
+    _put_stamp(rows, layout, stamp_ns)
+    numbers = _numbers_of(rows, layout)
+    numbers[:, POSITION], numbers[:, XYZW] = p_wb, q_wb_wxyz[:, _XYZW_FROM_WXYZ]
+    return rows
+
+
+def encode_pose(
+    stamp_ns: Int64[np.ndarray, " n"],
+    p_wb: Float64[np.ndarray, "n 3"],
+    q_wb_wxyz: Float64[np.ndarray, "n 4"],
+    frame_id: str,
+) -> UInt8[np.ndarray, "n L"]:
+    """One PoseStamped message per row.
+
+    Raises:
+        DataError: a stamp beyond the 32-bit seconds of ROS 2.
+    """
+    return _encode_pose(layout_of(POSE, "cdr", texts=[frame_id]), stamp_ns, p_wb, q_wb_wxyz)
+
+
+def encode_transform(
+    stamp_ns: Int64[np.ndarray, " n"],
+    p_wb: Float64[np.ndarray, "n 3"],
+    q_wb_wxyz: Float64[np.ndarray, "n 4"],
+    frame_id: str,
+    child_frame_id: str,
+) -> UInt8[np.ndarray, "n L"]:
+    """One TFMessage per row, with one transform in it.
+
+    Raises:
+        DataError: a stamp beyond the 32-bit seconds of ROS 2.
+    """
+    return _encode_pose(layout_of(TF, "cdr", texts=[frame_id, child_frame_id]), stamp_ns, p_wb, q_wb_wxyz)
+
+
+def encode_vector3(
+    stamp_ns: Int64[np.ndarray, " n"], vector: Float64[np.ndarray, "n 3"], frame_id: str
+) -> UInt8[np.ndarray, "n L"]:
+    """One Vector3Stamped message per row.
+
+    Raises:
+        DataError: a stamp beyond the 32-bit seconds of ROS 2.
+    """
+    layout = layout_of(VECTOR3, "cdr", texts=[frame_id])
+    rows = _blank(len(stamp_ns), layout)
+    _put_stamp(rows, layout, stamp_ns)
+    _numbers_of(rows, layout)[:] = vector
+    return rows
+
+
+def encode_twist(
+    stamp_ns: Int64[np.ndarray, " n"],
+    angular: Float64[np.ndarray, "n 3"],
+    linear: Float64[np.ndarray, "n 3"],
+    covariance: Float64[np.ndarray, "n 6 6"],
+    frame_id: str,
+) -> UInt8[np.ndarray, "n L"]:
+    """One TwistWithCovarianceStamped message per row; `covariance` is of angular then linear, in messages the other way round.
+
+    Raises:
+        DataError: a stamp beyond the 32-bit seconds of ROS 2.
+    """
+    layout = layout_of(TWIST, "cdr", texts=[frame_id])
+    rows = _blank(len(stamp_ns), layout)
+    _put_stamp(rows, layout, stamp_ns)
+    numbers = _numbers_of(rows, layout)
+    numbers[:, :3], numbers[:, 3:6] = linear, angular
+    numbers[:, 6:] = np.roll(covariance, (3, 3), axis=(1, 2)).reshape(len(stamp_ns), 36)
+    return rows
+
+
+def encode_float(values: Float64[np.ndarray, " n"]) -> UInt8[np.ndarray, "n L"]:
+    """One Float64 message per row; it has no stamp, so the log's own time carries it."""
+    layout = layout_of(FLOAT, "cdr")
+    rows = _blank(len(values), layout)
+    _numbers_of(rows, layout)[:, 0] = values
+    return rows
+
+
+def encode_image(stamp_ns: int, image: bytes, frame_id: str, image_format: str) -> bytes:
+    """One CompressedImage message around the image's own bytes.
+
+    Raises:
+        DataError: a stamp beyond the 32-bit seconds of ROS 2.
+    """
+    layout = layout_of(IMAGE, "cdr", texts=[frame_id, image_format], data_size=len(image))
+    assert layout.data is not None, "an image has bytes"
+    rows = np.zeros((1, layout.data[0]), np.uint8)
+    for at, value in layout.constants:
+        rows[0, at : at + len(value)] = np.frombuffer(value, np.uint8)
+    _put_stamp(rows, layout, np.array([stamp_ns], np.int64))
+    return rows.tobytes() + image

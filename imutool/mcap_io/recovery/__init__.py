@@ -1,0 +1,1 @@
+"""Damaged logs: find the valid records and rebuild the index."""

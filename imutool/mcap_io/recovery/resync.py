@@ -1,0 +1,218 @@
+"""Where records go on after a place at which they do not: every byte is looked at once, by numpy, and little believed.
+
+A record convinces by lengths inside it that agree with one another (a chunk's data with the chunk, an index's entries with the
+index, the texts of a definition with the definition); a message, which has none, by the records that follow it.
+"""
+
+from __future__ import annotations
+
+import struct
+from typing import Any
+
+import numpy as np
+from mcap.opcode import Opcode
+from mcap.records import (
+    AttachmentIndex,
+    Channel,
+    ChunkIndex,
+    DataEnd,
+    Footer,
+    Header,
+    Metadata,
+    MetadataIndex,
+    Schema,
+    Statistics,
+    SummaryOffset,
+)
+
+from imutool.errors import LogError
+from imutool.mcap_io.codec import records
+from imutool.mcap_io.codec.attachment import Attached
+from imutool.mcap_io.codec.records import CHUNK_HEAD, FIXED, HEAD, MAGIC
+from imutool.mcap_io.storage.source import Source
+
+WINDOW = 1 << 20
+MOST_SMALL = 1 << 24  # bytes of a record that is parsed whole: a definition, metadata, an entry of the summary
+MOST_TRIED = 1 << 17  # candidates looked at closely; beyond, a file is made to be searched for ever
+CHAIN = 3  # records in a row that a message needs to be believed after a gap
+PRIVATE = 0x80  # opcodes from here on belong to whoever writes them
+
+SMALL: dict[int, Any] = {
+    Opcode.HEADER: Header,
+    Opcode.FOOTER: Footer,
+    Opcode.SCHEMA: Schema,
+    Opcode.CHANNEL: Channel,
+    Opcode.CHUNK_INDEX: ChunkIndex,
+    Opcode.ATTACHMENT_INDEX: AttachmentIndex,
+    Opcode.STATISTICS: Statistics,
+    Opcode.METADATA: Metadata,
+    Opcode.METADATA_INDEX: MetadataIndex,
+    Opcode.SUMMARY_OFFSET: SummaryOffset,
+    Opcode.DATA_END: DataEnd,
+}
+HELD = {Opcode.MESSAGE, Opcode.CHUNK, Opcode.MESSAGE_INDEX}  # what comes into memory as a whole
+SUMMARY = {
+    Opcode.CHUNK_INDEX,
+    Opcode.ATTACHMENT_INDEX,
+    Opcode.STATISTICS,
+    Opcode.METADATA_INDEX,
+    Opcode.SUMMARY_OFFSET,
+}
+# The shortest body each can have
+LEAST = {
+    Opcode.HEADER: 8,
+    Opcode.FOOTER: 20,
+    Opcode.SCHEMA: 14,
+    Opcode.CHANNEL: 16,
+    Opcode.MESSAGE: FIXED,
+    Opcode.CHUNK: CHUNK_HEAD.size + 8,
+    Opcode.MESSAGE_INDEX: 6,
+    Opcode.CHUNK_INDEX: 56,
+    Opcode.ATTACHMENT: 36,
+    Opcode.ATTACHMENT_INDEX: 40,
+    Opcode.STATISTICS: 46,
+    Opcode.METADATA: 8,
+    Opcode.METADATA_INDEX: 20,
+    Opcode.SUMMARY_OFFSET: 17,
+    Opcode.DATA_END: 4,
+}
+_LEAST = np.full(256, 2**63, np.uint64)
+_LEAST[[int(o) for o in LEAST]] = list(LEAST.values())
+_KNOWN = _LEAST < 2**63
+_CANDIDATE = np.dtype([("opcode", "u1"), ("length", "<u8")])
+
+
+class Frames:
+    """What records say of themselves, in one file up to a byte.
+
+    Raises (everywhere):
+        LogError: the disk does not give the bytes.
+    """
+
+    def __init__(self, source: Source, limit: int) -> None:
+        self.source, self.limit, self.tried = source, limit, 0
+
+    def head(self, position: int) -> tuple[int, int] | None:
+        """Opcode and length of a record that fits into the file, if one can begin there."""
+        if not 0 <= position <= self.limit - HEAD.size:
+            return None
+        opcode, length = self.source.head(position)
+        if length > self.limit - position - HEAD.size or (opcode < PRIVATE and length < int(_LEAST[opcode])):
+            return None
+        if opcode in HELD and length > records.CHUNK_LIMIT:
+            return None
+        return opcode, length
+
+    def magic(self, position: int) -> bool:
+        """Whether a log begins or ends there."""
+        return position + len(MAGIC) <= self.limit and self.source.at(position, len(MAGIC)) == MAGIC
+
+    def find(self, start: int, end: int, needle: bytes) -> int:
+        """Where some bytes begin in a stretch, be it that they end behind it; -1 if they do not."""
+        over = len(needle) - 1
+        for at in range(start, end, WINDOW):
+            raw = self.source.at(at, min(WINDOW + over, end + over - at, self.limit - at))
+            if (found := raw.find(needle)) >= 0:
+                return at + found
+        return -1
+
+    def empty(self, start: int, end: int) -> bool:
+        """Whether all bytes of a stretch are zero."""
+        return not any(self.source.at(at, min(WINDOW, end - at)).strip(b"\0") for at in range(start, end, WINDOW))
+
+    def leads_on(self, position: int) -> bool:
+        """Whether what came before ended well: the file ends here, or what may be a record begins."""
+        return position == self.limit or self.magic(position) or self.head(position) is not None
+
+    def agrees(self, position: int, opcode: int, length: int) -> bool:
+        """Whether the lengths inside a record agree with its own; nothing can be said so of a message."""
+        if opcode == Opcode.CHUNK:
+            return self.chunk(position, length) is not None
+        if opcode == Opcode.MESSAGE_INDEX:
+            (size,) = struct.unpack("<I", self.source.at(position + HEAD.size + 2, 4))
+            return bool(size == length - 6 and size % 16 == 0)
+        try:
+            if opcode == Opcode.ATTACHMENT:
+                return Attached.of(self.source, position, length).length == HEAD.size + length
+            kind = SMALL.get(opcode)
+            if kind is None or length > MOST_SMALL:
+                return False
+            raw = self.source.at(position, HEAD.size + length)
+            return records.build(records.parse(kind, raw[HEAD.size :], position)) == raw
+        except LogError:
+            return False
+
+    def chunk(self, position: int, length: int) -> records.ChunkHead | None:
+        """The head of a chunk whose record has this length, if it is one in a compression that is known."""
+        whole = HEAD.size + length
+        try:
+            head = records.ChunkHead.of(self.source.at(position, min(128, whole, self.limit - position)), whole, position)
+        except LogError:
+            return None
+        return head if head.compression in records.COMPRESSIONS.values() else None
+
+    def own_length(self, position: int) -> int | None:
+        """The length a Chunk record has by what stands inside it, where its own length field is damaged."""
+        first = self.source.at(position, min(128, self.limit - position))
+        if len(first) < HEAD.size + CHUNK_HEAD.size:
+            return None
+        name = CHUNK_HEAD.unpack_from(first, HEAD.size)[4]
+        at = HEAD.size + CHUNK_HEAD.size + name
+        if name > 4 or first[at - name : at].decode(errors="replace") not in records.COMPRESSIONS.values():
+            return None
+        if len(first) < at + 8:
+            return None
+        (packed,) = struct.unpack_from("<Q", first, at)
+        length = at - HEAD.size + 8 + packed
+        return int(length) if packed and length <= self.limit - position - HEAD.size else None
+
+    def next(self, start: int, limit: int, channels: set[int]) -> int:
+        """The first byte from `start` on at which a record convincingly begins, or a log; `limit` if there is none."""
+        for at in range(start, limit, WINDOW):
+            raw = self.source.at(at, min(WINDOW + len(MAGIC), self.limit - at))
+            for offset in self._candidates(raw, at):
+                position = at + offset
+                if position >= limit or self.tried > MOST_TRIED:
+                    return limit
+                self.tried += 1
+                if self.magic(position) or self._convinces(position, channels):
+                    return position
+        return limit
+
+    def _candidates(self, raw: bytes, at: int) -> list[int]:
+        """Where a known opcode is followed by a length that fits, and where the magic stands, in the first `WINDOW` bytes."""
+        view = np.frombuffer(raw, np.uint8)
+        found: list[int] = []
+        if len(view) >= HEAD.size:
+            count = len(view) - HEAD.size + 1
+            small = (view[8:] == 0) & (view[7 : 7 + count] == 0) & (view[6 : 6 + count] == 0) & _KNOWN[view[:count]]
+            offsets = np.flatnonzero(small[:WINDOW])
+            heads = np.lib.stride_tricks.sliding_window_view(view, HEAD.size)[offsets].view(_CANDIDATE)[:, 0]
+            room = self.limit - at - HEAD.size - offsets
+            fits = (heads["length"] >= _LEAST[heads["opcode"]]) & (heads["length"].astype(np.int64) <= room)
+            found = offsets[fits].tolist()
+        magic = raw.find(MAGIC)
+        while 0 <= magic < WINDOW:
+            found.append(magic)
+            magic = raw.find(MAGIC, magic + 1)
+        return sorted(found)
+
+    def _convinces(self, position: int, channels: set[int]) -> bool:
+        found = self.head(position)
+        if found is None:
+            return False
+        opcode, length = found
+        end = position + HEAD.size + length
+        if opcode != Opcode.MESSAGE:
+            return self.agrees(position, opcode, length) and (opcode == Opcode.CHUNK or self.leads_on(end))
+        for _ in range(CHAIN):
+            if channels and int.from_bytes(self.source.at(position + HEAD.size, 2), "little") not in channels:
+                return False
+            position += HEAD.size + length
+            found = self.head(position)
+            if found is None:
+                return position == self.limit
+            opcode, length = found
+            if opcode != Opcode.MESSAGE:
+                return self.agrees(position, opcode, length)
+        return True

@@ -1,0 +1,1 @@
+"""Byte sources and targets: files and object stores."""

@@ -1,0 +1,215 @@
+"""A file that appears whole or not at all: written beside its place under another name, renamed when it is complete.
+
+What another file holds is copied by the kernel where its blocks stay blocks: a file system that shares them between files
+copies nothing at all. Where they move by part of a block it could only cut each in two, and costs more than reading and
+writing do: 1.05 times in memory, 1.5 times on ext4.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import secrets
+import weakref
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from types import TracebackType
+from typing import BinaryIO, Protocol
+
+from imutool.errors import ConfigError
+from imutool.location import Place, failures, reason
+from imutool.mcap_io.codec.crc import crc32
+from imutool.mcap_io.storage.source import Source, descriptor
+from imutool.mcap_io.storage.upload import Upload
+
+COPY_BYTES = 1 << 20  # what passes through memory stays in the processor's cache
+BLOCK_BYTES = 1 << 12  # of a file system
+
+
+class _Medium(Protocol):
+    """What is being written under its temporary name."""
+
+    @property
+    def temporary(self) -> Place: ...
+
+    def open(self) -> None: ...
+
+    def write(self, data: bytes | bytearray | memoryview) -> None: ...
+
+    def copy(self, source: Source, start: int, end: int) -> int:
+        """Takes bytes over without their coming here, as far as that can be done; returns where it stopped."""
+
+    def complete(self) -> None:
+        """Makes all of it readable under the temporary name."""
+
+    def publish(self) -> None:
+        """Puts it in its place."""
+
+    def discard(self) -> None:
+        """Removes it; what cannot be removed is left without a word."""
+
+
+class Target:
+    """Context manager over the file being written; leaving it without an error puts the file in its place.
+
+    Any error, Ctrl-C included, removes what was written. `crc` is the CRC-32 of everything written while `summing`. In a store
+    it is an object under another key, copied to its own by the store when it is complete; between the last look whether the
+    target exists and that copy lies a moment in which another writer's object would be replaced, as with a file.
+
+    Raises:
+        ConfigError: the target exists (without `overwrite`), is a folder, or the system refuses to write.
+    """
+
+    def __init__(self, path: Place, *, overwrite: bool = False, summing: bool = True) -> None:
+        self.path, self.overwrite = path, overwrite
+        self.position, self.crc, self.summing = 0, 0, summing
+        name = f".{path.name}.{os.getpid()}.{secrets.token_hex(4)}.partial"
+        self._medium: _Medium = _File(path, name) if isinstance(path, Path) else Upload(path, name)
+        self.temporary = self._medium.temporary
+        # Ctrl-C may come between two lines, before anybody is there to call `abandon`: then the file goes with this object
+        self._remove = weakref.finalize(self, self._medium.discard)
+        with self._told():
+            self._refuse_existing()
+            self._medium.open()
+
+    def _refuse_existing(self) -> None:
+        if self.path.is_dir():
+            raise ConfigError("the target is a folder", where=self.path, expected="the name of a file")
+        if self.path.exists() and not self.overwrite:
+            raise ConfigError("the target exists", where=self.path, fix="Choose another name, or add --overwrite")
+
+    @contextmanager
+    def _told(self) -> Iterator[None]:
+        try:
+            yield
+        except ConfigError:
+            raise
+        except failures(self.path) as error:
+            raise ConfigError(
+                f"cannot be written ({reason(error)})", where=self.path, fix="Choose a place that can be written and has room"
+            ) from error
+
+    def write(self, data: bytes | bytearray | memoryview) -> None:
+        """Appends bytes.
+
+        Raises:
+            ConfigError: the system refuses; the message gives its reason.
+        """
+        with self._told():
+            self._medium.write(data)
+        self.position += len(data)
+        if self.summing:
+            self.crc = crc32(data, self.crc)
+
+    def copy(self, source: Source, start: int, end: int) -> None:
+        """Appends the bytes of another file from `start` to `end`, by the kernel if that is quicker and their CRC not wanted.
+
+        Raises:
+            ConfigError: the system refuses to write.
+            LogError: the source does not have the bytes, or the disk does not give them.
+        """
+        if not self.summing:
+            with self._told():
+                stopped = self._medium.copy(source, start, end)
+            self.position, start = self.position + stopped - start, stopped
+        for at in range(start, end, COPY_BYTES):
+            self.write(source.at(at, min(COPY_BYTES, end - at)))
+
+    def flush(self) -> None:
+        """Hands everything over, so that it can be read back under its temporary name; nothing can be written after."""
+        with self._told():
+            self._medium.complete()
+
+    def __enter__(self) -> Target:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+        if kind is None:
+            self.commit()
+        else:
+            self.abandon()
+
+    def commit(self) -> None:
+        """Puts the complete file in its place.
+
+        Raises:
+            ConfigError: the system refuses, or somebody else wrote the target meanwhile; nothing is left behind.
+        """
+        try:
+            with self._told():
+                self._medium.complete()
+                self._refuse_existing()
+                self._medium.publish()
+            self._remove.detach()
+        except BaseException:
+            self.abandon()
+            raise
+
+    def abandon(self) -> None:
+        """Removes what was written."""
+        self._remove()
+
+
+class _File:
+    """A file beside its place."""
+
+    file: BinaryIO
+
+    def __init__(self, path: Path, name: str) -> None:
+        self.path, self.temporary = path, path.with_name(name)
+
+    def open(self) -> None:
+        self.file = self.temporary.open("xb")
+
+    def write(self, data: bytes | bytearray | memoryview) -> None:
+        self.file.write(data)
+
+    def copy(self, source: Source, start: int, end: int) -> int:
+        """By the kernel; where it began, if the kernel cannot do it, or not without cutting blocks in two."""
+        theirs, ours = descriptor(source.file), descriptor(self.file)
+        if theirs is None or ours is None or (start - self.file.tell()) % BLOCK_BYTES:
+            return start
+        calls: tuple[Callable[[int], int], ...] = (
+            lambda at: os.copy_file_range(theirs, ours, end - at, offset_src=at),
+            lambda at: os.sendfile(ours, theirs, at, end - at),
+        )
+        self.file.flush()
+        for call in calls:
+            while start < end and (count := _tried(call, start)):
+                start += count
+        self.file.seek(0, os.SEEK_END)
+        return start
+
+    def complete(self) -> None:
+        self.file.flush()
+
+    def publish(self) -> None:
+        os.fsync(self.file.fileno())
+        self.file.close()
+        self.temporary.replace(self.path)
+        _settle(self.path.parent)
+
+    def discard(self) -> None:
+        with contextlib.suppress(OSError, AttributeError):  # a full disk refuses the last flush; or it was never opened
+            self.file.close()
+        with contextlib.suppress(OSError):
+            self.temporary.unlink(missing_ok=True)
+
+
+def _settle(folder: Path) -> None:
+    """Has the new name written to the disk, so that a power cut does not bring back the old file; Windows has no way."""
+    with contextlib.suppress(OSError):
+        handle = os.open(folder, os.O_RDONLY)
+        try:
+            os.fsync(handle)
+        finally:
+            os.close(handle)
+
+
+def _tried(call: Callable[[int], int], at: int) -> int:
+    """Bytes that were copied; 0 if this call cannot do it, whatever the reason: reading and writing then say which."""
+    try:
+        return call(at)
+    except OSError:
+        return 0

@@ -1,0 +1,104 @@
+"""An object being written to a store: in parts, under a temporary key, then copied to its own by the store."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from typing import TYPE_CHECKING, Any
+
+from imutool.errors import ConfigError
+from imutool.location import reason
+from imutool.mcap_io.storage.source import Source
+
+if TYPE_CHECKING:
+    from upath import UPath
+
+logger = logging.getLogger(__name__)
+
+PART_BYTES = 8 << 20  # one part and its copies are what is in memory
+LARGE_AFTER, LARGE_PART_BYTES = 32 << 30, 64 << 20  # S3 takes 10 000 parts: so they are enough for 400 GiB
+
+
+class Upload:
+    """One object under its temporary key; nothing of it can be seen before `complete`."""
+
+    def __init__(self, path: UPath, name: str) -> None:
+        self.path, self.temporary = path, path.with_name(name)
+        self.size, self.seal = 0, ""
+        self.file: Any = None
+
+    def open(self) -> None:
+        """Begins; most stores notice at the first part."""
+        self.file = self.temporary.fs.open(self.temporary.path, "wb", block_size=PART_BYTES)
+
+    def write(self, data: bytes | bytearray | memoryview) -> None:
+        """Takes in bytes, and sends a part whenever there is one."""
+        if self.size >= LARGE_AFTER:
+            self.file.blocksize = LARGE_PART_BYTES
+        self.file.write(data)
+        self.size += len(data)
+
+    def copy(self, source: Source, start: int, end: int) -> int:
+        """Nothing: a part of one object is not asked for as a part of another here."""
+        return start
+
+    def complete(self) -> None:
+        """Sends the last part: the object is then there under its temporary key. Does nothing when it is there already."""
+        if not self.file.closed:
+            self.file.close()
+            self.seal = self._seal(self.temporary)
+
+    def publish(self) -> None:
+        """Copies the object to its own key, within the store, and removes the temporary one.
+
+        Raises:
+            ConfigError: the store holds something else than what was written.
+        """
+        if self._seal(self.temporary) != self.seal:
+            raise ConfigError("was changed by somebody while it was written", where=self.temporary)
+        with self._no_parts_left():
+            self.path.fs.cp_file(self.temporary.path, self.path.path)
+        self._seal(self.path)
+        try:
+            self.path.fs.rm_file(self.temporary.path)
+        except Exception as error:  # the object is in its place, and whole: that is what was asked for  # noqa: BLE001
+            logger.warning("%s could not be removed: %s", self.temporary, reason(error))
+
+    @contextmanager
+    def _no_parts_left(self) -> Iterator[None]:
+        """S3 copies large objects in parts, and s3fs leaves those of a copy that fails lying there: they are aborted here."""
+        before = self._uploads()
+        try:
+            yield
+        except BaseException:
+            with suppress(Exception):  # one thing after another can fail; the first is what is said
+                for upload in self._uploads() - before:  # the others are somebody else's
+                    self.path.fs.abort_mpu(*upload)
+            raise
+
+    def _uploads(self) -> set[tuple[str, str, str]]:
+        """Bucket, key and id of every unfinished upload to the target's key, in stores that tell."""
+        bucket, _, key = self.path.path.partition("/")
+        with suppress(Exception):  # no such call, or not allowed
+            found = self.path.fs.list_multipart_uploads(bucket)
+            return {(bucket, key, entry["UploadId"]) for entry in found if entry["Key"] == key}
+        return set()
+
+    def _seal(self, place: UPath) -> str:
+        """What identifies the contents of an object that must be as long as what was written."""
+        info: dict[str, Any] = place.fs.info(place.path)
+        if info["size"] != self.size:
+            raise ConfigError(f"the store holds {info['size']} bytes", where=place, expected=str(self.size))
+        return str(info.get("ETag", ""))
+
+    def discard(self) -> None:
+        """Aborts the upload and removes the temporary object, as far as the store can be reached."""
+        if self.file is None:
+            return
+        with suppress(AttributeError):  # else the file would complete the upload when it is collected; some have no such way
+            self.file.closed = True
+        with suppress(Exception):
+            self.file.discard()
+        with suppress(Exception):  # it is there if the upload was complete, or an answer was lost on its way
+            self.temporary.fs.rm_file(self.temporary.path)

@@ -1,0 +1,274 @@
+"""A log being written: definitions first, then chunks as they come, and a summary that indexes everything."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, field
+from types import TracebackType
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Int64, UInt16
+from mcap.opcode import Opcode
+from mcap.records import (
+    AttachmentIndex,
+    Channel,
+    ChunkIndex,
+    DataEnd,
+    Footer,
+    Header,
+    McapRecord,
+    Metadata,
+    MetadataIndex,
+    Schema,
+    Statistics,
+    SummaryOffset,
+)
+
+import imutool
+from imutool.errors import DataError
+from imutool.location import Place
+from imutool.mcap_io.codec import records
+from imutool.mcap_io.codec import schemas as schema
+from imutool.mcap_io.codec.chunk_index import ChunkIndexes
+from imutool.mcap_io.codec.records import FOOTER_SIZE, MAGIC
+from imutool.mcap_io.storage.target import Target
+
+LARGEST_ID = 2**16 - 1  # of a channel or a schema
+
+_FOREVER = "{sec: 9223372036, nsec: 854775807}"
+QOS = (
+    "- history: keep_last\n  depth: 10\n  reliability: reliable\n  durability: volatile\n"
+    f"  deadline: {_FOREVER}\n  lifespan: {_FOREVER}\n  liveliness: automatic\n"
+    f"  liveliness_lease_duration: {_FOREVER}\n  avoid_ros_namespace_conventions: false\n"
+)
+
+
+class Chunk(NamedTuple):
+    """Message records in log-time order, and what an index must know of each."""
+
+    data: bytes
+    channels: UInt16[np.ndarray, " n"]
+    times: Int64[np.ndarray, " n"]
+    offsets: Int64[np.ndarray, " n"]
+
+    @property
+    def start_ns(self) -> int:
+        """The earliest log time."""
+        return int(self.times.min())
+
+
+@dataclass
+class Contents:
+    """What the summary of a log says, collected while its data section is written."""
+
+    schemas: dict[int, Schema] = field(default_factory=dict)
+    channels: dict[int, Channel] = field(default_factory=dict)
+    chunks: ChunkIndexes = field(default_factory=ChunkIndexes)
+    attachments: list[AttachmentIndex] = field(default_factory=list)
+    metadata: list[MetadataIndex] = field(default_factory=list)
+    counts: Counter[int] = field(default_factory=Counter)
+    start_ns: int | None = None
+    end_ns: int = 0
+
+    def add(self, counts: Mapping[int, int], start_ns: int, end_ns: int) -> None:
+        """Counts the messages of a chunk."""
+        for channel, count in counts.items():  # `update` takes five times as long for the few there are
+            self.counts[channel] += count
+        self.start_ns = start_ns if self.start_ns is None else min(self.start_ns, start_ns)
+        self.end_ns = max(self.end_ns, end_ns)
+
+    def statistics(self) -> Statistics:
+        """The Statistics record."""
+        return Statistics(
+            attachment_count=len(self.attachments),
+            channel_count=len(self.channels),
+            channel_message_counts=dict(sorted(self.counts.items())),
+            chunk_count=len(self.chunks),
+            message_count=self.counts.total(),
+            message_end_time=self.end_ns,
+            message_start_time=self.start_ns or 0,
+            metadata_count=len(self.metadata),
+            schema_count=len(self.schemas),
+        )
+
+    def groups(self) -> Iterator[tuple[Opcode, bytes | bytearray]]:
+        """The bytes of the summary section, its records grouped by opcode as the format demands."""
+        yield Opcode.SCHEMA, _built(self.schemas.values())
+        yield Opcode.CHANNEL, _built(self.channels.values())
+        yield Opcode.STATISTICS, _built([self.statistics()])
+        yield Opcode.CHUNK_INDEX, self.chunks.raw
+        yield Opcode.ATTACHMENT_INDEX, _built(self.attachments)
+        yield Opcode.METADATA_INDEX, _built(self.metadata)
+
+
+def _built(group: Iterable[McapRecord]) -> bytes:
+    return b"".join(records.build(record) for record in group)
+
+
+class LogWriter:
+    """A log being written, as a context manager: complete and in its place on leaving, or gone after any error.
+
+    Without `data_crc` the log states no CRC of its data section, and bytes may pass into it that nobody has looked at.
+
+    Raises:
+        ConfigError: the target exists (without `overwrite`) or cannot be written, or an unknown compression.
+    """
+
+    def __init__(
+        self,
+        path: Place,
+        *,
+        compression: str = "zstd",
+        overwrite: bool = False,
+        header: bytes | None = None,
+        data_crc: bool = True,
+    ) -> None:
+        self.compression = records.COMPRESSIONS.get(compression, compression)
+        records.pack(compression)
+        self.contents, self.finished = Contents(), False
+        self.written: set[int] = set()  # schemas
+        self.target = Target(path, overwrite=overwrite, summing=data_crc)
+        try:
+            own = records.build(Header(profile="ros2", library=f"imutool {imutool.__version__}"))
+            self.target.write(MAGIC + (own if header is None else header))
+        except BaseException:
+            self.target.abandon()
+            raise
+
+    def __enter__(self) -> LogWriter:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+        if kind is not None:
+            self.target.abandon()
+            return
+        try:
+            self.finish()
+        except BaseException:
+            self.target.abandon()
+            raise
+        self.target.commit()
+
+    def channel(self, topic: str, schema_name: str, metadata: Mapping[str, str] | None = None) -> int:
+        """Defines a topic (and its schema, once), and returns its channel id, the largest there is plus one.
+
+        Raises:
+            DataError: the topic is defined already, or no id is left.
+        """
+        if any(channel.topic == topic for channel in self.contents.channels.values()):
+            raise DataError(f"two channels would be written to {topic}", expected="one topic each")
+        described = {"offered_qos_profiles": QOS, "topic_type_hash": schema.TYPE_HASHES[schema_name]}
+        record = Channel(
+            id=_next(self.contents.channels, "channel"),
+            topic=topic,
+            message_encoding="cdr",
+            metadata=described | dict(metadata or {}),
+            schema_id=self._schema(schema_name),
+        )
+        self.contents.channels[record.id] = record
+        self.target.write(records.build(record))
+        return record.id
+
+    def _schema(self, schema_name: str) -> int:
+        """The id of a schema: that of one with the same definition (comments aside), or a new one."""
+        text = schema.definition(schema_name)
+        for known in self.contents.schemas.values():
+            if known.name == schema_name and known.encoding == "ros2msg" and _bare(known.data) == _bare(text.encode()):
+                self._write_schema(known)  # once more: so far it may stand in a later chunk only
+                return int(known.id)
+        record = Schema(id=_next(self.contents.schemas, "schema"), name=schema_name, encoding="ros2msg", data=text.encode())
+        self.contents.schemas[record.id] = record
+        self._write_schema(record)
+        return record.id
+
+    def _write_schema(self, record: Schema) -> None:
+        if record.id not in self.written:
+            self.written.add(record.id)
+            self.target.write(records.build(record))
+
+    def metadata(self, name: str, values: Mapping[str, str]) -> None:
+        """Writes a metadata record."""
+        raw = records.build(Metadata(name=name, metadata=dict(values)))
+        self.contents.metadata.append(MetadataIndex(offset=self.target.position, length=len(raw), name=name))
+        self.target.write(raw)
+
+    def chunk(self, chunk: Chunk, compression: str | None = None) -> None:
+        """Writes messages as one chunk, with their message indexes."""
+        name = self.compression if compression is None else records.COMPRESSIONS.get(compression, compression)
+        packed = records.pack(name)(chunk.data)
+        start_ns, end_ns = chunk.start_ns, int(chunk.times.max())
+        head = records.chunk_head(chunk.data, packed, name, start_ns, end_ns)
+        offset = self.target.position
+        self.target.write(head)
+        self.target.write(packed)
+        self.index(
+            ChunkIndex(
+                chunk_length=len(head) + len(packed),
+                chunk_start_offset=offset,
+                compression=name,
+                compressed_size=len(packed),
+                message_end_time=end_ns,
+                message_index_length=0,
+                message_index_offsets={},
+                message_start_time=start_ns,
+                uncompressed_size=len(chunk.data),
+            ),
+            chunk.channels,
+            chunk.times,
+            chunk.offsets,
+        )
+
+    def index(
+        self,
+        entry: ChunkIndex,
+        channels: UInt16[np.ndarray, " n"],
+        times: Int64[np.ndarray, " n"],
+        offsets: Int64[np.ndarray, " n"],
+    ) -> None:
+        """Writes the message indexes of the chunk just written, and enters it in the summary."""
+        first, counts = self.target.position, {}
+        for channel in np.unique(channels).tolist():
+            mask = channels == channel
+            counts[channel] = int(mask.sum())
+            entry.message_index_offsets[channel] = self.target.position
+            self.target.write(records.message_index(channel, times[mask], offsets[mask]))
+        entry.message_index_length = self.target.position - first
+        self.contents.chunks.append(entry)
+        if counts:
+            self.contents.add(counts, int(times.min()), int(times.max()))
+
+    def finish(self) -> None:
+        """Ends the data section and writes the summary; the file is then complete under its temporary name."""
+        if self.finished:
+            return
+        self.finished = True
+        self.target.write(records.build(DataEnd(data_section_crc=self.target.crc)))
+        start, offsets = self.target.position, b""
+        self.target.summing, self.target.crc = True, 0  # from here on it is the summary's
+        for opcode, raw in self.contents.groups():
+            if raw:
+                at = self.target.position
+                offsets += records.build(SummaryOffset(group_opcode=opcode, group_start=at, group_length=len(raw)))
+            self.target.write(raw)
+        footer = Footer(summary_start=start, summary_offset_start=self.target.position, summary_crc=0)
+        self.target.write(offsets)
+        self.target.write(records.build(footer)[: FOOTER_SIZE - 4])
+        footer.summary_crc = self.target.crc
+        self.target.write(records.build(footer)[-4:] + MAGIC)
+        self.target.flush()
+
+
+def _next(taken: Mapping[int, object], what: str) -> int:
+    """The largest id plus one, which keeps all ids there are."""
+    largest = max(taken, default=0)
+    if largest >= LARGEST_ID:
+        raise DataError(f"a {what} has the id {largest}", expected=f"less than {LARGEST_ID}, so that one more has room")
+    return largest + 1
+
+
+def _bare(definition: bytes) -> list[bytes]:
+    """A message definition without comments, blank lines and spacing."""
+    lines = (b" ".join(line.partition(b"#")[0].split()) for line in definition.splitlines())
+    return [line for line in lines if line]

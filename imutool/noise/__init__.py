@@ -1,0 +1,1 @@
+"""Sensor noise: data sheets, Allan deviation, residuals against a reference."""

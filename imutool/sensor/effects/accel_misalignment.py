@@ -1,0 +1,31 @@
+"""Misalignment of the accelerometer's axes: off-diagonal 3x3 on f."""
+
+from __future__ import annotations
+
+from imutool.sensor.effect import Physics, Stage, Theta, each_pair, matrix
+from imutool.sensor.linear_effect import Effect, Sensor, off_diagonal, per_pair
+from imutool.sensor.readings import Read
+from imutool.sensor.signals import ACCEL
+
+SENSORS: tuple[Sensor, ...] = ("accel",)
+
+
+def effect(sensor: Sensor) -> Effect:
+    """m (-): seen where the attitude varies."""
+    pairs = per_pair("-", 0.05, diagonal=False)
+    return Effect("accel_misalignment", sensor, "accel += M f, diag M = 0", pairs, ACCEL, off_diagonal())
+
+
+def _forward(read: Read, m: Theta) -> Read:
+    return read.but(accel=read.accel + read.accel @ matrix(m).T)
+
+
+PHYSICS = Physics(
+    "accel_misalignment",
+    Stage.SENSOR,
+    SENSORS,
+    "accel += M f, diag M = 0",
+    each_pair("-", 0.05, diagonal=False),
+    "the attitude varies",
+    _forward,
+)

@@ -1,0 +1,30 @@
+"""Scale error of the accelerometer: f (1 + s), per axis."""
+
+from __future__ import annotations
+
+from imutool.sensor.effect import Physics, Stage, Theta, each_axis
+from imutool.sensor.linear_effect import Effect, Sensor, diagonal, per_axis
+from imutool.sensor.readings import Read
+from imutool.sensor.signals import ACCEL
+
+SENSORS: tuple[Sensor, ...] = ("accel",)
+
+
+def effect(sensor: Sensor) -> Effect:
+    """s (-): seen where the attitude varies; collinear with the bias otherwise."""
+    return Effect("accel_scale", sensor, "accel += s * f", per_axis("-", 0.1), ACCEL, diagonal())
+
+
+def _forward(read: Read, s: Theta) -> Read:
+    return read.but(accel=read.accel * (1.0 + s))
+
+
+PHYSICS = Physics(
+    "accel_scale",
+    Stage.SENSOR,
+    SENSORS,
+    "accel += s * f",
+    each_axis("-", 0.05),
+    "the attitude varies",
+    _forward,
+)

@@ -1,0 +1,38 @@
+"""Gravity of another size, or a world frame that stands askew of it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from imutool.recording import GRAVITY_M_S2
+from imutool.sensor.effect import Number, Physics, Stage, Theta, attitude
+from imutool.sensor.readings import Felt, Read
+
+
+def _forward(felt: Felt, theta: Theta) -> Felt:
+    """g_w = Exp(tilt_x, tilt_y, 0) (0, 0, -(g + dg)), so that the specific force changes by -R_wb^T times g_w's change."""
+    dg, tilt_x, tilt_y = theta.tolist()
+    up = Rotation.from_rotvec([tilt_x, tilt_y, 0.0]).apply([0.0, 0.0, 1.0])
+    more_w = (GRAVITY_M_S2 + dg) * up - np.array([0.0, 0.0, GRAVITY_M_S2])
+    return replace(felt, accel=felt.accel + np.einsum("nji,j->ni", attitude(felt, "gravity"), more_w))
+
+
+def _starts(_felt: Felt, _samples: Read) -> list[Theta]:
+    return [np.zeros(3)]
+
+
+PHYSICS = Physics(
+    "gravity",
+    Stage.MOTION,
+    ("accel",),
+    "accel -= R_wb^T (g_w - (0, 0, -g)), g_w = Exp(tilt) (0, 0, -(g + dg))",
+    (Number("magnitude", "m/s²", 0.05), Number("tilt_x", "rad", 0.05), Number("tilt_y", "rad", 0.05)),
+    "the attitude varies (against the bias)",
+    _forward,
+    linear=False,
+    starts=_starts,
+    needs=("attitude",),
+)

@@ -1,0 +1,16 @@
+"""Warm-up of the gyro: + A (1 - exp(-t/tau)), t from the log's start, tau one minute."""
+
+from __future__ import annotations
+
+from imutool.sensor import warm_up
+from imutool.sensor.linear_effect import Effect, Sensor
+
+SENSORS: tuple[Sensor, ...] = ("gyro",)
+
+
+def effect(sensor: Sensor) -> Effect:
+    """A (rad/s): seen where the log is longer than tau, and every log begins with a cold sensor."""
+    return warm_up.closed_form(sensor, "rad/s", 2e-3)
+
+
+PHYSICS = warm_up.physics("gyro", "rad/s", 0.02)

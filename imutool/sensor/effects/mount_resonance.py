@@ -1,0 +1,54 @@
+"""Resonance of a soft mount: the accelerometer feels the force through a spring and a damper, each axis to its own share."""
+
+from __future__ import annotations
+
+import cmath
+import math
+from dataclasses import replace
+
+import numpy as np
+
+from imutool.sensor.effect import Number, Physics, Stage, Theta, each_axis
+from imutool.sensor.filters import OMEGA, filtered
+from imutool.sensor.readings import Felt, Read
+
+START_HZ = (4.0, 8.0, 15.0, 30.0, 50.0)
+
+
+def _forward(felt: Felt, theta: Theta) -> Felt:
+    """f0 (Hz), zeta, share per axis: f + share (H f - f), H(s) = (2 zeta w0 s + w0²) / (s² + 2 zeta w0 s + w0²).
+
+    H is what a mass on a spring and a damper feels of its base's acceleration; it starts in the steady state.
+    """
+    share = theta[2:]
+    if not share.any():
+        return felt
+    zeta = float(theta[1])
+    a = 2.0 * math.pi * float(theta[0]) / felt.rate_hz  # rad a sample
+    pole = cmath.exp(a * (-zeta + cmath.sqrt(zeta**2 - 1.0)))
+    other = cmath.exp(a * (-zeta - cmath.sqrt(zeta**2 - 1.0)))
+    denominator = np.array([1.0, -(pole + other).real, (pole * other).real])
+    s = 1j * OMEGA
+    through = (2.0 * zeta * a * s + a**2) / (s**2 + 2.0 * zeta * a * s + a**2)
+    return replace(felt, accel=felt.accel + share * (filtered(felt.accel, through, denominator) - felt.accel))
+
+
+def _starts(_felt: Felt, _samples: Read) -> list[Theta]:
+    return [np.array([hz, 0.1, 0.5, 0.5, 0.5]) for hz in START_HZ]
+
+
+PHYSICS = Physics(
+    "mount_resonance",
+    Stage.MOUNT,
+    ("accel",),
+    "accel += share * (H f - f), H = (2 zeta w0 s + w0^2) / (s^2 + 2 zeta w0 s + w0^2), w0 = 2 pi f0",
+    (
+        Number("f0", "Hz", 20.0, positive=True, nothing=20.0),
+        Number("zeta", "-", 0.2, positive=True, nothing=0.2),
+        *each_axis("-", 1.0, "share_"),
+    ),
+    "motion or shocks excite it",
+    _forward,
+    linear=False,
+    starts=_starts,
+)

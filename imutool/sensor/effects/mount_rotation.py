@@ -1,0 +1,34 @@
+"""Rotation of the mount: the sensor's axes against the body's, the same for gyro and accelerometer."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from imutool.sensor.effect import Number, Physics, Stage, Theta
+from imutool.sensor.readings import Felt, Read
+
+
+def _forward(felt: Felt, phi: Theta) -> Felt:
+    """R_bi = Exp(phi) takes the sensor's vectors to the body; R_wb stays the body's attitude."""
+    R_bi = Rotation.from_rotvec(phi).as_matrix()
+    return replace(felt, gyro=felt.gyro @ R_bi, accel=felt.accel @ R_bi, alpha=felt.alpha @ R_bi)
+
+
+def _starts(_felt: Felt, _samples: Read) -> list[Theta]:
+    return [np.zeros(3)]
+
+
+PHYSICS = Physics(
+    "mount_rotation",
+    Stage.MOUNT,
+    ("gyro", "accel"),
+    "gyro = R_bi^T omega, accel = R_bi^T f, R_bi = Exp(phi)",
+    tuple(Number(f"phi_{axis}", "rad", 0.2) for axis in "xyz"),
+    "two axes turn, or one turns and gravity tilts",
+    _forward,
+    linear=False,
+    starts=_starts,
+)

@@ -1,0 +1,46 @@
+"""Quantization: readings are whole multiples of a least significant bit."""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Float64
+
+from imutool.sensor.effect import Number, Physics, Stage, Theta
+from imutool.sensor.readings import Felt, Read
+
+SAME = 1e-6  # of the largest reading: values no further apart are one value, told apart by rounding
+FINE = 1e-3  # of the smallest step is none
+
+
+def _forward(read: Read, lsb: Theta) -> Read:
+    gyro, accel = lsb.tolist()
+    return read.but(
+        np.rint(read.gyro / gyro) * gyro if gyro else None,
+        np.rint(read.accel / accel) * accel if accel else None,
+    )
+
+
+def _smallest_step(values: Float64[np.ndarray, "n 3"]) -> float:
+    """Between distinct values of one axis; where every axis reads one value all along, a step too small to be one."""
+    least = max(SAME * float(np.abs(values).max()), np.finfo(np.float64).tiny)
+    steps = np.diff(np.sort(values, axis=0), axis=0)
+    return float(steps[steps > least].min(initial=np.inf)) if (steps > least).any() else least
+
+
+def _starts(_felt: Felt, samples: Read) -> list[Theta]:
+    """One sensor in steps, the other, both."""
+    gyro, accel = _smallest_step(samples.gyro), _smallest_step(samples.accel)
+    return [np.array(lsb) for lsb in ((gyro, FINE * accel), (FINE * gyro, accel), (gyro, accel))]
+
+
+PHYSICS = Physics(
+    "quantization",
+    Stage.CONVERTER,
+    ("gyro", "accel"),
+    "gyro = LSB round(gyro / LSB), and likewise accel",
+    (Number("gyro_lsb", "rad/s", 1e-2, positive=True), Number("accel_lsb", "m/s²", 5e-2, positive=True)),
+    "the least significant bit exceeds the noise",
+    _forward,
+    linear=False,
+    starts=_starts,
+)

@@ -1,0 +1,69 @@
+"""A smooth curve of each axis's own rate, for a gyro that no named effect describes: + c(omega) + d(omega, filtered).
+
+Piecewise linear between knots that lie closer near zero, where cheap gyros have dead bands and signs; zero at zero, so that the
+rest bias stays what the sensor reads at rest. The second curve sees the rate through a filter of 0.1 s, for sensors whose
+correction lags their motion.
+"""
+
+from __future__ import annotations
+
+from bisect import bisect_right
+
+import numpy as np
+from jaxtyping import Float64
+
+from imutool.sensor.linear_effect import AXES, AtWork, Effect, Parameter, Sensor, Three
+from imutool.sensor.signals import GYRO, GYRO_SLOW, Signals
+
+SENSORS: tuple[Sensor, ...] = ("gyro",)
+POSITIVE_RAD_S = (0.03, 0.1, 0.25, 0.5, 1.0, 2.0, 4.0)
+KNOTS_RAD_S = np.array([*(-k for k in reversed(POSITIVE_RAD_S)), 0.0, *POSITIVE_RAD_S])
+NONZERO = KNOTS_RAD_S != 0.0
+
+
+def hats(x: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n q"]:
+    """The tent functions of all knots but zero, axis by axis; beyond the last knot they stay what they are there."""
+    inside = np.clip(x, KNOTS_RAD_S[0], KNOTS_RAD_S[-1])
+    j = np.clip(np.searchsorted(KNOTS_RAD_S, inside, side="right") - 1, 0, len(KNOTS_RAD_S) - 2)
+    weight = (inside - KNOTS_RAD_S[j]) / (KNOTS_RAD_S[j + 1] - KNOTS_RAD_S[j])
+    out = np.zeros((len(x), 3, len(KNOTS_RAD_S)))
+    np.put_along_axis(out, j[..., None], (1.0 - weight)[..., None], axis=2)
+    np.put_along_axis(out, j[..., None] + 1, weight[..., None], axis=2)
+    return out[:, :, NONZERO].reshape(len(x), -1)
+
+
+def _terms(signals: Signals) -> Float64[np.ndarray, "n q"]:
+    return np.concatenate([hats(signals.gyro), hats(signals.gyro_slow)], axis=1)
+
+
+def _at_work(theta: Float64[np.ndarray, " p"]) -> AtWork:
+    """The curves by interpolation; for one sample as a line looked up."""
+    values = np.zeros((2, 3, len(KNOTS_RAD_S)))
+    values[:, :, NONZERO] = theta.reshape(2, 3, -1)
+    slope = np.pad(np.diff(values) / np.diff(KNOTS_RAD_S), ((0, 0), (0, 0), (1, 1)))  # level beyond the last knots
+    at_zero = np.pad(values, ((0, 0), (0, 0), (1, 0)), mode="edge") - slope * np.pad(KNOTS_RAD_S, (1, 0), mode="edge")
+    knots, lines = KNOTS_RAD_S.tolist(), np.stack([at_zero, slope], axis=-1).reshape(6, -1, 2).tolist()
+
+    def one(_: float, row: list[float]) -> Three:
+        seen = zip(lines, row[GYRO] + row[GYRO_SLOW], strict=True)
+        e = [(segment := line[bisect_right(knots, x)])[0] + segment[1] * x for line, x in seen]
+        return e[0] + e[3], e[1] + e[4], e[2] + e[5]
+
+    def block(signals: Signals) -> Float64[np.ndarray, "n 3"]:
+        columns = zip((*signals.gyro.T, *signals.gyro_slow.T), values.reshape(6, -1), strict=True)
+        both = [np.interp(x, KNOTS_RAD_S, value) for x, value in columns]
+        return np.stack([a + b for a, b in zip(both[:3], both[3:], strict=True)], axis=1)
+
+    return AtWork(block, one)
+
+
+def effect(sensor: Sensor) -> Effect:
+    """Values at the knots (rad/s): seen where the axis turns at that rate."""
+    knots = KNOTS_RAD_S[NONZERO]
+    names = [f"{kind}{axis}{knot:+g}" for kind in ("", "slow_") for axis in AXES for knot in knots]
+    parameters = tuple(Parameter(name, "rad/s", 0.01) for name in names)
+    count = len(parameters)
+    pattern = np.zeros((3, count, count))
+    for index in range(count):
+        pattern[index // len(knots) % 3, index, index] = 1.0
+    return Effect("rate_curve", sensor, "gyro += c(omega) + d(omega filtered)", parameters, _terms, pattern, _at_work)

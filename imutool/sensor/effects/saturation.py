@@ -1,0 +1,41 @@
+"""Saturation: readings are clipped at a limit."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from imutool.sensor.effect import Number, Physics, Stage, Theta
+from imutool.sensor.readings import Felt, Read
+
+NEVER = 100.0  # times the largest reading is not reached
+
+
+def _forward(read: Read, limit: Theta) -> Read:
+    gyro, accel = (None if math.isinf(most) else most for most in limit.tolist())
+    return read.but(
+        None if gyro is None else np.clip(read.gyro, -gyro, gyro), None if accel is None else np.clip(read.accel, -accel, accel)
+    )
+
+
+def _starts(_felt: Felt, samples: Read) -> list[Theta]:
+    """One sensor limited, the other, both: at the largest reading, which is the limit wherever one is reached."""
+    gyro, accel = (float(np.abs(values).max()) or 1.0 for values in (samples.gyro, samples.accel))
+    return [np.array(limit) for limit in ((gyro, NEVER * accel), (NEVER * gyro, accel), (gyro, accel))]
+
+
+PHYSICS = Physics(
+    "saturation",
+    Stage.CONVERTER,
+    ("gyro", "accel"),
+    "gyro = clip(gyro, -L, L), accel = clip(accel, -K, K)",
+    (
+        Number("gyro_limit", "rad/s", 10.0, positive=True, nothing=math.inf),
+        Number("accel_limit", "m/s²", 80.0, positive=True, nothing=math.inf),
+    ),
+    "the limit is reached",
+    _forward,
+    linear=False,
+    starts=_starts,
+)

@@ -1,0 +1,33 @@
+"""Temperature: biases that follow a temperature channel of the log."""
+
+from __future__ import annotations
+
+from imutool.errors import DataError
+from imutool.sensor.effect import Physics, Stage, Theta, each_axis
+from imutool.sensor.readings import Read
+
+
+def _forward(read: Read, k: Theta) -> Read:
+    """k of the gyro, then of the accelerometer; T0 is the channel's mean. With several such channels: the first by name.
+
+    Raises:
+        DataError: no channel with a temperature in its name.
+    """
+    names = sorted(name for name in read.channels if "temperature" in name.lower())
+    if not names:
+        raise DataError("no temperature channel", where="temperature", expected="a channel with temperature in its name")
+    T = read.channels[names[0]]
+    warmer = (T - T.mean())[:, None]
+    return read.but(read.gyro + warmer * k[:3], read.accel + warmer * k[3:])
+
+
+PHYSICS = Physics(
+    "temperature",
+    Stage.SENSOR,
+    ("gyro", "accel"),
+    "gyro += k (T - T0), accel += l (T - T0)",
+    each_axis("rad/s per K", 1e-3, "gyro_") + each_axis("m/s² per K", 1e-2, "accel_"),
+    "the temperature varies",
+    _forward,
+    needs=("temperature",),
+)

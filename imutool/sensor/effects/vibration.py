@@ -1,0 +1,73 @@
+"""Vibration: a line in the spectra of specific force and angular rate."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from jaxtyping import Float64
+from scipy.ndimage import median_filter
+from scipy.signal import periodogram
+
+from imutool.inertial.stationary import white_noise
+from imutool.sensor.effect import Number, Physics, Stage, Theta, misfit
+from imutool.sensor.readings import Felt, Read
+
+LINES = 3  # starts: the strongest lines of the misfit
+FINER = 4  # times as many frequencies as samples tell: the top of a peak lies between three of them
+ABOUT = 401  # frequencies whose median tells what a line stands out from
+
+
+def _waves(t_s: Float64[np.ndarray, " n"], f_hz: float) -> Float64[np.ndarray, "n 2"]:
+    phase = 2.0 * np.pi * f_hz * t_s
+    return np.stack([np.sin(phase), np.cos(phase)], axis=1)
+
+
+def _forward(felt: Felt, theta: Theta) -> Felt:
+    """f (Hz), then the amplitudes of sine and cosine of each axis, accel (m/s²), gyro (rad/s); t on the motion's clock."""
+    waves = _waves(felt.t_s, float(theta[0])) @ theta[1:].reshape(6, 2).T
+    return replace(felt, accel=felt.accel + waves[:, :3], gyro=felt.gyro + waves[:, 3:])
+
+
+def _starts(felt: Felt, samples: Read) -> list[Theta]:
+    """The lines that stand out most from the spectrum of what is read more, with their amplitudes."""
+    gyro, accel = misfit(felt, samples)
+    error, t_s = np.concatenate([accel, gyro], axis=1), samples.stamp_s
+    error = error - error.mean(axis=0)
+    noise = white_noise(error)
+    rate_hz = (len(t_s) - 1) / (t_s[-1] - t_s[0])
+    f_hz, each = periodogram(error, rate_hz, "hann", nfft=FINER * len(t_s), axis=0)
+    level = np.log((each / np.maximum(noise, np.finfo(np.float64).tiny) ** 2).sum(axis=1) + np.finfo(np.float64).tiny)
+    out = level - median_filter(level, min(ABOUT, len(level)))
+    peaks = 1 + np.flatnonzero((out[1:-1] >= out[:-2]) & (out[1:-1] >= out[2:]))
+    starts = []
+    for peak in peaks[np.argsort(out[peaks])[::-1][:LINES]]:
+        line_hz = _top(f_hz, level, int(peak))
+        amplitudes = np.linalg.lstsq(_waves(t_s, line_hz), error, rcond=None)[0]
+        starts.append(np.concatenate([[line_hz], amplitudes.T.ravel()]))
+    return starts
+
+
+def _top(f_hz: Float64[np.ndarray, " n"], level: Float64[np.ndarray, " n"], peak: int) -> float:
+    """Of the parabola through a peak and its neighbours: a line under Hann's window is one in its logarithm, nearly."""
+    before, at, after = level[peak - 1 : peak + 2]
+    bend = before - 2.0 * at + after
+    return float(f_hz[peak] + (0.5 * (before - after) / bend if bend else 0.0) * f_hz[1])
+
+
+PHYSICS = Physics(
+    "vibration",
+    Stage.MOTION,
+    ("gyro", "accel"),
+    "accel, gyro += s sin(2 pi f t) + c cos(2 pi f t)",
+    (
+        Number("f", "Hz", 50.0, positive=True, nothing=50.0, step=1e-7),  # 90 s of 50 Hz turn the phase by 3e-3 rad
+        *(Number(f"accel_{of}_{axis}", "m/s²", 0.5) for axis in "xyz" for of in ("sin", "cos")),
+        *(Number(f"gyro_{of}_{axis}", "rad/s", 0.05) for axis in "xyz" for of in ("sin", "cos")),
+    ),
+    "the line stands above the noise",
+    _forward,
+    linear=False,
+    starts=_starts,
+    alternatives=lambda samples: len(samples.stamp_s) // 2,  # frequencies that samples tell apart
+)

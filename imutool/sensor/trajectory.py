@@ -1,0 +1,278 @@
+"""The motion behind measured poses: splines smoothed as their noise asks, where they can be trusted, and what a body feels.
+
+Poses of motion capture or of an estimator are noisy (0.1 to 5 mm, 0.05 to 0.5 degrees), have holes, glitches and steps, and
+are differentiated twice here. So: no curve across a hole; steps of the position (an estimator that takes in a fix) are
+levelled and let back in over seconds; glitches lose their weight; how smooth the curve is, the samples say themselves
+(`penalised_spline`); and the ends, where a derivative hangs on one side alone, are left out.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from jaxtyping import Bool, Float, Float64, Int64
+from scipy.ndimage import median_filter, percentile_filter
+
+from imutool.errors import ConfigError, DataError
+from imutool.inertial.kinematics import G_W, Trajectory, continuous
+from imutool.recording import GRAVITY_M_S2, Poses, seconds
+from imutool.sensor.readings import Felt
+from imutool.sensor.smoothing import Penalised, Samples
+
+MAX_GAP_S = 0.1  # a longer hole ends a stretch: nothing is invented across it
+KNOT_PERIODS = 2.0  # between knots: half the poses' own bandwidth, which noise never leaves
+LEAST_KNOT_S = 1e-3  # also where stamps come in bursts
+MOST_KNOT_S = 0.02  # but for slow poses a knot each: 25 Hz is what a body moves with
+LEAST_POSES = 25
+LEAST_S = 0.5  # a shorter stretch is all ends
+PASSES = 4  # fits, each with the weights of the one before
+FIRST_CUTOFF_HZ = 12.0  # of the first pass: higher, it would follow the glitches that it is to find
+HUMP = 3.0  # residuals of this many sigmas count half; of GLITCH they are dropped
+GLITCH = 8.0
+ANGLE = 2.0 * np.sqrt(4.0 / 3.0)  # a unit quaternion errs by half the angle, in three of its four coordinates
+WEIGHED = (
+    0.8196  # square root of the mean of r² / 3 / (1 + r² / 9) for three unit normal numbers: weights make noise look smaller
+)
+USUAL_S = 2.0  # time that says what residual is usual: poses err more in motion (their stamps) than at rest
+USUAL_PERCENTILE = 75.0  # of it: a motion that begins is no glitch, and a quarter of a second in two may be one
+USUAL_NORM = 2.0269  # that percentile of the length of three unit normal numbers; a unit quaternion, too, errs in three
+LEAST_NOISE = 3e-6  # m, or half of rad: what is less is rounding, and nothing a glitch beside it
+END_WORSE = 1.15  # where a derivative's standard deviation is this many times that amid the data, it is an end
+END_KNOTS = 5  # and no less: as far as a basis function at the end reaches, and a time constant of the smoothing
+LEAST_GYRO, LEAST_ACCEL = 1e-5, 1e-4  # rad/s (half), m/s²: exact poses have no ends worth leaving out
+STEP = 10.0  # median sizes by which a sample's step must differ from its neighbours'
+STEP_WINDOW = 10  # samples on either side that say how large a step is
+STEP_SMOOTH_HZ = 0.15  # the levelled steps come back this slowly: a centimetre adds 0.01 m/s²
+GLITCH_SAMPLES, NOT_BACK = 4, 0.3  # steps so close together that leave less than this share of the largest are a glitch
+EXPLAINED = 0.3  # of what is odd about it must be left, or it is no step
+LOCAL = 101  # samples whose median says what size is usual
+MOST_STEPS = 0.1  # of the samples; more are no steps but noise
+MAX_RATE_HZ = 100_000.0
+
+Times = Float64[np.ndarray, " n"]
+Values = Float64[np.ndarray, "n d"]
+
+
+@dataclass(frozen=True, eq=False)
+class Stretch:
+    """A stretch of motion without a hole, trusted from `start_s` to `end_s` (s from the first pose).
+
+    noise_m, noise_rad: standard deviation of a pose by coordinate. cutoff_hz: where smoothing halves a motion, of position and
+    rotation. gyro_std (rad/s), accel_std (m/s²): of what is felt, by axis, as far as noise and smoothing explain it.
+    """
+
+    trajectory: Trajectory
+    start_s: float
+    end_s: float
+    noise_m: float
+    noise_rad: float
+    cutoff_hz: tuple[float, float]
+    gyro_std: float
+    accel_std: float
+
+    @property
+    def duration_s(self) -> float:
+        """Trusted time."""
+        return self.end_s - self.start_s
+
+
+@dataclass(frozen=True, eq=False)
+class Smoothed:
+    """The stretches of a motion, time counted from `start_ns`; poses dropped as glitches, and steps that were levelled."""
+
+    start_ns: int
+    stretches: tuple[Stretch, ...]
+    glitches: int
+    steps: int
+
+    @property
+    def duration_s(self) -> float:
+        """Trusted time, all stretches together."""
+        return sum(stretch.duration_s for stretch in self.stretches)
+
+    @property
+    def gyro_std(self) -> float:
+        """Root mean square over the trusted time (rad/s, by axis)."""
+        return self._mean([stretch.gyro_std for stretch in self.stretches])
+
+    @property
+    def accel_std(self) -> float:
+        """Root mean square over the trusted time (m/s², by axis)."""
+        return self._mean([stretch.accel_std for stretch in self.stretches])
+
+    def _mean(self, std: list[float]) -> float:
+        return float(np.sqrt(np.average(np.square(std), weights=[stretch.duration_s for stretch in self.stretches])))
+
+    def covers(self, t_ns: Int64[np.ndarray, " n"]) -> Bool[np.ndarray, " n"]:
+        """Which instants lie in a trusted stretch."""
+        t_s = seconds(t_ns, self.start_ns)
+        return np.asarray(np.any([(t_s >= one.start_s) & (t_s <= one.end_s) for one in self.stretches], axis=0))
+
+    def felt(self, rate_hz: float, g_w: Float[np.ndarray, "3"] = G_W) -> list[Felt]:
+        """What the tracked point feels in each stretch, on the even clock k / rate of seconds from `start_ns`.
+
+        A stretch too short for four samples of that clock is left out.
+
+        Raises:
+            ConfigError: a rate that is not above 0 and up to 100 kHz.
+        """
+        if not 0.0 < rate_hz <= MAX_RATE_HZ:
+            raise ConfigError(f"a rate of {rate_hz:g} Hz", where="rate", expected=f"above 0, up to {MAX_RATE_HZ:g} Hz")
+        found = []
+        for stretch in self.stretches:
+            first, last = int(np.ceil(stretch.start_s * rate_hz)), int(np.floor(stretch.end_s * rate_hz))
+            if last - first >= 3:
+                found.append(self._felt(stretch, np.arange(first, last + 1) / rate_hz, g_w))
+        return found
+
+    def _felt(self, stretch: Stretch, t_s: Times, g_w: Float[np.ndarray, "3"]) -> Felt:
+        from scipy.spatial.transform import Rotation
+
+        motion = stretch.trajectory.at(self.start_ns + np.round(t_s * 1e9).astype(np.int64))
+        R_wb = Rotation.from_quat(motion.q_wb_wxyz, scalar_first=True).as_matrix()
+        return Felt(t_s, motion.omega_b, motion.specific_force(g_w=g_w), motion.alpha_b, np.ascontiguousarray(R_wb))
+
+
+def smooth_motion(poses: Poses) -> Smoothed:
+    """The smooth motion behind some poses, and where it can be trusted.
+
+    Position and quaternion are quintic splines, so that rate, angular acceleration and specific force follow in closed form
+    (`kinematics.Trajectory`). A stretch ends at a hole of more than 0.1 s; glitches are dropped, and where that leaves such a
+    hole the stretch ends too. Trusted is what lies so far from its ends that the rate and the acceleration are as good
+    as amid the data, but for a seventh (on made-up flights the error there is measured at no more than half as much again).
+
+    Raises:
+        DataError: no stretch of at least half a second and 25 poses can be trusted.
+        NumericsError: stamps so uneven that no curve is defined.
+    """
+    t_s = seconds(poses.t_ns, int(poses.t_ns[0])) if len(poses) else np.zeros(0)
+    columns = (poses.p_wb, continuous(poses.q_wb_wxyz))
+    stretches: list[Stretch] = []
+    glitches, steps = 0, 0
+    waiting = [np.arange(a, b) for a, b in _unbroken(t_s)][::-1]
+    while waiting:
+        rows = waiting.pop()
+        if not _long_enough(t_s[rows]):
+            continue
+        position, count = _levelled(t_s[rows], columns[0][rows])
+        fits = [_robust(t_s[rows], y) for y in (position, columns[1][rows])]
+        sound = np.all([weights > 0.0 for _, weights in fits], axis=0)
+        if len(parts := _unbroken(t_s[rows][sound])) > 1:  # a glitch so long that it is a hole
+            kept = rows[sound]
+            waiting += [kept[a:b] for a, b in reversed(parts)]
+            glitches += int((~sound).sum())
+            continue
+        stretch = _stretch(int(poses.t_ns[0]), t_s[rows][sound], fits[0][0], fits[1][0])
+        if stretch.duration_s > 0.0:
+            stretches.append(stretch)
+            glitches, steps = glitches + int((~sound).sum()), steps + count
+    if not stretches:
+        raise DataError(
+            f"no stretch of the {len(poses)} poses can be differentiated",
+            expected=f"{LEAST_POSES} poses over {LEAST_S:g} s and more, without a hole of {MAX_GAP_S:g} s",
+        )
+    return Smoothed(int(poses.t_ns[0]), tuple(stretches), glitches, steps)
+
+
+def _unbroken(t_s: Times) -> list[tuple[int, int]]:
+    """Row ranges between holes."""
+    edges = np.flatnonzero(np.diff(t_s) > MAX_GAP_S) + 1
+    ends = [0, *edges.tolist(), len(t_s)]
+    return [(a, b) for a, b in pairwise(ends) if b > a]
+
+
+def _long_enough(t_s: Times) -> bool:
+    return len(t_s) >= LEAST_POSES and float(t_s[-1] - t_s[0]) >= LEAST_S
+
+
+def _robust(t_s: Times, y: Values) -> tuple[Penalised, Times]:
+    """A fit in which glitches count for little and gross ones for nothing, and the weights it ended with.
+
+    Weights 1 / (1 + (r / 3 sigma)²), those of heavy tails, so that a fit with a few wild samples still converges.
+    """
+    period_s = float(np.median(np.diff(t_s)))
+    knot_s = max(period_s, min(KNOT_PERIODS * period_s, MOST_KNOT_S), LEAST_KNOT_S)
+    weights, window = np.ones(len(t_s)), min(2 * round(0.5 * USUAL_S / period_s), len(t_s)) + 1
+    for turn in range(PASSES):
+        samples = Samples(t_s, y, weights, knot_s)
+        fit = samples.fit(min(FIRST_CUTOFF_HZ, samples.highest_hz) if turn == 0 else None)
+        size = np.linalg.norm(fit.residual(), axis=1)
+        local = percentile_filter(size, USUAL_PERCENTILE, window, mode="nearest")
+        usual = np.maximum(np.maximum(local, np.median(size)) / USUAL_NORM, LEAST_NOISE)
+        if turn < PASSES - 1:
+            weights = 1.0 / (1.0 + (size / (HUMP * usual)) ** 2)
+        if 0 < turn < PASSES - 1:  # the first fit, of a cut-off that nobody chose, condemns nobody
+            weights[size > GLITCH * usual] = 0.0
+    return fit, weights
+
+
+def _stretch(start_ns: int, t_s: Times, position: Penalised, rotation: Penalised) -> Stretch:
+    """The stretch and its trusted part."""
+    end_s = 0.0
+    for one, derivative, least in ((position, 2, LEAST_ACCEL), (rotation, 1, LEAST_GYRO)):
+        lag_s = 1.0 / (2.0 * np.pi * one.cutoff_hz) if one.std(derivative) > least else 0.0
+        end_s = max(end_s, one.end_s(derivative, END_WORSE, least), END_KNOTS * one.samples.knot_s + lag_s)
+    tilt = GRAVITY_M_S2 * ANGLE * rotation.std(0)
+    return Stretch(
+        trajectory=Trajectory(start_ns, position.spline, rotation.spline),
+        start_s=float(t_s[0]) + end_s,
+        end_s=float(t_s[-1]) - end_s,
+        noise_m=position.noise / WEIGHED,
+        noise_rad=ANGLE * rotation.noise / WEIGHED,
+        cutoff_hz=(position.cutoff_hz, rotation.cutoff_hz),
+        gyro_std=ANGLE * rotation.std(1),
+        accel_std=float(np.hypot(position.std(2), tilt)),
+    )
+
+
+def _levelled(t_s: Times, y: Values) -> tuple[Values, int]:
+    """Positions without the steps between one sample and the next, which come back slowly; and how many there were.
+
+    A step is a difference that its neighbours' (through a cubic) do not explain. How large it is says a line of third degree
+    with a step through the samples around it. Steps that soon go back are a glitch, and stay.
+    """
+    at = _steps(t_s, y)
+    if not len(at) or len(at) > MOST_STEPS * len(t_s):
+        return y, 0
+    jump = np.zeros_like(y)
+    runs = np.split(at, np.flatnonzero(np.diff(at) > GLITCH_SAMPLES) + 1)
+    for run in runs:
+        jump[run] = [_step_size(t_s, y, at, int(k)) for k in run]
+    odd, left = (np.linalg.norm(_odd(t_s, values), axis=1) for values in (y, y - np.cumsum(jump, axis=0)))
+    for run in runs:
+        back = np.linalg.norm(jump[run].sum(axis=0)) < NOT_BACK * np.linalg.norm(jump[run], axis=1).max()
+        near = slice(max(0, int(run[0]) - GLITCH_SAMPLES), int(run[-1]) + GLITCH_SAMPLES + 1)
+        if back or left[near].max() > EXPLAINED * odd[run].min():
+            jump[run] = 0.0
+    slow = Samples(t_s, np.cumsum(jump, axis=0), np.ones(len(t_s)), 0.25 / STEP_SMOOTH_HZ)
+    return y - slow.fit(STEP_SMOOTH_HZ).residual(), int(np.count_nonzero(jump.any(axis=1)))
+
+
+def _odd(t_s: Times, y: Values) -> Values:
+    """By how much each position differs from the one before, less what a cubic through its neighbours' differences says."""
+    dt = np.diff(t_s)[:, None]
+    v = np.diff(y, axis=0) / dt
+    odd = np.zeros_like(y)
+    odd[3:-2] = (v[2:-2] - (4.0 * (v[1:-3] + v[3:-1]) - (v[:-4] + v[4:])) / 6.0) * dt[2:-2]
+    return odd
+
+
+def _steps(t_s: Times, y: Values) -> Int64[np.ndarray, " s"]:
+    """Rows before which the position seems to step."""
+    odd = np.linalg.norm(_odd(t_s, y), axis=1)
+    usual = np.maximum(np.maximum(median_filter(odd, LOCAL, mode="nearest"), np.median(odd)), LEAST_NOISE)
+    around = np.max([np.roll(odd, shift) for shift in (-2, -1, 1, 2)], axis=0)
+    rows: Int64[np.ndarray, " s"] = np.flatnonzero((odd > STEP * usual) & (odd >= 0.9 * around))
+    return rows
+
+
+def _step_size(t_s: Times, y: Values, at: Int64[np.ndarray, " s"], k: int) -> Float64[np.ndarray, " d"]:
+    """By least squares over the samples around row k, together with the other steps among them."""
+    a, b = max(0, k - STEP_WINDOW), min(len(t_s), k + STEP_WINDOW)
+    t = (t_s[a:b] - t_s[k]) / (t_s[b - 1] - t_s[a])
+    near = [k, *[int(other) for other in at if a < other < b and other != k]]
+    columns = [t**power for power in range(4)] + [(np.arange(a, b) >= row).astype(np.float64) for row in near]
+    solution = np.linalg.lstsq(np.stack(columns, axis=1), y[a:b], rcond=None)[0]
+    return np.asarray(solution[4])

@@ -1,0 +1,97 @@
+"""A training set down between two steps, to be taken up again: tensors in safetensors, the rest in its JSON header."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from imutool.bias.io import read_tensors, write_tensors
+from imutool.bias.model import SENSORS
+from imutool.config import plain
+from imutool.errors import ConfigError, ModelError
+from imutool.training.fit import Stage, Training
+from imutool.training.loss import RobustLoss
+
+FORMAT = "imutool.training/2"
+
+
+def save(training: Training, path: Path) -> None:
+    """Everything the next step depends on, written beside and renamed.
+
+    Raises:
+        ConfigError: the file cannot be written.
+    """
+    tensors = {f"model.{name}": value for name, value in training.model.state_dict().items()}
+    tensors |= {"tracks": training.tracks.knots.detach(), "generator": training.generator.get_state()}
+    about: dict[str, Any] = {"identity": _identity(training), "done": training.done}
+    if stage := training.stage:
+        about["stage"] = {"sensor": stage.sensor, "step": stage.step, "before": stage.before}
+        tensors |= {f"closed_form.{name}": value for name, value in stage.closed_form.items()}
+        tensors |= {f"mean.{name}": value for name, value in stage.mean.state_dict().items()}
+        tensors |= {f"usual.{n}": value for n, value in stage.objective.loss.medians.items()}
+        for index, state in stage.optimizer.state_dict()["state"].items():
+            tensors |= {f"optimizer.{index}.{name}": value for name, value in state.items()}
+    # clones: safetensors refuses tensors that share memory, as a model and its best state may
+    copies = {name: value.detach().cpu().clone().contiguous() for name, value in tensors.items()}
+    write_tensors(copies, {"format": FORMAT, "about": json.dumps(about)}, path, overwrite=True)
+
+
+def restore(training: Training, path: Path) -> None:
+    """Puts a training where a checkpoint left it.
+
+    Raises:
+        ConfigError: the checkpoint is of other logs, another method or other settings.
+        ModelError: it is damaged.
+    """
+    tensors, header = read_tensors(path, FORMAT)
+    try:
+        about = json.loads(header["about"])
+        if about["identity"] != _identity(training):
+            raise ConfigError(
+                "the checkpoint belongs to other logs, another method or other settings",
+                where=path,
+                fix="Give the same command again, or remove the file to start afresh",
+            )
+        training.model.load_state_dict(_part(tensors, "model."))
+        with torch.no_grad():
+            training.tracks.knots.copy_(tensors["tracks"])
+        training.generator.set_state(tensors["generator"])
+        training.done = {sensor: float(about["done"][sensor]) for sensor in SENSORS if sensor in about["done"]}
+        if "stage" in about:
+            training.stage = _stage(training, about["stage"], tensors)
+    except (KeyError, ValueError, TypeError, AttributeError, RuntimeError) as error:
+        raise ModelError(f"is no whole checkpoint ({error})", where=path, fix="Remove it to start afresh") from error
+
+
+def _stage(training: Training, about: dict[str, Any], tensors: dict[str, Tensor]) -> Stage:
+    stage = training.begin(about["sensor"])
+    stage.mean.load_state_dict(_part(tensors, "mean."))
+    state: dict[int, dict[str, Tensor]] = {}
+    for name, value in _part(tensors, "optimizer.").items():
+        index, key = name.split(".", 1)
+        state.setdefault(int(index), {})[key] = value
+    groups = stage.optimizer.state_dict()["param_groups"]
+    stage.optimizer.load_state_dict({"state": state, "param_groups": groups})
+    device = training.pool.t.device
+    stage.objective.loss = RobustLoss({int(n): value.to(device) for n, value in _part(tensors, "usual.").items()})
+    stage.step, stage.before, stage.closed_form = int(about["step"]), float(about["before"]), _part(tensors, "closed_form.")
+    return stage
+
+
+def _part(tensors: dict[str, Tensor], prefix: str) -> dict[str, Tensor]:
+    return {name.removeprefix(prefix): value for name, value in tensors.items() if name.startswith(prefix)}
+
+
+def _identity(training: Training) -> dict[str, Any]:
+    """What must be the same for a checkpoint to go on: logs (by their samples), method, settings."""
+    pool = training.pool
+    return {
+        "logs": [[name, int((pool.log == i).sum())] for i, name in enumerate(pool.names)],
+        "gyro_sum": float(pool.gyro.sum()),
+        "method": training.model.method,
+        "settings": json.loads(json.dumps(plain(training.settings))),
+    }

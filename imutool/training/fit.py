@@ -1,0 +1,246 @@
+"""The training: a closed form to start from, then gradient descent, gyro first and the accelerometer on top of it.
+
+What a step descends on is the objective's to say (`imutool.training.objective`), and it mixes all logs. Beside the sensor's
+weights each log has a track of its own rest bias, free but slow, so that what belongs to a run cannot be mistaken for what
+belongs to the sensor. What is kept is the end of the descent, as a running mean over its last steps, which one step's draw of
+windows cannot throw off; or the closed form it started from, if that drifts less over the longest windows of the held-out
+part. A choice among many steps would be made by the noise of that part, which may be seconds long.
+"""
+
+from __future__ import annotations
+
+import copy
+import math
+import time
+from collections.abc import Generator, Iterator, Sequence
+from dataclasses import dataclass, field
+
+import torch
+from jaxtyping import Int
+from torch import Tensor
+from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
+
+from imutool import registry
+from imutool.bias.model import COLUMNS, SENSORS, BiasModel, Sensor
+from imutool.config import build
+from imutool.errors import DataError, NumericsError
+from imutool.recording import Recording
+from imutool.training import closed_form, statistics
+from imutool.training.checks import refuse_device
+from imutool.training.corrected import corrected, up_to
+from imutool.training.increments import Increments
+from imutool.training.loss import error
+from imutool.training.objective import Objective, WindowEnds
+from imutool.training.segments import Pool
+from imutool.training.settings import TrainSettings, settings_for
+from imutool.training.tracks import Tracks
+
+__all__ = ["Epoch", "Stage", "TrainSettings", "Training"]
+
+OBJECTIVES: dict[str, type[Objective]] = {"window_ends": WindowEnds, "increments": Increments}
+LONGEST_HELD_OUT_S = {"gyro": 20.0, "accel": 5.0}
+HELD_OUT_HOP_S = 1.0
+WARM_UP_STEPS = 20
+AVERAGE_STEPS = 30  # over which weights are averaged
+SEED_STRIDE = 1_000_003  # between the seeds of two steps
+TRIM = 0.9  # the worst tenth of the held-out windows is where the truth has outliers
+
+
+@dataclass(frozen=True)
+class Epoch:
+    """One line of progress: errors are rad for the gyro's stage and m/s for the accelerometer's."""
+
+    sensor: Sensor
+    step: int
+    steps: int
+    loss: float
+    held_out: float
+    before: float  # held-out error of the closed form the stage started from
+    left_s: float
+    note: str = ""  # what is being done instead, where there are no steps to count
+
+
+@dataclass
+class Stage:
+    """What one sensor's descent must remember to go on: also what a checkpoint holds."""
+
+    sensor: Sensor
+    optimizer: torch.optim.Optimizer
+    mean: AveragedModel  # of the model
+    objective: Objective
+    step: int = 0
+    before: float = math.nan  # held-out error of the closed form
+    closed_form: dict[str, Tensor] = field(default_factory=dict)  # the model it left, once it is judged
+
+
+class Training:
+    """Trains one model on the recordings of one sensor; once `epochs` has ended, `model` is what is kept.
+
+    Raises:
+        DataError: recordings without truth, of different rates, too short, or standing still.
+        ConfigError: a method that is not trained, settings it does not know, or settings with another method's defaults.
+    """
+
+    def __init__(
+        self, recordings: Sequence[Recording], method: str, settings: TrainSettings | None = None, device: str = "cpu"
+    ) -> None:
+        self.settings = settings_for(method, settings)
+        refuse_device(device)
+        module = registry.load("imutool.bias", method)
+        self.pool = Pool.of(recordings, device=device)
+        torch.manual_seed(self.settings.seed)
+        config = build(module.Config, self.settings.model, where=f"model settings of {method}")
+        self.model: BiasModel = module.Model(config, self.pool.rate_hz).double().to(device)
+        learnt = ~self.pool.held_out
+        self.model.see(self.pool.gyro[learnt], self.pool.accel[learnt])
+        self.tracks = Tracks(self.pool, self.settings.track_knot_s)
+        self.generator = torch.Generator().manual_seed(self.settings.seed)
+        self.done: dict[Sensor, float] = {}  # held-out error of each finished stage
+        self.stage: Stage | None = None
+
+    def epochs(self) -> Iterator[Epoch]:
+        """Trains, yielding a line of progress now and then; may be left and entered again between two lines."""
+        for sensor in SENSORS:
+            if sensor in self.done:
+                continue
+            if self.stage is None:
+                self._closed_form(sensor)
+                self.stage = self.begin(sensor)
+            last = yield from self._descend(self.stage)
+            better = last <= self.stage.before
+            self.model.load_state_dict(self.stage.mean.module.state_dict() if better else self.stage.closed_form)
+            self.stage.objective.settle()
+            self.done[sensor], self.stage = min(last, self.stage.before), None
+        lengths: dict[Sensor, tuple[float, ...]] = {sensor: self._window_s(sensor) for sensor in SENSORS}
+        self.model.eval()
+        statistics.store(self.model, self.pool, self.tracks.per_log().detach(), lengths)
+        self.model.requires_grad_(False)
+
+    def held_out(self, sensor: Sensor, model: BiasModel) -> float:
+        """Error over the longest windows that fit the held-out parts: the mean without the worst tenth (rad or m/s).
+
+        Each log's constant is solved for on that part first: it belongs to the run, and what is judged here is the sensor.
+        """
+        first, n = self._held_out_windows(sensor)
+        rest, lengths = self.tracks.per_log().detach(), self._window_s(sensor)[:2]
+        columns = COLUMNS[sensor]
+        rest[:, columns] = model.rest_at_work(sensor, rest[:, columns])
+        scored, pool = corrected(model, self.pool, "held_out", up_to(sensor))
+        solved = closed_form.solve(scored, sensor, pool, rest, lengths, matrix=False, part="held_out")
+        rest[:, columns] = solved.rest
+        with torch.no_grad():
+            parts = torch.split(first, 64)
+            errors = torch.cat([error(scored, sensor, pool.windows(f, n, rest[pool.log[f]])) for f in parts])
+        kept = errors.sort().values[: max(1, int(TRIM * len(errors)))]
+        return float(kept.mean())
+
+    def _held_out_windows(self, sensor: Sensor) -> tuple[Int[Tensor, " m"], int]:
+        pool, window_s, of_log = self.pool, LONGEST_HELD_OUT_S[sensor], [torch.empty(0)] * len(self.pool.names)
+        while window_s > 0.1:
+            n = pool.samples(window_s)
+            first = pool.starts(n, "held_out", ends_only=True)
+            of_log = [first[pool.log[first] == i][:: pool.samples(HELD_OUT_HOP_S)] for i in range(len(pool.names))]
+            if all(len(part) for part in of_log):
+                return torch.cat(of_log), n
+            window_s *= 0.8
+        raise DataError(
+            "the last fifth of the log holds no stretch of truth",
+            where=", ".join(name for name, part in zip(pool.names, of_log, strict=True) if not len(part)),
+            expected="truth to the end of each log",
+            fix="Leave that log out or cut it",
+        )
+
+    def _closed_form(self, sensor: Sensor) -> None:
+        """Calibration and rest biases, as far as windows and a matrix show them."""
+        rest = self.tracks.per_log().detach()
+        scored, pool = corrected(self.model.eval(), self.pool, "train", up_to(sensor))
+        self._take(sensor, closed_form.solve(scored, sensor, pool, rest, self._window_s(sensor), matrix=True))
+
+    def _window_s(self, sensor: Sensor) -> tuple[float, ...]:
+        return self.settings.gyro_window_s if sensor == "gyro" else self.settings.accel_window_s
+
+    def _take(self, sensor: Sensor, solution: closed_form.Solution) -> None:
+        self.model.begin_at(sensor, solution.W)
+        self.tracks.set(sensor, solution.rest)
+
+    def begin(self, sensor: Sensor) -> Stage:
+        """A fresh stage, from where model and tracks stand: it moves the sensor's weights and the tracks."""
+        rate, decay = self._rate(sensor), self.settings.weight_decay
+        weights = {name: w for name, w in self.model.named_parameters() if f".{sensor}" in f".{name}"}
+        free = [w for name, w in weights.items() if name.startswith(self.model.undecayed)]
+        groups = [
+            {"params": [w for name, w in weights.items() if not name.startswith(self.model.undecayed)], "weight_decay": decay},
+            {"params": [*free, self.tracks.knots], "weight_decay": 0.0},
+        ]
+        average = get_ema_multi_avg_fn(1 - 1 / AVERAGE_STEPS)  # type: ignore[no-untyped-call]  # torch gives it no type
+        # with its buffers: the running statistics of a batch norm belong to the weights they were seen with
+        mean = AveragedModel(self.model.eval(), multi_avg_fn=average, use_buffers=True)
+        objective = OBJECTIVES[self.model.objective](self.model, sensor, self.pool, self.tracks, self.settings)
+        return Stage(sensor, torch.optim.AdamW(groups, lr=rate), mean, objective)
+
+    def _rate(self, sensor: Sensor) -> float:
+        return self.settings.gyro_rate if sensor == "gyro" else self.settings.accel_rate
+
+    def _descend(self, stage: Stage) -> Generator[Epoch, None, float]:
+        """To the last step; the held-out error there."""
+        settings, sensor = self.settings, stage.sensor
+        steps = settings.steps if self.model.iterative else 0
+        began, begun_at = time.monotonic(), stage.step
+        loss = float("nan")
+        while True:
+            if stage.step % settings.validate_every == 0 or stage.step == steps:
+                score = self._validate(stage)
+                per_step = (time.monotonic() - began) / max(stage.step - begun_at, 1)
+                yield Epoch(sensor, stage.step, steps, loss, score, stage.before, per_step * (steps - stage.step))
+            if stage.step >= steps:
+                return score
+            loss = self._one_step(stage, steps)
+
+    def _one_step(self, stage: Stage, steps: int) -> float:
+        warm, cool = min(1.0, (stage.step + 1) / WARM_UP_STEPS), 0.5 * (1 + math.cos(math.pi * stage.step / steps))
+        rate = self._rate(stage.sensor) * warm * cool
+        for group in stage.optimizer.param_groups:
+            group["lr"] = rate
+        self._set_training(stage)
+        # the losses are means over windows; a second of data counts once against the walk
+        total = self.tracks.wandering(stage.sensor) / (len(self.pool.t) / self.pool.rate_hz)
+        for term in stage.objective.terms(self.generator):
+            total = total + term
+        stage.optimizer.zero_grad()
+        total.backward()  # type: ignore[no-untyped-call]
+        if not bool(torch.isfinite(total)):
+            raise NumericsError(
+                f"the loss is {float(total.detach())} at step {stage.step} of the {stage.sensor} stage",
+                expected="a finite loss",
+                fix=f"Lower --set {stage.sensor}_rate",
+            )
+        stage.optimizer.step()
+        stage.mean.update_parameters(self.model)
+        stage.step += 1
+        return float(total.detach())
+
+    def _set_training(self, stage: Stage) -> None:
+        """Puts the parts of the stage's sensor, and no others, where batch norm and dropout do what they do in training.
+
+        What they draw follows from seed and step, so that a training taken up again goes on as if it had not been left.
+        """
+        self.model.eval()
+        for name, module in self.model.named_modules():
+            module.training = f".{stage.sensor}" in f".{name}"
+        torch.manual_seed((self.settings.seed + SEED_STRIDE * (stage.step + 1)) % 2**63)
+
+    def _validate(self, stage: Stage) -> float:
+        model = stage.mean.module
+        assert isinstance(model, BiasModel)
+        model.eval()
+        score = self.held_out(stage.sensor, model)
+        if stage.closed_form:
+            return score if math.isfinite(score) else math.inf
+        if not math.isfinite(score):
+            raise NumericsError(
+                f"the held-out error of the {stage.sensor} is {score} before the first step",
+                expected="a finite error",
+                fix="Look for absurd values in the logs with imutool info",
+            )
+        stage.before, stage.closed_form = score, copy.deepcopy(model.state_dict())
+        return score

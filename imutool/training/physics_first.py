@@ -1,0 +1,150 @@
+"""How `hybrid` is trained: effects in closed form, then the neural ODE on recordings that they have been taken off.
+
+Effects are chosen on the training part, and then fitted to the whole logs.
+
+The ODE's training is the one of `neural_ode`, and does not know that its samples were corrected. It is kept where it takes
+at least `LEAST_GAIN` off the held-out error of either sensor, and left out of the model where it does not.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import torch
+
+from imutool.bias import hybrid, neural_ode
+from imutool.bias.model import SENSORS, BiasModel, Sensor
+from imutool.config import build, plain
+from imutool.errors import ConfigError
+from imutool.recording import Imu, Recording, seconds
+from imutool.sensor import physics_file
+from imutool.sensor.catalogue import known, named
+from imutool.sensor.signals import SignalFilter, Signals
+from imutool.training.calibration import Calibration, calibrate
+from imutool.training.fit import Epoch
+from imutool.training.segments import Pool
+from imutool.training.settings import TrainSettings
+
+LEAST_GAIN = 0.03  # of the held-out error, for an ODE to be worth its weights
+
+
+@dataclass(frozen=True)
+class PhysicsFirst:
+    """A hybrid model whose effects are found, and the recordings without them."""
+
+    model: hybrid.Model
+    found: dict[Sensor, Calibration]
+    recordings: list[Recording]
+
+    @classmethod
+    def of(
+        cls, recordings: Sequence[Recording], settings: TrainSettings, device: str, say: Callable[[Epoch], None]
+    ) -> PhysicsFirst:
+        """Finds the effects of gyro, then accelerometer.
+
+        Raises:
+            DataError: no truth, too little of it, or different rates.
+            ConfigError: unknown settings, or an effect that is not known.
+        """
+        pool = Pool.of(recordings, device=device)
+        torch.manual_seed(settings.seed)
+        model = hybrid.Model(config_of(settings), pool.rate_hz).double()
+        signals, found = _where_there_is_truth(recordings, pool), {}
+        gyro = pool.gyro
+        for sensor in SENSORS:
+            say(Epoch(sensor, 0, 0, math.nan, math.nan, math.nan, 0.0, f"looking for effects on the {sensor}"))
+            chosen = calibrate(pool, sensor, gyro, model.named(sensor), "train", signals)
+            whole = calibrate(pool, sensor, gyro, chosen.effects, "all", signals)  # nothing is left to be chosen
+            found[sensor] = replace(whole, gains=chosen.gains)
+            model.take(sensor, found[sensor].effects, found[sensor].theta, found[sensor].covariance)
+            if sensor == "gyro":
+                error = torch.from_numpy(model.error("gyro", signals)).to(pool.gyro)
+                gyro = pool.gyro - error - found[sensor].rest[pool.log]
+        return cls(model, found, _without(model, recordings))
+
+    def ode_settings(self, settings: TrainSettings) -> TrainSettings:
+        """The settings of the ODE's own training."""
+        ode: neural_ode.Config = self.model.config.ode
+        return msgspec.structs.replace(settings, model=plain(ode))
+
+    def finish(self, learnt: BiasModel) -> hybrid.Model:
+        """The whole model, with the ODE that was trained, or without one where a constant was enough."""
+        model = self.model
+        if isinstance(learnt, neural_ode.Model):
+            assert model.ode is not None
+            model.ode.load_state_dict(learnt.state_dict())
+        else:
+            model.drop_remainder()
+        for name, value in learnt.named_buffers(recurse=False):
+            getattr(model, name).copy_(value)
+        return model
+
+
+def settings_for(physics: Path) -> tuple[list[str], tuple[str, ...]]:
+    """Settings for `hybrid` with the effects that a physics.toml names, and of those what it has no correction for.
+
+    Their numbers are fitted anew to the logs; the latter, and all that has no name, is left to the neural ODE.
+
+    Raises:
+        ConfigError: the file cannot be read, or names no effect that `hybrid` can take off.
+    """
+    names = tuple(dict.fromkeys(entry.name for entry in physics_file.read(physics).effect))
+    by_sensor = {sensor: [one.name for one in known(sensor) if one.name in names] for sensor in SENSORS}
+    taken = {name for some in by_sensor.values() for name in some}
+    if not taken:
+        raise ConfigError("no effect that a bias model can take off", where=physics, expected="for instance gyro_scale")
+    words = [f"model.{sensor}_effects={json.dumps(some)}" for sensor, some in by_sensor.items()]
+    return words, tuple(name for name in names if name not in taken)
+
+
+def helps(before: dict[Sensor, float], after: dict[Sensor, float]) -> bool:
+    """Whether a descent took enough off the held-out error of one sensor, and did no harm to the other."""
+    gains = [1 - after[sensor] / before[sensor] for sensor in SENSORS]
+    return max(gains) >= LEAST_GAIN and min(gains) > -LEAST_GAIN
+
+
+def config_of(settings: TrainSettings) -> hybrid.Config:
+    """The model's settings, with effects that are known.
+
+    Raises:
+        ConfigError: an unknown setting or effect (the nearest is named), or an effect on the wrong sensor.
+    """
+    config = build(hybrid.Config, settings.model, where="model settings of hybrid")
+    named("gyro", config.gyro_effects or ())
+    named("accel", config.accel_effects or ())
+    return config
+
+
+def _where_there_is_truth(recordings: Sequence[Recording], pool: Pool) -> Signals:
+    """The signals of a pool's samples as they are at work: their filters and their time start where the log does."""
+    parts: list[Signals] = []
+    for recording, count in zip(recordings, torch.bincount(pool.log).tolist(), strict=True):
+        first = int(np.searchsorted(recording.imu.t_ns, recording.overlap().imu.t_ns[0]))
+        parts.append(_signals(recording.imu, pool.rate_hz).rows(slice(first, first + count)))
+    return Signals(np.concatenate([part.t_s for part in parts]), np.concatenate([part.columns for part in parts]))
+
+
+def _signals(imu: Imu, rate_hz: float) -> Signals:
+    return SignalFilter(rate_hz)(seconds(imu.t_ns, int(imu.t_ns[0])), imu.gyro, imu.accel)
+
+
+def _without(model: hybrid.Model, recordings: Sequence[Recording]) -> list[Recording]:
+    """The recordings with the model's effects taken off their samples."""
+    return [replace(recording, imu=_corrected(model, recording.imu)) for recording in recordings]
+
+
+def _corrected(model: hybrid.Model, imu: Imu) -> Imu:
+    signals = _signals(imu, model.rate_hz)
+    return Imu(imu.t_ns, imu.gyro - model.error("gyro", signals), imu.accel - model.error("accel", signals))
+
+
+def described(found: dict[Sensor, Calibration]) -> Iterator[tuple[str, dict[str, object]]]:
+    """What a card says of the effects: what each took off the loss of logs that had no part in its fit, what was not seen."""
+    for sensor, one in found.items():
+        yield sensor, {"effects": list(one.effects), "gains": dict(one.gains), "unseen": list(one.unseen)}

@@ -1,0 +1,157 @@
+"""Logs in, a model file out: reads the logs, trains, keeps a checkpoint on the way, and writes the model with its card."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import torch
+
+from imutool import __version__, registry
+from imutool.bias import hybrid, io, neural_ode, static
+from imutool.bias.model import SENSORS, BiasModel
+from imutool.config import plain
+from imutool.errors import ConfigError
+from imutool.mcap_io.read import read
+from imutool.mcap_io.storage.digest import sha256
+from imutool.recording import Recording
+from imutool.training import checkpoint, checks
+from imutool.training.fit import Epoch, Training
+from imutool.training.physics_first import PhysicsFirst, config_of, described, helps
+from imutool.training.segments import Pool
+from imutool.training.settings import TrainSettings, settings_for
+
+UNITS = {"gyro": "rad", "accel": "m/s"}
+
+
+def checkpoint_path(out: Path) -> Path:
+    """Where the checkpoint of a training that will write `out` lies."""
+    return out.with_name(f"{out.name}.checkpoint")
+
+
+def train(
+    logs: Sequence[Path],
+    out: Path,
+    *,
+    method: str = "hybrid",
+    settings: TrainSettings | None = None,
+    device: str = "cpu",
+    imu: str | None = None,
+    truth: str | None = None,
+    resume: bool = False,
+    overwrite: bool = False,
+    progress: Callable[[Epoch], None] | None = None,
+) -> BiasModel:
+    """Trains a model on logs of one sensor and writes it; interrupted, it leaves a checkpoint that `resume` takes up.
+
+    Raises:
+        ConfigError: the target exists, unknown method or settings, or a checkpoint of another training.
+        LogError, DataError: a log without IMU or truth, different rates, too little to train on.
+        NumericsError: the loss diverged.
+    """
+    if out.exists() and not overwrite:
+        raise ConfigError("exists already", where=out, fix="Choose another name or give --overwrite")
+    if not out.parent.is_dir():
+        raise ConfigError("the folder does not exist", where=out.parent, fix="Create it first")
+    kept = checkpoint_path(out)
+    if resume and not kept.exists():
+        raise ConfigError("there is no checkpoint", where=kept, fix="Train without --resume")
+    if kept.exists() and not (resume or overwrite):
+        said = "an interrupted training left its checkpoint"
+        raise ConfigError(said, where=kept, fix="Give --resume to go on, or --overwrite to start afresh")
+    if method == static.Model.method:
+        raise ConfigError("static is not trained", where="--method", fix="Choose hybrid, neural_ode, conv or linear")
+    checks.refuse_device(device)
+    chosen = settings_for(method, settings)
+    if resume and not registry.load("imutool.bias", method).Model.iterative:
+        raise ConfigError(f"{method} has no steps to go on with", where="--resume", fix="Train it without --resume")
+    if method == hybrid.Model.method:
+        config_of(chosen)  # a slip of the pen is told before any log is read
+    recordings = [read(log, imu=imu, truth=truth) for log in logs]
+    checks.refuse(recordings, Pool.of(recordings))
+    say = progress or (lambda epoch: None)
+    descent = _Descent(kept, resume, device, say)
+    if method == hybrid.Model.method:
+        model, about = _physics_first(recordings, chosen, descent)
+    else:
+        training = descent(recordings, method, chosen)
+        model, about = training.model, {"held_out": _held_out(training)}
+    model.card = {
+        **_card(method, chosen, recordings, logs),
+        **about,
+        **{key: _shared(recordings, key) for key in ("sensor", "dataset")},
+    }
+    io.save(model, out, overwrite=overwrite)
+    kept.unlink(missing_ok=True)
+    return io.load(out)
+
+
+@dataclass(frozen=True)
+class _Descent:
+    """Runs a training to its end, with a checkpoint on the way."""
+
+    kept: Path
+    resume: bool
+    device: str
+    say: Callable[[Epoch], None]
+
+    def __call__(self, recordings: Sequence[Recording], method: str, settings: TrainSettings) -> Training:
+        training = Training(recordings, method, settings, self.device)
+        if training.model.iterative:
+            if self.resume:
+                checkpoint.restore(training, self.kept)
+            else:
+                self.kept.unlink(missing_ok=True)
+        try:
+            for epoch in training.epochs():
+                self.say(epoch)
+                if training.model.iterative and epoch.step:
+                    checkpoint.save(training, self.kept)
+        except KeyboardInterrupt as interrupt:  # it may have struck in the middle of a step: what is kept is from before
+            if self.kept.exists():
+                raise KeyboardInterrupt(
+                    f"{self.kept} holds what is done; the same command with --resume goes on from there"
+                ) from interrupt
+            raise
+        return training
+
+
+def _physics_first(
+    recordings: Sequence[Recording], settings: TrainSettings, descent: _Descent
+) -> tuple[BiasModel, dict[str, Any]]:
+    """Effects, then the neural ODE where it helps; what the card says of both."""
+    physics = PhysicsFirst.of(recordings, settings, descent.device, descent.say)
+    alone = msgspec.structs.replace(settings, model={})
+    without = descent(physics.recordings, static.Model.method, alone)
+    held_out: dict[str, Any] = {"effects": _held_out(without)}
+    kept = without
+    if physics.model.config.remainder:
+        ode = descent(physics.recordings, neural_ode.Model.method, physics.ode_settings(settings))
+        held_out["effects and neural_ode"] = _held_out(ode)
+        kept = ode if helps(without.done, ode.done) else without
+    model = physics.finish(kept.model)
+    return model, {"held_out": _held_out(kept), "compared": held_out, "physics": dict(described(physics.found))}
+
+
+def _shared(recordings: Sequence[Recording], key: str) -> str | None:
+    """What all logs say of themselves under a key, if they agree."""
+    said = {recording.metadata.get("imutool", {}).get(key) for recording in recordings}
+    return said.pop() if len(said) == 1 else None
+
+
+def _held_out(training: Training) -> dict[str, Any]:
+    return {sensor: {"error": training.done[sensor], "unit": UNITS[sensor]} for sensor in SENSORS}
+
+
+def _card(method: str, settings: TrainSettings, recordings: Sequence[Recording], logs: Sequence[Path]) -> dict[str, Any]:
+    """Everything needed to repeat the training."""
+    return {
+        "imutool": __version__,
+        "torch": torch.__version__,
+        "method": method,
+        "training": plain(settings),
+        "logs": [{"name": r.name, "file": p.name, "sha256": sha256(p)} for r, p in zip(recordings, logs, strict=True)],
+    }

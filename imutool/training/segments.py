@@ -1,0 +1,183 @@
+"""Recordings cut into windows: the truth laid on the IMU's clock, gaps masked, the last part held out.
+
+All logs lie end to end in one set of tensors, and a window is the index of its first sample; a batch is one gather over
+as many logs as it happens to touch, so that every step of a training mixes all sequences.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from imutool.bias.model import Segment
+from imutool.errors import DataError
+from imutool.geometry import so3
+from imutool.inertial.stationary import GAP_PERIODS
+from imutool.inertial.strapdown import with_velocity
+from imutool.recording import Recording, seconds
+
+HELD_OUT = 0.2  # the last fifth of every training log validates (method.md, Arrangement)
+MAX_RATE_SPREAD = 0.05
+
+Part = Literal["train", "held_out", "all"]
+
+
+@dataclass(frozen=True)
+class Windows:
+    """Some windows of n samples, the true poses at the first and the last, and the log each comes from."""
+
+    segment: Segment
+    dt: Float[Tensor, "batch steps"]
+    R_start: Float[Tensor, "batch 3 3"]
+    R_end: Float[Tensor, "batch 3 3"]
+    v_start: Float[Tensor, "batch 3"]
+    v_end: Float[Tensor, "batch 3"]
+    p_start: Float[Tensor, "batch 3"]
+    p_end: Float[Tensor, "batch 3"]
+    log: Int[Tensor, " batch"]
+
+
+@dataclass(frozen=True)
+class Pool:
+    """Every sample of the training logs, end to end, with the truth at each."""
+
+    names: tuple[str, ...]
+    rate_hz: float
+    t: Float[Tensor, " n"]  # s from the start of its log
+    gyro: Float[Tensor, "n 3"]
+    accel: Float[Tensor, "n 3"]
+    R_wb: Float[Tensor, "n 3 3"]
+    v_w: Float[Tensor, "n 3"]
+    p_wb: Float[Tensor, "n 3"]
+    log: Int[Tensor, " n"]
+    trusted: Bool[Tensor, " n"]
+    held_out: Bool[Tensor, " n"]
+    late: Bool[Tensor, " n"]  # samples are missing just before this one
+
+    @classmethod
+    def of(cls, recordings: Sequence[Recording], dtype: torch.dtype = torch.float64, device: str = "cpu") -> Pool:
+        """All recordings of one sensor.
+
+        Raises:
+            DataError: no truth, logs sampled at different rates, or no log long enough to hold anything.
+        """
+        tracks = [_Track.of(recording) for recording in recordings]
+        rates = [track.rate_hz for track in tracks]
+        if max(rates) / min(rates) - 1 > MAX_RATE_SPREAD:
+            listed = ", ".join(f"{r.name} {rate:.1f}" for r, rate in zip(recordings, rates, strict=True))
+            raise DataError(f"training logs at different rates ({listed} Hz)", expected="logs of one sensor")
+
+        def put(column: str) -> Tensor:
+            return torch.as_tensor(np.concatenate([getattr(track, column) for track in tracks]), dtype=dtype, device=device)
+
+        def flags(column: str) -> Tensor:
+            return torch.as_tensor(np.concatenate([getattr(track, column) for track in tracks]), device=device)
+
+        log = np.repeat(np.arange(len(tracks)), [len(track.t) for track in tracks])
+        return cls(
+            names=tuple(recording.name for recording in recordings),
+            rate_hz=float(np.median(rates)),
+            **{column: put(column) for column in ("t", "gyro", "accel", "R_wb", "v_w", "p_wb")},
+            log=torch.as_tensor(log, device=device),
+            trusted=flags("trusted"),
+            held_out=flags("held_out"),
+            late=flags("late"),
+        )
+
+    def samples(self, window_s: float) -> int:
+        """How many steps a window of this length takes."""
+        return max(1, round(window_s * self.rate_hz))
+
+    def starts(self, n: int, part: Part, *, hop: int = 1, ends_only: bool = False) -> Int[Tensor, " m"]:
+        """First samples of all windows of n steps that stay in one log and one part, and touch no gap in truth or samples.
+
+        Of every `hop` one is kept. With `ends_only` the truth is asked for at the two ends alone: for validation over times
+        longer than its gaps are apart.
+        """
+        first = torch.arange(0, max(len(self.t) - n, 0), hop, device=self.t.device)
+        last = first + n
+        keep = self.log[first] == self.log[last]
+        if part != "all":
+            wanted = part == "held_out"
+            keep &= (self.held_out[first] == wanted) & (self.held_out[last] == wanted)
+        keep &= self.trusted[first] & self.trusted[last]
+        breaks = torch.cumsum(self.late, dim=0)
+        keep &= breaks[last] == breaks[first]
+        if not ends_only:
+            holes = torch.cumsum(~self.trusted, dim=0)
+            keep &= holes[last] == holes[first]
+        return first[keep]
+
+    def around(self, first: Int[Tensor, " batch"], before: int, after: int) -> Int[Tensor, "batch _"]:
+        """Indices from `before` samples before some samples to `after` samples after them.
+
+        They stay in the log of the first: before its beginning its first sample repeats, after its end its last.
+        """
+        log = self.log[first]
+        begin, end = torch.searchsorted(self.log, log), torch.searchsorted(self.log, log, right=True) - 1
+        index = first[:, None] + torch.arange(-before, after + 1, device=first.device)
+        return torch.minimum(torch.maximum(index, begin[:, None]), end[:, None])
+
+    def windows(self, first: Int[Tensor, " batch"], n: int, rest: Float[Tensor, "batch 6"]) -> Windows:
+        """The windows of n steps that start at some samples, each from its own rest bias."""
+        index = first[:, None] + torch.arange(n + 1, device=first.device)
+        last, log = first + n, self.log[first]
+        t = self.t[index]
+        return Windows(
+            segment=Segment(t - t[:, :1], self.gyro[index], self.accel[index], rest),
+            dt=torch.diff(t, dim=1),
+            R_start=self.R_wb[first],
+            R_end=self.R_wb[last],
+            v_start=self.v_w[first],
+            v_end=self.v_w[last],
+            p_start=self.p_wb[first],
+            p_end=self.p_wb[last],
+            log=log,
+        )
+
+
+@dataclass(frozen=True)
+class _Track:
+    """One recording on its IMU's clock."""
+
+    rate_hz: float
+    t: np.ndarray
+    gyro: np.ndarray
+    accel: np.ndarray
+    R_wb: np.ndarray
+    v_w: np.ndarray
+    p_wb: np.ndarray
+    trusted: np.ndarray
+    held_out: np.ndarray
+    late: np.ndarray
+
+    @classmethod
+    def of(cls, recording: Recording) -> _Track:
+        try:
+            both = recording.overlap()
+        except DataError as error:
+            raise error.at(recording.name) from error
+        imu, truth = both.imu, both.truth
+        poses, trusted = with_velocity(truth).at(imu.t_ns)
+        assert poses.v_w is not None
+        t = seconds(imu.t_ns, int(imu.t_ns[0]))
+        R_wb = so3.matrix_from_quaternion_wxyz(torch.from_numpy(np.array(poses.q_wb_wxyz))).numpy()
+        held_out = t > (1 - HELD_OUT) * t[-1]
+        return cls(
+            1.0 / imu.period_s,
+            t,
+            imu.gyro,
+            imu.accel,
+            R_wb,
+            poses.v_w,
+            poses.p_wb,
+            trusted,
+            held_out,
+            np.diff(t, prepend=t[0]) > GAP_PERIODS * imu.period_s,
+        )

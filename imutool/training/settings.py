@@ -1,0 +1,81 @@
+"""How to train: the settings of a training, and the defaults that a method prefers."""
+
+from __future__ import annotations
+
+import functools
+from typing import Annotated, Any
+
+import msgspec
+
+from imutool import registry
+from imutool.config import Settings
+from imutool.errors import ConfigError
+
+Positive = Annotated[float, msgspec.Meta(gt=0)]
+Count = Annotated[int, msgspec.Meta(ge=1)]
+
+
+class IncrementSettings(Settings, frozen=True):
+    """For methods that descend on increments (`imutool.training.increments`): their lengths, and the stretches that hold them."""
+
+    gyro_samples: tuple[Count, ...] = (16, 32)
+    accel_samples: tuple[Count, ...] = (16, 32)
+    stretch_s: Positive = 16.0
+
+
+class TrainSettings(Settings, frozen=True):
+    """How to train; `model` holds the settings of the method (`imutool/bias/METHOD.py`, class Config).
+
+    The defaults here are those of linear and neural_ode; `settings_of` has those of any method.
+    """
+
+    seed: int = 0
+    gyro_window_s: tuple[Positive, ...] = (1.0, 4.0, 15.0)
+    accel_window_s: tuple[Positive, ...] = (0.5, 2.0)
+    samples: Count = 8_000
+    steps: Count = 300
+    gyro_rate: Positive = 1e-2  # learning rates
+    accel_rate: Positive = 3e-3
+    weight_decay: Annotated[float, msgspec.Meta(ge=0)] = 1e-4
+    track_knot_s: Positive = 20.0
+    validate_every: Count = 100  # steps between two lines of progress, each with a checkpoint
+    increments: IncrementSettings = IncrementSettings()
+    model: dict[str, Any] = msgspec.field(default_factory=dict)
+
+
+@functools.cache
+def settings_of(method: str) -> type[TrainSettings]:
+    """`TrainSettings` with the defaults that a method prefers (`BiasModel.prefers`) in place of the general ones.
+
+    Raises:
+        ConfigError: unknown method.
+    """
+    prefers = registry.load("imutool.bias", method).Model.prefers
+    if not prefers:
+        return TrainSettings
+    kinds = {field.name: field.type for field in msgspec.structs.fields(TrainSettings)}
+    fields = [(name, kinds[name], default) for name, default in prefers.items()]
+    made = msgspec.defstruct(
+        f"TrainSettings_{method}", fields, bases=(TrainSettings,), frozen=True, kw_only=True, forbid_unknown_fields=True
+    )
+    assert issubclass(made, TrainSettings)
+    return made
+
+
+def settings_for(method: str, given: TrainSettings | None) -> TrainSettings:
+    """The settings given, or the method's defaults.
+
+    Raises:
+        ConfigError: unknown method, or settings whose defaults are another method's: they would train without a word, badly.
+    """
+    kind = settings_of(method)
+    if given is None:
+        return kind()
+    if type(given) is not kind:
+        raise ConfigError(
+            f"settings of type {type(given).__name__}",
+            where=f"training {method}",
+            expected=kind.__name__,
+            fix=f"Build them with imutool.training.settings.settings_of({method!r})",
+        )
+    return given

@@ -1,0 +1,79 @@
+"""A picture of Allan deviations on paper, with the slopes that were read off them."""
+
+from __future__ import annotations
+
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from imutool.mcap_io.storage.target import Target
+from imutool.noise import allan
+from imutool.noise_identification import SENSORS, Identified, Sensor, Sight
+from imutool.viewing.html.drawing import Panel, Picture, legend, plain_numbers
+from imutool.viewing.html.drawing import png as drawn
+from imutool.viewing.html.theme import AXES, AXIS_COLORS, SOFT, TITLES, UNITS
+
+LINES = {
+    "quantisation": (0, (1, 3)),
+    "density": (0, (6, 2)),
+    "instability": (0, (3, 1, 1, 1)),
+    "walk": (0, (1, 1)),
+    "ramp": (0, (1, 3)),
+}
+HEIGHT_INCH = 3.8
+
+
+def deviations(found: Identified, path: Path, *, overwrite: bool = False) -> None:
+    """Writes a PNG: the deviation of each axis as points, the fitted sum as a line, each slope seen as its own.
+
+    Above what was seen at rest, below what was left in motion; only one of them where there is only one.
+
+    Raises:
+        ConfigError: matplotlib is not installed, or the file exists or cannot be written.
+    """
+    with Target(path, overwrite=overwrite) as target:  # refuses before the work is done, leaves nothing after a failure
+        target.write(png(found))
+
+
+def png(found: Identified) -> bytes:
+    """The picture of `deviations` as the content of a file.
+
+    Raises:
+        ConfigError: matplotlib is not installed.
+    """
+    sights = [sight for sight in (found.at_rest, found.in_motion) if sight is not None]
+    panels = [
+        Panel(partial(_draw, sight=sight, sensor=sensor), HEIGHT_INCH, f"{TITLES[sensor]}: {sight.how}")
+        for sight in sights
+        for sensor in SENSORS
+    ]
+    return drawn(Picture("allan", "Allan deviation", "", tuple(panels)), f"{found.log} {found.topic}")
+
+
+def _draw(figure: Any, *, sight: Sight, sensor: Sensor) -> None:
+    axes = figure.subplots()
+    curve = sight.curves[sensor]
+    for axis, (slopes, color) in enumerate(zip(sight.slopes[sensor], AXIS_COLORS, strict=True)):
+        error = curve.deviation[:, axis] / np.sqrt(2.0 * curve.freedom)
+        axes.errorbar(curve.tau_s, curve.deviation[:, axis], error, fmt="o", ms=4, color=color, lw=0.8, label=AXES[axis])
+        if not slopes.powers:
+            continue
+        tau_s = np.geomspace(slopes.from_s, curve.tau_s[-1], 200)
+        total = sum(allan.part(name, value, tau_s) ** 2 for name, value in slopes.powers.items())
+        axes.plot(tau_s, np.sqrt(total), color=color, lw=1.4)
+        for name, value in slopes.seen.items():
+            axes.plot(tau_s, allan.part(name, value, tau_s), color=color, lw=0.9, ls=LINES[name], alpha=0.8)
+    axes.set_xscale("log")
+    axes.set_yscale("log")
+    if len(curve.tau_s):
+        axes.set_ylim(curve.deviation.min() / 3.0, curve.deviation.max() * 2.0)
+    axes.set_title(f"{TITLES[sensor]}: {sight.how}".replace(", ", ",\n"), fontsize=9)
+    axes.set_xlabel("averaging time (s)")
+    axes.set_ylabel(f"Allan deviation ({UNITS[sensor]})")
+    plain_numbers(axes.xaxis, axes.yaxis)
+    named = sorted({name for slopes in sight.slopes[sensor] for name in slopes.seen}, key=list(LINES).index)
+    for name in named:
+        axes.plot([], [], color=SOFT, lw=0.9, ls=LINES[name], label=name)
+    legend(figure, axes.get_legend_handles_labels()[0])

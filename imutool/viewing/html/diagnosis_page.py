@@ -1,0 +1,229 @@
+"""One page about a diagnosis that a person reads in a minute: the conclusion, what was found, where, before and after."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from pathlib import Path
+
+from imutool import __version__
+from imutool.diagnosis.quantity import SHOWN, each, grouped, percent, symbol
+from imutool.diagnosis.result import SCHEMA, UNITS, Diagnosis, Finding, Traces
+from imutool.diagnosis.wording import (
+    answer,
+    before_after,
+    besides,
+    by_chance,
+    came_closer,
+    cannot_show,
+    does,
+    measured,
+    name,
+    remains,
+    unseen,
+    where,
+    with_all,
+)
+from imutool.mcap_io.storage.target import Target
+from imutool.viewing.html import diagnosis_figures as figures
+from imutool.viewing.html import diagnosis_paths
+from imutool.viewing.html.drawing import apart
+from imutool.viewing.html.page import document, text
+
+BAR_PIXELS = 80.0
+MOST_LOGS = 4  # that are drawn one by one; what is pooled takes all
+BEFORE = '<span class="key" style="background: var(--before)"></span>before'
+AFTER = '<span class="key" style="background: var(--after)"></span>with what was found'
+DIFFERENCE = '<span class="key" style="background: var(--before)"></span>real minus expected'
+HELD = '<span class="key" style="background: var(--held); opacity: 0.5"></span>time that no fit has seen'
+
+
+def write(d: Diagnosis, path: Path, *, logs: str | None = None, overwrite: bool = False) -> None:
+    """Writes the page: one file without any request to elsewhere, for light and dark screens and for paper.
+
+    Raises:
+        ConfigError: matplotlib is not installed, or the file exists (without `overwrite`) or cannot be written.
+    """
+    with Target(path, overwrite=overwrite) as target:  # refuses before the work is done, leaves nothing after a failure
+        target.write(html(d, logs=logs).encode())
+
+
+def html(d: Diagnosis, *, logs: str | None = None) -> str:
+    """The page of `write` as text; `logs` is the name of a page about the logs themselves, in the same folder.
+
+    Raises:
+        ConfigError: matplotlib is not installed.
+    """
+    names = ", ".join(Path(one).name for one in d.real)
+    against = (
+        f"against {Path(d.sim).name}"
+        if d.sim is not None
+        else f"against {'its' if len(d.real) == 1 else 'their'} own true poses"
+    )
+    body = [
+        f"<h1>{text(names)} {text(against)}</h1>",
+        f'<p class="conclusion">{text(" ".join(answer(d)))}</p>',
+        *(f'<p class="note">{text(one)}</p>' for one in besides(d)),
+        *(f'<p class="note">{text(one)}</p>' for one in d.remarks),
+        *([f'<p><a href="{text(logs)}">The recordings themselves</a>: signals, spectra, events.</p>'] if logs else []),
+        *_findings(d),
+        *_places(d),
+        *_before_and_after(d),
+        *_curves(d),
+        *_left(d),
+        *_provenance(d),
+    ]
+    return document(f"Diagnosis of {names}", body)
+
+
+def _findings(d: Diagnosis) -> Iterator[str]:
+    if not d.findings:
+        return
+    head = "".join(f"<th>{one}</th>" for one in ("What", "Equation", "Removes", "By chance"))
+    yield "<h2>What was left out</h2>"
+    yield f'<div class="scroll"><table class="findings"><thead><tr>{head}</tr></thead><tbody>'
+    for one in d.findings:
+        cells = [
+            f"<strong>{text(name(one))}</strong> {text(one.signal)}<br>{text(does(d, one))}{_similar(one)}",
+            f"<code>{text(one.equation)}</code>{_entries(one)}",
+            _gain(one),
+            f"<span class=entry>{text(by_chance(one.false_discovery_rate, short=True))}</span>",
+        ]
+        yield f"<tr>{''.join(f'<td>{cell}</td>' for cell in cells)}</tr>"
+    yield "</tbody></table></div>"
+
+
+def _gain(one: Finding) -> str:
+    """The share of the misfit as a number and a bar, and the root mean squares behind it."""
+    if not measured(one):
+        return "–"
+    width = 0 if math.isnan(one.share) else round(BAR_PIXELS * min(max(one.share, 0.0), 1.0))
+    unseen = text(before_after(one.held_out).removesuffix(" of unseen data"))
+    return f'{percent(one.share)}<span class="bar" style="width: {width}px"></span><br>{unseen}'
+
+
+def _similar(one: Finding) -> str:
+    return f"<br>could as well be {text(' or '.join(one.similar))}" if one.similar else ""
+
+
+def _entries(one: Finding) -> str:
+    """All entries of a matrix, of which the sentence tells the clearest; a curve is drawn instead."""
+    if one.curve is not None:
+        return f"<br>a curve of {text(one.curve.variable)}, drawn below"
+    out = []
+    for quantity in grouped(one.parameters):
+        if len(quantity.estimates) > SHOWN:
+            entries, unit = each(quantity.estimates, quantity.axes)
+            listed = "; ".join(f"<span class=entry>{text(entry)}</span>" for entry in entries)
+            out.append(f"<br>{text(quantity.label)} {listed} {text(unit)}".rstrip())
+    return "".join(out)
+
+
+def _places(d: Diagnosis) -> Iterator[str]:
+    if not d.located:
+        return
+    yield "<h2>Where it lies</h2>"
+    rows = "".join(f"<tr><td>{text(where(one))}</td><td class=number>{percent(one.share)}</td></tr>" for one in d.located)
+    head = "<tr><th>Signal, regime, time</th><th>Share of the misfit</th></tr>"
+    yield f'<div class="scroll"><table><thead>{head}</thead><tbody>{rows}</tbody></table></div>'
+    for k, trace in enumerate(d.traces[:MOST_LOGS]):
+        caption = (
+            f"{text(trace.log)}: local size of the misfit{_band(trace)}, by axis (each sensor to its own largest). "
+            '<span class="key" style="background: var(--mark)"></span>where it was located' + HELD
+        )
+        yield _figure(figures.where(d, trace), f"w{k}", caption)
+
+
+def _before_and_after(d: Diagnosis) -> Iterator[str]:
+    if not d.traces:
+        return
+    found = bool(d.findings)
+    both = BEFORE + AFTER if found else DIFFERENCE
+    over = "unseen time of all logs" if any(one.held_out.any() for one in d.traces) else "all time: none was held out"
+    yield f"<h2>{'Before and after' if found else 'What separates the two'}</h2>"
+    for k, trace in enumerate(d.traces[:MOST_LOGS]):
+        drawn = figures.residual(trace, found=found)
+        yield _figure(drawn, f"r{k}", f"{text(trace.log)}: over time{_band(trace)}. {both}{HELD}")
+    for k, (signal, beside) in enumerate(d.signals.items()):
+        drawn = figures.signal(beside, found=any(one.signal == signal for one in d.findings))
+        yield _figure(drawn, f"g{k}", f"{text(signal)}: over time. {both}{HELD}")
+    if len(d.traces) > MOST_LOGS:
+        yield f'<p class="note">The first {MOST_LOGS} of {len(d.traces)} logs are drawn; all are in the .rrd.</p>'
+    spectrum, rate, attitude = figures.spectrum(d), figures.against_rate(d), figures.against_attitude(d)
+    if spectrum is not None:
+        yield _figure(
+            spectrum, "s", f"Spectrum over {over} (Welch, mean of the axes); dashed: white noise of the floor's size. {both}"
+        )
+    else:
+        yield '<p class="note">No unseen stretch is long enough for a spectrum.</p>'
+    paths = diagnosis_paths.paths(d)
+    if paths is not None:
+        true = '<span class="key" style="background: var(--ink); opacity: 0.4"></span>true'
+        yield _figure(
+            paths, "p", f"Integrated from the true start of each stretch of {over}; drift as root mean square.{true}{both}"
+        )
+    bands = "means in bins, with two standard errors"
+    if rate is not None:
+        yield _figure(rate, "t", f"Against turning rate over {over}: {bands}. {both}")
+    if attitude is not None:
+        yield _figure(attitude, "a", f"Against attitude over {over}: {bands}. {both}")
+    else:
+        yield '<p class="note">No attitude is known, so nothing is drawn against it.</p>'
+
+
+def _curves(d: Diagnosis) -> Iterator[str]:
+    for k, one in enumerate(d.findings):
+        if one.curve is not None:
+            yield "<h2>A misfit without a name</h2>"
+            caption = f"{text(one.equation)}: a smooth curve of {text(one.curve.variable)}, with one standard deviation"
+            yield _figure(figures.curve(one.curve, one.signal), f"c{k}", caption)
+
+
+def _left(d: Diagnosis) -> Iterator[str]:
+    if d.unexplained:
+        yield "<h2>What remains</h2>"
+        head = "".join(f"<th>{one}</th>" for one in ("Signal", "Remains (rms)", "Noise (rms)", "Ratio", ""))
+        units = {one.signal: one.held_out.unit for one in d.findings} | UNITS
+        rows = []
+        for signal, one in d.unexplained.items():
+            unit = symbol(units.get(signal, ""))
+            ratio = f"{one.rms / one.noise_floor:.2f}" if one.noise_floor > 0.0 else "–"
+            numbers = (f"{one.rms:.3g} {unit}", f"{one.noise_floor:.3g} {unit}", ratio)
+            cells = "".join(f"<td class=number>{text(number)}</td>" for number in numbers)
+            rows.append(f"<tr><td>{text(signal)}</td>{cells}<td>{text(remains(one, unit))}</td></tr>")
+        yield f"<table><thead><tr>{head}</tr></thead><tbody>{''.join(rows)}</tbody></table>"
+    if d.closer and d.findings:
+        yield f"<h2>How much closer it comes</h2><p class=note>{text(with_all(d) + unseen(d))}.</p><dl>"
+        for signal, again in d.closer.items():
+            yield f"<dt>{text(signal)}</dt><dd>{text(came_closer(again))}</dd>"
+        yield "</dl>"
+
+
+def _provenance(d: Diagnosis) -> Iterator[str]:
+    yield "<h2>What this is about</h2><dl>"
+    for real in d.real:
+        yield f"<dt>real</dt><dd>{text(real)}</dd>"
+    yield f"<dt>expected from</dt><dd>{text(d.sim) if d.sim is not None else 'the true poses of the recording itself'}</dd>"
+    for trace in d.traces:
+        yield f"<dt>samples</dt><dd>{text(_samples(trace))}</dd>"
+    for bias in d.bias:
+        gyro, accel = (", ".join(f"{b:+.4g}" for b in part) for part in (bias[:3], bias[3:]))
+        yield f"<dt>constant bias</dt><dd>gyro ({gyro}) rad/s, accel ({accel}) m/s²</dd>"
+    if d.not_identifiable:
+        yield f"<dt>these logs cannot show</dt><dd>{text(', '.join(cannot_show(d)))}</dd>"
+    yield f"<dt>made by</dt><dd>imutool {text(__version__)}, {SCHEMA}</dd></dl>"
+
+
+def _samples(trace: Traces) -> str:
+    unseen = float(trace.held_out.mean()) * float(trace.t_s[-1] - trace.t_s[0])
+    span = f"{trace.t_s[0]:.1f} to {trace.t_s[-1]:.1f} s"
+    return f"{trace.log}: {len(trace.t_s)} at {figures.rate_hz(trace):.0f} Hz, {span}, {unseen:.0f} s of it unseen by any fit"
+
+
+def _band(trace: Traces) -> str:
+    """Up to where what is expected is known."""
+    return "" if trace.band_hz is None else f" below {trace.band_hz:.2g} Hz, up to where the poses know the motion"
+
+
+def _figure(svg: str, prefix: str, caption: str) -> str:
+    return f"<figure>{apart(svg, prefix)}<figcaption>{caption}</figcaption></figure>"

@@ -1,0 +1,259 @@
+"""Drawings by matplotlib: inline SVG whose colours are the page's, so that one serves light, dark and print; or a PNG."""
+
+from __future__ import annotations
+
+import io
+import re
+import threading
+import warnings
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float64
+
+from imutool.errors import ConfigError
+from imutool.viewing.html.page import plain, text
+from imutool.viewing.html.theme import GRID, INK, LIGHT
+
+WIDTH_INCH = 11.5  # at the page's 1150 pixels a letter of 9 points is 12 pixels high
+HALF_INCH = 5.6  # two of these side by side, or one on a phone, where the letters are 9 pixels high
+DOTS_PER_INCH = 200  # sharp in print
+HEADING_INCH = 0.45
+PER_DECADE = 40  # points of a spectrum
+LEGEND_LETTERS, HANDLE_LETTERS = 76, 8  # in a row of a legend at half width
+MOST_LETTERS = 48  # of a name in a legend
+BUCKETS = 400  # of a line that is drawn at half width: its lowest and its highest sample in each
+
+# a colour that stands for each of the theme's while an SVG is drawn; none may be one of matplotlib's own
+VARIABLES = {f"#{3 * k + 1:02x}{3 * k + 2:02x}{3 * k + 3:02x}": name for k, name in enumerate(LIGHT)}
+PLACES = {f"imutool:{name}": color for color, name in VARIABLES.items()}
+SHOWN = {f"imutool:{name}": color for name, color in LIGHT.items()}
+
+Line = Float64[np.ndarray, " n"]
+Thin = Float64[np.ndarray, " m"]  # of another length than what it was made of
+STYLE = {
+    "font.size": 9,
+    "axes.titlesize": 10,
+    "axes.titleweight": "bold",
+    "axes.titlelocation": "left",
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.grid": True,
+    "grid.linewidth": 0.6,
+    "legend.frameon": False,
+    "figure.constrained_layout.use": True,
+    "grid.color": GRID,
+    "text.color": INK,
+    "axes.labelcolor": INK,
+    "axes.edgecolor": INK,
+    "xtick.color": INK,
+    "ytick.color": INK,
+    "svg.fonttype": "none",
+    "text.parse_math": False,  # a dollar in the name of a channel is a dollar
+    "axes.formatter.useoffset": False,  # an axis that says +1.2e-3 in a corner is misread
+    "axes.formatter.limits": (-6, 9),  # nor is a power of ten above an axis seen
+    "axes.formatter.use_mathtext": False,
+    "axes.unicode_minus": True,
+}
+_drawing = threading.RLock()  # matplotlib's settings and names of colours are the whole program's
+
+
+@dataclass(frozen=True)
+class Panel:
+    """One drawing of half a page's width, or of all of it: on a figure or a part of one; `label` tells what it shows."""
+
+    draw: Callable[[Any], None]
+    height_inch: float
+    label: str
+    wide: bool = False
+
+
+@dataclass(frozen=True)
+class Picture:
+    """Panels that belong together, under one title; `name` ends the name of their file."""
+
+    name: str
+    title: str
+    caption: str
+    panels: tuple[Panel, ...]
+
+
+def svg(draw: Callable[[Any], None], height_inch: float, name: str, *, width_inch: float = WIDTH_INCH, label: str = "") -> str:
+    """What `draw` draws on a figure, as an `<svg>` element: colours are variables, two decimals, identifiers the figure's own.
+
+    Every curve that has a label carries it as its `<title>`, which a browser shows under the pointer.
+
+    Raises:
+        ConfigError: matplotlib is not installed.
+    """
+    with _inked(PLACES, name):
+        from matplotlib.backends.backend_svg import FigureCanvasSVG
+        from matplotlib.figure import Figure
+
+        figure = Figure(figsize=(width_inch, height_inch))
+        FigureCanvasSVG(figure)
+        buffer = io.StringIO()
+        draw(figure)
+        titles = _curves(figure)
+        figure.savefig(buffer, format="svg", transparent=True, metadata={"Date": None})
+    drawn = buffer.getvalue()
+    drawn = drawn[drawn.index("<svg") :]
+    drawn = re.sub(r"<metadata>.*?</metadata>|<style.*?</style>|<!--.*?-->", "", drawn, flags=re.DOTALL)
+    drawn = re.sub(r' (?:width|height)="[\d.]+pt"', "", drawn, count=2)
+    drawn = re.sub(r'(?<= d=")[^"]*', lambda path: re.sub(r"(\.\d\d)\d+", r"\1", path[0]).replace(" \n", "\n"), drawn)
+    drawn = re.sub(r'<g id="(curve-\d+)">', lambda g: f"{g[0]}<title>{text(titles[g[1]])}</title>", drawn)
+    for color, variable in VARIABLES.items():
+        drawn = drawn.replace(color, f"var(--{variable})")
+    return drawn.replace("<svg", f'<svg role="img" aria-label="{text(label)}"', 1) if label else drawn
+
+
+def png(picture: Picture, heading: str) -> bytes:
+    """A picture in light colours as the content of a file: its panels two in a row, under a heading.
+
+    Raises:
+        ConfigError: matplotlib is not installed.
+    """
+    rows = _rows(picture.panels)
+    heights = [max(panel.height_inch for panel in row) for row in rows]
+    columns = 2 if any(len(row) > 1 or row[0].wide for row in rows) else 1
+    with _inked(SHOWN, picture.name):
+        from matplotlib.backends.backend_agg import FigureCanvasAgg
+        from matplotlib.figure import Figure
+
+        figure = Figure(figsize=(HALF_INCH * columns, sum(heights) + HEADING_INCH), dpi=DOTS_PER_INCH)
+        FigureCanvasAgg(figure)
+        figure.suptitle(plain(heading), x=0.01, ha="left", fontsize=12, fontweight="bold")
+        parts = figure.subfigures(len(rows), 1, squeeze=False, height_ratios=heights)[:, 0]
+        for part, row in zip(parts, rows, strict=True):
+            alone = part.subfigures(1, 1 if row[0].wide else columns, squeeze=False)[0]
+            for place, panel in zip(alone, row, strict=False):
+                panel.draw(place)
+        buffer = io.BytesIO()
+        figure.savefig(buffer, format="png", metadata={"Software": None})
+    return buffer.getvalue()
+
+
+def apart(drawn: str, prefix: str) -> str:
+    """An `<svg>` element whose identifiers begin with a prefix: a page holds several, and `use` finds the first of a name."""
+    return re.sub(r'(?<= id=")|(?<=href="#)|(?<=url\(#)', f"{prefix}-", drawn)
+
+
+def legend(figure: Any, artists: Sequence[Any]) -> None:
+    """The artists' names in rows above everything: inside the axes they would cover a curve sooner or later."""
+    names = [short(str(artist.get_label())) for artist in artists]
+    widths = [len(name) + HANDLE_LETTERS for name in names]
+    columns = len(names) if sum(widths) <= LEGEND_LETTERS else max(1, min(len(names), LEGEND_LETTERS // max(widths)))
+    figure.legend(artists, names, loc="outside upper left", ncols=columns, handlelength=1.6, fontsize=8.5)
+
+
+def short(name: str) -> str:
+    """A name that fits a legend, and begins with no underscore, which matplotlib would take for a word to itself."""
+    name = plain(name).strip() or "?"
+    name = name if len(name) <= MOST_LETTERS else f"{name[: MOST_LETTERS - 1]}…"
+    return f"\u200a{name}" if name.startswith("_") else name
+
+
+def extremes(t: Line, y: Line, buckets: int = BUCKETS) -> tuple[Thin, Thin]:
+    """A line of at most two points a bucket, the lowest and the highest sample of each in their order; gaps stay gaps."""
+    if len(t) <= 2 * buckets:
+        return t, y
+    edges = np.unique(np.linspace(0, len(t), buckets + 1).astype(int))
+    keep = []
+    for first, last in pairwise(edges):
+        part = y[first:last]
+        if np.isnan(part).all():
+            keep.append(first)
+        else:
+            keep += sorted({first + int(np.nanargmin(part)), first + int(np.nanargmax(part))})
+    return t[keep], y[keep]
+
+
+def spans(t: Line, mask: Bool[np.ndarray, " n"]) -> list[tuple[float, float]]:
+    """Where a mask is true, as stretches of time."""
+    turns = np.flatnonzero(np.diff(np.concatenate([[False], mask, [False]]).astype(int)))
+    return [(float(t[first]), float(t[last - 1])) for first, last in zip(turns[::2], turns[1::2], strict=True)]
+
+
+def averaged(
+    frequency_hz: Line, power: Float64[np.ndarray, " n *k"], lowest_hz: float
+) -> tuple[Thin, Float64[np.ndarray, " m *k"]]:
+    """A spectrum whose neighbours are averaged, forty points a decade above `lowest_hz`.
+
+    Further up than there is room for, a line of noise would otherwise be as broad as it is high.
+    """
+    decade = np.round(PER_DECADE * np.log10(frequency_hz / lowest_hz)).astype(int)
+    starts = np.flatnonzero(np.diff(decade, prepend=decade[0] - 1))
+    count = np.diff(np.append(starts, len(decade)))
+    sums = np.add.reduceat(power, starts, axis=0)
+    return np.add.reduceat(frequency_hz, starts) / count, sums / count.reshape(-1, *[1] * (power.ndim - 1))
+
+
+def plain_numbers(*rulers: Any) -> None:
+    """Numbers along logarithmic axes as people write them, at the decades alone."""
+    from matplotlib.ticker import FuncFormatter, NullFormatter
+
+    for ruler in rulers:
+        ruler.set_major_formatter(FuncFormatter(lambda number, _: f"{number:g}"))
+        ruler.set_minor_formatter(NullFormatter())
+
+
+def library() -> Any:
+    """matplotlib, imported when first asked for.
+
+    Raises:
+        ConfigError: it is not installed.
+    """
+    try:
+        import matplotlib
+    except ImportError as error:
+        raise ConfigError(
+            f"matplotlib is not installed ({error})", where="report", fix="Install it with: pip install 'imutool[report]'"
+        ) from error
+    return matplotlib
+
+
+@contextmanager
+def _inked(colors: Mapping[str, str], salt: str) -> Iterator[None]:
+    """Our style, and our names for colours, for as long as something is drawn; they are no one's else afterwards."""
+    matplotlib = library()
+    known = matplotlib.colors.get_named_colors_mapping()
+    with _drawing, warnings.catch_warnings():  # letters that this font lacks are the browser's to draw
+        warnings.filterwarnings("ignore", message="Glyph .* missing from")
+        for name, color in colors.items():
+            known[name] = color
+        try:
+            with matplotlib.rc_context({**STYLE, "svg.hashsalt": salt}):
+                yield
+        finally:
+            for name in colors:
+                del known[name]
+
+
+def _curves(figure: Any) -> dict[str, str]:
+    """Gives every curve with a label an identifier; returns the labels by it."""
+    from matplotlib.collections import Collection
+    from matplotlib.lines import Line2D
+
+    titles: dict[str, str] = {}
+    for axes in figure.get_axes():
+        for artist in (*axes.lines, *axes.collections):
+            name = str(artist.get_label())
+            if isinstance(artist, Line2D | Collection) and name and not name.startswith("_"):
+                artist.set_gid(f"curve-{len(titles)}")
+                titles[f"curve-{len(titles)}"] = name
+    return titles
+
+
+def _rows(panels: Sequence[Panel]) -> list[list[Panel]]:
+    """Two panels a row; a wide one has its own."""
+    rows: list[list[Panel]] = []
+    for panel in panels:
+        if rows and len(rows[-1]) == 1 and not panel.wide and not rows[-1][0].wide:
+            rows[-1].append(panel)
+        else:
+            rows.append([panel])
+    return rows

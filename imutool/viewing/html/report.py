@@ -1,0 +1,255 @@
+"""A report about logs: one page that holds everything, to be read, printed and sent, or the same pictures as PNGs."""
+
+from __future__ import annotations
+
+import platform
+import re
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from imutool import __version__
+from imutool.errors import ConfigError
+from imutool.location import Place
+from imutool.mcap_io.storage.target import Target
+from imutool.viewing.html import report_errors, report_events, report_paths, report_signals
+from imutool.viewing.html.drawing import HALF_INCH, WIDTH_INCH, Panel, Picture, apart, library, png, svg
+from imutool.viewing.html.page import cards, document, text
+from imutool.viewing.html.report_wording import best, conclusion, label, lowest, number, overall, worst
+from imutool.viewing.html.report_wording import cards as numbers
+from imutool.viewing.model.run_data import RunData
+
+PICTURES: tuple[Callable[[RunData], Picture | None], ...] = (
+    report_paths.paths,
+    report_paths.heat,
+    report_errors.errors,
+    report_errors.drift,
+    report_signals.signals,
+    report_signals.zoom,
+    report_signals.biases,
+    report_signals.spectrum,
+    report_signals.at_rest,
+    report_events.lanes,
+)
+STYLE = """
+h1 { font-size: 22px; color: var(--ink); margin: 0 0 8px; }
+h2.log { font-size: 22px; border-top: 2px solid var(--grid); padding-top: 18px; }
+h3 { font-size: 17px; margin: 30px 0 4px; break-after: avoid; }
+nav { display: flex; flex-wrap: wrap; gap: 4px 16px; font-size: 14px; margin: 10px 0; }
+.pair { display: grid; grid-template-columns: repeat(auto-fit, minmax(min(100%, 440px), 1fr)); gap: 14px 24px; }
+.pair > * { min-width: 0; }
+.numeric th:not(:first-child), .numeric td:not(:first-child) { text-align: right; }
+.numeric th { white-space: normal; vertical-align: bottom; overflow-wrap: anywhere; }
+.numeric td:first-child { min-width: 130px; } .numeric .word { text-align: left !important; }
+@media screen and (min-width: 900px) { .numeric td:first-child { white-space: nowrap; } }
+td.best { font-weight: 700; color: var(--after); }
+summary { cursor: pointer; font-size: 15px; padding: 8px 0; color: var(--soft); }
+@media (max-width: 600px) { main { padding: 14px 12px 40px; } .conclusion { font-size: 17px; } }
+@media print { @page { size: A4; margin: 12mm; } body { font-size: 12px; } nav, summary { display: none; }
+  .pair { grid-template-columns: 1fr 1fr; gap: 8px 12px; } h2.log { break-before: page; } .conclusion { font-size: 16px; }
+  table, dl { font-size: 11px; } th, td { padding: 3px 8px 3px 0; } h3 { margin-top: 16px; }
+  section > .note, section > h3 { break-after: avoid; } .note { font-size: 11px; }
+  details::details-content { content-visibility: visible; display: block; block-size: auto; } a { color: inherit; } }
+"""
+
+
+def page(logs: Sequence[RunData]) -> str:
+    """The page: of one log its conclusion, figures and pictures; of several a comparison first, then each.
+
+    No request leaves it, it needs no program to be read, and what a log is called never becomes markup. A part that the data
+    do not have (truth, models, events) is left out.
+
+    Raises:
+        ConfigError: no logs, or matplotlib is not installed.
+    """
+    if not logs:
+        raise ConfigError("no logs", where="report", expected="at least one")
+    library()
+    if len(logs) == 1:
+        body = [f"<h1>{text(logs[0].name)}</h1>", *_log(logs[0], "log1", alone=True), *_made()]
+        return document(logs[0].name, body, STYLE)
+    body = [f"<h1>{len(logs)} logs</h1>", f'<p class="conclusion">{text(overall(logs))}</p>', *_compared(logs)]
+    for k, data in enumerate(logs, start=1):
+        body += [f'<h2 class="log" id="log{k}">{text(data.name)}</h2>', *_log(data, f"log{k}", alone=False)]
+    return document(f"{len(logs)} logs", [*body, *_made()], STYLE)
+
+
+def write_page(logs: Sequence[RunData], path: Place, *, overwrite: bool = False) -> None:
+    """Writes the page.
+
+    Raises:
+        ConfigError: as `page`, or the file exists (without `overwrite`) or cannot be written.
+    """
+    with Target(path, overwrite=overwrite) as target:  # refuses before the work is done, leaves nothing after a failure
+        target.write(page(logs).encode())
+
+
+def write_pngs(data: RunData, folder: Path, *, overwrite: bool = False) -> list[Path]:
+    """Writes every picture of the page that there is, NAME-paths.png and so on, and returns their paths.
+
+    Raises:
+        ConfigError: matplotlib is not installed, or a file exists (without `overwrite`) or cannot be written.
+    """
+    library()
+    pictures = [picture for picture in _pictures(data) if picture is not None]
+    paths = [folder / f"{file_name(data.name)}-{picture.name}.png" for picture in pictures]
+    there = [path for path in paths if path.exists()]
+    if there and not overwrite:  # before anything is drawn
+        raise ConfigError("the target exists", where=there[0], fix="Choose another folder, or add --overwrite")
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ConfigError(f"cannot be written ({error.strerror})", where=folder, expected="a folder") from error
+    for path, picture in zip(paths, pictures, strict=True):
+        with Target(path, overwrite=overwrite) as target:
+            target.write(png(picture, f"{data.name}: {picture.title}"))
+    return paths
+
+
+def file_name(name: str) -> str:
+    """What files about a log are called: its name without anything that leads elsewhere or hides the file."""
+    return re.sub(r"[^\w.+-]", "_", name).lstrip(".-")[:100] or "_"
+
+
+def by_topic(logs: Sequence[RunData], topics: Sequence[str]) -> list[RunData]:
+    """Several IMUs of one log, each called by its topic too; a single one keeps the log's name."""
+    if len(logs) < 2:
+        return list(logs)
+    return [replace(data, name=f"{data.name} {topic}") for data, topic in zip(logs, topics, strict=True)]
+
+
+def refuse(path: Place, *, overwrite: bool = False) -> None:
+    """Nothing, where a page can be written; to be asked before the work is done.
+
+    Raises:
+        ConfigError: matplotlib is not installed, or the file exists (without `overwrite`) or cannot be written.
+    """
+    library()
+    Target(path, overwrite=overwrite).abandon()
+
+
+def _pictures(data: RunData) -> Iterator[Picture | None]:
+    for make in PICTURES:
+        yield make(data)
+
+
+def _log(data: RunData, key: str, *, alone: bool) -> Iterator[str]:
+    """Everything about one log; among several its pictures are folded, on paper they are not."""
+    pictures = [picture for picture in _pictures(data) if picture is not None]
+    yield f'<p class="conclusion">{text(conclusion(data))}</p>'
+    yield cards(numbers(data))
+    entries = {picture.name: picture.title for picture in pictures}
+    links = [("figures", "Figures")] * bool(data.table()) + list(entries.items()) + [("provenance", "Provenance")]
+    yield f'<nav aria-label="Parts of the report about {text(data.name)}">'
+    yield "".join(f'<a href="#{key}-{name}">{text(title)}</a>' for name, title in links) + "</nav>"
+    yield f'<div class="pair">{"".join((*_figures(data, key), *_windows(data)))}</div>'
+    yield from (f'<p class="note">{text(note)}</p>' for note in (*data.notes, *report_signals.left_out()))
+    if not alone:
+        yield "<details><summary>Pictures, events and provenance</summary>"
+    for picture in pictures:
+        yield from _drawn(picture, key)
+        if picture.name == "events":
+            yield from report_events.table(data)
+    yield from _provenance(data, key)
+    if not alone:
+        yield "</details>"
+
+
+def _drawn(picture: Picture, key: str) -> Iterator[str]:
+    yield f'<section id="{key}-{picture.name}"><h3>{text(picture.title)}</h3>'
+    if picture.caption:
+        yield f'<p class="note">{text(picture.caption)}</p>'
+    yield '<div class="pair">' if not picture.panels[0].wide else "<div>"
+    for k, panel in enumerate(picture.panels):
+        yield f"<figure>{apart(_svg(panel, f'{picture.name}-{k}'), f'{key}-{picture.name}-{k}')}</figure>"
+    yield "</div></section>"
+
+
+def _svg(panel: Panel, name: str) -> str:
+    width = WIDTH_INCH if panel.wide else HALF_INCH
+    return svg(panel.draw, panel.height_inch, name, width_inch=width, label=panel.label)
+
+
+def _figures(data: RunData, key: str) -> Iterator[str]:
+    """Errors of every run, the best of each marked."""
+    rows = [(name, values) for name, values in data.table() if name not in ("samples", "duration_s")]
+    rows = [(name, values) for name, values in rows if any(value is not None for value in values)]
+    if not rows:
+        return
+    head = "".join(f"<th>{text(name)}</th>" for name in ("", *(trace.name for trace in data.traces)))
+    yield f'<section id="{key}-figures"><h3>Figures</h3>'
+    yield f'<div class="scroll"><table class="numeric"><thead><tr>{head}</tr></thead><tbody>'
+    for name, values in rows:
+        yield f"<tr><td>{text(label(name))}</td>{_cells(values, lowest(values, name))}</tr>"
+    counted = {trace.name: trace.figures for trace in data.traces if trace.figures}
+    samples, seconds = next(((one["samples"], one["duration_s"]) for one in counted.values()), (0, 0.0))
+    yield f'</tbody></table></div><p class="note">Root mean squares over {samples:,} samples in {number(seconds)} s from the '
+    yield "true start, and means over stretches of the true path; the best in bold.</p></section>"
+
+
+def _cells(values: Sequence[float | None], marked: int | None) -> str:
+    """Numbers as cells; the whole number is under the pointer."""
+    out = []
+    for k, value in enumerate(values):
+        kind = 'class="number best"' if k == marked else 'class="number"'
+        whole = "" if value is None else f' title="{value!r}"'
+        out.append(f"<td {kind}{whole}>{number(value)}</td>")
+    return "".join(out)
+
+
+def _windows(data: RunData) -> Iterator[str]:
+    """How far windows of each length drift that each start from the truth."""
+    lengths = sorted({window.length_s for trace in data.traces for window in trace.windows})
+    if not lengths:
+        return
+    runs = [trace for trace in data.traces if trace.windows]
+    quantities = (("orientation_deg", "°"), ("velocity_m_s", "m/s"), ("position_m", "m"))
+    head = "".join(f"<th>{text(name)}</th>" for name in ("", *(trace.name for trace in runs)))
+    yield "<section><h3>Drift from a true start</h3>"
+    yield f'<div class="scroll"><table class="numeric"><thead><tr>{head}</tr></thead><tbody>'
+    for name, unit in quantities:
+        for length in lengths:
+            found = [next((w for w in trace.windows if w.length_s == length), None) for trace in runs]
+            values = [None if one is None else float(getattr(one, name)) for one in found]
+            values = [value if value is not None and np.isfinite(value) else None for value in values]
+            words = f"{name.split('_')[0].capitalize()} after {length:g} s ({unit})"
+            yield f"<tr><td>{words}</td>{_cells(values, lowest(values, name))}</tr>"
+    yield '</tbody></table></div><p class="note">Root mean squares at the ends of windows that each start from the truth.</p>'
+    yield "</section>"
+
+
+def _compared(logs: Sequence[RunData]) -> Iterator[str]:
+    """Every run of every log in one row."""
+    head = ("Log", "Run", "Seconds", "Orientation error (°)", "Position error (m)", "Velocity error (m/s)", "Largest (°)")
+    yield '<div class="scroll"><table class="numeric"><thead><tr>'
+    yield "".join(f"<th{' class=word' * (one == 'Run')}>{one}</th>" for one in head) + "</tr></thead><tbody>"
+    for k, data in enumerate(logs, start=1):
+        chosen = best(data)
+        for trace in data.traces:
+            found = worst(trace, data)
+            values = [trace.figures.get(name) for name in ("aoe_deg", "ape_m", "velocity_rmse_m_s")]
+            cells = _cells([*values, None if found is None else found[0]], 0 if trace is chosen else None)
+            name = f'<td><a href="#log{k}">{text(data.name)}</a></td><td class=word>{text(trace.name)}</td>'
+            yield f"<tr>{name}<td class=number>{number(data.duration_s)}</td>{cells}</tr>"
+    yield "</tbody></table></div>"
+
+
+def _provenance(data: RunData, key: str) -> Iterator[str]:
+    yield f'<section id="{key}-provenance"><h3>Provenance</h3>'
+    yield "<dl>"
+    for name, words in data.provenance.items():
+        yield f"<dt>{text(name)}</dt><dd>{text(words)}</dd>"
+    for trace in data.models():
+        gyro, accel = (
+            ", ".join(f"{b:+.4g}" for b in bias.mean(axis=0)) for bias in (trace.run.gyro_bias, trace.run.accel_bias)
+        )
+        yield f"<dt>mean bias, {text(trace.name)}</dt><dd>gyro ({gyro}) rad/s, accel ({accel}) m/s²</dd>"
+    yield "</dl></section>"
+
+
+def _made() -> Iterator[str]:
+    """The versions of what made the page."""
+    drawn = f"numpy {np.__version__}, matplotlib {library().__version__}"
+    yield f'<p class="note">Made by imutool {text(__version__)}, Python {platform.python_version()}, {drawn}.</p>'

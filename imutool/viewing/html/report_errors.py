@@ -1,0 +1,145 @@
+"""How wrong each way of reading the IMU is over time: from the start, by angle and direction, and since each reset."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import partial
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float64, Int64
+
+from imutool.viewing.html.drawing import Panel, Picture, Thin, extremes, legend, plain_numbers
+from imutool.viewing.html.report_paths import color_of
+from imutool.viewing.html.report_wording import aligned
+from imutool.viewing.html.theme import INK
+from imutool.viewing.model.run_data import RunData, Trace
+from imutool.viewing.model.trajectory_error import Drift
+
+DECADES = 2.5  # shown below the largest error of the best run: nothing is decided further down
+APART = 8.0  # times between the largest errors of two runs: beyond, one scale for both is logarithmic, or leaves one out
+MOST_RESETS = 60  # that can be told apart in a picture
+HEIGHTS_INCH = {1: 2.6, 3: 5.6, 4: 5.6}  # of one and of several rows: what stands side by side is of one height
+
+Line = Float64[np.ndarray, " n"]
+
+
+def errors(data: RunData) -> Picture | None:
+    """Orientation (total, roll, pitch, yaw) and position (total, horizontal, vertical); nothing without truth."""
+    scored = [trace for trace in data.traces if trace.errors is not None]
+    if not scored:
+        return None
+    turned = {
+        "total": [_of(trace).orientation_total_deg for trace in scored],
+        **{name: [_of(trace).roll_pitch_yaw_deg[:, k] for trace in scored] for k, name in enumerate(("roll", "pitch", "yaw"))},
+    }
+    moved = {
+        "total": [_of(trace).position_total_m for trace in scored],
+        "horizontal": [_of(trace).horizontal_m for trace in scored],
+        "vertical": [_of(trace).vertical_m for trace in scored],
+    }
+    times = [data.elapsed_s(_of(trace).t_ns) for trace in scored]
+    panels = (
+        _panel(data, scored, times, turned, "Orientation error", "°"),
+        _panel(data, scored, times, moved, "Position error", "m"),
+    )
+    signed = [values for rows in (turned, moved) for name, values in rows.items() if name not in ("total", "horizontal")]
+    out = any(_leaving(values) for values in signed)
+    note = " Where an error with a sign is far larger than the others', it leaves its panel; the total shows all of it." * out
+    return Picture("errors", "Errors over time", f"Integrated from the true start, {aligned(data)}.{note}", panels)
+
+
+def drift(data: RunData) -> Picture | None:
+    """Orientation and position since integration was last set to the truth; nothing where that was not computed."""
+    with_drift = [(trace, trace.drift) for trace in data.traces if trace.drift is not None]
+    if not with_drift:
+        return None
+    scored, drifts = [trace for trace, _ in with_drift], [drift for _, drift in with_drift]
+    caption = f"Set to the truth every {drifts[0].reset_s:g} s."
+    curves = [(data.elapsed_s(one.t_ns), one.orientation_deg, one.position_m) for one in drifts]
+    if any(len(_resets(one)) > MOST_RESETS for one in drifts):
+        curves = [_largest(one, *rows) for one, rows in zip(drifts, curves, strict=True)]
+        caption += " Drawn is the largest drift of each such stretch."
+    times, turned, moved = (list(rows) for rows in zip(*curves, strict=True))
+    panels = (
+        _panel(data, scored, times, {"total": turned}, "Orientation drift", "°"),
+        _panel(data, scored, times, {"total": moved}, "Position drift", "m"),
+    )
+    return Picture("drift", "Drift since the last reset", caption, panels)
+
+
+def _resets(drift: Drift) -> Int64[np.ndarray, " k"]:
+    """The rows at which integration begins anew."""
+    return np.flatnonzero(np.diff(drift.since_s, prepend=np.inf) <= 0.0)
+
+
+def _largest(drift: Drift, t: Line, turned: Line, moved: Line) -> tuple[Thin, Thin, Thin]:
+    """The largest of each stretch between resets, at its beginning."""
+    starts = _resets(drift)
+    return t[starts], np.fmax.reduceat(turned, starts), np.fmax.reduceat(moved, starts)
+
+
+def _of(trace: Trace) -> Any:
+    assert trace.errors is not None, "looked at before"
+    return trace.errors
+
+
+def _panel(
+    data: RunData, scored: Sequence[Trace], times: Sequence[Line], rows: dict[str, list[Line]], title: str, unit: str
+) -> Panel:
+    draw = partial(_draw, data=data, scored=scored, times=times, rows=rows, title=title, unit=unit)
+    return Panel(draw, HEIGHTS_INCH[len(rows)], f"{title} of {', '.join(trace.name for trace in scored)} over time")
+
+
+def _draw(
+    figure: Any,
+    *,
+    data: RunData,
+    scored: Sequence[Trace],
+    times: Sequence[Line],
+    rows: dict[str, list[Line]],
+    title: str,
+    unit: str,
+) -> None:
+    panels = np.atleast_1d(figure.subplots(len(rows), 1, sharex=True))
+    lines: list[Any] = []
+    for axes, (name, values) in zip(panels, rows.items(), strict=True):
+        signed = name not in {"total", "horizontal"}
+        log = not signed and _apart(values)
+        for trace, t, error in zip(scored, times, values, strict=True):
+            shown = np.where(error > 0.0, error, np.nan) if log else error  # the start is exact, which a logarithm cannot show
+            label = f"{trace.name}: {title.lower()}, {name}" if axes is not panels[0] else trace.name
+            line = axes.plot(*extremes(t, shown), color=color_of(data, trace), lw=0.9 if trace.is_raw else 1.3, label=label)
+            lines += line if axes is panels[0] else []
+        _limits(axes, values, signed=signed, log=log)
+        axes.set_ylabel(f"{name} ({unit})" if len(rows) > 1 else f"{title.lower()} ({unit})")
+    panels[0].set_title(title)
+    panels[-1].set(xlabel="time (s)", xlim=(0.0, data.duration_s))
+    figure.align_ylabels(panels)
+    legend(figure, lines)
+
+
+def _limits(axes: Any, values: Sequence[Line], *, signed: bool, log: bool) -> None:
+    """So that the best and the worst run can be read: by a logarithm, or by leaving a far larger one out of the picture."""
+    tops = [float(np.nanmax(np.abs(one))) for one in values if np.isfinite(one).any()]
+    if log:
+        axes.set_yscale("log")
+        plain_numbers(axes.yaxis)
+        axes.set_ylim(min(tops) * 10.0**-DECADES, max(tops) * 2.0)
+    elif signed:
+        axes.axhline(0.0, color=INK, lw=0.6)
+        near = [top for top in tops if top <= APART * min(tops)]
+        most = max(near, default=0.0)
+        axes.set_ylim(-1.15 * most, 1.15 * most) if most > 0.0 else None
+    else:
+        axes.set_ylim(0.0, 1.1 * max(tops, default=1.0) or 1.0)
+
+
+def _apart(values: Sequence[Line]) -> bool:
+    """Whether one scale cannot show them all: the largest errors differ by far."""
+    tops = [float(np.nanmax(one)) for one in values if np.isfinite(one).any()]
+    return len(tops) > 1 and min(tops) > 0.0 and max(tops) > APART * min(tops)
+
+
+def _leaving(values: Sequence[Line]) -> bool:
+    return _apart([np.abs(one) for one in values])

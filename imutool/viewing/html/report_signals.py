@@ -1,0 +1,224 @@
+"""What was measured and what was taken off it, by axis: samples, biases, spectra, and Allan deviations at rest."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from functools import partial
+from importlib.util import find_spec
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float64
+
+from imutool.inertial import stationary
+from imutool.noise import allan
+from imutool.recording import Imu
+from imutool.viewing.html.drawing import Panel, Picture, averaged, extremes, legend, plain_numbers
+from imutool.viewing.html.report_paths import color_of
+from imutool.viewing.html.report_wording import best, number, spoken, worst
+from imutool.viewing.html.theme import AXES, AXIS_COLORS, INK, TITLES, UNITS
+from imutool.viewing.model.run_data import RunData, Trace
+
+SENSORS = ("gyro", "accel")
+HEIGHT_INCH = 4.2
+ZOOM_S = 4.0
+SIGMAS = 3.0
+BAND_POINTS = 300
+LEAST_REST_S = 4.0  # in one piece, from which an Allan deviation says something
+NOUNS = {"gyro": "Angular rate", "accel": "Specific force"}
+
+Vectors = Float64[np.ndarray, "_ 3"]
+Values = Float64[np.ndarray, " _"]
+
+
+def signals(data: RunData) -> Picture:
+    """Raw and corrected samples, each axis in a row: the lowest and the highest of every stretch are drawn."""
+    return _samples(data, "signals", "Signals", "Thinned without losing a peak.", (0.0, data.duration_s))
+
+
+def zoom(data: RunData) -> Picture | None:
+    """The seconds around the largest orientation error of the best model; nothing without truth or model."""
+    chosen = best(data)
+    found = None if chosen is None or chosen.is_raw else worst(chosen, data)
+    if found is None or data.duration_s <= 2.0 * ZOOM_S:
+        return None
+    assert chosen is not None, "then nothing was found"
+    first = min(max(found[1] - ZOOM_S / 2.0, 0.0), data.duration_s - ZOOM_S)
+    caption = f"Every sample of {ZOOM_S:g} s around the largest orientation error of {spoken(chosen)}."
+    return _samples(data, "zoom", "Signals where the error is largest", caption, (first, first + ZOOM_S))
+
+
+def biases(data: RunData) -> Picture | None:
+    """What each model took off, with three standard deviations where it states them, and the truth where known."""
+    models = data.models()
+    if not models:
+        return None
+    panels = [Panel(partial(_draw_bias, data=data, sensor=one), HEIGHT_INCH, f"{TITLES[one]} bias by axis") for one in SENSORS]
+    band = " Bands: three standard deviations, as the model states them." * any(t.run.bias_std is not None for t in models)
+    true = " Dashed: the true bias." * bool(data.true_bias)
+    return Picture("bias", "Biases", f"What each model took off the samples.{band}{true}", tuple(panels))
+
+
+def spectrum(data: RunData) -> Picture | None:
+    """Amplitude densities of the samples up to half their rate; nothing for a log too short to have one."""
+    if not any(trace.spectra for trace in data.traces):
+        return None
+    curves = {
+        sensor: [
+            (trace, one.frequency_hz, one.density) for trace in data.traces if (one := trace.spectra.get(sensor)) is not None
+        ]
+        for sensor in SENSORS
+    }
+    panels = [
+        Panel(
+            partial(_draw_spectrum, data=data, sensor=sensor, curves=curves[sensor]), HEIGHT_INCH, f"{TITLES[sensor]} spectrum"
+        )
+        for sensor in SENSORS
+        if curves[sensor]
+    ]
+    return Picture("spectrum", "Spectra", "Amplitude density of the samples (Welch), up to half their rate.", tuple(panels))
+
+
+def at_rest(data: RunData) -> Picture | None:
+    """Allan deviations, raw and corrected, over the time in which the log rests.
+
+    Nothing where it does not rest for long, or where allantools is not installed (`left_out` says so).
+    """
+    if find_spec("allantools") is None:
+        return None
+    imu = data.traces[0].run.imu
+    ranges = [(a, b) for a, b in stationary.stretches(imu) if (b - a) * imu.period_s >= LEAST_REST_S]
+    if not ranges:
+        return None
+    rest_s = sum(b - a for a, b in ranges) * imu.period_s
+    curves: dict[str, list[Any]] = {sensor: [] for sensor in SENSORS}
+    for trace in data.traces:
+        still = [trace.run.imu.between(int(imu.t_ns[a]), int(imu.t_ns[b - 1])) for a, b in ranges]
+        for sensor in SENSORS:
+            curve = allan.curve([_both(one)[sensor] for one in still], imu.period_s)
+            curves[sensor].append((trace, curve.tau_s, curve.deviation))
+    panels = [
+        Panel(partial(_draw_allan, data=data, sensor=one, curves=curves[one]), HEIGHT_INCH, f"{TITLES[one]} Allan deviation")
+        for one in SENSORS
+    ]
+    caption = f"Over {number(rest_s)} s at rest in {len(ranges)} stretch{'es' * (len(ranges) > 1)}; overlapping."
+    return Picture("allan", "Allan deviation at rest", caption, tuple(panels))
+
+
+def left_out() -> list[str]:
+    """Sentences about pictures that there could be if more were installed."""
+    if find_spec("allantools") is not None:
+        return []
+    return ["Allan deviations are left out: allantools is not installed (pip install 'imutool[report]')."]
+
+
+def _samples(data: RunData, name: str, title: str, caption: str, span_s: tuple[float, float]) -> Picture:
+    panels = [
+        Panel(partial(_draw_samples, data=data, sensor=sensor, span_s=span_s), HEIGHT_INCH, f"{NOUNS[sensor]} by axis")
+        for sensor in SENSORS
+    ]
+    return Picture(name, title, caption, tuple(panels))
+
+
+def _by_axis(figure: Any, sensor: str, title: str, unit: str) -> list[Any]:
+    """Three panels under each other, x, y and z in their colours."""
+    panels: list[Any] = list(figure.subplots(3, 1, sharex=True))
+    for axis, axes in enumerate(panels):
+        axes.set_ylabel(f"{AXES[axis]} ({unit})" if unit else AXES[axis], color=AXIS_COLORS[axis], fontweight="bold")
+    panels[0].set_title(title)
+    figure.align_ylabels(panels)
+    return panels
+
+
+def _draw_samples(figure: Any, *, data: RunData, sensor: str, span_s: tuple[float, float]) -> None:
+    panels = _by_axis(figure, sensor, NOUNS[sensor], UNITS[sensor])
+    lines = []
+    for trace in data.traces:
+        t = data.elapsed_s(trace.run.imu.t_ns)
+        part = slice(*np.searchsorted(t, span_s, side="left") + np.array([0, 1]))
+        values = _both(trace.run.imu)[sensor][part]
+        under = trace.is_raw and bool(data.models())
+        style: dict[str, Any] = {"color": color_of(data, trace), "lw": 1.8 if under else 0.8, "alpha": 0.55 if under else 1.0}
+        drawn = [_line(axes, t[part], values[:, k], trace.name, k, style) for k, axes in enumerate(panels)]
+        lines.append(drawn[0])
+    panels[-1].set(xlabel="time (s)", xlim=span_s)
+    legend(figure, lines)
+
+
+def _draw_bias(figure: Any, *, data: RunData, sensor: str) -> None:
+    panels = _by_axis(figure, sensor, f"{TITLES[sensor]} bias", UNITS[sensor])
+    lines = []
+    for trace in data.models():
+        bias = trace.run.gyro_bias if sensor == "gyro" else trace.run.accel_bias
+        t, color = data.elapsed_s(trace.run.imu.t_ns), color_of(data, trace)
+        if trace.run.bias_std is not None:
+            std = trace.run.bias_std[:, :3] if sensor == "gyro" else trace.run.bias_std[:, 3:]
+            _bands(panels, t, bias, SIGMAS * std, color)
+        drawn = [_line(axes, t, bias[:, k], trace.name, k, {"color": color, "lw": 1.3}) for k, axes in enumerate(panels)]
+        lines.append(drawn[0])
+    true = data.true_bias.get(sensor)
+    if true is not None:
+        t, style = data.elapsed_s(true.t_ns), {"color": INK, "lw": 1.3, "ls": (0, (4, 2))}
+        drawn = [_line(axes, t, true.values[:, k], "true", k, style) for k, axes in enumerate(panels)]
+        lines.append(drawn[0])
+    for axes in panels:
+        axes.margins(y=0.15)
+    panels[-1].set(xlabel="time (s)", xlim=(0.0, data.duration_s))
+    legend(figure, lines)
+
+
+def _bands(panels: Sequence[Any], t: Values, bias: Vectors, half: Vectors, color: str) -> None:
+    """Three standard deviations about each axis: of every stretch that is a pixel wide, from its lowest to its highest."""
+    starts = np.unique(np.linspace(0, len(t) - 1, BAND_POINTS).astype(int))
+    low, high = np.minimum.reduceat(bias - half, starts), np.maximum.reduceat(bias + half, starts)
+    for k, axes in enumerate(panels):
+        axes.fill_between(t[starts], low[:, k], high[:, k], color=color, alpha=0.22, lw=0, label=f"±3 σ, {AXES[k]}")
+
+
+def _draw_spectrum(figure: Any, *, data: RunData, sensor: str, curves: Sequence[Any]) -> None:
+    panels = _by_axis(figure, sensor, f"{NOUNS[sensor]} ({UNITS[sensor]}/√Hz)", "")
+    lines = []
+    for trace, frequency_hz, density in curves:
+        at, power = averaged(frequency_hz, density, frequency_hz[0])
+        drawn = [_log_line(axes, at, np.sqrt(power[:, k]), data, trace, k) for k, axes in enumerate(panels)]
+        lines.append(drawn[0])
+    _decades(panels)
+    panels[-1].set_xlabel("frequency (Hz)")
+    legend(figure, lines)
+
+
+def _draw_allan(figure: Any, *, data: RunData, sensor: str, curves: Sequence[Any]) -> None:
+    panels = _by_axis(figure, sensor, f"{TITLES[sensor]}: Allan deviation", UNITS[sensor])
+    lines = []
+    for trace, tau_s, deviation in curves:
+        drawn = [_log_line(axes, tau_s, deviation[:, k], data, trace, k) for k, axes in enumerate(panels)]
+        lines.append(drawn[0])
+    _decades(panels)
+    panels[-1].set_xlabel("averaging time (s)")
+    legend(figure, lines)
+
+
+def _line(axes: Any, t: Any, y: Any, name: str, axis: int, style: Mapping[str, Any]) -> Any:
+    return axes.plot(*extremes(t, y), label=name if axis == 0 else f"{name}, {AXES[axis]}", **style)[0]
+
+
+def _log_line(axes: Any, x: Any, y: Any, data: RunData, trace: Trace, axis: int) -> Any:
+    name = trace.name if axis == 0 else f"{trace.name}, {AXES[axis]}"
+    shown = np.where(y > 0.0, y, np.nan)  # a constant has no density
+    under = trace.is_raw and bool(data.models())
+    style: dict[str, Any] = {"color": color_of(data, trace), "lw": 1.8 if under else 1.0, "alpha": 0.55 if under else 1.0}
+    return axes.plot(x, shown, label=name, **style)[0]
+
+
+def _decades(panels: Sequence[Any]) -> None:
+    """Logarithmic axes whose ends are whole decades upwards, so that every panel has labels."""
+    for axes in panels:
+        axes.set_xscale("log")
+        axes.set_yscale("log")
+        low, high = axes.get_ylim()
+        axes.set_ylim(10.0 ** np.floor(np.log10(low)), 10.0 ** np.ceil(np.log10(high)))
+        plain_numbers(axes.xaxis, axes.yaxis)
+
+
+def _both(imu: Imu) -> dict[str, Vectors]:
+    return {"gyro": imu.gyro, "accel": imu.accel}

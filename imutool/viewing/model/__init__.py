@@ -1,0 +1,1 @@
+"""What a picture of a log shows, free of any viewer."""

@@ -1,0 +1,169 @@
+"""How far an estimate is from the truth over time: errors by axis, by angle and by direction, drift since a reset, windows."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal, NamedTuple, get_args
+
+import numpy as np
+from jaxtyping import Bool, Float64
+from scipy.spatial.transform import Rotation
+
+from imutool.errors import DataError
+from imutool.geometry import quaternion
+from imutool.inertial.metrics import align
+from imutool.inertial.strapdown import drift, drifted
+from imutool.recording import Poses, Times, nanoseconds
+
+Alignment = Literal["none", "origin", "yaw", "se3"]
+ALIGNMENTS: tuple[Alignment, ...] = get_args(Alignment)
+RESET_S = 10.0
+WINDOWS_S = (1.0, 5.0, 10.0, 30.0)
+
+
+@dataclass(frozen=True, eq=False)
+class Errors:
+    """How far an estimate is from the truth at its own stamps; a row is NaN where there is no truth to compare with."""
+
+    t_ns: Times
+    orientation_deg: Float64[np.ndarray, "n 3"]  # Log(R_true^T R_estimated), in the true body frame
+    roll_pitch_yaw_deg: Float64[np.ndarray, "n 3"]  # of R_estimated R_true^T: about the world's x, y and z (yaw: heading)
+    position_m: Float64[np.ndarray, "n 3"]  # estimated minus true, world
+
+    @property
+    def orientation_total_deg(self) -> Float64[np.ndarray, " n"]:
+        """The angle of the orientation error, 0 to 180 degrees."""
+        return quaternion.length(self.orientation_deg)
+
+    @property
+    def position_total_m(self) -> Float64[np.ndarray, " n"]:
+        """The length of the position error."""
+        return quaternion.length(self.position_m)
+
+    @property
+    def horizontal_m(self) -> Float64[np.ndarray, " n"]:
+        """The length of the position error in the world's horizontal plane."""
+        return quaternion.length(self.position_m[:, :2])
+
+    @property
+    def vertical_m(self) -> Float64[np.ndarray, " n"]:
+        """The position error upwards, with its sign."""
+        return self.position_m[:, 2]
+
+
+@dataclass(frozen=True, eq=False)
+class Drift:
+    """How far integration has drifted since it was last set to the truth, every `reset_s`; NaN where there is no truth."""
+
+    reset_s: float
+    t_ns: Times
+    since_s: Float64[np.ndarray, " n"]  # time since the reset
+    orientation_deg: Float64[np.ndarray, " n"]
+    velocity_m_s: Float64[np.ndarray, " n"]
+    position_m: Float64[np.ndarray, " n"]
+
+
+@dataclass(frozen=True)
+class Window:
+    """Root mean square errors at the ends of windows of one length that each start from the truth."""
+
+    length_s: float
+    count: int
+    orientation_deg: float
+    velocity_m_s: float
+    position_m: float
+
+
+def errors(estimate: Poses, truth: Poses, valid: Bool[np.ndarray, " n"]) -> Errors:
+    """The error of an estimate against the truth at the same stamps, NaN where `valid` is false."""
+    q_true, q = truth.q_wb_wxyz, estimate.q_wb_wxyz
+    back = quaternion.inverse(q_true)
+    hole = np.where(valid, 0.0, np.nan)[:, None]
+    turned = np.rad2deg(quaternion.log(quaternion.multiply(back, q)))
+    roll_pitch_yaw = np.rad2deg(quaternion.roll_pitch_yaw(quaternion.multiply(q, back)))
+    return Errors(estimate.t_ns, turned + hole, roll_pitch_yaw + hole, estimate.p_wb - truth.p_wb + hole)
+
+
+class Motion(NamedTuple):
+    """The rigid motion that brought an estimate nearest to the truth: a turn, then a shift, both in the world."""
+
+    turn: Rotation
+    shift_m: Float64[np.ndarray, "3"]
+
+
+def aligned(estimate: Poses, truth: Poses, valid: Bool[np.ndarray, " n"], alignment: Alignment) -> tuple[Poses, Motion]:
+    """The estimate after a rigid motion of all of it, found over the rows where the truth is known, and that motion.
+
+    `origin`: its first pose becomes the true one. `yaw`: positions are nearest by least squares among turns about the vertical,
+    theta = atan2(sum (p x p_true)_z, sum (p . p_true)_xy) about the means, the four directions an inertial sensor cannot know.
+    `se3`: among all rigid motions (Umeyama 1991, `metrics.align`).
+
+    Raises:
+        DataError: no row has truth, or positions that leave the motion of `se3` open.
+        NumericsError: positions overflow.
+    """
+    if not valid.any():
+        raise DataError("the truth is known at none of the estimate's stamps", expected="some overlap")
+    if alignment == "none":
+        return estimate, Motion(Rotation.identity(), np.zeros(3))
+    motion = _motion(estimate, truth, valid, alignment)
+    R = motion.turn.as_matrix()
+    v_w = None if estimate.v_w is None else estimate.v_w @ R.T
+    q_wb_wxyz = quaternion.multiply(motion.turn.as_quat(scalar_first=True)[None], estimate.q_wb_wxyz)
+    return Poses(estimate.t_ns, estimate.p_wb @ R.T + motion.shift_m, q_wb_wxyz, v_w), motion
+
+
+def _motion(estimate: Poses, truth: Poses, valid: Bool[np.ndarray, " n"], alignment: Alignment) -> Motion:
+    if alignment == "origin":
+        row = int(np.argmax(valid))
+        found, true = (Rotation.from_quat(poses.q_wb_wxyz[row], scalar_first=True) for poses in (estimate, truth))
+        return _about(true * found.inv(), estimate.p_wb[row], truth.p_wb[row])
+    p, p_true = estimate.p_wb[valid], truth.p_wb[valid]
+    centre, centre_true = p.mean(axis=0), p_true.mean(axis=0)
+    if alignment == "yaw":
+        (x, y, _), (x_true, y_true, _) = (p - centre).T, (p_true - centre_true).T
+        angle = np.arctan2(x @ y_true - y @ x_true, x @ x_true + y @ y_true)
+        return _about(Rotation.from_rotvec([0.0, 0.0, angle]), centre, centre_true)
+    motion = align(p, p_true)
+    if motion is None:
+        raise DataError(
+            "positions lie on a line and leave the turn about it open", where="--align", fix="Use --align yaw, origin or none"
+        )
+    return Motion(*motion)
+
+
+def _about(turn: Rotation, centre: Float64[np.ndarray, "3"], goal: Float64[np.ndarray, "3"]) -> Motion:
+    """The turn that takes a point to another."""
+    return Motion(turn, goal - turn.as_matrix() @ centre)
+
+
+def drift_since_reset(path: Poses, truth: Poses, valid: Bool[np.ndarray, " n"], reset_s: float = RESET_S) -> Drift:
+    """How far the integration of `path` would have drifted, had it been set to the truth every `reset_s`, at every sample.
+
+    A reset that falls where the truth is unknown happens as soon as it is known again.
+    """
+    known = np.flatnonzero(valid)
+    turn_of = (path.t_ns[known] - path.t_ns[0]) // nanoseconds(reset_s)
+    resets = np.diff(turn_of, prepend=-1) > 0
+    last_reset = known[resets][np.cumsum(resets) - 1]
+    found = drifted(path, truth, last_reset, slice(None) if valid.all() else known)
+    since_s, *errors = (np.full(len(path), np.nan) for _ in range(4))
+    since_s[known] = (path.t_ns[known] - path.t_ns[last_reset]) * 1e-9
+    for column, values in zip(errors, found._replace(orientation_rad=np.rad2deg(found.orientation_rad)), strict=True):
+        column[known] = values
+    return Drift(reset_s, path.t_ns, since_s, *errors)
+
+
+def windows(path: Poses, truth: Poses, valid: Bool[np.ndarray, " n"]) -> tuple[Window, ...]:
+    """The drift over windows of each length in `WINDOWS_S` of which at least one fits (`strapdown.drift`)."""
+    found = []
+    for length_s in WINDOWS_S:
+        ends = drift(path, truth, valid, length_s)
+        if count := len(ends.position_m):
+            turned_deg = float(np.rad2deg(_rms(ends.orientation_rad)))
+            found.append(Window(length_s, count, turned_deg, _rms(ends.velocity_m_s), _rms(ends.position_m)))
+    return tuple(found)
+
+
+def _rms(values: Float64[np.ndarray, " n"]) -> float:
+    return float(np.sqrt(np.mean(values**2)))

@@ -1,0 +1,213 @@
+"""What a person asked to see and how: checked before any work, done in one go, each way said in a sentence."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass
+from importlib.metadata import version
+from importlib.util import find_spec
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from imutool import __version__
+from imutool.errors import ConfigError, DataError
+from imutool.viewing.html import report
+from imutool.viewing.model.output import Shown
+from imutool.viewing.model.run_data import RunData
+from imutool.viewing.rerun.sdk import title
+
+if TYPE_CHECKING:
+    from imutool.viewing.rerun.connect import Peer
+    from imutool.viewing.rerun.web import Server
+
+logger = logging.getLogger(__name__)
+
+WORST = "worst"
+
+
+@dataclass(frozen=True)
+class Asked:
+    """The ways to look that were asked for, all of which are taken; with none of them a viewer opens.
+
+    `at` is where the cursor starts: seconds since the first IMU sample, or `worst`, the largest error of a model.
+    """
+
+    save: Path | None = None
+    connect: str | None = None
+    web: bool = False
+    port: int | None = None
+    export: Path | None = None
+    png: Path | None = None
+    html: Path | None = None
+    at: str | None = None
+    source: bool = True
+    overwrite: bool = False
+
+    @property
+    def opens_viewer(self) -> bool:
+        """Whether a viewer of our own is to open: nothing else was asked for."""
+        return self.connect is None and not self.web and all(p is None for p in (self.save, self.export, self.png, self.html))
+
+    @property
+    def needs_rerun(self) -> bool:
+        """Whether nothing of what was asked for can be done without Rerun."""
+        return self.connect is not None or self.web or self.save is not None or self.export is not None
+
+    @property
+    def has_cursor(self) -> bool:
+        """Whether one of the ways has a cursor that can be set; a file has none."""
+        return self.opens_viewer or self.connect is not None or self.web or self.export is not None
+
+
+class Ways:
+    """Everything that can be known before the logs are read: who listens, which port is free; context manager.
+
+    Where nobody listens at `connect`, that is said at once, an .rrd is saved instead, and `refused` is what to end with.
+
+    Raises:
+        ConfigError: contradictory wishes, `connect` is no address, or Rerun is needed and not installed.
+    """
+
+    def __init__(self, asked: Asked) -> None:
+        self.asked = asked
+        self.refused: ConfigError | None = None
+        self._peer: Peer | None = None
+        self._server: Server | None = None
+        self._stack = ExitStack()
+        _refuse_contradictions(asked)
+        if not asked.needs_rerun:
+            return
+        from imutool.viewing.rerun import connect, export, sdk, web
+
+        sdk.need_sdk()
+        if asked.export is not None:
+            export.refuse(asked.export, overwrite=asked.overwrite)
+        if asked.connect is not None:
+            self._connect(connect.full(asked.connect))
+        if asked.web:
+            self._server = self._stack.enter_context(web.Server(asked.port))
+
+    def _connect(self, url: str) -> None:
+        from imutool.viewing.rerun import connect
+
+        try:
+            self._peer = connect.probe(url)
+        except ConfigError as error:
+            self.refused = error
+            logger.warning("%s", error)
+
+    def show(self, logs: Sequence[RunData]) -> list[Shown]:
+        """Takes every way that was asked for, in an order that leaves the longest for last.
+
+        Raises:
+            ConfigError: a target exists or cannot be written, or a viewer stops listening.
+            DataError: `worst` without truth, a time outside the log, or a picture of nothing.
+        """
+        at_s = None if self.asked.at is None else cursor_s(logs, self.asked.at)
+        return [*self._pages(logs), *self._recordings(logs, at_s)]
+
+    def versions(self) -> dict[str, str | None]:
+        """Of imutool, of the Rerun that is installed, and of the viewer at `connect`, which may be another."""
+        rerun = version("rerun-sdk") if find_spec("rerun") is not None else None
+        return {"imutool": __version__, "rerun": rerun, "viewer": rerun if self._peer is None else self._peer.version}
+
+    def serve(self) -> None:
+        """Serves what `web` asked for until Ctrl-C; returns at once where it did not."""
+        if self._server is not None:
+            self._server.serve()
+
+    def __enter__(self) -> Ways:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._stack.close()
+
+    def _pages(self, logs: Sequence[RunData]) -> Iterator[Shown]:
+        """What needs no Rerun."""
+        if (page := self.asked.html) is not None:
+            yield _page(logs, page, self.asked.overwrite)
+        if (folder := self.asked.png) is not None:
+            for data in logs:
+                paths = report.write_pngs(data, folder, overwrite=self.asked.overwrite)
+                listed = ", ".join(map(str, paths))
+                yield Shown("png", str(folder), f"Drew {listed}" if paths else f"There is nothing to draw of {data.name}")
+
+    def _recordings(self, logs: Sequence[RunData], at_s: float | None) -> Iterator[Shown]:
+        """What needs Rerun."""
+        asked = self.asked
+        if asked.opens_viewer:
+            yield _open(logs, asked, at_s)
+        if not asked.needs_rerun:
+            return
+        from imutool.viewing.rerun import connect, export, files, web
+
+        if asked.save is not None or self.refused is not None:
+            yield files.save(logs, asked.save, source=asked.source, overwrite=asked.overwrite)
+        if asked.export is not None:
+            yield export.export(logs, asked.export, source=asked.source, at_s=at_s, overwrite=asked.overwrite)
+        if self._peer is not None:
+            yield connect.send(logs, self._peer, source=asked.source, at_s=at_s)
+        if self._server is not None:
+            yield self._server.offer(web.site(logs, source=asked.source, at_s=at_s))
+
+
+def cursor_s(logs: Sequence[RunData], at: str) -> float:
+    """A time since the first IMU sample: as it says, or where the first log with truth has its largest error.
+
+    That is the orientation error of a model, of what was recorded where there is no model.
+
+    Raises:
+        ConfigError: neither a number nor `worst`.
+        DataError: no log has truth, or the time is outside them all.
+    """
+    if at == WORST:
+        found = [(data, trace) for data in logs for trace in data.models() or data.traces if trace.errors is not None]
+        if not found:
+            raise DataError("no log has truth, so nobody knows its worst error", where="--at", fix="Give the time in seconds")
+        data = found[0][0]
+        peaks = [trace.errors for one, trace in found if one is data and trace.errors is not None]
+        worst = max(peaks, key=lambda errors: float(np.nanmax(errors.orientation_total_deg)))
+        row = int(np.nanargmax(worst.orientation_total_deg))
+        return float(data.elapsed_s(worst.t_ns[row : row + 1])[0])
+    longest = max(data.duration_s for data in logs)
+    try:
+        seconds = float(at)
+    except ValueError as error:
+        raise ConfigError(f"{at!r}", where="--at", expected="seconds since the first IMU sample, or worst") from error
+    if not 0.0 <= seconds <= longest:
+        raise DataError(f"{at} s is outside the log", where="--at", expected=f"0 to {longest:.3f} s")
+    return seconds
+
+
+def _open(logs: Sequence[RunData], asked: Asked, at_s: float | None) -> Shown:
+    """A viewer; without Rerun the next best thing, a page here."""
+    if find_spec("rerun") is None:
+        no_rerun = "The viewer is not installed (pip install 'imutool[view]')"
+        if find_spec("matplotlib") is None:
+            raise ConfigError(
+                no_rerun, where="view", expected="it, or matplotlib for a page", fix="pip install 'imutool[view,report]'"
+            )
+        page = _page(logs, Path(f"{title(logs)}.html"), asked.overwrite)
+        return page._replace(said=f"{no_rerun}. {page.said}")
+    from imutool.viewing.rerun import viewer
+
+    return viewer.show(logs, source=asked.source, at_s=at_s, overwrite=asked.overwrite)
+
+
+def _page(logs: Sequence[RunData], path: Path, overwrite: bool) -> Shown:
+    report.write_page(logs, path, overwrite=overwrite)
+    return Shown("html", str(path), f"Wrote {path}. Open it in a browser")
+
+
+def _refuse_contradictions(asked: Asked) -> None:
+    """Raises ConfigError where two wishes exclude each other, or one has nothing to act on."""
+    if asked.connect is not None and asked.web:
+        raise ConfigError("--connect and --web", where="view", fix="Leave one of the two out")
+    if asked.port is not None and not asked.web:
+        raise ConfigError(f"--port {asked.port} without --web", where="--port", fix="Add --web")
+    if asked.at is not None and not asked.has_cursor:
+        raise ConfigError("a file has no cursor", where="--at", fix="Leave it out, or give --connect, --web or --export-web")

@@ -1,0 +1,1 @@
+"""What is logged to Rerun, one kind of entity a file."""

@@ -1,0 +1,98 @@
+"""A covariance is that of the rest bias, and of the calibration as far as that is not a rest bias itself."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from imutool.bias import hybrid
+from imutool.bias_start.bias_covariance import Certainty
+from imutool.bias_start.bias_tracking import Following, Known, Track
+from imutool.bias_start.initial_bias import TurnOn
+
+RATE_HZ, SIZE = 200.0, 8000
+SCALE_STD, G_STD = 2e-3, 1e-4  # of a share, and of rad/s per m/s²
+REST = np.zeros(6)
+STD = np.array([3e-4] * 3 + [2e-2] * 3)
+KNOWN = Known(REST, STD, STD)
+WAYS = {
+    "held": TurnOn(REST, STD, "given"),
+    "followed": TurnOn(REST, STD, "followed", follows=KNOWN),
+    "smoothed": TurnOn(REST, STD, "smoothed", track=Track(np.zeros(1), REST[None], STD[None])),
+}
+SAME = 1e-10  # of float64 through a sum over all samples
+MEAN_LEFT = 0.01  # of the variance: a mean so far over 40 turns is not quite zero
+
+Samples = tuple[np.ndarray, np.ndarray, np.ndarray]
+
+
+def model_of(*names: str) -> hybrid.Model:
+    """Gyro effects of whose parameters nothing is known but a standard deviation."""
+    model = hybrid.Model(hybrid.Config(remainder=False), RATE_HZ).double()
+    std = {"gyro_scale": SCALE_STD, "gyro_g_sensitivity": G_STD}
+    size = {"gyro_scale": 3, "gyro_g_sensitivity": 9}
+    each = torch.cat([torch.full((size[name],), std[name], dtype=torch.float64) for name in names])
+    model.take("gyro", names, torch.zeros_like(each), torch.diag(each**2))
+    return model
+
+
+@pytest.fixture
+def turning() -> Samples:
+    """40 turns to and fro about x, level, at rest in the first sample's direction of gravity."""
+    t_s = np.arange(SIZE) / RATE_HZ
+    gyro = np.zeros((SIZE, 3))
+    gyro[:, 0] = 1.5 * np.sin(2 * np.pi * t_s)
+    return t_s, gyro, np.tile([0.0, 0.0, 9.81], (SIZE, 1))
+
+
+def calibrated(model: hybrid.Model, way: str, samples: Samples, blocks: int = 1) -> tuple[np.ndarray, np.ndarray]:
+    """The covariance, and what of it is the rest bias's."""
+    found: list[tuple[np.ndarray, np.ndarray]] = []
+    stream = WAYS[way].stream(model)
+    both = [Certainty(model, WAYS[way], stream) for _ in range(2)]
+    for rows in np.array_split(np.arange(SIZE), blocks):
+        some = tuple(x[rows] for x in samples)
+        stream(*some)
+        found.append((both[0](*some), both[1].parts(*some).rest))
+    return np.concatenate([a for a, _ in found]), np.concatenate([b for _, b in found])
+
+
+def test_a_bias_that_is_held_gets_all_that_the_fit_left_open(turning: Samples) -> None:
+    total, rest = calibrated(model_of("gyro_scale", "gyro_g_sensitivity"), "held", turning)
+    expected = np.zeros((SIZE, 3))
+    expected[:, 0] = (SCALE_STD * turning[1][:, 0]) ** 2
+    expected += (G_STD * 9.81) ** 2
+    np.testing.assert_allclose(np.diagonal(total - rest, axis1=1, axis2=2)[:, :3], expected, rtol=1e-6, atol=1e-15)
+
+
+@pytest.mark.parametrize("way", ["followed", "smoothed"])
+def test_what_stays_the_same_is_a_rest_bias_and_counts_once(turning: Samples, way: str) -> None:
+    total, rest = calibrated(model_of("gyro_g_sensitivity"), way, turning)
+    np.testing.assert_allclose(total, rest, rtol=0, atol=SAME * (G_STD * 9.81) ** 2)
+
+
+@pytest.mark.parametrize("way", ["followed", "smoothed"])
+def test_what_goes_with_the_motion_counts_whole(turning: Samples, way: str) -> None:
+    total, rest = calibrated(model_of("gyro_scale"), way, turning)
+    late = slice(SIZE // 2, None)  # the mean so far has become small
+    share = np.mean((total - rest)[late, 0, 0]) / np.mean((SCALE_STD * turning[1][late, 0]) ** 2)
+    assert abs(share - 1) < MEAN_LEFT
+
+
+@pytest.mark.parametrize("way", WAYS)
+def test_blocks_change_nothing(turning: Samples, way: str) -> None:
+    model = model_of("gyro_scale", "gyro_g_sensitivity")
+    whole, _ = calibrated(model, way, turning)
+    parts, _ = calibrated(model, way, turning, blocks=37)
+    np.testing.assert_allclose(parts, whole, rtol=1e-9, atol=SAME * (G_STD * 9.81) ** 2)
+
+
+def test_the_streams_own_covariance_is_left_as_it_is(turning: Samples) -> None:
+    model = model_of("gyro_scale")
+    stream = WAYS["followed"].stream(model)
+    assert isinstance(stream, Following)
+    stream(*turning)
+    before = stream.covariance.copy()
+    Certainty(model, WAYS["followed"], stream)(*turning)
+    assert np.array_equal(stream.covariance, before)

@@ -1,0 +1,212 @@
+"""Planted biases are found, as surely as it says; nothing later changes what came before; smoothing sees the end."""
+
+from __future__ import annotations
+
+import time
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from imutool.bias import static
+from imutool.bias.model import BiasModel
+from imutool.bias_start.bias_tracking import CHUNK_S, Following, Known, Passed, RestFilter, Track, followed, smooth, smoothed
+from imutool.inertial.metrics import consistency
+from imutool.recording import Imu, seconds
+from imutool.sensor.flight import FlightSettings, TriadSettings, flight
+
+RATE_HZ = 200.0
+PRIOR = np.array([3e-3] * 3 + [0.1] * 3)
+GROUND = np.array([1e-3] * 3 + [0.03] * 3)
+SENSOR = {
+    "gyro": TriadSettings(
+        noise_density=2e-4, walk_density=0.0, typical_bias=0.0, turn_on_bias=0.0, warm_up=0.0, scale=0.0, misalignment_rad=0.0
+    ),
+    "accel": TriadSettings(
+        noise_density=2e-3, walk_density=0.0, typical_bias=0.0, turn_on_bias=0.0, warm_up=0.0, scale=0.0, misalignment_rad=0.0
+    ),
+}
+SETTINGS = FlightSettings(**SENSOR, room_m=0.6, position_knot_s=0.9, tilt_rad=0.25)  # speeds of about 1 m/s
+KNOWN = Known(np.zeros(6), PRIOR, GROUND)
+SEEDS = range(12)
+BOUND = 0.999  # of chi-square: one run of this suite in a thousand would fail by chance, were the seeds not fixed
+
+
+def planted(seed: int) -> tuple[np.ndarray, np.ndarray]:
+    """A run's bias in motion, and what is added at rest."""
+    rng = np.random.default_rng([7, seed])
+    return PRIOR * rng.normal(size=6), GROUND * rng.normal(size=6) * np.array([1, 1, 1, 0, 0, 0])
+
+
+def biased(seed: int, *, duration_s: float = 60.0, still_s: float = 0.0, backwards: bool = False) -> Imu:
+    """A flight with planted biases: still at its start, or, flown backwards, at its end."""
+    made = flight(seed, SETTINGS, duration_s=duration_s, still_s=still_s).imu
+    bias, ground = planted(seed)
+    gyro, accel = made.gyro.copy(), made.accel.copy()
+    resting = (seconds(made.t_ns, int(made.t_ns[0])) < still_s)[:, None]
+    if backwards:  # time reversed: rates change sign, forces do not
+        gyro, accel, resting = -gyro[::-1], accel[::-1], resting[::-1]
+    both = bias + resting * ground
+    return Imu(made.t_ns, gyro + both[:, :3], accel + both[:, 3:])
+
+
+def samples(imu: Imu) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    return seconds(imu.t_ns, int(imu.t_ns[0])), imu.gyro, imu.accel
+
+
+def model() -> BiasModel:
+    return static.Model().double()
+
+
+def forward(imu: Imu, known: Known = KNOWN) -> list[Passed]:
+    return list(followed(model(), [samples(imu)], known))
+
+
+# ── what it finds ────────────────────────────────────────────────────────────────────────────────────────────────────
+
+
+@pytest.mark.parametrize("still_s", [0.0, 5.0])
+def test_planted_biases_are_found_within_three_of_its_standard_deviations(still_s: float) -> None:
+    for seed in (1, 2, 3):
+        last = forward(biased(seed, still_s=still_s))[-1].step.after
+        bias, _ = planted(seed)
+        std = np.sqrt(np.diag(last.P)[9:15])
+        assert (np.abs(last.bias - bias) < 3 * std).all()
+        assert (std[:3] < 0.7 * PRIOR[:3]).any(), "gravity in motion has shown something"
+
+
+@pytest.mark.parametrize("still_s", [0.0, 5.0])
+@pytest.mark.parametrize("way", ["forward", "smooth"])
+def test_it_is_as_sure_as_it_should_be(still_s: float, way: str) -> None:
+    """Never overconfident. The biases planted do not walk, so that it may be surer than it says."""
+    errors, covariances = [], []
+    for seed in SEEDS:
+        blocks = forward(biased(seed, still_s=still_s))
+        state = blocks[-1].step.after if way == "forward" else [s for _, s in smoothed(blocks)][len(blocks) // 2]
+        errors.append((state.bias - planted(seed)[0])[:3])
+        covariances.append(state.P[9:12, 9:12])
+    found = consistency(np.array(errors), np.array(covariances), BOUND)
+    assert 0.1 < found["nees_mean"] < found["nees_upper"], found
+
+
+def test_a_stop_tells_the_bias_at_rest_from_that_in_motion() -> None:
+    for seed in (1, 2, 3):
+        blocks = forward(biased(seed, still_s=5.0))
+        bias, ground = planted(seed)
+        at_rest = [block for block in blocks if block.resting and block.end_s < 5.0][-1].step.after  # then it moves, slowly
+        np.testing.assert_allclose(at_rest.rest_bias(True)[:3], (bias + ground)[:3], rtol=0, atol=3e-4)
+        std = np.sqrt(np.diag(at_rest.covariance(False))[:3])
+        assert (std > 0.6 * GROUND[:3]).all(), "what differs at rest is not known yet"
+
+
+def test_rest_at_the_end_is_seen_by_smoothing_and_not_before() -> None:
+    imu = biased(4, still_s=6.0, backwards=True)
+    bias, ground = planted(4)
+    sure = Known(np.zeros(6), PRIOR, np.array([1e-4] * 3 + [0.03] * 3))  # no difference at rest: the stop shows it all
+    imu = Imu(
+        imu.t_ns, imu.gyro - np.where(np.arange(len(imu)) > len(imu) - 6 * RATE_HZ, 1, 0)[:, None] * ground[:3], imu.accel
+    )
+    track, rested_s = smooth(model(), [samples(imu)], sure)
+    assert 5.4 < rested_s < 6.6  # it comes to rest slowly
+    causal = forward(imu, sure)
+    half = len(causal) // 2
+    assert not any(block.resting for block in causal[:half])
+    np.testing.assert_array_less(track.std[half, :3], 0.8 * np.sqrt(np.diag(causal[half].step.after.P)[9:12]).max())
+    late = len(track.t_s) - 16  # two seconds before it stops
+    assert np.linalg.norm(track.rest[late, :3] - bias[:3]) < 1e-3
+    assert np.linalg.norm(track.rest[late, :3] - bias[:3]) < np.linalg.norm(causal[late].step.after.bias[:3] - bias[:3])
+
+
+def test_smoothing_is_never_less_sure() -> None:
+    imu = biased(5, still_s=4.0)
+    blocks = forward(imu)
+    for block, state in smoothed(blocks):
+        less = np.linalg.eigvalsh(block.step.before.P[9:, 9:] - state.P[9:, 9:])
+        assert less.min() > -1e-10
+
+
+def test_biases_are_the_same_in_a_world_turned_about_the_vertical() -> None:
+    """And in samples: the body starts with another heading, which no sample knows. So turn the body about its own axis."""
+    imu = biased(6)
+    turn = Rotation.from_euler("xyz", [0.3, -0.8, 1.2]).as_matrix()
+    turned = Imu(imu.t_ns, imu.gyro @ turn.T, imu.accel @ turn.T)
+    even = Known(np.zeros(6), np.array([3e-3] * 3 + [0.1] * 3), GROUND)
+    one, other = forward(imu, even)[-1].step.after, forward(turned, even)[-1].step.after
+    np.testing.assert_allclose(other.bias[:3], turn @ one.bias[:3], rtol=0, atol=1e-8)
+    np.testing.assert_allclose(other.P[9:12, 9:12], turn @ one.P[9:12, 9:12] @ turn.T, rtol=0, atol=1e-9)
+
+
+# ── when it knows it ─────────────────────────────────────────────────────────────────────────────────────────────────
+
+
+def test_nothing_later_changes_what_came_before() -> None:
+    imu = biased(7, duration_s=30.0, still_s=4.0)
+    cut = 3333
+    other = biased(8, duration_s=30.0)
+    changed = Imu(
+        imu.t_ns,
+        np.concatenate([imu.gyro[:cut], other.gyro[cut:]]),
+        np.concatenate([imu.accel[:cut], 2.0 * other.accel[cut:]]),
+    )
+    one, two = (Following(model(), KNOWN, np.zeros(6), 0.0)(*samples(some)) for some in (imu, changed))
+    np.testing.assert_array_equal(one[:cut], two[:cut])
+    assert np.abs(one[cut + 200 :] - two[cut + 200 :]).max() > 1e-5
+
+
+@pytest.mark.parametrize("size", [1, 7, 1000])
+def test_batches_of_any_size_give_the_same_numbers(size: int) -> None:
+    t, gyro, accel = samples(biased(9, duration_s=12.0, still_s=3.0))
+    whole = Following(model(), KNOWN, np.zeros(6), 0.0)(t, gyro, accel)
+    stream = Following(model(), KNOWN, np.zeros(6), 0.0)
+    parts = [stream(t[a : a + size], gyro[a : a + size], accel[a : a + size]) for a in range(0, len(t), size)]
+    np.testing.assert_array_equal(np.concatenate(parts), whole)
+    assert len(np.unique(whole[:, 0])) > 15
+
+
+def test_chunks_of_smoothing_agree_with_smoothing_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    blocks = forward(biased(10, duration_s=90.0))
+    assert blocks[-1].end_s < CHUNK_S
+    whole = [(state.bias, np.sqrt(np.diag(state.P)[9:15])) for _, state in smoothed(blocks)]
+    monkeypatch.setattr("imutool.bias_start.bias_tracking.CHUNK_S", 10.0)
+    monkeypatch.setattr("imutool.bias_start.bias_tracking.LOOK_AHEAD_S", 60.0)
+    chunks = [(block, state.bias) for block, state in smoothed(blocks)]
+    assert [block.start_s for block, _ in chunks] == [block.start_s for block in blocks]
+    away = max(np.abs((bias - best) / std).max() for (_, bias), (best, std) in zip(chunks, whole, strict=True))
+    assert 0.0 < away < 1.0  # what comes a minute later moves an estimate by a fraction of its doubt
+
+
+def test_a_hole_in_the_samples_makes_it_less_sure_and_a_long_one_starts_the_pose_anew() -> None:
+    imu = biased(11, duration_s=40.0)
+    t = seconds(imu.t_ns, int(imu.t_ns[0]))
+    short, long = (imu.rows((t < 20.0) | (t > 20.0 + hole)) for hole in (0.2, 5.0))
+    whole, little, much = (forward(some)[45].step.after for some in (imu, short, long))
+    assert np.trace(little.P[:3, :3]) > np.trace(whole.P[:3, :3])
+    assert np.isfinite(much.bias).all()
+    end = forward(long)[-1].step.after
+    assert (np.abs(end.bias - planted(11)[0])[:3] < 3 * np.sqrt(np.diag(end.P)[9:12])).all()
+
+
+@pytest.mark.parametrize("count", [0, 1, 2, 50, 100])
+def test_less_than_a_block_says_nothing(count: int) -> None:
+    imu = biased(1, duration_s=2.0).rows(slice(0, count))
+    t, gyro, accel = samples(imu) if count else (np.zeros(0), np.zeros((0, 3)), np.zeros((0, 3)))
+    filter_ = RestFilter(KNOWN, ahead=True)
+    assert [*filter_.feed(t, gyro, accel), *filter_.finish()] == []
+    track, rested_s = smooth(model(), [(t, gyro, accel)], KNOWN)
+    assert (len(track.t_s), rested_s) == (0, 0.0)
+
+
+def test_a_track_holds_each_row_until_the_next() -> None:
+    track = Track(np.array([0.0, 1.0]), np.array([[1.0] * 6, [2.0] * 6]), np.ones((2, 6)))
+    np.testing.assert_array_equal(track.at(np.array([-1.0, 0.0, 0.99, 1.0, 9.0]))[:, 0], [1, 1, 1, 2, 2])
+
+
+def test_a_flight_of_150_seconds_takes_well_under_a_second() -> None:
+    imu = biased(1, duration_s=150.0)
+    best = np.inf
+    for _ in range(3):
+        began = time.process_time()
+        blocks = forward(imu)
+        best = min(best, time.process_time() - began)
+    assert len(blocks) == 300
+    assert best < 1.5, f"{best:.2f} s, with shapes checked at every call"

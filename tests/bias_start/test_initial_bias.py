@@ -1,0 +1,440 @@
+"""A start says what was measured and how sure it is; measurement and prior meet by their variances."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import msgspec
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+
+from imutool.bias import linear, static
+from imutool.bias.model import BiasModel
+from imutool.bias_start import initial_bias
+from imutool.bias_start.bias_tracking import Samples
+from imutool.bias_start.initial_bias import (
+    AT_REST_STD,
+    TRUTH_S,
+    NoRestError,
+    TurnOn,
+    at_rest,
+    auto,
+    find,
+    from_truth,
+    given,
+    known,
+    over_all_rest,
+    prior,
+    rest_spread,
+    smooth,
+)
+from imutool.errors import ConfigError, DataError
+from imutool.inertial.stationary import Blocks, in_blocks
+from imutool.inertial.strapdown import dead_reckon
+from imutool.recording import GRAVITY_M_S2, Imu, Poses, Recording, seconds
+from imutool.sensor.flight import FlightSettings as Flight
+from imutool.sensor.flight import TriadSettings, flight, trajectory
+
+RATE_HZ = 200.0
+NOISE = np.array([2.4e-3] * 3 + [0.03] * 3)  # of a sample: the ADIS16448 at 200 Hz
+GYRO_BIAS, ACCEL_BIAS = np.array([0.03, -0.02, 0.01]), np.array([0.15, -0.1, 0.2])
+Moves = Callable[[np.ndarray], np.ndarray]
+
+
+def resting(
+    stops: list[tuple[float, float]] | None = None, *, seed: int = 0, duration_s: float = 20.0, tilt: float = 0.3
+) -> tuple[Imu, Rotation]:
+    """An IMU that is still during the stops and shaken between them, and its attitude; tilts differ from stop to stop."""
+    stops = [(0.0, 4.0)] if stops is None else stops
+    rng = np.random.default_rng(seed)
+    t = np.arange(int(duration_s * RATE_HZ) + 1) / RATE_HZ
+    still = np.zeros(len(t), bool)
+    which = np.zeros(len(t), int)
+    for start, end in stops:
+        still |= (t >= start) & (t <= end)
+        which += t > end
+    shake = np.where(still[:, None], 0.0, np.sin(t[:, None] * np.array([7.0, 9.0, 11.0]) + 1.0))
+    attitude = Rotation.from_euler("xy", np.column_stack([tilt * (1 + which), -0.5 * tilt + 0.9 * which]))
+    gyro = shake + GYRO_BIAS + NOISE[:3] * rng.normal(size=(len(t), 3))
+    up_b = attitude.inv().apply(np.tile([0.0, 0.0, GRAVITY_M_S2], (len(t), 1)))
+    accel = up_b + 4.0 * shake + ACCEL_BIAS + NOISE[3:] * rng.normal(size=(len(t), 3))
+    t_ns = 10**18 + np.round(t * 1e9).astype(np.int64)
+    return Imu(t_ns, gyro, accel), attitude
+
+
+def blocks_of(imu: Imu) -> Blocks:
+    return in_blocks([(imu.t_ns, imu.gyro, imu.accel)], imu.period_s)
+
+
+def model(mean: float = 0.0, **std: float) -> BiasModel:
+    """A static model with a prior of its own."""
+    made = static.Model().double()
+    made.prior_mean.fill_(mean)
+    for name, value in std.items():
+        getattr(made, name).fill_(value)
+    return made
+
+
+# ── at rest ──────────────────────────────────────────────────────────────────────────────────────────────────────────
+
+
+def test_a_resting_start_shows_the_gyros_bias_and_the_accelerometers_along_gravity() -> None:
+    imu, attitude = resting()
+    start = at_rest(static.Model(), imu)
+    assert "4." in start.how or "3.9" in start.how
+    n = 4.0 * RATE_HZ
+    assert np.abs(start.rest[:3] - GYRO_BIAS).max() < 5 * NOISE[0] / np.sqrt(n) + 5e-4  # noise, and the pull of the prior
+    up_b = attitude[0].inv().apply([0.0, 0.0, 1.0])
+    assert up_b @ start.rest[3:] == pytest.approx(up_b @ ACCEL_BIAS, abs=0.02)  # its other parts tilt |f| in second order
+    across = start.rest[3:] - up_b * (up_b @ start.rest[3:])
+    assert np.linalg.norm(across) < 0.02, "gravity says nothing about these"
+    assert (start.std[:3] < 5e-4).all()
+    assert start.std[3:] @ np.abs(up_b) < 0.4
+    np.testing.assert_allclose(start.noise, NOISE, rtol=0.1)
+
+
+def test_it_is_the_kalman_update_of_the_prior() -> None:
+    """Against the textbook's matrices: x = x0 + K (z - h(x0)), K = P H^T (H P H^T + R)^-1, P = (I - K H) P."""
+    imu, _ = resting()
+    made = model(mean=0.01, prior_std=0.02)
+    start = at_rest(made, imu)
+    (stretch, *_) = initial_bias.stretches(imu)
+    still = imu.rows(slice(*stretch))
+    x = np.full(6, 0.01)
+    P = np.eye(6) * 0.02**2
+    mean = np.concatenate([still.gyro.mean(axis=0), still.accel.mean(axis=0)])
+    force = mean[3:] - x[3:]
+    up = force / np.linalg.norm(force)
+    H = np.zeros((4, 6))
+    H[:3, :3] = np.eye(3)
+    H[3, 3:] = up
+    z = np.concatenate([mean[:3] - x[:3], [np.linalg.norm(force) - GRAVITY_M_S2]])
+    noise = np.concatenate([still.gyro, still.accel], axis=1).std(axis=0)
+    R = np.diag(np.concatenate([AT_REST_STD[:3] ** 2 + noise[:3] ** 2 / len(still), AT_REST_STD[3:4] ** 2]))
+    K = P @ H.T @ np.linalg.inv(H @ P @ H.T + R)
+    np.testing.assert_allclose(start.rest, x + K @ z, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(start.std, np.sqrt(np.diag((np.eye(6) - K @ H) @ P)), rtol=1e-9)
+
+
+def test_a_prior_that_is_sure_is_kept_and_one_that_knows_nothing_gives_way() -> None:
+    imu, attitude = resting()
+    sure, unsure = (at_rest(model(mean=0.5, prior_std=std), imu) for std in (1e-9, 1e3))
+    np.testing.assert_allclose(sure.rest, 0.5, atol=1e-6)
+    np.testing.assert_allclose(unsure.rest[:3], GYRO_BIAS, atol=5e-4)
+    up_b = attitude[0].inv().apply([0.0, 0.0, 1.0])
+    assert up_b @ unsure.rest[3:] == pytest.approx(up_b @ ACCEL_BIAS, abs=0.2)
+
+
+def test_stops_in_several_attitudes_show_the_accelerometer_from_all_sides() -> None:
+    stops = [(0.0, 4.0), (6.0, 10.0), (12.0, 16.0), (18.0, 22.0)]
+    imu, _ = resting(stops, duration_s=22.0, tilt=0.7)
+    one, all_of_them = at_rest(static.Model(), imu), over_all_rest(static.Model(), blocks_of(imu))
+    assert np.linalg.norm(all_of_them.rest[3:] - ACCEL_BIAS) < 0.5 * np.linalg.norm(one.rest[3:] - ACCEL_BIAS)
+    assert (all_of_them.std <= one.std + 1e-12).all()
+    np.testing.assert_allclose(all_of_them.rest[:3], GYRO_BIAS, atol=4e-4)
+
+
+def test_a_models_own_part_is_taken_off_first() -> None:
+    """At rest the accelerometer's matrix sees gravity: W f is no turn-on bias."""
+    imu, _ = resting()
+    W = torch.diag(torch.tensor([0.02, -0.01, 0.03], dtype=torch.float64))
+    made = linear.Model().double()
+    made.begin_at("accel", W)
+    made.prior_std.fill_(1.0)
+    plain = static.Model().double()
+    plain.prior_std.fill_(1.0)
+    corrected = Imu(imu.t_ns, imu.gyro, imu.accel @ (np.eye(3) - W.numpy()).T)
+    np.testing.assert_allclose(at_rest(made, imu).rest, at_rest(plain, corrected).rest, atol=1e-12)
+
+
+@pytest.mark.parametrize("stops", [[], [(8.0, 12.0)], [(0.0, 0.9)]])
+def test_a_log_that_does_not_start_at_rest_is_refused(stops: list[tuple[float, float]]) -> None:
+    imu, _ = resting(stops)
+    with pytest.raises(DataError, match=r"the log does not start at rest.*--init prior"):
+        at_rest(static.Model(), imu)
+
+
+def test_a_stop_later_in_the_log_serves_a_constant_only() -> None:
+    imu, _ = resting([(8.0, 12.0)])
+    np.testing.assert_allclose(over_all_rest(static.Model(), blocks_of(imu)).rest[:3], GYRO_BIAS, atol=1e-3)
+    imu, _ = resting([])
+    with pytest.raises(DataError, match="the log never rests"):
+        over_all_rest(static.Model(), blocks_of(imu))
+
+
+@pytest.mark.parametrize("count", [0, 1, 20])
+def test_too_few_samples_are_no_rest(count: int) -> None:
+    imu = resting()[0].rows(slice(0, count))
+    with pytest.raises(DataError, match="does not start at rest"):
+        at_rest(static.Model(), imu)
+
+
+# ── from the truth ───────────────────────────────────────────────────────────────────────────────────────────────────
+
+PERFECT = TriadSettings(
+    noise_density=0.0, walk_density=0.0, typical_bias=0.0, turn_on_bias=0.0, warm_up=0.0, scale=0.0, misalignment_rad=0.0
+)
+# Exact samples and truth: what is left over 12 s is the rule's second order, 1e-5 rad/s, and 1e-3 m/s² with its tilt.
+TRUTH = np.array([5e-5] * 3 + [5e-3] * 3)
+
+
+@pytest.fixture(scope="module")
+def biased() -> Recording:
+    """An exact flight with a constant on each axis."""
+    settings = msgspec.structs.replace(Flight(gyro=PERFECT, accel=PERFECT), duration_s=12.0, still_s=0.5)
+    made = flight(3, settings)
+    poses = trajectory(3, settings).poses(made.imu.t_ns)
+    imu = Imu(made.imu.t_ns, made.imu.gyro + GYRO_BIAS, made.imu.accel + ACCEL_BIAS)
+    return Recording("biased", imu, {"/truth": poses})
+
+
+def sees_everything() -> BiasModel:
+    return model(prior_std=10.0, truth_std=1e-6)
+
+
+def test_twelve_seconds_of_truth_show_the_bias(biased: Recording) -> None:
+    start = from_truth(sees_everything(), biased)
+    assert (np.abs(start.rest - np.concatenate([GYRO_BIAS, ACCEL_BIAS])) < TRUTH).all()
+    np.testing.assert_allclose(start.std, 1e-6 * TRUTH_S / 12.0, rtol=1e-6)  # less truth than the model's figure is of
+    assert start.how == "truth over 12.0 s, ±1e-06 rad/s"
+
+
+def test_after_the_truth_the_rest_bias_is_followed_from_what_it_showed() -> None:
+    """Four seconds of truth, and a stop after which the gyro is another; the start itself knows nothing of that."""
+    imu, attitude = resting([(5.0, 15.0)])
+    debiased = Imu(imu.t_ns, imu.gyro - GYRO_BIAS, imu.accel - ACCEL_BIAS)
+    poses = dead_reckon(debiased, (attitude[0].as_quat(scalar_first=True), np.zeros(3), np.zeros(3)))
+    truth = {"/truth": poses.rows(slice(0, int(4 * RATE_HZ) + 1))}
+    moved = np.where(np.arange(len(imu))[:, None] >= 5 * RATE_HZ, [2e-3, 0.0, 0.0], 0.0)
+    made = trained(prior_std=0.05, truth_std=1e-4)
+    before, after = (from_truth(made, Recording("one", Imu(imu.t_ns, imu.gyro + x, imu.accel), truth)) for x in (0.0, moved))
+    np.testing.assert_allclose(before.rest, after.rest, rtol=1e-12)
+    assert after.how.endswith("then gravity in motion and every stop")
+    bias = after.stream(made)(*samples(Imu(imu.t_ns, imu.gyro + moved, imu.accel)))
+    held = int(after.hold_s * RATE_HZ)
+    np.testing.assert_array_equal(bias[:held], np.tile(after.rest, (held, 1)))
+    assert held == int(4 * RATE_HZ)
+    np.testing.assert_allclose(bias[int(15 * RATE_HZ), :3], GYRO_BIAS + np.array([2e-3, 0.0, 0.0]), atol=5e-4)
+
+
+def test_a_truth_whose_world_leans_is_believed_beside_itself_and_not_beside_gravity(biased: Recording) -> None:
+    """A motion capture set up askew by half a degree: a tenth of m/s² that the accelerometer has not got."""
+    lean = Rotation.from_rotvec([0.009, 0.0, 0.0])
+    truth = biased.truth
+    assert truth.v_w is not None
+    q = (lean * Rotation.from_quat(np.array(truth.q_wb_wxyz), scalar_first=True)).as_quat(scalar_first=True)
+    askew = replace(truth, q_wb_wxyz=q, p_wb=lean.apply(np.array(truth.p_wb)), v_w=lean.apply(np.array(truth.v_w)))
+    made = trained(mean=0.0, prior_std=0.02, truth_std=1e-3)
+    made.prior_mean.copy_(torch.from_numpy(np.concatenate([GYRO_BIAS, ACCEL_BIAS])))
+    upright, leaning = (from_truth(made, replace(biased, truths={"/truth": one})) for one in (truth, askew))
+    assert upright.follows is not None
+    assert leaning.follows is not None
+    assert np.linalg.norm(leaning.rest[3:] - upright.rest[3:]) > 0.02
+    np.testing.assert_allclose(leaning.rest[:3], upright.rest[:3], atol=1e-6)
+    np.testing.assert_allclose(leaning.follows.mean[3:], ACCEL_BIAS, atol=0.005)
+    np.testing.assert_allclose(leaning.follows.mean[:3], leaning.rest[:3], rtol=1e-12)
+    assert (leaning.follows.std[3:] > leaning.std[3:]).all()
+
+
+def test_a_shorter_truth_can_be_asked_for(biased: Recording) -> None:
+    start = find("truth:4", sees_everything(), biased)
+    assert (np.abs(start.rest - np.concatenate([GYRO_BIAS, ACCEL_BIAS])) < TRUTH).all()
+    assert start.how == "truth over 4.0 s, ±4e-06 rad/s"
+    np.testing.assert_allclose(start.std, 1e-6 * TRUTH_S / 4.0, rtol=1e-6)
+    for word in ("truth:0", "truth:nan", "truth:five"):
+        with pytest.raises(ConfigError, match="truth:SECONDS"):
+            find(word, sees_everything(), biased)
+
+
+def test_truth_and_prior_meet_by_their_variances(biased: Recording) -> None:
+    """Equal variances: half-way; a model sure of its prior (or of nothing else) keeps to it."""
+    full = from_truth(sees_everything(), biased)
+    half = from_truth(model(prior_std=0.1, truth_std=0.1 * 12.0 / TRUTH_S), biased)
+    np.testing.assert_allclose(half.rest, 0.5 * full.rest, rtol=1e-6)
+    np.testing.assert_allclose(half.std, 0.1 / np.sqrt(2), rtol=1e-12)
+    for truth_std in (1.0, 0.0):
+        kept = from_truth(model(mean=0.2, prior_std=0.0, truth_std=truth_std), biased)
+        np.testing.assert_allclose(kept.rest, 0.2)
+        np.testing.assert_array_equal(kept.std, 0.0)
+
+
+def test_the_models_own_part_is_taken_off_the_samples_first(biased: Recording) -> None:
+    made = linear.Model().double()
+    W = torch.tensor([[0.02, 0.01, 0.0], [0.0, -0.02, 0.005], [0.01, 0.0, 0.01]], dtype=torch.float64)
+    made.begin_at("gyro", W)
+    made.prior_std.fill_(10.0)
+    made.truth_std.fill_(1e-6)
+    measured = np.linalg.solve(np.eye(3) - W.numpy(), biased.imu.gyro.T).T  # then (I - W) u - rest is true again
+    start = from_truth(made, replace(biased, imu=Imu(biased.imu.t_ns, measured, biased.imu.accel)))
+    assert (np.abs(start.rest - np.concatenate([GYRO_BIAS, ACCEL_BIAS])) < TRUTH).all()
+
+
+def test_a_gap_in_the_truth_does_no_harm(biased: Recording) -> None:
+    t_s = (biased.truth.t_ns - biased.truth.t_ns[0]) * 1e-9
+    holed = replace(biased, truths={"/truth": biased.truth.rows((t_s < 1.0) | (t_s > 4.0))})
+    start = from_truth(sees_everything(), holed)
+    assert (np.abs(start.rest - np.concatenate([GYRO_BIAS, ACCEL_BIAS])) < TRUTH).all()
+
+
+def test_a_truth_without_velocity_gets_one(biased: Recording) -> None:
+    bare = replace(biased, truths={"/truth": replace(biased.truth, v_w=None)})
+    start = from_truth(sees_everything(), bare)
+    assert (np.abs(start.rest[:3] - GYRO_BIAS) < TRUTH[:3]).all()
+    assert (np.abs(start.rest[3:] - ACCEL_BIAS) < 0.05).all()  # a derived velocity is good to 0.1 m/s at the ends: over 5 s
+
+
+def test_a_truth_that_is_not_there_or_too_short_is_refused(biased: Recording) -> None:
+    with pytest.raises(DataError, match="biased: no true poses"):
+        from_truth(static.Model(), replace(biased, truths={}))
+    begin = int(biased.imu.t_ns[0])
+    short: Poses = biased.truth.between(begin, begin + 900_000_000)
+    with pytest.raises(DataError, match=r"biased: 0\.9 s of truth"):
+        from_truth(static.Model(), replace(biased, truths={"/truth": short}))
+
+
+# ── followed, and from the whole log ─────────────────────────────────────────────────────────────────────────────────
+
+
+def trained(logs: int = 6, **std: float) -> BiasModel:
+    made = model(**std)
+    made.card = {"name": "m", "logs": [{}] * logs}
+    return made
+
+
+def samples(imu: Imu) -> Samples:
+    return seconds(imu.t_ns, int(imu.t_ns[0])), imu.gyro, imu.accel
+
+
+def test_auto_is_the_stop_the_log_begins_with_and_says_how_sure() -> None:
+    imu, _ = resting()
+    start = auto(trained(prior_std=0.05), imu)
+    np.testing.assert_allclose(start.rest[:3], GYRO_BIAS, atol=5e-4)
+    assert start.how == "4.0 s at rest from 0.0 s on, prior of 6 runs, ±0.0002 rad/s, then gravity in motion and every stop"
+    assert (start.hold_s, start.follows, start.track) == (pytest.approx(4.0, abs=0.01), start.follows, None)
+    assert start.follows is not None
+    assert (start.follows.std[:3] == 0.05).all(), "from what was known before that stop"
+    np.testing.assert_allclose(start.noise[:3], NOISE[:3], rtol=0.3)
+
+
+def test_only_the_first_stop_makes_the_start() -> None:
+    """Later samples, in motion or at rest again, change nothing in it."""
+    imu, _ = resting([(0.0, 4.0), (10.0, 15.0)])
+    other = Imu(imu.t_ns, np.where(np.arange(len(imu))[:, None] < 900, imu.gyro, 0.3), imu.accel)
+    one, two = auto(trained(), imu), auto(trained(), other)
+    np.testing.assert_array_equal(one.rest, two.rest)
+    np.testing.assert_array_equal(one.std, two.std)
+
+
+def test_during_that_stop_its_samples_get_what_the_whole_of_it_says() -> None:
+    imu, _ = resting()
+    made = trained(prior_std=0.05)
+    start = auto(made, imu)
+    bias = start.stream(made)(*samples(imu))
+    still = int(start.hold_s * RATE_HZ)
+    np.testing.assert_array_equal(bias[:still], np.tile(start.rest, (still, 1)))
+    assert len(np.unique(bias[still + 200 :, 0])) > 5, "and then it is followed"
+
+
+def test_an_untrained_model_has_no_prior_to_follow_from() -> None:
+    with pytest.raises(DataError, match="the log does not start at rest"):
+        auto(static.Model(), resting([])[0])
+
+
+def test_the_whole_log_is_surer_than_its_start_and_later_stops_count() -> None:
+    imu, _ = resting([(12.0, 18.0)])
+    made = trained(prior_std=0.02)
+    start = smooth(made, [samples(imu)])
+    assert start.track is not None
+    assert start.how.startswith(("5.", "6."))
+    assert "s at rest in all, gravity in motion, prior of 6 runs, ±0.000" in start.how
+    np.testing.assert_allclose(start.track.at(np.array([11.0, 14.0]))[:, :3], np.tile(GYRO_BIAS, (2, 1)), atol=1.5e-3)
+    assert (start.std[:3] < 0.2 * prior(made).std[:3]).all()
+
+
+def test_smoothing_needs_something_to_go_by() -> None:
+    imu, _ = resting([])
+    with pytest.raises(NoRestError, match="here: the log never rests"):
+        smooth(static.Model(), [samples(imu)], "here")
+    wide = smooth(trained(prior_std=0.05), [samples(imu)])
+    assert wide.std[:3].max() > 1e-4
+    with pytest.raises(DataError, match="too short to be smoothed"):
+        smooth(trained(), [samples(imu.rows(slice(0, 20)))])
+
+
+def test_what_differs_at_rest_is_told_from_the_logs_own_bias() -> None:
+    away = np.array([2e-3, -5e-4, 0.0])
+    logs, own = [], []
+    for seed in range(5):
+        imu, _ = resting([(0.0, 4.0), (15.0, 20.0)], seed=seed)
+        logs.append(samples(imu))
+        own.append(np.concatenate([GYRO_BIAS - away * (-1) ** seed, ACCEL_BIAS]))
+    spread = rest_spread(static.Model(), logs, np.array(own))
+    np.testing.assert_allclose(spread[:2], initial_bias.MAD_TO_STD * np.abs(away[:2]), rtol=0.2)
+    assert spread[2] < 2.5 * AT_REST_STD[2]
+    assert (spread >= AT_REST_STD).all()
+    moving = samples(resting([])[0])
+    np.testing.assert_array_equal(rest_spread(static.Model(), [moving], np.zeros((1, 6))), AT_REST_STD)
+
+
+def test_a_model_that_says_how_rest_differs_is_believed() -> None:
+    made = trained(prior_std=3e-3)
+    before = auto(made, resting()[0])
+    made.register_buffer("rest_std", torch.tensor([2e-3] * 3 + [0.03] * 3))
+    np.testing.assert_allclose(known(made).ground_std[:3], 2e-3)
+    after = auto(made, resting()[0])
+    assert (after.std[:3] > 5 * before.std[:3]).all(), "in motion it is less sure"
+    np.testing.assert_allclose(after.rest[:3], before.rest[:3], atol=3e-4)  # at rest it is what it is
+
+
+# ── the words of --init ──────────────────────────────────────────────────────────────────────────────────────────────
+
+
+def test_the_prior_is_what_the_training_runs_had() -> None:
+    start = prior(model(mean=0.3, prior_std=0.2))
+    assert (start.rest.tolist(), start.how) == ([pytest.approx(0.3)] * 6, "prior of the training runs")
+    np.testing.assert_allclose(start.std, 0.2)
+
+
+def test_six_numbers_are_taken_as_they_are() -> None:
+    start = given("0.01,-2e-3,0, 1 ,2.5,-3")
+    assert start.rest.tolist() == [0.01, -2e-3, 0.0, 1.0, 2.5, -3.0]
+    assert not start.std.any()
+    assert start.how == "given"
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["", "1,2,3", "1,2,3,4,5,6,7", "a,b,c,d,e,f", "nan,0,0,0,0,0", "0,0,0,inf,0,0", "Truth", "stationery", "1;2;3;4;5;6"],
+)
+def test_other_words_are_refused_with_what_there_is(text: str) -> None:
+    imu, _ = resting()
+    with pytest.raises(ConfigError, match=r"--init: .*expected auto, stationary, prior, truth or gx,gy,gz,ax,ay,az"):
+        find(text, static.Model(), Recording("r", imu))
+
+
+def test_each_word_finds_its_way(biased: Recording) -> None:
+    imu, _ = resting()
+    still, trained = Recording("still", imu), static.Model()
+    trained.card = {"name": "trained"}
+    moving = Recording("moving", resting([])[0])
+    how = {way: find(way, trained, still).how for way in ("auto", "stationary", "prior", "1,2,3,4,5,6")}
+    assert "at rest" in how["auto"]
+    assert how["auto"].startswith("4.0 s at rest from 0.0 s on, prior of the training runs, ±")
+    assert how["1,2,3,4,5,6"] == "given"
+    assert find("truth", trained, biased).how.startswith("truth over 12.0 s, weighed against the training runs, ±")
+    assert find("auto", trained, moving).how.startswith("prior of the training runs, ±0.05 rad/s, then gravity in motion")
+    with pytest.raises(DataError, match="does not start at rest"):
+        find("stationary", trained, moving)
+    with pytest.raises(DataError, match="does not start at rest"):
+        find("auto", static.Model(), moving)  # no training runs, no prior to fall back on
+
+
+def test_a_start_does_not_share_memory_with_the_model() -> None:
+    made = model(mean=0.1)
+    start = prior(made)
+    start.rest[:] = 9.0
+    assert isinstance(start, TurnOn)
+    assert prior(made).rest.tolist() == [pytest.approx(0.1)] * 6

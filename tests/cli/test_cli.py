@@ -1,0 +1,250 @@
+"""The command line: codes, streams, help, tables. What commands compute is tested where it is computed."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import subprocess
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import pytest
+
+from imutool import cli, errors, registry
+from imutool.cli import terminal
+from imutool.cli.figures import epoch_line
+from imutool.demo import write_asl
+from imutool.sensor.flight import flight
+from imutool.training.fit import Epoch
+
+Run = Callable[..., subprocess.CompletedProcess[str]]
+Code = Callable[..., int]
+
+COMMANDS = [command.name or command.callback.__name__ for command in cli.app.registered_commands if command.callback]
+
+
+@pytest.fixture
+def code(monkeypatch: pytest.MonkeyPatch) -> Code:
+    """Runs a command line in this process and returns its exit code."""
+    monkeypatch.setenv("COLUMNS", "80")
+
+    def run(*words: str | Path) -> int:
+        monkeypatch.setattr(sys, "argv", ["imutool", *map(str, words)])
+        with pytest.raises(SystemExit) as leaving:
+            cli.main()
+        return int(leaving.value.code or 0)
+
+    return run
+
+
+# ── codes ──
+
+
+@pytest.mark.parametrize(
+    ("error", "expected"),
+    [
+        (errors.ConfigError("x"), 3),
+        (errors.DataError("x"), 4),
+        (errors.LogError("x"), 5),
+        (errors.ModelError("x"), 6),
+        (errors.NumericsError("x"), 7),
+        (KeyboardInterrupt(), 130),
+        (PermissionError(13, "Permission denied", "there"), 3),
+    ],
+    ids=lambda value: type(value).__name__,
+)
+def test_each_kind_of_error_has_its_code(
+    code: Code, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], error: BaseException, expected: int
+) -> None:
+    def inspect(_: Path, *, check: bool) -> None:
+        raise error
+
+    monkeypatch.setattr("imutool.log_info.inspect", inspect)
+    assert code("info", "log.mcap") == expected
+    printed = capsys.readouterr()
+    assert printed.out == ""
+    assert printed.err.startswith("error: ")
+
+
+def test_a_bug_is_a_traceback(monkeypatch: pytest.MonkeyPatch) -> None:
+    def inspect(_: Path, *, check: bool) -> None:
+        raise ZeroDivisionError
+
+    monkeypatch.setattr("imutool.log_info.inspect", inspect)
+    monkeypatch.setattr(sys, "argv", ["imutool", "info", "log.mcap"])
+    with pytest.raises(ZeroDivisionError):  # nobody catches it: Python prints the traceback and leaves with 1
+        cli.main()
+
+
+@pytest.mark.parametrize("words", [["frobnicate"], ["info"], ["info", "--colour", "x"], ["train", "a.mcap"]], ids=" ".join)
+def test_wrong_usage_exits_with_2(code: Code, capsys: pytest.CaptureFixture[str], words: list[str]) -> None:
+    assert code(*words) == 2
+    assert "Usage: " in capsys.readouterr().err
+
+
+def test_a_question_needs_no_full_stop() -> None:
+    assert str(errors.ConfigError("a", fix="Did you mean b?")) == "a. Did you mean b?"
+    assert str(errors.ConfigError("a", fix="Do b")) == "a. Do b."
+
+
+# ── help ──
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_every_help_has_an_example(code: Code, capsys: pytest.CaptureFixture[str], command: str) -> None:
+    assert code(command, "--help") == 0
+    printed = capsys.readouterr().out
+    assert f"Example: imutool {command} " in printed
+    assert max(map(len, printed.splitlines())) <= 80
+
+
+@pytest.mark.parametrize(("command", "group"), [("train", "imutool.bias"), ("convert", "imutool.converters")])
+def test_help_lists_what_can_be_named_with_its_summary(
+    code: Code, capsys: pytest.CaptureFixture[str], command: str, group: str
+) -> None:
+    assert code(command, "--help") == 0
+    printed = " ".join(capsys.readouterr().out.split())
+    for name in registry.names(group):
+        assert f"{name} {' '.join(registry.summary(group, name).split())}" in printed
+
+
+@pytest.mark.parametrize(
+    ("words", "near"),
+    [
+        (["train", "nowhere.mcap", "-o", "m.safetensors", "--method", "neural_odd"], "neural_ode"),
+        (["convert", "nowhere", "out", "--format", "eurok"], "euroc"),
+        (["train", "nowhere.mcap", "-o", "m.safetensors", "--set", "step=3"], "steps"),
+    ],
+    ids=["method", "format", "setting"],
+)
+def test_a_slip_of_the_pen_is_met_with_the_nearest_name(
+    code: Code, capsys: pytest.CaptureFixture[str], words: list[str], near: str
+) -> None:
+    assert code(*words) == 3
+    assert re.search(rf"Did you mean '?{near}'?\?", capsys.readouterr().err)
+
+
+# ── streams ──
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["convert", "seq", "seq.mcap"],
+        ["info", "{}/flight_1.mcap"],
+        ["train", "{}/flight_1.mcap", "--method", "linear", "-o", "m.safetensors"],
+        ["debias", "{}/flight_2.mcap", "out.mcap"],
+        ["evaluate", "{}/flight_2.mcap", "--model", "static"],
+        ["models"],
+    ],
+    ids=lambda words: words[0],
+)
+def test_json_to_stdout_is_json_alone(tmp_path: Path, logs: Path, imutool: Run, words: Sequence[str]) -> None:
+    write_asl(flight(1, duration_s=1.0), tmp_path / "seq")
+    done = imutool(*(word.format(logs) for word in words), "--json", "-", "-v", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert json.loads(done.stdout)["schema"].startswith("imutool.")
+
+
+def test_json_to_a_file_leaves_the_table_on_stdout(tmp_path: Path, logs: Path, imutool: Run) -> None:
+    done = imutool("info", logs / "flight_1.mcap", "--json", "report.json", cwd=tmp_path)
+    assert "/imu0" in done.stdout
+    assert json.loads((tmp_path / "report.json").read_text())["log"] == "flight_1"
+    assert [path.name for path in tmp_path.iterdir()] == ["report.json"]
+
+
+def test_results_go_to_stdout_and_the_rest_to_stderr_as_much_as_is_asked_for(tmp_path: Path, logs: Path, imutool: Run) -> None:
+    words = ["train", logs / "flight_1.mcap", "--method", "linear", "-o", "m.safetensors", "--overwrite"]
+    loud, quiet = (imutool(*words, option, cwd=tmp_path) for option in ("-v", "-q"))
+    assert loud.stdout == quiet.stdout == "m.safetensors\n"
+    assert quiet.stderr == ""
+    assert re.search(r"^info: Training gyro 0/0: held out [\d.]+° \(closed form [\d.]+\)", loud.stderr, re.MULTILINE)
+
+
+def test_warnings_of_a_log_are_results(tmp_path: Path, imutool: Run) -> None:
+    from dataclasses import replace
+
+    from imutool.mcap_io.write import write
+
+    recording = flight(1, duration_s=10.0)
+    in_g = replace(recording.imu, accel=recording.imu.accel / 9.81)
+    write(replace(recording, imu=in_g), tmp_path / "g.mcap")
+    assert re.search(r"^warning: .*\bg\b", imutool("info", "g.mcap", "-q", cwd=tmp_path).stdout, re.MULTILINE)
+
+
+@pytest.mark.parametrize("words", [[], ["--json", "-"]], ids=["table", "json"])
+def test_a_reader_that_has_left_is_no_error(logs: Path, command: str, words: list[str]) -> None:
+    reading, writing = os.pipe()
+    os.close(reading)
+    try:
+        line = [command, "info", str(logs / "flight_1.mcap"), *words]
+        done = subprocess.run(line, stdout=writing, stderr=subprocess.PIPE, text=True, check=False)
+    finally:
+        os.close(writing)
+    assert (done.returncode, done.stderr) == (141, "")
+
+
+def test_names_of_files_are_shown_as_they_are(tmp_path: Path, logs: Path, imutool: Run) -> None:
+    odd = "a [bold]b[] \x1b[31m.mcap"
+    (tmp_path / odd).write_bytes((logs / "flight_1.mcap").read_bytes())
+    done = imutool("info", odd, "./gone.mcap", cwd=tmp_path)
+    assert done.stderr.startswith("error: gone.mcap: ")
+    done = imutool("info", odd, cwd=tmp_path)
+    assert done.stdout.splitlines()[0] == r"a [bold]b[] \x1b[31m.mcap"
+
+
+# ── tables and progress ──
+
+
+@pytest.mark.parametrize("columns", [80, 200])
+def test_tables_hold_every_figure_and_no_line_is_wider_than_the_terminal(
+    tmp_path: Path, logs: Path, imutool: Run, columns: int
+) -> None:
+    words = ["evaluate", logs / "flight_2.mcap", "--model", "static", "--model", logs / "linear.safetensors"]
+    env = {"COLUMNS": str(columns), "TTY_COMPATIBLE": "1", "NO_COLOR": "1", "TERM": "xterm"}
+    done = imutool(*words, "--json", "out.json", "-q", cwd=tmp_path, env=env)
+    shown = re.sub(r"\x1b\[[0-9;]*m", "", done.stdout)
+    assert max(map(len, shown.splitlines())) <= columns
+    cells = set(shown.split())
+    results = json.loads((tmp_path / "out.json").read_text())["results"]
+    for one in results:
+        names = ("aoe_deg", "aoe_aligned_deg", "ape_m", "ape_aligned_m", "velocity_rmse_m_s")
+        figures = [one[name] for name in names] + [*one["roe_deg"].values(), *one["rpe_m"].values()]
+        assert {f"{figure:.2f}" for figure in figures if figure is not None} <= cells
+        assert {one["log"], one["model"]} <= cells
+
+
+def test_a_table_too_wide_goes_on_below_with_its_keys(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(terminal, "out", type(terminal.out)(width=30))  # it asks for COLUMNS once, when it is made
+    terminal.table([("log", "aaaaaaaa", "bbbbbbbb", "cccccccc", "dddddddd"), ("x" * 8, *"1234")], keys=1)
+    lines = [line.split() for line in capsys.readouterr().out.splitlines() if line.strip() and "─" not in line]
+    assert lines == [["log", "aaaaaaaa", "bbbbbbbb"], ["x" * 8, "1", "2"], ["log", "cccccccc", "dddddddd"], ["x" * 8, "3", "4"]]
+
+
+def test_nothing_is_folded_where_nobody_looks_at_a_terminal(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("COLUMNS", "30")
+    terminal.table([("log", "figure"), ("x" * 70, "y" * 70)], keys=1)
+    assert f"{'x' * 70}  {'y' * 70}" in capsys.readouterr().out
+
+
+def test_progress_tells_loss_held_out_error_and_time_left() -> None:
+    epoch = Epoch("gyro", step=40, steps=120, loss=0.25, held_out=0.0174533, before=0.00872665, left_s=83.2)
+    assert epoch_line(epoch) == (40, 120, "gyro 40/120: loss 0.250, held out 1.000° (closed form 0.500), 1:23 left")
+    done, total, text = epoch_line(Epoch("accel", 0, 0, float("nan"), 0.5, 0.5, 0.0))
+    assert (done, total, text) == (0, 1, "accel 0/0: held out 0.500 m/s (closed form 0.500)")
+
+
+def test_threads_that_wait_do_not_spin(code: Code, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("OMP_WAIT_POLICY", raising=False)
+    assert code("--version") == 0
+    assert os.environ["OMP_WAIT_POLICY"] == "PASSIVE"
+
+
+def test_the_commands_of_the_contract_are_there() -> None:
+    assert {"convert", "info", "train", "debias", "evaluate", "view", "models", "demo"} <= set(COMMANDS)

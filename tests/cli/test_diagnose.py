@@ -1,0 +1,287 @@
+"""`imutool diagnose` from logs to a folder: what it holds, what it says, and that its physics brings a simulation closer."""
+
+from __future__ import annotations
+
+import json
+import runpy
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner, Result
+
+from imutool import diagnosis_output
+from imutool.cli import app
+from imutool.diagnosis import unnamed
+from imutool.diagnosis.result import Curve, Diagnosis, Estimate, Finding, HeldOut
+from imutool.diagnosis.to_physics_file import found
+from imutool.diagnosis.wording import conclusion
+from imutool.errors import ConfigError
+from imutool.mcap_io.read import read
+from imutool.mcap_io.write import write
+from imutool.recording import Recording
+from imutool.sensor import physics_file
+from imutool.sensor.flight import flight
+from imutool.sensor.physics_file import Bias, Entry, PhysicsFile, Value
+from imutool.sensor.readings import Read
+from imutool.sensor.simulate import simulate
+
+MADE = SimpleNamespace(**runpy.run_path(str(Path(__file__).parents[1] / "diagnosis" / "diagnoses.py")))
+
+ARM_M = np.array([0.2, -0.1, 0.05])
+GYRO_BIAS, ACCEL_BIAS = (0.01, -0.02, 0.005), (0.1, 0.05, -0.08)
+WHITE = "gyro_density = [2e-4, 2e-4, 2e-4]\naccel_density = [2e-3, 2e-3, 2e-3]\n"
+RATE_HZ, SECONDS = 100.0, 30.0
+SIGMAS = 5.0  # of the planted arm, from what is stated
+BIAS_TOLERANCE = np.array([1e-3] * 3 + [1e-2] * 3)  # rad/s, m/s²: thirty seconds of the noise above, and what an arm hides
+EXACT = 1e-9  # of two ways to the same curve, between whose points both are straight
+Done = subprocess.CompletedProcess[str]
+Command = Callable[..., Done]
+HELD = HeldOut(0.02, 0.01, "rad/s", 9.0)
+
+
+def run(*words: str | Path) -> Result:
+    return CliRunner().invoke(app, [*map(str, words)])
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """trajectory.mcap, along it arm.mcap (a lever arm, a bias) and null.mcap (a bias), other.mcap along another motion."""
+    place = tmp_path_factory.mktemp("diagnose")
+    (place / "white.toml").write_text(WHITE)
+    bias = Bias(gyro=GYRO_BIAS, accel=ACCEL_BIAS)
+    arm = {axis: Value(value=r, unit="m") for axis, r in zip("xyz", ARM_M.tolist(), strict=True)}
+    physics_file.write(PhysicsFile(effect=(Entry(name="lever_arm", parameters=arm),), bias=bias), place / "arm.toml")
+    physics_file.write(PhysicsFile(bias=bias), place / "null.toml")
+    for name, seed in (("trajectory", 5), ("another", 6)):
+        write(flight(seed, duration_s=SECONDS), place / f"{name}.mcap")
+    for name, trajectory, seed in (("arm", "trajectory", 2), ("null", "trajectory", 3), ("other", "another", 4)):
+        physics = place / ("arm.toml" if name == "arm" else "null.toml")
+        path = place / f"{trajectory}.mcap"
+        simulate(path, place / f"{name}.mcap", physics=physics, noise=place / "white.toml", rate_hz=RATE_HZ, seed=seed)
+    return place
+
+
+@pytest.fixture(scope="module")
+def diagnosed(folder: Path, imutool: Command) -> tuple[Path, Done]:
+    """The folder that the installed command wrote about the lever arm, and what it said."""
+    words = ("-o", folder / "diagnosis", "--json", folder / "said.json")
+    said = imutool("diagnose", folder / "arm.mcap", *words, cwd=folder)
+    assert said.returncode == 0, said.stderr
+    return folder / "diagnosis", said
+
+
+def test_the_planted_lever_arm_is_found_and_written(diagnosed: tuple[Path, Done]) -> None:
+    place, _ = diagnosed
+    assert sorted(path.name for path in place.iterdir()) == sorted(diagnosis_output.FILES)
+    assert f'href="{diagnosis_output.LOG}"' in (place / diagnosis_output.REPORT).read_text()
+    page = (place / diagnosis_output.LOG).read_text()
+    assert "lever_arm" in page  # its finding, where it acts
+    assert ".partial" not in page
+    told = json.loads((place / "findings.json").read_text())
+    assert told["schema"] == "imutool.diagnosis/1"
+    assert told["mismatch"]
+    assert [one["effect"] for one in told["findings"]] == ["lever_arm"]
+    assert json.loads((place.parent / "said.json").read_text()) == told
+    (entry,) = physics_file.read(place / "physics.toml").effect
+    for axis, r in zip("xyz", ARM_M, strict=True):
+        value = entry.parameters[axis]
+        assert value.std is not None
+        assert abs(value.value - r) < SIGMAS * value.std
+        assert value.value == told["findings"][0]["parameters"][axis]["value"]
+    bias = physics_file.read(place / "physics.toml").bias
+    assert bias is not None
+    assert np.all(np.abs(np.array([*bias.gyro, *bias.accel]) - [*GYRO_BIAS, *ACCEL_BIAS]) < BIAS_TOLERANCE)
+    assert "lever_arm" in (place / "report.html").read_text()
+    assert (place / "view.rrd").read_bytes()[:4] == b"RRF2"
+
+
+def test_the_conclusion_comes_first(diagnosed: tuple[Path, Done]) -> None:
+    place, said = diagnosed
+    lines = said.stdout.splitlines()
+    assert lines[0].startswith("The accel differs")
+    assert "(lever_arm)" in lines[0]
+    assert lines[-1] == f"{place}: findings.json, physics.toml, report.html, log.html, view.rrd"
+    (closer,) = [line for line in lines if line.startswith("With everything that was found")]
+    assert "accel rms" in closer
+    assert "% closer" in closer
+
+
+def test_simulated_with_the_physics_found_it_comes_closer(diagnosed: tuple[Path, Done]) -> None:
+    place, _ = diagnosed
+    source = place.parent
+    for name, words in (("ideal", ()), ("again", ("--physics", place / "physics.toml"))):
+        said = run("simulate", source / "trajectory.mcap", source / f"{name}.mcap", "--rate", RATE_HZ, *words)
+        assert said.exit_code == 0, said.output
+    real, ideal, again = (read(source / f"{name}.mcap") for name in ("arm", "ideal", "again"))
+    assert distance(again, real) < 0.1 * distance(ideal, real)  # the noise of a sample is a twentieth of what the arm makes
+
+
+def distance(one: Recording, other: Recording) -> float:
+    """Root mean square difference of the specific forces, sample by sample."""
+    assert np.array_equal(one.imu.t_ns, other.imu.t_ns)
+    return float(np.sqrt(np.mean((one.imu.accel - other.imu.accel) ** 2)))
+
+
+def test_nothing_is_found_where_nothing_was_left_out(folder: Path, imutool: Command) -> None:
+    said = imutool("diagnose", folder / "null.mcap", "--json", "-", cwd=folder)
+    assert said.returncode == 0, said.stderr
+    told = json.loads(said.stdout)  # the JSON, and nothing beside it
+    assert not told["mismatch"]
+    assert told["findings"] == []
+    assert told["located"] == []
+
+
+def test_a_diagnosis_stays_where_one_is(diagnosed: tuple[Path, Done]) -> None:
+    place, _ = diagnosed
+    before = {path.name: path.read_bytes() for path in place.iterdir()}
+    said = run("diagnose", place.parent / "arm.mcap", "-o", place)
+    assert said.exit_code == ConfigError.exit_code
+    assert "holds a diagnosis already" in said.stderr
+    assert {path.name: path.read_bytes() for path in place.iterdir()} == before
+
+
+@pytest.mark.parametrize(
+    ("words", "code", "says"),
+    [
+        (["untrue.mcap", "--sim", "another.mcap"], 4, "turns otherwise"),
+        (["arm.mcap", "--imu", "/imu7"], 5, "/imu7"),
+        (["arm.mcap", "--truth", "/nowhere"], 5, "/nowhere"),
+        (["untrue.mcap"], 4, "no simulation and no true poses"),
+        (["nosuch.mcap"], 3, "nosuch.mcap"),
+        (["arm.mcap", "-o", "white.toml"], 3, "is a file"),
+    ],
+)
+def test_what_cannot_be_diagnosed_is_refused(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, words: list[str], code: int, says: str
+) -> None:
+    monkeypatch.chdir(folder)
+    if words[0] == "untrue.mcap":
+        write(replace(read(folder / "arm.mcap"), truths={}), folder / "untrue.mcap", overwrite=True)
+    before = sorted(folder.iterdir())
+    said = run("diagnose", *words)
+    assert said.exit_code == code, said.output
+    assert says in said.stderr
+    assert said.stdout == ""
+    assert sorted(folder.iterdir()) == before
+
+
+# ── the folder, of made-up diagnoses ──
+
+
+def test_other_files_in_the_folder_stay(tmp_path: Path) -> None:
+    (tmp_path / "real.mcap").write_bytes(b"mine")
+    assert diagnosis_output.write(MADE.NOTHING, tmp_path) == []
+    assert diagnosis_output.write(MADE.ARM, tmp_path, overwrite=True) == []
+    assert (tmp_path / "real.mcap").read_bytes() == b"mine"
+    without_logs = {*diagnosis_output.FILES, "real.mcap"} - {diagnosis_output.LOG}
+    assert {path.name for path in tmp_path.iterdir()} == without_logs
+    assert json.loads((tmp_path / "findings.json").read_text()) == diagnosis_output.plain(MADE.ARM)
+
+
+def test_an_absent_extra_costs_its_file_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    diagnosis_output.write(MADE.ARM, tmp_path / "out")
+    monkeypatch.setitem(sys.modules, "rerun", None)
+    (remark,) = diagnosis_output.write(MADE.NOTHING, tmp_path / "out", overwrite=True)
+    assert remark == "view.rrd is left out: rerun is not installed (pip install 'imutool[view]')"
+    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["findings.json", "physics.toml", "report.html"]
+
+
+def test_nothing_is_left_of_what_was_interrupted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def interrupted(*_: object, **__: object) -> Iterator[str]:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("imutool.viewing.rerun.diagnosis.save", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        diagnosis_output.write(MADE.ARM, tmp_path / "out")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_what_is_no_number_is_null_in_the_json() -> None:
+    endless = {"gyro_limit": Estimate(np.inf, np.nan, "rad/s"), "accel_limit": Estimate(80.0, 0.1, "m/s²")}
+    told = diagnosis_output.plain(replace(MADE.ARM, findings=(finding("saturation", "accel", endless),)))
+    assert told["findings"][0]["parameters"]["gyro_limit"] == {"value": None, "std": None, "unit": "rad/s"}
+    (entry,) = found(replace(MADE.ARM, findings=(finding("saturation", "accel", endless),))).effect
+    assert list(entry.parameters) == ["accel_limit"]
+
+
+# ── the physics found, as a file ──
+
+
+def finding(effect: str, signal: str, parameters: dict[str, Estimate], equation: str = "", **more: object) -> Finding:
+    return Finding(effect, signal, 0.5, 1e-9, 1e-3, parameters, equation, HELD, **more)  # type: ignore[arg-type]
+
+
+def only(*findings: Finding) -> Diagnosis:
+    return replace(MADE.ARM, findings=findings, bias=np.zeros((1, 6)))
+
+
+def test_a_null_diagnosis_is_a_bias_alone() -> None:
+    file = found(MADE.NOTHING)
+    assert file.effect == ()
+    assert file.term == ()
+    assert file.unknown == ()
+    assert file.bias is not None
+    assert [*file.bias.gyro, *file.bias.accel] == MADE.NOTHING.bias[0].tolist()
+    assert conclusion(MADE.NOTHING).startswith("Nothing")
+
+
+@pytest.mark.parametrize("effect", ["dropped_samples", "timestamp_jitter", "reference_error"])
+def test_what_is_no_effect_on_a_reading_stays_out(effect: str) -> None:
+    file = found(only(finding(effect, "both", {"share": Estimate(0.01, 0.001, "-")})))
+    assert file.effect == ()
+    assert file.acting()[0][0].name == physics_file.BIAS
+
+
+def test_what_is_driven_keeps_its_driver_and_lag() -> None:
+    unit = "m/s² per unit of /motor/current"
+    gain = {axis: Estimate(0.1 * k, 0.01, unit) for k, axis in enumerate("xyz")} | {"lag": Estimate(0.05, 0.01, "s")}
+    file = found(only(finding("driven", "accel", gain, driver="/motor/current")))
+    (physics, theta), _ = file.acting()
+    assert theta.tolist() == [0.0, 0.1, 0.2, 0.05]
+    t = np.arange(50) * 0.01
+    there = Read(t, np.zeros((50, 3)), np.zeros((50, 3)), np.zeros((50, 3)), None, {"/motor/current": t})
+    assert np.ptp(physics.forward(there, theta).accel[:, 2]) > 0.0
+
+
+def test_a_term_without_a_name_acts_as_it_was_found() -> None:
+    said = finding("unknown", "gyro", {"c": Estimate(0.3, 0.01, "")}, "gyro.z += c omega_x omega_y")
+    (physics, theta), _ = found(only(said)).acting()
+    gyro = np.random.default_rng(1).normal(size=(20, 3))
+    there = Read(np.arange(20) * 0.01, gyro, gyro, gyro)
+    added = physics.forward(there, theta).gyro - gyro
+    assert np.allclose(added, np.outer(gyro[:, 0] * gyro[:, 1], [0.0, 0.0, 0.3]), rtol=0, atol=EXACT)
+
+
+def test_a_curve_and_the_bias_add_up_to_what_was_fitted() -> None:
+    """The curve is told about its mean, which goes to the bias: the coefficients' own curve is what both make together."""
+    shape = unnamed.Curve("omega_x", 1, 2, np.array([-1.0, -0.3, 0.0, 0.2, 1.0]))
+    c, x = np.array([0.5, 0.1, 0.0, 0.2, 0.4, 0.9, 1.0]), np.linspace(-1.0, 1.0, 41)
+    y = np.zeros((41, 3))
+    mean = float((shape.basis(x) @ c).mean())
+    y[:, 2] = shape.basis(x) @ c - mean
+    curve = Curve("omega_x", "rad/s", x, y, np.full((41, 3), 0.01), mean)
+    acting = found(only(finding("unknown", "accel", {}, "accel.z += curve(omega_x)", curve=curve))).acting()
+    gyro = np.stack([x, np.zeros(41), np.zeros(41)], axis=1)
+    there = Read(np.arange(41) * 0.01, gyro, np.zeros((41, 3)), gyro)
+    for physics, theta in acting:
+        there = physics.forward(there, theta)
+    assert np.allclose(there.accel[:, 2], shape.basis(x) @ c, rtol=0, atol=EXACT)
+    assert not there.accel[:, :2].any()
+
+
+def test_every_term_there_can_be_is_written_as_it_acts() -> None:
+    """Whatever `unnamed` can propose, the file can say: same signal, same axis, same numbers."""
+    gyro, accel, alpha = (np.random.default_rng(k).normal(size=(30, 3)) for k in (1, 2, 3))
+    there = Read(np.arange(30) * 0.01, gyro, accel, alpha)
+    for physics in unnamed.terms(there):
+        c = {"c": Estimate(0.7, 0.01, physics.parameters[0].unit)}
+        (written, theta), _ = found(only(finding("unknown", physics.sensors[0], c, physics.equation))).acting()
+        one, other = written.forward(there, theta), physics.forward(there, np.array([0.7]))
+        assert np.allclose(one.gyro, other.gyro, rtol=0, atol=EXACT), physics.equation
+        assert np.allclose(one.accel, other.accel, rtol=0, atol=EXACT), physics.equation

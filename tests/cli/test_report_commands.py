@@ -1,0 +1,128 @@
+"""The commands that leave a page: it holds their numbers, a link leads to it, and nothing is lost for its sake."""
+
+from __future__ import annotations
+
+import json
+import re
+import runpy
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+from urllib.parse import unquote
+
+import pytest
+from typer.testing import CliRunner, Result
+
+from imutool import diagnosis_output
+from imutool.cli import app
+from imutool.errors import DataError
+from imutool.fleet import page as fleet_page
+from imutool.fleet.models import settled
+from imutool.fleet.task import Result as Done
+from imutool.fleet.task import Settings, Source, Task
+from imutool.fleet.work import stands, work
+from imutool.location import identity
+from imutool.viewing.html import report, report_paths
+
+MADE = SimpleNamespace(**runpy.run_path(str(Path(__file__).parents[1] / "diagnosis" / "diagnoses.py")))
+HOSTILE = "a#b?<b>&'%41"
+
+
+def run(*words: str | Path) -> Result:
+    return CliRunner().invoke(app, [*map(str, words)])
+
+
+@pytest.fixture(autouse=True)
+def few_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Pictures are looked at in view/test_report.py; here one of them is enough."""
+    monkeypatch.setattr(report, "PICTURES", (report_paths.paths,))
+
+
+def test_evaluate_writes_the_numbers_of_its_table(logs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    words = ["--model", logs / "linear.safetensors", "--zupt", "--report", "page.html", "--json", "said.json"]
+    done = run("evaluate", logs / "flight_2.mcap", *words)
+    assert done.exit_code == 0, done.output
+    assert "Report: page.html" in done.stdout
+    page = (tmp_path / "page.html").read_text()
+    results = json.loads((tmp_path / "said.json").read_text())["results"]
+    pure = [one for one in results if one["estimate"] == "integration"]
+    assert len(pure) == 2
+    for one in pure:
+        for name in ("aoe_deg", "aoe_aligned_deg", "ape_m", "ape_aligned_m", "velocity_rmse_m_s"):
+            assert f'title="{one[name]!r}"' in page
+    for one in results:
+        if one["estimate"] == "zupt":
+            assert f"With zero-velocity updates {one['model']} has an orientation error of {one['aoe_deg']:.2f}°" in page
+
+
+def test_debias_writes_a_page_of_the_new_log_and_refuses_before_the_work(logs: Path, tmp_path: Path) -> None:
+    words = [logs / "flight_1.mcap", tmp_path / "out.mcap", "--model", logs / "linear.safetensors"]
+    (tmp_path / "page.html").write_text("mine")
+    refused = run("debias", *words, "--report", tmp_path / "page.html")
+    assert refused.exit_code == 3
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["page.html"]
+    assert (tmp_path / "page.html").read_text() == "mine"
+    done = run("debias", *words, "--report", tmp_path / "new.html", "--json", tmp_path / "said.json")
+    assert done.exit_code == 0, done.output
+    assert json.loads((tmp_path / "said.json").read_text())["report"] == str(tmp_path / "new.html")
+    assert "in the log: linear" in (tmp_path / "new.html").read_text()
+
+
+def test_a_page_of_the_logs_that_cannot_be_drawn_costs_no_diagnosis(tmp_path: Path) -> None:
+    def look(folder: Path) -> list[object]:
+        assert folder.name == "out"
+        assert (folder / diagnosis_output.FINDINGS).is_file()
+        raise DataError("too little truth")
+
+    (remark,) = diagnosis_output.write(replace(MADE.NOTHING, traces=()), tmp_path / "out", logs=look)
+    assert remark.startswith("log.html is left out: too little truth")
+    assert "href" not in (tmp_path / "out" / diagnosis_output.REPORT).read_text()
+    assert not (tmp_path / "out" / diagnosis_output.LOG).exists()
+    assert [path.name for path in tmp_path.iterdir()] == ["out"]
+
+
+@pytest.fixture
+def task(logs: Path, tmp_path: Path) -> Task:
+    """A log of a fleet, in a folder and of a name that no address may trip over."""
+    log = logs / "flight_1.mcap"
+    size, stamp = identity(log)
+    settings = settled(Settings(command="debias", model=str(logs / "linear.safetensors"), pages=True))
+    source = Source(str(log), f"{HOSTILE}/log.mcap", size, stamp)
+    return Task(key="k", source=source, out=str(tmp_path / "out"), target=source.name, settings=settings)
+
+
+def test_a_fleet_leaves_a_page_beside_each_log_and_its_summary_leads_there(task: Task, tmp_path: Path) -> None:
+    done = work(task)
+    assert done.status == "ok", done.error
+    there = tmp_path / "out" / HOSTILE / "log.html"
+    assert done.page == f"{HOSTILE}/log.html"
+    assert "linear cuts the orientation error" in done.page_says
+    assert stands(done, there.with_suffix(".mcap"))
+    summary = tmp_path / "pages" / "summary.html"
+    summary.parent.mkdir()
+    fleet_page.write([done], task.settings, summary, out=tmp_path / "out", seconds=1.0, source="logs")
+    content = summary.read_text()
+    (link,) = re.findall(r'<a href="([^"]*)"', content)
+    assert (summary.parent / unquote(link)).resolve() == there
+    assert not set("#?<'") & set(link)
+    assert "linear cuts the orientation error" in content
+    there.unlink()
+    assert not stands(done, there.with_suffix(".mcap")), "a page that is gone is made again"
+
+
+def test_a_fleet_replaces_its_own_page_and_nobody_elses(task: Task, tmp_path: Path) -> None:
+    there = tmp_path / "out" / HOSTILE / "log.html"
+    there.parent.mkdir(parents=True)
+    there.write_text("mine")
+    done = work(task)
+    assert done.status == "ok"
+    assert done.page == ""
+    assert any("no page: " in warning and "no fleet has written it" in warning for warning in done.warnings)
+    assert there.read_text() == "mine"
+    assert "<h2>Logs</h2>" not in fleet_page.html([done], task.settings, seconds=1.0, source="logs")
+
+
+def test_without_pages_a_summary_leads_nowhere() -> None:
+    done = Done(key="k", source="a.mcap", target="a.mcap", status="ok")
+    assert "<a " not in fleet_page.html([done], Settings(command="debias"), seconds=1.0, source="logs")

@@ -1,0 +1,102 @@
+"""A simulation of another motion: what both have is no finding, what differs is told with both numbers."""
+
+from __future__ import annotations
+
+import runpy
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from imutool.diagnosis.compare_findings import ANOTHER_MOTION, remarks, shared
+from imutool.diagnosis.diagnose import diagnose
+from imutool.diagnosis.result import Curve, Estimate, Finding, HeldOut
+from imutool.errors import DataError
+from imutool.mcap_io.write import write
+
+PLANTED = SimpleNamespace(**runpy.run_path(str(Path(__file__).with_name("planted.py"))))
+ARM, SCALE = [0.2, -0.05, 0.1], [0.02, 0.0, -0.015]
+SURE = 6.0  # of stated deviations: differentiated poses lack a little of the motion
+
+
+def finding(effect: str = "gyro_scale", x: float = 0.02, std: float = 1e-4, **more: object) -> Finding:
+    held_out = HeldOut(0.02, 0.01, "rad/s", 9.0)
+    found = Finding(effect, "gyro", 0.9, 1e-9, 0.0, {"x": Estimate(x, std, "-")}, "gyro += S gyro", held_out)
+    return replace(found, **more)
+
+
+def log(folder: Path, name: str, seed: int, effects: Mapping[str, Sequence[float]], *, poses: bool = True) -> Path:
+    felt = PLANTED.rich(seed)
+    samples = PLANTED.ideal(felt, PLANTED.acting(effects)) + PLANTED.noise(len(felt.t_s), seed) + PLANTED.BIAS
+    truth = PLANTED.poses(PLANTED.moving(seed), PLANTED.clock(rate_hz=200.0)) if poses else None
+    path = folder / f"{name}.mcap"
+    write(PLANTED.recording(name, felt.t_s, samples, poses=truth), path)
+    return path
+
+
+@pytest.mark.parametrize(
+    ("x", "std", "alike"),
+    [(0.02, 1e-4, True), (0.0205, 1e-6, True), (0.0203, 1e-4, True), (0.022, 1e-4, False), (0.03, 0.01, True)],
+)
+def test_numbers_are_alike_within_what_the_two_are_sure_of_and_what_poses_can_tell(x: float, std: float, alike: bool) -> None:
+    assert shared(finding(), [finding("lever_arm"), finding(x=x, std=std)]) is alike
+
+
+def test_another_effect_signal_or_driver_is_another_finding() -> None:
+    driven = finding("driven", driver="/motor.x")
+    assert not shared(finding(), [finding("gyro_misalignment"), finding(signal="accel")])
+    assert not shared(driven, [finding("driven", driver="/motor.y")])
+    assert shared(driven, [driven])
+
+
+def test_curves_are_alike_where_both_reach() -> None:
+    def curve(slope: float, first: float) -> Finding:
+        x = np.linspace(first, 2.0, 21)
+        y = np.outer(slope * x, [1.0, 0.0, 0.0])
+        one = Curve("rate about x", "rad/s", x, y - y.mean(axis=0), np.full((21, 3), 1e-3))
+        return finding("unknown", parameters={}, curve=one)
+
+    assert shared(curve(0.1, -2.0), [curve(0.1, -1.0)])
+    assert not shared(curve(0.1, -2.0), [curve(0.2, -1.0)])
+
+
+def test_what_the_simulation_has_is_said() -> None:
+    here = [finding(), finding("lever_arm"), finding("mount_rotation")]
+    known = [finding(), finding("lever_arm", x=0.5), finding("clock_offset")]
+    said = "\n".join(remarks(here, known))
+    assert "gyro scale: the simulation has it alike" in said
+    assert "lever arm: the simulation has it too, as" in said
+    assert "clock offset: the simulation has it" in said
+    assert "mount rotation" not in said
+
+
+def test_what_only_the_recording_has_is_found_beside_a_simulation_of_another_motion(tmp_path: Path) -> None:
+    real = log(tmp_path, "real", 3, {"lever_arm": ARM, "gyro_scale": SCALE})
+    sim = log(tmp_path, "sim", 7, {"gyro_scale": SCALE})
+    found = diagnose([real], sim)
+    assert found.sim == str(sim)
+    assert [one.effect for one in found.findings] == ["lever_arm"]
+    arm = found.findings[0].parameters
+    assert all(abs(arm[axis].value - true) < SURE * arm[axis].std for axis, true in zip("xyz", ARM, strict=True))
+    assert found.remarks[0] == ANOTHER_MOTION
+    assert any("gyro scale: the simulation has it alike" in remark for remark in found.remarks)
+    assert found.closer["gyro"].rms_before == pytest.approx(
+        found.closer["gyro"].rms_after, rel=0.02
+    )  # nothing is left out there
+    assert found.closer["accel"].rms_after < 0.1 * found.closer["accel"].rms_before
+
+
+def test_another_motion_without_poses_on_both_sides_is_refused(tmp_path: Path) -> None:
+    real = log(tmp_path, "real", 3, {}, poses=False)
+    sim = log(tmp_path, "sim", 7, {})
+    with pytest.raises(DataError, match="turns otherwise"):
+        diagnose([real], sim)
+
+
+def test_a_simulation_of_the_motion_of_some_recordings_only_is_refused(tmp_path: Path) -> None:
+    reals = [log(tmp_path, "one", 3, {}), log(tmp_path, "two", 7, {})]
+    with pytest.raises(DataError, match="some recordings only"):
+        diagnose(reals, log(tmp_path, "sim", 7, {}))

@@ -1,0 +1,294 @@
+"""From logs on disk to the answer: what was planted is named, placed, sized and removed; nothing is said of nothing."""
+
+from __future__ import annotations
+
+import json
+import runpy
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from imutool.diagnosis.diagnose import diagnose
+from imutool.diagnosis.result import Diagnosis
+from imutool.errors import DataError, LogError
+from imutool.mcap_io.read import read
+from imutool.mcap_io.write import write
+
+PLANTED = SimpleNamespace(**runpy.run_path(str(Path(__file__).with_name("planted.py"))))
+SURE = 4.0
+ARM = [0.2, -0.05, 0.1]
+FLOOR = 0.15  # how well a noise level is known from twenty seconds
+SIM_HZ = 200.0
+Made = Callable[..., tuple[Path, Path]]
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Made:
+    """Writes a recording with effects and a simulation of the same motion without, and says where they are."""
+
+    def make(
+        effects: Mapping[str, Sequence[float]] | None = None,
+        *,
+        seed: int = 1,
+        name: str = "real",
+        real_poses: bool = False,
+        sim_noise: bool = True,
+        keep: np.ndarray | None = None,
+        added: Callable[[Any], np.ndarray] | None = None,
+        lsb: np.ndarray | None = None,
+        sim_seed: int | None = None,
+    ) -> tuple[Path, Path]:
+        folder, felt = tmp_path_factory.mktemp("pair"), PLANTED.rich(seed)
+        real = PLANTED.ideal(felt, PLANTED.acting(effects or {})) + PLANTED.noise(len(felt.t_s), seed) + PLANTED.BIAS
+        if added is not None:
+            real = real + added(felt)
+        if lsb is not None:
+            real = lsb * np.round(real / lsb)
+        rows = np.ones(len(real), bool) if keep is None else keep
+        path = PLANTED.moving(seed)
+        truth = PLANTED.poses(path, PLANTED.clock(rate_hz=SIM_HZ)) if real_poses else None
+        recording = PLANTED.recording(name, felt.t_s[rows], real[rows], poses=truth)
+        t_sim = PLANTED.clock(rate_hz=SIM_HZ)
+        path = PLANTED.moving(seed if sim_seed is None else sim_seed)
+        imu = path.imu(path.start_ns + np.round(t_sim * 1e9).astype(np.int64))
+        sim = np.concatenate([imu.gyro, imu.accel], axis=1) + (PLANTED.noise(len(t_sim), seed + 99) if sim_noise else 0.0)
+        write(recording, folder / f"{name}.mcap")
+        write(PLANTED.recording("sim", t_sim, sim, poses=PLANTED.poses(path, t_sim)), folder / "sim.mcap")
+        return folder / f"{name}.mcap", folder / "sim.mcap"
+
+    return make
+
+
+def effects(found: Diagnosis) -> list[str]:
+    return [one.effect for one in found.findings]
+
+
+def near(found: Diagnosis, effect: str, truth: Mapping[str, float]) -> bool:
+    one = next(one for one in found.findings if one.effect == effect)
+    return all(abs(one.parameters[name].value - value) < SURE * one.parameters[name].std for name, value in truth.items())
+
+
+@pytest.fixture(scope="module")
+def nothing(made: Made) -> tuple[Path, Path, Diagnosis]:
+    """A bias and noise, beside a simulation."""
+    real, sim = made()
+    return real, sim, diagnose([real], sim)
+
+
+@pytest.fixture(scope="module")
+def arm(made: Made) -> tuple[Path, Path, Diagnosis]:
+    """A lever arm, beside a simulation."""
+    real, sim = made({"lever_arm": ARM})
+    return real, sim, diagnose([real], sim)
+
+
+@pytest.fixture(scope="module")
+def arm_by_poses(made: Made) -> tuple[Path, Diagnosis]:
+    """A lever arm, beside the recording's own poses."""
+    real, _ = made({"lever_arm": ARM}, real_poses=True)
+    return real, diagnose([real])
+
+
+# ── nothing ──
+
+
+def test_noise_and_a_constant_bias_are_no_mismatch(nothing: tuple[Path, Path, Diagnosis]) -> None:
+    _, _, found = nothing
+    assert not found.mismatch
+    assert found.findings == ()
+    assert found.located == ()
+    assert found.not_identifiable == ()
+    assert (np.abs(found.bias[0] - PLANTED.BIAS) < 6 * PLANTED.NOISE / np.sqrt(2000)).all()
+    for signal, noise in (("gyro", PLANTED.NOISE[0]), ("accel", PLANTED.NOISE[3])):
+        assert found.unexplained[signal].white
+        assert found.unexplained[signal].noise_floor == pytest.approx(noise, rel=FLOOR)
+        assert found.unexplained[signal].rms == pytest.approx(noise, rel=FLOOR)
+
+
+def test_noise_and_a_constant_bias_are_no_mismatch_beside_true_poses_either(made: Made) -> None:
+    real, _ = made(seed=2, real_poses=True)
+    assert not diagnose([real]).mismatch
+
+
+def test_times_count_from_the_start_of_the_log_also_where_its_poses_begin_later(made: Made, tmp_path: Path) -> None:
+    real, _ = made({"lever_arm": ARM}, real_poses=True)
+    recording = read(real)
+    late_s = 3.0
+    truth = recording.truth.between(int(recording.imu.t_ns[0]) + int(late_s * 1e9), int(recording.imu.t_ns[-1]))
+    write(replace(recording, truths={"/ground_truth/pose": truth}), tmp_path / "late.mcap")
+    found = diagnose([tmp_path / "late.mcap"])
+    assert effects(found) == ["lever_arm"]
+    assert late_s <= found.traces[0].t_s[0] < late_s + 1.0
+    assert min(first for place in found.located for first, _ in place.intervals_s) >= late_s
+
+
+# ── the JSON ──
+
+KEYS = {"schema", "real", "sim", "mismatch", "located", "findings", "bias", "not_identifiable", "unexplained"}
+
+
+def test_the_json_has_the_fields_that_programs_read(arm: tuple[Path, Path, Diagnosis]) -> None:
+    real, sim, found = arm
+    plain = found.plain()
+    assert json.loads(json.dumps(plain, allow_nan=False)) == plain
+    assert set(plain) >= KEYS
+    assert plain["schema"] == "imutool.diagnosis/1"
+    assert plain["real"] == [str(real)]
+    assert plain["sim"] == str(sim)
+    assert plain["mismatch"] is True
+    (place,) = plain["located"]
+    assert set(place) >= {"signal", "axes", "intervals_s", "regime", "share", "p_value"}
+    assert place["signal"] == "accel"
+    assert set(place["axes"]) <= {"x", "y", "z"}
+    assert all(0.0 <= begin < end for begin, end in place["intervals_s"])
+    (one,) = plain["findings"]
+    assert set(one) >= {"effect", "signal", "share", "p_value", "false_discovery_rate", "parameters", "equation", "held_out"}
+    assert one["effect"] == "lever_arm"
+    assert one["signal"] == "accel"
+    assert set(one["parameters"]) == {"x", "y", "z"}
+    assert one["parameters"]["x"]["unit"] == "m"
+    assert set(one["parameters"]["x"]) == {"value", "std", "unit"}
+    assert set(one["held_out"]) == {"rms_before", "rms_after", "unit", "seconds"}
+    assert one["held_out"]["unit"] == "m/s^2"
+    assert set(plain["bias"]) == {"gyro", "accel"}
+    assert len(plain["bias"]["gyro"]) == 3
+    assert set(plain["unexplained"]) >= {"gyro_rms", "accel_rms", "noise_floor", "white"}
+    assert set(plain["unexplained"]["noise_floor"]) == {"gyro", "accel"}
+
+
+def test_the_json_of_nothing_says_so_and_has_every_field(nothing: tuple[Path, Path, Diagnosis]) -> None:
+    plain = nothing[2].plain()
+    json.dumps(plain, allow_nan=False)
+    assert set(plain) >= KEYS
+    assert plain["mismatch"] is False
+    assert plain["findings"] == []
+    assert plain["located"] == []
+
+
+# ── what was planted ──
+
+
+def test_a_lever_arm_is_named_sized_placed_and_removed(arm: tuple[Path, Path, Diagnosis]) -> None:
+    found = arm[2]
+    assert effects(found) == ["lever_arm"]
+    assert near(found, "lever_arm", dict(zip("xyz", ARM, strict=True)))
+    (one,) = found.findings
+    assert one.share > 0.9
+    assert one.p_value < 1e-12
+    assert one.false_discovery_rate < 0.01
+    assert one.held_out.rms_before > 5 * PLANTED.NOISE[3]
+    assert one.held_out.rms_after == pytest.approx(PLANTED.NOISE[3], rel=FLOOR)
+    assert 4.0 < one.held_out.seconds < 12.0  # about a third of 24 s
+    closer = found.closer["accel"]
+    assert closer.by == "second simulation"
+    assert closer.rms_before == pytest.approx(one.held_out.rms_before, rel=1e-9)
+    assert closer.rms_after == pytest.approx(one.held_out.rms_after, rel=0.01)  # another way to the same: smoothed poses
+    assert closer.share == pytest.approx(1.0, abs=0.01)
+    assert [place.signal for place in found.located] == ["accel"]
+    (trace,) = found.traces
+    assert trace.real.shape == trace.before.shape == trace.after.shape
+    assert (trace.real - trace.after)[:, 3:].std() < 1.1 * PLANTED.NOISE[3] < (trace.real - trace.before)[:, 3:].std()
+
+
+def test_a_pair_is_named_whole_strongest_first(made: Made) -> None:
+    real, sim = made({"clock_offset": [0.004], "lever_arm": ARM})
+    found = diagnose([real], sim)
+    assert sorted(effects(found)) == ["clock_offset", "lever_arm"]
+    assert near(found, "clock_offset", {"tau": 0.004})
+    assert near(found, "lever_arm", dict(zip("xyz", ARM, strict=True)))
+    p_values = [one.p_value for one in found.findings]
+    assert p_values == sorted(p_values)
+
+
+def test_without_a_simulation_the_recordings_own_poses_serve(arm_by_poses: tuple[Path, Diagnosis]) -> None:
+    found = arm_by_poses[1]
+    assert effects(found) == ["lever_arm"]
+    assert found.sim is None
+    assert found.plain()["sim"] is None
+    assert near(found, "lever_arm", dict(zip("xyz", ARM, strict=True)))
+
+
+def test_what_separates_the_two_is_never_denied(made: Made) -> None:
+    """A misfit four times the noise, whatever it is called: the answer is not that nothing but noise is there."""
+
+    def bent(felt: Any) -> np.ndarray:
+        out = np.zeros((len(felt.t_s), 6))
+        out[:, 4] = 0.5 * np.tanh(felt.gyro[:, 2] / 0.4)
+        return out
+
+    real, sim = made(added=bent, seed=9)
+    found = diagnose([real], sim)
+    assert found.mismatch
+    assert not {one.effect for one in found.findings} - {"unknown"}
+
+
+# ── what stamps and digits show ──
+
+
+def test_missing_samples_are_counted_and_a_coarse_grid_is_told_with_its_step(made: Made) -> None:
+    keep = np.ones(2400, bool)
+    keep[np.random.default_rng(4).choice(np.arange(50, 2350), 12, replace=False)] = False
+    real, sim = made(keep=keep, lsb=np.repeat([0.01, 0.1], 3))
+    found = diagnose([real], sim)
+    assert sorted(effects(found)) == ["dropped_samples", "quantization"]
+    told = {one.effect: one.parameters for one in found.findings}
+    assert told["dropped_samples"]["missing"].value == 12
+    assert told["quantization"]["gyro_lsb"].value == pytest.approx(0.01, rel=1e-3)
+    assert told["quantization"]["accel_lsb"].value == pytest.approx(0.1, rel=1e-3)
+    json.dumps(found.plain(), allow_nan=False)
+
+
+# ── several logs, and what is refused ──
+
+
+def test_several_recordings_share_the_physics_and_have_a_bias_each(made: Made, arm_by_poses: tuple[Path, Diagnosis]) -> None:
+    first, alone = arm_by_poses
+    second, _ = made({"lever_arm": ARM}, seed=2, name="second", real_poses=True)
+    both = diagnose([first, second])
+    assert effects(both) == ["lever_arm"]
+    assert both.bias.shape == (2, 6)
+    assert len(both.plain()["biases"]) == 2
+    assert len(both.traces) == 2
+    assert {place.log for place in both.located} == {str(first), str(second)}
+    assert {place["log"] for place in both.plain()["located"]} == set(both.plain()["real"])
+    assert "log" not in alone.plain()["located"][0]
+    assert both.findings[0].parameters["x"].std < alone.findings[0].parameters["x"].std
+    assert near(both, "lever_arm", dict(zip("xyz", ARM, strict=True)))
+
+
+def test_neither_truth_nor_simulation_is_refused_with_what_would_help(made: Made) -> None:
+    real, _ = made()
+    with pytest.raises(DataError, match=r"no simulation and no true poses.*--sim"):
+        diagnose([real])
+
+
+def test_a_simulation_of_another_motion_is_refused(made: Made) -> None:
+    real, sim = made(sim_seed=7)
+    with pytest.raises(DataError, match="motion"):
+        diagnose([real], sim)
+
+
+def test_what_is_no_log_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "real.mcap").write_bytes(b"no log at all")
+    with pytest.raises(LogError):
+        diagnose([tmp_path / "real.mcap"])
+
+
+def test_logs_are_left_as_they_are_and_progress_is_told_and_the_answer_is_the_same_again(
+    arm: tuple[Path, Path, Diagnosis],
+) -> None:
+    real, sim, found = arm
+    before = real.read_bytes(), sim.read_bytes()
+    told: list[tuple[int, int]] = []
+    again = diagnose([real], sim, tell=lambda done, total, _: told.append((done, total)))
+    assert again.plain() == found.plain()
+    assert (real.read_bytes(), sim.read_bytes()) == before
+    assert told == sorted(told)
+    assert told[0][0] == 0
+    assert told[-1][0] == told[-1][1]
+    assert sorted(path.name for path in real.parent.iterdir()) == ["real.mcap", "sim.mcap"]

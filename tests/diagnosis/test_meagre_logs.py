@@ -1,0 +1,222 @@
+"""Logs that hold less than one would wish: each is told what is the matter, and what can be answered all the same is."""
+
+from __future__ import annotations
+
+import json
+import runpy
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from types import SimpleNamespace
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+
+from imutool.diagnosis.diagnose import diagnose
+from imutool.diagnosis.result import Diagnosis
+from imutool.diagnosis.to_physics_file import found as physics_found
+from imutool.diagnosis.wording import conclusion
+from imutool.errors import DataError, LogError
+from imutool.mcap_io.write import write
+from imutool.recording import Poses
+
+PLANTED = SimpleNamespace(**runpy.run_path(str(Path(__file__).with_name("planted.py"))))
+ARM = [0.2, -0.05, 0.1]
+SCALE = [0.03, -0.02, 0.04]
+SURE = 4.5
+SIM_HZ = 200.0
+LSB = np.repeat([0.01, 0.1], 3)  # coarser than the noise
+ALMOST = 0.98
+
+
+class Logs(NamedTuple):
+    """Where they are."""
+
+    real: Path
+    sim: Path
+
+
+def moving(
+    folder: Path,
+    effects: Mapping[str, Sequence[float]],
+    *,
+    duration_s: float = PLANTED.DURATION_S,
+    rate_hz: float = PLANTED.RATE_HZ,
+    limit: np.ndarray | None = None,
+    stuck: int | None = None,
+    poses_s: np.ndarray | None = None,
+    sim_from_s: float = 0.0,
+    sim_seed: int = 1,
+    name: str = "real",
+) -> Logs:
+    """A recording of a motion with effects, which may be clipped, stuck on an axis or have poses, and a simulation."""
+    felt, t_s = PLANTED.rich(1, duration_s), PLANTED.clock(duration_s, rate_hz)
+    samples = PLANTED.ideal(felt, PLANTED.acting(effects), t_s) + PLANTED.noise(len(t_s), 1) + PLANTED.BIAS
+    if limit is not None:
+        samples = np.clip(samples, -limit, limit)
+    if stuck is not None:
+        samples[:, stuck] = 3.25
+    poses = None if poses_s is None else PLANTED.poses(PLANTED.moving(1, duration_s), poses_s)
+    write(PLANTED.recording(name, t_s, samples, poses=poses), folder / f"{name}.mcap")
+    path, t_sim = PLANTED.moving(sim_seed, duration_s), PLANTED.clock(duration_s, SIM_HZ, sim_from_s)
+    imu = path.imu(path.start_ns + np.round(t_sim * 1e9).astype(np.int64))
+    sim = np.concatenate([imu.gyro, imu.accel], axis=1) + PLANTED.noise(len(t_sim), 99)
+    write(PLANTED.recording("sim", t_sim, sim, poses=PLANTED.poses(path, t_sim)), folder / f"{name}_sim.mcap")
+    return Logs(folder / f"{name}.mcap", folder / f"{name}_sim.mcap")
+
+
+def resting(
+    folder: Path, name: str, *, poses: bool = False, lsb: np.ndarray | None = None, noisy: bool = True, seed: int = 3
+) -> Path:
+    """A recording at rest."""
+    t_s = PLANTED.clock()
+    samples = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 9.81]) + PLANTED.BIAS + noisy * PLANTED.noise(len(t_s), seed)
+    samples = samples if lsb is None else lsb * np.round(samples / lsb)
+    p_wb = np.random.default_rng(1).normal(0.0, 1e-4, (len(t_s), 3))
+    t_ns = PLANTED.START_NS + np.round(t_s * 1e9).astype(np.int64)
+    truth = Poses(t_ns, p_wb, np.tile([1.0, 0.0, 0.0, 0.0], (len(t_s), 1))) if poses else None
+    write(PLANTED.recording(name, t_s, samples, poses=truth), folder / f"{name}.mcap")
+    return folder / f"{name}.mcap"
+
+
+def effects(d: Diagnosis) -> list[str]:
+    json.dumps(d.plain(), allow_nan=False)
+    return [one.effect for one in d.findings]
+
+
+def near(d: Diagnosis, effect: str, truth: Mapping[str, float]) -> bool:
+    (one,) = (one for one in d.findings if one.effect == effect)
+    return all(abs(one.parameters[name].value - value) < SURE * one.parameters[name].std for name, value in truth.items())
+
+
+# ── a sensor, or an axis, that tells nothing ──
+
+
+@pytest.fixture(scope="module")
+def saturated(tmp_path_factory: pytest.TempPathFactory) -> Diagnosis:
+    """An accelerometer at half a metre a second squared throughout, beside a gyro with a scale error."""
+    limit = np.array([np.inf] * 3 + [0.05] * 3)
+    return diagnose([(logs := moving(tmp_path_factory.mktemp("limit"), {"gyro_scale": SCALE}, limit=limit)).real], logs.sim)
+
+
+def test_beside_an_accelerometer_at_its_limit_throughout_the_gyro_is_answered(saturated: Diagnosis) -> None:
+    assert "gyro_scale" in effects(saturated)
+    assert near(saturated, "gyro_scale", dict(zip("xyz", SCALE, strict=True)))
+    assert set(effects(saturated)) <= {"gyro_scale", "saturation"}
+    assert any("accel is at its limit of 0.05 m/s²: x in " in one for one in saturated.remarks)
+
+
+def test_what_only_the_saturated_sensor_shows_is_listed_as_not_identifiable(saturated: Diagnosis) -> None:
+    assert {"accel_scale.z", "accel_quadratic.z"} & set(saturated.not_identifiable) or {
+        "accel_scale",
+        "accel_quadratic",
+    } <= set(saturated.not_identifiable)
+    assert not any(name.startswith("gyro") for name in saturated.not_identifiable)
+
+
+def test_a_stuck_axis_is_told_and_the_others_are_answered(tmp_path: Path) -> None:
+    logs = moving(tmp_path, {"lever_arm": ARM}, stuck=4)
+    d = diagnose([logs.real], logs.sim)
+    assert effects(d) == ["lever_arm"]
+    assert near(d, "lever_arm", dict(zip("xyz", ARM, strict=True)))
+    assert d.mismatch
+    assert conclusion(d).startswith("The accel's y is no measurement: it reads 3.25 m/s² in every sample.")
+    (place,) = (one for one in d.located if one.axes == ("y",))
+    assert place.intervals_s[0][1] - place.intervals_s[0][0] > ALMOST * PLANTED.DURATION_S
+    assert "accel_scale.y" in d.not_identifiable
+    assert "accel_scale.x" not in d.not_identifiable
+    assert d.unexplained["accel"].white
+
+
+def test_a_dead_sensor_is_refused_with_what_it_reads(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match=r"gyro x reads 0.02 rad/s in every sample"):
+        diagnose([resting(tmp_path, "dead", poses=True, noisy=False)])
+
+
+# ── rest ──
+
+
+def test_at_rest_bias_noise_and_digits_are_answered_and_the_rest_is_listed(tmp_path: Path) -> None:
+    d = diagnose([resting(tmp_path, "still", poses=True, lsb=LSB)])
+    assert effects(d) == ["quantization"]
+    assert np.abs(d.bias[0] - PLANTED.BIAS).max() < LSB.max()
+    assert {"gyro_scale", "lever_arm", "clock_offset", "low_pass", "mount_resonance"} <= set(d.not_identifiable)
+    assert not {"gyro_bias_drift", "vibration"} & set(d.not_identifiable)
+    assert any("too little motion for anything but a bias" in one for one in d.remarks)
+
+
+def test_at_rest_a_simulation_at_rest_serves_though_nothing_can_be_aligned(tmp_path: Path) -> None:
+    d = diagnose([resting(tmp_path, "still")], resting(tmp_path, "sim", seed=4))
+    assert effects(d) == []
+    assert not d.mismatch
+    assert "clock_offset" in d.not_identifiable
+
+
+# ── time and motion ──
+
+
+def test_ten_seconds_are_enough_for_what_is_large(tmp_path: Path) -> None:
+    logs = moving(tmp_path, {"lever_arm": ARM}, duration_s=10.0)
+    d = diagnose([logs.real], logs.sim)
+    assert effects(d) == ["lever_arm"]
+    assert near(d, "lever_arm", dict(zip("xyz", ARM, strict=True)))
+
+
+def test_a_recording_of_another_rate_than_the_simulation_is_compared(tmp_path: Path) -> None:
+    logs = moving(tmp_path, {"lever_arm": ARM}, rate_hz=73.0)
+    assert effects(diagnose([logs.real], logs.sim)) == ["lever_arm"]
+
+
+def test_too_little_shared_time_is_refused_with_how_much_there_is(tmp_path: Path) -> None:
+    logs = moving(tmp_path, {}, sim_from_s=19.0)
+    with pytest.raises(DataError, match=r"(4.9|5.0) s shared with the simulation.*at least 8 s"):
+        diagnose([logs.real], logs.sim)
+
+
+# ── names ──
+
+
+def test_a_field_that_no_log_has_is_refused_before_anything_is_searched(tmp_path: Path) -> None:
+    logs, told = moving(tmp_path, {}), []
+    with pytest.raises(LogError, match=r"no topic /odom|/odom"):
+        diagnose([logs.real], logs.sim, signals=["/odom.twist"], tell=lambda done, total, word: told.append(word))
+    assert told == ["reading"]
+
+
+def test_an_imu_that_the_log_does_not_have_is_refused_with_those_there_are(tmp_path: Path) -> None:
+    real = moving(tmp_path, {}).real
+    with pytest.raises(LogError, match="/imu0"):
+        diagnose([real], imu="/imu7")
+
+
+# ── poses ──
+
+
+def test_poses_too_slow_to_be_differentiated_leave_what_samples_show_by_themselves(tmp_path: Path) -> None:
+    logs = moving(tmp_path, {}, poses_s=PLANTED.clock(rate_hz=5.0))
+    d = diagnose([logs.real])
+    assert effects(d) == []
+    (said,) = d.remarks
+    assert "can be differentiated" in said
+    assert "Only what stamps and digits show by themselves could be asked" in said
+    assert {"lever_arm", "gyro_scale", "clock_offset"} <= set(d.not_identifiable)
+    assert physics_found(d).bias is None  # nobody knows it
+    assert d.plain()["bias"] == {"gyro": None, "accel": None}
+
+
+def test_poses_of_a_part_answer_for_that_part(tmp_path: Path) -> None:
+    logs = moving(tmp_path, {"lever_arm": ARM}, poses_s=PLANTED.clock(15.0, first_s=3.0))
+    d = diagnose([logs.real])
+    assert effects(d) == ["lever_arm"]
+    (trace,) = d.traces
+    assert 3.0 <= trace.t_s[0] < 4.0
+    assert 14.0 < trace.t_s[-1] <= 15.0
+    assert any("poses cover 12 of 24 s" in one for one in d.remarks)
+
+
+def test_of_several_logs_one_without_usable_poses_is_left_out_with_a_word(tmp_path: Path) -> None:
+    whole = moving(tmp_path, {"lever_arm": ARM}, poses_s=PLANTED.clock(15.0), duration_s=15.0, name="whole")
+    poor = moving(tmp_path, {"lever_arm": ARM}, poses_s=PLANTED.clock(rate_hz=5.0), name="poor")
+    d = diagnose([poor.real, whole.real])
+    assert effects(d) == ["lever_arm"]
+    assert any(one.startswith("left out, poor") for one in d.remarks)

@@ -1,0 +1,200 @@
+"""What stamps and digits show by themselves: every missing sample, jitter, the LSB, the limit; and none where none are."""
+
+from __future__ import annotations
+
+import runpy
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from imutool.diagnosis import timestamps
+from imutool.diagnosis.gauss_newton import fit
+
+PLANTED = SimpleNamespace(**runpy.run_path(str(Path(__file__).with_name("planted.py"))))
+N = 2400
+SURE = 4.0
+NANOSECOND = 1e-9
+PARTS_PER_MILLION = 1e-6
+
+
+def clean() -> np.ndarray:
+    """As a log stores them: whole nanoseconds."""
+    return np.round(PLANTED.clock() * 1e9) * 1e-9
+
+
+def without(count: int, seed: int) -> np.ndarray:
+    rng = np.random.default_rng([seed, 11])
+    gone = rng.choice(np.arange(20, N - 20), count, replace=False)
+    return np.delete(clean(), gone)
+
+
+# ── missing samples ──
+
+
+def test_a_clean_clock_misses_nothing_and_is_its_own_even_clock() -> None:
+    even, missing = timestamps.even(clean())
+    assert missing == 0
+    assert np.abs(even - clean()).max() < 2 * NANOSECOND
+
+
+@pytest.mark.parametrize("ppm", [-1000.0, 300.0])
+def test_a_clock_that_runs_fast_misses_nothing(ppm: float) -> None:
+    t = clean() * (1.0 + ppm * PARTS_PER_MILLION)
+    even, missing = timestamps.even(t)
+    assert missing == 0
+    assert np.abs(even - t).max() < 2 * NANOSECOND
+
+
+@pytest.mark.parametrize(
+    ("count", "jitter_s"),
+    [(n, jitter_s) for n in (1, 5, 17) for jitter_s in (0.0, 1e-4)]
+    + [
+        (60, 0.0),
+        pytest.param(60, 1e-4),
+        pytest.param(17, 5e-4),
+        pytest.param(60, 5e-4),
+    ],
+)
+@pytest.mark.parametrize("seed", range(3))
+def test_missing_samples_are_counted_exactly(count: int, seed: int, jitter_s: float) -> None:
+    t = without(count, seed)
+    t = t + jitter_s * np.random.default_rng([seed, 12]).normal(size=len(t))
+    even, missing = timestamps.even(t)
+    assert missing == count
+    assert np.abs(even - (t if not jitter_s else without(count, seed))).max() < (1e-6 if not jitter_s else 4 * jitter_s)
+
+
+@pytest.mark.parametrize("length", [2, 10, 100])
+def test_samples_missing_in_a_row_are_counted_exactly(length: int) -> None:
+    assert timestamps.even(np.delete(clean(), slice(1000, 1000 + length)))[1] == length
+
+
+def test_the_finding_states_count_and_share() -> None:
+    felt = PLANTED.rich()
+    one = PLANTED.pair(felt, stamp_s=without(24, 0))
+    (found,) = timestamps.dropped([one])
+    assert found.effect == "dropped_samples"
+    assert found.parameters["missing"].value == 24
+    assert found.parameters["share"].value == pytest.approx(24 / N)
+    (both,) = timestamps.dropped([one, one])
+    assert both.parameters["missing"].value == 48
+
+
+# ── jitter ──
+
+
+@pytest.mark.parametrize(("jitter_s", "seed"), [(1e-4, 1), (5e-4, 2), (1e-3, 1), (3e-3, 1), pytest.param(2e-3, 2)])
+def test_jitter_has_the_size_that_was_planted(jitter_s: float, seed: int) -> None:
+    t = clean() + jitter_s * np.random.default_rng(seed).normal(size=N)
+    even, missing = timestamps.even(t)
+    assert missing == 0
+    assert float((t - even).std()) == pytest.approx(jitter_s, rel=SURE / np.sqrt(2 * N))
+
+
+@pytest.mark.parametrize(("share", "jitter_s"), [(1.0, 5e-4), (0.0, 5e-4), (0.0, 2e-3), pytest.param(1.0, 2e-3)])
+def test_whether_samples_jitter_with_their_stamps_is_seen_in_the_signals(share: float, jitter_s: float) -> None:
+    felt = PLANTED.rich()
+    t = clean()
+    t[1:-1] += jitter_s * np.random.default_rng(2).normal(size=N - 2)
+    one = PLANTED.pair(felt, stamp_s=t)
+    taken = t if share == 0.0 else clean()
+    one = replace(one, real=PLANTED.ideal(felt, (), taken) + PLANTED.noise(N, 3) + PLANTED.BIAS)
+    (physics,) = timestamps.jitter([one])
+    assert physics.name == "timestamp_jitter"
+    got = fit([PLANTED.weighed(one)], ((physics, np.zeros(3)),))
+    assert abs(got.chosen[0][1][0] - share) < SURE * got.stds()["timestamp_jitter"][0]
+
+
+def test_even_stamps_do_not_jitter() -> None:
+    assert timestamps.jitter([PLANTED.pair(PLANTED.rich(), stamp_s=clean())]) == ()
+
+
+# ── digits ──
+
+
+@pytest.mark.parametrize("times", [1.0, 3.0])
+def test_the_lsb_is_found_to_a_thousandth(times: float) -> None:
+    lsb = times * np.array([PLANTED.NOISE[0], PLANTED.NOISE[3]])
+    one = PLANTED.pair(PLANTED.rich())
+    one = replace(one, real=np.repeat(lsb, 3) * np.round(one.real / np.repeat(lsb, 3)))
+    (found,) = timestamps.rounded([one], PLANTED.NOISE)
+    assert found.effect == "quantization"
+    assert found.signal == "both"
+    assert found.parameters["gyro_lsb"].value == pytest.approx(lsb[0], rel=1e-3)
+    assert found.parameters["accel_lsb"].value == pytest.approx(lsb[1], rel=1e-3)
+    assert found.parameters["gyro_lsb"].unit == "rad/s"
+
+
+def test_a_grid_in_one_sensor_is_told_of_that_one() -> None:
+    one = PLANTED.pair(PLANTED.rich())
+    one.real[:, 3:] = 0.06 * np.round(one.real[:, 3:] / 0.06)
+    (found,) = timestamps.rounded([one], PLANTED.NOISE)
+    assert found.signal == "accel"
+    assert set(found.parameters) == {"accel_lsb"}
+
+
+def test_a_grid_much_finer_than_the_noise_is_not_told() -> None:
+    one = PLANTED.pair(PLANTED.rich())
+    lsb = PLANTED.NOISE / 10.0
+    assert timestamps.rounded([replace(one, real=lsb * np.round(one.real / lsb))], PLANTED.NOISE) == []
+
+
+def test_few_distinct_values_are_no_grid() -> None:
+    assert timestamps.grid(np.repeat([1.0, 2.0], 50)) == 0.0
+    assert timestamps.grid(np.zeros(100)) == 0.0
+
+
+# ── limits ──
+
+
+def clipped_pair(limit: float) -> tuple[object, np.ndarray]:
+    one = PLANTED.pair(PLANTED.rich())
+    there = one.real.copy()
+    return replace(one, real=np.concatenate([np.clip(there[:, :3], -limit, limit), there[:, 3:]], axis=1)), there
+
+
+@pytest.mark.parametrize("quantile", [0.9, 0.97])
+def test_the_limit_is_found_exactly_and_clipped_rows_are_those_at_it(quantile: float) -> None:
+    raw = PLANTED.pair(PLANTED.rich()).real
+    limit = float(np.quantile(np.abs(raw[:, :3]), quantile))
+    one, there = clipped_pair(limit)
+    assert timestamps.limits(one.real) == {"gyro": limit}
+    beyond = (np.abs(there[:, :3]) >= limit).any(axis=1)
+    clipped = timestamps.clipped(one.real)
+    assert clipped[:, :3][np.abs(there[:, :3]) >= limit].all()
+    assert not clipped[:, 3:].any()
+    assert clipped.any(axis=1).sum() < 3 * beyond.sum()
+    (found,) = timestamps.saturated([one], [there], 50)
+    assert found.effect == "saturation"
+    assert found.signal == "gyro"
+    assert found.parameters["gyro_limit"].value == limit
+    assert found.held_out.rms_after < 1e-12 < found.held_out.rms_before
+    assert found.p_value < 1e-6
+    assert found.share == pytest.approx(1.0)
+
+
+def test_the_same_reading_again_and_again_is_no_limit_where_no_more_was_expected() -> None:
+    """A parked vehicle on a coarse grid reads its largest value often, and nothing says that it should read more."""
+    t = PLANTED.clock()
+    real = np.zeros((N, 6))
+    real[:, 5] = 9.81
+    one = replace(PLANTED.pair(PLANTED.rich()), real=real, stamp_s=t)
+    rng = np.random.default_rng(3)
+    assert timestamps.saturated([one], [real + 1e-3 * rng.normal(size=real.shape)], 50) == []
+
+
+# ── nothing of it ──
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_clean_samples_show_nothing_of_all_that(seed: int) -> None:
+    one = PLANTED.pair(PLANTED.rich(seed), seed=seed, stamp_s=clean())
+    assert timestamps.dropped([one]) == []
+    assert timestamps.jitter([one]) == ()
+    assert timestamps.rounded([one], PLANTED.NOISE) == []
+    assert timestamps.limits(one.real) == {}
+    assert not timestamps.clipped(one.real).any()
+    assert timestamps.saturated([one], [one.real], 50) == []

@@ -1,0 +1,382 @@
+"""What is said in words: the right effect, size, sign and certainty, in a unit and with the digits a person reads."""
+
+from __future__ import annotations
+
+import importlib
+import math
+import pkgutil
+import re
+import runpy
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+import imutool.sensor.effects
+from imutool.diagnosis.quantity import grouped, percent, value, vector
+from imutool.diagnosis.result import Estimate, Finding, HeldOut, Located, Unexplained
+from imutool.diagnosis.wording import NULL, SENTENCES, by_chance, conclusion, lines, rms, sentence, signals, table
+
+MADE = SimpleNamespace(**runpy.run_path(str(Path(__file__).with_name("diagnoses.py"))))
+CATALOGUE = [  # of physics: what an ideal simulation leaves out, and what any signal can have
+    "gyro_bias", "accel_bias", "gyro_scale", "gyro_misalignment", "gyro_g_sensitivity", "gyro_quadratic", "gyro_bias_drift",
+    "accel_scale", "accel_misalignment", "accel_quadratic", "accel_bias_drift", "lever_arm", "mount_rotation", "size_effect",
+    "clock_offset", "clock_skew", "clock_jump", "low_pass", "saturation", "quantization", "gravity", "earth_rotation",
+    "vibration", "mount_resonance", "temperature", "dropped_samples", "timestamp_jitter", "reference_error", "driven",
+    "unknown", "gain", "offset", "delay", "dead_band", "drift", "friction",
+]  # fmt: skip
+# An uncertainty keeps one digit between 1.95 and 9.5, else two: a number moves by at most this share of it.
+ROUNDED = 0.26
+
+
+def finding(effect: str, parameters: dict[str, Estimate], signal: str = "accel", **changes: object) -> Finding:
+    return replace(MADE.LEVER_ARM, effect=effect, signal=signal, parameters=parameters, **changes)
+
+
+# ── whole conclusions ──
+
+
+def test_one_finding_is_one_sentence_with_place_size_gain_and_what_is_left() -> None:
+    assert conclusion(MADE.LATE) == (
+        "The gyro differs when turning: it lags the simulation by 12.4 ± 0.3 ms (clock_offset); modelling it removes 63 % of "
+        "the misfit on 30 s of unseen data; nothing else stands above the noise."
+    )
+
+
+def test_a_lever_arm_is_a_vector_and_a_regime_without_a_preposition_gets_one() -> None:
+    assert conclusion(MADE.ARM).startswith(
+        "The accel differs at angular rate above 0.4 rad/s: it sits (0.213, -0.051, 0.120) ± 0.004 m from the tracked point "
+        "(lever_arm); modelling it removes 71 % "
+    )
+
+
+def test_nothing_is_said_plainly_and_what_cannot_be_seen_with_it() -> None:
+    assert conclusion(MADE.NOTHING) == NULL == "Nothing but a constant bias and noise separates the two."
+    still = replace(MADE.NOTHING, not_identifiable=("gyro_scale.x", "gyro_scale.y", "lever_arm", "/odom.v.delay"))
+    assert conclusion(still) == f"{NULL} These logs cannot show: gyro_scale (x, y), lever_arm, /odom.v.delay."
+
+
+def test_several_findings_come_strongest_first_by_signal_compared_with_the_poses_if_nothing_was_simulated() -> None:
+    said = conclusion(MADE.BOTH)
+    assert said.startswith("Two things were left out. The accel differs ")
+    assert said.index("lever_arm") < said.index("The gyro differs when turning: it lags the true poses by 12.4 ± 0.3 ms")
+    assert said.count("of unseen data") == 1  # the same 30 s
+    assert said.endswith("Nothing else stands above the noise. These logs cannot show: gyro_scale (x), gravity (tilt).")
+
+
+def test_two_findings_on_one_signal_share_its_sentence() -> None:
+    scale = finding("accel_scale", {axis: Estimate(0.02, 0.001, "-") for axis in "xyz"})
+    said = conclusion(replace(MADE.ARM, findings=(MADE.LEVER_ARM, scale)))
+    assert said.count("The accel differs") == 1
+    assert "; its scale is off by (2.00, 2.00, 2.00) ± 0.10 % (accel_scale); modelling it removes 71 % of the misfit;" in said
+
+
+def test_of_many_findings_the_three_strongest_are_told_in_full() -> None:
+    weaker = [finding(name, {"k": Estimate(1.0, 0.1, "K")}, "gyro") for name in ("gyro_scale", "gyro_quadratic")]
+    said = conclusion(replace(MADE.BOTH, findings=(MADE.LEVER_ARM, MADE.LAG, MADE.DRIVEN, *weaker)))
+    assert said.startswith("Five things were left out.")
+    assert said.count("modelling it removes") == 3
+    assert "Smaller: gyro_scale (gyro), gyro_quadratic (gyro). Nothing else stands above the noise." in said
+
+
+def test_two_sizes_are_told_apart_with_as_many_digits_as_it_takes() -> None:
+    assert rms(HeldOut(0.8761, 0.8759, "m/s^2", 9.0)) == "rms 0.8761 to 0.8759 m/s²"
+    assert rms(HeldOut(0.52, 0.19, "m/s^2", 9.0)) == "rms 0.52 to 0.19 m/s²"
+    assert rms(HeldOut(0.5, 0.5, "m/s^2", 9.0)) == "rms 0.5 to 0.5 m/s²"
+
+
+def test_a_driver_is_named_with_its_gain_and_lag() -> None:
+    said = conclusion(MADE.BY_CURRENT)
+    assert "it follows /motor.current with gain 0.31 ± 0.02 m/s² per A, lag 120 ± 10 ms (driven);" in said
+
+
+def test_the_unknown_is_said_to_have_no_name() -> None:
+    assert "it follows a smooth curve of angular rate z that has no name among the known effects (unknown)" in conclusion(
+        MADE.NAMELESS
+    )
+    equation = finding("unknown", {"a": Estimate(0.3, 0.01, "s²/m")}, equation="accel_x += a f_z^2")
+    assert sentence(MADE.ARM, equation) == (
+        "accel_x += a f_z^2, with a 0.300 ± 0.010 s²/m; this has no name among the known effects (unknown)"
+    )
+
+
+def test_what_cannot_be_told_apart_is_said_beside_the_name() -> None:
+    one = replace(MADE.LAG, similar=("low_pass", "delay"))
+    assert sentence(MADE.LATE, one).endswith("by 12.4 ± 0.3 ms (clock_offset; could as well be low_pass or delay)")
+
+
+def test_a_place_without_a_name_is_not_passed_over() -> None:
+    said = conclusion(MADE.UNEXPLAINED)
+    assert "The accel differs at angular rate above 0.4 rad/s, and what was left out could not be named." in said
+    assert "What remains of the accel is 0.2 against 0.05 m/s² of noise, and has no explanation yet." in said
+
+
+@pytest.mark.parametrize(
+    ("rms", "white", "words"),
+    [
+        (0.05, True, "nothing else stands above the noise"),
+        (0.05, False, "what remains of the accel is as small as the noise, but not white"),
+        (0.06, True, "what remains of the accel is 0.06 against 0.05 m/s² of noise, and has no explanation yet"),
+    ],
+)
+def test_what_remains_is_held_against_the_noise(rms: float, white: bool, words: str) -> None:
+    left = {"accel": Unexplained(rms, 0.05, white)}
+    assert conclusion(replace(MADE.ARM, unexplained=left)).endswith(f"; {words}.")
+
+
+def test_a_null_case_with_coloured_noise_says_so() -> None:
+    said = conclusion(replace(MADE.NOTHING, unexplained=MADE.unexplained(white=False)))
+    assert said == f"{NULL} What remains of the accel is as small as the noise, but not white."
+
+
+@pytest.mark.parametrize(
+    ("regime", "words"),
+    [
+        ("always", "The gyro differs throughout: it"),
+        (
+            "always, most with angular rate above 0.4 rad/s",
+            "The gyro differs throughout, most with angular rate above 0.4 rad/s: it",
+        ),
+        ("no regime: it comes and goes", "The gyro differs off and on: it"),
+        ("when turning", "The gyro differs when turning: it"),
+        ("time above 30 s", "The gyro differs at time above 30 s: it"),
+        ("", "The gyro differs: it"),
+    ],
+)
+def test_a_regime_goes_on_after_differs(regime: str, words: str) -> None:
+    assert conclusion(replace(MADE.LATE, located=(replace(MADE.TURNING, regime=regime),))).startswith(words)
+
+
+def test_the_regime_is_that_of_the_largest_share_of_the_same_signal() -> None:
+    small = replace(MADE.TURNING, regime="always", share=0.1)
+    assert conclusion(replace(MADE.LATE, located=(small, MADE.TURNING, MADE.FAST))).startswith("The gyro differs when turning:")
+
+
+def test_what_was_counted_and_not_fitted_claims_no_gain() -> None:
+    steps = finding("quantization", {"gyro_lsb": Estimate(0.001, 1e-6, "rad/s")}, "gyro", held_out=HeldOut(0.0, 0.0, "-", 90.0))
+    d = replace(MADE.LATE, findings=(steps,))
+    assert conclusion(d) == (
+        "The gyro differs when turning: it comes in steps of 1.0000 ± 0.0010 mrad/s (quantization); "
+        "nothing else stands above the noise."
+    )
+    assert "rms" not in lines(d)[1]
+
+
+def test_what_is_on_both_sensors_is_said_of_the_sensor() -> None:
+    both = replace(MADE.LAG, signal="gyro, accel")
+    said = conclusion(replace(MADE.LATE, findings=(both,)))
+    assert said.startswith("Gyro and accel differ when turning: the sensor lags the simulation by 12.4 ± 0.3 ms")
+    assert signals("both") == signals("imu") == signals("gyro+accel") == signals("gyro and accel") == ("gyro", "accel")
+
+
+def test_any_other_signal_goes_by_its_own_name() -> None:
+    one = finding("gain", {"gain": Estimate(0.05, 0.002, "-")}, "/odom.twist.twist.linear.x")
+    said = conclusion(replace(MADE.ARM, located=(), findings=(one,)))
+    assert said.startswith("/odom.twist.twist.linear.x differs: its gain is off by 5.0 ± 0.2 % (gain);")
+
+
+def test_lines_hold_each_finding_place_gain_and_remark() -> None:
+    said = lines(MADE.BOTH)
+    assert said[0] == conclusion(MADE.BOTH)
+    assert said[1] == (
+        "1. lever_arm (accel): (0.213, -0.051, 0.120) ± 0.004 m; rms 0.52 to 0.19 m/s² on 30 s of unseen data; "
+        "1 in 100 by chance"
+    )
+    assert said[3] == "Where: accel x, y, angular rate above 0.4 rad/s, 12.0 to 48.5 s; 83 % of the misfit"
+    assert said[5] == (
+        "With everything that was found, over 90 s held out of the search: "
+        "gyro rms 0.02 to 0.0074 rad/s, 63 % closer; accel rms 0.52 to 0.19 m/s², 63 % closer"
+    )
+    assert said[-1] == MADE.BOTH.remarks[0]
+    assert len(said) == 7
+    assert lines(MADE.NOTHING) == [NULL]
+
+
+def test_many_stretches_are_counted_not_listed() -> None:
+    many = Located("gyro", ("x",), tuple((float(k), k + 0.5) for k in range(9)), "", 0.5, 0.01)
+    assert lines(replace(MADE.NOTHING, located=(many,)))[1] == (
+        "Where: gyro x, 0.0 to 0.5 s, 1.0 to 1.5 s, 7 more stretches; 50 % of the misfit"
+    )
+
+
+# ── every effect ──
+
+
+@pytest.mark.parametrize("effect", CATALOGUE)
+def test_every_effect_has_a_sentence_with_its_number_its_unit_and_its_name(effect: str) -> None:
+    assert effect in SENTENCES
+    said = sentence(MADE.ARM, finding(effect, {"k": Estimate(3.25, 0.02, "K")}))
+    assert "3.25 ± 0.02 K" in said
+    assert said.endswith(f"({effect})")
+
+
+def physics() -> list[object]:
+    modules = [m.name for m in pkgutil.iter_modules(imutool.sensor.effects.__path__) if not m.name.startswith("_")]
+    found = [getattr(importlib.import_module(f"imutool.sensor.effects.{name}"), "PHYSICS", None) for name in modules]
+    return [one for one in found if one is not None]
+
+
+@pytest.mark.parametrize("one", physics(), ids=lambda one: one.name)
+def test_a_sentence_leaves_no_quantity_of_a_real_effect_out(one: SimpleNamespace) -> None:
+    theta = {n.name: Estimate(n.plausible * (0.71 + 0.1 * k), n.plausible * 0.01, n.unit) for k, n in enumerate(one.parameters)}
+    said = sentence(MADE.ARM, finding(one.name, theta))
+    for quantity in grouped(theta):
+        assert str(quantity) in said, quantity
+
+
+def test_an_effect_nobody_wrote_a_sentence_for_is_still_said_with_its_equation_and_numbers() -> None:
+    one = finding("vendor_effect", {"k": Estimate(3.25, 0.02, "K")}, equation="accel += k T")
+    assert sentence(MADE.ARM, one) == "it shows vendor_effect, accel += k T, k 3.25 ± 0.02 K (vendor_effect)"
+    bare = finding("reference_error", {}, equation="the truth is late")
+    assert sentence(MADE.ARM, bare) == "it shows reference_error, the truth is late (reference_error)"
+
+
+@pytest.mark.parametrize(
+    ("effect", "number", "words"),
+    [
+        ("clock_offset", Estimate(-0.0124, 0.0003, "s"), "it lags the simulation by 12.4 ± 0.3 ms"),  # taken at t + tau
+        ("clock_offset", Estimate(0.0124, 0.0003, "s"), "it is ahead of the simulation by 12.4 ± 0.3 ms"),
+        ("clock_skew", Estimate(5e-5, 3e-6, "-"), "the clock of the recording runs slow by 50 ± 3 ppm"),  # t (1 + eps)
+        ("clock_skew", Estimate(-5e-5, 3e-6, "-"), "the clock of the recording runs fast by 50 ± 3 ppm"),
+        ("delay", Estimate(0.2, 0.01, "s"), "it lags the simulation by 200 ± 10 ms"),
+    ],
+)
+def test_signs_become_words(effect: str, number: Estimate, words: str) -> None:
+    assert sentence(MADE.ARM, finding(effect, {"k": number})).startswith(words)
+
+
+def test_a_jump_says_when_and_how_far() -> None:
+    jump = {"t_jump": Estimate(31.02, 0.05, "s"), "step": Estimate(0.02, 0.0004, "s")}
+    assert sentence(MADE.ARM, finding("clock_jump", jump)) == (
+        "the clock of the recording jumps by 20.0 ± 0.4 ms at 31.02 ± 0.05 s (clock_jump)"
+    )
+
+
+def test_a_limit_that_is_never_reached_is_not_news() -> None:
+    limits = {"gyro_limit": Estimate(math.inf, 0.0, "rad/s"), "accel_limit": Estimate(39.2, 0.2, "m/s²")}
+    assert sentence(MADE.ARM, finding("saturation", limits)) == "it stops at its limit of 39.2 ± 0.2 m/s² (saturation)"
+
+
+# ── numbers ──
+
+
+@pytest.mark.parametrize(
+    ("number", "words"),
+    [
+        (Estimate(0.01243, 0.00031, "s"), "12.4 ± 0.3 ms"),
+        (Estimate(0.01243, 0.00012, "s"), "12.43 ± 0.12 ms"),
+        (Estimate(0.01243, 0.000096, "s"), "12.43 ± 0.10 ms"),
+        (Estimate(0.01243, 0.05, "s"), "10 ± 50 ms"),
+        (Estimate(1.5, 0.2, "s"), "1.5 ± 0.2 s"),
+        (Estimate(math.radians(2.5), math.radians(0.3), "rad"), "2.5 ± 0.3°"),
+        (Estimate(0.0213, 0.0004, "-"), "2.13 ± 0.04 %"),
+        (Estimate(9.81, 0.0, "m/s^2"), "9.81 m/s²"),
+        (Estimate(9.81, math.nan, "m/s^2"), "9.81 m/s² (uncertainty unknown)"),
+        (Estimate(0.0, 0.002, "m"), "0 ± 2 mm"),
+        (Estimate(-0.0004, 0.02, "m"), "0 ± 20 mm"),
+        (Estimate(2.1e-5, 3e-7, "rad/s per m/s²"), "(21.0 ± 0.3) × 10⁻⁶ rad/s per m/s²"),
+        (Estimate(1234567.0, 30.0, "Hz"), "(1.23457 ± 0.00003) × 10⁶ Hz"),
+    ],
+)
+def test_a_number_is_rounded_to_its_uncertainty_in_a_unit_of_its_size(number: Estimate, words: str) -> None:
+    assert value(number) == words
+
+
+@given(st.floats(1e-9, 1e9), st.floats(1e-4, 10.0), st.sampled_from(["s", "m", "rad", "-", "rad/s", "K"]))
+def test_rounding_moves_a_number_by_less_than_its_uncertainty(size: float, relative: float, unit: str) -> None:
+    said = value(Estimate(size, size * relative, unit))
+    number, band = (float(part) for part in re.findall(r"-?\d+(?:\.\d+)?(?= |\)|$|°)", said.replace("°", " "))[:2])
+    raised = re.search(r"× 10([⁻⁰¹²³⁴⁵⁶⁷⁸⁹]+)", said)
+    power = int(raised[1].translate(str.maketrans("⁻⁰¹²³⁴⁵⁶⁷⁸⁹", "-0123456789"))) if raised else 0
+    symbol = said.rpartition("°" if "°" in said else " ")[2] if "°" not in said else "°"
+    scale = {"ms": 1e-3, "µs": 1e-6, "mm": 1e-3, "°": math.pi / 180.0, "%": 1e-2, "ppm": 1e-6, "mrad/s": 1e-3}.get(symbol, 1.0)
+    scale *= 10.0**power
+    assert abs(number * scale - size) <= ROUNDED * size * relative
+    assert abs(band * scale - size * relative) <= ROUNDED * size * relative
+
+
+def test_parameters_that_belong_together_are_grouped_and_words_that_end_like_an_axis_are_not() -> None:
+    names = ["x", "y", "z", "tau", "tilt_x", "tilt_y", "frequency", "latency", "xy", "yx"]
+    units = dict.fromkeys(["x", "y", "z"], "m") | {"xy": "-", "yx": "-"}
+    found = grouped({name: Estimate(1.0, 0.1, units.get(name, "s")) for name in names})
+    assert [(one.label, one.axes) for one in found] == [
+        ("", ("x", "y", "z")),
+        ("tau", ("tau",)),
+        ("tilt", ("x", "y")),
+        ("frequency", ("frequency",)),
+        ("latency", ("latency",)),
+        ("", ("xy", "yx")),
+    ]
+
+
+def test_a_vector_rounds_each_component_to_its_own_uncertainty() -> None:
+    several = [Estimate(0.2131, 0.0043, "m"), Estimate(-0.0512, 0.031, "m"), Estimate(0.4, 0.3, "m")]
+    assert vector(several) == "(0.213, -0.05, 0.4) ± (0.004, 0.03, 0.3) m"
+
+
+def test_of_a_matrix_the_clearest_three_are_said() -> None:
+    matrix = {a + b: Estimate(0.001 * k, 0.001, "-") for k, (a, b) in enumerate((a, b) for a in "xyz" for b in "xyz")}
+    assert str(grouped(matrix)[0]) == "(zx 0.60, zy 0.70, zz 0.80) ± 0.10 % and 6 more"
+
+
+@pytest.mark.parametrize(
+    ("share", "words"),
+    [(0.63, "63 %"), (0.0, "0 %"), (0.004, "less than 1 %"), (0.0004, "less than 0.1 %"), (0.999, "more than 99 %"),
+     (1.0, "100 %"), (-0.1, "-10 %"), (math.nan, "an unknown share")],
+)  # fmt: skip
+def test_a_share_is_never_nothing_or_all_unless_it_is(share: float, words: str) -> None:
+    assert percent(share) == words
+
+
+def test_a_chance_too_small_for_a_float_is_a_bound() -> None:
+    assert by_chance(0.0) == "less than 1 in 10⁹ by chance"
+    assert by_chance(5e-7) == "1 in 2 000 000 by chance"
+    assert by_chance(0.25) == "25 % by chance"
+    assert by_chance(1e-12, short=True) == "below 10⁻⁹"
+
+
+def test_a_second_simulation_is_told_with_the_share_of_the_misfit_that_is_gone() -> None:
+    again = {signal: replace(one, by="second simulation") for signal, one in MADE.BOTH.closer.items()}
+    d = replace(MADE.BOTH, closer=again)
+    words = "90 % of the misfit of the gyro and 87 % of the misfit of the accel is gone on 90 s of unseen time."
+    assert f"Simulated again with this, {words}" in conclusion(d)
+    assert any(line.startswith("Simulated again with everything that was found, over 90 s held") for line in lines(d))
+    assert "Simulated again" not in conclusion(MADE.BOTH)
+    only_gyro = conclusion(replace(d, findings=(MADE.LAG,)))
+    assert "90 % of the misfit of the gyro is gone" in only_gyro
+
+
+def test_many_things_that_cannot_be_seen_are_counted() -> None:
+    many = replace(MADE.NOTHING, not_identifiable=tuple("abcdefgh"))
+    assert conclusion(many).endswith("These logs cannot show: a, b, c, d, 4 more effects in whole or part.")
+
+
+def test_an_axis_that_is_no_measurement_comes_first() -> None:
+    stuck = Located("accel", ("y",), ((0.0, 90.0),), "always: it reads 3.25 m/s² in every sample", 1.0, 0.0)
+    said = conclusion(replace(MADE.LATE, located=(MADE.TURNING, stuck)))
+    assert said.startswith("The accel's y is no measurement: it reads 3.25 m/s² in every sample. The gyro differs when turning")
+
+
+def test_the_table_has_a_row_for_each_finding_no_wider_than_a_terminal() -> None:
+    head, *rows = table(MADE.BOTH)
+    assert head == ["What", "Removes", "Value"]
+    assert rows[0] == ["lever_arm (accel)", "71 %", "(0.213, -0.051, 0.120) ± 0.004 m\n1 in 100 by chance"]
+    assert all(max(map(len, row[2].split("\n"))) <= 40 for row in rows)
+
+
+def test_many_entries_of_one_effect_that_cannot_be_seen_are_counted() -> None:
+    hidden = tuple(f"gyro_misalignment.{k}" for k in range(9))
+    assert conclusion(replace(MADE.NOTHING, not_identifiable=hidden)).endswith("show: gyro_misalignment (9 of its numbers).")
+
+
+def test_a_place_of_one_of_several_logs_names_it() -> None:
+    place = replace(MADE.FAST, log="folder/second.mcap")
+    assert lines(replace(MADE.NOTHING, located=(place,)))[1].startswith("Where: second, accel x, y, angular rate above 0.4")
+
+
+def test_no_unseen_time_is_not_called_unseen() -> None:
+    one = replace(MADE.LAG, held_out=HeldOut(0.02, 0.01, "rad/s", 0.0))
+    assert "unseen" not in conclusion(replace(MADE.LATE, findings=(one,)))

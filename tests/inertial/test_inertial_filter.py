@@ -1,0 +1,144 @@
+"""The filter's algebra: errors go on and off, heading changes nothing, a backward pass is never less sure."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from imutool.inertial import inertial_filter
+from imutool.inertial.inertial_filter import (
+    BIAS,
+    SIZE,
+    STOPPED,
+    FilterSettings,
+    State,
+    Step,
+    level,
+    move,
+    smooth,
+    stand,
+    update,
+)
+from imutool.inertial.preintegration import integrate
+
+S = FilterSettings()
+EXACT = 1e-10
+WALK = np.array([1e-4] * 3 + [2e-3] * 3)
+P_BIAS = np.diag([3e-3] * 3 + [0.2] * 3 + [1e-3] * 3 + [0.03] * 3) ** 2
+
+
+def start(heading: float = 0.0) -> State:
+    x = level(np.array([0.5, -0.3, 9.7]), np.zeros(6), np.zeros(6), P_BIAS, S)
+    turn = Rotation.from_euler("z", heading).as_matrix()
+    return State(turn @ x.R_wb, turn @ x.v_w, turn @ x.p_wb, x.bias, x.ground, x.P)
+
+
+def steps(x: State, count: int = 20, seed: int = 0) -> list[Step]:
+    """Motion, a stop, motion: samples that need not be a flight's."""
+    rng = np.random.default_rng(seed)
+    t = np.arange(101) / 200.0
+    found = []
+    for i in range(count):
+        gyro, accel = 0.5 * rng.normal(size=(101, 3)), np.array([0.0, 0.5, 9.8]) + rng.normal(size=(101, 3))
+        if i % 7 == 3:
+            found.append(
+                stand(x, np.concatenate([1e-3 * rng.normal(size=3), accel.mean(axis=0)]), np.full(3, 1e-8), 0.5, WALK, S)
+            )
+        else:
+            found.append(move(x, integrate(t, gyro - x.bias[:3], accel - x.bias[3:]), 0.0, WALK, S))
+        x = found[-1].after
+    return found
+
+
+def test_errors_go_on_and_come_off_again() -> None:
+    rng = np.random.default_rng(0)
+    x = steps(start())[-1].after
+    e = 0.3 * rng.normal(size=SIZE)
+    np.testing.assert_allclose(x.moved(e, x.P).minus(x), e, rtol=0, atol=EXACT)
+    np.testing.assert_allclose(x.minus(x), 0.0, rtol=0, atol=EXACT)
+
+
+@pytest.mark.parametrize("up", [[0.1, 0.2, 9.8], [9.81, 0.0, 0.0], [0.0, 0.0, -9.81], [0.0, -9.0, -3.0]])
+def test_level_puts_the_force_upright_without_a_heading(up: list[float]) -> None:
+    x = level(np.array(up), np.zeros(6), np.zeros(6), P_BIAS, S)
+    np.testing.assert_allclose(x.R_wb @ np.array(up) / np.linalg.norm(up), [0.0, 0.0, 1.0], rtol=0, atol=1e-12)
+    np.testing.assert_allclose(x.R_wb @ x.R_wb.T, np.eye(3), rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("heading", [0.4, 2.0, -3.0])
+def test_biases_do_not_depend_on_the_heading(heading: float) -> None:
+    """The tilt's first uncertainty is round, so the world may be turned about the vertical before or after."""
+    one, other = steps(start())[-1].after, steps(start(heading))[-1].after
+    np.testing.assert_allclose(other.bias, one.bias, rtol=0, atol=EXACT)
+    np.testing.assert_allclose(other.ground, one.ground, rtol=0, atol=EXACT)
+    np.testing.assert_allclose(other.P[9:, 9:], one.P[9:, 9:], rtol=0, atol=EXACT)
+    turn = Rotation.from_euler("z", heading).as_matrix()
+    np.testing.assert_allclose(other.R_wb, turn @ one.R_wb, rtol=0, atol=EXACT)
+
+
+def test_heading_is_never_found_out() -> None:
+    """A heading error shows in no measurement: as large as at the start whatever is measured."""
+    x = start()
+    P = x.P.copy()
+    P[2, 2] = 1.0
+    x = State(x.R_wb, x.v_w, x.p_wb, x.bias, x.ground, P)
+    assert steps(x)[-1].after.P[2, 2] > 1.0
+
+
+def test_a_move_is_linear_in_the_error() -> None:
+    """F against the integral itself: a small error before, and what it is after. Jr is first order in the turn of a step."""
+    t = np.arange(101) / 200.0
+    rng = np.random.default_rng(3)
+    gyro, accel = 0.8 * rng.normal(size=3) + np.zeros((101, 3)), np.array([0.3, 0.1, 9.9]) + 0.2 * rng.normal(size=(101, 3))
+    x = start(0.7).moved(np.concatenate([np.zeros(3), [0.8, -0.5, 0.3], [1.0, 2.0, -3.0], np.zeros(12)]), start().P)
+
+    def expected(y: State) -> State:
+        return move(y, integrate(t, gyro - y.bias[:3], accel - y.bias[3:]), 0.0, WALK, S).expected
+
+    F = move(x, integrate(t, gyro - x.bias[:3], accel - x.bias[3:]), 0.0, WALK, S).F
+    size = 1e-6
+    for i in range(15):
+        e = np.zeros(SIZE)
+        e[i] = size
+        slope = (expected(x.moved(e, x.P)).minus(expected(x.moved(-e, x.P)))) / (2 * size)
+        np.testing.assert_allclose(slope, F[:, i], rtol=0, atol=1e-4, err_msg=str(i))
+
+
+def test_an_update_is_the_textbooks() -> None:
+    x = steps(start())[-1].expected
+    noise = np.full(3, 0.04)
+    z = np.array([0.1, -0.2, 0.05])
+    K = x.P @ STOPPED.T @ np.linalg.inv(STOPPED @ x.P @ STOPPED.T + np.diag(noise))
+    got = update(x, STOPPED, z, noise)
+    np.testing.assert_allclose(got.P, (np.eye(SIZE) - K @ STOPPED) @ x.P, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(got.bias, x.bias - (K @ z)[BIAS], rtol=0, atol=EXACT)
+
+
+def test_the_backward_pass_ends_where_the_forward_one_does_and_is_nowhere_less_sure() -> None:
+    forward = steps(start(), 40)
+    states = smooth(forward)
+    assert len(states) == 41
+    np.testing.assert_array_equal(states[-1].bias, forward[-1].after.bias)
+    for before, state in zip((step.before for step in forward), states, strict=False):
+        slack = np.linalg.eigvalsh(before.P[9:, 9:] - state.P[9:, 9:])
+        assert slack.min() > -1e-9
+        assert np.linalg.eigvalsh(state.P).min() > -1e-12
+    assert states[0].P[9, 9] < 0.9 * forward[0].before.P[9, 9]
+
+
+def test_smoothing_a_linear_case_is_least_squares() -> None:
+    """Only the rest: two stops show the same sum b + d with walks between; the answer of the normal equations."""
+    x = start()
+    mean = [np.array([1e-3, 0.0, 0.0, 0.5, -0.3, 9.7]), np.array([2e-3, 0.0, 0.0, 0.5, -0.3, 9.7])]
+    found = []
+    for one in mean:
+        found.append(stand(x, one, np.full(3, 1e-8), 0.5, WALK, S))
+        x = found[-1].after
+    q, r = WALK[0] ** 2 * 0.5 + inertial_filter.LEAST_VARIANCE, 1e-8 + S.rest_rad_s**2
+    # unknown: b0, b1, b2 along x, and d
+    A = np.array([[1, 0, 0, 0], [0, 0, 0, 1], [-1, 1, 0, 0], [0, -1, 1, 0], [0, 1, 0, 1], [0, 0, 1, 1]], float)
+    y = np.array([0, 0, 0, 0, 1e-3, 2e-3])
+    w = 1 / np.array([P_BIAS[0, 0], P_BIAS[6, 6] + 2 * inertial_filter.LEAST_VARIANCE, q, q, r, r])
+    solved = np.linalg.solve(A.T @ (w[:, None] * A), A.T @ (w * y))
+    np.testing.assert_allclose([s.bias[0] for s in smooth(found)], solved[:3], rtol=1e-3)

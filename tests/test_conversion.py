@@ -1,0 +1,262 @@
+"""The way from a data set to logs on disk: where they go, what fails, and what an interrupt leaves."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import signal
+import sys
+import types
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from imutool import conversion as convert_module
+from imutool import registry
+from imutool.conversion import ConvertReport, convert
+from imutool.errors import ConfigError, DataError
+from imutool.mcap_io.log import Log
+from imutool.mcap_io.read import read
+from imutool.recording import Imu, Recording
+
+START_NS = 1403636579758560000
+PNG = b"\x89PNG\r\n\x1a\n"
+
+
+def sequence(folder: Path, *, rows: int = 50, bad_line: int | None = None, images: int = 0) -> Path:
+    """A EuRoC sequence of resting samples; `bad_line` of its IMU table holds a word."""
+    stamps = [START_NS + n * 5_000_000 for n in range(rows)]
+    imu = ["#timestamp [ns],wx,wy,wz,ax,ay,az", *(f"{t},0.01,0.02,0.03,0,0,9.81" for t in stamps)]
+    if bad_line is not None:
+        imu[bad_line - 1] = imu[bad_line - 1].replace("9.81", "oops")
+    truth = ["#timestamp,x,y,z,qw,qx,qy,qz", *(f"{t},1,2,3,1,0,0,0" for t in stamps)]
+    for name, lines in (("imu0", imu), ("state_groundtruth_estimate0", truth)):
+        (folder / "mav0" / name).mkdir(parents=True)
+        (folder / "mav0" / name / "data.csv").write_text("\n".join(lines) + "\n")
+    if images:
+        (folder / "mav0/cam0/data").mkdir(parents=True)
+        listed = [f"{t},{t}.png" for t in stamps[:images]]
+        (folder / "mav0/cam0/data.csv").write_text("\n".join(["#timestamp [ns],filename", *listed]))
+        for t in stamps[:images]:
+            (folder / f"mav0/cam0/data/{t}.png").write_bytes(PNG + os.urandom(20_000))
+    return folder
+
+
+@pytest.fixture
+def source(tmp_path: Path) -> Path:
+    folder = tmp_path / "source"
+    for name in ("a", "b", "c"):
+        sequence(folder / name)
+    return folder
+
+
+def content(folder: Path) -> dict[str, bytes]:
+    return {str(path.relative_to(folder)): path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}
+
+
+def test_one_sequence_goes_to_the_file_named(source, tmp_path):
+    report = convert(source / "a", tmp_path / "new" / "log.mcap")
+    assert report == ConvertReport([tmp_path / "new" / "log.mcap"], [])
+    assert read(report.written[0]) == next(iter(registry.load("imutool.converters", "euroc").read(source / "a")))
+
+
+def test_one_sequence_into_a_folder_that_exists_takes_its_name(source, tmp_path):
+    (tmp_path / "out").mkdir()
+    assert convert(source / "a", tmp_path / "out").written == [tmp_path / "out" / "a.mcap"]
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_several_sequences_go_to_a_folder_and_each_is_told_when_done(source, tmp_path, workers):
+    before = content(source)
+    told = []
+    report = convert(source, tmp_path / "out", workers=workers, progress=lambda *args: told.append(args))
+    assert report.written == [tmp_path / "out" / f"{name}.mcap" for name in "abc"]
+    assert [done for done, _, _ in told] == [1, 2, 3]
+    assert {total for _, total, _ in told} == {3}
+    assert sorted(name for _, _, name in told) == ["a", "b", "c"]
+    assert read(report.written[1]).name == "b"
+    assert content(source) == before
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_a_broken_sequence_is_reported_and_the_others_are_written(source, tmp_path, workers):
+    sequence(source / "broken", bad_line=7)
+    (source / "empty.zip").touch()
+    report = convert(source, tmp_path / "out", workers=workers)
+    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["a.mcap", "b.mcap", "c.mcap"]
+    assert [failure.name for failure in report.failures] == ["empty", "broken"]
+    assert f"{source}/empty.zip: is empty" in report.failures[0].message
+    assert f"{source}/broken/mav0/imu0/data.csv:7: column 7 is 'oops'; expected a number." in report.failures[1].message
+
+
+def test_the_only_sequence_raises_its_own_error_and_leaves_nothing(tmp_path):
+    sequence(tmp_path / "broken", bad_line=7)
+    with pytest.raises(DataError, match=r"data\.csv:7"):
+        convert(tmp_path / "broken", tmp_path / "out" / "log.mcap")
+    assert content(tmp_path / "out") == {}
+
+
+def test_sequences_are_chosen_by_name(source, tmp_path):
+    sequence(source / "broken", bad_line=7)
+    report = convert(source, tmp_path / "out", sequences=["a", "c"])
+    assert [path.name for path in report.written] == ["a.mcap", "c.mcap"]
+    assert report.failures == []
+    assert convert(source, tmp_path / "b.mcap", sequences=["b"]).written == [tmp_path / "b.mcap"]
+
+
+def test_an_unknown_sequence_is_refused_with_the_nearest(tmp_path):
+    sequence(tmp_path / "source" / "MH_04_difficult")
+    sequence(tmp_path / "source" / "V1_01_easy")
+    with pytest.raises(ConfigError, match=r"'MH_4_difficult' is not in the source.*Did you mean 'MH_04_difficult'"):
+        convert(tmp_path / "source", tmp_path / "out", sequences=["MH_4_difficult"])
+    assert not (tmp_path / "out").exists()
+
+
+def test_an_unknown_format_is_refused_with_the_nearest(source, tmp_path):
+    with pytest.raises(ConfigError, match="Did you mean 'euroc'"):
+        convert(source, tmp_path / "out", format="eurok")
+
+
+@pytest.mark.parametrize("kind", ["empty folder", "folder of notes", "text file", "other archive"])
+def test_where_nothing_is_recognised_the_message_says_what_was_looked_for(tmp_path, kind):
+    source = tmp_path / "source"
+    if kind == "text file":
+        source = tmp_path / "notes.txt"
+        source.write_text("notes")
+    else:
+        source.mkdir()
+        if kind == "folder of notes":
+            (source / "notes.txt").write_text("notes")
+    with pytest.raises(DataError, match=r"no sequence found; expected a folder with mav0.*\.zip.*ROS 1 \.bag"):
+        convert(source, tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+def test_an_existing_log_is_kept_unless_overwriting_is_asked_for(source, tmp_path):
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "b.mcap").write_bytes(b"precious")
+    with pytest.raises(ConfigError, match="exists"):
+        convert(source, tmp_path / "out")
+    assert content(tmp_path / "out") == {"b.mcap": b"precious"}  # and the others were not begun
+    assert len(convert(source, tmp_path / "out", overwrite=True).written) == 3
+
+
+def test_several_sequences_do_not_go_into_one_file(source, tmp_path):
+    with pytest.raises(ConfigError, match="several sequences do not fit into one file"):
+        convert(source, tmp_path / "out.mcap")
+
+
+def test_two_sequences_of_one_name_are_refused(source, tmp_path):
+    sequence(source / "copy" / "a")
+    with pytest.raises(ConfigError, match="two sequences are named a"):
+        convert(source, tmp_path / "out")
+
+
+def test_a_source_is_never_the_target(tmp_path):
+    folder = sequence(tmp_path / "one")
+    archive = tmp_path / "one.zip"
+    with zipfile.ZipFile(archive, "w") as file:
+        for name, data in content(folder).items():
+            file.writestr(name, data)
+    before = content(tmp_path)
+    with pytest.raises(ConfigError, match="is the source itself"):
+        convert(archive, archive, overwrite=True)
+    with pytest.raises(ConfigError, match="is the source itself"):
+        convert(folder, folder / "mav0/imu0/data.csv", overwrite=True)
+    assert content(tmp_path) == before
+
+
+@pytest.mark.skipif(not Path("/proc/self").is_dir(), reason="no /proc, a place even root cannot write to")
+def test_a_read_only_target_is_refused(source):
+    with pytest.raises(ConfigError, match=r"/proc/a\.mcap: cannot be written"):
+        convert(source / "a", Path("/proc/a.mcap"))
+    with pytest.raises(ConfigError, match="/proc/imutool: cannot be made"):
+        convert(source, Path("/proc/imutool"))
+
+
+def test_a_target_below_a_file_is_refused(source, tmp_path):
+    (tmp_path / "file").write_text("x")
+    with pytest.raises(ConfigError, match="cannot be made"):
+        convert(source / "a", tmp_path / "file" / "a.mcap")
+
+
+def test_images_are_written_unless_left_out(tmp_path):
+    source = sequence(tmp_path / "one", images=5)
+    topic = "/cam0/image_raw/compressed"
+    convert(source, tmp_path / "with.mcap")
+    convert(source, tmp_path / "without.mcap", images=False)
+    images = {int(path.stem): path.read_bytes() for path in (source / "mav0/cam0/data").iterdir()}
+    with Log(tmp_path / "with.mcap") as log:
+        assert dict(log.images(topic)) == images
+    with Log(tmp_path / "without.mcap") as log:
+        assert topic not in log.topics
+
+
+def test_an_interrupt_ends_all_processes_and_leaves_nothing_half_written(tmp_path):
+    """Small sequences end first; the interrupt comes while large ones are being written."""
+    sequence(tmp_path / "source" / "a")
+    for name in ("b", "c"):
+        sequence(tmp_path / "source" / name, rows=1500, images=1500)
+    before = content(tmp_path / "source")
+    children = set(multiprocessing.active_children())
+
+    def interrupt(done, total, name):
+        os.kill(os.getpid(), signal.SIGINT)
+
+    with pytest.raises(KeyboardInterrupt):
+        convert(tmp_path / "source", tmp_path / "out", workers=2, progress=interrupt)
+    assert set(multiprocessing.active_children()) == children
+    left = {name: (tmp_path / "out" / name) for name in content(tmp_path / "out")}
+    assert set(left) <= {"a.mcap", "b.mcap", "c.mcap"}
+    assert all(read(path).name == path.stem for path in left.values())
+    assert content(tmp_path / "source") == before
+
+
+def test_a_process_that_dies_is_a_failure_of_its_sequence_not_of_the_tool(source, tmp_path, monkeypatch):
+    monkeypatch.setattr(convert_module, "_convert_in_process", _die)
+    report = convert(source, tmp_path / "out", workers=2)
+    assert [failure.name for failure in report.failures] == ["a", "b", "c"]
+    assert "its process died" in report.failures[0].message
+
+
+def _die(job: object) -> None:
+    os._exit(9)
+
+
+@pytest.fixture
+def outside(monkeypatch):
+    """A converter of another package that has `read` alone."""
+    module = types.ModuleType("outside")
+    imu = Imu(np.arange(5) * 10, np.zeros((5, 3)), np.ones((5, 3)))
+    module.read = lambda source: (Recording(name, imu) for name in source.read_text().split())
+    known, real = registry.names, registry.load
+    monkeypatch.setattr(registry, "names", lambda group: [*known(group), "outside"])
+    monkeypatch.setattr(registry, "load", lambda group, name: module if name == "outside" else real(group, name))
+    return module
+
+
+def test_a_converter_that_only_reads_is_used_on_request(outside, tmp_path):
+    (tmp_path / "list.txt").write_text("x y")
+    report = convert(tmp_path / "list.txt", tmp_path / "out", format="outside")
+    assert [path.name for path in report.written] == ["x.mcap", "y.mcap"]
+    assert convert(tmp_path / "list.txt", tmp_path / "y.mcap", format="outside", sequences=["y"]).written
+    with pytest.raises(DataError, match="no sequence found"):
+        convert(tmp_path / "list.txt", tmp_path / "out2")
+
+
+def test_what_two_converters_claim_must_be_decided(source, tmp_path, monkeypatch, outside):
+    euroc = registry.load("imutool.converters", "euroc")
+    outside.sequences, outside.recognises = euroc.sequences, lambda sequence: True
+    with pytest.raises(ConfigError, match="is recognised as euroc and outside"):
+        convert(source, tmp_path / "out")
+
+
+def test_converting_needs_no_torch():
+    import subprocess
+
+    heavy = "('torch', 'rosbags', 'rerun', 'matplotlib')"
+    code = f"import imutool.conversion, imutool.log_info, sys; print([m for m in {heavy} if m in sys.modules])"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"

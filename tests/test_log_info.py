@@ -1,0 +1,236 @@
+"""What `inspect` says about logs whose defects, noise and coverage are known."""
+
+from __future__ import annotations
+
+import json
+import tracemalloc
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from imutool.converters import fetch, tum_vi
+from imutool.errors import LogError
+from imutool.log_info import imu_rows, inspect, topic_rows
+from imutool.mcap_io.codec.decode import decode_imu
+from imutool.mcap_io.write import write
+from imutool.recording import GRAVITY_M_S2, Frames, Imu, Poses, Recording
+
+PERIOD_NS = 5_000_000
+START_NS = 1_700_000_000_000_000_000
+GYRO_STD, ACCEL_STD = 2.4e-3, 0.03
+NOISE_TOLERANCE = 0.15  # the calmest quarter of 1 s windows is a few per cent below the true value; the rest is chance
+IMAGE_BYTES = 1_000_000
+
+
+def resting(count: int = 4000, seed: int = 3) -> Imu:
+    rng = np.random.default_rng(seed)
+    gyro = 0.02 + GYRO_STD * rng.normal(size=(count, 3))
+    accel = np.array([0.0, 0.0, GRAVITY_M_S2]) + ACCEL_STD * rng.normal(size=(count, 3))
+    return Imu(START_NS + PERIOD_NS * np.arange(count), gyro, accel)
+
+
+def swinging(count: int = 4000) -> Imu:
+    """Never at rest: 1.5 rad/s about x, twice a second."""
+    imu = resting(count)
+    gyro = imu.gyro.copy()
+    gyro[:, 0] += 1.5 * np.sin(2 * np.pi * 2.0 * np.arange(count) * PERIOD_NS * 1e-9)
+    return replace(imu, gyro=gyro)
+
+
+def still_poses(t_ns: np.ndarray) -> Poses:
+    return Poses(t_ns, np.zeros((len(t_ns), 3)), np.tile([1.0, 0.0, 0.0, 0.0], (len(t_ns), 1)))
+
+
+def logged(folder: Path, imu: Imu, **kwargs: object) -> dict[str, object]:
+    path = folder / "log.mcap"
+    write(Recording("log", imu, **kwargs), path, overwrite=True)
+    report = inspect(path)
+    json.dumps(report, allow_nan=False)  # every value is plain JSON
+    return report
+
+
+def test_clocks_of_every_topic_are_measured(tmp_path):
+    imu = resting(1000)
+    truth = still_poses(imu.t_ns[::10])
+    report = logged(tmp_path, imu, truths={"/ground_truth/pose": truth})
+    assert report["schema"] == "imutool.info/1"
+    topics = {topic["name"]: topic for topic in report["topics"]}
+    assert {"/imu0", "/ground_truth/pose"} <= set(topics)
+    assert topics["/imu0"]["type"] == "sensor_msgs/msg/Imu"
+    assert topics["/imu0"]["count"] == 1000
+    assert topics["/imu0"]["rate_hz"] == pytest.approx(200.0)
+    assert topics["/imu0"]["jitter_s"] == 0.0
+    assert topics["/imu0"]["largest_gap_s"] == pytest.approx(0.005)
+    assert topics["/imu0"]["first_ns"] == START_NS
+    assert topics["/imu0"]["last_ns"] == START_NS + 999 * PERIOD_NS
+    assert topics["/ground_truth/pose"]["rate_hz"] == pytest.approx(20.0)
+    assert report["duration_s"] == pytest.approx(999 * 0.005)
+
+
+def test_jitter_and_gaps_are_those_of_the_periods(tmp_path):
+    imu = resting(1001)
+    shift = np.where(np.arange(1001) % 2, 500_000, 0)  # periods alternate between 5.5 and 4.5 ms
+    (found,) = logged(tmp_path, Imu(imu.t_ns + shift, imu.gyro, imu.accel))["imu"]
+    assert found["jitter_s"] == pytest.approx(0.5e-3, rel=1e-6)
+    assert found["largest_gap_s"] == pytest.approx(5.5e-3)
+
+
+def test_missing_samples_are_counted_from_the_gaps(tmp_path):
+    imu = resting(1000)
+    kept = np.ones(1000, bool)
+    kept[100] = kept[300:310] = False
+    (found,) = logged(tmp_path, imu.rows(kept))["imu"]
+    assert found["missing"] == 11
+    assert "11 samples missing" in found["warnings"]
+    assert found["largest_gap_s"] == pytest.approx(0.055)
+
+
+def test_disorder_repeats_and_values_that_are_no_numbers_are_counted_not_refused(tmp_path, monkeypatch):
+    """A log as a poor recorder leaves it; our own writer would refuse, so its checks are stepped around."""
+    imu = resting(1000)
+    path = tmp_path / "log.mcap"
+    write(Recording("log", imu), path)
+
+    def spoiled(rows, encoding="cdr", layout=None):
+        columns = decode_imu(rows, encoding, layout)
+        stamps, gyro = columns.stamp_ns.copy(), columns.gyro.copy()
+        stamps[[10, 11]] = stamps[[11, 10]]
+        stamps[500] = stamps[499]
+        gyro[700, 1] = np.nan
+        return columns._replace(stamp_ns=stamps, gyro=gyro)
+
+    monkeypatch.setattr("imutool.log_info.decode_imu", spoiled)
+    (found,) = inspect(path)["imu"]
+    assert (found["out_of_order"], found["duplicated"], found["not_finite"]) == (1, 1, 1)
+    assert found["samples"] == 1000
+    assert {"1 samples out of order", "1 samples with a repeated stamp"} <= set(found["warnings"])
+
+
+def test_clipping_is_seen_and_noise_and_coarse_steps_are_not(tmp_path):
+    imu = swinging()
+    clipped = replace(imu, gyro=imu.gyro.clip(-1.0, 1.0))
+    (found,) = logged(tmp_path, clipped)["imu"]
+    assert found["saturated"] == int((np.abs(imu.gyro) >= 1.0).any(axis=1).sum())
+    coarse = replace(imu, gyro=np.round(imu.gyro / 0.01) * 0.01, accel=np.round(resting().accel / 0.02) * 0.02)
+    for clean in (imu, coarse, replace(resting(), accel=coarse.accel)):
+        (found,) = logged(tmp_path, clean)["imu"]
+        assert found["saturated"] == 0
+    assert "exactly that value" in found["saturation_rule"]
+
+
+def test_rest_noise_and_gravity_of_a_resting_sensor(tmp_path):
+    (found,) = logged(tmp_path, resting())["imu"]
+    assert found["stationary_s"] > 19.0
+    assert found["stationary"][0]["first_ns"] == START_NS
+    assert found["accel_at_rest_m_s2"] == pytest.approx(GRAVITY_M_S2, abs=0.01)
+    noise = found["noise"]
+    assert noise["gyro_std_rad_s"] == pytest.approx([GYRO_STD] * 3, rel=NOISE_TOLERANCE)
+    assert noise["accel_std_m_s2"] == pytest.approx([ACCEL_STD] * 3, rel=NOISE_TOLERANCE)
+    assert noise["gyro_density"] == pytest.approx([GYRO_STD * np.sqrt(0.005)] * 3, rel=NOISE_TOLERANCE)
+    assert noise["accel_density"] == pytest.approx([ACCEL_STD * np.sqrt(0.005)] * 3, rel=NOISE_TOLERANCE)
+    assert found["warnings"] == []
+
+
+def test_without_rest_there_is_no_noise_estimate(tmp_path):
+    (found,) = logged(tmp_path, swinging())["imu"]
+    assert found["stationary"] == []
+    assert found["noise"] is None
+    assert found["accel_at_rest_m_s2"] is None
+
+
+@pytest.mark.parametrize(("factor", "unit"), [(1 / GRAVITY_M_S2, "g"), (1000 / GRAVITY_M_S2, "mg"), (1 / 0.3048, "ft/s^2")])
+@pytest.mark.parametrize("make", [resting, swinging])
+def test_specific_force_in_another_unit_is_said(tmp_path, factor, unit, make):
+    imu = make()
+    (found,) = logged(tmp_path, replace(imu, accel=imu.accel * factor))["imu"]
+    assert any(f"the unit looks like {unit}, not m/s^2" in warning for warning in found["warnings"])
+
+
+def test_a_rate_in_degrees_is_said(tmp_path):
+    imu = swinging()
+    (found,) = logged(tmp_path, replace(imu, gyro=np.degrees(imu.gyro)))["imu"]
+    assert any("the unit looks like deg/s, not rad/s" in warning for warning in found["warnings"])
+    (found,) = logged(tmp_path, imu)["imu"]
+    assert found["warnings"] == []
+
+
+def test_slow_rates_in_degrees_show_against_the_truth(data, tmp_path):
+    """FETCH turns so slowly that half its rates pass for rad/s; the motion capture knows better."""
+    (recording,) = fetch.read(data / "fetch" / "05_random")
+    for slow_by in (1.0, 0.5):
+        gyro = np.degrees(recording.imu.gyro) * slow_by
+        write(replace(recording, imu=replace(recording.imu, gyro=gyro)), tmp_path / "log.mcap", overwrite=True)
+        assert any("looks like deg/s" in warning for warning in inspect(tmp_path / "log.mcap")["warnings"])
+    write(recording, tmp_path / "log.mcap", overwrite=True)
+    assert inspect(tmp_path / "log.mcap")["warnings"] == []
+
+
+def test_coverage_by_the_truth_counts_samples_between_near_poses(tmp_path):
+    imu = resting(2000)
+    known = np.ones(2000, bool)
+    known[:200] = known[1000:1200] = False  # starts 1 s late and has a gap of 201 periods
+    report = logged(tmp_path, imu, truths={"/ground_truth/pose": still_poses(imu.t_ns[known])})
+    (truth,) = report["truth"]
+    assert truth["coverage"] == pytest.approx(1600 / 2000)
+    assert truth["gaps"] == 1
+    assert truth["longest_gap_s"] == pytest.approx(201 * 0.005)
+    assert truth["starts_after_s"] == pytest.approx(1.0)
+    assert truth["ends_before_s"] == 0.0
+
+
+def test_a_truth_of_another_time_is_said(tmp_path):
+    imu = resting(500)
+    report = logged(tmp_path, imu, truths={"/ground_truth/pose": still_poses(imu.t_ns + 10**12)})
+    assert report["truth"][0]["coverage"] == 0.0
+    assert "/ground_truth/pose: shares no time with the IMU" in report["warnings"]
+
+
+def test_a_log_without_truth_says_so(tmp_path):
+    assert logged(tmp_path, resting(500))["warnings"] == ["no true poses"]
+
+
+def test_images_are_counted_without_holding_them(tmp_path):
+    imu = resting(500)
+    images = Frames("png", 60, lambda: ((START_NS + n * 30_000_000, bytes([n]) * IMAGE_BYTES) for n in range(60)))
+    write(Recording("log", imu, frames={"/cam0/image_raw/compressed": images}), tmp_path / "log.mcap", compression="none")
+    tracemalloc.start()
+    report = inspect(tmp_path / "log.mcap")
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    camera = next(topic for topic in report["topics"] if topic["name"].startswith("/cam0"))
+    assert camera["count"] == 60
+    assert camera["rate_hz"] == pytest.approx(1 / 0.03)
+    assert peak < 12 * IMAGE_BYTES  # of 60
+
+
+def test_real_recordings_are_described_without_false_alarms(data, tmp_path):
+    (room,) = tum_vi.read(data / "tumvi" / "dataset-room2.tar.gz")
+    write(room, tmp_path / "room2.mcap")
+    report = inspect(tmp_path / "room2.mcap")
+    assert report["warnings"] == []
+    (truth,) = report["truth"]
+    assert truth["gaps"] == 17  # drop-outs of the motion capture
+    assert truth["longest_gap_s"] == pytest.approx(2.491667)
+    assert report["imu"][0]["rate_hz"] == pytest.approx(199.362, abs=1e-3)
+    assert report["imu"][0]["missing"] == 0
+
+
+def test_the_tables_hold_what_the_report_holds(tmp_path):
+    imu = resting(1000)
+    report = logged(tmp_path, imu, truths={"/ground_truth/pose": still_poses(imu.t_ns)})
+    header, *rows = topic_rows(report)
+    assert header[0] == "topic"
+    assert {row[0]: row[2] for row in rows}["/imu0"] == "1000"
+    properties = {(topic, name): value for topic, name, value in imu_rows(report)[1:]}
+    assert properties["/imu0", "accel at rest"] == f"{report['imu'][0]['accel_at_rest_m_s2']:.3f} m/s²"
+    assert properties["/imu0", "missing"] == "0"
+    assert properties["/ground_truth/pose", "covers"].startswith("100.0 %")
+
+
+@pytest.mark.parametrize("content", [b"", b"just text, no log"])
+def test_what_is_no_log_is_refused(tmp_path, content):
+    (tmp_path / "log.mcap").write_bytes(content)
+    with pytest.raises(LogError, match=r"log\.mcap"):
+        inspect(tmp_path / "log.mcap")

@@ -1,0 +1,182 @@
+"""Plant an effect and it is found, named, and as sure as it says; plant none and none is found."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from imutool.errors import ConfigError, DataError
+from imutool.recording import Imu, Poses, Recording, seconds
+from imutool.sensor.catalogue import named
+from imutool.sensor.linear_effect import Effect, Sensor, compiled
+from imutool.sensor.signals import SignalFilter
+from imutool.training.calibration import FOLDS, Calibration, calibrate, folded
+from imutool.training.segments import Pool
+
+MakeRecording = Callable[..., Recording]
+RATE_HZ = 100.0
+FLIGHT = {"rate_hz": RATE_HZ, "duration_s": 60.0, "still_s": 0.0}
+NOISE = {"gyro": 2e-3, "accel": 0.05}  # of a sample
+REST = {"gyro": 0.01, "accel": 0.1}
+SURE = 3.0  # standard deviations
+# what a flight of a quadrotor's kind shows: sizes that change its drift several times over
+GYRO = ("gyro_scale", "gyro_misalignment", "gyro_g_sensitivity", "gyro_quadratic", "gyro_bias_drift", "clock_offset")
+ACCEL = ("accel_scale", "accel_misalignment", "lever_arm", "clock_offset", "accel_bias_drift")
+PLANTED: list[tuple[Sensor, str]] = [*(("gyro", name) for name in GYRO), *(("accel", name) for name in ACCEL)]
+
+
+def measured(recording: Recording, effects: Sequence[Effect], theta: np.ndarray, seed: int) -> Recording:
+    """The samples of a sensor with errors: u = true + E(u) + rest, solved by going round, then noise."""
+    imu, rng = recording.imu, np.random.default_rng(seed)
+    t_s, u = seconds(imu.t_ns, int(imu.t_ns[0])), {"gyro": imu.gyro.copy(), "accel": imu.accel.copy()}
+    for _ in range(8):
+        signals = SignalFilter(RATE_HZ)(t_s, u["gyro"], u["accel"])
+        for sensor in ("gyro", "accel"):
+            own = [effect for effect in effects if effect.sensor == sensor]
+            error = compiled(own, theta)(signals) if own else 0.0
+            u[sensor] = getattr(imu, sensor) + error
+    for sensor in ("gyro", "accel"):
+        u[sensor] = u[sensor] + REST[sensor] * rng.normal(size=3) + NOISE[sensor] * rng.normal(size=u[sensor].shape)
+    return Recording(recording.name, Imu(imu.t_ns, u["gyro"], u["accel"]), recording.truths)
+
+
+def planted_theta(effects: Sequence[Effect]) -> np.ndarray:
+    """A third of what is plausible, alternately up and down."""
+    plausible = np.concatenate([effect.plausible for effect in effects])
+    signs = np.where(np.arange(len(plausible)) % 2, -1.0, 1.0)
+    return 0.3 * plausible * signs
+
+
+@pytest.fixture(scope="module")
+def flights(perfect: MakeRecording) -> list[Recording]:
+    return [perfect(seed, **FLIGHT) for seed in (1, 2, 3)]
+
+
+def found(
+    flights: Sequence[Recording], sensor: Sensor, effects: Sequence[Effect], names: Sequence[str] | None = None
+) -> Calibration:
+    """The calibration of flights with effects planted on one sensor; the other's errors are its rest bias alone."""
+    theta = planted_theta(effects) if effects else np.zeros(0)
+    pool = Pool.of([measured(flight, effects, theta, seed) for seed, flight in enumerate(flights)])
+    true_gyro = torch.cat([torch.tensor(flight.overlap().imu.gyro) for flight in flights])
+    return calibrate(pool, sensor, pool.gyro if sensor == "gyro" else true_gyro, names)
+
+
+def z_scores(calibration: Calibration, theta: np.ndarray) -> np.ndarray:
+    z: np.ndarray = (calibration.theta.numpy() - theta) / calibration.covariance.diagonal().sqrt().numpy()
+    return z
+
+
+@pytest.mark.parametrize(("sensor", "name"), PLANTED, ids=str)
+def test_a_planted_effect_is_found_and_named_and_no_other(flights: list[Recording], sensor: Sensor, name: str) -> None:
+    effects = named(sensor, [name])
+    calibration = found(flights, sensor, effects)
+    assert calibration.effects == (name,)
+    assert list(calibration.gains) == [name]
+    assert calibration.gains[name] > 0.3
+    z = z_scores(calibration, planted_theta(effects))
+    assert np.abs(z).max() < SURE, z
+    assert calibration.unseen == ()
+
+
+@pytest.mark.parametrize("sensor", ["gyro", "accel"])
+def test_where_nothing_is_planted_nothing_is_found(flights: list[Recording], sensor: Sensor) -> None:
+    calibration = found(flights, sensor, ())
+    assert calibration.effects == ()
+    assert calibration.gains == {}
+    assert calibration.theta.shape == (0,)
+    assert calibration.covariance.shape == (0, 0)
+
+
+def test_effects_planted_together_are_told_apart(flights: list[Recording]) -> None:
+    effects = named("gyro", ["gyro_misalignment", "gyro_scale"])
+    calibration = found(flights, "gyro", effects, ["gyro_misalignment", "gyro_scale"])
+    assert np.abs(z_scores(calibration, planted_theta(effects))).max() < SURE
+
+
+def test_a_curve_that_no_name_describes_is_found_as_a_curve(flights: list[Recording]) -> None:
+    """A dead band: below 0.1 rad/s the sensor reads less, beyond it a constant too little."""
+    (effect,) = named("gyro", ["rate_curve"])
+    names = [parameter.name for parameter in effect.parameters]
+    size = {name: 0.0 if name.startswith("slow") else -0.02 * np.sign(float(name[1:])) for name in names}
+    size = {name: 0.3 * value if "0.03" in name else value for name, value in size.items()}
+    theta = np.array([size[name] for name in names])
+    pool = Pool.of([measured(flight, [effect], theta, seed) for seed, flight in enumerate(flights)])
+    calibration = calibrate(pool, "gyro", pool.gyro)
+    assert "rate_curve" in calibration.effects
+    assert next(iter(calibration.gains)) == "rate_curve"
+
+
+def test_a_rest_bias_of_its_own_is_found_for_every_log(flights: list[Recording]) -> None:
+    calibration = found(flights, "gyro", ())
+    for seed, rest in enumerate(calibration.rest.numpy()):
+        planted = REST["gyro"] * np.random.default_rng(seed).normal(size=3)
+        np.testing.assert_allclose(
+            rest, planted, rtol=0, atol=5 * NOISE["gyro"] / np.sqrt(0.8 * RATE_HZ * FLIGHT["duration_s"])
+        )
+
+
+def test_two_logs_are_cut_into_parts_that_predict_one_another(flights: list[Recording]) -> None:
+    calibration = found(flights[:2], "gyro", named("gyro", ["gyro_scale"]))
+    assert calibration.effects == ("gyro_scale",)
+    assert calibration.rest.shape == (2, 3)
+    pool = Pool.of(flights[:2])
+    for part, used in (("train", ~pool.held_out), ("held_out", pool.held_out), ("all", pool.held_out | True)):
+        parts = folded(pool, part)  # type: ignore[arg-type]  # one of three words
+        assert len(parts.names) == 2 * FOLDS
+        assert torch.equal(parts.log // FOLDS, pool.log)
+        assert bool((torch.diff(parts.log) >= 0).all())
+        counts = torch.bincount(parts.log[used], minlength=2 * FOLDS)
+        assert int(counts.max() - counts.min()) <= 1, part
+    whole = Pool.of(flights)
+    assert folded(whole, "train") is whole
+
+
+def planar(recording: Recording) -> Recording:
+    """The heading of a flight, and nothing else: a robot on a flat floor."""
+    from scipy.spatial.transform import Rotation
+
+    truth, imu = recording.truth, recording.imu
+    w_z = imu.gyro[:, 2]
+    dt = np.diff(seconds(imu.t_ns, int(imu.t_ns[0])))
+    heading = np.concatenate([[0.0], np.cumsum(0.5 * (w_z[1:] + w_z[:-1]) * dt)])
+    q_wb_wxyz = Rotation.from_euler("z", heading[:, None]).as_quat(scalar_first=True)
+    still = np.zeros((len(imu), 3))
+    assert np.array_equal(truth.t_ns, imu.t_ns)
+    poses = Poses(imu.t_ns, still, q_wb_wxyz, still)
+    gyro = np.stack([np.zeros(len(imu)), np.zeros(len(imu)), w_z], axis=1)
+    return replace(recording, imu=Imu(imu.t_ns, gyro, still + np.array([0.0, 0.0, 9.81])), truths={"/ground_truth/pose": poses})
+
+
+def test_what_a_planar_motion_cannot_show_stays_at_its_prior_and_is_named(flights: list[Recording]) -> None:
+    effects = named("gyro", ["gyro_misalignment"])
+    calibration = found([planar(flight) for flight in flights], "gyro", effects, ["gyro_misalignment"])
+    never = {f"gyro_misalignment.{pair}" for pair in ("xy", "yx")}
+    assert never <= set(calibration.unseen) <= never | {f"gyro_misalignment.{pair}" for pair in ("zx", "zy")}
+    theta, plausible = planted_theta(effects), effects[0].plausible
+    for parameter, value, planted, width in zip(
+        effects[0].parameters, calibration.theta.numpy(), theta, plausible, strict=True
+    ):
+        if parameter.name in ("xz", "yz"):  # what turning about z adds to the others
+            assert abs(value - planted) < 0.1 * abs(planted), parameter.name
+        else:
+            assert abs(value) < 0.2 * width, parameter.name
+
+
+def test_named_effects_are_fitted_whether_or_not_the_logs_support_them(flights: list[Recording]) -> None:
+    calibration = found(flights, "gyro", (), ["gyro_quadratic", "gyro_scale"])
+    assert calibration.effects == ("gyro_quadratic", "gyro_scale")
+    assert np.abs(z_scores(calibration, np.zeros(6))).max() < SURE
+    with pytest.raises(ConfigError, match="Did you mean 'gyro_scale'"):
+        found(flights, "gyro", (), ["gyro_scael"])
+
+
+def test_a_log_whose_truth_has_too_many_holes_is_named(flights: list[Recording], without_truth: MakeRecording) -> None:
+    bare = without_truth(flights[1], 0.6, 0.97 * FLIGHT["duration_s"])
+    pool = Pool.of([flights[0], bare, flights[2]])
+    with pytest.raises(DataError, match=r"exact_2: no stretch of truth without a gap in the train part; expected 1 s"):
+        calibrate(pool, "gyro", pool.gyro)

@@ -1,0 +1,85 @@
+"""What no model should be learned from is refused before a step is made, and what is merely hard is not."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from imutool.errors import DataError
+from imutool.mcap_io.read import read
+from imutool.recording import Imu, Recording
+from imutool.sensor.flight import flight
+from imutool.training.checks import refuse
+from imutool.training.segments import Pool
+
+
+def checked(*recordings: Recording) -> None:
+    refuse(recordings, Pool.of(recordings))
+
+
+@pytest.fixture(scope="module")
+def flown() -> Recording:
+    return flight(1, duration_s=20.0)
+
+
+def with_gyro(recording: Recording, gyro: np.ndarray) -> Recording:
+    return replace(recording, imu=Imu(recording.imu.t_ns, gyro, recording.imu.accel))
+
+
+def of_sensor(recording: Recording, name: str, sensor: str) -> Recording:
+    return replace(recording, name=name, metadata={"imutool": {"sensor": sensor}})
+
+
+def test_a_flight_with_a_poor_sensor_is_accepted(flown: Recording) -> None:
+    """Scale wrong by a fifth, a bias of 11 degrees a second."""
+    checked(with_gyro(flown, 1.2 * flown.imu.gyro + 0.2))
+
+
+def test_logs_of_two_sensors_are_told_by_name(flown: Recording) -> None:
+    with pytest.raises(DataError, match=r"different sensors \(a: bmi160, b: adis16448\)"):
+        checked(of_sensor(flown, "a", "bmi160"), of_sensor(flown, "b", "adis16448"))
+
+
+def test_a_log_that_does_not_say_its_sensor_goes_with_any(flown: Recording) -> None:
+    checked(of_sensor(flown, "a", "bmi160"), replace(flown, name="b", metadata={}))
+
+
+def test_a_sensor_on_a_table_is_refused(flown: Recording) -> None:
+    still = np.full_like(flown.imu.gyro, 0.05) + 1e-3 * np.random.default_rng(0).normal(size=flown.imu.gyro.shape)
+    with pytest.raises(DataError, match="stands still"):
+        checked(with_gyro(flown, still))
+
+
+def test_a_truth_of_another_flight_is_refused_by_name(flown: Recording) -> None:
+    other = flight(2, duration_s=20.0)
+    t_ns = flown.truth.t_ns
+    swapped = replace(other.truth, t_ns=t_ns) if len(other.truth) == len(t_ns) else None
+    assert swapped is not None, "made-up flights have one clock"
+    with pytest.raises(DataError, match=r"worthless: .*do not follow the gyro"):
+        checked(flown, replace(flown, name="worthless", truths={"/ground_truth/pose": swapped}))
+
+
+def test_a_truth_of_another_frame_is_refused(flown: Recording) -> None:
+    """The axes of the gyro in another order than the truth's body."""
+    with pytest.raises(DataError, match="do not follow the gyro"):
+        checked(with_gyro(flown, flown.imu.gyro[:, [1, 2, 0]]))
+
+
+def test_a_few_seconds_are_not_enough() -> None:
+    with pytest.raises(DataError, match="expected at least 10 s"):
+        checked(flight(1, duration_s=6.0))
+
+
+def test_every_training_log_of_the_data_sets_is_accepted(data: Path, tmp_path: Path) -> None:
+    """Among them one of whose truth a tenth is missing, and a robot that stands for a fifth of the time."""
+    from imutool.conversion import convert
+
+    convert(data / "fetch", tmp_path / "fetch")
+    convert(data / "tumvi" / "dataset-room1.tar.gz", tmp_path / "room1.mcap")
+    convert(data / "euroc" / "V2_01_easy.zip", tmp_path / "V2_01.mcap")
+    checked(*(read(path) for path in sorted((tmp_path / "fetch").iterdir())))
+    checked(read(tmp_path / "room1.mcap"))
+    checked(read(tmp_path / "V2_01.mcap", truth="/ground_truth/pose"))

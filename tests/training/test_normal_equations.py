@@ -1,0 +1,99 @@
+"""Leaving a log out of shared least squares gives what solving all the others from scratch gives."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from imutool.training.normal_equations import Equations, Problem
+
+LOGS, SHARED, OWN = 4, 5, 2
+ROUNDING = 1e-10
+Data = list[tuple[torch.Tensor, torch.Tensor]]
+
+
+@pytest.fixture(scope="module")
+def data() -> Data:
+    """Slopes and residuals of each log at zero: e = J [theta, own] + r."""
+    generator = torch.Generator().manual_seed(1)
+
+    def normal(*shape: int) -> torch.Tensor:
+        return torch.randn(*shape, generator=generator, dtype=torch.float64)
+
+    return [(normal(30, SHARED + OWN), normal(30)) for _ in range(LOGS)]
+
+
+PRIOR, OWN_PRIOR = torch.linspace(0.5, 2.0, SHARED).double(), torch.tensor([0.3, 0.7]).double()
+
+
+def problem(data: Data, theta: torch.Tensor, own: torch.Tensor) -> Problem:
+    """The losses about a point."""
+    H, g, c = [], [], []
+    for i, (J, r) in enumerate(data):
+        e = J @ torch.cat([theta, own[i]]) + r
+        H.append(J.T @ J)
+        g.append(J.T @ e)
+        c.append(e @ e)
+    equations = Equations(torch.stack(H), torch.stack(g), torch.stack(c))
+    return Problem(theta, own, PRIOR, OWN_PRIOR, equations, equations)
+
+
+def at_once(data: Data, columns: list[int], logs: list[int]) -> tuple[torch.Tensor, torch.Tensor]:
+    """All unknowns in one system: theta (others at zero) and the own of each log."""
+    c = len(columns)
+    H = torch.zeros(c + OWN * len(logs), c + OWN * len(logs), dtype=torch.float64)
+    g = torch.zeros(len(H), dtype=torch.float64)
+    H[:c, :c] += torch.diag(PRIOR[columns])
+    for k, i in enumerate(logs):
+        where = [*range(c), *range(c + OWN * k, c + OWN * (k + 1))]
+        J, r = data[i]
+        J = J[:, [*columns, SHARED, SHARED + 1]]
+        H[torch.tensor(where)[:, None], torch.tensor(where)] += J.T @ J
+        g[where] += J.T @ r
+        own = where[c:]
+        H[own, own] += OWN_PRIOR
+    x = -torch.linalg.solve(H, g)
+    return x[:c], x[c:].reshape(-1, OWN)
+
+
+@pytest.mark.parametrize("columns", [list(range(SHARED)), [0, 3], []])
+@pytest.mark.parametrize("without", [None, 2])
+@pytest.mark.parametrize("from_zero", [True, False])
+def test_the_shared_parameters_are_those_of_the_whole_system(
+    data: Data, columns: list[int], without: int | None, from_zero: bool
+) -> None:
+    """From any point: the losses are quadratic, so one step arrives."""
+    size = 0.0 if from_zero else 1.0
+    theta, own = size * torch.arange(float(SHARED)).double(), size * torch.ones(LOGS, OWN).double()
+    made = problem(data, theta, own)
+    found = made.solve(columns, without)
+    logs = [i for i in range(LOGS) if i != without]
+    expected, expected_own = at_once(data, columns, logs)
+    others = [k for k in range(SHARED) if k not in columns]
+    torch.testing.assert_close(found.theta[columns], expected, rtol=0, atol=ROUNDING)
+    assert not found.theta[others].any()
+    torch.testing.assert_close(made.own_at(found.theta)[logs], expected_own, rtol=0, atol=ROUNDING)
+    assert found.covariance.shape == (len(columns), len(columns))
+
+
+def test_a_logs_loss_is_judged_at_what_the_others_say(data: Data) -> None:
+    made = problem(data, torch.zeros(SHARED).double(), torch.zeros(LOGS, OWN).double())
+    losses = made.predicted([1, 2])
+    for i, (J, r) in enumerate(data):
+        theta, _ = at_once(data, [1, 2], [j for j in range(LOGS) if j != i])
+        left = J[:, [1, 2]] @ theta + r
+        own = torch.linalg.lstsq(J[:, SHARED:], -left[:, None]).solution[:, 0]
+        assert float(losses[i]) == pytest.approx(float((left + J[:, SHARED:] @ own).square().sum()), rel=1e-8)
+
+
+def test_the_covariance_is_the_inverse_of_the_information(data: Data) -> None:
+    """Schur's complement inverted is the block of the whole inverse."""
+    made = problem(data, torch.zeros(SHARED).double(), torch.zeros(LOGS, OWN).double())
+    H = torch.zeros(SHARED + OWN * LOGS, SHARED + OWN * LOGS).double()
+    H[:SHARED, :SHARED] += torch.diag(PRIOR)
+    for i, (J, _) in enumerate(data):
+        where = torch.tensor([*range(SHARED), *range(SHARED + OWN * i, SHARED + OWN * (i + 1))])
+        H[where[:, None], where] += J.T @ J
+        H[where[SHARED:], where[SHARED:]] += OWN_PRIOR
+    expected = torch.linalg.inv(H)[:SHARED, :SHARED]
+    torch.testing.assert_close(made.solve(range(SHARED)).covariance, expected, rtol=0, atol=ROUNDING)

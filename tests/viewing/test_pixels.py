@@ -1,0 +1,82 @@
+"""Rerun's own viewer draws what it is given: every curve of every view, in its colour, found among the pixels."""
+
+from __future__ import annotations
+
+import runpy
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from imutool.viewing.model.run_data import RunData, build
+from imutool.viewing.rerun import layout, scene
+
+HERE = Path(__file__).parent
+VIEWERS = SimpleNamespace(**runpy.run_path(str(HERE.parent / "viewers.py")))
+CURVES = SimpleNamespace(**runpy.run_path(str(HERE / "curves.py")))
+APART = SimpleNamespace(**runpy.run_path(str(HERE / "apart.py")))
+
+WINDOW, WIDE = (1280, 800), (1600, 1000)  # the second for what lies close together
+INK = 400  # pixels that differ from the ground, the least of a view that says anything
+
+
+def one_model() -> list[RunData]:
+    made = APART.recording()
+    return [build(made, APART.runs(made))]
+
+
+def nothing_known() -> list[RunData]:
+    """A log without truth, read as it is."""
+    made = replace(APART.recording(), truths={}, scalars={})
+    return [build(made, APART.runs(made, models=0))]
+
+
+def two_models() -> list[RunData]:
+    made = APART.recording()
+    return [build(made, APART.runs(made, models=2))]
+
+
+def two_logs() -> list[RunData]:
+    made = [APART.recording(seed) for seed in (3, 4)]
+    return [build(one, APART.runs(one)) for one in made]
+
+
+EVERYTHING = None  # tabs
+CASES = {one_model: EVERYTHING, nothing_known: EVERYTHING, two_models: 2, two_logs: 2}
+
+
+def curves_of(case: Callable[[], list[RunData]], folder: Path) -> list[Any]:
+    """Every curve that is logged."""
+    path = CURVES.RRD.written(case(), folder / "logged.rrd")
+    found: list[Any] = CURVES.curves(path)
+    return found
+
+
+def drawn(case: Callable[[], list[RunData]], tabs: int | None) -> tuple[list[Any], dict[Any, np.ndarray]]:
+    """The views behind the first so many tabs, and their pictures."""
+    logs = case()
+    blueprint = layout.blueprint(logs)
+
+    def look(running: Any) -> dict[Any, np.ndarray]:
+        return CURVES.pictures(running, blueprint, lambda to: scene.log(logs, to), logs[0].duration_s, tabs)
+
+    seen = VIEWERS.seen(look, WINDOW if tabs is EVERYTHING else WIDE)
+    return [view for view in CURVES.RRD.views(blueprint) if view.id in seen], seen
+
+
+@pytest.mark.parametrize("case", CASES, ids=lambda case: case.__name__)
+def test_every_view_draws_every_curve_it_holds(case: Callable[[], list[RunData]], tmp_path: Path) -> None:
+    curves = curves_of(case, tmp_path)
+    views, seen = drawn(case, CASES[case])
+    assert [fault for view in views for fault in CURVES.unseen(view, seen[view.id], curves)] == []
+    assert [view.name for view in views if ink(seen[view.id]) < INK] == []
+
+
+def ink(picture: np.ndarray) -> int:
+    """How many pixels are not the ground."""
+    ground = np.median(picture[::5, ::5].reshape(-1, 3), axis=0)
+    return int((np.abs(picture - ground).max(axis=-1) > 40).sum())
