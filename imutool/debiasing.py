@@ -19,13 +19,13 @@ from imutool import __version__
 from imutool.bias import static
 from imutool.bias.io import shipped, shipped_for
 from imutool.bias.model import BiasModel, OneByOne, Stream, Vector6
-from imutool.bias_start.bias_covariance import Certainty
-from imutool.bias_start.initial_bias import TurnOn, following
+from imutool.bias_start.bias_covariance import BiasCovariance
+from imutool.bias_start.initial_bias import InitialBias, following
 from imutool.bias_start.model_choice import prepare, refuse_smooth
 from imutool.cleaning import Cleaner, Rules, Survey, look
 from imutool.config import plain
 from imutool.errors import ConfigError, LogError
-from imutool.location import Place
+from imutool.location import Location
 from imutool.mcap_io.added_topics import Made, NewTopic
 from imutool.mcap_io.batches import Clock, ImuBatch
 from imutool.mcap_io.codec import schemas
@@ -55,13 +55,13 @@ class DebiasReport:
     """What was done to a log, one entry per IMU topic."""
 
     models: Mapping[str, str]
-    starts: Mapping[str, TurnOn]
+    starts: Mapping[str, InitialBias]
     rewrite: RewriteReport
     losses: Losses  # of a damaged source; empty as far as it was looked at (`check`)
     surveys: Mapping[str, Survey]  # of what was cleaned
 
 
-def apply(model: BiasModel, start: TurnOn, imu: Imu) -> Debiased:
+def apply(model: BiasModel, start: InitialBias, imu: Imu) -> Debiased:
     """A model over samples in memory, from their first on."""
     bias = start.stream(model)(seconds(imu.t_ns, int(imu.t_ns[0])), imu.gyro, imu.accel)
     return Debiased(Imu(imu.t_ns, imu.gyro - bias[:, :3], imu.accel - bias[:, 3:]), bias)
@@ -79,13 +79,13 @@ class Block(NamedTuple):
 Watch = Callable[[Block], None]
 
 
-def apply_with_std(model: BiasModel, start: TurnOn, imu: Imu) -> tuple[Debiased, Float64[np.ndarray, "n 6"]]:
+def apply_with_std(model: BiasModel, start: InitialBias, imu: Imu) -> tuple[Debiased, Float64[np.ndarray, "n 6"]]:
     """As `apply`, and one standard deviation of the bias at each sample, gyro (rad/s) then accel (m/s²): `imutool.bias_start.bias_covariance`.
 
     In blocks, as a log is debiased: a covariance is 288 bytes.
     """
     stream = start.stream(model)
-    certainty = Certainty(model, start, stream)
+    certainty = BiasCovariance(model, start, stream)
     t_s = seconds(imu.t_ns, int(imu.t_ns[0]))
     bias, std = np.empty((len(imu), 6)), np.empty((len(imu), 6))
     for first in range(0, len(imu), BLOCK):
@@ -103,7 +103,7 @@ class OnlineDebiaser:
     begins at the prior and is followed by what the samples show, as by `--init auto`.
     """
 
-    def __init__(self, model: BiasModel, start: TurnOn | None = None) -> None:
+    def __init__(self, model: BiasModel, start: InitialBias | None = None) -> None:
         stream = (start or following(model)).stream(model)
         self._one, self._start_ns = stream.one if isinstance(stream, OneByOne) else _by_blocks(stream), -1
 
@@ -136,7 +136,7 @@ class Debiaser:
     """
 
     def __init__(
-        self, source_topic: str, model: BiasModel, start: TurnOn, found: Survey | None = None, watch: Watch | None = None
+        self, source_topic: str, model: BiasModel, start: InitialBias, found: Survey | None = None, watch: Watch | None = None
     ) -> None:
         self.source_topic, self._watch = source_topic, watch
         self._clean = None if found is None else Cleaner(found)
@@ -148,7 +148,7 @@ class Debiaser:
         )
         self._stream, self._start_ns = start.stream(model), -1
         self._clock = Clock()
-        self._certainty = Certainty(model, start, self._stream)
+        self._certainty = BiasCovariance(model, start, self._stream)
         noise = model.noise_std.detach().cpu().double().numpy()
         self._white = np.diag(np.where(noise > 0, noise, start.noise) ** 2)
 
@@ -190,8 +190,8 @@ class Debiaser:
 
 
 def debias(
-    source: Place,
-    target: Place | None,
+    source: Location,
+    target: Location | None,
     *,
     model: str | Path | Mapping[str, str | Path] | None = None,
     imus: Sequence[str] = (),
@@ -256,10 +256,10 @@ class _Asked:
 
 
 def _debias(
-    source: Place,
-    sound: Place,
+    source: Location,
+    sound: Location,
     losses: Losses,
-    target: Place | None,
+    target: Location | None,
     asked: _Asked,
     progress: Callable[[int, int], None] | None,
 ) -> DebiasReport:
@@ -327,7 +327,7 @@ def _chosen(log: Log, imus: Sequence[str], given: Mapping[str, str | Path]) -> l
     return topics
 
 
-def _provenance(topic: str, model: BiasModel, start: TurnOn, init: str, smooth: bool) -> dict[str, str]:
+def _provenance(topic: str, model: BiasModel, start: InitialBias, init: str, smooth: bool) -> dict[str, str]:
     return {
         "version": __version__,
         "command": "debias",

@@ -26,8 +26,8 @@ from imutool.sensor import physics_file
 if TYPE_CHECKING:
     from imutool.viewing.model.run_data import RunData
 
-FINDINGS, PHYSICS, REPORT, LOG, VIEW = "findings.json", "physics.toml", "report.html", "log.html", "view.rrd"
-FILES = (FINDINGS, PHYSICS, REPORT, LOG, VIEW)
+FINDINGS, EFFECT, REPORT, LOG, VIEW = "findings.json", "physics.toml", "report.html", "log.html", "view.rrd"
+FILES = (FINDINGS, EFFECT, REPORT, LOG, VIEW)
 DRAWN = ("matplotlib", "report")  # the library that draws a file, and its extra
 NEEDS = {LOG: DRAWN, REPORT: DRAWN, VIEW: ("rerun", "view")}
 
@@ -96,7 +96,7 @@ def _finite(value: Any) -> Any:
 def _make(d: Diagnosis, folder: Path, logs: Callable[[Path], list[RunData]] | None) -> list[str]:
     text = json.dumps(plain(d), indent=2, allow_nan=False, ensure_ascii=False)
     (folder / FINDINGS).write_text(text + "\n", encoding="utf-8")
-    physics_file.write(found(d), folder / PHYSICS)
+    physics_file.write(found(d), folder / EFFECT)
     drawn: dict[str, Callable[[Path], None]] = {REPORT: lambda path: _page(d, path), VIEW: lambda path: _recording(d, path)}
     if logs is not None:  # before the report, which says where it is
         drawn = {LOG: lambda path: _logs(logs(folder), path)} | drawn

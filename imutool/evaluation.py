@@ -14,7 +14,7 @@ from imutool.bias import static
 from imutool.bias.io import check_rate, find_model
 from imutool.bias.model import BiasModel
 from imutool.bias_start.bias_tracking import Known
-from imutool.bias_start.initial_bias import AT_REST_STD, LEAST_STD, TurnOn, find
+from imutool.bias_start.initial_bias import AT_REST_STD, LEAST_STD, InitialBias, find
 from imutool.bias_start.model_choice import estimate_at_rest, refuse_smooth, smooth_in_memory
 from imutool.bias_start.zero_velocity import with_stops
 from imutool.debiasing import Debiased, apply
@@ -102,7 +102,7 @@ def _over(imu: Imu, true: Poses) -> Imu:
     return rows
 
 
-def _left(start: TurnOn | None) -> Known:
+def _left(start: InitialBias | None) -> Known:
     """What may be left of the bias after debiasing: the start's uncertainty, or anything where nothing was taken off."""
     std = np.array(RAW_STD) if start is None else np.maximum(start.std, LEAST_STD)
     return Known(np.zeros(6), std, AT_REST_STD)
@@ -110,7 +110,7 @@ def _left(start: TurnOn | None) -> Known:
 
 def runs(
     recording: Recording, models: Sequence[str | Path], init: str, where: str | Path, *, smooth: bool = False
-) -> Iterator[tuple[str, Debiased, TurnOn | None]]:
+) -> Iterator[tuple[str, Debiased, InitialBias | None]]:
     """The samples as recorded, then as each model corrects them: name, samples and bias, and the start."""
     refuse_smooth(init, smooth)
     yield RAW, Debiased(recording.imu, np.zeros((len(recording.imu), 6))), None
@@ -120,7 +120,7 @@ def runs(
 
 def started(
     recording: Recording, models: Sequence[str | Path], init: str, where: str | Path, *, smooth: bool = False
-) -> Iterator[tuple[str, BiasModel, TurnOn]]:
+) -> Iterator[tuple[str, BiasModel, InitialBias]]:
     """Each model asked for, its name, and the start it gets in this recording."""
     refuse_smooth(init, smooth)
     for given in models:
@@ -130,7 +130,7 @@ def started(
 
 def _model_and_start(
     given: str | Path, recording: Recording, init: str, where: str | Path, smooth: bool
-) -> tuple[BiasModel, TurnOn]:
+) -> tuple[BiasModel, InitialBias]:
     untrained = str(given) == static.Model.method
     if untrained and init == "auto" and not smooth:
         return estimate_at_rest(recording.imu, where)

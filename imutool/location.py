@@ -19,9 +19,9 @@ from imutool.errors import ConfigError
 if TYPE_CHECKING:
     from upath import UPath
 
-    Place: TypeAlias = Path | UPath
+    Location: TypeAlias = Path | UPath
 else:
-    Place = Path | ForwardRef("upath.UPath")  # beartype looks the name up, and imports upath, at the first URL it meets
+    Location = Path | ForwardRef("upath.UPath")  # beartype looks the name up, and imports upath, at the first URL it meets
 
 CLOUD = "pip install 'imutool[cloud]'"
 STORES = {
@@ -47,7 +47,7 @@ class Opened(NamedTuple):
     size: int
 
 
-def place(text: str) -> Place:
+def to_location(text: str) -> Location:
     """The file or the object that a user names.
 
     Raises:
@@ -98,7 +98,7 @@ def redacted(text: str) -> str:
     return re.sub(r"(?i)((?:signature|sig|token|credential)=)[^&\s\"']+", r"\1***", re.sub(r"//[^/\s]*@", "//***@", text))
 
 
-def failures(where: Place) -> type[Exception]:
+def failures(where: Location) -> type[Exception]:
     """What reading and writing there may raise: of a store whatever its library does, since they have no class in common."""
     return OSError if isinstance(where, Path) else Exception
 
@@ -114,7 +114,7 @@ def reason(error: Exception) -> str:
     return redacted(str(error)) or type(error).__name__
 
 
-def opened(where: Place) -> Opened:
+def opened(where: Location) -> Opened:
     """A place open for reading; of a store by ranges, in blocks, of which a few are kept.
 
     Raises:
@@ -129,14 +129,14 @@ def opened(where: Place) -> Opened:
     return Opened(remote, remote.size)
 
 
-def same(one: Place, other: Place) -> bool:
+def same(one: Location, other: Location) -> bool:
     """Whether two places that exist are one; a link to a file is that file."""
     if isinstance(one, Path) and isinstance(other, Path):
         return one.exists() and other.exists() and one.samefile(other)
     return one == other
 
 
-def identity(where: Place) -> tuple[int, str]:
+def identity(where: Location) -> tuple[int, str]:
     """Size in bytes, and the etag of a store or the time of the last change: what changes when somebody writes there.
 
     Raises:

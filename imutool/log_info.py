@@ -26,7 +26,7 @@ from imutool.cleaning.rules.units import (
 )
 from imutool.errors import LogError
 from imutool.inertial.stationary import stretches
-from imutool.location import Place
+from imutool.location import Location
 from imutool.mcap_io.codec import schemas
 from imutool.mcap_io.codec.decode import decode_imu
 from imutool.mcap_io.log import Log
@@ -40,7 +40,7 @@ NOISE_WINDOW_S = 1.0
 Report = dict[str, Any]
 
 
-def inspect(path: Place, *, check: bool = True) -> Report:
+def inspect(path: Location, *, check: bool = True) -> Report:
     """Everything `imutool info` says about a log, as plain JSON values (schema `imutool.info/1`).
 
     A damaged log is described by what of it is sound, and `losses` says what is not (`mcap_io.losses.Losses.plain`). For that

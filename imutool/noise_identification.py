@@ -17,7 +17,7 @@ from jaxtyping import Float64
 from imutool.config import build
 from imutool.errors import DataError
 from imutool.inertial.stationary import stretches, white_noise
-from imutool.location import Place
+from imutool.location import Location
 from imutool.mcap_io.read import read
 from imutool.noise import allan
 from imutool.noise import datasheet as noise
@@ -76,7 +76,9 @@ class Identified:
     remarks: list[str]
 
 
-def identify(path: Place, *, imu: str | None = None, truth: str | None = None, model: str | Path | None = None) -> Identified:
+def identify(
+    path: Location, *, imu: str | None = None, truth: str | None = None, model: str | Path | None = None
+) -> Identified:
     """The noise of one IMU of a log, from its time at rest and, where there is truth, from its motion.
 
     In motion the samples are first corrected: by `model`, else by a matrix and a constant fitted to this log's own truth.
@@ -142,7 +144,7 @@ def _vibrates(one: Slopes) -> bool:
     return one.excess > VIBRATES or "quantisation" in one.seen or not one.powers
 
 
-def _in_motion(recording: Recording, model: str | Path | None, path: Place) -> Sight:
+def _in_motion(recording: Recording, model: str | Path | None, path: Location) -> Sight:
     """Deviation of what is left of the samples against the truth.
 
     Raises:
@@ -158,7 +160,7 @@ def _in_motion(recording: Recording, model: str | Path | None, path: Place) -> S
     return Sight.of(f"{_duration(seconds)} in motion against {topic}, {by}", seconds, both)
 
 
-def _by_model(recording: Recording, model: str | Path, path: Place) -> tuple[Imu, str]:
+def _by_model(recording: Recording, model: str | Path, path: Location) -> tuple[Imu, str]:
     from imutool.evaluation import runs
 
     *_, last = runs(recording, [model], "auto", str(path))

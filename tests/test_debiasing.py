@@ -20,7 +20,7 @@ from rosbags.highlevel import AnyReader
 from imutool.bias import linear, neural_ode, static
 from imutool.bias.io import load, save
 from imutool.bias.model import BiasModel, Segment
-from imutool.bias_start.initial_bias import TurnOn, at_rest, auto, following, from_truth, given, prior, smooth
+from imutool.bias_start.initial_bias import InitialBias, at_rest, auto, following, from_truth, given, prior, smooth
 from imutool.bias_start.model_choice import estimate_at_rest
 from imutool.cli.debias import assigned
 from imutool.conversion import convert
@@ -647,7 +647,7 @@ def test_the_batch_path_is_the_models_forward_pass(recording: Recording) -> None
     t = torch.from_numpy(seconds(imu.t_ns, int(imu.t_ns[0])))[None]
     gyro, accel = (torch.from_numpy(u.copy())[None] for u in (imu.gyro, imu.accel))
     expected = model(Segment(t, gyro, accel, torch.zeros(1, 6, dtype=torch.float64)))[0]
-    start = TurnOn(np.zeros(6), np.zeros(6), "zero")
+    start = InitialBias(np.zeros(6), np.zeros(6), "zero")
     np.testing.assert_allclose(apply(model, start, imu).bias, expected, rtol=0, atol=ONLINE)
 
 

@@ -16,7 +16,7 @@ import pytest
 
 from imutool.debiasing import debias
 from imutool.errors import ConfigError, LogError
-from imutool.location import BLOCK_BYTES, place, reason, same
+from imutool.location import BLOCK_BYTES, reason, same, to_location
 from imutool.log_info import inspect
 from imutool.mcap_io.log import Log
 from imutool.mcap_io.rewrite import rewrite
@@ -35,12 +35,12 @@ LEAST_PART = 5 * MIB  # S3 takes no smaller ones, but for the last
 
 @pytest.mark.parametrize("text", ["log.mcap", "/data/log.mcap", "s3/log.mcap", "a:b.mcap"])
 def test_a_name_without_a_store_is_a_file(text: str) -> None:
-    assert place(text) == Path(text)
-    assert place(f"file://{text}") == Path(text)
+    assert to_location(text) == Path(text)
+    assert to_location(f"file://{text}") == Path(text)
 
 
 def test_a_url_is_an_object_in_a_store(store: Any) -> None:
-    found = place("s3://fleet/robot 7/log#1.mcap")
+    found = to_location("s3://fleet/robot 7/log#1.mcap")
     assert not isinstance(found, Path)
     assert (str(found), found.name, found.stem) == ("s3://fleet/robot 7/log#1.mcap", "log#1.mcap", "log#1")
     assert store.requests == []
@@ -48,20 +48,20 @@ def test_a_url_is_an_object_in_a_store(store: Any) -> None:
 
 def test_an_unknown_store_is_refused_with_those_there_are() -> None:
     with pytest.raises(ConfigError, match=r"ftp://host/log.mcap: is no store known here; expected s3://, gs://, az://"):
-        place("ftp://host/log.mcap")
+        to_location("ftp://host/log.mcap")
 
 
 @pytest.mark.parametrize(("url", "package"), [("gs://bucket/log.mcap", "gcsfs"), ("az://container/log.mcap", "adlfs")])
 def test_a_store_without_its_package_says_how_to_get_it(monkeypatch: pytest.MonkeyPatch, url: str, package: str) -> None:
     monkeypatch.setitem(sys.modules, package, None)
     with pytest.raises(ConfigError, match=rf"needs a package .* pip install 'imutool\[cloud\]' {package}"):
-        place(url)
+        to_location(url)
 
 
 def test_without_fsspec_the_message_says_how_to_get_it(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "upath", None)
     with pytest.raises(ConfigError, match=r"pip install 'imutool\[cloud\]'"):
-        place("s3://bucket/log.mcap")
+        to_location("s3://bucket/log.mcap")
 
 
 @pytest.mark.parametrize(
@@ -76,7 +76,7 @@ def test_without_fsspec_the_message_says_how_to_get_it(monkeypatch: pytest.Monke
 )
 def test_a_url_with_something_secret_in_it_is_refused_and_not_repeated(url: str) -> None:
     with pytest.raises(ConfigError) as raised:
-        place(url)
+        to_location(url)
     assert "hush" not in str(raised.value)
 
 
@@ -84,9 +84,9 @@ def test_a_place_is_itself_and_no_other(tmp_path: Path, store: Any) -> None:
     (tmp_path / "a").touch()
     (tmp_path / "b").symlink_to(tmp_path / "a")
     assert same(tmp_path / "a", tmp_path / "b")
-    assert same(place("s3://fleet/a"), place("s3://fleet/a"))
-    assert not same(place("s3://fleet/a"), place("s3://fleet/b"))
-    assert not same(place("s3://fleet/a"), Path("/fleet/a"))
+    assert same(to_location("s3://fleet/a"), to_location("s3://fleet/a"))
+    assert not same(to_location("s3://fleet/a"), to_location("s3://fleet/b"))
+    assert not same(to_location("s3://fleet/a"), Path("/fleet/a"))
 
 
 # ── a log in a store ──
@@ -101,7 +101,7 @@ def test_debias_from_store_to_store_is_byte_for_byte_the_local_result(
     store: Any, logs: Path, tmp_path: Path, flight: bytes
 ) -> None:
     url, model = store.put("in/flight_1.mcap", flight), logs / "linear.safetensors"
-    debias(place(url), place("s3://fleet/out/log.mcap"), model=model)
+    debias(to_location(url), to_location("s3://fleet/out/log.mcap"), model=model)
     debias(logs / "flight_1.mcap", tmp_path / "log.mcap", model=model)
     assert store.get("out/log.mcap") == (tmp_path / "log.mcap").read_bytes()
     assert store.keys() == ["in/flight_1.mcap", "out/log.mcap"]
@@ -128,7 +128,7 @@ def test_the_command_debiases_and_describes_logs_in_a_store_and_says_nothing_sec
 
 
 def test_a_key_that_is_taken_is_refused_without_overwrite(store: Any, flight: bytes) -> None:
-    source, taken = place(store.put("in.mcap", flight)), place(store.put("out.mcap", b"precious"))
+    source, taken = to_location(store.put("in.mcap", flight)), to_location(store.put("out.mcap", b"precious"))
     with pytest.raises(ConfigError, match=r"s3://fleet/out.mcap: the target exists.*--overwrite"):
         rewrite(source, taken, [], metadata={})
     assert store.get("out.mcap") == b"precious"
@@ -142,7 +142,7 @@ def test_a_key_that_is_taken_is_refused_without_overwrite(store: Any, flight: by
 def test_a_large_object_goes_up_in_parts_and_comes_back(store: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     data = bytes(range(256)) * (11 * MIB // 256)
     monkeypatch.setattr(upload, "PART_BYTES", LEAST_PART)
-    with Target(place("s3://fleet/large")) as target:
+    with Target(to_location("s3://fleet/large")) as target:
         for at in range(0, len(data), MIB):
             target.write(data[at : at + MIB])
         assert store.uploads() == [target.temporary.name]
@@ -166,7 +166,7 @@ def test_parts_grow_so_that_there_are_never_too_many_of_them(store: Any, monkeyp
 
 def filled(url: str, pieces: int = 1, size: int = 4, then: Callable[[Target], object] = lambda _: None) -> None:
     """Writes an object of some pieces, and does something to it before it is put in its place."""
-    with Target(place(url)) as target:
+    with Target(to_location(url)) as target:
         for _ in range(pieces):
             target.write(bytes(size))
         then(target)
@@ -190,7 +190,7 @@ def test_an_upload_that_is_given_up_leaves_neither_parts_nor_objects(
 
 
 def test_a_target_that_is_forgotten_leaves_nothing(store: Any) -> None:
-    target = Target(place("s3://fleet/out"))
+    target = Target(to_location("s3://fleet/out"))
     target.write(b"ours")
     del target
     assert (store.uploads(), store.keys()) == ([], [])
@@ -224,10 +224,10 @@ def test_a_large_object_that_cannot_be_copied_to_its_key_leaves_no_parts(store: 
 
 
 def test_any_store_of_fsspec_serves(logs: Path, tmp_path: Path) -> None:
-    fs = place("memory://").fs
+    fs = to_location("memory://").fs
     fs.store.clear()
     fs.pipe_file("/in/log.mcap", (logs / "flight_1.mcap").read_bytes())
-    rewrite(place("memory://in/log.mcap"), place("memory://out/log.mcap"), [], metadata={})
+    rewrite(to_location("memory://in/log.mcap"), to_location("memory://out/log.mcap"), [], metadata={})
     rewrite(logs / "flight_1.mcap", tmp_path / "log.mcap", [], metadata={})
     assert fs.cat_file("/out/log.mcap") == (tmp_path / "log.mcap").read_bytes()
     assert sorted(fs.store) == ["/in/log.mcap", "/out/log.mcap"]
@@ -267,9 +267,9 @@ def failing(wanted: Callable[[Any], bool], how: str, times: int = 10**9) -> Call
 @pytest.mark.parametrize("how", ["500", "503", "cut"])
 @pytest.mark.parametrize("wanted", [of("GET", "in.mcap"), of("PUT", "partial"), of("PUT", "out.mcap"), of("HEAD", "out.mcap")])
 def test_a_store_that_fails_once_is_asked_again(store: Any, flight: bytes, wanted: Any, how: str) -> None:
-    source = place(store.put("in.mcap", flight))
+    source = to_location(store.put("in.mcap", flight))
     store.fault = failing(wanted, how, times=1)
-    report = rewrite(source, place("s3://fleet/out.mcap"), [], metadata={})
+    report = rewrite(source, to_location("s3://fleet/out.mcap"), [], metadata={})
     assert len(store.get("out.mcap")) == report.target_bytes
     assert (store.keys(), store.uploads()) == (["in.mcap", "out.mcap"], [])
 
@@ -279,7 +279,7 @@ def test_a_store_that_fails_for_good_while_a_log_is_read_is_said_and_nothing_is_
     store: Any, flight: bytes, how: str
 ) -> None:
     url = store.put("in.mcap", flight + bytes(2 * BLOCK_BYTES))
-    source = Source(place(url))
+    source = Source(to_location(url))
     assert source.at(0, 8) == flight[:8]
     store.fault = failing(of("GET", "in.mcap"), how)
     with pytest.raises(LogError, match=r"cannot be read at byte 5000000 \(.+\)") as raised:
@@ -287,7 +287,7 @@ def test_a_store_that_fails_for_good_while_a_log_is_read_is_said_and_nothing_is_
     source.file.close()
     assert store.secret not in str(raised.value)
     with pytest.raises(LogError, match=r"s3://fleet/in.mcap: cannot be read at byte"):
-        rewrite(place(url), place("s3://fleet/out.mcap"), [], metadata={})
+        rewrite(to_location(url), to_location("s3://fleet/out.mcap"), [], metadata={})
     assert (store.keys(), store.uploads()) == (["in.mcap"], [])
 
 
@@ -308,15 +308,15 @@ def test_a_store_that_fails_for_good_while_a_log_is_written_is_said_and_nothing_
 
 def test_what_the_store_refuses_is_said(store: Any, flight: bytes) -> None:
     with pytest.raises(ConfigError, match=r"s3://fleet/none.mcap: cannot be opened \(no such object, or no such bucket\)"):
-        Log(place("s3://fleet/none.mcap"))
+        Log(to_location("s3://fleet/none.mcap"))
     with pytest.raises(ConfigError, match=r"s3://none/in.mcap: cannot be opened \(no such object, or no such bucket\)"):
-        Log(place("s3://none/in.mcap"))
+        Log(to_location("s3://none/in.mcap"))
     with pytest.raises(ConfigError, match=r"s3://none/out: cannot be written \(no such object, or no such bucket\)"):
         filled("s3://none/out")
     store.fault = failing(of("HEAD", "in.mcap"), "403")
     url = store.put("in.mcap", flight)
     with pytest.raises(ConfigError, match=r"s3://fleet/in.mcap: cannot be opened \(the store refuses access: Forbidden\)"):
-        Log(place(url))
+        Log(to_location(url))
     store.fault = failing(of("PUT", "partial"), "403")
     with pytest.raises(ConfigError, match=r"s3://fleet/out: cannot be written \(the store refuses access"):
         filled("s3://fleet/out")
@@ -333,7 +333,7 @@ def test_without_credentials_the_message_says_so(store: Any, imutool: Any, tmp_p
 
 
 def test_an_object_that_changes_while_it_is_read_is_said(store: Any, flight: bytes) -> None:
-    source = Source(place(store.put("in.mcap", flight + bytes(2 * BLOCK_BYTES))))
+    source = Source(to_location(store.put("in.mcap", flight + bytes(2 * BLOCK_BYTES))))
     store.put("in.mcap", flight[::-1] + bytes(2 * BLOCK_BYTES))
     with pytest.raises(LogError, match="cannot be read at byte 5000000"):
         source.at(5_000_000, 10)
@@ -341,11 +341,11 @@ def test_an_object_that_changes_while_it_is_read_is_said(store: Any, flight: byt
 
 
 def test_the_hash_of_an_object_is_that_of_its_bytes(store: Any, logs: Path, flight: bytes) -> None:
-    assert sha256(place(store.put("in.mcap", flight))) == sha256(logs / "flight_1.mcap")
+    assert sha256(to_location(store.put("in.mcap", flight))) == sha256(logs / "flight_1.mcap")
 
 
 def test_a_log_is_described_as_the_file_is(store: Any, logs: Path, flight: bytes) -> None:
-    there, here = inspect(place(store.put("flight_1.mcap", flight))), inspect(logs / "flight_1.mcap")
+    there, here = inspect(to_location(store.put("flight_1.mcap", flight))), inspect(logs / "flight_1.mcap")
     assert there.pop("path") == "s3://fleet/flight_1.mcap"
     assert there == {name: value for name, value in here.items() if name != "path"}
 

@@ -12,7 +12,7 @@ from imutool.bag import records
 from imutool.bag.records import FIRST_RECORD, MAGIC, U32, Op
 from imutool.bag.scan import Bag, Chunk, Loss
 from imutool.errors import ConfigError, LogError
-from imutool.location import Place, same
+from imutool.location import Location, same
 from imutool.mcap_io.storage.source import Source
 from imutool.mcap_io.storage.target import Target
 
@@ -69,7 +69,7 @@ class _Entry(NamedTuple):
     counts: Mapping[int, int]
 
 
-def is_bag(where: Place) -> bool:
+def is_bag(where: Location) -> bool:
     """Whether a file begins as ROS 1 bags do.
 
     Raises:
@@ -83,7 +83,7 @@ def is_bag(where: Place) -> bool:
         source.file.close()
 
 
-def repair_bag(source: Place, target: Place, *, overwrite: bool = False, progress: Progress | None = None) -> BagReport:
+def repair_bag(source: Location, target: Location, *, overwrite: bool = False, progress: Progress | None = None) -> BagReport:
     """Writes `target`: every message of `source` that can be read, byte for byte, with its index.
 
     A chunk of which nothing is lost keeps its bytes; any other is written unpacked with the messages found in it. The result
@@ -185,7 +185,7 @@ def _crc(chunk: Chunk, crc: int) -> int:
     return crc
 
 
-def _read_back(path: Place, tell: Callable[[int], None]) -> int:
+def _read_back(path: Location, tell: Callable[[int], None]) -> int:
     """The CRC of all messages in a bag that must be whole."""
     crc = 0
     with Bag(path) as bag:

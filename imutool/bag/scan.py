@@ -14,7 +14,7 @@ from typing import NamedTuple
 from imutool.bag import records
 from imutool.bag.records import HEAD_LIMIT, MAGIC, Connection, Head, Op
 from imutool.errors import LogError
-from imutool.location import Place
+from imutool.location import Location
 from imutool.mcap_io.storage.source import Source
 
 SCAN_BYTES = 4096, 1 << 20  # looked through at once, first and at most: what is sought may be near
@@ -63,7 +63,7 @@ class Bag:
         LogError: empty, no ROS 1 bag, or encrypted.
     """
 
-    def __init__(self, path: Place, *, salvage: bool = False) -> None:
+    def __init__(self, path: Location, *, salvage: bool = False) -> None:
         self.path, self.salvage = path, salvage
         self.connections: dict[int, Connection] = {}
         self.doubtful: set[int] = set()  # numbers that may mean something else by now

@@ -19,11 +19,11 @@ from jaxtyping import Float, Float64
 from torch import Tensor
 
 from imutool.bias import neural_ode
-from imutool.bias.model import COLUMNS, SENSORS, BiasModel, OneByOne, Segment, Sensor, Stream, Unsure, Vector6
+from imutool.bias.model import COLUMNS, SENSORS, BiasModel, CovarianceModel, OneByOne, Segment, Sensor, Stream, Vector6
 from imutool.config import Settings
 from imutool.errors import ConfigError
 from imutool.sensor.catalogue import named as effects_named
-from imutool.sensor.linear_effect import Effect, Together, compiled, patterns
+from imutool.sensor.linear_effect import LinearEffect, Together, compiled, patterns
 from imutool.sensor.signals import POWER_S, SignalFilter, Signals
 
 FORGOTTEN = 10.0  # time constants after which a filter's start no longer shows
@@ -54,7 +54,7 @@ class Model(BiasModel):
         chosen = config or Config()
         assert isinstance(chosen, Config)
         super().__init__(chosen, rate_hz)
-        self.effects: dict[Sensor, tuple[Effect, ...]] = {"gyro": (), "accel": ()}
+        self.effects: dict[Sensor, tuple[LinearEffect, ...]] = {"gyro": (), "accel": ()}
         for sensor in SENSORS:
             self._hold(sensor, self.named(sensor) or ())
         self.ode = neural_ode.Model(chosen.ode, rate_hz) if chosen.remainder else None
@@ -111,7 +111,7 @@ class Model(BiasModel):
         """The neural ODE's."""
         return np.zeros((6, 6)) if self.ode is None else self.ode.rest_dynamics()
 
-    def calibration_covariance(self) -> Unsure | None:
+    def calibration_covariance(self) -> CovarianceModel | None:
         """Of the effects' error, from the covariance of their parameters: T Sigma T^T, as its root T Sigma^1/2."""
         roots: dict[Sensor, Float64[np.ndarray, "3 q p"]] = {}
         for sensor in SENSORS:

@@ -60,7 +60,7 @@ class OneByOne(Stream, Protocol):
 
 
 @runtime_checkable
-class Unsure(Protocol):
+class CovarianceModel(Protocol):
     """Roots S of the covariance S S^T of what the motion adds, for samples as they arrive, by sensor.
 
     The columns of S are the same unknowns at every sample: a mean over samples has the mean of S.
@@ -127,7 +127,7 @@ class BiasModel(nn.Module, ABC):
         """d(drift of the rest bias) / d(rest bias), a second: how an error of the start grows or dies. Zero for most."""
         return np.zeros((6, 6))
 
-    def calibration_covariance(self) -> Unsure | None:
+    def calibration_covariance(self) -> CovarianceModel | None:
         """What is left open of the motion-dependent part, for each sample as a root; none where it is not known."""
         return None
 

@@ -24,13 +24,13 @@ from torch import Tensor
 
 from imutool import registry
 from imutool.bias import hybrid
-from imutool.bias.model import COLUMNS, SENSORS, OneByOne, Segment, Sensor, Stream, Unsure, Vector6
+from imutool.bias.model import COLUMNS, SENSORS, CovarianceModel, OneByOne, Segment, Sensor, Stream, Vector6
 from imutool.errors import ModelError
 from imutool.sensor import catalogue, physics_file
-from imutool.sensor.effect import Physics, Theta
-from imutool.sensor.linear_effect import AXES, Effect, Parameter, full, per_pair
+from imutool.sensor.effect import Effect, Theta
+from imutool.sensor.linear_effect import AXES, LinearEffect, LinearParameter, full, per_pair
 from imutool.sensor.physics_file import Bias, Entry, PhysicsFile
-from imutool.sensor.readings import Read
+from imutool.sensor.readings import SensorSamples
 from imutool.sensor.signals import POWER_S, Signals
 
 # How far a bias lies from run to run: of the ADIS16448 in EuRoC's training sequences, 2 mrad/s and 0.02 m/s². Where the file
@@ -47,7 +47,7 @@ MATRIX = {  # by entry, what it is of each sensor's matrix
 DRIFTS = {"gyro_bias_drift", "accel_bias_drift"}
 
 logger = logging.getLogger(__name__)
-Part = tuple[Effect, Theta, Theta]  # an effect, its parameters, their standard deviations
+Part = tuple[LinearEffect, Theta, Theta]  # an effect, its parameters, their standard deviations
 
 
 class Model(hybrid.Model):
@@ -89,7 +89,7 @@ class Model(hybrid.Model):
         assert isinstance(inner, OneByOne)
         return _Less(inner, self._b)
 
-    def calibration_covariance(self) -> Unsure | None:
+    def calibration_covariance(self) -> CovarianceModel | None:
         """From the parameters' standard deviations, taken as independent."""
         unsure = super().calibration_covariance()
         assert unsure is not None
@@ -166,7 +166,7 @@ def _taken(entry: Entry, parts: Mapping[Sensor, list[Part]]) -> bool:
     if entry.name == "clock_offset" and abs(_value(entry, "tau")) > MOST_TAU_S:
         return False
     for sensor in sensors:
-        effect: Effect = module.effect(sensor)
+        effect: LinearEffect = module.effect(sensor)
         if entry.name in DRIFTS:
             effect = replace(effect, sees=_warming(_value(entry, "tau")))
         names = [_named(entry, sensor, parameter) for parameter in effect.parameters]
@@ -175,7 +175,7 @@ def _taken(entry: Entry, parts: Mapping[Sensor, list[Part]]) -> bool:
     return bool(sensors)
 
 
-def _named(entry: Entry, sensor: Sensor, parameter: Parameter) -> str:
+def _named(entry: Entry, sensor: Sensor, parameter: LinearParameter) -> str:
     """What the file calls an effect's parameter: by the sensor as well where the effect acts on both."""
     both = f"{sensor}_{parameter.name}"
     return both if both in entry.parameters else parameter.name
@@ -192,7 +192,7 @@ def _std(entry: Entry, name: str) -> float:
 
 def _nothing(entry: Entry, name: str) -> float:
     (physics,) = catalogue.physics([entry.name])
-    return next((number.nothing for number in physics.parameters if number.name == name), 0.0)
+    return next((number.null_value for number in physics.parameters if number.name == name), 0.0)
 
 
 def _warming(tau_s: float) -> Callable[[Signals], Float64[np.ndarray, "n 1"]]:
@@ -214,18 +214,18 @@ def _needs_more(words: str) -> bool:
     return words.startswith("/") or "t" in words.replace("|", " ").split()
 
 
-def _as_effect(physics: Physics, theta: Theta, sensor: Sensor) -> Part:
+def _as_effect(physics: Effect, theta: Theta, sensor: Sensor) -> Part:
     """What has no name, as an effect of size one that is made of what it adds to a reading."""
     column = COLUMNS[sensor]
 
     def added(signals: Signals) -> Float64[np.ndarray, "n 3"]:
-        read = Read(signals.t_s, signals.gyro, signals.accel, signals.alpha)
+        read = SensorSamples(signals.t_s, signals.gyro, signals.accel, signals.alpha)
         out = physics.forward(read, theta)
         both = np.concatenate([out.gyro - read.gyro, out.accel - read.accel], axis=1)
         return np.asarray(both[:, column])
 
-    size = (Parameter("size", "-", 1.0),)
-    effect = Effect(physics.name, sensor, physics.equation, size, added, np.eye(3)[:, :, None])
+    size = (LinearParameter("size", "-", 1.0),)
+    effect = LinearEffect(physics.name, sensor, physics.equation, size, added, np.eye(3)[:, :, None])
     return effect, np.ones(1), np.zeros(1)
 
 
@@ -251,6 +251,6 @@ def _matrix(file: PhysicsFile, sensor: Sensor) -> Part | None:
     return _full(sensor), (np.eye(3) - np.linalg.inv(T)).ravel(), np.sqrt(variance).ravel()
 
 
-def _full(sensor: Sensor) -> Effect:
+def _full(sensor: Sensor) -> LinearEffect:
     """A matrix on the sensor's own reading."""
-    return Effect(f"{sensor}_matrix", sensor, f"{sensor} += A {sensor}", per_pair("-", 0.1), COLUMNS[sensor], full())
+    return LinearEffect(f"{sensor}_matrix", sensor, f"{sensor} += A {sensor}", per_pair("-", 0.1), COLUMNS[sensor], full())

@@ -25,7 +25,7 @@ from scipy.linalg import expm
 
 from imutool.bias.model import COLUMNS, BiasModel, Sensor, Stream
 from imutool.bias_start.bias_tracking import Along, Following
-from imutool.bias_start.initial_bias import TurnOn
+from imutool.bias_start.initial_bias import InitialBias
 
 STEP_S = 1.0  # of the covariance's own dynamics, which take minutes
 
@@ -34,16 +34,16 @@ Roots = Mapping[Sensor, Float64[np.ndarray, "n 3 p"]]
 
 
 class Parts(NamedTuple):
-    """Covariance of the rest bias at each sample, and the root of what the calibration adds (`imutool.bias.model.Unsure`)."""
+    """Covariance of the rest bias at each sample, and the root of what the calibration adds (`imutool.bias.model.CovarianceModel`)."""
 
     rest: Covariances
     calibration: Roots
 
 
-class Certainty:
+class BiasCovariance:
     """The covariance of the bias at each sample, gyro (rad/s) then accel (m/s²), for samples as they arrive."""
 
-    def __init__(self, model: BiasModel, start: TurnOn, stream: Stream) -> None:
+    def __init__(self, model: BiasModel, start: InitialBias, stream: Stream) -> None:
         self._stream, self._calibration = stream, model.calibration_covariance()
         self._mean = _RunningMean() if isinstance(stream, Following | Along) else None
         self._P, self._t_s = np.diag(start.std**2), 0.0

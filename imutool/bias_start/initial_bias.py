@@ -49,7 +49,7 @@ class NoRestError(DataError):
 
 
 @dataclass(frozen=True)
-class TurnOn:
+class InitialBias:
     """A rest bias (gyro rad/s, accel m/s²), its standard deviation, and how it came about in a few words.
 
     It holds for the whole log, or is where something begins: `track`, the rest bias in time, or what the samples show from
@@ -73,7 +73,7 @@ class TurnOn:
         return model.stream(self.rest)
 
 
-def find(way: str, model: BiasModel, recording: Recording) -> TurnOn:
+def find(way: str, model: BiasModel, recording: Recording) -> InitialBias:
     """The start that `--init WAY` asks for.
 
     Raises:
@@ -92,7 +92,7 @@ def find(way: str, model: BiasModel, recording: Recording) -> TurnOn:
     return given(way)
 
 
-def auto(model: BiasModel, imu: Imu) -> TurnOn:
+def auto(model: BiasModel, imu: Imu) -> InitialBias:
     """The stop that the log begins with, weighed against the training runs; from there on the rest bias is followed.
 
     Only the samples up to the end of that stop are used.
@@ -117,16 +117,18 @@ def auto(model: BiasModel, imu: Imu) -> TurnOn:
     used = f"{end - rested[0].start_s:.1f} s at rest from 0.0 s on"
     if model.card:
         used = f"{used}, {_from_training(model)}"
-    return TurnOn(state.rest_bias(True), std, f"{used}, {_sure(std)}, then {FOLLOWED}", noise, follows=before, hold_s=end)
+    return InitialBias(state.rest_bias(True), std, f"{used}, {_sure(std)}, then {FOLLOWED}", noise, follows=before, hold_s=end)
 
 
-def following(model: BiasModel) -> TurnOn:
+def following(model: BiasModel) -> InitialBias:
     """The prior, and from the first sample on what the samples show: for a live node, which cannot look ahead."""
     start = prior(model)
-    return TurnOn(start.rest, start.std, f"{_from_training(model)}, {_sure(start.std)}, then {FOLLOWED}", follows=known(model))
+    return InitialBias(
+        start.rest, start.std, f"{_from_training(model)}, {_sure(start.std)}, then {FOLLOWED}", follows=known(model)
+    )
 
 
-def smooth(model: BiasModel, batches: Iterable[Samples], where: str = "") -> TurnOn:
+def smooth(model: BiasModel, batches: Iterable[Samples], where: str = "") -> InitialBias:
     """The rest bias in time from the whole of a log: all its stops, gravity in motion, and the training runs.
 
     `batches` are seconds since the first sample, gyro and accel.
@@ -143,7 +145,7 @@ def smooth(model: BiasModel, batches: Iterable[Samples], where: str = "") -> Tur
     std = np.median(track.std, axis=0)
     parts = [f"{rested_s:.1f} s at rest in all"] * (rested_s > 0) + ["gravity in motion"]
     parts += [_from_training(model)] * bool(model.card)
-    return TurnOn(track.rest[0], std, f"{', '.join(parts)}, {_sure(std)}, forward and backward", track=track)
+    return InitialBias(track.rest[0], std, f"{', '.join(parts)}, {_sure(std)}, forward and backward", track=track)
 
 
 def known(model: BiasModel) -> Known:
@@ -189,7 +191,7 @@ def _sure(std: Vector6) -> str:
     return f"±{std[:3].max():.1g} rad/s"
 
 
-def given(text: str) -> TurnOn:
+def given(text: str) -> InitialBias:
     """Six numbers from the command line: gx,gy,gz in rad/s, ax,ay,az in m/s².
 
     Raises:
@@ -201,7 +203,7 @@ def given(text: str) -> TurnOn:
         rest = np.zeros(0)
     if rest.shape != (6,) or not np.isfinite(rest).all():
         raise ConfigError(f"{text!r}", where="--init", expected=f"{', '.join(WAYS)} or gx,gy,gz,ax,ay,az")
-    return TurnOn(rest, np.zeros(6), "given")
+    return InitialBias(rest, np.zeros(6), "given")
 
 
 def _truth_s(way: str) -> float:
@@ -220,12 +222,12 @@ def _truth_s(way: str) -> float:
     return value
 
 
-def prior(model: BiasModel) -> TurnOn:
+def prior(model: BiasModel) -> InitialBias:
     """What the sensor had in its training runs."""
-    return TurnOn(_numpy(model.prior_mean), _numpy(model.prior_std), "prior of the training runs")
+    return InitialBias(_numpy(model.prior_mean), _numpy(model.prior_std), "prior of the training runs")
 
 
-def at_rest(model: BiasModel, imu: Imu) -> TurnOn:
+def at_rest(model: BiasModel, imu: Imu) -> InitialBias:
     """From the stretch at rest that the log starts with.
 
     Raises:
@@ -246,7 +248,7 @@ def _no_rest() -> DataError:
     )
 
 
-def over_all_rest(model: BiasModel, blocks: Blocks) -> TurnOn:
+def over_all_rest(model: BiasModel, blocks: Blocks) -> InitialBias:
     """From all the time at rest in a log, also what comes after the motion: a constant has no before and after.
 
     For a model that takes nothing off but a constant: of the samples there is only what `stationary.in_blocks` keeps.
@@ -276,7 +278,7 @@ class _Still(NamedTuple):
     end_ns: int
 
 
-def _from_rest(model: BiasModel, imu: Imu, found: tuple[int, int]) -> TurnOn:
+def _from_rest(model: BiasModel, imu: Imu, found: tuple[int, int]) -> InitialBias:
     """From one stretch at rest, with what the model says of the motion taken off."""
     start, still = prior(model), imu.rows(slice(*found))
     left = np.concatenate([still.gyro, still.accel], axis=1) - _bias(model, still, start.rest) + start.rest
@@ -285,7 +287,7 @@ def _from_rest(model: BiasModel, imu: Imu, found: tuple[int, int]) -> TurnOn:
     return _weighed(start, [_Still(mean, apart, len(still), int(still.t_ns[0]), int(still.t_ns[-1]))], int(imu.t_ns[0]))
 
 
-def _weighed(start: TurnOn, stills: Sequence[_Still], first_ns: int) -> TurnOn:
+def _weighed(start: InitialBias, stills: Sequence[_Still], first_ns: int) -> InitialBias:
     """True rate zero; specific force g along where it points, so the accelerometer's bias is seen along gravity only."""
     rest, var = start.rest.copy(), start.std**2
     count = sum(still.samples for still in stills)
@@ -304,10 +306,10 @@ def _weighed(start: TurnOn, stills: Sequence[_Still], first_ns: int) -> TurnOn:
         var[3:] *= 1 - gain * up
     total_s = 1e-9 * sum(still.end_ns - still.start_ns for still in stills)
     first_s = 1e-9 * (stills[0].start_ns - first_ns)
-    return TurnOn(rest, np.sqrt(var), f"{total_s:.1f} s at rest from {first_s:.1f} s on", noise)
+    return InitialBias(rest, np.sqrt(var), f"{total_s:.1f} s at rest from {first_s:.1f} s on", noise)
 
 
-def from_truth(model: BiasModel, recording: Recording, truth_s: float = TRUTH_S) -> TurnOn:
+def from_truth(model: BiasModel, recording: Recording, truth_s: float = TRUTH_S) -> InitialBias:
     """From the first seconds of true poses, as many as there are up to `truth_s` (gaps do no harm), and the prior.
 
     They hold for as long as they last; from there on the rest bias is followed. What follows goes by gravity, from which the
@@ -338,14 +340,14 @@ def from_truth(model: BiasModel, recording: Recording, truth_s: float = TRUTH_S)
     rest, std = _moved(start, offset, measured)
     how = f"truth over {found_s:.1f} s{', weighed against the training runs' if model.card else ''}, {_sure(std)}"
     if not model.card:
-        return TurnOn(rest, std, how)
+        return InitialBias(rest, std, how)
     upright, unsure = _moved(start, offset, measured + WORLD_TILT_STD**2)
     before = replace(known(model), mean=upright, std=np.maximum(unsure, LEAST_STD))
     ends = seconds(piece.t_ns[-1:], int(recording.imu.t_ns[0]))[0]
-    return TurnOn(rest, std, f"{how}, then {FOLLOWED}", follows=before, hold_s=float(ends))
+    return InitialBias(rest, std, f"{how}, then {FOLLOWED}", follows=before, hold_s=float(ends))
 
 
-def _moved(start: TurnOn, offset: Vector6, variance: Vector6) -> tuple[Vector6, Vector6]:
+def _moved(start: InitialBias, offset: Vector6, variance: Vector6) -> tuple[Vector6, Vector6]:
     """A start moved towards where a measurement of this variance says it is off by `offset`: rest bias and its deviation."""
     var = start.std**2
     gain = np.divide(var, var + variance, out=np.zeros(6), where=var > 0)  # a prior without doubt stays

@@ -16,12 +16,12 @@ from imutool.bias import static
 from imutool.bias.io import check_rate, find_model
 from imutool.bias.model import BiasModel
 from imutool.bias_start.bias_tracking import Samples
-from imutool.bias_start.initial_bias import NoRestError, TurnOn, find, over_all_rest
+from imutool.bias_start.initial_bias import InitialBias, NoRestError, find, over_all_rest
 from imutool.bias_start.initial_bias import smooth as smooth_rest
 from imutool.cleaning import Survey, cleaned
 from imutool.errors import ConfigError, DataError, LogError, ModelError
 from imutool.inertial.stationary import Blocks, in_blocks, white_noise
-from imutool.location import Place
+from imutool.location import Location
 from imutool.mcap_io.batches import ImuBatch
 from imutool.mcap_io.log import Log
 from imutool.mcap_io.read import read
@@ -41,8 +41,8 @@ def refuse_smooth(init: str, smooth: bool) -> None:
 
 
 def prepare(
-    source: Place, topic: str, name: str | Path | None, init: str, smooth: bool, found: Survey | None
-) -> tuple[BiasModel, TurnOn]:
+    source: Location, topic: str, name: str | Path | None, init: str, smooth: bool, found: Survey | None
+) -> tuple[BiasModel, InitialBias]:
     """Model and start for one IMU."""
     untrained = name is None or str(name) == static.Model.method
     head = _head(source, topic, init, found)
@@ -62,7 +62,7 @@ def prepare(
     return model, start if start.noise.any() else replace(start, noise=_noise(head.imu))
 
 
-def smooth_in_memory(model: BiasModel, imu: Imu, where: str | Place) -> TurnOn:
+def smooth_in_memory(model: BiasModel, imu: Imu, where: str | Location) -> InitialBias:
     """The rest bias in time from all of some samples.
 
     Raises:
@@ -73,7 +73,7 @@ def smooth_in_memory(model: BiasModel, imu: Imu, where: str | Place) -> TurnOn:
     return _smoothed(model, [(t_s, imu.gyro, imu.accel)], where)
 
 
-def _smoothed(model: BiasModel, batches: Iterable[Samples], where: str | Place) -> TurnOn:
+def _smoothed(model: BiasModel, batches: Iterable[Samples], where: str | Location) -> InitialBias:
     try:
         return smooth_rest(model, batches, str(where))
     except NoRestError as error:
@@ -94,7 +94,7 @@ def _batches(log: Log, topic: str, found: Survey | None) -> Iterator[Samples]:
             yield seconds(batch.stamp_ns, start_ns), batch.gyro, batch.accel
 
 
-def _head(source: Place, topic: str, init: str, found: Survey | None) -> Recording:
+def _head(source: Location, topic: str, init: str, found: Survey | None) -> Recording:
     """The first minute of a log; of its truth only what is asked for, since it may be no business of the IMU's."""
     with Log(source) as log:
         first = next((int(times.min()) for times in log.stamps(topic) if len(times)), None)
@@ -107,7 +107,7 @@ def _head(source: Place, topic: str, init: str, found: Survey | None) -> Recordi
     return Recording(source.stem, samples, imu_topic=topic, source=str(source))
 
 
-def _samples(source: Place, topic: str, found: Survey | None, end_ns: int | None = None) -> Imu:
+def _samples(source: Location, topic: str, found: Survey | None, end_ns: int | None = None) -> Imu:
     """The samples of one IMU, as a survey says they are clean where there is one; its end is then by stamp.
 
     Raises:
@@ -127,7 +127,7 @@ def _noise(imu: Imu) -> Float64[np.ndarray, "6"]:
     return white_noise(np.concatenate([imu.gyro, imu.accel], axis=1))
 
 
-def estimate_at_rest(imu: Imu, where: str | Place) -> tuple[BiasModel, TurnOn]:
+def estimate_at_rest(imu: Imu, where: str | Location) -> tuple[BiasModel, InitialBias]:
     """The static model with its bias: the mean over all time at rest, for a log nobody trained a model for.
 
     Raises:
@@ -137,7 +137,7 @@ def estimate_at_rest(imu: Imu, where: str | Place) -> tuple[BiasModel, TurnOn]:
     return _estimate(in_blocks([(imu.t_ns, imu.gyro, imu.accel)], imu.period_s), where)
 
 
-def _estimate(blocks: Blocks, where: str | Place) -> tuple[BiasModel, TurnOn]:
+def _estimate(blocks: Blocks, where: str | Location) -> tuple[BiasModel, InitialBias]:
     model = static.Model()
     try:
         return model, over_all_rest(model, blocks)
@@ -145,7 +145,7 @@ def _estimate(blocks: Blocks, where: str | Place) -> tuple[BiasModel, TurnOn]:
         raise _nothing_known(where) from error
 
 
-def _nothing_known(where: str | Place) -> ModelError:
+def _nothing_known(where: str | Location) -> ModelError:
     return ModelError(
         "no model given, and the log holds no stretch at rest to measure a static bias on",
         where=where,

@@ -22,7 +22,7 @@ from imutool.cleaning.score import Verdict, score, verdict
 from imutool.cleaning.settings import GROUP, Rules
 from imutool.cleaning.truth import Truth, read_truth
 from imutool.errors import LogError
-from imutool.location import Place
+from imutool.location import Location
 from imutool.mcap_io.batches import ImuBatch
 from imutool.mcap_io.codec import schemas
 from imutool.mcap_io.log import Log
@@ -119,7 +119,7 @@ class Survey:
         return {"schema": SCHEMA, **plain, "findings": json.dumps(findings)}
 
 
-def survey(path: Place, topic: str | None = None, rules: Rules | None = None) -> Survey:
+def survey(path: Location, topic: str | None = None, rules: Rules | None = None) -> Survey:
     """Looks through one IMU of a log; memory grows by some 6 kB a second of it (`tests/bench/clean.py`).
 
     Raises:

@@ -11,7 +11,7 @@ import typer
 from imutool.cli.app import LOST, Init, Json, Overwrite, Quiet, Smooth, Verbose, app, listing
 from imutool.cli.terminal import out, plain, progress, say, table, tell_losses, write_json
 from imutool.errors import ConfigError, LogError
-from imutool.location import place
+from imutool.location import to_location
 
 if TYPE_CHECKING:
     from imutool.cleaning import Rules, Survey
@@ -57,8 +57,8 @@ def clean(
 
         with progress("Cleaning", verbose, quiet) as tell:
             report = debias(
-                place(source),
-                place(target),
+                to_location(source),
+                to_location(target),
                 model=model,
                 imus=imu or (),
                 init=init,
@@ -102,7 +102,7 @@ def _looked(
     from imutool.cleaning import look
     from imutool.mcap_io.log import Log
 
-    with Log(place(source), salvage=True) as log:
+    with Log(to_location(source), salvage=True) as log:
         topics = list(imus) or log.imu_topics
         if not topics:
             raise LogError("no IMU topic", where=source, expected=log.listing())

@@ -12,11 +12,11 @@ import typer
 from imutool.cli.app import LOST, Init, Json, Overwrite, Quiet, Smooth, Verbose, app
 from imutool.cli.terminal import progress, say, tell_losses, write_json
 from imutool.errors import ConfigError
-from imutool.location import Place, place
+from imutool.location import Location, to_location
 
 if TYPE_CHECKING:
     from imutool.debiasing import DebiasReport
-    from imutool.viewing.model.output import Shown
+    from imutool.viewing.model.output import Output
     from imutool.viewing.rerun.live import Live
 
 MODEL_HELP = (
@@ -64,8 +64,8 @@ def debias(
     live = _watching(source, target, view, connect, save_view, overwrite)
     with progress("Debiasing", verbose, quiet) as tell, live as watch:
         report = run(
-            place(source),
-            None if target is None else place(target),
+            to_location(source),
+            None if target is None else to_location(target),
             model=models,
             imus=imu or (),
             init=init,
@@ -83,13 +83,15 @@ def debias(
         _say(report, output, result["imus"], verify, shown or ())
     if report_to is not None:  # last: should it fail, the log is there all the same, and that has been said
         with progress("Drawing", verbose, quiet):
-            _draw(place(target or source), list(report.starts), report_to, overwrite)
+            _draw(to_location(target or source), list(report.starts), report_to, overwrite)
         if not told:
             say(f"Report: {report_to}")
     raise typer.Exit(LOST if report.losses else 0)
 
 
-def _result(report: DebiasReport, output: str, shown: Sequence[Shown] | None, page: Path | None, clean: bool) -> dict[str, Any]:
+def _result(
+    report: DebiasReport, output: str, shown: Sequence[Output] | None, page: Path | None, clean: bool
+) -> dict[str, Any]:
     """What was done, for programs."""
     imus = {
         topic: {
@@ -119,7 +121,9 @@ def _result(report: DebiasReport, output: str, shown: Sequence[Shown] | None, pa
     return result
 
 
-def _say(report: DebiasReport, target: str, imus: Mapping[str, Mapping[str, Any]], verify: str, shown: Sequence[Shown]) -> None:
+def _say(
+    report: DebiasReport, target: str, imus: Mapping[str, Mapping[str, Any]], verify: str, shown: Sequence[Output]
+) -> None:
     """What was done, in lines."""
     for topic, one in report.surveys.items():
         say(f"{topic}: {one.verdict}, score {one.score:.3f}, {one.valid} of {one.messages} samples valid")
@@ -148,7 +152,7 @@ def _watching(
     return watching(out.stem, connect_to=connect, save=save, instead=Path(f"{out.stem}.rrd"), overwrite=overwrite)
 
 
-def _draw(log: Place, topics: Sequence[str], page: Path, overwrite: bool) -> None:
+def _draw(log: Location, topics: Sequence[str], page: Path, overwrite: bool) -> None:
     """A page about the debiased log, each of its IMUs under its own topic where there are several."""
     from imutool.viewing.html.report import by_topic, write_page
     from imutool.viewing.model.runs import load

@@ -131,10 +131,10 @@ def diagnose(
     from pathlib import Path
 
     from imutool.fleet.work import robot_pattern
-    from imutool.location import place
+    from imutool.location import to_location
 
     robot_pattern(robot_from)
-    there = None if sim is None else place(sim)
+    there = None if sim is None else to_location(sim)
     where = there.absolute() if isinstance(there, Path) else there
     return Settings(
         command="diagnose",
@@ -166,10 +166,10 @@ def _run(
 ) -> None:
     from imutool.fleet.engine import Engine
     from imutool.fleet.run import run
-    from imutool.location import place
+    from imutool.location import to_location
 
     size = memory_bytes(memory)
-    page = None if report is None else place(report)
+    page = None if report is None else to_location(report)
     with progress(f"Fleet {settings.command}", verbose, quiet) as tell:
         done = run(
             source,

@@ -10,7 +10,7 @@ import typer
 from imutool.cli.app import LOST, Json, Overwrite, Quiet, Verbose, app
 from imutool.cli.terminal import log_to_stderr, out, plain, say, table, tell_losses, write_json
 from imutool.errors import ConfigError
-from imutool.location import place
+from imutool.location import to_location
 
 if TYPE_CHECKING:
     from imutool.noise_identification import Identified
@@ -42,7 +42,7 @@ def info(
         raise ConfigError(f"{idle[0]} says nothing without --noise", where="info", fix="Add --noise")
     if len(logs) > 1 and (noise_plot or noise_toml):
         raise ConfigError(f"{len(logs)} logs do not fit one file", where="--noise-plot, --noise-toml", expected="one log")
-    places = [place(log) for log in logs]
+    places = [to_location(log) for log in logs]
     reports = [inspect(log, check=not quick) for log in places]
     lost = any(report["losses"]["stretches"] for report in reports)
     found = []

@@ -10,7 +10,7 @@ import typer
 from imutool.cli.app import LOST, Json, Overwrite, Quiet, Verbose, app
 from imutool.cli.terminal import progress, say, tell_losses, write_json
 from imutool.errors import ConfigError
-from imutool.location import place
+from imutool.location import to_location
 
 
 class Damaged(StrEnum):
@@ -38,7 +38,7 @@ def repair(
     from imutool.bag.repair import NO_ATTACHMENTS, is_bag, repair_bag
     from imutool.mcap_io.repair import repair as repair_log
 
-    here, there = place(source), place(target)
+    here, there = to_location(source), to_location(target)
     with progress("Repairing", verbose, quiet) as tell:
         if is_bag(here):
             if damaged is Damaged.keep:

@@ -55,12 +55,12 @@ def view(
     saved.
     """
     from imutool.viewing.model.runs import load
-    from imutool.viewing.outputs import Asked, Ways
+    from imutool.viewing.outputs import Asked, Outputs
 
     aligned = _alignment(align)
     read = partial(load, models=model or (), init=init, smooth=smooth, imu=imu, truth=truth, align=aligned, findings=findings)
     asked = Asked(save, connect, web, port, export_web, png, html, at, source, overwrite)
-    with Ways(asked) as ways:
+    with Outputs(asked) as ways:
         with progress("Reading", verbose, quiet) as tell:
             data = []
             for done, log in enumerate(logs):

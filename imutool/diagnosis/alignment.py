@@ -23,7 +23,7 @@ from imutool.inertial.kinematics import through
 from imutool.inertial.stationary import white_noise
 from imutool.inertial.strapdown import with_velocity
 from imutool.recording import Imu, Poses, Recording, seconds
-from imutool.sensor.readings import NOTHING, Felt
+from imutool.sensor.readings import NOTHING, IdealMotion
 
 LEAST_S = 8.0  # below, nothing can be learned and tested
 ALIGN_HZ = 100.0
@@ -55,7 +55,7 @@ class Pair:
     """
 
     name: str
-    felt: Felt
+    felt: IdealMotion
     stamp_s: Float64[np.ndarray, " n"]
     real: Float64[np.ndarray, "n 6"]
     fitted: Bool[np.ndarray, " n"]
@@ -117,7 +117,7 @@ def of_one_motion(real: Imu, sim: Imu) -> bool:
     return _shift(real, sim) is not None
 
 
-def with_truth(real: Recording, felt: Felt, start_ns: int, band_hz: float) -> Pair:
+def with_truth(real: Recording, felt: IdealMotion, start_ns: int, band_hz: float) -> Pair:
     """The recording beside what its own true poses say, `felt` being on seconds since `start_ns`, true up to `band_hz`.
 
     Raises:
@@ -131,7 +131,7 @@ def with_truth(real: Recording, felt: Felt, start_ns: int, band_hz: float) -> Pa
 
 def _pair(
     real: Recording,
-    felt: Felt,
+    felt: IdealMotion,
     stamp_s: Float64[np.ndarray, " n"],
     inside: Bool[np.ndarray, " n"],
     against: str,
@@ -203,7 +203,7 @@ def _channels(recording: Recording, t_ns: np.ndarray) -> dict[str, Float64[np.nd
 
 def _simulated(
     t_sim: Float64[np.ndarray, " m"], sim: Recording, shift_s: float, start_ns: int, real: Recording
-) -> tuple[Felt, Float64[np.ndarray, "6"]]:
+) -> tuple[IdealMotion, Float64[np.ndarray, "6"]]:
     """The simulation without its noise on an even clock, and how noisy it was where that had to be filtered out."""
     samples = np.concatenate([sim.imu.gyro, sim.imu.accel], axis=1)
     noise = white_noise(samples)
@@ -221,12 +221,12 @@ def _simulated(
     R_wb = _attitude(sim, t_ns + round(shift_s * 1e9))
     if R_wb is None:
         R_wb = _attitude(real, t_ns)
-    return Felt(t_s, clean[:, :3], clean[:, 3:], alpha, R_wb, _channels(real, t_ns)), noise
+    return IdealMotion(t_s, clean[:, :3], clean[:, 3:], alpha, R_wb, _channels(real, t_ns)), noise
 
 
 def _by_poses(
     sim: Recording, samples: Float64[np.ndarray, "m 6"], noise: Float64[np.ndarray, "6"], rate_hz: float
-) -> Felt | None:
+) -> IdealMotion | None:
     """What the simulation's own poses say its IMU feels, if that is what it reads but for white noise and a constant."""
     if not sim.truths:
         return None
@@ -238,7 +238,7 @@ def _by_poses(
     motion = trajectory.at(t_ns[t_ns <= poses.t_ns[-1]])
     R_wb = Rotation.from_quat(motion.q_wb_wxyz, scalar_first=True).as_matrix()
     t_s = np.arange(len(motion.p_wb)) * round(1e9 / rate_hz) * 1e-9
-    felt = Felt(t_s, motion.omega_b, motion.specific_force(), motion.alpha_b, R_wb)
+    felt = IdealMotion(t_s, motion.omega_b, motion.specific_force(), motion.alpha_b, R_wb)
     t_s = seconds(sim.imu.t_ns, int(poses.t_ns[0]))
     rows = (t_s >= felt.t_s[0]) & (t_s <= felt.t_s[-1])
     if rows.mean() < MOST_OF_IT:

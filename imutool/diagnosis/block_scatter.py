@@ -18,7 +18,7 @@ from scipy.linalg import solve_triangular
 from scipy.stats import f as fisher
 
 from imutool.diagnosis import gauss_newton as fits
-from imutool.diagnosis.gauss_newton import Fit, Weighed
+from imutool.diagnosis.gauss_newton import Fit, WhitenedLog
 
 BLOCK_S = 5.0
 LEAST_BLOCKS = 6
@@ -46,7 +46,7 @@ class Scatter:
         return float(fisher.logsf(f, parameters, parameters * self.blocks[name]))
 
 
-def scatter(logs: Sequence[Weighed], found: Fit, part: str) -> Scatter:
+def scatter(logs: Sequence[WhitenedLog], found: Fit, part: str) -> Scatter:
     """What blocks of the rows that were fitted say of how sure the fit is."""
     blocks = [one for k, log in enumerate(logs) for one in _blocks(log, found, k, part)]
     _, prior_std = fits.priors(found.chosen, found.chosen)
@@ -110,7 +110,7 @@ def _seen_from(lower: Matrix, H: Matrix) -> Matrix:
     return np.asarray(0.5 * (out + out.T))
 
 
-def _blocks(log: Weighed, found: Fit, k: int, part: str) -> list[tuple[Matrix, Float64[np.ndarray, " p"]]]:
+def _blocks(log: WhitenedLog, found: Fit, k: int, part: str) -> list[tuple[Matrix, Float64[np.ndarray, " p"]]]:
     """Each block's information on the effects, and the sum of its J^T r, a constant taken out of all the log."""
     rows, begins = log.rows(part), _begins(found)
     left = log.residual(found.courses[k])[rows] - log.constants[rows] * found.bias[k]

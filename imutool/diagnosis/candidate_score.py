@@ -9,9 +9,9 @@ import numpy as np
 from jaxtyping import Float64, Int64
 
 from imutool.diagnosis.forward_cache import Course
-from imutool.diagnosis.gauss_newton import Fit, Weighed, direction, priors
+from imutool.diagnosis.gauss_newton import Fit, WhitenedLog, direction, priors
 from imutool.diagnosis.jacobians import slope
-from imutool.sensor.effect import Physics, Theta
+from imutool.sensor.effect import Effect, Theta
 
 RIDGE = 1e-9
 
@@ -34,7 +34,7 @@ class _Axis(NamedTuple):
 class Panel:
     """The normal equations of a fit, with a place left for one more effect."""
 
-    def __init__(self, logs: Sequence[Weighed], now: Fit) -> None:
+    def __init__(self, logs: Sequence[WhitenedLog], now: Fit) -> None:
         self.logs, self.now = logs, now
         q = sum(len(theta) for _, theta in now.chosen)
         self.N, self.g, self.total, self.axes = RIDGE * np.eye(q), np.zeros(q), 0.0, []
@@ -52,7 +52,7 @@ class Panel:
                 self.total += float(one.r @ one.r)
         self.left = self.total - float(self.g @ np.linalg.solve(self.N, self.g))
 
-    def gain(self, physics: Physics, start: Theta) -> float:
+    def gain(self, physics: Effect, start: Theta) -> float:
         """Squares that one linear step from a start takes off, no positive parameter changing by more than a factor of e."""
         chosen, p = (*self.now.chosen, (physics, start)), len(start)
         moves = np.array([not number.begins for number in physics.parameters])  # the others are gone through, not stepped

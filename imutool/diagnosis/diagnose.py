@@ -18,7 +18,7 @@ from imutool.diagnosis.block_scatter import scatter
 from imutool.diagnosis.compare_findings import ANOTHER_MOTION
 from imutool.diagnosis.fixed_parameters import only
 from imutool.diagnosis.forward_cache import Chosen
-from imutool.diagnosis.gauss_newton import Weighed, expected, fit
+from imutool.diagnosis.gauss_newton import WhitenedLog, expected, fit
 from imutool.diagnosis.model_selection import Discovery, discover
 from imutool.diagnosis.noise_estimate import weighed
 from imutool.diagnosis.observability import unseen
@@ -29,12 +29,12 @@ from imutool.diagnosis.result import Closer, Diagnosis, Finding
 from imutool.diagnosis.scalar.diagnose import SignalDiagnosis, diagnose_signal
 from imutool.diagnosis.to_physics_file import NO_EFFECT
 from imutool.errors import ConfigError, DataError, ImutoolError, NumericsError
-from imutool.location import Place
+from imutool.location import Location
 from imutool.mcap_io.fields import others, read_field
 from imutool.mcap_io.read import read as read_log
 from imutool.recording import Recording
 from imutool.sensor import catalogue
-from imutool.sensor.effect import Physics
+from imutool.sensor.effect import Effect
 from imutool.sensor.trajectory import smooth_motion
 
 LEAST_BAND_HZ = 1.0  # and no less: what rests, smoothing makes straight, and it is known all the same
@@ -53,8 +53,8 @@ Tell = Callable[[int, int, str], None]
 
 
 def diagnose(
-    reals: Sequence[Place],
-    sim: Place | None = None,
+    reals: Sequence[Location],
+    sim: Location | None = None,
     *,
     imu: str | None = None,
     truth: str | None = None,
@@ -109,7 +109,7 @@ def diagnose(
     return told
 
 
-def _again(told: Diagnosis, logs: Sequence[Weighed], found: Discovery, sim: Recording) -> Diagnosis:
+def _again(told: Diagnosis, logs: Sequence[WhitenedLog], found: Discovery, sim: Recording) -> Diagnosis:
     """With what a second simulation says of the findings; where there can be none, with the reason."""
     if any(one.effect == summarize.JITTER for one in told.findings):  # stamps that jitter are no physics to simulate
         return told
@@ -174,8 +174,8 @@ class Measured(NamedTuple):
 
 
 def measured(
-    real: Place,
-    sim: Place | None = None,
+    real: Location,
+    sim: Location | None = None,
     *,
     imu: str | None = None,
     truth: str | None = None,
@@ -198,12 +198,12 @@ def measured(
     for one in asked:
         free = [k for k, number in enumerate(one.parameters) if not {one.name, f"{one.name}.{number.name}"} & hidden]
         shown += [only(one, free)] if free else []
-    found = fit(logs, tuple((one, one.nothing.astype(float)) for one in shown), part="all")
+    found = fit(logs, tuple((one, one.null_value.astype(float)) for one in shown), part="all")
     std = scatter(logs, found, "all").std if shown else {}
     return Measured(found.chosen, {name: np.asarray(one) for name, one in std.items()}, found.information, found.bias)
 
 
-def remaining(real: Place, chosen: Chosen = (), *, imu: str | None = None, truth: str | None = None) -> dict[str, Closer]:
+def remaining(real: Location, chosen: Chosen = (), *, imu: str | None = None, truth: str | None = None) -> dict[str, Closer]:
     """How far a recording is from what its own true poses say, all of it: without and with some physics, by signal.
 
     The best constant of its own is in both; compared is as far up in frequency as the poses are known.
@@ -305,12 +305,12 @@ def _telling(pair: Pair) -> Pair:
     return rest
 
 
-def _candidates(pairs: Sequence[Pair]) -> tuple[Physics, ...]:
+def _candidates(pairs: Sequence[Pair]) -> tuple[Effect, ...]:
     """What of the catalogue can be thought of here, and stamps that may be wrong."""
     attitude = all(pair.felt.R_wb is not None for pair in pairs)
     channels = set.intersection(*(set(pair.channels) for pair in pairs))
 
-    def thinkable(physics: Physics) -> bool:
+    def thinkable(physics: Effect) -> bool:
         return all(attitude if need == "attitude" else any(need in name for name in channels) for need in physics.needs)
 
     found = [one for one in catalogue.physics() if thinkable(one) and one.name not in SHOWN_BY_SAMPLES]
@@ -319,7 +319,7 @@ def _candidates(pairs: Sequence[Pair]) -> tuple[Physics, ...]:
     return (*found, *(timestamps.jitter(pairs) if exact else ()), *timestamps.soft_limits(pairs, biases))
 
 
-def later(pairs: Sequence[Pair]) -> list[tuple[Physics, ...]]:
+def later(pairs: Sequence[Pair]) -> list[tuple[Effect, ...]]:
     """What is asked once the catalogue has nothing more to say: other channels, then curves and equations without a name."""
     like = unnamed.like(pairs)
     return [tuple(unnamed.driven(pairs)), (*unnamed.curves(like), *unnamed.terms(like))]

@@ -8,32 +8,32 @@ from typing import Any
 
 import numpy as np
 
-from imutool.sensor.effect import Physics, Theta
+from imutool.sensor.effect import Effect, Theta
 
 IMPLAUSIBLE = 4.0  # times the plausible size
 
 
-class Held:
+class FixedParameters:
     """The forward model of the others."""
 
-    def __init__(self, physics: Physics, free: Sequence[int]) -> None:
+    def __init__(self, physics: Effect, free: Sequence[int]) -> None:
         self.physics, self.free = physics, list(free)
 
     def __call__(self, signals: Any, theta: Theta) -> Any:
         """As the whole effect, with nothing for what is held."""
-        every = self.physics.nothing.astype(float)
+        every = self.physics.null_value.astype(float)
         every[self.free] = theta
         return self.physics.forward(signals, every)
 
 
-def only(physics: Physics, free: Sequence[int]) -> Physics:
+def only(physics: Effect, free: Sequence[int]) -> Effect:
     """The effect with these of its parameters, by place; itself where they are all."""
     if len(free) == len(physics.parameters):
         return physics
-    return replace(physics, parameters=tuple(physics.parameters[k] for k in free), forward=Held(physics, free))
+    return replace(physics, parameters=tuple(physics.parameters[k] for k in free), forward=FixedParameters(physics, free))
 
 
-def plausible(physics: Physics, theta: Theta) -> Physics:
+def plausible(physics: Effect, theta: Theta) -> Effect:
     """Itself, or without the parameters that came out many times larger than anything met: a fit to noise, not a number."""
     if not physics.linear or ":" in physics.name:
         return physics
@@ -43,7 +43,7 @@ def plausible(physics: Physics, theta: Theta) -> Physics:
     return only(physics, free)
 
 
-def kept(physics: Physics, held: Physics, theta: Theta) -> Theta:
+def kept(physics: Effect, held: Effect, theta: Theta) -> Theta:
     """The values of the parameters that are left."""
     names = [number.name for number in held.parameters]
     return np.array([value for number, value in zip(physics.parameters, theta, strict=True) if number.name in names])

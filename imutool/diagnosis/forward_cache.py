@@ -12,21 +12,21 @@ import numpy as np
 from jaxtyping import Float64
 
 from imutool.diagnosis.alignment import Pair
-from imutool.sensor.effect import Number, Physics, Stage, Theta, Way, in_order, turn
+from imutool.sensor.effect import Effect, Parameter, SignalState, Stage, Theta, in_stage_order, stage_order
 
 STEP, LOG_STEP = 1e-3, 1e-3
 
-Chosen = tuple[tuple[Physics, Theta], ...]
+Chosen = tuple[tuple[Effect, Theta], ...]
 
 
 class Course:
     """A log's ideal signals on their way to its readings; what is the same as on another course is taken from there."""
 
     def __init__(self, pair: Pair, chosen: Chosen, like: Course | None = None) -> None:
-        self.pair, self.acting = pair, in_order(chosen)
+        self.pair, self.acting = pair, in_stage_order(chosen)
         same = 0 if like is None else _shared(self.acting, like.acting)
-        begun = [Way(pair.felt, pair.stamp_s, pair.stamp_s)]
-        self._ways: list[Way] = begun if like is None else like._ways[: same + 1]
+        begun = [SignalState(pair.felt, pair.stamp_s, pair.stamp_s)]
+        self._ways: list[SignalState] = begun if like is None else like._ways[: same + 1]
         for physics, theta in self.acting[same:]:
             if physics.stage > Stage.CLOCK:
                 self._ways[-1] = self._ways[-1].taking()
@@ -44,15 +44,15 @@ class Course:
         rows = {first + k: row for first, here, there in both if here is not there for k, row in enumerate((here - there).T)}
         return {axis: row for axis, row in rows.items() if row.any()}
 
-    def slope(self, physics: Physics) -> Iterator[tuple[int, int, Float64[np.ndarray, " n"]]]:
+    def slope(self, physics: Effect) -> Iterator[tuple[int, int, Float64[np.ndarray, " n"]]]:
         """d expected / d (free parameters) of an effect, by forward differences: axis, parameter, and a row that is not zero.
 
         An effect that is not on the course is taken to be there, doing nothing, for which it has to be linear.
         """
         place = next((k for k, (one, _) in enumerate(self.acting) if one is physics), None)
         if place is None:
-            place = bisect([turn(one) for one, _ in self.acting], turn(physics))
-            theta, behind = physics.nothing.astype(float), self.acting[place:]
+            place = bisect([stage_order(one) for one, _ in self.acting], stage_order(physics))
+            theta, behind = physics.null_value.astype(float), self.acting[place:]
         else:
             theta, behind = self.acting[place][1], self.acting[place + 1 :]
         if physics.stage > Stage.CLOCK:
@@ -72,7 +72,7 @@ class Course:
                     yield from ((first + k, j, row) for k, row in enumerate(rows) if row.any())
 
 
-def _shared(a: list[tuple[Physics, Theta]], b: list[tuple[Physics, Theta]]) -> int:
+def _shared(a: list[tuple[Effect, Theta]], b: list[tuple[Effect, Theta]]) -> int:
     """How many effects two courses begin with alike."""
     count = 0
     for (one, theta), (other, same) in zip(a, b, strict=False):
@@ -82,17 +82,17 @@ def _shared(a: list[tuple[Physics, Theta]], b: list[tuple[Physics, Theta]]) -> i
     return count
 
 
-def free(physics: Physics, theta: Theta) -> Theta:
+def free(physics: Effect, theta: Theta) -> Theta:
     """Parameters as they are fitted: logarithms of the positive ones."""
     return np.array([np.log(t) if n.positive else t for t, n in zip(theta, physics.parameters, strict=True)])
 
 
-def bound(physics: Physics, x: Theta) -> Theta:
+def bound(physics: Effect, x: Theta) -> Theta:
     """Back from there."""
     return np.array([np.exp(np.clip(v, -50, 50)) if n.positive else v for v, n in zip(x, physics.parameters, strict=True)])
 
 
-def step_of(number: Number) -> float:
+def step_of(number: Parameter) -> float:
     """For differences."""
     if number.step is not None:
         return number.step

@@ -34,7 +34,7 @@ STRAIGHT = 0.05  # of a step's length in white samples: by how much it may miss 
 
 
 @dataclass(frozen=True, eq=False)
-class Weighed:
+class WhitenedLog:
     """A pair with the noise it is weighed by, and rows by what they are for."""
 
     pair: Pair
@@ -78,7 +78,7 @@ class Fit:
     objective: float
     rows: int
     numbers: int
-    logs: tuple[Weighed, ...]
+    logs: tuple[WhitenedLog, ...]
     part: str
     courses: tuple[Course, ...]
     prior: Float64[np.ndarray, " p"]
@@ -136,7 +136,7 @@ def priors(chosen: Chosen, begun: Chosen) -> tuple[Float64[np.ndarray, " p"], Fl
 
 
 def fit(
-    logs: Sequence[Weighed],
+    logs: Sequence[WhitenedLog],
     begun: Chosen,
     part: str = "fitted",
     iterations: int = ITERATIONS,
@@ -193,7 +193,7 @@ class _State(NamedTuple):
 
 
 def _step(
-    logs: Sequence[Weighed],
+    logs: Sequence[WhitenedLog],
     slopes: Slopes,
     now: _State,
     masks: Sequence[Bool[np.ndarray, " n"]],
@@ -209,7 +209,7 @@ def _step(
 
 
 def _straight(
-    logs: Sequence[Weighed],
+    logs: Sequence[WhitenedLog],
     slopes: Slopes,
     before: _State,
     after: _State,
@@ -246,7 +246,7 @@ def _solved(N: Float64[np.ndarray, "q q"], g: Float64[np.ndarray, " q"], chosen:
     return delta[: len(begins)]
 
 
-def _set_in(logs: Sequence[Weighed], now: _State, masks: Sequence[Bool[np.ndarray, " n"]]) -> Iterator[Chosen]:
+def _set_in(logs: Sequence[WhitenedLog], now: _State, masks: Sequence[Bool[np.ndarray, " n"]]) -> Iterator[Chosen]:
     """With one effect setting in at its best time: before it squares left without the effect count, behind it those with it."""
     chosen = now.chosen
     for k, (physics, _) in enumerate(chosen):
@@ -297,7 +297,7 @@ def _penalty(chosen: Chosen, mean: Theta, std: Theta) -> float:
 
 
 def _biases(
-    logs: Sequence[Weighed],
+    logs: Sequence[WhitenedLog],
     residuals: Sequence[Float64[np.ndarray, "n 6"]],
     masks: Sequence[Bool[np.ndarray, " n"]],
     penalty: float,
@@ -312,7 +312,7 @@ def _biases(
 
 
 def _normal(
-    logs: Sequence[Weighed],
+    logs: Sequence[WhitenedLog],
     slopes: Slopes,
     residuals: Sequence[Float64[np.ndarray, "n 6"]],
     b: Float64[np.ndarray, "logs 6"],

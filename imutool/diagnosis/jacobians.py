@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float64, Int64
 
 from imutool.diagnosis.forward_cache import Chosen, Course
 from imutool.diagnosis.whitening import Whitener
-from imutool.sensor.effect import Physics, Theta
+from imutool.sensor.effect import Effect, Theta
 
 
 class Slope(NamedTuple):
@@ -24,7 +24,7 @@ class Slope(NamedTuple):
     on: Bool[np.ndarray, "6 p"]
 
 
-def slope(whiten: Whitener, course: Course, physics: Physics) -> Slope:
+def slope(whiten: Whitener, course: Course, physics: Effect) -> Slope:
     """Of an effect on a course, or of a linear one that is not."""
     shape = 6, len(physics.parameters)
     white, on = np.zeros((*shape, len(range(0, len(course.pair.stamp_s), whiten.every)))), np.zeros(shape, bool)

@@ -20,15 +20,15 @@ from imutool.diagnosis import gauss_newton as fits
 from imutool.diagnosis.alignment import Pair
 from imutool.diagnosis.block_scatter import Scatter, scatter
 from imutool.diagnosis.candidate_score import Panel
-from imutool.diagnosis.fixed_parameters import Held, kept, plausible
+from imutool.diagnosis.fixed_parameters import FixedParameters, kept, plausible
 from imutool.diagnosis.forward_cache import Chosen
-from imutool.diagnosis.gauss_newton import Fit, Weighed, fit
+from imutool.diagnosis.gauss_newton import Fit, WhitenedLog, fit
 from imutool.diagnosis.model_error_floor import faint
 from imutool.diagnosis.onset import onsets
 from imutool.diagnosis.significance import chance, gains, helps, needed, predicts
 from imutool.diagnosis.unnamed import Curve, finer, like
-from imutool.sensor.effect import Physics, Theta
-from imutool.sensor.readings import Read
+from imutool.sensor.effect import Effect, Theta
+from imutool.sensor.readings import SensorSamples
 
 FALSE_DISCOVERY = 5e-3
 HELPS = 0.05  # chance of the gain on unseen blocks being none
@@ -53,7 +53,7 @@ class Judged:
     motion showed, `similar` which other effects would have done as well in its place.
     """
 
-    physics: Physics
+    physics: Effect
     theta: Theta
     std: Theta
     unidentified: tuple[str, ...]
@@ -74,9 +74,9 @@ class Discovery:
 
 
 def discover(
-    logs: Sequence[Weighed],
-    candidates: Sequence[Physics],
-    later: Sequence[Sequence[Physics]] = (),
+    logs: Sequence[WhitenedLog],
+    candidates: Sequence[Effect],
+    later: Sequence[Sequence[Effect]] = (),
     tell: Callable[[str], None] | None = None,
 ) -> Discovery:
     """The effects that the logs show together; those of `later` are asked, in turn, when those before have nothing to say.
@@ -98,7 +98,7 @@ def discover(
     return search.judged(now)
 
 
-def _path(first: _Search, now: Fit, others: tuple[Physics, ...], waiting: list[Sequence[Physics]]) -> tuple[_Search, Fit]:
+def _path(first: _Search, now: Fit, others: tuple[Effect, ...], waiting: list[Sequence[Effect]]) -> tuple[_Search, Fit]:
     """One effect after another comes in, until none of the candidates that there are by then explains more than chance."""
     search = replace(first, others=others)
     for _ in range(ROUNDS):
@@ -126,7 +126,7 @@ class _Ranked(NamedTuple):
     """A candidate by what one linear step from its best start gains, and by the chance of that."""
 
     score: float
-    physics: Physics
+    physics: Effect
     start: Theta
     gain: float
 
@@ -138,9 +138,9 @@ class _Ranked(NamedTuple):
 
 @dataclass(eq=False)
 class _Search:
-    logs: Sequence[Weighed]
-    named: tuple[Physics, ...]
-    others: tuple[Physics, ...]
+    logs: Sequence[WhitenedLog]
+    named: tuple[Effect, ...]
+    others: tuple[Effect, ...]
     before: float  # squares of white residuals with nothing but a constant bias
     tell: Callable[[str], None]
     starts: dict[str, list[Theta]] = field(default_factory=dict)
@@ -157,7 +157,7 @@ class _Search:
                 self.starts[one.name] = self._starts(one)
                 self.luck[one.name] = self._luck(one)
 
-    def also(self, others: Sequence[Physics]) -> _Search:
+    def also(self, others: Sequence[Effect]) -> _Search:
         """With more candidates; what is known of those there were stays known."""
         return replace(self, others=(*self.others, *others))
 
@@ -166,18 +166,18 @@ class _Search:
         """All starts of all candidates: what the chance of a false finding is multiplied by."""
         return sum(len(self.starts[one.name]) for one in (*self.named, *self.others))
 
-    def _starts(self, physics: Physics) -> list[Theta]:
+    def _starts(self, physics: Effect) -> list[Theta]:
         if physics.starts is None:
-            return [physics.nothing.astype(float)]
+            return [physics.null_value.astype(float)]
         pair = self.logs[0].pair
         return [np.asarray(start, dtype=float) for start in physics.starts(pair.felt, _as_read(pair))]
 
-    def _luck(self, physics: Physics) -> float:
+    def _luck(self, physics: Effect) -> float:
         if physics.alternatives is None:
             return 0.0
         return float(np.log(max(1.0, physics.alternatives(_as_read(self.logs[0].pair)) / len(self.starts[physics.name]))))
 
-    def chance(self, physics: Physics, gain: float) -> float:
+    def chance(self, physics: Effect, gain: float) -> float:
         """The logarithm of the chance that noise alone gains as much by an effect, at the best of its alternatives."""
         return chance(gain, len(physics.parameters)) + self.luck[physics.name]
 
@@ -206,7 +206,7 @@ class _Search:
             return None  # the rim of something that has no name: a name for it would be wrong
         return best[1]
 
-    def tried_with(self, others: Chosen, physics: Physics, start: Theta, near: Fit, hopeful: float) -> Fit:
+    def tried_with(self, others: Chosen, physics: Effect, start: Theta, near: Fit, hopeful: float) -> Fit:
         """The fit with one more effect, without those of its numbers that would be many times larger than anything met."""
         trial = fit(self.logs, (*others, (physics, start)), near=near, hopeful=hopeful)
         held = plausible(physics, trial.chosen[-1][1])
@@ -215,7 +215,7 @@ class _Search:
         left = kept(physics, held, trial.chosen[-1][1])
         return fit(self.logs, (*others, (held, left)), near=near, hopeful=hopeful)
 
-    def ranked(self, now: Fit, candidates: Sequence[Physics]) -> list[_Ranked]:
+    def ranked(self, now: Fit, candidates: Sequence[Effect]) -> list[_Ranked]:
         """Candidates by what one linear step promises, each from its best start."""
         if self.known_for is not now:
             self.known_for, self.known, self.trials = now, {}, {}
@@ -235,7 +235,7 @@ class _Search:
         fine = finer(physics, like([log.pair for log in self.logs]))
         if fine is None:
             return now
-        trial = fit(self.logs, (*others, (fine, fine.nothing.astype(float))), near=now)
+        trial = fit(self.logs, (*others, (fine, fine.null_value.astype(float))), near=now)
         return trial if cost(trial) < cost(now) - CLEARLY else now
 
     def exchanged(self, now: Fit) -> Fit:
@@ -314,7 +314,7 @@ class _Search:
                     found.append(physics.name.partition(" ")[0])
         return tuple(dict.fromkeys(found))
 
-    def _beyond_the_band(self, physics: Physics, theta: Theta) -> bool:
+    def _beyond_the_band(self, physics: Effect, theta: Theta) -> bool:
         """A frequency at which smoothed poses, which lose and lag by themselves, look alike; or slower than anything met."""
         more = BEYOND_LOW_PASS if physics.name == "low_pass" else BEYOND
         reach = [more * log.pair.band_hz for log in self.logs if log.pair.band_hz is not None]
@@ -344,22 +344,22 @@ class _Search:
             for number, s in zip(physics.parameters, std, strict=True)
             if s > (fits.LOG_PRIOR if number.positive else number.plausible) and not isinstance(physics.forward, Curve)
         ]
-        if isinstance(physics.forward, Held):
+        if isinstance(physics.forward, FixedParameters):
             kept = {number.name for number in physics.parameters}
             unseen += [f"{physics.name}.{n.name}" for n in physics.forward.physics.parameters if n.name not in kept]
         return Judged(physics, theta, std, tuple(unseen), float(np.exp(max(log_p, -700.0))), rate, gain)
 
 
-def _but_faint(verdicts: Sequence[Judged], logs: Sequence[Weighed]) -> list[Judged]:
+def _but_faint(verdicts: Sequence[Judged], logs: Sequence[WhitenedLog]) -> list[Judged]:
     """Without trust in what may be the inexactness of a far larger effect."""
     exact = not any(log.pair.sim_noise.any() for log in logs)
     hidden = faint({one.physics.name: one.gain for one in verdicts}, exact)
     return [replace(one, false_discovery_rate=1.0) if one.physics.name in hidden else one for one in verdicts]
 
 
-def _as_read(pair: Pair) -> Read:
+def _as_read(pair: Pair) -> SensorSamples:
     """The samples as they were recorded."""
-    return Read(pair.stamp_s, pair.real[:, :3], pair.real[:, 3:], np.zeros((len(pair.real), 3)))
+    return SensorSamples(pair.stamp_s, pair.real[:, :3], pair.real[:, 3:], np.zeros((len(pair.real), 3)))
 
 
 def _set_in_as(fitted: Chosen, whole: Chosen) -> Chosen:

@@ -14,11 +14,11 @@ from jaxtyping import Float64
 
 from imutool.diagnosis.alignment import Pair
 from imutool.diagnosis.forward_cache import Chosen, Course
-from imutool.diagnosis.gauss_newton import Weighed, expected
+from imutool.diagnosis.gauss_newton import WhitenedLog, expected
 from imutool.diagnosis.known_band import known_below
 from imutool.diagnosis.whitening import Band, Whitener, level, settled, whitener
-from imutool.sensor.effect import Physics, Theta
-from imutool.sensor.readings import Read
+from imutool.sensor.effect import Effect, Theta
+from imutool.sensor.readings import SensorSamples
 
 ORDER_SIM, ORDER_TRUTH = 6, 6  # of the autoregression: the noise of a sensor; of poses, on rows that just hold their band
 RIDGE = 1e-8
@@ -27,7 +27,7 @@ MUCH = 3.0  # times the noise of another axis
 SAME = 1e-3  # of a column, left when those before it are taken out: it says nothing of its own
 
 
-def weighed(pair: Pair, candidates: Sequence[Physics]) -> Weighed:
+def weighed(pair: Pair, candidates: Sequence[Effect]) -> WhitenedLog:
     """The pair with its noise; beside poses also with the band up to which they are seen to know the motion."""
     if pair.against == "simulation":
         return _counting(pair, level(_left(pair, candidates), pair.usable, 1.0 / pair.period_s, ORDER_SIM))
@@ -42,12 +42,12 @@ def weighed(pair: Pair, candidates: Sequence[Physics]) -> Weighed:
     return _counting(pair, alike(found))
 
 
-def _counting(pair: Pair, white: Whitener) -> Weighed:
+def _counting(pair: Pair, white: Whitener) -> WhitenedLog:
     """Without the values into which samples that tell nothing have gone."""
-    return Weighed(pair, white if pair.known is None else white.counting(pair.known))
+    return WhitenedLog(pair, white if pair.known is None else white.counting(pair.known))
 
 
-def _in_band(pair: Pair, candidates: Sequence[Physics], band_hz: float) -> tuple[Whitener, Float64[np.ndarray, "m 6"]]:
+def _in_band(pair: Pair, candidates: Sequence[Effect], band_hz: float) -> tuple[Whitener, Float64[np.ndarray, "m 6"]]:
     """The noise of rows up to a frequency, and what a rich model leaves there."""
     band = Band.below(band_hz, 1.0 / pair.period_s)
     columns, misfit = _rich(pair, candidates, band), band(pair.real - expected(pair, ()))
@@ -89,9 +89,9 @@ def noise_std(found: Whitener) -> Float64[np.ndarray, "6"]:
     return np.asarray(found.std * np.sqrt((1.0 / response).mean(axis=1)))
 
 
-def _left(pair: Pair, candidates: Sequence[Physics]) -> Float64[np.ndarray, "n 6"]:
+def _left(pair: Pair, candidates: Sequence[Effect]) -> Float64[np.ndarray, "n 6"]:
     """What is left of a simulation's misfit when everything linear has had its way."""
-    linear: Chosen = tuple((one, one.nothing.astype(float)) for one in candidates if one.linear)
+    linear: Chosen = tuple((one, one.null_value.astype(float)) for one in candidates if one.linear)
     course = Course(pair, linear)
     left: Float64[np.ndarray, "n 6"] = pair.real - course.expected
     columns: list[list[np.ndarray]] = [[np.ones(len(left))] for _ in range(6)]
@@ -107,9 +107,9 @@ def _left(pair: Pair, candidates: Sequence[Physics]) -> Float64[np.ndarray, "n 6
     return left
 
 
-def _rich(pair: Pair, candidates: Sequence[Physics], band: Band) -> list[Float64[np.ndarray, "_ m"]]:
+def _rich(pair: Pair, candidates: Sequence[Effect], band: Band) -> list[Float64[np.ndarray, "_ m"]]:
     """For each axis a constant, and derivatives of everything in the catalogue at the places where fits begin, in a band."""
-    samples = Read(pair.stamp_s, pair.real[:, :3], pair.real[:, 3:], np.zeros((len(pair.real), 3)))
+    samples = SensorSamples(pair.stamp_s, pair.real[:, :3], pair.real[:, 3:], np.zeros((len(pair.real), 3)))
     columns = [[np.ones(len(pair.real))] for _ in range(6)]
     nothing = Course(pair, ())
     for physics in candidates:

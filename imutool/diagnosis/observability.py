@@ -11,8 +11,8 @@ from collections.abc import Iterator, Mapping, Sequence
 import numpy as np
 from jaxtyping import Float64
 
-from imutool.diagnosis.gauss_newton import Weighed, expected
-from imutool.sensor.effect import Physics
+from imutool.diagnosis.gauss_newton import WhitenedLog, expected
+from imutool.sensor.effect import Effect
 
 ENOUGH = 36.0  # squares: six standard deviations, as what is tried some thousand times has to be
 SMALL = 1e-2  # of the plausible size, at which an effect is still proportional to it
@@ -20,7 +20,7 @@ BEHIND: Mapping[str, tuple[str, ...]] = {"clock_offset": ("clock_skew", "clock_j
 """What delays, swings or jumps needs the motion that shows a delay."""
 
 
-def unseen(logs: Sequence[Weighed], candidates: Sequence[Physics]) -> tuple[str, ...]:
+def unseen(logs: Sequence[WhitenedLog], candidates: Sequence[Effect]) -> tuple[str, ...]:
     """`effect.parameter` of what cannot be seen, and `effect` where that is all of it."""
     out: list[str] = []
     for physics in candidates:
@@ -34,17 +34,17 @@ def unseen(logs: Sequence[Weighed], candidates: Sequence[Physics]) -> tuple[str,
     return tuple(dict.fromkeys(out))
 
 
-def _asked(physics: Physics) -> bool:
+def _asked(physics: Effect) -> bool:
     """What is proportional to its numbers near nothing."""
-    return bool(np.isfinite(physics.nothing).all()) and not any(n.positive or n.begins for n in physics.parameters)
+    return bool(np.isfinite(physics.null_value).all()) and not any(n.positive or n.begins for n in physics.parameters)
 
 
-def _behind(physics: Physics, candidates: Sequence[Physics]) -> Iterator[str]:
+def _behind(physics: Effect, candidates: Sequence[Effect]) -> Iterator[str]:
     there = {one.name for one in candidates}
     return (name for name in BEHIND.get(physics.name, ()) if name in there)
 
 
-def _gains(logs: Sequence[Weighed], physics: Physics) -> Float64[np.ndarray, " p"]:
+def _gains(logs: Sequence[WhitenedLog], physics: Effect) -> Float64[np.ndarray, " p"]:
     """Squares that each number adds at its plausible size, less those of the constant that hides most of it."""
     total = np.zeros(len(physics.parameters))
     for log in logs:

@@ -8,12 +8,12 @@ import numpy as np
 from jaxtyping import Float64
 
 from imutool.diagnosis.forward_cache import Chosen
-from imutool.diagnosis.gauss_newton import Fit, Weighed, fit
+from imutool.diagnosis.gauss_newton import Fit, WhitenedLog, fit
 
 NEAR_S, MOST_TIMES = 0.4, 41  # around where a fit put it: as far as the filter of a band smears it
 
 
-def onsets(logs: Sequence[Weighed], found: Fit, part: str, inflation: float) -> tuple[Fit, dict[tuple[str, int], float]]:
+def onsets(logs: Sequence[WhitenedLog], found: Fit, part: str, inflation: float) -> tuple[Fit, dict[tuple[str, int], float]]:
     """The fit with each such time at its mean over what the rows leave likely, and the standard deviation of that (s).
 
     A time is as likely as exp(-squares / 2), the squares divided by `inflation` where they are more than noise.
@@ -35,7 +35,7 @@ def onsets(logs: Sequence[Weighed], found: Fit, part: str, inflation: float) -> 
     return found, spread
 
 
-def _left(logs: Sequence[Weighed], found: Fit, k: int, j: int, t_s: float, part: str) -> float:
+def _left(logs: Sequence[WhitenedLog], found: Fit, k: int, j: int, t_s: float, part: str) -> float:
     """Squares that are left with another time, all else as it is but for the constants."""
     return fit(logs, _at(found, k, j, t_s), part=part, iterations=0).objective
 

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float64
 from scipy.stats import chi2
 
-from imutool.diagnosis.gauss_newton import Weighed, expected
+from imutool.diagnosis.gauss_newton import WhitenedLog, expected
 from imutool.diagnosis.result import UNITS, Estimate, Finding, HeldOut, Located
 
 BLOCK_S = 0.25
@@ -23,7 +23,7 @@ QUIET = 1.1  # squares left a row outside
 JOIN_S = 0.6
 
 
-def wrong_for_moments(logs: Sequence[Weighed]) -> tuple[list[Finding], list[Located]]:
+def wrong_for_moments(logs: Sequence[WhitenedLog]) -> tuple[list[Finding], list[Located]]:
     """`reference_error` with its length and moments, and where it is; nothing where the misfit is anything else."""
     if len(logs) != 1:
         return [], []

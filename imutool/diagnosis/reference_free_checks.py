@@ -10,7 +10,7 @@ from imutool.diagnosis.result import UNITS, Diagnosis, Estimate, Finding, HeldOu
 from imutool.inertial.stationary import white_noise
 from imutool.recording import Recording, seconds
 from imutool.sensor import catalogue
-from imutool.sensor.readings import Felt
+from imutool.sensor.readings import IdealMotion
 
 BY_THEMSELVES = frozenset({"saturation", "quantization"})  # of the catalogue
 
@@ -22,7 +22,7 @@ def by_samples(real: Recording, path: str, why: str) -> Diagnosis:
     """
     stamp_s = seconds(real.imu.t_ns, int(real.imu.t_ns[0]))
     samples, none = np.concatenate([real.imu.gyro, real.imu.accel], axis=1), np.zeros(len(stamp_s), bool)
-    pair = Pair(real.name, Felt(stamp_s, *np.zeros((3, len(stamp_s), 3))), stamp_s, samples, none, none)
+    pair = Pair(real.name, IdealMotion(stamp_s, *np.zeros((3, len(stamp_s), 3))), stamp_s, samples, none, none)
     findings = [*timestamps.dropped([pair]), *timestamps.rounded([pair], white_noise(samples)), *_limits(pair)]
     told = f"{why.rstrip('.')}. Only what stamps and digits show by themselves could be asked"
     hidden = tuple(one.name for one in catalogue.physics() if one.name not in BY_THEMSELVES)

@@ -14,14 +14,14 @@ import numpy as np
 from jaxtyping import Float64
 
 from imutool.diagnosis.alignment import Pair
-from imutool.diagnosis.gauss_newton import Weighed, expected
+from imutool.diagnosis.gauss_newton import WhitenedLog, expected
 from imutool.diagnosis.result import Closer
 from imutool.diagnosis.summarize import closer, floor, with_constant
 from imutool.errors import DataError
 from imutool.recording import Recording
 from imutool.sensor.effect import Acting
 from imutool.sensor.physics_file import PhysicsFile
-from imutool.sensor.readings import Felt
+from imutool.sensor.readings import IdealMotion
 from imutool.sensor.simulate import FELT_HZ, read_all
 from imutool.sensor.trajectory import smooth_motion
 
@@ -29,7 +29,7 @@ AS_GOOD = 0.3  # of the noise: how far a simulation along the poses may be from 
 MOST_OF_IT = 0.8  # of the held-out samples that the poses have to cover
 
 
-def simulated_again(logs: Sequence[Weighed], sim: Recording, physics: PhysicsFile) -> Mapping[str, Closer]:
+def simulated_again(logs: Sequence[WhitenedLog], sim: Recording, physics: PhysicsFile) -> Mapping[str, Closer]:
     """By signal, the misfit of the simulation as it was given and as it is with some physics, on held-out time.
 
     Raises:
@@ -50,14 +50,14 @@ def simulated_again(logs: Sequence[Weighed], sim: Recording, physics: PhysicsFil
         pair = replace(log.pair, fitted=log.pair.fitted & good, held_out=log.pair.held_out & good)
         if pair.held_out.sum() < MOST_OF_IT * log.pair.held_out.sum():
             raise DataError("its poses cover too little of the recording", where=sim.name)
-        there.append(Weighed(pair, log.whiten))
+        there.append(WhitenedLog(pair, log.whiten))
         before.append(with_constant(pair, expected(pair, ())))
         after.append(with_constant(pair, found))
         _refuse_unlike(there[-1], before[-1], with_constant(pair, plain), sim)
     return {signal: replace(one, by="second simulation") for signal, one in closer(there, before, after).items()}
 
 
-def _felt(felt: Felt, start_ns: int, pair: Pair) -> Felt:
+def _felt(felt: IdealMotion, start_ns: int, pair: Pair) -> IdealMotion:
     """On the recording's clock, with its channels."""
     first_ns = pair.start_ns - round(float(pair.stamp_s[0]) * 1e9)
     t_s = felt.t_s + (start_ns - first_ns) * 1e-9 - pair.aligned_s
@@ -65,7 +65,7 @@ def _felt(felt: Felt, start_ns: int, pair: Pair) -> Felt:
     return replace(felt, t_s=t_s, channels=channels)
 
 
-def _read(pair: Pair, felts: Sequence[Felt], acting: Acting) -> Float64[np.ndarray, "n 6"]:
+def _read(pair: Pair, felts: Sequence[IdealMotion], acting: Acting) -> Float64[np.ndarray, "n 6"]:
     """What the second simulation reads at the recording's stamps; NaN where it has no motion."""
     stamps = [pair.stamp_s[(pair.stamp_s >= one.t_s[0]) & (pair.stamp_s <= one.t_s[-1])] for one in felts]
     got = read_all(felts, stamps, acting)
@@ -74,7 +74,9 @@ def _read(pair: Pair, felts: Sequence[Felt], acting: Acting) -> Float64[np.ndarr
     return out
 
 
-def _refuse_unlike(log: Weighed, given: Float64[np.ndarray, "n 6"], plain: Float64[np.ndarray, "n 6"], sim: Recording) -> None:
+def _refuse_unlike(
+    log: WhitenedLog, given: Float64[np.ndarray, "n 6"], plain: Float64[np.ndarray, "n 6"], sim: Recording
+) -> None:
     """Poses that are too coarse or too noisy give another simulation than the one that was given, whatever the physics.
 
     Raises:

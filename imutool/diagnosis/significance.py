@@ -9,7 +9,7 @@ from scipy.stats import norm, wilcoxon
 from scipy.stats import t as student
 
 from imutool.diagnosis.forward_cache import Chosen
-from imutool.diagnosis.gauss_newton import Fit, Weighed, expected
+from imutool.diagnosis.gauss_newton import Fit, WhitenedLog, expected
 
 BLOCK_S = 2.0
 FAR_OUT = 300.0  # half the gain, above which the tail itself is less than a number can hold
@@ -41,7 +41,7 @@ def predicts(blocks: Float64[np.ndarray, "b 2"]) -> float:
     return float(norm.sf((gain + size) / (2.0 * np.sqrt(size)))) if size > 0 else 1.0
 
 
-def gains(log: Weighed, fitted: Fit, k: int, part: str) -> Float64[np.ndarray, "b 2"]:
+def gains(log: WhitenedLog, fitted: Fit, k: int, part: str) -> Float64[np.ndarray, "b 2"]:
     """Squares by which each block of a part that was not fitted is better with an effect, and those of what it adds."""
     chosen = fitted.chosen
     with_, without = (_white(log, one, part) for one in (chosen, (*chosen[:k], *chosen[k + 1 :])))
@@ -52,7 +52,7 @@ def gains(log: Weighed, fitted: Fit, k: int, part: str) -> Float64[np.ndarray, "
     return np.stack([np.bincount(inverse, weights=column, minlength=len(names)) for column in each.T], axis=1)
 
 
-def _white(log: Weighed, chosen: Chosen, part: str) -> Float64[np.ndarray, "n 6"]:
+def _white(log: WhitenedLog, chosen: Chosen, part: str) -> Float64[np.ndarray, "n 6"]:
     """White residuals of a part, with the best constant for that part."""
     rows = log.rows(part)
     residual = log.whiten(log.pair.real - expected(log.pair, chosen))[rows]

@@ -14,7 +14,7 @@ from imutool.diagnosis import timestamps, unnamed
 from imutool.diagnosis.alignment import LEAST_NOISE, Pair
 from imutool.diagnosis.compare_findings import remarks, shared
 from imutool.diagnosis.forward_cache import Chosen
-from imutool.diagnosis.gauss_newton import Fit, Weighed, expected, fit
+from imutool.diagnosis.gauss_newton import Fit, WhitenedLog, expected, fit
 from imutool.diagnosis.late_stamps import late_stamps
 from imutool.diagnosis.localization import of_findings, of_what_is_left
 from imutool.diagnosis.model_selection import Discovery, Judged
@@ -37,7 +37,7 @@ BY_CHANCE = 1e-3  # or more, where so few values are left that noise alone excee
 
 
 def told(
-    logs: Sequence[Weighed],
+    logs: Sequence[WhitenedLog],
     found: Discovery,
     reals: Mapping[str, str],
     sim: str | None,
@@ -96,7 +96,7 @@ def _traces(pair: Pair, before: Float64[np.ndarray, "n 6"], after: Float64[np.nd
     )
 
 
-def without_held_out(logs: Sequence[Weighed], found: Discovery, d: Diagnosis) -> PhysicsFile:
+def without_held_out(logs: Sequence[WhitenedLog], found: Discovery, d: Diagnosis) -> PhysicsFile:
     """What was found as physics.toml has it, with the numbers that the fitted time alone says; digits are no motion's."""
     theta = {physics.name: value for physics, value in found.fitted.chosen}
     judged = {(_effect(one), one.physics.equation): replace(one, theta=theta[one.physics.name]) for one in found.judged}
@@ -112,7 +112,7 @@ def without_held_out(logs: Sequence[Weighed], found: Discovery, d: Diagnosis) ->
 
 
 def _worthwhile(
-    logs: Sequence[Weighed], found: Discovery, noise: Float64[np.ndarray, "6"]
+    logs: Sequence[WhitenedLog], found: Discovery, noise: Float64[np.ndarray, "6"]
 ) -> tuple[Discovery, list[Finding], list[str]]:
     """A discovery without effects that bring nothing on unseen time beside the others, its findings, and those effects."""
     named, idle = [_finding(logs, found, one, noise) for one in found.judged], []
@@ -167,7 +167,7 @@ def with_constant(pair: Pair, there: Float64[np.ndarray, "n 6"]) -> Float64[np.n
     return np.asarray(there + constant)
 
 
-def floor(logs: Sequence[Weighed]) -> Float64[np.ndarray, "6"]:
+def floor(logs: Sequence[WhitenedLog]) -> Float64[np.ndarray, "6"]:
     """The noise of a sample by axis, before it was made white; of an axis nobody knows, that of those beside it."""
     total, count = np.zeros(6), np.zeros(6)
     for log in logs:
@@ -180,7 +180,7 @@ def floor(logs: Sequence[Weighed]) -> Float64[np.ndarray, "6"]:
     return np.asarray(np.sqrt(variance))
 
 
-def _unseen(log: Weighed, there: Float64[np.ndarray, "n 6"], part: slice) -> Float64[np.ndarray, " m"]:
+def _unseen(log: WhitenedLog, there: Float64[np.ndarray, "n 6"], part: slice) -> Float64[np.ndarray, " m"]:
     """What is left on held-out samples that tell anything, up to where what is expected is known."""
     pair, counts = log.pair, log.whiten.counts
     left, rows = pair.real - there, pair.held_out[:: log.whiten.every]
@@ -189,7 +189,7 @@ def _unseen(log: Weighed, there: Float64[np.ndarray, "n 6"], part: slice) -> Flo
     return np.asarray(left[rows, part].ravel() if counts is None else left[rows, part][counts[rows, part]])
 
 
-def closer(logs: Sequence[Weighed], before: Sequence[np.ndarray], after: Sequence[np.ndarray]) -> dict[str, Closer]:
+def closer(logs: Sequence[WhitenedLog], before: Sequence[np.ndarray], after: Sequence[np.ndarray]) -> dict[str, Closer]:
     """What all findings together bring to each sensor, on held-out time."""
     noise, out = floor(logs), {}
     for signal, k in _known([log.pair for log in logs]).items():
@@ -197,14 +197,14 @@ def closer(logs: Sequence[Weighed], before: Sequence[np.ndarray], after: Sequenc
     return out
 
 
-def _noise(logs: Sequence[Weighed], floor: Float64[np.ndarray, "6"], k: int) -> float:
+def _noise(logs: Sequence[WhitenedLog], floor: Float64[np.ndarray, "6"], k: int) -> float:
     """Of a sensor, over the axes of which anything is known."""
     part, axes = slice(3 * k, 3 * k + 3), np.any([log.pair.axes for log in logs], axis=0)
     return float(np.sqrt(np.mean(floor[part][axes[part]] ** 2)))
 
 
 def _held_out(
-    logs: Sequence[Weighed], before: Sequence[np.ndarray], after: Sequence[np.ndarray], k: int, unit_: str
+    logs: Sequence[WhitenedLog], before: Sequence[np.ndarray], after: Sequence[np.ndarray], k: int, unit_: str
 ) -> HeldOut:
     """Root mean squares over held-out samples and axes of a signal, and how long that was; no numbers where none are known."""
     part = slice(3 * k, 3 * k + 3)
@@ -216,7 +216,7 @@ def _held_out(
     return HeldOut(rms[0], rms[1], unit_, round(length, 1))
 
 
-def _finding(logs: Sequence[Weighed], found: Discovery, one: Judged, floor: Float64[np.ndarray, "6"]) -> Finding:
+def _finding(logs: Sequence[WhitenedLog], found: Discovery, one: Judged, floor: Float64[np.ndarray, "6"]) -> Finding:
     """One effect: what leaving it out costs on time that its parameters were not fitted to."""
     pairs = [log.pair for log in logs]
     fitted = found.fitted
@@ -297,7 +297,7 @@ def _curve(pair: Pair, one: Judged, whole: Fit) -> Curve | None:
 
 
 def _unexplained(
-    logs: Sequence[Weighed], after: Sequence[Float64[np.ndarray, "n 6"]], noises: Float64[np.ndarray, "6"]
+    logs: Sequence[WhitenedLog], after: Sequence[Float64[np.ndarray, "n 6"]], noises: Float64[np.ndarray, "6"]
 ) -> dict[str, Unexplained]:
     """Of the sensors of which anything is known; beside poses, whose errors come and go, by blocks that are of one mind."""
     out, beside_poses = {}, any(log.whiten.band is not None for log in logs)
@@ -314,7 +314,7 @@ def _unexplained(
     return out
 
 
-def _by_chance(logs: Sequence[Weighed], after: Sequence[Float64[np.ndarray, "n 6"]], k: int, noise: float) -> float:
+def _by_chance(logs: Sequence[WhitenedLog], after: Sequence[Float64[np.ndarray, "n 6"]], k: int, noise: float) -> float:
     """The chance of blocks of held-out time having so much more power than noise, as far as they differ among themselves."""
     powers: list[float] = []
     for log, there in zip(logs, after, strict=True):

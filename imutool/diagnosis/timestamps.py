@@ -11,8 +11,8 @@ from scipy.stats import binom
 
 from imutool.diagnosis.alignment import Pair
 from imutool.diagnosis.result import UNITS, Estimate, Finding, HeldOut
-from imutool.sensor.effect import Number, Physics, Stage, Theta
-from imutool.sensor.readings import Felt, Read
+from imutool.sensor.effect import Effect, Parameter, Stage, Theta
+from imutool.sensor.readings import IdealMotion, SensorSamples
 
 MEDIAN, FEW = 15, 500  # samples: of a running median, and to find a period by first
 PERIOD_SPAN, PERIODS = 0.02, 201  # periods tried about the median step
@@ -72,7 +72,7 @@ def _period(since_s: Float64[np.ndarray, " n"]) -> tuple[float, float, float]:
     return best, float(np.angle(mean)) / (2.0 * np.pi) * best, float(abs(mean))
 
 
-def jitter(pairs: Sequence[Pair]) -> tuple[Physics, ...]:
+def jitter(pairs: Sequence[Pair]) -> tuple[Effect, ...]:
     """Samples taken evenly whose stamps are not: a share of one is all of it. None where the stamps are even."""
     late = [(pair.stamp_s, even(pair.stamp_s)[0] - pair.stamp_s) for pair in pairs]
     if min(float(x.std()) for _, x in late) < LEAST_JITTER_S:
@@ -84,9 +84,9 @@ def jitter(pairs: Sequence[Pair]) -> tuple[Physics, ...]:
         return np.asarray(taken_s + theta[0] * correction + theta[1] + theta[2] * np.linspace(-1.0, 1.0, len(taken_s)))
 
     unsure = float(np.mean([x.std() / np.sqrt(len(x)) for _, x in late]))  # to which stamps show where the even clock begins
-    share = (Number("share", "-", 1.0), Number("begins_off", "s", unsure), Number("ends_off", "s", 2.0 * unsure))
+    share = (Parameter("share", "-", 1.0), Parameter("begins_off", "s", unsure), Parameter("ends_off", "s", 2.0 * unsure))
     return (
-        Physics(
+        Effect(
             "timestamp_jitter",
             Stage.CLOCK,
             ("gyro", "accel"),
@@ -161,7 +161,7 @@ def limits(real: Float64[np.ndarray, "n 6"]) -> dict[str, float]:
     return found
 
 
-def soft_limits(pairs: Sequence[Pair], biases: Sequence[Float64[np.ndarray, "6"]]) -> tuple[Physics, ...]:
+def soft_limits(pairs: Sequence[Pair], biases: Sequence[Float64[np.ndarray, "6"]]) -> tuple[Effect, ...]:
     """A limit whose readings still carry noise: one candidate a sensor, for a fit. What is clipped includes the bias."""
     found = []
     for k, signal in enumerate(("gyro", "accel")):
@@ -172,12 +172,12 @@ def soft_limits(pairs: Sequence[Pair], biases: Sequence[Float64[np.ndarray, "6"]
         most = float(max(np.abs(pair.real[:, part]).max() for pair in pairs))
         unit = UNITS[signal].replace("^2", "²")
         found.append(
-            Physics(
+            Effect(
                 "saturation" if k == 0 else "saturation accel",
                 Stage.CONVERTER,
                 ("gyro",) if k == 0 else ("accel",),
                 f"{signal} = clip({signal}, -L, L)",
-                (Number(f"{signal}_limit", unit, most, positive=True, nothing=np.inf, step=1e-4),),
+                (Parameter(f"{signal}_limit", unit, most, positive=True, null_value=np.inf, step=1e-4),),
                 "the limit is reached",
                 _Clip(k, bias),
                 linear=False,
@@ -193,7 +193,7 @@ class _Clip:
     def __init__(self, sensor: int, bias: Float64[np.ndarray, "3"]) -> None:
         self.sensor, self.bias = sensor, bias
 
-    def __call__(self, read: Read, theta: Theta) -> Read:
+    def __call__(self, read: SensorSamples, theta: Theta) -> SensorSamples:
         x = read.gyro if self.sensor == 0 else read.accel
         out = np.clip(x + self.bias, -theta[0], theta[0]) - self.bias
         return read.but(gyro=out) if self.sensor == 0 else read.but(accel=out)
@@ -205,7 +205,7 @@ class _Starts:
     def __init__(self, most: float) -> None:
         self.most = most
 
-    def __call__(self, _felt: Felt, _samples: Read) -> list[Theta]:
+    def __call__(self, _felt: IdealMotion, _samples: SensorSamples) -> list[Theta]:
         return [np.array([share * self.most]) for share in SHARES]
 
 

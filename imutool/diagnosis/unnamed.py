@@ -1,6 +1,6 @@
 """Misfits without a name in the catalogue: driven by another channel of the log, or unknown.
 
-Each becomes a `Physics` of its own, made for the log at hand, so that it is fitted, tested, simulated and removed like any
+Each becomes a `Effect` of its own, made for the log at hand, so that it is fitted, tested, simulated and removed like any
 other. `driven`: gain on every axis times a channel, some time later. `unknown`: a smooth curve of one variable (cubic
 B-splines), or a short equation out of a library of products and powers; whichever explains more is kept, and no name is given
 to it.
@@ -17,9 +17,9 @@ from scipy.interpolate import BSpline
 
 from imutool.diagnosis.alignment import Pair
 from imutool.sensor import catalogue
-from imutool.sensor.effect import Number, Physics, Stage, Theta
+from imutool.sensor.effect import Effect, Parameter, Stage, Theta
 from imutool.sensor.linear_effect import Sensor
-from imutool.sensor.readings import Read, Vectors
+from imutool.sensor.readings import SensorSamples, Vectors
 from imutool.sensor.variables import VARIABLES
 
 LAGS_S = (-0.5, -0.2, -0.1, -0.05, 0.0, 0.05, 0.1, 0.2, 0.5)
@@ -31,10 +31,10 @@ INSIDE = 0.005  # of the values of a variable lie beyond its first knot, and as 
 QUANTILES, BY_RANGE = 1001, 0.35  # places between which knots are found, and how many of them by the range alone
 SPREAD = 1e-9  # relative: knots that lie closer are one
 
-Variable = Callable[[Read], Float64[np.ndarray, " n"]]
+Variable = Callable[[SensorSamples], Float64[np.ndarray, " n"]]
 
 
-def driven(pairs: Sequence[Pair]) -> Iterator[Physics]:
+def driven(pairs: Sequence[Pair]) -> Iterator[Effect]:
     """An effect for each other channel of the logs: + gain * channel, taken some time earlier, on one of the sensors."""
     named = {need for physics in catalogue.physics() for need in physics.needs}
     for name in sorted(set.intersection(*(set(pair.channels) for pair in pairs))):
@@ -46,10 +46,10 @@ def driven(pairs: Sequence[Pair]) -> Iterator[Physics]:
             continue
         for k, (signal, measured_in) in enumerate(SIGNALS):
             numbers = (
-                *(Number(axis, f"{measured_in} per unit of {name}", PLAUSIBLE[signal] / size) for axis in AXES),
-                Number("lag", "s", 0.2),
+                *(Parameter(axis, f"{measured_in} per unit of {name}", PLAUSIBLE[signal] / size) for axis in AXES),
+                Parameter("lag", "s", 0.2),
             )
-            yield Physics(
+            yield Effect(
                 f"driven:{name}:{signal}",
                 Stage.SENSOR,
                 (signal,),
@@ -66,7 +66,7 @@ class _Driven:
     def __init__(self, channel: str, center: float, sensor: int) -> None:
         self.channel, self.center, self.sensor = channel, center, sensor
 
-    def __call__(self, read: Read, theta: Theta) -> Read:
+    def __call__(self, read: SensorSamples, theta: Theta) -> SensorSamples:
         x = np.interp(read.stamp_s - theta[3], read.stamp_s, read.channels[self.channel]) - self.center
         added = x[:, None] * theta[:3]
         return read.but(gyro=read.gyro + added) if self.sensor == 0 else read.but(accel=read.accel + added)
@@ -80,7 +80,7 @@ def unit(variable: str) -> str:
     return UNIT_OF[variable.strip("|").split("_")[0]]
 
 
-def curves(like: Read) -> Iterator[Physics]:
+def curves(like: SensorSamples) -> Iterator[Effect]:
     """A smooth curve of each variable, on each axis of each sensor."""
     for variable in VARIABLES:
         inner = _knots(like, variable, KNOTS)
@@ -88,7 +88,7 @@ def curves(like: Read) -> Iterator[Physics]:
             yield from (_curve(variable, k, axis, inner) for k in range(len(SIGNALS)) for axis in range(3))
 
 
-def finer(physics: Physics, like: Read) -> Physics | None:
+def finer(physics: Effect, like: SensorSamples) -> Effect | None:
     """The same curve with more knots, for what has an edge; nothing for what is no curve, or varies too little."""
     coarse = physics.forward
     if not isinstance(coarse, Curve):
@@ -97,7 +97,7 @@ def finer(physics: Physics, like: Read) -> Physics | None:
     return None if inner is None else _curve(coarse.variable, coarse.sensor, coarse.axis, inner)
 
 
-def _knots(like: Read, variable: str, count: int) -> Float64[np.ndarray, " p"] | None:
+def _knots(like: SensorSamples, variable: str, count: int) -> Float64[np.ndarray, " p"] | None:
     """Most of them by samples, some by the range they go through; none for what hardly varies.
 
     By samples alone, a robot that stands most of the time has all its knots where it stands.
@@ -109,14 +109,14 @@ def _knots(like: Read, variable: str, count: int) -> Float64[np.ndarray, " p"] |
     return inner if np.diff(inner).min() > SPREAD * max(1.0, np.abs(inner).max()) else None
 
 
-def _curve(variable: str, sensor: int, axis: int, inner: Float64[np.ndarray, " p"]) -> Physics:
+def _curve(variable: str, sensor: int, axis: int, inner: Float64[np.ndarray, " p"]) -> Effect:
     signal, measured_in = SIGNALS[sensor]
-    return Physics(
+    return Effect(
         f"unknown:{signal}.{AXES[axis]}({variable})",
         Stage.SENSOR,
         (signal,),
         f"{signal}.{AXES[axis]} += curve({variable})",
-        tuple(Number(f"c{j}", measured_in, PLAUSIBLE[signal]) for j in range(len(inner) + 2)),
+        tuple(Parameter(f"c{j}", measured_in, PLAUSIBLE[signal]) for j in range(len(inner) + 2)),
         f"{variable} varies",
         Curve(variable, sensor, axis, inner),
     )
@@ -144,7 +144,7 @@ class Curve:
             self._last = x.copy(), np.asarray(BSpline.design_matrix(inside, self.knots, 3).toarray()[:, : len(self.inner) + 2])
         return self._last[1]
 
-    def __call__(self, read: Read, theta: Theta) -> Read:
+    def __call__(self, read: SensorSamples, theta: Theta) -> SensorSamples:
         """The reading with the curve on it."""
         return _on_axis(read, self.sensor, self.axis, self.basis(VARIABLES[self.variable](read)) @ theta)
 
@@ -163,15 +163,15 @@ def library() -> Iterator[tuple[str, Variable]]:
             yield f"{other} {name}", partial(_product, VARIABLES[other], x)
 
 
-def _of(x: Variable, function: Callable[[np.ndarray], np.ndarray], read: Read) -> Float64[np.ndarray, " n"]:
+def _of(x: Variable, function: Callable[[np.ndarray], np.ndarray], read: SensorSamples) -> Float64[np.ndarray, " n"]:
     return np.asarray(function(x(read)))
 
 
-def _product(x: Variable, y: Variable, read: Read) -> Float64[np.ndarray, " n"]:
+def _product(x: Variable, y: Variable, read: SensorSamples) -> Float64[np.ndarray, " n"]:
     return x(read) * y(read)
 
 
-def terms(like: Read) -> Iterator[Physics]:
+def terms(like: SensorSamples) -> Iterator[Effect]:
     """Each term of the library on each axis of each sensor."""
     for text, term in library():
         size = float(np.std(term(like)))
@@ -179,12 +179,12 @@ def terms(like: Read) -> Iterator[Physics]:
             continue
         for k, (signal, measured_in) in enumerate(SIGNALS):
             for axis in range(3):
-                yield Physics(
+                yield Effect(
                     f"unknown:{signal}.{AXES[axis]}:{text}",
                     Stage.SENSOR,
                     (signal,),
                     f"{signal}.{AXES[axis]} += c {text}",
-                    (Number("c", f"{measured_in} per unit of {text}", PLAUSIBLE[signal] / size),),
+                    (Parameter("c", f"{measured_in} per unit of {text}", PLAUSIBLE[signal] / size),),
                     f"{text} varies",
                     _Term(term, k, axis),
                 )
@@ -194,17 +194,17 @@ class _Term:
     def __init__(self, term: Variable, sensor: int, axis: int) -> None:
         self.term, self.sensor, self.axis = term, sensor, axis
 
-    def __call__(self, read: Read, theta: Theta) -> Read:
+    def __call__(self, read: SensorSamples, theta: Theta) -> SensorSamples:
         return _on_axis(read, self.sensor, self.axis, theta[0] * self.term(read))
 
 
-def _on_axis(read: Read, sensor: int, axis: int, added: Float64[np.ndarray, " n"]) -> Read:
+def _on_axis(read: SensorSamples, sensor: int, axis: int, added: Float64[np.ndarray, " n"]) -> SensorSamples:
     out: Vectors = (read.gyro if sensor == 0 else read.accel).copy()
     out[:, axis] += added
     return read.but(gyro=out) if sensor == 0 else read.but(accel=out)
 
 
-def like(pairs: Sequence[Pair]) -> Read:
+def like(pairs: Sequence[Pair]) -> SensorSamples:
     """Ideal signals at the samples of the first log that are fitted: what ranges there are."""
     pair = pairs[0]
     stamp_s = pair.stamp_s[pair.fitted]

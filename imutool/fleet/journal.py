@@ -24,7 +24,7 @@ import msgspec
 from imutool import __version__
 from imutool.errors import ConfigError
 from imutool.fleet.task import Result, Settings
-from imutool.location import Place, failures, reason
+from imutool.location import Location, failures, reason
 
 NAME = "fleet.journal"
 PIECE_BYTES = 256 << 10  # of a journal in a store
@@ -59,7 +59,7 @@ class Journal:
             `overwrite`); another process writes to it; or it cannot be written.
     """
 
-    def __init__(self, out: Place, settings: Settings, *, resume: bool = False, overwrite: bool = False) -> None:
+    def __init__(self, out: Location, settings: Settings, *, resume: bool = False, overwrite: bool = False) -> None:
         self.path = out / NAME
         self._begun: set[str] = set()
         self._done: dict[str, int] = {}
@@ -190,9 +190,9 @@ class Journal:
 class _Pieces:
     """A journal in a store; `file` gets what is there."""
 
-    def __init__(self, folder: Place, file: IO[bytes]) -> None:
+    def __init__(self, folder: Location, file: IO[bytes]) -> None:
         self._folder, self._held = folder, bytearray()
-        there: list[Place] = sorted(folder.glob("*.jsonl"), key=str)
+        there: list[Location] = sorted(folder.glob("*.jsonl"), key=str)
         for piece in there:
             raw = piece.read_bytes()
             file.write(raw if raw.endswith(b"\n") or not raw else raw + b"\n")

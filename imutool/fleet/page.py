@@ -16,7 +16,7 @@ from jaxtyping import Float64
 from imutool import __version__
 from imutool.fleet.robots import FEWEST, Compared, Outlier
 from imutool.fleet.task import Result, Settings
-from imutool.location import Place
+from imutool.location import Location
 from imutool.mcap_io.storage.target import Target
 from imutool.viewing.html.drawing import apart, svg
 from imutool.viewing.html.page import cards, document, text
@@ -35,8 +35,8 @@ OWN_STYLE = """
 class Links:
     """The way from the page to what lies below OUT: relative where both are on one disk, so that both can be moved together."""
 
-    page: Place
-    out: Place | None
+    page: Location
+    out: Location | None
 
     def to(self, name: str) -> str:
         """An address that a browser takes as it is, whatever the log is called."""
@@ -91,9 +91,9 @@ class _Seen:
 def write(
     results: Iterable[Result],
     settings: Settings,
-    path: Place,
+    path: Location,
     *,
-    out: Place | None = None,
+    out: Location | None = None,
     seconds: float,
     source: str,
     compared: Compared | None = None,

@@ -9,7 +9,7 @@ from typing import Any
 from imutool import __version__
 from imutool.errors import ConfigError
 from imutool.fleet.task import Result
-from imutool.location import Place
+from imutool.location import Location
 from imutool.mcap_io.storage.target import Target
 
 NAME = "fleet.parquet"
@@ -32,7 +32,7 @@ def arrow() -> Any:
     return pa
 
 
-def write(results: Iterable[Result], path: Place) -> None:
+def write(results: Iterable[Result], path: Location) -> None:
     """Writes the rows, in the order in which they come; an earlier file is replaced once this one is whole.
 
     Raises:

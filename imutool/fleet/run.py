@@ -22,7 +22,7 @@ from imutool.fleet.robots import Compared, compare
 from imutool.fleet.sources import Found, find, leftovers, remove
 from imutool.fleet.task import FINAL, Result, Settings, Source, Task
 from imutool.fleet.work import called, page_name, write_json
-from imutool.location import Place, place
+from imutool.location import Location, to_location
 
 LOST = 3  # something of a log was lost, or a log was quarantined
 COMPARED = "fleet.json"
@@ -82,7 +82,7 @@ class FleetReport:
     """What came of a fleet; `trouble` is of the logs that are not whole, the first thousand."""
 
     source: str
-    out: Place
+    out: Location
     command: str
     tally: Tally
     seconds: float
@@ -126,7 +126,7 @@ def run(
     resume: bool = False,
     overwrite: bool = False,
     recheck: bool = False,
-    page: Place | None = None,
+    page: Location | None = None,
     tell: Tell = lambda done, total, words: None,
 ) -> FleetReport:
     """Does what `settings` say to every log of `source`, into `out`, and writes fleet.parquet there and the page where asked.
@@ -170,7 +170,7 @@ def run(
         return _told(fleet, journal, source, tally, began, page)
 
 
-def _told(fleet: _Fleet, journal: Journal, source: str, tally: Tally, began: float, page: Place | None) -> FleetReport:
+def _told(fleet: _Fleet, journal: Journal, source: str, tally: Tally, began: float, page: Location | None) -> FleetReport:
     """Everything that is made of the results: read from the journal as often as it takes, never held."""
     settings, out = fleet.settings, fleet.out
     results.write(fleet.results(journal), out / results.NAME)
@@ -192,7 +192,7 @@ def _told(fleet: _Fleet, journal: Journal, source: str, tally: Tally, began: flo
 class _Fleet:
     """What is to be done, made up as it is asked for: a million logs are a million small tuples, not tasks."""
 
-    def __init__(self, found: Found, out: Place, settings: Settings, overwrite: bool, recheck: bool) -> None:
+    def __init__(self, found: Found, out: Location, settings: Settings, overwrite: bool, recheck: bool) -> None:
         self.found, self.out, self.settings = found, out, settings
         self._overwrite, self._recheck = overwrite, recheck
         self.skipped: set[str] = set()
@@ -259,7 +259,7 @@ class _Fleet:
         return not (self._overwrite or journal.ours(name)) and (self.out / name).exists()
 
 
-def _refuse_strangers(out: Place, page: Place | None) -> None:
+def _refuse_strangers(out: Location, page: Location | None) -> None:
     """Refuses to write over what no fleet has written.
 
     Raises:
@@ -272,7 +272,7 @@ def _refuse_strangers(out: Place, page: Place | None) -> None:
             raise ConfigError("the target exists", where=out / name, fix="Choose another OUT, or add --overwrite")
 
 
-def _is_page(path: Place) -> bool:
+def _is_page(path: Location) -> bool:
     """Whether a file is a page about a fleet."""
     if not path.is_file():
         return False
@@ -292,6 +292,6 @@ def _key(where: str) -> str:
     return hashlib.sha256(where.encode()).hexdigest()
 
 
-def _out(text: str) -> Place:
-    out = place(text)
+def _out(text: str) -> Location:
+    out = to_location(text)
     return out.absolute() if isinstance(out, Path) else out

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 from imutool.errors import ConfigError
 from imutool.fleet.task import Source
-from imutool.location import Place, failures, identity, place, reason, seal
+from imutool.location import Location, failures, identity, reason, seal, to_location
 
 LOG, BAG = ".mcap", ".bag"
 PATTERN = re.compile(r"[*?\[]")
@@ -34,7 +34,7 @@ class _File(NamedTuple):
     about: dict[str, Any] | None = None
 
 
-def find(text: str, out: Place, *, bags: bool = False) -> Found:
+def find(text: str, out: Location, *, bags: bool = False) -> Found:
     """The logs that a path, a glob, a folder or a URL names, with `bags` ROS 1 bags too; what lies below `out` is no source.
 
     A log is called by its path from the folder, or from the last part of a pattern before its first wildcard; a log alone by
@@ -93,7 +93,7 @@ def _shown(name: str) -> str:
 
 def _files(text: str, endings: tuple[str, ...]) -> tuple[str, Iterator[_File]]:
     """Where names begin, and the files."""
-    where = place(text)
+    where = to_location(text)
     if not isinstance(where, Path):
         return _in_store(text, endings)
     if where.is_dir():
@@ -132,7 +132,7 @@ def _in_store(text: str, endings: tuple[str, ...]) -> tuple[str, Iterator[_File]
     """As `_files`, by listings alone: a thousand objects a request."""
     match = PATTERN.search(text)
     fixed = text.rstrip("/") if match is None else text[: match.start()].rpartition("/")[0]
-    root = place(fixed)
+    root = to_location(fixed)
     assert not isinstance(root, Path), "who calls has seen that it is none"
     try:
         if match is None:
@@ -148,7 +148,7 @@ def _in_store(text: str, endings: tuple[str, ...]) -> tuple[str, Iterator[_File]
     )
 
 
-def within(out: Place, name: str) -> Place:
+def within(out: Location, name: str) -> Location:
     """The target of a name below OUT.
 
     Raises:
@@ -162,7 +162,7 @@ def within(out: Place, name: str) -> Place:
     return target
 
 
-def leftovers(out: Place, names: Iterable[str]) -> Iterator[Place]:
+def leftovers(out: Location, names: Iterable[str]) -> Iterator[Location]:
     """Files that were being written beside these targets when somebody was killed: .NAME.PID.RANDOM.partial."""
     folders: dict[str, set[str]] = {}
     for name in names:
@@ -175,7 +175,7 @@ def leftovers(out: Place, names: Iterable[str]) -> Iterator[Place]:
                 yield path
 
 
-def remove(leftover: Iterable[Place]) -> None:
+def remove(leftover: Iterable[Location]) -> None:
     """Removes them, unless somebody else has meanwhile.
 
     Raises:
@@ -190,7 +190,7 @@ def remove(leftover: Iterable[Place]) -> None:
             raise ConfigError(f"cannot be removed ({reason(error)})", where=path) from error
 
 
-def _partial(folder: Place) -> list[Place]:
+def _partial(folder: Location) -> list[Location]:
     try:
         return list(folder.glob(".*.partial"))
     except failures(folder) as error:

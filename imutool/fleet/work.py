@@ -23,7 +23,7 @@ from imutool.diagnosis_output import plain
 from imutool.errors import ConfigError, ImutoolError, LogError, ModelError
 from imutool.fleet.sources import leftovers, remove, within
 from imutool.fleet.task import Imu, Parameter, Result, Settings, Task
-from imutool.location import Place, identity, place
+from imutool.location import Location, identity, to_location
 from imutool.mcap_io.log import Log
 from imutool.mcap_io.storage.digest import sha256
 from imutool.mcap_io.storage.target import Target
@@ -39,8 +39,8 @@ class _Job:
     """A task with its places opened up."""
 
     name: str
-    source: Place
-    target: Place
+    source: Location
+    target: Location
     settings: Settings
 
 
@@ -62,7 +62,10 @@ def work(task: Task, model: bytes | None = None) -> Result:
     )
     try:
         job = _Job(
-            task.source.name, place(task.source.place), within(place(task.out), task.target), _at_hand(task.settings, model)
+            task.source.name,
+            to_location(task.source.place),
+            within(to_location(task.out), task.target),
+            _at_hand(task.settings, model),
         )
         if task.done is not None and stands(task.done, job.target, whole=task.recheck):
             return msgspec.structs.replace(task.done, status="skipped", earlier=task.done.status)
@@ -89,7 +92,7 @@ def page_name(log: str) -> str:
     return log.removesuffix(".mcap") + ".html"
 
 
-def stands(done: Result, target: Place, *, whole: bool = False) -> bool:
+def stands(done: Result, target: Location, *, whole: bool = False) -> bool:
     """Whether a target is still what an earlier run left: of its size, and a log that opens; with `whole`, of its SHA-256."""
     if done.status == "quarantined":  # nothing was written
         return True
@@ -122,20 +125,20 @@ def _at_hand(settings: Settings, model: bytes | None) -> Settings:
     return msgspec.structs.replace(settings, model=str(there))
 
 
-def _refuse_changed(task: Task, source: Place) -> None:
+def _refuse_changed(task: Task, source: Location) -> None:
     """A log that is still being written is left for another time."""
     if identity(source) != (task.source.size, task.source.stamp):
         raise LogError("has changed since it was listed", where=source, fix="Go on with --resume when it is complete")
 
 
-def _clear(task: Task, target: Place) -> None:
+def _clear(task: Task, target: Location) -> None:
     """Makes the folder, and removes what a killed attempt at this target left in it."""
     if isinstance(target, Path):
         target.parent.mkdir(parents=True, exist_ok=True)
-    remove(leftovers(place(task.out), [task.target, page_name(task.target)]))
+    remove(leftovers(to_location(task.out), [task.target, page_name(task.target)]))
 
 
-def _measured(target: Place) -> dict[str, Any]:
+def _measured(target: Location) -> dict[str, Any]:
     return {"target_bytes": identity(target)[0], "target_sha256": sha256(target)}
 
 
@@ -226,7 +229,7 @@ def _diagnose(job: _Job) -> dict[str, Any]:
 
     s = job.settings
     robot = robot_of(job.name, s.robot_from, job.source)
-    sim = None if s.sim is None else _simulation(place(s.sim), job.name)
+    sim = None if s.sim is None else _simulation(to_location(s.sim), job.name)
     fixed = measured(job.source, sim, imu=s.imu, truth=s.truth)
     parameters = tuple(
         Parameter(physics.name, number.name, float(value), float(std), number.unit)
@@ -245,7 +248,7 @@ def _diagnose(job: _Job) -> dict[str, Any]:
     return told
 
 
-def robot_of(name: str, pattern: str | None, log: Place) -> str:
+def robot_of(name: str, pattern: str | None, log: Location) -> str:
     """Whose log it is: as a pattern says of its name, or `metadata:RECORD.KEY` of what it holds; else its folder's name.
 
     Raises:
@@ -286,7 +289,7 @@ def robot_pattern(pattern: str | None) -> re.Pattern[str] | str | None:
         raise ConfigError(f"{pattern!r} is no pattern ({error})", where="--robot-from") from error
 
 
-def _simulation(folder: Place, name: str) -> Place:
+def _simulation(folder: Location, name: str) -> Location:
     """The simulation of a log: of the same name in another folder; a file serves for all."""
     found = folder if folder.suffix == ".mcap" else folder / name
     if not found.is_file():
@@ -294,7 +297,7 @@ def _simulation(folder: Place, name: str) -> Place:
     return found
 
 
-def write_json(report: Mapping[str, Any], target: Place) -> None:
+def write_json(report: Mapping[str, Any], target: Location) -> None:
     """Writes values as JSON, in place of what is there."""
     with Target(target, overwrite=True) as out:
         out.write(json.dumps(report, indent=2, allow_nan=False, ensure_ascii=False).encode() + b"\n")

@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Float64, Int64, UInt8
 
 from imutool.errors import LogError
-from imutool.location import Place
+from imutool.location import Location
 from imutool.mcap_io.batches import Clock
 from imutool.mcap_io.codec import ros2_definition
 from imutool.mcap_io.codec.records import Rows
@@ -45,7 +45,7 @@ class Fields:
         return len(self.t_ns)
 
 
-def read_field(path: Place, signal: str) -> Fields:
+def read_field(path: Location, signal: str) -> Fields:
     """One signal of a log, named TOPIC.field.
 
     Raises:
@@ -56,7 +56,7 @@ def read_field(path: Place, signal: str) -> Fields:
     return read_fields(path, [signal])[signal]
 
 
-def read_fields(path: Place, signals: Sequence[str]) -> dict[str, Fields]:
+def read_fields(path: Location, signals: Sequence[str]) -> dict[str, Fields]:
     """Several signals of a log, in one pass over it.
 
     Raises:
@@ -111,7 +111,7 @@ def numeric_fields(log: Log, topic: str, *, long: bool = True) -> list[str]:
     return []
 
 
-def others(path: Place, signal: str, most: int = MOST_OTHERS) -> dict[str, Fields]:
+def others(path: Location, signal: str, most: int = MOST_OTHERS) -> dict[str, Fields]:
     """Every other number of a log that varies, by TOPIC.field: what might drive a signal. Stamps and covariances are not asked.
 
     What cannot serve is left out: constants, NaN, stamps that go back, long arrays (images), topics without a definition, what

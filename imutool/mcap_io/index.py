@@ -60,7 +60,7 @@ class Block:
         return known is None or not channels.isdisjoint(known)
 
 
-class Structure:
+class LogIndex:
     """The chart of one log.
 
     Raises:

@@ -15,14 +15,14 @@ from mcap.opcode import Opcode
 from mcap.records import Metadata
 
 from imutool.errors import DataError, LogError
-from imutool.location import Place
+from imutool.location import Location
 from imutool.mcap_io.batches import Clock, ImuBatch, PoseBatch, ScalarBatch, finite
 from imutool.mcap_io.codec import records, schemas
 from imutool.mcap_io.codec.decode import TwistColumns, decode_image, decode_imu, decode_poses, decode_scalars, decode_twist
 from imutool.mcap_io.codec.records import HEAD
-from imutool.mcap_io.index import Block, Span, Structure
+from imutool.mcap_io.index import Block, LogIndex, Span
 from imutool.mcap_io.losses import Losses
-from imutool.mcap_io.recovery.recovered_index import Salvaged
+from imutool.mcap_io.recovery.recovered_index import RecoveredIndex
 from imutool.mcap_io.storage.memory import keep_buffers
 from imutool.mcap_io.storage.source import Source
 from imutool.mcap_io.topics import DERIVED_KEY, ENCODINGS, MESSAGE_POSES, SCALARS, Topic, topics_of
@@ -41,13 +41,13 @@ class Log:
         LogError: empty, not an MCAP log, cut short or damaged; with `salvage`, if there is nothing in it to be saved.
     """
 
-    def __init__(self, path: Place, *, salvage: bool = False) -> None:
+    def __init__(self, path: Location, *, salvage: bool = False) -> None:
         keep_buffers()
         self.path = path
         self._source = Source(path)
         try:
             with self.named():
-                self.structure = Salvaged(self._source) if salvage else Structure(self._source)
+                self.structure = RecoveredIndex(self._source) if salvage else LogIndex(self._source)
                 self.topics = MappingProxyType(topics_of(self.structure))
         except BaseException:
             self._source.file.close()

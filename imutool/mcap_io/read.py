@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float64, Int64, UInt32
 
 from imutool.errors import LogError
-from imutool.location import Place
+from imutool.location import Location
 from imutool.mcap_io.batches import Clock, finite
 from imutool.mcap_io.codec import records, schemas
 from imutool.mcap_io.codec.decode import decode_image
@@ -29,7 +29,7 @@ OWN_KEYS = ("writer", "name", "source", "imu_topic", SHADOWED_KEY)
 
 
 def read(
-    path: Place,
+    path: Location,
     *,
     imu: str | None = None,
     truth: str | None = None,
@@ -273,7 +273,7 @@ def _format(log: Log, topic: str) -> str:
     return ""
 
 
-def _opener(path: Place, topic: str, start_ns: int | None, end_ns: int | None) -> Callable[[], Iterator[tuple[int, bytes]]]:
+def _opener(path: Location, topic: str, start_ns: int | None, end_ns: int | None) -> Callable[[], Iterator[tuple[int, bytes]]]:
     def each() -> Iterator[tuple[int, bytes]]:
         with Log(path) as log:
             yield from log.images(topic, start_ns, end_ns)

@@ -21,11 +21,11 @@ from mcap.records import AttachmentIndex, ChunkIndex, Metadata, MetadataIndex
 
 import imutool
 from imutool.errors import ConfigError, ImutoolError, LogError
-from imutool.location import Place, failures, same
+from imutool.location import Location, failures, same
 from imutool.mcap_io.codec import records
 from imutool.mcap_io.codec.attachment import Attached
 from imutool.mcap_io.codec.records import CHUNK_HEAD, HEAD
-from imutool.mcap_io.index import Block, Span, Structure
+from imutool.mcap_io.index import Block, LogIndex, Span
 from imutool.mcap_io.log import Log
 from imutool.mcap_io.losses import Loss, Losses
 from imutool.mcap_io.storage.source import Source
@@ -57,8 +57,8 @@ class RepairReport:
 
 
 def repair(
-    source: Place,
-    target: Place,
+    source: Location,
+    target: Location,
     *,
     damaged: str = "drop",
     overwrite: bool = False,
@@ -114,7 +114,7 @@ def repair(
             return RepairReport(losses, messages, len(out.contents.chunks), len(kept), size, out.target.position)
 
 
-def _told(source: Place, damaged: str, losses: Losses) -> dict[str, str]:
+def _told(source: Location, damaged: str, losses: Losses) -> dict[str, str]:
     """The metadata record."""
     found = losses.plain()
     unknown = {key: "unknown" if value is None else value for key, value in found.items() if key != "whole"}
@@ -125,7 +125,7 @@ def _told(source: Place, damaged: str, losses: Losses) -> dict[str, str]:
 class _Saved:
     """The part of a log that goes on, item by item."""
 
-    def __init__(self, structure: Structure, losses: Losses, out: LogWriter) -> None:
+    def __init__(self, structure: LogIndex, losses: Losses, out: LogWriter) -> None:
         self.structure, self.source, self.losses, self.out = structure, structure.source, losses, out
         out.contents.schemas.update(sorted(structure.schemas.items()))
         out.contents.channels.update(sorted(structure.channels.items()))
@@ -239,7 +239,7 @@ def _keep(out: LogWriter, source: Source, loss: Loss) -> None:
 
 
 @contextmanager
-def repaired(source: Place, beside: Place) -> Iterator[tuple[Place, Losses] | None]:
+def repaired(source: Location, beside: Location) -> Iterator[tuple[Location, Losses] | None]:
     """A repaired copy of a damaged log in the folder of `beside`, for as long as it is needed; None if the log is whole.
 
     Raises:

@@ -25,12 +25,12 @@ from mcap.opcode import Opcode
 from mcap.records import AttachmentIndex, ChunkIndex, Metadata, MetadataIndex
 
 from imutool.errors import ConfigError, LogError
-from imutool.location import Place, identity, same
+from imutool.location import Location, identity, same
 from imutool.mcap_io.added_topics import Derived, Stream
 from imutool.mcap_io.codec import records
 from imutool.mcap_io.codec import schemas as schema
 from imutool.mcap_io.codec.records import HEAD, ChunkHead
-from imutool.mcap_io.index import Block, Span, Structure
+from imutool.mcap_io.index import Block, LogIndex, Span
 from imutool.mcap_io.listing import Listing, described, head, listing
 from imutool.mcap_io.log import Log
 from imutool.mcap_io.passthrough import Passage
@@ -58,8 +58,8 @@ class RewriteReport:
 
 
 def rewrite(
-    source: Place,
-    target: Place | None,
+    source: Location,
+    target: Location | None,
     derived: Sequence[Derived],
     *,
     metadata: Values | Callable[[Verified], Values],
@@ -127,7 +127,7 @@ def _refuse_taken(log: Log, derived: Sequence[Derived]) -> None:
                 )
 
 
-def _compression(structure: Structure) -> str:
+def _compression(structure: LogIndex) -> str:
     """New chunks are packed as the source's first chunk is; a log without chunks gets them unpacked."""
     return next((b.compression for b in structure.blocks if b.compression is not None), "none")
 

@@ -8,7 +8,7 @@ from types import MappingProxyType
 
 from imutool.errors import LogError
 from imutool.mcap_io.codec import schemas
-from imutool.mcap_io.index import Structure
+from imutool.mcap_io.index import LogIndex
 
 ENCODINGS = ("cdr", "ros1")
 DERIVED_KEY = "imutool_source_topic"  # channel metadata: computed by imutool from this topic
@@ -29,7 +29,7 @@ class Topic:
     metadata: Mapping[str, str]
 
 
-def topics_of(structure: Structure) -> dict[str, Topic]:
+def topics_of(structure: LogIndex) -> dict[str, Topic]:
     """The topics of a log by their names, in order of their channel ids.
 
     Raises:

@@ -15,11 +15,11 @@ from mcap.opcode import Opcode
 from mcap.records import AttachmentIndex, DataEnd, MetadataIndex, SummaryOffset
 
 from imutool.errors import ConfigError, LogError
-from imutool.location import Place
+from imutool.location import Location
 from imutool.mcap_io.codec import records
 from imutool.mcap_io.codec.crc import crc32
 from imutool.mcap_io.codec.records import FOOTER_SIZE, HEAD, MAGIC
-from imutool.mcap_io.index import Block, Span, Structure
+from imutool.mcap_io.index import Block, LogIndex, Span
 from imutool.mcap_io.listing import described
 from imutool.mcap_io.log import Log
 from imutool.mcap_io.storage.source import Source
@@ -47,7 +47,7 @@ def refuse_unknown(mode: str) -> None:
 
 
 def verify(
-    path: Place,
+    path: Location,
     counts: Mapping[int, int],
     *,
     unpacked: Collection[int] | None = None,
@@ -85,7 +85,7 @@ class _Sums:
         self.counts: Counter[int] = Counter()
         self.start_ns, self.end_ns = 2**64, 0
 
-    def take(self, structure: Structure, block: Block, *, whole: bool) -> None:
+    def take(self, structure: LogIndex, block: Block, *, whole: bool) -> None:
         """Checks a block, and its messages if it is to be taken `whole`."""
         if block.compression is None:
             raise LogError(f"messages lie outside chunks at byte {block.offset}", expected="chunks alone")
@@ -105,7 +105,7 @@ class _Sums:
             self.counts[channel] += count
         self.start_ns, self.end_ns = min(self.start_ns, listed.start_ns), max(self.end_ns, listed.end_ns)
 
-    def compare(self, structure: Structure, counts: Mapping[int, int]) -> None:
+    def compare(self, structure: LogIndex, counts: Mapping[int, int]) -> None:
         """Holds the sums against the log's statistics, and against what should be there."""
         told = structure.statistics
         if self.counts != Counter(counts):
@@ -120,7 +120,7 @@ class _Sums:
             raise LogError(f"the statistics say the messages end at {told.message_end_time} ns", expected=str(self.end_ns))
 
 
-def _summary(structure: Structure) -> None:
+def _summary(structure: LogIndex) -> None:
     """Follows the summary: its groups are where its offsets say, its indexes lead to records of their kind."""
     source, footer = structure.source, structure.footer
     start, end = footer.summary_start, source.size - len(MAGIC) - FOOTER_SIZE
@@ -155,7 +155,7 @@ def _summary(structure: Structure) -> None:
         raise LogError("the statistics count other attachments, metadata or chunks than the summary lists")
 
 
-def _attachments(structure: Structure) -> None:
+def _attachments(structure: LogIndex) -> None:
     """The CRC of every attachment that states one."""
     for item in structure.items:
         if isinstance(item, Span) and item.opcode == Opcode.ATTACHMENT:
@@ -178,7 +178,7 @@ def crc_of(source: Source, start: int, end: int, crc: int = 0) -> int:
     return crc
 
 
-def stated_crc(structure: Structure) -> int:
+def stated_crc(structure: LogIndex) -> int:
     """The CRC of the data section that the log states; 0 where it states none."""
     opcode, length = structure.source.head(structure.data_end)
     if opcode != Opcode.DATA_END:
@@ -187,7 +187,7 @@ def stated_crc(structure: Structure) -> int:
     return int(records.parse(DataEnd, body, structure.data_end).data_section_crc)
 
 
-def check_data_crc(structure: Structure, crc: int) -> None:
+def check_data_crc(structure: LogIndex, crc: int) -> None:
     """Refuses a log whose data section has another CRC than it states.
 
     Raises:

@@ -18,7 +18,7 @@ from jaxtyping import Int64, Shaped, UInt8
 
 import imutool
 from imutool.errors import DataError
-from imutool.location import Place
+from imutool.location import Location
 from imutool.mcap_io.codec import records, schemas
 from imutool.mcap_io.codec.encode import encode_float, encode_image, encode_imu, encode_pose, encode_transform, encode_vector3
 from imutool.mcap_io.read import OWN_KEYS, RECORD, SHADOWED_KEY, UNIT_KEY, VELOCITY_KEY
@@ -46,7 +46,7 @@ class Series(NamedTuple):
         return records.message_rows(self.channel, times, times, sequence, payload)
 
 
-def write(recording: Recording, path: Place, *, compression: str = "zstd", overwrite: bool = False) -> None:
+def write(recording: Recording, path: Location, *, compression: str = "zstd", overwrite: bool = False) -> None:
     """Writes a recording as a log, which `read` gives back bit for bit. Log time, publish time and stamp are one.
 
     Raises:

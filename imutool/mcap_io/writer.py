@@ -28,7 +28,7 @@ from mcap.records import (
 
 import imutool
 from imutool.errors import DataError
-from imutool.location import Place
+from imutool.location import Location
 from imutool.mcap_io.codec import records
 from imutool.mcap_io.codec import schemas as schema
 from imutool.mcap_io.codec.chunk_index import ChunkIndexes
@@ -118,7 +118,7 @@ class LogWriter:
 
     def __init__(
         self,
-        path: Place,
+        path: Location,
         *,
         compression: str = "zstd",
         overwrite: bool = False,

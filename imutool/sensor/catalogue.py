@@ -6,19 +6,19 @@ from collections.abc import Sequence
 
 from imutool import registry
 from imutool.errors import ConfigError
-from imutool.sensor.effect import Physics
-from imutool.sensor.linear_effect import Effect, Sensor
+from imutool.sensor.effect import Effect
+from imutool.sensor.linear_effect import LinearEffect, Sensor
 
 GROUP = "imutool.effects"
 
 
-def known(sensor: Sensor) -> tuple[Effect, ...]:
+def known(sensor: Sensor) -> tuple[LinearEffect, ...]:
     """Every effect with a closed form that acts on a sensor, by name."""
     modules = registry.every(GROUP).values()
     return tuple(module.effect(sensor) for module in modules if sensor in getattr(module, "SENSORS", ()))
 
 
-def named(sensor: Sensor, names: Sequence[str]) -> tuple[Effect, ...]:
+def named(sensor: Sensor, names: Sequence[str]) -> tuple[LinearEffect, ...]:
     """Some effects on a sensor, in the order of their names.
 
     Raises:
@@ -36,16 +36,16 @@ def named(sensor: Sensor, names: Sequence[str]) -> tuple[Effect, ...]:
     return tuple(found)
 
 
-def physics(names: Sequence[str] | None = None) -> tuple[Physics, ...]:
+def physics(names: Sequence[str] | None = None) -> tuple[Effect, ...]:
     """Every effect that can be simulated, by name; or some, in the order of their names.
 
     Raises:
         ConfigError: an unknown name (the nearest is given), or that of an effect that is fitted alone and not simulated.
     """
     modules = list(registry.every(GROUP).values()) if names is None else [registry.load(GROUP, name) for name in names]
-    found = tuple(module.PHYSICS for module in modules if hasattr(module, "PHYSICS"))
+    found = tuple(module.EFFECT for module in modules if hasattr(module, "EFFECT"))
     if names is not None and len(found) < len(names):
-        lacking = next(name for name, module in zip(names, modules, strict=True) if not hasattr(module, "PHYSICS"))
+        lacking = next(name for name, module in zip(names, modules, strict=True) if not hasattr(module, "EFFECT"))
         listed = ", ".join(one.name for one in physics())
         raise ConfigError(f"{lacking} cannot be simulated", where="effects", expected=f"some of {listed}")
     return found

@@ -1,16 +1,16 @@
 """The forward side of an effect: what it makes of the ideal signals, in the order in which they meet it.
 
-A file of an effect names it `PHYSICS`. Its `forward` takes ideal signals and parameters and gives what comes out; nothing else
+A file of an effect names it `EFFECT`. Its `forward` takes ideal signals and parameters and gives what comes out; nothing else
 is needed to simulate it, and the estimator differentiates it by differences. Effects act in the order of their `stage`:
 
 | stage | acts on | effects |
 |---|---|---|
-| MOTION | `Felt` | what the point where the sensor sits feels: gravity, earth_rotation, lever_arm, size_effect, vibration |
-| MOUNT | `Felt` | how the sensor sits: mount_resonance, mount_rotation |
-| BANDWIDTH | `Felt` | what it is too slow for: low_pass |
+| MOTION | `IdealMotion` | what the point where the sensor sits feels: gravity, earth_rotation, lever_arm, size_effect, vibration |
+| MOUNT | `IdealMotion` | how the sensor sits: mount_resonance, mount_rotation |
+| BANDWIDTH | `IdealMotion` | what it is too slow for: low_pass |
 | CLOCK | times | when samples are taken: clock_offset, clock_skew, clock_jump |
-| SENSOR | `Read` | scale, misalignment, nonlinearity, g-sensitivity, temperature, drift, bias |
-| CONVERTER | `Read` | saturation, then quantization |
+| SENSOR | `SensorSamples` | scale, misalignment, nonlinearity, g-sensitivity, temperature, drift, bias |
+| CONVERTER | `SensorSamples` | saturation, then quantization |
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from jaxtyping import Float64
 
 from imutool.errors import DataError
 from imutool.sensor.linear_effect import AXES, Sensor
-from imutool.sensor.readings import Felt, Read, Times
+from imutool.sensor.readings import IdealMotion, SensorSamples, Times
 
 Theta = Float64[np.ndarray, "_"]  # effects that act together have numbers of their own, so this length binds no other
 
@@ -42,10 +42,10 @@ class Stage(IntEnum):
 
 
 @dataclass(frozen=True)
-class Number:
+class Parameter:
     """A parameter: name, unit, plausible size (one standard deviation of what is met), whether it is positive by nature.
 
-    `nothing` is the value at which the effect does nothing: 0, or infinity (a cut-off frequency, a limit). A number that
+    `null_value` is the value at which the effect does nothing: 0, or infinity (a cut-off frequency, a limit). A number that
     matters only beside an amplitude (a time constant, a frequency) has its plausible size there: any value would do.
     `step`, where given, is the largest one whose difference is still a derivative, of the logarithm if `positive`. `begins`: it
     is the time (s from the log's start) at which the effect sets in, never if infinite; nothing is smooth in it, so all times
@@ -56,13 +56,13 @@ class Number:
     unit: str
     plausible: float
     positive: bool = False
-    nothing: float = 0.0
+    null_value: float = 0.0
     step: float | None = None
     begins: bool = False
 
 
 @dataclass(frozen=True)
-class Physics:
+class Effect:
     """An effect as it acts.
 
     forward: (Felt, theta) -> Felt up to BANDWIDTH; (taken_s, theta) -> taken_s at CLOCK; (Read, theta) -> Read after.
@@ -77,12 +77,12 @@ class Physics:
     stage: Stage
     sensors: tuple[Sensor, ...]
     equation: str
-    parameters: tuple[Number, ...]
+    parameters: tuple[Parameter, ...]
     seen_if: str
     forward: Callable[[Any, Theta], Any]
     linear: bool = True
-    starts: Callable[[Felt, Read], Sequence[Theta]] | None = None
-    alternatives: Callable[[Read], int] | None = None
+    starts: Callable[[IdealMotion, SensorSamples], Sequence[Theta]] | None = None
+    alternatives: Callable[[SensorSamples], int] | None = None
     needs: tuple[str, ...] = ()
 
     @property
@@ -91,19 +91,19 @@ class Physics:
         return np.array([number.plausible for number in self.parameters])
 
     @property
-    def nothing(self) -> Theta:
+    def null_value(self) -> Theta:
         """The parameters at which it does nothing."""
-        return np.array([number.nothing for number in self.parameters])
+        return np.array([number.null_value for number in self.parameters])
 
 
-def each_axis(unit: str, plausible: float, before: str = "") -> tuple[Number, ...]:
+def each_axis(unit: str, plausible: float, before: str = "") -> tuple[Parameter, ...]:
     """One number for each axis, its name perhaps with a word before."""
-    return tuple(Number(before + axis, unit, plausible) for axis in AXES)
+    return tuple(Parameter(before + axis, unit, plausible) for axis in AXES)
 
 
-def each_pair(unit: str, plausible: float, *, diagonal: bool = True, before: str = "") -> tuple[Number, ...]:
+def each_pair(unit: str, plausible: float, *, diagonal: bool = True, before: str = "") -> tuple[Parameter, ...]:
     """One number for each entry of a 3x3 matrix, row by row: `xy` is what y adds to x."""
-    return tuple(Number(before + a + b, unit, plausible) for a in AXES for b in AXES if diagonal or a != b)
+    return tuple(Parameter(before + a + b, unit, plausible) for a in AXES for b in AXES if diagonal or a != b)
 
 
 def matrix(theta: Float64[np.ndarray, "6"]) -> Float64[np.ndarray, "3 3"]:
@@ -113,7 +113,7 @@ def matrix(theta: Float64[np.ndarray, "6"]) -> Float64[np.ndarray, "3 3"]:
     return out
 
 
-def attitude(felt: Felt, effect: str) -> Float64[np.ndarray, "n 3 3"]:
+def attitude(felt: IdealMotion, effect: str) -> Float64[np.ndarray, "n 3 3"]:
     """R_wb, for an effect that needs it.
 
     Raises:
@@ -124,63 +124,63 @@ def attitude(felt: Felt, effect: str) -> Float64[np.ndarray, "n 3 3"]:
     return felt.R_wb
 
 
-def misfit(felt: Felt, samples: Read) -> tuple[Float64[np.ndarray, "n 3"], Float64[np.ndarray, "n 3"]]:
+def misfit(felt: IdealMotion, samples: SensorSamples) -> tuple[Float64[np.ndarray, "n 3"], Float64[np.ndarray, "n 3"]]:
     """Samples minus the ideal at the same stamps: gyro (rad/s), accel (m/s²). Good enough to start a fit from."""
     ideal = felt.taken(samples.stamp_s, samples.stamp_s)
     return samples.gyro - ideal.gyro, samples.accel - ideal.accel
 
 
 CONVERTER_ORDER = {"saturation": 1, "quantization": 2}
-Acting = Sequence[tuple[Physics, Theta]]
+Acting = Sequence[tuple[Effect, Theta]]
 
 
 @dataclass(frozen=True, eq=False)
-class Way:
+class SignalState:
     """How far signals have come: what is felt and when samples are taken of it, or, behind the clock, what is read."""
 
-    felt: Felt
+    felt: IdealMotion
     taken_s: Times
     stamp_s: Times
-    taken: Read | None = None
+    taken: SensorSamples | None = None
 
-    def through(self, physics: Physics, theta: Theta) -> Way:
+    def through(self, physics: Effect, theta: Theta) -> SignalState:
         """Behind one more effect, whose turn it is."""
         if physics.stage < Stage.CLOCK:
-            return Way(physics.forward(self.felt, theta), self.taken_s, self.stamp_s)
+            return SignalState(physics.forward(self.felt, theta), self.taken_s, self.stamp_s)
         if physics.stage == Stage.CLOCK:
-            return Way(self.felt, physics.forward(self.taken_s, theta), self.stamp_s)
-        return Way(self.felt, self.taken_s, self.stamp_s, physics.forward(self.arrived(), theta))
+            return SignalState(self.felt, physics.forward(self.taken_s, theta), self.stamp_s)
+        return SignalState(self.felt, self.taken_s, self.stamp_s, physics.forward(self.arrived(), theta))
 
-    def taking(self) -> Way:
+    def taking(self) -> SignalState:
         """With the samples taken: behind this, the clock and what is felt do not matter any more."""
-        return self if self.taken is not None else Way(self.felt, self.taken_s, self.stamp_s, self.arrived())
+        return self if self.taken is not None else SignalState(self.felt, self.taken_s, self.stamp_s, self.arrived())
 
-    def arrived(self) -> Read:
+    def arrived(self) -> SensorSamples:
         """One row a sample."""
         return self.felt.taken(self.taken_s, self.stamp_s) if self.taken is None else self.taken
 
 
-def read(felt: Felt, stamp_s: Times, acting: Acting) -> Read:
+def read(felt: IdealMotion, stamp_s: Times, acting: Acting) -> SensorSamples:
     """What a sensor with these effects reads at some stamps: the stages one after another, within a stage by name."""
-    way = Way(felt, np.asarray(stamp_s, dtype=np.float64), stamp_s)
-    for physics, theta in in_order(acting):
+    way = SignalState(felt, np.asarray(stamp_s, dtype=np.float64), stamp_s)
+    for physics, theta in in_stage_order(acting):
         way = way.through(physics, theta)
     return way.arrived()
 
 
-def sensed(taken: Read, acting: Acting) -> Read:
+def sensed(taken: SensorSamples, acting: Acting) -> SensorSamples:
     """What a sensor makes of samples that are taken: the stages behind CLOCK alone."""
-    for physics, theta in in_order(acting):
+    for physics, theta in in_stage_order(acting):
         if physics.stage > Stage.CLOCK:
             taken = physics.forward(taken, theta)
     return taken
 
 
-def in_order(acting: Acting) -> list[tuple[Physics, Theta]]:
+def in_stage_order(acting: Acting) -> list[tuple[Effect, Theta]]:
     """As they act."""
-    return sorted(acting, key=lambda pair: turn(pair[0]))
+    return sorted(acting, key=lambda pair: stage_order(pair[0]))
 
 
-def turn(physics: Physics) -> tuple[int, int, str]:
+def stage_order(physics: Effect) -> tuple[int, int, str]:
     """By which it is told when an effect acts."""
     return physics.stage, CONVERTER_ORDER.get(physics.name, 0), physics.name

@@ -22,7 +22,7 @@ Three = tuple[float, float, float]
 
 
 @dataclass(frozen=True)
-class Parameter:
+class LinearParameter:
     """A number of an effect: its name within the effect, its unit, and the size it plausibly has (one standard deviation)."""
 
     name: str
@@ -46,13 +46,13 @@ class AtWork:
 
 
 @dataclass(frozen=True)
-class Effect:
+class LinearEffect:
     """One effect on one sensor. It sees columns of the signals, or what a function makes of them."""
 
     name: str
     sensor: Sensor
     equation: str
-    parameters: tuple[Parameter, ...]
+    parameters: tuple[LinearParameter, ...]
     sees: slice | Callable[[Signals], Float64[np.ndarray, "n q"]]
     pattern: Float64[np.ndarray, "3 q p"]
     at_work: Callable[[Float64[np.ndarray, " p"]], AtWork] | None = None  # a quicker way than through many terms
@@ -117,7 +117,7 @@ class Together:
         return x, y, z
 
 
-def patterns(effects: Sequence[Effect]) -> Float64[np.ndarray, "3 q p"]:
+def patterns(effects: Sequence[LinearEffect]) -> Float64[np.ndarray, "3 q p"]:
     """The effects' patterns side by side: [axis, term, parameter]."""
     terms, parameters = (sum(effect.pattern.shape[k] for effect in effects) for k in (1, 2))
     out, q, p = np.zeros((3, terms, parameters)), 0, 0
@@ -128,7 +128,7 @@ def patterns(effects: Sequence[Effect]) -> Float64[np.ndarray, "3 q p"]:
     return out
 
 
-def compiled(effects: Sequence[Effect], theta: Float64[np.ndarray, " p"]) -> Together:
+def compiled(effects: Sequence[LinearEffect], theta: Float64[np.ndarray, " p"]) -> Together:
     """Some effects at work together, for given parameters in their order."""
     matrix, others = np.zeros((COUNT, 3)), []
     for effect in effects:
@@ -141,14 +141,14 @@ def compiled(effects: Sequence[Effect], theta: Float64[np.ndarray, " p"]) -> Tog
     return Together(matrix, tuple(others))
 
 
-def per_axis(unit: str, plausible: float) -> tuple[Parameter, ...]:
+def per_axis(unit: str, plausible: float) -> tuple[LinearParameter, ...]:
     """One parameter for each axis."""
-    return tuple(Parameter(axis, unit, plausible) for axis in AXES)
+    return tuple(LinearParameter(axis, unit, plausible) for axis in AXES)
 
 
-def per_pair(unit: str, plausible: float, *, diagonal: bool = True) -> tuple[Parameter, ...]:
+def per_pair(unit: str, plausible: float, *, diagonal: bool = True) -> tuple[LinearParameter, ...]:
     """One parameter for each entry of a 3x3 matrix, row by row: `xy` is what y adds to x."""
-    return tuple(Parameter(a + b, unit, plausible) for a in AXES for b in AXES if diagonal or a != b)
+    return tuple(LinearParameter(a + b, unit, plausible) for a in AXES for b in AXES if diagonal or a != b)
 
 
 def diagonal() -> Float64[np.ndarray, "3 3 3"]:

@@ -50,9 +50,9 @@ from imutool.config import Settings, build, toml
 from imutool.errors import ConfigError, DataError, ImutoolError
 from imutool.mcap_io.storage.target import Target
 from imutool.sensor import catalogue
-from imutool.sensor.effect import Number, Physics, Stage, Theta
+from imutool.sensor.effect import Effect, Parameter, Stage, Theta
 from imutool.sensor.linear_effect import AXES
-from imutool.sensor.readings import Read
+from imutool.sensor.readings import SensorSamples
 from imutool.sensor.variables import VARIABLES, factor, words
 
 SCHEMA = "imutool.physics/1"
@@ -66,7 +66,7 @@ Sensor = Literal["gyro", "accel"]
 Three = tuple[float, float, float]
 NotNegative = Annotated[float, Meta(ge=0.0)]
 ThreeStd = tuple[NotNegative, NotNegative, NotNegative]
-Known = Callable[[Sequence[str]], tuple[Physics, ...]]
+Known = Callable[[Sequence[str]], tuple[Effect, ...]]
 
 
 class Value(Settings, frozen=True, kw_only=True):
@@ -123,13 +123,13 @@ class PhysicsFile(Settings, frozen=True, kw_only=True):
     unknown: tuple[Curve, ...] = ()
     term: tuple[Term, ...] = ()
 
-    def acting(self, where: str | Path = "physics", known: Known = catalogue.physics) -> list[tuple[Physics, Theta]]:
+    def acting(self, where: str | Path = "physics", known: Known = catalogue.physics) -> list[tuple[Effect, Theta]]:
         """The effects as they act, each with its parameters; `known` finds them by name.
 
         Raises:
             ConfigError: an unknown effect, parameter, unit, signal, variable or term (the nearest is named), or a wrong value.
         """
-        found: list[tuple[Physics, Theta]] = []
+        found: list[tuple[Effect, Theta]] = []
         for k, entry in enumerate(self.effect):
             place = f"effect[{k}]"
             physics = _driven(entry, where, place) if entry.name == DRIVEN else _named(entry.name, known, where, place)
@@ -228,7 +228,7 @@ def _refuse_infinite(value: Any, where: Path, place: str = "") -> None:
 # ── effects by name ──
 
 
-def _named(name: str, known: Known, where: str | Path, place: str) -> Physics:
+def _named(name: str, known: Known, where: str | Path, place: str) -> Effect:
     try:
         (physics,) = known([name])
     except ImutoolError as error:
@@ -236,13 +236,13 @@ def _named(name: str, known: Known, where: str | Path, place: str) -> Physics:
     return physics
 
 
-def _theta(entry: Entry, physics: Physics, where: str | Path, place: str) -> Theta:
+def _theta(entry: Entry, physics: Effect, where: str | Path, place: str) -> Theta:
     """The parameters in the effect's own order."""
     if entry.signal not in ("", "both", *physics.sensors):
         listed = " or ".join(physics.sensors)
         raise ConfigError(f"{place}.signal is {entry.signal}: {entry.name} does not act there", where=where, expected=listed)
     numbers = {number.name: number for number in physics.parameters}
-    theta = physics.nothing.astype(np.float64)
+    theta = physics.null_value.astype(np.float64)
     for name, value in entry.parameters.items():
         key = f"{place}.parameters.{name}"
         if name not in numbers:
@@ -267,16 +267,16 @@ def _unknown(key: str, name: str, names: Sequence[str], where: str | Path) -> Co
 # ── effects without one ──
 
 
-def _constant(bias: Bias) -> Physics:
+def _constant(bias: Bias) -> Effect:
     gyro, accel = np.array(bias.gyro), np.array(bias.accel)
 
-    def forward(read: Read, _: Theta) -> Read:
+    def forward(read: SensorSamples, _: Theta) -> SensorSamples:
         return read.but(read.gyro + gyro, read.accel + accel)
 
-    return Physics(BIAS, Stage.SENSOR, ("gyro", "accel"), "+ b", (), "always", forward)
+    return Effect(BIAS, Stage.SENSOR, ("gyro", "accel"), "+ b", (), "always", forward)
 
 
-def _driven(entry: Entry, where: str | Path, place: str) -> Physics:
+def _driven(entry: Entry, where: str | Path, place: str) -> Effect:
     """+ gain (c(t - lag) - mean of c) on the axes of one signal."""
     if entry.signal not in UNITS:
         raise ConfigError(f"{place}.signal is {entry.signal!r}", where=where, expected="gyro or accel for what is driven")
@@ -285,44 +285,44 @@ def _driven(entry: Entry, where: str | Path, place: str) -> Physics:
     signal: Sensor = "gyro" if entry.signal == "gyro" else "accel"
     channel = entry.driver
 
-    def forward(read: Read, theta: Theta) -> Read:
+    def forward(read: SensorSamples, theta: Theta) -> SensorSamples:
         c = _channel(read, channel)
         return _added(read, signal, np.outer(np.interp(read.stamp_s - theta[3], read.stamp_s, c) - c.mean(), theta[:3]))
 
-    numbers = (*(Number(axis, f"{UNITS[signal]} per unit of {channel}", 1.0) for axis in AXES), Number("lag", "s", 0.2))
-    return Physics(DRIVEN, Stage.SENSOR, (signal,), f"{signal} += gain (c(t - lag) - mean)", numbers, "c varies", forward)
+    numbers = (*(Parameter(axis, f"{UNITS[signal]} per unit of {channel}", 1.0) for axis in AXES), Parameter("lag", "s", 0.2))
+    return Effect(DRIVEN, Stage.SENSOR, (signal,), f"{signal} += gain (c(t - lag) - mean)", numbers, "c varies", forward)
 
 
-def _curve(curve: Curve, k: int, where: str | Path) -> Physics:
+def _curve(curve: Curve, k: int, where: str | Path) -> Effect:
     x, y, variable = np.array(curve.x), np.array(curve.y), curve.variable
     if not variable.startswith("/") and variable not in VARIABLES:
         raise _unknown(f"unknown[{k}].variable", variable, [*VARIABLES, "/TOPIC"], where)
 
-    def forward(read: Read, _: Theta) -> Read:
+    def forward(read: SensorSamples, _: Theta) -> SensorSamples:
         at = VARIABLES[variable](read) if variable in VARIABLES else _channel(read, variable)
         return _added(read, curve.signal, np.stack([np.interp(at, x, column) for column in y.T], axis=1))
 
     equation = f"{curve.signal} += curve({variable})"
     needs = () if variable in VARIABLES else (variable,)
-    return Physics(f"{UNKNOWN}[{k}]", Stage.SENSOR, (curve.signal,), equation, (), "it varies", forward, needs=needs)
+    return Effect(f"{UNKNOWN}[{k}]", Stage.SENSOR, (curve.signal,), equation, (), "it varies", forward, needs=needs)
 
 
-def _term(term: Term, k: int, where: str | Path) -> Physics:
+def _term(term: Term, k: int, where: str | Path) -> Effect:
     """Factors are variables, |variable|, variable^n or sign(variable), with a space or a bar between them."""
     factors = [factor(word) for word in words(term.term)]
     if not factors or None in factors:
         raise _unknown(f"term[{k}].term", term.term, [f"products of {', '.join(VARIABLES)}"], where)
 
-    def forward(read: Read, _: Theta) -> Read:
+    def forward(read: SensorSamples, _: Theta) -> SensorSamples:
         size = np.prod([one(read) for one in factors if one is not None], axis=0)
         return _added(read, term.signal, np.outer(size, term.value))
 
-    return Physics(
+    return Effect(
         f"{UNKNOWN}[term {k}]", Stage.SENSOR, (term.signal,), f"{term.signal} += c {term.term}", (), "it varies", forward
     )
 
 
-def _channel(read: Read, name: str) -> Float64[np.ndarray, " n"]:
+def _channel(read: SensorSamples, name: str) -> Float64[np.ndarray, " n"]:
     """A channel of the log.
 
     Raises:
@@ -334,7 +334,7 @@ def _channel(read: Read, name: str) -> Float64[np.ndarray, " n"]:
     return read.channels[name]
 
 
-def _added(read: Read, signal: str, more: Float64[np.ndarray, "n 3"]) -> Read:
+def _added(read: SensorSamples, signal: str, more: Float64[np.ndarray, "n 3"]) -> SensorSamples:
     return read.but(gyro=read.gyro + more) if signal == "gyro" else read.but(accel=read.accel + more)
 
 

@@ -32,7 +32,7 @@ Instants = tuple[Float64[np.ndarray, " n"], Float64[np.ndarray, " m"], csr_array
 class Sampler:
     """Cubic splines over one even clock, taken at some instants; it remembers a few, for most of them stay the same.
 
-    All that `replace` makes of a `Felt` shares one, so that what an effect leaves alone is worked on once. What it gives cannot
+    All that `replace` makes of a `IdealMotion` shares one, so that what an effect leaves alone is worked on once. What it gives cannot
     be written to; each memory is replaced as a whole, so threads may share it.
     """
 
@@ -40,12 +40,12 @@ class Sampler:
         self._instants: tuple[Instants, ...] = ()
         self._coefficients, self._values, self._beside = _Recent(), _Recent(), _Recent()
 
-    def motion(self, felt: Felt, taken_s: Float64[np.ndarray, " m"]) -> tuple[Vectors, ...]:
+    def motion(self, felt: IdealMotion, taken_s: Float64[np.ndarray, " m"]) -> tuple[Vectors, ...]:
         """gyro, accel, alpha."""
         instants = self._at(felt.t_s, taken_s)
         return tuple(self._at_instants(x, instants) for x in (felt.gyro, felt.accel, felt.alpha))
 
-    def beside(self, felt: Felt, taken_s: Float64[np.ndarray, " m"]) -> Float64[np.ndarray, "m k"]:
+    def beside(self, felt: IdealMotion, taken_s: Float64[np.ndarray, " m"]) -> Float64[np.ndarray, "m k"]:
         """R_wb row by row, where it is known, then the channels."""
         instants = self._at(felt.t_s, taken_s)
 
@@ -134,7 +134,7 @@ def _coefficients(x: Float64[np.ndarray, "n k"]) -> Float64[np.ndarray, "m k"]:
 
 
 @dataclass(frozen=True, eq=False)
-class Felt:
+class IdealMotion:
     """What the tracked point of a body feels, on an even clock of seconds.
 
     gyro: angular rate, body frame (rad/s); accel: specific force R_wb^T (a_w - g_w) (m/s²); alpha: angular acceleration
@@ -155,7 +155,7 @@ class Felt:
         """Of the even clock."""
         return float((len(self.t_s) - 1) / (self.t_s[-1] - self.t_s[0]))
 
-    def taken(self, taken_s: Float64[np.ndarray, " m"], stamp_s: Float64[np.ndarray, " m"]) -> Read:
+    def taken(self, taken_s: Float64[np.ndarray, " m"], stamp_s: Float64[np.ndarray, " m"]) -> SensorSamples:
         """What is felt at other times (cubic splines; held beyond the ends), one row a sample.
 
         Raises:
@@ -165,11 +165,11 @@ class Felt:
         beside = self.sampler.beside(self, taken_s)
         R_wb = None if self.R_wb is None else beside[:, :9].reshape(-1, 3, 3)
         names = {name: beside[:, k - len(self.channels)] for k, name in enumerate(self.channels)}
-        return Read(stamp_s, gyro, accel, alpha, R_wb, names)
+        return SensorSamples(stamp_s, gyro, accel, alpha, R_wb, names)
 
 
 @dataclass(frozen=True, eq=False)
-class Read:
+class SensorSamples:
     """One row a sample, by the log's own stamps (s): the same signals, on their way through the sensor."""
 
     stamp_s: Times
@@ -179,7 +179,7 @@ class Read:
     R_wb: Float64[np.ndarray, "n 3 3"] | None = None
     channels: Mapping[str, Float64[np.ndarray, " n"]] = field(default_factory=lambda: NOTHING)
 
-    def but(self, gyro: Vectors | None = None, accel: Vectors | None = None) -> Read:
+    def but(self, gyro: Vectors | None = None, accel: Vectors | None = None) -> SensorSamples:
         """With one of the sensors, or both, reading something else."""
         kept = self.gyro if gyro is None else gyro, self.accel if accel is None else accel
-        return Read(self.stamp_s, *kept, self.alpha, self.R_wb, self.channels)
+        return SensorSamples(self.stamp_s, *kept, self.alpha, self.R_wb, self.channels)

@@ -25,9 +25,9 @@ from imutool.mcap_io.write import write
 from imutool.noise import datasheet as noises
 from imutool.recording import Imu, Poses, Recording, seconds, unit_quaternions
 from imutool.sensor import physics_file
-from imutool.sensor.effect import Acting, Physics, Stage, Theta, sensed
+from imutool.sensor.effect import Acting, Effect, Stage, Theta, sensed
 from imutool.sensor.physics_file import DRIVEN, PhysicsFile
-from imutool.sensor.readings import Felt, Read
+from imutool.sensor.readings import IdealMotion, SensorSamples
 from imutool.sensor.trajectory import Smoothed, smooth_motion
 
 SCHEMA = "imutool.simulation/1"
@@ -171,7 +171,7 @@ def simulated(source: Recording, acting: Acting, noise: noises.Noise, rate_hz: f
     )
 
 
-def read_all(felts: Sequence[Felt], stamps: Sequence[Float64[np.ndarray, " _"]], acting: Acting) -> Read:
+def read_all(felts: Sequence[IdealMotion], stamps: Sequence[Float64[np.ndarray, " _"]], acting: Acting) -> SensorSamples:
     """What a sensor with these effects reads over several stretches of one motion.
 
     As `_forward.read`, but clock and sensor know of no stretches: a drift goes on from one to the next, a clock jumps once.
@@ -195,10 +195,10 @@ def read_all(felts: Sequence[Felt], stamps: Sequence[Float64[np.ndarray, " _"]],
     return sensed(_joined(parts), acting)
 
 
-def _joined(parts: Sequence[Read]) -> Read:
+def _joined(parts: Sequence[SensorSamples]) -> SensorSamples:
     channels = {name: np.concatenate([part.channels[name] for part in parts]) for name in parts[0].channels}
     attitudes = [part.R_wb for part in parts if part.R_wb is not None]
-    return Read(
+    return SensorSamples(
         np.concatenate([part.stamp_s for part in parts]),
         np.concatenate([part.gyro for part in parts]),
         np.concatenate([part.accel for part in parts]),
@@ -208,13 +208,13 @@ def _joined(parts: Sequence[Read]) -> Read:
     )
 
 
-def _stamps(felt: Felt, rate_hz: float) -> Float64[np.ndarray, " m"]:
+def _stamps(felt: IdealMotion, rate_hz: float) -> Float64[np.ndarray, " m"]:
     """Whole periods since the first pose, within a stretch."""
     first, last = np.ceil(felt.t_s[0] * rate_hz - 1e-6), np.floor(felt.t_s[-1] * rate_hz + 1e-6)
     return np.asarray(np.arange(first, last + 1.0) / rate_hz)
 
 
-def _exact(motion: Smoothed, felts: Sequence[Felt], stamps: Sequence[Float64[np.ndarray, " _"]]) -> Poses:
+def _exact(motion: Smoothed, felts: Sequence[IdealMotion], stamps: Sequence[Float64[np.ndarray, " _"]]) -> Poses:
     """The motion at the samples, with its velocity."""
     parts = []
     for stretch in motion.stretches:
@@ -233,11 +233,11 @@ def _nanoseconds(motion: Smoothed, stamp_s: Float64[np.ndarray, " m"]) -> Int64[
     return np.asarray(motion.start_ns + np.round(stamp_s * 1e9).astype(np.int64))
 
 
-def _noise(noise: noises.Noise, rate_hz: float, seed: int) -> Physics:
+def _noise(noise: noises.Noise, rate_hz: float, seed: int) -> Effect:
     """White noise and a walking bias as an effect; what is not known is not added. Each kind has random numbers of its own."""
     known = {name: np.nan_to_num(noise.values(name)) for name in noises.UNITS}
 
-    def forward(read: Read, _: Theta) -> Read:
+    def forward(read: SensorSamples, _: Theta) -> SensorSamples:
         dt = np.diff(read.stamp_s, prepend=read.stamp_s[0])[:, None]  # a walk goes on in a hole
         out = []
         for k, (name, values) in enumerate((("gyro", read.gyro), ("accel", read.accel))):
@@ -246,7 +246,7 @@ def _noise(noise: noises.Noise, rate_hz: float, seed: int) -> Physics:
             out.append(values + known[f"{name}_density"] * np.sqrt(rate_hz) * white + bias)
         return read.but(*out)
 
-    return Physics(NOISE, Stage.SENSOR, ("gyro", "accel"), "+ n + b(t)", (), "always", forward)
+    return Effect(NOISE, Stage.SENSOR, ("gyro", "accel"), "+ n + b(t)", (), "always", forward)
 
 
 def _remarks(motion: Smoothed, poses: Poses, noise: noises.Noise) -> tuple[str, ...]:

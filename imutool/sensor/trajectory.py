@@ -18,7 +18,7 @@ from scipy.ndimage import median_filter, percentile_filter
 from imutool.errors import ConfigError, DataError
 from imutool.inertial.kinematics import G_W, Trajectory, continuous
 from imutool.recording import GRAVITY_M_S2, Poses, seconds
-from imutool.sensor.readings import Felt
+from imutool.sensor.readings import IdealMotion
 from imutool.sensor.smoothing import Penalised, Samples
 
 MAX_GAP_S = 0.1  # a longer hole ends a stretch: nothing is invented across it
@@ -110,7 +110,7 @@ class Smoothed:
         t_s = seconds(t_ns, self.start_ns)
         return np.asarray(np.any([(t_s >= one.start_s) & (t_s <= one.end_s) for one in self.stretches], axis=0))
 
-    def felt(self, rate_hz: float, g_w: Float[np.ndarray, "3"] = G_W) -> list[Felt]:
+    def felt(self, rate_hz: float, g_w: Float[np.ndarray, "3"] = G_W) -> list[IdealMotion]:
         """What the tracked point feels in each stretch, on the even clock k / rate of seconds from `start_ns`.
 
         A stretch too short for four samples of that clock is left out.
@@ -127,12 +127,12 @@ class Smoothed:
                 found.append(self._felt(stretch, np.arange(first, last + 1) / rate_hz, g_w))
         return found
 
-    def _felt(self, stretch: Stretch, t_s: Times, g_w: Float[np.ndarray, "3"]) -> Felt:
+    def _felt(self, stretch: Stretch, t_s: Times, g_w: Float[np.ndarray, "3"]) -> IdealMotion:
         from scipy.spatial.transform import Rotation
 
         motion = stretch.trajectory.at(self.start_ns + np.round(t_s * 1e9).astype(np.int64))
         R_wb = Rotation.from_quat(motion.q_wb_wxyz, scalar_first=True).as_matrix()
-        return Felt(t_s, motion.omega_b, motion.specific_force(g_w=g_w), motion.alpha_b, np.ascontiguousarray(R_wb))
+        return IdealMotion(t_s, motion.omega_b, motion.specific_force(g_w=g_w), motion.alpha_b, np.ascontiguousarray(R_wb))
 
 
 def smooth_motion(poses: Poses) -> Smoothed:

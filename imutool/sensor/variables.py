@@ -11,13 +11,13 @@ import numpy as np
 from jaxtyping import Float64
 
 from imutool.sensor.linear_effect import AXES
-from imutool.sensor.readings import Read
+from imutool.sensor.readings import SensorSamples
 
-Variable = Callable[[Read], Float64[np.ndarray, " n"]]
+Variable = Callable[[SensorSamples], Float64[np.ndarray, " n"]]
 
 
 def _column(name: str, axis: int) -> Variable:
-    def column(read: Read) -> Float64[np.ndarray, " n"]:
+    def column(read: SensorSamples) -> Float64[np.ndarray, " n"]:
         values: Float64[np.ndarray, "n 3"] = getattr(read, name)
         return values[:, axis]
 
@@ -57,7 +57,7 @@ class _Factor:
     change: Callable[[Any], Any]
     power: float
 
-    def __call__(self, read: Read) -> Float64[np.ndarray, " n"]:
+    def __call__(self, read: SensorSamples) -> Float64[np.ndarray, " n"]:
         return np.asarray(self.change(self.variable(read)) ** self.power)
 
 

@@ -19,7 +19,7 @@ from torch import Tensor
 
 from imutool.bias.model import Sensor
 from imutool.sensor.catalogue import known, named
-from imutool.sensor.linear_effect import Effect
+from imutool.sensor.linear_effect import LinearEffect
 from imutool.sensor.signals import SignalFilter, Signals
 from imutool.training.closed_form import CORRELATED
 from imutool.training.linearised import Seen, linearise
@@ -106,13 +106,13 @@ def folded(pool: Pool, part: Part) -> Pool:
     return replace(pool, names=tuple(f"{n} {k + 1}/{FOLDS}" for n in pool.names for k in range(FOLDS)), log=log)
 
 
-def _columns(effects: Sequence[Effect], names: Sequence[str]) -> list[int]:
+def _columns(effects: Sequence[LinearEffect], names: Sequence[str]) -> list[int]:
     """Where the parameters of some of the effects are."""
     of = [effect.name for effect in effects for _ in effect.parameters]
     return [k for k, name in enumerate(of) if name in names]
 
 
-def _choose(problem: Problem, effects: Sequence[Effect]) -> dict[str, float]:
+def _choose(problem: Problem, effects: Sequence[LinearEffect]) -> dict[str, float]:
     """Forward: the effect that helps most, if it helps enough, most logs, and not by chance; with what each gained."""
     gains: dict[str, float] = {}
     loss = problem.predicted([])
@@ -130,7 +130,7 @@ def _choose(problem: Problem, effects: Sequence[Effect]) -> dict[str, float]:
         gains[best], loss = gain, agreed[best]
 
 
-def _beyond_chance(problem: Problem, effects: Sequence[Effect], names: Sequence[str]) -> bool:
+def _beyond_chance(problem: Problem, effects: Sequence[LinearEffect], names: Sequence[str]) -> bool:
     """Whether the last effect's parameters are further from zero than all candidates together come by chance (Wald's test).
 
     Windows count as independent here, where the covariance takes many to say the same once: this is to keep out what nothing
@@ -144,7 +144,7 @@ def _beyond_chance(problem: Problem, effects: Sequence[Effect], names: Sequence[
     return wald > float(chi2.isf(BY_CHANCE / len(effects), len(own)))
 
 
-def _unseen(effects: Sequence[Effect], problem: Problem, covariance: Float[Tensor, "p p"]) -> tuple[str, ...]:
+def _unseen(effects: Sequence[LinearEffect], problem: Problem, covariance: Float[Tensor, "p p"]) -> tuple[str, ...]:
     """Parameters no surer than their prior: the motion does not show them."""
     names = [f"{effect.name}.{parameter.name}" for effect in effects for parameter in effect.parameters]
     share = (covariance.diagonal() * problem.prior).sqrt()

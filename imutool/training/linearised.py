@@ -19,7 +19,7 @@ from imutool.bias.model import Sensor
 from imutool.errors import DataError
 from imutool.inertial.strapdown import GRAVITY_W
 from imutool.inertial.windows import HUBER_MEDIANS, attitudes, huber_weight, rotation_residual, velocity_residual
-from imutool.sensor.linear_effect import Effect, patterns
+from imutool.sensor.linear_effect import LinearEffect, patterns
 from imutool.sensor.signals import Signals
 from imutool.training.closed_form import CORRELATED, REST_PRIOR, median_per_log
 from imutool.training.normal_equations import Equations, Problem
@@ -56,7 +56,7 @@ class WindowSet:
     judged: bool
 
 
-def linearise(seen: Seen, effects: Sequence[Effect], part: Part) -> Problem:
+def linearise(seen: Seen, effects: Sequence[LinearEffect], part: Part) -> Problem:
     """Gauss-Newton with all effects at once: first on the shortest windows, then on longer ones as well.
 
     Raises:
@@ -108,7 +108,7 @@ def _window_sets(seen: Seen, part: Part) -> list[WindowSet]:
 
 
 def _equations(
-    seen: Seen, effects: Sequence[Effect], theta: Float[Tensor, " p"], own: Float[Tensor, "logs o"], windows: WindowSet
+    seen: Seen, effects: Sequence[LinearEffect], theta: Float[Tensor, " p"], own: Float[Tensor, "logs o"], windows: WindowSet
 ) -> Equations:
     """Normal equations of the windows of one length."""
     pool, n = seen.pool, windows.n
@@ -159,14 +159,16 @@ def _summed(e: Float[Tensor, "m 3"], J: Float[Tensor, "m 3 k"], log: Int[Tensor,
     return Equations(H, g, c)
 
 
-def _terms(signals: Signals, effects: Sequence[Effect], index: Int[np.ndarray, "*shape"]) -> Float64[np.ndarray, "*shape q"]:
+def _terms(
+    signals: Signals, effects: Sequence[LinearEffect], index: Int[np.ndarray, "*shape"]
+) -> Float64[np.ndarray, "*shape q"]:
     """The terms of some effects at some samples."""
     rows = signals.rows(index.ravel())
     parts = [np.zeros((index.size, 0)), *(effect.terms(rows) for effect in effects)]
     return np.concatenate(parts, axis=1).reshape(*index.shape, -1)
 
 
-def _error(signals: Signals, effects: Sequence[Effect], theta: Float64[np.ndarray, " p"]) -> Float[Tensor, "n 3"]:
+def _error(signals: Signals, effects: Sequence[LinearEffect], theta: Float64[np.ndarray, " p"]) -> Float[Tensor, "n 3"]:
     """The error of every sample, a chunk at a time."""
     matrix = np.einsum("iqp,p->qi", patterns(effects), theta)
     rows = np.arange(len(signals.t_s))

@@ -16,7 +16,7 @@ import numpy as np
 from imutool import __version__
 from imutool.errors import ConfigError, DataError
 from imutool.viewing.html import report
-from imutool.viewing.model.output import Shown
+from imutool.viewing.model.output import Output
 from imutool.viewing.model.run_data import RunData
 from imutool.viewing.rerun.sdk import title
 
@@ -63,7 +63,7 @@ class Asked:
         return self.opens_viewer or self.connect is not None or self.web or self.export is not None
 
 
-class Ways:
+class Outputs:
     """Everything that can be known before the logs are read: who listens, which port is free; context manager.
 
     Where nobody listens at `connect`, that is said at once, an .rrd is saved instead, and `refused` is what to end with.
@@ -100,7 +100,7 @@ class Ways:
             self.refused = error
             logger.warning("%s", error)
 
-    def show(self, logs: Sequence[RunData]) -> list[Shown]:
+    def show(self, logs: Sequence[RunData]) -> list[Output]:
         """Takes every way that was asked for, in an order that leaves the longest for last.
 
         Raises:
@@ -120,13 +120,13 @@ class Ways:
         if self._server is not None:
             self._server.serve()
 
-    def __enter__(self) -> Ways:
+    def __enter__(self) -> Outputs:
         return self
 
     def __exit__(self, *_: object) -> None:
         self._stack.close()
 
-    def _pages(self, logs: Sequence[RunData]) -> Iterator[Shown]:
+    def _pages(self, logs: Sequence[RunData]) -> Iterator[Output]:
         """What needs no Rerun."""
         if (page := self.asked.html) is not None:
             yield _page(logs, page, self.asked.overwrite)
@@ -134,9 +134,9 @@ class Ways:
             for data in logs:
                 paths = report.write_pngs(data, folder, overwrite=self.asked.overwrite)
                 listed = ", ".join(map(str, paths))
-                yield Shown("png", str(folder), f"Drew {listed}" if paths else f"There is nothing to draw of {data.name}")
+                yield Output("png", str(folder), f"Drew {listed}" if paths else f"There is nothing to draw of {data.name}")
 
-    def _recordings(self, logs: Sequence[RunData], at_s: float | None) -> Iterator[Shown]:
+    def _recordings(self, logs: Sequence[RunData], at_s: float | None) -> Iterator[Output]:
         """What needs Rerun."""
         asked = self.asked
         if asked.opens_viewer:
@@ -183,7 +183,7 @@ def cursor_s(logs: Sequence[RunData], at: str) -> float:
     return seconds
 
 
-def _open(logs: Sequence[RunData], asked: Asked, at_s: float | None) -> Shown:
+def _open(logs: Sequence[RunData], asked: Asked, at_s: float | None) -> Output:
     """A viewer; without Rerun the next best thing, a page here."""
     if find_spec("rerun") is None:
         no_rerun = "The viewer is not installed (pip install 'imutool[view]')"
@@ -198,9 +198,9 @@ def _open(logs: Sequence[RunData], asked: Asked, at_s: float | None) -> Shown:
     return viewer.show(logs, source=asked.source, at_s=at_s, overwrite=asked.overwrite)
 
 
-def _page(logs: Sequence[RunData], path: Path, overwrite: bool) -> Shown:
+def _page(logs: Sequence[RunData], path: Path, overwrite: bool) -> Output:
     report.write_page(logs, path, overwrite=overwrite)
-    return Shown("html", str(path), f"Wrote {path}. Open it in a browser")
+    return Output("html", str(path), f"Wrote {path}. Open it in a browser")
 
 
 def _refuse_contradictions(asked: Asked) -> None:

@@ -23,7 +23,7 @@ from imutool.bag.records import Op
 from imutool.bag.repair import repair_bag
 from imutool.bag.scan import Bag
 from imutool.errors import ConfigError, LogError
-from imutool.location import place
+from imutool.location import to_location
 
 STORE = get_typestore(Stores.ROS1_NOETIC)
 TEXT = STORE.types["std_msgs/msg/String"]
@@ -317,7 +317,7 @@ def test_the_target_is_not_the_source_and_not_there_already(tmp_path: Path) -> N
 
 def test_a_bag_in_a_store_is_repaired_there(store: Any, tmp_path: Path) -> None:
     raw = write_bag(tmp_path / "one.bag").read_bytes()
-    report = repair_bag(place(store.put("in.bag", raw[:6000])), place("s3://fleet/out.bag"))
+    report = repair_bag(to_location(store.put("in.bag", raw[:6000])), to_location("s3://fleet/out.bag"))
     (tmp_path / "out.bag").write_bytes(store.get("out.bag"))
     assert len(told(tmp_path / "out.bag")) == sum(report.messages.values()) > 0
     assert store.keys() == ["in.bag", "out.bag"]

@@ -26,7 +26,7 @@ from jaxtyping import Float64
 
 from imutool.bias.io import load
 from imutool.bias.model import BiasModel
-from imutool.bias_start.bias_covariance import Certainty
+from imutool.bias_start.bias_covariance import BiasCovariance
 from imutool.bias_start.bias_from_truth import truth_offset
 from imutool.bias_start.initial_bias import TRUTH_S, find
 from imutool.bias_start.model_choice import smooth_in_memory
@@ -114,7 +114,7 @@ def windows(
     begun = smooth_in_memory(model, imu, recording.name) if start == "smooth" else find(start, model, recording)
     stream = begun.stream(model)
     bias = stream(seen.t_s, imu.gyro, imu.accel)
-    P, roots = Certainty(model, begun, stream).parts(seen.t_s, imu.gyro, imu.accel)
+    P, roots = BiasCovariance(model, begun, stream).parts(seen.t_s, imu.gyro, imu.accel)
     S = roots.get("gyro", np.zeros((len(bias), 3, 0)))
     measured = np.diag(measured_variance(model, seen))
     errors, covariances = [], []

@@ -31,7 +31,7 @@ import torch
 
 from imutool.bias import io, neural_ode
 from imutool.bias.model import BiasModel
-from imutool.bias_start.initial_bias import TurnOn, following, prior
+from imutool.bias_start.initial_bias import InitialBias, following, prior
 from imutool.debiasing import OnlineDebiaser, debias
 from imutool.mcap_io.write import write
 from imutool.recording import Imu, seconds
@@ -52,14 +52,14 @@ def write_random_model(path: Path, rate_hz: float) -> None:
     io.save(model, path)
 
 
-def in_blocks(model: BiasModel, start: TurnOn, imu: Imu) -> np.ndarray:
+def in_blocks(model: BiasModel, start: InitialBias, imu: Imu) -> np.ndarray:
     """The bias at every sample, block by block."""
     stream, t_s = model.stream(start.rest), seconds(imu.t_ns, int(imu.t_ns[0]))
     parts = [slice(first, first + BLOCK) for first in range(0, len(imu), BLOCK)]
     return np.concatenate([stream(t_s[part], imu.gyro[part], imu.accel[part]) for part in parts])
 
 
-def one_by_one(model: BiasModel, start: TurnOn, imu: Imu) -> np.ndarray:
+def one_by_one(model: BiasModel, start: InitialBias, imu: Imu) -> np.ndarray:
     """The same, as a live node gets it."""
     online = OnlineDebiaser(model, start)
     return np.array([online(int(t), gyro, accel)[2] for t, gyro, accel in zip(imu.t_ns, imu.gyro, imu.accel, strict=True)])

@@ -16,7 +16,7 @@ import torch
 from imutool.bias.io import load
 from imutool.bias.model import Segment
 from imutool.bias.neural_ode import Model
-from imutool.bias_start.initial_bias import TurnOn, from_truth
+from imutool.bias_start.initial_bias import InitialBias, from_truth
 from imutool.debiasing import apply
 from imutool.inertial import metrics
 from imutool.inertial.strapdown import along_truth
@@ -47,7 +47,7 @@ def aoe(recording: Recording, imu: Imu) -> float:
 
 
 @torch.no_grad()
-def by_rk4(model: Model, start: TurnOn, imu: Imu) -> Imu:
+def by_rk4(model: Model, start: InitialBias, imu: Imu) -> Imu:
     """The debiased samples with the drift solved by rk4 over the whole log."""
     model.config = msgspec.structs.replace(model.config, solver="rk4")
     t = torch.from_numpy(seconds(imu.t_ns, int(imu.t_ns[0])))[None]

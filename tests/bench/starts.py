@@ -26,7 +26,7 @@ from imutool.bias.io import load
 from imutool.bias.model import BiasModel, Vector6
 from imutool.bias_start import initial_bias
 from imutool.bias_start.bias_tracking import Samples, Track, followed
-from imutool.bias_start.initial_bias import TurnOn
+from imutool.bias_start.initial_bias import InitialBias
 from imutool.errors import DataError
 from imutool.inertial import metrics
 from imutool.inertial.strapdown import along_truth
@@ -85,14 +85,14 @@ def score(model: BiasModel, recording: Recording, own: Vector6) -> tuple[list[fl
         "VQF all": by_vqf(model, imu, offline=True),
         "auto": auto,
         "smooth": smooth,
-        "oracle": TurnOn(own, np.zeros(6), "oracle"),
+        "oracle": InitialBias(own, np.zeros(6), "oracle"),
     }
     last = list(followed(model, [samples(imu)], initial_bias.known(model)))[-1].step.after
     row = [aoe(model, starts[column], recording) for column in COLUMNS]
     return row, f"   {halfway - began:.2f} {ended - halfway:.2f}; {auto.how}", (last.bias - own)[:3], last.P[9:12, 9:12]
 
 
-def aoe(model: BiasModel, start: TurnOn, recording: Recording) -> float:
+def aoe(model: BiasModel, start: InitialBias, recording: Recording) -> float:
     """AOE in degrees of pure integration with this start."""
     imu = recording.imu
     bias = start.stream(model)(*samples(imu))
@@ -111,14 +111,14 @@ def own_bias(model: BiasModel, recordings: list[Recording]) -> np.ndarray:
     return rest.numpy()
 
 
-def at_rest_else_prior(model: BiasModel, imu: Imu) -> TurnOn:
+def at_rest_else_prior(model: BiasModel, imu: Imu) -> InitialBias:
     try:
         return initial_bias.at_rest(model, imu)
     except DataError:
         return initial_bias.prior(model)
 
 
-def by_vqf(model: BiasModel, imu: Imu, *, offline: bool) -> TurnOn:
+def by_vqf(model: BiasModel, imu: Imu, *, offline: bool) -> InitialBias:
     """VQF's bias at every sample, on top of the prior's mean."""
     t_s, gyro, accel = samples(imu)
     start = initial_bias.prior(model)
@@ -131,7 +131,7 @@ def by_vqf(model: BiasModel, imu: Imu, *, offline: bool) -> TurnOn:
         found = vqf.VQF(imu.period_s, **settings).updateBatch(rate, force)["bias"]
     rest = np.tile(start.rest, (len(imu), 1))
     rest[:, :3] += found
-    return TurnOn(rest[0], start.std, "VQF", track=Track(t_s, rest, np.tile(start.std, (len(imu), 1))))
+    return InitialBias(rest[0], start.std, "VQF", track=Track(t_s, rest, np.tile(start.std, (len(imu), 1))))
 
 
 def samples(imu: Imu) -> Samples:

@@ -21,7 +21,7 @@ from mcap.writer import CompressionType, Writer
 
 from imutool import location as places
 from imutool.debiasing import debias
-from imutool.location import place
+from imutool.location import to_location
 from imutool.mcap_io.codec import schemas
 from imutool.mcap_io.codec.encode import encode_imu
 from imutool.mcap_io.log import Log
@@ -63,11 +63,11 @@ def main() -> None:
         store.empty()
         url, size = store.put("in.mcap", source.read_bytes()), source.stat().st_size
         passes: dict[str, Callable[[], object]] = {
-            "open": lambda: Log(place(url)).__exit__(None, None, None),
-            "sha256": lambda: sha256(place(url)),
-            "imu": lambda: [len(batch.gyro) for batch in Log(place(url)).imu_batches("/imu0")],
-            "copy": lambda: rewrite(place(url), place("s3://fleet/out.mcap"), [], metadata={}, overwrite=True),
-            "debias": lambda: debias(place(url), place("s3://fleet/out.mcap"), model="static", overwrite=True),
+            "open": lambda: Log(to_location(url)).__exit__(None, None, None),
+            "sha256": lambda: sha256(to_location(url)),
+            "imu": lambda: [len(batch.gyro) for batch in Log(to_location(url)).imu_batches("/imu0")],
+            "copy": lambda: rewrite(to_location(url), to_location("s3://fleet/out.mcap"), [], metadata={}, overwrite=True),
+            "debias": lambda: debias(to_location(url), to_location("s3://fleet/out.mcap"), model="static", overwrite=True),
         }
         print(f"{source.name}: {size / MIB:.1f} MiB; GETs and MiB read of the source, seconds")
         print(f"{'cache':>12} {'block MiB':>9} " + " ".join(f"{name:>22}" for name in passes) + "   one pass needs")

@@ -7,9 +7,9 @@ import pytest
 import torch
 
 from imutool.bias import hybrid
-from imutool.bias_start.bias_covariance import Certainty
+from imutool.bias_start.bias_covariance import BiasCovariance
 from imutool.bias_start.bias_tracking import Following, Known, Track
-from imutool.bias_start.initial_bias import TurnOn
+from imutool.bias_start.initial_bias import InitialBias
 
 RATE_HZ, SIZE = 200.0, 8000
 SCALE_STD, G_STD = 2e-3, 1e-4  # of a share, and of rad/s per m/s²
@@ -17,9 +17,9 @@ REST = np.zeros(6)
 STD = np.array([3e-4] * 3 + [2e-2] * 3)
 KNOWN = Known(REST, STD, STD)
 WAYS = {
-    "held": TurnOn(REST, STD, "given"),
-    "followed": TurnOn(REST, STD, "followed", follows=KNOWN),
-    "smoothed": TurnOn(REST, STD, "smoothed", track=Track(np.zeros(1), REST[None], STD[None])),
+    "held": InitialBias(REST, STD, "given"),
+    "followed": InitialBias(REST, STD, "followed", follows=KNOWN),
+    "smoothed": InitialBias(REST, STD, "smoothed", track=Track(np.zeros(1), REST[None], STD[None])),
 }
 SAME = 1e-10  # of float64 through a sum over all samples
 MEAN_LEFT = 0.01  # of the variance: a mean so far over 40 turns is not quite zero
@@ -50,7 +50,7 @@ def calibrated(model: hybrid.Model, way: str, samples: Samples, blocks: int = 1)
     """The covariance, and what of it is the rest bias's."""
     found: list[tuple[np.ndarray, np.ndarray]] = []
     stream = WAYS[way].stream(model)
-    both = [Certainty(model, WAYS[way], stream) for _ in range(2)]
+    both = [BiasCovariance(model, WAYS[way], stream) for _ in range(2)]
     for rows in np.array_split(np.arange(SIZE), blocks):
         some = tuple(x[rows] for x in samples)
         stream(*some)
@@ -94,5 +94,5 @@ def test_the_streams_own_covariance_is_left_as_it_is(turning: Samples) -> None:
     assert isinstance(stream, Following)
     stream(*turning)
     before = stream.covariance.copy()
-    Certainty(model, WAYS["followed"], stream)(*turning)
+    BiasCovariance(model, WAYS["followed"], stream)(*turning)
     assert np.array_equal(stream.covariance, before)

@@ -18,8 +18,8 @@ from imutool.bias_start.bias_tracking import Samples
 from imutool.bias_start.initial_bias import (
     AT_REST_STD,
     TRUTH_S,
+    InitialBias,
     NoRestError,
-    TurnOn,
     at_rest,
     auto,
     find,
@@ -436,5 +436,5 @@ def test_a_start_does_not_share_memory_with_the_model() -> None:
     made = model(mean=0.1)
     start = prior(made)
     start.rest[:] = 9.0
-    assert isinstance(start, TurnOn)
+    assert isinstance(start, InitialBias)
     assert prior(made).rest.tolist() == [pytest.approx(0.1)] * 6

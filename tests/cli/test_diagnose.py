@@ -28,7 +28,7 @@ from imutool.recording import Recording
 from imutool.sensor import physics_file
 from imutool.sensor.flight import flight
 from imutool.sensor.physics_file import Bias, Entry, PhysicsFile, Value
-from imutool.sensor.readings import Read
+from imutool.sensor.readings import SensorSamples
 from imutool.sensor.simulate import simulate
 
 MADE = SimpleNamespace(**runpy.run_path(str(Path(__file__).parents[1] / "diagnosis" / "diagnoses.py")))
@@ -245,7 +245,7 @@ def test_what_is_driven_keeps_its_driver_and_lag() -> None:
     (physics, theta), _ = file.acting()
     assert theta.tolist() == [0.0, 0.1, 0.2, 0.05]
     t = np.arange(50) * 0.01
-    there = Read(t, np.zeros((50, 3)), np.zeros((50, 3)), np.zeros((50, 3)), None, {"/motor/current": t})
+    there = SensorSamples(t, np.zeros((50, 3)), np.zeros((50, 3)), np.zeros((50, 3)), None, {"/motor/current": t})
     assert np.ptp(physics.forward(there, theta).accel[:, 2]) > 0.0
 
 
@@ -253,7 +253,7 @@ def test_a_term_without_a_name_acts_as_it_was_found() -> None:
     said = finding("unknown", "gyro", {"c": Estimate(0.3, 0.01, "")}, "gyro.z += c omega_x omega_y")
     (physics, theta), _ = found(only(said)).acting()
     gyro = np.random.default_rng(1).normal(size=(20, 3))
-    there = Read(np.arange(20) * 0.01, gyro, gyro, gyro)
+    there = SensorSamples(np.arange(20) * 0.01, gyro, gyro, gyro)
     added = physics.forward(there, theta).gyro - gyro
     assert np.allclose(added, np.outer(gyro[:, 0] * gyro[:, 1], [0.0, 0.0, 0.3]), rtol=0, atol=EXACT)
 
@@ -268,7 +268,7 @@ def test_a_curve_and_the_bias_add_up_to_what_was_fitted() -> None:
     curve = Curve("omega_x", "rad/s", x, y, np.full((41, 3), 0.01), mean)
     acting = found(only(finding("unknown", "accel", {}, "accel.z += curve(omega_x)", curve=curve))).acting()
     gyro = np.stack([x, np.zeros(41), np.zeros(41)], axis=1)
-    there = Read(np.arange(41) * 0.01, gyro, np.zeros((41, 3)), gyro)
+    there = SensorSamples(np.arange(41) * 0.01, gyro, np.zeros((41, 3)), gyro)
     for physics, theta in acting:
         there = physics.forward(there, theta)
     assert np.allclose(there.accel[:, 2], shape.basis(x) @ c, rtol=0, atol=EXACT)
@@ -278,7 +278,7 @@ def test_a_curve_and_the_bias_add_up_to_what_was_fitted() -> None:
 def test_every_term_there_can_be_is_written_as_it_acts() -> None:
     """Whatever `unnamed` can propose, the file can say: same signal, same axis, same numbers."""
     gyro, accel, alpha = (np.random.default_rng(k).normal(size=(30, 3)) for k in (1, 2, 3))
-    there = Read(np.arange(30) * 0.01, gyro, accel, alpha)
+    there = SensorSamples(np.arange(30) * 0.01, gyro, accel, alpha)
     for physics in unnamed.terms(there):
         c = {"c": Estimate(0.7, 0.01, physics.parameters[0].unit)}
         (written, theta), _ = found(only(finding("unknown", physics.sensors[0], c, physics.equation))).acting()

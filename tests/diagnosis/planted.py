@@ -10,14 +10,14 @@ from scipy.spatial.transform import Rotation
 
 from imutool.diagnosis.alignment import Pair, split
 from imutool.diagnosis.forward_cache import Chosen
-from imutool.diagnosis.gauss_newton import Weighed
+from imutool.diagnosis.gauss_newton import WhitenedLog
 from imutool.diagnosis.whitening import Whitener
 from imutool.inertial.kinematics import Trajectory
 from imutool.recording import Imu, Poses, Recording
 from imutool.sensor import catalogue as _catalogue
-from imutool.sensor.effect import Physics, read
+from imutool.sensor.effect import Effect, read
 from imutool.sensor.flight import FlightSettings, trajectory
-from imutool.sensor.readings import Felt
+from imutool.sensor.readings import IdealMotion
 
 RATE_HZ, DURATION_S = 100.0, 24.0
 START_NS = 1_700_000_000_000_000_000
@@ -35,16 +35,16 @@ def clock(duration_s: float = DURATION_S, rate_hz: float = RATE_HZ, first_s: flo
     return first_s + np.arange(round((duration_s - first_s) * rate_hz)) / rate_hz
 
 
-def rich(seed: int = 1, duration_s: float = DURATION_S, channels: Mapping[str, np.ndarray] | None = None) -> Felt:
+def rich(seed: int = 1, duration_s: float = DURATION_S, channels: Mapping[str, np.ndarray] | None = None) -> IdealMotion:
     """Turns about all three axes, tilts, and accelerates."""
     path, t_s = moving(seed, duration_s), clock(duration_s)
     motion = path.at(path.start_ns + np.round(t_s * 1e9).astype(np.int64))
     R_wb = Rotation.from_quat(motion.q_wb_wxyz, scalar_first=True).as_matrix()
-    felt = Felt(t_s, motion.omega_b, motion.specific_force(), motion.alpha_b, R_wb)
+    felt = IdealMotion(t_s, motion.omega_b, motion.specific_force(), motion.alpha_b, R_wb)
     return felt if channels is None else replace(felt, channels=channels)
 
 
-def planar(duration_s: float = DURATION_S) -> Felt:
+def planar(duration_s: float = DURATION_S) -> IdealMotion:
     """A vehicle on level ground: turns about z alone, accelerates along x and y."""
     t = clock(duration_s)
     heading = 0.8 * np.sin(0.9 * t) + 0.5 * np.sin(2.1 * t + 1.0)
@@ -53,10 +53,10 @@ def planar(duration_s: float = DURATION_S) -> Felt:
     zero, up = np.zeros_like(t), np.full_like(t, 9.81)
     force = np.stack([0.7 * np.sin(1.3 * t), 0.5 * np.cos(0.7 * t), up], axis=1)
     R_wb = Rotation.from_euler("z", heading[:, None]).as_matrix()
-    return Felt(t, np.stack([zero, zero, rate], axis=1), force, np.stack([zero, zero, alpha], axis=1), R_wb)
+    return IdealMotion(t, np.stack([zero, zero, rate], axis=1), force, np.stack([zero, zero, alpha], axis=1), R_wb)
 
 
-def shaken(seed: int = 1, duration_s: float = DURATION_S) -> Felt:
+def shaken(seed: int = 1, duration_s: float = DURATION_S) -> IdealMotion:
     """Turns to and fro about all three axes so often that every few seconds see every rate; angular rates in closed form."""
     rng, t = np.random.default_rng([seed, 3]), clock(duration_s)
     f, size, phase = rng.uniform(0.3, 1.5, (3, 4)), rng.uniform(0.2, 0.5, (3, 4)), rng.uniform(0.0, 2.0 * np.pi, (3, 4))
@@ -69,7 +69,7 @@ def shaken(seed: int = 1, duration_s: float = DURATION_S) -> Felt:
         R = R @ step
     a_w = np.stack([np.sin(1.7 * t + 2.0 * k) + 0.5 * np.cos(4.1 * t + k) for k in range(3)], axis=1)
     force = np.einsum("nji,nj->ni", R_wb, a_w + np.array([0.0, 0.0, 9.81]))
-    return Felt(t, gyro, force, alpha, R_wb)
+    return IdealMotion(t, gyro, force, alpha, R_wb)
 
 
 def acting(effects: Mapping[str, Sequence[float]]) -> Chosen:
@@ -77,12 +77,12 @@ def acting(effects: Mapping[str, Sequence[float]]) -> Chosen:
     return tuple((_catalogue.physics([name])[0], np.array(theta, dtype=float)) for name, theta in effects.items())
 
 
-def catalogue() -> tuple[Physics, ...]:
+def catalogue() -> tuple[Effect, ...]:
     """All that a fit can find without another channel of the log."""
     return tuple(one for one in _catalogue.physics() if set(one.needs) <= {"attitude"} and one.name not in SHOWN_BY_SAMPLES)
 
 
-def ideal(felt: Felt, chosen: Chosen = (), stamp_s: np.ndarray | None = None) -> np.ndarray:
+def ideal(felt: IdealMotion, chosen: Chosen = (), stamp_s: np.ndarray | None = None) -> np.ndarray:
     """Readings with effects, without noise and bias: gyro (rad/s), accel (m/s²)."""
     got = read(felt, felt.t_s if stamp_s is None else stamp_s, chosen)
     return np.concatenate([got.gyro, got.accel], axis=1)
@@ -93,7 +93,7 @@ def noise(count: int, seed: int) -> np.ndarray:
 
 
 def pair(
-    felt: Felt,
+    felt: IdealMotion,
     effects: Mapping[str, Sequence[float]] | None = None,
     seed: int = 0,
     stamp_s: np.ndarray | None = None,
@@ -110,9 +110,9 @@ def pair(
     return Pair(f"log_{seed}", felt, stamp_s, real, usable & ~held_out, usable & held_out, channels=names)
 
 
-def weighed(one: Pair) -> Weighed:
+def weighed(one: Pair) -> WhitenedLog:
     """By the noise that was planted, which is white."""
-    return Weighed(one, Whitener(np.ones((6, 1)), NOISE))
+    return WhitenedLog(one, Whitener(np.ones((6, 1)), NOISE))
 
 
 def recording(

@@ -10,7 +10,7 @@ import numpy as np
 from scipy.signal import lfilter
 
 from imutool.diagnosis.block_scatter import Scatter, scatter
-from imutool.diagnosis.gauss_newton import Fit, Weighed, fit
+from imutool.diagnosis.gauss_newton import Fit, WhitenedLog, fit
 
 PLANTED = SimpleNamespace(**runpy.run_path(str(Path(__file__).with_name("planted.py"))))
 FELT = PLANTED.shaken(duration_s=45.0)
@@ -20,7 +20,7 @@ SPREAD = (0.7, 1.35)  # of sixteen times three numbers of unit variance, not qui
 SCALE = [0.02, -0.01, 0.015]
 
 
-def noisy(seed: int, lasting: bool) -> tuple[Weighed, Fit, Scatter]:
+def noisy(seed: int, lasting: bool) -> tuple[WhitenedLog, Fit, Scatter]:
     """A scale that is fitted as if the noise were white."""
     added = None
     if lasting:

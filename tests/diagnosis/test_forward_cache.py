@@ -16,7 +16,7 @@ from imutool.diagnosis.forward_cache import Course, bound, free, step_of
 from imutool.diagnosis.gauss_newton import fit
 from imutool.diagnosis.jacobians import Slopes, slope
 from imutool.diagnosis.whitening import Band, Whitener
-from imutool.sensor.effect import Physics, Stage, Theta, read
+from imutool.sensor.effect import Effect, Stage, Theta, read
 
 PLANTED = SimpleNamespace(**runpy.run_path(str(Path(__file__).with_name("planted.py"))))
 ROUNDED = 1e-6  # of the largest derivative: differences of numbers to sixteen digits, over steps of a thousandth
@@ -31,7 +31,7 @@ AROUND = {  # effects of every stage, so that each is asked with others before a
 SECONDS = 20.0
 
 
-def evaluated(pair: Pair, chosen: tuple[tuple[Physics, Theta], ...]) -> np.ndarray:
+def evaluated(pair: Pair, chosen: tuple[tuple[Effect, Theta], ...]) -> np.ndarray:
     """From the start, nothing remembered."""
     got = read(
         type(pair.felt)(*(getattr(pair.felt, n) for n in ("t_s", "gyro", "accel", "alpha", "R_wb"))), pair.stamp_s, chosen
@@ -39,7 +39,7 @@ def evaluated(pair: Pair, chosen: tuple[tuple[Physics, Theta], ...]) -> np.ndarr
     return np.concatenate([got.gyro, got.accel], axis=1)
 
 
-def start(physics: Physics, pair: Pair) -> Theta:
+def start(physics: Effect, pair: Pair) -> Theta:
     """Where a fit of it would begin, or a tenth of its plausible size."""
     if physics.starts is None:
         return 0.1 * physics.plausible
@@ -54,7 +54,7 @@ def pair() -> Pair:
 
 
 @pytest.mark.parametrize("physics", PLANTED.catalogue(), ids=lambda one: one.name)
-def test_slopes_are_the_differences_of_the_whole(pair: Pair, physics: Physics) -> None:
+def test_slopes_are_the_differences_of_the_whole(pair: Pair, physics: Effect) -> None:
     others = tuple(one for one in PLANTED.acting(AROUND) if one[0].name != physics.name)
     theta = start(physics, pair)
     chosen = (*others, (physics, theta))
@@ -69,11 +69,11 @@ def test_slopes_are_the_differences_of_the_whole(pair: Pair, physics: Physics) -
 
 
 @pytest.mark.parametrize("physics", [one for one in PLANTED.catalogue() if one.linear], ids=lambda one: one.name)
-def test_the_slope_of_a_linear_effect_needs_it_not_to_be_there(pair: Pair, physics: Physics) -> None:
+def test_the_slope_of_a_linear_effect_needs_it_not_to_be_there(pair: Pair, physics: Effect) -> None:
     others = tuple(one for one in PLANTED.acting(AROUND) if one[0].name != physics.name)
     noise = Whitener(np.ones((6, 1)), PLANTED.NOISE)
     beside = slope(noise, Course(pair, others), physics)
-    there = slope(noise, Course(pair, (*others, (physics, physics.nothing.astype(float)))), physics)
+    there = slope(noise, Course(pair, (*others, (physics, physics.null_value.astype(float)))), physics)
     np.testing.assert_array_equal(beside.on, there.on)
     np.testing.assert_allclose(beside.white, there.white, rtol=1e-12)
 

@@ -153,14 +153,14 @@ def test_a_fit_never_ends_worse_than_it_began() -> None:
     log = PLANTED.weighed(pair)
     for name in ("low_pass", "clock_offset", "gyro_scale", "size_effect"):
         physics = catalogue.physics([name])[0]
-        start = np.array([5.0]) if name == "low_pass" else physics.nothing.astype(float)
+        start = np.array([5.0]) if name == "low_pass" else physics.null_value.astype(float)
         began = fit([log], ((physics, start),), iterations=0)
         assert fit([log], ((physics, start),)).objective <= began.objective
 
 
 @pytest.mark.parametrize("physics", catalogue.physics(), ids=lambda one: one.name)
 def test_parameters_come_back_from_how_they_are_fitted(physics: catalogue.Physics) -> None:
-    theta = np.where(np.isfinite(physics.nothing), physics.nothing, 0.0) + 0.7 * np.where(
+    theta = np.where(np.isfinite(physics.null_value), physics.null_value, 0.0) + 0.7 * np.where(
         physics.plausible > 0, physics.plausible, 1.0
     )
     np.testing.assert_allclose(bound(physics, free(physics, theta)), theta, rtol=1e-12)

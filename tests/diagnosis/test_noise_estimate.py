@@ -12,7 +12,7 @@ import pytest
 from scipy.signal import butter, sosfiltfilt
 
 from imutool.diagnosis.alignment import Pair
-from imutool.diagnosis.gauss_newton import Weighed
+from imutool.diagnosis.gauss_newton import WhitenedLog
 from imutool.diagnosis.known_band import known_below
 from imutool.diagnosis.noise_estimate import MUCH, noise_std, weighed
 
@@ -29,7 +29,7 @@ def beside_poses(effects: dict[str, list[float]] | None = None, added: np.ndarra
     return replace(pair, against="true poses", band_hz=BAND_HZ)
 
 
-def noise(log: Weighed) -> np.ndarray:
+def noise(log: WhitenedLog) -> np.ndarray:
     return np.asarray(noise_std(log.whiten))
 
 

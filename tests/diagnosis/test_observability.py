@@ -10,7 +10,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from imutool.diagnosis.gauss_newton import Weighed
+from imutool.diagnosis.gauss_newton import WhitenedLog
 from imutool.diagnosis.observability import ENOUGH, unseen
 from imutool.diagnosis.whitening import Whitener
 
@@ -21,7 +21,7 @@ def shown(felt: object, names: list[str] | None = None, *, noise: float = 1.0, k
     """What is not seen of some effects, at so many times the planted noise."""
     pair = replace(PLANTED.pair(felt), known=known)
     white = Whitener(np.ones((6, 1)), noise * PLANTED.NOISE)
-    log = Weighed(pair, white if known is None else white.counting(known))
+    log = WhitenedLog(pair, white if known is None else white.counting(known))
     some = [one for one in PLANTED.catalogue() if names is None or one.name in names]
     return set(unseen([log], some))
 

@@ -11,8 +11,8 @@ import pytest
 
 from imutool.diagnosis import unnamed
 from imutool.diagnosis.gauss_newton import fit
-from imutool.sensor.effect import Physics
-from imutool.sensor.readings import Read
+from imutool.sensor.effect import Effect
+from imutool.sensor.readings import SensorSamples
 
 PLANTED = SimpleNamespace(**runpy.run_path(str(Path(__file__).with_name("planted.py"))))
 SURE = 4.0
@@ -20,7 +20,7 @@ T = PLANTED.clock()
 CURRENT = np.sin(0.7 * T) + 0.5 * np.cos(1.9 * T)
 
 
-def named(physics: str, among: object) -> Physics:
+def named(physics: str, among: object) -> Effect:
     return next(one for one in among if one.name == physics)  # type: ignore[attr-defined]
 
 
@@ -158,7 +158,7 @@ def test_a_curve_bends_where_the_samples_are() -> None:
     rng = np.random.default_rng(0)
     x = np.where(rng.random(4000) < 0.02, 6.0, 0.5) * rng.standard_normal(4000)
     gyro = np.stack([x, np.zeros_like(x), np.zeros_like(x)], axis=1)
-    like = Read(np.arange(len(x)) * 0.01, gyro, np.zeros_like(gyro), np.zeros_like(gyro))
+    like = SensorSamples(np.arange(len(x)) * 0.01, gyro, np.zeros_like(gyro), np.zeros_like(gyro))
     curve = next(one for one in unnamed.curves(like) if one.name == "unknown:gyro.z(omega_x)").forward
     assert isinstance(curve, unnamed.Curve)
     y = np.tanh(x / 0.3)
@@ -176,7 +176,7 @@ def test_a_curve_follows_the_range_of_a_robot_that_stands_most_of_the_time() -> 
     turning = np.clip(np.concatenate([np.zeros(7000), np.linspace(0.0, 0.5, 200), np.full(3000, 0.5)]), 0.0, 0.5)
     x = turning + 1e-3 * rng.standard_normal(len(turning))
     gyro = np.stack([x, np.zeros_like(x), np.zeros_like(x)], axis=1)
-    like = Read(np.arange(len(x)) * 0.01, gyro, np.zeros_like(gyro), np.zeros_like(gyro))
+    like = SensorSamples(np.arange(len(x)) * 0.01, gyro, np.zeros_like(gyro), np.zeros_like(gyro))
     coarse = next(one for one in unnamed.curves(like) if one.name == "unknown:gyro.x(omega_x)")
     fine = unnamed.finer(coarse, like)
     assert fine is not None

@@ -215,7 +215,7 @@ def test_every_effect_has_a_sentence_with_its_number_its_unit_and_its_name(effec
 
 def physics() -> list[object]:
     modules = [m.name for m in pkgutil.iter_modules(imutool.sensor.effects.__path__) if not m.name.startswith("_")]
-    found = [getattr(importlib.import_module(f"imutool.sensor.effects.{name}"), "PHYSICS", None) for name in modules]
+    found = [getattr(importlib.import_module(f"imutool.sensor.effects.{name}"), "EFFECT", None) for name in modules]
     return [one for one in found if one is not None]
 
 

@@ -29,7 +29,7 @@ from imutool.fleet.models import settled
 from imutool.fleet.run import Tally, run
 from imutool.fleet.task import Result, Settings, Task
 from imutool.fleet.work import work
-from imutool.location import place
+from imutool.location import to_location
 from imutool.mcap_io.storage.digest import sha256
 
 Workers = Callable[[], Engine]
@@ -387,7 +387,7 @@ def test_a_fleet_in_a_store_is_that_of_a_folder(fleet: Path, store: Any, setting
     for path in fleet.rglob("*.mcap"):
         store.put(f"logs/{path.relative_to(fleet)}", path.read_bytes())
     left = "out/robot_a/.log.mcap.12.0123abcd.partial"
-    run("s3://fleet/logs", "s3://fleet/out", settings, Inline, page=place("s3://fleet/out.html"))
+    run("s3://fleet/logs", "s3://fleet/out", settings, Inline, page=to_location("s3://fleet/out.html"))
     store.put(left, b"half")
     again = run("s3://fleet/logs", "s3://fleet/out", settings, Inline, resume=True, recheck=True)
     assert dict(again.tally.statuses) == {"skipped": 2}

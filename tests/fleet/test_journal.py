@@ -14,7 +14,7 @@ from imutool.errors import ConfigError
 from imutool.fleet import journal as journals
 from imutool.fleet.journal import NAME, Journal
 from imutool.fleet.task import Result, Settings, Source
-from imutool.location import Place, place
+from imutool.location import Location, to_location
 
 SETTINGS = Settings(command="debias", model="m", model_sha256="1")
 OTHER = msgspec.structs.replace(SETTINGS, init="prior")
@@ -24,7 +24,7 @@ def result(key: str, **changes: Any) -> Result:
     return Result(key=key, source=f"/logs/{key}.mcap", target=f"{key}.mcap", status="ok", **changes)
 
 
-def fill(out: Place, *keys: str) -> None:
+def fill(out: Location, *keys: str) -> None:
     with Journal(out, SETTINGS) as journal:
         for key in keys:
             journal.begin(key, f"{key}.mcap")
@@ -109,7 +109,7 @@ def test_a_key_is_of_the_content_the_model_and_the_settings() -> None:
 
 def test_in_a_store_it_lies_in_pieces(store: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(journals, "PIECE_BYTES", 1000)
-    out = place("s3://fleet/out")
+    out = to_location("s3://fleet/out")
     fill(out, *"abcdef")
     pieces = len(store.keys())
     assert pieces > 2

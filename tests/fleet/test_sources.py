@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from imutool.errors import ConfigError
 from imutool.fleet.sources import LONGEST, find, leftovers, relative, remove, within
-from imutool.location import identity, place
+from imutool.location import identity, to_location
 
 NOWHERE = Path("/nowhere")
 
@@ -143,13 +143,13 @@ def test_a_store_is_listed_in_one_request(store: Any) -> None:
     for key in ("robots/a/log.mcap", "robots/b/log.mcap", "robots/b/notes.txt", "out/a/log.mcap"):
         store.put(key, b"12345")
     store.requests.clear()
-    found = find("s3://fleet/robots", place("s3://fleet/robots/out")).logs
+    found = find("s3://fleet/robots", to_location("s3://fleet/robots/out")).logs
     assert [(one.place, one.name, one.size) for one in found] == [
         ("s3://fleet/robots/a/log.mcap", "a/log.mcap", 5),
         ("s3://fleet/robots/b/log.mcap", "b/log.mcap", 5),
     ]
     assert len(store.requests) <= 2
-    assert identity(place("s3://fleet/robots/a/log.mcap")) == (5, found[0].stamp)
+    assert identity(to_location("s3://fleet/robots/a/log.mcap")) == (5, found[0].stamp)
     assert [one.name for one in find("s3://fleet/*/b/*.mcap", NOWHERE).logs] == ["robots/b/log.mcap"]
     assert [one.name for one in find("s3://fleet/robots/b/log.mcap", NOWHERE).logs] == ["log.mcap"]
     with pytest.raises(ConfigError, match=r"no \.mcap log"):

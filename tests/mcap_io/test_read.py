@@ -18,7 +18,7 @@ from imutool.errors import ConfigError, LogError
 from imutool.mcap_io.codec import schemas
 from imutool.mcap_io.codec.decode import decode_imu
 from imutool.mcap_io.codec.encode import encode_imu, encode_pose, encode_vector3
-from imutool.mcap_io.index import Structure
+from imutool.mcap_io.index import LogIndex
 from imutool.mcap_io.log import Log
 from imutool.mcap_io.read import VELOCITY_KEY, read
 from imutool.mcap_io.topics import DERIVED_KEY
@@ -200,10 +200,10 @@ def test_reading_holds_one_chunk_and_batches_keep_no_chunk_alive(long_log: Path)
 
 
 def test_stamps_come_from_the_indexes_and_unpack_nothing(long_log: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def refuse(self: Structure, *_: object) -> None:
+    def refuse(self: LogIndex, *_: object) -> None:
         raise AssertionError("a chunk was unpacked")
 
-    monkeypatch.setattr(Structure, "unpack", refuse)
+    monkeypatch.setattr(LogIndex, "unpack", refuse)
     with Log(long_log) as log:
         stamps = np.concatenate(list(log.stamps("/imu0")))
     assert np.array_equal(stamps, START_NS + 1_000_000 * np.arange(120_000))
@@ -212,8 +212,8 @@ def test_stamps_come_from_the_indexes_and_unpack_nothing(long_log: Path, monkeyp
 def test_chunks_of_other_topics_are_not_unpacked(recording: Recording, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = tmp_path / "log.mcap"
     write(recording, path)
-    unpack, seen = Structure.unpack, []
-    monkeypatch.setattr(Structure, "unpack", lambda self, block: (seen.append(block), unpack(self, block))[1])
+    unpack, seen = LogIndex.unpack, []
+    monkeypatch.setattr(LogIndex, "unpack", lambda self, block: (seen.append(block), unpack(self, block))[1])
     with Log(path) as log:
         blocks = log.structure.blocks
         (imu,) = log.channel_ids("/imu0")

@@ -14,7 +14,7 @@ from imutool.sensor.catalogue import known, named
 from imutool.sensor.effects import rate_curve
 from imutool.sensor.effects.rate_curve import KNOTS_RAD_S, NONZERO, hats
 from imutool.sensor.flight import trajectory
-from imutool.sensor.linear_effect import Effect, Sensor, compiled, patterns
+from imutool.sensor.linear_effect import LinearEffect, Sensor, compiled, patterns
 from imutool.sensor.signals import ACCEL, ALPHA, COUNT, GYRO, GYRO_SLOW, SignalFilter, Signals
 
 RATE_HZ = 200.0
@@ -45,7 +45,7 @@ def lively(n: int = 200) -> Signals:
     return SignalFilter(RATE_HZ)(np.arange(n) / RATE_HZ, 3.0 * rng.normal(size=(n, 3)), 9.0 * rng.normal(size=(n, 3)))
 
 
-def some_theta(effect: Effect, seed: int = 0) -> np.ndarray:
+def some_theta(effect: LinearEffect, seed: int = 0) -> np.ndarray:
     return effect.plausible * np.random.default_rng(seed).normal(size=len(effect.parameters))
 
 
@@ -54,13 +54,13 @@ def close(a: np.ndarray, b: np.ndarray) -> None:
 
 
 @pytest.fixture
-def effect(name: str, sensor: Sensor) -> Effect:
-    made: Effect = registry.load("imutool.effects", name).effect(sensor)
+def effect(name: str, sensor: Sensor) -> LinearEffect:
+    made: LinearEffect = registry.load("imutool.effects", name).effect(sensor)
     return made
 
 
 @pytest.mark.parametrize(("name", "sensor"), EACH)
-def test_terms_pattern_and_parameters_fit_one_another(effect: Effect, name: str, sensor: Sensor) -> None:
+def test_terms_pattern_and_parameters_fit_one_another(effect: LinearEffect, name: str, sensor: Sensor) -> None:
     signals = lively()
     terms = effect.terms(signals)
     assert terms.shape[0] == len(signals.t_s)
@@ -77,7 +77,7 @@ def test_terms_pattern_and_parameters_fit_one_another(effect: Effect, name: str,
 
 
 @pytest.mark.parametrize(("name", "sensor"), EACH)
-def test_at_work_it_is_the_matrix_way(effect: Effect) -> None:
+def test_at_work_it_is_the_matrix_way(effect: LinearEffect) -> None:
     theta, signals = some_theta(effect), lively()
     expected = effect.terms(signals) @ effect.matrix(theta)
     assert np.abs(expected).max() > 0
@@ -90,7 +90,7 @@ def test_at_work_it_is_the_matrix_way(effect: Effect) -> None:
 
 
 @pytest.mark.parametrize(("name", "sensor"), EACH)
-def test_it_is_linear_in_its_parameters_each_through_its_own_pattern(effect: Effect) -> None:
+def test_it_is_linear_in_its_parameters_each_through_its_own_pattern(effect: LinearEffect) -> None:
     signals = lively(20)
     terms = effect.terms(signals)
     error = effect.compiled(some_theta(effect))(signals)
@@ -98,7 +98,7 @@ def test_it_is_linear_in_its_parameters_each_through_its_own_pattern(effect: Eff
 
 
 @pytest.mark.parametrize(("name", "sensor"), EACH)
-def test_nothing_in_no_motion_at_the_start_of_a_log(effect: Effect) -> None:
+def test_nothing_in_no_motion_at_the_start_of_a_log(effect: LinearEffect) -> None:
     """No rate, no force, time zero: every effect belongs to something, and the rest bias stays what is read at rest."""
     still = Signals(np.zeros(2), np.zeros((2, COUNT)))
     assert not effect.terms(still).any()
@@ -122,7 +122,7 @@ def test_it_is_the_catalogues(name: str, counted: tuple[int, str]) -> None:
 
 
 @pytest.mark.parametrize(("name", "sensor"), EACH)
-def test_columns_beyond_what_it_wants_change_nothing(effect: Effect) -> None:
+def test_columns_beyond_what_it_wants_change_nothing(effect: LinearEffect) -> None:
     together, signals = compiled([effect], some_theta(effect)), lively(30)
     assert 0 < together.wanted <= COUNT
     cut = signals.columns.copy()

@@ -13,8 +13,8 @@ from scipy.spatial.transform import Rotation
 from imutool import registry
 from imutool.errors import ConfigError, DataError
 from imutool.sensor.catalogue import known, named, physics
-from imutool.sensor.effect import Physics, Stage, read, sensed
-from imutool.sensor.readings import Felt, Read
+from imutool.sensor.effect import Effect, Stage, read, sensed
+from imutool.sensor.readings import IdealMotion, SensorSamples
 from imutool.sensor.signals import SLOW_S
 
 RATE_HZ = 200.0
@@ -31,7 +31,7 @@ def clock(seconds: float = 10.0, rate_hz: float = RATE_HZ) -> np.ndarray:
     return np.arange(round(seconds * rate_hz)) / rate_hz
 
 
-def lively(seconds: float = 10.0) -> Felt:
+def lively(seconds: float = 10.0) -> IdealMotion:
     """Turning and shaking in every axis, below 4 Hz."""
     t, rng = clock(seconds), np.random.default_rng(4)
 
@@ -40,49 +40,49 @@ def lively(seconds: float = 10.0) -> Felt:
         return size * np.sin(2.0 * np.pi * f * t[:, None, None] + at).sum(axis=1)
 
     R_wb = Rotation.from_rotvec(waves(0.3)).as_matrix()
-    return Felt(t, waves(1.0), waves(3.0) + np.array([0.0, 0.0, G]), waves(5.0), R_wb, {"/imu0.temperature": 20.0 + t})
+    return IdealMotion(t, waves(1.0), waves(3.0) + np.array([0.0, 0.0, G]), waves(5.0), R_wb, {"/imu0.temperature": 20.0 + t})
 
 
-def still(seconds: float = 1.0, gyro: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> Felt:
+def still(seconds: float = 1.0, gyro: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> IdealMotion:
     """Level, perhaps turning at a constant rate."""
     t = clock(seconds)
     n = len(t)
     accel = np.tile([0.0, 0.0, G], (n, 1))
-    return Felt(t, np.tile(gyro, (n, 1)), accel, np.zeros((n, 3)), np.tile(np.eye(3), (n, 1, 1)))
+    return IdealMotion(t, np.tile(gyro, (n, 1)), accel, np.zeros((n, 3)), np.tile(np.eye(3), (n, 1, 1)))
 
 
-def sine(f_hz: float, seconds: float = 20.0, rate_hz: float = RATE_HZ) -> Felt:
+def sine(f_hz: float, seconds: float = 20.0, rate_hz: float = RATE_HZ) -> IdealMotion:
     """One frequency on every axis."""
     t = clock(seconds, rate_hz)
     x = np.tile(np.sin(2.0 * np.pi * f_hz * t)[:, None], (1, 3))
-    return Felt(t, x, x.copy(), x.copy())
+    return IdealMotion(t, x, x.copy(), x.copy())
 
 
-def ideal(one: Physics, felt: Felt) -> Felt | Read | np.ndarray:
+def ideal(one: Effect, felt: IdealMotion) -> IdealMotion | SensorSamples | np.ndarray:
     """What an effect acts on."""
     if one.stage < Stage.CLOCK:
         return felt
     return felt.t_s + 0.3 if one.stage == Stage.CLOCK else felt.taken(felt.t_s, felt.t_s)
 
 
-def numbers(of: Felt | Read | np.ndarray) -> dict[str, np.ndarray]:
+def numbers(of: IdealMotion | SensorSamples | np.ndarray) -> dict[str, np.ndarray]:
     if isinstance(of, np.ndarray):
         return {"taken_s": of}
     arrays = {column.name: getattr(of, column.name) for column in fields(of)}
     return {name: value for name, value in arrays.items() if isinstance(value, np.ndarray)} | dict(of.channels)
 
 
-def some_theta(one: Physics) -> np.ndarray:
+def some_theta(one: Effect) -> np.ndarray:
     draw = np.random.default_rng(1).uniform(0.3, 1.0, len(one.parameters))
     return one.plausible * draw
 
 
-def only(name: str) -> Physics:
+def only(name: str) -> Effect:
     return physics([name])[0]
 
 
-def act(name: str, of: Felt | Read, *theta: float) -> Felt | Read:
-    out: Felt | Read = only(name).forward(of, np.array(theta))
+def act(name: str, of: IdealMotion | SensorSamples, *theta: float) -> IdealMotion | SensorSamples:
+    out: IdealMotion | SensorSamples = only(name).forward(of, np.array(theta))
     return out
 
 
@@ -90,13 +90,13 @@ def close(a: np.ndarray, b: np.ndarray, tolerance: float = SAME) -> None:
     np.testing.assert_allclose(a, b, rtol=0, atol=tolerance * max(1.0, float(np.abs(b).max())))
 
 
-# every file with PHYSICS
+# every file with EFFECT
 
 
 @pytest.mark.parametrize("one", ALL)
-def test_it_says_what_it_is(one: Physics) -> None:
+def test_it_says_what_it_is(one: Effect) -> None:
     module = registry.load("imutool.effects", one.name)
-    assert module.PHYSICS is one
+    assert module.EFFECT is one
     assert set(one.sensors) <= {"gyro", "accel"}
     assert one.sensors
     assert one.equation
@@ -109,16 +109,16 @@ def test_it_says_what_it_is(one: Physics) -> None:
 
 
 @pytest.mark.parametrize("one", ALL)
-def test_at_nothing_it_does_nothing(one: Physics) -> None:
+def test_at_nothing_it_does_nothing(one: Effect) -> None:
     felt = lively()
-    before, after = numbers(ideal(one, felt)), numbers(one.forward(ideal(one, felt), one.nothing))
+    before, after = numbers(ideal(one, felt)), numbers(one.forward(ideal(one, felt), one.null_value))
     assert before.keys() == after.keys()
     for name, value in before.items():
         np.testing.assert_array_equal(after[name], value, err_msg=name)
 
 
 @pytest.mark.parametrize("one", ALL)
-def test_it_acts_keeps_shapes_and_leaves_what_it_is_given_alone(one: Physics) -> None:
+def test_it_acts_keeps_shapes_and_leaves_what_it_is_given_alone(one: Effect) -> None:
     felt = lively(30.0)  # clocks jump within it
     given = ideal(one, felt)
     theta = some_theta(one)
@@ -139,7 +139,7 @@ def test_it_acts_keeps_shapes_and_leaves_what_it_is_given_alone(one: Physics) ->
 
 
 @pytest.mark.parametrize("one", [p for p in ALL if p.values[0].linear])
-def test_a_linear_one_adds_in_proportion(one: Physics) -> None:
+def test_a_linear_one_adds_in_proportion(one: Effect) -> None:
     felt = lively()
     theta = some_theta(one)
     zero, once, twice = (numbers(one.forward(ideal(one, felt), k * theta)) for k in (0.0, 1.0, 2.0))
@@ -148,14 +148,14 @@ def test_a_linear_one_adds_in_proportion(one: Physics) -> None:
 
 
 @pytest.mark.parametrize("one", WITH_STARTS)
-def test_starts_are_finite_and_positive_where_the_number_is_and_work(one: Physics) -> None:
+def test_starts_are_finite_and_positive_where_the_number_is_and_work(one: Effect) -> None:
     assert one.starts is not None
     felt = lively()
     real = read(felt, felt.t_s, [(one, some_theta(one))])
-    starts = one.starts(felt, Read(felt.t_s, real.gyro, real.accel, np.zeros_like(real.gyro)))
+    starts = one.starts(felt, SensorSamples(felt.t_s, real.gyro, real.accel, np.zeros_like(real.gyro)))
     assert starts
     for start in starts:
-        assert start.shape == one.nothing.shape
+        assert start.shape == one.null_value.shape
         assert np.isfinite(start).all()
         assert all(value > 0 for value, number in zip(start, one.parameters, strict=True) if number.positive)
         assert np.isfinite(read(felt, felt.t_s, [(one, start)]).accel).all()
@@ -459,10 +459,10 @@ def test_stages_act_in_their_order_whatever_the_order_given() -> None:
     theta = {"quantization": [0.05, 0.05], "gyro_scale": [0.1] * 3, "clock_offset": [0.01], "low_pass": [5.0]}
     theta |= {"saturation": [1.02, 9.99], "lever_arm": [0.3, 0.0, 0.0], "mount_rotation": [0.1, 0.2, 0.3]}
     acting = [(only(name), np.array(value)) for name, value in theta.items()]
-    now: Felt | Read = felt
+    now: IdealMotion | SensorSamples = felt
     for name in ("lever_arm", "mount_rotation", "low_pass"):
         now = act(name, now, *theta[name])
-    assert isinstance(now, Felt)
+    assert isinstance(now, IdealMotion)
     now = now.taken(stamp_s + 0.01, stamp_s)
     for name in ("gyro_scale", "saturation", "quantization"):
         now = act(name, now, *theta[name])
@@ -506,7 +506,7 @@ def test_what_is_remembered_never_outlives_a_change() -> None:
     fresh = replace(felt, gyro=felt.gyro * 2.0, channels={"/x": felt.t_s, "/y": -felt.t_s})
     ways = [(felt, t), (fresh, t), (felt, t[:50]), (fresh, felt.t_s), (felt, felt.t_s), (felt, t), (fresh, t)]
     for one, taken_s in ways:
-        alone = Felt(one.t_s, one.gyro, one.accel, one.alpha, one.R_wb, one.channels)
+        alone = IdealMotion(one.t_s, one.gyro, one.accel, one.alpha, one.R_wb, one.channels)
         seen, expected = one.taken(taken_s, taken_s), alone.taken(taken_s, taken_s)
         for name, value in numbers(expected).items():
             np.testing.assert_array_equal(numbers(seen)[name], value, err_msg=name)

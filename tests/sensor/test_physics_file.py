@@ -12,9 +12,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from imutool.errors import ConfigError, DataError
-from imutool.sensor.effect import Number, Physics, Stage, Theta
+from imutool.sensor.effect import Effect, Parameter, Stage, Theta
 from imutool.sensor.physics_file import Bias, Curve, Entry, PhysicsFile, Term, Value, read, write
-from imutool.sensor.readings import Read
+from imutool.sensor.readings import SensorSamples
 
 NUMBERS = st.floats(allow_nan=False, allow_infinity=False)
 POSITIVE = st.floats(min_value=0.0, allow_nan=False, allow_infinity=False)
@@ -132,10 +132,10 @@ def test_what_cannot_act_is_named(tmp_path: Path, text: str, named: str) -> None
 
 
 def test_parameters_go_in_the_effects_own_order_and_what_is_left_out_does_nothing() -> None:
-    numbers = (Number("b", "m", 1.0), Number("a", "s", 1.0), Number("cut", "Hz", 1.0, nothing=np.inf))
-    planted = Physics("planted", Stage.SENSOR, ("gyro",), "", numbers, "", lambda read, theta: read)
+    numbers = (Parameter("b", "m", 1.0), Parameter("a", "s", 1.0), Parameter("cut", "Hz", 1.0, null_value=np.inf))
+    planted = Effect("planted", Stage.SENSOR, ("gyro",), "", numbers, "", lambda read, theta: read)
 
-    def known(names: Sequence[str]) -> tuple[Physics, ...]:
+    def known(names: Sequence[str]) -> tuple[Effect, ...]:
         assert list(names) == ["planted"]
         return (planted,)
 
@@ -146,26 +146,26 @@ def test_parameters_go_in_the_effects_own_order_and_what_is_left_out_does_nothin
 
 
 @pytest.fixture
-def ideal() -> Read:
+def ideal() -> SensorSamples:
     rng = np.random.default_rng(0)
     t_s = 0.01 * np.arange(200)
     gyro, accel, alpha = (rng.normal(size=(200, 3)) for _ in range(3))
-    return Read(t_s + 5.0, gyro, accel, alpha, channels={"/motor": np.sin(t_s)})
+    return SensorSamples(t_s + 5.0, gyro, accel, alpha, channels={"/motor": np.sin(t_s)})
 
 
-def one(file: PhysicsFile) -> tuple[Physics, Theta]:
+def one(file: PhysicsFile) -> tuple[Effect, Theta]:
     (pair,) = file.acting()
     return pair
 
 
-def test_a_bias_is_added(ideal: Read) -> None:
+def test_a_bias_is_added(ideal: SensorSamples) -> None:
     physics, theta = one(PhysicsFile(bias=Bias(gyro=(1.0, 2.0, 3.0), accel=(4.0, 5.0, 6.0))))
     out = physics.forward(ideal, theta)
     np.testing.assert_allclose(out.gyro - ideal.gyro, np.tile([1.0, 2.0, 3.0], (200, 1)))
     np.testing.assert_allclose(out.accel - ideal.accel, np.tile([4.0, 5.0, 6.0], (200, 1)))
 
 
-def test_a_curve_is_straight_between_its_points_and_held_beyond(ideal: Read) -> None:
+def test_a_curve_is_straight_between_its_points_and_held_beyond(ideal: SensorSamples) -> None:
     curve = Curve(signal="accel", variable="omega_y", unit="rad/s", x=(-0.5, 0.5), y=((0.0, 1.0, 0.0), (0.0, 3.0, 2.0)))
     physics, theta = one(PhysicsFile(unknown=(curve,)))
     out = physics.forward(ideal, theta)
@@ -189,14 +189,14 @@ def test_a_curve_is_straight_between_its_points_and_held_beyond(ideal: Read) -> 
     ],
     ids=lambda value: value if isinstance(value, str) else "",
 )
-def test_a_term_is_what_it_says(ideal: Read, text: str, expected: object) -> None:
+def test_a_term_is_what_it_says(ideal: SensorSamples, text: str, expected: object) -> None:
     physics, theta = one(PhysicsFile(term=(Term(signal="gyro", term=text, value=(0.0, 2.0, 0.0)),)))
     out = physics.forward(ideal, theta)
     np.testing.assert_allclose(out.gyro[:, 1] - ideal.gyro[:, 1], 2.0 * expected(ideal), atol=1e-12)  # type: ignore[operator]
     np.testing.assert_array_equal(out.gyro[:, [0, 2]], ideal.gyro[:, [0, 2]])
 
 
-def test_what_is_driven_follows_its_channel_later(ideal: Read) -> None:
+def test_what_is_driven_follows_its_channel_later(ideal: SensorSamples) -> None:
     parameters = {"y": Value(value=3.0, unit="rad/s per A"), "lag": Value(value=0.1, unit="s")}
     entry = Entry(name="driven", signal="gyro", driver="/motor", parameters=parameters)
     physics, theta = one(PhysicsFile(effect=(entry,)))
@@ -205,7 +205,7 @@ def test_what_is_driven_follows_its_channel_later(ideal: Read) -> None:
     np.testing.assert_allclose(added[10:], 3.0 * (c[:-10] - c.mean()), atol=1e-12)
 
 
-def test_a_channel_that_is_not_there_is_named(ideal: Read) -> None:
+def test_a_channel_that_is_not_there_is_named(ideal: SensorSamples) -> None:
     entry = Entry(name="driven", signal="gyro", driver="/wheel", parameters={"y": Value(value=3.0, unit="")})
     physics, theta = one(PhysicsFile(effect=(entry,)))
     with pytest.raises(DataError, match=r"no channel /wheel; expected one of the log's channels: /motor"):

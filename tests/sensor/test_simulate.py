@@ -22,9 +22,9 @@ from imutool.mcap_io.writer import LogWriter
 from imutool.noise import datasheet as noises
 from imutool.recording import GRAVITY_M_S2, Imu, Poses, Recording, Scalars, seconds
 from imutool.sensor import catalogue
-from imutool.sensor.effect import Physics, Stage, Theta
+from imutool.sensor.effect import Effect, Stage, Theta
 from imutool.sensor.physics_file import PhysicsFile
-from imutool.sensor.readings import Read
+from imutool.sensor.readings import SensorSamples
 from imutool.sensor.simulate import MOTION_TOPIC, read_all, simulate, simulated
 
 START_NS = 1_700_000_000_000_000_123
@@ -46,7 +46,7 @@ def recording(truth: Poses, **changes: object) -> Recording:
     return replace(Recording("made_up", none, {"/ground_truth/pose": truth}), **changes)  # type: ignore[arg-type]
 
 
-def along(truth: Poses, acting: list[tuple[Physics, Theta]] | None = None, **changes: object) -> Recording:
+def along(truth: Poses, acting: list[tuple[Effect, Theta]] | None = None, **changes: object) -> Recording:
     return simulated(recording(truth, **changes), acting or [], NONE, RATE_HZ, 0).recording
 
 
@@ -123,8 +123,8 @@ def test_a_lever_arm_on_a_constant_turn_reads_the_centripetal_acceleration() -> 
     np.testing.assert_allclose(imu.accel, np.tile([-0.1 * 2.0**2, 0.0, GRAVITY_M_S2], (len(imu), 1)), atol=ACCEL)
 
 
-def planted(name: str, stage: Stage, forward: Callable[..., object]) -> tuple[Physics, Theta]:
-    return Physics(name, stage, ("gyro", "accel"), "", (), "", forward), np.zeros(0)
+def planted(name: str, stage: Stage, forward: Callable[..., object]) -> tuple[Effect, Theta]:
+    return Effect(name, stage, ("gyro", "accel"), "", (), "", forward), np.zeros(0)
 
 
 def test_effects_act_in_the_order_of_their_stages() -> None:
@@ -232,7 +232,7 @@ def test_several_stretches_are_read_as_one_sensor() -> None:
     second = replace(felts[1], t_s=felts[1].t_s + 10.0)
     stamps = [felts[0].t_s[::2], second.t_s[::2]]
     out = read_all([felts[0], second], stamps, [])
-    assert isinstance(out, Read)
+    assert isinstance(out, SensorSamples)
     np.testing.assert_array_equal(out.stamp_s, np.concatenate(stamps))
     np.testing.assert_allclose(out.gyro[:, 2], np.where(out.stamp_s < 8.0, 0.0, 2.0), atol=GYRO)
 

@@ -12,7 +12,7 @@ import torch
 from imutool.errors import ConfigError, DataError
 from imutool.recording import Imu, Poses, Recording, seconds
 from imutool.sensor.catalogue import named
-from imutool.sensor.linear_effect import Effect, Sensor, compiled
+from imutool.sensor.linear_effect import LinearEffect, Sensor, compiled
 from imutool.sensor.signals import SignalFilter
 from imutool.training.calibration import FOLDS, Calibration, calibrate, folded
 from imutool.training.segments import Pool
@@ -29,7 +29,7 @@ ACCEL = ("accel_scale", "accel_misalignment", "lever_arm", "clock_offset", "acce
 PLANTED: list[tuple[Sensor, str]] = [*(("gyro", name) for name in GYRO), *(("accel", name) for name in ACCEL)]
 
 
-def measured(recording: Recording, effects: Sequence[Effect], theta: np.ndarray, seed: int) -> Recording:
+def measured(recording: Recording, effects: Sequence[LinearEffect], theta: np.ndarray, seed: int) -> Recording:
     """The samples of a sensor with errors: u = true + E(u) + rest, solved by going round, then noise."""
     imu, rng = recording.imu, np.random.default_rng(seed)
     t_s, u = seconds(imu.t_ns, int(imu.t_ns[0])), {"gyro": imu.gyro.copy(), "accel": imu.accel.copy()}
@@ -44,7 +44,7 @@ def measured(recording: Recording, effects: Sequence[Effect], theta: np.ndarray,
     return Recording(recording.name, Imu(imu.t_ns, u["gyro"], u["accel"]), recording.truths)
 
 
-def planted_theta(effects: Sequence[Effect]) -> np.ndarray:
+def planted_theta(effects: Sequence[LinearEffect]) -> np.ndarray:
     """A third of what is plausible, alternately up and down."""
     plausible = np.concatenate([effect.plausible for effect in effects])
     signs = np.where(np.arange(len(plausible)) % 2, -1.0, 1.0)
@@ -57,7 +57,7 @@ def flights(perfect: MakeRecording) -> list[Recording]:
 
 
 def found(
-    flights: Sequence[Recording], sensor: Sensor, effects: Sequence[Effect], names: Sequence[str] | None = None
+    flights: Sequence[Recording], sensor: Sensor, effects: Sequence[LinearEffect], names: Sequence[str] | None = None
 ) -> Calibration:
     """The calibration of flights with effects planted on one sensor; the other's errors are its rest bias alone."""
     theta = planted_theta(effects) if effects else np.zeros(0)

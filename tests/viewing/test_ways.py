@@ -16,7 +16,7 @@ from imutool.mcap_io.write import write
 from imutool.recording import Recording
 from imutool.viewing import outputs
 from imutool.viewing.model.run_data import Run, RunData, build
-from imutool.viewing.outputs import Asked, Ways, cursor_s
+from imutool.viewing.outputs import Asked, Outputs, cursor_s
 
 
 @pytest.mark.parametrize(
@@ -30,7 +30,7 @@ from imutool.viewing.outputs import Asked, Ways, cursor_s
 )
 def test_contradictions_are_refused_before_any_work(asked: Asked, what: str) -> None:
     with pytest.raises(ConfigError, match=what):
-        Ways(asked)
+        Outputs(asked)
 
 
 @pytest.fixture
@@ -49,7 +49,7 @@ def report(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_files_and_pages_are_made_together_and_each_is_said(data: RunData, tmp_path: Path, report: None) -> None:
     asked = Asked(save=tmp_path / "a.rrd", html=tmp_path / "a.html", png=tmp_path / "p")
-    with Ways(asked) as chosen:
+    with Outputs(asked) as chosen:
         shown = chosen.show([data])
     assert [one.how for one in shown] == ["html", "png", "rrd"]
     assert (tmp_path / "a.html").read_text(encoding="utf-8") == "flight_3"
@@ -64,13 +64,13 @@ def test_without_rerun_a_page_is_written_here_and_said(
     there = outputs.find_spec
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(outputs, "find_spec", lambda name: None if name == "rerun" else there(name))
-    with Ways(Asked()) as chosen:
+    with Outputs(Asked()) as chosen:
         (shown,) = chosen.show([data])
     assert (shown.how, shown.place) == ("html", "flight_3.html")
     assert "not installed (pip install 'imutool[view]')" in shown.said
     assert (tmp_path / "flight_3.html").read_text(encoding="utf-8") == "flight_3"
     monkeypatch.setattr(outputs, "find_spec", lambda name: None)
-    with Ways(Asked()) as chosen, pytest.raises(ConfigError, match=r"imutool\[view,report\]"):
+    with Outputs(Asked()) as chosen, pytest.raises(ConfigError, match=r"imutool\[view,report\]"):
         chosen.show([data])
 
 
@@ -78,7 +78,7 @@ def test_what_needs_rerun_is_refused_without_it_before_any_work(monkeypatch: pyt
     monkeypatch.setitem(sys.modules, "rerun", None)
     for asked in (Asked(save=Path("a")), Asked(connect="1"), Asked(web=True), Asked(export=Path("a"))):
         with pytest.raises(ConfigError, match=r"pip install 'imutool\[view\]'"):
-            Ways(asked)
+            Outputs(asked)
 
 
 def test_the_cursor_starts_at_a_time_or_at_the_worst_error_of_a_model(

@@ -18,7 +18,7 @@ from imutool.diagnosis.result import Estimate, Finding, HeldOut, Located, Signal
 from imutool.diagnosis.scalar import effects, fit
 from imutool.diagnosis.scalar.alignment import Beside, beside
 from imutool.diagnosis.scalar.effects import Chosen, Column, Curve, Samples
-from imutool.diagnosis.scalar.fit import Fit, Weighed
+from imutool.diagnosis.scalar.fit import Fit, WhitenedLog
 from imutool.diagnosis.scalar.search import Found, Judged, Search
 from imutool.diagnosis.timestamps import LEAST_DIGITS, grid
 from imutool.mcap_io.fields import Fields
@@ -77,7 +77,7 @@ def diagnose_signal(real: Fields, sim: Fields, others: Mapping[str, Fields], nam
     return _told(pair, signal, found, len(always), name, unit, lsb)
 
 
-def _weighed(pair: Beside, residual: Samples, lsb: float) -> Weighed:
+def _weighed(pair: Beside, residual: Samples, lsb: float) -> WhitenedLog:
     usable = pair.fitted | pair.held_out
     x = pair.ideal.taken(()).x
     rounding = None
@@ -85,7 +85,7 @@ def _weighed(pair: Beside, residual: Samples, lsb: float) -> Weighed:
         model = pair.real - residual
         _, rounding = fit.density(np.rint(model / lsb) * lsb - model, usable, pair.rate_hz)
     noise = fit.noise(residual, usable, pair.rate_hz, fit.edge_hz(x, pair.rate_hz), pair.simulated, rounding)
-    return Weighed(pair.ideal, pair.real, pair.fitted, pair.held_out, noise)
+    return WhitenedLog(pair.ideal, pair.real, pair.fitted, pair.held_out, noise)
 
 
 def _rich(pair: Beside) -> Samples:
@@ -123,7 +123,7 @@ def _lsb(real: Fields, sim: Fields) -> float:
 # ── what is told ──
 
 
-def _told(pair: Beside, signal: Weighed, found: Found, always: int, name: str, unit: str, lsb: float) -> SignalDiagnosis:
+def _told(pair: Beside, signal: WhitenedLog, found: Found, always: int, name: str, unit: str, lsb: float) -> SignalDiagnosis:
     level = signal.noise.level
     chosen, held = found.whole.chosen, pair.held_out
     before, after = pair.ideal.expected(()), pair.ideal.expected(chosen)

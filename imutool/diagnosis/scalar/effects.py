@@ -17,7 +17,7 @@ from scipy.interpolate import BSpline
 from scipy.ndimage import map_coordinates, spline_filter
 from scipy.signal import lfilter
 
-from imutool.sensor.effect import Number, Theta
+from imutool.sensor.effect import Parameter, Theta
 
 Column = Float64[np.ndarray, "_"]
 Samples = Float64[np.ndarray, " n"]
@@ -68,7 +68,7 @@ class Effect:
     key: str
     stage: Stage
     equation: str
-    numbers: tuple[Number, ...]
+    numbers: tuple[Parameter, ...]
     forward: Callable[..., object]
     starts: tuple[Theta, ...]
     driver: str = ""
@@ -76,9 +76,9 @@ class Effect:
     wanders: bool = False  # in time, so that a few blocks do not say what is between them
 
     @property
-    def nothing(self) -> Theta:
+    def null_value(self) -> Theta:
         """The parameters at which it does nothing."""
-        return np.array([number.nothing for number in self.numbers])
+        return np.array([number.null_value for number in self.numbers])
 
 
 Chosen = tuple[tuple[Effect, Theta], ...]
@@ -136,7 +136,7 @@ def offset(size: float, unit: str) -> Effect:
         "offset",
         Stage.ADDED,
         "y += offset",
-        (Number("offset", unit, 10.0 * size),),
+        (Parameter("offset", unit, 10.0 * size),),
         lambda y, taken, theta: y + theta[0],
         (np.zeros(1),),
     )
@@ -145,7 +145,7 @@ def offset(size: float, unit: str) -> Effect:
 def delay(lag_s: float, step_s: float) -> Effect:
     """Positive where the recording comes late; `step_s` is what derivatives move it by."""
     starts = (np.zeros(1),) if abs(lag_s) < 1e-9 else (np.zeros(1), np.array([lag_s]))
-    numbers = (Number("delay", "s", max(0.2, abs(lag_s)), step=step_s),)
+    numbers = (Parameter("delay", "s", max(0.2, abs(lag_s)), step=step_s),)
     return Effect("delay", "delay", Stage.CLOCK, "y(t) = x(t - delay)", numbers, lambda theta: theta[0], starts)
 
 
@@ -165,7 +165,7 @@ def named(ideal: Ideal, real: Samples, lag_s: float, unit: str) -> Iterator[Effe
         "low_pass",
         Stage.BANDWIDTH,
         "dy/dt = 2 pi f_c (x - y)",
-        (Number("f_c", "Hz", 10.0, positive=True, nothing=np.inf),),
+        (Parameter("f_c", "Hz", 10.0, positive=True, null_value=np.inf),),
         _low_pass,
         tuple(np.array([times * slope / size / (2.0 * np.pi)]) for times in CUTOFFS),
     )
@@ -174,13 +174,13 @@ def named(ideal: Ideal, real: Samples, lag_s: float, unit: str) -> Iterator[Effe
         "gain",
         Stage.GAIN,
         "y = gain x",
-        (Number("gain", "-", 0.5, nothing=1.0),),
+        (Parameter("gain", "-", 0.5, null_value=1.0),),
         lambda y, taken, theta: theta[0] * y,
         (np.ones(1),),
     )
     yield from _dead_bands(size, unit)
     yield from _drifts(ideal, size, unit)
-    level = (Number("level", unit, size),)
+    level = (Parameter("level", unit, size),)
     yield Effect(
         "friction", "friction of x", Stage.ADDED, "y += level sign(x)", level, _Sign(False, STEEP * size), (np.zeros(1),)
     )
@@ -199,7 +199,7 @@ def _low_pass(fine: Column, rate_hz: float, theta: Theta) -> Column:
 
 
 def _dead_bands(size: float, unit: str) -> Iterator[Effect]:
-    numbers = (Number("width", unit, size, positive=True), Number("center", unit, 0.3 * size))
+    numbers = (Parameter("width", unit, size, positive=True), Parameter("center", unit, 0.3 * size))
     starts = tuple(np.array([width * size, 0.0]) for width in WIDTHS)
 
     def zone(y: Samples, _taken: Taken, theta: Theta) -> Samples:
@@ -225,11 +225,11 @@ def _dead_bands(size: float, unit: str) -> Iterator[Effect]:
 
 def _limits(real: Samples, size: float, unit: str) -> Iterator[Effect]:
     """Above, below, or both: a side that is never reached is no limit."""
-    upper, lower = Number("upper", unit, size, nothing=np.inf), Number("lower", unit, size, nothing=-np.inf)
+    upper, lower = Parameter("upper", unit, size, null_value=np.inf), Parameter("lower", unit, size, null_value=-np.inf)
     high, low = ([np.quantile(real, out) for out in outs] for outs in ([1.0 - r for r in REACHED], REACHED))
     texts = "y = min(x, upper)", "y = max(x, lower)", "y = min(max(x, lower), upper)"
 
-    def effect(key: str, text: str, numbers: tuple[Number, ...], starts: Iterable[Sequence[float]]) -> Effect:
+    def effect(key: str, text: str, numbers: tuple[Parameter, ...], starts: Iterable[Sequence[float]]) -> Effect:
         def clip(y: Samples, _taken: Taken, theta: Theta) -> Samples:
             least, most = (theta[-1] if key != "upper limit" else -np.inf), (theta[0] if key != "lower limit" else np.inf)
             return np.asarray(np.clip(y, least, most))
@@ -265,7 +265,7 @@ def _drifts(ideal: Ideal, size: float, unit: str) -> Iterator[Effect]:
         "drift",
         Stage.ADDED,
         "y += rate t",
-        (Number("rate", f"{unit}/s" if unit else "1/s", size / length),),
+        (Parameter("rate", f"{unit}/s" if unit else "1/s", size / length),),
         lambda y, taken, theta: y + theta[0] * (taken.t_s - middle),
         (np.zeros(1),),
     )
@@ -316,7 +316,7 @@ def _curve(
     name: str, key: str, variable: str, of: str, first: float, last: float, knots: int, size: float, unit: str
 ) -> Effect:
     curve = Curve(variable, of, first, last, knots)
-    numbers = tuple(Number(f"c{j}", unit, share * size) for j, share in enumerate(curve.plausible))
+    numbers = tuple(Parameter(f"c{j}", unit, share * size) for j, share in enumerate(curve.plausible))
     text = f"y += curve({variable})"
     return Effect(name, key, Stage.ADDED, text, numbers, curve, (np.zeros(knots),), wanders=variable == "t")
 
@@ -351,7 +351,7 @@ def driven(ideal: Ideal, real: Samples, unit: str) -> Iterator[Effect]:
         spread = float(there.std())
         if not spread > 1e-12 * max(1.0, float(np.abs(there).max())) or abs(float(np.corrcoef(there, real)[0, 1])) > SAME:
             continue
-        numbers = (Number("gain", f"{unit or '1'} per unit of {name}", size / spread), Number("lag", "s", 0.2))
+        numbers = (Parameter("gain", f"{unit or '1'} per unit of {name}", size / spread), Parameter("lag", "s", 0.2))
         yield Effect(
             "driven",
             f"driven by {name}",

@@ -17,7 +17,7 @@ from scipy.signal import lfilter, welch
 
 from imutool.diagnosis.scalar.effects import Chosen, Column, Effect, Ideal, Samples, Stage
 from imutool.diagnosis.whitening import settled
-from imutool.sensor.effect import Number, Theta
+from imutool.sensor.effect import Parameter, Theta
 
 ORDER = 6
 SEGMENT, LINES = 512, 9  # samples of a spectrum; frequencies of the median that takes lines out of it
@@ -83,7 +83,7 @@ def noise(
 
 
 @dataclass(frozen=True, eq=False)
-class Weighed:
+class WhitenedLog:
     """A recorded signal beside the simulated one, the rows that count, and the noise."""
 
     ideal: Ideal
@@ -127,7 +127,7 @@ class Fit:
         return np.array([s * t if n.positive else s for s, t, n in zip(std, theta, effect.numbers, strict=True)])
 
 
-def _numbers(chosen: Chosen) -> list[Number]:
+def _numbers(chosen: Chosen) -> list[Parameter]:
     return [number for effect, _ in chosen for number in effect.numbers]
 
 
@@ -149,12 +149,14 @@ def _bound(chosen: Chosen, free: Column) -> Chosen:
 def priors(begun: Chosen) -> tuple[Column, Column]:
     """Mean and standard deviation of the free parameters: about nothing, or where the fit began if nothing is infinite."""
     at = _free(begun)
-    mean = [x if n.positive or not np.isfinite(n.nothing) else n.nothing for n, x in zip(_numbers(begun), at, strict=True)]
+    mean = [
+        x if n.positive or not np.isfinite(n.null_value) else n.null_value for n, x in zip(_numbers(begun), at, strict=True)
+    ]
     std = [LOG_PRIOR if n.positive else PRIOR * n.plausible for n in _numbers(begun)]
     return np.array(mean), np.array(std)
 
 
-def step_of(number: Number) -> float:
+def step_of(number: Parameter) -> float:
     """For differences, of the logarithm of what is positive."""
     return number.step or (LOG_STEP if number.positive else STEP * number.plausible)
 
@@ -176,7 +178,7 @@ def derivatives(ideal: Ideal, chosen: Chosen, of: Sequence[int]) -> Float64[np.n
     return np.stack(columns, axis=1) if columns else np.zeros((len(ideal.t_s), 0))
 
 
-def fit(signal: Weighed, begun: Chosen, part: str = "fitted", iterations: int = ITERATIONS) -> Fit:
+def fit(signal: WhitenedLog, begun: Chosen, part: str = "fitted", iterations: int = ITERATIONS) -> Fit:
     """The effects fitted together to a part of the rows, from where they begin."""
     fitting = _Fitting(signal, signal.rows(part), begun)
     fitting.descend(iterations)
@@ -189,7 +191,7 @@ def fit(signal: Weighed, begun: Chosen, part: str = "fitted", iterations: int = 
 class _Fitting:
     """Effects on their way to the least squares of some rows."""
 
-    def __init__(self, signal: Weighed, rows: Bool[np.ndarray, " n"], begun: Chosen) -> None:
+    def __init__(self, signal: WhitenedLog, rows: Bool[np.ndarray, " n"], begun: Chosen) -> None:
         self.signal, self.rows, self.chosen = signal, rows, begun
         self.mean, self.std = priors(begun)
         self.objective, self.white = np.inf, np.zeros(0)
@@ -238,7 +240,7 @@ class _Fitting:
 class Panel:
     """The normal equations of a fit, with a place left for one more effect."""
 
-    def __init__(self, signal: Weighed, now: Fit) -> None:
+    def __init__(self, signal: WhitenedLog, now: Fit) -> None:
         self.signal, self.now, self.rows = signal, now, signal.rows("fitted")
         self.A = signal.noise.whiten(derivatives(signal.ideal, now.chosen, range(len(now.chosen))))[self.rows]
         _, std = priors(now.chosen)

@@ -12,7 +12,7 @@ from scipy.stats import wilcoxon
 
 from imutool.diagnosis.model_selection import FALSE_DISCOVERY, HELPS
 from imutool.diagnosis.scalar.effects import Chosen, Effect, Samples, differ
-from imutool.diagnosis.scalar.fit import BETWEEN_SAMPLES, Fit, Panel, Weighed, fit
+from imutool.diagnosis.scalar.fit import BETWEEN_SAMPLES, Fit, Panel, WhitenedLog, fit
 from imutool.diagnosis.significance import BLOCK_S, chance
 
 ALIKE = 4.0  # natural logarithms of chance within which two effects cannot be told apart
@@ -49,7 +49,7 @@ class Search:
     """
 
     def __init__(
-        self, signal: Weighed, always: Chosen, candidates: Sequence[Effect], later: Sequence[Sequence[Effect]]
+        self, signal: WhitenedLog, always: Chosen, candidates: Sequence[Effect], later: Sequence[Sequence[Effect]]
     ) -> None:
         self.signal, self.always = signal, always
         self.candidates, self.later = list(candidates), [list(group) for group in later]

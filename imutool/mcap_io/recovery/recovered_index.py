@@ -18,18 +18,18 @@ from imutool.errors import LogError
 from imutool.mcap_io.codec import records
 from imutool.mcap_io.codec.crc import crc32
 from imutool.mcap_io.codec.records import FOOTER_SIZE, HEAD, MAGIC
-from imutool.mcap_io.index import RUN_BYTES, Block, Span, Structure
+from imutool.mcap_io.index import RUN_BYTES, Block, LogIndex, Span
 from imutool.mcap_io.losses import Loss, Losses
 from imutool.mcap_io.recovery.chunk_repair import in_order, mended
 from imutool.mcap_io.recovery.definitions import by_the_whole, counted, edited, learn, refuse_others, search
 from imutool.mcap_io.recovery.resync import PRIVATE
-from imutool.mcap_io.recovery.scan import LATEST_NS, Gap, Walk, reason
+from imutool.mcap_io.recovery.scan import LATEST_NS, Gap, Scan, reason
 from imutool.mcap_io.sections import DEFINITIONS, Sections
 from imutool.mcap_io.storage.source import Source
 
 
-class Salvaged(Structure):
-    """As `Structure`, for a file that may be damaged; `losses` says what could not be used, and grows while chunks are read.
+class RecoveredIndex(LogIndex):
+    """As `LogIndex`, for a file that may be damaged; `losses` says what could not be used, and grows while chunks are read.
 
     Without a summary that a CRC vouches for, every chunk is unpacked at once, because only that proves it.
 
@@ -205,7 +205,7 @@ class Salvaged(Structure):
 
     def _chart(self, index: dict[int, ChunkIndex]) -> int:
         limit = self.footer.summary_start if self._trusted else self.source.size
-        self._walk = Walk(self.source, limit, index, self.sections, self.losses)
+        self._walk = Scan(self.source, limit, index, self.sections, self.losses)
         self._walk.run()
         self.items = self._walk.items
         return self._walk.data_end

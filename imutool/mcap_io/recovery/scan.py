@@ -47,7 +47,7 @@ class Gap:
     end_ns: int | None = None
 
 
-class Walk:
+class Scan:
     """One pass over the records of a file; `index` has the chunks of a summary that is sound, if there is one.
 
     Raises:

@@ -7,13 +7,13 @@ import threading
 from types import TracebackType
 
 from imutool.errors import ConfigError, ImutoolError, LogError
-from imutool.location import Place, failures, opened, reason
+from imutool.location import Location, failures, opened, reason
 from imutool.mcap_io.storage.source import Source
 
 BLOCK_BYTES = 1 << 20
 
 
-def sha256(path: Place) -> str:
+def sha256(path: Location) -> str:
     """The SHA-256 of a file, in hex, a block at a time.
 
     Raises:
@@ -32,7 +32,7 @@ class Digest:
     A context manager: leaving it ends the thread, whether or not anybody asked for the result.
     """
 
-    def __init__(self, path: Place) -> None:
+    def __init__(self, path: Location) -> None:
         self._source, self._sum = Source(path), hashlib.sha256()
         self._error: ImutoolError | None = None
         self._left = threading.Event()

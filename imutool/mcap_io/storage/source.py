@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from imutool.errors import ConfigError, LogError
-from imutool.location import Place, failures, opened, reason
+from imutool.location import Location, failures, opened, reason
 from imutool.mcap_io.codec.records import HEAD
 
 CUT_SHORT = "Save what is there with `imutool repair`, or copy it again from where it was recorded"
@@ -12,7 +12,7 @@ CUT_SHORT = "Save what is there with `imutool repair`, or copy it again from whe
 class Source:
     """The bytes of a file or an object in a store that is only ever read, with a refusal in place of a short read."""
 
-    def __init__(self, path: Place, expected: str = "an MCAP log") -> None:
+    def __init__(self, path: Location, expected: str = "an MCAP log") -> None:
         try:
             self.file, self.size = opened(path)
         except failures(path) as error:

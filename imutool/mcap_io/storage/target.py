@@ -18,7 +18,7 @@ from types import TracebackType
 from typing import BinaryIO, Protocol
 
 from imutool.errors import ConfigError
-from imutool.location import Place, failures, reason
+from imutool.location import Location, failures, reason
 from imutool.mcap_io.codec.crc import crc32
 from imutool.mcap_io.storage.source import Source, descriptor
 from imutool.mcap_io.storage.upload import Upload
@@ -31,7 +31,7 @@ class _Medium(Protocol):
     """What is being written under its temporary name."""
 
     @property
-    def temporary(self) -> Place: ...
+    def temporary(self) -> Location: ...
 
     def open(self) -> None: ...
 
@@ -61,7 +61,7 @@ class Target:
         ConfigError: the target exists (without `overwrite`), is a folder, or the system refuses to write.
     """
 
-    def __init__(self, path: Place, *, overwrite: bool = False, summing: bool = True) -> None:
+    def __init__(self, path: Location, *, overwrite: bool = False, summing: bool = True) -> None:
         self.path, self.overwrite = path, overwrite
         self.position, self.crc, self.summing = 0, 0, summing
         name = f".{path.name}.{os.getpid()}.{secrets.token_hex(4)}.partial"

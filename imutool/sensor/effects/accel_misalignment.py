@@ -2,25 +2,25 @@
 
 from __future__ import annotations
 
-from imutool.sensor.effect import Physics, Stage, Theta, each_pair, matrix
-from imutool.sensor.linear_effect import Effect, Sensor, off_diagonal, per_pair
-from imutool.sensor.readings import Read
+from imutool.sensor.effect import Effect, Stage, Theta, each_pair, matrix
+from imutool.sensor.linear_effect import LinearEffect, Sensor, off_diagonal, per_pair
+from imutool.sensor.readings import SensorSamples
 from imutool.sensor.signals import ACCEL
 
 SENSORS: tuple[Sensor, ...] = ("accel",)
 
 
-def effect(sensor: Sensor) -> Effect:
+def effect(sensor: Sensor) -> LinearEffect:
     """m (-): seen where the attitude varies."""
     pairs = per_pair("-", 0.05, diagonal=False)
-    return Effect("accel_misalignment", sensor, "accel += M f, diag M = 0", pairs, ACCEL, off_diagonal())
+    return LinearEffect("accel_misalignment", sensor, "accel += M f, diag M = 0", pairs, ACCEL, off_diagonal())
 
 
-def _forward(read: Read, m: Theta) -> Read:
+def _forward(read: SensorSamples, m: Theta) -> SensorSamples:
     return read.but(accel=read.accel + read.accel @ matrix(m).T)
 
 
-PHYSICS = Physics(
+EFFECT = Effect(
     "accel_misalignment",
     Stage.SENSOR,
     SENSORS,

@@ -2,23 +2,23 @@
 
 from __future__ import annotations
 
-from imutool.sensor.effect import Physics, Stage, Theta, each_axis
-from imutool.sensor.linear_effect import Effect, Sensor, diagonal, per_axis
-from imutool.sensor.readings import Read
+from imutool.sensor.effect import Effect, Stage, Theta, each_axis
+from imutool.sensor.linear_effect import LinearEffect, Sensor, diagonal, per_axis
+from imutool.sensor.readings import SensorSamples
 
 SENSORS: tuple[Sensor, ...] = ("accel",)
 
 
-def effect(sensor: Sensor) -> Effect:
+def effect(sensor: Sensor) -> LinearEffect:
     """k (s²/m): seen where the attitude varies."""
-    return Effect("accel_quadratic", sensor, "accel += k * f^2", per_axis("s²/m", 6e-3), lambda s: s.accel**2, diagonal())
+    return LinearEffect("accel_quadratic", sensor, "accel += k * f^2", per_axis("s²/m", 6e-3), lambda s: s.accel**2, diagonal())
 
 
-def _forward(read: Read, k: Theta) -> Read:
+def _forward(read: SensorSamples, k: Theta) -> SensorSamples:
     return read.but(accel=read.accel * (1.0 + k * read.accel))
 
 
-PHYSICS = Physics(
+EFFECT = Effect(
     "accel_quadratic",
     Stage.SENSOR,
     SENSORS,

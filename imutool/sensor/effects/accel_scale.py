@@ -2,24 +2,24 @@
 
 from __future__ import annotations
 
-from imutool.sensor.effect import Physics, Stage, Theta, each_axis
-from imutool.sensor.linear_effect import Effect, Sensor, diagonal, per_axis
-from imutool.sensor.readings import Read
+from imutool.sensor.effect import Effect, Stage, Theta, each_axis
+from imutool.sensor.linear_effect import LinearEffect, Sensor, diagonal, per_axis
+from imutool.sensor.readings import SensorSamples
 from imutool.sensor.signals import ACCEL
 
 SENSORS: tuple[Sensor, ...] = ("accel",)
 
 
-def effect(sensor: Sensor) -> Effect:
+def effect(sensor: Sensor) -> LinearEffect:
     """s (-): seen where the attitude varies; collinear with the bias otherwise."""
-    return Effect("accel_scale", sensor, "accel += s * f", per_axis("-", 0.1), ACCEL, diagonal())
+    return LinearEffect("accel_scale", sensor, "accel += s * f", per_axis("-", 0.1), ACCEL, diagonal())
 
 
-def _forward(read: Read, s: Theta) -> Read:
+def _forward(read: SensorSamples, s: Theta) -> SensorSamples:
     return read.but(accel=read.accel * (1.0 + s))
 
 
-PHYSICS = Physics(
+EFFECT = Effect(
     "accel_scale",
     Stage.SENSOR,
     SENSORS,

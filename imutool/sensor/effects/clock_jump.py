@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from imutool.sensor.effect import Number, Physics, Stage, Theta, misfit
-from imutool.sensor.readings import Felt, Read, Times
+from imutool.sensor.effect import Effect, Parameter, Stage, Theta, misfit
+from imutool.sensor.readings import IdealMotion, SensorSamples, Times
 
 PARTS, STARTS = 12, 4  # of the log, and the best times of how many of them
 
@@ -15,7 +15,7 @@ def _forward(taken_s: Times, theta: Theta) -> Times:
     return np.asarray(taken_s + theta[1] * (taken_s >= theta[0]))
 
 
-def _starts(felt: Felt, samples: Read) -> list[Theta]:
+def _starts(felt: IdealMotion, samples: SensorSamples) -> list[Theta]:
     """Where one offset before and another after explain most of the gyro's misfit, to first order, in several parts of the log.
 
     An offset tau adds tau d omega/dt, so that sums up to each sample and from it on tell what any jump would bring.
@@ -33,12 +33,12 @@ def _starts(felt: Felt, samples: Read) -> list[Theta]:
     return [np.array([(t_s[row] + t_s[row + 1]) / 2.0, after[row] - before[row]]) for row in best]
 
 
-PHYSICS = Physics(
+EFFECT = Effect(
     "clock_jump",
     Stage.CLOCK,
     ("gyro", "accel"),
     "samples are taken at t + step from t_jump on",
-    (Number("t_jump", "s", 30.0, begins=True), Number("step", "s", 0.05)),
+    (Parameter("t_jump", "s", 30.0, begins=True), Parameter("step", "s", 0.05)),
     "it moves before and after",
     _forward,
     linear=False,

@@ -4,36 +4,36 @@ from __future__ import annotations
 
 import numpy as np
 
-from imutool.sensor.effect import Number, Physics, Stage, Theta
-from imutool.sensor.linear_effect import Effect, Parameter, Sensor
-from imutool.sensor.readings import Felt, Read, Times
+from imutool.sensor.effect import Effect, Parameter, Stage, Theta
+from imutool.sensor.linear_effect import LinearEffect, LinearParameter, Sensor
+from imutool.sensor.readings import IdealMotion, SensorSamples, Times
 from imutool.sensor.signals import ACCEL_DOT, GYRO_DOT
 
 SENSORS: tuple[Sensor, ...] = ("gyro", "accel")
 
 
-def effect(sensor: Sensor) -> Effect:
+def effect(sensor: Sensor) -> LinearEffect:
     """tau (s): seen while it moves. Against poses, what is seen is the offset between the IMU's clock and theirs."""
     sees, name = (GYRO_DOT, "omega") if sensor == "gyro" else (ACCEL_DOT, "f")
     same = np.eye(3)[:, :, None]
-    return Effect("clock_offset", sensor, f"{sensor} += tau d{name}/dt", (Parameter("tau", "s", 0.01),), sees, same)
+    return LinearEffect("clock_offset", sensor, f"{sensor} += tau d{name}/dt", (LinearParameter("tau", "s", 0.01),), sees, same)
 
 
 def _forward(taken_s: Times, tau_s: Theta) -> Times:
     return np.asarray(taken_s + tau_s[0])
 
 
-def _starts(_felt: Felt, _samples: Read) -> list[Theta]:
+def _starts(_felt: IdealMotion, _samples: SensorSamples) -> list[Theta]:
     """From no offset, and from beyond half a period of motion at a few hertz either way."""
     return [np.array([tau_s]) for tau_s in (0.0, -0.05, 0.05)]
 
 
-PHYSICS = Physics(
+EFFECT = Effect(
     "clock_offset",
     Stage.CLOCK,
     SENSORS,
     "samples are taken at t + tau",
-    (Number("tau", "s", 0.05),),
+    (Parameter("tau", "s", 0.05),),
     "it moves",
     _forward,
     linear=False,

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from imutool.sensor.effect import Number, Physics, Stage, Theta
-from imutool.sensor.readings import Felt, Read, Times
+from imutool.sensor.effect import Effect, Parameter, Stage, Theta
+from imutool.sensor.readings import IdealMotion, SensorSamples, Times
 
 
 def _forward(taken_s: Times, eps: Theta) -> Times:
@@ -13,16 +13,16 @@ def _forward(taken_s: Times, eps: Theta) -> Times:
     return np.asarray(taken_s + eps[0] * taken_s)
 
 
-def _starts(_felt: Felt, _samples: Read) -> list[Theta]:
+def _starts(_felt: IdealMotion, _samples: SensorSamples) -> list[Theta]:
     return [np.array([eps]) for eps in (0.0, -1e-3, 1e-3)]
 
 
-PHYSICS = Physics(
+EFFECT = Effect(
     "clock_skew",
     Stage.CLOCK,
     ("gyro", "accel"),
     "samples are taken at t (1 + eps)",
-    (Number("eps", "-", 1e-3),),
+    (Parameter("eps", "-", 1e-3),),
     "the log is long, and it moves",
     _forward,
     linear=False,

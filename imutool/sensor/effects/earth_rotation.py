@@ -8,8 +8,8 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Float64
 
-from imutool.sensor.effect import Number, Physics, Stage, Theta, attitude
-from imutool.sensor.readings import Felt, Read
+from imutool.sensor.effect import Effect, Parameter, Stage, Theta, attitude
+from imutool.sensor.readings import IdealMotion, SensorSamples
 
 EARTH_RAD_S = 7.292115e-5  # WGS 84
 
@@ -20,7 +20,7 @@ def omega_w(latitude: float, heading: float) -> Float64[np.ndarray, "3"]:
     return EARTH_RAD_S * np.array([level * math.cos(heading), level * math.sin(heading), math.sin(latitude)])
 
 
-def _forward(felt: Felt, theta: Theta) -> Felt:
+def _forward(felt: IdealMotion, theta: Theta) -> IdealMotion:
     """Latitude, heading (rad). An infinite latitude is none: the earth stands still."""
     latitude, heading = theta.tolist()
     if math.isinf(latitude):
@@ -28,16 +28,16 @@ def _forward(felt: Felt, theta: Theta) -> Felt:
     return replace(felt, gyro=felt.gyro + np.einsum("nji,j->ni", attitude(felt, "earth_rotation"), omega_w(latitude, heading)))
 
 
-def _starts(_felt: Felt, _samples: Read) -> list[Theta]:
+def _starts(_felt: IdealMotion, _samples: SensorSamples) -> list[Theta]:
     return [np.array([latitude, heading]) for latitude in (-0.8, 0.8) for heading in (-3.0, -1.0, 1.0, 3.0)]
 
 
-PHYSICS = Physics(
+EFFECT = Effect(
     "earth_rotation",
     Stage.MOTION,
     ("gyro",),
     "gyro += R_wb^T omega_e",
-    (Number("latitude", "rad", 0.8, nothing=math.inf), Number("heading", "rad", 2.0)),
+    (Parameter("latitude", "rad", 0.8, null_value=math.inf), Parameter("heading", "rad", 2.0)),
     "the noise is that of a navigation-grade gyro, and the attitude varies",
     _forward,
     linear=False,

@@ -8,11 +8,11 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from imutool.recording import GRAVITY_M_S2
-from imutool.sensor.effect import Number, Physics, Stage, Theta, attitude
-from imutool.sensor.readings import Felt, Read
+from imutool.sensor.effect import Effect, Parameter, Stage, Theta, attitude
+from imutool.sensor.readings import IdealMotion, SensorSamples
 
 
-def _forward(felt: Felt, theta: Theta) -> Felt:
+def _forward(felt: IdealMotion, theta: Theta) -> IdealMotion:
     """g_w = Exp(tilt_x, tilt_y, 0) (0, 0, -(g + dg)), so that the specific force changes by -R_wb^T times g_w's change."""
     dg, tilt_x, tilt_y = theta.tolist()
     up = Rotation.from_rotvec([tilt_x, tilt_y, 0.0]).apply([0.0, 0.0, 1.0])
@@ -20,16 +20,16 @@ def _forward(felt: Felt, theta: Theta) -> Felt:
     return replace(felt, accel=felt.accel + np.einsum("nji,j->ni", attitude(felt, "gravity"), more_w))
 
 
-def _starts(_felt: Felt, _samples: Read) -> list[Theta]:
+def _starts(_felt: IdealMotion, _samples: SensorSamples) -> list[Theta]:
     return [np.zeros(3)]
 
 
-PHYSICS = Physics(
+EFFECT = Effect(
     "gravity",
     Stage.MOTION,
     ("accel",),
     "accel -= R_wb^T (g_w - (0, 0, -g)), g_w = Exp(tilt) (0, 0, -(g + dg))",
-    (Number("magnitude", "m/s²", 0.05), Number("tilt_x", "rad", 0.05), Number("tilt_y", "rad", 0.05)),
+    (Parameter("magnitude", "m/s²", 0.05), Parameter("tilt_x", "rad", 0.05), Parameter("tilt_y", "rad", 0.05)),
     "the attitude varies (against the bias)",
     _forward,
     linear=False,

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from imutool.sensor import warm_up
-from imutool.sensor.linear_effect import Effect, Sensor
+from imutool.sensor.linear_effect import LinearEffect, Sensor
 
 SENSORS: tuple[Sensor, ...] = ("gyro",)
 
 
-def effect(sensor: Sensor) -> Effect:
+def effect(sensor: Sensor) -> LinearEffect:
     """A (rad/s): seen where the log is longer than tau, and every log begins with a cold sensor."""
     return warm_up.closed_form(sensor, "rad/s", 2e-3)
 
 
-PHYSICS = warm_up.physics("gyro", "rad/s", 0.02)
+EFFECT = warm_up.physics("gyro", "rad/s", 0.02)

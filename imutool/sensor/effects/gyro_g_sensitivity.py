@@ -2,25 +2,25 @@
 
 from __future__ import annotations
 
-from imutool.sensor.effect import Physics, Stage, Theta, each_pair
-from imutool.sensor.linear_effect import Effect, Sensor, full, per_pair
-from imutool.sensor.readings import Read
+from imutool.sensor.effect import Effect, Stage, Theta, each_pair
+from imutool.sensor.linear_effect import LinearEffect, Sensor, full, per_pair
+from imutool.sensor.readings import SensorSamples
 from imutool.sensor.signals import ACCEL
 
 SENSORS: tuple[Sensor, ...] = ("gyro",)
 
 
-def effect(sensor: Sensor) -> Effect:
+def effect(sensor: Sensor) -> LinearEffect:
     """G (rad/s per m/s²): seen where attitude or acceleration varies; collinear with the bias at rest."""
     pairs = per_pair("rad/s per m/s²", 1e-3)
-    return Effect("gyro_g_sensitivity", sensor, "gyro += G f", pairs, ACCEL, full())
+    return LinearEffect("gyro_g_sensitivity", sensor, "gyro += G f", pairs, ACCEL, full())
 
 
-def _forward(read: Read, g: Theta) -> Read:
+def _forward(read: SensorSamples, g: Theta) -> SensorSamples:
     return read.but(gyro=read.gyro + read.accel @ g.reshape(3, 3).T)
 
 
-PHYSICS = Physics(
+EFFECT = Effect(
     "gyro_g_sensitivity",
     Stage.SENSOR,
     SENSORS,

@@ -2,25 +2,25 @@
 
 from __future__ import annotations
 
-from imutool.sensor.effect import Physics, Stage, Theta, each_pair, matrix
-from imutool.sensor.linear_effect import Effect, Sensor, off_diagonal, per_pair
-from imutool.sensor.readings import Read
+from imutool.sensor.effect import Effect, Stage, Theta, each_pair, matrix
+from imutool.sensor.linear_effect import LinearEffect, Sensor, off_diagonal, per_pair
+from imutool.sensor.readings import SensorSamples
 from imutool.sensor.signals import GYRO
 
 SENSORS: tuple[Sensor, ...] = ("gyro",)
 
 
-def effect(sensor: Sensor) -> Effect:
+def effect(sensor: Sensor) -> LinearEffect:
     """m (-): seen where two axes turn. A rotation common to gyro and accelerometer is a mount rotation."""
     pairs = per_pair("-", 0.05, diagonal=False)
-    return Effect("gyro_misalignment", sensor, "gyro += M omega, diag M = 0", pairs, GYRO, off_diagonal())
+    return LinearEffect("gyro_misalignment", sensor, "gyro += M omega, diag M = 0", pairs, GYRO, off_diagonal())
 
 
-def _forward(read: Read, m: Theta) -> Read:
+def _forward(read: SensorSamples, m: Theta) -> SensorSamples:
     return read.but(gyro=read.gyro + read.gyro @ matrix(m).T)
 
 
-PHYSICS = Physics(
+EFFECT = Effect(
     "gyro_misalignment",
     Stage.SENSOR,
     SENSORS,

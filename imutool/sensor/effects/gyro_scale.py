@@ -2,24 +2,24 @@
 
 from __future__ import annotations
 
-from imutool.sensor.effect import Physics, Stage, Theta, each_axis
-from imutool.sensor.linear_effect import Effect, Sensor, diagonal, per_axis
-from imutool.sensor.readings import Read
+from imutool.sensor.effect import Effect, Stage, Theta, each_axis
+from imutool.sensor.linear_effect import LinearEffect, Sensor, diagonal, per_axis
+from imutool.sensor.readings import SensorSamples
 from imutool.sensor.signals import GYRO
 
 SENSORS: tuple[Sensor, ...] = ("gyro",)
 
 
-def effect(sensor: Sensor) -> Effect:
+def effect(sensor: Sensor) -> LinearEffect:
     """s (-): seen where the axis turns."""
-    return Effect("gyro_scale", sensor, "gyro += s * omega", per_axis("-", 0.1), GYRO, diagonal())
+    return LinearEffect("gyro_scale", sensor, "gyro += s * omega", per_axis("-", 0.1), GYRO, diagonal())
 
 
-def _forward(read: Read, s: Theta) -> Read:
+def _forward(read: SensorSamples, s: Theta) -> SensorSamples:
     return read.but(gyro=read.gyro * (1.0 + s))
 
 
-PHYSICS = Physics(
+EFFECT = Effect(
     "gyro_scale",
     Stage.SENSOR,
     SENSORS,

@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Float64
 
-from imutool.sensor.effect import Physics, Stage, Theta, each_axis
+from imutool.sensor.effect import Effect, Stage, Theta, each_axis
 from imutool.sensor.effects.size_effect import levers
-from imutool.sensor.linear_effect import AtWork, Effect, Sensor, Three, per_axis
-from imutool.sensor.readings import Felt
+from imutool.sensor.linear_effect import AtWork, LinearEffect, Sensor, Three, per_axis
+from imutool.sensor.readings import IdealMotion
 from imutool.sensor.signals import ALPHA, GYRO, Signals
 
 SENSORS: tuple[Sensor, ...] = ("accel",)
@@ -59,17 +59,17 @@ def _at_work(r_b: Float64[np.ndarray, "3"]) -> AtWork:
     return AtWork(block, one)
 
 
-def effect(sensor: Sensor) -> Effect:
+def effect(sensor: Sensor) -> LinearEffect:
     """r (m): from the tracked point to the accelerometer; the part along a single turning axis is not seen."""
     equation = "accel += alpha x r + omega x (omega x r)"
-    return Effect("lever_arm", sensor, equation, per_axis("m", 0.3), _terms, _pattern(), _at_work)
+    return LinearEffect("lever_arm", sensor, equation, per_axis("m", 0.3), _terms, _pattern(), _at_work)
 
 
-def _forward(felt: Felt, r_b: Theta) -> Felt:
+def _forward(felt: IdealMotion, r_b: Theta) -> IdealMotion:
     return replace(felt, accel=felt.accel + levers(felt, np.tile(r_b, (3, 1))))
 
 
-PHYSICS = Physics(
+EFFECT = Effect(
     "lever_arm",
     Stage.MOTION,
     SENSORS,

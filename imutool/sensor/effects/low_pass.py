@@ -7,14 +7,14 @@ from dataclasses import replace
 
 import numpy as np
 
-from imutool.sensor.effect import Number, Physics, Stage, Theta
+from imutool.sensor.effect import Effect, Parameter, Stage, Theta
 from imutool.sensor.filters import OMEGA, filtered
-from imutool.sensor.readings import Felt, Read
+from imutool.sensor.readings import IdealMotion, SensorSamples
 
 START_HZ = (2.0, 5.0, 10.0, 20.0, 40.0, 80.0)
 
 
-def _forward(felt: Felt, cutoff_hz: Theta) -> Felt:
+def _forward(felt: IdealMotion, cutoff_hz: Theta) -> IdealMotion:
     """As if what is felt first had always been felt; an infinite cut-off frequency lets everything pass."""
     if math.isinf(cutoff_hz[0]):
         return felt
@@ -24,16 +24,16 @@ def _forward(felt: Felt, cutoff_hz: Theta) -> Felt:
     return replace(felt, gyro=both[:, :3], accel=both[:, 3:6], alpha=both[:, 6:])
 
 
-def _starts(_felt: Felt, _samples: Read) -> list[Theta]:
+def _starts(_felt: IdealMotion, _samples: SensorSamples) -> list[Theta]:
     return [np.array([hz]) for hz in START_HZ]
 
 
-PHYSICS = Physics(
+EFFECT = Effect(
     "low_pass",
     Stage.BANDWIDTH,
     ("gyro", "accel"),
     "d gyro/dt = 2 pi f_c (omega - gyro), and likewise accel",
-    (Number("f_c", "Hz", 20.0, positive=True, nothing=math.inf),),
+    (Parameter("f_c", "Hz", 20.0, positive=True, null_value=math.inf),),
     "it moves at frequencies near f_c; a delay alone is a clock_offset",
     _forward,
     linear=False,

@@ -8,14 +8,14 @@ from dataclasses import replace
 
 import numpy as np
 
-from imutool.sensor.effect import Number, Physics, Stage, Theta, each_axis
+from imutool.sensor.effect import Effect, Parameter, Stage, Theta, each_axis
 from imutool.sensor.filters import OMEGA, filtered
-from imutool.sensor.readings import Felt, Read
+from imutool.sensor.readings import IdealMotion, SensorSamples
 
 START_HZ = (4.0, 8.0, 15.0, 30.0, 50.0)
 
 
-def _forward(felt: Felt, theta: Theta) -> Felt:
+def _forward(felt: IdealMotion, theta: Theta) -> IdealMotion:
     """f0 (Hz), zeta, share per axis: f + share (H f - f), H(s) = (2 zeta w0 s + w0²) / (s² + 2 zeta w0 s + w0²).
 
     H is what a mass on a spring and a damper feels of its base's acceleration; it starts in the steady state.
@@ -33,18 +33,18 @@ def _forward(felt: Felt, theta: Theta) -> Felt:
     return replace(felt, accel=felt.accel + share * (filtered(felt.accel, through, denominator) - felt.accel))
 
 
-def _starts(_felt: Felt, _samples: Read) -> list[Theta]:
+def _starts(_felt: IdealMotion, _samples: SensorSamples) -> list[Theta]:
     return [np.array([hz, 0.1, 0.5, 0.5, 0.5]) for hz in START_HZ]
 
 
-PHYSICS = Physics(
+EFFECT = Effect(
     "mount_resonance",
     Stage.MOUNT,
     ("accel",),
     "accel += share * (H f - f), H = (2 zeta w0 s + w0^2) / (s^2 + 2 zeta w0 s + w0^2), w0 = 2 pi f0",
     (
-        Number("f0", "Hz", 20.0, positive=True, nothing=20.0),
-        Number("zeta", "-", 0.2, positive=True, nothing=0.2),
+        Parameter("f0", "Hz", 20.0, positive=True, null_value=20.0),
+        Parameter("zeta", "-", 0.2, positive=True, null_value=0.2),
         *each_axis("-", 1.0, "share_"),
     ),
     "motion or shocks excite it",

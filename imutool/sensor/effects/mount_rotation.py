@@ -7,26 +7,26 @@ from dataclasses import replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from imutool.sensor.effect import Number, Physics, Stage, Theta
-from imutool.sensor.readings import Felt, Read
+from imutool.sensor.effect import Effect, Parameter, Stage, Theta
+from imutool.sensor.readings import IdealMotion, SensorSamples
 
 
-def _forward(felt: Felt, phi: Theta) -> Felt:
+def _forward(felt: IdealMotion, phi: Theta) -> IdealMotion:
     """R_bi = Exp(phi) takes the sensor's vectors to the body; R_wb stays the body's attitude."""
     R_bi = Rotation.from_rotvec(phi).as_matrix()
     return replace(felt, gyro=felt.gyro @ R_bi, accel=felt.accel @ R_bi, alpha=felt.alpha @ R_bi)
 
 
-def _starts(_felt: Felt, _samples: Read) -> list[Theta]:
+def _starts(_felt: IdealMotion, _samples: SensorSamples) -> list[Theta]:
     return [np.zeros(3)]
 
 
-PHYSICS = Physics(
+EFFECT = Effect(
     "mount_rotation",
     Stage.MOUNT,
     ("gyro", "accel"),
     "gyro = R_bi^T omega, accel = R_bi^T f, R_bi = Exp(phi)",
-    tuple(Number(f"phi_{axis}", "rad", 0.2) for axis in "xyz"),
+    tuple(Parameter(f"phi_{axis}", "rad", 0.2) for axis in "xyz"),
     "two axes turn, or one turns and gravity tilts",
     _forward,
     linear=False,

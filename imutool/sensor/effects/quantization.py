@@ -5,14 +5,14 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float64
 
-from imutool.sensor.effect import Number, Physics, Stage, Theta
-from imutool.sensor.readings import Felt, Read
+from imutool.sensor.effect import Effect, Parameter, Stage, Theta
+from imutool.sensor.readings import IdealMotion, SensorSamples
 
 SAME = 1e-6  # of the largest reading: values no further apart are one value, told apart by rounding
 FINE = 1e-3  # of the smallest step is none
 
 
-def _forward(read: Read, lsb: Theta) -> Read:
+def _forward(read: SensorSamples, lsb: Theta) -> SensorSamples:
     gyro, accel = lsb.tolist()
     return read.but(
         np.rint(read.gyro / gyro) * gyro if gyro else None,
@@ -27,18 +27,18 @@ def _smallest_step(values: Float64[np.ndarray, "n 3"]) -> float:
     return float(steps[steps > least].min(initial=np.inf)) if (steps > least).any() else least
 
 
-def _starts(_felt: Felt, samples: Read) -> list[Theta]:
+def _starts(_felt: IdealMotion, samples: SensorSamples) -> list[Theta]:
     """One sensor in steps, the other, both."""
     gyro, accel = _smallest_step(samples.gyro), _smallest_step(samples.accel)
     return [np.array(lsb) for lsb in ((gyro, FINE * accel), (FINE * gyro, accel), (gyro, accel))]
 
 
-PHYSICS = Physics(
+EFFECT = Effect(
     "quantization",
     Stage.CONVERTER,
     ("gyro", "accel"),
     "gyro = LSB round(gyro / LSB), and likewise accel",
-    (Number("gyro_lsb", "rad/s", 1e-2, positive=True), Number("accel_lsb", "m/s²", 5e-2, positive=True)),
+    (Parameter("gyro_lsb", "rad/s", 1e-2, positive=True), Parameter("accel_lsb", "m/s²", 5e-2, positive=True)),
     "the least significant bit exceeds the noise",
     _forward,
     linear=False,

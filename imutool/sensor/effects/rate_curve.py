@@ -12,7 +12,7 @@ from bisect import bisect_right
 import numpy as np
 from jaxtyping import Float64
 
-from imutool.sensor.linear_effect import AXES, AtWork, Effect, Parameter, Sensor, Three
+from imutool.sensor.linear_effect import AXES, AtWork, LinearEffect, LinearParameter, Sensor, Three
 from imutool.sensor.signals import GYRO, GYRO_SLOW, Signals
 
 SENSORS: tuple[Sensor, ...] = ("gyro",)
@@ -57,13 +57,13 @@ def _at_work(theta: Float64[np.ndarray, " p"]) -> AtWork:
     return AtWork(block, one)
 
 
-def effect(sensor: Sensor) -> Effect:
+def effect(sensor: Sensor) -> LinearEffect:
     """Values at the knots (rad/s): seen where the axis turns at that rate."""
     knots = KNOTS_RAD_S[NONZERO]
     names = [f"{kind}{axis}{knot:+g}" for kind in ("", "slow_") for axis in AXES for knot in knots]
-    parameters = tuple(Parameter(name, "rad/s", 0.01) for name in names)
+    parameters = tuple(LinearParameter(name, "rad/s", 0.01) for name in names)
     count = len(parameters)
     pattern = np.zeros((3, count, count))
     for index in range(count):
         pattern[index // len(knots) % 3, index, index] = 1.0
-    return Effect("rate_curve", sensor, "gyro += c(omega) + d(omega filtered)", parameters, _terms, pattern, _at_work)
+    return LinearEffect("rate_curve", sensor, "gyro += c(omega) + d(omega filtered)", parameters, _terms, pattern, _at_work)

@@ -6,33 +6,33 @@ import math
 
 import numpy as np
 
-from imutool.sensor.effect import Number, Physics, Stage, Theta
-from imutool.sensor.readings import Felt, Read
+from imutool.sensor.effect import Effect, Parameter, Stage, Theta
+from imutool.sensor.readings import IdealMotion, SensorSamples
 
 NEVER = 100.0  # times the largest reading is not reached
 
 
-def _forward(read: Read, limit: Theta) -> Read:
+def _forward(read: SensorSamples, limit: Theta) -> SensorSamples:
     gyro, accel = (None if math.isinf(most) else most for most in limit.tolist())
     return read.but(
         None if gyro is None else np.clip(read.gyro, -gyro, gyro), None if accel is None else np.clip(read.accel, -accel, accel)
     )
 
 
-def _starts(_felt: Felt, samples: Read) -> list[Theta]:
+def _starts(_felt: IdealMotion, samples: SensorSamples) -> list[Theta]:
     """One sensor limited, the other, both: at the largest reading, which is the limit wherever one is reached."""
     gyro, accel = (float(np.abs(values).max()) or 1.0 for values in (samples.gyro, samples.accel))
     return [np.array(limit) for limit in ((gyro, NEVER * accel), (NEVER * gyro, accel), (gyro, accel))]
 
 
-PHYSICS = Physics(
+EFFECT = Effect(
     "saturation",
     Stage.CONVERTER,
     ("gyro", "accel"),
     "gyro = clip(gyro, -L, L), accel = clip(accel, -K, K)",
     (
-        Number("gyro_limit", "rad/s", 10.0, positive=True, nothing=math.inf),
-        Number("accel_limit", "m/s²", 80.0, positive=True, nothing=math.inf),
+        Parameter("gyro_limit", "rad/s", 10.0, positive=True, null_value=math.inf),
+        Parameter("accel_limit", "m/s²", 80.0, positive=True, null_value=math.inf),
     ),
     "the limit is reached",
     _forward,

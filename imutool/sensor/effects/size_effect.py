@@ -7,11 +7,11 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Float64
 
-from imutool.sensor.effect import Physics, Stage, Theta, each_pair
-from imutool.sensor.readings import Felt
+from imutool.sensor.effect import Effect, Stage, Theta, each_pair
+from imutool.sensor.readings import IdealMotion
 
 
-def levers(felt: Felt, r_b: Float64[np.ndarray, "3 3"]) -> Float64[np.ndarray, "n 3"]:
+def levers(felt: IdealMotion, r_b: Float64[np.ndarray, "3 3"]) -> Float64[np.ndarray, "n 3"]:
     """What axis i feels more at `r_b[i]` than at the tracked point: component i of alpha x r_i + omega x (omega x r_i) (m/s²).
 
     The double product is omega (omega . r) - |omega|² r; its parts that axis i sees come together in one product each.
@@ -27,11 +27,11 @@ def levers(felt: Felt, r_b: Float64[np.ndarray, "3 3"]) -> Float64[np.ndarray, "
     return along
 
 
-def _forward(felt: Felt, r_b: Theta) -> Felt:
+def _forward(felt: IdealMotion, r_b: Theta) -> IdealMotion:
     return replace(felt, accel=felt.accel + levers(felt, r_b.reshape(3, 3)))
 
 
-PHYSICS = Physics(
+EFFECT = Effect(
     "size_effect",
     Stage.MOTION,
     ("accel",),

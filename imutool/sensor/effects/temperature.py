@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from imutool.errors import DataError
-from imutool.sensor.effect import Physics, Stage, Theta, each_axis
-from imutool.sensor.readings import Read
+from imutool.sensor.effect import Effect, Stage, Theta, each_axis
+from imutool.sensor.readings import SensorSamples
 
 
-def _forward(read: Read, k: Theta) -> Read:
+def _forward(read: SensorSamples, k: Theta) -> SensorSamples:
     """k of the gyro, then of the accelerometer; T0 is the channel's mean. With several such channels: the first by name.
 
     Raises:
@@ -21,7 +21,7 @@ def _forward(read: Read, k: Theta) -> Read:
     return read.but(read.gyro + warmer * k[:3], read.accel + warmer * k[3:])
 
 
-PHYSICS = Physics(
+EFFECT = Effect(
     "temperature",
     Stage.SENSOR,
     ("gyro", "accel"),

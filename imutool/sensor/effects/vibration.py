@@ -10,8 +10,8 @@ from scipy.ndimage import median_filter
 from scipy.signal import periodogram
 
 from imutool.inertial.stationary import white_noise
-from imutool.sensor.effect import Number, Physics, Stage, Theta, misfit
-from imutool.sensor.readings import Felt, Read
+from imutool.sensor.effect import Effect, Parameter, Stage, Theta, misfit
+from imutool.sensor.readings import IdealMotion, SensorSamples
 
 LINES = 3  # starts: the strongest lines of the misfit
 FINER = 4  # times as many frequencies as samples tell: the top of a peak lies between three of them
@@ -23,13 +23,13 @@ def _waves(t_s: Float64[np.ndarray, " n"], f_hz: float) -> Float64[np.ndarray, "
     return np.stack([np.sin(phase), np.cos(phase)], axis=1)
 
 
-def _forward(felt: Felt, theta: Theta) -> Felt:
+def _forward(felt: IdealMotion, theta: Theta) -> IdealMotion:
     """f (Hz), then the amplitudes of sine and cosine of each axis, accel (m/s²), gyro (rad/s); t on the motion's clock."""
     waves = _waves(felt.t_s, float(theta[0])) @ theta[1:].reshape(6, 2).T
     return replace(felt, accel=felt.accel + waves[:, :3], gyro=felt.gyro + waves[:, 3:])
 
 
-def _starts(felt: Felt, samples: Read) -> list[Theta]:
+def _starts(felt: IdealMotion, samples: SensorSamples) -> list[Theta]:
     """The lines that stand out most from the spectrum of what is read more, with their amplitudes."""
     gyro, accel = misfit(felt, samples)
     error, t_s = np.concatenate([accel, gyro], axis=1), samples.stamp_s
@@ -55,15 +55,15 @@ def _top(f_hz: Float64[np.ndarray, " n"], level: Float64[np.ndarray, " n"], peak
     return float(f_hz[peak] + (0.5 * (before - after) / bend if bend else 0.0) * f_hz[1])
 
 
-PHYSICS = Physics(
+EFFECT = Effect(
     "vibration",
     Stage.MOTION,
     ("gyro", "accel"),
     "accel, gyro += s sin(2 pi f t) + c cos(2 pi f t)",
     (
-        Number("f", "Hz", 50.0, positive=True, nothing=50.0, step=1e-7),  # 90 s of 50 Hz turn the phase by 3e-3 rad
-        *(Number(f"accel_{of}_{axis}", "m/s²", 0.5) for axis in "xyz" for of in ("sin", "cos")),
-        *(Number(f"gyro_{of}_{axis}", "rad/s", 0.05) for axis in "xyz" for of in ("sin", "cos")),
+        Parameter("f", "Hz", 50.0, positive=True, null_value=50.0, step=1e-7),  # 90 s of 50 Hz turn the phase by 3e-3 rad
+        *(Parameter(f"accel_{of}_{axis}", "m/s²", 0.5) for axis in "xyz" for of in ("sin", "cos")),
+        *(Parameter(f"gyro_{of}_{axis}", "rad/s", 0.05) for axis in "xyz" for of in ("sin", "cos")),
     ),
     "the line stands above the noise",
     _forward,

@@ -9,22 +9,22 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float64
 
-from imutool.sensor.effect import Physics, Stage, Theta, each_pair
-from imutool.sensor.linear_effect import Effect, Sensor, full, per_pair
-from imutool.sensor.readings import Read
+from imutool.sensor.effect import Effect, Stage, Theta, each_pair
+from imutool.sensor.linear_effect import LinearEffect, Sensor, full, per_pair
+from imutool.sensor.readings import SensorSamples
 from imutool.sensor.signals import POWER_S, SLOW_S, VIBRATION, low_pass
 
 SENSORS: tuple[Sensor, ...] = ("gyro", "accel")
 PLAUSIBLE = {"gyro": ("rad/s per (m/s²)²", 1e-3), "accel": ("s²/m", 2e-2)}
 
 
-def effect(sensor: Sensor) -> Effect:
+def effect(sensor: Sensor) -> LinearEffect:
     """K: seen where vibration comes and goes; collinear with the bias otherwise."""
     pairs = per_pair(*PLAUSIBLE[sensor])
-    return Effect("vibration_rectification", sensor, f"{sensor} += K v^2", pairs, VIBRATION, full())
+    return LinearEffect("vibration_rectification", sensor, f"{sensor} += K v^2", pairs, VIBRATION, full())
 
 
-def _power(read: Read) -> Float64[np.ndarray, "n 3"]:
+def _power(read: SensorSamples) -> Float64[np.ndarray, "n 3"]:
     """As `SignalFilter` has it, over samples at their mean rate: (m/s²)² per axis."""
     period_s = (read.stamp_s[-1] - read.stamp_s[0]) / (len(read.stamp_s) - 1)
     slow, power = -np.expm1(-period_s / np.array([SLOW_S, POWER_S]))
@@ -33,13 +33,13 @@ def _power(read: Read) -> Float64[np.ndarray, "n 3"]:
     return low_pass((read.accel - before) ** 2, power, np.zeros(3))
 
 
-def _forward(read: Read, k: Theta) -> Read:
+def _forward(read: SensorSamples, k: Theta) -> SensorSamples:
     """K of the gyro, then of the accelerometer."""
     power = _power(read)
     return read.but(read.gyro + power @ k[:9].reshape(3, 3).T, read.accel + power @ k[9:].reshape(3, 3).T)
 
 
-PHYSICS = Physics(
+EFFECT = Effect(
     "vibration_rectification",
     Stage.SENSOR,
     SENSORS,

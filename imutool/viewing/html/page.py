@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from html import escape
 
-from imutool.location import Place
+from imutool.location import Location
 from imutool.viewing.html.theme import STYLE
 
 GENERATOR = '<meta name="generator" content="imutool">'
@@ -24,7 +24,7 @@ def document(title: str, body: Iterable[str], style: str = "") -> str:
     return f'<!DOCTYPE html>\n<html lang="en"><head>{head}</head>\n<body><main>\n{lines}\n</main></body></html>\n'
 
 
-def is_ours(path: Place) -> bool:
+def is_ours(path: Location) -> bool:
     """Whether a file begins like a page that imutool has written."""
     with path.open("rb") as file:
         return GENERATOR.encode() in file.read(1024)

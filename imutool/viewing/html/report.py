@@ -12,7 +12,7 @@ import numpy as np
 
 from imutool import __version__
 from imutool.errors import ConfigError
-from imutool.location import Place
+from imutool.location import Location
 from imutool.mcap_io.storage.target import Target
 from imutool.viewing.html import report_errors, report_events, report_paths, report_signals
 from imutool.viewing.html.drawing import HALF_INCH, WIDTH_INCH, Panel, Picture, apart, library, png, svg
@@ -76,7 +76,7 @@ def page(logs: Sequence[RunData]) -> str:
     return document(f"{len(logs)} logs", [*body, *_made()], STYLE)
 
 
-def write_page(logs: Sequence[RunData], path: Place, *, overwrite: bool = False) -> None:
+def write_page(logs: Sequence[RunData], path: Location, *, overwrite: bool = False) -> None:
     """Writes the page.
 
     Raises:
@@ -120,7 +120,7 @@ def by_topic(logs: Sequence[RunData], topics: Sequence[str]) -> list[RunData]:
     return [replace(data, name=f"{data.name} {topic}") for data, topic in zip(logs, topics, strict=True)]
 
 
-def refuse(path: Place, *, overwrite: bool = False) -> None:
+def refuse(path: Location, *, overwrite: bool = False) -> None:
     """Nothing, where a page can be written; to be asked before the work is done.
 
     Raises:

@@ -7,7 +7,7 @@ from typing import Literal, NamedTuple
 How = Literal["viewer", "connect", "rrd", "web", "folder", "png", "html"]
 
 
-class Shown(NamedTuple):
+class Output(NamedTuple):
     """One way to look that was taken: `place` is a URL or a path, `said` says it and how to go on."""
 
     how: How

@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from imutool import __version__
-from imutool.location import Place
+from imutool.location import Location
 from imutool.recording import Recording
 
 OURS = "imutool"  # with it begin the names of the metadata records that imutool writes
@@ -17,7 +17,7 @@ LONGEST = 200  # letters of a value
 
 
 def provenance(
-    log: Place,
+    log: Location,
     recording: Recording,
     metadata: Sequence[tuple[str, Mapping[str, str]]],
     models: Mapping[str, str],

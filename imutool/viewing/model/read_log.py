@@ -12,7 +12,7 @@ from imutool.cleaning import Cleaner, Rules, Survey
 from imutool.cleaning.first_pass import examine
 from imutool.cleaning.truth import Truth, of_poses
 from imutool.errors import DataError, LogError
-from imutool.location import Place
+from imutool.location import Location
 from imutool.mcap_io.batches import ImuBatch
 from imutool.mcap_io.codec import schemas
 from imutool.mcap_io.codec.decode import TwistColumns
@@ -53,7 +53,7 @@ class _Read(NamedTuple):
     metadata: list[tuple[str, dict[str, str]]]
 
 
-def recorded(path: Place, *, imu: str | None = None, truth: str | None = None) -> Recorded:
+def recorded(path: Location, *, imu: str | None = None, truth: str | None = None) -> Recorded:
     """Reads a log for looking at it.
 
     An IMU that cannot be held as it is (stamps that repeat or go back, values that are no numbers) is read as `debias --clean`
@@ -90,7 +90,7 @@ def recorded(path: Place, *, imu: str | None = None, truth: str | None = None) -
     return Recorded(replace(rest, imu=samples), logged, tuple(debiased), survey, metadata, tuple(notes))
 
 
-def _read(path: Place, imu: str | None, truth: str | None, notes: list[str], *, salvage: bool) -> _Read:
+def _read(path: Location, imu: str | None, truth: str | None, notes: list[str], *, salvage: bool) -> _Read:
     def refused(name: str, error: LogError) -> None:
         notes.append(f"The true poses on {name} are left out: {error.what}.")
 

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from imutool.location import Place
+from imutool.location import Location
 from imutool.recording import Recording
 from imutool.viewing.model.events import of_survey
 from imutool.viewing.model.findings import of_findings
@@ -17,7 +17,7 @@ from imutool.viewing.model.trajectory_error import Alignment
 
 
 def load(
-    log: Place,
+    log: Location,
     *,
     models: Sequence[str | Path] = (),
     init: str = "auto",

@@ -12,7 +12,7 @@ from typing import NamedTuple
 from urllib.parse import SplitResult, urlsplit
 
 from imutool.errors import ConfigError
-from imutool.viewing.model.output import Shown
+from imutool.viewing.model.output import Output
 from imutool.viewing.model.run_data import RunData
 from imutool.viewing.rerun import layout, scene
 from imutool.viewing.rerun.entities import clock
@@ -49,7 +49,7 @@ def probe(url: str) -> Peer:
     return Peer(place, _version(place))
 
 
-def send(logs: Sequence[RunData], peer: Peer, *, source: bool = True, at_s: float | None = None) -> Shown:
+def send(logs: Sequence[RunData], peer: Peer, *, source: bool = True, at_s: float | None = None) -> Output:
     """Sends all logs to whoever `probe` found, the cursor set to `at_s` seconds where a viewer can be told.
 
     Raises:
@@ -68,7 +68,7 @@ def send(logs: Sequence[RunData], peer: Peer, *, source: bool = True, at_s: floa
         recording.disconnect()
     if at_s is not None and peer.version is not None:
         move(peer, at_s)
-    return Shown("connect", peer.url, f"Sent to {peer.url}{told(peer)}.")
+    return Output("connect", peer.url, f"Sent to {peer.url}{told(peer)}.")
 
 
 def move(peer: Peer, at_s: float) -> None:

@@ -11,7 +11,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from imutool.errors import ConfigError
-from imutool.viewing.model.output import Shown
+from imutool.viewing.model.output import Output
 from imutool.viewing.model.run_data import RunData
 from imutool.viewing.rerun.sdk import need_sdk
 from imutool.viewing.rerun.web import FILES, PAGE, site
@@ -36,7 +36,7 @@ def refuse(folder: Path, *, overwrite: bool = False) -> None:
 
 def export(
     logs: Sequence[RunData], folder: Path, *, source: bool = True, at_s: float | None = None, overwrite: bool = False
-) -> Shown:
+) -> Output:
     """Writes the folder, whole or not at all: the page, the viewer's two files and the recording.
 
     Raises:
@@ -58,7 +58,7 @@ def export(
             with contextlib.suppress(FileNotFoundError):
                 shutil.rmtree(beside)
     served = f"python -m http.server --bind 127.0.0.1 --directory {folder}"
-    return Shown("folder", str(folder / PAGE), f"Exported {folder} for any web server, for instance: {served}")
+    return Output("folder", str(folder / PAGE), f"Exported {folder} for any web server, for instance: {served}")
 
 
 def _put(made: Path, place: Path) -> None:

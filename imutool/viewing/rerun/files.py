@@ -6,13 +6,13 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from imutool.mcap_io.storage.target import Target
-from imutool.viewing.model.output import Shown
+from imutool.viewing.model.output import Output
 from imutool.viewing.model.run_data import RunData
 from imutool.viewing.rerun import layout, scene
 from imutool.viewing.rerun.sdk import FLUSH_S, need_sdk, stream, title
 
 
-def save(logs: Sequence[RunData], path: Path | None = None, *, source: bool = True, overwrite: bool = False) -> Shown:
+def save(logs: Sequence[RunData], path: Path | None = None, *, source: bool = True, overwrite: bool = False) -> Output:
     """Writes all logs into one .rrd: `path`, or NAME.rrd in the folder `path`, or NAME.rrd here.
 
     Raises:
@@ -23,7 +23,7 @@ def save(logs: Sequence[RunData], path: Path | None = None, *, source: bool = Tr
     need_sdk()
     with Target(target, overwrite=overwrite) as file:  # refuses before the work is done, leaves nothing after a failure
         file.write(rrd(logs, source=source))
-    return Shown("rrd", str(target), f"Saved {target}. Open with: rerun {target}")
+    return Output("rrd", str(target), f"Saved {target}. Open with: rerun {target}")
 
 
 def rrd(logs: Sequence[RunData], *, source: bool = True) -> bytes:

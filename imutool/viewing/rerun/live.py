@@ -20,7 +20,7 @@ from imutool.errors import ConfigError, ImutoolError
 from imutool.inertial.strapdown import Start, dead_reckon
 from imutool.mcap_io.storage.target import Target
 from imutool.recording import Imu, Poses
-from imutool.viewing.model.output import Shown
+from imutool.viewing.model.output import Output
 from imutool.viewing.model.run_data import level_start
 from imutool.viewing.rerun import connect, live_layout, viewer
 from imutool.viewing.rerun.connect import Peer
@@ -61,11 +61,11 @@ def watching(
     live = Live(name)
     if connect_to is not None:
         peer = connect.probe(connect_to)
-        live.send(peer, Shown("connect", peer.url, f"Shown as it went: {peer.url}{connect.told(peer)}."))
+        live.send(peer, Output("connect", peer.url, f"Shown as it went: {peer.url}{connect.told(peer)}."))
     elif save is None:
         try:
             peer = viewer.open_empty()
-            live.send(peer, Shown("viewer", peer.url, "The viewer is open, and showed it as it went."))
+            live.send(peer, Output("viewer", peer.url, "The viewer is open, and showed it as it went."))
         except ConfigError as error:
             save, live.trouble = instead, viewer.sentence(error)
     if save is None:
@@ -100,9 +100,9 @@ class Live:
         self._viewer: rr.RecordingStream | None = None
         self._file: rr.RecordingStream | None = None
         self._left_at = time.monotonic()
-        self.shown: list[Shown] = []
+        self.shown: list[Output] = []
 
-    def send(self, peer: Peer, shown: Shown) -> None:
+    def send(self, peer: Peer, shown: Output) -> None:
         """Sends everything to a viewer, which is `shown` unless it goes away."""
         self._viewer = named(self._name)
         self._viewer.connect_grpc(peer.url)
@@ -112,7 +112,7 @@ class Live:
         """Also writes everything to a file, which is to become `path`."""
         self._file = named(self._name)
         self._file.save(temporary)
-        self.shown.append(Shown("rrd", str(path), f"{self.trouble}Saved {path}. Open with: rerun {path}"))
+        self.shown.append(Output("rrd", str(path), f"{self.trouble}Saved {path}. Open with: rerun {path}"))
 
     def __call__(self, block: Block) -> None:
         """Shows a block; what cannot be shown is said once, and the rest goes on without it."""

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from imutool.errors import ConfigError
-from imutool.viewing.model.output import Shown
+from imutool.viewing.model.output import Output
 from imutool.viewing.model.run_data import RunData
 from imutool.viewing.rerun import connect, files
 from imutool.viewing.rerun.connect import Peer
@@ -27,7 +27,7 @@ SETTLES_S = 1.0  # within which one that finds no window or no graphics has died
 VIEWERS: list[subprocess.Popen[bytes]] = []  # they outlive us; held so that Python does not warn of a lost child
 
 
-def show(logs: Sequence[RunData], *, source: bool = True, at_s: float | None = None, overwrite: bool = False) -> Shown:
+def show(logs: Sequence[RunData], *, source: bool = True, at_s: float | None = None, overwrite: bool = False) -> Output:
     """Opens a viewer; where there is no display or the viewer does not start, saves NAME.rrd here, and says so.
 
     Raises:
@@ -43,7 +43,7 @@ def show(logs: Sequence[RunData], *, source: bool = True, at_s: float | None = N
     return saved._replace(said=f"{trouble}{saved.said}, or look in a browser: imutool view --web")
 
 
-def open_viewer(logs: Sequence[RunData], *, source: bool = True, at_s: float | None = None) -> Shown:
+def open_viewer(logs: Sequence[RunData], *, source: bool = True, at_s: float | None = None) -> Output:
     """Opens a viewer of our own with all logs, the cursor at `at_s` seconds.
 
     Raises:
@@ -58,7 +58,7 @@ def open_viewer(logs: Sequence[RunData], *, source: bool = True, at_s: float | N
         raise viewer.trouble() or error from error
     if trouble := viewer.trouble(wait_s=0.0):
         raise trouble
-    return Shown("viewer", viewer.peer.url, "The viewer is open.")
+    return Output("viewer", viewer.peer.url, "The viewer is open.")
 
 
 def open_empty() -> Peer:

@@ -12,7 +12,7 @@ from typing import Any
 
 from imutool.errors import ConfigError
 from imutool.recording import nanoseconds
-from imutool.viewing.model.output import Shown
+from imutool.viewing.model.output import Output
 from imutool.viewing.model.run_data import RunData
 from imutool.viewing.rerun import viewer
 from imutool.viewing.rerun.files import rrd
@@ -108,10 +108,10 @@ class Server:
         """What is served under a name; the page itself under none."""
         return self._files.get(name or PAGE)
 
-    def offer(self, files: Mapping[str, bytes]) -> Shown:
+    def offer(self, files: Mapping[str, bytes]) -> Output:
         """Takes what is to be served, and says where it is; `serve` then serves it."""
         self._files = files
-        return Shown("web", self.url, f"{self.moved}Open {self.url} in a browser on this machine; Ctrl-C ends it.")
+        return Output("web", self.url, f"{self.moved}Open {self.url} in a browser on this machine; Ctrl-C ends it.")
 
     def serve(self) -> None:
         """Serves until Ctrl-C or `close`."""
