@@ -1,7 +1,8 @@
 """A model at work: over a whole log, over a recording in memory, or one sample at a time; always the same numbers.
 
 Causal throughout, unless `smooth` is asked for: the bias at a sample comes from that sample and earlier ones, once the start
-is known (`imutool.bias_start.initial_bias`). Smoothing reads the log twice; of the first pass it keeps thirteen numbers for each half second.
+is known (`imutool.bias_start.initial_bias`). Smoothing reads the log twice; of the first pass it keeps thirteen numbers for
+each half second.
 """
 
 from __future__ import annotations
@@ -80,7 +81,8 @@ Watch = Callable[[Block], None]
 
 
 def apply_with_std(model: BiasModel, start: InitialBias, imu: Imu) -> tuple[Debiased, Float64[np.ndarray, "n 6"]]:
-    """As `apply`, and one standard deviation of the bias at each sample, gyro (rad/s) then accel (m/s²): `imutool.bias_start.bias_covariance`.
+    """As `apply`, and one standard deviation of the bias at each sample, gyro (rad/s) then accel (m/s²):
+    `imutool.bias_start.bias_covariance`.
 
     In blocks, as a log is debiased: a covariance is 288 bytes.
     """
@@ -99,7 +101,8 @@ def apply_with_std(model: BiasModel, start: InitialBias, imu: Imu) -> tuple[Debi
 class OnlineDebiaser:
     """One sample in, one corrected sample out: for a live node.
 
-    The start is a rest bias from `imutool.bias_start.initial_bias`, for instance `at_rest` over the first seconds, or `prior`. Without one, it
+    The start is a rest bias from `imutool.bias_start.initial_bias`, for instance `at_rest` over the first seconds, or
+    `prior`. Without one, it
     begins at the prior and is followed by what the samples show, as by `--init auto`.
     """
 

@@ -1,6 +1,7 @@
 """Known physics first, a neural ODE for the rest: bias = rest + sum of effects + what the ODE finds in what they leave.
 
-The effects are those of `imutool.sensor.effects` that the training logs support (`imutool.training.calibration`): each linear in
+The effects are those of `imutool.sensor.effects` that the training logs support (`imutool.training.calibration`): each
+linear in
 its parameters, fitted together in closed form, chosen by how well logs predict one another, with the covariance of the
 answer. The neural ODE (`imutool.bias.neural_ode`) is shown samples that the effects have been taken off, and is left out
 where it does not help on the held-out part: then debiasing is a few products a sample.

@@ -156,6 +156,7 @@ class NeuralStream:
     def __call__(
         self, t_s: Float64[np.ndarray, " n"], gyro: Float64[np.ndarray, "n 3"], accel: Float64[np.ndarray, "n 3"]
     ) -> Float64[np.ndarray, "n 6"]:
+        """Bias at each sample of a block, gyro (rad/s) then accel (m/s²)."""
         if len(t_s) == 1:
             return self.one(float(t_s[0]), np.concatenate([gyro[0], accel[0]]))[None]
         u = np.concatenate([gyro, accel], axis=1)

@@ -34,7 +34,9 @@ Roots = Mapping[Sensor, Float64[np.ndarray, "n 3 p"]]
 
 
 class Parts(NamedTuple):
-    """Covariance of the rest bias at each sample, and the root of what the calibration adds (`imutool.bias.model.CovarianceModel`)."""
+    """Covariance of the rest bias at each sample, and the root of what the calibration adds
+    (`imutool.bias.model.CovarianceModel`).
+    """
 
     rest: Covariances
     calibration: Roots

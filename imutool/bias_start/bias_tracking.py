@@ -1,6 +1,7 @@
 """The rest bias followed through a log: by each sample from what came before it, or from the whole log.
 
-Samples, less what the model says the motion adds, go through `imutool.inertial.inertial_filter` in blocks of half a second. `Following`
+Samples, less what the model says the motion adds, go through `imutool.inertial.inertial_filter` in blocks of half a second.
+`Following`
 and `Along` are streams (`imutool.bias.model.Stream`) like the one a model gives for a constant rest bias.
 """
 

@@ -5,7 +5,8 @@ measurement along one direction, as a Kalman update). With a model that adds a m
 measured is what is left of the samples after that part.
 
 `auto` and `truth` are a start and more: from there on the rest bias is followed, by every stop and by gravity in motion
-(`imutool.bias_start.bias_tracking`), so that the bias of a sample depends on that sample and earlier ones. The one exception is what the
+(`imutool.bias_start.bias_tracking`), so that the bias of a sample depends on that sample and earlier ones. The one exception
+is what the
 start was measured on, the stop that a log begins with or the first seconds of truth: its samples get what the whole of it says.
 `smooth` takes the whole log for each sample.
 """

@@ -1,6 +1,7 @@
 """Dead reckoning that knows when it stands: debiased samples through the inertial filter, from a known pose.
 
-At every stop velocity and rate are zero, in between speed is bounded (`imutool.inertial.inertial_filter`); each correction also moves
+At every stop velocity and rate are zero, in between speed is bounded (`imutool.inertial.inertial_filter`); each correction
+also moves
 the position as far as it had drifted with the velocity. Without a stop, what remains is the bounded speed.
 """
 

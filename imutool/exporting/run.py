@@ -28,7 +28,8 @@ def export(
     """Writes the folder `out` in one of `FORMATS`.
 
     `imu` is the topic that goes into a EuRoC folder: by default the debiased one, else the only raw one. `sensor_noise` is
-    a data sheet or a TOML file (`imutool.noise.datasheet.read`) for its `sensor.yaml`. With `overwrite` an earlier export of the same
+    a data sheet or a TOML file (`imutool.noise.datasheet.read`) for its `sensor.yaml`. With `overwrite` an earlier export of
+    the same
     format is replaced; any other folder is refused all the same.
 
     Raises:

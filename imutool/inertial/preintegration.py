@@ -1,7 +1,8 @@
 """What a stretch of inertial samples adds to attitude, velocity and position, and how a bias changes that; numpy, no torch.
 
 Forster, Carlone, Dellaert, Scaramuzza, "On-Manifold Preintegration", TRO 2017, eq. 33-36 and 44, here with the mean of two
-samples over the step between them (`imutool.inertial.windows` says why) and with sums in place of the recursions, so that a block of a
+samples over the step between them (`imutool.inertial.windows` says why) and with sums in place of the recursions, so that a
+block of a
 hundred samples costs a few dozen array operations.
 """
 

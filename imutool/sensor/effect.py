@@ -5,7 +5,8 @@ is needed to simulate it, and the estimator differentiates it by differences. Ef
 
 | stage | acts on | effects |
 |---|---|---|
-| MOTION | `IdealMotion` | what the point where the sensor sits feels: gravity, earth_rotation, lever_arm, size_effect, vibration |
+| MOTION | `IdealMotion` | what the point where the sensor sits feels: gravity, earth_rotation, lever_arm, size_effect,
+vibration |
 | MOUNT | `IdealMotion` | how the sensor sits: mount_resonance, mount_rotation |
 | BANDWIDTH | `IdealMotion` | what it is too slow for: low_pass |
 | CLOCK | times | when samples are taken: clock_offset, clock_skew, clock_jump |

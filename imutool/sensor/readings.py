@@ -32,7 +32,8 @@ Instants = tuple[Float64[np.ndarray, " n"], Float64[np.ndarray, " m"], csr_array
 class Sampler:
     """Cubic splines over one even clock, taken at some instants; it remembers a few, for most of them stay the same.
 
-    All that `replace` makes of a `IdealMotion` shares one, so that what an effect leaves alone is worked on once. What it gives cannot
+    All that `replace` makes of a `IdealMotion` shares one, so that what an effect leaves alone is worked on once. What it
+    gives cannot
     be written to; each memory is replaced as a whole, so threads may share it.
     """
 

@@ -1,6 +1,7 @@
 """Which effects the training logs support, and how large they are: one linear solve a step, no descent.
 
-Effects (`imutool.sensor.effects`) are shared by all logs; rest bias and tilt are each log's own (`imutool.training.linearised`).
+Effects (`imutool.sensor.effects`) are shared by all logs; rest bias and tilt are each log's own
+(`imutool.training.linearised`).
 Effects are chosen forward by how well the other logs predict each log's long windows (`imutool.training.normal_equations`), and
 refused where most logs do not agree or chance could have done it. What the motion cannot show stays where its prior has it,
 and is named.

@@ -1,7 +1,8 @@
 """A calibration without a single step of gradient descent: robust Gauss-Newton over windows between true poses.
 
 Unknown are one matrix W of the sensor and one rest bias a log. The residual of a window is what integration misses
-(`imutool.inertial.windows`), its derivative is exact, Huber's weights keep outliers of the truth from pulling, and everything has a
+(`imutool.inertial.windows`), its derivative is exact, Huber's weights keep outliers of the truth from pulling, and
+everything has a
 prior, measured against the residuals' own noise, so that what the motion does not show stays at zero.
 """
 

@@ -1,7 +1,8 @@
 """What integration between two true poses misses, to first order in the parameters of effects and in what is a log's own.
 
 A log's own are its rest bias and, for the accelerometer, the tilt of its truth's world against gravity. The residual of a
-window and how each sample moves it come from `imutool.inertial.windows`; an effect's error is linear in its parameters, so the rest is
+window and how each sample moves it come from `imutool.inertial.windows`; an effect's error is linear in its parameters, so
+the rest is
 a product of matrices.
 """
 

@@ -16,7 +16,9 @@ Count = Annotated[int, msgspec.Meta(ge=1)]
 
 
 class IncrementSettings(Settings, frozen=True):
-    """For methods that descend on increments (`imutool.training.increments`): their lengths, and the stretches that hold them."""
+    """For methods that descend on increments (`imutool.training.increments`): their lengths, and the stretches that hold
+    them.
+    """
 
     gyro_samples: tuple[Count, ...] = (16, 32)
     accel_samples: tuple[Count, ...] = (16, 32)

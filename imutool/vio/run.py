@@ -147,7 +147,9 @@ def score(
     bias_states: bool,
     progress: Callable[[int, int], None] | None = None,
 ) -> dict[str, Any]:
-    """Figures of one run (`imutool.inertial.metrics`, aligned in heading and position at the first keyframe), or why it failed."""
+    """Figures of one run (`imutool.inertial.metrics`, aligned in heading and position at the first keyframe), or why it
+    failed.
+    """
     began = time.process_time()
     start = Start.of(course.true)
     try:

@@ -1,6 +1,7 @@
 """How late the truth is behind the gyro, under two rules of integration: `python tests/bench/truth_delay.py LOG...`.
 
-Held: each sample holds until the next (Euler). Mean: a step sees the mean of its two ends (`imutool.inertial.windows`). A truth that
+Held: each sample holds until the next (Euler). Mean: a step sees the mean of its two ends (`imutool.inertial.windows`). A
+truth that
 is late by tau adds omega_end tau - dR^T omega_start tau to the residual of a window; tau is fitted robustly over windows of
 one second, each log's bias solved for first. Prints tau in ms and the median residual in degrees with tau taken out.
 """

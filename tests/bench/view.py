@@ -1,7 +1,8 @@
 """What it costs to make a log ready to be looked at: `python tests/bench/view.py [--minutes 60] [--profile]`.
 
 A made-up log of that length at 200 Hz, truth at 200 Hz too and a debiased channel in it, in a temporary folder. Prints seconds
-of `imutool.viewing.model.runs.load` (all of it), of `rundata.build` (its last part: paths, errors, drift, windows, spectra, events), and
+of `imutool.viewing.model.runs.load` (all of it), of `rundata.build` (its last part: paths, errors, drift, windows, spectra,
+events), and
 how much memory the process took at most beyond what the imports take. On one core, the log in the page cache.
 
 Then the viewer, Rerun's own without a window and drawing in software (the slowest that there is): seconds until everything is

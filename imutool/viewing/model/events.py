@@ -44,7 +44,9 @@ class Event:
 
 
 def of_survey(survey: Survey) -> tuple[list[Event], list[str]]:
-    """What `imutool.cleaning` found at some time, and sentences for what it found without one, or at more times than it kept."""
+    """What `imutool.cleaning` found at some time, and sentences for what it found without one, or at more times than it
+    kept.
+    """
     found, notes = [], []
     for finding in survey.findings:
         kind = OF_RULE.get(finding.rule)
