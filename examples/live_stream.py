@@ -14,8 +14,8 @@ import numpy as np
 
 from imutool.bias import static
 from imutool.bias_start.initial_bias import at_rest
-from imutool.debiasing import Block, OnlineDebiaser
-from imutool.mcap_io.batches import ImuBatch
+from imutool.debiasing import DebiasedBlock, OnlineDebiaser
+from imutool.mcap_io.topics import ImuBatch
 from imutool.recording import Imu, nanoseconds
 from imutool.sensor.flight import flight
 from imutool.viewing.rerun.live import watching
@@ -39,7 +39,7 @@ def main(where: str, duration_s: float = 20.0) -> None:
             bias = np.stack(
                 [online(*sample)[2] for sample in zip(samples.t_ns.tolist(), samples.gyro, samples.accel, strict=True)]
             )
-            live(Block("/imu0", as_batch(samples, first), bias, std[: len(samples)]))
+            live(DebiasedBlock("/imu0", as_batch(samples, first), bias, std[: len(samples)]))
             if file is None:  # the time that the sensor would have taken
                 time.sleep(max(0.0, began + (first + len(samples)) * sensor.period_s - time.monotonic()))
     print(f"{len(sensor)} samples in batches of {BATCH}, bias at the end {bias[-1].round(4)}")

@@ -25,7 +25,7 @@ from imutool.fleet.sources import leftovers, remove, within
 from imutool.fleet.task import Imu, Parameter, Result, Settings, Task
 from imutool.location import Location, identity, to_location
 from imutool.mcap_io.log import Log
-from imutool.mcap_io.storage.digest import sha256
+from imutool.mcap_io.storage.source import sha256
 from imutool.mcap_io.storage.target import Target
 
 LOST = 3  # exit code: something of the log was lost

@@ -27,7 +27,7 @@ from imutool.conversion import convert
 from imutool.converters import euroc
 from imutool.debiasing import debias
 from imutool.errors import ConfigError, ImutoolError, LogError
-from imutool.exporting.run import export
+from imutool.exporting.export import export
 from imutool.mcap_io.log import Log
 from imutool.mcap_io.read import read
 from imutool.mcap_io.write import write

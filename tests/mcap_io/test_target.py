@@ -14,12 +14,12 @@ from typing import Any
 import pytest
 
 from imutool.errors import ConfigError
-from imutool.mcap_io.added_topics import Made, NewTopic
-from imutool.mcap_io.batches import ImuBatch
+from imutool.mcap_io.added_topics import DerivedBatch, NewTopic
 from imutool.mcap_io.codec import schemas
 from imutool.mcap_io.codec.encode import encode_imu
 from imutool.mcap_io.rewrite import rewrite
 from imutool.mcap_io.storage.target import Target
+from imutool.mcap_io.topics import ImuBatch
 from imutool.mcap_io.write import write
 from imutool.recording import Frames, Recording
 
@@ -33,11 +33,11 @@ class Failing:
     def __init__(self, error: BaseException) -> None:
         self.error, self.seen = error, 0
 
-    def __call__(self, batch: ImuBatch) -> Made:
+    def __call__(self, batch: ImuBatch) -> DerivedBatch:
         self.seen += 1
         if self.seen == 2:
             raise self.error
-        return Made(batch, [encode_imu(batch.stamp_ns, batch.gyro, batch.accel, batch.frame_id)])
+        return DerivedBatch(batch, [encode_imu(batch.stamp_ns, batch.gyro, batch.accel, batch.frame_id)])
 
 
 @pytest.fixture

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from imutool.errors import ConfigError
 from imutool.exporting import euroc, rosbag2
-from imutool.exporting.report import ExportReport, Progress
+from imutool.exporting.folder import ExportReport, Progress
 
 FORMATS = ("euroc", "rosbag2")
 
