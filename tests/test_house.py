@@ -7,6 +7,7 @@ import graphlib
 import json
 import os
 import re
+import statistics
 import subprocess
 import sys
 import time
@@ -93,6 +94,9 @@ def against_the_order(found: dict[str, ast.Module]) -> list[str]:
 
 IMUTOOL, CONVERTERS = modules(ROOT / "imutool", "imutool"), modules(ROOT / "converters", "imutool.converters")
 
+EVERYTHING = IMUTOOL | CONVERTERS
+SOURCES = [*sorted((ROOT / "imutool").rglob("*.py")), *sorted((ROOT / "converters").rglob("*.py"))]
+
 
 def test_every_room_has_its_place_in_the_order() -> None:
     assert {room(name) for name in IMUTOOL} - {""} <= set(LEVEL)
@@ -115,8 +119,7 @@ def test_the_order_is_really_looked_at() -> None:
 
 
 def test_no_two_modules_import_each_other() -> None:
-    everything = IMUTOOL | CONVERTERS
-    graph = {name: imports(tree, set(everything)) & set(everything) - {name} for name, tree in everything.items()}
+    graph = {name: imports(tree, set(EVERYTHING)) & set(EVERYTHING) - {name} for name, tree in EVERYTHING.items()}
     graphlib.TopologicalSorter(graph).prepare()
 
 
@@ -134,6 +137,102 @@ def test_converters_are_never_imported_by_name() -> None:
 def test_no_room_is_a_drawer() -> None:
     names = {name.rpartition(".")[2].strip("_") for name in IMUTOOL | CONVERTERS}
     assert not names & {"utils", "util", "helpers", "common", "misc"}
+
+
+# ── the size of rooms, files and functions ──
+
+MOST_MODULES, MOST_LINES, MOST_FUNCTION_LINES, MEDIAN_FUNCTION_LINES = 12, 300, 60, 7
+CATALOGUES = {"imutool.cleaning.rules", "imutool.cli", "imutool.converters", "imutool.sensor.effects"}  # a file is an entry
+
+
+def folders() -> dict[str, list[str]]:
+    """The modules that lie in each folder, by the folder's dotted name."""
+    packages = {name.rpartition(".")[0] for name in EVERYTHING} & set(EVERYTHING)
+    return {package: [name for name in EVERYTHING if name.rpartition(".")[0] == package] for package in packages}
+
+
+def functions(tree: ast.Module) -> Iterator[ast.FunctionDef]:
+    """Every function and method of a module."""
+    yield from (node for node in ast.walk(tree) if isinstance(node, ast.FunctionDef))
+
+
+def lines_of(node: ast.FunctionDef) -> int:
+    assert node.end_lineno is not None
+    return node.end_lineno - node.lineno + 1
+
+
+def test_a_room_has_at_most_a_dozen_modules() -> None:
+    modules_in = {room: [n for n in names if n not in folders()] for room, names in folders().items()}
+    assert {
+        room: len(names) for room, names in modules_in.items() if len(names) > MOST_MODULES and room not in CATALOGUES
+    } == {}
+
+
+def test_no_file_is_longer_than_a_reader_likes() -> None:
+    sizes = {path: len(path.read_text(encoding="utf-8").splitlines()) for path in SOURCES}
+    assert {str(path.relative_to(ROOT)): size for path, size in sizes.items() if size > MOST_LINES} == {}
+
+
+def test_functions_are_short() -> None:
+    sizes = {f"{name}.{node.name}": lines_of(node) for name, tree in EVERYTHING.items() for node in functions(tree)}
+    assert {name: size for name, size in sizes.items() if size > MOST_FUNCTION_LINES} == {}
+    assert statistics.median(sizes.values()) <= MEDIAN_FUNCTION_LINES
+
+
+# ── names and words ──
+
+FIRST_LINE = 90  # characters of a docstring's first line
+
+
+def is_private(name: str) -> bool:
+    return any(part.startswith("_") and not part.startswith("__") for part in name.split("."))
+
+
+def test_no_private_name_is_imported_from_another_room() -> None:
+    found = []
+    for name, tree in EVERYTHING.items():
+        home = name if name in folders() else name.rpartition(".")[0]
+        for node in ast.walk(tree):
+            if isinstance(node, ast.ImportFrom) and str(node.module).split(".")[0] == "imutool":
+                named = [f"{node.module}.{alias.name}" for alias in node.names]
+                found += [f"{name}: {other}" for other in named if is_private(other) and not other.startswith(f"{home}.")]
+    assert found == []
+
+
+def test_a_module_says_in_one_line_what_it_holds() -> None:
+    first = {name: (ast.get_docstring(tree) or "").partition("\n")[0] for name, tree in EVERYTHING.items()}
+    assert {name: line for name, line in first.items() if not 0 < len(line) <= FIRST_LINE} == {}
+
+
+def test_every_public_function_and_class_says_in_one_line_what_it_is() -> None:
+    found = []
+    for name, tree in EVERYTHING.items():
+        for node in tree.body:
+            if isinstance(node, ast.FunctionDef | ast.ClassDef) and not node.name.startswith("_"):
+                line = (ast.get_docstring(node) or "").partition("\n")[0]
+                if not 0 < len(line) <= FIRST_LINE:
+                    found.append(f"{name}.{node.name}: {line}")
+    assert found == []
+
+
+def test_what_is_public_is_documented() -> None:
+    import imutool
+
+    assert imutool.__all__ == sorted(imutool.__all__)
+    assert [name for name in imutool.__all__ if not (getattr(imutool, name).__doc__ or "").strip()] == []
+
+
+PRIVATE_PHRASES = ("what is told", "what is said", "is had", "cannot be had", "nothing of it", "is no longer told")
+
+
+def test_no_private_language_in_docstrings() -> None:
+    found = []
+    for name, tree in EVERYTHING.items():
+        for node in ast.walk(tree):
+            if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef):
+                text = (ast.get_docstring(node) or "").lower()
+                found += [f"{name}: {phrase}" for phrase in PRIVATE_PHRASES if phrase in text]
+    assert found == []
 
 
 # ── what a command imports ──
