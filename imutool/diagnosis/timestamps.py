@@ -230,7 +230,7 @@ def saturated(pairs: Sequence[Pair], expected: Sequence[Float64[np.ndarray, "n 6
     told: dict[str, Estimate] = {}
     powers, signal_of, p = [0.0, 0.0, 0.0], "", 1.0
     real, there = (np.concatenate(parts) for parts in ([pair.real for pair in pairs], expected))
-    for k, signal in enumerate(("gyro", "accel")):
+    for k, signal in enumerate(SENSORS):
         most = limits(real).get(signal)
         if most is None:
             continue
