@@ -246,10 +246,10 @@ def saturated(pairs: Sequence[Pair], expected: Sequence[Float64[np.ndarray, "n 6
         powers, signal_of, p = [float(before.sum()), float(after.sum()), float(at.size)], signal, min(p, chance)
     if not told:
         return []
-    signal = signal_of if len(told) == 1 else "both"
+    seen_in = signal_of if len(told) == 1 else "both"
     length = sum(float(pair.stamp_s[-1] - pair.stamp_s[0]) for pair in pairs)
     held = HeldOut(
         float(np.sqrt(powers[0] / powers[2])), float(np.sqrt(powers[1] / powers[2])), ASCII_UNITS[signal_of], round(length, 1)
     )
     share = float(np.clip(1.0 - powers[1] / max(powers[0], 1e-300), 0.0, 1.0))
-    return [Finding("saturation", signal, share, min(p, 1.0), min(p, 1.0), told, "readings are clipped at +-limit", held)]
+    return [Finding("saturation", seen_in, share, min(p, 1.0), min(p, 1.0), told, "readings are clipped at +-limit", held)]
