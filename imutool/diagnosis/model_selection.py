@@ -28,7 +28,7 @@ from imutool.diagnosis.onset import onsets
 from imutool.diagnosis.significance import chance, gains, helps, needed, predicts
 from imutool.diagnosis.unnamed import Curve, finer, like
 from imutool.sensor.effect import Effect, Theta
-from imutool.sensor.readings import SensorSamples
+from imutool.sensor.samples import SensorSamples
 
 FALSE_DISCOVERY = 5e-3
 HELPS = 0.05  # chance of the gain on unseen blocks being none

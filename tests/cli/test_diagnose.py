@@ -28,7 +28,7 @@ from imutool.recording import Recording
 from imutool.sensor import physics_file
 from imutool.sensor.flight import flight
 from imutool.sensor.physics_file import Bias, Entry, PhysicsFile, Value
-from imutool.sensor.readings import SensorSamples
+from imutool.sensor.samples import SensorSamples
 from imutool.sensor.simulate import simulate
 
 MADE = SimpleNamespace(**runpy.run_path(str(Path(__file__).parents[1] / "diagnosis" / "diagnoses.py")))

@@ -16,7 +16,7 @@ from imutool.diagnosis.forward_cache import Course, bound, free, step_of
 from imutool.diagnosis.gauss_newton import fit
 from imutool.diagnosis.jacobians import Slopes, slope
 from imutool.diagnosis.whitening import Band, Whitener
-from imutool.sensor.effect import Effect, Stage, Theta, read
+from imutool.sensor.effect import Effect, Stage, Theta, simulate_samples
 
 PLANTED = SimpleNamespace(**runpy.run_path(str(Path(__file__).with_name("planted.py"))))
 ROUNDED = 1e-6  # of the largest derivative: differences of numbers to sixteen digits, over steps of a thousandth
@@ -33,7 +33,7 @@ SECONDS = 20.0
 
 def evaluated(pair: Pair, chosen: tuple[tuple[Effect, Theta], ...]) -> np.ndarray:
     """From the start, nothing remembered."""
-    got = read(
+    got = simulate_samples(
         type(pair.felt)(*(getattr(pair.felt, n) for n in ("t_s", "gyro", "accel", "alpha", "R_wb"))), pair.stamp_s, chosen
     )
     return np.concatenate([got.gyro, got.accel], axis=1)
@@ -43,7 +43,7 @@ def start(physics: Effect, pair: Pair) -> Theta:
     """Where a fit of it would begin, or a tenth of its plausible size."""
     if physics.starts is None:
         return 0.1 * physics.plausible
-    got = read(pair.felt, pair.stamp_s, ())
+    got = simulate_samples(pair.felt, pair.stamp_s, ())
     return np.asarray(physics.starts(pair.felt, got.but(pair.real[:, :3], pair.real[:, 3:]))[0], dtype=float)
 
 

@@ -12,7 +12,7 @@ import pytest
 from imutool.diagnosis import unnamed
 from imutool.diagnosis.gauss_newton import fit
 from imutool.sensor.effect import Effect
-from imutool.sensor.readings import SensorSamples
+from imutool.sensor.samples import SensorSamples
 
 PLANTED = SimpleNamespace(**runpy.run_path(str(Path(__file__).with_name("planted.py"))))
 SURE = 4.0
