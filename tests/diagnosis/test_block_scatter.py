@@ -9,8 +9,8 @@ from types import SimpleNamespace
 import numpy as np
 from scipy.signal import lfilter
 
-from imutool.diagnosis.block_scatter import Scatter, scatter
-from imutool.diagnosis.gauss_newton import Fit, WhitenedLog, fit
+from imutool.diagnosis.estimation.block_scatter import Scatter, scatter
+from imutool.diagnosis.estimation.gauss_newton import Fit, WhitenedLog, fit
 
 PLANTED = SimpleNamespace(**runpy.run_path(str(Path(__file__).with_name("planted.py"))))
 FELT = PLANTED.shaken(duration_s=45.0)

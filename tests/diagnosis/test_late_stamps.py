@@ -9,8 +9,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from imutool.diagnosis.alignment import Pair
-from imutool.diagnosis.late_stamps import late_stamps
+from imutool.diagnosis.estimation.alignment import Pair
+from imutool.diagnosis.estimation.late_stamps import late_stamps
 
 PLANTED = SimpleNamespace(**runpy.run_path(str(Path(__file__).with_name("planted.py"))))
 FELT = PLANTED.rich()

@@ -10,8 +10,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from imutool.diagnosis import timestamps
-from imutool.diagnosis.gauss_newton import fit
+from imutool.diagnosis.estimation import timestamps
+from imutool.diagnosis.estimation.gauss_newton import fit
 
 PLANTED = SimpleNamespace(**runpy.run_path(str(Path(__file__).with_name("planted.py"))))
 N = 2400
