@@ -21,13 +21,13 @@ from imutool.diagnosis.estimation.model_selection import SelectedEffect, Selecti
 from imutool.diagnosis.estimation.noise_estimate import noise_std
 from imutool.diagnosis.estimation.unnamed_effects import unit
 from imutool.diagnosis.localization import of_findings, of_what_is_left
-from imutool.diagnosis.quantity import AXES, percent, symbol
-from imutool.diagnosis.result import UNITS, Closer, Curve, Diagnosis, Estimate, Finding, HeldOut, Located, Traces, Unexplained
+from imutool.diagnosis.quantity import percent
+from imutool.diagnosis.result import Closer, Curve, Diagnosis, Estimate, Finding, HeldOut, Located, Traces, Unexplained
 from imutool.diagnosis.to_physics_file import found as physics_file
 from imutool.inertial.stationary import white_noise
 from imutool.sensor.physics_file import PhysicsFile
+from imutool.units import ASCII_UNITS, AXES, SENSORS, UNITS
 
-SIGNALS = tuple(UNITS)
 JITTER, QUANTIZATION = "timestamp_jitter", "quantization"
 SHOWN_KNOTS = 41  # of a curve without a name, as it is told
 SOME = 0.05  # of the samples of an axis at its limit, from which on that is told
@@ -145,8 +145,8 @@ def _stuck(pair: Pair, floor: Float64[np.ndarray, "6"], *, several: bool) -> Ite
     """Axes that read the same in every sample though more was expected than that."""
     stuck, there = timestamps.stuck(pair.real), expected(pair, ())
     for a in np.flatnonzero(stuck & ~_ended(pair) & (there.std(axis=0) > MOVES * floor)):
-        signal = SIGNALS[a // 3]
-        regime = f"always: it reads {pair.real[0, a]:.4g} {symbol(UNITS[signal])} in every sample"
+        signal = SENSORS[a // 3]
+        regime = f"always: it reads {pair.real[0, a]:.4g} {UNITS[signal]} in every sample"
         span = ((float(pair.stamp_s[0]), float(pair.stamp_s[-1])),)
         yield Located(signal, (AXES[a % 3],), span, regime, 1.0, 0.0, pair.name if several else "")
 
@@ -194,7 +194,7 @@ def closer(logs: Sequence[WhitenedLog], before: Sequence[np.ndarray], after: Seq
     """What all findings together bring to each sensor, on held-out time."""
     noise, out = floor(logs), {}
     for signal, k in _known([log.pair for log in logs]).items():
-        out[signal] = Closer.of(_held_out(logs, before, after, k, UNITS[signal]), _noise(logs, noise, k))
+        out[signal] = Closer.of(_held_out(logs, before, after, k, ASCII_UNITS[signal]), _noise(logs, noise, k))
     return out
 
 
@@ -230,8 +230,8 @@ def _finding(logs: Sequence[WhitenedLog], found: Selection, one: SelectedEffect,
     shares, known = [], _known(pairs)
     for j, signal in enumerate(("gyro", "accel")):
         if signal in one.physics.sensors and signal in known:
-            held = _held_out(logs, alone, with_, j, UNITS[signal])
-            all_ = _held_out(logs, nothing, with_, j, UNITS[signal])
+            held = _held_out(logs, alone, with_, j, ASCII_UNITS[signal])
+            all_ = _held_out(logs, nothing, with_, j, ASCII_UNITS[signal])
             noise = float(np.mean(floor[3 * j : 3 * j + 3] ** 2))
             most = max(all_.rms_before, held.rms_before)  # effects may make up for one another
             misfit = max(most**2 - noise, 1e-300)
@@ -297,7 +297,7 @@ def _unexplained(
     """Of the sensors of which anything is known; beside poses, whose errors come and go, by blocks that are of one mind."""
     out, beside_poses = {}, any(log.whiten.band is not None for log in logs)
     for signal, k in _known([log.pair for log in logs]).items():
-        held, noise = _held_out(logs, after, after, k, UNITS[signal]), _noise(logs, noises, k)
+        held, noise = _held_out(logs, after, after, k, ASCII_UNITS[signal]), _noise(logs, noises, k)
         part = slice(3 * k, 3 * k + 3)
         unseen = sum(len(_unseen(log, there, part)) for log, there in zip(logs, after, strict=True))
         seen = sum(log.numbers("fitted") for log in logs) / 2.0  # of both sensors
@@ -328,20 +328,20 @@ def _by_chance(logs: Sequence[WhitenedLog], after: Sequence[Float64[np.ndarray, 
 def _known(pairs: Sequence[Pair]) -> dict[str, int]:
     """Sensors of which an axis at least tells anything, with their places."""
     axes = np.any([pair.axes for pair in pairs], axis=0)
-    return {signal: k for k, signal in enumerate(SIGNALS) if axes[3 * k : 3 * k + 3].any()}
+    return {signal: k for k, signal in enumerate(SENSORS) if axes[3 * k : 3 * k + 3].any()}
 
 
 def silent(pair: Pair) -> list[str]:
     """What of a log tells nothing, and why."""
     stuck, clipped, ended, out = timestamps.stuck(pair.real), timestamps.clipped(pair.real).mean(axis=0), _ended(pair), []
     for a in np.flatnonzero(stuck & ~ended):
-        signal = SIGNALS[a // 3]
-        out.append(f"{signal} {AXES[a % 3]} reads {pair.real[0, a]:.4g} {symbol(UNITS[signal])} in every sample")
+        signal = SENSORS[a // 3]
+        out.append(f"{signal} {AXES[a % 3]} reads {pair.real[0, a]:.4g} {UNITS[signal]} in every sample")
     for signal, most in timestamps.limits(pair.real).items():
-        k = 3 * SIGNALS.index(signal)
+        k = 3 * SENSORS.index(signal)
         share = ", ".join(f"{AXES[a - k]} in {percent(float(clipped[a]))}" for a in range(k, k + 3) if ended[a])
         if share:
-            out.append(f"{signal} is at its limit of {most:.4g} {symbol(UNITS[signal])}: {share} of the samples")
+            out.append(f"{signal} is at its limit of {most:.4g} {UNITS[signal]}: {share} of the samples")
     return out
 
 

@@ -25,8 +25,8 @@ import numpy as np
 from jaxtyping import Float64
 
 from imutool.errors import DataError
-from imutool.sensor.linear_effect import AXES, Sensor
 from imutool.sensor.readings import IdealMotion, SensorSamples, Times
+from imutool.units import AXES, Sensor
 
 Kind = Literal["catalogue", "driven", "unknown"]
 Theta = Float64[np.ndarray, "_"]  # effects that act together have numbers of their own, so this length binds no other

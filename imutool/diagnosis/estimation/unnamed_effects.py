@@ -18,13 +18,12 @@ from scipy.interpolate import BSpline
 from imutool.diagnosis.estimation.alignment import Pair
 from imutool.sensor import catalogue
 from imutool.sensor.effect import Effect, Parameter, Stage, Theta
-from imutool.sensor.linear_effect import Sensor
 from imutool.sensor.readings import SensorSamples, Vectors
 from imutool.sensor.variables import VARIABLES
+from imutool.units import AXES, Sensor
 
 LAGS_S = (-0.5, -0.2, -0.1, -0.05, 0.0, 0.05, 0.1, 0.2, 0.5)
 KNOTS, FINE_KNOTS = 9, 33
-AXES = ("x", "y", "z")
 SIGNALS: tuple[tuple[Sensor, str], ...] = (("gyro", "rad/s"), ("accel", "m/s²"))
 PLAUSIBLE = {"gyro": 0.1, "accel": 1.0}
 INSIDE = 0.005  # of the values of a variable lie beyond its first knot, and as many beyond its last
