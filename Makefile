@@ -24,7 +24,7 @@ test: lint viewers  ## format, lint, types, then every test with warnings as err
 	@$(BIN)/python -m pytest -n $(WORKERS) --maxprocesses 4 --dist worksteal
 
 viewers: $(READY_TEST)  ## a browser and a software graphics driver for the tests that look, where apt-get may bring them
-	@$(BIN)/python tests/viewers.py
+	@$(BIN)/python tests/support/viewers.py
 
 lint: $(READY_TEST)  ## format, lint and types only
 	@echo "lint: ruff format, ruff check, mypy --strict"

@@ -6,7 +6,6 @@ The installed command, made-up logs and a model trained on them are here too, fo
 from __future__ import annotations
 
 import os
-import runpy
 import signal
 import subprocess
 import sys
@@ -26,6 +25,8 @@ signal.signal(signal.SIGINT, signal.default_int_handler)
 if not os.environ.get("CI"):  # there hypothesis has a profile of its own, which has no deadline and always draws the same
     settings.register_profile("side by side", deadline=None)  # a wall clock says little where tests share the cores
     settings.load_profile("side by side")
+
+sys.path.insert(0, str(Path(__file__).parent))  # for tests/support
 
 install_import_hook(["imutool"], "beartype.beartype").__enter__()
 
@@ -96,14 +97,16 @@ def demonstration(tmp_path_factory: pytest.TempPathFactory, imutool: Callable[..
 @pytest.fixture(scope="session")
 def store_server() -> Iterator[Any]:
     """One S3 server for all tests, since the clients of a process keep the address they first found."""
-    server = runpy.run_path(str(Path(__file__).with_name("object_store.py")))["Store"]()
+    from support.object_store import Store
+
+    server = Store()
     yield server
     server.stop()
 
 
 @pytest.fixture
 def store(store_server: Any, monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
-    """The S3 store of tests/object_store.py with an empty bucket, found by the usual environment."""
+    """The S3 store of tests/support/object_store.py with an empty bucket, found by the usual environment."""
     for name, value in store_server.environment.items():
         monkeypatch.setenv(name, value)
     monkeypatch.setattr("s3fs.S3FileSystem.retries", 2)  # by itself it asks five times, for longer each time
