@@ -17,6 +17,7 @@ import pytest
 from hypothesis import settings
 from jaxtyping import install_import_hook
 
+os.environ["COLUMNS"] = "80"  # the width of the commands' tables, which are made at import
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # as the command does: idle threads must not spin while others test
 
 # a shell starts background jobs with SIGINT ignored, and they pass that on: the tests of Ctrl-C would test nothing
@@ -49,11 +50,18 @@ def command() -> str:
 
 @pytest.fixture(scope="session")
 def imutool(command: str) -> Callable[..., subprocess.CompletedProcess[str]]:
-    """Runs the installed command in a folder of its own and returns what it printed and its exit code."""
+    """Runs the command line in a folder and returns what it printed and its exit code.
 
-    def run(*words: str | Path, cwd: Path, **options: object) -> subprocess.CompletedProcess[str]:
-        line = [command, *map(str, words)]
+    In this process, but for what is about processes: `apart=True`, limits, and fleets, whose workers are processes too.
+    """
+
+    def run(*words: str | Path, cwd: Path, apart: bool = False, **options: object) -> subprocess.CompletedProcess[str]:
+        from support.in_process import run_command
+
         env = {**os.environ, "COLUMNS": "80", **options.pop("env", {})}  # type: ignore[dict-item]
+        line = [command, *map(str, words)]
+        if not (apart or options or words[:1] == ("fleet",) or env["COLUMNS"] != "80"):
+            return run_command(line[1:], cwd, env)
         return subprocess.run(
             line,
             cwd=cwd,
