@@ -16,7 +16,7 @@ from typer.testing import CliRunner, Result
 
 from imutool import diagnosis_output
 from imutool.cli import app
-from imutool.diagnosis import unnamed
+from imutool.diagnosis.estimation import unnamed_effects as unnamed
 from imutool.diagnosis.result import Curve, Diagnosis, Estimate, Finding, HeldOut
 from imutool.diagnosis.to_physics_file import found
 from imutool.diagnosis.wording import conclusion

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from support import planted
 
-from imutool.diagnosis.forward_cache import bound, free
-from imutool.diagnosis.gauss_newton import PATIENCE, PRIOR, Fit, expected, fit
-from imutool.diagnosis.jacobians import Slopes
+from imutool.diagnosis.estimation.forward_cache import bound, free
+from imutool.diagnosis.estimation.gauss_newton import PATIENCE, PRIOR, Fit, expected, fit
+from imutool.diagnosis.estimation.jacobians import Jacobians
 from imutool.sensor import catalogue
 
 SURE = 4.0  # standard deviations: 1 in 16 000 outside
@@ -79,7 +79,7 @@ def test_without_effects_the_bias_is_the_mean_of_what_is_left() -> None:
     left = (pair.real - expected(pair, ()))[pair.fitted]
     np.testing.assert_allclose(got.bias[0], left.mean(axis=0), rtol=1e-4)  # but for a weak prior
     assert got.covariance.shape == (0, 0)
-    assert got.names == ()
+    assert got.keys == ()
 
 
 def test_what_a_planar_motion_does_not_excite_stays_at_nothing_and_says_so() -> None:
@@ -185,11 +185,11 @@ def test_derivatives_that_were_kept_end_where_new_ones_end(monkeypatch: pytest.M
     pair = planted.pair(planted.rich(), {"low_pass": [6.0], "lever_arm": [0.3, -0.2, 0.1]}, 13)
     log, begun = planted.weighed(pair), planted.acting({"low_pass": [15.0], "lever_arm": [0.0] * 3})
     kept = fit([log], begun)
-    monkeypatch.setattr("imutool.diagnosis.gauss_newton.STRAIGHT", 0.0)  # so that every step asks for new ones
-    monkeypatch.setattr(Slopes, "linear", lambda self: None)
+    monkeypatch.setattr("imutool.diagnosis.estimation.gauss_newton.STRAIGHT", 0.0)  # so that every step asks for new ones
+    monkeypatch.setattr(Jacobians, "linear", lambda self: None)
     anew = fit([log], begun)
     for (_, one), (physics, other) in zip(kept.chosen, anew.chosen, strict=True):
-        assert (np.abs(one - other) < SAME * anew.stds()[physics.name]).all()
+        assert (np.abs(one - other) < SAME * anew.stds()[physics.key]).all()
 
 
 def test_a_fit_that_falls_short_of_what_was_hoped_for_goes_no_further() -> None:

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from support import planted
 
-from imutool.diagnosis.alignment import Pair
-from imutool.diagnosis.late_stamps import late_stamps
+from imutool.diagnosis.estimation.alignment import Pair
+from imutool.diagnosis.estimation.late_stamps import late_stamps
 
 FELT = planted.rich()
 INNER = slice(5, -5)

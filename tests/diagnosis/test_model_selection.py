@@ -10,9 +10,10 @@ from scipy.special import gammaincc
 from scipy.stats import chi2
 from support import planted
 
-from imutool.diagnosis import unnamed
-from imutool.diagnosis.alignment import Pair
-from imutool.diagnosis.model_selection import FALSE_DISCOVERY, Discovery, chance, discover
+from imutool.diagnosis.estimation import unnamed_effects as unnamed
+from imutool.diagnosis.estimation.alignment import Pair
+from imutool.diagnosis.estimation.model_selection import FALSE_DISCOVERY, Selection, select_effects
+from imutool.diagnosis.estimation.significance import log_p_value
 
 SURE = 4.0
 DURATION_S = 20.0
@@ -31,37 +32,37 @@ SINGLE = {
 }
 
 
-def asked(pair: Pair, beyond: bool = True) -> Discovery:
+def asked(pair: Pair, beyond: bool = True) -> Selection:
     """The catalogue, then (beyond it) channels, then what has no name."""
     if not beyond:
-        return discover([planted.weighed(pair)], planted.catalogue())
+        return select_effects([planted.weighed(pair)], planted.catalogue())
     like = unnamed.like([pair])
     later = [tuple(unnamed.driven([pair])), (*unnamed.curves(like), *unnamed.terms(like))]
-    return discover([planted.weighed(pair)], planted.catalogue(), later)
+    return select_effects([planted.weighed(pair)], planted.catalogue(), later)
 
 
-def names(found: Discovery) -> list[str]:
-    return [one.physics.name for one in found.judged]
+def names(found: Selection) -> list[str]:
+    return [one.physics.key for one in found.selected]
 
 
-def sure(found: Discovery, name: str, truth: list[float]) -> bool:
-    one = next(one for one in found.judged if one.physics.name == name)
+def sure(found: Selection, name: str, truth: list[float]) -> bool:
+    one = next(one for one in found.selected if one.physics.key == name)
     return bool((np.abs(one.theta - truth) < SURE * one.std).all())
 
 
-# ── chance ──
+# ── log_p_value ──
 
 
 @pytest.mark.parametrize("k", [1, 2, 3, 6, 9])
 def test_chance_is_the_tail_of_chi_square(k: int) -> None:
     for gain in (0.0, 1.0, 10.0, 100.0, 500.0):
-        assert chance(gain, k) == pytest.approx(float(np.log(gammaincc(k / 2.0, gain / 2.0))), rel=1e-9, abs=1e-12)
+        assert log_p_value(gain, k) == pytest.approx(float(np.log(gammaincc(k / 2.0, gain / 2.0))), rel=1e-9, abs=1e-12)
 
 
 @pytest.mark.parametrize("k", [1, 2, 3, 6, 9])
 def test_chance_goes_on_smoothly_where_the_tail_is_less_than_a_number_holds(k: int) -> None:
     gains = np.concatenate([np.arange(500.0, 1600.0, 1.0), np.geomspace(1600.0, 1e8, 200)])
-    log_p = np.array([chance(float(gain), k) for gain in gains])
+    log_p = np.array([log_p_value(float(gain), k) for gain in gains])
     assert np.isfinite(log_p).all()
     assert (np.diff(log_p) < 0).all()
     step = np.diff(log_p[:1100])
@@ -74,17 +75,17 @@ def test_chance_goes_on_smoothly_where_the_tail_is_less_than_a_number_holds(k: i
 
 def test_chance_of_two_parameters_is_known_in_closed_form() -> None:
     for gain in (1.0, 599.0, 601.0, 1e4, 1e7):
-        assert chance(gain, 2) == pytest.approx(-gain / 2.0, rel=1e-12)
+        assert log_p_value(gain, 2) == pytest.approx(-gain / 2.0, rel=1e-12)
 
 
 def test_more_parameters_need_a_larger_gain() -> None:
     for gain in (30.0, 1000.0):
-        log_p = [chance(gain, k) for k in (1, 3, 6, 9)]
+        log_p = [log_p_value(gain, k) for k in (1, 3, 6, 9)]
         assert log_p == sorted(log_p)
 
 
 def test_a_loss_is_no_evidence() -> None:
-    assert chance(-5.0, 3) == 0.0
+    assert log_p_value(-5.0, 3) == 0.0
 
 
 # ── nothing ──
@@ -110,8 +111,8 @@ def test_a_single_effect_is_found_alone_and_by_its_name(name: str) -> None:
     )
     assert names(found) == [name]
     assert sure(found, name, SINGLE[name])
-    assert found.judged[0].false_discovery_rate <= FALSE_DISCOVERY
-    assert found.judged[0].unidentified == ()
+    assert found.selected[0].false_discovery_rate <= FALSE_DISCOVERY
+    assert found.selected[0].unidentified == ()
 
 
 @pytest.mark.parametrize(
@@ -121,7 +122,7 @@ def test_a_pair_is_found_both_by_name(both: tuple[str, str]) -> None:
     planted = {name: SINGLE[name] for name in both}
     found = asked(planted.pair(planted.rich(3, DURATION_S), planted, 3), beyond=False)
     assert sorted(names(found)) == sorted(both)
-    assert found.judged[0].gain >= found.judged[1].gain  # strongest first
+    assert found.selected[0].gain >= found.selected[1].gain  # strongest first
     assert all(sure(found, name, planted[name]) for name in both)
 
 
@@ -129,7 +130,7 @@ def test_two_logs_show_together_what_each_shows_alone() -> None:
     logs = [
         planted.weighed(planted.pair(planted.rich(seed, DURATION_S), {"lever_arm": [0.1, 0.0, 0.05]}, seed)) for seed in (4, 5)
     ]
-    found = discover(logs, planted.catalogue())
+    found = select_effects(logs, planted.catalogue())
     assert names(found) == ["lever_arm"]
     assert found.whole.bias.shape == (2, 6)
 
@@ -137,7 +138,7 @@ def test_two_logs_show_together_what_each_shows_alone() -> None:
 def test_what_the_motion_cannot_show_of_a_found_effect_is_named() -> None:
     found = asked(planted.pair(planted.planar(DURATION_S), {"lever_arm": [0.3, 0.1, 0.0]}, 6), beyond=False)
     assert names(found) == ["lever_arm"]
-    assert found.judged[0].unidentified == ("lever_arm.z",)
+    assert found.selected[0].unidentified == ("lever_arm.z",)
 
 
 # ── by another channel, or by nothing that has a name ──
@@ -175,16 +176,16 @@ def test_a_misfit_without_a_name_gets_none_of_the_catalogues(column: int, seed: 
     added = np.zeros((len(felt.t_s), 6))
     added[:, column] = (0.05 if column < 3 else 0.5) * np.tanh(felt.gyro[:, 2] / 0.4)
     found = asked(planted.pair(felt, None, seed, added=added))
-    assert found.judged
+    assert found.selected
     assert all(name.startswith("unknown:") for name in names(found)), names(found)
     before, after = fit_cost(found)
     assert after < 0.2 * before  # of the squares above the noise
 
 
-def fit_cost(found: Discovery) -> tuple[float, float]:
+def fit_cost(found: Selection) -> tuple[float, float]:
     """Squares above the noise that the effects took, with those that are left; and those that are left."""
     left = max(found.whole.objective - 6.0 * found.whole.rows, 0.0)
-    return left + sum(one.gain for one in found.judged), left
+    return left + sum(one.gain for one in found.selected), left
 
 
 # ── rivals, and what sets in ──
@@ -203,7 +204,7 @@ def test_a_temperature_that_rises_as_the_bias_does_is_named_beside_the_drift() -
         drift, temp = (
             planted.acting({name: size})[0][0] for name, size in (("gyro_bias_drift", [0] * 4), ("temperature", [0] * 6))
         )
-        return {one.physics.name: one.similar for one in discover([planted.weighed(pair)], (drift, temp)).judged}
+        return {one.physics.key: one.similar for one in select_effects([planted.weighed(pair)], (drift, temp)).selected}
 
     (name, rivals), *more = told(rising).items()
     assert {name, *rivals} == {"gyro_bias_drift", "temperature"}
@@ -216,7 +217,7 @@ def test_the_time_of_a_jump_is_found_also_beside_another_effect_and_between_fitt
     pair = planted.pair(planted.rich(3, DURATION_S), {"clock_jump": [t_jump, -0.02], "gyro_scale": [0.02, -0.03, 0.01]}, 3)
     found = asked(pair, beyond=False)
     assert sorted(names(found)) == ["clock_jump", "gyro_scale"]
-    jump = next(one for one in found.judged if one.physics.name == "clock_jump")
+    jump = next(one for one in found.selected if one.physics.key == "clock_jump")
     assert abs(jump.theta[0] - t_jump) < 0.05  # s: five samples, in which it may hardly move
     assert jump.theta[1] == pytest.approx(-0.02, abs=2e-4)
 

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from support import planted
 
-from imutool.diagnosis.gauss_newton import WhitenedLog
-from imutool.diagnosis.observability import ENOUGH, unseen
-from imutool.diagnosis.whitening import Whitener
+from imutool.diagnosis.estimation.gauss_newton import WhitenedLog
+from imutool.diagnosis.estimation.observability import ENOUGH, unobservable
+from imutool.diagnosis.estimation.whitening import Whitener
 
 
 def shown(felt: object, names: list[str] | None = None, *, noise: float = 1.0, known: np.ndarray | None = None) -> set[str]:
@@ -19,7 +19,7 @@ def shown(felt: object, names: list[str] | None = None, *, noise: float = 1.0, k
     white = Whitener(np.ones((6, 1)), noise * planted.NOISE)
     log = WhitenedLog(pair, white if known is None else white.counting(known))
     some = [one for one in planted.catalogue() if names is None or one.name in names]
-    return set(unseen([log], some))
+    return set(unobservable([log], some))
 
 
 def test_a_motion_about_every_axis_shows_every_scale() -> None:

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from support import planted
 
-from imutool.diagnosis import timestamps
-from imutool.diagnosis.gauss_newton import fit
+from imutool.diagnosis.estimation import timestamps
+from imutool.diagnosis.estimation.gauss_newton import fit
 
 N = 2400
 SURE = 4.0

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from support import planted
 
-from imutool.diagnosis import unnamed
-from imutool.diagnosis.gauss_newton import fit
+from imutool.diagnosis.estimation import unnamed_effects as unnamed
+from imutool.diagnosis.estimation.gauss_newton import fit
 from imutool.sensor.effect import Effect
 from imutool.sensor.readings import SensorSamples
 
@@ -17,18 +17,18 @@ CURRENT = np.sin(0.7 * T) + 0.5 * np.cos(1.9 * T)
 
 
 def named(physics: str, among: object) -> Effect:
-    return next(one for one in among if one.name == physics)  # type: ignore[attr-defined]
+    return next(one for one in among if one.key == physics)  # type: ignore[attr-defined]
 
 
 def test_each_channel_may_drive_each_sensor_and_none_that_the_catalogue_names() -> None:
     channels = {"/motor": CURRENT, "/imu0/temperature": 20.0 + T, "/still": np.ones_like(T)}
     pair = planted.pair(planted.rich(channels=channels))
-    assert [one.name for one in unnamed.driven([pair])] == ["driven:/motor:gyro", "driven:/motor:accel"]
+    assert [one.key for one in unnamed.driven([pair])] == ["driven:/motor:gyro", "driven:/motor:accel"]
 
 
 def test_only_channels_of_all_logs_may_drive() -> None:
     pairs = [planted.pair(planted.rich(channels={"/motor": CURRENT, name: CURRENT**2})) for name in ("/one", "/other")]
-    assert {one.name.split(":")[1] for one in unnamed.driven(pairs)} == {"/motor"}
+    assert {one.key.split(":")[1] for one in unnamed.driven(pairs)} == {"/motor"}
 
 
 @pytest.mark.parametrize("sensor", ["gyro", "accel"])
@@ -59,7 +59,7 @@ def test_gain_and_lag_of_a_driver_come_back() -> None:
         fit([planted.weighed(pair)], ((physics, start),), iterations=12) for start in physics.starts(felt, unnamed.like([pair]))
     ]
     best = min(fits, key=lambda one: one.objective)
-    assert (np.abs(best.chosen[0][1] - truth) < SURE * best.stds()[physics.name]).all()
+    assert (np.abs(best.chosen[0][1] - truth) < SURE * best.stds()[physics.key]).all()
 
 
 def test_every_curve_and_term_adds_on_one_axis_in_proportion_to_its_parameters_and_nothing_at_zero() -> None:
@@ -67,14 +67,14 @@ def test_every_curve_and_term_adds_on_one_axis_in_proportion_to_its_parameters_a
     columns = np.concatenate([before.gyro, before.accel], axis=1)
     everything = (*unnamed.curves(before), *unnamed.terms(before))
     assert len(everything) > 500
-    assert len({one.name for one in everything}) == len(everything)
+    assert len({one.key for one in everything}) == len(everything)
     for physics in everything[::7]:  # eighty of them, every axis and kind among them
         theta = np.linspace(0.5, 1.0, len(physics.parameters)) * physics.plausible
         once, twice, none = (physics.forward(before, factor * theta) for factor in (1.0, 2.0, 0.0))
         added, doubled, nothing = (np.concatenate([r.gyro, r.accel], axis=1) - columns for r in (once, twice, none))
         np.testing.assert_allclose(doubled, 2.0 * added, atol=1e-9 * max(1.0, np.abs(added).max()))
         assert not nothing.any()
-        signal, _, rest = physics.name.removeprefix("unknown:").partition(".")
+        signal, _, rest = physics.key.removeprefix("unknown:").partition(".")
         column = {"gyro": 0, "accel": 3}[signal] + "xyz".index(rest[0])
         assert np.flatnonzero(added.any(axis=0)).tolist() == [column]
         assert physics.sensors == (signal,)
@@ -130,8 +130,8 @@ def test_the_coefficient_of_a_term_comes_back(text: str, column: int, size: floa
 
 def test_a_variable_that_never_changes_makes_no_curve_and_no_term() -> None:
     like = unnamed.like([planted.pair(planted.planar())])
-    assert not any("omega_x" in one.name or "f_z" in one.name for one in unnamed.curves(like))
-    assert not any("omega_x" in one.name for one in unnamed.terms(like))
+    assert not any("omega_x" in one.key or "f_z" in one.key for one in unnamed.curves(like))
+    assert not any("omega_x" in one.key for one in unnamed.terms(like))
 
 
 def test_what_is_like_the_first_log_are_its_ideal_signals_at_its_fitted_samples() -> None:
@@ -155,7 +155,7 @@ def test_a_curve_bends_where_the_samples_are() -> None:
     x = np.where(rng.random(4000) < 0.02, 6.0, 0.5) * rng.standard_normal(4000)
     gyro = np.stack([x, np.zeros_like(x), np.zeros_like(x)], axis=1)
     like = SensorSamples(np.arange(len(x)) * 0.01, gyro, np.zeros_like(gyro), np.zeros_like(gyro))
-    curve = next(one for one in unnamed.curves(like) if one.name == "unknown:gyro.z(omega_x)").forward
+    curve = next(one for one in unnamed.curves(like) if one.key == "unknown:gyro.z(omega_x)").forward
     assert isinstance(curve, unnamed.Curve)
     y = np.tanh(x / 0.3)
     basis = curve.basis(x)
@@ -173,7 +173,7 @@ def test_a_curve_follows_the_range_of_a_robot_that_stands_most_of_the_time() -> 
     x = turning + 1e-3 * rng.standard_normal(len(turning))
     gyro = np.stack([x, np.zeros_like(x), np.zeros_like(x)], axis=1)
     like = SensorSamples(np.arange(len(x)) * 0.01, gyro, np.zeros_like(gyro), np.zeros_like(gyro))
-    coarse = next(one for one in unnamed.curves(like) if one.name == "unknown:gyro.x(omega_x)")
+    coarse = next(one for one in unnamed.curves(like) if one.key == "unknown:gyro.x(omega_x)")
     fine = unnamed.finer(coarse, like)
     assert fine is not None
     assert isinstance(fine.forward, unnamed.Curve)

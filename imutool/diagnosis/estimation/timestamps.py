@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float64
 from scipy.ndimage import binary_dilation, median_filter
 from scipy.stats import binom
 
-from imutool.diagnosis.alignment import Pair
+from imutool.diagnosis.estimation.alignment import Pair
 from imutool.diagnosis.result import Estimate, Finding, HeldOut
 from imutool.sensor.effect import Effect, Parameter, Stage, Theta
 from imutool.sensor.readings import IdealMotion, SensorSamples
@@ -174,7 +174,7 @@ def soft_limits(pairs: Sequence[Pair], biases: Sequence[Float64[np.ndarray, "6"]
         unit = UNITS[signal]
         found.append(
             Effect(
-                "saturation" if k == 0 else "saturation accel",
+                "saturation",
                 Stage.CONVERTER,
                 ("gyro",) if k == 0 else ("accel",),
                 f"{signal} = clip({signal}, -L, L)",
@@ -183,6 +183,7 @@ def soft_limits(pairs: Sequence[Pair], biases: Sequence[Float64[np.ndarray, "6"]
                 _Clip(k, bias),
                 linear=False,
                 starts=_Starts(most),
+                variant="" if k == 0 else "accel",
             )
         )
     return tuple(found)
