@@ -1,7 +1,7 @@
 """Prints the test files that a change touches: `python tests/changed.py [BASE]` for `make check`.
 
-A changed test file stands for itself, a changed module `imutool/ROOM/NAME.py` for `tests/ROOM/test_NAME.py`, or for the files
-of `tests/ROOM` that import it where no file has its name. The base is where the branch left `origin/main`, else the last commit.
+A changed test file stands for itself. A changed module `imutool/ROOM/NAME.py` stands for `tests/ROOM/test_NAME.py`, or, where
+no file has that name, for the files of `tests/ROOM` that import it. The base is where the branch left `origin/main`, else HEAD.
 """
 
 from __future__ import annotations

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from filelock import FileLock
 from hypothesis import settings
 from jaxtyping import install_import_hook
 
@@ -77,6 +78,21 @@ def imutool(command: str) -> Callable[..., subprocess.CompletedProcess[str]]:
     return run
 
 
+def made_once(factory: pytest.TempPathFactory, name: str, make: Callable[[Path], None]) -> Path:
+    """A folder that `make` fills once for all workers: who comes second waits and takes it as it is."""
+    if "PYTEST_XDIST_WORKER" not in os.environ:
+        folder = factory.mktemp(name)
+        make(folder)
+        return folder
+    folder = factory.getbasetemp().parent / name
+    with FileLock(f"{folder}.lock"):
+        if not (folder / ".made").exists():
+            folder.mkdir(exist_ok=True)
+            make(folder)
+            (folder / ".made").touch()
+    return folder
+
+
 @pytest.fixture(scope="session")
 def logs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with flight_1.mcap and flight_2.mcap (20 s, 200 Hz, 3 s at rest), linear.safetensors of the first."""
@@ -84,22 +100,25 @@ def logs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     from imutool.sensor.flight import flight
     from imutool.training.run import train
 
-    folder = tmp_path_factory.mktemp("logs")
-    for seed in (1, 2):
-        write(flight(seed, duration_s=20.0), folder / f"flight_{seed}.mcap")
-    train([folder / "flight_1.mcap"], folder / "linear.safetensors", method="linear")
-    return folder
+    def make(folder: Path) -> None:
+        for seed in (1, 2):
+            write(flight(seed, duration_s=20.0), folder / f"flight_{seed}.mcap")
+        train([folder / "flight_1.mcap"], folder / "linear.safetensors", method="linear")
+
+    return made_once(tmp_path_factory, "logs", make)
 
 
 @pytest.fixture(scope="session")
 def demonstration(tmp_path_factory: pytest.TempPathFactory, imutool: Callable[..., subprocess.CompletedProcess[str]]) -> Path:
     """The folder in which `imutool demo -o demo-out` ran (once for all tests: it trains), its report in `report.json`."""
-    folder = tmp_path_factory.mktemp("demo")
-    done = imutool("demo", "-o", "demo-out", "--json", "report.json", cwd=folder)
-    assert done.returncode == 0, done.stderr
-    (folder / "stdout.txt").write_text(done.stdout)
-    (folder / "stderr.txt").write_text(done.stderr)
-    return folder
+
+    def make(folder: Path) -> None:
+        done = imutool("demo", "-o", "demo-out", "--json", "report.json", cwd=folder, apart=True)
+        assert done.returncode == 0, done.stderr
+        (folder / "stdout.txt").write_text(done.stdout)
+        (folder / "stderr.txt").write_text(done.stderr)
+
+    return made_once(tmp_path_factory, "demo", make)
 
 
 @pytest.fixture(scope="session")
