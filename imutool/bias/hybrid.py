@@ -20,12 +20,13 @@ from jaxtyping import Float, Float64
 from torch import Tensor
 
 from imutool.bias import neural_ode
-from imutool.bias.model import COLUMNS, SENSORS, BiasModel, CovarianceModel, OneByOne, Segment, Sensor, Stream, Vector6
+from imutool.bias.model import COLUMNS, BiasModel, CovarianceModel, OneByOne, Segment, Stream, Vector6
 from imutool.config import Settings
 from imutool.errors import ConfigError
 from imutool.sensor.catalogue import named as effects_named
 from imutool.sensor.linear_effect import LinearEffect, Together, compiled, patterns
 from imutool.sensor.signals import POWER_S, SignalFilter, Signals
+from imutool.units import SENSORS, Sensor
 
 FORGOTTEN = 10.0  # time constants after which a filter's start no longer shows
 

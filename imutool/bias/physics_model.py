@@ -24,14 +24,15 @@ from torch import Tensor
 
 from imutool import registry
 from imutool.bias import hybrid
-from imutool.bias.model import COLUMNS, SENSORS, CovarianceModel, OneByOne, Segment, Sensor, Stream, Vector6
+from imutool.bias.model import COLUMNS, CovarianceModel, OneByOne, Segment, Stream, Vector6
 from imutool.errors import ModelError
 from imutool.sensor import catalogue, physics_file
 from imutool.sensor.effect import Effect, Theta
-from imutool.sensor.linear_effect import AXES, LinearEffect, LinearParameter, full, per_pair
+from imutool.sensor.linear_effect import LinearEffect, LinearParameter, full, per_pair
 from imutool.sensor.physics_file import Bias, Entry, PhysicsFile
 from imutool.sensor.readings import SensorSamples
 from imutool.sensor.signals import POWER_S, Signals
+from imutool.units import AXES, SENSORS, Sensor
 
 # How far a bias lies from run to run: of the ADIS16448 in EuRoC's training sequences, 2 mrad/s and 0.02 m/s². Where the file
 # says nothing of the bias: data sheet of a consumer sensor, as in `imutool.bias.static`.

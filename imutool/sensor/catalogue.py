@@ -7,7 +7,8 @@ from collections.abc import Sequence
 from imutool import registry
 from imutool.errors import ConfigError
 from imutool.sensor.effect import Effect
-from imutool.sensor.linear_effect import LinearEffect, Sensor
+from imutool.sensor.linear_effect import LinearEffect
+from imutool.units import Sensor
 
 GROUP = "imutool.effects"
 

@@ -19,15 +19,16 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from enum import IntEnum
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Float64
 
 from imutool.errors import DataError
-from imutool.sensor.linear_effect import AXES, Sensor
 from imutool.sensor.readings import IdealMotion, SensorSamples, Times
+from imutool.units import AXES, Sensor
 
+Kind = Literal["catalogue", "driven", "unknown"]
 Theta = Float64[np.ndarray, "_"]  # effects that act together have numbers of their own, so this length binds no other
 
 
@@ -72,6 +73,8 @@ class Effect:
         finite, and positive where a number is (a limit that is not reached instead of none).
     alternatives: out of how many the starts are the best, given the samples; so many times likelier does chance look like one.
     needs: channels without which it cannot be thought of, such as "temperature"; a channel whose name contains it serves.
+    kind: of the catalogue, driven by the channel `variable`, or unknown: a curve of `variable`, or a term, on one `axis`.
+    variant: tells effects of one name apart.
     """
 
     name: str
@@ -85,6 +88,15 @@ class Effect:
     starts: Callable[[IdealMotion, SensorSamples], Sequence[Theta]] | None = None
     alternatives: Callable[[SensorSamples], int] | None = None
     needs: tuple[str, ...] = ()
+    kind: Kind = "catalogue"
+    variable: str = ""
+    axis: int | None = None
+    variant: str = ""
+
+    @property
+    def key(self) -> str:
+        """Name and variant, which identify an effect among candidates."""
+        return f"{self.name}:{self.variant}" if self.variant else self.name
 
     @property
     def plausible(self) -> Theta:
@@ -184,4 +196,4 @@ def in_stage_order(acting: Acting) -> list[tuple[Effect, Theta]]:
 
 def stage_order(physics: Effect) -> tuple[int, int, str]:
     """By which it is told when an effect acts."""
-    return physics.stage, CONVERTER_ORDER.get(physics.name, 0), physics.name
+    return physics.stage, CONVERTER_ORDER.get(physics.name, 0), physics.key

@@ -9,15 +9,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 from jaxtyping import Float64
 
 from imutool.sensor.signals import COUNT, Signals
+from imutool.units import AXES, Sensor
 
-Sensor = Literal["gyro", "accel"]
-AXES = ("x", "y", "z")
 Three = tuple[float, float, float]
 
 

@@ -6,9 +6,10 @@ import numpy as np
 from jaxtyping import Float64
 
 from imutool.sensor.effect import Effect, Parameter, Stage, Theta, each_axis, misfit
-from imutool.sensor.linear_effect import LinearEffect, Sensor, full, per_axis
+from imutool.sensor.linear_effect import LinearEffect, full, per_axis
 from imutool.sensor.readings import IdealMotion, SensorSamples
 from imutool.sensor.signals import Signals
+from imutool.units import Sensor
 
 TAU_S = 60.0  # of the closed form, which is linear in A alone
 START_TAU_S = (10.0, 30.0, 100.0)

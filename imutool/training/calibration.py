@@ -18,7 +18,6 @@ from jaxtyping import Float
 from scipy.stats import chi2
 from torch import Tensor
 
-from imutool.bias.model import Sensor
 from imutool.sensor.catalogue import known, named
 from imutool.sensor.linear_effect import LinearEffect
 from imutool.sensor.signals import SignalFilter, Signals
@@ -26,6 +25,7 @@ from imutool.training.closed_form import CORRELATED
 from imutool.training.linearised import Seen, linearise
 from imutool.training.normal_equations import Problem
 from imutool.training.segments import Part, Pool
+from imutool.units import Sensor
 
 BY_CHANCE = 0.01  # how often anything may be found where there is nothing
 LEAST_GAIN = 0.03  # of the judged loss, for an effect to be worth its parameters

@@ -16,7 +16,6 @@ import torch
 from jaxtyping import Float, Float64, Int
 from torch import Tensor
 
-from imutool.bias.model import Sensor
 from imutool.errors import DataError
 from imutool.inertial.strapdown import GRAVITY_W
 from imutool.inertial.windows import HUBER_MEDIANS, attitudes, huber_weight, rotation_residual, velocity_residual
@@ -25,6 +24,7 @@ from imutool.sensor.signals import Signals
 from imutool.training.closed_form import CORRELATED, REST_PRIOR, median_per_log
 from imutool.training.normal_equations import Equations, Problem
 from imutool.training.segments import Part, Pool, Windows
+from imutool.units import Sensor
 
 WINDOW_S: Mapping[Sensor, tuple[float, ...]] = {"gyro": (1.0, 4.0, 15.0, 40.0), "accel": (0.5, 2.0, 5.0)}
 JUDGED_FROM_S: Mapping[Sensor, float] = {"gyro": 4.0, "accel": 2.0}  # drift over short windows does not rank calibrations

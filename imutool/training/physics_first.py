@@ -19,7 +19,7 @@ import numpy as np
 import torch
 
 from imutool.bias import hybrid, neural_ode
-from imutool.bias.model import SENSORS, BiasModel, Sensor
+from imutool.bias.model import BiasModel
 from imutool.config import build, plain
 from imutool.errors import ConfigError
 from imutool.recording import Imu, Recording, seconds
@@ -30,6 +30,7 @@ from imutool.training.calibration import Calibration, calibrate
 from imutool.training.fit import Epoch
 from imutool.training.segments import Pool
 from imutool.training.settings import TrainSettings
+from imutool.units import SENSORS, Sensor
 
 LEAST_GAIN = 0.03  # of the held-out error, for an ODE to be worth its weights
 

@@ -11,7 +11,7 @@ import torch
 
 from imutool.bias import hybrid, neural_ode
 from imutool.bias.io import load, save
-from imutool.bias.model import COLUMNS, SENSORS, BiasModel, OneByOne, Segment, Sensor
+from imutool.bias.model import COLUMNS, BiasModel, OneByOne, Segment
 from imutool.bias_start.initial_bias import prior
 from imutool.config import build as build_settings
 from imutool.debiasing import OnlineDebiaser, apply
@@ -20,6 +20,7 @@ from imutool.recording import Imu
 from imutool.sensor.catalogue import known, named
 from imutool.sensor.linear_effect import compiled
 from imutool.sensor.signals import SignalFilter
+from imutool.units import SENSORS, Sensor
 
 MakeModel, MakeSegment = Callable[..., BiasModel], Callable[..., Segment]
 RATE_HZ = 200.0

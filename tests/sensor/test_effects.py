@@ -14,8 +14,9 @@ from imutool.sensor.catalogue import known, named
 from imutool.sensor.effects import rate_curve
 from imutool.sensor.effects.rate_curve import KNOTS_RAD_S, NONZERO, hats
 from imutool.sensor.flight import trajectory
-from imutool.sensor.linear_effect import LinearEffect, Sensor, compiled, patterns
+from imutool.sensor.linear_effect import LinearEffect, compiled, patterns
 from imutool.sensor.signals import ACCEL, ALPHA, COUNT, GYRO, GYRO_SLOW, SignalFilter, Signals
+from imutool.units import Sensor
 
 RATE_HZ = 200.0
 NAMES = [name for name in registry.names("imutool.effects") if hasattr(registry.load("imutool.effects", name), "effect")]

@@ -12,10 +12,11 @@ import torch
 from imutool.errors import ConfigError, DataError
 from imutool.recording import Imu, Poses, Recording, seconds
 from imutool.sensor.catalogue import named
-from imutool.sensor.linear_effect import LinearEffect, Sensor, compiled
+from imutool.sensor.linear_effect import LinearEffect, compiled
 from imutool.sensor.signals import SignalFilter
 from imutool.training.calibration import FOLDS, Calibration, calibrate, folded
 from imutool.training.segments import Pool
+from imutool.units import Sensor
 
 MakeRecording = Callable[..., Recording]
 RATE_HZ = 100.0

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from imutool.sensor import warm_up
-from imutool.sensor.linear_effect import LinearEffect, Sensor
+from imutool.sensor.linear_effect import LinearEffect
+from imutool.units import Sensor
 
 SENSORS: tuple[Sensor, ...] = ("accel",)
 

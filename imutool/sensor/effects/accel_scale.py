@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from imutool.sensor.effect import Effect, Stage, Theta, each_axis
-from imutool.sensor.linear_effect import LinearEffect, Sensor, diagonal, per_axis
+from imutool.sensor.linear_effect import LinearEffect, diagonal, per_axis
 from imutool.sensor.readings import SensorSamples
 from imutool.sensor.signals import ACCEL
+from imutool.units import Sensor
 
 SENSORS: tuple[Sensor, ...] = ("accel",)
 

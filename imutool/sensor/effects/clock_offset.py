@@ -5,9 +5,10 @@ from __future__ import annotations
 import numpy as np
 
 from imutool.sensor.effect import Effect, Parameter, Stage, Theta
-from imutool.sensor.linear_effect import LinearEffect, LinearParameter, Sensor
+from imutool.sensor.linear_effect import LinearEffect, LinearParameter
 from imutool.sensor.readings import IdealMotion, SensorSamples, Times
 from imutool.sensor.signals import ACCEL_DOT, GYRO_DOT
+from imutool.units import Sensor
 
 SENSORS: tuple[Sensor, ...] = ("gyro", "accel")
 

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from imutool.sensor.effect import Effect, Stage, Theta, each_pair
-from imutool.sensor.linear_effect import LinearEffect, Sensor, full, per_pair
+from imutool.sensor.linear_effect import LinearEffect, full, per_pair
 from imutool.sensor.readings import SensorSamples
 from imutool.sensor.signals import ACCEL
+from imutool.units import Sensor
 
 SENSORS: tuple[Sensor, ...] = ("gyro",)
 

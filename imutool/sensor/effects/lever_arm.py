@@ -9,9 +9,10 @@ from jaxtyping import Float64
 
 from imutool.sensor.effect import Effect, Stage, Theta, each_axis
 from imutool.sensor.effects.size_effect import levers
-from imutool.sensor.linear_effect import AtWork, LinearEffect, Sensor, Three, per_axis
+from imutool.sensor.linear_effect import AtWork, LinearEffect, Three, per_axis
 from imutool.sensor.readings import IdealMotion
 from imutool.sensor.signals import ALPHA, GYRO, Signals
+from imutool.units import Sensor
 
 SENSORS: tuple[Sensor, ...] = ("accel",)
 # columns of the terms: alpha_x, alpha_y, alpha_z, then the products of rates

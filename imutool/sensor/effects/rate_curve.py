@@ -12,8 +12,9 @@ from bisect import bisect_right
 import numpy as np
 from jaxtyping import Float64
 
-from imutool.sensor.linear_effect import AXES, AtWork, LinearEffect, LinearParameter, Sensor, Three
+from imutool.sensor.linear_effect import AtWork, LinearEffect, LinearParameter, Three
 from imutool.sensor.signals import GYRO, GYRO_SLOW, Signals
+from imutool.units import AXES, Sensor
 
 SENSORS: tuple[Sensor, ...] = ("gyro",)
 POSITIVE_RAD_S = (0.03, 0.1, 0.25, 0.5, 1.0, 2.0, 4.0)

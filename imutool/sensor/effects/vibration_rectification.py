@@ -10,9 +10,10 @@ import numpy as np
 from jaxtyping import Float64
 
 from imutool.sensor.effect import Effect, Stage, Theta, each_pair
-from imutool.sensor.linear_effect import LinearEffect, Sensor, full, per_pair
+from imutool.sensor.linear_effect import LinearEffect, full, per_pair
 from imutool.sensor.readings import SensorSamples
 from imutool.sensor.signals import POWER_S, SLOW_S, VIBRATION, low_pass
+from imutool.units import Sensor
 
 SENSORS: tuple[Sensor, ...] = ("gyro", "accel")
 PLAUSIBLE = {"gyro": ("rad/s per (m/s²)²", 1e-3), "accel": ("s²/m", 2e-2)}

@@ -8,6 +8,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from imutool.diagnosis.result import Closer, Curve, Diagnosis, Estimate, Finding, HeldOut, Located, Traces, Unexplained
+from imutool.geometry import quaternion
 from imutool.inertial.strapdown import dead_reckon
 from imutool.recording import Imu
 
@@ -30,11 +31,12 @@ def motion(seed: int, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, n
             alpha[:, axis] += 6.28 * f * amplitude * np.cos(6.28 * f * t + phase)
     moving = np.clip((t - 10.0) / 2.0, 0.0, 1.0)[:, None]
     gyro, alpha = gyro * moving, alpha * moving
-    steps = Rotation.from_rotvec(gyro / RATE_HZ)
-    attitude = [Rotation.identity()]
-    for step in steps[:-1]:
-        attitude.append(attitude[-1] * step)
-    R_wb = Rotation.concatenate(attitude)
+    q_wb_wxyz = np.concatenate([[[1.0, 0.0, 0.0, 0.0]], quaternion.exp(gyro[:-1] / RATE_HZ)])
+    shift = 1
+    while shift < count:  # running products in log2(n) passes
+        q_wb_wxyz = np.concatenate([q_wb_wxyz[:shift], quaternion.multiply(q_wb_wxyz[:-shift], q_wb_wxyz[shift:])])
+        shift *= 2
+    R_wb = Rotation.from_quat(quaternion.unit(q_wb_wxyz), scalar_first=True)
     up = R_wb.apply([0.0, 0.0, 9.81], inverse=True)
     accel = up + moving * np.sin(t)[:, None] * rng.normal(0.0, 0.8, 3)
     return gyro, alpha, accel, R_wb.as_quat(scalar_first=True)

@@ -17,8 +17,8 @@ from jaxtyping import Bool, Float64
 from scipy.linalg import solve_triangular
 from scipy.stats import f as fisher
 
-from imutool.diagnosis import gauss_newton as fits
-from imutool.diagnosis.gauss_newton import Fit, WhitenedLog
+from imutool.diagnosis.estimation import gauss_newton as fits
+from imutool.diagnosis.estimation.gauss_newton import Fit, WhitenedLog
 
 BLOCK_S = 5.0
 LEAST_BLOCKS = 6
@@ -82,11 +82,11 @@ def _by_effect(found: Fit, by_blocks: Matrix, by_information: Matrix, shares: Se
         own, seen = by_information[part, part], by_blocks[part, part]
         each = np.array([np.diag(one)[part] for one in shares]) / np.diag(own)
         ratio, blocks = _moderated(np.diag(seen) / np.diag(own), _effective(each), usual)
-        std[physics.name] = stated[physics.name] * np.sqrt(np.maximum(1.0, np.where(_begins(found)[part], 1.0, ratio)))
+        std[physics.key] = stated[physics.key] * np.sqrt(np.maximum(1.0, np.where(_begins(found)[part], 1.0, ratio)))
         mean = np.asarray(np.trace(np.linalg.solve(own, seen)) / len(theta))
         taken = np.array([np.trace(np.linalg.solve(own, one[part, part])) for one in shares])
         ratio, blocks = _moderated(mean, _effective(taken), usual)
-        inflation[physics.name], count[physics.name] = max(1.0, float(ratio)), float(blocks)
+        inflation[physics.key], count[physics.key] = max(1.0, float(ratio)), float(blocks)
     return Scatter(std, inflation, count)
 
 

@@ -21,7 +21,7 @@ SURE = 3.0  # standard deviations of a gain (Bendat and Piersol, Random Data, 4t
 LEAST_HZ = 1.25  # below, nothing would be left to look at
 
 
-def known_below(real: Float64[np.ndarray, "m 6"], left: Float64[np.ndarray, "m 6"], rate_hz: float, most_hz: float) -> float:
+def known_band_hz(real: Float64[np.ndarray, "m 6"], left: Float64[np.ndarray, "m 6"], rate_hz: float, most_hz: float) -> float:
     """The frequency (Hz, up to `most_hz`) below which hardly any of what is expected is an error of the poses.
 
     `left` is what a rich model of the sensor leaves of what is read; what is expected is the rest.

@@ -1,6 +1,6 @@
 """Real viewers without a screen for the tests: Chromium, and Rerun's own viewer on a software Vulkan driver.
 
-python tests/viewers.py    brings what is missing where apt-get may, and says what is missing where it may not
+python tests/support/viewers.py    brings what is missing where apt-get may, and says what is missing where it may not
 """
 
 from __future__ import annotations

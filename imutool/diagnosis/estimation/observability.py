@@ -11,7 +11,7 @@ from collections.abc import Iterator, Mapping, Sequence
 import numpy as np
 from jaxtyping import Float64
 
-from imutool.diagnosis.gauss_newton import WhitenedLog, expected
+from imutool.diagnosis.estimation.gauss_newton import WhitenedLog, expected
 from imutool.sensor.effect import Effect
 
 ENOUGH = 36.0  # squares: six standard deviations, as what is tried some thousand times has to be
@@ -20,7 +20,7 @@ BEHIND: Mapping[str, tuple[str, ...]] = {"clock_offset": ("clock_skew", "clock_j
 """What delays, swings or jumps needs the motion that shows a delay."""
 
 
-def unseen(logs: Sequence[WhitenedLog], candidates: Sequence[Effect]) -> tuple[str, ...]:
+def unobservable(logs: Sequence[WhitenedLog], candidates: Sequence[Effect]) -> tuple[str, ...]:
     """`effect.parameter` of what cannot be seen, and `effect` where that is all of it."""
     out: list[str] = []
     for physics in candidates:

@@ -13,9 +13,9 @@ from jaxtyping import Float64
 from scipy.signal import savgol_filter
 from scipy.stats import norm
 
-from imutool.diagnosis.alignment import Pair
+from imutool.diagnosis.estimation.alignment import Pair
+from imutool.diagnosis.estimation.timestamps import LEAST_JITTER_S, even
 from imutool.diagnosis.result import Estimate, Finding, HeldOut
-from imutool.diagnosis.timestamps import LEAST_JITTER_S, even
 
 AROUND, DEGREE = 15, 3  # samples of a line, and what it may bend
 EVENLY = 5.0  # standard deviations by which samples must be nearer to even than to their stamps

@@ -12,11 +12,11 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float64
 
-from imutool.diagnosis.alignment import Pair
-from imutool.diagnosis.forward_cache import Chosen, Course
-from imutool.diagnosis.gauss_newton import WhitenedLog, expected
-from imutool.diagnosis.known_band import known_below
-from imutool.diagnosis.whitening import Band, Whitener, level, settled, whitener
+from imutool.diagnosis.estimation.alignment import Pair
+from imutool.diagnosis.estimation.forward_cache import Chosen, ForwardPass
+from imutool.diagnosis.estimation.gauss_newton import WhitenedLog, expected
+from imutool.diagnosis.estimation.known_band import known_band_hz
+from imutool.diagnosis.estimation.whitening import Band, Whitener, level, settled, whitener
 from imutool.sensor.effect import Effect, Theta
 from imutool.sensor.readings import SensorSamples
 
@@ -27,7 +27,7 @@ MUCH = 3.0  # times the noise of another axis
 SAME = 1e-3  # of a column, left when those before it are taken out: it says nothing of its own
 
 
-def weighed(pair: Pair, candidates: Sequence[Effect]) -> WhitenedLog:
+def whitened(pair: Pair, candidates: Sequence[Effect]) -> WhitenedLog:
     """The pair with its noise; beside poses also with the band up to which they are seen to know the motion."""
     if pair.against == "simulation":
         return _counting(pair, level(_left(pair, candidates), pair.usable, 1.0 / pair.period_s, ORDER_SIM))
@@ -35,11 +35,11 @@ def weighed(pair: Pair, candidates: Sequence[Effect]) -> WhitenedLog:
     found, left = _in_band(pair, candidates, pair.band_hz)
     assert found.band is not None
     rate_hz = 1.0 / (pair.period_s * found.every)
-    band_hz = known_below(found.band(pair.real), left, rate_hz, pair.band_hz)
+    band_hz = known_band_hz(found.band(pair.real), left, rate_hz, pair.band_hz)
     if band_hz < pair.band_hz:
         pair = pair.within(band_hz)
         found, _ = _in_band(pair, candidates, band_hz)
-    return _counting(pair, alike(found))
+    return _counting(pair, limited_to_quiet_axes(found))
 
 
 def _counting(pair: Pair, white: Whitener) -> WhitenedLog:
@@ -67,7 +67,7 @@ def _in_band(pair: Pair, candidates: Sequence[Effect], band_hz: float) -> tuple[
     return Whitener(found.filters, found.std, band), left
 
 
-def alike(found: Whitener) -> Whitener:
+def limited_to_quiet_axes(found: Whitener) -> Whitener:
     """With no axis much noisier than the quiet ones of its sensor.
 
     Poses err alike in all directions, and a sensor's axes are noisy alike; an axis in which much more is left holds what
@@ -92,7 +92,7 @@ def noise_std(found: Whitener) -> Float64[np.ndarray, "6"]:
 def _left(pair: Pair, candidates: Sequence[Effect]) -> Float64[np.ndarray, "n 6"]:
     """What is left of a simulation's misfit when everything linear has had its way."""
     linear: Chosen = tuple((one, one.null_value.astype(float)) for one in candidates if one.linear)
-    course = Course(pair, linear)
+    course = ForwardPass(pair, linear)
     left: Float64[np.ndarray, "n 6"] = pair.real - course.expected
     columns: list[list[np.ndarray]] = [[np.ones(len(left))] for _ in range(6)]
     for one, _ in linear:
@@ -111,12 +111,12 @@ def _rich(pair: Pair, candidates: Sequence[Effect], band: Band) -> list[Float64[
     """For each axis a constant, and derivatives of everything in the catalogue at the places where fits begin, in a band."""
     samples = SensorSamples(pair.stamp_s, pair.real[:, :3], pair.real[:, 3:], np.zeros((len(pair.real), 3)))
     columns = [[np.ones(len(pair.real))] for _ in range(6)]
-    nothing = Course(pair, ())
+    nothing = ForwardPass(pair, ())
     for physics in candidates:
         starts: Sequence[Theta] = ()
         if physics.starts is not None and not physics.linear:
             starts = physics.starts(pair.felt, samples)
-        courses = [Course(pair, ((physics, np.asarray(start, dtype=float)),), nothing) for start in starts] or [nothing]
+        courses = [ForwardPass(pair, ((physics, np.asarray(start, dtype=float)),), nothing) for start in starts] or [nothing]
         for course in courses:
             for axis, j, row in course.slope(physics):
                 if not physics.parameters[j].begins:

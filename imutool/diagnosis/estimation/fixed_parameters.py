@@ -26,24 +26,24 @@ class FixedParameters:
         return self.physics.forward(signals, every)
 
 
-def only(physics: Effect, free: Sequence[int]) -> Effect:
+def with_free(physics: Effect, free: Sequence[int]) -> Effect:
     """The effect with these of its parameters, by place; itself where they are all."""
     if len(free) == len(physics.parameters):
         return physics
     return replace(physics, parameters=tuple(physics.parameters[k] for k in free), forward=FixedParameters(physics, free))
 
 
-def plausible(physics: Effect, theta: Theta) -> Effect:
+def without_implausible(physics: Effect, theta: Theta) -> Effect:
     """Itself, or without the parameters that came out many times larger than anything met: a fit to noise, not a number."""
-    if not physics.linear or ":" in physics.name:
+    if not physics.linear or physics.kind != "catalogue":
         return physics
     free = [k for k, (n, v) in enumerate(zip(physics.parameters, theta, strict=True)) if abs(v) <= IMPLAUSIBLE * n.plausible]
     if len(free) == len(theta):
         return physics
-    return only(physics, free)
+    return with_free(physics, free)
 
 
-def kept(physics: Effect, held: Effect, theta: Theta) -> Theta:
+def values_of(physics: Effect, held: Effect, theta: Theta) -> Theta:
     """The values of the parameters that are left."""
     names = [number.name for number in held.parameters]
     return np.array([value for number, value in zip(physics.parameters, theta, strict=True) if number.name in names])

@@ -8,9 +8,9 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float64, Int64
 
-from imutool.diagnosis.forward_cache import Course
-from imutool.diagnosis.gauss_newton import Fit, WhitenedLog, direction, priors
-from imutool.diagnosis.jacobians import slope
+from imutool.diagnosis.estimation.forward_cache import ForwardPass
+from imutool.diagnosis.estimation.gauss_newton import Fit, WhitenedLog, direction, priors
+from imutool.diagnosis.estimation.jacobians import effect_jacobian
 from imutool.sensor.effect import Effect, Theta
 
 RIDGE = 1e-9
@@ -31,7 +31,7 @@ class _Axis(NamedTuple):
         return np.asarray(x - (x @ self.bias)[..., None] * self.bias)
 
 
-class Panel:
+class CandidateScore:
     """The normal equations of a fit, with a place left for one more effect."""
 
     def __init__(self, logs: Sequence[WhitenedLog], now: Fit) -> None:
@@ -59,8 +59,8 @@ class Panel:
         N_bb, N_ab, g_b = np.zeros((p, p)), np.zeros((len(self.N), p)), np.zeros(p)
         g_a, total = self.g.copy(), self.total
         for k, (log, course) in enumerate(zip(self.logs, self.now.courses, strict=True)):
-            with_it = course if physics.linear else Course(log.pair, chosen, course)
-            B, added = slope(log.whiten, with_it, physics), with_it.added(course)
+            with_it = course if physics.linear else ForwardPass(log.pair, chosen, course)
+            B, added = effect_jacobian(log.whiten, with_it, physics), with_it.added(course)
             for axis, one in enumerate(self.axes[6 * k : 6 * k + 6]):
                 js, r = np.flatnonzero(B.on[axis] & moves), one.r
                 if axis in added:

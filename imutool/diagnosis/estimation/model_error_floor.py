@@ -15,7 +15,7 @@ EXACT, FILTERED = 1e-5, 1e-3  # of the squares that the largest effect takes: 0.
 LEFT_OUT = {"mount_resonance": 1e-2}  # by models that are known to be simpler than what they stand for
 
 
-def faint(gains: Mapping[str, float], exact: bool) -> frozenset[str]:
+def below_model_error(gains: Mapping[str, float], exact: bool) -> frozenset[str]:
     """Effects that follow the motion, and explain no more than another one's model may be wrong by.
 
     `gains` are the squares that leaving an effect out would cost; `exact`: what was expected holds no noise of a simulation.

@@ -17,10 +17,10 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float64
 
-from imutool.diagnosis.alignment import Pair
-from imutool.diagnosis.forward_cache import Chosen, Course, bound, free
-from imutool.diagnosis.jacobians import Slopes
-from imutool.diagnosis.whitening import Whitener, settled
+from imutool.diagnosis.estimation.alignment import Pair
+from imutool.diagnosis.estimation.forward_cache import Chosen, ForwardPass, bound, free
+from imutool.diagnosis.estimation.jacobians import Jacobians
+from imutool.diagnosis.estimation.whitening import Whitener, settled
 from imutool.sensor.effect import Theta
 
 PRIOR = 3.0
@@ -60,7 +60,7 @@ class WhitenedLog:
         """What a constant on each axis becomes behind the filter."""
         return self.whiten(np.ones_like(self.pair.real))
 
-    def residual(self, course: Course) -> Float64[np.ndarray, "n 6"]:
+    def residual(self, course: ForwardPass) -> Float64[np.ndarray, "n 6"]:
         """White residuals, with the bias."""
         return self.whiten(self.pair.real - course.expected)
 
@@ -80,18 +80,18 @@ class Fit:
     numbers: int
     logs: tuple[WhitenedLog, ...]
     part: str
-    courses: tuple[Course, ...]
+    courses: tuple[ForwardPass, ...]
     prior: Float64[np.ndarray, " p"]
 
     @property
-    def names(self) -> tuple[str, ...]:
-        """The effects."""
-        return tuple(physics.name for physics, _ in self.chosen)
+    def keys(self) -> tuple[str, ...]:
+        """The effects' keys."""
+        return tuple(physics.key for physics, _ in self.chosen)
 
     @cached_property
-    def slopes(self) -> Slopes:
+    def slopes(self) -> Jacobians:
         """Derivatives of the white samples, where the fit ended."""
-        return Slopes([log.whiten for log in self.logs], self.courses, self.chosen)
+        return Jacobians([log.whiten for log in self.logs], self.courses, self.chosen)
 
     @cached_property
     def information(self) -> Float64[np.ndarray, "p p"]:
@@ -112,7 +112,7 @@ class Fit:
         out, first = {}, 0
         for physics, theta in self.chosen:
             std = np.sqrt(np.diag(self.covariance)[first : first + len(theta)])
-            out[physics.name] = np.array(
+            out[physics.key] = np.array(
                 [s * t if n.positive else s for s, t, n in zip(std, theta, physics.parameters, strict=True)]
             )
             first += len(theta)
@@ -121,7 +121,7 @@ class Fit:
 
 def expected(pair: Pair, chosen: Chosen) -> Float64[np.ndarray, "n 6"]:
     """What the sensor would read, without bias."""
-    return Course(pair, chosen).expected
+    return ForwardPass(pair, chosen).expected
 
 
 def priors(chosen: Chosen, begun: Chosen) -> tuple[Float64[np.ndarray, " p"], Float64[np.ndarray, " p"]]:
@@ -152,7 +152,7 @@ def fit(
     masks, whiteners = [log.rows(part) for log in logs], [log.whiten for log in logs]
 
     def tried(chosen: Chosen, like: _State | None) -> _State:
-        courses = [Course(log.pair, chosen, None if like is None else like.courses[k]) for k, log in enumerate(logs)]
+        courses = [ForwardPass(log.pair, chosen, None if like is None else like.courses[k]) for k, log in enumerate(logs)]
         residuals = [log.residual(course) for log, course in zip(logs, courses, strict=True)]
         return _State(chosen, courses, residuals, *_biases(logs, residuals, masks, _penalty(chosen, mean, std)))
 
@@ -162,7 +162,7 @@ def fit(
         before = now.objective
         for moved in _set_in(logs, now, masks):
             now = min(now, tried(moved, now), key=_objective)
-        slopes = Slopes(whiteners, now.courses, now.chosen, known)
+        slopes = Jacobians(whiteners, now.courses, now.chosen, known)
         sizes = (_step(logs, slopes, now, masks, mean, std) * 0.5**back for back in range(BACKTRACKS))
         x = np.concatenate([free(physics, theta) for physics, theta in now.chosen])
         tries = ((step, tried(_moved(now.chosen, x + step), now)) for step in sizes)
@@ -186,7 +186,7 @@ class _State(NamedTuple):
     """How far a fit has come."""
 
     chosen: Chosen
-    courses: list[Course]
+    courses: list[ForwardPass]
     residuals: list[Float64[np.ndarray, "n 6"]]
     bias: Float64[np.ndarray, "logs 6"]
     objective: float
@@ -194,7 +194,7 @@ class _State(NamedTuple):
 
 def _step(
     logs: Sequence[WhitenedLog],
-    slopes: Slopes,
+    slopes: Jacobians,
     now: _State,
     masks: Sequence[Bool[np.ndarray, " n"]],
     mean: Float64[np.ndarray, " p"],
@@ -210,7 +210,7 @@ def _step(
 
 def _straight(
     logs: Sequence[WhitenedLog],
-    slopes: Slopes,
+    slopes: Jacobians,
     before: _State,
     after: _State,
     step: Theta,
@@ -255,7 +255,7 @@ def _set_in(logs: Sequence[WhitenedLog], now: _State, masks: Sequence[Bool[np.nd
                 continue
             at, excess = [], []
             for log, mask, bias, course in zip(logs, masks, now.bias, now.courses, strict=True):
-                courses = (Course(log.pair, _but(chosen, k, j, t), course) for t in (np.inf, -np.inf))
+                courses = (ForwardPass(log.pair, _but(chosen, k, j, t), course) for t in (np.inf, -np.inf))
                 ends = (log.residual(one) - log.constants * bias for one in courses)
                 never, always = ((one[mask] ** 2).sum(1) for one in ends)
                 stamp_s = log.pair.stamp_s
@@ -313,7 +313,7 @@ def _biases(
 
 def _normal(
     logs: Sequence[WhitenedLog],
-    slopes: Slopes,
+    slopes: Jacobians,
     residuals: Sequence[Float64[np.ndarray, "n 6"]],
     b: Float64[np.ndarray, "logs 6"],
     masks: Sequence[Bool[np.ndarray, " n"]],

@@ -12,19 +12,19 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float64, Int64
 
-from imutool.diagnosis.forward_cache import Chosen, Course
-from imutool.diagnosis.whitening import Whitener
+from imutool.diagnosis.estimation.forward_cache import Chosen, ForwardPass
+from imutool.diagnosis.estimation.whitening import Whitener
 from imutool.sensor.effect import Effect, Theta
 
 
-class Slope(NamedTuple):
+class EffectJacobian(NamedTuple):
     """Of one effect on one log, by axis and parameter; `on` says which of them are anything but zero."""
 
     white: Float64[np.ndarray, "6 p n"]
     on: Bool[np.ndarray, "6 p"]
 
 
-def slope(whiten: Whitener, course: Course, physics: Effect) -> Slope:
+def effect_jacobian(whiten: Whitener, course: ForwardPass, physics: Effect) -> EffectJacobian:
     """Of an effect on a course, or of a linear one that is not."""
     shape = 6, len(physics.parameters)
     white, on = np.zeros((*shape, len(range(0, len(course.pair.stamp_s), whiten.every)))), np.zeros(shape, bool)
@@ -32,27 +32,27 @@ def slope(whiten: Whitener, course: Course, physics: Effect) -> Slope:
     if found:
         axes, js = np.array([axis for axis, _, _ in found]), np.array([j for _, j, _ in found])
         white[axes, js], on[axes, js] = whiten.rows(np.stack([row for _, _, row in found]), axes), True
-    return Slope(white, on)
+    return EffectJacobian(white, on)
 
 
-class Slopes:
+class Jacobians:
     """Of effects together; those that are `known` from elsewhere are taken as they are, the very same effect there and here."""
 
     def __init__(
-        self, whiteners: Sequence[Whitener], courses: Sequence[Course], chosen: Chosen, known: Slopes | None = None
+        self, whiteners: Sequence[Whitener], courses: Sequence[ForwardPass], chosen: Chosen, known: Jacobians | None = None
     ) -> None:
-        theirs: dict[int, tuple[Slope, ...]] = {} if known is None else known._by_effect
+        theirs: dict[int, tuple[EffectJacobian, ...]] = {} if known is None else known._by_effect
         self.fresh = not any(id(physics) in theirs for physics, _ in chosen)
         self.chosen = chosen
-        self._by_effect: dict[int, tuple[Slope, ...]] = {}
+        self._by_effect: dict[int, tuple[EffectJacobian, ...]] = {}
         for physics, _ in chosen:
             there = theirs.get(id(physics))
-            mine = (slope(whiten, course, physics) for whiten, course in zip(whiteners, courses, strict=True))
+            mine = (effect_jacobian(whiten, course, physics) for whiten, course in zip(whiteners, courses, strict=True))
             self._by_effect[id(physics)] = tuple(mine) if there is None else there
 
-    def linear(self) -> Slopes:
+    def linear(self) -> Jacobians:
         """Of the linear effects alone, which change least from step to step."""
-        out = Slopes((), (), ())
+        out = Jacobians((), (), ())
         out.chosen = tuple(one for one in self.chosen if one[0].linear)
         out._by_effect = {id(physics): self._by_effect[id(physics)] for physics, _ in out.chosen}
         return out

@@ -15,16 +15,15 @@ import numpy as np
 from jaxtyping import Float64
 from scipy.interpolate import BSpline
 
-from imutool.diagnosis.alignment import Pair
+from imutool.diagnosis.estimation.alignment import Pair
 from imutool.sensor import catalogue
 from imutool.sensor.effect import Effect, Parameter, Stage, Theta
-from imutool.sensor.linear_effect import Sensor
 from imutool.sensor.readings import SensorSamples, Vectors
 from imutool.sensor.variables import VARIABLES
+from imutool.units import AXES, Sensor
 
 LAGS_S = (-0.5, -0.2, -0.1, -0.05, 0.0, 0.05, 0.1, 0.2, 0.5)
 KNOTS, FINE_KNOTS = 9, 33
-AXES = ("x", "y", "z")
 SIGNALS: tuple[tuple[Sensor, str], ...] = (("gyro", "rad/s"), ("accel", "m/s²"))
 PLAUSIBLE = {"gyro": 0.1, "accel": 1.0}
 INSIDE = 0.005  # of the values of a variable lie beyond its first knot, and as many beyond its last
@@ -50,7 +49,7 @@ def driven(pairs: Sequence[Pair]) -> Iterator[Effect]:
                 Parameter("lag", "s", 0.2),
             )
             yield Effect(
-                f"driven:{name}:{signal}",
+                "driven",
                 Stage.SENSOR,
                 (signal,),
                 f"{signal} += gain ({name}(t - lag) - mean)",
@@ -59,6 +58,9 @@ def driven(pairs: Sequence[Pair]) -> Iterator[Effect]:
                 _Driven(name, center, k),
                 linear=False,
                 starts=lambda felt, real: [np.array([0.0, 0.0, 0.0, lag]) for lag in LAGS_S],
+                kind="driven",
+                variable=name,
+                variant=f"{name}:{signal}",
             )
 
 
@@ -112,13 +114,17 @@ def _knots(like: SensorSamples, variable: str, count: int) -> Float64[np.ndarray
 def _curve(variable: str, sensor: int, axis: int, inner: Float64[np.ndarray, " p"]) -> Effect:
     signal, measured_in = SIGNALS[sensor]
     return Effect(
-        f"unknown:{signal}.{AXES[axis]}({variable})",
+        "unknown",
         Stage.SENSOR,
         (signal,),
         f"{signal}.{AXES[axis]} += curve({variable})",
         tuple(Parameter(f"c{j}", measured_in, PLAUSIBLE[signal]) for j in range(len(inner) + 2)),
         f"{variable} varies",
         Curve(variable, sensor, axis, inner),
+        kind="unknown",
+        variable=variable,
+        axis=axis,
+        variant=f"{signal}.{AXES[axis]}({variable})",
     )
 
 
@@ -180,13 +186,17 @@ def terms(like: SensorSamples) -> Iterator[Effect]:
         for k, (signal, measured_in) in enumerate(SIGNALS):
             for axis in range(3):
                 yield Effect(
-                    f"unknown:{signal}.{AXES[axis]}:{text}",
+                    "unknown",
                     Stage.SENSOR,
                     (signal,),
                     f"{signal}.{AXES[axis]} += c {text}",
                     (Parameter("c", f"{measured_in} per unit of {text}", PLAUSIBLE[signal] / size),),
                     f"{text} varies",
                     _Term(term, k, axis),
+                    kind="unknown",
+                    variable=text,
+                    axis=axis,
+                    variant=f"{signal}.{AXES[axis]}:{text}",
                 )
 
 

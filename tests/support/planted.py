@@ -8,10 +8,10 @@ from dataclasses import replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from imutool.diagnosis.alignment import Pair, split
-from imutool.diagnosis.forward_cache import Chosen
-from imutool.diagnosis.gauss_newton import WhitenedLog
-from imutool.diagnosis.whitening import Whitener
+from imutool.diagnosis.estimation.alignment import Pair, split
+from imutool.diagnosis.estimation.forward_cache import Chosen
+from imutool.diagnosis.estimation.gauss_newton import WhitenedLog
+from imutool.diagnosis.estimation.whitening import Whitener
 from imutool.inertial.kinematics import Trajectory
 from imutool.recording import Imu, Poses, Recording
 from imutool.sensor import catalogue as _catalogue

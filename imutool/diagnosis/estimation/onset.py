@@ -7,13 +7,15 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float64
 
-from imutool.diagnosis.forward_cache import Chosen
-from imutool.diagnosis.gauss_newton import Fit, WhitenedLog, fit
+from imutool.diagnosis.estimation.forward_cache import Chosen
+from imutool.diagnosis.estimation.gauss_newton import Fit, WhitenedLog, fit
 
 NEAR_S, MOST_TIMES = 0.4, 41  # around where a fit put it: as far as the filter of a band smears it
 
 
-def onsets(logs: Sequence[WhitenedLog], found: Fit, part: str, inflation: float) -> tuple[Fit, dict[tuple[str, int], float]]:
+def estimate_onsets(
+    logs: Sequence[WhitenedLog], found: Fit, part: str, inflation: float
+) -> tuple[Fit, dict[tuple[str, int], float]]:
     """The fit with each such time at its mean over what the rows leave likely, and the standard deviation of that (s).
 
     A time is as likely as exp(-squares / 2), the squares divided by `inflation` where they are more than noise.
@@ -30,7 +32,7 @@ def onsets(logs: Sequence[WhitenedLog], found: Fit, part: str, inflation: float)
             likely = np.exp(-(squares - squares.min()) / (2.0 * inflation))
             likely /= likely.sum()
             mean = float(likely @ t_s)
-            spread[physics.name, j] = float(np.sqrt(likely @ (t_s - mean) ** 2 + step_s**2 / 12.0))
+            spread[physics.key, j] = float(np.sqrt(likely @ (t_s - mean) ** 2 + step_s**2 / 12.0))
             found = fit(logs, _at(found, k, j, mean), part=part, iterations=0)
     return found, spread
 

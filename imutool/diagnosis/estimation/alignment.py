@@ -112,7 +112,7 @@ def with_simulation(real: Recording, sim: Recording) -> Pair:
     return _pair(real, felt, stamp_s, inside, "simulation", shift_s, noise)
 
 
-def of_one_motion(real: Imu, sim: Imu) -> bool:
+def same_motion(real: Imu, sim: Imu) -> bool:
     """Whether a recording and a simulation turn alike, whatever their clocks say."""
     return _shift(real, sim) is not None
 
@@ -215,7 +215,7 @@ def _simulated(
         return replace(felt, t_s=t_s, channels=_channels(real, t_ns)), np.zeros(6)
     t_s = t_sim[0] + period_s * np.arange(int((t_sim[-1] - t_sim[0]) / period_s) + 1)
     even = np.asarray(make_interp_spline(t_sim, samples, k=3)(t_s))
-    clean = np.stack([wiener(column) for column in even.T], axis=1)
+    clean = np.stack([wiener_filter(column) for column in even.T], axis=1)
     alpha = np.asarray(make_interp_spline(t_s, clean[:, :3], k=5)(t_s, 1))
     t_ns = start_ns + np.round(t_s * 1e9).astype(np.int64)
     R_wb = _attitude(sim, t_ns + round(shift_s * 1e9))
@@ -257,15 +257,15 @@ def _attitude(recording: Recording, t_ns: np.ndarray) -> Float64[np.ndarray, "n 
     if not recording.truths:
         return None
     poses, known = recording.truth.at(t_ns, max_gap_s=1.0)
-    return matrices(poses) if known.mean() > 0.9 else None
+    return rotation_matrices(poses) if known.mean() > 0.9 else None
 
 
-def matrices(poses: Poses) -> Float64[np.ndarray, "n 3 3"]:
+def rotation_matrices(poses: Poses) -> Float64[np.ndarray, "n 3 3"]:
     """R_wb of some poses."""
     return np.asarray(Rotation.from_quat(poses.q_wb_wxyz, scalar_first=True).as_matrix())
 
 
-def wiener(x: Float64[np.ndarray, " n"]) -> Float64[np.ndarray, " n"]:
+def wiener_filter(x: Float64[np.ndarray, " n"]) -> Float64[np.ndarray, " n"]:
     """A signal without the white noise that the top of its spectrum shows: each frequency by 1 - noise / power."""
     n = len(x)
     if nothing_but_noise(x):  # its ends would be taken for a ramp

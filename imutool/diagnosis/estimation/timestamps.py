@@ -9,10 +9,11 @@ from jaxtyping import Bool, Float64
 from scipy.ndimage import binary_dilation, median_filter
 from scipy.stats import binom
 
-from imutool.diagnosis.alignment import Pair
-from imutool.diagnosis.result import UNITS, Estimate, Finding, HeldOut
+from imutool.diagnosis.estimation.alignment import Pair
+from imutool.diagnosis.result import Estimate, Finding, HeldOut
 from imutool.sensor.effect import Effect, Parameter, Stage, Theta
 from imutool.sensor.readings import IdealMotion, SensorSamples
+from imutool.units import ASCII_UNITS, SENSORS, UNITS, Sensor
 
 MEDIAN, FEW = 15, 500  # samples: of a running median, and to find a period by first
 PERIOD_SPAN, PERIODS = 0.02, 201  # periods tried about the median step
@@ -127,7 +128,7 @@ def rounded(pairs: Sequence[Pair], floor: Float64[np.ndarray, "6"]) -> list[Find
     if not lsb:
         return []
     signal = next(iter(lsb)) if len(lsb) == 1 else "both"
-    parameters = {f"{name}_lsb": Estimate(value, 1e-3 * value, UNITS[name].replace("^2", "²")) for name, value in lsb.items()}
+    parameters = {f"{name}_lsb": Estimate(value, 1e-3 * value, UNITS[name]) for name, value in lsb.items()}
     length = sum(float(pair.stamp_s[-1] - pair.stamp_s[0]) for pair in pairs)
     nothing = HeldOut(0.0, 0.0, "-", round(length, 1))
     return [Finding("quantization", signal, 0.0, 0.0, 0.0, parameters, "values are multiples of an LSB", nothing)]
@@ -148,10 +149,10 @@ def grid(x: Float64[np.ndarray, " n"]) -> float:
     return step if float((off < 0.05).mean()) > ON_GRID else 0.0
 
 
-def limits(real: Float64[np.ndarray, "n 6"]) -> dict[str, float]:
+def limits(real: Float64[np.ndarray, "n 6"]) -> dict[Sensor, float]:
     """The largest readings of a sensor that come again and again, to the last digit: where its converter ends."""
-    found = {}
-    for k, signal in enumerate(("gyro", "accel")):
+    found: dict[Sensor, float] = {}
+    for k, signal in enumerate(SENSORS):
         values = np.abs(real[:, 3 * k : 3 * k + 3])
         most = float(values.max())
         below = values[values < most * (1.0 - 1e-9)]
@@ -170,10 +171,10 @@ def soft_limits(pairs: Sequence[Pair], biases: Sequence[Float64[np.ndarray, "6"]
         part = slice(3 * k, 3 * k + 3)
         bias = np.mean([b[part] for b in biases], axis=0)
         most = float(max(np.abs(pair.real[:, part]).max() for pair in pairs))
-        unit = UNITS[signal].replace("^2", "²")
+        unit = UNITS[signal]
         found.append(
             Effect(
-                "saturation" if k == 0 else "saturation accel",
+                "saturation",
                 Stage.CONVERTER,
                 ("gyro",) if k == 0 else ("accel",),
                 f"{signal} = clip({signal}, -L, L)",
@@ -182,6 +183,7 @@ def soft_limits(pairs: Sequence[Pair], biases: Sequence[Float64[np.ndarray, "6"]
                 _Clip(k, bias),
                 linear=False,
                 starts=_Starts(most),
+                variant="" if k == 0 else "accel",
             )
         )
     return tuple(found)
@@ -229,7 +231,7 @@ def saturated(pairs: Sequence[Pair], expected: Sequence[Float64[np.ndarray, "n 6
     told: dict[str, Estimate] = {}
     powers, signal_of, p = [0.0, 0.0, 0.0], "", 1.0
     real, there = (np.concatenate(parts) for parts in ([pair.real for pair in pairs], expected))
-    for k, signal in enumerate(("gyro", "accel")):
+    for k, signal in enumerate(SENSORS):
         most = limits(real).get(signal)
         if most is None:
             continue
@@ -239,16 +241,16 @@ def saturated(pairs: Sequence[Pair], expected: Sequence[Float64[np.ndarray, "n 6
         chance = float(binom.sf(beyond.sum() - 1, len(beyond), 0.5)) * tried
         if chance > 1e-2 and beyond.mean() < 0.9:
             continue
-        told[f"{signal}_limit"] = Estimate(most, EXACT * most, UNITS[signal].replace("^2", "²"))
+        told[f"{signal}_limit"] = Estimate(most, EXACT * most, UNITS[signal])
         before = ((real - there)[:, part] ** 2)[at]
         after = ((real[:, part] - np.clip(there[:, part], -most, most)) ** 2)[at]
         powers, signal_of, p = [float(before.sum()), float(after.sum()), float(at.size)], signal, min(p, chance)
     if not told:
         return []
-    signal = signal_of if len(told) == 1 else "both"
+    seen_in = signal_of if len(told) == 1 else "both"
     length = sum(float(pair.stamp_s[-1] - pair.stamp_s[0]) for pair in pairs)
     held = HeldOut(
-        float(np.sqrt(powers[0] / powers[2])), float(np.sqrt(powers[1] / powers[2])), UNITS[signal_of], round(length, 1)
+        float(np.sqrt(powers[0] / powers[2])), float(np.sqrt(powers[1] / powers[2])), ASCII_UNITS[signal_of], round(length, 1)
     )
     share = float(np.clip(1.0 - powers[1] / max(powers[0], 1e-300), 0.0, 1.0))
-    return [Finding("saturation", signal, share, min(p, 1.0), min(p, 1.0), told, "readings are clipped at +-limit", held)]
+    return [Finding("saturation", seen_in, share, min(p, 1.0), min(p, 1.0), told, "readings are clipped at +-limit", held)]

@@ -11,7 +11,7 @@ from collections.abc import Iterator
 import numpy as np
 from jaxtyping import Float64
 
-from imutool.diagnosis.alignment import Pair
+from imutool.diagnosis.estimation.alignment import Pair
 from imutool.sensor.effect import Effect, Parameter, SignalState, Stage, Theta, in_stage_order, stage_order
 
 STEP, LOG_STEP = 1e-3, 1e-3
@@ -19,10 +19,10 @@ STEP, LOG_STEP = 1e-3, 1e-3
 Chosen = tuple[tuple[Effect, Theta], ...]
 
 
-class Course:
+class ForwardPass:
     """A log's ideal signals on their way to its readings; what is the same as on another course is taken from there."""
 
-    def __init__(self, pair: Pair, chosen: Chosen, like: Course | None = None) -> None:
+    def __init__(self, pair: Pair, chosen: Chosen, like: ForwardPass | None = None) -> None:
         self.pair, self.acting = pair, in_stage_order(chosen)
         same = 0 if like is None else _shared(self.acting, like.acting)
         begun = [SignalState(pair.felt, pair.stamp_s, pair.stamp_s)]
@@ -38,7 +38,7 @@ class Course:
         """What the sensor would read, without bias."""
         return np.concatenate([self.read.gyro, self.read.accel], axis=1)
 
-    def added(self, to: Course) -> dict[int, Float64[np.ndarray, " n"]]:
+    def added(self, to: ForwardPass) -> dict[int, Float64[np.ndarray, " n"]]:
         """What it makes the sensor read more than on another course, by axis; where that is nothing there is no such axis."""
         both = ((0, self.read.gyro, to.read.gyro), (3, self.read.accel, to.read.accel))
         rows = {first + k: row for first, here, there in both if here is not there for k, row in enumerate((here - there).T)}
