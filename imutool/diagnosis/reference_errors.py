@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float64
 from scipy.stats import chi2
 
-from imutool.diagnosis.gauss_newton import WhitenedLog, expected
+from imutool.diagnosis.estimation.gauss_newton import WhitenedLog, expected
 from imutool.diagnosis.result import Estimate, Finding, HeldOut, Located
 from imutool.units import ASCII_UNITS, AXES, SENSORS
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from imutool.diagnosis import timestamps
-from imutool.diagnosis.alignment import Pair
+from imutool.diagnosis.estimation import timestamps
+from imutool.diagnosis.estimation.alignment import Pair
 from imutool.diagnosis.result import Diagnosis, Estimate, Finding, HeldOut
 from imutool.inertial.stationary import white_noise
 from imutool.recording import Recording, seconds

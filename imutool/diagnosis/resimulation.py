@@ -13,8 +13,8 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Float64
 
-from imutool.diagnosis.alignment import Pair
-from imutool.diagnosis.gauss_newton import WhitenedLog, expected
+from imutool.diagnosis.estimation.alignment import Pair
+from imutool.diagnosis.estimation.gauss_newton import WhitenedLog, expected
 from imutool.diagnosis.result import Closer
 from imutool.diagnosis.summarize import closer, floor, with_constant
 from imutool.errors import DataError

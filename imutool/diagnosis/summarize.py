@@ -10,19 +10,20 @@ from jaxtyping import Bool, Float64
 from scipy.stats import f as fisher
 from scipy.stats import ttest_1samp
 
-from imutool.diagnosis import timestamps, unnamed
-from imutool.diagnosis.alignment import LEAST_NOISE, Pair
 from imutool.diagnosis.compare_findings import remarks, shared
-from imutool.diagnosis.forward_cache import Chosen
-from imutool.diagnosis.gauss_newton import Fit, WhitenedLog, expected, fit
-from imutool.diagnosis.late_stamps import late_stamps
+from imutool.diagnosis.estimation import timestamps
+from imutool.diagnosis.estimation import unnamed_effects as unnamed
+from imutool.diagnosis.estimation.alignment import LEAST_NOISE, Pair
+from imutool.diagnosis.estimation.forward_cache import Chosen
+from imutool.diagnosis.estimation.gauss_newton import Fit, WhitenedLog, expected, fit
+from imutool.diagnosis.estimation.late_stamps import late_stamps
+from imutool.diagnosis.estimation.model_selection import SelectedEffect, Selection
+from imutool.diagnosis.estimation.noise_estimate import noise_std
+from imutool.diagnosis.estimation.unnamed_effects import unit
 from imutool.diagnosis.localization import of_findings, of_what_is_left
-from imutool.diagnosis.model_selection import Discovery, Judged
-from imutool.diagnosis.noise_estimate import noise_std
 from imutool.diagnosis.quantity import percent
 from imutool.diagnosis.result import Closer, Curve, Diagnosis, Estimate, Finding, HeldOut, Located, Traces, Unexplained
 from imutool.diagnosis.to_physics_file import found as physics_file
-from imutool.diagnosis.unnamed import unit
 from imutool.inertial.stationary import white_noise
 from imutool.sensor.physics_file import PhysicsFile
 from imutool.units import ASCII_UNITS, AXES, SENSORS, UNITS
@@ -38,7 +39,7 @@ BY_CHANCE = 1e-3  # or more, where so few values are left that noise alone excee
 
 def told(
     logs: Sequence[WhitenedLog],
-    found: Discovery,
+    found: Selection,
     reals: Mapping[str, str],
     sim: str | None,
     known: Sequence[Finding],
@@ -60,14 +61,14 @@ def told(
     if not exact:
         all_found += late_stamps(pairs)
     findings = [one for one in all_found if not shared(one, known)]
-    expected_too = {judged.physics.name for judged, one in zip(found.judged, named, strict=True) if shared(one, known)}
-    before = [_with(pair, tuple(one for one in found.fitted.chosen if one[0].name in expected_too)) for pair in pairs]
+    expected_too = {judged.physics.key for judged, one in zip(found.selected, named, strict=True) if shared(one, known)}
+    before = [_with(pair, tuple(one for one in found.fitted.chosen if one[0].key in expected_too)) for pair in pairs]
     p_values = {
         signal: min((one.p_value for one in findings if one.effect != JITTER and one.signal in (signal, "both")), default=1.0)
         for signal in ("gyro", "accel")
     }
     quiet = expected_too | {JITTER}  # where stamps are wrong, signals are not
-    still = [_with(pair, tuple(one for one in found.fitted.chosen if one[0].name in quiet)) for pair in pairs]
+    still = [_with(pair, tuple(one for one in found.fitted.chosen if one[0].key in quiet)) for pair in pairs]
     unexplained = _unexplained(logs, after, noise)
     if findings:
         places = of_findings(pairs, still, after, noise, findings, p_values)
@@ -96,10 +97,10 @@ def _traces(pair: Pair, before: Float64[np.ndarray, "n 6"], after: Float64[np.nd
     )
 
 
-def without_held_out(logs: Sequence[WhitenedLog], found: Discovery, d: Diagnosis) -> PhysicsFile:
+def without_held_out(logs: Sequence[WhitenedLog], found: Selection, d: Diagnosis) -> PhysicsFile:
     """What was found as physics.toml has it, with the numbers that the fitted time alone says; digits are no motion's."""
-    theta = {physics.name: value for physics, value in found.fitted.chosen}
-    judged = {(_effect(one), one.physics.equation): replace(one, theta=theta[one.physics.name]) for one in found.judged}
+    theta = {physics.key: value for physics, value in found.fitted.chosen}
+    judged = {(one.physics.name, one.physics.equation): replace(one, theta=theta[one.physics.key]) for one in found.selected}
     pairs = [log.pair for log in logs]
 
     def fitted(one: Finding) -> Finding:
@@ -112,31 +113,31 @@ def without_held_out(logs: Sequence[WhitenedLog], found: Discovery, d: Diagnosis
 
 
 def _worthwhile(
-    logs: Sequence[WhitenedLog], found: Discovery, noise: Float64[np.ndarray, "6"]
-) -> tuple[Discovery, list[Finding], list[str]]:
+    logs: Sequence[WhitenedLog], found: Selection, noise: Float64[np.ndarray, "6"]
+) -> tuple[Selection, list[Finding], list[str]]:
     """A discovery without effects that bring nothing on unseen time beside the others, its findings, and those effects."""
-    named, idle = [_finding(logs, found, one, noise) for one in found.judged], []
+    named, idle = [_finding(logs, found, one, noise) for one in found.selected], []
     while any(one.share <= 0.0 for one in named):
         least = min(range(len(named)), key=lambda k: named[k].share)
         idle.append(named[least].effect)
-        name = found.judged[least].physics.name
+        name = found.selected[least].physics.key
         fitted, whole = (
-            fit(logs, tuple(one for one in those.chosen if one[0].name != name), part=those.part, near=those)
+            fit(logs, tuple(one for one in those.chosen if one[0].key != name), part=those.part, near=those)
             for those in (found.fitted, found.whole)
         )
-        theta = {physics.name: value for physics, value in whole.chosen}
-        rest = (one for one in found.judged if one.physics.name != name)
-        judged = tuple(replace(one, theta=theta[one.physics.name]) for one in rest)
-        found = replace(found, judged=judged, fitted=fitted, whole=whole)
-        named = [_finding(logs, found, one, noise) for one in found.judged]
+        theta = {physics.key: value for physics, value in whole.chosen}
+        rest = (one for one in found.selected if one.physics.key != name)
+        selected = tuple(replace(one, theta=theta[one.physics.key]) for one in rest)
+        found = replace(found, selected=selected, fitted=fitted, whole=whole)
+        named = [_finding(logs, found, one, noise) for one in found.selected]
     return found, named, idle
 
 
-def _not_identifiable(found: Discovery, idle: Sequence[str], hidden: Sequence[str]) -> tuple[str, ...]:
+def _not_identifiable(found: Selection, idle: Sequence[str], hidden: Sequence[str]) -> tuple[str, ...]:
     """Of what was found, the numbers that nothing shows; of the rest of the catalogue what could not be seen."""
-    told = [name for one in found.judged for name in one.unidentified if one.physics.name != JITTER]
+    told = [name for one in found.selected for name in one.unidentified if one.physics.name != JITTER]
     told += idle
-    there = {one.physics.name.partition(" ")[0] for one in found.judged}
+    there = {one.physics.name for one in found.selected}
     return tuple(dict.fromkeys([*told, *(name for name in hidden if name.partition(".")[0] not in there)]))
 
 
@@ -216,12 +217,12 @@ def _held_out(
     return HeldOut(rms[0], rms[1], unit_, round(length, 1))
 
 
-def _finding(logs: Sequence[WhitenedLog], found: Discovery, one: Judged, floor: Float64[np.ndarray, "6"]) -> Finding:
+def _finding(logs: Sequence[WhitenedLog], found: Selection, one: SelectedEffect, floor: Float64[np.ndarray, "6"]) -> Finding:
     """One effect: what leaving it out costs on time that its parameters were not fitted to."""
     pairs = [log.pair for log in logs]
     fitted = found.fitted
-    names = [physics.name for physics, _ in fitted.chosen]
-    k = names.index(one.physics.name)
+    names = [physics.key for physics, _ in fitted.chosen]
+    k = names.index(one.physics.key)
     without: Chosen = (*fitted.chosen[:k], *fitted.chosen[k + 1 :])
     with_ = [_with(pair, fitted.chosen) for pair in pairs]
     alone = [_with(pair, without) for pair in pairs]
@@ -240,9 +241,8 @@ def _finding(logs: Sequence[WhitenedLog], found: Discovery, one: Judged, floor: 
     if sum(brought for brought, *_ in shares) <= 0.0:  # what it takes from one sensor it adds to the other
         share = 0.0
     told_signal = signal if len(one.physics.sensors) == 1 else "both"
-    name, _, rest = one.physics.name.partition(":")
     return Finding(
-        effect=_effect(one),
+        effect=one.physics.name,
         signal=told_signal,
         share=share,
         p_value=one.p_value,
@@ -250,18 +250,13 @@ def _finding(logs: Sequence[WhitenedLog], found: Discovery, one: Judged, floor: 
         parameters=_parameters(pairs, one),
         equation=one.physics.equation,
         held_out=held,
-        driver=rest.rpartition(":")[0] if name == "driven" else "",
+        driver=one.physics.variable if one.physics.kind == "driven" else "",
         curve=_curve(logs[0].pair, one, found.whole),
         similar=one.similar,
     )
 
 
-def _effect(one: Judged) -> str:
-    """Its name in the catalogue: `saturation accel` is the accelerometer's, `driven:` and `unknown:` are of something."""
-    return one.physics.name.replace(" accel", "").partition(":")[0]
-
-
-def _parameters(pairs: Sequence[Pair], one: Judged) -> dict[str, Estimate]:
+def _parameters(pairs: Sequence[Pair], one: SelectedEffect) -> dict[str, Estimate]:
     """As they were fitted, but for what stamps and samples show exactly; a curve is told by its values."""
     if isinstance(one.physics.forward, unnamed.Curve):
         return {}
@@ -275,7 +270,7 @@ def _parameters(pairs: Sequence[Pair], one: Judged) -> dict[str, Estimate]:
     }
 
 
-def _curve(pair: Pair, one: Judged, whole: Fit) -> Curve | None:
+def _curve(pair: Pair, one: SelectedEffect, whole: Fit) -> Curve | None:
     """A curve without a name by its values, with what they are sure to."""
     forward = one.physics.forward
     if not isinstance(forward, unnamed.Curve):
@@ -284,7 +279,7 @@ def _curve(pair: Pair, one: Judged, whole: Fit) -> Curve | None:
     basis = forward.basis(x)
     first = 0
     for physics, theta in whole.chosen:
-        if physics.name == one.physics.name:
+        if physics.key == one.physics.key:
             break
         first += len(theta)
     covariance = whole.covariance[first : first + len(one.theta), first : first + len(one.theta)]

@@ -20,7 +20,7 @@ from imutool.units import AXES, Sensor
 
 NO_EFFECT = frozenset({"dropped_samples", "timestamp_jitter", "reference_error"})
 UNKNOWN = "unknown"
-ON_AXIS = re.compile(r"(gyro|accel)\.([xyz]) \+= (?:c (?P<term>.+)|curve\(.+\))")  # how `imutool.diagnosis.unnamed` writes it
+ON_AXIS = re.compile(r"(gyro|accel)\.([xyz]) \+= (?:c (?P<term>.+)|curve\(.+\))")  # as unnamed_effects writes it
 
 
 def found(d: Diagnosis) -> PhysicsFile:

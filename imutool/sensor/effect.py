@@ -19,7 +19,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from enum import IntEnum
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Float64
@@ -29,6 +29,7 @@ from imutool.sensor.samples import IdealMotion, SensorSamples, Times
 from imutool.sensor.signals import Signals
 from imutool.units import AXES, Sensor
 
+Kind = Literal["catalogue", "driven", "unknown"]
 Three = tuple[float, float, float]
 Theta = Float64[np.ndarray, "_"]  # effects that act together have parameters of their own, so this length binds no other
 
@@ -92,6 +93,8 @@ class Effect:
         finite, and positive where a parameter is (a limit that is not reached instead of none).
     alternatives: out of how many the starts are the best, given the samples; so many times likelier does chance look like one.
     needs: channels that it cannot do without, such as "temperature"; a channel whose name contains it serves.
+    kind: of the catalogue, driven by the channel `variable`, or unknown: a curve of `variable`, or a term, on one `axis`.
+    variant: tells effects of one name apart.
     trained: a bias model can have it: its error follows from the sensor's own samples and is linear in all parameters but those
         `fixed_in_training`.
     diagnosed: a diagnosis may find it.
@@ -110,10 +113,19 @@ class Effect:
     starts: Callable[[IdealMotion, SensorSamples], Sequence[Theta]] | None = None
     alternatives: Callable[[SensorSamples], int] | None = None
     needs: tuple[str, ...] = ()
+    kind: Kind = "catalogue"
+    variable: str = ""
+    axis: int | None = None
+    variant: str = ""
     trained: bool = False
     diagnosed: bool = True
     basis: Callable[[Signals], Float64[np.ndarray, "n q"]] | None = None
     fast: Callable[[Theta], CompiledEffect] | None = None
+
+    @property
+    def key(self) -> str:
+        """Name and variant, which identify an effect among candidates."""
+        return f"{self.name}:{self.variant}" if self.variant else self.name
 
     @property
     def plausible(self) -> Theta:
@@ -212,5 +224,5 @@ def in_stage_order(acting: Acting) -> list[tuple[Effect, Theta]]:
 
 
 def stage_order(effect: Effect) -> tuple[int, int, str]:
-    """Sorting key of an effect: its stage, then its place in the converter, then its name."""
-    return effect.stage, CONVERTER_ORDER.get(effect.name, 0), effect.name
+    """Sorting key of an effect: its stage, then its place in the converter, then its key."""
+    return effect.stage, CONVERTER_ORDER.get(effect.name, 0), effect.key
