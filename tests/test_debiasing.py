@@ -251,7 +251,7 @@ def test_what_was_checked_stands_in_the_log_and_in_the_report(source: Path, mode
         assert json.loads(metadata(out)[-1][1]["verified"]) == verified._asdict()
         assert verified.mode == check
         assert (verified.chunks_checked == verified.chunks) == (check == "all")
-    with pytest.raises(ConfigError, match="--verify: 'most'"):
+    with pytest.raises(ConfigError, match="check: 'most'"):
         debias(source, tmp_path / "out.mcap", model=model_file, check="most")
 
 
@@ -370,7 +370,7 @@ def metadata_of(source: Path, tmp_path: Path, model: str | Path) -> dict[str, st
 
 
 def test_smoothing_finds_its_own_start(source: Path, model_file: Path, tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match=r"--smooth: --smooth with --init prior; expected --init auto"):
+    with pytest.raises(ConfigError, match=r"smooth: `smooth` with `init=prior`; expected `init=auto`"):
         debias(source, tmp_path / "out.mcap", model=model_file, init="prior", smooth=True)
     assert not (tmp_path / "out.mcap").exists()
 

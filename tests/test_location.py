@@ -128,7 +128,7 @@ def test_the_command_debiases_and_describes_logs_in_a_store_and_says_nothing_sec
 
 def test_a_key_that_is_taken_is_refused_without_overwrite(store: Any, flight: bytes) -> None:
     source, taken = to_location(store.put("in.mcap", flight)), to_location(store.put("out.mcap", b"precious"))
-    with pytest.raises(ConfigError, match=r"s3://fleet/out.mcap: the target exists.*--overwrite"):
+    with pytest.raises(ConfigError, match=r"s3://fleet/out.mcap: the target exists.*`overwrite=True`"):
         rewrite(source, taken, [], metadata={})
     assert store.get("out.mcap") == b"precious"
     with pytest.raises(ConfigError, match="the target is the source"):

@@ -37,7 +37,7 @@ def check_smooth(init: str, smooth: bool) -> None:
         ConfigError: both are asked for.
     """
     if smooth and init != "auto":
-        raise ConfigError(f"`smooth` with `init` {init}", where="smooth", expected="`init` auto", fix="Give one of the two")
+        raise ConfigError(f"`smooth` with `init={init}`", where="smooth", expected="`init=auto`", fix="Give one of the two")
 
 
 def choose_model_and_start(

@@ -86,7 +86,7 @@ def _best_imu(log: Log) -> str:
     found = derived or [t.name for t in every]
     if len(found) != 1:
         listed = ", ".join(found) or "none"
-        raise LogError(f"IMU topics: {listed}", where=log.path, expected="one", fix="Choose with --imu" if found else "")
+        raise LogError(f"IMU topics: {listed}", where=log.path, expected="one", fix="Choose one with `imu`" if found else "")
     return found[0]
 
 
@@ -145,7 +145,7 @@ class _Asl:
             for t_ns, image in frames.each():
                 ending = next((kind for start, kind in IMAGES.items() if image.startswith(start)), None)
                 if ending is None:
-                    raise LogError(f"the image at {t_ns} ns is neither PNG nor JPEG", where=topic, fix="Use --format rosbag2")
+                    raise LogError(f"the image at {t_ns} ns is neither PNG nor JPEG", where=topic, fix="Use `format=rosbag2`")
                 name = f"{t_ns}{ending}"
                 try:
                     with (images / name).open("xb") as file:

@@ -45,7 +45,7 @@ class ExportFolder:
         if not self.path.exists() and not self.path.is_symlink():
             return
         if not self.overwrite:
-            raise ConfigError("the target exists", where=self.path, fix="Choose another name, or add --overwrite")
+            raise ConfigError("the target exists", where=self.path, fix="Choose another name, or add `overwrite=True`")
         if self.path.is_symlink() or not self.path.is_dir():
             raise ConfigError("the target is no folder", where=self.path, expected="the name of a new folder")
         if self.log.resolve().is_relative_to(self.path.resolve()):

@@ -49,7 +49,7 @@ def _refuse_what_rosbag2_cannot(log: Log) -> None:
             what = (
                 f"{topic.name} is encoded as {topic.message_encoding!r}" if topic.schema_name else f"{topic.name} has no schema"
             )
-            raise LogError(what, where=log.path, expected="CDR messages of ROS 2", fix="Use --format euroc")
+            raise LogError(what, where=log.path, expected="CDR messages of ROS 2", fix="Use `format=euroc`")
 
 
 def _copy(log: Path, copy: Path, tell: Progress) -> None:

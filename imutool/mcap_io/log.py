@@ -15,7 +15,7 @@ from mcap.opcode import Opcode
 from mcap.records import Metadata
 
 from imutool.errors import DataError, LogError
-from imutool.location import Location
+from imutool.location import Location, to_location
 from imutool.mcap_io.blocks import MessageBlock, RecordSpan
 from imutool.mcap_io.codec import messages, records, schemas
 from imutool.mcap_io.codec.decode import decode_image
@@ -39,9 +39,10 @@ class Log:
 
     index: LogIndex
 
-    def __init__(self, path: Location | Source) -> None:
+    def __init__(self, path: str | Location | Source) -> None:
         keep_buffers()
-        self._source = path if isinstance(path, Source) else Source(path)
+        place = to_location(path) if isinstance(path, str) else path
+        self._source = place if isinstance(place, Source) else Source(place)
         self._owns_source, self.path = True, self._source.path
         try:
             with self.named():

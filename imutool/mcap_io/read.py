@@ -103,7 +103,7 @@ def _choose_imu(log: Log, imu: str | None) -> str:
     if not found:
         raise LogError("the log has no IMU topic", where=log.path, expected=f"{schemas.IMU} among {log.listing()}")
     if len(found) > 1:
-        raise LogError(f"the log has {len(found)} IMU topics: {', '.join(found)}", where=log.path, fix="Choose one with --imu")
+        raise LogError(f"the log has {len(found)} IMU topics: {', '.join(found)}", where=log.path, fix="Choose one with `imu`")
     return log.topic(found[0], (schemas.IMU,)).name
 
 

@@ -18,7 +18,7 @@ ENCODINGS = ("cdr", "ros1")
 DERIVED_KEY = "imutool_source_topic"  # channel metadata: computed by imutool from this topic
 MESSAGE_POSES = (schemas.POSE, schemas.ODOMETRY, schemas.TRANSFORM)
 SCALARS = {schemas.FLOAT: 1, schemas.VECTOR3: 3}
-CLEAN_FIX = "See what is wrong with imutool clean LOG, and leave it out when debiasing with `clean`"
+CLEAN_FIX = "See what is wrong with imutool clean LOG, and leave it out with imutool debias --clean"
 
 
 class ImuBatch(NamedTuple):

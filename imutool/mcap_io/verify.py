@@ -40,7 +40,7 @@ def check_mode(mode: str) -> None:
         ConfigError: not one of `MODES`.
     """
     if mode not in MODES:
-        raise ConfigError(f"{mode!r}", where="verify", expected=", ".join(MODES))
+        raise ConfigError(f"{mode!r}", where="check", expected=", ".join(MODES))
 
 
 def verify(

@@ -25,7 +25,7 @@ from imutool.viewing.model.runs import load
 from imutool.viewing.rerun import export, layout, scene
 from imutool.viewing.rerun.entities.palette import RAW_FADE, XYZ, faded
 
-VIEWERS = SimpleNamespace(**runpy.run_path(str(Path(__file__).parents[1] / "viewers.py")))
+VIEWERS = SimpleNamespace(**runpy.run_path(str(Path(__file__).parents[1] / "support" / "viewers.py")))
 
 SIZE = (1280, 720)
 COLORS = 256

@@ -34,8 +34,8 @@ from imutool.viewing.model import run_data, runs
 from imutool.viewing.rerun import layout, scene
 
 TESTS = Path(__file__).parents[1]
-VIEWERS = SimpleNamespace(**runpy.run_path(str(TESTS / "viewers.py")))
-VIEWS = SimpleNamespace(**runpy.run_path(str(TESTS / "viewing" / "rrd.py")))
+VIEWERS = SimpleNamespace(**runpy.run_path(str(TESTS / "support" / "viewers.py")))
+VIEWS = SimpleNamespace(**runpy.run_path(str(TESTS / "support" / "saved_rrd.py")))
 
 RATE_HZ = 200.0
 GIVE_UP_S = 120.0

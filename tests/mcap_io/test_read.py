@@ -324,7 +324,7 @@ def test_a_log_without_imu_lists_its_topics(foreign: Foreign, make: Make) -> Non
 
 def test_several_imus_are_listed(foreign: Foreign, make: Make) -> None:
     path = foreign(imu_messages(make, "/left") + imu_messages(make, "/right"))
-    with pytest.raises(LogError, match=r"2 IMU topics: /left, /right. Choose one with --imu"):
+    with pytest.raises(LogError, match=r"2 IMU topics: /left, /right. Choose one with `imu`"):
         read(path)
     assert read(path, imu="/right").imu_topic == "/right"
 

@@ -69,7 +69,7 @@ def test_a_failure_keeps_the_file_that_was_to_be_replaced(source: Path, folder: 
     target.write_text("precious")
     with pytest.raises(KeyboardInterrupt):
         rewrite(source, target, [Failing(KeyboardInterrupt())], metadata={}, overwrite=True)
-    with pytest.raises(ConfigError, match=r"the target exists.*--overwrite"):
+    with pytest.raises(ConfigError, match=r"the target exists.*`overwrite=True`"):
         rewrite(source, target, [], metadata={})
     assert [path.read_text() for path in folder.iterdir()] == ["precious"]
 

@@ -327,7 +327,7 @@ def test_all_finds_the_damage_that_the_others_pass_on(source: Path, tmp_path: Pa
     with pytest.raises(LogError, match="the chunk at byte"):
         rewrite(source, tmp_path / "all.mcap", [Half("/imu0")], metadata={}, check="all")
     assert not (tmp_path / "all.mcap").exists()
-    with pytest.raises(ConfigError, match="--verify: 'some'; expected all, imu, none"):
+    with pytest.raises(ConfigError, match="check: 'some'; expected all, imu, none"):
         rewrite(source, tmp_path / "some.mcap", [], metadata={}, check="some")
 
 
@@ -426,7 +426,7 @@ def test_in_place_of_a_log_that_grows_is_refused(source: Path, tmp_path: Path) -
 KILLED = """
 import os, signal, sys
 from pathlib import Path
-from imutool.mcap_io import target
+from imutool.mcap_io.storage import target
 from imutool.mcap_io.rewrite import rewrite
 place, count = sys.argv[2], int(sys.argv[3])
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import re
-import runpy
 import sys
 from collections.abc import Iterator
 from dataclasses import replace
@@ -15,6 +14,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from support import diagnoses, markup
 
 from imutool.diagnosis.result import Closer, SignalTraces
 from imutool.diagnosis.wording import conclusion
@@ -24,9 +24,7 @@ from imutool.viewing.html import drawing
 from imutool.viewing.html.diagnosis_page import html, write
 from imutool.viewing.html.page import text
 
-MADE = SimpleNamespace(**runpy.run_path(str(Path(__file__).parents[1] / "diagnosis" / "diagnoses.py")))
-MARKUP = SimpleNamespace(**runpy.run_path(str(Path(__file__).parent / "markup.py")))
-Page, svgs = MARKUP.Page, MARKUP.svgs
+Page, svgs = markup.Page, markup.svgs
 MOST_BYTES = 3_000_000
 # Welch's estimate over 30 s has about 14 independent windows and three axes, and a bin at the top averages many frequencies.
 DENSITY = 0.05
@@ -34,12 +32,12 @@ DENSITY = 0.05
 
 @pytest.fixture(scope="module")
 def three() -> str:
-    return html(MADE.THREE)
+    return html(diagnoses.THREE)
 
 
 @pytest.fixture(scope="module")
 def nothing() -> str:
-    return html(MADE.NOTHING)
+    return html(diagnoses.NOTHING)
 
 
 # ── what it says ──
@@ -47,7 +45,7 @@ def nothing() -> str:
 
 @pytest.mark.parametrize("name", ["NOTHING", "ARM", "LATE", "BOTH", "BY_CURRENT", "NAMELESS", "UNEXPLAINED"])
 def test_the_conclusion_comes_first_and_what_remains_and_the_provenance_after(name: str) -> None:
-    d = replace(getattr(MADE, name), traces=())  # its words alone: figures are looked at below
+    d = replace(getattr(diagnoses, name), traces=())  # its words alone: figures are looked at below
     said = Page(html(d)).text
     places = [said.index(words) for words in (conclusion(d), "What remains", "What this is about", "imutool.diagnosis/1")]
     assert places == sorted(places)
@@ -67,10 +65,10 @@ def test_the_table_holds_effect_signal_equation_value_share_unseen_time_and_chan
 
 
 def test_a_matrix_is_listed_entry_by_entry() -> None:
-    estimate = type(MADE.LAG.parameters["tau"])
+    estimate = type(diagnoses.LAG.parameters["tau"])
     matrix = {a + b: estimate(0.01 * (1 + k), 0.001, "-") for k, (a, b) in enumerate((a, b) for a in "xyz" for b in "xyz")}
-    one = replace(MADE.LEVER_ARM, effect="gyro_misalignment", parameters=matrix)
-    said = Page(html(replace(MADE.ARM, findings=(one,), traces=()))).text
+    one = replace(diagnoses.LEVER_ARM, effect="gyro_misalignment", parameters=matrix)
+    said = Page(html(replace(diagnoses.ARM, findings=(one,), traces=()))).text
     assert "; ".join(f"{key} {1 + k}.00 ± 0.10" for k, key in enumerate(matrix)).replace("; ", " ; ") + " %" in said
 
 
@@ -80,21 +78,21 @@ def test_every_log_has_its_bias_its_samples_and_its_unseen_time(three: str) -> N
     assert "one: 18000 at 200 Hz, 0.0 to 90.0 s, 30 s of it unseen by any fit" in said
     assert "two: 14000 at 200 Hz, 100.0 to 170.0 s, 23 s of it unseen by any fit" in said
     assert "gyro rms 0.02 to 0.0074 rad/s, 63 % closer" in said
-    assert MADE.THREE.remarks[0] in said
+    assert diagnoses.THREE.remarks[0] in said
 
 
 def test_what_was_counted_and_not_fitted_claims_no_gain() -> None:
     steps = replace(
-        MADE.LAG, effect="quantization", share=0.0, held_out=replace(MADE.LAG.held_out, rms_before=0.0, rms_after=0.0)
+        diagnoses.LAG, effect="quantization", share=0.0, held_out=replace(diagnoses.LAG.held_out, rms_before=0.0, rms_after=0.0)
     )
-    said = Page(html(replace(MADE.LATE, findings=(steps,), traces=()))).text
+    said = Page(html(replace(diagnoses.LATE, findings=(steps,), traces=()))).text
     assert "removes 0 %" not in said
     assert "rms 0 to 0" not in said
     assert "it comes in steps of" in said
 
 
 def test_a_curve_is_drawn_for_the_axes_that_have_one() -> None:
-    curve = MADE.UNKNOWN.curve  # x bends, y does nothing but has a band, z bends
+    curve = diagnoses.UNKNOWN.curve  # x bends, y does nothing but has a band, z bends
     only = replace(curve, y=curve.y * [0.0, 0.0, 1.0], band=curve.band * [0.0, 0.0, 1.0])
     titles = {word for word in Page(figures.curve(only, "gyro")).words if word.startswith("gyro")}
     assert titles == {"gyro z"}
@@ -125,15 +123,15 @@ def test_what_a_log_is_called_never_becomes_markup(three: str) -> None:
     page = Page(three)
     assert "img" not in page.tags
     assert page.handlers == []
-    assert MADE.HOSTILE in page.text
-    driver = replace(MADE.DRIVEN, driver=MADE.HOSTILE, equation=MADE.HOSTILE, similar=(MADE.HOSTILE,))
-    place = replace(MADE.FAST, signal=MADE.HOSTILE, regime=MADE.HOSTILE)
-    curve = replace(MADE.UNKNOWN.curve, variable=MADE.HOSTILE, unit=MADE.HOSTILE)
-    nameless = replace(MADE.UNKNOWN, signal=MADE.HOSTILE, curve=curve)
+    assert diagnoses.HOSTILE in page.text
+    driver = replace(diagnoses.DRIVEN, driver=diagnoses.HOSTILE, equation=diagnoses.HOSTILE, similar=(diagnoses.HOSTILE,))
+    place = replace(diagnoses.FAST, signal=diagnoses.HOSTILE, regime=diagnoses.HOSTILE)
+    curve = replace(diagnoses.UNKNOWN.curve, variable=diagnoses.HOSTILE, unit=diagnoses.HOSTILE)
+    nameless = replace(diagnoses.UNKNOWN, signal=diagnoses.HOSTILE, curve=curve)
     hostile = replace(
-        MADE.THREE, sim=MADE.HOSTILE, findings=(driver, nameless), located=(place,), remarks=(MADE.HOSTILE,),
-        not_identifiable=(MADE.HOSTILE,), unexplained={MADE.HOSTILE: MADE.unexplained()["gyro"]}, traces=(),
-        closer={MADE.HOSTILE: Closer.of(MADE.LAG.held_out, 0.001)},
+        diagnoses.THREE, sim=diagnoses.HOSTILE, findings=(driver, nameless), located=(place,), remarks=(diagnoses.HOSTILE,),
+        not_identifiable=(diagnoses.HOSTILE,), unexplained={diagnoses.HOSTILE: diagnoses.unexplained()["gyro"]}, traces=(),
+        closer={diagnoses.HOSTILE: Closer.of(diagnoses.LAG.held_out, 0.001)},
     )  # fmt: skip
     page = Page(html(hostile))
     assert not page.tags & {"img", "script"}
@@ -159,12 +157,12 @@ def test_it_is_drawn_in_the_pages_own_colours_for_light_dark_and_paper(three: st
 
 
 def test_the_same_diagnosis_gives_the_same_page(nothing: str) -> None:
-    assert html(MADE.NOTHING) == nothing
+    assert html(diagnoses.NOTHING) == nothing
 
 
 def test_ten_logs_draw_the_first_four_and_say_so() -> None:
-    many = tuple(MADE.traces(f"log {k}", late=True, seed=k, duration_s=20.0) for k in range(10))
-    d = replace(MADE.LATE, real=("x.mcap",) * 10, bias=np.zeros((10, 6)), traces=many)
+    many = tuple(diagnoses.traces(f"log {k}", late=True, seed=k, duration_s=20.0) for k in range(10))
+    d = replace(diagnoses.LATE, real=("x.mcap",) * 10, bias=np.zeros((10, 6)), traces=many)
     content = html(d)
     assert len(content.encode()) < MOST_BYTES
     assert "The first 4 of 10 logs are drawn" in Page(content).text
@@ -186,14 +184,14 @@ def axes_labels(svg: str) -> str:
 
 
 def test_every_figure_has_labels_with_units() -> None:
-    d = MADE.BOTH
+    d = diagnoses.BOTH
     wanted = {
         figures.where(d, d.traces[0]): ["time (s)", "gyro x", "accel z", "unseen"],
         figures.residual(d.traces[0], found=True): ["time (s)", "x (rad/s)", "z (m/s²)"],
         figures.spectrum(d): ["frequency (Hz)", "density (rad/s/√Hz)", "density (m/s²/√Hz)"],
         figures.against_rate(d): ["rate about y (rad/s)", "turning rate (rad/s)", "mean misfit (m/s²)"],
         figures.against_attitude(d): ["z above the horizon (°)", "mean misfit (rad/s)"],
-        figures.curve(MADE.UNKNOWN.curve, "gyro"): ["angular rate z (rad/s)", "misfit (rad/s)", "gyro z"],
+        figures.curve(diagnoses.UNKNOWN.curve, "gyro"): ["angular rate z (rad/s)", "misfit (rad/s)", "gyro z"],
     }
     for svg, words in wanted.items():
         assert svg is not None
@@ -213,18 +211,18 @@ def changed(d: SimpleNamespace, unseen: bool) -> SimpleNamespace:
 @pytest.mark.parametrize("figure", [figures.spectrum, figures.against_rate, figures.against_attitude])
 def test_spectra_and_means_are_over_unseen_time_alone(figure: object) -> None:
     assert callable(figure)
-    drawn = figure(MADE.LATE)
-    assert figure(changed(MADE.LATE, unseen=False)) == drawn
-    assert figure(changed(MADE.LATE, unseen=True)) != drawn
+    drawn = figure(diagnoses.LATE)
+    assert figure(changed(diagnoses.LATE, unseen=False)) == drawn
+    assert figure(changed(diagnoses.LATE, unseen=True)) != drawn
 
 
 def test_another_signal_is_drawn_as_recorded_and_expected_and_what_is_left() -> None:
     t_s = np.arange(500) / 50.0
     there, held_out = np.sin(t_s), t_s > 5.0
     beside = SignalTraces(t_s, 1.2 * there, there, 1.2 * there, held_out, "m/s")
-    with_it = replace(MADE.BOTH, signals={"/odom.<x>": beside})
+    with_it = replace(diagnoses.BOTH, signals={"/odom.<x>": beside})
     content = html(with_it)
-    assert len(svgs(content)) == len(svgs(html(MADE.BOTH))) + 1
+    assert len(svgs(content)) == len(svgs(html(diagnoses.BOTH))) + 1
     assert "/odom.&lt;x&gt;: over time" in content
     svg = figures.signal(beside, found=True)
     assert "(m/s)" in axes_labels(svg)
@@ -233,9 +231,9 @@ def test_another_signal_is_drawn_as_recorded_and_expected_and_what_is_left() -> 
 
 
 def test_without_attitude_or_a_long_enough_stretch_it_says_so() -> None:
-    (trace,) = MADE.LATE.traces
+    (trace,) = diagnoses.LATE.traces
     held_out = np.arange(len(trace.t_s)) % 100 < 20  # a tenth of a second at a time
-    d = replace(MADE.LATE, traces=(replace(trace, truth=None, held_out=held_out),))
+    d = replace(diagnoses.LATE, traces=(replace(trace, truth=None, held_out=held_out),))
     said = Page(html(d)).text
     assert "No attitude is known" in said
     assert "No unseen stretch is long enough for a spectrum" in said
@@ -243,20 +241,20 @@ def test_without_attitude_or_a_long_enough_stretch_it_says_so() -> None:
 
 
 def test_where_nothing_was_held_out_all_time_is_drawn_and_said() -> None:
-    (trace,) = MADE.LATE.traces
-    d = replace(MADE.LATE, traces=(replace(trace, held_out=np.zeros_like(trace.held_out)),))
+    (trace,) = diagnoses.LATE.traces
+    d = replace(diagnoses.LATE, traces=(replace(trace, held_out=np.zeros_like(trace.held_out)),))
     assert "all time: none was held out" in Page(html(d)).text
 
 
 def test_a_stretch_without_expectation_leaves_a_hole_and_no_error() -> None:
-    (trace,) = MADE.LATE.traces
+    (trace,) = diagnoses.LATE.traces
     before, after = trace.before.copy(), trace.after.copy()
     before[7000:9000] = after[7000:9000] = np.nan
     svg = figures.residual(replace(trace, before=before, after=after), found=True)
     whole = figures.residual(trace, found=True)
     lifted = [len(re.findall(r"\bM ", drawn)) for drawn in (svg, whole)]
     assert lifted[0] == lifted[1] + 12  # the pen, once in each of two lines in six panels
-    d = replace(MADE.LATE, traces=(replace(trace, before=before, after=after),))
+    d = replace(diagnoses.LATE, traces=(replace(trace, before=before, after=after),))
     for drawn in (figures.spectrum(d), figures.against_rate(d), figures.against_attitude(d), figures.where(d, d.traces[0])):
         assert drawn is not None
         assert "nan" not in drawn
@@ -264,7 +262,7 @@ def test_a_stretch_without_expectation_leaves_a_hole_and_no_error() -> None:
 
 def test_located_stretches_shade_the_axes_they_name_alone() -> None:
     def shaded(axes: tuple[str, ...]) -> int:
-        d = replace(MADE.ARM, located=(replace(MADE.FAST, axes=axes),))
+        d = replace(diagnoses.ARM, located=(replace(diagnoses.FAST, axes=axes),))
         return figures.where(d, d.traces[0]).count("var(--mark)")
 
     assert shaded(()) == 0
@@ -272,8 +270,8 @@ def test_located_stretches_shade_the_axes_they_name_alone() -> None:
 
 
 def test_a_place_is_shaded_in_its_own_log_and_in_every_stretch_of_it() -> None:
-    place = replace(MADE.FAST, intervals_s=((80.0, 120.0),))
-    first, second = MADE.traces("a", duration_s=90.0), MADE.traces("a", start_s=100.0, duration_s=90.0)
+    place = replace(diagnoses.FAST, intervals_s=((80.0, 120.0),))
+    first, second = diagnoses.traces("a", duration_s=90.0), diagnoses.traces("a", start_s=100.0, duration_s=90.0)
     assert list(figures.located_in(first, place)) == [(80.0, first.t_s[-1])]
     assert list(figures.located_in(second, place)) == [(100.0, 120.0)]
     of_b = replace(place, log="b.mcap")
@@ -282,7 +280,7 @@ def test_a_place_is_shaded_in_its_own_log_and_in_every_stretch_of_it() -> None:
 
 
 def test_beside_poses_a_misfit_is_drawn_as_far_as_they_know_the_motion() -> None:
-    trace = MADE.traces("a")
+    trace = diagnoses.traces("a")
     assert (figures.known(trace, trace.after) == trace.real - trace.after).all()
     slow = figures.known(replace(trace, band_hz=4.0), trace.after)
     away = slice(100, -100)  # a filter's length from the ends
@@ -307,11 +305,11 @@ def test_a_mask_becomes_stretches_of_time() -> None:
 
 
 def test_white_noise_has_the_density_of_the_dashed_line() -> None:
-    found = figures._density(MADE.NOTHING.traces, slice(0, 3), after=False)
+    found = figures._density(diagnoses.NOTHING.traces, slice(0, 3), after=False)
     assert found is not None
     frequency, density = found
     assert frequency[-1] == pytest.approx(100.0, rel=0.05)
-    wanted = MADE.GYRO_NOISE * np.sqrt(2.0 / MADE.RATE_HZ)
+    wanted = diagnoses.GYRO_NOISE * np.sqrt(2.0 / diagnoses.RATE_HZ)
     assert np.median(density[frequency > 5.0]) == pytest.approx(wanted, rel=DENSITY)
 
 
@@ -332,12 +330,12 @@ def test_means_follow_a_line_and_their_bands_count_blocks_not_samples() -> None:
 
 def test_it_is_written_and_an_existing_page_is_kept(tmp_path: Path, nothing: str) -> None:
     target = tmp_path / "report.html"
-    write(MADE.NOTHING, target)
+    write(diagnoses.NOTHING, target)
     assert target.read_text(encoding="utf-8") == nothing
     with pytest.raises(ConfigError, match="exists"):
-        write(MADE.LATE, target)
+        write(diagnoses.LATE, target)
     assert target.read_text(encoding="utf-8") == nothing
-    write(replace(MADE.LATE, traces=()), target, overwrite=True)
+    write(replace(diagnoses.LATE, traces=()), target, overwrite=True)
     assert target.read_text(encoding="utf-8") != nothing
     assert [path.name for path in tmp_path.iterdir()] == ["report.html"]
 
@@ -353,12 +351,12 @@ def interrupted(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
 
 def test_an_interrupt_leaves_nothing(tmp_path: Path, interrupted: None) -> None:
     with pytest.raises(KeyboardInterrupt):
-        write(replace(MADE.LATE, traces=()), tmp_path / "report.html")
+        write(replace(diagnoses.LATE, traces=()), tmp_path / "report.html")
     assert list(tmp_path.iterdir()) == []
 
 
 def test_a_missing_matplotlib_says_how_to_get_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "matplotlib", None)
     with pytest.raises(ConfigError, match=r"pip install 'imutool\[report\]'"):
-        write(MADE.NOTHING, tmp_path / "report.html")
+        write(diagnoses.NOTHING, tmp_path / "report.html")
     assert list(tmp_path.iterdir()) == []

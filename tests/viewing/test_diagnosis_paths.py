@@ -2,19 +2,16 @@
 
 from __future__ import annotations
 
-import runpy
 from dataclasses import replace
-from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from support import diagnoses
 
 from imutool.diagnosis.result import Traces
 from imutool.recording import Poses
 from imutool.viewing.html.diagnosis_paths import MOST_S, drift, paths, stretches
 
-MADE = SimpleNamespace(**runpy.run_path(str(Path(__file__).parents[1] / "diagnosis" / "diagnoses.py")))
 RATE_HZ, SECONDS = 100.0, 40.0
 TURN_RAD_S, PUSH_M_S2 = 0.01, 0.2  # what is left out of a sensor at rest
 STEP = 2.0 / RATE_HZ  # Euler's rule is half a step late; between two rows of the drift's clock lies another
@@ -54,6 +51,6 @@ def test_a_long_stretch_is_cut_and_a_gap_is_never_crossed() -> None:
 
 
 def test_paths_are_drawn_where_poses_are_known_and_something_was_found() -> None:
-    assert paths(MADE.BOTH) is not None
-    assert paths(replace(MADE.BOTH, findings=())) is None
-    assert paths(replace(MADE.BOTH, traces=tuple(replace(trace, truth=None) for trace in MADE.BOTH.traces))) is None
+    assert paths(diagnoses.BOTH) is not None
+    assert paths(replace(diagnoses.BOTH, findings=())) is None
+    assert paths(replace(diagnoses.BOTH, traces=tuple(replace(trace, truth=None) for trace in diagnoses.BOTH.traces))) is None

@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import os
-import runpy
 import subprocess
 import sys
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -16,13 +14,13 @@ import pyarrow as pa
 import pytest
 import rerun as rr
 from rerun.chunk import RrdReader
+from support import diagnoses
 
 from imutool.diagnosis.wording import conclusion
 from imutool.errors import ConfigError
 from imutool.viewing.rerun import diagnosis as view
 from imutool.viewing.rerun.viewer import binary
 
-MADE = SimpleNamespace(**runpy.run_path(str(Path(__file__).parents[1] / "diagnosis" / "diagnoses.py")))
 AXES = [(signal, axis) for signal in ("gyro", "accel") for axis in "xyz"]
 
 
@@ -68,13 +66,13 @@ def layout(path: Path) -> str:
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("diagnosis")
     for name in ("NOTHING", "BOTH", "THREE"):
-        view.save(getattr(MADE, name), folder / f"{name}.rrd")
+        view.save(getattr(diagnoses, name), folder / f"{name}.rrd")
     return folder
 
 
 @pytest.mark.parametrize("name", ["NOTHING", "BOTH", "THREE"])
 def test_samples_and_what_is_left_read_back_bit_for_bit_with_their_nanoseconds(folder: Path, name: str) -> None:
-    d = getattr(MADE, name)
+    d = getattr(diagnoses, name)
     entities = read(folder / f"{name}.rrd")
     for trace in d.traces:
         root = str(rr.new_entity_path([trace.log]))
@@ -113,8 +111,8 @@ def test_a_state_turns_where_a_located_stretch_begins_and_ends(folder: Path) -> 
 
 
 def test_stretches_that_overlap_are_one(folder: Path) -> None:
-    other = replace(MADE.FAST, intervals_s=((40.0, 50.0), (50.0, 55.0), (70.0, 71.0)), regime="high up")
-    view.save(replace(MADE.ARM, located=(other, MADE.FAST)), folder / "overlap.rrd")
+    other = replace(diagnoses.FAST, intervals_s=((40.0, 50.0), (50.0, 55.0), (70.0, 71.0)), regime="high up")
+    view.save(replace(diagnoses.ARM, located=(other, diagnoses.FAST)), folder / "overlap.rrd")
     entity = read(folder / "overlap.rrd")["/flight/where/accel/x"]
     wanted = [(0.0, "elsewhere"), (12.0, "here"), (55.0, "elsewhere"), (70.0, "here"), (71.0, "elsewhere")]
     assert states(entity) == wanted
@@ -144,10 +142,10 @@ def test_events_stand_where_stretches_begin_and_end(folder: Path) -> None:
 
 def test_located_time_goes_to_the_log_it_lies_in(folder: Path) -> None:
     entities = read(folder / "THREE.rrd")
-    second = replace(MADE.FAST, intervals_s=((110.0, 120.0),))
+    second = replace(diagnoses.FAST, intervals_s=((110.0, 120.0),))
     assert "/one/where/accel/x" in entities
     assert "/two/where/accel/x" not in entities
-    view.save(replace(MADE.THREE, located=(second,)), folder / "second.rrd")
+    view.save(replace(diagnoses.THREE, located=(second,)), folder / "second.rrd")
     entities = read(folder / "second.rrd")
     assert "/one/where/accel/x" not in entities
     assert "/two/where/accel/x" in entities
@@ -155,9 +153,9 @@ def test_located_time_goes_to_the_log_it_lies_in(folder: Path) -> None:
 
 def test_the_report_says_the_conclusion_and_what_a_log_is_called_is_no_markup(folder: Path) -> None:
     (words,) = read(folder / "BOTH.rrd")["/report"].static["TextDocument:text"]
-    assert conclusion(MADE.BOTH).replace("_", "\\_") in words
-    assert MADE.BOTH.remarks[0] in words
-    hostile = replace(MADE.BY_CURRENT, findings=(replace(MADE.DRIVEN, driver="[a](http://b) <i>"),), traces=())
+    assert conclusion(diagnoses.BOTH).replace("_", "\\_") in words
+    assert diagnoses.BOTH.remarks[0] in words
+    hostile = replace(diagnoses.BY_CURRENT, findings=(replace(diagnoses.DRIVEN, driver="[a](http://b) <i>"),), traces=())
     view.save(hostile, folder / "hostile.rrd")
     (words,) = read(folder / "hostile.rrd")["/report"].static["TextDocument:text"]
     assert r"\[a\](http://b) \<i\>" in words
@@ -170,7 +168,7 @@ def test_the_layout_has_a_tab_for_each_log_and_a_panel_for_each_axis(folder: Pat
         "Events", "Report", "elapsed",
     ):  # fmt: skip
         assert f"'{words}'" in said, words
-    assert "'What is left'" not in layout_of(replace(MADE.BOTH, traces=()), folder / "bare.rrd")
+    assert "'What is left'" not in layout_of(replace(diagnoses.BOTH, traces=()), folder / "bare.rrd")
 
 
 def layout_of(d: object, path: Path) -> str:
@@ -179,8 +177,8 @@ def layout_of(d: object, path: Path) -> str:
 
 
 def test_two_logs_of_one_name_stay_apart(folder: Path) -> None:
-    first, second = MADE.traces("log", duration_s=12.0), MADE.traces("log", seed=2, duration_s=12.0)
-    d = replace(MADE.NOTHING, real=("a", "b"), bias=np.zeros((2, 6)), traces=(first, second, replace(first, log="report")))
+    first, second = diagnoses.traces("log", duration_s=12.0), diagnoses.traces("log", seed=2, duration_s=12.0)
+    d = replace(diagnoses.NOTHING, real=("a", "b"), bias=np.zeros((2, 6)), traces=(first, second, replace(first, log="report")))
     assert view.names(d.traces) == ["log", "log (2)", "report (2)"]
     view.save(d, folder / "twice.rrd")
     entities = read(folder / "twice.rrd")
@@ -200,9 +198,9 @@ def test_an_existing_file_is_kept_unless_told_otherwise(tmp_path: Path) -> None:
     target = tmp_path / "view.rrd"
     target.write_bytes(b"mine")
     with pytest.raises(ConfigError, match="exists"):
-        view.save(MADE.NOTHING, target)
+        view.save(diagnoses.NOTHING, target)
     assert target.read_bytes() == b"mine"
-    view.save(MADE.NOTHING, target, overwrite=True)
+    view.save(diagnoses.NOTHING, target, overwrite=True)
     assert "/report" in read(target)
     assert [path.name for path in tmp_path.iterdir()] == ["view.rrd"]
 
@@ -213,14 +211,14 @@ def test_an_interrupt_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyP
 
     monkeypatch.setattr(os, "fsync", fail)
     with pytest.raises(KeyboardInterrupt):
-        view.save(MADE.NOTHING, tmp_path / "view.rrd")
+        view.save(diagnoses.NOTHING, tmp_path / "view.rrd")
     assert list(tmp_path.iterdir()) == []
 
 
 def test_a_missing_rerun_says_how_to_get_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "rerun", None)
     with pytest.raises(ConfigError, match=r"pip install 'imutool\[view\]'"):
-        view.save(MADE.NOTHING, tmp_path / "view.rrd")
+        view.save(diagnoses.NOTHING, tmp_path / "view.rrd")
     assert list(tmp_path.iterdir()) == []
 
 

@@ -3,23 +3,19 @@
 from __future__ import annotations
 
 import re
-import runpy
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
+from support import diagnoses, image_difference, viewers
 
 from imutool.viewing.html import diagnosis_page, report
 from imutool.viewing.model.run_data import build
 
 TESTS = Path(__file__).parents[1]
-VIEWERS = SimpleNamespace(**runpy.run_path(str(TESTS / "viewers.py")))
-APART = SimpleNamespace(**runpy.run_path(str(TESTS / "viewing" / "apart.py")))
-MADE = SimpleNamespace(**runpy.run_path(str(TESTS / "diagnosis" / "diagnoses.py")))
 
 WIDE, NARROW, PAPER = 1280, 400, 794  # CSS pixels; the last is A4 at 96 dots per inch
 HEIGHT = 720
@@ -32,7 +28,7 @@ HOSTILE = "<img src=x onerror=alert(1)>"  # a log may be called anything
 
 @pytest.fixture(scope="module")
 def browser() -> Iterator[Any]:
-    with VIEWERS.chromium() as running:
+    with viewers.chromium() as running:
         yield running
 
 
@@ -40,16 +36,16 @@ def browser() -> Iterator[Any]:
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Each page as NAME.html."""
     folder = tmp_path_factory.mktemp("pages")
-    flights = [APART.recording(seed) for seed in (3, 4)]
+    flights = [image_difference.recording(seed) for seed in (3, 4)]
     hostile = replace(flights[1], name=HOSTILE)
     logs = {
-        "one model": [build(flights[0], APART.runs(flights[0]))],
-        "nothing known": [build(replace(flights[0], truths={}, scalars={}), APART.runs(flights[0], models=0))],
-        "two logs": [build(one, APART.runs(one)) for one in (flights[0], hostile)],
+        "one model": [build(flights[0], image_difference.runs(flights[0]))],
+        "nothing known": [build(replace(flights[0], truths={}, scalars={}), image_difference.runs(flights[0], models=0))],
+        "two logs": [build(one, image_difference.runs(one)) for one in (flights[0], hostile)],
     }
     for name, shown in logs.items():
         report.write_page(shown, folder / f"{name}.html")
-    diagnosis_page.write(MADE.LATE, folder / "diagnosis.html")
+    diagnosis_page.write(diagnoses.LATE, folder / "diagnosis.html")
     return folder
 
 
@@ -125,7 +121,7 @@ def test_its_words_can_be_read_and_every_figure_is_drawn(
         "[...document.querySelectorAll('svg, img')].map(f => f.getBoundingClientRect())"
         ".map(b => [b.x + scrollX, b.y + scrollY, b.width, b.height])"
     )
-    whole = VIEWERS.pixels(one.page.screenshot(full_page=True)).astype(np.int16)
+    whole = viewers.pixels(one.page.screenshot(full_page=True)).astype(np.int16)
     np.testing.assert_array_equal(whole[2, 2], ground)  # it is painted as it says
     assert boxes
     for k, (x, y, width, height) in enumerate(boxes):

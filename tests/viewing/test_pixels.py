@@ -2,47 +2,43 @@
 
 from __future__ import annotations
 
-import runpy
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
+from support import drawn_curves, image_difference, viewers
 
 from imutool.viewing.model.run_data import RunData, build
 from imutool.viewing.rerun import layout, scene
 
 HERE = Path(__file__).parent
-VIEWERS = SimpleNamespace(**runpy.run_path(str(HERE.parent / "viewers.py")))
-CURVES = SimpleNamespace(**runpy.run_path(str(HERE / "curves.py")))
-APART = SimpleNamespace(**runpy.run_path(str(HERE / "apart.py")))
 
 WINDOW, WIDE = (1280, 800), (1600, 1000)  # the second for what lies close together
 INK = 400  # pixels that differ from the ground, the least of a view that says anything
 
 
 def one_model() -> list[RunData]:
-    made = APART.recording()
-    return [build(made, APART.runs(made))]
+    made = image_difference.recording()
+    return [build(made, image_difference.runs(made))]
 
 
 def nothing_known() -> list[RunData]:
     """A log without truth, read as it is."""
-    made = replace(APART.recording(), truths={}, scalars={})
-    return [build(made, APART.runs(made, models=0))]
+    made = replace(image_difference.recording(), truths={}, scalars={})
+    return [build(made, image_difference.runs(made, models=0))]
 
 
 def two_models() -> list[RunData]:
-    made = APART.recording()
-    return [build(made, APART.runs(made, models=2))]
+    made = image_difference.recording()
+    return [build(made, image_difference.runs(made, models=2))]
 
 
 def two_logs() -> list[RunData]:
-    made = [APART.recording(seed) for seed in (3, 4)]
-    return [build(one, APART.runs(one)) for one in made]
+    made = [image_difference.recording(seed) for seed in (3, 4)]
+    return [build(one, image_difference.runs(one)) for one in made]
 
 
 EVERYTHING = None  # tabs
@@ -51,8 +47,8 @@ CASES = {one_model: EVERYTHING, nothing_known: EVERYTHING, two_models: 2, two_lo
 
 def curves_of(case: Callable[[], list[RunData]], folder: Path) -> list[Any]:
     """Every curve that is logged."""
-    path = CURVES.RRD.written(case(), folder / "logged.rrd")
-    found: list[Any] = CURVES.curves(path)
+    path = drawn_curves.RRD.written(case(), folder / "logged.rrd")
+    found: list[Any] = drawn_curves.curves(path)
     return found
 
 
@@ -62,17 +58,17 @@ def drawn(case: Callable[[], list[RunData]], tabs: int | None) -> tuple[list[Any
     blueprint = layout.blueprint(logs)
 
     def look(running: Any) -> dict[Any, np.ndarray]:
-        return CURVES.pictures(running, blueprint, lambda to: scene.log(logs, to), logs[0].duration_s, tabs)
+        return drawn_curves.pictures(running, blueprint, lambda to: scene.log(logs, to), logs[0].duration_s, tabs)
 
-    seen = VIEWERS.seen(look, WINDOW if tabs is EVERYTHING else WIDE)
-    return [view for view in CURVES.RRD.views(blueprint) if view.id in seen], seen
+    seen = viewers.seen(look, WINDOW if tabs is EVERYTHING else WIDE)
+    return [view for view in drawn_curves.RRD.views(blueprint) if view.id in seen], seen
 
 
 @pytest.mark.parametrize("case", CASES, ids=lambda case: case.__name__)
 def test_every_view_draws_every_curve_it_holds(case: Callable[[], list[RunData]], tmp_path: Path) -> None:
     curves = curves_of(case, tmp_path)
     views, seen = drawn(case, CASES[case])
-    assert [fault for view in views for fault in CURVES.unseen(view, seen[view.id], curves)] == []
+    assert [fault for view in views for fault in drawn_curves.unseen(view, seen[view.id], curves)] == []
     assert [view.name for view in views if ink(seen[view.id]) < INK] == []
 
 

@@ -3,20 +3,19 @@
 from __future__ import annotations
 
 import re
-import runpy
 import struct
 import subprocess
 import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 from unittest import mock
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from support import markup
 
 from imutool.errors import ConfigError
 from imutool.recording import Imu, Poses, Recording
@@ -28,8 +27,7 @@ from imutool.viewing.model.events import Event
 from imutool.viewing.model.run_data import Run, RunData, Trace, build
 from imutool.viewing.model.trajectory_error import Drift, Errors, Window
 
-MARKUP = SimpleNamespace(**runpy.run_path(str(Path(__file__).parent / "markup.py")))
-Page, svgs, curves = MARKUP.Page, MARKUP.svgs, MARKUP.curves
+Page, svgs, curves = markup.Page, markup.svgs, markup.curves
 SECONDS, STILL_S = 20.0, 6.0  # of a flight, and of its rest before that
 HOUR = 720_000  # samples at 200 Hz
 MOST_BYTES, MOST_BYTES_OF_AN_HOUR = 1_500_000, 6_000_000

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import http.server
 import os
-import runpy
 import shutil
 import signal
 import subprocess
@@ -13,14 +12,12 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import pytest
+from support import viewers
 
 from imutool.viewing.rerun.entities.palette import XYZ
-
-VIEWERS = SimpleNamespace(**runpy.run_path(str(Path(__file__).parents[1] / "viewers.py")))
 
 SIZE = {"width": 800, "height": 500}  # software draws it
 LEAST = 200  # pixels of a colour; a legend alone has some fifty
@@ -50,7 +47,7 @@ def served(folder: Path) -> Iterator[str]:
 
 @pytest.fixture(scope="module")
 def browser() -> Iterator[Any]:
-    with VIEWERS.chromium() as running:
+    with viewers.chromium() as running:
         yield running
 
 
@@ -78,7 +75,7 @@ class Visit:
 
     def picture(self, enough: Callable[[Any], bool]) -> Any:
         """The page when it shows enough and stands still."""
-        return VIEWERS.steady(self.page.screenshot, enough, WAITS_S)
+        return viewers.steady(self.page.screenshot, enough, WAITS_S)
 
     def __enter__(self) -> Visit:
         return self
@@ -89,12 +86,12 @@ class Visit:
 
 def draws(picture: Any) -> bool:
     """Whether all three axes are there."""
-    return all(VIEWERS.drawn(picture, color) >= LEAST for color in XYZ)
+    return all(viewers.drawn(picture, color) >= LEAST for color in XYZ)
 
 
 def is_up(picture: Any) -> bool:
     """Whether the viewer itself is there: its bar warns in orange of the software it draws with."""
-    return VIEWERS.saturated(picture[:30]) > 20
+    return viewers.saturated(picture[:30]) > 20
 
 
 def test_the_exported_folder_draws_the_log_and_no_request_leaves_it(browser: Any, exported: Path) -> None:
@@ -106,7 +103,7 @@ def test_the_exported_folder_draws_the_log_and_no_request_leaves_it(browser: Any
 
 
 def test_the_page_of_web_draws_the_log_and_asks_this_machine_alone(browser: Any, logs: Path, command: str) -> None:
-    port = VIEWERS.free_port()
+    port = viewers.free_port()
     line = [command, "view", str(logs / "flight_1.mcap"), "--web", "--port", str(port), "--at", AT_S]
     server = subprocess.Popen(
         line, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True, env={**os.environ, "COLUMNS": "200"}

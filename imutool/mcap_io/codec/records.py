@@ -185,7 +185,7 @@ def pack(compression: str) -> Callable[[bytes], bytes]:
         return lambda data: bytes(lz4.frame.compress(data, block_linked=False))
     if name == "":
         return lambda data: data
-    raise ConfigError(f"{compression!r} is no compression", where="--compression", expected=", ".join(COMPRESSIONS))
+    raise ConfigError(f"unknown compression {compression!r}", where="compression", expected=", ".join(COMPRESSIONS))
 
 
 def chunk_head(data: bytes, packed: bytes, compression: str, start_ns: int, end_ns: int) -> bytes:

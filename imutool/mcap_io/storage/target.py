@@ -76,7 +76,7 @@ class Target:
         if self.path.is_dir():
             raise ConfigError("the target is a folder", where=self.path, expected="the name of a file")
         if self.path.exists() and not self.overwrite:
-            raise ConfigError("the target exists", where=self.path, fix="Choose another name, or add --overwrite")
+            raise ConfigError("the target exists", where=self.path, fix="Choose another name, or add `overwrite=True`")
 
     @contextmanager
     def _told(self) -> Iterator[None]:

@@ -13,11 +13,12 @@ from jaxtyping import Bool, Float64
 from scipy.signal import fftconvolve, welch
 from scipy.spatial.transform import Rotation
 
+from imutool.diagnosis.estimation.whitening import Band
 from imutool.diagnosis.result import Curve, Diagnosis, Located, SignalTraces, Traces
-from imutool.diagnosis.whitening import Band
 from imutool.diagnosis.wording import signals
+from imutool.units import AXES, UNITS
 from imutool.viewing.html.drawing import Line, Thin, averaged, extremes, plain_numbers, spans, svg
-from imutool.viewing.html.theme import AFTER, AXES, BEFORE, HELD, INK, MARK, TITLES, UNITS
+from imutool.viewing.html.theme import AFTER, BEFORE, HELD, INK, MARK, TITLES
 
 SIGNALS = {"gyro": slice(0, 3), "accel": slice(3, 6)}
 

@@ -13,10 +13,11 @@ from jaxtyping import Float64
 from imutool.inertial import stationary
 from imutool.noise import allan
 from imutool.recording import Imu
+from imutool.units import AXES, UNITS
 from imutool.viewing.html.drawing import Panel, Picture, averaged, extremes, legend, plain_numbers
 from imutool.viewing.html.report_paths import color_of
 from imutool.viewing.html.report_wording import best, number, spoken, worst
-from imutool.viewing.html.theme import AXES, AXIS_COLORS, INK, TITLES, UNITS
+from imutool.viewing.html.theme import AXIS_COLORS, INK, TITLES
 from imutool.viewing.model.run_data import RunData, Trace
 
 SENSORS = ("gyro", "accel")

@@ -14,9 +14,10 @@ from jaxtyping import Float64
 from imutool.diagnosis.result import Diagnosis, Located, Traces
 from imutool.diagnosis.wording import lines, where
 from imutool.mcap_io.storage.target import Target
+from imutool.units import AXES, UNITS
 from imutool.viewing.html.diagnosis_figures import located_in
 from imutool.viewing.html.drawing import spans
-from imutool.viewing.rerun.entities.palette import AXES, BOLD_WIDTH, GREY, MODEL_COLORS, RAW_COLOR, RAW_WIDTH
+from imutool.viewing.rerun.entities.palette import BOLD_WIDTH, GREY, MODEL_COLORS, RAW_COLOR, RAW_WIDTH
 from imutool.viewing.rerun.sdk import FLUSH_S, entity_path, need_sdk
 
 if TYPE_CHECKING:
@@ -24,7 +25,6 @@ if TYPE_CHECKING:
     import rerun.blueprint as rrb
 
 TITLES = {"gyro": "Angular rate", "accel": "Specific force"}
-UNITS = {"gyro": "rad/s", "accel": "m/s²"}
 LINES = ("real", "before", "after")  # in this order in every `samples`; `left` holds real minus the other two
 INSIDE, OUTSIDE = "here", "elsewhere"
 MARK_COLOR, HELD_COLOR = (230, 167, 0), (122, 122, 122)

@@ -7,13 +7,14 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from imutool.units import AXES, UNITS
 from imutool.viewing.model.run_data import RunData, Trace
 from imutool.viewing.model.trajectory_error import Drift, Errors
 from imutool.viewing.rerun import source
 from imutool.viewing.rerun.entities import errors, events, signals, spectrum
 from imutool.viewing.rerun.entities import names as entities
 from imutool.viewing.rerun.entities.names import Scope
-from imutool.viewing.rerun.entities.palette import AXES, GROUND, color_name, color_of
+from imutool.viewing.rerun.entities.palette import GROUND, color_name, color_of
 from imutool.viewing.rerun.entities.plots import both_ways, limit, plot, upwards, whole
 
 if TYPE_CHECKING:
@@ -108,7 +109,7 @@ def _bias_of(data: RunData, scope: Scope, kind: str, axis: int) -> rrb.TimeSerie
         words.insert(1, f"±{signals.SIGMAS:g}σ thin")
     key = ", ".join([*words, *([_colors(data, data.models())] if several else [])])
     return plot(
-        list(overrides), f"{AXES[axis]} ({signals.UNITS[kind]})", key, height=_bias_range(data, kind, axis), overrides=overrides
+        list(overrides), f"{AXES[axis]} ({UNITS[kind]})", key, height=_bias_range(data, kind, axis), overrides=overrides
     )
 
 

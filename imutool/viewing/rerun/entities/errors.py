@@ -6,13 +6,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from imutool.units import AXES
 from imutool.viewing.model.run_data import RunData, Trace
 from imutool.viewing.model.trajectory_error import Drift, Errors
 from imutool.viewing.rerun.entities import names as entities
 from imutool.viewing.rerun.entities import styles
 from imutool.viewing.rerun.entities.names import Scope
 from imutool.viewing.rerun.entities.palette import (
-    AXES,
     BOLD_WIDTH,
     RAW_FADE,
     RAW_WIDTH,

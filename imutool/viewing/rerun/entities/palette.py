@@ -9,7 +9,6 @@ from imutool.viewing.model.run_data import RunData, Trace
 
 Color = tuple[int, int, int]
 
-AXES = ("x", "y", "z")
 XYZ: tuple[Color, ...] = ((230, 60, 60), (40, 170, 70), (60, 120, 240))  # the same three everywhere, on dark and light
 GREY: Color = (128, 128, 128)
 TRUTH_COLOR: Color = (150, 150, 150)

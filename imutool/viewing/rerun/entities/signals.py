@@ -17,7 +17,6 @@ if TYPE_CHECKING:
     import rerun as rr
 
 KINDS = ("gyro", "accel")
-UNITS = {"gyro": "rad/s", "accel": "m/s²"}
 SIGMAS = 3.0
 MOST_DERIVED = 50_000  # rows of a curve that is computed: four minutes at 200 Hz; a sample is only left out above MOST
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
+from imutool.units import AXES
 from imutool.viewing.rerun.entities.names import Role
 from imutool.viewing.rerun.entities.palette import (
-    AXES,
     BOLD_WIDTH,
     INK,
     RAW_FADE,
