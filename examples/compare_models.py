@@ -10,7 +10,7 @@ from pathlib import Path
 
 from imutool.cli import terminal
 from imutool.viewing.model.runs import load
-from imutool.viewing.rerun import files
+from imutool.viewing.rerun import scene
 
 
 def main(log: Path, target: Path, models: list[str]) -> None:
@@ -22,7 +22,7 @@ def main(log: Path, target: Path, models: list[str]) -> None:
         for window in trace.windows:
             drifts = f"{window.orientation_deg:.3f} deg, {window.position_m:.3f} m"
             print(f"{trace.name}: over {window.length_s:g} s from the truth it drifts by {drifts} ({window.count} windows)")
-    print(files.save([data], target, overwrite=True).said)
+    print(scene.save([data], target, overwrite=True).said)
 
 
 if __name__ == "__main__":

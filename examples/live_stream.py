@@ -18,7 +18,7 @@ from imutool.debiasing import Block, OnlineDebiaser
 from imutool.mcap_io.batches import ImuBatch
 from imutool.recording import Imu, nanoseconds
 from imutool.sensor.flight import flight
-from imutool.viewing.rerun.live import watching
+from imutool.viewing.rerun.live import live_view
 
 REST_S = 2.0  # how long the sensor is known to stand still after it is switched on
 BATCH = 100  # samples that are shown together: half a second
@@ -33,7 +33,7 @@ def main(where: str, duration_s: float = 20.0) -> None:
 
     file = Path(where) if where.endswith(".rrd") else None
     began = time.monotonic()
-    with watching("live", connect_to=None if file else where, save=file, instead=Path("live.rrd"), overwrite=True) as live:
+    with live_view("live", connect_to=None if file else where, save=file, instead=Path("live.rrd"), overwrite=True) as live:
         for first in range(0, len(sensor), BATCH):
             samples = sensor.rows(slice(first, first + BATCH))
             bias = np.stack(

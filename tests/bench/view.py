@@ -35,7 +35,7 @@ from imutool.viewing.rerun import layout, scene
 
 TESTS = Path(__file__).parents[1]
 VIEWERS = SimpleNamespace(**runpy.run_path(str(TESTS / "viewers.py")))
-VIEWS = SimpleNamespace(**runpy.run_path(str(TESTS / "viewing" / "rrd.py")))
+VIEWS = SimpleNamespace(**runpy.run_path(str(TESTS / "viewing" / "rrd_reader.py")))
 
 RATE_HZ = 200.0
 GIVE_UP_S = 120.0

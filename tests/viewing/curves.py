@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-import runpy
 from collections.abc import Iterator, Mapping, Sequence
 from itertools import islice
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any, NamedTuple
 
 import numpy as np
 import pyarrow as pa
 from rerun.chunk import RrdReader
 
-RRD = SimpleNamespace(**runpy.run_path(str(Path(__file__).with_name("rrd.py"))))
+from tests.viewing import rrd_reader
 
 LEAST = 200  # pixels of a curve; its sample in a legend has some fifty
 WITHIN = 36.0  # in RGB: what an edge mixes of a line with its ground, and less than two colours of ours are apart
@@ -69,7 +67,7 @@ def unpacked(rgba: Sequence[int]) -> np.ndarray:
 
 def faces(blueprint: Any) -> Iterator[list[Any]]:
     """Turns the tabs of a layout until every view has been in front, and each time names those that are new."""
-    waiting = {leaf.id: leaf for leaf in RRD.views(blueprint.root_container)}
+    waiting = {leaf.id: leaf for leaf in rrd_reader.views(blueprint.root_container)}
     while waiting:
         front = turn(blueprint.root_container, waiting)
         new = [waiting.pop(leaf.id) for leaf in front if leaf.id in waiting]
@@ -83,7 +81,9 @@ def turn(part: Any, waiting: Mapping[Any, Any]) -> list[Any]:
         return [part]
     parts = list(part.contents)
     if type(part).__name__ == "Tabs":
-        part.active_tab = next((k for k, inner in enumerate(parts) if any(leaf.id in waiting for leaf in RRD.views(inner))), 0)
+        part.active_tab = next(
+            (k for k, inner in enumerate(parts) if any(leaf.id in waiting for leaf in rrd_reader.views(inner))), 0
+        )
         parts = [parts[part.active_tab]]
     return [leaf for inner in parts for leaf in turn(inner, waiting)]
 
@@ -91,7 +91,7 @@ def turn(part: Any, waiting: Mapping[Any, Any]) -> list[Any]:
 def shown(view: Any, curves: Sequence[Curve]) -> list[Curve]:
     """The curves that a view holds, as it has them drawn: it may leave some of an entity out, and colour others anew."""
     found = []
-    for entity in sorted(RRD.held(view, [curve.entity for curve in curves])):
+    for entity in sorted(rrd_reader.held(view, [curve.entity for curve in curves])):
         mine = [curve for curve in curves if curve.entity == entity]
         style = view.visualizer_overrides.get(entity)
         visible, colors = (column(style, name) for name in ("visible_series", "colors"))

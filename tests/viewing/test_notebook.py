@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import html.parser
 import os
-import runpy
 import subprocess
 import sys
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -21,16 +19,15 @@ from imutool.viewing import notebook
 from imutool.viewing.model.run_data import RunData
 from imutool.viewing.model.runs import load
 from imutool.viewing.rerun import viewer
-
-RRD = SimpleNamespace(**runpy.run_path(str(Path(__file__).parent / "rrd.py")))
+from tests.viewing import rrd_reader
 
 # In a process of its own: where the widget's program comes from is settled once, by an import that takes seconds.
 WIDGET = """
 import gzip, sys
 from pathlib import Path
 gzip.compress = lambda program: program[:1]  # 67 MB, which nobody runs here
-from imutool.view import notebook
-from imutool.view.runs import load
+from imutool.viewing import notebook
+from imutool.viewing.model.runs import load
 viewer = notebook.show([load(Path(sys.argv[1]))], source=False)
 assert not __import__("rerun_notebook").ASSET_IS_URL, "the program would come from the network"
 parts = [buffer for event, buffers in viewer._viewer._event_queue for buffer in buffers]
@@ -62,8 +59,8 @@ def test_the_widget_is_given_all_that_a_file_would_hold(recording: Recording, tm
     assert done.returncode == 0, done.stderr
     merge = [str(viewer.binary()), "rrd", "merge", *sorted(map(str, parts.iterdir())), "-o", str(tmp_path / "all.rrd")]
     subprocess.run(merge, check=True, capture_output=True)
-    RRD.written([load(log)], tmp_path / "file.rrd", source=False)
-    given, kept = RRD.read(tmp_path / "all.rrd"), RRD.read(tmp_path / "file.rrd")
+    rrd_reader.written([load(log)], tmp_path / "file.rrd", source=False)
+    given, kept = rrd_reader.read(tmp_path / "all.rrd"), rrd_reader.read(tmp_path / "file.rrd")
     assert set(given) == set(kept)
     name = "Scalars:scalars"
     np.testing.assert_array_equal(given["/imu/gyro/raw"].numbers(name), kept["/imu/gyro/raw"].numbers(name))
