@@ -82,9 +82,9 @@ def test_the_conclusion_comes_first_and_holds_the_figures_of_the_best_model(seen
     whole = seen.traces[2].figures
     said = Page(page).text
     assert said.index("whole cuts the orientation error") < said.index("Figures")
-    assert f"from {report_wording.measure(seen.traces[0].figures['aoe_deg'], '°')} to" in said
+    assert f"from {report_wording.format_quantity(seen.traces[0].figures['aoe_deg'], '°')} to" in said
     less = report_wording.ratio_text(seen.traces[0].figures["aoe_deg"], whole["aoe_deg"])
-    assert f"to {report_wording.measure(whole['aoe_deg'], '°')} ({less})" in said
+    assert f"to {report_wording.format_quantity(whole['aoe_deg'], '°')} ({less})" in said
     errors = seen.traces[2].errors
     assert errors is not None
     row = int(np.nanargmax(errors.orientation_total_deg))

@@ -168,7 +168,7 @@ def test_a_file_that_lost_its_end_is_no_file(
     with caplog.at_level(logging.WARNING, "imutool"):
         out, watch = watched(log, tmp_path, save=tmp_path / "live.rrd")
     assert len(caplog.records) == 1
-    assert "could not be written whole" in caplog.text
+    assert "could not be written completely" in caplog.text
     assert (watch.shown, [path.name for path in tmp_path.iterdir()]) == ([], ["out.mcap"])
     assert out.read_bytes() == unwatched.read_bytes()
 
