@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-import runpy
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import pytest
-
-VIEWERS = SimpleNamespace(**runpy.run_path(str(Path(__file__).with_name("viewers.py"))))
+from support import viewers
 
 
 @pytest.fixture(params=["browser", "driver"])
@@ -22,26 +19,26 @@ def hidden(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch, tmp_
 
 
 def look(what: str) -> None:
-    with {"browser": VIEWERS.chromium, "driver": VIEWERS.native}[what]():
+    with {"browser": viewers.chromium, "driver": viewers.native}[what]():
         raise AssertionError("there is nothing to look with")
 
 
 def test_in_ci_a_missing_viewer_fails_the_test_and_names_the_package(hidden: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("CI", "true")
-    with pytest.raises(pytest.fail.Exception, match=rf"no {hidden} .*apt-get install .*{VIEWERS.PACKAGES[hidden][0]}"):
+    with pytest.raises(pytest.fail.Exception, match=rf"no {hidden} .*apt-get install .*{viewers.PACKAGES[hidden][0]}"):
         look(hidden)
 
 
 def test_elsewhere_a_missing_viewer_skips_the_test_and_names_the_package(hidden: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("CI", raising=False)
-    with pytest.raises(pytest.skip.Exception, match=rf"NOT LOOKED AT: .*apt-get install .*{VIEWERS.PACKAGES[hidden][0]}"):
+    with pytest.raises(pytest.skip.Exception, match=rf"NOT LOOKED AT: .*apt-get install .*{viewers.PACKAGES[hidden][0]}"):
         look(hidden)
 
 
 def test_a_driver_that_the_environment_chooses_is_taken(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     (tmp_path / "mine.json").touch()
     monkeypatch.setenv("VK_DRIVER_FILES", str(tmp_path / "mine.json"))
-    assert VIEWERS.driver() == tmp_path / "mine.json"
+    assert viewers.driver() == tmp_path / "mine.json"
 
 
 def test_a_viewer_that_dies_is_asked_once_more_and_one_that_shows_the_wrong_thing_never(
@@ -57,10 +54,10 @@ def test_a_viewer_that_dies_is_asked_once_more_and_one_that_shows_the_wrong_thin
         asked.append(viewer)
         raise AssertionError("no such curve")
 
-    for job, raises, times in ((die, VIEWERS.DiedError, 2), (wrong, AssertionError, 1)):
+    for job, raises, times in ((die, viewers.DiedError, 2), (wrong, AssertionError, 1)):
         asked: list[Any] = []
         with pytest.raises(raises):
-            VIEWERS.seen(job)
+            viewers.seen(job)
         assert len(asked) == times
 
 
@@ -74,11 +71,11 @@ def test_what_is_missing_is_fetched_three_times_before_it_is_given_up(
         (tmp_path / name).chmod(0o755)
     for name in ("env", "true", "false", "sh"):
         (tmp_path / name).symlink_to(f"/usr/bin/{name}")
-    monkeypatch.setitem(VIEWERS.main.__globals__, "PAUSE_S", 0.0)
-    VIEWERS.main()
+    monkeypatch.setitem(viewers.main.__globals__, "PAUSE_S", 0.0)
+    viewers.main()
     lines = asked.read_text().splitlines()
-    assert len(lines) == (2 if works else VIEWERS.ATTEMPTS)
+    assert len(lines) == (2 if works else viewers.ATTEMPTS)
     assert ("NOT LOOKED AT" in capfd.readouterr().err) == (not works)
     if works:
         assert lines[0].endswith("update")
-        assert all(package in lines[1] for package in VIEWERS.PACKAGES[hidden])
+        assert all(package in lines[1] for package in viewers.PACKAGES[hidden])

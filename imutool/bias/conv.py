@@ -30,9 +30,10 @@ from jaxtyping import Float, Float64
 from torch import Tensor, nn
 from torch.nn import functional
 
-from imutool.bias.model import COLUMNS, SENSORS, BiasModel, Segment, Sensor, Stream, Vector6
+from imutool.bias.model import COLUMNS, BiasModel, Segment, Stream, Vector6
 from imutool.config import Settings
 from imutool.errors import ConfigError
+from imutool.units import SENSORS, Sensor
 
 Positive = Annotated[float, msgspec.Meta(gt=0)]
 Channels = Annotated[tuple[Annotated[int, msgspec.Meta(ge=1, le=512)], ...], msgspec.Meta(min_length=1, max_length=8)]

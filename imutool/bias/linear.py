@@ -9,8 +9,9 @@ import torch
 from jaxtyping import Float, Float64
 from torch import Tensor, nn
 
-from imutool.bias.model import SENSORS, BiasModel, Segment, Sensor, Stream, Vector6
+from imutool.bias.model import BiasModel, Segment, Stream, Vector6
 from imutool.config import Settings
+from imutool.units import SENSORS, Sensor
 
 
 class Config(Settings, frozen=True):

@@ -19,9 +19,8 @@ from jaxtyping import Float, Float64
 from torch import Tensor, nn
 
 from imutool.config import Settings
+from imutool.units import SENSORS, Sensor
 
-Sensor = Literal["gyro", "accel"]
-SENSORS: tuple[Sensor, Sensor] = ("gyro", "accel")
 COLUMNS = {"gyro": slice(0, 3), "accel": slice(3, 6)}  # of every vector of six
 
 Vector6 = Float64[np.ndarray, "6"]  # gyro (rad/s) then accel (m/s²)

@@ -27,11 +27,12 @@ from jaxtyping import Float, Float64
 from torch import Tensor, nn
 from torchdiffeq import odeint, odeint_adjoint
 
-from imutool.bias.model import COLUMNS, SENSORS, BiasModel, Segment, Sensor, Vector6
+from imutool.bias.model import COLUMNS, BiasModel, Segment, Vector6
 from imutool.bias.neural_stream import Array, Curves, CurveWeights, DriftRate, NeuralStream, perceptron
 from imutool.bias.ode import HermitePath
 from imutool.config import Settings
 from imutool.errors import ConfigError
+from imutool.units import SENSORS, Sensor
 
 SLOW_S, DRIFT_SEES_S = 0.1, 0.5  # time constants of what the curve and the drift see
 NEAR_ZERO = 10.0

@@ -12,8 +12,9 @@ from jaxtyping import Float64
 from scipy.special import erf
 from torch import Tensor, nn
 
-from imutool.bias.model import COLUMNS, Sensor, Vector6
+from imutool.bias.model import COLUMNS, Vector6
 from imutool.sensor.signals import low_pass
+from imutool.units import Sensor
 
 ROWS = 64  # at a time: they stay in the cache, and a product this small is never handed to threads that must be woken first
 HALF_ROOT = math.sqrt(0.5)

@@ -9,8 +9,9 @@ import torch
 from jaxtyping import Float, Float64
 from torch import Tensor
 
-from imutool.bias.model import BiasModel, Segment, Sensor, Stream, Vector6
+from imutool.bias.model import BiasModel, Segment, Stream, Vector6
 from imutool.config import Settings
+from imutool.units import Sensor
 
 
 class Config(Settings, frozen=True):

@@ -23,9 +23,10 @@ import numpy as np
 from jaxtyping import Float64
 from scipy.linalg import expm
 
-from imutool.bias.model import COLUMNS, BiasModel, Sensor, Stream
+from imutool.bias.model import COLUMNS, BiasModel, Stream
 from imutool.bias_start.bias_tracking import Along, Following
 from imutool.bias_start.initial_bias import InitialBias
+from imutool.units import Sensor
 
 STEP_S = 1.0  # of the covariance's own dynamics, which take minutes
 

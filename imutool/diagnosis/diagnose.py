@@ -12,16 +12,18 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float64
 
-from imutool.diagnosis import summarize, timestamps, unnamed
-from imutool.diagnosis.alignment import LEAST_S, Pair, of_one_motion, with_simulation, with_truth
-from imutool.diagnosis.block_scatter import scatter
+from imutool.diagnosis import summarize
 from imutool.diagnosis.compare_findings import ANOTHER_MOTION
-from imutool.diagnosis.fixed_parameters import only
-from imutool.diagnosis.forward_cache import Chosen
-from imutool.diagnosis.gauss_newton import WhitenedLog, expected, fit
-from imutool.diagnosis.model_selection import Discovery, discover
-from imutool.diagnosis.noise_estimate import weighed
-from imutool.diagnosis.observability import unseen
+from imutool.diagnosis.estimation import timestamps
+from imutool.diagnosis.estimation import unnamed_effects as unnamed
+from imutool.diagnosis.estimation.alignment import LEAST_S, Pair, same_motion, with_simulation, with_truth
+from imutool.diagnosis.estimation.block_scatter import scatter
+from imutool.diagnosis.estimation.fixed_parameters import with_free
+from imutool.diagnosis.estimation.forward_cache import Chosen
+from imutool.diagnosis.estimation.gauss_newton import WhitenedLog, expected, fit
+from imutool.diagnosis.estimation.model_selection import Selection, select_effects
+from imutool.diagnosis.estimation.noise_estimate import whitened
+from imutool.diagnosis.estimation.observability import unobservable
 from imutool.diagnosis.reference_errors import wrong_for_moments
 from imutool.diagnosis.reference_free_checks import by_samples
 from imutool.diagnosis.resimulation import simulated_again
@@ -88,15 +90,15 @@ def diagnose(
         return by_samples(recordings[0], str(reals[0]), left_out[0])
     say(1, 4, "noise")
     candidates = _candidates(pairs)
-    logs = [weighed(pair, (*candidates, *unnamed.driven([pair]))) for pair in pairs]
+    logs = [whitened(pair, (*candidates, *unnamed.driven([pair]))) for pair in pairs]
     pairs = [log.pair for log in logs]
     say(2, 4, "searching")
     moments = wrong_for_moments(logs)
     asked, unnamed_too = ((), ()) if moments[0] else (candidates, later(pairs))
-    found = discover(logs, asked, unnamed_too, lambda word: say(2, 4, f"trying {word}"))
+    found = select_effects(logs, asked, unnamed_too, lambda word: say(2, 4, f"trying {word}"))
     say(3, 4, "locating")
     paths = {recording.name: str(real) for recording, real in zip(recordings, reals, strict=True)}
-    told = summarize.told(logs, found, paths, None if sim is None else str(sim), known, unseen(logs, candidates))
+    told = summarize.told(logs, found, paths, None if sim is None else str(sim), known, unobservable(logs, candidates))
     if simulated is not None and any(one.effect not in NO_EFFECT for one in told.findings):
         say(3, 4, "simulating again")
         told = _again(told, logs, found, simulated)
@@ -109,7 +111,7 @@ def diagnose(
     return told
 
 
-def _again(told: Diagnosis, logs: Sequence[WhitenedLog], found: Discovery, sim: Recording) -> Diagnosis:
+def _again(told: Diagnosis, logs: Sequence[WhitenedLog], found: Selection, sim: Recording) -> Diagnosis:
     """With what a second simulation says of the findings; where there can be none, with the reason."""
     if any(one.effect == summarize.JITTER for one in told.findings):  # stamps that jitter are no physics to simulate
         return told
@@ -191,13 +193,13 @@ def measured(
     simulated = None if sim is None else read_log(sim, imu=imu)
     pairs = [_telling(pair) for pair in _pairs(read_log(real, imu=imu, truth=truth), simulated, truth)]
     candidates = _candidates(pairs)
-    logs = [weighed(pair, candidates) for pair in pairs]
-    asked = catalogue.physics(effects)
-    hidden = set(unseen(logs, asked))
+    logs = [whitened(pair, candidates) for pair in pairs]
+    asked = catalogue.diagnosed(effects)
+    hidden = set(unobservable(logs, asked))
     shown = []
     for one in asked:
         free = [k for k, number in enumerate(one.parameters) if not {one.name, f"{one.name}.{number.name}"} & hidden]
-        shown += [only(one, free)] if free else []
+        shown += [with_free(one, free)] if free else []
     found = fit(logs, tuple((one, one.null_value.astype(float)) for one in shown), part="all")
     std = scatter(logs, found, "all").std if shown else {}
     return Measured(found.chosen, {name: np.asarray(one) for name, one in std.items()}, found.information, found.bias)
@@ -214,9 +216,9 @@ def remaining(real: Location, chosen: Chosen = (), *, imu: str | None = None, tr
     pairs = [_telling(pair) for pair in _pairs(read_log(real, imu=imu, truth=truth), None, truth)]
     candidates = _candidates(pairs)
     logs = []
-    for log in (weighed(pair, candidates) for pair in pairs):
-        unseen = replace(log.pair, fitted=np.zeros_like(log.pair.fitted), held_out=log.pair.fitted | log.pair.held_out)
-        logs.append(replace(log, pair=unseen))
+    for log in (whitened(pair, candidates) for pair in pairs):
+        unobservable = replace(log.pair, fitted=np.zeros_like(log.pair.fitted), held_out=log.pair.fitted | log.pair.held_out)
+        logs.append(replace(log, pair=unobservable))
     before, after = ([summarize.with_constant(log.pair, expected(log.pair, one)) for log in logs] for one in ((), chosen))
     return summarize.closer(logs, before, after)
 
@@ -227,7 +229,7 @@ def _moves_apart(reals: Sequence[Recording], sim: Recording, signals: Sequence[s
     Raises:
         DataError: it is of the motion of some only, or other signals are to be compared with it.
     """
-    of_one = [of_one_motion(real.imu, sim.imu) for real in reals]
+    of_one = [same_motion(real.imu, sim.imu) for real in reals]
     if all(of_one) or not all(real.truths for real in reals):
         return False
     if any(of_one):
@@ -313,7 +315,7 @@ def _candidates(pairs: Sequence[Pair]) -> tuple[Effect, ...]:
     def thinkable(physics: Effect) -> bool:
         return all(attitude if need == "attitude" else any(need in name for name in channels) for need in physics.needs)
 
-    found = [one for one in catalogue.physics() if thinkable(one) and one.name not in SHOWN_BY_SAMPLES]
+    found = [one for one in catalogue.diagnosed() if thinkable(one) and one.name not in SHOWN_BY_SAMPLES]
     biases = [np.median(pair.real - expected(pair, ()), axis=0) for pair in pairs]
     exact = all(pair.against == "simulation" for pair in pairs)  # poses know nothing of a millisecond: `late_stamps`
     return (*found, *(timestamps.jitter(pairs) if exact else ()), *timestamps.soft_limits(pairs, biases))

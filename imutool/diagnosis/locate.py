@@ -15,13 +15,13 @@ from jaxtyping import Bool, Float64
 from scipy.stats import chi2, mannwhitneyu
 
 from imutool.diagnosis.result import Located
+from imutool.units import AXES
 
 WINDOW_S = 1.0
 CLEAR = 12.0  # squares of misfit over noise by which a second, or an axis, stands out of it
 AXIS_SHARE = 0.02  # of the strongest axis' squares, below which an axis is only touched
 JOIN_S = 1.5  # intervals closer than this are one
 TELLS = 0.35  # Youden's index above which a regime is worth its words
-AXES = ("x", "y", "z")
 SIGNALS = ("gyro", "accel")
 CHANCE = 1e-3
 

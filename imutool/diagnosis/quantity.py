@@ -8,8 +8,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from imutool.diagnosis.result import Estimate
+from imutool.units import AXES, with_superscripts
 
-AXES = ("x", "y", "z")
 SHOWN = 3  # numbers of one quantity; a matrix has up to nine
 RAISED = ("⁰", "¹", "²", "³", "⁴", "⁵", "⁶", "⁷", "⁸", "⁹")
 
@@ -121,7 +121,7 @@ def each(several: Sequence[Estimate], labels: Sequence[str]) -> tuple[list[str],
 
 def symbol(unit: str) -> str:
     """A unit as people write it: `m/s²`, and nothing for none."""
-    return "" if unit in {"-", "1", ""} else unit.replace("^2", "²").replace("^3", "³")
+    return "" if unit in {"-", "1", ""} else with_superscripts(unit)
 
 
 def percent(share: float) -> str:

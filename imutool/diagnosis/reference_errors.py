@@ -12,8 +12,9 @@ import numpy as np
 from jaxtyping import Float64
 from scipy.stats import chi2
 
-from imutool.diagnosis.gauss_newton import WhitenedLog, expected
-from imutool.diagnosis.result import UNITS, Estimate, Finding, HeldOut, Located
+from imutool.diagnosis.estimation.gauss_newton import WhitenedLog, expected
+from imutool.diagnosis.result import Estimate, Finding, HeldOut, Located
+from imutool.units import ASCII_UNITS, AXES, SENSORS
 
 BLOCK_S = 0.25
 STANDS_OUT = 1e-7  # chance of a block of noise
@@ -59,19 +60,19 @@ def wrong_for_moments(logs: Sequence[WhitenedLog]) -> tuple[list[Finding], list[
     t_all = log.pair.stamp_s
     away = unseen & ~np.any([(t_all >= a - BLOCK_S) & (t_all <= b + BLOCK_S) for a, b in runs], axis=0)
     before, after = (float(np.sqrt((left[mask, 3:] ** 2).mean())) for mask in (unseen, away))
-    held = HeldOut(before, after, UNITS["accel"], round(float(unseen.sum()) * log.pair.period_s, 1))
+    held = HeldOut(before, after, ASCII_UNITS["accel"], round(float(unseen.sum()) * log.pair.period_s, 1))
     finding = Finding(
         "reference_error", "both", share, STANDS_OUT, STANDS_OUT, parameters, "the reference is wrong there", held
     )
-    return [finding], [_where(signal, white[:, 3 * k : 3 * k + 3], inside, runs, share) for k, signal in enumerate(UNITS)]
+    return [finding], [_where(signal, white[:, 3 * k : 3 * k + 3], inside, runs, share) for k, signal in enumerate(SENSORS)]
 
 
 def _where(
     signal: str, white: Float64[np.ndarray, "n 3"], inside: np.ndarray, runs: list[tuple[float, float]], share: float
 ) -> Located:
     power = (white[inside] ** 2).mean(axis=0)
-    axes = tuple(axis for axis, value in zip("xyz", power, strict=True) if value > 1.3)
-    return Located(signal, axes or ("x", "y", "z"), tuple(runs), "no regime: the reference's own moments", share, STANDS_OUT)
+    axes = tuple(axis for axis, value in zip(AXES, power, strict=True) if value > 1.3)
+    return Located(signal, axes or AXES, tuple(runs), "no regime: the reference's own moments", share, STANDS_OUT)
 
 
 def _runs(loud: np.ndarray, start_s: float) -> list[tuple[float, float]]:

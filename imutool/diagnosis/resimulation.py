@@ -13,15 +13,15 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Float64
 
-from imutool.diagnosis.alignment import Pair
-from imutool.diagnosis.gauss_newton import WhitenedLog, expected
+from imutool.diagnosis.estimation.alignment import Pair
+from imutool.diagnosis.estimation.gauss_newton import WhitenedLog, expected
 from imutool.diagnosis.result import Closer
 from imutool.diagnosis.summarize import closer, floor, with_constant
 from imutool.errors import DataError
 from imutool.recording import Recording
 from imutool.sensor.effect import Acting
 from imutool.sensor.physics_file import PhysicsFile
-from imutool.sensor.readings import IdealMotion
+from imutool.sensor.samples import IdealMotion
 from imutool.sensor.simulate import FELT_HZ, read_all
 from imutool.sensor.trajectory import smooth_motion
 

@@ -13,10 +13,10 @@ import numpy as np
 from jaxtyping import Bool, Float64
 
 from imutool.recording import Poses
+from imutool.units import ASCII_UNITS
 
 SCHEMA = "imutool.diagnosis/1"
 WORTH = 0.1  # of the noise, in power, that a misfit must have for a share of it to mean anything
-UNITS = {"gyro": "rad/s", "accel": "m/s^2"}
 
 
 @dataclass(frozen=True)
@@ -170,7 +170,7 @@ class Diagnosis:
 
     def plain(self) -> dict[str, Any]:
         """As JSON has it; nothing is said of what is left of a sensor that told nothing."""
-        left = dict.fromkeys(UNITS) | dict(self.unexplained)
+        left = dict.fromkeys(ASCII_UNITS) | dict(self.unexplained)
         return {
             "schema": SCHEMA,
             "real": list(self.real),

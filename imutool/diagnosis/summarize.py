@@ -10,23 +10,24 @@ from jaxtyping import Bool, Float64
 from scipy.stats import f as fisher
 from scipy.stats import ttest_1samp
 
-from imutool.diagnosis import timestamps, unnamed
-from imutool.diagnosis.alignment import LEAST_NOISE, Pair
 from imutool.diagnosis.compare_findings import remarks, shared
-from imutool.diagnosis.forward_cache import Chosen
-from imutool.diagnosis.gauss_newton import Fit, WhitenedLog, expected, fit
-from imutool.diagnosis.late_stamps import late_stamps
+from imutool.diagnosis.estimation import timestamps
+from imutool.diagnosis.estimation import unnamed_effects as unnamed
+from imutool.diagnosis.estimation.alignment import LEAST_NOISE, Pair
+from imutool.diagnosis.estimation.forward_cache import Chosen
+from imutool.diagnosis.estimation.gauss_newton import Fit, WhitenedLog, expected, fit
+from imutool.diagnosis.estimation.late_stamps import late_stamps
+from imutool.diagnosis.estimation.model_selection import SelectedEffect, Selection
+from imutool.diagnosis.estimation.noise_estimate import noise_std
+from imutool.diagnosis.estimation.unnamed_effects import unit
 from imutool.diagnosis.localization import of_findings, of_what_is_left
-from imutool.diagnosis.model_selection import Discovery, Judged
-from imutool.diagnosis.noise_estimate import noise_std
-from imutool.diagnosis.quantity import AXES, percent, symbol
-from imutool.diagnosis.result import UNITS, Closer, Curve, Diagnosis, Estimate, Finding, HeldOut, Located, Traces, Unexplained
+from imutool.diagnosis.quantity import percent
+from imutool.diagnosis.result import Closer, Curve, Diagnosis, Estimate, Finding, HeldOut, Located, Traces, Unexplained
 from imutool.diagnosis.to_physics_file import found as physics_file
-from imutool.diagnosis.unnamed import unit
 from imutool.inertial.stationary import white_noise
 from imutool.sensor.physics_file import PhysicsFile
+from imutool.units import ASCII_UNITS, AXES, SENSORS, UNITS
 
-SIGNALS = tuple(UNITS)
 JITTER, QUANTIZATION = "timestamp_jitter", "quantization"
 SHOWN_KNOTS = 41  # of a curve without a name, as it is told
 SOME = 0.05  # of the samples of an axis at its limit, from which on that is told
@@ -38,7 +39,7 @@ BY_CHANCE = 1e-3  # or more, where so few values are left that noise alone excee
 
 def told(
     logs: Sequence[WhitenedLog],
-    found: Discovery,
+    found: Selection,
     reals: Mapping[str, str],
     sim: str | None,
     known: Sequence[Finding],
@@ -60,14 +61,14 @@ def told(
     if not exact:
         all_found += late_stamps(pairs)
     findings = [one for one in all_found if not shared(one, known)]
-    expected_too = {judged.physics.name for judged, one in zip(found.judged, named, strict=True) if shared(one, known)}
-    before = [_with(pair, tuple(one for one in found.fitted.chosen if one[0].name in expected_too)) for pair in pairs]
+    expected_too = {judged.physics.key for judged, one in zip(found.selected, named, strict=True) if shared(one, known)}
+    before = [_with(pair, tuple(one for one in found.fitted.chosen if one[0].key in expected_too)) for pair in pairs]
     p_values = {
         signal: min((one.p_value for one in findings if one.effect != JITTER and one.signal in (signal, "both")), default=1.0)
         for signal in ("gyro", "accel")
     }
     quiet = expected_too | {JITTER}  # where stamps are wrong, signals are not
-    still = [_with(pair, tuple(one for one in found.fitted.chosen if one[0].name in quiet)) for pair in pairs]
+    still = [_with(pair, tuple(one for one in found.fitted.chosen if one[0].key in quiet)) for pair in pairs]
     unexplained = _unexplained(logs, after, noise)
     if findings:
         places = of_findings(pairs, still, after, noise, findings, p_values)
@@ -96,10 +97,10 @@ def _traces(pair: Pair, before: Float64[np.ndarray, "n 6"], after: Float64[np.nd
     )
 
 
-def without_held_out(logs: Sequence[WhitenedLog], found: Discovery, d: Diagnosis) -> PhysicsFile:
+def without_held_out(logs: Sequence[WhitenedLog], found: Selection, d: Diagnosis) -> PhysicsFile:
     """What was found as physics.toml has it, with the numbers that the fitted time alone says; digits are no motion's."""
-    theta = {physics.name: value for physics, value in found.fitted.chosen}
-    judged = {(_effect(one), one.physics.equation): replace(one, theta=theta[one.physics.name]) for one in found.judged}
+    theta = {physics.key: value for physics, value in found.fitted.chosen}
+    judged = {(one.physics.name, one.physics.equation): replace(one, theta=theta[one.physics.key]) for one in found.selected}
     pairs = [log.pair for log in logs]
 
     def fitted(one: Finding) -> Finding:
@@ -112,31 +113,31 @@ def without_held_out(logs: Sequence[WhitenedLog], found: Discovery, d: Diagnosis
 
 
 def _worthwhile(
-    logs: Sequence[WhitenedLog], found: Discovery, noise: Float64[np.ndarray, "6"]
-) -> tuple[Discovery, list[Finding], list[str]]:
+    logs: Sequence[WhitenedLog], found: Selection, noise: Float64[np.ndarray, "6"]
+) -> tuple[Selection, list[Finding], list[str]]:
     """A discovery without effects that bring nothing on unseen time beside the others, its findings, and those effects."""
-    named, idle = [_finding(logs, found, one, noise) for one in found.judged], []
+    named, idle = [_finding(logs, found, one, noise) for one in found.selected], []
     while any(one.share <= 0.0 for one in named):
         least = min(range(len(named)), key=lambda k: named[k].share)
         idle.append(named[least].effect)
-        name = found.judged[least].physics.name
+        name = found.selected[least].physics.key
         fitted, whole = (
-            fit(logs, tuple(one for one in those.chosen if one[0].name != name), part=those.part, near=those)
+            fit(logs, tuple(one for one in those.chosen if one[0].key != name), part=those.part, near=those)
             for those in (found.fitted, found.whole)
         )
-        theta = {physics.name: value for physics, value in whole.chosen}
-        rest = (one for one in found.judged if one.physics.name != name)
-        judged = tuple(replace(one, theta=theta[one.physics.name]) for one in rest)
-        found = replace(found, judged=judged, fitted=fitted, whole=whole)
-        named = [_finding(logs, found, one, noise) for one in found.judged]
+        theta = {physics.key: value for physics, value in whole.chosen}
+        rest = (one for one in found.selected if one.physics.key != name)
+        selected = tuple(replace(one, theta=theta[one.physics.key]) for one in rest)
+        found = replace(found, selected=selected, fitted=fitted, whole=whole)
+        named = [_finding(logs, found, one, noise) for one in found.selected]
     return found, named, idle
 
 
-def _not_identifiable(found: Discovery, idle: Sequence[str], hidden: Sequence[str]) -> tuple[str, ...]:
+def _not_identifiable(found: Selection, idle: Sequence[str], hidden: Sequence[str]) -> tuple[str, ...]:
     """Of what was found, the numbers that nothing shows; of the rest of the catalogue what could not be seen."""
-    told = [name for one in found.judged for name in one.unidentified if one.physics.name != JITTER]
+    told = [name for one in found.selected for name in one.unidentified if one.physics.name != JITTER]
     told += idle
-    there = {one.physics.name.partition(" ")[0] for one in found.judged}
+    there = {one.physics.name for one in found.selected}
     return tuple(dict.fromkeys([*told, *(name for name in hidden if name.partition(".")[0] not in there)]))
 
 
@@ -144,8 +145,8 @@ def _stuck(pair: Pair, floor: Float64[np.ndarray, "6"], *, several: bool) -> Ite
     """Axes that read the same in every sample though more was expected than that."""
     stuck, there = timestamps.stuck(pair.real), expected(pair, ())
     for a in np.flatnonzero(stuck & ~_ended(pair) & (there.std(axis=0) > MOVES * floor)):
-        signal = SIGNALS[a // 3]
-        regime = f"always: it reads {pair.real[0, a]:.4g} {symbol(UNITS[signal])} in every sample"
+        signal = SENSORS[a // 3]
+        regime = f"always: it reads {pair.real[0, a]:.4g} {UNITS[signal]} in every sample"
         span = ((float(pair.stamp_s[0]), float(pair.stamp_s[-1])),)
         yield Located(signal, (AXES[a % 3],), span, regime, 1.0, 0.0, pair.name if several else "")
 
@@ -193,7 +194,7 @@ def closer(logs: Sequence[WhitenedLog], before: Sequence[np.ndarray], after: Seq
     """What all findings together bring to each sensor, on held-out time."""
     noise, out = floor(logs), {}
     for signal, k in _known([log.pair for log in logs]).items():
-        out[signal] = Closer.of(_held_out(logs, before, after, k, UNITS[signal]), _noise(logs, noise, k))
+        out[signal] = Closer.of(_held_out(logs, before, after, k, ASCII_UNITS[signal]), _noise(logs, noise, k))
     return out
 
 
@@ -216,12 +217,12 @@ def _held_out(
     return HeldOut(rms[0], rms[1], unit_, round(length, 1))
 
 
-def _finding(logs: Sequence[WhitenedLog], found: Discovery, one: Judged, floor: Float64[np.ndarray, "6"]) -> Finding:
+def _finding(logs: Sequence[WhitenedLog], found: Selection, one: SelectedEffect, floor: Float64[np.ndarray, "6"]) -> Finding:
     """One effect: what leaving it out costs on time that its parameters were not fitted to."""
     pairs = [log.pair for log in logs]
     fitted = found.fitted
-    names = [physics.name for physics, _ in fitted.chosen]
-    k = names.index(one.physics.name)
+    names = [physics.key for physics, _ in fitted.chosen]
+    k = names.index(one.physics.key)
     without: Chosen = (*fitted.chosen[:k], *fitted.chosen[k + 1 :])
     with_ = [_with(pair, fitted.chosen) for pair in pairs]
     alone = [_with(pair, without) for pair in pairs]
@@ -229,8 +230,8 @@ def _finding(logs: Sequence[WhitenedLog], found: Discovery, one: Judged, floor: 
     shares, known = [], _known(pairs)
     for j, signal in enumerate(("gyro", "accel")):
         if signal in one.physics.sensors and signal in known:
-            held = _held_out(logs, alone, with_, j, UNITS[signal])
-            all_ = _held_out(logs, nothing, with_, j, UNITS[signal])
+            held = _held_out(logs, alone, with_, j, ASCII_UNITS[signal])
+            all_ = _held_out(logs, nothing, with_, j, ASCII_UNITS[signal])
             noise = float(np.mean(floor[3 * j : 3 * j + 3] ** 2))
             most = max(all_.rms_before, held.rms_before)  # effects may make up for one another
             misfit = max(most**2 - noise, 1e-300)
@@ -240,9 +241,8 @@ def _finding(logs: Sequence[WhitenedLog], found: Discovery, one: Judged, floor: 
     if sum(brought for brought, *_ in shares) <= 0.0:  # what it takes from one sensor it adds to the other
         share = 0.0
     told_signal = signal if len(one.physics.sensors) == 1 else "both"
-    name, _, rest = one.physics.name.partition(":")
     return Finding(
-        effect=_effect(one),
+        effect=one.physics.name,
         signal=told_signal,
         share=share,
         p_value=one.p_value,
@@ -250,18 +250,13 @@ def _finding(logs: Sequence[WhitenedLog], found: Discovery, one: Judged, floor: 
         parameters=_parameters(pairs, one),
         equation=one.physics.equation,
         held_out=held,
-        driver=rest.rpartition(":")[0] if name == "driven" else "",
+        driver=one.physics.variable if one.physics.kind == "driven" else "",
         curve=_curve(logs[0].pair, one, found.whole),
         similar=one.similar,
     )
 
 
-def _effect(one: Judged) -> str:
-    """Its name in the catalogue: `saturation accel` is the accelerometer's, `driven:` and `unknown:` are of something."""
-    return one.physics.name.replace(" accel", "").partition(":")[0]
-
-
-def _parameters(pairs: Sequence[Pair], one: Judged) -> dict[str, Estimate]:
+def _parameters(pairs: Sequence[Pair], one: SelectedEffect) -> dict[str, Estimate]:
     """As they were fitted, but for what stamps and samples show exactly; a curve is told by its values."""
     if isinstance(one.physics.forward, unnamed.Curve):
         return {}
@@ -275,7 +270,7 @@ def _parameters(pairs: Sequence[Pair], one: Judged) -> dict[str, Estimate]:
     }
 
 
-def _curve(pair: Pair, one: Judged, whole: Fit) -> Curve | None:
+def _curve(pair: Pair, one: SelectedEffect, whole: Fit) -> Curve | None:
     """A curve without a name by its values, with what they are sure to."""
     forward = one.physics.forward
     if not isinstance(forward, unnamed.Curve):
@@ -284,7 +279,7 @@ def _curve(pair: Pair, one: Judged, whole: Fit) -> Curve | None:
     basis = forward.basis(x)
     first = 0
     for physics, theta in whole.chosen:
-        if physics.name == one.physics.name:
+        if physics.key == one.physics.key:
             break
         first += len(theta)
     covariance = whole.covariance[first : first + len(one.theta), first : first + len(one.theta)]
@@ -302,7 +297,7 @@ def _unexplained(
     """Of the sensors of which anything is known; beside poses, whose errors come and go, by blocks that are of one mind."""
     out, beside_poses = {}, any(log.whiten.band is not None for log in logs)
     for signal, k in _known([log.pair for log in logs]).items():
-        held, noise = _held_out(logs, after, after, k, UNITS[signal]), _noise(logs, noises, k)
+        held, noise = _held_out(logs, after, after, k, ASCII_UNITS[signal]), _noise(logs, noises, k)
         part = slice(3 * k, 3 * k + 3)
         unseen = sum(len(_unseen(log, there, part)) for log, there in zip(logs, after, strict=True))
         seen = sum(log.numbers("fitted") for log in logs) / 2.0  # of both sensors
@@ -333,20 +328,20 @@ def _by_chance(logs: Sequence[WhitenedLog], after: Sequence[Float64[np.ndarray, 
 def _known(pairs: Sequence[Pair]) -> dict[str, int]:
     """Sensors of which an axis at least tells anything, with their places."""
     axes = np.any([pair.axes for pair in pairs], axis=0)
-    return {signal: k for k, signal in enumerate(SIGNALS) if axes[3 * k : 3 * k + 3].any()}
+    return {signal: k for k, signal in enumerate(SENSORS) if axes[3 * k : 3 * k + 3].any()}
 
 
 def silent(pair: Pair) -> list[str]:
     """What of a log tells nothing, and why."""
     stuck, clipped, ended, out = timestamps.stuck(pair.real), timestamps.clipped(pair.real).mean(axis=0), _ended(pair), []
     for a in np.flatnonzero(stuck & ~ended):
-        signal = SIGNALS[a // 3]
-        out.append(f"{signal} {AXES[a % 3]} reads {pair.real[0, a]:.4g} {symbol(UNITS[signal])} in every sample")
+        signal = SENSORS[a // 3]
+        out.append(f"{signal} {AXES[a % 3]} reads {pair.real[0, a]:.4g} {UNITS[signal]} in every sample")
     for signal, most in timestamps.limits(pair.real).items():
-        k = 3 * SIGNALS.index(signal)
+        k = 3 * SENSORS.index(signal)
         share = ", ".join(f"{AXES[a - k]} in {percent(float(clipped[a]))}" for a in range(k, k + 3) if ended[a])
         if share:
-            out.append(f"{signal} is at its limit of {most:.4g} {symbol(UNITS[signal])}: {share} of the samples")
+            out.append(f"{signal} is at its limit of {most:.4g} {UNITS[signal]}: {share} of the samples")
     return out
 
 

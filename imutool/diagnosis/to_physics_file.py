@@ -15,12 +15,12 @@ import numpy as np
 from jaxtyping import Float64
 
 from imutool.diagnosis.result import Diagnosis, Estimate, Finding
-from imutool.sensor.linear_effect import AXES
-from imutool.sensor.physics_file import DRIVEN, Bias, Curve, Entry, PhysicsFile, Sensor, Term, Three, Value
+from imutool.sensor.physics_file import DRIVEN, Bias, Curve, Entry, PhysicsFile, Term, Three, Value
+from imutool.units import AXES, Sensor
 
 NO_EFFECT = frozenset({"dropped_samples", "timestamp_jitter", "reference_error"})
 UNKNOWN = "unknown"
-ON_AXIS = re.compile(r"(gyro|accel)\.([xyz]) \+= (?:c (?P<term>.+)|curve\(.+\))")  # how `imutool.diagnosis.unnamed` writes it
+ON_AXIS = re.compile(r"(gyro|accel)\.([xyz]) \+= (?:c (?P<term>.+)|curve\(.+\))")  # as unnamed_effects writes it
 
 
 def found(d: Diagnosis) -> PhysicsFile:

@@ -18,8 +18,9 @@ from imutool.fleet.robots import FEWEST, Compared, Outlier
 from imutool.fleet.task import Result, Settings
 from imutool.location import Location
 from imutool.mcap_io.storage.target import Target
+from imutool.units import UNITS
 from imutool.viewing.html.drawing import prefix_ids, svg
-from imutool.viewing.html.page import AFTER, AXIS_COLORS, UNITS, cards, document, text
+from imutool.viewing.html.page import AFTER, AXIS_COLORS, cards, document, text
 
 MOST_ROWS = 500  # in a table: more is for the Parquet file
 MOST_NAMED = 10  # robots with an effect

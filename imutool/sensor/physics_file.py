@@ -51,18 +51,16 @@ from imutool.errors import ConfigError, DataError, ImutoolError
 from imutool.mcap_io.storage.target import Target
 from imutool.sensor import catalogue
 from imutool.sensor.effect import Effect, Parameter, Stage, Theta
-from imutool.sensor.linear_effect import AXES
-from imutool.sensor.readings import SensorSamples
+from imutool.sensor.samples import SensorSamples
 from imutool.sensor.variables import VARIABLES, factor, words
+from imutool.units import AXES, UNITS, Sensor
 
 SCHEMA = "imutool.physics/1"
 DRIVEN = "driven"
 # Within the stage SENSOR effects act by name. What has no name was learned from the ideal signals and comes first, upper case
 # sorting before lower; a bias comes last, so that no scale acts on it.
 UNKNOWN, BIAS = "Unknown", "~bias"
-UNITS = {"gyro": "rad/s", "accel": "m/s²"}
 
-Sensor = Literal["gyro", "accel"]
 Three = tuple[float, float, float]
 NotNegative = Annotated[float, Meta(ge=0.0)]
 ThreeStd = tuple[NotNegative, NotNegative, NotNegative]
@@ -123,7 +121,7 @@ class PhysicsFile(Settings, frozen=True, kw_only=True):
     unknown: tuple[Curve, ...] = ()
     term: tuple[Term, ...] = ()
 
-    def acting(self, where: str | Path = "physics", known: Known = catalogue.physics) -> list[tuple[Effect, Theta]]:
+    def acting(self, where: str | Path = "physics", known: Known = catalogue.effects) -> list[tuple[Effect, Theta]]:
         """The effects as they act, each with its parameters; `known` finds them by name.
 
         Raises:

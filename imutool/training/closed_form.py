@@ -15,11 +15,12 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from imutool.bias.model import COLUMNS, BiasModel, Sensor
+from imutool.bias.model import COLUMNS, BiasModel
 from imutool.errors import DataError
 from imutool.inertial.strapdown import GRAVITY_W
 from imutool.inertial.windows import HUBER_MEDIANS, attitudes, between, huber_weight, rotation_residual, velocity_residual
 from imutool.training.segments import Part, Pool, Windows
+from imutool.units import Sensor
 
 W_PRIOR = 0.05  # plausible misalignment; a scale error of 0.1 is two of these
 REST_PRIOR = {"gyro": 0.1, "accel": 1.0}  # rad/s, m/s²: plausible turn-on biases

@@ -8,8 +8,9 @@ from dataclasses import replace
 import torch
 
 from imutool.bias import static
-from imutool.bias.model import SENSORS, BiasModel, Segment, Sensor
+from imutool.bias.model import BiasModel, Segment
 from imutool.training.segments import Part, Pool
+from imutool.units import SENSORS, Sensor
 
 CHUNK = 8192  # samples at a time: what is in memory does not depend on how long a log is
 

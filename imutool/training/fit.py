@@ -21,7 +21,7 @@ from torch import Tensor
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
 from imutool import registry
-from imutool.bias.model import COLUMNS, SENSORS, BiasModel, Sensor
+from imutool.bias.model import COLUMNS, BiasModel
 from imutool.config import build
 from imutool.errors import DataError, NumericsError
 from imutool.recording import Recording
@@ -34,6 +34,7 @@ from imutool.training.objective import Objective, WindowEnds
 from imutool.training.segments import Pool
 from imutool.training.settings import TrainSettings, settings_for
 from imutool.training.tracks import Tracks
+from imutool.units import SENSORS, Sensor
 
 __all__ = ["Epoch", "Stage", "TrainSettings", "Training"]
 

@@ -13,11 +13,12 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from imutool.bias.model import BiasModel, Sensor
+from imutool.bias.model import BiasModel
 from imutool.geometry import so3
 from imutool.inertial.strapdown import GRAVITY_W
 from imutool.inertial.windows import HUBER_MEDIANS, attitudes, between, end_attitude, huber
 from imutool.training.segments import Windows
+from imutool.units import Sensor
 
 
 def orientation_error(model: BiasModel, windows: Windows) -> Float[Tensor, " batch"]:

@@ -12,12 +12,13 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from imutool.bias.model import BiasModel, Sensor
+from imutool.bias.model import BiasModel
 from imutool.training.closed_form import median_per_log
 from imutool.training.loss import RobustLoss, error
 from imutool.training.segments import Pool
 from imutool.training.settings import TrainSettings
 from imutool.training.tracks import Tracks
+from imutool.units import Sensor
 
 USUAL_SAMPLES = 200_000  # enough for a median
 BATCH = 64  # windows at a time where no gradient is kept

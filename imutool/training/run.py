@@ -12,7 +12,7 @@ import torch
 
 from imutool import __version__, registry
 from imutool.bias import hybrid, io, neural_ode, static
-from imutool.bias.model import SENSORS, BiasModel
+from imutool.bias.model import BiasModel
 from imutool.config import plain
 from imutool.errors import ConfigError
 from imutool.mcap_io.read import read
@@ -23,6 +23,7 @@ from imutool.training.fit import Epoch, Training
 from imutool.training.physics_first import PhysicsFirst, config_of, described, helps
 from imutool.training.segments import Pool
 from imutool.training.settings import TrainSettings, settings_for
+from imutool.units import SENSORS
 
 UNITS = {"gyro": "rad", "accel": "m/s"}
 

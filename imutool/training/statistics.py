@@ -10,13 +10,14 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from imutool.bias.model import COLUMNS, SENSORS, BiasModel, Segment, Sensor
+from imutool.bias.model import COLUMNS, BiasModel, Segment
 from imutool.bias_start.bias_from_truth import truth_offset
 from imutool.bias_start.initial_bias import TRUTH_S, rest_spread
 from imutool.inertial.stationary import white_noise
 from imutool.training import closed_form
 from imutool.training.corrected import corrected
 from imutool.training.segments import Pool
+from imutool.units import SENSORS, Sensor
 
 MAD_TO_STD = 1.4826
 ONE_RUN_STD = {"gyro": 5e-3, "accel": 0.1}  # run-to-run spread when there is one run to judge by, rad/s and m/s²

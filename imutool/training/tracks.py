@@ -9,8 +9,9 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
-from imutool.bias.model import COLUMNS, SENSORS, Sensor
+from imutool.bias.model import COLUMNS
 from imutool.training.segments import Pool
+from imutool.units import SENSORS, Sensor
 
 TRACK_UNIT = {"gyro": 1e-1, "accel": 1.0}  # one unit of a track's parameter, rad/s and m/s²
 TRACK_WALK = {"gyro": 1e-4, "accel": 2e-3}  # how far a rest bias may walk in a second^1/2, rad/s and m/s²

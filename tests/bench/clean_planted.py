@@ -12,9 +12,9 @@ from pathlib import Path
 
 import numpy as np
 
-sys.path.insert(0, str(Path(__file__).parents[1] / "cleaning"))
+sys.path.insert(0, str(Path(__file__).parents[1] / "support"))
 
-from defects import late, messages, repeated, with_values, without
+from imu_defects import late, messages, repeated, with_values, without
 
 from imutool.cleaning import survey
 from imutool.cleaning.first_pass import examine

@@ -26,7 +26,7 @@ from imutool.viewing.rerun import layout, scene
 from imutool.viewing.rerun.entities.styles import RAW_FADE, XYZ, blend_to_grey
 from imutool.viewing.rerun.web import export
 
-VIEWERS = SimpleNamespace(**runpy.run_path(str(Path(__file__).parents[1] / "viewers.py")))
+VIEWERS = SimpleNamespace(**runpy.run_path(str(Path(__file__).parents[1] / "support" / "viewers.py")))
 
 SIZE = (1280, 720)
 COLORS = 256

@@ -18,8 +18,8 @@ from jaxtyping import Float64
 from scipy.signal import butter, sosfiltfilt
 from sensor_tables import markdown
 
-from imutool.diagnosis.alignment import with_truth
-from imutool.diagnosis.gauss_newton import expected
+from imutool.diagnosis.estimation.alignment import with_truth
+from imutool.diagnosis.estimation.gauss_newton import expected
 from imutool.mcap_io.read import read
 from imutool.sensor.trajectory import smooth_motion
 

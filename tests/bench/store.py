@@ -56,7 +56,7 @@ def mixed(path: Path) -> Path:
 
 def main() -> None:
     """Measures and prints."""
-    store = runpy.run_path(str(Path(__file__).parents[1] / "object_store.py"))["Store"]()
+    store = runpy.run_path(str(Path(__file__).parents[1] / "support" / "object_store.py"))["Store"]()
     os.environ.update(store.environment)
     with tempfile.TemporaryDirectory() as folder:
         source = Path(sys.argv[1]) if len(sys.argv) > 1 else mixed(Path(folder) / "mixed.mcap")

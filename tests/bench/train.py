@@ -43,7 +43,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from imutool.bias.model import COLUMNS, BiasModel, Sensor
+from imutool.bias.model import COLUMNS, BiasModel
 from imutool.bias.ode import HermitePath, Method, integrate
 from imutool.demo import write_asl
 from imutool.geometry import so3
@@ -54,6 +54,7 @@ from imutool.sensor.flight import flight
 from imutool.training.fit import Training, TrainSettings
 from imutool.training.loss import RobustLoss, error
 from imutool.training.segments import Windows
+from imutool.units import Sensor
 
 STAGES: tuple[Sensor, Sensor] = ("gyro", "accel")
 UNITS = {"gyro": "rad", "accel": "m/s"}

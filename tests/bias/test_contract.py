@@ -21,8 +21,9 @@ from safetensors.torch import save_file
 from imutool import registry
 from imutool.bias import io
 from imutool.bias.io import MAX_BYTES, check_rate, find_model, header_of, load, save
-from imutool.bias.model import SENSORS, BiasModel, Segment
+from imutool.bias.model import BiasModel, Segment
 from imutool.errors import ConfigError, ModelError
+from imutool.units import SENSORS
 
 MakeSegment = Callable[..., Segment]
 RATE_HZ = 200.0

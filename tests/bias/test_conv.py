@@ -17,8 +17,9 @@ from torch import Tensor
 
 from imutool.bias.conv import BLOCK, LEAST_SCALE, Config, Layer, Model, Net
 from imutool.bias.io import load, save
-from imutool.bias.model import COLUMNS, SENSORS, BiasModel, Segment, Sensor
+from imutool.bias.model import COLUMNS, BiasModel, Segment
 from imutool.errors import ConfigError
+from imutool.units import SENSORS, Sensor
 
 MakeSegment = Callable[..., Segment]
 CONTEXT = 510  # (7 - 1) * (1 + 4 + 16 + 64)

@@ -11,7 +11,7 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from imutool.bias.model import COLUMNS, BiasModel, Segment, Sensor
+from imutool.bias.model import COLUMNS, BiasModel, Segment
 from imutool.bias.neural_ode import DRIFT_SEES_S, SLOW_S, Config, Curve, Drift, Model
 from imutool.bias.neural_stream import Curves
 from imutool.bias.ode import HermitePath, integrate
@@ -19,6 +19,7 @@ from imutool.geometry import so3
 from imutool.inertial.windows import attitudes
 from imutool.recording import seconds
 from imutool.sensor.flight import flight
+from imutool.units import Sensor
 
 RATE_HZ = 200.0
 SECONDS = 20.0

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from defects import batch_of, cut, late, pick, repeated, with_values
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from support.imu_defects import batch_of, cut, late, pick, repeated, with_values
 
 from imutool.cleaning.cleaner import Cleaner
 from imutool.cleaning.first_pass import Survey, examine

@@ -7,7 +7,7 @@ from types import ModuleType
 
 import numpy as np
 import pytest
-from defects import batch_of, late, repeated, with_values, without
+from support.imu_defects import batch_of, late, repeated, with_values, without
 
 from imutool.cleaning.first_pass import Survey, examine
 from imutool.cleaning.truth import Truth

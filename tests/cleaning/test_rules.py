@@ -7,7 +7,7 @@ from itertools import combinations
 
 import numpy as np
 import pytest
-from defects import batch_of, late, pick, repeated, with_values, without
+from support.imu_defects import batch_of, late, pick, repeated, with_values, without
 
 from imutool.cleaning.finding import Finding
 from imutool.cleaning.first_pass import Survey, examine

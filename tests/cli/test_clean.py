@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from defects import messages, repeated, with_values, without, write_log
+from support.imu_defects import messages, repeated, with_values, without, write_log
 
 from imutool.cleaning import Rules, survey
 from imutool.debiasing import debias

@@ -3,21 +3,20 @@
 from __future__ import annotations
 
 import json
-import runpy
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from support import diagnoses
 from typer.testing import CliRunner, Result
 
 from imutool import diagnosis_output
 from imutool.cli import app
-from imutool.diagnosis import unnamed
+from imutool.diagnosis.estimation import unnamed_effects as unnamed
 from imutool.diagnosis.result import Curve, Diagnosis, Estimate, Finding, HeldOut
 from imutool.diagnosis.to_physics_file import found
 from imutool.diagnosis.wording import conclusion
@@ -28,10 +27,8 @@ from imutool.recording import Recording
 from imutool.sensor import physics_file
 from imutool.sensor.flight import flight
 from imutool.sensor.physics_file import Bias, Entry, PhysicsFile, Value
-from imutool.sensor.readings import SensorSamples
+from imutool.sensor.samples import SensorSamples
 from imutool.sensor.simulate import simulate
-
-MADE = SimpleNamespace(**runpy.run_path(str(Path(__file__).parents[1] / "diagnosis" / "diagnoses.py")))
 
 ARM_M = np.array([0.2, -0.1, 0.05])
 GYRO_BIAS, ACCEL_BIAS = (0.01, -0.02, 0.005), (0.1, 0.05, -0.08)
@@ -176,18 +173,18 @@ def test_what_cannot_be_diagnosed_is_refused(
 
 def test_other_files_in_the_folder_stay(tmp_path: Path) -> None:
     (tmp_path / "real.mcap").write_bytes(b"mine")
-    assert diagnosis_output.write(MADE.NOTHING, tmp_path) == []
-    assert diagnosis_output.write(MADE.ARM, tmp_path, overwrite=True) == []
+    assert diagnosis_output.write(diagnoses.NOTHING, tmp_path) == []
+    assert diagnosis_output.write(diagnoses.ARM, tmp_path, overwrite=True) == []
     assert (tmp_path / "real.mcap").read_bytes() == b"mine"
     without_logs = {*diagnosis_output.FILES, "real.mcap"} - {diagnosis_output.LOG}
     assert {path.name for path in tmp_path.iterdir()} == without_logs
-    assert json.loads((tmp_path / "findings.json").read_text()) == diagnosis_output.plain(MADE.ARM)
+    assert json.loads((tmp_path / "findings.json").read_text()) == diagnosis_output.plain(diagnoses.ARM)
 
 
 def test_an_absent_extra_costs_its_file_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    diagnosis_output.write(MADE.ARM, tmp_path / "out")
+    diagnosis_output.write(diagnoses.ARM, tmp_path / "out")
     monkeypatch.setitem(sys.modules, "rerun", None)
-    (remark,) = diagnosis_output.write(MADE.NOTHING, tmp_path / "out", overwrite=True)
+    (remark,) = diagnosis_output.write(diagnoses.NOTHING, tmp_path / "out", overwrite=True)
     assert remark == "view.rrd is left out: rerun is not installed (pip install 'imutool[view]')"
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["findings.json", "physics.toml", "report.html"]
 
@@ -198,15 +195,15 @@ def test_nothing_is_left_of_what_was_interrupted(tmp_path: Path, monkeypatch: py
 
     monkeypatch.setattr("imutool.viewing.rerun.diagnosis.save", interrupted)
     with pytest.raises(KeyboardInterrupt):
-        diagnosis_output.write(MADE.ARM, tmp_path / "out")
+        diagnosis_output.write(diagnoses.ARM, tmp_path / "out")
     assert list(tmp_path.iterdir()) == []
 
 
 def test_what_is_no_number_is_null_in_the_json() -> None:
     endless = {"gyro_limit": Estimate(np.inf, np.nan, "rad/s"), "accel_limit": Estimate(80.0, 0.1, "m/s²")}
-    told = diagnosis_output.plain(replace(MADE.ARM, findings=(finding("saturation", "accel", endless),)))
+    told = diagnosis_output.plain(replace(diagnoses.ARM, findings=(finding("saturation", "accel", endless),)))
     assert told["findings"][0]["parameters"]["gyro_limit"] == {"value": None, "std": None, "unit": "rad/s"}
-    (entry,) = found(replace(MADE.ARM, findings=(finding("saturation", "accel", endless),))).effect
+    (entry,) = found(replace(diagnoses.ARM, findings=(finding("saturation", "accel", endless),))).effect
     assert list(entry.parameters) == ["accel_limit"]
 
 
@@ -218,17 +215,17 @@ def finding(effect: str, signal: str, parameters: dict[str, Estimate], equation:
 
 
 def only(*findings: Finding) -> Diagnosis:
-    return replace(MADE.ARM, findings=findings, bias=np.zeros((1, 6)))
+    return replace(diagnoses.ARM, findings=findings, bias=np.zeros((1, 6)))
 
 
 def test_a_null_diagnosis_is_a_bias_alone() -> None:
-    file = found(MADE.NOTHING)
+    file = found(diagnoses.NOTHING)
     assert file.effect == ()
     assert file.term == ()
     assert file.unknown == ()
     assert file.bias is not None
-    assert [*file.bias.gyro, *file.bias.accel] == MADE.NOTHING.bias[0].tolist()
-    assert conclusion(MADE.NOTHING).startswith("Nothing")
+    assert [*file.bias.gyro, *file.bias.accel] == diagnoses.NOTHING.bias[0].tolist()
+    assert conclusion(diagnoses.NOTHING).startswith("Nothing")
 
 
 @pytest.mark.parametrize("effect", ["dropped_samples", "timestamp_jitter", "reference_error"])

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import json
 import re
-import runpy
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 from urllib.parse import unquote
 
 import pytest
+from support import diagnoses
 from typer.testing import CliRunner, Result
 
 from imutool import diagnosis_output
@@ -24,7 +23,6 @@ from imutool.fleet.work import stands, work
 from imutool.location import identity
 from imutool.viewing.html import report, report_paths
 
-MADE = SimpleNamespace(**runpy.run_path(str(Path(__file__).parents[1] / "diagnosis" / "diagnoses.py")))
 HOSTILE = "a#b?<b>&'%41"
 
 
@@ -75,7 +73,7 @@ def test_a_page_of_the_logs_that_cannot_be_drawn_costs_no_diagnosis(tmp_path: Pa
         assert (folder / diagnosis_output.FINDINGS).is_file()
         raise DataError("too little truth")
 
-    (remark,) = diagnosis_output.write(replace(MADE.NOTHING, traces=()), tmp_path / "out", logs=look)
+    (remark,) = diagnosis_output.write(replace(diagnoses.NOTHING, traces=()), tmp_path / "out", logs=look)
     assert remark.startswith("log.html is left out: too little truth")
     assert "href" not in (tmp_path / "out" / diagnosis_output.REPORT).read_text()
     assert not (tmp_path / "out" / diagnosis_output.LOG).exists()

@@ -2,18 +2,14 @@
 
 from __future__ import annotations
 
-import runpy
-from pathlib import Path
-from types import SimpleNamespace
-
 import numpy as np
 from scipy.signal import lfilter
+from support import planted
 
-from imutool.diagnosis.block_scatter import Scatter, scatter
-from imutool.diagnosis.gauss_newton import Fit, WhitenedLog, fit
+from imutool.diagnosis.estimation.block_scatter import Scatter, scatter
+from imutool.diagnosis.estimation.gauss_newton import Fit, WhitenedLog, fit
 
-PLANTED = SimpleNamespace(**runpy.run_path(str(Path(__file__).with_name("planted.py"))))
-FELT = PLANTED.shaken(duration_s=45.0)
+FELT = planted.shaken(duration_s=45.0)
 SEEDS = 16
 LASTS = 0.98  # from one sample at 100 Hz to the next: half a second
 SPREAD = (0.7, 1.35)  # of sixteen times three numbers of unit variance, not quite independent
@@ -25,9 +21,9 @@ def noisy(seed: int, lasting: bool) -> tuple[WhitenedLog, Fit, Scatter]:
     added = None
     if lasting:
         white = np.random.default_rng([seed, 11]).normal(size=(len(FELT.t_s), 6))
-        added = 2.0 * PLANTED.NOISE * lfilter([np.sqrt(1.0 - LASTS**2)], [1.0, -LASTS], white, axis=0)
-    log = PLANTED.weighed(PLANTED.pair(FELT, {"gyro_scale": SCALE}, seed, added=added))
-    found = fit([log], PLANTED.acting({"gyro_scale": [0.0] * 3}), part="all")
+        added = 2.0 * planted.NOISE * lfilter([np.sqrt(1.0 - LASTS**2)], [1.0, -LASTS], white, axis=0)
+    log = planted.weighed(planted.pair(FELT, {"gyro_scale": SCALE}, seed, added=added))
+    found = fit([log], planted.acting({"gyro_scale": [0.0] * 3}), part="all")
     return log, found, scatter([log], found, "all")
 
 
@@ -59,7 +55,7 @@ def test_a_gain_is_as_likely_as_it_comes_where_noise_lasts() -> None:
     often = {"blocks": 0, "squares": 0}
     for seed in range(SEEDS):
         log, _, _ = noisy(seed, lasting=True)
-        start = PLANTED.acting({"gyro_scale": SCALE, "gyro_quadratic": [0.0] * 3})
+        start = planted.acting({"gyro_scale": SCALE, "gyro_quadratic": [0.0] * 3})
         whole, without = fit([log], start, part="all"), fit([log], start[:1], part="all")
         gain = without.objective - whole.objective
         often["blocks"] += scatter([log], whole, "all").chance("gyro_quadratic", gain, 3) < np.log(0.05)
@@ -69,8 +65,8 @@ def test_a_gain_is_as_likely_as_it_comes_where_noise_lasts() -> None:
 
 
 def test_a_time_at_which_something_begins_is_taken_as_it_is() -> None:
-    log = PLANTED.weighed(PLANTED.pair(FELT, {"clock_jump": [21.3, 0.02]}))
-    found = fit([log], PLANTED.acting({"clock_jump": [20.0, 0.01]}), part="all")
+    log = planted.weighed(planted.pair(FELT, {"clock_jump": [21.3, 0.02]}))
+    found = fit([log], planted.acting({"clock_jump": [20.0, 0.01]}), part="all")
     seen = scatter([log], found, "all")
     begins, step = seen.std["clock_jump"]
     assert begins == found.stds()["clock_jump"][0]
@@ -78,17 +74,17 @@ def test_a_time_at_which_something_begins_is_taken_as_it_is() -> None:
 
 
 def test_logs_lend_each_other_their_blocks() -> None:
-    logs = [PLANTED.weighed(PLANTED.pair(FELT, {"gyro_scale": SCALE}, seed)) for seed in range(2)]
-    begun = PLANTED.acting({"gyro_scale": [0.0] * 3})
+    logs = [planted.weighed(planted.pair(FELT, {"gyro_scale": SCALE}, seed)) for seed in range(2)]
+    begun = planted.acting({"gyro_scale": [0.0] * 3})
     one, both = (scatter(some, fit(some, begun, part="all"), "all") for some in (logs[:1], logs))
     assert both.blocks["gyro_scale"] > 1.4 * one.blocks["gyro_scale"]
     assert (both.std["gyro_scale"] < one.std["gyro_scale"]).all()
 
 
 def test_what_the_motion_does_not_show_stays_unsure() -> None:
-    felt = PLANTED.planar(60.0)
-    log = PLANTED.weighed(PLANTED.pair(felt, {"gyro_scale": [0.0, 0.0, 0.02]}))
-    found = fit([log], PLANTED.acting({"gyro_scale": [0.0] * 3}), part="all")
+    felt = planted.planar(60.0)
+    log = planted.weighed(planted.pair(felt, {"gyro_scale": [0.0, 0.0, 0.02]}))
+    found = fit([log], planted.acting({"gyro_scale": [0.0] * 3}), part="all")
     std = scatter([log], found, "all").std["gyro_scale"]
     assert (std[:2] > 0.1).all()
     assert std[2] < 1e-3

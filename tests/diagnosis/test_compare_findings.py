@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import runpy
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from support import planted
 
 from imutool.diagnosis.compare_findings import ANOTHER_MOTION, remarks, shared
 from imutool.diagnosis.diagnose import diagnose
@@ -17,7 +16,6 @@ from imutool.diagnosis.result import Curve, Estimate, Finding, HeldOut
 from imutool.errors import DataError
 from imutool.mcap_io.write import write
 
-PLANTED = SimpleNamespace(**runpy.run_path(str(Path(__file__).with_name("planted.py"))))
 ARM, SCALE = [0.2, -0.05, 0.1], [0.02, 0.0, -0.015]
 SURE = 6.0  # of stated deviations: differentiated poses lack a little of the motion
 
@@ -29,11 +27,11 @@ def finding(effect: str = "gyro_scale", x: float = 0.02, std: float = 1e-4, **mo
 
 
 def log(folder: Path, name: str, seed: int, effects: Mapping[str, Sequence[float]], *, poses: bool = True) -> Path:
-    felt = PLANTED.rich(seed)
-    samples = PLANTED.ideal(felt, PLANTED.acting(effects)) + PLANTED.noise(len(felt.t_s), seed) + PLANTED.BIAS
-    truth = PLANTED.poses(PLANTED.moving(seed), PLANTED.clock(rate_hz=200.0)) if poses else None
+    felt = planted.rich(seed)
+    samples = planted.ideal(felt, planted.acting(effects)) + planted.noise(len(felt.t_s), seed) + planted.BIAS
+    truth = planted.poses(planted.moving(seed), planted.clock(rate_hz=200.0)) if poses else None
     path = folder / f"{name}.mcap"
-    write(PLANTED.recording(name, felt.t_s, samples, poses=truth), path)
+    write(planted.recording(name, felt.t_s, samples, poses=truth), path)
     return path
 
 

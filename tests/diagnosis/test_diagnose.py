@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import json
-import runpy
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
+from support import planted
 
 from imutool.diagnosis.diagnose import diagnose
 from imutool.diagnosis.result import Diagnosis
@@ -19,7 +18,6 @@ from imutool.errors import DataError, LogError
 from imutool.mcap_io.read import read
 from imutool.mcap_io.write import write
 
-PLANTED = SimpleNamespace(**runpy.run_path(str(Path(__file__).with_name("planted.py"))))
 SURE = 4.0
 ARM = [0.2, -0.05, 0.1]
 FLOOR = 0.15  # how well a noise level is known from twenty seconds
@@ -43,22 +41,22 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Made:
         lsb: np.ndarray | None = None,
         sim_seed: int | None = None,
     ) -> tuple[Path, Path]:
-        folder, felt = tmp_path_factory.mktemp("pair"), PLANTED.rich(seed)
-        real = PLANTED.ideal(felt, PLANTED.acting(effects or {})) + PLANTED.noise(len(felt.t_s), seed) + PLANTED.BIAS
+        folder, felt = tmp_path_factory.mktemp("pair"), planted.rich(seed)
+        real = planted.ideal(felt, planted.acting(effects or {})) + planted.noise(len(felt.t_s), seed) + planted.BIAS
         if added is not None:
             real = real + added(felt)
         if lsb is not None:
             real = lsb * np.round(real / lsb)
         rows = np.ones(len(real), bool) if keep is None else keep
-        path = PLANTED.moving(seed)
-        truth = PLANTED.poses(path, PLANTED.clock(rate_hz=SIM_HZ)) if real_poses else None
-        recording = PLANTED.recording(name, felt.t_s[rows], real[rows], poses=truth)
-        t_sim = PLANTED.clock(rate_hz=SIM_HZ)
-        path = PLANTED.moving(seed if sim_seed is None else sim_seed)
+        path = planted.moving(seed)
+        truth = planted.poses(path, planted.clock(rate_hz=SIM_HZ)) if real_poses else None
+        recording = planted.recording(name, felt.t_s[rows], real[rows], poses=truth)
+        t_sim = planted.clock(rate_hz=SIM_HZ)
+        path = planted.moving(seed if sim_seed is None else sim_seed)
         imu = path.imu(path.start_ns + np.round(t_sim * 1e9).astype(np.int64))
-        sim = np.concatenate([imu.gyro, imu.accel], axis=1) + (PLANTED.noise(len(t_sim), seed + 99) if sim_noise else 0.0)
+        sim = np.concatenate([imu.gyro, imu.accel], axis=1) + (planted.noise(len(t_sim), seed + 99) if sim_noise else 0.0)
         write(recording, folder / f"{name}.mcap")
-        write(PLANTED.recording("sim", t_sim, sim, poses=PLANTED.poses(path, t_sim)), folder / "sim.mcap")
+        write(planted.recording("sim", t_sim, sim, poses=planted.poses(path, t_sim)), folder / "sim.mcap")
         return folder / f"{name}.mcap", folder / "sim.mcap"
 
     return make
@@ -103,8 +101,8 @@ def test_noise_and_a_constant_bias_are_no_mismatch(nothing: tuple[Path, Path, Di
     assert found.findings == ()
     assert found.located == ()
     assert found.not_identifiable == ()
-    assert (np.abs(found.bias[0] - PLANTED.BIAS) < 6 * PLANTED.NOISE / np.sqrt(2000)).all()
-    for signal, noise in (("gyro", PLANTED.NOISE[0]), ("accel", PLANTED.NOISE[3])):
+    assert (np.abs(found.bias[0] - planted.BIAS) < 6 * planted.NOISE / np.sqrt(2000)).all()
+    for signal, noise in (("gyro", planted.NOISE[0]), ("accel", planted.NOISE[3])):
         assert found.unexplained[signal].white
         assert found.unexplained[signal].noise_floor == pytest.approx(noise, rel=FLOOR)
         assert found.unexplained[signal].rms == pytest.approx(noise, rel=FLOOR)
@@ -181,8 +179,8 @@ def test_a_lever_arm_is_named_sized_placed_and_removed(arm: tuple[Path, Path, Di
     assert one.share > 0.9
     assert one.p_value < 1e-12
     assert one.false_discovery_rate < 0.01
-    assert one.held_out.rms_before > 5 * PLANTED.NOISE[3]
-    assert one.held_out.rms_after == pytest.approx(PLANTED.NOISE[3], rel=FLOOR)
+    assert one.held_out.rms_before > 5 * planted.NOISE[3]
+    assert one.held_out.rms_after == pytest.approx(planted.NOISE[3], rel=FLOOR)
     assert 4.0 < one.held_out.seconds < 12.0  # about a third of 24 s
     closer = found.closer["accel"]
     assert closer.by == "second simulation"
@@ -192,7 +190,7 @@ def test_a_lever_arm_is_named_sized_placed_and_removed(arm: tuple[Path, Path, Di
     assert [place.signal for place in found.located] == ["accel"]
     (trace,) = found.traces
     assert trace.real.shape == trace.before.shape == trace.after.shape
-    assert (trace.real - trace.after)[:, 3:].std() < 1.1 * PLANTED.NOISE[3] < (trace.real - trace.before)[:, 3:].std()
+    assert (trace.real - trace.after)[:, 3:].std() < 1.1 * planted.NOISE[3] < (trace.real - trace.before)[:, 3:].std()
 
 
 def test_a_pair_is_named_whole_strongest_first(made: Made) -> None:

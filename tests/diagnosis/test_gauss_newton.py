@@ -2,19 +2,15 @@
 
 from __future__ import annotations
 
-import runpy
-from pathlib import Path
-from types import SimpleNamespace
-
 import numpy as np
 import pytest
+from support import planted
 
-from imutool.diagnosis.forward_cache import bound, free
-from imutool.diagnosis.gauss_newton import PATIENCE, PRIOR, Fit, expected, fit
-from imutool.diagnosis.jacobians import Slopes
+from imutool.diagnosis.estimation.forward_cache import bound, free
+from imutool.diagnosis.estimation.gauss_newton import PATIENCE, PRIOR, Fit, expected, fit
+from imutool.diagnosis.estimation.jacobians import Jacobians
 from imutool.sensor import catalogue
 
-PLANTED = SimpleNamespace(**runpy.run_path(str(Path(__file__).with_name("planted.py"))))
 SURE = 4.0  # standard deviations: 1 in 16 000 outside
 SEEDS = 20
 SAME = 0.1  # of a standard deviation, or a square: kept derivatives are right to a few per cent of what noise does
@@ -36,18 +32,22 @@ EFFECTS: dict[str, dict[str, tuple[list[float], list[float]]]] = {  # what is pl
 }
 
 
-def planted(effects: dict[str, tuple[list[float], list[float]]], seed: int) -> tuple[Fit, dict[str, np.ndarray]]:
+def fit_of_planted(effects: dict[str, tuple[list[float], list[float]]], seed: int) -> tuple[Fit, dict[str, np.ndarray]]:
     """A fit, and by effect how far the parameters are from the planted ones in stated standard deviations."""
-    felt = PLANTED.rich()
-    pair = PLANTED.pair(felt, {name: truth for name, (truth, _) in effects.items()}, seed)
-    got = fit([PLANTED.weighed(pair)], PLANTED.acting({name: start for name, (_, start) in effects.items()}), iterations=12)
+    felt = planted.rich()
+    pair = planted.pair(felt, {name: truth for name, (truth, _) in effects.items()}, seed)
+    got = fit(
+        [planted.weighed(pair)],
+        planted.acting({name: start for name, (_, start) in effects.items()}),
+        iterations=12,
+    )
     stds = got.stds()
     return got, {p.name: (theta - np.array(effects[p.name][0])) / stds[p.name] for p, theta in got.chosen}
 
 
 @pytest.mark.parametrize("name", EFFECTS)
 def test_planted_parameters_come_back_within_their_uncertainty(name: str) -> None:
-    got, z = planted(EFFECTS[name], 3)
+    got, z = fit_of_planted(EFFECTS[name], 3)
     for effect, scores in z.items():
         assert np.abs(scores).max() < SURE, f"{effect}: {scores}"
         truth = np.abs(EFFECTS[name][effect][0]).max()
@@ -56,36 +56,36 @@ def test_planted_parameters_come_back_within_their_uncertainty(name: str) -> Non
 
 @pytest.mark.parametrize("name", ["arm and clock", "gyro scale", "low pass"])
 def test_uncertainties_are_calibrated(name: str) -> None:
-    scores = np.concatenate([np.concatenate(list(planted(EFFECTS[name], seed)[1].values())) for seed in range(SEEDS)])
+    scores = np.concatenate([np.concatenate(list(fit_of_planted(EFFECTS[name], seed)[1].values())) for seed in range(SEEDS)])
     rms = float(np.sqrt(np.mean(scores**2)))
     assert CALIBRATED[0] < rms < CALIBRATED[1], f"{rms:.2f} over {len(scores)}"
 
 
 def test_what_is_left_of_the_right_model_is_noise() -> None:
-    got, _ = planted(EFFECTS["arm and clock"], 5)
+    got, _ = fit_of_planted(EFFECTS["arm and clock"], 5)
     n = 6 * got.rows
     assert abs(got.objective - n) < SURE * np.sqrt(2 * n)
 
 
 def test_biases_come_back_beside_the_effects() -> None:
-    got, _ = planted(EFFECTS["lever arm"], 6)
-    assert (np.abs(got.bias[0] - PLANTED.BIAS) < 2 * SURE * PLANTED.NOISE / np.sqrt(got.rows)).all()
+    got, _ = fit_of_planted(EFFECTS["lever arm"], 6)
+    assert (np.abs(got.bias[0] - planted.BIAS) < 2 * SURE * planted.NOISE / np.sqrt(got.rows)).all()
 
 
 def test_without_effects_the_bias_is_the_mean_of_what_is_left() -> None:
-    felt = PLANTED.rich()
-    pair = PLANTED.pair(felt, None, 7)
-    got = fit([PLANTED.weighed(pair)], ())
+    felt = planted.rich()
+    pair = planted.pair(felt, None, 7)
+    got = fit([planted.weighed(pair)], ())
     left = (pair.real - expected(pair, ()))[pair.fitted]
     np.testing.assert_allclose(got.bias[0], left.mean(axis=0), rtol=1e-4)  # but for a weak prior
     assert got.covariance.shape == (0, 0)
-    assert got.names == ()
+    assert got.keys == ()
 
 
 def test_what_a_planar_motion_does_not_excite_stays_at_nothing_and_says_so() -> None:
-    misalignment, arm = PLANTED.acting({"gyro_misalignment": [0.0] * 6, "lever_arm": [0.0] * 3})
-    pair = PLANTED.pair(PLANTED.planar(), {"gyro_misalignment": [0, 0.02, 0, -0.03, 0, 0], "lever_arm": [0.3, 0.1, 0.0]}, 8)
-    got = fit([PLANTED.weighed(pair)], (misalignment, arm))
+    misalignment, arm = planted.acting({"gyro_misalignment": [0.0] * 6, "lever_arm": [0.0] * 3})
+    pair = planted.pair(planted.planar(), {"gyro_misalignment": [0, 0.02, 0, -0.03, 0, 0], "lever_arm": [0.3, 0.1, 0.0]}, 8)
+    got = fit([planted.weighed(pair)], (misalignment, arm))
     stds = got.stds()
     names = [number.name for number in misalignment[0].parameters]
     for name, value, std in zip(names, got.chosen[0][1], stds["gyro_misalignment"], strict=True):
@@ -103,16 +103,16 @@ def test_what_a_planar_motion_does_not_excite_stays_at_nothing_and_says_so() -> 
 
 def test_two_logs_share_parameters_and_keep_biases_of_their_own() -> None:
     truth = np.array([0.2, -0.05, 0.1])
-    biases = np.array([PLANTED.BIAS, -2.0 * PLANTED.BIAS])
+    biases = np.array([planted.BIAS, -2.0 * planted.BIAS])
     logs = [
-        PLANTED.weighed(PLANTED.pair(PLANTED.rich(seed), {"lever_arm": truth}, seed, bias=bias))
+        planted.weighed(planted.pair(planted.rich(seed), {"lever_arm": truth}, seed, bias=bias))
         for seed, bias in zip((1, 2), biases, strict=True)
     ]
-    begun = PLANTED.acting({"lever_arm": [0.0] * 3})
+    begun = planted.acting({"lever_arm": [0.0] * 3})
     both, alone = fit(logs, begun), [fit([log], begun) for log in logs]
     std = both.stds()["lever_arm"]
     assert np.abs((both.chosen[0][1] - truth) / std).max() < SURE
-    assert (np.abs(both.bias - biases) < 2 * SURE * PLANTED.NOISE / np.sqrt(both.rows / 2)).all()
+    assert (np.abs(both.bias - biases) < 2 * SURE * planted.NOISE / np.sqrt(both.rows / 2)).all()
     information = sum(one.stds()["lever_arm"] ** -2.0 for one in alone)
     np.testing.assert_allclose(std, information**-0.5, rtol=0.1)  # but for correlations between the axes
 
@@ -120,45 +120,45 @@ def test_two_logs_share_parameters_and_keep_biases_of_their_own() -> None:
 def test_a_constant_in_one_log_alone_is_no_effect_of_both() -> None:
     """g-sensitivity is a bias where nothing tilts: only a bias for each log keeps two logs of a planar motion apart."""
     logs = [
-        PLANTED.weighed(PLANTED.pair(PLANTED.planar(), None, seed, bias=bias))
-        for seed, bias in ((1, PLANTED.BIAS), (2, -PLANTED.BIAS))
+        planted.weighed(planted.pair(planted.planar(), None, seed, bias=bias))
+        for seed, bias in ((1, planted.BIAS), (2, -planted.BIAS))
     ]
-    got = fit(logs, PLANTED.acting({"gyro_g_sensitivity": [0.0] * 9}))
+    got = fit(logs, planted.acting({"gyro_g_sensitivity": [0.0] * 9}))
     assert (np.abs(got.chosen[0][1]) < SURE * got.stds()["gyro_g_sensitivity"]).all()
     assert (np.abs(got.chosen[0][1].reshape(3, 3)[:, 2]) < 1e-4).all()  # what always feels +g
 
 
 def test_held_out_rows_do_not_enter_a_fit() -> None:
-    felt = PLANTED.rich()
-    pair = PLANTED.pair(felt, {"lever_arm": [0.2, -0.05, 0.1]}, 9)
-    begun = PLANTED.acting({"lever_arm": [0.0] * 3})
-    here = fit([PLANTED.weighed(pair)], begun)
+    felt = planted.rich()
+    pair = planted.pair(felt, {"lever_arm": [0.2, -0.05, 0.1]}, 9)
+    begun = planted.acting({"lever_arm": [0.0] * 3})
+    here = fit([planted.weighed(pair)], begun)
     pair.real[~pair.fitted] += 100.0
-    there = fit([PLANTED.weighed(pair)], begun)
+    there = fit([planted.weighed(pair)], begun)
     np.testing.assert_array_equal(here.chosen[0][1], there.chosen[0][1])
     assert here.rows == there.rows == int(pair.fitted.sum())
 
 
 @pytest.mark.parametrize("part", ["fitted", "held_out", "all"])
 def test_each_part_gives_the_same_answer_but_for_its_noise(part: str) -> None:
-    pair = PLANTED.pair(PLANTED.rich(), {"clock_offset": [0.02]}, 10)
-    got = fit([PLANTED.weighed(pair)], PLANTED.acting({"clock_offset": [0.0]}), part=part)
+    pair = planted.pair(planted.rich(), {"clock_offset": [0.02]}, 10)
+    got = fit([planted.weighed(pair)], planted.acting({"clock_offset": [0.0]}), part=part)
     assert abs(got.chosen[0][1][0] - 0.02) < SURE * got.stds()["clock_offset"][0]
     rows = {"fitted": pair.fitted, "held_out": pair.held_out, "all": pair.fitted | pair.held_out}[part]
     assert got.rows == int(rows.sum())
 
 
 def test_a_fit_never_ends_worse_than_it_began() -> None:
-    pair = PLANTED.pair(PLANTED.rich(), {"mount_rotation": [0.05, 0.02, -0.03]}, 11)
-    log = PLANTED.weighed(pair)
+    pair = planted.pair(planted.rich(), {"mount_rotation": [0.05, 0.02, -0.03]}, 11)
+    log = planted.weighed(pair)
     for name in ("low_pass", "clock_offset", "gyro_scale", "size_effect"):
-        physics = catalogue.physics([name])[0]
+        physics = catalogue.diagnosed([name])[0]
         start = np.array([5.0]) if name == "low_pass" else physics.null_value.astype(float)
         began = fit([log], ((physics, start),), iterations=0)
         assert fit([log], ((physics, start),)).objective <= began.objective
 
 
-@pytest.mark.parametrize("physics", catalogue.physics(), ids=lambda one: one.name)
+@pytest.mark.parametrize("physics", catalogue.diagnosed(), ids=lambda one: one.name)
 def test_parameters_come_back_from_how_they_are_fitted(physics: catalogue.Physics) -> None:
     theta = np.where(np.isfinite(physics.null_value), physics.null_value, 0.0) + 0.7 * np.where(
         physics.plausible > 0, physics.plausible, 1.0
@@ -169,9 +169,9 @@ def test_parameters_come_back_from_how_they_are_fitted(physics: catalogue.Physic
 @pytest.mark.parametrize("name", ["low pass", "arm and clock", "gyro drift"])
 def test_derivatives_of_a_fit_nearby_lead_to_the_same_answer(name: str) -> None:
     effects = EFFECTS[name]
-    pair = PLANTED.pair(PLANTED.rich(), {one: truth for one, (truth, _) in effects.items()}, 12)
-    log, begun = PLANTED.weighed(pair), PLANTED.acting({one: start for one, (_, start) in effects.items()})
-    scale = PLANTED.acting({"gyro_scale": [0.0] * 3})
+    pair = planted.pair(planted.rich(), {one: truth for one, (truth, _) in effects.items()}, 12)
+    log, begun = planted.weighed(pair), planted.acting({one: start for one, (_, start) in effects.items()})
+    scale = planted.acting({"gyro_scale": [0.0] * 3})
     alone = fit([log], (*begun, *scale))
     near = fit([log], (*begun, *scale), near=fit([log], begun))
     assert near.objective == pytest.approx(alone.objective, abs=SAME)
@@ -182,19 +182,19 @@ def test_derivatives_of_a_fit_nearby_lead_to_the_same_answer(name: str) -> None:
 
 
 def test_derivatives_that_were_kept_end_where_new_ones_end(monkeypatch: pytest.MonkeyPatch) -> None:
-    pair = PLANTED.pair(PLANTED.rich(), {"low_pass": [6.0], "lever_arm": [0.3, -0.2, 0.1]}, 13)
-    log, begun = PLANTED.weighed(pair), PLANTED.acting({"low_pass": [15.0], "lever_arm": [0.0] * 3})
+    pair = planted.pair(planted.rich(), {"low_pass": [6.0], "lever_arm": [0.3, -0.2, 0.1]}, 13)
+    log, begun = planted.weighed(pair), planted.acting({"low_pass": [15.0], "lever_arm": [0.0] * 3})
     kept = fit([log], begun)
-    monkeypatch.setattr("imutool.diagnosis.gauss_newton.STRAIGHT", 0.0)  # so that every step asks for new ones
-    monkeypatch.setattr(Slopes, "linear", lambda self: None)
+    monkeypatch.setattr("imutool.diagnosis.estimation.gauss_newton.STRAIGHT", 0.0)  # so that every step asks for new ones
+    monkeypatch.setattr(Jacobians, "linear", lambda self: None)
     anew = fit([log], begun)
     for (_, one), (physics, other) in zip(kept.chosen, anew.chosen, strict=True):
-        assert (np.abs(one - other) < SAME * anew.stds()[physics.name]).all()
+        assert (np.abs(one - other) < SAME * anew.stds()[physics.key]).all()
 
 
 def test_a_fit_that_falls_short_of_what_was_hoped_for_goes_no_further() -> None:
-    pair = PLANTED.pair(PLANTED.rich(), {"low_pass": [3.0]}, 14)
-    log, begun = PLANTED.weighed(pair), PLANTED.acting({"low_pass": [80.0]})
+    pair = planted.pair(planted.rich(), {"low_pass": [3.0]}, 14)
+    log, begun = planted.weighed(pair), planted.acting({"low_pass": [80.0]})
     whole = fit([log], begun)
     short = fit([log], begun, iterations=PATIENCE)
     assert whole.objective < short.objective - 1.0

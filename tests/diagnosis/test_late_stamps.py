@@ -2,28 +2,24 @@
 
 from __future__ import annotations
 
-import runpy
-from pathlib import Path
-from types import SimpleNamespace
-
 import numpy as np
 import pytest
+from support import planted
 
-from imutool.diagnosis.alignment import Pair
-from imutool.diagnosis.late_stamps import late_stamps
+from imutool.diagnosis.estimation.alignment import Pair
+from imutool.diagnosis.estimation.late_stamps import late_stamps
 
-PLANTED = SimpleNamespace(**runpy.run_path(str(Path(__file__).with_name("planted.py"))))
-FELT = PLANTED.rich()
+FELT = planted.rich()
 INNER = slice(5, -5)
 
 
 def stamped(late_s: np.ndarray, taken_late: bool) -> Pair:
     """Samples of a flight whose stamps are late, taken then or at even times."""
     stamp_s = FELT.t_s[INNER] + late_s[INNER]
-    pair: Pair = PLANTED.pair(FELT, stamp_s=stamp_s)
+    pair: Pair = planted.pair(FELT, stamp_s=stamp_s)
     if taken_late:
         return pair
-    even = PLANTED.ideal(FELT)[INNER] + PLANTED.noise(len(stamp_s), 3) + PLANTED.BIAS
+    even = planted.ideal(FELT)[INNER] + planted.noise(len(stamp_s), 3) + planted.BIAS
     return Pair(pair.name, FELT, stamp_s, even, pair.fitted, pair.held_out)
 
 
@@ -51,5 +47,5 @@ def test_even_stamps_are_no_finding() -> None:
 
 def test_a_body_at_rest_cannot_tell() -> None:
     still = stamped(jittering(1e-3, 0), taken_late=False)
-    at_rest = Pair("rest", FELT, still.stamp_s, PLANTED.noise(len(still.stamp_s), 4), still.fitted, still.held_out)
+    at_rest = Pair("rest", FELT, still.stamp_s, planted.noise(len(still.stamp_s), 4), still.fitted, still.held_out)
     assert late_stamps([at_rest]) == []

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import json
-import runpy
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from types import SimpleNamespace
 from typing import NamedTuple
 
 import numpy as np
 import pytest
+from support import planted
 
 from imutool.diagnosis.diagnose import diagnose
 from imutool.diagnosis.result import Diagnosis
@@ -20,7 +19,6 @@ from imutool.errors import DataError, LogError
 from imutool.mcap_io.write import write
 from imutool.recording import Poses
 
-PLANTED = SimpleNamespace(**runpy.run_path(str(Path(__file__).with_name("planted.py"))))
 ARM = [0.2, -0.05, 0.1]
 SCALE = [0.03, -0.02, 0.04]
 SURE = 4.5
@@ -40,8 +38,8 @@ def moving(
     folder: Path,
     effects: Mapping[str, Sequence[float]],
     *,
-    duration_s: float = PLANTED.DURATION_S,
-    rate_hz: float = PLANTED.RATE_HZ,
+    duration_s: float = planted.DURATION_S,
+    rate_hz: float = planted.RATE_HZ,
     limit: np.ndarray | None = None,
     stuck: int | None = None,
     poses_s: np.ndarray | None = None,
@@ -50,18 +48,18 @@ def moving(
     name: str = "real",
 ) -> Logs:
     """A recording of a motion with effects, which may be clipped, stuck on an axis or have poses, and a simulation."""
-    felt, t_s = PLANTED.rich(1, duration_s), PLANTED.clock(duration_s, rate_hz)
-    samples = PLANTED.ideal(felt, PLANTED.acting(effects), t_s) + PLANTED.noise(len(t_s), 1) + PLANTED.BIAS
+    felt, t_s = planted.rich(1, duration_s), planted.clock(duration_s, rate_hz)
+    samples = planted.ideal(felt, planted.acting(effects), t_s) + planted.noise(len(t_s), 1) + planted.BIAS
     if limit is not None:
         samples = np.clip(samples, -limit, limit)
     if stuck is not None:
         samples[:, stuck] = 3.25
-    poses = None if poses_s is None else PLANTED.poses(PLANTED.moving(1, duration_s), poses_s)
-    write(PLANTED.recording(name, t_s, samples, poses=poses), folder / f"{name}.mcap")
-    path, t_sim = PLANTED.moving(sim_seed, duration_s), PLANTED.clock(duration_s, SIM_HZ, sim_from_s)
+    poses = None if poses_s is None else planted.poses(planted.moving(1, duration_s), poses_s)
+    write(planted.recording(name, t_s, samples, poses=poses), folder / f"{name}.mcap")
+    path, t_sim = planted.moving(sim_seed, duration_s), planted.clock(duration_s, SIM_HZ, sim_from_s)
     imu = path.imu(path.start_ns + np.round(t_sim * 1e9).astype(np.int64))
-    sim = np.concatenate([imu.gyro, imu.accel], axis=1) + PLANTED.noise(len(t_sim), 99)
-    write(PLANTED.recording("sim", t_sim, sim, poses=PLANTED.poses(path, t_sim)), folder / f"{name}_sim.mcap")
+    sim = np.concatenate([imu.gyro, imu.accel], axis=1) + planted.noise(len(t_sim), 99)
+    write(planted.recording("sim", t_sim, sim, poses=planted.poses(path, t_sim)), folder / f"{name}_sim.mcap")
     return Logs(folder / f"{name}.mcap", folder / f"{name}_sim.mcap")
 
 
@@ -69,13 +67,13 @@ def resting(
     folder: Path, name: str, *, poses: bool = False, lsb: np.ndarray | None = None, noisy: bool = True, seed: int = 3
 ) -> Path:
     """A recording at rest."""
-    t_s = PLANTED.clock()
-    samples = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 9.81]) + PLANTED.BIAS + noisy * PLANTED.noise(len(t_s), seed)
+    t_s = planted.clock()
+    samples = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 9.81]) + planted.BIAS + noisy * planted.noise(len(t_s), seed)
     samples = samples if lsb is None else lsb * np.round(samples / lsb)
     p_wb = np.random.default_rng(1).normal(0.0, 1e-4, (len(t_s), 3))
-    t_ns = PLANTED.START_NS + np.round(t_s * 1e9).astype(np.int64)
+    t_ns = planted.START_NS + np.round(t_s * 1e9).astype(np.int64)
     truth = Poses(t_ns, p_wb, np.tile([1.0, 0.0, 0.0, 0.0], (len(t_s), 1))) if poses else None
-    write(PLANTED.recording(name, t_s, samples, poses=truth), folder / f"{name}.mcap")
+    write(planted.recording(name, t_s, samples, poses=truth), folder / f"{name}.mcap")
     return folder / f"{name}.mcap"
 
 
@@ -122,7 +120,7 @@ def test_a_stuck_axis_is_told_and_the_others_are_answered(tmp_path: Path) -> Non
     assert d.mismatch
     assert conclusion(d).startswith("The accel's y is no measurement: it reads 3.25 m/s² in every sample.")
     (place,) = (one for one in d.located if one.axes == ("y",))
-    assert place.intervals_s[0][1] - place.intervals_s[0][0] > ALMOST * PLANTED.DURATION_S
+    assert place.intervals_s[0][1] - place.intervals_s[0][0] > ALMOST * planted.DURATION_S
     assert "accel_scale.y" in d.not_identifiable
     assert "accel_scale.x" not in d.not_identifiable
     assert d.unexplained["accel"].white
@@ -139,7 +137,7 @@ def test_a_dead_sensor_is_refused_with_what_it_reads(tmp_path: Path) -> None:
 def test_at_rest_bias_noise_and_digits_are_answered_and_the_rest_is_listed(tmp_path: Path) -> None:
     d = diagnose([resting(tmp_path, "still", poses=True, lsb=LSB)])
     assert effects(d) == ["quantization"]
-    assert np.abs(d.bias[0] - PLANTED.BIAS).max() < LSB.max()
+    assert np.abs(d.bias[0] - planted.BIAS).max() < LSB.max()
     assert {"gyro_scale", "lever_arm", "clock_offset", "low_pass", "mount_resonance"} <= set(d.not_identifiable)
     assert not {"gyro_bias_drift", "vibration"} & set(d.not_identifiable)
     assert any("too little motion for anything but a bias" in one for one in d.remarks)
@@ -193,7 +191,7 @@ def test_an_imu_that_the_log_does_not_have_is_refused_with_those_there_are(tmp_p
 
 
 def test_poses_too_slow_to_be_differentiated_leave_what_samples_show_by_themselves(tmp_path: Path) -> None:
-    logs = moving(tmp_path, {}, poses_s=PLANTED.clock(rate_hz=5.0))
+    logs = moving(tmp_path, {}, poses_s=planted.clock(rate_hz=5.0))
     d = diagnose([logs.real])
     assert effects(d) == []
     (said,) = d.remarks
@@ -205,7 +203,7 @@ def test_poses_too_slow_to_be_differentiated_leave_what_samples_show_by_themselv
 
 
 def test_poses_of_a_part_answer_for_that_part(tmp_path: Path) -> None:
-    logs = moving(tmp_path, {"lever_arm": ARM}, poses_s=PLANTED.clock(15.0, first_s=3.0))
+    logs = moving(tmp_path, {"lever_arm": ARM}, poses_s=planted.clock(15.0, first_s=3.0))
     d = diagnose([logs.real])
     assert effects(d) == ["lever_arm"]
     (trace,) = d.traces
@@ -215,8 +213,8 @@ def test_poses_of_a_part_answer_for_that_part(tmp_path: Path) -> None:
 
 
 def test_of_several_logs_one_without_usable_poses_is_left_out_with_a_word(tmp_path: Path) -> None:
-    whole = moving(tmp_path, {"lever_arm": ARM}, poses_s=PLANTED.clock(15.0), duration_s=15.0, name="whole")
-    poor = moving(tmp_path, {"lever_arm": ARM}, poses_s=PLANTED.clock(rate_hz=5.0), name="poor")
+    whole = moving(tmp_path, {"lever_arm": ARM}, poses_s=planted.clock(15.0), duration_s=15.0, name="whole")
+    poor = moving(tmp_path, {"lever_arm": ARM}, poses_s=planted.clock(rate_hz=5.0), name="poor")
     d = diagnose([poor.real, whole.real])
     assert effects(d) == ["lever_arm"]
     assert any(one.startswith("left out, poor") for one in d.remarks)

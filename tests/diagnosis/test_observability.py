@@ -2,36 +2,32 @@
 
 from __future__ import annotations
 
-import runpy
 from dataclasses import replace
-from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from support import planted
 
-from imutool.diagnosis.gauss_newton import WhitenedLog
-from imutool.diagnosis.observability import ENOUGH, unseen
-from imutool.diagnosis.whitening import Whitener
-
-PLANTED = SimpleNamespace(**runpy.run_path(str(Path(__file__).with_name("planted.py"))))
+from imutool.diagnosis.estimation.gauss_newton import WhitenedLog
+from imutool.diagnosis.estimation.observability import ENOUGH, unobservable
+from imutool.diagnosis.estimation.whitening import Whitener
 
 
 def shown(felt: object, names: list[str] | None = None, *, noise: float = 1.0, known: np.ndarray | None = None) -> set[str]:
     """What is not seen of some effects, at so many times the planted noise."""
-    pair = replace(PLANTED.pair(felt), known=known)
-    white = Whitener(np.ones((6, 1)), noise * PLANTED.NOISE)
+    pair = replace(planted.pair(felt), known=known)
+    white = Whitener(np.ones((6, 1)), noise * planted.NOISE)
     log = WhitenedLog(pair, white if known is None else white.counting(known))
-    some = [one for one in PLANTED.catalogue() if names is None or one.name in names]
-    return set(unseen([log], some))
+    some = [one for one in planted.catalogue() if names is None or one.name in names]
+    return set(unobservable([log], some))
 
 
 def test_a_motion_about_every_axis_shows_every_scale() -> None:
-    assert shown(PLANTED.rich(), ["gyro_scale", "gyro_misalignment", "lever_arm", "clock_offset", "mount_rotation"]) == set()
+    assert shown(planted.rich(), ["gyro_scale", "gyro_misalignment", "lever_arm", "clock_offset", "mount_rotation"]) == set()
 
 
 def test_a_planar_robot_shows_no_scale_of_axes_that_never_turn() -> None:
-    hidden = shown(PLANTED.planar(), ["gyro_scale", "gyro_misalignment", "gyro_quadratic", "lever_arm"])
+    hidden = shown(planted.planar(), ["gyro_scale", "gyro_misalignment", "gyro_quadratic", "lever_arm"])
     assert hidden == {"gyro_scale.x", "gyro_scale.y", "gyro_quadratic.x", "gyro_quadratic.y", "lever_arm.z"} | {
         f"gyro_misalignment.{entry}" for entry in ("xy", "yx", "zx", "zy")
     }
@@ -39,18 +35,18 @@ def test_a_planar_robot_shows_no_scale_of_axes_that_never_turn() -> None:
 
 @pytest.mark.parametrize(("share", "seen"), [(0.98, True), (1.02, False)])
 def test_a_number_is_seen_where_its_plausible_size_adds_enough_squares(share: float, seen: bool) -> None:
-    felt = PLANTED.planar()
-    pair = PLANTED.pair(felt)
+    felt = planted.planar()
+    pair = planted.pair(felt)
     rows = pair.fitted | pair.held_out
     rate = felt.gyro[rows, 2]
-    plausible = next(one for one in PLANTED.catalogue() if one.name == "gyro_scale").plausible[2]
+    plausible = next(one for one in planted.catalogue() if one.name == "gyro_scale").plausible[2]
     noise = plausible * np.sqrt(((rate - rate.mean()) ** 2).sum() / ENOUGH)
-    hidden = shown(felt, ["gyro_scale"], noise=share * noise / PLANTED.NOISE[0])
+    hidden = shown(felt, ["gyro_scale"], noise=share * noise / planted.NOISE[0])
     assert ("gyro_scale" not in hidden) == seen
 
 
 def test_what_delays_is_seen_by_a_delay_and_at_rest_by_nothing() -> None:
-    felt = PLANTED.planar()
+    felt = planted.planar()
     rest = replace(felt, gyro=0 * felt.gyro, accel=np.tile([0.0, 0.0, 9.81], (len(felt.t_s), 1)), alpha=0 * felt.alpha)
     hidden = shown(replace(rest, R_wb=np.tile(np.eye(3), (len(felt.t_s), 1, 1))))
     assert {"clock_offset", "clock_skew", "clock_jump", "low_pass", "mount_resonance", "lever_arm", "gyro_scale"} <= hidden
@@ -58,7 +54,7 @@ def test_what_delays_is_seen_by_a_delay_and_at_rest_by_nothing() -> None:
 
 
 def test_an_axis_of_which_nothing_is_known_shows_nothing() -> None:
-    felt = PLANTED.rich()
+    felt = planted.rich()
     known = np.ones((len(felt.t_s), 6), bool)
     known[:, 1] = False
     assert shown(felt, ["gyro_scale", "accel_scale"], known=known) == {"gyro_scale.y"}

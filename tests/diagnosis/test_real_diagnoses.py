@@ -3,20 +3,18 @@
 from __future__ import annotations
 
 import importlib.util
-import runpy
 import sys
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
+from support import planted
 
 from imutool.diagnosis.diagnose import remaining
 from imutool.mcap_io.write import write
 
 BENCH = Path(__file__).parents[1] / "bench"
-planted = SimpleNamespace(**runpy.run_path(str(Path(__file__).with_name("planted.py"))))
 EXACT = 1e-12
 DRAWS = 2000
 OF_ONE = 0.05  # z of so many honest draws lies as near to 1: its own deviation is 1 / sqrt(2 * 2000)

@@ -2,18 +2,15 @@
 
 from __future__ import annotations
 
-import runpy
 from dataclasses import replace
-from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from support import planted
 
-from imutool.diagnosis import timestamps
-from imutool.diagnosis.gauss_newton import fit
+from imutool.diagnosis.estimation import timestamps
+from imutool.diagnosis.estimation.gauss_newton import fit
 
-PLANTED = SimpleNamespace(**runpy.run_path(str(Path(__file__).with_name("planted.py"))))
 N = 2400
 SURE = 4.0
 NANOSECOND = 1e-9
@@ -22,7 +19,7 @@ PARTS_PER_MILLION = 1e-6
 
 def clean() -> np.ndarray:
     """As a log stores them: whole nanoseconds."""
-    return np.round(PLANTED.clock() * 1e9) * 1e-9
+    return np.round(planted.clock() * 1e9) * 1e-9
 
 
 def without(count: int, seed: int) -> np.ndarray:
@@ -73,8 +70,8 @@ def test_samples_missing_in_a_row_are_counted_exactly(length: int) -> None:
 
 
 def test_the_finding_states_count_and_share() -> None:
-    felt = PLANTED.rich()
-    one = PLANTED.pair(felt, stamp_s=without(24, 0))
+    felt = planted.rich()
+    one = planted.pair(felt, stamp_s=without(24, 0))
     (found,) = timestamps.dropped([one])
     assert found.effect == "dropped_samples"
     assert found.parameters["missing"].value == 24
@@ -96,20 +93,20 @@ def test_jitter_has_the_size_that_was_planted(jitter_s: float, seed: int) -> Non
 
 @pytest.mark.parametrize(("share", "jitter_s"), [(1.0, 5e-4), (0.0, 5e-4), (0.0, 2e-3), pytest.param(1.0, 2e-3)])
 def test_whether_samples_jitter_with_their_stamps_is_seen_in_the_signals(share: float, jitter_s: float) -> None:
-    felt = PLANTED.rich()
+    felt = planted.rich()
     t = clean()
     t[1:-1] += jitter_s * np.random.default_rng(2).normal(size=N - 2)
-    one = PLANTED.pair(felt, stamp_s=t)
+    one = planted.pair(felt, stamp_s=t)
     taken = t if share == 0.0 else clean()
-    one = replace(one, real=PLANTED.ideal(felt, (), taken) + PLANTED.noise(N, 3) + PLANTED.BIAS)
+    one = replace(one, real=planted.ideal(felt, (), taken) + planted.noise(N, 3) + planted.BIAS)
     (physics,) = timestamps.jitter([one])
     assert physics.name == "timestamp_jitter"
-    got = fit([PLANTED.weighed(one)], ((physics, np.zeros(3)),))
+    got = fit([planted.weighed(one)], ((physics, np.zeros(3)),))
     assert abs(got.chosen[0][1][0] - share) < SURE * got.stds()["timestamp_jitter"][0]
 
 
 def test_even_stamps_do_not_jitter() -> None:
-    assert timestamps.jitter([PLANTED.pair(PLANTED.rich(), stamp_s=clean())]) == ()
+    assert timestamps.jitter([planted.pair(planted.rich(), stamp_s=clean())]) == ()
 
 
 # ── digits ──
@@ -117,10 +114,10 @@ def test_even_stamps_do_not_jitter() -> None:
 
 @pytest.mark.parametrize("times", [1.0, 3.0])
 def test_the_lsb_is_found_to_a_thousandth(times: float) -> None:
-    lsb = times * np.array([PLANTED.NOISE[0], PLANTED.NOISE[3]])
-    one = PLANTED.pair(PLANTED.rich())
+    lsb = times * np.array([planted.NOISE[0], planted.NOISE[3]])
+    one = planted.pair(planted.rich())
     one = replace(one, real=np.repeat(lsb, 3) * np.round(one.real / np.repeat(lsb, 3)))
-    (found,) = timestamps.rounded([one], PLANTED.NOISE)
+    (found,) = timestamps.rounded([one], planted.NOISE)
     assert found.effect == "quantization"
     assert found.signal == "both"
     assert found.parameters["gyro_lsb"].value == pytest.approx(lsb[0], rel=1e-3)
@@ -129,17 +126,17 @@ def test_the_lsb_is_found_to_a_thousandth(times: float) -> None:
 
 
 def test_a_grid_in_one_sensor_is_told_of_that_one() -> None:
-    one = PLANTED.pair(PLANTED.rich())
+    one = planted.pair(planted.rich())
     one.real[:, 3:] = 0.06 * np.round(one.real[:, 3:] / 0.06)
-    (found,) = timestamps.rounded([one], PLANTED.NOISE)
+    (found,) = timestamps.rounded([one], planted.NOISE)
     assert found.signal == "accel"
     assert set(found.parameters) == {"accel_lsb"}
 
 
 def test_a_grid_much_finer_than_the_noise_is_not_told() -> None:
-    one = PLANTED.pair(PLANTED.rich())
-    lsb = PLANTED.NOISE / 10.0
-    assert timestamps.rounded([replace(one, real=lsb * np.round(one.real / lsb))], PLANTED.NOISE) == []
+    one = planted.pair(planted.rich())
+    lsb = planted.NOISE / 10.0
+    assert timestamps.rounded([replace(one, real=lsb * np.round(one.real / lsb))], planted.NOISE) == []
 
 
 def test_few_distinct_values_are_no_grid() -> None:
@@ -151,14 +148,14 @@ def test_few_distinct_values_are_no_grid() -> None:
 
 
 def clipped_pair(limit: float) -> tuple[object, np.ndarray]:
-    one = PLANTED.pair(PLANTED.rich())
+    one = planted.pair(planted.rich())
     there = one.real.copy()
     return replace(one, real=np.concatenate([np.clip(there[:, :3], -limit, limit), there[:, 3:]], axis=1)), there
 
 
 @pytest.mark.parametrize("quantile", [0.9, 0.97])
 def test_the_limit_is_found_exactly_and_clipped_rows_are_those_at_it(quantile: float) -> None:
-    raw = PLANTED.pair(PLANTED.rich()).real
+    raw = planted.pair(planted.rich()).real
     limit = float(np.quantile(np.abs(raw[:, :3]), quantile))
     one, there = clipped_pair(limit)
     assert timestamps.limits(one.real) == {"gyro": limit}
@@ -178,10 +175,10 @@ def test_the_limit_is_found_exactly_and_clipped_rows_are_those_at_it(quantile: f
 
 def test_the_same_reading_again_and_again_is_no_limit_where_no_more_was_expected() -> None:
     """A parked vehicle on a coarse grid reads its largest value often, and nothing says that it should read more."""
-    t = PLANTED.clock()
+    t = planted.clock()
     real = np.zeros((N, 6))
     real[:, 5] = 9.81
-    one = replace(PLANTED.pair(PLANTED.rich()), real=real, stamp_s=t)
+    one = replace(planted.pair(planted.rich()), real=real, stamp_s=t)
     rng = np.random.default_rng(3)
     assert timestamps.saturated([one], [real + 1e-3 * rng.normal(size=real.shape)], 50) == []
 
@@ -191,10 +188,10 @@ def test_the_same_reading_again_and_again_is_no_limit_where_no_more_was_expected
 
 @pytest.mark.parametrize("seed", range(5))
 def test_clean_samples_show_nothing_of_all_that(seed: int) -> None:
-    one = PLANTED.pair(PLANTED.rich(seed), seed=seed, stamp_s=clean())
+    one = planted.pair(planted.rich(seed), seed=seed, stamp_s=clean())
     assert timestamps.dropped([one]) == []
     assert timestamps.jitter([one]) == ()
-    assert timestamps.rounded([one], PLANTED.NOISE) == []
+    assert timestamps.rounded([one], planted.NOISE) == []
     assert timestamps.limits(one.real) == {}
     assert not timestamps.clipped(one.real).any()
     assert timestamps.saturated([one], [one.real], 50) == []

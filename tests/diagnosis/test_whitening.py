@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
-from imutool.diagnosis.whitening import Band, Whitener, burg, level, settled, whitener
+from imutool.diagnosis.estimation.whitening import Band, Whitener, burg, level, settled, whitener
 
 N, RATE_HZ, STD = 12_000, 100.0, 0.01
 SIGMAS = 4.5  # of a sample autocorrelation, one over the root of the count; some 60 are looked at

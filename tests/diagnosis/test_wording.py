@@ -6,21 +6,19 @@ import importlib
 import math
 import pkgutil
 import re
-import runpy
 from dataclasses import replace
-from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from support import diagnoses
 
 import imutool.sensor.effects
 from imutool.diagnosis.quantity import grouped, percent, value, vector
 from imutool.diagnosis.result import Estimate, Finding, HeldOut, Located, Unexplained
 from imutool.diagnosis.wording import NULL, SENTENCES, by_chance, conclusion, lines, rms, sentence, signals, table
 
-MADE = SimpleNamespace(**runpy.run_path(str(Path(__file__).with_name("diagnoses.py"))))
 CATALOGUE = [  # of physics: what an ideal simulation leaves out, and what any signal can have
     "gyro_bias", "accel_bias", "gyro_scale", "gyro_misalignment", "gyro_g_sensitivity", "gyro_quadratic", "gyro_bias_drift",
     "accel_scale", "accel_misalignment", "accel_quadratic", "accel_bias_drift", "lever_arm", "mount_rotation", "size_effect",
@@ -33,34 +31,34 @@ ROUNDED = 0.26
 
 
 def finding(effect: str, parameters: dict[str, Estimate], signal: str = "accel", **changes: object) -> Finding:
-    return replace(MADE.LEVER_ARM, effect=effect, signal=signal, parameters=parameters, **changes)
+    return replace(diagnoses.LEVER_ARM, effect=effect, signal=signal, parameters=parameters, **changes)
 
 
 # ── whole conclusions ──
 
 
 def test_one_finding_is_one_sentence_with_place_size_gain_and_what_is_left() -> None:
-    assert conclusion(MADE.LATE) == (
+    assert conclusion(diagnoses.LATE) == (
         "The gyro differs when turning: it lags the simulation by 12.4 ± 0.3 ms (clock_offset); modelling it removes 63 % of "
         "the misfit on 30 s of unseen data; nothing else stands above the noise."
     )
 
 
 def test_a_lever_arm_is_a_vector_and_a_regime_without_a_preposition_gets_one() -> None:
-    assert conclusion(MADE.ARM).startswith(
+    assert conclusion(diagnoses.ARM).startswith(
         "The accel differs at angular rate above 0.4 rad/s: it sits (0.213, -0.051, 0.120) ± 0.004 m from the tracked point "
         "(lever_arm); modelling it removes 71 % "
     )
 
 
 def test_nothing_is_said_plainly_and_what_cannot_be_seen_with_it() -> None:
-    assert conclusion(MADE.NOTHING) == NULL == "Nothing but a constant bias and noise separates the two."
-    still = replace(MADE.NOTHING, not_identifiable=("gyro_scale.x", "gyro_scale.y", "lever_arm", "/odom.v.delay"))
+    assert conclusion(diagnoses.NOTHING) == NULL == "Nothing but a constant bias and noise separates the two."
+    still = replace(diagnoses.NOTHING, not_identifiable=("gyro_scale.x", "gyro_scale.y", "lever_arm", "/odom.v.delay"))
     assert conclusion(still) == f"{NULL} These logs cannot show: gyro_scale (x, y), lever_arm, /odom.v.delay."
 
 
 def test_several_findings_come_strongest_first_by_signal_compared_with_the_poses_if_nothing_was_simulated() -> None:
-    said = conclusion(MADE.BOTH)
+    said = conclusion(diagnoses.BOTH)
     assert said.startswith("Two things were left out. The accel differs ")
     assert said.index("lever_arm") < said.index("The gyro differs when turning: it lags the true poses by 12.4 ± 0.3 ms")
     assert said.count("of unseen data") == 1  # the same 30 s
@@ -69,14 +67,14 @@ def test_several_findings_come_strongest_first_by_signal_compared_with_the_poses
 
 def test_two_findings_on_one_signal_share_its_sentence() -> None:
     scale = finding("accel_scale", {axis: Estimate(0.02, 0.001, "-") for axis in "xyz"})
-    said = conclusion(replace(MADE.ARM, findings=(MADE.LEVER_ARM, scale)))
+    said = conclusion(replace(diagnoses.ARM, findings=(diagnoses.LEVER_ARM, scale)))
     assert said.count("The accel differs") == 1
     assert "; its scale is off by (2.00, 2.00, 2.00) ± 0.10 % (accel_scale); modelling it removes 71 % of the misfit;" in said
 
 
 def test_of_many_findings_the_three_strongest_are_told_in_full() -> None:
     weaker = [finding(name, {"k": Estimate(1.0, 0.1, "K")}, "gyro") for name in ("gyro_scale", "gyro_quadratic")]
-    said = conclusion(replace(MADE.BOTH, findings=(MADE.LEVER_ARM, MADE.LAG, MADE.DRIVEN, *weaker)))
+    said = conclusion(replace(diagnoses.BOTH, findings=(diagnoses.LEVER_ARM, diagnoses.LAG, diagnoses.DRIVEN, *weaker)))
     assert said.startswith("Five things were left out.")
     assert said.count("modelling it removes") == 3
     assert "Smaller: gyro_scale (gyro), gyro_quadratic (gyro). Nothing else stands above the noise." in said
@@ -89,27 +87,27 @@ def test_two_sizes_are_told_apart_with_as_many_digits_as_it_takes() -> None:
 
 
 def test_a_driver_is_named_with_its_gain_and_lag() -> None:
-    said = conclusion(MADE.BY_CURRENT)
+    said = conclusion(diagnoses.BY_CURRENT)
     assert "it follows /motor.current with gain 0.31 ± 0.02 m/s² per A, lag 120 ± 10 ms (driven);" in said
 
 
 def test_the_unknown_is_said_to_have_no_name() -> None:
     assert "it follows a smooth curve of angular rate z that has no name among the known effects (unknown)" in conclusion(
-        MADE.NAMELESS
+        diagnoses.NAMELESS
     )
     equation = finding("unknown", {"a": Estimate(0.3, 0.01, "s²/m")}, equation="accel_x += a f_z^2")
-    assert sentence(MADE.ARM, equation) == (
+    assert sentence(diagnoses.ARM, equation) == (
         "accel_x += a f_z^2, with a 0.300 ± 0.010 s²/m; this has no name among the known effects (unknown)"
     )
 
 
 def test_what_cannot_be_told_apart_is_said_beside_the_name() -> None:
-    one = replace(MADE.LAG, similar=("low_pass", "delay"))
-    assert sentence(MADE.LATE, one).endswith("by 12.4 ± 0.3 ms (clock_offset; could as well be low_pass or delay)")
+    one = replace(diagnoses.LAG, similar=("low_pass", "delay"))
+    assert sentence(diagnoses.LATE, one).endswith("by 12.4 ± 0.3 ms (clock_offset; could as well be low_pass or delay)")
 
 
 def test_a_place_without_a_name_is_not_passed_over() -> None:
-    said = conclusion(MADE.UNEXPLAINED)
+    said = conclusion(diagnoses.UNEXPLAINED)
     assert "The accel differs at angular rate above 0.4 rad/s, and what was left out could not be named." in said
     assert "What remains of the accel is 0.2 against 0.05 m/s² of noise, and has no explanation yet." in said
 
@@ -124,11 +122,11 @@ def test_a_place_without_a_name_is_not_passed_over() -> None:
 )
 def test_what_remains_is_held_against_the_noise(rms: float, white: bool, words: str) -> None:
     left = {"accel": Unexplained(rms, 0.05, white)}
-    assert conclusion(replace(MADE.ARM, unexplained=left)).endswith(f"; {words}.")
+    assert conclusion(replace(diagnoses.ARM, unexplained=left)).endswith(f"; {words}.")
 
 
 def test_a_null_case_with_coloured_noise_says_so() -> None:
-    said = conclusion(replace(MADE.NOTHING, unexplained=MADE.unexplained(white=False)))
+    said = conclusion(replace(diagnoses.NOTHING, unexplained=diagnoses.unexplained(white=False)))
     assert said == f"{NULL} What remains of the accel is as small as the noise, but not white."
 
 
@@ -147,17 +145,19 @@ def test_a_null_case_with_coloured_noise_says_so() -> None:
     ],
 )
 def test_a_regime_goes_on_after_differs(regime: str, words: str) -> None:
-    assert conclusion(replace(MADE.LATE, located=(replace(MADE.TURNING, regime=regime),))).startswith(words)
+    assert conclusion(replace(diagnoses.LATE, located=(replace(diagnoses.TURNING, regime=regime),))).startswith(words)
 
 
 def test_the_regime_is_that_of_the_largest_share_of_the_same_signal() -> None:
-    small = replace(MADE.TURNING, regime="always", share=0.1)
-    assert conclusion(replace(MADE.LATE, located=(small, MADE.TURNING, MADE.FAST))).startswith("The gyro differs when turning:")
+    small = replace(diagnoses.TURNING, regime="always", share=0.1)
+    assert conclusion(replace(diagnoses.LATE, located=(small, diagnoses.TURNING, diagnoses.FAST))).startswith(
+        "The gyro differs when turning:"
+    )
 
 
 def test_what_was_counted_and_not_fitted_claims_no_gain() -> None:
     steps = finding("quantization", {"gyro_lsb": Estimate(0.001, 1e-6, "rad/s")}, "gyro", held_out=HeldOut(0.0, 0.0, "-", 90.0))
-    d = replace(MADE.LATE, findings=(steps,))
+    d = replace(diagnoses.LATE, findings=(steps,))
     assert conclusion(d) == (
         "The gyro differs when turning: it comes in steps of 1.0000 ± 0.0010 mrad/s (quantization); "
         "nothing else stands above the noise."
@@ -166,21 +166,21 @@ def test_what_was_counted_and_not_fitted_claims_no_gain() -> None:
 
 
 def test_what_is_on_both_sensors_is_said_of_the_sensor() -> None:
-    both = replace(MADE.LAG, signal="gyro, accel")
-    said = conclusion(replace(MADE.LATE, findings=(both,)))
+    both = replace(diagnoses.LAG, signal="gyro, accel")
+    said = conclusion(replace(diagnoses.LATE, findings=(both,)))
     assert said.startswith("Gyro and accel differ when turning: the sensor lags the simulation by 12.4 ± 0.3 ms")
     assert signals("both") == signals("imu") == signals("gyro+accel") == signals("gyro and accel") == ("gyro", "accel")
 
 
 def test_any_other_signal_goes_by_its_own_name() -> None:
     one = finding("gain", {"gain": Estimate(0.05, 0.002, "-")}, "/odom.twist.twist.linear.x")
-    said = conclusion(replace(MADE.ARM, located=(), findings=(one,)))
+    said = conclusion(replace(diagnoses.ARM, located=(), findings=(one,)))
     assert said.startswith("/odom.twist.twist.linear.x differs: its gain is off by 5.0 ± 0.2 % (gain);")
 
 
 def test_lines_hold_each_finding_place_gain_and_remark() -> None:
-    said = lines(MADE.BOTH)
-    assert said[0] == conclusion(MADE.BOTH)
+    said = lines(diagnoses.BOTH)
+    assert said[0] == conclusion(diagnoses.BOTH)
     assert said[1] == (
         "1. lever_arm (accel): (0.213, -0.051, 0.120) ± 0.004 m; rms 0.52 to 0.19 m/s² on 30 s of unseen data; "
         "1 in 100 by chance"
@@ -190,14 +190,14 @@ def test_lines_hold_each_finding_place_gain_and_remark() -> None:
         "With everything that was found, over 90 s held out of the search: "
         "gyro rms 0.02 to 0.0074 rad/s, 63 % closer; accel rms 0.52 to 0.19 m/s², 63 % closer"
     )
-    assert said[-1] == MADE.BOTH.remarks[0]
+    assert said[-1] == diagnoses.BOTH.remarks[0]
     assert len(said) == 7
-    assert lines(MADE.NOTHING) == [NULL]
+    assert lines(diagnoses.NOTHING) == [NULL]
 
 
 def test_many_stretches_are_counted_not_listed() -> None:
     many = Located("gyro", ("x",), tuple((float(k), k + 0.5) for k in range(9)), "", 0.5, 0.01)
-    assert lines(replace(MADE.NOTHING, located=(many,)))[1] == (
+    assert lines(replace(diagnoses.NOTHING, located=(many,)))[1] == (
         "Where: gyro x, 0.0 to 0.5 s, 1.0 to 1.5 s, 7 more stretches; 50 % of the misfit"
     )
 
@@ -208,7 +208,7 @@ def test_many_stretches_are_counted_not_listed() -> None:
 @pytest.mark.parametrize("effect", CATALOGUE)
 def test_every_effect_has_a_sentence_with_its_number_its_unit_and_its_name(effect: str) -> None:
     assert effect in SENTENCES
-    said = sentence(MADE.ARM, finding(effect, {"k": Estimate(3.25, 0.02, "K")}))
+    said = sentence(diagnoses.ARM, finding(effect, {"k": Estimate(3.25, 0.02, "K")}))
     assert "3.25 ± 0.02 K" in said
     assert said.endswith(f"({effect})")
 
@@ -222,16 +222,16 @@ def physics() -> list[object]:
 @pytest.mark.parametrize("one", physics(), ids=lambda one: one.name)
 def test_a_sentence_leaves_no_quantity_of_a_real_effect_out(one: SimpleNamespace) -> None:
     theta = {n.name: Estimate(n.plausible * (0.71 + 0.1 * k), n.plausible * 0.01, n.unit) for k, n in enumerate(one.parameters)}
-    said = sentence(MADE.ARM, finding(one.name, theta))
+    said = sentence(diagnoses.ARM, finding(one.name, theta))
     for quantity in grouped(theta):
         assert str(quantity) in said, quantity
 
 
 def test_an_effect_nobody_wrote_a_sentence_for_is_still_said_with_its_equation_and_numbers() -> None:
     one = finding("vendor_effect", {"k": Estimate(3.25, 0.02, "K")}, equation="accel += k T")
-    assert sentence(MADE.ARM, one) == "it shows vendor_effect, accel += k T, k 3.25 ± 0.02 K (vendor_effect)"
+    assert sentence(diagnoses.ARM, one) == "it shows vendor_effect, accel += k T, k 3.25 ± 0.02 K (vendor_effect)"
     bare = finding("reference_error", {}, equation="the truth is late")
-    assert sentence(MADE.ARM, bare) == "it shows reference_error, the truth is late (reference_error)"
+    assert sentence(diagnoses.ARM, bare) == "it shows reference_error, the truth is late (reference_error)"
 
 
 @pytest.mark.parametrize(
@@ -245,19 +245,19 @@ def test_an_effect_nobody_wrote_a_sentence_for_is_still_said_with_its_equation_a
     ],
 )
 def test_signs_become_words(effect: str, number: Estimate, words: str) -> None:
-    assert sentence(MADE.ARM, finding(effect, {"k": number})).startswith(words)
+    assert sentence(diagnoses.ARM, finding(effect, {"k": number})).startswith(words)
 
 
 def test_a_jump_says_when_and_how_far() -> None:
     jump = {"t_jump": Estimate(31.02, 0.05, "s"), "step": Estimate(0.02, 0.0004, "s")}
-    assert sentence(MADE.ARM, finding("clock_jump", jump)) == (
+    assert sentence(diagnoses.ARM, finding("clock_jump", jump)) == (
         "the clock of the recording jumps by 20.0 ± 0.4 ms at 31.02 ± 0.05 s (clock_jump)"
     )
 
 
 def test_a_limit_that_is_never_reached_is_not_news() -> None:
     limits = {"gyro_limit": Estimate(math.inf, 0.0, "rad/s"), "accel_limit": Estimate(39.2, 0.2, "m/s²")}
-    assert sentence(MADE.ARM, finding("saturation", limits)) == "it stops at its limit of 39.2 ± 0.2 m/s² (saturation)"
+    assert sentence(diagnoses.ARM, finding("saturation", limits)) == "it stops at its limit of 39.2 ± 0.2 m/s² (saturation)"
 
 
 # ── numbers ──
@@ -339,29 +339,29 @@ def test_a_chance_too_small_for_a_float_is_a_bound() -> None:
 
 
 def test_a_second_simulation_is_told_with_the_share_of_the_misfit_that_is_gone() -> None:
-    again = {signal: replace(one, by="second simulation") for signal, one in MADE.BOTH.closer.items()}
-    d = replace(MADE.BOTH, closer=again)
+    again = {signal: replace(one, by="second simulation") for signal, one in diagnoses.BOTH.closer.items()}
+    d = replace(diagnoses.BOTH, closer=again)
     words = "90 % of the misfit of the gyro and 87 % of the misfit of the accel is gone on 90 s of unseen time."
     assert f"Simulated again with this, {words}" in conclusion(d)
     assert any(line.startswith("Simulated again with everything that was found, over 90 s held") for line in lines(d))
-    assert "Simulated again" not in conclusion(MADE.BOTH)
-    only_gyro = conclusion(replace(d, findings=(MADE.LAG,)))
+    assert "Simulated again" not in conclusion(diagnoses.BOTH)
+    only_gyro = conclusion(replace(d, findings=(diagnoses.LAG,)))
     assert "90 % of the misfit of the gyro is gone" in only_gyro
 
 
 def test_many_things_that_cannot_be_seen_are_counted() -> None:
-    many = replace(MADE.NOTHING, not_identifiable=tuple("abcdefgh"))
+    many = replace(diagnoses.NOTHING, not_identifiable=tuple("abcdefgh"))
     assert conclusion(many).endswith("These logs cannot show: a, b, c, d, 4 more effects in whole or part.")
 
 
 def test_an_axis_that_is_no_measurement_comes_first() -> None:
     stuck = Located("accel", ("y",), ((0.0, 90.0),), "always: it reads 3.25 m/s² in every sample", 1.0, 0.0)
-    said = conclusion(replace(MADE.LATE, located=(MADE.TURNING, stuck)))
+    said = conclusion(replace(diagnoses.LATE, located=(diagnoses.TURNING, stuck)))
     assert said.startswith("The accel's y is no measurement: it reads 3.25 m/s² in every sample. The gyro differs when turning")
 
 
 def test_the_table_has_a_row_for_each_finding_no_wider_than_a_terminal() -> None:
-    head, *rows = table(MADE.BOTH)
+    head, *rows = table(diagnoses.BOTH)
     assert head == ["What", "Removes", "Value"]
     assert rows[0] == ["lever_arm (accel)", "71 %", "(0.213, -0.051, 0.120) ± 0.004 m\n1 in 100 by chance"]
     assert all(max(map(len, row[2].split("\n"))) <= 40 for row in rows)
@@ -369,14 +369,18 @@ def test_the_table_has_a_row_for_each_finding_no_wider_than_a_terminal() -> None
 
 def test_many_entries_of_one_effect_that_cannot_be_seen_are_counted() -> None:
     hidden = tuple(f"gyro_misalignment.{k}" for k in range(9))
-    assert conclusion(replace(MADE.NOTHING, not_identifiable=hidden)).endswith("show: gyro_misalignment (9 of its numbers).")
+    assert conclusion(replace(diagnoses.NOTHING, not_identifiable=hidden)).endswith(
+        "show: gyro_misalignment (9 of its numbers)."
+    )
 
 
 def test_a_place_of_one_of_several_logs_names_it() -> None:
-    place = replace(MADE.FAST, log="folder/second.mcap")
-    assert lines(replace(MADE.NOTHING, located=(place,)))[1].startswith("Where: second, accel x, y, angular rate above 0.4")
+    place = replace(diagnoses.FAST, log="folder/second.mcap")
+    assert lines(replace(diagnoses.NOTHING, located=(place,)))[1].startswith(
+        "Where: second, accel x, y, angular rate above 0.4"
+    )
 
 
 def test_no_unseen_time_is_not_called_unseen() -> None:
-    one = replace(MADE.LAG, held_out=HeldOut(0.02, 0.01, "rad/s", 0.0))
-    assert "unseen" not in conclusion(replace(MADE.LATE, findings=(one,)))
+    one = replace(diagnoses.LAG, held_out=HeldOut(0.02, 0.01, "rad/s", 0.0))
+    assert "unseen" not in conclusion(replace(diagnoses.LATE, findings=(one,)))

@@ -3,18 +3,16 @@
 from __future__ import annotations
 
 import os
-import runpy
 import shutil
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from types import SimpleNamespace
 
 import pytest
+from support import planted
 
 from imutool.fleet.engine import Engine
 from imutool.mcap_io.write import write
 
-PLANTED = SimpleNamespace(**runpy.run_path(str(Path(__file__).parents[1] / "diagnosis" / "planted.py")))
 LOG_S = 10.0  # below eight nothing is told
 Robot = Callable[[Path, int, Mapping[str, Sequence[float]]], None]
 
@@ -57,10 +55,10 @@ def robot() -> Robot:
     """Writes a robot's log: a motion of its own, effects, noise, a bias, and its true poses."""
 
     def make(path: Path, seed: int, effects: Mapping[str, Sequence[float]]) -> None:
-        felt, motion = PLANTED.rich(seed, LOG_S), PLANTED.moving(seed, LOG_S)
-        samples = PLANTED.ideal(felt, PLANTED.acting(effects)) + PLANTED.noise(len(felt.t_s), seed) + PLANTED.BIAS
-        poses = PLANTED.poses(motion, PLANTED.clock(LOG_S, rate_hz=200.0))
+        felt, motion = planted.rich(seed, LOG_S), planted.moving(seed, LOG_S)
+        samples = planted.ideal(felt, planted.acting(effects)) + planted.noise(len(felt.t_s), seed) + planted.BIAS
+        poses = planted.poses(motion, planted.clock(LOG_S, rate_hz=200.0))
         path.parent.mkdir(parents=True, exist_ok=True)
-        write(PLANTED.recording(path.stem, felt.t_s, samples, poses=poses), path)
+        write(planted.recording(path.stem, felt.t_s, samples, poses=poses), path)
 
     return make

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import os
 import random
-import runpy
 import signal
 import struct
 import subprocess
@@ -16,7 +15,6 @@ from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from types import SimpleNamespace
 
 import lz4.frame
 import pytest
@@ -25,6 +23,7 @@ from mcap.reader import make_reader
 from mcap.records import Attachment, Chunk, Metadata
 from mcap.stream_reader import StreamReader
 from rosbags.highlevel import AnyReader
+from support import log_damage
 
 from imutool.errors import ConfigError, LogError
 from imutool.log_info import inspect
@@ -40,8 +39,7 @@ Message = tuple[str, int, int, int, bytes]  # topic, log time, publish time, seq
 Messages = list[tuple[str, str, int, int, int, bytes]]
 Foreign = Callable[..., Path]
 
-DAMAGE = SimpleNamespace(**runpy.run_path(str(Path(__file__).with_name("damage.py"))))  # reads logs message by message
-content, of_block, stretches, by_mcap = DAMAGE.content, DAMAGE.of_block, DAMAGE.stretches, DAMAGE.by_mcap
+content, of_block, stretches, by_mcap = log_damage.content, log_damage.of_block, log_damage.stretches, log_damage.by_mcap
 ROOM_BYTES = 30 << 20
 BUDGET_S = 20.0  # for one file, with every annotation checked on a busy machine
 UNCHUNKED = ("unchunked", "unchunked-no-summary")
@@ -140,10 +138,10 @@ def test_a_log_that_holds_nothing_is_refused(tmp_path: Path) -> None:
 
 @pytest.fixture
 def ways() -> Callable[..., str]:
-    """Runs `damage.py`, which says what should not have happened."""
+    """Runs `support/log_damage.py`, which says what should not have happened."""
 
     def run(*words: str | Path) -> str:
-        line = [sys.executable, Path(__file__).with_name("damage.py"), *words]
+        line = [sys.executable, Path(__file__).parents[1] / "support" / "log_damage.py", *words]
         done = subprocess.run(line, capture_output=True, text=True, timeout=240, check=False)
         return done.stdout + done.stderr
 

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Callable, Iterator
-from pathlib import Path
 from typing import Any
 
 import msgspec
@@ -15,8 +13,6 @@ import torch
 from imutool.recording import Imu, Poses, Recording
 from imutool.sensor.flight import FlightSettings as Flight
 from imutool.sensor.flight import TriadSettings, flight, trajectory
-
-sys.path.insert(0, str(Path(__file__).parent))  # for the simulated GPU
 
 PERFECT = TriadSettings(
     noise_density=0.0, walk_density=0.0, typical_bias=0.0, turn_on_bias=0.0, warm_up=0.0, scale=0.0, misalignment_rad=0.0

@@ -11,12 +11,12 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from imutool.bias import linear
-from imutool.bias.model import Sensor
 from imutool.errors import DataError
 from imutool.recording import Imu, Poses, Recording
 from imutool.training import closed_form
 from imutool.training.closed_form import Solution, solve
 from imutool.training.segments import Pool
+from imutool.units import Sensor
 
 Make = Callable[..., Recording]
 W = {

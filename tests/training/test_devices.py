@@ -12,8 +12,8 @@ import msgspec
 import numpy as np
 import pytest
 import torch
-from devices import OnGpu, simulated_gpu
 from safetensors.torch import load_file
+from support.fake_gpu import OnGpu, simulated_gpu
 from torch import Tensor, nn
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 

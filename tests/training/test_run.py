@@ -16,7 +16,6 @@ from typer.testing import CliRunner
 
 from imutool.bias import hybrid
 from imutool.bias.io import load
-from imutool.bias.model import Sensor
 from imutool.cli.app import app
 from imutool.config import build
 from imutool.config import load as load_settings
@@ -29,6 +28,7 @@ from imutool.training.objective import WindowEnds
 from imutool.training.physics_first import config_of, helps, settings_for
 from imutool.training.run import checkpoint_path, train
 from imutool.training.settings import settings_of
+from imutool.units import Sensor
 
 TINY = TrainSettings(
     gyro_window_s=(0.25, 0.5),

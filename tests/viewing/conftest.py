@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import sys
-from pathlib import Path
-
 import numpy as np
 import pytest
 
@@ -12,8 +9,6 @@ from imutool.recording import Imu, Recording
 from imutool.sensor.flight import ACCEL_BIAS, GYRO_BIAS, flight
 from imutool.viewing.model.run_data import Run, RunData
 from imutool.viewing.model.runs import build
-
-sys.path.insert(0, str(Path(__file__).parents[1] / "cleaning"))  # for the planting of defects
 
 
 @pytest.fixture(scope="session")

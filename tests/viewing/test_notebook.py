@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from rerun.chunk import RrdReader
+from support import saved_rrd
 
 from imutool.errors import ConfigError
 from imutool.mcap_io.write import write
@@ -19,7 +20,6 @@ from imutool.viewing import notebook
 from imutool.viewing.model.run_data import RunData
 from imutool.viewing.model.runs import load
 from imutool.viewing.rerun import viewer
-from tests.viewing import rrd_reader
 
 # In a process of its own: where the widget's program comes from is settled once, by an import that takes seconds.
 WIDGET = """
@@ -59,8 +59,8 @@ def test_the_widget_is_given_all_that_a_file_would_hold(recording: Recording, tm
     assert done.returncode == 0, done.stderr
     merge = [str(viewer.binary()), "rrd", "merge", *sorted(map(str, parts.iterdir())), "-o", str(tmp_path / "all.rrd")]
     subprocess.run(merge, check=True, capture_output=True)
-    rrd_reader.written([load(log)], tmp_path / "file.rrd", source=False)
-    given, kept = rrd_reader.read(tmp_path / "all.rrd"), rrd_reader.read(tmp_path / "file.rrd")
+    saved_rrd.written([load(log)], tmp_path / "file.rrd", source=False)
+    given, kept = saved_rrd.read(tmp_path / "all.rrd"), saved_rrd.read(tmp_path / "file.rrd")
     assert set(given) == set(kept)
     name = "Scalars:scalars"
     np.testing.assert_array_equal(given["/imu/gyro/raw"].numbers(name), kept["/imu/gyro/raw"].numbers(name))

@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float64
 from scipy.interpolate import make_interp_spline
 from scipy.signal import correlate, correlation_lags, welch
 
-from imutool.diagnosis.alignment import BUFFER_S, FARTHEST_S, GAP_PERIODS, split, wiener
+from imutool.diagnosis.estimation.alignment import BUFFER_S, FARTHEST_S, GAP_PERIODS, split, wiener_filter
 from imutool.diagnosis.scalar.effects import Column, Ideal, Samples
 from imutool.diagnosis.scalar.fit import SEGMENT, TOP
 from imutool.errors import DataError
@@ -128,7 +128,7 @@ def _ideal(t_sim: Column, values: Column, period_sim: float, period_real: float,
     top = (f_hz >= TOP_BAND / period_sim) & (f_hz <= TOP / period_sim)
     rate_hz = min(OVERSAMPLED / min(period_sim, period_real), MOST_FINE / (t_even[-1] - t_even[0]))
     t_fine = t_even[0] + np.arange(int((t_even[-1] - t_even[0]) * rate_hz) + 1) / rate_hz
-    clean = wiener(even)
+    clean = wiener_filter(even)
     fine = np.interp(t_fine, t_even, clean) if _jumps(values) else np.asarray(make_interp_spline(t_even, clean, k=3)(t_fine))
     return Ideal(float(t_fine[0]), rate_hz, fine, t_s, {}), float(np.median(power[top]))
 

@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Bool, Float64
 from scipy.interpolate import BSpline
 
+from imutool.diagnosis.estimation.timestamps import LEAST_DIGITS, grid
 from imutool.diagnosis.locate import regime
 from imutool.diagnosis.result import Curve as ToldCurve
 from imutool.diagnosis.result import Estimate, Finding, HeldOut, Located, SignalTraces, Unexplained
@@ -20,7 +21,6 @@ from imutool.diagnosis.scalar.alignment import Beside, beside
 from imutool.diagnosis.scalar.effects import Chosen, Column, Curve, Samples
 from imutool.diagnosis.scalar.fit import Fit, WhitenedLog
 from imutool.diagnosis.scalar.search import Found, Judged, Search
-from imutool.diagnosis.timestamps import LEAST_DIGITS, grid
 from imutool.mcap_io.fields import Fields
 
 BETTER_NOISE = 0.95  # of what the noise was first taken for, below which effects are asked once more

@@ -15,8 +15,8 @@ from scipy.linalg import solve_toeplitz
 from scipy.ndimage import median_filter
 from scipy.signal import lfilter, welch
 
+from imutool.diagnosis.estimation.whitening import settled
 from imutool.diagnosis.scalar.effects import Chosen, Column, Effect, Ideal, Samples, Stage
-from imutool.diagnosis.whitening import settled
 from imutool.sensor.effect import Parameter, Theta
 
 ORDER = 6

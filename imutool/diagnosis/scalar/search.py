@@ -10,10 +10,10 @@ from jaxtyping import Float64
 from scipy.stats import t as student
 from scipy.stats import wilcoxon
 
-from imutool.diagnosis.model_selection import FALSE_DISCOVERY, HELPS
+from imutool.diagnosis.estimation.model_selection import FALSE_DISCOVERY, HELPS
+from imutool.diagnosis.estimation.significance import BLOCK_S, log_p_value
 from imutool.diagnosis.scalar.effects import Chosen, Effect, Samples, differ
 from imutool.diagnosis.scalar.fit import BETWEEN_SAMPLES, Fit, Panel, WhitenedLog, fit
-from imutool.diagnosis.significance import BLOCK_S, chance
 
 ALIKE = 4.0  # natural logarithms of chance within which two effects cannot be told apart
 TRIED = 5  # candidates that are fitted in full in a round
@@ -110,7 +110,7 @@ class Search:
         for effect in self.candidates:
             if differ(effect, besides):
                 gain, k = max((panel.gain(effect, start), k) for k, start in enumerate(effect.starts))
-                out.append((chance(gain, len(effect.numbers)), effect, effect.starts[k]))
+                out.append((log_p_value(gain, len(effect.numbers)), effect, effect.starts[k]))
         return sorted(out, key=lambda entry: entry[0])
 
     def _added(self, now: Fit) -> Fit | None:
@@ -118,7 +118,7 @@ class Search:
         best: tuple[float, Fit] | None = None
         for _, effect, start in self._ranked(now, [one for one, _ in now.chosen])[:TRIED]:
             trial = fit(self.signal, (*now.chosen, (effect, start)))
-            score = chance(now.objective - trial.objective, len(start))
+            score = log_p_value(now.objective - trial.objective, len(start))
             if best is None or score < best[0]:
                 best = score, trial
         return None if best is None or best[0] > self.threshold else best[1]
@@ -127,12 +127,12 @@ class Search:
         """With an effect replaced by another, or by its variant, that explains more, where there is one."""
         for k in list(self._of(now))[:-1]:
             without = self._without(now, k)
-            here = chance(without.objective - now.objective, len(now.chosen[k][1]))
+            here = log_p_value(without.objective - now.objective, len(now.chosen[k][1]))
             for score, effect, start in self._ranked(without, [one for one, _ in without.chosen])[:3]:
                 if effect.key == now.chosen[k][0].key or score > here:
                     continue
                 trial = fit(self.signal, (*without.chosen, (effect, start)))
-                if chance(without.objective - trial.objective, len(start)) < here - 1.0:
+                if log_p_value(without.objective - trial.objective, len(start)) < here - 1.0:
                     return trial
         return now
 
@@ -140,7 +140,7 @@ class Search:
         """Without effects that the others have made superfluous."""
         for k in list(self._of(now))[:-1]:  # the last has just come in
             without = self._without(now, k)
-            if chance(without.objective - now.objective, len(now.chosen[k][1])) > self.threshold:
+            if log_p_value(without.objective - now.objective, len(now.chosen[k][1])) > self.threshold:
                 return self._pruned(without)
         return now
 
@@ -168,7 +168,7 @@ class Search:
         gain = without.objective - whole.objective
         if any(one.jumps for j, (one, _) in enumerate(whole.chosen) if j != k):
             gain /= BETWEEN_SAMPLES**2  # whatever moves the signal a little wins single samples at an edge
-        log_p = chance(gain, len(theta))
+        log_p = log_p_value(gain, len(theta))
         gains = self._gains(fitted, k, "fitted", "held_out")
         if not effect.wanders:
             gains = np.concatenate([gains, self._gains(other, k, "held_out", "fitted")])
@@ -185,7 +185,7 @@ class Search:
             if score > 0.3 * log_p:  # hopeless even if the step that was tried is far from the best
                 continue
             trial = fit(self.signal, (*without.chosen, (one, start)), "all")
-            if chance(without.objective - trial.objective, len(start)) < log_p + ALIKE:
+            if log_p_value(without.objective - trial.objective, len(start)) < log_p + ALIKE:
                 found.append(one.key if one.name in ("driven", "unknown", effect.name) else one.name)
         return tuple(dict.fromkeys(found))
 

@@ -11,9 +11,10 @@ import numpy as np
 from imutool.mcap_io.storage.target import Target
 from imutool.noise import allan
 from imutool.noise_identification import SENSORS, Identified, Sensor, Sight
+from imutool.units import AXES, UNITS
 from imutool.viewing.html.drawing import Panel, Picture, legend, plain_tick_labels
 from imutool.viewing.html.drawing import png as drawn
-from imutool.viewing.html.page import AXES, AXIS_COLORS, SOFT, TITLES, UNITS
+from imutool.viewing.html.page import AXIS_COLORS, SOFT, TITLES
 
 LINES = {
     "quantisation": (0, (1, 3)),

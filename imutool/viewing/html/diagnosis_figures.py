@@ -13,9 +13,10 @@ from jaxtyping import Bool, Float64
 from scipy.signal import fftconvolve, welch
 from scipy.spatial.transform import Rotation
 
+from imutool.diagnosis.estimation.whitening import Band
 from imutool.diagnosis.result import Curve, Diagnosis, Located, SignalTraces, Traces
-from imutool.diagnosis.whitening import Band
 from imutool.diagnosis.wording import signals
+from imutool.units import AXES, UNITS
 from imutool.viewing.html.drawing import (
     DecimatedLine,
     Line,
@@ -25,7 +26,7 @@ from imutool.viewing.html.drawing import (
     svg,
     true_intervals,
 )
-from imutool.viewing.html.page import AFTER, AXES, BEFORE, HELD, INK, MARK, TITLES, UNITS
+from imutool.viewing.html.page import AFTER, BEFORE, HELD, INK, MARK, TITLES
 
 SIGNALS = {"gyro": slice(0, 3), "accel": slice(3, 6)}
 

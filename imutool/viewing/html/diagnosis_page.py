@@ -8,7 +8,7 @@ from pathlib import Path
 
 from imutool import __version__
 from imutool.diagnosis.quantity import SHOWN, each, grouped, percent, symbol
-from imutool.diagnosis.result import SCHEMA, UNITS, Diagnosis, Finding, Traces
+from imutool.diagnosis.result import SCHEMA, Diagnosis, Finding, Traces
 from imutool.diagnosis.wording import (
     answer,
     before_after,
@@ -25,6 +25,7 @@ from imutool.diagnosis.wording import (
     with_all,
 )
 from imutool.mcap_io.storage.target import Target
+from imutool.units import ASCII_UNITS
 from imutool.viewing.html import diagnosis_figures as figures
 from imutool.viewing.html import diagnosis_paths
 from imutool.viewing.html.drawing import prefix_ids
@@ -183,7 +184,7 @@ def _left(d: Diagnosis) -> Iterator[str]:
     if d.unexplained:
         yield "<h2>What remains</h2>"
         head = "".join(f"<th>{one}</th>" for one in ("Signal", "Remains (rms)", "Noise (rms)", "Ratio", ""))
-        units = {one.signal: one.held_out.unit for one in d.findings} | UNITS
+        units = {one.signal: one.held_out.unit for one in d.findings} | ASCII_UNITS
         rows = []
         for signal, one in d.unexplained.items():
             unit = symbol(units.get(signal, ""))

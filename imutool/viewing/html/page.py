@@ -105,10 +105,8 @@ INK, GRID, SOFT, BEFORE, AFTER, MARK, HELD, X, Y, Z = (
 )
 MODELS = tuple(f"imutool:{name}" for name in ("after", "second", "third", "fourth"))
 LEVELS = tuple(f"imutool:e{level}" for level in range(7))
-AXES = ("x", "y", "z")
 AXIS_COLORS = (X, Y, Z)
 TITLES = {"gyro": "Gyro", "accel": "Accel"}
-UNITS = {"gyro": "rad/s", "accel": "m/s²"}
 
 
 def _variables(colors: dict[str, str]) -> str:

@@ -10,8 +10,9 @@ import numpy as np
 from jaxtyping import Float64
 
 from imutool.recording import Poses
+from imutool.units import AXES
 from imutool.viewing.html.drawing import Panel, Picture, legend
-from imutool.viewing.html.page import AXES, BEFORE, HELD, INK, LEVELS, MODELS
+from imutool.viewing.html.page import BEFORE, HELD, INK, LEVELS, MODELS
 from imutool.viewing.html.report_wording import best_run, format_quantity, run_name
 from imutool.viewing.model.decimate import path_rows
 from imutool.viewing.model.run_data import RunData, Trace, split_at_gaps

@@ -13,8 +13,9 @@ from jaxtyping import Float64
 from imutool.inertial import stationary
 from imutool.noise import allan
 from imutool.recording import Imu
+from imutool.units import AXES, UNITS
 from imutool.viewing.html.drawing import Panel, Picture, average_log_bins, decimate_extremes, legend, plain_tick_labels
-from imutool.viewing.html.page import AXES, AXIS_COLORS, INK, TITLES, UNITS
+from imutool.viewing.html.page import AXIS_COLORS, INK, TITLES
 from imutool.viewing.html.report_paths import color_of
 from imutool.viewing.html.report_wording import best_run, format_number, run_name, worst_orientation_error
 from imutool.viewing.model.run_data import RunData, Trace

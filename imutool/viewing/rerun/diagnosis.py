@@ -14,11 +14,12 @@ from imutool.diagnosis.result import Diagnosis, Located, Traces
 from imutool.diagnosis.wording import lines, where
 from imutool.mcap_io.storage.target import Target
 from imutool.recording import Times
+from imutool.units import AXES, UNITS
 from imutool.viewing.html.diagnosis_figures import intervals_in_log
 from imutool.viewing.html.drawing import true_intervals
 from imutool.viewing.rerun.entities import styles
-from imutool.viewing.rerun.entities.signals import KINDS, UNITS
-from imutool.viewing.rerun.entities.styles import AXES, BOLD_WIDTH, EVENT_COLOR, GREY, MODEL_COLORS, RAW_COLOR, RAW_WIDTH, Color
+from imutool.viewing.rerun.entities.signals import KINDS
+from imutool.viewing.rerun.entities.styles import BOLD_WIDTH, EVENT_COLOR, GREY, MODEL_COLORS, RAW_COLOR, RAW_WIDTH, Color
 from imutool.viewing.rerun.plots import frame, whole_time_axis
 from imutool.viewing.rerun.sdk import FLUSH_S, elapsed_column, entity_path, new_stream, require_rerun, unique_names
 

@@ -7,11 +7,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from imutool.units import AXES, UNITS
 from imutool.viewing.model.run_data import RunData, Trace
 from imutool.viewing.model.trajectory_error import Drift, Errors
 from imutool.viewing.rerun import sdk, source
 from imutool.viewing.rerun.entities import errors, signals
-from imutool.viewing.rerun.entities.styles import AXES, BACKGROUND, color_name, color_of
+from imutool.viewing.rerun.entities.styles import BACKGROUND, color_name, color_of
 from imutool.viewing.rerun.plots import error_axis_limit, plot, signed_range, unsigned_range, whole_time_axis
 from imutool.viewing.rerun.sdk import Scope
 
@@ -107,7 +108,7 @@ def _bias_of(data: RunData, scope: Scope, kind: str, axis: int) -> rrb.TimeSerie
         key_parts.insert(1, f"±{signals.SIGMAS:g}σ thin")
     key = ", ".join([*key_parts, *([_colors(data, data.models())] if several else [])])
     return plot(
-        list(overrides), f"{AXES[axis]} ({signals.UNITS[kind]})", key, height=_bias_range(data, kind, axis), overrides=overrides
+        list(overrides), f"{AXES[axis]} ({UNITS[kind]})", key, height=_bias_range(data, kind, axis), overrides=overrides
     )
 
 

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from support import diagnoses, markup
 
 from imutool.diagnosis.result import Closer, SignalTraces
 from imutool.diagnosis.wording import conclusion
@@ -22,8 +23,6 @@ from imutool.viewing.html import diagnosis_figures as figures
 from imutool.viewing.html import drawing
 from imutool.viewing.html.diagnosis_page import html, write
 from imutool.viewing.html.page import text
-from tests.diagnosis import diagnoses
-from tests.viewing import markup
 
 Page, svgs = markup.Page, markup.svgs
 MOST_BYTES = 3_000_000

@@ -6,11 +6,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from support import diagnoses
 
 from imutool.diagnosis.result import Traces
 from imutool.recording import Poses
 from imutool.viewing.html.diagnosis_paths import MOST_S, held_out_stretches, paths, rms_drift
-from tests.diagnosis import diagnoses
 
 RATE_HZ, SECONDS = 100.0, 40.0
 TURN_RAD_S, PUSH_M_S2 = 0.01, 0.2  # what is left out of a sensor at rest

@@ -10,12 +10,10 @@ from typing import Any
 
 import numpy as np
 import pytest
+from support import diagnoses, image_difference, viewers
 
 from imutool.viewing.html import diagnosis_page, report
 from imutool.viewing.model.runs import build
-from tests import viewers
-from tests.diagnosis import diagnoses
-from tests.viewing import separated
 
 TESTS = Path(__file__).parents[1]
 
@@ -38,12 +36,12 @@ def browser() -> Iterator[Any]:
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Each page as NAME.html."""
     folder = tmp_path_factory.mktemp("pages")
-    flights = [separated.recording(seed) for seed in (3, 4)]
+    flights = [image_difference.recording(seed) for seed in (3, 4)]
     hostile = replace(flights[1], name=HOSTILE)
     logs = {
-        "one model": [build(flights[0], separated.runs(flights[0]))],
-        "nothing known": [build(replace(flights[0], truths={}, scalars={}), separated.runs(flights[0], models=0))],
-        "two logs": [build(one, separated.runs(one)) for one in (flights[0], hostile)],
+        "one model": [build(flights[0], image_difference.runs(flights[0]))],
+        "nothing known": [build(replace(flights[0], truths={}, scalars={}), image_difference.runs(flights[0], models=0))],
+        "two logs": [build(one, image_difference.runs(one)) for one in (flights[0], hostile)],
     }
     for name, shown in logs.items():
         report.write_page(shown, folder / f"{name}.html")

@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from support import markup
 
 from imutool.errors import ConfigError
 from imutool.recording import Imu, Poses, Recording
@@ -25,7 +26,6 @@ from imutool.viewing.model.events import Event
 from imutool.viewing.model.run_data import Run, RunData, Trace
 from imutool.viewing.model.runs import build
 from imutool.viewing.model.trajectory_error import Drift, Errors, Window
-from tests.viewing import markup
 
 Page, svgs, curves = markup.Page, markup.svgs, markup.curves
 SECONDS, STILL_S = 20.0, 6.0  # of a flight, and of its rest before that

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from defects import batch_of, late, repeated, with_values, without
+from support.imu_defects import batch_of, late, repeated, with_values, without
 
 from imutool.cleaning.first_pass import examine
 from imutool.mcap_io.batches import ImuBatch

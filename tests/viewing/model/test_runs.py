@@ -8,9 +8,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from defects import batch_of, late, pick, repeated, with_values, write_log
 from mcap.reader import make_reader
 from mcap.writer import Writer
+from support.imu_defects import batch_of, late, pick, repeated, with_values, write_log
 
 from imutool.debiasing import apply, apply_with_std, debias
 from imutool.errors import ConfigError, DataError, LogError

@@ -14,12 +14,12 @@ import pyarrow as pa
 import pytest
 import rerun as rr
 from rerun.chunk import RrdReader
+from support import diagnoses
 
 from imutool.diagnosis.wording import conclusion
 from imutool.errors import ConfigError
 from imutool.viewing.rerun import diagnosis as view
 from imutool.viewing.rerun.viewer import binary
-from tests.diagnosis import diagnoses
 
 AXES = [(signal, axis) for signal in ("gyro", "accel") for axis in "xyz"]
 

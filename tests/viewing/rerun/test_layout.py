@@ -12,13 +12,13 @@ from typing import Any
 import numpy as np
 import pytest
 import rerun.blueprint as rrb
+from support import saved_rrd
 
 from imutool.recording import Recording
 from imutool.viewing.model.run_data import Run, RunData
 from imutool.viewing.model.runs import build
 from imutool.viewing.rerun import layout
 from imutool.viewing.rerun.plots import error_axis_limit, plot
-from tests.viewing import rrd_reader
 
 LONGEST = 90  # letters of a title at 1280 pixels: half the window is about 640 wide
 NOT_SHOWN = {"/__properties", "/world"}  # a view has the second one as its origin
@@ -58,25 +58,25 @@ def logs(request: pytest.FixtureRequest, recording: Recording, runs: list[Run]) 
 
 def tabs(part: Any) -> list[str]:
     """The names of the tabs on the right of one log."""
-    found: list[str] = rrd_reader.names(part.contents[1])
+    found: list[str] = saved_rrd.names(part.contents[1])
     return found
 
 
 def test_every_view_shows_something_and_all_that_is_logged_is_shown(logs: list[RunData], tmp_path: Path) -> None:
-    entities = rrd_reader.read(rrd_reader.written(logs, tmp_path / "a.rrd"))
+    entities = saved_rrd.read(saved_rrd.written(logs, tmp_path / "a.rrd"))
     paths = [path for path in entities if entities[path].columns or entities[path].static]
     shown: set[str] = set()
-    for view in rrd_reader.views(layout.blueprint(logs)):
-        for name in rrd_reader.contents(view):
-            held = rrd_reader.held(SimpleNamespace(contents=name, origin=view.origin), paths)
+    for view in saved_rrd.views(layout.blueprint(logs)):
+        for name in saved_rrd.contents(view):
+            held = saved_rrd.held(SimpleNamespace(contents=name, origin=view.origin), paths)
             assert held, f"{view.name}: {name}"
             shown |= held
-        assert set(view.visualizer_overrides) <= set(rrd_reader.contents(view))
+        assert set(view.visualizer_overrides) <= set(saved_rrd.contents(view))
     assert {path for path in set(paths) - shown if not path.endswith("/world")} <= NOT_SHOWN
 
 
 def test_titles_have_units_and_fit(logs: list[RunData]) -> None:
-    for view in rrd_reader.views(layout.blueprint(logs)):
+    for view in saved_rrd.views(layout.blueprint(logs)):
         assert view.name
         assert len(view.name) <= LONGEST
         if isinstance(view, rrb.TimeSeriesView):
@@ -84,13 +84,13 @@ def test_titles_have_units_and_fit(logs: list[RunData]) -> None:
 
 
 def test_plots_show_the_whole_log_on_every_timeline_and_space_what_has_happened(logs: list[RunData]) -> None:
-    for view in rrd_reader.views(layout.blueprint(logs)):
+    for view in saved_rrd.views(layout.blueprint(logs)):
         if isinstance(view, rrb.TimeSeriesView):
             (told,) = view.properties["TimeAxis"].view_range.as_arrow_array().to_pylist()
             assert told["start"] == told["end"]  # infinite, both
         if isinstance(view, rrb.Spatial3DView):
             ranges = view.properties["VisibleTimeRanges"].ranges.as_arrow_array().to_pylist()
-            assert [one["timeline"] for one in ranges] == list(rrd_reader.TIMELINES)
+            assert [one["timeline"] for one in ranges] == list(saved_rrd.TIMELINES)
 
 
 def test_the_tabs_are_those_that_have_content(recording: Recording, runs: list[Run]) -> None:
@@ -106,8 +106,8 @@ def test_the_tabs_are_those_that_have_content(recording: Recording, runs: list[R
 def test_several_logs_are_compared_first_and_then_have_a_tab_each(recording: Recording, runs: list[Run]) -> None:
     two = CASES["two logs"](recording, runs)
     root = layout.blueprint(two).root_container
-    assert rrd_reader.names(root) == ["Compare", "flight_3", "[a] b/c"]
-    compared = rrd_reader.views(root.contents[0])
+    assert saved_rrd.names(root) == ["Compare", "flight_3", "[a] b/c"]
+    compared = saved_rrd.views(root.contents[0])
     assert [view.name for view in compared] == ["Orientation error (deg)", "Position error (m)", "Figures"]
     styles = list(compared[0].visualizer_overrides.values())
     named = [style.names.as_arrow_array().to_pylist()[0] for style in styles]
@@ -117,14 +117,14 @@ def test_several_logs_are_compared_first_and_then_have_a_tab_each(recording: Rec
     colors = [tuple(style.colors.as_arrow_array().to_pylist()) for style in styles]
     assert len(set(colors)) == len(colors)
     alone = layout.blueprint(CASES["logs without truth"](recording, runs)).root_container.contents[0]
-    assert [view.name for view in rrd_reader.views(alone)] == ["Figures"]
+    assert [view.name for view in saved_rrd.views(alone)] == ["Figures"]
 
 
 def test_a_bias_is_plotted_by_axis_with_all_that_is_known_of_it(recording: Recording, runs: list[Run]) -> None:
     bias = layout.blueprint(CASES["one model"](recording, runs)).root_container.contents[1].contents[1]
-    assert rrd_reader.names(bias) == ["Gyro bias (rad/s)", "Accel bias (m/s²)"]
+    assert saved_rrd.names(bias) == ["Gyro bias (rad/s)", "Accel bias (m/s²)"]
     for (kind, unit), part in zip({"gyro": "rad/s", "accel": "m/s²"}.items(), bias.contents, strict=True):
-        for axis, view in enumerate(rrd_reader.views(part)):
+        for axis, view in enumerate(saved_rrd.views(part)):
             assert view.name == f"{'xyz'[axis]} ({unit}): estimated bold, ±3σ thin, true broad and pale"
             visible = {
                 path: style.visible_series.as_arrow_array().to_pylist() for path, style in view.visualizer_overrides.items()
@@ -136,7 +136,7 @@ def test_a_bias_is_plotted_by_axis_with_all_that_is_known_of_it(recording: Recor
 
 def test_colours_in_titles_are_those_of_the_curves(recording: Recording, runs: list[Run]) -> None:
     def titles(case: str) -> list[str]:
-        return [view.name for view in rrd_reader.views(layout.blueprint(CASES[case](recording, runs)))]
+        return [view.name for view in saved_rrd.views(layout.blueprint(CASES[case](recording, runs)))]
 
     (orientation,) = [title for title in titles("one model") if title.startswith("Orientation error (deg), top")]
     assert re.fullmatch(r"Orientation error \(deg\), top [\d.]+: debiased blue, raw orange, worst pink", orientation)

@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from support import saved_rrd
 
 from imutool.cleaning.cleaner import rows
 from imutool.debiasing import Block, Watch, debias
@@ -22,7 +23,6 @@ from imutool.mcap_io.write import write
 from imutool.sensor.flight import flight
 from imutool.viewing.model.runs import load
 from imutool.viewing.rerun import live, scene, viewer
-from tests.viewing import rrd_reader
 
 SECONDS, BLOCK = 12.0, 250  # samples at 200 Hz, as from a log with images
 PATH_M = 1e-4  # single precision, in which Rerun keeps positions, over some hundred metres
@@ -79,13 +79,13 @@ def test_what_is_watched_is_what_is_shown_afterwards(log: Path, unwatched: Path,
     watched(log, tmp_path, save=tmp_path / "live.rrd")
     data = load(unwatched)
     (tmp_path / "after.rrd").write_bytes(scene.rrd([data], source=False))
-    seen, after = rrd_reader.read(tmp_path / "live.rrd"), rrd_reader.read(tmp_path / "after.rrd")
+    seen, after = saved_rrd.read(tmp_path / "live.rrd"), saved_rrd.read(tmp_path / "after.rrd")
     curves = [f"/imu/{kind}/{role}" for kind in ("gyro", "accel") for role in ("raw", "debiased")]
     curves += [f"/bias/{kind}/{name}" for kind in ("gyro", "accel") for name in ("estimated", "sigma")]
     for path in curves:
         name = "Scalars:scalars"
         np.testing.assert_allclose(seen[path].numbers(name), after[path].numbers(name), rtol=1e-12, atol=1e-12, err_msg=path)
-        for timeline in rrd_reader.TIMELINES:
+        for timeline in saved_rrd.TIMELINES:
             np.testing.assert_array_equal(seen[path].times(name, timeline), after[path].times(name, timeline), err_msg=path)
         for style in ("SeriesLines:names", "SeriesLines:colors", "SeriesLines:widths"):
             assert seen[path].static[style] == after[path].static[style], (path, style)
@@ -133,7 +133,7 @@ def test_a_viewer_that_goes_away_is_said_once_and_neither_log_nor_file_suffer(
     assert [record.getMessage() for record in caplog.records] == ["The viewer is gone; debiasing goes on without it"]
     assert [one.how for one in watch.shown] == ["rrd"]
     assert out.read_bytes() == unwatched.read_bytes()
-    assert len(rrd_reader.read(tmp_path / "live.rrd")["/imu/gyro/raw"].numbers("Scalars:scalars")) == sum(
+    assert len(saved_rrd.read(tmp_path / "live.rrd")["/imu/gyro/raw"].numbers("Scalars:scalars")) == sum(
         len(b.bias) for b in blocks
     )
 
@@ -179,7 +179,7 @@ def test_samples_that_come_again_from_a_repaired_log_are_shown_once(log: Path, t
     with live.live_view("log", save=tmp_path / "live.rrd", instead=tmp_path) as watch:
         for block in (*blocks[:4], *blocks):
             watch(block)
-    stamps = rrd_reader.read(tmp_path / "live.rrd")["/imu/gyro/raw"].times("Scalars:scalars", "ros2_timestamp")
+    stamps = saved_rrd.read(tmp_path / "live.rrd")["/imu/gyro/raw"].times("Scalars:scalars", "ros2_timestamp")
     np.testing.assert_array_equal(stamps, np.concatenate([block.batch.stamp_ns for block in blocks]))
 
 
@@ -190,7 +190,7 @@ def test_a_second_imu_has_a_tree_of_its_own(log: Path, tmp_path: Path) -> None:
         for block in blocks:
             watch(block)
             watch(block._replace(topic="/imu 1"))
-    found = rrd_reader.read(tmp_path / "live.rrd")
+    found = saved_rrd.read(tmp_path / "live.rrd")
     for path in ("imu/gyro/debiased", "world/debiased/body", "bias/accel/sigma"):
         assert {f"/{path}", rf"/run/\/imu\ 1/{path}"} <= set(found)
 
@@ -208,7 +208,7 @@ def test_where_no_viewer_opens_a_file_is_written_instead_and_said(
     (shown,) = watch.shown
     assert shown.said.startswith(why)
     assert f". Saved {tmp_path / 'instead.rrd'}. Open with: rerun" in shown.said
-    assert "/imu/gyro/raw" in rrd_reader.read(tmp_path / "instead.rrd")
+    assert "/imu/gyro/raw" in saved_rrd.read(tmp_path / "instead.rrd")
 
 
 def test_a_debiasing_that_fails_leaves_no_file_and_an_existing_one_is_kept(log: Path, tmp_path: Path) -> None:
@@ -228,4 +228,4 @@ def test_the_command_says_what_it_kept(
     assert done.returncode == 0, done.stderr
     (shown,) = json.loads(done.stdout)["shown"]
     assert (shown["how"], shown["place"]) == ("rrd", "v.rrd")
-    assert "/world/debiased/path" in rrd_reader.read(tmp_path / "v.rrd")
+    assert "/world/debiased/path" in saved_rrd.read(tmp_path / "v.rrd")

@@ -9,12 +9,11 @@ from typing import Any
 
 import numpy as np
 import pytest
+from support import drawn_curves, image_difference, saved_rrd, viewers
 
 from imutool.viewing.model.run_data import RunData
 from imutool.viewing.model.runs import build
 from imutool.viewing.rerun import layout, scene
-from tests import viewers
-from tests.viewing import curves, separated
 
 HERE = Path(__file__).parent
 
@@ -23,24 +22,24 @@ INK = 400  # pixels that differ from the ground, the least of a view that says a
 
 
 def one_model() -> list[RunData]:
-    made = separated.recording()
-    return [build(made, separated.runs(made))]
+    made = image_difference.recording()
+    return [build(made, image_difference.runs(made))]
 
 
 def nothing_known() -> list[RunData]:
     """A log without truth, read as it is."""
-    made = replace(separated.recording(), truths={}, scalars={})
-    return [build(made, separated.runs(made, models=0))]
+    made = replace(image_difference.recording(), truths={}, scalars={})
+    return [build(made, image_difference.runs(made, models=0))]
 
 
 def two_models() -> list[RunData]:
-    made = separated.recording()
-    return [build(made, separated.runs(made, models=2))]
+    made = image_difference.recording()
+    return [build(made, image_difference.runs(made, models=2))]
 
 
 def two_logs() -> list[RunData]:
-    made = [separated.recording(seed) for seed in (3, 4)]
-    return [build(one, separated.runs(one)) for one in made]
+    made = [image_difference.recording(seed) for seed in (3, 4)]
+    return [build(one, image_difference.runs(one)) for one in made]
 
 
 EVERYTHING = None  # tabs
@@ -49,8 +48,8 @@ CASES = {one_model: EVERYTHING, nothing_known: EVERYTHING, two_models: 2, two_lo
 
 def curves_of(case: Callable[[], list[RunData]], folder: Path) -> list[Any]:
     """Every curve that is logged."""
-    path = curves.RRD.written(case(), folder / "logged.rrd")
-    found: list[Any] = curves.curves(path)
+    path = saved_rrd.written(case(), folder / "logged.rrd")
+    found: list[Any] = drawn_curves.curves(path)
     return found
 
 
@@ -60,17 +59,17 @@ def drawn(case: Callable[[], list[RunData]], tabs: int | None) -> tuple[list[Any
     blueprint = layout.blueprint(logs)
 
     def look(running: Any) -> dict[Any, np.ndarray]:
-        return curves.pictures(running, blueprint, lambda to: scene.log(logs, to), logs[0].duration_s, tabs)
+        return drawn_curves.pictures(running, blueprint, lambda to: scene.log(logs, to), logs[0].duration_s, tabs)
 
     seen = viewers.seen(look, WINDOW if tabs is EVERYTHING else WIDE)
-    return [view for view in curves.RRD.views(blueprint) if view.id in seen], seen
+    return [view for view in saved_rrd.views(blueprint) if view.id in seen], seen
 
 
 @pytest.mark.parametrize("case", CASES, ids=lambda case: case.__name__)
 def test_every_view_draws_every_curve_it_holds(case: Callable[[], list[RunData]], tmp_path: Path) -> None:
     curves = curves_of(case, tmp_path)
     views, seen = drawn(case, CASES[case])
-    assert [fault for view in views for fault in curves.unseen(view, seen[view.id], curves)] == []
+    assert [fault for view in views for fault in drawn_curves.unseen(view, seen[view.id], curves)] == []
     assert [view.name for view in views if ink(seen[view.id]) < INK] == []
 
 

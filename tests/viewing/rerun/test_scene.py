@@ -10,6 +10,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import rerun as rr
+from support import saved_rrd
 
 from imutool.recording import Recording
 from imutool.viewing.model.events import Event
@@ -19,7 +20,6 @@ from imutool.viewing.model.trajectory_error import Drift, Errors, Window
 from imutool.viewing.rerun import scene, sdk
 from imutool.viewing.rerun.entities import paths, signals, styles
 from imutool.viewing.rerun.viewer import binary
-from tests.viewing import rrd_reader
 
 SCALARS = "Scalars:scalars"
 SECOND = 1_000_000_000
@@ -55,13 +55,13 @@ def one(recording: Recording, runs: list[Run]) -> RunData:
 
 @pytest.fixture(scope="module")
 def saved(one: RunData, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    found: Path = rrd_reader.written([one], tmp_path_factory.mktemp("scene") / "one.rrd")
+    found: Path = saved_rrd.written([one], tmp_path_factory.mktemp("scene") / "one.rrd")
     return found
 
 
 @pytest.fixture(scope="module")
 def entities(saved: Path) -> SimpleNamespace:
-    return SimpleNamespace(**{"all": rrd_reader.read(saved)})
+    return SimpleNamespace(**{"all": saved_rrd.read(saved)})
 
 
 def of_errors(home: str, part: str, errors: Errors) -> Curves:
@@ -137,7 +137,7 @@ def test_every_curve_reads_back_bit_for_bit_with_its_nanoseconds(one: RunData, e
 
 def test_nothing_is_on_any_other_timeline(entities: SimpleNamespace) -> None:
     found = {line for entity in entities.all.values() for stamps in entity.stamps.values() for line in stamps}
-    assert found == set(rrd_reader.TIMELINES)
+    assert found == set(saved_rrd.TIMELINES)
 
 
 def test_curves_show_the_extremes_of_what_falls_on_a_pixel(one: RunData, entities: SimpleNamespace) -> None:
@@ -188,7 +188,7 @@ def test_a_very_long_curve_is_thinned_with_its_extremes_kept(
     one: RunData, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, limit: str, path: str, most: int
 ) -> None:
     monkeypatch.setattr(signals, limit, most)
-    found = rrd_reader.read(rrd_reader.written([one], tmp_path / "thin.rrd"))
+    found = saved_rrd.read(saved_rrd.written([one], tmp_path / "thin.rrd"))
     t_ns, whole = expected(one)[path]
     values = found[path].numbers(SCALARS)
     assert len(values) <= most < len(whole)
@@ -277,7 +277,7 @@ def test_no_line_is_drawn_across_a_gap(recording: Recording, runs: list[Run], tm
     gappy = recording.truth.rows((t_ns < 4 * SECOND) | (t_ns > 5 * SECOND))
     data = build(replace(recording, truths={"/ground_truth/pose": gappy}), runs[:1])
     assert data.truth is not None
-    found = rrd_reader.read(rrd_reader.written([data], tmp_path / "gap.rrd"))["/world/gt/path"]
+    found = saved_rrd.read(saved_rrd.written([data], tmp_path / "gap.rrd"))["/world/gt/path"]
     pieces = np.concatenate(strips(found))
     assert len(pieces) == len(data.truth) - 2
     edge = int(np.argmax(np.diff(data.truth.t_ns)))
@@ -365,7 +365,7 @@ def test_the_report_holds_figures_windows_events_and_notes_and_no_markup_of_othe
 
 
 def test_several_models_lie_under_their_names_and_raw_and_truth_beside_them(data: RunData, tmp_path: Path) -> None:
-    found = rrd_reader.read(rrd_reader.written([data], tmp_path / "two.rrd"))
+    found = saved_rrd.read(saved_rrd.written([data], tmp_path / "two.rrd"))
     scopes = {"static": "/run/static", "my model/v1": f"/run/{SPELT}"}
     wanted = expected(data, "", scopes)
     check(data, wanted, found)
@@ -382,7 +382,7 @@ def test_several_logs_lie_under_their_names_each_a_whole_tree(
     one: RunData, data: RunData, recording: Recording, runs: list[Run], tmp_path: Path
 ) -> None:
     bare = build(replace(recording, truths={}, scalars={}), runs[:1])
-    found = rrd_reader.read(rrd_reader.written([one, data, replace(bare, name="a/b")], tmp_path / "logs.rrd"))
+    found = saved_rrd.read(saved_rrd.written([one, data, replace(bare, name="a/b")], tmp_path / "logs.rrd"))
     second = r"/run/flight_3\ \(2\)"
     scopes = {"static": f"{second}/static", "my model/v1": f"{second}/{SPELT}"}
     for log, wanted in (
@@ -420,7 +420,7 @@ def test_a_name_is_shortened_by_the_words_that_all_models_begin_with(data: RunDa
 def test_what_is_unknown_is_left_out(recording: Recording, runs: list[Run], tmp_path: Path) -> None:
     short = recording.between(int(recording.imu.t_ns[0]), int(recording.imu.t_ns[40]))  # too short for a spectrum
     data = replace(build(replace(short, truths={}, scalars={}), [Run.raw(short.imu)]), events=())
-    found = rrd_reader.read(rrd_reader.written([data], tmp_path / "bare.rrd"))
+    found = saved_rrd.read(saved_rrd.written([data], tmp_path / "bare.rrd"))
     wanted = {"/imu/gyro/raw", "/imu/accel/raw", "/world", "/world/raw/path", "/world/raw/body", "/report", "/__properties"}
     assert set(found) == wanted
     assert "no truth" in found["/report"].static["TextDocument:text"][0]
@@ -428,7 +428,7 @@ def test_what_is_unknown_is_left_out(recording: Recording, runs: list[Run], tmp_
 
 @pytest.mark.parametrize("case", ["one", "data"])
 def test_reruns_own_verifier_accepts_the_file(case: str, tmp_path: Path, request: pytest.FixtureRequest) -> None:
-    path = rrd_reader.written([request.getfixturevalue(case)], tmp_path / "verified.rrd")
+    path = saved_rrd.written([request.getfixturevalue(case)], tmp_path / "verified.rrd")
     run = subprocess.run([str(binary()), "rrd", "verify", str(path)], capture_output=True, text=True, check=False)
     assert run.returncode == 0, run.stderr
 

@@ -11,13 +11,13 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from PIL import Image
+from support import saved_rrd
 
 from imutool.mcap_io.write import write
 from imutool.recording import Frames, Recording, Scalars
 from imutool.viewing.model.run_data import RunData
 from imutool.viewing.model.runs import load
 from imutool.viewing.rerun import layout, source
-from tests.viewing import rrd_reader
 
 CAMERA = "/cam0/image_raw/compressed"
 BLOB = "EncodedImage:blob"
@@ -55,8 +55,8 @@ def data(log: Path) -> RunData:
 
 @pytest.fixture(scope="module")
 def entities(data: RunData, tmp_path_factory: pytest.TempPathFactory) -> SimpleNamespace:
-    path = rrd_reader.written([data], tmp_path_factory.mktemp("rrd") / "a.rrd")
-    return SimpleNamespace(all=rrd_reader.read(path))
+    path = saved_rrd.written([data], tmp_path_factory.mktemp("rrd") / "a.rrd")
+    return SimpleNamespace(all=saved_rrd.read(path))
 
 
 def report(entities: dict) -> str:
@@ -77,7 +77,7 @@ def test_camera_frames_are_the_logs_own_bytes_at_their_nanoseconds(
 
 def test_nothing_is_on_any_other_timeline(entities: SimpleNamespace) -> None:
     found = {line for entity in entities.all.values() for stamps in entity.stamps.values() for line in stamps}
-    assert found == set(rrd_reader.TIMELINES)
+    assert found == set(saved_rrd.TIMELINES)
 
 
 def test_what_is_drawn_already_is_left_out_and_all_else_is_there(entities: SimpleNamespace) -> None:
@@ -91,7 +91,7 @@ def test_a_log_without_truth_has_its_other_topics_too(
 ) -> None:
     images = {CAMERA: Frames("png", len(frames), lambda: iter(frames))}
     write(replace(recording, truths={}, scalars={}, frames=images), tmp_path / "bare.mcap")
-    found = rrd_reader.read(rrd_reader.written([load(tmp_path / "bare.mcap")], tmp_path / "bare.rrd"))
+    found = saved_rrd.read(saved_rrd.written([load(tmp_path / "bare.mcap")], tmp_path / "bare.rrd"))
     assert CAMERA in found
     assert "/imu0" not in found
 
@@ -111,18 +111,18 @@ def test_transforms_that_have_no_header_of_their_own_are_placed_by_their_log_tim
 
 def test_cameras_have_a_tab_only_where_the_source_is_shown(data: RunData) -> None:
     def tabs(source: bool) -> list[str]:
-        found: list[str] = rrd_reader.names(layout.blueprint([data], source=source).root_container.contents[1])
+        found: list[str] = saved_rrd.names(layout.blueprint([data], source=source).root_container.contents[1])
         return found
 
     assert tabs(True) == [*tabs(False), "Cameras"]
     (camera,) = [
-        view for view in rrd_reader.views(layout.blueprint([data])) if view.class_identifier == "2D" and "cam" in view.name
+        view for view in saved_rrd.views(layout.blueprint([data])) if view.class_identifier == "2D" and "cam" in view.name
     ]
     assert camera.origin == CAMERA
 
 
 def test_without_the_source_nothing_of_it_is_there(data: RunData, tmp_path: Path) -> None:
-    found = rrd_reader.read(rrd_reader.written([data], tmp_path / "bare.rrd", source=False))
+    found = saved_rrd.read(saved_rrd.written([data], tmp_path / "bare.rrd", source=False))
     assert not {CAMERA, "/tf", "/wind"} & set(found)
 
 
@@ -130,10 +130,10 @@ def test_a_log_too_large_for_a_viewer_is_left_out_and_said(
     data: RunData, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(source, "SOURCE_LIMIT", 1000)
-    found = rrd_reader.read(rrd_reader.written([data], tmp_path / "large.rrd"))
+    found = saved_rrd.read(saved_rrd.written([data], tmp_path / "large.rrd"))
     assert CAMERA not in found
     assert "The log's other topics are not shown" in report(found)
-    assert "Cameras" not in rrd_reader.names(layout.blueprint([data]).root_container.contents[1])
+    assert "Cameras" not in saved_rrd.names(layout.blueprint([data]).root_container.contents[1])
 
 
 @pytest.mark.parametrize("content", [b"", b"no log at all", b"\x89MCAP0\r\n" + bytes(100)])
@@ -142,11 +142,11 @@ def test_a_log_that_cannot_be_read_any_more_is_said_and_the_rest_is_drawn(
 ) -> None:
     path = tmp_path / "gone.mcap"
     path.write_bytes(content)
-    found = rrd_reader.read(rrd_reader.written([replace(data, source=path)], tmp_path / "a.rrd"))
+    found = saved_rrd.read(saved_rrd.written([replace(data, source=path)], tmp_path / "a.rrd"))
     assert "The log's other topics are not shown" in report(found)
     assert "/imu/gyro/raw" in found
     path.unlink()
-    assert "not shown" in report(rrd_reader.read(rrd_reader.written([replace(data, source=path)], tmp_path / "b.rrd")))
+    assert "not shown" in report(saved_rrd.read(saved_rrd.written([replace(data, source=path)], tmp_path / "b.rrd")))
 
 
 def test_of_a_damaged_log_what_lies_before_the_damage_is_shown(data: RunData, recording: Recording, tmp_path: Path) -> None:
@@ -155,7 +155,7 @@ def test_of_a_damaged_log_what_lies_before_the_damage_is_shown(data: RunData, re
     write(replace(recording, frames={CAMERA: Frames("png", 20, lambda: iter(large))}), tmp_path / "whole.mcap")
     content = (tmp_path / "whole.mcap").read_bytes()
     (tmp_path / "cut.mcap").write_bytes(content[: len(content) * 2 // 3])
-    found = rrd_reader.read(rrd_reader.written([replace(data, source=tmp_path / "cut.mcap")], tmp_path / "a.rrd"))
+    found = saved_rrd.read(saved_rrd.written([replace(data, source=tmp_path / "cut.mcap")], tmp_path / "a.rrd"))
     shown = [bytes(row[0]) for row in found[CAMERA].rows(BLOB).to_pylist()]
     assert 5 < len(shown) < 20
     assert shown == [image for _, image in large[: len(shown)]]
@@ -170,12 +170,12 @@ def test_another_clock_in_the_headers_is_not_taken_for_the_imus(data: RunData) -
 
 
 def test_several_logs_keep_their_topics_apart_and_their_transforms_out(data: RunData, tmp_path: Path) -> None:
-    found = rrd_reader.read(rrd_reader.written([data, replace(data, name="other")], tmp_path / "two.rrd"))
+    found = saved_rrd.read(saved_rrd.written([data, replace(data, name="other")], tmp_path / "two.rrd"))
     for name in (data.name, "other"):
         assert {f"/run/{name}{CAMERA}", f"/run/{name}/source/imu/temperature"} <= set(found)
         assert f"/run/{name}/tf" not in found  # a viewer has one set of frames
         assert "transforms (/tf)" in found[f"/run/{name}/report"].static["TextDocument:text"][0]
     cameras = [
-        view.origin for view in rrd_reader.views(layout.blueprint([data, replace(data, name="other")])) if "cam0" in view.name
+        view.origin for view in saved_rrd.views(layout.blueprint([data, replace(data, name="other")])) if "cam0" in view.name
     ]
     assert cameras == [f"/run/{data.name}{CAMERA}", f"/run/other{CAMERA}"]

@@ -15,9 +15,9 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from support import viewers
 
 from imutool.viewing.rerun.entities.styles import XYZ
-from tests import viewers
 
 SIZE = {"width": 800, "height": 500}  # software draws it
 LEAST = 200  # pixels of a colour; a legend alone has some fifty

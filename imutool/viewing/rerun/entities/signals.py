@@ -10,18 +10,18 @@ import numpy as np
 from jaxtyping import Float64
 
 from imutool.recording import Times
+from imutool.units import AXES
 from imutool.viewing.model.decimate import MAX_CURVE_ROWS, curve_rows
 from imutool.viewing.model.run_data import RunData, Trace
 from imutool.viewing.rerun import sdk
 from imutool.viewing.rerun.entities import styles
-from imutool.viewing.rerun.entities.styles import AXES, BOLD_WIDTH, GRID, INK, RAW_FADE, XYZ, axis_colors, blend_to_grey
+from imutool.viewing.rerun.entities.styles import BOLD_WIDTH, GRID, INK, RAW_FADE, XYZ, axis_colors, blend_to_grey
 from imutool.viewing.rerun.sdk import Scope
 
 if TYPE_CHECKING:
     import rerun as rr
 
 KINDS = ("gyro", "accel")
-UNITS = {"gyro": "rad/s", "accel": "m/s²"}
 SIGMAS = 3.0
 MAX_DERIVED_ROWS = 50_000  # of a computed curve (four minutes at 200 Hz); samples keep up to MAX_CURVE_ROWS
 

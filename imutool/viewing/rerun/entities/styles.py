@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from jaxtyping import Float64, UInt8
 
+from imutool.units import AXES
 from imutool.viewing.model.run_data import RunData, Trace
 from imutool.viewing.rerun.sdk import Role
 
@@ -16,7 +17,6 @@ if TYPE_CHECKING:
 
 Color = tuple[int, int, int]
 
-AXES = ("x", "y", "z")
 XYZ: tuple[Color, ...] = ((230, 60, 60), (40, 170, 70), (60, 120, 240))  # the same three everywhere, on dark and light
 GREY: Color = (128, 128, 128)
 TRUTH_COLOR: Color = (150, 150, 150)

@@ -1,0 +1,1 @@
+"""The estimator: effects found and fitted on whitened residuals of aligned logs."""

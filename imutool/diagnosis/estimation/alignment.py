@@ -1,0 +1,329 @@
+"""A recording beside what a simulation, or its own true poses, say it should read: one clock, one row a sample.
+
+A simulation's samples carry noise of their own, and a term that can shrink the simulation would shrink its noise as well and
+look like physics. Where the simulation's poses explain its samples but for white noise, they stand in for them, without noise
+and with their derivatives. Else its samples go through a Wiener filter: what their own spectrum shows to be noise is taken
+away.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from jaxtyping import Bool, Float64
+from scipy.interpolate import make_interp_spline
+from scipy.ndimage import uniform_filter1d
+from scipy.signal import correlate, correlation_lags
+from scipy.spatial.transform import Rotation
+
+from imutool.errors import DataError
+from imutool.inertial.kinematics import through
+from imutool.inertial.stationary import white_noise
+from imutool.inertial.strapdown import with_velocity
+from imutool.recording import Imu, Poses, Recording, seconds
+from imutool.sensor.samples import NOTHING, IdealMotion
+
+LEAST_S = 8.0  # below, nothing can be learned and tested
+ALIGN_HZ = 100.0
+FARTHEST_S = 5.0  # by which clocks of one epoch may differ
+ALIKE = 0.6  # correlation of the turning below which two logs are of different motions
+BLOCK_S, HELD_OUT_EACH = 6.0, 3  # every third block of six seconds is never fitted
+BUFFER_S = 0.3  # around a border between blocks, counted for neither
+NOISE_BAND = 0.8  # of Nyquist: above, a simulated motion has nothing
+SMOOTHED_BINS = 15
+GAP_PERIODS = 3.0
+KNOWN_SHARE = 0.5  # of the samples that have a true pose, from which on the poses are worth drawing
+MOST_OF_IT = 0.9  # of the simulation that its poses must cover to stand for it
+POSES_HZ = 40.0  # slower poses cannot be differentiated twice
+MEANS, LEAST_MEANS = (20, 200), 8  # samples of a mean, and how many means there are at least
+TOLERATED_MEAN = 1.8  # by which they may scatter more than noise is measured, which finds five sixths of it
+COARSE, TOLERATED = 5, 1.3
+LEAST_NOISE = np.array([1e-4] * 3 + [1e-3] * 3)
+
+
+@dataclass(frozen=True, eq=False)
+class Pair:
+    """Ideal signals on an even clock, and real samples by their stamps on that clock (s from the first sample).
+
+    `fitted` and `held_out` are rows; rows in neither are borders, gaps and ends. `band_hz` is where what is expected ends to be
+    known (none: nowhere), `sim_noise` what was filtered out of a simulation's samples (nothing where its poses stand in for
+    them), `truth` the true poses at its stamps, `aligned_s` what was added to the stamps where the two clocks share no epoch.
+    `known` says which samples tell what an axis felt (none: all): those of a converter at its end and of an axis that is
+    stuck do not.
+    """
+
+    name: str
+    felt: IdealMotion
+    stamp_s: Float64[np.ndarray, " n"]
+    real: Float64[np.ndarray, "n 6"]
+    fitted: Bool[np.ndarray, " n"]
+    held_out: Bool[np.ndarray, " n"]
+    truth: Poses | None = None
+    aligned_s: float = 0.0
+    against: str = "simulation"
+    start_ns: int = 0
+    band_hz: float | None = None
+    sim_noise: Float64[np.ndarray, "6"] = field(default_factory=lambda: np.zeros(6))
+    channels: Mapping[str, Float64[np.ndarray, " n"]] = field(default_factory=lambda: NOTHING)
+    known: Bool[np.ndarray, "n 6"] | None = None
+
+    @property
+    def usable(self) -> Bool[np.ndarray, "n 6"]:
+        """Samples that count, fitted or held out."""
+        rows = (self.fitted | self.held_out)[:, None]
+        return np.asarray(np.broadcast_to(rows, self.real.shape) if self.known is None else rows & self.known)
+
+    @property
+    def axes(self) -> Bool[np.ndarray, "6"]:
+        """Of which anything is known at all."""
+        return np.ones(6, bool) if self.known is None else np.asarray(self.known.any(axis=0))
+
+    @property
+    def period_s(self) -> float:
+        """Median time between real samples."""
+        return float(np.median(np.diff(self.stamp_s)))
+
+    def within(self, band_hz: float) -> Pair:
+        """Where what is expected is known to less: the poses turn out to be worse than their noise says."""
+        return replace(self, band_hz=band_hz)
+
+
+def with_simulation(real: Recording, sim: Recording) -> Pair:
+    """The recording beside a simulation of the same motion.
+
+    Raises:
+        DataError: the two share too little time, or are not of one motion.
+    """
+    shift_s = _shift(real.imu, sim.imu)
+    if shift_s is None:
+        raise DataError(
+            "the simulation turns otherwise than the recording",
+            where=real.name,
+            expected="one motion, or true poses in both logs",
+            fix="Leave --sim out to compare the recording with its own true poses",
+        )
+    start_ns = int(real.imu.t_ns[0])
+    t_sim = seconds(sim.imu.t_ns, start_ns) - shift_s  # on the recording's clock
+    stamp_s = seconds(real.imu.t_ns, start_ns)
+    felt, noise = _simulated(t_sim, sim, shift_s, start_ns, real)
+    inside = (stamp_s >= felt.t_s[0]) & (stamp_s <= felt.t_s[-1])
+    return _pair(real, felt, stamp_s, inside, "simulation", shift_s, noise)
+
+
+def same_motion(real: Imu, sim: Imu) -> bool:
+    """Whether a recording and a simulation turn alike, whatever their clocks say."""
+    return _shift(real, sim) is not None
+
+
+def with_truth(real: Recording, felt: IdealMotion, start_ns: int, band_hz: float) -> Pair:
+    """The recording beside what its own true poses say, `felt` being on seconds since `start_ns`, true up to `band_hz`.
+
+    Raises:
+        DataError: too little shared time.
+    """
+    stamp_s = seconds(real.imu.t_ns, start_ns)
+    inside = (stamp_s >= felt.t_s[0]) & (stamp_s <= felt.t_s[-1])
+    felt = replace(felt, channels=_channels(real, start_ns + np.round(felt.t_s * 1e9).astype(np.int64)))
+    return replace(_pair(real, felt, stamp_s, inside, "true poses", 0.0, np.zeros(6)), band_hz=band_hz)
+
+
+def _pair(
+    real: Recording,
+    felt: IdealMotion,
+    stamp_s: Float64[np.ndarray, " n"],
+    inside: Bool[np.ndarray, " n"],
+    against: str,
+    aligned_s: float,
+    sim_noise: Float64[np.ndarray, "6"],
+) -> Pair:
+    rows = np.flatnonzero(inside)
+    shared_s = float(stamp_s[rows[-1]] - stamp_s[rows[0]]) if len(rows) > 1 else 0.0
+    if shared_s < LEAST_S:
+        raise DataError(
+            f"{shared_s:.1f} s shared with the {against}",
+            where=real.name,
+            expected=f"at least {LEAST_S:g} s",
+            fix="Give logs of the same time, or a longer one",
+        )
+    part = slice(int(rows[0]), int(rows[-1]) + 1)
+    stamp_s = stamp_s[part]
+    samples = np.concatenate([real.imu.gyro, real.imu.accel], axis=1)[part]
+    held_out, usable = split(stamp_s)
+    t_ns = real.imu.t_ns[part]
+    truth = None
+    if real.truths:
+        poses, known = with_velocity(real.truth).at(t_ns)
+        truth = poses if known.mean() > KNOWN_SHARE else None
+    return Pair(
+        real.name,
+        felt,
+        stamp_s,
+        samples,
+        usable & ~held_out,
+        usable & held_out,
+        truth,
+        aligned_s,
+        against,
+        int(t_ns[0]),
+        sim_noise=sim_noise,
+        channels={name: values for name, values in _channels(real, t_ns).items() if np.ptp(values) > 0},
+    )
+
+
+def split(stamp_s: Float64[np.ndarray, " n"]) -> tuple[Bool[np.ndarray, " n"], Bool[np.ndarray, " n"]]:
+    """Rows that are held out, and rows that count at all: away from borders between the two and from gaps."""
+    since = stamp_s - stamp_s[0]
+    block_s = min(BLOCK_S, since[-1] / (2 * HELD_OUT_EACH))
+    block = np.floor(since / block_s).astype(int)
+    held_out = block % HELD_OUT_EACH == HELD_OUT_EACH - 1
+    inside = since - block * block_s
+    kind_before, kind_after = held_out != ((block - 1) % HELD_OUT_EACH == 2), held_out != ((block + 1) % HELD_OUT_EACH == 2)
+    usable = ~(((inside < BUFFER_S) & kind_before & (block > 0)) | ((inside > block_s - BUFFER_S) & kind_after))
+    usable &= (since > BUFFER_S) & (since < since[-1] - BUFFER_S)
+    step = np.diff(stamp_s)
+    for k in np.flatnonzero(step > GAP_PERIODS * np.median(step)):
+        usable &= (stamp_s < stamp_s[k] - BUFFER_S) | (stamp_s > stamp_s[k + 1] + BUFFER_S)
+    return held_out, usable
+
+
+def _channels(recording: Recording, t_ns: np.ndarray) -> dict[str, Float64[np.ndarray, " n"]]:
+    """Every other number of a log at some times, linearly between its messages, by `topic.field`."""
+    out: dict[str, Float64[np.ndarray, " n"]] = {}
+    for topic, scalars in recording.scalars.items():
+        if len(scalars.t_ns) < 2:
+            continue
+        start = int(scalars.t_ns[0])
+        for k in range(scalars.values.shape[1]):
+            name = topic if scalars.values.shape[1] == 1 else f"{topic}.{'xyz'[k]}"
+            out[name] = np.interp(seconds(t_ns, start), seconds(scalars.t_ns, start), scalars.values[:, k])
+    return out
+
+
+def _simulated(
+    t_sim: Float64[np.ndarray, " m"], sim: Recording, shift_s: float, start_ns: int, real: Recording
+) -> tuple[IdealMotion, Float64[np.ndarray, "6"]]:
+    """The simulation without its noise on an even clock, and how noisy it was where that had to be filtered out."""
+    samples = np.concatenate([sim.imu.gyro, sim.imu.accel], axis=1)
+    noise = white_noise(samples)
+    period_s = float(np.median(np.diff(t_sim)))
+    felt = _by_poses(sim, samples, noise, 1.0 / period_s)
+    if felt is not None:
+        t_s = seconds(sim.truth.t_ns[:1], start_ns)[0] - shift_s + felt.t_s
+        t_ns = start_ns + np.round(t_s * 1e9).astype(np.int64)
+        return replace(felt, t_s=t_s, channels=_channels(real, t_ns)), np.zeros(6)
+    t_s = t_sim[0] + period_s * np.arange(int((t_sim[-1] - t_sim[0]) / period_s) + 1)
+    even = np.asarray(make_interp_spline(t_sim, samples, k=3)(t_s))
+    clean = np.stack([wiener_filter(column) for column in even.T], axis=1)
+    alpha = np.asarray(make_interp_spline(t_s, clean[:, :3], k=5)(t_s, 1))
+    t_ns = start_ns + np.round(t_s * 1e9).astype(np.int64)
+    R_wb = _attitude(sim, t_ns + round(shift_s * 1e9))
+    if R_wb is None:
+        R_wb = _attitude(real, t_ns)
+    return IdealMotion(t_s, clean[:, :3], clean[:, 3:], alpha, R_wb, _channels(real, t_ns)), noise
+
+
+def _by_poses(
+    sim: Recording, samples: Float64[np.ndarray, "m 6"], noise: Float64[np.ndarray, "6"], rate_hz: float
+) -> IdealMotion | None:
+    """What the simulation's own poses say its IMU feels, if that is what it reads but for white noise and a constant."""
+    if not sim.truths:
+        return None
+    poses = sim.truth
+    if poses.period_s * POSES_HZ > 1.0 or np.diff(poses.t_ns).max() > 1e9 * GAP_PERIODS * poses.period_s:
+        return None
+    trajectory = through(poses)  # a simulation's poses are exact, or the test below fails
+    t_ns = poses.t_ns[0] + np.arange(int(poses.duration_s * rate_hz) + 1) * round(1e9 / rate_hz)
+    motion = trajectory.at(t_ns[t_ns <= poses.t_ns[-1]])
+    R_wb = Rotation.from_quat(motion.q_wb_wxyz, scalar_first=True).as_matrix()
+    t_s = np.arange(len(motion.p_wb)) * round(1e9 / rate_hz) * 1e-9
+    felt = IdealMotion(t_s, motion.omega_b, motion.specific_force(), motion.alpha_b, R_wb)
+    t_s = seconds(sim.imu.t_ns, int(poses.t_ns[0]))
+    rows = (t_s >= felt.t_s[0]) & (t_s <= felt.t_s[-1])
+    if rows.mean() < MOST_OF_IT:
+        return None
+    read = felt.taken(t_s[rows], t_s[rows])
+    left = samples[rows] - np.concatenate([read.gyro, read.accel], axis=1)
+    left = left - left.mean(axis=0)
+    coarse = (
+        left[: len(left) // COARSE * COARSE].reshape(-1, COARSE, 6).mean(axis=1)
+    )  # where a misfit of motion would stand out
+    exact = (coarse.std(axis=0) < TOLERATED * np.maximum(noise, LEAST_NOISE) / np.sqrt(COARSE)).all()
+    return felt if exact else None
+
+
+def _attitude(recording: Recording, t_ns: np.ndarray) -> Float64[np.ndarray, "n 3 3"] | None:
+    if not recording.truths:
+        return None
+    poses, known = recording.truth.at(t_ns, max_gap_s=1.0)
+    return rotation_matrices(poses) if known.mean() > 0.9 else None
+
+
+def rotation_matrices(poses: Poses) -> Float64[np.ndarray, "n 3 3"]:
+    """R_wb of some poses."""
+    return np.asarray(Rotation.from_quat(poses.q_wb_wxyz, scalar_first=True).as_matrix())
+
+
+def wiener_filter(x: Float64[np.ndarray, " n"]) -> Float64[np.ndarray, " n"]:
+    """A signal without the white noise that the top of its spectrum shows: each frequency by 1 - noise / power."""
+    n = len(x)
+    if nothing_but_noise(x):  # its ends would be taken for a ramp
+        return np.full(n, x.mean())
+    line = np.linspace(x[0], x[-1], n)  # its ends meet, so that the spectrum of a ramp is not in the noise's band
+    mirrored = np.concatenate([x - line, -(x - line)[-2:0:-1]])
+    spectrum = np.fft.rfft(mirrored)
+    power = uniform_filter1d(np.abs(spectrum) ** 2, SMOOTHED_BINS, mode="nearest")
+    floor = float(np.median(power[int(NOISE_BAND * len(power)) :]))
+    gain = np.clip(1.0 - floor / np.maximum(power, 1e-300), 0.0, 1.0)
+    gain[power < 2.0 * floor] = 0.0  # what is noise for the most part goes altogether
+    return line + np.fft.irfft(gain * spectrum, n=len(mirrored))[:n]
+
+
+def _shift(real: Imu, sim: Imu) -> float | None:
+    """What has to be added to the recording's times to get the simulation's (s): 0 where the two clocks share an epoch.
+
+    None where the two are not of one motion.
+    """
+    overlap = (min(real.t_ns[-1], sim.t_ns[-1]) - max(real.t_ns[0], sim.t_ns[0])) * 1e-9
+    shared = overlap > min(LEAST_S, 0.5 * min(real.duration_s, sim.duration_s))
+    if _rests(real) and _rests(sim):
+        return 0.0 if shared else None
+    lag_s, alike = _lag(real, sim)
+    if shared and abs(lag_s) < FARTHEST_S:
+        return 0.0
+    return lag_s if alike >= ALIKE else None
+
+
+def _rests(imu: Imu) -> bool:
+    """Whether it turns by no more than its noise: then nothing can be aligned, and nothing has to be."""
+    return all(nothing_but_noise(column, least) for column, least in zip(imu.gyro.T, LEAST_NOISE, strict=False))
+
+
+def nothing_but_noise(x: Float64[np.ndarray, " n"], least: float = 0.0) -> bool:
+    """Whether means of a signal, over a few samples and over much of it, scatter no more than those of white noise."""
+    noise = max(float(white_noise(x[:, None])[0]), least)
+    sizes = [size for size in (*MEANS, len(x) // LEAST_MEANS) if 0 < size <= len(x) // LEAST_MEANS]
+    means = (x[: len(x) // size * size].reshape(-1, size).mean(axis=1) for size in sizes)
+    return all(float(mean.std()) <= TOLERATED_MEAN * noise / np.sqrt(size) for mean, size in zip(means, sizes, strict=True))
+
+
+def _lag(real: Imu, sim: Imu) -> tuple[float, float]:
+    """The shift at which the two turn alike, and their correlation there."""
+    rows = [np.linalg.norm(imu.gyro - np.median(imu.gyro, axis=0), axis=1) for imu in (real, sim)]
+    start = [int(imu.t_ns[0]) for imu in (real, sim)]
+    grids = [np.arange(0.0, imu.duration_s, 1.0 / ALIGN_HZ) for imu in (real, sim)]
+    a, b = (
+        np.interp(grid, seconds(imu.t_ns, first), row)
+        for grid, imu, first, row in zip(grids, (real, sim), start, rows, strict=True)
+    )
+    a, b = a - a.mean(), b - b.mean()
+    lags = correlation_lags(len(b), len(a))
+    # b[i + lag] beside a[i]: only what both cover counts, or a short piece would be unlike the whole it comes from
+    first, last = np.maximum(0, -lags), np.minimum(len(a), len(b) - lags)
+    energy_a, energy_b = (np.concatenate([[0.0], np.cumsum(x * x)]) for x in (a, b))
+    shared = np.sqrt((energy_a[last] - energy_a[first]) * (energy_b[last + lags] - energy_b[first + lags]))
+    enough = last - first >= min(LEAST_S * ALIGN_HZ, 0.8 * min(len(a), len(b)))
+    both = np.where(enough, correlate(b, a, mode="full") / np.maximum(shared, 1e-12), -1.0)
+    best = int(np.argmax(both))
+    return (start[1] - start[0]) * 1e-9 + float(lags[best]) / ALIGN_HZ, float(both[best])

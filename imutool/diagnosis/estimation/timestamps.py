@@ -1,0 +1,256 @@
+"""What stamps and digits show without any simulation: samples that are missing, stamps that jitter, values on a grid."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Bool, Float64
+from scipy.ndimage import binary_dilation, median_filter
+from scipy.stats import binom
+
+from imutool.diagnosis.estimation.alignment import Pair
+from imutool.diagnosis.result import Estimate, Finding, HeldOut
+from imutool.sensor.effect import Effect, Parameter, Stage, Theta
+from imutool.sensor.samples import IdealMotion, SensorSamples
+from imutool.units import ASCII_UNITS, SENSORS, UNITS, Sensor
+
+MEDIAN, FEW = 15, 500  # samples: of a running median, and to find a period by first
+PERIOD_SPAN, PERIODS = 0.02, 201  # periods tried about the median step
+CLEAR, AGREE, LAG = 0.25, 0.3, 10  # of a period; of stamps that all agree; samples
+LEAST_MISSING, LEAST_AT_LIMIT, PILED = 3, 4, 2.0
+NEARLY, EXACT = 0.995, 1e-3
+SHARES = (0.999, 0.99, 0.97, 0.9, 0.8)  # of the largest reading, where a soft limit is looked for
+LEAST_JITTER_S = 2e-5
+LEAST_DIGITS = 0.3  # of the noise: finer steps leave no trace in it
+ON_GRID = 0.98  # of the samples
+LEAST_VALUES = 3  # that a grid is told from
+
+
+def even(stamp_s: Float64[np.ndarray, " n"]) -> tuple[Float64[np.ndarray, " n"], int]:
+    """Stamps of an even clock through some stamps, and how many samples it misses.
+
+    The period is the one in which the stamps agree best, which samples that are missing do not change; a running median of what
+    each stamp counts, less its number, says which samples those are though every stamp jitters.
+    """
+    k = np.arange(len(stamp_s), dtype=np.float64)
+    since = stamp_s - stamp_s[0]
+    period, phase, agree = _period(since)
+    if agree < AGREE:
+        return _by_level(stamp_s, k)
+    counted = np.rint((since - phase) / period) - k
+    steady = median_filter(counted, MEDIAN, mode="nearest")
+    clear = np.abs((since - phase) / period - k - counted) < CLEAR  # a stamp well within its own period is taken at its word
+    missing = np.where(clear, counted, steady)
+    missing = np.where(np.abs(missing - steady) > 0.5, steady, missing) if not clear.all() else counted
+    slope, start = np.polyfit(k + missing, stamp_s, 1)
+    return start + slope * (k + missing), int(missing[-1] - missing[0])
+
+
+def _by_level(stamp_s: Float64[np.ndarray, " n"], k: Float64[np.ndarray, " n"]) -> tuple[Float64[np.ndarray, " n"], int]:
+    """For stamps that jitter by much of a period: a missing sample lifts the level of all later ones."""
+    period = float(np.median(stamp_s[LAG:] - stamp_s[:-LAG])) / LAG
+    missing = np.zeros(len(stamp_s))
+    for _ in range(4):
+        slope, start = np.polyfit(k + missing, stamp_s, 1)
+        period = slope if missing.any() or abs(slope / period - 1.0) < 0.1 / len(k) else period
+        level = median_filter((stamp_s - start) / period - k, MEDIAN, mode="nearest")
+        missing = np.maximum.accumulate(np.rint(level - level[0]))
+    slope, start = np.polyfit(k + missing, stamp_s, 1)
+    return start + slope * (k + missing), int(missing[-1] - missing[0])
+
+
+def _period(since_s: Float64[np.ndarray, " n"]) -> tuple[float, float, float]:
+    """The period near the median step in which the stamps agree best (s), where they lie in it, and how well they agree."""
+    best = float(np.median(np.diff(since_s)))
+    span = PERIOD_SPAN
+    for count in (FEW, len(since_s)):
+        some = since_s[:count]
+        tried = best * (1.0 + np.linspace(-span, span, PERIODS))
+        agree = np.array([abs(np.exp(2j * np.pi * some / one).sum()) for one in tried])
+        best, span = float(tried[int(np.argmax(agree))]), 4.0 * span / PERIODS
+    mean = np.exp(2j * np.pi * since_s / best).mean()
+    return best, float(np.angle(mean)) / (2.0 * np.pi) * best, float(abs(mean))
+
+
+def jitter(pairs: Sequence[Pair]) -> tuple[Effect, ...]:
+    """Samples taken evenly whose stamps are not: a share of one is all of it. None where the stamps are even."""
+    late = [(pair.stamp_s, even(pair.stamp_s)[0] - pair.stamp_s) for pair in pairs]
+    if min(float(x.std()) for _, x in late) < LEAST_JITTER_S:
+        return ()
+
+    def forward(taken_s: Float64[np.ndarray, " n"], theta: Theta) -> Float64[np.ndarray, " n"]:
+        alike = (one for one in late if len(one[0]) == len(taken_s))
+        _, correction = min(alike, key=lambda one: abs(float(one[0][0] - taken_s[0])))
+        return np.asarray(taken_s + theta[0] * correction + theta[1] + theta[2] * np.linspace(-1.0, 1.0, len(taken_s)))
+
+    unsure = float(np.mean([x.std() / np.sqrt(len(x)) for _, x in late]))  # to which stamps show where the even clock begins
+    share = (Parameter("share", "-", 1.0), Parameter("begins_off", "s", unsure), Parameter("ends_off", "s", 2.0 * unsure))
+    return (
+        Effect(
+            "timestamp_jitter",
+            Stage.CLOCK,
+            ("gyro", "accel"),
+            "stamps jitter, samples do not",
+            share,
+            "it moves, and stamps are uneven",
+            forward,
+        ),
+    )
+
+
+def dropped(pairs: Sequence[Pair]) -> list[Finding]:
+    """Samples that an even clock would have had."""
+    missing, total, length = 0, 0, 0.0
+    for pair in pairs:
+        missing, total = missing + even(pair.stamp_s)[1], total + len(pair.stamp_s)
+        length += float(pair.stamp_s[-1] - pair.stamp_s[0])
+    if missing < LEAST_MISSING:
+        return []
+    share = missing / (missing + total)
+    parameters = {
+        "share": Estimate(share, float(np.sqrt(missing)) / (missing + total), "-"),
+        "missing": Estimate(float(missing), 0.0, "samples"),
+    }
+    nothing = HeldOut(0.0, 0.0, "-", round(length, 1))
+    return [Finding("dropped_samples", "both", 0.0, 0.0, 0.0, parameters, "samples are missing", nothing)]
+
+
+def rounded(pairs: Sequence[Pair], floor: Float64[np.ndarray, "6"]) -> list[Finding]:
+    """Values on a grid as coarse as the noise."""
+    lsb = {}
+    for k, signal in enumerate(("gyro", "accel")):
+        axes = [pair.real[:, a] for pair in pairs for a in range(3 * k, 3 * k + 3)]
+        grids = [grid(x) for x in axes if len(np.unique(x)) >= LEAST_VALUES] or [0.0]  # fewer lie on any grid
+        noise = float(np.sqrt(np.mean(floor[3 * k : 3 * k + 3] ** 2)))
+        if min(grids) > LEAST_DIGITS * noise and max(grids) < 1.5 * min(grids):
+            lsb[signal] = float(np.median(grids))
+    if not lsb:
+        return []
+    signal = next(iter(lsb)) if len(lsb) == 1 else "both"
+    parameters = {f"{name}_lsb": Estimate(value, 1e-3 * value, UNITS[name]) for name, value in lsb.items()}
+    length = sum(float(pair.stamp_s[-1] - pair.stamp_s[0]) for pair in pairs)
+    nothing = HeldOut(0.0, 0.0, "-", round(length, 1))
+    return [Finding("quantization", signal, 0.0, 0.0, 0.0, parameters, "values are multiples of an LSB", nothing)]
+
+
+def grid(x: Float64[np.ndarray, " n"]) -> float:
+    """The step of the grid that values lie on; 0 where they lie on none, or take fewer than three values."""
+    values = np.unique(np.round(x, 12))
+    if len(values) < LEAST_VALUES:
+        return 0.0
+    step = float(np.diff(values).min())
+    if step <= 0:
+        return 0.0
+    for _ in range(3):  # least squares on the multiples
+        k = np.rint((values - values[0]) / step)
+        step = float((k @ (values - values[0])) / (k @ k))
+    off = np.abs((x - values[0]) / step - np.rint((x - values[0]) / step))
+    return step if float((off < 0.05).mean()) > ON_GRID else 0.0
+
+
+def limits(real: Float64[np.ndarray, "n 6"]) -> dict[Sensor, float]:
+    """The largest readings of a sensor that come again and again, to the last digit: where its converter ends."""
+    found: dict[Sensor, float] = {}
+    for k, signal in enumerate(SENSORS):
+        values = np.abs(real[:, 3 * k : 3 * k + 3])
+        most = float(values.max())
+        below = values[values < most * (1.0 - 1e-9)]
+        at, next_to = values.size - below.size, int((below >= below.max(initial=0.0) * (1.0 - 1e-9)).sum())
+        if at >= LEAST_AT_LIMIT and at > PILED * next_to:  # values on a grid come again everywhere, and less at their ends
+            found[signal] = most
+    return found
+
+
+def soft_limits(pairs: Sequence[Pair], biases: Sequence[Float64[np.ndarray, "6"]]) -> tuple[Effect, ...]:
+    """A limit whose readings still carry noise: one candidate a sensor, for a fit. What is clipped includes the bias."""
+    found = []
+    for k, signal in enumerate(("gyro", "accel")):
+        if any(signal in limits(pair.real) for pair in pairs):
+            continue
+        part = slice(3 * k, 3 * k + 3)
+        bias = np.mean([b[part] for b in biases], axis=0)
+        most = float(max(np.abs(pair.real[:, part]).max() for pair in pairs))
+        unit = UNITS[signal]
+        found.append(
+            Effect(
+                "saturation",
+                Stage.CONVERTER,
+                ("gyro",) if k == 0 else ("accel",),
+                f"{signal} = clip({signal}, -L, L)",
+                (Parameter(f"{signal}_limit", unit, most, positive=True, null_value=np.inf, step=1e-4),),
+                "the limit is reached",
+                _Clip(k, bias),
+                linear=False,
+                starts=_Starts(most),
+                variant="" if k == 0 else "accel",
+            )
+        )
+    return tuple(found)
+
+
+class _Clip:
+    """Readings between two limits, the bias being part of what is read."""
+
+    def __init__(self, sensor: int, bias: Float64[np.ndarray, "3"]) -> None:
+        self.sensor, self.bias = sensor, bias
+
+    def __call__(self, read: SensorSamples, theta: Theta) -> SensorSamples:
+        x = read.gyro if self.sensor == 0 else read.accel
+        out = np.clip(x + self.bias, -theta[0], theta[0]) - self.bias
+        return read.but(gyro=out) if self.sensor == 0 else read.but(accel=out)
+
+
+class _Starts:
+    """A little below the largest reading, which noise has raised."""
+
+    def __init__(self, most: float) -> None:
+        self.most = most
+
+    def __call__(self, _felt: IdealMotion, _samples: SensorSamples) -> list[Theta]:
+        return [np.array([share * self.most]) for share in SHARES]
+
+
+def clipped(real: Float64[np.ndarray, "n 6"]) -> Bool[np.ndarray, "n 6"]:
+    """Samples of an axis whose converter is at its end, and those beside them: what they would have been nobody knows."""
+    at, most = np.zeros(real.shape, bool), limits(real)
+    for k, signal in enumerate(("gyro", "accel")):
+        if signal in most:
+            part = slice(3 * k, 3 * k + 3)
+            at[:, part] = np.abs(real[:, part]) >= NEARLY * most[signal]
+    return np.asarray(binary_dilation(at, np.ones((5, 1), bool))) if at.any() else at
+
+
+def stuck(real: Float64[np.ndarray, "n 6"]) -> Bool[np.ndarray, "6"]:
+    """Axes that read the same in every sample."""
+    return np.asarray(np.ptp(real, axis=0) == 0.0)
+
+
+def saturated(pairs: Sequence[Pair], expected: Sequence[Float64[np.ndarray, "n 6"]], tried: int) -> list[Finding]:
+    """Clipping that the expectation, which knows no limit, exceeds: more than by chance (a sign test on clipped samples)."""
+    told: dict[str, Estimate] = {}
+    powers, signal_of, p = [0.0, 0.0, 0.0], "", 1.0
+    real, there = (np.concatenate(parts) for parts in ([pair.real for pair in pairs], expected))
+    for k, signal in enumerate(SENSORS):
+        most = limits(real).get(signal)
+        if most is None:
+            continue
+        part = slice(3 * k, 3 * k + 3)
+        at = np.abs(real[:, part]) >= most * (1.0 - 1e-9)
+        beyond = (there[:, part] * np.sign(real[:, part]))[at] > most
+        chance = float(binom.sf(beyond.sum() - 1, len(beyond), 0.5)) * tried
+        if chance > 1e-2 and beyond.mean() < 0.9:
+            continue
+        told[f"{signal}_limit"] = Estimate(most, EXACT * most, UNITS[signal])
+        before = ((real - there)[:, part] ** 2)[at]
+        after = ((real[:, part] - np.clip(there[:, part], -most, most)) ** 2)[at]
+        powers, signal_of, p = [float(before.sum()), float(after.sum()), float(at.size)], signal, min(p, chance)
+    if not told:
+        return []
+    seen_in = signal_of if len(told) == 1 else "both"
+    length = sum(float(pair.stamp_s[-1] - pair.stamp_s[0]) for pair in pairs)
+    held = HeldOut(
+        float(np.sqrt(powers[0] / powers[2])), float(np.sqrt(powers[1] / powers[2])), ASCII_UNITS[signal_of], round(length, 1)
+    )
+    share = float(np.clip(1.0 - powers[1] / max(powers[0], 1e-300), 0.0, 1.0))
+    return [Finding("saturation", seen_in, share, min(p, 1.0), min(p, 1.0), told, "readings are clipped at +-limit", held)]

@@ -1,0 +1,16 @@
+"""Names of sensors, axes and units, as tables, files and figures write them."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+Sensor = Literal["gyro", "accel"]
+SENSORS: tuple[Sensor, Sensor] = ("gyro", "accel")
+AXES = ("x", "y", "z")
+UNITS = {"gyro": "rad/s", "accel": "m/s²"}  # as people read them
+ASCII_UNITS = {"gyro": "rad/s", "accel": "m/s^2"}  # as JSON and logs hold them
+
+
+def with_superscripts(unit: str) -> str:
+    """A unit as people read it: `m/s²` for `m/s^2`."""
+    return unit.replace("^2", "²").replace("^3", "³")

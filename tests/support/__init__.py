@@ -1,0 +1,1 @@
+"""What several test rooms share: made-up recordings, planted errors, viewers, an object store."""
