@@ -15,7 +15,8 @@ import numpy as np
 from jaxtyping import Float64
 
 from imutool.diagnosis.result import Diagnosis, Estimate, Finding
-from imutool.sensor.physics_file import DRIVEN, Bias, Curve, Entry, PhysicsFile, Term, Three, Value
+from imutool.sensor.physics_file import Bias, Curve, Entry, PhysicsFile, Term, Three, Value
+from imutool.sensor.unnamed_effects import DRIVEN
 from imutool.units import AXES, Sensor
 
 NO_EFFECT = frozenset({"dropped_samples", "timestamp_jitter", "reference_error"})

@@ -10,7 +10,7 @@ from support import diagnoses
 
 from imutool.diagnosis.result import Traces
 from imutool.recording import Poses
-from imutool.viewing.html.diagnosis_paths import MOST_S, drift, paths, stretches
+from imutool.viewing.html.diagnosis_paths import MOST_S, held_out_stretches, paths, rms_drift
 
 RATE_HZ, SECONDS = 100.0, 40.0
 TURN_RAD_S, PUSH_M_S2 = 0.01, 0.2  # what is left out of a sensor at rest
@@ -31,22 +31,23 @@ def at_rest() -> Traces:
 
 
 def test_what_is_left_out_drifts_as_it_must_and_what_is_modelled_does_not() -> None:
-    found = list(stretches(at_rest()))
+    found = list(held_out_stretches(at_rest()))
     assert len(found) == 1
-    t_s, before = drift(found, 1)
+    t_s, before = rms_drift(found, 1)
     assert t_s[-1] == pytest.approx(8.0, abs=0.1)
     assert before[:, 0] == pytest.approx(np.degrees(TURN_RAD_S) * t_s, abs=1e-6)
     assert before[:, 1] == pytest.approx(0.5 * PUSH_M_S2 * t_s**2, abs=PUSH_M_S2 * 8.0 * STEP)
-    assert np.abs(drift(found, 2)[1]).max() < 1e-9
+    assert np.abs(rms_drift(found, 2)[1]).max() < 1e-9
 
 
 def test_a_long_stretch_is_cut_and_a_gap_is_never_crossed() -> None:
     trace = replace(at_rest(), held_out=np.ones(int(SECONDS * RATE_HZ), bool))
-    assert [one.truth.duration_s for one in stretches(trace)] == pytest.approx([MOST_S] * 4, abs=0.02)
+    assert [one.truth.duration_s for one in held_out_stretches(trace)] == pytest.approx([MOST_S] * 4, abs=0.02)
     ideal = trace.ideal.copy()
     ideal[500:600] = np.nan
     assert all(
-        one.truth.t_ns[-1] <= 5 * 10**9 or one.truth.t_ns[0] >= 6 * 10**9 for one in stretches(replace(trace, ideal=ideal))
+        one.truth.t_ns[-1] <= 5 * 10**9 or one.truth.t_ns[0] >= 6 * 10**9
+        for one in held_out_stretches(replace(trace, ideal=ideal))
     )
 
 

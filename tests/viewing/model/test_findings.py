@@ -11,8 +11,8 @@ import pytest
 from imutool.diagnosis_output import FINDINGS as WRITTEN
 from imutool.errors import ConfigError, DataError
 from imutool.viewing.model import findings
-from imutool.viewing.model.events import MOST_PER_KIND
-from imutool.viewing.model.findings import FINDINGS, of_findings
+from imutool.viewing.model.events import MAX_EVENTS_PER_KIND
+from imutool.viewing.model.findings import FINDINGS, finding_events
 
 START_NS, END_NS = 1_700_000_000_000_000_000, 1_700_000_060_000_000_000
 DIAGNOSIS: dict[str, Any] = {
@@ -41,7 +41,7 @@ def test_the_file_is_the_one_that_is_written() -> None:
 
 
 def test_findings_act_where_they_were_located(tmp_path: Path) -> None:
-    events, notes = of_findings(folder(tmp_path), "drive.mcap", START_NS, END_NS)
+    events, notes = finding_events(folder(tmp_path), "drive.mcap", START_NS, END_NS)
     assert notes == []
     assert {event.kind for event in events} == {"finding"}
     assert [(event.start_ns - START_NS, event.end_ns - START_NS) for event in events] == [
@@ -54,14 +54,14 @@ def test_findings_act_where_they_were_located(tmp_path: Path) -> None:
 
 
 def test_findings_without_a_place_are_told(tmp_path: Path) -> None:
-    events, notes = of_findings(folder(tmp_path, located=[]), "drive.mcap", START_NS, END_NS)
+    events, notes = finding_events(folder(tmp_path, located=[]), "drive.mcap", START_NS, END_NS)
     assert events == []
     assert [note.split(",")[0] for note in notes] == ["Diagnosis: lever_arm on accel", "Diagnosis: driven on both"]
 
 
 @pytest.mark.parametrize("log", ["second.mcap", "other.mcap"])
 def test_another_log_than_the_first_is_not_marked_and_says_so(tmp_path: Path, log: str) -> None:
-    events, notes = of_findings(folder(tmp_path), log, START_NS, END_NS)
+    events, notes = finding_events(folder(tmp_path), log, START_NS, END_NS)
     assert events == []
     assert "drive.mcap" in notes[0]
     assert log in notes[0]
@@ -85,22 +85,22 @@ HOSTILE = {
 def test_what_is_no_diagnosis_is_refused(tmp_path: Path, content: bytes) -> None:
     (tmp_path / FINDINGS).write_bytes(content)
     with pytest.raises(DataError, match="findings"):
-        of_findings(tmp_path, "drive.mcap", START_NS, END_NS)
+        finding_events(tmp_path, "drive.mcap", START_NS, END_NS)
 
 
 def test_a_huge_file_is_refused_before_it_is_understood(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(findings, "MOST_BYTES", 100)
+    monkeypatch.setattr(findings, "MAX_BYTES", 100)
     with pytest.raises(DataError, match="longer than 100 bytes"):
-        of_findings(folder(tmp_path), "drive.mcap", START_NS, END_NS)
+        finding_events(folder(tmp_path), "drive.mcap", START_NS, END_NS)
 
 
 def test_a_folder_without_one_is_refused(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="diagnose -o"):
-        of_findings(tmp_path / "nowhere", "drive.mcap", START_NS, END_NS)
+        finding_events(tmp_path / "nowhere", "drive.mcap", START_NS, END_NS)
 
 
 def test_thousands_of_stretches_are_bounded(tmp_path: Path) -> None:
     place = {"signal": "gyro", "intervals_s": [[k * 1e-3, k * 1e-3] for k in range(5000)]}
-    events, notes = of_findings(folder(tmp_path, located=[place]), "drive.mcap", START_NS, END_NS)
-    assert len(events) == MOST_PER_KIND
-    assert notes[0].endswith(f"{5000 - MOST_PER_KIND} shorter stretches are not marked.")
+    events, notes = finding_events(folder(tmp_path, located=[place]), "drive.mcap", START_NS, END_NS)
+    assert len(events) == MAX_EVENTS_PER_KIND
+    assert notes[0].endswith(f"{5000 - MAX_EVENTS_PER_KIND} shorter stretches are not marked.")

@@ -186,11 +186,11 @@ def axes_labels(svg: str) -> str:
 def test_every_figure_has_labels_with_units() -> None:
     d = diagnoses.BOTH
     wanted = {
-        figures.where(d, d.traces[0]): ["time (s)", "gyro x", "accel z", "unseen"],
+        figures.misfit_strip(d, d.traces[0]): ["time (s)", "gyro x", "accel z", "unseen"],
         figures.residual(d.traces[0], found=True): ["time (s)", "x (rad/s)", "z (m/s²)"],
         figures.spectrum(d): ["frequency (Hz)", "density (rad/s/√Hz)", "density (m/s²/√Hz)"],
-        figures.against_rate(d): ["rate about y (rad/s)", "turning rate (rad/s)", "mean misfit (m/s²)"],
-        figures.against_attitude(d): ["z above the horizon (°)", "mean misfit (rad/s)"],
+        figures.residual_against_rate(d): ["rate about y (rad/s)", "turning rate (rad/s)", "mean misfit (m/s²)"],
+        figures.residual_against_attitude(d): ["z above the horizon (°)", "mean misfit (rad/s)"],
         figures.curve(diagnoses.UNKNOWN.curve, "gyro"): ["angular rate z (rad/s)", "misfit (rad/s)", "gyro z"],
     }
     for svg, words in wanted.items():
@@ -208,7 +208,7 @@ def changed(d: SimpleNamespace, unseen: bool) -> SimpleNamespace:
     return replace(d, traces=(replace(trace, real=real),))
 
 
-@pytest.mark.parametrize("figure", [figures.spectrum, figures.against_rate, figures.against_attitude])
+@pytest.mark.parametrize("figure", [figures.spectrum, figures.residual_against_rate, figures.residual_against_attitude])
 def test_spectra_and_means_are_over_unseen_time_alone(figure: object) -> None:
     assert callable(figure)
     drawn = figure(diagnoses.LATE)
@@ -224,10 +224,10 @@ def test_another_signal_is_drawn_as_recorded_and_expected_and_what_is_left() -> 
     content = html(with_it)
     assert len(svgs(content)) == len(svgs(html(diagnoses.BOTH))) + 1
     assert "/odom.&lt;x&gt;: over time" in content
-    svg = figures.signal(beside, found=True)
+    svg = figures.scalar_signal(beside, found=True)
     assert "(m/s)" in axes_labels(svg)
     assert "var(--after)" in svg
-    assert "var(--after)" not in figures.signal(beside, found=False)
+    assert "var(--after)" not in figures.scalar_signal(beside, found=False)
 
 
 def test_without_attitude_or_a_long_enough_stretch_it_says_so() -> None:
@@ -255,7 +255,12 @@ def test_a_stretch_without_expectation_leaves_a_hole_and_no_error() -> None:
     lifted = [len(re.findall(r"\bM ", drawn)) for drawn in (svg, whole)]
     assert lifted[0] == lifted[1] + 12  # the pen, once in each of two lines in six panels
     d = replace(diagnoses.LATE, traces=(replace(trace, before=before, after=after),))
-    for drawn in (figures.spectrum(d), figures.against_rate(d), figures.against_attitude(d), figures.where(d, d.traces[0])):
+    for drawn in (
+        figures.spectrum(d),
+        figures.residual_against_rate(d),
+        figures.residual_against_attitude(d),
+        figures.misfit_strip(d, d.traces[0]),
+    ):
         assert drawn is not None
         assert "nan" not in drawn
 
@@ -263,7 +268,7 @@ def test_a_stretch_without_expectation_leaves_a_hole_and_no_error() -> None:
 def test_located_stretches_shade_the_axes_they_name_alone() -> None:
     def shaded(axes: tuple[str, ...]) -> int:
         d = replace(diagnoses.ARM, located=(replace(diagnoses.FAST, axes=axes),))
-        return figures.where(d, d.traces[0]).count("var(--mark)")
+        return figures.misfit_strip(d, d.traces[0]).count("var(--mark)")
 
     assert shaded(()) == 0
     assert shaded(("x", "y")) == 2 * shaded(("x",)) > 0
@@ -272,17 +277,17 @@ def test_located_stretches_shade_the_axes_they_name_alone() -> None:
 def test_a_place_is_shaded_in_its_own_log_and_in_every_stretch_of_it() -> None:
     place = replace(diagnoses.FAST, intervals_s=((80.0, 120.0),))
     first, second = diagnoses.traces("a", duration_s=90.0), diagnoses.traces("a", start_s=100.0, duration_s=90.0)
-    assert list(figures.located_in(first, place)) == [(80.0, first.t_s[-1])]
-    assert list(figures.located_in(second, place)) == [(100.0, 120.0)]
+    assert list(figures.intervals_in_log(first, place)) == [(80.0, first.t_s[-1])]
+    assert list(figures.intervals_in_log(second, place)) == [(100.0, 120.0)]
     of_b = replace(place, log="b.mcap")
-    assert list(figures.located_in(replace(first, path="a.mcap"), of_b)) == []
-    assert list(figures.located_in(replace(first, path="b.mcap"), of_b)) == [(80.0, first.t_s[-1])]
+    assert list(figures.intervals_in_log(replace(first, path="a.mcap"), of_b)) == []
+    assert list(figures.intervals_in_log(replace(first, path="b.mcap"), of_b)) == [(80.0, first.t_s[-1])]
 
 
 def test_beside_poses_a_misfit_is_drawn_as_far_as_they_know_the_motion() -> None:
     trace = diagnoses.traces("a")
-    assert (figures.known(trace, trace.after) == trace.real - trace.after).all()
-    slow = figures.known(replace(trace, band_hz=4.0), trace.after)
+    assert (figures.residual_in_band(trace, trace.after) == trace.real - trace.after).all()
+    slow = figures.residual_in_band(replace(trace, band_hz=4.0), trace.after)
     away = slice(100, -100)  # a filter's length from the ends
     assert slow[away].std() < 0.3 * (trace.real - trace.after)[away].std()  # white noise, of which 4 % of the band is left
 
@@ -290,7 +295,7 @@ def test_beside_poses_a_misfit_is_drawn_as_far_as_they_know_the_motion() -> None
 @given(st.lists(st.floats(-1e3, 1e3), min_size=1, max_size=400), st.integers(1, 50))
 def test_thinning_a_line_keeps_its_ends_of_scale_its_order_and_its_length_in_bounds(values: list[float], buckets: int) -> None:
     t, y = np.arange(len(values), dtype=float), np.array(values)
-    thin_t, thin_y = drawing.extremes(t, y, buckets)
+    thin_t, thin_y = drawing.decimate_extremes(t, y, buckets)
     assert len(thin_t) <= 2 * buckets
     assert (np.diff(thin_t) > 0).all()
     assert thin_y.min() == y.min()
@@ -300,8 +305,8 @@ def test_thinning_a_line_keeps_its_ends_of_scale_its_order_and_its_length_in_bou
 
 def test_a_mask_becomes_stretches_of_time() -> None:
     t = np.arange(6) / 2.0
-    assert drawing.spans(t, np.array([True, True, False, True, False, True])) == [(0.0, 0.5), (1.5, 1.5), (2.5, 2.5)]
-    assert drawing.spans(t, np.zeros(6, dtype=bool)) == []
+    assert drawing.true_intervals(t, np.array([True, True, False, True, False, True])) == [(0.0, 0.5), (1.5, 1.5), (2.5, 2.5)]
+    assert drawing.true_intervals(t, np.zeros(6, dtype=bool)) == []
 
 
 def test_white_noise_has_the_density_of_the_dashed_line() -> None:

@@ -14,7 +14,7 @@ import pytest
 
 from imutool.errors import ConfigError
 from imutool.viewing.model.run_data import RunData
-from imutool.viewing.rerun import export, viewer, web
+from imutool.viewing.rerun import viewer, web
 
 FAKE = {"re_viewer.js": b"// a viewer", "re_viewer_bg.wasm": b"\0asm"}
 
@@ -22,7 +22,7 @@ FAKE = {"re_viewer.js": b"// a viewer", "re_viewer_bg.wasm": b"\0asm"}
 @pytest.fixture
 def no_program(monkeypatch: pytest.MonkeyPatch) -> None:
     """The viewer's own files, 43 MB, are asked for in one test; elsewhere they are stood in for."""
-    monkeypatch.setattr(web, "assets", lambda: dict(FAKE))
+    monkeypatch.setattr(web, "viewer_files", lambda: dict(FAKE))
 
 
 @pytest.fixture
@@ -101,7 +101,7 @@ def test_a_port_that_is_taken_is_said_at_once_and_another_one_used() -> None:
             shown = server.offer({})
             assert server.port != port
             assert shown.said.startswith(
-                f"Port {port} cannot be had (Address already in use). Open http://127.0.0.1:{server.port}/"
+                f"Port {port} cannot be used (Address already in use). Open http://127.0.0.1:{server.port}/"
             )
     with web.Server(port) as server:
         assert (server.port, server.moved) == (port, "")
@@ -129,8 +129,8 @@ def test_the_policy_lets_nothing_in_or_out_but_the_pages_own_origin() -> None:
 
 
 def test_the_viewers_files_come_out_of_the_installed_program() -> None:
-    found = web.assets()
-    assert set(found) == set(web.THEIRS)
+    found = web.viewer_files()
+    assert set(found) == set(web.RERUN_FILES)
     assert found["re_viewer_bg.wasm"][:4] == b"\0asm"
     assert b"WebHandle" in found["re_viewer.js"]
     assert b"viewer_control" in found["re_viewer.js"]  # by which our page moves the cursor
@@ -139,20 +139,20 @@ def test_the_viewers_files_come_out_of_the_installed_program() -> None:
 @pytest.mark.parametrize("binary", ["/bin/false", "/nowhere/rerun"])
 def test_a_program_that_does_not_run_is_said(monkeypatch: pytest.MonkeyPatch, binary: str) -> None:
     monkeypatch.setattr(viewer, "binary", lambda: Path(binary))
-    with pytest.raises(ConfigError, match="cannot be"):
-        web.assets()
+    with pytest.raises(ConfigError, match=r"cannot be|does not serve"):
+        web.viewer_files()
 
 
 def test_a_folder_holds_the_whole_page_and_replaces_only_itself(data: RunData, no_program: None, tmp_path: Path) -> None:
     folder = tmp_path / "deep" / "web"
-    shown = export.export([data], folder)
+    shown = web.export([data], folder)
     assert {path.name for path in folder.iterdir()} == set(web.FILES)
     assert shown.place == str(folder / "index.html")
     assert f"--directory {folder}" in shown.said
     with pytest.raises(ConfigError, match="exists"):
-        export.export([data], folder)
+        web.export([data], folder)
     (folder / "start.js").write_bytes(b"old")
-    export.export([data], folder, overwrite=True)
+    web.export([data], folder, overwrite=True)
     assert (folder / "start.js").read_bytes() == (Path(web.__file__).parent / "site" / "start.js").read_bytes()
     assert [path.name for path in folder.parent.iterdir()] == ["web"]
 
@@ -160,9 +160,9 @@ def test_a_folder_holds_the_whole_page_and_replaces_only_itself(data: RunData, n
 def test_a_folder_with_anything_else_in_it_is_never_replaced(data: RunData, no_program: None, tmp_path: Path) -> None:
     (tmp_path / "thesis.tex").write_text("years", encoding="ascii")
     with pytest.raises(ConfigError, match=r"thesis\.tex"):
-        export.export([data], tmp_path, overwrite=True)
+        web.export([data], tmp_path, overwrite=True)
     with pytest.raises(ConfigError, match="is a file"):
-        export.export([data], tmp_path / "thesis.tex", overwrite=True)
+        web.export([data], tmp_path / "thesis.tex", overwrite=True)
     assert [path.name for path in tmp_path.iterdir()] == ["thesis.tex"]
 
 
@@ -171,7 +171,7 @@ def test_a_failure_on_the_way_leaves_the_old_folder_and_no_other(
     data: RunData, no_program: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, failure: BaseException
 ) -> None:
     folder = tmp_path / "web"
-    export.export([data], folder)
+    web.export([data], folder)
     before = {path.name: path.read_bytes() for path in folder.iterdir()}
     rename = Path.rename
 
@@ -182,6 +182,6 @@ def test_a_failure_on_the_way_leaves_the_old_folder_and_no_other(
 
     monkeypatch.setattr(Path, "rename", fail)
     with pytest.raises((KeyboardInterrupt, ConfigError)):
-        export.export([data], folder, overwrite=True)
+        web.export([data], folder, overwrite=True)
     assert {path.name: path.read_bytes() for path in folder.iterdir()} == before
     assert [path.name for path in tmp_path.iterdir()] == ["web"]

@@ -2,20 +2,18 @@
 
 from __future__ import annotations
 
-import runpy
 from collections.abc import Callable
 from functools import wraps
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import pytest
 import rerun as rr
 
-from imutool.viewing.rerun.entities import clock
+from imutool.viewing.rerun import sdk
+from tests.viewing.rerun import test_pixels
 
 HERE = Path(__file__).parent
-PIXELS = SimpleNamespace(**runpy.run_path(str(HERE / "test_pixels.py")))
 
 Plant = Callable[[pytest.MonkeyPatch], None]
 SCALE, LATE_NS = 1.001, 1
@@ -61,7 +59,7 @@ def late(timeline: str) -> Plant:
 
 PATH, SERIES = without("world/debiased/path"), without("error/position/debiased")
 MUTANTS = {"path dropped": PATH, "series dropped": SERIES, "scaled": scaled} | {
-    f"late on {name}": late(name) for name in clock.TIMELINES
+    f"late on {name}": late(name) for name in sdk.TIMELINES
 }
 CURVES_READ_BACK = "test_every_curve_reads_back_bit_for_bit_with_its_nanoseconds"
 CATCHERS = {"path dropped": "test_the_file_holds_exactly_the_entities_it_should", "series dropped": CURVES_READ_BACK} | {
@@ -109,9 +107,9 @@ def test_a_wrong_in_what_is_logged_fails_the_test_that_reads_it_back(wrong: str,
 def test_what_is_missing_is_missing_among_the_pixels(
     plant: Plant, entity: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    curves = PIXELS.curves_of(PIXELS.one_model, tmp_path)
+    curves = test_pixels.curves_of(test_pixels.one_model, tmp_path)
     plant(monkeypatch)
-    views, seen = PIXELS.drawn(PIXELS.one_model, 1)
-    faults = [fault for view in views for fault in PIXELS.CURVES.unseen(view, seen[view.id], curves)]
+    views, seen = test_pixels.drawn(test_pixels.one_model, 1)
+    faults = [fault for view in views for fault in test_pixels.curves.unseen(view, seen[view.id], curves)]
     assert faults
     assert all(entity in fault for fault in faults)

@@ -14,10 +14,11 @@ from support import saved_rrd
 
 from imutool.recording import Recording
 from imutool.viewing.model.events import Event
-from imutool.viewing.model.run_data import Logged, Run, RunData, build
+from imutool.viewing.model.run_data import LogTimes, Run, RunData
+from imutool.viewing.model.runs import build
 from imutool.viewing.model.trajectory_error import Drift, Errors, Window
-from imutool.viewing.rerun import scene
-from imutool.viewing.rerun.entities import names, palette, paths, signals, spectrum
+from imutool.viewing.rerun import scene, sdk
+from imutool.viewing.rerun.entities import paths, signals, styles
 from imutool.viewing.rerun.viewer import binary
 
 SCALARS = "Scalars:scalars"
@@ -43,7 +44,7 @@ def filled(data: RunData) -> RunData:
         Event("worst", start + 5 * SECOND, start + 5 * SECOND, HOSTILE),
         Event("saturation", data.end_ns, data.end_ns, "at the very end"),
     )
-    logged = Logged(stamps, stamps + LATE_NS)
+    logged = LogTimes(stamps, stamps + LATE_NS)
     return replace(data, traces=tuple(traces), events=events, logged=logged, provenance={"file": HOSTILE})
 
 
@@ -180,7 +181,8 @@ def test_the_worst_moment_is_marked_where_it_is(one: RunData, entities: SimpleNa
 
 
 @pytest.mark.parametrize(
-    ("limit", "path", "most"), [("MOST", "/imu/accel/raw", 200), ("MOST_DERIVED", "/error/position/raw/axes", 100)]
+    ("limit", "path", "most"),
+    [("MAX_CURVE_ROWS", "/imu/accel/raw", 200), ("MAX_DERIVED_ROWS", "/error/position/raw/axes", 100)],
 )
 def test_a_very_long_curve_is_thinned_with_its_extremes_kept(
     one: RunData, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, limit: str, path: str, most: int
@@ -194,7 +196,7 @@ def test_a_very_long_curve_is_thinned_with_its_extremes_kept(
     np.testing.assert_array_equal(values.max(axis=0), whole.max(axis=0))
     np.testing.assert_array_equal(values, whole[np.searchsorted(t_ns, found[path].times(SCALARS, "ros2_timestamp"))])
     (text,) = found["/report"].static["TextDocument:text"]
-    assert ("Of errors and biases at most 100 rows" in text) == (limit == "MOST_DERIVED")
+    assert ("Errors and biases are drawn with at most 100 rows" in text) == (limit == "MAX_DERIVED_ROWS")
 
 
 # ── space ──
@@ -240,11 +242,11 @@ def test_the_debiased_path_has_the_colour_of_its_error_and_the_legend_its_scale(
     errors = one.models()[0].errors
     assert errors is not None
     total = errors.orientation_total_deg
-    top = palette.end_of_scale(total.max())
+    top = styles.round_up_125(total.max())
     assert total.max() <= top < 2.6 * total.max()
     packed = entities.all["/world/debiased/path"].rows("LineStrips3D:colors").flatten().to_numpy()
     found = np.stack([packed >> 24, packed >> 16 & 255, packed >> 8 & 255], axis=1)
-    np.testing.assert_array_equal(found, palette.heat(np.maximum(total[:-1], total[1:]), top))
+    np.testing.assert_array_equal(found, styles.heat_colors(np.maximum(total[:-1], total[1:]), top))
     assert entities.all["/legend/ticks"].static["Points2D:labels"][0] == "0°"
     assert entities.all["/legend/ticks"].static["Points2D:labels"][4] == f"{top:g}°"
 
@@ -261,13 +263,13 @@ def test_an_error_vector_goes_from_the_true_place_to_the_estimated_one(one: RunD
 
 @pytest.mark.parametrize(("highest", "top"), [(0.3, 0.5), (1.0, 1.0), (1.1, 2.0), (5.0, 5.0), (130.0, 200.0), (0.0, 1.0)])
 def test_a_scale_ends_with_a_number_that_can_be_read(highest: float, top: float) -> None:
-    assert palette.end_of_scale(highest) == pytest.approx(top)
+    assert styles.round_up_125(highest) == pytest.approx(top)
 
 
 def test_heat_runs_from_its_first_colour_to_its_last_and_is_grey_where_nothing_is_known() -> None:
-    colors = palette.heat(np.array([0.0, 1.0, 2.0, 9.0, np.nan]), 2.0)
-    np.testing.assert_array_equal(colors[[0, 1, 2, 3]], palette.HEAT[[0, 3, 6, 6]])
-    assert tuple(colors[4]) == palette.GREY
+    colors = styles.heat_colors(np.array([0.0, 1.0, 2.0, 9.0, np.nan]), 2.0)
+    np.testing.assert_array_equal(colors[[0, 1, 2, 3]], styles.HEAT[[0, 3, 6, 6]])
+    assert tuple(colors[4]) == styles.GREY
 
 
 def test_no_line_is_drawn_across_a_gap(recording: Recording, runs: list[Run], tmp_path: Path) -> None:
@@ -285,14 +287,14 @@ def test_no_line_is_drawn_across_a_gap(recording: Recording, runs: list[Run], tm
 
 
 def test_rows_of_a_very_long_path_are_bounded(one: RunData, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(paths, "MOST_ROWS", 3)
-    cut = paths.pieces(one.traces[0].path)
+    monkeypatch.setattr(paths, "MAX_ROWS", 3)
+    cut = paths.path_pieces(one.traces[0].path)
     assert len(cut.counts) == len(cut.stamp_ns) == 3
     assert cut.counts.sum() == len(cut.first) == len(one.traces[0].path) - 1
 
 
 def test_a_path_of_one_pose_has_no_pieces(one: RunData) -> None:
-    cut = paths.pieces(one.traces[0].path.rows(slice(0, 1)))
+    cut = paths.path_pieces(one.traces[0].path.rows(slice(0, 1)))
     assert len(cut.first) == len(cut.counts) == 0
 
 
@@ -301,13 +303,13 @@ def test_a_path_of_one_pose_has_no_pieces(one: RunData) -> None:
 
 def test_a_spectrum_is_drawn_where_its_axes_say(one: RunData, entities: SimpleNamespace) -> None:
     for kind in ("gyro", "accel"):
-        frame = spectrum.frame_of(one, kind)
+        frame = signals.decade_frame(one, kind)
         drawn = entities.all[f"/spectrum/{kind}/debiased"].static["LineStrips2D:strips"]
         found = one.traces[1].spectra[kind]
         for points, column in zip(drawn, found.density.T, strict=True):
             x, y = np.array(points).T
-            hz = 10.0 ** (x / spectrum.WIDTH * (frame.high_hz - frame.low_hz) + frame.low_hz)
-            root = 10.0 ** ((1.0 - y / spectrum.HEIGHT) * (frame.high - frame.low) + frame.low)
+            hz = 10.0 ** (x / signals.WIDTH * (frame.high_hz - frame.low_hz) + frame.low_hz)
+            root = 10.0 ** ((1.0 - y / signals.HEIGHT) * (frame.high - frame.low) + frame.low)
             rows = np.abs(found.frequency_hz - hz[:, None]).argmin(axis=1)
             np.testing.assert_allclose(hz, found.frequency_hz[rows], rtol=1e-4)
             np.testing.assert_allclose(root, np.maximum(np.sqrt(column[rows]), 10.0**frame.low), rtol=1e-4)
@@ -404,7 +406,7 @@ def test_a_name_is_shortened_by_the_words_that_all_models_begin_with(data: RunDa
         raw, *others = data.traces
         named = [replace(trace, run=replace(trace.run, name=name)) for trace, name in zip(others * 2, models, strict=False)]
         changed = replace(data, traces=(raw, *named))
-        return [names.label(changed, trace) for trace in changed.traces]
+        return [sdk.label(changed, trace) for trace in changed.traces]
 
     assert labels("euroc-adis16448-conv", "euroc-adis16448-linear") == ["raw", "conv", "linear"]
     assert labels("a-b", "a-bc") == ["raw", "b", "bc"]

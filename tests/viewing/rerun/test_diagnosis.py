@@ -164,11 +164,11 @@ def test_the_report_says_the_conclusion_and_what_a_log_is_called_is_no_markup(fo
 def test_the_layout_has_a_tab_for_each_log_and_a_panel_for_each_axis(folder: Path) -> None:
     said = layout(folder / "THREE.rrd")
     for words in (
-        "one", "two", "What is left", "Samples", "Angular rate x (rad/s)", "Specific force z (m/s²)", "Where it differs",
+        "one", "two", "Residuals", "Samples", "Angular rate x (rad/s)", "Specific force z (m/s²)", "Where it differs",
         "Events", "Report", "elapsed",
     ):  # fmt: skip
         assert f"'{words}'" in said, words
-    assert "'What is left'" not in layout_of(replace(diagnoses.BOTH, traces=()), folder / "bare.rrd")
+    assert "'Residuals'" not in layout_of(replace(diagnoses.BOTH, traces=()), folder / "bare.rrd")
 
 
 def layout_of(d: object, path: Path) -> str:

@@ -22,7 +22,7 @@ from imutool.errors import ConfigError
 from imutool.mcap_io.write import write
 from imutool.sensor.flight import flight
 from imutool.viewing.model.runs import load
-from imutool.viewing.rerun import files, live, viewer
+from imutool.viewing.rerun import live, scene, viewer
 
 SECONDS, BLOCK = 12.0, 250  # samples at 200 Hz, as from a log with images
 PATH_M = 1e-4  # single precision, in which Rerun keeps positions, over some hundred metres
@@ -70,7 +70,7 @@ def in_blocks(watch: BlockCallback) -> BlockCallback:
 def watched(log: Path, folder: Path, **options: Any) -> tuple[Path, live.Live]:
     """The debiased log, and who watched it."""
     out = folder / "out.mcap"
-    with live.watching("log", instead=folder / "instead.rrd", **options) as watch:
+    with live.live_view("log", instead=folder / "instead.rrd", **options) as watch:
         debias(log, out, watch=in_blocks(watch))
     return out, watch
 
@@ -78,7 +78,7 @@ def watched(log: Path, folder: Path, **options: Any) -> tuple[Path, live.Live]:
 def test_what_is_watched_is_what_is_shown_afterwards(log: Path, unwatched: Path, tmp_path: Path) -> None:
     watched(log, tmp_path, save=tmp_path / "live.rrd")
     data = load(unwatched)
-    (tmp_path / "after.rrd").write_bytes(files.rrd([data], source=False))
+    (tmp_path / "after.rrd").write_bytes(scene.rrd([data], source=False))
     seen, after = saved_rrd.read(tmp_path / "live.rrd"), saved_rrd.read(tmp_path / "after.rrd")
     curves = [f"/imu/{kind}/{role}" for kind in ("gyro", "accel") for role in ("raw", "debiased")]
     curves += [f"/bias/{kind}/{name}" for kind in ("gyro", "accel") for name in ("estimated", "sigma")]
@@ -144,7 +144,7 @@ def test_what_cannot_be_shown_does_not_stop_the_debiasing(
     def fail(_: object) -> None:
         raise ValueError("no path")
 
-    monkeypatch.setattr(live.paths, "pieces", fail)
+    monkeypatch.setattr(live.paths, "path_pieces", fail)
     with caplog.at_level(logging.WARNING, "imutool"):
         out, watch = watched(log, tmp_path, save=tmp_path / "live.rrd")
     assert len(caplog.records) == 1
@@ -168,7 +168,7 @@ def test_a_file_that_lost_its_end_is_no_file(
     with caplog.at_level(logging.WARNING, "imutool"):
         out, watch = watched(log, tmp_path, save=tmp_path / "live.rrd")
     assert len(caplog.records) == 1
-    assert "could not be written whole" in caplog.text
+    assert "could not be written completely" in caplog.text
     assert (watch.shown, [path.name for path in tmp_path.iterdir()]) == ([], ["out.mcap"])
     assert out.read_bytes() == unwatched.read_bytes()
 
@@ -176,7 +176,7 @@ def test_a_file_that_lost_its_end_is_no_file(
 def test_samples_that_come_again_from_a_repaired_log_are_shown_once(log: Path, tmp_path: Path) -> None:
     blocks: list[DebiasedBlock] = []
     debias(log, tmp_path / "out.mcap", watch=in_blocks(blocks.append))
-    with live.watching("log", save=tmp_path / "live.rrd", instead=tmp_path) as watch:
+    with live.live_view("log", save=tmp_path / "live.rrd", instead=tmp_path) as watch:
         for block in (*blocks[:4], *blocks):
             watch(block)
     stamps = saved_rrd.read(tmp_path / "live.rrd")["/imu/gyro/raw"].times("Scalars:scalars", "ros2_timestamp")
@@ -186,7 +186,7 @@ def test_samples_that_come_again_from_a_repaired_log_are_shown_once(log: Path, t
 def test_a_second_imu_has_a_tree_of_its_own(log: Path, tmp_path: Path) -> None:
     blocks: list[DebiasedBlock] = []
     debias(log, tmp_path / "out.mcap", watch=in_blocks(blocks.append))
-    with live.watching("log", save=tmp_path / "live.rrd", instead=tmp_path) as watch:
+    with live.live_view("log", save=tmp_path / "live.rrd", instead=tmp_path) as watch:
         for block in blocks:
             watch(block)
             watch(block._replace(topic="/imu 1"))
@@ -212,11 +212,11 @@ def test_where_no_viewer_opens_a_file_is_written_instead_and_said(
 
 
 def test_a_debiasing_that_fails_leaves_no_file_and_an_existing_one_is_kept(log: Path, tmp_path: Path) -> None:
-    with pytest.raises(KeyboardInterrupt), live.watching("log", save=tmp_path / "a.rrd", instead=tmp_path):
+    with pytest.raises(KeyboardInterrupt), live.live_view("log", save=tmp_path / "a.rrd", instead=tmp_path):
         raise KeyboardInterrupt
     assert list(tmp_path.iterdir()) == []
     (tmp_path / "a.rrd").write_bytes(b"mine")
-    with pytest.raises(ConfigError, match="exists"), live.watching("log", save=tmp_path / "a.rrd", instead=tmp_path):
+    with pytest.raises(ConfigError, match="exists"), live.live_view("log", save=tmp_path / "a.rrd", instead=tmp_path):
         pass
     assert (tmp_path / "a.rrd").read_bytes() == b"mine"
 

@@ -15,20 +15,21 @@ from imutool.errors import ConfigError, DataError
 from imutool.mcap_io.write import write
 from imutool.recording import Recording
 from imutool.viewing import outputs
-from imutool.viewing.model.run_data import Run, RunData, build
-from imutool.viewing.outputs import Asked, Outputs, cursor_s
+from imutool.viewing.model.run_data import Run, RunData
+from imutool.viewing.model.runs import build
+from imutool.viewing.outputs import Outputs, RequestedOutputs, cursor_s
 
 
 @pytest.mark.parametrize(
     ("asked", "what"),
     [
-        (Asked(connect="1", web=True), "--connect and --web"),
-        (Asked(port=9090), "without --web"),
-        (Asked(save=Path("a.rrd"), at="worst"), "no cursor"),
-        (Asked(html=Path("a.html"), at="1"), "no cursor"),
+        (RequestedOutputs(connect="1", web=True), "`connect` and `web`"),
+        (RequestedOutputs(port=9090), "without `web`"),
+        (RequestedOutputs(save=Path("a.rrd"), at="worst"), "no cursor"),
+        (RequestedOutputs(html=Path("a.html"), at="1"), "no cursor"),
     ],
 )
-def test_contradictions_are_refused_before_any_work(asked: Asked, what: str) -> None:
+def test_contradictions_are_refused_before_any_work(asked: RequestedOutputs, what: str) -> None:
     with pytest.raises(ConfigError, match=what):
         Outputs(asked)
 
@@ -48,7 +49,7 @@ def report(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_files_and_pages_are_made_together_and_each_is_said(data: RunData, tmp_path: Path, report: None) -> None:
-    asked = Asked(save=tmp_path / "a.rrd", html=tmp_path / "a.html", png=tmp_path / "p")
+    asked = RequestedOutputs(save=tmp_path / "a.rrd", html=tmp_path / "a.html", png=tmp_path / "p")
     with Outputs(asked) as chosen:
         shown = chosen.show([data])
     assert [one.how for one in shown] == ["html", "png", "rrd"]
@@ -64,19 +65,24 @@ def test_without_rerun_a_page_is_written_here_and_said(
     there = outputs.find_spec
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(outputs, "find_spec", lambda name: None if name == "rerun" else there(name))
-    with Outputs(Asked()) as chosen:
+    with Outputs(RequestedOutputs()) as chosen:
         (shown,) = chosen.show([data])
     assert (shown.how, shown.place) == ("html", "flight_3.html")
     assert "not installed (pip install 'imutool[view]')" in shown.said
     assert (tmp_path / "flight_3.html").read_text(encoding="utf-8") == "flight_3"
     monkeypatch.setattr(outputs, "find_spec", lambda name: None)
-    with Outputs(Asked()) as chosen, pytest.raises(ConfigError, match=r"imutool\[view,report\]"):
+    with Outputs(RequestedOutputs()) as chosen, pytest.raises(ConfigError, match=r"imutool\[view,report\]"):
         chosen.show([data])
 
 
 def test_what_needs_rerun_is_refused_without_it_before_any_work(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "rerun", None)
-    for asked in (Asked(save=Path("a")), Asked(connect="1"), Asked(web=True), Asked(export=Path("a"))):
+    for asked in (
+        RequestedOutputs(save=Path("a")),
+        RequestedOutputs(connect="1"),
+        RequestedOutputs(web=True),
+        RequestedOutputs(export_web=Path("a")),
+    ):
         with pytest.raises(ConfigError, match=r"pip install 'imutool\[view\]'"):
             Outputs(asked)
 
@@ -117,7 +123,7 @@ def test_where_nobody_listens_a_file_is_saved_and_the_command_fails_all_the_same
     write(recording, tmp_path / "log.mcap")
     done = imutool("view", "log.mcap", "--connect", "127.0.0.1:1", "--quiet", cwd=tmp_path)
     assert done.returncode == ConfigError.exit_code
-    assert done.stderr.count("nobody listens there") == 2  # before the log is read, and at the end
+    assert done.stderr.count("nothing listens there") == 2  # before the log is read, and at the end
     assert done.stdout == "Saved flight_3.rrd. Open with: rerun flight_3.rrd\n"
     assert {path.name for path in tmp_path.iterdir()} == {"log.mcap", "flight_3.rrd"}
 

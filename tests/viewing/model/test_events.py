@@ -11,15 +11,15 @@ from imutool.mcap_io.topics import ImuBatch
 from imutool.recording import Imu, Recording
 from imutool.sensor.flight import flight
 from imutool.viewing.model.events import (
+    KIND_OF_RULE,
     KINDS,
-    LONGEST_TEXT,
-    MOST_PER_KIND,
-    OF_RULE,
+    MAX_EVENTS_PER_KIND,
+    MAX_TEXT_LENGTH,
     Event,
-    gathered,
-    of_stops,
-    of_survey,
-    of_worst,
+    events_within,
+    stop_events,
+    survey_events,
+    worst_error_events,
 )
 from imutool.viewing.model.trajectory_error import Errors
 
@@ -30,11 +30,11 @@ def good() -> Recording:
 
 
 def found_in(batch: ImuBatch) -> tuple[list[Event], list[str]]:
-    return of_survey(examine(lambda: [batch], None))
+    return survey_events(examine(lambda: [batch], None))
 
 
 def test_every_rule_that_tells_a_time_has_a_kind_of_its_own() -> None:
-    assert set(OF_RULE.values()) == set(KINDS) - {"stop", "worst", "finding"}
+    assert set(KIND_OF_RULE.values()) == set(KINDS) - {"stop", "worst", "finding"}
 
 
 def test_a_good_log_has_no_event(good: Recording) -> None:
@@ -68,12 +68,12 @@ def test_what_is_found_without_a_time_is_a_sentence(good: Recording) -> None:
 
 
 def test_stops_are_where_the_body_stands(good: Recording) -> None:
-    (stop,) = of_stops(good.imu)
+    (stop,) = stop_events(good.imu)
     start_ns = int(good.imu.t_ns[0])
     assert stop.kind == "stop"
     assert stop.start_ns == start_ns
     assert (stop.end_ns - start_ns) * 1e-9 == pytest.approx(3.0, abs=1.0)  # still_s of the flight, which sets off gently
-    assert of_stops(Imu(good.imu.t_ns[:1], good.imu.gyro[:1], good.imu.accel[:1])) == []
+    assert stop_events(Imu(good.imu.t_ns[:1], good.imu.gyro[:1], good.imu.accel[:1])) == []
 
 
 def test_the_worst_moment_is_that_of_the_largest_error_and_holes_are_none() -> None:
@@ -83,17 +83,17 @@ def test_the_worst_moment_is_that_of_the_largest_error_and_holes_are_none() -> N
     hole = np.full((5, 3), np.nan)
     orientation, position = error.copy(), error.copy()
     orientation[1] = np.nan
-    worst = list(of_worst("a model", Errors(t_ns, orientation, orientation, position)))
+    worst = list(worst_error_events("a model", Errors(t_ns, orientation, orientation, position)))
     assert [(event.kind, event.start_ns, event.end_ns) for event in worst] == [("worst", 3000, 3000), ("worst", 1000, 1000)]
     assert worst[0].text == "a model: largest orientation error, 7 deg"
     assert worst[1].text == "a model: largest position error, 12345 m"
-    assert list(of_worst("none", Errors(t_ns, hole, hole, hole))) == []
+    assert list(worst_error_events("none", Errors(t_ns, hole, hole, hole))) == []
 
 
 def test_of_too_many_the_longest_are_kept_and_the_rest_counted() -> None:
-    gaps = [Event("gap", 1000 * k, 1000 * k + k, "gap") for k in range(MOST_PER_KIND + 40)]
-    kept, notes = gathered([Event("stop", 0, 10, "still"), *gaps], 0, 10**9)
-    assert len(kept) == MOST_PER_KIND + 1
+    gaps = [Event("gap", 1000 * k, 1000 * k + k, "gap") for k in range(MAX_EVENTS_PER_KIND + 40)]
+    kept, notes = events_within([Event("stop", 0, 10, "still"), *gaps], 0, 10**9)
+    assert len(kept) == MAX_EVENTS_PER_KIND + 1
     assert min(event.end_ns - event.start_ns for event in kept if event.kind == "gap") == 40
     assert [event.start_ns for event in kept] == sorted(event.start_ns for event in kept)
     assert len(notes) == 1
@@ -107,7 +107,7 @@ def test_events_end_with_the_log_and_another_century_is_only_counted() -> None:
         Event("out_of_order", 4 * 10**18, 4 * 10**18, "in 2096"),
         Event("spike", 500, 500, "x" * 10_000),
     ]
-    kept, notes = gathered(events, 100, 1000)
+    kept, notes = events_within(events, 100, 1000)
     assert [(event.start_ns, event.end_ns) for event in kept] == [(100, 150), (500, 500), (900, 1000)]
-    assert len(kept[1].text) == LONGEST_TEXT
-    assert notes == ("Events of kind out of order: 1 lie outside the log's own time and are not shown.",)
+    assert len(kept[1].text) == MAX_TEXT_LENGTH
+    assert notes == ("Events of kind out of order: 1 lie outside the log and are not shown.",)

@@ -86,7 +86,7 @@ def test_no_alignment_changes_no_bit(stretch: Stretch) -> None:
     _, path, true, valid = stretch
     same, motion = aligned(path, true, valid, "none")
     assert same == path
-    assert motion.turn.magnitude() == 0.0
+    assert motion.rotation.magnitude() == 0.0
     assert not motion.shift_m.any()
 
 
@@ -95,7 +95,7 @@ def test_a_planted_motion_about_the_vertical_is_found_by_every_alignment(stretch
     _, _, true, valid = stretch
     turn, shift = MOVED
     back, motion = aligned(moved(true, turn, shift), true, valid, alignment)
-    assert (motion.turn * turn).magnitude() < FOUND
+    assert (motion.rotation * turn).magnitude() < FOUND
     np.testing.assert_allclose(back.p_wb, true.p_wb, atol=1e-7)
     assert errors(back, true, valid).orientation_total_deg[valid].max() < 1e-5
     assert back.v_w is not None
@@ -108,13 +108,13 @@ def test_the_truths_holes_count_in_no_alignment(stretch: Stretch) -> None:
     wrong[~valid] += 1000.0
     estimate = Poses(true.t_ns, wrong, true.q_wb_wxyz, true.v_w)
     for alignment in ("origin", "yaw", "se3"):
-        assert aligned(estimate, true, valid, alignment)[1].turn.magnitude() < FOUND  # type: ignore[arg-type]
+        assert aligned(estimate, true, valid, alignment)[1].rotation.magnitude() < FOUND  # type: ignore[arg-type]
 
 
 def test_yaw_turns_about_the_vertical_alone_and_is_the_best_such_turn(stretch: Stretch) -> None:
     _, path, true, valid = stretch
     best, motion = aligned(path, true, valid, "yaw")
-    np.testing.assert_allclose(motion.turn.apply([0.0, 0.0, 1.0]), [0.0, 0.0, 1.0], atol=1e-12)
+    np.testing.assert_allclose(motion.rotation.apply([0.0, 0.0, 1.0]), [0.0, 0.0, 1.0], atol=1e-12)
 
     def misfit(poses: Poses) -> float:
         away = (poses.p_wb - true.p_wb)[valid]
@@ -140,7 +140,7 @@ def test_positions_on_a_line_leave_the_turn_open(stretch: Stretch) -> None:
     line = Poses(true.t_ns, np.outer(np.arange(len(true)), [1.0, 0.0, 0.0]), true.q_wb_wxyz)
     with pytest.raises(DataError, match="line"):
         aligned(line, line, valid, "se3")
-    assert aligned(line, line, valid, "yaw")[1].turn.magnitude() < FOUND
+    assert aligned(line, line, valid, "yaw")[1].rotation.magnitude() < FOUND
     with pytest.raises(DataError, match="none of the estimate's stamps"):
         aligned(line, line, np.zeros(len(line), bool), "se3")
 

@@ -15,9 +15,10 @@ import rerun.blueprint as rrb
 from support import saved_rrd
 
 from imutool.recording import Recording
-from imutool.viewing.model.run_data import Run, RunData, build
+from imutool.viewing.model.run_data import Run, RunData
+from imutool.viewing.model.runs import build
 from imutool.viewing.rerun import layout
-from imutool.viewing.rerun.entities.plots import limit, plot
+from imutool.viewing.rerun.plots import error_axis_limit, plot
 
 LONGEST = 90  # letters of a title at 1280 pixels: half the window is about 640 wide
 NOT_SHOWN = {"/__properties", "/world"}  # a view has the second one as its origin
@@ -141,7 +142,7 @@ def test_colours_in_titles_are_those_of_the_curves(recording: Recording, runs: l
     assert re.fullmatch(r"Orientation error \(deg\), top [\d.]+: debiased blue, raw orange, worst pink", orientation)
     (position,) = [title for title in titles("two models") if title.startswith("Position error (m), top")]
     assert re.fullmatch(r"Position error \(m\), top [\d.]+: static blue, my model/v1 green, raw orange, worst pink", position)
-    assert "Angular rate (rad/s): x red, y green, z blue; debiased bold, raw faint" in titles("one model")
+    assert "Angular rate (rad/s): x red, y green, z blue; debiased bold, raw pale" in titles("one model")
     assert "Angular rate (rad/s): x red, y green, z blue" in titles("raw alone")
     assert "Angular rate (rad/s): x red, y green, z blue; static bold, my model/v1 paler" in titles("two models")
 
@@ -160,10 +161,10 @@ def test_only_where_a_title_cannot_say_what_is_what_a_legend_covers_curves() -> 
 def test_an_error_plot_keeps_the_models_readable_whatever_raw_does(data: RunData) -> None:
     errors = {"static": np.array([0.0, 2.0]), "my model/v1": np.array([np.nan, -1.0])}
     for raw, height in {6.0: 1.05 * 6.0, 19.9: 1.05 * 19.9, 20.1: 5.0, 2000.0: 5.0}.items():
-        assert limit(data, errors | {"raw": np.array([raw, np.nan])}) == pytest.approx(height)
-    assert limit(data, {"raw": np.array([np.nan])}) is None
-    assert limit(data, {"raw": np.zeros(3)}) is None
-    assert limit(data, {}) is None
+        assert error_axis_limit(data, errors | {"raw": np.array([raw, np.nan])}) == pytest.approx(height)
+    assert error_axis_limit(data, {"raw": np.array([np.nan])}) is None
+    assert error_axis_limit(data, {"raw": np.zeros(3)}) is None
+    assert error_axis_limit(data, {}) is None
 
 
 def test_it_opens_with_whole_paths_on_elapsed_time(data: RunData) -> None:

@@ -17,7 +17,7 @@ from typing import Any
 import pytest
 from support import viewers
 
-from imutool.viewing.rerun.entities.palette import XYZ
+from imutool.viewing.rerun.entities.styles import XYZ
 
 SIZE = {"width": 800, "height": 500}  # software draws it
 LEAST = 200  # pixels of a colour; a legend alone has some fifty

@@ -19,7 +19,7 @@ from rerun.chunk import RrdReader
 from imutool.errors import ConfigError
 from imutool.viewing.model.run_data import RunData
 from imutool.viewing.rerun import connect, viewer
-from imutool.viewing.rerun.connect import Peer
+from imutool.viewing.rerun.connect import Listener
 
 NO_WAIT_S = 2.0
 SERVER_STARTS_S = 10.0
@@ -64,7 +64,8 @@ def received(tmp_path: Path) -> Iterator[tuple[str, Path, subprocess.Popen[bytes
 
 
 @pytest.mark.parametrize(
-    ("who", "what"), [("dead", "nobody listens"), ("website", "no viewer"), ("silent", "no viewer"), ("away", "nobody listens")]
+    ("who", "what"),
+    [("dead", "nothing listens"), ("website", "not a viewer"), ("silent", "not a viewer"), ("away", "nothing listens")],
 )
 @pytest.mark.parametrize("scheme", ["rerun+http", "rerun+https"])
 def test_who_is_no_viewer_is_refused_at_once(request: pytest.FixtureRequest, who: str, what: str, scheme: str) -> None:
@@ -78,8 +79,8 @@ def test_who_is_no_viewer_is_refused_at_once(request: pytest.FixtureRequest, who
 
 
 def test_a_line_opens_and_answers_within_two_seconds_or_never() -> None:
-    assert 3 * connect.REACH_S < NO_WAIT_S
-    assert connect.MOVE_S < NO_WAIT_S
+    assert 3 * connect.ANSWER_TIMEOUT_S < NO_WAIT_S
+    assert connect.CURSOR_TIMEOUT_S < NO_WAIT_S
 
 
 @pytest.mark.parametrize(
@@ -93,9 +94,9 @@ def test_what_is_no_url_of_a_viewer_is_refused(url: str) -> None:
 
 def test_port_host_and_whole_urls_name_the_same_place() -> None:
     full = "rerun+http://127.0.0.1:5555/proxy"
-    assert {connect.full(words) for words in ("5555", "127.0.0.1:5555", full, full.removesuffix("/proxy"))} == {full}
-    assert connect.full("example.org") == "rerun+http://example.org:9876/proxy"
-    assert connect.full("rerun+https://[::1]:1") == "rerun+https://[::1]:1/proxy"
+    assert {connect.full_url(words) for words in ("5555", "127.0.0.1:5555", full, full.removesuffix("/proxy"))} == {full}
+    assert connect.full_url("example.org") == "rerun+http://example.org:9876/proxy"
+    assert connect.full_url("rerun+https://[::1]:1") == "rerun+https://[::1]:1/proxy"
 
 
 @pytest.mark.filterwarnings("ignore:RRD file has no footer")  # the server is ended, which leaves none
@@ -104,7 +105,7 @@ def test_a_server_without_a_viewer_is_known_as_such_and_gets_everything(
 ) -> None:
     url, file, process = received
     peer = connect.probe(url)
-    assert peer == Peer(url, None)
+    assert peer == Listener(url, None)
     shown = connect.send([data], peer, at_s=1.0)  # nobody there has a cursor
     assert (shown.how, shown.place) == ("connect", url)
     end = time.monotonic() + SERVER_STARTS_S
@@ -126,7 +127,7 @@ def test_one_that_is_gone_when_the_logs_are_read_is_an_error_that_says_so(
     peer = connect.probe(url)
     process.kill()
     process.wait()
-    with pytest.raises(ConfigError, match="nobody listens"):
+    with pytest.raises(ConfigError, match="nothing listens"):
         connect.send([data], peer)
 
 
@@ -150,6 +151,6 @@ def test_one_that_is_gone_while_it_is_sent_to_is_an_error_that_says_so(
 
 
 def test_another_version_is_named_beside_ours() -> None:
-    assert connect.told(Peer("", "0.40.2")).startswith(f", which is Rerun 0.40.2, not {rr.__version__}")
-    assert connect.told(Peer("", rr.__version__)) == ""
-    assert connect.told(Peer("", None)) == ""
+    assert connect.version_mismatch(Listener("", "0.40.2")).startswith(f", which is Rerun 0.40.2, not {rr.__version__}")
+    assert connect.version_mismatch(Listener("", rr.__version__)) == ""
+    assert connect.version_mismatch(Listener("", None)) == ""

@@ -20,11 +20,11 @@ from support import markup
 from imutool.errors import ConfigError
 from imutool.recording import Imu, Poses, Recording
 from imutool.sensor.flight import flight
-from imutool.viewing.html import drawing, report, report_errors, report_events, report_paths, report_signals, report_wording
-from imutool.viewing.html.page import is_ours
-from imutool.viewing.html.theme import DARK, LEVELS, LIGHT, PAPER
+from imutool.viewing.html import drawing, report, report_errors, report_paths, report_signals, report_wording
+from imutool.viewing.html.page import DARK, LEVELS, LIGHT, PAPER, is_imutool_page
 from imutool.viewing.model.events import Event
-from imutool.viewing.model.run_data import Run, RunData, Trace, build
+from imutool.viewing.model.run_data import Run, RunData, Trace
+from imutool.viewing.model.runs import build
 from imutool.viewing.model.trajectory_error import Drift, Errors, Window
 
 Page, svgs, curves = markup.Page, markup.svgs, markup.curves
@@ -82,24 +82,24 @@ def test_the_conclusion_comes_first_and_holds_the_figures_of_the_best_model(seen
     whole = seen.traces[2].figures
     said = Page(page).text
     assert said.index("whole cuts the orientation error") < said.index("Figures")
-    assert f"from {report_wording.measure(seen.traces[0].figures['aoe_deg'], '°')} to" in said
-    less = report_wording.times(seen.traces[0].figures["aoe_deg"], whole["aoe_deg"])
-    assert f"to {report_wording.measure(whole['aoe_deg'], '°')} ({less})" in said
+    assert f"from {report_wording.format_quantity(seen.traces[0].figures['aoe_deg'], '°')} to" in said
+    less = report_wording.ratio_text(seen.traces[0].figures["aoe_deg"], whole["aoe_deg"])
+    assert f"to {report_wording.format_quantity(whole['aoe_deg'], '°')} ({less})" in said
     errors = seen.traces[2].errors
     assert errors is not None
     row = int(np.nanargmax(errors.orientation_total_deg))
-    worst = report_wording.measure(float(errors.orientation_total_deg[row]), "°")
-    at = report_wording.number(float(seen.elapsed_s(errors.t_ns)[row]))
+    worst = report_wording.format_quantity(float(errors.orientation_total_deg[row]), "°")
+    at = report_wording.format_number(float(seen.elapsed_s(errors.t_ns)[row]))
     assert f"without alignment; at worst by {worst}, {at} s after the start." in said
 
 
 def test_a_model_that_does_harm_is_not_praised(seen: RunData) -> None:
     raw, half, _ = seen.traces
     worse = replace(half, figures={**half.figures, "aoe_deg": 2.0 * raw.figures["aoe_deg"], "ape_m": raw.figures["ape_m"]})
-    said = report_wording.compared(worse, raw)
+    said = report_wording.comparison(worse, raw)
     assert said.startswith("half raises the orientation error from")
     assert "(2.0 times) and leaves the position error about as it was" in said
-    assert report_wording.overall([replace(seen, traces=(raw, worse))]).startswith("In 0 of 1 logs")
+    assert report_wording.summary_of_logs([replace(seen, traces=(raw, worse))]).startswith("In 0 of 1 logs")
 
 
 def test_every_figure_is_in_the_table_to_the_last_digit_and_the_best_is_marked(seen: RunData, page: str) -> None:
@@ -111,7 +111,7 @@ def test_every_figure_is_in_the_table_to_the_last_digit_and_the_best_is_marked(s
     for name, values in seen.table():
         if name in ("samples", "duration_s") or None in values:
             continue
-        found = rows[report_wording.label(name)]
+        found = rows[report_wording.figure_label(name)]
         assert [float(value) for _, value in found] == values
         assert [bool(best) for best, _ in found] == [value == min(values) for value in values]
         checked += 1
@@ -125,10 +125,10 @@ def test_every_figure_is_in_the_table_to_the_last_digit_and_the_best_is_marked(s
 
 def test_numbers_are_read_easily() -> None:
     told = {0.0: "0", 0.99996: "1.00", 1.234: "1.23", 43.21: "43.2", 0.0012345: "0.00123", 12345.6: "12,346", 3e-7: "3.0e-07"}
-    assert {value: report_wording.number(value) for value in told} == told
-    assert report_wording.number(None) == report_wording.number(float("nan")) == "–"
-    assert report_wording.measure(23_900.0, "m") == "23.9 km"
-    assert report_wording.times(62.0, 2.0) == "31 times"
+    assert {value: report_wording.format_number(value) for value in told} == told
+    assert report_wording.format_number(None) == report_wording.format_number(float("nan")) == "–"
+    assert report_wording.format_quantity(23_900.0, "m") == "23.9 km"
+    assert report_wording.ratio_text(62.0, 2.0) == "31 times"
 
 
 def drawing_only(*makes: object) -> object:
@@ -137,7 +137,7 @@ def drawing_only(*makes: object) -> object:
 
 
 def test_several_logs_are_compared_first_and_each_has_its_part(seen: RunData) -> None:
-    with drawing_only(report_paths.paths, report_events.lanes):
+    with drawing_only(report_paths.paths, report_errors.event_lanes):
         both = report.page([seen, replace(seen, name="other")])
     parsed = Page(both)
     assert parsed.text.startswith("2 logs 2 logs In 2 of 2 logs the best model has a smaller orientation error than raw")
@@ -153,7 +153,7 @@ def test_events_have_lanes_and_rows_and_of_many_the_rest_is_counted(seen: RunDat
     assert {"gap: 1", "clock jump: 1", "worst error: 4"} <= set(curve_titles(page))
     assert "20 samples are missing" in Page(page).text
     many = [Event("stop", seen.start_ns + k * 10**8, seen.start_ns + k * 10**8, f"stop {k}") for k in range(90)]
-    with drawing_only(report_events.lanes):
+    with drawing_only(report_errors.event_lanes):
         said = Page(report.page([replace(seen, events=(*seen.events, *many))])).text
     listed = len(re.findall(r"\bstop \d+\b", said))
     assert 0 < listed < 90
@@ -188,7 +188,7 @@ def test_signals_are_the_samples_of_both_runs_on_one_scale(seen: RunData, which:
     t = seen.elapsed_s(seen.traces[0].run.imu.t_ns)
     for axis, suffix in enumerate(("", ", y", ", z")):
         values = [(one.name, (one.run.imu.gyro, one.run.imu.accel)[which][:, axis]) for one in seen.traces]
-        same_scale([(drawn[f"{name}{suffix}"], *drawing.extremes(t, y)) for name, y in values])
+        same_scale([(drawn[f"{name}{suffix}"], *drawing.decimate_extremes(t, y)) for name, y in values])
 
 
 def same_scale(lines: list[tuple[np.ndarray, np.ndarray, np.ndarray]]) -> None:
@@ -204,10 +204,10 @@ def same_scale(lines: list[tuple[np.ndarray, np.ndarray, np.ndarray]]) -> None:
 def test_biases_are_what_was_taken_off_with_the_truth_on_the_same_scale(seen: RunData) -> None:
     drawn = curves(panel(seen, report_signals.biases))
     true = seen.true_bias["gyro"]
-    lines = [(drawn["true, z"], *drawing.extremes(seen.elapsed_s(true.t_ns), true.values[:, 2]))]
+    lines = [(drawn["true, z"], *drawing.decimate_extremes(seen.elapsed_s(true.t_ns), true.values[:, 2]))]
     for trace in seen.models():
         t = seen.elapsed_s(trace.run.imu.t_ns)
-        lines.append((drawn[f"{trace.name}, z"], *drawing.extremes(t, trace.run.gyro_bias[:, 2])))
+        lines.append((drawn[f"{trace.name}, z"], *drawing.decimate_extremes(t, trace.run.gyro_bias[:, 2])))
     same_scale(lines)
 
 
@@ -216,13 +216,13 @@ def test_errors_are_on_one_scale_and_logarithmic_where_they_are_far_apart(seen: 
     assert raw.errors is not None
     assert half.errors is not None
     near = replace(seen, traces=(raw, half))
-    drawn = curves(panel(near, report_errors.errors))
+    drawn = curves(panel(near, report_errors.error_curves))
     t = seen.elapsed_s(raw.errors.t_ns)
-    same_scale([(drawn[one.name], *drawing.extremes(t, of(one).orientation_total_deg)) for one in near.traces])
+    same_scale([(drawn[one.name], *drawing.decimate_extremes(t, of(one).orientation_total_deg)) for one in near.traces])
     tiny = replace(half, errors=scaled(half.errors, 1e-4))
-    drawn = curves(panel(replace(seen, traces=(raw, tiny)), report_errors.errors))
+    drawn = curves(panel(replace(seen, traces=(raw, tiny)), report_errors.error_curves))
     heights = drawn["raw"][200:, 1] - drawn["half"][200:, 1]  # upwards, numbers get smaller
-    ratio = drawing.extremes(t, of(raw).orientation_total_deg / of(tiny).orientation_total_deg)
+    ratio = drawing.decimate_extremes(t, of(raw).orientation_total_deg / of(tiny).orientation_total_deg)
     assert heights.max() < 0.0
     assert np.log10(ratio[1][1:]).min() > 3.0
 
@@ -257,10 +257,10 @@ def test_the_path_is_coloured_by_its_error_and_the_largest_keeps_its_colour(seen
     error = np.zeros_like(of(whole).position_m)
     error[1234, 0] = 7.0  # one sample of four thousand
     peaked = replace(whole, errors=replace(of(whole), position_m=error))
-    drawn = curves(panel(replace(seen, traces=(peaked,)), report_paths.heat))
+    drawn = curves(panel(replace(seen, traces=(peaked,)), report_paths.error_map))
     assert set(drawn) == {f"{low} to {low + 1} m" for low in (0, 6)} | {f"{k} to {k + 1} m" for k in range(1, 6)} - empty(drawn)
     assert len(drawn["6 to 7 m"]) >= 2
-    assert report_paths.heat(replace(seen, truth=None)) is None
+    assert report_paths.error_map(replace(seen, truth=None)) is None
 
 
 def empty(drawn: dict[str, np.ndarray]) -> set[str]:
@@ -274,17 +274,17 @@ def test_a_long_log_shows_the_largest_drift_of_each_stretch(seen: RunData) -> No
     level = np.repeat(np.arange(rows // stretch, dtype=float), stretch)
     drift = Drift(10.0, seen.start_ns + np.arange(rows) * 10**8, since, level + since / 20.0, since, level)
     data = replace(seen, end_ns=int(drift.t_ns[-1]), traces=(replace(seen.traces[0], drift=drift),))
-    picture = report_errors.drift(data)
+    picture = report_errors.drift_curves(data)
     assert picture is not None
     assert "Drawn is the largest" in picture.caption
-    points = curves(panel(data, report_errors.drift))["raw"]
+    points = curves(panel(data, report_errors.drift_curves))["raw"]
     assert len(points) == rows // stretch
     steps = np.diff(points[:, 1])  # every stretch is as much above the one before
     np.testing.assert_allclose(steps, steps.mean(), atol=PIXEL)
 
 
 def test_the_seconds_of_the_largest_error_are_shown_whole(seen: RunData) -> None:
-    found = report_wording.worst(seen.traces[2], seen)
+    found = report_wording.worst_orientation_error(seen.traces[2], seen)
     assert found is not None
     points = curves(panel(seen, report_signals.zoom))["raw"]
     assert len(points) == pytest.approx(report_signals.ZOOM_S * 200.0, abs=3)
@@ -293,7 +293,7 @@ def test_the_seconds_of_the_largest_error_are_shown_whole(seen: RunData) -> None
 @given(st.floats(0.1, 10.0), st.integers(50, 2000))
 def test_averaging_a_spectrum_keeps_a_level_and_its_order(level: float, count: int) -> None:
     frequency = np.arange(1.0, count + 1.0)
-    at, power = drawing.averaged(frequency, np.full((count, 3), level), 1.0)
+    at, power = drawing.average_log_bins(frequency, np.full((count, 3), level), 1.0)
     np.testing.assert_allclose(power, level, rtol=1e-12)
     assert (np.diff(at) > 0.0).all()
     assert at[0] == 1.0
@@ -322,7 +322,7 @@ def test_a_bare_log_has_no_empty_section(flown: Recording) -> None:
     content = report.page([replace(data, events=(), traces=(replace(trace, spectra={}),))])
     assert titles(content) == ["Paths", "Signals", "Allan deviation at rest", "Provenance"]
     moving = flown.imu.between(int(flown.imu.t_ns[1000]), int(flown.imu.t_ns[-1]))
-    assert report_signals.at_rest(build(replace(flown, imu=moving), [Run.raw(moving)])) is None
+    assert report_signals.allan_deviation(build(replace(flown, imu=moving), [Run.raw(moving)])) is None
 
 
 def test_truth_without_a_model_is_scored_alone(seen: RunData) -> None:
@@ -335,7 +335,7 @@ def test_truth_without_a_model_is_scored_alone(seen: RunData) -> None:
 
 def test_without_allantools_the_page_says_what_is_left_out(seen: RunData, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(report_signals, "find_spec", lambda name: None)
-    with drawing_only(report_signals.at_rest):
+    with drawing_only(report_signals.allan_deviation):
         content = report.page([replace(seen, traces=seen.traces[:1])])
     assert "Allan deviation at rest" not in titles(content)
     assert "Allan deviations are left out: allantools is not installed" in Page(content).text
@@ -364,7 +364,7 @@ def test_names_from_anywhere_are_words_and_nothing_else(seen: RunData) -> None:
         events=(Event("gap", seen.start_ns, seen.end_ns, HOSTILE),),
         traces=(seen.traces[0], replace(seen.traces[2], run=replace(seen.traces[2].run, name=HOSTILE))),
     )
-    with drawing_only(report_paths.paths, report_signals.biases, report_events.lanes):
+    with drawing_only(report_paths.paths, report_signals.biases, report_errors.event_lanes):
         content = report.page([hostile, replace(hostile, name="_")])
     parsed = Page(content)
     assert not parsed.tags & {"img", "script"}
@@ -422,14 +422,14 @@ def test_an_hour_stays_small() -> None:
 
 def test_a_page_is_written_whole_and_an_existing_file_is_kept(seen: RunData, tmp_path: Path) -> None:
     target = tmp_path / "report.html"
-    report.refuse(target)
+    report.check_target(target)
     assert list(tmp_path.iterdir()) == []
     with drawing_only(report_paths.paths):
         page = report.page([seen])
         report.write_page([seen], target)
     assert target.read_text(encoding="utf-8") == page
-    assert is_ours(target)
-    for refused in (lambda: report.write_page([seen], target), lambda: report.refuse(target)):
+    assert is_imutool_page(target)
+    for refused in (lambda: report.write_page([seen], target), lambda: report.check_target(target)):
         with pytest.raises(ConfigError, match="exists"):
             refused()
     assert target.read_text(encoding="utf-8") == page
@@ -486,7 +486,7 @@ def test_a_missing_matplotlib_says_how_to_get_it(seen: RunData, tmp_path: Path, 
     for make in (
         lambda: report.write_page([seen], tmp_path / "a.html"),
         lambda: report.write_pngs(seen, tmp_path),
-        lambda: report.refuse(tmp_path / "a.html"),
+        lambda: report.check_target(tmp_path / "a.html"),
     ):
         with pytest.raises(ConfigError, match=r"pip install 'imutool\[report\]'"):
             make()

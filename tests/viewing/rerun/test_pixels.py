@@ -9,9 +9,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-from support import drawn_curves, image_difference, viewers
+from support import drawn_curves, image_difference, saved_rrd, viewers
 
-from imutool.viewing.model.run_data import RunData, build
+from imutool.viewing.model.run_data import RunData
+from imutool.viewing.model.runs import build
 from imutool.viewing.rerun import layout, scene
 
 HERE = Path(__file__).parent
@@ -47,7 +48,7 @@ CASES = {one_model: EVERYTHING, nothing_known: EVERYTHING, two_models: 2, two_lo
 
 def curves_of(case: Callable[[], list[RunData]], folder: Path) -> list[Any]:
     """Every curve that is logged."""
-    path = drawn_curves.RRD.written(case(), folder / "logged.rrd")
+    path = saved_rrd.written(case(), folder / "logged.rrd")
     found: list[Any] = drawn_curves.curves(path)
     return found
 
@@ -61,7 +62,7 @@ def drawn(case: Callable[[], list[RunData]], tabs: int | None) -> tuple[list[Any
         return drawn_curves.pictures(running, blueprint, lambda to: scene.log(logs, to), logs[0].duration_s, tabs)
 
     seen = viewers.seen(look, WINDOW if tabs is EVERYTHING else WIDE)
-    return [view for view in drawn_curves.RRD.views(blueprint) if view.id in seen], seen
+    return [view for view in saved_rrd.views(blueprint) if view.id in seen], seen
 
 
 @pytest.mark.parametrize("case", CASES, ids=lambda case: case.__name__)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from imutool.recording import Imu
-from imutool.viewing.model.spectra import FEWEST, spectra
+from imutool.viewing.model.run_data import MIN_SAMPLES, spectra
 
 RATE_HZ, COUNT = 200.0, 40_000
 SCATTER = 0.1  # of a mean over 800 frequencies of 49 half-overlapping windows: a hundredth, with margin
@@ -41,5 +41,5 @@ def test_a_vibration_is_found_on_its_axis_with_its_power_and_a_constant_nowhere(
 
 
 def test_a_log_too_short_has_no_spectrum() -> None:
-    assert not spectra(sampled(np.zeros((FEWEST - 1, 3))))
-    assert set(spectra(sampled(np.zeros((FEWEST, 3))))) == {"gyro", "accel"}
+    assert not spectra(sampled(np.zeros((MIN_SAMPLES - 1, 3))))
+    assert set(spectra(sampled(np.zeros((MIN_SAMPLES, 3))))) == {"gyro", "accel"}

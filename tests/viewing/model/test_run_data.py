@@ -13,9 +13,10 @@ from imutool.inertial import metrics
 from imutool.inertial.strapdown import Start, dead_reckon
 from imutool.recording import Imu, Poses, Recording, seconds
 from imutool.sensor.flight import ACCEL, GYRO, flight
-from imutool.viewing.model import run_data
+from imutool.viewing.model import runs as runs_module
 from imutool.viewing.model.events import Event
-from imutool.viewing.model.run_data import RAW, Run, RunData, build, level_start, stretches
+from imutool.viewing.model.run_data import RAW, Run, RunData, level_start, split_at_gaps
+from imutool.viewing.model.runs import build
 from imutool.viewing.model.trajectory_error import Alignment, errors
 
 ROUNDING = 1e-9  # degrees and metres: some thousand float64 operations on numbers of size one
@@ -86,7 +87,7 @@ def test_a_gap_in_the_truth_is_a_hole_in_the_errors_and_in_the_true_path(recordi
     assert hole[(t > 4.01) & (t < 4.99)].all()
     assert not hole[(t < 3.99) | (t > 5.01)].any()
     assert data.truth is not None
-    pieces = stretches(data.truth)
+    pieces = split_at_gaps(data.truth)
     assert len(pieces) == 2
     assert sum(map(len, pieces)) == len(data.truth)
     assert int(pieces[1].t_ns[0] - pieces[0].t_ns[-1]) > 900_000_000
@@ -194,9 +195,9 @@ def test_runs_of_other_stamps_are_each_scored_on_their_own(recording: Recording,
 def test_a_log_too_long_to_be_drawn_whole_says_so(
     recording: Recording, runs: list[Run], data: RunData, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    assert not any("are drawn" in note for note in data.notes)
-    monkeypatch.setattr(run_data, "MOST", 1000)
-    assert any("at most 1000 are drawn" in note for note in build(recording, runs).notes)
+    assert not any("at most" in note for note in data.notes)
+    monkeypatch.setattr(runs_module, "MAX_CURVE_ROWS", 1000)
+    assert any("at most 1000 rows" in note for note in build(recording, runs).notes)
 
 
 def test_the_table_has_a_row_per_figure_and_a_column_per_run(data: RunData) -> None:
@@ -216,7 +217,7 @@ def test_raw_subtracts_nothing(data: RunData) -> None:
 
 @pytest.mark.parametrize("names", [[], ["raw", "raw"], ["raw", "truth"]])
 def test_runs_need_names_of_their_own(recording: Recording, runs: list[Run], names: list[str]) -> None:
-    with pytest.raises(ConfigError, match="runs are called"):
+    with pytest.raises(ConfigError, match="runs have the names"):
         build(recording, [replace(runs[0], name=name) for name in names])
 
 

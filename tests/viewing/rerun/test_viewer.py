@@ -18,7 +18,7 @@ from rerun.chunk import RrdReader
 
 from imutool.errors import ConfigError
 from imutool.viewing.model.run_data import RunData
-from imutool.viewing.rerun import connect, files, viewer
+from imutool.viewing.rerun import connect, scene, viewer
 
 NO_WAIT_S = 2.0
 SETTLED_S = 0.5
@@ -67,7 +67,7 @@ def refused(logs: list[RunData]) -> float:
 def test_without_a_display_it_saves_at_once_and_says_how_to_open(data: RunData, here: Path, no_display: None) -> None:
     said = viewer.show([data]).said
     assert said == (
-        "There is no display here. Saved flight_3.rrd. Open with: rerun flight_3.rrd, or look in a browser: imutool view --web"
+        "There is no display here. Saved flight_3.rrd. Open with: rerun flight_3.rrd, or use a browser: imutool view --web"
     )
     assert entities(here / "flight_3.rrd") >= {"/world/raw/path"}
 
@@ -103,7 +103,7 @@ def test_the_real_viewer_that_finds_no_window_is_noticed_though_it_listened(
 
 
 def test_no_wait_for_what_dies_is_longer_than_two_seconds() -> None:
-    assert viewer.SETTLES_S < NO_WAIT_S
+    assert viewer.DIES_WITHIN_S < NO_WAIT_S
 
 
 @pytest.fixture
@@ -140,7 +140,7 @@ def test_an_opened_viewer_receives_everything_with_the_layout(
     shown = viewer.show([data])
     assert (shown.how, shown.said) == ("viewer", "The viewer is open.")
     received = stand_in()
-    files.save([data], tmp_path / "saved.rrd")
+    scene.save([data], tmp_path / "saved.rrd")
     assert entities(received) == entities(tmp_path / "saved.rrd")
     assert len(RrdReader(received).blueprints()) == 1
 
@@ -156,7 +156,7 @@ def test_a_viewer_listens_on_this_machine_only(stand_in: Callable[[], Path]) -> 
 
 def test_several_logs_are_one_file(data: RunData, tmp_path: Path) -> None:
     other = replace(data, name="other log")
-    shown = files.save([data, other], tmp_path)
+    shown = scene.save([data, other], tmp_path)
     assert shown.place == str(tmp_path / "flight_3_and_1_more.rrd")
     found = entities(Path(shown.place))
     assert found >= {"/run/flight_3/imu/gyro/raw", r"/run/other\ log/imu/gyro/raw"}
@@ -166,9 +166,9 @@ def test_an_existing_file_is_kept_unless_told_otherwise(data: RunData, tmp_path:
     target = tmp_path / "a.rrd"
     target.write_bytes(b"mine")
     with pytest.raises(ConfigError, match="exists"):
-        files.save([data], target)
+        scene.save([data], target)
     assert target.read_bytes() == b"mine"
-    files.save([data], target, overwrite=True)
+    scene.save([data], target, overwrite=True)
     assert [p.name for p in tmp_path.iterdir()] == ["a.rrd"]
     assert entities(target)
 
@@ -185,7 +185,7 @@ def test_a_failure_on_the_way_leaves_the_old_file_and_no_other(
 
     monkeypatch.setattr(os, "fsync", fail)
     with pytest.raises((KeyboardInterrupt, ConfigError)):
-        files.save([data], target, overwrite=True)
+        scene.save([data], target, overwrite=True)
     assert target.read_bytes() == b"mine"
     assert [p.name for p in tmp_path.iterdir()] == ["a.rrd"]
 
@@ -197,7 +197,7 @@ def test_a_name_that_leads_elsewhere_stays_here(data: RunData, here: Path, no_di
 
 
 def test_reruns_own_verifier_accepts_the_file(data: RunData, tmp_path: Path) -> None:
-    saved = files.save([data], tmp_path / "a.rrd").place
+    saved = scene.save([data], tmp_path / "a.rrd").place
     run = subprocess.run([str(viewer.binary()), "rrd", "verify", saved], capture_output=True, text=True, check=False)
     assert run.returncode == 0, run.stderr
 
