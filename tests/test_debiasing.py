@@ -20,11 +20,12 @@ from rosbags.highlevel import AnyReader
 from imutool.bias import linear, neural_ode, static
 from imutool.bias.io import load, save
 from imutool.bias.model import BiasModel, Segment
+from imutool.bias_start.correction import OnlineDebiaser, apply
 from imutool.bias_start.initial_bias import InitialBias, at_rest, auto, following, from_truth, given, prior, smooth
 from imutool.bias_start.model_choice import estimate_at_rest
 from imutool.cli.debias import assigned
 from imutool.conversion import convert
-from imutool.debiasing import OnlineDebiaser, apply, debias
+from imutool.debiasing import debias
 from imutool.errors import ConfigError, LogError, ModelError
 from imutool.mcap_io.codec import schemas
 from imutool.mcap_io.codec.decode import decode_imu, decode_scalars

@@ -10,6 +10,7 @@ import bz2
 import re
 import struct
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from enum import IntEnum
 from typing import NamedTuple
 
@@ -81,6 +82,36 @@ class Connection(NamedTuple):
     topic: str
     kind: str
     record: bytes
+
+
+@dataclass(frozen=True)
+class Loss:
+    """A stretch of the bag that could not be read, why, and how many messages its index says it held."""
+
+    offset: int
+    length: int
+    reason: str
+    messages: int | None = None
+
+
+class Message(NamedTuple):
+    """Where one message lies in the bytes of its chunk."""
+
+    connection: int
+    time_ns: int
+    at: int
+    data_at: int
+    end: int
+
+
+class Chunk(NamedTuple):
+    """One chunk's bytes, unpacked, and its messages; `whole` when nothing in it was lost."""
+
+    offset: int
+    length: int
+    data: bytes
+    messages: list[Message]
+    whole: bool
 
 
 def fields(data: bytes, at: int, end: int) -> dict[bytes, bytes] | None:

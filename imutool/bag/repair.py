@@ -9,8 +9,8 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 from imutool.bag import records
-from imutool.bag.records import FIRST_RECORD, MAGIC, U32, Op
-from imutool.bag.scan import Bag, Chunk, Loss
+from imutool.bag.records import FIRST_RECORD, MAGIC, U32, Chunk, Loss, Op
+from imutool.bag.scan import Bag
 from imutool.errors import ConfigError, LogError
 from imutool.location import Location, same_location
 from imutool.mcap_io.storage.source import Source

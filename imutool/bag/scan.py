@@ -8,11 +8,9 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator
-from dataclasses import dataclass
-from typing import NamedTuple
 
 from imutool.bag import records
-from imutool.bag.records import HEAD_LIMIT, MAGIC, Connection, Head, Op
+from imutool.bag.records import HEAD_LIMIT, MAGIC, Chunk, Connection, Head, Loss, Message, Op
 from imutool.errors import LogError
 from imutool.location import Location
 from imutool.mcap_io.storage.source import Source
@@ -21,36 +19,6 @@ SCAN_BYTES = 4096, 1 << 20  # looked through at once, first and at most: what is
 HEAD_BYTES = 256  # of a record, read at first; most heads are shorter
 MOST_LOSSES = 10_000  # that are listed one by one
 MOST_REASONS = 5  # for one chunk
-
-
-@dataclass(frozen=True)
-class Loss:
-    """A stretch of the bag that could not be read, why, and how many messages its index says it held."""
-
-    offset: int
-    length: int
-    reason: str
-    messages: int | None = None
-
-
-class Message(NamedTuple):
-    """Where one message lies in the bytes of its chunk."""
-
-    connection: int
-    time_ns: int
-    at: int
-    data_at: int
-    end: int
-
-
-class Chunk(NamedTuple):
-    """One chunk's bytes, unpacked, and its messages; `whole` when nothing in it was lost."""
-
-    offset: int
-    length: int
-    data: bytes
-    messages: list[Message]
-    whole: bool
 
 
 class Bag:

@@ -1,0 +1,84 @@
+"""Correct IMU samples with a bias model: all samples in memory, or one at a time; always the same numbers.
+
+Causal: the bias at a sample comes from that sample and earlier ones, once the initial bias is known.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float64
+
+from imutool.bias.model import BiasModel, OneByOne, Stream, Vector6
+from imutool.bias_start.bias_covariance import BiasCovariance
+from imutool.bias_start.initial_bias import InitialBias, following
+from imutool.recording import Imu, seconds
+
+BLOCK_SAMPLES = 1 << 14  # are corrected at once: a covariance has 288 bytes
+
+
+class DebiasedImu(NamedTuple):
+    """Corrected samples and the subtracted bias: gyro (rad/s), then accel (m/s²)."""
+
+    imu: Imu
+    bias: Float64[np.ndarray, "n 6"]
+
+
+def apply(model: BiasModel, start: InitialBias, imu: Imu) -> DebiasedImu:
+    """A model over samples in memory, from their first on."""
+    bias = start.stream(model)(seconds(imu.t_ns, int(imu.t_ns[0])), imu.gyro, imu.accel)
+    return DebiasedImu(Imu(imu.t_ns, imu.gyro - bias[:, :3], imu.accel - bias[:, 3:]), bias)
+
+
+def apply_with_std(model: BiasModel, start: InitialBias, imu: Imu) -> tuple[DebiasedImu, Float64[np.ndarray, "n 6"]]:
+    """As `apply`, and one standard deviation of the bias at each sample, gyro (rad/s) then accel (m/s²):
+    `imutool.bias_start.bias_covariance`.
+
+    In blocks, as a log is debiased: a covariance is 288 bytes.
+    """
+    stream = start.stream(model)
+    certainty = BiasCovariance(model, start, stream)
+    t_s = seconds(imu.t_ns, int(imu.t_ns[0]))
+    bias, std = np.empty((len(imu), 6)), np.empty((len(imu), 6))
+    for first in range(0, len(imu), BLOCK_SAMPLES):
+        rows = slice(first, first + BLOCK_SAMPLES)
+        bias[rows] = stream(t_s[rows], imu.gyro[rows], imu.accel[rows])
+        covariance = certainty(t_s[rows], imu.gyro[rows], imu.accel[rows])
+        std[rows] = np.sqrt(covariance.diagonal(axis1=1, axis2=2))
+    return DebiasedImu(Imu(imu.t_ns, imu.gyro - bias[:, :3], imu.accel - bias[:, 3:]), bias), std
+
+
+class OnlineDebiaser:
+    """One sample in, one corrected sample out: for a live node.
+
+    The start is a rest bias from `imutool.bias_start.initial_bias`, for instance `at_rest` over the first seconds, or
+    `prior`. Without one, it
+    begins at the prior and is followed by what the samples show, as by `--init auto`.
+    """
+
+    def __init__(self, model: BiasModel, start: InitialBias | None = None) -> None:
+        stream = (start or following(model)).stream(model)
+        self._one, self._start_ns = stream.one if isinstance(stream, OneByOne) else _by_blocks(stream), -1
+
+    def __call__(
+        self, stamp_ns: int, gyro: Float64[np.ndarray, "3"], accel: Float64[np.ndarray, "3"]
+    ) -> tuple[Float64[np.ndarray, "3"], Float64[np.ndarray, "3"], Float64[np.ndarray, "6"]]:
+        """Corrected angular rate (rad/s) and specific force (m/s²), and the bias that was subtracted."""
+        if self._start_ns < 0:
+            self._start_ns = stamp_ns
+        u = np.concatenate((gyro, accel))
+        bias = self._one((stamp_ns - self._start_ns) * 1e-9, u)
+        clean = u - bias
+        return clean[:3], clean[3:], bias
+
+
+def _by_blocks(stream: Stream) -> Callable[[float, Vector6], Vector6]:
+    """One sample as a block of one, for a stream that knows no shorter way."""
+
+    def one(t_s: float, u: Vector6) -> Vector6:
+        bias: Vector6 = stream(np.array([t_s]), u[None, :3], u[None, 3:])[0]
+        return bias
+
+    return one
