@@ -1,4 +1,4 @@
-"""A model at work: over a whole log, over a recording in memory, or one sample at a time; always the same numbers.
+"""Debias a log: copy it and add debiased samples, biases and their covariance.
 
 Causal throughout, unless `smooth` is asked for: the bias at a sample comes from that sample and earlier ones, once the start
 is known (`imutool.bias_start.initial_bias`). Smoothing reads the log twice; of the first pass it keeps thirteen numbers for
@@ -46,7 +46,7 @@ CLEAN_RECORD = "imutool_clean"
 
 @dataclass(frozen=True)
 class DebiasReport:
-    """What was done to a log, one entry per IMU topic."""
+    """Models, initial biases, copy and losses of a debiased log, per IMU topic."""
 
     models: Mapping[str, str]
     starts: Mapping[str, InitialBias]
@@ -146,17 +146,16 @@ def debias(
     progress: Callable[[int, int], None] | None = None,
     watch: BlockCallback | None = None,
 ) -> DebiasReport:
-    """Writes `target`: all of `source` unchanged, and beside each IMU its debiased samples and the bias taken off.
+    """Writes `target`: all of `source`, and for each IMU its debiased samples and the bias.
 
     One model serves every IMU, or each has its own by topic, "" being that of all others. An IMU without one gets the
     one the log's metadata names, else the one that ships for its sensor, else the mean over time at rest. The IMUs are
     those in `imus`, else those with a model of their own, else the log's only one.
-    With `smooth` the start bias at every time comes from the whole log, also from what follows.
-    Without a target the log itself is replaced (`mcap_io.rewrite`, which also says what `check` checks).
-    Of a damaged log, what is sound goes through a repaired copy beside the target (`mcap_io.salvage`), and `losses` says
-    what is missing; it is not replaced. With `clean` a first pass says what is to be left out or converted
-    (`imutool.cleaning`), and the record `imutool_clean` what it found.
-    `watch` is told every batch of samples as it is debiased, those of a damaged log again when its repaired copy is.
+    With `smooth` the initial bias at every time comes from the whole log, also from later samples.
+    Without a target the log itself is replaced; `check` is that of `mcap_io.rewrite`. The intact part of a damaged log is
+    debiased from a repaired copy beside the target (`mcap_io.repair`), and `losses` lists the rest; it is not replaced. With
+    `clean` a first pass finds samples to leave out or convert (`imutool.cleaning`); the record `imutool_clean` lists them.
+    `watch` is called with every batch of debiased samples, those of a damaged log again when its repaired copy is debiased.
 
     Raises:
         ConfigError: source or target cannot be opened, `init` makes no sense, `smooth` is asked for with another `init`,
@@ -243,12 +242,12 @@ def _debias(
 
 
 def _record_name(name: str, topic: str, records: Mapping[str, object]) -> str:
-    """The name of a metadata record: with its topic where there are several."""
+    """The name of a metadata record: with its topic where there are several IMUs."""
     return f"{name}{topic}" if len(records) > 1 else name
 
 
 def _model_of_log(about: Mapping[str, str]) -> str | Path | None:
-    """The model that a log's metadata name, which must be one that ships: a log may come from anybody."""
+    """The shipped model that a log's metadata name: a log may come from anybody."""
     return shipped(about["model"]) if about.get("model") else shipped_for(about.get("sensor"), about.get("dataset"))
 
 

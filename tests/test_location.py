@@ -97,10 +97,19 @@ def flight(logs: Path) -> bytes:
 
 
 def test_debias_from_store_to_store_is_byte_for_byte_the_local_result(
-    store: Any, logs: Path, tmp_path: Path, flight: bytes
+    store: Any, logs: Path, tmp_path: Path, flight: bytes, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     url, model = store.put("in/flight_1.mcap", flight), logs / "linear.safetensors"
+    opened: list[str] = []
+    original = Source.__init__
+
+    def open_source(source: Source, path: Any, *words: Any) -> None:
+        opened.append(str(path))
+        original(source, path, *words)
+
+    monkeypatch.setattr(Source, "__init__", open_source)
     debias(to_location(url), to_location("s3://fleet/out/log.mcap"), model=model)
+    assert opened.count(url) == 2  # once to read, once more for its checksum
     debias(logs / "flight_1.mcap", tmp_path / "log.mcap", model=model)
     assert store.get("out/log.mcap") == (tmp_path / "log.mcap").read_bytes()
     assert store.keys() == ["in/flight_1.mcap", "out/log.mcap"]

@@ -1,4 +1,4 @@
-"""A bag written anew from what can be read of another: its chunks as they are, with the index that the format asks for."""
+"""Repair a ROS 1 bag: copy its intact chunks and rebuild its index."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ class BagReport:
         return self.lost == 0
 
     def plain(self) -> dict[str, Any]:
-        """What was lost, as `recovery.losses.Losses.plain`; the format has no CRCs, so nothing is proven."""
+        """Losses as JSON values, as of `recovery.losses.Losses.plain`."""
         known = [loss.messages for loss in self.losses if loss.messages is not None]
         return {
             "whole": self.whole and self.was_indexed,
@@ -84,7 +84,7 @@ def is_bag(where: Location) -> bool:
 
 
 def repair_bag(source: Location, target: Location, *, overwrite: bool = False, progress: Progress | None = None) -> BagReport:
-    """Writes `target`: every message of `source` that can be read, byte for byte, with its index.
+    """Writes every readable message of `source` to `target`, byte for byte, with an index.
 
     A chunk of which nothing is lost keeps its bytes; any other is written unpacked with the messages found in it. The result
     is read back and compared before it takes its place. The format has no checks of its own: a flipped byte in the payload of

@@ -1,4 +1,4 @@
-"""A bag followed from its first byte to its last, chunk by chunk, whatever its index says or whether it has one.
+"""Scan a ROS 1 bag from its first byte to its last, chunk by chunk, without its index.
 
 Where the framing is broken, the walk goes on at the next chunk, and inside an unpacked chunk at the next message. A message
 counts as found when what follows it is a record, or the end of its chunk.
@@ -22,7 +22,7 @@ MOST_REASONS = 5  # for one chunk
 
 
 class Bag:
-    """A bag open for reading. With `salvage` what cannot be read is noted in `losses`; without, it is refused.
+    """A bag open for reading; with `salvage` damage goes to `losses`, else it is an error.
 
     Memory is bounded by the largest chunk.
 
@@ -67,7 +67,7 @@ class Bag:
         return found if found is not None and found.op == Op.BAG and found.end <= size else None
 
     def _index(self, header: Head | None) -> bool:
-        """Whether the bag has its index; its connections are then known from the start, also of chunks that are lost."""
+        """Whether the bag has its index; its connections are then known from the start."""
         if header is None or not (position := header.number(b"index_pos")):
             return False
         for _ in range(header.number(b"conn_count")):
@@ -170,7 +170,7 @@ class Bag:
             self.lose(found.at, found.end - found.at, error.what)
 
     def _next_chunk(self, start: int) -> int:
-        """Where the next chunk or another bag begins at or behind a byte; the end of the file if none does."""
+        """Offset of the next chunk or bag at or behind a byte, or the end of the file."""
         size, (scan, most) = self.source.size, SCAN_BYTES
         while start < size:
             raw = self.source.at(start, min(scan + HEAD_BYTES, size - start))
@@ -182,18 +182,18 @@ class Bag:
         return size
 
     def _end(self, found: Head) -> int:
-        """Where a chunk ends: where it says, if a record follows there; else where the next one begins."""
+        """End of a chunk: where it says, if a record follows there; else the next chunk's start."""
         return found.end if self._lands(found.end) else self._next_chunk(found.data_at)
 
     def _lands(self, end: int) -> bool:
-        """Whether a record may end there: another begins, or nothing is left that could be one, or another bag."""
+        """Whether a record may end there: a record, another bag or the end of the file follows."""
         left = self.source.size - end
         if 0 <= left < 8 or (left > 0 and self._head(end) is not None):
             return True
         return left >= len(MAGIC) and self.source.at(end, len(MAGIC)) == MAGIC
 
     def _chunk(self, found: Head, end: int) -> Chunk:
-        """What can be read of a chunk; all that is wrong with it is one loss."""
+        """The readable part of a chunk; all its damage is one loss."""
         compression = found.fields[b"compression"].decode("ascii", "replace")
         wrong = end != found.end
         reasons = ["the chunk does not end where it says"] if wrong else []
@@ -222,7 +222,7 @@ class Bag:
         return records.unpack(compression, self.source.at(found.data_at, packed), found.number(b"size"), cut=cut)
 
     def _told(self, position: int) -> int | None:
-        """How many messages the index records behind a chunk say it has; None where there are none."""
+        """Messages that the index records behind a chunk count, or None without any."""
         total: int | None = None
         while (found := self._head(position)) is not None and found.op == Op.INDEX:
             if found.size != 12 * found.number(b"count"):
@@ -244,7 +244,7 @@ class _Inside:
             self.reasons.append(reason)
 
     def messages(self) -> list[Message]:
-        """Those of known connections, each followed by a record or the end."""
+        """Messages of known connections, each followed by a record or the end."""
         found: list[Message] = []
         unknown: Counter[int] = Counter()
         position, end, bag = 0, len(self.data), self.bag
@@ -272,7 +272,7 @@ class _Inside:
         return found
 
     def _cut(self, position: int) -> bool:
-        """Whether the chunk was cut off inside the head that begins there, so that the record ahead of it can be trusted."""
+        """Whether the chunk was cut off inside the head at `position`."""
         left = len(self.data) - position
         return self.loose and 0 < left < HEAD_BYTES and records.next_head(self.data, Op.MESSAGE, position) is None
 

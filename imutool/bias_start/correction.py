@@ -1,4 +1,4 @@
-"""Correct IMU samples with a bias model: all samples in memory, or one at a time; always the same numbers.
+"""Correct IMU samples with a bias model: all in memory, or one at a time.
 
 Causal: the bias at a sample comes from that sample and earlier ones, once the initial bias is known.
 """
@@ -27,16 +27,15 @@ class DebiasedImu(NamedTuple):
 
 
 def apply(model: BiasModel, start: InitialBias, imu: Imu) -> DebiasedImu:
-    """A model over samples in memory, from their first on."""
+    """Corrected samples of a model, from their first on."""
     bias = start.stream(model)(seconds(imu.t_ns, int(imu.t_ns[0])), imu.gyro, imu.accel)
     return DebiasedImu(Imu(imu.t_ns, imu.gyro - bias[:, :3], imu.accel - bias[:, 3:]), bias)
 
 
 def apply_with_std(model: BiasModel, start: InitialBias, imu: Imu) -> tuple[DebiasedImu, Float64[np.ndarray, "n 6"]]:
-    """As `apply`, and one standard deviation of the bias at each sample, gyro (rad/s) then accel (m/s²):
-    `imutool.bias_start.bias_covariance`.
+    """Corrected samples as `apply`, and one standard deviation of the bias at each sample.
 
-    In blocks, as a log is debiased: a covariance is 288 bytes.
+    Gyro (rad/s), then accel (m/s²); see `imutool.bias_start.bias_covariance`. Computed in blocks, as a log is debiased.
     """
     stream = start.stream(model)
     certainty = BiasCovariance(model, start, stream)
@@ -51,7 +50,7 @@ def apply_with_std(model: BiasModel, start: InitialBias, imu: Imu) -> tuple[Debi
 
 
 class OnlineDebiaser:
-    """One sample in, one corrected sample out: for a live node.
+    """Corrects one sample at a time, for a live node.
 
     The start is a rest bias from `imutool.bias_start.initial_bias`, for instance `at_rest` over the first seconds, or
     `prior`. Without one, it

@@ -1,4 +1,4 @@
-"""A log as a rosbag2 folder: a copy of it, byte for byte, and the metadata.yaml that rosbag2 asks for."""
+"""Export a log as a rosbag2 folder: a byte-for-byte copy and its metadata.yaml."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def write(log: Path, out: Path, overwrite: bool, tell: Progress) -> ExportReport
 
 
 def _refuse_what_rosbag2_cannot(log: Log) -> None:
-    """The log is copied as it is, so it must be one already.
+    """Refuses a log that rosbag2 cannot read as it is.
 
     Raises:
         LogError: the profile is another, or a topic is not in CDR or has no schema.
@@ -53,7 +53,7 @@ def _refuse_what_rosbag2_cannot(log: Log) -> None:
 
 
 def _copy(log: Path, copy: Path, tell: Progress) -> None:
-    """The log's bytes in a file of its own (no link: what happens to one must not happen to the other), read back and compared.
+    """Copies the log into a file of its own, reads it back and compares.
 
     Raises:
         LogError: the log changed while it was copied.
@@ -81,7 +81,7 @@ def _copy(log: Path, copy: Path, tell: Progress) -> None:
 
 
 def _metadata_yaml(log: Log, name: str) -> str:
-    """What rosbag2 wants to know of the folder; JSON strings are YAML strings."""
+    """The text of metadata.yaml; JSON strings are YAML strings."""
     ends = [(int(t.min()), int(t.max())) for topic in log.topics for t in log.stamps(topic) if len(t)]
     start = min((first for first, _ in ends), default=0)
     duration = max((last for _, last in ends), default=0) - start

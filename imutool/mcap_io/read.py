@@ -1,4 +1,4 @@
-"""Logs read back as recordings; what a topic means is decided here: the IMU, the true poses, the scalar channels."""
+"""Read a log as a recording: its IMU, true poses, scalar channels and images."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ def read_recording(
     Raises:
         LogError: as `read`.
     """
-    imu_topic = _choose_imu(log, imu)
+    imu_topic = log.topic(log.only_imu() if imu is None else imu, (schemas.IMU,)).name
     own, metadata = _own_and_user_metadata(log)
     truths = _choose_truths(log, truth)
     velocities = {t.name: t.metadata[VELOCITY_KEY] for t in log.topics.values() if VELOCITY_KEY in t.metadata}
@@ -94,17 +94,6 @@ def read_recording(
         imu_topic=imu_topic,
         source=own.get("source", ""),
     )
-
-
-def _choose_imu(log: Log, imu: str | None) -> str:
-    if imu is not None:
-        return log.topic(imu, (schemas.IMU,)).name
-    found = log.imu_topics
-    if not found:
-        raise LogError("the log has no IMU topic", where=log.path, expected=f"{schemas.IMU} among {log.listing()}")
-    if len(found) > 1:
-        raise LogError(f"the log has {len(found)} IMU topics: {', '.join(found)}", where=log.path, fix="Choose one with `imu`")
-    return log.topic(found[0], (schemas.IMU,)).name
 
 
 def _choose_truths(log: Log, truth: str | None) -> list[str]:
@@ -173,7 +162,7 @@ class _Gather:
 
     @contextmanager
     def _told(self, topic: str) -> Iterator[None]:
-        """Leaves a topic out that cannot be held, where somebody is to be told of it."""
+        """Leaves out a topic that a recording cannot hold, if the caller wants to know of it."""
         try:
             yield
         except LogError as error:
@@ -254,7 +243,7 @@ class _Gather:
 
 
 def _frames(log: Log, start_ns: int | None, end_ns: int | None) -> dict[str, Frames]:
-    """Image topics, to be opened again when somebody copies them."""
+    """Image topics, opened again when somebody reads them."""
     found = {}
     for topic in log.with_schema((schemas.IMAGE,)):
         if topic.message_encoding in ENCODINGS:
@@ -265,7 +254,7 @@ def _frames(log: Log, start_ns: int | None, end_ns: int | None) -> dict[str, Fra
 
 
 def _format(log: Log, topic: str) -> str:
-    """What the first image says it is."""
+    """Image format, from the first image."""
     for _, rows in log.rows([topic]):
         with log.named(topic):
             return decode_image(rows.payload[0].tobytes(), log.topics[topic].message_encoding)[1]
@@ -281,7 +270,7 @@ def _opener(path: Location, topic: str, start_ns: int | None, end_ns: int | None
 
 
 def _own_and_user_metadata(log: Log) -> tuple[dict[str, str], dict[str, dict[str, str]]]:
-    """What the writer noted about the recording, and the recording's own metadata, which it was laid over.
+    """The writer's notes on the recording, and the recording's own metadata.
 
     The writer's record is the first `imutool` that names what it shadows; later ones tell of what was done to the log.
     """
@@ -299,7 +288,7 @@ def _own_and_user_metadata(log: Log) -> tuple[dict[str, str], dict[str, dict[str
 
 
 def _shadowed(text: str) -> Mapping[str, str] | None:
-    """A recording's own entries under the keys the writer uses; None where it had no record `imutool` at all."""
+    """A recording's own entries under our keys; None where it had no record `imutool`."""
     try:
         value = json.loads(text)
     except ValueError:

@@ -7,10 +7,12 @@ of a definition with the definition). A message has no such lengths: the records
 from __future__ import annotations
 
 import struct
+from collections import Counter
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from jaxtyping import Int64
+from jaxtyping import Int64, UInt64
 from mcap.opcode import Opcode
 from mcap.records import (
     AttachmentIndex,
@@ -31,6 +33,7 @@ from imutool.mcap_io.blocks import Attachment
 from imutool.mcap_io.codec import records
 from imutool.mcap_io.codec.messages import FIXED
 from imutool.mcap_io.codec.records import CHUNK_HEAD, HEAD, MAGIC
+from imutool.mcap_io.recovery.losses import LATEST_NS
 from imutool.mcap_io.storage.source import Source
 
 WINDOW = 1 << 20
@@ -83,6 +86,29 @@ _MIN_LENGTH = np.full(256, 2**63, np.uint64)
 _MIN_LENGTH[[int(o) for o in MIN_LENGTH]] = list(MIN_LENGTH.values())
 _KNOWN = _MIN_LENGTH < 2**63
 _CANDIDATE = np.dtype([("opcode", "u1"), ("length", "<u8")])
+
+
+@dataclass
+class Gap:
+    """A stretch without a valid record."""
+
+    offset: int
+    length: int
+    reason: str
+    counts: Counter[int] = field(default_factory=Counter)  # by the channel ids of its section
+    counted: bool = False  # from message indexes that survived behind it
+    start_ns: int | None = None
+    end_ns: int | None = None
+
+    def count(self, channel: int, entries: UInt64[np.ndarray, "n 2"]) -> None:
+        """Counts the messages of a lost chunk from the entries of a message index behind it."""
+        if not self.counted:
+            self.counts, self.counted = Counter(), True
+        self.counts[channel] += len(entries)
+        if len(entries) and entries[:, 0].max() < LATEST_NS:
+            first, last = int(entries[:, 0].min()), int(entries[:, 0].max())
+            self.start_ns = first if self.start_ns is None else min(first, self.start_ns)
+            self.end_ns = last if self.end_ns is None else max(last, self.end_ns)
 
 
 class RecordFrames:

@@ -8,12 +8,9 @@ from __future__ import annotations
 
 import struct
 from bisect import bisect_right
-from collections import Counter
 from collections.abc import Mapping
-from dataclasses import dataclass, field
 
 import numpy as np
-from jaxtyping import UInt64
 from mcap.opcode import Opcode
 from mcap.records import ChunkIndex, Footer, Header
 
@@ -24,37 +21,16 @@ from imutool.mcap_io.codec.records import FOOTER_SIZE, HEAD, MAGIC, crc32
 from imutool.mcap_io.index import MAX_SUMMARY
 from imutool.mcap_io.recovery.definitions import DEFINITIONS, Sections
 from imutool.mcap_io.recovery.losses import LATEST_NS, Losses, reason
-from imutool.mcap_io.recovery.resync import MAX_CANDIDATES, PRIVATE, SUMMARY, RecordFrames
+from imutool.mcap_io.recovery.resync import LOG_START, MAX_CANDIDATES, PRIVATE, SUMMARY, Gap, RecordFrames
 from imutool.mcap_io.storage.source import Source
 
 MAX_ITEMS = 5_000_000  # a 100 GB log has some 100 000 chunks; a file of nothing but empty ones would fill the memory
 
 
-@dataclass
-class Gap:
-    """A stretch without a valid record."""
-
-    offset: int
-    length: int
-    reason: str
-    counts: Counter[int] = field(default_factory=Counter)  # by the channel ids of its section
-    counted: bool = False  # from message indexes that survived behind it
-    start_ns: int | None = None
-    end_ns: int | None = None
-
-    def count(self, channel: int, entries: UInt64[np.ndarray, "n 2"]) -> None:
-        """Counts the messages of a lost chunk from the entries of a message index behind it."""
-        if not self.counted:
-            self.counts, self.counted = Counter(), True
-        self.counts[channel] += len(entries)
-        if len(entries) and entries[:, 0].max() < LATEST_NS:
-            first, last = int(entries[:, 0].min()), int(entries[:, 0].max())
-            self.start_ns = first if self.start_ns is None else min(first, self.start_ns)
-            self.end_ns = last if self.end_ns is None else max(last, self.end_ns)
-
-
 class Scan:
-    """One pass over the records of a file; `chunks` are the entries of an intact summary, if there is one.
+    """One pass over the records of a file.
+
+    `chunks` are the entries of an intact summary, if there is one.
 
     Raises:
         LogError: more records than any recorder writes.

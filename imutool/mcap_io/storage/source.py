@@ -1,4 +1,4 @@
-"""The bytes of a log, wherever it lies: read only, by offset and length, never a byte fewer than asked for."""
+"""Read the bytes of a log by offset, and its SHA-256; a short read is an error."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ CUT_SHORT = "Save what is there with `imutool repair`, or copy it again from whe
 
 
 class Source:
-    """The bytes of a file or an object in a store that is only ever read, with a refusal in place of a short read."""
+    """Bytes of a file or object, read only; a short read is an error."""
 
     def __init__(self, path: Location, expected: str = "an MCAP log") -> None:
         try:
@@ -55,7 +55,7 @@ def crc_of(source: Source, start: int, end: int, crc: int = 0) -> int:
 
 
 def descriptor(file: object) -> int | None:
-    """The number under which the system knows an open file; none for what only looks like one, as in an object store."""
+    """The system's number of an open file; None in an object store."""
     try:
         return int(file.fileno())  # type: ignore[attr-defined]  # asked for, not demanded
     except (AttributeError, OSError):
@@ -63,7 +63,7 @@ def descriptor(file: object) -> int | None:
 
 
 def sha256(path: Location) -> str:
-    """The SHA-256 of a file, in hex, a block at a time.
+    """SHA-256 of a file, in hex, a block at a time.
 
     Raises:
         ConfigError: the file cannot be read.
@@ -76,7 +76,7 @@ def sha256(path: Location) -> str:
 
 
 class Digest:
-    """The SHA-256 of a file while something else reads it, so that a disk is asked for each block once.
+    """SHA-256 of a file in a thread, while the caller reads it: the disk reads a block once.
 
     A context manager: leaving it ends the thread, whether or not anybody asked for the result.
     """
