@@ -26,7 +26,7 @@ from jaxtyping import Float64
 
 from imutool.errors import DataError
 from imutool.sensor.readings import IdealMotion, SensorSamples, Times
-from imutool.units import AXES, Sensor
+from imutool.units import AXES
 
 Kind = Literal["catalogue", "driven", "unknown"]
 Theta = Float64[np.ndarray, "_"]  # effects that act together have numbers of their own, so this length binds no other
@@ -75,23 +75,25 @@ class Effect:
     needs: channels without which it cannot be thought of, such as "temperature"; a channel whose name contains it serves.
     kind: of the catalogue, driven by the channel `variable`, or unknown: a curve of `variable`, or a term, on one `axis`.
     variant: tells effects of one name apart.
+    jumps: whether what comes out is no smooth function of the parameters, which is an edge between two samples.
     """
 
     name: str
     stage: Stage
-    sensors: tuple[Sensor, ...]
+    sensors: tuple[str, ...]
     equation: str
     parameters: tuple[Parameter, ...]
     seen_if: str
     forward: Callable[[Any, Theta], Any]
     linear: bool = True
-    starts: Callable[[IdealMotion, SensorSamples], Sequence[Theta]] | None = None
+    starts: Callable[[Any, Any], Sequence[Theta]] | None = None
     alternatives: Callable[[SensorSamples], int] | None = None
     needs: tuple[str, ...] = ()
     kind: Kind = "catalogue"
     variable: str = ""
     axis: int | None = None
     variant: str = ""
+    jumps: bool = False
 
     @property
     def key(self) -> str:
@@ -143,7 +145,7 @@ def misfit(felt: IdealMotion, samples: SensorSamples) -> tuple[Float64[np.ndarra
     return samples.gyro - ideal.gyro, samples.accel - ideal.accel
 
 
-CONVERTER_ORDER = {"saturation": 1, "quantization": 2}
+WITHIN_STAGE = {"gain": -2, "dead_band": -1, "saturation": 1, "quantization": 2}
 Acting = Sequence[tuple[Effect, Theta]]
 
 
@@ -151,10 +153,10 @@ Acting = Sequence[tuple[Effect, Theta]]
 class SignalState:
     """How far signals have come: what is felt and when samples are taken of it, or, behind the clock, what is read."""
 
-    felt: IdealMotion
+    felt: Any  # an `IdealMotion`, or any other signal that can be sampled
     taken_s: Times
     stamp_s: Times
-    taken: SensorSamples | None = None
+    taken: Any = None
 
     def through(self, physics: Effect, theta: Theta) -> SignalState:
         """Behind one more effect, whose turn it is."""
@@ -196,4 +198,4 @@ def in_stage_order(acting: Acting) -> list[tuple[Effect, Theta]]:
 
 def stage_order(physics: Effect) -> tuple[int, int, str]:
     """By which it is told when an effect acts."""
-    return physics.stage, CONVERTER_ORDER.get(physics.name, 0), physics.key
+    return physics.stage, WITHIN_STAGE.get(physics.name, 0), physics.key

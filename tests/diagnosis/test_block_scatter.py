@@ -6,8 +6,9 @@ import numpy as np
 from scipy.signal import lfilter
 from support import planted
 
-from imutool.diagnosis.estimation.block_scatter import Scatter, scatter
-from imutool.diagnosis.estimation.gauss_newton import Fit, WhitenedLog, fit
+from imutool.diagnosis.estimation.gauss_newton import Fit, fit
+from imutool.diagnosis.estimation.significance import Scatter, scatter
+from imutool.diagnosis.estimation.whitening import WhitenedLog
 
 FELT = planted.shaken(duration_s=45.0)
 SEEDS = 16

@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 from support import planted
 
-from imutool.diagnosis.estimation.forward_cache import bound, free
-from imutool.diagnosis.estimation.gauss_newton import PATIENCE, PRIOR, Fit, expected, fit
-from imutool.diagnosis.estimation.jacobians import Jacobians
+from imutool.diagnosis.estimation.gauss_newton import PATIENCE, PRIOR, Fit, fit
+from imutool.diagnosis.estimation.jacobians import Jacobians, bound, expected, free
 from imutool.sensor import catalogue
 
 SURE = 4.0  # standard deviations: 1 in 16 000 outside

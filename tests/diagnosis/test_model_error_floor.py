@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from imutool.diagnosis.estimation.model_error_floor import EXACT, FILTERED, FOLLOWING, LEFT_OUT, below_model_error
+from imutool.diagnosis.estimation.observability import EXACT, FILTERED, FOLLOWING, LEFT_OUT, below_model_error
 from imutool.sensor import catalogue
 
 

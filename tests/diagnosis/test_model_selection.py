@@ -11,7 +11,7 @@ from scipy.stats import chi2
 from support import planted
 
 from imutool.diagnosis.estimation import unnamed_effects as unnamed
-from imutool.diagnosis.estimation.alignment import Pair
+from imutool.diagnosis.estimation.aligned_log import Pair
 from imutool.diagnosis.estimation.model_selection import FALSE_DISCOVERY, Selection, select_effects
 from imutool.diagnosis.estimation.significance import log_p_value
 

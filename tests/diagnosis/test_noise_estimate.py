@@ -9,10 +9,9 @@ import pytest
 from scipy.signal import butter, sosfiltfilt
 from support import planted
 
-from imutool.diagnosis.estimation.alignment import Pair
-from imutool.diagnosis.estimation.gauss_newton import WhitenedLog
-from imutool.diagnosis.estimation.known_band import known_band_hz
-from imutool.diagnosis.estimation.noise_estimate import MUCH, noise_std, whitened
+from imutool.diagnosis.estimation.aligned_log import Pair
+from imutool.diagnosis.estimation.noise_estimate import MUCH, known_band_hz, noise_std, whitened
+from imutool.diagnosis.estimation.whitening import WhitenedImu
 
 FELT = planted.rich(duration_s=45.0)
 BAND_HZ = 6.0
@@ -26,7 +25,7 @@ def beside_poses(effects: dict[str, list[float]] | None = None, added: np.ndarra
     return replace(pair, against="true poses", band_hz=BAND_HZ)
 
 
-def noise(log: WhitenedLog) -> np.ndarray:
+def noise(log: WhitenedImu) -> np.ndarray:
     return np.asarray(noise_std(log.whiten))
 
 

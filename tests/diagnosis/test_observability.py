@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 from support import planted
 
-from imutool.diagnosis.estimation.gauss_newton import WhitenedLog
 from imutool.diagnosis.estimation.observability import ENOUGH, unobservable
-from imutool.diagnosis.estimation.whitening import Whitener
+from imutool.diagnosis.estimation.whitening import WhitenedLog, Whitener
 
 
 def shown(felt: object, names: list[str] | None = None, *, noise: float = 1.0, known: np.ndarray | None = None) -> set[str]:

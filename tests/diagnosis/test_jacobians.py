@@ -7,11 +7,10 @@ import pytest
 from scipy.signal import firwin
 from support import planted
 
-from imutool.diagnosis.estimation.alignment import Pair
+from imutool.diagnosis.estimation.aligned_log import Pair
 from imutool.diagnosis.estimation.candidate_score import CandidateScore
-from imutool.diagnosis.estimation.forward_cache import ForwardPass, bound, free, step_of
 from imutool.diagnosis.estimation.gauss_newton import fit
-from imutool.diagnosis.estimation.jacobians import Jacobians, effect_jacobian
+from imutool.diagnosis.estimation.jacobians import ForwardPass, Jacobians, bound, effect_jacobian, free, step_of
 from imutool.diagnosis.estimation.whitening import Band, Whitener
 from imutool.sensor.effect import Effect, Stage, Theta, read
 
