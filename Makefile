@@ -9,7 +9,7 @@ READY_DEMO := $(VENV)/.ready-demo
 READY_TEST := $(VENV)/.ready-test
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test viewers lint format bench clean
+.PHONY: help demo test check viewers lint format bench clean
 .NOTPARALLEL:
 
 help:  ## say what there is
@@ -22,6 +22,9 @@ demo: $(READY_DEMO)  ## the whole way on a made-up recording: convert, train, de
 test: lint viewers  ## format, lint, types, then every test with warnings as errors
 	@echo "test: pytest, side by side"
 	@$(BIN)/python -m pytest -n $(WORKERS) --maxprocesses 4 --dist worksteal
+
+check: lint  ## lint, types and the tests that a change touches (BASE=commit; else what is not on origin/main yet)
+	@$(BIN)/python -m pytest -q -n $(WORKERS) --maxprocesses 4 --dist worksteal $$($(BIN)/python tests/changed.py $(BASE))
 
 viewers: $(READY_TEST)  ## a browser and a software graphics driver for the tests that look, where apt-get may bring them
 	@$(BIN)/python tests/support/viewers.py

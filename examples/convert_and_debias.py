@@ -6,24 +6,21 @@ python examples/convert_and_debias.py MH_04_difficult.zip out [model.safetensors
 from __future__ import annotations
 
 import sys
-from pathlib import Path
 
-from imutool.conversion import convert
-from imutool.debiasing import debias
-from imutool.evaluation import evaluate
+import imutool
 
 
-def main(source: Path, folder: Path, model: str = "static") -> None:
-    for log in convert(source, folder, overwrite=True).written:
+def main(source: str, folder: str, model: str = "static") -> None:
+    for log in imutool.convert(source, folder, overwrite=True).written:
         debiased = log.with_name(f"{log.stem}_debiased.mcap")
-        report = debias(log, debiased, model=model, overwrite=True)
+        report = imutool.debias(log, debiased, model=model, overwrite=True)
         for topic, start in report.starts.items():
             print(f"{debiased}: {topic} with {report.models[topic]}, start bias from {start.how}")
-        for result in evaluate(log, models=[model]):
+        for result in imutool.evaluate(log, models=[model]):
             print(f"  {result['model']:>12}: orientation {result['aoe_deg']:8.2f} deg, position {result['ape_m']:8.2f} m")
 
 
 if __name__ == "__main__":
     if len(sys.argv) < 3:
         sys.exit(__doc__)
-    main(Path(sys.argv[1]), Path(sys.argv[2]), *sys.argv[3:])
+    main(*sys.argv[1:])

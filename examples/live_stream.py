@@ -1,56 +1,42 @@
-"""A sensor that is corrected while it measures, seen as it happens: a made-up one at 200 Hz, to a viewer or into an .rrd.
+"""Correct a sensor while it measures and show it live: a made-up sensor at 200 Hz, to a viewer or into an .rrd.
 
 rerun &  python examples/live_stream.py 127.0.0.1:9876 [seconds]
-         python examples/live_stream.py out.rrd [seconds]             as fast as it goes, since nobody waits
+         python examples/live_stream.py out.rrd [seconds]             as fast as it goes, because nobody waits
 """
 
 from __future__ import annotations
 
 import sys
 import time
-from pathlib import Path
 
 import numpy as np
 
-from imutool.bias import static
-from imutool.bias_start.initial_bias import at_rest
-from imutool.debiasing import Block, OnlineDebiaser
-from imutool.mcap_io.batches import ImuBatch
-from imutool.recording import Imu, nanoseconds
-from imutool.sensor.flight import flight
-from imutool.viewing.rerun.live import watching
+import imutool
 
-REST_S = 2.0  # how long the sensor is known to stand still after it is switched on
-BATCH = 100  # samples that are shown together: half a second
+REST_S = 2.0  # the sensor stands still for this long after it is switched on
+BATCH = 100  # samples shown together: half a second
 
 
 def main(where: str, duration_s: float = 20.0) -> None:
-    sensor, model = flight(1, duration_s=duration_s).imu, static.Model()
-    still = sensor.between(int(sensor.t_ns[0]), int(sensor.t_ns[0]) + nanoseconds(REST_S))
-    start = at_rest(model, still)
-    online = OnlineDebiaser(model, start)
-    std = np.tile(start.std, (BATCH, 1))
+    sensor, model = imutool.example_recording(duration_s=duration_s).imu, imutool.load_model("static")
+    start = imutool.bias_at_rest(model, sensor.rows(slice(0, round(REST_S / sensor.period_s))))
+    online = imutool.OnlineDebiaser(model, start)
+    to_file = where.endswith(".rrd")
+    output = {"save": where} if to_file else {"connect": where}
 
-    file = Path(where) if where.endswith(".rrd") else None
     began = time.monotonic()
-    with watching("live", connect_to=None if file else where, save=file, instead=Path("live.rrd"), overwrite=True) as live:
+    with imutool.watch("live", **output, overwrite=True) as live:
         for first in range(0, len(sensor), BATCH):
             samples = sensor.rows(slice(first, first + BATCH))
             bias = np.stack(
                 [online(*sample)[2] for sample in zip(samples.t_ns.tolist(), samples.gyro, samples.accel, strict=True)]
             )
-            live(Block("/imu0", as_batch(samples, first), bias, std[: len(samples)]))
-            if file is None:  # the time that the sensor would have taken
+            live.add(samples, bias, np.tile(start.std, (len(samples), 1)))
+            if not to_file:  # the time that the sensor would have taken
                 time.sleep(max(0.0, began + (first + len(samples)) * sensor.period_s - time.monotonic()))
     print(f"{len(sensor)} samples in batches of {BATCH}, bias at the end {bias[-1].round(4)}")
-    for shown in live.shown:
+    for shown in live.outputs:
         print(shown.said)
-
-
-def as_batch(imu: Imu, first: int) -> ImuBatch:
-    """The samples as messages that were logged when they were measured."""
-    sequence = np.arange(first, first + len(imu), dtype=np.uint32)
-    return ImuBatch(imu.t_ns, imu.t_ns, sequence, imu.t_ns, imu.gyro, imu.accel, "imu")
 
 
 if __name__ == "__main__":

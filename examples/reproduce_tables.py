@@ -24,15 +24,9 @@ from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
-import msgspec
 import numpy as np
 
-from imutool.conversion import convert
-from imutool.debiasing import apply
-from imutool.evaluation import evaluate
-from imutool.inertial.metrics import orientation_errors
-from imutool.inertial.strapdown import along_truth
-from imutool.mcap_io.read import read
+import imutool
 
 TRAIN = {
     "euroc": ("MH_01_easy", "MH_03_medium", "MH_05_difficult", "V1_02_medium", "V2_01_easy", "V2_03_difficult"),
@@ -98,7 +92,7 @@ def main() -> None:
     options.out.mkdir(parents=True, exist_ok=True)
     for name in sets:
         if not (options.out / name).exists():
-            convert(options.data / name, options.out / name)
+            imutool.convert(options.data / name, options.out / name)
     methods = options.method or METHODS
     jobs = [
         Job(name, method, seed, options.swap, options.out)
@@ -126,16 +120,12 @@ def figures(job: Job) -> list[dict[str, Any]]:
     model, logs = job.folder / f"{job.name}.safetensors", job.folder / job.data_set
     began = time.process_time()
     if not model.exists():
-        from imutool.training.run import train
-        from imutool.training.settings import settings_of
-
-        settings = msgspec.structs.replace(settings_of(job.method)(), seed=job.seed)
-        train([logs / f"{name}.mcap" for name in learn], model, method=job.method, settings=settings)
+        imutool.train([logs / f"{name}.mcap" for name in learn], model, method=job.method, settings={"seed": job.seed})
     trained_s, rows = time.process_time() - began, []
     for sequence in test:
         for start in STARTS:
             how: dict[str, Any] = {"smooth": True} if start == "smooth" else {"init": start}
-            results = evaluate(logs / f"{sequence}.mcap", models=[model], truth=OTHER_TRUTH.get(sequence), **how)
+            results = imutool.evaluate(logs / f"{sequence}.mcap", models=[model], truth=OTHER_TRUTH.get(sequence), **how)
             for result, method in zip(results, ("raw", job.method), strict=True):
                 rows.append({**result, "method": method, "start": start, "seed": job.seed, "trained_cpu_s": trained_s})
     kept.write_text(json.dumps(rows), encoding="utf-8")
@@ -185,22 +175,17 @@ def plots(jobs: list[Job]) -> list[tuple[str, str]]:
     mpl.use("Agg")
     from matplotlib import pyplot as plt
 
-    from imutool.bias.io import load
-    from imutool.bias_start.initial_bias import find
-
     drawn = []
     for data_set in dict.fromkeys(job.data_set for job in jobs):
         first = [job for job in jobs if job.data_set == data_set and job.seed == 0]
         for sequence in first[0].sequences[1]:
-            recording = read(first[0].folder / data_set / f"{sequence}.mcap", truth=OTHER_TRUTH.get(sequence))
-            recording = recording.with_truth(OTHER_TRUTH.get(sequence, "/ground_truth/pose"))
+            log, truth = first[0].folder / data_set / f"{sequence}.mcap", OTHER_TRUTH.get(sequence)
             figure, axes = plt.subplots(figsize=(8, 3), layout="constrained")
             for job in first:
-                model = load(job.folder / f"{job.name}.safetensors")
-                imu = apply(model, find("truth", model, recording), recording.imu).imu
-                estimate, true, valid = along_truth(imu, recording.truth, recording.name)
-                t_s = (true.t_ns[valid] - true.t_ns[0]) * 1e-9
-                axes.plot(t_s, np.degrees(orientation_errors(estimate.rows(valid), true.rows(valid))), label=job.method, lw=1)
+                model = job.folder / f"{job.name}.safetensors"
+                errors = imutool.load_run(log, models=[model], truth=truth, init="truth").traces[1].errors
+                t_s = (errors.t_ns - errors.t_ns[0]) * 1e-9
+                axes.plot(t_s, errors.orientation_total_deg, label=job.method, lw=1)
             axes.set(xlabel="time, s", ylabel="orientation error, °", title=sequence, ylim=(0, None))
             axes.legend(loc="upper left", frameon=False)
             buffer = io.BytesIO()

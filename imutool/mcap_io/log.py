@@ -15,7 +15,7 @@ from mcap.opcode import Opcode
 from mcap.records import Metadata
 
 from imutool.errors import DataError, LogError
-from imutool.location import Location
+from imutool.location import Location, to_location
 from imutool.mcap_io.batches import Clock, ImuBatch, PoseBatch, ScalarBatch, finite
 from imutool.mcap_io.codec import records, schemas
 from imutool.mcap_io.codec.decode import TwistColumns, decode_image, decode_imu, decode_poses, decode_scalars, decode_twist
@@ -41,10 +41,10 @@ class Log:
         LogError: empty, not an MCAP log, cut short or damaged; with `salvage`, if there is nothing in it to be saved.
     """
 
-    def __init__(self, path: Location, *, salvage: bool = False) -> None:
+    def __init__(self, path: str | Location, *, salvage: bool = False) -> None:
         keep_buffers()
-        self.path = path
-        self._source = Source(path)
+        self.path = to_location(path) if isinstance(path, str) else path
+        self._source = Source(self.path)
         try:
             with self.named():
                 self.structure = RecoveredIndex(self._source) if salvage else LogIndex(self._source)

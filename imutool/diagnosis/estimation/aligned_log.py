@@ -4,15 +4,15 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
-from typing import Any, Self
+from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float64
 
 from imutool.recording import Poses
 from imutool.sensor.effect import Effect, SignalState, Theta
-from imutool.sensor.readings import NOTHING, IdealMotion, SensorSamples
+from imutool.sensor.samples import NOTHING, IdealMotion, SensorSamples
 
 BLOCK_S, HELD_OUT_EACH = 6.0, 3  # every third block of six seconds is never fitted
 MARGIN_S = 0.3  # around a border between blocks, counted for neither
@@ -88,10 +88,6 @@ class AlignedLog(ABC):
     def period_s(self) -> float:
         """Median time between recorded samples."""
         return float(np.median(np.diff(self.stamp_s)))
-
-    def within(self, band_hz: float) -> Self:
-        """The log with its expectation known up to a lower frequency."""
-        return replace(self, band_hz=band_hz)
 
     def starts(self, effect: Effect) -> list[Theta]:
         """Parameters to start a fit of an effect from."""

@@ -32,9 +32,9 @@ class ForwardPass:
         self._states: list[SignalState] = [pair.state()] if like is None else like._states[: same + 1]
         for effect, theta in self.acting[same:]:
             if effect.stage > Stage.CLOCK:
-                self._states[-1] = self._states[-1].taking()
+                self._states[-1] = self._states[-1].sampled()
             self._states.append(self._states[-1].through(effect, theta))
-        self.blocks = pair.blocks(self._states[-1].arrived())
+        self.blocks = pair.blocks(self._states[-1].samples())
 
     @property
     def expected(self) -> Float64[np.ndarray, "n k"]:
@@ -59,7 +59,7 @@ class ForwardPass:
         else:
             theta, behind = self.acting[place][1], self.acting[place + 1 :]
         if effect.stage > Stage.CLOCK:
-            self._states[place] = self._states[place].taking()
+            self._states[place] = self._states[place].sampled()
         x, before = free(effect, theta), self._states[place]
         for j, parameter in enumerate(effect.parameters):
             h = step_of(parameter)
@@ -68,7 +68,7 @@ class ForwardPass:
             state = before.through(effect, bound(effect, moved))
             for other, values in behind:
                 state = state.through(other, values)
-            for (first, then), (_, now) in zip(self.pair.blocks(state.arrived()), self.blocks, strict=True):
+            for (first, then), (_, now) in zip(self.pair.blocks(state.samples()), self.blocks, strict=True):
                 if then is not now:
                     rows = ((then - now) / h).T
                     yield from ((first + k, j, row) for k, row in enumerate(rows) if row.any())

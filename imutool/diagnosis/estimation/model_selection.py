@@ -120,7 +120,8 @@ def _unnamed(found: Fit) -> int:
 
 def _exclude(a: Effect, b: Effect) -> bool:
     """Whether two effects never act together: variants of one effect of the catalogue on one sensor."""
-    variants = a.kind == b.kind == "catalogue" and a.name == b.name and bool(set(a.sensors) & set(b.sensors))
+    one_sensor = a.sensors == b.sensors or bool(set(a.sensors) & set(b.sensors))
+    variants = a.kind == b.kind == "catalogue" and a.name == b.name and one_sensor
     return a.key == b.key or variants
 
 

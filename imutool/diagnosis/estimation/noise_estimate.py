@@ -8,6 +8,7 @@ fit of them would start. An effect left out here would be taken for noise, and n
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -37,7 +38,7 @@ def whitened(pair: Pair, candidates: Sequence[Effect], settings: BandSettings) -
     rate_hz = 1.0 / (pair.period_s * found.every)
     band_hz = known_band_hz(found.band(pair.real), left, rate_hz, pair.band_hz, settings)
     if band_hz < pair.band_hz:
-        pair = pair.within(band_hz)
+        pair = replace(pair, band_hz=band_hz)
         found, _ = _in_band(pair, candidates, band_hz)
     return _counting(pair, limited_to_quiet_axes(found, settings.noisy_axis))
 

@@ -131,7 +131,7 @@ def _rich_residual(pair: AlignedSignal) -> Samples:
     columns += [np.sign(x), np.sign(dx)]
     for of in (x, dx, pair.stamp_s):
         columns += [*SplineCurve("", np.linspace(of.min(), of.max(), RICH_KNOTS - 2)).basis(of).T]
-    return pair.real[:, 0] - ridge_fit(np.stack(columns, axis=1), pair.real[:, 0], pair.usable[:, 0])
+    return np.asarray(pair.real[:, 0] - ridge_fit(np.stack(columns, axis=1), pair.real[:, 0], pair.usable[:, 0]))
 
 
 def _lsb(real: Fields, sim: Fields) -> float:
@@ -167,7 +167,7 @@ def _summarized(pair: AlignedSignal, log: WhitenedLog, found: Selection, always:
         unit=unit,
         located=_located(pair, after - before, level, p_value) if found.selected else (),
         findings=tuple(findings),
-        offset=Estimate(float(dict((e.key, theta) for e, theta in chosen)["offset"][0]), float(offset[0]), unit),
+        offset=Estimate(float({e.key: theta for e, theta in chosen}["offset"][0]), float(offset[0]), unit),
         not_identifiable=() if pair.shares_epoch else (f"{name}.delay",),
         unexplained=Unexplained(rms, level, rms < WHITE * floor),
         closer=_held_out(pair, before, after),
@@ -177,7 +177,7 @@ def _summarized(pair: AlignedSignal, log: WhitenedLog, found: Selection, always:
 
 
 def _column(pair: AlignedSignal, chosen: Chosen) -> Samples:
-    return expected(pair, chosen)[:, 0]
+    return np.asarray(expected(pair, chosen)[:, 0])
 
 
 def _held_out(pair: AlignedSignal, before: Samples, after: Samples) -> HeldOut:

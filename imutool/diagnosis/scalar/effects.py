@@ -118,10 +118,7 @@ def _effect(
 ) -> Effect:
     """An effect on the one column; nonlinear, unless it has no starts."""
     given = None if starts is None else lambda ideal, real: starts
-    return Effect(name, stage, SIGNAL, equation, parameters, "it varies", forward, starts is None, given, **more)
-
-
-SIGNAL = ("signal",)
+    return Effect(name, stage, (), equation, parameters, "it varies", forward, starts is None, given, **more)
 
 
 # ── the effects ──

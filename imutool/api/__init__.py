@@ -1,0 +1,1 @@
+"""Public functions behind `import imutool`, for paths, URLs and arrays."""

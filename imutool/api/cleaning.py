@@ -1,0 +1,138 @@
+"""Find and remove defects of a log's IMU; save the sound part of a damaged log."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from imutool.api.logs import Progress
+from imutool.api.paths import LogPath, location
+from imutool.bag.repair import NO_ATTACHMENTS, BagReport, is_bag, repair_bag
+from imutool.cleaning import Rules, Survey, look
+from imutool.cleaning.settings import chosen
+from imutool.errors import ConfigError, LogError
+from imutool.mcap_io.log import Log
+from imutool.mcap_io.losses import Losses
+from imutool.mcap_io.repair import RepairReport
+from imutool.mcap_io.repair import repair as repair_log
+
+
+@dataclass(frozen=True)
+class CleanReport:
+    """Defects of a log's IMUs, and the samples written, if any.
+
+    Attributes:
+        surveys: One survey per IMU: `topic`, `verdict`, `score`, `findings`, `reasons`.
+        losses: Stretches that a damaged log lost.
+        added: Messages written, by topic; empty without `target`.
+    """
+
+    surveys: tuple[Survey, ...]
+    losses: Losses
+    added: dict[str, int]
+
+
+def clean(
+    source: LogPath,
+    target: LogPath | None = None,
+    *,
+    model: str | Path | None = None,
+    imus: Sequence[str] = (),
+    rules: Sequence[str] = (),
+    skip_rules: Sequence[str] = (),
+    force: bool = False,
+    init: str = "auto",
+    smooth: bool = False,
+    overwrite: bool = False,
+    progress: Progress | None = None,
+) -> CleanReport:
+    """Find defects in a log's IMU; with `target`, write the log with a clean, debiased IMU.
+
+    Args:
+        source: MCAP log: a file or a URL.
+        target: Log to write; without one, the function only reports.
+        model: Bias model for `target`, as in `debias`.
+        imus: IMU topics; by default all, and with `target` the only one.
+        rules: Rules to apply; by default all (`imutool clean --help` lists them).
+        skip_rules: Rules to leave out.
+        force: Write `target` even from a log with the verdict `quarantine`.
+        init: Initial bias for `target`, as in `debias`.
+        smooth: Smoothing for `target`, as in `debias`.
+        overwrite: Replace an existing `target`.
+        progress: Callback with bytes done and bytes in all.
+
+    Raises:
+        ConfigError: The log cannot be opened, a rule is unknown, or `target` exists.
+        LogError: No such IMU, or the log is not trusted and `force` is false.
+
+    Examples:
+        >>> import imutool
+        >>> report = imutool.clean("flight_1.mcap")
+        >>> report.surveys[0].verdict
+        'good'
+    """
+    wanted = chosen(rules, skip_rules, force)
+    if target is None:
+        return _survey(source, imus, wanted)
+    from imutool.debiasing import debias
+
+    report = debias(
+        location(source),
+        location(target),
+        model=model,
+        imus=imus,
+        init=init,
+        smooth=smooth,
+        clean=wanted,
+        overwrite=overwrite,
+        progress=progress,
+    )
+    return CleanReport(tuple(report.surveys.values()), report.losses, dict(report.rewrite.added))
+
+
+def _survey(source: LogPath, imus: Sequence[str], rules: Rules) -> CleanReport:
+    with Log(location(source), salvage=True) as log:
+        topics = list(imus) or log.imu_topics
+        if not topics:
+            raise LogError("no IMU topic", where=source, expected=log.listing())
+        surveys = tuple(look(log, topic, rules) for topic in topics)
+        return CleanReport(surveys, log.losses or Losses(), {})
+
+
+def repair(
+    source: LogPath,
+    target: LogPath,
+    *,
+    damaged: str = "drop",
+    overwrite: bool = False,
+    progress: Progress | None = None,
+) -> RepairReport | BagReport:
+    """Save the sound part of a damaged MCAP log or ROS 1 bag, with new indexes.
+
+    Args:
+        source: Damaged log or bag: a file or a URL.
+        target: File or URL to write.
+        damaged: `drop` damaged bytes, or `keep` them as attachments (MCAP only).
+        overwrite: Replace an existing `target`.
+        progress: Callback with bytes done and bytes in all.
+
+    Returns:
+        `whole` (no damage found), `messages` saved by topic, and `losses`.
+
+    Raises:
+        ConfigError: A file cannot be opened, `target` exists or is `source`, or `damaged` is unknown.
+        LogError: Not a log, or no part of it is sound.
+
+    Examples:
+        >>> import imutool
+        >>> report = imutool.repair("cut_short.mcap", "saved.mcap")
+        >>> report.whole, report.messages["/imu0"] > 0
+        (False, True)
+    """
+    here, there = location(source), location(target)
+    if not is_bag(here):
+        return repair_log(here, there, damaged=damaged, overwrite=overwrite, progress=progress)
+    if damaged != "drop":
+        raise ConfigError(NO_ATTACHMENTS, where="damaged", fix="Leave `damaged` out")
+    return repair_bag(here, there, overwrite=overwrite, progress=progress)

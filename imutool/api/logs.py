@@ -1,0 +1,192 @@
+"""Read, write, convert, inspect and export MCAP logs."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+from imutool import conversion, log_info
+from imutool.api.paths import LogPath, local, location
+from imutool.conversion import ConvertReport
+from imutool.exporting.report import ExportReport
+from imutool.exporting.run import export as export_log
+from imutool.mcap_io.read import read as read_log
+from imutool.mcap_io.write import write as write_log
+from imutool.recording import Recording
+
+Progress = Callable[[int, int], None]  # bytes done, bytes in all
+NamedProgress = Callable[[int, int, str], None]  # steps done, steps in all, the current step
+
+
+def read(
+    path: LogPath,
+    *,
+    imu: str | None = None,
+    truth: str | None = None,
+    start_ns: int | None = None,
+    end_ns: int | None = None,
+) -> Recording:
+    """Read a log as numpy arrays; `read(write(recording)) == recording`, bit for bit.
+
+    A log of another program gets the file's name. Its pose topics become `truths`, its Float64 and Vector3Stamped topics
+    become `scalars`.
+
+    Args:
+        path: MCAP log: a file, or a URL such as `s3://bucket/log.mcap`.
+        imu: IMU topic; needed where the log has several.
+        truth: The only pose topic to read; by default all of them.
+        start_ns: First log time to read, in nanoseconds.
+        end_ns: Last log time to read, in nanoseconds.
+
+    Raises:
+        ConfigError: The file cannot be opened.
+        LogError: No IMU, several without `imu`, an unknown topic, NaN, decreasing stamps, or damage.
+
+    Examples:
+        >>> import imutool
+        >>> recording = imutool.read("flight_1.mcap")
+        >>> recording.imu.gyro.shape, recording.imu.t_ns.dtype
+        ((4001, 3), dtype('int64'))
+        >>> list(recording.truths)
+        ['/ground_truth/pose']
+    """
+    return read_log(location(path), imu=imu, truth=truth, start_ns=start_ns, end_ns=end_ns)
+
+
+def write(path: LogPath, recording: Recording, *, compression: str = "zstd", overwrite: bool = False) -> None:
+    """Write a recording as an MCAP log. The log appears whole or not at all.
+
+    Args:
+        path: MCAP log to write: a file or a URL.
+        recording: Arrays to write.
+        compression: `zstd`, `lz4` or `none`.
+        overwrite: Replace an existing log.
+
+    Raises:
+        ConfigError: The log exists without `overwrite`, cannot be written, or the compression is unknown.
+        DataError: Two topics of one name, or times before 1970.
+
+    Examples:
+        >>> import imutool
+        >>> import numpy as np
+        >>> t_ns = 1_700_000_000_000_000_000 + 5_000_000 * np.arange(200)
+        >>> gyro, accel = np.zeros((200, 3)), np.tile([0.0, 0.0, 9.81], (200, 1))
+        >>> recording = imutool.Recording("bench", imutool.Imu(t_ns, gyro, accel))
+        >>> imutool.write("bench.mcap", recording)
+        >>> imutool.read("bench.mcap") == recording
+        True
+    """
+    write_log(recording, location(path), compression=compression, overwrite=overwrite)
+
+
+def convert(
+    source: str | Path,
+    out: str | Path,
+    *,
+    format: str = "auto",
+    sequences: Sequence[str] = (),
+    compression: str = "zstd",
+    images: bool = True,
+    overwrite: bool = False,
+    workers: int | None = None,
+    progress: NamedProgress | None = None,
+) -> ConvertReport:
+    """Convert a raw data set to MCAP logs, one log per sequence.
+
+    Args:
+        source: Sequence folder, archive (.zip, .tar, .tar.gz), ROS 1 bag, or a folder of these.
+        out: Log file for one sequence, folder for several.
+        format: Converter (`euroc`, `tum_vi`, `fetch`, ...), or `auto` to recognise it.
+        sequences: Names of the sequences to convert; by default all.
+        compression: `zstd`, `lz4` or `none`.
+        images: Copy camera frames as well.
+        overwrite: Replace existing logs.
+        workers: Processes; by default one per core. A script that uses several needs `if __name__ == "__main__":`.
+        progress: Callback with sequences done, sequences in all, and the name of the last one.
+
+    Returns:
+        `written`, the logs in the order of the source, and `failures`.
+
+    Raises:
+        DataError: The source holds no known sequence.
+        ConfigError: Unknown format or sequence, an existing log without `overwrite`.
+        ImutoolError: The only sequence failed. With several, failures are in the report.
+
+    Examples:
+        >>> import imutool
+        >>> [log.name for log in imutool.convert("raw", "logs", format="euroc").written]
+        ['flight_1.mcap', 'flight_2.mcap']
+    """
+    return conversion.convert(
+        local(source, "source"),
+        local(out, "out"),
+        format=format,
+        sequences=sequences,
+        compression=compression,
+        images=images,
+        overwrite=overwrite,
+        workers=workers,
+        progress=progress,
+    )
+
+
+def info(path: LogPath, *, check: bool = True) -> log_info.Report:
+    """Report on a log: topics, rates, gaps, saturation, time at rest, truth coverage, damage.
+
+    Args:
+        path: MCAP log: a file or a URL.
+        check: Compare the CRC of every chunk; otherwise only of chunks with IMU messages.
+
+    Raises:
+        ConfigError: The file cannot be opened.
+        LogError: It is not an MCAP log, or no part of it is sound.
+
+    Examples:
+        >>> import imutool
+        >>> report = imutool.info("flight_1.mcap")
+        >>> report["imu"][0]["topic"], round(report["imu"][0]["rate_hz"])
+        ('/imu0', 200)
+    """
+    return log_info.inspect(location(path), check=check)
+
+
+def export(
+    log: str | Path,
+    out: str | Path,
+    *,
+    format: str,
+    imu: str | None = None,
+    noise: str | Path | None = None,
+    overwrite: bool = False,
+    progress: NamedProgress | None = None,
+) -> ExportReport:
+    """Write a log as a EuRoC (ASL) folder or a rosbag2 folder, for programs that read these.
+
+    Args:
+        log: MCAP log.
+        out: Folder to make.
+        format: `euroc` or `rosbag2`.
+        imu: IMU topic for a EuRoC folder; by default the debiased one.
+        noise: Data sheet (`adis16448`, `bmi160`) or TOML file for the folder's `sensor.yaml`.
+        overwrite: Replace an earlier export of the same format.
+        progress: Callback with steps done, steps in all, and the current step.
+
+    Raises:
+        ConfigError: Unknown format, an option that the format does not use, an existing folder.
+        LogError: The log is damaged, or holds data that the format cannot represent.
+
+    Examples:
+        >>> import imutool
+        >>> report = imutool.export("flight_1.mcap", "flight_1_euroc", format="euroc")
+        >>> report.imu
+        '/imu0'
+    """
+    return export_log(
+        local(log, "log"),
+        local(out, "out"),
+        format=format,
+        imu=imu,
+        sensor_noise=noise,
+        overwrite=overwrite,
+        progress=progress,
+    )

@@ -1,0 +1,199 @@
+"""Load a bias model and apply it to a recording or a log."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import overload
+
+import numpy as np
+from jaxtyping import Float64
+
+from imutool import debiasing, evaluation
+from imutool.api.logs import Progress
+from imutool.api.paths import LogPath, location
+from imutool.bias import static
+from imutool.bias.io import find_model, shipped_for
+from imutool.bias.model import BiasModel
+from imutool.bias_start.initial_bias import InitialBias, at_rest, find
+from imutool.bias_start.model_choice import refuse_smooth, smooth_in_memory
+from imutool.debiasing import DebiasReport, apply_with_std
+from imutool.errors import ConfigError
+from imutool.recording import Imu, Recording
+
+Model = str | Path | BiasModel
+
+
+def load_model(name: str | Path, *, rate_hz: float | None = None) -> BiasModel:
+    """Bias model from a file, by the name of a model that ships, or `static`.
+
+    Args:
+        name: `FILE.safetensors`, a name that `imutool models` lists, `static`, or a `physics.toml`.
+        rate_hz: Sample rate; needed for a `physics.toml` alone.
+
+    Raises:
+        ModelError: No such model (the message suggests the nearest name), or a damaged file.
+        ConfigError: A `physics.toml` that cannot be read.
+
+    Examples:
+        >>> import imutool
+        >>> model = imutool.load_model("linear.safetensors")
+        >>> model.method, model.rate_hz
+        ('linear', 200.0)
+        >>> imutool.load_model("euroc-adis16448-hybrid").method
+        'hybrid'
+    """
+    return static.Model() if str(name) == static.Model.method else find_model(name, rate_hz)
+
+
+def bias_at_rest(model: BiasModel, imu: Imu) -> InitialBias:
+    """Initial bias from samples at rest.
+
+    An `OnlineDebiaser` starts from it.
+
+    Args:
+        model: Bias model of the sensor.
+        imu: Samples at rest, 1.5 s or more.
+
+    Returns:
+        `rest`, the bias (gyro in rad/s, accel in m/s²), its standard deviation `std`, and the method in words, `how`.
+
+    Raises:
+        DataError: The samples are not at rest.
+
+    Examples:
+        >>> import imutool
+        >>> imu = imutool.read("flight_1.mcap").imu
+        >>> start = imutool.bias_at_rest(imutool.load_model("static"), imu.rows(slice(0, 400)))
+        >>> start.rest.shape
+        (6,)
+    """
+    return at_rest(model, imu)
+
+
+@dataclass(frozen=True, eq=False)
+class DebiasedRecording:
+    """Recording with debiased samples, and the bias that was subtracted.
+
+    Attributes:
+        recording: Input with the debiased IMU in place of the raw one.
+        bias: Subtracted bias at each sample: gyro (rad/s), then accel (m/s²).
+        std: One standard deviation of `bias`.
+        model: Name of the model.
+        start: Initial bias: `rest`, `std` and, in words, `how`.
+    """
+
+    recording: Recording
+    bias: Float64[np.ndarray, "n 6"]
+    std: Float64[np.ndarray, "n 6"]
+    model: str
+    start: InitialBias
+
+    @property
+    def imu(self) -> Imu:
+        """Debiased samples."""
+        return self.recording.imu
+
+
+@overload
+def debias(
+    source: Recording, target: Model | None = None, *, model: Model | None = None, init: str = "auto", smooth: bool = False
+) -> DebiasedRecording: ...
+
+
+@overload
+def debias(
+    source: LogPath,
+    target: LogPath | None = None,
+    *,
+    model: str | Path | Mapping[str, str | Path] | None = None,
+    init: str = "auto",
+    smooth: bool = False,
+    imus: Sequence[str] = (),
+    in_place: bool = False,
+    check: str = "imu",
+    overwrite: bool = False,
+    progress: Progress | None = None,
+) -> DebiasReport: ...
+
+
+def debias(
+    source: LogPath | Recording,
+    target: LogPath | BiasModel | None = None,
+    *,
+    model: Model | Mapping[str, str | Path] | None = None,
+    init: str = "auto",
+    smooth: bool = False,
+    imus: Sequence[str] = (),
+    in_place: bool = False,
+    check: str = "imu",
+    overwrite: bool = False,
+    progress: Progress | None = None,
+) -> DebiasedRecording | DebiasReport:
+    """Subtract the IMU's bias from a recording, or write a debiased log.
+
+    `debias(recording, model)` returns arrays. `debias("in.mcap", "out.mcap", model=...)` writes a log with every record of
+    the old one, `/imu0/debiased`, the subtracted bias and its covariance. The bias at a sample depends on that sample and
+    earlier ones, unless `smooth` is true.
+
+    Args:
+        source: Recording, or MCAP log: a file or a URL.
+        target: Log to write. With a recording, the second argument is the model.
+        model: Model file, name of a model that ships, `static`, or a dictionary from IMU topic to model. By default the
+            model that the log names or that ships for its sensor, otherwise the mean bias at rest. With a recording,
+            also a loaded model.
+        init: Initial bias: `auto`, `stationary`, `prior`, `truth`, `truth:SECONDS`, or six numbers.
+        smooth: Estimate the initial bias from the whole log, forward and backward.
+        imus: IMU topics of a log to debias; by default the only one.
+        in_place: Replace the log `source` instead of writing `target`.
+        check: Chunks of a log whose CRC is compared: `imu`, `all` or `none`.
+        overwrite: Replace an existing `target`.
+        progress: Callback with bytes done and bytes in all.
+
+    Raises:
+        ConfigError: A file cannot be opened, `target` is missing or exists, or options contradict each other.
+        LogError: No such IMU, a log that is debiased already, or damage that cannot be repaired.
+        ModelError: No model and no time at rest, another sample rate, or a damaged model file.
+
+    Examples:
+        >>> import imutool
+        >>> recording = imutool.read("flight_2.mcap")
+        >>> debiased = imutool.debias(recording, imutool.load_model("linear.safetensors"))
+        >>> debiased.imu.gyro.shape, debiased.bias.shape
+        ((4001, 3), (4001, 6))
+        >>> report = imutool.debias("flight_2.mcap", "debiased.mcap", model="linear.safetensors")
+        >>> report.rewrite.added["/imu0/debiased"]
+        4001
+    """
+    if isinstance(source, Recording):
+        return _debias_recording(source, model if target is None else target, init, smooth)
+    if isinstance(model, BiasModel) or isinstance(target, BiasModel):
+        raise ConfigError("a loaded model", where="model", expected="a model file, whose digest goes into the log")
+    if in_place == (target is not None):
+        raise ConfigError("`target` and `in_place`", where="debias", expected="one of the two")
+    out = None if target is None else location(target)
+    run = partial(debiasing.debias, location(source), out, model=model, imus=imus, init=init, smooth=smooth)
+    return run(check=check, overwrite=overwrite, progress=progress)
+
+
+def _debias_recording(recording: Recording, model: object, init: str, smooth: bool) -> DebiasedRecording:
+    if not isinstance(model, Model | None):
+        raise ConfigError(f"{type(model).__name__}", where="model", expected="one model: a file, a name or a loaded model")
+    name, chosen, start = _model_and_start(recording, model, init, smooth)
+    debiased, std = apply_with_std(chosen, start, recording.imu)
+    return DebiasedRecording(replace(recording, imu=debiased.imu), debiased.bias, std, name, start)
+
+
+def _model_and_start(recording: Recording, model: Model | None, init: str, smooth: bool) -> tuple[str, BiasModel, InitialBias]:
+    if model is None:
+        about = recording.metadata.get("imutool", {})
+        model = shipped_for(about.get("sensor"), about.get("dataset")) or static.Model.method
+    if not isinstance(model, BiasModel) or model.method == static.Model.method:
+        given = static.Model.method if isinstance(model, BiasModel) else model
+        ((name, chosen, start),) = evaluation.started(recording, [given], init, recording.name, smooth=smooth)
+        return name, chosen, start
+    refuse_smooth(init, smooth)
+    start = smooth_in_memory(model, recording.imu, recording.name) if smooth else find(init, model, recording)
+    return str(model.card.get("name", model.method)), model, start

@@ -1,0 +1,149 @@
+"""Simulate an IMU, diagnose its physics, and make up a flight."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import msgspec
+
+from imutool import diagnosis_output
+from imutool.api.logs import NamedProgress
+from imutool.api.paths import LogPath, local, location
+from imutool.diagnosis.diagnose import diagnose as diagnose_logs
+from imutool.diagnosis.result import Diagnosis
+from imutool.recording import Recording
+from imutool.sensor.flight import FlightSettings, flight
+from imutool.sensor.simulate import Simulation
+from imutool.sensor.simulate import simulate as simulate_log
+
+if TYPE_CHECKING:
+    from imutool.viewing.model.run_data import RunData
+
+
+def example_recording(seed: int = 1, *, duration_s: float = 20.0) -> Recording:
+    """Made-up flight with true poses and biases.
+
+    The sensor is at rest for the first three seconds.
+
+    Args:
+        seed: Motion, turn-on bias and drift. The sensor's calibration is the same for all seeds.
+        duration_s: Length of the flight in seconds.
+
+    Raises:
+        ConfigError: A negative or infinite duration.
+
+    Examples:
+        >>> import imutool
+        >>> recording = imutool.example_recording(seed=7, duration_s=5.0)
+        >>> recording.name, len(recording.imu)
+        ('flight_7', 1001)
+    """
+    return flight(seed, msgspec.structs.replace(FlightSettings(), duration_s=duration_s))
+
+
+def simulate(
+    trajectory: str | Path,
+    out: str | Path,
+    *,
+    physics: str | Path | None = None,
+    noise: str | Path = "none",
+    rate_hz: float | None = None,
+    seed: int = 0,
+    truth: str | None = None,
+    overwrite: bool = False,
+    progress: NamedProgress | None = None,
+) -> Simulation:
+    """Simulate an IMU along the true poses of a log, and write the log.
+
+    Args:
+        trajectory: MCAP log with poses.
+        out: Log to write.
+        physics: `physics.toml` with the effects of the sensor; by default an ideal sensor.
+        noise: `none`, a data sheet (`adis16448`, `bmi160`), or a TOML file.
+        rate_hz: Sample rate; by default that of the log's IMU, otherwise 200 Hz.
+        seed: Seed of the noise.
+        truth: Pose topic; by default the first.
+        overwrite: Replace an existing log.
+        progress: Callback with steps done, steps in all, and the current step.
+
+    Returns:
+        `recording`, the smoothed `motion`, and `remarks`.
+
+    Raises:
+        ConfigError: A setting, a settings file, or an existing log.
+        LogError: No poses, or damage.
+        DataError: Less than 2 s of usable motion, or an effect lacks its input channel.
+
+    Examples:
+        >>> import imutool
+        >>> simulation = imutool.simulate("flight_1.mcap", "ideal.mcap")
+        >>> len(simulation.recording.imu) > 3900
+        True
+    """
+    return simulate_log(
+        local(trajectory, "trajectory"),
+        local(out, "out"),
+        physics=None if physics is None else local(physics, "physics"),
+        noise=noise,
+        rate_hz=rate_hz,
+        seed=seed,
+        truth=truth,
+        overwrite=overwrite,
+        progress=progress,
+    )
+
+
+def diagnose(
+    reals: LogPath | Sequence[LogPath],
+    sim: LogPath | None = None,
+    *,
+    imu: str | None = None,
+    truth: str | None = None,
+    signals: Sequence[str] = (),
+    output: str | Path | None = None,
+    overwrite: bool = False,
+    progress: NamedProgress | None = None,
+) -> Diagnosis:
+    """Find the physics that a simulation lacks: name, size, uncertainty and place.
+
+    Args:
+        reals: Recordings. Several share the physics, with one constant bias each.
+        sim: Simulation; by default each recording is compared with its own true poses.
+        imu: IMU topic; needed where a log has several.
+        truth: Topic of the true poses; by default the first.
+        signals: Other fields to compare, `TOPIC.field`; one recording and its simulation.
+        output: Folder for `findings.json`, `physics.toml`, `report.html`, `log.html` and `view.rrd`.
+        overwrite: Replace an earlier diagnosis in `output`.
+        progress: Callback with steps done, steps in all, and the current step.
+
+    Returns:
+        `findings`, each with effect, parameters, uncertainty and gain, and `remarks`.
+
+    Raises:
+        ConfigError: A log cannot be read, or `output` exists.
+        LogError: No such topic.
+        DataError: No truth and no simulation, or too little shared time.
+
+    Examples:
+        >>> import imutool
+        >>> diagnosis = imutool.diagnose("real.mcap", "sim.mcap")  # doctest: +SKIP
+        >>> [finding.effect for finding in diagnosis.findings]  # doctest: +SKIP
+        ['lever_arm']
+    """
+    several = reals if isinstance(reals, Sequence) and not isinstance(reals, str) else [reals]
+    logs = [location(real) for real in several]
+    folder = None if output is None else local(output, "output")
+    if folder is not None:
+        diagnosis_output.refuse(folder, overwrite=overwrite)
+    found = diagnose_logs(logs, None if sim is None else location(sim), imu=imu, truth=truth, signals=signals, tell=progress)
+    if folder is not None:
+
+        def runs(findings: Path) -> list[RunData]:
+            from imutool.viewing.model.runs import load
+
+            return [load(real, imu=imu, truth=truth, findings=findings) for real in logs]
+
+        diagnosis_output.write(found, folder, logs=runs, overwrite=overwrite)
+    return found

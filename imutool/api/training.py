@@ -1,0 +1,122 @@
+"""Train a bias model and score it against the true poses."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from imutool import evaluation
+from imutool.api.paths import LogPath, local, locals_of
+from imutool.bias.model import BiasModel
+from imutool.config import build
+from imutool.training import run
+from imutool.training.fit import Epoch
+from imutool.training.settings import settings_of
+
+
+def train(
+    logs: LogPath | Sequence[LogPath],
+    out: str | Path,
+    *,
+    method: str = "hybrid",
+    settings: Mapping[str, Any] | None = None,
+    device: str = "cpu",
+    imu: str | None = None,
+    truth: str | None = None,
+    resume: bool = False,
+    overwrite: bool = False,
+    progress: Callable[[Epoch], None] | None = None,
+) -> BiasModel:
+    """Train a bias model on logs of one sensor with true poses, and write it.
+
+    Args:
+        logs: MCAP logs.
+        out: Model file to write, `FILE.safetensors`.
+        method: `hybrid`, `neural_ode`, `conv` or `linear`.
+        settings: Training settings by name, for example `{"steps": 300, "seed": 1}`.
+        device: `cpu` or `cuda`.
+        imu: IMU topic; needed where the logs have several.
+        truth: Topic of the true poses; by default the first.
+        resume: Continue from the checkpoint of an interrupted training.
+        overwrite: Replace an existing model.
+        progress: Callback for each evaluation of the held-out part.
+
+    Raises:
+        ConfigError: The file exists, an unknown method or setting, or a checkpoint of another training.
+        LogError: A log without IMU or truth.
+        DataError: Different sample rates, or too little motion.
+        NumericsError: The loss diverged.
+
+    Examples:
+        >>> import imutool
+        >>> model = imutool.train(["flight_1.mcap"], "mine.safetensors", method="linear")
+        >>> sorted(model.card["held_out"])
+        ['accel', 'gyro']
+    """
+    chosen = None if settings is None else build(settings_of(method), dict(settings), where="settings")
+    return run.train(
+        locals_of(logs, "logs"),
+        local(out, "out"),
+        method=method,
+        settings=chosen,
+        device=device,
+        imu=imu,
+        truth=truth,
+        resume=resume,
+        overwrite=overwrite,
+        progress=progress,
+    )
+
+
+def evaluate(
+    log: str | Path,
+    *,
+    models: Sequence[str | Path] = (),
+    init: str = "auto",
+    smooth: bool = False,
+    zupt: bool = False,
+    truth: str | None = None,
+    imu: str | None = None,
+    trajectories: str | Path | None = None,
+    overwrite: bool = False,
+) -> list[dict[str, Any]]:
+    """Score pure integration against the true poses, raw and with each model.
+
+    Args:
+        log: MCAP log with true poses.
+        models: Model files, names of models that ship, or `static`.
+        init: Initial bias, as in `debias`.
+        smooth: Smoothing, as in `debias`.
+        zupt: Also score dead reckoning with zero-velocity updates.
+        truth: Topic of the true poses; by default the first.
+        imu: IMU topic; needed where the log has several.
+        trajectories: Folder for trajectories in the TUM format.
+        overwrite: Replace existing trajectories.
+
+    Returns:
+        One result for `raw` and one per model: `aoe_deg`, `ape_m`, `roe_deg`, `rpe_m`, velocity error, and others.
+
+    Raises:
+        ConfigError: Contradictory options, two models of one name, or files that exist.
+        LogError: No IMU or no truth.
+        DataError: IMU and truth share no time.
+        ModelError: A model that does not fit the log.
+
+    Examples:
+        >>> import imutool
+        >>> raw, linear = imutool.evaluate("flight_2.mcap", models=["linear.safetensors"])
+        >>> linear["aoe_deg"] < raw["aoe_deg"]
+        True
+    """
+    return evaluation.evaluate(
+        local(log, "log"),
+        models=models,
+        init=init,
+        smooth=smooth,
+        zupt=zupt,
+        truth=truth,
+        imu=imu,
+        trajectories=None if trajectories is None else local(trajectories, "trajectories"),
+        overwrite=overwrite,
+    )

@@ -1,0 +1,236 @@
+"""Show logs: in the Rerun viewer, in a browser, in a notebook, as a page, or live."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float64
+
+from imutool.api.paths import LogPath, local, location
+from imutool.debiasing import Block
+from imutool.errors import ConfigError
+from imutool.mcap_io.batches import ImuBatch
+from imutool.recording import Imu
+from imutool.viewing import notebook
+from imutool.viewing.model.output import Output
+from imutool.viewing.model.run_data import RunData
+from imutool.viewing.model.runs import load
+from imutool.viewing.model.trajectory_error import ALIGNMENTS, Alignment
+from imutool.viewing.outputs import Asked, Outputs
+from imutool.viewing.rerun import live
+
+
+def load_run(
+    log: LogPath,
+    *,
+    models: Sequence[str | Path] = (),
+    init: str = "auto",
+    smooth: bool = False,
+    imu: str | None = None,
+    truth: str | None = None,
+    align: str = "none",
+    findings: str | Path | None = None,
+) -> RunData:
+    """Traces, errors, figures and events of one log, as `view` shows them.
+
+    Args:
+        log: MCAP log: a file or a URL.
+        models: Models to apply: files, names of models that ship, or `static`.
+        init: Initial bias, as in `debias`.
+        smooth: Smoothing, as in `debias`.
+        imu: IMU topic; needed where the log has several.
+        truth: Topic of the true poses; by default the first.
+        align: Alignment of each path with the truth: `none`, `origin`, `yaw` or `se3`.
+        findings: Folder of a diagnosis, whose findings become events.
+
+    Returns:
+        `traces`, one for `raw` and one per model, each with `run`, `path`, `errors` and `windows`; `events`; and `table()`.
+
+    Raises:
+        ConfigError: A file cannot be read, or options contradict each other.
+        LogError: No IMU, or no part of the log is sound.
+        ModelError: A model that does not fit the log.
+
+    Examples:
+        >>> import imutool
+        >>> run = imutool.load_run("flight_2.mcap", models=["linear.safetensors"])
+        >>> [trace.name for trace in run.traces]
+        ['raw', 'linear']
+        >>> run.traces[1].errors.orientation_total_deg.shape == run.traces[1].errors.t_ns.shape
+        True
+    """
+    return load(
+        location(log),
+        models=models,
+        init=init,
+        smooth=smooth,
+        imu=imu,
+        truth=truth,
+        align=_alignment(align),
+        findings=None if findings is None else local(findings, "findings"),
+    )
+
+
+def _alignment(name: str) -> Alignment:
+    for known in ALIGNMENTS:
+        if known == name:
+            return known
+    raise ConfigError(f"{name!r}", where="align", expected=", ".join(ALIGNMENTS))
+
+
+def view(
+    logs: LogPath | RunData | Sequence[LogPath | RunData],
+    *,
+    at: float | str | None = None,
+    source: bool = True,
+    save: str | Path | None = None,
+    connect: str | None = None,
+    web: bool = False,
+    port: int | None = None,
+    export_web: str | Path | None = None,
+    png: str | Path | None = None,
+    html: str | Path | None = None,
+    overwrite: bool = False,
+    **options: Any,
+) -> list[Output]:
+    """Show truth, raw and debiased: in a viewer, in a browser, or as files.
+
+    Without `save`, `connect`, `web`, `export_web`, `png` and `html`, a viewer opens. Where no window can open, the function
+    saves an .rrd file.
+
+    Args:
+        logs: Logs (files or URLs), or runs from `load_run`.
+        at: Position of the cursor: seconds from the first sample, or `worst`, the largest orientation error of a model.
+        source: Also show what else the log holds, for example cameras.
+        save: .rrd file for the Rerun viewer.
+        connect: Address of a running viewer, `HOST:PORT`.
+        web: Serve to a browser on this machine, until Ctrl-C.
+        port: Port for `web`; by default a free one.
+        export_web: Folder that any web server can serve.
+        png: Folder for pictures.
+        html: Page in one file.
+        overwrite: Replace existing files.
+        **options: Options of `load_run`: `models`, `init`, `smooth`, `imu`, `truth`, `align`, `findings`.
+
+    Returns:
+        One entry per output: `kind`, `address`, and a sentence, `said`.
+
+    Raises:
+        ConfigError: Contradictory options, a file that exists, no viewer at `connect`, or Rerun is not installed.
+        DataError: `at` is outside the log.
+
+    Examples:
+        >>> import imutool
+        >>> (page,) = imutool.view("flight_2.mcap", models=["linear.safetensors"], html="flight_2.html")
+        >>> print(page.said)
+        Wrote flight_2.html. Open it in a browser
+    """
+    several = logs if isinstance(logs, Sequence) and not isinstance(logs, str) else [logs]
+    paths = [None if path is None else Path(path) for path in (save, export_web, png, html)]
+    cursor = None if at is None else str(at)
+    asked = Asked(paths[0], connect, web, port, paths[1], paths[2], paths[3], cursor, source, overwrite)
+    with Outputs(asked) as outputs:
+        shown = outputs.show([one if isinstance(one, RunData) else load_run(one, **options) for one in several])
+        if outputs.refused is not None:
+            raise outputs.refused
+        outputs.serve()
+    return shown
+
+
+def notebook_viewer(runs: RunData | Sequence[RunData]) -> Any:
+    """Rerun viewer as a notebook widget; it needs no network.
+
+    Args:
+        runs: Runs from `load_run`.
+
+    Raises:
+        ConfigError: The extra `notebook` is not installed.
+
+    Examples:
+        >>> import imutool
+        >>> imutool.notebook_viewer(imutool.load_run("flight_2.mcap"))  # doctest: +SKIP
+    """
+    return notebook.show([runs] if isinstance(runs, RunData) else runs)
+
+
+def notebook_page(runs: RunData | Sequence[RunData]) -> notebook.Page:
+    """Report as a notebook cell; a saved notebook shows it too.
+
+    Args:
+        runs: Runs from `load_run`.
+
+    Raises:
+        ConfigError: matplotlib is not installed.
+
+    Examples:
+        >>> import imutool
+        >>> page = imutool.notebook_page(imutool.load_run("flight_2.mcap"))
+        >>> "<svg" in page.content
+        True
+    """
+    return notebook.page([runs] if isinstance(runs, RunData) else runs)
+
+
+class LiveView:
+    """Live view of one IMU; `watch` opens it.
+
+    Attributes:
+        outputs: Where the samples were shown, one entry per output with a sentence, `said`; complete at the end.
+    """
+
+    def __init__(self, topic: str, show: live.Live) -> None:
+        self._topic, self._show, self._count = topic, show, 0
+
+    def add(self, imu: Imu, bias: Float64[np.ndarray, "n 6"], std: Float64[np.ndarray, "n 6"]) -> None:
+        """Show a batch of samples as they were debiased.
+
+        Args:
+            imu: Raw samples.
+            bias: Subtracted bias at each sample: gyro (rad/s), then accel (m/s²).
+            std: One standard deviation of `bias`.
+        """
+        sequence = np.arange(self._count, self._count + len(imu), dtype=np.uint32)
+        self._count += len(imu)
+        batch = ImuBatch(imu.t_ns, imu.t_ns, sequence, imu.t_ns, imu.gyro, imu.accel, "imu")
+        self._show(Block(self._topic, batch, bias, std))
+
+    @property
+    def outputs(self) -> list[Output]:
+        """Where the samples were shown."""
+        return self._show.shown
+
+
+@contextmanager
+def watch(
+    name: str, *, topic: str = "/imu0", connect: str | None = None, save: str | Path | None = None, overwrite: bool = False
+) -> Iterator[LiveView]:
+    """Show a sensor while it measures: a context manager that gives a `LiveView`.
+
+    Without `connect` and `save` a viewer opens. Where no window can open, the view goes to the file `NAME.rrd`.
+
+    Args:
+        name: Name of the recording in the viewer.
+        topic: Name of the IMU.
+        connect: Address of a running viewer, `HOST:PORT`.
+        save: .rrd file to write.
+        overwrite: Replace an existing file.
+
+    Raises:
+        ConfigError: Rerun is not installed, no viewer at `connect`, or the file exists.
+
+    Examples:
+        >>> import imutool
+        >>> import numpy as np
+        >>> imu = imutool.example_recording(duration_s=2.0).imu
+        >>> with imutool.watch("live", save="live.rrd") as live:
+        ...     live.add(imu, np.zeros((len(imu), 6)), np.ones((len(imu), 6)))
+        >>> len(live.outputs)
+        1
+    """
+    file, instead = None if save is None else Path(save), Path(f"{name}.rrd")
+    with live.watching(name, connect_to=connect, save=file, instead=instead, overwrite=overwrite) as show:
+        yield LiveView(topic, show)

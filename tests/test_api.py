@@ -1,0 +1,245 @@
+"""The public API: light to import, documented, and every example of its documentation runs."""
+
+from __future__ import annotations
+
+import ast
+import doctest
+import inspect
+import json
+import pydoc
+import re
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import imutool
+from imutool.demo import write_asl
+
+ROOT = Path(__file__).parents[1]
+IMPORT_SHARE = 0.1  # of the time that `import torch` takes
+ROUNDS = 3
+REQUIRED = {
+    *("read", "write", "Recording", "Imu", "Poses", "Log", "convert", "info", "clean", "repair", "debias", "OnlineDebiaser"),
+    *("load_model", "train", "evaluate", "simulate", "diagnose", "export", "view", "ImutoolError"),
+}
+FUNCTIONS = [name for name in imutool.__all__ if inspect.isfunction(getattr(imutool, name))]
+PARAGRAPHS = ("Args:", "Raises:", "Examples:")
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory, logs: Path) -> Path:
+    """A folder with what the examples read: raw/, two logs, a model, a damaged log."""
+    made = tmp_path_factory.mktemp("api")
+    for name in ("flight_1.mcap", "flight_2.mcap", "linear.safetensors"):
+        shutil.copy(logs / name, made / name)
+    for seed in (1, 2):
+        write_asl(imutool.example_recording(seed, duration_s=2.0), made / "raw" / f"flight_{seed}")
+    whole = (made / "flight_1.mcap").read_bytes()
+    (made / "cut_short.mcap").write_bytes(whole[: len(whole) * 3 // 4])
+    return made
+
+
+# ── importing ──
+
+
+def test_all_that_is_promised_is_public() -> None:
+    assert set(imutool.__all__) >= REQUIRED
+    assert list(imutool.__all__) == sorted(set(imutool.__all__))
+    assert set(imutool.__all__) <= set(dir(imutool))
+    for name in imutool.__all__:
+        getattr(imutool, name)
+
+
+def test_an_unknown_name_is_an_attribute_error() -> None:
+    with pytest.raises(AttributeError, match="no attribute 'reed'"):
+        imutool.reed  # noqa: B018
+
+
+def test_the_types_that_tools_see_are_the_names_that_are_imported() -> None:
+    """What stands under TYPE_CHECKING is what `__getattr__` gives."""
+    tree = ast.parse(Path(imutool.__file__).read_text(encoding="utf-8"))
+    (block,) = (node for node in tree.body if isinstance(node, ast.If) and "TYPE_CHECKING" in ast.dump(node.test))
+    seen = {name.name: node.module for node in block.body if isinstance(node, ast.ImportFrom) for name in node.names}
+    assert seen == imutool._HOME
+    assert {*seen, "__version__"} == set(imutool.__all__)
+
+
+def test_importing_the_package_imports_no_numpy_and_no_torch() -> None:
+    code = "import imutool, sys; print(sorted({'numpy', 'torch', 'msgspec', 'rerun'} & set(sys.modules)))"
+    assert subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True).stdout.strip() == "[]"
+
+
+def test_reading_and_writing_import_no_torch() -> None:
+    code = "import imutool, sys; imutool.read, imutool.write, imutool.info, imutool.clean; assert 'torch' not in sys.modules"
+    subprocess.run([sys.executable, "-c", code], check=True)
+
+
+def test_importing_takes_a_tenth_of_importing_torch() -> None:
+    clock = "import time; a = time.perf_counter(); import {}; print(time.perf_counter() - a)"
+
+    def seconds(package: str) -> float:
+        line = [sys.executable, "-c", clock.format(package)]
+        return float(subprocess.run(line, check=True, capture_output=True, text=True).stdout)
+
+    both = [(seconds("imutool"), seconds("torch")) for _ in range(ROUNDS)]
+    ours, torch = (min(times) for times in zip(*both, strict=True))
+    assert ours < IMPORT_SHARE * torch, f"import imutool took {ours:.3f} s, import torch {torch:.2f} s"
+
+
+# ── documentation ──
+
+
+@pytest.mark.parametrize("name", sorted(set(imutool.__all__) - {"__version__"}))
+def test_every_public_name_is_documented(name: str) -> None:
+    doc = inspect.getdoc(getattr(imutool, name)) or ""
+    assert doc, f"{name} has no docstring"
+    assert doc != inspect.getdoc(object)
+
+
+@pytest.mark.parametrize("name", FUNCTIONS)
+def test_every_public_function_says_arguments_errors_and_an_example(name: str) -> None:
+    function = getattr(imutool, name)
+    doc = inspect.getdoc(function) or ""
+    missing = [paragraph for paragraph in PARAGRAPHS if f"\n{paragraph}\n" not in doc]
+    assert not missing
+    for parameter in inspect.signature(function).parameters:
+        assert re.search(rf"^ +(\*\*)?{parameter}: ", doc, re.MULTILINE), f"{name} does not document {parameter}"
+
+
+@pytest.mark.parametrize("name", FUNCTIONS)
+def test_every_example_of_a_docstring_runs(name: str, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    shutil.copytree(folder, tmp_path, dirs_exist_ok=True)
+    monkeypatch.chdir(tmp_path)
+    doc = inspect.getdoc(getattr(imutool, name)) or ""
+    test = doctest.DocTestParser().get_doctest(doc, {}, name, None, None)
+    assert test.examples
+    told: list[str] = []
+    assert doctest.DocTestRunner(optionflags=doctest.ELLIPSIS).run(test, out=told.append).failed == 0, "".join(told)
+
+
+def lines_of_help() -> list[str]:
+    """The code of the package's docstring: what `help(imutool)` shows."""
+    doc = inspect.getdoc(imutool) or ""
+    block = re.search(r"::\n\n((?: {4}.*\n|\n)+)", doc)
+    assert block is not None
+    return [line.removeprefix("    ") for line in block[1].splitlines() if line.strip()]
+
+
+def test_help_shows_the_way_from_a_raw_folder_to_a_debiased_log_in_ten_lines() -> None:
+    lines = lines_of_help()
+    assert len(lines) - 1 <= 10  # without the import
+    shown = pydoc.render_doc(imutool, renderer=pydoc.plaintext)
+    assert all(line in shown for line in lines)
+
+
+def test_the_lines_of_help_run(tmp_path: Path) -> None:
+    for seed in (1, 2):
+        write_asl(imutool.example_recording(seed), tmp_path / "raw" / f"flight_{seed}")
+    (tmp_path / "way.py").write_text("\n".join(["if True:", *(f"    {line}" for line in lines_of_help())]))
+    code = "import runpy\nif __name__ == '__main__': runpy.run_path('way.py')"
+    (tmp_path / "run.py").write_text(code)
+    done = subprocess.run([sys.executable, "run.py"], cwd=tmp_path, capture_output=True, text=True, timeout=240, check=False)
+    assert done.returncode == 0, done.stderr
+    errors = {name: float(value) for name, value in re.findall(r"^(\w+) ([\d.]+)$", done.stdout, re.MULTILINE)}
+    assert errors["sensor"] < errors["raw"]
+    assert "<svg" in (tmp_path / "debiased.html").read_text(encoding="utf-8")
+
+
+# ── arrays ──
+
+
+def test_arrays_survive_a_log_bit_for_bit(tmp_path: Path) -> None:
+    recording = imutool.example_recording(3, duration_s=2.0)
+    imutool.write(str(tmp_path / "a.mcap"), recording)
+    assert imutool.read(str(tmp_path / "a.mcap")) == recording
+    assert imutool.read(tmp_path / "a.mcap") == recording
+
+
+def test_a_recording_is_debiased_as_its_log_is(tmp_path: Path, logs: Path) -> None:
+    source, model = logs / "flight_2.mcap", logs / "linear.safetensors"
+    from_arrays = imutool.debias(imutool.read(source), imutool.load_model(model))
+    by_name = imutool.debias(imutool.read(source), model=model)
+    imutool.debias(str(source), tmp_path / "out.mcap", model=model)
+    with imutool.Log(tmp_path / "out.mcap") as log:
+        batches = list(log.imu_batches("/imu0/debiased"))
+    gyro, accel = (np.concatenate([getattr(batch, name) for batch in batches]) for name in ("gyro", "accel"))
+    for debiased in (from_arrays, by_name):
+        assert np.array_equal(debiased.imu.gyro, gyro)
+        assert np.array_equal(debiased.imu.accel, accel)
+        assert debiased.model == "linear"
+        assert debiased.std.min() > 0.0
+
+
+@pytest.mark.parametrize("smooth", [False, True])
+@pytest.mark.parametrize("model", ["static", None])
+def test_a_recording_is_debiased_without_a_trained_model(logs: Path, model: str | None, smooth: bool) -> None:
+    recording = imutool.read(logs / "flight_2.mcap")
+    debiased = imutool.debias(recording, model, smooth=smooth)
+    assert debiased.model == "static"
+    true = recording.scalars["/ground_truth/bias/gyro"].values
+    assert np.abs(debiased.bias[:, :3] - true).max() < 0.02
+
+
+def test_samples_one_by_one_are_debiased_as_the_recording_is(logs: Path) -> None:
+    recording, model = imutool.read(logs / "flight_2.mcap"), imutool.load_model(logs / "linear.safetensors")
+    online, imu = imutool.OnlineDebiaser(model), recording.imu
+    rows = [online(*sample)[2] for sample in zip(imu.t_ns.tolist(), imu.gyro, imu.accel, strict=True)]
+    settled = slice(-1000, None)
+    assert np.allclose(np.array(rows)[settled], imutool.debias(recording, model).bias[settled], atol=0.01)
+
+
+@pytest.mark.parametrize(
+    ("call", "said"),
+    [
+        (imutool.debias, "one of the two"),
+        (lambda log: imutool.debias(log, "out.mcap", in_place=True), "one of the two"),
+        (lambda log: imutool.debias(log, "out.mcap", model=imutool.load_model("static")), "a model file"),
+        (lambda log: imutool.view(log, html="x.html", align="sideways"), "none, origin, yaw, se3"),
+        (lambda log: imutool.export("s3://bucket/log.mcap", "out", format="euroc"), "a file on this machine"),
+        (lambda log: imutool.train([log], "m.safetensors", settings={"step": 3}), "Did you mean steps"),
+    ],
+    ids=["no target", "both targets", "loaded model", "alignment", "url", "setting"],
+)
+def test_what_cannot_be_is_said(call: Callable[[str], object], said: str, logs: Path, tmp_path: Path) -> None:
+    with pytest.raises(imutool.ConfigError, match=said):
+        call(str(logs / "flight_1.mcap"))
+
+
+def test_a_url_is_a_path(store: Any, logs: Path) -> None:
+    recording = imutool.read(logs / "flight_1.mcap")
+    imutool.write("s3://fleet/flight_1.mcap", recording)
+    assert imutool.read("s3://fleet/flight_1.mcap") == recording
+
+
+# ── what we show to others uses the public API alone ──
+
+
+def shown_code() -> Iterator[tuple[str, str]]:
+    """Python code of the examples, of the notebook, and of every page: where, and the text."""
+    for path in sorted((ROOT / "examples").glob("*.py")):
+        yield path.name, path.read_text(encoding="utf-8")
+    for path in sorted((ROOT / "examples").glob("*.ipynb")):
+        cells = json.loads(path.read_text(encoding="utf-8"))["cells"]
+        yield path.name, "\n".join("".join(cell["source"]) for cell in cells if cell["cell_type"] == "code")
+    for path in [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]:
+        if path.exists():
+            for block in re.findall(r"```py(?:thon)?[^\n]*\n(.*?)```", path.read_text(encoding="utf-8"), re.DOTALL):
+                yield path.name, block
+
+
+def test_examples_and_pages_import_the_package_alone() -> None:
+    for where, code in shown_code():
+        for node in ast.walk(ast.parse(code)):
+            if isinstance(node, ast.Import):
+                inside = [name.name for name in node.names if name.name.startswith("imutool.")]
+                assert not inside, f"{where} imports {inside}"
+            elif isinstance(node, ast.ImportFrom):
+                assert (node.module or "").partition(".")[0] != "imutool" or node.module == "imutool", f"{where}: {node.module}"
+            elif isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name) and node.value.id == "imutool":
+                assert node.attr in imutool.__all__, f"{where} uses imutool.{node.attr}"
