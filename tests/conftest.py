@@ -14,9 +14,11 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from filelock import FileLock
 from hypothesis import settings
 from jaxtyping import install_import_hook
 
+os.environ["COLUMNS"] = "80"  # the width of the commands' tables, which are made at import
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # as the command does: idle threads must not spin while others test
 
 # a shell starts background jobs with SIGINT ignored, and they pass that on: the tests of Ctrl-C would test nothing
@@ -49,11 +51,18 @@ def command() -> str:
 
 @pytest.fixture(scope="session")
 def imutool(command: str) -> Callable[..., subprocess.CompletedProcess[str]]:
-    """Runs the installed command in a folder of its own and returns what it printed and its exit code."""
+    """Runs the command line in a folder and returns what it printed and its exit code.
 
-    def run(*words: str | Path, cwd: Path, **options: object) -> subprocess.CompletedProcess[str]:
-        line = [command, *map(str, words)]
+    In this process, but for what is about processes: `apart=True`, limits, and fleets, whose workers are processes too.
+    """
+
+    def run(*words: str | Path, cwd: Path, apart: bool = False, **options: object) -> subprocess.CompletedProcess[str]:
+        from support.in_process import run_command
+
         env = {**os.environ, "COLUMNS": "80", **options.pop("env", {})}  # type: ignore[dict-item]
+        line = [command, *map(str, words)]
+        if not (apart or options or words[:1] == ("fleet",) or env["COLUMNS"] != "80"):
+            return run_command(line[1:], cwd, env)
         return subprocess.run(
             line,
             cwd=cwd,
@@ -69,6 +78,21 @@ def imutool(command: str) -> Callable[..., subprocess.CompletedProcess[str]]:
     return run
 
 
+def made_once(factory: pytest.TempPathFactory, name: str, make: Callable[[Path], None]) -> Path:
+    """A folder that `make` fills once for all workers: who comes second waits and takes it as it is."""
+    if "PYTEST_XDIST_WORKER" not in os.environ:
+        folder = factory.mktemp(name)
+        make(folder)
+        return folder
+    folder = factory.getbasetemp().parent / name
+    with FileLock(f"{folder}.lock"):
+        if not (folder / ".made").exists():
+            folder.mkdir(exist_ok=True)
+            make(folder)
+            (folder / ".made").touch()
+    return folder
+
+
 @pytest.fixture(scope="session")
 def logs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with flight_1.mcap and flight_2.mcap (20 s, 200 Hz, 3 s at rest), linear.safetensors of the first."""
@@ -76,22 +100,25 @@ def logs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     from imutool.sensor.flight import flight
     from imutool.training.run import train
 
-    folder = tmp_path_factory.mktemp("logs")
-    for seed in (1, 2):
-        write(flight(seed, duration_s=20.0), folder / f"flight_{seed}.mcap")
-    train([folder / "flight_1.mcap"], folder / "linear.safetensors", method="linear")
-    return folder
+    def make(folder: Path) -> None:
+        for seed in (1, 2):
+            write(flight(seed, duration_s=20.0), folder / f"flight_{seed}.mcap")
+        train([folder / "flight_1.mcap"], folder / "linear.safetensors", method="linear")
+
+    return made_once(tmp_path_factory, "logs", make)
 
 
 @pytest.fixture(scope="session")
 def demonstration(tmp_path_factory: pytest.TempPathFactory, imutool: Callable[..., subprocess.CompletedProcess[str]]) -> Path:
     """The folder in which `imutool demo -o demo-out` ran (once for all tests: it trains), its report in `report.json`."""
-    folder = tmp_path_factory.mktemp("demo")
-    done = imutool("demo", "-o", "demo-out", "--json", "report.json", cwd=folder)
-    assert done.returncode == 0, done.stderr
-    (folder / "stdout.txt").write_text(done.stdout)
-    (folder / "stderr.txt").write_text(done.stderr)
-    return folder
+
+    def make(folder: Path) -> None:
+        done = imutool("demo", "-o", "demo-out", "--json", "report.json", cwd=folder, apart=True)
+        assert done.returncode == 0, done.stderr
+        (folder / "stdout.txt").write_text(done.stdout)
+        (folder / "stderr.txt").write_text(done.stderr)
+
+    return made_once(tmp_path_factory, "demo", make)
 
 
 @pytest.fixture(scope="session")
