@@ -70,7 +70,8 @@ def test_the_architecture_names_files_that_exist() -> None:
     text = (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8")
     named = PATH_IN_TEXT.findall(text)
     assert len(named) > 40
-    assert [path for path in named if not (ROOT / path).exists()] == []
+    missing = [path for path in named if "NAME" not in path and not (ROOT / path).exists()]
+    assert missing == []
 
 
 def test_the_architecture_names_every_room() -> None:
