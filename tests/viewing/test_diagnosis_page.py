@@ -6,7 +6,6 @@ import os
 import re
 import sys
 from collections.abc import Iterator
-from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -15,6 +14,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from support import diagnoses, markup
+from support.diagnoses import replace
 
 from imutool.diagnosis.result import Closer, SignalTraces
 from imutool.diagnosis.wording import conclusion
