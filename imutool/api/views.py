@@ -20,7 +20,7 @@ from imutool.viewing.model.output import Output
 from imutool.viewing.model.run_data import RunData
 from imutool.viewing.model.runs import load
 from imutool.viewing.model.trajectory_error import ALIGNMENTS, Alignment
-from imutool.viewing.outputs import Asked, Outputs
+from imutool.viewing.outputs import Outputs, RequestedOutputs
 from imutool.viewing.rerun import live
 
 
@@ -132,7 +132,7 @@ def view(
     several = logs if isinstance(logs, Sequence) and not isinstance(logs, str) else [logs]
     paths = [None if path is None else Path(path) for path in (save, export_web, png, html)]
     cursor = None if at is None else str(at)
-    asked = Asked(paths[0], connect, web, port, paths[1], paths[2], paths[3], cursor, source, overwrite)
+    asked = RequestedOutputs(paths[0], connect, web, port, paths[1], paths[2], paths[3], cursor, source, overwrite)
     with Outputs(asked) as outputs:
         shown = outputs.show([one if isinstance(one, RunData) else load_run(one, **options) for one in several])
         if outputs.refused is not None:
@@ -232,5 +232,5 @@ def watch(
         1
     """
     file, instead = None if save is None else Path(save), Path(f"{name}.rrd")
-    with live.watching(name, connect_to=connect, save=file, instead=instead, overwrite=overwrite) as show:
+    with live.live_view(name, connect_to=connect, save=file, instead=instead, overwrite=overwrite) as show:
         yield LiveView(topic, show)

@@ -90,9 +90,9 @@ def debias(
     refuse_smooth(init, smooth)
     refuse_unknown(verify)
     if pages:
-        from imutool.viewing.html.drawing import library
+        from imutool.viewing.html.drawing import require_matplotlib
 
-        library()
+        require_matplotlib()
     return settled(Settings(command="debias", model=model, init=init, smooth=smooth, clean=clean, check=verify, pages=pages))
 
 

@@ -80,7 +80,7 @@ def _slow(left: Float64[np.ndarray, "n 6"]) -> Float64[np.ndarray, "n 6"]:
 
 def _variables(pair: Pair) -> dict[str, tuple[str, Float64[np.ndarray, " n"]]]:
     """What a regime can be of."""
-    read = pair.felt.taken(pair.stamp_s, pair.stamp_s)
+    read = pair.felt.sample(pair.stamp_s, pair.stamp_s)
     rate, force = np.linalg.norm(read.gyro, axis=1), np.linalg.norm(read.accel, axis=1)
     out = {
         "angular rate": ("rad/s", rate),

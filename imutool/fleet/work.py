@@ -173,16 +173,16 @@ def _debias(job: _Job) -> dict[str, Any]:
 def _page(job: _Job, topics: Sequence[str], warnings: tuple[str, ...]) -> dict[str, Any]:
     """Writes a page about a debiased log beside it. A log that cannot be drawn is whole all the same, and is warned of."""
     from imutool.viewing.html import report
-    from imutool.viewing.html.page import is_ours
+    from imutool.viewing.html.page import is_imutool_page
     from imutool.viewing.html.report_wording import conclusion
     from imutool.viewing.model.runs import load
 
     path = job.target.with_name(page_name(job.target.name))
     try:
-        if path.exists() and not is_ours(path):
+        if path.exists() and not is_imutool_page(path):
             raise ConfigError("the page exists, and no fleet has written it", where=path, fix="Move it, or choose another OUT")
         logs = [load(job.target, imu=topic) for topic in topics]
-        report.write_page(report.by_topic(logs, topics), path, overwrite=True)
+        report.write_page(report.name_by_topic(logs, topics), path, overwrite=True)
     except ImutoolError as error:
         return {"warnings": (*warnings, f"no page: {error}")}
     return {"page": page_name(job.name), "page_says": conclusion(logs[0])[:MOST_LETTERS]}

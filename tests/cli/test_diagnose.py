@@ -28,7 +28,7 @@ from imutool.report import json_values
 from imutool.sensor import physics_file
 from imutool.sensor.flight import flight
 from imutool.sensor.physics_file import Bias, Entry, PhysicsFile, Value
-from imutool.sensor.readings import SensorSamples
+from imutool.sensor.samples import SensorSamples
 from imutool.sensor.simulate import simulate
 from imutool.units import AXES
 

@@ -12,7 +12,7 @@ from scipy.stats import binom
 from imutool.diagnosis.estimation.alignment import Pair
 from imutool.diagnosis.result import Estimate, Finding, HeldOut
 from imutool.sensor.effect import Effect, Parameter, Stage, Theta
-from imutool.sensor.readings import IdealMotion, SensorSamples
+from imutool.sensor.samples import IdealMotion, SensorSamples
 from imutool.units import ASCII_UNITS, SENSORS, UNITS, Sensor
 
 MEDIAN, FEW = 15, 500  # samples: of a running median, and to find a period by first
@@ -198,7 +198,7 @@ class _Clip:
     def __call__(self, read: SensorSamples, theta: Theta) -> SensorSamples:
         x = read.gyro if self.sensor == 0 else read.accel
         out = np.clip(x + self.bias, -theta[0], theta[0]) - self.bias
-        return read.but(gyro=out) if self.sensor == 0 else read.but(accel=out)
+        return read.with_readings(gyro=out) if self.sensor == 0 else read.with_readings(accel=out)
 
 
 class _Starts:
