@@ -24,7 +24,7 @@ from imutool.fleet.sources import leftovers, remove, within
 from imutool.fleet.task import Imu, Parameter, Result, Settings, Task
 from imutool.location import Location, identity, to_location
 from imutool.mcap_io.log import Log
-from imutool.mcap_io.storage.digest import sha256
+from imutool.mcap_io.storage.source import sha256
 from imutool.mcap_io.storage.target import Target
 from imutool.report import json_values
 
