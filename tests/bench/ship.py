@@ -21,8 +21,8 @@ METHODS = ("linear", "conv", "neural_ode", "hybrid")
 MOST_BYTES = 2_000_000
 COMMAND = "imutool train {logs} -o {name}.safetensors --method {method} --seed {seed}"
 LIMITS = (
-    "This is the calibration of one unit: another sensor of the same type has another scale, misalignment and turn-on bias. It was "
-    "trained and tested indoors, on runs of one to three minutes, at laboratory temperatures."
+    "This is the calibration of one unit: another sensor of the same type has another scale, misalignment and turn-on bias. It "
+    "was trained and tested indoors, on runs of one to three minutes, at laboratory temperatures."
 )
 
 
