@@ -7,7 +7,7 @@ Three clocks meet here. `t_s` is even and belongs to the motion; effects of the 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from types import MappingProxyType
@@ -18,7 +18,9 @@ from scipy.ndimage import spline_filter1d
 from scipy.sparse import csr_array
 
 from imutool.errors import DataError
+from imutool.recording import Recording, seconds
 from imutool.sensor.signals import FILTERED, SignalFilter, Signals
+from imutool.units import AXES, Sensor
 
 Vectors = Float64[np.ndarray, "n 3"]
 Columns = Float64[np.ndarray, "_ _"]
@@ -158,7 +160,7 @@ class IdealMotion:
         """Of the even clock."""
         return float((len(self.t_s) - 1) / (self.t_s[-1] - self.t_s[0]))
 
-    def taken(self, taken_s: Float64[np.ndarray, " m"], stamp_s: Float64[np.ndarray, " m"]) -> SensorSamples:
+    def sample(self, taken_s: Float64[np.ndarray, " m"], stamp_s: Float64[np.ndarray, " m"]) -> SensorSamples:
         """What is felt at other times (cubic splines; held beyond the ends), one row a sample.
 
         Raises:
@@ -191,7 +193,39 @@ class SensorSamples:
         rate_hz = (len(self.stamp_s) - 1) / (self.stamp_s[-1] - self.stamp_s[0])
         return SignalFilter(float(rate_hz), FILTERED.stop)(self.stamp_s, self.gyro, self.accel)
 
-    def but(self, gyro: Vectors | None = None, accel: Vectors | None = None) -> SensorSamples:
+    @classmethod
+    def joined(cls, parts: Sequence[SensorSamples]) -> SensorSamples:
+        """Several stretches end to end; the attitude only where all of them have one."""
+        attitudes = [part.R_wb for part in parts if part.R_wb is not None]
+        return cls(
+            np.concatenate([part.stamp_s for part in parts]),
+            np.concatenate([part.gyro for part in parts]),
+            np.concatenate([part.accel for part in parts]),
+            np.concatenate([part.alpha for part in parts]),
+            np.concatenate(attitudes) if len(attitudes) == len(parts) else None,
+            {name: np.concatenate([part.channels[name] for part in parts]) for name in parts[0].channels},
+        )
+
+    def with_readings(self, gyro: Vectors | None = None, accel: Vectors | None = None) -> SensorSamples:
         """With one of the sensors, or both, reading something else."""
         kept = self.gyro if gyro is None else gyro, self.accel if accel is None else accel
         return SensorSamples(self.stamp_s, *kept, self.alpha, self.R_wb, self.channels)
+
+    def with_added(self, sensor: Sensor, added: Vectors) -> SensorSamples:
+        """The samples with something added to one sensor."""
+        if sensor == "gyro":
+            return self.with_readings(gyro=self.gyro + added)
+        return self.with_readings(accel=self.accel + added)
+
+
+def channels_at(
+    recording: Recording, t_s: Times, start_ns: int, least_messages: int = 1
+) -> dict[str, Float64[np.ndarray, " n"]]:
+    """Scalar channels of a log at seconds from `start_ns`: linear between messages, by topic or `topic.x`."""
+    out = {}
+    for topic, scalars in recording.scalars.items():
+        if len(scalars) >= least_messages:
+            own_s, width = seconds(scalars.t_ns, start_ns), scalars.values.shape[1]
+            for axis, column in zip(AXES, scalars.values.T, strict=False):
+                out[topic if width == 1 else f"{topic}.{axis}"] = np.interp(t_s, own_s, column)
+    return out

@@ -18,23 +18,24 @@ import numpy as np
 from jaxtyping import Float64, Int64
 
 from imutool.errors import ConfigError, DataError, ImutoolError, LogError
-from imutool.mcap_io.batches import PoseBatch
 from imutool.mcap_io.log import Log
 from imutool.mcap_io.read import read as read_log
+from imutool.mcap_io.topics import PoseBatch
 from imutool.mcap_io.write import write
 from imutool.noise import datasheet as noises
-from imutool.recording import Imu, Poses, Recording, seconds, unit_quaternions
+from imutool.recording import Imu, Poses, Recording, unit_quaternions
 from imutool.sensor import physics_file
-from imutool.sensor.effect import Acting, Effect, Stage, Theta, distort
-from imutool.sensor.physics_file import DRIVEN, PhysicsFile
-from imutool.sensor.samples import IdealMotion, SensorSamples
-from imutool.sensor.trajectory import Smoothed, smooth_motion
+from imutool.sensor.effect import Acting, Effect, Stage, Theta, simulate_stretches
+from imutool.sensor.physics_file import PhysicsFile
+from imutool.sensor.samples import IdealMotion, SensorSamples, channels_at
+from imutool.sensor.trajectory import SmoothMotion, smooth_motion
+from imutool.sensor.unnamed_effects import DRIVEN
 
 SCHEMA = "imutool.simulation/1"
 RATE_HZ = 200.0  # of a trajectory without an IMU
 SLOWEST_HZ, FASTEST_HZ = 10.0, 4000.0
 LEAST_S = 2.0  # of trusted motion
-FELT_HZ = 400.0  # of the motion's clock, at least: filters and shifts act on it before samples are taken
+MOTION_HZ = 400.0  # of the motion's clock, at least: filters and shifts act on it before samples are taken
 MOTION_TOPIC = "/motion/pose"  # the exact motion of the samples, beside the truth that it was smoothed from
 TRUTH_TOPIC = "/ground_truth/pose"
 NOISE = "~noise"  # within the stage SENSOR effects act by name: behind all, and before the converter
@@ -47,7 +48,7 @@ class Simulation:
     """The recording, the motion it was made from, and what was done."""
 
     recording: Recording
-    motion: Smoothed
+    motion: SmoothMotion
     settings: Mapping[str, Any]
     remarks: tuple[str, ...]
 
@@ -136,9 +137,9 @@ def simulated(source: Recording, acting: Acting, noise: noises.Noise, rate_hz: f
         DataError: no poses, less than 2 s of the motion can be trusted, an effect lacks a channel.
     """
     if not SLOWEST_HZ <= rate_hz <= FASTEST_HZ:
-        raise ConfigError(f"a rate of {rate_hz:g} Hz", where="--rate", expected=f"{SLOWEST_HZ:g} to {FASTEST_HZ:g} Hz")
+        raise ConfigError(f"a rate of {rate_hz:g} Hz", where="rate_hz", expected=f"{SLOWEST_HZ:g} to {FASTEST_HZ:g} Hz")
     if seed < 0:
-        raise ConfigError(f"seed {seed} is negative", where="--seed", expected="0 or more")
+        raise ConfigError(f"seed {seed} is negative", where="seed", expected="0 or more")
     motion = smooth_motion(source.truth)
     if motion.duration_s < LEAST_S:
         raise DataError(
@@ -147,21 +148,23 @@ def simulated(source: Recording, acting: Acting, noise: noises.Noise, rate_hz: f
             fix="Give a longer trajectory",
         )
     remarks = _remarks(motion, source.truth, noise)
-    felts = motion.felt(rate_hz * max(1, int(np.ceil(FELT_HZ / rate_hz))))
+    ideals = motion.ideal_motions(rate_hz * max(1, int(np.ceil(MOTION_HZ / rate_hz))))
     needed = any(physics.needs or physics.name == DRIVEN for physics, _ in acting)
     if needed:
-        felts = [replace(felt, channels=_channels(source, motion.start_ns, felt.t_s)) for felt in felts]
-    stamps = [_stamps(felt, rate_hz) for felt in felts]
+        ideals = [replace(ideal, channels=channels_at(source, ideal.t_s, motion.start_ns)) for ideal in ideals]
+    stamps = [_stamps(ideal, rate_hz) for ideal in ideals]
     begins_s = float(stamps[0][0])  # effects count time from the first sample that is written
-    since = [replace(felt, t_s=felt.t_s - begins_s) for felt in felts]
-    out = read_all(since, [part - begins_s for part in stamps], [*acting, (_noise(noise, rate_hz, seed), np.zeros(0))])
+    since = [replace(ideal, t_s=ideal.t_s - begins_s) for ideal in ideals]
+    out = simulate_stretches(
+        since, [part - begins_s for part in stamps], [*acting, (_noise(noise, rate_hz, seed), np.zeros(0))]
+    )
     imu = Imu(_nanoseconds(motion, out.stamp_s + begins_s), out.gyro, out.accel)
     inside = motion.covers(source.truth.t_ns)
     return Simulation(
         Recording(
             name=source.name,
             imu=imu,
-            truths={TRUTH_TOPIC: source.truth.rows(inside), MOTION_TOPIC: _exact(motion, felts, stamps)},
+            truths={TRUTH_TOPIC: source.truth.rows(inside), MOTION_TOPIC: _exact(motion, ideals, stamps)},
             scalars=dict(source.scalars) if needed else {},
             source=source.source,
         ),
@@ -171,54 +174,17 @@ def simulated(source: Recording, acting: Acting, noise: noises.Noise, rate_hz: f
     )
 
 
-def read_all(felts: Sequence[IdealMotion], stamps: Sequence[Float64[np.ndarray, " _"]], acting: Acting) -> SensorSamples:
-    """What a sensor with these effects reads over several stretches of one motion.
-
-    As `_forward.read`, but clock and sensor know of no stretches: a drift goes on from one to the next, a clock jumps once.
-    """
-    order = sorted(acting, key=lambda pair: (pair[0].stage, pair[0].name))
-    for physics, theta in order:
-        if physics.stage < Stage.CLOCK:
-            felts = [physics.forward(felt, theta) for felt in felts]
-    stamp_s = np.concatenate(stamps)
-    taken_s, piece = stamp_s, np.repeat(np.arange(len(felts)), [len(part) for part in stamps])
-    for physics, theta in order:
-        if physics.stage == Stage.CLOCK:
-            taken_s = physics.forward(taken_s, theta)
-    parts = []
-    for k, felt in enumerate(felts):
-        rows = (piece == k) & (taken_s >= felt.t_s[0]) & (taken_s <= felt.t_s[-1])
-        if rows.any():
-            parts.append(felt.taken(taken_s[rows], stamp_s[rows]))
-    if not parts:
-        raise DataError("the clock takes every sample outside the motion", expected="a smaller offset")
-    return distort(_joined(parts), acting)
-
-
-def _joined(parts: Sequence[SensorSamples]) -> SensorSamples:
-    channels = {name: np.concatenate([part.channels[name] for part in parts]) for name in parts[0].channels}
-    attitudes = [part.R_wb for part in parts if part.R_wb is not None]
-    return SensorSamples(
-        np.concatenate([part.stamp_s for part in parts]),
-        np.concatenate([part.gyro for part in parts]),
-        np.concatenate([part.accel for part in parts]),
-        np.concatenate([part.alpha for part in parts]),
-        np.concatenate(attitudes) if len(attitudes) == len(parts) else None,
-        channels,
-    )
-
-
-def _stamps(felt: IdealMotion, rate_hz: float) -> Float64[np.ndarray, " m"]:
+def _stamps(ideal: IdealMotion, rate_hz: float) -> Float64[np.ndarray, " m"]:
     """Whole periods since the first pose, within a stretch."""
-    first, last = np.ceil(felt.t_s[0] * rate_hz - 1e-6), np.floor(felt.t_s[-1] * rate_hz + 1e-6)
+    first, last = np.ceil(ideal.t_s[0] * rate_hz - 1e-6), np.floor(ideal.t_s[-1] * rate_hz + 1e-6)
     return np.asarray(np.arange(first, last + 1.0) / rate_hz)
 
 
-def _exact(motion: Smoothed, felts: Sequence[IdealMotion], stamps: Sequence[Float64[np.ndarray, " _"]]) -> Poses:
+def _exact(motion: SmoothMotion, ideals: Sequence[IdealMotion], stamps: Sequence[Float64[np.ndarray, " _"]]) -> Poses:
     """The motion at the samples, with its velocity."""
     parts = []
     for stretch in motion.stretches:
-        own = [s for s, felt in zip(stamps, felts, strict=True) if stretch.start_s <= felt.t_s[0] <= stretch.end_s]
+        own = [s for s, ideal in zip(stamps, ideals, strict=True) if stretch.start_s <= ideal.t_s[0] <= stretch.end_s]
         parts += [stretch.trajectory.poses(_nanoseconds(motion, stamp_s)) for stamp_s in own]
     velocities = [part.v_w for part in parts if part.v_w is not None]
     return Poses(
@@ -229,7 +195,7 @@ def _exact(motion: Smoothed, felts: Sequence[IdealMotion], stamps: Sequence[Floa
     )
 
 
-def _nanoseconds(motion: Smoothed, stamp_s: Float64[np.ndarray, " m"]) -> Int64[np.ndarray, " m"]:
+def _nanoseconds(motion: SmoothMotion, stamp_s: Float64[np.ndarray, " m"]) -> Int64[np.ndarray, " m"]:
     return np.asarray(motion.start_ns + np.round(stamp_s * 1e9).astype(np.int64))
 
 
@@ -244,12 +210,12 @@ def _noise(noise: noises.Noise, rate_hz: float, seed: int) -> Effect:
             white, walk = (np.random.default_rng([seed, k, kind]).normal(size=values.shape) for kind in (0, 1))
             bias = np.cumsum(known[f"{name}_walk"] * np.sqrt(np.abs(dt)) * walk, axis=0)
             out.append(values + known[f"{name}_density"] * np.sqrt(rate_hz) * white + bias)
-        return read.but(*out)
+        return read.with_readings(*out)
 
     return Effect(NOISE, Stage.SENSOR, ("gyro", "accel"), "+ n + b(t)", (), "always", forward)
 
 
-def _remarks(motion: Smoothed, poses: Poses, noise: noises.Noise) -> tuple[str, ...]:
+def _remarks(motion: SmoothMotion, poses: Poses, noise: noises.Noise) -> tuple[str, ...]:
     said = []
     left_out = poses.duration_s - motion.duration_s
     if left_out > 0.05 * poses.duration_s:
@@ -260,17 +226,6 @@ def _remarks(motion: Smoothed, poses: Poses, noise: noises.Noise) -> tuple[str, 
     if lacking := [name for name in kinds if np.isnan(noise.values(name)).any()]:
         said.append(f"{', '.join(lacking)} not known in the noise file, and not simulated")
     return tuple(said)
-
-
-def _channels(recording: Recording, start_ns: int, t_s: Float64[np.ndarray, " n"]) -> dict[str, Float64[np.ndarray, " n"]]:
-    """Other numbers of the log, straight between its messages, by topic, those of a vector by `topic.x`."""
-    out = {}
-    for topic, scalars in recording.scalars.items():
-        if len(scalars):
-            own_s, width = seconds(scalars.t_ns, start_ns), scalars.values.shape[1]
-            for k, column in enumerate(scalars.values.T):
-                out[topic if width == 1 else f"{topic}.{'xyz'[k]}"] = np.interp(t_s, own_s, column)
-    return out
 
 
 def _rounded(rate_hz: float) -> float:
@@ -304,7 +259,7 @@ def _without_imu(log: Log, truth: str | None) -> Recording:
         frames = {child: parts for child, parts in frames.items() if name == f"{topic}/{child}"}
     if len(frames) != 1:
         listed = ", ".join(f"{topic}/{child}" for child in frames) or "(none)"
-        raise LogError(f"{len(frames)} bodies on {name}", where=log.path, expected="one", fix=f"Choose --truth out of {listed}")
+        raise LogError(f"{len(frames)} bodies on {name}", where=log.path, expected="one", fix=f"Choose `truth` out of {listed}")
     (parts,) = frames.values()
     t_ns, p_wb, q_wb = (np.concatenate([part[k] for part in parts]) for k in (3, 4, 5))
     with log.named(topic):

@@ -79,7 +79,7 @@ class Stretch:
 
 
 @dataclass(frozen=True, eq=False)
-class Smoothed:
+class SmoothMotion:
     """The stretches of a motion, time counted from `start_ns`; poses dropped as glitches, and steps that were levelled."""
 
     start_ns: int
@@ -110,7 +110,7 @@ class Smoothed:
         t_s = seconds(t_ns, self.start_ns)
         return np.asarray(np.any([(t_s >= one.start_s) & (t_s <= one.end_s) for one in self.stretches], axis=0))
 
-    def felt(self, rate_hz: float, g_w: Float[np.ndarray, "3"] = G_W) -> list[IdealMotion]:
+    def ideal_motions(self, rate_hz: float, g_w: Float[np.ndarray, "3"] = G_W) -> list[IdealMotion]:
         """What the tracked point feels in each stretch, on the even clock k / rate of seconds from `start_ns`.
 
         A stretch too short for four samples of that clock is left out.
@@ -135,7 +135,7 @@ class Smoothed:
         return IdealMotion(t_s, motion.omega_b, motion.specific_force(g_w=g_w), motion.alpha_b, np.ascontiguousarray(R_wb))
 
 
-def smooth_motion(poses: Poses) -> Smoothed:
+def smooth_motion(poses: Poses) -> SmoothMotion:
     """The smooth motion behind some poses, and where it can be trusted.
 
     Position and quaternion are quintic splines, so that rate, angular acceleration and specific force follow in closed form
@@ -173,7 +173,7 @@ def smooth_motion(poses: Poses) -> Smoothed:
             f"no stretch of the {len(poses)} poses can be differentiated",
             expected=f"{LEAST_POSES} poses over {LEAST_S:g} s and more, without a hole of {MAX_GAP_S:g} s",
         )
-    return Smoothed(int(poses.t_ns[0]), tuple(stretches), glitches, steps)
+    return SmoothMotion(int(poses.t_ns[0]), tuple(stretches), glitches, steps)
 
 
 def _unbroken(t_s: Times) -> list[tuple[int, int]]:

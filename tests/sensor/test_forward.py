@@ -62,7 +62,7 @@ def ideal(one: Effect, felt: IdealMotion) -> IdealMotion | SensorSamples | np.nd
     """What an effect acts on."""
     if one.stage < Stage.CLOCK:
         return felt
-    return felt.t_s + 0.3 if one.stage == Stage.CLOCK else felt.taken(felt.t_s, felt.t_s)
+    return felt.t_s + 0.3 if one.stage == Stage.CLOCK else felt.sample(felt.t_s, felt.t_s)
 
 
 def numbers(of: IdealMotion | SensorSamples | np.ndarray) -> dict[str, np.ndarray]:
@@ -263,7 +263,7 @@ def test_a_line_is_found_to_a_fiftieth_of_a_turn() -> None:
     noise = 0.05 * np.random.default_rng(2).normal(size=(2, *felt.accel.shape))
     real = simulate_samples(felt, felt.t_s, [(one, theta)])
     assert one.starts is not None
-    start = one.starts(felt, real.but(gyro=real.gyro + 0.1 * noise[0], accel=real.accel + noise[1] + 0.1))[0]
+    start = one.starts(felt, real.with_readings(gyro=real.gyro + 0.1 * noise[0], accel=real.accel + noise[1] + 0.1))[0]
     assert abs(start[0] - theta[0]) * felt.t_s[-1] < 0.02
     np.testing.assert_allclose(start[1:7], theta[1:7], atol=0.03)
     np.testing.assert_allclose(start[7:], theta[7:], atol=0.003)
@@ -367,7 +367,7 @@ def test_a_jump_is_found_where_it_is() -> None:
     real = simulate_samples(felt, felt.t_s, [(one, truth), (only("clock_offset"), np.array([0.01]))])
     noise = 1e-3 * np.random.default_rng(5).normal(size=real.gyro.shape)
     assert one.starts is not None
-    start = one.starts(felt, real.but(gyro=real.gyro + noise + 0.1))[0]
+    start = one.starts(felt, real.with_readings(gyro=real.gyro + noise + 0.1))[0]
     assert np.all(np.abs(start - truth) < [0.05, 0.001])
 
 
@@ -376,7 +376,7 @@ def test_a_jump_is_found_where_it_is() -> None:
 
 @pytest.mark.parametrize("sensor", ["gyro", "accel"])
 def test_scale_misalignment_and_square_are_what_their_equations_say(sensor: str) -> None:
-    taken = lively().taken(clock() + 0.002, clock())
+    taken = lively().sample(clock() + 0.002, clock())
     x = getattr(taken, sensor)
     theta = np.array([0.01, -0.02, 0.03])
     close(getattr(act(f"{sensor}_scale", taken, *theta), sensor), x + theta * x)
@@ -387,14 +387,14 @@ def test_scale_misalignment_and_square_are_what_their_equations_say(sensor: str)
 
 
 def test_force_turns_a_gyro_by_its_sensitivity() -> None:
-    taken = still().taken(clock(1.0), clock(1.0))
+    taken = still().sample(clock(1.0), clock(1.0))
     g = np.arange(9.0) * 1e-3
     close(act("gyro_g_sensitivity", taken, *g).gyro, np.tile(G * g[2::3], (len(taken.gyro), 1)))
 
 
 @pytest.mark.parametrize("sensor", ["gyro", "accel"])
 def test_a_warm_up_reaches_what_its_time_constant_says(sensor: str) -> None:
-    taken = still(20.0).taken(clock(20.0), clock(20.0))
+    taken = still(20.0).sample(clock(20.0), clock(20.0))
     more = getattr(act(f"{sensor}_bias_drift", taken, 0.1, 0.2, -0.3, 4.0), sensor) - getattr(taken, sensor)
     close(more[0], np.zeros(3))
     close(more[round(4.0 * RATE_HZ)], (1.0 - math.exp(-1.0)) * np.array([0.1, 0.2, -0.3]))
@@ -404,7 +404,7 @@ def test_a_warm_up_reaches_what_its_time_constant_says(sensor: str) -> None:
 def test_a_warm_up_starts_with_its_amplitude_at_the_right_time_constant(sensor: str, A: float) -> None:
     felt, one = lively(90.0), only(f"{sensor}_bias_drift")
     real = simulate_samples(felt, felt.t_s, [(one, np.array([A, -A, 0.0, 30.0]))])
-    real = real.but(real.gyro + 0.1, real.accel - 0.2)
+    real = real.with_readings(real.gyro + 0.1, real.accel - 0.2)
     assert one.starts is not None
     close(one.starts(felt, real)[1], np.array([A, -A, 0.0, 30.0]), 1e-9)
 
@@ -423,7 +423,7 @@ def test_vibration_that_is_rectified_has_the_power_of_a_sine() -> None:
     """A sine of amplitude 3 has power 4.5, times the gain of what tells vibration from motion: 1 - g / (z - 1 + g)."""
     felt = still(10.0)
     felt = replace(felt, accel=felt.accel + [3.0, 0.0, 0.0] * np.sin(2.0 * np.pi * 40.0 * felt.t_s)[:, None])
-    taken = felt.taken(felt.t_s, felt.t_s)
+    taken = felt.sample(felt.t_s, felt.t_s)
     theta = np.zeros(18)
     theta[3], theta[9] = 1e-3, 1e-2  # gyro_yx, accel_xx
     out = act("vibration_rectification", taken, *theta)
@@ -464,7 +464,7 @@ def test_stages_act_in_their_order_whatever_the_order_given() -> None:
     for name in ("lever_arm", "mount_rotation", "low_pass"):
         now = act(name, now, *theta[name])
     assert isinstance(now, IdealMotion)
-    now = now.taken(stamp_s + 0.01, stamp_s)
+    now = now.sample(stamp_s + 0.01, stamp_s)
     for name in ("gyro_scale", "saturation", "quantization"):
         now = act(name, now, *theta[name])
     for order in (acting, acting[::-1]):
@@ -488,7 +488,7 @@ def test_sensed_is_the_part_behind_the_clock() -> None:
 def test_taken_is_the_signal_at_those_times(at: Callable[[np.ndarray], np.ndarray]) -> None:
     felt = replace(sine(2.0), channels={"/a.b": clock(20.0) ** 2})
     taken_s = at(felt.t_s)[100:-100]
-    out = felt.taken(taken_s, taken_s - 1.0)
+    out = felt.sample(taken_s, taken_s - 1.0)
     for values in (out.gyro, out.accel, out.alpha):
         close(values, np.tile(np.sin(4.0 * np.pi * taken_s)[:, None], (1, 3)), SPLINE)
     close(out.channels["/a.b"], taken_s**2, 1e-9)
@@ -497,7 +497,7 @@ def test_taken_is_the_signal_at_those_times(at: Callable[[np.ndarray], np.ndarra
 
 def test_beyond_the_ends_what_was_there_is_held() -> None:
     felt = lively()
-    out = felt.taken(np.array([-5.0, 99.0]), np.array([0.0, 1.0]))
+    out = felt.sample(np.array([-5.0, 99.0]), np.array([0.0, 1.0]))
     close(out.gyro, felt.gyro[[0, -1]])
     close(out.accel, felt.accel[[0, -1]])
 
@@ -508,7 +508,7 @@ def test_what_is_remembered_never_outlives_a_change() -> None:
     ways = [(felt, t), (fresh, t), (felt, t[:50]), (fresh, felt.t_s), (felt, felt.t_s), (felt, t), (fresh, t)]
     for one, taken_s in ways:
         alone = IdealMotion(one.t_s, one.gyro, one.accel, one.alpha, one.R_wb, one.channels)
-        seen, expected = one.taken(taken_s, taken_s), alone.taken(taken_s, taken_s)
+        seen, expected = one.sample(taken_s, taken_s), alone.sample(taken_s, taken_s)
         for name, value in numbers(expected).items():
             np.testing.assert_array_equal(numbers(seen)[name], value, err_msg=name)
 
@@ -518,4 +518,4 @@ def test_a_clock_that_is_not_even_is_refused() -> None:
     t_s = felt.t_s.copy()
     t_s[50:] += 0.004
     with pytest.raises(DataError, match=r"off in row 50|off in row 49"):
-        replace(felt, t_s=t_s).taken(felt.t_s + 0.001, felt.t_s)
+        replace(felt, t_s=t_s).sample(felt.t_s + 0.001, felt.t_s)

@@ -102,7 +102,7 @@ def test_kinematics_reads_what_its_sensors_read(runs: dict[str, Run], name: str)
 def test_a_smoothed_motion_feels_what_its_sensors_read(runs: dict[str, Run], name: str) -> None:
     run = runs[name]
     motion = smooth_motion(run.poses)
-    (felt,) = motion.felt(1.0 / (STEP_S * EACH))
+    (felt,) = motion.ideal_motions(1.0 / (STEP_S * EACH))
     rows = np.round(felt.t_s / (STEP_S * EACH)).astype(int)
     for ours, theirs, usual, worst in (
         (felt.gyro, run.gyro[rows], SMOOTH_GYRO, WORST_GYRO),

@@ -23,7 +23,7 @@ from imutool.inertial.kinematics import through
 from imutool.inertial.stationary import white_noise
 from imutool.inertial.strapdown import with_velocity
 from imutool.recording import Imu, Poses, Recording, seconds
-from imutool.sensor.samples import IdealMotion
+from imutool.sensor.samples import IdealMotion, channels_at
 
 LEAST_S = 8.0  # below, nothing can be learned and tested
 ALIGN_HZ = 100.0
@@ -123,16 +123,8 @@ def _pair(
 
 
 def _channels(recording: Recording, t_ns: np.ndarray) -> dict[str, Float64[np.ndarray, " n"]]:
-    """Every other number of a log at some times, linearly between its messages, by `topic.field`."""
-    out: dict[str, Float64[np.ndarray, " n"]] = {}
-    for topic, scalars in recording.scalars.items():
-        if len(scalars.t_ns) < 2:
-            continue
-        start = int(scalars.t_ns[0])
-        for k in range(scalars.values.shape[1]):
-            name = topic if scalars.values.shape[1] == 1 else f"{topic}.{'xyz'[k]}"
-            out[name] = np.interp(seconds(t_ns, start), seconds(scalars.t_ns, start), scalars.values[:, k])
-    return out
+    """Scalar channels of a log at some times; a single message is no course."""
+    return channels_at(recording, seconds(t_ns, int(t_ns[0])), int(t_ns[0]), least_messages=2)
 
 
 def _simulated(
@@ -177,7 +169,7 @@ def _by_poses(
     rows = (t_s >= felt.t_s[0]) & (t_s <= felt.t_s[-1])
     if rows.mean() < MOST_OF_IT:
         return None
-    read = felt.taken(t_s[rows], t_s[rows])
+    read = felt.sample(t_s[rows], t_s[rows])
     left = samples[rows] - np.concatenate([read.gyro, read.accel], axis=1)
     left = left - left.mean(axis=0)
     coarse = (

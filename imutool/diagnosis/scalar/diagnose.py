@@ -207,6 +207,8 @@ def _finding(pair: AlignedSignal, found: Selection, one: SelectedEffect, always:
         driver=effect.variable if effect.kind == "driven" else "",
         similar=one.similar,
         curve=_curve(found, one),
+        kind=effect.kind,
+        variable=effect.variable,
     )
 
 
@@ -220,7 +222,7 @@ def _curve(found: Selection, one: SelectedEffect) -> Curve | None:
     centred = basis - basis.mean(axis=0)
     place = found.whole.place(one.physics.key)
     band = np.sqrt(np.einsum("nq,qp,np->n", centred, found.whole.covariance[place, place], centred))
-    return Curve(forward.variable, forward.unit, x, (centred @ one.theta)[:, None], band[:, None])
+    return Curve.of_arrays(forward.variable, forward.unit, x, (centred @ one.theta)[:, None], band[:, None])
 
 
 def _located(pair: AlignedSignal, misfit: Samples, level: float, p_value: float) -> tuple[Located, ...]:
