@@ -16,11 +16,10 @@ from imutool.bias import static
 from imutool.bias.io import check_rate, find_model
 from imutool.bias.model import BiasModel
 from imutool.bias_start.bias_tracking import Samples
-from imutool.bias_start.initial_bias import InitialBias, NoRestError, find, over_all_rest
-from imutool.bias_start.initial_bias import smooth as smooth_rest
+from imutool.bias_start.initial_bias import InitialBias, NoRestError, find, over_all_rest, smoothed_start
 from imutool.cleaning import Survey, cleaned
 from imutool.errors import ConfigError, DataError, LogError, ModelError
-from imutool.inertial.stationary import Blocks, in_blocks, white_noise
+from imutool.inertial.stationary import Blocks, block_statistics, white_noise
 from imutool.location import Location
 from imutool.mcap_io.batches import ImuBatch
 from imutool.mcap_io.log import Log
@@ -37,7 +36,7 @@ def refuse_smooth(init: str, smooth: bool) -> None:
         ConfigError: it is asked for together with a start that is given.
     """
     if smooth and init != "auto":
-        raise ConfigError(f"--smooth with --init {init}", where="--smooth", expected="--init auto", fix="Give one of the two")
+        raise ConfigError(f"`smooth` with `init` {init}", where="smooth", expected="`init` auto", fix="Give one of the two")
 
 
 def prepare(
@@ -49,7 +48,7 @@ def prepare(
     if untrained and init == "auto" and not smooth:
         with Log(source) as log:
             batches = ((batch.stamp_ns, batch.gyro, batch.accel) for batch in _imu_batches(log, topic, found))
-            return _estimate(in_blocks(batches, head.imu.period_s), source)
+            return _estimate(block_statistics(batches, head.imu.period_s), source)
     rate_hz = 1.0 / head.imu.period_s
     model: BiasModel = static.Model() if name is None or untrained else find_model(name, rate_hz)
     if not untrained:
@@ -75,7 +74,7 @@ def smooth_in_memory(model: BiasModel, imu: Imu, where: str | Location) -> Initi
 
 def _smoothed(model: BiasModel, batches: Iterable[Samples], where: str | Location) -> InitialBias:
     try:
-        return smooth_rest(model, batches, str(where))
+        return smoothed_start(model, batches, str(where))
     except NoRestError as error:
         raise _nothing_known(where) from error
 
@@ -134,7 +133,7 @@ def estimate_at_rest(imu: Imu, where: str | Location) -> tuple[BiasModel, Initia
         DataError: fewer than two samples.
         ModelError: the log never rests.
     """
-    return _estimate(in_blocks([(imu.t_ns, imu.gyro, imu.accel)], imu.period_s), where)
+    return _estimate(block_statistics([(imu.t_ns, imu.gyro, imu.accel)], imu.period_s), where)
 
 
 def _estimate(blocks: Blocks, where: str | Location) -> tuple[BiasModel, InitialBias]:
@@ -149,6 +148,6 @@ def _nothing_known(where: str | Location) -> ModelError:
     return ModelError(
         "no model given, and the log holds no stretch at rest to measure a static bias on",
         where=where,
-        expected="--model, or at least 1.5 s without motion",
-        fix="Give --model (imutool models lists those that ship), or train one with imutool train",
+        expected="`model`, or at least 1.5 s without motion",
+        fix="Give `model` (imutool models lists those that ship), or train one with imutool train",
     )

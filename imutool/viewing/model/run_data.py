@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from imutool.errors import ConfigError, DataError
 from imutool.inertial.metrics import evaluate
-from imutool.inertial.strapdown import Start, dead_reckon, stretch_with_truth, with_velocity
+from imutool.inertial.strapdown import StartPose, dead_reckon, stretch_with_truth, with_velocity
 from imutool.recording import GAP_FACTOR, MIN_GAP_S, Imu, Poses, Recording, Scalars, Times, nanoseconds, seconds
 from imutool.viewing.model.decimate import MOST
 from imutool.viewing.model.events import Event, gathered, of_stops, of_worst
@@ -194,7 +194,7 @@ def build(
     )
 
 
-def level_start(imu: Imu) -> Start:
+def level_start(imu: Imu) -> StartPose:
     """The start at the origin, at rest, heading zero, with roll and pitch that make the first specific force point up.
 
     roll = atan2(f_y, f_z), pitch = atan2(-f_x, hypot(f_y, f_z)): exact if the IMU does not accelerate in that time.
@@ -202,7 +202,7 @@ def level_start(imu: Imu) -> Start:
     first = imu.between(int(imu.t_ns[0]), int(imu.t_ns[0]) + nanoseconds(LEVELLING_S))
     f_x, f_y, f_z = first.accel.mean(axis=0)
     level = Rotation.from_euler("ZYX", [0.0, np.arctan2(-f_x, np.hypot(f_y, f_z)), np.arctan2(f_y, f_z)])
-    return Start(level.as_quat(scalar_first=True), np.zeros(3), np.zeros(3))
+    return StartPose(level.as_quat(scalar_first=True), np.zeros(3), np.zeros(3))
 
 
 def stretches(poses: Poses) -> list[Poses]:
@@ -250,7 +250,7 @@ class Known(NamedTuple):
 def _score(run: Run, known: Known, align: Alignment) -> tuple[Trace, str]:
     """One run, and how it was aligned (nothing where it was not)."""
     rows, true, valid = known
-    path = dead_reckon(run.imu.rows(rows), Start.of(true))
+    path = dead_reckon(run.imu.rows(rows), StartPose.of(true))
     moved, motion = aligned(path, true, valid, align)
     of_truth = (
         drift_since_reset(path, true, valid),
