@@ -18,7 +18,7 @@ from imutool.errors import ConfigError, DataError
 from imutool.geometry import so3
 from imutool.inertial.windows import rotation_residual
 from imutool.mcap_io.read import read
-from imutool.mcap_io.storage.digest import sha256
+from imutool.mcap_io.storage.source import sha256
 from imutool.recording import Recording
 from imutool.training import checkpoint
 from imutool.training.fit import Epoch, Training, check_device
