@@ -76,9 +76,9 @@ def _leave(lost: bool) -> NoReturn:
 def _write_noise(found: Identified, plot: Path | None, toml: Path | None, overwrite: bool) -> None:
     """The files that were asked for."""
     if plot is not None:
-        from imutool.viewing.html.allan_plot import deviations
+        from imutool.viewing.html.allan_plot import write_png
 
-        deviations(found, plot, overwrite=overwrite)
+        write_png(found, plot, overwrite=overwrite)
     if toml is not None:
         from imutool.noise.datasheet import write
 

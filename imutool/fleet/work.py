@@ -19,14 +19,14 @@ from typing import Any
 import msgspec
 
 from imutool.cleaning import UntrustedError
-from imutool.diagnosis_output import plain
 from imutool.errors import ConfigError, ImutoolError, LogError, ModelError
 from imutool.fleet.sources import leftovers, remove, within
 from imutool.fleet.task import Imu, Parameter, Result, Settings, Task
 from imutool.location import Location, identity, to_location
 from imutool.mcap_io.log import Log
-from imutool.mcap_io.storage.digest import sha256
+from imutool.mcap_io.storage.source import sha256
 from imutool.mcap_io.storage.target import Target
+from imutool.report import json_values
 
 LOST = 3  # exit code: something of the log was lost
 MOST_LOSSES = 20  # stretches told of a log; its metadata and its repair tell all
@@ -173,16 +173,16 @@ def _debias(job: _Job) -> dict[str, Any]:
 def _page(job: _Job, topics: Sequence[str], warnings: tuple[str, ...]) -> dict[str, Any]:
     """Writes a page about a debiased log beside it. A log that cannot be drawn is whole all the same, and is warned of."""
     from imutool.viewing.html import report
-    from imutool.viewing.html.page import is_ours
+    from imutool.viewing.html.page import is_imutool_page
     from imutool.viewing.html.report_wording import conclusion
     from imutool.viewing.model.runs import load
 
     path = job.target.with_name(page_name(job.target.name))
     try:
-        if path.exists() and not is_ours(path):
+        if path.exists() and not is_imutool_page(path):
             raise ConfigError("the page exists, and no fleet has written it", where=path, fix="Move it, or choose another OUT")
         logs = [load(job.target, imu=topic) for topic in topics]
-        report.write_page(report.by_topic(logs, topics), path, overwrite=True)
+        report.write_page(report.name_by_topic(logs, topics), path, overwrite=True)
     except ImutoolError as error:
         return {"warnings": (*warnings, f"no page: {error}")}
     return {"page": page_name(job.name), "page_says": conclusion(logs[0])[:MOST_LETTERS]}
@@ -241,7 +241,7 @@ def _diagnose(job: _Job) -> dict[str, Any]:
     report["parameters"] = [msgspec.to_builtins(one) for one in parameters]
     if not s.quick:
         found = diagnose([job.source], sim, imu=s.imu, truth=s.truth)
-        report["diagnosis"] = plain(found)
+        report["diagnosis"] = json_values(found.report)
         told["effects"] = tuple(one.effect for one in found.findings)
         told["warnings"] = found.remarks
     write_json(report, job.target)

@@ -16,7 +16,7 @@ from imutool.bias.model import BiasModel
 from imutool.config import plain
 from imutool.errors import ConfigError
 from imutool.mcap_io.read import read
-from imutool.mcap_io.storage.digest import sha256
+from imutool.mcap_io.storage.source import sha256
 from imutool.recording import Recording
 from imutool.training import checkpoint, checks
 from imutool.training.fit import Epoch, Training
