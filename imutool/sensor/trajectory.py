@@ -230,7 +230,7 @@ def _stretch(start_ns: int, t_s: Times, position: Penalised, rotation: Penalised
 def _levelled(t_s: Times, y: Values) -> tuple[Values, int]:
     """Positions with steps between two samples spread over seconds; and the number of steps.
 
-    A step is a difference that its neighbours' (through a cubic) do not explain. Its size is that of a cubic with a step that is
+    A step is a difference that its neighbours' (through a cubic) do not explain. Its size is that of a cubic with a step
     fitted to the samples around it. Steps that soon go back are a glitch, and stay.
     """
     at = _steps(t_s, y)
