@@ -129,8 +129,8 @@ def simulate(
 def simulated(source: Recording, acting: Acting, noise: noises.Noise, rate_hz: float, seed: int) -> Simulation:
     """Simulated IMU along the (first) true poses of a recording, on a regular clock.
 
-    Samples cover every trusted stretch. Stamps are whole periods after the first pose, on the poses' clock;
-    samples that an effect of the clock takes outside a stretch are left out. The true poses in a stretch are copied as they are;
+    Samples cover every trusted stretch. Stamps are whole periods after the first pose, on the poses' clock. Samples that an
+    effect of the clock takes outside a stretch are left out. The true poses in a stretch are copied as they are;
     `/motion/pose` holds the motion itself.
 
     Raises:
