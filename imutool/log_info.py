@@ -25,11 +25,12 @@ from imutool.cleaning.rules.units import (
     spread,
 )
 from imutool.errors import LogError
-from imutool.inertial.stationary import stretches
+from imutool.inertial.stationary import rest_stretches
 from imutool.location import Location
 from imutool.mcap_io.codec import schemas
 from imutool.mcap_io.codec.decode import decode_imu
 from imutool.mcap_io.log import Log
+from imutool.mcap_io.recovery.recovered_log import RecoveredLog
 from imutool.mcap_io.topics import DERIVED_KEY, ENCODINGS, Topic
 from imutool.recording import GAP_FACTOR, GRAVITY_M_S2, MIN_GAP_S, Imu, nanoseconds, seconds
 
@@ -43,7 +44,7 @@ Report = dict[str, Any]
 def inspect(path: Location, *, check: bool = True) -> Report:
     """Everything `imutool info` says about a log, as plain JSON values (schema `imutool.info/1`).
 
-    A damaged log is described by what of it is sound, and `losses` says what is not (`mcap_io.losses.Losses.plain`). For that
+    A damaged log is described by what of it is sound, and `losses` says what is not (`recovery.losses`). For that
     every chunk is read once; without `check` only those with IMU messages are, and damage elsewhere may go unnoticed.
 
     `rate_hz` is one over the median period, so that drop-outs do not lower it; `jitter_s` is the standard deviation of
@@ -53,8 +54,7 @@ def inspect(path: Location, *, check: bool = True) -> Report:
         ConfigError: the file cannot be opened.
         LogError: it is no MCAP log, or nothing in it is sound.
     """
-    with Log(path, salvage=True) as log:
-        assert log.losses is not None, "with salvage there are losses, if perhaps none"
+    with RecoveredLog(path) as log:
         if check:
             log.check()
         clocks = {name: _joined(log.stamps(name)) for name in log.topics}
@@ -221,7 +221,7 @@ def _saturated(values: Float64[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
 
 def _rest(imu: Imu) -> Report:
     """Where the sensor rests, the specific force it reads there, and its noise."""
-    found = stretches(imu)
+    found = rest_stretches(imu)
     samples = [slice(a, b) for a, b in found]
     weights = [b - a for a, b in found]
     norms = [float(np.linalg.norm(imu.accel[s].mean(axis=0))) for s in samples]

@@ -11,9 +11,9 @@ import numpy as np
 from jaxtyping import Float64
 
 from imutool.api.paths import LogPath, local, location
-from imutool.debiasing import Block
+from imutool.debiasing import DebiasedBlock
 from imutool.errors import ConfigError
-from imutool.mcap_io.batches import ImuBatch
+from imutool.mcap_io.topics import ImuBatch
 from imutool.recording import Imu
 from imutool.viewing import notebook
 from imutool.viewing.model.output import Output
@@ -196,7 +196,7 @@ class LiveView:
         sequence = np.arange(self._count, self._count + len(imu), dtype=np.uint32)
         self._count += len(imu)
         batch = ImuBatch(imu.t_ns, imu.t_ns, sequence, imu.t_ns, imu.gyro, imu.accel, "imu")
-        self._show(Block(self._topic, batch, bias, std))
+        self._show(DebiasedBlock(self._topic, batch, bias, std))
 
     @property
     def outputs(self) -> list[Output]:

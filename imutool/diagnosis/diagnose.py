@@ -255,7 +255,7 @@ def _with_signal(told: Diagnosis, one: SignalDiagnosis) -> Diagnosis:
         findings=(*told.findings, *one.findings),
         not_identifiable=(*told.not_identifiable, *one.not_identifiable),
         unexplained={**told.unexplained, signal: one.unexplained},
-        closer={**told.closer, signal: Closer.of(one.closer, one.unexplained.noise_floor)},
+        closer={**told.closer, signal: Closer.computed(one.closer, one.unexplained.noise_floor)},
         remarks=(*told.remarks, *one.remarks),
         signals={**told.signals, signal: one.traces},
     )

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
+import msgspec
 import numpy as np
 from jaxtyping import Float64
 
@@ -54,7 +55,9 @@ def simulated_again(logs: Sequence[WhitenedLog], sim: Recording, physics: Physic
         before.append(with_constant(pair, expected(pair, ())))
         after.append(with_constant(pair, found))
         _refuse_unlike(there[-1], before[-1], with_constant(pair, plain), sim)
-    return {signal: replace(one, by="second simulation") for signal, one in closer(there, before, after).items()}
+    return {
+        signal: msgspec.structs.replace(one, by="second simulation") for signal, one in closer(there, before, after).items()
+    }
 
 
 def _felt(felt: IdealMotion, start_ns: int, pair: Pair) -> IdealMotion:

@@ -148,6 +148,11 @@ def each_pair(unit: str, plausible: float, *, diagonal: bool = True, before: str
     return tuple(Parameter(before + a + b, unit, plausible) for a in AXES for b in AXES if diagonal or a != b)
 
 
+def starts_at(*starts: Sequence[float]) -> Callable[[IdealMotion, SensorSamples], Sequence[Theta]]:
+    """Starts of a fit that are the same for every log."""
+    return lambda _motion, _samples: [np.array(theta) for theta in starts]
+
+
 def matrix(theta: Float64[np.ndarray, "6"]) -> Float64[np.ndarray, "3 3"]:
     """The matrix with these entries off its diagonal, row by row, and zeros on it."""
     out = np.zeros((3, 3))

@@ -30,7 +30,7 @@ from imutool.fleet.run import Tally, run
 from imutool.fleet.task import Result, Settings, Task
 from imutool.fleet.work import work
 from imutool.location import to_location
-from imutool.mcap_io.storage.digest import sha256
+from imutool.mcap_io.storage.source import sha256
 
 Workers = Callable[[], Engine]
 SOON_S = 60.0

@@ -22,7 +22,7 @@ from imutool.fleet.sources import find
 from imutool.fleet.task import Result, Settings, Source, Task
 from imutool.fleet.work import called, robot_of, robot_pattern, work
 from imutool.mcap_io.read import read
-from imutool.mcap_io.storage.digest import sha256
+from imutool.mcap_io.storage.source import sha256
 from imutool.mcap_io.write import write
 
 

@@ -19,7 +19,7 @@ from scipy.signal import correlate, correlation_lags
 from scipy.spatial.transform import Rotation
 
 from imutool.errors import DataError
-from imutool.inertial.kinematics import through
+from imutool.inertial.kinematics import fit_trajectory
 from imutool.inertial.stationary import white_noise
 from imutool.inertial.strapdown import with_velocity
 from imutool.recording import Imu, Poses, Recording, seconds
@@ -225,7 +225,7 @@ def _by_poses(
     poses = sim.truth
     if poses.period_s * POSES_HZ > 1.0 or np.diff(poses.t_ns).max() > 1e9 * GAP_PERIODS * poses.period_s:
         return None
-    trajectory = through(poses)  # a simulation's poses are exact, or the test below fails
+    trajectory = fit_trajectory(poses)  # a simulation's poses are exact, or the test below fails
     t_ns = poses.t_ns[0] + np.arange(int(poses.duration_s * rate_hz) + 1) * round(1e9 / rate_hz)
     motion = trajectory.at(t_ns[t_ns <= poses.t_ns[-1]])
     R_wb = Rotation.from_quat(motion.q_wb_wxyz, scalar_first=True).as_matrix()

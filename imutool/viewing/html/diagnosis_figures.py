@@ -155,13 +155,14 @@ def residual_against_attitude(d: Diagnosis) -> str | None:
 
 def curve(found: Curve, signal: str) -> str:
     """Curve of a finding without a name over its variable, one panel per axis, with its band."""
+    all_y, all_bands = np.array(found.y), np.array(found.band)
 
     def draw(figure: Any) -> None:
-        count = found.y.shape[1]
-        told = [k for k in range(count) if found.y[:, k].any() or found.band[:, k].any()]  # the others have no part in it
+        count = all_y.shape[1]
+        told = [k for k in range(count) if all_y[:, k].any() or all_bands[:, k].any()]  # the others have no part in it
         panels = figure.subplots(1, max(len(told), 1), squeeze=False, sharey=True)[0]
         for k, axes in zip(told, panels, strict=False):
-            y, band = found.y[:, k], found.band[:, k]
+            y, band = all_y[:, k], all_bands[:, k]
             axes.fill_between(found.x, y - band, y + band, color=AFTER, alpha=0.3, lw=0)
             axes.plot(found.x, y, color=AFTER, lw=1.4)
             axes.axhline(0.0, color=INK, lw=0.6)

@@ -14,7 +14,7 @@ from jaxtyping import Float64
 from scipy.spatial.transform import Rotation
 
 from imutool.diagnosis.result import Diagnosis, Traces
-from imutool.inertial.strapdown import Start, dead_reckon
+from imutool.inertial.strapdown import StartPose, dead_reckon
 from imutool.recording import Imu, Poses
 from imutool.viewing.html.diagnosis_figures import GAP_PERIODS, held_out_mask, rate_hz
 from imutool.viewing.html.drawing import svg
@@ -96,7 +96,7 @@ def _stretch(trace: Traces, rows: slice) -> Stretch:
     for expected in (trace.before, trace.after):
         read = trace.ideal[rows] + trace.real[rows] - expected[rows]
         imu = Imu(truth.t_ns, np.ascontiguousarray(read[:, :3]), np.ascontiguousarray(read[:, 3:]))
-        sides.append(dead_reckon(imu, Start.of(truth)))
+        sides.append(dead_reckon(imu, StartPose.of(truth)))
     return Stretch(truth, *sides)
 
 

@@ -88,7 +88,7 @@ def allan_deviation(data: RunData) -> Picture | None:
     if find_spec("allantools") is None:
         return None
     imu = data.traces[0].run.imu
-    ranges = [(a, b) for a, b in stationary.stretches(imu) if (b - a) * imu.period_s >= MIN_REST_S]
+    ranges = [(a, b) for a, b in stationary.rest_stretches(imu) if (b - a) * imu.period_s >= MIN_REST_S]
     if not ranges:
         return None
     rest_s = sum(b - a for a, b in ranges) * imu.period_s

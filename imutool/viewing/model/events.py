@@ -63,7 +63,7 @@ def survey_events(survey: Survey) -> tuple[list[Event], list[str]]:
 
 def stop_events(imu: Imu) -> list[Event]:
     """Intervals in which the IMU rests (`imutool.inertial.stationary`)."""
-    ends = ((int(imu.t_ns[first]), int(imu.t_ns[end - 1])) for first, end in stationary.stretches(imu))
+    ends = ((int(imu.t_ns[first]), int(imu.t_ns[end - 1])) for first, end in stationary.rest_stretches(imu))
     return [Event("stop", first, last, f"at rest for {(last - first) * 1e-9:.1f} s") for first, last in ends]
 
 

@@ -13,13 +13,13 @@ from imutool.cleaning.first_pass import examine
 from imutool.cleaning.truth import Truth, of_poses
 from imutool.errors import DataError, LogError
 from imutool.location import Location
-from imutool.mcap_io.batches import ImuBatch
 from imutool.mcap_io.codec import schemas
 from imutool.mcap_io.codec.decode import TwistColumns
 from imutool.mcap_io.log import Log
-from imutool.mcap_io.losses import told
-from imutool.mcap_io.read import recording_in
-from imutool.mcap_io.topics import DERIVED_KEY
+from imutool.mcap_io.read import read_recording
+from imutool.mcap_io.recovery.losses import describe
+from imutool.mcap_io.recovery.recovered_log import RecoveredLog
+from imutool.mcap_io.topics import DERIVED_KEY, ImuBatch
 from imutool.recording import Imu, Recording
 from imutool.viewing.model.run_data import LogTimes, Run
 
@@ -66,10 +66,10 @@ def read_log(path: Location, *, imu: str | None = None, truth: str | None = None
     """
     notes: list[str] = []
     try:
-        found = _read(path, imu, truth, notes, salvage=False)
+        found = _read(Log(path), imu, truth, notes)
     except LogError:  # reading with recovery is slower; an error that is not damage comes again
         notes.clear()
-        found = _read(path, imu, truth, notes, salvage=True)
+        found = _read(RecoveredLog(path), imu, truth, notes)
     topic, derived, batches, biases_by_topic, rest, metadata = found
     where = f"{path} {topic}"
     survey = examine(lambda: batches[topic], _true(rest), Rules(), where=str(path), topic=topic)
@@ -90,19 +90,21 @@ def read_log(path: Location, *, imu: str | None = None, truth: str | None = None
     return LogContents(replace(rest, imu=samples), logged, tuple(debiased), survey, metadata, tuple(notes))
 
 
-def _read(path: Location, imu: str | None, truth: str | None, notes: list[str], *, salvage: bool) -> _Read:
+def _read(opened: Log, imu: str | None, truth: str | None, notes: list[str]) -> _Read:
     def refused(name: str, error: LogError) -> None:
         notes.append(f"The true poses on {name} are left out: {error.what}.")
 
-    with Log(path, salvage=salvage) as log:
+    with opened as log:
         topic = log.only_imu() if imu is None else log.topic(imu, (schemas.IMU,)).name
         derived = [one.name for one in log.with_schema((schemas.IMU,)) if one.metadata.get(DERIVED_KEY) == topic]
         biases = [one.name for one in log.with_schema((schemas.TWIST,)) if one.metadata.get(DERIVED_KEY) == topic]
         batches, biases_by_topic = _messages(log, [topic, *derived], biases)
-        rest = recording_in(log, imu=topic, truth=truth, samples=NO_SAMPLES, derived=False, refused=None if truth else refused)
+        rest = read_recording(
+            log, imu=topic, truth=truth, samples=NO_SAMPLES, derived=False, refused=None if truth else refused
+        )
         metadata = log.metadata_records()
-        if log.losses is not None:
-            notes += [f"The log is damaged; {line}." for line in told(log.losses.plain())]
+        if isinstance(log, RecoveredLog):
+            notes += [f"The log is damaged; {line}." for line in describe(log.losses.plain())]
     return _Read(topic, derived, batches, biases_by_topic, rest, metadata)
 
 
@@ -115,9 +117,9 @@ def _messages(
     for topic, rows in log.rows([*imus, *biases]):
         with log.named(topic):
             if topic in samples:
-                samples[topic] += log.decode_imu(topic, rows)
+                samples[topic] += log.topics[topic].decode_imu(rows)
             else:
-                biases_by_topic[topic] += log.decode_twist(topic, rows)
+                biases_by_topic[topic] += log.topics[topic].decode_twist(rows)
     return samples, biases_by_topic
 
 

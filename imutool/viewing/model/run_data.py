@@ -15,7 +15,7 @@ from scipy.signal import welch
 from scipy.spatial.transform import Rotation
 
 from imutool.errors import DataError
-from imutool.inertial.strapdown import Start
+from imutool.inertial.strapdown import StartPose
 from imutool.recording import GAP_FACTOR, MIN_GAP_S, Imu, Poses, Scalars, Times, nanoseconds, seconds
 from imutool.viewing.model.events import Event
 from imutool.viewing.model.trajectory_error import Alignment, Drift, Errors, Window
@@ -140,7 +140,7 @@ class RunData:
         return tuple(trace for trace in self.traces if not trace.is_raw)
 
 
-def level_start(imu: Imu) -> Start:
+def level_start(imu: Imu) -> StartPose:
     """Start at the origin, at rest, heading zero, levelled by the first specific force.
 
     roll = atan2(f_y, f_z), pitch = atan2(-f_x, hypot(f_y, f_z)): exact if the IMU does not accelerate in that time.
@@ -148,7 +148,7 @@ def level_start(imu: Imu) -> Start:
     first = imu.between(int(imu.t_ns[0]), int(imu.t_ns[0]) + nanoseconds(LEVELLING_S))
     f_x, f_y, f_z = first.accel.mean(axis=0)
     level = Rotation.from_euler("ZYX", [0.0, np.arctan2(-f_x, np.hypot(f_y, f_z)), np.arctan2(f_y, f_z)])
-    return Start(level.as_quat(scalar_first=True), np.zeros(3), np.zeros(3))
+    return StartPose(level.as_quat(scalar_first=True), np.zeros(3), np.zeros(3))
 
 
 def split_at_gaps(poses: Poses) -> list[Poses]:

@@ -17,7 +17,7 @@ from jaxtyping import Bool
 from imutool import __version__
 from imutool.errors import ConfigError
 from imutool.inertial.metrics import evaluate
-from imutool.inertial.strapdown import Start, dead_reckon, stretch_with_truth, with_velocity
+from imutool.inertial.strapdown import StartPose, dead_reckon, stretch_with_truth, with_velocity
 from imutool.location import Location
 from imutool.recording import Imu, Poses, Recording, Scalars, seconds
 from imutool.viewing.model.decimate import MAX_CURVE_ROWS
@@ -185,7 +185,7 @@ class TruthSpan(NamedTuple):
 def _score(run: Run, known: TruthSpan, align: Alignment) -> tuple[Trace, str]:
     """One run with its errors and figures, and a note on its alignment, if any."""
     rows, true, valid = known
-    path = dead_reckon(run.imu.rows(rows), Start.of(true))
+    path = dead_reckon(run.imu.rows(rows), StartPose.of(true))
     moved, motion = aligned(path, true, valid, align)
     of_truth = (
         drift_since_reset(path, true, valid),

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from imutool.errors import DataError
 from imutool.geometry import quaternion
 from imutool.inertial.metrics import align
-from imutool.inertial.strapdown import drift, drifted
+from imutool.inertial.strapdown import drift, window_drift
 from imutool.recording import Poses, Times, nanoseconds
 
 Alignment = Literal["none", "origin", "yaw", "se3"]
@@ -146,7 +146,7 @@ def drift_since_reset(path: Poses, truth: Poses, valid: Bool[np.ndarray, " n"], 
     turn_of = (path.t_ns[known] - path.t_ns[0]) // nanoseconds(reset_s)
     resets = np.diff(turn_of, prepend=-1) > 0
     last_reset = known[resets][np.cumsum(resets) - 1]
-    found = drifted(path, truth, last_reset, slice(None) if valid.all() else known)
+    found = window_drift(path, truth, last_reset, slice(None) if valid.all() else known)
     since_s, *errors = (np.full(len(path), np.nan) for _ in range(4))
     since_s[known] = (path.t_ns[known] - path.t_ns[last_reset]) * 1e-9
     for column, values in zip(errors, found._replace(orientation_rad=np.rad2deg(found.orientation_rad)), strict=True):

@@ -15,9 +15,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from imutool.debiasing import Block
+from imutool.debiasing import DebiasedBlock
 from imutool.errors import ConfigError, ImutoolError
-from imutool.inertial.strapdown import Start, dead_reckon
+from imutool.inertial.strapdown import StartPose, dead_reckon
 from imutool.mcap_io.storage.target import Target
 from imutool.recording import Imu, Poses
 from imutool.viewing.model.output import Output
@@ -113,7 +113,7 @@ class Live:
         self._file.save(temporary)
         self.shown.append(Output("rrd", str(path), f"{self.trouble}Saved {path}. Open with: rerun {path}"))
 
-    def __call__(self, block: Block) -> None:
+    def __call__(self, block: DebiasedBlock) -> None:
         """Show a block; after an error, warn once and stop the live view."""
         streams = [stream for stream in (self._viewer, self._file) if stream is not None]
         if not streams:
@@ -185,7 +185,7 @@ class Live:
 class _Imu:
     """Entities and growing paths of one IMU."""
 
-    def __init__(self, scope: Scope, first: Block) -> None:
+    def __init__(self, scope: Scope, first: DebiasedBlock) -> None:
         self.scope = scope
         self._start_ns = self._last_ns = int(first.batch.stamp_ns[0])
         self._last_ns -= 1
@@ -216,7 +216,7 @@ class _Imu:
             )
             to.log(self._path("bias", kind, "sigma"), styles.sigma_curves("estimated"), static=True, strict=True)
 
-    def log(self, block: Block, streams: list[rr.RecordingStream]) -> None:
+    def log(self, block: DebiasedBlock, streams: list[rr.RecordingStream]) -> None:
         """Log the new samples of a block: after the recovery of a damaged log some come again."""
         new = block.batch.stamp_ns > self._last_ns
         if not new.any():
@@ -272,7 +272,7 @@ class _GrowingPath:
     """Dead-reckoned path that grows by batches and equals that of `runs.build` to the last digits."""
 
     def __init__(self) -> None:
-        self._end: tuple[Imu, Start] | None = None
+        self._end: tuple[Imu, StartPose] | None = None
 
     def __call__(self, imu: Imu) -> Poses:
         """Poses at the samples, after the last pose before them, so that lines join.
@@ -286,5 +286,5 @@ class _GrowingPath:
             last, start = self._end
             joined = (np.concatenate([getattr(last, name), getattr(imu, name)]) for name in ("t_ns", "gyro", "accel"))
             poses = dead_reckon(Imu(*joined), start)
-        self._end = imu.rows(slice(len(imu) - 1, None)), Start(*(np.array(part) for part in Start.of(poses, -1)))
+        self._end = imu.rows(slice(len(imu) - 1, None)), StartPose(*(np.array(part) for part in StartPose.of(poses, -1)))
         return poses

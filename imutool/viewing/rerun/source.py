@@ -13,7 +13,7 @@ import numpy as np
 
 from imutool.errors import LogError
 from imutool.mcap_io.codec import schemas
-from imutool.mcap_io.log import Log
+from imutool.mcap_io.recovery.recovered_log import RecoveredLog
 from imutool.mcap_io.topics import DERIVED_KEY, Topic
 from imutool.recording import Times
 from imutool.viewing.model.run_data import TRUE_BIAS, RunData
@@ -53,7 +53,7 @@ def plan_import(data: RunData, scope: Scope) -> ImportPlan:
             return ImportPlan(
                 sentence=f"{NOT_SHOWN}: the log has {size / 1e6:.0f} MB, more than the limit of {SOURCE_LIMIT / 1e6:.0f} MB."
             )
-        with Log(data.source, salvage=True) as log:
+        with RecoveredLog(data.source) as log:
             topics = tuple(log.topics.values())
     except (OSError, LogError) as error:
         return ImportPlan(sentence=f"{NOT_SHOWN}: {error}")

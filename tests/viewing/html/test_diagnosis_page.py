@@ -6,7 +6,6 @@ import os
 import re
 import sys
 from collections.abc import Iterator
-from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -15,6 +14,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from support import diagnoses, markup
+from support.diagnoses import replace
 
 from imutool.diagnosis.result import Closer, SignalTraces
 from imutool.diagnosis.wording import conclusion
@@ -93,7 +93,8 @@ def test_what_was_counted_and_not_fitted_claims_no_gain() -> None:
 
 def test_a_curve_is_drawn_for_the_axes_that_have_one() -> None:
     curve = diagnoses.UNKNOWN.curve  # x bends, y does nothing but has a band, z bends
-    only = replace(curve, y=curve.y * [0.0, 0.0, 1.0], band=curve.band * [0.0, 0.0, 1.0])
+    assert curve is not None
+    only = replace(curve, y=tuple((0.0, 0.0, z) for *_, z in curve.y), band=tuple((0.0, 0.0, z) for *_, z in curve.band))
     titles = {word for word in Page(figures.curve(only, "gyro")).words if word.startswith("gyro")}
     assert titles == {"gyro z"}
     titles = {word for word in Page(figures.curve(curve, "gyro")).words if word.startswith("gyro")}

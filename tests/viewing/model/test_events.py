@@ -7,7 +7,7 @@ import pytest
 from support.imu_defects import batch_of, late, repeated, with_values, without
 
 from imutool.cleaning.first_pass import examine
-from imutool.mcap_io.batches import ImuBatch
+from imutool.mcap_io.topics import ImuBatch
 from imutool.recording import Imu, Recording
 from imutool.sensor.flight import flight
 from imutool.viewing.model.events import (

@@ -15,13 +15,12 @@ from support.imu_defects import batch_of, late, pick, repeated, with_values, wri
 from imutool.debiasing import apply, apply_with_std, debias
 from imutool.errors import ConfigError, DataError, LogError
 from imutool.evaluation import started
-from imutool.mcap_io.batches import ImuBatch
 from imutool.mcap_io.codec import schemas
 from imutool.mcap_io.codec.decode import TwistColumns, decode_twist
 from imutool.mcap_io.codec.encode import encode_imu
 from imutool.mcap_io.log import Log
 from imutool.mcap_io.read import read
-from imutool.mcap_io.topics import DERIVED_KEY
+from imutool.mcap_io.topics import DERIVED_KEY, ImuBatch
 from imutool.mcap_io.write import write
 from imutool.recording import Imu, Recording
 from imutool.sensor.flight import flight
@@ -131,7 +130,7 @@ def test_a_bias_in_the_log_that_is_no_number_is_found_by_subtraction(debiased: P
         columns = decode_twist(*words)  # type: ignore[arg-type]
         return columns._replace(variance=np.full_like(columns.variance, np.nan))
 
-    monkeypatch.setattr("imutool.mcap_io.log.decode_twist", spoiled)
+    monkeypatch.setattr("imutool.mcap_io.topics.decode_twist", spoiled)
     run = load(debiased).traces[1].run
     assert run.bias_std is None
     np.testing.assert_allclose(run.gyro_bias, sound.gyro_bias, atol=LAST_BITS)

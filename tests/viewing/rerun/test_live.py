@@ -17,7 +17,7 @@ import pytest
 from support import saved_rrd
 
 from imutool.cleaning.cleaner import rows
-from imutool.debiasing import Block, Watch, debias
+from imutool.debiasing import BlockCallback, DebiasedBlock, debias
 from imutool.errors import ConfigError
 from imutool.mcap_io.write import write
 from imutool.sensor.flight import flight
@@ -56,13 +56,13 @@ def server(tmp_path: Path) -> Iterator[tuple[str, subprocess.Popen[bytes]]]:
     process.wait()
 
 
-def in_blocks(watch: Watch) -> Watch:
+def in_blocks(watch: BlockCallback) -> BlockCallback:
     """What a log whose chunks hold few IMU messages would tell."""
 
-    def cut(block: Block) -> None:
+    def cut(block: DebiasedBlock) -> None:
         for first in range(0, len(block.bias), BLOCK):
             part = slice(first, first + BLOCK)
-            watch(Block(block.topic, rows(block.batch, part), block.bias[part], block.std[part]))
+            watch(DebiasedBlock(block.topic, rows(block.batch, part), block.bias[part], block.std[part]))
 
     return cut
 
@@ -120,7 +120,7 @@ def test_a_viewer_that_goes_away_is_said_once_and_neither_log_nor_file_suffer(
     seen = live.Live.__call__
     blocks = []
 
-    def until_the_third(self: live.Live, block: Block) -> None:
+    def until_the_third(self: live.Live, block: DebiasedBlock) -> None:
         blocks.append(block)
         if len(blocks) == 3:
             process.kill()
@@ -174,7 +174,7 @@ def test_a_file_that_lost_its_end_is_no_file(
 
 
 def test_samples_that_come_again_from_a_repaired_log_are_shown_once(log: Path, tmp_path: Path) -> None:
-    blocks: list[Block] = []
+    blocks: list[DebiasedBlock] = []
     debias(log, tmp_path / "out.mcap", watch=in_blocks(blocks.append))
     with live.live_view("log", save=tmp_path / "live.rrd", instead=tmp_path) as watch:
         for block in (*blocks[:4], *blocks):
@@ -184,7 +184,7 @@ def test_samples_that_come_again_from_a_repaired_log_are_shown_once(log: Path, t
 
 
 def test_a_second_imu_has_a_tree_of_its_own(log: Path, tmp_path: Path) -> None:
-    blocks: list[Block] = []
+    blocks: list[DebiasedBlock] = []
     debias(log, tmp_path / "out.mcap", watch=in_blocks(blocks.append))
     with live.live_view("log", save=tmp_path / "live.rrd", instead=tmp_path) as watch:
         for block in blocks:

@@ -1,4 +1,4 @@
-"""What a damaged log has lost: stretches of bytes with their reason, and the messages known to have lain in them."""
+"""Losses of a damaged log: stretches of bytes with their reason, and the messages known to be lost."""
 
 from __future__ import annotations
 
@@ -6,8 +6,11 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-MOST_TOLD = 20  # lines to a person
-MOST_LISTED = 1000  # stretches; a hostile file could have one every few bytes, and nobody reads that many
+from imutool.errors import LogError
+
+LATEST_NS = 2**63  # no clock shows log times from here on (the year 2262)
+MAX_LINES = 20  # of stretches in a description
+MAX_LISTED = 1000  # stretches; a hostile file could have one every few bytes
 
 
 @dataclass(slots=True)
@@ -37,21 +40,26 @@ class Loss:
 
 @dataclass
 class Losses:
-    """Everything known to be wrong with a log; true if something was lost.
+    """Damage found in a log so far; true if something was lost.
 
-    Damage that cost nothing (a summary, a message index, the head of a chunk that could be put right) is in `mended`. Of
-    messages that no CRC covers, nobody can say whether they are as they were recorded: `unchecked` counts them.
+    `harmless` lists damage without loss: a summary, a message index, a chunk's head that could be rebuilt. `unchecked` counts
+    messages that no CRC covers, which may differ from what was recorded.
     """
 
     entries: list[Loss] = field(default_factory=list)
-    mended: list[str] = field(default_factory=list)
-    left_out: int = 0  # stretches beyond those listed
+    harmless: list[str] = field(default_factory=list)
+    unlisted: int = 0  # stretches beyond those listed
     bytes: int = 0
-    unproven: list[str] = field(default_factory=list)  # topics whose definition no CRC covers
+    unchecked_topics: list[str] = field(default_factory=list)  # topics whose definition no CRC covers
     unchecked_in: dict[int, int] = field(default_factory=dict)  # messages without CRC, by the offset of their stretch
 
     def __bool__(self) -> bool:
         return bool(self.entries)
+
+    @property
+    def intact(self) -> bool:
+        """Whether nothing was lost and nothing had to be rebuilt."""
+        return not self.entries and not self.harmless
 
     @property
     def unchecked(self) -> int:
@@ -70,46 +78,46 @@ class Losses:
     @property
     def exact(self) -> bool:
         """Whether `topics` is all that was lost."""
-        return not self.left_out and all(entry.exact for entry in self.entries)
+        return not self.unlisted and all(entry.exact for entry in self.entries)
 
     def add(self, loss: Loss) -> None:
         """Takes in a stretch."""
         self.bytes += loss.length
-        if len(self.entries) < MOST_LISTED:
+        if len(self.entries) < MAX_LISTED:
             self.entries.append(loss)
             self.entries.sort(key=lambda entry: entry.offset)
         else:
-            self.left_out += 1
+            self.unlisted += 1
 
-    def mend(self, what: str) -> None:
-        """Takes in damage that cost nothing."""
-        if len(self.mended) < MOST_LISTED and what not in self.mended:
-            self.mended.append(what)
+    def add_harmless(self, what: str) -> None:
+        """Takes in damage without loss."""
+        if len(self.harmless) < MAX_LISTED and what not in self.harmless:
+            self.harmless.append(what)
 
     def plain(self) -> dict[str, Any]:
         """As JSON values; `messages` is null where their number is not known."""
         return {
-            "whole": not self.entries and not self.mended,
+            "whole": self.intact,
             "bytes": self.bytes,
             "messages": sum(self.topics.values()) if self.exact else None,
             "topics": self.topics,
             "stretches": [entry.plain() for entry in self.entries],
-            "stretches_not_listed": self.left_out,
-            "mended": list(self.mended),
+            "stretches_not_listed": self.unlisted,
+            "mended": list(self.harmless),
             "unchecked_messages": self.unchecked,
-            "unchecked_definitions": list(self.unproven),
+            "unchecked_definitions": list(self.unchecked_topics),
         }
 
 
-def told(losses: Mapping[str, Any]) -> list[str]:
-    """What `Losses.plain` says, for a person: one line a stretch, the first `MOST_TOLD` of them."""
+def describe(losses: Mapping[str, Any]) -> list[str]:
+    """Lines for a person from `Losses.plain`: one for each stretch, at most `MAX_LINES`."""
     stretches, mended = losses["stretches"], losses["mended"]
-    lines = [f"lost: {_stretch(entry)}" for entry in stretches[:MOST_TOLD]]
+    lines = [f"lost: {_stretch(entry)}" for entry in stretches[:MAX_LINES]]
     if (more := len(stretches) + losses["stretches_not_listed"] - len(lines)) > 0:
         lines.append(f"lost: {more} more stretches")
-    lines += [f"mended: {what}" for what in mended[:MOST_TOLD]]
-    if len(mended) > MOST_TOLD:
-        lines.append(f"mended: {len(mended) - MOST_TOLD} more places")
+    lines += [f"mended: {what}" for what in mended[:MAX_LINES]]
+    if len(mended) > MAX_LINES:
+        lines.append(f"mended: {len(mended) - MAX_LINES} more places")
     if losses["unchecked_messages"]:
         lines.append(f"unchecked: {losses['unchecked_messages']} messages lie where no CRC covers them")
     if losses["unchecked_definitions"]:
@@ -127,3 +135,8 @@ def _stretch(entry: Mapping[str, Any]) -> str:
     first, last = entry["first_ns"], entry["last_ns"]
     when = "" if first is None or last is None else f", log time {first * 1e-9:.3f} to {last * 1e-9:.3f} s"
     return f"byte {entry['offset']}, {entry['bytes']} bytes: {entry['reason']} (lost: {which}{when})"
+
+
+def reason(error: LogError) -> str:
+    """What an error says, as part of a line."""
+    return error.what + (f", expected {error.expected}" if error.expected else "")

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from imutool.errors import ConfigError
 from imutool.exporting import euroc, rosbag2
-from imutool.exporting.report import ExportReport, Progress
+from imutool.exporting.folder import ExportReport, Progress
 
 FORMATS = ("euroc", "rosbag2")
 
@@ -40,7 +40,7 @@ def export(
         near = difflib.get_close_matches(format, FORMATS, n=1)
         raise ConfigError(
             f"unknown format {format!r}",
-            where="--format",
+            where="format",
             expected=" or ".join(FORMATS),
             fix=f"Did you mean {near[0]}?" if near else "",
         )
@@ -48,5 +48,5 @@ def export(
     if format == "euroc":
         return euroc.write(log, out, imu, sensor_noise, overwrite, tell)
     if imu is not None or sensor_noise is not None:
-        raise ConfigError("a rosbag2 folder holds the whole log", where="--imu, --noise", fix="Leave them out")
+        raise ConfigError("a rosbag2 folder holds the whole log", where="imu, sensor_noise", fix="Leave them out")
     return rosbag2.write(log, out, overwrite, tell)
