@@ -20,7 +20,7 @@ from imutool import __version__
 from imutool.bias import static
 from imutool.bias.io import shipped, shipped_for
 from imutool.bias.model import BiasModel
-from imutool.bias_start.bias_covariance import BiasCovariance
+from imutool.bias_start.bias_covariance import BiasEstimator
 from imutool.bias_start.initial_bias import InitialBias
 from imutool.bias_start.model_choice import check_smooth, choose_model_and_start
 from imutool.cleaning import Cleaner, Rules, Survey, look
@@ -89,9 +89,8 @@ class Debiaser:
             NewTopic(f"{source_topic}/bias/accel", schemas.VECTOR3),
             NewTopic(f"{source_topic}/bias", schemas.TWIST),
         )
-        self._stream, self._start_ns = start.stream(model), -1
+        self._estimator, self._start_ns = BiasEstimator(model, start), -1
         self._clock = StampCheck()
-        self._covariance = BiasCovariance(model, start, self._stream)
         noise = model.noise_std.detach().cpu().double().numpy()
         self._white = np.diag(np.where(noise > 0, noise, start.noise) ** 2)
 
@@ -109,9 +108,8 @@ class Debiaser:
         if self._start_ns < 0 and len(batch.stamp_ns):
             self._start_ns = int(batch.stamp_ns[0])
         t_s = seconds(batch.stamp_ns, self._start_ns)
-        bias = self._stream(t_s, batch.gyro, batch.accel)
-        unsure = self._covariance(t_s, batch.gyro, batch.accel)
-        total = unsure + self._white
+        bias, covariance = self._estimator(t_s, batch.gyro, batch.accel)
+        total = covariance + self._white
         corrected = encode_imu(
             batch.stamp_ns,
             batch.gyro - bias[:, :3],
@@ -124,10 +122,10 @@ class Debiaser:
             corrected,
             _vector(batch.stamp_ns, bias[:, :3], batch.frame_id),
             _vector(batch.stamp_ns, bias[:, 3:], batch.frame_id),
-            encode_twist(batch.stamp_ns, bias[:, :3], bias[:, 3:], unsure, batch.frame_id),
+            encode_twist(batch.stamp_ns, bias[:, :3], bias[:, 3:], covariance, batch.frame_id),
         )
         if self._watch is not None and len(batch.stamp_ns):
-            std = np.sqrt(unsure.diagonal(axis1=1, axis2=2))
+            std = np.sqrt(covariance.diagonal(axis1=1, axis2=2))
             self._watch(DebiasedBlock(self.source_topic, batch, bias, std))
         return DerivedBatch(batch, payloads)
 

@@ -33,7 +33,7 @@ STORES = {
     "https": CLOUD,
     "memory": CLOUD,
 }
-ACCOUNTS = ("az", "abfs")  # these say CONTAINER@ACCOUNT, which is no secret
+ACCOUNTS = ("az", "abfs")  # their URLs say CONTAINER@ACCOUNT, which is not secret
 BLOCK_BYTES = 4 << 20
 # A scan, the message indexes behind its chunk and the summary each have their block: 7 requests where 6 are the fewest, and
 # the library's own reading ahead made 13 (tests/bench/store.py)
@@ -52,7 +52,7 @@ def to_location(text: str) -> Location:
     """File or object that a user names.
 
     Raises:
-        ConfigError: a store nobody here knows, one whose package is not installed, or a URL with a password or signature in it.
+        ConfigError: an unknown kind of store, one whose package is not installed, or a URL with a password or signature in it.
     """
     scheme, found, rest = text.partition("://")
     if not found:
@@ -60,20 +60,20 @@ def to_location(text: str) -> Location:
     if scheme == "file":
         return Path(rest)
     if scheme not in STORES:
-        raise ConfigError("is no store known here", where=redact(text), expected=", ".join(f"{name}://" for name in STORES))
+        raise ConfigError("unknown kind of store", where=redact(text), expected=", ".join(f"{name}://" for name in STORES))
     _refuse_secrets(scheme, text)
     try:
         from upath import UPath
 
-        found_place = UPath(text, use_listings_cache=False)  # a listing kept from before would hide what others write
-        found_place.fs  # noqa: B018  imports the store's package
+        place = UPath(text, use_listings_cache=False)  # a cached listing would hide what others write
+        place.fs  # noqa: B018  imports the store's package
     except ImportError as error:
         raise ConfigError(
             f"needs a package that is not installed ({error})", where=text, fix=f"Install it with: {STORES[scheme]}"
         ) from error
-    except Exception as error:  # whatever the store's own set-up trips over
+    except Exception as error:  # any error of the store's set-up
         raise ConfigError(f"cannot be opened ({reason(error)})", where=text) from error
-    return found_place
+    return place
 
 
 def _refuse_secrets(scheme: str, text: str) -> None:

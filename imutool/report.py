@@ -28,7 +28,9 @@ __all__ = ["REPORTS", "UNSET", "Report", "Section", "UnsetType", "json_schema", 
 
 # by name, the module and the type: imported when its schema is asked for, so that --help stays light
 REPORTS = {
+    "diagnosis": "imutool.diagnosis.result:DiagnosisReport",
     "models": "imutool.cli.models:Models",
+    "score": "imutool.blind_cases.cases:OpenedCase",
 }
 
 

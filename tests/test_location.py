@@ -46,7 +46,7 @@ def test_a_url_is_an_object_in_a_store(store: Any) -> None:
 
 
 def test_an_unknown_store_is_refused_with_those_there_are() -> None:
-    with pytest.raises(ConfigError, match=r"ftp://host/log.mcap: is no store known here; expected s3://, gs://, az://"):
+    with pytest.raises(ConfigError, match=r"ftp://host/log.mcap: unknown kind of store; expected s3://, gs://, az://"):
         to_location("ftp://host/log.mcap")
 
 
@@ -216,7 +216,7 @@ def test_a_temporary_object_that_somebody_changed_is_not_published(store: Any) -
         target.flush()
         store.put(target.temporary.name, b"not!")
 
-    with pytest.raises(ConfigError, match="was changed by somebody"):
+    with pytest.raises(ConfigError, match="was changed while"):
         filled("s3://fleet/out", then=change)
     assert store.keys() == []
 
@@ -334,7 +334,7 @@ def test_what_the_store_refuses_is_said(store: Any, flight: bytes) -> None:
 def test_without_credentials_the_message_says_so(store: Any, imutool: Any, tmp_path: Path, flight: bytes) -> None:
     store.put("in.mcap", flight)
     env = {"AWS_ACCESS_KEY_ID": "", "AWS_SECRET_ACCESS_KEY": "", "AWS_EC2_METADATA_DISABLED": "true", "HOME": str(tmp_path)}
-    done = imutool("info", "s3://fleet/in.mcap", cwd=tmp_path, env=env)
+    done = imutool("info", "s3://fleet/in.mcap", cwd=tmp_path, apart=True, env=env)
     assert done.returncode == ConfigError.exit_code
     assert "cannot be opened (Unable to locate credentials)" in " ".join(done.stderr.split())
     assert "Traceback" not in done.stderr

@@ -1,7 +1,7 @@
 """Records of a ROS 1 bag (format 2.0) to and from bytes.
 
-Format: http://wiki.ros.org/Bags/Format/2.0. Every length read is held against the bytes there are. Nothing in the format
-proves that bytes are those that were recorded, but for the checks inside bz2 and some lz4 chunks.
+Format: http://wiki.ros.org/Bags/Format/2.0. Every length read is compared with the available bytes. The format has
+no checksums, but bz2 and some lz4 chunks do.
 """
 
 from __future__ import annotations
@@ -194,7 +194,7 @@ def unpack(compression: str, packed: bytes, size: int, *, cut: bool = False) -> 
         raise LogError(f"it says it unpacks to {size} bytes", expected=f"at most {CHUNK_LIMIT}")
     unpacker = bz2.BZ2Decompressor() if compression == "bz2" else lz4.frame.LZ4FrameDecompressor()
     parts: list[bytes] = []
-    left, data = size + 1, packed  # one more than it says, to notice one that goes on
+    left, data = size + 1, packed  # a byte more than stated, to notice a longer one
     try:
         while left and not unpacker.eof and (data or not unpacker.needs_input):
             parts.append(unpacker.decompress(data, max_length=left))

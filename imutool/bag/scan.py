@@ -1,6 +1,6 @@
 """Scan a ROS 1 bag from its first byte to its last, chunk by chunk, without its index.
 
-Where the framing is broken, the walk goes on at the next chunk, and inside an unpacked chunk at the next message. A message
+Where the framing is broken, the scan goes on at the next chunk, and inside an unpacked chunk at the next message. A message
 counts as found when what follows it is a record, or the end of its chunk.
 """
 
@@ -17,12 +17,12 @@ from imutool.mcap_io.storage.source import Source
 
 SCAN_BYTES = 4096, 1 << 20  # looked through at once, first and at most: what is sought may be near
 HEAD_BYTES = 256  # of a record, read at first; most heads are shorter
-MOST_LOSSES = 10_000  # that are listed one by one
-MOST_REASONS = 5  # for one chunk
+MAX_LOSSES = 10_000  # in `losses`
+MAX_REASONS = 5  # for one chunk
 
 
 class Bag:
-    """A bag open for reading; with `salvage` damage goes to `losses`, else it is an error.
+    """A bag open for reading; with `recover` damage goes to `losses`, else it is an error.
 
     Memory is bounded by the largest chunk.
 
@@ -31,12 +31,12 @@ class Bag:
         LogError: empty, no ROS 1 bag, or encrypted.
     """
 
-    def __init__(self, path: Location, *, salvage: bool = False) -> None:
-        self.path, self.salvage = path, salvage
+    def __init__(self, path: Location, *, recover: bool = False) -> None:
+        self.path, self.recover = path, recover
         self.connections: dict[int, Connection] = {}
-        self.doubtful: set[int] = set()  # numbers that may mean something else by now
+        self.doubtful: set[int] = set()  # numbers that two connections may share
         self.losses: list[Loss] = []
-        self.lost = 0  # how many losses there are, also those that are not listed
+        self.lost = 0  # number of losses, also beyond those in `losses`
         self.source = Source(path, expected="a ROS 1 bag")
         try:
             self.header = self._begin()
@@ -104,9 +104,14 @@ class Bag:
         if found.size > records.DEFINITION_LIMIT:
             raise LogError(f"a connection record has {found.size} bytes", expected=f"at most {records.DEFINITION_LIMIT}")
         raw = self.source.at(found.at, found.end - found.at)
-        self._learn(records.connection(found, raw[found.data_at - found.at :], raw))
+        self.add_connection(records.connection(found, raw[found.data_at - found.at :], raw))
 
-    def _learn(self, new: Connection) -> None:
+    def add_connection(self, new: Connection) -> None:
+        """Adds a connection.
+
+        Raises:
+            LogError: its number belongs to another one.
+        """
         known = self.connections.setdefault(new.number, new)
         if (known.topic, known.kind) != (new.topic, new.kind):
             self.doubtful.add(new.number)
@@ -117,23 +122,23 @@ class Bag:
         """Notes a loss, or refuses the bag.
 
         Raises:
-            LogError: without `salvage`.
+            LogError: without `recover`.
         """
-        if not self.salvage:
+        if not self.recover:
             raise LogError(
                 f"the bag is damaged at byte {offset}: {reason}",
                 where=self.path,
                 fix="Save what is there with `imutool repair`",
             )
         self.lost += 1
-        if len(self.losses) < MOST_LOSSES:
+        if len(self.losses) < MAX_LOSSES:
             self.losses.append(Loss(offset, length, reason, messages))
 
     def chunks(self) -> Iterator[Chunk]:
         """Every chunk with messages in it, in file order.
 
         Raises:
-            LogError: damage, without `salvage`; or the disk does not give the bytes.
+            LogError: damage, without `recover`; or the disk does not give the bytes.
         """
         position, size = len(MAGIC), self.source.size
         while position < size:
@@ -152,7 +157,7 @@ class Bag:
                 if chunk.messages:
                     yield chunk
                 position = end
-            elif found.op == Op.MESSAGE or not self._lands(found.end):  # it would lead past the record behind it
+            elif found.op == Op.MESSAGE or not self._is_boundary(found.end):  # it would lead past the record behind it
                 position = self._next_chunk(found.data_at)
                 outside = "a message lies outside chunks" if found.op == Op.MESSAGE else "a record does not end where it says"
                 self.lose(found.at, position - found.at, outside)
@@ -160,8 +165,8 @@ class Bag:
                 if found.op == Op.CONNECTION:
                     self._try_define(found)
                 position = found.end
-        if self.header is not None and (told := self.header.number(b"index_pos")) > size:
-            self.lose(size, told - size, f"the bag's header says its index begins at byte {told}")
+        if self.header is not None and (index_pos := self.header.number(b"index_pos")) > size:
+            self.lose(size, index_pos - size, f"the bag's header says its index begins at byte {index_pos}")
 
     def _try_define(self, found: Head) -> None:
         try:
@@ -183,9 +188,9 @@ class Bag:
 
     def _end(self, found: Head) -> int:
         """End of a chunk: where it says, if a record follows there; else the next chunk's start."""
-        return found.end if self._lands(found.end) else self._next_chunk(found.data_at)
+        return found.end if self._is_boundary(found.end) else self._next_chunk(found.data_at)
 
-    def _lands(self, end: int) -> bool:
+    def _is_boundary(self, end: int) -> bool:
         """Whether a record may end there: a record, another bag or the end of the file follows."""
         left = self.source.size - end
         if 0 <= left < 8 or (left > 0 and self._head(end) is not None):
@@ -197,18 +202,18 @@ class Bag:
         compression = found.fields[b"compression"].decode("ascii", "replace")
         wrong = end != found.end
         reasons = ["the chunk does not end where it says"] if wrong else []
-        data, messages, told = b"", list[Message](), self._told(end)
+        data, messages, indexed = b"", list[Message](), self._indexed_count(end)
         try:
             data = self._unpacked(found, end, compression)
         except LogError as error:
             reasons.append(f"the chunk cannot be unpacked: {error.what}")
         else:
-            inside = _Inside(self, data, wrong)
-            messages = inside.messages()
-            reasons += inside.reasons
-        missing = None if told is None else max(0, told - len(messages))
+            scan = _ChunkScan(self, data, wrong)
+            messages = scan.messages()
+            reasons += scan.reasons
+        missing = None if indexed is None else max(0, indexed - len(messages))
         if missing and not reasons:
-            reasons.append("its index tells of more messages than are in it")
+            reasons.append("its index counts more messages than are in it")
         if reasons:
             self.lose(found.at, end - found.at, "; ".join(reasons), missing)
         return Chunk(found.at, end - found.at, data, messages, not reasons)
@@ -221,7 +226,7 @@ class Bag:
             raise LogError(f"it has {packed} bytes", expected=f"at most {records.CHUNK_LIMIT}")
         return records.unpack(compression, self.source.at(found.data_at, packed), found.number(b"size"), cut=cut)
 
-    def _told(self, position: int) -> int | None:
+    def _indexed_count(self, position: int) -> int | None:
         """Messages that the index records behind a chunk count, or None without any."""
         total: int | None = None
         while (found := self._head(position)) is not None and found.op == Op.INDEX:
@@ -232,7 +237,7 @@ class Bag:
         return total
 
 
-class _Inside:
+class _ChunkScan:
     """The records of one chunk."""
 
     def __init__(self, bag: Bag, data: bytes, loose: bool) -> None:
@@ -240,7 +245,7 @@ class _Inside:
         self.reasons: list[str] = []  # why something is lost, the first few
 
     def _lose(self, reason: str) -> None:
-        if len(self.reasons) < MOST_REASONS:
+        if len(self.reasons) < MAX_REASONS:
             self.reasons.append(reason)
 
     def messages(self) -> list[Message]:
@@ -284,6 +289,6 @@ class _Inside:
 
     def _define(self, head: Head) -> None:
         try:
-            self.bag._learn(records.connection(head, self.data[head.data_at : head.end], self.data[head.at : head.end]))
+            self.bag.add_connection(records.connection(head, self.data[head.data_at : head.end], self.data[head.at : head.end]))
         except LogError as error:
             self._lose(error.what)

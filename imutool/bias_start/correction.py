@@ -11,9 +11,9 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float64
 
-from imutool.bias.model import BiasModel, OneByOne, Stream, Vector6
-from imutool.bias_start.bias_covariance import BiasCovariance
-from imutool.bias_start.initial_bias import InitialBias, following
+from imutool.bias.model import BiasModel, SampleStream, Stream, Vector6
+from imutool.bias_start.bias_covariance import BiasEstimator
+from imutool.bias_start.initial_bias import InitialBias, tracked_from_prior
 from imutool.recording import Imu, seconds
 
 BLOCK_SAMPLES = 1 << 14  # are corrected at once: a covariance has 288 bytes
@@ -37,14 +37,12 @@ def apply_with_std(model: BiasModel, start: InitialBias, imu: Imu) -> tuple[Debi
 
     Gyro (rad/s), then accel (m/s²); see `imutool.bias_start.bias_covariance`. Computed in blocks, as a log is debiased.
     """
-    stream = start.stream(model)
-    certainty = BiasCovariance(model, start, stream)
+    estimator = BiasEstimator(model, start)
     t_s = seconds(imu.t_ns, int(imu.t_ns[0]))
     bias, std = np.empty((len(imu), 6)), np.empty((len(imu), 6))
     for first in range(0, len(imu), BLOCK_SAMPLES):
         rows = slice(first, first + BLOCK_SAMPLES)
-        bias[rows] = stream(t_s[rows], imu.gyro[rows], imu.accel[rows])
-        covariance = certainty(t_s[rows], imu.gyro[rows], imu.accel[rows])
+        bias[rows], covariance = estimator(t_s[rows], imu.gyro[rows], imu.accel[rows])
         std[rows] = np.sqrt(covariance.diagonal(axis1=1, axis2=2))
     return DebiasedImu(Imu(imu.t_ns, imu.gyro - bias[:, :3], imu.accel - bias[:, 3:]), bias), std
 
@@ -54,12 +52,12 @@ class OnlineDebiaser:
 
     The start is a rest bias from `imutool.bias_start.initial_bias`, for instance `at_rest` over the first seconds, or
     `prior`. Without one, it
-    begins at the prior and is followed by what the samples show, as by `--init auto`.
+    begins at the prior and follows the samples, as `init="auto"` does.
     """
 
     def __init__(self, model: BiasModel, start: InitialBias | None = None) -> None:
-        stream = (start or following(model)).stream(model)
-        self._one, self._start_ns = stream.one if isinstance(stream, OneByOne) else _by_blocks(stream), -1
+        stream = (start or tracked_from_prior(model)).stream(model)
+        self._correct, self._start_ns = stream.one if isinstance(stream, SampleStream) else _by_blocks(stream), -1
 
     def __call__(
         self, stamp_ns: int, gyro: Float64[np.ndarray, "3"], accel: Float64[np.ndarray, "3"]
@@ -68,16 +66,16 @@ class OnlineDebiaser:
         if self._start_ns < 0:
             self._start_ns = stamp_ns
         u = np.concatenate((gyro, accel))
-        bias = self._one((stamp_ns - self._start_ns) * 1e-9, u)
+        bias = self._correct((stamp_ns - self._start_ns) * 1e-9, u)
         clean = u - bias
         return clean[:3], clean[3:], bias
 
 
 def _by_blocks(stream: Stream) -> Callable[[float, Vector6], Vector6]:
-    """One sample as a block of one, for a stream that knows no shorter way."""
+    """Corrects one sample as a block of one, for a stream without a shorter way."""
 
-    def one(t_s: float, u: Vector6) -> Vector6:
+    def correct(t_s: float, u: Vector6) -> Vector6:
         bias: Vector6 = stream(np.array([t_s]), u[None, :3], u[None, 3:])[0]
         return bias
 
-    return one
+    return correct

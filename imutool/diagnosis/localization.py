@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 
+import msgspec
 import numpy as np
 from jaxtyping import Float64
 from scipy.ndimage import uniform_filter1d
 
-from imutool.diagnosis.estimation.alignment import Pair
+from imutool.diagnosis.estimation.aligned_log import Pair
 from imutool.diagnosis.locate import located
 from imutool.diagnosis.result import Finding, Located
 
@@ -45,7 +45,7 @@ def _places(
     for log in logs:
         stretches = [(pair, misfit) for pair, misfit in zip(pairs, misfits, strict=True) if pair.name == log]
         places = _of_one(stretches, floor, p_values)
-        out += [replace(one, log=log) if len(logs) > 1 else one for one in places]
+        out += [msgspec.structs.replace(one, log=log) if len(logs) > 1 else one for one in places]
     return sorted(out, key=lambda one: one.p_value)
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 
+import msgspec
 import numpy as np
 from jaxtyping import Bool, Float64
 from scipy.stats import f as fisher
@@ -13,17 +14,19 @@ from scipy.stats import ttest_1samp
 from imutool.diagnosis.compare_findings import remarks, shared
 from imutool.diagnosis.estimation import timestamps
 from imutool.diagnosis.estimation import unnamed_effects as unnamed
-from imutool.diagnosis.estimation.alignment import LEAST_NOISE, Pair
-from imutool.diagnosis.estimation.forward_cache import Chosen
-from imutool.diagnosis.estimation.gauss_newton import Fit, WhitenedLog, expected, fit
-from imutool.diagnosis.estimation.late_stamps import late_stamps
+from imutool.diagnosis.estimation.aligned_log import Pair
+from imutool.diagnosis.estimation.alignment import LEAST_NOISE
+from imutool.diagnosis.estimation.gauss_newton import Fit, fit
+from imutool.diagnosis.estimation.jacobians import Chosen, expected
 from imutool.diagnosis.estimation.model_selection import SelectedEffect, Selection
 from imutool.diagnosis.estimation.noise_estimate import noise_std
+from imutool.diagnosis.estimation.timestamps import late_stamps
 from imutool.diagnosis.estimation.unnamed_effects import unit
+from imutool.diagnosis.estimation.whitening import WhitenedImu
 from imutool.diagnosis.localization import of_findings, of_what_is_left
 from imutool.diagnosis.quantity import percent
 from imutool.diagnosis.result import Closer, Curve, Diagnosis, Estimate, Finding, HeldOut, Located, Traces, Unexplained
-from imutool.diagnosis.to_physics_file import found as physics_file
+from imutool.diagnosis.to_physics_file import to_physics_file
 from imutool.inertial.stationary import white_noise
 from imutool.sensor.physics_file import PhysicsFile
 from imutool.units import ASCII_UNITS, AXES, SENSORS, UNITS
@@ -38,7 +41,7 @@ BY_CHANCE = 1e-3  # or more, where so few values are left that noise alone excee
 
 
 def told(
-    logs: Sequence[WhitenedLog],
+    logs: Sequence[WhitenedImu],
     found: Selection,
     reals: Mapping[str, str],
     sim: str | None,
@@ -79,7 +82,7 @@ def told(
     return Diagnosis(
         real=tuple(reals.values()),
         sim=sim,
-        located=tuple(replace(one, log=reals[one.log]) if one.log else one for one in places),
+        located=tuple(msgspec.structs.replace(one, log=reals[one.log]) if one.log else one for one in places),
         findings=tuple(findings),
         bias=found.whole.bias,
         not_identifiable=_not_identifiable(found, idle, hidden),
@@ -97,7 +100,7 @@ def _traces(pair: Pair, before: Float64[np.ndarray, "n 6"], after: Float64[np.nd
     )
 
 
-def without_held_out(logs: Sequence[WhitenedLog], found: Selection, d: Diagnosis) -> PhysicsFile:
+def without_held_out(logs: Sequence[WhitenedImu], found: Selection, d: Diagnosis) -> PhysicsFile:
     """What was found as physics.toml has it, with the numbers that the fitted time alone says; digits are no motion's."""
     theta = {physics.key: value for physics, value in found.fitted.chosen}
     judged = {(one.physics.name, one.physics.equation): replace(one, theta=theta[one.physics.key]) for one in found.selected}
@@ -107,13 +110,14 @@ def without_held_out(logs: Sequence[WhitenedLog], found: Selection, d: Diagnosis
         there = judged.get((one.effect, one.equation))
         if there is None:
             return one
-        return replace(one, parameters=_parameters(pairs, there), curve=_curve(pairs[0], there, found.fitted))
+        curve = _curve(pairs[0], there, found.fitted)
+        return msgspec.structs.replace(one, parameters=_parameters(pairs, there), curve=curve)
 
-    return physics_file(replace(d, findings=tuple(fitted(one) for one in d.findings if one.effect != QUANTIZATION)))
+    return to_physics_file(replace(d, findings=tuple(fitted(one) for one in d.findings if one.effect != QUANTIZATION)))
 
 
 def _worthwhile(
-    logs: Sequence[WhitenedLog], found: Selection, noise: Float64[np.ndarray, "6"]
+    logs: Sequence[WhitenedImu], found: Selection, noise: Float64[np.ndarray, "6"]
 ) -> tuple[Selection, list[Finding], list[str]]:
     """A discovery without effects that bring nothing on unseen time beside the others, its findings, and those effects."""
     named, idle = [_finding(logs, found, one, noise) for one in found.selected], []
@@ -168,7 +172,7 @@ def with_constant(pair: Pair, there: Float64[np.ndarray, "n 6"]) -> Float64[np.n
     return np.asarray(there + constant)
 
 
-def floor(logs: Sequence[WhitenedLog]) -> Float64[np.ndarray, "6"]:
+def floor(logs: Sequence[WhitenedImu]) -> Float64[np.ndarray, "6"]:
     """The noise of a sample by axis, before it was made white; of an axis nobody knows, that of those beside it."""
     total, count = np.zeros(6), np.zeros(6)
     for log in logs:
@@ -181,7 +185,7 @@ def floor(logs: Sequence[WhitenedLog]) -> Float64[np.ndarray, "6"]:
     return np.asarray(np.sqrt(variance))
 
 
-def _unseen(log: WhitenedLog, there: Float64[np.ndarray, "n 6"], part: slice) -> Float64[np.ndarray, " m"]:
+def _unseen(log: WhitenedImu, there: Float64[np.ndarray, "n 6"], part: slice) -> Float64[np.ndarray, " m"]:
     """What is left on held-out samples that tell anything, up to where what is expected is known."""
     pair, counts = log.pair, log.whiten.counts
     left, rows = pair.real - there, pair.held_out[:: log.whiten.every]
@@ -190,22 +194,22 @@ def _unseen(log: WhitenedLog, there: Float64[np.ndarray, "n 6"], part: slice) ->
     return np.asarray(left[rows, part].ravel() if counts is None else left[rows, part][counts[rows, part]])
 
 
-def closer(logs: Sequence[WhitenedLog], before: Sequence[np.ndarray], after: Sequence[np.ndarray]) -> dict[str, Closer]:
+def closer(logs: Sequence[WhitenedImu], before: Sequence[np.ndarray], after: Sequence[np.ndarray]) -> dict[str, Closer]:
     """What all findings together bring to each sensor, on held-out time."""
     noise, out = floor(logs), {}
     for signal, k in _known([log.pair for log in logs]).items():
-        out[signal] = Closer.of(_held_out(logs, before, after, k, ASCII_UNITS[signal]), _noise(logs, noise, k))
+        out[signal] = Closer.computed(_held_out(logs, before, after, k, ASCII_UNITS[signal]), _noise(logs, noise, k))
     return out
 
 
-def _noise(logs: Sequence[WhitenedLog], floor: Float64[np.ndarray, "6"], k: int) -> float:
+def _noise(logs: Sequence[WhitenedImu], floor: Float64[np.ndarray, "6"], k: int) -> float:
     """Of a sensor, over the axes of which anything is known."""
     part, axes = slice(3 * k, 3 * k + 3), np.any([log.pair.axes for log in logs], axis=0)
     return float(np.sqrt(np.mean(floor[part][axes[part]] ** 2)))
 
 
 def _held_out(
-    logs: Sequence[WhitenedLog], before: Sequence[np.ndarray], after: Sequence[np.ndarray], k: int, unit_: str
+    logs: Sequence[WhitenedImu], before: Sequence[np.ndarray], after: Sequence[np.ndarray], k: int, unit_: str
 ) -> HeldOut:
     """Root mean squares over held-out samples and axes of a signal, and how long that was; no numbers where none are known."""
     part = slice(3 * k, 3 * k + 3)
@@ -217,7 +221,7 @@ def _held_out(
     return HeldOut(rms[0], rms[1], unit_, round(length, 1))
 
 
-def _finding(logs: Sequence[WhitenedLog], found: Selection, one: SelectedEffect, floor: Float64[np.ndarray, "6"]) -> Finding:
+def _finding(logs: Sequence[WhitenedImu], found: Selection, one: SelectedEffect, floor: Float64[np.ndarray, "6"]) -> Finding:
     """One effect: what leaving it out costs on time that its parameters were not fitted to."""
     pairs = [log.pair for log in logs]
     fitted = found.fitted
@@ -253,7 +257,16 @@ def _finding(logs: Sequence[WhitenedLog], found: Selection, one: SelectedEffect,
         driver=one.physics.variable if one.physics.kind == "driven" else "",
         curve=_curve(logs[0].pair, one, found.whole),
         similar=one.similar,
+        kind=one.physics.kind,
+        axis=None if one.physics.axis is None else AXES[one.physics.axis],
+        variable=one.physics.variable,
+        onset_s=_onset_s(one),
     )
+
+
+def _onset_s(one: SelectedEffect) -> float | None:
+    times = [float(t_s) for number, t_s in zip(one.physics.parameters, one.theta, strict=True) if number.begins]
+    return times[0] if times and np.isfinite(times[0]) else None
 
 
 def _parameters(pairs: Sequence[Pair], one: SelectedEffect) -> dict[str, Estimate]:
@@ -288,11 +301,11 @@ def _curve(pair: Pair, one: SelectedEffect, whole: Fit) -> Curve | None:
     y[:, forward.axis] = basis @ one.theta - middle
     centred = basis - basis.mean(axis=0)
     band[:, forward.axis] = np.sqrt(np.einsum("nq,qp,np->n", centred, covariance, centred))
-    return Curve(forward.variable, unit(forward.variable), x, y, band, middle)
+    return Curve.of_arrays(forward.variable, unit(forward.variable), x, y, band, middle)
 
 
 def _unexplained(
-    logs: Sequence[WhitenedLog], after: Sequence[Float64[np.ndarray, "n 6"]], noises: Float64[np.ndarray, "6"]
+    logs: Sequence[WhitenedImu], after: Sequence[Float64[np.ndarray, "n 6"]], noises: Float64[np.ndarray, "6"]
 ) -> dict[str, Unexplained]:
     """Of the sensors of which anything is known; beside poses, whose errors come and go, by blocks that are of one mind."""
     out, beside_poses = {}, any(log.whiten.band is not None for log in logs)
@@ -300,7 +313,7 @@ def _unexplained(
         held, noise = _held_out(logs, after, after, k, ASCII_UNITS[signal]), _noise(logs, noises, k)
         part = slice(3 * k, 3 * k + 3)
         unseen = sum(len(_unseen(log, there, part)) for log, there in zip(logs, after, strict=True))
-        seen = sum(log.numbers("fitted") for log in logs) / 2.0  # of both sensors
+        seen = sum(log.count("fitted") for log in logs) / 2.0  # of both sensors
         most = max(WHITE, float(np.sqrt(fisher.isf(BY_CHANCE, unseen, max(seen, 1.0))))) if unseen else WHITE
         white = held.rms_after < most * noise
         if not white and beside_poses:
@@ -309,7 +322,7 @@ def _unexplained(
     return out
 
 
-def _by_chance(logs: Sequence[WhitenedLog], after: Sequence[Float64[np.ndarray, "n 6"]], k: int, noise: float) -> float:
+def _by_chance(logs: Sequence[WhitenedImu], after: Sequence[Float64[np.ndarray, "n 6"]], k: int, noise: float) -> float:
     """The chance of blocks of held-out time having so much more power than noise, as far as they differ among themselves."""
     powers: list[float] = []
     for log, there in zip(logs, after, strict=True):

@@ -79,7 +79,7 @@ def _best_imu(log: Log) -> str:
     """The debiased IMU, else the raw one.
 
     Raises:
-        LogError: there is none, or several to choose from.
+        LogError: none, or several.
     """
     every = log.with_schema((schemas.IMU,))
     derived = [t.name for t in every if DERIVED_KEY in t.metadata]
@@ -180,12 +180,12 @@ class _Asl:
         lines = [note + "sensor_type: imu", f"comment: {json.dumps(named or 'unknown')}", "T_BS:", IDENTITY.rstrip("\n")]
         lines.append(f"rate_hz: {1.0 / self.recording.imu.period_s:.6g}")
         if given is None:
-            said = (
+            origin = (
                 f"the sensor's, {named}"
                 if named in datasheet.SHEETS
                 else f"{DEFAULT_SHEET}'s, as the log does not name its sensor"
             )
-            lines.append(f"# Noise: defaults of a data sheet ({said}), not measured on this sensor")
+            lines.append(f"# Noise: defaults of a data sheet ({origin}), not measured on this sensor")
         for key, (quantity, unit) in DENSITIES.items():
             axes = sheet.values(quantity)
             known = axes[np.isfinite(axes)]

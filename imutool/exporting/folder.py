@@ -26,7 +26,7 @@ class ExportFolder:
     was made here and its top holds nothing but what `holds` matches: a data set that merely looks alike is never removed.
 
     Raises:
-        ConfigError: the target exists (without `overwrite`), is no export, holds the log, or cannot be written.
+        ConfigError: the target exists (without `overwrite`), is not an export, holds the log, or cannot be written.
     """
 
     def __init__(self, path: Path, log: Path, *, signed: str, holds: str, overwrite: bool) -> None:
@@ -47,7 +47,7 @@ class ExportFolder:
         if not self.overwrite:
             raise ConfigError("the target exists", where=self.path, fix="Choose another name, or add `overwrite=True`")
         if self.path.is_symlink() or not self.path.is_dir():
-            raise ConfigError("the target is no folder", where=self.path, expected="the name of a new folder")
+            raise ConfigError("the target is not a folder", where=self.path, expected="the name of a new folder")
         if self.log.resolve().is_relative_to(self.path.resolve()):
             raise ConfigError("the target holds the log itself", where=self.path, expected="another folder")
         foreign = sorted(entry.name for entry in self.path.iterdir() if not re.fullmatch(self.holds, entry.name))

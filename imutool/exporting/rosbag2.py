@@ -25,7 +25,7 @@ QOS_NUMBERS = {  # as rmw numbers them; names came with version 9
 def write(log: Path, out: Path, overwrite: bool, tell: Progress) -> ExportReport:
     """Writes the folder `out`; the arguments are those of `imutool.exporting.export.export`."""
     with Log(log) as opened:
-        _refuse_what_rosbag2_cannot(opened)
+        _check_readable(opened)
         name = f"{out.absolute().name}_0.mcap"
         text = _metadata_yaml(opened, name)
         counts = {topic.name: topic.count for topic in opened.topics.values()}
@@ -36,7 +36,7 @@ def write(log: Path, out: Path, overwrite: bool, tell: Progress) -> ExportReport
     return ExportReport(out, "rosbag2", None, counts)
 
 
-def _refuse_what_rosbag2_cannot(log: Log) -> None:
+def _check_readable(log: Log) -> None:
     """Refuses a log that rosbag2 cannot read as it is.
 
     Raises:
@@ -59,10 +59,10 @@ def _copy(log: Path, copy: Path, tell: Progress) -> None:
         LogError: the log changed while it was copied.
         ConfigError: what was written does not read back the same.
     """
-    size, done, told = log.stat().st_size, 0, hashlib.sha256()
+    size, done, digest = log.stat().st_size, 0, hashlib.sha256()
     with log.open("rb") as source, copy.open("xb") as target:
         while block := source.read(COPY_BYTES):
-            told.update(block)
+            digest.update(block)
             target.write(block)
             done += len(block)
             tell(done, 2 * size, copy.name)
@@ -70,13 +70,13 @@ def _copy(log: Path, copy: Path, tell: Progress) -> None:
         os.fsync(target.fileno())
     if done != size:
         raise LogError("changed while it was copied", where=log, fix="Wait until it is complete")
-    again = hashlib.sha256()
+    copied = hashlib.sha256()
     with copy.open("rb") as written:
         while block := written.read(COPY_BYTES):
-            again.update(block)
+            copied.update(block)
             done += len(block)
             tell(done, 2 * size, copy.name)
-    if again.digest() != told.digest():
+    if copied.digest() != digest.digest():
         raise ConfigError("does not read back as it was written", where=copy.parent, fix="Look at the disk")
 
 

@@ -19,7 +19,6 @@ from typing import Any
 import msgspec
 
 from imutool.cleaning import UntrustedError
-from imutool.diagnosis_output import plain
 from imutool.errors import ConfigError, ImutoolError, LogError, ModelError
 from imutool.fleet.sources import leftovers, remove, within
 from imutool.fleet.task import Imu, Parameter, Result, Settings, Task
@@ -27,6 +26,7 @@ from imutool.location import Location, identity, to_location
 from imutool.mcap_io.log import Log
 from imutool.mcap_io.storage.source import sha256
 from imutool.mcap_io.storage.target import Target
+from imutool.report import json_values
 
 LOST = 3  # exit code: something of the log was lost
 MOST_LOSSES = 20  # stretches told of a log; its metadata and its repair tell all
@@ -241,7 +241,7 @@ def _diagnose(job: _Job) -> dict[str, Any]:
     report["parameters"] = [msgspec.to_builtins(one) for one in parameters]
     if not s.quick:
         found = diagnose([job.source], sim, imu=s.imu, truth=s.truth)
-        report["diagnosis"] = plain(found)
+        report["diagnosis"] = json_values(found.report)
         told["effects"] = tuple(one.effect for one in found.findings)
         told["warnings"] = found.remarks
     write_json(report, job.target)

@@ -25,8 +25,8 @@ from imutool.mcap_io.read import UNIT_KEY
 from imutool.mcap_io.topics import DERIVED_KEY, StampCheck, Topic
 
 LISTED = 60  # fields named in a message
-LONGEST_ROW = 64  # of an array of numbers that is looked at as channels
-MOST_OTHERS, LOOKED_AT = 48, 4  # channels, and how many times as many fields are read to find those that vary
+MAX_ROW = 64  # numbers of an array that become channels
+MAX_OTHERS, READ_FACTOR = 48, 4  # channels, and how many times as many fields are read to find varying ones
 _PATH = re.compile(r"[A-Za-z]\w*(\[\d{1,9}\])?(\.[A-Za-z]\w*(\[\d{1,9}\])?)*")
 _LAST = re.compile(r"(.*?)(?:\[(\d+)\])?")
 _NO_CHANNEL = re.compile(r"(^|\.)(\w*stamp|covariance|\w+_covariance)\b")
@@ -96,7 +96,7 @@ def numeric_fields(log: Log, topic: str, *, long: bool = True) -> list[str]:
     return []
 
 
-def others(path: Location, signal: str, most: int = MOST_OTHERS) -> dict[str, Fields]:
+def others(path: Location, signal: str, most: int = MAX_OTHERS) -> dict[str, Fields]:
     """Every other varying number of a log by TOPIC.field: candidates to drive a signal.
 
     Left out are stamps, covariances, constants, NaN, stamps that go back, long arrays (images), topics without a definition or
@@ -107,7 +107,7 @@ def others(path: Location, signal: str, most: int = MOST_OTHERS) -> dict[str, Fi
     """
     with Log(path) as log:
         readers = {}
-        left = LOOKED_AT * most
+        left = READ_FACTOR * most
         for name, topic in log.topics.items():
             paths = [] if DERIVED_KEY in topic.metadata else _offered(log, name)
             paths = [inside for inside in paths if f"{name}.{inside}" != signal and not _NO_CHANNEL.search(inside)][:left]
@@ -157,8 +157,8 @@ def _paths(walk: ros2_definition.Walk, long: bool = True) -> Iterator[str]:
             continue
         if leaf.length is None:
             yield leaf.path
-        elif long or leaf.length <= LONGEST_ROW:
-            yield from (f"{leaf.path}[{k}]" for k in range(min(leaf.length, LONGEST_ROW)))
+        elif long or leaf.length <= MAX_ROW:
+            yield from (f"{leaf.path}[{k}]" for k in range(min(leaf.length, MAX_ROW)))
 
 
 def _listed(names: Collection[str]) -> str:
@@ -220,7 +220,7 @@ class _Reader:
         """Offsets of the wanted fields and of the header's stamp; the walk ends at the last.
 
         Raises:
-            LogError: there is no such number; the message lists those that there are.
+            LogError: no such number; the message lists the known ones.
         """
         asked: dict[str, list[tuple[str, int | None]]] = {}
         for path in self.paths:
@@ -238,15 +238,15 @@ class _Reader:
                 break  # what comes behind need not lie alike
         missing = [path for path in self.paths if path not in found]
         if missing and self.strict:
-            raise self._none(missing[0], walk)
+            raise self._unknown(missing[0], walk)
         return found
 
-    def _none(self, path: str, walk: ros2_definition.Walk) -> LogError:
-        there = list(_paths(ros2_definition.Walk(walk.payload, self.definition)))
-        near = difflib.get_close_matches(path, there, n=1)
+    def _unknown(self, path: str, walk: ros2_definition.Walk) -> LogError:
+        known = list(_paths(ros2_definition.Walk(walk.payload, self.definition)))
+        near = difflib.get_close_matches(path, known, n=1)
         return LogError(
             f"there is no number {path} in {self.topic.schema_name}",
-            expected=_listed(there),
+            expected=_listed(known),
             fix=f"Did you mean {self.topic.name}.{near[0]}?" if near else "",
         )
 

@@ -64,8 +64,8 @@ def read_recording(
 ) -> Recording:
     """As `read`, in a log that is open.
 
-    Where somebody is to be told (`refused`), poses that a recording cannot hold are left out. Without `derived` the scalars
-    that imutool computed are not read.
+    With `refused`, poses that a recording cannot hold are left out and `refused` is called with topic and error. Without
+    `derived` the scalars that imutool computed are not read.
 
     Raises:
         LogError: as `read`.
@@ -79,16 +79,16 @@ def read_recording(
         for t in log.with_schema(SCALARS)
         if t.name not in velocities and t.message_encoding in ENCODINGS and (derived or DERIVED_KEY not in t.metadata)
     ]
-    gather = _Gather(log, imu_topic, truths, velocities, scalars, refused)
+    columns = _Columns(log, imu_topic, truths, velocities, scalars, refused)
     with log.named():
-        topics = gather.topics if samples is None else gather.topics[1:]
+        topics = columns.topics if samples is None else columns.topics[1:]
         for topic, rows in log.rows(topics, start_ns, end_ns):
-            gather.take(topic, rows)
+            columns.take(topic, rows)
     return Recording(
         name=own.get("name", log.path.stem),
-        imu=gather.imu() if samples is None else samples,
-        truths=gather.truths(truth),
-        scalars=gather.scalars(),
+        imu=columns.imu() if samples is None else samples,
+        truths=columns.truths(truth),
+        scalars=columns.scalars(),
         frames=_frames(log, start_ns, end_ns),
         metadata=metadata,
         imu_topic=imu_topic,
@@ -109,7 +109,7 @@ def _choose_truths(log: Log, truth: str | None) -> list[str]:
     return trees
 
 
-class _Gather:
+class _Columns:
     """Collects the columns of every wanted topic in one pass over the log."""
 
     def __init__(
@@ -140,7 +140,7 @@ class _Gather:
                     self._keep(topic, imu.sequence, imu.stamp_ns, imu.gyro, imu.accel)
         elif topic in self.truth_topics:
             if topic not in self.left_out:
-                with self._told(topic), self.log.named(topic):
+                with self._leave_out_on_error(topic), self.log.named(topic):
                     self._take_poses(topic, rows)
         elif topic in self.velocity_topics:
             with self.log.named(topic):
@@ -161,7 +161,7 @@ class _Gather:
             self._keep(name, pose.sequence, pose.stamp_ns, pose.p_wb, pose.q_wb_wxyz)
 
     @contextmanager
-    def _told(self, topic: str) -> Iterator[None]:
+    def _leave_out_on_error(self, topic: str) -> Iterator[None]:
         """Leaves out a topic that a recording cannot hold, if the caller wants to know of it."""
         try:
             yield
@@ -215,7 +215,7 @@ class _Gather:
         found = {}
         for name in names:
             if name not in self.left_out:
-                with self._told(name):
+                with self._leave_out_on_error(name):
                     found[name] = self._poses(name)
         return found
 
@@ -272,7 +272,7 @@ def _opener(path: Location, topic: str, start_ns: int | None, end_ns: int | None
 def _own_and_user_metadata(log: Log) -> tuple[dict[str, str], dict[str, dict[str, str]]]:
     """The writer's notes on the recording, and the recording's own metadata.
 
-    The writer's record is the first `imutool` that names what it shadows; later ones tell of what was done to the log.
+    The writer's record is the first `imutool` that names what it shadows; later ones describe what was done to the log.
     """
     own: dict[str, str] = {}
     found: dict[str, dict[str, str]] = {}

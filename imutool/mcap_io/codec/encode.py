@@ -36,10 +36,10 @@ _XYZW_FROM_WXYZ = [1, 2, 3, 0]
 
 def _blank(count: int, layout: Layout) -> UInt8[np.ndarray, "n L"]:
     """Messages with every byte filled in that they share."""
-    one = np.zeros(layout.size, np.uint8)
+    message = np.zeros(layout.size, np.uint8)
     for at, value in layout.constants:
-        one[at : at + len(value)] = np.frombuffer(value, np.uint8)
-    return np.repeat(one[None, :], count, axis=0)
+        message[at : at + len(value)] = np.frombuffer(value, np.uint8)
+    return np.repeat(message[None, :], count, axis=0)
 
 
 def _put_stamp(rows: UInt8[np.ndarray, "n L"], layout: Layout, stamp_ns: Int64[np.ndarray, " n"]) -> None:
@@ -70,7 +70,7 @@ def encode_imu(
     """One Imu message per row.
 
     Orientation is (0, 0, 0, 1) and marked as not measured; covariances, row-major, are one
-    for all or one per row, and all zeros ("unknown", says the message's definition) where not given.
+    for all or one per row, and all zeros ("unknown" in the message's definition) where not given.
 
     Raises:
         DataError: a stamp beyond the 32-bit seconds of ROS 2.

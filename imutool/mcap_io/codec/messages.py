@@ -79,7 +79,7 @@ def signed(times: UInt64[np.ndarray, " n"]) -> Int64[np.ndarray, " n"]:
 def scan(data: bytes | memoryview, *, bare: bool = False) -> tuple[Int64[np.ndarray, " n"], list[tuple[int, int, int]], int]:
     """Offsets of messages and definitions in a stretch of records, and where whole records end.
 
-    A `bare` stretch lies outside chunks and also ends before the first record that is no message, or none that can be.
+    A `bare` stretch lies outside chunks and also ends before the first record that is not a valid message.
     Stretches of equally long messages, which topic-grouped chunks consist of, are recognised as a matrix; the framing is still
     followed record by record, only not in Python.
     """
@@ -143,7 +143,7 @@ def parse(data: bytes | memoryview, offset: int) -> Messages:
 def parse_at(data: bytes | memoryview, offsets: Int64[np.ndarray, " n"]) -> Messages | None:
     """Messages at these offsets; None unless they alone fill the bytes from end to end.
 
-    What `messages` finds by following the records one by one, for bytes of which an index is there: a tenth of the time
+    As `parse`, which follows the records one by one, where an index lists the offsets: a tenth of the time
     where lengths alternate.
     """
     view, count = np.frombuffer(data, np.uint8), len(offsets)

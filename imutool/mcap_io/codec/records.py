@@ -2,7 +2,7 @@
 
 The classes of the `mcap` package serve all but the ChunkIndex record: there is one for each chunk, and `mcap` takes 30 µs to
 parse it and 20 µs to build it, a third of what copying a log of 1 MiB chunks costs; the functions here take a tenth.
-Format: https://mcap.dev/spec. Every length read from a file is compared with the bytes there are.
+Format: https://mcap.dev/spec. Every length read from a file is compared with the available bytes.
 """
 
 from __future__ import annotations

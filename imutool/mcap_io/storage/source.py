@@ -11,7 +11,7 @@ from imutool.location import Location, io_errors, open_location, reason
 from imutool.mcap_io.codec.records import HEAD, crc32
 
 BLOCK_BYTES = 1 << 20
-CUT_SHORT = "Save what is there with `imutool repair`, or copy it again from where it was recorded"
+CUT_SHORT = "Save the rest with `imutool repair`, or copy it again from where it was recorded"
 
 
 class Source:
@@ -95,7 +95,7 @@ class Digest:
                 if self._left.is_set():
                     return
                 self._sum.update(self._source.at(at, min(BLOCK_BYTES, size - at)))
-        except LogError as error:  # told where the result is asked for
+        except LogError as error:  # raised by `result`
             self._error = error.at(self._source.path)
 
     def result(self) -> str:

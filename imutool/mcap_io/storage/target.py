@@ -66,9 +66,9 @@ class Target:
         name = f".{path.name}.{os.getpid()}.{secrets.token_hex(4)}.partial"
         self._medium: _Medium = _File(path, name) if isinstance(path, Path) else Upload(path, name)
         self.temporary = self._medium.temporary
-        # Ctrl-C may come between two lines, before anybody is there to call `abandon`: then the file goes with this object
+        # Ctrl-C may come between two lines, before `abandon` can be called: then the file goes with this object
         self._remove = weakref.finalize(self, self._medium.discard)
-        with self._told():
+        with self._system_errors():
             self._refuse_existing()
             self._medium.open()
 
@@ -79,7 +79,7 @@ class Target:
             raise ConfigError("the target exists", where=self.path, fix="Choose another name, or add `overwrite=True`")
 
     @contextmanager
-    def _told(self) -> Iterator[None]:
+    def _system_errors(self) -> Iterator[None]:
         try:
             yield
         except ConfigError:
@@ -95,7 +95,7 @@ class Target:
         Raises:
             ConfigError: the system refuses; the message gives its reason.
         """
-        with self._told():
+        with self._system_errors():
             self._medium.write(data)
         self.position += len(data)
         if self.summing:
@@ -109,7 +109,7 @@ class Target:
             LogError: the source does not have the bytes, or the disk does not give them.
         """
         if not self.summing:
-            with self._told():
+            with self._system_errors():
                 stopped = self._medium.copy(source, start, end)
             self.position, start = self.position + stopped - start, stopped
         for at in range(start, end, BLOCK_BYTES):
@@ -117,7 +117,7 @@ class Target:
 
     def flush(self) -> None:
         """Makes all bytes readable under the temporary name; nothing can be written after."""
-        with self._told():
+        with self._system_errors():
             self._medium.complete()
 
     def __enter__(self) -> Target:
@@ -136,7 +136,7 @@ class Target:
             ConfigError: the system refuses, or somebody else wrote the target meanwhile; nothing is left behind.
         """
         try:
-            with self._told():
+            with self._system_errors():
                 self._medium.complete()
                 self._refuse_existing()
                 self._medium.publish()

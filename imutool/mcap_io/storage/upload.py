@@ -25,7 +25,7 @@ class Upload:
 
     def __init__(self, path: UPath, name: str) -> None:
         self.path, self.temporary = path, path.with_name(name)
-        self.size, self.seal = 0, ""
+        self.size, self.etag = 0, ""
         self.file: Any = None
 
     def open(self) -> None:
@@ -47,7 +47,7 @@ class Upload:
         """Sends the last part, unless that is done: the temporary object then exists."""
         if not self.file.closed:
             self.file.close()
-            self.seal = self._seal(self.temporary)
+            self.etag = self._check_size(self.temporary)
 
     def publish(self) -> None:
         """Copies the object to its own key, within the store, and removes the temporary one.
@@ -55,11 +55,11 @@ class Upload:
         Raises:
             ConfigError: the store holds something else than what was written.
         """
-        if self._seal(self.temporary) != self.seal:
-            raise ConfigError("was changed by somebody while it was written", where=self.temporary)
+        if self._check_size(self.temporary) != self.etag:
+            raise ConfigError("was changed while it was written", where=self.temporary)
         with self._no_parts_left():
             self.path.fs.cp_file(self.temporary.path, self.path.path)
-        self._seal(self.path)
+        self._check_size(self.path)
         try:
             self.path.fs.rm_file(self.temporary.path)
         except Exception as error:  # the object is in its place, and whole: that is what was asked for  # noqa: BLE001
@@ -72,7 +72,7 @@ class Upload:
         try:
             yield
         except BaseException:
-            with suppress(Exception):  # one thing after another can fail; the first is what is said
+            with suppress(Exception):  # the first error is raised
                 for upload in self._uploads() - before:  # the others are somebody else's
                     self.path.fs.abort_mpu(*upload)
             raise
@@ -85,7 +85,7 @@ class Upload:
             return {(bucket, key, entry["UploadId"]) for entry in found if entry["Key"] == key}
         return set()
 
-    def _seal(self, place: UPath) -> str:
+    def _check_size(self, place: UPath) -> str:
         """ETag of an object, whose size must be that of the bytes written."""
         info: dict[str, Any] = place.fs.info(place.path)
         if info["size"] != self.size:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +15,7 @@ import pytest
 import rerun as rr
 from rerun.chunk import RrdReader
 from support import diagnoses
+from support.diagnoses import replace
 
 from imutool.diagnosis.wording import conclusion
 from imutool.errors import ConfigError
