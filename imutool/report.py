@@ -28,6 +28,8 @@ __all__ = ["REPORTS", "UNSET", "Report", "Section", "UnsetType", "json_schema", 
 
 # by name, the module and the type: imported when its schema is asked for, so that --help stays light
 REPORTS = {
+    "info": "imutool.log_report:LogInfo",
+    "infos": "imutool.log_report:LogInfos",
     "models": "imutool.cli.models:Models",
 }
 

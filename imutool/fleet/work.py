@@ -27,6 +27,7 @@ from imutool.location import Location, identity, to_location
 from imutool.mcap_io.log import Log
 from imutool.mcap_io.storage.digest import sha256
 from imutool.mcap_io.storage.target import Target
+from imutool.report import json_values
 
 LOST = 3  # exit code: something of the log was lost
 MOST_LOSSES = 20  # stretches told of a log; its metadata and its repair tell all
@@ -192,10 +193,10 @@ def _info(job: _Job) -> dict[str, Any]:
     from imutool.log_info import inspect
 
     report = inspect(job.source)
-    write_json(report, job.target)
-    told = {"messages": report["messages"], "duration_s": report["duration_s"]}
-    lost = _lost(report.get("losses"))
-    return told | lost | {"warnings": (*lost.get("warnings", ()), *report["warnings"])}
+    write_json(json_values(report), job.target)
+    told = {"messages": report.messages, "duration_s": report.duration_s}
+    lost = _lost(report.losses)
+    return told | lost | {"warnings": (*lost.get("warnings", ()), *report.warnings)}
 
 
 def _repair(job: _Job) -> dict[str, Any]:
