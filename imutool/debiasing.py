@@ -23,7 +23,7 @@ from imutool.bias.model import BiasModel, OneByOne, Stream, Vector6
 from imutool.bias_start.bias_covariance import BiasCovariance
 from imutool.bias_start.initial_bias import InitialBias, following
 from imutool.bias_start.model_choice import prepare, refuse_smooth
-from imutool.cleaning import Cleaner, Rules, Survey, look
+from imutool.cleaning import Cleaner, CleaningSettings, Survey, look
 from imutool.config import plain
 from imutool.errors import ConfigError, LogError
 from imutool.location import Location
@@ -201,7 +201,7 @@ def debias(
     init: str = "auto",
     smooth: bool = False,
     check: str = "imu",
-    clean: Rules | None = None,
+    clean: CleaningSettings | None = None,
     overwrite: bool = False,
     progress: Callable[[int, int], None] | None = None,
     watch: Watch | None = None,
@@ -252,7 +252,7 @@ class _Asked:
     imus: Sequence[str]
     init: str
     smooth: bool
-    clean: Rules | None
+    clean: CleaningSettings | None
     check: str
     overwrite: bool
     watch: Watch | None

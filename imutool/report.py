@@ -28,9 +28,17 @@ __all__ = ["REPORTS", "UNSET", "Report", "Section", "UnsetType", "json_schema", 
 
 # by name, the module and the type: imported when its schema is asked for, so that --help stays light
 REPORTS = {
+    "clean": "imutool.cleaning.first_pass:CleaningReport",
+    "conversion": "imutool.cli.convert:Conversion",
+    "debias": "imutool.cli.debias:DebiasSummary",
+    "demo": "imutool.cli.shipped:DemoReport",
+    "export": "imutool.cli.convert:Export",
     "info": "imutool.log_report:LogInfo",
     "infos": "imutool.log_report:LogInfos",
-    "models": "imutool.cli.models:Models",
+    "models": "imutool.cli.shipped:Models",
+    "repair": "imutool.cli.repair:Repair",
+    "training": "imutool.cli.train:TrainingReport",
+    "view": "imutool.cli.view:View",
 }
 
 

@@ -10,8 +10,7 @@ from typing import Annotated, Any
 import typer
 
 from imutool.cli.app import Imu, Init, Json, Logs, Models, Overwrite, Quiet, Report, Smooth, Truth, Verbose, app
-from imutool.cli.figures import figures
-from imutool.cli.terminal import progress, say, write_json
+from imutool.cli.terminal import figures, progress, say, write_json
 
 
 @app.command(epilog="Example: [bold]imutool evaluate MH_04.mcap --model adis.safetensors --init truth[/]")

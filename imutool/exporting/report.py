@@ -5,9 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
-SCHEMA = "imutool.export/1"
 Progress = Callable[[int, int, str], None]  # done, in all, what is being written
 
 
@@ -20,14 +18,3 @@ class ExportReport:
     imu: str | None = None
     written: dict[str, int] = field(default_factory=dict)
     left_out: list[str] = field(default_factory=list)
-
-    def plain(self) -> dict[str, Any]:
-        """The report as plain JSON values."""
-        return {
-            "schema": SCHEMA,
-            "output": str(self.output),
-            "format": self.format,
-            "imu": self.imu,
-            "written": self.written,
-            "left_out": self.left_out,
-        }

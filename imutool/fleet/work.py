@@ -144,11 +144,11 @@ def _measured(target: Location) -> dict[str, Any]:
 
 
 def _debias(job: _Job) -> dict[str, Any]:
-    from imutool.cleaning import Rules
+    from imutool.cleaning import CleaningSettings
     from imutool.debiasing import debias
 
     s = job.settings
-    rules = Rules() if s.clean else None
+    rules = CleaningSettings() if s.clean else None
     report = debias(
         job.source, job.target, model=s.model, init=s.init, smooth=s.smooth, clean=rules, check=s.check, overwrite=True
     )

@@ -11,7 +11,7 @@ from support.imu_defects import batch_of, cut, late, pick, repeated, with_values
 from imutool.cleaning.cleaner import Cleaner
 from imutool.cleaning.first_pass import Survey, examine
 from imutool.cleaning.samples import BLOCK, blocks, padded
-from imutool.cleaning.settings import Rules, every
+from imutool.cleaning.settings import CleaningSettings, every
 from imutool.errors import LogError
 from imutool.mcap_io.batches import Clock, ImuBatch
 from imutool.sensor.flight import flight
@@ -38,7 +38,7 @@ def spoiled() -> ImuBatch:
 SPOILED = spoiled()
 
 
-def look(batches: list[ImuBatch], rules: Rules | None = None) -> Survey:
+def look(batches: list[ImuBatch], rules: CleaningSettings | None = None) -> Survey:
     return examine(lambda: batches, None, rules)
 
 
@@ -132,7 +132,7 @@ def test_exactly_what_was_planted_is_dropped_wherever_it_is(places, random):
 @settings(max_examples=20, deadline=None)
 @given(st.sets(st.sampled_from(every())))
 def test_any_rule_can_be_left_out_without_a_warning(without_rules):
-    survey = look([SPOILED], Rules(without=tuple(sorted(without_rules))))
+    survey = look([SPOILED], CleaningSettings(without=tuple(sorted(without_rules))))
     assert not {one.rule for one in survey.findings} & without_rules
     survey.record()
 

@@ -19,7 +19,7 @@ import pyarrow.parquet as pq
 import pytest
 from typer.testing import CliRunner
 
-from imutool.cleaning import Rules
+from imutool.cleaning import CleaningSettings
 from imutool.cli import app
 from imutool.debiasing import debias
 from imutool.errors import ConfigError
@@ -249,7 +249,7 @@ def expected(logs: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, 
         source = folder / "in" / f"log_{k}.mcap"
         source.parent.mkdir(exist_ok=True)
         shutil.copy(logs / f"flight_{1 + k % 2}.mcap", source)
-        debias(source, folder / source.name, model=logs / "linear.safetensors", clean=Rules())
+        debias(source, folder / source.name, model=logs / "linear.safetensors", clean=CleaningSettings())
     return {path.name: sha256(path) for path in folder.glob("*.mcap")}
 
 

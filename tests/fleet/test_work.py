@@ -14,7 +14,7 @@ from rosbags.rosbag1 import Reader, Writer
 from rosbags.typesys import Stores, get_typestore
 
 from imutool.bag.repair import repair_bag
-from imutool.cleaning import Rules
+from imutool.cleaning import CleaningSettings
 from imutool.debiasing import debias
 from imutool.errors import ConfigError
 from imutool.fleet.models import settled
@@ -42,7 +42,7 @@ def done(logs: Path, tmp_path: Path, settings: Settings) -> Result:
 
 
 def test_a_debiased_log_is_what_debias_makes_of_it(done: Result, logs: Path, tmp_path: Path, settings: Settings) -> None:
-    debias(logs / "flight_1.mcap", tmp_path / "alone.mcap", model=settings.model, clean=Rules())
+    debias(logs / "flight_1.mcap", tmp_path / "alone.mcap", model=settings.model, clean=CleaningSettings())
     target = tmp_path / "out" / "a" / "log.mcap"
     assert target.read_bytes() == (tmp_path / "alone.mcap").read_bytes()
     assert (done.status, done.error, done.exit_code) == ("ok", "", 0)
