@@ -146,12 +146,12 @@ def identity(where: Location) -> tuple[int, str]:
         if isinstance(where, Path):
             status = where.stat()
             return status.st_size, str(status.st_mtime_ns)
-        return seal(where.fs.info(where.path))
+        return size_and_stamp(where.fs.info(where.path))
     except failures(where) as error:
         raise ConfigError(f"cannot be read ({reason(error)})", where=where, fix="See who may read it") from error
 
 
-def seal(about: Mapping[str, Any]) -> tuple[int, str]:
+def size_and_stamp(about: Mapping[str, Any]) -> tuple[int, str]:
     """Size and etag as a store says them, by whatever name."""
     names = ("ETag", "etag", "md5Hash", "content_md5", "LastModified", "last_modified", "mtime", "created")
     stamp = next((str(about[name]) for name in names if about.get(name)), "")

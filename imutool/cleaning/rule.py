@@ -5,7 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
-from typing import ClassVar, Self
+from typing import ClassVar
 
 import numpy as np
 from jaxtyping import Float64, Int64
@@ -60,7 +60,7 @@ class Rule(ABC):
         """Take in the next samples; none is dropped."""
         return
 
-    def second_pass(self, messages: int) -> Self | None:
+    def second_pass(self, messages: int) -> Rule | None:
         """The instance for a second pass over the log, from the first one's totals; None where one pass is enough."""
         return None
 

@@ -25,9 +25,8 @@ from imutool.debiasing import debias
 from imutool.errors import ConfigError
 from imutool.fleet.engine import Engine
 from imutool.fleet.journal import NAME
-from imutool.fleet.models import settled
-from imutool.fleet.run import Tally, run
-from imutool.fleet.task import Result, Settings, Task
+from imutool.fleet.run import Progress, run
+from imutool.fleet.task import Result, Settings, Task, with_model_hash
 from imutool.fleet.work import work
 from imutool.location import to_location
 from imutool.mcap_io.storage.digest import sha256
@@ -41,7 +40,7 @@ LOGS = 6  # of a fleet that is killed
 
 @pytest.fixture
 def settings(logs: Path) -> Settings:
-    return settled(Settings(command="debias", model=str(logs / "linear.safetensors")))
+    return with_model_hash(Settings(command="debias", model=str(logs / "linear.safetensors")))
 
 
 def rows(out: Path) -> dict[str, dict[str, Any]]:
@@ -408,7 +407,7 @@ def test_a_fleet_in_a_store_is_that_of_a_folder(fleet: Path, store: Any, setting
 
 def test_an_exit_code_tells_the_worst() -> None:
     def ended(*results: tuple[str, int, str | None]) -> int:
-        tally = Tally(len(results), 0)
+        tally = Progress(len(results), 0)
         for status, code, earlier in results:
             tally.take(Result(key="", source="", target="", status=status, exit_code=code, earlier=earlier))
         return tally.exit_code

@@ -17,10 +17,9 @@ from imutool.bag.repair import repair_bag
 from imutool.cleaning import CleaningSettings
 from imutool.debiasing import debias
 from imutool.errors import ConfigError
-from imutool.fleet.models import settled
 from imutool.fleet.sources import find
-from imutool.fleet.task import Result, Settings, Source, Task
-from imutool.fleet.work import called, robot_of, robot_pattern, work
+from imutool.fleet.task import Result, Settings, Source, Task, with_model_hash
+from imutool.fleet.work import robot_of, robot_pattern, target_name, work
 from imutool.mcap_io.read import read
 from imutool.mcap_io.storage.digest import sha256
 from imutool.mcap_io.write import write
@@ -64,7 +63,7 @@ def test_done_again_it_is_the_same_byte_for_byte(done: Result, logs: Path, tmp_p
 def test_a_machine_without_the_model_gets_it(done: Result, logs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     model = (logs / "linear.safetensors").read_bytes()
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
-    away = settled(Settings(command="debias", model=str(logs / "linear.safetensors")))
+    away = with_model_hash(Settings(command="debias", model=str(logs / "linear.safetensors")))
     away = msgspec.structs.replace(away, model="/not/here/linear.safetensors")
     assert work(task(logs / "flight_1.mcap", tmp_path / "far", away), model).target_sha256 == done.target_sha256
     spoiled = work(task(logs / "flight_1.mcap", tmp_path / "far", away), model + b"more")
@@ -137,7 +136,7 @@ def bag(tmp_path: Path) -> Path:
 
 def bag_task(source: Path, out: Path, settings: Settings) -> Task:
     (one,) = find(str(source), Path("/nowhere"), bags=True).logs
-    return Task(key="k", source=one, out=str(out), target=called(one.name, "repair"), settings=settings)
+    return Task(key="k", source=one, out=str(out), target=target_name(one.name, "repair"), settings=settings)
 
 
 def test_a_bag_is_repaired_as_a_bag(bag: Path, tmp_path: Path) -> None:
