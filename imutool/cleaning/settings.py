@@ -55,5 +55,5 @@ def chosen(only: Iterable[str], without: Iterable[str], force: bool = False) -> 
     rules = CleaningSettings(only=tuple(only), without=tuple(without), force=force)
     rules.names()
     if both := set(rules.only) & set(rules.without):
-        raise ConfigError(f"{min(both)} is asked for and left out", where="--rule", fix="Give --rule or --no-rule")
+        raise ConfigError(f"{min(both)} is asked for and left out", where="rule", fix="Give `rule` or `no_rule`")
     return rules

@@ -9,6 +9,7 @@ from typing import Annotated
 import typer
 
 from imutool.cli.app import Json, Overwrite, Quiet, Verbose, app, listing
+from imutool.cli.parameters import with_flags
 from imutool.cli.terminal import progress, say, tell_error, write_json
 from imutool.errors import DataError
 from imutool.report import Report, Section
@@ -82,7 +83,7 @@ def convert(
         for path in report.written:
             say(str(path))
     for failure in report.failures:
-        tell_error(failure.message)
+        tell_error(with_flags(failure.message))
     if report.failures:
         raise typer.Exit(DataError.exit_code)
 

@@ -11,6 +11,7 @@ import typer
 
 from imutool.cli.app import App, Imu, Init, Json, Overwrite, Quiet, Smooth, Truth, Verbose, app
 from imutool.cli.debias import VERIFY_HELP
+from imutool.cli.parameters import with_flags
 from imutool.cli.terminal import out, plain, progress, say, write_json
 from imutool.errors import ConfigError
 from imutool.fleet.task import Settings
@@ -190,10 +191,10 @@ def _run(
 
 
 def _show(done: FleetReport, report: str | None) -> None:
-    for one in done.not_whole[:SHOWN]:
-        why = one.error or "; ".join(one.losses) or "; ".join(one.warnings)
-        line = f"[yellow]{one.earlier or one.status}:[/] {plain(why if one.source in why else f'{one.source}: {why}')}"
-        out.print(line, highlight=False, soft_wrap=True)
+    for result in done.not_whole[:SHOWN]:
+        why = result.error or "; ".join(result.losses) or "; ".join(result.warnings)
+        why = plain(with_flags(why if result.source in why else f"{result.source}: {why}"))
+        out.print(f"[yellow]{result.earlier or result.status}:[/] {why}", highlight=False, soft_wrap=True)
     if len(done.not_whole) > SHOWN:
         say("and more")
     if done.comparison is not None:

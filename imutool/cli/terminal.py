@@ -19,6 +19,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn
 from rich.table import Table
 
+from imutool.cli.parameters import with_flags
 from imutool.errors import ConfigError
 from imutool.mcap_io.losses import told
 from imutool.report import json_values
@@ -131,7 +132,7 @@ class _Lines(logging.Handler):
     """Log records as lines on stderr, above the progress bar where there is one."""
 
     def emit(self, record: logging.LogRecord) -> None:
-        err.print(plain(f"{record.levelname.lower()}: {record.getMessage()}"), highlight=False, soft_wrap=True)
+        err.print(plain(with_flags(f"{record.levelname.lower()}: {record.getMessage()}")), highlight=False, soft_wrap=True)
 
 
 def log_to_stderr(verbose: bool, quiet: bool) -> None:

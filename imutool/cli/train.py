@@ -13,7 +13,7 @@ from imutool import registry
 from imutool.cli.app import Imu, Json, Logs, Overwrite, Quiet, Truth, Verbose, app, listing
 from imutool.cli.terminal import epoch_line, progress, say, write_json
 from imutool.errors import ConfigError
-from imutool.report import Report, Section
+from imutool.report import UNSET, Report, Section, UnsetType
 
 
 @app.command(
@@ -81,7 +81,7 @@ class TrainingLog(Section, frozen=True):
 
 
 class TrainingReport(Report, frozen=True, kw_only=True, tag="imutool.training/1"):
-    """The report of `imutool train`: the new model's card."""
+    """The report of `imutool train`: the new model's card; `compared` and `physics` for a hybrid model."""
 
     model: str
     imutool: str
@@ -90,6 +90,12 @@ class TrainingReport(Report, frozen=True, kw_only=True, tag="imutool.training/1"
     training: dict[str, Any]
     logs: list[TrainingLog]
     held_out: dict[str, Any]
+    compared: dict[str, Any] | UnsetType = UNSET
+    physics: dict[str, Any] | UnsetType = UNSET
+    sensor: str | None
+    dataset: str | None
+    name: str | UnsetType = UNSET
+    sha256: str | UnsetType = UNSET
 
 
 def training_report(model: Path, card: Mapping[str, Any]) -> TrainingReport:

@@ -250,7 +250,7 @@ class UnitReport(Report, frozen=True, tag="imutool.unit/1"):
     """Parameters of one robot's sensor from one log, with the start bias (rad/s, m/s²)."""
 
     robot: str
-    bias: list[float]
+    bias: list[list[float]]
     parameters: list[Parameter]
     diagnosis: dict[str, Any] | UnsetType = UNSET
 

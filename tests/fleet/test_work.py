@@ -17,9 +17,10 @@ from imutool.bag.repair import repair_bag
 from imutool.cleaning import CleaningSettings
 from imutool.debiasing import debias
 from imutool.errors import ConfigError
+from imutool.fleet.robots import robot_of, robot_pattern
 from imutool.fleet.sources import find
 from imutool.fleet.task import Result, Settings, Source, Task, with_model_hash
-from imutool.fleet.work import robot_of, robot_pattern, target_name, work
+from imutool.fleet.work import target_name, work
 from imutool.mcap_io.read import read
 from imutool.mcap_io.storage.digest import sha256
 from imutool.mcap_io.write import write
@@ -194,10 +195,10 @@ def test_a_robot_is_its_folder_or_what_the_pattern_says(logs: Path, tmp_path: Pa
     assert robot_of("robot_3.mcap", None, log) == "robot_3"
     assert robot_of("site/r3_monday.mcap", r"(r\d+)_", log) == "r3"
     assert robot_of("any.mcap", "metadata:unit.serial", log) == "7"
-    with pytest.raises(ConfigError, match="fits nothing"):
+    with pytest.raises(ConfigError, match="matches nothing"):
         robot_of("site/monday.mcap", r"(r\d+)_", log)
     with pytest.raises(ConfigError, match="has no 'name'"):
         robot_of("any.mcap", "metadata:unit.name", log)
     for wrong in ("(", "metadata:serial"):
-        with pytest.raises(ConfigError, match="--robot-from"):
+        with pytest.raises(ConfigError, match="robot_from"):
             robot_pattern(wrong)
