@@ -40,11 +40,12 @@ BLOCK_BYTES = 4 << 20
 CACHE, CACHE_OPTIONS = "blockcache", {"maxblocks": 4}
 
 
-class Opened(NamedTuple):
-    """What can be read of a place, from any byte, and how many bytes it has."""
+class OpenFile(NamedTuple):
+    """A file or object open for reading from any byte, its size, and its `identity` when it was opened."""
 
     file: BinaryIO
     size: int
+    identity: tuple[int, str]
 
 
 def to_location(text: str) -> Location:
@@ -59,7 +60,7 @@ def to_location(text: str) -> Location:
     if scheme == "file":
         return Path(rest)
     if scheme not in STORES:
-        raise ConfigError("is no store known here", where=redacted(text), expected=", ".join(f"{name}://" for name in STORES))
+        raise ConfigError("is no store known here", where=redact(text), expected=", ".join(f"{name}://" for name in STORES))
     _refuse_secrets(scheme, text)
     try:
         from upath import UPath
@@ -80,7 +81,7 @@ def _refuse_secrets(scheme: str, text: str) -> None:
     if at and (scheme not in ACCOUNTS or ":" in login):
         raise ConfigError(
             "a user name or password stands in the URL",
-            where=redacted(text),
+            where=redact(text),
             expected="none: URLs are written into reports and logs",
             fix="Give it by the store's environment variables or profile",
         )
@@ -93,12 +94,12 @@ def _refuse_secrets(scheme: str, text: str) -> None:
         )
 
 
-def redacted(text: str) -> str:
+def redact(text: str) -> str:
     """Text that may hold URLs, without the users, passwords and signatures in them."""
     return re.sub(r"(?i)((?:signature|sig|token|credential)=)[^&\s\"']+", r"\1***", re.sub(r"//[^/\s]*@", "//***@", text))
 
 
-def failures(where: Location) -> type[Exception]:
+def io_errors(where: Location) -> type[Exception]:
     """What reading and writing there may raise: of a store whatever its library does, since they have no class in common."""
     return OSError if isinstance(where, Path) else Exception
 
@@ -106,34 +107,36 @@ def failures(where: Location) -> type[Exception]:
 def reason(error: Exception) -> str:
     """What went wrong in the words of the system or the store, with nothing secret in it."""
     if isinstance(error, OSError) and error.strerror:
-        return redacted(error.strerror)
+        return redact(error.strerror)
     if isinstance(error, FileNotFoundError):
         return "no such object, or no such bucket"
     if isinstance(error, PermissionError):
-        return redacted(f"the store refuses access: {error}")
-    return redacted(str(error)) or type(error).__name__
+        return redact(f"the store refuses access: {error}")
+    return redact(str(error)) or type(error).__name__
 
 
-def opened(where: Location) -> Opened:
-    """A place open for reading; of a store by ranges, in blocks, of which a few are kept.
+def open_location(where: Location) -> OpenFile:
+    """A file or object open for reading; a store is read by ranges, in blocks, of which a few are kept.
 
     Raises:
-        whatever `failures` names.
+        The classes that `io_errors` names.
     """
     if isinstance(where, Path):
         file = where.open("rb", buffering=0)
-        return Opened(file, os.fstat(file.fileno()).st_size)
+        status = os.fstat(file.fileno())
+        return OpenFile(file, status.st_size, (status.st_size, str(status.st_mtime_ns)))
     remote = where.fs.open(where.path, "rb", block_size=BLOCK_BYTES, cache_type=CACHE, cache_options=dict(CACHE_OPTIONS))
     if remote.size is None:
         raise OSError("the server does not say how long it is, so no part of it can be asked for")
-    return Opened(remote, remote.size)
+    details = getattr(remote, "details", None)  # as opening it has learnt them, without another request
+    return OpenFile(remote, remote.size, size_and_etag(details if isinstance(details, dict) else where.fs.info(where.path)))
 
 
-def same(one: Location, other: Location) -> bool:
-    """Whether two places that exist are one; a link to a file is that file."""
-    if isinstance(one, Path) and isinstance(other, Path):
-        return one.exists() and other.exists() and one.samefile(other)
-    return one == other
+def same_location(a: Location, b: Location) -> bool:
+    """Whether two locations are one existing file or object; a link to a file is that file."""
+    if isinstance(a, Path) and isinstance(b, Path):
+        return a.exists() and b.exists() and a.samefile(b)
+    return a == b
 
 
 def identity(where: Location) -> tuple[int, str]:
@@ -146,12 +149,12 @@ def identity(where: Location) -> tuple[int, str]:
         if isinstance(where, Path):
             status = where.stat()
             return status.st_size, str(status.st_mtime_ns)
-        return size_and_stamp(where.fs.info(where.path))
-    except failures(where) as error:
+        return size_and_etag(where.fs.info(where.path))
+    except io_errors(where) as error:
         raise ConfigError(f"cannot be read ({reason(error)})", where=where, fix="See who may read it") from error
 
 
-def size_and_stamp(about: Mapping[str, Any]) -> tuple[int, str]:
+def size_and_etag(about: Mapping[str, Any]) -> tuple[int, str]:
     """Size and etag as a store says them, by whatever name."""
     names = ("ETag", "etag", "md5Hash", "content_md5", "LastModified", "last_modified", "mtime", "created")
     stamp = next((str(about[name]) for name in names if about.get(name)), "")

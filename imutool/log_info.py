@@ -25,12 +25,13 @@ from imutool.cleaning.rules.units import (
     spread,
 )
 from imutool.errors import LogError
-from imutool.inertial.stationary import stretches
+from imutool.inertial.stationary import rest_stretches
 from imutool.location import Location
 from imutool.log_report import ImuInfo, ImuNoise, Interval, LogInfo, TopicInfo, TruthInfo
 from imutool.mcap_io.codec import schemas
 from imutool.mcap_io.codec.decode import decode_imu
 from imutool.mcap_io.log import Log
+from imutool.mcap_io.recovery.recovered_log import RecoveredLog
 from imutool.mcap_io.topics import DERIVED_KEY, ENCODINGS, Topic
 from imutool.recording import GAP_FACTOR, GRAVITY_M_S2, MIN_GAP_S, Imu, nanoseconds, seconds
 from imutool.report import UNSET
@@ -57,8 +58,7 @@ def inspect(path: Location, *, check: bool = True) -> LogInfo:
         ConfigError: the file cannot be opened.
         LogError: the file is not an MCAP log, or nothing in it is sound.
     """
-    with Log(path, salvage=True) as log:
-        assert log.losses is not None, "with salvage there are losses, if perhaps none"
+    with RecoveredLog(path) as log:
         if check:
             log.check()
         clocks = {name: _joined(log.stamps(name)) for name in log.topics}
@@ -185,7 +185,7 @@ class _Rest(NamedTuple):
 
 def _rest(imu: Imu) -> _Rest:
     """Stationary stretches, the specific force there, and the noise."""
-    found = stretches(imu)
+    found = rest_stretches(imu)
     samples = [slice(a, b) for a, b in found]
     weights = [b - a for a, b in found]
     norms = [float(np.linalg.norm(imu.accel[s].mean(axis=0))) for s in samples]

@@ -32,16 +32,20 @@ REPORTS = {
     "conversion": "imutool.cli.convert:Conversion",
     "debias": "imutool.cli.debias:DebiasSummary",
     "demo": "imutool.cli.shipped:DemoReport",
+    "diagnosis": "imutool.diagnosis.result:DiagnosisReport",
+    "evaluation": "imutool.cli.evaluate:Evaluation",
+    "export": "imutool.cli.convert:Export",
     "fleet": "imutool.fleet.results:FleetSummary",
     "fleet-diagnosis": "imutool.fleet.robots:FleetDiagnosis",
-    "export": "imutool.cli.convert:Export",
     "info": "imutool.log_report:LogInfo",
     "infos": "imutool.log_report:LogInfos",
     "models": "imutool.cli.shipped:Models",
     "repair": "imutool.cli.repair:Repair",
-    "unit": "imutool.fleet.work:UnitReport",
+    "score": "imutool.blind_cases.cases:OpenedCase",
     "training": "imutool.cli.train:TrainingReport",
+    "unit": "imutool.fleet.work:UnitReport",
     "view": "imutool.cli.view:View",
+    "vio": "imutool.cli.vio:VioReport",
 }
 
 

@@ -17,13 +17,12 @@ import pytest
 
 from imutool.debiasing import debias
 from imutool.errors import ConfigError, LogError
-from imutool.location import BLOCK_BYTES, reason, same, to_location
+from imutool.location import BLOCK_BYTES, reason, same_location, to_location
 from imutool.log_info import inspect
 from imutool.mcap_io.log import Log
 from imutool.mcap_io.rewrite import rewrite
 from imutool.mcap_io.storage import upload
-from imutool.mcap_io.storage.digest import sha256
-from imutool.mcap_io.storage.source import Source
+from imutool.mcap_io.storage.source import Source, sha256
 from imutool.mcap_io.storage.target import Target
 from imutool.mcap_io.write import write
 from imutool.recording import Frames, Imu, Recording
@@ -84,10 +83,10 @@ def test_a_url_with_something_secret_in_it_is_refused_and_not_repeated(url: str)
 def test_a_place_is_itself_and_no_other(tmp_path: Path, store: Any) -> None:
     (tmp_path / "a").touch()
     (tmp_path / "b").symlink_to(tmp_path / "a")
-    assert same(tmp_path / "a", tmp_path / "b")
-    assert same(to_location("s3://fleet/a"), to_location("s3://fleet/a"))
-    assert not same(to_location("s3://fleet/a"), to_location("s3://fleet/b"))
-    assert not same(to_location("s3://fleet/a"), Path("/fleet/a"))
+    assert same_location(tmp_path / "a", tmp_path / "b")
+    assert same_location(to_location("s3://fleet/a"), to_location("s3://fleet/a"))
+    assert not same_location(to_location("s3://fleet/a"), to_location("s3://fleet/b"))
+    assert not same_location(to_location("s3://fleet/a"), Path("/fleet/a"))
 
 
 # ── a log in a store ──
@@ -130,7 +129,7 @@ def test_the_command_debiases_and_describes_logs_in_a_store_and_says_nothing_sec
 
 def test_a_key_that_is_taken_is_refused_without_overwrite(store: Any, flight: bytes) -> None:
     source, taken = to_location(store.put("in.mcap", flight)), to_location(store.put("out.mcap", b"precious"))
-    with pytest.raises(ConfigError, match=r"s3://fleet/out.mcap: the target exists.*--overwrite"):
+    with pytest.raises(ConfigError, match=r"s3://fleet/out.mcap: the target exists.*`overwrite=True`"):
         rewrite(source, taken, [], metadata={})
     assert store.get("out.mcap") == b"precious"
     with pytest.raises(ConfigError, match="the target is the source"):

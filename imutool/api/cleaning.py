@@ -12,8 +12,8 @@ from imutool.bag.repair import NO_ATTACHMENTS, BagReport, is_bag, repair_bag
 from imutool.cleaning import CleaningSettings, Survey, look
 from imutool.cleaning.settings import chosen
 from imutool.errors import ConfigError, LogError
-from imutool.mcap_io.log import Log
-from imutool.mcap_io.losses import Losses
+from imutool.mcap_io.recovery.losses import Losses
+from imutool.mcap_io.recovery.recovered_log import RecoveredLog
 from imutool.mcap_io.repair import RepairReport
 from imutool.mcap_io.repair import repair as repair_log
 
@@ -92,12 +92,12 @@ def clean(
 
 
 def _survey(source: LogPath, imus: Sequence[str], rules: CleaningSettings) -> CleanReport:
-    with Log(location(source), salvage=True) as log:
+    with RecoveredLog(location(source)) as log:
         topics = list(imus) or log.imu_topics
         if not topics:
             raise LogError("no IMU topic", where=source, expected=log.listing())
         surveys = tuple(look(log, topic, rules) for topic in topics)
-        return CleanReport(surveys, log.losses or Losses(), {})
+        return CleanReport(surveys, log.losses, {})
 
 
 def repair(

@@ -8,8 +8,8 @@ from pathlib import Path
 from imutool import conversion, log_info
 from imutool.api.paths import LogPath, local, location
 from imutool.conversion import ConvertReport
-from imutool.exporting.report import ExportReport
-from imutool.exporting.run import export as export_log
+from imutool.exporting.export import export as export_log
+from imutool.exporting.folder import ExportReport
 from imutool.log_report import LogInfo
 from imutool.mcap_io.read import read as read_log
 from imutool.mcap_io.write import write as write_log

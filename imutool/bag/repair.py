@@ -12,7 +12,7 @@ from imutool.bag import records
 from imutool.bag.records import FIRST_RECORD, MAGIC, U32, Op
 from imutool.bag.scan import Bag, Chunk, Loss
 from imutool.errors import ConfigError, LogError
-from imutool.location import Location, same
+from imutool.location import Location, same_location
 from imutool.mcap_io.storage.source import Source
 from imutool.mcap_io.storage.target import Target
 
@@ -40,7 +40,7 @@ class BagReport:
         return self.lost == 0
 
     def plain(self) -> dict[str, Any]:
-        """What was lost, as `mcap_io.losses.Losses.plain` says it of logs; the format has no CRCs, so nothing is proven."""
+        """What was lost, as `recovery.losses.Losses.plain`; the format has no CRCs, so nothing is proven."""
         known = [loss.messages for loss in self.losses if loss.messages is not None]
         return {
             "whole": self.whole and self.was_indexed,
@@ -94,7 +94,7 @@ def repair_bag(source: Location, target: Location, *, overwrite: bool = False, p
         ConfigError: source or target cannot be opened, the target exists or is the source.
         LogError: the source is no ROS 1 bag or encrypted, or nothing in it can be read.
     """
-    if same(source, target):
+    if same_location(source, target):
         raise ConfigError("the target is the source", where=target, fix="Choose another name")
     tell = progress or (lambda done, total: None)
     with Bag(source, salvage=True) as bag, Target(target, overwrite=overwrite) as out:

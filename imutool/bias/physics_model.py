@@ -23,7 +23,7 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from imutool.bias import hybrid
-from imutool.bias.model import CovarianceModel, OneByOne, Segment, Stream, Vector6
+from imutool.bias.model import CovarianceModel, SampleStream, Segment, Stream, Vector6
 from imutool.errors import ModelError
 from imutool.sensor import catalogue, physics_file
 from imutool.sensor.effect import Effect, Parameter, Stage, Theta, each_pair
@@ -31,6 +31,7 @@ from imutool.sensor.linear_form import LinearForm, linear_form
 from imutool.sensor.physics_file import Bias, Entry, PhysicsFile
 from imutool.sensor.samples import SensorSamples
 from imutool.sensor.signals import POWER_S
+from imutool.sensor.unnamed_effects import DRIVEN
 from imutool.units import AXES, SENSORS, Sensor
 
 # How far a bias lies from run to run: of the ADIS16448 in EuRoC's training sequences, 2 mrad/s and 0.02 m/s². Where the file
@@ -86,7 +87,7 @@ class Model(hybrid.Model):
     def stream(self, rest: Vector6) -> Stream:
         """The same in numpy."""
         inner = super().stream(rest)
-        assert isinstance(inner, OneByOne)
+        assert isinstance(inner, SampleStream)
         return _Less(inner, self._b)
 
     def calibration_covariance(self) -> CovarianceModel | None:
@@ -105,7 +106,7 @@ class Model(hybrid.Model):
 class _Less:
     """A stream that is shown samples without a constant."""
 
-    def __init__(self, inner: OneByOne, b: Vector6) -> None:
+    def __init__(self, inner: SampleStream, b: Vector6) -> None:
         self._inner, self._b = inner, b
 
     def __call__(
@@ -159,7 +160,7 @@ def _taken(entry: Entry, parts: Mapping[Sensor, list[Part]]) -> bool:
     """Whether an effect can be taken off; one in closed form is added to the parts, those of the matrix come later."""
     if entry.name in MATRIX or entry.name == MOUNT:
         return True
-    if entry.name == physics_file.DRIVEN:
+    if entry.name == DRIVEN:
         return False
     (effect,) = catalogue.effects([entry.name])
     if not effect.trained or (entry.name == "clock_offset" and abs(_value(entry, "tau")) > MOST_TAU_S):
@@ -204,7 +205,9 @@ def _of_size_one(effect: Effect, theta: Theta, sensor: Sensor) -> Part:
 
     def forward(samples: SensorSamples, size: Theta) -> SensorSamples:
         out = effect.forward(samples, theta)
-        return samples.but(samples.gyro + size * (out.gyro - samples.gyro), samples.accel + size * (out.accel - samples.accel))
+        return samples.with_readings(
+            samples.gyro + size * (out.gyro - samples.gyro), samples.accel + size * (out.accel - samples.accel)
+        )
 
     sized = replace(effect, parameters=(Parameter("size", "-", 1.0),), forward=forward)
     return linear_form(sized, sensor), np.ones(1), np.zeros(1)
@@ -237,7 +240,7 @@ def _full(sensor: Sensor) -> LinearForm:
 
     def forward(samples: SensorSamples, theta: Theta) -> SensorSamples:
         A = theta.reshape(3, 3).T
-        return samples.but(samples.gyro + samples.gyro @ A, samples.accel + samples.accel @ A)
+        return samples.with_readings(samples.gyro + samples.gyro @ A, samples.accel + samples.accel @ A)
 
     equation, parameters = f"{sensor} += A {sensor}", each_pair("-", 0.1)
     effect = Effect(f"{sensor}_matrix", Stage.SENSOR, (sensor,), equation, parameters, "always", forward, trained=True)

@@ -20,9 +20,9 @@ from imutool.cleaning.settings import GROUP, CleaningSettings
 from imutool.cleaning.truth import Truth, read_truth
 from imutool.errors import LogError
 from imutool.location import Location
-from imutool.mcap_io.batches import ImuBatch
 from imutool.mcap_io.codec import schemas
 from imutool.mcap_io.log import Log
+from imutool.mcap_io.topics import ImuBatch
 from imutool.report import UNSET, Report, Section, UnsetType, json_values
 
 SCHEMA = "imutool.clean/1"
@@ -241,7 +241,7 @@ def raw_batches(log: Log, topic: str, start_ns: int | None = None, end_ns: int |
     log.topic(topic, (schemas.IMU,))
     for _, rows in log.rows([topic], start_ns, end_ns):
         with log.named(topic):
-            yield from log.decode_imu(topic, rows)
+            yield from log.topics[topic].decode_imu(rows)
 
 
 def _reasons(settings: CleaningSettings, whole: TopicSummary, invalid: int, findings: Sequence[Finding]) -> Iterator[str]:

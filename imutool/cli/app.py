@@ -86,6 +86,8 @@ def listing(group: str, option: str) -> type[TyperCommand]:
     """A command whose help also lists what can be named, found (and nothing of it imported) when help is asked for."""
 
     class Listing(Command):
+        values = (group, option)  # for the documentation
+
         def format_help(self, ctx: Any, formatter: Any) -> None:
             lines = [f"[bold]{name}[/]  {plain(registry.summary(group, name))}" for name in registry.names(group)]
             self.epilog = "\n\n".join([f"Values of {option}:", *lines, self.epilog or ""])
@@ -111,7 +113,7 @@ Smooth = Annotated[bool, typer.Option("--smooth", help="Take the whole log for e
 Imu = Annotated[str | None, typer.Option(help="IMU topic, where a log has several.")]
 Truth = Annotated[str | None, typer.Option(help="Topic of the true poses, where a log has several.")]
 Json = Annotated[str | None, typer.Option("--json", metavar="FILE|-", help="Write the report as JSON; - is stdout.")]
-ReportPage = Annotated[Path | None, typer.Option(metavar="F.html", help="Write a page: figures, paths, errors, biases, spectra.")]
+ReportPage = Annotated[Path | None, typer.Option(metavar="F.html", help="Write a page of figures, paths, errors and spectra.")]
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace what is there.")]
 Verbose = Annotated[bool, typer.Option("-v", "--verbose", help="Say more.")]
 Quiet = Annotated[bool, typer.Option("-q", "--quiet", help="Say only results and errors.")]

@@ -16,7 +16,7 @@ from imutool.report import UNSET
 
 if TYPE_CHECKING:
     from imutool.cleaning import CleaningSettings, Survey
-    from imutool.mcap_io.losses import Losses
+    from imutool.mcap_io.recovery.losses import Losses
 
 COLORS = {"good": "green", "usable": "yellow", "quarantine": "red"}
 SHOWN = 3  # intervals of a finding in the table; all of them are in the JSON
@@ -104,9 +104,9 @@ def _looked(
 ) -> tuple[list[Survey], Losses]:
     """Survey of each IMU of a log, and the losses of a damaged log."""
     from imutool.cleaning import look
-    from imutool.mcap_io.log import Log
+    from imutool.mcap_io.recovery.recovered_log import RecoveredLog
 
-    with Log(to_location(source), salvage=True) as log:
+    with RecoveredLog(to_location(source)) as log:
         topics = list(imus) or log.imu_topics
         if not topics:
             raise LogError("no IMU topic", where=source, expected=log.listing())
@@ -114,7 +114,6 @@ def _looked(
         for done, topic in enumerate(topics):
             tell(done, len(topics), topic)
             surveys.append(look(log, topic, rules))
-        assert log.losses is not None, "with salvage there are losses, if perhaps none"
         return surveys, log.losses
 
 

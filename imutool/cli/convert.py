@@ -103,7 +103,7 @@ def export(
     quiet: Quiet = False,
 ) -> None:
     """Write a log as a EuRoC folder or a rosbag2 folder, for programs that read those."""
-    from imutool.exporting.run import export as run
+    from imutool.exporting.export import export as run
 
     with progress("Exporting", verbose, quiet) as tell:
         report = run(log, target, format=format, imu=imu, sensor_noise=noise, overwrite=overwrite, progress=tell)

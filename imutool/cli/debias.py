@@ -58,7 +58,7 @@ def debias(
     if report_to is not None:
         from imutool.viewing.html import report as pages
 
-        pages.refuse(report_to, overwrite=overwrite)
+        pages.check_target(report_to, overwrite=overwrite)
     from imutool.cleaning import CleaningSettings
     from imutool.debiasing import debias as run
 
@@ -168,18 +168,18 @@ def _watching(
     """Whoever is to watch; without that nothing of the viewer is imported."""
     if not view and connect is None and save is None:
         return nullcontext()
-    from imutool.viewing.rerun.live import watching
+    from imutool.viewing.rerun.live import live_view
 
     out = Path(target or source)
-    return watching(out.stem, connect_to=connect, save=save, instead=Path(f"{out.stem}.rrd"), overwrite=overwrite)
+    return live_view(out.stem, connect_to=connect, save=save, instead=Path(f"{out.stem}.rrd"), overwrite=overwrite)
 
 
 def _draw(log: Location, topics: Sequence[str], page: Path, overwrite: bool) -> None:
     """A page about the debiased log, each of its IMUs under its own topic where there are several."""
-    from imutool.viewing.html.report import by_topic, write_page
+    from imutool.viewing.html.report import name_by_topic, write_page
     from imutool.viewing.model.runs import load
 
-    write_page(by_topic([load(log, imu=topic) for topic in topics], topics), page, overwrite=overwrite)
+    write_page(name_by_topic([load(log, imu=topic) for topic in topics], topics), page, overwrite=overwrite)
 
 
 def _refuse_contradictions(target: str | None, in_place: bool, overwrite: bool) -> None:

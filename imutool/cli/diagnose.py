@@ -57,7 +57,7 @@ def diagnose(
             tell(0, 1, "writing")
             for remark in diagnosis_output.write(found, folder, logs=look, overwrite=overwrite):
                 logger.warning("%s", remark)
-    if write_json(diagnosis_output.plain(found), json_to):
+    if write_json(found.report, json_to):
         return
     say(conclusion(found))
     if found.findings:

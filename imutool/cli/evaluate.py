@@ -42,7 +42,7 @@ def evaluate(
     from imutool.viewing.model.runs import load
 
     if report is not None:
-        pages.refuse(report, overwrite=overwrite)
+        pages.check_target(report, overwrite=overwrite)
     results: list[dict[str, Any]] = []
     logs_seen = []
     with progress("Evaluating", verbose, quiet) as tell:

@@ -84,19 +84,18 @@ def debias(
     pages: Annotated[bool, typer.Option("--pages", help=PAGES_HELP)] = False,
 ) -> Settings:
     """Debias every log, as `imutool debias --clean` does."""
-    from imutool.bias_start.model_choice import refuse_smooth
+    from imutool.bias_start.model_choice import check_smooth
     from imutool.fleet.task import with_model_hash
-    from imutool.mcap_io.verify import refuse_unknown
+    from imutool.mcap_io.verify import check_mode
 
-    refuse_smooth(init, smooth)
-    refuse_unknown(verify)
+    check_smooth(init, smooth)
+    check_mode(verify)
     if pages:
-        from imutool.viewing.html.drawing import library
+        from imutool.viewing.html.drawing import require_matplotlib
 
-        library()
-    return with_model_hash(
-        Settings(command="debias", model=model, init=init, smooth=smooth, clean=clean, check=verify, pages=pages)
-    )
+        require_matplotlib()
+    settings = Settings(command="debias", model=model, init=init, smooth=smooth, clean=clean, check=verify, pages=pages)
+    return with_model_hash(settings)
 
 
 @_command("repair logs/ repaired/ --report repaired.html")

@@ -16,7 +16,7 @@ from imutool.report import json_values
 
 if TYPE_CHECKING:
     from imutool.log_report import LogInfo
-    from imutool.noise_identification import Identified
+    from imutool.noise_identification import IdentifiedNoise
 
 
 @app.command(epilog="Example: [bold]imutool info MH_04.mcap[/] or [bold]imutool info still.mcap --noise --noise-toml i.toml[/]")
@@ -77,12 +77,12 @@ def _leave(lost: bool) -> NoReturn:
     raise typer.Exit(LOST if lost else 0)
 
 
-def _write_noise(found: Identified, plot: Path | None, toml: Path | None, overwrite: bool) -> None:
+def _write_noise(found: IdentifiedNoise, plot: Path | None, toml: Path | None, overwrite: bool) -> None:
     """The files that were asked for."""
     if plot is not None:
-        from imutool.viewing.html.allan_plot import deviations
+        from imutool.viewing.html.allan_plot import write_png
 
-        deviations(found, plot, overwrite=overwrite)
+        write_png(found, plot, overwrite=overwrite)
     if toml is not None:
         from imutool.noise.datasheet import write
 

@@ -21,7 +21,7 @@ from rich.table import Table
 
 from imutool.cli.parameters import with_flags
 from imutool.errors import ConfigError
-from imutool.mcap_io.losses import told
+from imutool.mcap_io.recovery.losses import describe
 from imutool.report import json_values
 
 if TYPE_CHECKING:
@@ -59,8 +59,8 @@ def tell_error(message: str) -> None:
 
 
 def tell_losses(losses: Mapping[str, Any]) -> None:
-    """What is wrong with a log (`mcap_io.losses.Losses.plain`), one line a stretch."""
-    for line in told(losses):
+    """What is wrong with a log (`mcap_io.recovery.losses.Losses.plain`), one line a stretch."""
+    for line in describe(losses):
         kind, _, rest = line.partition(": ")
         out.print(f"[yellow]{kind}:[/] {plain(rest)}", highlight=False, soft_wrap=True)
 

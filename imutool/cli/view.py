@@ -66,11 +66,11 @@ def view(
     saved.
     """
     from imutool.viewing.model.runs import load
-    from imutool.viewing.outputs import Asked, Outputs
+    from imutool.viewing.outputs import Outputs, RequestedOutputs
 
     aligned = _alignment(align)
     read = partial(load, models=model or (), init=init, smooth=smooth, imu=imu, truth=truth, align=aligned, findings=findings)
-    asked = Asked(save, connect, web, port, export_web, png, html, at, source, overwrite)
+    asked = RequestedOutputs(save, connect, web, port, export_web, png, html, at, source, overwrite)
     with Outputs(asked) as outputs:
         with progress("Reading", verbose, quiet) as tell:
             data = []

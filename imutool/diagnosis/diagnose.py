@@ -255,7 +255,7 @@ def _with_signal(told: Diagnosis, one: SignalDiagnosis) -> Diagnosis:
         findings=(*told.findings, *one.findings),
         not_identifiable=(*told.not_identifiable, *one.not_identifiable),
         unexplained={**told.unexplained, signal: one.unexplained},
-        closer={**told.closer, signal: Closer.of(one.closer, one.unexplained.noise_floor)},
+        closer={**told.closer, signal: Closer.computed(one.closer, one.unexplained.noise_floor)},
         remarks=(*told.remarks, *one.remarks),
         signals={**told.signals, signal: one.traces},
     )
@@ -270,7 +270,7 @@ def _pairs(real: Recording, sim: Recording | None, truth: str | None) -> Iterato
         raise DataError("no simulation and no true poses", where=real.name, expected="--sim SIM.mcap, or poses in the log")
     chosen = real if truth is not None else real.with_truth(next(iter(real.truths)))
     motion = smooth_motion(chosen.truth)
-    parts = [felt for felt in motion.felt(1.0 / real.imu.period_s) if felt.t_s[-1] - felt.t_s[0] >= LEAST_S]
+    parts = [felt for felt in motion.ideal_motions(1.0 / real.imu.period_s) if felt.t_s[-1] - felt.t_s[0] >= LEAST_S]
     if not parts:
         raise DataError(
             f"the true poses have no stretch of {LEAST_S:g} s that can be differentiated",

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 
+import msgspec
 import numpy as np
 from jaxtyping import Float64
 from scipy.ndimage import uniform_filter1d
@@ -45,7 +45,7 @@ def _places(
     for log in logs:
         stretches = [(pair, misfit) for pair, misfit in zip(pairs, misfits, strict=True) if pair.name == log]
         places = _of_one(stretches, floor, p_values)
-        out += [replace(one, log=log) if len(logs) > 1 else one for one in places]
+        out += [msgspec.structs.replace(one, log=log) if len(logs) > 1 else one for one in places]
     return sorted(out, key=lambda one: one.p_value)
 
 
@@ -80,7 +80,7 @@ def _slow(left: Float64[np.ndarray, "n 6"]) -> Float64[np.ndarray, "n 6"]:
 
 def _variables(pair: Pair) -> dict[str, tuple[str, Float64[np.ndarray, " n"]]]:
     """What a regime can be of."""
-    read = pair.felt.taken(pair.stamp_s, pair.stamp_s)
+    read = pair.felt.sample(pair.stamp_s, pair.stamp_s)
     rate, force = np.linalg.norm(read.gyro, axis=1), np.linalg.norm(read.accel, axis=1)
     out = {
         "angular rate": ("rad/s", rate),

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
+import msgspec
 import numpy as np
 from jaxtyping import Float64
 
@@ -19,10 +20,10 @@ from imutool.diagnosis.result import Closer
 from imutool.diagnosis.summarize import closer, floor, with_constant
 from imutool.errors import DataError
 from imutool.recording import Recording
-from imutool.sensor.effect import Acting
+from imutool.sensor.effect import Acting, simulate_stretches
 from imutool.sensor.physics_file import PhysicsFile
 from imutool.sensor.samples import IdealMotion
-from imutool.sensor.simulate import FELT_HZ, read_all
+from imutool.sensor.simulate import MOTION_HZ
 from imutool.sensor.trajectory import smooth_motion
 
 AS_GOOD = 0.3  # of the noise: how far a simulation along the poses may be from the one that was given, and still stand for it
@@ -40,7 +41,7 @@ def simulated_again(logs: Sequence[WhitenedLog], sim: Recording, physics: Physic
         raise DataError("it has no poses", where=sim.name, expected="poses to simulate along")
     motion = smooth_motion(sim.truth)
     rate_hz = 1.0 / sim.imu.period_s
-    felts = motion.felt(rate_hz * max(1, int(np.ceil(FELT_HZ / rate_hz))))
+    felts = motion.ideal_motions(rate_hz * max(1, int(np.ceil(MOTION_HZ / rate_hz))))
     acting = physics.acting()
     there, before, after = [], [], []
     for log in logs:
@@ -54,7 +55,9 @@ def simulated_again(logs: Sequence[WhitenedLog], sim: Recording, physics: Physic
         before.append(with_constant(pair, expected(pair, ())))
         after.append(with_constant(pair, found))
         _refuse_unlike(there[-1], before[-1], with_constant(pair, plain), sim)
-    return {signal: replace(one, by="second simulation") for signal, one in closer(there, before, after).items()}
+    return {
+        signal: msgspec.structs.replace(one, by="second simulation") for signal, one in closer(there, before, after).items()
+    }
 
 
 def _felt(felt: IdealMotion, start_ns: int, pair: Pair) -> IdealMotion:
@@ -68,7 +71,7 @@ def _felt(felt: IdealMotion, start_ns: int, pair: Pair) -> IdealMotion:
 def _read(pair: Pair, felts: Sequence[IdealMotion], acting: Acting) -> Float64[np.ndarray, "n 6"]:
     """What the second simulation reads at the recording's stamps; NaN where it has no motion."""
     stamps = [pair.stamp_s[(pair.stamp_s >= one.t_s[0]) & (pair.stamp_s <= one.t_s[-1])] for one in felts]
-    got = read_all(felts, stamps, acting)
+    got = simulate_stretches(felts, stamps, acting)
     out = np.full(pair.real.shape, np.nan)
     out[np.searchsorted(pair.stamp_s, got.stamp_s)] = np.concatenate([got.gyro, got.accel], axis=1)
     return out

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 
+import msgspec
 import numpy as np
 from jaxtyping import Bool, Float64
 from scipy.stats import f as fisher
@@ -23,7 +24,7 @@ from imutool.diagnosis.estimation.unnamed_effects import unit
 from imutool.diagnosis.localization import of_findings, of_what_is_left
 from imutool.diagnosis.quantity import percent
 from imutool.diagnosis.result import Closer, Curve, Diagnosis, Estimate, Finding, HeldOut, Located, Traces, Unexplained
-from imutool.diagnosis.to_physics_file import found as physics_file
+from imutool.diagnosis.to_physics_file import to_physics_file
 from imutool.inertial.stationary import white_noise
 from imutool.sensor.physics_file import PhysicsFile
 from imutool.units import ASCII_UNITS, AXES, SENSORS, UNITS
@@ -79,7 +80,7 @@ def told(
     return Diagnosis(
         real=tuple(reals.values()),
         sim=sim,
-        located=tuple(replace(one, log=reals[one.log]) if one.log else one for one in places),
+        located=tuple(msgspec.structs.replace(one, log=reals[one.log]) if one.log else one for one in places),
         findings=tuple(findings),
         bias=found.whole.bias,
         not_identifiable=_not_identifiable(found, idle, hidden),
@@ -107,9 +108,10 @@ def without_held_out(logs: Sequence[WhitenedLog], found: Selection, d: Diagnosis
         there = judged.get((one.effect, one.equation))
         if there is None:
             return one
-        return replace(one, parameters=_parameters(pairs, there), curve=_curve(pairs[0], there, found.fitted))
+        curve = _curve(pairs[0], there, found.fitted)
+        return msgspec.structs.replace(one, parameters=_parameters(pairs, there), curve=curve)
 
-    return physics_file(replace(d, findings=tuple(fitted(one) for one in d.findings if one.effect != QUANTIZATION)))
+    return to_physics_file(replace(d, findings=tuple(fitted(one) for one in d.findings if one.effect != QUANTIZATION)))
 
 
 def _worthwhile(
@@ -194,7 +196,7 @@ def closer(logs: Sequence[WhitenedLog], before: Sequence[np.ndarray], after: Seq
     """What all findings together bring to each sensor, on held-out time."""
     noise, out = floor(logs), {}
     for signal, k in _known([log.pair for log in logs]).items():
-        out[signal] = Closer.of(_held_out(logs, before, after, k, ASCII_UNITS[signal]), _noise(logs, noise, k))
+        out[signal] = Closer.computed(_held_out(logs, before, after, k, ASCII_UNITS[signal]), _noise(logs, noise, k))
     return out
 
 
@@ -253,7 +255,16 @@ def _finding(logs: Sequence[WhitenedLog], found: Selection, one: SelectedEffect,
         driver=one.physics.variable if one.physics.kind == "driven" else "",
         curve=_curve(logs[0].pair, one, found.whole),
         similar=one.similar,
+        kind=one.physics.kind,
+        axis=None if one.physics.axis is None else AXES[one.physics.axis],
+        variable=one.physics.variable,
+        onset_s=_onset_s(one),
     )
+
+
+def _onset_s(one: SelectedEffect) -> float | None:
+    times = [float(t_s) for number, t_s in zip(one.physics.parameters, one.theta, strict=True) if number.begins]
+    return times[0] if times and np.isfinite(times[0]) else None
 
 
 def _parameters(pairs: Sequence[Pair], one: SelectedEffect) -> dict[str, Estimate]:
@@ -288,7 +299,7 @@ def _curve(pair: Pair, one: SelectedEffect, whole: Fit) -> Curve | None:
     y[:, forward.axis] = basis @ one.theta - middle
     centred = basis - basis.mean(axis=0)
     band[:, forward.axis] = np.sqrt(np.einsum("nq,qp,np->n", centred, covariance, centred))
-    return Curve(forward.variable, unit(forward.variable), x, y, band, middle)
+    return Curve.of_arrays(forward.variable, unit(forward.variable), x, y, band, middle)
 
 
 def _unexplained(

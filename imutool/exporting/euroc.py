@@ -11,8 +11,7 @@ import numpy as np
 from jaxtyping import Float64, Int64
 
 from imutool.errors import LogError
-from imutool.exporting.folder import SIGNATURE, ExportFolder, writing
-from imutool.exporting.report import ExportReport, Progress
+from imutool.exporting.folder import SIGNATURE, ExportFolder, ExportReport, Progress, writing
 from imutool.mcap_io.codec import schemas
 from imutool.mcap_io.log import Log
 from imutool.mcap_io.read import VELOCITY_KEY, read
@@ -58,7 +57,7 @@ IDENTITY = "  cols: 4\n  rows: 4\n  data: [1.0, 0.0, 0.0, 0.0,\n" + (
 def write(
     log: Path, out: Path, imu: str | None, sensor_noise: str | Path | None, overwrite: bool, tell: Progress
 ) -> ExportReport:
-    """Writes the folder `out`; the arguments are those of `imutool.exporting.run.export`."""
+    """Writes the folder `out`; the arguments are those of `imutool.exporting.export.export`."""
     given = datasheet.read(sensor_noise) if sensor_noise is not None else None
     with Log(log) as opened:
         topic = imu or _best_imu(opened)
@@ -87,7 +86,7 @@ def _best_imu(log: Log) -> str:
     found = derived or [t.name for t in every]
     if len(found) != 1:
         listed = ", ".join(found) or "none"
-        raise LogError(f"IMU topics: {listed}", where=log.path, expected="one", fix="Choose with --imu" if found else "")
+        raise LogError(f"IMU topics: {listed}", where=log.path, expected="one", fix="Choose one with `imu`" if found else "")
     return found[0]
 
 
@@ -146,7 +145,7 @@ class _Asl:
             for t_ns, image in frames.each():
                 ending = next((kind for start, kind in IMAGES.items() if image.startswith(start)), None)
                 if ending is None:
-                    raise LogError(f"the image at {t_ns} ns is neither PNG nor JPEG", where=topic, fix="Use --format rosbag2")
+                    raise LogError(f"the image at {t_ns} ns is neither PNG nor JPEG", where=topic, fix="Use `format=rosbag2`")
                 name = f"{t_ns}{ending}"
                 try:
                     with (images / name).open("xb") as file:

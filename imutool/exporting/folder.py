@@ -8,7 +8,8 @@ import re
 import secrets
 import shutil
 import weakref
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
 from pathlib import Path
 from types import TracebackType
 
@@ -43,7 +44,7 @@ class ExportFolder:
         if not self.path.exists() and not self.path.is_symlink():
             return
         if not self.overwrite:
-            raise ConfigError("the target exists", where=self.path, fix="Choose another name, or add --overwrite")
+            raise ConfigError("the target exists", where=self.path, fix="Choose another name, or add `overwrite=True`")
         if self.path.is_symlink() or not self.path.is_dir():
             raise ConfigError("the target is no folder", where=self.path, expected="the name of a new folder")
         if self.log.resolve().is_relative_to(self.path.resolve()):
@@ -96,3 +97,17 @@ def writing(path: Path) -> Iterator[None]:
         reason = error.strerror or type(error).__name__
         fix = "Choose a place that can be written and has room"
         raise ConfigError(f"cannot be written ({reason})", where=path, fix=fix) from error
+
+
+Progress = Callable[[int, int, str], None]  # done, in all, what is being written
+
+
+@dataclass(frozen=True)
+class ExportReport:
+    """What was written: the IMU's topic (of a EuRoC folder), messages or rows by file, and the topics left behind."""
+
+    output: Path
+    format: str
+    imu: str | None = None
+    written: dict[str, int] = field(default_factory=dict)
+    left_out: list[str] = field(default_factory=list)

@@ -9,8 +9,7 @@ import re
 from pathlib import Path
 
 from imutool.errors import ConfigError, LogError
-from imutool.exporting.folder import SIGNATURE, ExportFolder, writing
-from imutool.exporting.report import ExportReport, Progress
+from imutool.exporting.folder import SIGNATURE, ExportFolder, ExportReport, Progress, writing
 from imutool.mcap_io.log import Log
 
 COPY_BYTES = 1 << 20
@@ -24,7 +23,7 @@ QOS_NUMBERS = {  # as rmw numbers them; names came with version 9
 
 
 def write(log: Path, out: Path, overwrite: bool, tell: Progress) -> ExportReport:
-    """Writes the folder `out`; the arguments are those of `imutool.exporting.run.export`."""
+    """Writes the folder `out`; the arguments are those of `imutool.exporting.export.export`."""
     with Log(log) as opened:
         _refuse_what_rosbag2_cannot(opened)
         name = f"{out.absolute().name}_0.mcap"
@@ -50,7 +49,7 @@ def _refuse_what_rosbag2_cannot(log: Log) -> None:
             what = (
                 f"{topic.name} is encoded as {topic.message_encoding!r}" if topic.schema_name else f"{topic.name} has no schema"
             )
-            raise LogError(what, where=log.path, expected="CDR messages of ROS 2", fix="Use --format euroc")
+            raise LogError(what, where=log.path, expected="CDR messages of ROS 2", fix="Use `format=euroc`")
 
 
 def _copy(log: Path, copy: Path, tell: Progress) -> None:

@@ -23,7 +23,7 @@ import msgspec
 from imutool import __version__
 from imutool.errors import ConfigError
 from imutool.fleet.task import Result, Settings
-from imutool.location import Location, failures, reason
+from imutool.location import Location, io_errors, reason
 
 NAME = "fleet.journal"
 PIECE_BYTES = 256 << 10  # of a journal in a store
@@ -70,7 +70,7 @@ class Journal:
             else:
                 self._file = tempfile.TemporaryFile()  # noqa: SIM115  closed with the journal
                 self._pieces = _Pieces(self.path, self._file)
-        except failures(out) as error:
+        except io_errors(out) as error:
             raise ConfigError(f"cannot be written ({reason(error)})", where=self.path, fix="Choose another OUT") from error
         try:
             self._lock()
@@ -124,7 +124,7 @@ class Journal:
                 os.fsync(self._file.fileno())
             else:
                 self._pieces.append(raw)
-        except failures(self.path) as error:
+        except io_errors(self.path) as error:
             with contextlib.suppress(OSError):
                 self._file.truncate(at)
             raise ConfigError(

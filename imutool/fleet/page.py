@@ -19,9 +19,8 @@ from imutool.fleet.task import Result, Settings
 from imutool.location import Location
 from imutool.mcap_io.storage.target import Target
 from imutool.units import UNITS
-from imutool.viewing.html.drawing import apart, svg
-from imutool.viewing.html.page import cards, document, text
-from imutool.viewing.html.theme import AFTER, AXIS_COLORS
+from imutool.viewing.html.drawing import prefix_ids, svg
+from imutool.viewing.html.page import AFTER, AXIS_COLORS, cards, document, text
 
 MOST_NAMED = 10  # robots with an effect
 BINS = 30
@@ -248,7 +247,7 @@ def _histogram(axes: Any, values: Float64[np.ndarray, " n"], label: str, color: 
 
 
 def _figure(drawn: str, prefix: str, caption: str) -> str:
-    return f"<figure>{apart(drawn, prefix)}<figcaption>{text(caption)}</figcaption></figure>"
+    return f"<figure>{prefix_ids(drawn, prefix)}<figcaption>{text(caption)}</figcaption></figure>"
 
 
 def _provenance(settings: Settings) -> Iterator[str]:

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 from imutool.errors import ConfigError
 from imutool.fleet.task import Source
-from imutool.location import Location, failures, identity, reason, size_and_stamp, to_location
+from imutool.location import Location, identity, io_errors, reason, size_and_etag, to_location
 
 LOG, BAG = ".mcap", ".bag"
 PATTERN = re.compile(r"[*?\[]")
@@ -54,7 +54,7 @@ def find(text: str, out: Location, *, bags: bool = False) -> Found:
             before = taken.setdefault(name.casefold(), where)  # one file on some systems, two on others
             if before != where:
                 raise ConfigError(f"would be called {name}, and so would {before}", fix="Rename one of the two")
-            logs.append(Source(where, name, *(identity(Path(where)) if about is None else size_and_stamp(about))))
+            logs.append(Source(where, name, *(identity(Path(where)) if about is None else size_and_etag(about))))
         except ConfigError as error:
             refused.append((_shown(where), str(error)))
     if not logs and not refused:
@@ -139,7 +139,7 @@ def _in_store(text: str, endings: tuple[str, ...]) -> tuple[str, Iterator[_File]
             found = root.fs.find(root.path, detail=True)
         else:
             found = root.fs.glob(root.path.rstrip("/") + text[len(fixed) :], detail=True)
-    except failures(root) as error:
+    except io_errors(root) as error:
         raise ConfigError(f"cannot be listed ({reason(error)})", where=text) from error
     whole = fixed.rpartition("/")[0] if list(found) == [root.path] else fixed  # a log alone, by its own name
     files = [_File(fixed + path[len(root.path.rstrip("/")) :], about) for path, about in sorted(found.items())]
@@ -186,12 +186,12 @@ def remove_files(leftover: Iterable[Location]) -> None:
             path.unlink()
         except FileNotFoundError:
             continue
-        except failures(path) as error:
+        except io_errors(path) as error:
             raise ConfigError(f"cannot be removed ({reason(error)})", where=path) from error
 
 
 def _partial(folder: Location) -> list[Location]:
     try:
         return list(folder.glob(".*.partial"))
-    except failures(folder) as error:
+    except io_errors(folder) as error:
         raise ConfigError(f"cannot be listed ({reason(error)})", where=folder) from error

@@ -18,13 +18,12 @@ from typing import Any
 import msgspec
 
 from imutool.cleaning import UntrustedError
-from imutool.diagnosis_output import plain
 from imutool.errors import ConfigError, ImutoolError, LogError, ModelError
 from imutool.fleet.sources import partial_files, remove_files, within
 from imutool.fleet.task import Imu, Parameter, Result, Settings, Task
 from imutool.location import Location, identity, to_location
 from imutool.mcap_io.log import Log
-from imutool.mcap_io.storage.digest import sha256
+from imutool.mcap_io.storage.source import sha256
 from imutool.mcap_io.storage.target import Target
 from imutool.report import UNSET, Report, UnsetType, json_values
 
@@ -172,16 +171,16 @@ def _debias(job: _Job) -> dict[str, Any]:
 def _page(job: _Job, topics: Sequence[str], warnings: tuple[str, ...]) -> dict[str, Any]:
     """Write a page about a debiased log beside it; if it cannot be drawn, the result has a warning."""
     from imutool.viewing.html import report
-    from imutool.viewing.html.page import is_ours
+    from imutool.viewing.html.page import is_imutool_page
     from imutool.viewing.html.report_wording import conclusion
     from imutool.viewing.model.runs import load
 
     path = job.target.with_name(page_name(job.target.name))
     try:
-        if path.exists() and not is_ours(path):
+        if path.exists() and not is_imutool_page(path):
             raise ConfigError("the page exists, and no fleet has written it", where=path, fix="Move it, or choose another OUT")
         logs = [load(job.target, imu=topic) for topic in topics]
-        report.write_page(report.by_topic(logs, topics), path, overwrite=True)
+        report.write_page(report.name_by_topic(logs, topics), path, overwrite=True)
     except ImutoolError as error:
         return {"warnings": (*warnings, f"no page: {error}")}
     return {"page": page_name(job.name), "page_says": conclusion(logs[0])[:MOST_LETTERS]}
@@ -240,7 +239,7 @@ def _diagnose(job: _Job) -> dict[str, Any]:
     diagnosis: dict[str, Any] | UnsetType = UNSET
     if not s.quick:
         found = diagnose([job.source], sim, imu=s.imu, truth=s.truth)
-        diagnosis = plain(found)
+        diagnosis = json_values(found.report)
         entries |= {"effects": tuple(finding.effect for finding in found.findings), "warnings": found.remarks}
     write_json(UnitReport(robot, fixed.bias.tolist(), list(parameters), diagnosis), job.target)
     return entries

@@ -18,12 +18,11 @@ from jaxtyping import Float64, Int64, UInt8
 
 from imutool.errors import LogError
 from imutool.location import Location
-from imutool.mcap_io.batches import Clock
 from imutool.mcap_io.codec import ros2_definition
-from imutool.mcap_io.codec.records import Rows
+from imutool.mcap_io.codec.messages import Rows
 from imutool.mcap_io.log import Log
 from imutool.mcap_io.read import UNIT_KEY
-from imutool.mcap_io.topics import DERIVED_KEY, Topic
+from imutool.mcap_io.topics import DERIVED_KEY, StampCheck, Topic
 
 LISTED = 60  # fields named in a message
 LONGEST_ROW = 64  # of an array of numbers that is looked at as channels
@@ -162,9 +161,9 @@ def _definition(log: Log, topic: Topic) -> ros2_definition.Definition:
             expected="ros2msg and cdr",
             fix="Record it with ROS 2's own MCAP plugin",
         )
-    channel = next(c for c in log.structure.channels.values() if c.topic == topic.name)
+    channel = next(c for c in log.index.channels.values() if c.topic == topic.name)
     with log.named(topic.name):
-        return ros2_definition.parse(topic.schema_name, log.structure.schemas[channel.schema_id].data)
+        return ros2_definition.parse(topic.schema_name, log.index.schemas[channel.schema_id].data)
 
 
 def _paths(walk: ros2_definition.Walk, long: bool = True) -> Iterator[str]:
@@ -289,7 +288,7 @@ class _Reader:
                 expected="finite numbers",
                 fix="Choose another field, or cut the log before or after it",
             )
-        Clock().check(t_ns, sequence)
+        StampCheck().check(t_ns, sequence)
         return Fields(t_ns, values, self.topic.metadata.get(UNIT_KEY, ""))
 
     def usable(self, path: str) -> Fields | None:

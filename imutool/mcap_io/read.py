@@ -12,11 +12,10 @@ from jaxtyping import Float64, Int64, UInt32
 
 from imutool.errors import LogError
 from imutool.location import Location
-from imutool.mcap_io.batches import Clock, finite
-from imutool.mcap_io.codec import records, schemas
+from imutool.mcap_io.codec import messages, schemas
 from imutool.mcap_io.codec.decode import decode_image
 from imutool.mcap_io.log import Log
-from imutool.mcap_io.topics import DERIVED_KEY, ENCODINGS, MESSAGE_POSES, SCALARS
+from imutool.mcap_io.topics import DERIVED_KEY, ENCODINGS, MESSAGE_POSES, SCALARS, StampCheck, check_finite
 from imutool.recording import UNIT_QUATERNION_TOLERANCE, Frames, Imu, Poses, Recording, Scalars, unit_quaternions
 
 logger = logging.getLogger(__name__)
@@ -49,10 +48,10 @@ def read(
         LogError: no IMU or several without `imu`, no such topic, values or stamps no recording can hold, a damaged log.
     """
     with Log(path) as log:
-        return recording_in(log, imu=imu, truth=truth, start_ns=start_ns, end_ns=end_ns, samples=samples)
+        return read_recording(log, imu=imu, truth=truth, start_ns=start_ns, end_ns=end_ns, samples=samples)
 
 
-def recording_in(
+def read_recording(
     log: Log,
     *,
     imu: str | None = None,
@@ -104,7 +103,7 @@ def _choose_imu(log: Log, imu: str | None) -> str:
     if not found:
         raise LogError("the log has no IMU topic", where=log.path, expected=f"{schemas.IMU} among {log.listing()}")
     if len(found) > 1:
-        raise LogError(f"the log has {len(found)} IMU topics: {', '.join(found)}", where=log.path, fix="Choose one with --imu")
+        raise LogError(f"the log has {len(found)} IMU topics: {', '.join(found)}", where=log.path, fix="Choose one with `imu`")
     return log.topic(found[0], (schemas.IMU,)).name
 
 
@@ -135,7 +134,7 @@ class _Gather:
     ) -> None:
         self.log, self.imu_topic, self.truth_topics, self.scalar_topics = log, imu, truths, scalars
         self.velocity_topics = {name: of for name, of in velocities.items() if of in truths}
-        self.clocks: dict[str, Clock] = {}
+        self.clocks: dict[str, StampCheck] = {}
         self.kept: dict[str, list[tuple[np.ndarray, ...]]] = {}  # columns, by topic
         self.left_out: set[str] = set()
         self.refused = refused
@@ -144,11 +143,11 @@ class _Gather:
     def topics(self) -> list[str]:
         return [self.imu_topic, *self.truth_topics, *self.velocity_topics, *self.scalar_topics]
 
-    def take(self, topic: str, rows: records.Rows) -> None:
+    def take(self, topic: str, rows: messages.Rows) -> None:
         if topic == self.imu_topic:
             with self.log.named(topic):
-                for imu in self.log.decode_imu(topic, rows):
-                    finite(imu.sequence, angular_velocity=imu.gyro, linear_acceleration=imu.accel)
+                for imu in self.log.topics[topic].decode_imu(rows):
+                    check_finite(imu.sequence, angular_velocity=imu.gyro, linear_acceleration=imu.accel)
                     self._keep(topic, imu.sequence, imu.stamp_ns, imu.gyro, imu.accel)
         elif topic in self.truth_topics:
             if topic not in self.left_out:
@@ -156,19 +155,19 @@ class _Gather:
                     self._take_poses(topic, rows)
         elif topic in self.velocity_topics:
             with self.log.named(topic):
-                for velocity in self.log.decode_scalars(topic, rows):
+                for velocity in self.log.topics[topic].decode_scalars(rows):
                     self._keep(topic, velocity.sequence, velocity.stamp_ns, velocity.values)
         elif topic not in self.left_out:
             try:
-                for scalar in self.log.decode_scalars(topic, rows):
+                for scalar in self.log.topics[topic].decode_scalars(rows):
                     self._keep(topic, scalar.sequence, scalar.stamp_ns, scalar.values)
             except LogError as error:
                 logger.warning("%s %s is left out: %s", self.log.path, topic, error.what)
                 self.left_out.add(topic)
 
-    def _take_poses(self, topic: str, rows: records.Rows) -> None:
+    def _take_poses(self, topic: str, rows: messages.Rows) -> None:
         tree = self.log.topics[topic].schema_name == schemas.TF
-        for pose in self.log.decode_poses(topic, rows):
+        for pose in self.log.topics[topic].decode_poses(rows):
             name = f"{topic}/{pose.child_frame_id.lstrip('/')}" if tree else topic
             self._keep(name, pose.sequence, pose.stamp_ns, pose.p_wb, pose.q_wb_wxyz)
 
@@ -190,7 +189,7 @@ class _Gather:
         stamp_ns: Int64[np.ndarray, " n"],
         *columns: Float64[np.ndarray, "n _"],
     ) -> None:
-        self.clocks.setdefault(name, Clock()).check(stamp_ns, sequence)
+        self.clocks.setdefault(name, StampCheck()).check(stamp_ns, sequence)
         self.kept.setdefault(name, []).append((stamp_ns, *columns))
 
     def columns(self, name: str, *widths: int) -> tuple[Int64[np.ndarray, " n"], list[Float64[np.ndarray, "n _"]]]:

@@ -19,7 +19,7 @@ from jaxtyping import Int64, Shaped, UInt8
 import imutool
 from imutool.errors import DataError
 from imutool.location import Location
-from imutool.mcap_io.codec import records, schemas
+from imutool.mcap_io.codec import messages, schemas
 from imutool.mcap_io.codec.encode import encode_float, encode_image, encode_imu, encode_pose, encode_transform, encode_vector3
 from imutool.mcap_io.read import OWN_KEYS, RECORD, SHADOWED_KEY, UNIT_KEY, VELOCITY_KEY
 from imutool.mcap_io.writer import Chunk, LogWriter
@@ -43,7 +43,7 @@ class Series(NamedTuple):
         payload = self.encode(*(column[part] for column in self.columns))
         times = self.t_ns[part]
         sequence = np.arange(part.start, part.stop, dtype=np.uint32)
-        return records.message_rows(self.channel, times, times, sequence, payload)
+        return messages.message_rows(self.channel, times, times, sequence, payload)
 
 
 def write(recording: Recording, path: Location, *, compression: str = "zstd", overwrite: bool = False) -> None:
@@ -141,7 +141,7 @@ def chunks(group: Sequence[Series]) -> Iterator[Chunk]:
             mine = offsets[which[first:last] == index]
             if len(mine):
                 rows = series.records(slice(done[index], done[index] + len(mine)))
-                records.scatter(data, mine, rows)
+                messages.scatter(data, mine, rows)
                 done[index] += len(mine)
         channels = np.array([series.channel for series in group], np.uint16)[which[first:last]]
         yield Chunk(data.tobytes(), channels, times[first:last], offsets)
@@ -164,7 +164,7 @@ def _image_chunks(channel: int, topic: str, frames: Frames) -> Iterator[Chunk]:
         if t_ns < 0:
             raise DataError(f"an image of {topic} has the time {t_ns} ns", expected="no time before 1970")
         payload = encode_image(t_ns, image, frame_id, frames.format)
-        parts.append(records.message_record(channel, sequence, t_ns, payload))
+        parts.append(messages.message_record(channel, sequence, t_ns, payload))
         times.append(t_ns)
         offsets.append(size)
         size += len(parts[-1])

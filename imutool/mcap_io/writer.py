@@ -29,9 +29,8 @@ from mcap.records import (
 import imutool
 from imutool.errors import DataError
 from imutool.location import Location
-from imutool.mcap_io.codec import records
+from imutool.mcap_io.codec import messages, records
 from imutool.mcap_io.codec import schemas as schema
-from imutool.mcap_io.codec.chunk_index import ChunkIndexes
 from imutool.mcap_io.codec.records import FOOTER_SIZE, MAGIC
 from imutool.mcap_io.storage.target import Target
 
@@ -65,7 +64,7 @@ class Contents:
 
     schemas: dict[int, Schema] = field(default_factory=dict)
     channels: dict[int, Channel] = field(default_factory=dict)
-    chunks: ChunkIndexes = field(default_factory=ChunkIndexes)
+    chunks: records.ChunkIndexes = field(default_factory=records.ChunkIndexes)
     attachments: list[AttachmentIndex] = field(default_factory=list)
     metadata: list[MetadataIndex] = field(default_factory=list)
     counts: Counter[int] = field(default_factory=Counter)
@@ -203,24 +202,10 @@ class LogWriter:
         offset = self.target.position
         self.target.write(head)
         self.target.write(packed)
-        self.index(
-            ChunkIndex(
-                chunk_length=len(head) + len(packed),
-                chunk_start_offset=offset,
-                compression=name,
-                compressed_size=len(packed),
-                message_end_time=end_ns,
-                message_index_length=0,
-                message_index_offsets={},
-                message_start_time=start_ns,
-                uncompressed_size=len(chunk.data),
-            ),
-            chunk.channels,
-            chunk.times,
-            chunk.offsets,
-        )
+        entry = records.ChunkHead.of(head, len(head) + len(packed), offset).index_at(offset, len(head) + len(packed))
+        self.write_indexes(entry, chunk.channels, chunk.times, chunk.offsets)
 
-    def index(
+    def write_indexes(
         self,
         entry: ChunkIndex,
         channels: UInt16[np.ndarray, " n"],
@@ -233,7 +218,7 @@ class LogWriter:
             mask = channels == channel
             counts[channel] = int(mask.sum())
             entry.message_index_offsets[channel] = self.target.position
-            self.target.write(records.message_index(channel, times[mask], offsets[mask]))
+            self.target.write(messages.message_index(channel, times[mask], offsets[mask]))
         entry.message_index_length = self.target.position - first
         self.contents.chunks.append(entry)
         if counts:

@@ -148,6 +148,11 @@ def each_pair(unit: str, plausible: float, *, diagonal: bool = True, before: str
     return tuple(Parameter(before + a + b, unit, plausible) for a in AXES for b in AXES if diagonal or a != b)
 
 
+def starts_at(*starts: Sequence[float]) -> Callable[[IdealMotion, SensorSamples], Sequence[Theta]]:
+    """Starts of a fit that are the same for every log."""
+    return lambda _motion, _samples: [np.array(theta) for theta in starts]
+
+
 def matrix(theta: Float64[np.ndarray, "6"]) -> Float64[np.ndarray, "3 3"]:
     """The matrix with these entries off its diagonal, row by row, and zeros on it."""
     out = np.zeros((3, 3))
@@ -168,7 +173,7 @@ def attitude_of(motion: IdealMotion, effect: str) -> Float64[np.ndarray, "n 3 3"
 
 def residual(motion: IdealMotion, samples: SensorSamples) -> tuple[Float64[np.ndarray, "n 3"], Float64[np.ndarray, "n 3"]]:
     """Samples minus the ideal ones at the same stamps: gyro (rad/s), accel (m/s²). Good enough to start a fit from."""
-    ideal = motion.taken(samples.stamp_s, samples.stamp_s)
+    ideal = motion.sample(samples.stamp_s, samples.stamp_s)
     return samples.gyro - ideal.gyro, samples.accel - ideal.accel
 
 
@@ -199,7 +204,7 @@ class SignalState:
 
     def samples(self) -> SensorSamples:
         """One row a sample."""
-        return self.motion.taken(self.taken_s, self.stamp_s) if self.taken is None else self.taken
+        return self.motion.sample(self.taken_s, self.stamp_s) if self.taken is None else self.taken
 
 
 def simulate_samples(motion: IdealMotion, stamp_s: Times, acting: Acting) -> SensorSamples:
@@ -208,6 +213,32 @@ def simulate_samples(motion: IdealMotion, stamp_s: Times, acting: Acting) -> Sen
     for effect, theta in in_stage_order(acting):
         state = state.through(effect, theta)
     return state.samples()
+
+
+def simulate_stretches(
+    motions: Sequence[IdealMotion], stamps: Sequence[Float64[np.ndarray, " _"]], acting: Acting
+) -> SensorSamples:
+    """Samples of a sensor with these effects over several stretches of one motion.
+
+    As `simulate_samples`, but clock and sensor know of no stretches: a drift goes on from one to the next, a clock jumps once.
+    """
+    order = in_stage_order(acting)
+    for effect, theta in order:
+        if effect.stage < Stage.CLOCK:
+            motions = [effect.forward(motion, theta) for motion in motions]
+    stamp_s = np.concatenate(stamps)
+    taken_s, stretch = stamp_s, np.repeat(np.arange(len(motions)), [len(part) for part in stamps])
+    for effect, theta in order:
+        if effect.stage == Stage.CLOCK:
+            taken_s = effect.forward(taken_s, theta)
+    parts = []
+    for k, motion in enumerate(motions):
+        rows = (stretch == k) & (taken_s >= motion.t_s[0]) & (taken_s <= motion.t_s[-1])
+        if rows.any():
+            parts.append(motion.sample(taken_s[rows], stamp_s[rows]))
+    if not parts:
+        raise DataError("the clock takes every sample outside the motion", expected="a smaller offset")
+    return distort(SensorSamples.joined(parts), acting)
 
 
 def distort(samples: SensorSamples, acting: Acting) -> SensorSamples:

@@ -13,7 +13,7 @@ from imutool.cleaning.first_pass import Survey, examine
 from imutool.cleaning.samples import BLOCK, blocks, padded
 from imutool.cleaning.settings import CleaningSettings, every
 from imutool.errors import LogError
-from imutool.mcap_io.batches import Clock, ImuBatch
+from imutool.mcap_io.topics import ImuBatch, StampCheck
 from imutool.report import json_values
 from imutool.sensor.flight import flight
 
@@ -68,7 +68,7 @@ def test_how_messages_are_cut_into_batches_changes_nothing(first_cut, second_cut
 
 def test_what_is_left_is_finite_and_in_order_and_as_it_was_but_for_its_unit():
     clean = Cleaner(WHOLE)(SPOILED)
-    Clock().take(clean)
+    StampCheck().check_imu(clean)
     assert len(clean.stamp_ns) == WHOLE.valid < COUNT
     kept = ~WHOLE.dropped
     for name in ("log_time", "publish_time", "sequence", "stamp_ns", "gyro"):
@@ -104,7 +104,7 @@ def test_whatever_the_stamps_and_values_what_is_left_is_fit_for_a_model(data):
     made = ImuBatch(log_ns, log_ns, np.arange(n, dtype=np.uint32), stamp_ns, values[:, :3].copy(), values[:, 3:].copy(), "imu")
     survey = look([made])
     json_values(survey.report())
-    Clock().take(Cleaner(survey)(made))
+    StampCheck().check_imu(Cleaner(survey)(made))
     assert 0.0 <= survey.score <= 1.0
 
 

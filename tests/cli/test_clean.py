@@ -16,8 +16,8 @@ from support.imu_defects import messages, repeated, with_values, without, write_
 from imutool.cleaning import CleaningSettings, survey
 from imutool.debiasing import debias
 from imutool.errors import LogError
-from imutool.mcap_io.batches import Clock, ImuBatch
 from imutool.mcap_io.log import Log
+from imutool.mcap_io.topics import ImuBatch, StampCheck
 from imutool.mcap_io.write import write
 from imutool.sensor.flight import flight
 from imutool.viewing.html import cleaning_page
@@ -92,9 +92,9 @@ def test_with_out_the_debiased_channel_is_the_clean_one_and_the_source_stays(
         rows = {name: list(opened.rows(["/imu0"])) for name, opened in (("raw", raw), ("copy", log))}
         for (_, one), (_, other) in zip(rows["raw"], rows["copy"], strict=True):
             assert one.payload.tobytes() == other.payload.tobytes()
-        clean, clock = list(log.imu_batches("/imu0/debiased")), Clock()
+        clean, clock = list(log.imu_batches("/imu0/debiased")), StampCheck()
         for batch in clean:
-            clock.take(batch)
+            clock.check_imu(batch)
         metadata = log.metadata()["imutool_clean"]
         kept = {(int(t), int(s)) for batch in clean for t, s in zip(batch.log_time, batch.sequence, strict=True)}
     messages_of = [batch for _, rows_ in rows["raw"] for batch in raw_columns(rows_)]

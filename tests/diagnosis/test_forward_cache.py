@@ -40,7 +40,7 @@ def start(physics: Effect, pair: Pair) -> Theta:
     if physics.starts is None:
         return 0.1 * physics.plausible
     got = simulate_samples(pair.felt, pair.stamp_s, ())
-    return np.asarray(physics.starts(pair.felt, got.but(pair.real[:, :3], pair.real[:, 3:]))[0], dtype=float)
+    return np.asarray(physics.starts(pair.felt, got.with_readings(pair.real[:, :3], pair.real[:, 3:]))[0], dtype=float)
 
 
 @pytest.fixture(scope="module")

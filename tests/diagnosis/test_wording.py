@@ -6,13 +6,13 @@ import importlib
 import math
 import pkgutil
 import re
-from dataclasses import replace
 from types import SimpleNamespace
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from support import diagnoses
+from support.diagnoses import replace
 
 import imutool.sensor.effects
 from imutool.diagnosis.quantity import grouped, percent, value, vector

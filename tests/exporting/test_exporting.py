@@ -27,7 +27,7 @@ from imutool.conversion import convert
 from imutool.converters import euroc
 from imutool.debiasing import debias
 from imutool.errors import ConfigError, ImutoolError, LogError
-from imutool.exporting.run import export
+from imutool.exporting.export import export
 from imutool.mcap_io.log import Log
 from imutool.mcap_io.read import read
 from imutool.mcap_io.write import write
@@ -291,7 +291,7 @@ def test_what_is_there_is_replaced_only_when_asked(log: Path, tmp_path: Path, fo
     out = tmp_path / "out"
     export(log, out, format=format)
     first = everything(out)
-    with pytest.raises(ConfigError, match="--overwrite"):
+    with pytest.raises(ConfigError, match="`overwrite=True`"):
         export(log, out, format=format)
     assert everything(out) == first
     write(whole(3.0), tmp_path / "longer.mcap")

@@ -29,7 +29,7 @@ from imutool.fleet.run import Progress, run
 from imutool.fleet.task import Result, Settings, Task, with_model_hash
 from imutool.fleet.work import work
 from imutool.location import to_location
-from imutool.mcap_io.storage.digest import sha256
+from imutool.mcap_io.storage.source import sha256
 from imutool.report import json_values
 
 Workers = Callable[[], Engine]

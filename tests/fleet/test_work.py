@@ -22,7 +22,7 @@ from imutool.fleet.sources import find
 from imutool.fleet.task import Result, Settings, Source, Task, with_model_hash
 from imutool.fleet.work import target_name, work
 from imutool.mcap_io.read import read
-from imutool.mcap_io.storage.digest import sha256
+from imutool.mcap_io.storage.source import sha256
 from imutool.mcap_io.write import write
 
 

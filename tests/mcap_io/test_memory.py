@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from imutool.mcap_io.storage.memory import keep_buffers
+from imutool.mcap_io.codec.records import keep_buffers
 from imutool.mcap_io.write import write
 from imutool.recording import Frames, Imu, Recording
 
@@ -21,8 +21,8 @@ from imutool.mcap_io.log import Log
 with Log(Path(sys.argv[1])) as log:
     topic, = log.topics.keys() - log.imu_topics
     def run():
-        for block in log.structure.blocks:
-            log.structure.unpack(block)
+        for block in log.index.blocks:
+            log.index.unpack(block)
     run()
     before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
     run()

@@ -31,8 +31,9 @@ from imutool.mcap_io import index
 from imutool.mcap_io.codec import records
 from imutool.mcap_io.codec.records import HEAD, MAGIC
 from imutool.mcap_io.codec.ros2_definition import DEEPEST, parse
-from imutool.mcap_io.index import Block
+from imutool.mcap_io.index import MessageBlock
 from imutool.mcap_io.log import Log
+from imutool.mcap_io.recovery.recovered_log import RecoveredLog
 from imutool.mcap_io.repair import RECORD, repair
 
 Message = tuple[str, int, int, int, bytes]  # topic, log time, publish time, sequence, payload
@@ -82,9 +83,9 @@ def some(seed: int, count: int, topics: tuple[str, str] = ("/a", "/b"), start_ns
     ]
 
 
-def blocks(path: Path) -> list[Block]:
+def blocks(path: Path) -> list[MessageBlock]:
     with Log(path) as log:
-        return log.structure.blocks
+        return log.index.blocks
 
 
 def flip(path: Path, at: int, mask: int = 1) -> None:
@@ -106,10 +107,9 @@ def put(path: Path, at: int, data: bytes) -> None:
 
 def test_a_whole_log_is_whole(foreign: Foreign, tmp_path: Path, layout: str) -> None:
     path = foreign(some(1, 40), layout, chunk_size=300, attachments=(b"a" * 500,), metadata={"vehicle": {"id": "7"}})
-    with Log(path) as strict, Log(path, salvage=True) as log:
+    with Log(path) as strict, RecoveredLog(path) as log:
         log.check()
         assert content(log) == content(strict)
-        assert strict.losses is None
         assert log.losses is not None
         assert not log.losses
         assert log.losses.plain()["whole"]
@@ -173,8 +173,8 @@ def test_cut_at_and_around_every_record_of_a_larger_log(foreign: Foreign, flight
         os.truncate(path, cut)
         theory = sum(len(each) for _, end, each in whole if end <= cut)
         if cut > whole[0][0]:
-            with in_time(), Log(path, salvage=True) as log:
-                assert sum(log.structure.counts().values()) == theory, cut
+            with in_time(), RecoveredLog(path) as log:
+                assert sum(log.index.counts().values()) == theory, cut
 
 
 # ── what is lost, what is mended ─────────────────────────────────────────────────────────────────────────────────────
@@ -185,7 +185,7 @@ def test_a_flipped_byte_costs_its_chunk_and_its_messages_are_counted(foreign: Fo
     path = foreign(flight, layout, chunk_size=20_000)
     whole, block = stretches(path), blocks(path)[3]
     flip(path, block.offset + block.length - 30)
-    with Log(path, salvage=True) as log:
+    with RecoveredLog(path) as log:
         found, losses = content(log), log.losses
         assert found == [m for start, _, each in whole if start != block.offset for m in each]
         (loss,) = losses.entries
@@ -206,7 +206,7 @@ def test_a_zeroed_chunk_head_costs_that_chunk_alone_and_surviving_indexes_count_
     path = foreign(flight, layout, chunk_size=20_000)
     whole, block = stretches(path), blocks(path)[3]
     put(path, block.offset - 50, bytes(400))
-    with Log(path, salvage=True) as log:
+    with RecoveredLog(path) as log:
         assert content(log) == [m for start, _, each in whole if start != block.offset for m in each]
         lost = next(each for start, _, each in whole if start == block.offset)
         assert log.losses.topics == Counter(m[0] for m in lost)
@@ -226,10 +226,10 @@ def test_a_damaged_chunk_head_is_put_right_where_its_contents_are_sound(
         "inner length": (block.offset + 9 + 32 + name, (77).to_bytes(8, "little")),
     }[field]
     put(path, at, value)
-    with Log(path, salvage=True) as log:
+    with RecoveredLog(path) as log:
         assert content(log) == [m for _, _, each in whole for m in each]
         assert not log.losses
-        assert any(f"the head of the chunk at byte {block.offset} was damaged" in line for line in log.losses.mended)
+        assert any(f"the head of the chunk at byte {block.offset} was damaged" in line for line in log.losses.harmless)
     report = repair(path, tmp_path / "out.mcap")
     assert not report.losses
     assert not report.whole
@@ -242,9 +242,9 @@ def test_definitions_of_a_damaged_first_chunk_are_found_in_it_and_said_to_be_unp
     path = foreign(flight, "no-summary", chunk_size=200_000)
     whole, block = stretches(path), blocks(path)[0]
     flip(path, block.offset + block.length - 30)
-    with Log(path, salvage=True) as log:
+    with RecoveredLog(path) as log:
         assert content(log) == [m for _, _, each in whole[1:] for m in each]
-        assert log.losses.unproven == ["/height", "/imu/data", "/mocap"]
+        assert log.losses.unchecked_topics == ["/height", "/imu/data", "/mocap"]
 
 
 def test_messages_that_nobody_defines_are_counted_and_left_out(foreign: Foreign, tmp_path: Path) -> None:
@@ -253,7 +253,7 @@ def test_messages_that_nobody_defines_are_counted_and_left_out(foreign: Foreign,
     put(path, block.offset, bytes(block.length))
     with pytest.raises(LogError, match="nothing in it can be saved"):
         repair(path, tmp_path / "out.mcap")
-    with Log(path, salvage=True) as log:
+    with RecoveredLog(path) as log:
         assert content(log) == []
         assert set(log.losses.topics) == {"(channel 1, not defined)", "(channel 2, not defined)"}
 
@@ -273,7 +273,7 @@ def test_two_logs_in_one_file_keep_their_topics_although_their_ids_collide(
     theory = [m for _, end, each in whole if end <= stop for m in each] + others
     assert Counter(by_mcap(target)) == Counter(theory)
     assert bool(report.losses) == (how != "whole")
-    assert any("another log begins" in line for line in report.losses.mended)
+    assert any("another log begins" in line for line in report.losses.harmless)
 
 
 def test_messages_outside_chunks_resume_behind_a_broken_length(foreign: Foreign, flight: Messages, tmp_path: Path) -> None:
@@ -296,7 +296,7 @@ def test_the_contents_of_a_damaged_chunk_are_never_taken_for_messages_outside_ch
     path = foreign(flight, "plain", chunk_size=20_000)
     whole, block = stretches(path), blocks(path)[0]
     put(path, block.offset, bytes(300))  # no compression: the messages lie there to be read
-    with Log(path, salvage=True) as log:
+    with RecoveredLog(path) as log:
         assert content(log) == [m for _, _, each in whole[1:] for m in each]
         assert log.losses.unchecked == 0
 
@@ -306,13 +306,13 @@ def test_damage_that_only_the_crc_of_the_data_section_shows_is_told(foreign: For
     path = foreign(flight, layout, metadata={"vehicle": {"id": "7777"}})
     whole = path.read_bytes()
     flip(path, blocks(path)[2].end - 3)  # in a message index: the chunk says the same
-    with Log(path, salvage=True) as log:
+    with RecoveredLog(path) as log:
         log.check()
         assert not log.losses
-        assert any("message index" in line for line in log.losses.mended)
+        assert any("message index" in line for line in log.losses.harmless)
     path.write_bytes(whole)
     flip(path, whole.index(b"7777") + 1)  # in metadata: nothing says the same
-    with Log(path, salvage=True) as log:
+    with RecoveredLog(path) as log:
         log.check()
         assert "metadata" in log.losses.entries[0].reason
 
@@ -349,7 +349,7 @@ def test_a_repaired_log_has_its_sound_chunks_as_they_were_and_everybody_reads_it
     with Log(target) as log:
         log.check()
         record = log.metadata()[RECORD]
-        assert {b.offset for b in log.structure.blocks if not b.indexes} == set()
+        assert {b.offset for b in log.index.blocks if not b.indexes} == set()
     assert json.loads(record["topics"]) == report.losses.topics
     assert {s["offset"] for s in json.loads(record["stretches"])} == {loss.offset for loss in report.losses.entries}
     with AnyReader([target]) as reader:
@@ -407,7 +407,7 @@ BOMB = zstandard.ZstdCompressor(level=1).compress(bytes(200 << 20))
 def test_a_chunk_that_unpacks_to_more_than_it_says_is_refused_without_unpacking_it(tmp_path: Path, size: int) -> None:
     path = tmp_path / "log.mcap"
     hostile(path, chunk(BOMB, size))
-    with in_time(), in_room(), Log(path, salvage=True) as log:
+    with in_time(), in_room(), RecoveredLog(path) as log:
         assert log.losses
     with pytest.raises(LogError), in_time(), Log(path) as log:
         content(log)
@@ -420,7 +420,7 @@ def test_an_lz4_frame_that_goes_on_beyond_the_stated_size_is_refused(tmp_path: P
     liar = frame.begin(source_size=len(body)) + frame.compress(body + bytes(200 << 20)) + bytes(4)
     for packed in (lz4.frame.compress(body + bytes(200 << 20)), liar):
         hostile(path, chunk(packed, len(body), b"lz4", zlib.crc32(body)))
-        with in_time(), in_room(), Log(path, salvage=True) as log:
+        with in_time(), in_room(), RecoveredLog(path) as log:
             assert "unpack" in log.losses.entries[0].reason
 
 
@@ -429,19 +429,19 @@ def test_a_file_of_false_starts_is_searched_in_bounded_time(tmp_path: Path) -> N
     records_in_records = b"".join(HEAD.pack(5, (1 << 20) - i) + bytes(22) for i in range(20_000))
     path.write_bytes(MAGIC + bytes(9) + records_in_records + bytes(1 << 20))
     with pytest.raises(LogError, match="not an MCAP log"), in_time():
-        Log(path, salvage=True)
+        RecoveredLog(path)
 
 
 def test_chunks_in_a_chunk_and_logs_in_an_attachment_stay_where_they_are(foreign: Foreign, tmp_path: Path) -> None:
     inner = foreign(some(6, 20), "plain", name="inner").read_bytes()
     path = foreign(some(7, 20), name="outer", attachments=(inner,))
-    with Log(path, salvage=True) as log:
+    with RecoveredLog(path) as log:
         assert len(content(log)) == 20
     os.truncate(path, path.stat().st_size - 300)  # without its summary
-    with Log(path, salvage=True) as log:
+    with RecoveredLog(path) as log:
         assert len(content(log)) == 20
     hostile(path, chunk(inner, len(inner), b"", zlib.crc32(inner)))
-    with in_time(), Log(path, salvage=True) as log:
+    with in_time(), RecoveredLog(path) as log:
         assert not content(log)
 
 
@@ -452,22 +452,22 @@ def test_huge_claims_of_metadata_and_attachments_cost_nothing(tmp_path: Path) ->
     metadata = HEAD.pack(12, 20) + huge + bytes(16)
     channel = HEAD.pack(4, 30) + bytes(4) + huge + bytes(22)
     hostile(path, attachment, metadata, channel)
-    with in_time(), Log(path, salvage=True) as log:
+    with in_time(), RecoveredLog(path) as log:
         assert len(log.losses.entries) == 3
 
 
 def test_nothing_longer_than_a_chunk_may_be_comes_into_memory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(records, "CHUNK_LIMIT", 1 << 20)
-    monkeypatch.setattr(index, "MOST_SUMMARY", 1 << 20)
+    monkeypatch.setattr(index, "MAX_SUMMARY", 1 << 20)
     size = 50 << 20
     path, message = tmp_path / "log.mcap", struct.pack("<HIQQ", 1, 0, 0, 0)
     for start in (HEAD.pack(5, size) + message, HEAD.pack(6, size + 49) + struct.pack("<QQQIIQ", 0, 1, size, 7, 0, size)):
         hostile(path, start, bytes(size))
-        with in_time(), in_room(), Log(path, salvage=True) as log:
+        with in_time(), in_room(), RecoveredLog(path) as log:
             assert log.losses.bytes > size
     footer = HEAD.pack(2, 20) + struct.pack("<QQI", 8, 0, 1) + MAGIC
     path.write_bytes(MAGIC + HEAD.pack(1, 8) + bytes(8) + bytes(size) + footer)
-    with in_time(), in_room(), Log(path, salvage=True) as log:
+    with in_time(), in_room(), RecoveredLog(path) as log:
         assert log.losses
 
 

@@ -14,12 +14,12 @@ from typing import Any
 import pytest
 
 from imutool.errors import ConfigError
-from imutool.mcap_io.added_topics import Made, NewTopic
-from imutool.mcap_io.batches import ImuBatch
+from imutool.mcap_io.added_topics import DerivedBatch, NewTopic
 from imutool.mcap_io.codec import schemas
 from imutool.mcap_io.codec.encode import encode_imu
 from imutool.mcap_io.rewrite import rewrite
 from imutool.mcap_io.storage.target import Target
+from imutool.mcap_io.topics import ImuBatch
 from imutool.mcap_io.write import write
 from imutool.recording import Frames, Recording
 
@@ -33,11 +33,11 @@ class Failing:
     def __init__(self, error: BaseException) -> None:
         self.error, self.seen = error, 0
 
-    def __call__(self, batch: ImuBatch) -> Made:
+    def __call__(self, batch: ImuBatch) -> DerivedBatch:
         self.seen += 1
         if self.seen == 2:
             raise self.error
-        return Made(batch, [encode_imu(batch.stamp_ns, batch.gyro, batch.accel, batch.frame_id)])
+        return DerivedBatch(batch, [encode_imu(batch.stamp_ns, batch.gyro, batch.accel, batch.frame_id)])
 
 
 @pytest.fixture
@@ -69,7 +69,7 @@ def test_a_failure_keeps_the_file_that_was_to_be_replaced(source: Path, folder: 
     target.write_text("precious")
     with pytest.raises(KeyboardInterrupt):
         rewrite(source, target, [Failing(KeyboardInterrupt())], metadata={}, overwrite=True)
-    with pytest.raises(ConfigError, match=r"the target exists.*--overwrite"):
+    with pytest.raises(ConfigError, match=r"the target exists.*`overwrite=True`"):
         rewrite(source, target, [], metadata={})
     assert [path.read_text() for path in folder.iterdir()] == ["precious"]
 

@@ -19,11 +19,11 @@ from scipy.signal import correlate, correlation_lags
 from scipy.spatial.transform import Rotation
 
 from imutool.errors import DataError
-from imutool.inertial.kinematics import through
+from imutool.inertial.kinematics import fit_trajectory
 from imutool.inertial.stationary import white_noise
 from imutool.inertial.strapdown import with_velocity
 from imutool.recording import Imu, Poses, Recording, seconds
-from imutool.sensor.samples import NOTHING, IdealMotion
+from imutool.sensor.samples import NOTHING, IdealMotion, channels_at
 
 LEAST_S = 8.0  # below, nothing can be learned and tested
 ALIGN_HZ = 100.0
@@ -189,16 +189,8 @@ def split(stamp_s: Float64[np.ndarray, " n"]) -> tuple[Bool[np.ndarray, " n"], B
 
 
 def _channels(recording: Recording, t_ns: np.ndarray) -> dict[str, Float64[np.ndarray, " n"]]:
-    """Every other number of a log at some times, linearly between its messages, by `topic.field`."""
-    out: dict[str, Float64[np.ndarray, " n"]] = {}
-    for topic, scalars in recording.scalars.items():
-        if len(scalars.t_ns) < 2:
-            continue
-        start = int(scalars.t_ns[0])
-        for k in range(scalars.values.shape[1]):
-            name = topic if scalars.values.shape[1] == 1 else f"{topic}.{'xyz'[k]}"
-            out[name] = np.interp(seconds(t_ns, start), seconds(scalars.t_ns, start), scalars.values[:, k])
-    return out
+    """Scalar channels of a log at some times; a single message is no course."""
+    return channels_at(recording, seconds(t_ns, int(t_ns[0])), int(t_ns[0]), least_messages=2)
 
 
 def _simulated(
@@ -233,7 +225,7 @@ def _by_poses(
     poses = sim.truth
     if poses.period_s * POSES_HZ > 1.0 or np.diff(poses.t_ns).max() > 1e9 * GAP_PERIODS * poses.period_s:
         return None
-    trajectory = through(poses)  # a simulation's poses are exact, or the test below fails
+    trajectory = fit_trajectory(poses)  # a simulation's poses are exact, or the test below fails
     t_ns = poses.t_ns[0] + np.arange(int(poses.duration_s * rate_hz) + 1) * round(1e9 / rate_hz)
     motion = trajectory.at(t_ns[t_ns <= poses.t_ns[-1]])
     R_wb = Rotation.from_quat(motion.q_wb_wxyz, scalar_first=True).as_matrix()
@@ -243,7 +235,7 @@ def _by_poses(
     rows = (t_s >= felt.t_s[0]) & (t_s <= felt.t_s[-1])
     if rows.mean() < MOST_OF_IT:
         return None
-    read = felt.taken(t_s[rows], t_s[rows])
+    read = felt.sample(t_s[rows], t_s[rows])
     left = samples[rows] - np.concatenate([read.gyro, read.accel], axis=1)
     left = left - left.mean(axis=0)
     coarse = (

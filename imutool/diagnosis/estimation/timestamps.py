@@ -198,7 +198,7 @@ class _Clip:
     def __call__(self, read: SensorSamples, theta: Theta) -> SensorSamples:
         x = read.gyro if self.sensor == 0 else read.accel
         out = np.clip(x + self.bias, -theta[0], theta[0]) - self.bias
-        return read.but(gyro=out) if self.sensor == 0 else read.but(accel=out)
+        return read.with_readings(gyro=out) if self.sensor == 0 else read.with_readings(accel=out)
 
 
 class _Starts:

@@ -19,7 +19,7 @@ from imutool.diagnosis.estimation.alignment import Pair
 from imutool.sensor import catalogue
 from imutool.sensor.effect import Effect, Parameter, Stage, Theta
 from imutool.sensor.samples import SensorSamples, Vectors
-from imutool.sensor.variables import VARIABLES
+from imutool.sensor.unnamed_effects import VARIABLES
 from imutool.units import AXES, Sensor
 
 LAGS_S = (-0.5, -0.2, -0.1, -0.05, 0.0, 0.05, 0.1, 0.2, 0.5)
@@ -71,7 +71,7 @@ class _Driven:
     def __call__(self, read: SensorSamples, theta: Theta) -> SensorSamples:
         x = np.interp(read.stamp_s - theta[3], read.stamp_s, read.channels[self.channel]) - self.center
         added = x[:, None] * theta[:3]
-        return read.but(gyro=read.gyro + added) if self.sensor == 0 else read.but(accel=read.accel + added)
+        return read.with_readings(gyro=read.gyro + added) if self.sensor == 0 else read.with_readings(accel=read.accel + added)
 
 
 UNIT_OF = {"omega": "rad/s", "f": "m/s²", "alpha": "rad/s²", "t": "s"}
@@ -211,11 +211,11 @@ class _Term:
 def _on_axis(read: SensorSamples, sensor: int, axis: int, added: Float64[np.ndarray, " n"]) -> SensorSamples:
     out: Vectors = (read.gyro if sensor == 0 else read.accel).copy()
     out[:, axis] += added
-    return read.but(gyro=out) if sensor == 0 else read.but(accel=out)
+    return read.with_readings(gyro=out) if sensor == 0 else read.with_readings(accel=out)
 
 
 def like(pairs: Sequence[Pair]) -> SensorSamples:
     """Ideal signals at the samples of the first log that are fitted: what ranges there are."""
     pair = pairs[0]
     stamp_s = pair.stamp_s[pair.fitted]
-    return pair.felt.taken(stamp_s, stamp_s)
+    return pair.felt.sample(stamp_s, stamp_s)

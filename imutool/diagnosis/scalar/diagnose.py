@@ -15,7 +15,7 @@ from scipy.interpolate import BSpline
 from imutool.diagnosis.estimation.timestamps import LEAST_DIGITS, grid
 from imutool.diagnosis.locate import regime
 from imutool.diagnosis.result import Curve as ToldCurve
-from imutool.diagnosis.result import Estimate, Finding, HeldOut, Located, SignalTraces, Unexplained
+from imutool.diagnosis.result import Estimate, Finding, HeldOut, Kind, Located, SignalTraces, Unexplained
 from imutool.diagnosis.scalar import effects, fit
 from imutool.diagnosis.scalar.alignment import Beside, beside
 from imutool.diagnosis.scalar.effects import Chosen, Column, Curve, Samples
@@ -29,6 +29,7 @@ SHOWN_KNOTS = 41
 WHITE = 1.15
 EXACT = 1e-3
 SAME_GRID = 0.01
+_KINDS: Mapping[str, Kind] = {"driven": "driven", "unknown": "unknown"}
 RIDGE = 1e-8
 RICH_KNOTS = 12
 
@@ -195,6 +196,8 @@ def _finding(pair: Beside, found: Found, one: Judged, k: int, always: int, level
         driver=one.effect.driver,
         similar=one.similar,
         curve=_curve(found.whole, k, unit),
+        kind=_KINDS.get(one.effect.name, "catalogue"),
+        variable=one.effect.forward.variable if isinstance(one.effect.forward, Curve) else one.effect.driver,
     )
 
 
@@ -219,7 +222,7 @@ def _curve(whole: Fit, k: int, unit: str) -> ToldCurve | None:
     centred = basis - basis.mean(axis=0)
     covariance = whole.covariance[whole.place(k), whole.place(k)]
     band = np.sqrt(np.einsum("nq,qp,np->n", centred, covariance, centred))
-    return ToldCurve(forward.variable, forward.unit, x, (centred @ theta)[:, None], band[:, None])
+    return ToldCurve.of_arrays(forward.variable, forward.unit, x, (centred @ theta)[:, None], band[:, None])
 
 
 def _rounded(pair: Beside, model: Samples, lsb: float, name: str, unit: str) -> Finding:

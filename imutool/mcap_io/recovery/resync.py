@@ -1,7 +1,7 @@
-"""Where records go on after a place at which they do not: every byte is looked at once, by numpy, and little believed.
+"""Find the next valid record after corrupt bytes.
 
-A record convinces by lengths inside it that agree with one another (a chunk's data with the chunk, an index's entries with the
-index, the texts of a definition with the definition); a message, which has none, by the records that follow it.
+A record is valid when the lengths inside it agree (a chunk's data with the chunk, an index's entries with the index, the texts
+of a definition with the definition). A message has no such lengths: the records that follow it must be valid.
 """
 
 from __future__ import annotations
@@ -26,15 +26,16 @@ from mcap.records import (
 )
 
 from imutool.errors import LogError
+from imutool.mcap_io.blocks import Attachment
 from imutool.mcap_io.codec import records
-from imutool.mcap_io.codec.attachment import Attached
-from imutool.mcap_io.codec.records import CHUNK_HEAD, FIXED, HEAD, MAGIC
+from imutool.mcap_io.codec.messages import FIXED
+from imutool.mcap_io.codec.records import CHUNK_HEAD, HEAD, MAGIC
 from imutool.mcap_io.storage.source import Source
 
 WINDOW = 1 << 20
-MOST_SMALL = 1 << 24  # bytes of a record that is parsed whole: a definition, metadata, an entry of the summary
-MOST_TRIED = 1 << 17  # candidates looked at closely; beyond, a file is made to be searched for ever
-CHAIN = 3  # records in a row that a message needs to be believed after a gap
+MAX_SMALL = 1 << 24  # bytes of a record that is parsed whole: a definition, metadata, an entry of the summary
+MAX_CANDIDATES = 1 << 17  # parsed in one file; more occur only in a file made to be searched forever
+CHAIN = 3  # records in a row that prove a message after a gap
 PRIVATE = 0x80  # opcodes from here on belong to whoever writes them
 
 SMALL: dict[int, Any] = {
@@ -50,7 +51,7 @@ SMALL: dict[int, Any] = {
     Opcode.SUMMARY_OFFSET: SummaryOffset,
     Opcode.DATA_END: DataEnd,
 }
-HELD = {Opcode.MESSAGE, Opcode.CHUNK, Opcode.MESSAGE_INDEX}  # what comes into memory as a whole
+IN_MEMORY = {Opcode.MESSAGE, Opcode.CHUNK, Opcode.MESSAGE_INDEX}  # as a whole
 SUMMARY = {
     Opcode.CHUNK_INDEX,
     Opcode.ATTACHMENT_INDEX,
@@ -58,8 +59,8 @@ SUMMARY = {
     Opcode.METADATA_INDEX,
     Opcode.SUMMARY_OFFSET,
 }
-# The shortest body each can have
-LEAST = {
+# The shortest body of each
+MIN_LENGTH = {
     Opcode.HEADER: 8,
     Opcode.FOOTER: 20,
     Opcode.SCHEMA: 14,
@@ -76,39 +77,39 @@ LEAST = {
     Opcode.SUMMARY_OFFSET: 17,
     Opcode.DATA_END: 4,
 }
-_LEAST = np.full(256, 2**63, np.uint64)
-_LEAST[[int(o) for o in LEAST]] = list(LEAST.values())
-_KNOWN = _LEAST < 2**63
+_MIN_LENGTH = np.full(256, 2**63, np.uint64)
+_MIN_LENGTH[[int(o) for o in MIN_LENGTH]] = list(MIN_LENGTH.values())
+_KNOWN = _MIN_LENGTH < 2**63
 _CANDIDATE = np.dtype([("opcode", "u1"), ("length", "<u8")])
 
 
-class Frames:
-    """What records say of themselves, in one file up to a byte.
+class RecordFrames:
+    """Checks of record framing in one file, up to a byte.
 
     Raises (everywhere):
         LogError: the disk does not give the bytes.
     """
 
     def __init__(self, source: Source, limit: int) -> None:
-        self.source, self.limit, self.tried = source, limit, 0
+        self.source, self.limit, self.candidates = source, limit, 0
 
     def head(self, position: int) -> tuple[int, int] | None:
-        """Opcode and length of a record that fits into the file, if one can begin there."""
+        """Opcode and length of a record that fits into the file, or None."""
         if not 0 <= position <= self.limit - HEAD.size:
             return None
         opcode, length = self.source.head(position)
-        if length > self.limit - position - HEAD.size or (opcode < PRIVATE and length < int(_LEAST[opcode])):
+        if length > self.limit - position - HEAD.size or (opcode < PRIVATE and length < int(_MIN_LENGTH[opcode])):
             return None
-        if opcode in HELD and length > records.CHUNK_LIMIT:
+        if opcode in IN_MEMORY and length > records.CHUNK_LIMIT:
             return None
         return opcode, length
 
-    def magic(self, position: int) -> bool:
-        """Whether a log begins or ends there."""
+    def is_magic(self, position: int) -> bool:
+        """Whether the magic of a log stands there."""
         return position + len(MAGIC) <= self.limit and self.source.at(position, len(MAGIC)) == MAGIC
 
     def find(self, start: int, end: int, needle: bytes) -> int:
-        """Where some bytes begin in a stretch, be it that they end behind it; -1 if they do not."""
+        """First offset of `needle` that begins in a stretch, or -1."""
         over = len(needle) - 1
         for at in range(start, end, WINDOW):
             raw = self.source.at(at, min(WINDOW + over, end + over - at, self.limit - at))
@@ -116,16 +117,16 @@ class Frames:
                 return at + found
         return -1
 
-    def empty(self, start: int, end: int) -> bool:
+    def is_zero(self, start: int, end: int) -> bool:
         """Whether all bytes of a stretch are zero."""
         return not any(self.source.at(at, min(WINDOW, end - at)).strip(b"\0") for at in range(start, end, WINDOW))
 
-    def leads_on(self, position: int) -> bool:
-        """Whether what came before ended well: the file ends here, or what may be a record begins."""
-        return position == self.limit or self.magic(position) or self.head(position) is not None
+    def is_boundary(self, position: int) -> bool:
+        """Whether a record can end here: the file ends, or another record or a log begins."""
+        return position == self.limit or self.is_magic(position) or self.head(position) is not None
 
-    def agrees(self, position: int, opcode: int, length: int) -> bool:
-        """Whether the lengths inside a record agree with its own; nothing can be said so of a message."""
+    def is_valid(self, position: int, opcode: int, length: int) -> bool:
+        """Whether the lengths inside a record agree with its own; always False for a message."""
         if opcode == Opcode.CHUNK:
             return self.chunk(position, length) is not None
         if opcode == Opcode.MESSAGE_INDEX:
@@ -133,9 +134,9 @@ class Frames:
             return bool(size == length - 6 and size % 16 == 0)
         try:
             if opcode == Opcode.ATTACHMENT:
-                return Attached.of(self.source, position, length).length == HEAD.size + length
+                return Attachment.of(self.source, position, length).length == HEAD.size + length
             kind = SMALL.get(opcode)
-            if kind is None or length > MOST_SMALL:
+            if kind is None or length > MAX_SMALL:
                 return False
             raw = self.source.at(position, HEAD.size + length)
             return records.build(records.parse(kind, raw[HEAD.size :], position)) == raw
@@ -143,7 +144,7 @@ class Frames:
             return False
 
     def chunk(self, position: int, length: int) -> records.ChunkHead | None:
-        """The head of a chunk whose record has this length, if it is one in a compression that is known."""
+        """The head of a chunk whose record has this length, or None; its compression must be known."""
         whole = HEAD.size + length
         try:
             head = records.ChunkHead.of(self.source.at(position, min(128, whole, self.limit - position)), whole, position)
@@ -151,8 +152,8 @@ class Frames:
             return None
         return head if head.compression in records.COMPRESSIONS.values() else None
 
-    def own_length(self, position: int) -> int | None:
-        """The length a Chunk record has by what stands inside it, where its own length field is damaged."""
+    def chunk_length(self, position: int) -> int | None:
+        """Length of a Chunk record from the fields inside it, where its own length field is damaged."""
         first = self.source.at(position, min(128, self.limit - position))
         if len(first) < HEAD.size + CHUNK_HEAD.size:
             return None
@@ -166,21 +167,21 @@ class Frames:
         length = at - HEAD.size + 8 + packed
         return int(length) if packed and length <= self.limit - position - HEAD.size else None
 
-    def next(self, start: int, limit: int, channels: set[int]) -> int:
-        """The first byte from `start` on at which a record convincingly begins, or a log; `limit` if there is none."""
+    def find_next(self, start: int, limit: int, channels: set[int]) -> int:
+        """Offset of the next valid record or log from `start` on; `limit` if there is none."""
         for at in range(start, limit, WINDOW):
             raw = self.source.at(at, min(WINDOW + len(MAGIC), self.limit - at))
             for offset in self._candidates(raw, at):
                 position = at + offset
-                if position >= limit or self.tried > MOST_TRIED:
+                if position >= limit or self.candidates > MAX_CANDIDATES:
                     return limit
-                self.tried += 1
-                if self.magic(position) or self._convinces(position, channels):
+                self.candidates += 1
+                if self.is_magic(position) or self._is_plausible(position, channels):
                     return position
         return limit
 
     def _candidates(self, raw: bytes, at: int) -> list[int]:
-        """Where a known opcode is followed by a length that fits, and where the magic stands, in the first `WINDOW` bytes."""
+        """Offsets of a known opcode with a length that fits, and of the magic, in the first `WINDOW` bytes."""
         view = np.frombuffer(raw, np.uint8)
         found: list[int] = []
         if len(view) >= HEAD.size:
@@ -189,7 +190,7 @@ class Frames:
             offsets = np.flatnonzero(small[:WINDOW])
             heads = np.lib.stride_tricks.sliding_window_view(view, HEAD.size)[offsets].view(_CANDIDATE)[:, 0]
             room = self.limit - at - HEAD.size - offsets
-            fits = (heads["length"] >= _LEAST[heads["opcode"]]) & (heads["length"].astype(np.int64) <= room)
+            fits = (heads["length"] >= _MIN_LENGTH[heads["opcode"]]) & (heads["length"].astype(np.int64) <= room)
             found = offsets[fits].tolist()
         magic = raw.find(MAGIC)
         while 0 <= magic < WINDOW:
@@ -197,14 +198,14 @@ class Frames:
             magic = raw.find(MAGIC, magic + 1)
         return sorted(found)
 
-    def _convinces(self, position: int, channels: set[int]) -> bool:
+    def _is_plausible(self, position: int, channels: set[int]) -> bool:
         found = self.head(position)
         if found is None:
             return False
         opcode, length = found
         end = position + HEAD.size + length
         if opcode != Opcode.MESSAGE:
-            return self.agrees(position, opcode, length) and (opcode == Opcode.CHUNK or self.leads_on(end))
+            return self.is_valid(position, opcode, length) and (opcode == Opcode.CHUNK or self.is_boundary(end))
         for _ in range(CHAIN):
             if channels and int.from_bytes(self.source.at(position + HEAD.size, 2), "little") not in channels:
                 return False
@@ -214,5 +215,5 @@ class Frames:
                 return position == self.limit
             opcode, length = found
             if opcode != Opcode.MESSAGE:
-                return self.agrees(position, opcode, length)
+                return self.is_valid(position, opcode, length)
         return True

@@ -18,13 +18,12 @@ from types import TracebackType
 from typing import BinaryIO, Protocol
 
 from imutool.errors import ConfigError
-from imutool.location import Location, failures, reason
-from imutool.mcap_io.codec.crc import crc32
-from imutool.mcap_io.storage.source import Source, descriptor
+from imutool.location import Location, io_errors, reason
+from imutool.mcap_io.codec.records import crc32
+from imutool.mcap_io.storage.source import BLOCK_BYTES, Source, crc_of, descriptor
 from imutool.mcap_io.storage.upload import Upload
 
-COPY_BYTES = 1 << 20  # what passes through memory stays in the processor's cache
-BLOCK_BYTES = 1 << 12  # of a file system
+PAGE_BYTES = 1 << 12  # of a file system
 
 
 class _Medium(Protocol):
@@ -77,7 +76,7 @@ class Target:
         if self.path.is_dir():
             raise ConfigError("the target is a folder", where=self.path, expected="the name of a file")
         if self.path.exists() and not self.overwrite:
-            raise ConfigError("the target exists", where=self.path, fix="Choose another name, or add --overwrite")
+            raise ConfigError("the target exists", where=self.path, fix="Choose another name, or add `overwrite=True`")
 
     @contextmanager
     def _told(self) -> Iterator[None]:
@@ -85,7 +84,7 @@ class Target:
             yield
         except ConfigError:
             raise
-        except failures(self.path) as error:
+        except io_errors(self.path) as error:
             raise ConfigError(
                 f"cannot be written ({reason(error)})", where=self.path, fix="Choose a place that can be written and has room"
             ) from error
@@ -113,8 +112,8 @@ class Target:
             with self._told():
                 stopped = self._medium.copy(source, start, end)
             self.position, start = self.position + stopped - start, stopped
-        for at in range(start, end, COPY_BYTES):
-            self.write(source.at(at, min(COPY_BYTES, end - at)))
+        for at in range(start, end, BLOCK_BYTES):
+            self.write(source.at(at, min(BLOCK_BYTES, end - at)))
 
     def flush(self) -> None:
         """Hands everything over, so that it can be read back under its temporary name; nothing can be written after."""
@@ -168,7 +167,7 @@ class _File:
     def copy(self, source: Source, start: int, end: int) -> int:
         """By the kernel; where it began, if the kernel cannot do it, or not without cutting blocks in two."""
         theirs, ours = descriptor(source.file), descriptor(self.file)
-        if theirs is None or ours is None or (start - self.file.tell()) % BLOCK_BYTES:
+        if theirs is None or ours is None or (start - self.file.tell()) % PAGE_BYTES:
             return start
         calls: tuple[Callable[[int], int], ...] = (
             lambda at: os.copy_file_range(theirs, ours, end - at, offset_src=at),
@@ -213,3 +212,50 @@ def _tried(call: Callable[[int], int], at: int) -> int:
         return call(at)
     except OSError:
         return 0
+
+
+class PassThrough:
+    """Copies a source into a target from its first byte to its last, with new records between those of the source."""
+
+    def __init__(self, source: Source, target: Target) -> None:
+        self.source, self.target = source, target
+        self.copied = self.crc = 0  # bytes of the source so far, and their CRC if it states one
+        self.pending_end = 0  # the bytes from `copied` to here are to be copied, but not yet
+
+    @property
+    def pending(self) -> int:
+        """Bytes to be copied later."""
+        return self.pending_end - self.copied
+
+    def defer(self, end: int) -> int:
+        """Marks the source up to here to be copied now or later; returns by how much its bytes move."""
+        self.pending_end = end
+        return self.target.position - self.copied
+
+    def flush(self) -> None:
+        """Copies the pending bytes."""
+        start, end, out = self.copied, self.pending_end, self.target
+        self.copied = end
+        if not out.summing:
+            out.copy(self.source, start, end)
+            return
+        for at in range(start, end, BLOCK_BYTES):  # read once for the CRC of the source and that of the copy
+            raw = self.source.at(at, min(BLOCK_BYTES, end - at))
+            self.crc = crc32(raw, self.crc)
+            out.write(raw)
+
+    def skip(self, end: int) -> None:
+        """Leaves out the bytes of the source up to here, which are written in another form or not at all."""
+        if self.target.summing:
+            self.crc = crc_of(self.source, self.copied, end, self.crc)
+        self.copied = self.pending_end = end
+
+    def write(self, raw: memoryview) -> int:
+        """Copies bytes of the source that are in memory already; returns where they went."""
+        self.flush()
+        at = self.target.position
+        if self.target.summing:
+            self.crc = crc32(raw, self.crc)
+        self.target.write(raw)
+        self.copied = self.pending_end = self.copied + len(raw)
+        return at

@@ -21,7 +21,7 @@ def _starts(motion: IdealMotion, samples: SensorSamples) -> list[Theta]:
     An offset tau adds tau d omega/dt, so that sums up to each sample and from it on tell what any jump would bring.
     """
     error, _ = residual(motion, samples)
-    slope = np.gradient(motion.taken(samples.stamp_s, samples.stamp_s).gyro, samples.stamp_s, axis=0)
+    slope = np.gradient(motion.sample(samples.stamp_s, samples.stamp_s).gyro, samples.stamp_s, axis=0)
     common = np.cumsum(np.sum(slope * (error - np.median(error, axis=0)), axis=1))
     power = np.cumsum(np.sum(slope**2, axis=1)) + np.finfo(np.float64).tiny
     before = common[:-1] / power[:-1]

@@ -18,7 +18,7 @@ def warm_up(sensor: Sensor, unit: str, plausible: float) -> Effect:
 
     def forward(samples: SensorSamples, theta: Theta) -> SensorSamples:
         added = _course(samples.stamp_s, float(theta[3]))[:, None] * theta[:3]
-        return samples.but(samples.gyro + added) if sensor == "gyro" else samples.but(accel=samples.accel + added)
+        return samples.with_added(sensor, added)
 
     def starts(motion: IdealMotion, samples: SensorSamples) -> list[Theta]:
         """Amplitudes by least squares, with a constant, for each tau."""

@@ -7,7 +7,7 @@ from imutool.sensor.samples import SensorSamples
 
 
 def _forward(samples: SensorSamples, m: Theta) -> SensorSamples:
-    return samples.but(gyro=samples.gyro + samples.gyro @ matrix(m).T)
+    return samples.with_readings(gyro=samples.gyro + samples.gyro @ matrix(m).T)
 
 
 EFFECT = Effect(

@@ -14,7 +14,7 @@ FINE = 1e-3  # of the smallest step is none
 
 def _forward(samples: SensorSamples, lsb: Theta) -> SensorSamples:
     gyro, accel = lsb.tolist()
-    return samples.but(
+    return samples.with_readings(
         np.rint(samples.gyro / gyro) * gyro if gyro else None,
         np.rint(samples.accel / accel) * accel if accel else None,
     )

@@ -23,7 +23,7 @@ NONZERO = KNOTS_RAD_S != 0.0
 
 
 def _forward(samples: SensorSamples, theta: Theta) -> SensorSamples:
-    return samples.but(gyro=samples.gyro + _curves(samples.signals, _values(theta)))
+    return samples.with_readings(gyro=samples.gyro + _curves(samples.signals, _values(theta)))
 
 
 def _values(theta: Theta) -> Float64[np.ndarray, "2 3 k"]:

@@ -18,7 +18,7 @@ def _forward(samples: SensorSamples, k: Theta) -> SensorSamples:
         raise DataError("no temperature channel", where="temperature", expected="a channel with temperature in its name")
     T = samples.channels[names[0]]
     warmer = (T - T.mean())[:, None]
-    return samples.but(samples.gyro + warmer * k[:3], samples.accel + warmer * k[3:])
+    return samples.with_readings(samples.gyro + warmer * k[:3], samples.accel + warmer * k[3:])
 
 
 EFFECT = Effect(

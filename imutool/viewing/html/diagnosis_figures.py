@@ -17,22 +17,30 @@ from imutool.diagnosis.estimation.whitening import Band
 from imutool.diagnosis.result import Curve, Diagnosis, Located, SignalTraces, Traces
 from imutool.diagnosis.wording import signals
 from imutool.units import AXES, UNITS
-from imutool.viewing.html.drawing import Line, Thin, averaged, extremes, plain_numbers, spans, svg
-from imutool.viewing.html.theme import AFTER, BEFORE, HELD, INK, MARK, TITLES
+from imutool.viewing.html.drawing import (
+    DecimatedLine,
+    Line,
+    average_log_bins,
+    decimate_extremes,
+    plain_tick_labels,
+    svg,
+    true_intervals,
+)
+from imutool.viewing.html.page import AFTER, BEFORE, HELD, INK, MARK, TITLES
 
 SIGNALS = {"gyro": slice(0, 3), "accel": slice(3, 6)}
 
 BUCKETS = 600  # a column of the page each: its lowest and its highest sample are drawn
 STRIP_BINS = 400
 WELCH_S = 8.0  # the longest window; shorter where unseen stretches are
-FEWEST = 32  # samples in a window, below which there is no spectrum
+MIN_SAMPLES = 32  # samples in a window, below which there is no spectrum
 BINS = 16
 LEAST_BLOCKS = 3  # in a bin
 BLOCK_S = 0.5  # one independent value each: misfits of a motion last about so long
-GAP = 1.5  # periods without a sample that end a stretch
+GAP_PERIODS = 1.5  # periods without a sample that end a stretch
 
 
-def where(d: Diagnosis, trace: Traces) -> str:
+def misfit_strip(d: Diagnosis, trace: Traces) -> str:
     """The misfit of each axis along one log as a strip of its height, located stretches shaded, unseen time below."""
 
     def draw(figure: Any) -> None:
@@ -48,9 +56,9 @@ def where(d: Diagnosis, trace: Traces) -> str:
                 axes.fill_between(edges[:-1], -row, -row + area, step="post", color=INK, alpha=0.55, lw=0)
             for place in d.located:
                 if axis in place.axes and signal in signals(place.signal):
-                    for first, last in located_in(trace, place):
+                    for first, last in intervals_in_log(trace, place):
                         axes.fill_between([first, last], -row, -row + 0.94, color=MARK, alpha=0.3, lw=0)
-        for first, last in spans(trace.t_s, trace.held_out):
+        for first, last in true_intervals(trace.t_s, trace.held_out):
             axes.fill_between([first, last], -6.0, -5.3, color=HELD, alpha=0.5, lw=0)
         axes.set_yticks([0.45 - row for row in range(7)], [*names, "unseen"])
         axes.set(xlim=(trace.t_s[0], trace.t_s[-1]), ylim=(-6.1, 1.0), xlabel="time (s)")
@@ -68,9 +76,9 @@ def residual(trace: Traces, *, found: bool) -> str:
         for column, (signal, part) in enumerate(SIGNALS.items()):
             for row, axes in enumerate(panels[:, column]):
                 for expected, color in _sides(trace, found):
-                    left = known(trace, expected)[:, part][:, row]
-                    axes.plot(*extremes(trace.t_s, left, BUCKETS), color=color, lw=0.6)
-                for first, last in spans(trace.t_s, trace.held_out):
+                    left = residual_in_band(trace, expected)[:, part][:, row]
+                    axes.plot(*decimate_extremes(trace.t_s, left, BUCKETS), color=color, lw=0.6)
+                for first, last in true_intervals(trace.t_s, trace.held_out):
                     axes.axvspan(first, last, color=HELD, alpha=0.15, lw=0)
                 axes.set_ylabel(f"{AXES[row]} ({UNITS[signal]})")
             panels[0, column].set_title(f"{TITLES[signal]}: real minus expected")
@@ -79,17 +87,17 @@ def residual(trace: Traces, *, found: bool) -> str:
     return svg(draw, 4.4, "residual")
 
 
-def signal(beside: SignalTraces, *, found: bool) -> str:
+def scalar_signal(beside: SignalTraces, *, found: bool) -> str:
     """Another signal as it was recorded and expected, and real minus expected before and (if `found`) after, over time."""
 
     def draw(figure: Any) -> None:
         above, below = figure.subplots(2, 1, sharex=True)
-        above.plot(*extremes(beside.t_s, beside.real, BUCKETS), color=INK, lw=0.9)
+        above.plot(*decimate_extremes(beside.t_s, beside.real, BUCKETS), color=INK, lw=0.9)
         for expected, color in [(beside.before, BEFORE), (beside.after, AFTER)][: 1 + found]:
-            above.plot(*extremes(beside.t_s, expected, BUCKETS), color=color, lw=0.8)
-            below.plot(*extremes(beside.t_s, beside.real - expected, BUCKETS), color=color, lw=0.6)
+            above.plot(*decimate_extremes(beside.t_s, expected, BUCKETS), color=color, lw=0.8)
+            below.plot(*decimate_extremes(beside.t_s, beside.real - expected, BUCKETS), color=color, lw=0.6)
         for axes, title in ((above, "Recorded (ink) and expected"), (below, "Real minus expected")):
-            for first, last in spans(beside.t_s, beside.held_out):
+            for first, last in true_intervals(beside.t_s, beside.held_out):
                 axes.axvspan(first, last, color=HELD, alpha=0.15, lw=0)
             axes.set_title(title)
             axes.set_ylabel(f"({beside.unit})" if beside.unit else "value")
@@ -112,7 +120,7 @@ def spectrum(d: Diagnosis) -> str | None:
             if signal in d.unexplained:
                 floor = d.unexplained[signal].noise_floor * np.sqrt(2.0 / rate_hz(d.traces[0]))
                 axes.axhline(floor, color=INK, lw=1.0, ls=(0, (4, 3)))
-            plain_numbers(axes.xaxis, axes.yaxis)
+            plain_tick_labels(axes.xaxis, axes.yaxis)
             low, high = axes.get_ylim()
             axes.set_ylim(10.0 ** np.floor(np.log10(low)), 10.0 ** np.ceil(np.log10(high)))  # whole decades have labels
             axes.set(xlabel="frequency (Hz)", ylabel=f"density ({UNITS[signal]}/√Hz)", title=TITLES[signal])
@@ -120,7 +128,7 @@ def spectrum(d: Diagnosis) -> str | None:
     return svg(draw, 2.9, "spectrum")
 
 
-def against_rate(d: Diagnosis) -> str | None:
+def residual_against_rate(d: Diagnosis) -> str | None:
     """Mean residual in bins of turning rate: the gyro's against that about the same axis, the accel's against its size."""
 
     def variable(trace: Traces, signal: str, axis: int) -> Line:
@@ -131,7 +139,7 @@ def against_rate(d: Diagnosis) -> str | None:
     return _binned(d, variable, names, "rate")
 
 
-def against_attitude(d: Diagnosis) -> str | None:
+def residual_against_attitude(d: Diagnosis) -> str | None:
     """Mean residual in bins of how far its axis rises above the horizon; nothing where no attitude is known."""
 
     def variable(trace: Traces, signal: str, axis: int) -> Line:
@@ -147,13 +155,14 @@ def against_attitude(d: Diagnosis) -> str | None:
 
 def curve(found: Curve, signal: str) -> str:
     """A misfit without a name as a curve of one variable with its band, a panel for each axis that has one."""
+    all_y, all_bands = np.array(found.y), np.array(found.band)
 
     def draw(figure: Any) -> None:
-        count = found.y.shape[1]
-        told = [k for k in range(count) if found.y[:, k].any() or found.band[:, k].any()]  # the others have no part in it
+        count = all_y.shape[1]
+        told = [k for k in range(count) if all_y[:, k].any() or all_bands[:, k].any()]  # the others have no part in it
         panels = figure.subplots(1, max(len(told), 1), squeeze=False, sharey=True)[0]
         for k, axes in zip(told, panels, strict=False):
-            y, band = found.y[:, k], found.band[:, k]
+            y, band = all_y[:, k], all_bands[:, k]
             axes.fill_between(found.x, y - band, y + band, color=AFTER, alpha=0.3, lw=0)
             axes.plot(found.x, y, color=AFTER, lw=1.4)
             axes.axhline(0.0, color=INK, lw=0.6)
@@ -165,7 +174,7 @@ def curve(found: Curve, signal: str) -> str:
     return svg(draw, 2.6, "curve")
 
 
-def located_in(trace: Traces, place: Located) -> Iterator[tuple[float, float]]:
+def intervals_in_log(trace: Traces, place: Located) -> Iterator[tuple[float, float]]:
     """What of a place lies in a stretch of a log; a place of no log in particular is on the clock of all."""
     if place.log not in ("", trace.path):
         return
@@ -175,7 +184,7 @@ def located_in(trace: Traces, place: Located) -> Iterator[tuple[float, float]]:
             yield low, high
 
 
-def known(trace: Traces, expected: Float64[np.ndarray, "n 6"]) -> Float64[np.ndarray, "n 6"]:
+def residual_in_band(trace: Traces, expected: Float64[np.ndarray, "n 6"]) -> Float64[np.ndarray, "n 6"]:
     """Real minus expected, without what is faster than the expected is known."""
     left: Float64[np.ndarray, "n 6"] = trace.real - expected
     if trace.band_hz is None:
@@ -184,7 +193,7 @@ def known(trace: Traces, expected: Float64[np.ndarray, "n 6"]) -> Float64[np.nda
     return np.asarray(fftconvolve(left, taps[:, None], mode="same", axes=0))
 
 
-def unseen(trace: Traces) -> Bool[np.ndarray, " n"]:
+def held_out_mask(trace: Traces) -> Bool[np.ndarray, " n"]:
     """Samples that no fit has seen; all of them where none was held out."""
     return trace.held_out if trace.held_out.any() else np.ones_like(trace.held_out)
 
@@ -200,7 +209,7 @@ def _sides(trace: Traces, found: bool) -> list[tuple[Float64[np.ndarray, "n 6"],
 
 def _local_rms(trace: Traces, edges: Line) -> Float64[np.ndarray, "bins 6"]:
     """Root mean square of the misfit before, a row each between edges; NaN where there is no sample."""
-    squares = known(trace, trace.before) ** 2
+    squares = residual_in_band(trace, trace.before) ** 2
     there = np.isfinite(squares)
     bins = np.clip(np.searchsorted(edges, trace.t_s, side="right") - 1, 0, len(edges) - 2)
     sums, counts = np.zeros((2, len(edges) - 1, 6))
@@ -215,7 +224,7 @@ def _density(traces: Sequence[Traces], part: slice, after: bool) -> tuple[Line, 
     pieces = [(rate_hz(trace), piece) for trace in traces for piece in _stretches(trace, part, after)]
     longest_s = max((len(piece) / rate for rate, piece in pieces), default=0.0)
     window_s = min(WELCH_S, 2.0 ** np.floor(np.log2(max(longest_s, 1e-9))))
-    pieces = [(rate, piece) for rate, piece in pieces if len(piece) >= max(round(window_s * rate), FEWEST)]
+    pieces = [(rate, piece) for rate, piece in pieces if len(piece) >= max(round(window_s * rate), MIN_SAMPLES)]
     if not pieces:
         return None
     highest = min(rate for rate, _ in pieces) / 2.0
@@ -225,18 +234,18 @@ def _density(traces: Sequence[Traces], part: slice, after: bool) -> tuple[Line, 
         at, power = welch(piece, fs=rate, nperseg=round(window_s * rate), axis=0)
         total += len(piece) * np.interp(frequency, at, power.mean(axis=1))
         weight += len(piece)
-    at, density = averaged(frequency, total / weight, 1.0 / window_s)
+    at, density = average_log_bins(frequency, total / weight, 1.0 / window_s)
     return at, np.sqrt(density)
 
 
 def _stretches(trace: Traces, part: slice, after: bool) -> Iterator[Float64[np.ndarray, "m 3"]]:
     """The residual over unseen time, cut where samples are missing."""
     left = (trace.real - (trace.after if after else trace.before))[:, part]
-    good = unseen(trace) & np.isfinite(left).all(axis=1)
+    good = held_out_mask(trace) & np.isfinite(left).all(axis=1)
     rows = np.flatnonzero(good)
-    steps = np.diff(trace.t_s[rows]) > GAP / rate_hz(trace)
+    steps = np.diff(trace.t_s[rows]) > GAP_PERIODS / rate_hz(trace)
     for piece in np.split(rows, np.flatnonzero(steps) + 1):
-        if len(piece) >= FEWEST:
+        if len(piece) >= MIN_SAMPLES:
             yield left[piece]
 
 
@@ -249,11 +258,11 @@ def _binned(d: Diagnosis, variable: Callable[[Traces, str, int], Line], names: d
         panels = figure.subplots(2, 3, sharey="row")
         for row, (signal, part) in enumerate(SIGNALS.items()):
             for axis, axes in enumerate(panels[row]):
-                x = np.concatenate([variable(trace, signal, axis)[unseen(trace)] for trace in d.traces])
-                blocks = np.concatenate([_blocks(trace, k)[unseen(trace)] for k, trace in enumerate(d.traces)])
+                x = np.concatenate([variable(trace, signal, axis)[held_out_mask(trace)] for trace in d.traces])
+                blocks = np.concatenate([_blocks(trace, k)[held_out_mask(trace)] for k, trace in enumerate(d.traces)])
                 for side, color in enumerate((BEFORE, AFTER)[: 1 + bool(d.findings)]):
-                    left = [known(trace, trace.after if side else trace.before) for trace in d.traces]
-                    y = np.concatenate([one[unseen(t), part][:, axis] for one, t in zip(left, d.traces, strict=True)])
+                    left = [residual_in_band(trace, trace.after if side else trace.before) for trace in d.traces]
+                    y = np.concatenate([one[held_out_mask(t), part][:, axis] for one, t in zip(left, d.traces, strict=True)])
                     centre, mean, band = means(x, y, blocks)
                     axes.fill_between(centre, mean - band, mean + band, color=color, alpha=0.25, lw=0)
                     axes.plot(centre, mean, color=color, lw=1.2, marker="o", ms=2.5)
@@ -266,7 +275,7 @@ def _binned(d: Diagnosis, variable: Callable[[Traces, str, int], Line], names: d
     return svg(draw, 4.2, name)
 
 
-def means(x: Line, y: Line, blocks: Float64[np.ndarray, " n"]) -> tuple[Thin, Thin, Thin]:
+def means(x: Line, y: Line, blocks: Float64[np.ndarray, " n"]) -> tuple[DecimatedLine, DecimatedLine, DecimatedLine]:
     """Centres of even bins, the mean in each, and two standard errors, one independent value a block of time."""
     good = np.isfinite(x) & np.isfinite(y)
     x, y, blocks = x[good], y[good], blocks[good]

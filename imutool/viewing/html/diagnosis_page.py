@@ -28,7 +28,7 @@ from imutool.mcap_io.storage.target import Target
 from imutool.units import ASCII_UNITS
 from imutool.viewing.html import diagnosis_figures as figures
 from imutool.viewing.html import diagnosis_paths
-from imutool.viewing.html.drawing import apart
+from imutool.viewing.html.drawing import prefix_ids
 from imutool.viewing.html.page import document, text
 
 BAR_PIXELS = 80.0
@@ -132,7 +132,7 @@ def _places(d: Diagnosis) -> Iterator[str]:
             f"{text(trace.log)}: local size of the misfit{_band(trace)}, by axis (each sensor to its own largest). "
             '<span class="key" style="background: var(--mark)"></span>where it was located' + HELD
         )
-        yield _figure(figures.where(d, trace), f"w{k}", caption)
+        yield _figure(figures.misfit_strip(d, trace), f"w{k}", caption)
 
 
 def _before_and_after(d: Diagnosis) -> Iterator[str]:
@@ -146,11 +146,11 @@ def _before_and_after(d: Diagnosis) -> Iterator[str]:
         drawn = figures.residual(trace, found=found)
         yield _figure(drawn, f"r{k}", f"{text(trace.log)}: over time{_band(trace)}. {both}{HELD}")
     for k, (signal, beside) in enumerate(d.signals.items()):
-        drawn = figures.signal(beside, found=any(one.signal == signal for one in d.findings))
+        drawn = figures.scalar_signal(beside, found=any(one.signal == signal for one in d.findings))
         yield _figure(drawn, f"g{k}", f"{text(signal)}: over time. {both}{HELD}")
     if len(d.traces) > MOST_LOGS:
         yield f'<p class="note">The first {MOST_LOGS} of {len(d.traces)} logs are drawn; all are in the .rrd.</p>'
-    spectrum, rate, attitude = figures.spectrum(d), figures.against_rate(d), figures.against_attitude(d)
+    spectrum, rate, attitude = figures.spectrum(d), figures.residual_against_rate(d), figures.residual_against_attitude(d)
     if spectrum is not None:
         yield _figure(
             spectrum, "s", f"Spectrum over {over} (Welch, mean of the axes); dashed: white noise of the floor's size. {both}"
@@ -227,4 +227,4 @@ def _band(trace: Traces) -> str:
 
 
 def _figure(svg: str, prefix: str, caption: str) -> str:
-    return f"<figure>{apart(svg, prefix)}<figcaption>{caption}</figcaption></figure>"
+    return f"<figure>{prefix_ids(svg, prefix)}<figcaption>{caption}</figcaption></figure>"

@@ -14,11 +14,11 @@ from jaxtyping import Float64
 from scipy.spatial.transform import Rotation
 
 from imutool.diagnosis.result import Diagnosis, Traces
-from imutool.inertial.strapdown import Start, dead_reckon
+from imutool.inertial.strapdown import StartPose, dead_reckon
 from imutool.recording import Imu, Poses
-from imutool.viewing.html.diagnosis_figures import GAP, rate_hz, unseen
+from imutool.viewing.html.diagnosis_figures import GAP_PERIODS, held_out_mask, rate_hz
 from imutool.viewing.html.drawing import svg
-from imutool.viewing.html.theme import AFTER, BEFORE, INK
+from imutool.viewing.html.page import AFTER, BEFORE, INK
 
 LEAST_S, MOST_S = 2.0, 10.0  # of a stretch; a longer one is cut
 GRID_S = 0.05  # of the drift's clock
@@ -32,12 +32,12 @@ class Stretch(NamedTuple):
     after: Poses
 
 
-def stretches(trace: Traces) -> Iterator[Stretch]:
+def held_out_stretches(trace: Traces) -> Iterator[Stretch]:
     """Unseen stretches without gaps that have poses, ten seconds long at most; none where no poses are known."""
     if trace.truth is None or trace.ideal is None:
         return
-    rows = np.flatnonzero(unseen(trace) & np.isfinite(trace.ideal).all(axis=1))
-    breaks = np.flatnonzero(np.diff(trace.t_s[rows]) > GAP / rate_hz(trace)) + 1
+    rows = np.flatnonzero(held_out_mask(trace) & np.isfinite(trace.ideal).all(axis=1))
+    breaks = np.flatnonzero(np.diff(trace.t_s[rows]) > GAP_PERIODS / rate_hz(trace)) + 1
     for piece in np.split(rows, breaks):
         count = max(1, int(np.ceil(len(piece) / (MOST_S * rate_hz(trace)))))
         for part in np.array_split(piece, count):
@@ -50,7 +50,7 @@ def paths(d: Diagnosis) -> str | None:
 
     None where no stretch has poses, or nothing was found.
     """
-    drawn = [list(stretches(trace)) for trace in d.traces]
+    drawn = [list(held_out_stretches(trace)) for trace in d.traces]
     everything = [one for log in drawn for one in log]
     if not everything or not d.findings:
         return None
@@ -65,14 +65,14 @@ def paths(d: Diagnosis) -> str | None:
         above.set_aspect("equal", adjustable="datalim")
         for axes, name, column in ((turned, "orientation error (°)", 0), (moved, "position error (m)", 1)):
             for side, color in ((1, BEFORE), (2, AFTER)):
-                t_s, rms = drift(everything, side)
+                t_s, rms = rms_drift(everything, side)
                 axes.plot(t_s, rms[:, column], color=color, lw=1.3)
             axes.set(xlabel="time since the true start (s)", title=name.capitalize(), xlim=(0.0, None), ylim=(0.0, None))
 
     return svg(draw, 3.0, "paths")
 
 
-def drift(found: Sequence[Stretch], side: int) -> tuple[Float64[np.ndarray, " k"], Float64[np.ndarray, "k 2"]]:
+def rms_drift(found: Sequence[Stretch], side: int) -> tuple[Float64[np.ndarray, " k"], Float64[np.ndarray, "k 2"]]:
     """Root mean square orientation error (deg) and position error (m) over stretches, by time since their start.
 
     `side` is 1 for before, 2 for after. As far as half of the stretches reach.
@@ -96,7 +96,7 @@ def _stretch(trace: Traces, rows: slice) -> Stretch:
     for expected in (trace.before, trace.after):
         read = trace.ideal[rows] + trace.real[rows] - expected[rows]
         imu = Imu(truth.t_ns, np.ascontiguousarray(read[:, :3]), np.ascontiguousarray(read[:, 3:]))
-        sides.append(dead_reckon(imu, Start.of(truth)))
+        sides.append(dead_reckon(imu, StartPose.of(truth)))
     return Stretch(truth, *sides)
 
 

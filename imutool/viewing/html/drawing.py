@@ -16,8 +16,7 @@ import numpy as np
 from jaxtyping import Bool, Float64
 
 from imutool.errors import ConfigError
-from imutool.viewing.html.page import plain, text
-from imutool.viewing.html.theme import GRID, INK, LIGHT
+from imutool.viewing.html.page import GRID, INK, LIGHT, printable, text
 
 WIDTH_INCH = 11.5  # at the page's 1150 pixels a letter of 9 points is 12 pixels high
 HALF_INCH = 5.6  # two of these side by side, or one on a phone, where the letters are 9 pixels high
@@ -30,11 +29,11 @@ BUCKETS = 400  # of a line that is drawn at half width: its lowest and its highe
 
 # a colour that stands for each of the theme's while an SVG is drawn; none may be one of matplotlib's own
 VARIABLES = {f"#{3 * k + 1:02x}{3 * k + 2:02x}{3 * k + 3:02x}": name for k, name in enumerate(LIGHT)}
-PLACES = {f"imutool:{name}": color for color, name in VARIABLES.items()}
-SHOWN = {f"imutool:{name}": color for name, color in LIGHT.items()}
+PLACEHOLDER_COLORS = {f"imutool:{name}": color for color, name in VARIABLES.items()}
+LIGHT_COLORS = {f"imutool:{name}": color for name, color in LIGHT.items()}
 
 Line = Float64[np.ndarray, " n"]
-Thin = Float64[np.ndarray, " m"]  # of another length than what it was made of
+DecimatedLine = Float64[np.ndarray, " m"]  # of another length than what it was made of
 STYLE = {
     "font.size": 9,
     "axes.titlesize": 10,
@@ -90,7 +89,7 @@ def svg(draw: Callable[[Any], None], height_inch: float, name: str, *, width_inc
     Raises:
         ConfigError: matplotlib is not installed.
     """
-    with _inked(PLACES, name):
+    with _inked(PLACEHOLDER_COLORS, name):
         from matplotlib.backends.backend_svg import FigureCanvasSVG
         from matplotlib.figure import Figure
 
@@ -120,13 +119,13 @@ def png(picture: Picture, heading: str) -> bytes:
     rows = _rows(picture.panels)
     heights = [max(panel.height_inch for panel in row) for row in rows]
     columns = 2 if any(len(row) > 1 or row[0].wide for row in rows) else 1
-    with _inked(SHOWN, picture.name):
+    with _inked(LIGHT_COLORS, picture.name):
         from matplotlib.backends.backend_agg import FigureCanvasAgg
         from matplotlib.figure import Figure
 
         figure = Figure(figsize=(HALF_INCH * columns, sum(heights) + HEADING_INCH), dpi=DOTS_PER_INCH)
         FigureCanvasAgg(figure)
-        figure.suptitle(plain(heading), x=0.01, ha="left", fontsize=12, fontweight="bold")
+        figure.suptitle(printable(heading), x=0.01, ha="left", fontsize=12, fontweight="bold")
         parts = figure.subfigures(len(rows), 1, squeeze=False, height_ratios=heights)[:, 0]
         for part, row in zip(parts, rows, strict=True):
             alone = part.subfigures(1, 1 if row[0].wide else columns, squeeze=False)[0]
@@ -137,27 +136,27 @@ def png(picture: Picture, heading: str) -> bytes:
     return buffer.getvalue()
 
 
-def apart(drawn: str, prefix: str) -> str:
+def prefix_ids(drawn: str, prefix: str) -> str:
     """An `<svg>` element whose identifiers begin with a prefix: a page holds several, and `use` finds the first of a name."""
     return re.sub(r'(?<= id=")|(?<=href="#)|(?<=url\(#)', f"{prefix}-", drawn)
 
 
 def legend(figure: Any, artists: Sequence[Any]) -> None:
     """The artists' names in rows above everything: inside the axes they would cover a curve sooner or later."""
-    names = [short(str(artist.get_label())) for artist in artists]
+    names = [legend_name(str(artist.get_label())) for artist in artists]
     widths = [len(name) + HANDLE_LETTERS for name in names]
     columns = len(names) if sum(widths) <= LEGEND_LETTERS else max(1, min(len(names), LEGEND_LETTERS // max(widths)))
     figure.legend(artists, names, loc="outside upper left", ncols=columns, handlelength=1.6, fontsize=8.5)
 
 
-def short(name: str) -> str:
+def legend_name(name: str) -> str:
     """A name that fits a legend, and begins with no underscore, which matplotlib would take for a word to itself."""
-    name = plain(name).strip() or "?"
+    name = printable(name).strip() or "?"
     name = name if len(name) <= MOST_LETTERS else f"{name[: MOST_LETTERS - 1]}…"
     return f"\u200a{name}" if name.startswith("_") else name
 
 
-def extremes(t: Line, y: Line, buckets: int = BUCKETS) -> tuple[Thin, Thin]:
+def decimate_extremes(t: Line, y: Line, buckets: int = BUCKETS) -> tuple[DecimatedLine, DecimatedLine]:
     """A line of at most two points a bucket, the lowest and the highest sample of each in their order; gaps stay gaps."""
     if len(t) <= 2 * buckets:
         return t, y
@@ -172,15 +171,15 @@ def extremes(t: Line, y: Line, buckets: int = BUCKETS) -> tuple[Thin, Thin]:
     return t[keep], y[keep]
 
 
-def spans(t: Line, mask: Bool[np.ndarray, " n"]) -> list[tuple[float, float]]:
+def true_intervals(t: Line, mask: Bool[np.ndarray, " n"]) -> list[tuple[float, float]]:
     """Where a mask is true, as stretches of time."""
     turns = np.flatnonzero(np.diff(np.concatenate([[False], mask, [False]]).astype(int)))
     return [(float(t[first]), float(t[last - 1])) for first, last in zip(turns[::2], turns[1::2], strict=True)]
 
 
-def averaged(
+def average_log_bins(
     frequency_hz: Line, power: Float64[np.ndarray, " n *k"], lowest_hz: float
-) -> tuple[Thin, Float64[np.ndarray, " m *k"]]:
+) -> tuple[DecimatedLine, Float64[np.ndarray, " m *k"]]:
     """A spectrum whose neighbours are averaged, forty points a decade above `lowest_hz`.
 
     Further up than there is room for, a line of noise would otherwise be as broad as it is high.
@@ -192,7 +191,7 @@ def averaged(
     return np.add.reduceat(frequency_hz, starts) / count, sums / count.reshape(-1, *[1] * (power.ndim - 1))
 
 
-def plain_numbers(*rulers: Any) -> None:
+def plain_tick_labels(*rulers: Any) -> None:
     """Numbers along logarithmic axes as people write them, at the decades alone."""
     from matplotlib.ticker import FuncFormatter, NullFormatter
 
@@ -201,7 +200,7 @@ def plain_numbers(*rulers: Any) -> None:
         ruler.set_minor_formatter(NullFormatter())
 
 
-def library() -> Any:
+def require_matplotlib() -> Any:
     """matplotlib, imported when first asked for.
 
     Raises:
@@ -219,7 +218,7 @@ def library() -> Any:
 @contextmanager
 def _inked(colors: Mapping[str, str], salt: str) -> Iterator[None]:
     """Our style, and our names for colours, for as long as something is drawn; they are no one's else afterwards."""
-    matplotlib = library()
+    matplotlib = require_matplotlib()
     known = matplotlib.colors.get_named_colors_mapping()
     with _drawing, warnings.catch_warnings():  # letters that this font lacks are the browser's to draw
         warnings.filterwarnings("ignore", message="Glyph .* missing from")

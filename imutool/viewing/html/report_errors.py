@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from functools import partial
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float64, Int64
 
-from imutool.viewing.html.drawing import Panel, Picture, Thin, extremes, legend, plain_numbers
+from imutool.viewing.html.drawing import DecimatedLine, Panel, Picture, decimate_extremes, legend, plain_tick_labels
+from imutool.viewing.html.page import AFTER, BEFORE, HELD, INK, MARK, text
 from imutool.viewing.html.report_paths import color_of
-from imutool.viewing.html.report_wording import aligned
-from imutool.viewing.html.theme import INK
+from imutool.viewing.html.report_wording import alignment_text, format_number
+from imutool.viewing.model.events import KINDS, Event
 from imutool.viewing.model.run_data import RunData, Trace
 from imutool.viewing.model.trajectory_error import Drift
 
@@ -24,7 +25,7 @@ HEIGHTS_INCH = {1: 2.6, 3: 5.6, 4: 5.6}  # of one and of several rows: what stan
 Line = Float64[np.ndarray, " n"]
 
 
-def errors(data: RunData) -> Picture | None:
+def error_curves(data: RunData) -> Picture | None:
     """Orientation (total, roll, pitch, yaw) and position (total, horizontal, vertical); nothing without truth."""
     scored = [trace for trace in data.traces if trace.errors is not None]
     if not scored:
@@ -46,10 +47,10 @@ def errors(data: RunData) -> Picture | None:
     signed = [values for rows in (turned, moved) for name, values in rows.items() if name not in ("total", "horizontal")]
     out = any(_leaving(values) for values in signed)
     note = " Where an error with a sign is far larger than the others', it leaves its panel; the total shows all of it." * out
-    return Picture("errors", "Errors over time", f"Integrated from the true start, {aligned(data)}.{note}", panels)
+    return Picture("errors", "Errors over time", f"Integrated from the true start, {alignment_text(data)}.{note}", panels)
 
 
-def drift(data: RunData) -> Picture | None:
+def drift_curves(data: RunData) -> Picture | None:
     """Orientation and position since integration was last set to the truth; nothing where that was not computed."""
     with_drift = [(trace, trace.drift) for trace in data.traces if trace.drift is not None]
     if not with_drift:
@@ -73,7 +74,7 @@ def _resets(drift: Drift) -> Int64[np.ndarray, " k"]:
     return np.flatnonzero(np.diff(drift.since_s, prepend=np.inf) <= 0.0)
 
 
-def _largest(drift: Drift, t: Line, turned: Line, moved: Line) -> tuple[Thin, Thin, Thin]:
+def _largest(drift: Drift, t: Line, turned: Line, moved: Line) -> tuple[DecimatedLine, DecimatedLine, DecimatedLine]:
     """The largest of each stretch between resets, at its beginning."""
     starts = _resets(drift)
     return t[starts], np.fmax.reduceat(turned, starts), np.fmax.reduceat(moved, starts)
@@ -109,7 +110,9 @@ def _draw(
         for trace, t, error in zip(scored, times, values, strict=True):
             shown = np.where(error > 0.0, error, np.nan) if log else error  # the start is exact, which a logarithm cannot show
             label = f"{trace.name}: {title.lower()}, {name}" if axes is not panels[0] else trace.name
-            line = axes.plot(*extremes(t, shown), color=color_of(data, trace), lw=0.9 if trace.is_raw else 1.3, label=label)
+            line = axes.plot(
+                *decimate_extremes(t, shown), color=color_of(data, trace), lw=0.9 if trace.is_raw else 1.3, label=label
+            )
             lines += line if axes is panels[0] else []
         _limits(axes, values, signed=signed, log=log)
         axes.set_ylabel(f"{name} ({unit})" if len(rows) > 1 else f"{title.lower()} ({unit})")
@@ -124,7 +127,7 @@ def _limits(axes: Any, values: Sequence[Line], *, signed: bool, log: bool) -> No
     tops = [float(np.nanmax(np.abs(one))) for one in values if np.isfinite(one).any()]
     if log:
         axes.set_yscale("log")
-        plain_numbers(axes.yaxis)
+        plain_tick_labels(axes.yaxis)
         axes.set_ylim(min(tops) * 10.0**-DECADES, max(tops) * 2.0)
     elif signed:
         axes.axhline(0.0, color=INK, lw=0.6)
@@ -143,3 +146,70 @@ def _apart(values: Sequence[Line]) -> bool:
 
 def _leaving(values: Sequence[Line]) -> bool:
     return _apart([np.abs(one) for one in values])
+
+
+MOST_ROWS = 40
+LEAST_SHARE = 0.002  # of the time, so that one sample in an hour is seen
+LANE_INCH, EDGES_INCH = 0.24, 0.75
+HARMLESS = {"stop": HELD, "finding": AFTER, "worst": BEFORE}
+
+
+def event_lanes(data: RunData) -> Picture | None:
+    """A lane for each kind of event that there is; nothing where nothing happened."""
+    kinds = [kind for kind in KINDS if any(event.kind == kind for event in data.events)]
+    if not kinds:
+        return None
+    height = EDGES_INCH + LANE_INCH * len(kinds)
+    panel = Panel(
+        partial(_draw_lanes, data=data, kinds=kinds),
+        height,
+        f"Events over time: {', '.join(map(event_label, kinds))}",
+        wide=True,
+    )
+    return Picture("events", "Events", "", (panel,))
+
+
+def event_table(data: RunData) -> Iterator[str]:
+    """The first events of each kind in words, in the order of time; how many more there are is said."""
+    shown = sorted(_first(data.events), key=lambda event: event.start_ns)
+    yield '<div class="scroll"><table><thead><tr><th>From (s)</th><th>For</th><th>What</th><th></th></tr></thead><tbody>'
+    for event in shown:
+        start_s, seconds = (event.start_ns - data.start_ns) * 1e-9, (event.end_ns - event.start_ns) * 1e-9
+        length = f"{format_number(seconds)} s" if seconds > 0.0 else "a moment"
+        yield (
+            f"<tr><td class=number>{start_s:.3f}</td><td class=number>{length}</td>"
+            f"<td class=entry>{event_label(event.kind)}</td><td>{text(event.text)}</td></tr>"
+        )
+    yield "</tbody></table></div>"
+    if len(shown) < len(data.events):
+        yield f'<p class="note">{len(data.events) - len(shown):,} more are drawn above and not listed.</p>'
+
+
+def event_label(kind: str) -> str:
+    """A kind of event in words."""
+    return {"worst": "worst error"}.get(kind, kind.replace("_", " "))
+
+
+def _first(events: Sequence[Event]) -> list[Event]:
+    """As many as there is room for, of every kind the same number."""
+    kinds = {event.kind for event in events}
+    share = max(1, MOST_ROWS // max(len(kinds), 1))
+    return [event for kind in kinds for event in [one for one in events if one.kind == kind][:share]]
+
+
+def _draw_lanes(figure: Any, *, data: RunData, kinds: Sequence[str]) -> None:
+    axes = figure.subplots()
+    least = LEAST_SHARE * data.duration_s
+    for lane, kind in enumerate(kinds):
+        bars = []
+        for event in data.events:
+            if event.kind == kind:
+                first, length = (event.start_ns - data.start_ns) * 1e-9, (event.end_ns - event.start_ns) * 1e-9
+                bars.append((min(first, data.duration_s - least), max(length, least)))
+        axes.broken_barh(
+            bars, (-lane - 0.4, 0.8), color=HARMLESS.get(kind, MARK), lw=0, label=f"{event_label(kind)}: {len(bars)}"
+        )
+    axes.set_yticks([-lane for lane in range(len(kinds))], [event_label(kind) for kind in kinds])
+    axes.tick_params(axis="y", length=0)
+    axes.set(xlim=(0.0, data.duration_s), ylim=(-len(kinds) + 0.4, 0.6), xlabel="time (s)")
+    axes.grid(visible=False, axis="y")

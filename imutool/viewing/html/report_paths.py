@@ -12,10 +12,10 @@ from jaxtyping import Float64
 from imutool.recording import Poses
 from imutool.units import AXES
 from imutool.viewing.html.drawing import Panel, Picture, legend
-from imutool.viewing.html.report_wording import best, measure, spoken
-from imutool.viewing.html.theme import BEFORE, HELD, INK, LEVELS, MODELS
+from imutool.viewing.html.page import BEFORE, HELD, INK, LEVELS, MODELS
+from imutool.viewing.html.report_wording import best_run, format_quantity, run_name
 from imutool.viewing.model.decimate import path_rows
-from imutool.viewing.model.run_data import RunData, Trace, stretches
+from imutool.viewing.model.run_data import RunData, Trace, split_at_gaps
 
 HEIGHT_INCH = 4.3
 MOST_POINTS = 1500  # of a path
@@ -50,13 +50,13 @@ def paths(data: RunData) -> Picture:
     told = ["Circle: start" if data.truth is None else "Circle: start; square: end of the truth"]
     for trace in far:
         out_of = "the first two pictures" if models and not trace.is_raw else "every picture" if models else "the picture"
-        told.append(f"{spoken(trace)} leaves {out_of} and ends {measure(_end_m(data, trace), 'm')} from the {start}")
+        told.append(f"{run_name(trace)} leaves {out_of} and ends {format_quantity(_end_m(data, trace), 'm')} from the {start}")
     return Picture("paths", "Paths", f"{'. '.join(told)}.", panels)
 
 
-def heat(data: RunData) -> Picture | None:
+def error_map(data: RunData) -> Picture | None:
     """The best run's path coloured by its error in position and in orientation; nothing without truth."""
-    trace = best(data)
+    trace = best_run(data)
     if trace is None or trace.errors is None or data.truth is None:
         return None
     fits = trace in _near(data)[0]
@@ -64,11 +64,11 @@ def heat(data: RunData) -> Picture | None:
     kinds = {"Position": (trace.errors.position_total_m, "m"), "Orientation": (trace.errors.orientation_total_deg, "°")}
     panels = []
     for kind, (error, unit) in kinds.items():
-        title = f"{kind} error, at most {measure(float(np.nanmax(error)), unit)}"
+        title = f"{kind} error, at most {format_quantity(float(np.nanmax(error)), unit)}"
         draw = partial(_draw_heat, points=points, error=error, title=title, unit=unit)
         panels.append(Panel(draw, HEIGHT_INCH, f"{kind} error of {trace.name} along the path from above, in colours"))
-    whose = f"Path of {spoken(trace)}" if fits else "The true path"
-    caption = f"{whose} from above, coloured by the error that {spoken(trace)} has there."
+    whose = f"Path of {run_name(trace)}" if fits else "The true path"
+    caption = f"{whose} from above, coloured by the error that {run_name(trace)} has there."
     return Picture("error-map", "Where the error grows", caption, tuple(panels))
 
 
@@ -137,7 +137,7 @@ def _pieces(points: Points, here: Any) -> tuple[Any, Any]:
 
 def _broken(poses: Poses) -> Points:
     """A path as one line that is broken where poses are missing."""
-    parts = stretches(poses)
+    parts = split_at_gaps(poses)
     share = max(2, MOST_POINTS // max(len(parts), 1))
     hole = np.full((1, 3), np.nan)
     rows = [piece for part in parts for piece in (part.p_wb[path_rows(part.p_wb, share)], hole)][:-1]

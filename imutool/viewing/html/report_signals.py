@@ -14,10 +14,10 @@ from imutool.inertial import stationary
 from imutool.noise import allan
 from imutool.recording import Imu
 from imutool.units import AXES, UNITS
-from imutool.viewing.html.drawing import Panel, Picture, averaged, extremes, legend, plain_numbers
+from imutool.viewing.html.drawing import Panel, Picture, average_log_bins, decimate_extremes, legend, plain_tick_labels
+from imutool.viewing.html.page import AXIS_COLORS, INK, TITLES
 from imutool.viewing.html.report_paths import color_of
-from imutool.viewing.html.report_wording import best, number, spoken, worst
-from imutool.viewing.html.theme import AXIS_COLORS, INK, TITLES
+from imutool.viewing.html.report_wording import best_run, format_number, run_name, worst_orientation_error
 from imutool.viewing.model.run_data import RunData, Trace
 
 SENSORS = ("gyro", "accel")
@@ -39,13 +39,13 @@ def signals(data: RunData) -> Picture:
 
 def zoom(data: RunData) -> Picture | None:
     """The seconds around the largest orientation error of the best model; nothing without truth or model."""
-    chosen = best(data)
-    found = None if chosen is None or chosen.is_raw else worst(chosen, data)
+    chosen = best_run(data)
+    found = None if chosen is None or chosen.is_raw else worst_orientation_error(chosen, data)
     if found is None or data.duration_s <= 2.0 * ZOOM_S:
         return None
     assert chosen is not None, "then nothing was found"
     first = min(max(found[1] - ZOOM_S / 2.0, 0.0), data.duration_s - ZOOM_S)
-    caption = f"Every sample of {ZOOM_S:g} s around the largest orientation error of {spoken(chosen)}."
+    caption = f"Every sample of {ZOOM_S:g} s around the largest orientation error of {run_name(chosen)}."
     return _samples(data, "zoom", "Signals where the error is largest", caption, (first, first + ZOOM_S))
 
 
@@ -80,7 +80,7 @@ def spectrum(data: RunData) -> Picture | None:
     return Picture("spectrum", "Spectra", "Amplitude density of the samples (Welch), up to half their rate.", tuple(panels))
 
 
-def at_rest(data: RunData) -> Picture | None:
+def allan_deviation(data: RunData) -> Picture | None:
     """Allan deviations, raw and corrected, over the time in which the log rests.
 
     Nothing where it does not rest for long, or where allantools is not installed (`left_out` says so).
@@ -88,7 +88,7 @@ def at_rest(data: RunData) -> Picture | None:
     if find_spec("allantools") is None:
         return None
     imu = data.traces[0].run.imu
-    ranges = [(a, b) for a, b in stationary.stretches(imu) if (b - a) * imu.period_s >= LEAST_REST_S]
+    ranges = [(a, b) for a, b in stationary.rest_stretches(imu) if (b - a) * imu.period_s >= LEAST_REST_S]
     if not ranges:
         return None
     rest_s = sum(b - a for a, b in ranges) * imu.period_s
@@ -102,11 +102,11 @@ def at_rest(data: RunData) -> Picture | None:
         Panel(partial(_draw_allan, data=data, sensor=one, curves=curves[one]), HEIGHT_INCH, f"{TITLES[one]} Allan deviation")
         for one in SENSORS
     ]
-    caption = f"Over {number(rest_s)} s at rest in {len(ranges)} stretch{'es' * (len(ranges) > 1)}; overlapping."
+    caption = f"Over {format_number(rest_s)} s at rest in {len(ranges)} stretch{'es' * (len(ranges) > 1)}; overlapping."
     return Picture("allan", "Allan deviation at rest", caption, tuple(panels))
 
 
-def left_out() -> list[str]:
+def missing_pictures() -> list[str]:
     """Sentences about pictures that there could be if more were installed."""
     if find_spec("allantools") is not None:
         return []
@@ -180,7 +180,7 @@ def _draw_spectrum(figure: Any, *, data: RunData, sensor: str, curves: Sequence[
     panels = _by_axis(figure, sensor, f"{NOUNS[sensor]} ({UNITS[sensor]}/√Hz)", "")
     lines = []
     for trace, frequency_hz, density in curves:
-        at, power = averaged(frequency_hz, density, frequency_hz[0])
+        at, power = average_log_bins(frequency_hz, density, frequency_hz[0])
         drawn = [_log_line(axes, at, np.sqrt(power[:, k]), data, trace, k) for k, axes in enumerate(panels)]
         lines.append(drawn[0])
     _decades(panels)
@@ -200,7 +200,7 @@ def _draw_allan(figure: Any, *, data: RunData, sensor: str, curves: Sequence[Any
 
 
 def _line(axes: Any, t: Any, y: Any, name: str, axis: int, style: Mapping[str, Any]) -> Any:
-    return axes.plot(*extremes(t, y), label=name if axis == 0 else f"{name}, {AXES[axis]}", **style)[0]
+    return axes.plot(*decimate_extremes(t, y), label=name if axis == 0 else f"{name}, {AXES[axis]}", **style)[0]
 
 
 def _log_line(axes: Any, x: Any, y: Any, data: RunData, trace: Trace, axis: int) -> Any:
@@ -218,7 +218,7 @@ def _decades(panels: Sequence[Any]) -> None:
         axes.set_yscale("log")
         low, high = axes.get_ylim()
         axes.set_ylim(10.0 ** np.floor(np.log10(low)), 10.0 ** np.ceil(np.log10(high)))
-        plain_numbers(axes.xaxis, axes.yaxis)
+        plain_tick_labels(axes.xaxis, axes.yaxis)
 
 
 def _both(imu: Imu) -> dict[str, Vectors]:
