@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float64
 from scipy.interpolate import BSpline
 
 from imutool.diagnosis.estimation.timestamps import LEAST_DIGITS, grid
-from imutool.diagnosis.locate import regime
+from imutool.diagnosis.localization import regime
 from imutool.diagnosis.result import Curve as ToldCurve
 from imutool.diagnosis.result import Estimate, Finding, HeldOut, Kind, Located, SignalTraces, Unexplained
 from imutool.diagnosis.scalar import effects, fit
