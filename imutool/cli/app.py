@@ -82,6 +82,8 @@ def listing(group: str, option: str) -> type[TyperCommand]:
     """A command whose help also lists what can be named, found (and nothing of it imported) when help is asked for."""
 
     class Listing(Command):
+        values = (group, option)  # for the documentation
+
         def format_help(self, ctx: Any, formatter: Any) -> None:
             lines = [f"[bold]{name}[/]  {plain(registry.summary(group, name))}" for name in registry.names(group)]
             self.epilog = "\n\n".join([f"Values of {option}:", *lines, self.epilog or ""])

@@ -16,7 +16,7 @@ from jaxtyping import Bool, Float64
 from scipy.ndimage import uniform_filter1d
 from scipy.stats import chi2, mannwhitneyu
 
-from imutool.diagnosis.estimation.alignment import Pair
+from imutool.diagnosis.estimation.aligned_log import Pair
 from imutool.diagnosis.result import Finding, Located
 from imutool.units import AXES, SENSORS
 
@@ -139,7 +139,7 @@ def locate(
             Located(
                 sensor,
                 tuple(AXES[a] for a in axes),
-                tuple(_intervals(float(t_s[0]) + WINDOW_S * seconds[inside])),
+                tuple(intervals(float(t_s[0]) + WINDOW_S * seconds[inside])),
                 regime(inside, power, window, variables),
                 float(power[inside].sum() / max(power.sum(), 1e-300)),
                 p_values.get(sensor, float(chi2.sf(axes_power.sum(), 3))),
@@ -148,8 +148,8 @@ def locate(
     return sorted(found, key=lambda place: place.p_value)
 
 
-def _intervals(begins_s: Float64[np.ndarray, " w"]) -> list[tuple[float, float]]:
-    """Intervals of windows, by where each begins; those close to one another are joined."""
+def intervals(begins_s: Float64[np.ndarray, " w"]) -> list[tuple[float, float]]:
+    """Intervals of windows, by where each begins; neighbours are joined."""
     out: list[tuple[float, float]] = []
     for begin in begins_s.tolist():
         if out and begin - out[-1][1] < JOIN_S - WINDOW_S:

@@ -1,10 +1,10 @@
-"""physics.toml: which effects act on a sensor and how large they are, as `diagnose` finds them and `simulate` takes them.
+"""physics.toml: effects on a sensor and their sizes, as `diagnose` writes them and `simulate` reads them.
 
 ::
 
     [[effect]]
     name = "lever_arm"                 # of the catalogue, or "driven"
-    signal = "accel"                   # where it was seen; it acts wherever it acts
+    signal = "accel"                   # where it was seen
     [effect.parameters.x]
     value = 0.213
     std = 0.004                        # may be left out
@@ -61,7 +61,7 @@ Known = Callable[[Sequence[str]], tuple[Effect, ...]]
 
 
 class Value(Settings, frozen=True, kw_only=True):
-    """A parameter, its standard deviation where that is known, and its unit."""
+    """Value of a parameter, its standard deviation where that is known, and its unit."""
 
     value: float
     std: NotNegative | None = None
@@ -69,7 +69,7 @@ class Value(Settings, frozen=True, kw_only=True):
 
 
 class Entry(Settings, frozen=True, kw_only=True):
-    """An effect by name; `signal` says where it was seen, `driver` the channel that drives what is `driven`."""
+    """Effect by name; `signal` says where it was seen, `driver` is the channel behind a `driven` one."""
 
     name: str
     signal: Literal["gyro", "accel", "both", ""] = ""
@@ -79,14 +79,14 @@ class Entry(Settings, frozen=True, kw_only=True):
 
 
 class Bias(Settings, frozen=True, kw_only=True):
-    """A constant: rad/s, m/s²."""
+    """Constant bias (rad/s, m/s²)."""
 
     gyro: Three = (0.0, 0.0, 0.0)
     accel: Three = (0.0, 0.0, 0.0)
 
 
 class Curve(Settings, frozen=True, kw_only=True):
-    """What is added to the axes of a signal as a curve of one variable; `band` is one standard deviation."""
+    """Curve of one variable, added to the axes of a signal; `band` is one standard deviation."""
 
     signal: Sensor
     variable: str
@@ -97,7 +97,7 @@ class Curve(Settings, frozen=True, kw_only=True):
 
 
 class Term(Settings, frozen=True, kw_only=True):
-    """What is added to the axes of a signal as so many times a product of signals."""
+    """Product of variables, added to the axes of a signal so many times."""
 
     signal: Sensor
     term: str
@@ -106,7 +106,7 @@ class Term(Settings, frozen=True, kw_only=True):
 
 
 class PhysicsFile(Settings, frozen=True, kw_only=True):
-    """Everything that a physics.toml says."""
+    """Contents of a physics.toml."""
 
     schema: Literal["imutool.physics/1"] = "imutool.physics/1"
     effect: tuple[Entry, ...] = ()
@@ -115,7 +115,7 @@ class PhysicsFile(Settings, frozen=True, kw_only=True):
     term: tuple[Term, ...] = ()
 
     def acting(self, where: str | Path = "physics", known: Known = catalogue.effects) -> list[tuple[Effect, Theta]]:
-        """The effects as they act, each with its parameters; `known` finds them by name.
+        """Effects with their parameters; `known` finds them by name.
 
         Raises:
             ConfigError: an unknown effect, parameter, unit, signal, variable or term (the nearest is named), or a wrong value.
@@ -135,7 +135,7 @@ class PhysicsFile(Settings, frozen=True, kw_only=True):
 
 
 def read(path: Path) -> PhysicsFile:
-    """What a physics.toml says, checked but for the names, which `acting` looks up.
+    """Read and check a physics.toml; `acting` looks up its names.
 
     Raises:
         ConfigError: no such file, no TOML, an unknown or missing key, a wrong type, a number that is not finite.
@@ -156,7 +156,7 @@ def read(path: Path) -> PhysicsFile:
 
 
 def write(file: PhysicsFile, path: Path, *, overwrite: bool = False) -> None:
-    """Writes a physics.toml, which `read` gives back bit for bit.
+    """Write a physics.toml, which `read` gives back bit for bit.
 
     Raises:
         ConfigError: the file exists (without `overwrite`), or cannot be written.
@@ -166,7 +166,7 @@ def write(file: PhysicsFile, path: Path, *, overwrite: bool = False) -> None:
 
 
 def to_toml(file: PhysicsFile) -> str:
-    """The text of the file."""
+    """Text of the file."""
     lines = ["# Physics of an IMU, as `imutool simulate --physics FILE` takes it", f"schema = {_text(file.schema)}"]
     for entry in file.effect:
         lines += ["", "[[effect]]", f"name = {_text(entry.name)}"]
@@ -192,7 +192,7 @@ def to_toml(file: PhysicsFile) -> str:
 
 
 def _text(text: str) -> str:
-    """A string of TOML, which escapes as JSON does but for one control character."""
+    """String of TOML, which escapes as JSON does but for one control character."""
     return json.dumps(text, ensure_ascii=False).replace("\x7f", "\\u007f")
 
 
@@ -205,7 +205,7 @@ def _row(values: Sequence[float]) -> str:
 
 
 def _refuse_infinite(value: Any, where: Path, place: str = "") -> None:
-    """As `config.build`, with the place in a list."""
+    """Refuse numbers that are not finite, and name their place."""
     if isinstance(value, float) and not np.isfinite(value):
         raise ConfigError(f"{place} is {value}", where=where, expected="a finite number")
     if isinstance(value, dict):
@@ -228,7 +228,7 @@ def _named(name: str, known: Known, where: str | Path, place: str) -> Effect:
 
 
 def _theta(entry: Entry, effect: Effect, where: str | Path, place: str) -> Theta:
-    """The parameters in the effect's own order."""
+    """Parameters in the effect's own order."""
     if entry.signal not in ("", "both", *effect.sensors):
         listed = " or ".join(effect.sensors)
         raise ConfigError(f"{place}.signal is {entry.signal}: {entry.name} does not act there", where=where, expected=listed)
@@ -281,6 +281,6 @@ def _term(term: Term, k: int, where: str | Path) -> Effect:
 
 
 def plain(file: PhysicsFile) -> dict[str, Any]:
-    """The file as plain JSON values."""
+    """The file as JSON values."""
     values: dict[str, Any] = msgspec.to_builtins(file)
     return values

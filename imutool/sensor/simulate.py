@@ -1,7 +1,7 @@
-"""A simulated recording: an IMU along any trajectory with poses, with the effects of a physics.toml and a sensor's noise.
+"""Simulation of an IMU along any log with poses, with the effects of a physics.toml and a sensor's noise.
 
-Poses become a smooth motion (`motion`), the motion what an ideal IMU feels, the effects act on that in the order of their
-stages (`effects._forward`), noise joins behind the sensor and before its converter; the log holds the samples beside the truth.
+Poses become a smooth motion (`trajectory`), the motion ideal signals, the effects act on these in the order of their stages
+(`effect`). Noise is added behind the sensor and before its converter; the log holds the samples and the truth.
 White noise has standard deviation density * sqrt(rate), the bias walks by walk * sqrt(dt) a sample from zero (IEEE 952);
 the instability of a data sheet, a floor of the Allan deviation, is not simulated beside a walk.
 """
@@ -35,8 +35,8 @@ SCHEMA = "imutool.simulation/1"
 RATE_HZ = 200.0  # of a trajectory without an IMU
 SLOWEST_HZ, FASTEST_HZ = 10.0, 4000.0
 LEAST_S = 2.0  # of trusted motion
-MOTION_HZ = 400.0  # of the motion's clock, at least: filters and shifts act on it before samples are taken
-MOTION_TOPIC = "/motion/pose"  # the exact motion of the samples, beside the truth that it was smoothed from
+MOTION_HZ = 400.0  # of the motion's clock, at least: filters and shifts act there before samples are taken
+MOTION_TOPIC = "/motion/pose"  # the exact motion of the samples; the truth that it was smoothed from is copied
 TRUTH_TOPIC = "/ground_truth/pose"
 NOISE = "~noise"  # within the stage SENSOR effects act by name: behind all, and before the converter
 
@@ -45,7 +45,7 @@ Progress = Callable[[int, int, str], None]
 
 @dataclass(frozen=True, eq=False)
 class Simulation:
-    """The recording, the motion it was made from, and what was done."""
+    """Simulated recording, its smooth motion, settings and remarks."""
 
     recording: Recording
     motion: SmoothMotion
@@ -53,18 +53,18 @@ class Simulation:
     remarks: tuple[str, ...]
 
     def plain(self) -> dict[str, Any]:
-        """As JSON."""
+        """The report as JSON values."""
         motion = self.motion
         return {
             "schema": SCHEMA,
             **self.settings,
             "samples": len(self.recording.imu),
             "duration_s": motion.duration_s,
-            "stretches_s": [[one.start_s, one.end_s] for one in motion.stretches],
+            "stretches_s": [[part.start_s, part.end_s] for part in motion.stretches],
             "motion": {
-                "pose_noise_m": [one.noise_m for one in motion.stretches],
-                "pose_noise_rad": [one.noise_rad for one in motion.stretches],
-                "cutoff_hz": [list(one.cutoff_hz) for one in motion.stretches],
+                "pose_noise_m": [part.noise_m for part in motion.stretches],
+                "pose_noise_rad": [part.noise_rad for part in motion.stretches],
+                "cutoff_hz": [list(part.cutoff_hz) for part in motion.stretches],
                 "gyro_std_rad_s": motion.gyro_std,
                 "accel_std_m_s2": motion.accel_std,
                 "glitches": motion.glitches,
@@ -86,7 +86,7 @@ def simulate(
     overwrite: bool = False,
     progress: Progress | None = None,
 ) -> Simulation:
-    """Simulates an IMU along the poses of a log and writes the log `out`; see `simulated`.
+    """Simulate an IMU along the poses of a log and write the log `out`; see `simulated`.
 
     `physics` is a physics.toml, `noise` a data sheet's name or a TOML file. Without `rate_hz` the rate is that of the log's own
     first IMU, 200 Hz where it has none.
@@ -96,21 +96,21 @@ def simulate(
         LogError: the log has no poses, or is damaged.
         DataError: less than 2 s of the motion can be trusted, or an effect lacks a channel.
     """
-    tell = progress or (lambda done, total, word: None)
+    report = progress or (lambda done, total, word: None)
     file = PhysicsFile() if physics is None else physics_file.read(physics)
     acting = file.acting(where=physics or "physics")
     sheet = noises.read(noise)
     if out.exists() and out.samefile(trajectory):
         raise ConfigError("is the trajectory itself", where=out, expected="another OUT")
-    tell(0, 4, "reading")
+    report(0, 4, "reading")
     source = _source(trajectory, truth)
     own_rate = 1.0 / source.imu.period_s if len(source.imu) > 1 else RATE_HZ
-    tell(1, 4, "smoothing")
+    report(1, 4, "smoothing")
     try:
         found = simulated(source, acting, sheet, _rounded(own_rate) if rate_hz is None else rate_hz, seed)
     except ImutoolError as error:
         raise error.at(trajectory) from error
-    tell(2, 4, "writing")
+    report(2, 4, "writing")
     asked = {
         "command": "simulate",
         "trajectory": trajectory.name,
@@ -122,15 +122,16 @@ def simulate(
     texts = {key: value if isinstance(value, str) else json.dumps(value, ensure_ascii=False) for key, value in asked.items()}
     recording = replace(found.recording, name=out.stem, metadata={**source.metadata, "imutool": texts})
     write(recording, out, overwrite=overwrite)
-    tell(4, 4, "")
+    report(4, 4, "")
     return replace(found, recording=recording, settings=asked | {"output": str(out)})
 
 
 def simulated(source: Recording, acting: Acting, noise: noises.Noise, rate_hz: float, seed: int) -> Simulation:
-    """An IMU along the (first) true poses of a recording: samples on a regular clock over every trusted stretch of the motion.
+    """Simulated IMU along the (first) true poses of a recording, on a regular clock.
 
-    Stamps are whole periods after the first pose, on the clock of the poses. Samples that an effect of the clock takes outside
-    a stretch are left out. The true poses in a stretch are copied as they are; `/motion/pose` holds the motion itself.
+    Samples cover every trusted stretch. Stamps are whole periods after the first pose, on the poses' clock. Samples that an
+    effect of the clock takes outside a stretch are left out. The true poses in a stretch are copied as they are;
+    `/motion/pose` holds the motion itself.
 
     Raises:
         ConfigError: the rate or the seed.
@@ -149,7 +150,7 @@ def simulated(source: Recording, acting: Acting, noise: noises.Noise, rate_hz: f
         )
     remarks = _remarks(motion, source.truth, noise)
     ideals = motion.ideal_motions(rate_hz * max(1, int(np.ceil(MOTION_HZ / rate_hz))))
-    needed = any(physics.needs or physics.name == DRIVEN for physics, _ in acting)
+    needed = any(effect.needs or effect.name == DRIVEN for effect, _ in acting)
     if needed:
         ideals = [replace(ideal, channels=channels_at(source, ideal.t_s, motion.start_ns)) for ideal in ideals]
     stamps = [_stamps(ideal, rate_hz) for ideal in ideals]
@@ -175,13 +176,13 @@ def simulated(source: Recording, acting: Acting, noise: noises.Noise, rate_hz: f
 
 
 def _stamps(ideal: IdealMotion, rate_hz: float) -> Float64[np.ndarray, " m"]:
-    """Whole periods since the first pose, within a stretch."""
+    """Stamps of whole periods since the first pose, within a stretch."""
     first, last = np.ceil(ideal.t_s[0] * rate_hz - 1e-6), np.floor(ideal.t_s[-1] * rate_hz + 1e-6)
     return np.asarray(np.arange(first, last + 1.0) / rate_hz)
 
 
 def _exact(motion: SmoothMotion, ideals: Sequence[IdealMotion], stamps: Sequence[Float64[np.ndarray, " _"]]) -> Poses:
-    """The motion at the samples, with its velocity."""
+    """Poses of the motion at the samples, with velocity."""
     parts = []
     for stretch in motion.stretches:
         own = [s for s, ideal in zip(stamps, ideals, strict=True) if stretch.start_s <= ideal.t_s[0] <= stretch.end_s]
@@ -200,42 +201,42 @@ def _nanoseconds(motion: SmoothMotion, stamp_s: Float64[np.ndarray, " m"]) -> In
 
 
 def _noise(noise: noises.Noise, rate_hz: float, seed: int) -> Effect:
-    """White noise and a walking bias as an effect; what is not known is not added. Each kind has random numbers of its own."""
+    """Effect of white noise and a walking bias; unknown densities count as zero. Each kind draws from its own stream."""
     known = {name: np.nan_to_num(noise.values(name)) for name in noises.UNITS}
 
-    def forward(read: SensorSamples, _: Theta) -> SensorSamples:
-        dt = np.diff(read.stamp_s, prepend=read.stamp_s[0])[:, None]  # a walk goes on in a hole
+    def forward(samples: SensorSamples, _: Theta) -> SensorSamples:
+        dt = np.diff(samples.stamp_s, prepend=samples.stamp_s[0])[:, None]  # a walk goes on in a hole
         out = []
-        for k, (name, values) in enumerate((("gyro", read.gyro), ("accel", read.accel))):
+        for k, (name, values) in enumerate((("gyro", samples.gyro), ("accel", samples.accel))):
             white, walk = (np.random.default_rng([seed, k, kind]).normal(size=values.shape) for kind in (0, 1))
             bias = np.cumsum(known[f"{name}_walk"] * np.sqrt(np.abs(dt)) * walk, axis=0)
             out.append(values + known[f"{name}_density"] * np.sqrt(rate_hz) * white + bias)
-        return read.with_readings(*out)
+        return samples.with_readings(*out)
 
     return Effect(NOISE, Stage.SENSOR, ("gyro", "accel"), "+ n + b(t)", (), "always", forward)
 
 
 def _remarks(motion: SmoothMotion, poses: Poses, noise: noises.Noise) -> tuple[str, ...]:
-    said = []
+    remarks = []
     left_out = poses.duration_s - motion.duration_s
     if left_out > 0.05 * poses.duration_s:
-        said.append(
+        remarks.append(
             f"{left_out:.1f} s of {poses.duration_s:.1f} s are left out: holes and glitches of the poses, and their ends"
         )
     kinds = [name for name in noises.UNITS if "instability" not in name]
     if lacking := [name for name in kinds if np.isnan(noise.values(name)).any()]:
-        said.append(f"{', '.join(lacking)} not known in the noise file, and not simulated")
-    return tuple(said)
+        remarks.append(f"{', '.join(lacking)} not known in the noise file, and not simulated")
+    return tuple(remarks)
 
 
 def _rounded(rate_hz: float) -> float:
-    """A measured rate to a tenth of a per cent: a clock of 200.0016 Hz is one of 200."""
+    """Measured rate, rounded where that changes less than a tenth of a per cent: 200.0016 Hz is 200."""
     whole = round(rate_hz)
     return float(whole) if whole and abs(rate_hz / whole - 1.0) < 1e-3 else rate_hz
 
 
 def _source(path: Path, truth: str | None) -> Recording:
-    """The log with its poses; one without an IMU gets an empty one."""
+    """Recording of a log with poses; without an IMU, an empty one stands in."""
     with Log(path) as log:
         imus = log.imu_topics
         if not imus:
@@ -247,7 +248,7 @@ def _source(path: Path, truth: str | None) -> Recording:
 
 
 def _without_imu(log: Log, truth: str | None) -> Recording:
-    """Poses alone: the first pose topic or the one asked for; of a tree of transforms TOPIC/CHILD_FRAME, or its only child."""
+    """Poses of the first pose topic or of `truth`; in a tree of transforms TOPIC/CHILD_FRAME, or its only child."""
     if not log.pose_topics:
         raise LogError("the log has no poses", where=log.path, expected=f"poses among {log.listing()}")
     name = truth or log.pose_topics[0]
