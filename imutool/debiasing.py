@@ -19,9 +19,9 @@ from jaxtyping import Float64, Int64, UInt8
 from imutool import __version__
 from imutool.bias import static
 from imutool.bias.io import shipped, shipped_for
-from imutool.bias.model import BiasModel, OneByOne, Stream, Vector6
-from imutool.bias_start.bias_covariance import BiasCovariance
-from imutool.bias_start.initial_bias import InitialBias, following
+from imutool.bias.model import BiasModel, SampleStream, Stream, Vector6
+from imutool.bias_start.bias_covariance import BiasEstimator
+from imutool.bias_start.initial_bias import InitialBias, tracked_from_prior
 from imutool.bias_start.model_choice import check_smooth, choose_model_and_start
 from imutool.cleaning import Cleaner, Rules, Survey, look
 from imutool.config import plain
@@ -87,14 +87,12 @@ def apply_with_std(model: BiasModel, start: InitialBias, imu: Imu) -> tuple[Debi
 
     In blocks, as a log is debiased: a covariance is 288 bytes.
     """
-    stream = start.stream(model)
-    certainty = BiasCovariance(model, start, stream)
+    estimator = BiasEstimator(model, start)
     t_s = seconds(imu.t_ns, int(imu.t_ns[0]))
     bias, std = np.empty((len(imu), 6)), np.empty((len(imu), 6))
     for first in range(0, len(imu), BLOCK_SAMPLES):
         rows = slice(first, first + BLOCK_SAMPLES)
-        bias[rows] = stream(t_s[rows], imu.gyro[rows], imu.accel[rows])
-        covariance = certainty(t_s[rows], imu.gyro[rows], imu.accel[rows])
+        bias[rows], covariance = estimator(t_s[rows], imu.gyro[rows], imu.accel[rows])
         std[rows] = np.sqrt(covariance.diagonal(axis1=1, axis2=2))
     return DebiasedImu(Imu(imu.t_ns, imu.gyro - bias[:, :3], imu.accel - bias[:, 3:]), bias), std
 
@@ -108,8 +106,8 @@ class OnlineDebiaser:
     """
 
     def __init__(self, model: BiasModel, start: InitialBias | None = None) -> None:
-        stream = (start or following(model)).stream(model)
-        self._one, self._start_ns = stream.one if isinstance(stream, OneByOne) else _by_blocks(stream), -1
+        stream = (start or tracked_from_prior(model)).stream(model)
+        self._one, self._start_ns = stream.one if isinstance(stream, SampleStream) else _by_blocks(stream), -1
 
     def __call__(
         self, stamp_ns: int, gyro: Float64[np.ndarray, "3"], accel: Float64[np.ndarray, "3"]
@@ -155,9 +153,8 @@ class Debiaser:
             NewTopic(f"{source_topic}/bias/accel", schemas.VECTOR3),
             NewTopic(f"{source_topic}/bias", schemas.TWIST),
         )
-        self._stream, self._start_ns = start.stream(model), -1
+        self._estimator, self._start_ns = BiasEstimator(model, start), -1
         self._clock = StampCheck()
-        self._covariance = BiasCovariance(model, start, self._stream)
         noise = model.noise_std.detach().cpu().double().numpy()
         self._white = np.diag(np.where(noise > 0, noise, start.noise) ** 2)
 
@@ -175,9 +172,8 @@ class Debiaser:
         if self._start_ns < 0 and len(batch.stamp_ns):
             self._start_ns = int(batch.stamp_ns[0])
         t_s = seconds(batch.stamp_ns, self._start_ns)
-        bias = self._stream(t_s, batch.gyro, batch.accel)
-        unsure = self._covariance(t_s, batch.gyro, batch.accel)
-        total = unsure + self._white
+        bias, covariance = self._estimator(t_s, batch.gyro, batch.accel)
+        total = covariance + self._white
         corrected = encode_imu(
             batch.stamp_ns,
             batch.gyro - bias[:, :3],
@@ -190,10 +186,10 @@ class Debiaser:
             corrected,
             _vector(batch.stamp_ns, bias[:, :3], batch.frame_id),
             _vector(batch.stamp_ns, bias[:, 3:], batch.frame_id),
-            encode_twist(batch.stamp_ns, bias[:, :3], bias[:, 3:], unsure, batch.frame_id),
+            encode_twist(batch.stamp_ns, bias[:, :3], bias[:, 3:], covariance, batch.frame_id),
         )
         if self._watch is not None and len(batch.stamp_ns):
-            std = np.sqrt(unsure.diagonal(axis1=1, axis2=2))
+            std = np.sqrt(covariance.diagonal(axis1=1, axis2=2))
             self._watch(DebiasedBlock(self.source_topic, batch, bias, std))
         return DerivedBatch(batch, payloads)
 

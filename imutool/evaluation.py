@@ -13,14 +13,14 @@ from jaxtyping import Bool
 from imutool.bias import static
 from imutool.bias.io import check_rate, find_model
 from imutool.bias.model import BiasModel
-from imutool.bias_start.bias_tracking import Known
+from imutool.bias_start.bias_tracking import BiasPrior
 from imutool.bias_start.initial_bias import AT_REST_STD, LEAST_STD, InitialBias, find
 from imutool.bias_start.model_choice import check_smooth, estimate_at_rest, smooth_in_memory
-from imutool.bias_start.zero_velocity import with_stops
+from imutool.bias_start.zero_velocity import zero_velocity_trajectory
 from imutool.debiasing import DebiasedImu, apply
 from imutool.errors import ConfigError
 from imutool.inertial import metrics
-from imutool.inertial.strapdown import Start, along_truth, drift
+from imutool.inertial.strapdown import StartPose, along_truth, drift
 from imutool.mcap_io.read import read
 from imutool.recording import Imu, Poses, Recording
 
@@ -65,7 +65,7 @@ def evaluate(
         drifted = _drift(integrated, true, valid)
         estimates = {PURE: integrated}
         if zupt:
-            estimates[ZUPT] = with_stops(_over(found.imu, true), Start.of(true), _left(start), smooth=smooth)
+            estimates[ZUPT] = zero_velocity_trajectory(_over(found.imu, true), StartPose.of(true), _left(start), smooth=smooth)
         for kind, estimate in estimates.items():
             results.append(
                 {
@@ -102,10 +102,10 @@ def _over(imu: Imu, true: Poses) -> Imu:
     return rows
 
 
-def _left(start: InitialBias | None) -> Known:
+def _left(start: InitialBias | None) -> BiasPrior:
     """What may be left of the bias after debiasing: the start's uncertainty, or anything where nothing was taken off."""
     std = np.array(RAW_STD) if start is None else np.maximum(start.std, LEAST_STD)
-    return Known(np.zeros(6), std, AT_REST_STD)
+    return BiasPrior(np.zeros(6), std, AT_REST_STD)
 
 
 def runs(

@@ -25,7 +25,7 @@ from imutool.cleaning.rules.units import (
     spread,
 )
 from imutool.errors import LogError
-from imutool.inertial.stationary import stretches
+from imutool.inertial.stationary import rest_stretches
 from imutool.location import Location
 from imutool.mcap_io.codec import schemas
 from imutool.mcap_io.codec.decode import decode_imu
@@ -221,7 +221,7 @@ def _saturated(values: Float64[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
 
 def _rest(imu: Imu) -> Report:
     """Where the sensor rests, the specific force it reads there, and its noise."""
-    found = stretches(imu)
+    found = rest_stretches(imu)
     samples = [slice(a, b) for a, b in found]
     weights = [b - a for a, b in found]
     norms = [float(np.linalg.norm(imu.accel[s].mean(axis=0))) for s in samples]

@@ -20,7 +20,16 @@ from rosbags.highlevel import AnyReader
 from imutool.bias import linear, neural_ode, static
 from imutool.bias.io import load, save
 from imutool.bias.model import BiasModel, Segment
-from imutool.bias_start.initial_bias import InitialBias, at_rest, auto, following, from_truth, given, prior, smooth
+from imutool.bias_start.initial_bias import (
+    InitialBias,
+    at_rest,
+    auto,
+    from_numbers,
+    from_truth,
+    prior,
+    smooth,
+    tracked_from_prior,
+)
 from imutool.bias_start.model_choice import estimate_at_rest
 from imutool.cli.debias import assigned
 from imutool.conversion import convert
@@ -337,7 +346,7 @@ def test_every_start_is_the_one_turn_on_finds(
         "stationary": lambda: at_rest(model, recording.imu),
         "prior": lambda: prior(model),
         "truth": lambda: from_truth(model, recording),
-    }.get(init, lambda: given(init))()
+    }.get(init, lambda: from_numbers(init))()
     start = report.starts["/imu0"]
     assert start.how == expected.how
     np.testing.assert_allclose(start.rest, expected.rest, rtol=0, atol=1e-12)
@@ -634,7 +643,7 @@ def test_one_sample_at_a_time_gives_the_batchs_numbers(recording: Recording, met
 def test_a_live_node_follows_the_rest_bias_as_a_log_does(recording: Recording, method: str) -> None:
     """From the prior on, without a look at what is to come."""
     model, imu = make_model(method), recording.imu.rows(slice(0, 1500))
-    online, batch = OnlineDebiaser(model), apply(model, following(model), imu)
+    online, batch = OnlineDebiaser(model), apply(model, tracked_from_prior(model), imu)
     found = np.array([online(int(t), w, a)[2] for t, w, a in zip(imu.t_ns, imu.gyro, imu.accel, strict=True)])
     np.testing.assert_allclose(found, batch.bias, rtol=0, atol=ONLINE)
     still = recording.imu.gyro[:600].mean(axis=0)

@@ -19,7 +19,7 @@ from jaxtyping import Float, Float64
 from torch import Tensor
 
 from imutool.bias import neural_ode
-from imutool.bias.model import COLUMNS, BiasModel, CovarianceModel, OneByOne, Segment, Stream, Vector6
+from imutool.bias.model import COLUMNS, BiasModel, CovarianceModel, SampleStream, Segment, Stream, Vector6
 from imutool.config import Settings
 from imutool.errors import ConfigError
 from imutool.sensor import catalogue
@@ -159,7 +159,7 @@ class _Stream:
     """Effects, then the neural ODE on the corrected samples; its state is that of the filters."""
 
     def __init__(
-        self, rate_hz: float, gyro: CompiledEffects, accel: CompiledEffects, ode: OneByOne | None, rest: Vector6
+        self, rate_hz: float, gyro: CompiledEffects, accel: CompiledEffects, ode: SampleStream | None, rest: Vector6
     ) -> None:
         self._signals = SignalFilter(rate_hz, max(gyro.wanted, accel.wanted))
         self._matrix = np.concatenate([gyro.matrix, accel.matrix], axis=1)

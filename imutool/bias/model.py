@@ -11,7 +11,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
-from typing import Any, ClassVar, Literal, Protocol, runtime_checkable
+from typing import Any, ClassVar, Literal, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 import torch
@@ -24,6 +24,7 @@ from imutool.units import SENSORS, Sensor
 COLUMNS = {"gyro": slice(0, 3), "accel": slice(3, 6)}  # of every vector of six
 
 Vector6 = Float64[np.ndarray, "6"]  # gyro (rad/s) then accel (m/s²)
+Covariances = Float64[np.ndarray, "n 6 6"]
 
 
 @dataclass(frozen=True)
@@ -50,8 +51,25 @@ class Stream(Protocol):
         """The bias at each sample, from this and earlier samples only; the blocks' borders change nothing."""
 
 
+class BiasEstimate(NamedTuple):
+    """A bias at each sample, gyro (rad/s) then accel (m/s²), and its covariance."""
+
+    bias: Float64[np.ndarray, "n 6"]
+    covariance: Covariances
+
+
 @runtime_checkable
-class OneByOne(Stream, Protocol):
+class RestBiasEstimator(Protocol):
+    """A model at work with the covariance of its rest bias, for samples as they arrive in blocks of any size."""
+
+    def estimate(
+        self, t_s: Float64[np.ndarray, " n"], gyro: Float64[np.ndarray, "n 3"], accel: Float64[np.ndarray, "n 3"]
+    ) -> BiasEstimate:
+        """The bias at each sample, and the covariance of the rest bias in it."""
+
+
+@runtime_checkable
+class SampleStream(Stream, Protocol):
     """A stream with a shorter way for a single sample, for live use: half of such a call is cutting and joining arrays."""
 
     def one(self, t_s: float, u: Vector6) -> Vector6:

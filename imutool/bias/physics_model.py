@@ -23,7 +23,7 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from imutool.bias import hybrid
-from imutool.bias.model import CovarianceModel, OneByOne, Segment, Stream, Vector6
+from imutool.bias.model import CovarianceModel, SampleStream, Segment, Stream, Vector6
 from imutool.errors import ModelError
 from imutool.sensor import catalogue, physics_file
 from imutool.sensor.effect import Effect, Parameter, Stage, Theta, each_pair
@@ -87,7 +87,7 @@ class Model(hybrid.Model):
     def stream(self, rest: Vector6) -> Stream:
         """The model in numpy."""
         inner = super().stream(rest)
-        assert isinstance(inner, OneByOne)
+        assert isinstance(inner, SampleStream)
         return _Less(inner, self._b)
 
     def calibration_covariance(self) -> CovarianceModel | None:
@@ -106,7 +106,7 @@ class Model(hybrid.Model):
 class _Less:
     """Stream that sees samples without a constant."""
 
-    def __init__(self, inner: OneByOne, b: Vector6) -> None:
+    def __init__(self, inner: SampleStream, b: Vector6) -> None:
         self._inner, self._b = inner, b
 
     def __call__(

@@ -16,11 +16,10 @@ from imutool.bias import static
 from imutool.bias.io import check_rate, find_model
 from imutool.bias.model import BiasModel
 from imutool.bias_start.bias_tracking import Samples
-from imutool.bias_start.initial_bias import InitialBias, NoRestError, find, over_all_rest
-from imutool.bias_start.initial_bias import smooth as smooth_rest
+from imutool.bias_start.initial_bias import InitialBias, NoRestError, find, over_all_rest, smoothed_start
 from imutool.cleaning import Survey, cleaned
 from imutool.errors import ConfigError, DataError, LogError, ModelError
-from imutool.inertial.stationary import Blocks, in_blocks, white_noise
+from imutool.inertial.stationary import Blocks, block_statistics, white_noise
 from imutool.location import Location
 from imutool.mcap_io.log import Log
 from imutool.mcap_io.read import read_recording
@@ -49,7 +48,7 @@ def choose_model_and_start(
     period_s = first_minute.imu.period_s
     if untrained and init == "auto" and not smooth:
         batches = ((batch.stamp_ns, batch.gyro, batch.accel) for batch in _imu_batches(log, topic, survey))
-        return _estimate(in_blocks(batches, period_s), log.path)
+        return _estimate(block_statistics(batches, period_s), log.path)
     model: BiasModel = static.Model() if name is None or untrained else find_model(name, 1.0 / period_s)
     if not untrained:
         check_rate(model, 1.0 / period_s, log.path)
@@ -70,7 +69,7 @@ def smooth_in_memory(model: BiasModel, imu: Imu, where: str | Location) -> Initi
 
 def _smoothed(model: BiasModel, batches: Iterable[Samples], where: str | Location) -> InitialBias:
     try:
-        return smooth_rest(model, batches, str(where))
+        return smoothed_start(model, batches, str(where))
     except NoRestError as error:
         raise _no_start(where) from error
 
@@ -127,7 +126,7 @@ def estimate_at_rest(imu: Imu, where: str | Location) -> tuple[BiasModel, Initia
         DataError: fewer than two samples.
         ModelError: the log never rests.
     """
-    return _estimate(in_blocks([(imu.t_ns, imu.gyro, imu.accel)], imu.period_s), where)
+    return _estimate(block_statistics([(imu.t_ns, imu.gyro, imu.accel)], imu.period_s), where)
 
 
 def _estimate(blocks: Blocks, where: str | Location) -> tuple[BiasModel, InitialBias]:

@@ -13,7 +13,7 @@ from imutool.errors import ConfigError
 from imutool.location import to_location
 
 if TYPE_CHECKING:
-    from imutool.noise_identification import Identified
+    from imutool.noise_identification import IdentifiedNoise
 
 
 @app.command(epilog="Example: [bold]imutool info MH_04.mcap[/] or [bold]imutool info still.mcap --noise --noise-toml i.toml[/]")
@@ -73,7 +73,7 @@ def _leave(lost: bool) -> NoReturn:
     raise typer.Exit(LOST if lost else 0)
 
 
-def _write_noise(found: Identified, plot: Path | None, toml: Path | None, overwrite: bool) -> None:
+def _write_noise(found: IdentifiedNoise, plot: Path | None, toml: Path | None, overwrite: bool) -> None:
     """The files that were asked for."""
     if plot is not None:
         from imutool.viewing.html.allan_plot import write_png

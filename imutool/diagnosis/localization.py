@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float64
 from scipy.ndimage import uniform_filter1d
 
-from imutool.diagnosis.estimation.alignment import Pair
+from imutool.diagnosis.estimation.aligned_log import Pair
 from imutool.diagnosis.locate import located
 from imutool.diagnosis.result import Finding, Located
 

@@ -57,7 +57,7 @@ def located(
             Located(
                 signal,
                 tuple(AXES[a] for a in axes),
-                tuple(_intervals(float(t_s[0]) + WINDOW_S * seconds[inside])),
+                tuple(intervals(float(t_s[0]) + WINDOW_S * seconds[inside])),
                 regime(inside, power, window, variables),
                 float(power[inside].sum() / max(power.sum(), 1e-300)),
                 p_values.get(signal, float(chi2.sf(axes_power.sum(), 3))),
@@ -66,7 +66,7 @@ def located(
     return sorted(found, key=lambda one: one.p_value)
 
 
-def _intervals(begins_s: Float64[np.ndarray, " w"]) -> list[tuple[float, float]]:
+def intervals(begins_s: Float64[np.ndarray, " w"]) -> list[tuple[float, float]]:
     """Stretches of windows, by where each begins; those close to one another are joined."""
     out: list[tuple[float, float]] = []
     for begin in begins_s.tolist():

@@ -134,7 +134,7 @@ class Trajectory:
                 )
 
 
-def through(poses: Poses, knot_spacing_s: float | None = None, degree: int = DEGREE) -> Trajectory:
+def fit_trajectory(poses: Poses, knot_spacing_s: float | None = None, degree: int = DEGREE) -> Trajectory:
     """The smooth trajectory through true poses, time counted from the first of them.
 
     Without `knot_spacing_s` the splines pass through every pose, noise included: its second derivative is then noise

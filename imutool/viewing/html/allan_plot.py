@@ -1,4 +1,4 @@
-"""A picture of Allan deviations on paper, with the slopes that were read off them."""
+"""Plot of Allan deviations with the fitted noise terms, as a PNG."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 
 from imutool.mcap_io.storage.target import Target
 from imutool.noise import allan
-from imutool.noise_identification import SENSORS, Identified, Sensor, Sight
+from imutool.noise_identification import SENSORS, CurveSource, IdentifiedNoise, Sensor
 from imutool.units import AXES, UNITS
 from imutool.viewing.html.drawing import Panel, Picture, legend, plain_tick_labels
 from imutool.viewing.html.drawing import png as drawn
@@ -26,8 +26,8 @@ LINES = {
 HEIGHT_INCH = 3.8
 
 
-def write_png(found: Identified, path: Path, *, overwrite: bool = False) -> None:
-    """Writes a PNG: the deviation of each axis as points, the fitted sum as a line, each slope seen as its own.
+def write_png(found: IdentifiedNoise, path: Path, *, overwrite: bool = False) -> None:
+    """Write a PNG of the Allan deviation of each axis, the fitted sum and each noise term.
 
     Above what was seen at rest, below what was left in motion; only one of them where there is only one.
 
@@ -38,8 +38,8 @@ def write_png(found: Identified, path: Path, *, overwrite: bool = False) -> None
         target.write(png(found))
 
 
-def png(found: Identified) -> bytes:
-    """The picture of `deviations` as the content of a file.
+def png(found: IdentifiedNoise) -> bytes:
+    """Content of the PNG file of `write_png`.
 
     Raises:
         ConfigError: matplotlib is not installed.
@@ -53,7 +53,7 @@ def png(found: Identified) -> bytes:
     return drawn(Picture("allan", "Allan deviation", "", tuple(panels)), f"{found.log} {found.topic}")
 
 
-def _draw(figure: Any, *, sight: Sight, sensor: Sensor) -> None:
+def _draw(figure: Any, *, sight: CurveSource, sensor: Sensor) -> None:
     axes = figure.subplots()
     curve = sight.curves[sensor]
     for axis, (slopes, color) in enumerate(zip(sight.slopes[sensor], AXIS_COLORS, strict=True)):

@@ -1,4 +1,4 @@
-"""Rerun recording of a diagnosis: real, before and after by axis, residuals, events and the conclusion."""
+"""Rerun recording of a diagnosis: samples, residuals, located intervals and conclusion."""
 
 from __future__ import annotations
 

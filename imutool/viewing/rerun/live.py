@@ -1,4 +1,4 @@
-"""Live view of a debiasing: each batch of samples and the dead-reckoned paths go to a viewer or an .rrd file.
+"""Live view of a debiasing: batches of samples and paths go to a viewer or a file.
 
 Entities and styles are those of `scene`, except what needs truth or the end. Memory is constant: only the last pose of each
 path is kept. An error here never stops the debiasing.
@@ -17,7 +17,7 @@ import numpy as np
 
 from imutool.debiasing import DebiasedBlock
 from imutool.errors import ConfigError, ImutoolError
-from imutool.inertial.strapdown import Start, dead_reckon
+from imutool.inertial.strapdown import StartPose, dead_reckon
 from imutool.mcap_io.storage.target import Target
 from imutool.recording import Imu, Poses
 from imutool.viewing.model.output import Output
@@ -272,7 +272,7 @@ class _GrowingPath:
     """Dead-reckoned path that grows by batches and equals that of `runs.build` to the last digits."""
 
     def __init__(self) -> None:
-        self._end: tuple[Imu, Start] | None = None
+        self._end: tuple[Imu, StartPose] | None = None
 
     def __call__(self, imu: Imu) -> Poses:
         """Poses at the samples, after the last pose before them, so that lines join.
@@ -286,5 +286,5 @@ class _GrowingPath:
             last, start = self._end
             joined = (np.concatenate([getattr(last, name), getattr(imu, name)]) for name in ("t_ns", "gyro", "accel"))
             poses = dead_reckon(Imu(*joined), start)
-        self._end = imu.rows(slice(len(imu) - 1, None)), Start(*(np.array(part) for part in Start.of(poses, -1)))
+        self._end = imu.rows(slice(len(imu) - 1, None)), StartPose(*(np.array(part) for part in StartPose.of(poses, -1)))
         return poses

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from imutool.errors import ConfigError, DataError
 from imutool.inertial import metrics
-from imutool.inertial.strapdown import Start, dead_reckon
+from imutool.inertial.strapdown import StartPose, dead_reckon
 from imutool.recording import Imu, Poses, Recording, seconds
 from imutool.sensor.flight import ACCEL, GYRO, flight
 from imutool.viewing.model import runs as runs_module
@@ -33,7 +33,7 @@ def test_figures_are_those_of_the_metrics(recording: Recording, runs: list[Run],
     truth, valid = recording.truth.at(recording.imu.t_ns)
     assert valid.all()
     for run, trace in zip(runs, data.traces, strict=True):
-        path = dead_reckon(run.imu, Start.of(truth))
+        path = dead_reckon(run.imu, StartPose.of(truth))
         assert trace.path == path
         assert dict(trace.figures) == metrics.evaluate(path, truth, valid)
 

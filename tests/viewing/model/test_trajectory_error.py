@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from imutool.errors import DataError
 from imutool.inertial.metrics import write_tum
-from imutool.inertial.strapdown import Start, along_truth, dead_reckon
+from imutool.inertial.strapdown import StartPose, along_truth, dead_reckon
 from imutool.recording import Imu, Poses, Recording
 from imutool.viewing.model.trajectory_error import ALIGNMENTS, Alignment, aligned, drift_since_reset, errors, windows
 
@@ -51,7 +51,7 @@ def test_drift_is_that_of_integrating_anew_from_every_reset(stretch: Stretch) ->
     resets = 0
     for number in np.unique(turn_of[valid]):
         rows = np.flatnonzero((turn_of == number) & valid)
-        again = dead_reckon(imu.rows(slice(rows[0], rows[-1] + 1)), Start.of(true, int(rows[0])))
+        again = dead_reckon(imu.rows(slice(rows[0], rows[-1] + 1)), StartPose.of(true, int(rows[0])))
         anew = errors(again, true.rows(slice(rows[0], rows[-1] + 1)), np.ones(len(again), bool))
         part = rows - rows[0]
         np.testing.assert_allclose(got.since_s[rows], (path.t_ns[rows] - path.t_ns[rows[0]]) * 1e-9, atol=AGREEMENT)
@@ -74,7 +74,7 @@ def test_windows_are_the_drift_at_their_ends(stretch: Stretch) -> None:
     assert [window.length_s for window in found] == [1.0, 5.0]  # of eight seconds, no 10 and 30
     first = found[1]
     end = int(np.searchsorted(path.t_ns, path.t_ns[0] + 5_000_000_000))
-    again = dead_reckon(imu.rows(slice(0, end + 1)), Start.of(true))
+    again = dead_reckon(imu.rows(slice(0, end + 1)), StartPose.of(true))
     error = errors(again, true.rows(slice(0, end + 1)), np.ones(end + 1, bool))
     assert first.count == 1
     assert first.orientation_deg == pytest.approx(error.orientation_total_deg[-1], abs=AGREEMENT)
