@@ -42,6 +42,7 @@ REPORTS = {
     "models": "imutool.cli.shipped:Models",
     "repair": "imutool.cli.repair:Repair",
     "score": "imutool.blind_cases.cases:OpenedCase",
+    "simulation": "imutool.cli.simulate:SimulationReport",
     "training": "imutool.cli.train:TrainingReport",
     "unit": "imutool.fleet.work:UnitReport",
     "view": "imutool.cli.view:View",

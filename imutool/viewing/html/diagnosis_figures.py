@@ -1,4 +1,4 @@
-"""Figures of a diagnosis as inline SVG: where the misfit lies, and how it looks before and after, all on unseen time if any.
+"""Figures of a diagnosis as inline SVG: location of the misfit, residuals, spectra, trends.
 
 Colours are left to the page: each stands for a variable of its style sheet, so that one drawing serves light, dark and print.
 """
@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from imutool.diagnosis.estimation.whitening import Band
 from imutool.diagnosis.result import Curve, Diagnosis, Located, SignalTraces, Traces
-from imutool.diagnosis.wording import signals
+from imutool.diagnosis.wording.effect_sentences import signals
 from imutool.units import AXES, UNITS
 from imutool.viewing.html.drawing import (
     DecimatedLine,
@@ -41,7 +41,7 @@ GAP_PERIODS = 1.5  # periods without a sample that end a stretch
 
 
 def misfit_strip(d: Diagnosis, trace: Traces) -> str:
-    """The misfit of each axis along one log as a strip of its height, located stretches shaded, unseen time below."""
+    """Local misfit of each axis along one log, with located intervals and unseen time."""
 
     def draw(figure: Any) -> None:
         axes = figure.subplots()
@@ -69,7 +69,7 @@ def misfit_strip(d: Diagnosis, trace: Traces) -> str:
 
 
 def residual(trace: Traces, *, found: bool) -> str:
-    """Real minus expected of one log over time, per axis, before and (if anything was `found`) after; unseen time shaded."""
+    """Residual of one log over time by axis, before and after; unseen time is shaded."""
 
     def draw(figure: Any) -> None:
         panels = figure.subplots(3, 2, sharex=True, sharey="col")
@@ -88,7 +88,7 @@ def residual(trace: Traces, *, found: bool) -> str:
 
 
 def scalar_signal(beside: SignalTraces, *, found: bool) -> str:
-    """Another signal as it was recorded and expected, and real minus expected before and (if `found`) after, over time."""
+    """Another signal over time: recorded, expected, and its residual before and after."""
 
     def draw(figure: Any) -> None:
         above, below = figure.subplots(2, 1, sharex=True)
@@ -107,7 +107,7 @@ def scalar_signal(beside: SignalTraces, *, found: bool) -> str:
 
 
 def spectrum(d: Diagnosis) -> str | None:
-    """Welch's estimate of the residual's amplitude density (root mean square over axes and logs); nothing if too short."""
+    """Amplitude density of the residual by Welch's method; None if too short."""
     density = {signal: [_density(d.traces, part, after) for after in (False, True)] for signal, part in SIGNALS.items()}
     if any(found is None for both in density.values() for found in both):
         return None
@@ -129,7 +129,7 @@ def spectrum(d: Diagnosis) -> str | None:
 
 
 def residual_against_rate(d: Diagnosis) -> str | None:
-    """Mean residual in bins of turning rate: the gyro's against that about the same axis, the accel's against its size."""
+    """Mean residual in bins of turning rate: gyro about its own axis, accel by the total rate."""
 
     def variable(trace: Traces, signal: str, axis: int) -> Line:
         rate: Line = trace.before[:, axis] if signal == "gyro" else np.linalg.norm(trace.before[:, :3], axis=1)
@@ -140,7 +140,7 @@ def residual_against_rate(d: Diagnosis) -> str | None:
 
 
 def residual_against_attitude(d: Diagnosis) -> str | None:
-    """Mean residual in bins of how far its axis rises above the horizon; nothing where no attitude is known."""
+    """Mean residual in bins of an axis's elevation above the horizon; None without attitude."""
 
     def variable(trace: Traces, signal: str, axis: int) -> Line:
         assert trace.truth is not None, "looked at before"
@@ -154,7 +154,7 @@ def residual_against_attitude(d: Diagnosis) -> str | None:
 
 
 def curve(found: Curve, signal: str) -> str:
-    """A misfit without a name as a curve of one variable with its band, a panel for each axis that has one."""
+    """Curve of a finding without a name over its variable, one panel per axis, with its band."""
     all_y, all_bands = np.array(found.y), np.array(found.band)
 
     def draw(figure: Any) -> None:
@@ -175,7 +175,7 @@ def curve(found: Curve, signal: str) -> str:
 
 
 def intervals_in_log(trace: Traces, place: Located) -> Iterator[tuple[float, float]]:
-    """What of a place lies in a stretch of a log; a place of no log in particular is on the clock of all."""
+    """Intervals of a located misfit within a log; without a log's name they hold for all logs."""
     if place.log not in ("", trace.path):
         return
     for first, last in place.intervals_s:
@@ -185,7 +185,7 @@ def intervals_in_log(trace: Traces, place: Located) -> Iterator[tuple[float, flo
 
 
 def residual_in_band(trace: Traces, expected: Float64[np.ndarray, "n 6"]) -> Float64[np.ndarray, "n 6"]:
-    """Real minus expected, without what is faster than the expected is known."""
+    """Residual below the frequency up to which the expected signal is known."""
     left: Float64[np.ndarray, "n 6"] = trace.real - expected
     if trace.band_hz is None:
         return np.asarray(left)
@@ -194,12 +194,12 @@ def residual_in_band(trace: Traces, expected: Float64[np.ndarray, "n 6"]) -> Flo
 
 
 def held_out_mask(trace: Traces) -> Bool[np.ndarray, " n"]:
-    """Samples that no fit has seen; all of them where none was held out."""
+    """Mask of the samples that no fit has seen; all samples where none was held out."""
     return trace.held_out if trace.held_out.any() else np.ones_like(trace.held_out)
 
 
 def rate_hz(trace: Traces) -> float:
-    """Samples a second, by the median step."""
+    """Sample rate by the median step."""
     return 1.0 / float(np.median(np.diff(trace.t_s)))
 
 
@@ -276,7 +276,7 @@ def _binned(d: Diagnosis, variable: Callable[[Traces, str, int], Line], names: d
 
 
 def means(x: Line, y: Line, blocks: Float64[np.ndarray, " n"]) -> tuple[DecimatedLine, DecimatedLine, DecimatedLine]:
-    """Centres of even bins, the mean in each, and two standard errors, one independent value a block of time."""
+    """Bin centres, means and two standard errors, with one independent value per block of time."""
     good = np.isfinite(x) & np.isfinite(y)
     x, y, blocks = x[good], y[good], blocks[good]
     if not len(x):

@@ -1,4 +1,4 @@
-"""Events in a log: gaps, stops, saturation, clock jumps, the worst error, findings of a diagnosis."""
+"""Events in a log: gaps, rest, saturation, clock jumps, the worst error."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ class Event:
 
 
 def survey_events(survey: Survey) -> tuple[list[Event], list[str]]:
-    """What `imutool.cleaning` found at some time, and sentences for what it found without one, or at more times than it
+    """Events from a cleaning survey, and notes on findings without times or with too many.
     kept.
     """
     found, notes = [], []
@@ -79,7 +79,7 @@ def worst_error_events(name: str, errors: Errors) -> Iterator[Event]:
 
 
 def events_within(events: Iterable[Event], start_ns: int, end_ns: int) -> tuple[tuple[Event, ...], tuple[str, ...]]:
-    """Events within the log by time: per kind the MAX_EVENTS_PER_KIND longest, with notes that count the others.
+    """Events within a log by time, the longest of each kind, with notes that count the others.
 
     An event that is partly outside is cut to the log's time; a note counts those wholly outside (stamps of another century).
     """

@@ -44,7 +44,7 @@ class _Diagnosis(msgspec.Struct):
 
 
 def finding_events(folder: Path, log: str, start_ns: int, end_ns: int) -> tuple[list[Event], list[str]]:
-    """Events where a diagnosis located a misfit in a log (by its file name), and notes on what has no time.
+    """Events of the located findings of a log (by file name), and notes on the others.
 
     Times of a place count from the start of its log, or of the first where it names none. What is located without a time acts
     everywhere. Of a place with more stretches than are ever shown, the longest.

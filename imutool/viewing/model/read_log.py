@@ -1,4 +1,4 @@
-"""Read a log for viewing: its IMU, also where it is not sound, and the channels derived from it."""
+"""Read a log for viewing: its IMU, also where it is unsound, and derived channels."""
 
 from __future__ import annotations
 
