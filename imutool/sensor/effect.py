@@ -187,7 +187,7 @@ Acting = Sequence[tuple[Effect, Theta]]
 class SignalState:
     """Signals between two effects: a motion and when it is sampled, or, behind the clock, the samples."""
 
-    motion: Any  # an `IdealMotion`, or another signal with the same method `taken`
+    motion: Any  # an `IdealMotion`, or another signal with the same method `sample`
     taken_s: Times
     stamp_s: Times
     taken: Any = None

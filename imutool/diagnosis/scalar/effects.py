@@ -62,7 +62,7 @@ class IdealSignal:
     def _coefficients(self) -> tuple[Column, ...]:
         return tuple(spline_filter(column) for column in (self.fine, np.gradient(self.fine) * self.rate_hz))
 
-    def taken(self, taken_s: Samples, stamp_s: Samples) -> SignalSamples:
+    def sample(self, taken_s: Samples, stamp_s: Samples) -> SignalSamples:
         """The signal sampled at some times (cubic splines)."""
         at = ((taken_s - self.start_s) * self.rate_hz)[None]
         x, dx = (map_coordinates(c, at, order=3, mode="nearest", prefilter=False) for c in self._coefficients)
@@ -104,7 +104,7 @@ class AlignedSignal(AlignedLog):
     @cached_property
     def sampled(self) -> SignalSamples:
         """The ideal signal at the stamps."""
-        return self.ideal.taken(self.stamp_s, self.stamp_s)
+        return self.ideal.sample(self.stamp_s, self.stamp_s)
 
 
 def _effect(
