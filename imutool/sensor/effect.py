@@ -86,6 +86,7 @@ class CompiledEffect:
 class Effect:
     """An effect on a sensor: its equation, its parameters and its forward model.
 
+    observable_if: what a log must have for the parameters to show, as the reference of the effects lists it.
     forward: (IdealMotion, theta) -> IdealMotion up to BANDWIDTH; (taken_s, theta) -> taken_s at CLOCK; (SensorSamples, theta)
         -> SensorSamples behind it.
     linear: whether what it adds is proportional to theta (then a fit may start at zero).
@@ -108,7 +109,7 @@ class Effect:
     sensors: tuple[Sensor, ...]
     equation: str
     parameters: tuple[Parameter, ...]
-    seen_if: str
+    observable_if: str
     forward: Callable[[Any, Theta], Any]
     linear: bool = True
     starts: Callable[[Any, Any], Sequence[Theta]] | None = None

@@ -63,7 +63,7 @@ def _sentence(survey: Survey) -> str:
 
 def _row(finding: Finding, survey: Survey) -> str:
     values = f'<div class="note">{text(_as_text(finding.values))}</div>' if finding.values else ""
-    short = [text(finding.rule), str(finding.count), finding.action, f"{finding.sure:.2f}"]
+    short = [text(finding.rule), str(finding.count), finding.action, f"{finding.confidence:.2f}"]
     rule, count, action, sure = (f'<td class="number">{cell}</td>' for cell in short)
     return f"<tr>{rule}{count}<td>{text(finding.what)}{values}</td>{action}{sure}<td>{_strip(finding, survey)}</td></tr>"
 
