@@ -49,8 +49,8 @@ def diagnose(
     from imutool.config import load as load_settings
     from imutool.diagnosis.diagnose import diagnose as run
     from imutool.diagnosis.settings import DiagnoseSettings
-    from imutool.diagnosis.wording import below, conclusion
-    from imutool.diagnosis.wording import table as findings_table
+    from imutool.diagnosis.wording.conclusion import below, conclusion
+    from imutool.diagnosis.wording.conclusion import table as findings_table
     from imutool.viewing.model.runs import load
 
     def look(findings: Path) -> list[RunData]:

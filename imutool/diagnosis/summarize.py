@@ -23,10 +23,10 @@ from imutool.diagnosis.estimation.noise_estimate import noise_std
 from imutool.diagnosis.estimation.timestamps import late_stamps
 from imutool.diagnosis.estimation.unnamed_effects import unit
 from imutool.diagnosis.estimation.whitening import WhitenedImu
-from imutool.diagnosis.localization import of_findings, of_what_is_left
-from imutool.diagnosis.quantity import percent
+from imutool.diagnosis.localization import locate_findings, locate_residual
 from imutool.diagnosis.result import Closer, Curve, Diagnosis, Estimate, Finding, HeldOut, Located, Traces, Unexplained
 from imutool.diagnosis.to_physics_file import to_physics_file
+from imutool.diagnosis.wording.quantity import percent
 from imutool.inertial.stationary import white_noise
 from imutool.sensor.physics_file import PhysicsFile
 from imutool.units import ASCII_UNITS, AXES, SENSORS, UNITS
@@ -74,10 +74,10 @@ def told(
     still = [_with(pair, tuple(one for one in found.fitted.chosen if one[0].key in quiet)) for pair in pairs]
     unexplained = _unexplained(logs, after, noise)
     if findings:
-        places = of_findings(pairs, still, after, noise, findings, p_values)
+        places = locate_findings(pairs, still, after, noise, findings, p_values)
     else:  # where something is left all the same, it is said where
         odd = {name for name, one in unexplained.items() if not one.white}
-        places = [place for place in of_what_is_left(pairs, after, noise) if place.signal in odd]
+        places = [place for place in locate_residual(pairs, after, noise) if place.signal in odd]
     places += [place for pair in pairs for place in _stuck(pair, noise, several=len(reals) > 1)]
     return Diagnosis(
         real=tuple(reals.values()),
@@ -150,9 +150,9 @@ def _stuck(pair: Pair, floor: Float64[np.ndarray, "6"], *, several: bool) -> Ite
     stuck, there = timestamps.stuck(pair.real), expected(pair, ())
     for a in np.flatnonzero(stuck & ~_ended(pair) & (there.std(axis=0) > MOVES * floor)):
         signal = SENSORS[a // 3]
-        regime = f"always: it reads {pair.real[0, a]:.4g} {UNITS[signal]} in every sample"
+        reason = f"it reads {pair.real[0, a]:.4g} {UNITS[signal]} in every sample"
         span = ((float(pair.stamp_s[0]), float(pair.stamp_s[-1])),)
-        yield Located(signal, (AXES[a % 3],), span, regime, 1.0, 0.0, pair.name if several else "")
+        yield Located(signal, (AXES[a % 3],), span, f"always: {reason}", 1.0, 0.0, pair.name if several else "", reason)
 
 
 def _ended(pair: Pair) -> Bool[np.ndarray, "6"]:

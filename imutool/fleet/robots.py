@@ -22,8 +22,8 @@ import numpy as np
 from jaxtyping import Float64
 from scipy.stats import t as student
 
-from imutool.diagnosis.quantity import value as told
 from imutool.diagnosis.result import Estimate
+from imutool.diagnosis.wording.quantity import value as told
 from imutool.fleet.task import Parameter, Result
 
 QN, MAD = 2.2219, 1.4826  # what makes them the standard deviation of normal numbers

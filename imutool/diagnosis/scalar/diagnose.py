@@ -16,7 +16,7 @@ from imutool.diagnosis.estimation.noise_estimate import ORDER, noise_std, ridge_
 from imutool.diagnosis.estimation.timestamps import LEAST_DIGITS, grid
 from imutool.diagnosis.estimation.unnamed_effects import SplineCurve
 from imutool.diagnosis.estimation.whitening import LINES, SEGMENT, WhitenedLog, Whitener, autoregression
-from imutool.diagnosis.locate import CLEAR, WINDOW_S, intervals, regime
+from imutool.diagnosis.localization import CLEAR, WINDOW_S, intervals, regime
 from imutool.diagnosis.result import Curve, Estimate, Finding, HeldOut, Located, SignalTraces, Unexplained
 from imutool.diagnosis.scalar import effects
 from imutool.diagnosis.scalar.alignment import TOP, aligned

@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from imutool.diagnosis.estimation.whitening import Band
 from imutool.diagnosis.result import Curve, Diagnosis, Located, SignalTraces, Traces
-from imutool.diagnosis.wording import signals
+from imutool.diagnosis.wording.effect_sentences import signals
 from imutool.units import AXES, UNITS
 from imutool.viewing.html.drawing import (
     DecimatedLine,

@@ -7,23 +7,21 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from imutool import __version__
-from imutool.diagnosis.quantity import SHOWN, each, grouped, percent, symbol
 from imutool.diagnosis.result import SCHEMA, Diagnosis, Finding, Traces
-from imutool.diagnosis.wording import (
-    answer,
-    before_after,
-    besides,
-    by_chance,
-    came_closer,
-    cannot_show,
-    does,
-    measured,
-    name,
-    remains,
-    unseen,
-    where,
-    with_all,
+from imutool.diagnosis.wording.conclusion import (
+    chance_text,
+    gain_source,
+    gain_text,
+    headline,
+    held_out_time,
+    improvement,
+    location_text,
+    notes,
+    residual_text,
+    unobservable,
 )
+from imutool.diagnosis.wording.effect_sentences import effect_sentence, has_gain, label
+from imutool.diagnosis.wording.quantity import SHOWN, each, grouped, percent, symbol
 from imutool.mcap_io.storage.target import Target
 from imutool.units import ASCII_UNITS
 from imutool.viewing.html import diagnosis_figures as figures
@@ -63,8 +61,8 @@ def html(d: Diagnosis, *, logs: str | None = None) -> str:
     )
     body = [
         f"<h1>{text(names)} {text(against)}</h1>",
-        f'<p class="conclusion">{text(" ".join(answer(d)))}</p>',
-        *(f'<p class="note">{text(one)}</p>' for one in besides(d)),
+        f'<p class="conclusion">{text(" ".join(headline(d)))}</p>',
+        *(f'<p class="note">{text(one)}</p>' for one in notes(d)),
         *(f'<p class="note">{text(one)}</p>' for one in d.remarks),
         *([f'<p><a href="{text(logs)}">The recordings themselves</a>: signals, spectra, events.</p>'] if logs else []),
         *_findings(d),
@@ -85,10 +83,10 @@ def _findings(d: Diagnosis) -> Iterator[str]:
     yield f'<div class="scroll"><table class="findings"><thead><tr>{head}</tr></thead><tbody>'
     for one in d.findings:
         cells = [
-            f"<strong>{text(name(one))}</strong> {text(one.signal)}<br>{text(does(d, one))}{_similar(one)}",
+            f"<strong>{text(label(one))}</strong> {text(one.signal)}<br>{text(effect_sentence(d, one))}{_similar(one)}",
             f"<code>{text(one.equation)}</code>{_entries(one)}",
             _gain(one),
-            f"<span class=entry>{text(by_chance(one.false_discovery_rate, short=True))}</span>",
+            f"<span class=entry>{text(chance_text(one.false_discovery_rate, short=True))}</span>",
         ]
         yield f"<tr>{''.join(f'<td>{cell}</td>' for cell in cells)}</tr>"
     yield "</tbody></table></div>"
@@ -96,10 +94,10 @@ def _findings(d: Diagnosis) -> Iterator[str]:
 
 def _gain(one: Finding) -> str:
     """Share of the misfit as a number and a bar, with the root mean squares."""
-    if not measured(one):
+    if not has_gain(one):
         return "–"
     width = 0 if math.isnan(one.share) else round(BAR_PIXELS * min(max(one.share, 0.0), 1.0))
-    unseen = text(before_after(one.held_out).removesuffix(" of unseen data"))
+    unseen = text(gain_text(one.held_out).removesuffix(" of unseen data"))
     return f'{percent(one.share)}<span class="bar" style="width: {width}px"></span><br>{unseen}'
 
 
@@ -124,7 +122,9 @@ def _places(d: Diagnosis) -> Iterator[str]:
     if not d.located:
         return
     yield "<h2>Location of the misfit</h2>"
-    rows = "".join(f"<tr><td>{text(where(one))}</td><td class=number>{percent(one.share)}</td></tr>" for one in d.located)
+    rows = "".join(
+        f"<tr><td>{text(location_text(one))}</td><td class=number>{percent(one.share)}</td></tr>" for one in d.located
+    )
     head = "<tr><th>Signal, regime, time</th><th>Share of the misfit</th></tr>"
     yield f'<div class="scroll"><table><thead>{head}</thead><tbody>{rows}</tbody></table></div>'
     for k, trace in enumerate(d.traces[:MAX_LOGS]):
@@ -191,12 +191,12 @@ def _left(d: Diagnosis) -> Iterator[str]:
             ratio = f"{one.rms / one.noise_floor:.2f}" if one.noise_floor > 0.0 else "–"
             numbers = (f"{one.rms:.3g} {unit}", f"{one.noise_floor:.3g} {unit}", ratio)
             cells = "".join(f"<td class=number>{text(number)}</td>" for number in numbers)
-            rows.append(f"<tr><td>{text(signal)}</td>{cells}<td>{text(remains(one, unit))}</td></tr>")
+            rows.append(f"<tr><td>{text(signal)}</td>{cells}<td>{text(residual_text(one, unit))}</td></tr>")
         yield f"<table><thead><tr>{head}</tr></thead><tbody>{''.join(rows)}</tbody></table>"
     if d.closer and d.findings:
-        yield f"<h2>Improvement</h2><p class=note>{text(with_all(d) + unseen(d))}.</p><dl>"
+        yield f"<h2>Improvement</h2><p class=note>{text(gain_source(d) + held_out_time(d))}.</p><dl>"
         for signal, again in d.closer.items():
-            yield f"<dt>{text(signal)}</dt><dd>{text(came_closer(again))}</dd>"
+            yield f"<dt>{text(signal)}</dt><dd>{text(improvement(again))}</dd>"
         yield "</dl>"
 
 
@@ -211,7 +211,7 @@ def _provenance(d: Diagnosis) -> Iterator[str]:
         gyro, accel = (", ".join(f"{b:+.4g}" for b in part) for part in (bias[:3], bias[3:]))
         yield f"<dt>constant bias</dt><dd>gyro ({gyro}) rad/s, accel ({accel}) m/s²</dd>"
     if d.not_identifiable:
-        yield f"<dt>these logs cannot show</dt><dd>{text(', '.join(cannot_show(d)))}</dd>"
+        yield f"<dt>these logs cannot show</dt><dd>{text(', '.join(unobservable(d)))}</dd>"
     yield f"<dt>made by</dt><dd>imutool {text(__version__)}, {SCHEMA}</dd></dl>"
 
 

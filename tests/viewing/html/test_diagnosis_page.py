@@ -17,7 +17,7 @@ from support import diagnoses, markup
 from support.diagnoses import replace
 
 from imutool.diagnosis.result import Closer, SignalTraces
-from imutool.diagnosis.wording import conclusion
+from imutool.diagnosis.wording.conclusion import conclusion
 from imutool.errors import ConfigError
 from imutool.viewing.html import diagnosis_figures as figures
 from imutool.viewing.html import drawing
@@ -132,7 +132,7 @@ def test_what_a_log_is_called_never_becomes_markup(three: str) -> None:
     hostile = replace(
         diagnoses.THREE, sim=diagnoses.HOSTILE, findings=(driver, nameless), located=(place,), remarks=(diagnoses.HOSTILE,),
         not_identifiable=(diagnoses.HOSTILE,), unexplained={diagnoses.HOSTILE: diagnoses.unexplained()["gyro"]}, traces=(),
-        closer={diagnoses.HOSTILE: Closer.of(diagnoses.LAG.held_out, 0.001)},
+        closer={diagnoses.HOSTILE: Closer.computed(diagnoses.LAG.held_out, 0.001)},
     )  # fmt: skip
     page = Page(html(hostile))
     assert not page.tags & {"img", "script"}
