@@ -66,7 +66,7 @@ def html(d: Diagnosis, *, logs: str | None = None) -> str:
         *(f'<p class="note">{text(one)}</p>' for one in d.remarks),
         *([f'<p><a href="{text(logs)}">The recordings themselves</a>: signals, spectra, events.</p>'] if logs else []),
         *_findings(d),
-        *_places(d),
+        *_locations(d),
         *_before_and_after(d),
         *_curves(d),
         *_left(d),
@@ -118,7 +118,7 @@ def _entries(one: Finding) -> str:
     return "".join(out)
 
 
-def _places(d: Diagnosis) -> Iterator[str]:
+def _locations(d: Diagnosis) -> Iterator[str]:
     if not d.located:
         return
     yield "<h2>Location of the misfit</h2>"
@@ -139,21 +139,21 @@ def _before_and_after(d: Diagnosis) -> Iterator[str]:
     if not d.traces:
         return
     found = bool(d.findings)
-    both = BEFORE + AFTER if found else DIFFERENCE
+    legend = BEFORE + AFTER if found else DIFFERENCE
     over = "unseen time of all logs" if any(one.held_out.any() for one in d.traces) else "all time: none was held out"
     yield f"<h2>{'Before and after' if found else 'Difference'}</h2>"
     for k, trace in enumerate(d.traces[:MAX_LOGS]):
         drawn = figures.residual(trace, found=found)
-        yield _figure(drawn, f"r{k}", f"{text(trace.log)}: over time{_band(trace)}. {both}{HELD}")
-    for k, (signal, beside) in enumerate(d.signals.items()):
-        drawn = figures.scalar_signal(beside, found=any(one.signal == signal for one in d.findings))
-        yield _figure(drawn, f"g{k}", f"{text(signal)}: over time. {both}{HELD}")
+        yield _figure(drawn, f"r{k}", f"{text(trace.log)}: over time{_band(trace)}. {legend}{HELD}")
+    for k, (signal, traces) in enumerate(d.signals.items()):
+        drawn = figures.scalar_signal(traces, found=any(one.signal == signal for one in d.findings))
+        yield _figure(drawn, f"g{k}", f"{text(signal)}: over time. {legend}{HELD}")
     if len(d.traces) > MAX_LOGS:
         yield f'<p class="note">The first {MAX_LOGS} of {len(d.traces)} logs are drawn; all are in the .rrd.</p>'
     spectrum, rate, attitude = figures.spectrum(d), figures.residual_against_rate(d), figures.residual_against_attitude(d)
     if spectrum is not None:
         yield _figure(
-            spectrum, "s", f"Spectrum over {over} (Welch, mean of the axes); dashed: white noise of the floor's size. {both}"
+            spectrum, "s", f"Spectrum over {over} (Welch, mean of the axes); dashed: white noise of the floor's size. {legend}"
         )
     else:
         yield '<p class="note">Every unseen stretch is too short for a spectrum.</p>'
@@ -161,13 +161,13 @@ def _before_and_after(d: Diagnosis) -> Iterator[str]:
     if paths is not None:
         true = '<span class="key" style="background: var(--ink); opacity: 0.4"></span>true'
         yield _figure(
-            paths, "p", f"Integrated from the true start of each stretch of {over}; drift as root mean square.{true}{both}"
+            paths, "p", f"Integrated from the true start of each stretch of {over}; drift as root mean square.{true}{legend}"
         )
     bands = "means in bins, with two standard errors"
     if rate is not None:
-        yield _figure(rate, "t", f"Against turning rate over {over}: {bands}. {both}")
+        yield _figure(rate, "t", f"Against turning rate over {over}: {bands}. {legend}")
     if attitude is not None:
-        yield _figure(attitude, "a", f"Against attitude over {over}: {bands}. {both}")
+        yield _figure(attitude, "a", f"Against attitude over {over}: {bands}. {legend}")
     else:
         yield '<p class="note">The attitude is unknown, so there is no figure against it.</p>'
 
