@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float64, Int64
 
-from imutool.diagnosis.estimation.gauss_newton import Fit, direction, priors
+from imutool.diagnosis.estimation.gauss_newton import Fit, direction, parameters_of, priors
 from imutool.diagnosis.estimation.jacobians import ForwardPass, effect_jacobian
 from imutool.diagnosis.estimation.significance import log_p_value
 from imutool.diagnosis.estimation.whitening import WhitenedLog
@@ -139,3 +139,14 @@ class Candidates:
                 gain, start = max(gains, key=lambda pair: pair[0])
                 self.scores[effect.key] = Scored(self.log_p(effect, gain), effect, start, gain)
         return sorted((self.scores[effect.key] for effect in asked), key=lambda entry: entry.log_p)
+
+
+def unnamed_count(found: Fit) -> int:
+    """Number of effects that are not of the catalogue."""
+    return sum(effect.kind != "catalogue" for effect, _ in found.chosen)
+
+
+def bic(found: Fit, unnamed_penalty: float) -> float:
+    """Squares left and the cost of the parameters (BIC); an effect outside the catalogue costs more."""
+    count = len(parameters_of(found.chosen))
+    return found.objective + count * float(np.log(found.numbers)) + unnamed_penalty * unnamed_count(found)

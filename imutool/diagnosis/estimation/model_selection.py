@@ -16,8 +16,8 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from imutool.diagnosis.estimation.aligned_log import Pair
-from imutool.diagnosis.estimation.candidate_score import Candidates
-from imutool.diagnosis.estimation.gauss_newton import BETWEEN_SAMPLES, LOG_PRIOR, Fit, fit, parameters_of
+from imutool.diagnosis.estimation.candidate_score import Candidates, bic, unnamed_count
+from imutool.diagnosis.estimation.gauss_newton import BETWEEN_SAMPLES, LOG_PRIOR, Fit, fit
 from imutool.diagnosis.estimation.jacobians import Chosen
 from imutool.diagnosis.estimation.observability import (
     below_model_error,
@@ -87,6 +87,7 @@ def select_effects(
     """
     unnamed = tuple(effect for group in later for effect in group)
     settings = settings or SearchSettings()
+    penalty = settings.unnamed_penalty
     start = fit(logs, always)
     known = Candidates(logs, (*candidates, *unnamed))
     silent = progress or (lambda text: None)
@@ -94,11 +95,11 @@ def select_effects(
     best_named, best_unnamed = (max((s.aic_gain for s in known.ranked(start, c)), default=0.0) for c in (candidates, unnamed))
     unnamed_first = best_unnamed > best_named + settings.clearly_better
     search, now = _grown(first, start, unnamed, []) if unnamed_first else _grown(first, start, (), list(later))
-    doubtful = len(now.chosen) - len(always) >= settings.suspicious_effects or _unnamed(now) > 0
+    doubtful = len(now.chosen) - len(always) >= settings.suspicious_effects or unnamed_count(now) > 0
     if unnamed and doubtful and now.objective > settings.explained_chi_square * now.numbers:
         # many small parts that do not add up, or an unnamed one: perhaps one effect alone is the better answer
         other = _grown(first, start, (), list(later)) if unnamed_first else _grown(first, start, unnamed, [])
-        if search.cost(other[1]) < search.cost(now) - settings.clearly_better:
+        if bic(other[1], penalty) < bic(now, penalty) - settings.clearly_better:
             search, now = other
     return search.tested(now)
 
@@ -122,11 +123,6 @@ def _grown(first: _Search, now: Fit, unnamed: tuple[Effect, ...], waiting: list[
 
 def _exact(logs: Sequence[WhitenedLog]) -> bool:
     return all(log.pair.exact for log in logs)
-
-
-def _unnamed(found: Fit) -> int:
-    """Number of effects that are not of the catalogue."""
-    return sum(effect.kind != "catalogue" for effect, _ in found.chosen)
 
 
 @dataclass(eq=False)
@@ -153,11 +149,6 @@ class _Search:
         """Log p-value that a finding needs after the correction."""
         return float(np.log(self.settings.false_discovery_rate / self.tried))
 
-    def cost(self, found: Fit) -> float:
-        """Squares left and the cost of the parameters (BIC); an effect outside the catalogue costs more."""
-        count = len(parameters_of(found.chosen))
-        return found.objective + count * float(np.log(found.numbers)) + self.settings.unnamed_penalty * _unnamed(found)
-
     def removable(self, now: Fit) -> range:
         """Places of effects but for those of every fit and the last, which has just come in."""
         return range(len(self.always), len(now.chosen) - 1)
@@ -167,7 +158,9 @@ class _Search:
         share = self.settings.rival_share
         if self.trials_of is not now:
             self.trials_of, self.trials = now, {}
-        ranked = self.candidates.ranked(now, self.named + (self.unnamed if _unnamed(now) < self.settings.most_unnamed else ()))
+        ranked = self.candidates.ranked(
+            now, self.named + (self.unnamed if unnamed_count(now) < self.settings.most_unnamed else ())
+        )
         best: tuple[float, Fit] | None = None
         for promised, effect, start, _ in ranked[: self.settings.fitted_each_round]:
             if best is not None and promised > best[0] * (1.0 if effect.linear else share):
@@ -184,7 +177,7 @@ class _Search:
         if best is None or best[0] > self.threshold:
             return None
         enough = self.settings.unnamed_share * (self.before - now.numbers)
-        if _unnamed(best[1]) and now.objective - best[1].objective < enough:
+        if unnamed_count(best[1]) and now.objective - best[1].objective < enough:
             return None  # the rim of something that has no name: a name for it would be wrong
         return best[1]
 
@@ -206,7 +199,8 @@ class _Search:
         if fine is None:
             return now
         trial = fit(self.logs, (*others, (fine, fine.null_value.astype(float))), near=now)
-        return trial if self.cost(trial) < self.cost(now) - self.settings.clearly_better else now
+        penalty = self.settings.unnamed_penalty
+        return trial if bic(trial, penalty) < bic(now, penalty) - self.settings.clearly_better else now
 
     def exchanged(self, now: Fit) -> Fit:
         """The fit with an effect replaced by another of the catalogue that explains more, where there is one."""
