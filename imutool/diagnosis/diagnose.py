@@ -1,6 +1,6 @@
-"""From logs to an answer: paired with what was expected, weighed by the noise, searched, located, tested on unseen time.
+"""Diagnosis of logs: aligned, whitened, effects selected and tested on held-out time, misfits located.
 
-logs ─ pair ─> Pair[] ─ whitening ─> Weighed[] ─ discover ─> Judged[] ─ locate ─> Diagnosis
+logs ─ alignment ─> Pair[] ─ noise_estimate ─> WhitenedImu[] ─ model_selection ─> Selection ─ summarize ─> Diagnosis
 """
 
 from __future__ import annotations
