@@ -51,6 +51,7 @@ def effect_sizes(
     imu: str | None = None,
     truth: str | None = None,
     effects: Sequence[str] = EVERY_UNIT,
+    settings: DiagnoseSettings | None = None,
 ) -> EffectSizes:
     """Sizes of some effects of the catalogue, fitted together to a recording, significant or not.
 
@@ -62,7 +63,7 @@ def effect_sizes(
     simulated = None if sim is None else read_log(sim, imu=imu)
     pairs = [without_unusable(pair) for pair in align(read_log(real, imu=imu, truth=truth), simulated, truth)]
     candidates = candidates_for(pairs)
-    settings = DiagnoseSettings()
+    settings = settings or DiagnoseSettings()
     logs = [whitened(pair, candidates, settings.band) for pair in pairs]
     asked = catalogue.diagnosed(effects)
     hidden = set(unobservable(logs, asked, settings.search))

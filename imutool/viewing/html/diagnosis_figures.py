@@ -1,6 +1,6 @@
 """Figures of a diagnosis as inline SVG: location of the misfit, residuals, spectra, trends.
 
-Colours are left to the page: each stands for a variable of its style sheet, so that one drawing serves light, dark and print.
+Colours are variables of the page's style sheet, so that one drawing serves light, dark and print.
 """
 
 from __future__ import annotations
@@ -30,14 +30,14 @@ from imutool.viewing.html.page import AFTER, BEFORE, HELD, INK, MARK, TITLES
 
 SIGNALS = {"gyro": slice(0, 3), "accel": slice(3, 6)}
 
-BUCKETS = 600  # a column of the page each: its lowest and its highest sample are drawn
+BUCKETS = 600  # of a line; each draws its lowest and its highest sample
 STRIP_BINS = 400
-WELCH_S = 8.0  # the longest window; shorter where unseen stretches are
+WELCH_S = 8.0  # longest window; shorter for short unseen stretches
 MIN_SAMPLES = 32  # samples in a window, below which there is no spectrum
 BINS = 16
 LEAST_BLOCKS = 3  # in a bin
-BLOCK_S = 0.5  # one independent value each: misfits of a motion last about so long
-GAP_PERIODS = 1.5  # periods without a sample that end a stretch
+BLOCK_S = 0.5  # one independent value each: the misfit of a motion lasts about this long
+GAP_PERIODS = 1.5  # sample periods without a sample that end a stretch
 
 
 def misfit_strip(d: Diagnosis, trace: Traces) -> str:
@@ -54,9 +54,9 @@ def misfit_strip(d: Diagnosis, trace: Traces) -> str:
             if top > 0.0:
                 area = np.nan_to_num(heights[:, row]) / top * 0.9
                 axes.fill_between(edges[:-1], -row, -row + area, step="post", color=INK, alpha=0.55, lw=0)
-            for place in d.located:
-                if axis in place.axes and signal in signals(place.signal):
-                    for first, last in intervals_in_log(trace, place):
+            for located in d.located:
+                if axis in located.axes and signal in signals(located.signal):
+                    for first, last in intervals_in_log(trace, located):
                         axes.fill_between([first, last], -row, -row + 0.94, color=MARK, alpha=0.3, lw=0)
         for first, last in true_intervals(trace.t_s, trace.held_out):
             axes.fill_between([first, last], -6.0, -5.3, color=HELD, alpha=0.5, lw=0)
@@ -87,21 +87,21 @@ def residual(trace: Traces, *, found: bool) -> str:
     return svg(draw, 4.4, "residual")
 
 
-def scalar_signal(beside: SignalTraces, *, found: bool) -> str:
+def scalar_signal(traces: SignalTraces, *, found: bool) -> str:
     """Another signal over time: recorded, expected, and its residual before and after."""
 
     def draw(figure: Any) -> None:
         above, below = figure.subplots(2, 1, sharex=True)
-        above.plot(*decimate_extremes(beside.t_s, beside.real, BUCKETS), color=INK, lw=0.9)
-        for expected, color in [(beside.before, BEFORE), (beside.after, AFTER)][: 1 + found]:
-            above.plot(*decimate_extremes(beside.t_s, expected, BUCKETS), color=color, lw=0.8)
-            below.plot(*decimate_extremes(beside.t_s, beside.real - expected, BUCKETS), color=color, lw=0.6)
+        above.plot(*decimate_extremes(traces.t_s, traces.real, BUCKETS), color=INK, lw=0.9)
+        for expected, color in [(traces.before, BEFORE), (traces.after, AFTER)][: 1 + found]:
+            above.plot(*decimate_extremes(traces.t_s, expected, BUCKETS), color=color, lw=0.8)
+            below.plot(*decimate_extremes(traces.t_s, traces.real - expected, BUCKETS), color=color, lw=0.6)
         for axes, title in ((above, "Recorded (ink) and expected"), (below, "Real minus expected")):
-            for first, last in true_intervals(beside.t_s, beside.held_out):
+            for first, last in true_intervals(traces.t_s, traces.held_out):
                 axes.axvspan(first, last, color=HELD, alpha=0.15, lw=0)
             axes.set_title(title)
-            axes.set_ylabel(f"({beside.unit})" if beside.unit else "value")
-        below.set(xlabel="time (s)", xlim=(beside.t_s[0], beside.t_s[-1]))
+            axes.set_ylabel(f"({traces.unit})" if traces.unit else "value")
+        below.set(xlabel="time (s)", xlim=(traces.t_s[0], traces.t_s[-1]))
 
     return svg(draw, 3.6, "signal")
 
@@ -115,7 +115,7 @@ def spectrum(d: Diagnosis) -> str | None:
     def draw(figure: Any) -> None:
         for axes, (signal, both) in zip(figure.subplots(1, 2), density.items(), strict=True):
             for found, color in list(zip(both, (BEFORE, AFTER), strict=True))[: 1 + bool(d.findings)]:
-                assert found is not None, "looked at above"
+                assert found is not None, "checked above"
                 axes.loglog(found[0], found[1], color=color, lw=1.1)
             if signal in d.unexplained:
                 floor = d.unexplained[signal].noise_floor * np.sqrt(2.0 / rate_hz(d.traces[0]))
@@ -143,7 +143,7 @@ def residual_against_attitude(d: Diagnosis) -> str | None:
     """Mean residual in bins of an axis's elevation above the horizon; None without attitude."""
 
     def variable(trace: Traces, signal: str, axis: int) -> Line:
-        assert trace.truth is not None, "looked at before"
+        assert trace.truth is not None, "checked by the caller"
         up_b = Rotation.from_quat(trace.truth.q_wb_wxyz, scalar_first=True).apply([0.0, 0.0, 1.0], inverse=True)
         rise: Line = np.degrees(np.arcsin(np.clip(up_b[:, axis], -1.0, 1.0)))
         return rise
@@ -159,9 +159,9 @@ def curve(found: Curve, signal: str) -> str:
 
     def draw(figure: Any) -> None:
         count = all_y.shape[1]
-        told = [k for k in range(count) if all_y[:, k].any() or all_bands[:, k].any()]  # the others have no part in it
-        panels = figure.subplots(1, max(len(told), 1), squeeze=False, sharey=True)[0]
-        for k, axes in zip(told, panels, strict=False):
+        drawn = [k for k in range(count) if all_y[:, k].any() or all_bands[:, k].any()]
+        panels = figure.subplots(1, max(len(drawn), 1), squeeze=False, sharey=True)[0]
+        for k, axes in zip(drawn, panels, strict=False):
             y, band = all_y[:, k], all_bands[:, k]
             axes.fill_between(found.x, y - band, y + band, color=AFTER, alpha=0.3, lw=0)
             axes.plot(found.x, y, color=AFTER, lw=1.4)
@@ -174,11 +174,11 @@ def curve(found: Curve, signal: str) -> str:
     return svg(draw, 2.6, "curve")
 
 
-def intervals_in_log(trace: Traces, place: Located) -> Iterator[tuple[float, float]]:
+def intervals_in_log(trace: Traces, located: Located) -> Iterator[tuple[float, float]]:
     """Intervals of a located misfit within a log; without a log's name they hold for all logs."""
-    if place.log not in ("", trace.path):
+    if located.log not in ("", trace.path):
         return
-    for first, last in place.intervals_s:
+    for first, last in located.intervals_s:
         low, high = max(first, float(trace.t_s[0])), min(last, float(trace.t_s[-1]))
         if low < high:
             yield low, high
@@ -208,19 +208,19 @@ def _sides(trace: Traces, found: bool) -> list[tuple[Float64[np.ndarray, "n 6"],
 
 
 def _local_rms(trace: Traces, edges: Line) -> Float64[np.ndarray, "bins 6"]:
-    """Root mean square of the misfit before, a row each between edges; NaN where there is no sample."""
+    """Root mean square of the misfit before between edges; NaN without samples."""
     squares = residual_in_band(trace, trace.before) ** 2
-    there = np.isfinite(squares)
+    finite = np.isfinite(squares)
     bins = np.clip(np.searchsorted(edges, trace.t_s, side="right") - 1, 0, len(edges) - 2)
     sums, counts = np.zeros((2, len(edges) - 1, 6))
-    np.add.at(sums, bins, np.where(there, squares, 0.0))
-    np.add.at(counts, bins, there)
+    np.add.at(sums, bins, np.where(finite, squares, 0.0))
+    np.add.at(counts, bins, finite)
     out: Float64[np.ndarray, "bins 6"] = np.sqrt(np.where(counts > 0, sums, np.nan) / np.maximum(counts, 1))
     return out
 
 
 def _density(traces: Sequence[Traces], part: slice, after: bool) -> tuple[Line, Line] | None:
-    """Frequencies and amplitude density over the unseen stretches of all logs, each as long as its windows count."""
+    """Frequencies and amplitude density over the unseen stretches of all logs, weighted by their length."""
     pieces = [(rate_hz(trace), piece) for trace in traces for piece in _stretches(trace, part, after)]
     longest_s = max((len(piece) / rate for rate, piece in pieces), default=0.0)
     window_s = min(WELCH_S, 2.0 ** np.floor(np.log2(max(longest_s, 1e-9))))
@@ -239,10 +239,9 @@ def _density(traces: Sequence[Traces], part: slice, after: bool) -> tuple[Line, 
 
 
 def _stretches(trace: Traces, part: slice, after: bool) -> Iterator[Float64[np.ndarray, "m 3"]]:
-    """The residual over unseen time, cut where samples are missing."""
+    """Residual over unseen time, split where samples are missing."""
     left = (trace.real - (trace.after if after else trace.before))[:, part]
-    good = held_out_mask(trace) & np.isfinite(left).all(axis=1)
-    rows = np.flatnonzero(good)
+    rows = np.flatnonzero(held_out_mask(trace) & np.isfinite(left).all(axis=1))
     steps = np.diff(trace.t_s[rows]) > GAP_PERIODS / rate_hz(trace)
     for piece in np.split(rows, np.flatnonzero(steps) + 1):
         if len(piece) >= MIN_SAMPLES:
@@ -250,7 +249,7 @@ def _stretches(trace: Traces, part: slice, after: bool) -> Iterator[Float64[np.n
 
 
 def _binned(d: Diagnosis, variable: Callable[[Traces, str, int], Line], names: dict[str, str], name: str) -> str | None:
-    """A panel for each signal and axis: means in bins of a variable over all logs, before and after."""
+    """Means in bins of a variable over all logs, before and after, one panel per signal and axis."""
     if not d.traces:
         return None
 
@@ -296,6 +295,5 @@ def means(x: Line, y: Line, blocks: Float64[np.ndarray, " n"]) -> tuple[Decimate
 
 
 def _blocks(trace: Traces, log: int) -> Float64[np.ndarray, " n"]:
-    """A number of its own for each block of time of each log."""
-    block: Float64[np.ndarray, " n"] = np.floor((trace.t_s - trace.t_s[0]) / BLOCK_S) + 1e6 * log
-    return block
+    """Block number of each sample, different for each log."""
+    return np.asarray(np.floor((trace.t_s - trace.t_s[0]) / BLOCK_S) + 1e6 * log)

@@ -21,8 +21,7 @@ from imutool.inertial.strapdown import StartPose, dead_reckon, stretch_with_trut
 from imutool.location import Location
 from imutool.recording import Imu, Poses, Recording, Scalars, seconds
 from imutool.viewing.model.decimate import MAX_CURVE_ROWS
-from imutool.viewing.model.events import Event, events_within, stop_events, survey_events, worst_error_events
-from imutool.viewing.model.findings import finding_events
+from imutool.viewing.model.events import Event, events_within, finding_events, stop_events, survey_events, worst_error_events
 from imutool.viewing.model.read_log import read_log
 from imutool.viewing.model.run_data import (
     LEVELLING_S,
@@ -85,7 +84,7 @@ def _with_models(
     recording: Recording, models: Sequence[str | Path], init: str, log: str, smooth: bool
 ) -> tuple[list[Run], dict[str, str]]:
     """Run of each model, and by its name its file digest, method and start bias."""
-    from imutool.debiasing import apply_with_std
+    from imutool.bias_start.correction import apply_with_std
     from imutool.evaluation import started
 
     runs, origins = [], {}

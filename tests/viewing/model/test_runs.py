@@ -12,7 +12,8 @@ from mcap.reader import make_reader
 from mcap.writer import Writer
 from support.imu_defects import batch_of, late, pick, repeated, with_values, write_log
 
-from imutool.debiasing import apply, apply_with_std, debias
+from imutool.bias_start.correction import apply, apply_with_std
+from imutool.debiasing import debias
 from imutool.errors import ConfigError, DataError, LogError
 from imutool.evaluation import started
 from imutool.mcap_io.codec import schemas
@@ -24,7 +25,7 @@ from imutool.mcap_io.topics import DERIVED_KEY, ImuBatch
 from imutool.mcap_io.write import write
 from imutool.recording import Imu, Recording
 from imutool.sensor.flight import flight
-from imutool.viewing.model.findings import FINDINGS
+from imutool.viewing.model.events import FINDINGS
 from imutool.viewing.model.runs import MAX_ENTRIES, MAX_VALUE_LENGTH, load, provenance
 
 LAST_BITS = 1e-12  # rad/s and m/s²: the bias in blocks and in one go
