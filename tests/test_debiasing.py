@@ -27,7 +27,7 @@ from imutool.bias_start.initial_bias import (
     from_numbers,
     from_truth,
     prior,
-    smooth,
+    smoothed_start,
     tracked_from_prior,
 )
 from imutool.bias_start.model_choice import estimate_at_rest
@@ -363,7 +363,7 @@ def test_smoothing_takes_the_whole_log_and_says_so(source: Path, recording: Reco
         model = load(path)
     report = debias(source, tmp_path / "out.mcap", model=path, smooth=True)
     imu = recording.imu
-    start = smooth(model, [(seconds(imu.t_ns, int(imu.t_ns[0])), imu.gyro, imu.accel)])
+    start = smoothed_start(model, [(seconds(imu.t_ns, int(imu.t_ns[0])), imu.gyro, imu.accel)])
     made = read(tmp_path / "out.mcap", imu="/imu0/debiased").imu
     np.testing.assert_allclose(made.gyro, apply(model, start, imu).imu.gyro, rtol=0, atol=1e-12)
     assert report.starts["/imu0"].how == start.how
