@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 import torch
@@ -17,8 +15,6 @@ from imutool.geometry import so3
 from imutool.inertial.windows import end_attitude
 from imutool.recording import seconds
 from imutool.sensor.flight import flight
-from imutool.training.fit import Training
-from imutool.training.settings import TrainSettings
 
 RATE_HZ = 200.0
 STREAM = 1e-6  # rad/s and m/s²: of numpy against torch, as for every model
@@ -79,23 +75,3 @@ def test_the_default_scheme_stands_in_no_file() -> None:
 def test_it_needs_a_drift_of_the_gyro() -> None:
     with pytest.raises(ConfigError, match="drift of the gyro"):
         Model(Config(scheme="joint", drift=()), RATE_HZ)
-
-
-def test_training_lowers_the_held_out_error_and_the_file_works(tmp_path: Path) -> None:
-    settings = TrainSettings(
-        gyro_window_s=(0.25, 0.5),
-        accel_window_s=(0.25,),
-        samples=400,
-        steps=30,
-        validate_every=30,
-        track_knot_s=4.0,
-        model={"scheme": "joint", "curve_width": 8},
-    )
-    training = Training([flight(seed, duration_s=6.0, still_s=0.5) for seed in (1, 2)], "neural_ode", settings)
-    epochs = [epoch for epoch in training.epochs() if epoch.sensor == "gyro"]
-    assert epochs[-1].held_out < epochs[0].held_out
-    io.save(training.model, tmp_path / "joint.safetensors")
-    loaded = io.load(tmp_path / "joint.safetensors")
-    imu = flight(3, duration_s=2.0).imu
-    bias = loaded.stream(loaded.prior_mean.numpy())(seconds(imu.t_ns, int(imu.t_ns[0])), imu.gyro, imu.accel)
-    assert np.isfinite(bias).all()
