@@ -29,13 +29,22 @@ Every command has `--help`. With `--json FILE|-` a command writes its report as 
 | 130 | interrupted | |
 """
 
+EFFECTS = """# Effects
+
+What distinguishes a real sensor from an ideal one: `imutool simulate` applies it, `imutool diagnose` finds it, bias
+models correct it. Each is one file in `imutool/sensor/effects/`.
+"""
 
 PLACEHOLDERS = {"str": "TEXT", "int": "N", "float": "X", "Path": "PATH", "path": "PATH", "int range": "N"}
 
 
 def on_files(files: Files, config: Any) -> Files:
     """Adds the generated pages."""
-    for name, text in (("reference/commands.md", commands()), *project_files()):
+    for name, text in (
+        ("reference/commands.md", commands()),
+        ("reference/effects.md", effects()),
+        *project_files(),
+    ):
         files.append(File.generated(config, name, content=text))
     return files
 
@@ -45,6 +54,18 @@ def project_files() -> Iterator[tuple[str, str]]:
     for name in ("CONTRIBUTING.md", "CHANGELOG.md"):
         text = (ROOT / name).read_text(encoding="utf-8")
         yield name.lower(), re.sub(r"\]\(docs/", "](", text)
+
+
+def effects() -> str:
+    """Markdown with a table of the effects, from the catalogue itself."""
+    from imutool.sensor import catalogue
+
+    rows = ["| effect | equation | parameters | observable if |", "|---|---|---|---|"]
+    for effect in catalogue.effects():
+        units = dict.fromkeys(parameter.unit for parameter in effect.parameters)
+        parameters = f"{len(effect.parameters)} ({', '.join(units)})"
+        rows.append(" | ".join(("", f"`{effect.name}`", f"`{effect.equation}`", parameters, effect.observable_if, "")).strip())
+    return "\n".join([EFFECTS, *rows, ""])
 
 
 def commands() -> str:

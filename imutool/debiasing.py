@@ -23,7 +23,7 @@ from imutool.bias.model import BiasModel, SampleStream, Stream, Vector6
 from imutool.bias_start.bias_covariance import BiasEstimator
 from imutool.bias_start.initial_bias import InitialBias, tracked_from_prior
 from imutool.bias_start.model_choice import check_smooth, choose_model_and_start
-from imutool.cleaning import Cleaner, Rules, Survey, look
+from imutool.cleaning import Cleaner, CleaningSettings, Survey, look
 from imutool.config import plain
 from imutool.errors import ConfigError, LogError
 from imutool.location import Location
@@ -203,7 +203,7 @@ def debias(
     init: str = "auto",
     smooth: bool = False,
     check: str = "imu",
-    clean: Rules | None = None,
+    clean: CleaningSettings | None = None,
     overwrite: bool = False,
     progress: Callable[[int, int], None] | None = None,
     watch: BlockCallback | None = None,
@@ -262,7 +262,7 @@ class _Options:
     imus: Sequence[str]
     init: str
     smooth: bool
-    clean: Rules | None
+    clean: CleaningSettings | None
     check: str
     overwrite: bool
     watch: BlockCallback | None

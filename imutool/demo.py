@@ -109,7 +109,7 @@ def _check(out: Path, overwrite: bool) -> None:
     if out.exists() and not out.is_dir():
         raise ConfigError("is a file", where=out, expected="a folder")
     if out.exists() and any(out.iterdir()) and not overwrite:
-        raise ConfigError("is not empty", where=out, fix="Choose another -o, or add --overwrite")
+        raise ConfigError("is not empty", where=out, fix="Choose another `out`, or add `overwrite`")
 
 
 def write_asl(recording: Recording, folder: Path) -> None:

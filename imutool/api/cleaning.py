@@ -9,7 +9,7 @@ from pathlib import Path
 from imutool.api.logs import Progress
 from imutool.api.paths import LogPath, location
 from imutool.bag.repair import NO_ATTACHMENTS, BagReport, is_bag, repair_bag
-from imutool.cleaning import Rules, Survey, look
+from imutool.cleaning import CleaningSettings, Survey, look
 from imutool.cleaning.settings import chosen
 from imutool.errors import ConfigError, LogError
 from imutool.mcap_io.recovery.losses import Losses
@@ -91,7 +91,7 @@ def clean(
     return CleanReport(tuple(report.surveys.values()), report.losses, dict(report.rewrite.added))
 
 
-def _survey(source: LogPath, imus: Sequence[str], rules: Rules) -> CleanReport:
+def _survey(source: LogPath, imus: Sequence[str], rules: CleaningSettings) -> CleanReport:
     with RecoveredLog(location(source)) as log:
         topics = list(imus) or log.imu_topics
         if not topics:

@@ -1,4 +1,4 @@
-"""The neural ODE at work in numpy: torch's overhead for one sample is twenty times its arithmetic."""
+"""Neural ODE in numpy for live use: torch's overhead for one sample is twenty times its arithmetic."""
 
 from __future__ import annotations
 

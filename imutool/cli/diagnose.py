@@ -42,8 +42,8 @@ def diagnose(
     """Find where a recording differs from a simulation, name what physics was left out, model it, and show the gain."""
     from imutool import diagnosis_output
     from imutool.diagnosis.diagnose import diagnose as run
-    from imutool.diagnosis.wording import below, conclusion
-    from imutool.diagnosis.wording import table as findings_table
+    from imutool.diagnosis.wording.conclusion import below, conclusion
+    from imutool.diagnosis.wording.conclusion import table as findings_table
     from imutool.viewing.model.runs import load
 
     def look(findings: Path) -> list[RunData]:

@@ -16,19 +16,21 @@ from imutool.diagnosis import summarize
 from imutool.diagnosis.compare_findings import ANOTHER_MOTION
 from imutool.diagnosis.estimation import timestamps
 from imutool.diagnosis.estimation import unnamed_effects as unnamed
-from imutool.diagnosis.estimation.alignment import LEAST_S, Pair, same_motion, with_simulation, with_truth
-from imutool.diagnosis.estimation.block_scatter import scatter
-from imutool.diagnosis.estimation.fixed_parameters import with_free
-from imutool.diagnosis.estimation.forward_cache import Chosen
-from imutool.diagnosis.estimation.gauss_newton import WhitenedLog, expected, fit
+from imutool.diagnosis.estimation.aligned_log import Pair
+from imutool.diagnosis.estimation.alignment import LEAST_S, same_motion, with_simulation, with_truth
+from imutool.diagnosis.estimation.gauss_newton import fit
+from imutool.diagnosis.estimation.jacobians import Chosen, expected
 from imutool.diagnosis.estimation.model_selection import Selection, select_effects
 from imutool.diagnosis.estimation.noise_estimate import whitened
-from imutool.diagnosis.estimation.observability import unobservable
+from imutool.diagnosis.estimation.observability import unobservable, with_free
+from imutool.diagnosis.estimation.significance import scatter
+from imutool.diagnosis.estimation.whitening import WhitenedImu
 from imutool.diagnosis.reference_errors import wrong_for_moments
 from imutool.diagnosis.reference_free_checks import by_samples
 from imutool.diagnosis.resimulation import simulated_again
 from imutool.diagnosis.result import Closer, Diagnosis, Finding
 from imutool.diagnosis.scalar.diagnose import SignalDiagnosis, diagnose_signal
+from imutool.diagnosis.settings import DiagnoseSettings
 from imutool.diagnosis.to_physics_file import NO_EFFECT
 from imutool.errors import ConfigError, DataError, ImutoolError, NumericsError
 from imutool.location import Location
@@ -62,6 +64,7 @@ def diagnose(
     truth: str | None = None,
     signals: Sequence[str] = (),
     tell: Tell | None = None,
+    settings: DiagnoseSettings | None = None,
 ) -> Diagnosis:
     """What separates recordings from a simulation, or from what their own true poses say.
 
@@ -73,7 +76,7 @@ def diagnose(
         ConfigError, LogError: a log cannot be read, or has no such topic; signals without a simulation, or of several logs.
         DataError: no truth and no simulation, too little shared time, another motion, no axis that tells anything.
     """
-    say = tell or (lambda done, total, text: None)
+    say, settings = tell or (lambda done, total, text: None), settings or DiagnoseSettings()
     if signals and (sim is None or len(reals) != 1):
         raise ConfigError("--signal compares one recording with its simulation", where="--signal", fix="Give one log and --sim")
     say(0, 4, "reading")
@@ -83,22 +86,24 @@ def diagnose(
     known: tuple[Finding, ...] = ()
     if sim is not None and simulated is not None and simulated.truths and _moves_apart(recordings, simulated, signals):
         say(0, 4, "the simulation, of another motion")
-        known, simulated = diagnose([sim], imu=imu).findings, None
+        known, simulated = diagnose([sim], imu=imu, settings=settings).findings, None
     apart = sim is not None and simulated is None
     pairs, left_out = _paired(recordings, simulated, truth)
     if not pairs:
         return by_samples(recordings[0], str(reals[0]), left_out[0])
     say(1, 4, "noise")
     candidates = _candidates(pairs)
-    logs = [whitened(pair, (*candidates, *unnamed.driven([pair]))) for pair in pairs]
+    logs = [whitened(pair, (*candidates, *unnamed.driven([pair])), settings.band) for pair in pairs]
     pairs = [log.pair for log in logs]
     say(2, 4, "searching")
     moments = wrong_for_moments(logs)
     asked, unnamed_too = ((), ()) if moments[0] else (candidates, later(pairs))
-    found = select_effects(logs, asked, unnamed_too, lambda word: say(2, 4, f"trying {word}"))
+    found = select_effects(logs, asked, unnamed_too, lambda word: say(2, 4, f"trying {word}"), settings=settings.search)
     say(3, 4, "locating")
     paths = {recording.name: str(real) for recording, real in zip(recordings, reals, strict=True)}
-    told = summarize.told(logs, found, paths, None if sim is None else str(sim), known, unobservable(logs, candidates))
+    told = summarize.told(
+        logs, found, paths, None if sim is None else str(sim), known, unobservable(logs, candidates, settings.search)
+    )
     if simulated is not None and any(one.effect not in NO_EFFECT for one in told.findings):
         say(3, 4, "simulating again")
         told = _again(told, logs, found, simulated)
@@ -106,12 +111,12 @@ def diagnose(
     told = replace(told, findings=(*moments[0], *told.findings), located=tuple(moments[1]) or told.located)
     for signal, real, there in beside:
         say(3, 4, signal)
-        told = _with_signal(told, diagnose_signal(real, there, others(reals[0], signal), signal))
+        told = _with_signal(told, diagnose_signal(real, there, others(reals[0], signal), signal, settings.search))
     say(4, 4, "")
     return told
 
 
-def _again(told: Diagnosis, logs: Sequence[WhitenedLog], found: Selection, sim: Recording) -> Diagnosis:
+def _again(told: Diagnosis, logs: Sequence[WhitenedImu], found: Selection, sim: Recording) -> Diagnosis:
     """With what a second simulation says of the findings; where there can be none, with the reason."""
     if any(one.effect == summarize.JITTER for one in told.findings):  # stamps that jitter are no physics to simulate
         return told
@@ -193,15 +198,16 @@ def measured(
     simulated = None if sim is None else read_log(sim, imu=imu)
     pairs = [_telling(pair) for pair in _pairs(read_log(real, imu=imu, truth=truth), simulated, truth)]
     candidates = _candidates(pairs)
-    logs = [whitened(pair, candidates) for pair in pairs]
+    settings = DiagnoseSettings()
+    logs = [whitened(pair, candidates, settings.band) for pair in pairs]
     asked = catalogue.diagnosed(effects)
-    hidden = set(unobservable(logs, asked))
+    hidden = set(unobservable(logs, asked, settings.search))
     shown = []
     for one in asked:
         free = [k for k, number in enumerate(one.parameters) if not {one.name, f"{one.name}.{number.name}"} & hidden]
         shown += [with_free(one, free)] if free else []
     found = fit(logs, tuple((one, one.null_value.astype(float)) for one in shown), part="all")
-    std = scatter(logs, found, "all").std if shown else {}
+    std = scatter(logs, found, "all", settings.search.robust_block_s).std if shown else {}
     return Measured(found.chosen, {name: np.asarray(one) for name, one in std.items()}, found.information, found.bias)
 
 
@@ -216,7 +222,7 @@ def remaining(real: Location, chosen: Chosen = (), *, imu: str | None = None, tr
     pairs = [_telling(pair) for pair in _pairs(read_log(real, imu=imu, truth=truth), None, truth)]
     candidates = _candidates(pairs)
     logs = []
-    for log in (whitened(pair, candidates) for pair in pairs):
+    for log in (whitened(pair, candidates, DiagnoseSettings().band) for pair in pairs):
         unobservable = replace(log.pair, fitted=np.zeros_like(log.pair.fitted), held_out=log.pair.fitted | log.pair.held_out)
         logs.append(replace(log, pair=unobservable))
     before, after = ([summarize.with_constant(log.pair, expected(log.pair, one)) for log in logs] for one in ((), chosen))

@@ -12,7 +12,8 @@ import numpy as np
 from jaxtyping import Float64
 from scipy.stats import chi2
 
-from imutool.diagnosis.estimation.gauss_newton import WhitenedLog, expected
+from imutool.diagnosis.estimation.jacobians import expected
+from imutool.diagnosis.estimation.whitening import WhitenedImu
 from imutool.diagnosis.result import Estimate, Finding, HeldOut, Located
 from imutool.units import ASCII_UNITS, AXES, SENSORS
 
@@ -24,7 +25,7 @@ QUIET = 1.1  # squares left a row outside
 JOIN_S = 0.6
 
 
-def wrong_for_moments(logs: Sequence[WhitenedLog]) -> tuple[list[Finding], list[Located]]:
+def wrong_for_moments(logs: Sequence[WhitenedImu]) -> tuple[list[Finding], list[Located]]:
     """`reference_error` with its length and moments, and where it is; nothing where the misfit is anything else."""
     if len(logs) != 1:
         return [], []

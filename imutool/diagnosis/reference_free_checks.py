@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from imutool.diagnosis.estimation import timestamps
-from imutool.diagnosis.estimation.alignment import Pair
+from imutool.diagnosis.estimation.aligned_log import Pair
 from imutool.diagnosis.result import Diagnosis, Estimate, Finding, HeldOut
 from imutool.inertial.stationary import white_noise
 from imutool.recording import Recording, seconds
@@ -23,7 +23,7 @@ def by_samples(real: Recording, path: str, why: str) -> Diagnosis:
     """
     stamp_s = seconds(real.imu.t_ns, int(real.imu.t_ns[0]))
     samples, none = np.concatenate([real.imu.gyro, real.imu.accel], axis=1), np.zeros(len(stamp_s), bool)
-    pair = Pair(real.name, IdealMotion(stamp_s, *np.zeros((3, len(stamp_s), 3))), stamp_s, samples, none, none)
+    pair = Pair(real.name, stamp_s, samples, none, none, felt=IdealMotion(stamp_s, *np.zeros((3, len(stamp_s), 3))))
     findings = [*timestamps.dropped([pair]), *timestamps.rounded([pair], white_noise(samples)), *_limits(pair)]
     told = f"{why.rstrip('.')}. Only what stamps and digits show by themselves could be asked"
     hidden = tuple(one.name for one in catalogue.diagnosed() if one.name not in BY_THEMSELVES)

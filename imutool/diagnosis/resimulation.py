@@ -14,8 +14,9 @@ import msgspec
 import numpy as np
 from jaxtyping import Float64
 
-from imutool.diagnosis.estimation.alignment import Pair
-from imutool.diagnosis.estimation.gauss_newton import WhitenedLog, expected
+from imutool.diagnosis.estimation.aligned_log import Pair
+from imutool.diagnosis.estimation.jacobians import expected
+from imutool.diagnosis.estimation.whitening import WhitenedImu
 from imutool.diagnosis.result import Closer
 from imutool.diagnosis.summarize import closer, floor, with_constant
 from imutool.errors import DataError
@@ -30,7 +31,7 @@ AS_GOOD = 0.3  # of the noise: how far a simulation along the poses may be from 
 MOST_OF_IT = 0.8  # of the held-out samples that the poses have to cover
 
 
-def simulated_again(logs: Sequence[WhitenedLog], sim: Recording, physics: PhysicsFile) -> Mapping[str, Closer]:
+def simulated_again(logs: Sequence[WhitenedImu], sim: Recording, physics: PhysicsFile) -> Mapping[str, Closer]:
     """By signal, the misfit of the simulation as it was given and as it is with some physics, on held-out time.
 
     Raises:
@@ -51,7 +52,7 @@ def simulated_again(logs: Sequence[WhitenedLog], sim: Recording, physics: Physic
         pair = replace(log.pair, fitted=log.pair.fitted & good, held_out=log.pair.held_out & good)
         if pair.held_out.sum() < MOST_OF_IT * log.pair.held_out.sum():
             raise DataError("its poses cover too little of the recording", where=sim.name)
-        there.append(WhitenedLog(pair, log.whiten))
+        there.append(WhitenedImu(pair, log.whiten))
         before.append(with_constant(pair, expected(pair, ())))
         after.append(with_constant(pair, found))
         _refuse_unlike(there[-1], before[-1], with_constant(pair, plain), sim)
@@ -78,7 +79,7 @@ def _read(pair: Pair, felts: Sequence[IdealMotion], acting: Acting) -> Float64[n
 
 
 def _refuse_unlike(
-    log: WhitenedLog, given: Float64[np.ndarray, "n 6"], plain: Float64[np.ndarray, "n 6"], sim: Recording
+    log: WhitenedImu, given: Float64[np.ndarray, "n 6"], plain: Float64[np.ndarray, "n 6"], sim: Recording
 ) -> None:
     """Poses that are too coarse or too noisy give another simulation than the one that was given, whatever the physics.
 

@@ -30,7 +30,7 @@ class Located(Section, frozen=True, omit_defaults=True):
     """Location of a misfit: axes of a signal, intervals (s from the start of the log) and regime.
 
     `share` is the part of the signal's misfit above the noise that lies there; `p_value` is that of noise alone.
-    `log` is the path of the log where there are several.
+    `log` is the path of the log where there are several; `reason` says why an unusable axis is no measurement.
     """
 
     signal: str
@@ -40,6 +40,7 @@ class Located(Section, frozen=True, omit_defaults=True):
     share: Number
     p_value: Number
     log: str = ""
+    reason: str = ""
 
 
 class Estimate(Section, frozen=True):

@@ -14,17 +14,19 @@ from scipy.stats import ttest_1samp
 from imutool.diagnosis.compare_findings import remarks, shared
 from imutool.diagnosis.estimation import timestamps
 from imutool.diagnosis.estimation import unnamed_effects as unnamed
-from imutool.diagnosis.estimation.alignment import LEAST_NOISE, Pair
-from imutool.diagnosis.estimation.forward_cache import Chosen
-from imutool.diagnosis.estimation.gauss_newton import Fit, WhitenedLog, expected, fit
-from imutool.diagnosis.estimation.late_stamps import late_stamps
+from imutool.diagnosis.estimation.aligned_log import Pair
+from imutool.diagnosis.estimation.alignment import LEAST_NOISE
+from imutool.diagnosis.estimation.gauss_newton import Fit, fit
+from imutool.diagnosis.estimation.jacobians import Chosen, expected
 from imutool.diagnosis.estimation.model_selection import SelectedEffect, Selection
 from imutool.diagnosis.estimation.noise_estimate import noise_std
+from imutool.diagnosis.estimation.timestamps import late_stamps
 from imutool.diagnosis.estimation.unnamed_effects import unit
-from imutool.diagnosis.localization import of_findings, of_what_is_left
-from imutool.diagnosis.quantity import percent
+from imutool.diagnosis.estimation.whitening import WhitenedImu
+from imutool.diagnosis.localization import locate_findings, locate_residual
 from imutool.diagnosis.result import Closer, Curve, Diagnosis, Estimate, Finding, HeldOut, Located, Traces, Unexplained
 from imutool.diagnosis.to_physics_file import to_physics_file
+from imutool.diagnosis.wording.quantity import percent
 from imutool.inertial.stationary import white_noise
 from imutool.sensor.physics_file import PhysicsFile
 from imutool.units import ASCII_UNITS, AXES, SENSORS, UNITS
@@ -39,7 +41,7 @@ BY_CHANCE = 1e-3  # or more, where so few values are left that noise alone excee
 
 
 def told(
-    logs: Sequence[WhitenedLog],
+    logs: Sequence[WhitenedImu],
     found: Selection,
     reals: Mapping[str, str],
     sim: str | None,
@@ -72,10 +74,10 @@ def told(
     still = [_with(pair, tuple(one for one in found.fitted.chosen if one[0].key in quiet)) for pair in pairs]
     unexplained = _unexplained(logs, after, noise)
     if findings:
-        places = of_findings(pairs, still, after, noise, findings, p_values)
+        places = locate_findings(pairs, still, after, noise, findings, p_values)
     else:  # where something is left all the same, it is said where
         odd = {name for name, one in unexplained.items() if not one.white}
-        places = [place for place in of_what_is_left(pairs, after, noise) if place.signal in odd]
+        places = [place for place in locate_residual(pairs, after, noise) if place.signal in odd]
     places += [place for pair in pairs for place in _stuck(pair, noise, several=len(reals) > 1)]
     return Diagnosis(
         real=tuple(reals.values()),
@@ -98,7 +100,7 @@ def _traces(pair: Pair, before: Float64[np.ndarray, "n 6"], after: Float64[np.nd
     )
 
 
-def without_held_out(logs: Sequence[WhitenedLog], found: Selection, d: Diagnosis) -> PhysicsFile:
+def without_held_out(logs: Sequence[WhitenedImu], found: Selection, d: Diagnosis) -> PhysicsFile:
     """What was found as physics.toml has it, with the numbers that the fitted time alone says; digits are no motion's."""
     theta = {physics.key: value for physics, value in found.fitted.chosen}
     judged = {(one.physics.name, one.physics.equation): replace(one, theta=theta[one.physics.key]) for one in found.selected}
@@ -115,7 +117,7 @@ def without_held_out(logs: Sequence[WhitenedLog], found: Selection, d: Diagnosis
 
 
 def _worthwhile(
-    logs: Sequence[WhitenedLog], found: Selection, noise: Float64[np.ndarray, "6"]
+    logs: Sequence[WhitenedImu], found: Selection, noise: Float64[np.ndarray, "6"]
 ) -> tuple[Selection, list[Finding], list[str]]:
     """A discovery without effects that bring nothing on unseen time beside the others, its findings, and those effects."""
     named, idle = [_finding(logs, found, one, noise) for one in found.selected], []
@@ -148,9 +150,9 @@ def _stuck(pair: Pair, floor: Float64[np.ndarray, "6"], *, several: bool) -> Ite
     stuck, there = timestamps.stuck(pair.real), expected(pair, ())
     for a in np.flatnonzero(stuck & ~_ended(pair) & (there.std(axis=0) > MOVES * floor)):
         signal = SENSORS[a // 3]
-        regime = f"always: it reads {pair.real[0, a]:.4g} {UNITS[signal]} in every sample"
+        reason = f"it reads {pair.real[0, a]:.4g} {UNITS[signal]} in every sample"
         span = ((float(pair.stamp_s[0]), float(pair.stamp_s[-1])),)
-        yield Located(signal, (AXES[a % 3],), span, regime, 1.0, 0.0, pair.name if several else "")
+        yield Located(signal, (AXES[a % 3],), span, f"always: {reason}", 1.0, 0.0, pair.name if several else "", reason)
 
 
 def _ended(pair: Pair) -> Bool[np.ndarray, "6"]:
@@ -170,7 +172,7 @@ def with_constant(pair: Pair, there: Float64[np.ndarray, "n 6"]) -> Float64[np.n
     return np.asarray(there + constant)
 
 
-def floor(logs: Sequence[WhitenedLog]) -> Float64[np.ndarray, "6"]:
+def floor(logs: Sequence[WhitenedImu]) -> Float64[np.ndarray, "6"]:
     """The noise of a sample by axis, before it was made white; of an axis nobody knows, that of those beside it."""
     total, count = np.zeros(6), np.zeros(6)
     for log in logs:
@@ -183,7 +185,7 @@ def floor(logs: Sequence[WhitenedLog]) -> Float64[np.ndarray, "6"]:
     return np.asarray(np.sqrt(variance))
 
 
-def _unseen(log: WhitenedLog, there: Float64[np.ndarray, "n 6"], part: slice) -> Float64[np.ndarray, " m"]:
+def _unseen(log: WhitenedImu, there: Float64[np.ndarray, "n 6"], part: slice) -> Float64[np.ndarray, " m"]:
     """What is left on held-out samples that tell anything, up to where what is expected is known."""
     pair, counts = log.pair, log.whiten.counts
     left, rows = pair.real - there, pair.held_out[:: log.whiten.every]
@@ -192,7 +194,7 @@ def _unseen(log: WhitenedLog, there: Float64[np.ndarray, "n 6"], part: slice) ->
     return np.asarray(left[rows, part].ravel() if counts is None else left[rows, part][counts[rows, part]])
 
 
-def closer(logs: Sequence[WhitenedLog], before: Sequence[np.ndarray], after: Sequence[np.ndarray]) -> dict[str, Closer]:
+def closer(logs: Sequence[WhitenedImu], before: Sequence[np.ndarray], after: Sequence[np.ndarray]) -> dict[str, Closer]:
     """What all findings together bring to each sensor, on held-out time."""
     noise, out = floor(logs), {}
     for signal, k in _known([log.pair for log in logs]).items():
@@ -200,14 +202,14 @@ def closer(logs: Sequence[WhitenedLog], before: Sequence[np.ndarray], after: Seq
     return out
 
 
-def _noise(logs: Sequence[WhitenedLog], floor: Float64[np.ndarray, "6"], k: int) -> float:
+def _noise(logs: Sequence[WhitenedImu], floor: Float64[np.ndarray, "6"], k: int) -> float:
     """Of a sensor, over the axes of which anything is known."""
     part, axes = slice(3 * k, 3 * k + 3), np.any([log.pair.axes for log in logs], axis=0)
     return float(np.sqrt(np.mean(floor[part][axes[part]] ** 2)))
 
 
 def _held_out(
-    logs: Sequence[WhitenedLog], before: Sequence[np.ndarray], after: Sequence[np.ndarray], k: int, unit_: str
+    logs: Sequence[WhitenedImu], before: Sequence[np.ndarray], after: Sequence[np.ndarray], k: int, unit_: str
 ) -> HeldOut:
     """Root mean squares over held-out samples and axes of a signal, and how long that was; no numbers where none are known."""
     part = slice(3 * k, 3 * k + 3)
@@ -219,7 +221,7 @@ def _held_out(
     return HeldOut(rms[0], rms[1], unit_, round(length, 1))
 
 
-def _finding(logs: Sequence[WhitenedLog], found: Selection, one: SelectedEffect, floor: Float64[np.ndarray, "6"]) -> Finding:
+def _finding(logs: Sequence[WhitenedImu], found: Selection, one: SelectedEffect, floor: Float64[np.ndarray, "6"]) -> Finding:
     """One effect: what leaving it out costs on time that its parameters were not fitted to."""
     pairs = [log.pair for log in logs]
     fitted = found.fitted
@@ -303,7 +305,7 @@ def _curve(pair: Pair, one: SelectedEffect, whole: Fit) -> Curve | None:
 
 
 def _unexplained(
-    logs: Sequence[WhitenedLog], after: Sequence[Float64[np.ndarray, "n 6"]], noises: Float64[np.ndarray, "6"]
+    logs: Sequence[WhitenedImu], after: Sequence[Float64[np.ndarray, "n 6"]], noises: Float64[np.ndarray, "6"]
 ) -> dict[str, Unexplained]:
     """Of the sensors of which anything is known; beside poses, whose errors come and go, by blocks that are of one mind."""
     out, beside_poses = {}, any(log.whiten.band is not None for log in logs)
@@ -311,7 +313,7 @@ def _unexplained(
         held, noise = _held_out(logs, after, after, k, ASCII_UNITS[signal]), _noise(logs, noises, k)
         part = slice(3 * k, 3 * k + 3)
         unseen = sum(len(_unseen(log, there, part)) for log, there in zip(logs, after, strict=True))
-        seen = sum(log.numbers("fitted") for log in logs) / 2.0  # of both sensors
+        seen = sum(log.count("fitted") for log in logs) / 2.0  # of both sensors
         most = max(WHITE, float(np.sqrt(fisher.isf(BY_CHANCE, unseen, max(seen, 1.0))))) if unseen else WHITE
         white = held.rms_after < most * noise
         if not white and beside_poses:
@@ -320,7 +322,7 @@ def _unexplained(
     return out
 
 
-def _by_chance(logs: Sequence[WhitenedLog], after: Sequence[Float64[np.ndarray, "n 6"]], k: int, noise: float) -> float:
+def _by_chance(logs: Sequence[WhitenedImu], after: Sequence[Float64[np.ndarray, "n 6"]], k: int, noise: float) -> float:
     """The chance of blocks of held-out time having so much more power than noise, as far as they differ among themselves."""
     powers: list[float] = []
     for log, there in zip(logs, after, strict=True):

@@ -12,7 +12,6 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import TracebackType
-from typing import Any
 
 from imutool.errors import ConfigError
 
@@ -100,7 +99,6 @@ def writing(path: Path) -> Iterator[None]:
         raise ConfigError(f"cannot be written ({reason})", where=path, fix=fix) from error
 
 
-SCHEMA = "imutool.export/1"
 Progress = Callable[[int, int, str], None]  # done, in all, what is being written
 
 
@@ -113,14 +111,3 @@ class ExportReport:
     imu: str | None = None
     written: dict[str, int] = field(default_factory=dict)
     left_out: list[str] = field(default_factory=list)
-
-    def plain(self) -> dict[str, Any]:
-        """The report as plain JSON values."""
-        return {
-            "schema": SCHEMA,
-            "output": str(self.output),
-            "format": self.format,
-            "imu": self.imu,
-            "written": self.written,
-            "left_out": self.left_out,
-        }

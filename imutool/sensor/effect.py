@@ -86,6 +86,7 @@ class CompiledEffect:
 class Effect:
     """An effect on a sensor: its equation, its parameters and its forward model.
 
+    observable_if: what a log must have for the parameters to show, as the reference of the effects lists it.
     forward: (IdealMotion, theta) -> IdealMotion up to BANDWIDTH; (taken_s, theta) -> taken_s at CLOCK; (SensorSamples, theta)
         -> SensorSamples behind it.
     linear: whether what it adds is proportional to theta (then a fit may start at zero).
@@ -95,6 +96,7 @@ class Effect:
     needs: channels that it cannot do without, such as "temperature"; a channel whose name contains it serves.
     kind: of the catalogue, driven by the channel `variable`, or unknown: a curve of `variable`, or a term, on one `axis`.
     variant: tells effects of one name apart.
+    jumps: what comes out is no smooth function of the parameters: an edge between two samples.
     trained: a bias model can have it: its error follows from the sensor's own samples and is linear in all parameters but those
         `fixed_in_training`.
     diagnosed: a diagnosis may find it.
@@ -107,16 +109,17 @@ class Effect:
     sensors: tuple[Sensor, ...]
     equation: str
     parameters: tuple[Parameter, ...]
-    seen_if: str
+    observable_if: str
     forward: Callable[[Any, Theta], Any]
     linear: bool = True
-    starts: Callable[[IdealMotion, SensorSamples], Sequence[Theta]] | None = None
+    starts: Callable[[Any, Any], Sequence[Theta]] | None = None
     alternatives: Callable[[SensorSamples], int] | None = None
     needs: tuple[str, ...] = ()
     kind: Kind = "catalogue"
     variable: str = ""
     axis: int | None = None
     variant: str = ""
+    jumps: bool = False
     trained: bool = False
     diagnosed: bool = True
     basis: Callable[[Signals], Float64[np.ndarray, "n q"]] | None = None
@@ -177,7 +180,7 @@ def residual(motion: IdealMotion, samples: SensorSamples) -> tuple[Float64[np.nd
     return samples.gyro - ideal.gyro, samples.accel - ideal.accel
 
 
-CONVERTER_ORDER = {"saturation": 1, "quantization": 2}
+WITHIN_STAGE = {"gain": -2, "dead_band": -1, "saturation": 1, "quantization": 2}
 Acting = Sequence[tuple[Effect, Theta]]
 
 
@@ -185,10 +188,10 @@ Acting = Sequence[tuple[Effect, Theta]]
 class SignalState:
     """Signals between two effects: a motion and when it is sampled, or, behind the clock, the samples."""
 
-    motion: IdealMotion
+    motion: Any  # an `IdealMotion`, or another signal with the same method `sample`
     taken_s: Times
     stamp_s: Times
-    taken: SensorSamples | None = None
+    taken: Any = None
 
     def through(self, effect: Effect, theta: Theta) -> SignalState:
         """The signals behind one more effect, the next in stage order."""
@@ -202,7 +205,7 @@ class SignalState:
         """The signals with the samples taken: behind this, clock and motion do not matter any more."""
         return self if self.taken is not None else SignalState(self.motion, self.taken_s, self.stamp_s, self.samples())
 
-    def samples(self) -> SensorSamples:
+    def samples(self) -> Any:
         """One row a sample."""
         return self.motion.sample(self.taken_s, self.stamp_s) if self.taken is None else self.taken
 
@@ -212,7 +215,8 @@ def simulate_samples(motion: IdealMotion, stamp_s: Times, acting: Acting) -> Sen
     state = SignalState(motion, np.asarray(stamp_s, dtype=np.float64), stamp_s)
     for effect, theta in in_stage_order(acting):
         state = state.through(effect, theta)
-    return state.samples()
+    samples: SensorSamples = state.samples()
+    return samples
 
 
 def simulate_stretches(
@@ -255,5 +259,5 @@ def in_stage_order(acting: Acting) -> list[tuple[Effect, Theta]]:
 
 
 def stage_order(effect: Effect) -> tuple[int, int, str]:
-    """Sorting key of an effect: its stage, then its place in the converter, then its key."""
-    return effect.stage, CONVERTER_ORDER.get(effect.name, 0), effect.key
+    """Sorting key of an effect: its stage, then its place within it, then its key."""
+    return effect.stage, WITHIN_STAGE.get(effect.name, 0), effect.key

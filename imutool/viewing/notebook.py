@@ -69,7 +69,7 @@ class Page:
 
 
 def page(logs: Sequence[RunData], *, height_px: int = HEIGHT_PX) -> Page:
-    """HTML report of all logs, which also shows in a saved notebook and on a web page made of it.
+    """HTML report of all logs, which also shows in a saved notebook.
 
     Raises:
         ConfigError: no log, or matplotlib is not installed.

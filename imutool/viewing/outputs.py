@@ -114,7 +114,7 @@ class Outputs:
         return [*self._pages(logs), *self._recordings(logs, at_s)]
 
     def versions(self) -> dict[str, str | None]:
-        """Versions of imutool, of the installed Rerun, and of the viewer at `connect`, which may differ."""
+        """Versions of imutool, of the installed Rerun, and of the viewer at `connect`."""
         rerun = version("rerun-sdk") if find_spec("rerun") is not None else None
         return {"imutool": __version__, "rerun": rerun, "viewer": rerun if self._peer is None else self._peer.version}
 
@@ -159,7 +159,7 @@ class Outputs:
 
 
 def cursor_s(logs: Sequence[RunData], at: str) -> float:
-    """Cursor time since the first IMU sample: `at` in seconds, or the largest error of the first log with truth.
+    """Cursor time (s since the first IMU sample) from `at`: seconds, or `worst`.
 
     The error is the orientation error of the models, of raw without a model.
 

@@ -19,7 +19,7 @@ from scipy.signal import butter, sosfiltfilt
 from sensor_tables import markdown
 
 from imutool.diagnosis.estimation.alignment import with_truth
-from imutool.diagnosis.estimation.gauss_newton import expected
+from imutool.diagnosis.estimation.jacobians import expected
 from imutool.mcap_io.read import read
 from imutool.sensor.trajectory import smooth_motion
 

@@ -19,7 +19,7 @@ from imutool.cli import app
 from imutool.diagnosis.estimation import unnamed_effects as unnamed
 from imutool.diagnosis.result import Curve, Diagnosis, Estimate, Finding, HeldOut
 from imutool.diagnosis.to_physics_file import to_physics_file
-from imutool.diagnosis.wording import conclusion
+from imutool.diagnosis.wording.conclusion import conclusion
 from imutool.errors import ConfigError
 from imutool.mcap_io.read import read
 from imutool.mcap_io.write import write

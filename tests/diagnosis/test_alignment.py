@@ -8,13 +8,14 @@ import numpy as np
 import pytest
 from support import planted
 
-from imutool.diagnosis.estimation.alignment import Pair, split, wiener_filter, with_simulation, with_truth
+from imutool.diagnosis.estimation.aligned_log import Pair, split
+from imutool.diagnosis.estimation.alignment import wiener_filter, with_simulation, with_truth
 from imutool.errors import DataError
 from imutool.recording import Recording, Scalars
 
 KEPT = 0.01  # of a signal below a tenth of Nyquist that the filter may change
 NOISE_LEFT = 0.25  # of the noise's size above the signal's band: one smoothed bin in eighty stands out by twice, by chance
-BUFFER_S = 0.25  # a little less than what lies around a border
+MARGIN_S = 0.25  # a little less than what lies around a border
 GRID_S = 0.011  # the step of the correlation that aligns two clocks
 SLACK = 1.05  # over the noise: what reading a spline between samples may add
 YEAR_NS = 365 * 86_400 * 1_000_000_000
@@ -230,7 +231,7 @@ def test_about_a_third_is_held_out_and_apart_from_what_is_fitted(duration_s: flo
     order = np.argsort(times)
     border = np.diff(kinds[order]) != 0
     assert border.sum() >= 2
-    assert np.diff(times[order])[border].min() > 2.0 * BUFFER_S  # neither looks over it
+    assert np.diff(times[order])[border].min() > 2.0 * MARGIN_S  # neither looks over it
 
 
 def test_gaps_and_ends_count_for_neither() -> None:
@@ -238,7 +239,7 @@ def test_gaps_and_ends_count_for_neither() -> None:
     keep = (t < 14.0) | (t > 15.5)
     t = t[keep]
     _, usable = split(t)
-    near = (np.abs(t - 14.0) < BUFFER_S) | (np.abs(t - 15.5) < BUFFER_S) | (t < BUFFER_S) | (t > t[-1] - BUFFER_S)
+    near = (np.abs(t - 14.0) < MARGIN_S) | (np.abs(t - 15.5) < MARGIN_S) | (t < MARGIN_S) | (t > t[-1] - MARGIN_S)
     assert near.sum() > 80
     assert not usable[near].any()
 

@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 from support import planted
 
-from imutool.diagnosis.estimation.forward_cache import bound, free
-from imutool.diagnosis.estimation.gauss_newton import PATIENCE, PRIOR, Fit, expected, fit
-from imutool.diagnosis.estimation.jacobians import Jacobians
+from imutool.diagnosis.estimation.gauss_newton import PATIENCE, PRIOR, Fit, fit
+from imutool.diagnosis.estimation.jacobians import Jacobians, bound, expected, free
 from imutool.sensor import catalogue
 
 SURE = 4.0  # standard deviations: 1 in 16 000 outside
@@ -63,13 +62,13 @@ def test_uncertainties_are_calibrated(name: str) -> None:
 
 def test_what_is_left_of_the_right_model_is_noise() -> None:
     got, _ = fit_of_planted(EFFECTS["arm and clock"], 5)
-    n = 6 * got.rows
+    n = got.numbers
     assert abs(got.objective - n) < SURE * np.sqrt(2 * n)
 
 
 def test_biases_come_back_beside_the_effects() -> None:
     got, _ = fit_of_planted(EFFECTS["lever arm"], 6)
-    assert (np.abs(got.bias[0] - planted.BIAS) < 2 * SURE * planted.NOISE / np.sqrt(got.rows)).all()
+    assert (np.abs(got.bias[0] - planted.BIAS) < 2 * SURE * planted.NOISE / np.sqrt(got.numbers / 6)).all()
 
 
 def test_without_effects_the_bias_is_the_mean_of_what_is_left() -> None:
@@ -112,7 +111,7 @@ def test_two_logs_share_parameters_and_keep_biases_of_their_own() -> None:
     both, alone = fit(logs, begun), [fit([log], begun) for log in logs]
     std = both.stds()["lever_arm"]
     assert np.abs((both.chosen[0][1] - truth) / std).max() < SURE
-    assert (np.abs(both.bias - biases) < 2 * SURE * planted.NOISE / np.sqrt(both.rows / 2)).all()
+    assert (np.abs(both.bias - biases) < 2 * SURE * planted.NOISE / np.sqrt(both.numbers / 12)).all()
     information = sum(one.stds()["lever_arm"] ** -2.0 for one in alone)
     np.testing.assert_allclose(std, information**-0.5, rtol=0.1)  # but for correlations between the axes
 
@@ -136,7 +135,7 @@ def test_held_out_rows_do_not_enter_a_fit() -> None:
     pair.real[~pair.fitted] += 100.0
     there = fit([planted.weighed(pair)], begun)
     np.testing.assert_array_equal(here.chosen[0][1], there.chosen[0][1])
-    assert here.rows == there.rows == int(pair.fitted.sum())
+    assert here.numbers == there.numbers == 6 * int(pair.fitted.sum())
 
 
 @pytest.mark.parametrize("part", ["fitted", "held_out", "all"])
@@ -145,7 +144,7 @@ def test_each_part_gives_the_same_answer_but_for_its_noise(part: str) -> None:
     got = fit([planted.weighed(pair)], planted.acting({"clock_offset": [0.0]}), part=part)
     assert abs(got.chosen[0][1][0] - 0.02) < SURE * got.stds()["clock_offset"][0]
     rows = {"fitted": pair.fitted, "held_out": pair.held_out, "all": pair.fitted | pair.held_out}[part]
-    assert got.rows == int(rows.sum())
+    assert got.numbers == 6 * int(rows.sum())
 
 
 def test_a_fit_never_ends_worse_than_it_began() -> None:
@@ -185,7 +184,7 @@ def test_derivatives_that_were_kept_end_where_new_ones_end(monkeypatch: pytest.M
     pair = planted.pair(planted.rich(), {"low_pass": [6.0], "lever_arm": [0.3, -0.2, 0.1]}, 13)
     log, begun = planted.weighed(pair), planted.acting({"low_pass": [15.0], "lever_arm": [0.0] * 3})
     kept = fit([log], begun)
-    monkeypatch.setattr("imutool.diagnosis.estimation.gauss_newton.STRAIGHT", 0.0)  # so that every step asks for new ones
+    monkeypatch.setattr("imutool.diagnosis.estimation.gauss_newton.PREDICTED", 0.0)  # so that every step asks for new ones
     monkeypatch.setattr(Jacobians, "linear", lambda self: None)
     anew = fit([log], begun)
     for (_, one), (physics, other) in zip(kept.chosen, anew.chosen, strict=True):
@@ -198,5 +197,5 @@ def test_a_fit_that_falls_short_of_what_was_hoped_for_goes_no_further() -> None:
     whole = fit([log], begun)
     short = fit([log], begun, iterations=PATIENCE)
     assert whole.objective < short.objective - 1.0
-    np.testing.assert_array_equal(fit([log], begun, hopeful=0.0).chosen[0][1], short.chosen[0][1])
-    np.testing.assert_array_equal(fit([log], begun, hopeful=np.inf).chosen[0][1], whole.chosen[0][1])
+    np.testing.assert_array_equal(fit([log], begun, give_up_above=0.0).chosen[0][1], short.chosen[0][1])
+    np.testing.assert_array_equal(fit([log], begun, give_up_above=np.inf).chosen[0][1], whole.chosen[0][1])

@@ -11,9 +11,10 @@ from scipy.stats import chi2
 from support import planted
 
 from imutool.diagnosis.estimation import unnamed_effects as unnamed
-from imutool.diagnosis.estimation.alignment import Pair
-from imutool.diagnosis.estimation.model_selection import FALSE_DISCOVERY, Selection, select_effects
+from imutool.diagnosis.estimation.aligned_log import Pair
+from imutool.diagnosis.estimation.model_selection import Selection, select_effects
 from imutool.diagnosis.estimation.significance import log_p_value
+from imutool.diagnosis.settings import SearchSettings
 
 SURE = 4.0
 DURATION_S = 20.0
@@ -111,7 +112,7 @@ def test_a_single_effect_is_found_alone_and_by_its_name(name: str) -> None:
     )
     assert names(found) == [name]
     assert sure(found, name, SINGLE[name])
-    assert found.selected[0].false_discovery_rate <= FALSE_DISCOVERY
+    assert found.selected[0].false_discovery_rate <= SearchSettings().false_discovery_rate
     assert found.selected[0].unidentified == ()
 
 

@@ -8,9 +8,12 @@ import numpy as np
 import pytest
 from support import planted
 
-from imutool.diagnosis.estimation.gauss_newton import WhitenedLog
-from imutool.diagnosis.estimation.observability import ENOUGH, unobservable
-from imutool.diagnosis.estimation.whitening import Whitener
+from imutool.diagnosis.estimation.observability import FOLLOWING, below_model_error, unobservable
+from imutool.diagnosis.estimation.whitening import WhitenedLog, Whitener
+from imutool.diagnosis.settings import SearchSettings
+from imutool.sensor import catalogue
+
+SETTINGS = SearchSettings()
 
 
 def shown(felt: object, names: list[str] | None = None, *, noise: float = 1.0, known: np.ndarray | None = None) -> set[str]:
@@ -19,7 +22,7 @@ def shown(felt: object, names: list[str] | None = None, *, noise: float = 1.0, k
     white = Whitener(np.ones((6, 1)), noise * planted.NOISE)
     log = WhitenedLog(pair, white if known is None else white.counting(known))
     some = [one for one in planted.catalogue() if names is None or one.name in names]
-    return set(unobservable([log], some))
+    return set(unobservable([log], some, SETTINGS))
 
 
 def test_a_motion_about_every_axis_shows_every_scale() -> None:
@@ -40,7 +43,7 @@ def test_a_number_is_seen_where_its_plausible_size_adds_enough_squares(share: fl
     rows = pair.fitted | pair.held_out
     rate = felt.gyro[rows, 2]
     plausible = next(one for one in planted.catalogue() if one.name == "gyro_scale").plausible[2]
-    noise = plausible * np.sqrt(((rate - rate.mean()) ** 2).sum() / ENOUGH)
+    noise = plausible * np.sqrt(((rate - rate.mean()) ** 2).sum() / SETTINGS.observable_squares)
     hidden = shown(felt, ["gyro_scale"], noise=share * noise / planted.NOISE[0])
     assert ("gyro_scale" not in hidden) == seen
 
@@ -58,3 +61,29 @@ def test_an_axis_of_which_nothing_is_known_shows_nothing() -> None:
     known = np.ones((len(felt.t_s), 6), bool)
     known[:, 1] = False
     assert shown(felt, ["gyro_scale", "accel_scale"], known=known) == {"gyro_scale.y"}
+
+
+def test_every_effect_with_a_model_error_floor_is_in_the_catalogue() -> None:
+    assert {one.name for one in catalogue.diagnosed(sorted(FOLLOWING))} == FOLLOWING
+
+
+@pytest.mark.parametrize(("denoised", "allowed"), [(False, SETTINGS.model_error), (True, SETTINGS.model_error_denoised)])
+def test_a_filter_or_a_clock_must_explain_more_than_a_larger_models_error(denoised: bool, allowed: float) -> None:
+    for name in FOLLOWING:
+        assert below_model_error({"lever_arm": 1e8, name: 0.9e8 * allowed}, denoised, SETTINGS) == {name}
+        assert not below_model_error({"lever_arm": 1e8, name: 1.1e8 * allowed}, denoised, SETTINGS)
+
+
+def test_a_mass_on_springs_does_more_than_its_model_says() -> None:
+    between = 0.5 * SETTINGS.model_error_resonance
+    assert below_model_error({"mount_resonance": 1.0, "clock_offset": between}, False, SETTINGS) == {"clock_offset"}
+    assert not below_model_error({"lever_arm": 1.0, "clock_offset": between}, False, SETTINGS)
+
+
+def test_what_does_not_follow_the_motion_is_told_however_faint() -> None:
+    assert not below_model_error({"timestamp_jitter": 1e9, "temperature": 300.0, "gyro_scale": 30.0}, True, SETTINGS)
+
+
+def test_an_effect_alone_is_told() -> None:
+    assert not below_model_error({"clock_offset": 25.0}, True, SETTINGS)
+    assert not below_model_error({}, False, SETTINGS)

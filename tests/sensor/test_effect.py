@@ -100,7 +100,7 @@ def test_it_says_what_it_is(one: Effect) -> None:
     assert set(one.sensors) <= {"gyro", "accel"}
     assert one.sensors
     assert one.equation
-    assert one.seen_if
+    assert one.observable_if
     names = [number.name for number in one.parameters]
     assert len(set(names)) == len(names) > 0
     assert all(number.unit for number in one.parameters)

@@ -387,7 +387,7 @@ def test_a_physics_file_says_which_effects_hybrid_takes_off_and_what_is_left(tmp
 def test_a_physics_file_of_which_hybrid_knows_nothing_is_refused(tmp_path: Path) -> None:
     file = tmp_path / "physics.toml"
     file.write_text(entry("saturation", "gyro", "rad/s"))
-    with pytest.raises(ConfigError, match="no effect that a bias model can take off"):
+    with pytest.raises(ConfigError, match="no effect that a bias model can correct"):
         settings_for(file)
     said = CliRunner().invoke(app, ["train", "a.mcap", "-o", str(tmp_path / "m"), "--method", "linear", "--physics", str(file)])
     assert said.exit_code == 3

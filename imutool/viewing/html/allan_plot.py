@@ -1,4 +1,4 @@
-"""A picture of Allan deviations on paper, with the slopes that were read off them."""
+"""Plot of Allan deviations with the fitted noise terms, as a PNG."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ HEIGHT_INCH = 3.8
 
 
 def write_png(found: IdentifiedNoise, path: Path, *, overwrite: bool = False) -> None:
-    """Writes a PNG: the deviation of each axis as points, the fitted sum as a line, each slope seen as its own.
+    """Write a PNG of the Allan deviation of each axis, the fitted sum and each noise term.
 
     Above what was seen at rest, below what was left in motion; only one of them where there is only one.
 
@@ -39,7 +39,7 @@ def write_png(found: IdentifiedNoise, path: Path, *, overwrite: bool = False) ->
 
 
 def png(found: IdentifiedNoise) -> bytes:
-    """The picture of `deviations` as the content of a file.
+    """Content of the PNG file of `write_png`.
 
     Raises:
         ConfigError: matplotlib is not installed.

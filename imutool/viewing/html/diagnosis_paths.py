@@ -1,4 +1,4 @@
-"""What a diagnosis is worth to who integrates: unseen stretches, each from its true start, without and with what was found.
+"""Integrated paths of a diagnosis: unseen stretches from a true start, before and after.
 
 A stretch's samples are what a perfect sensor would have read plus what is left over, before or after the findings are modelled
 (a constant bias is taken off either way). Their integral is `strapdown.dead_reckon`.
@@ -25,7 +25,7 @@ GRID_S = 0.05  # of the drift's clock
 
 
 class Stretch(NamedTuple):
-    """True poses of one unseen stretch, and what integration from its start makes of it, before and after."""
+    """True poses of one unseen stretch, and its integrated poses before and after the findings."""
 
     truth: Poses
     before: Poses
@@ -33,7 +33,7 @@ class Stretch(NamedTuple):
 
 
 def held_out_stretches(trace: Traces) -> Iterator[Stretch]:
-    """Unseen stretches without gaps that have poses, ten seconds long at most; none where no poses are known."""
+    """Unseen stretches without gaps, at most ten seconds long; none without known poses."""
     if trace.truth is None or trace.ideal is None:
         return
     rows = np.flatnonzero(held_out_mask(trace) & np.isfinite(trace.ideal).all(axis=1))
@@ -46,7 +46,7 @@ def held_out_stretches(trace: Traces) -> Iterator[Stretch]:
 
 
 def paths(d: Diagnosis) -> str | None:
-    """Unseen stretches of the first log seen from above, and how orientation and position drift from a true start, over all.
+    """Unseen stretches of the first log from above, and drift from a true start over all logs.
 
     None where no stretch has poses, or nothing was found.
     """
@@ -73,7 +73,7 @@ def paths(d: Diagnosis) -> str | None:
 
 
 def rms_drift(found: Sequence[Stretch], side: int) -> tuple[Float64[np.ndarray, " k"], Float64[np.ndarray, "k 2"]]:
-    """Root mean square orientation error (deg) and position error (m) over stretches, by time since their start.
+    """Root mean square orientation (deg) and position error (m) by time since the start.
 
     `side` is 1 for before, 2 for after. As far as half of the stretches reach.
     """

@@ -1,4 +1,4 @@
-"""What every page has in common: one file of words and drawings that asks nobody for anything."""
+"""HTML page: document frame, colours, style sheet and escaping."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ from html import escape
 from imutool.location import Location
 
 GENERATOR = '<meta name="generator" content="imutool">'
-POLICY = "default-src 'none'; style-src 'unsafe-inline'"  # whatever a log is called, no request leaves the page
+POLICY = "default-src 'none'; style-src 'unsafe-inline'"  # no request leaves the page
 
 
 def document(title: str, body: Iterable[str], style: str = "") -> str:
-    """A whole page of lines that are markup already, for light and dark screens and for paper; the title is escaped."""
+    """HTML document from lines of markup, for light and dark screens and paper."""
     head = (
         f'<meta charset="utf-8"><meta http-equiv="Content-Security-Policy" content="{POLICY}">'
         '<meta name="viewport" content="width=device-width, initial-scale=1">'
@@ -24,23 +24,23 @@ def document(title: str, body: Iterable[str], style: str = "") -> str:
 
 
 def is_imutool_page(path: Location) -> bool:
-    """Whether a file begins like a page that imutool has written."""
+    """Whether a file begins like a page that imutool wrote."""
     with path.open("rb") as file:
         return GENERATOR.encode() in file.read(1024)
 
 
 def text(words: str) -> str:
-    """Words from anywhere, logs included, as text of the page: no markup, no letter that hides or turns others."""
+    """Escape text from anywhere for a page, with control characters spelt out."""
     return escape(printable(words))
 
 
 def printable(words: str) -> str:
-    """The same before it is markup: what cannot be printed is spelt out."""
+    """Text with unprintable characters spelt out."""
     return "".join(c if c.isprintable() else repr(c)[1:-1] for c in words)
 
 
 def cards(numbers: Iterable[tuple[str, str]]) -> str:
-    """Numbers to be seen first, each with what it is of."""
+    """Row of key numbers, each with a caption."""
     return (
         '<div class="numbers">' + "".join(f"<div><b>{text(n)}</b><span>{text(of)}</span></div>" for n, of in numbers) + "</div>"
     )

@@ -1,4 +1,4 @@
-"""A report about logs: one page that holds everything, to be read, printed and sent, or the same pictures as PNGs."""
+"""HTML report of logs as one self-contained page, or its pictures as PNG files."""
 
 from __future__ import annotations
 
@@ -64,10 +64,10 @@ summary { cursor: pointer; font-size: 15px; padding: 8px 0; color: var(--soft); 
 
 
 def page(logs: Sequence[RunData]) -> str:
-    """The page: of one log its conclusion, figures and pictures; of several a comparison first, then each.
+    """HTML of the report; several logs are compared first.
 
-    No request leaves it, it needs no program to be read, and what a log is called never becomes markup. A part that the data
-    do not have (truth, models, events) is left out.
+    No request leaves the page, it needs no script, and text from the logs is escaped. Parts without data (truth, models,
+    events) are left out.
 
     Raises:
         ConfigError: no logs, or matplotlib is not installed.
@@ -85,7 +85,7 @@ def page(logs: Sequence[RunData]) -> str:
 
 
 def write_page(logs: Sequence[RunData], path: Location, *, overwrite: bool = False) -> None:
-    """Writes the page.
+    """Write the page.
 
     Raises:
         ConfigError: as `page`, or the file exists (without `overwrite`) or cannot be written.
@@ -95,7 +95,7 @@ def write_page(logs: Sequence[RunData], path: Location, *, overwrite: bool = Fal
 
 
 def write_pngs(data: RunData, folder: Path, *, overwrite: bool = False) -> list[Path]:
-    """Writes every picture of the page that there is, NAME-paths.png and so on, and returns their paths.
+    """Write every picture of the page as NAME-paths.png and so on, and return their paths.
 
     Raises:
         ConfigError: matplotlib is not installed, or a file exists (without `overwrite`) or cannot be written.
@@ -103,9 +103,9 @@ def write_pngs(data: RunData, folder: Path, *, overwrite: bool = False) -> list[
     require_matplotlib()
     pictures = [picture for picture in _pictures(data) if picture is not None]
     paths = [folder / f"{file_name(data.name)}-{picture.name}.png" for picture in pictures]
-    there = [path for path in paths if path.exists()]
-    if there and not overwrite:  # before anything is drawn
-        raise ConfigError("the target exists", where=there[0], fix="Choose another folder, or add --overwrite")
+    existing = [path for path in paths if path.exists()]
+    if existing and not overwrite:  # before anything is drawn
+        raise ConfigError("the target exists", where=existing[0], fix="Choose another folder, or add `overwrite`")
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -117,19 +117,19 @@ def write_pngs(data: RunData, folder: Path, *, overwrite: bool = False) -> list[
 
 
 def file_name(name: str) -> str:
-    """What files about a log are called: its name without anything that leads elsewhere or hides the file."""
+    """File name for a log: its name without separators, leading dots and unsafe characters."""
     return re.sub(r"[^\w.+-]", "_", name).lstrip(".-")[:100] or "_"
 
 
 def name_by_topic(logs: Sequence[RunData], topics: Sequence[str]) -> list[RunData]:
-    """Several IMUs of one log, each called by its topic too; a single one keeps the log's name."""
+    """Name several IMUs of one log by their topics too; a single one keeps the log's name."""
     if len(logs) < 2:
         return list(logs)
     return [replace(data, name=f"{data.name} {topic}") for data, topic in zip(logs, topics, strict=True)]
 
 
 def check_target(path: Location, *, overwrite: bool = False) -> None:
-    """Nothing, where a page can be written; to be asked before the work is done.
+    """Check before the work that a page can be written.
 
     Raises:
         ConfigError: matplotlib is not installed, or the file exists (without `overwrite`) or cannot be written.
@@ -144,7 +144,7 @@ def _pictures(data: RunData) -> Iterator[Picture | None]:
 
 
 def _log(data: RunData, key: str, *, alone: bool) -> Iterator[str]:
-    """Everything about one log; among several its pictures are folded, on paper they are not."""
+    """Section of one log; among several logs its pictures are folded on screen."""
     pictures = [picture for picture in _pictures(data) if picture is not None]
     yield f'<p class="conclusion">{text(conclusion(data))}</p>'
     yield cards(key_numbers(data))
@@ -181,7 +181,7 @@ def _svg(panel: Panel, name: str) -> str:
 
 
 def _figures(data: RunData, key: str) -> Iterator[str]:
-    """Errors of every run, the best of each marked."""
+    """Table of the errors of every run, the best of each marked."""
     rows = [(name, values) for name, values in data.table() if name not in ("samples", "duration_s")]
     rows = [(name, values) for name, values in rows if any(value is not None for value in values)]
     if not rows:
@@ -198,17 +198,17 @@ def _figures(data: RunData, key: str) -> Iterator[str]:
 
 
 def _cells(values: Sequence[float | None], marked: int | None) -> str:
-    """Numbers as cells; the whole number is under the pointer."""
+    """Numbers as cells, with all digits in a tooltip."""
     out = []
     for k, value in enumerate(values):
         kind = 'class="number best"' if k == marked else 'class="number"'
-        whole = "" if value is None else f' title="{value!r}"'
-        out.append(f"<td {kind}{whole}>{format_number(value)}</td>")
+        tooltip = "" if value is None else f' title="{value!r}"'
+        out.append(f"<td {kind}{tooltip}>{format_number(value)}</td>")
     return "".join(out)
 
 
 def _windows(data: RunData) -> Iterator[str]:
-    """How far windows of each length drift that each start from the truth."""
+    """Table of the drift over windows that each start from the truth."""
     lengths = sorted({window.length_s for trace in data.traces for window in trace.windows})
     if not lengths:
         return
@@ -229,7 +229,7 @@ def _windows(data: RunData) -> Iterator[str]:
 
 
 def _compared(logs: Sequence[RunData]) -> Iterator[str]:
-    """Every run of every log in one row."""
+    """Table with one row for every run of every log."""
     head = ("Log", "Run", "Seconds", "Orientation error (°)", "Position error (m)", "Velocity error (m/s)", "Largest (°)")
     yield '<div class="scroll"><table class="numeric"><thead><tr>'
     yield "".join(f"<th{' class=word' * (one == 'Run')}>{one}</th>" for one in head) + "</tr></thead><tbody>"
@@ -258,6 +258,6 @@ def _provenance(data: RunData, key: str) -> Iterator[str]:
 
 
 def _made() -> Iterator[str]:
-    """The versions of what made the page."""
+    """Versions of the software that made the page."""
     drawn = f"numpy {np.__version__}, matplotlib {require_matplotlib().__version__}"
     yield f'<p class="note">Made by imutool {text(__version__)}, Python {platform.python_version()}, {drawn}.</p>'

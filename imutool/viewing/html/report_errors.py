@@ -1,4 +1,4 @@
-"""How wrong each way of reading the IMU is over time: from the start, by angle and direction, and since each reset."""
+"""Pictures of errors over time, drift since each reset, and events."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ from imutool.viewing.model.events import KINDS, Event
 from imutool.viewing.model.run_data import RunData, Trace
 from imutool.viewing.model.trajectory_error import Drift
 
-DECADES = 2.5  # shown below the largest error of the best run: nothing is decided further down
-APART = 8.0  # times between the largest errors of two runs: beyond, one scale for both is logarithmic, or leaves one out
-MOST_RESETS = 60  # that can be told apart in a picture
-HEIGHTS_INCH = {1: 2.6, 3: 5.6, 4: 5.6}  # of one and of several rows: what stands side by side is of one height
+DECADES = 2.5  # shown below the largest error of the best run
+LINEAR_RATIO = 8.0  # of the largest errors of two runs; above it a scale is logarithmic, or one run leaves the panel
+MAX_RESETS = 60  # that stay distinguishable in a picture
+HEIGHTS_INCH = {1: 2.6, 3: 5.6, 4: 5.6}  # by number of rows: panels side by side have one height
 
 Line = Float64[np.ndarray, " n"]
 
 
 def error_curves(data: RunData) -> Picture | None:
-    """Orientation (total, roll, pitch, yaw) and position (total, horizontal, vertical); nothing without truth."""
+    """Orientation and position error, total and by direction; None without truth."""
     scored = [trace for trace in data.traces if trace.errors is not None]
     if not scored:
         return None
@@ -45,22 +45,22 @@ def error_curves(data: RunData) -> Picture | None:
         _panel(data, scored, times, moved, "Position error", "m"),
     )
     signed = [values for rows in (turned, moved) for name, values in rows.items() if name not in ("total", "horizontal")]
-    out = any(_leaving(values) for values in signed)
-    note = " Where an error with a sign is far larger than the others', it leaves its panel; the total shows all of it." * out
+    out = any(_leaves_panel(values) for values in signed)
+    note = " A signed error far above the others leaves its panel; the total shows it whole." * out
     return Picture("errors", "Errors over time", f"Integrated from the true start, {alignment_text(data)}.{note}", panels)
 
 
 def drift_curves(data: RunData) -> Picture | None:
-    """Orientation and position since integration was last set to the truth; nothing where that was not computed."""
+    """Orientation and position drift since the last reset to the truth; None without truth."""
     with_drift = [(trace, trace.drift) for trace in data.traces if trace.drift is not None]
     if not with_drift:
         return None
     scored, drifts = [trace for trace, _ in with_drift], [drift for _, drift in with_drift]
     caption = f"Set to the truth every {drifts[0].reset_s:g} s."
     curves = [(data.elapsed_s(one.t_ns), one.orientation_deg, one.position_m) for one in drifts]
-    if any(len(_resets(one)) > MOST_RESETS for one in drifts):
+    if any(len(_resets(one)) > MAX_RESETS for one in drifts):
         curves = [_largest(one, *rows) for one, rows in zip(drifts, curves, strict=True)]
-        caption += " Drawn is the largest drift of each such stretch."
+        caption += " Each stretch shows its largest drift."
     times, turned, moved = (list(rows) for rows in zip(*curves, strict=True))
     panels = (
         _panel(data, scored, times, {"total": turned}, "Orientation drift", "°"),
@@ -70,18 +70,18 @@ def drift_curves(data: RunData) -> Picture | None:
 
 
 def _resets(drift: Drift) -> Int64[np.ndarray, " k"]:
-    """The rows at which integration begins anew."""
+    """Rows at which integration starts again."""
     return np.flatnonzero(np.diff(drift.since_s, prepend=np.inf) <= 0.0)
 
 
 def _largest(drift: Drift, t: Line, turned: Line, moved: Line) -> tuple[DecimatedLine, DecimatedLine, DecimatedLine]:
-    """The largest of each stretch between resets, at its beginning."""
+    """Largest drift between two resets, at the first of them."""
     starts = _resets(drift)
     return t[starts], np.fmax.reduceat(turned, starts), np.fmax.reduceat(moved, starts)
 
 
 def _of(trace: Trace) -> Any:
-    assert trace.errors is not None, "looked at before"
+    assert trace.errors is not None, "only runs with errors come here"
     return trace.errors
 
 
@@ -106,9 +106,9 @@ def _draw(
     lines: list[Any] = []
     for axes, (name, values) in zip(panels, rows.items(), strict=True):
         signed = name not in {"total", "horizontal"}
-        log = not signed and _apart(values)
+        log = not signed and _needs_log_scale(values)
         for trace, t, error in zip(scored, times, values, strict=True):
-            shown = np.where(error > 0.0, error, np.nan) if log else error  # the start is exact, which a logarithm cannot show
+            shown = np.where(error > 0.0, error, np.nan) if log else error  # the start is exact: log(0)
             label = f"{trace.name}: {title.lower()}, {name}" if axes is not panels[0] else trace.name
             line = axes.plot(
                 *decimate_extremes(t, shown), color=color_of(data, trace), lw=0.9 if trace.is_raw else 1.3, label=label
@@ -123,7 +123,7 @@ def _draw(
 
 
 def _limits(axes: Any, values: Sequence[Line], *, signed: bool, log: bool) -> None:
-    """So that the best and the worst run can be read: by a logarithm, or by leaving a far larger one out of the picture."""
+    """Axis limits that keep the best and the worst run readable."""
     tops = [float(np.nanmax(np.abs(one))) for one in values if np.isfinite(one).any()]
     if log:
         axes.set_yscale("log")
@@ -131,31 +131,31 @@ def _limits(axes: Any, values: Sequence[Line], *, signed: bool, log: bool) -> No
         axes.set_ylim(min(tops) * 10.0**-DECADES, max(tops) * 2.0)
     elif signed:
         axes.axhline(0.0, color=INK, lw=0.6)
-        near = [top for top in tops if top <= APART * min(tops)]
+        near = [top for top in tops if top <= LINEAR_RATIO * min(tops)]
         most = max(near, default=0.0)
         axes.set_ylim(-1.15 * most, 1.15 * most) if most > 0.0 else None
     else:
         axes.set_ylim(0.0, 1.1 * max(tops, default=1.0) or 1.0)
 
 
-def _apart(values: Sequence[Line]) -> bool:
-    """Whether one scale cannot show them all: the largest errors differ by far."""
+def _needs_log_scale(values: Sequence[Line]) -> bool:
+    """Whether the largest errors differ too much for one linear scale."""
     tops = [float(np.nanmax(one)) for one in values if np.isfinite(one).any()]
-    return len(tops) > 1 and min(tops) > 0.0 and max(tops) > APART * min(tops)
+    return len(tops) > 1 and min(tops) > 0.0 and max(tops) > LINEAR_RATIO * min(tops)
 
 
-def _leaving(values: Sequence[Line]) -> bool:
-    return _apart([np.abs(one) for one in values])
+def _leaves_panel(values: Sequence[Line]) -> bool:
+    return _needs_log_scale([np.abs(one) for one in values])
 
 
-MOST_ROWS = 40
-LEAST_SHARE = 0.002  # of the time, so that one sample in an hour is seen
+MAX_ROWS = 40
+MIN_EVENT_SHARE = 0.002  # of the duration, so that one sample in an hour is visible
 LANE_INCH, EDGES_INCH = 0.24, 0.75
-HARMLESS = {"stop": HELD, "finding": AFTER, "worst": BEFORE}
+EVENT_COLORS = {"stop": HELD, "finding": AFTER, "worst": BEFORE}
 
 
 def event_lanes(data: RunData) -> Picture | None:
-    """A lane for each kind of event that there is; nothing where nothing happened."""
+    """Lane for each kind of event; None without events."""
     kinds = [kind for kind in KINDS if any(event.kind == kind for event in data.events)]
     if not kinds:
         return None
@@ -170,7 +170,7 @@ def event_lanes(data: RunData) -> Picture | None:
 
 
 def event_table(data: RunData) -> Iterator[str]:
-    """The first events of each kind in words, in the order of time; how many more there are is said."""
+    """Table of the first events of each kind by time, with the number of the others."""
     shown = sorted(_first(data.events), key=lambda event: event.start_ns)
     yield '<div class="scroll"><table><thead><tr><th>From (s)</th><th>For</th><th>What</th><th></th></tr></thead><tbody>'
     for event in shown:
@@ -182,24 +182,24 @@ def event_table(data: RunData) -> Iterator[str]:
         )
     yield "</tbody></table></div>"
     if len(shown) < len(data.events):
-        yield f'<p class="note">{len(data.events) - len(shown):,} more are drawn above and not listed.</p>'
+        yield f'<p class="note">{len(data.events) - len(shown):,} more are drawn above but not listed.</p>'
 
 
 def event_label(kind: str) -> str:
-    """A kind of event in words."""
+    """Kind of event as text."""
     return {"worst": "worst error"}.get(kind, kind.replace("_", " "))
 
 
 def _first(events: Sequence[Event]) -> list[Event]:
-    """As many as there is room for, of every kind the same number."""
+    """First events of every kind, the same number of each."""
     kinds = {event.kind for event in events}
-    share = max(1, MOST_ROWS // max(len(kinds), 1))
+    share = max(1, MAX_ROWS // max(len(kinds), 1))
     return [event for kind in kinds for event in [one for one in events if one.kind == kind][:share]]
 
 
 def _draw_lanes(figure: Any, *, data: RunData, kinds: Sequence[str]) -> None:
     axes = figure.subplots()
-    least = LEAST_SHARE * data.duration_s
+    least = MIN_EVENT_SHARE * data.duration_s
     for lane, kind in enumerate(kinds):
         bars = []
         for event in data.events:
@@ -207,7 +207,7 @@ def _draw_lanes(figure: Any, *, data: RunData, kinds: Sequence[str]) -> None:
                 first, length = (event.start_ns - data.start_ns) * 1e-9, (event.end_ns - event.start_ns) * 1e-9
                 bars.append((min(first, data.duration_s - least), max(length, least)))
         axes.broken_barh(
-            bars, (-lane - 0.4, 0.8), color=HARMLESS.get(kind, MARK), lw=0, label=f"{event_label(kind)}: {len(bars)}"
+            bars, (-lane - 0.4, 0.8), color=EVENT_COLORS.get(kind, MARK), lw=0, label=f"{event_label(kind)}: {len(bars)}"
         )
     axes.set_yticks([-lane for lane in range(len(kinds))], [event_label(kind) for kind in kinds])
     axes.tick_params(axis="y", length=0)

@@ -1,4 +1,4 @@
-"""What a report says in words and numbers: the conclusion, the cards, the labels of figures."""
+"""Words and numbers of a report: conclusion, key numbers, labels of figures."""
 
 from __future__ import annotations
 
@@ -18,29 +18,29 @@ FIGURE_LABELS = {
     "roe_deg": "Turn over {} m (ROE, °)",
     "rpe_m": "Motion over {} m (RPE, m)",
 }
-SAME_WITHIN = 0.05  # closer than that, two errors are about the same
+SAME_WITHIN = 0.05  # relative difference up to which two errors count as the same
 NOT_ERRORS = ("samples", "duration_s")  # no errors
 
 
 def best_run(data: RunData) -> Trace | None:
-    """The model with the smallest orientation error, raw where there is none; nothing without truth."""
+    """Run with the smallest orientation error, a model if there is one; None without truth."""
     scored = [trace for trace in data.traces if trace.figures.get("aoe_deg") is not None]
     models = [trace for trace in scored if not trace.is_raw]
     return min(models or scored, key=lambda trace: float(trace.figures["aoe_deg"]), default=None)
 
 
 def raw_run(data: RunData) -> Trace | None:
-    """The run as recorded, where it is among those shown."""
+    """Run as recorded, if it is shown."""
     return next((trace for trace in data.traces if trace.is_raw), None)
 
 
 def run_name(trace: Trace) -> str:
-    """A run's name within a sentence."""
+    """Name of a run within a sentence."""
     return trace.name.removeprefix("in the log: ")
 
 
 def format_number(value: float | None) -> str:
-    """A number as people read it: three digits, thousands as they are."""
+    """Number with three digits and thousands separators."""
     if value is None or not np.isfinite(value):
         return "–"
     value = float(f"{value:.2e}") if abs(value) < 999.5 else value  # 0.9996 has two digits behind the point, as 1.00
@@ -52,26 +52,26 @@ def format_number(value: float | None) -> str:
 
 
 def format_quantity(value: float, unit: str) -> str:
-    """A number with its unit; from a kilometre on in kilometres."""
+    """Number with its unit; from one kilometre on in kilometres."""
     if unit == "m" and abs(value) >= 1000.0:
         return f"{format_number(value / 1000.0)} km"
     return f"{format_number(value)}{'' if unit == '°' else ' '}{unit}"
 
 
 def figure_label(name: str) -> str:
-    """What a figure is called in a table: `roe_deg 5` is turned into words."""
+    """Label of a figure in a table, such as that of `roe_deg 5`."""
     key, _, distance = name.partition(" ")
     return FIGURE_LABELS[key].format(distance) if key in FIGURE_LABELS else name.replace("_", " ")
 
 
 def alignment_text(data: RunData) -> str:
-    """What was done before errors were taken, in words."""
+    """Alignment before errors are computed, as text."""
     how = {"none": "without alignment", "origin": "aligned at the start", "yaw": "aligned in position and heading"}
     return how.get(data.alignment, "aligned by a rigid motion")
 
 
 def worst_orientation_error(trace: Trace, data: RunData) -> tuple[float, float] | None:
-    """The largest orientation error (degrees) and when it was (s from the start)."""
+    """Largest orientation error (deg) and its time (s from the start)."""
     if trace.errors is None or not np.isfinite(trace.errors.orientation_total_deg).any():
         return None
     row = int(np.nanargmax(trace.errors.orientation_total_deg))
@@ -80,12 +80,12 @@ def worst_orientation_error(trace: Trace, data: RunData) -> tuple[float, float] 
 
 
 def conclusion(data: RunData) -> str:
-    """What a reader is to know first, in a sentence or two; figures are without alignment, whatever the pictures are."""
+    """Conclusion in one or two sentences, from figures without alignment."""
     chosen, before = best_run(data), raw_run(data)
     if chosen is None:
         return _without_truth(data)
     if chosen.is_raw or before is None:
-        told = f"{run_name(chosen)} is wrong by {_errors(chosen)} over {format_number(data.duration_s)} s, without alignment"
+        told = f"{run_name(chosen)} has errors of {_errors(chosen)} over {format_number(data.duration_s)} s, without alignment"
     else:
         told = f"{comparison(chosen, before)} over {format_number(chosen.figures['duration_s'])} s, without alignment"
     found = worst_orientation_error(chosen, data)
@@ -95,7 +95,7 @@ def conclusion(data: RunData) -> str:
 
 
 def comparison(chosen: Trace, before: Trace) -> str:
-    """How a model stands to raw: orientation first, then position."""
+    """Comparison of a model with raw: orientation first, then position."""
     parts: list[tuple[str, str]] = []
     for figure, what, unit in (("aoe_deg", "orientation", "°"), ("ape_m", "position", "m")):
         old, new = float(before.figures[figure]), float(chosen.figures[figure])
@@ -113,7 +113,7 @@ def comparison(chosen: Trace, before: Trace) -> str:
 
 
 def ratio_text(large: float, small: float) -> str:
-    """How many times: `31 times`."""
+    """Ratio as text: `31 times`."""
     if small <= 0.0:
         return "to nothing"
     ratio = large / small
@@ -121,22 +121,22 @@ def ratio_text(large: float, small: float) -> str:
 
 
 def summary_of_logs(logs: Sequence[RunData]) -> str:
-    """The same of several logs: how often a model is better than raw, and the middle of what it brings."""
+    """Summary of several logs: how often a model beats raw, and the median errors."""
     pairs = [(best_run(one), raw_run(one)) for one in logs]
     scored = [(a, b) for a, b in pairs if a is not None and b is not None and not a.is_raw]
     if not scored:
         with_truth = sum(one.truth is not None for one in logs)
-        return f"{len(logs)} logs, {with_truth} of them with truth, none of them both with truth and with a model."
+        return f"{len(logs)} logs, {with_truth} of them with truth, none with both truth and a model."
     better = sum(float(a.figures["aoe_deg"]) < float(b.figures["aoe_deg"]) for a, b in scored)
     new, old = (float(np.median([run.figures["aoe_deg"] for run in side])) for side in zip(*scored, strict=True))
     return (
         f"In {better} of {len(scored)} logs the best model has a smaller orientation error than raw: "
-        f"{format_quantity(new, '°')} instead of {format_quantity(old, '°')} in the middle (median), without alignment."
+        f"{format_quantity(new, '°')} instead of {format_quantity(old, '°')} (medians), without alignment."
     )
 
 
 def key_numbers(data: RunData) -> list[tuple[str, str]]:
-    """The numbers to be seen first, each with what it is of."""
+    """Key numbers of a log, each with its caption."""
     told = [(f"{format_number(data.duration_s)} s", f"{len(data.traces[0].run.imu):,} samples at {rate_hz(data):.0f} Hz")]
     chosen, before = best_run(data), raw_run(data)
     for trace in dict.fromkeys(one for one in (before, chosen) if one is not None and one.figures):
@@ -150,12 +150,12 @@ def key_numbers(data: RunData) -> list[tuple[str, str]]:
 
 
 def rate_hz(data: RunData) -> float:
-    """Samples a second, by the median step."""
+    """Sample rate by the median step."""
     return 1.0 / data.traces[0].run.imu.period_s
 
 
 def index_of_best(values: Sequence[float | None], name: str) -> int | None:
-    """Which of several figures is the best one; none where there is nothing to choose from, or what is counted is no error."""
+    """Index of the smallest error; None for fewer than two values or for counts."""
     known = [(value, k) for k, value in enumerate(values) if value is not None]
     if name in NOT_ERRORS or len(known) < 2 or min(known)[0] == max(known)[0]:
         return None
@@ -163,7 +163,7 @@ def index_of_best(values: Sequence[float | None], name: str) -> int | None:
 
 
 def unit_of(name: str) -> str:
-    """The unit that ends the name of a figure."""
+    """Unit at the end of a figure's name."""
     return "°" if re.search(r"_deg\b", name) else "m" if re.search(r"_m\b", name) else ""
 
 
@@ -176,9 +176,9 @@ def _errors(trace: Trace) -> str:
 
 
 def _without_truth(data: RunData) -> str:
-    told = f"{data.name}: {format_number(data.duration_s)} s without truth, so nothing says how wrong it is."
+    told = f"{data.name}: {format_number(data.duration_s)} s without truth, so its errors are unknown."
     for trace in data.models():
         gyro, accel = (np.linalg.norm(bias.mean(axis=0)) for bias in (trace.run.gyro_bias, trace.run.accel_bias))
-        off = f"{np.degrees(gyro):.3g}°/s off the angular rate and {accel:.3g} m/s² off the specific force"
-        told += f" {run_name(trace)} takes {off}."
+        off = f"{np.degrees(gyro):.3g}°/s from the angular rate and {accel:.3g} m/s² from the specific force"
+        told += f" {run_name(trace)} subtracts {off}."
     return told

@@ -12,7 +12,7 @@ Rows = Int64[np.ndarray, " m"]
 
 
 def curve_rows(values: Float64[np.ndarray, "n k"], most: int = MAX_CURVE_ROWS) -> Rows:
-    """Rows of a curve to draw, at most `most`: all, or the lowest and highest of every column per equal bucket.
+    """Decimate a curve to `most` rows: per bucket the lowest and highest of every column.
 
     The first and the last row are always drawn, and of a bucket with NaN rows one such row, so that a hole stays a hole.
     `most` is at least 2 k + 3.
@@ -38,7 +38,7 @@ def curve_rows(values: Float64[np.ndarray, "n k"], most: int = MAX_CURVE_ROWS) -
 
 
 def path_rows(p_wb: Float64[np.ndarray, "n 3"], most: int = MAX_PATH_ROWS) -> Rows:
-    """Rows of a path to draw, at most `most`: all, or half of them even in time and half even along the path.
+    """Decimate a path to at most `most` rows: half even in time, half even along the path.
 
     A row left out follows a drawn one by less than 2 / (most - 2) of the path's length and of its rows: a fast part keeps its
     shape, and so does a small part of a path that left for kilometres. The first and the last row are always drawn.

@@ -1,4 +1,4 @@
-"""Output of a view: what was opened or written, as a sentence and as fields."""
+"""Output that was opened or written, as a sentence and as fields."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ How = Literal["viewer", "connect", "rrd", "web", "folder", "png", "html"]
 
 
 class Output(NamedTuple):
-    """One output: `place` is a URL or a path, `said` a sentence on the result and how to open it."""
+    """Output of a view: `place` is a URL or a path, `said` a sentence on how to open it."""
 
     how: How
     place: str

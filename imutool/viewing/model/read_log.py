@@ -1,4 +1,4 @@
-"""Read a log for viewing: its IMU, also where it is not sound, and the channels derived from it."""
+"""Read a log for viewing: its IMU, also where it is unsound, and derived channels."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from imutool.cleaning import Cleaner, Rules, Survey
+from imutool.cleaning import Cleaner, CleaningSettings, Survey
 from imutool.cleaning.first_pass import examine
 from imutool.cleaning.truth import Truth, of_poses
 from imutool.errors import DataError, LogError
@@ -72,7 +72,7 @@ def read_log(path: Location, *, imu: str | None = None, truth: str | None = None
         found = _read(RecoveredLog(path), imu, truth, notes)
     topic, derived, batches, biases_by_topic, rest, metadata = found
     where = f"{path} {topic}"
-    survey = examine(lambda: batches[topic], _true(rest), Rules(), where=str(path), topic=topic)
+    survey = examine(lambda: batches[topic], _true(rest), CleaningSettings(), where=str(path), topic=topic)
     samples, logged, why = _sound_samples(batches[topic], survey, where)
     if why:
         left = f"{survey.messages - survey.valid} of {survey.messages} messages are left out"

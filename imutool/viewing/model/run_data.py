@@ -1,4 +1,4 @@
-"""Data of a view: runs, traces with errors and spectra, events and notes, free of any viewer."""
+"""Data of a view: runs, traces with errors and spectra, events and notes."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ TRUE_BIAS = {"gyro": "/ground_truth/bias/gyro", "accel": "/ground_truth/bias/acc
 
 @dataclass(frozen=True, eq=False)
 class Run:
-    """IMU samples, raw or corrected by a model, with the bias that was subtracted (zeros for raw).
+    """IMU samples, raw or corrected by a model, with the subtracted bias (zeros for raw).
 
     `bias_std` is one standard deviation of the bias, gyro (rad/s) then accel (m/s²), where the model states it.
     """
@@ -86,7 +86,7 @@ class LogTimes:
     log_ns: Times
 
     def at(self, t_ns: Times) -> Times:
-        """Log times at stamps: exact at a message's stamp, elsewhere with the nearest message's delay."""
+        """Log times at header stamps: exact at a message's, elsewhere with the nearest one's delay."""
         right = np.clip(np.searchsorted(self.stamp_ns, t_ns), 0, len(self.stamp_ns) - 1)
         left = np.maximum(right - 1, 0)
         nearer = np.where(t_ns - self.stamp_ns[left] < self.stamp_ns[right] - t_ns, left, right)
@@ -96,7 +96,7 @@ class LogTimes:
 
 @dataclass(frozen=True, eq=False)
 class RunData:
-    """Data of one log for viewing: `traces` in the order of the runs, elapsed time from `start_ns`.
+    """Data of one log for viewing: traces in the order of the runs, events, provenance.
 
     `true_bias` holds `gyro` (rad/s) and `accel` (m/s²) where the log has them; `notes` are sentences for the reader;
     `provenance` names file, size, models with digest and start, and versions.
@@ -130,7 +130,7 @@ class RunData:
         return t_ns if self.logged is None else self.logged.at(t_ns)
 
     def table(self) -> list[tuple[str, list[float | None]]]:
-        """Figures as rows: a label (`aoe_deg`, `roe_deg 5`) and one value per trace, None where it has none."""
+        """Figures as rows: a label (`aoe_deg`, `roe_deg 5`) and one value or None per trace."""
         columns = [dict(_numbers(trace.figures)) for trace in self.traces]
         labels = list(dict.fromkeys(label for column in columns for label in column))
         return [(label, [column.get(label) for column in columns]) for label in labels]
@@ -183,7 +183,7 @@ class Spectrum:
 
 
 def spectra(imu: Imu) -> Mapping[str, Spectrum]:
-    """Power spectral densities by Welch's method: `gyro` ((rad/s)²/Hz), `accel` ((m/s²)²/Hz); empty for a short log.
+    """Power spectral densities of gyro ((rad/s)²/Hz) and accel ((m/s²)²/Hz), by Welch's method.
 
     Samples count as evenly spaced by their median period, so jitter and gaps blur lines a little.
     """

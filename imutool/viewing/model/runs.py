@@ -1,4 +1,4 @@
-"""Load a log for viewing: raw, debiased in the log, and with each requested model, with errors, events and provenance."""
+"""Load a log for viewing: raw and debiased runs with errors, events and provenance."""
 
 from __future__ import annotations
 
@@ -21,8 +21,7 @@ from imutool.inertial.strapdown import StartPose, dead_reckon, stretch_with_trut
 from imutool.location import Location
 from imutool.recording import Imu, Poses, Recording, Scalars, seconds
 from imutool.viewing.model.decimate import MAX_CURVE_ROWS
-from imutool.viewing.model.events import Event, events_within, stop_events, survey_events, worst_error_events
-from imutool.viewing.model.findings import finding_events
+from imutool.viewing.model.events import Event, events_within, finding_events, stop_events, survey_events, worst_error_events
 from imutool.viewing.model.read_log import read_log
 from imutool.viewing.model.run_data import (
     LEVELLING_S,
@@ -48,7 +47,7 @@ def load(
     align: Alignment = "none",
     findings: Path | None = None,
 ) -> RunData:
-    """Load all data of one log for viewing; `findings` is the folder of a diagnosis whose findings become events.
+    """Load all data of one log for viewing, with the events of a diagnosis in `findings`.
 
     Raises:
         ConfigError: the log or the folder cannot be read; two models of one name; `smooth` with another `init` than auto.
@@ -105,7 +104,7 @@ def build(
     events: Sequence[Event] = (),
     notes: Sequence[str] = (),
 ) -> RunData:
-    """Build the data of a view from a recording and its runs, with events and notes that are known beforehand.
+    """Build the data of a view from a recording and its runs.
 
     With truth every path starts at the true pose and velocity of the first sample that has one and ends with the last such
     sample; figures, drift and windows are of that path, errors after the alignment asked for. Without, a path starts at the
@@ -175,7 +174,7 @@ def _scored(runs: Sequence[Run], truth: Poses, where: str, align: Alignment) -> 
 
 
 class TruthSpan(NamedTuple):
-    """Span with truth: rows of the IMU, the true poses at them, and a mask of the rows outside gaps."""
+    """Span with truth: rows of the IMU, true poses, and a mask of the rows outside gaps."""
 
     rows: slice
     true: Poses
@@ -219,7 +218,7 @@ def provenance(
     models: Mapping[str, str],
     settings: Mapping[str, str],
 ) -> dict[str, str]:
-    """Provenance by name: file, topics, settings, models, versions, and imutool's own metadata records in the log.
+    """Provenance by name: file, topics, settings, models, versions, imutool's metadata records.
 
     There is no digest of the log, which may have terabytes. Long values are cut, entries beyond MAX_ENTRIES counted.
     """

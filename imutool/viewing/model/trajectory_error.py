@@ -1,4 +1,4 @@
-"""Errors of an estimate against the truth over time: by axis, angle and direction, drift since a reset, windows."""
+"""Trajectory errors over time, drift since a reset, and drift over windows."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ class Errors:
 
 @dataclass(frozen=True, eq=False)
 class Drift:
-    """Drift of the integration since its last reset to the truth, every `reset_s`; NaN where the truth is unknown."""
+    """Drift since the last reset to the truth, every `reset_s`; NaN where the truth is unknown."""
 
     reset_s: float
     t_ns: Times
@@ -65,7 +65,7 @@ class Drift:
 
 @dataclass(frozen=True)
 class Window:
-    """Root mean square errors at the ends of windows of one length that each start from the truth."""
+    """Root mean square drift over windows of one length that each start from the truth."""
 
     length_s: float
     count: int
@@ -85,14 +85,14 @@ def errors(estimate: Poses, truth: Poses, valid: Bool[np.ndarray, " n"]) -> Erro
 
 
 class RigidMotion(NamedTuple):
-    """Rigid motion that aligns an estimate with the truth: a rotation, then a shift, both in the world frame."""
+    """Rigid motion of an alignment: a rotation, then a shift, both in the world frame."""
 
     rotation: Rotation
     shift_m: Float64[np.ndarray, "3"]
 
 
 def aligned(estimate: Poses, truth: Poses, valid: Bool[np.ndarray, " n"], alignment: Alignment) -> tuple[Poses, RigidMotion]:
-    """Align an estimate with the truth by one rigid motion, fitted to the rows where the truth is known.
+    """Align an estimate with the truth by one rigid motion.
 
     `origin`: its first pose becomes the true one. `yaw`: positions are nearest by least squares among turns about the vertical,
     theta = atan2(sum (p x p_true)_z, sum (p . p_true)_xy) about the means, the four directions an inertial sensor cannot know.
@@ -138,7 +138,7 @@ def _about(rotation: Rotation, centre: Float64[np.ndarray, "3"], goal: Float64[n
 
 
 def drift_since_reset(path: Poses, truth: Poses, valid: Bool[np.ndarray, " n"], reset_s: float = RESET_S) -> Drift:
-    """Drift of `path` at every sample, had its integration been reset to the truth every `reset_s`.
+    """Drift of `path` at every sample, with a reset to the truth every `reset_s`.
 
     Where the truth is unknown, the reset waits until it is known again.
     """
@@ -155,7 +155,7 @@ def drift_since_reset(path: Poses, truth: Poses, valid: Bool[np.ndarray, " n"], 
 
 
 def windows(path: Poses, truth: Poses, valid: Bool[np.ndarray, " n"]) -> tuple[Window, ...]:
-    """Drift over windows of each length in `WINDOWS_S` of which at least one fits (`strapdown.drift`)."""
+    """Drift over windows of each length in `WINDOWS_S` that fits (`strapdown.drift`)."""
     found = []
     for length_s in WINDOWS_S:
         ends = drift(path, truth, valid, length_s)

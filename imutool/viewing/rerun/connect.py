@@ -1,4 +1,4 @@
-"""Connection to a running viewer, here or on another machine; the listener is checked before anything is sent."""
+"""Connection to a running viewer, which is checked before anything is sent."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ FRAME_HEAD_BYTES, SETTINGS = 9, 4
 
 
 class Listener(NamedTuple):
-    """Listener at a URL with the version of its viewer; None where no viewer answered (a server without one)."""
+    """Listener at a URL with the version of its viewer; None where no viewer answered."""
 
     url: str
     version: str | None
@@ -49,7 +49,7 @@ def probe(url: str) -> Listener:
 
 
 def send(logs: Sequence[RunData], peer: Listener, *, source: bool = True, at_s: float | None = None) -> Output:
-    """Send all logs to the listener that `probe` found, and set a viewer's cursor to `at_s` seconds.
+    """Send all logs to the listener that `probe` found, and set the cursor to `at_s` seconds.
 
     Raises:
         ConfigError: the listener stopped.

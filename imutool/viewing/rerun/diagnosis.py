@@ -1,4 +1,4 @@
-"""Rerun recording of a diagnosis: real, before and after by axis, residuals, events and the conclusion."""
+"""Rerun recording of a diagnosis: samples, residuals, located intervals and conclusion."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from imutool.diagnosis.result import Diagnosis, Located, Traces
-from imutool.diagnosis.wording import lines, where
+from imutool.diagnosis.wording.conclusion import lines, location_text
 from imutool.mcap_io.storage.target import Target
 from imutool.recording import Times
 from imutool.units import AXES, UNITS
@@ -147,7 +147,7 @@ def _log_intervals(to: rr.RecordingStream, d: Diagnosis, name: str, trace: Trace
     texts = [(t_s, "INFO", words) for ends in unseen for t_s, words in zip(ends, UNSEEN_TEXTS, strict=True)]
     inside: dict[tuple[str, ...], list[tuple[float, float]]] = {("unseen",): unseen}
     for located in d.located:
-        what = where(Located(located.signal, located.axes, (), located.regime, located.share, located.p_value))
+        what = location_text(Located(located.signal, located.axes, (), located.regime, located.share, located.p_value))
         for first, last in intervals_in_log(trace, located):
             texts += [(first, "WARN", f"begins: {what}"), (last, "INFO", f"ends: {what}")]
             for axis in located.axes or ("",):

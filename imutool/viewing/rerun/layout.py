@@ -1,4 +1,4 @@
-"""Viewer layouts: paths over errors beside tabs, a comparison of several logs, and the layout of a live view."""
+"""Viewer layouts of one log, of several logs, and of a live view."""
 
 from __future__ import annotations
 

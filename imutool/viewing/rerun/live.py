@@ -1,4 +1,4 @@
-"""Live view of a debiasing: each batch of samples and the dead-reckoned paths go to a viewer or an .rrd file.
+"""Live view of a debiasing: batches of samples and paths go to a viewer or a file.
 
 Entities and styles are those of `scene`, except what needs truth or the end. Memory is constant: only the last pose of each
 path is kept. An error here never stops the debiasing.

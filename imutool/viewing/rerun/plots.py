@@ -1,4 +1,4 @@
-"""Plot views, axis limits, camera positions and the blueprint frame that every layout shares."""
+"""Plot views, axis limits, cameras and the blueprint frame of every layout."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def plot(
     legend: bool | None = None,
     overrides: Mapping[Any, Any] | None = None,
 ) -> rrb.TimeSeriesView:
-    """Time series view of some entities over the whole log; `key` explains the curves in the title.
+    """Time series view of entities over the whole log; `key` explains the curves in the title.
 
     A legend always covers some curves. Unless `legend` decides, it appears only where the title is too short for the key.
     """
@@ -66,7 +66,7 @@ def plot(
 
 
 def whole_time_axis(span_s: tuple[float, float] | None = None) -> rrb.TimeAxis:
-    """Time axis over the whole timeline or a span of it; by default Rerun shows one minute around the cursor."""
+    """Time axis over the whole timeline or a span; Rerun's default shows one minute."""
     import rerun as rr
     import rerun.blueprint as rrb
 
@@ -76,7 +76,7 @@ def whole_time_axis(span_s: tuple[float, float] | None = None) -> rrb.TimeAxis:
 
 
 def visible_until_cursor(last_s: float | None = None) -> list[rrb.VisibleTimeRange]:
-    """Visible time ranges that end at the cursor on every timeline: from the start, or only the last seconds."""
+    """Visible time ranges up to the cursor: from the start, or only the last seconds."""
     import rerun as rr
     import rerun.blueprint as rrb
 
@@ -100,7 +100,7 @@ def diagonal_m(box: Box) -> float:
 
 
 def error_axis_limit(data: RunData, values: Mapping[str, np.ndarray]) -> float | None:
-    """Upper limit of a plot of errors by run; a raw error that would flatten the models' curves leaves the plot.
+    """Upper limit of a plot of errors; a raw error that flattens the models' curves leaves it.
 
     None where no run has an error above zero.
     """

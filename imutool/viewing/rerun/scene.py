@@ -1,4 +1,4 @@
-"""Entities of one or several logs, logged into a Rerun recording with their layout, or saved as an .rrd file."""
+"""Log all entities of logs into a Rerun recording, or save them as an .rrd file."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def send(logs: Sequence[RunData], to: rr.RecordingStream, *, source: bool = True
 
 
 def save(logs: Sequence[RunData], path: Path | None = None, *, source: bool = True, overwrite: bool = False) -> Output:
-    """Write all logs into one .rrd file: `path`, NAME.rrd in the folder `path`, or NAME.rrd in the current folder.
+    """Write all logs into one .rrd file: `path`, or NAME.rrd in the folder `path` or here.
 
     Raises:
         ConfigError: no log, Rerun is not installed, the file exists (without `overwrite`) or cannot be written.

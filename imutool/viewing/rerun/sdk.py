@@ -51,7 +51,7 @@ def stream_of_logs(logs: Sequence[RunData]) -> rr.RecordingStream:
 
 
 def new_stream(name: str) -> rr.RecordingStream:
-    """Create a recording stream with its own application id, because Rerun keeps one layout per application.
+    """Create a recording stream in an application of its own: Rerun keeps a layout for each.
 
     The stream has no `log_time` and no `log_tick`: the time of drawing tells the user nothing.
 
@@ -93,7 +93,7 @@ def rerun_version() -> str:
 
 
 def scopes(logs: Sequence[RunData]) -> list[Scope]:
-    """Scope of each log: the root for one log, `run/NAME` for several, numbered where names repeat."""
+    """Scope of each log: the root for one log, `run/NAME` for several."""
     if len(logs) == 1:
         return [()]
     return [("run", name) for name in unique_names([data.name or "log" for data in logs])]
@@ -116,7 +116,7 @@ def role(trace: Trace) -> Role:
 
 
 def label(data: RunData, trace: Trace) -> str:
-    """Name of a trace in a title: of several models each model's name without the words they all begin with."""
+    """Name of a trace in a title; model names without their common first words."""
     if trace.is_raw or len(data.models()) < 2:
         return role(trace)
     return trace.name[_common_prefix_length([model.name for model in data.models()]) :] or trace.name
@@ -137,14 +137,14 @@ def entity_path(scope: Scope, *parts: str) -> str:
 
 
 def trace_path(data: RunData, trace: Trace, scope: Scope, *parts: str) -> str:
-    """Entity path of one trace; each of several models has a scope of its own, named after the model."""
+    """Entity path of one trace; each of several models has its own scope."""
     if not trace.is_raw and len(data.models()) > 1:
         scope = (*(scope or ("run",)), trace.name)
     return entity_path(scope, *parts)
 
 
 def time_columns(stamp_ns: Times, log_ns: Times, start_ns: int) -> list[rr.TimeColumn]:
-    """Time columns of rows: time since the first IMU sample, header stamp and log time, exact to the nanosecond."""
+    """Time columns in nanoseconds: time since the first IMU sample, header stamp, log time."""
     import rerun as rr
 
     return [

@@ -1,4 +1,4 @@
-"""Cameras and other topics of the log, imported by Rerun on our timelines under their own names."""
+"""Import cameras and other topics of the log into the recording, through Rerun."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ NOT_SHOWN = "The log's other topics are not shown"
 
 @dataclass(frozen=True)
 class ImportPlan:
-    """Import of a log by Rerun: its cameras, the topics left out as they are already drawn, and the reason for no import."""
+    """Import of a log by Rerun: cameras, topics already drawn, and the reason for no import."""
 
     wanted: bool = False
     left_out: tuple[str, ...] = ()
@@ -133,7 +133,7 @@ def _with_elapsed(chunk: Chunk, data: RunData) -> list[Chunk]:
 
 
 def elapsed_ns(stamp_ns: Times | None, log_ns: Times | None, data: RunData) -> Times:
-    """Time since the first IMU sample, by header stamps if all lie on its clock, else by log times."""
+    """Time since the first IMU sample, by header stamps on its clock, else by log times."""
     if stamp_ns is not None:
         inside = (stamp_ns > data.start_ns - MARGIN_NS) & (stamp_ns < data.end_ns + MARGIN_NS)
         if inside.all():

@@ -1,4 +1,4 @@
-"""Tabs beside the paths: signals, biases, spectra, errors in detail, events, report and cameras."""
+"""Tabs of a layout: signals, biases, spectra, errors, events, report and cameras."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def tabs(data: RunData, scope: Scope, with_source: bool) -> list[View]:
 
 
 def total_errors(data: RunData, scope: Scope) -> list[View]:
-    """Plots of the total errors of every run, with the worst moment of each model; none without truth."""
+    """Plots of the total errors of every run, with the worst moment of each model."""
     found = []
     for kind in errors.KINDS:
         scored = [trace for trace in data.traces if trace.errors is not None]

@@ -28,7 +28,7 @@ VIEWERS: list[subprocess.Popen[bytes]] = []  # they outlive us; kept so that Pyt
 
 
 def show(logs: Sequence[RunData], *, source: bool = True, at_s: float | None = None, overwrite: bool = False) -> Output:
-    """Open a viewer, or save NAME.rrd here where there is no display or the viewer does not start.
+    """Open a viewer, or save NAME.rrd here where no viewer can open.
 
     Raises:
         ConfigError: no log, Rerun is not installed, or the file exists (without `overwrite`) or cannot be written.
@@ -87,7 +87,7 @@ class Viewer(NamedTuple):
     peer: Listener
 
     def trouble(self, wait_s: float = DIES_WITHIN_S) -> ConfigError | None:
-        """Error if the viewer has died or dies within `wait_s`: without a window it listens before it dies."""
+        """Error if the viewer has died or dies within `wait_s`."""
         with contextlib.suppress(subprocess.TimeoutExpired):
             self.process.wait(wait_s)
         return None if self.process.returncode is None else _stopped(self.process)
@@ -151,7 +151,7 @@ def free_port() -> int:
 
 
 def binary() -> Path:
-    """Path of the viewer: its Python wrapper needs a PATH and leaves the viewer running when killed."""
+    """Path of the viewer's program; its Python wrapper leaves the viewer running when killed."""
     spec = importlib.util.find_spec("rerun_cli")  # comes with rerun-sdk
     folders = list(spec.submodule_search_locations or ()) if spec else [""]
     return Path(folders[0]) / ("rerun.exe" if sys.platform == "win32" else "rerun")

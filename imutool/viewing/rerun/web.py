@@ -1,4 +1,4 @@
-"""Rerun's web viewer with a recording: served to this machine only, or exported as a folder for any web server."""
+"""Rerun's web viewer with a recording, served to this machine or exported as a folder."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ POLICY = (
 
 
 def site(logs: Sequence[RunData], *, source: bool = True, at_s: float | None = None) -> dict[str, bytes]:
-    """Files of a web page that shows all logs, by name: the page, the viewer's files and the recording.
+    """Files of a web page with all logs: page, viewer and recording, by name.
 
     Raises:
         ConfigError: no log, Rerun is not installed, or its program does not run.
@@ -81,7 +81,7 @@ def viewer_files() -> dict[str, bytes]:
 
 
 class Server:
-    """Web server on loopback, bound at once so that a used port is known before any work; context manager.
+    """Web server on loopback, bound at once so that a used port is known before any work.
 
     `moved` is a sentence where the requested port is in use and another one serves.
     """

@@ -157,7 +157,7 @@ def test_events_have_lanes_and_rows_and_of_many_the_rest_is_counted(seen: RunDat
         said = Page(report.page([replace(seen, events=(*seen.events, *many))])).text
     listed = len(re.findall(r"\bstop \d+\b", said))
     assert 0 < listed < 90
-    assert f"{90 - listed} more are drawn above and not listed" in said
+    assert f"{90 - listed} more are drawn above but not listed" in said
 
 
 def curve_titles(content: str) -> list[str]:
@@ -276,7 +276,7 @@ def test_a_long_log_shows_the_largest_drift_of_each_stretch(seen: RunData) -> No
     data = replace(seen, end_ns=int(drift.t_ns[-1]), traces=(replace(seen.traces[0], drift=drift),))
     picture = report_errors.drift_curves(data)
     assert picture is not None
-    assert "Drawn is the largest" in picture.caption
+    assert "Each stretch shows its largest" in picture.caption
     points = curves(panel(data, report_errors.drift_curves))["raw"]
     assert len(points) == rows // stretch
     steps = np.diff(points[:, 1])  # every stretch is as much above the one before
@@ -312,7 +312,7 @@ def test_without_truth_there_are_no_errors_and_it_is_said(flown: Recording) -> N
     content = report.page([data])
     assert titles(content) == ["Paths", "Signals", "Biases", "Spectra", "Allan deviation at rest", "Events", "Provenance"]
     said = Page(content).text
-    assert "without truth, so nothing says how wrong it is. model takes 0.992°/s off the angular rate" in said
+    assert "without truth, so its errors are unknown. model subtracts 0.992°/s from the angular rate" in said
     assert "truth" not in curve_titles(content)
 
 
@@ -329,7 +329,7 @@ def test_truth_without_a_model_is_scored_alone(seen: RunData) -> None:
     with drawing_only(report_signals.biases, report_signals.zoom):
         content = report.page([replace(seen, traces=seen.traces[:1])])
     assert titles(content) == ["Figures", "Drift from a true start", "Provenance"]
-    assert "raw is wrong by" in Page(content).text
+    assert "raw has errors of" in Page(content).text
     assert 'class="number best"' not in content  # there is nothing to choose from
 
 
@@ -338,7 +338,7 @@ def test_without_allantools_the_page_says_what_is_left_out(seen: RunData, monkey
     with drawing_only(report_signals.allan_deviation):
         content = report.page([replace(seen, traces=seen.traces[:1])])
     assert "Allan deviation at rest" not in titles(content)
-    assert "Allan deviations are left out: allantools is not installed" in Page(content).text
+    assert "Without Allan deviations: allantools is not installed" in Page(content).text
 
 
 # ── a page that can be sent to anybody ──

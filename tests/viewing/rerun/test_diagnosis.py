@@ -17,7 +17,7 @@ from rerun.chunk import RrdReader
 from support import diagnoses
 from support.diagnoses import replace
 
-from imutool.diagnosis.wording import conclusion
+from imutool.diagnosis.wording.conclusion import conclusion
 from imutool.errors import ConfigError
 from imutool.viewing.rerun import diagnosis as view
 from imutool.viewing.rerun.viewer import binary
@@ -225,7 +225,8 @@ def test_a_missing_rerun_says_how_to_get_it(tmp_path: Path, monkeypatch: pytest.
 
 def test_importing_what_shows_a_diagnosis_costs_no_viewer_no_plotting_and_no_torch() -> None:
     code = (
-        "import sys, imutool.diagnosis.wording, imutool.viewing.html.diagnosis_page, imutool.viewing.rerun.diagnosis\n"
+        "import sys, imutool.diagnosis.wording.conclusion\n"
+        "import imutool.viewing.html.diagnosis_page, imutool.viewing.rerun.diagnosis\n"
         "print(sorted({'torch', 'rerun', 'matplotlib'} & set(sys.modules)))"
     )
     run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

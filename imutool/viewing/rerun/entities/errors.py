@@ -33,7 +33,7 @@ def total_error(errors: Errors, kind: str) -> np.ndarray:
 
 
 def log_errors(data: RunData, to: rr.RecordingStream, scope: Scope) -> None:
-    """Log the errors of every run that has any: `error/{orientation,position}/…` and `error/drift/…`."""
+    """Log the errors of every run: `error/{orientation,position}/…` and `error/drift/…`."""
     for trace in data.traces:
         if trace.errors is not None:
             _log_errors(data, to, scope, trace, trace.errors)
@@ -83,7 +83,7 @@ def event_kinds(data: RunData) -> list[str]:
 
 
 def log_events(data: RunData, to: rr.RecordingStream, scope: Scope) -> None:
-    """Log `events/KIND` for each kind: states for the lane, and a text at the start of each event."""
+    """Log `events/KIND`: states for the lane, and a text at the start of each event."""
     import rerun as rr
 
     for kind in event_kinds(data):

@@ -33,7 +33,7 @@ WORST_RADIUS, POLE_SHARE = 5.0, 0.2  # screen points; share of the scene, so tha
 
 @dataclass(frozen=True, eq=False)
 class Pieces:
-    """Straight pieces of a path between samples `first` and `last`, none across a gap, `counts` of them in each row.
+    """Straight pieces of a path between samples `first` and `last`, `counts` of them per row.
 
     A row has the stamp of its last sample: what the cursor shows has happened.
     """
@@ -89,7 +89,7 @@ def log_paths(data: RunData, to: rr.RecordingStream, scope: Scope, size: float) 
 
 
 def error_scale_top(data: RunData) -> float | None:
-    """End of the path's colour scale, deg of orientation error; None without truth or with several models.
+    """Upper end of the path's colour scale, deg; None without truth or with several models.
 
     Of several models each path has a colour of its own; the plots show their errors.
     """

@@ -32,7 +32,7 @@ MAX_POINTS = 400  # of a spectrum's curve: about two a pixel, the lowest and the
 
 
 def log_signals(data: RunData, to: rr.RecordingStream, scope: Scope) -> None:
-    """Log the samples of every run, the biases of every model, and the true biases where they are known."""
+    """Log the samples of every run, the biases of every model, and the true biases."""
     for trace in data.traces:
         _log_samples(data, to, scope, trace)
         if not trace.is_raw:
@@ -76,7 +76,7 @@ def log_axes(
     *,
     max_rows: int | None = None,
 ) -> None:
-    """Log three curves of a run about or along x, y and z: raw thin and pale where there is a model, a model's bold."""
+    """Log three curves of a run about or along x, y and z."""
     names = styles.axis_names(sdk.label(data, trace), axes)
     style = styles.axis_curves(sdk.role(trace), names, rank=model_index(data, trace), alone=not data.models())
     log_curves(to, data, entity, t_ns, values, style, max_rows=max_rows)
@@ -92,7 +92,7 @@ def log_curves(
     *,
     max_rows: int | None = None,
 ) -> None:
-    """Log one curve per column after its style, decimated to `max_rows` (MAX_DERIVED_ROWS) without losing an extreme."""
+    """Log one curve per column after its style, decimated to `max_rows` (MAX_DERIVED_ROWS)."""
     import rerun as rr
 
     to.log(entity, style, static=True, strict=True)
@@ -110,7 +110,7 @@ def decimation_note(data: RunData) -> list[str]:
 
 @dataclass(frozen=True)
 class DecadeFrame:
-    """Whole decades of frequency (Hz) and of the root of the density that hold all curves of a drawing."""
+    """Whole decades of frequency (Hz) and root density that hold all curves of a drawing."""
 
     low_hz: int
     high_hz: int

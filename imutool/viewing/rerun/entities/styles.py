@@ -1,4 +1,4 @@
-"""Colours, line widths and styles of curves, paths and bodies; a style is logged before its data."""
+"""Colours, line widths and styles of curves, paths and bodies."""
 
 from __future__ import annotations
 
@@ -52,12 +52,12 @@ def color_name(data: RunData, trace: Trace) -> str:
 
 
 def axis_colors(rank: int = 0) -> list[Color]:
-    """Red, green and blue; greyer for each further model, so that several models differ in one plot."""
+    """Red, green and blue; greyer for each further model."""
     return [blend_to_grey(color, min(NEXT_MODEL_FADE * rank, 0.75)) for color in XYZ]
 
 
 def blend_to_grey(color: Color, share: float) -> Color:
-    """Blend a colour with grey: pale on dark and light backgrounds alike, which transparency is not."""
+    """Blend a colour with grey, which is pale on dark and light backgrounds alike."""
     red, green, blue = (round(c + share * (g - c)) for c, g in zip(color, GREY, strict=True))
     return red, green, blue
 
@@ -78,7 +78,7 @@ def round_up_125(highest: float) -> float:
 
 
 def curves(names: Sequence[str], colors: Sequence[Color], width: float) -> rr.SeriesLines:
-    """Style of one curve per name; draws the extremes per pixel where Rerun would draw their mean."""
+    """Style of one curve per name; draws the extremes per pixel instead of the mean."""
     return line_style(names, colors, [width] * len(names))
 
 
@@ -91,7 +91,7 @@ def line_style(names: Sequence[str], colors: Sequence[Color], widths: Sequence[f
 
 
 def axis_curves(role: Role, names: Sequence[str], *, rank: int = 0, alone: bool = False) -> rr.SeriesLines:
-    """Style of three curves x, y and z: raw thin and pale unless it is `alone`, each further model greyer."""
+    """Style of three curves: raw thin and pale unless `alone`, each further model greyer."""
     if role == "raw" and not alone:
         return curves(names, [blend_to_grey(color, RAW_FADE) for color in axis_colors(rank)], RAW_WIDTH)
     return curves(names, axis_colors(rank), BOLD_WIDTH)
@@ -119,7 +119,7 @@ def total_error_curve(role: Role, name: str, color: Color) -> rr.SeriesLines:
 
 
 def path_style(role: str, color: Color | None) -> rr.LineStrips3D:
-    """Width of a path (`gt`, `raw` or `debiased`) and its colour; None where each piece has its own."""
+    """Width of a path (`gt`, `raw` or `debiased`) and its colour, if it has only one."""
     import rerun as rr
 
     radii = rr.Radius.ui_points([PATH_RADII[role]])

@@ -1,4 +1,4 @@
-"""Numbers with their uncertainty as people write them: rounded to it, in a unit that suits their size, vectors together."""
+"""Quantities with their uncertainty as text: rounded to it, in a readable unit, vectors together."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ PLAIN_FROM, PLAIN_BELOW = 1e-2, 1e5  # outside, a power of ten is taken out in f
 
 @dataclass(frozen=True)
 class Quantity:
-    """Parameters that belong together, such as the three of a lever arm: a label, their axes and their estimates."""
+    """Parameters of one vector or matrix: label, axes and estimates."""
 
     label: str
     axes: tuple[str, ...]
@@ -62,16 +62,16 @@ class Quantity:
 
 
 def grouped(estimates: Mapping[str, Estimate]) -> list[Quantity]:
-    """Parameters by what they belong to: `x`, `y`, `z` (or `tilt_x`, `tilt_y`; `xy`, `yx`) of one unit are one quantity.
+    """Quantities of parameters: `x`, `y`, `z` (or `tilt_x`, `tilt_y`; `xy`, `yx`) of a unit are one quantity.
 
     What is infinite is left out: a limit or a cut-off that is never reached.
     """
     taken: dict[tuple[str, str], list[str]] = {}
-    for key, one in estimates.items():
-        if math.isinf(one.value):
+    for key, estimate in estimates.items():
+        if math.isinf(estimate.value):
             continue
         match = re.fullmatch(r"(?P<stem>.*?)[._]?(?:[xyz][._]?[xyz]|[xyz])", key)
-        taken.setdefault((match["stem"] if match else key, one.unit), []).append(key)
+        taken.setdefault((match["stem"] if match else key, estimate.unit), []).append(key)
     out = []
     for (stem, _), keys in taken.items():
         if len(keys) == 1:  # a word that only ends like an axis, such as `frequency`
@@ -82,19 +82,19 @@ def grouped(estimates: Mapping[str, Estimate]) -> list[Quantity]:
     return out
 
 
-def value(one: Estimate) -> str:
+def value(estimate: Estimate) -> str:
     """`12.4 ± 0.3 ms`: in a readable unit, rounded to the uncertainty; four digits where that is zero."""
-    size, unit = _step([one])
-    number, band, factor = _numbers([one], size)
+    size, unit = _step([estimate])
+    number, band, factor = _numbers([estimate], size)
     text = f"{number[0]} ± {band[0]}" if band[0] else number[0]
     if factor:
         text = f"({text}) {factor}" if band[0] else f"{text} {factor}"
-    unknown = "" if math.isfinite(one.std) else " (uncertainty unknown)"
+    unknown = "" if math.isfinite(estimate.std) else " (uncertainty unknown)"
     return _with(text, unit) + unknown
 
 
 def vector(several: Sequence[Estimate], labels: Sequence[str] = ()) -> str:
-    """`(0.213, -0.051, 0.120) ± 0.004 m`: as `value`, one unit for all; labels come before the numbers."""
+    """`(0.213, -0.051, 0.120) ± 0.004 m`: as `value`, in one unit for all; labels come before the numbers."""
     size, unit = _step(several)
     numbers, bands, factor = _numbers(several, size)
     if labels:
@@ -104,7 +104,7 @@ def vector(several: Sequence[Estimate], labels: Sequence[str] = ()) -> str:
         text += f" ± {bands[0]}" if len(set(bands)) == 1 else f" ± ({', '.join(bands)})"
     if factor:
         text = f"[{text}] {factor}"
-    unknown = "" if all(math.isfinite(one.std) for one in several) else " (uncertainty unknown)"
+    unknown = "" if all(math.isfinite(estimate.std) for estimate in several) else " (uncertainty unknown)"
     return _with(text, unit) + unknown
 
 
@@ -133,17 +133,17 @@ def percent(share: float) -> str:
     return "more than 99 %" if 0.995 < share < 1.0 else f"{100.0 * share:.0f} %"
 
 
-def _clearness(one: Estimate) -> float:
+def _clearness(estimate: Estimate) -> float:
     """How many standard deviations it is from zero."""
-    return abs(one.value) / one.std if one.std > 0.0 else math.inf
+    return abs(estimate.value) / estimate.std if estimate.std > 0.0 else math.inf
 
 
 def _step(several: Sequence[Estimate]) -> tuple[float, str]:
     """The size of the unit that suits the largest of them, and its symbol."""
     unit = symbol(several[0].unit)
-    largest = max(abs(one.value) for one in several)
+    largest = max(abs(estimate.value) for estimate in several)
     if largest == 0.0 or not math.isfinite(largest):
-        largest = max((one.std for one in several if math.isfinite(one.std)), default=0.0)
+        largest = max((estimate.std for estimate in several if math.isfinite(estimate.std)), default=0.0)
     for least, size, name in STEPS.get(unit or "-", ()):
         if largest >= least:
             return size, name
@@ -152,8 +152,8 @@ def _step(several: Sequence[Estimate]) -> tuple[float, str]:
 
 def _numbers(several: Sequence[Estimate], size: float) -> tuple[list[str], list[str], str]:
     """Values and bands as text, each rounded to its own uncertainty, and the power of ten taken out in front."""
-    values = [one.value / size for one in several]
-    bands = [one.std / size for one in several]
+    values = [estimate.value / size for estimate in several]
+    bands = [estimate.std / size for estimate in several]
     largest = max((abs(v) for v in [*values, *bands] if math.isfinite(v)), default=0.0)
     power = 0 if largest == 0.0 or PLAIN_FROM <= largest < PLAIN_BELOW else 3 * math.floor(math.log10(largest) / 3.0)
     values, bands = [v / 10.0**power for v in values], [b / 10.0**power for b in bands]

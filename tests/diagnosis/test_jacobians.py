@@ -7,11 +7,10 @@ import pytest
 from scipy.signal import firwin
 from support import planted
 
-from imutool.diagnosis.estimation.alignment import Pair
+from imutool.diagnosis.estimation.aligned_log import Pair
 from imutool.diagnosis.estimation.candidate_score import CandidateScore
-from imutool.diagnosis.estimation.forward_cache import ForwardPass, bound, free, step_of
 from imutool.diagnosis.estimation.gauss_newton import fit
-from imutool.diagnosis.estimation.jacobians import Jacobians, effect_jacobian
+from imutool.diagnosis.estimation.jacobians import ForwardPass, Jacobians, bound, effect_jacobian, free, step_of
 from imutool.diagnosis.estimation.whitening import Band, Whitener
 from imutool.sensor.effect import Effect, Stage, Theta, simulate_samples
 
@@ -50,12 +49,12 @@ def pair() -> Pair:
 
 
 @pytest.mark.parametrize("physics", planted.catalogue(), ids=lambda one: one.name)
-def test_slopes_are_the_differences_of_the_whole(pair: Pair, physics: Effect) -> None:
+def test_jacobians_are_the_differences_of_the_whole(pair: Pair, physics: Effect) -> None:
     others = tuple(one for one in planted.acting(AROUND) if one[0].name != physics.name)
     theta = start(physics, pair)
     chosen = (*others, (physics, theta))
     base, got = evaluated(pair, chosen), np.zeros((6, len(theta), len(pair.stamp_s)))
-    for axis, j, row in ForwardPass(pair, chosen, ForwardPass(pair, others)).slope(physics):
+    for axis, j, row in ForwardPass(pair, chosen, ForwardPass(pair, others)).derivatives(physics):
         got[axis, j] = row
     for j, number in enumerate(physics.parameters):
         x = free(physics, theta)
@@ -65,7 +64,7 @@ def test_slopes_are_the_differences_of_the_whole(pair: Pair, physics: Effect) ->
 
 
 @pytest.mark.parametrize("physics", [one for one in planted.catalogue() if one.linear], ids=lambda one: one.name)
-def test_the_slope_of_a_linear_effect_needs_it_not_to_be_there(pair: Pair, physics: Effect) -> None:
+def test_the_jacobian_of_a_linear_effect_needs_no_pass_through_it(pair: Pair, physics: Effect) -> None:
     others = tuple(one for one in planted.acting(AROUND) if one[0].name != physics.name)
     noise = Whitener(np.ones((6, 1)), planted.NOISE)
     beside = effect_jacobian(noise, ForwardPass(pair, others), physics)
@@ -74,7 +73,7 @@ def test_the_slope_of_a_linear_effect_needs_it_not_to_be_there(pair: Pair, physi
     np.testing.assert_allclose(beside.white, there.white, rtol=1e-12)
 
 
-def test_a_course_like_another_reads_what_a_new_one_reads(pair: Pair) -> None:
+def test_a_pass_continued_from_another_reads_what_a_new_one_reads(pair: Pair) -> None:
     acting = planted.acting(AROUND)
     known = ForwardPass(pair, acting[4:])
     for chosen in (acting, acting[1:], acting[::-1], acting[:3], (), acting[4:]):
@@ -87,11 +86,11 @@ def test_what_an_effect_adds_is_told_for_the_axes_that_it_changes(pair: Pair) ->
     nothing, scaled = ForwardPass(pair, ()), ForwardPass(pair, planted.acting({"gyro_scale": [0.01, 0.0, 0.0]}))
     added = scaled.added(nothing)
     assert list(added) == [0]
-    np.testing.assert_allclose(added[0], 0.01 * nothing.read.gyro[:, 0])
+    np.testing.assert_allclose(added[0], 0.01 * nothing.expected[:, 0])
 
 
 @pytest.mark.parametrize("band", [None, Band(firwin(67, 8.0, fs=100.0), 4)])
-def test_a_step_along_slopes_is_the_sum_of_their_rows(pair: Pair, band: Band | None) -> None:
+def test_a_step_along_jacobians_is_the_sum_of_their_rows(pair: Pair, band: Band | None) -> None:
     chosen = planted.acting(AROUND)
     whiten = Whitener(np.tile([1.0, -0.4], (6, 1)), planted.NOISE, band)
     slopes = Jacobians([whiten], [ForwardPass(pair, chosen)], chosen)
@@ -104,7 +103,7 @@ def test_a_step_along_slopes_is_the_sum_of_their_rows(pair: Pair, band: Band | N
         np.testing.assert_allclose(slopes.along(0, axis, step, rows), step @ whole[axis], atol=1e-9 * np.abs(whole).max())
 
 
-def test_slopes_that_are_known_are_taken_as_they_are(pair: Pair) -> None:
+def test_jacobians_that_are_known_are_taken_as_they_are(pair: Pair) -> None:
     chosen = planted.acting(AROUND)
     noise, course = Whitener(np.ones((6, 1)), planted.NOISE), ForwardPass(pair, chosen)
     known = Jacobians([noise], [ForwardPass(pair, chosen[:2])], chosen[:2])
@@ -118,7 +117,7 @@ def test_slopes_that_are_known_are_taken_as_they_are(pair: Pair) -> None:
             np.testing.assert_array_equal(mine[k], row)
 
 
-def test_what_the_panel_promises_of_a_linear_effect_a_fit_keeps(pair: Pair) -> None:
+def test_what_the_score_promises_of_a_linear_effect_a_fit_keeps(pair: Pair) -> None:
     log = planted.weighed(pair)
     now = fit([log], planted.acting({"clock_offset": [0.0]}))
     panel = CandidateScore([log], now)
@@ -128,7 +127,7 @@ def test_what_the_panel_promises_of_a_linear_effect_a_fit_keeps(pair: Pair) -> N
         assert panel.gain(physics, nothing) == pytest.approx(gained, rel=0.01, abs=0.1)
 
 
-def test_the_panel_promises_no_more_than_a_step_by_a_factor_of_e(pair: Pair) -> None:
+def test_the_score_promises_no_more_than_a_step_by_a_factor_of_e(pair: Pair) -> None:
     """A low-pass that is far from where it would do no harm: extrapolated, its harm would turn into a gain."""
     log = planted.weighed(pair)
     now = fit([log], planted.acting({"clock_offset": [0.0], "lever_arm": [0.0] * 3}))

@@ -16,8 +16,8 @@ import numpy as np
 from jaxtyping import Bool, Int64
 from numpy.lib.stride_tricks import sliding_window_view
 
-from imutool.cleaning.finding import Finding, Places, runs
-from imutool.cleaning.rule import Rule, Whole
+from imutool.cleaning.finding import Finding, Intervals, runs
+from imutool.cleaning.rule import Rule, TopicSummary
 from imutool.cleaning.samples import Samples, padded
 from imutool.recording import nanoseconds
 
@@ -38,7 +38,7 @@ class Epoch:
     count: int
 
 
-class TimeBack(Rule):
+class NonMonotonic(Rule):
     """Leaves samples whose stamps strictly increase.
 
     Args:
@@ -52,7 +52,7 @@ class TimeBack(Rule):
         super().__init__()
         self._skip = skip
         self.epochs: list[Epoch] = []
-        self._late, self._ahead, self._other = Places(), Places(), Places()
+        self._late, self._ahead, self._other = Intervals(), Intervals(), Intervals()
         self._furthest_s, self._set_back = 0.0, 0
         self._last: int | None = None
         self._late_ns: list[Int64[np.ndarray, " n"]] = []
@@ -77,7 +77,7 @@ class TimeBack(Rule):
             self._drop(self._other, samples, skipped)
             yield samples.where(~skipped)
 
-    def _drop(self, places: Places, samples: Samples, mask: Bool[np.ndarray, " n"]) -> None:
+    def _drop(self, places: Intervals, samples: Samples, mask: Bool[np.ndarray, " n"]) -> None:
         if mask.any():
             places.add(samples.number[mask], samples.stamp_ns[mask])
             self.dropped.append(samples.number[mask])
@@ -125,7 +125,11 @@ class TimeBack(Rule):
         epoch.count += len(rows)
         self._last = epoch.last_ns
 
-    def findings(self, whole: Whole) -> Iterator[Finding]:
+    def second_pass(self, messages: int) -> NonMonotonic | None:
+        """The rule that skips the epochs left out; None where the clock was never set."""
+        return NonMonotonic(left_out(self.epochs, messages)) if len(self.epochs) > 1 else None
+
+    def findings(self, whole: TopicSummary) -> Iterator[Finding]:
         """Late samples, samples ahead, and epochs left out."""
         if self._late.count:
             whole.late_ns = np.sort(np.concatenate(self._late_ns))
@@ -134,12 +138,12 @@ class TimeBack(Rule):
             yield Finding("time_back", "warning", what, **self._late.where(), values=values, action="dropped")
         if self._ahead.count:
             what = "samples with a stamp ahead of those that follow"
-            yield Finding("time_back", "warning", what, **self._ahead.where(), action="dropped", sure=0.9)
+            yield Finding("time_back", "warning", what, **self._ahead.where(), action="dropped", confidence=0.9)
         if self._other.count:
             share = self._other.count / whole.messages
             what = "samples from before or after the clock was set, apart from the rest by more than a pause explains"
             yield Finding(
-                "time_back", "error", what, **self._other.where(), values={"share": share}, action="dropped", sure=0.8
+                "time_back", "error", what, **self._other.where(), values={"share": share}, action="dropped", confidence=0.8
             )
 
 
