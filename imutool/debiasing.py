@@ -1,4 +1,4 @@
-"""A model at work: over a whole log, over a recording in memory, or one sample at a time; always the same numbers.
+"""Debias a log: copy it and add debiased samples, biases and their covariance.
 
 Causal throughout, unless `smooth` is asked for: the bias at a sample comes from that sample and earlier ones, once the start
 is known (`imutool.bias_start.initial_bias`). Smoothing reads the log twice; of the first pass it keeps thirteen numbers for
@@ -19,9 +19,9 @@ from jaxtyping import Float64, Int64, UInt8
 from imutool import __version__
 from imutool.bias import static
 from imutool.bias.io import shipped, shipped_for
-from imutool.bias.model import BiasModel, SampleStream, Stream, Vector6
+from imutool.bias.model import BiasModel
 from imutool.bias_start.bias_covariance import BiasEstimator
-from imutool.bias_start.initial_bias import InitialBias, tracked_from_prior
+from imutool.bias_start.initial_bias import InitialBias
 from imutool.bias_start.model_choice import check_smooth, choose_model_and_start
 from imutool.cleaning import Cleaner, CleaningSettings, Survey, look
 from imutool.config import plain
@@ -38,35 +38,21 @@ from imutool.mcap_io.rewrite import RewriteReport, Values, rewrite
 from imutool.mcap_io.storage.source import Digest
 from imutool.mcap_io.topics import ImuBatch, StampCheck
 from imutool.mcap_io.verify import Verified, check_mode
-from imutool.recording import Imu, seconds
+from imutool.recording import seconds
 
 SUFFIX = "/debiased"
-BLOCK_SAMPLES = 1 << 14
 CLEAN_RECORD = "imutool_clean"
-
-
-class DebiasedImu(NamedTuple):
-    """Corrected samples and the subtracted bias: gyro (rad/s), then accel (m/s²)."""
-
-    imu: Imu
-    bias: Float64[np.ndarray, "n 6"]
 
 
 @dataclass(frozen=True)
 class DebiasReport:
-    """What was done to a log, one entry per IMU topic."""
+    """Models, initial biases, copy and losses of a debiased log, per IMU topic."""
 
     models: Mapping[str, str]
     starts: Mapping[str, InitialBias]
     rewrite: RewriteReport
     losses: Losses  # of a damaged source; empty as far as it was looked at (`check`)
     surveys: Mapping[str, Survey]  # of what was cleaned
-
-
-def apply(model: BiasModel, start: InitialBias, imu: Imu) -> DebiasedImu:
-    """A model over samples in memory, from their first on."""
-    bias = start.stream(model)(seconds(imu.t_ns, int(imu.t_ns[0])), imu.gyro, imu.accel)
-    return DebiasedImu(Imu(imu.t_ns, imu.gyro - bias[:, :3], imu.accel - bias[:, 3:]), bias)
 
 
 class DebiasedBlock(NamedTuple):
@@ -79,56 +65,6 @@ class DebiasedBlock(NamedTuple):
 
 
 BlockCallback = Callable[[DebiasedBlock], None]
-
-
-def apply_with_std(model: BiasModel, start: InitialBias, imu: Imu) -> tuple[DebiasedImu, Float64[np.ndarray, "n 6"]]:
-    """As `apply`, and one standard deviation of the bias at each sample, gyro (rad/s) then accel (m/s²):
-    `imutool.bias_start.bias_covariance`.
-
-    In blocks, as a log is debiased: a covariance is 288 bytes.
-    """
-    estimator = BiasEstimator(model, start)
-    t_s = seconds(imu.t_ns, int(imu.t_ns[0]))
-    bias, std = np.empty((len(imu), 6)), np.empty((len(imu), 6))
-    for first in range(0, len(imu), BLOCK_SAMPLES):
-        rows = slice(first, first + BLOCK_SAMPLES)
-        bias[rows], covariance = estimator(t_s[rows], imu.gyro[rows], imu.accel[rows])
-        std[rows] = np.sqrt(covariance.diagonal(axis1=1, axis2=2))
-    return DebiasedImu(Imu(imu.t_ns, imu.gyro - bias[:, :3], imu.accel - bias[:, 3:]), bias), std
-
-
-class OnlineDebiaser:
-    """One sample in, one corrected sample out: for a live node.
-
-    The start is a rest bias from `imutool.bias_start.initial_bias`, for instance `at_rest` over the first seconds, or
-    `prior`. Without one, it
-    begins at the prior and is followed by what the samples show, as by `--init auto`.
-    """
-
-    def __init__(self, model: BiasModel, start: InitialBias | None = None) -> None:
-        stream = (start or tracked_from_prior(model)).stream(model)
-        self._one, self._start_ns = stream.one if isinstance(stream, SampleStream) else _by_blocks(stream), -1
-
-    def __call__(
-        self, stamp_ns: int, gyro: Float64[np.ndarray, "3"], accel: Float64[np.ndarray, "3"]
-    ) -> tuple[Float64[np.ndarray, "3"], Float64[np.ndarray, "3"], Float64[np.ndarray, "6"]]:
-        """Corrected angular rate (rad/s) and specific force (m/s²), and the bias that was subtracted."""
-        if self._start_ns < 0:
-            self._start_ns = stamp_ns
-        u = np.concatenate((gyro, accel))
-        bias = self._one((stamp_ns - self._start_ns) * 1e-9, u)
-        clean = u - bias
-        return clean[:3], clean[3:], bias
-
-
-def _by_blocks(stream: Stream) -> Callable[[float, Vector6], Vector6]:
-    """One sample as a block of one, for a stream that knows no shorter way."""
-
-    def one(t_s: float, u: Vector6) -> Vector6:
-        bias: Vector6 = stream(np.array([t_s]), u[None, :3], u[None, 3:])[0]
-        return bias
-
-    return one
 
 
 class Debiaser:
@@ -208,17 +144,16 @@ def debias(
     progress: Callable[[int, int], None] | None = None,
     watch: BlockCallback | None = None,
 ) -> DebiasReport:
-    """Writes `target`: all of `source` unchanged, and beside each IMU its debiased samples and the bias taken off.
+    """Writes `target`: all of `source`, and for each IMU its debiased samples and the bias.
 
     One model serves every IMU, or each has its own by topic, "" being that of all others. An IMU without one gets the
     one the log's metadata names, else the one that ships for its sensor, else the mean over time at rest. The IMUs are
     those in `imus`, else those with a model of their own, else the log's only one.
-    With `smooth` the start bias at every time comes from the whole log, also from what follows.
-    Without a target the log itself is replaced (`mcap_io.rewrite`, which also says what `check` checks).
-    Of a damaged log, what is sound goes through a repaired copy beside the target (`mcap_io.salvage`), and `losses` says
-    what is missing; it is not replaced. With `clean` a first pass says what is to be left out or converted
-    (`imutool.cleaning`), and the record `imutool_clean` what it found.
-    `watch` is told every batch of samples as it is debiased, those of a damaged log again when its repaired copy is.
+    With `smooth` the initial bias at every time comes from the whole log, also from later samples.
+    Without a target the log itself is replaced; `check` is that of `mcap_io.rewrite`. The intact part of a damaged log is
+    debiased from a repaired copy beside the target (`mcap_io.repair`), and `losses` lists the rest; it is not replaced. With
+    `clean` a first pass finds samples to leave out or convert (`imutool.cleaning`); the record `imutool_clean` lists them.
+    `watch` is called with every batch of debiased samples, those of a damaged log again when its repaired copy is debiased.
 
     Raises:
         ConfigError: source or target cannot be opened, `init` makes no sense, `smooth` is asked for with another `init`,
@@ -305,12 +240,12 @@ def _debias(
 
 
 def _record_name(name: str, topic: str, records: Mapping[str, object]) -> str:
-    """The name of a metadata record: with its topic where there are several."""
+    """The name of a metadata record: with its topic where there are several IMUs."""
     return f"{name}{topic}" if len(records) > 1 else name
 
 
 def _model_of_log(about: Mapping[str, str]) -> str | Path | None:
-    """The model that a log's metadata name, which must be one that ships: a log may come from anybody."""
+    """The shipped model that a log's metadata name: a log may come from anybody."""
     return shipped(about["model"]) if about.get("model") else shipped_for(about.get("sensor"), about.get("dataset"))
 
 

@@ -14,10 +14,10 @@ from imutool.bias import static
 from imutool.bias.io import check_rate, find_model
 from imutool.bias.model import BiasModel
 from imutool.bias_start.bias_tracking import BiasPrior
+from imutool.bias_start.correction import DebiasedImu, apply
 from imutool.bias_start.initial_bias import AT_REST_STD, LEAST_STD, InitialBias, find
 from imutool.bias_start.model_choice import check_smooth, estimate_at_rest, smooth_in_memory
 from imutool.bias_start.zero_velocity import zero_velocity_trajectory
-from imutool.debiasing import DebiasedImu, apply
 from imutool.errors import ConfigError
 from imutool.inertial import metrics
 from imutool.inertial.strapdown import StartPose, along_truth, drift

@@ -1,4 +1,4 @@
-"""Where a log lies: a file on this machine, or an object in a store, named by its URL.
+"""Locations of logs: a file on this machine, or an object in a store by its URL.
 
 A store is read and written through fsspec, which is imported only when a URL is given. What opens it comes from the store's
 own usual chain (environment, profile, instance role; its endpoint from AWS_ENDPOINT_URL) and never from the URL, because a
@@ -33,7 +33,7 @@ STORES = {
     "https": CLOUD,
     "memory": CLOUD,
 }
-ACCOUNTS = ("az", "abfs")  # these say CONTAINER@ACCOUNT, which is no secret
+ACCOUNTS = ("az", "abfs")  # their URLs say CONTAINER@ACCOUNT, which is not secret
 BLOCK_BYTES = 4 << 20
 # A scan, the message indexes behind its chunk and the summary each have their block: 7 requests where 6 are the fewest, and
 # the library's own reading ahead made 13 (tests/bench/store.py)
@@ -41,7 +41,7 @@ CACHE, CACHE_OPTIONS = "blockcache", {"maxblocks": 4}
 
 
 class OpenFile(NamedTuple):
-    """A file or object open for reading from any byte, its size, and its `identity` when it was opened."""
+    """An open file or object, its size, and its `identity` when it was opened."""
 
     file: BinaryIO
     size: int
@@ -49,10 +49,10 @@ class OpenFile(NamedTuple):
 
 
 def to_location(text: str) -> Location:
-    """The file or the object that a user names.
+    """File or object that a user names.
 
     Raises:
-        ConfigError: a store nobody here knows, one whose package is not installed, or a URL with a password or signature in it.
+        ConfigError: an unknown kind of store, one whose package is not installed, or a URL with a password or signature in it.
     """
     scheme, found, rest = text.partition("://")
     if not found:
@@ -60,20 +60,20 @@ def to_location(text: str) -> Location:
     if scheme == "file":
         return Path(rest)
     if scheme not in STORES:
-        raise ConfigError("is no store known here", where=redact(text), expected=", ".join(f"{name}://" for name in STORES))
+        raise ConfigError("unknown kind of store", where=redact(text), expected=", ".join(f"{name}://" for name in STORES))
     _refuse_secrets(scheme, text)
     try:
         from upath import UPath
 
-        found_place = UPath(text, use_listings_cache=False)  # a listing kept from before would hide what others write
-        found_place.fs  # noqa: B018  imports the store's package
+        place = UPath(text, use_listings_cache=False)  # a cached listing would hide what others write
+        place.fs  # noqa: B018  imports the store's package
     except ImportError as error:
         raise ConfigError(
             f"needs a package that is not installed ({error})", where=text, fix=f"Install it with: {STORES[scheme]}"
         ) from error
-    except Exception as error:  # whatever the store's own set-up trips over
+    except Exception as error:  # any error of the store's set-up
         raise ConfigError(f"cannot be opened ({reason(error)})", where=text) from error
-    return found_place
+    return place
 
 
 def _refuse_secrets(scheme: str, text: str) -> None:
@@ -95,17 +95,17 @@ def _refuse_secrets(scheme: str, text: str) -> None:
 
 
 def redact(text: str) -> str:
-    """Text that may hold URLs, without the users, passwords and signatures in them."""
+    """Text without the users, passwords and signatures of the URLs in it."""
     return re.sub(r"(?i)((?:signature|sig|token|credential)=)[^&\s\"']+", r"\1***", re.sub(r"//[^/\s]*@", "//***@", text))
 
 
 def io_errors(where: Location) -> type[Exception]:
-    """What reading and writing there may raise: of a store whatever its library does, since they have no class in common."""
+    """Exception class of reading and writing a location: OSError, or any of a store."""
     return OSError if isinstance(where, Path) else Exception
 
 
 def reason(error: Exception) -> str:
-    """What went wrong in the words of the system or the store, with nothing secret in it."""
+    """The system's or store's reason of an error, without secrets."""
     if isinstance(error, OSError) and error.strerror:
         return redact(error.strerror)
     if isinstance(error, FileNotFoundError):
@@ -116,7 +116,7 @@ def reason(error: Exception) -> str:
 
 
 def open_location(where: Location) -> OpenFile:
-    """A file or object open for reading; a store is read by ranges, in blocks, of which a few are kept.
+    """Opens a file or object for reading; a store is read by blocks, of which a few are kept.
 
     Raises:
         The classes that `io_errors` names.
@@ -140,7 +140,7 @@ def same_location(a: Location, b: Location) -> bool:
 
 
 def identity(where: Location) -> tuple[int, str]:
-    """Size in bytes, and the etag of a store or the time of the last change: what changes when somebody writes there.
+    """Size, and the etag of a store or the time of the last change.
 
     Raises:
         ConfigError: it cannot be asked for.
@@ -155,7 +155,7 @@ def identity(where: Location) -> tuple[int, str]:
 
 
 def size_and_etag(about: Mapping[str, Any]) -> tuple[int, str]:
-    """Size and etag as a store says them, by whatever name."""
+    """Size and etag from a store's description, whatever names it uses."""
     names = ("ETag", "etag", "md5Hash", "content_md5", "LastModified", "last_modified", "mtime", "created")
     stamp = next((str(about[name]) for name in names if about.get(name)), "")
     return int(about["size"]), stamp.strip('"')

@@ -20,6 +20,7 @@ from rosbags.highlevel import AnyReader
 from imutool.bias import linear, neural_ode, static
 from imutool.bias.io import load, save
 from imutool.bias.model import BiasModel, Segment
+from imutool.bias_start.correction import OnlineDebiaser, apply
 from imutool.bias_start.initial_bias import (
     InitialBias,
     at_rest,
@@ -31,15 +32,17 @@ from imutool.bias_start.initial_bias import (
     tracked_from_prior,
 )
 from imutool.bias_start.model_choice import estimate_at_rest
+from imutool.cleaning import Rules
 from imutool.cli.debias import assigned
 from imutool.conversion import convert
-from imutool.debiasing import OnlineDebiaser, apply, debias
+from imutool.debiasing import debias
 from imutool.errors import ConfigError, LogError, ModelError
 from imutool.mcap_io.codec import schemas
 from imutool.mcap_io.codec.decode import decode_imu, decode_scalars
 from imutool.mcap_io.codec.encode import encode_imu, encode_pose
+from imutool.mcap_io.index import LogIndex
 from imutool.mcap_io.read import read
-from imutool.mcap_io.storage.source import sha256
+from imutool.mcap_io.storage.source import Source, sha256
 from imutool.mcap_io.write import write
 from imutool.recording import Frames, Recording, Scalars, seconds
 from imutool.sensor.flight import flight
@@ -455,7 +458,7 @@ def test_a_model_for_another_rate_is_refused(source: Path, tmp_path: Path) -> No
 def test_several_imus_each_get_their_own(recording: Recording, tmp_path: Path, model_file: Path) -> None:
     log = tmp_path / "two.mcap"
     both = write_two_imus(recording, log)
-    with pytest.raises(LogError, match=r"IMU topics: /imu0, /imu1; expected one.*`imu`"):
+    with pytest.raises(LogError, match=r"2 IMU topics: /imu0, /imu1. Choose one with `imu`"):
         debias(log, tmp_path / "out.mcap", model=model_file)
     report = debias(log, tmp_path / "out.mcap", model=model_file, imus=["/imu0", "/imu1"])
     assert set(report.rewrite.added) == {
@@ -693,3 +696,35 @@ def test_a_real_log_keeps_every_message_and_opens_elsewhere(data: Path, tmp_path
         np.testing.assert_array_equal([[getattr(getattr(m, name), axis) for axis in "xyz"] for m in made], values)
     stamps = [m.header.stamp.sec * 10**9 + m.header.stamp.nanosec for m in made]
     np.testing.assert_array_equal(stamps, expected.t_ns)
+
+
+# ── one open log ──
+
+
+class Opens:
+    """Counts the sources that are opened of one log, and the indexes that are read of it."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, name: str) -> None:
+        self.sources = self.summaries = 0
+
+        def open_source(source: Source, path: Any, *words: Any) -> None:
+            self.sources += path.name == name
+            original_open(source, path, *words)
+
+        def read_summary(index: LogIndex) -> Any:
+            self.summaries += index.source.path.name == name
+            return original_read(index)
+
+        original_open, original_read = Source.__init__, LogIndex._read_summary
+        monkeypatch.setattr(Source, "__init__", open_source)
+        monkeypatch.setattr(LogIndex, "_read_summary", read_summary)
+
+
+@pytest.mark.parametrize("options", [{}, {"smooth": True}, {"init": "truth"}, {"clean": Rules()}], ids=str)
+def test_a_log_is_opened_once_and_once_more_for_its_checksum(
+    logs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, options: dict[str, Any]
+) -> None:
+    (tmp_path / "in.mcap").write_bytes((logs / "flight_1.mcap").read_bytes())
+    opens = Opens(monkeypatch, "in.mcap")
+    debias(tmp_path / "in.mcap", tmp_path / "out.mcap", model=logs / "linear.safetensors", **options)
+    assert (opens.sources, opens.summaries) == (2, 2)  # the summary once to look for damage, once to read: from one open file

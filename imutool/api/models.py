@@ -17,9 +17,10 @@ from imutool.api.paths import LogPath, location
 from imutool.bias import static
 from imutool.bias.io import find_model, shipped_for
 from imutool.bias.model import BiasModel
+from imutool.bias_start.correction import apply_with_std
 from imutool.bias_start.initial_bias import InitialBias, at_rest, find
 from imutool.bias_start.model_choice import check_smooth, smooth_in_memory
-from imutool.debiasing import DebiasReport, apply_with_std
+from imutool.debiasing import DebiasReport
 from imutool.errors import ConfigError
 from imutool.recording import Imu, Recording
 

@@ -1,4 +1,4 @@
-"""Choose the bias model and the initial bias for an IMU, from its log's first minute or from all of it.
+"""Choose the bias model and the initial bias for an IMU of a log.
 
 Samples are cleaned where there is a survey (`imutool.cleaning`). Memory does not grow with the log.
 """
@@ -89,7 +89,7 @@ def _batches(log: Log, topic: str, survey: Survey | None) -> Iterator[Samples]:
 
 
 def _first_minute(log: Log, topic: str, init: str, survey: Survey | None) -> Recording:
-    """The first minute of a log, with its truth only where `init` asks for it: it may not belong to this IMU."""
+    """The first minute of a log, with its truth only where `init` asks for it."""
     first = next((int(times.min()) for times in log.stamps(topic) if len(times)), None)
     end_ns = None if first is None else first + nanoseconds(HEAD_S)
     if init.partition(":")[0] == "truth" and survey is None:
@@ -120,7 +120,7 @@ def _noise(imu: Imu) -> Float64[np.ndarray, "6"]:
 
 
 def estimate_at_rest(imu: Imu, where: str | Location) -> tuple[BiasModel, InitialBias]:
-    """The static model with its bias: the mean over all time at rest, for a log nobody trained a model for.
+    """The static model with the mean bias over all rest, for a log without a model.
 
     Raises:
         DataError: fewer than two samples.

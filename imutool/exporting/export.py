@@ -1,4 +1,4 @@
-"""A log for programs that do not read MCAP as it is: a EuRoC (ASL) folder, or a rosbag2 folder around a copy of the log.
+"""Export a log as a EuRoC (ASL) folder, or as a rosbag2 folder around a copy.
 
 Both are folders that appear whole or not at all. The log stays as it is.
 """

@@ -1,4 +1,4 @@
-"""A folder that appears whole or not at all: written beside its place, renamed when complete."""
+"""Write a folder that appears whole or not at all, and report its contents."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ SIGNATURE = "# Exported by imutool"
 
 
 class ExportFolder:
-    """Context manager over a folder being written; leaving it without an error puts it in its place.
+    """The folder being written; leaving the context without an error puts it in its place.
 
     Any error, Ctrl-C included, removes what was written. An older folder is replaced only if its file `signed` says that it
     was made here and its top holds nothing but what `holds` matches: a data set that merely looks alike is never removed.
 
     Raises:
-        ConfigError: the target exists (without `overwrite`), is no export, holds the log, or cannot be written.
+        ConfigError: the target exists (without `overwrite`), is not an export, holds the log, or cannot be written.
     """
 
     def __init__(self, path: Path, log: Path, *, signed: str, holds: str, overwrite: bool) -> None:
@@ -46,7 +46,7 @@ class ExportFolder:
         if not self.overwrite:
             raise ConfigError("the target exists", where=self.path, fix="Choose another name, or add `overwrite=True`")
         if self.path.is_symlink() or not self.path.is_dir():
-            raise ConfigError("the target is no folder", where=self.path, expected="the name of a new folder")
+            raise ConfigError("the target is not a folder", where=self.path, expected="the name of a new folder")
         if self.log.resolve().is_relative_to(self.path.resolve()):
             raise ConfigError("the target holds the log itself", where=self.path, expected="another folder")
         foreign = sorted(entry.name for entry in self.path.iterdir() if not re.fullmatch(self.holds, entry.name))
@@ -72,7 +72,7 @@ class ExportFolder:
             self._remove()
 
     def _commit(self) -> None:
-        """Puts the folder in its place, and an older one out of it only when nothing can go wrong any more."""
+        """Puts the folder in its place, and an older one out of it once nothing can fail."""
         self._refuse_existing()
         with writing(self.path):
             if not self.path.exists():
@@ -90,7 +90,7 @@ class ExportFolder:
 
 @contextlib.contextmanager
 def writing(path: Path) -> Iterator[None]:
-    """While something is written there: what the system refuses is said as a ConfigError."""
+    """Turns errors of the system into a ConfigError while a folder is written."""
     try:
         yield
     except OSError as error:
@@ -104,7 +104,7 @@ Progress = Callable[[int, int, str], None]  # done, in all, what is being writte
 
 @dataclass(frozen=True)
 class ExportReport:
-    """What was written: the IMU's topic (of a EuRoC folder), messages or rows by file, and the topics left behind."""
+    """Exported files with their rows, the IMU's topic (EuRoC), and the topics left out."""
 
     output: Path
     format: str

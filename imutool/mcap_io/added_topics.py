@@ -28,7 +28,10 @@ class NewTopic(NamedTuple):
 
 
 class DerivedBatch(NamedTuple):
-    """Messages computed from a batch: the source messages that have one, and a payload row for each."""
+    """Messages computed from a batch, a payload row for each.
+
+    `batch` holds the source messages that have one.
+    """
 
     batch: ImuBatch
     payloads: Sequence[UInt8[np.ndarray, "n L"]]
@@ -47,12 +50,12 @@ class DerivedTopics(Protocol):
         """The topics to be added."""
 
     def __call__(self, batch: ImuBatch) -> DerivedBatch:
-        """Messages for a batch: which of its messages stay, and one array of CDR payloads per new topic."""
+        """Messages for a batch: the source messages that stay, and CDR payloads per new topic."""
 
 
 @dataclass
 class DerivedStream:
-    """Source messages waiting to be decoded and computed messages waiting to be written, of one `DerivedTopics`."""
+    """Queues of one `DerivedTopics`: source messages to decode, computed messages to write."""
 
     log: Log
     derived: DerivedTopics

@@ -84,7 +84,7 @@ class MessageBlock:
 
 
 class MessageIndexes(NamedTuple):
-    """The message indexes of one chunk: messages and entries (log time, offset) per channel id that has any."""
+    """Message indexes of one chunk: counts and entries (log time, offset) per channel id."""
 
     counts: dict[int, int]
     entries: UInt64[np.ndarray, "n 2"]  # channel after channel, in order of `counts`
@@ -110,7 +110,7 @@ class MessageIndexes(NamedTuple):
 
 
 def parse_message_indexes(raw: bytes | memoryview, block: MessageBlock, unpacked: int) -> MessageIndexes | None:
-    """The message indexes behind a chunk of `unpacked` bytes; None where there are none or they are wrong.
+    """Message indexes behind a chunk of `unpacked` bytes; None if missing or wrong.
 
     `raw` is all that lies between the chunk and the block's end. The indexes are right when that is nothing but MessageIndex
     records, each channel's once and where the block says, and every entry lies within the chunk. Whether a message lies
@@ -154,7 +154,7 @@ def read_message_indexes(source: Source, block: MessageBlock) -> tuple[ChunkHead
 
 
 def message_offsets(source: Source, block: MessageBlock, size: int) -> Int64[np.ndarray, " n"] | None:
-    """Message offsets in a chunk of `size` bytes from its message indexes; None where those must be wrong.
+    """Message offsets in a chunk of `size` bytes from its message indexes; None if wrong.
 
     Only a hint: the caller checks that messages lie there.
     """

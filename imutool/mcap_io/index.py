@@ -1,8 +1,7 @@
 """Index of an intact log: its definitions, chunks and other records, in file order.
 
-The data section is followed from its first byte to its end, so no record in it is overlooked. A chunk that the summary lists is
-stepped over without reading it: one dictionary look-up per chunk. Logs without summary, message indexes or chunks are indexed
-the same way and only cost more reading.
+The data section is followed from its first byte to its end, so no record is overlooked. A chunk that the summary lists is not
+read: one dictionary look-up per chunk. Logs without summary, message indexes or chunks only cost more reading.
 """
 
 from __future__ import annotations
@@ -47,8 +46,7 @@ class LogIndex:
         self.items: list[MessageBlock | RecordSpan] = []
         self.statistics: Statistics | None = None
         self.footer = self._read_footer()
-        chunks = self._read_summary()
-        self.data_end = self._scan_data_section(chunks)
+        self.data_end = self._scan_data_section(self._read_summary())
         self._find_definitions()
 
     @property
@@ -71,7 +69,7 @@ class LogIndex:
 
     @property
     def definitions_known(self) -> bool:
-        """Whether the statistics count as many definitions as are known: no chunk need be unpacked to find one."""
+        """Whether no definition is missing: the statistics count as many as are known."""
         counted = self.statistics
         return counted is not None and (counted.channel_count, counted.schema_count) == (len(self.channels), len(self.schemas))
 
@@ -164,7 +162,7 @@ class LogIndex:
         return footer
 
     def _read_summary(self) -> dict[int, ChunkIndex]:
-        """Takes definitions and statistics from the summary; returns its chunk indexes by their chunk's offset."""
+        """Reads definitions and statistics; returns the chunk indexes by chunk offset."""
         start, end = self.footer.summary_start, self.source.size - len(MAGIC) - FOOTER_SIZE
         if start == 0:
             return {}
@@ -236,7 +234,7 @@ class LogIndex:
         raise LogError(f"the data section does not end before byte {limit}", expected="a DataEnd record")
 
     def _add(self, opcode: int, position: int, length: int, limit: int) -> int:
-        """Takes in one record of the data section, or one run of messages; returns where the next begins."""
+        """Adds one record of the data section, or a run of messages; returns where the next begins."""
         whole = HEAD.size + length
         if opcode == Opcode.CHUNK:
             head = records.ChunkHead.of(self.source.at(position, min(HEAD_BYTES, whole)), whole, position)

@@ -1,4 +1,4 @@
-"""A log opened for reading: whole columns at a time, one chunk in memory, every chunk's CRC checked.
+"""Read an MCAP log: whole columns at a time, one chunk in memory, every CRC checked.
 
 Topics are found by schema, not by name; messages come in file order.
 """
@@ -26,7 +26,9 @@ from imutool.mcap_io.topics import ENCODINGS, MESSAGE_POSES, SCALARS, ImuBatch, 
 
 
 class Log:
-    """One MCAP file or object in a store, open for reading: chunked or not, with or without a summary or message indexes.
+    """An MCAP file or object in a store, open for reading.
+
+    It may have chunks, a summary and message indexes, or not.
 
     Memory is bounded by its largest chunk. An open `Source` can be given in place of a path. Times given to a
     method select by log time, both ends included. The first damage is an error; `recovery.recovered_log.RecoveredLog` reads
@@ -103,11 +105,11 @@ class Log:
             LogError: there are others, or none.
         """
         found = self.imu_topics
-        if len(found) != 1:
-            listed = ", ".join(found) or "none"
-            raise LogError(
-                f"IMU topics: {listed}", where=self.path, expected="one", fix="Choose one with `imu`" if found else ""
-            )
+        if not found:
+            raise LogError("the log has no IMU topic", where=self.path, expected=f"{schemas.IMU} among {self.listing()}")
+        if len(found) > 1:
+            listed = ", ".join(found)
+            raise LogError(f"the log has {len(found)} IMU topics: {listed}", where=self.path, fix="Choose one with `imu`")
         return found[0]
 
     @property
@@ -142,7 +144,7 @@ class Log:
         return ", ".join(every) if every else "a log with topics (this one has none)"
 
     def metadata(self) -> dict[str, dict[str, str]]:
-        """The metadata records by name; where a name comes twice, later entries replace earlier ones."""
+        """Metadata records by name; of two of one name, later entries replace earlier ones."""
         found: dict[str, dict[str, str]] = {}
         for name, values in self.metadata_records():
             found.setdefault(name, {}).update(values)
@@ -164,7 +166,7 @@ class Log:
         return found
 
     def stamps(self, topic: str) -> Iterator[Int64[np.ndarray, " n"]]:
-        """Log times of one topic in file order, from message indexes where the log has them, without unpacking.
+        """Log times of one topic in file order, from message indexes where possible.
 
         Raises:
             LogError: no such topic, or a damaged log.

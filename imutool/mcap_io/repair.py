@@ -1,4 +1,4 @@
-"""Rewrite a damaged log: intact chunks byte for byte, every index rebuilt, and a record of what was lost.
+"""Repair a damaged log: copy intact chunks, rebuild every index, record what was lost.
 
 An intact chunk is copied; its message indexes are made from its messages, which its CRC proves, and never copied. Definitions
 stand in front of everything, so that the next damage costs less. Messages that no CRC covers go into chunks that state none:
@@ -63,7 +63,7 @@ def repair(
     overwrite: bool = False,
     progress: Callable[[int, int], None] | None = None,
 ) -> RepairReport:
-    """Writes `target`: everything intact of `source`, in the order of the file, with all indexes.
+    """Writes the intact part of `source` to `target`, in the order of the file, with all indexes.
 
     With `damaged="keep"` the bytes of damaged stretches become attachments `imutool/damaged/OFFSET`, which no reader takes
     for messages. The metadata record `imutool_repair` lists what was lost; an intact log gets none. The result is
@@ -108,7 +108,7 @@ def _loss_record(source: Location, damaged: str, losses: Losses) -> dict[str, st
 
 
 def _save(log: RecoveredLog, out: LogWriter, damaged: str, tell: Callable[[int], None]) -> int:
-    """Copies everything intact, and damaged stretches if they are to be kept; returns how many were.
+    """Copies everything intact; returns how many damaged stretches were kept.
 
     Raises:
         LogError: nothing is intact.
@@ -214,7 +214,7 @@ def _attach_damaged(out: LogWriter, source: Source, loss: Loss) -> None:
 
 @contextmanager
 def repaired(source: Location, beside: Location) -> Iterator[tuple[Location, Losses] | None]:
-    """A temporary repaired copy of a damaged log in the folder of `beside`; None if the log is intact.
+    """Temporary repaired copy of a damaged log beside another file; None if the log is intact.
 
     Raises:
         ConfigError: the copy cannot be written.

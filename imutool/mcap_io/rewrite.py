@@ -44,7 +44,6 @@ from imutool.mcap_io.write import CHUNK_BYTES
 from imutool.mcap_io.writer import Chunk, LogWriter
 
 RUN_BYTES = 16 << 20  # of the source are copied at once; progress is reported between
-
 Values = Mapping[str, Mapping[str, str]]  # the entries of metadata records, by the records' names
 
 
@@ -70,7 +69,9 @@ def rewrite(
     check: str = "imu",
     progress: Callable[[int, int], None] | None = None,
 ) -> RewriteReport:
-    """Writes `target`: all of `source`, the derived topics in chunks of their own, and the metadata records.
+    """Writes all of `source` to `target`, with derived topics and metadata records.
+
+    Derived messages are in chunks of their own.
 
     A derived message has log time, publish time and sequence of its source message. Where the source has a metadata record of
     the same name, both stand in the target; a function as `metadata` is called when all else is written.
@@ -130,7 +131,7 @@ def _check_new_topics(log: Log, derived: Sequence[DerivedTopics]) -> None:
 
 
 def _compression(index: LogIndex) -> str:
-    """The compression of the source's first chunk, for the new chunks; none for a log without chunks."""
+    """Compression of the source's first chunk, for the new chunks."""
     return next((b.compression for b in index.blocks if b.compression is not None), "none")
 
 
@@ -205,7 +206,6 @@ class _Rewrite:
             check_data_crc(self.index, self.passing.crc)
 
     def _verified(self) -> Verified:
-        """The checks that the target will have passed when it takes its place."""
         chunks = len(self.out.contents.chunks)
         checked = {"all": chunks, "imu": self.checked + len(self.new_chunks), "none": self.checked}[self.check]
         return Verified(self.check, checked, chunks)

@@ -1,4 +1,4 @@
-"""Topics of a log, batches of messages decoded from them, and the checks of numbers and stamps."""
+"""Topics of a log, batches of their messages, and checks of numbers and stamps."""
 
 from __future__ import annotations
 
@@ -47,7 +47,10 @@ class PoseBatch(NamedTuple):
 
 
 class ScalarBatch(NamedTuple):
-    """Consecutive messages of a numeric topic; `stamp_ns` is the log time where the message has no header."""
+    """Consecutive messages of a numeric topic.
+
+    `stamp_ns` is the log time where the message has no header.
+    """
 
     log_time: Int64[np.ndarray, " n"]
     publish_time: Int64[np.ndarray, " n"]
@@ -74,7 +77,7 @@ class Topic:
         return DERIVED_KEY in self.metadata
 
     def decode_imu(self, rows: Rows) -> Iterator[ImuBatch]:
-        """IMU messages from their bytes, one batch per stretch with one frame; values are not checked.
+        """IMU messages from their bytes, one batch per stretch with one frame, unchecked.
 
         Raises:
             LogError: a payload that is no such message.
@@ -85,7 +88,7 @@ class Topic:
             yield ImuBatch(cut.log_time, cut.publish_time, cut.sequence, *columns)
 
     def decode_poses(self, rows: Rows) -> Iterator[PoseBatch]:
-        """Poses from their bytes, one batch per stretch with the same frames, and per transform in a TFMessage.
+        """Poses from their bytes, one batch per stretch with one frame and per transform.
 
         Raises:
             LogError: a payload that is no such message, NaN or infinite values.
@@ -110,7 +113,7 @@ class Topic:
             yield ScalarBatch(cut.log_time, cut.publish_time, cut.sequence, stamp_ns, columns.values, columns.frame_id)
 
     def decode_twist(self, rows: Rows) -> Iterator[TwistColumns]:
-        """Biases with covariance from their bytes, one batch per stretch with one frame; values are not checked.
+        """Biases with covariance from their bytes, one batch per stretch with one frame.
 
         Raises:
             LogError: a payload that is no such message.

@@ -50,7 +50,9 @@ def verify(
     unpacked: Collection[int] | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> int:
-    """Checks a log that should hold `counts` messages per channel id; returns how many chunks were unpacked.
+    """Checks a log that should hold `counts` messages per channel id.
+
+    Returns how many chunks were unpacked.
 
     These are the chunks that begin at the bytes `unpacked`, or else every chunk, and then the CRC of every attachment and
     of the data section too.
@@ -120,7 +122,7 @@ class _Sums:
 
 
 def _check_summary(index: LogIndex) -> None:
-    """Follows the summary: its groups are where its offsets say, its indexes lead to records of their kind."""
+    """Checks that the groups of the summary are where its offsets say, and its indexes lead."""
     source, footer = index.source, index.footer
     start, end = footer.summary_start, source.size - len(MAGIC) - FOOTER_SIZE
     raw, at, groups = source.at(start, end - start), 0, dict[int, tuple[int, int]]()

@@ -31,8 +31,9 @@ import torch
 
 from imutool.bias import io, neural_ode
 from imutool.bias.model import BiasModel
+from imutool.bias_start.correction import OnlineDebiaser
 from imutool.bias_start.initial_bias import InitialBias, prior, tracked_from_prior
-from imutool.debiasing import OnlineDebiaser, debias
+from imutool.debiasing import debias
 from imutool.mcap_io.write import write
 from imutool.recording import Imu, seconds
 from imutool.sensor.flight import flight

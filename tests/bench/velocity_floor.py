@@ -18,8 +18,8 @@ import numpy as np
 from jaxtyping import Float64
 
 from imutool.bias.io import load
+from imutool.bias_start.correction import apply
 from imutool.bias_start.initial_bias import find
-from imutool.debiasing import apply
 from imutool.inertial.strapdown import GRAVITY_W, StartPose, along_truth, dead_reckon, drift, with_velocity
 from imutool.mcap_io.read import read
 from imutool.recording import Imu, Poses, Recording, seconds

@@ -12,9 +12,9 @@ import torch
 from imutool.bias import hybrid, neural_ode
 from imutool.bias.io import load, save
 from imutool.bias.model import COLUMNS, BiasModel, SampleStream, Segment
+from imutool.bias_start.correction import OnlineDebiaser, apply
 from imutool.bias_start.initial_bias import prior
 from imutool.config import build as build_settings
-from imutool.debiasing import OnlineDebiaser, apply
 from imutool.errors import ConfigError, ModelError
 from imutool.recording import Imu
 from imutool.sensor import catalogue

@@ -13,8 +13,9 @@ import torch
 from imutool.bias.io import find_model
 from imutool.bias.model import Segment
 from imutool.bias.physics_model import MOST_TAU_S, Model
+from imutool.bias_start.correction import apply
 from imutool.bias_start.initial_bias import prior
-from imutool.debiasing import apply, debias
+from imutool.debiasing import debias
 from imutool.errors import ConfigError, ModelError
 from imutool.mcap_io.read import read
 from imutool.mcap_io.write import write

@@ -150,7 +150,7 @@ def test_a_bag_is_repaired_as_a_bag(bag: Path, tmp_path: Path) -> None:
     assert (out / "log.bag").read_bytes() == (tmp_path / "alone.bag").read_bytes()
     assert (found.status, found.exit_code) == ("lost", 3)
     assert 0 < found.messages < 40
-    assert "index: it was made anew" in found.warnings[0]
+    assert "index: it was rebuilt" in found.warnings[0]
     with Reader(out / "log.bag") as reader:
         assert len(list(reader.messages())) == found.messages
     again = work(msgspec.structs.replace(bag_task(bag, out, repair), done=found))

@@ -1,4 +1,4 @@
-"""Message and MessageIndex records: whole columns of messages to and from the bytes of a chunk.
+"""Message and MessageIndex records: columns of messages to and from a chunk's bytes.
 
 A log holds millions of messages, so they go through numpy instead of the classes of the `mcap` package.
 """
@@ -32,7 +32,7 @@ FIXED = MESSAGE.itemsize - HEAD.size  # the part of a message's length that is n
 
 
 class Messages(NamedTuple):
-    """The messages of one stretch of bytes, in file order, and the definitions among them."""
+    """Messages of one stretch of bytes, in file order, and the definitions among them."""
 
     data: UInt8[np.ndarray, " b"]
     offsets: Int64[np.ndarray, " n"]
@@ -49,7 +49,10 @@ class Messages(NamedTuple):
 
 
 class Rows(NamedTuple):
-    """Consecutive messages of equal size, as columns; every array is a copy, so the chunk they came from is freed."""
+    """Consecutive messages of equal size, as columns.
+
+    Every array is a copy, so the chunk they came from is freed.
+    """
 
     channel: UInt16[np.ndarray, " n"]
     log_time: Int64[np.ndarray, " n"]
@@ -74,9 +77,9 @@ def signed(times: UInt64[np.ndarray, " n"]) -> Int64[np.ndarray, " n"]:
 
 
 def scan(data: bytes | memoryview, *, bare: bool = False) -> tuple[Int64[np.ndarray, " n"], list[tuple[int, int, int]], int]:
-    """Where messages and definitions begin in a stretch of records, and the byte at which whole records end.
+    """Offsets of messages and definitions in a stretch of records, and where whole records end.
 
-    A `bare` stretch lies outside chunks and also ends before the first record that is no message, or none that can be.
+    A `bare` stretch lies outside chunks and also ends before the first record that is not a valid message.
     Stretches of equally long messages, which topic-grouped chunks consist of, are recognised as a matrix; the framing is still
     followed record by record, only not in Python.
     """
@@ -122,7 +125,7 @@ def _run(view: UInt8[np.ndarray, " b"], position: int, stride: int) -> int:
 
 
 def parse(data: bytes | memoryview, offset: int) -> Messages:
-    """The messages in the unpacked bytes of a chunk, or in a run of records outside chunks.
+    """Messages in the unpacked bytes of a chunk, or in a run of records outside chunks.
 
     Raises:
         LogError: the records do not fill the bytes exactly; `offset` says where in the file they came from.
@@ -138,9 +141,9 @@ def parse(data: bytes | memoryview, offset: int) -> Messages:
 
 
 def parse_at(data: bytes | memoryview, offsets: Int64[np.ndarray, " n"]) -> Messages | None:
-    """The messages that begin at these offsets, in order; None unless they, and nothing else, fill the bytes from end to end.
+    """Messages at these offsets; None unless they alone fill the bytes from end to end.
 
-    What `messages` finds by following the records one by one, for bytes of which an index is there: a tenth of the time
+    As `parse`, which follows the records one by one, where an index lists the offsets: a tenth of the time
     where lengths alternate.
     """
     view, count = np.frombuffer(data, np.uint8), len(offsets)
@@ -157,7 +160,10 @@ def parse_at(data: bytes | memoryview, offsets: Int64[np.ndarray, " n"]) -> Mess
 
 
 def _matrix(view: UInt8[np.ndarray, " b"], offsets: Int64[np.ndarray, " n"], width: int) -> UInt8[np.ndarray, "n w"]:
-    """Copies of the `width` bytes at each offset; a view, where the spacing would allow one, made decoding slower."""
+    """Copies of the `width` bytes at each offset.
+
+    A view, where the spacing would allow one, made decoding slower.
+    """
     if not len(offsets):
         return np.zeros((0, width), np.uint8)
     # a window on every byte; numpy's sliding_window_view makes the same, and takes longer than the copies out of one chunk
@@ -167,13 +173,13 @@ def _matrix(view: UInt8[np.ndarray, " b"], offsets: Int64[np.ndarray, " n"], wid
 
 
 def rows(found: Messages, mask: Bool[np.ndarray, " n"]) -> Iterator[Rows]:
-    """The chosen messages as columns, one entry per stretch of equal size; file order is kept."""
+    """The chosen messages as columns, one entry per stretch of equal size, in file order."""
     for heads, payload in cut(found, mask):
         yield columns(heads, payload)
 
 
 def cut(found: Messages, mask: Bool[np.ndarray, " n"]) -> Iterator[tuple[Shaped[np.ndarray, " n"], UInt8[np.ndarray, "n L"]]]:
-    """Heads (of dtype MESSAGE) and payloads of the chosen messages, one pair per stretch of equal size, in file order."""
+    """Heads (dtype MESSAGE) and payloads of the chosen messages, per stretch of equal size."""
     heads, offsets = found.heads[mask], found.offsets[mask]
     edges = np.flatnonzero(heads["length"][1:] != heads["length"][:-1]) + 1
     for first, last in pairwise([0, *edges.tolist(), len(heads)] if len(heads) else []):
@@ -199,7 +205,7 @@ def message_rows(
     payload: UInt8[np.ndarray, "n L"],
     out: UInt8[np.ndarray, "n M"] | None = None,
 ) -> UInt8[np.ndarray, "n M"]:
-    """One Message record per row: opcode, length, channel, sequence, the two times, and the payload; in `out`, if given."""
+    """One Message record per row, in `out` if given."""
     count, size = payload.shape
     records = np.empty((count, MESSAGE.itemsize + size), np.uint8) if out is None else out
     heads = np.empty(count, MESSAGE)
@@ -211,7 +217,7 @@ def message_rows(
 
 
 def message_record(channel: int, sequence: int, time_ns: int, payload: bytes) -> bytes:
-    """One Message record, for the few that are large; both its times are the same."""
+    """One Message record with one time, for the few large ones."""
     fixed = struct.pack("<HIQQ", channel, sequence, time_ns, time_ns)
     return HEAD.pack(Opcode.MESSAGE, FIXED + len(payload)) + fixed + payload
 
@@ -226,7 +232,7 @@ def scatter(data: UInt8[np.ndarray, " b"], offsets: Int64[np.ndarray, " n"], row
 
 
 def message_index(channel: int, times: Int64[np.ndarray, " n"], offsets: Int64[np.ndarray, " n"]) -> bytes:
-    """A MessageIndex record, its entries in order of log time (and of the file, where that is equal)."""
+    """A MessageIndex record, its entries in order of log time, then of the file."""
     entries = np.empty((len(times), 2), "<u8")
     order = np.argsort(times, kind="stable")
     entries[:, 0], entries[:, 1] = times[order], offsets[order]

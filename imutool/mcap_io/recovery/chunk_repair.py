@@ -27,7 +27,7 @@ STEP = 256
 
 
 def repair_head(raw: bytes, offset: int, known: ChunkIndex | None) -> bytes | None:
-    """The Chunk record with a head that its contents prove; None if the head is intact, or cannot be proven.
+    """The Chunk record with a head that its contents prove; None if intact or unprovable.
 
     `known` is the chunk's entry in an intact summary. The CRC itself must stand in the record as it was written.
     """
@@ -85,7 +85,7 @@ def _candidates(raw: bytes, known: ChunkIndex | None) -> Iterator[bytes]:
 
 
 def find_definitions(raw: bytes) -> Iterator[tuple[int, bytes]]:
-    """Finds Schema and Channel records (opcode, body) at the start of a damaged chunk; nothing proves them.
+    """Finds Schema and Channel records at the start of a damaged chunk; nothing proves them.
 
     A writer may define its channels in its first chunk alone; without them no later chunk can be read.
     """
@@ -128,7 +128,7 @@ def _unpack_start(packed: bytes) -> bytes:
 
 
 def _unpack_steps(packed: bytes) -> Iterator[bytes]:
-    """The contents of a frame in pieces, none longer than `MAX_UNPACKED` whatever the frame says."""
+    """Contents of a frame in pieces of at most `MAX_UNPACKED` bytes."""
     if packed.startswith(FRAME_MAGICS[0]):
         with zstandard.ZstdDecompressor().stream_reader(packed[:MAX_UNPACKED]) as stream:
             while piece := stream.read(STEP):

@@ -77,7 +77,7 @@ class Sections:
         return {channel for section in self.each for channel in section.channels}
 
     def define(self, opcode: int, body: bytes, offset: int, *, proven: bool) -> str:
-        """Takes in a Schema or Channel record at `offset`; returns a conflict that could be resolved, or "".
+        """Adds a Schema or Channel record; returns a conflict that could be resolved, or "".
 
         Raises:
             LogError: damaged, or a CRC covers another definition of the same id as well.
@@ -107,7 +107,7 @@ class Sections:
         return known is not None and not same_definition(known, record)
 
     def renumber(self) -> tuple[dict[int, Schema], dict[int, Channel]]:
-        """Schemas and channels of the whole file; those of the first section keep their ids, others where free."""
+        """Schemas and channels of the whole file; the first section keeps its ids."""
         schemas: dict[int, Schema] = {}
         channels: dict[int, Channel] = {}
         for section in self.each:
@@ -124,7 +124,7 @@ class Sections:
         return schemas, channels
 
     def _name(self, section: Section, channel: Channel, schemas: dict[int, Schema], channels: dict[int, Channel]) -> str:
-        """The topic's name in the whole file: a topic carries one type, so one of another type gets another name."""
+        """The topic's name in the whole file: one of another type gets another name."""
         taken = {other.topic: _type(other, schemas) for other in channels.values()}
         names = chain([channel.topic], (f"{channel.topic}_{number}" for number in count(2)))
         name = next(name for name in names if taken.get(name, _type(channel, schemas)) == _type(channel, schemas))
@@ -168,7 +168,7 @@ def _same_channel(a: Channel, b: Channel) -> bool:
 
 
 def _place(known: dict[int, Any], record: Any, same: Callable[[Any, Any], bool], *, reuse: bool) -> int:
-    """The id of a definition among those known: that of an equal one, its own if it is free, or a new one."""
+    """Id of a definition: that of an equal one, its own if free, or a new one."""
     if reuse:
         for found, other in known.items():
             if same(other, record):
@@ -179,7 +179,7 @@ def _place(known: dict[int, Any], record: Any, same: Callable[[Any, Any], bool],
 
 
 def read_definitions(sections: Sections, losses: Losses, found: messages.Messages, block: MessageBlock) -> None:
-    """Takes in the definitions of a chunk; if they contradict proven ones, another log has begun."""
+    """Takes in a chunk's definitions; contradictions to proven ones begin another section."""
     found_definitions = [(opcode, found.data[first : first + length].tobytes()) for opcode, first, length in found.definitions]
     proven = block.offset not in losses.unchecked_in
     for second_try in (False, True):
@@ -199,7 +199,7 @@ def read_definitions(sections: Sections, losses: Losses, found: messages.Message
 def search_damaged(
     sections: Sections, source: Source, blocks: Sequence[MessageBlock], damaged: Sequence[tuple[int, int]]
 ) -> None:
-    """Looks for missing definitions of intact messages in the damaged stretches (first byte, bytes) of their log."""
+    """Looks for missing definitions in the damaged stretches (first byte, bytes) of a log."""
     for section in sections.each:
         stop = sections.end(section) or source.size + 1
         for offset, length in sorted(stretch for stretch in damaged if section.start <= stretch[0] < stop):
@@ -220,7 +220,7 @@ def renumber_counts(section: Section, counts: Mapping[int, int]) -> dict[int, in
 
 
 def check_definitions(sections: Sections, found: messages.Messages, block: MessageBlock, agreed: set[bytes]) -> None:
-    """Refuses a CRC-proven chunk that defines ids otherwise than the log around it: it belongs to another log.
+    """Refuses a CRC-proven chunk whose definitions show that another log wrote it.
 
     `agreed` collects the bodies of definitions that need not be compared again.
 
@@ -238,7 +238,7 @@ def check_definitions(sections: Sections, found: messages.Messages, block: Messa
 
 
 def map_channels(section: Section, found: messages.Messages) -> tuple[Int64[np.ndarray, " n"], Bool[np.ndarray, " n"]] | None:
-    """Channel ids of the messages in the whole file, -1 where undefined, and a mask of the readable messages.
+    """Channel ids in the whole file, -1 where undefined, and a mask of readable messages.
 
     None where the messages can stay as they are.
     """

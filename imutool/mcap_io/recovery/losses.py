@@ -1,4 +1,4 @@
-"""Losses of a damaged log: stretches of bytes with their reason, and the messages known to be lost."""
+"""Losses of a damaged log: byte ranges with reasons, and the messages lost in them."""
 
 from __future__ import annotations
 

@@ -22,7 +22,8 @@ from imutool.mcap_io.recovery import definitions
 from imutool.mcap_io.recovery.chunk_repair import is_consistent, repair_head
 from imutool.mcap_io.recovery.definitions import DEFINITIONS, Sections
 from imutool.mcap_io.recovery.losses import LATEST_NS, Loss, Losses, reason
-from imutool.mcap_io.recovery.scan import Gap, Scan
+from imutool.mcap_io.recovery.resync import Gap
+from imutool.mcap_io.recovery.scan import Scan
 from imutool.mcap_io.storage.source import Source
 
 

@@ -15,7 +15,7 @@ from imutool.mcap_io.verify import stated_crc
 
 
 class RecoveredLog(Log):
-    """A log that may be damaged: only what a CRC proves is read, and `losses` lists the rest with the reason.
+    """A log that may be damaged: reads what a CRC proves, and lists the rest in `losses`.
 
     `losses` is complete once everything was read (`check`), because damage inside a chunk shows when the chunk is unpacked.
 
@@ -38,7 +38,7 @@ class RecoveredLog(Log):
         return self.index.losses
 
     def strict(self) -> Log:
-        """The same log over the same open file, where the first damage is an error; it closes the file.
+        """The same log over the same open file, where damage is an error; it closes the file.
 
         Raises:
             LogError: the log is damaged.
@@ -48,7 +48,7 @@ class RecoveredLog(Log):
         return log
 
     def check(self) -> None:
-        """Compares the CRC of every chunk, of every attachment and of the data section; `losses` is then complete."""
+        """Compares the CRC of every chunk, attachment and of the data section; completes `losses`."""
         with self.named():
             self.index.check()
             self.check_data_crc()

@@ -7,9 +7,12 @@ of a definition with the definition). A message has no such lengths: the records
 from __future__ import annotations
 
 import struct
+from collections import Counter
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
+from jaxtyping import Int64, UInt64
 from mcap.opcode import Opcode
 from mcap.records import (
     AttachmentIndex,
@@ -30,12 +33,14 @@ from imutool.mcap_io.blocks import Attachment
 from imutool.mcap_io.codec import records
 from imutool.mcap_io.codec.messages import FIXED
 from imutool.mcap_io.codec.records import CHUNK_HEAD, HEAD, MAGIC
+from imutool.mcap_io.recovery.losses import LATEST_NS
 from imutool.mcap_io.storage.source import Source
 
 WINDOW = 1 << 20
 MAX_SMALL = 1 << 24  # bytes of a record that is parsed whole: a definition, metadata, an entry of the summary
 MAX_CANDIDATES = 1 << 17  # parsed in one file; more occur only in a file made to be searched forever
 CHAIN = 3  # records in a row that prove a message after a gap
+LOG_START = MAGIC + bytes([Opcode.HEADER])
 PRIVATE = 0x80  # opcodes from here on belong to whoever writes them
 
 SMALL: dict[int, Any] = {
@@ -81,6 +86,29 @@ _MIN_LENGTH = np.full(256, 2**63, np.uint64)
 _MIN_LENGTH[[int(o) for o in MIN_LENGTH]] = list(MIN_LENGTH.values())
 _KNOWN = _MIN_LENGTH < 2**63
 _CANDIDATE = np.dtype([("opcode", "u1"), ("length", "<u8")])
+
+
+@dataclass
+class Gap:
+    """A stretch without a valid record."""
+
+    offset: int
+    length: int
+    reason: str
+    counts: Counter[int] = field(default_factory=Counter)  # by the channel ids of its section
+    counted: bool = False  # from message indexes that survived behind it
+    start_ns: int | None = None
+    end_ns: int | None = None
+
+    def count(self, channel: int, entries: UInt64[np.ndarray, "n 2"]) -> None:
+        """Counts the messages of a lost chunk from the entries of a message index behind it."""
+        if not self.counted:
+            self.counts, self.counted = Counter(), True
+        self.counts[channel] += len(entries)
+        if len(entries) and entries[:, 0].max() < LATEST_NS:
+            first, last = int(entries[:, 0].min()), int(entries[:, 0].max())
+            self.start_ns = first if self.start_ns is None else min(first, self.start_ns)
+            self.end_ns = last if self.end_ns is None else max(last, self.end_ns)
 
 
 class RecordFrames:
@@ -217,3 +245,55 @@ class RecordFrames:
             if opcode != Opcode.MESSAGE:
                 return self.is_valid(position, opcode, length)
         return True
+
+    def overlaps_next(self, position: int, opcode: int, length: int) -> bool:
+        """Whether a record was cut off and the next one overwrites its end.
+
+        Then another log begins inside it, or no record follows a chunk; and its CRC does not prove it whole.
+        """
+        end = position + HEAD.size + length
+        unframed = opcode == Opcode.CHUNK and not self.is_boundary(end)
+        if not (unframed or self.find(position, end, LOG_START) >= 0):
+            return False
+        try:
+            if opcode == Opcode.CHUNK:
+                records.unpack(self.source.at(position, end - position), position)
+            elif opcode == Opcode.ATTACHMENT:
+                return not Attachment.of(self.source, position, length).check_crc(self.source)
+        except LogError:
+            return True
+        return opcode != Opcode.CHUNK
+
+    def ends_run(self, end: int, raw: bytes, offsets: Int64[np.ndarray, " n"], channels: set[int]) -> bool:
+        """Whether the last message of a run ends at `end`: a record follows, perhaps a damaged one."""
+        if self.is_boundary(end):
+            return True
+        room = self.limit - end
+        if room >= HEAD.size:
+            opcode, length = self.source.head(end)
+            if opcode in MIN_LENGTH and opcode != Opcode.MESSAGE and length < 1 << 48:
+                return True  # a record of another kind, which goes on beyond the end of the file or is damaged
+        if room < HEAD.size + 2:
+            return self.source.at(end, 1)[0] in MIN_LENGTH
+        heads = [raw[at : at + HEAD.size + 2] for at in offsets[-256:].tolist()]
+        if heads[-1] in heads[:-1]:
+            return True  # as long as one before it on its channel
+        following = self.source.at(end, HEAD.size + 2)
+        opcode, length = HEAD.unpack_from(following)
+        known = channels | {int.from_bytes(head[HEAD.size :], "little") for head in heads}
+        if opcode == Opcode.MESSAGE and int.from_bytes(following[HEAD.size :], "little") in known:
+            return True
+        return bool(length <= room - HEAD.size and length >= FIXED and self.is_boundary(end + HEAD.size + length))
+
+    def broken_framing(self, position: int) -> str:
+        """Describes what is wrong with the record at a position."""
+        room = self.limit - position - HEAD.size
+        if room < 0:
+            return "the log is cut short here, inside the head of a record"
+        opcode, length = self.source.head(position)
+        if opcode not in set(Opcode):
+            return "no record begins here"
+        name = records.name_of(opcode)
+        if length > room:
+            return f"the {name} record here says it has {length} bytes, and {room} are there"
+        return f"the {name} record here is damaged"

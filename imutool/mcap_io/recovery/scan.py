@@ -8,45 +8,29 @@ from __future__ import annotations
 
 import struct
 from bisect import bisect_right
-from collections import Counter
 from collections.abc import Mapping
-from dataclasses import dataclass, field
 
 import numpy as np
-from jaxtyping import Int64
 from mcap.opcode import Opcode
 from mcap.records import ChunkIndex, Footer, Header
 
 from imutool.errors import LogError
-from imutool.mcap_io.blocks import RUN_BYTES, Attachment, MessageBlock, RecordSpan
+from imutool.mcap_io.blocks import RUN_BYTES, MessageBlock, RecordSpan
 from imutool.mcap_io.codec import messages, records
-from imutool.mcap_io.codec.messages import FIXED
 from imutool.mcap_io.codec.records import FOOTER_SIZE, HEAD, MAGIC, crc32
 from imutool.mcap_io.index import MAX_SUMMARY
 from imutool.mcap_io.recovery.definitions import DEFINITIONS, Sections
 from imutool.mcap_io.recovery.losses import LATEST_NS, Losses, reason
-from imutool.mcap_io.recovery.resync import MAX_CANDIDATES, MIN_LENGTH, PRIVATE, SUMMARY, RecordFrames
+from imutool.mcap_io.recovery.resync import LOG_START, MAX_CANDIDATES, PRIVATE, SUMMARY, Gap, RecordFrames
 from imutool.mcap_io.storage.source import Source
 
 MAX_ITEMS = 5_000_000  # a 100 GB log has some 100 000 chunks; a file of nothing but empty ones would fill the memory
-LOG_START = MAGIC + bytes([Opcode.HEADER])
-
-
-@dataclass
-class Gap:
-    """A stretch without a valid record."""
-
-    offset: int
-    length: int
-    reason: str
-    counts: Counter[int] = field(default_factory=Counter)  # by the channel ids of its section
-    counted: bool = False  # from message indexes that survived behind it
-    start_ns: int | None = None
-    end_ns: int | None = None
 
 
 class Scan:
-    """One pass over the records of a file; `chunks` are the entries of an intact summary, if there is one.
+    """One pass over the records of a file.
+
+    `chunks` are the entries of an intact summary, if there is one.
 
     Raises:
         LogError: more records than any recorder writes.
@@ -137,25 +121,7 @@ class Scan:
             return self._messages(position, head[1])
         if head is None or not frames.is_valid(position, *head):
             return self._damaged(position)
-        return None if self._overlaps_next(position, *head) else self._record(position, *head)
-
-    def _overlaps_next(self, position: int, opcode: int, length: int) -> bool:
-        """Whether a record was cut off and the next one overwrites its end.
-
-        Then another log begins inside it, or no record follows a chunk; and its CRC does not prove it whole.
-        """
-        end = position + HEAD.size + length
-        unframed = opcode == Opcode.CHUNK and not self.frames.is_boundary(end)
-        if self.has_summary or not (unframed or self.frames.find(position, end, LOG_START) >= 0):
-            return False
-        try:
-            if opcode == Opcode.CHUNK:
-                records.unpack(self.source.at(position, end - position), position)
-            elif opcode == Opcode.ATTACHMENT:
-                return not Attachment.of(self.source, position, length).check_crc(self.source)
-        except LogError:
-            return True
-        return opcode != Opcode.CHUNK
+        return None if not self.has_summary and self.frames.overlaps_next(position, *head) else self._record(position, *head)
 
     def _log_boundary(self, position: int) -> None:
         """Handles the magic inside the file: another log begins here if a Header follows, else one has ended."""
@@ -232,25 +198,13 @@ class Scan:
         """Assigns a message index to the chunk right before it, or counts the messages of a lost one."""
         last, self._open_gap = self._last, None
         if isinstance(last, Gap):
-            self._count(last, position, length)
+            body = self.source.at(position + HEAD.size, length)
+            last.count(int.from_bytes(body[:2], "little"), np.frombuffer(body, "<u8", offset=6).reshape(-1, 2))
         elif last is not None and last.end == position:
             channel, size = struct.unpack("<HI", self.source.at(position + HEAD.size, 6))
             last.end = position + HEAD.size + length
             if size:
                 last.indexes[channel] = position
-
-    def _count(self, gap: Gap, position: int, length: int) -> None:
-        """Counts the messages of a lost chunk from a message index behind it."""
-        body = self.source.at(position + HEAD.size, length)
-        (channel,) = struct.unpack_from("<H", body)
-        entries = np.frombuffer(body, "<u8", offset=6).reshape(-1, 2)
-        if not gap.counted:
-            gap.counts, gap.counted = Counter(), True
-        gap.counts[channel] += len(entries)
-        if len(entries) and entries[:, 0].max() < LATEST_NS:
-            first, final = int(entries[:, 0].min()), int(entries[:, 0].max())
-            gap.start_ns = first if gap.start_ns is None else min(first, gap.start_ns)
-            gap.end_ns = final if gap.end_ns is None else max(final, gap.end_ns)
 
     def _damaged(self, position: int) -> int | None:
         """Handles an invalid or unknown record; returns its end, or None where that is unknown."""
@@ -289,7 +243,7 @@ class Scan:
         limit = self.frames.limit
         raw = self.source.at(position, min(max(RUN_BYTES, HEAD.size + length), limit - position))
         offsets, _, end = messages.scan(raw, bare=True)
-        if not self._bounded(position + end, raw, offsets):
+        if not self.frames.ends_run(position + end, raw, offsets, self.sections.channels() | self._used_channels):
             end = int(offsets[-1])
         next_log = -1 if self.has_summary else self.frames.find(position, position + end, LOG_START)
         if next_log >= 0:
@@ -306,33 +260,11 @@ class Scan:
             self.doubtful.append((block, self._open_gap))
         return position + end
 
-    def _bounded(self, end: int, raw: bytes, offsets: Int64[np.ndarray, " n"]) -> bool:
-        """Whether the last message of a run ends at `end`: a record follows, perhaps a damaged one."""
-        frames = self.frames
-        if frames.is_boundary(end):
-            return True
-        room = frames.limit - end
-        if room >= HEAD.size:
-            opcode, length = self.source.head(end)
-            if opcode in MIN_LENGTH and opcode != Opcode.MESSAGE and length < 1 << 48:
-                return True  # a record of another kind, which goes on beyond the end of the file or is damaged
-        if room < HEAD.size + 2:
-            return self.source.at(end, 1)[0] in MIN_LENGTH
-        heads = [raw[at : at + HEAD.size + 2] for at in offsets[-256:].tolist()]
-        if heads[-1] in heads[:-1]:
-            return True  # as long as one before it on its channel
-        following = self.source.at(end, HEAD.size + 2)
-        opcode, length = HEAD.unpack_from(following)
-        known = self.sections.channels() | self._used_channels | {int.from_bytes(head[HEAD.size :], "little") for head in heads}
-        if opcode == Opcode.MESSAGE and int.from_bytes(following[HEAD.size :], "little") in known:
-            return True
-        return bool(length <= room - HEAD.size and length >= FIXED and frames.is_boundary(end + HEAD.size + length))
-
     def _gap(self, position: int, limit: int) -> int:
         """Goes on to the next valid record; the bytes between are lost."""
         frames = self.frames
         after = frames.find_next(position + 1, limit, self.sections.channels() | self._used_channels)
-        gap = Gap(position, after - position, self._broken_framing(position))
+        gap = Gap(position, after - position, frames.broken_framing(position))
         if frames.candidates > MAX_CANDIDATES:
             gap.reason += "; the search for what follows was given up after too many false starts"
         first = self.source.at(position, min(64, frames.limit - position))
@@ -352,15 +284,3 @@ class Scan:
         self.gaps.append(gap)
         self._last = self._open_gap = gap
         return after
-
-    def _broken_framing(self, position: int) -> str:
-        room = self.frames.limit - position - HEAD.size
-        if room < 0:
-            return "the log is cut short here, inside the head of a record"
-        opcode, length = self.source.head(position)
-        if opcode not in set(Opcode):
-            return "no record begins here"
-        name = records.name_of(opcode)
-        if length > room:
-            return f"the {name} record here says it has {length} bytes, and {room} are there"
-        return f"the {name} record here is damaged"

@@ -1,4 +1,4 @@
-"""The bytes of a log, wherever it lies: read only, by offset and length, never a byte fewer than asked for."""
+"""Read the bytes of a log by offset, and its SHA-256; a short read is an error."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from imutool.location import Location, io_errors, open_location, reason
 from imutool.mcap_io.codec.records import HEAD, crc32
 
 BLOCK_BYTES = 1 << 20
-CUT_SHORT = "Save what is there with `imutool repair`, or copy it again from where it was recorded"
+CUT_SHORT = "Save the rest with `imutool repair`, or copy it again from where it was recorded"
 
 
 class Source:
-    """The bytes of a file or an object in a store that is only ever read, with a refusal in place of a short read."""
+    """Bytes of a file or object, read only; a short read is an error."""
 
     def __init__(self, path: Location, expected: str = "an MCAP log") -> None:
         try:
@@ -55,7 +55,7 @@ def crc_of(source: Source, start: int, end: int, crc: int = 0) -> int:
 
 
 def descriptor(file: object) -> int | None:
-    """The number under which the system knows an open file; none for what only looks like one, as in an object store."""
+    """The system's number of an open file; None in an object store."""
     try:
         return int(file.fileno())  # type: ignore[attr-defined]  # asked for, not demanded
     except (AttributeError, OSError):
@@ -63,7 +63,7 @@ def descriptor(file: object) -> int | None:
 
 
 def sha256(path: Location) -> str:
-    """The SHA-256 of a file, in hex, a block at a time.
+    """SHA-256 of a file, in hex, a block at a time.
 
     Raises:
         ConfigError: the file cannot be read.
@@ -76,7 +76,7 @@ def sha256(path: Location) -> str:
 
 
 class Digest:
-    """The SHA-256 of a file while something else reads it, so that a disk is asked for each block once.
+    """SHA-256 of a file in a thread, while the caller reads it: the disk reads a block once.
 
     A context manager: leaving it ends the thread, whether or not anybody asked for the result.
     """
@@ -95,7 +95,7 @@ class Digest:
                 if self._left.is_set():
                     return
                 self._sum.update(self._source.at(at, min(BLOCK_BYTES, size - at)))
-        except LogError as error:  # told where the result is asked for
+        except LogError as error:  # raised by `result`
             self._error = error.at(self._source.path)
 
     def result(self) -> str:

@@ -84,7 +84,7 @@ def _with_models(
     recording: Recording, models: Sequence[str | Path], init: str, log: str, smooth: bool
 ) -> tuple[list[Run], dict[str, str]]:
     """Run of each model, and by its name its file digest, method and start bias."""
-    from imutool.debiasing import apply_with_std
+    from imutool.bias_start.correction import apply_with_std
     from imutool.evaluation import started
 
     runs, origins = [], {}

@@ -12,7 +12,8 @@ from mcap.reader import make_reader
 from mcap.writer import Writer
 from support.imu_defects import batch_of, late, pick, repeated, with_values, write_log
 
-from imutool.debiasing import apply, apply_with_std, debias
+from imutool.bias_start.correction import apply, apply_with_std
+from imutool.debiasing import debias
 from imutool.errors import ConfigError, DataError, LogError
 from imutool.evaluation import started
 from imutool.mcap_io.codec import schemas

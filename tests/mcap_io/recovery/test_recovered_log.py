@@ -141,7 +141,7 @@ def ways() -> Callable[..., str]:
     """Runs `support/log_damage.py`, which says what should not have happened."""
 
     def run(*words: str | Path) -> str:
-        line = [sys.executable, Path(__file__).parents[1] / "support" / "log_damage.py", *words]
+        line = [sys.executable, Path(__file__).parents[2] / "support" / "log_damage.py", *words]
         done = subprocess.run(line, capture_output=True, text=True, timeout=240, check=False)
         return done.stdout + done.stderr
 

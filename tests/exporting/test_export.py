@@ -317,7 +317,7 @@ def test_a_folder_that_was_not_made_here_is_never_removed(log: Path, tmp_path: P
     with pytest.raises(ConfigError, match=r"thesis\.tex"):
         export(log, original, format=format, overwrite=True)
     (original / "thesis.tex").unlink()
-    with pytest.raises(ConfigError, match="no folder"):
+    with pytest.raises(ConfigError, match="not a folder"):
         export(log, log, format=format, overwrite=True)
 
 
