@@ -1,4 +1,4 @@
-"""Hybrid bias model: rest bias + error of fitted effects + a neural ODE on the corrected samples.
+"""Hybrid bias model: rest bias + fitted effects + a neural ODE on the corrected samples.
 
 The effects are those of `imutool.sensor.effects` that the training logs support (`imutool.training.calibration`): linear in
 their parameters, fitted together by least squares with a covariance, chosen by how well logs predict one another. The neural
@@ -94,7 +94,7 @@ class Model(BiasModel):
         return self._compiled(sensor)(signals)
 
     def sensor_bias(self, sensor: Sensor, segment: Segment) -> Float[Tensor, "batch n 3"]:
-        """Error of the effects, and the neural ODE on the corrected samples; filters start at the first sample."""
+        """Error of the effects plus the neural ODE's; filters start at the first sample."""
         error = self._on(sensor, segment)
         if self.ode is None:
             return segment.rest[:, None, COLUMNS[sensor]] + error
@@ -113,7 +113,7 @@ class Model(BiasModel):
         return np.zeros((6, 6)) if self.ode is None else self.ode.rest_dynamics()
 
     def calibration_covariance(self) -> CovarianceModel | None:
-        """Covariance of the effects' error, T Sigma T^T from their parameters', as its root T Sigma^1/2."""
+        """Root T Sigma^1/2 of the covariance of the effects' error, T Sigma T^T."""
         roots: dict[Sensor, Float64[np.ndarray, "3 q p"]] = {}
         for sensor in SENSORS:
             covariance: Tensor = getattr(self, f"covariance_{sensor}")

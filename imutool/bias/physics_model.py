@@ -119,7 +119,7 @@ class _Less:
 
 
 def load(path: Path, rate_hz: float) -> Model:
-    """Bias model from a physics.toml, for samples at a rate; warns of effects that it cannot correct.
+    """Bias model from a physics.toml at a sample rate; warns of effects that it cannot correct.
 
     Raises:
         ConfigError: the file cannot be read, or has an unknown name.
@@ -157,7 +157,7 @@ def load(path: Path, rate_hz: float) -> Model:
 
 
 def _taken(entry: Entry, parts: Mapping[Sensor, list[Part]]) -> bool:
-    """Whether an effect can be corrected; one with a linear form is added to the parts, those of the matrix come later."""
+    """Whether an effect can be corrected; one with a linear form is added to the parts."""
     if entry.name in MATRIX or entry.name == MOUNT:
         return True
     if entry.name == DRIVEN:
@@ -196,7 +196,7 @@ def _words(file: PhysicsFile) -> list[str]:
 
 
 def _needs_more(words: str) -> bool:
-    """Whether a part needs more than the sensor's own signals: a channel, or the time since a log's start."""
+    """Whether a part needs a channel, or the time since the log's start."""
     return words.startswith("/") or "t" in words.replace("|", " ").split()
 
 
@@ -214,7 +214,7 @@ def _of_size_one(effect: Effect, theta: Theta, sensor: Sensor) -> Part:
 
 
 def _matrix(file: PhysicsFile, sensor: Sensor) -> Part | None:
-    """Effect I - T^-1 of nine parameters, with the standard deviations of the factors of T; none where T is I."""
+    """Effect I - T^-1 of nine parameters with standard deviations; none where T is I."""
     entries = {entry.name: entry for entry in file.effect if MATRIX.get(entry.name) == sensor or entry.name == MOUNT}
     if not entries:
         return None

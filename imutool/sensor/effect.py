@@ -1,14 +1,14 @@
-"""The forward side of an effect: what it makes of the ideal signals, in the order in which they meet it.
+"""Effect: equation, parameters and forward model of one deviation of a real sensor.
 
-A file of an effect names it `EFFECT`. Its `forward` takes ideal signals and parameters and gives what comes out; nothing else
-is needed to simulate it, and the estimator differentiates it by differences. Effects act in the order of their `stage`:
+A file of `imutool/sensor/effects` holds one, by the name `EFFECT`. Its `forward` maps ideal signals and parameters to the
+signals behind it. Nothing else is needed: simulation runs it, the diagnosis differentiates it by differences, and the linear
+error of a bias model is derived from it (`imutool.sensor.linear_form`). Effects act in the order of their `stage`:
 
 | stage | acts on | effects |
 |---|---|---|
-| MOTION | `IdealMotion` | what the point where the sensor sits feels: gravity, earth_rotation, lever_arm, size_effect,
-vibration |
-| MOUNT | `IdealMotion` | how the sensor sits: mount_resonance, mount_rotation |
-| BANDWIDTH | `IdealMotion` | what it is too slow for: low_pass |
+| MOTION | `IdealMotion` | motion where the sensor sits: gravity, earth_rotation, lever_arm, size_effect, vibration |
+| MOUNT | `IdealMotion` | how the sensor is mounted: mount_resonance, mount_rotation |
+| BANDWIDTH | `IdealMotion` | the sensor's own bandwidth: low_pass |
 | CLOCK | times | when samples are taken: clock_offset, clock_skew, clock_jump |
 | SENSOR | `SensorSamples` | scale, misalignment, nonlinearity, g-sensitivity, temperature, drift, bias |
 | CONVERTER | `SensorSamples` | saturation, then quantization |
@@ -47,7 +47,7 @@ class Stage(IntEnum):
 
 @dataclass(frozen=True)
 class Parameter:
-    """A parameter of an effect: name, unit, plausible size (one standard deviation of what is met).
+    """Parameter of an effect: name, unit, and plausible size as one standard deviation.
 
     positive: it is positive by nature, so that a fit moves its logarithm.
     null_value: the value at which the effect does nothing: 0, or infinity (a cut-off frequency, a limit). A parameter that
@@ -69,7 +69,7 @@ class Parameter:
 
 @dataclass(frozen=True, slots=True)
 class CompiledEffect:
-    """An effect for given parameters: the error at each sample of a block, and at one sample from its time and columns.
+    """Effect for given parameters: the error in a block, and at one sample by time and columns.
 
     One sample is plain floats: numpy's calls would cost several times the arithmetic.
     """
@@ -175,7 +175,10 @@ def attitude_of(motion: IdealMotion, effect: str) -> Float64[np.ndarray, "n 3 3"
 
 
 def residual(motion: IdealMotion, samples: SensorSamples) -> tuple[Float64[np.ndarray, "n 3"], Float64[np.ndarray, "n 3"]]:
-    """Samples minus the ideal ones at the same stamps: gyro (rad/s), accel (m/s²). Good enough to start a fit from."""
+    """Residual: samples minus the ideal ones at the same stamps, gyro (rad/s) and accel (m/s²).
+
+    Good enough to start a fit from.
+    """
     ideal = motion.sample(samples.stamp_s, samples.stamp_s)
     return samples.gyro - ideal.gyro, samples.accel - ideal.accel
 
@@ -186,7 +189,7 @@ Acting = Sequence[tuple[Effect, Theta]]
 
 @dataclass(frozen=True, eq=False)
 class SignalState:
-    """Signals between two effects: a motion and when it is sampled, or, behind the clock, the samples."""
+    """Signals between two effects: a motion and its sample times or, behind the clock, samples."""
 
     motion: Any  # an `IdealMotion`, or another signal with the same method `sample`
     taken_s: Times
@@ -211,7 +214,7 @@ class SignalState:
 
 
 def simulate_samples(motion: IdealMotion, stamp_s: Times, acting: Acting) -> SensorSamples:
-    """Samples of a sensor with these effects at some stamps: the stages one after another, within a stage by name."""
+    """Samples of a sensor with these effects at some stamps, applied in stage order."""
     state = SignalState(motion, np.asarray(stamp_s, dtype=np.float64), stamp_s)
     for effect, theta in in_stage_order(acting):
         state = state.through(effect, theta)

@@ -1,4 +1,4 @@
-"""Synthetic flights: an exactly known motion, and a low-cost IMU with bias, scale and misalignment."""
+"""Synthetic flights: an exact motion, and a low-cost IMU with bias, scale and misalignment."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ Positive = Annotated[float, Meta(gt=0.0)]
 
 
 class TriadSettings(config.Settings, frozen=True, kw_only=True):
-    """Noise and errors of one triad of a sensor, in its unit u: rad/s for the gyroscope, m/s² for the accelerometer.
+    """Noise and errors of one triad in its unit u: rad/s (gyroscope), m/s² (accelerometer).
 
     Noise densities are a data sheet's; the other entries are standard deviations from which a sensor, or one flight
     of that sensor, is drawn.
@@ -88,7 +88,7 @@ class FlightSettings(config.Settings, frozen=True, kw_only=True):
 
 
 def flight(seed: int = 0, settings: FlightSettings | None = None, **changes: Any) -> Recording:
-    """Synthetic flight of the sensor `sensor_seed`: raw IMU, true poses with velocity, true biases.
+    """Synthetic flight of sensor `sensor_seed`: raw IMU, true poses with velocity and biases.
 
     accel, gyro = M s + b(t) + noise, with s from the kinematics of the trajectory, M = I + scale + misalignment fixed
     for the sensor, b = turn-on value + warm-up exp(-t / warm_up_s) + random walk. The true bias on
@@ -146,7 +146,7 @@ def trajectory(seed: int = 0, settings: FlightSettings | None = None) -> Traject
 
 
 def _points(settings: FlightSettings, knot_s: float) -> tuple[int, int]:
-    """Number of control points that repeat the first one, so that nothing moves before `still_s`, and of free ones.
+    """Number of control points that repeat the first, for rest until `still_s`, and of free ones.
 
     Point j acts from knot j on, and knot j lies at (j - DEGREE) knot_s - MARGIN_S.
     """
@@ -166,7 +166,7 @@ def _spline(points: Float64[np.ndarray, "free k"], still: int, knot_s: float) ->
 def _wander(
     rng: Generator, count: int, size: Float64[np.ndarray, " k"], centre: Float64[np.ndarray, " k"]
 ) -> Float64[np.ndarray, "count k"]:
-    """First-order autoregression about the centre, of standard deviation `size`; it starts near zero."""
+    """First-order autoregression about a centre, of standard deviation `size`, from near zero."""
     steps = np.sqrt(1.0 - PERSISTENCE**2) * size * rng.normal(size=(count, len(size)))
     path: Float64[np.ndarray, "count k"] = np.zeros_like(steps)
     for row in range(1, count):  # one row per control point: hundreds, not samples
@@ -211,13 +211,13 @@ def _truth(path: Trajectory, settings: FlightSettings, seed: int) -> Poses:
 
 
 def _clock(start_ns: int, duration_s: float, rate_hz: float) -> Times:
-    """Stamps of a regular clock, each rounded by itself so that no error adds up; the last is in the duration."""
+    """Stamps of a regular clock within the duration, each rounded by itself so that no error adds up."""
     count = int(np.floor(duration_s * rate_hz + 1e-6)) + 1
     return start_ns + np.round(np.arange(count) * (1e9 / rate_hz)).astype(np.int64)
 
 
 def _generator(purpose: str, seed: int) -> Generator:
-    """Random numbers by purpose, so that a new purpose leaves the numbers of the others as they were."""
+    """Random numbers by purpose, so that a new purpose does not change those of the others."""
     if seed < 0:
         raise ConfigError(f"seed {seed} is negative", where="flight", expected="0 or more")
     return default_rng([zlib.crc32(purpose.encode()), seed])

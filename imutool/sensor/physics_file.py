@@ -1,4 +1,4 @@
-"""physics.toml: effects on a sensor and their sizes, as `diagnose` writes them and `simulate` reads them.
+"""physics.toml: effects on a sensor and their sizes, from `diagnose` to `simulate`.
 
 ::
 
@@ -69,7 +69,7 @@ class Value(Settings, frozen=True, kw_only=True):
 
 
 class Entry(Settings, frozen=True, kw_only=True):
-    """Effect by name; `signal` says where it was seen, `driver` is the channel behind a `driven` one."""
+    """Effect by name; `signal` is where it was seen, `driver` the channel behind a `driven` one."""
 
     name: str
     signal: Literal["gyro", "accel", "both", ""] = ""
@@ -273,7 +273,7 @@ def _curve(curve: Curve, k: int, where: str | Path) -> Effect:
 
 
 def _term(term: Term, k: int, where: str | Path) -> Effect:
-    """Factors are variables, |variable|, variable^n or sign(variable), with a space or a bar between them."""
+    """Effect of a product of variables, |variable|, variable^n or sign(variable)."""
     effect = unnamed_effects.product(f"term {k}", term.signal, term.term, term.value)
     if effect is None:
         raise _unknown(f"term[{k}].term", term.term, [f"products of {', '.join(VARIABLES)}"], where)

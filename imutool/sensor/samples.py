@@ -1,4 +1,4 @@
-"""Ideal motion and sensor samples: the signals between a simulation and the samples of a log.
+"""Ideal motion and sensor samples: signals between a simulation and the samples of a log.
 
 Three clocks meet here. `t_s` is even and belongs to the motion; effects of the motion, the mount and the bandwidth act there.
 `taken_s` says when, on that clock, each sample was taken; effects of the clock act on it. `stamp_s` is what the log says.
@@ -68,7 +68,7 @@ class Sampler:
         return self._values(x, instants, lambda: _fixed(np.asarray(weights @ coefficients)))
 
     def _at(self, t_s: Times, taken_s: Float64[np.ndarray, " m"]) -> Instants:
-        """Clock, instants, and the matrix from coefficients to values (None: the instants are the clock's own).
+        """Clock, instants, and the matrix from coefficients to values; none at the clock's own instants.
 
         Raises:
             DataError: a clock that is not even.
@@ -129,7 +129,7 @@ def _weights(t_s: Float64[np.ndarray, " n"], taken_s: Float64[np.ndarray, " m"])
 
 
 def _coefficients(x: Float64[np.ndarray, "n k"]) -> Float64[np.ndarray, "m k"]:
-    """Spline coefficients; beyond the ends the columns are reflected through their last point, so that no end bends."""
+    """Spline coefficients; beyond the ends columns are reflected through their last point."""
     beyond = np.minimum(np.arange(1, PAD + 1), len(x) - 1)
     padded = np.concatenate([2.0 * x[0] - x[beyond[::-1]], x, 2.0 * x[-1] - x[len(x) - 1 - beyond]])
     if not x.shape[1]:
@@ -186,7 +186,7 @@ class SensorSamples:
 
     @cached_property
     def signals(self) -> Signals:
-        """The filtered signals: those of a running filter where `online` has them, else of these samples at their mean rate."""
+        """Filtered signals: those of a running filter (`online`), else of these samples at mean rate."""
         if self.online is not None:
             return self.online
         rate_hz = (len(self.stamp_s) - 1) / (self.stamp_s[-1] - self.stamp_s[0])
@@ -220,7 +220,7 @@ class SensorSamples:
 def channels_at(
     recording: Recording, t_s: Times, start_ns: int, least_messages: int = 1
 ) -> dict[str, Float64[np.ndarray, " n"]]:
-    """Scalar channels of a log at seconds from `start_ns`: linear between messages, by topic or `topic.x`."""
+    """Scalar channels of a log at seconds from `start_ns`, interpolated, by topic or `topic.x`."""
     out = {}
     for topic, scalars in recording.scalars.items():
         if len(scalars) >= least_messages:

@@ -1,4 +1,4 @@
-"""Causal signals of an IMU: its samples behind a few first-order filters, and their derivatives.
+"""Causal signals of an IMU: samples behind first-order filters, and their derivatives.
 
 A filter of time constant tau follows dy/dt = (x - y) / tau, so that its input's slow derivative is (x - y) / tau itself (over
 samples: over the lag behind a ramp, a little less than tau, so that a ramp's slope is exact).
@@ -33,7 +33,7 @@ Vectors = Float64[np.ndarray, "n 3"]
 
 @dataclass(frozen=True, slots=True)
 class Signals:
-    """Signals, one row a sample: rad/s, m/s², their derivatives, vibration power in (m/s²)² per axis."""
+    """Signals, one row a sample: rad/s, m/s², derivatives, vibration power in (m/s²)²."""
 
     t_s: Float64[np.ndarray, " n"]
     columns: Float64[np.ndarray, "n 27"]
@@ -55,7 +55,7 @@ class Signals:
 
     @property
     def gyro_dot(self) -> Vectors:
-        """Derivative of the rate from one sample to the next: its integral is exact, its noise large."""
+        """Derivative of the rate between two samples: its integral is exact, its noise large."""
         return self.columns[:, GYRO_DOT]
 
     @property
@@ -79,7 +79,7 @@ class Signals:
 
 
 class SignalFilter:
-    """Filter that makes signals of samples as they arrive, in blocks of any size; its state is the last row and its time.
+    """Causal filter from samples to signals, in blocks of any size; its state is the last row.
 
     It fills the first `wanted` columns of a row, and more where that is no extra work; the others are zero.
     """
@@ -109,7 +109,7 @@ class SignalFilter:
         return Signals(t_s, columns)
 
     def one(self, t_s: float, u: Float64[np.ndarray, "6"]) -> Float64[np.ndarray, "27"]:
-        """The columns at one sample, in a row that the next call overwrites; `_many` would take ten times as long."""
+        """Columns at one sample, in a row that the next call overwrites; ten times faster than a block."""
         if math.isnan(self._t_s):
             self._begin(t_s, u)
         if self._derives:
@@ -153,6 +153,6 @@ class SignalFilter:
 
 
 def low_pass(x: Float64[np.ndarray, "n k"], gain: float, before: Float64[np.ndarray, " k"]) -> Float64[np.ndarray, "n k"]:
-    """y_k = y_{k-1} + gain (x_k - y_{k-1}), from a state on; gain = 1 - exp(-period / tau) is the ODE's own solution."""
+    """Low-pass y_k = y_{k-1} + gain (x_k - y_{k-1}) from a state; gain = 1 - exp(-period / tau)."""
     y, _ = lfilter([gain], [1.0, gain - 1.0], x, axis=0, zi=(1.0 - gain) * before[None])
     return np.asarray(y)

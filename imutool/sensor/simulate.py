@@ -1,4 +1,4 @@
-"""Simulation of an IMU along any log with poses, with the effects of a physics.toml and a sensor's noise.
+"""Simulation of an IMU along a log's poses, with effects of a physics.toml and noise.
 
 Poses become a smooth motion (`trajectory`), the motion ideal signals, the effects act on these in the order of their stages
 (`effect`). Noise is added behind the sensor and before its converter; the log holds the samples and the truth.
@@ -201,7 +201,7 @@ def _nanoseconds(motion: SmoothMotion, stamp_s: Float64[np.ndarray, " m"]) -> In
 
 
 def _noise(noise: noises.Noise, rate_hz: float, seed: int) -> Effect:
-    """Effect of white noise and a walking bias; unknown densities count as zero. Each kind draws from its own stream."""
+    """Effect of white noise and a walking bias, each from its own stream; unknown densities are zero."""
     known = {name: np.nan_to_num(noise.values(name)) for name in noises.UNITS}
 
     def forward(samples: SensorSamples, _: Theta) -> SensorSamples:
@@ -230,7 +230,7 @@ def _remarks(motion: SmoothMotion, poses: Poses, noise: noises.Noise) -> tuple[s
 
 
 def _rounded(rate_hz: float) -> float:
-    """Measured rate, rounded where that changes less than a tenth of a per cent: 200.0016 Hz is 200."""
+    """Measured rate, rounded where that changes it by less than 0.1 %: 200.0016 Hz is 200."""
     whole = round(rate_hz)
     return float(whole) if whole and abs(rate_hz / whole - 1.0) < 1e-3 else rate_hz
 
@@ -248,7 +248,7 @@ def _source(path: Path, truth: str | None) -> Recording:
 
 
 def _without_imu(log: Log, truth: str | None) -> Recording:
-    """Poses of the first pose topic or of `truth`; in a tree of transforms TOPIC/CHILD_FRAME, or its only child."""
+    """Poses of the first pose topic or `truth`; of transforms TOPIC/CHILD_FRAME or the only child."""
     if not log.pose_topics:
         raise LogError("the log has no poses", where=log.path, expected=f"poses among {log.listing()}")
     name = truth or log.pose_topics[0]

@@ -40,7 +40,7 @@ Band = Float64[np.ndarray, "6 c"]
 
 @dataclass(frozen=True, eq=False)
 class Penalised:
-    """Fitted spline: `noise` is the standard deviation of a sample of weight one, `cutoff_hz` where smoothing halves.
+    """Fitted spline; `noise` is a sample's standard deviation at weight 1, `cutoff_hz` halves a motion.
 
     `penalty` is what it was fitted with, `likeliest` the one that the samples ask for.
     """
@@ -58,7 +58,7 @@ class Penalised:
         return left
 
     def std(self, derivative: int) -> float:
-        """Standard deviation of a derivative amid the data, smoothing and noise together, one coordinate.
+        """Standard deviation of a derivative amid the data, by smoothing and noise, one coordinate.
 
         For curves as rough as the likeliest penalty l says: noise² times the mean over theta of |B|² (b + lambda² p / l) /
         (b + lambda p)², B the transform of the basis' derivative, at the knots and halfway between them. With lambda = l that
@@ -76,7 +76,7 @@ class Penalised:
         return self.noise * float(np.sqrt(np.mean(both)))
 
     def end_s(self, derivative: int, worse: float, least: float) -> float:
-        """How far from an end the standard deviation of a derivative is above `least` and `worse` times that farther in.
+        """Time from an end within which a derivative's deviation is above `least` and `worse` times the inner.
 
         From the posterior of an even piece as dense as the data, in full; at most half of that piece.
         """
@@ -123,7 +123,7 @@ class Samples:
         return np.asarray(np.sum(parts, axis=0))
 
     def _normal(self) -> Band:
-        """Normal matrix B^T W B, its upper diagonals as scipy keeps them: the last row is the main one."""
+        """Normal matrix B^T W B, upper diagonals in scipy's order: the last row is the main one."""
         band = np.zeros((DEGREE + 1, self.count))
         for i in range(DEGREE + 1):
             for j in range(i, DEGREE + 1):

@@ -1,4 +1,4 @@
-"""Smooth motion behind measured poses: penalised splines where they can be trusted, and the ideal IMU signals.
+"""Smooth motion behind measured poses: penalised splines, and the ideal IMU signals.
 
 Poses of motion capture or of an estimator are noisy (0.1 to 5 mm, 0.05 to 0.5 degrees), have holes, glitches and steps, and
 are differentiated twice here. So: no curve across a hole; steps of the position (an estimator that takes in a fix) are
@@ -57,7 +57,7 @@ Values = Float64[np.ndarray, "n d"]
 
 @dataclass(frozen=True, eq=False)
 class Stretch:
-    """Stretch of motion without a hole, trusted from `start_s` to `end_s` (s from the first pose).
+    """Stretch of motion without a hole, trusted from `start_s` to `end_s` after the first pose.
 
     noise_m, noise_rad: standard deviation of a pose by coordinate. cutoff_hz: where smoothing halves a motion, of position and
     rotation. gyro_std (rad/s), accel_std (m/s²): of the ideal signals, by axis, as far as noise and smoothing explain it.
@@ -80,7 +80,7 @@ class Stretch:
 
 @dataclass(frozen=True, eq=False)
 class SmoothMotion:
-    """Stretches of a smooth motion, time counted from `start_ns`; dropped glitches, levelled steps."""
+    """Stretches of a smooth motion, timed from `start_ns`; dropped glitches, levelled steps."""
 
     start_ns: int
     stretches: tuple[Stretch, ...]
@@ -111,7 +111,7 @@ class SmoothMotion:
         return np.asarray(np.any([(t_s >= stretch.start_s) & (t_s <= stretch.end_s) for stretch in self.stretches], axis=0))
 
     def ideal_motions(self, rate_hz: float, g_w: Float[np.ndarray, "3"] = G_W) -> list[IdealMotion]:
-        """Ideal IMU signals of the tracked point in each stretch, on the even clock k / rate from `start_ns`.
+        """Ideal IMU signals of the tracked point in each stretch, at k / rate from `start_ns`.
 
         A stretch too short for four samples of that clock is left out.
 
@@ -188,7 +188,7 @@ def _long_enough(t_s: Times) -> bool:
 
 
 def _robust(t_s: Times, y: Values) -> tuple[Penalised, Times]:
-    """Robust fit, in which glitches count for little and gross ones for nothing, and its last weights.
+    """Robust fit, in which glitches count little and gross ones not at all; its last weights.
 
     Weights 1 / (1 + (r / 3 sigma)²), those of heavy tails, so that a fit with a few wild samples still converges.
     """
@@ -251,7 +251,7 @@ def _levelled(t_s: Times, y: Values) -> tuple[Values, int]:
 
 
 def _odd(t_s: Times, y: Values) -> Values:
-    """By how much each position differs from the one before, less what a cubic through its neighbours' differences says."""
+    """Difference of each position to the one before, less a cubic's through its neighbours."""
     dt = np.diff(t_s)[:, None]
     v = np.diff(y, axis=0) / dt
     odd = np.zeros_like(y)

@@ -1,4 +1,4 @@
-"""Effects without a name, as physics.toml has them: constant bias, driven gain, curve of a variable, product of factors."""
+"""Effects without a name in physics.toml: constant bias, driven gain, curve, product."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def factors(text: str) -> list[str]:
 
 
 def factor(word: str) -> Variable | None:
-    """A factor as a function of the samples: a variable, its size, its sign or a power; None if it is none of these."""
+    """Factor as a function of the samples: a variable, its size, sign or power; else None."""
     for pattern, change in CHANGES:
         found = re.fullmatch(pattern, word)
         if found and found[1] in VARIABLES:
@@ -91,7 +91,7 @@ def constant_bias(gyro: Sequence[float], accel: Sequence[float]) -> Effect:
 
 
 def driven(signal: Sensor, channel: str) -> Effect:
-    """Effect of a channel c of the log: + gain (c(t - lag) - mean of c) on each axis of a signal."""
+    """Effect of a channel c of the log: + gain (c(t - lag) - mean of c), by axis of a signal."""
 
     def forward(samples: SensorSamples, theta: Theta) -> SensorSamples:
         c = _channel(samples, channel)
@@ -104,7 +104,7 @@ def driven(signal: Sensor, channel: str) -> Effect:
 
 
 def curve(label: str, signal: Sensor, variable: str, x: Float64[np.ndarray, " k"], y: Float64[np.ndarray, "k 3"]) -> Effect:
-    """Effect of a curve of a variable, or of a channel of the log, for each axis: straight between its points."""
+    """Effect of a piecewise linear curve of a variable or channel, by axis of a signal."""
     of = VARIABLES.get(variable)
 
     def forward(samples: SensorSamples, _: Theta) -> SensorSamples:

@@ -1,4 +1,4 @@
-"""Calibration: effects that the training logs support, and their parameters, by linear least squares.
+"""Calibration: effects that the training logs support, fitted by linear least squares.
 
 Effects (`imutool.sensor.effects`) are shared by all logs; rest bias and tilt are each log's own
 (`imutool.training.linearised`).
@@ -96,7 +96,7 @@ def calibrate(
 
 
 def folded(pool: Pool, part: Part) -> Pool:
-    """Pool with each log cut in equal folds, where there are too few logs to predict one from the others."""
+    """Pool with each log cut in equal folds where there are too few logs."""
     if len(pool.names) >= FOLDS:
         return pool
     counts = torch.ones_like(pool.held_out) if part == "all" else pool.held_out == (part == "held_out")
@@ -132,7 +132,7 @@ def _choose(problem: Problem, effects: Sequence[LinearForm]) -> dict[str, float]
 
 
 def _beyond_chance(problem: Problem, effects: Sequence[LinearForm], names: Sequence[str]) -> bool:
-    """Wald's test of the last effect's parameters against zero, corrected for the number of candidates.
+    """Wald's test of the last effect's parameters, corrected for the number of candidates.
 
     Windows count as independent here, though the covariance takes them as correlated: the test only keeps out effects without
     evidence; the held-out loss decides which come in.

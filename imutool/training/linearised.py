@@ -1,4 +1,4 @@
-"""Residuals of integration between true poses, linearised in effect parameters and per-log unknowns.
+"""Residuals between true poses, linearised in effect parameters and per-log unknowns.
 
 Unknowns of a log are its rest bias and, for the accelerometer, the tilt of its truth's world against gravity. The residual of a
 window and how each sample moves it come from `imutool.inertial.windows`; an effect's error is linear in its parameters, so
@@ -54,7 +54,7 @@ def prior_std(effect: LinearForm) -> Float64[np.ndarray, " p"]:
 
 @dataclass(frozen=True)
 class Seen:
-    """Samples of one sensor in a pool: signals, and the rate that carries an accelerometer's attitude."""
+    """Samples of one sensor in a pool: signals, and the gyro for an accelerometer's attitude."""
 
     pool: Pool
     sensor: Sensor
@@ -77,7 +77,7 @@ class WindowSet:
 
 
 def linearise(seen: Seen, effects: Sequence[LinearForm], part: Part) -> Problem:
-    """Gauss-Newton on all effects at once: first on the shortest windows, then on longer ones as well.
+    """Gauss-Newton on all effects at once, from the shortest windows to all lengths.
 
     Raises:
         DataError: a log without a window that is free of gaps.

@@ -1,4 +1,4 @@
-"""Normal equations of many logs that share parameters, kept by log: to leave one out is cheap.
+"""Normal equations of many logs that share parameters, kept by log so that one can be left out.
 
 Unknowns are theta, shared by all logs, and a few of each log, which are eliminated log by log (Schur's complement). A
 prediction of one log from all others is then one solve of a matrix as small as theta.

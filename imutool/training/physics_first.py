@@ -1,4 +1,4 @@
-"""Training of `hybrid`: effects by linear least squares, then the neural ODE on corrected recordings.
+"""Training of `hybrid`: effects by least squares, then the ODE on corrected recordings.
 
 Effects are chosen on the training part, and then fitted to the whole logs.
 
@@ -87,7 +87,7 @@ class PhysicsFirst:
 
 
 def settings_for(physics: Path) -> tuple[list[str], tuple[str, ...]]:
-    """Settings for `hybrid` with the effects of a physics.toml, and the names that it cannot have.
+    """Settings for `hybrid` with the effects of a physics.toml, and names that it cannot have.
 
     Their parameters are fitted anew to the logs. Effects that it cannot have, or without a name, are left to the neural ODE.
 
@@ -104,7 +104,7 @@ def settings_for(physics: Path) -> tuple[list[str], tuple[str, ...]]:
 
 
 def helps(before: dict[Sensor, float], after: dict[Sensor, float]) -> bool:
-    """Whether a descent lowers the held-out error of one sensor enough, and does not raise the other's."""
+    """Whether a descent lowers one sensor's held-out error enough, and does not raise the other's."""
     gains = [1 - after[sensor] / before[sensor] for sensor in SENSORS]
     return max(gains) >= LEAST_GAIN and min(gains) > -LEAST_GAIN
 
@@ -145,6 +145,6 @@ def _corrected(model: hybrid.Model, imu: Imu) -> Imu:
 
 
 def described(found: dict[Sensor, Calibration]) -> Iterator[tuple[str, dict[str, object]]]:
-    """Entries of a model card: effects, their gains on logs without part in the fit, unseen parameters."""
+    """Entries of a model card: effects, gains on logs left out of the fit, unseen parameters."""
     for sensor, fitted in found.items():
         yield sensor, {"effects": list(fitted.effects), "gains": dict(fitted.gains), "unseen": list(fitted.unseen)}

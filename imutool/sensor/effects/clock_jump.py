@@ -16,7 +16,7 @@ def _forward(taken_s: Times, theta: Theta) -> Times:
 
 
 def _starts(motion: IdealMotion, samples: SensorSamples) -> list[Theta]:
-    """Where one offset before and another after explain most of the gyro's residual, to first order, by part of the log.
+    """Times at which two offsets explain most of the gyro's residual, to first order, by part.
 
     An offset tau adds tau d omega/dt, so that sums up to each sample and from it on tell what any jump would bring.
     """

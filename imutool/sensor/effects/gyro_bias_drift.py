@@ -1,4 +1,4 @@
-"""Warm-up of the gyro: + A (1 - exp(-t/tau)), t from the log's start. Every log is taken to begin with a cold sensor."""
+"""Warm-up of the gyro: + A (1 - exp(-t/tau)), t from the log's start with a cold sensor."""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Misalignment of the gyro's axes: off-diagonal 3x3 on omega. A rotation common to both sensors is a mount rotation."""
+"""Misalignment of the gyro's axes: off-diagonal 3x3 on omega.
+
+A rotation common to both sensors is a mount rotation.
+"""
 
 from __future__ import annotations
 

@@ -42,7 +42,7 @@ def _forward(motion: IdealMotion, cutoff_hz: Theta) -> IdealMotion:
 def filtered(
     x: Float64[np.ndarray, "n k"], gain: Complex128[np.ndarray, " w"], denominator: Float64[np.ndarray, " d"]
 ) -> Float64[np.ndarray, "n k"]:
-    """Columns behind a filter of gain 1 at rest, held constant before the first and behind the last.
+    """Columns behind a filter of gain 1 at rest, held constant beyond the ends.
 
     gain: H at the frequencies `OMEGA`; denominator: D in powers of 1/z.
     """

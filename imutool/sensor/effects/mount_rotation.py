@@ -1,4 +1,4 @@
-"""Rotation of the mount: the sensor's axes against the body's, the same for gyro and accelerometer."""
+"""Rotation of the mount: the axes of both sensors against the body's."""
 
 from __future__ import annotations
 

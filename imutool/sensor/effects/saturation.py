@@ -21,7 +21,7 @@ def _forward(samples: SensorSamples, limit: Theta) -> SensorSamples:
 
 
 def _starts(_motion: IdealMotion, samples: SensorSamples) -> list[Theta]:
-    """One sensor limited, the other, both: at the largest reading, which is the limit wherever one is reached."""
+    """Limits of one sensor, the other, both: the largest readings, for these are limits if reached."""
     gyro, accel = (float(np.abs(values).max()) or 1.0 for values in (samples.gyro, samples.accel))
     return [np.array(limit) for limit in ((gyro, NEVER * accel), (NEVER * gyro, accel), (gyro, accel))]
 

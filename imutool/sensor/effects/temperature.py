@@ -8,7 +8,7 @@ from imutool.sensor.samples import SensorSamples
 
 
 def _forward(samples: SensorSamples, k: Theta) -> SensorSamples:
-    """k of the gyro, then of the accelerometer; T0 is the channel's mean. With several such channels: the first by name.
+    """k of the gyro, then of the accelerometer; T0 is the mean of the first channel by name.
 
     Raises:
         DataError: no channel with a temperature in its name.

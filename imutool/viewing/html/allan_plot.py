@@ -29,7 +29,7 @@ HEIGHT_INCH = 3.8
 def write_png(found: IdentifiedNoise, path: Path, *, overwrite: bool = False) -> None:
     """Write a PNG of the Allan deviation of each axis, the fitted sum and each noise term.
 
-    Above what was seen at rest, below what was left in motion; only one of them where there is only one.
+    Above from rest, below from the residual in motion, where the log has them.
 
     Raises:
         ConfigError: matplotlib is not installed, or the file exists or cannot be written.

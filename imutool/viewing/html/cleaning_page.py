@@ -33,8 +33,8 @@ def write(surveys: Sequence[Survey], path: Path, *, overwrite: bool = False) -> 
 
 def html(surveys: Sequence[Survey]) -> str:
     """Text of the page of `write`."""
-    logs = ", ".join(sorted({Path(one.log).name for one in surveys}))
-    return document(logs, [f"<h1>{text(logs)}</h1>", *(line for one in surveys for line in _imu(one))])
+    logs = ", ".join(sorted({Path(survey.log).name for survey in surveys}))
+    return document(logs, [f"<h1>{text(logs)}</h1>", *(line for survey in surveys for line in _imu(survey))])
 
 
 def _imu(survey: Survey) -> Iterator[str]:
@@ -43,10 +43,10 @@ def _imu(survey: Survey) -> Iterator[str]:
     yield from (f"<p>{text(reason)}</p>" for reason in survey.reasons)
     if survey.findings:
         head = "".join(
-            f"<th>{one}</th>" for one in ("Rule", "Count", "What was found", "Action", "Confidence", "Where in the log")
+            f"<th>{title}</th>" for title in ("Rule", "Count", "What was found", "Action", "Confidence", "Where in the log")
         )
         yield f'<div class="scroll"><table><thead><tr>{head}</tr></thead><tbody>'
-        yield from (_row(one, survey) for one in survey.findings)
+        yield from (_row(finding, survey) for finding in survey.findings)
         yield "</tbody></table></div>"
 
 

@@ -143,7 +143,7 @@ def residual_against_attitude(d: Diagnosis) -> str | None:
     """Mean residual in bins of an axis's elevation above the horizon; None without attitude."""
 
     def variable(trace: Traces, signal: str, axis: int) -> Line:
-        assert trace.truth is not None, "looked at before"
+        assert trace.truth is not None, "checked by the caller"
         up_b = Rotation.from_quat(trace.truth.q_wb_wxyz, scalar_first=True).apply([0.0, 0.0, 1.0], inverse=True)
         rise: Line = np.degrees(np.arcsin(np.clip(up_b[:, axis], -1.0, 1.0)))
         return rise

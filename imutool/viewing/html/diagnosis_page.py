@@ -53,7 +53,7 @@ def html(d: Diagnosis, *, logs: str | None = None) -> str:
     Raises:
         ConfigError: matplotlib is not installed.
     """
-    names = ", ".join(Path(one).name for one in d.real)
+    names = ", ".join(Path(real).name for real in d.real)
     against = (
         f"against {Path(d.sim).name}"
         if d.sim is not None
@@ -62,8 +62,8 @@ def html(d: Diagnosis, *, logs: str | None = None) -> str:
     body = [
         f"<h1>{text(names)} {text(against)}</h1>",
         f'<p class="conclusion">{text(" ".join(headline(d)))}</p>',
-        *(f'<p class="note">{text(one)}</p>' for one in notes(d)),
-        *(f'<p class="note">{text(one)}</p>' for one in d.remarks),
+        *(f'<p class="note">{text(line)}</p>' for line in notes(d)),
+        *(f'<p class="note">{text(line)}</p>' for line in d.remarks),
         *([f'<p><a href="{text(logs)}">The recordings themselves</a>: signals, spectra, events.</p>'] if logs else []),
         *_findings(d),
         *_locations(d),
@@ -78,39 +78,40 @@ def html(d: Diagnosis, *, logs: str | None = None) -> str:
 def _findings(d: Diagnosis) -> Iterator[str]:
     if not d.findings:
         return
-    head = "".join(f"<th>{one}</th>" for one in ("Effect", "Equation", "Removes", "By chance"))
+    head = "".join(f"<th>{title}</th>" for title in ("Effect", "Equation", "Removes", "By chance"))
     yield "<h2>Unmodelled effects</h2>"
     yield f'<div class="scroll"><table class="findings"><thead><tr>{head}</tr></thead><tbody>'
-    for one in d.findings:
+    for finding in d.findings:
         cells = [
-            f"<strong>{text(label(one))}</strong> {text(one.signal)}<br>{text(effect_sentence(d, one))}{_similar(one)}",
-            f"<code>{text(one.equation)}</code>{_entries(one)}",
-            _gain(one),
-            f"<span class=entry>{text(chance_text(one.false_discovery_rate, short=True))}</span>",
+            f"<strong>{text(label(finding))}</strong> {text(finding.signal)}"
+            f"<br>{text(effect_sentence(d, finding))}{_similar(finding)}",
+            f"<code>{text(finding.equation)}</code>{_entries(finding)}",
+            _gain(finding),
+            f"<span class=entry>{text(chance_text(finding.false_discovery_rate, short=True))}</span>",
         ]
         yield f"<tr>{''.join(f'<td>{cell}</td>' for cell in cells)}</tr>"
     yield "</tbody></table></div>"
 
 
-def _gain(one: Finding) -> str:
+def _gain(finding: Finding) -> str:
     """Share of the misfit as a number and a bar, with the root mean squares."""
-    if not has_gain(one):
+    if not has_gain(finding):
         return "–"
-    width = 0 if math.isnan(one.share) else round(BAR_PIXELS * min(max(one.share, 0.0), 1.0))
-    unseen = text(gain_text(one.held_out).removesuffix(" of unseen data"))
-    return f'{percent(one.share)}<span class="bar" style="width: {width}px"></span><br>{unseen}'
+    width = 0 if math.isnan(finding.share) else round(BAR_PIXELS * min(max(finding.share, 0.0), 1.0))
+    unseen = text(gain_text(finding.held_out).removesuffix(" of unseen data"))
+    return f'{percent(finding.share)}<span class="bar" style="width: {width}px"></span><br>{unseen}'
 
 
-def _similar(one: Finding) -> str:
-    return f"<br>could as well be {text(' or '.join(one.similar))}" if one.similar else ""
+def _similar(finding: Finding) -> str:
+    return f"<br>could as well be {text(' or '.join(finding.similar))}" if finding.similar else ""
 
 
-def _entries(one: Finding) -> str:
+def _entries(finding: Finding) -> str:
     """All entries of a matrix, of which the sentence names only the clearest."""
-    if one.curve is not None:
-        return f"<br>a curve of {text(one.curve.variable)}, drawn below"
+    if finding.curve is not None:
+        return f"<br>a curve of {text(finding.curve.variable)}, drawn below"
     out = []
-    for quantity in grouped(one.parameters):
+    for quantity in grouped(finding.parameters):
         if len(quantity.estimates) > SHOWN:
             entries, unit = each(quantity.estimates, quantity.axes)
             listed = "; ".join(f"<span class=entry>{text(entry)}</span>" for entry in entries)
@@ -123,7 +124,8 @@ def _locations(d: Diagnosis) -> Iterator[str]:
         return
     yield "<h2>Location of the misfit</h2>"
     rows = "".join(
-        f"<tr><td>{text(location_text(one))}</td><td class=number>{percent(one.share)}</td></tr>" for one in d.located
+        f"<tr><td>{text(location_text(located))}</td><td class=number>{percent(located.share)}</td></tr>"
+        for located in d.located
     )
     head = "<tr><th>Signal, regime, time</th><th>Share of the misfit</th></tr>"
     yield f'<div class="scroll"><table><thead>{head}</thead><tbody>{rows}</tbody></table></div>'
@@ -173,25 +175,25 @@ def _before_and_after(d: Diagnosis) -> Iterator[str]:
 
 
 def _curves(d: Diagnosis) -> Iterator[str]:
-    for k, one in enumerate(d.findings):
-        if one.curve is not None:
+    for k, finding in enumerate(d.findings):
+        if finding.curve is not None:
             yield "<h2>Unnamed misfit</h2>"
-            caption = f"{text(one.equation)}: a smooth curve of {text(one.curve.variable)}, with one standard deviation"
-            yield _figure(figures.curve(one.curve, one.signal), f"c{k}", caption)
+            caption = f"{text(finding.equation)}: a smooth curve of {text(finding.curve.variable)}, with one standard deviation"
+            yield _figure(figures.curve(finding.curve, finding.signal), f"c{k}", caption)
 
 
 def _left(d: Diagnosis) -> Iterator[str]:
     if d.unexplained:
         yield "<h2>Remaining misfit</h2>"
-        head = "".join(f"<th>{one}</th>" for one in ("Signal", "Remains (rms)", "Noise (rms)", "Ratio", ""))
-        units = {one.signal: one.held_out.unit for one in d.findings} | ASCII_UNITS
+        head = "".join(f"<th>{title}</th>" for title in ("Signal", "Remains (rms)", "Noise (rms)", "Ratio", ""))
+        units = {finding.signal: finding.held_out.unit for finding in d.findings} | ASCII_UNITS
         rows = []
-        for signal, one in d.unexplained.items():
+        for signal, residual in d.unexplained.items():
             unit = symbol(units.get(signal, ""))
-            ratio = f"{one.rms / one.noise_floor:.2f}" if one.noise_floor > 0.0 else "–"
-            numbers = (f"{one.rms:.3g} {unit}", f"{one.noise_floor:.3g} {unit}", ratio)
+            ratio = f"{residual.rms / residual.noise_floor:.2f}" if residual.noise_floor > 0.0 else "–"
+            numbers = (f"{residual.rms:.3g} {unit}", f"{residual.noise_floor:.3g} {unit}", ratio)
             cells = "".join(f"<td class=number>{text(number)}</td>" for number in numbers)
-            rows.append(f"<tr><td>{text(signal)}</td>{cells}<td>{text(residual_text(one, unit))}</td></tr>")
+            rows.append(f"<tr><td>{text(signal)}</td>{cells}<td>{text(residual_text(residual, unit))}</td></tr>")
         yield f"<table><thead><tr>{head}</tr></thead><tbody>{''.join(rows)}</tbody></table>"
     if d.closer and d.findings:
         yield f"<h2>Improvement</h2><p class=note>{text(gain_source(d) + held_out_time(d))}.</p><dl>"

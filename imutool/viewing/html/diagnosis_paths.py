@@ -1,6 +1,6 @@
 """Integrated paths of a diagnosis: unseen stretches from a true start, before and after.
 
-A stretch's samples are what a perfect sensor would have read plus what is left over, before or after the findings are modelled
+The samples of a stretch are those of a perfect sensor plus the residual before or after the findings are modelled
 (a constant bias is taken off either way). Their integral is `strapdown.dead_reckon`.
 """
 
@@ -51,16 +51,16 @@ def paths(d: Diagnosis) -> str | None:
     None where no stretch has poses, or nothing was found.
     """
     drawn = [list(held_out_stretches(trace)) for trace in d.traces]
-    everything = [one for log in drawn for one in log]
+    everything = [stretch for log in drawn for stretch in log]
     if not everything or not d.findings:
         return None
 
     def draw(figure: Any) -> None:
         above, turned, moved = figure.subplots(1, 3, width_ratios=[1.2, 1.0, 1.0])
-        for one in drawn[0] or everything[:1]:
-            for poses, color, width in ((one.truth, INK, 2.0), (one.before, BEFORE, 1.0), (one.after, AFTER, 1.0)):
+        for stretch in drawn[0] or everything[:1]:
+            for poses, color, width in ((stretch.truth, INK, 2.0), (stretch.before, BEFORE, 1.0), (stretch.after, AFTER, 1.0)):
                 above.plot(*poses.p_wb[:, :2].T, color=color, lw=width, alpha=0.4 if color == INK else 1.0)
-            above.plot(*one.truth.p_wb[0, :2], "o", color=INK, ms=2.5)
+            above.plot(*stretch.truth.p_wb[0, :2], "o", color=INK, ms=2.5)
         above.set(xlabel="x (m)", ylabel="y (m)", title="Seen from above")
         above.set_aspect("equal", adjustable="datalim")
         for axes, name, column in ((turned, "orientation error (°)", 0), (moved, "position error (m)", 1)):
@@ -77,20 +77,20 @@ def rms_drift(found: Sequence[Stretch], side: int) -> tuple[Float64[np.ndarray, 
 
     `side` is 1 for before, 2 for after. As far as half of the stretches reach.
     """
-    lasting = float(np.median([one.truth.duration_s for one in found]))
+    lasting = float(np.median([stretch.truth.duration_s for stretch in found]))
     t_s = np.arange(0.0, lasting + 1e-9, GRID_S)
     squares = np.full((len(found), len(t_s), 2), np.nan)
-    for k, one in enumerate(found):
-        own_s = (one.truth.t_ns - one.truth.t_ns[0]) * 1e-9
+    for k, stretch in enumerate(found):
+        own_s = (stretch.truth.t_ns - stretch.truth.t_ns[0]) * 1e-9
         reach = t_s <= own_s[-1]
-        for column, error in enumerate(_errors(one.truth, one[side])):
+        for column, error in enumerate(_errors(stretch.truth, stretch[side])):
             squares[k, reach, column] = np.interp(t_s[reach], own_s, error) ** 2
     return t_s, np.sqrt(np.nanmean(squares, axis=0))
 
 
 def _stretch(trace: Traces, rows: slice) -> Stretch:
-    assert trace.truth is not None, "looked at before"
-    assert trace.ideal is not None, "looked at before"
+    assert trace.truth is not None, "checked by the caller"
+    assert trace.ideal is not None, "checked by the caller"
     truth: Poses = trace.truth.rows(rows)
     sides = []
     for expected in (trace.before, trace.after):

@@ -47,7 +47,7 @@ def cards(numbers: Iterable[tuple[str, str]]) -> str:
 
 
 # Okabe and Ito's palette, on dark a little lighter; red, green and blue are the axes as in the viewer. From e0 (none) to e6
-# (the most) an error grows: blue, yellow and red are told apart by colour-blind eyes too.
+# (the most) an error grows: blue, yellow and red differ for colour-blind eyes too.
 LIGHT = {
     "paper": "#ffffff",
     "ink": "#1a1a1a",
@@ -98,7 +98,7 @@ DARK = LIGHT | {
 }
 PAPER = LIGHT | {"ink": "#000000", "soft": "#444444", "grid": "#cccccc", "panel": "#ffffff"}
 
-# As matplotlib is told them: `svg` leaves them to the page, `png` takes the light ones. They are names of matplotlib's only
+# Names of colours for matplotlib: `svg` leaves them to the page, `png` takes the light ones. matplotlib knows them only
 # while something is drawn (`drawing`).
 INK, GRID, SOFT, BEFORE, AFTER, MARK, HELD, X, Y, Z = (
     f"imutool:{name}" for name in ("ink", "grid", "soft", "before", "after", "mark", "held", "x", "y", "z")

@@ -57,9 +57,9 @@ def drift_curves(data: RunData) -> Picture | None:
         return None
     scored, drifts = [trace for trace, _ in with_drift], [drift for _, drift in with_drift]
     caption = f"Set to the truth every {drifts[0].reset_s:g} s."
-    curves = [(data.elapsed_s(one.t_ns), one.orientation_deg, one.position_m) for one in drifts]
-    if any(len(_resets(one)) > MAX_RESETS for one in drifts):
-        curves = [_largest(one, *rows) for one, rows in zip(drifts, curves, strict=True)]
+    curves = [(data.elapsed_s(drift.t_ns), drift.orientation_deg, drift.position_m) for drift in drifts]
+    if any(len(_resets(drift)) > MAX_RESETS for drift in drifts):
+        curves = [_largest(drift, *rows) for drift, rows in zip(drifts, curves, strict=True)]
         caption += " Each stretch shows its largest drift."
     times, turned, moved = (list(rows) for rows in zip(*curves, strict=True))
     panels = (
@@ -124,7 +124,7 @@ def _draw(
 
 def _limits(axes: Any, values: Sequence[Line], *, signed: bool, log: bool) -> None:
     """Axis limits that keep the best and the worst run readable."""
-    tops = [float(np.nanmax(np.abs(one))) for one in values if np.isfinite(one).any()]
+    tops = [float(np.nanmax(np.abs(errors))) for errors in values if np.isfinite(errors).any()]
     if log:
         axes.set_yscale("log")
         plain_tick_labels(axes.yaxis)
@@ -140,12 +140,12 @@ def _limits(axes: Any, values: Sequence[Line], *, signed: bool, log: bool) -> No
 
 def _needs_log_scale(values: Sequence[Line]) -> bool:
     """Whether the largest errors differ too much for one linear scale."""
-    tops = [float(np.nanmax(one)) for one in values if np.isfinite(one).any()]
+    tops = [float(np.nanmax(errors)) for errors in values if np.isfinite(errors).any()]
     return len(tops) > 1 and min(tops) > 0.0 and max(tops) > LINEAR_RATIO * min(tops)
 
 
 def _leaves_panel(values: Sequence[Line]) -> bool:
-    return _needs_log_scale([np.abs(one) for one in values])
+    return _needs_log_scale([np.abs(errors) for errors in values])
 
 
 MAX_ROWS = 40
@@ -194,7 +194,7 @@ def _first(events: Sequence[Event]) -> list[Event]:
     """First events of every kind, the same number of each."""
     kinds = {event.kind for event in events}
     share = max(1, MAX_ROWS // max(len(kinds), 1))
-    return [event for kind in kinds for event in [one for one in events if one.kind == kind][:share]]
+    return [event for kind in kinds for event in [other for other in events if other.kind == kind][:share]]
 
 
 def _draw_lanes(figure: Any, *, data: RunData, kinds: Sequence[str]) -> None:

@@ -85,13 +85,13 @@ def conclusion(data: RunData) -> str:
     if chosen is None:
         return _without_truth(data)
     if chosen.is_raw or before is None:
-        told = f"{run_name(chosen)} has errors of {_errors(chosen)} over {format_number(data.duration_s)} s, without alignment"
+        text = f"{run_name(chosen)} has errors of {_errors(chosen)} over {format_number(data.duration_s)} s, without alignment"
     else:
-        told = f"{comparison(chosen, before)} over {format_number(chosen.figures['duration_s'])} s, without alignment"
+        text = f"{comparison(chosen, before)} over {format_number(chosen.figures['duration_s'])} s, without alignment"
     found = worst_orientation_error(chosen, data)
     at = "" if found is None else f"; at worst by {format_quantity(found[0], '°')}, {format_number(found[1])} s after the start"
     at += f" ({alignment_text(data)})" * (found is not None and data.alignment != "none")
-    return f"{data.name}: {told}{at}."
+    return f"{data.name}: {text}{at}."
 
 
 def comparison(chosen: Trace, before: Trace) -> str:
@@ -122,10 +122,10 @@ def ratio_text(large: float, small: float) -> str:
 
 def summary_of_logs(logs: Sequence[RunData]) -> str:
     """Summary of several logs: how often a model beats raw, and the median errors."""
-    pairs = [(best_run(one), raw_run(one)) for one in logs]
+    pairs = [(best_run(data), raw_run(data)) for data in logs]
     scored = [(a, b) for a, b in pairs if a is not None and b is not None and not a.is_raw]
     if not scored:
-        with_truth = sum(one.truth is not None for one in logs)
+        with_truth = sum(data.truth is not None for data in logs)
         return f"{len(logs)} logs, {with_truth} of them with truth, none with both truth and a model."
     better = sum(float(a.figures["aoe_deg"]) < float(b.figures["aoe_deg"]) for a, b in scored)
     new, old = (float(np.median([run.figures["aoe_deg"] for run in side])) for side in zip(*scored, strict=True))
@@ -137,16 +137,16 @@ def summary_of_logs(logs: Sequence[RunData]) -> str:
 
 def key_numbers(data: RunData) -> list[tuple[str, str]]:
     """Key numbers of a log, each with its caption."""
-    told = [(f"{format_number(data.duration_s)} s", f"{len(data.traces[0].run.imu):,} samples at {rate_hz(data):.0f} Hz")]
+    numbers = [(f"{format_number(data.duration_s)} s", f"{len(data.traces[0].run.imu):,} samples at {rate_hz(data):.0f} Hz")]
     chosen, before = best_run(data), raw_run(data)
-    for trace in dict.fromkeys(one for one in (before, chosen) if one is not None and one.figures):
-        told.append((format_quantity(float(trace.figures["aoe_deg"]), "°"), f"orientation error, {run_name(trace)}"))
-        told.append((format_quantity(float(trace.figures["ape_m"]), "m"), f"position error, {run_name(trace)}"))
+    for trace in dict.fromkeys(trace for trace in (before, chosen) if trace is not None and trace.figures):
+        numbers.append((format_quantity(float(trace.figures["aoe_deg"]), "°"), f"orientation error, {run_name(trace)}"))
+        numbers.append((format_quantity(float(trace.figures["ape_m"]), "m"), f"position error, {run_name(trace)}"))
     if chosen is not None and (window := _window(chosen, 10.0)) is not None:
-        told.append((format_quantity(window, "°"), f"drift in 10 s, {run_name(chosen)}"))
+        numbers.append((format_quantity(window, "°"), f"drift in 10 s, {run_name(chosen)}"))
     if (count := sum(event.kind != "worst" for event in data.events)) > 0:
-        told.append((f"{count:,}", "events"))
-    return told
+        numbers.append((f"{count:,}", "events"))
+    return numbers
 
 
 def rate_hz(data: RunData) -> float:
@@ -168,7 +168,7 @@ def unit_of(name: str) -> str:
 
 
 def _window(trace: Trace, length_s: float) -> float | None:
-    return next((one.orientation_deg for one in trace.windows if one.length_s == length_s), None)
+    return next((window.orientation_deg for window in trace.windows if window.length_s == length_s), None)
 
 
 def _errors(trace: Trace) -> str:
@@ -176,9 +176,9 @@ def _errors(trace: Trace) -> str:
 
 
 def _without_truth(data: RunData) -> str:
-    told = f"{data.name}: {format_number(data.duration_s)} s without truth, so its errors are unknown."
+    sentence = f"{data.name}: {format_number(data.duration_s)} s without truth, so its errors are unknown."
     for trace in data.models():
         gyro, accel = (np.linalg.norm(bias.mean(axis=0)) for bias in (trace.run.gyro_bias, trace.run.accel_bias))
         off = f"{np.degrees(gyro):.3g}°/s from the angular rate and {accel:.3g} m/s² from the specific force"
-        told += f" {run_name(trace)} subtracts {off}."
-    return told
+        sentence += f" {run_name(trace)} subtracts {off}."
+    return sentence

@@ -209,17 +209,17 @@ def export(
     return Output("folder", str(folder / PAGE), f"Exported {folder} for any web server, for instance: {served}")
 
 
-def _replace_folder(made: Path, place: Path) -> None:
+def _replace_folder(source: Path, target: Path) -> None:
     """Move a folder to its place; an existing one is removed after the move, and restored if it fails."""
-    if not place.exists():
-        made.rename(place)
+    if not target.exists():
+        source.rename(target)
         return
-    old = made.with_suffix(".replaced")
-    place.rename(old)
+    old = source.with_suffix(".replaced")
+    target.rename(old)
     try:
-        made.rename(place)
+        source.rename(target)
     except BaseException:
-        old.rename(place)
+        old.rename(target)
         raise
     shutil.rmtree(old)
 
