@@ -187,6 +187,7 @@ def measured(
     imu: str | None = None,
     truth: str | None = None,
     effects: Sequence[str] = EVERY_UNIT,
+    settings: DiagnoseSettings | None = None,
 ) -> Measured:
     """Some effects of the catalogue, fitted to a recording together whether they are there or not: what units are compared by.
 
@@ -198,7 +199,7 @@ def measured(
     simulated = None if sim is None else read_log(sim, imu=imu)
     pairs = [_telling(pair) for pair in _pairs(read_log(real, imu=imu, truth=truth), simulated, truth)]
     candidates = _candidates(pairs)
-    settings = DiagnoseSettings()
+    settings = settings or DiagnoseSettings()
     logs = [whitened(pair, candidates, settings.band) for pair in pairs]
     asked = catalogue.diagnosed(effects)
     hidden = set(unobservable(logs, asked, settings.search))

@@ -173,6 +173,23 @@ def test_what_cannot_be_diagnosed_is_refused(
 # ── the folder, of made-up diagnoses ──
 
 
+def test_a_setting_reaches_the_search(folder: Path, tmp_path: Path) -> None:
+    """At a false discovery rate that no gain reaches, a planted lever arm is not found."""
+    config = tmp_path / "settings.toml"
+    config.write_text("[search]\nrounds = 1\n")
+    words = ("diagnose", folder / "arm.mcap", "--config", config, "--json", "-")
+    done = run(*words, "--set", "search.false_discovery_rate=1e-300", "--quiet")
+    assert done.exit_code == 0, done.output
+    assert json.loads(done.stdout)["findings"] == []
+
+
+@pytest.mark.parametrize("word", ["search.false_discovery=1e-3", "search.false_discovery_rate=2", "band.sigma=none"])
+def test_a_wrong_setting_is_refused(folder: Path, word: str) -> None:
+    done = run("diagnose", folder / "arm.mcap", "--set", word)
+    assert done.exit_code == ConfigError.exit_code
+    assert word.partition("=")[0].rpartition(".")[2] in done.stderr
+
+
 def test_other_files_in_the_folder_stay(tmp_path: Path) -> None:
     (tmp_path / "real.mcap").write_bytes(b"mine")
     assert diagnosis_output.write(diagnoses.NOTHING, tmp_path) == []

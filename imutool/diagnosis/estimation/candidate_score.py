@@ -1,4 +1,4 @@
-"""Score test of a candidate effect: the gain of one linear step beside a fit, without a fit for each candidate."""
+"""Score test of candidate effects: the gain of one linear step beside a fit, and candidates ranked by its p-value."""
 
 from __future__ import annotations
 
@@ -8,8 +8,9 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float64, Int64
 
-from imutool.diagnosis.estimation.gauss_newton import Fit, direction, priors
+from imutool.diagnosis.estimation.gauss_newton import Fit, direction, parameters_of, priors
 from imutool.diagnosis.estimation.jacobians import ForwardPass, effect_jacobian
+from imutool.diagnosis.estimation.significance import log_p_value
 from imutool.diagnosis.estimation.whitening import WhitenedLog
 from imutool.sensor.effect import Effect, Theta
 
@@ -79,3 +80,73 @@ class CandidateScore:
         step = np.linalg.solve(S, g)
         far = float(np.abs(step[[parameter.positive for parameter in effect.parameters]]).max(initial=1.0))
         return float(self.left - total + g_a @ beside[:, p] + (2.0 / far - 1.0 / far**2) * (g @ step))
+
+
+def _exclude(a: Effect, b: Effect) -> bool:
+    """Whether two effects never act together: variants of one effect of the catalogue on one sensor."""
+    one_sensor = a.sensors == b.sensors or bool(set(a.sensors) & set(b.sensors))
+    variants = a.kind == b.kind == "catalogue" and a.name == b.name and one_sensor
+    return a.key == b.key or variants
+
+
+class Scored(NamedTuple):
+    """A candidate with the log p-value of its score from its best start, and the gain in squares."""
+
+    log_p: float
+    effect: Effect
+    start: Theta
+    gain: float
+
+    @property
+    def aic_gain(self) -> float:
+        """Gain less the expectation for as many parameters (Akaike)."""
+        return self.gain - 2.0 * len(self.start)
+
+
+class Candidates:
+    """Candidate effects with the starts of their fits, and their scores beside the last fit that was asked for."""
+
+    def __init__(self, logs: Sequence[WhitenedLog], effects: Sequence[Effect]) -> None:
+        self.logs = logs
+        self.starts: dict[str, list[Theta]] = {}
+        self.log_choices: dict[str, float] = {}
+        self.scores: dict[str, Scored] = {}
+        self.scored_fit: Fit | None = None
+        pair = logs[0].pair
+        for effect in effects:
+            if effect.key not in self.starts:
+                starts = self.starts[effect.key] = pair.starts(effect)
+                self.log_choices[effect.key] = float(np.log(max(1.0, pair.alternatives(effect) / len(starts))))
+
+    def count(self, effects: Sequence[Effect]) -> int:
+        """Number of starts of some candidates: the hypotheses of the Bonferroni correction."""
+        return sum(len(self.starts[effect.key]) for effect in effects)
+
+    def log_p(self, effect: Effect, gain: float) -> float:
+        """Log p-value of a gain by an effect; starts that are the best of many choices make chance likelier."""
+        return log_p_value(gain, len(effect.parameters)) + self.log_choices[effect.key]
+
+    def ranked(self, now: Fit, candidates: Sequence[Effect]) -> list[Scored]:
+        """Candidates beside a fit by their score, each from its best start."""
+        if self.scored_fit is not now:
+            self.scored_fit, self.scores = now, {}
+        asked = [effect for effect in candidates if not any(_exclude(effect, other) for other, _ in now.chosen)]
+        score = None
+        for effect in asked:
+            if effect.key not in self.scores:
+                score = score or CandidateScore(self.logs, now)
+                gains = [(score.gain(effect, start), start) for start in self.starts[effect.key]]
+                gain, start = max(gains, key=lambda pair: pair[0])
+                self.scores[effect.key] = Scored(self.log_p(effect, gain), effect, start, gain)
+        return sorted((self.scores[effect.key] for effect in asked), key=lambda entry: entry.log_p)
+
+
+def unnamed_count(found: Fit) -> int:
+    """Number of effects that are not of the catalogue."""
+    return sum(effect.kind != "catalogue" for effect, _ in found.chosen)
+
+
+def bic(found: Fit, unnamed_penalty: float) -> float:
+    """Squares left and the cost of the parameters (BIC); an effect outside the catalogue costs more."""
+    count = len(parameters_of(found.chosen))
+    return found.objective + count * float(np.log(found.numbers)) + unnamed_penalty * unnamed_count(found)

@@ -12,24 +12,30 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from typing import NamedTuple
 
 import numpy as np
 
 from imutool.diagnosis.estimation.aligned_log import Pair
-from imutool.diagnosis.estimation.candidate_score import CandidateScore
-from imutool.diagnosis.estimation.gauss_newton import BETWEEN_SAMPLES, LOG_PRIOR, Fit, fit, parameters_of
+from imutool.diagnosis.estimation.candidate_score import Candidates, bic, unnamed_count
+from imutool.diagnosis.estimation.gauss_newton import BETWEEN_SAMPLES, LOG_PRIOR, Fit, fit
 from imutool.diagnosis.estimation.jacobians import Chosen
-from imutool.diagnosis.estimation.observability import below_model_error, unidentified, values_of, without_implausible
+from imutool.diagnosis.estimation.observability import (
+    below_model_error,
+    beyond_the_band,
+    plausible_part,
+    unidentified,
+    values_of,
+    without_implausible,
+)
 from imutool.diagnosis.estimation.significance import (
     Scatter,
     estimate_onsets,
     gain_for,
     held_out_gains,
     held_out_p_value,
-    log_p_value,
     prediction_p_value,
     scatter,
+    with_onsets_of,
 )
 from imutool.diagnosis.estimation.unnamed_effects import Curve, SplineCurve, finer, like
 from imutool.diagnosis.estimation.whitening import WhitenedLog
@@ -81,16 +87,18 @@ def select_effects(
     """
     unnamed = tuple(effect for group in later for effect in group)
     settings = settings or SearchSettings()
+    penalty = settings.unnamed_penalty
     start = fit(logs, always)
-    first = _Search(logs, tuple(candidates), unnamed, always, start.objective, settings, progress or (lambda text: None))
-    best_named, best_unnamed = (max((s.aic_gain for s in first.ranked(start, c)), default=0.0) for c in (first.named, unnamed))
+    known, said = Candidates(logs, (*candidates, *unnamed)), progress or (lambda text: None)
+    first = _Search(logs, tuple(candidates), unnamed, always, start.objective, settings, said, known)
+    best_named, best_unnamed = (max((s.aic_gain for s in known.ranked(start, c)), default=0.0) for c in (candidates, unnamed))
     unnamed_first = best_unnamed > best_named + settings.clearly_better
     search, now = _grown(first, start, unnamed, []) if unnamed_first else _grown(first, start, (), list(later))
-    doubtful = len(now.chosen) - len(always) >= settings.suspicious_effects or _unnamed(now) > 0
+    doubtful = len(now.chosen) - len(always) >= settings.suspicious_effects or unnamed_count(now) > 0
     if unnamed and doubtful and now.objective > settings.explained_chi_square * now.numbers:
         # many small parts that do not add up, or an unnamed one: perhaps one effect alone is the better answer
         other = _grown(first, start, (), list(later)) if unnamed_first else _grown(first, start, unnamed, [])
-        if search.cost(other[1]) < search.cost(now) - settings.clearly_better:
+        if bic(other[1], penalty) < bic(now, penalty) - settings.clearly_better:
             search, now = other
     return search.tested(now)
 
@@ -100,8 +108,7 @@ def _grown(first: _Search, now: Fit, unnamed: tuple[Effect, ...], waiting: list[
     search, settings = replace(first, unnamed=unnamed), first.settings
     for _ in range(settings.rounds):
         count = len(now.chosen) - len(first.always)
-        found = f" with {', '.join(now.keys[len(first.always) :])}" if count else ""
-        search.progress(f"{len(search.named) + len(search.unnamed)} effects{found}")
+        search.progress(" with ".join([f"{len(search.named) + len(search.unnamed)} effects", *now.keys[len(first.always) :]]))
         hopeless = count > settings.suspicious_effects and now.objective > settings.hopeless_chi_square * now.numbers
         better = search.added(now) if count < settings.most_effects and not hopeless else None
         if better is not None:
@@ -113,36 +120,8 @@ def _grown(first: _Search, now: Fit, unnamed: tuple[Effect, ...], waiting: list[
     return search, now
 
 
-def _unnamed(found: Fit) -> int:
-    """Number of effects that are not of the catalogue."""
-    return sum(effect.kind != "catalogue" for effect, _ in found.chosen)
-
-
-def _exclude(a: Effect, b: Effect) -> bool:
-    """Whether two effects never act together: variants of one effect of the catalogue on one sensor."""
-    one_sensor = a.sensors == b.sensors or bool(set(a.sensors) & set(b.sensors))
-    variants = a.kind == b.kind == "catalogue" and a.name == b.name and one_sensor
-    return a.key == b.key or variants
-
-
-class _Scored(NamedTuple):
-    """A candidate with the log p-value of its score from its best start, and the gain in squares."""
-
-    log_p: float
-    effect: Effect
-    start: Theta
-    gain: float
-
-    @property
-    def aic_gain(self) -> float:
-        """Gain less the expectation for as many parameters (Akaike)."""
-        return self.gain - 2.0 * len(self.start)
-
-
 @dataclass(eq=False)
 class _Search:
-    """A search among named and unnamed candidates, with what it has evaluated."""
-
     logs: Sequence[WhitenedLog]
     named: tuple[Effect, ...]
     unnamed: tuple[Effect, ...]
@@ -150,40 +129,20 @@ class _Search:
     before: float  # squares of white residuals with nothing but a constant bias
     settings: SearchSettings
     progress: Callable[[str], None]
-    starts: dict[str, list[Theta]] = field(default_factory=dict)
-    log_choices: dict[str, float] = field(default_factory=dict)  # of starts picked from many: what that adds to a log p-value
-    scores: dict[str, _Scored] = field(default_factory=dict)  # beside the effects of one fit
-    trials: dict[str, Fit] = field(default_factory=dict)  # with one of the candidates, likewise
-    scored_fit: Fit | None = None
-    scattered_fit: tuple[Fit, Scatter] | None = None
+    candidates: Candidates
+    trials: dict[str, Fit] = field(default_factory=dict)  # with one more candidate than `trials_of`
+    trials_of: Fit | None = None
     onset_std: dict[tuple[str, int], float] = field(default_factory=dict)
-
-    def __post_init__(self) -> None:
-        for effect in (*self.named, *self.unnamed):
-            if effect.key not in self.starts:
-                pair = self.logs[0].pair
-                self.starts[effect.key] = pair.starts(effect)
-                choices = pair.alternatives(effect) / len(self.starts[effect.key])
-                self.log_choices[effect.key] = float(np.log(max(1.0, choices)))
 
     @property
     def tried(self) -> int:
-        """Number of starts of all candidates: the hypotheses of the Bonferroni correction."""
-        return sum(len(self.starts[effect.key]) for effect in (*self.named, *self.unnamed))
+        """Number of hypotheses of the Bonferroni correction."""
+        return self.candidates.count((*self.named, *self.unnamed))
 
     @property
     def threshold(self) -> float:
         """Log p-value that a finding needs after the correction."""
         return float(np.log(self.settings.false_discovery_rate / self.tried))
-
-    def log_p(self, effect: Effect, gain: float) -> float:
-        """Log p-value of a gain by an effect, at the best of its alternatives."""
-        return log_p_value(gain, len(effect.parameters)) + self.log_choices[effect.key]
-
-    def cost(self, found: Fit) -> float:
-        """Squares left and the cost of the parameters (BIC); an effect outside the catalogue costs more."""
-        count = len(parameters_of(found.chosen))
-        return found.objective + count * float(np.log(found.numbers)) + self.settings.unnamed_penalty * _unnamed(found)
 
     def removable(self, now: Fit) -> range:
         """Places of effects but for those of every fit and the last, which has just come in."""
@@ -192,7 +151,11 @@ class _Search:
     def added(self, now: Fit) -> Fit | None:
         """The best fit with one more effect; none if chance explains its gain."""
         share = self.settings.rival_share
-        ranked = self.ranked(now, self.named + (self.unnamed if _unnamed(now) < self.settings.most_unnamed else ()))
+        if self.trials_of is not now:
+            self.trials_of, self.trials = now, {}
+        ranked = self.candidates.ranked(
+            now, self.named + (self.unnamed if unnamed_count(now) < self.settings.most_unnamed else ())
+        )
         best: tuple[float, Fit] | None = None
         for promised, effect, start, _ in ranked[: self.settings.fitted_each_round]:
             if best is not None and promised > best[0] * (1.0 if effect.linear else share):
@@ -202,15 +165,14 @@ class _Search:
                 self.trials[effect.key] = self.tried_with(now.chosen, effect, start, now, limit)
             trial = self.trials[effect.key]
             it, theta = trial.chosen[-1]
-            if not it.parameters or self._beyond_the_band(it, theta):
+            if not it.parameters or beyond_the_band(it, theta, self.logs, self.settings):
                 continue
-            log_p = self.log_p(it, now.objective - trial.objective)
-            if best is None or log_p < best[0]:
-                best = log_p, trial
+            log_p = self.candidates.log_p(it, now.objective - trial.objective)
+            best = (log_p, trial) if best is None or log_p < best[0] else best
         if best is None or best[0] > self.threshold:
             return None
-        misfit = self.before - now.numbers
-        if _unnamed(best[1]) and now.objective - best[1].objective < self.settings.unnamed_share * misfit:
+        enough = self.settings.unnamed_share * (self.before - now.numbers)
+        if unnamed_count(best[1]) and now.objective - best[1].objective < enough:
             return None  # the rim of something that has no name: a name for it would be wrong
         return best[1]
 
@@ -223,20 +185,6 @@ class _Search:
             return trial
         return fit(self.logs, (*others, (reduced, values_of(effect, reduced, theta))), near=near, give_up_above=limit)
 
-    def ranked(self, now: Fit, candidates: Sequence[Effect]) -> list[_Scored]:
-        """Candidates by their score, each from its best start."""
-        if self.scored_fit is not now:
-            self.scored_fit, self.scores, self.trials = now, {}, {}
-        asked = [effect for effect in candidates if not any(_exclude(effect, other) for other, _ in now.chosen)]
-        score = None
-        for effect in asked:
-            if effect.key not in self.scores:
-                score = score or CandidateScore(self.logs, now)
-                gains = [(score.gain(effect, start), start) for start in self.starts[effect.key]]
-                gain, start = max(gains, key=lambda pair: pair[0])
-                self.scores[effect.key] = _Scored(self.log_p(effect, gain), effect, start, gain)
-        return sorted((self.scores[effect.key] for effect in asked), key=lambda entry: entry.log_p)
-
     def refined(self, now: Fit) -> Fit:
         """The fit with more knots in the curve that has just come in, where an edge pays for them."""
         others, (effect, _) = now.chosen[:-1], now.chosen[-1]
@@ -246,7 +194,8 @@ class _Search:
         if fine is None:
             return now
         trial = fit(self.logs, (*others, (fine, fine.null_value.astype(float))), near=now)
-        return trial if self.cost(trial) < self.cost(now) - self.settings.clearly_better else now
+        penalty = self.settings.unnamed_penalty
+        return trial if bic(trial, penalty) < bic(now, penalty) - self.settings.clearly_better else now
 
     def exchanged(self, now: Fit) -> Fit:
         """The fit with an effect replaced by another of the catalogue that explains more, where there is one."""
@@ -254,9 +203,9 @@ class _Search:
         for k in self.removable(now) if few else ():
             others, mine = (*now.chosen[:k], *now.chosen[k + 1 :]), now.chosen[k][0]
             without = fit(self.logs, others, iterations=2, near=now)
-            here = self.log_p(mine, without.objective - now.objective)
+            here = self.candidates.log_p(mine, without.objective - now.objective)
             unfitted = fit(self.logs, others, iterations=0)  # refitted, a nonlinear effect may diverge for good
-            for log_p, effect, start, _ in self.ranked(unfitted, self.named)[:2]:
+            for log_p, effect, start, _ in self.candidates.ranked(unfitted, self.named)[:2]:
                 if effect.key == mine.key:
                     if effect.linear:  # its score is its gain
                         break
@@ -265,7 +214,7 @@ class _Search:
                     continue
                 limit = without.objective - self.settings.rival_share * (without.objective - now.objective)
                 trial = self.tried_with(others, effect, start, without, limit)
-                if self.log_p(trial.chosen[-1][0], without.objective - trial.objective) < here - 1.0:
+                if self.candidates.log_p(trial.chosen[-1][0], without.objective - trial.objective) < here - 1.0:
                     return trial
         return now
 
@@ -273,10 +222,10 @@ class _Search:
         """The fit without effects that the others have made superfluous."""
         for k in self.removable(now):
             effect, theta = now.chosen[k]
-            least = gain_for(self.threshold - self.log_choices[effect.key], len(theta))
+            least = gain_for(self.threshold - self.candidates.log_choices[effect.key], len(theta))
             limit = now.objective + self.settings.give_up_factor * least  # a superfluous effect leaves less after a few steps
             without = fit(self.logs, (*now.chosen[:k], *now.chosen[k + 1 :]), near=now, give_up_above=limit)
-            if self.log_p(effect, without.objective - now.objective) > self.threshold:
+            if self.candidates.log_p(effect, without.objective - now.objective) > self.threshold:
                 return self.pruned(without)
         return now
 
@@ -287,36 +236,26 @@ class _Search:
             self.progress(f"on unseen time: {', '.join(now.keys[first:])}")
             other = fit(self.logs, now.chosen, part="held_out", near=now)
             whole = fit(self.logs, now.chosen, part="all", near=now)
-            reduced = self._plausible(whole.chosen)
-            if reduced is not None:
+            if (reduced := plausible_part(whole.chosen, self.settings.implausible_factor)) is not None:
                 now = fit(self.logs, reduced)
                 continue
             whole, self.onset_std = estimate_onsets(self.logs, whole, "all", max(1.0, whole.reduced_chi_square))
-            verdicts = self._beyond_model_error([self._verdict(k, now, other, whole) for k in range(first, len(now.chosen))])
+            scattered = self._scattered(whole)
+            tests = [self._verdict(k, now, other, whole, scattered) for k in range(first, len(now.chosen))]
+            verdicts = self._beyond_model_error(tests)
             worst = max(range(len(verdicts)), key=lambda k: verdicts[k].false_discovery_rate)
             if verdicts[worst].false_discovery_rate <= self.settings.false_discovery_rate:
                 selected = [replace(one, similar=self._similar(first + k, now)) for k, one in enumerate(verdicts)]
-                fitted = replace(now, chosen=_with_onsets_of(now.chosen, whole.chosen))
+                fitted = replace(now, chosen=with_onsets_of(now.chosen, whole.chosen))
                 return Selection(tuple(sorted(selected, key=lambda one: -one.gain)), fitted, whole, self.tried)
             now = fit(self.logs, (*now.chosen[: first + worst], *now.chosen[first + worst + 1 :]), near=now)
         return Selection((), now, fit(self.logs, now.chosen, part="all"), self.tried)
 
-    def _plausible(self, chosen: Chosen) -> Chosen | None:
-        """The effects without implausible parameters; none if all are plausible."""
-        reduced = [without_implausible(effect, theta, self.settings.implausible_factor) for effect, theta in chosen]
-        if all(new is effect for new, (effect, _) in zip(reduced, chosen, strict=True)):
-            return None
-        left = [(new, values_of(effect, new, theta)) for new, (effect, theta) in zip(reduced, chosen, strict=True)]
-        return tuple(pair for pair in left if len(pair[1]))
-
-    def _scattered(self, found: Fit, part: str) -> Scatter | None:
+    def _scattered(self, found: Fit) -> Scatter | None:
         """Robust covariance; none where the noise is known and the residuals are as white."""
-        exact = all(log.pair.exact for log in self.logs)
-        if exact and found.objective < self.settings.white_chi_square * found.numbers:
+        if all(log.pair.exact for log in self.logs) and found.objective < self.settings.white_chi_square * found.numbers:
             return None
-        if self.scattered_fit is None or self.scattered_fit[0] is not found:
-            self.scattered_fit = found, scatter(self.logs, found, part, self.settings.robust_block_s)
-        return self.scattered_fit[1]
+        return scatter(self.logs, found, found.part, self.settings.robust_block_s)
 
     def _similar(self, k: int, now: Fit) -> tuple[str, ...]:
         """Effects of the catalogue that in an effect's place leave about as little (Akaike's criterion)."""
@@ -324,38 +263,30 @@ class _Search:
         others = (*now.chosen[:k], *now.chosen[k + 1 :])
         without = fit(self.logs, others, iterations=2, near=now)
         gain, found = without.objective - now.objective, []
-        for _, effect, start, promised in self.ranked(without, self.named)[: self.settings.rivals]:
+        for _, effect, start, promised in self.candidates.ranked(without, self.named)[: self.settings.rivals]:
             if effect.key != now.chosen[k][0].key and promised > share * gain:
-                limit = without.objective - share * gain
-                trial = fit(self.logs, (*others, (effect, start)), near=without, give_up_above=limit)
-                enough = now.objective + 2 * len(now.chosen[k][1]) + self.settings.clearly_better
-                if trial.objective + 2 * len(start) < enough:
+                trial = fit(self.logs, (*others, (effect, start)), near=without, give_up_above=without.objective - share * gain)
+                aic = now.objective + 2 * len(now.chosen[k][1])
+                if trial.objective + 2 * len(start) < aic + self.settings.clearly_better:
                     found.append(effect.name)
         return tuple(dict.fromkeys(found))
 
-    def _beyond_the_band(self, effect: Effect, theta: Theta) -> bool:
-        """Whether a frequency is one at which smoothed poses, which lose and lag by themselves, look alike, or too slow."""
-        factor = self.settings.beyond_band_low_pass if effect.name == "low_pass" else self.settings.beyond_band
-        reach = [factor * log.pair.band_hz for log in self.logs if log.pair.band_hz is not None]
-        hertz = [value for parameter, value in zip(effect.parameters, theta, strict=True) if parameter.unit == "Hz"]
-        return bool(reach and hertz and (max(hertz) > min(reach) or min(hertz) < self.settings.slowest_hz))
-
-    def _verdict(self, k: int, fitted: Fit, other: Fit, whole: Fit) -> SelectedEffect:
+    def _verdict(self, k: int, fitted: Fit, other: Fit, whole: Fit, scattered: Scatter | None) -> SelectedEffect:
         effect, theta = whole.chosen[k]
         without = fit(self.logs, (*whole.chosen[:k], *whole.chosen[k + 1 :]), part="all", near=whole)
         gain = without.objective - whole.objective
         if any(rest.jumps for rest, _ in without.chosen):
             gain /= BETWEEN_SAMPLES**2  # whatever moves the signal a little wins single samples at an edge
-        scattered = self._scattered(whole, "all")
-        log_p = self.log_p(effect, gain)
+        log_p = self.candidates.log_p(effect, gain)
         if scattered is not None:
-            log_p = max(log_p, scattered.log_p_value(effect.key, gain, len(theta)) + self.log_choices[effect.key])
+            log_p = max(log_p, scattered.log_p_value(effect.key, gain, len(theta)) + self.candidates.log_choices[effect.key])
         parts, block_s = ((fitted, "held_out"), (other, "fitted")), self.settings.held_out_block_s
         blocks = np.concatenate([held_out_gains(log, of, k, part, block_s) for of, part in parts for log in self.logs])
-        exact = all(log.pair.exact for log in self.logs)
-        helping = min(held_out_p_value(blocks[:, 0]), prediction_p_value(blocks) if exact else 1.0)
+        helping = min(
+            held_out_p_value(blocks[:, 0]), prediction_p_value(blocks) if all(log.pair.exact for log in self.logs) else 1.0
+        )
         rate = min(1.0, float(np.exp(min(0.0, log_p + np.log(self.tried)))))
-        if helping > self.settings.held_out_p_value or self._beyond_the_band(effect, theta):
+        if helping > self.settings.held_out_p_value or beyond_the_band(effect, theta, self.logs, self.settings):
             rate = 1.0
         std = (whole.stds() if scattered is None else scattered.std)[effect.key]
         std = np.array([self.onset_std.get((effect.key, j), float(s)) for j, s in enumerate(std)])
@@ -367,12 +298,3 @@ class _Search:
         denoised = any(log.pair.denoised for log in self.logs)
         hidden = below_model_error({one.physics.key: one.gain for one in verdicts}, denoised, self.settings)
         return [replace(one, false_discovery_rate=1.0) if one.physics.key in hidden else one for one in verdicts]
-
-
-def _with_onsets_of(fitted: Chosen, whole: Chosen) -> Chosen:
-    """Effects with the onsets that all rows show: fitted rows do not show one between them."""
-    out = []
-    for (effect, theta), (_, seen) in zip(fitted, whole, strict=True):
-        begins = np.array([parameter.begins for parameter in effect.parameters])
-        out.append((effect, np.where(begins, seen, theta)))
-    return tuple(out)

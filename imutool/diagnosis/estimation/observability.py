@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float64
 
-from imutool.diagnosis.estimation.jacobians import expected
+from imutool.diagnosis.estimation.jacobians import Chosen, expected
 from imutool.diagnosis.estimation.whitening import WhitenedLog
 from imutool.diagnosis.settings import SearchSettings
 from imutool.sensor.effect import Effect, Theta
@@ -97,6 +97,15 @@ def values_of(effect: Effect, reduced: Effect, theta: Theta) -> Theta:
     return np.array([value for parameter, value in zip(effect.parameters, theta, strict=True) if parameter.name in names])
 
 
+def plausible_part(chosen: Chosen, factor: float) -> Chosen | None:
+    """The effects without implausible parameters; none if all are plausible."""
+    reduced = [without_implausible(effect, theta, factor) for effect, theta in chosen]
+    if all(new is effect for new, (effect, _) in zip(reduced, chosen, strict=True)):
+        return None
+    left = [(new, values_of(effect, new, theta)) for new, (effect, theta) in zip(reduced, chosen, strict=True)]
+    return tuple(pair for pair in left if len(pair[1]))
+
+
 def unidentified(effect: Effect, std: Theta, log_prior: float, *, curve: bool) -> Iterator[str]:
     """`effect.parameter` of what is no surer than its prior, and of what is fixed; a curve's coefficients are not named."""
     for parameter, s in zip(effect.parameters, std, strict=True):
@@ -127,3 +136,11 @@ def below_model_error(gains: Mapping[str, float], denoised: bool, settings: Sear
         if key in FOLLOWING
         and any(gain < max(allowed, simplified.get(other, 0.0)) * more for other, more in gains.items() if other != key)
     )
+
+
+def beyond_the_band(effect: Effect, theta: Theta, logs: Sequence[WhitenedLog], settings: SearchSettings) -> bool:
+    """Whether a frequency is one at which smoothed poses, which lose and lag by themselves, look alike, or too slow."""
+    factor = settings.beyond_band_low_pass if effect.name == "low_pass" else settings.beyond_band
+    reach = [factor * log.pair.band_hz for log in logs if log.pair.band_hz is not None]
+    hertz = [value for parameter, value in zip(effect.parameters, theta, strict=True) if parameter.unit == "Hz"]
+    return bool(reach and hertz and (max(hertz) > min(reach) or min(hertz) < settings.slowest_hz))

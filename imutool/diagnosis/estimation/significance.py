@@ -209,3 +209,12 @@ def estimate_onsets(
             spread[effect.key, j] = float(np.sqrt(likely @ (t_s - mean) ** 2 + step_s**2 / 12.0))
             found = fit(logs, with_value(found.chosen, k, j, mean), part=part, iterations=0)
     return found, spread
+
+
+def with_onsets_of(fitted: Chosen, whole: Chosen) -> Chosen:
+    """Effects with the onsets that all rows show: fitted rows do not show one between them."""
+    out = []
+    for (effect, theta), (_, seen) in zip(fitted, whole, strict=True):
+        begins = np.array([parameter.begins for parameter in effect.parameters])
+        out.append((effect, np.where(begins, seen, theta)))
+    return tuple(out)

@@ -12,7 +12,7 @@ from scipy.signal import correlate, correlation_lags, welch
 from imutool.diagnosis.estimation.aligned_log import GAP_PERIODS, MARGIN_S, split
 from imutool.diagnosis.estimation.alignment import FARTHEST_S, wiener_filter
 from imutool.diagnosis.estimation.whitening import SEGMENT
-from imutool.diagnosis.scalar.effects import AlignedSignal, Column, IdealSignal
+from imutool.diagnosis.scalar.signal import AlignedSignal, Column, IdealSignal
 from imutool.errors import DataError
 from imutool.mcap_io.fields import Fields
 from imutool.recording import seconds

@@ -20,7 +20,8 @@ from imutool.diagnosis.localization import CLEAR, WINDOW_S, intervals, regime
 from imutool.diagnosis.result import Curve, Estimate, Finding, HeldOut, Located, SignalTraces, Unexplained
 from imutool.diagnosis.scalar import effects
 from imutool.diagnosis.scalar.alignment import TOP, aligned
-from imutool.diagnosis.scalar.effects import AlignedSignal, Column, Samples, SignalCurve
+from imutool.diagnosis.scalar.effects import SignalCurve
+from imutool.diagnosis.scalar.signal import AlignedSignal, Column, Samples
 from imutool.diagnosis.settings import SearchSettings
 from imutool.mcap_io.fields import Fields
 

@@ -7,22 +7,18 @@ lag are those of control textbooks (e.g. Slotine and Li, Applied Nonlinear Contr
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
-from functools import cached_property
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float64
-from scipy.ndimage import map_coordinates, spline_filter
 from scipy.signal import lfilter
 
-from imutool.diagnosis.estimation.aligned_log import AlignedLog, Blocks
 from imutool.diagnosis.estimation.unnamed_effects import LAGS_S, SplineCurve
-from imutool.sensor.effect import Effect, Kind, Parameter, SignalState, Stage, Theta
+from imutool.diagnosis.scalar.signal import AlignedSignal, IdealSignal, Samples, SignalSamples
+from imutool.sensor.effect import Effect, Kind, Parameter, Stage, Theta
 
-Column = Float64[np.ndarray, "_"]
-Samples = Float64[np.ndarray, " n"]
 CUTOFFS = (100.0, 30.0, 10.0, 3.0, 1.0, 0.3)  # to start from, over the signal's own mean frequency
 WIDTHS = (0.05, 0.15, 0.4, 0.8)  # of a dead band, over the signal's standard deviation
 REACHED = (0.001, 0.02, 0.1)  # of the samples beyond a limit to start from
@@ -32,79 +28,6 @@ LOG_MOVED = 0.02  # of the logarithm of a positive parameter, likewise
 KNOTS, KNOTS_OF_TIME = 7, 15
 BEND = 0.3  # of the signal's size: a second difference between a curve's knots
 COPY = 0.98  # correlation above which another channel is a copy of the signal
-
-
-@dataclass(frozen=True, eq=False)
-class SignalSamples:
-    """A signal on its way through the effects: its value now, and the ideal one with its derivative (per second) as sampled."""
-
-    stamp_s: Samples
-    y: Samples
-    x: Samples
-    dx: Samples
-    channels: Mapping[str, tuple[Column, Column]]
-
-    def but(self, y: Samples) -> SignalSamples:
-        """The samples with another value."""
-        return replace(self, y=np.asarray(y))
-
-
-@dataclass(frozen=True, eq=False)
-class IdealSignal:
-    """A simulated signal without noise on a fine even clock, and other channels by name with their times (s)."""
-
-    start_s: float
-    rate_hz: float
-    fine: Column
-    channels: Mapping[str, tuple[Column, Column]]
-
-    @cached_property
-    def _coefficients(self) -> tuple[Column, ...]:
-        return tuple(spline_filter(column) for column in (self.fine, np.gradient(self.fine) * self.rate_hz))
-
-    def sample(self, taken_s: Samples, stamp_s: Samples) -> SignalSamples:
-        """The signal sampled at some times (cubic splines)."""
-        at = ((taken_s - self.start_s) * self.rate_hz)[None]
-        x, dx = (map_coordinates(c, at, order=3, mode="nearest", prefilter=False) for c in self._coefficients)
-        return SignalSamples(stamp_s, x, x, dx, self.channels)
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class AlignedSignal(AlignedLog):
-    """One recorded column with the ideal signal.
-
-    `lag_s` is how much later the recording follows at first sight, `sim_density` the density of the simulation's own noise.
-    """
-
-    ideal: IdealSignal
-    unit: str
-    lag_s: float
-    sim_density: float
-    shares_epoch: bool
-
-    exact, denoised = True, False
-
-    @property
-    def bias_std(self) -> Float64[np.ndarray, " k"]:
-        """The offset is an effect, which acts before saturation."""
-        return np.full(1, 1e-9)
-
-    def state(self) -> SignalState:
-        """The ideal signal, to be sampled at the stamps."""
-        return SignalState(self.ideal, self.stamp_s, self.stamp_s)
-
-    def blocks(self, samples: SignalSamples) -> Blocks:
-        """The one column."""
-        return ((0, samples.y[:, None]),)
-
-    def recorded(self) -> tuple[IdealSignal, Samples]:
-        """The ideal signal and the recorded column."""
-        return self.ideal, self.real[:, 0]
-
-    @cached_property
-    def sampled(self) -> SignalSamples:
-        """The ideal signal at the stamps."""
-        return self.ideal.sample(self.stamp_s, self.stamp_s)
 
 
 def _effect(
