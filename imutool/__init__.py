@@ -47,7 +47,7 @@ _HOMES = {  # public names by the module that defines them; a name is imported w
     "imutool.api.views": ("LiveView", "load_run", "notebook_page", "notebook_viewer", "view", "watch"),
     "imutool.bias.model": ("BiasModel",),
     "imutool.bias_start.initial_bias": ("InitialBias",),
-    "imutool.debiasing": ("OnlineDebiaser",),
+    "imutool.bias_start.correction": ("OnlineDebiaser",),
     "imutool.errors": ("ConfigError", "DataError", "ImutoolError", "LogError", "ModelError", "NumericsError"),
     "imutool.mcap_io.log": ("Log",),
     "imutool.recording": ("Frames", "Imu", "Poses", "Recording", "Scalars"),

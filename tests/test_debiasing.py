@@ -32,7 +32,7 @@ from imutool.bias_start.initial_bias import (
     tracked_from_prior,
 )
 from imutool.bias_start.model_choice import estimate_at_rest
-from imutool.cleaning import Rules
+from imutool.cleaning import CleaningSettings
 from imutool.cli.debias import assigned
 from imutool.conversion import convert
 from imutool.debiasing import debias
@@ -720,7 +720,7 @@ class Opens:
         monkeypatch.setattr(LogIndex, "_read_summary", read_summary)
 
 
-@pytest.mark.parametrize("options", [{}, {"smooth": True}, {"init": "truth"}, {"clean": Rules()}], ids=str)
+@pytest.mark.parametrize("options", [{}, {"smooth": True}, {"init": "truth"}, {"clean": CleaningSettings()}], ids=str)
 def test_a_log_is_opened_once_and_once_more_for_its_checksum(
     logs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, options: dict[str, Any]
 ) -> None:

@@ -23,16 +23,7 @@ from imutool.recording import Imu, Poses, Recording, Scalars, seconds
 from imutool.viewing.model.decimate import MAX_CURVE_ROWS
 from imutool.viewing.model.events import Event, events_within, finding_events, stop_events, survey_events, worst_error_events
 from imutool.viewing.model.read_log import read_log
-from imutool.viewing.model.run_data import (
-    LEVELLING_S,
-    TRUE_BIAS,
-    TRUTH,
-    Run,
-    RunData,
-    Trace,
-    level_start,
-    spectra,
-)
+from imutool.viewing.model.run_data import LEVELLING_S, TRUE_BIAS, TRUTH, Run, RunData, Trace, level_start, spectra
 from imutool.viewing.model.trajectory_error import Alignment, aligned, drift_since_reset, errors, windows
 
 
@@ -186,11 +177,7 @@ def _score(run: Run, known: TruthSpan, align: Alignment) -> tuple[Trace, str]:
     rows, true, valid = known
     path = dead_reckon(run.imu.rows(rows), StartPose.of(true))
     moved, motion = aligned(path, true, valid, align)
-    of_truth = (
-        drift_since_reset(path, true, valid),
-        windows(path, true, valid),
-        MappingProxyType(evaluate(path, true, valid)),
-    )
+    of_truth = (drift_since_reset(path, true, valid), windows(path, true, valid), MappingProxyType(evaluate(path, true, valid)))
     trace = Trace(run, moved, errors(moved, true, valid), *of_truth, spectra=spectra(run.imu))
     if align == "none":
         return trace, ""

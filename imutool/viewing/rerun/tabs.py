@@ -242,11 +242,7 @@ def _cameras(data: RunData, scope: Scope) -> View | None:
 
 
 def _three(
-    data: RunData,
-    contents: list[str],
-    title: str,
-    height: tuple[float, float] | None = None,
-    names: tuple[str, ...] = AXES,
+    data: RunData, contents: list[str], title: str, height: tuple[float, float] | None = None, names: tuple[str, ...] = AXES
 ) -> rrb.TimeSeriesView:
     """Plot of curves about or along x, y and z, with their colours in the title instead of a legend of six lines."""
     key = ", ".join(f"{name} {color}" for name, color in zip(names, ("red", "green", "blue"), strict=True))
