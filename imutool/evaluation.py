@@ -43,7 +43,7 @@ def evaluate(
     trajectories: Path | None = None,
     overwrite: bool = False,
 ) -> list[dict[str, Any]]:
-    """One result for the raw samples and one for each model (contracts.md, evaluate).
+    """One result for the raw samples and one for each model.
 
     Every trajectory starts at the true pose and velocity at the first sample the truth covers, and is integrated by
     `strapdown.dead_reckon`; only samples outside gaps of the truth are scored. With `smooth` each bias comes from the whole

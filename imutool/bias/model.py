@@ -7,6 +7,7 @@ the same error at every sample, which is what lets `imutool.bias_start.initial_b
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -19,6 +20,7 @@ from jaxtyping import Float, Float64
 from torch import Tensor, nn
 
 from imutool.config import Settings
+from imutool.inertial.windows import end_attitude
 from imutool.units import SENSORS, Sensor
 
 COLUMNS = {"gyro": slice(0, 3), "accel": slice(3, 6)}  # of every vector of six
@@ -108,6 +110,7 @@ class BiasModel(nn.Module, ABC):
     objective: ClassVar[Literal["window_ends", "increments"]] = "window_ends"  # what the descent minimises (imutool.training)
     prefers: ClassVar[Mapping[str, Any]] = MappingProxyType({})  # TrainSettings that differ from the general defaults
     undecayed: ClassVar[tuple[str, ...]] = ()  # beginnings of the names of parameters that weight decay leaves alone
+    longest_window_s: float = math.inf  # of the training: a longer one is cut to it
     context: int = 0  # samples from before a segment that the answer over it depends on; such a bias is rest + f(samples)
     prior_mean: Tensor
     prior_std: Tensor
@@ -140,6 +143,12 @@ class BiasModel(nn.Module, ABC):
     def forward(self, segment: Segment) -> Float[Tensor, "batch n 6"]:
         """The bias at each sample: gyro (rad/s), then accel (m/s²)."""
         return torch.cat([self.sensor_bias(sensor, segment) for sensor in SENSORS], dim=-1)
+
+    def end_attitude(
+        self, R_start: Float[Tensor, "batch 3 3"], segment: Segment, dt: Float[Tensor, "batch steps"]
+    ) -> Float[Tensor, "batch 3 3"]:
+        """Attitude (body to world) at the last sample, by integrating the debiased rate from `R_start`. Differentiable."""
+        return end_attitude(R_start, segment.gyro - self.sensor_bias("gyro", segment), dt)
 
     def rest_dynamics(self) -> Float64[np.ndarray, "6 6"]:
         """d(drift of the rest bias) / d(rest bias), a second: how an error of the start grows or dies. Zero for most."""

@@ -246,11 +246,6 @@ def _gelu(x: Array) -> Array:
     return y
 
 
-def _with_constant(layer: nn.Linear) -> Array:
-    """A layer's matrix for rows from the left, and its constant as one more row."""
-    return np.concatenate([_array(layer.weight).T, _array(layer.bias)[None]])
-
-
 def _array(tensor: Tensor) -> Array:
     out: Array = tensor.detach().to("cpu", torch.float64).numpy()
     return out

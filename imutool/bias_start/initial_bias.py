@@ -277,7 +277,7 @@ def _no_rest() -> DataError:
 def over_all_rest(model: BiasModel, blocks: Blocks) -> InitialBias:
     """From all the time at rest in a log, also what comes after the motion: a constant has no before and after.
 
-    For a model that takes nothing off but a constant: of the samples there is only what `stationary.in_blocks` keeps.
+    For a model that takes nothing off but a constant: of the samples there is only what `stationary.block_statistics` keeps.
 
     Raises:
         DataError: the log never rests.

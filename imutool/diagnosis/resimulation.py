@@ -17,8 +17,8 @@ from jaxtyping import Float64
 from imutool.diagnosis.estimation.aligned_log import Pair
 from imutool.diagnosis.estimation.jacobians import expected
 from imutool.diagnosis.estimation.whitening import WhitenedImu
+from imutool.diagnosis.held_out import gains, noise_floor, with_constant
 from imutool.diagnosis.result import Closer
-from imutool.diagnosis.summarize import closer, floor, with_constant
 from imutool.errors import DataError
 from imutool.recording import Recording
 from imutool.sensor.effect import Acting, simulate_stretches
@@ -31,7 +31,7 @@ AS_GOOD = 0.3  # of the noise: how far a simulation along the poses may be from 
 MOST_OF_IT = 0.8  # of the held-out samples that the poses have to cover
 
 
-def simulated_again(logs: Sequence[WhitenedImu], sim: Recording, physics: PhysicsFile) -> Mapping[str, Closer]:
+def resimulate(logs: Sequence[WhitenedImu], sim: Recording, physics: PhysicsFile) -> Mapping[str, Closer]:
     """By signal, the misfit of the simulation as it was given and as it is with some physics, on held-out time.
 
     Raises:
@@ -56,9 +56,7 @@ def simulated_again(logs: Sequence[WhitenedImu], sim: Recording, physics: Physic
         before.append(with_constant(pair, expected(pair, ())))
         after.append(with_constant(pair, found))
         _refuse_unlike(there[-1], before[-1], with_constant(pair, plain), sim)
-    return {
-        signal: msgspec.structs.replace(one, by="second simulation") for signal, one in closer(there, before, after).items()
-    }
+    return {signal: msgspec.structs.replace(one, by="second simulation") for signal, one in gains(there, before, after).items()}
 
 
 def _felt(felt: IdealMotion, start_ns: int, pair: Pair) -> IdealMotion:
@@ -88,5 +86,5 @@ def _refuse_unlike(
     """
     rows = log.pair.held_out
     off = np.sqrt(((given - plain)[rows] ** 2).mean(axis=0))
-    if (off > AS_GOOD * floor([log])).any():
+    if (off > AS_GOOD * noise_floor([log])).any():
         raise DataError("a simulation along its poses is not the simulation that was given", where=sim.name)

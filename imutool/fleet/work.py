@@ -223,13 +223,14 @@ def _lost(losses: Mapping[str, Any] | None) -> dict[str, Any]:
 
 
 def _diagnose(job: _Job) -> dict[str, Any]:
-    from imutool.diagnosis.diagnose import diagnose, measured
+    from imutool.diagnosis.diagnose import diagnose
+    from imutool.diagnosis.effect_sizes import effect_sizes
     from imutool.fleet.robots import robot_of
 
     s = job.settings
     robot = robot_of(job.name, s.robot_from, job.source)
     sim = None if s.sim is None else _simulation(to_location(s.sim), job.name)
-    fixed = measured(job.source, sim, imu=s.imu, truth=s.truth)
+    fixed = effect_sizes(job.source, sim, imu=s.imu, truth=s.truth)
     parameters = tuple(
         Parameter(physics.name, number.name, float(value), float(std), number.unit)
         for physics, theta in fixed.chosen

@@ -163,17 +163,6 @@ def fit_trajectory(poses: Poses, knot_spacing_s: float | None = None, degree: in
     return Trajectory(int(poses.t_ns[0]), position, quaternion)
 
 
-def rates_from_poses(poses: Poses) -> Vectors:
-    """Mean angular rate (rad/s, body frame) over each interval between consecutive poses: Log(R_k^T R_{k+1}) / dt.
-
-    One row less than there are poses. A turn of more than pi between two poses is read as its shorter complement.
-    """
-    rotations = Rotation.from_quat(poses.q_wb_wxyz, scalar_first=True)
-    dt = np.diff(poses.t_ns).astype(np.float64) * 1e-9
-    turned: Vectors = (rotations[:-1].inv() * rotations[1:]).as_rotvec() / dt[:, None]
-    return turned
-
-
 def _conjugate_product(a: Float64[np.ndarray, "n 4"], b: Float64[np.ndarray, "n 4"]) -> Vectors:
     """Im(a* b) of wxyz quaternions."""
     a_w, a_v, b_w, b_v = a[:, :1], a[:, 1:], b[:, :1], b[:, 1:]

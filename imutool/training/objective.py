@@ -21,7 +21,7 @@ from torch import Tensor, nn
 from imutool.bias.model import COLUMNS, BiasModel
 from imutool.geometry import so3
 from imutool.inertial.strapdown import GRAVITY_W
-from imutool.inertial.windows import HUBER_MEDIANS, attitudes, end_attitude, huber, step_means
+from imutool.inertial.windows import HUBER_MEDIANS, attitudes, huber, step_means
 from imutool.training.closed_form import median_per_log
 from imutool.training.segments import Pool, Windows
 from imutool.training.settings import TrainSettings
@@ -81,8 +81,7 @@ class RestBiases(nn.Module):
 
 def orientation_error(model: BiasModel, windows: Windows) -> Float[Tensor, " batch"]:
     """|Log(R_hat^T R)| at the end of each window, in rad (paper, eq. 16, at the last sample)."""
-    gyro = windows.segment.gyro - model.sensor_bias("gyro", windows.segment)
-    R_hat = end_attitude(windows.R_start, gyro, windows.dt)
+    R_hat = model.end_attitude(windows.R_start, windows.segment, windows.dt)
     return length(so3.log(R_hat.mT @ windows.R_end))
 
 
@@ -167,7 +166,7 @@ class WindowEndObjective(Objective):
 
     def _choose(self) -> None:
         named = self.settings.gyro_window_s if self.sensor == "gyro" else self.settings.accel_window_s
-        lengths = map(self.pool.samples, named)
+        lengths = dict.fromkeys(self.pool.samples(min(window_s, self.model.longest_window_s)) for window_s in named)
         self.pools = [(n, first) for n in lengths if len(first := self.pool.starts(n, "train"))]
 
     def errors(self, first: Int[Tensor, " m"], n: int) -> Float[Tensor, " m"]:

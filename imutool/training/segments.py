@@ -24,7 +24,7 @@ from imutool.inertial.strapdown import with_velocity
 from imutool.recording import Recording, seconds
 from imutool.units import SENSORS, Sensor
 
-HELD_OUT = 0.2  # the last fifth of every training log validates (method.md, Arrangement)
+HELD_OUT = 0.2  # the last fifth of every training log validates, as in the paper
 MAX_RATE_SPREAD = 0.05
 
 Part = Literal["train", "held_out", "all"]

@@ -17,12 +17,17 @@ independent windows, are a little narrow.
 from __future__ import annotations
 
 import argparse
+import sys
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 import torch
 from jaxtyping import Float64
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "support"))
+
+from nees import consistency
 
 from imutool.bias.io import load
 from imutool.bias.model import BiasModel
@@ -31,7 +36,6 @@ from imutool.bias_start.bias_from_truth import bias_from_truth
 from imutool.bias_start.initial_bias import TRUTH_S, find
 from imutool.bias_start.model_choice import smooth_in_memory
 from imutool.geometry import so3
-from imutool.inertial import metrics
 from imutool.inertial.strapdown import with_velocity
 from imutool.inertial.windows import running_product, step_means
 from imutool.mcap_io.read import read
@@ -141,9 +145,9 @@ def measured_variance(model: BiasModel, seen: Seen) -> Float64[np.ndarray, "3"]:
 
 
 def told(logs: list[tuple[np.ndarray, np.ndarray]]) -> str:
-    """The figures of `metrics.consistency` in a line."""
+    """The figures of `support.nees` in a line."""
     e, P = (np.concatenate(parts) for parts in zip(*logs, strict=True))
-    found = metrics.consistency(e, P)
+    found = consistency(e, P)
     bounds = f"95 % bounds {found['nees_lower']:.2f} to {found['nees_upper']:.2f}"
     return f"NEES {found['nees_mean']:6.2f}  {bounds}  windows {found['samples']:3.0f}  consistent: {found['consistent']}"
 

@@ -74,7 +74,7 @@ def score(model: BiasModel, recording: Recording, own: Vector6) -> tuple[list[fl
     auto = initial_bias.auto(model, imu)
     auto.stream(model)(*samples(imu))
     halfway = time.perf_counter()
-    smooth = initial_bias.smooth(model, [samples(imu)])
+    smooth = initial_bias.smoothed_start(model, [samples(imu)])
     ended = time.perf_counter()
     starts = {
         "truth": initial_bias.from_truth(model, recording),

@@ -7,6 +7,7 @@ import time
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from support.nees import consistency
 
 from imutool.bias import static
 from imutool.bias.model import BiasModel
@@ -21,7 +22,6 @@ from imutool.bias_start.bias_tracking import (
     smooth_bias,
     smooth_blocks,
 )
-from imutool.inertial.metrics import consistency
 from imutool.recording import Imu, seconds
 from imutool.sensor.flight import FlightSettings, TriadSettings, flight
 

@@ -101,7 +101,7 @@ def test_it_is_the_kalman_update_of_the_prior() -> None:
     imu, _ = resting()
     made = model(mean=0.01, prior_std=0.02)
     start = at_rest(made, imu)
-    (stretch, *_) = initial_bias.stretches(imu)
+    (stretch, *_) = initial_bias.rest_stretches(imu)
     still = imu.rows(slice(*stretch))
     x = np.full(6, 0.01)
     P = np.eye(6) * 0.02**2

@@ -262,7 +262,7 @@ def test_several_recordings_share_the_physics_and_have_a_bias_each(made: Made, a
 
 def test_neither_truth_nor_simulation_is_refused_with_what_would_help(made: Made) -> None:
     real, _ = made()
-    with pytest.raises(DataError, match=r"no simulation and no true poses.*--sim"):
+    with pytest.raises(DataError, match=r"no simulation and no true poses.*`sim`"):
         diagnose([real])
 
 

@@ -10,9 +10,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.interpolate import make_interp_spline
 from scipy.spatial.transform import Rotation
+from support.rates import rates_from_poses
 
 from imutool.errors import DataError, NumericsError
-from imutool.inertial.kinematics import G_W, Trajectory, fit_trajectory, rates_from_poses
+from imutool.inertial.kinematics import G_W, Trajectory, fit_trajectory
 from imutool.recording import Poses
 
 START_NS = 1_700_000_000_000_000_123

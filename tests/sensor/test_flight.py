@@ -8,10 +8,10 @@ import msgspec
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from support.rates import rates_from_poses
 
 from imutool import config
 from imutool.errors import ConfigError
-from imutool.inertial.kinematics import rates_from_poses
 from imutool.inertial.strapdown import StartPose, dead_reckon
 from imutool.recording import Recording, seconds
 from imutool.sensor.flight import ACCEL_BIAS, GYRO_BIAS, FlightSettings, TriadSettings, flight, trajectory

@@ -89,9 +89,8 @@ def select_effects(
     settings = settings or SearchSettings()
     penalty = settings.unnamed_penalty
     start = fit(logs, always)
-    known = Candidates(logs, (*candidates, *unnamed))
-    silent = progress or (lambda text: None)
-    first = _Search(logs, tuple(candidates), unnamed, always, start.objective, settings, silent, known)
+    known, said = Candidates(logs, (*candidates, *unnamed)), progress or (lambda text: None)
+    first = _Search(logs, tuple(candidates), unnamed, always, start.objective, settings, said, known)
     best_named, best_unnamed = (max((s.aic_gain for s in known.ranked(start, c)), default=0.0) for c in (candidates, unnamed))
     unnamed_first = best_unnamed > best_named + settings.clearly_better
     search, now = _grown(first, start, unnamed, []) if unnamed_first else _grown(first, start, (), list(later))
@@ -119,10 +118,6 @@ def _grown(first: _Search, now: Fit, unnamed: tuple[Effect, ...], waiting: list[
         else:
             break
     return search, now
-
-
-def _exact(logs: Sequence[WhitenedLog]) -> bool:
-    return all(log.pair.exact for log in logs)
 
 
 @dataclass(eq=False)
@@ -241,8 +236,7 @@ class _Search:
             self.progress(f"on unseen time: {', '.join(now.keys[first:])}")
             other = fit(self.logs, now.chosen, part="held_out", near=now)
             whole = fit(self.logs, now.chosen, part="all", near=now)
-            reduced = plausible_part(whole.chosen, self.settings.implausible_factor)
-            if reduced is not None:
+            if (reduced := plausible_part(whole.chosen, self.settings.implausible_factor)) is not None:
                 now = fit(self.logs, reduced)
                 continue
             whole, self.onset_std = estimate_onsets(self.logs, whole, "all", max(1.0, whole.reduced_chi_square))
@@ -259,7 +253,7 @@ class _Search:
 
     def _scattered(self, found: Fit) -> Scatter | None:
         """Robust covariance; none where the noise is known and the residuals are as white."""
-        if _exact(self.logs) and found.objective < self.settings.white_chi_square * found.numbers:
+        if all(log.pair.exact for log in self.logs) and found.objective < self.settings.white_chi_square * found.numbers:
             return None
         return scatter(self.logs, found, found.part, self.settings.robust_block_s)
 
@@ -288,7 +282,9 @@ class _Search:
             log_p = max(log_p, scattered.log_p_value(effect.key, gain, len(theta)) + self.candidates.log_choices[effect.key])
         parts, block_s = ((fitted, "held_out"), (other, "fitted")), self.settings.held_out_block_s
         blocks = np.concatenate([held_out_gains(log, of, k, part, block_s) for of, part in parts for log in self.logs])
-        helping = min(held_out_p_value(blocks[:, 0]), prediction_p_value(blocks) if _exact(self.logs) else 1.0)
+        helping = min(
+            held_out_p_value(blocks[:, 0]), prediction_p_value(blocks) if all(log.pair.exact for log in self.logs) else 1.0
+        )
         rate = min(1.0, float(np.exp(min(0.0, log_p + np.log(self.tried)))))
         if helping > self.settings.held_out_p_value or beyond_the_band(effect, theta, self.logs, self.settings):
             rate = 1.0
