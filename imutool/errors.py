@@ -1,4 +1,4 @@
-"""Everything that can go wrong for a reason the user can act on, sorted by what the user can do about it.
+"""Errors that the user can act on, sorted by what to do; each has an exit code.
 
 ::
 
@@ -11,6 +11,10 @@
 
 Wrong usage exits with 2, an interrupt with 130; anything else is a bug and shows its traceback with 1.
 `imutool.cli.main` is the one place that catches.
+
+The library names its parameters as Python does: plain in `where` (``where="init"``, ``where="imu, noise"``), in backquotes in
+a sentence (``fix="Give `model`"``, ``expected="`init=prior`"``). The command line shows its flags in their place: ``--init``,
+``--model``, ``--init prior`` (`imutool.cli.parameters`). No other module knows flags.
 """
 
 from __future__ import annotations
@@ -19,11 +23,11 @@ from typing import ClassVar
 
 
 class ImutoolError(Exception):
-    """A failure with an address: where it happened, what was found, what was expected, what to do.
+    """Error with four parts: where it happened, what was found, what was expected, what to do.
 
     Args:
         what: what happened, with the offending value in it.
-        where: what names the place: a file or URL, optionally with a line (``data.csv:17``), the topic, or the setting.
+        where: the file or URL, optionally with a line (``data.csv:17``), the topic, the setting, or the parameter.
         expected: what would have been right, as the end of "expected ...".
         fix: what the user can do, as a sentence without its full stop.
     """
@@ -42,11 +46,11 @@ class ImutoolError(Exception):
         return f"{place}{self.what}{expected}.{fix}"
 
     def at(self, where: object) -> ImutoolError:
-        """The same error with its address filled in, for a caller that knows the file when the raiser did not."""
+        """Return the error with its place filled in, for a caller that knows the file when the raiser did not."""
         return self if self.where is not None else type(self)(self.what, where=where, expected=self.expected, fix=self.fix)
 
     def __reduce__(self) -> tuple[object, ...]:
-        """Errors cross process borders when many sequences convert at once; keyword arguments need saying how."""
+        """Pickle with keyword arguments: errors cross process borders when many sequences convert at once."""
         return _rebuild, (type(self), self.what, self.where, self.expected, self.fix)
 
 
@@ -55,7 +59,7 @@ def _rebuild(kind: type[ImutoolError], what: str, where: str | None, expected: s
 
 
 class ConfigError(ImutoolError):
-    """The command line or a settings file asks for something that cannot be done."""
+    """A parameter or a settings file asks for something impossible."""
 
     exit_code = 3
 
@@ -67,7 +71,7 @@ class DataError(ImutoolError):
 
 
 class LogError(ImutoolError):
-    """An MCAP log cannot be read, or lacks what was asked of it."""
+    """An MCAP log cannot be read, or lacks the requested data."""
 
     exit_code = 5
 
@@ -79,6 +83,6 @@ class ModelError(ImutoolError):
 
 
 class NumericsError(ImutoolError):
-    """A computation left the range in which its answer means something."""
+    """A computation left the range in which its result is valid."""
 
     exit_code = 7

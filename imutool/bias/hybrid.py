@@ -23,8 +23,8 @@ from imutool.bias import neural_ode
 from imutool.bias.model import COLUMNS, BiasModel, CovarianceModel, OneByOne, Segment, Stream, Vector6
 from imutool.config import Settings
 from imutool.errors import ConfigError
-from imutool.sensor.catalogue import named as effects_named
-from imutool.sensor.linear_effect import LinearEffect, Together, compiled, patterns
+from imutool.sensor import catalogue
+from imutool.sensor.linear_form import CompiledEffects, LinearForm, compiled, patterns
 from imutool.sensor.signals import POWER_S, SignalFilter, Signals
 from imutool.units import SENSORS, Sensor
 
@@ -56,7 +56,7 @@ class Model(BiasModel):
         chosen = config or Config()
         assert isinstance(chosen, Config)
         super().__init__(chosen, rate_hz)
-        self.effects: dict[Sensor, tuple[LinearEffect, ...]] = {"gyro": (), "accel": ()}
+        self.effects: dict[Sensor, tuple[LinearForm, ...]] = {"gyro": (), "accel": ()}
         for sensor in SENSORS:
             self._hold(sensor, self.named(sensor) or ())
         self.ode = neural_ode.Model(chosen.ode, rate_hz) if chosen.remainder else None
@@ -143,7 +143,7 @@ class Model(BiasModel):
         return torch.stack(rows).to(segment.t)
 
     def _hold(self, sensor: Sensor, names: tuple[str, ...]) -> None:
-        self.effects[sensor] = effects_named(sensor, names)
+        self.effects[sensor] = catalogue.trained(sensor, names)
         size = sum(len(effect.parameters) for effect in self.effects[sensor])
         like = self.prior_mean
         self.register_buffer(f"theta_{sensor}", like.new_zeros(size))
@@ -151,7 +151,7 @@ class Model(BiasModel):
         looks_back = any(self.effects.values())
         self.context = math.ceil(FORGOTTEN * POWER_S * self.rate_hz) if looks_back else 0
 
-    def _compiled(self, sensor: Sensor) -> Together:
+    def _compiled(self, sensor: Sensor) -> CompiledEffects:
         theta: Tensor = getattr(self, f"theta_{sensor}")
         return compiled(self.effects[sensor], theta.detach().cpu().double().numpy())
 
@@ -159,7 +159,9 @@ class Model(BiasModel):
 class _Stream:
     """Effects, then the neural ODE on what they leave; remembers what the filters do."""
 
-    def __init__(self, rate_hz: float, gyro: Together, accel: Together, ode: OneByOne | None, rest: Vector6) -> None:
+    def __init__(
+        self, rate_hz: float, gyro: CompiledEffects, accel: CompiledEffects, ode: OneByOne | None, rest: Vector6
+    ) -> None:
         self._signals = SignalFilter(rate_hz, max(gyro.wanted, accel.wanted))
         self._matrix = np.concatenate([gyro.matrix, accel.matrix], axis=1)
         self._gyro, self._accel, self._product_alone = gyro, accel, not (gyro.others or accel.others)

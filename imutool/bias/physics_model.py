@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import hashlib
 import logging
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import ClassVar
@@ -22,16 +22,15 @@ from jaxtyping import Float, Float64
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from imutool import registry
 from imutool.bias import hybrid
-from imutool.bias.model import COLUMNS, CovarianceModel, OneByOne, Segment, Stream, Vector6
+from imutool.bias.model import CovarianceModel, OneByOne, Segment, Stream, Vector6
 from imutool.errors import ModelError
 from imutool.sensor import catalogue, physics_file
-from imutool.sensor.effect import Effect, Theta
-from imutool.sensor.linear_effect import LinearEffect, LinearParameter, full, per_pair
+from imutool.sensor.effect import Effect, Parameter, Stage, Theta, each_pair
+from imutool.sensor.linear_form import LinearForm, linear_form
 from imutool.sensor.physics_file import Bias, Entry, PhysicsFile
-from imutool.sensor.readings import SensorSamples
-from imutool.sensor.signals import POWER_S, Signals
+from imutool.sensor.samples import SensorSamples
+from imutool.sensor.signals import POWER_S
 from imutool.units import AXES, SENSORS, Sensor
 
 # How far a bias lies from run to run: of the ADIS16448 in EuRoC's training sequences, 2 mrad/s and 0.02 m/s². Where the file
@@ -48,7 +47,7 @@ MATRIX = {  # by entry, what it is of each sensor's matrix
 DRIFTS = {"gyro_bias_drift", "accel_bias_drift"}
 
 logger = logging.getLogger(__name__)
-Part = tuple[LinearEffect, Theta, Theta]  # an effect, its parameters, their standard deviations
+Part = tuple[LinearForm, Theta, Theta]  # an effect, its parameters, their standard deviations
 
 
 class Model(hybrid.Model):
@@ -71,7 +70,7 @@ class Model(hybrid.Model):
             gyro_effects=tuple(effect.name for effect in self.effects["gyro"]),
             accel_effects=tuple(effect.name for effect in self.effects["accel"]),
         )
-        looks_back = any(not isinstance(effect.sees, slice) for of in self.effects.values() for effect in of)
+        looks_back = any(effect.columns is None for of in self.effects.values() for effect in of)
         self.context = int(np.ceil(hybrid.FORGOTTEN * POWER_S * rate_hz)) if looks_back else 0
         self._b = np.zeros(6) if bias is None else np.array([*bias.gyro, *bias.accel])
         self.prior_mean.copy_(torch.from_numpy(self._b))
@@ -130,12 +129,12 @@ def load(path: Path, rate_hz: float) -> Model:
     parts: dict[Sensor, list[Part]] = {"gyro": [], "accel": []}
     kept = [entry.name for entry in file.effect if not _taken(entry, parts)]
     without_name = acting[len(file.effect) : len(acting) - (file.bias is not None)]
-    for (physics, theta), words in zip(without_name, _words(file), strict=True):
+    for (effect, theta), words in zip(without_name, _words(file), strict=True):
         if _needs_more(words):
-            kept.append(f"{physics.equation}")
+            kept.append(effect.equation)
         else:
-            for sensor in physics.sensors:
-                parts[sensor].append(_as_effect(physics, theta, sensor))
+            for sensor in effect.sensors:
+                parts[sensor].append(_of_size_one(effect, theta, sensor))
     for sensor in SENSORS:
         part = _matrix(file, sensor)
         if part is not None:
@@ -162,47 +161,32 @@ def _taken(entry: Entry, parts: Mapping[Sensor, list[Part]]) -> bool:
         return True
     if entry.name == physics_file.DRIVEN:
         return False
-    module = registry.load(catalogue.GROUP, entry.name)
-    sensors: tuple[Sensor, ...] = getattr(module, "SENSORS", ())
-    if entry.name == "clock_offset" and abs(_value(entry, "tau")) > MOST_TAU_S:
+    (effect,) = catalogue.effects([entry.name])
+    if not effect.trained or (entry.name == "clock_offset" and abs(_value(entry, "tau")) > MOST_TAU_S):
         return False
-    for sensor in sensors:
-        effect: LinearEffect = module.effect(sensor)
-        if entry.name in DRIFTS:
-            effect = replace(effect, sees=_warming(_value(entry, "tau")))
-        names = [_named(entry, sensor, parameter) for parameter in effect.parameters]
+    if entry.name in DRIFTS:
+        fixed = (replace(parameter, fixed_in_training=_value(entry, "tau")) for parameter in effect.parameters[3:])
+        effect = replace(effect, parameters=(*effect.parameters[:3], *fixed))
+    for sensor in effect.sensors:
+        form = linear_form(effect, sensor)
+        names = [effect.parameters[k].name for k in form.free]
         theta, std = (np.array([of(entry, name) for name in names]) for of in (_value, _std))
-        parts[sensor].append((effect, theta, std))
-    return bool(sensors)
-
-
-def _named(entry: Entry, sensor: Sensor, parameter: LinearParameter) -> str:
-    """What the file calls an effect's parameter: by the sensor as well where the effect acts on both."""
-    both = f"{sensor}_{parameter.name}"
-    return both if both in entry.parameters else parameter.name
+        parts[sensor].append((form, theta, std))
+    return True
 
 
 def _value(entry: Entry, name: str) -> float:
     """What the file leaves out does nothing; a drift's time constant has to be there."""
-    return entry.parameters[name].value if name in entry.parameters else _nothing(entry, name)
+    return entry.parameters[name].value if name in entry.parameters else _null_value(entry, name)
 
 
 def _std(entry: Entry, name: str) -> float:
     return (entry.parameters[name].std or 0.0) if name in entry.parameters else 0.0
 
 
-def _nothing(entry: Entry, name: str) -> float:
-    (physics,) = catalogue.physics([entry.name])
-    return next((number.null_value for number in physics.parameters if number.name == name), 0.0)
-
-
-def _warming(tau_s: float) -> Callable[[Signals], Float64[np.ndarray, "n 1"]]:
-    """The drift's course with the time constant that was found instead of the usual one."""
-
-    def course(signals: Signals) -> Float64[np.ndarray, "n 1"]:
-        return np.asarray(-np.expm1(-signals.t_s[:, None] / tau_s))
-
-    return course
+def _null_value(entry: Entry, name: str) -> float:
+    (effect,) = catalogue.effects([entry.name])
+    return next((parameter.null_value for parameter in effect.parameters if parameter.name == name), 0.0)
 
 
 def _words(file: PhysicsFile) -> list[str]:
@@ -215,19 +199,15 @@ def _needs_more(words: str) -> bool:
     return words.startswith("/") or "t" in words.replace("|", " ").split()
 
 
-def _as_effect(physics: Effect, theta: Theta, sensor: Sensor) -> Part:
-    """What has no name, as an effect of size one that is made of what it adds to a reading."""
-    column = COLUMNS[sensor]
+def _of_size_one(effect: Effect, theta: Theta, sensor: Sensor) -> Part:
+    """An effect without a name as one of a single parameter, the size, that is one."""
 
-    def added(signals: Signals) -> Float64[np.ndarray, "n 3"]:
-        read = SensorSamples(signals.t_s, signals.gyro, signals.accel, signals.alpha)
-        out = physics.forward(read, theta)
-        both = np.concatenate([out.gyro - read.gyro, out.accel - read.accel], axis=1)
-        return np.asarray(both[:, column])
+    def forward(samples: SensorSamples, size: Theta) -> SensorSamples:
+        out = effect.forward(samples, theta)
+        return samples.but(samples.gyro + size * (out.gyro - samples.gyro), samples.accel + size * (out.accel - samples.accel))
 
-    size = (LinearParameter("size", "-", 1.0),)
-    effect = LinearEffect(physics.name, sensor, physics.equation, size, added, np.eye(3)[:, :, None])
-    return effect, np.ones(1), np.zeros(1)
+    sized = replace(effect, parameters=(Parameter("size", "-", 1.0),), forward=forward)
+    return linear_form(sized, sensor), np.ones(1), np.zeros(1)
 
 
 def _matrix(file: PhysicsFile, sensor: Sensor) -> Part | None:
@@ -252,6 +232,13 @@ def _matrix(file: PhysicsFile, sensor: Sensor) -> Part | None:
     return _full(sensor), (np.eye(3) - np.linalg.inv(T)).ravel(), np.sqrt(variance).ravel()
 
 
-def _full(sensor: Sensor) -> LinearEffect:
+def _full(sensor: Sensor) -> LinearForm:
     """A matrix on the sensor's own reading."""
-    return LinearEffect(f"{sensor}_matrix", sensor, f"{sensor} += A {sensor}", per_pair("-", 0.1), COLUMNS[sensor], full())
+
+    def forward(samples: SensorSamples, theta: Theta) -> SensorSamples:
+        A = theta.reshape(3, 3).T
+        return samples.but(samples.gyro + samples.gyro @ A, samples.accel + samples.accel @ A)
+
+    equation, parameters = f"{sensor} += A {sensor}", each_pair("-", 0.1)
+    effect = Effect(f"{sensor}_matrix", Stage.SENSOR, (sensor,), equation, parameters, "always", forward, trained=True)
+    return linear_form(effect, sensor)

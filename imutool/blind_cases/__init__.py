@@ -1,1 +1,1 @@
-"""How sealed cases are made: a handwriting of its own, which knows nothing of the effects that `diagnose` fits."""
+"""Blind cases of `conceal`: their generator, envelope and score; no code of the estimator."""

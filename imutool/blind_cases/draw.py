@@ -1,25 +1,26 @@
-"""What a case conceals: drawn, and sized so that an optimal estimator could see it and tell it from everything else.
+"""Random choice of what a blind case conceals, sized so that an optimal estimator could see it.
 
 Sizes: `large` is the plausible size of the catalogue, `middle` a quarter of it, `small` 3.5 times the smallest that an optimal
-test sees (`information.visible`), both against the noise and against the most similar other effect. What the motion cannot
-show that clearly at the asked size is not drawn for it. Effects of stamps and of rounding, which any look at the numbers
+test sees (`information.detectable_misfit`), against the noise and against the most similar other effect. An effect that the
+motion cannot show that clearly at the asked size is not drawn. Effects of stamps and of rounding, which any look at the numbers
 shows, have fixed small sizes: a sixteenth of a share or a jitter, an LSB of one standard deviation of the noise; so has the
 length of what a reference lost, a quarter of a second.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal, get_args
 
 import numpy as np
+from jaxtyping import Float64
 from numpy.random import Generator
 
 from imutool.blind_cases import unnamed
-from imutool.blind_cases.amounts import drawn
-from imutool.blind_cases.effects import CATALOGUE, Model, Stage, Theta
-from imutool.blind_cases.information import Sight, visible
+from imutool.blind_cases.catalogue import CATALOGUE, NO_LIMIT, clipping
+from imutool.blind_cases.effects import ACCEL, GYRO, Model, Six, Stage, Theta
+from imutool.blind_cases.information import Detectability, detectable_misfit
 from imutool.errors import ConfigError, DataError
 from imutool.noise.datasheet import SHEETS, Noise
 
@@ -29,10 +30,10 @@ KINDS, SIZES = get_args(Kind), get_args(Size)
 CHANCES = {"single": 0.45, "pair": 0.2, "null": 0.1, "driven": 0.1, "unknown": 0.15}
 FACTOR = {"large": 1.0, "middle": 0.25}
 FIXED_SMALL = {"dropped_samples": 1 / 16, "timestamp_jitter": 1 / 16, "quantization": 1 / 8, "reference_error": 1 / 8}
-CLEAR = 3.5  # times the smallest visible size
-UNNAMED_SHARE = 0.3  # of an unknown's misfit that nothing in the catalogue takes over
+CLEAR = 3.5  # times the smallest detectable size
+UNNAMED_SHARE = 0.3  # of an unknown's misfit that no effect of the catalogue explains
 TRIES, STEPS = 12, 8
-TINY, CLOSE = 1e-9, 0.9  # as near to what is wanted as `_sized` comes
+TINY = 1e-9
 GYRO_BIAS, ACCEL_BIAS = 0.03, 0.3  # rad/s, m/s²: spread of the constant bias every real log has
 
 # two of one row are never concealed together: by definition they are parts of the same thing
@@ -51,11 +52,12 @@ NAVIGATION = Noise(
 )
 GRADES = {"adis16448": SHEETS["adis16448"], "bmi160": SHEETS["bmi160"], "navigation": NAVIGATION}
 GRADE_CHANCES = {"adis16448": 0.475, "bmi160": 0.475, "navigation": 0.05}
+Sigma = Float64[np.ndarray, "6"]
 
 
 @dataclass(frozen=True, eq=False)
 class Concealed:
-    """What acts in a case: `acting` with the parameters as they are, and the size each was drawn at (1 is plausible)."""
+    """Effects of a case with their parameters, and the size each was drawn at (1 is plausible)."""
 
     kind: str
     size: str
@@ -63,8 +65,8 @@ class Concealed:
     factors: tuple[float, ...] = ()
 
 
-def concealed(seen: Sight, rng: Generator, kind: Kind, size: Size, effects: Sequence[str] = ()) -> Concealed:
-    """A case of a kind and size on a scene; `effects` names those to conceal instead of drawing them.
+def draw_effects(seen: Detectability, rng: Generator, kind: Kind, size: Size, effects: Sequence[str] = ()) -> Concealed:
+    """Effects of a case of some kind and size; `effects` names them instead of drawing them.
 
     Raises:
         ConfigError: no such effect.
@@ -79,44 +81,30 @@ def concealed(seen: Sight, rng: Generator, kind: Kind, size: Size, effects: Sequ
         return _pair(seen, rng, size, effects)
     for _ in range(TRIES):
         for model, theta in _candidates(seen, rng, kind, effects):
-            sized = _sized(seen, model, theta, size)
-            if sized is not None and (kind != "unknown" or _has_no_name(seen, model, sized[0])):
-                return Concealed(kind, size, ((model, sized[0]),), (sized[1],))
+            found = sized(seen, model, theta, size)
+            if found is not None and (kind != "unknown" or has_no_name(seen, model, found[0])):
+                return Concealed(kind, size, ((model, found[0]),), (found[1],))
     raise _hidden(kind, size, effects)
 
 
-def shown(seen: Sight, what: Concealed) -> bool:
-    """Whether a case could be drawn on this sight of its scene: everything in it as clear as a case has to be.
-
-    What stamps, digits and lost poses show needs no sight.
-    """
-    plain = [(model, theta) for model, theta in what.acting if model.stage != Stage.STAMPS and model.name not in FIXED_SMALL]
-    for model, theta in plain:
-        wanted = CLEAR**2 * visible(max(int(model.amounts.sum()), 1))
-        clear = seen.told_apart(model, theta)[0] >= wanted * CLOSE
-        if not clear or (what.kind == "unknown" and not _has_no_name(seen, model, theta)):
-            return False
-    return len(plain) < 2 or _both_seen(seen, plain[0], plain[1])
-
-
-def _pair(seen: Sight, rng: Generator, size: Size, effects: Sequence[str]) -> Concealed:
+def _pair(seen: Detectability, rng: Generator, size: Size, effects: Sequence[str]) -> Concealed:
     for _ in range(TRIES):
         found: list[tuple[Model, Theta, float]] = []
         for model, theta in _candidates(seen, rng, "single", effects):
-            if found and _alike(found[0][0].name, model.name):
+            if found and any({found[0][0].name, model.name} <= row for row in ALIKE):
                 continue
-            sized = None if model.name in ALONE else _sized(seen, model, theta, size)
-            if sized is not None:
-                found.append((model, *sized))
+            at_size = None if model.name in ALONE else sized(seen, model, theta, size)
+            if at_size is not None:
+                found.append((model, *at_size))
             if len(found) == 2:
                 break
-        if len(found) == 2 and _both_seen(seen, found[0][:2], found[1][:2]):
+        if len(found) == 2 and distinct(seen, found[0][:2], found[1][:2]):
             acting, factors = tuple((m, theta) for m, theta, _ in found), tuple(factor for *_, factor in found)
             return Concealed("pair", size, acting, factors)
     raise _hidden("pair", size, effects)
 
 
-def _candidates(seen: Sight, rng: Generator, kind: str, effects: Sequence[str]) -> list[tuple[Model, Theta]]:
+def _candidates(seen: Detectability, rng: Generator, kind: str, effects: Sequence[str]) -> list[tuple[Model, Theta]]:
     """Effects in the order in which they are tried, at the plausible size."""
     scene = seen.scene
     if kind == "driven":
@@ -125,20 +113,20 @@ def _candidates(seen: Sight, rng: Generator, kind: str, effects: Sequence[str]) 
         return [unnamed.unknown(rng, effects[0] if effects else None)]
     ideal = scene.ideal(seen.t_s)
     names = list(effects) or [str(name) for name in rng.permutation(sorted(CATALOGUE))]
-    return [(CATALOGUE[name], drawn(CATALOGUE[name], rng, ideal, scene.noise, scene.duration_s)) for name in names]
+    return [(CATALOGUE[name], draw_parameters(CATALOGUE[name], rng, ideal, scene.noise, scene.duration_s)) for name in names]
 
 
-def _sized(seen: Sight, model: Model, theta: Theta, size: Size) -> tuple[Theta, float] | None:
-    """Parameters at a size, and the size as a part of the plausible one; None where the motion does not show it."""
+def sized(seen: Detectability, model: Model, theta: Theta, size: Size) -> tuple[Theta, float] | None:
+    """Parameters at a size, and its ratio to the plausible one; None where the motion does not show it."""
     ideal = seen.scene.ideal(seen.t_s)
     fixed = size == "small" and model.name in FIXED_SMALL
     factor = FIXED_SMALL[model.name] if fixed else FACTOR.get(size, 1.0)
     if model.stage == Stage.STAMPS:
         return model.sized(theta, factor, ideal), factor
-    wanted = CLEAR**2 * visible(max(int(model.amounts.sum()), 1))
+    wanted = wanted_misfit(model)
     for _ in range(STEPS):
         at = model.sized(theta, factor, ideal)
-        shown = max(seen.told_apart(model, at)[0], TINY)
+        shown = max(seen.distinct_misfit(model, at)[0], TINY)
         if size != "small" or fixed:
             return (at, factor) if shown >= wanted else None
         if shown < wanted and factor >= 1.0:
@@ -149,23 +137,25 @@ def _sized(seen: Sight, model: Model, theta: Theta, size: Size) -> tuple[Theta, 
     return model.sized(theta, factor, ideal), factor
 
 
-def _both_seen(seen: Sight, one: tuple[Model, Theta], other: tuple[Model, Theta]) -> bool:
-    """Whether neither could be taken for a part of the other."""
-    for first, second in ((one, other), (other, one)):
+def wanted_misfit(model: Model) -> float:
+    """Squared misfit over the noise that an effect of a case must have."""
+    return CLEAR**2 * detectable_misfit(max(int(model.amounts.sum()), 1))
+
+
+def distinct(seen: Detectability, effect: tuple[Model, Theta], other: tuple[Model, Theta]) -> bool:
+    """Whether neither of two effects explains the other."""
+    for first, second in ((effect, other), (other, effect)):
         if Stage.STAMPS in (first[0].stage, second[0].stage):
             continue
-        if seen.beside(first, second) < 0.5 * CLEAR**2 * visible(max(int(first[0].amounts.sum()), 1)):
+        if seen.misfit_beyond(first, second) < 0.5 * wanted_misfit(first[0]):
             return False
     return True
 
 
-def _has_no_name(seen: Sight, model: Model, theta: Theta) -> bool:
-    left, _ = seen.told_apart(model, theta)
-    return left >= UNNAMED_SHARE * seen.seen([(model, theta)])
-
-
-def _alike(one: str, other: str) -> bool:
-    return any({one, other} <= row for row in ALIKE)
+def has_no_name(seen: Detectability, model: Model, theta: Theta) -> bool:
+    """Whether no effect of the catalogue explains most of the misfit."""
+    remaining, _ = seen.distinct_misfit(model, theta)
+    return remaining >= UNNAMED_SHARE * seen.squared_misfit([(model, theta)])
 
 
 def _hidden(kind: str, size: str, effects: Sequence[str]) -> DataError:
@@ -175,3 +165,81 @@ def _hidden(kind: str, size: str, effects: Sequence[str]) -> DataError:
         expected="a motion that shows it",
         fix="Choose a livelier trajectory, another size, or less noise",
     )
+
+
+# ── parameters at the plausible size ──
+
+
+def draw_parameters(model: Model, rng: Generator, signal: Six, noise: Sigma, duration_s: float) -> Theta:
+    """Random parameters at the plausible size.
+
+    Amounts are Gaussian with a root mean square of one plausible size, every second time on a single axis; the others are
+    spread over their plausible range.
+    """
+    if model.name in _SPECIAL:
+        return _SPECIAL[model.name](rng, signal, noise, duration_s)
+    amounts = model.amounts
+    theta = model.plausible * np.where(amounts, rng.standard_normal(len(amounts)), 1.0)
+    count = int(amounts.sum())
+    parts = {"gravity": 1, "temperature": 2}.get(model.name, 3)  # one row of a matrix, one axis, one sensor
+    if count % parts == 0 and rng.random() < 0.5:
+        kept = np.zeros(count, dtype=bool)
+        kept[rng.integers(parts) * (count // parts) :][: count // parts] = True
+        theta[amounts] *= kept
+    if model.name == "size_effect":  # what is common to all three axes would be a lever arm
+        theta -= np.tile(theta.reshape(3, 3).mean(axis=0), 3)
+    if not amounts.all():
+        theta[~amounts] = rng.uniform(0.1, 0.4) * duration_s  # time constants of the drifts
+    used = theta[amounts] / model.plausible[amounts]
+    theta[amounts] /= np.sqrt(np.mean(used[used != 0.0] ** 2))
+    return theta
+
+
+def _either_sign(rng: Generator, value: float) -> Theta:
+    return np.array([value * rng.choice([-1.0, 1.0])])
+
+
+def _line(rng: Generator, signal: Six, noise: Sigma, duration_s: float) -> Theta:
+    which = rng.choice(3, p=[0.2, 0.6, 0.2])
+    amplitude = np.abs(rng.standard_normal(6)) + 0.2
+    amplitude[GYRO] *= 0.1 * (which != 1)
+    amplitude[ACCEL] *= 1.0 * (which != 0)
+    return np.concatenate([[rng.uniform(15.0, 80.0)], amplitude, rng.uniform(0.0, 2.0 * np.pi, 6)])
+
+
+def _resonance(rng: Generator, signal: Six, noise: Sigma, duration_s: float) -> Theta:
+    share = np.ones(3) if rng.random() < 0.4 else rng.permutation([1.0, rng.uniform(0.0, 0.5), 0.0])
+    return np.array([np.exp(rng.uniform(np.log(3.0), np.log(30.0))), rng.uniform(0.05, 0.4), *share])
+
+
+def _limits(rng: Generator, signal: Six, noise: Sigma, duration_s: float) -> Theta:
+    """Which sensor clips; `clipping` gives the limit."""
+    which = rng.choice(3, p=[0.4, 0.4, 0.2])
+    return clipping(np.array([NO_LIMIT * (which == 1), NO_LIMIT * (which == 0)]), 1.0, signal)
+
+
+def _lsb(rng: Generator, signal: Six, noise: Sigma, duration_s: float) -> Theta:
+    """Eight standard deviations of the noise."""
+    which = rng.choice(3)
+    return 8.0 * np.array([noise[0] * (which != 1), noise[3] * (which != 0)])
+
+
+def _gaps(rng: Generator, signal: Six, noise: Sigma, duration_s: float) -> Theta:
+    starts = (np.arange(3) + rng.uniform(0.2, 0.7, 3)) * duration_s / 3.0
+    return np.array([2.0, *starts])
+
+
+_SPECIAL: Mapping[str, Callable[[Generator, Six, Sigma, float], Theta]] = {
+    "clock_offset": lambda rng, *_: _either_sign(rng, 0.05),
+    "clock_skew": lambda rng, *_: _either_sign(rng, 1e-3),
+    "clock_jump": lambda rng, signal, noise, span: np.array([rng.uniform(0.25, 0.75) * span, *_either_sign(rng, 0.05)]),
+    "low_pass": lambda rng, *_: np.array([rng.uniform(4.0, 6.0)]),
+    "saturation": _limits,
+    "quantization": _lsb,
+    "vibration": _line,
+    "mount_resonance": _resonance,
+    "earth_rotation": lambda rng, *_: np.array([rng.uniform(-1.2, 1.2), rng.uniform(-3.0, 3.0)]),
+    "dropped_samples": lambda rng, *_: np.array([0.02]),
+    "timestamp_jitter": lambda rng, *_: np.array([2e-3]),
+    "reference_error": _gaps,
+}

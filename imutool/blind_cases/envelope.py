@@ -1,8 +1,8 @@
-"""An envelope that holds the truth of a case until it is opened: a seal, not security.
+"""Envelope with the concealed truth of a blind case: a seal, not security.
 
-The truth is JSON, padded to a multiple of 16 KiB so that its length says nothing, XORed with SHAKE-256 of a random key that
-lies in a file beside it. The commitment, a SHA-256 over a random salt, the truth and the logs, shows whether any of them was
-changed. Whoever has the folder can open the envelope at once; nobody can change it unnoticed, nor read it by accident.
+The truth is JSON, padded to a multiple of 16 KiB so that its length reveals nothing, XORed with SHAKE-256 of a random key in a
+file beside it. The commitment, a SHA-256 over a random salt, the truth and the logs, shows whether any of them was changed.
+Whoever has the folder can open the envelope at once; nobody can change it unnoticed, nor read it by accident.
 """
 
 from __future__ import annotations
@@ -14,33 +14,103 @@ import json
 import secrets
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
+
+import msgspec
+from msgspec import Struct
 
 from imutool.errors import DataError
 
-SCHEMA = "imutool.envelope/1"
+SCHEMA: Literal["imutool.envelope/1"] = "imutool.envelope/1"
 BLOCK = 16384
 LARGEST = 1 << 24  # bytes of an envelope that anybody would read
 
 
-def sealed(truth: Mapping[str, Any], logs: Mapping[str, Path]) -> tuple[dict[str, Any], str]:
-    """The envelope (as plain JSON values) and its key in hexadecimal digits."""
-    text = json.dumps(truth, sort_keys=True, allow_nan=False).encode()
+class Marks(Struct, frozen=True):
+    """Marks of one sensor's misfit, by second and by axis: `#` clear, `?` doubtful, `.` nothing."""
+
+    seconds: str
+    axes: dict[str, str]
+    localised: bool
+
+
+class Location(Struct, frozen=True):
+    """Marks of the concealed misfit by sensor."""
+
+    window_s: float
+    gyro: Marks
+    accel: Marks
+
+
+class Rms(Struct, frozen=True):
+    """Root mean square residual with the misfit, and without it."""
+
+    rms_before: float
+    rms_after: float
+
+
+class TrueParameter(Struct, frozen=True):
+    """True value of a parameter, its scale, and the smallest standard deviation of an estimate (None: no bound)."""
+
+    value: float
+    unit: str
+    scale: float
+    smallest_std: float | None
+    identifiable: bool
+
+
+class ConcealedEffect(Struct, frozen=True):
+    """Effect of a blind case; `factor` is its size over the plausible one."""
+
+    effect: str
+    signal: str
+    driver: str
+    equation: str
+    factor: float
+    parameters: dict[str, TrueParameter]
+
+
+class ConcealedTruth(Struct, frozen=True, kw_only=True, omit_defaults=True):
+    """Truth of a blind case; `generator` names another program that made it."""
+
+    schema: Literal["imutool.sealed_truth/1"]
+    seed: int
+    trajectory: str
+    noise: str
+    kind: str
+    size: str
+    effects: tuple[ConcealedEffect, ...]
+    came_to: dict[str, float]
+    bias: dict[str, tuple[float, ...]]
+    noise_std: dict[str, tuple[float, ...]]
+    duration_s: float
+    place: Location
+    achievable: dict[str, Rms]
+    generator: str = ""
+
+
+class Envelope(Struct, frozen=True):
+    """Sealed truth with its salt, its commitment and the digests of the logs."""
+
+    schema: Literal["imutool.envelope/1"]
+    salt: str
+    commitment: str
+    logs: dict[str, str]
+    sealed: str
+
+
+def seal(truth: ConcealedTruth, logs: Mapping[str, Path]) -> tuple[Envelope, str]:
+    """Envelope with a truth, and its key in hexadecimal digits."""
+    text = json.dumps(msgspec.to_builtins(truth), sort_keys=True, allow_nan=False).encode()
     text += b" " * (-len(text) % BLOCK)
     key, salt = secrets.token_bytes(32), secrets.token_bytes(32)
     digests = {name: digest(path) for name, path in sorted(logs.items())}
-    envelope = {
-        "schema": SCHEMA,
-        "salt": salt.hex(),
-        "commitment": _commitment(salt, text, digests),
-        "logs": digests,
-        "sealed": base64.b64encode(_veil(text, key)).decode(),
-    }
-    return envelope, key.hex()
+    sealed = base64.b64encode(_xor(text, key)).decode()
+    return Envelope(SCHEMA, salt.hex(), _commitment(salt, text, digests), digests, sealed), key.hex()
 
 
-def unsealed(envelope: Path, key: Path) -> dict[str, Any]:
-    """The truth in an envelope.
+def unseal(envelope: Path, key: Path) -> ConcealedTruth:
+    """Truth in an envelope.
 
     Raises:
         DataError: no envelope or key, one of another case, or anything in it or in the logs was changed.
@@ -49,25 +119,36 @@ def unsealed(envelope: Path, key: Path) -> dict[str, Any]:
     if held.get("schema") != SCHEMA:
         raise DataError(f"schema {held.get('schema')!r}", where=envelope, expected=SCHEMA)
     try:
+        contents = msgspec.convert(held, Envelope)
         secret = bytes.fromhex(_text(key).strip())
-        salt, hidden = bytes.fromhex(held["salt"]), base64.b64decode(held["sealed"], validate=True)
-        digests = {str(name): str(value) for name, value in held["logs"].items()}
-    except (KeyError, AttributeError, TypeError, ValueError, binascii.Error) as error:
+        salt, hidden = bytes.fromhex(contents.salt), base64.b64decode(contents.sealed, validate=True)
+    except (msgspec.ValidationError, ValueError, binascii.Error) as error:
         raise DataError(f"the envelope is damaged ({error})", where=envelope, expected="one that conceal wrote") from error
-    text = _veil(hidden, secret)
-    if not secrets.compare_digest(_commitment(salt, text, digests), str(held.get("commitment"))):
+    text = _xor(hidden, secret)
+    if not secrets.compare_digest(_commitment(salt, text, contents.logs), contents.commitment):
         raise DataError("the envelope was changed, or the key is another's", where=envelope, expected="its commitment")
-    for name, value in digests.items():
+    for name, value in contents.logs.items():
         if digest(envelope.parent / Path(name).name) != value:
             raise DataError(
                 "the log was changed since it was sealed", where=envelope.parent / name, expected=f"SHA-256 {value}"
             )
-    truth: dict[str, Any] = json.loads(text)
-    return truth
+    return to_truth(json.loads(text), envelope)
+
+
+def to_truth(values: Mapping[str, Any], where: Path) -> ConcealedTruth:
+    """Truth from JSON values.
+
+    Raises:
+        DataError: a field is missing or of another type.
+    """
+    try:
+        return msgspec.convert(values, ConcealedTruth)
+    except msgspec.ValidationError as error:
+        raise DataError(f"the truth cannot be read ({error})", where=where, expected="a case of this version") from error
 
 
 def read_json(path: Path) -> dict[str, Any]:
-    """A JSON object from a file.
+    """JSON object in a file.
 
     Raises:
         DataError: no such file, too large, or no JSON object.
@@ -91,7 +172,7 @@ def digest(path: Path) -> str:
         with path.open("rb") as file:
             return hashlib.file_digest(file, "sha256").hexdigest()
     except OSError as error:
-        raise DataError(f"cannot be read ({error.strerror})", where=path, expected="a file of the sealed case") from error
+        raise DataError(f"cannot be read ({error.strerror})", where=path, expected="a file of the blind case") from error
 
 
 def _text(path: Path) -> str:
@@ -100,10 +181,10 @@ def _text(path: Path) -> str:
             raise DataError(f"{path.stat().st_size} bytes", where=path, expected=f"at most {LARGEST}")
         return path.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
-        raise DataError(f"cannot be read ({error})", where=path, expected="a file of the sealed case") from error
+        raise DataError(f"cannot be read ({error})", where=path, expected="a file of the blind case") from error
 
 
-def _veil(data: bytes, key: bytes) -> bytes:
+def _xor(data: bytes, key: bytes) -> bytes:
     stream = hashlib.shake_256(key).digest(len(data))
     return (int.from_bytes(data, "big") ^ int.from_bytes(stream, "big")).to_bytes(len(data), "big")
 

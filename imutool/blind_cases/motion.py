@@ -1,8 +1,8 @@
-"""A smooth motion near true poses, and what an ideal sensor feels along it: straight from rigid-body mechanics.
+"""Smooth motion through true poses, and the kinematics of an ideal sensor along it.
 
 Position and quaternion are penalised B-splines (Eilers & Marx 1996: a difference penalty on the coefficients) of degree 5,
-fitted robustly, so that outliers and gaps of a motion capture leave no jerk. What they give is the truth of a sealed case by
-definition; how near it comes to the recorded poses only decides how lifelike the motion is.
+fitted robustly, so that outliers and gaps of a motion capture leave no jerk. The splines are the truth of a blind case by
+definition; their distance from the recorded poses only decides how lifelike the motion is.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from imutool.errors import DataError
 from imutool.recording import GRAVITY_M_S2, Poses, seconds
 
 DEGREE, KNOT_S = 5, 0.05
-ROUNDS, OUTLIER = 5, 4.0  # of reweighting; a pose this many robust standard deviations away counts nothing
+ROUNDS, OUTLIER = 5, 4.0  # of reweighting; a pose this many robust standard deviations away has no weight
 SLOWEST_HZ, FASTEST_HZ = 2.0, 8.0  # between these the smoothing is cut off, according to the poses' noise
 SPURIOUS = (0.1, 0.1)  # m/s² and rad/s²: how much of the second derivative may be the poses' noise
 SHORTEST_S = 20.0
@@ -30,8 +30,8 @@ Knots = Float64[np.ndarray, " m"]
 
 
 @dataclass(frozen=True, eq=False)
-class Felt:
-    """Angular rate omega (rad/s), its derivative alpha, specific force f = R_wb^T (a_w - g_w) (m/s²), all in the body."""
+class Kinematics:
+    """Rate omega (rad/s), its derivative alpha, specific force f = R_wb^T (a_w - g_w) (m/s²), in the body."""
 
     t_s: Times
     omega: Vectors
@@ -42,15 +42,15 @@ class Felt:
 
 @dataclass(frozen=True, eq=False)
 class Motion:
-    """Splines of the position (m) and of a multiple of q_wb (wxyz) over seconds, good between `first_s` and `last_s`."""
+    """Splines of position (m) and of a multiple of q_wb (wxyz), valid from `first_s` to `last_s`."""
 
     position: BSpline
     quaternion: BSpline
     first_s: float
     last_s: float
 
-    def felt(self, t_s: Times) -> Felt:
-        """What an ideal sensor at the tracked point feels; times beyond the ends are held there.
+    def kinematics(self, t_s: Times) -> Kinematics:
+        """Kinematics of the tracked point; times beyond the ends are held there.
 
         R(Q) does not change with the length of Q: omega = 2 Im(Q* Q') / |Q|², and alpha is its derivative.
         """
@@ -62,17 +62,17 @@ class Motion:
         R_wb = _matrix(q / np.sqrt(length2))
         up = np.array([0.0, 0.0, GRAVITY_M_S2])
         f = np.einsum("nji,nj->ni", R_wb, self.position(t, 2) + up)
-        return Felt(np.asarray(t_s, dtype=np.float64), omega, alpha, f, R_wb)
+        return Kinematics(np.asarray(t_s, dtype=np.float64), omega, alpha, f, R_wb)
 
     def pose(self, t_s: Times) -> tuple[Vectors, Float64[np.ndarray, "n 4"]]:
-        """Position and unit quaternion (wxyz)."""
+        """Position and unit quaternion (wxyz) at some times."""
         q = self.quaternion(t_s)
         return np.asarray(self.position(t_s)), q / np.linalg.norm(q, axis=1, keepdims=True)
 
 
 @dataclass(frozen=True, eq=False)
 class Smoother:
-    """True poses on their way to a motion: columns on seconds, and how strongly each is smoothed."""
+    """True poses with the penalty and the robust weights of their splines."""
 
     t_s: Times
     p_wb: Vectors
@@ -81,7 +81,7 @@ class Smoother:
     weights: Mapping[str, Times] = field(default_factory=dict)
 
     def motion(self, without: tuple[tuple[float, float], ...] = ()) -> Motion:
-        """The motion; `without` the poses of some stretches (s), which are bridged as smoothly as the rest."""
+        """Motion through the poses; those in the intervals `without` (s) are left out and bridged."""
         kept = np.ones(len(self.t_s), dtype=bool)
         for start, end in without:
             kept &= (self.t_s < start) | (self.t_s > end)
@@ -93,7 +93,7 @@ class Smoother:
 
 
 def smoother(poses: Poses) -> Smoother:
-    """Poses made ready: signs of quaternions continuous, smoothing by their noise, outliers without weight.
+    """Smoother of true poses: continuous quaternions, penalty by their noise, no weight on outliers.
 
     Raises:
         DataError: fewer poses than 20 s of any motion capture give, or shorter than that.
@@ -115,7 +115,7 @@ def smoother(poses: Poses) -> Smoother:
 
 
 def _penalty(t: Times, y: Float64[np.ndarray, "n k"], spurious: float) -> float:
-    """The penalty that halves amplitudes at a frequency f, chosen so that noise leaves `spurious` of second derivative.
+    """Penalty that halves amplitudes at a frequency f, at which noise leaves `spurious` of second derivative.
 
     White noise of standard deviation s at rate r, cut off at f, gives s (2 pi f)² sqrt(2 f / (5 r)); third differences, whose
     variance is 20 s², tell s. Data weigh r a second, the penalty lambda (2 pi f h)^6 / h, h the knots' distance.
@@ -128,7 +128,7 @@ def _penalty(t: Times, y: Float64[np.ndarray, "n k"], spurious: float) -> float:
 
 
 def _robust_weights(t: Times, y: Float64[np.ndarray, "n k"], knots: Knots, penalty: float) -> Times:
-    """One for poses near the smooth curve, falling to nothing for outliers (Tukey's biweight)."""
+    """Tukey's biweight: one near the smooth curve, falling to zero for outliers."""
     weights = np.ones(len(t))
     for _ in range(ROUNDS):
         away = np.linalg.norm(y - _solve(t, y, weights, knots, penalty)(t), axis=1)

@@ -1,4 +1,4 @@
-"""A motion with a start, a length, noise and other channels; what a sensor reads along it with some effects acting."""
+"""Scene of a blind case: a motion with noise and channels, and the samples of a sensor along it."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ from scipy.interpolate import make_interp_spline
 
 from imutool.blind_cases import unnamed
 from imutool.blind_cases.effects import Model, Reading, Six, Stage, Theta, Times
-from imutool.blind_cases.motion import Felt, Motion, Smoother
+from imutool.blind_cases.motion import Kinematics, Motion, Smoother
 from imutool.errors import ConfigError
 from imutool.noise.datasheet import Noise
 from imutool.recording import Imu, Poses
 
 RATE_HZ, POSE_RATE_HZ, GRID_HZ = 200.0, 100.0, 1000.0
-MARGIN_S = 2.5  # of motion before and after what a log shows: filters settle in it, shifted clocks read from it
+MARGIN_S = 2.5  # of motion before and after the log: filters settle in it, shifted clocks read from it
 SETTLE_S = 2.0
-EPOCH_NS = 1_700_000_000_000_000_000  # of every case: when it starts says nothing
+EPOCH_NS = 1_700_000_000_000_000_000  # of every case: the start time reveals nothing
 SIM_SHARE = 0.3  # of the real sensor's noise
 FILTERS = {"low_pass", "mount_resonance"}
 JITTER_MAX_S = 2.4e-3  # neighbours 5 ms apart keep their order
@@ -30,7 +30,10 @@ Acting = Sequence[tuple[Model, Theta]]
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """Seconds count from the log's start. `noise`: standard deviation of a real sample, by column."""
+    """Motion, noise and channels of a case; seconds count from the log's start.
+
+    `noise` is the standard deviation of a real sample, by column.
+    """
 
     smoother: Smoother
     motion: Motion
@@ -42,55 +45,55 @@ class Scene:
 
     @property
     def t_s(self) -> Times:
-        """When samples are taken, were the clock true."""
+        """Sample times of a true clock."""
         return np.arange(int(self.duration_s * RATE_HZ) + 1) / RATE_HZ
 
     @property
     def sigma(self) -> Float64[np.ndarray, "6"]:
-        """Of the difference of a real and a simulated sample."""
+        """Standard deviation of a real minus a simulated sample, by column."""
         return np.asarray(self.noise * np.hypot(1.0, SIM_SHARE))
 
-    def felt(self, t_s: Times) -> Felt:
-        """What the tracked point feels."""
-        return replace(self.motion.felt(t_s + self.start_s), t_s=np.asarray(t_s, dtype=np.float64))
+    def kinematics(self, t_s: Times) -> Kinematics:
+        """Kinematics of the tracked point."""
+        return replace(self.motion.kinematics(t_s + self.start_s), t_s=np.asarray(t_s, dtype=np.float64))
 
     def ideal(self, t_s: Times) -> Six:
-        """What an ideal sensor reads."""
-        felt = self.felt(t_s)
-        return np.concatenate([felt.omega, felt.f], axis=1)
+        """Samples of an ideal sensor."""
+        ideal = self.kinematics(t_s)
+        return np.concatenate([ideal.omega, ideal.f], axis=1)
 
-    def at(self, t_s: Times) -> dict[str, Times]:
-        """The channels at some times."""
+    def channels_at(self, t_s: Times) -> dict[str, Times]:
+        """Channels at some times."""
         return {topic: np.interp(t_s, self.channel_t_s, values) for topic, values in self.channels.items()}
 
-    def arriving(self, acting: Acting, t_s: Times) -> Six:
-        """What the converter gets without noise, one row for each true-clock time of a sample."""
+    def converter_input(self, acting: Acting, t_s: Times) -> Six:
+        """Signal before the converter, without noise, a row for each true-clock time of a sample."""
         order = sorted(acting, key=lambda pair: (pair[0].stage, pair[0].name))
         taken = np.asarray(t_s, dtype=np.float64)
         for model, theta in order:
             if model.stage == Stage.CLOCK:
                 taken = model.act(taken, theta)
         mounted = [(m, theta) for m, theta in order if m.stage in (Stage.MOUNT, Stage.BANDWIDTH)]
-        signal = self._felt_with(order, mounted, taken)
+        signal = self._through_mount(order, mounted, taken)
         for model, theta in order:
             if model.stage == Stage.SENSOR:
-                signal = model.act(Reading(t_s, signal, self.at(t_s)), theta)
+                signal = model.act(Reading(t_s, signal, self.channels_at(t_s)), theta)
         return signal
 
-    def _felt_with(self, order: Acting, mounted: Acting, taken: Times) -> Six:
+    def _through_mount(self, order: Acting, mounted: Acting, taken: Times) -> Six:
         dynamic = any(model.name in FILTERS for model, _ in mounted)
         first = min(float(taken[0]), 0.0) - SETTLE_S
         count = int((float(taken[-1]) + 0.2 - first) * GRID_HZ)
         grid = first + np.arange(count) / GRID_HZ if dynamic else taken
-        felt = self.felt(grid)
-        signal = np.concatenate([felt.omega, felt.f], axis=1)
-        signal = signal + sum((m.act(felt, theta) for m, theta in order if m.stage == Stage.FELT), np.zeros(6))
+        ideal = self.kinematics(grid)
+        signal = np.concatenate([ideal.omega, ideal.f], axis=1)
+        signal = signal + sum((m.act(ideal, theta) for m, theta in order if m.stage == Stage.IDEAL), np.zeros(6))
         for model, theta in mounted:
             signal = model.act(GRID_HZ, signal, theta)
         return np.asarray(make_interp_spline(grid, signal, k=3)(taken)) if dynamic else signal
 
-    def converted(self, acting: Acting, signal: Six) -> Six:
-        """What comes out of the converter: clipped, then rounded."""
+    def converter_output(self, acting: Acting, signal: Six) -> Six:
+        """Signal after the converter: clipped, then rounded."""
         rank = {"saturation": 0, "quantization": 1}
         for model, theta in sorted(acting, key=lambda pair: rank.get(pair[0].name, 0)):
             if model.stage == Stage.CONVERTER:
@@ -98,31 +101,31 @@ class Scene:
         return signal
 
     def reference(self, acting: Acting) -> Motion:
-        """The motion as the reference has it: without the poses it lost, bridged."""
+        """Motion of the reference, which bridges the poses that it lost."""
         for model, theta in acting:
             if model.stage == Stage.REFERENCE:
-                return self.smoother.motion(self.lost(theta))
+                return self.smoother.motion(self.lost_intervals(theta))
         return self.motion
 
-    def lost(self, theta: Theta) -> tuple[tuple[float, float], ...]:
-        """Stretches the reference lost, on the clock of its poses."""
+    def lost_intervals(self, theta: Theta) -> tuple[tuple[float, float], ...]:
+        """Intervals that the reference lost, on the clock of its poses (s)."""
         return tuple((self.start_s + start, self.start_s + start + float(theta[0])) for start in theta[1:].tolist())
 
     def expected(self, acting: Acting, t_s: Times) -> Six:
-        """What the simulation says: ideal, along the reference."""
+        """Samples of the simulation without noise: ideal, along the reference."""
         return replace(self, motion=self.reference(acting)).ideal(t_s)
 
     def misfit(self, acting: Acting, t_s: Times) -> Six:
-        """Real less simulated, without any noise and bias."""
-        return np.asarray(self.converted(acting, self.arriving(acting, t_s)) - self.expected(acting, t_s))
+        """Real minus simulated samples, without noise and bias."""
+        return np.asarray(self.converter_output(acting, self.converter_input(acting, t_s)) - self.expected(acting, t_s))
 
     # ── logs ──
 
     def real(self, acting: Acting, bias: Theta, rng: Generator) -> tuple[Imu, dict[str, float]]:
-        """Samples with effects, bias and noise; and what the effects of the stamps came to."""
+        """Samples with effects, bias and noise, and the realised sizes of the effects of the stamps."""
         t_s = self.t_s
-        signal = self.arriving(acting, t_s) + bias + self.noise * rng.standard_normal((len(t_s), 6))
-        signal = self.converted(acting, signal)
+        signal = self.converter_input(acting, t_s) + bias + self.noise * rng.standard_normal((len(t_s), 6))
+        signal = self.converter_output(acting, signal)
         kept, stamps, came_to = np.ones(len(t_s), dtype=bool), t_s, {}
         for model, theta in acting:
             if model.name == "dropped_samples":
@@ -135,12 +138,12 @@ class Scene:
         return _imu(stamps[kept], signal[kept]), came_to
 
     def simulated(self, acting: Acting, rng: Generator) -> Imu:
-        """Ideal samples along the reference, with the simulation's own small noise."""
+        """Samples of the simulation: ideal, along the reference, with a small noise."""
         ideal = self.expected(acting, self.t_s)
         return _imu(self.t_s, ideal + SIM_SHARE * self.noise * rng.standard_normal(ideal.shape))
 
     def poses(self, acting: Acting, noise: tuple[float, float], rng: Generator) -> Poses:
-        """The reference's poses, with noise of its own (m, rad)."""
+        """Poses of the reference, with noise (m, rad)."""
         t_s = np.arange(int(self.duration_s * POSE_RATE_HZ) + 1) / POSE_RATE_HZ
         p_wb, q = self.reference(acting).pose(t_s + self.start_s)
         p_wb = p_wb + noise[0] * rng.standard_normal(p_wb.shape)
@@ -152,23 +155,23 @@ class Scene:
 
 
 def stamps_ns(t_s: Times) -> Int64[np.ndarray, " n"]:
-    """Nanoseconds of the log's clock."""
+    """Stamps on the log's clock (ns)."""
     out: Int64[np.ndarray, " n"] = EPOCH_NS + np.round(t_s * 1e9).astype(np.int64)
     return out
 
 
-def set_up(smoother: Smoother, noise: Noise, rng: Generator, longest_s: float) -> Scene:
-    """A scene somewhere in a trajectory, as long as may be.
+def place_scene(smoother: Smoother, noise: Noise, rng: Generator, longest_s: float) -> Scene:
+    """Scene at a random start of a trajectory, at most `longest_s` long.
 
     Raises:
-        ConfigError: noise that is not known, or none.
+        ConfigError: unknown or zero noise.
     """
     density = np.concatenate([noise.values("gyro_density"), noise.values("accel_density")])
     if not (np.isfinite(density).all() and (density > 0.0).all()):
         raise ConfigError(
-            "sizes are told against noise, and this has none or an unknown one",
-            where="--noise",
-            expected="gyro_density and accel_density of every axis above zero",
+            "the noise is zero or unknown, and effects are sized by it",
+            where="noise",
+            expected="gyro_density and accel_density above zero on every axis",
         )
     motion = smoother.motion()
     room = motion.last_s - motion.first_s - 2.0 * MARGIN_S

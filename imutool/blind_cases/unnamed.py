@@ -1,14 +1,14 @@
-"""What has no name in the catalogue: odd terms of the signals themselves, and what follows another channel of the log."""
+"""Concealed effects without a name in the catalogue: odd terms of the signals, and driven columns."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 
 import numpy as np
-from jaxtyping import Float64
 from numpy.random import Generator
 
-from imutool.blind_cases.effects import AXES, Model, Parameter, Reading, Six, Stage, Theta
+from imutool.blind_cases.catalogue import AXES
+from imutool.blind_cases.effects import Model, Parameter, Reading, Six, Stage, Theta, Times
 
 RATE_HZ = 50.0  # of the channels
 LONGEST_LAG_S = 0.3
@@ -22,13 +22,12 @@ TOPICS: Mapping[str, str] = {
 }
 DRIVERS = ("/battery/voltage", "/motor/current", "/rotor/speed", "/servo/position")
 
-Times = Float64[np.ndarray, " n"]
-
 
 def channels(rng: Generator, t_s: Times, motion: Six) -> dict[str, Times]:
-    """Other channels of a log, on their own clock; `motion` is what an ideal IMU reads then, which the rotor follows a little.
+    """Other channels of a log, on their own clock.
 
-    Every case has all of them, whether anything follows one or not. The voltage sags with the current: a decoy of it.
+    `motion` are the samples of an ideal IMU at these times, which the rotor follows a little. Every case has all channels,
+    whether an effect follows one or not. The voltage sags with the current, as a decoy.
     """
     dt = float(t_s[1] - t_s[0])
     current = 4.0 + 1.5 * _wander(rng, len(t_s), 0.6, dt) + 2.0 * (_wander(rng, len(t_s), 2.0, dt) > 1.0)
@@ -63,7 +62,7 @@ def _wander(rng: Generator, count: int, memory_s: float, dt: float) -> Times:
 
 
 def driven(rng: Generator, spread: Mapping[str, float]) -> tuple[Model, Theta]:
-    """A column that follows a channel: + gain c(t - lag). At the plausible size its spread is 0.05 rad/s or 0.5 m/s²."""
+    """Column that follows a channel: + gain c(t - lag). Its plausible spread is 0.05 rad/s or 0.5 m/s²."""
     topic = DRIVERS[rng.integers(len(DRIVERS))]
     column = int(rng.integers(6))
     gain = (0.05 if column < 3 else 0.5) / spread[topic]
@@ -72,7 +71,7 @@ def driven(rng: Generator, spread: Mapping[str, float]) -> tuple[Model, Theta]:
 
 
 def follower(topic: str, column: int, gain: float = 1.0) -> Model:
-    """The model of a column (of six) that follows a channel; `gain`: its plausible size."""
+    """Model of a column (of six) that follows a channel; `gain` is its plausible size."""
     sensor = "gyro" if column < 3 else "accel"
     unit = f"{'rad/s' if column < 3 else 'm/s^2'} per {TOPICS[topic]}"
 
@@ -110,7 +109,7 @@ FORMS: Mapping[str, tuple[str, str, float, str, str, Term]] = {
 
 
 def unknown(rng: Generator, form: str | None = None) -> tuple[Model, Theta]:
-    """One odd term on one column, at the plausible size."""
+    """Odd term of the signals on one column, at the plausible size."""
     name = form or sorted(FORMS)[rng.integers(len(FORMS))]
     _, output, large, unit, equation, term = FORMS[name]
     i, out_axis = int(rng.integers(3)), int(rng.integers(3))

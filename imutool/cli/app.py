@@ -4,15 +4,17 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, Any, NoReturn
 
 import typer
 from typer.core import TyperCommand, TyperGroup
+from typer.models import CommandFunctionType
 
 from imutool import __version__, registry
+from imutool.cli.parameters import error_with_flags, flags
 from imutool.cli.terminal import plain, say, tell_error
 from imutool.errors import ConfigError, ImutoolError
 
@@ -51,10 +53,35 @@ def caught() -> Iterator[None]:
         _fail(f"{place}{error.strerror or error}. Choose another place or make room.", ConfigError.exit_code)
 
 
+class Command(TyperCommand):
+    """A command whose errors name its flags where the library names parameters."""
+
+    def invoke(self, ctx: Any) -> Any:
+        """Run the command.
+
+        Raises:
+            ImutoolError: the command failed.
+        """
+        try:
+            return super().invoke(ctx)
+        except ImutoolError as error:
+            raise error_with_flags(error, flags(self)) from error
+
+
+class App(typer.Typer):
+    """An application whose commands are `Command`s."""
+
+    def command(
+        self, name: str | None = None, *, cls: type[TyperCommand] | None = None, **settings: Any
+    ) -> Callable[[CommandFunctionType], CommandFunctionType]:
+        """Register a function as a command."""
+        return super().command(name, cls=cls or Command, **settings)
+
+
 def listing(group: str, option: str) -> type[TyperCommand]:
     """A command whose help also lists what can be named, found (and nothing of it imported) when help is asked for."""
 
-    class Listing(TyperCommand):
+    class Listing(Command):
         def format_help(self, ctx: Any, formatter: Any) -> None:
             lines = [f"[bold]{name}[/]  {plain(registry.summary(group, name))}" for name in registry.names(group)]
             self.epilog = "\n\n".join([f"Values of {option}:", *lines, self.epilog or ""])
@@ -63,7 +90,7 @@ def listing(group: str, option: str) -> type[TyperCommand]:
     return Listing
 
 
-app = typer.Typer(
+app = App(
     name="imutool",
     help="Raw inertial data to MCAP, learned IMU bias dynamics, debiased logs, and a picture of what changed.",
     cls=_Commands,

@@ -46,9 +46,11 @@ def conceal(
 
 
 def _open(folder: Path, findings: Path | None, json_to: str | None) -> None:
-    from imutool.blind_cases.cases import opened
+    import msgspec
 
-    result = opened(folder, findings)
+    from imutool.blind_cases.cases import open_case
+
+    result: dict[str, Any] = msgspec.to_builtins(open_case(folder, findings))
     if write_json(result, json_to):
         return
     hidden = "; ".join(_told(effect) for effect in result["truth"]["effects"]) or "nothing but a bias and noise"

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from imutool.cli.app import Imu, Init, Json, Overwrite, Quiet, Smooth, Truth, Verbose, app
+from imutool.cli.app import App, Imu, Init, Json, Overwrite, Quiet, Smooth, Truth, Verbose, app
 from imutool.cli.debias import VERIFY_HELP
 from imutool.cli.terminal import out, plain, progress, say, write_json
 from imutool.errors import ConfigError
@@ -18,7 +18,7 @@ from imutool.fleet.task import Settings
 if TYPE_CHECKING:
     from imutool.fleet.run import FleetReport
 
-fleet = typer.Typer(
+fleet = App(
     name="fleet",
     help="The same for many logs: on all cores of this machine, or on a Ray cluster.",
     no_args_is_help=True,

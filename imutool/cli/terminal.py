@@ -12,6 +12,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import msgspec
 from rich import box
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn
@@ -19,6 +20,7 @@ from rich.table import Table
 
 from imutool.errors import ConfigError
 from imutool.mcap_io.losses import told
+from imutool.report import json_values
 
 NUMBER = re.compile(r"[-+]?[0-9.]+|[–?]")
 
@@ -105,7 +107,8 @@ def write_json(report: Any, where: str | None) -> bool:
     """
     if where is None:
         return False
-    text = json.dumps(report, indent=2, allow_nan=False, ensure_ascii=False)
+    values = json_values(report) if isinstance(report, msgspec.Struct) else report
+    text = json.dumps(values, indent=2, allow_nan=False, ensure_ascii=False)
     if where == "-":
         sys.stdout.write(text + "\n")
         return True

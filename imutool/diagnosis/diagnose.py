@@ -194,7 +194,7 @@ def measured(
     pairs = [_telling(pair) for pair in _pairs(read_log(real, imu=imu, truth=truth), simulated, truth)]
     candidates = _candidates(pairs)
     logs = [whitened(pair, candidates) for pair in pairs]
-    asked = catalogue.physics(effects)
+    asked = catalogue.diagnosed(effects)
     hidden = set(unobservable(logs, asked))
     shown = []
     for one in asked:
@@ -315,7 +315,7 @@ def _candidates(pairs: Sequence[Pair]) -> tuple[Effect, ...]:
     def thinkable(physics: Effect) -> bool:
         return all(attitude if need == "attitude" else any(need in name for name in channels) for need in physics.needs)
 
-    found = [one for one in catalogue.physics() if thinkable(one) and one.name not in SHOWN_BY_SAMPLES]
+    found = [one for one in catalogue.diagnosed() if thinkable(one) and one.name not in SHOWN_BY_SAMPLES]
     biases = [np.median(pair.real - expected(pair, ()), axis=0) for pair in pairs]
     exact = all(pair.against == "simulation" for pair in pairs)  # poses know nothing of a millisecond: `late_stamps`
     return (*found, *(timestamps.jitter(pairs) if exact else ()), *timestamps.soft_limits(pairs, biases))

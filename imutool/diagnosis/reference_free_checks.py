@@ -10,7 +10,7 @@ from imutool.diagnosis.result import Diagnosis, Estimate, Finding, HeldOut
 from imutool.inertial.stationary import white_noise
 from imutool.recording import Recording, seconds
 from imutool.sensor import catalogue
-from imutool.sensor.readings import IdealMotion
+from imutool.sensor.samples import IdealMotion
 from imutool.units import UNITS
 
 BY_THEMSELVES = frozenset({"saturation", "quantization"})  # of the catalogue
@@ -26,7 +26,7 @@ def by_samples(real: Recording, path: str, why: str) -> Diagnosis:
     pair = Pair(real.name, IdealMotion(stamp_s, *np.zeros((3, len(stamp_s), 3))), stamp_s, samples, none, none)
     findings = [*timestamps.dropped([pair]), *timestamps.rounded([pair], white_noise(samples)), *_limits(pair)]
     told = f"{why.rstrip('.')}. Only what stamps and digits show by themselves could be asked"
-    hidden = tuple(one.name for one in catalogue.physics() if one.name not in BY_THEMSELVES)
+    hidden = tuple(one.name for one in catalogue.diagnosed() if one.name not in BY_THEMSELVES)
     return Diagnosis((path,), None, (), tuple(findings), np.full((1, 6), np.nan), hidden, {}, (told,))
 
 

@@ -21,7 +21,7 @@ from imutool.errors import DataError
 from imutool.recording import Recording
 from imutool.sensor.effect import Acting
 from imutool.sensor.physics_file import PhysicsFile
-from imutool.sensor.readings import IdealMotion
+from imutool.sensor.samples import IdealMotion
 from imutool.sensor.simulate import FELT_HZ, read_all
 from imutool.sensor.trajectory import smooth_motion
 

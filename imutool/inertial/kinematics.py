@@ -8,6 +8,7 @@ have no singularity to steer around, whatever the angles, and every derivative f
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Float64
@@ -23,6 +24,22 @@ G_W = np.array([0.0, 0.0, -GRAVITY_M_S2])
 G_W.flags.writeable = False
 
 Vectors = Float64[np.ndarray, "n 3"]
+
+
+def lever_acceleration(omega: Any, alpha: Any, arms: Any) -> tuple[Any, Any, Any]:
+    """Acceleration alpha x r + omega x (omega x r) of a point r away on a rigid body (m/s²), by axis.
+
+    Component i is that of the point `arms[i]`: an accelerometer's axes may lie apart. omega and alpha are three floats or three
+    columns each; written out, because for floats numpy would cost several times the arithmetic.
+    """
+    (wx, wy, wz), (ax, ay, az) = omega, alpha
+    (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = arms
+    wx_wx, wy_wy, wz_wz = wx * wx, wy * wy, wz * wz
+    return (
+        ay * xz - az * xy + wx * (wy * xy + wz * xz) - (wy_wy + wz_wz) * xx,
+        az * yx - ax * yz + wy * (wz * yz + wx * yx) - (wz_wz + wx_wx) * yy,
+        ax * zy - ay * zx + wz * (wx * zx + wy * zy) - (wx_wx + wy_wy) * zz,
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,7 +68,7 @@ class Motion:
         return felt if r_b is None else felt + self._lever(r_b)
 
     def _lever(self, r_b: Float[np.ndarray, "3"]) -> Vectors:
-        return np.cross(self.alpha_b, r_b) + np.cross(self.omega_b, np.cross(self.omega_b, r_b))
+        return np.stack(lever_acceleration(self.omega_b.T, self.alpha_b.T, (r_b, r_b, r_b)), axis=1)
 
     def _rotation(self) -> Rotation:
         return Rotation.from_quat(self.q_wb_wxyz, scalar_first=True)

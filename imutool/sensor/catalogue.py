@@ -1,4 +1,4 @@
-"""The effects there are: all that act on a sensor, or those a person names; and all that can be simulated."""
+"""Catalogue of effects: the files of `imutool/sensor/effects`, and those that other packages register."""
 
 from __future__ import annotations
 
@@ -7,46 +7,48 @@ from collections.abc import Sequence
 from imutool import registry
 from imutool.errors import ConfigError
 from imutool.sensor.effect import Effect
-from imutool.sensor.linear_effect import LinearEffect
+from imutool.sensor.linear_form import LinearForm, linear_form
 from imutool.units import Sensor
 
 GROUP = "imutool.effects"
 
 
-def known(sensor: Sensor) -> tuple[LinearEffect, ...]:
-    """Every effect with a closed form that acts on a sensor, by name."""
-    modules = registry.every(GROUP).values()
-    return tuple(module.effect(sensor) for module in modules if sensor in getattr(module, "SENSORS", ()))
-
-
-def named(sensor: Sensor, names: Sequence[str]) -> tuple[LinearEffect, ...]:
-    """Some effects on a sensor, in the order of their names.
+def effects(names: Sequence[str] | None = None) -> tuple[Effect, ...]:
+    """Every effect, by name; or some, in the order of their names.
 
     Raises:
-        ConfigError: an unknown name (the nearest is given), one that acts on the other sensor alone, or one given twice.
+        ConfigError: an unknown name (the nearest is given).
     """
-    where, found = f"effects of the {sensor}", []
-    for name in names:
-        module = registry.load(GROUP, name)
-        if sensor not in getattr(module, "SENSORS", ()):
-            listed = ", ".join(effect.name for effect in known(sensor))
-            raise ConfigError(f"{name} does not act on the {sensor}", where=where, expected=f"some of {listed}")
-        found.append(module.effect(sensor))
-    if len(set(names)) < len(names):
-        raise ConfigError(f"{', '.join(names)}: one stands there twice", where=where, expected="each at most once")
-    return tuple(found)
+    modules = registry.every(GROUP).values() if names is None else [registry.load(GROUP, name) for name in names]
+    return tuple(module.EFFECT for module in modules)
 
 
-def physics(names: Sequence[str] | None = None) -> tuple[Effect, ...]:
-    """Every effect that can be simulated, by name; or some, in the order of their names.
+def diagnosed(names: Sequence[str] | None = None) -> tuple[Effect, ...]:
+    """Every effect that a diagnosis may find, by name; or some, in the order of their names.
 
     Raises:
-        ConfigError: an unknown name (the nearest is given), or that of an effect that is fitted alone and not simulated.
+        ConfigError: an unknown name (the nearest is given), or an effect that a diagnosis does not look for.
     """
-    modules = list(registry.every(GROUP).values()) if names is None else [registry.load(GROUP, name) for name in names]
-    found = tuple(module.EFFECT for module in modules if hasattr(module, "EFFECT"))
-    if names is not None and len(found) < len(names):
-        lacking = next(name for name, module in zip(names, modules, strict=True) if not hasattr(module, "EFFECT"))
-        listed = ", ".join(one.name for one in physics())
-        raise ConfigError(f"{lacking} cannot be simulated", where="effects", expected=f"some of {listed}")
-    return found
+    found = effects(names)
+    refused = [effect.name for effect in found if not effect.diagnosed]
+    if refused and names is not None:
+        listed = ", ".join(effect.name for effect in diagnosed())
+        raise ConfigError(f"{refused[0]} is not diagnosed", where="effects", expected=f"some of {listed}")
+    return tuple(effect for effect in found if effect.diagnosed)
+
+
+def trained(sensor: Sensor, names: Sequence[str] | None = None) -> tuple[LinearForm, ...]:
+    """Every effect on a sensor that a bias model can have, by name; or some, in the order of their names.
+
+    Raises:
+        ConfigError: an unknown name (the nearest is given), an effect without a linear form on the sensor, or a name twice.
+    """
+    found, where = effects(names), f"effects of the {sensor}"
+    chosen = [effect for effect in found if effect.trained and sensor in effect.sensors]
+    if names is not None and len(chosen) < len(found):
+        refused = next(effect.name for effect in found if effect not in chosen)
+        listed = ", ".join(form.name for form in trained(sensor))
+        raise ConfigError(f"{refused} does not act on the {sensor}", where=where, expected=f"some of {listed}")
+    if names is not None and len(set(names)) < len(names):
+        raise ConfigError(f"{', '.join(names)}: a name stands there twice", where=where, expected="each at most once")
+    return tuple(linear_form(effect, sensor) for effect in chosen)

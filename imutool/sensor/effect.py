@@ -25,15 +25,17 @@ import numpy as np
 from jaxtyping import Float64
 
 from imutool.errors import DataError
-from imutool.sensor.readings import IdealMotion, SensorSamples, Times
+from imutool.sensor.samples import IdealMotion, SensorSamples, Times
+from imutool.sensor.signals import Signals
 from imutool.units import AXES, Sensor
 
 Kind = Literal["catalogue", "driven", "unknown"]
-Theta = Float64[np.ndarray, "_"]  # effects that act together have numbers of their own, so this length binds no other
+Three = tuple[float, float, float]
+Theta = Float64[np.ndarray, "_"]  # effects that act together have parameters of their own, so this length binds no other
 
 
 class Stage(IntEnum):
-    """When an effect acts."""
+    """Stage at which an effect acts."""
 
     MOTION = 0
     MOUNT = 1
@@ -45,13 +47,14 @@ class Stage(IntEnum):
 
 @dataclass(frozen=True)
 class Parameter:
-    """A parameter: name, unit, plausible size (one standard deviation of what is met), whether it is positive by nature.
+    """A parameter of an effect: name, unit, plausible size (one standard deviation of what is met).
 
-    `null_value` is the value at which the effect does nothing: 0, or infinity (a cut-off frequency, a limit). A number that
-    matters only beside an amplitude (a time constant, a frequency) has its plausible size there: any value would do.
-    `step`, where given, is the largest one whose difference is still a derivative, of the logarithm if `positive`. `begins`: it
-    is the time (s from the log's start) at which the effect sets in, never if infinite; nothing is smooth in it, so all times
-    are gone through.
+    positive: it is positive by nature, so that a fit moves its logarithm.
+    null_value: the value at which the effect does nothing: 0, or infinity (a cut-off frequency, a limit). A parameter that
+        matters only together with an amplitude (a time constant, a frequency) has its plausible size there.
+    step: the largest step whose difference is still a derivative, of the logarithm if `positive`.
+    begins: it is the time (s from the log's start) at which the effect sets in, never if infinite; a fit tries all times.
+    fixed_in_training: the value that training gives a parameter in which the effect is not linear.
     """
 
     name: str
@@ -61,20 +64,42 @@ class Parameter:
     null_value: float = 0.0
     step: float | None = None
     begins: bool = False
+    fixed_in_training: float | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class CompiledEffect:
+    """An effect for given parameters: the error at each sample of a block, and at one sample from its time and columns.
+
+    One sample is plain floats: numpy's calls would cost several times the arithmetic.
+    """
+
+    block: Callable[[Signals], Float64[np.ndarray, "n 3"]]
+    one: Callable[[float, list[float]], Three]
+
+    def __call__(self, signals: Signals) -> Float64[np.ndarray, "n 3"]:
+        """The error at each sample of a block."""
+        return self.block(signals)
 
 
 @dataclass(frozen=True)
 class Effect:
-    """An effect as it acts.
+    """An effect on a sensor: its equation, its parameters and its forward model.
 
-    forward: (Felt, theta) -> Felt up to BANDWIDTH; (taken_s, theta) -> taken_s at CLOCK; (Read, theta) -> Read after.
+    forward: (IdealMotion, theta) -> IdealMotion up to BANDWIDTH; (taken_s, theta) -> taken_s at CLOCK; (SensorSamples, theta)
+        -> SensorSamples behind it.
     linear: whether what it adds is proportional to theta (then a fit may start at zero).
-    starts: for the others, values of theta to start a fit from, given the ideal signals and the samples: at least one, all
-        finite, and positive where a number is (a limit that is not reached instead of none).
+    starts: for the others, values of theta to start a fit from, given the ideal motion and the samples: at least one, all
+        finite, and positive where a parameter is (a limit that is not reached instead of none).
     alternatives: out of how many the starts are the best, given the samples; so many times likelier does chance look like one.
-    needs: channels without which it cannot be thought of, such as "temperature"; a channel whose name contains it serves.
+    needs: channels that it cannot do without, such as "temperature"; a channel whose name contains it serves.
     kind: of the catalogue, driven by the channel `variable`, or unknown: a curve of `variable`, or a term, on one `axis`.
     variant: tells effects of one name apart.
+    trained: a bias model can have it: its error follows from the sensor's own samples and is linear in all parameters but those
+        `fixed_in_training`.
+    diagnosed: a diagnosis may find it.
+    basis: the terms of a trained effect, where `forward` for one parameter at a time would be slow; the same numbers.
+    fast: a trained effect for given parameters, where `forward` would be slow; the same numbers.
     """
 
     name: str
@@ -92,6 +117,10 @@ class Effect:
     variable: str = ""
     axis: int | None = None
     variant: str = ""
+    trained: bool = False
+    diagnosed: bool = True
+    basis: Callable[[Signals], Float64[np.ndarray, "n q"]] | None = None
+    fast: Callable[[Theta], CompiledEffect] | None = None
 
     @property
     def key(self) -> str:
@@ -101,45 +130,45 @@ class Effect:
     @property
     def plausible(self) -> Theta:
         """The plausible size of each parameter."""
-        return np.array([number.plausible for number in self.parameters])
+        return np.array([parameter.plausible for parameter in self.parameters])
 
     @property
     def null_value(self) -> Theta:
-        """The parameters at which it does nothing."""
-        return np.array([number.null_value for number in self.parameters])
+        """The parameters at which the effect does nothing."""
+        return np.array([parameter.null_value for parameter in self.parameters])
 
 
 def each_axis(unit: str, plausible: float, before: str = "") -> tuple[Parameter, ...]:
-    """One number for each axis, its name perhaps with a word before."""
+    """One parameter for each axis, its name with a prefix."""
     return tuple(Parameter(before + axis, unit, plausible) for axis in AXES)
 
 
 def each_pair(unit: str, plausible: float, *, diagonal: bool = True, before: str = "") -> tuple[Parameter, ...]:
-    """One number for each entry of a 3x3 matrix, row by row: `xy` is what y adds to x."""
+    """One parameter for each entry of a 3x3 matrix, row by row: `xy` is what y adds to x."""
     return tuple(Parameter(before + a + b, unit, plausible) for a in AXES for b in AXES if diagonal or a != b)
 
 
 def matrix(theta: Float64[np.ndarray, "6"]) -> Float64[np.ndarray, "3 3"]:
-    """The matrix whose entries off the diagonal are these, row by row; the diagonal is zero."""
+    """The matrix with these entries off its diagonal, row by row, and zeros on it."""
     out = np.zeros((3, 3))
     out[~np.eye(3, dtype=bool)] = theta
     return out
 
 
-def attitude(felt: IdealMotion, effect: str) -> Float64[np.ndarray, "n 3 3"]:
+def attitude_of(motion: IdealMotion, effect: str) -> Float64[np.ndarray, "n 3 3"]:
     """R_wb, for an effect that needs it.
 
     Raises:
-        DataError: it is not known.
+        DataError: the motion has no attitude.
     """
-    if felt.R_wb is None:
+    if motion.R_wb is None:
         raise DataError("the attitude is not known", where=effect, expected="a motion with orientations")
-    return felt.R_wb
+    return motion.R_wb
 
 
-def misfit(felt: IdealMotion, samples: SensorSamples) -> tuple[Float64[np.ndarray, "n 3"], Float64[np.ndarray, "n 3"]]:
-    """Samples minus the ideal at the same stamps: gyro (rad/s), accel (m/s²). Good enough to start a fit from."""
-    ideal = felt.taken(samples.stamp_s, samples.stamp_s)
+def residual(motion: IdealMotion, samples: SensorSamples) -> tuple[Float64[np.ndarray, "n 3"], Float64[np.ndarray, "n 3"]]:
+    """Samples minus the ideal ones at the same stamps: gyro (rad/s), accel (m/s²). Good enough to start a fit from."""
+    ideal = motion.taken(samples.stamp_s, samples.stamp_s)
     return samples.gyro - ideal.gyro, samples.accel - ideal.accel
 
 
@@ -149,51 +178,51 @@ Acting = Sequence[tuple[Effect, Theta]]
 
 @dataclass(frozen=True, eq=False)
 class SignalState:
-    """How far signals have come: what is felt and when samples are taken of it, or, behind the clock, what is read."""
+    """Signals between two effects: a motion and when it is sampled, or, behind the clock, the samples."""
 
-    felt: IdealMotion
+    motion: IdealMotion
     taken_s: Times
     stamp_s: Times
     taken: SensorSamples | None = None
 
-    def through(self, physics: Effect, theta: Theta) -> SignalState:
-        """Behind one more effect, whose turn it is."""
-        if physics.stage < Stage.CLOCK:
-            return SignalState(physics.forward(self.felt, theta), self.taken_s, self.stamp_s)
-        if physics.stage == Stage.CLOCK:
-            return SignalState(self.felt, physics.forward(self.taken_s, theta), self.stamp_s)
-        return SignalState(self.felt, self.taken_s, self.stamp_s, physics.forward(self.arrived(), theta))
+    def through(self, effect: Effect, theta: Theta) -> SignalState:
+        """The signals behind one more effect, the next in stage order."""
+        if effect.stage < Stage.CLOCK:
+            return SignalState(effect.forward(self.motion, theta), self.taken_s, self.stamp_s)
+        if effect.stage == Stage.CLOCK:
+            return SignalState(self.motion, effect.forward(self.taken_s, theta), self.stamp_s)
+        return SignalState(self.motion, self.taken_s, self.stamp_s, effect.forward(self.samples(), theta))
 
-    def taking(self) -> SignalState:
-        """With the samples taken: behind this, the clock and what is felt do not matter any more."""
-        return self if self.taken is not None else SignalState(self.felt, self.taken_s, self.stamp_s, self.arrived())
+    def sampled(self) -> SignalState:
+        """The signals with the samples taken: behind this, clock and motion do not matter any more."""
+        return self if self.taken is not None else SignalState(self.motion, self.taken_s, self.stamp_s, self.samples())
 
-    def arrived(self) -> SensorSamples:
+    def samples(self) -> SensorSamples:
         """One row a sample."""
-        return self.felt.taken(self.taken_s, self.stamp_s) if self.taken is None else self.taken
+        return self.motion.taken(self.taken_s, self.stamp_s) if self.taken is None else self.taken
 
 
-def read(felt: IdealMotion, stamp_s: Times, acting: Acting) -> SensorSamples:
-    """What a sensor with these effects reads at some stamps: the stages one after another, within a stage by name."""
-    way = SignalState(felt, np.asarray(stamp_s, dtype=np.float64), stamp_s)
-    for physics, theta in in_stage_order(acting):
-        way = way.through(physics, theta)
-    return way.arrived()
+def simulate_samples(motion: IdealMotion, stamp_s: Times, acting: Acting) -> SensorSamples:
+    """Samples of a sensor with these effects at some stamps: the stages one after another, within a stage by name."""
+    state = SignalState(motion, np.asarray(stamp_s, dtype=np.float64), stamp_s)
+    for effect, theta in in_stage_order(acting):
+        state = state.through(effect, theta)
+    return state.samples()
 
 
-def sensed(taken: SensorSamples, acting: Acting) -> SensorSamples:
-    """What a sensor makes of samples that are taken: the stages behind CLOCK alone."""
-    for physics, theta in in_stage_order(acting):
-        if physics.stage > Stage.CLOCK:
-            taken = physics.forward(taken, theta)
-    return taken
+def distort(samples: SensorSamples, acting: Acting) -> SensorSamples:
+    """Samples behind the stages SENSOR and CONVERTER alone."""
+    for effect, theta in in_stage_order(acting):
+        if effect.stage > Stage.CLOCK:
+            samples = effect.forward(samples, theta)
+    return samples
 
 
 def in_stage_order(acting: Acting) -> list[tuple[Effect, Theta]]:
-    """As they act."""
+    """The effects in the order in which they act."""
     return sorted(acting, key=lambda pair: stage_order(pair[0]))
 
 
-def stage_order(physics: Effect) -> tuple[int, int, str]:
-    """By which it is told when an effect acts."""
-    return physics.stage, CONVERTER_ORDER.get(physics.name, 0), physics.key
+def stage_order(effect: Effect) -> tuple[int, int, str]:
+    """Sorting key of an effect: its stage, then its place in the converter, then its key."""
+    return effect.stage, CONVERTER_ORDER.get(effect.name, 0), effect.key

@@ -51,7 +51,7 @@ from imutool.errors import ConfigError, DataError, ImutoolError
 from imutool.mcap_io.storage.target import Target
 from imutool.sensor import catalogue
 from imutool.sensor.effect import Effect, Parameter, Stage, Theta
-from imutool.sensor.readings import SensorSamples
+from imutool.sensor.samples import SensorSamples
 from imutool.sensor.variables import VARIABLES, factor, words
 from imutool.units import AXES, UNITS, Sensor
 
@@ -121,7 +121,7 @@ class PhysicsFile(Settings, frozen=True, kw_only=True):
     unknown: tuple[Curve, ...] = ()
     term: tuple[Term, ...] = ()
 
-    def acting(self, where: str | Path = "physics", known: Known = catalogue.physics) -> list[tuple[Effect, Theta]]:
+    def acting(self, where: str | Path = "physics", known: Known = catalogue.effects) -> list[tuple[Effect, Theta]]:
         """The effects as they act, each with its parameters; `known` finds them by name.
 
         Raises:

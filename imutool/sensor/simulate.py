@@ -25,9 +25,9 @@ from imutool.mcap_io.write import write
 from imutool.noise import datasheet as noises
 from imutool.recording import Imu, Poses, Recording, seconds, unit_quaternions
 from imutool.sensor import physics_file
-from imutool.sensor.effect import Acting, Effect, Stage, Theta, sensed
+from imutool.sensor.effect import Acting, Effect, Stage, Theta, distort
 from imutool.sensor.physics_file import DRIVEN, PhysicsFile
-from imutool.sensor.readings import IdealMotion, SensorSamples
+from imutool.sensor.samples import IdealMotion, SensorSamples
 from imutool.sensor.trajectory import Smoothed, smooth_motion
 
 SCHEMA = "imutool.simulation/1"
@@ -192,7 +192,7 @@ def read_all(felts: Sequence[IdealMotion], stamps: Sequence[Float64[np.ndarray, 
             parts.append(felt.taken(taken_s[rows], stamp_s[rows]))
     if not parts:
         raise DataError("the clock takes every sample outside the motion", expected="a smaller offset")
-    return sensed(_joined(parts), acting)
+    return distort(_joined(parts), acting)
 
 
 def _joined(parts: Sequence[SensorSamples]) -> SensorSamples:

@@ -18,7 +18,7 @@ from scipy.ndimage import median_filter, percentile_filter
 from imutool.errors import ConfigError, DataError
 from imutool.inertial.kinematics import G_W, Trajectory, continuous
 from imutool.recording import GRAVITY_M_S2, Poses, seconds
-from imutool.sensor.readings import IdealMotion
+from imutool.sensor.samples import IdealMotion
 from imutool.sensor.smoothing import Penalised, Samples
 
 MAX_GAP_S = 0.1  # a longer hole ends a stretch: nothing is invented across it

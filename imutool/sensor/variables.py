@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float64
 
-from imutool.sensor.readings import SensorSamples
+from imutool.sensor.samples import SensorSamples
 from imutool.units import AXES
 
 Variable = Callable[[SensorSamples], Float64[np.ndarray, " n"]]

@@ -18,8 +18,8 @@ from jaxtyping import Float
 from scipy.stats import chi2
 from torch import Tensor
 
-from imutool.sensor.catalogue import known, named
-from imutool.sensor.linear_effect import LinearEffect
+from imutool.sensor import catalogue
+from imutool.sensor.linear_form import LinearForm
 from imutool.sensor.signals import SignalFilter, Signals
 from imutool.training.closed_form import CORRELATED
 from imutool.training.linearised import Seen, linearise
@@ -75,7 +75,7 @@ def calibrate(
         DataError: a log without a stretch of truth that is free of gaps.
         ConfigError: a name that no effect on the sensor has.
     """
-    effects = known(sensor) if names is None else named(sensor, names)
+    effects = catalogue.trained(sensor, names)
     seen = Seen(folded(pool, part), sensor, signals_of(pool) if signals is None else signals, gyro)
     problem, gains = linearise(seen, effects, part), {}
     if names is None:
@@ -107,13 +107,13 @@ def folded(pool: Pool, part: Part) -> Pool:
     return replace(pool, names=tuple(f"{n} {k + 1}/{FOLDS}" for n in pool.names for k in range(FOLDS)), log=log)
 
 
-def _columns(effects: Sequence[LinearEffect], names: Sequence[str]) -> list[int]:
+def _columns(effects: Sequence[LinearForm], names: Sequence[str]) -> list[int]:
     """Where the parameters of some of the effects are."""
     of = [effect.name for effect in effects for _ in effect.parameters]
     return [k for k, name in enumerate(of) if name in names]
 
 
-def _choose(problem: Problem, effects: Sequence[LinearEffect]) -> dict[str, float]:
+def _choose(problem: Problem, effects: Sequence[LinearForm]) -> dict[str, float]:
     """Forward: the effect that helps most, if it helps enough, most logs, and not by chance; with what each gained."""
     gains: dict[str, float] = {}
     loss = problem.predicted([])
@@ -131,7 +131,7 @@ def _choose(problem: Problem, effects: Sequence[LinearEffect]) -> dict[str, floa
         gains[best], loss = gain, agreed[best]
 
 
-def _beyond_chance(problem: Problem, effects: Sequence[LinearEffect], names: Sequence[str]) -> bool:
+def _beyond_chance(problem: Problem, effects: Sequence[LinearForm], names: Sequence[str]) -> bool:
     """Whether the last effect's parameters are further from zero than all candidates together come by chance (Wald's test).
 
     Windows count as independent here, where the covariance takes many to say the same once: this is to keep out what nothing
@@ -145,7 +145,7 @@ def _beyond_chance(problem: Problem, effects: Sequence[LinearEffect], names: Seq
     return wald > float(chi2.isf(BY_CHANCE / len(effects), len(own)))
 
 
-def _unseen(effects: Sequence[LinearEffect], problem: Problem, covariance: Float[Tensor, "p p"]) -> tuple[str, ...]:
+def _unseen(effects: Sequence[LinearForm], problem: Problem, covariance: Float[Tensor, "p p"]) -> tuple[str, ...]:
     """Parameters no surer than their prior: the motion does not show them."""
     names = [f"{effect.name}.{parameter.name}" for effect in effects for parameter in effect.parameters]
     share = (covariance.diagonal() * problem.prior).sqrt()

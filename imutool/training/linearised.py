@@ -19,7 +19,7 @@ from torch import Tensor
 from imutool.errors import DataError
 from imutool.inertial.strapdown import GRAVITY_W
 from imutool.inertial.windows import HUBER_MEDIANS, attitudes, huber_weight, rotation_residual, velocity_residual
-from imutool.sensor.linear_effect import LinearEffect, patterns
+from imutool.sensor.linear_form import LinearForm, patterns
 from imutool.sensor.signals import Signals
 from imutool.training.closed_form import CORRELATED, REST_PRIOR, median_per_log
 from imutool.training.normal_equations import Equations, Problem
@@ -31,6 +31,25 @@ JUDGED_FROM_S: Mapping[Sensor, float] = {"gyro": 4.0, "accel": 2.0}  # drift ove
 TILT_PRIOR = 0.1  # m/s² of gravity in the truth's horizontal plane: half a degree
 MAX_SAMPLES = 150_000  # of one window length
 CHUNK = 20_000  # samples at a time
+
+
+# Standard deviations of the priors, in the parameters' units, where they are not the plausible sizes of the diagnosis: training
+# calibrates a sensor that works, and what it did not see of a drift or a nonlinearity has to stay near zero; a diagnosis looks
+# for faults. The shipped models were trained with these.
+PRIOR_STD: Mapping[str, float] = {
+    "accel_bias_drift": 0.1,
+    "accel_scale": 0.1,
+    "clock_offset": 0.01,
+    "gyro_bias_drift": 2e-3,
+    "gyro_g_sensitivity": 1e-3,
+    "gyro_quadratic": 0.02,
+}
+
+
+def prior_std(effect: LinearForm) -> Float64[np.ndarray, " p"]:
+    """Standard deviation of the prior of each parameter, which is about zero."""
+    same = PRIOR_STD.get(effect.name)
+    return effect.plausible if same is None else np.full(len(effect.parameters), same)
 
 
 @dataclass(frozen=True)
@@ -57,15 +76,15 @@ class WindowSet:
     judged: bool
 
 
-def linearise(seen: Seen, effects: Sequence[LinearEffect], part: Part) -> Problem:
+def linearise(seen: Seen, effects: Sequence[LinearForm], part: Part) -> Problem:
     """Gauss-Newton with all effects at once: first on the shortest windows, then on longer ones as well.
 
     Raises:
         DataError: a log without a window that is free of gaps.
     """
     sets, logs = _window_sets(seen, part), len(seen.pool.names)
-    plausible = np.concatenate([np.zeros(0), *(effect.plausible for effect in effects)])
-    prior = torch.from_numpy(plausible**-2.0).to(seen.pool.t)
+    std = np.concatenate([np.zeros(0), *(prior_std(effect) for effect in effects)])
+    prior = torch.from_numpy(std**-2.0).to(seen.pool.t)
     tilt_prior = [TILT_PRIOR**-2] * (seen.own_size - 3)
     own_prior = torch.tensor([REST_PRIOR[seen.sensor] ** -2] * 3 + tilt_prior).to(seen.pool.t)
     theta, own = torch.zeros_like(prior), prior.new_zeros(logs, seen.own_size)
@@ -109,7 +128,7 @@ def _window_sets(seen: Seen, part: Part) -> list[WindowSet]:
 
 
 def _equations(
-    seen: Seen, effects: Sequence[LinearEffect], theta: Float[Tensor, " p"], own: Float[Tensor, "logs o"], windows: WindowSet
+    seen: Seen, effects: Sequence[LinearForm], theta: Float[Tensor, " p"], own: Float[Tensor, "logs o"], windows: WindowSet
 ) -> Equations:
     """Normal equations of the windows of one length."""
     pool, n = seen.pool, windows.n
@@ -161,7 +180,7 @@ def _summed(e: Float[Tensor, "m 3"], J: Float[Tensor, "m 3 k"], log: Int[Tensor,
 
 
 def _terms(
-    signals: Signals, effects: Sequence[LinearEffect], index: Int[np.ndarray, "*shape"]
+    signals: Signals, effects: Sequence[LinearForm], index: Int[np.ndarray, "*shape"]
 ) -> Float64[np.ndarray, "*shape q"]:
     """The terms of some effects at some samples."""
     rows = signals.rows(index.ravel())
@@ -169,7 +188,7 @@ def _terms(
     return np.concatenate(parts, axis=1).reshape(*index.shape, -1)
 
 
-def _error(signals: Signals, effects: Sequence[LinearEffect], theta: Float64[np.ndarray, " p"]) -> Float[Tensor, "n 3"]:
+def _error(signals: Signals, effects: Sequence[LinearForm], theta: Float64[np.ndarray, " p"]) -> Float[Tensor, "n 3"]:
     """The error of every sample, a chunk at a time."""
     matrix = np.einsum("iqp,p->qi", patterns(effects), theta)
     rows = np.arange(len(signals.t_s))

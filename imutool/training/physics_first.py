@@ -23,8 +23,7 @@ from imutool.bias.model import BiasModel
 from imutool.config import build, plain
 from imutool.errors import ConfigError
 from imutool.recording import Imu, Recording, seconds
-from imutool.sensor import physics_file
-from imutool.sensor.catalogue import known, named
+from imutool.sensor import catalogue, physics_file
 from imutool.sensor.signals import SignalFilter, Signals
 from imutool.training.calibration import Calibration, calibrate
 from imutool.training.fit import Epoch
@@ -96,7 +95,7 @@ def settings_for(physics: Path) -> tuple[list[str], tuple[str, ...]]:
         ConfigError: the file cannot be read, or names no effect that `hybrid` can take off.
     """
     names = tuple(dict.fromkeys(entry.name for entry in physics_file.read(physics).effect))
-    by_sensor = {sensor: [one.name for one in known(sensor) if one.name in names] for sensor in SENSORS}
+    by_sensor = {sensor: [form.name for form in catalogue.trained(sensor) if form.name in names] for sensor in SENSORS}
     taken = {name for some in by_sensor.values() for name in some}
     if not taken:
         raise ConfigError("no effect that a bias model can take off", where=physics, expected="for instance gyro_scale")
@@ -117,8 +116,8 @@ def config_of(settings: TrainSettings) -> hybrid.Config:
         ConfigError: an unknown setting or effect (the nearest is named), or an effect on the wrong sensor.
     """
     config = build(hybrid.Config, settings.model, where="model settings of hybrid")
-    named("gyro", config.gyro_effects or ())
-    named("accel", config.accel_effects or ())
+    catalogue.trained("gyro", config.gyro_effects or ())
+    catalogue.trained("accel", config.accel_effects or ())
     return config
 
 

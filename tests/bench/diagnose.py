@@ -26,11 +26,13 @@ from itertools import product
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import msgspec
 import numpy as np
 
-from imutool.blind_cases.cases import OPENED, conceal, opened, shown_by_poses
+from imutool.blind_cases.cases import OPENED, conceal, open_case
+from imutool.blind_cases.catalogue import CATALOGUE
 from imutool.blind_cases.draw import SIZES
-from imutool.blind_cases.effects import CATALOGUE
+from imutool.blind_cases.envelope import to_truth
 from imutool.blind_cases.unnamed import FORMS
 from imutool.errors import DataError, ImutoolError
 
@@ -110,9 +112,11 @@ def diagnose(folder: Path, with_sim: bool) -> tuple[Path, float, str]:
 
 def shown(line: dict[str, Any], task: Task, trajectories: Sequence[Path]) -> bool | None:
     """Whether poses alone show an opened case; unknown without its trajectory."""
-    truth = line["truth"]
-    made_of = [path for path in trajectories if path.stem == truth.get("trajectory")]
-    return shown_by_poses(made_of[0], truth, task.effects) if made_of else None
+    from pose_detectability import detectable_from_poses
+
+    truth = to_truth(line["truth"], Path("findings.json"))
+    made_of = [path for path in trajectories if path.stem == truth.trajectory]
+    return detectable_from_poses(made_of[0], truth, task.effects) if made_of else None
 
 
 def one(number: int, folder: Path, task: Task, options: argparse.Namespace) -> dict[str, Any]:
@@ -122,7 +126,7 @@ def one(number: int, folder: Path, task: Task, options: argparse.Namespace) -> d
     line: dict[str, Any] = {"case": number, **task._asdict(), "seconds": took, "failed": failed}
     if not failed:
         try:
-            line |= opened(folder, findings)
+            line |= msgspec.to_builtins(open_case(folder, findings))
             if options.no_sim:
                 line["shown"] = shown(line, task, options.trajectories)
         except ImutoolError as error:

@@ -1,4 +1,4 @@
-"""Sealed cases of another hand: MuJoCo moves a body, and reads its own gyro and accelerometer on it.
+"""Blind cases of another generator: MuJoCo moves a body, and reads its own gyro and accelerometer on it.
 
 A heavy body flies under smooth random forces and torques. A site at its origin is what a simulation believes: an ideal IMU. The
 real one is another site: off the origin (a lever arm), turned (a mount rotation), on a small mass on springs and dampers (a
@@ -22,8 +22,9 @@ from numpy.random import Generator, default_rng
 from scipy.interpolate import make_interp_spline
 
 from imutool.blind_cases import unnamed
-from imutool.blind_cases.cases import TRUTH_SCHEMA, log, write_case
-from imutool.blind_cases.place import achievable, place
+from imutool.blind_cases.cases import TRUTH_SCHEMA, case_log, write_case
+from imutool.blind_cases.envelope import ConcealedEffect, ConcealedTruth, TrueParameter
+from imutool.blind_cases.information import achievable_rms, location
 from imutool.blind_cases.scene import POSE_RATE_HZ, RATE_HZ, SIM_SHARE, stamps_ns
 from imutool.recording import GRAVITY_M_S2, Imu, Poses, Scalars
 
@@ -80,24 +81,26 @@ def conceal_mujoco(folder: Path, *, seed: int, kind: str | None = None, duration
     sim = _imu(ideal + SIM_SHARE * NOISE * rng.standard_normal(ideal.shape))
     noisy = _imu(real + bias + NOISE * rng.standard_normal(real.shape))
     sigma = NOISE * np.hypot(1.0, SIM_SHARE)
-    told = {
-        "schema": TRUTH_SCHEMA,
-        "seed": seed,
-        "generator": "mujoco",
-        "trajectory": "mujoco",
-        "noise": "mujoco",
-        "kind": {0: "null", 1: "single", 2: "pair"}[len(effects)],
-        "size": "middle",
-        "effects": effects,
-        "bias": {"gyro": bias[:3].tolist(), "accel": bias[3:].tolist()},
-        "noise_std": {"real": NOISE.tolist(), "sim": (SIM_SHARE * NOISE).tolist()},
-        "place": place(real - ideal, sigma),
-        "achievable": achievable(real - ideal, sigma),
-    }
-    write_case(folder, log(sim, truth, scalars), log(noisy, truth, scalars), told)
+    case = ConcealedTruth(
+        schema=TRUTH_SCHEMA,
+        seed=seed,
+        generator="mujoco",
+        trajectory="mujoco",
+        noise="mujoco",
+        kind={0: "null", 1: "single", 2: "pair"}[len(effects)],
+        size="middle",
+        effects=tuple(effects),
+        came_to={},
+        bias={"gyro": tuple(bias[:3].tolist()), "accel": tuple(bias[3:].tolist())},
+        noise_std={"real": tuple(NOISE.tolist()), "sim": tuple((SIM_SHARE * NOISE).tolist())},
+        duration_s=duration_s,
+        place=location(real - ideal, sigma),
+        achievable=achievable_rms(real - ideal, sigma),
+    )
+    write_case(folder, case_log(sim, truth, scalars), case_log(noisy, truth, scalars), case)
 
 
-def drawn(kind: str, rng: Generator) -> tuple[Mounted, list[dict[str, Any]]]:
+def drawn(kind: str, rng: Generator) -> tuple[Mounted, list[ConcealedEffect]]:
     """A mount, and what it is in the catalogue's words."""
     settings: dict[str, Any] = {}
     effects = []
@@ -124,12 +127,9 @@ def drawn(kind: str, rng: Generator) -> tuple[Mounted, list[dict[str, Any]]]:
     return Mounted(**settings), effects
 
 
-def _effect(name: str, signal: str, values: dict[str, tuple[float, str]]) -> dict[str, Any]:
-    parameters = {
-        key: {"value": float(v), "unit": unit, "scale": abs(float(v)), "smallest_std": None, "identifiable": True}
-        for key, (v, unit) in values.items()
-    }
-    return {"effect": name, "signal": signal, "driver": "", "equation": "", "factor": 1.0, "parameters": parameters}
+def _effect(name: str, signal: str, values: dict[str, tuple[float, str]]) -> ConcealedEffect:
+    parameters = {key: TrueParameter(float(v), unit, abs(float(v)), None, True) for key, (v, unit) in values.items()}
+    return ConcealedEffect(name, signal, "", "", 1.0, parameters)
 
 
 def fly(mounted: Mounted, duration_s: float, rng: Generator) -> Flown:

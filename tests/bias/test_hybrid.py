@@ -17,8 +17,8 @@ from imutool.config import build as build_settings
 from imutool.debiasing import OnlineDebiaser, apply
 from imutool.errors import ConfigError, ModelError
 from imutool.recording import Imu
-from imutool.sensor.catalogue import known, named
-from imutool.sensor.linear_effect import compiled
+from imutool.sensor import catalogue
+from imutool.sensor.linear_form import compiled
 from imutool.sensor.signals import SignalFilter
 from imutool.units import SENSORS, Sensor
 
@@ -33,7 +33,7 @@ FORGOTTEN = 1e-4  # exp(-10), and a little
 
 
 def theta_of(sensor: Sensor, names: tuple[str, ...], seed: int = 5) -> np.ndarray:
-    plausible = np.concatenate([np.zeros(0), *(effect.plausible for effect in named(sensor, names))])
+    plausible = np.concatenate([np.zeros(0), *(effect.plausible for effect in catalogue.trained(sensor, names))])
     return plausible * np.random.default_rng(seed).normal(size=len(plausible))
 
 
@@ -50,7 +50,7 @@ def model_of(build: MakeModel, names: dict[Sensor, tuple[str, ...]] | None = Non
 def by_hand(sensor: Sensor, seen: Segment) -> np.ndarray:
     """E of the first element of a batch."""
     t, gyro, accel = (value[0].numpy() for value in (seen.t, seen.gyro, seen.accel))
-    error: np.ndarray = compiled(named(sensor, NAMES[sensor]), theta_of(sensor, NAMES[sensor]))(
+    error: np.ndarray = compiled(catalogue.trained(sensor, NAMES[sensor]), theta_of(sensor, NAMES[sensor]))(
         SignalFilter(RATE_HZ)(t, gyro, accel)
     )
     return error
@@ -213,7 +213,9 @@ def test_it_does_not_start_from_a_matrix(build: MakeModel) -> None:
 
 
 def test_every_known_effect_can_be_held_at_once(build: MakeModel, seen: Segment, tmp_path: Path) -> None:
-    everything: dict[Sensor, tuple[str, ...]] = {sensor: tuple(effect.name for effect in known(sensor)) for sensor in SENSORS}
+    everything: dict[Sensor, tuple[str, ...]] = {
+        sensor: tuple(effect.name for effect in catalogue.trained(sensor)) for sensor in SENSORS
+    }
     model = model_of(build, everything)
     save(model, tmp_path / "all.safetensors")
     assert torch.isfinite(load(tmp_path / "all.safetensors")(seen)).all()

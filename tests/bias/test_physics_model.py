@@ -48,7 +48,7 @@ EFFECTS: Mapping[str, tuple[Mapping[str, float], float]] = {
 
 
 def entry(name: str, values: Mapping[str, float], std: float | None = None) -> Entry:
-    (physics,) = catalogue.physics([name])
+    (physics,) = catalogue.effects([name])
     units = {number.name: number.unit for number in physics.parameters}
     return Entry(name=name, parameters={key: Value(value=v, std=std, unit=units[key]) for key, v in values.items()})
 

@@ -1,4 +1,4 @@
-"""Sealed cases: forward models against closed forms, what a seal holds, what logs must not tell, what a score says."""
+"""Blind cases: forward models against closed forms, the envelope, what logs must not reveal, the score."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 import pytest
 from numpy.random import default_rng
@@ -19,14 +20,14 @@ from scipy.interpolate import make_interp_spline
 from scipy.spatial.transform import Rotation
 
 from imutool.blind_cases import draw, unnamed
-from imutool.blind_cases.amounts import drawn
-from imutool.blind_cases.cases import ENVELOPE, FINDINGS, KEY, OPENED, REAL, SIM, conceal, opened, shown_by_poses
-from imutool.blind_cases.effects import ACCEL, CATALOGUE, EARTH_RAD_S, GYRO, NO_LIMIT, Reading
-from imutool.blind_cases.envelope import unsealed
-from imutool.blind_cases.filters import first_order, mount
-from imutool.blind_cases.information import FALSE_ALARM, bounds, poses_power, sight, visible
-from imutool.blind_cases.motion import Felt, smoother
-from imutool.blind_cases.scene import POSE_RATE_HZ, RATE_HZ, SIM_SHARE, Scene, set_up
+from imutool.blind_cases.cases import ENVELOPE, FINDINGS, KEY, OPENED, REAL, SIM, conceal, open_case
+from imutool.blind_cases.catalogue import CATALOGUE, NO_LIMIT
+from imutool.blind_cases.draw import draw_parameters
+from imutool.blind_cases.effects import ACCEL, EARTH_RAD_S, GYRO, Reading, first_order, spring_mount
+from imutool.blind_cases.envelope import to_truth, unseal
+from imutool.blind_cases.information import FALSE_ALARM, cramer_rao_bounds, detectability, detectable_misfit
+from imutool.blind_cases.motion import Kinematics, smoother
+from imutool.blind_cases.scene import POSE_RATE_HZ, RATE_HZ, SIM_SHARE, Scene, place_scene
 from imutool.blind_cases.score import score
 from imutool.errors import ConfigError, DataError
 from imutool.mcap_io.log import Log
@@ -42,9 +43,41 @@ FILTER = 2e-3  # straight lines between samples 1 ms apart, for sines of some he
 TURN_RAD_S, RADIUS_M = 0.8, 2.0
 SEED = 918273645546372819
 FLIGHT_S = 30.0
+WHERE = Path("findings.json")
 
 ROOT = Path(__file__).parents[2]
 MAY_IMPORT = {"imutool.errors", "imutool.recording", "imutool.noise.datasheet", "imutool.mcap_io"}
+
+
+def as_json(report: msgspec.Struct) -> dict[str, Any]:
+    """A report as its reader gets it."""
+    values: dict[str, Any] = json.loads(msgspec.json.encode(report))
+    return values
+
+
+def unsealed(case: Path) -> dict[str, Any]:
+    return as_json(unseal(case / ENVELOPE, case / KEY))
+
+
+def opened(case: Path) -> dict[str, Any]:
+    return as_json(open_case(case))
+
+
+def scored(truth: dict[str, Any], findings: dict[str, Any]) -> dict[str, Any]:
+    return as_json(score(to_truth(truth, WHERE), findings, WHERE))
+
+
+def _bench(name: str) -> Any:
+    """A module of tests/bench, which is no package."""
+    spec = importlib.util.spec_from_file_location(f"bench_{name}", ROOT / "tests/bench" / f"{name}.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = sys.modules[spec.name] = importlib.util.module_from_spec(spec)  # dataclasses look their module up
+    spec.loader.exec_module(module)
+    return module
+
+
+POSES = _bench("pose_detectability")
 
 
 # ── the generator's own hand ──
@@ -76,11 +109,11 @@ def circle() -> Poses:
 @pytest.fixture(scope="module")
 def scene() -> Scene:
     """A made-up flight."""
-    return set_up(smoother(flight(3, duration_s=FLIGHT_S).truth), draw.GRADES["bmi160"], default_rng(0), 60.0)
+    return place_scene(smoother(flight(3, duration_s=FLIGHT_S).truth), draw.GRADES["bmi160"], default_rng(0), 60.0)
 
 
 def test_a_circle_is_felt_as_mechanics_says(circle: Poses) -> None:
-    felt = smoother(circle).motion().felt(np.arange(2.0, 38.0, 0.005))
+    felt = smoother(circle).motion().kinematics(np.arange(2.0, 38.0, 0.005))
     # the body's x axis points outwards: the centripetal acceleration is -w² r along it
     assert np.abs(felt.omega - [0.0, 0.0, TURN_RAD_S]).max() < SPLINE
     assert np.abs(felt.alpha).max() < 10 * SPLINE
@@ -92,17 +125,17 @@ def test_outliers_and_gaps_of_the_poses_leave_no_jerk(circle: Poses) -> None:
     p[::97] += 0.5
     kept = np.ones(len(p), dtype=bool)
     kept[1500:1600] = False
-    felt = smoother(replace(circle, p_wb=p).rows(kept)).motion().felt(np.arange(2.0, 38.0, 0.005))
+    felt = smoother(replace(circle, p_wb=p).rows(kept)).motion().kinematics(np.arange(2.0, 38.0, 0.005))
     assert np.abs(felt.f - [-(TURN_RAD_S**2) * RADIUS_M, 0.0, GRAVITY_M_S2]).max() < 0.02
 
 
 def test_derivatives_are_those_of_the_motion(scene: Scene) -> None:
     t, h = np.arange(1.0, 20.0, 0.1), 1e-5
-    before, after = scene.felt(t - h), scene.felt(t + h)
-    assert np.abs((after.omega - before.omega) / (2 * h) - scene.felt(t).alpha).max() < 1e-5
+    before, after = scene.kinematics(t - h), scene.kinematics(t + h)
+    assert np.abs((after.omega - before.omega) / (2 * h) - scene.kinematics(t).alpha).max() < 1e-5
     turn = np.einsum("nji,njk->nik", before.R_wb, after.R_wb)
     omega = np.stack([turn[:, 2, 1] - turn[:, 1, 2], turn[:, 0, 2] - turn[:, 2, 0], turn[:, 1, 0] - turn[:, 0, 1]], axis=1)
-    assert np.abs(omega / (4 * h) - scene.felt(t).omega).max() < 1e-5
+    assert np.abs(omega / (4 * h) - scene.kinematics(t).omega).max() < 1e-5
 
 
 # ── each model against its closed form ──
@@ -110,7 +143,7 @@ def test_derivatives_are_those_of_the_motion(scene: Scene) -> None:
 T = np.array([0.0, 10.0, 20.0])
 OMEGA, ALPHA, F = np.array([0.3, -0.5, 2.0]), np.array([0.4, 0.1, -0.2]), np.array([1.0, -2.0, 9.0])
 R_WB = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])  # a quarter turn about z
-FELT = Felt(T, np.tile(OMEGA, (3, 1)), np.tile(ALPHA, (3, 1)), np.tile(F, (3, 1)), np.tile(R_WB, (3, 1, 1)))
+FELT = Kinematics(T, np.tile(OMEGA, (3, 1)), np.tile(ALPHA, (3, 1)), np.tile(F, (3, 1)), np.tile(R_WB, (3, 1, 1)))
 BOTH = np.tile(np.concatenate([OMEGA, F]), (3, 1))
 READING = Reading(T, BOTH, {"/imu0/temperature": np.array([25.0, 30.0, 40.0])})
 NONE3 = np.zeros(3)
@@ -202,7 +235,7 @@ def test_a_filter_has_the_gain_and_the_delay_of_its_formula() -> None:
     assert np.abs(late - np.sin(2 * np.pi * 4.0 * t[10_000:] - np.pi / 4) / np.sqrt(2.0)).max() < FILTER
     ramp = first_order(t[:, None], 1000.0, 4.0)[10_000:, 0]
     assert np.abs(t[10_000:] - ramp - 1.0 / (2 * np.pi * 4.0)).max() < 1e-9  # a ramp is late by the time constant
-    on_mount = mount(sine, 1000.0, 4.0, 0.1)[15_000:, 0]
+    on_mount = spring_mount(sine, 1000.0, 4.0, 0.1)[15_000:, 0]
     assert np.abs(on_mount).max() == pytest.approx(np.sqrt(1.0 + 0.2**2) / 0.2, abs=10 * FILTER)  # at resonance
 
 
@@ -221,26 +254,26 @@ def test_models_act_in_the_stated_order(scene: Scene) -> None:
     acting = [(CATALOGUE["gyro_scale"], np.full(3, 0.1)), (CATALOGUE["mount_rotation"], np.array([0.0, 0.0, np.pi / 2]))]
     ideal = scene.ideal(scene.t_s)
     expected = 1.1 * np.stack([ideal[:, 1], -ideal[:, 0], ideal[:, 2]], axis=1)
-    assert np.abs(scene.arriving(acting, scene.t_s)[:, GYRO] - expected).max() < EXACT
+    assert np.abs(scene.converter_input(acting, scene.t_s)[:, GYRO] - expected).max() < EXACT
 
 
 def test_a_late_clock_reads_the_motion_of_that_time(scene: Scene) -> None:
     t = scene.t_s
-    late = scene.arriving([(CATALOGUE["clock_offset"], np.array([0.05]))], t)
+    late = scene.converter_input([(CATALOGUE["clock_offset"], np.array([0.05]))], t)
     assert np.abs(late - scene.ideal(t + 0.05)).max() < EXACT
 
 
 def test_filters_on_the_way_agree_with_the_slow_limit(scene: Scene) -> None:
-    late = scene.arriving([(CATALOGUE["low_pass"], np.array([100.0]))], scene.t_s)
+    late = scene.converter_input([(CATALOGUE["low_pass"], np.array([100.0]))], scene.t_s)
     assert np.abs(late - scene.ideal(scene.t_s - 1.0 / (200.0 * np.pi)))[200:].max() < 0.02  # far below its cut-off: a delay
 
 
 def test_a_driven_column_follows_its_channel_late(scene: Scene) -> None:
     model, theta = unnamed.driven(default_rng(5), {topic: float(v.std()) for topic, v in scene.channels.items()})
     t = scene.t_s[200:]
-    added = (scene.arriving([(model, theta)], scene.t_s) - scene.ideal(scene.t_s))[200:]
+    added = (scene.converter_input([(model, theta)], scene.t_s) - scene.ideal(scene.t_s))[200:]
     column = int(np.argmax(np.abs(added).max(axis=0)))
-    grid = scene.at(scene.t_s)[model.driver]
+    grid = scene.channels_at(scene.t_s)[model.driver]
     assert np.abs(added[:, column] - theta[0] * np.interp(t - theta[1], scene.t_s, grid)).max() < 1e-9
     assert np.abs(np.delete(added, column, axis=1)).max() == 0.0
 
@@ -248,7 +281,7 @@ def test_a_driven_column_follows_its_channel_late(scene: Scene) -> None:
 @pytest.mark.parametrize("form", sorted(unnamed.FORMS))
 def test_an_unknown_term_is_on_one_column_and_says_its_equation(scene: Scene, form: str) -> None:
     model, theta = unnamed.unknown(default_rng(1), form)
-    added = scene.arriving([(model, theta)], scene.t_s) - scene.ideal(scene.t_s)
+    added = scene.converter_input([(model, theta)], scene.t_s) - scene.ideal(scene.t_s)
     assert np.count_nonzero(np.abs(added).max(axis=0)) == 1
     assert model.equation.startswith(f"{model.signal}.")
 
@@ -258,15 +291,15 @@ def test_an_unknown_term_is_on_one_column_and_says_its_equation(scene: Scene, fo
 
 def test_what_a_test_sees_every_second_time() -> None:
     # one parameter: |z| beyond 3.2905 half of the time means z centred there
-    assert visible(1) == pytest.approx(3.2905**2, rel=1e-3)
-    draws = default_rng(0).noncentral_chisquare(9, visible(9), 200_000)
+    assert detectable_misfit(1) == pytest.approx(3.2905**2, rel=1e-3)
+    draws = default_rng(0).noncentral_chisquare(9, detectable_misfit(9), 200_000)
     from scipy.stats import chi2
 
     assert np.mean(draws > chi2.isf(FALSE_ALARM, 9)) == pytest.approx(0.5, abs=0.005)  # four standard errors
 
 
 def test_the_bound_of_a_scale_is_that_of_a_straight_line(scene: Scene) -> None:
-    (std,) = bounds(scene, [(CATALOGUE["gyro_scale"], np.full(3, 0.01))])
+    (std,) = cramer_rao_bounds(scene, [(CATALOGUE["gyro_scale"], np.full(3, 0.01))])
     omega = scene.ideal(scene.t_s)[:, GYRO]
     sigma = scene.noise[:3] * np.hypot(1.0, SIM_SHARE)
     assert std is not None
@@ -274,48 +307,52 @@ def test_the_bound_of_a_scale_is_that_of_a_straight_line(scene: Scene) -> None:
 
 
 def test_what_a_motion_cannot_show_has_no_bound(circle: Poses) -> None:
-    planar = set_up(smoother(circle), draw.GRADES["bmi160"], default_rng(0), 30.0)
+    planar = place_scene(smoother(circle), draw.GRADES["bmi160"], default_rng(0), 30.0)
     turning = replace(planar, noise=np.ones(6))
-    (std,) = bounds(turning, [(CATALOGUE["gyro_scale"], np.full(3, 0.01))])
+    (std,) = cramer_rao_bounds(turning, [(CATALOGUE["gyro_scale"], np.full(3, 0.01))])
     assert std is not None
     assert std.min() > 1.0  # a constant turn tells a scale from a bias no more than rest does
 
 
 @pytest.mark.parametrize("name", ["gyro_scale", "lever_arm", "clock_jump"])
 def test_sizes_are_what_they_say(scene: Scene, name: str) -> None:
-    seen, model = sight(scene), CATALOGUE[name]
+    seen, model = detectability(scene), CATALOGUE[name]
     ideal = scene.ideal(seen.t_s)
-    theta = drawn(model, default_rng(2), ideal, scene.noise, scene.duration_s)
+    theta = draw_parameters(model, default_rng(2), ideal, scene.noise, scene.duration_s)
     amounts = model.amounts
     used = theta[amounts] / model.plausible[amounts]
     assert np.sqrt(np.mean(used[used != 0.0] ** 2)) == pytest.approx(1.0)
-    middle = draw._sized(seen, model, theta, "middle")
-    small = draw._sized(seen, model, theta, "small")
+    middle = draw.sized(seen, model, theta, "middle")
+    small = draw.sized(seen, model, theta, "small")
     assert middle is not None
     assert small is not None
     assert middle[0][amounts] == pytest.approx(0.25 * theta[amounts])
-    left, _ = seen.told_apart(model, small[0])
-    assert left == pytest.approx(draw.CLEAR**2 * visible(int(amounts.sum())), rel=0.2)
+    left, _ = seen.distinct_misfit(model, small[0])
+    assert left == pytest.approx(draw.CLEAR**2 * detectable_misfit(int(amounts.sum())), rel=0.2)
     assert small[1] < 0.25
 
 
 def test_what_cannot_be_seen_is_not_drawn(scene: Scene) -> None:
     with pytest.raises(DataError, match="earth_rotation"):
-        draw.concealed(sight(scene), default_rng(0), "single", "large", ["earth_rotation"])
+        draw.draw_effects(detectability(scene), default_rng(0), "single", "large", ["earth_rotation"])
 
 
 def test_poses_without_noise_show_what_a_simulation_shows_and_noisy_ones_less(scene: Scene) -> None:
     model = CATALOGUE["lever_arm"]
     acting = [(model, np.array([0.05, -0.02, 0.03]))]
-    noiseless, good, bad = (sight(scene, size).seen(acting) for size in ((0.0, 0.0), (1e-4, 1e-4), (2e-3, 5e-3)))
-    beside_simulation = sight(scene).seen(acting) * (1.0 + SIM_SHARE**2)  # whose own noise the poses do not have
+    noiseless, good, bad = (
+        POSES.beside_poses(scene, size).squared_misfit(acting) for size in ((0.0, 0.0), (1e-4, 1e-4), (2e-3, 5e-3))
+    )
+    beside_simulation = detectability(scene).squared_misfit(acting) * (
+        1.0 + SIM_SHARE**2
+    )  # whose own noise the poses do not have
     assert noiseless == pytest.approx(beside_simulation, rel=1e-6)
     assert noiseless > good > 5.0 * bad
 
 
 def test_power_of_poses_is_that_of_their_derivatives(scene: Scene) -> None:
     f_hz, noise, size = np.array([0.0, 5.0]), np.zeros(6), (1e-3, 2e-3)
-    still, fast = poses_power(f_hz, noise, size)
+    still, fast = POSES.pose_noise_power(f_hz, noise, size)
     omega = 2.0 * np.pi * 5.0
     assert still[:3] == pytest.approx(0.0)
     assert fast[:3] == pytest.approx(omega**2 * 4e-6 / POSE_RATE_HZ)
@@ -324,16 +361,16 @@ def test_power_of_poses_is_that_of_their_derivatives(scene: Scene) -> None:
 
 
 def test_a_case_drawn_beside_a_simulation_is_shown_by_good_poses_and_not_by_bad_ones(scene: Scene) -> None:
-    what = draw.concealed(sight(scene), default_rng(0), "single", "small", ["accel_scale"])
-    assert draw.shown(sight(scene, (1e-6, 1e-7)), what)
-    assert not draw.shown(sight(scene, (5e-3, 1e-1)), what)
-    assert draw.shown(sight(scene, (5e-3, 1e-1)), draw.Concealed("null", "middle"))
+    what = draw.draw_effects(detectability(scene), default_rng(0), "single", "small", ["accel_scale"])
+    assert POSES.is_detectable(POSES.beside_poses(scene, (1e-6, 1e-7)), what)
+    assert not POSES.is_detectable(POSES.beside_poses(scene, (5e-3, 1e-1)), what)
+    assert POSES.is_detectable(POSES.beside_poses(scene, (5e-3, 1e-1)), draw.Concealed("null", "middle"))
 
 
 def test_pairs_hold_two_different_things(scene: Scene) -> None:
-    seen = sight(scene)
+    seen = detectability(scene)
     for seed in range(5):
-        (one, _), (other, _) = draw.concealed(seen, default_rng(seed), "pair", "large").acting
+        (one, _), (other, _) = draw.draw_effects(seen, default_rng(seed), "pair", "large").acting
         assert one.name != other.name
         assert not any({one.name, other.name} <= row for row in draw.ALIKE)
 
@@ -373,12 +410,12 @@ def cases(trajectory: Path, tmp_path_factory: pytest.TempPathFactory) -> list[Pa
 
 
 def _kinds(case: Path) -> set[str]:
-    return {one["effect"] for one in unsealed(case / ENVELOPE, case / KEY)["effects"]}
+    return {one["effect"] for one in unsealed(case)["effects"]}
 
 
 def test_an_envelope_gives_back_what_was_put_in(cases: list[Path]) -> None:
     for case, asked in zip(cases, CASES, strict=True):
-        truth = unsealed(case / ENVELOPE, case / KEY)
+        truth = unsealed(case)
         assert asked["kind"] in (truth["kind"], "any")
         assert {one["effect"] for one in truth["effects"]} >= set(asked.get("effects", ()))
         assert len(truth["effects"]) == {"null": 0, "pair": 2}.get(truth["kind"], 1)
@@ -386,7 +423,7 @@ def test_an_envelope_gives_back_what_was_put_in(cases: list[Path]) -> None:
 
 def test_the_logs_hold_what_the_truth_says(cases: list[Path]) -> None:
     case = next(case for case in cases if _kinds(case) == {"gyro_scale"})
-    truth = unsealed(case / ENVELOPE, case / KEY)
+    truth = unsealed(case)
     sim, real = read(case / SIM).imu, read(case / REAL).imu
     scale = [truth["effects"][0]["parameters"][axis]["value"] for axis in "xyz"]
     left = real.gyro - sim.gyro * (1.0 + np.array(scale)) - truth["bias"]["gyro"]
@@ -445,10 +482,11 @@ def case(cases: list[Path], tmp_path: Path) -> Path:
 
 def test_an_opened_case_is_planned_again_by_its_seed(cases: list[Path], trajectory: Path) -> None:
     for k in (0, 5):
-        truth = unsealed(cases[k] / ENVELOPE, cases[k] / KEY)
-        assert isinstance(shown_by_poses(trajectory, truth, CASES[k].get("effects", ())), bool)
+        truth = unsealed(cases[k])
+        assert isinstance(POSES.detectable_from_poses(trajectory, to_truth(truth, WHERE), CASES[k].get("effects", ())), bool)
+    other = to_truth({**truth, "effects": [_concealed("none", "gyro")]}, WHERE)
     with pytest.raises(DataError, match="not made of this"):
-        shown_by_poses(trajectory, {**truth, "effects": [{"effect": "none"}]}, CASES[k].get("effects", ()))
+        POSES.detectable_from_poses(trajectory, other, CASES[k].get("effects", ()))
 
 
 def _findings(findings: list[dict[str, Any]], located: list[dict[str, Any]] | None = None, **more: Any) -> dict[str, Any]:
@@ -476,7 +514,7 @@ def test_a_change_of_anything_sealed_is_noticed(case: Path, changed: str) -> Non
 @pytest.mark.parametrize(("off", "gain"), [(0.0, 1.0), (0.1, 0.99), (1.0, 0.0), (-1.0, 0.0)])
 def test_the_gain_is_what_our_own_model_of_the_findings_explains(case: Path, off: float, gain: float) -> None:
     """A scale that is wrong by a share leaves the square of it, whatever the findings say of themselves."""
-    true = unsealed(case / ENVELOPE, case / KEY)["effects"][0]["parameters"]
+    true = unsealed(case)["effects"][0]["parameters"]
     told = {axis: ((1.0 + off) * true[axis]["value"], 0.1) for axis in "xyz"}
     (case / FINDINGS).write_text(json.dumps(_findings([_finding("gyro_scale", "gyro", **told)])))
     assert opened(case)["gain"] == pytest.approx(gain, abs=1e-6)  # the spline through poses 10 ms apart is that good
@@ -497,7 +535,7 @@ def test_findings_changed_after_the_opening_are_refused(case: Path) -> None:
 
 def test_a_case_is_never_overwritten(case: Path, trajectory: Path) -> None:
     before = {path.name: path.read_bytes() for path in case.iterdir()}
-    with pytest.raises(ConfigError, match="lies there already"):
+    with pytest.raises(ConfigError, match="holds a case already"):
         conceal(trajectory, case, seed=1)
     assert {path.name: path.read_bytes() for path in case.iterdir()} == before
 
@@ -512,7 +550,7 @@ def test_a_wrong_word_is_refused_and_leaves_nothing(trajectory: Path, tmp_path: 
 
 
 def test_noise_of_nothing_is_refused(trajectory: Path, tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match="told against noise"):
+    with pytest.raises(ConfigError, match="sized by it"):
         conceal(trajectory, tmp_path / "case", seed=1, noise="none")
 
 
@@ -541,16 +579,6 @@ def test_the_command_conceals_and_opens(
 # ── the benchmark, and the second generator ──
 
 
-def _bench(name: str) -> Any:
-    """A module of tests/bench, which is no package."""
-    spec = importlib.util.spec_from_file_location(f"bench_{name}", ROOT / "tests/bench" / f"{name}.py")
-    assert spec is not None
-    assert spec.loader is not None
-    module = sys.modules[spec.name] = importlib.util.module_from_spec(spec)  # dataclasses look their module up
-    spec.loader.exec_module(module)
-    return module
-
-
 def test_cases_are_dealt_in_proportion_whatever_their_number() -> None:
     bench = _bench("diagnose")
     deck = bench.deck()
@@ -568,8 +596,8 @@ def test_cases_are_dealt_in_proportion_whatever_their_number() -> None:
 def test_a_line_of_scores_becomes_a_row() -> None:
     bench = _bench("diagnose")
     said = _findings([_finding("gyro_scale", "gyro", x=(0.12, 0.01), y=(-0.2, 0.01))])
-    line = {"case": 0, "effects": ["gyro_scale"], "seconds": 2.0, "failed": "", **score(_truth(SCALE), said, WHERE)}
-    wrong = {**line, **score(_truth(SCALE), _findings([_finding("low_pass", "gyro")]), WHERE)}
+    line = {"case": 0, "effects": ["gyro_scale"], "seconds": 2.0, "failed": "", **scored(_truth(SCALE), said)}
+    wrong = {**line, **scored(_truth(SCALE), _findings([_finding("low_pass", "gyro")]))}
     cells = dict(zip(bench.HEAD, bench.row("all", [line, wrong]), strict=True))
     assert cells["n"] == "2"
     assert cells["detected"] == "100 %"
@@ -633,9 +661,16 @@ def _truth(*effects: dict[str, Any], kind: str = "single") -> dict[str, Any]:
     something = {"seconds": "..##?.", "axes": {"x": "#", "y": "?", "z": "."}, "localised": True}
     quiet = {"rms_before": 0.1, "rms_after": 0.1}
     return {
+        "schema": "imutool.sealed_truth/1",
+        "seed": 1,
+        "trajectory": "flight",
+        "noise": "bmi160",
         "kind": kind,
         "size": "middle",
         "effects": list(effects),
+        "came_to": {},
+        "bias": {"gyro": [0.0] * 3, "accel": [0.0] * 3},
+        "duration_s": 6.0,
         "place": {"window_s": 1.0, "gyro": something if effects else nothing, "accel": nothing},
         "achievable": {"gyro": {"rms_before": 0.5, "rms_after": 0.1} if effects else quiet, "accel": quiet},
         "noise_std": {"real": [0.1] * 6, "sim": [0.03] * 6},
@@ -647,18 +682,17 @@ def _concealed(effect: str, signal: str, driver: str = "", **values: float) -> d
         name: {"value": value, "unit": "-", "scale": abs(value), "smallest_std": 0.01, "identifiable": True}
         for name, value in values.items()
     }
-    return {"effect": effect, "signal": signal, "driver": driver, "parameters": parameters}
+    return {"effect": effect, "signal": signal, "driver": driver, "equation": "", "factor": 1.0, "parameters": parameters}
 
 
 SCALE = _concealed("gyro_scale", "gyro", x=0.1, y=-0.2)
-WHERE = Path("findings.json")
 
 
 def test_all_right_scores_in_full() -> None:
     located = [{"signal": "gyro", "axes": ["x"], "intervals_s": [[2.0, 4.0]], "regime": "", "share": 1.0, "p_value": 0.0}]
     closer = {"gyro": {"rms_before": 0.5, "rms_after": 0.1, "unit": "rad/s", "seconds": 10.0}}
     said = _findings([_finding("gyro_scale", "gyro", x=(0.12, 0.01), y=(-0.2, 0.01))], located, closer=closer)
-    out = score(_truth(SCALE), said, WHERE)
+    out = scored(_truth(SCALE), said)
     assert (out["right"], out["detected"], out["precision"], out["recall"]) == (True, True, 1.0, 1.0)
     assert out["place"] == {"seconds_f1": 1.0, "axes_f1": 1.0, "f1": 1.0}
     assert [row["sigmas"] for row in out["parameters"]] == pytest.approx([2.0, 0.0])
@@ -669,7 +703,7 @@ def test_all_right_scores_in_full() -> None:
 
 
 def test_a_wrong_name_is_a_miss_and_a_false_finding() -> None:
-    out = score(_truth(SCALE), _findings([_finding("gyro_quadratic", "gyro")]), WHERE)
+    out = scored(_truth(SCALE), _findings([_finding("gyro_quadratic", "gyro")]))
     assert (out["right"], out["hits"], out["missing"], out["wrong"]) == (False, [], ["gyro_scale"], ["gyro_quadratic"])
     assert (out["precision"], out["recall"]) == (0.0, 0.0)
     assert out["place"]["seconds_f1"] == 0.0
@@ -679,41 +713,41 @@ def test_a_wrong_name_is_a_miss_and_a_false_finding() -> None:
 
 def test_a_missing_one_and_an_extra_one() -> None:
     pair = _truth(SCALE, _concealed("lever_arm", "accel", x=0.1), kind="pair")
-    out = score(pair, _findings([_finding("gyro_scale", "gyro", x=(0.1, 0.01))]), WHERE)
+    out = scored(pair, _findings([_finding("gyro_scale", "gyro", x=(0.1, 0.01))]))
     assert (out["right"], out["missing"], out["wrong"], out["precision"], out["recall"]) == (False, ["lever_arm"], [], 1.0, 0.5)
     assert out["untold"] == ["gyro_scale.y"]
-    extra = score(_truth(SCALE), _findings([_finding("gyro_scale", "gyro"), _finding("low_pass", "gyro")]), WHERE)
+    extra = scored(_truth(SCALE), _findings([_finding("gyro_scale", "gyro"), _finding("low_pass", "gyro")]))
     assert (extra["right"], extra["wrong"], extra["precision"], extra["recall"]) == (False, ["low_pass"], 0.5, 1.0)
 
 
 def test_nothing_where_nothing_is_and_a_bias_is_no_news() -> None:
-    out = score(_truth(kind="null"), _findings([]), WHERE)
+    out = scored(_truth(kind="null"), _findings([]))
     assert (out["right"], out["detected"], out["precision"], out["recall"], out["gain"]) == (True, False, None, None, None)
     assert out["place"]["f1"] is None
-    assert score(_truth(kind="null"), _findings([_finding("gyro_bias", "gyro")]), WHERE)["right"]
-    false = score(_truth(kind="null"), _findings([_finding("unknown", "gyro")]), WHERE)
+    assert scored(_truth(kind="null"), _findings([_finding("gyro_bias", "gyro")]))["right"]
+    false = scored(_truth(kind="null"), _findings([_finding("unknown", "gyro")]))
     assert (false["right"], false["wrong"]) == (False, ["unknown"])
 
 
 def test_a_driver_must_be_the_right_one() -> None:
     truth = _truth(_concealed("driven", "gyro", "/motor/current", gain=0.1, lag=0.2))
     field = _finding("driven", "gyro", "/motor/current.data", gain=(0.1, 0.01), delay=(0.2, 0.1))
-    out = score(truth, _findings([field]), WHERE)
+    out = scored(truth, _findings([field]))
     assert out["right"]
     assert [row["parameter"] for row in out["parameters"]] == ["gain", "lag"]
-    assert not score(truth, _findings([_finding("driven", "gyro", "/motor/currents")]), WHERE)["right"]
+    assert not scored(truth, _findings([_finding("driven", "gyro", "/motor/currents")]))["right"]
 
 
 def test_a_place_half_found_scores_by_its_f1() -> None:
     located = [{"signal": "gyro", "axes": ["x", "z"], "intervals_s": [[0.0, 3.0]], "regime": "", "share": 1.0, "p_value": 0.0}]
-    out = score(_truth(SCALE), _findings([], located), WHERE)
+    out = scored(_truth(SCALE), _findings([], located))
     # seconds 0 and 1 are false, 2 is right, 3 is missed; of the axes x is right and z is false
     assert out["place"] == pytest.approx({"seconds_f1": 2.0 / 5.0, "axes_f1": 2.0 / 3.0, "f1": (2.0 / 5.0 + 2.0 / 3.0) / 2.0})
 
 
 def test_a_line_told_as_sine_and_cosine_is_compared_by_its_amplitude() -> None:
     truth = _truth(_concealed("vibration", "accel", accel_x=5.0))
-    out = score(truth, _findings([_finding("vibration", "accel", sin_x=(3.0, 0.1), cos_x=(4.0, 0.1))]), WHERE)
+    out = scored(truth, _findings([_finding("vibration", "accel", sin_x=(3.0, 0.1), cos_x=(4.0, 0.1))]))
     assert [(row["value"], row["std"]) for row in out["parameters"]] == [(pytest.approx(5.0), pytest.approx(0.1))]
 
 
@@ -729,4 +763,4 @@ def test_a_line_told_as_sine_and_cosine_is_compared_by_its_amplitude() -> None:
 )
 def test_findings_that_are_none_are_refused(said: dict[str, Any]) -> None:
     with pytest.raises(DataError):
-        score(_truth(SCALE), said, WHERE)
+        scored(_truth(SCALE), said)

@@ -27,7 +27,7 @@ from imutool.recording import Recording
 from imutool.sensor import physics_file
 from imutool.sensor.flight import flight
 from imutool.sensor.physics_file import Bias, Entry, PhysicsFile, Value
-from imutool.sensor.readings import SensorSamples
+from imutool.sensor.samples import SensorSamples
 from imutool.sensor.simulate import simulate
 
 ARM_M = np.array([0.2, -0.1, 0.05])

@@ -13,7 +13,7 @@ from imutool.diagnosis.estimation.forward_cache import ForwardPass, bound, free,
 from imutool.diagnosis.estimation.gauss_newton import fit
 from imutool.diagnosis.estimation.jacobians import Jacobians, effect_jacobian
 from imutool.diagnosis.estimation.whitening import Band, Whitener
-from imutool.sensor.effect import Effect, Stage, Theta, read
+from imutool.sensor.effect import Effect, Stage, Theta, simulate_samples
 
 ROUNDED = 1e-6  # of the largest derivative: differences of numbers to sixteen digits, over steps of a thousandth
 AROUND = {  # effects of every stage, so that each is asked with others before and behind it
@@ -29,7 +29,7 @@ SECONDS = 20.0
 
 def evaluated(pair: Pair, chosen: tuple[tuple[Effect, Theta], ...]) -> np.ndarray:
     """From the start, nothing remembered."""
-    got = read(
+    got = simulate_samples(
         type(pair.felt)(*(getattr(pair.felt, n) for n in ("t_s", "gyro", "accel", "alpha", "R_wb"))), pair.stamp_s, chosen
     )
     return np.concatenate([got.gyro, got.accel], axis=1)
@@ -39,7 +39,7 @@ def start(physics: Effect, pair: Pair) -> Theta:
     """Where a fit of it would begin, or a tenth of its plausible size."""
     if physics.starts is None:
         return 0.1 * physics.plausible
-    got = read(pair.felt, pair.stamp_s, ())
+    got = simulate_samples(pair.felt, pair.stamp_s, ())
     return np.asarray(physics.starts(pair.felt, got.but(pair.real[:, :3], pair.real[:, 3:]))[0], dtype=float)
 
 

@@ -152,13 +152,13 @@ def test_a_fit_never_ends_worse_than_it_began() -> None:
     pair = planted.pair(planted.rich(), {"mount_rotation": [0.05, 0.02, -0.03]}, 11)
     log = planted.weighed(pair)
     for name in ("low_pass", "clock_offset", "gyro_scale", "size_effect"):
-        physics = catalogue.physics([name])[0]
+        physics = catalogue.diagnosed([name])[0]
         start = np.array([5.0]) if name == "low_pass" else physics.null_value.astype(float)
         began = fit([log], ((physics, start),), iterations=0)
         assert fit([log], ((physics, start),)).objective <= began.objective
 
 
-@pytest.mark.parametrize("physics", catalogue.physics(), ids=lambda one: one.name)
+@pytest.mark.parametrize("physics", catalogue.diagnosed(), ids=lambda one: one.name)
 def test_parameters_come_back_from_how_they_are_fitted(physics: catalogue.Physics) -> None:
     theta = np.where(np.isfinite(physics.null_value), physics.null_value, 0.0) + 0.7 * np.where(
         physics.plausible > 0, physics.plausible, 1.0

@@ -9,7 +9,7 @@ from imutool.sensor import catalogue
 
 
 def test_every_effect_that_is_asked_for_its_faintness_is_in_the_catalogue() -> None:
-    assert {one.name for one in catalogue.physics(sorted(FOLLOWING | set(LEFT_OUT)))} == FOLLOWING | set(LEFT_OUT)
+    assert {one.name for one in catalogue.diagnosed(sorted(FOLLOWING | set(LEFT_OUT)))} == FOLLOWING | set(LEFT_OUT)
 
 
 @pytest.mark.parametrize(("exact", "allowed"), [(True, EXACT), (False, FILTERED)])

@@ -9,7 +9,7 @@ from support import planted
 from imutool.diagnosis.estimation import unnamed_effects as unnamed
 from imutool.diagnosis.estimation.gauss_newton import fit
 from imutool.sensor.effect import Effect
-from imutool.sensor.readings import SensorSamples
+from imutool.sensor.samples import SensorSamples
 
 SURE = 4.0
 T = planted.clock()

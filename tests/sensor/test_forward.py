@@ -12,9 +12,9 @@ from scipy.spatial.transform import Rotation
 
 from imutool import registry
 from imutool.errors import ConfigError, DataError
-from imutool.sensor.catalogue import known, named, physics
-from imutool.sensor.effect import Effect, Stage, read, sensed
-from imutool.sensor.readings import IdealMotion, SensorSamples
+from imutool.sensor import catalogue
+from imutool.sensor.effect import Effect, Stage, distort, simulate_samples
+from imutool.sensor.samples import IdealMotion, SensorSamples
 from imutool.sensor.signals import SLOW_S
 
 RATE_HZ = 200.0
@@ -23,8 +23,8 @@ SAME = 1e-12  # of a result's size: two orders of the same few sums
 SPLINE = 1e-5  # of a sine at 2 Hz: a cubic spline's error at a hundredth of the sample rate is (pi/100)^4 of it
 FILTER = 1e-3  # what `_filters` promises, gain and phase, up to a quarter of the sample rate
 SLOWLY = 1e-4  # and up to a tenth of it
-ALL = [pytest.param(one, id=one.name) for one in physics()]
-WITH_STARTS = [pytest.param(one, id=one.name) for one in physics() if one.starts is not None]
+ALL = [pytest.param(one, id=one.name) for one in catalogue.effects()]
+WITH_STARTS = [pytest.param(one, id=one.name) for one in catalogue.effects() if one.starts is not None]
 
 
 def clock(seconds: float = 10.0, rate_hz: float = RATE_HZ) -> np.ndarray:
@@ -78,7 +78,7 @@ def some_theta(one: Effect) -> np.ndarray:
 
 
 def only(name: str) -> Effect:
-    return physics([name])[0]
+    return catalogue.effects([name])[0]
 
 
 def act(name: str, of: IdealMotion | SensorSamples, *theta: float) -> IdealMotion | SensorSamples:
@@ -151,14 +151,14 @@ def test_a_linear_one_adds_in_proportion(one: Effect) -> None:
 def test_starts_are_finite_and_positive_where_the_number_is_and_work(one: Effect) -> None:
     assert one.starts is not None
     felt = lively()
-    real = read(felt, felt.t_s, [(one, some_theta(one))])
+    real = simulate_samples(felt, felt.t_s, [(one, some_theta(one))])
     starts = one.starts(felt, SensorSamples(felt.t_s, real.gyro, real.accel, np.zeros_like(real.gyro)))
     assert starts
     for start in starts:
         assert start.shape == one.null_value.shape
         assert np.isfinite(start).all()
         assert all(value > 0 for value, number in zip(start, one.parameters, strict=True) if number.positive)
-        assert np.isfinite(read(felt, felt.t_s, [(one, start)]).accel).all()
+        assert np.isfinite(simulate_samples(felt, felt.t_s, [(one, start)]).accel).all()
 
 
 def test_the_catalogue_of_left_out_physics_is_there() -> None:
@@ -167,21 +167,22 @@ def test_the_catalogue_of_left_out_physics_is_there() -> None:
     expected |= {"gyro_g_sensitivity", "lever_arm", "size_effect", "mount_rotation", "mount_resonance", "low_pass", "gravity"}
     expected |= {"clock_offset", "clock_skew", "clock_jump", "saturation", "quantization", "earth_rotation", "vibration"}
     expected |= {"temperature", "vibration_rectification"}
-    assert {one.name for one in physics()} == expected
+    assert {one.name for one in catalogue.diagnosed()} == expected
+    assert {one.name for one in catalogue.effects()} == expected | {"rate_curve"}
 
 
 def test_names_pick_some_and_a_wrong_one_suggests_the_nearest() -> None:
-    assert [one.name for one in physics(["low_pass", "gravity"])] == ["low_pass", "gravity"]
+    assert [one.name for one in catalogue.effects(["low_pass", "gravity"])] == ["low_pass", "gravity"]
     with pytest.raises(ConfigError, match="low_pass"):
-        physics(["lowpass"])
-    with pytest.raises(ConfigError, match="rate_curve cannot be simulated; expected some of accel_bias_drift"):
-        physics(["rate_curve"])
+        catalogue.effects(["lowpass"])
+    with pytest.raises(ConfigError, match="rate_curve is not diagnosed; expected some of accel_bias_drift"):
+        catalogue.diagnosed(["rate_curve"])
 
 
 def test_an_effect_without_closed_form_is_no_term_of_a_bias_model() -> None:
-    assert "low_pass" not in {effect.name for effect in known("gyro")}
+    assert "low_pass" not in {effect.name for effect in catalogue.trained("gyro")}
     with pytest.raises(ConfigError, match="low_pass does not act on the gyro"):
-        named("gyro", ["low_pass"])
+        catalogue.trained("gyro", ["low_pass"])
 
 
 # what the mounting point feels
@@ -260,7 +261,7 @@ def test_a_line_is_found_to_a_fiftieth_of_a_turn() -> None:
     felt, one = lively(60.0), only("vibration")
     theta = np.array([31.4159, 0.3, 0.1, 0.0, 0.2, -0.1, 0.0, 0.03, 0.0, 0.0, -0.01, 0.0, 0.0])
     noise = 0.05 * np.random.default_rng(2).normal(size=(2, *felt.accel.shape))
-    real = read(felt, felt.t_s, [(one, theta)])
+    real = simulate_samples(felt, felt.t_s, [(one, theta)])
     assert one.starts is not None
     start = one.starts(felt, real.but(gyro=real.gyro + 0.1 * noise[0], accel=real.accel + noise[1] + 0.1))[0]
     assert abs(start[0] - theta[0]) * felt.t_s[-1] < 0.02
@@ -339,7 +340,7 @@ def test_filters_begin_settled(name: str, theta: tuple[float, ...]) -> None:
 def test_an_offset_takes_a_shifted_sine() -> None:
     felt, tau = sine(2.0), 0.0137
     stamp_s = felt.t_s[200:-200]
-    out = read(felt, stamp_s, [(only("clock_offset"), np.array([tau]))])
+    out = simulate_samples(felt, stamp_s, [(only("clock_offset"), np.array([tau]))])
     np.testing.assert_array_equal(out.stamp_s, stamp_s)
     close(out.gyro[:, 0], np.sin(2.0 * np.pi * 2.0 * (stamp_s + tau)), SPLINE)
 
@@ -347,14 +348,14 @@ def test_an_offset_takes_a_shifted_sine() -> None:
 def test_a_skewed_clock_takes_a_sine_of_another_frequency() -> None:
     felt, eps = sine(2.0), 1e-3
     stamp_s = felt.t_s[200:-200]
-    out = read(felt, stamp_s, [(only("clock_skew"), np.array([eps]))])
+    out = simulate_samples(felt, stamp_s, [(only("clock_skew"), np.array([eps]))])
     close(out.accel[:, 1], np.sin(4.0 * np.pi * (stamp_s + eps * stamp_s)), SPLINE)
 
 
 def test_a_clock_jumps_once() -> None:
     felt, step = sine(2.0), 0.02
     stamp_s = felt.t_s[200:-200]
-    out = read(felt, stamp_s, [(only("clock_jump"), np.array([6.0 - 1e-9, step]))])
+    out = simulate_samples(felt, stamp_s, [(only("clock_jump"), np.array([6.0 - 1e-9, step]))])
     late = stamp_s >= 6.0 - 1e-9  # of the log, whatever part of it is looked at
     assert np.count_nonzero(~late) == 1000
     close(out.gyro[:, 2], np.sin(4.0 * np.pi * (stamp_s + step * late)), SPLINE)
@@ -363,7 +364,7 @@ def test_a_clock_jumps_once() -> None:
 def test_a_jump_is_found_where_it_is() -> None:
     felt, one = lively(60.0), only("clock_jump")
     truth = np.array([32.0, 0.004])
-    real = read(felt, felt.t_s, [(one, truth), (only("clock_offset"), np.array([0.01]))])
+    real = simulate_samples(felt, felt.t_s, [(one, truth), (only("clock_offset"), np.array([0.01]))])
     noise = 1e-3 * np.random.default_rng(5).normal(size=real.gyro.shape)
     assert one.starts is not None
     start = one.starts(felt, real.but(gyro=real.gyro + noise + 0.1))[0]
@@ -402,7 +403,7 @@ def test_a_warm_up_reaches_what_its_time_constant_says(sensor: str) -> None:
 @pytest.mark.parametrize(("sensor", "A"), [("gyro", 0.02), ("accel", 0.5)])
 def test_a_warm_up_starts_with_its_amplitude_at_the_right_time_constant(sensor: str, A: float) -> None:
     felt, one = lively(90.0), only(f"{sensor}_bias_drift")
-    real = read(felt, felt.t_s, [(one, np.array([A, -A, 0.0, 30.0]))])
+    real = simulate_samples(felt, felt.t_s, [(one, np.array([A, -A, 0.0, 30.0]))])
     real = real.but(real.gyro + 0.1, real.accel - 0.2)
     assert one.starts is not None
     close(one.starts(felt, real)[1], np.array([A, -A, 0.0, 30.0]), 1e-9)
@@ -434,7 +435,7 @@ def test_vibration_that_is_rectified_has_the_power_of_a_sine() -> None:
 
 def test_readings_are_clipped_at_their_limit_and_the_limit_is_found() -> None:
     felt, one = lively(), only("saturation")
-    out = read(felt, felt.t_s, [(one, np.array([1.5, 12.0]))])
+    out = simulate_samples(felt, felt.t_s, [(one, np.array([1.5, 12.0]))])
     np.testing.assert_array_equal(out.gyro, np.minimum(np.maximum(felt.gyro, -1.5), 1.5))
     np.testing.assert_array_equal(out.accel, np.minimum(np.maximum(felt.accel, -12.0), 12.0))
     assert one.starts is not None
@@ -443,7 +444,7 @@ def test_readings_are_clipped_at_their_limit_and_the_limit_is_found() -> None:
 
 def test_readings_are_rounded_to_whole_steps_and_the_step_is_found() -> None:
     felt, one = lively(), only("quantization")
-    out = read(felt, felt.t_s, [(one, np.array([0.1, 0.25]))])
+    out = simulate_samples(felt, felt.t_s, [(one, np.array([0.1, 0.25]))])
     np.testing.assert_allclose(out.gyro, np.round(felt.gyro, 1), atol=1e-12)
     np.testing.assert_array_equal(out.accel, np.round(4.0 * felt.accel) / 4.0)
     assert one.starts is not None
@@ -467,7 +468,7 @@ def test_stages_act_in_their_order_whatever_the_order_given() -> None:
     for name in ("gyro_scale", "saturation", "quantization"):
         now = act(name, now, *theta[name])
     for order in (acting, acting[::-1]):
-        out = read(felt, stamp_s, order)
+        out = simulate_samples(felt, stamp_s, order)
         np.testing.assert_array_equal(out.gyro, now.gyro)
         np.testing.assert_array_equal(out.accel, now.accel)
     assert np.abs(out.gyro).max() == pytest.approx(1.0)  # 1.02 clipped, then rounded to 1.00
@@ -476,8 +477,8 @@ def test_stages_act_in_their_order_whatever_the_order_given() -> None:
 def test_sensed_is_the_part_behind_the_clock() -> None:
     felt = lively()
     acting = [(only("gyro_scale"), np.full(3, 0.1)), (only("clock_offset"), np.array([0.01]))]
-    taken = read(felt, felt.t_s, acting[1:])
-    np.testing.assert_array_equal(sensed(taken, acting).gyro, read(felt, felt.t_s, acting).gyro)
+    taken = simulate_samples(felt, felt.t_s, acting[1:])
+    np.testing.assert_array_equal(distort(taken, acting).gyro, simulate_samples(felt, felt.t_s, acting).gyro)
 
 
 # what is felt, taken at other times

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from imutool.errors import ConfigError, DataError
 from imutool.sensor.effect import Effect, Parameter, Stage, Theta
 from imutool.sensor.physics_file import Bias, Curve, Entry, PhysicsFile, Term, Value, read, write
-from imutool.sensor.readings import SensorSamples
+from imutool.sensor.samples import SensorSamples
 
 NUMBERS = st.floats(allow_nan=False, allow_infinity=False)
 POSITIVE = st.floats(min_value=0.0, allow_nan=False, allow_infinity=False)

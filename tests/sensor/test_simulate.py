@@ -24,7 +24,7 @@ from imutool.recording import GRAVITY_M_S2, Imu, Poses, Recording, Scalars, seco
 from imutool.sensor import catalogue
 from imutool.sensor.effect import Effect, Stage, Theta
 from imutool.sensor.physics_file import PhysicsFile
-from imutool.sensor.readings import SensorSamples
+from imutool.sensor.samples import SensorSamples
 from imutool.sensor.simulate import MOTION_TOPIC, read_all, simulate, simulated
 
 START_NS = 1_700_000_000_000_000_123
@@ -118,7 +118,7 @@ def test_coning_reads_its_closed_form() -> None:
 
 
 def test_a_lever_arm_on_a_constant_turn_reads_the_centripetal_acceleration() -> None:
-    (lever,) = catalogue.physics(["lever_arm"])
+    (lever,) = catalogue.effects(["lever_arm"])
     imu = along(turning(), [(lever, np.array([0.1, 0.0, 0.0]))]).imu
     np.testing.assert_allclose(imu.accel, np.tile([-0.1 * 2.0**2, 0.0, GRAVITY_M_S2], (len(imu), 1)), atol=ACCEL)
 
@@ -169,7 +169,7 @@ def test_the_clock_and_the_sensor_know_of_no_holes() -> None:
 
 
 def test_a_temperature_comes_from_the_log_and_goes_into_the_new_one() -> None:
-    (temperature,) = catalogue.physics(["temperature"])
+    (temperature,) = catalogue.effects(["temperature"])
     truth = resting()
     warming = Scalars(truth.t_ns, 20.0 + T[:, None], "degC")
     out = along(truth, [(temperature, np.array([0.1, 0, 0, 0, 0, 0.0]))], scalars={"/imu0/temperature": warming})

@@ -15,9 +15,9 @@ from imutool.diagnosis.estimation.whitening import Whitener
 from imutool.inertial.kinematics import Trajectory
 from imutool.recording import Imu, Poses, Recording
 from imutool.sensor import catalogue as _catalogue
-from imutool.sensor.effect import Effect, read
+from imutool.sensor.effect import Effect, simulate_samples
 from imutool.sensor.flight import FlightSettings, trajectory
-from imutool.sensor.readings import IdealMotion
+from imutool.sensor.samples import IdealMotion
 
 RATE_HZ, DURATION_S = 100.0, 24.0
 START_NS = 1_700_000_000_000_000_000
@@ -74,17 +74,17 @@ def shaken(seed: int = 1, duration_s: float = DURATION_S) -> IdealMotion:
 
 def acting(effects: Mapping[str, Sequence[float]]) -> Chosen:
     """Effects of the catalogue by name, with their parameters."""
-    return tuple((_catalogue.physics([name])[0], np.array(theta, dtype=float)) for name, theta in effects.items())
+    return tuple((_catalogue.diagnosed([name])[0], np.array(theta, dtype=float)) for name, theta in effects.items())
 
 
 def catalogue() -> tuple[Effect, ...]:
     """All that a fit can find without another channel of the log."""
-    return tuple(one for one in _catalogue.physics() if set(one.needs) <= {"attitude"} and one.name not in SHOWN_BY_SAMPLES)
+    return tuple(one for one in _catalogue.diagnosed() if set(one.needs) <= {"attitude"} and one.name not in SHOWN_BY_SAMPLES)
 
 
 def ideal(felt: IdealMotion, chosen: Chosen = (), stamp_s: np.ndarray | None = None) -> np.ndarray:
     """Readings with effects, without noise and bias: gyro (rad/s), accel (m/s²)."""
-    got = read(felt, felt.t_s if stamp_s is None else stamp_s, chosen)
+    got = simulate_samples(felt, felt.t_s if stamp_s is None else stamp_s, chosen)
     return np.concatenate([got.gyro, got.accel], axis=1)
 
 

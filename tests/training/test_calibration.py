@@ -11,10 +11,11 @@ import torch
 
 from imutool.errors import ConfigError, DataError
 from imutool.recording import Imu, Poses, Recording, seconds
-from imutool.sensor.catalogue import named
-from imutool.sensor.linear_effect import LinearEffect, compiled
+from imutool.sensor import catalogue
+from imutool.sensor.linear_form import LinearForm, compiled
 from imutool.sensor.signals import SignalFilter
 from imutool.training.calibration import FOLDS, Calibration, calibrate, folded
+from imutool.training.linearised import prior_std
 from imutool.training.segments import Pool
 from imutool.units import Sensor
 
@@ -30,7 +31,7 @@ ACCEL = ("accel_scale", "accel_misalignment", "lever_arm", "clock_offset", "acce
 PLANTED: list[tuple[Sensor, str]] = [*(("gyro", name) for name in GYRO), *(("accel", name) for name in ACCEL)]
 
 
-def measured(recording: Recording, effects: Sequence[LinearEffect], theta: np.ndarray, seed: int) -> Recording:
+def measured(recording: Recording, effects: Sequence[LinearForm], theta: np.ndarray, seed: int) -> Recording:
     """The samples of a sensor with errors: u = true + E(u) + rest, solved by going round, then noise."""
     imu, rng = recording.imu, np.random.default_rng(seed)
     t_s, u = seconds(imu.t_ns, int(imu.t_ns[0])), {"gyro": imu.gyro.copy(), "accel": imu.accel.copy()}
@@ -45,9 +46,9 @@ def measured(recording: Recording, effects: Sequence[LinearEffect], theta: np.nd
     return Recording(recording.name, Imu(imu.t_ns, u["gyro"], u["accel"]), recording.truths)
 
 
-def planted_theta(effects: Sequence[LinearEffect]) -> np.ndarray:
+def planted_theta(effects: Sequence[LinearForm]) -> np.ndarray:
     """A third of what is plausible, alternately up and down."""
-    plausible = np.concatenate([effect.plausible for effect in effects])
+    plausible = np.concatenate([prior_std(effect) for effect in effects])
     signs = np.where(np.arange(len(plausible)) % 2, -1.0, 1.0)
     return 0.3 * plausible * signs
 
@@ -58,7 +59,7 @@ def flights(perfect: MakeRecording) -> list[Recording]:
 
 
 def found(
-    flights: Sequence[Recording], sensor: Sensor, effects: Sequence[LinearEffect], names: Sequence[str] | None = None
+    flights: Sequence[Recording], sensor: Sensor, effects: Sequence[LinearForm], names: Sequence[str] | None = None
 ) -> Calibration:
     """The calibration of flights with effects planted on one sensor; the other's errors are its rest bias alone."""
     theta = planted_theta(effects) if effects else np.zeros(0)
@@ -74,7 +75,7 @@ def z_scores(calibration: Calibration, theta: np.ndarray) -> np.ndarray:
 
 @pytest.mark.parametrize(("sensor", "name"), PLANTED, ids=str)
 def test_a_planted_effect_is_found_and_named_and_no_other(flights: list[Recording], sensor: Sensor, name: str) -> None:
-    effects = named(sensor, [name])
+    effects = catalogue.trained(sensor, [name])
     calibration = found(flights, sensor, effects)
     assert calibration.effects == (name,)
     assert list(calibration.gains) == [name]
@@ -94,14 +95,14 @@ def test_where_nothing_is_planted_nothing_is_found(flights: list[Recording], sen
 
 
 def test_effects_planted_together_are_told_apart(flights: list[Recording]) -> None:
-    effects = named("gyro", ["gyro_misalignment", "gyro_scale"])
+    effects = catalogue.trained("gyro", ["gyro_misalignment", "gyro_scale"])
     calibration = found(flights, "gyro", effects, ["gyro_misalignment", "gyro_scale"])
     assert np.abs(z_scores(calibration, planted_theta(effects))).max() < SURE
 
 
 def test_a_curve_that_no_name_describes_is_found_as_a_curve(flights: list[Recording]) -> None:
     """A dead band: below 0.1 rad/s the sensor reads less, beyond it a constant too little."""
-    (effect,) = named("gyro", ["rate_curve"])
+    (effect,) = catalogue.trained("gyro", ["rate_curve"])
     names = [parameter.name for parameter in effect.parameters]
     size = {name: 0.0 if name.startswith("slow") else -0.02 * np.sign(float(name[1:])) for name in names}
     size = {name: 0.3 * value if "0.03" in name else value for name, value in size.items()}
@@ -122,7 +123,7 @@ def test_a_rest_bias_of_its_own_is_found_for_every_log(flights: list[Recording])
 
 
 def test_two_logs_are_cut_into_parts_that_predict_one_another(flights: list[Recording]) -> None:
-    calibration = found(flights[:2], "gyro", named("gyro", ["gyro_scale"]))
+    calibration = found(flights[:2], "gyro", catalogue.trained("gyro", ["gyro_scale"]))
     assert calibration.effects == ("gyro_scale",)
     assert calibration.rest.shape == (2, 3)
     pool = Pool.of(flights[:2])
@@ -154,7 +155,7 @@ def planar(recording: Recording) -> Recording:
 
 
 def test_what_a_planar_motion_cannot_show_stays_at_its_prior_and_is_named(flights: list[Recording]) -> None:
-    effects = named("gyro", ["gyro_misalignment"])
+    effects = catalogue.trained("gyro", ["gyro_misalignment"])
     calibration = found([planar(flight) for flight in flights], "gyro", effects, ["gyro_misalignment"])
     never = {f"gyro_misalignment.{pair}" for pair in ("xy", "yx")}
     assert never <= set(calibration.unseen) <= never | {f"gyro_misalignment.{pair}" for pair in ("zx", "zy")}

@@ -23,7 +23,7 @@ from imutool.inertial.kinematics import through
 from imutool.inertial.stationary import white_noise
 from imutool.inertial.strapdown import with_velocity
 from imutool.recording import Imu, Poses, Recording, seconds
-from imutool.sensor.readings import NOTHING, IdealMotion
+from imutool.sensor.samples import NOTHING, IdealMotion
 
 LEAST_S = 8.0  # below, nothing can be learned and tested
 ALIGN_HZ = 100.0

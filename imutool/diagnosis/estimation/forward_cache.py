@@ -29,9 +29,9 @@ class ForwardPass:
         self._ways: list[SignalState] = begun if like is None else like._ways[: same + 1]
         for physics, theta in self.acting[same:]:
             if physics.stage > Stage.CLOCK:
-                self._ways[-1] = self._ways[-1].taking()
+                self._ways[-1] = self._ways[-1].sampled()
             self._ways.append(self._ways[-1].through(physics, theta))
-        self.read = self._ways[-1].arrived()
+        self.read = self._ways[-1].samples()
 
     @property
     def expected(self) -> Float64[np.ndarray, "n 6"]:
@@ -56,7 +56,7 @@ class ForwardPass:
         else:
             theta, behind = self.acting[place][1], self.acting[place + 1 :]
         if physics.stage > Stage.CLOCK:
-            self._ways[place] = self._ways[place].taking()
+            self._ways[place] = self._ways[place].sampled()
         x, begun = free(physics, theta), self._ways[place]
         for j, number in enumerate(physics.parameters):
             h = step_of(number)
@@ -65,7 +65,7 @@ class ForwardPass:
             way = begun.through(physics, bound(physics, moved))
             for other, values in behind:
                 way = way.through(other, values)
-            there = way.arrived()
+            there = way.samples()
             for first, then, now in ((0, there.gyro, self.read.gyro), (3, there.accel, self.read.accel)):
                 if then is not now:
                     rows = ((then - now) / h).T

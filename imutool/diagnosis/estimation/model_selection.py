@@ -34,7 +34,7 @@ from imutool.diagnosis.estimation.significance import (
 )
 from imutool.diagnosis.estimation.unnamed_effects import Curve, finer, like
 from imutool.sensor.effect import Effect, Theta
-from imutool.sensor.readings import SensorSamples
+from imutool.sensor.samples import SensorSamples
 
 FALSE_DISCOVERY = 5e-3
 HELPS = 0.05  # chance of the gain on unseen blocks being none

@@ -18,7 +18,7 @@ from imutool.diagnosis.estimation.gauss_newton import WhitenedLog, expected
 from imutool.diagnosis.estimation.known_band import known_band_hz
 from imutool.diagnosis.estimation.whitening import Band, Whitener, level, settled, whitener
 from imutool.sensor.effect import Effect, Theta
-from imutool.sensor.readings import SensorSamples
+from imutool.sensor.samples import SensorSamples
 
 ORDER_SIM, ORDER_TRUTH = 6, 6  # of the autoregression: the noise of a sensor; of poses, on rows that just hold their band
 RIDGE = 1e-8

@@ -12,7 +12,7 @@ from scipy.stats import binom
 from imutool.diagnosis.estimation.alignment import Pair
 from imutool.diagnosis.result import Estimate, Finding, HeldOut
 from imutool.sensor.effect import Effect, Parameter, Stage, Theta
-from imutool.sensor.readings import IdealMotion, SensorSamples
+from imutool.sensor.samples import IdealMotion, SensorSamples
 from imutool.units import ASCII_UNITS, SENSORS, UNITS, Sensor
 
 MEDIAN, FEW = 15, 500  # samples: of a running median, and to find a period by first

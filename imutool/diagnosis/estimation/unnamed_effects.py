@@ -18,7 +18,7 @@ from scipy.interpolate import BSpline
 from imutool.diagnosis.estimation.alignment import Pair
 from imutool.sensor import catalogue
 from imutool.sensor.effect import Effect, Parameter, Stage, Theta
-from imutool.sensor.readings import SensorSamples, Vectors
+from imutool.sensor.samples import SensorSamples, Vectors
 from imutool.sensor.variables import VARIABLES
 from imutool.units import AXES, Sensor
 
@@ -35,7 +35,7 @@ Variable = Callable[[SensorSamples], Float64[np.ndarray, " n"]]
 
 def driven(pairs: Sequence[Pair]) -> Iterator[Effect]:
     """An effect for each other channel of the logs: + gain * channel, taken some time earlier, on one of the sensors."""
-    named = {need for physics in catalogue.physics() for need in physics.needs}
+    named = {need for physics in catalogue.diagnosed() for need in physics.needs}
     for name in sorted(set.intersection(*(set(pair.channels) for pair in pairs))):
         if any(need in name for need in named):
             continue  # the catalogue has a name for that

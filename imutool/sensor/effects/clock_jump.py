@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from imutool.sensor.effect import Effect, Parameter, Stage, Theta, misfit
-from imutool.sensor.readings import IdealMotion, SensorSamples, Times
+from imutool.sensor.effect import Effect, Parameter, Stage, Theta, residual
+from imutool.sensor.samples import IdealMotion, SensorSamples, Times
 
 PARTS, STARTS = 12, 4  # of the log, and the best times of how many of them
 
@@ -15,13 +15,13 @@ def _forward(taken_s: Times, theta: Theta) -> Times:
     return np.asarray(taken_s + theta[1] * (taken_s >= theta[0]))
 
 
-def _starts(felt: IdealMotion, samples: SensorSamples) -> list[Theta]:
-    """Where one offset before and another after explain most of the gyro's misfit, to first order, in several parts of the log.
+def _starts(motion: IdealMotion, samples: SensorSamples) -> list[Theta]:
+    """Where one offset before and another after explain most of the gyro's residual, to first order, by part of the log.
 
     An offset tau adds tau d omega/dt, so that sums up to each sample and from it on tell what any jump would bring.
     """
-    error, _ = misfit(felt, samples)
-    slope = np.gradient(felt.taken(samples.stamp_s, samples.stamp_s).gyro, samples.stamp_s, axis=0)
+    error, _ = residual(motion, samples)
+    slope = np.gradient(motion.taken(samples.stamp_s, samples.stamp_s).gyro, samples.stamp_s, axis=0)
     common = np.cumsum(np.sum(slope * (error - np.median(error, axis=0)), axis=1))
     power = np.cumsum(np.sum(slope**2, axis=1)) + np.finfo(np.float64).tiny
     before = common[:-1] / power[:-1]

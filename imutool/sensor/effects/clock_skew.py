@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from imutool.sensor.effect import Effect, Parameter, Stage, Theta
-from imutool.sensor.readings import IdealMotion, SensorSamples, Times
+from imutool.sensor.samples import IdealMotion, SensorSamples, Times
 
 
 def _forward(taken_s: Times, eps: Theta) -> Times:
@@ -13,7 +13,7 @@ def _forward(taken_s: Times, eps: Theta) -> Times:
     return np.asarray(taken_s + eps[0] * taken_s)
 
 
-def _starts(_felt: IdealMotion, _samples: SensorSamples) -> list[Theta]:
+def _starts(_motion: IdealMotion, _samples: SensorSamples) -> list[Theta]:
     return [np.array([eps]) for eps in (0.0, -1e-3, 1e-3)]
 
 

@@ -8,8 +8,8 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Float64
 
-from imutool.sensor.effect import Effect, Parameter, Stage, Theta, attitude
-from imutool.sensor.readings import IdealMotion, SensorSamples
+from imutool.sensor.effect import Effect, Parameter, Stage, Theta, attitude_of
+from imutool.sensor.samples import IdealMotion, SensorSamples
 
 EARTH_RAD_S = 7.292115e-5  # WGS 84
 
@@ -20,15 +20,17 @@ def omega_w(latitude: float, heading: float) -> Float64[np.ndarray, "3"]:
     return EARTH_RAD_S * np.array([level * math.cos(heading), level * math.sin(heading), math.sin(latitude)])
 
 
-def _forward(felt: IdealMotion, theta: Theta) -> IdealMotion:
+def _forward(motion: IdealMotion, theta: Theta) -> IdealMotion:
     """Latitude, heading (rad). An infinite latitude is none: the earth stands still."""
     latitude, heading = theta.tolist()
     if math.isinf(latitude):
-        return felt
-    return replace(felt, gyro=felt.gyro + np.einsum("nji,j->ni", attitude(felt, "earth_rotation"), omega_w(latitude, heading)))
+        return motion
+    return replace(
+        motion, gyro=motion.gyro + np.einsum("nji,j->ni", attitude_of(motion, "earth_rotation"), omega_w(latitude, heading))
+    )
 
 
-def _starts(_felt: IdealMotion, _samples: SensorSamples) -> list[Theta]:
+def _starts(_motion: IdealMotion, _samples: SensorSamples) -> list[Theta]:
     return [np.array([latitude, heading]) for latitude in (-0.8, 0.8) for heading in (-3.0, -1.0, 1.0, 3.0)]
 
 

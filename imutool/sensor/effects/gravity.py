@@ -8,19 +8,19 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from imutool.recording import GRAVITY_M_S2
-from imutool.sensor.effect import Effect, Parameter, Stage, Theta, attitude
-from imutool.sensor.readings import IdealMotion, SensorSamples
+from imutool.sensor.effect import Effect, Parameter, Stage, Theta, attitude_of
+from imutool.sensor.samples import IdealMotion, SensorSamples
 
 
-def _forward(felt: IdealMotion, theta: Theta) -> IdealMotion:
+def _forward(motion: IdealMotion, theta: Theta) -> IdealMotion:
     """g_w = Exp(tilt_x, tilt_y, 0) (0, 0, -(g + dg)), so that the specific force changes by -R_wb^T times g_w's change."""
     dg, tilt_x, tilt_y = theta.tolist()
     up = Rotation.from_rotvec([tilt_x, tilt_y, 0.0]).apply([0.0, 0.0, 1.0])
     more_w = (GRAVITY_M_S2 + dg) * up - np.array([0.0, 0.0, GRAVITY_M_S2])
-    return replace(felt, accel=felt.accel + np.einsum("nji,j->ni", attitude(felt, "gravity"), more_w))
+    return replace(motion, accel=motion.accel + np.einsum("nji,j->ni", attitude_of(motion, "gravity"), more_w))
 
 
-def _starts(_felt: IdealMotion, _samples: SensorSamples) -> list[Theta]:
+def _starts(_motion: IdealMotion, _samples: SensorSamples) -> list[Theta]:
     return [np.zeros(3)]
 
 

@@ -1,17 +1,53 @@
-"""Warm-up of the gyro: + A (1 - exp(-t/tau)), t from the log's start, tau one minute."""
+"""Warm-up of the gyro: + A (1 - exp(-t/tau)), t from the log's start. Every log is taken to begin with a cold sensor."""
 
 from __future__ import annotations
 
-from imutool.sensor import warm_up
-from imutool.sensor.linear_effect import LinearEffect
+import numpy as np
+from jaxtyping import Float64
+
+from imutool.sensor.effect import Effect, Parameter, Stage, Theta, each_axis, residual
+from imutool.sensor.samples import IdealMotion, SensorSamples
 from imutool.units import Sensor
 
-SENSORS: tuple[Sensor, ...] = ("gyro",)
+TRAINING_TAU_S = 60.0
+START_TAU_S = (10.0, 30.0, 100.0)
 
 
-def effect(sensor: Sensor) -> LinearEffect:
-    """A (rad/s): seen where the log is longer than tau, and every log begins with a cold sensor."""
-    return warm_up.closed_form(sensor, "rad/s", 2e-3)
+def warm_up(sensor: Sensor, unit: str, plausible: float) -> Effect:
+    """Warm-up of either sensor: A, then tau (s)."""
+
+    def forward(samples: SensorSamples, theta: Theta) -> SensorSamples:
+        added = _course(samples.stamp_s, float(theta[3]))[:, None] * theta[:3]
+        return samples.but(samples.gyro + added) if sensor == "gyro" else samples.but(accel=samples.accel + added)
+
+    def starts(motion: IdealMotion, samples: SensorSamples) -> list[Theta]:
+        """Amplitudes by least squares, with a constant, for each tau."""
+        error, found = residual(motion, samples)[0 if sensor == "gyro" else 1], []
+        for tau_s in START_TAU_S:
+            course = _course(samples.stamp_s, tau_s)
+            columns = np.stack([course, np.ones_like(course)], axis=1)
+            found.append(np.append(np.linalg.lstsq(columns, error, rcond=None)[0][0], tau_s))
+        return found
+
+    return Effect(
+        f"{sensor}_bias_drift",
+        Stage.SENSOR,
+        (sensor,),
+        f"{sensor} += A (1 - exp(-t/tau))",
+        (
+            *each_axis(unit, plausible),
+            Parameter("tau", "s", 30.0, positive=True, null_value=30.0, fixed_in_training=TRAINING_TAU_S),
+        ),
+        "the log is longer than tau",
+        forward,
+        linear=False,
+        starts=starts,
+        trained=True,
+    )
 
 
-EFFECT = warm_up.physics("gyro", "rad/s", 0.02)
+def _course(stamp_s: Float64[np.ndarray, " n"], tau_s: float) -> Float64[np.ndarray, " n"]:
+    return np.asarray(-np.expm1(-stamp_s / tau_s))
+
+
+EFFECT = warm_up("gyro", "rad/s", 0.02)

@@ -9,22 +9,22 @@ import numpy as np
 
 from imutool.sensor.effect import Effect, Parameter, Stage, Theta
 from imutool.sensor.filters import OMEGA, filtered
-from imutool.sensor.readings import IdealMotion, SensorSamples
+from imutool.sensor.samples import IdealMotion, SensorSamples
 
 START_HZ = (2.0, 5.0, 10.0, 20.0, 40.0, 80.0)
 
 
-def _forward(felt: IdealMotion, cutoff_hz: Theta) -> IdealMotion:
+def _forward(motion: IdealMotion, cutoff_hz: Theta) -> IdealMotion:
     """As if what is felt first had always been felt; an infinite cut-off frequency lets everything pass."""
     if math.isinf(cutoff_hz[0]):
-        return felt
-    a = 2.0 * math.pi * float(cutoff_hz[0]) / felt.rate_hz  # rad a sample
+        return motion
+    a = 2.0 * math.pi * float(cutoff_hz[0]) / motion.rate_hz  # rad a sample
     denominator = np.array([1.0, -math.exp(-a)])
-    both = filtered(np.concatenate([felt.gyro, felt.accel, felt.alpha], axis=1), a / (1j * OMEGA + a), denominator)
-    return replace(felt, gyro=both[:, :3], accel=both[:, 3:6], alpha=both[:, 6:])
+    both = filtered(np.concatenate([motion.gyro, motion.accel, motion.alpha], axis=1), a / (1j * OMEGA + a), denominator)
+    return replace(motion, gyro=both[:, :3], accel=both[:, 3:6], alpha=both[:, 6:])
 
 
-def _starts(_felt: IdealMotion, _samples: SensorSamples) -> list[Theta]:
+def _starts(_motion: IdealMotion, _samples: SensorSamples) -> list[Theta]:
     return [np.array([hz]) for hz in START_HZ]
 
 

@@ -10,30 +10,30 @@ import numpy as np
 
 from imutool.sensor.effect import Effect, Parameter, Stage, Theta, each_axis
 from imutool.sensor.filters import OMEGA, filtered
-from imutool.sensor.readings import IdealMotion, SensorSamples
+from imutool.sensor.samples import IdealMotion, SensorSamples
 
 START_HZ = (4.0, 8.0, 15.0, 30.0, 50.0)
 
 
-def _forward(felt: IdealMotion, theta: Theta) -> IdealMotion:
+def _forward(motion: IdealMotion, theta: Theta) -> IdealMotion:
     """f0 (Hz), zeta, share per axis: f + share (H f - f), H(s) = (2 zeta w0 s + w0²) / (s² + 2 zeta w0 s + w0²).
 
     H is what a mass on a spring and a damper feels of its base's acceleration; it starts in the steady state.
     """
     share = theta[2:]
     if not share.any():
-        return felt
+        return motion
     zeta = float(theta[1])
-    a = 2.0 * math.pi * float(theta[0]) / felt.rate_hz  # rad a sample
+    a = 2.0 * math.pi * float(theta[0]) / motion.rate_hz  # rad a sample
     pole = cmath.exp(a * (-zeta + cmath.sqrt(zeta**2 - 1.0)))
     other = cmath.exp(a * (-zeta - cmath.sqrt(zeta**2 - 1.0)))
     denominator = np.array([1.0, -(pole + other).real, (pole * other).real])
     s = 1j * OMEGA
     through = (2.0 * zeta * a * s + a**2) / (s**2 + 2.0 * zeta * a * s + a**2)
-    return replace(felt, accel=felt.accel + share * (filtered(felt.accel, through, denominator) - felt.accel))
+    return replace(motion, accel=motion.accel + share * (filtered(motion.accel, through, denominator) - motion.accel))
 
 
-def _starts(_felt: IdealMotion, _samples: SensorSamples) -> list[Theta]:
+def _starts(_motion: IdealMotion, _samples: SensorSamples) -> list[Theta]:
     return [np.array([hz, 0.1, 0.5, 0.5, 0.5]) for hz in START_HZ]
 
 

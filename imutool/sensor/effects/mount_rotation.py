@@ -8,16 +8,16 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from imutool.sensor.effect import Effect, Parameter, Stage, Theta
-from imutool.sensor.readings import IdealMotion, SensorSamples
+from imutool.sensor.samples import IdealMotion, SensorSamples
 
 
-def _forward(felt: IdealMotion, phi: Theta) -> IdealMotion:
+def _forward(motion: IdealMotion, phi: Theta) -> IdealMotion:
     """R_bi = Exp(phi) takes the sensor's vectors to the body; R_wb stays the body's attitude."""
     R_bi = Rotation.from_rotvec(phi).as_matrix()
-    return replace(felt, gyro=felt.gyro @ R_bi, accel=felt.accel @ R_bi, alpha=felt.alpha @ R_bi)
+    return replace(motion, gyro=motion.gyro @ R_bi, accel=motion.accel @ R_bi, alpha=motion.alpha @ R_bi)
 
 
-def _starts(_felt: IdealMotion, _samples: SensorSamples) -> list[Theta]:
+def _starts(_motion: IdealMotion, _samples: SensorSamples) -> list[Theta]:
     return [np.zeros(3)]
 
 

@@ -6,17 +6,17 @@ import numpy as np
 from jaxtyping import Float64
 
 from imutool.sensor.effect import Effect, Parameter, Stage, Theta
-from imutool.sensor.readings import IdealMotion, SensorSamples
+from imutool.sensor.samples import IdealMotion, SensorSamples
 
 SAME = 1e-6  # of the largest reading: values no further apart are one value, told apart by rounding
 FINE = 1e-3  # of the smallest step is none
 
 
-def _forward(read: SensorSamples, lsb: Theta) -> SensorSamples:
+def _forward(samples: SensorSamples, lsb: Theta) -> SensorSamples:
     gyro, accel = lsb.tolist()
-    return read.but(
-        np.rint(read.gyro / gyro) * gyro if gyro else None,
-        np.rint(read.accel / accel) * accel if accel else None,
+    return samples.but(
+        np.rint(samples.gyro / gyro) * gyro if gyro else None,
+        np.rint(samples.accel / accel) * accel if accel else None,
     )
 
 
@@ -27,7 +27,7 @@ def _smallest_step(values: Float64[np.ndarray, "n 3"]) -> float:
     return float(steps[steps > least].min(initial=np.inf)) if (steps > least).any() else least
 
 
-def _starts(_felt: IdealMotion, samples: SensorSamples) -> list[Theta]:
+def _starts(_motion: IdealMotion, samples: SensorSamples) -> list[Theta]:
     """One sensor in steps, the other, both."""
     gyro, accel = _smallest_step(samples.gyro), _smallest_step(samples.accel)
     return [np.array(lsb) for lsb in ((gyro, FINE * accel), (FINE * gyro, accel), (gyro, accel))]

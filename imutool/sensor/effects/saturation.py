@@ -7,19 +7,20 @@ import math
 import numpy as np
 
 from imutool.sensor.effect import Effect, Parameter, Stage, Theta
-from imutool.sensor.readings import IdealMotion, SensorSamples
+from imutool.sensor.samples import IdealMotion, SensorSamples
 
 NEVER = 100.0  # times the largest reading is not reached
 
 
-def _forward(read: SensorSamples, limit: Theta) -> SensorSamples:
+def _forward(samples: SensorSamples, limit: Theta) -> SensorSamples:
     gyro, accel = (None if math.isinf(most) else most for most in limit.tolist())
-    return read.but(
-        None if gyro is None else np.clip(read.gyro, -gyro, gyro), None if accel is None else np.clip(read.accel, -accel, accel)
+    return samples.but(
+        None if gyro is None else np.clip(samples.gyro, -gyro, gyro),
+        None if accel is None else np.clip(samples.accel, -accel, accel),
     )
 
 
-def _starts(_felt: IdealMotion, samples: SensorSamples) -> list[Theta]:
+def _starts(_motion: IdealMotion, samples: SensorSamples) -> list[Theta]:
     """One sensor limited, the other, both: at the largest reading, which is the limit wherever one is reached."""
     gyro, accel = (float(np.abs(values).max()) or 1.0 for values in (samples.gyro, samples.accel))
     return [np.array(limit) for limit in ((gyro, NEVER * accel), (NEVER * gyro, accel), (gyro, accel))]

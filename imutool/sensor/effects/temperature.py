@@ -4,21 +4,21 @@ from __future__ import annotations
 
 from imutool.errors import DataError
 from imutool.sensor.effect import Effect, Stage, Theta, each_axis
-from imutool.sensor.readings import SensorSamples
+from imutool.sensor.samples import SensorSamples
 
 
-def _forward(read: SensorSamples, k: Theta) -> SensorSamples:
+def _forward(samples: SensorSamples, k: Theta) -> SensorSamples:
     """k of the gyro, then of the accelerometer; T0 is the channel's mean. With several such channels: the first by name.
 
     Raises:
         DataError: no channel with a temperature in its name.
     """
-    names = sorted(name for name in read.channels if "temperature" in name.lower())
+    names = sorted(name for name in samples.channels if "temperature" in name.lower())
     if not names:
         raise DataError("no temperature channel", where="temperature", expected="a channel with temperature in its name")
-    T = read.channels[names[0]]
+    T = samples.channels[names[0]]
     warmer = (T - T.mean())[:, None]
-    return read.but(read.gyro + warmer * k[:3], read.accel + warmer * k[3:])
+    return samples.but(samples.gyro + warmer * k[:3], samples.accel + warmer * k[3:])
 
 
 EFFECT = Effect(

@@ -10,10 +10,10 @@ from scipy.ndimage import median_filter
 from scipy.signal import periodogram
 
 from imutool.inertial.stationary import white_noise
-from imutool.sensor.effect import Effect, Parameter, Stage, Theta, misfit
-from imutool.sensor.readings import IdealMotion, SensorSamples
+from imutool.sensor.effect import Effect, Parameter, Stage, Theta, residual
+from imutool.sensor.samples import IdealMotion, SensorSamples
 
-LINES = 3  # starts: the strongest lines of the misfit
+LINES = 3  # starts: the strongest lines of the residual
 FINER = 4  # times as many frequencies as samples tell: the top of a peak lies between three of them
 ABOUT = 401  # frequencies whose median tells what a line stands out from
 
@@ -23,15 +23,15 @@ def _waves(t_s: Float64[np.ndarray, " n"], f_hz: float) -> Float64[np.ndarray, "
     return np.stack([np.sin(phase), np.cos(phase)], axis=1)
 
 
-def _forward(felt: IdealMotion, theta: Theta) -> IdealMotion:
+def _forward(motion: IdealMotion, theta: Theta) -> IdealMotion:
     """f (Hz), then the amplitudes of sine and cosine of each axis, accel (m/s²), gyro (rad/s); t on the motion's clock."""
-    waves = _waves(felt.t_s, float(theta[0])) @ theta[1:].reshape(6, 2).T
-    return replace(felt, accel=felt.accel + waves[:, :3], gyro=felt.gyro + waves[:, 3:])
+    waves = _waves(motion.t_s, float(theta[0])) @ theta[1:].reshape(6, 2).T
+    return replace(motion, accel=motion.accel + waves[:, :3], gyro=motion.gyro + waves[:, 3:])
 
 
-def _starts(felt: IdealMotion, samples: SensorSamples) -> list[Theta]:
+def _starts(motion: IdealMotion, samples: SensorSamples) -> list[Theta]:
     """The lines that stand out most from the spectrum of what is read more, with their amplitudes."""
-    gyro, accel = misfit(felt, samples)
+    gyro, accel = residual(motion, samples)
     error, t_s = np.concatenate([accel, gyro], axis=1), samples.stamp_s
     error = error - error.mean(axis=0)
     noise = white_noise(error)

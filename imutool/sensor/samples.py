@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from functools import cached_property
 from types import MappingProxyType
 
 import numpy as np
@@ -17,6 +18,7 @@ from scipy.ndimage import spline_filter1d
 from scipy.sparse import csr_array
 
 from imutool.errors import DataError
+from imutool.sensor.signals import FILTERED, SignalFilter, Signals
 
 Vectors = Float64[np.ndarray, "n 3"]
 Columns = Float64[np.ndarray, "_ _"]
@@ -179,6 +181,15 @@ class SensorSamples:
     alpha: Vectors
     R_wb: Float64[np.ndarray, "n 3 3"] | None = None
     channels: Mapping[str, Float64[np.ndarray, " n"]] = field(default_factory=lambda: NOTHING)
+    online: Signals | None = field(default=None, repr=False)
+
+    @cached_property
+    def signals(self) -> Signals:
+        """The filtered signals: those of a running filter where `online` has them, else of these samples at their mean rate."""
+        if self.online is not None:
+            return self.online
+        rate_hz = (len(self.stamp_s) - 1) / (self.stamp_s[-1] - self.stamp_s[0])
+        return SignalFilter(float(rate_hz), FILTERED.stop)(self.stamp_s, self.gyro, self.accel)
 
     def but(self, gyro: Vectors | None = None, accel: Vectors | None = None) -> SensorSamples:
         """With one of the sensors, or both, reading something else."""

@@ -1,0 +1,75 @@
+"""Flags for parameters: turns the library's `init` into the command line's --init, in errors and messages."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from typing import Any
+
+from imutool.errors import ImutoolError
+
+# The library's name of a parameter, and this command line's where it is another.
+ALIASES = {
+    "check": ("verify", "quick"),
+    "damage": ("damaged",),
+    "folder": ("folder", "target"),
+    "imus": ("imu",),
+    "memory_bytes": ("memory",),
+    "models": ("model",),
+    "out": ("target", "folder", "model"),
+    "overrides": ("set_",),
+    "page": ("report",),
+    "pattern": ("robot_from",),
+    "rate_hz": ("rate",),
+    "real": ("reals",),
+    "robots": ("robot_from",),
+    "rules": ("rule",),
+    "sensor_noise": ("noise",),
+    "sequences": ("sequence",),
+    "settings": ("config",),
+    "signals": ("signal",),
+}
+QUOTED = re.compile(r"`([a-z_]+)(?:=([^`]*))?`")
+PLACE = re.compile(r"([a-z_]+)(?:=(\S*))?")
+
+
+def flags(command: Any) -> dict[str, str]:
+    """The flag of each parameter of a click command, by the library's names; an argument's is its word in the usage."""
+    own = {parameter.name: _flag(parameter) for parameter in command.params}
+    known = {name.rstrip("_"): flag for name, flag in own.items()}
+    for name, others in ALIASES.items():
+        flag = next((own[other] for other in others if other in own), None)
+        if flag is not None:
+            known.setdefault(name, flag)
+    return known
+
+
+def _flag(parameter: Any) -> str:
+    if parameter.param_type_name == "argument":
+        return str(parameter.metavar or parameter.name.upper()).removesuffix("...")
+    return str(max(parameter.opts, key=len))
+
+
+def with_flags(text: str, known: Mapping[str, str]) -> str:
+    """The text with each backquoted parameter as its flag; what the command does not know stays as it is."""
+    return QUOTED.sub(lambda match: _shown(match[1], match[2], known) or match[0], text)
+
+
+def _shown(name: str, value: str | None, known: Mapping[str, str]) -> str | None:
+    """`init` as --init, `init=prior` as --init prior, `smooth=True` as --smooth, `images=False` as --no-images."""
+    if value == "False":
+        return known.get(f"no_{name}")
+    flag = known.get(name)
+    return flag if flag is None or value in {None, "True"} else f"{flag} {str(value).strip(chr(34))}"
+
+
+def error_with_flags(error: ImutoolError, known: Mapping[str, str]) -> ImutoolError:
+    """The error as the command line shows it."""
+    where = error.where
+    if where is not None:
+        parts = [PLACE.fullmatch(part) for part in where.split(", ")]
+        shown = [None if part is None else _shown(part[1], part[2], known) for part in parts]
+        if None not in shown:
+            where = ", ".join(map(str, shown))
+    what, expected, fix = (with_flags(text, known) for text in (error.what, error.expected, error.fix))
+    return type(error)(what, where=where, expected=expected, fix=fix)

@@ -1,0 +1,94 @@
+"""Reports for programs: typed Structs, their JSON values, and their JSON Schema.
+
+A command's `--json` report is one `Report`: a frozen msgspec Struct whose tag is the first key, `"schema": "imutool.NAME/1"`.
+Objects inside it are `Section`s. Text output reads the same Structs. To add a report: derive it, name it in `REPORTS`.
+::
+
+    class Models(Report, frozen=True, tag="imutool.models/1"):
+        models: list[ModelEntry]
+
+A key that not every report has is declared `key: T | UnsetType = UNSET`; the class
+takes `kw_only=True` where such a key stands before one that every report has. Units stand in the names, as in settings.
+"""
+
+from __future__ import annotations
+
+import difflib
+import importlib
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import msgspec
+from msgspec import UNSET, UnsetType
+
+from imutool.errors import ConfigError
+
+__all__ = ["REPORTS", "UNSET", "Report", "Section", "UnsetType", "json_schema", "json_values", "report_type"]
+
+# by name, the module and the type: imported when its schema is asked for, so that --help stays light
+REPORTS = {
+    "models": "imutool.cli.models:Models",
+}
+
+
+class Section(msgspec.Struct, frozen=True):
+    """An object inside a report; numpy scalars and arrays may stand for its numbers and lists."""
+
+
+class Report(msgspec.Struct, frozen=True, tag_field="schema"):
+    """What a command reports; a subclass gives its schema's name and version as `tag`."""
+
+
+def json_values(report: msgspec.Struct | Mapping[str, Any]) -> dict[str, Any]:
+    """The report as plain JSON values: arrays as lists, paths as text, NaN and infinity as null; unset keys are left out."""
+    values = _finite(msgspec.to_builtins(report, enc_hook=_plain))
+    assert isinstance(values, dict)
+    return values
+
+
+def report_type(name: str) -> type[Report]:
+    """The type of a report by its name, `info` or `imutool.info/1`.
+
+    Raises:
+        ConfigError: no report has this name; the message names the nearest.
+    """
+    short = name.removeprefix("imutool.").partition("/")[0]
+    if short not in REPORTS:
+        near = difflib.get_close_matches(short, REPORTS, n=1)
+        raise ConfigError(
+            f"no report is named {name!r}",
+            where="schema",
+            expected=f"one of {', '.join(sorted(REPORTS))}",
+            fix=f"Did you mean {near[0]}?" if near else "",
+        )
+    module, _, kind = REPORTS[short].partition(":")
+    found = getattr(importlib.import_module(module), kind)
+    assert isinstance(found, type)
+    assert issubclass(found, Report)
+    return found
+
+
+def json_schema(name: str) -> dict[str, Any]:
+    """JSON Schema (2020-12) of a report.
+
+    Raises:
+        ConfigError: no report has this name; the message names the nearest.
+    """
+    schema = msgspec.json.schema(report_type(name))
+    return {"$schema": "https://json-schema.org/draft/2020-12/schema", **schema}
+
+
+def _plain(value: Any) -> Any:
+    """numpy arrays and scalars as Python's (without an import of numpy), anything else as text."""
+    return value.tolist() if hasattr(value, "tolist") else str(value)
+
+
+def _finite(value: Any) -> Any:
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if isinstance(value, dict):
+        return {key: _finite(inner) for key, inner in value.items()}
+    if isinstance(value, list | tuple):
+        return [_finite(inner) for inner in value]
+    return value

@@ -1,0 +1,233 @@
+"""Linear form of an effect on one sensor: error = terms @ matrix(theta), derived from the effect's `forward`.
+
+A bias model needs an error that is linear in its parameters: any set of effects is then fitted together by one linear solve a
+Gauss-Newton step, with the covariance of the answer. The error is `sum_p theta_p sum_q pattern[:, q, p] term_q`. Simulation
+takes the terms of the true motion, debiasing of the measured one, which differs by the error times the error.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import lru_cache
+
+import numpy as np
+from jaxtyping import Float64, Int64
+
+from imutool.sensor.effect import CompiledEffect, Effect, Parameter, Stage, Theta, Three
+from imutool.sensor.samples import IdealMotion, SensorSamples
+from imutool.sensor.signals import COUNT, Signals
+from imutool.units import Sensor
+
+# Size of the parameters with which `forward` is asked for an error: beside that error the reading is lost in rounding, and to
+# divide by a power of two is exact. So the error has all its digits, and not only those that a reading leaves to it.
+SCALE = 2.0**100
+PROBE_ROWS = 128
+SAME = 1e-9  # an effect's own basis may differ by rounding from what `forward` says
+
+
+@dataclass(frozen=True, eq=False)
+class Probe:
+    """Parameters of a call of `forward`, and the terms that the error's axes then are: (axis, term)."""
+
+    theta: Theta
+    terms: tuple[tuple[int, int], ...]
+
+
+@dataclass(frozen=True, eq=False)
+class LinearForm:
+    """An effect on one sensor: the parameters that reach this sensor, and its pattern [axis, term, parameter].
+
+    columns: the signals' columns that are its terms; none where terms follow from `probes` (or the effect's own `basis`).
+    base: values of the effect's parameters, zero but for those that training fixes; free: where the others stand.
+    """
+
+    effect: Effect
+    sensor: Sensor
+    parameters: tuple[Parameter, ...]
+    base: Theta
+    free: Int64[np.ndarray, " p"]
+    columns: Int64[np.ndarray, " q"] | None
+    probes: tuple[Probe, ...]
+    pattern: Float64[np.ndarray, "3 q p"]
+
+    @property
+    def name(self) -> str:
+        """The effect's name."""
+        return self.effect.name
+
+    @property
+    def plausible(self) -> Float64[np.ndarray, " p"]:
+        """The plausible size of each parameter."""
+        return np.array([parameter.plausible for parameter in self.parameters])
+
+    def terms(self, signals: Signals) -> Float64[np.ndarray, "n q"]:
+        """The terms of the error at each sample."""
+        if self.columns is not None:
+            return signals.columns[:, self.columns]
+        if self.effect.basis is not None:
+            return self.effect.basis(signals)
+        out = np.empty((len(signals.t_s), self.pattern.shape[1]))
+        for probe in self.probes:
+            error = _error(self.effect, self.sensor, signals, probe.theta)
+            for axis, term in probe.terms:
+                out[:, term] = error[:, axis]
+        return out / SCALE
+
+    def matrix(self, theta: Float64[np.ndarray, " p"]) -> Float64[np.ndarray, "q 3"]:
+        """The matrix of error = terms @ matrix."""
+        out: Float64[np.ndarray, "q 3"] = np.einsum("iqp,p->qi", self.pattern, theta)
+        return out
+
+    def compiled(self, theta: Float64[np.ndarray, " p"]) -> CompiledEffect:
+        """The error for given parameters."""
+        if self.effect.fast is not None:
+            return self.effect.fast(self._scaled(theta, 1.0))
+        at = self._scaled(theta, SCALE)
+
+        def block(signals: Signals) -> Float64[np.ndarray, "n 3"]:
+            return _error(self.effect, self.sensor, signals, at) / SCALE
+
+        def one(t_s: float, row: list[float]) -> Three:
+            x, y, z = block(Signals(np.array([t_s]), np.array([row])))[0].tolist()
+            return x, y, z
+
+        return CompiledEffect(block, one)
+
+    def _scaled(self, theta: Float64[np.ndarray, " p"], scale: float) -> Theta:
+        out = self.base.copy()
+        out[self.free] = scale * theta
+        return out
+
+
+@dataclass(frozen=True, eq=False)
+class CompiledEffects:
+    """Several effects for given parameters: one product with all columns, and the effects that no product gives."""
+
+    matrix: Float64[np.ndarray, "27 3"]
+    others: tuple[CompiledEffect, ...]
+
+    @property
+    def wanted(self) -> int:
+        """How many of the signals' columns they need."""
+        if self.others:
+            return COUNT
+        return int(np.flatnonzero(self.matrix.any(axis=1)).max(initial=-1)) + 1
+
+    def __call__(self, signals: Signals) -> Float64[np.ndarray, "n 3"]:
+        """The error at each sample of a block."""
+        out: Float64[np.ndarray, "n 3"] = np.dot(signals.columns, self.matrix)
+        for other in self.others:
+            out += other(signals)
+        return out
+
+    def others_at(self, t_s: float, row: list[float]) -> Three:
+        """The error of `others` at one sample."""
+        x, y, z = 0.0, 0.0, 0.0
+        for other in self.others:
+            dx, dy, dz = other.one(t_s, row)
+            x, y, z = x + dx, y + dy, z + dz
+        return x, y, z
+
+
+def patterns(forms: Sequence[LinearForm]) -> Float64[np.ndarray, "3 q p"]:
+    """Patterns of several effects side by side: [axis, term, parameter]."""
+    terms, parameters = (sum(form.pattern.shape[k] for form in forms) for k in (1, 2))
+    out, q, p = np.zeros((3, terms, parameters)), 0, 0
+    for form in forms:
+        _, dq, dp = form.pattern.shape
+        out[:, q : q + dq, p : p + dp] = form.pattern
+        q, p = q + dq, p + dp
+    return out
+
+
+def compiled(forms: Sequence[LinearForm], theta: Float64[np.ndarray, " p"]) -> CompiledEffects:
+    """Several effects together, for given parameters in their order."""
+    matrix, others = np.zeros((COUNT, 3)), []
+    for form in forms:
+        size = len(form.parameters)
+        own, theta = theta[:size], theta[size:]
+        if form.columns is not None:
+            matrix[form.columns] += form.matrix(own)
+        else:
+            others.append(form.compiled(own))
+    return CompiledEffects(matrix, tuple(others))
+
+
+@lru_cache(maxsize=256)
+def linear_form(effect: Effect, sensor: Sensor) -> LinearForm:
+    """The linear form of an effect on a sensor, from the errors that `forward` gives for one parameter at a time."""
+    base = np.array([parameter.fixed_in_training or 0.0 for parameter in effect.parameters])
+    free = np.flatnonzero([parameter.fixed_in_training is None for parameter in effect.parameters])
+    signals = _probe_signals()
+    probed = base + SCALE * np.eye(len(base))[free]
+    errors = np.stack([_error(effect, sensor, signals, theta) for theta in probed], axis=2) / SCALE  # [row, axis, parameter]
+    reached = errors.any(axis=(0, 1))
+    free, probed, errors = free[reached], probed[reached], errors[:, :, reached]
+    probes: tuple[Probe, ...] = ()
+    columns, term = None, _found_among(signals.columns, errors, 0.0) if effect.trained else None
+    if term is not None:
+        columns, term = np.unique(term[term >= 0]), np.searchsorted(np.unique(term[term >= 0]), term, side="right") - 1
+    elif effect.basis is not None:
+        term = _found_among(effect.basis(signals), errors, SAME)
+        assert term is not None, f"the basis of {effect.name} lacks an error that its forward makes"
+    else:
+        probes, term = _distinct(probed, errors)
+    pattern = np.zeros((3, int(term.max(initial=-1)) + 1, len(free)))
+    for axis, k in np.argwhere(term >= 0):
+        pattern[axis, term[axis, k], k] = 1.0
+    named = [replace(of, name=of.name.removeprefix(f"{sensor}_")) for of in (effect.parameters[k] for k in free)]
+    return LinearForm(effect, sensor, tuple(named), base, free, columns, probes, pattern)
+
+
+def _error(effect: Effect, sensor: Sensor, signals: Signals, theta: Theta) -> Float64[np.ndarray, "n 3"]:
+    """What the effect adds to a sensor's samples; behind a clock to first order, the shift times the derivative."""
+    if effect.stage == Stage.CLOCK:
+        shift_s = effect.forward(signals.t_s, theta) - signals.t_s
+        return np.asarray(shift_s[:, None] * (signals.gyro_dot if sensor == "gyro" else signals.accel_dot))
+    before: IdealMotion | SensorSamples
+    if effect.stage < Stage.CLOCK:
+        before = IdealMotion(signals.t_s, signals.gyro, signals.accel, signals.alpha)
+    else:
+        before = SensorSamples(signals.t_s, signals.gyro, signals.accel, signals.alpha, online=signals)
+    after = effect.forward(before, theta)
+    return np.asarray(after.gyro - before.gyro if sensor == "gyro" else after.accel - before.accel)
+
+
+def _probe_signals() -> Signals:
+    """Signals without any relation to one another, of sizes between a hundredth and five."""
+    rng = np.random.default_rng(0)
+    size = 10.0 ** rng.uniform(-2.0, 0.7, (PROBE_ROWS, COUNT))
+    return Signals(rng.uniform(1.0, 100.0, PROBE_ROWS), np.where(rng.random(size.shape) < 0.5, size, -size))
+
+
+def _found_among(
+    columns: Float64[np.ndarray, "n c"], errors: Float64[np.ndarray, "n 3 p"], tolerance: float
+) -> Int64[np.ndarray, "3 p"] | None:
+    """Which column each error is, -1 where it is zero; none if an error is no column."""
+    found = np.full(errors.shape[1:], -1)
+    for axis, k in np.argwhere(errors.any(axis=0)):
+        off = np.abs(columns - errors[:, axis, k, None]).max(axis=0)
+        found[axis, k] = off.argmin()
+        if off.min() > tolerance:
+            return None
+    return found
+
+
+def _distinct(
+    probed: Float64[np.ndarray, "p all"], errors: Float64[np.ndarray, "n 3 p"]
+) -> tuple[tuple[Probe, ...], Int64[np.ndarray, "3 p"]]:
+    """The errors that differ from one another, each the term of one probe; and which of them each error is."""
+    known: dict[bytes, int] = {}
+    probes, found = [], np.full(errors.shape[1:], -1)
+    for k, theta in enumerate(probed):
+        own = []
+        for axis in np.flatnonzero(errors[:, :, k].any(axis=0)):
+            key = errors[:, axis, k].tobytes()
+            if key not in known:
+                known[key] = len(known)
+                own.append((int(axis), known[key]))
+            found[axis, k] = known[key]
+        if own:
+            probes.append(Probe(theta, tuple(own)))
+    return tuple(probes), found

@@ -1,0 +1,63 @@
+"""Parameters as flags: the library says `init`, the command line --init."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import pytest
+import typer
+
+from imutool import cli
+from imutool.cli.parameters import error_with_flags, flags, with_flags
+from imutool.errors import ConfigError
+
+COMMANDS = typer.main.get_command(cli.app).commands  # type: ignore[attr-defined]
+
+
+def test_an_argument_goes_by_its_word_and_an_option_by_its_long_flag() -> None:
+    known = flags(COMMANDS["debias"])
+    assert (known["init"], known["models"], known["out"], known["source"]) == ("--init", "--model", "OUT", "IN")
+    assert flags(COMMANDS["train"])["set"] == "--set"
+
+
+@pytest.mark.parametrize(
+    ("text", "shown"),
+    [
+        ("Give `model`", "Give --model"),
+        ("Give `init=prior`", "Give --init prior"),
+        ('Give `init="prior"`', "Give --init prior"),
+        ("Add `smooth=True`", "Add --smooth"),
+        ("Run `imutool clean LOG` or `rerun`", "Run `imutool clean LOG` or `rerun`"),
+    ],
+)
+def test_a_parameter_in_backquotes_is_shown_as_its_flag(text: str, shown: str) -> None:
+    assert with_flags(text, flags(COMMANDS["debias"])) == shown
+
+
+def test_leaving_out_is_a_flag_of_its_own() -> None:
+    assert with_flags("Leave images out with `images=False`", flags(COMMANDS["convert"])) == "Leave images out with --no-images"
+
+
+@pytest.mark.parametrize(
+    ("where", "shown"), [("init", "--init"), ("model, imu", "--model, --imu"), ("data.csv:17", "data.csv:17"), ("logs", "logs")]
+)
+def test_a_place_is_a_parameter_only_if_the_command_has_it(where: str, shown: str) -> None:
+    assert error_with_flags(ConfigError("x", where=where), flags(COMMANDS["debias"])).where == shown
+
+
+def test_an_error_names_the_parameter_in_python_and_the_flag_on_the_command_line(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    error = ConfigError("'x'", where="init", expected="auto or six numbers", fix="Give `init=prior` with a trained `model`")
+
+    def debias(*_: object, **__: object) -> None:
+        raise error
+
+    assert str(error) == "init: 'x'; expected auto or six numbers. Give `init=prior` with a trained `model`."
+    monkeypatch.setattr("imutool.debiasing.debias", debias)
+    monkeypatch.setattr(sys, "argv", ["imutool", "debias", "a.mcap", str(tmp_path / "b.mcap"), "--init", "x"])
+    with pytest.raises(SystemExit):
+        cli.main()
+    printed = capsys.readouterr().err
+    assert printed.lstrip() == "error: --init: 'x'; expected auto or six numbers. Give --init prior with a trained --model.\n"
