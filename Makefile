@@ -9,7 +9,7 @@ READY_DEMO := $(VENV)/.ready-demo
 READY_TEST := $(VENV)/.ready-test
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test check viewers lint format bench clean
+.PHONY: help demo test check docs viewers lint format bench clean
 .NOTPARALLEL:
 
 help:  ## say what there is
@@ -25,6 +25,10 @@ test: lint viewers  ## format, lint, types, then every test with warnings as err
 
 check: lint  ## lint, types and the tests that a change touches (BASE=commit; else what is not on origin/main yet)
 	@$(BIN)/python -m pytest -q -n $(WORKERS) --maxprocesses 4 --dist worksteal $$($(BIN)/python tests/changed.py $(BASE))
+
+docs: $(READY_TEST)  ## the documentation site, strict and without a network, into site/
+	@NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --quiet --strict
+	@echo "docs: open site/index.html"
 
 viewers: $(READY_TEST)  ## a browser and a software graphics driver for the tests that look, where apt-get may bring them
 	@$(BIN)/python tests/support/viewers.py
@@ -43,7 +47,7 @@ bench: $(READY_TEST)  ## the benchmarks of speed; those of accuracy take recordi
 	@set -e; for bench in tests/bench/codec.py tests/bench/train.py tests/bench/debias.py; do echo "bench: $$bench"; $(BIN)/python $$bench; done
 
 clean:  ## remove the virtual environment, the demo and all caches
-	rm -rf $(VENV) $(DEMO) build dist .mypy_cache .pytest_cache .ruff_cache .hypothesis
+	rm -rf $(VENV) $(DEMO) build dist site .mypy_cache .pytest_cache .ruff_cache .hypothesis
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
 
 $(BIN)/python:

@@ -134,7 +134,7 @@ def _frames(tree: Tree, camera: str, content: bytes) -> Frames | str:
         return "the source has none of the listed images"
     if missing is not None:
         line, file = missing
-        raise DataError(f"{file} is not in the source", where=f"{where}:{line}", fix="Leave images out with --no-images")
+        raise DataError(f"{file} is not in the source", where=f"{where}:{line}", fix="Leave images out with `images=False`")
     formats = {IMAGE_FORMATS[PurePosixPath(name).suffix.lower()] for name in stamps}
     if len(formats) > 1:
         raise DataError(f"lists {' and '.join(sorted(formats))} images", where=where, expected="one kind")

@@ -224,7 +224,7 @@ def _open(path: Path) -> Iterator[Bag]:
     """The bag, open; one with an index must be whole, of any other what can be read is taken."""
     try:
         with Bag(path) as bag:
-            bag.salvage = not bag.indexed
+            bag.recover = not bag.indexed
             yield bag
     except (ConfigError, LogError) as error:
         raise DataError(f"cannot be read as a ROS 1 bag ({error.what})", where=path, fix=error.fix) from error

@@ -32,8 +32,8 @@ if TYPE_CHECKING:
     from imutool.api.training import evaluate, train
     from imutool.api.views import LiveView, load_run, notebook_page, notebook_viewer, view, watch
     from imutool.bias.model import BiasModel
+    from imutool.bias_start.correction import OnlineDebiaser
     from imutool.bias_start.initial_bias import InitialBias
-    from imutool.debiasing import OnlineDebiaser
     from imutool.errors import ConfigError, DataError, ImutoolError, LogError, ModelError, NumericsError
     from imutool.mcap_io.log import Log
     from imutool.recording import Frames, Imu, Poses, Recording, Scalars
@@ -47,7 +47,7 @@ _HOMES = {  # public names by the module that defines them; a name is imported w
     "imutool.api.views": ("LiveView", "load_run", "notebook_page", "notebook_viewer", "view", "watch"),
     "imutool.bias.model": ("BiasModel",),
     "imutool.bias_start.initial_bias": ("InitialBias",),
-    "imutool.debiasing": ("OnlineDebiaser",),
+    "imutool.bias_start.correction": ("OnlineDebiaser",),
     "imutool.errors": ("ConfigError", "DataError", "ImutoolError", "LogError", "ModelError", "NumericsError"),
     "imutool.mcap_io.log": ("Log",),
     "imutool.recording": ("Frames", "Imu", "Poses", "Recording", "Scalars"),

@@ -82,7 +82,7 @@ def _put(values: dict[str, Any], word: str) -> None:
     """Lays one `a.b=value` word into nested tables; the value is read as TOML, else taken as a string."""
     key, equals, text = word.partition("=")
     if not equals or not key:
-        raise ConfigError(f"{word!r} sets nothing", where="--set", expected="key=value")
+        raise ConfigError(f"{word!r} sets nothing", where="set", expected="key=value")
     try:
         (value,) = tomllib.loads(f"value = {text}").values()
     except (ValueError, RecursionError):  # no TOML, more than one line of it, or nested too deeply to be any setting's
@@ -91,7 +91,7 @@ def _put(values: dict[str, Any], word: str) -> None:
     for table in tables:
         values = values.setdefault(table, {})
         if not isinstance(values, dict):
-            raise ConfigError(f"{table!r} is a value, not a table", where=f"--set {word}")
+            raise ConfigError(f"{table!r} is a value, not a table", where=f"set={word}")
     values[last] = value
 
 

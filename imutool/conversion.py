@@ -143,7 +143,7 @@ def _find(source: Path, format: str) -> _Found:
                 if format != AUTO or module.recognises(sequence):
                     mine.append(_Job(key, sequence))
                 elif not mine:
-                    reason = DataError("no converter recognises it", where=str(sequence), fix="Choose one with --format")
+                    reason = DataError("no converter recognises it", where=str(sequence), fix="Choose one with `format`")
                     errors.setdefault(str(sequence), (sequence.name, reason))
             except ImutoolError as error:
                 errors[str(sequence)] = (sequence.name, error)
@@ -156,7 +156,7 @@ def _find(source: Path, format: str) -> _Found:
     for place, jobs in claims.items():
         if len(jobs) > 1:
             keys = " and ".join(job.converter for job in jobs)
-            raise ConfigError(f"is recognised as {keys}", where=place, fix="Choose one with --format")
+            raise ConfigError(f"is recognised as {keys}", where=place, fix="Choose one with `format`")
     return _Found(
         [job for jobs in claims.values() for job in jobs],
         [error for place, error in errors.items() if not claims[place]],
@@ -175,7 +175,7 @@ def _only(found: _Found, wanted: Sequence[str]) -> _Found:
             near = difflib.get_close_matches(name, known, n=1)
             raise ConfigError(
                 f"{name!r} is not in the source",
-                where="--sequence",
+                where="sequences",
                 expected=f"one of {', '.join(sorted(known))}",
                 fix=f"Did you mean {near[0]!r}?" if near else "",
             )
@@ -209,14 +209,14 @@ def _check_targets(jobs: Sequence[_Job]) -> None:
         if (other := seen.setdefault(job.target, job)) is not job:
             raise ConfigError(
                 f"two sequences are named {job.sequence.name}: {other.sequence} and {job.sequence}",
-                where="SRC",
+                where="source",
                 fix="Convert them one at a time",
             )
         path = getattr(job.sequence, "path", None)
         if path is not None and _is_part_of(job.target, path):
-            raise ConfigError("is the source itself", where=job.target, expected="another OUT")
+            raise ConfigError("is the source itself", where=job.target, expected="another `out`")
         if job.target.exists() and not job.overwrite:
-            raise ConfigError("exists", where=job.target, fix="Choose another OUT or pass --overwrite")
+            raise ConfigError("exists", where=job.target, fix="Choose another `out`, or add `overwrite`")
 
 
 def _is_part_of(target: Path, source: Path) -> bool:

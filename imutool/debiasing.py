@@ -1,4 +1,4 @@
-"""A model at work: over a whole log, over a recording in memory, or one sample at a time; always the same numbers.
+"""Debias a log: copy it and add debiased samples, biases and their covariance.
 
 Causal throughout, unless `smooth` is asked for: the bias at a sample comes from that sample and earlier ones, once the start
 is known (`imutool.bias_start.initial_bias`). Smoothing reads the log twice; of the first pass it keeps thirteen numbers for
@@ -19,41 +19,34 @@ from jaxtyping import Float64, Int64, UInt8
 from imutool import __version__
 from imutool.bias import static
 from imutool.bias.io import shipped, shipped_for
-from imutool.bias.model import BiasModel, OneByOne, Stream, Vector6
-from imutool.bias_start.bias_covariance import BiasCovariance
-from imutool.bias_start.initial_bias import InitialBias, following
-from imutool.bias_start.model_choice import prepare, refuse_smooth
-from imutool.cleaning import Cleaner, Rules, Survey, look
+from imutool.bias.model import BiasModel
+from imutool.bias_start.bias_covariance import BiasEstimator
+from imutool.bias_start.initial_bias import InitialBias
+from imutool.bias_start.model_choice import check_smooth, choose_model_and_start
+from imutool.cleaning import Cleaner, CleaningSettings, Survey, look
 from imutool.config import plain
 from imutool.errors import ConfigError, LogError
 from imutool.location import Location
-from imutool.mcap_io.added_topics import Made, NewTopic
-from imutool.mcap_io.batches import Clock, ImuBatch
+from imutool.mcap_io.added_topics import DerivedBatch, NewTopic
 from imutool.mcap_io.codec import schemas
 from imutool.mcap_io.codec.encode import encode_imu, encode_twist, encode_vector3
 from imutool.mcap_io.log import Log
-from imutool.mcap_io.losses import Losses
+from imutool.mcap_io.recovery.losses import Losses
+from imutool.mcap_io.recovery.recovered_log import RecoveredLog
 from imutool.mcap_io.repair import repaired
 from imutool.mcap_io.rewrite import RewriteReport, Values, rewrite
-from imutool.mcap_io.storage.digest import Digest
-from imutool.mcap_io.verify import Verified, refuse_unknown
-from imutool.recording import Imu, seconds
+from imutool.mcap_io.storage.source import Digest
+from imutool.mcap_io.topics import ImuBatch, StampCheck
+from imutool.mcap_io.verify import Verified, check_mode
+from imutool.recording import seconds
 
 SUFFIX = "/debiased"
-BLOCK = 1 << 14  # samples
 CLEAN_RECORD = "imutool_clean"
-
-
-class Debiased(NamedTuple):
-    """Corrected samples and what was subtracted: gyro (rad/s), then accel (m/s²)."""
-
-    imu: Imu
-    bias: Float64[np.ndarray, "n 6"]
 
 
 @dataclass(frozen=True)
 class DebiasReport:
-    """What was done to a log, one entry per IMU topic."""
+    """Models, initial biases, copy and losses of a debiased log, per IMU topic."""
 
     models: Mapping[str, str]
     starts: Mapping[str, InitialBias]
@@ -62,14 +55,8 @@ class DebiasReport:
     surveys: Mapping[str, Survey]  # of what was cleaned
 
 
-def apply(model: BiasModel, start: InitialBias, imu: Imu) -> Debiased:
-    """A model over samples in memory, from their first on."""
-    bias = start.stream(model)(seconds(imu.t_ns, int(imu.t_ns[0])), imu.gyro, imu.accel)
-    return Debiased(Imu(imu.t_ns, imu.gyro - bias[:, :3], imu.accel - bias[:, 3:]), bias)
-
-
-class Block(NamedTuple):
-    """Consecutive samples of one IMU as they are debiased, for whoever watches: gyro (rad/s), then accel (m/s²)."""
+class DebiasedBlock(NamedTuple):
+    """Consecutive samples of one IMU as they are debiased: gyro (rad/s), then accel (m/s²)."""
 
     topic: str
     batch: ImuBatch  # raw
@@ -77,69 +64,22 @@ class Block(NamedTuple):
     std: Float64[np.ndarray, "n 6"]  # one standard deviation of it
 
 
-Watch = Callable[[Block], None]
-
-
-def apply_with_std(model: BiasModel, start: InitialBias, imu: Imu) -> tuple[Debiased, Float64[np.ndarray, "n 6"]]:
-    """As `apply`, and one standard deviation of the bias at each sample, gyro (rad/s) then accel (m/s²):
-    `imutool.bias_start.bias_covariance`.
-
-    In blocks, as a log is debiased: a covariance is 288 bytes.
-    """
-    stream = start.stream(model)
-    certainty = BiasCovariance(model, start, stream)
-    t_s = seconds(imu.t_ns, int(imu.t_ns[0]))
-    bias, std = np.empty((len(imu), 6)), np.empty((len(imu), 6))
-    for first in range(0, len(imu), BLOCK):
-        rows = slice(first, first + BLOCK)
-        bias[rows] = stream(t_s[rows], imu.gyro[rows], imu.accel[rows])
-        covariance = certainty(t_s[rows], imu.gyro[rows], imu.accel[rows])
-        std[rows] = np.sqrt(covariance.diagonal(axis1=1, axis2=2))
-    return Debiased(Imu(imu.t_ns, imu.gyro - bias[:, :3], imu.accel - bias[:, 3:]), bias), std
-
-
-class OnlineDebiaser:
-    """One sample in, one corrected sample out: for a live node.
-
-    The start is a rest bias from `imutool.bias_start.initial_bias`, for instance `at_rest` over the first seconds, or
-    `prior`. Without one, it
-    begins at the prior and is followed by what the samples show, as by `--init auto`.
-    """
-
-    def __init__(self, model: BiasModel, start: InitialBias | None = None) -> None:
-        stream = (start or following(model)).stream(model)
-        self._one, self._start_ns = stream.one if isinstance(stream, OneByOne) else _by_blocks(stream), -1
-
-    def __call__(
-        self, stamp_ns: int, gyro: Float64[np.ndarray, "3"], accel: Float64[np.ndarray, "3"]
-    ) -> tuple[Float64[np.ndarray, "3"], Float64[np.ndarray, "3"], Float64[np.ndarray, "6"]]:
-        """Corrected angular rate (rad/s) and specific force (m/s²), and the bias that was subtracted."""
-        if self._start_ns < 0:
-            self._start_ns = stamp_ns
-        u = np.concatenate((gyro, accel))
-        bias = self._one((stamp_ns - self._start_ns) * 1e-9, u)
-        clean = u - bias
-        return clean[:3], clean[3:], bias
-
-
-def _by_blocks(stream: Stream) -> Callable[[float, Vector6], Vector6]:
-    """One sample as a block of one, for a stream that knows no shorter way."""
-
-    def one(t_s: float, u: Vector6) -> Vector6:
-        bias: Vector6 = stream(np.array([t_s]), u[None, :3], u[None, 3:])[0]
-        return bias
-
-    return one
+BlockCallback = Callable[[DebiasedBlock], None]
 
 
 class Debiaser:
-    """The channels a log gains, computed batch by batch as the log is copied (`mcap_io.derived.Derived`).
+    """Debiased topics of one IMU, computed batch by batch as the log is copied (`mcap_io.added_topics`).
 
-    With a survey, only of what is left of the samples when they are clean. Who watches is told every batch.
+    With a survey the samples are cleaned first. `watch` is called with every batch.
     """
 
     def __init__(
-        self, source_topic: str, model: BiasModel, start: InitialBias, found: Survey | None = None, watch: Watch | None = None
+        self,
+        source_topic: str,
+        model: BiasModel,
+        start: InitialBias,
+        found: Survey | None = None,
+        watch: BlockCallback | None = None,
     ) -> None:
         self.source_topic, self._watch = source_topic, watch
         self._clean = None if found is None else Cleaner(found)
@@ -149,13 +89,12 @@ class Debiaser:
             NewTopic(f"{source_topic}/bias/accel", schemas.VECTOR3),
             NewTopic(f"{source_topic}/bias", schemas.TWIST),
         )
-        self._stream, self._start_ns = start.stream(model), -1
-        self._clock = Clock()
-        self._certainty = BiasCovariance(model, start, self._stream)
+        self._estimator, self._start_ns = BiasEstimator(model, start), -1
+        self._clock = StampCheck()
         noise = model.noise_std.detach().cpu().double().numpy()
         self._white = np.diag(np.where(noise > 0, noise, start.noise) ** 2)
 
-    def __call__(self, batch: ImuBatch) -> Made:
+    def __call__(self, batch: ImuBatch) -> DerivedBatch:
         """Payloads of the corrected messages, of the two biases, and of both with their covariance.
 
         A corrected sample's covariance is that of its bias and the sensor's white noise.
@@ -165,13 +104,12 @@ class Debiaser:
         """
         if self._clean is not None:
             batch = self._clean(batch)
-        self._clock.take(batch)
+        self._clock.check_imu(batch)
         if self._start_ns < 0 and len(batch.stamp_ns):
             self._start_ns = int(batch.stamp_ns[0])
         t_s = seconds(batch.stamp_ns, self._start_ns)
-        bias = self._stream(t_s, batch.gyro, batch.accel)
-        unsure = self._certainty(t_s, batch.gyro, batch.accel)
-        total = unsure + self._white
+        bias, covariance = self._estimator(t_s, batch.gyro, batch.accel)
+        total = covariance + self._white
         corrected = encode_imu(
             batch.stamp_ns,
             batch.gyro - bias[:, :3],
@@ -184,12 +122,12 @@ class Debiaser:
             corrected,
             _vector(batch.stamp_ns, bias[:, :3], batch.frame_id),
             _vector(batch.stamp_ns, bias[:, 3:], batch.frame_id),
-            encode_twist(batch.stamp_ns, bias[:, :3], bias[:, 3:], unsure, batch.frame_id),
+            encode_twist(batch.stamp_ns, bias[:, :3], bias[:, 3:], covariance, batch.frame_id),
         )
         if self._watch is not None and len(batch.stamp_ns):
-            std = np.sqrt(unsure.diagonal(axis1=1, axis2=2))
-            self._watch(Block(self.source_topic, batch, bias, std))
-        return Made(batch, payloads)
+            std = np.sqrt(covariance.diagonal(axis1=1, axis2=2))
+            self._watch(DebiasedBlock(self.source_topic, batch, bias, std))
+        return DerivedBatch(batch, payloads)
 
 
 def debias(
@@ -201,22 +139,21 @@ def debias(
     init: str = "auto",
     smooth: bool = False,
     check: str = "imu",
-    clean: Rules | None = None,
+    clean: CleaningSettings | None = None,
     overwrite: bool = False,
     progress: Callable[[int, int], None] | None = None,
-    watch: Watch | None = None,
+    watch: BlockCallback | None = None,
 ) -> DebiasReport:
-    """Writes `target`: all of `source` unchanged, and beside each IMU its debiased samples and the bias taken off.
+    """Writes `target`: all of `source`, and for each IMU its debiased samples and the bias.
 
     One model serves every IMU, or each has its own by topic, "" being that of all others. An IMU without one gets the
     one the log's metadata names, else the one that ships for its sensor, else the mean over time at rest. The IMUs are
     those in `imus`, else those with a model of their own, else the log's only one.
-    With `smooth` the start bias at every time comes from the whole log, also from what follows.
-    Without a target the log itself is replaced (`mcap_io.rewrite`, which also says what `check` checks).
-    Of a damaged log, what is sound goes through a repaired copy beside the target (`mcap_io.salvage`), and `losses` says
-    what is missing; it is not replaced. With `clean` a first pass says what is to be left out or converted
-    (`imutool.cleaning`), and the record `imutool_clean` what it found.
-    `watch` is told every batch of samples as it is debiased, those of a damaged log again when its repaired copy is.
+    With `smooth` the initial bias at every time comes from the whole log, also from later samples.
+    Without a target the log itself is replaced; `check` is that of `mcap_io.rewrite`. The intact part of a damaged log is
+    debiased from a repaired copy beside the target (`mcap_io.repair`), and `losses` lists the rest; it is not replaced. With
+    `clean` a first pass finds samples to leave out or convert (`imutool.cleaning`); the record `imutool_clean` lists them.
+    `watch` is called with every batch of debiased samples, those of a damaged log again when its repaired copy is debiased.
 
     Raises:
         ConfigError: source or target cannot be opened, `init` makes no sense, `smooth` is asked for with another `init`,
@@ -225,86 +162,94 @@ def debias(
             or cannot be trusted, with `clean`.
         ModelError: no model and no time at rest; a model for another rate; a damaged model file.
     """
-    refuse_smooth(init, smooth)
-    refuse_unknown(check)
-    asked = _Asked(model, imus, init, smooth, clean, check, overwrite, watch)
-    with Log(source, salvage=True) as log:
-        assert log.losses is not None, "with salvage there are losses, if perhaps none"
-        damaged = bool(log.losses or log.losses.mended)
-    if not damaged:
-        try:
-            return _debias(source, source, Losses(), target, asked, progress)
-        except LogError as error:  # damage inside a chunk shows only here
-            refusal = error
+    check_smooth(init, smooth)
+    check_mode(check)
+    options = _Options(model, imus, init, smooth, clean, check, overwrite, watch)
+    refusal: LogError | None = None
+    try:
+        if (log := _open_intact(source)) is not None:
+            with log:
+                return _debias(log, source, Losses(), target, options, progress)
+    except LogError as error:  # damage inside a chunk shows only here
+        refusal = error
     with repaired(source, target or source) as saved:
         if saved is None:
+            assert refusal is not None, "an intact log was debiased, or refused"
             raise refusal
         if target is None:
-            raise LogError("the log is damaged", where=source, fix="Give OUT: put in its place, the damaged part would be gone")
-        return _debias(source, *saved, target, asked, progress)
+            raise LogError("the log is damaged", where=source, fix="Give a target: in place, the damaged part would be gone")
+        copy, losses = saved
+        with Log(copy) as log:
+            return _debias(log, source, losses, target, options, progress)
+
+
+def _open_intact(source: Location) -> Log | None:
+    """The log, opened; None where opening it shows damage."""
+    with RecoveredLog(source) as log:
+        return log.strict() if log.losses.intact else None
 
 
 @dataclass(frozen=True)
-class _Asked:
-    """What `debias` is to do."""
+class _Options:
+    """The arguments of `debias`."""
 
     model: str | Path | Mapping[str, str | Path] | None
     imus: Sequence[str]
     init: str
     smooth: bool
-    clean: Rules | None
+    clean: CleaningSettings | None
     check: str
     overwrite: bool
-    watch: Watch | None
+    watch: BlockCallback | None
 
 
 def _debias(
+    log: Log,
     source: Location,
-    sound: Location,
     losses: Losses,
     target: Location | None,
-    asked: _Asked,
+    options: _Options,
     progress: Callable[[int, int], None] | None,
 ) -> DebiasReport:
-    """The same for a log that is whole, or for the `sound` copy of one that is not."""
-    model = asked.model
+    """Debiases an open log: the source itself, or the repaired copy of a damaged one."""
+    model = options.model
     given = dict(model) if isinstance(model, Mapping) else {} if model is None else {"": model}
-    with Log(sound) as log:
-        topics = _chosen(log, asked.imus, given)
-        about = log.metadata().get("imutool", {})
-        surveys = {} if asked.clean is None else {topic: look(log, topic, asked.clean).trusted() for topic in topics}
-    named = given.get("") or (None if all(topic in given for topic in topics) else _of_the_log(about))
+    topics = _choose_imus(log, options.imus, given)
+    about = log.metadata().get("imutool", {})
+    surveys = {} if options.clean is None else {topic: look(log, topic, options.clean).trusted() for topic in topics}
+    default = given.get("") or (None if all(topic in given for topic in topics) else _model_of_log(about))
     derived, starts, models, records = [], {}, {}, {}
     with Digest(source) as digest:
         for topic in topics:
-            chosen, start = prepare(sound, topic, given.get(topic, named), asked.init, asked.smooth, surveys.get(topic))
-            derived.append(Debiaser(topic, chosen, start, surveys.get(topic), asked.watch))
+            name, survey = given.get(topic, default), surveys.get(topic)
+            chosen, start = choose_model_and_start(log, topic, name, options.init, options.smooth, survey)
+            derived.append(Debiaser(topic, chosen, start, survey, options.watch))
             starts[topic], models[topic] = start, str(chosen.card.get("name", chosen.method))
-            records[topic] = _provenance(topic, chosen, start, asked.init, asked.smooth)
+            records[topic] = _provenance(topic, chosen, start, options.init, options.smooth)
 
         def metadata(verified: Verified) -> Values:
             origin = {"source_file": source.name, "source_sha256": digest.result(), "source_size": str(source.stat().st_size)}
             checked = {"verified": json.dumps(verified._asdict())}
-            told = {_record("imutool", topic, records): v | origin | checked for topic, v in records.items()}
-            return told | {_record(CLEAN_RECORD, topic, records): found.record() for topic, found in surveys.items()}
+            entries = {_record_name("imutool", topic, records): v | origin | checked for topic, v in records.items()}
+            return entries | {_record_name(CLEAN_RECORD, topic, records): found.record() for topic, found in surveys.items()}
 
         report = rewrite(
-            sound, target, derived, metadata=metadata, overwrite=asked.overwrite, check=asked.check, progress=progress
+            log, target, derived, metadata=metadata, overwrite=options.overwrite, check=options.check, progress=progress
         )
     return DebiasReport(models, starts, report, losses, surveys)
 
 
-def _record(name: str, topic: str, records: Mapping[str, object]) -> str:
-    """The name of a metadata record: with its topic where there are several."""
+def _record_name(name: str, topic: str, records: Mapping[str, object]) -> str:
+    """The name of a metadata record: with its topic where there are several IMUs."""
     return f"{name}{topic}" if len(records) > 1 else name
 
 
-def _of_the_log(about: Mapping[str, str]) -> str | Path | None:
-    """The model that a log's metadata name, which must be one that ships: a log may come from anybody."""
+def _model_of_log(about: Mapping[str, str]) -> str | Path | None:
+    """The shipped model that a log's metadata name: a log may come from anybody."""
     return shipped(about["model"]) if about.get("model") else shipped_for(about.get("sensor"), about.get("dataset"))
 
 
-def _chosen(log: Log, imus: Sequence[str], given: Mapping[str, str | Path]) -> list[str]:
+def _choose_imus(log: Log, imus: Sequence[str], given: Mapping[str, str | Path]) -> list[str]:
     """The IMUs to debias, each once.
 
     Raises:
@@ -317,15 +262,15 @@ def _chosen(log: Log, imus: Sequence[str], given: Mapping[str, str | Path]) -> l
         if topic not in topics:
             raise ConfigError(
                 f"a model for {topic}, which is not to be debiased",
-                where="--model",
+                where="model",
                 expected=", ".join(topics),
-                fix=f"Add --imu {topic}, or leave the model out",
+                fix=f"Add {topic} to `imus`, or leave the model out",
             )
     if "" in given and all(topic in given for topic in topics):
         raise ConfigError(
             f"{given['']} is for all IMUs without a model of their own, and each has one",
-            where="--model",
-            fix="Leave it out, or name the other IMUs with --imu",
+            where="model",
+            fix="Leave it out, or name the other IMUs in `imus`",
         )
     return topics
 

@@ -21,7 +21,7 @@ from imutool.training.fit import Epoch, TrainSettings
 from imutool.training.run import train
 from imutool.viewing.html import report
 from imutool.viewing.model.runs import load
-from imutool.viewing.rerun import files
+from imutool.viewing.rerun import scene
 
 TRAINING_SEEDS = (1, 2, 3, 4)  # four flights of one sensor, each with a turn-on bias of its own
 TEST_SEED = 5
@@ -89,7 +89,7 @@ def run(
     say("5. Measuring against the truth, drawing")
     results = evaluate(log, models=["static", model])
     data = load(log, models=["static", model])
-    files.save([data], rrd, overwrite=overwrite)
+    scene.save([data], rrd, overwrite=overwrite)
     pictures = report.write_pngs(data, out / "pictures", overwrite=overwrite)
     report.write_page([data], page, overwrite=overwrite)
     png = next(path for path in pictures if path.stem.endswith("-errors"))
@@ -109,7 +109,7 @@ def _check(out: Path, overwrite: bool) -> None:
     if out.exists() and not out.is_dir():
         raise ConfigError("is a file", where=out, expected="a folder")
     if out.exists() and any(out.iterdir()) and not overwrite:
-        raise ConfigError("is not empty", where=out, fix="Choose another -o, or add --overwrite")
+        raise ConfigError("is not empty", where=out, fix="Choose another `out`, or add `overwrite`")
 
 
 def write_asl(recording: Recording, folder: Path) -> None:

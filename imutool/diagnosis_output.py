@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import contextlib
 import json
-import math
 import os
 import secrets
 import shutil
@@ -16,11 +15,12 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from imutool.diagnosis.result import Diagnosis
-from imutool.diagnosis.to_physics_file import found
+from imutool.diagnosis.to_physics_file import to_physics_file
 from imutool.errors import ConfigError, ImutoolError
+from imutool.report import json_values
 from imutool.sensor import physics_file
 
 if TYPE_CHECKING:
@@ -77,26 +77,10 @@ def write(
     return remarks
 
 
-def plain(d: Diagnosis) -> dict[str, Any]:
-    """What findings.json holds; JSON has no word for infinity (a cut-off never reached) or for no number: null."""
-    values: dict[str, Any] = _finite(d.plain())
-    return values
-
-
-def _finite(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {key: _finite(inner) for key, inner in value.items()}
-    if isinstance(value, list | tuple):
-        return [_finite(inner) for inner in value]
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    return value
-
-
 def _make(d: Diagnosis, folder: Path, logs: Callable[[Path], list[RunData]] | None) -> list[str]:
-    text = json.dumps(plain(d), indent=2, allow_nan=False, ensure_ascii=False)
+    text = json.dumps(json_values(d.report), indent=2, allow_nan=False, ensure_ascii=False)
     (folder / FINDINGS).write_text(text + "\n", encoding="utf-8")
-    physics_file.write(found(d), folder / EFFECT)
+    physics_file.write(to_physics_file(d), folder / EFFECT)
     drawn: dict[str, Callable[[Path], None]] = {REPORT: lambda path: _page(d, path), VIEW: lambda path: _recording(d, path)}
     if logs is not None:  # before the report, which says where it is
         drawn = {LOG: lambda path: _logs(logs(folder), path)} | drawn

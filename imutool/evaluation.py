@@ -13,14 +13,14 @@ from jaxtyping import Bool
 from imutool.bias import static
 from imutool.bias.io import check_rate, find_model
 from imutool.bias.model import BiasModel
-from imutool.bias_start.bias_tracking import Known
+from imutool.bias_start.bias_tracking import BiasPrior
+from imutool.bias_start.correction import DebiasedImu, apply
 from imutool.bias_start.initial_bias import AT_REST_STD, LEAST_STD, InitialBias, find
-from imutool.bias_start.model_choice import estimate_at_rest, refuse_smooth, smooth_in_memory
-from imutool.bias_start.zero_velocity import with_stops
-from imutool.debiasing import Debiased, apply
+from imutool.bias_start.model_choice import check_smooth, estimate_at_rest, smooth_in_memory
+from imutool.bias_start.zero_velocity import zero_velocity_trajectory
 from imutool.errors import ConfigError
 from imutool.inertial import metrics
-from imutool.inertial.strapdown import Start, along_truth, drift
+from imutool.inertial.strapdown import StartPose, along_truth, drift
 from imutool.mcap_io.read import read
 from imutool.recording import Imu, Poses, Recording
 
@@ -43,7 +43,7 @@ def evaluate(
     trajectories: Path | None = None,
     overwrite: bool = False,
 ) -> list[dict[str, Any]]:
-    """One result for the raw samples and one for each model (contracts.md, evaluate).
+    """One result for the raw samples and one for each model.
 
     Every trajectory starts at the true pose and velocity at the first sample the truth covers, and is integrated by
     `strapdown.dead_reckon`; only samples outside gaps of the truth are scored. With `smooth` each bias comes from the whole
@@ -65,7 +65,7 @@ def evaluate(
         drifted = _drift(integrated, true, valid)
         estimates = {PURE: integrated}
         if zupt:
-            estimates[ZUPT] = with_stops(_over(found.imu, true), Start.of(true), _left(start), smooth=smooth)
+            estimates[ZUPT] = zero_velocity_trajectory(_over(found.imu, true), StartPose.of(true), _left(start), smooth=smooth)
         for kind, estimate in estimates.items():
             results.append(
                 {
@@ -102,18 +102,18 @@ def _over(imu: Imu, true: Poses) -> Imu:
     return rows
 
 
-def _left(start: InitialBias | None) -> Known:
+def _left(start: InitialBias | None) -> BiasPrior:
     """What may be left of the bias after debiasing: the start's uncertainty, or anything where nothing was taken off."""
     std = np.array(RAW_STD) if start is None else np.maximum(start.std, LEAST_STD)
-    return Known(np.zeros(6), std, AT_REST_STD)
+    return BiasPrior(np.zeros(6), std, AT_REST_STD)
 
 
 def runs(
     recording: Recording, models: Sequence[str | Path], init: str, where: str | Path, *, smooth: bool = False
-) -> Iterator[tuple[str, Debiased, InitialBias | None]]:
+) -> Iterator[tuple[str, DebiasedImu, InitialBias | None]]:
     """The samples as recorded, then as each model corrects them: name, samples and bias, and the start."""
-    refuse_smooth(init, smooth)
-    yield RAW, Debiased(recording.imu, np.zeros((len(recording.imu), 6))), None
+    check_smooth(init, smooth)
+    yield RAW, DebiasedImu(recording.imu, np.zeros((len(recording.imu), 6))), None
     for name, model, start in started(recording, models, init, where, smooth=smooth):
         yield name, apply(model, start, recording.imu), start
 
@@ -122,7 +122,7 @@ def started(
     recording: Recording, models: Sequence[str | Path], init: str, where: str | Path, *, smooth: bool = False
 ) -> Iterator[tuple[str, BiasModel, InitialBias]]:
     """Each model asked for, its name, and the start it gets in this recording."""
-    refuse_smooth(init, smooth)
+    check_smooth(init, smooth)
     for given in models:
         model, start = _model_and_start(given, recording, init, where, smooth)
         yield str(model.card.get("name", model.method)), model, start

@@ -1,4 +1,4 @@
-"""Where a log lies: a file on this machine, or an object in a store, named by its URL.
+"""Locations of logs: a file on this machine, or an object in a store by its URL.
 
 A store is read and written through fsspec, which is imported only when a URL is given. What opens it comes from the store's
 own usual chain (environment, profile, instance role; its endpoint from AWS_ENDPOINT_URL) and never from the URL, because a
@@ -33,25 +33,26 @@ STORES = {
     "https": CLOUD,
     "memory": CLOUD,
 }
-ACCOUNTS = ("az", "abfs")  # these say CONTAINER@ACCOUNT, which is no secret
+ACCOUNTS = ("az", "abfs")  # their URLs say CONTAINER@ACCOUNT, which is not secret
 BLOCK_BYTES = 4 << 20
 # A scan, the message indexes behind its chunk and the summary each have their block: 7 requests where 6 are the fewest, and
 # the library's own reading ahead made 13 (tests/bench/store.py)
 CACHE, CACHE_OPTIONS = "blockcache", {"maxblocks": 4}
 
 
-class Opened(NamedTuple):
-    """What can be read of a place, from any byte, and how many bytes it has."""
+class OpenFile(NamedTuple):
+    """An open file or object, its size, and its `identity` when it was opened."""
 
     file: BinaryIO
     size: int
+    identity: tuple[int, str]
 
 
 def to_location(text: str) -> Location:
-    """The file or the object that a user names.
+    """File or object that a user names.
 
     Raises:
-        ConfigError: a store nobody here knows, one whose package is not installed, or a URL with a password or signature in it.
+        ConfigError: an unknown kind of store, one whose package is not installed, or a URL with a password or signature in it.
     """
     scheme, found, rest = text.partition("://")
     if not found:
@@ -59,20 +60,20 @@ def to_location(text: str) -> Location:
     if scheme == "file":
         return Path(rest)
     if scheme not in STORES:
-        raise ConfigError("is no store known here", where=redacted(text), expected=", ".join(f"{name}://" for name in STORES))
+        raise ConfigError("unknown kind of store", where=redact(text), expected=", ".join(f"{name}://" for name in STORES))
     _refuse_secrets(scheme, text)
     try:
         from upath import UPath
 
-        found_place = UPath(text, use_listings_cache=False)  # a listing kept from before would hide what others write
-        found_place.fs  # noqa: B018  imports the store's package
+        place = UPath(text, use_listings_cache=False)  # a cached listing would hide what others write
+        place.fs  # noqa: B018  imports the store's package
     except ImportError as error:
         raise ConfigError(
             f"needs a package that is not installed ({error})", where=text, fix=f"Install it with: {STORES[scheme]}"
         ) from error
-    except Exception as error:  # whatever the store's own set-up trips over
+    except Exception as error:  # any error of the store's set-up
         raise ConfigError(f"cannot be opened ({reason(error)})", where=text) from error
-    return found_place
+    return place
 
 
 def _refuse_secrets(scheme: str, text: str) -> None:
@@ -80,7 +81,7 @@ def _refuse_secrets(scheme: str, text: str) -> None:
     if at and (scheme not in ACCOUNTS or ":" in login):
         raise ConfigError(
             "a user name or password stands in the URL",
-            where=redacted(text),
+            where=redact(text),
             expected="none: URLs are written into reports and logs",
             fix="Give it by the store's environment variables or profile",
         )
@@ -93,51 +94,53 @@ def _refuse_secrets(scheme: str, text: str) -> None:
         )
 
 
-def redacted(text: str) -> str:
-    """Text that may hold URLs, without the users, passwords and signatures in them."""
+def redact(text: str) -> str:
+    """Text without the users, passwords and signatures of the URLs in it."""
     return re.sub(r"(?i)((?:signature|sig|token|credential)=)[^&\s\"']+", r"\1***", re.sub(r"//[^/\s]*@", "//***@", text))
 
 
-def failures(where: Location) -> type[Exception]:
-    """What reading and writing there may raise: of a store whatever its library does, since they have no class in common."""
+def io_errors(where: Location) -> type[Exception]:
+    """Exception class of reading and writing a location: OSError, or any of a store."""
     return OSError if isinstance(where, Path) else Exception
 
 
 def reason(error: Exception) -> str:
-    """What went wrong in the words of the system or the store, with nothing secret in it."""
+    """The system's or store's reason of an error, without secrets."""
     if isinstance(error, OSError) and error.strerror:
-        return redacted(error.strerror)
+        return redact(error.strerror)
     if isinstance(error, FileNotFoundError):
         return "no such object, or no such bucket"
     if isinstance(error, PermissionError):
-        return redacted(f"the store refuses access: {error}")
-    return redacted(str(error)) or type(error).__name__
+        return redact(f"the store refuses access: {error}")
+    return redact(str(error)) or type(error).__name__
 
 
-def opened(where: Location) -> Opened:
-    """A place open for reading; of a store by ranges, in blocks, of which a few are kept.
+def open_location(where: Location) -> OpenFile:
+    """Opens a file or object for reading; a store is read by blocks, of which a few are kept.
 
     Raises:
-        whatever `failures` names.
+        The classes that `io_errors` names.
     """
     if isinstance(where, Path):
         file = where.open("rb", buffering=0)
-        return Opened(file, os.fstat(file.fileno()).st_size)
+        status = os.fstat(file.fileno())
+        return OpenFile(file, status.st_size, (status.st_size, str(status.st_mtime_ns)))
     remote = where.fs.open(where.path, "rb", block_size=BLOCK_BYTES, cache_type=CACHE, cache_options=dict(CACHE_OPTIONS))
     if remote.size is None:
         raise OSError("the server does not say how long it is, so no part of it can be asked for")
-    return Opened(remote, remote.size)
+    details = getattr(remote, "details", None)  # as opening it has learnt them, without another request
+    return OpenFile(remote, remote.size, size_and_etag(details if isinstance(details, dict) else where.fs.info(where.path)))
 
 
-def same(one: Location, other: Location) -> bool:
-    """Whether two places that exist are one; a link to a file is that file."""
-    if isinstance(one, Path) and isinstance(other, Path):
-        return one.exists() and other.exists() and one.samefile(other)
-    return one == other
+def same_location(a: Location, b: Location) -> bool:
+    """Whether two locations are one existing file or object; a link to a file is that file."""
+    if isinstance(a, Path) and isinstance(b, Path):
+        return a.exists() and b.exists() and a.samefile(b)
+    return a == b
 
 
 def identity(where: Location) -> tuple[int, str]:
-    """Size in bytes, and the etag of a store or the time of the last change: what changes when somebody writes there.
+    """Size, and the etag of a store or the time of the last change.
 
     Raises:
         ConfigError: it cannot be asked for.
@@ -146,13 +149,13 @@ def identity(where: Location) -> tuple[int, str]:
         if isinstance(where, Path):
             status = where.stat()
             return status.st_size, str(status.st_mtime_ns)
-        return seal(where.fs.info(where.path))
-    except failures(where) as error:
+        return size_and_etag(where.fs.info(where.path))
+    except io_errors(where) as error:
         raise ConfigError(f"cannot be read ({reason(error)})", where=where, fix="See who may read it") from error
 
 
-def seal(about: Mapping[str, Any]) -> tuple[int, str]:
-    """Size and etag as a store says them, by whatever name."""
+def size_and_etag(about: Mapping[str, Any]) -> tuple[int, str]:
+    """Size and etag from a store's description, whatever names it uses."""
     names = ("ETag", "etag", "md5Hash", "content_md5", "LastModified", "last_modified", "mtime", "created")
     stamp = next((str(about[name]) for name in names if about.get(name)), "")
     return int(about["size"]), stamp.strip('"')

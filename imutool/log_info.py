@@ -1,13 +1,13 @@
-"""What a log holds and how good it is: clocks of every topic, defects and noise of its IMUs, coverage by the truth.
+"""Contents and quality of a log: clock of every topic, defects and noise of its IMUs, coverage by the truth.
 
-Images are never unpacked; of an IMU the columns are held. Nothing is refused that can be described: stamps that go back,
-repeated stamps and values that are no numbers are counted, where reading the log would stop at the first.
+Images are never unpacked; an IMU's columns are held in memory. Defects are counted where reading the log would stop at the
+first: stamps that go back, repeated stamps, and values that are not finite.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from typing import Any
+from collections.abc import Iterable, Mapping
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float64, Int64
@@ -25,167 +25,124 @@ from imutool.cleaning.rules.units import (
     spread,
 )
 from imutool.errors import LogError
-from imutool.inertial.stationary import stretches
+from imutool.inertial.stationary import rest_stretches
 from imutool.location import Location
+from imutool.log_report import ImuInfo, ImuNoise, Interval, LogInfo, TopicInfo, TruthInfo
 from imutool.mcap_io.codec import schemas
 from imutool.mcap_io.codec.decode import decode_imu
 from imutool.mcap_io.log import Log
+from imutool.mcap_io.recovery.recovered_log import RecoveredLog
 from imutool.mcap_io.topics import DERIVED_KEY, ENCODINGS, Topic
 from imutool.recording import GAP_FACTOR, GRAVITY_M_S2, MIN_GAP_S, Imu, nanoseconds, seconds
+from imutool.report import UNSET
 
-SCHEMA = "imutool.info/1"
 CALM_SHARE = 0.25  # of the resting windows, the calmest, that give the noise: motors may idle in the others
 NOISE_WINDOW_S = 1.0
 
-Report = dict[str, Any]
+
+class _Clock(NamedTuple):
+    rate_hz: float | None
+    jitter_s: float | None
+    largest_gap_s: float | None
+    first_ns: int | None
+    last_ns: int | None
 
 
-def inspect(path: Location, *, check: bool = True) -> Report:
-    """Everything `imutool info` says about a log, as plain JSON values (schema `imutool.info/1`).
+def inspect(path: Location, *, check: bool = True) -> LogInfo:
+    """Describe a log: topics, clocks, IMU defects and noise, coverage by the truth, warnings.
 
-    A damaged log is described by what of it is sound, and `losses` says what is not (`mcap_io.losses.Losses.plain`). For that
-    every chunk is read once; without `check` only those with IMU messages are, and damage elsewhere may go unnoticed.
-
-    `rate_hz` is one over the median period, so that drop-outs do not lower it; `jitter_s` is the standard deviation of
-    the periods. Both, and the largest gap, are null where a topic has fewer than two messages.
+    Of a damaged log the sound part is described, and `losses` lists the rest. For that every chunk is read once; without
+    `check` only chunks with IMU messages are read, and damage elsewhere may go unnoticed.
 
     Raises:
         ConfigError: the file cannot be opened.
-        LogError: it is no MCAP log, or nothing in it is sound.
+        LogError: the file is not an MCAP log, or nothing in it is sound.
     """
-    with Log(path, salvage=True) as log:
-        assert log.losses is not None, "with salvage there are losses, if perhaps none"
+    with RecoveredLog(path) as log:
         if check:
             log.check()
         clocks = {name: _joined(log.stamps(name)) for name in log.topics}
         imus = [_imu(log, topic) for topic in log.topics.values() if topic.schema_name == schemas.IMU]
-        own = [imu for imu in imus if "derived_from" not in imu]
-        truths = [_coverage(name, clocks[name], clocks[own[0]["topic"]]) for name in log.pose_topics if own]
-        warnings = [f"{imu['topic']}: {warning}" for imu in imus for warning in imu["warnings"]]
+        own = [imu for imu in imus if imu.derived_from is UNSET]
+        truths = [_coverage(name, clocks[name], clocks[own[0].topic]) for name in log.pose_topics if own]
+        warnings = [f"{imu.topic}: {warning}" for imu in imus for warning in imu.warnings]
         warnings += _truth_warnings(log, own, truths)
         stamps = [clock for clock in clocks.values() if len(clock)]
         first, last = min((int(c.min()) for c in stamps), default=None), max((int(c.max()) for c in stamps), default=None)
-        return {
-            "schema": SCHEMA,
-            "log": path.stem,
-            "path": str(path),
-            "bytes": path.stat().st_size,
-            "profile": log.profile,
-            "messages": sum(len(clock) for clock in clocks.values()),
-            "first_ns": first,
-            "last_ns": last,
-            "duration_s": None if first is None or last is None else (last - first) * 1e-9,
-            "topics": [_topic(topic, clocks[name]) for name, topic in log.topics.items()],
-            "imu": imus,
-            "truth": truths,
-            "metadata": sorted(log.metadata()),
-            "warnings": warnings,
-            "checked": check,
-            "losses": log.losses.plain(),
-        }
-
-
-def topic_rows(report: Report) -> list[tuple[str, ...]]:
-    """The topics as rows of text for a table, the first row its header."""
-    header = ("topic", "type", "count", "rate Hz", "jitter ms", "largest gap s", "first s", "last s")
-    rows = [
-        (
-            topic["name"],
-            topic["type"],
-            str(topic["count"]),
-            _number(topic["rate_hz"], ".2f"),
-            _number(topic["jitter_s"], ".3f", 1e3),
-            _number(topic["largest_gap_s"], ".3f"),
-            _number(topic["first_ns"], ".3f", 1e-9),
-            _number(topic["last_ns"], ".3f", 1e-9),
+        return LogInfo(
+            log=path.stem,
+            path=str(path),
+            bytes=path.stat().st_size,
+            profile=log.profile,
+            messages=sum(len(clock) for clock in clocks.values()),
+            first_ns=first,
+            last_ns=last,
+            duration_s=None if first is None or last is None else (last - first) * 1e-9,
+            topics=[_topic(topic, clocks[name]) for name, topic in log.topics.items()],
+            imu=imus,
+            truth=truths,
+            metadata=sorted(log.metadata()),
+            warnings=warnings,
+            checked=check,
+            losses=log.losses.plain(),
         )
-        for topic in report["topics"]
-    ]
-    return [header, *rows]
-
-
-def imu_rows(report: Report) -> list[tuple[str, ...]]:
-    """What is known of each IMU and truth as rows of topic, property and value, for a table."""
-    rows: list[tuple[str, ...]] = [("topic", "property", "value")]
-    for imu in report["imu"]:
-        if "samples" not in imu:
-            continue
-        counts = ("out_of_order", "duplicated", "missing", "not_finite", "saturated")
-        rows.append((imu["topic"], "samples", str(imu["samples"])))
-        rows += [(imu["topic"], name.replace("_", " "), str(imu[name])) for name in counts]
-        rows.append((imu["topic"], "at rest", f"{imu['stationary_s']:.1f} s in {len(imu['stationary'])} stretches"))
-        rows.append((imu["topic"], "accel at rest", _number(imu["accel_at_rest_m_s2"], ".3f") + " m/s²"))
-        for name, unit in (("gyro", "rad/s"), ("accel", "m/s²")):
-            noise = imu["noise"]
-            if noise is not None:
-                density = noise[f"{name}_density"]
-                rows.append((imu["topic"], f"{name} noise", ", ".join(f"{d:.2e}" for d in density) + f" {unit}/√Hz"))
-    for truth in report["truth"]:
-        value = f"{100 * truth['coverage']:.1f} % of the IMU, {truth['gaps']} gaps, longest {truth['longest_gap_s']:.2f} s"
-        rows.append((truth["topic"], "covers", value))
-    return rows
-
-
-def _number(value: float | int | None, form: str, scale: float = 1.0) -> str:
-    return "–" if value is None else format(value * scale, form)
 
 
 def _joined(parts: Iterable[Int64[np.ndarray, " n"]]) -> Int64[np.ndarray, " m"]:
     return np.concatenate([np.empty(0, np.int64), *parts])
 
 
-def _topic(topic: Topic, log_times: Int64[np.ndarray, " n"]) -> Report:
-    return {
-        "name": topic.name,
-        "type": topic.schema_name,
-        "encoding": topic.message_encoding,
-        "count": len(log_times),
-        **_clock(log_times),
-    }
+def _topic(topic: Topic, log_times: Int64[np.ndarray, " n"]) -> TopicInfo:
+    return TopicInfo(topic.name, topic.schema_name, topic.message_encoding, len(log_times), *_clock(log_times))
 
 
-def _clock(t_ns: Int64[np.ndarray, " n"]) -> Report:
-    """Rate, jitter, largest gap and ends of the times, put in order."""
+def _clock(t_ns: Int64[np.ndarray, " n"]) -> _Clock:
+    """Rate, jitter, largest gap and ends of the sorted times."""
     ordered = np.sort(t_ns)
     periods = np.diff(ordered)
     known = len(periods) > 0
     median = float(np.median(periods)) if known else 0.0
-    return {
-        "rate_hz": 1e9 / median if median > 0 else None,
-        "jitter_s": float(np.std(periods)) * 1e-9 if known else None,
-        "largest_gap_s": float(periods.max()) * 1e-9 if known else None,
-        "first_ns": int(ordered[0]) if len(ordered) else None,
-        "last_ns": int(ordered[-1]) if len(ordered) else None,
-    }
+    return _Clock(
+        rate_hz=1e9 / median if median > 0 else None,
+        jitter_s=float(np.std(periods)) * 1e-9 if known else None,
+        largest_gap_s=float(periods.max()) * 1e-9 if known else None,
+        first_ns=int(ordered[0]) if len(ordered) else None,
+        last_ns=int(ordered[-1]) if len(ordered) else None,
+    )
 
 
-def _imu(log: Log, topic: Topic) -> Report:
+def _imu(log: Log, topic: Topic) -> ImuInfo:
     """Defects, rest and noise of one IMU; of one in an unknown encoding only a warning."""
-    report: Report = {"topic": topic.name, "warnings": []}
-    if DERIVED_KEY in topic.metadata:
-        report["derived_from"] = topic.metadata[DERIVED_KEY]
+    derived_from = topic.metadata.get(DERIVED_KEY, UNSET)
     if topic.message_encoding not in ENCODINGS:
-        report["warnings"].append(f"encoding {topic.message_encoding!r} is not read")
-        return report
+        warnings = [f"encoding {topic.message_encoding!r} is not read"]
+        return ImuInfo(topic=topic.name, warnings=warnings, derived_from=derived_from)
     t_ns, gyro, accel = _columns(log, topic)
     finite = np.isfinite(gyro).all(axis=1) & np.isfinite(accel).all(axis=1)
     ordered, first = np.unique(t_ns[finite], return_index=True)
     imu = Imu(ordered, gyro[finite][first], accel[finite][first])
     later = np.maximum.accumulate(t_ns) if len(t_ns) else t_ns
-    saturated = _saturated(gyro) | _saturated(accel)
-    report |= {
-        "samples": len(t_ns),
-        **_clock(t_ns),
+    counts = {
         "out_of_order": int((t_ns < later).sum()),
         "duplicated": len(t_ns) - len(np.unique(t_ns)),
         "missing": _missing(np.unique(t_ns)),
         "not_finite": int((~finite).sum()),
-        "saturated": int(saturated.sum()),
-        "saturation_rule": saturation.RULE,
-        **_rest(imu),
+        "saturated": int((_saturated(gyro) | _saturated(accel)).sum()),
     }
-    report["warnings"] += _imu_warnings(report, imu)
-    return report
+    rest = _rest(imu)
+    return ImuInfo(
+        topic=topic.name,
+        warnings=_imu_warnings(counts, imu, rest.accel_m_s2),
+        derived_from=derived_from,
+        samples=len(t_ns),
+        **_clock(t_ns)._asdict(),
+        **counts,
+        saturation_rule=saturation.RULE,
+        stationary_s=rest.seconds,
+        stationary=rest.stretches,
+        accel_at_rest_m_s2=rest.accel_m_s2,
+        noise=rest.noise,
+    )
 
 
 def _columns(log: Log, topic: Topic) -> tuple[Int64[np.ndarray, " n"], Float64[np.ndarray, "n 3"], Float64[np.ndarray, "n 3"]]:
@@ -219,21 +176,28 @@ def _saturated(values: Float64[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
     return found
 
 
-def _rest(imu: Imu) -> Report:
-    """Where the sensor rests, the specific force it reads there, and its noise."""
-    found = stretches(imu)
+class _Rest(NamedTuple):
+    seconds: float
+    stretches: list[Interval]
+    accel_m_s2: float | None
+    noise: ImuNoise | None
+
+
+def _rest(imu: Imu) -> _Rest:
+    """Stationary stretches, the specific force there, and the noise."""
+    found = rest_stretches(imu)
     samples = [slice(a, b) for a, b in found]
     weights = [b - a for a, b in found]
     norms = [float(np.linalg.norm(imu.accel[s].mean(axis=0))) for s in samples]
-    return {
-        "stationary_s": float(sum(imu.t_ns[b - 1] - imu.t_ns[a] for a, b in found)) * 1e-9,
-        "stationary": [{"first_ns": int(imu.t_ns[a]), "last_ns": int(imu.t_ns[b - 1])} for a, b in found],
-        "accel_at_rest_m_s2": float(np.average(norms, weights=weights)) if found else None,
-        "noise": _noise(imu, samples),
-    }
+    return _Rest(
+        seconds=float(sum(imu.t_ns[b - 1] - imu.t_ns[a] for a, b in found)) * 1e-9,
+        stretches=[Interval(int(imu.t_ns[a]), int(imu.t_ns[b - 1])) for a, b in found],
+        accel_m_s2=float(np.average(norms, weights=weights)) if found else None,
+        noise=_noise(imu, samples),
+    )
 
 
-def _noise(imu: Imu, samples: list[slice]) -> Report | None:
+def _noise(imu: Imu, samples: list[slice]) -> ImuNoise | None:
     """Standard deviation and density by axis in the calmest quarter of the resting seconds.
 
     density = std * sqrt(period), the white noise that a sensor's data sheet or an ASL `sensor.yaml` states.
@@ -241,30 +205,30 @@ def _noise(imu: Imu, samples: list[slice]) -> Report | None:
     if not samples:
         return None
     length = max(2, round(NOISE_WINDOW_S / imu.period_s))
-    report: Report = {}
-    for name, unit, values in (("gyro", "rad_s", imu.gyro), ("accel", "m_s2", imu.accel)):
+    std = []
+    for values in (imu.gyro, imu.accel):
         parts = [values[s][: (s.stop - s.start) // length * length].reshape(-1, length, 3) for s in samples]
         variances = np.concatenate(parts).var(axis=1, ddof=1)
         calm = variances[np.argsort(variances.sum(axis=1))[: max(1, round(CALM_SHARE * len(variances)))]]
-        std = np.sqrt(calm.mean(axis=0))
-        report[f"{name}_std_{unit}"] = std.tolist()
-        report[f"{name}_density"] = (std * np.sqrt(imu.period_s)).tolist()
-    return {**report, "gyro_density_unit": "rad/s/sqrt(Hz)", "accel_density_unit": "m/s^2/sqrt(Hz)"}
+        std.append(np.sqrt(calm.mean(axis=0)))
+    gyro, accel = std
+    root_s = np.sqrt(imu.period_s)
+    return ImuNoise(gyro.tolist(), (gyro * root_s).tolist(), accel.tolist(), (accel * root_s).tolist())
 
 
-def _imu_warnings(report: Report, imu: Imu) -> list[str]:
-    said = {
+def _imu_warnings(counts: Mapping[str, int], imu: Imu, rest_accel: float | None) -> list[str]:
+    words = {
         "out_of_order": "samples out of order",
         "duplicated": "samples with a repeated stamp",
         "missing": "samples missing",
-        "not_finite": "samples that are no finite numbers",
+        "not_finite": "samples that are not finite",
         "saturated": "samples saturated",
     }
-    warnings = [f"{report[key]} {words}" for key, words in said.items() if report[key]]
+    warnings = [f"{counts[key]} {text}" for key, text in words.items() if counts[key]]
     if not len(imu):
         return [*warnings, "no samples"]
-    if (known := report["accel_at_rest_m_s2"]) is not None:
-        warnings += _accel_warnings(known, "at rest")
+    if rest_accel is not None:
+        warnings += _accel_warnings(rest_accel, "at rest")
     elif abs((level := float(np.median(np.linalg.norm(imu.accel, axis=1)))) / GRAVITY_M_S2 - 1.0) > 0.5:
         warnings += _accel_warnings(level, "in the median")
     largest = float(np.abs(imu.gyro).max())
@@ -274,7 +238,7 @@ def _imu_warnings(report: Report, imu: Imu) -> list[str]:
 
 
 def _accel_warnings(level: float, when: str) -> list[str]:
-    """What a reading says about its unit."""
+    """Warnings about the unit of a reading."""
     unit = accel_unit(level, REST_TOLERANCE if when == "at rest" else MOVING_TOLERANCE)
     if unit == "m/s^2":
         return []
@@ -283,12 +247,11 @@ def _accel_warnings(level: float, when: str) -> list[str]:
     return [f"accel magnitude {when} is {level:.4g} m/s^2, gravity is {GRAVITY_M_S2}"]
 
 
-def _coverage(name: str, truth_ns: Int64[np.ndarray, " n"], imu_ns: Int64[np.ndarray, " m"]) -> Report:
-    """How much of the IMU's time lies between two true poses that are not too far apart (4 median periods, 60 ms)."""
+def _coverage(name: str, truth_ns: Int64[np.ndarray, " n"], imu_ns: Int64[np.ndarray, " m"]) -> TruthInfo:
+    """Share of the IMU's time between two true poses that are not too far apart (4 median periods, 60 ms)."""
     knots = np.unique(truth_ns)
-    report: Report = {"topic": name, "poses": len(truth_ns), "coverage": 0.0, "gaps": 0, "longest_gap_s": 0.0}
     if len(knots) < 2 or not len(imu_ns):
-        return report
+        return TruthInfo(name, len(truth_ns))
     start, end = int(imu_ns.min()), int(imu_ns.max())
     steps = np.diff(knots)
     limit = max(GAP_FACTOR * float(np.median(steps)), nanoseconds(MIN_GAP_S))
@@ -298,26 +261,28 @@ def _coverage(name: str, truth_ns: Int64[np.ndarray, " n"], imu_ns: Int64[np.nda
     known = inside & (
         (steps <= limit)[np.clip(after - 1, 0, len(steps) - 1)] | (knots[np.clip(after, 0, len(steps))] == imu_ns)
     )
-    return report | {
-        "coverage": float(known.mean()),
-        "gaps": int(gap.sum()),
-        "longest_gap_s": float(steps[gap].max()) * 1e-9 if gap.any() else 0.0,
-        "starts_after_s": float(knots[0] - start) * 1e-9,
-        "ends_before_s": float(end - knots[-1]) * 1e-9,
-    }
+    return TruthInfo(
+        name,
+        len(truth_ns),
+        coverage=float(known.mean()),
+        gaps=int(gap.sum()),
+        longest_gap_s=float(steps[gap].max()) * 1e-9 if gap.any() else 0.0,
+        starts_after_s=float(knots[0] - start) * 1e-9,
+        ends_before_s=float(end - knots[-1]) * 1e-9,
+    )
 
 
-def _truth_warnings(log: Log, imus: list[Report], truths: list[Report]) -> list[str]:
+def _truth_warnings(log: Log, imus: list[ImuInfo], truths: list[TruthInfo]) -> list[str]:
     if not imus:
         return ["no IMU topic"]
     if not truths:
         return ["no true poses"]
-    warnings = [f"{truth['topic']}: shares no time with the IMU" for truth in truths if truth["coverage"] == 0.0]
-    if "samples" in imus[0] and not any("deg/s" in warning for warning in imus[0]["warnings"]):
+    warnings = [f"{truth.topic}: shares no time with the IMU" for truth in truths if truth.coverage == 0.0]
+    if imus[0].samples is not UNSET and not any("deg/s" in warning for warning in imus[0].warnings):
         try:
-            warnings += _rate_warning(log, imus[0]["topic"], truths[0]["topic"])
+            warnings += _rate_warning(log, imus[0].topic, truths[0].topic)
         except LogError as error:
-            warnings.append(f"{truths[0]['topic']}: {error.what}")
+            warnings.append(f"{truths[0].topic}: {error.what}")
     return warnings
 
 

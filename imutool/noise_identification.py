@@ -16,7 +16,7 @@ from jaxtyping import Float64
 
 from imutool.config import build
 from imutool.errors import DataError
-from imutool.inertial.stationary import stretches, white_noise
+from imutool.inertial.stationary import rest_stretches, white_noise
 from imutool.location import Location
 from imutool.mcap_io.read import read
 from imutool.noise import allan
@@ -42,7 +42,7 @@ WINDOWS_S: Mapping[Sensor, tuple[float, float]] = {
 
 
 @dataclass(frozen=True)
-class Sight:
+class CurveSource:
     """One way of seeing the noise: over how many seconds, in words, the curve of each sensor, and what its slopes say."""
 
     how: str
@@ -51,7 +51,7 @@ class Sight:
     slopes: Mapping[Sensor, list[Slopes]]
 
     @classmethod
-    def of(cls, how: str, seconds: float, curves: Mapping[Sensor, Curve]) -> Sight:
+    def of(cls, how: str, seconds: float, curves: Mapping[Sensor, Curve]) -> CurveSource:
         """The sight with its slopes read off."""
         return cls(how, seconds, curves, {sensor: allan.slopes(curve) for sensor, curve in curves.items()})
 
@@ -61,7 +61,7 @@ class Sight:
 
 
 @dataclass(frozen=True)
-class Identified:
+class IdentifiedNoise:
     """The noise, with what it was read from and what has to be said about it."""
 
     log: str
@@ -71,14 +71,14 @@ class Identified:
     samples: Mapping[
         Sensor, Float64[np.ndarray, "3"]
     ]  # density of each sensor as the second differences of its samples have it
-    at_rest: Sight | None
-    in_motion: Sight | None
+    at_rest: CurveSource | None
+    in_motion: CurveSource | None
     remarks: list[str]
 
 
 def identify(
     path: Location, *, imu: str | None = None, truth: str | None = None, model: str | Path | None = None
-) -> Identified:
+) -> IdentifiedNoise:
     """The noise of one IMU of a log, from its time at rest and, where there is truth, from its motion.
 
     In motion the samples are first corrected: by `model`, else by a matrix and a constant fitted to this log's own truth.
@@ -103,10 +103,10 @@ def identify(
         remarks.append("in motion: the log has no true poses")
     samples = {
         sensor: white_noise(u) * np.sqrt(recording.imu.period_s)
-        for sensor, u in zip(SENSORS, _both(recording.imu), strict=True)
+        for sensor, u in zip(SENSORS, _columns(recording.imu), strict=True)
     }
     at_most = {sensor: _bound(rest.curves[sensor]) if rest is not None else UNKNOWN for sensor in SENSORS}
-    found = _settle(rest, motion, samples, at_most, recording.imu.period_s, remarks)
+    found = _combine(rest, motion, samples, at_most, recording.imu.period_s, remarks)
     if rest is None and motion is None:
         raise DataError(
             "the log shows no noise: " + "; ".join(remarks),
@@ -114,19 +114,19 @@ def identify(
             expected="a stretch at rest, or true poses",
             fix="Record the sensor at rest, for hours if its bias walk is wanted",
         )
-    return Identified(recording.name, recording.imu_topic, found, at_most, samples, rest, motion, remarks)
+    return IdentifiedNoise(recording.name, recording.imu_topic, found, at_most, samples, rest, motion, remarks)
 
 
-def _at_rest(imu: Imu, remarks: list[str]) -> Sight | None:
-    found = stretches(imu)
+def _at_rest(imu: Imu, remarks: list[str]) -> CurveSource | None:
+    found = rest_stretches(imu)
     if not found:
         remarks.append("at rest: the log never rests")
         return None
     lengths = [float(imu.t_ns[b - 1] - imu.t_ns[a]) * 1e-9 for a, b in found]
     curves = {
-        sensor: allan.curve([u[a:b] for a, b in found], imu.period_s) for sensor, u in zip(SENSORS, _both(imu), strict=True)
+        sensor: allan.curve([u[a:b] for a, b in found], imu.period_s) for sensor, u in zip(SENSORS, _columns(imu), strict=True)
     }
-    sight = Sight.of(f"{_duration(sum(lengths))} at rest", sum(lengths), curves)
+    sight = CurveSource.of(f"{_duration(sum(lengths))} at rest", sum(lengths), curves)
     for sensor in SENSORS:
         shaken = ["xyz"[axis] for axis, one in enumerate(sight.slopes[sensor]) if _vibrates(one)]
         if shaken:
@@ -144,7 +144,7 @@ def _vibrates(one: Slopes) -> bool:
     return one.excess > VIBRATES or "quantisation" in one.seen or not one.powers
 
 
-def _in_motion(recording: Recording, model: str | Path | None, path: Location) -> Sight:
+def _in_motion(recording: Recording, model: str | Path | None, path: Location) -> CurveSource:
     """Deviation of what is left of the samples against the truth.
 
     Raises:
@@ -157,7 +157,7 @@ def _in_motion(recording: Recording, model: str | Path | None, path: Location) -
     both = dict(zip(SENSORS, curves(corrected, recording.truth), strict=True))
     seconds = recording.overlap().imu.duration_s
     topic = next(iter(recording.truths))
-    return Sight.of(f"{_duration(seconds)} in motion against {topic}, {by}", seconds, both)
+    return CurveSource.of(f"{_duration(seconds)} in motion against {topic}, {by}", seconds, both)
 
 
 def _by_model(recording: Recording, model: str | Path, path: Location) -> tuple[Imu, str]:
@@ -183,16 +183,16 @@ def _by_fit(recording: Recording) -> tuple[Imu, str]:
     known = static.Model(rate_hz=pool.rate_hz).double()
     rest = torch.zeros(1, 6, dtype=torch.float64)
     corrected = []
-    for column, (sensor, u) in enumerate(zip(SENSORS, _both(recording.imu), strict=True)):
+    for column, (sensor, u) in enumerate(zip(SENSORS, _columns(recording.imu), strict=True)):
         solution = closed_form.solve(known, sensor, pool, rest, WINDOWS_S[sensor], matrix=True, part="all")
         rest[:, 3 * column : 3 * column + 3] = solution.rest
         corrected.append(u - u @ solution.W.numpy().T - solution.rest.numpy())
     return Imu(recording.imu.t_ns, *corrected), "corrected by a matrix and a constant fitted to it"
 
 
-def _settle(
-    rest: Sight | None,
-    motion: Sight | None,
+def _combine(
+    rest: CurveSource | None,
+    motion: CurveSource | None,
     samples: Mapping[Sensor, Float64[np.ndarray, "3"]],
     at_most: Mapping[Sensor, list[float | None]],
     period_s: float,
@@ -203,7 +203,9 @@ def _settle(
     sources: dict[str, str] = {}
     for sensor in SENSORS:
         believed = (
-            [False] * 3 if motion is None else _believed(sensor, motion, samples[sensor], at_most[sensor], period_s, remarks)
+            [False] * 3
+            if motion is None
+            else _well_determined(sensor, motion, samples[sensor], at_most[sensor], period_s, remarks)
         )
         for kind in KINDS:
             name = f"{sensor}_{kind}"
@@ -218,9 +220,9 @@ def _settle(
     return build(Noise, {**values, "sources": sources})
 
 
-def _believed(
+def _well_determined(
     sensor: Sensor,
-    motion: Sight,
+    motion: CurveSource,
     sample: Float64[np.ndarray, "3"],
     at_most: list[float | None],
     period_s: float,
@@ -259,7 +261,7 @@ def _bound(curve: Curve) -> list[float | None]:
     return [float(value) for value in seen.min(axis=0)]
 
 
-def _both(imu: Imu) -> tuple[Float64[np.ndarray, "n 3"], Float64[np.ndarray, "n 3"]]:
+def _columns(imu: Imu) -> tuple[Float64[np.ndarray, "n 3"], Float64[np.ndarray, "n 3"]]:
     return imu.gyro, imu.accel
 
 
@@ -267,7 +269,7 @@ def _duration(seconds: float) -> str:
     return f"{seconds / 3600:.1f} h" if seconds >= 5400 else f"{seconds / 60:.1f} min" if seconds >= 90 else f"{seconds:.3g} s"
 
 
-def plain(found: Identified) -> dict[str, Any]:
+def plain(found: IdentifiedNoise) -> dict[str, Any]:
     """Everything found as plain JSON values: null is what the log cannot show."""
     report: dict[str, Any] = {"imu": found.topic, **noise.plain(found.noise)}
     report["at_most"] = {f"{sensor}_density": axes for sensor, axes in found.at_most.items()}
@@ -277,7 +279,7 @@ def plain(found: Identified) -> dict[str, Any]:
     return {**report, "remarks": list(found.remarks)}
 
 
-def _plain_sight(sight: Sight) -> dict[str, Any]:
+def _plain_sight(sight: CurveSource) -> dict[str, Any]:
     report: dict[str, Any] = {"how": sight.how, "seconds": sight.seconds}
     for sensor in SENSORS:
         curve = sight.curves[sensor]
@@ -291,7 +293,7 @@ def _plain_sight(sight: Sight) -> dict[str, Any]:
     return report
 
 
-def rows(found: Identified) -> list[tuple[str, ...]]:
+def rows(found: IdentifiedNoise) -> list[tuple[str, ...]]:
     """What was found as rows of text for a table, the first its header."""
     table: list[tuple[str, ...]] = [("noise", "x", "y", "z", "unit", "source")]
     for name, unit in UNITS.items():

@@ -19,7 +19,7 @@ GROUPS = {
     "imutool.effects": "imutool.sensor.effects",
     "imutool.clean": "imutool.cleaning.rules",
 }
-NOT_PLUGINS = {"imutool.bias": frozenset({"io", "model", "neural_stream", "ode", "physics_model"})}
+NOT_PLUGINS = {"imutool.bias": frozenset({"io", "joint_ode", "model", "neural_stream", "ode", "physics_model"})}
 
 
 def names(group: str) -> list[str]:

@@ -28,7 +28,25 @@ __all__ = ["REPORTS", "UNSET", "Report", "Section", "UnsetType", "json_schema", 
 
 # by name, the module and the type: imported when its schema is asked for, so that --help stays light
 REPORTS = {
-    "models": "imutool.cli.models:Models",
+    "clean": "imutool.cleaning.first_pass:CleaningReport",
+    "conversion": "imutool.cli.convert:Conversion",
+    "debias": "imutool.cli.debias:DebiasSummary",
+    "demo": "imutool.cli.shipped:DemoReport",
+    "diagnosis": "imutool.diagnosis.result:DiagnosisReport",
+    "evaluation": "imutool.cli.evaluate:Evaluation",
+    "export": "imutool.cli.convert:Export",
+    "fleet": "imutool.fleet.results:FleetSummary",
+    "fleet-diagnosis": "imutool.fleet.robots:FleetDiagnosis",
+    "info": "imutool.log_report:LogInfo",
+    "infos": "imutool.log_report:LogInfos",
+    "models": "imutool.cli.shipped:Models",
+    "repair": "imutool.cli.repair:Repair",
+    "score": "imutool.blind_cases.cases:OpenedCase",
+    "simulation": "imutool.cli.simulate:SimulationReport",
+    "training": "imutool.cli.train:TrainingReport",
+    "unit": "imutool.fleet.work:UnitReport",
+    "view": "imutool.cli.view:View",
+    "vio": "imutool.cli.vio:VioReport",
 }
 
 

@@ -81,8 +81,8 @@ def test_a_word_is_read_as_toml_or_taken_as_it_is(word: str, field: str, value: 
         ("on=1", r"bool.*on"),
         ("inner.window_s=-1", r"> 0.*inner.window_s"),
         ("inner=3", r"inner"),
-        ("steps", r"--set: 'steps' sets nothing; expected key=value"),
-        ("=3", r"--set: '=3' sets nothing; expected key=value"),
+        ("steps", r"set: 'steps' sets nothing; expected key=value"),
+        ("=3", r"set: '=3' sets nothing; expected key=value"),
         ("steps.more=3", r"int.*steps"),
     ],
 )
@@ -92,7 +92,7 @@ def test_a_wrong_word_is_refused_with_what_is_wrong(word: str, message: str) -> 
 
 
 def test_a_table_over_a_value_is_refused(file: Path) -> None:
-    with pytest.raises(ConfigError, match=r"--set steps.more=3: 'steps' is a value, not a table"):
+    with pytest.raises(ConfigError, match=r"set=steps.more=3: 'steps' is a value, not a table"):
         load(Outer, file, ["steps.more=3"])
     with pytest.raises(ConfigError, match=r"'steps' is a value, not a table"):
         load(Outer, None, ["steps=3", "steps.more=3"])

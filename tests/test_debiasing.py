@@ -20,17 +20,29 @@ from rosbags.highlevel import AnyReader
 from imutool.bias import linear, neural_ode, static
 from imutool.bias.io import load, save
 from imutool.bias.model import BiasModel, Segment
-from imutool.bias_start.initial_bias import InitialBias, at_rest, auto, following, from_truth, given, prior, smooth
+from imutool.bias_start.correction import OnlineDebiaser, apply
+from imutool.bias_start.initial_bias import (
+    InitialBias,
+    at_rest,
+    auto,
+    from_numbers,
+    from_truth,
+    prior,
+    smoothed_start,
+    tracked_from_prior,
+)
 from imutool.bias_start.model_choice import estimate_at_rest
+from imutool.cleaning import CleaningSettings
 from imutool.cli.debias import assigned
 from imutool.conversion import convert
-from imutool.debiasing import OnlineDebiaser, apply, debias
+from imutool.debiasing import debias
 from imutool.errors import ConfigError, LogError, ModelError
 from imutool.mcap_io.codec import schemas
 from imutool.mcap_io.codec.decode import decode_imu, decode_scalars
 from imutool.mcap_io.codec.encode import encode_imu, encode_pose
+from imutool.mcap_io.index import LogIndex
 from imutool.mcap_io.read import read
-from imutool.mcap_io.storage.digest import sha256
+from imutool.mcap_io.storage.source import Source, sha256
 from imutool.mcap_io.write import write
 from imutool.recording import Frames, Recording, Scalars, seconds
 from imutool.sensor.flight import flight
@@ -251,7 +263,7 @@ def test_what_was_checked_stands_in_the_log_and_in_the_report(source: Path, mode
         assert json.loads(metadata(out)[-1][1]["verified"]) == verified._asdict()
         assert verified.mode == check
         assert (verified.chunks_checked == verified.chunks) == (check == "all")
-    with pytest.raises(ConfigError, match="--verify: 'most'"):
+    with pytest.raises(ConfigError, match="check: 'most'"):
         debias(source, tmp_path / "out.mcap", model=model_file, check="most")
 
 
@@ -337,7 +349,7 @@ def test_every_start_is_the_one_turn_on_finds(
         "stationary": lambda: at_rest(model, recording.imu),
         "prior": lambda: prior(model),
         "truth": lambda: from_truth(model, recording),
-    }.get(init, lambda: given(init))()
+    }.get(init, lambda: from_numbers(init))()
     start = report.starts["/imu0"]
     assert start.how == expected.how
     np.testing.assert_allclose(start.rest, expected.rest, rtol=0, atol=1e-12)
@@ -354,7 +366,7 @@ def test_smoothing_takes_the_whole_log_and_says_so(source: Path, recording: Reco
         model = load(path)
     report = debias(source, tmp_path / "out.mcap", model=path, smooth=True)
     imu = recording.imu
-    start = smooth(model, [(seconds(imu.t_ns, int(imu.t_ns[0])), imu.gyro, imu.accel)])
+    start = smoothed_start(model, [(seconds(imu.t_ns, int(imu.t_ns[0])), imu.gyro, imu.accel)])
     made = read(tmp_path / "out.mcap", imu="/imu0/debiased").imu
     np.testing.assert_allclose(made.gyro, apply(model, start, imu).imu.gyro, rtol=0, atol=1e-12)
     assert report.starts["/imu0"].how == start.how
@@ -370,7 +382,7 @@ def metadata_of(source: Path, tmp_path: Path, model: str | Path) -> dict[str, st
 
 
 def test_smoothing_finds_its_own_start(source: Path, model_file: Path, tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match=r"--smooth: --smooth with --init prior; expected --init auto"):
+    with pytest.raises(ConfigError, match=r"smooth: `smooth` with `init=prior`; expected `init=auto`"):
         debias(source, tmp_path / "out.mcap", model=model_file, init="prior", smooth=True)
     assert not (tmp_path / "out.mcap").exists()
 
@@ -426,7 +438,7 @@ def test_no_model_and_no_rest_is_a_refusal_that_says_what_to_do(tmp_path: Path) 
     log = moving(tmp_path)
     for model in (None, "static", Path("static")):
         with pytest.raises(
-            ModelError, match=r"moving.mcap: no model given.*expected --model, or at least 1.5 s without motion"
+            ModelError, match=r"moving.mcap: no model given.*expected `model`, or at least 1.5 s without motion"
         ):
             debias(log, tmp_path / "out.mcap", model=model)
         with pytest.raises(ModelError, match=r"moving.mcap: no model given"):
@@ -446,7 +458,7 @@ def test_a_model_for_another_rate_is_refused(source: Path, tmp_path: Path) -> No
 def test_several_imus_each_get_their_own(recording: Recording, tmp_path: Path, model_file: Path) -> None:
     log = tmp_path / "two.mcap"
     both = write_two_imus(recording, log)
-    with pytest.raises(LogError, match=r"IMU topics: /imu0, /imu1; expected one.*--imu"):
+    with pytest.raises(LogError, match=r"2 IMU topics: /imu0, /imu1. Choose one with `imu`"):
         debias(log, tmp_path / "out.mcap", model=model_file)
     report = debias(log, tmp_path / "out.mcap", model=model_file, imus=["/imu0", "/imu1"])
     assert set(report.rewrite.added) == {
@@ -481,7 +493,7 @@ def test_two_imus_with_a_model_each_are_what_each_alone_would_be(recording: Reco
 def test_models_that_contradict_one_another_are_refused(recording: Recording, tmp_path: Path, model_file: Path) -> None:
     log, out = tmp_path / "two.mcap", tmp_path / "out.mcap"
     write_two_imus(recording, log)
-    with pytest.raises(ConfigError, match=r"--model: a model for /imu1, .* expected /imu0.*--imu /imu1"):
+    with pytest.raises(ConfigError, match=r"model: a model for /imu1, .* expected /imu0.*/imu1 to `imus`"):
         debias(log, out, model={"/imu1": model_file}, imus=["/imu0"])
     with pytest.raises(ConfigError, match="each has one"):
         debias(log, out, model={"": "static", "/imu0": model_file, "/imu1": model_file})
@@ -564,7 +576,7 @@ def test_of_a_truncated_log_what_is_left_is_debiased_and_without_anything_left_n
     source.write_bytes(whole[:-30])  # the end of the summary
     report = debias(source, folder / "out.mcap", model=model_file)
     assert not report.losses
-    assert report.losses.mended
+    assert report.losses.harmless
     assert [path.name for path in folder.iterdir()] == ["out.mcap"]
 
 
@@ -634,7 +646,7 @@ def test_one_sample_at_a_time_gives_the_batchs_numbers(recording: Recording, met
 def test_a_live_node_follows_the_rest_bias_as_a_log_does(recording: Recording, method: str) -> None:
     """From the prior on, without a look at what is to come."""
     model, imu = make_model(method), recording.imu.rows(slice(0, 1500))
-    online, batch = OnlineDebiaser(model), apply(model, following(model), imu)
+    online, batch = OnlineDebiaser(model), apply(model, tracked_from_prior(model), imu)
     found = np.array([online(int(t), w, a)[2] for t, w, a in zip(imu.t_ns, imu.gyro, imu.accel, strict=True)])
     np.testing.assert_allclose(found, batch.bias, rtol=0, atol=ONLINE)
     still = recording.imu.gyro[:600].mean(axis=0)
@@ -684,3 +696,35 @@ def test_a_real_log_keeps_every_message_and_opens_elsewhere(data: Path, tmp_path
         np.testing.assert_array_equal([[getattr(getattr(m, name), axis) for axis in "xyz"] for m in made], values)
     stamps = [m.header.stamp.sec * 10**9 + m.header.stamp.nanosec for m in made]
     np.testing.assert_array_equal(stamps, expected.t_ns)
+
+
+# ── one open log ──
+
+
+class Opens:
+    """Counts the sources that are opened of one log, and the indexes that are read of it."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, name: str) -> None:
+        self.sources = self.summaries = 0
+
+        def open_source(source: Source, path: Any, *words: Any) -> None:
+            self.sources += path.name == name
+            original_open(source, path, *words)
+
+        def read_summary(index: LogIndex) -> Any:
+            self.summaries += index.source.path.name == name
+            return original_read(index)
+
+        original_open, original_read = Source.__init__, LogIndex._read_summary
+        monkeypatch.setattr(Source, "__init__", open_source)
+        monkeypatch.setattr(LogIndex, "_read_summary", read_summary)
+
+
+@pytest.mark.parametrize("options", [{}, {"smooth": True}, {"init": "truth"}, {"clean": CleaningSettings()}], ids=str)
+def test_a_log_is_opened_once_and_once_more_for_its_checksum(
+    logs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, options: dict[str, Any]
+) -> None:
+    (tmp_path / "in.mcap").write_bytes((logs / "flight_1.mcap").read_bytes())
+    opens = Opens(monkeypatch, "in.mcap")
+    debias(tmp_path / "in.mcap", tmp_path / "out.mcap", model=logs / "linear.safetensors", **options)
+    assert (opens.sources, opens.summaries) == (2, 2)  # the summary once to look for damage, once to read: from one open file

@@ -227,7 +227,7 @@ def test_smoothing_is_said_and_finds_its_own_start(log: Path, model: Path) -> No
     assert (causal["smooth"], smooth["smooth"]) == (False, True)
     assert smooth["init_how"].endswith("forward and backward")
     assert smooth["aoe_deg"] != causal["aoe_deg"]
-    with pytest.raises(ConfigError, match=r"--smooth with --init truth"):
+    with pytest.raises(ConfigError, match=r"`smooth` with `init=truth`"):
         evaluate(log, models=[model], init="truth", smooth=True)
 
 

@@ -31,7 +31,7 @@ TIERS = (
     ("config", "location", "registry", "report", "units", "geometry", "recording"),
     ("inertial", "mcap_io", "bag"),
     ("noise", "cleaning"),
-    ("sensor", "log_info", "exporting"),
+    ("sensor", "log_info", "log_report", "exporting"),
     ("bias",),
     ("bias_start",),
     ("debiasing",),

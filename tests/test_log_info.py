@@ -6,16 +6,19 @@ import json
 import tracemalloc
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
+from imutool.cli.info import imu_rows, topic_rows
 from imutool.converters import fetch, tum_vi
 from imutool.errors import LogError
-from imutool.log_info import imu_rows, inspect, topic_rows
+from imutool.log_info import inspect
 from imutool.mcap_io.codec.decode import decode_imu
 from imutool.mcap_io.write import write
 from imutool.recording import GRAVITY_M_S2, Frames, Imu, Poses, Recording
+from imutool.report import json_values
 
 PERIOD_NS = 5_000_000
 START_NS = 1_700_000_000_000_000_000
@@ -43,12 +46,17 @@ def still_poses(t_ns: np.ndarray) -> Poses:
     return Poses(t_ns, np.zeros((len(t_ns), 3)), np.tile([1.0, 0.0, 0.0, 0.0], (len(t_ns), 1)))
 
 
-def logged(folder: Path, imu: Imu, **kwargs: object) -> dict[str, object]:
+def described(path: Path) -> dict[str, Any]:
+    """The report as its JSON values."""
+    report = json_values(inspect(path))
+    json.dumps(report, allow_nan=False)
+    return report
+
+
+def logged(folder: Path, imu: Imu, **kwargs: object) -> dict[str, Any]:
     path = folder / "log.mcap"
     write(Recording("log", imu, **kwargs), path, overwrite=True)
-    report = inspect(path)
-    json.dumps(report, allow_nan=False)  # every value is plain JSON
-    return report
+    return described(path)
 
 
 def test_clocks_of_every_topic_are_measured(tmp_path):
@@ -102,7 +110,7 @@ def test_disorder_repeats_and_values_that_are_no_numbers_are_counted_not_refused
         return columns._replace(stamp_ns=stamps, gyro=gyro)
 
     monkeypatch.setattr("imutool.log_info.decode_imu", spoiled)
-    (found,) = inspect(path)["imu"]
+    (found,) = described(path)["imu"]
     assert (found["out_of_order"], found["duplicated"], found["not_finite"]) == (1, 1, 1)
     assert found["samples"] == 1000
     assert {"1 samples out of order", "1 samples with a repeated stamp"} <= set(found["warnings"])
@@ -162,9 +170,9 @@ def test_slow_rates_in_degrees_show_against_the_truth(data, tmp_path):
     for slow_by in (1.0, 0.5):
         gyro = np.degrees(recording.imu.gyro) * slow_by
         write(replace(recording, imu=replace(recording.imu, gyro=gyro)), tmp_path / "log.mcap", overwrite=True)
-        assert any("looks like deg/s" in warning for warning in inspect(tmp_path / "log.mcap")["warnings"])
+        assert any("looks like deg/s" in warning for warning in inspect(tmp_path / "log.mcap").warnings)
     write(recording, tmp_path / "log.mcap", overwrite=True)
-    assert inspect(tmp_path / "log.mcap")["warnings"] == []
+    assert inspect(tmp_path / "log.mcap").warnings == []
 
 
 def test_coverage_by_the_truth_counts_samples_between_near_poses(tmp_path):
@@ -196,7 +204,7 @@ def test_images_are_counted_without_holding_them(tmp_path):
     images = Frames("png", 60, lambda: ((START_NS + n * 30_000_000, bytes([n]) * IMAGE_BYTES) for n in range(60)))
     write(Recording("log", imu, frames={"/cam0/image_raw/compressed": images}), tmp_path / "log.mcap", compression="none")
     tracemalloc.start()
-    report = inspect(tmp_path / "log.mcap")
+    report = described(tmp_path / "log.mcap")
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     camera = next(topic for topic in report["topics"] if topic["name"].startswith("/cam0"))
@@ -208,7 +216,7 @@ def test_images_are_counted_without_holding_them(tmp_path):
 def test_real_recordings_are_described_without_false_alarms(data, tmp_path):
     (room,) = tum_vi.read(data / "tumvi" / "dataset-room2.tar.gz")
     write(room, tmp_path / "room2.mcap")
-    report = inspect(tmp_path / "room2.mcap")
+    report = described(tmp_path / "room2.mcap")
     assert report["warnings"] == []
     (truth,) = report["truth"]
     assert truth["gaps"] == 17  # drop-outs of the motion capture
@@ -219,12 +227,13 @@ def test_real_recordings_are_described_without_false_alarms(data, tmp_path):
 
 def test_the_tables_hold_what_the_report_holds(tmp_path):
     imu = resting(1000)
-    report = logged(tmp_path, imu, truths={"/ground_truth/pose": still_poses(imu.t_ns)})
+    values = logged(tmp_path, imu, truths={"/ground_truth/pose": still_poses(imu.t_ns)})
+    report = inspect(tmp_path / "log.mcap")
     header, *rows = topic_rows(report)
     assert header[0] == "topic"
     assert {row[0]: row[2] for row in rows}["/imu0"] == "1000"
     properties = {(topic, name): value for topic, name, value in imu_rows(report)[1:]}
-    assert properties["/imu0", "accel at rest"] == f"{report['imu'][0]['accel_at_rest_m_s2']:.3f} m/s²"
+    assert properties["/imu0", "accel at rest"] == f"{values['imu'][0]['accel_at_rest_m_s2']:.3f} m/s²"
     assert properties["/imu0", "missing"] == "0"
     assert properties["/ground_truth/pose", "covers"].startswith("100.0 %")
 

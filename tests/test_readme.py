@@ -1,25 +1,34 @@
-"""The README's commands run as they stand: every `$ ` line of a console block marked `<!-- test -->`, in one empty folder."""
+"""What README and the pages show runs: every `$ ` line of a console block marked `<!-- test -->`, and every Python block."""
 
 from __future__ import annotations
 
 import os
 import re
 import shlex
+import shutil
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 
-README = Path(__file__).parents[1] / "README.md"
+ROOT = Path(__file__).parents[1]
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
 RUN_ALREADY = ["imutool", "demo", "-o", "demo-out"]  # by the fixture whose folder the others run in: it trains
 MARKED = re.compile(r"^<!-- test -->\s*\n```console\n(.*?)^```", re.MULTILINE | re.DOTALL)
+PYTHON = re.compile(r"^```python\n(.*?)^```", re.MULTILINE | re.DOTALL)
+LINK = re.compile(r"!?\[[^\]]*\]\(([^)\s]+)\)")
 
 
 def commands(text: str) -> list[str]:
     """The command lines of marked blocks, in order, with lines that end in a backslash joined."""
     blocks = [block.replace("\\\n", " ") for block in MARKED.findall(text)]
     return [line.removeprefix("$ ") for block in blocks for line in block.splitlines() if line.startswith("$ ")]
+
+
+def with_blocks(pattern: re.Pattern[str]) -> list[Path]:
+    """Pages that have such a block."""
+    return [page for page in PAGES if pattern.search(page.read_text(encoding="utf-8"))]
 
 
 def test_marked_blocks_alone_are_taken() -> None:
@@ -29,22 +38,22 @@ def test_marked_blocks_alone_are_taken() -> None:
     assert [shlex.split(line) for line in commands(text)] == [["imutool", "b", "-c"], ["imutool", "d"]]
 
 
-def test_the_readme_shows_commands_to_run() -> None:
-    assert any(line.startswith("imutool ") for line in commands(README.read_text(encoding="utf-8")))
+def test_the_readme_and_every_tutorial_show_commands_to_run() -> None:
+    wanted = {ROOT / "README.md", ROOT / "docs" / "quick-start.md", *(ROOT / "docs" / "tutorials").glob("*.md")}
+    assert wanted <= set(with_blocks(MARKED))
 
 
-def test_every_marked_command_of_the_readme_runs(demonstration: Path) -> None:
-    lines = commands(README.read_text(encoding="utf-8"))
-    if not lines:
-        pytest.fail("README.md has no console block marked <!-- test -->")
+@pytest.mark.parametrize("page", with_blocks(MARKED), ids=lambda page: page.stem)
+def test_every_marked_command_runs(page: Path, demonstration: Path, tmp_path: Path) -> None:
+    (tmp_path / "demo-out").symlink_to(demonstration / "demo-out")
     path = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
-    for line in lines:
+    for line in commands(page.read_text(encoding="utf-8")):
         assert line.startswith("imutool "), f"{line!r}: only imutool's own commands are run here"
         if shlex.split(line) == RUN_ALREADY:
             continue
         done = subprocess.run(
             ["bash", "-c", line],
-            cwd=demonstration,
+            cwd=tmp_path,
             env={**os.environ, "PATH": path, "DISPLAY": "", "WAYLAND_DISPLAY": ""},  # no window opens here
             stdin=subprocess.DEVNULL,
             capture_output=True,
@@ -53,3 +62,21 @@ def test_every_marked_command_of_the_readme_runs(demonstration: Path) -> None:
             check=False,
         )
         assert done.returncode == 0, f"$ {line}\n{done.stderr}"
+
+
+@pytest.mark.parametrize("page", with_blocks(PYTHON), ids=lambda page: page.stem)
+def test_every_python_block_runs(page: Path, logs: Path, tmp_path: Path) -> None:
+    for name in ("flight_1.mcap", "flight_2.mcap", "linear.safetensors"):
+        shutil.copy(logs / name, tmp_path / name)
+    blocks = PYTHON.findall(page.read_text(encoding="utf-8"))
+    done = subprocess.run(
+        [sys.executable, "-c", "\n".join(blocks)], cwd=tmp_path, capture_output=True, text=True, timeout=240, check=False
+    )
+    assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.parametrize("name", ["README.md", "CONTRIBUTING.md", "CHANGELOG.md", "models/README.md", "docs/architecture.md"])
+def test_relative_links_lead_somewhere(name: str) -> None:
+    page = ROOT / name
+    targets = [link.partition("#")[0] for link in LINK.findall(page.read_text(encoding="utf-8")) if "://" not in link]
+    assert [target for target in targets if target and not (page.parent / target).exists()] == []

@@ -9,11 +9,11 @@ from pathlib import Path
 from imutool.api.logs import Progress
 from imutool.api.paths import LogPath, location
 from imutool.bag.repair import NO_ATTACHMENTS, BagReport, is_bag, repair_bag
-from imutool.cleaning import Rules, Survey, look
+from imutool.cleaning import CleaningSettings, Survey, look
 from imutool.cleaning.settings import chosen
 from imutool.errors import ConfigError, LogError
-from imutool.mcap_io.log import Log
-from imutool.mcap_io.losses import Losses
+from imutool.mcap_io.recovery.losses import Losses
+from imutool.mcap_io.recovery.recovered_log import RecoveredLog
 from imutool.mcap_io.repair import RepairReport
 from imutool.mcap_io.repair import repair as repair_log
 
@@ -91,13 +91,13 @@ def clean(
     return CleanReport(tuple(report.surveys.values()), report.losses, dict(report.rewrite.added))
 
 
-def _survey(source: LogPath, imus: Sequence[str], rules: Rules) -> CleanReport:
-    with Log(location(source), salvage=True) as log:
+def _survey(source: LogPath, imus: Sequence[str], rules: CleaningSettings) -> CleanReport:
+    with RecoveredLog(location(source)) as log:
         topics = list(imus) or log.imu_topics
         if not topics:
             raise LogError("no IMU topic", where=source, expected=log.listing())
         surveys = tuple(look(log, topic, rules) for topic in topics)
-        return CleanReport(surveys, log.losses or Losses(), {})
+        return CleanReport(surveys, log.losses, {})
 
 
 def repair(

@@ -8,8 +8,9 @@ from pathlib import Path
 from imutool import conversion, log_info
 from imutool.api.paths import LogPath, local, location
 from imutool.conversion import ConvertReport
-from imutool.exporting.report import ExportReport
-from imutool.exporting.run import export as export_log
+from imutool.exporting.export import export as export_log
+from imutool.exporting.folder import ExportReport
+from imutool.log_report import LogInfo
 from imutool.mcap_io.read import read as read_log
 from imutool.mcap_io.write import write as write_log
 from imutool.recording import Recording
@@ -130,7 +131,7 @@ def convert(
     )
 
 
-def info(path: LogPath, *, check: bool = True) -> log_info.Report:
+def info(path: LogPath, *, check: bool = True) -> LogInfo:
     """Report on a log: topics, rates, gaps, saturation, time at rest, truth coverage, damage.
 
     Args:
@@ -144,7 +145,7 @@ def info(path: LogPath, *, check: bool = True) -> log_info.Report:
     Examples:
         >>> import imutool
         >>> report = imutool.info("flight_1.mcap")
-        >>> report["imu"][0]["topic"], round(report["imu"][0]["rate_hz"])
+        >>> report.imu[0].topic, round(report.imu[0].rate_hz)
         ('/imu0', 200)
     """
     return log_info.inspect(location(path), check=check)

@@ -17,9 +17,10 @@ from imutool.api.paths import LogPath, location
 from imutool.bias import static
 from imutool.bias.io import find_model, shipped_for
 from imutool.bias.model import BiasModel
+from imutool.bias_start.correction import apply_with_std
 from imutool.bias_start.initial_bias import InitialBias, at_rest, find
-from imutool.bias_start.model_choice import refuse_smooth, smooth_in_memory
-from imutool.debiasing import DebiasReport, apply_with_std
+from imutool.bias_start.model_choice import check_smooth, smooth_in_memory
+from imutool.debiasing import DebiasReport
 from imutool.errors import ConfigError
 from imutool.recording import Imu, Recording
 
@@ -194,6 +195,6 @@ def _model_and_start(recording: Recording, model: Model | None, init: str, smoot
         given = static.Model.method if isinstance(model, BiasModel) else model
         ((name, chosen, start),) = evaluation.started(recording, [given], init, recording.name, smooth=smooth)
         return name, chosen, start
-    refuse_smooth(init, smooth)
+    check_smooth(init, smooth)
     start = smooth_in_memory(model, recording.imu, recording.name) if smooth else find(init, model, recording)
     return str(model.card.get("name", model.method)), model, start

@@ -11,16 +11,16 @@ import numpy as np
 from jaxtyping import Float64
 
 from imutool.api.paths import LogPath, local, location
-from imutool.debiasing import Block
+from imutool.debiasing import DebiasedBlock
 from imutool.errors import ConfigError
-from imutool.mcap_io.batches import ImuBatch
+from imutool.mcap_io.topics import ImuBatch
 from imutool.recording import Imu
 from imutool.viewing import notebook
 from imutool.viewing.model.output import Output
 from imutool.viewing.model.run_data import RunData
 from imutool.viewing.model.runs import load
 from imutool.viewing.model.trajectory_error import ALIGNMENTS, Alignment
-from imutool.viewing.outputs import Asked, Outputs
+from imutool.viewing.outputs import Outputs, RequestedOutputs
 from imutool.viewing.rerun import live
 
 
@@ -132,7 +132,7 @@ def view(
     several = logs if isinstance(logs, Sequence) and not isinstance(logs, str) else [logs]
     paths = [None if path is None else Path(path) for path in (save, export_web, png, html)]
     cursor = None if at is None else str(at)
-    asked = Asked(paths[0], connect, web, port, paths[1], paths[2], paths[3], cursor, source, overwrite)
+    asked = RequestedOutputs(paths[0], connect, web, port, paths[1], paths[2], paths[3], cursor, source, overwrite)
     with Outputs(asked) as outputs:
         shown = outputs.show([one if isinstance(one, RunData) else load_run(one, **options) for one in several])
         if outputs.refused is not None:
@@ -196,7 +196,7 @@ class LiveView:
         sequence = np.arange(self._count, self._count + len(imu), dtype=np.uint32)
         self._count += len(imu)
         batch = ImuBatch(imu.t_ns, imu.t_ns, sequence, imu.t_ns, imu.gyro, imu.accel, "imu")
-        self._show(Block(self._topic, batch, bias, std))
+        self._show(DebiasedBlock(self._topic, batch, bias, std))
 
     @property
     def outputs(self) -> list[Output]:
@@ -232,5 +232,5 @@ def watch(
         1
     """
     file, instead = None if save is None else Path(save), Path(f"{name}.rrd")
-    with live.watching(name, connect_to=connect, save=file, instead=instead, overwrite=overwrite) as show:
+    with live.live_view(name, connect_to=connect, save=file, instead=instead, overwrite=overwrite) as show:
         yield LiveView(topic, show)

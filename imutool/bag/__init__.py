@@ -1,1 +1,1 @@
-"""ROS 1 bags by their bytes: read without trusting their index, and written anew with one."""
+"""Read and repair ROS 1 bags without trusting their index."""

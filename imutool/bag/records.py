@@ -1,7 +1,7 @@
-"""The records of a ROS 1 bag, format 2.0: heads of named fields, chunks of messages, and what indexes them.
+"""Records of a ROS 1 bag (format 2.0) to and from bytes.
 
-Format: http://wiki.ros.org/Bags/Format/2.0. Every length read is held against the bytes there are. Nothing in the format
-proves that bytes are those that were recorded, but for the checks inside bz2 and some lz4 chunks.
+Format: http://wiki.ros.org/Bags/Format/2.0. Every length read is compared with the available bytes. The format has
+no checksums, but bz2 and some lz4 chunks do.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ import bz2
 import re
 import struct
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from enum import IntEnum
 from typing import NamedTuple
 
@@ -83,8 +84,38 @@ class Connection(NamedTuple):
     record: bytes
 
 
+@dataclass(frozen=True)
+class Loss:
+    """A byte range of a bag that could not be read, and how many messages were in it."""
+
+    offset: int
+    length: int
+    reason: str
+    messages: int | None = None
+
+
+class Message(NamedTuple):
+    """Where one message lies in the bytes of its chunk."""
+
+    connection: int
+    time_ns: int
+    at: int
+    data_at: int
+    end: int
+
+
+class Chunk(NamedTuple):
+    """One chunk's bytes, unpacked, and its messages; `whole` when nothing in it was lost."""
+
+    offset: int
+    length: int
+    data: bytes
+    messages: list[Message]
+    whole: bool
+
+
 def fields(data: bytes, at: int, end: int) -> dict[bytes, bytes] | None:
-    """Named values that fill a stretch exactly; None where they do not."""
+    """Named values that fill a byte range exactly, or None."""
     found: dict[bytes, bytes] = {}
     while at < end:
         if end - at < 4:
@@ -99,7 +130,7 @@ def fields(data: bytes, at: int, end: int) -> dict[bytes, bytes] | None:
 
 
 def head(data: bytes, at: int) -> Head | None:
-    """The head of the record that begins there; None where none of the known kinds does, or it is cut off."""
+    """Head of the record at a byte; None if cut off or of no known kind."""
     if len(data) - at < 8:
         return None
     (size,) = U32.unpack_from(data, at)
@@ -118,7 +149,7 @@ def head(data: bytes, at: int) -> Head | None:
 
 
 def next_head(data: bytes, op: Op, start: int) -> Head | None:
-    """The first record of a kind at or behind a byte, found by what every such head has in it."""
+    """Next record of a kind at or behind a byte, by the bytes that each head contains."""
     sign = b"\4\0\0\0op=" + bytes([op])
     at = data.find(sign, start)
     while at >= 0:
@@ -130,7 +161,7 @@ def next_head(data: bytes, op: Op, start: int) -> Head | None:
 
 
 def connection(found: Head, data: bytes, record: bytes) -> Connection:
-    """What a connection record defines.
+    """Parses a connection record.
 
     Raises:
         LogError: it lacks what every reader asks of it, or holds something else.
@@ -150,7 +181,7 @@ def connection(found: Head, data: bytes, record: bytes) -> Connection:
 
 
 def unpack(compression: str, packed: bytes, size: int, *, cut: bool = False) -> bytes:
-    """The bytes of a chunk, never more than it says it has; of one that is cut off those that are there.
+    """Contents of a chunk, at most as long as stated; of a cut one the bytes it has.
 
     Raises:
         LogError: an unknown compression, damaged, or of another size than it says.
@@ -163,7 +194,7 @@ def unpack(compression: str, packed: bytes, size: int, *, cut: bool = False) -> 
         raise LogError(f"it says it unpacks to {size} bytes", expected=f"at most {CHUNK_LIMIT}")
     unpacker = bz2.BZ2Decompressor() if compression == "bz2" else lz4.frame.LZ4FrameDecompressor()
     parts: list[bytes] = []
-    left, data = size + 1, packed  # one more than it says, to notice one that goes on
+    left, data = size + 1, packed  # a byte more than stated, to notice a longer one
     try:
         while left and not unpacker.eof and (data or not unpacker.needs_input):
             parts.append(unpacker.decompress(data, max_length=left))
@@ -188,7 +219,7 @@ def record(op: Op, named: Mapping[bytes, bytes], data: bytes) -> bytes:
 
 
 def stamp(time_ns: int) -> bytes:
-    """A time as the format has it."""
+    """A time as the format stores it."""
     return struct.pack("<II", *divmod(time_ns, 10**9))
 
 
@@ -200,13 +231,13 @@ def bag_header(index_pos: int, connections: int, chunks: int) -> bytes:
 
 
 def index(number: int, entries: Sequence[tuple[int, int]]) -> bytes:
-    """Times (ns) and offsets of one connection's messages in the chunk ahead of it."""
+    """Index record: times (ns) and offsets of one connection's messages in a chunk."""
     data = b"".join(stamp(time_ns) + U32.pack(offset) for time_ns, offset in sorted(entries))
     return record(Op.INDEX, {b"ver": U32.pack(1), b"conn": U32.pack(number), b"count": U32.pack(len(entries))}, data)
 
 
 def chunk_info(position: int, first_ns: int, last_ns: int, counts: Mapping[int, int]) -> bytes:
-    """What the end of a bag says of a chunk."""
+    """Chunk info record for the end of a bag."""
     named = {
         b"ver": U32.pack(1),
         b"chunk_pos": struct.pack("<Q", position),

@@ -1,4 +1,4 @@
-"""A bag written anew from what can be read of another: its chunks as they are, with the index that the format asks for."""
+"""Repair a ROS 1 bag: copy its intact chunks and rebuild its index."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 from imutool.bag import records
-from imutool.bag.records import FIRST_RECORD, MAGIC, U32, Op
-from imutool.bag.scan import Bag, Chunk, Loss
+from imutool.bag.records import FIRST_RECORD, MAGIC, U32, Chunk, Loss, Op
+from imutool.bag.scan import Bag
 from imutool.errors import ConfigError, LogError
-from imutool.location import Location, same
+from imutool.location import Location, same_location
 from imutool.mcap_io.storage.source import Source
 from imutool.mcap_io.storage.target import Target
 
@@ -27,7 +27,7 @@ class BagReport:
 
     messages: Mapping[str, int]  # per topic
     chunks: int
-    rebuilt: int  # of these, made anew because something in them was lost
+    rebuilt: int  # of these, rebuilt because messages in them were lost
     was_indexed: bool
     lost: int  # stretches, of which the first are listed
     losses: Sequence[Loss]
@@ -40,7 +40,7 @@ class BagReport:
         return self.lost == 0
 
     def plain(self) -> dict[str, Any]:
-        """What was lost, as `mcap_io.losses.Losses.plain` says it of logs; the format has no CRCs, so nothing is proven."""
+        """Losses as JSON values, as of `recovery.losses.Losses.plain`."""
         known = [loss.messages for loss in self.losses if loss.messages is not None]
         return {
             "whole": self.whole and self.was_indexed,
@@ -49,7 +49,7 @@ class BagReport:
             "topics": {},
             "stretches": [_stretch(loss) for loss in self.losses],
             "stretches_not_listed": self.lost - len(self.losses),
-            "mended": [] if self.was_indexed else ["the bag had no index: it was made anew"],
+            "mended": [] if self.was_indexed else ["the bag had no index: it was rebuilt"],
             "unchecked_messages": 0,
             "unchecked_definitions": [],
         }
@@ -84,32 +84,32 @@ def is_bag(where: Location) -> bool:
 
 
 def repair_bag(source: Location, target: Location, *, overwrite: bool = False, progress: Progress | None = None) -> BagReport:
-    """Writes `target`: every message of `source` that can be read, byte for byte, with its index.
+    """Writes every readable message of `source` to `target`, byte for byte, with an index.
 
     A chunk of which nothing is lost keeps its bytes; any other is written unpacked with the messages found in it. The result
     is read back and compared before it takes its place. The format has no checks of its own: a flipped byte in the payload of
-    an unpacked chunk is not noticed by anybody. `progress` is told the bytes done, of three times those of the source.
+    an unpacked chunk cannot be noticed. `progress` gets the bytes done, of three times those of the source.
 
     Raises:
         ConfigError: source or target cannot be opened, the target exists or is the source.
-        LogError: the source is no ROS 1 bag or encrypted, or nothing in it can be read.
+        LogError: the source is not a ROS 1 bag or is encrypted, or nothing in it can be read.
     """
-    if same(source, target):
+    if same_location(source, target):
         raise ConfigError("the target is the source", where=target, fix="Choose another name")
     tell = progress or (lambda done, total: None)
-    with Bag(source, salvage=True) as bag, Target(target, overwrite=overwrite) as out:
+    with Bag(source, recover=True) as bag, Target(target, overwrite=overwrite) as out:
         size = bag.source.size
         index_pos, count = _plan(bag, lambda done: tell(done, PASSES * size))
         if not count and (bag.lost or bag.header is None):
             raise LogError("not one message can be read", where=source, expected="a bag with messages")
         used = sorted(bag.connections)
         out.write(MAGIC + records.bag_header(index_pos, len(used), count))
-        with Bag(source, salvage=True) as again:
-            entries, crc, rebuilt = _write(again, out, lambda done: tell(size + done, PASSES * size))
-            if (out.position, len(entries), sorted(again.connections)) != (index_pos, count, used):
+        with Bag(source, recover=True) as second:
+            entries, crc, rebuilt = _write(second, out, lambda done: tell(size + done, PASSES * size))
+            if (out.position, len(entries), sorted(second.connections)) != (index_pos, count, used):
                 raise LogError("the bag changed while it was read", where=source)
             for number in used:
-                out.write(again.connections[number].record)
+                out.write(second.connections[number].record)
         for entry in entries:
             out.write(records.chunk_info(*entry))
         out.flush()
@@ -123,7 +123,7 @@ def repair_bag(source: Location, target: Location, *, overwrite: bool = False, p
 
 
 def _plan(bag: Bag, tell: Callable[[int], None]) -> tuple[int, int]:
-    """Where the index will begin, and how many chunks there will be."""
+    """Offset of the index, and number of chunks, in the target."""
     position, count = len(MAGIC) + FIRST_RECORD + 8, 0
     for chunk in bag.chunks():
         position += _length(chunk) + sum(len(raw) for raw in _indexes(chunk, _offsets(chunk)))
@@ -133,7 +133,7 @@ def _plan(bag: Bag, tell: Callable[[int], None]) -> tuple[int, int]:
 
 
 def _write(bag: Bag, out: Target, tell: Callable[[int], None]) -> tuple[list[_Entry], int, int]:
-    """The chunks written, the CRC of their messages, and how many were made anew."""
+    """Writes the chunks; returns their entries, the CRC of their messages, and how many were rebuilt."""
     entries, crc, rebuilt = [], 0, 0
     for chunk in bag.chunks():
         counts = Counter(message.connection for message in chunk.messages)
@@ -186,7 +186,7 @@ def _crc(chunk: Chunk, crc: int) -> int:
 
 
 def _read_back(path: Location, tell: Callable[[int], None]) -> int:
-    """The CRC of all messages in a bag that must be whole."""
+    """CRC of all messages in a bag that must be intact."""
     crc = 0
     with Bag(path) as bag:
         if not bag.indexed:

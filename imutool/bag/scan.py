@@ -1,6 +1,6 @@
-"""A bag followed from its first byte to its last, chunk by chunk, whatever its index says or whether it has one.
+"""Scan a ROS 1 bag from its first byte to its last, chunk by chunk, without its index.
 
-Where the framing is broken, the walk goes on at the next chunk, and inside an unpacked chunk at the next message. A message
+Where the framing is broken, the scan goes on at the next chunk, and inside an unpacked chunk at the next message. A message
 counts as found when what follows it is a record, or the end of its chunk.
 """
 
@@ -8,53 +8,21 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator
-from dataclasses import dataclass
-from typing import NamedTuple
 
 from imutool.bag import records
-from imutool.bag.records import HEAD_LIMIT, MAGIC, Connection, Head, Op
+from imutool.bag.records import HEAD_LIMIT, MAGIC, Chunk, Connection, Head, Loss, Message, Op
 from imutool.errors import LogError
 from imutool.location import Location
 from imutool.mcap_io.storage.source import Source
 
 SCAN_BYTES = 4096, 1 << 20  # looked through at once, first and at most: what is sought may be near
 HEAD_BYTES = 256  # of a record, read at first; most heads are shorter
-MOST_LOSSES = 10_000  # that are listed one by one
-MOST_REASONS = 5  # for one chunk
-
-
-@dataclass(frozen=True)
-class Loss:
-    """A stretch of the bag that could not be read, why, and how many messages its index says it held."""
-
-    offset: int
-    length: int
-    reason: str
-    messages: int | None = None
-
-
-class Message(NamedTuple):
-    """Where one message lies in the bytes of its chunk."""
-
-    connection: int
-    time_ns: int
-    at: int
-    data_at: int
-    end: int
-
-
-class Chunk(NamedTuple):
-    """One chunk's bytes, unpacked, and its messages; `whole` when nothing in it was lost."""
-
-    offset: int
-    length: int
-    data: bytes
-    messages: list[Message]
-    whole: bool
+MAX_LOSSES = 10_000  # in `losses`
+MAX_REASONS = 5  # for one chunk
 
 
 class Bag:
-    """A bag open for reading. With `salvage` what cannot be read is noted in `losses`; without, it is refused.
+    """A bag open for reading; with `recover` damage goes to `losses`, else it is an error.
 
     Memory is bounded by the largest chunk.
 
@@ -63,12 +31,12 @@ class Bag:
         LogError: empty, no ROS 1 bag, or encrypted.
     """
 
-    def __init__(self, path: Location, *, salvage: bool = False) -> None:
-        self.path, self.salvage = path, salvage
+    def __init__(self, path: Location, *, recover: bool = False) -> None:
+        self.path, self.recover = path, recover
         self.connections: dict[int, Connection] = {}
-        self.doubtful: set[int] = set()  # numbers that may mean something else by now
+        self.doubtful: set[int] = set()  # numbers that two connections may share
         self.losses: list[Loss] = []
-        self.lost = 0  # how many losses there are, also those that are not listed
+        self.lost = 0  # number of losses, also beyond those in `losses`
         self.source = Source(path, expected="a ROS 1 bag")
         try:
             self.header = self._begin()
@@ -99,7 +67,7 @@ class Bag:
         return found if found is not None and found.op == Op.BAG and found.end <= size else None
 
     def _index(self, header: Head | None) -> bool:
-        """Whether the bag has its index; its connections are then known from the start, also of chunks that are lost."""
+        """Whether the bag has its index; its connections are then known from the start."""
         if header is None or not (position := header.number(b"index_pos")):
             return False
         for _ in range(header.number(b"conn_count")):
@@ -136,9 +104,14 @@ class Bag:
         if found.size > records.DEFINITION_LIMIT:
             raise LogError(f"a connection record has {found.size} bytes", expected=f"at most {records.DEFINITION_LIMIT}")
         raw = self.source.at(found.at, found.end - found.at)
-        self._learn(records.connection(found, raw[found.data_at - found.at :], raw))
+        self.add_connection(records.connection(found, raw[found.data_at - found.at :], raw))
 
-    def _learn(self, new: Connection) -> None:
+    def add_connection(self, new: Connection) -> None:
+        """Adds a connection.
+
+        Raises:
+            LogError: its number belongs to another one.
+        """
         known = self.connections.setdefault(new.number, new)
         if (known.topic, known.kind) != (new.topic, new.kind):
             self.doubtful.add(new.number)
@@ -149,23 +122,23 @@ class Bag:
         """Notes a loss, or refuses the bag.
 
         Raises:
-            LogError: without `salvage`.
+            LogError: without `recover`.
         """
-        if not self.salvage:
+        if not self.recover:
             raise LogError(
                 f"the bag is damaged at byte {offset}: {reason}",
                 where=self.path,
                 fix="Save what is there with `imutool repair`",
             )
         self.lost += 1
-        if len(self.losses) < MOST_LOSSES:
+        if len(self.losses) < MAX_LOSSES:
             self.losses.append(Loss(offset, length, reason, messages))
 
     def chunks(self) -> Iterator[Chunk]:
         """Every chunk with messages in it, in file order.
 
         Raises:
-            LogError: damage, without `salvage`; or the disk does not give the bytes.
+            LogError: damage, without `recover`; or the disk does not give the bytes.
         """
         position, size = len(MAGIC), self.source.size
         while position < size:
@@ -184,7 +157,7 @@ class Bag:
                 if chunk.messages:
                     yield chunk
                 position = end
-            elif found.op == Op.MESSAGE or not self._lands(found.end):  # it would lead past the record behind it
+            elif found.op == Op.MESSAGE or not self._is_boundary(found.end):  # it would lead past the record behind it
                 position = self._next_chunk(found.data_at)
                 outside = "a message lies outside chunks" if found.op == Op.MESSAGE else "a record does not end where it says"
                 self.lose(found.at, position - found.at, outside)
@@ -192,8 +165,8 @@ class Bag:
                 if found.op == Op.CONNECTION:
                     self._try_define(found)
                 position = found.end
-        if self.header is not None and (told := self.header.number(b"index_pos")) > size:
-            self.lose(size, told - size, f"the bag's header says its index begins at byte {told}")
+        if self.header is not None and (index_pos := self.header.number(b"index_pos")) > size:
+            self.lose(size, index_pos - size, f"the bag's header says its index begins at byte {index_pos}")
 
     def _try_define(self, found: Head) -> None:
         try:
@@ -202,7 +175,7 @@ class Bag:
             self.lose(found.at, found.end - found.at, error.what)
 
     def _next_chunk(self, start: int) -> int:
-        """Where the next chunk or another bag begins at or behind a byte; the end of the file if none does."""
+        """Offset of the next chunk or bag at or behind a byte, or the end of the file."""
         size, (scan, most) = self.source.size, SCAN_BYTES
         while start < size:
             raw = self.source.at(start, min(scan + HEAD_BYTES, size - start))
@@ -214,33 +187,33 @@ class Bag:
         return size
 
     def _end(self, found: Head) -> int:
-        """Where a chunk ends: where it says, if a record follows there; else where the next one begins."""
-        return found.end if self._lands(found.end) else self._next_chunk(found.data_at)
+        """End of a chunk: where it says, if a record follows there; else the next chunk's start."""
+        return found.end if self._is_boundary(found.end) else self._next_chunk(found.data_at)
 
-    def _lands(self, end: int) -> bool:
-        """Whether a record may end there: another begins, or nothing is left that could be one, or another bag."""
+    def _is_boundary(self, end: int) -> bool:
+        """Whether a record may end there: a record, another bag or the end of the file follows."""
         left = self.source.size - end
         if 0 <= left < 8 or (left > 0 and self._head(end) is not None):
             return True
         return left >= len(MAGIC) and self.source.at(end, len(MAGIC)) == MAGIC
 
     def _chunk(self, found: Head, end: int) -> Chunk:
-        """What can be read of a chunk; all that is wrong with it is one loss."""
+        """The readable part of a chunk; all its damage is one loss."""
         compression = found.fields[b"compression"].decode("ascii", "replace")
         wrong = end != found.end
         reasons = ["the chunk does not end where it says"] if wrong else []
-        data, messages, told = b"", list[Message](), self._told(end)
+        data, messages, indexed = b"", list[Message](), self._indexed_count(end)
         try:
             data = self._unpacked(found, end, compression)
         except LogError as error:
             reasons.append(f"the chunk cannot be unpacked: {error.what}")
         else:
-            inside = _Inside(self, data, wrong)
-            messages = inside.messages()
-            reasons += inside.reasons
-        missing = None if told is None else max(0, told - len(messages))
+            scan = _ChunkScan(self, data, wrong)
+            messages = scan.messages()
+            reasons += scan.reasons
+        missing = None if indexed is None else max(0, indexed - len(messages))
         if missing and not reasons:
-            reasons.append("its index tells of more messages than are in it")
+            reasons.append("its index counts more messages than are in it")
         if reasons:
             self.lose(found.at, end - found.at, "; ".join(reasons), missing)
         return Chunk(found.at, end - found.at, data, messages, not reasons)
@@ -253,8 +226,8 @@ class Bag:
             raise LogError(f"it has {packed} bytes", expected=f"at most {records.CHUNK_LIMIT}")
         return records.unpack(compression, self.source.at(found.data_at, packed), found.number(b"size"), cut=cut)
 
-    def _told(self, position: int) -> int | None:
-        """How many messages the index records behind a chunk say it has; None where there are none."""
+    def _indexed_count(self, position: int) -> int | None:
+        """Messages that the index records behind a chunk count, or None without any."""
         total: int | None = None
         while (found := self._head(position)) is not None and found.op == Op.INDEX:
             if found.size != 12 * found.number(b"count"):
@@ -264,7 +237,7 @@ class Bag:
         return total
 
 
-class _Inside:
+class _ChunkScan:
     """The records of one chunk."""
 
     def __init__(self, bag: Bag, data: bytes, loose: bool) -> None:
@@ -272,11 +245,11 @@ class _Inside:
         self.reasons: list[str] = []  # why something is lost, the first few
 
     def _lose(self, reason: str) -> None:
-        if len(self.reasons) < MOST_REASONS:
+        if len(self.reasons) < MAX_REASONS:
             self.reasons.append(reason)
 
     def messages(self) -> list[Message]:
-        """Those of known connections, each followed by a record or the end."""
+        """Messages of known connections, each followed by a record or the end."""
         found: list[Message] = []
         unknown: Counter[int] = Counter()
         position, end, bag = 0, len(self.data), self.bag
@@ -304,7 +277,7 @@ class _Inside:
         return found
 
     def _cut(self, position: int) -> bool:
-        """Whether the chunk was cut off inside the head that begins there, so that the record ahead of it can be trusted."""
+        """Whether the chunk was cut off inside the head at `position`."""
         left = len(self.data) - position
         return self.loose and 0 < left < HEAD_BYTES and records.next_head(self.data, Op.MESSAGE, position) is None
 
@@ -316,6 +289,6 @@ class _Inside:
 
     def _define(self, head: Head) -> None:
         try:
-            self.bag._learn(records.connection(head, self.data[head.data_at : head.end], self.data[head.at : head.end]))
+            self.bag.add_connection(records.connection(head, self.data[head.data_at : head.end], self.data[head.at : head.end]))
         except LogError as error:
             self._lose(error.what)

@@ -58,7 +58,7 @@ class Config(Settings, frozen=True):
     accel_unit_m_s2: Positive = 0.2
 
 
-class Folded(NamedTuple):
+class FoldedLayer(NamedTuple):
     """A layer at work, on deviations from what it gives without motion: y = GELU(weight * x + there) - GELU(there)."""
 
     weight: Float[Tensor, "after before kernel"]
@@ -90,11 +90,11 @@ class Layer(nn.Module):
             self.var.copy_(var)
         return functional.dropout(functional.gelu(y), self.dropout, self.training)
 
-    def folded(self, x: Float[Tensor, " before"]) -> Folded:
+    def folded(self, x: Float[Tensor, " before"]) -> FoldedLayer:
         """The layer at work, around what it gives for a constant input."""
         gain = self.gain * (self.var + EPSILON).rsqrt()
         weight = self.weight * gain[:, None, None]
-        return Folded(weight, weight.sum(2) @ x + self.shift - self.mean * gain, self.dilation)
+        return FoldedLayer(weight, weight.sum(2) @ x + self.shift - self.mean * gain, self.dilation)
 
 
 class Net(nn.Module):
@@ -135,7 +135,7 @@ class Net(nn.Module):
         level: Tensor = self.unit * (self.out @ functional.gelu(self.folded()[-1].there))
         return level
 
-    def folded(self) -> list[Folded]:
+    def folded(self) -> list[FoldedLayer]:
         """The layers at work; the first is given u / scale, the deviation of its input from that of no motion."""
         x, found = -self.centre / self.scale, []
         for layer in self.layers:
@@ -257,7 +257,7 @@ class _Convolution:
     full is the past moved to its front, so that a single sample costs no copy of it.
     """
 
-    def __init__(self, folded: Folded) -> None:
+    def __init__(self, folded: FoldedLayer) -> None:
         out, channels, self.kernel = folded.weight.shape
         self.dilation, self.reach = folded.dilation, (self.kernel - 1) * folded.dilation
         self.weight = _array(folded.weight).transpose(2, 1, 0).reshape(self.kernel * channels, out).copy()

@@ -1,10 +1,9 @@
-"""Known physics first, a neural ODE for the rest: bias = rest + sum of effects + what the ODE finds in what they leave.
+"""Hybrid bias model: rest bias + fitted effects + a neural ODE on the corrected samples.
 
-The effects are those of `imutool.sensor.effects` that the training logs support (`imutool.training.calibration`): each
-linear in
-its parameters, fitted together in closed form, chosen by how well logs predict one another, with the covariance of the
-answer. The neural ODE (`imutool.bias.neural_ode`) is shown samples that the effects have been taken off, and is left out
-where it does not help on the held-out part: then debiasing is a few products a sample.
+The effects are those of `imutool.sensor.effects` that the training logs support (`imutool.training.calibration`): linear in
+their parameters, fitted together by least squares with a covariance, chosen by how well logs predict one another. The neural
+ODE (`imutool.bias.neural_ode`) sees samples corrected for the effects. It is left out where it does not help on the held-out
+part: then debiasing is a few products a sample.
 """
 
 from __future__ import annotations
@@ -20,7 +19,7 @@ from jaxtyping import Float, Float64
 from torch import Tensor
 
 from imutool.bias import neural_ode
-from imutool.bias.model import COLUMNS, BiasModel, CovarianceModel, OneByOne, Segment, Stream, Vector6
+from imutool.bias.model import COLUMNS, BiasModel, CovarianceModel, SampleStream, Segment, Stream, Vector6
 from imutool.config import Settings
 from imutool.errors import ConfigError
 from imutool.sensor import catalogue
@@ -28,11 +27,11 @@ from imutool.sensor.linear_form import CompiledEffects, LinearForm, compiled, pa
 from imutool.sensor.signals import POWER_S, SignalFilter, Signals
 from imutool.units import SENSORS, Sensor
 
-FORGOTTEN = 10.0  # time constants after which a filter's start no longer shows
+FORGOTTEN = 10.0  # time constants after which the start of a filter no longer matters
 
 
 class Config(Settings, frozen=True):
-    """The effects of each sensor by name (none given: the training chooses), and the neural ODE on top of them."""
+    """Effects of each sensor by name (none given: the training chooses), and the neural ODE."""
 
     gyro_effects: tuple[str, ...] | None = None
     accel_effects: tuple[str, ...] | None = None
@@ -62,11 +61,11 @@ class Model(BiasModel):
         self.ode = neural_ode.Model(chosen.ode, rate_hz) if chosen.remainder else None
 
     def named(self, sensor: Sensor) -> tuple[str, ...] | None:
-        """The effects the settings name for a sensor; none if they are for the training to choose."""
+        """Effects that the settings name for a sensor; none if the training is to choose them."""
         return self.config.gyro_effects if sensor == "gyro" else self.config.accel_effects
 
     def take(self, sensor: Sensor, names: Sequence[str], theta: Float[Tensor, " p"], covariance: Float[Tensor, "p p"]) -> None:
-        """Takes over effects and their parameters, in the order of `names`, as the training found them."""
+        """Take over effects and their fitted parameters, in the order of `names`."""
         key = f"{sensor}_effects"
         self.config = msgspec.structs.replace(self.config, **{key: tuple(names)})
         self._hold(sensor, tuple(names))
@@ -75,11 +74,11 @@ class Model(BiasModel):
             getattr(self, f"covariance_{sensor}").copy_(covariance)
 
     def drop_remainder(self) -> None:
-        """Leaves the effects alone: the neural ODE has nothing to add."""
+        """Drop the neural ODE, and keep the effects alone."""
         self.config, self.ode = msgspec.structs.replace(self.config, remainder=False), None
 
     def begin_at(self, sensor: Sensor, W: Float[Tensor, "3 3"]) -> None:
-        """Nothing that could be taken over as it is: effects are fitted and chosen all together.
+        """Refuse a start from a matrix: effects are fitted and chosen all together.
 
         Raises:
             ConfigError: always; `imutool.training.run.train` knows how a hybrid is trained.
@@ -91,30 +90,30 @@ class Model(BiasModel):
         )
 
     def error(self, sensor: Sensor, signals: Signals) -> Float64[np.ndarray, "n 3"]:
-        """What the effects make of some signals (rad/s or m/s²)."""
+        """Error of the effects at some signals (rad/s or m/s²)."""
         return self._compiled(sensor)(signals)
 
     def sensor_bias(self, sensor: Sensor, segment: Segment) -> Float[Tensor, "batch n 3"]:
-        """Effects on the segment's signals, and the neural ODE on what they leave; the filters start at the first sample."""
+        """Error of the effects plus the neural ODE's; filters start at the first sample."""
         error = self._on(sensor, segment)
         if self.ode is None:
             return segment.rest[:, None, COLUMNS[sensor]] + error
-        left = {"gyro": segment.gyro, "accel": segment.accel}
-        left[sensor] = left[sensor] - error
-        return error + self.ode.sensor_bias(sensor, Segment(segment.t, left["gyro"], left["accel"], segment.rest))
+        corrected = {"gyro": segment.gyro, "accel": segment.accel}
+        corrected[sensor] = corrected[sensor] - error
+        return error + self.ode.sensor_bias(sensor, Segment(segment.t, corrected["gyro"], corrected["accel"], segment.rest))
 
     def stream(self, rest: Vector6) -> Stream:
-        """The same in numpy, from the log's first sample on."""
+        """The model in numpy, from the log's first sample on."""
         ode = None if self.ode is None else self.ode.stream(rest)
         gyro, accel = (self._compiled(sensor) for sensor in SENSORS)
         return _Stream(self.rate_hz, gyro, accel, ode, rest.astype(np.float64))
 
     def rest_dynamics(self) -> Float64[np.ndarray, "6 6"]:
-        """The neural ODE's."""
+        """Rest dynamics of the neural ODE."""
         return np.zeros((6, 6)) if self.ode is None else self.ode.rest_dynamics()
 
     def calibration_covariance(self) -> CovarianceModel | None:
-        """Of the effects' error, from the covariance of their parameters: T Sigma T^T, as its root T Sigma^1/2."""
+        """Root T Sigma^1/2 of the covariance of the effects' error, T Sigma T^T."""
         roots: dict[Sensor, Float64[np.ndarray, "3 q p"]] = {}
         for sensor in SENSORS:
             covariance: Tensor = getattr(self, f"covariance_{sensor}")
@@ -123,7 +122,7 @@ class Model(BiasModel):
             roots[sensor] = patterns(self.effects[sensor]) @ root
         filter_ = SignalFilter(self.rate_hz)
 
-        def unsure(
+        def root_at(
             t_s: Float64[np.ndarray, " n"], gyro: Float64[np.ndarray, "n 3"], accel: Float64[np.ndarray, "n 3"]
         ) -> dict[Sensor, Float64[np.ndarray, "n 3 p"]]:
             signals, out = filter_(t_s, gyro, accel), {}
@@ -133,7 +132,7 @@ class Model(BiasModel):
                     out[sensor] = np.einsum("nq,iqp->nip", terms, roots[sensor], optimize=True)
             return out
 
-        return unsure
+        return root_at
 
     def _on(self, sensor: Sensor, segment: Segment) -> Float[Tensor, "batch n 3"]:
         rows = []
@@ -157,14 +156,14 @@ class Model(BiasModel):
 
 
 class _Stream:
-    """Effects, then the neural ODE on what they leave; remembers what the filters do."""
+    """Effects, then the neural ODE on the corrected samples; its state is that of the filters."""
 
     def __init__(
-        self, rate_hz: float, gyro: CompiledEffects, accel: CompiledEffects, ode: OneByOne | None, rest: Vector6
+        self, rate_hz: float, gyro: CompiledEffects, accel: CompiledEffects, ode: SampleStream | None, rest: Vector6
     ) -> None:
         self._signals = SignalFilter(rate_hz, max(gyro.wanted, accel.wanted))
         self._matrix = np.concatenate([gyro.matrix, accel.matrix], axis=1)
-        self._gyro, self._accel, self._product_alone = gyro, accel, not (gyro.others or accel.others)
+        self._gyro, self._accel, self._only_product = gyro, accel, not (gyro.others or accel.others)
         self._ode, self._rest, self._start_s = ode, rest, math.nan
 
     def __call__(
@@ -191,7 +190,7 @@ class _Stream:
         since_s = t_s - self._start_s
         row = self._signals.one(since_s, u)
         error: Vector6 = row.dot(self._matrix)
-        if not self._product_alone:
+        if not self._only_product:
             floats = row.tolist()
             error += (*self._gyro.others_at(since_s, floats), *self._accel.others_at(since_s, floats))
         error += self._rest if self._ode is None else self._ode.one(t_s, u - error)

@@ -7,11 +7,12 @@ the same error at every sample, which is what lets `imutool.bias_start.initial_b
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
-from typing import Any, ClassVar, Literal, Protocol, runtime_checkable
+from typing import Any, ClassVar, Literal, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 import torch
@@ -19,11 +20,13 @@ from jaxtyping import Float, Float64
 from torch import Tensor, nn
 
 from imutool.config import Settings
+from imutool.inertial.windows import end_attitude
 from imutool.units import SENSORS, Sensor
 
 COLUMNS = {"gyro": slice(0, 3), "accel": slice(3, 6)}  # of every vector of six
 
 Vector6 = Float64[np.ndarray, "6"]  # gyro (rad/s) then accel (m/s²)
+Covariances = Float64[np.ndarray, "n 6 6"]
 
 
 @dataclass(frozen=True)
@@ -50,8 +53,25 @@ class Stream(Protocol):
         """The bias at each sample, from this and earlier samples only; the blocks' borders change nothing."""
 
 
+class BiasEstimate(NamedTuple):
+    """A bias at each sample, gyro (rad/s) then accel (m/s²), and its covariance."""
+
+    bias: Float64[np.ndarray, "n 6"]
+    covariance: Covariances
+
+
 @runtime_checkable
-class OneByOne(Stream, Protocol):
+class RestBiasEstimator(Protocol):
+    """A model at work with the covariance of its rest bias, for samples as they arrive in blocks of any size."""
+
+    def estimate(
+        self, t_s: Float64[np.ndarray, " n"], gyro: Float64[np.ndarray, "n 3"], accel: Float64[np.ndarray, "n 3"]
+    ) -> BiasEstimate:
+        """The bias at each sample, and the covariance of the rest bias in it."""
+
+
+@runtime_checkable
+class SampleStream(Stream, Protocol):
     """A stream with a shorter way for a single sample, for live use: half of such a call is cutting and joining arrays."""
 
     def one(self, t_s: float, u: Vector6) -> Vector6:
@@ -79,7 +99,7 @@ class BiasModel(nn.Module, ABC):
     Attributes:
         prior_mean, prior_std: rest bias over the training runs, and its spread from run to run.
         truth_std: spread of a rest bias estimated from `imutool.bias_start.initial_bias.TRUTH_S` seconds of this data's own
-        truth.
+            truth.
         rest_std: how far the bias at rest lies from that in motion.
         walk_std: how far a rest bias walks in a second^1/2.
         noise_std: white noise of a sample, as seen in the residuals, for the debiased message's covariance.
@@ -90,6 +110,7 @@ class BiasModel(nn.Module, ABC):
     objective: ClassVar[Literal["window_ends", "increments"]] = "window_ends"  # what the descent minimises (imutool.training)
     prefers: ClassVar[Mapping[str, Any]] = MappingProxyType({})  # TrainSettings that differ from the general defaults
     undecayed: ClassVar[tuple[str, ...]] = ()  # beginnings of the names of parameters that weight decay leaves alone
+    longest_window_s: float = math.inf  # of the training: a longer one is cut to it
     context: int = 0  # samples from before a segment that the answer over it depends on; such a bias is rest + f(samples)
     prior_mean: Tensor
     prior_std: Tensor
@@ -122,6 +143,12 @@ class BiasModel(nn.Module, ABC):
     def forward(self, segment: Segment) -> Float[Tensor, "batch n 6"]:
         """The bias at each sample: gyro (rad/s), then accel (m/s²)."""
         return torch.cat([self.sensor_bias(sensor, segment) for sensor in SENSORS], dim=-1)
+
+    def end_attitude(
+        self, R_start: Float[Tensor, "batch 3 3"], segment: Segment, dt: Float[Tensor, "batch steps"]
+    ) -> Float[Tensor, "batch 3 3"]:
+        """Attitude (body to world) at the last sample, by integrating the debiased rate from `R_start`. Differentiable."""
+        return end_attitude(R_start, segment.gyro - self.sensor_bias("gyro", segment), dt)
 
     def rest_dynamics(self) -> Float64[np.ndarray, "6 6"]:
         """d(drift of the rest bias) / d(rest bias), a second: how an error of the start grows or dies. Zero for most."""

@@ -27,7 +27,9 @@ from jaxtyping import Float, Float64
 from torch import Tensor, nn
 from torchdiffeq import odeint, odeint_adjoint
 
-from imutool.bias.model import COLUMNS, BiasModel, Segment, Vector6
+from imutool.bias import joint_ode
+from imutool.bias.joint_ode import JointField
+from imutool.bias.model import COLUMNS, BiasModel, SampleStream, Segment, Vector6
 from imutool.bias.neural_stream import Array, Curves, CurveWeights, DriftRate, NeuralStream, perceptron
 from imutool.bias.ode import HermitePath
 from imutool.config import Settings
@@ -36,6 +38,7 @@ from imutool.units import SENSORS, Sensor
 
 SLOW_S, DRIFT_SEES_S = 0.1, 0.5  # time constants of what the curve and the drift see
 NEAR_ZERO = 10.0
+GYRO_HIDDEN = (128, 128), (512,)  # of both residual blocks, as released
 NEGLIGIBLE = 1e-15
 
 Positive = Annotated[float, msgspec.Meta(gt=0)]
@@ -43,12 +46,13 @@ Width = Annotated[int, msgspec.Meta(ge=1, le=4096)]
 
 
 class Config(Settings, frozen=True):
-    """Sizes, solver, and whose rest bias drifts. The scales set where a unit of network input or output lies; no limits.
+    """Scheme, sizes, solver, and whose rest bias drifts. The scales are units of network inputs and outputs, no limits.
 
     The accelerometer's does not drift unless asked: it is judged over the five seconds that attitude errors leave it, and
     what drifts by a hundredth in five seconds is nowhere after a minute (seen: 0.3 m/s² on FETCH).
     """
 
+    scheme: Literal["split", "joint"] | msgspec.UnsetType = msgspec.UNSET  # joint: the paper's (`joint_ode`)
     curve_width: Width = 64
     drift: tuple[Sensor, ...] = ("gyro",)
     drift_step_s: Positive = 0.25
@@ -146,6 +150,8 @@ class Model(BiasModel):
                 where="model.adjoint",
                 fix="Use model.solver=rk4 or dopri5 with it, or backpropagation",
             )
+        if chosen.scheme == "joint" and "gyro" not in chosen.drift:
+            raise ConfigError("the joint scheme without a drift of the gyro", where="model.drift", expected="gyro among them")
         super().__init__(chosen, rate_hz)
         c = chosen
         self.stride = max(1, round(c.drift_step_s * rate_hz))
@@ -155,14 +161,40 @@ class Model(BiasModel):
                 "accel": Curve(c.curve_width, c.accel_scale_m_s2, c.accel_curve_m_s2),
             }
         )
-        drifts = {
-            "gyro": Drift(((128, 128), (512,)), c.gyro_scale_rad_s, c.gyro_curve_rad_s, c.gyro_drift_rad_s2),
+        drifts: dict[str, nn.Module] = {
+            "gyro": Drift(GYRO_HIDDEN, c.gyro_scale_rad_s, c.gyro_curve_rad_s, c.gyro_drift_rad_s2),
             "accel": Drift(((256, 512), (256, 256)), c.accel_scale_m_s2, c.accel_curve_m_s2, c.accel_drift_m_s3),
         }
+        if self.joint:
+            del self.curve["gyro"]
+            drifts["gyro"] = JointField(drifts["gyro"])
+            self.longest_window_s = joint_ode.WINDOW_S
         self.drift = nn.ModuleDict({sensor: drift for sensor, drift in drifts.items() if sensor in c.drift})
+
+    @property
+    def joint(self) -> bool:
+        """Whether attitude and gyro bias are integrated together; the accelerometer keeps the split scheme."""
+        return self.config.scheme == "joint"
+
+    def _joint_start(self, segment: Segment) -> tuple[JointField, Float[Tensor, "b 3"]]:
+        """The joint field, and the bias at the first sample."""
+        field = _part(self.drift, "gyro", JointField)
+        return field, segment.rest[:, :3] + segment.gyro[:, 0] @ field.W.mT
+
+    def end_attitude(
+        self, R_start: Float[Tensor, "b 3 3"], segment: Segment, dt: Float[Tensor, "b steps"]
+    ) -> Float[Tensor, "b 3 3"]:
+        """Attitude at the last sample; in the joint scheme by the joint ODE on SO(3)."""
+        if not self.joint:
+            return super().end_attitude(R_start, segment, dt)
+        field, start = self._joint_start(segment)
+        return joint_ode.end_attitude(field, segment, start, R_start, self.config.solver, adjoint=self.config.adjoint)
 
     def sensor_bias(self, sensor: Sensor, segment: Segment) -> Float[Tensor, "batch n 3"]:
         """beta + C(u) at each sample; beta goes on straight between the drift's steps."""
+        if self.joint and sensor == "gyro":
+            field, start = self._joint_start(segment)
+            return joint_ode.bias_path(field, segment, start, self.config.solver, adjoint=self.config.adjoint)
         u, rest = segment.of(sensor)
         motion: Float[Tensor, "batch n 3"] = self.curve[sensor](u, self._filtered(u, SLOW_S))
         if sensor not in self.config.drift:
@@ -170,9 +202,10 @@ class Model(BiasModel):
         return self._rest_path(segment.t, u, rest, self.drift[sensor]) + motion
 
     def begin_at(self, sensor: Sensor, W: Float[Tensor, "3 3"]) -> None:
-        """The linear part of the curve."""
+        """The linear part of the curve, or of the joint field."""
+        joint = self.joint and sensor == "gyro"
         with torch.no_grad():
-            _part(self.curve, sensor, Curve).W.copy_(W)
+            (_part(self.drift, sensor, JointField) if joint else _part(self.curve, sensor, Curve)).W.copy_(W)
 
     def _rest_path(
         self, t: Float[Tensor, "b n"], u: Float[Tensor, "b n 3"], rest: Float[Tensor, "b 3"], drift: nn.Module
@@ -198,7 +231,7 @@ class Model(BiasModel):
         still = self.prior_mean.new_zeros(1, 3)
         for sensor in self.config.drift:
             at = COLUMNS[sensor]
-            drift = _part(self.drift, sensor, Drift)
+            drift = self.drift[sensor]
             by_rest = torch.autograd.functional.jacobian(  # type: ignore[no-untyped-call]  # torch gives it no type
                 lambda beta, g=drift: g(beta, still, still)[0], self.prior_mean[None, at]
             )
@@ -215,11 +248,23 @@ class Model(BiasModel):
             shift, keep = 2 * shift, keep * keep
         return y
 
-    def stream(self, rest: Vector6) -> NeuralStream:
-        """The same in numpy, one Euler step of the drift every `stride` samples."""
+    def stream(self, rest: Vector6) -> SampleStream:
+        """The same in numpy, by Euler: a step every `stride` samples, or at every sample in the joint scheme."""
+        if self.joint:
+            return self._joint_stream(rest)
         gyro, accel = (_part(self.curve, sensor, Curve).weights() for sensor in SENSORS)
         drifts = {sensor: _part(self.drift, sensor, Drift).numpy() for sensor in self.config.drift}
         return NeuralStream(Curves(gyro, accel), drifts, self.stride, self.rate_hz, (SLOW_S, DRIFT_SEES_S), rest)
+
+    def _joint_stream(self, rest: Vector6) -> SampleStream:
+        field, accel = _part(self.drift, "gyro", JointField), _part(self.curve, "accel", Curve)
+        without_motion = Curve(self.config.curve_width, 1.0, 0.0)  # of the gyro, whose calibration the joint field holds
+        curves = Curves(without_motion.double().weights(), accel.weights())
+        others: tuple[Sensor, ...] = tuple(sensor for sensor in self.config.drift if sensor != "gyro")
+        drifts = {sensor: _part(self.drift, sensor, Drift).numpy() for sensor in others}
+        own = NeuralStream(curves, drifts, self.stride, self.rate_hz, (SLOW_S, DRIFT_SEES_S), rest)
+        rate = _part(field, "drift", Drift).numpy()
+        return joint_ode.JointStream(rate, field.W.detach().cpu().double().numpy(), rest, own)
 
 
 class _OnGrid(nn.Module):
@@ -244,9 +289,8 @@ def _solve(field: nn.Module, rest: Float[Tensor, "b 3"], steps: int, solver: str
 P = TypeVar("P", bound=nn.Module)
 
 
-def _part(parts: nn.ModuleDict, sensor: Sensor, kind: type[P]) -> P:
-    """One sensor's part, with its type (a ModuleDict only knows modules)."""
-    part = parts[sensor]
+def _part(parts: nn.Module, name: str, kind: type[P]) -> P:
+    part = parts.get_submodule(name)
     assert isinstance(part, kind)
     return part
 

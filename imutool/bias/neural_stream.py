@@ -1,4 +1,4 @@
-"""The neural ODE at work in numpy: torch's overhead for one sample is twenty times its arithmetic."""
+"""Neural ODE in numpy for live use: torch would take twenty times as long for a sample."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ class CurveWeights:
 
 
 class Curves:
-    """The curves of gyro and accelerometer side by side: two networks of one shape cost half the calls when stacked.
+    """Curves of gyro and accelerometer, stacked: two networks of one shape cost half the calls.
 
     GELU(h) = h (1 + erf(h / sqrt 2)) / 2; its constants, the layers' own and N(0, 0) are folded into the matrices. Features are
     rows and samples columns, or there is one sample and no such axis: every part of a layer is then one piece of memory.
@@ -244,11 +244,6 @@ def _affine(W: Array, b: Array) -> Callable[[Array], Array]:
 def _gelu(x: Array) -> Array:
     y: Array = 0.5 * x * (1.0 + erf(x * HALF_ROOT))
     return y
-
-
-def _with_constant(layer: nn.Linear) -> Array:
-    """A layer's matrix for rows from the left, and its constant as one more row."""
-    return np.concatenate([_array(layer.weight).T, _array(layer.bias)[None]])
 
 
 def _array(tensor: Tensor) -> Array:

@@ -1,4 +1,4 @@
-"""A physics.toml run backwards: what it says acts on a sensor, taken off the samples, with its bias as the prior.
+"""Bias model from a physics.toml: its effects are corrected for, its bias is the prior.
 
 Scale, misalignment and the rotation of the mount are one matrix, reading = T f + b with T = (I + S)(I + M) R^T (they act in
 this order), and its inverse is exact: f = (u - b) - (I - T^-1)(u - b). Everything else in closed form is of the measured
@@ -23,7 +23,7 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from imutool.bias import hybrid
-from imutool.bias.model import CovarianceModel, OneByOne, Segment, Stream, Vector6
+from imutool.bias.model import CovarianceModel, SampleStream, Segment, Stream, Vector6
 from imutool.errors import ModelError
 from imutool.sensor import catalogue, physics_file
 from imutool.sensor.effect import Effect, Parameter, Stage, Theta, each_pair
@@ -31,14 +31,15 @@ from imutool.sensor.linear_form import LinearForm, linear_form
 from imutool.sensor.physics_file import Bias, Entry, PhysicsFile
 from imutool.sensor.samples import SensorSamples
 from imutool.sensor.signals import POWER_S
+from imutool.sensor.unnamed_effects import DRIVEN
 from imutool.units import AXES, SENSORS, Sensor
 
-# How far a bias lies from run to run: of the ADIS16448 in EuRoC's training sequences, 2 mrad/s and 0.02 m/s². Where the file
-# says nothing of the bias: data sheet of a consumer sensor, as in `imutool.bias.static`.
+# Spread of a bias from run to run: of the ADIS16448 in EuRoC's training sequences, 2 mrad/s and 0.02 m/s². Where the file
+# has no bias: data sheet of a consumer sensor, as in `imutool.bias.static`.
 TURN_ON_STD, UNKNOWN_STD = (2e-3, 0.02), (0.05, 0.4)
-MOST_TAU_S = 0.01  # a clock's offset beyond is no small error: the derivative's noise would be more than what it removes
+MOST_TAU_S = 0.01  # for a larger clock offset the derivative's noise exceeds the error that it removes
 MOUNT = "mount_rotation"
-MATRIX = {  # by entry, what it is of each sensor's matrix
+MATRIX = {  # effects that are a factor of a sensor's matrix
     "gyro_scale": "gyro",
     "gyro_misalignment": "gyro",
     "accel_scale": "accel",
@@ -78,34 +79,34 @@ class Model(hybrid.Model):
         self.truth_std.copy_(torch.tensor([2e-3] * 3 + [0.1] * 3))  # as `imutool.bias.static`
 
     def sensor_bias(self, sensor: Sensor, segment: Segment) -> Float[Tensor, "batch n 3"]:
-        """The effects on the samples without the file's bias, and the rest bias."""
+        """Rest bias, and the error of the effects at the samples without the file's bias."""
         b = torch.from_numpy(self._b).to(segment.gyro)
         less = Segment(segment.t, segment.gyro - b[:3], segment.accel - b[3:], segment.rest)
         return super().sensor_bias(sensor, less)
 
     def stream(self, rest: Vector6) -> Stream:
-        """The same in numpy."""
+        """The model in numpy."""
         inner = super().stream(rest)
-        assert isinstance(inner, OneByOne)
+        assert isinstance(inner, SampleStream)
         return _Less(inner, self._b)
 
     def calibration_covariance(self) -> CovarianceModel | None:
-        """From the parameters' standard deviations, taken as independent."""
-        unsure = super().calibration_covariance()
-        assert unsure is not None
+        """Covariance from the parameters' standard deviations, taken as independent."""
+        root_at = super().calibration_covariance()
+        assert root_at is not None
 
         def less(
             t_s: Float64[np.ndarray, " n"], gyro: Float64[np.ndarray, "n 3"], accel: Float64[np.ndarray, "n 3"]
         ) -> Mapping[Sensor, Float64[np.ndarray, "n 3 p"]]:
-            return unsure(t_s, gyro - self._b[:3], accel - self._b[3:])
+            return root_at(t_s, gyro - self._b[:3], accel - self._b[3:])
 
         return less
 
 
 class _Less:
-    """A stream that is shown samples without a constant."""
+    """Stream that sees samples without a constant."""
 
-    def __init__(self, inner: OneByOne, b: Vector6) -> None:
+    def __init__(self, inner: SampleStream, b: Vector6) -> None:
         self._inner, self._b = inner, b
 
     def __call__(
@@ -118,11 +119,11 @@ class _Less:
 
 
 def load(path: Path, rate_hz: float) -> Model:
-    """The model that a physics.toml is, for samples at a rate. What cannot be taken off is told in a warning.
+    """Bias model from a physics.toml at a sample rate; warns of effects that it cannot correct.
 
     Raises:
-        ConfigError: the file cannot be read, or names what there is not.
-        ModelError: nothing in it can be taken off.
+        ConfigError: the file cannot be read, or has an unknown name.
+        ModelError: the file has nothing to correct.
     """
     file = physics_file.read(path)
     acting = file.acting(where=path)
@@ -142,10 +143,10 @@ def load(path: Path, rate_hz: float) -> Model:
     if not any(parts.values()) and file.bias is None:
         listed = ", ".join(kept) or "nothing at all"
         raise ModelError(
-            f"nothing in it can be taken off ({listed})", where=path, expected="a bias, or an effect in closed form"
+            f"nothing in it can be corrected ({listed})", where=path, expected="a bias, or an effect in closed form"
         )
     if kept:
-        logger.warning("%s: not taken off, for they cannot be: %s", path, ", ".join(kept))
+        logger.warning("%s: cannot be corrected, and stays in the samples: %s", path, ", ".join(kept))
     if any(entry.name == MOUNT for entry in file.effect):
         logger.warning("%s: mount_rotation is undone, so that samples are in the body's axes, not the sensor's", path)
     model = Model(parts, file.bias, rate_hz)
@@ -156,10 +157,10 @@ def load(path: Path, rate_hz: float) -> Model:
 
 
 def _taken(entry: Entry, parts: Mapping[Sensor, list[Part]]) -> bool:
-    """Whether an effect can be taken off; one in closed form is added to the parts, those of the matrix come later."""
+    """Whether an effect can be corrected; one with a linear form is added to the parts."""
     if entry.name in MATRIX or entry.name == MOUNT:
         return True
-    if entry.name == physics_file.DRIVEN:
+    if entry.name == DRIVEN:
         return False
     (effect,) = catalogue.effects([entry.name])
     if not effect.trained or (entry.name == "clock_offset" and abs(_value(entry, "tau")) > MOST_TAU_S):
@@ -176,7 +177,7 @@ def _taken(entry: Entry, parts: Mapping[Sensor, list[Part]]) -> bool:
 
 
 def _value(entry: Entry, name: str) -> float:
-    """What the file leaves out does nothing; a drift's time constant has to be there."""
+    """Value in the file; a parameter that it leaves out does nothing."""
     return entry.parameters[name].value if name in entry.parameters else _null_value(entry, name)
 
 
@@ -190,12 +191,12 @@ def _null_value(entry: Entry, name: str) -> float:
 
 
 def _words(file: PhysicsFile) -> list[str]:
-    """What each part without a name depends on, in the order in which they act."""
+    """Variables of each part without a name, in the order in which they act."""
     return [*(curve.variable for curve in file.unknown), *(term.term for term in file.term)]
 
 
 def _needs_more(words: str) -> bool:
-    """Whether it takes more than the sensor's own signals: another channel, or the time since a log's start."""
+    """Whether a part needs a channel, or the time since the log's start."""
     return words.startswith("/") or "t" in words.replace("|", " ").split()
 
 
@@ -204,14 +205,16 @@ def _of_size_one(effect: Effect, theta: Theta, sensor: Sensor) -> Part:
 
     def forward(samples: SensorSamples, size: Theta) -> SensorSamples:
         out = effect.forward(samples, theta)
-        return samples.but(samples.gyro + size * (out.gyro - samples.gyro), samples.accel + size * (out.accel - samples.accel))
+        return samples.with_readings(
+            samples.gyro + size * (out.gyro - samples.gyro), samples.accel + size * (out.accel - samples.accel)
+        )
 
     sized = replace(effect, parameters=(Parameter("size", "-", 1.0),), forward=forward)
     return linear_form(sized, sensor), np.ones(1), np.zeros(1)
 
 
 def _matrix(file: PhysicsFile, sensor: Sensor) -> Part | None:
-    """I - T^-1 as an effect of nine parameters, with the standard deviations of what T is made of; none where T is I."""
+    """Effect I - T^-1 of nine parameters with standard deviations; none where T is I."""
     entries = {entry.name: entry for entry in file.effect if MATRIX.get(entry.name) == sensor or entry.name == MOUNT}
     if not entries:
         return None
@@ -233,11 +236,11 @@ def _matrix(file: PhysicsFile, sensor: Sensor) -> Part | None:
 
 
 def _full(sensor: Sensor) -> LinearForm:
-    """A matrix on the sensor's own reading."""
+    """Effect of a full matrix on the sensor's own reading."""
 
     def forward(samples: SensorSamples, theta: Theta) -> SensorSamples:
         A = theta.reshape(3, 3).T
-        return samples.but(samples.gyro + samples.gyro @ A, samples.accel + samples.accel @ A)
+        return samples.with_readings(samples.gyro + samples.gyro @ A, samples.accel + samples.accel @ A)
 
     equation, parameters = f"{sensor} += A {sensor}", each_pair("-", 0.1)
     effect = Effect(f"{sensor}_matrix", Stage.SENSOR, (sensor,), equation, parameters, "always", forward, trained=True)

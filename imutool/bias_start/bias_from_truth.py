@@ -10,12 +10,12 @@ from torch import Tensor
 from imutool.bias.model import Vector6
 from imutool.geometry import so3
 from imutool.inertial.strapdown import GRAVITY_W
-from imutool.inertial.windows import HUBER_MEDIANS, attitudes, between, huber_weight, running_product
+from imutool.inertial.windows import HUBER_MEDIANS, attitudes, huber_weight, running_product, step_means
 
 ITERATIONS = 4
 
 
-def truth_offset(
+def bias_from_truth(
     t_s: Float64[np.ndarray, " n"],
     samples: Float64[np.ndarray, "n 6"],
     R_wb: Float[Tensor, "n 3 3"],
@@ -32,13 +32,13 @@ def truth_offset(
     rate, force = torch.from_numpy(samples[:, :3])[None], torch.from_numpy(samples[:, 3:])[None]
     offset = torch.zeros(2, 3, dtype=torch.float64)
     for _ in range(ITERATIONS):
-        running = running_product(so3.exp(between(rate - offset[0]) * dt[..., None]))[0]
+        running = running_product(so3.exp(step_means(rate - offset[0]) * dt[..., None]))[0]
         missed = (running @ so3.log(running.mT @ (R_wb[0].mT @ R_wb[1:]))[..., None])[..., 0]
         by_rate = torch.cumsum(running * dt[0, :, None, None], dim=0)
         offset[0] -= _slope(missed, by_rate, seen[1:])
     R_wb = _attitudes(t_s, rate - offset[0], R_wb, trusted)
     a_w = (R_wb @ force[0, ..., None])[..., 0] + torch.tensor(GRAVITY_W, dtype=torch.float64)
-    risen = torch.cumsum(between(a_w[None])[0] * dt[0, :, None], dim=0)
+    risen = torch.cumsum(step_means(a_w[None])[0] * dt[0, :, None], dim=0)
     by_force = torch.cumsum(0.5 * (R_wb[:-1] + R_wb[1:]) * dt[0, :, None, None], dim=0)
     offset[1] = -_slope(v_w[1:] - v_w[0] - risen, by_force, seen[1:])
     return offset.flatten().numpy()

@@ -23,13 +23,23 @@ import torch
 from jaxtyping import Float64
 from torch import Tensor
 
-from imutool.bias.model import BiasModel, Stream, Vector6
-from imutool.bias_start.bias_from_truth import truth_offset
-from imutool.bias_start.bias_tracking import USUAL_WALK, Along, Following, Known, Passed, Samples, Track, followed
-from imutool.bias_start.bias_tracking import smooth as smooth_track
+from imutool.bias.model import BiasModel, RestBiasEstimator, Stream, Vector6
+from imutool.bias_start.bias_from_truth import bias_from_truth
+from imutool.bias_start.bias_tracking import (
+    USUAL_WALK,
+    BiasPrior,
+    BiasTrajectory,
+    ConstantBiasStream,
+    FilteredBlock,
+    Samples,
+    TrackedBiasStream,
+    TrajectoryBiasStream,
+    filter_blocks,
+    smooth_bias,
+)
 from imutool.errors import ConfigError, DataError
 from imutool.geometry import so3
-from imutool.inertial.stationary import Blocks, resting, stretches, white_noise
+from imutool.inertial.stationary import Blocks, rest_stretches, resting_blocks, white_noise
 from imutool.inertial.strapdown import with_velocity
 from imutool.recording import GRAVITY_M_S2, Imu, Recording, nanoseconds, seconds
 
@@ -40,9 +50,9 @@ AT_REST_STD = np.array([1e-4] * 3 + [0.03] * 3)  # earth's rotation; local gravi
 REST_BEGINS_WITHIN_S = 5.0  # later, its bias would be one of the future
 MAD_TO_STD = 1.4826
 LEAST_STD = np.array([1e-6] * 3 + [1e-4] * 3)  # a prior without any doubt would leave nothing to estimate
-FOLLOWED = "gravity in motion and every stop"
+TRACKED_BY = "gravity in motion and every stop"
 
-WAYS = ("auto", "stationary", "prior", "truth")
+METHODS = ("auto", "stationary", "prior", "truth")
 
 
 class NoRestError(DataError):
@@ -61,17 +71,30 @@ class InitialBias:
     std: Vector6
     how: str
     noise: Vector6 = field(default_factory=lambda: np.zeros(6))  # of a sample, where it could be measured
-    track: Track | None = None
-    follows: Known | None = None
+    track: BiasTrajectory | None = None
+    follows: BiasPrior | None = None
     hold_s: float = 0.0
 
     def stream(self, model: BiasModel) -> Stream:
         """The model at work from this start on."""
         if self.track is not None:
-            return Along(model, self.track)
+            return TrajectoryBiasStream(model, self.track)
         if self.follows is not None:
-            return Following(model, self.follows, self.rest, self.hold_s)
+            return TrackedBiasStream(model, self.follows, self.rest, self.hold_s)
         return model.stream(self.rest)
+
+    def estimator(self, model: BiasModel) -> RestBiasEstimator:
+        """The model at work from this start on, with the covariance of the rest bias."""
+        if self.track is not None:
+            return TrajectoryBiasStream(model, self.track)
+        if self.follows is not None:
+            return TrackedBiasStream(model, self.follows, self.rest, self.hold_s)
+        return ConstantBiasStream(model, self.rest, self.std)
+
+    @property
+    def tracked(self) -> bool:
+        """Whether the rest bias follows the samples, or stays constant over the whole log."""
+        return self.track is not None or self.follows is not None
 
 
 def find(way: str, model: BiasModel, recording: Recording) -> InitialBias:
@@ -90,7 +113,7 @@ def find(way: str, model: BiasModel, recording: Recording) -> InitialBias:
         return at_rest(model, recording.imu)
     if way == "auto":
         return auto(model, recording.imu)
-    return given(way)
+    return from_numbers(way)
 
 
 def auto(model: BiasModel, imu: Imu) -> InitialBias:
@@ -101,16 +124,16 @@ def auto(model: BiasModel, imu: Imu) -> InitialBias:
     Raises:
         DataError: an untrained model, and the log does not start at rest.
     """
-    rested: list[Passed] = []
-    before = known(model)
-    for block in followed(model, [_samples(imu)], before, ahead=True):
+    rested: list[FilteredBlock] = []
+    before = bias_prior(model)
+    for block in filter_blocks(model, [_samples(imu)], before, ahead=True):
         if not block.resting:
             break
         rested.append(block)
     if not rested:
         if not model.card:
             raise _no_rest()
-        return following(model)
+        return tracked_from_prior(model)
     end, state = rested[-1].end_s, rested[-1].step.after
     std = np.sqrt(np.diag(state.covariance(False)))  # in motion, where it is to serve
     still = imu.rows(slice(0, int(np.searchsorted(imu.t_ns, imu.t_ns[0] + nanoseconds(end)))))
@@ -118,18 +141,20 @@ def auto(model: BiasModel, imu: Imu) -> InitialBias:
     used = f"{end - rested[0].start_s:.1f} s at rest from 0.0 s on"
     if model.card:
         used = f"{used}, {_from_training(model)}"
-    return InitialBias(state.rest_bias(True), std, f"{used}, {_sure(std)}, then {FOLLOWED}", noise, follows=before, hold_s=end)
-
-
-def following(model: BiasModel) -> InitialBias:
-    """The prior, and from the first sample on what the samples show: for a live node, which cannot look ahead."""
-    start = prior(model)
     return InitialBias(
-        start.rest, start.std, f"{_from_training(model)}, {_sure(start.std)}, then {FOLLOWED}", follows=known(model)
+        state.rest_bias(True), std, f"{used}, {_accuracy(std)}, then {TRACKED_BY}", noise, follows=before, hold_s=end
     )
 
 
-def smooth(model: BiasModel, batches: Iterable[Samples], where: str = "") -> InitialBias:
+def tracked_from_prior(model: BiasModel) -> InitialBias:
+    """The prior, and from the first sample on what the samples show: for a live node, which cannot look ahead."""
+    start = prior(model)
+    return InitialBias(
+        start.rest, start.std, f"{_from_training(model)}, {_accuracy(start.std)}, then {TRACKED_BY}", follows=bias_prior(model)
+    )
+
+
+def smoothed_start(model: BiasModel, batches: Iterable[Samples], where: str = "") -> InitialBias:
     """The rest bias in time from the whole of a log: all its stops, gravity in motion, and the training runs.
 
     `batches` are seconds since the first sample, gyro and accel.
@@ -138,7 +163,7 @@ def smooth(model: BiasModel, batches: Iterable[Samples], where: str = "") -> Ini
         DataError: less than half a second of samples.
         NoRestError: an untrained model, and a log that never rests.
     """
-    track, rested_s = smooth_track(model, batches, known(model))
+    track, rested_s = smooth_bias(model, batches, bias_prior(model))
     if not len(track.t_s):
         raise DataError("too short to be smoothed", where=where, expected="at least half a second of samples")
     if not model.card and not rested_s:
@@ -146,15 +171,15 @@ def smooth(model: BiasModel, batches: Iterable[Samples], where: str = "") -> Ini
     std = np.median(track.std, axis=0)
     parts = [f"{rested_s:.1f} s at rest in all"] * (rested_s > 0) + ["gravity in motion"]
     parts += [_from_training(model)] * bool(model.card)
-    return InitialBias(track.rest[0], std, f"{', '.join(parts)}, {_sure(std)}, forward and backward", track=track)
+    return InitialBias(track.rest[0], std, f"{', '.join(parts)}, {_accuracy(std)}, forward and backward", track=track)
 
 
-def known(model: BiasModel) -> Known:
+def bias_prior(model: BiasModel) -> BiasPrior:
     """What the training runs say of the next run's biases; how far they walk is alike for the axes of a sensor."""
     ground = np.maximum(_numpy(model.rest_std), AT_REST_STD)
     walk = np.repeat(np.sqrt(np.mean(_numpy(model.walk_std).reshape(2, 3) ** 2, axis=1)), 3)
     walk = np.where(walk > 0, walk, USUAL_WALK)
-    return Known(_numpy(model.prior_mean), np.maximum(_numpy(model.prior_std), LEAST_STD), ground, walk)
+    return BiasPrior(_numpy(model.prior_mean), np.maximum(_numpy(model.prior_std), LEAST_STD), ground, walk)
 
 
 def rest_spread(model: BiasModel, logs: Sequence[Samples], rest: Float64[np.ndarray, "logs 6"]) -> Vector6:
@@ -167,7 +192,7 @@ def rest_spread(model: BiasModel, logs: Sequence[Samples], rest: Float64[np.ndar
     for (t_s, gyro, accel), own in zip(logs, rest, strict=True):
         t_ns = np.round(t_s * 1e9).astype(np.int64)
         left = np.concatenate([gyro, accel], axis=1) - model.stream(own)(t_s, gyro, accel)
-        for first, last in stretches(Imu(t_ns, gyro, accel)):
+        for first, last in rest_stretches(Imu(t_ns, gyro, accel)):
             mean = left[first:last].mean(axis=0)
             away.append([*mean[:3], *[np.linalg.norm(mean[3:]) - GRAVITY_M_S2] * 3])
     if not away:
@@ -187,12 +212,12 @@ def _from_training(model: BiasModel) -> str:
     return f"prior of {len(logs)} runs" if len(logs) > 1 else "prior of the training runs"
 
 
-def _sure(std: Vector6) -> str:
+def _accuracy(std: Vector6) -> str:
     """The least sure axis of the gyro."""
     return f"±{std[:3].max():.1g} rad/s"
 
 
-def given(text: str) -> InitialBias:
+def from_numbers(text: str) -> InitialBias:
     """Six numbers from the command line: gx,gy,gz in rad/s, ax,ay,az in m/s².
 
     Raises:
@@ -203,7 +228,7 @@ def given(text: str) -> InitialBias:
     except ValueError:
         rest = np.zeros(0)
     if rest.shape != (6,) or not np.isfinite(rest).all():
-        raise ConfigError(f"{text!r}", where="--init", expected=f"{', '.join(WAYS)} or gx,gy,gz,ax,ay,az")
+        raise ConfigError(f"{text!r}", where="--init", expected=f"{', '.join(METHODS)} or gx,gy,gz,ax,ay,az")
     return InitialBias(rest, np.zeros(6), "given")
 
 
@@ -235,7 +260,7 @@ def at_rest(model: BiasModel, imu: Imu) -> InitialBias:
         DataError: there is none.
     """
     starts_by = np.searchsorted(imu.t_ns, imu.t_ns[0] + nanoseconds(REST_BEGINS_WITHIN_S)) if len(imu) else 0
-    found = [stretch for stretch in stretches(imu) if stretch[0] <= starts_by]
+    found = [stretch for stretch in rest_stretches(imu) if stretch[0] <= starts_by]
     if not found:
         raise _no_rest()
     return _from_rest(model, imu, found[0])
@@ -252,12 +277,12 @@ def _no_rest() -> DataError:
 def over_all_rest(model: BiasModel, blocks: Blocks) -> InitialBias:
     """From all the time at rest in a log, also what comes after the motion: a constant has no before and after.
 
-    For a model that takes nothing off but a constant: of the samples there is only what `stationary.in_blocks` keeps.
+    For a model that takes nothing off but a constant: of the samples there is only what `stationary.block_statistics` keeps.
 
     Raises:
         DataError: the log never rests.
     """
-    found = resting(blocks)
+    found = resting_blocks(blocks)
     if not found:
         raise DataError("the log never rests", expected="1.5 s or more without motion")
     stills = []
@@ -265,11 +290,11 @@ def over_all_rest(model: BiasModel, blocks: Blocks) -> InitialBias:
         part, mean = slice(first, last), blocks.mean[first:last].mean(axis=0)
         apart = (blocks.k - 1) * blocks.var[part] + blocks.k * (blocks.mean[part] - mean) ** 2
         ends_ns = int(blocks.first_ns[first]), int(blocks.last_ns[last - 1])
-        stills.append(_Still(mean, apart.sum(axis=0), (last - first) * blocks.k, *ends_ns))
-    return _weighed(prior(model), stills, int(blocks.first_ns[0]))
+        stills.append(_RestStretch(mean, apart.sum(axis=0), (last - first) * blocks.k, *ends_ns))
+    return _combined(prior(model), stills, int(blocks.first_ns[0]))
 
 
-class _Still(NamedTuple):
+class _RestStretch(NamedTuple):
     """A stretch at rest: what the samples are on average, their squared distance from that in all, and how many there are."""
 
     mean: Vector6
@@ -285,10 +310,10 @@ def _from_rest(model: BiasModel, imu: Imu, found: tuple[int, int]) -> InitialBia
     left = np.concatenate([still.gyro, still.accel], axis=1) - _bias(model, still, start.rest) + start.rest
     mean = left.mean(axis=0)
     apart = ((left - mean) ** 2).sum(axis=0)
-    return _weighed(start, [_Still(mean, apart, len(still), int(still.t_ns[0]), int(still.t_ns[-1]))], int(imu.t_ns[0]))
+    return _combined(start, [_RestStretch(mean, apart, len(still), int(still.t_ns[0]), int(still.t_ns[-1]))], int(imu.t_ns[0]))
 
 
-def _weighed(start: InitialBias, stills: Sequence[_Still], first_ns: int) -> InitialBias:
+def _combined(start: InitialBias, stills: Sequence[_RestStretch], first_ns: int) -> InitialBias:
     """True rate zero; specific force g along where it points, so the accelerometer's bias is seen along gravity only."""
     rest, var = start.rest.copy(), start.std**2
     count = sum(still.samples for still in stills)
@@ -336,19 +361,19 @@ def from_truth(model: BiasModel, recording: Recording, truth_s: float = TRUTH_S)
     start = prior(model)
     left = np.concatenate([piece.gyro, piece.accel], axis=1) - _bias(model, piece, start.rest)
     R_wb = so3.matrix_from_quaternion_wxyz(torch.from_numpy(np.array(poses.q_wb_wxyz)))
-    offset = truth_offset(t[rows], left, R_wb, torch.from_numpy(np.array(poses.v_w)), trusted[rows])
+    offset = bias_from_truth(t[rows], left, R_wb, torch.from_numpy(np.array(poses.v_w)), trusted[rows])
     measured = _numpy(model.truth_std) ** 2 * (TRUTH_S / found_s) ** 2
-    rest, std = _moved(start, offset, measured)
-    how = f"truth over {found_s:.1f} s{', weighed against the training runs' if model.card else ''}, {_sure(std)}"
+    rest, std = _updated(start, offset, measured)
+    how = f"truth over {found_s:.1f} s{', weighed against the training runs' if model.card else ''}, {_accuracy(std)}"
     if not model.card:
         return InitialBias(rest, std, how)
-    upright, unsure = _moved(start, offset, measured + WORLD_TILT_STD**2)
-    before = replace(known(model), mean=upright, std=np.maximum(unsure, LEAST_STD))
+    upright, unsure = _updated(start, offset, measured + WORLD_TILT_STD**2)
+    before = replace(bias_prior(model), mean=upright, std=np.maximum(unsure, LEAST_STD))
     ends = seconds(piece.t_ns[-1:], int(recording.imu.t_ns[0]))[0]
-    return InitialBias(rest, std, f"{how}, then {FOLLOWED}", follows=before, hold_s=float(ends))
+    return InitialBias(rest, std, f"{how}, then {TRACKED_BY}", follows=before, hold_s=float(ends))
 
 
-def _moved(start: InitialBias, offset: Vector6, variance: Vector6) -> tuple[Vector6, Vector6]:
+def _updated(start: InitialBias, offset: Vector6, variance: Vector6) -> tuple[Vector6, Vector6]:
     """A start moved towards where a measurement of this variance says it is off by `offset`: rest bias and its deviation."""
     var = start.std**2
     gain = np.divide(var, var + variance, out=np.zeros(6), where=var > 0)  # a prior without doubt stays

@@ -1,6 +1,6 @@
-"""Which model an IMU of a log gets and where its rest bias starts: from the log's first minute, or from a pass over all of it.
+"""Choose the bias model and the initial bias for an IMU of a log.
 
-Everything is read through a survey (`imutool.cleaning`) where there is one. Memory does not grow with the log.
+Samples are cleaned where there is a survey (`imutool.cleaning`). Memory does not grow with the log.
 """
 
 from __future__ import annotations
@@ -16,50 +16,44 @@ from imutool.bias import static
 from imutool.bias.io import check_rate, find_model
 from imutool.bias.model import BiasModel
 from imutool.bias_start.bias_tracking import Samples
-from imutool.bias_start.initial_bias import InitialBias, NoRestError, find, over_all_rest
-from imutool.bias_start.initial_bias import smooth as smooth_rest
+from imutool.bias_start.initial_bias import InitialBias, NoRestError, find, over_all_rest, smoothed_start
 from imutool.cleaning import Survey, cleaned
 from imutool.errors import ConfigError, DataError, LogError, ModelError
-from imutool.inertial.stationary import Blocks, in_blocks, white_noise
+from imutool.inertial.stationary import Blocks, block_statistics, white_noise
 from imutool.location import Location
-from imutool.mcap_io.batches import ImuBatch
 from imutool.mcap_io.log import Log
-from imutool.mcap_io.read import read
+from imutool.mcap_io.read import read_recording
+from imutool.mcap_io.topics import ImuBatch
 from imutool.recording import Imu, Recording, nanoseconds, seconds
 
-HEAD_S = 60.0  # of a log, read to find the start: a constant, however long the log
+HEAD_S = 60.0  # of a log are read to find the initial bias, however long the log
 
 
-def refuse_smooth(init: str, smooth: bool) -> None:
-    """Smoothing finds the start by itself.
+def check_smooth(init: str, smooth: bool) -> None:
+    """Refuses smoothing together with a given start: smoothing finds its own.
 
     Raises:
-        ConfigError: it is asked for together with a start that is given.
+        ConfigError: both are asked for.
     """
     if smooth and init != "auto":
-        raise ConfigError(f"--smooth with --init {init}", where="--smooth", expected="--init auto", fix="Give one of the two")
+        raise ConfigError(f"`smooth` with `init={init}`", where="smooth", expected="`init=auto`", fix="Give one of the two")
 
 
-def prepare(
-    source: Location, topic: str, name: str | Path | None, init: str, smooth: bool, found: Survey | None
+def choose_model_and_start(
+    log: Log, topic: str, name: str | Path | None, init: str, smooth: bool, survey: Survey | None
 ) -> tuple[BiasModel, InitialBias]:
-    """Model and start for one IMU."""
+    """Model and initial bias for one IMU of a log."""
     untrained = name is None or str(name) == static.Model.method
-    head = _head(source, topic, init, found)
+    first_minute = _first_minute(log, topic, init, survey)
+    period_s = first_minute.imu.period_s
     if untrained and init == "auto" and not smooth:
-        with Log(source) as log:
-            batches = ((batch.stamp_ns, batch.gyro, batch.accel) for batch in _imu_batches(log, topic, found))
-            return _estimate(in_blocks(batches, head.imu.period_s), source)
-    rate_hz = 1.0 / head.imu.period_s
-    model: BiasModel = static.Model() if name is None or untrained else find_model(name, rate_hz)
+        batches = ((batch.stamp_ns, batch.gyro, batch.accel) for batch in _imu_batches(log, topic, survey))
+        return _estimate(block_statistics(batches, period_s), log.path)
+    model: BiasModel = static.Model() if name is None or untrained else find_model(name, 1.0 / period_s)
     if not untrained:
-        check_rate(model, rate_hz, source)
-    if smooth:
-        with Log(source) as log:  # a first pass, in constant memory but for the track
-            start = _smoothed(model, _batches(log, topic, found), source)
-    else:
-        start = find(init, model, head)
-    return model, start if start.noise.any() else replace(start, noise=_noise(head.imu))
+        check_rate(model, 1.0 / period_s, log.path)
+    start = _smoothed(model, _batches(log, topic, survey), log.path) if smooth else find(init, model, first_minute)
+    return model, start if start.noise.any() else replace(start, noise=_noise(first_minute.imu))
 
 
 def smooth_in_memory(model: BiasModel, imu: Imu, where: str | Location) -> InitialBias:
@@ -75,51 +69,49 @@ def smooth_in_memory(model: BiasModel, imu: Imu, where: str | Location) -> Initi
 
 def _smoothed(model: BiasModel, batches: Iterable[Samples], where: str | Location) -> InitialBias:
     try:
-        return smooth_rest(model, batches, str(where))
+        return smoothed_start(model, batches, str(where))
     except NoRestError as error:
-        raise _nothing_known(where) from error
+        raise _no_start(where) from error
 
 
-def _imu_batches(log: Log, topic: str, found: Survey | None, end_ns: int | None = None) -> Iterator[ImuBatch]:
-    """An IMU's messages: as they must be, or as a survey says they are clean."""
-    return log.imu_batches(topic, end_ns=end_ns) if found is None else cleaned(log, found, end_ns)
+def _imu_batches(log: Log, topic: str, survey: Survey | None, end_ns: int | None = None) -> Iterator[ImuBatch]:
+    """An IMU's messages, cleaned where there is a survey."""
+    return log.imu_batches(topic, end_ns=end_ns) if survey is None else cleaned(log, survey, end_ns)
 
 
-def _batches(log: Log, topic: str, found: Survey | None) -> Iterator[Samples]:
+def _batches(log: Log, topic: str, survey: Survey | None) -> Iterator[Samples]:
     """An IMU's samples, with seconds since the first."""
     start_ns = None
-    for batch in _imu_batches(log, topic, found):
+    for batch in _imu_batches(log, topic, survey):
         if len(batch.stamp_ns):
             start_ns = int(batch.stamp_ns[0]) if start_ns is None else start_ns
             yield seconds(batch.stamp_ns, start_ns), batch.gyro, batch.accel
 
 
-def _head(source: Location, topic: str, init: str, found: Survey | None) -> Recording:
-    """The first minute of a log; of its truth only what is asked for, since it may be no business of the IMU's."""
-    with Log(source) as log:
-        first = next((int(times.min()) for times in log.stamps(topic) if len(times)), None)
+def _first_minute(log: Log, topic: str, init: str, survey: Survey | None) -> Recording:
+    """The first minute of a log, with its truth only where `init` asks for it."""
+    first = next((int(times.min()) for times in log.stamps(topic) if len(times)), None)
     end_ns = None if first is None else first + nanoseconds(HEAD_S)
-    if init.partition(":")[0] == "truth" and found is None:
-        return read(source, imu=topic, end_ns=end_ns)
-    samples = _samples(source, topic, found, end_ns if found is None else found.start_ns + nanoseconds(HEAD_S))
+    if init.partition(":")[0] == "truth" and survey is None:
+        return read_recording(log, imu=topic, end_ns=end_ns)
+    samples = _samples(log, topic, survey, end_ns if survey is None else survey.start_ns + nanoseconds(HEAD_S))
     if init.partition(":")[0] == "truth":
-        return read(source, imu=topic, end_ns=end_ns, samples=samples)
-    return Recording(source.stem, samples, imu_topic=topic, source=str(source))
+        return read_recording(log, imu=topic, end_ns=end_ns, samples=samples)
+    return Recording(log.path.stem, samples, imu_topic=topic, source=str(log.path))
 
 
-def _samples(source: Location, topic: str, found: Survey | None, end_ns: int | None = None) -> Imu:
-    """The samples of one IMU, as a survey says they are clean where there is one; its end is then by stamp.
+def _samples(log: Log, topic: str, survey: Survey | None, end_ns: int | None = None) -> Imu:
+    """The samples of one IMU, cleaned where there is a survey, whose end is then by stamp.
 
     Raises:
         LogError: fewer than two, or none that a recording could hold.
     """
-    with Log(source) as log:
-        batches = list(_imu_batches(log, topic, found, end_ns))
-        count = sum(len(batch.stamp_ns) for batch in batches)
-        if count < 2:
-            raise LogError(f"{topic} holds {count} messages", where=source, expected="at least 2")
-        with log.named(topic):
-            return Imu(*(np.concatenate([getattr(batch, c) for batch in batches]) for c in ("stamp_ns", "gyro", "accel")))
+    batches = list(_imu_batches(log, topic, survey, end_ns))
+    count = sum(len(batch.stamp_ns) for batch in batches)
+    if count < 2:
+        raise LogError(f"{topic} holds {count} messages", where=log.path, expected="at least 2")
+    with log.named(topic):
+        return Imu(*(np.concatenate([getattr(batch, c) for batch in batches]) for c in ("stamp_ns", "gyro", "accel")))
 
 
 def _noise(imu: Imu) -> Float64[np.ndarray, "6"]:
@@ -128,13 +120,13 @@ def _noise(imu: Imu) -> Float64[np.ndarray, "6"]:
 
 
 def estimate_at_rest(imu: Imu, where: str | Location) -> tuple[BiasModel, InitialBias]:
-    """The static model with its bias: the mean over all time at rest, for a log nobody trained a model for.
+    """The static model with the mean bias over all rest, for a log without a model.
 
     Raises:
         DataError: fewer than two samples.
         ModelError: the log never rests.
     """
-    return _estimate(in_blocks([(imu.t_ns, imu.gyro, imu.accel)], imu.period_s), where)
+    return _estimate(block_statistics([(imu.t_ns, imu.gyro, imu.accel)], imu.period_s), where)
 
 
 def _estimate(blocks: Blocks, where: str | Location) -> tuple[BiasModel, InitialBias]:
@@ -142,13 +134,13 @@ def _estimate(blocks: Blocks, where: str | Location) -> tuple[BiasModel, Initial
     try:
         return model, over_all_rest(model, blocks)
     except DataError as error:
-        raise _nothing_known(where) from error
+        raise _no_start(where) from error
 
 
-def _nothing_known(where: str | Location) -> ModelError:
+def _no_start(where: str | Location) -> ModelError:
     return ModelError(
         "no model given, and the log holds no stretch at rest to measure a static bias on",
         where=where,
-        expected="--model, or at least 1.5 s without motion",
-        fix="Give --model (imutool models lists those that ship), or train one with imutool train",
+        expected="`model`, or at least 1.5 s without motion",
+        fix="Give `model` (imutool models lists those that ship), or train one with imutool train",
     )

@@ -13,15 +13,15 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from imutool.bias.model import Vector6
-from imutool.bias_start.bias_tracking import Known, Passed, RestFilter, smoothed
+from imutool.bias_start.bias_tracking import BiasFilter, BiasPrior, FilteredBlock, smooth_blocks
 from imutool.inertial.inertial_filter import SIZE, State
-from imutool.inertial.strapdown import Start, dead_reckon
+from imutool.inertial.strapdown import StartPose, dead_reckon
 from imutool.recording import Imu, Poses, seconds
 
 START_STD = np.array([1e-3] * 3 + [1e-2] * 3 + [1e-3] * 3)  # rad, m/s, m: of the pose it starts from
 
 
-def with_stops(imu: Imu, start: Start, known: Known, *, smooth: bool = False) -> Poses:
+def zero_velocity_trajectory(imu: Imu, start: StartPose, known: BiasPrior, *, smooth: bool = False) -> Poses:
     """The trajectory at the IMU's stamps, from `start` at its first; with `smooth` each pose is given all samples.
 
     `imu` is debiased, `known` what may be left of the bias. Between the filter's blocks of half a second the samples are
@@ -31,7 +31,7 @@ def with_stops(imu: Imu, start: Start, known: Known, *, smooth: bool = False) ->
         DataError: no samples.
         NumericsError: the numbers overflow.
     """
-    filter_ = RestFilter(known, ahead=smooth)
+    filter_ = BiasFilter(known, ahead=smooth)
     filter_.state = _state(start, known)
     t_s = seconds(imu.t_ns, int(imu.t_ns[0]) if len(imu) else 0)
     estimates = _estimates(filter_, imu, t_s, smooth)
@@ -45,10 +45,10 @@ def with_stops(imu: Imu, start: Start, known: Known, *, smooth: bool = False) ->
     return Poses(imu.t_ns, *columns)
 
 
-def _estimates(filter_: RestFilter, imu: Imu, t_s: np.ndarray, smooth: bool) -> Iterator[tuple[float, bool, State, State]]:
+def _estimates(filter_: BiasFilter, imu: Imu, t_s: np.ndarray, smooth: bool) -> Iterator[tuple[float, bool, State, State]]:
     """Of each block: its end, whether at rest, the estimate at its start and at its end."""
 
-    def blocks() -> Iterator[Passed]:
+    def blocks() -> Iterator[FilteredBlock]:
         yield from filter_.feed(t_s, imu.gyro, imu.accel)
         yield from filter_.finish()
 
@@ -56,8 +56,8 @@ def _estimates(filter_: RestFilter, imu: Imu, t_s: np.ndarray, smooth: bool) -> 
         for block in blocks():
             yield block.end_s, block.resting, block.step.before, block.step.after
         return
-    held: tuple[Passed, State] | None = None
-    for block, state in smoothed(blocks()):
+    held: tuple[FilteredBlock, State] | None = None
+    for block, state in smooth_blocks(blocks()):
         if held is not None:
             yield held[0].end_s, held[0].resting, held[1], state
         held = block, state
@@ -65,7 +65,7 @@ def _estimates(filter_: RestFilter, imu: Imu, t_s: np.ndarray, smooth: bool) -> 
         yield held[0].end_s, held[0].resting, held[1], held[0].step.after  # at the end there is nothing later
 
 
-def _state(start: Start, known: Known) -> State:
+def _state(start: StartPose, known: BiasPrior) -> State:
     R_wb = Rotation.from_quat(start.q_wb_wxyz, scalar_first=True).as_matrix()
     P = np.zeros((SIZE, SIZE))
     # the errors are the invariant ones: an error of the attitude turns velocity and position about the origin with it

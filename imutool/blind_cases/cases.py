@@ -12,7 +12,7 @@ import secrets
 import shutil
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import msgspec
 import numpy as np
@@ -26,7 +26,7 @@ from imutool.blind_cases.gain import WITHOUT_MISFIT
 from imutool.blind_cases.information import achievable_rms, cramer_rao_bounds, detectability, location
 from imutool.blind_cases.motion import smoother
 from imutool.blind_cases.scene import SIM_SHARE, Scene, place_scene, stamps_ns
-from imutool.blind_cases.score import Score, score
+from imutool.blind_cases.score import SCHEMA, Score, score
 from imutool.errors import ConfigError, DataError
 from imutool.mcap_io.read import read
 from imutool.mcap_io.storage.target import Target
@@ -36,12 +36,11 @@ from imutool.noise.datasheet import read as read_noise
 from imutool.recording import Imu, Poses, Recording, Scalars
 
 SIM, REAL, ENVELOPE, KEY, FINDINGS, OPENED = "sim.mcap", "real.mcap", "envelope.json", "key", "findings.json", "opened.json"
-TRUTH_SCHEMA: Literal["imutool.sealed_truth/1"] = "imutool.sealed_truth/1"
 LONGEST_S = 75.0
 POSE_NOISE = (2e-4, 2e-4)  # m, rad: of the real log's poses, as a motion capture has it
 
 
-class OpenedCase(Score, frozen=True, kw_only=True):
+class OpenedCase(Score, frozen=True, kw_only=True, tag=SCHEMA):
     """Score of the findings with which a case was opened, and its truth."""
 
     findings_sha256: str
@@ -166,7 +165,6 @@ def _truth(
     misfit = scene.misfit(concealed.acting, scene.t_s)
     removable = [effect for effect in concealed.acting if effect[0].name not in WITHOUT_MISFIT]  # rounding cannot be undone
     return ConcealedTruth(
-        schema=TRUTH_SCHEMA,
         seed=seed,
         trajectory=trajectory,
         noise=grade,

@@ -14,19 +14,19 @@ import json
 import secrets
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import msgspec
-from msgspec import Struct
 
 from imutool.errors import DataError
+from imutool.report import Report, Section
 
-SCHEMA: Literal["imutool.envelope/1"] = "imutool.envelope/1"
+SCHEMA = "imutool.envelope/1"
 BLOCK = 16384
 LARGEST = 1 << 24  # bytes of an envelope that anybody would read
 
 
-class Marks(Struct, frozen=True):
+class Marks(Section, frozen=True):
     """Marks of one sensor's misfit, by second and by axis: `#` clear, `?` doubtful, `.` nothing."""
 
     seconds: str
@@ -34,7 +34,7 @@ class Marks(Struct, frozen=True):
     localised: bool
 
 
-class Location(Struct, frozen=True):
+class Location(Section, frozen=True):
     """Marks of the concealed misfit by sensor."""
 
     window_s: float
@@ -42,14 +42,14 @@ class Location(Struct, frozen=True):
     accel: Marks
 
 
-class Rms(Struct, frozen=True):
+class Rms(Section, frozen=True):
     """Root mean square residual with the misfit, and without it."""
 
     rms_before: float
     rms_after: float
 
 
-class TrueParameter(Struct, frozen=True):
+class TrueParameter(Section, frozen=True):
     """True value of a parameter, its scale, and the smallest standard deviation of an estimate (None: no bound)."""
 
     value: float
@@ -59,7 +59,7 @@ class TrueParameter(Struct, frozen=True):
     identifiable: bool
 
 
-class ConcealedEffect(Struct, frozen=True):
+class ConcealedEffect(Section, frozen=True):
     """Effect of a blind case; `factor` is its size over the plausible one."""
 
     effect: str
@@ -70,10 +70,9 @@ class ConcealedEffect(Struct, frozen=True):
     parameters: dict[str, TrueParameter]
 
 
-class ConcealedTruth(Struct, frozen=True, kw_only=True, omit_defaults=True):
+class ConcealedTruth(Report, frozen=True, kw_only=True, omit_defaults=True, tag="imutool.sealed_truth/1"):
     """Truth of a blind case; `generator` names another program that made it."""
 
-    schema: Literal["imutool.sealed_truth/1"]
     seed: int
     trajectory: str
     noise: str
@@ -89,10 +88,9 @@ class ConcealedTruth(Struct, frozen=True, kw_only=True, omit_defaults=True):
     generator: str = ""
 
 
-class Envelope(Struct, frozen=True):
+class Envelope(Report, frozen=True, tag=SCHEMA):
     """Sealed truth with its salt, its commitment and the digests of the logs."""
 
-    schema: Literal["imutool.envelope/1"]
     salt: str
     commitment: str
     logs: dict[str, str]
@@ -106,7 +104,7 @@ def seal(truth: ConcealedTruth, logs: Mapping[str, Path]) -> tuple[Envelope, str
     key, salt = secrets.token_bytes(32), secrets.token_bytes(32)
     digests = {name: digest(path) for name, path in sorted(logs.items())}
     sealed = base64.b64encode(_xor(text, key)).decode()
-    return Envelope(SCHEMA, salt.hex(), _commitment(salt, text, digests), digests, sealed), key.hex()
+    return Envelope(salt.hex(), _commitment(salt, text, digests), digests, sealed), key.hex()
 
 
 def unseal(envelope: Path, key: Path) -> ConcealedTruth:

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import msgspec
 import numpy as np
-from msgspec import Struct
 
 from imutool.blind_cases.catalogue import AXES, CATALOGUE
 from imutool.blind_cases.envelope import ConcealedEffect, ConcealedTruth, Location
@@ -24,9 +23,9 @@ from imutool.blind_cases.gain import (
 )
 from imutool.errors import DataError
 from imutool.recording import Recording
+from imutool.report import Report, Section
 
-SCHEMA: Literal["imutool.score/1"] = "imutool.score/1"
-FINDINGS_SCHEMA = "imutool.diagnosis/1"
+SCHEMA, FINDINGS_SCHEMA = "imutool.score/1", "imutool.diagnosis/1"
 IN_EVERY_LOG = {"gyro_bias", "accel_bias"}  # right, but never concealed
 # other names of a parameter in findings
 ALIASES: Mapping[str, tuple[str, ...]] = {
@@ -51,7 +50,7 @@ ALIASES: Mapping[str, tuple[str, ...]] = {
 }
 
 
-class LocationScore(Struct, frozen=True):
+class LocationScore(Section, frozen=True):
     """F1 of the seconds (of a signal whose misfit comes and goes), of the axes, and their mean."""
 
     seconds_f1: float | None
@@ -59,7 +58,7 @@ class LocationScore(Struct, frozen=True):
     f1: float | None
 
 
-class ParameterScore(Struct, frozen=True):
+class ParameterScore(Section, frozen=True):
     """Reported value of an identifiable parameter against the true one.
 
     `sigmas`: error over the reported deviation; `percent`: error over the parameter's scale; `over_bound`: reported deviation
@@ -76,7 +75,7 @@ class ParameterScore(Struct, frozen=True):
     over_bound: float | None
 
 
-class Score(Struct, frozen=True, kw_only=True):
+class Score(Report, frozen=True, kw_only=True, tag=SCHEMA):
     """Score of findings: names, location, parameters and gain.
 
     Attributes:
@@ -87,7 +86,6 @@ class Score(Struct, frozen=True, kw_only=True):
         gain_said: reduction of the residual on held-out time that the findings report, over the achievable one.
     """
 
-    schema: Literal["imutool.score/1"]
     kind: str
     size: str
     concealed: tuple[str, ...]
@@ -129,7 +127,6 @@ def _score(truth: ConcealedTruth, found: Findings, sim: Recording | None) -> Sco
     if sim is not None:
         explained = explained_gain(truth, [(finding, _catalogue_values(finding)) for finding in findings], sim)
     return Score(
-        schema=SCHEMA,
         kind=truth.kind,
         size=truth.size,
         concealed=tuple(effect.effect for effect in truth.effects),

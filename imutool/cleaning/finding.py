@@ -1,7 +1,8 @@
-"""What a rule has found: which defect, how often, when, what was done about it, and how sure that is."""
+"""Findings of the rules, their intervals, and the score and verdict that follow from them."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
 from typing import Any, Literal
@@ -10,12 +11,15 @@ import numpy as np
 from jaxtyping import Bool, Int64
 
 from imutool.cleaning.samples import Numbers
+from imutool.report import Section
 
 Severity = Literal["note", "warning", "error"]
 Action = Literal["dropped", "converted", "flagged"]
+Verdict = Literal["good", "usable", "quarantine"]
 
 JOIN = 64  # samples: defects nearer to one another than this are one interval
 MAX_INTERVALS = 100  # listed of one finding; the rest is counted
+CORRECTED, FLAGGED, ERROR = 0.02, 0.05, 0.3  # what a kind of finding costs the score
 
 
 @dataclass(frozen=True)
@@ -23,10 +27,10 @@ class Finding:
     """One kind of defect in one topic.
 
     Attributes:
-        count: of what `what` says: samples, steps, axes.
-        intervals_ns: where, by header stamp, first and last affected sample; at most `MAX_INTERVALS`.
-        sure: how sure it is that this is a defect and the action right, 0 to 1, as a person would say it.
-        distrust: why the log should not be used, where that follows.
+        count: of samples, steps or axes, as `what` says.
+        intervals_ns: header stamps of the first and last affected sample; at most `MAX_INTERVALS`.
+        confidence: that this is a defect and the action right, 0 to 1.
+        distrust: the reason not to use the log, if there is one.
     """
 
     rule: str
@@ -37,29 +41,44 @@ class Finding:
     intervals_left_out: int = 0
     values: dict[str, Any] = field(default_factory=dict)
     action: Action = "flagged"
-    sure: float = 1.0
+    confidence: float = 1.0
     distrust: str = ""
 
-    def plain(self, start_ns: int) -> dict[str, Any]:
-        """As JSON values; seconds count from the topic's first good sample."""
-        seconds = [[round((a - start_ns) * 1e-9, 6), round((b - start_ns) * 1e-9, 6)] for a, b in self.intervals_ns]
-        return {
-            "rule": self.rule,
-            "severity": self.severity,
-            "what": self.what,
-            "count": self.count,
-            "intervals_ns": [list(pair) for pair in self.intervals_ns],
-            "intervals_s": seconds,
-            "intervals_left_out": self.intervals_left_out,
-            "values": self.values,
-            "action": self.action,
-            "sure": self.sure,
-            "distrust": self.distrust,
-        }
+    def report(self, start_ns: int) -> FindingReport:
+        """Report entry; seconds count from the topic's first good sample."""
+        return FindingReport(
+            rule=self.rule,
+            severity=self.severity,
+            what=self.what,
+            count=self.count,
+            intervals_ns=list(self.intervals_ns),
+            intervals_s=[(round((a - start_ns) * 1e-9, 6), round((b - start_ns) * 1e-9, 6)) for a, b in self.intervals_ns],
+            intervals_left_out=self.intervals_left_out,
+            values=self.values,
+            action=self.action,
+            sure=self.confidence,
+            distrust=self.distrust,
+        )
 
 
-class Places:
-    """Samples as a bounded number of intervals: numbers near one another are one, and beyond the bound are only counted."""
+class FindingReport(Section, frozen=True):
+    """A finding in JSON."""
+
+    rule: str
+    severity: Severity
+    what: str
+    count: int
+    intervals_ns: list[tuple[int, int]]
+    intervals_s: list[tuple[float, float]]
+    intervals_left_out: int
+    values: dict[str, Any]
+    action: Action
+    sure: float
+    distrust: str
+
+
+class Intervals:
+    """Intervals of affected samples: neighbours join, at most `MAX_INTERVALS` are kept, the rest is counted."""
 
     def __init__(self) -> None:
         self.count = 0
@@ -100,3 +119,34 @@ def runs(mask: Bool[np.ndarray, " n"]) -> list[tuple[int, int]]:
     """Index ranges `[first, end)` in which a mask holds."""
     edges = np.flatnonzero(np.diff(mask.astype(np.int8), prepend=0, append=0))
     return [(int(a), int(b)) for a, b in edges.reshape(-1, 2)]
+
+
+def score(messages: int, valid: int, missing: int, findings: Sequence[Finding]) -> float:
+    """Quality of the IMU's samples, 0 (no valid sample) to 1 (nothing found).
+
+        score = share * prod(1 - penalty)
+
+    `share` is that of valid samples among those received and missing (a message sent twice counts once). Each kind of finding
+    (a rule, and its cost) counts once: a note costs nothing, a warning that was corrected (dropped, converted) 0.02, one that
+    was only flagged 0.05, an error 0.3.
+    """
+    whole = messages + missing
+    value = valid / whole if whole else 0.0
+    for _, cost in {(one.rule, _cost(one)) for one in findings}:
+        value *= 1.0 - cost
+    return value
+
+
+def _cost(finding: Finding) -> float:
+    if finding.severity == "error":
+        return ERROR
+    if finding.severity == "note":
+        return 0.0
+    return FLAGGED if finding.action == "flagged" else CORRECTED
+
+
+def verdict(findings: Sequence[Finding], reasons: Sequence[str]) -> Verdict:
+    """Verdict on the log: `quarantine` with a reason not to trust it, `good` with nothing but notes, else `usable`."""
+    if reasons:
+        return "quarantine"
+    return "usable" if any(one.severity != "note" for one in findings) else "good"

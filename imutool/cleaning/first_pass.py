@@ -1,9 +1,9 @@
-"""The first pass over a log's IMU: what is wrong with it, which messages to leave out, and whether to trust the rest."""
+"""Survey of a log's IMU: its defects, the messages to leave out, and whether to trust the rest."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache, cached_property
 from typing import Any
@@ -12,20 +12,18 @@ import numpy as np
 from jaxtyping import Bool, Float64
 
 from imutool import registry
-from imutool.cleaning.finding import Finding
-from imutool.cleaning.motion import Motion
-from imutool.cleaning.rule import Rule, Whole
+from imutool.cleaning.finding import Finding, FindingReport, Verdict, score, verdict
+from imutool.cleaning.rule import Rule, TopicSummary
 from imutool.cleaning.rules.gaps import MISSING
-from imutool.cleaning.rules.non_monotonic import TimeBack, left_out
-from imutool.cleaning.samples import Samples, blocks
-from imutool.cleaning.score import Verdict, score, verdict
-from imutool.cleaning.settings import GROUP, Rules
+from imutool.cleaning.samples import Motion, Samples, blocks
+from imutool.cleaning.settings import GROUP, CleaningSettings
 from imutool.cleaning.truth import Truth, read_truth
 from imutool.errors import LogError
 from imutool.location import Location
-from imutool.mcap_io.batches import ImuBatch
 from imutool.mcap_io.codec import schemas
 from imutool.mcap_io.log import Log
+from imutool.mcap_io.topics import ImuBatch
+from imutool.report import UNSET, Report, Section, UnsetType, json_values
 
 SCHEMA = "imutool.clean/1"
 RECORDED = 20  # intervals of a finding that go into a log's metadata
@@ -33,23 +31,23 @@ FEWEST = 2  # samples that make a log
 
 
 class UntrustedError(LogError):
-    """A log whose IMU cannot be cleaned without guessing: it is left alone."""
+    """The log's IMU cannot be cleaned without guessing."""
 
 
 @dataclass(frozen=True, eq=False)
 class Survey:
-    """What was found out about one IMU.
+    """Findings in one IMU, and the messages to leave out.
 
     Attributes:
-        dropped: of every message, in file order, whether it is to be left out.
-        scale: what gyro and accel are to be multiplied by.
-        surplus: messages that are another one once more, bit for bit: to leave them out costs nothing.
-        reasons: why the log is not to be trusted; none where it is.
+        dropped: whether each message, in file order, is left out.
+        scale: factors from the log's units to rad/s and m/s², gyro then accel.
+        surplus: bit-for-bit copies of other messages; to drop them costs nothing.
+        reasons: why the log is not to be trusted; empty where it is.
     """
 
     log: str
     topic: str
-    rules: Rules
+    settings: CleaningSettings
     messages: int
     start_ns: int
     end_ns: int
@@ -62,12 +60,12 @@ class Survey:
 
     @cached_property
     def valid(self) -> int:
-        """The number of messages that are left."""
+        """Number of messages that are left."""
         return self.messages - int(self.dropped.sum())
 
     @property
     def score(self) -> float:
-        """Quality from 0 to 1 (`imutool.cleaning.score`)."""
+        """Quality from 0 to 1 (`imutool.cleaning.finding.score`)."""
         return score(self.messages - self.surplus, self.valid, self.missing, self.findings)
 
     @property
@@ -76,125 +74,154 @@ class Survey:
         return verdict(self.findings, self.reasons)
 
     def trusted(self) -> Survey:
-        """Itself, if the log is to be trusted or its rules say to use it all the same.
+        """Return the survey if the log is to be trusted, or the settings force its use.
 
         Raises:
-            UntrustedError: it is not; the message gives the reasons.
+            UntrustedError: the log is not to be trusted; the message gives the reasons.
         """
-        if self.verdict != "quarantine" or self.rules.force:
+        if self.verdict != "quarantine" or self.settings.force:
             return self
         raise UntrustedError(
             f"cannot be trusted: {'; '.join(self.reasons)}",
             where=f"{self.log} {self.topic}",
             expected="a log whose IMU can be cleaned without guessing",
-            fix="It was left alone; look at it with imutool clean LOG, leave a rule out with --no-rule, or insist with --force",
+            fix="Look at it with `imutool clean LOG`, leave a rule out, or clean it with `force`",
         )
 
-    def plain(self) -> dict[str, Any]:
-        """As JSON values."""
-        return {
-            "topic": self.topic,
-            "verdict": self.verdict,
-            "score": round(self.score, 4),
-            "reasons": list(self.reasons),
-            "messages": self.messages,
-            "valid": self.valid,
-            "missing": self.missing,
-            "first_ns": self.start_ns,
-            "last_ns": self.end_ns,
-            "duration_s": (self.end_ns - self.start_ns) * 1e-9,
-            "scale": {"gyro": float(self.scale[0]), "accel": float(self.scale[3])},
-            "rules": self.rules.names(),
-            "findings": [finding.plain(self.start_ns) for finding in self.findings],
-        }
+    def report(self) -> SurveyReport:
+        """Entry of the report."""
+        return SurveyReport(
+            topic=self.topic,
+            verdict=self.verdict,
+            score=round(self.score, 4),
+            reasons=list(self.reasons),
+            messages=self.messages,
+            valid=self.valid,
+            missing=self.missing,
+            first_ns=self.start_ns,
+            last_ns=self.end_ns,
+            duration_s=(self.end_ns - self.start_ns) * 1e-9,
+            scale={"gyro": float(self.scale[0]), "accel": float(self.scale[3])},
+            rules=self.settings.names(),
+            findings=[finding.report(self.start_ns) for finding in self.findings],
+        )
 
     def record(self) -> dict[str, str]:
-        """For a log's metadata: what was found and done; of each finding at most `RECORDED` intervals."""
-        report = self.plain()
-        findings = report.pop("findings")
-        for one in findings:
-            one["intervals_left_out"] += max(0, len(one["intervals_ns"]) - RECORDED)
-            del one["intervals_s"], one["intervals_ns"][RECORDED:]
-        plain = {key: value if isinstance(value, str) else json.dumps(value) for key, value in report.items()}
-        return {"schema": SCHEMA, **plain, "findings": json.dumps(findings)}
+        """The report as text for a log's metadata, with at most `RECORDED` intervals of each finding."""
+        values = json_values(self.report())
+        findings = values.pop("findings")
+        for finding in findings:
+            finding["intervals_left_out"] += max(0, len(finding["intervals_ns"]) - RECORDED)
+            del finding["intervals_s"], finding["intervals_ns"][RECORDED:]
+        texts = {key: value if isinstance(value, str) else json.dumps(value) for key, value in values.items()}
+        return {"schema": SCHEMA, **texts, "findings": json.dumps(findings)}
 
 
-def survey(path: Location, topic: str | None = None, rules: Rules | None = None) -> Survey:
-    """Looks through one IMU of a log; memory grows by some 6 kB a second of it (`tests/bench/clean.py`).
+class SurveyReport(Section, frozen=True, kw_only=True):
+    """A survey in JSON."""
+
+    topic: str
+    verdict: Verdict
+    score: float
+    reasons: list[str]
+    messages: int
+    valid: int
+    missing: int
+    first_ns: int
+    last_ns: int
+    duration_s: float
+    scale: dict[str, float]
+    rules: list[str]
+    findings: list[FindingReport]
+
+
+class CleaningReport(Report, frozen=True, kw_only=True, tag=SCHEMA):
+    """The report of `imutool clean`; `output` and `added` (messages by topic) where a log was written."""
+
+    log: str
+    imus: list[SurveyReport]
+    losses: dict[str, Any]
+    output: str | UnsetType = UNSET
+    added: dict[str, int] | UnsetType = UNSET
+
+
+def survey(path: Location, topic: str | None = None, settings: CleaningSettings | None = None) -> Survey:
+    """Survey one IMU of a log; memory grows by some 6 kB for each of its seconds (`tests/bench/clean.py`).
 
     Raises:
         ConfigError: the file cannot be opened, or a rule is not known.
         LogError: no such IMU, several without `topic`, or a damaged log.
     """
     with Log(path) as log:
-        return look(log, topic or log.only_imu(), rules)
+        return look(log, topic or log.only_imu(), settings)
 
 
-def look(log: Log, topic: str, rules: Rules | None = None) -> Survey:
-    """As `survey`, in a log that is open.
+def look(log: Log, topic: str, settings: CleaningSettings | None = None) -> Survey:
+    """Survey one IMU of an open log.
 
     Raises:
         ConfigError: a rule is not known.
         LogError: no such IMU topic, or damage.
     """
-    return examine(lambda: raw_batches(log, topic), read_truth(log), rules, where=str(log.path), topic=topic)
+    return examine(lambda: raw_batches(log, topic), read_truth(log), settings, where=str(log.path), topic=topic)
 
 
 def examine(
-    each: Callable[[], Iterable[ImuBatch]], truth: Truth | None, rules: Rules | None = None, *, where: str = "", topic: str = ""
+    each: Callable[[], Iterable[ImuBatch]],
+    truth: Truth | None,
+    settings: CleaningSettings | None = None,
+    *,
+    where: str = "",
+    topic: str = "",
 ) -> Survey:
-    """As `survey`, of messages that can be gone through again (a clock that was set is only known of in the end).
+    """Survey messages that can be read twice (that a clock was set is known only at the end).
 
     Raises:
         ConfigError: a rule is not known.
     """
-    rules = rules or Rules()
-    stations, whole = _through(each(), truth, rules, None)
-    clock = next((one for one in stations if isinstance(one, TimeBack)), None)
-    if clock is not None and len(clock.epochs) > 1:
-        stations, whole = _through(each(), truth, rules, left_out(clock.epochs, whole.messages))
-    findings = tuple(finding for station in stations for finding in station.findings(whole))
+    settings = settings or CleaningSettings()
+    names = settings.names()
+    stages, whole = _through(each(), truth, settings, {name: _rule(name)() for name in names})
+    again = {name: stage.second_pass(whole.messages) for name, stage in stages.items()}
+    if any(stage is not None for stage in again.values()):
+        stages, whole = _through(each(), truth, settings, {name: again[name] or _rule(name)() for name in names})
+    findings = tuple(finding for stage in stages.values() for finding in stage.findings(whole))
     dropped = np.zeros(whole.messages, bool)
-    for station in stations:
-        for numbers in station.dropped:
+    for stage in stages.values():
+        for numbers in stage.dropped:
             dropped[numbers] = True
     missing = sum(one.count for one in findings if one.rule == "gaps" and one.what == MISSING)
     surplus = sum(one.values["identical"] for one in findings if one.rule == "duplicates")
-    reasons = tuple(_reasons(rules, whole, int(dropped.sum()) - surplus, findings))
+    reasons = tuple(_reasons(settings, whole, int(dropped.sum()) - surplus, findings))
     start_ns, end_ns = whole.motion.start_ns or 0, whole.motion.end_ns
     counts = whole.messages, start_ns, end_ns, missing, surplus
-    return Survey(where, topic, rules, *counts, dropped, whole.scale, findings, reasons)
+    return Survey(where, topic, settings, *counts, dropped, whole.scale, findings, reasons)
 
 
 def _through(
-    batches: Iterable[ImuBatch], truth: Truth | None, rules: Rules, skip: Sequence[tuple[int, int]] | None
-) -> tuple[list[Rule], Whole]:
-    """One pass: the rules, each having seen what those before it left, and what is known in the end."""
-    stations = sorted((_make(name, skip) for name in rules.names()), key=lambda rule: rule.place)
+    batches: Iterable[ImuBatch], truth: Truth | None, settings: CleaningSettings, rules: Mapping[str, Rule]
+) -> tuple[dict[str, Rule], TopicSummary]:
+    """One pass: the rules in their order, each of which has seen what those before it left, and the topic's totals."""
+    stages = dict(sorted(rules.items(), key=lambda item: item[1].place))
     motion, counter = Motion(), _Counter()
     stream: Iterable[Samples] = counter(blocks(batches))
-    for station in stations:
-        stream = station(stream)
+    for stage in stages.values():
+        stream = stage(stream)
     for samples in stream:
         motion.see(samples)
-    return stations, Whole(rules, counter.count, motion, truth)
-
-
-def _make(name: str, skip: Sequence[tuple[int, int]] | None) -> Rule:
-    """A rule by the name of its file."""
-    kind = _kind(name)
-    return TimeBack(skip) if kind is TimeBack else kind()
+    return stages, TopicSummary(settings, counter.count, motion, truth)
 
 
 @cache
-def _kind(name: str) -> type[Rule]:
+def _rule(name: str) -> type[Rule]:
+    """The rule in the file of that name."""
     module = registry.load(GROUP, name)
     own = (one for one in vars(module).values() if isinstance(one, type) and one.__module__ == module.__name__)
     return next(one for one in own if issubclass(one, Rule))
 
 
 class _Counter:
-    """Counts what passes before any rule sees it."""
+    """Counts the messages before any rule sees them."""
 
     def __init__(self) -> None:
         self.count = 0
@@ -206,7 +233,7 @@ class _Counter:
 
 
 def raw_batches(log: Log, topic: str, start_ns: int | None = None, end_ns: int | None = None) -> Iterator[ImuBatch]:
-    """The messages of an IMU as they are, in file order: nothing is asked of their values.
+    """Messages of an IMU as recorded, in file order, with unchecked values.
 
     Raises:
         LogError: no such IMU topic, another encoding, or damage.
@@ -214,15 +241,15 @@ def raw_batches(log: Log, topic: str, start_ns: int | None = None, end_ns: int |
     log.topic(topic, (schemas.IMU,))
     for _, rows in log.rows([topic], start_ns, end_ns):
         with log.named(topic):
-            yield from log.decode_imu(topic, rows)
+            yield from log.topics[topic].decode_imu(rows)
 
 
-def _reasons(rules: Rules, whole: Whole, invalid: int, findings: Sequence[Finding]) -> Iterator[str]:
-    """Why not to trust the log."""
+def _reasons(settings: CleaningSettings, whole: TopicSummary, invalid: int, findings: Sequence[Finding]) -> Iterator[str]:
+    """Reasons not to trust the log."""
     if whole.motion.samples < FEWEST:
         yield f"{whole.motion.samples} of {whole.messages} samples are left"
         return
     share = invalid / whole.messages
-    if share > rules.max_invalid_share:
+    if share > settings.max_invalid_share:
         yield f"{100 * share:.0f} % of the samples are invalid"
     yield from (finding.distrust for finding in findings if finding.distrust)

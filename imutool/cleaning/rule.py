@@ -1,4 +1,4 @@
-"""What every rule is: a station that samples pass, in one pass over the log, and what it says at the end."""
+"""Base class of the rules: a stage of the pipeline that samples pass once, with findings at the end."""
 
 from __future__ import annotations
 
@@ -11,24 +11,23 @@ import numpy as np
 from jaxtyping import Float64, Int64
 
 from imutool.cleaning.finding import Finding
-from imutool.cleaning.motion import Motion
-from imutool.cleaning.samples import Numbers, Samples
-from imutool.cleaning.settings import Rules
+from imutool.cleaning.samples import Motion, Numbers, Samples
+from imutool.cleaning.settings import CleaningSettings
 from imutool.cleaning.truth import Truth
 
 
 @dataclass
-class Whole:
-    """What is known of a topic when all its samples have passed; the rules read it in their order and may add to it.
+class TopicSummary:
+    """Totals of a topic after all its samples have passed; rules read them in their order and may add to them.
 
     Attributes:
-        scale: what gyro and accel are to be multiplied by to be rad/s and m/s².
-        late_ns: stamps of samples that came too late, in order (from `time_back`): they are not missing.
+        scale: factors from the log's units to rad/s and m/s², gyro then accel.
+        late_ns: sorted stamps of late samples (from `time_back`): they are not missing.
         jumps: numbers of the samples before which the clock of the stamps stepped (from `clock_jumps`).
         other_rate_ns: stretches at another rate (from `changed_rate`).
     """
 
-    rules: Rules
+    settings: CleaningSettings
     messages: int
     motion: Motion
     truth: Truth | None
@@ -39,10 +38,10 @@ class Whole:
 
 
 class Rule(ABC):
-    """One kind of defect. Made anew for each pass; what it remembers does not grow with the log, but for a row a second.
+    """One kind of defect. Each pass has its own instance; its memory is bounded, but for a row a second.
 
     Attributes:
-        place: rules see the samples in this order, those that drop some before those that measure what is left.
+        place: position in the pipeline; rules that drop samples come before those that measure the rest.
         dropped: the numbers of the messages to be left out.
     """
 
@@ -52,15 +51,19 @@ class Rule(ABC):
         self.dropped: list[Numbers] = []
 
     def __call__(self, stream: Iterable[Samples]) -> Iterator[Samples]:
-        """The samples that are left; a rule that drops none only overrides `see`."""
+        """Pass on the samples that are left; a rule that drops none overrides `see` alone."""
         for samples in stream:
             self.see(samples)
             yield samples
 
     def see(self, samples: Samples) -> None:
-        """The next samples, of which none is to be dropped."""
+        """Take in the next samples; none is dropped."""
         return
 
+    def second_pass(self, messages: int) -> Rule | None:
+        """The instance for a second pass over the log, from the first one's totals; None where one pass is enough."""
+        return None
+
     @abstractmethod
-    def findings(self, whole: Whole) -> Iterator[Finding]:
-        """What was found, once everything has passed."""
+    def findings(self, whole: TopicSummary) -> Iterator[Finding]:
+        """Findings, after the last sample."""

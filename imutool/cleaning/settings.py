@@ -17,7 +17,7 @@ GROUP = "imutool.clean"  # of rules: one file each
 Share = Annotated[float, Meta(ge=0.0, le=1.0)]
 
 
-class Rules(Settings, frozen=True, kw_only=True):
+class CleaningSettings(Settings, frozen=True, kw_only=True):
     """Which rules run (by name; all where none is named, less those left out), and the limits of trust."""
 
     only: tuple[str, ...] = ()
@@ -46,14 +46,14 @@ def every() -> tuple[str, ...]:
     return tuple(registry.names(GROUP))
 
 
-def chosen(only: Iterable[str], without: Iterable[str], force: bool = False) -> Rules:
+def chosen(only: Iterable[str], without: Iterable[str], force: bool = False) -> CleaningSettings:
     """The rules of a command line.
 
     Raises:
         ConfigError: a name that is no rule, or one both asked for and left out.
     """
-    rules = Rules(only=tuple(only), without=tuple(without), force=force)
+    rules = CleaningSettings(only=tuple(only), without=tuple(without), force=force)
     rules.names()
     if both := set(rules.only) & set(rules.without):
-        raise ConfigError(f"{min(both)} is asked for and left out", where="--rule", fix="Give --rule or --no-rule")
+        raise ConfigError(f"{min(both)} is asked for and left out", where="rule", fix="Give `rule` or `no_rule`")
     return rules

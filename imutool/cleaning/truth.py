@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float64, Int64
 
-from imutool.cleaning.motion import STEP_NS
+from imutool.cleaning.samples import STEP_NS
 from imutool.errors import LogError
 from imutool.mcap_io.log import Log
 from imutool.recording import GRAVITY_M_S2, Poses, seconds

@@ -14,7 +14,7 @@ from typer.core import TyperCommand, TyperGroup
 from typer.models import CommandFunctionType
 
 from imutool import __version__, registry
-from imutool.cli.parameters import error_with_flags, flags
+from imutool.cli.parameters import current, error_with_flags, flags, with_flags
 from imutool.cli.terminal import plain, say, tell_error
 from imutool.errors import ConfigError, ImutoolError
 
@@ -62,10 +62,14 @@ class Command(TyperCommand):
         Raises:
             ImutoolError: the command failed.
         """
+        known = flags(self)
+        current.set(known)
         try:
             return super().invoke(ctx)
         except ImutoolError as error:
-            raise error_with_flags(error, flags(self)) from error
+            raise error_with_flags(error, known) from error
+        except KeyboardInterrupt as interrupt:
+            raise KeyboardInterrupt(with_flags(str(interrupt), known)) from interrupt
 
 
 class App(typer.Typer):
@@ -82,6 +86,8 @@ def listing(group: str, option: str) -> type[TyperCommand]:
     """A command whose help also lists what can be named, found (and nothing of it imported) when help is asked for."""
 
     class Listing(Command):
+        values = (group, option)  # for the documentation
+
         def format_help(self, ctx: Any, formatter: Any) -> None:
             lines = [f"[bold]{name}[/]  {plain(registry.summary(group, name))}" for name in registry.names(group)]
             self.epilog = "\n\n".join([f"Values of {option}:", *lines, self.epilog or ""])
@@ -107,7 +113,7 @@ Smooth = Annotated[bool, typer.Option("--smooth", help="Take the whole log for e
 Imu = Annotated[str | None, typer.Option(help="IMU topic, where a log has several.")]
 Truth = Annotated[str | None, typer.Option(help="Topic of the true poses, where a log has several.")]
 Json = Annotated[str | None, typer.Option("--json", metavar="FILE|-", help="Write the report as JSON; - is stdout.")]
-Report = Annotated[Path | None, typer.Option(metavar="F.html", help="Write a page: figures, paths, errors, biases, spectra.")]
+ReportPage = Annotated[Path | None, typer.Option(metavar="F.html", help="Write a page of figures, paths, errors and spectra.")]
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace what is there.")]
 Verbose = Annotated[bool, typer.Option("-v", "--verbose", help="Say more.")]
 Quiet = Annotated[bool, typer.Option("-q", "--quiet", help="Say only results and errors.")]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -12,10 +12,11 @@ from imutool.cli.app import LOST, Init, Json, Overwrite, Quiet, Smooth, Verbose,
 from imutool.cli.terminal import out, plain, progress, say, table, tell_losses, write_json
 from imutool.errors import ConfigError, LogError
 from imutool.location import to_location
+from imutool.report import UNSET
 
 if TYPE_CHECKING:
-    from imutool.cleaning import Rules, Survey
-    from imutool.mcap_io.losses import Losses
+    from imutool.cleaning import CleaningSettings, Survey
+    from imutool.mcap_io.recovery.losses import Losses
 
 COLORS = {"good": "green", "usable": "yellow", "quarantine": "red"}
 SHOWN = 3  # intervals of a finding in the table; all of them are in the JSON
@@ -78,16 +79,19 @@ def clean(
 def _tell(
     source: str, surveys: Sequence[Survey], losses: Losses, target: str | None, added: Mapping[str, int], json_to: str | None
 ) -> None:
-    """Says what was found and what was written, as JSON or for a person; something lost is an exit code."""
-    from imutool.cleaning.first_pass import SCHEMA
+    """Report findings and output, as JSON or as text; losses become the exit code."""
+    from imutool.cleaning.first_pass import CleaningReport
 
-    result: dict[str, Any] = {"schema": SCHEMA, "log": source, "imus": [one.plain() for one in surveys]}
-    result["losses"] = losses.plain()
-    if target is not None:
-        result |= {"output": target, "added": dict(added)}
-    if not write_json(result, json_to):
-        for one in surveys:
-            show(one)
+    report = CleaningReport(
+        log=source,
+        imus=[survey.report() for survey in surveys],
+        losses=losses.plain(),
+        output=UNSET if target is None else target,
+        added=UNSET if target is None else dict(added),
+    )
+    if not write_json(report, json_to):
+        for survey in surveys:
+            show(survey)
         if target is not None:
             say(f"{target}: {', '.join(f'{count} on {name}' for name, count in added.items())}")
         tell_losses(losses.plain())
@@ -96,13 +100,13 @@ def _tell(
 
 
 def _looked(
-    source: str, imus: Sequence[str], rules: Rules, tell: Callable[[int, int, str], None]
+    source: str, imus: Sequence[str], rules: CleaningSettings, tell: Callable[[int, int, str], None]
 ) -> tuple[list[Survey], Losses]:
-    """What is found in each IMU of a log, and what of a damaged log is lost."""
+    """Survey of each IMU of a log, and the losses of a damaged log."""
     from imutool.cleaning import look
-    from imutool.mcap_io.log import Log
+    from imutool.mcap_io.recovery.recovered_log import RecoveredLog
 
-    with Log(to_location(source), salvage=True) as log:
+    with RecoveredLog(to_location(source)) as log:
         topics = list(imus) or log.imu_topics
         if not topics:
             raise LogError("no IMU topic", where=source, expected=log.listing())
@@ -110,12 +114,11 @@ def _looked(
         for done, topic in enumerate(topics):
             tell(done, len(topics), topic)
             surveys.append(look(log, topic, rules))
-        assert log.losses is not None, "with salvage there are losses, if perhaps none"
         return surveys, log.losses
 
 
 def show(survey: Survey) -> None:
-    """Verdict, score and findings of one IMU, for a person."""
+    """Print verdict, score and findings of one IMU."""
     counts = f"{survey.valid} of {survey.messages} samples valid, {survey.missing} missing"
     color = COLORS[survey.verdict]
     line = f"{plain(survey.topic)}: [bold {color}]{survey.verdict}[/], score {survey.score:.3f}, {counts}"
@@ -127,13 +130,13 @@ def show(survey: Survey) -> None:
 
 
 def finding_rows(survey: Survey) -> list[tuple[str, ...]]:
-    """The findings as rows of text, the first row their header."""
+    """Rows of the table of findings, the header first."""
     rows: list[tuple[str, ...]] = [("rule", "count", "what was found", "done", "when s")]
-    for one in survey.findings:
-        times = [_span(first - survey.start_ns, last - survey.start_ns) for first, last in one.intervals_ns]
-        more = len(times) - SHOWN + one.intervals_left_out
+    for finding in survey.findings:
+        times = [_span(first - survey.start_ns, last - survey.start_ns) for first, last in finding.intervals_ns]
+        more = len(times) - SHOWN + finding.intervals_left_out
         when = ", ".join(times[:SHOWN]) + (f" and {more} more" if more > 0 else "")
-        rows.append((one.rule, str(one.count), one.what, one.action, when or "whole log"))
+        rows.append((finding.rule, str(finding.count), finding.what, finding.action, when or "whole log"))
     return rows
 
 

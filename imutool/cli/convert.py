@@ -1,4 +1,4 @@
-"""`imutool convert`."""
+"""`imutool convert` into logs, and `imutool export` out of them."""
 
 from __future__ import annotations
 
@@ -9,8 +9,10 @@ from typing import Annotated
 import typer
 
 from imutool.cli.app import Json, Overwrite, Quiet, Verbose, app, listing
+from imutool.cli.parameters import with_flags
 from imutool.cli.terminal import progress, say, tell_error, write_json
 from imutool.errors import DataError
+from imutool.report import Report, Section
 
 
 class Compression(StrEnum):
@@ -19,6 +21,30 @@ class Compression(StrEnum):
     zstd = "zstd"
     lz4 = "lz4"
     none = "none"
+
+
+class Failure(Section, frozen=True):
+    """A sequence that was not written."""
+
+    name: str
+    message: str
+
+
+class Conversion(Report, frozen=True, tag="imutool.conversion/1"):
+    """The report of `imutool convert`."""
+
+    written: list[str]
+    failures: list[Failure]
+
+
+class Export(Report, frozen=True, tag="imutool.export/1"):
+    """The report of `imutool export`: messages or rows by file, and the topics left out."""
+
+    output: str
+    format: str
+    imu: str | None
+    written: dict[str, int]
+    left_out: list[str]
 
 
 @app.command(
@@ -52,12 +78,39 @@ def convert(
             workers=workers,
             progress=tell,
         )
-    failures = [{"name": failure.name, "message": failure.message} for failure in report.failures]
-    result = {"schema": "imutool.conversion/1", "written": [str(path) for path in report.written], "failures": failures}
-    if not write_json(result, json_to):
+    failures = [Failure(failure.name, failure.message) for failure in report.failures]
+    if not write_json(Conversion([str(path) for path in report.written], failures), json_to):
         for path in report.written:
             say(str(path))
     for failure in report.failures:
-        tell_error(failure.message)
+        tell_error(with_flags(failure.message))
     if report.failures:
         raise typer.Exit(DataError.exit_code)
+
+
+@app.command(epilog="Example: [bold]imutool export MH_04_debiased.mcap MH_04_debiased --format euroc[/]")
+def export(
+    log: Annotated[Path, typer.Argument(metavar="LOG", help="An MCAP log.")],
+    target: Annotated[Path, typer.Argument(metavar="OUT", help="The folder that is made.")],
+    format: Annotated[str, typer.Option(help="euroc: an ASL folder; rosbag2: a folder around a copy of the log.")],
+    imu: Annotated[str | None, typer.Option(help="IMU topic of a EuRoC folder; by default the debiased one.")] = None,
+    noise: Annotated[
+        str | None, typer.Option(metavar="NAME|F.toml", help="Noise for its sensor.yaml: a data sheet or a file.")
+    ] = None,
+    overwrite: Overwrite = False,
+    json_to: Json = None,
+    verbose: Verbose = False,
+    quiet: Quiet = False,
+) -> None:
+    """Write a log as a EuRoC folder or a rosbag2 folder, for programs that read those."""
+    from imutool.exporting.export import export as run
+
+    with progress("Exporting", verbose, quiet) as tell:
+        report = run(log, target, format=format, imu=imu, sensor_noise=noise, overwrite=overwrite, progress=tell)
+    summary = Export(str(report.output), report.format, report.imu, report.written, report.left_out)
+    if write_json(summary, json_to):
+        return
+    counts = ", ".join(f"{count} on {name}" for name, count in report.written.items())
+    say(f"{target}: {counts}" + (f"; IMU from {report.imu}" if report.imu else ""))
+    if report.left_out:
+        say(f"left out: {', '.join(report.left_out)}")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -13,6 +13,7 @@ from imutool.cli.app import LOST, Init, Json, Overwrite, Quiet, Smooth, Verbose,
 from imutool.cli.terminal import progress, say, tell_losses, write_json
 from imutool.errors import ConfigError
 from imutool.location import Location, to_location
+from imutool.report import UNSET, Report, Section, UnsetType, json_values
 
 if TYPE_CHECKING:
     from imutool.debiasing import DebiasReport
@@ -57,8 +58,8 @@ def debias(
     if report_to is not None:
         from imutool.viewing.html import report as pages
 
-        pages.refuse(report_to, overwrite=overwrite)
-    from imutool.cleaning import Rules
+        pages.check_target(report_to, overwrite=overwrite)
+    from imutool.cleaning import CleaningSettings
     from imutool.debiasing import debias as run
 
     live = _watching(source, target, view, connect, save_view, overwrite)
@@ -71,73 +72,94 @@ def debias(
             init=init,
             smooth=smooth,
             check=verify,
-            clean=Rules() if clean else None,
+            clean=CleaningSettings() if clean else None,
             overwrite=overwrite,
             progress=lambda done, total: tell(done, total, ""),
             watch=watch,
         )
-    output, shown = str(target or source), None if watch is None else watch.shown
-    result = _result(report, output, shown, report_to, clean)
-    told = write_json(result, json_to)
-    if not told:
-        _say(report, output, result["imus"], verify, shown or ())
+    shown = None if watch is None else watch.shown
+    summary = _summary(report, str(target or source), shown, report_to, clean)
+    json_only = write_json(summary, json_to)
+    if not json_only:
+        _say(report, summary, shown or ())
     if report_to is not None:  # last: should it fail, the log is there all the same, and that has been said
         with progress("Drawing", verbose, quiet):
             _draw(to_location(target or source), list(report.starts), report_to, overwrite)
-        if not told:
+        if not json_only:
             say(f"Report: {report_to}")
     raise typer.Exit(LOST if report.losses else 0)
 
 
-def _result(
+class DebiasedImu(Section, frozen=True):
+    """Model and start bias of an IMU (gyro rad/s, accel m/s²) with its standard deviation."""
+
+    model: str
+    init_how: str
+    gyro_bias: list[float]
+    accel_bias: list[float]
+    std: list[float]
+
+
+class Verified(Section, frozen=True):
+    """The chunks of the new log that were read back."""
+
+    mode: str
+    chunks_checked: int
+    chunks: int
+
+
+class DebiasSummary(Report, frozen=True, kw_only=True, tag="imutool.debias/1"):
+    """The report of `imutool debias`; `shown`, `report` and `clean` only where they were asked for."""
+
+    output: str
+    imus: dict[str, DebiasedImu]
+    copied: int
+    added: dict[str, int]
+    verified: Verified
+    losses: dict[str, Any]
+    shown: list[dict[str, str]] | UnsetType = UNSET
+    report: str | UnsetType = UNSET
+    clean: list[dict[str, Any]] | UnsetType = UNSET
+
+
+def _summary(
     report: DebiasReport, output: str, shown: Sequence[Output] | None, page: Path | None, clean: bool
-) -> dict[str, Any]:
-    """What was done, for programs."""
+) -> DebiasSummary:
     imus = {
-        topic: {
-            "model": report.models[topic],
-            "init_how": start.how,
-            "gyro_bias": start.rest[:3].tolist(),
-            "accel_bias": start.rest[3:].tolist(),
-            "std": start.std.tolist(),
-        }
+        topic: DebiasedImu(
+            report.models[topic], start.how, start.rest[:3].tolist(), start.rest[3:].tolist(), start.std.tolist()
+        )
         for topic, start in report.starts.items()
     }
-    result = {
-        "schema": "imutool.debias/1",
-        "output": output,
-        "imus": imus,
-        "copied": report.rewrite.copied,
-        "added": dict(report.rewrite.added),
-        "verified": report.rewrite.verified._asdict(),
-        "losses": report.losses.plain(),
-    }
-    if shown is not None:
-        result["shown"] = [one.plain() for one in shown]
-    if page is not None:
-        result["report"] = str(page)
-    if clean:
-        result["clean"] = [one.plain() for one in report.surveys.values()]
-    return result
+    return DebiasSummary(
+        output=output,
+        imus=imus,
+        copied=report.rewrite.copied,
+        added=dict(report.rewrite.added),
+        verified=Verified(*report.rewrite.verified),
+        losses=report.losses.plain(),
+        shown=UNSET if shown is None else [output.plain() for output in shown],
+        report=UNSET if page is None else str(page),
+        clean=[json_values(survey.report()) for survey in report.surveys.values()] if clean else UNSET,
+    )
 
 
-def _say(
-    report: DebiasReport, target: str, imus: Mapping[str, Mapping[str, Any]], verify: str, shown: Sequence[Output]
-) -> None:
-    """What was done, in lines."""
-    for topic, one in report.surveys.items():
-        say(f"{topic}: {one.verdict}, score {one.score:.3f}, {one.valid} of {one.messages} samples valid")
-    for topic, entry in imus.items():
-        bias = ", ".join(f"{b:+.5f}" for b in entry["gyro_bias"]), ", ".join(f"{b:+.4f}" for b in entry["accel_bias"])
-        start = f"start bias {bias[0]} rad/s; {bias[1]} m/s² ({entry['init_how']})"
-        say(f"{topic}: {entry['model']}, {start}")
-    counts = ", ".join(f"{count} on {name}" for name, count in report.rewrite.added.items())
-    say(f"{target}: {report.rewrite.copied} messages as they were, {counts}")
-    verified = report.rewrite.verified
-    say(f"checked: every index, and the contents of {verified.chunks_checked} of {verified.chunks} chunks (--verify {verify})")
-    for way in shown:
-        say(way.said)
-    tell_losses(report.losses.plain())
+def _say(report: DebiasReport, summary: DebiasSummary, shown: Sequence[Output]) -> None:
+    """Print what was done."""
+    for topic, survey in report.surveys.items():
+        say(f"{topic}: {survey.verdict}, score {survey.score:.3f}, {survey.valid} of {survey.messages} samples valid")
+    for topic, imu in summary.imus.items():
+        gyro = ", ".join(f"{b:+.5f}" for b in imu.gyro_bias)
+        accel = ", ".join(f"{b:+.4f}" for b in imu.accel_bias)
+        say(f"{topic}: {imu.model}, start bias {gyro} rad/s; {accel} m/s² ({imu.init_how})")
+    counts = ", ".join(f"{count} on {name}" for name, count in summary.added.items())
+    say(f"{summary.output}: {summary.copied} messages as they were, {counts}")
+    verified = summary.verified
+    chunks = f"{verified.chunks_checked} of {verified.chunks} chunks"
+    say(f"checked: every index, and the contents of {chunks} (--verify {verified.mode})")
+    for output in shown:
+        say(output.said)
+    tell_losses(summary.losses)
 
 
 def _watching(
@@ -146,18 +168,18 @@ def _watching(
     """Whoever is to watch; without that nothing of the viewer is imported."""
     if not view and connect is None and save is None:
         return nullcontext()
-    from imutool.viewing.rerun.live import watching
+    from imutool.viewing.rerun.live import live_view
 
     out = Path(target or source)
-    return watching(out.stem, connect_to=connect, save=save, instead=Path(f"{out.stem}.rrd"), overwrite=overwrite)
+    return live_view(out.stem, connect_to=connect, save=save, instead=Path(f"{out.stem}.rrd"), overwrite=overwrite)
 
 
 def _draw(log: Location, topics: Sequence[str], page: Path, overwrite: bool) -> None:
     """A page about the debiased log, each of its IMUs under its own topic where there are several."""
-    from imutool.viewing.html.report import by_topic, write_page
+    from imutool.viewing.html.report import name_by_topic, write_page
     from imutool.viewing.model.runs import load
 
-    write_page(by_topic([load(log, imu=topic) for topic in topics], topics), page, overwrite=overwrite)
+    write_page(name_by_topic([load(log, imu=topic) for topic in topics], topics), page, overwrite=overwrite)
 
 
 def _refuse_contradictions(target: str | None, in_place: bool, overwrite: bool) -> None:

@@ -32,6 +32,11 @@ def diagnose(
             "-o", "--output", metavar="DIR", help="For findings.json, physics.toml, report.html, log.html and view.rrd."
         ),
     ] = None,
+    config: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE.toml", help="Settings; imutool.diagnosis.settings.DiagnoseSettings lists them."),
+    ] = None,
+    set_: Annotated[list[str] | None, typer.Option("--set", metavar="key=value", help="One setting. Repeatable.")] = None,
     imu: Imu = None,
     truth: Truth = None,
     overwrite: Overwrite = False,
@@ -41,23 +46,26 @@ def diagnose(
 ) -> None:
     """Find where a recording differs from a simulation, name what physics was left out, model it, and show the gain."""
     from imutool import diagnosis_output
+    from imutool.config import load as load_settings
     from imutool.diagnosis.diagnose import diagnose as run
-    from imutool.diagnosis.wording import below, conclusion
-    from imutool.diagnosis.wording import table as findings_table
+    from imutool.diagnosis.settings import DiagnoseSettings
+    from imutool.diagnosis.wording.conclusion import below, conclusion
+    from imutool.diagnosis.wording.conclusion import table as findings_table
     from imutool.viewing.model.runs import load
 
     def look(findings: Path) -> list[RunData]:
         return [load(real, imu=imu, truth=truth, findings=findings) for real in reals]
 
+    settings = load_settings(DiagnoseSettings, config, set_ or ())
     if folder is not None:
         diagnosis_output.refuse(folder, overwrite=overwrite)
     with progress("Diagnosing", verbose, quiet) as tell:
-        found = run(reals, sim, imu=imu, truth=truth, signals=signal or (), tell=tell)
+        found = run(reals, sim, imu=imu, truth=truth, signals=signal or (), tell=tell, settings=settings)
         if folder is not None:
             tell(0, 1, "writing")
             for remark in diagnosis_output.write(found, folder, logs=look, overwrite=overwrite):
                 logger.warning("%s", remark)
-    if write_json(diagnosis_output.plain(found), json_to):
+    if write_json(found.report, json_to):
         return
     say(conclusion(found))
     if found.findings:

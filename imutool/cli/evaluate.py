@@ -9,9 +9,15 @@ from typing import Annotated, Any
 
 import typer
 
-from imutool.cli.app import Imu, Init, Json, Logs, Models, Overwrite, Quiet, Report, Smooth, Truth, Verbose, app
-from imutool.cli.figures import figures
-from imutool.cli.terminal import progress, say, write_json
+from imutool.cli.app import Imu, Init, Json, Logs, Models, Overwrite, Quiet, ReportPage, Smooth, Truth, Verbose, app
+from imutool.cli.terminal import figures, progress, say, write_json
+from imutool.report import Report
+
+
+class Evaluation(Report, frozen=True, tag="imutool.evaluation/1"):
+    """The report of `imutool evaluate`: scores of each log, model and estimate."""
+
+    results: list[dict[str, Any]]
 
 
 @app.command(epilog="Example: [bold]imutool evaluate MH_04.mcap --model adis.safetensors --init truth[/]")
@@ -24,20 +30,19 @@ def evaluate(
     truth: Truth = None,
     imu: Imu = None,
     trajectories: Annotated[Path | None, typer.Option(metavar="DIR", help="Write TUM-format trajectories there.")] = None,
-    report: Report = None,
+    report: ReportPage = None,
     overwrite: Overwrite = False,
     json_to: Json = None,
     verbose: Verbose = False,
     quiet: Quiet = False,
 ) -> None:
     """Integrate the IMU alone from the true start, raw and with each model, and score it against the truth."""
-    from imutool.evaluation import SCHEMA
     from imutool.evaluation import evaluate as run
     from imutool.viewing.html import report as pages
     from imutool.viewing.model.runs import load
 
     if report is not None:
-        pages.refuse(report, overwrite=overwrite)
+        pages.check_target(report, overwrite=overwrite)
     results: list[dict[str, Any]] = []
     logs_seen = []
     with progress("Evaluating", verbose, quiet) as tell:
@@ -62,7 +67,7 @@ def evaluate(
             tell(len(logs), len(logs), "drawing")
             pages.write_page(logs_seen, report, overwrite=overwrite)
         tell(len(logs), len(logs), "")
-    if not write_json({"schema": SCHEMA, "results": results}, json_to):
+    if not write_json(Evaluation(results), json_to):
         figures([{**one, "model": f"{one['model']} zupt"} if one["estimate"] == "zupt" else one for one in results])
         if report is not None:
             say(f"Report: {report}")

@@ -11,6 +11,7 @@ import typer
 
 from imutool.cli.app import App, Imu, Init, Json, Overwrite, Quiet, Smooth, Truth, Verbose, app
 from imutool.cli.debias import VERIFY_HELP
+from imutool.cli.parameters import with_flags
 from imutool.cli.terminal import out, plain, progress, say, write_json
 from imutool.errors import ConfigError
 from imutool.fleet.task import Settings
@@ -83,17 +84,18 @@ def debias(
     pages: Annotated[bool, typer.Option("--pages", help=PAGES_HELP)] = False,
 ) -> Settings:
     """Debias every log, as `imutool debias --clean` does."""
-    from imutool.bias_start.model_choice import refuse_smooth
-    from imutool.fleet.models import settled
-    from imutool.mcap_io.verify import refuse_unknown
+    from imutool.bias_start.model_choice import check_smooth
+    from imutool.fleet.task import with_model_hash
+    from imutool.mcap_io.verify import check_mode
 
-    refuse_smooth(init, smooth)
-    refuse_unknown(verify)
+    check_smooth(init, smooth)
+    check_mode(verify)
     if pages:
-        from imutool.viewing.html.drawing import library
+        from imutool.viewing.html.drawing import require_matplotlib
 
-        library()
-    return settled(Settings(command="debias", model=model, init=init, smooth=smooth, clean=clean, check=verify, pages=pages))
+        require_matplotlib()
+    settings = Settings(command="debias", model=model, init=init, smooth=smooth, clean=clean, check=verify, pages=pages)
+    return with_model_hash(settings)
 
 
 @_command("repair logs/ repaired/ --report repaired.html")
@@ -102,7 +104,7 @@ def repair(
 ) -> Settings:
     """Save of every log and ROS 1 bag what can be saved, as `imutool repair` does; a whole one is copied."""
     if damaged not in {"drop", "keep"}:
-        raise ConfigError(f"{damaged!r} is nothing to do with damage", where="--damaged", expected="drop or keep")
+        raise ConfigError(f"{damaged!r} is nothing to do with damage", where="damaged", expected="drop or keep")
     return Settings(command="repair", damaged=damaged)
 
 
@@ -130,7 +132,7 @@ def diagnose(
     """One kind of sensor on many robots: what all share, and which robot is unlike the others."""
     from pathlib import Path
 
-    from imutool.fleet.work import robot_pattern
+    from imutool.fleet.robots import robot_pattern
     from imutool.location import to_location
 
     robot_pattern(robot_from)
@@ -182,24 +184,24 @@ def _run(
             page=page,
             tell=tell,
         )
-    if not write_json(done.plain(), json_to):
+    if not write_json(done.summary(), json_to):
         _show(done, report)
-    raise typer.Exit(done.tally.exit_code)
+    raise typer.Exit(done.progress.exit_code)
 
 
 def _show(done: FleetReport, report: str | None) -> None:
-    for one in done.trouble[:SHOWN]:
-        why = one.error or "; ".join(one.losses) or "; ".join(one.warnings)
-        line = f"[yellow]{one.earlier or one.status}:[/] {plain(why if one.source in why else f'{one.source}: {why}')}"
-        out.print(line, highlight=False, soft_wrap=True)
-    if len(done.trouble) > SHOWN:
+    for result in done.not_whole[:SHOWN]:
+        why = result.error or "; ".join(result.losses) or "; ".join(result.warnings)
+        why = plain(with_flags(why if result.source in why else f"{result.source}: {why}"))
+        out.print(f"[yellow]{result.earlier or result.status}:[/] {why}", highlight=False, soft_wrap=True)
+    if len(done.not_whole) > SHOWN:
         say("and more")
-    if done.compared is not None:
-        say(done.compared.summary)
-        for outlier in done.compared.outliers:
+    if done.comparison is not None:
+        say(done.comparison.summary)
+        for outlier in done.comparison.outliers:
             say(outlier.sentence)
     made = [str(done.out / "fleet.parquet"), *([report] if report else [])]
-    say(f"{done.tally.words()}; {', '.join(made)}")
+    say(f"{done.progress.line()}; {', '.join(made)}")
 
 
 def memory_bytes(text: str) -> int:
@@ -210,5 +212,5 @@ def memory_bytes(text: str) -> int:
     """
     match = re.fullmatch(r"(\d+(?:\.\d+)?)\s*([KMGT]?)(?:i?B)?", text.strip(), re.IGNORECASE)
     if match is None:
-        raise ConfigError(f"{text!r} is no size", where="--memory-per-task", expected="bytes, or a number with K, M, G or T")
+        raise ConfigError(f"{text!r} is no size", where="memory_bytes", expected="bytes, or a number with K, M, G or T")
     return int(float(match[1]) * UNITS[match[2].upper()])

@@ -6,14 +6,17 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, NoReturn
 
 import typer
+from msgspec.structs import replace
 
 from imutool.cli.app import LOST, Json, Overwrite, Quiet, Verbose, app
 from imutool.cli.terminal import log_to_stderr, out, plain, say, table, tell_losses, write_json
 from imutool.errors import ConfigError
 from imutool.location import to_location
+from imutool.report import json_values
 
 if TYPE_CHECKING:
-    from imutool.noise_identification import Identified
+    from imutool.log_report import LogInfo
+    from imutool.noise_identification import IdentifiedNoise
 
 
 @app.command(epilog="Example: [bold]imutool info MH_04.mcap[/] or [bold]imutool info still.mcap --noise --noise-toml i.toml[/]")
@@ -34,7 +37,8 @@ def info(
     quiet: Quiet = False,
 ) -> None:
     """Say what is in a log and what looks wrong with it; with --noise, how noisy its IMU is."""
-    from imutool.log_info import imu_rows, inspect, topic_rows
+    from imutool.log_info import inspect
+    from imutool.log_report import LogInfos
 
     log_to_stderr(verbose, quiet)
     asked = {"--model": model, "--imu": imu, "--truth": truth, "--noise-plot": noise_plot, "--noise-toml": noise_toml}
@@ -44,16 +48,16 @@ def info(
         raise ConfigError(f"{len(logs)} logs do not fit one file", where="--noise-plot, --noise-toml", expected="one log")
     places = [to_location(log) for log in logs]
     reports = [inspect(log, check=not quick) for log in places]
-    lost = any(report["losses"]["stretches"] for report in reports)
+    lost = any(report.losses["stretches"] for report in reports)
     found = []
     if noise:
         from imutool import noise_identification
 
         found = [noise_identification.identify(log, imu=imu, truth=truth, model=model) for log in places]
-        for report, one in zip(reports, found, strict=True):
-            report["noise"] = noise_identification.plain(one)
+        noises = [noise_identification.plain(identified) for identified in found]
+        reports = [replace(report, noise=noise) for report, noise in zip(reports, noises, strict=True)]
         _write_noise(found[0], noise_plot, noise_toml, overwrite)
-    if write_json(reports[0] if len(reports) == 1 else {"schema": "imutool.infos/1", "logs": reports}, json_to):
+    if write_json(reports[0] if len(reports) == 1 else LogInfos(reports), json_to):
         _leave(lost)
     for number, (log, report) in enumerate(zip(logs, reports, strict=True)):
         say(log)
@@ -63,9 +67,9 @@ def info(
             table(noise_identification.rows(found[number]), keys=1)
             for remark in found[number].remarks:
                 out.print(f"[cyan]noise:[/] {plain(remark)}", highlight=False, soft_wrap=True)
-        for warning in report["warnings"]:
+        for warning in report.warnings:
             out.print(f"[yellow]warning:[/] {plain(warning)}", highlight=False, soft_wrap=True)
-        tell_losses(report["losses"])
+        tell_losses(report.losses)
     _leave(lost)
 
 
@@ -73,13 +77,58 @@ def _leave(lost: bool) -> NoReturn:
     raise typer.Exit(LOST if lost else 0)
 
 
-def _write_noise(found: Identified, plot: Path | None, toml: Path | None, overwrite: bool) -> None:
+def _write_noise(found: IdentifiedNoise, plot: Path | None, toml: Path | None, overwrite: bool) -> None:
     """The files that were asked for."""
     if plot is not None:
-        from imutool.viewing.html.allan_plot import deviations
+        from imutool.viewing.html.allan_plot import write_png
 
-        deviations(found, plot, overwrite=overwrite)
+        write_png(found, plot, overwrite=overwrite)
     if toml is not None:
         from imutool.noise.datasheet import write
 
         write(found.noise, toml, overwrite=overwrite)
+
+
+def topic_rows(report: LogInfo) -> list[tuple[str, ...]]:
+    """Rows of the table of topics, the header first."""
+    header = ("topic", "type", "count", "rate Hz", "jitter ms", "largest gap s", "first s", "last s")
+    rows = [
+        (
+            topic.name,
+            topic.type,
+            str(topic.count),
+            _number(topic.rate_hz, ".2f"),
+            _number(topic.jitter_s, ".3f", 1e3),
+            _number(topic.largest_gap_s, ".3f"),
+            _number(topic.first_ns, ".3f", 1e-9),
+            _number(topic.last_ns, ".3f", 1e-9),
+        )
+        for topic in report.topics
+    ]
+    return [header, *rows]
+
+
+def imu_rows(report: LogInfo) -> list[tuple[str, ...]]:
+    """Rows of the table of properties of each IMU and truth, the header first."""
+    rows: list[tuple[str, ...]] = [("topic", "property", "value")]
+    for imu in map(json_values, report.imu):
+        if "samples" not in imu:
+            continue
+        counts = ("out_of_order", "duplicated", "missing", "not_finite", "saturated")
+        rows.append((imu["topic"], "samples", str(imu["samples"])))
+        rows += [(imu["topic"], name.replace("_", " "), str(imu[name])) for name in counts]
+        rows.append((imu["topic"], "at rest", f"{imu['stationary_s']:.1f} s in {len(imu['stationary'])} stretches"))
+        rows.append((imu["topic"], "accel at rest", _number(imu["accel_at_rest_m_s2"], ".3f") + " m/s²"))
+        for name, unit in (("gyro", "rad/s"), ("accel", "m/s²")):
+            noise = imu["noise"]
+            if noise is not None:
+                density = noise[f"{name}_density"]
+                rows.append((imu["topic"], f"{name} noise", ", ".join(f"{d:.2e}" for d in density) + f" {unit}/√Hz"))
+    for truth in report.truth:
+        value = f"{100 * truth.coverage:.1f} % of the IMU, {truth.gaps} gaps, longest {truth.longest_gap_s:.2f} s"
+        rows.append((truth.topic, "covers", value))
+    return rows
+
+
+def _number(value: float | int | None, form: str, scale: float = 1.0) -> str:
+    return "–" if value is None else format(value * scale, form)

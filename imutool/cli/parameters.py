@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
+from contextvars import ContextVar
 from typing import Any
 
 from imutool.errors import ImutoolError
@@ -29,6 +30,7 @@ ALIASES = {
     "settings": ("config",),
     "signals": ("signal",),
 }
+current: ContextVar[Mapping[str, str]] = ContextVar("flags of the command that runs", default={})  # noqa: B039  never changed
 QUOTED = re.compile(r"`([a-z_]+)(?:=([^`]*))?`")
 PLACE = re.compile(r"([a-z_]+)(?:=(\S*))?")
 
@@ -50,8 +52,9 @@ def _flag(parameter: Any) -> str:
     return str(max(parameter.opts, key=len))
 
 
-def with_flags(text: str, known: Mapping[str, str]) -> str:
-    """The text with each backquoted parameter as its flag; what the command does not know stays as it is."""
+def with_flags(text: str, known: Mapping[str, str] | None = None) -> str:
+    """The text with each backquoted parameter as its flag, by default of the command that runs; other words stay."""
+    known = current.get() if known is None else known
     return QUOTED.sub(lambda match: _shown(match[1], match[2], known) or match[0], text)
 
 

@@ -11,6 +11,7 @@ from imutool.cli.app import LOST, Json, Overwrite, Quiet, Verbose, app
 from imutool.cli.terminal import progress, say, tell_losses, write_json
 from imutool.errors import ConfigError
 from imutool.location import to_location
+from imutool.report import UNSET, Report, UnsetType
 
 
 class Damaged(StrEnum):
@@ -18,6 +19,17 @@ class Damaged(StrEnum):
 
     drop = "drop"
     keep = "keep"
+
+
+class Repair(Report, frozen=True, kw_only=True, tag="imutool.repair/1"):
+    """The report of `imutool repair`; `kept` counts the damaged stretches kept as attachments (MCAP)."""
+
+    output: str
+    whole: bool
+    messages: dict[str, int]
+    chunks: int
+    kept: int | UnsetType = UNSET
+    losses: dict[str, Any]
 
 
 @app.command(
@@ -42,24 +54,25 @@ def repair(
     with progress("Repairing", verbose, quiet) as tell:
         if is_bag(here):
             if damaged is Damaged.keep:
-                raise ConfigError(NO_ATTACHMENTS, where="--damaged keep", fix="Leave --damaged out")
+                raise ConfigError(NO_ATTACHMENTS, where="damaged=keep", fix="Leave `damaged` out")
             bag = repair_bag(here, there, overwrite=overwrite, progress=lambda done, total: tell(done, total, ""))
-            result: dict[str, Any] = {
-                "whole": bag.whole,
-                "messages": dict(bag.messages),
-                "chunks": bag.chunks,
-                "losses": bag.plain(),
-            }
+            report = Repair(output=target, whole=bag.whole, messages=dict(bag.messages), chunks=bag.chunks, losses=bag.plain())
         else:
             log = repair_log(
                 here, there, damaged=damaged.value, overwrite=overwrite, progress=lambda done, total: tell(done, total, "")
             )
-            result = {"whole": log.whole, "messages": dict(log.messages), "chunks": log.chunks, "kept": log.kept}
-            result["losses"] = log.losses.plain()
-    if not write_json({"schema": "imutool.repair/1", "output": target, **result}, json_to):
-        tell_losses(result["losses"])
-        counts = ", ".join(f"{count} on {topic}" for topic, count in result["messages"].items()) or "no message"
-        state = "the log was whole" if result["whole"] else "saved"
+            report = Repair(
+                output=target,
+                whole=log.whole,
+                messages=dict(log.messages),
+                chunks=log.chunks,
+                kept=log.kept,
+                losses=log.losses.plain(),
+            )
+    if not write_json(report, json_to):
+        tell_losses(report.losses)
+        counts = ", ".join(f"{count} on {topic}" for topic, count in report.messages.items()) or "no message"
+        state = "the log was whole" if report.whole else "saved"
         say(f"{target}: {state}, {counts}")
-    if result["losses"]["stretches"]:
+    if report.losses["stretches"]:
         raise typer.Exit(LOST)

@@ -3,12 +3,43 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
 from imutool.cli.app import Json, Overwrite, Quiet, Truth, Verbose, app
 from imutool.cli.terminal import logger, progress, say, write_json
+from imutool.report import Report, Section
+
+
+class MotionQuality(Section, frozen=True):
+    """Noise of the poses and of the motion smoothed from them, by stretch; glitches dropped and steps levelled."""
+
+    pose_noise_m: list[float]
+    pose_noise_rad: list[float]
+    cutoff_hz: list[list[float]]
+    gyro_std_rad_s: float
+    accel_std_m_s2: float
+    glitches: int
+    steps: int
+
+
+class SimulationReport(Report, frozen=True, kw_only=True, tag="imutool.simulation/1"):
+    """The report of `imutool simulate`."""
+
+    command: str
+    trajectory: str
+    truth: str
+    physics: dict[str, Any]
+    noise: dict[str, Any]
+    rate_hz: float
+    seed: int
+    output: str
+    samples: int
+    duration_s: float
+    stretches_s: list[list[float]]
+    motion: MotionQuality
+    remarks: list[str]
 
 
 @app.command(epilog="Example: [bold]imutool simulate V1_02.mcap sim.mcap --physics physics.toml --noise adis16448 --seed 1[/]")
@@ -46,17 +77,17 @@ def simulate(
         )
         for remark in found.remarks:
             logger.warning("%s", remark)
-    report = found.plain()
+    values = {key: value for key, value in found.plain().items() if key != "schema"}
+    report = SimulationReport(**values | {"motion": MotionQuality(**values["motion"])})
     if write_json(report, json_to):
         return
-    physics_told = report["physics"]
-    acting = [effect["name"] for effect in physics_told["effect"]]
-    acting += [f"a curve of {curve['variable']}" for curve in physics_told["unknown"]]
-    acting += [term["term"] for term in physics_told["term"]] + ["bias"] * (physics_told["bias"] is not None)
+    acting = [effect["name"] for effect in report.physics["effect"]]
+    acting += [f"a curve of {curve['variable']}" for curve in report.physics["unknown"]]
+    acting += [term["term"] for term in report.physics["term"]] + ["bias"] * (report.physics["bias"] is not None)
     names = ", ".join(acting) or "ideal"
     pieces = len(found.motion.stretches)
-    where = f"{report['duration_s']:.1f} s" + (f" in {pieces} stretches" if pieces > 1 else "")
-    say(f"{target}: {report['samples']} samples at {report['rate_hz']:g} Hz over {where}; physics {names}; noise {noise}")
-    motion = report["motion"]
-    sure = f"{motion['gyro_std_rad_s']:.2g} rad/s and {motion['accel_std_m_s2']:.2g} m/s²"
-    say(f"the poses say what is felt to {sure}; {motion['glitches']} glitches dropped, {motion['steps']} steps levelled")
+    where = f"{report.duration_s:.1f} s" + (f" in {pieces} stretches" if pieces > 1 else "")
+    say(f"{target}: {report.samples} samples at {report.rate_hz:g} Hz over {where}; physics {names}; noise {noise}")
+    motion = report.motion
+    std = f"{motion.gyro_std_rad_s:.2g} rad/s and {motion.accel_std_m_s2:.2g} m/s²"
+    say(f"uncertainty of the motion {std}; {motion.glitches} glitches dropped, {motion.steps} steps levelled")

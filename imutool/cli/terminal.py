@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import json
 import logging
+import math
 import os
 import re
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import msgspec
 from rich import box
@@ -18,9 +19,13 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn
 from rich.table import Table
 
+from imutool.cli.parameters import with_flags
 from imutool.errors import ConfigError
-from imutool.mcap_io.losses import told
+from imutool.mcap_io.recovery.losses import describe
 from imutool.report import json_values
+
+if TYPE_CHECKING:
+    from imutool.training.fit import Epoch
 
 NUMBER = re.compile(r"[-+]?[0-9.]+|[–?]")
 
@@ -54,8 +59,8 @@ def tell_error(message: str) -> None:
 
 
 def tell_losses(losses: Mapping[str, Any]) -> None:
-    """What is wrong with a log (`mcap_io.losses.Losses.plain`), one line a stretch."""
-    for line in told(losses):
+    """What is wrong with a log (`mcap_io.recovery.losses.Losses.plain`), one line a stretch."""
+    for line in describe(losses):
         kind, _, rest = line.partition(": ")
         out.print(f"[yellow]{kind}:[/] {plain(rest)}", highlight=False, soft_wrap=True)
 
@@ -127,7 +132,7 @@ class _Lines(logging.Handler):
     """Log records as lines on stderr, above the progress bar where there is one."""
 
     def emit(self, record: logging.LogRecord) -> None:
-        err.print(plain(f"{record.levelname.lower()}: {record.getMessage()}"), highlight=False, soft_wrap=True)
+        err.print(plain(with_flags(f"{record.levelname.lower()}: {record.getMessage()}")), highlight=False, soft_wrap=True)
 
 
 def log_to_stderr(verbose: bool, quiet: bool) -> None:
@@ -150,3 +155,34 @@ def progress(what: str, verbose: bool, quiet: bool) -> Iterator[Callable[[int, i
                 logger.info("%s %s", what, word)
 
         yield tell
+
+
+def epoch_line(epoch: Epoch) -> tuple[int, int, str]:
+    """A line of training as progress: steps done, steps in all, the figures in words."""
+    if epoch.note:
+        return 0, 1, epoch.note
+    scale, unit = (180.0 / math.pi, "°") if epoch.sensor == "gyro" else (1.0, " m/s")
+    held_out, before = epoch.held_out * scale, epoch.before * scale
+    minutes, seconds = divmod(round(epoch.left_s), 60)
+    loss = "" if math.isnan(epoch.loss) else f"loss {epoch.loss:.3f}, "  # before the first step there is none
+    text = f"{epoch.sensor} {epoch.step}/{epoch.steps}: {loss}held out {held_out:.3f}{unit} (closed form {before:.3f})"
+    return epoch.step, max(epoch.steps, 1), f"{text}, {minutes}:{seconds:02d} left" if epoch.step else text
+
+
+def figures(results: Sequence[dict[str, Any]]) -> None:
+    """Evaluation results as two tables: over the whole path, and per metres flown."""
+
+    def number(value: float | None) -> str:
+        return "–" if value is None else format(value, ".2f")
+
+    distances = list(results[0]["roe_deg"])
+    names = ("aoe_deg", "aoe_aligned_deg", "ape_m", "ape_aligned_m", "velocity_rmse_m_s")
+    whole = [("log", "model", "AOE\n°", "aligned\n°", "APE\nm", "aligned\nm", "velocity\nm/s")]
+    roe = [("log", "model", *(f"ROE °\n{d} m" for d in distances))]
+    rpe = [("log", "model", *(f"RPE m\n{d} m" for d in distances))]
+    for one in results:
+        whole.append((one["log"], one["model"], *(number(one[name]) for name in names)))
+        roe.append((one["log"], one["model"], *(number(one["roe_deg"][d]) for d in distances)))
+        rpe.append((one["log"], one["model"], *(number(one["rpe_m"][d]) for d in distances)))
+    for rows in (whole, roe, rpe):
+        table(rows, keys=2)

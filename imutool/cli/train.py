@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
 from imutool import registry
 from imutool.cli.app import Imu, Json, Logs, Overwrite, Quiet, Truth, Verbose, app, listing
-from imutool.cli.figures import epoch_line
-from imutool.cli.terminal import progress, say, write_json
+from imutool.cli.terminal import epoch_line, progress, say, write_json
 from imutool.errors import ConfigError
+from imutool.report import UNSET, Report, Section, UnsetType
 
 
 @app.command(
@@ -67,8 +68,40 @@ def train(
             overwrite=overwrite,
             progress=lambda epoch: tell(*epoch_line(epoch)),
         )
-    if not write_json({"schema": "imutool.training/1", "model": str(model), **trained.card}, json_to):
+    if not write_json(training_report(model, trained.card), json_to):
         say(str(model))
+
+
+class TrainingLog(Section, frozen=True):
+    """A log that a model was trained on."""
+
+    name: str
+    file: str
+    sha256: str
+
+
+class TrainingReport(Report, frozen=True, kw_only=True, tag="imutool.training/1"):
+    """The report of `imutool train`: the new model's card; `compared` and `physics` for a hybrid model."""
+
+    model: str
+    imutool: str
+    torch: str
+    method: str
+    training: dict[str, Any]
+    logs: list[TrainingLog]
+    held_out: dict[str, Any]
+    compared: dict[str, Any] | UnsetType = UNSET
+    physics: dict[str, Any] | UnsetType = UNSET
+    sensor: str | None
+    dataset: str | None
+    name: str | UnsetType = UNSET
+    sha256: str | UnsetType = UNSET
+
+
+def training_report(model: Path, card: Mapping[str, Any]) -> TrainingReport:
+    """Report of a training from the card of its model."""
+    logs = [TrainingLog(**log) for log in card["logs"]]
+    return TrainingReport(**{"model": str(model), **card, "logs": logs})
 
 
 def _named_by(physics: Path, method: str) -> tuple[list[str], tuple[str, ...]]:

@@ -12,6 +12,7 @@ import typer
 from imutool.cli.app import Imu, Init, Json, Logs, Models, Overwrite, Quiet, Smooth, Truth, Verbose, app
 from imutool.cli.terminal import progress, say, write_json
 from imutool.errors import ConfigError
+from imutool.report import Report
 
 if TYPE_CHECKING:
     from imutool.viewing.model.trajectory_error import Alignment
@@ -19,6 +20,16 @@ if TYPE_CHECKING:
 AT_HELP = "Where the cursor starts: seconds, or worst, the largest orientation error of a model."
 ALIGN_HELP = "Move each path onto the truth before its errors are taken: by its start, its heading, or as a whole."
 SOURCE_HELP = "Also show what else the log holds, cameras for instance."
+
+
+class View(Report, frozen=True, tag="imutool.view/1"):
+    """The report of `imutool view`, with the versions of imutool, of the Rerun installed, and of the viewer."""
+
+    logs: list[str]
+    shown: list[dict[str, str]]
+    imutool: str | None
+    rerun: str | None
+    viewer: str | None
 
 
 @app.command(epilog="Example: [bold]imutool view MH_04_debiased.mcap --save MH_04.rrd[/]")
@@ -55,26 +66,26 @@ def view(
     saved.
     """
     from imutool.viewing.model.runs import load
-    from imutool.viewing.outputs import Asked, Outputs
+    from imutool.viewing.outputs import Outputs, RequestedOutputs
 
     aligned = _alignment(align)
     read = partial(load, models=model or (), init=init, smooth=smooth, imu=imu, truth=truth, align=aligned, findings=findings)
-    asked = Asked(save, connect, web, port, export_web, png, html, at, source, overwrite)
-    with Outputs(asked) as ways:
+    asked = RequestedOutputs(save, connect, web, port, export_web, png, html, at, source, overwrite)
+    with Outputs(asked) as outputs:
         with progress("Reading", verbose, quiet) as tell:
             data = []
             for done, log in enumerate(logs):
                 tell(done, len(logs), log.name)
                 data.append(read(log))
-        shown = ways.show(data)
-        result = {"schema": "imutool.view/1", "logs": [str(log) for log in logs], "shown": [one.plain() for one in shown]}
-        if not write_json(result | ways.versions(), json_to):
-            for one in shown:
-                say(one.said)
+        shown = outputs.show(data)
+        report = View([str(log) for log in logs], [output.plain() for output in shown], **outputs.versions())
+        if not write_json(report, json_to):
+            for output in shown:
+                say(output.said)
         sys.stdout.flush()  # whoever reads it through a pipe wants the address now
-        if ways.refused is not None:
-            raise ways.refused
-        ways.serve()
+        if outputs.refused is not None:
+            raise outputs.refused
+        outputs.serve()
 
 
 def _alignment(word: str) -> Alignment:

@@ -2,12 +2,19 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
 from imutool.cli.app import Imu, Init, Json, Logs, Models, Quiet, Truth, Verbose, app
 from imutool.cli.terminal import progress, say, table, write_json
+from imutool.report import Report
+
+
+class VioReport(Report, frozen=True, tag="imutool.vio/1"):
+    """The report of `imutool vio`: scores of each log, model and choice of bias states."""
+
+    results: list[dict[str, Any]]
 
 
 @app.command(epilog="Example: [bold]imutool vio MH_04.mcap --model adis.safetensors --blackout 3[/]")
@@ -39,7 +46,7 @@ def vio(
     The camera is simulated: EuRoC's stereo pair along the log's true poses, on every data set.
     """
     from imutool.config import load
-    from imutool.vio.run import SCHEMA, VioSettings, tabulate
+    from imutool.vio.run import VioSettings, tabulate
     from imutool.vio.run import vio as run
 
     given = {"smoother.lag_s": lag, "keyframes_hz": keyframes, "features": features, "pixel_noise": pixel_noise}
@@ -52,7 +59,7 @@ def vio(
             results += run(
                 log, models=model or (), init=init, truth=truth, imu=imu, bias_states=states, settings=settings, progress=tell
             )
-    if write_json({"schema": SCHEMA, "results": results}, json_to):
+    if write_json(VioReport(results), json_to):
         return
     for rows in tabulate(results):
         table(rows, keys=3)

@@ -10,8 +10,8 @@ from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 
-from imutool.diagnosis.quantity import grouped
 from imutool.diagnosis.result import Curve, Estimate, Finding
+from imutool.diagnosis.wording.quantity import grouped
 
 ALIKE_STD = 3.0  # parameters this many joint standard deviations apart are two values,
 ALIKE_SHARE = 0.03  # unless they are within this of the largest: smoothed poses lack a per cent of either motion
@@ -68,14 +68,16 @@ def _same_numbers(here: Mapping[str, Estimate], there: Mapping[str, Estimate]) -
 
 def _same_curve(here: Curve, there: Curve) -> bool:
     """Where the variable reaches on both sides, about the mean there."""
-    inside = (here.x >= there.x[0]) & (here.x <= there.x[-1])
+    x = np.array(here.x)
+    inside = (x >= there.x[0]) & (x <= there.x[-1])
     if not inside.any():
         return False
     y, band = (
-        np.stack([np.interp(here.x[inside], there.x, column) for column in part.T], axis=1) for part in (there.y, there.band)
+        np.stack([np.interp(x[inside], there.x, column) for column in np.array(part).T], axis=1)
+        for part in (there.y, there.band)
     )
-    off = here.y[inside] - y
-    return bool((np.abs(off - off.mean(axis=0)) <= ALIKE_STD * np.hypot(here.band[inside], band)).all())
+    off = np.array(here.y)[inside] - y
+    return bool((np.abs(off - off.mean(axis=0)) <= ALIKE_STD * np.hypot(np.array(here.band)[inside], band)).all())
 
 
 def _words(one: Finding) -> str:

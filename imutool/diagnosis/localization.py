@@ -1,24 +1,38 @@
-"""Where the misfit of a diagnosis lies: in the stretches of each log, by what was found or by what is left."""
+"""Localization of a misfit: axes of a signal, intervals of time, and the regime of the motion.
+
+The misfit that the findings explain is known almost without noise, so the location is read from it: a second counts when the
+misfit in it would stand out of the noise by itself. The regime is the variable, with a threshold, that best separates the
+seconds with misfit from those without (Youden's index), if it does so better than chance (Mann and Whitney's test, times the
+variables tried).
+"""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 
+import msgspec
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Bool, Float64
 from scipy.ndimage import uniform_filter1d
+from scipy.stats import chi2, mannwhitneyu
 
-from imutool.diagnosis.estimation.alignment import Pair
-from imutool.diagnosis.locate import located
+from imutool.diagnosis.estimation.aligned_log import Pair
 from imutool.diagnosis.result import Finding, Located
+from imutool.units import AXES, SENSORS
 
-SLOW = 9  # samples of a running mean
+WINDOW_S = 1.0
+CLEAR = 12.0  # squares of misfit over noise by which a second, or an axis, stands out of it
+AXIS_SHARE = 0.02  # of the strongest axis' squares, below which an axis is not named
+JOIN_S = 1.5  # intervals closer than this are joined
+LEAST_YOUDEN = 0.35  # Youden's index from which a regime is named
+CHANCE = 1e-3
+MEAN_SAMPLES = 9  # of a running mean
 
 Samples = Float64[np.ndarray, "_ 6"]
+Variables = Mapping[str, tuple[str, Float64[np.ndarray, " n"]]]
 
 
-def of_findings(
+def locate_findings(
     pairs: Sequence[Pair],
     before: Sequence[Samples],
     after: Sequence[Samples],
@@ -26,46 +40,47 @@ def of_findings(
     findings: Sequence[Finding],
     p_values: Mapping[str, float],
 ) -> list[Located]:
-    """Where the findings change what is expected: `after` against `before` of each pair, with the findings of converters."""
-    return _places(pairs, [_converted(a, findings) - b for a, b in zip(after, before, strict=True)], floor, p_values)
+    """Locations where the findings change the expected samples: `after` minus `before` of each pair."""
+    misfits = [_converter_output(a, findings) - b for a, b in zip(after, before, strict=True)]
+    return _locate_logs(pairs, misfits, floor, p_values)
 
 
-def of_what_is_left(pairs: Sequence[Pair], after: Sequence[Samples], floor: Float64[np.ndarray, "6"]) -> list[Located]:
-    """Where something is left that nothing explains: running means that stand out of the noise."""
-    left = [_slow(pair.real - a) for pair, a in zip(pairs, after, strict=True)]
-    return _places(pairs, left, floor / np.sqrt(SLOW), {})
+def locate_residual(pairs: Sequence[Pair], after: Sequence[Samples], floor: Float64[np.ndarray, "6"]) -> list[Located]:
+    """Locations of an unexplained residual: running means that stand out of the noise."""
+    means = [np.asarray(uniform_filter1d(pair.real - a, MEAN_SAMPLES, axis=0)) for pair, a in zip(pairs, after, strict=True)]
+    return _locate_logs(pairs, means, floor / np.sqrt(MEAN_SAMPLES), {})
 
 
-def _places(
+def _locate_logs(
     pairs: Sequence[Pair], misfits: Sequence[Samples], floor: Float64[np.ndarray, "6"], p_values: Mapping[str, float]
 ) -> list[Located]:
     """Strongest first, log by log: `log` is the pair's name where there are several."""
     logs = list(dict.fromkeys(pair.name for pair in pairs))
     out = []
     for log in logs:
-        stretches = [(pair, misfit) for pair, misfit in zip(pairs, misfits, strict=True) if pair.name == log]
-        places = _of_one(stretches, floor, p_values)
-        out += [replace(one, log=log) if len(logs) > 1 else one for one in places]
-    return sorted(out, key=lambda one: one.p_value)
+        segments = [(pair, misfit) for pair, misfit in zip(pairs, misfits, strict=True) if pair.name == log]
+        located = _locate_log(segments, floor, p_values)
+        out += [msgspec.structs.replace(place, log=log) if len(logs) > 1 else place for place in located]
+    return sorted(out, key=lambda place: place.p_value)
 
 
-def _of_one(
-    stretches: Sequence[tuple[Pair, Samples]], floor: Float64[np.ndarray, "6"], p_values: Mapping[str, float]
+def _locate_log(
+    segments: Sequence[tuple[Pair, Samples]], floor: Float64[np.ndarray, "6"], p_values: Mapping[str, float]
 ) -> list[Located]:
-    """Stretches of one log share its clock; the constant of each is its own."""
-    t_s = np.concatenate([pair.stamp_s for pair, _ in stretches])
-    misfit = np.concatenate([misfit - np.median(misfit, axis=0) for _, misfit in stretches])
-    each = [_variables(pair) for pair, _ in stretches]
-    variables = {name: (unit, np.concatenate([one[name][1] for one in each])) for name, (unit, _) in each[0].items()}
-    return located(t_s, misfit, floor, variables, p_values)
+    """Segments of one log share its clock; each has its own constant."""
+    t_s = np.concatenate([pair.stamp_s for pair, _ in segments])
+    misfit = np.concatenate([misfit - np.median(misfit, axis=0) for _, misfit in segments])
+    each = [_variables(pair) for pair, _ in segments]
+    variables = {name: (unit, np.concatenate([own[name][1] for own in each])) for name, (unit, _) in each[0].items()}
+    return locate(t_s, misfit, floor, variables, p_values)
 
 
-def _converted(there: Float64[np.ndarray, "n 6"], findings: Sequence[Finding]) -> Float64[np.ndarray, "n 6"]:
-    """As a converter gives it whose limits and steps were found."""
-    out = there.copy()
-    told = {name: estimate.value for one in findings for name, estimate in one.parameters.items()}
-    for k, signal in enumerate(("gyro", "accel")):
-        part, limit, lsb = slice(3 * k, 3 * k + 3), told.get(f"{signal}_limit"), told.get(f"{signal}_lsb")
+def _converter_output(samples: Float64[np.ndarray, "n 6"], findings: Sequence[Finding]) -> Float64[np.ndarray, "n 6"]:
+    """Clipped and rounded as the findings say."""
+    out = samples.copy()
+    values = {name: estimate.value for finding in findings for name, estimate in finding.parameters.items()}
+    for k, sensor in enumerate(SENSORS):
+        part, limit, lsb = slice(3 * k, 3 * k + 3), values.get(f"{sensor}_limit"), values.get(f"{sensor}_lsb")
         if limit is not None and np.isfinite(limit):
             out[:, part] = np.clip(out[:, part], -limit, limit)
         if lsb is not None:
@@ -73,14 +88,9 @@ def _converted(there: Float64[np.ndarray, "n 6"], findings: Sequence[Finding]) -
     return out
 
 
-def _slow(left: Float64[np.ndarray, "n 6"]) -> Float64[np.ndarray, "n 6"]:
-    """A running mean: what is left without most of its noise."""
-    return np.asarray(uniform_filter1d(left, SLOW, axis=0))
-
-
-def _variables(pair: Pair) -> dict[str, tuple[str, Float64[np.ndarray, " n"]]]:
-    """What a regime can be of."""
-    read = pair.felt.taken(pair.stamp_s, pair.stamp_s)
+def _variables(pair: Pair) -> Variables:
+    """Variables of a regime at the samples, with their units."""
+    read = pair.felt.sample(pair.stamp_s, pair.stamp_s)
     rate, force = np.linalg.norm(read.gyro, axis=1), np.linalg.norm(read.accel, axis=1)
     out = {
         "angular rate": ("rad/s", rate),
@@ -90,7 +100,89 @@ def _variables(pair: Pair) -> dict[str, tuple[str, Float64[np.ndarray, " n"]]]:
     }
     if read.R_wb is not None:
         out["tilt"] = ("rad", np.arccos(np.clip(read.R_wb[:, 2, 2], -1.0, 1.0)))
-    for k, axis in enumerate("xyz"):
+    for k, axis in enumerate(AXES):
         out[f"rate about {axis}"] = ("rad/s", np.abs(read.gyro[:, k]))
         out[f"force along {axis}"] = ("m/s²", np.abs(read.accel[:, k]))
     return out | {name: ("", values) for name, values in pair.channels.items()}
+
+
+def locate(
+    t_s: Float64[np.ndarray, " n"],
+    misfit: Float64[np.ndarray, "n 6"],
+    noise: Float64[np.ndarray, "6"],
+    variables: Variables,
+    p_values: Mapping[str, float],
+) -> list[Located]:
+    """Location of a misfit by sensor, strongest first; samples may be of several segments of one log.
+
+    Args:
+        t_s: stamps of the samples.
+        misfit: real minus expected samples, without noise.
+        noise: standard deviation of a sample, by column.
+        variables: what a regime can be of, by name, with unit and values at the samples.
+        p_values: of the findings by sensor; one that is too small for any single second to show it lies everywhere.
+    """
+    found = []
+    scaled = (misfit - np.median(misfit, axis=0)) / noise
+    seconds, window = np.unique(np.floor((t_s - t_s[0]) / WINDOW_S), return_inverse=True)
+    for k, sensor in enumerate(SENSORS):
+        part = scaled[:, 3 * k : 3 * k + 3] ** 2
+        axes_power = part.sum(axis=0)
+        axes = [a for a in range(3) if axes_power[a] > max(CLEAR, AXIS_SHARE * axes_power.max())]
+        power = np.bincount(window, weights=part.sum(axis=1))
+        inside = power > CLEAR
+        if axes and not inside.any() and p_values.get(sensor, 1.0) < CHANCE:
+            inside = np.ones(len(power), bool)
+        if not axes or not inside.any():
+            continue
+        found.append(
+            Located(
+                sensor,
+                tuple(AXES[a] for a in axes),
+                tuple(intervals(float(t_s[0]) + WINDOW_S * seconds[inside])),
+                regime(inside, power, window, variables),
+                float(power[inside].sum() / max(power.sum(), 1e-300)),
+                p_values.get(sensor, float(chi2.sf(axes_power.sum(), 3))),
+            )
+        )
+    return sorted(found, key=lambda place: place.p_value)
+
+
+def intervals(begins_s: Float64[np.ndarray, " w"]) -> list[tuple[float, float]]:
+    """Intervals of windows, by where each begins; neighbours are joined."""
+    out: list[tuple[float, float]] = []
+    for begin in begins_s.tolist():
+        if out and begin - out[-1][1] < JOIN_S - WINDOW_S:
+            out[-1] = out[-1][0], begin + WINDOW_S
+        else:
+            out.append((begin, begin + WINDOW_S))
+    return out
+
+
+def regime(inside: Bool[np.ndarray, " w"], power: Float64[np.ndarray, " w"], window: np.ndarray, variables: Variables) -> str:
+    """Regime in words: "angular rate above 0.4 rad/s", or "always"."""
+    high = inside if not inside.all() else power > np.median(power)
+    if high.all() or not high.any():
+        return "always"
+    counts = np.maximum(np.bincount(window), 1)
+    best: tuple[float, str] | None = None
+    for name, (unit, values) in variables.items():
+        level = np.bincount(window, weights=values) / counts
+        for sign, word in ((1.0, "above"), (-1.0, "below")):
+            index, threshold = _youden(sign * level, high)
+            p = float(mannwhitneyu(sign * level[high], sign * level[~high], alternative="greater").pvalue) * 2 * len(variables)
+            if p < CHANCE and index > LEAST_YOUDEN and (best is None or index > best[0]):
+                best = index, f"{name} {word} {sign * threshold:.2g} {unit}".strip()
+    if best is None:
+        return "no regime: it comes and goes" if not inside.all() else "always"
+    return best[1] if not inside.all() else f"always, most with {best[1]}"
+
+
+def _youden(level: Float64[np.ndarray, " w"], high: Sequence[bool] | Bool[np.ndarray, " w"]) -> tuple[float, float]:
+    """Youden's index of the best threshold between high windows and the others, and that threshold."""
+    order = np.argsort(level)
+    flags = np.asarray(high)[order]
+    above_high = 1.0 - np.cumsum(flags) / max(flags.sum(), 1)
+    above_low = 1.0 - np.cumsum(~flags) / max((~flags).sum(), 1)
+    k = int(np.argmax(above_high - above_low))
+    return float(above_high[k] - above_low[k]), float(0.5 * (level[order][k] + level[order][min(k + 1, len(level) - 1)]))

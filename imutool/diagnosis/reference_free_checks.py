@@ -1,29 +1,32 @@
-"""What a recording says of itself, where nothing says what it should have read: stamps, digits and limits."""
+"""Checks that need no reference: dropped samples, quantization, saturation, stuck axes."""
 
 from __future__ import annotations
 
 import numpy as np
+from jaxtyping import Bool
 
 from imutool.diagnosis.estimation import timestamps
-from imutool.diagnosis.estimation.alignment import Pair
+from imutool.diagnosis.estimation.aligned_log import Pair
 from imutool.diagnosis.result import Diagnosis, Estimate, Finding, HeldOut
+from imutool.diagnosis.wording.quantity import percent
 from imutool.inertial.stationary import white_noise
 from imutool.recording import Recording, seconds
 from imutool.sensor import catalogue
 from imutool.sensor.samples import IdealMotion
-from imutool.units import UNITS
+from imutool.units import AXES, SENSORS, UNITS
 
+SOME = 0.05  # of the samples of an axis at its limit, from which it is reported
 BY_THEMSELVES = frozenset({"saturation", "quantization"})  # of the catalogue
 
 
-def by_samples(real: Recording, path: str, why: str) -> Diagnosis:
-    """Missing samples, coarse digits and a limit that is reached; all else cannot be told, for the reason that is given.
+def check_without_reference(real: Recording, path: str, why: str) -> Diagnosis:
+    """Diagnosis without a reference: missing samples, quantization, saturation; `why` says why there is none.
 
     The constant bias is not known either (NaN).
     """
     stamp_s = seconds(real.imu.t_ns, int(real.imu.t_ns[0]))
     samples, none = np.concatenate([real.imu.gyro, real.imu.accel], axis=1), np.zeros(len(stamp_s), bool)
-    pair = Pair(real.name, IdealMotion(stamp_s, *np.zeros((3, len(stamp_s), 3))), stamp_s, samples, none, none)
+    pair = Pair(real.name, stamp_s, samples, none, none, felt=IdealMotion(stamp_s, *np.zeros((3, len(stamp_s), 3))))
     findings = [*timestamps.dropped([pair]), *timestamps.rounded([pair], white_noise(samples)), *_limits(pair)]
     told = f"{why.rstrip('.')}. Only what stamps and digits show by themselves could be asked"
     hidden = tuple(one.name for one in catalogue.diagnosed() if one.name not in BY_THEMSELVES)
@@ -31,7 +34,7 @@ def by_samples(real: Recording, path: str, why: str) -> Diagnosis:
 
 
 def _limits(pair: Pair) -> list[Finding]:
-    """Readings that come again and again at the largest of all."""
+    """Saturation: samples that pile up at the largest value."""
     most = timestamps.limits(pair.real)
     if not most:
         return []
@@ -40,3 +43,22 @@ def _limits(pair: Pair) -> list[Finding]:
     signal = next(iter(most)) if len(most) == 1 else "both"
     nothing = HeldOut(0.0, 0.0, "-", length)
     return [Finding("saturation", signal, 0.0, 0.0, 0.0, told, "readings pile up at +-limit", nothing)]
+
+
+def unusable_axes(pair: Pair) -> list[str]:
+    """Unusable axes of a log, with the reason."""
+    stuck, clipped, ended, out = timestamps.stuck(pair.real), timestamps.clipped(pair.real).mean(axis=0), at_limit(pair), []
+    for a in np.flatnonzero(stuck & ~ended):
+        signal = SENSORS[a // 3]
+        out.append(f"{signal} {AXES[a % 3]} reads {pair.real[0, a]:.4g} {UNITS[signal]} in every sample")
+    for signal, most in timestamps.limits(pair.real).items():
+        k = 3 * SENSORS.index(signal)
+        share = ", ".join(f"{AXES[a - k]} in {percent(float(clipped[a]))}" for a in range(k, k + 3) if ended[a])
+        if share:
+            out.append(f"{signal} is at its limit of {most:.4g} {UNITS[signal]}: {share} of the samples")
+    return out
+
+
+def at_limit(pair: Pair) -> Bool[np.ndarray, "6"]:
+    """Axes that are clipped in more than 5 % of the samples."""
+    return np.asarray(timestamps.clipped(pair.real).mean(axis=0) > SOME)

@@ -10,26 +10,28 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
+import msgspec
 import numpy as np
 from jaxtyping import Float64
 
-from imutool.diagnosis.estimation.alignment import Pair
-from imutool.diagnosis.estimation.gauss_newton import WhitenedLog, expected
+from imutool.diagnosis.estimation.aligned_log import Pair
+from imutool.diagnosis.estimation.jacobians import expected
+from imutool.diagnosis.estimation.whitening import WhitenedImu
+from imutool.diagnosis.held_out import gains, noise_floor, with_constant
 from imutool.diagnosis.result import Closer
-from imutool.diagnosis.summarize import closer, floor, with_constant
 from imutool.errors import DataError
 from imutool.recording import Recording
-from imutool.sensor.effect import Acting
+from imutool.sensor.effect import Acting, simulate_stretches
 from imutool.sensor.physics_file import PhysicsFile
 from imutool.sensor.samples import IdealMotion
-from imutool.sensor.simulate import FELT_HZ, read_all
+from imutool.sensor.simulate import MOTION_HZ
 from imutool.sensor.trajectory import smooth_motion
 
 AS_GOOD = 0.3  # of the noise: how far a simulation along the poses may be from the one that was given, and still stand for it
 MOST_OF_IT = 0.8  # of the held-out samples that the poses have to cover
 
 
-def simulated_again(logs: Sequence[WhitenedLog], sim: Recording, physics: PhysicsFile) -> Mapping[str, Closer]:
+def resimulate(logs: Sequence[WhitenedImu], sim: Recording, physics: PhysicsFile) -> Mapping[str, Closer]:
     """By signal, the misfit of the simulation as it was given and as it is with some physics, on held-out time.
 
     Raises:
@@ -40,7 +42,7 @@ def simulated_again(logs: Sequence[WhitenedLog], sim: Recording, physics: Physic
         raise DataError("it has no poses", where=sim.name, expected="poses to simulate along")
     motion = smooth_motion(sim.truth)
     rate_hz = 1.0 / sim.imu.period_s
-    felts = motion.felt(rate_hz * max(1, int(np.ceil(FELT_HZ / rate_hz))))
+    felts = motion.ideal_motions(rate_hz * max(1, int(np.ceil(MOTION_HZ / rate_hz))))
     acting = physics.acting()
     there, before, after = [], [], []
     for log in logs:
@@ -50,11 +52,11 @@ def simulated_again(logs: Sequence[WhitenedLog], sim: Recording, physics: Physic
         pair = replace(log.pair, fitted=log.pair.fitted & good, held_out=log.pair.held_out & good)
         if pair.held_out.sum() < MOST_OF_IT * log.pair.held_out.sum():
             raise DataError("its poses cover too little of the recording", where=sim.name)
-        there.append(WhitenedLog(pair, log.whiten))
+        there.append(WhitenedImu(pair, log.whiten))
         before.append(with_constant(pair, expected(pair, ())))
         after.append(with_constant(pair, found))
         _refuse_unlike(there[-1], before[-1], with_constant(pair, plain), sim)
-    return {signal: replace(one, by="second simulation") for signal, one in closer(there, before, after).items()}
+    return {signal: msgspec.structs.replace(one, by="second simulation") for signal, one in gains(there, before, after).items()}
 
 
 def _felt(felt: IdealMotion, start_ns: int, pair: Pair) -> IdealMotion:
@@ -68,14 +70,14 @@ def _felt(felt: IdealMotion, start_ns: int, pair: Pair) -> IdealMotion:
 def _read(pair: Pair, felts: Sequence[IdealMotion], acting: Acting) -> Float64[np.ndarray, "n 6"]:
     """What the second simulation reads at the recording's stamps; NaN where it has no motion."""
     stamps = [pair.stamp_s[(pair.stamp_s >= one.t_s[0]) & (pair.stamp_s <= one.t_s[-1])] for one in felts]
-    got = read_all(felts, stamps, acting)
+    got = simulate_stretches(felts, stamps, acting)
     out = np.full(pair.real.shape, np.nan)
     out[np.searchsorted(pair.stamp_s, got.stamp_s)] = np.concatenate([got.gyro, got.accel], axis=1)
     return out
 
 
 def _refuse_unlike(
-    log: WhitenedLog, given: Float64[np.ndarray, "n 6"], plain: Float64[np.ndarray, "n 6"], sim: Recording
+    log: WhitenedImu, given: Float64[np.ndarray, "n 6"], plain: Float64[np.ndarray, "n 6"], sim: Recording
 ) -> None:
     """Poses that are too coarse or too noisy give another simulation than the one that was given, whatever the physics.
 
@@ -84,5 +86,5 @@ def _refuse_unlike(
     """
     rows = log.pair.held_out
     off = np.sqrt(((given - plain)[rows] ** 2).mean(axis=0))
-    if (off > AS_GOOD * floor([log])).any():
+    if (off > AS_GOOD * noise_floor([log])).any():
         raise DataError("a simulation along its poses is not the simulation that was given", where=sim.name)

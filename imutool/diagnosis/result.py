@@ -1,127 +1,179 @@
-"""What `diagnose` says: where a simulation and a recording differ, what was left out, how sure that is, and what it brings.
+"""Report of a diagnosis: located misfits, findings, biases, unexplained residuals.
 
-`Diagnosis.plain` is the JSON of contracts.md (`imutool.diagnosis/1`); the traces beside it are for pictures.
+`DiagnosisReport` is the JSON `imutool.diagnosis/1`; the traces of a `Diagnosis` are for figures only.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from jaxtyping import Bool, Float64
 
 from imutool.recording import Poses
+from imutool.report import Report, Section
 from imutool.units import ASCII_UNITS
 
 SCHEMA = "imutool.diagnosis/1"
-WORTH = 0.1  # of the noise, in power, that a misfit must have for a share of it to mean anything
+LEAST_MISFIT = 0.1  # of the noise's power: with less misfit than that, a share of it means nothing
+
+Kind = Literal["catalogue", "driven", "unknown"]
+if TYPE_CHECKING:
+    Number = float
+else:
+    Number = float | None  # a number in memory; null in JSON where it is infinite or not a number
 
 
-@dataclass(frozen=True)
-class Located:
-    """Where the misfit lies: axes of a signal, stretches of time (s from the start of the log), and in which regime.
+class Located(Section, frozen=True, omit_defaults=True):
+    """Location of a misfit: axes of a signal, intervals (s from the start of the log) and regime.
 
-    `share` is how much of that signal's misfit above the noise lies there; `p_value` is that of noise alone doing the same.
-    `log` is which of several it is, as `Diagnosis.real` has it.
+    `share` is the part of the signal's misfit above the noise that lies there; `p_value` is that of noise alone.
+    `log` is the path of the log where there are several; `reason` says why an unusable axis is no measurement.
     """
 
     signal: str
     axes: tuple[str, ...]
     intervals_s: tuple[tuple[float, float], ...]
     regime: str
-    share: float
-    p_value: float
+    share: Number
+    p_value: Number
     log: str = ""
+    reason: str = ""
 
 
-@dataclass(frozen=True)
-class Estimate:
-    """A parameter with its standard deviation."""
+class Estimate(Section, frozen=True):
+    """Parameter value with its standard deviation."""
 
-    value: float
-    std: float
+    value: Number
+    std: Number
     unit: str
 
 
-@dataclass(frozen=True)
-class HeldOut:
-    """Root mean square of the residual over time that no fit has seen, before and after the effect was modelled."""
+class HeldOut(Section, frozen=True):
+    """Root mean square residual on held-out time, before and after the effect was modelled."""
 
-    rms_before: float
-    rms_after: float
+    rms_before: Number
+    rms_after: Number
     unit: str
-    seconds: float
+    seconds: Number
 
 
-@dataclass(frozen=True)
-class Closer(HeldOut):
-    """As `HeldOut` for all findings together; `share` of the misfit above the noise is gone, in power (none where none was).
+class Closer(HeldOut, frozen=True):
+    """Held-out residual before and after all findings; `share` of the misfit's power is removed.
 
-    `by` a second simulation with what was found on the other time, or as the search computes it.
+    `share` is None where there was no misfit; `by` says whether a second simulation or the estimator gave the residual after.
     """
 
     share: float | None = None
     by: Literal["second simulation", "computed"] = "computed"
 
     @classmethod
-    def of(cls, one: HeldOut, noise_floor: float) -> Closer:
-        """As it is computed, over noise of some root mean square."""
-        misfit = one.rms_before**2 - noise_floor**2
-        gone = None
-        if misfit > WORTH * noise_floor**2:
-            gone = max(-1.0, min(1.0, (one.rms_before**2 - one.rms_after**2) / misfit))
-        return cls(one.rms_before, one.rms_after, one.unit, one.seconds, gone)
+    def computed(cls, held_out: HeldOut, noise_floor: float) -> Closer:
+        """Share of the misfit above a noise of this root mean square that was removed."""
+        misfit = held_out.rms_before**2 - noise_floor**2
+        share = None
+        if misfit > LEAST_MISFIT * noise_floor**2:
+            share = max(-1.0, min(1.0, (held_out.rms_before**2 - held_out.rms_after**2) / misfit))
+        return cls(held_out.rms_before, held_out.rms_after, held_out.unit, held_out.seconds, share)
 
 
-@dataclass(frozen=True, eq=False)
-class Curve:
-    """A misfit without a name as a curve of one variable: values about their mean, with a band (one standard deviation).
+class Curve(Section, frozen=True):
+    """Curve of an unknown effect over one variable, about its mean, with one standard deviation.
 
-    The mean, which no motion tells from a bias, is apart.
+    `y` and `band` have a column for each axis. No motion separates the `mean` from a bias, so it stands by itself.
     """
 
     variable: str
     unit: str
-    x: Float64[np.ndarray, " k"]
-    y: Float64[np.ndarray, "k axes"]
-    band: Float64[np.ndarray, "k axes"]
+    x: tuple[float, ...]
+    y: tuple[tuple[float, ...], ...]
+    band: tuple[tuple[Number, ...], ...]
     mean: float = 0.0
 
+    @classmethod
+    def of_arrays(
+        cls,
+        variable: str,
+        unit: str,
+        x: Float64[np.ndarray, " k"],
+        y: Float64[np.ndarray, "k axes"],
+        band: Float64[np.ndarray, "k axes"],
+        mean: float = 0.0,
+    ) -> Curve:
+        """Curve from numpy arrays."""
+        y_rows, band_rows = (tuple(tuple(row) for row in values.tolist()) for values in (y, band))
+        return cls(variable, unit, tuple(x.tolist()), y_rows, band_rows, mean)
 
-@dataclass(frozen=True)
-class Finding:
-    """An effect of the catalogue, `driven` (by the channel `driver`), or `unknown`.
 
-    `share`: of the signal's misfit above the noise, what it removes on held-out time. `similar`: what cannot be told from it.
+class Finding(Section, frozen=True, omit_defaults=True):
+    """Effect that separates the recording from the simulation, with its parameters and its gain.
+
+    Attributes:
+        effect: a name of the catalogue, `driven` or `unknown`.
+        share: the part of the signal's misfit above the noise that it removes on held-out time.
+        similar: other effects that would do as well.
+        kind: `driven` follows the channel `driver`; `unknown` is a `curve` of `variable`, or a term `variable`, on `axis`.
+        onset_s: when it sets in (s from the start of the log).
     """
 
     effect: str
     signal: str
-    share: float
-    p_value: float
-    false_discovery_rate: float
+    share: Number
+    p_value: Number
+    false_discovery_rate: Number
     parameters: Mapping[str, Estimate]
     equation: str
     held_out: HeldOut
     driver: str = ""
     similar: tuple[str, ...] = ()
     curve: Curve | None = None
+    kind: Kind = "catalogue"
+    axis: str | None = None
+    variable: str = ""
+    onset_s: float | None = None
 
 
-@dataclass(frozen=True)
-class Unexplained:
-    """What is left of a signal: its root mean square, the noise's, and whether it looks like noise."""
+class Unexplained(Section, frozen=True):
+    """Residual of a signal after all findings: root mean square, noise floor, and whether it is white."""
 
-    rms: float
-    noise_floor: float
+    rms: Number
+    noise_floor: Number
     white: bool
+
+
+class Bias(Section, frozen=True):
+    """Constant bias of one log (rad/s, m/s²); None where it is not known."""
+
+    gyro: tuple[float, ...] | None
+    accel: tuple[float, ...] | None
+
+
+class DiagnosisReport(Report, frozen=True, tag=SCHEMA):
+    """Findings of a diagnosis as JSON (`imutool.diagnosis/1`).
+
+    Attributes:
+        bias: of the first log; `biases` has one for each log.
+        unexplained: `SIGNAL_rms` of each signal, `noise_floor` by signal, and whether all residuals are `white`.
+    """
+
+    real: tuple[str, ...]
+    sim: str | None
+    mismatch: bool
+    located: tuple[Located, ...]
+    findings: tuple[Finding, ...]
+    bias: Bias
+    biases: tuple[Bias, ...]
+    not_identifiable: tuple[str, ...]
+    unexplained: Mapping[str, Number | bool | dict[str, Number]]
+    closer: Mapping[str, Closer]
+    remarks: tuple[str, ...]
 
 
 @dataclass(frozen=True, eq=False)
 class Traces:
-    """One log, for pictures: gyro (rad/s) and accel (m/s²), what was expected before and after, which samples were held out."""
+    """Samples of one log for figures: recorded and expected gyro (rad/s) and accel (m/s²)."""
 
     log: str
     t_s: Float64[np.ndarray, " n"]
@@ -130,14 +182,14 @@ class Traces:
     after: Float64[np.ndarray, "n 6"]  # with the findings modelled
     held_out: Bool[np.ndarray, " n"]
     truth: Poses | None = None  # at these samples
-    ideal: Float64[np.ndarray, "n 6"] | None = None  # what a perfect sensor would have read
-    band_hz: float | None = None  # above it what was expected is not known
-    path: str = ""  # of the log, as `Diagnosis.real` has it
+    ideal: Float64[np.ndarray, "n 6"] | None = None  # an ideal sensor's samples
+    band_hz: float | None = None  # the expected signal is known below this frequency
+    path: str = ""  # of the log, as in `Diagnosis.real`
 
 
 @dataclass(frozen=True, eq=False)
 class SignalTraces:
-    """One other signal, for pictures: what was recorded, what was expected before and after, which samples were held out."""
+    """Samples of another signal for figures: recorded, expected before and after, held-out rows."""
 
     t_s: Float64[np.ndarray, " n"]
     real: Float64[np.ndarray, " n"]
@@ -149,7 +201,10 @@ class SignalTraces:
 
 @dataclass(frozen=True, eq=False)
 class Diagnosis:
-    """The answer. Findings come strongest first; `bias` is each log's own constant, that of the first log in the JSON."""
+    """Result of `diagnose`: findings, strongest first, located misfits, biases and traces.
+
+    `bias` has a row for each log; the JSON shows the first as `bias` and all as `biases`.
+    """
 
     real: tuple[str, ...]
     sim: str | None
@@ -159,7 +214,7 @@ class Diagnosis:
     not_identifiable: tuple[str, ...]
     unexplained: Mapping[str, Unexplained]
     remarks: tuple[str, ...] = ()
-    closer: Mapping[str, Closer] = field(default_factory=dict)  # of each signal, once simulated again with the findings
+    closer: Mapping[str, Closer] = field(default_factory=dict)  # by signal
     traces: tuple[Traces, ...] = ()
     signals: Mapping[str, SignalTraces] = field(default_factory=dict)  # by TOPIC.field
 
@@ -168,68 +223,35 @@ class Diagnosis:
         """Whether more than a constant bias and noise separates the two."""
         return bool(self.findings) or bool(self.located)
 
-    def plain(self) -> dict[str, Any]:
-        """As JSON has it; nothing is said of what is left of a sensor that told nothing."""
-        left = dict.fromkeys(ASCII_UNITS) | dict(self.unexplained)
-        return {
-            "schema": SCHEMA,
-            "real": list(self.real),
-            "sim": self.sim,
-            "mismatch": self.mismatch,
-            "located": [_located(one) for one in self.located],
-            "findings": [_finding(one) for one in self.findings],
-            "bias": _bias(self.bias[0]),
-            "biases": [_bias(one) for one in self.bias],
-            "not_identifiable": list(self.not_identifiable),
-            "unexplained": {
-                **{f"{name}_rms": None if one is None else one.rms for name, one in left.items()},
-                "noise_floor": {name: None if one is None else one.noise_floor for name, one in left.items()},
-                "white": all(one.white for one in self.unexplained.values()),
-            },
-            "closer": {name: _held_out(one) | {"share": one.share, "by": one.by} for name, one in self.closer.items()},
-            "remarks": list(self.remarks),
-        }
+    @property
+    def report(self) -> DiagnosisReport:
+        """The JSON report; a sensor whose axes are all unusable has null residuals."""
+        biases = tuple(_bias(row) for row in self.bias)
+        return DiagnosisReport(
+            real=self.real,
+            sim=self.sim,
+            mismatch=self.mismatch,
+            located=self.located,
+            findings=self.findings,
+            bias=biases[0],
+            biases=biases,
+            not_identifiable=self.not_identifiable,
+            unexplained=_unexplained(self.unexplained),
+            closer=self.closer,
+            remarks=self.remarks,
+        )
 
 
-def _bias(one: Float64[np.ndarray, "6"]) -> dict[str, Any]:
-    """Nothing where nobody knows it."""
-    parts = {"gyro": one[:3], "accel": one[3:]}
-    return {signal: part.tolist() if np.isfinite(part).all() else None for signal, part in parts.items()}
+def _bias(values: Float64[np.ndarray, "6"]) -> Bias:
+    known = (part if np.isfinite(part).all() else None for part in (values[:3], values[3:]))
+    return Bias(*(None if part is None else tuple(part.tolist()) for part in known))
 
 
-def _located(one: Located) -> dict[str, Any]:
-    out = {
-        "signal": one.signal,
-        "axes": list(one.axes),
-        "intervals_s": [list(interval) for interval in one.intervals_s],
-        "regime": one.regime,
-        "share": one.share,
-        "p_value": one.p_value,
+def _unexplained(residuals: Mapping[str, Unexplained]) -> dict[str, float | bool | dict[str, float]]:
+    missing = Unexplained(np.nan, np.nan, white=True)  # null in JSON
+    by_signal = dict.fromkeys(ASCII_UNITS, missing) | dict(residuals)
+    return {
+        **{f"{signal}_rms": residual.rms for signal, residual in by_signal.items()},
+        "noise_floor": {signal: residual.noise_floor for signal, residual in by_signal.items()},
+        "white": all(residual.white for residual in residuals.values()),
     }
-    return out | {"log": one.log} if one.log else out
-
-
-def _finding(one: Finding) -> dict[str, Any]:
-    out: dict[str, Any] = {
-        "effect": one.effect,
-        "signal": one.signal,
-        "share": one.share,
-        "p_value": one.p_value,
-        "false_discovery_rate": one.false_discovery_rate,
-        "parameters": {name: {"value": e.value, "std": e.std, "unit": e.unit} for name, e in one.parameters.items()},
-        "equation": one.equation,
-        "held_out": _held_out(one.held_out),
-    }
-    if one.driver:
-        out["driver"] = one.driver
-    if one.similar:
-        out["similar"] = list(one.similar)
-    if one.curve is not None:
-        curve = one.curve
-        out["curve"] = {"variable": curve.variable, "unit": curve.unit}
-        out["curve"] |= {"x": curve.x.tolist(), "y": curve.y.tolist(), "band": curve.band.tolist()}
-    return out
-
-
-def _held_out(one: HeldOut) -> dict[str, Any]:
-    return {"rms_before": one.rms_before, "rms_after": one.rms_after, "unit": one.unit, "seconds": one.seconds}

@@ -1,13 +1,12 @@
-"""The physics that a diagnosis found, as a physics.toml says it: what `simulate` adds and `debias` takes off.
+"""Physics file (physics.toml) of a diagnosis, which `simulate` adds and `debias` removes.
 
-Left out is what is no effect on a reading: samples that are missing, stamps that jitter, a reference that is wrong. Findings
-with nothing finite to say of themselves are left out as well.
+Missing samples, jittering stamps and a wrong reference are no effects of a sensor and are left out, as are findings without a
+finite parameter.
 """
 
 from __future__ import annotations
 
 import math
-import re
 from collections.abc import Mapping
 from typing import Literal
 
@@ -15,41 +14,41 @@ import numpy as np
 from jaxtyping import Float64
 
 from imutool.diagnosis.result import Diagnosis, Estimate, Finding
-from imutool.sensor.physics_file import DRIVEN, Bias, Curve, Entry, PhysicsFile, Term, Three, Value
+from imutool.sensor.physics_file import Bias, Curve, Entry, PhysicsFile, Term, Three, Value
 from imutool.units import AXES, Sensor
 
 NO_EFFECT = frozenset({"dropped_samples", "timestamp_jitter", "reference_error"})
-UNKNOWN = "unknown"
-ON_AXIS = re.compile(r"(gyro|accel)\.([xyz]) \+= (?:c (?P<term>.+)|curve\(.+\))")  # as unnamed_effects writes it
 
 
-def found(d: Diagnosis) -> PhysicsFile:
-    """What was found, and the constant bias of the first log beside it, if it is known.
+def to_physics_file(d: Diagnosis) -> PhysicsFile:
+    """Physics file with the findings, and with the constant bias of the first log if it is known.
 
-    A curve without a name is told about its mean; the mean belongs to the bias, and is added to it.
+    The values of a curve are about its mean, which is added to the bias.
     """
     entries, curves, terms = [], [], []
     bias = np.array(d.bias[0], dtype=np.float64)
-    for one in d.findings:
-        if one.effect in NO_EFFECT:
+    for finding in d.findings:
+        if finding.effect in NO_EFFECT:
             continue
-        if one.effect != UNKNOWN:
-            values = _values(one.parameters)
-            if values:
-                entries.append(
-                    Entry(
-                        name=one.effect,
-                        signal=_signal(one.signal),
-                        driver=one.driver if one.effect == DRIVEN else "",
-                        equation=one.equation,
-                        parameters=values,
-                    )
+        if finding.kind == "unknown":
+            sensor = _sensor(finding.signal)
+            if sensor is None:
+                continue  # a curve of another signal than the IMU's
+            if finding.curve is None:
+                terms.append(_term(finding, sensor))
+            else:
+                curves.append(_curve(finding, sensor))
+                bias[3 * (sensor == "accel") + _column(finding)] += finding.curve.mean
+        elif values := _values(finding.parameters):
+            entries.append(
+                Entry(
+                    name=finding.effect,
+                    signal=_signal(finding.signal),
+                    driver=finding.driver,
+                    equation=finding.equation,
+                    parameters=values,
                 )
-        elif one.curve is not None:
-            curves.append(_curve(one))
-            bias += _mean_of_curve(one)
-        else:
-            terms.append(_term(one))
+            )
     return PhysicsFile(
         effect=tuple(entries),
         bias=Bias(gyro=_three(bias[:3]), accel=_three(bias[3:])) if np.isfinite(bias).all() else None,
@@ -59,7 +58,7 @@ def found(d: Diagnosis) -> PhysicsFile:
 
 
 def _values(parameters: Mapping[str, Estimate]) -> dict[str, Value]:
-    """What is infinite is not there: a limit or a cut-off that is never reached."""
+    """Leaves out infinite values: a limit or a cut-off that is never reached."""
     return {
         name: Value(value=float(e.value), std=float(e.std) if math.isfinite(e.std) else None, unit=e.unit)
         for name, e in parameters.items()
@@ -67,52 +66,43 @@ def _values(parameters: Mapping[str, Estimate]) -> dict[str, Value]:
     }
 
 
-def _curve(one: Finding) -> Curve:
-    assert one.curve is not None
-    sensor, _, _ = _place(one)
-    curve = one.curve
+def _curve(finding: Finding, sensor: Sensor) -> Curve:
+    assert finding.curve is not None
+    curve = finding.curve
     return Curve(
         signal=sensor,
         variable=curve.variable,
         unit=curve.unit,
-        x=tuple(curve.x.tolist()),
-        y=tuple(_three(row) for row in curve.y),
-        band=tuple(_three(row) for row in curve.band),
+        x=curve.x,
+        y=tuple(_three(np.array(row)) for row in curve.y),
+        band=tuple(_three(np.array(row)) for row in curve.band),
     )
 
 
-def _mean_of_curve(one: Finding) -> Float64[np.ndarray, "6"]:
-    """What the curve is on average, on its axis."""
-    assert one.curve is not None
-    sensor, axis, _ = _place(one)
-    out = np.zeros(6)
-    out[3 * (sensor == "accel") + axis] = one.curve.mean
-    return out
-
-
-def _term(one: Finding) -> Term:
-    sensor, axis, text = _place(one)
-    (c,) = one.parameters.values()
+def _term(finding: Finding, sensor: Sensor) -> Term:
+    axis = _column(finding)
+    (c,) = finding.parameters.values()
     value, std = np.zeros(3), np.zeros(3)
     value[axis], std[axis] = c.value, c.std if math.isfinite(c.std) else 0.0
-    return Term(signal=sensor, term=text, value=_three(value), std=_three(std))
+    return Term(signal=sensor, term=finding.variable, value=_three(value), std=_three(std))
 
 
-def _place(one: Finding) -> tuple[Sensor, int, str]:
-    """Sensor, axis and term of what has no name: its equation says it."""
-    match = ON_AXIS.fullmatch(one.equation)
-    assert match is not None, f"an unknown finding's equation: {one.equation}"
-    sensor: Sensor = "gyro" if match[1] == "gyro" else "accel"
-    return sensor, AXES.index(match[2]), match["term"] or ""
+def _column(finding: Finding) -> int:
+    assert finding.axis is not None, f"an unknown effect of {finding.signal} has an axis"
+    return AXES.index(finding.axis)
+
+
+def _sensor(signal: str) -> Sensor | None:
+    match signal:
+        case "gyro" | "accel":
+            return signal
+        case _:
+            return None
 
 
 def _signal(signal: str) -> Literal["gyro", "accel", "both", ""]:
-    """Where an effect acts; what has another name says it by acting."""
-    match signal:
-        case "gyro" | "accel" | "both":
-            return signal
-        case _:
-            return ""
+    """Signal of a physics file; empty for any other signal of the log."""
+    return "both" if signal == "both" else _sensor(signal) or ""
 
 
 def _three(values: Float64[np.ndarray, "3"]) -> Three:

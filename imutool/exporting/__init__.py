@@ -1,1 +1,1 @@
-"""A log for programs that do not read MCAP as it is."""
+"""Export a log for programs that cannot read it as MCAP."""

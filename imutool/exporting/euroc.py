@@ -1,4 +1,4 @@
-"""A log as a EuRoC (ASL) folder: data.csv and sensor.yaml of an IMU, the truth and the cameras."""
+"""Export a log as a EuRoC (ASL) folder: IMU, truth and cameras."""
 
 from __future__ import annotations
 
@@ -11,8 +11,7 @@ import numpy as np
 from jaxtyping import Float64, Int64
 
 from imutool.errors import LogError
-from imutool.exporting.folder import SIGNATURE, ExportFolder, writing
-from imutool.exporting.report import ExportReport, Progress
+from imutool.exporting.folder import SIGNATURE, ExportFolder, ExportReport, Progress, writing
 from imutool.mcap_io.codec import schemas
 from imutool.mcap_io.log import Log
 from imutool.mcap_io.read import VELOCITY_KEY, read
@@ -58,7 +57,7 @@ IDENTITY = "  cols: 4\n  rows: 4\n  data: [1.0, 0.0, 0.0, 0.0,\n" + (
 def write(
     log: Path, out: Path, imu: str | None, sensor_noise: str | Path | None, overwrite: bool, tell: Progress
 ) -> ExportReport:
-    """Writes the folder `out`; the arguments are those of `imutool.exporting.run.export`."""
+    """Writes the folder `out`; the arguments are those of `imutool.exporting.export.export`."""
     given = datasheet.read(sensor_noise) if sensor_noise is not None else None
     with Log(log) as opened:
         topic = imu or _best_imu(opened)
@@ -80,19 +79,19 @@ def _best_imu(log: Log) -> str:
     """The debiased IMU, else the raw one.
 
     Raises:
-        LogError: there is none, or several to choose from.
+        LogError: none, or several.
     """
     every = log.with_schema((schemas.IMU,))
     derived = [t.name for t in every if DERIVED_KEY in t.metadata]
     found = derived or [t.name for t in every]
     if len(found) != 1:
         listed = ", ".join(found) or "none"
-        raise LogError(f"IMU topics: {listed}", where=log.path, expected="one", fix="Choose with --imu" if found else "")
+        raise LogError(f"IMU topics: {listed}", where=log.path, expected="one", fix="Choose one with `imu`" if found else "")
     return found[0]
 
 
 class _Asl:
-    """Writes the parts of a `mav0` folder, and keeps count."""
+    """Writes the parts of a `mav0` folder and counts their rows."""
 
     def __init__(self, root: Path, recording: Recording, tell: Progress) -> None:
         self.root, self.recording, self.tell = root, recording, tell
@@ -101,13 +100,13 @@ class _Asl:
         self.root.mkdir()
 
     def imu(self, given: Noise | None) -> None:
-        """`imu0`: samples to the last bit, and a sensor.yaml."""
+        """Writes `imu0`: samples to the last bit, and a sensor.yaml."""
         imu = self.recording.imu
         self._table("imu0", IMU_COLUMNS, imu.t_ns, np.concatenate([imu.gyro, imu.accel], axis=1))
         self._text("imu0/sensor.yaml", self._imu_yaml(given))
 
     def truths(self) -> None:
-        """The true poses under the names EuRoC has for them; the first under that of the truth, whatever its topic."""
+        """Writes the true poses under EuRoC's names, the first as the ground truth."""
         for number, (topic, poses) in enumerate(self.recording.truths.items()):
             folder = TRUTH_FOLDER if number == 0 else TRUTH_FOLDERS.get(topic)
             if folder is None or f"{folder}/data.csv" in self.written or not len(poses):
@@ -119,7 +118,7 @@ class _Asl:
             self._table(folder, TRUTH_COLUMNS, poses.t_ns, values)
 
     def _bias(self, topic: str, poses: Poses, end: str) -> Float64[np.ndarray, "n 3"]:
-        """A true bias on the stamps of the poses, NaN where it is not known; all NaN if some of it lies between them."""
+        """True bias on the stamps of the poses, NaN where unknown or between the stamps."""
         rows = np.full((len(poses), 3), np.nan)
         name = f"{topic.removesuffix('/pose')}/bias/{end}"
         known: Scalars | None = self.recording.scalars.get(name)
@@ -129,7 +128,7 @@ class _Asl:
         return rows
 
     def cameras(self) -> None:
-        """One folder a camera with the images byte for byte, one in memory at a time."""
+        """Writes one folder per camera, images byte for byte, one in memory at a time."""
         for number, (topic, frames) in enumerate(self.recording.frames.items()):
             named = re.match(r"/(cam\d+)/", topic)
             folder = named[1] if named else f"cam{number}"
@@ -146,7 +145,7 @@ class _Asl:
             for t_ns, image in frames.each():
                 ending = next((kind for start, kind in IMAGES.items() if image.startswith(start)), None)
                 if ending is None:
-                    raise LogError(f"the image at {t_ns} ns is neither PNG nor JPEG", where=topic, fix="Use --format rosbag2")
+                    raise LogError(f"the image at {t_ns} ns is neither PNG nor JPEG", where=topic, fix="Use `format=rosbag2`")
                 name = f"{t_ns}{ending}"
                 try:
                     with (images / name).open("xb") as file:
@@ -171,7 +170,7 @@ class _Asl:
         return str(self.recording.metadata.get(name, {}).get("text", ""))
 
     def _imu_yaml(self, given: Noise | None) -> str:
-        """The source's own text where it has one and nothing else was asked for; else one with a sheet's figures."""
+        """The source's own sensor.yaml unless another noise is given, else a data sheet's figures."""
         note = f"{SIGNATURE} from {_line(self.recording.name)}, topic {_line(self.recording.imu_topic)}\n"
         if (kept := self._kept("imu0/sensor.yaml")) and given is None:
             directive, rest = (kept + "\n").split("\n", 1) if kept.startswith("%") else ("", kept)  # %YAML must come first
@@ -181,12 +180,12 @@ class _Asl:
         lines = [note + "sensor_type: imu", f"comment: {json.dumps(named or 'unknown')}", "T_BS:", IDENTITY.rstrip("\n")]
         lines.append(f"rate_hz: {1.0 / self.recording.imu.period_s:.6g}")
         if given is None:
-            said = (
+            origin = (
                 f"the sensor's, {named}"
                 if named in datasheet.SHEETS
                 else f"{DEFAULT_SHEET}'s, as the log does not name its sensor"
             )
-            lines.append(f"# Noise: defaults of a data sheet ({said}), not measured on this sensor")
+            lines.append(f"# Noise: defaults of a data sheet ({origin}), not measured on this sensor")
         for key, (quantity, unit) in DENSITIES.items():
             axes = sheet.values(quantity)
             known = axes[np.isfinite(axes)]

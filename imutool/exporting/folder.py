@@ -1,4 +1,4 @@
-"""A folder that appears whole or not at all: written beside its place, renamed when complete."""
+"""Write a folder that appears whole or not at all, and report its contents."""
 
 from __future__ import annotations
 
@@ -8,7 +8,8 @@ import re
 import secrets
 import shutil
 import weakref
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
 from pathlib import Path
 from types import TracebackType
 
@@ -18,13 +19,13 @@ SIGNATURE = "# Exported by imutool"
 
 
 class ExportFolder:
-    """Context manager over a folder being written; leaving it without an error puts it in its place.
+    """The folder being written; leaving the context without an error puts it in its place.
 
     Any error, Ctrl-C included, removes what was written. An older folder is replaced only if its file `signed` says that it
     was made here and its top holds nothing but what `holds` matches: a data set that merely looks alike is never removed.
 
     Raises:
-        ConfigError: the target exists (without `overwrite`), is no export, holds the log, or cannot be written.
+        ConfigError: the target exists (without `overwrite`), is not an export, holds the log, or cannot be written.
     """
 
     def __init__(self, path: Path, log: Path, *, signed: str, holds: str, overwrite: bool) -> None:
@@ -43,9 +44,9 @@ class ExportFolder:
         if not self.path.exists() and not self.path.is_symlink():
             return
         if not self.overwrite:
-            raise ConfigError("the target exists", where=self.path, fix="Choose another name, or add --overwrite")
+            raise ConfigError("the target exists", where=self.path, fix="Choose another name, or add `overwrite=True`")
         if self.path.is_symlink() or not self.path.is_dir():
-            raise ConfigError("the target is no folder", where=self.path, expected="the name of a new folder")
+            raise ConfigError("the target is not a folder", where=self.path, expected="the name of a new folder")
         if self.log.resolve().is_relative_to(self.path.resolve()):
             raise ConfigError("the target holds the log itself", where=self.path, expected="another folder")
         foreign = sorted(entry.name for entry in self.path.iterdir() if not re.fullmatch(self.holds, entry.name))
@@ -71,7 +72,7 @@ class ExportFolder:
             self._remove()
 
     def _commit(self) -> None:
-        """Puts the folder in its place, and an older one out of it only when nothing can go wrong any more."""
+        """Puts the folder in its place, and an older one out of it once nothing can fail."""
         self._refuse_existing()
         with writing(self.path):
             if not self.path.exists():
@@ -89,10 +90,24 @@ class ExportFolder:
 
 @contextlib.contextmanager
 def writing(path: Path) -> Iterator[None]:
-    """While something is written there: what the system refuses is said as a ConfigError."""
+    """Turns errors of the system into a ConfigError while a folder is written."""
     try:
         yield
     except OSError as error:
         reason = error.strerror or type(error).__name__
         fix = "Choose a place that can be written and has room"
         raise ConfigError(f"cannot be written ({reason})", where=path, fix=fix) from error
+
+
+Progress = Callable[[int, int, str], None]  # done, in all, what is being written
+
+
+@dataclass(frozen=True)
+class ExportReport:
+    """Exported files with their rows, the IMU's topic (EuRoC), and the topics left out."""
+
+    output: Path
+    format: str
+    imu: str | None = None
+    written: dict[str, int] = field(default_factory=dict)
+    left_out: list[str] = field(default_factory=list)

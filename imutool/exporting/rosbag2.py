@@ -1,4 +1,4 @@
-"""A log as a rosbag2 folder: a copy of it, byte for byte, and the metadata.yaml that rosbag2 asks for."""
+"""Export a log as a rosbag2 folder: a byte-for-byte copy and its metadata.yaml."""
 
 from __future__ import annotations
 
@@ -9,8 +9,7 @@ import re
 from pathlib import Path
 
 from imutool.errors import ConfigError, LogError
-from imutool.exporting.folder import SIGNATURE, ExportFolder, writing
-from imutool.exporting.report import ExportReport, Progress
+from imutool.exporting.folder import SIGNATURE, ExportFolder, ExportReport, Progress, writing
 from imutool.mcap_io.log import Log
 
 COPY_BYTES = 1 << 20
@@ -24,9 +23,9 @@ QOS_NUMBERS = {  # as rmw numbers them; names came with version 9
 
 
 def write(log: Path, out: Path, overwrite: bool, tell: Progress) -> ExportReport:
-    """Writes the folder `out`; the arguments are those of `imutool.exporting.run.export`."""
+    """Writes the folder `out`; the arguments are those of `imutool.exporting.export.export`."""
     with Log(log) as opened:
-        _refuse_what_rosbag2_cannot(opened)
+        _check_readable(opened)
         name = f"{out.absolute().name}_0.mcap"
         text = _metadata_yaml(opened, name)
         counts = {topic.name: topic.count for topic in opened.topics.values()}
@@ -37,8 +36,8 @@ def write(log: Path, out: Path, overwrite: bool, tell: Progress) -> ExportReport
     return ExportReport(out, "rosbag2", None, counts)
 
 
-def _refuse_what_rosbag2_cannot(log: Log) -> None:
-    """The log is copied as it is, so it must be one already.
+def _check_readable(log: Log) -> None:
+    """Refuses a log that rosbag2 cannot read as it is.
 
     Raises:
         LogError: the profile is another, or a topic is not in CDR or has no schema.
@@ -50,20 +49,20 @@ def _refuse_what_rosbag2_cannot(log: Log) -> None:
             what = (
                 f"{topic.name} is encoded as {topic.message_encoding!r}" if topic.schema_name else f"{topic.name} has no schema"
             )
-            raise LogError(what, where=log.path, expected="CDR messages of ROS 2", fix="Use --format euroc")
+            raise LogError(what, where=log.path, expected="CDR messages of ROS 2", fix="Use `format=euroc`")
 
 
 def _copy(log: Path, copy: Path, tell: Progress) -> None:
-    """The log's bytes in a file of its own (no link: what happens to one must not happen to the other), read back and compared.
+    """Copies the log into a file of its own, reads it back and compares.
 
     Raises:
         LogError: the log changed while it was copied.
         ConfigError: what was written does not read back the same.
     """
-    size, done, told = log.stat().st_size, 0, hashlib.sha256()
+    size, done, digest = log.stat().st_size, 0, hashlib.sha256()
     with log.open("rb") as source, copy.open("xb") as target:
         while block := source.read(COPY_BYTES):
-            told.update(block)
+            digest.update(block)
             target.write(block)
             done += len(block)
             tell(done, 2 * size, copy.name)
@@ -71,18 +70,18 @@ def _copy(log: Path, copy: Path, tell: Progress) -> None:
         os.fsync(target.fileno())
     if done != size:
         raise LogError("changed while it was copied", where=log, fix="Wait until it is complete")
-    again = hashlib.sha256()
+    copied = hashlib.sha256()
     with copy.open("rb") as written:
         while block := written.read(COPY_BYTES):
-            again.update(block)
+            copied.update(block)
             done += len(block)
             tell(done, 2 * size, copy.name)
-    if again.digest() != told.digest():
+    if copied.digest() != digest.digest():
         raise ConfigError("does not read back as it was written", where=copy.parent, fix="Look at the disk")
 
 
 def _metadata_yaml(log: Log, name: str) -> str:
-    """What rosbag2 wants to know of the folder; JSON strings are YAML strings."""
+    """The text of metadata.yaml; JSON strings are YAML strings."""
     ends = [(int(t.min()), int(t.max())) for topic in log.topics for t in log.stamps(topic) if len(t)]
     start = min((first for first, _ in ends), default=0)
     duration = max((last for _, last in ends), default=0) - start

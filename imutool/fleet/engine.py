@@ -1,7 +1,7 @@
-"""Work on Ray: the same on the cores of this machine and on a cluster, one task per log, no more in flight than are worked on.
+"""Workers on Ray: the cores of this machine or a cluster, one task for each log.
 
-Nothing but this file knows of Ray. Without an address it is started for this run alone: on the loopback interface, behind a
-token that never touches a disk, without dashboard and usage statistics, in a temporary folder that goes with it.
+Only this file uses Ray. Without an address Ray is started for this run alone: on the loopback interface, with a token that is
+never written to a disk, without dashboard and usage statistics, in a temporary folder that is removed at the end.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ def _work(raw: bytes, model: bytes | None) -> bytes:
 
 
 class Engine:
-    """Workers, for as long as the context lasts.
+    """Pool of Ray workers, as a context manager.
 
     `workers` limits how many logs are worked on at once, `memory_bytes` is set aside for each. Where Ray runs in this process
     already it is used, and left running.
@@ -87,7 +87,7 @@ class Engine:
         self.close()
 
     def close(self) -> None:
-        """Ends what was started; workers that are still at it are killed."""
+        """Shut down; running workers are killed."""
         if self._own:
             self._ray.shutdown()
             self._own = False
@@ -96,7 +96,7 @@ class Engine:
 
     @property
     def slots(self) -> int:
-        """How many logs can be worked on at once, as things stand: a cluster may grow."""
+        """Number of logs that can be worked on at once now; a cluster may grow."""
         fits = 0
         for node in self._ray.nodes():
             if node["Alive"]:
@@ -107,9 +107,9 @@ class Engine:
     def run(
         self, tasks: Iterable[Task], tick: Callable[[int], None] = lambda running: None, model: bytes | None = None
     ) -> Generator[Result]:
-        """Results as they come; `tick` is told now and then how many tasks are in flight, `model` goes to every worker.
+        """Yield results as tasks end; `tick` gets the number of tasks in flight, `model` goes to every worker.
 
-        A worker that dies takes nothing with it: its task is given to another one, `retries` times.
+        The task of a worker that dies goes to another one, up to `retries` times.
 
         Raises:
             ConfigError: Ray itself has died.
@@ -157,9 +157,9 @@ class Engine:
             words, code = f"a bug, please report it: {error.cause!r}", BUG
             logging.getLogger("imutool").info("%s: %s", task.source.place, error)
         except errors.LocalRayletDiedError as error:
-            raise ConfigError("Ray has died on this machine", fix="Go on with --resume") from error
+            raise ConfigError("Ray has died on this machine", fix="Go on with `resume`") from error
         except errors.OutOfMemoryError:
-            words, code = "its worker ran out of memory. Set more aside with --memory-per-task.", LogError.exit_code
+            words, code = "its worker ran out of memory. Set more aside with `memory_bytes`.", LogError.exit_code
         except errors.RayError as error:
             words = f"its worker died, and each one after it ({type(error).__name__}). Look at this log by itself."
             code = LogError.exit_code
@@ -199,20 +199,20 @@ class Engine:
             raise ConfigError(
                 f"Ray cannot be {'reached' if address else 'started'} {where} ({str(error).splitlines()[0]})",
                 expected="a cluster that answers" if address else "a system that lets processes listen on 127.0.0.1",
-                fix="Give the address of a cluster with --address, or set TMPDIR to a short path that can be written",
+                fix="Give the address of a cluster with `address`, or set TMPDIR to a short path that can be written",
             ) from error
 
     def refuse_too_much(self) -> None:
-        """Refuses to wait for memory that no machine has.
+        """Refuse more memory for a task than any machine has.
 
         Raises:
-            ConfigError: what was asked for, and what there is.
+            ConfigError: no machine has that much memory.
         """
         most = max((node["Resources"].get("memory", 0.0) for node in self._ray.nodes() if node["Alive"]), default=0.0)
         if self._memory > most:
             raise ConfigError(
                 f"{self._memory / 2**30:.2f} GiB for each task",
-                where="--memory-per-task",
+                where="memory_bytes",
                 expected=f"at most {most / 2**30:.2f} GiB, which the largest machine has to give",
             )
 
@@ -241,7 +241,7 @@ def _interrupts_kept() -> Iterator[Callable[[], None]]:
 
 
 def _sweep() -> None:
-    """Removes the folders of runs on this machine that were killed and could not do it."""
+    """Remove the temporary folders of killed runs on this machine."""
     for folder in Path(tempfile.gettempdir()).glob(f"{FOLDER}*"):
         pid = folder.name.removeprefix(FOLDER).partition(".")[0]
         if pid.isdecimal() and not _lives(int(pid)):
@@ -259,7 +259,7 @@ def _lives(pid: int) -> bool:
 
 
 def _refuse_silence(address: str) -> None:
-    """Asks whether anybody listens at HOST:PORT; Ray itself would wait for minutes.
+    """Check that HOST:PORT accepts connections; Ray itself would wait for minutes.
 
     Raises:
         ConfigError: nobody does.
@@ -270,11 +270,11 @@ def _refuse_silence(address: str) -> None:
     try:
         socket.create_connection((host.strip("[]"), int(port)), timeout=ANSWER_S).close()
     except (OSError, OverflowError) as error:
-        raise ConfigError(f"nobody answers ({error})", where=f"--address {address}", expected="a Ray cluster") from error
+        raise ConfigError(f"no answer ({error})", where=f"address={address}", expected="a Ray cluster") from error
 
 
 def _ray(*, local: bool) -> Any:
-    """Ray, told before it is imported to keep to itself; where somebody has imported it already, it is as it was told then."""
+    """Import Ray, with its settings in the environment before a first import."""
     if local and "ray" not in sys.modules:
         for name, value in QUIET.items():
             os.environ.setdefault(name, value)

@@ -1,8 +1,7 @@
-"""What a fleet has done, line by line in OUT/fleet.journal: it only grows, and what it says is on the disk.
+"""Journal of a fleet, OUT/fleet.journal: an append-only file of JSON lines, each flushed to the disk.
 
-A line says that a target was begun (so that a later run knows it for the fleet's own), or what became of a log. One process
-writes, holding a lock that goes with it. A line that was torn when that process died is cut off; a line that is no longer
-readable is passed over, and its log done again.
+A line notes that a target was begun (a later run then knows it as the fleet's own), or the result of a log. One process writes,
+and holds a lock. A line that a dying process left incomplete is cut off; an unreadable line is skipped, and its log done again.
 
 In an object store, where nothing can be appended to, OUT/fleet.journal/ holds pieces of it: each is written over with one line
 more until it is large enough for the next to begin, and what is read is a copy. Nobody there can hold a lock.
@@ -24,14 +23,14 @@ import msgspec
 from imutool import __version__
 from imutool.errors import ConfigError
 from imutool.fleet.task import Result, Settings
-from imutool.location import Location, failures, reason
+from imutool.location import Location, io_errors, reason
 
 NAME = "fleet.journal"
 PIECE_BYTES = 256 << 10  # of a journal in a store
 
 
 class Run(msgspec.Struct, frozen=True, tag_field="line", tag="run"):
-    """A run begins: what it does to every log, by which version of the tool, and whether all logs are to be done anew."""
+    """Start of a run: its settings, the version of the tool, and whether all logs are done anew."""
 
     settings: Settings
     digest: str
@@ -39,18 +38,18 @@ class Run(msgspec.Struct, frozen=True, tag_field="line", tag="run"):
     version: str = __version__
 
 
-class Began(msgspec.Struct, frozen=True, tag_field="line", tag="began"):
+class TargetBegun(msgspec.Struct, frozen=True, tag_field="line", tag="began"):
     """A target is about to be written."""
 
     key: str
     target: str
 
 
-_line = msgspec.json.Decoder(Run | Began | Result)
+_line = msgspec.json.Decoder(Run | TargetBegun | Result)
 
 
 class Journal:
-    """The journal of OUT, open for reading and appending; of what it says only keys and places in the file are held.
+    """Journal of OUT, open for reading and appending; memory holds only keys and offsets.
 
     With `resume` it goes on where it ended. With `overwrite` it begins anew or, with both, goes on under other settings.
 
@@ -71,7 +70,7 @@ class Journal:
             else:
                 self._file = tempfile.TemporaryFile()  # noqa: SIM115  closed with the journal
                 self._pieces = _Pieces(self.path, self._file)
-        except failures(out) as error:
+        except io_errors(out) as error:
             raise ConfigError(f"cannot be written ({reason(error)})", where=self.path, fix="Choose another OUT") from error
         try:
             self._lock()
@@ -96,7 +95,7 @@ class Journal:
         return target in self._begun
 
     def done(self, key: str) -> Result | None:
-        """What the journal says of a log, if it says anything."""
+        """Result of a log, if the journal has one."""
         at = self._done.get(key)
         if at is None:
             return None
@@ -106,16 +105,16 @@ class Journal:
         return found
 
     def begin(self, key: str, target: str) -> None:
-        """Says, before anything is written, that a target will be the fleet's own."""
+        """Note, before anything is written, that a target is the fleet's own."""
         if target not in self._begun:
-            self._append(Began(key, target))
+            self._append(TargetBegun(key, target))
             self._begun.add(target)
 
     def finish(self, result: Result) -> None:
-        """Says what became of a log."""
+        """Note the result of a log."""
         self._done[result.key] = self._append(result)
 
-    def _append(self, line: Run | Began | Result) -> int:
+    def _append(self, line: Run | TargetBegun | Result) -> int:
         raw = msgspec.json.encode(line) + b"\n"
         at = self._file.seek(0, os.SEEK_END)
         try:
@@ -125,11 +124,11 @@ class Journal:
                 os.fsync(self._file.fileno())
             else:
                 self._pieces.append(raw)
-        except failures(self.path) as error:
+        except io_errors(self.path) as error:
             with contextlib.suppress(OSError):
                 self._file.truncate(at)
             raise ConfigError(
-                f"cannot be written ({reason(error)})", where=self.path, fix="Make room, and go on with --resume"
+                f"cannot be written ({reason(error)})", where=self.path, fix="Make room, and go on with `resume`"
             ) from error
         return at
 
@@ -142,7 +141,7 @@ class Journal:
             ) from error
 
     def _read(self) -> Run | None:
-        """Takes in what is there, cuts a torn last line off, and returns the last run's line."""
+        """Read the journal, cut off an incomplete last line, and return the last run's line."""
         run, end = None, 0
         for at, raw in self._lines():
             if not raw.endswith(b"\n"):
@@ -156,7 +155,7 @@ class Journal:
                         run = line
                         if line.anew:
                             self._done.clear()
-                    case Began():
+                    case TargetBegun():
                         self._begun.add(line.target)
                     case Result():
                         self._begun.add(line.target)
@@ -177,18 +176,18 @@ class Journal:
             raise ConfigError(
                 "holds a fleet's results already",
                 where=self.path.parent,
-                fix="Go on with --resume, choose another OUT, or begin anew with --overwrite",
+                fix="Go on with `resume`, choose another `out`, or begin anew with `overwrite`",
             )
         if known.digest != settings.digest:
             raise ConfigError(
                 f"was begun with other settings ({_difference(known, settings)})",
                 where=self.path.parent,
-                fix="Give the same ones, choose another OUT, or add --overwrite to do all logs again",
+                fix="Give the same ones, choose another `out`, or add `overwrite` to do all logs again",
             )
 
 
 class _Pieces:
-    """A journal in a store; `file` gets what is there."""
+    """Journal in an object store; `file` gets its content."""
 
     def __init__(self, folder: Location, file: IO[bytes]) -> None:
         self._folder, self._held = folder, bytearray()
@@ -199,7 +198,7 @@ class _Pieces:
         self._number = 1 + max((int(one.stem) for one in there if one.stem.isdecimal()), default=-1)
 
     def append(self, raw: bytes) -> None:
-        """Writes the piece over with one line more."""
+        """Write the piece again with one more line."""
         if len(self._held) > PIECE_BYTES:
             self._held.clear()
             self._number += 1

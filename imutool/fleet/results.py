@@ -1,20 +1,53 @@
-"""OUT/fleet.parquet: a row for each log, for whatever reads Parquet."""
+"""Results of a fleet: the rows of OUT/fleet.parquet, one for each log, and their statistics."""
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, field
 from itertools import islice
 from typing import Any
 
 from imutool import __version__
 from imutool.errors import ConfigError
+from imutool.fleet.robots import FleetDiagnosis
 from imutool.fleet.task import Result
 from imutool.location import Location
 from imutool.mcap_io.storage.target import Target
+from imutool.report import UNSET, Report, Section, UnsetType
 
 NAME = "fleet.parquet"
 ROWS = 4096  # in a group; of a million logs no more are held
 SCHEMA = "imutool.fleet-results/1"
+MOST_ROWS = 500  # in a table: more is for the Parquet file
+TROUBLE = ("failed", "quarantined", "lost")
+
+
+class LogProblem(Section, frozen=True):
+    """A log that is not whole."""
+
+    source: str
+    status: str
+    error: str
+    losses: list[str]
+    exit_code: int
+
+
+class FleetSummary(Report, frozen=True, kw_only=True, tag="imutool.fleet/1"):
+    """The report of `imutool fleet`; `not_whole` lists the first thousand logs with a problem."""
+
+    command: str
+    source: str
+    output: str
+    results: str
+    logs: int
+    statuses: dict[str, int]
+    bytes: int
+    seconds: float
+    mb_per_s: float
+    exit_code: int
+    not_whole: list[LogProblem]
+    comparison: FleetDiagnosis | UnsetType = UNSET
 
 
 def arrow() -> Any:
@@ -33,7 +66,7 @@ def arrow() -> Any:
 
 
 def write(results: Iterable[Result], path: Location) -> None:
-    """Writes the rows, in the order in which they come; an earlier file is replaced once this one is whole.
+    """Write the rows in their order; an earlier file is replaced once this one is whole.
 
     Raises:
         ConfigError: pyarrow is not installed, or the system refuses to write.
@@ -79,8 +112,8 @@ def _schema(pa: Any) -> Any:
 
 
 def row(result: Result) -> dict[str, Any]:
-    """A result as the values of its row; what a failed log has none of is null."""
-    there = result.status != "failed"
+    """Row of a result; a failed log has nulls."""
+    known = result.status != "failed"
     return {
         "source": result.source,
         "target": result.target or None,
@@ -94,15 +127,15 @@ def row(result: Result) -> dict[str, Any]:
         "seconds": result.seconds,
         "cpu_seconds": result.cpu_seconds,
         "source_bytes": result.source_bytes,
-        "target_bytes": result.target_bytes if there else None,
+        "target_bytes": result.target_bytes if known else None,
         "target_sha256": result.target_sha256 or None,
-        "messages": result.messages if there else None,
+        "messages": result.messages if known else None,
         "duration_s": result.duration_s,
         "biases": [
-            {"topic": one.topic, "gyro_rad_s": list(one.gyro_bias), "accel_m_s2": list(one.accel_bias)} for one in result.imus
+            {"topic": imu.topic, "gyro_rad_s": list(imu.gyro_bias), "accel_m_s2": list(imu.accel_bias)} for imu in result.imus
         ],
-        "models": [one.model for one in result.imus],
-        "init_how": [one.init_how for one in result.imus],
+        "models": [imu.model for imu in result.imus],
+        "init_how": [imu.init_how for imu in result.imus],
         "robot": result.robot or None,
         "effects": None if result.effects is None else list(result.effects),
         "parameters": [
@@ -115,6 +148,49 @@ def row(result: Result) -> dict[str, Any]:
     }
 
 
+@dataclass
+class Statistics:
+    """Statistics of all results, gathered in result pass: counts, numbers for the histograms, and rows of the tables."""
+
+    statuses: Counter[str] = field(default_factory=Counter)
+    bytes_in: int = 0
+    bytes_out: int = 0
+    messages: int = 0
+    seconds: list[float] = field(default_factory=list)
+    speeds: list[float] = field(default_factory=list)
+    scores: list[float] = field(default_factory=list)
+    biases: dict[str, list[tuple[float, ...]]] = field(default_factory=lambda: {"gyro": [], "accel": []})
+    warnings: Counter[str] = field(default_factory=Counter)
+    trouble: list[Result] = field(default_factory=list)
+    peak_bytes: int = 0
+    drawn: list[Result] = field(default_factory=list)
+    pages: int = 0
+
+    def add(self, result: Result) -> None:
+        """Take in a result."""
+        status = result.earlier if result.status == "skipped" and result.earlier else result.status
+        self.statuses[status] += 1
+        self.statuses["skipped"] += result.status == "skipped"
+        self.peak_bytes = max(self.peak_bytes, result.peak_bytes)
+        if status in TROUBLE and len(self.trouble) < MOST_ROWS:
+            self.trouble.append(result)
+        if status == "failed":
+            return
+        self.bytes_in, self.bytes_out = self.bytes_in + result.source_bytes, self.bytes_out + result.target_bytes
+        self.messages += result.messages
+        self.pages += bool(result.page)
+        if result.page and len(self.drawn) < MOST_ROWS:
+            self.drawn.append(result)
+        self.seconds.append(result.seconds)
+        self.speeds.append(result.source_bytes / 1e6 / max(result.seconds, 1e-9))
+        if result.score is not None:
+            self.scores.append(result.score)
+        for imu in result.imus:
+            self.biases["gyro"].append(imu.gyro_bias)
+            self.biases["accel"].append(imu.accel_bias)
+        self.warnings.update({warning.partition(": ")[2] or warning for warning in result.warnings})
+
+
 def _batches(results: Iterable[Result]) -> Iterator[list[dict[str, Any]]]:
     waiting = iter(results)
     while rows := [row(one) for one in islice(waiting, ROWS)]:
@@ -122,7 +198,7 @@ def _batches(results: Iterable[Result]) -> Iterator[list[dict[str, Any]]]:
 
 
 class _Sink:
-    """A target as pyarrow asks a file to be."""
+    """File interface of a target for pyarrow."""
 
     closed = False
 
@@ -136,7 +212,7 @@ class _Sink:
         return raw.nbytes
 
     def tell(self) -> int:
-        """How many there are."""
+        """Number of bytes so far."""
         return self._target.position
 
     def flush(self) -> None:

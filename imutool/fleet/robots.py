@@ -1,9 +1,8 @@
-"""One kind of sensor on many robots: what all share, and which robot is unlike the others.
+"""Comparison of many robots with one kind of sensor: shared parameters, and outliers.
 
-Each log says of each parameter how large it is, and how sure that is. Logs of a robot are pooled by their certainty. A robot's
-value x is compared with the middle m of all (the median) and the spread s between them (Qn of Rousseeuw and Croux 1993, section
-3, which half of the robots cannot spoil, and which knows a normal spread from half the robots that the median absolute
-deviation needs):
+Each log gives each parameter with its standard deviation; the logs of a robot are pooled with inverse-variance weights. A
+robot's value x is compared with the median m of all robots and the robust spread s between them (Qn of Rousseeuw and Croux
+1993, section 3: breakdown point 50 %, twice as efficient as the median absolute deviation):
 
     z = (x - m) / sqrt(s^2 + std^2)
 
@@ -14,6 +13,7 @@ of all robots and effects those are told whose false discovery rate (Benjamini a
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -22,9 +22,13 @@ import numpy as np
 from jaxtyping import Float64
 from scipy.stats import t as student
 
-from imutool.diagnosis.quantity import value as told
 from imutool.diagnosis.result import Estimate
+from imutool.diagnosis.wording.quantity import value as value_text
+from imutool.errors import ConfigError
 from imutool.fleet.task import Parameter, Result
+from imutool.location import Location
+from imutool.mcap_io.log import Log
+from imutool.report import Report
 
 QN, MAD = 2.2219, 1.4826  # what makes them the standard deviation of normal numbers
 QN_OF_FEW = {2: 0.399, 3: 0.994, 4: 0.512, 5: 0.844, 6: 0.611, 7: 0.857, 8: 0.669, 9: 0.872}  # Croux and Rousseeuw 1992
@@ -35,8 +39,8 @@ FEWEST = 5  # robots: among fewer the odd one cannot be told
 SMALLEST = 0.01  # of the median uncertainty: a spread of nothing at all is rounding
 
 
-class Shared(NamedTuple):
-    """A parameter over all robots: its median, the robust spread between them, and how many there are."""
+class SharedParameter(NamedTuple):
+    """A parameter over all robots: its median, the robust spread between robots, and their number."""
 
     label: str
     unit: str
@@ -45,13 +49,13 @@ class Shared(NamedTuple):
     robots: int
 
     @property
-    def told(self) -> str:
+    def text(self) -> str:
         """`0.13 ± 0.19 %`: the middle, and the spread between robots."""
-        return told(Estimate(self.middle, self.spread, self.unit))
+        return value_text(Estimate(self.middle, self.spread, self.unit))
 
 
 class Outlier(NamedTuple):
-    """A robot that is unlike the others in an effect: in which parameter most, by how many sigmas, and how surely."""
+    """An outlier: a robot whose effect differs from the others', by its most deviating parameter."""
 
     robot: str
     effect: str
@@ -73,12 +77,12 @@ class Outlier(NamedTuple):
     @property
     def here(self) -> str:
         """What this robot shows."""
-        return told(Estimate(self.value, self.std, self.unit))
+        return value_text(Estimate(self.value, self.std, self.unit))
 
     @property
     def others(self) -> str:
         """What the others show: their middle and their spread."""
-        return told(Estimate(self.middle, self.spread, self.unit))
+        return value_text(Estimate(self.middle, self.spread, self.unit))
 
     @property
     def sentence(self) -> str:
@@ -87,12 +91,12 @@ class Outlier(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Compared:
-    """What all robots share, and the outliers, the clearest first."""
+class Comparison:
+    """Shared parameters of all robots, and the outliers, the clearest first."""
 
     robots: int
     logs: int
-    shared: tuple[Shared, ...]
+    shared: tuple[SharedParameter, ...]
     outliers: tuple[Outlier, ...]
     effects: Mapping[str, tuple[str, ...]]  # found by a search beyond what all are compared by: on which robots
 
@@ -105,18 +109,29 @@ class Compared:
         count = f"{odd} of {self.robots} robots {'is' if odd == 1 else 'are'}" if odd else f"None of {self.robots} robots is"
         return f"{count} unlike the others (false discovery rate below {FALSE_DISCOVERY:.0%}, {self.logs} logs)."
 
-    def plain(self) -> dict[str, Any]:
-        """As JSON has it."""
-        return {
-            "schema": "imutool.fleet-diagnosis/1",
-            "robots": self.robots,
-            "logs": self.logs,
-            "summary": self.summary,
-            "false_discovery_rate": FALSE_DISCOVERY,
-            "outliers": [one._asdict() | {"sentence": one.sentence} for one in self.outliers],
-            "shared": [one._asdict() for one in self.shared],
-            "effects": {name: list(robots) for name, robots in self.effects.items()},
-        }
+    def report(self) -> FleetDiagnosis:
+        """Report of the comparison."""
+        return FleetDiagnosis(
+            robots=self.robots,
+            logs=self.logs,
+            summary=self.summary,
+            false_discovery_rate=FALSE_DISCOVERY,
+            outliers=[outlier._asdict() | {"sentence": outlier.sentence} for outlier in self.outliers],
+            shared=[parameter._asdict() for parameter in self.shared],
+            effects={name: list(robots) for name, robots in self.effects.items()},
+        )
+
+
+class FleetDiagnosis(Report, frozen=True, kw_only=True, tag="imutool.fleet-diagnosis/1"):
+    """The comparison of robots; `effects` are those that a search found beyond the compared ones, with their robots."""
+
+    robots: int
+    logs: int
+    summary: str
+    false_discovery_rate: float
+    outliers: list[dict[str, Any]]
+    shared: list[dict[str, Any]]
+    effects: dict[str, list[str]]
 
 
 def label(effect: str, parameter: str) -> str:
@@ -124,8 +139,8 @@ def label(effect: str, parameter: str) -> str:
     return f"{effect} {parameter}".replace("_", " ")
 
 
-def compare(results: Iterable[Result]) -> Compared:
-    """What robots share and which are unlike the others, from what each log shows; failed logs say nothing."""
+def compare(results: Iterable[Result]) -> Comparison:
+    """Compare robots by the parameters of their logs; failed logs are left out."""
     logs: dict[str, list[Result]] = {}
     for one in results:
         if one.parameters:
@@ -141,14 +156,14 @@ def compare(results: Iterable[Result]) -> Compared:
     for k, name in enumerate(names):
         there = np.isfinite(x[:, k])
         middle, spread = _robust(x[there, k])
-        shared.append(Shared(label(*name), units[name], middle, spread, int(there.sum())))
+        shared.append(SharedParameter(label(*name), units[name], middle, spread, int(there.sum())))
     if len(pooled) >= FEWEST:
         found = _outliers(list(pooled), names, units, x, std)
     beyond: dict[str, set[str]] = {}
     for robot, own in logs.items():
         for effect in {effect for one in own for effect in one.effects or ()} - {effect for effect, _ in names}:
             beyond.setdefault(effect, set()).add(robot)
-    return Compared(
+    return Comparison(
         len(pooled),
         sum(map(len, logs.values())),
         tuple(shared),
@@ -158,7 +173,7 @@ def compare(results: Iterable[Result]) -> Compared:
 
 
 def _pooled(logs: Sequence[Sequence[Parameter]]) -> dict[tuple[str, str], tuple[float, float]]:
-    """Each parameter of a robot over its logs, weighed by their certainty; logs that disagree make it less sure."""
+    """Inverse-variance mean of each parameter over a robot's logs; disagreement of the logs enlarges its uncertainty."""
     columns: dict[tuple[str, str], list[tuple[float, float]]] = {}
     for parameters in logs:
         for one in parameters:
@@ -197,7 +212,7 @@ def _outliers(
     x: Float64[np.ndarray, "robots names"],
     std: Float64[np.ndarray, "robots names"],
 ) -> list[Outlier]:
-    """By effect of each robot, the parameter that is farthest off; those that chance does not explain, clearest first."""
+    """Most deviating parameter by robot and effect; those beyond the false discovery rate, the clearest first."""
     tested: list[Outlier] = []
     known = [(np.isfinite(column), *_robust(column[np.isfinite(column)])) for column in x.T]
     for r, robot in enumerate(robots):
@@ -219,5 +234,46 @@ def _outliers(
     tested.sort(key=lambda one: one.p_value)
     rates = np.array([one.p_value * len(tested) / (k + 1) for k, one in enumerate(tested)])
     rates = np.minimum.accumulate(rates[::-1])[::-1]
-    told_ = [one._replace(false_discovery_rate=float(rate)) for one, rate in zip(tested, rates, strict=True)]
-    return sorted((one for one in told_ if one.false_discovery_rate <= FALSE_DISCOVERY), key=lambda one: -one.sigma)
+    ranked = [one._replace(false_discovery_rate=float(rate)) for one, rate in zip(tested, rates, strict=True)]
+    return sorted((one for one in ranked if one.false_discovery_rate <= FALSE_DISCOVERY), key=lambda one: -one.sigma)
+
+
+def robot_of(name: str, pattern: str | None, log: Location) -> str:
+    """Name of the robot of a log: by a pattern on the log's name, by its metadata (`metadata:RECORD.KEY`), else by its folder.
+
+    Raises:
+        ConfigError: the pattern is invalid, or does not match.
+    """
+    fits = robot_pattern(pattern)
+    if fits is None:
+        folder, _, file = name.rpartition("/")
+        return folder or file.removesuffix(".mcap")
+    if isinstance(fits, str):
+        record, _, key = fits.rpartition(".")
+        with Log(log) as opened:
+            found = opened.metadata().get(record, {}).get(key, "")
+        if not found:
+            raise ConfigError(f"has no {key!r} in its metadata {record!r}", where=log)
+        return found
+    match = fits.search(name)
+    if match is None:
+        raise ConfigError(f"{fits.pattern!r} matches nothing in {name}", where="robot_from")
+    return str(match[1] if fits.groups else match[0])
+
+
+def robot_pattern(pattern: str | None) -> re.Pattern[str] | str | None:
+    """Regular expression on names, or RECORD.KEY of metadata.
+
+    Raises:
+        ConfigError: the pattern is neither.
+    """
+    if pattern is None:
+        return None
+    if pattern.startswith("metadata:"):
+        if "." not in pattern:
+            raise ConfigError(f"{pattern!r} names no metadata", where="robot_from", expected="metadata:RECORD.KEY")
+        return pattern.removeprefix("metadata:")
+    try:
+        return re.compile(pattern)
+    except re.error as error:
+        raise ConfigError(f"{pattern!r} is not a regular expression ({error})", where="robot_from") from error

@@ -1,4 +1,4 @@
-"""A fleet from its first log to its last: what there is, what is done already, who does the rest, and what came of it."""
+"""Run of a fleet: lists the logs, skips those done, gives the rest to the engine, and writes the results."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ from collections.abc import Callable, Iterator
 from contextlib import closing
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import msgspec
 
@@ -18,22 +17,24 @@ from imutool.fleet import results
 from imutool.fleet.engine import BUG, Engine
 from imutool.fleet.journal import NAME as JOURNAL
 from imutool.fleet.journal import Journal
-from imutool.fleet.robots import Compared, compare
-from imutool.fleet.sources import Found, find, leftovers, remove
+from imutool.fleet.results import FleetSummary, LogProblem
+from imutool.fleet.robots import Comparison, compare
+from imutool.fleet.sources import Found, find, partial_files, remove_files
 from imutool.fleet.task import FINAL, Result, Settings, Source, Task
-from imutool.fleet.work import called, page_name, write_json
+from imutool.fleet.work import page_name, target_name, write_json
 from imutool.location import Location, to_location
+from imutool.report import UNSET
 
 LOST = 3  # something of a log was lost, or a log was quarantined
 COMPARED = "fleet.json"
 TITLE = b"<title>Fleet "
-TOLD = 1000  # logs that are not whole, in JSON
+MOST_LISTED = 1000  # of the results with a problem, in JSON
 Tell = Callable[[int, int, str], None]
 
 
 @dataclass
-class Tally:
-    """How far a fleet is."""
+class Progress:
+    """Progress of a fleet: counts, bytes, exit codes."""
 
     logs: int
     total_bytes: int
@@ -43,8 +44,8 @@ class Tally:
     codes: set[int] = field(default_factory=set)
     began: float = field(default_factory=time.perf_counter)
 
-    def take(self, result: Result) -> None:
-        """Counts one more."""
+    def add(self, result: Result) -> None:
+        """Count one more result."""
         self.statuses[result.status] += 1
         self.bytes_done += result.source_bytes
         if result.status != "skipped":
@@ -59,7 +60,7 @@ class Tally:
         """0: every log whole; a bug above all, then the largest code of the logs that failed, then 3 for what was lost."""
         return BUG if BUG in self.codes else max(self.codes, default=0)
 
-    def words(self, running: int = 0) -> str:
+    def line(self, running: int = 0) -> str:
         """`12 of 40 done, 1 failed, 2 running, 35 MB/s, 1:20 left`."""
         elapsed = time.perf_counter() - self.began
         parts = [f"{self.statuses.total()} of {self.logs} done"]
@@ -79,42 +80,36 @@ class Tally:
 
 @dataclass(frozen=True)
 class FleetReport:
-    """What came of a fleet; `trouble` is of the logs that are not whole, the first thousand."""
+    """Outcome of a fleet; `not_whole` are the results with a problem, at most the first thousand."""
 
     source: str
     out: Location
     command: str
-    tally: Tally
+    progress: Progress
     seconds: float
-    trouble: tuple[Result, ...]
-    compared: Compared | None
+    not_whole: tuple[Result, ...]
+    comparison: Comparison | None
 
-    def plain(self) -> dict[str, Any]:
-        """As JSON has it."""
-        told: dict[str, Any] = {
-            "schema": "imutool.fleet/1",
-            "command": self.command,
-            "source": self.source,
-            "output": str(self.out),
-            "results": str(self.out / results.NAME),
-            "logs": self.tally.logs,
-            "statuses": dict(self.tally.statuses),
-            "bytes": self.tally.bytes_done,
-            "seconds": self.seconds,
-            "mb_per_s": self.tally.bytes_worked / 1e6 / self.seconds,
-            "exit_code": self.tally.exit_code,
-            "not_whole": [
-                {
-                    "source": one.source,
-                    "status": one.earlier or one.status,
-                    "error": one.error,
-                    "losses": list(one.losses),
-                    "exit_code": one.exit_code,
-                }
-                for one in self.trouble
+    def summary(self) -> FleetSummary:
+        """Summary in JSON."""
+        progress = self.progress
+        return FleetSummary(
+            command=self.command,
+            source=self.source,
+            output=str(self.out),
+            results=str(self.out / results.NAME),
+            logs=progress.logs,
+            statuses=dict(progress.statuses),
+            bytes=progress.bytes_done,
+            seconds=self.seconds,
+            mb_per_s=progress.bytes_worked / 1e6 / self.seconds,
+            exit_code=progress.exit_code,
+            not_whole=[
+                LogProblem(result.source, result.earlier or result.status, result.error, list(result.losses), result.exit_code)
+                for result in self.not_whole
             ],
-        }
-        return told if self.compared is None else told | {"comparison": self.compared.plain()}
+            comparison=UNSET if self.comparison is None else self.comparison.report(),
+        )
 
 
 def run(
@@ -129,110 +124,112 @@ def run(
     page: Location | None = None,
     tell: Tell = lambda done, total, words: None,
 ) -> FleetReport:
-    """Does what `settings` say to every log of `source`, into `out`, and writes fleet.parquet there and the page where asked.
+    """Apply `settings` to every log of `source`, into `out`; write fleet.parquet there, and the page where asked.
 
     Raises:
         ConfigError: no logs; an `out` that holds results already, or cannot be written; a page that exists (without `overwrite`
             or `resume`); no engine.
-        KeyboardInterrupt: with a word on how to go on; nothing half-written is left.
+        KeyboardInterrupt: the message says how to go on; no partial file is left.
     """
     began = time.perf_counter()
     results.arrow()  # before the work, not after
     target = _out(out)
     if not overwrite:
-        _refuse_strangers(target, page if page is None or not (resume and _is_page(page)) else None)
+        _refuse_existing(target, page if page is None or not (resume and _is_page(page)) else None)
     model = None if settings.model is None or not Path(settings.model).is_absolute() else _bytes(Path(settings.model))
     found = find(source, target, bags=settings.command == "repair")
-    tally = Tally(len(found.logs) + len(found.refused), sum(one.size for one in found.logs))
+    progress = Progress(len(found.logs) + len(found.refused), sum(source.size for source in found.logs))
     fleet = _Fleet(found, target, settings, overwrite, recheck)
 
     def tick(flying: int) -> None:
-        tell(tally.bytes_done, tally.total_bytes, tally.words(flying))
+        tell(progress.bytes_done, progress.total_bytes, progress.line(flying))
 
     with Journal(target, settings, resume=resume, overwrite=overwrite) as journal:
-        fleet.sweep()
+        fleet.remove_partial()
         try:
-            for result in fleet.hopeless(journal):
+            for result in fleet.refused(journal):
                 journal.finish(result)
-                tally.take(result)
+                progress.add(result)
             with engine() as workers, closing(workers.run(fleet.tasks(journal), tick, model)) as finished:
                 for result in finished:
                     if result.status == "skipped":
                         fleet.skipped.add(result.key)
                     else:
                         journal.finish(result)
-                    tally.take(result)
+                    progress.add(result)
         except KeyboardInterrupt as interrupt:
-            raise KeyboardInterrupt(f"{tally.words()}; go on with --resume") from interrupt
+            raise KeyboardInterrupt(f"{progress.line()}; go on with `resume`") from interrupt
         finally:
-            if tally.statuses.total() < tally.logs:  # workers have been killed
-                fleet.sweep()
-        return _told(fleet, journal, source, tally, began, page)
+            if progress.statuses.total() < progress.logs:  # workers have been killed
+                fleet.remove_partial()
+        return _report(fleet, journal, source, progress, began, page)
 
 
-def _told(fleet: _Fleet, journal: Journal, source: str, tally: Tally, began: float, page: Location | None) -> FleetReport:
-    """Everything that is made of the results: read from the journal as often as it takes, never held."""
+def _report(
+    fleet: _Fleet, journal: Journal, source: str, progress: Progress, began: float, page: Location | None
+) -> FleetReport:
+    """Table, comparison and page from the results, which are read from the journal each time and never held in memory."""
     settings, out = fleet.settings, fleet.out
     results.write(fleet.results(journal), out / results.NAME)
-    compared = None
+    comparison = None
     if settings.command == "diagnose":
-        compared = compare(fleet.results(journal))
-        write_json(compared.plain(), out / COMPARED)
+        comparison = compare(fleet.results(journal))
+        write_json(comparison.report(), out / COMPARED)
     seconds = time.perf_counter() - began
     if page is not None:
         from imutool.fleet import page as pages
 
         every = fleet.results(journal)
-        pages.write(every, settings, page, out=out, seconds=seconds, source=source, compared=compared, overwrite=True)
-    trouble = (one for one in fleet.results(journal) if (one.earlier or one.status) != "ok")
-    first = tuple(one for one, _ in zip(trouble, range(TOLD), strict=False))
-    return FleetReport(source, out, settings.command, tally, seconds, first, compared)
+        pages.write(every, settings, page, out=out, seconds=seconds, source=source, comparison=comparison, overwrite=True)
+    not_whole = (result for result in fleet.results(journal) if (result.earlier or result.status) != "ok")
+    first = tuple(result for result, _ in zip(not_whole, range(MOST_LISTED), strict=False))
+    return FleetReport(source, out, settings.command, progress, seconds, first, comparison)
 
 
 class _Fleet:
-    """What is to be done, made up as it is asked for: a million logs are a million small tuples, not tasks."""
+    """Logs and tasks of a fleet; tasks are made one at a time, since a fleet may have a million logs."""
 
     def __init__(self, found: Found, out: Location, settings: Settings, overwrite: bool, recheck: bool) -> None:
         self.found, self.out, self.settings = found, out, settings
         self._overwrite, self._recheck = overwrite, recheck
         self.skipped: set[str] = set()
 
-    def sweep(self) -> None:
-        """Removes what was half-written when somebody was killed."""
-        names = [self._name(one) for one in self.found.logs]
+    def remove_partial(self) -> None:
+        """Remove the partial files of a killed run."""
+        names = [self._name(source) for source in self.found.logs]
         pages = [page_name(name) for name in names] if self.settings.pages else []
-        remove(leftovers(self.out, [*names, *pages]))
+        remove_files(partial_files(self.out, [*names, *pages]))
 
-    def hopeless(self, journal: Journal) -> Iterator[Result]:
-        """Logs that cannot be taken, and those for which somebody else's file is in the way."""
+    def refused(self, journal: Journal) -> Iterator[Result]:
+        """Results of logs with an unusable name, and of those whose target is a file that no fleet has written."""
         for where, why in self.found.refused:
             yield Result(key=_key(where), source=where, target="", status="failed", error=why, exit_code=ConfigError.exit_code)
-        for one in self.found.logs:
-            if self._taken(one, journal):
+        for source in self.found.logs:
+            if self._blocked(source, journal):
                 error = ConfigError(
-                    "the target exists", where=self.out / self._name(one), fix="Choose another OUT, or add --overwrite"
+                    "the target exists", where=self.out / self._name(source), fix="Choose another `out`, or add `overwrite`"
                 )
                 yield Result(
-                    key=one.key(self.settings),
-                    source=one.place,
+                    key=source.key(self.settings),
+                    source=source.place,
                     target="",
                     status="failed",
-                    source_bytes=one.size,
+                    source_bytes=source.size,
                     error=str(error),
                     exit_code=error.exit_code,
                 )
 
     def tasks(self, journal: Journal) -> Iterator[Task]:
-        """The others; each is begun in the journal as it is taken."""
-        for one in self.found.logs:
-            if self._taken(one, journal):
+        """Tasks of the other logs; the journal notes each before it starts."""
+        for source in self.found.logs:
+            if self._blocked(source, journal):
                 continue
-            key, name = one.key(self.settings), self._name(one)
+            key, name = source.key(self.settings), self._name(source)
             done = journal.done(key)
             journal.begin(key, name)
             yield Task(
                 key=key,
-                source=one,
+                source=source,
                 out=str(self.out),
                 target=name,
                 settings=self.settings,
@@ -241,8 +238,8 @@ class _Fleet:
             )
 
     def results(self, journal: Journal) -> Iterator[Result]:
-        """What became of every log, in order of their names; those that were refused come last."""
-        keys = [one.key(self.settings) for one in self.found.logs] + [_key(where) for where, _ in self.found.refused]
+        """Results of all logs, sorted by name; refused logs come last."""
+        keys = [source.key(self.settings) for source in self.found.logs] + [_key(where) for where, _ in self.found.refused]
         for key in keys:
             result = journal.done(key)
             if result is not None and key in self.skipped:
@@ -251,25 +248,25 @@ class _Fleet:
                 yield result
 
     def _name(self, source: Source) -> str:
-        """What the result of a log is called below OUT."""
-        return called(source.name, self.settings.command)
+        """Name of a log's target below OUT."""
+        return target_name(source.name, self.settings.command)
 
-    def _taken(self, source: Source, journal: Journal) -> bool:
+    def _blocked(self, source: Source, journal: Journal) -> bool:
         name = self._name(source)
         return not (self._overwrite or journal.ours(name)) and (self.out / name).exists()
 
 
-def _refuse_strangers(out: Location, page: Location | None) -> None:
-    """Refuses to write over what no fleet has written.
+def _refuse_existing(out: Location, page: Location | None) -> None:
+    """Refuse to replace a file that no fleet has written.
 
     Raises:
         ConfigError: the page exists, or a table or comparison in an OUT that no fleet has begun.
     """
     if page is not None and page.exists():
-        raise ConfigError("the target exists", where=page, fix="Choose another --report, or add --overwrite")
+        raise ConfigError("the target exists", where=page, fix="Choose another `page`, or add `overwrite`")
     for name in (results.NAME, COMPARED):
         if not (out / JOURNAL).exists() and (out / name).exists():
-            raise ConfigError("the target exists", where=out / name, fix="Choose another OUT, or add --overwrite")
+            raise ConfigError("the target exists", where=out / name, fix="Choose another `out`, or add `overwrite`")
 
 
 def _is_page(path: Location) -> bool:
@@ -288,7 +285,7 @@ def _bytes(path: Path) -> bytes:
 
 
 def _key(where: str) -> str:
-    """What a log is filed under that cannot be taken."""
+    """Key of a refused log."""
     return hashlib.sha256(where.encode()).hexdigest()
 
 

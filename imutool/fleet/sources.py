@@ -1,4 +1,4 @@
-"""Which logs a fleet has, and what each is called below OUT: never a place outside it, never one name for two logs."""
+"""Source logs of a fleet, and the name of each below OUT: never outside of it, never the same for two logs."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 from imutool.errors import ConfigError
 from imutool.fleet.task import Source
-from imutool.location import Location, failures, identity, reason, seal, to_location
+from imutool.location import Location, identity, io_errors, reason, size_and_etag, to_location
 
 LOG, BAG = ".mcap", ".bag"
 PATTERN = re.compile(r"[*?\[]")
@@ -21,24 +21,24 @@ OWN = "fleet."  # how the names of what the fleet itself writes at the top of OU
 
 
 class Found(NamedTuple):
-    """The logs of a fleet in order of their names, and the places of those that cannot be taken, with the reason."""
+    """Logs of a fleet sorted by name, and the places of refused ones with the reason."""
 
     logs: list[Source]
     refused: list[tuple[str, str]]
 
 
 class _File(NamedTuple):
-    """A file as a listing gives it; what a store's listing says of it besides, so that it need not be asked again."""
+    """File of a listing, with the details that a store's listing gives."""
 
     where: str
     about: dict[str, Any] | None = None
 
 
 def find(text: str, out: Location, *, bags: bool = False) -> Found:
-    """The logs that a path, a glob, a folder or a URL names, with `bags` ROS 1 bags too; what lies below `out` is no source.
+    """Find the logs of a path, a glob, a folder or a URL, with `bags` ROS 1 bags too; logs below `out` are left out.
 
-    A log is called by its path from the folder, or from the last part of a pattern before its first wildcard; a log alone by
-    its own name. Links are followed. A log that cannot be called anything below OUT is refused, and the others go on.
+    The name of a log is its path from the folder, or from the last part of a pattern before its first wildcard; a single log
+    keeps its own name. Links are followed. A log without a usable name below OUT is refused, and the others go on.
 
     Raises:
         ConfigError: nothing there, or no log in it.
@@ -54,7 +54,7 @@ def find(text: str, out: Location, *, bags: bool = False) -> Found:
             before = taken.setdefault(name.casefold(), where)  # one file on some systems, two on others
             if before != where:
                 raise ConfigError(f"would be called {name}, and so would {before}", fix="Rename one of the two")
-            logs.append(Source(where, name, *(identity(Path(where)) if about is None else seal(about))))
+            logs.append(Source(where, name, *(identity(Path(where)) if about is None else size_and_etag(about))))
         except ConfigError as error:
             refused.append((_shown(where), str(error)))
     if not logs and not refused:
@@ -66,10 +66,10 @@ def find(text: str, out: Location, *, bags: bool = False) -> Found:
 
 
 def relative(file: str, root: str) -> str:
-    """What a file below a root is called below OUT.
+    """Name below OUT of a file below a root.
 
     Raises:
-        ConfigError: a name that leads elsewhere, or that a terminal or a file system would not take as it is.
+        ConfigError: the name leads elsewhere, or a terminal or a file system would not take it.
     """
     if not file.startswith(f"{root.rstrip('/')}/"):
         raise ConfigError("lies outside what was asked for", expected=f"something below {root}")
@@ -92,7 +92,7 @@ def _shown(name: str) -> str:
 
 
 def _files(text: str, endings: tuple[str, ...]) -> tuple[str, Iterator[_File]]:
-    """Where names begin, and the files."""
+    """Root of the names, and the files."""
     where = to_location(text)
     if not isinstance(where, Path):
         return _in_store(text, endings)
@@ -129,7 +129,7 @@ def _walk(folder: Path, endings: tuple[str, ...], above: frozenset[tuple[int, in
 
 
 def _in_store(text: str, endings: tuple[str, ...]) -> tuple[str, Iterator[_File]]:
-    """As `_files`, by listings alone: a thousand objects a request."""
+    """Files in an object store, by listings: a thousand objects a request."""
     match = PATTERN.search(text)
     fixed = text.rstrip("/") if match is None else text[: match.start()].rpartition("/")[0]
     root = to_location(fixed)
@@ -139,7 +139,7 @@ def _in_store(text: str, endings: tuple[str, ...]) -> tuple[str, Iterator[_File]
             found = root.fs.find(root.path, detail=True)
         else:
             found = root.fs.glob(root.path.rstrip("/") + text[len(fixed) :], detail=True)
-    except failures(root) as error:
+    except io_errors(root) as error:
         raise ConfigError(f"cannot be listed ({reason(error)})", where=text) from error
     whole = fixed.rpartition("/")[0] if list(found) == [root.path] else fixed  # a log alone, by its own name
     files = [_File(fixed + path[len(root.path.rstrip("/")) :], about) for path, about in sorted(found.items())]
@@ -149,7 +149,7 @@ def _in_store(text: str, endings: tuple[str, ...]) -> tuple[str, Iterator[_File]
 
 
 def within(out: Location, name: str) -> Location:
-    """The target of a name below OUT.
+    """Target of a name below OUT.
 
     Raises:
         ConfigError: a link in OUT leads elsewhere.
@@ -162,8 +162,8 @@ def within(out: Location, name: str) -> Location:
     return target
 
 
-def leftovers(out: Location, names: Iterable[str]) -> Iterator[Location]:
-    """Files that were being written beside these targets when somebody was killed: .NAME.PID.RANDOM.partial."""
+def partial_files(out: Location, names: Iterable[str]) -> Iterator[Location]:
+    """Partial files that killed runs left beside these targets: .NAME.PID.RANDOM.partial."""
     folders: dict[str, set[str]] = {}
     for name in names:
         folder, _, file = name.rpartition("/")
@@ -175,8 +175,8 @@ def leftovers(out: Location, names: Iterable[str]) -> Iterator[Location]:
                 yield path
 
 
-def remove(leftover: Iterable[Location]) -> None:
-    """Removes them, unless somebody else has meanwhile.
+def remove_files(leftover: Iterable[Location]) -> None:
+    """Remove files; a missing one is no error.
 
     Raises:
         ConfigError: the system refuses.
@@ -186,12 +186,12 @@ def remove(leftover: Iterable[Location]) -> None:
             path.unlink()
         except FileNotFoundError:
             continue
-        except failures(path) as error:
+        except io_errors(path) as error:
             raise ConfigError(f"cannot be removed ({reason(error)})", where=path) from error
 
 
 def _partial(folder: Location) -> list[Location]:
     try:
         return list(folder.glob(".*.partial"))
-    except failures(folder) as error:
+    except io_errors(folder) as error:
         raise ConfigError(f"cannot be listed ({reason(error)})", where=folder) from error

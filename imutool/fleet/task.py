@@ -1,8 +1,9 @@
-"""What crosses the border between the one who plans and those who work: a task there, a result back, both plain data."""
+"""Settings, tasks and results of a fleet: plain data that the planner and the workers exchange."""
 
 from __future__ import annotations
 
 import hashlib
+from pathlib import Path
 from typing import Literal
 
 import msgspec
@@ -12,11 +13,11 @@ from imutool import __version__
 Command = Literal["debias", "repair", "info", "diagnose"]
 Status = Literal["ok", "lost", "failed", "quarantined", "skipped"]
 
-FINAL = frozenset({"ok", "lost", "quarantined"})  # a failed log is tried again by --resume, these are done
+FINAL = frozenset({"ok", "lost", "quarantined"})  # with `resume` a failed log is tried again; these are done
 
 
 class Settings(msgspec.Struct, frozen=True, kw_only=True):
-    """What is done to every log. Paths and URLs are absolute; `model_sha256` is of the model file, or of all that ship."""
+    """Settings of the work on every log; paths are absolute, `model_sha256` is of the model file or of all that ship."""
 
     command: Command
     model: str | None = None
@@ -35,12 +36,34 @@ class Settings(msgspec.Struct, frozen=True, kw_only=True):
 
     @property
     def digest(self) -> str:
-        """One hash over all that decides what comes out, the version of the tool included."""
+        """SHA-256 over all that decides the results, the version of the tool included."""
         return _sha256(__version__, msgspec.json.encode(self).decode())
 
 
+def with_model_hash(settings: Settings) -> Settings:
+    """Settings with the model's absolute path and SHA-256: the same name may stand for another file tomorrow.
+
+    Without a model the hash is that of all that ship, since each log chooses one of them.
+
+    Raises:
+        ModelError: no such model.
+    """
+    from imutool.bias.io import digest, find_model, library
+
+    name = settings.model
+    if name is not None and Path(name).suffix in {".safetensors", ".toml"}:
+        path = Path(name).absolute()
+        if path.suffix == ".safetensors":
+            find_model(path)  # before a thousand logs say the same
+        return msgspec.structs.replace(settings, model=str(path), model_sha256=digest(path))
+    if name is not None and name != "static":
+        return msgspec.structs.replace(settings, model_sha256=str(find_model(name).card["sha256"]))
+    every = "".join(digest(path) for path in sorted(library().glob("*.safetensors")))
+    return msgspec.structs.replace(settings, model_sha256=hashlib.sha256(every.encode()).hexdigest())
+
+
 class Source(msgspec.Struct, frozen=True):
-    """A log: where it is, what it is called below OUT, and what tells it from another one of that name.
+    """A source log: its place, its name below OUT, and its identity (size and stamp).
 
     `stamp` is the store's etag, or the time of the last change in nanoseconds.
     """
@@ -51,12 +74,12 @@ class Source(msgspec.Struct, frozen=True):
     stamp: str
 
     def key(self, settings: Settings) -> str:
-        """What its result is filed under: another content or other settings make another key."""
+        """Key of its result: changes with the content and with the settings."""
         return _sha256(self.place, str(self.size), self.stamp, settings.digest)
 
 
 class Imu(msgspec.Struct, frozen=True):
-    """What was taken off an IMU at the start: model, how the start was found, gyro (rad/s) and accel (m/s²) bias."""
+    """Start bias of an IMU, gyro (rad/s) and accel (m/s²), with its model and how the start was found."""
 
     topic: str
     model: str
@@ -66,7 +89,7 @@ class Imu(msgspec.Struct, frozen=True):
 
 
 class Parameter(msgspec.Struct, frozen=True):
-    """A number of an effect as one log shows it, with its standard deviation."""
+    """Parameter of an effect as one log shows it, with its standard deviation."""
 
     effect: str
     name: str
@@ -76,9 +99,9 @@ class Parameter(msgspec.Struct, frozen=True):
 
 
 class Result(msgspec.Struct, frozen=True, kw_only=True, tag_field="line", tag="done"):
-    """What became of one log. `target` is relative to OUT; `exit_code` is what the command alone would have ended with.
+    """Result of one log. `target` is relative to OUT; `exit_code` is that of the command on this log alone.
 
-    `earlier`, of a log that was skipped, is the status it got when it was done.
+    `earlier` is the status of a skipped log from the run that did it.
     """
 
     key: str
@@ -109,9 +132,9 @@ class Result(msgspec.Struct, frozen=True, kw_only=True, tag_field="line", tag="d
 
 
 class Task(msgspec.Struct, frozen=True, kw_only=True):
-    """One log to be worked on. `done` is what an earlier run says of it, to be checked before it is believed.
+    """Task of one log. `done` is the result of an earlier run, to be checked before it is used.
 
-    An existing target is replaced: who makes a task has seen that it is the fleet's own, or may be replaced.
+    An existing target is replaced: the planner has checked that it is the fleet's own, or may be replaced.
     """
 
     key: str
@@ -120,7 +143,7 @@ class Task(msgspec.Struct, frozen=True, kw_only=True):
     target: str
     settings: Settings
     done: Result | None = None
-    recheck: bool = False  # by reading it whole
+    recheck: bool = False  # read the whole target again
 
 
 def _sha256(*parts: str) -> str:

@@ -1,6 +1,6 @@
 """Rotations on tensors: exponential, logarithm, Jacobians and quaternions, for any batch, in float32 and float64.
 
-Right convention throughout (`design.md`, Names): `R_wb` takes body vectors to world and dR/dt = R_wb [omega_b]x, hence
+Right convention throughout: `R_wb` takes body vectors to world and dR/dt = R_wb [omega_b]x, hence
 d Exp(xi)/dt = Exp(xi) [J_r(xi) dxi/dt]x (Barfoot, State Estimation for Robotics, 2017, eq. 7.77a; Chirikjian 2012).
 
 Every function of the angle is written as a function of s = |xi|², which is analytic: no square root is differentiated
@@ -80,13 +80,6 @@ def hat(v: Vectors) -> Rotations:
     return flat.reshape(*v.shape[:-1], 3, 3)
 
 
-def vee(skew: Rotations) -> Vectors:
-    """The vector of a skew matrix; of any other matrix, that of its skew part."""
-    upper = torch.stack([skew[..., 2, 1], skew[..., 0, 2], skew[..., 1, 0]], dim=-1)
-    lower = torch.stack([skew[..., 1, 2], skew[..., 2, 0], skew[..., 0, 1]], dim=-1)
-    return 0.5 * (upper - lower)
-
-
 def exp(xi: Vectors) -> Rotations:
     """The rotation Exp(xi) = I + sin(a)/a [xi]x + (1 - cos a)/a² [xi]x², a = |xi| (Rodrigues)."""
     s = _squared(xi)
@@ -111,12 +104,6 @@ def right_jacobian(xi: Vectors) -> Rotations:
     return _quadratic(xi, s, -_versine(s), _defect(s))
 
 
-def left_jacobian(xi: Vectors) -> Rotations:
-    """J_l(xi) = J_r(-xi) = J_r(xi)^T."""
-    s = _squared(xi)
-    return _quadratic(xi, s, _versine(s), _defect(s))
-
-
 def right_jacobian_inverse(xi: Vectors) -> Rotations:
     """J_r^{-1}(xi) = I + [xi]x / 2 + (1/a² - cot(a/2) / (2a)) [xi]x², defined for |xi| < 2 pi.
 
@@ -124,12 +111,6 @@ def right_jacobian_inverse(xi: Vectors) -> Rotations:
     """
     s = _squared(xi)
     return _quadratic(xi, s, torch.full_like(s, 0.5), _half_cot(s))
-
-
-def left_jacobian_inverse(xi: Vectors) -> Rotations:
-    """J_l^{-1}(xi) = J_r^{-1}(-xi), defined for |xi| < 2 pi."""
-    s = _squared(xi)
-    return _quadratic(xi, s, torch.full_like(s, -0.5), _half_cot(s))
 
 
 def chart_rate(xi: Vectors, omega_b: Vectors) -> Vectors:

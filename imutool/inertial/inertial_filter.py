@@ -129,7 +129,7 @@ def level(accel: Vector3, bias: Vector6, ground: Vector6, P_bias: Float64[np.nda
     return State(exp(turn), np.zeros(3), np.zeros(3), bias, ground, P)
 
 
-def move(x: State, motion: Increment, missing_s: float, walk: Vector6, s: FilterSettings) -> Step:
+def motion_step(x: State, motion: Increment, missing_s: float, walk: Vector6, s: FilterSettings) -> Step:
     """Through a block in motion, integrated with the bias of `x`; then the bounded velocity. `walk` is b's in a second^1/2."""
     T = motion.duration_s
     R = x.R_wb @ motion.R
@@ -143,7 +143,7 @@ def move(x: State, motion: Increment, missing_s: float, walk: Vector6, s: Filter
     return step._replace(after=update(step.expected, STOPPED, v, np.full(3, noise)))
 
 
-def stand(x: State, mean: Vector6, variance: Float64[np.ndarray, "3"], T: float, walk: Vector6, s: FilterSettings) -> Step:
+def rest_step(x: State, mean: Vector6, variance: Float64[np.ndarray, "3"], T: float, walk: Vector6, s: FilterSettings) -> Step:
     """Through a block at rest, from the samples' mean and the variance of the gyro's: no velocity, no rate."""
     dv = (mean[3:] - x.bias[3:] - x.ground[3:]) * T
     by_bias = np.zeros((9, 6))
@@ -212,7 +212,7 @@ def smooth(steps: Sequence[Step]) -> list[State]:
     return found[::-1]
 
 
-def again(x: State, accel: Vector3, s: FilterSettings) -> Step:
+def reset_pose(x: State, accel: Vector3, s: FilterSettings) -> Step:
     """Pose anew, biases kept: after a time without samples, in which anything may have happened."""
     fresh = level(accel, x.bias, x.ground, x.P[9:, 9:], s)
     P = fresh.P + LEAST_VARIANCE * np.eye(SIZE)

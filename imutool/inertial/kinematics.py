@@ -134,7 +134,7 @@ class Trajectory:
                 )
 
 
-def through(poses: Poses, knot_spacing_s: float | None = None, degree: int = DEGREE) -> Trajectory:
+def fit_trajectory(poses: Poses, knot_spacing_s: float | None = None, degree: int = DEGREE) -> Trajectory:
     """The smooth trajectory through true poses, time counted from the first of them.
 
     Without `knot_spacing_s` the splines pass through every pose, noise included: its second derivative is then noise
@@ -161,17 +161,6 @@ def through(poses: Poses, knot_spacing_s: float | None = None, degree: int = DEG
             fix="Use a larger knot spacing, or a stretch of truth without gaps",
         ) from error
     return Trajectory(int(poses.t_ns[0]), position, quaternion)
-
-
-def rates_from_poses(poses: Poses) -> Vectors:
-    """Mean angular rate (rad/s, body frame) over each interval between consecutive poses: Log(R_k^T R_{k+1}) / dt.
-
-    One row less than there are poses. A turn of more than pi between two poses is read as its shorter complement.
-    """
-    rotations = Rotation.from_quat(poses.q_wb_wxyz, scalar_first=True)
-    dt = np.diff(poses.t_ns).astype(np.float64) * 1e-9
-    turned: Vectors = (rotations[:-1].inv() * rotations[1:]).as_rotvec() / dt[:, None]
-    return turned
 
 
 def _conjugate_product(a: Float64[np.ndarray, "n 4"], b: Float64[np.ndarray, "n 4"]) -> Vectors:

@@ -63,7 +63,7 @@ class Blocks(NamedTuple):
     late: Bool[np.ndarray, " m"]  # samples are missing inside or before it
 
 
-def in_blocks(batches: Iterable[Batch], period_s: float, settings: StationarySettings | None = None) -> Blocks:
+def block_statistics(batches: Iterable[Batch], period_s: float, settings: StationarySettings | None = None) -> Blocks:
     """The blocks of some samples, of which no more than a batch is held; what does not fill a block at the end is left out."""
     k = max(2, round((settings or StationarySettings()).block_s / period_s))
     parts = [_blocks_of(np.zeros(0, np.int64), np.zeros((0, 6)), k, 0, period_s)]
@@ -88,18 +88,18 @@ def _blocks_of(t_ns: Int64[np.ndarray, " n"], u: Float64[np.ndarray, "n 6"], k: 
     return Blocks(k, period_s, t[:, 0].copy(), t[:, -1].copy(), np.asarray(cut.mean(axis=1)), cut.var(axis=1, ddof=1), inside)
 
 
-def stretches(imu: Imu, settings: StationarySettings | None = None) -> list[tuple[int, int]]:
+def rest_stretches(imu: Imu, settings: StationarySettings | None = None) -> list[tuple[int, int]]:
     """Index ranges `[start, end)` in which the sensor rests for at least `min_s`, in order and apart.
 
     An IMU with fewer samples than a window, or less than two a block, has no stretches.
     """
     if len(imu) < 2:
         return []
-    blocks = in_blocks([(imu.t_ns, imu.gyro, imu.accel)], imu.period_s, settings)
-    return [(first * blocks.k, last * blocks.k) for first, last in resting(blocks, settings)]
+    blocks = block_statistics([(imu.t_ns, imu.gyro, imu.accel)], imu.period_s, settings)
+    return [(first * blocks.k, last * blocks.k) for first, last in resting_blocks(blocks, settings)]
 
 
-def resting(blocks: Blocks, settings: StationarySettings | None = None) -> list[tuple[int, int]]:
+def resting_blocks(blocks: Blocks, settings: StationarySettings | None = None) -> list[tuple[int, int]]:
     """Ranges `[first, end)` of blocks over which the sensor rests for at least `min_s`, in order and apart.
 
     Window statistics: block means m_j and variances s_j^2 over k samples each; rest when
@@ -132,7 +132,7 @@ def resting(blocks: Blocks, settings: StationarySettings | None = None) -> list[
     return [(a, b) for a, b in _runs(resting_blocks) if blocks.last_ns[b - 1] - blocks.first_ns[a] >= least_ns]
 
 
-class Stillness:
+class OnlineRestDetector:
     """The same rule for samples as they come: told block after block, it says whether the sensor has rested until now.
 
     What `stretches` takes from the whole log is taken from what there was of it so far: the calmest windows, and the usual

@@ -30,7 +30,7 @@ Vectors = Float64[np.ndarray, "n 3"]
 Quaternions = Float64[np.ndarray, "n 4"]
 
 
-class Start(NamedTuple):
+class StartPose(NamedTuple):
     """Where an integration begins: orientation (body to world), position in m, world velocity in m/s."""
 
     q_wb_wxyz: Float64[np.ndarray, "4"]
@@ -38,7 +38,7 @@ class Start(NamedTuple):
     v_w: Float64[np.ndarray, "3"]
 
     @classmethod
-    def of(cls, poses: Poses, row: int = 0) -> Start:
+    def of(cls, poses: Poses, row: int = 0) -> StartPose:
         """The start at one row of a trajectory.
 
         Raises:
@@ -56,7 +56,7 @@ def dead_reckon(
     start: tuple[Float64[np.ndarray, "4"], Float64[np.ndarray, "3"], Float64[np.ndarray, "3"]],
     g_w: tuple[float, float, float] = GRAVITY_W,
 ) -> Poses:
-    """The trajectory that the IMU alone gives, at every one of its stamps, the first being `start` (a `Start`).
+    """The trajectory that the IMU alone gives, at every one of its stamps, the first being `start` (a `StartPose`).
 
     Rotations are a prefix product of quaternions in log depth, velocity and position cumulative sums; the rounding
     grows with the logarithm of the length. 30 000 samples take about 10 ms.
@@ -97,7 +97,7 @@ def along_truth(imu: Imu, truth: Poses, where: str) -> tuple[Poses, Poses, Bool[
         NumericsError: the numbers overflow.
     """
     rows, true, valid = stretch_with_truth(imu.t_ns, truth, where)
-    return dead_reckon(imu.rows(rows), Start.of(true)), true, valid
+    return dead_reckon(imu.rows(rows), StartPose.of(true)), true, valid
 
 
 def stretch_with_truth(t_ns: Times, truth: Poses, where: str) -> tuple[slice, Poses, Bool[np.ndarray, " m"]]:
@@ -114,7 +114,7 @@ def stretch_with_truth(t_ns: Times, truth: Poses, where: str) -> tuple[slice, Po
     return rows, true.rows(rows), valid[rows]
 
 
-class Drifted(NamedTuple):
+class Drift(NamedTuple):
     """Errors of integrations that each start from the truth: orientation (rad), velocity (m/s) and position (m)."""
 
     orientation_rad: Float64[np.ndarray, " m"]
@@ -122,7 +122,7 @@ class Drifted(NamedTuple):
     position_m: Float64[np.ndarray, " m"]
 
 
-def drifted(path: Poses, truth: Poses, first: Int64[np.ndarray, " m"], last: Int64[np.ndarray, " m"] | slice) -> Drifted:
+def window_drift(path: Poses, truth: Poses, first: Int64[np.ndarray, " m"], last: Int64[np.ndarray, " m"] | slice) -> Drift:
     """How far integrations that start from the truth at rows `first` are from it at rows `last`, all from one integration.
 
     `path` is that of the same samples from any start, on the stamps of `truth`. Had it started from the truth at row s, all of
@@ -150,10 +150,10 @@ def drifted(path: Poses, truth: Poses, first: Int64[np.ndarray, " m"], last: Int
     further = p_true[first] - p_true[last] + v_true[first] * T + g_S
     further += quaternion.rotate(q_c, p[last] - p[first] - v[first] * T - g_S)
     turned = quaternion.angle_between(quaternion.multiply(q_c, q[last]), q_true[last])
-    return Drifted(turned, quaternion.length(faster), quaternion.length(further))
+    return Drift(turned, quaternion.length(faster), quaternion.length(further))
 
 
-def drift(path: Poses, truth: Poses, valid: Bool[np.ndarray, " n"], window_s: float) -> Drifted:
+def drift(path: Poses, truth: Poses, valid: Bool[np.ndarray, " n"], window_s: float) -> Drift:
     """How far integration drifts in a window, at the end of each, of what `along_truth` gives.
 
     Windows follow one another through the log; each starts from the truth and counts if the truth is known at both ends and the
@@ -177,7 +177,7 @@ def drift(path: Poses, truth: Poses, valid: Bool[np.ndarray, " n"], window_s: fl
             pairs.append((first, last))
         first = last
     rows = np.array(pairs, np.int64).reshape(-1, 2)
-    return drifted(path, truth, rows[:, 0], rows[:, 1])
+    return window_drift(path, truth, rows[:, 0], rows[:, 1])
 
 
 def with_velocity(poses: Poses) -> Poses:

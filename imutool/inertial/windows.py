@@ -22,7 +22,7 @@ Samples = Float[Tensor, "batch n 3"]
 Steps = Float[Tensor, "batch n-1"]
 
 
-def between(u: Samples) -> Float[Tensor, "batch n-1 3"]:
+def step_means(u: Samples) -> Float[Tensor, "batch n-1 3"]:
     """The mean of each sample and the next: what a step from one to the other sees."""
     return 0.5 * (u[:, :-1] + u[:, 1:])
 
@@ -47,13 +47,13 @@ def whole_product(increments: Float[Tensor, "batch n 3 3"]) -> Float[Tensor, "ba
 
 def attitudes(R_start: Float[Tensor, "batch 3 3"], gyro: Samples, dt: Steps) -> Float[Tensor, "batch n 3 3"]:
     """Attitude (body to world) at each sample, from `R_start` at the first."""
-    later = R_start[:, None] @ running_product(so3.exp(between(gyro) * dt[..., None]))
+    later = R_start[:, None] @ running_product(so3.exp(step_means(gyro) * dt[..., None]))
     return torch.cat([R_start[:, None], later], dim=1)
 
 
 def end_attitude(R_start: Float[Tensor, "batch 3 3"], gyro: Samples, dt: Steps) -> Float[Tensor, "batch 3 3"]:
     """Attitude at the last sample alone, at half the cost."""
-    return R_start @ whole_product(so3.exp(between(gyro) * dt[..., None]))
+    return R_start @ whole_product(so3.exp(step_means(gyro) * dt[..., None]))
 
 
 def rotation_residual(
@@ -65,7 +65,7 @@ def rotation_residual(
         e = Log(R_hat^T R_true) in rad, and A with e(gyro + d) = e - sum_k A_k d_k to first order in a small e, d_k the
         change of the rate over step k (`between`): it turns the step's end by d_k dt_k, seen through what comes after.
     """
-    running = running_product(so3.exp(between(gyro) * dt[..., None]))
+    running = running_product(so3.exp(step_means(gyro) * dt[..., None]))
     R_hat = running[:, -1]
     A = (R_hat.mT[:, None] @ running) * dt[..., None, None]
     return so3.log(R_hat.mT @ R_true), A

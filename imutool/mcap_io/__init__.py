@@ -1,1 +1,1 @@
-"""MCAP: what the log holds, how an array becomes messages and back, and the pass-through that keeps every byte."""
+"""Read, write, copy, verify and repair MCAP logs."""

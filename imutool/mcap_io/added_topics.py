@@ -1,4 +1,4 @@
-"""What is added to a log: topics computed from one of its IMUs, batch by batch as the log is copied."""
+"""Topics added to a log, computed from one of its IMUs batch by batch as the log is copied."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ from typing import NamedTuple, Protocol, runtime_checkable
 import numpy as np
 from jaxtyping import Int64, Shaped, UInt8, UInt16
 
-from imutool.mcap_io.batches import ImuBatch
-from imutool.mcap_io.codec import records
+from imutool.mcap_io.codec import messages
 from imutool.mcap_io.log import Log
+from imutool.mcap_io.topics import ImuBatch
 from imutool.mcap_io.writer import Chunk
 
-FEED_BYTES = 1 << 18  # of IMU messages make a batch: one chunk holds a few among its images, too few for numpy to be quick
+BATCH_BYTES = 1 << 18  # of IMU messages are decoded at once: one chunk holds too few among its images for numpy to be quick
 
-Heads = Shaped[np.ndarray, " n"]  # of dtype records.MESSAGE
+Heads = Shaped[np.ndarray, " n"]  # of dtype messages.MESSAGE
 Payload = UInt8[np.ndarray, "n L"]
 
 
@@ -27,16 +27,19 @@ class NewTopic(NamedTuple):
     schema_name: str
 
 
-class Made(NamedTuple):
-    """Messages computed from a batch: times and sequence of the source messages that have one, a payload row for each."""
+class DerivedBatch(NamedTuple):
+    """Messages computed from a batch, a payload row for each.
+
+    `batch` holds the source messages that have one.
+    """
 
     batch: ImuBatch
     payloads: Sequence[UInt8[np.ndarray, "n L"]]
 
 
 @runtime_checkable
-class Derived(Protocol):
-    """Channels computed from one IMU topic of the source, which is fed in file order."""
+class DerivedTopics(Protocol):
+    """Topics computed from one IMU topic of the source, in file order."""
 
     @property
     def source_topic(self) -> str:
@@ -46,67 +49,67 @@ class Derived(Protocol):
     def topics(self) -> Sequence[NewTopic]:
         """The topics to be added."""
 
-    def __call__(self, batch: ImuBatch) -> Made:
-        """What to write for a batch: which of its messages stay, and one array of CDR payloads per new topic."""
+    def __call__(self, batch: ImuBatch) -> DerivedBatch:
+        """Messages for a batch: the source messages that stay, and CDR payloads per new topic."""
 
 
 @dataclass
-class Stream:
-    """One `Derived`, the ids of its channels, and what waits to be decoded, then to be written."""
+class DerivedStream:
+    """Queues of one `DerivedTopics`: source messages to decode, computed messages to write."""
 
     log: Log
-    make: Derived
+    derived: DerivedTopics
     sources: set[int]
     ids: list[int]
-    waiting: list[tuple[Heads, Payload]] = field(default_factory=list)  # of the source, of equal size
-    waits: int = 0  # bytes of them
+    undecoded: list[tuple[Heads, Payload]] = field(default_factory=list)  # of the source, of equal size
+    undecoded_bytes: int = 0
     data: list[UInt8[np.ndarray, "n M"]] = field(default_factory=list)
     channels: list[UInt16[np.ndarray, " n"]] = field(default_factory=list)
     times: list[Int64[np.ndarray, " n"]] = field(default_factory=list)
     offsets: list[Int64[np.ndarray, " n"]] = field(default_factory=list)
     size: int = 0
 
-    def feed(self, found: records.Messages) -> None:
-        """Takes in its messages of a chunk of the source, and decodes them once there are enough."""
+    def add(self, found: messages.Messages) -> None:
+        """Takes in the IMU's messages of a source chunk, and decodes them once there are enough."""
         of = found.heads["channel"]
         mask = np.logical_or.reduce([of == channel for channel in self.sources])
-        for heads, payload in records.cut(found, mask):
-            if self.waiting and self.waiting[-1][1].shape[1] != payload.shape[1]:
+        for heads, payload in messages.cut(found, mask):
+            if self.undecoded and self.undecoded[-1][1].shape[1] != payload.shape[1]:
                 self.decode()
-            self.waiting.append((heads, payload))
-            self.waits += payload.size
-        if self.waits >= FEED_BYTES:
+            self.undecoded.append((heads, payload))
+            self.undecoded_bytes += payload.size
+        if self.undecoded_bytes >= BATCH_BYTES:
             self.decode()
 
     def decode(self) -> None:
-        """Hands the messages that waited over."""
-        if self.waiting:
-            heads, payloads = zip(*self.waiting, strict=True)
-            rows = records.columns(np.concatenate(heads), np.concatenate(payloads))
-            self.waiting.clear()
-            self.waits = 0
-            with self.log.named(self.make.source_topic):
-                for batch in self.log.decode_imu(self.make.source_topic, rows):
-                    self.take(batch)
+        """Decodes the waiting messages and computes the new ones."""
+        if self.undecoded:
+            heads, payloads = zip(*self.undecoded, strict=True)
+            rows = messages.columns(np.concatenate(heads), np.concatenate(payloads))
+            self.undecoded.clear()
+            self.undecoded_bytes = 0
+            with self.log.named(self.derived.source_topic):
+                for batch in self.log.topics[self.derived.source_topic].decode_imu(rows):
+                    self._compute(batch)
 
-    def take(self, batch: ImuBatch) -> None:
-        """Computes the new messages of a batch; those of one source message stand side by side."""
-        batch, payloads = self.make(batch)
+    def _compute(self, batch: ImuBatch) -> None:
+        """Computes the new messages of a batch, side by side for each source message."""
+        batch, payloads = self.derived(batch)
         assert len(payloads) == len(self.ids), f"{len(payloads)} arrays for {len(self.ids)} topics"
-        widths = [records.MESSAGE.itemsize + payload.shape[1] for payload in payloads]
+        widths = [messages.MESSAGE.itemsize + payload.shape[1] for payload in payloads]
         count, stride, ends = len(batch.log_time), sum(widths), np.cumsum(widths)
         data = np.empty((count, stride), np.uint8)
         for channel, payload, width, end in zip(self.ids, payloads, widths, ends.tolist(), strict=True):
-            here = data[:, end - width : end]
-            records.message_rows(channel, batch.log_time, batch.publish_time, batch.sequence, payload, here)
+            columns = data[:, end - width : end]
+            messages.message_rows(channel, batch.log_time, batch.publish_time, batch.sequence, payload, columns)
         self.data.append(data)
         self.channels.append(np.tile(np.array(self.ids, np.uint16), count))
         self.times.append(np.repeat(batch.log_time, len(widths)))
         self.offsets.append((self.size + stride * np.arange(count)[:, None] + ends - widths).reshape(-1))
         self.size += count * stride
 
-    def taken(self) -> Chunk:
-        """What waits, as one chunk."""
+    def pop_chunk(self) -> Chunk:
+        """Hands over the computed messages as one chunk."""
         times, offsets = np.concatenate(self.times), np.concatenate(self.offsets)
         chunk = Chunk(b"".join(part.data for part in self.data), np.concatenate(self.channels), times, offsets)
         for column in (self.data, self.channels, self.times, self.offsets):

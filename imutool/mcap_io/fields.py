@@ -1,14 +1,14 @@
-"""Any number of any ROS 2 message in a log, by topic and dotted path: `/joint_states.position[2]`.
+"""Read any number of any ROS 2 message by topic and path: `/joint_states.position[2]`.
 
-Nothing is known beforehand of a message but the definition that the log carries. A message is walked once; those after it that
-share its counts lie the same way and are cut out in one numpy pass. One chunk is in memory at a time.
+Field offsets come from the definition in the log: one message is walked, and messages that share its counts are cut out in one
+numpy pass. One chunk is in memory at a time.
 """
 
 from __future__ import annotations
 
 import difflib
 import re
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, field
 from itertools import pairwise
 from typing import NamedTuple
@@ -18,16 +18,15 @@ from jaxtyping import Float64, Int64, UInt8
 
 from imutool.errors import LogError
 from imutool.location import Location
-from imutool.mcap_io.batches import Clock
 from imutool.mcap_io.codec import ros2_definition
-from imutool.mcap_io.codec.records import Rows
+from imutool.mcap_io.codec.messages import Rows
 from imutool.mcap_io.log import Log
 from imutool.mcap_io.read import UNIT_KEY
-from imutool.mcap_io.topics import DERIVED_KEY, Topic
+from imutool.mcap_io.topics import DERIVED_KEY, StampCheck, Topic
 
 LISTED = 60  # fields named in a message
-LONGEST_ROW = 64  # of an array of numbers that is looked at as channels
-MOST_OTHERS, LOOKED_AT = 48, 4  # channels, and how many times as many fields are read to find those that vary
+MAX_ROW = 64  # numbers of an array that become channels
+MAX_OTHERS, READ_FACTOR = 48, 4  # channels, and how many times as many fields are read to find varying ones
 _PATH = re.compile(r"[A-Za-z]\w*(\[\d{1,9}\])?(\.[A-Za-z]\w*(\[\d{1,9}\])?)*")
 _LAST = re.compile(r"(.*?)(?:\[(\d+)\])?")
 _NO_CHANNEL = re.compile(r"(^|\.)(\w*stamp|covariance|\w+_covariance)\b")
@@ -35,7 +34,7 @@ _NO_CHANNEL = re.compile(r"(^|\.)(\w*stamp|covariance|\w+_covariance)\b")
 
 @dataclass(frozen=True, eq=False)
 class Fields:
-    """One number of a log over time: stamps of the messages' headers (their log times where they have none), as float64."""
+    """One number of a log over time, at the stamps of the headers or else at log times."""
 
     t_ns: Int64[np.ndarray, " n"]
     values: Float64[np.ndarray, " n"]
@@ -53,30 +52,14 @@ def read_field(path: Location, signal: str) -> Fields:
         LogError: no such topic or field (the message lists what there is), another encoding, an array that is shorter in some
             message, NaN or infinity, stamps that do not increase, damage.
     """
-    return read_fields(path, [signal])[signal]
-
-
-def read_fields(path: Location, signals: Sequence[str]) -> dict[str, Fields]:
-    """Several signals of a log, in one pass over it.
-
-    Raises:
-        ConfigError, LogError: as `read_field`.
-    """
     with Log(path) as log:
-        wanted: dict[str, list[str]] = {}
-        for signal in signals:
-            topic, inside = split(log, signal)
-            wanted.setdefault(topic, []).append(inside)
-        readers = {topic: _Reader(log, log.topics[topic], tuple(dict.fromkeys(paths))) for topic, paths in wanted.items()}
-        for topic, rows in log.rows(list(wanted)):
+        topic, inside = split(log, signal)
+        reader = _Reader(log, log.topics[topic], (inside,))
+        for _, rows in log.rows([topic]):
             with log.named(topic):
-                readers[topic].take(rows)
-        out = {}
-        for signal in signals:
-            topic, inside = split(log, signal)
-            with log.named(topic):
-                out[signal] = readers[topic].whole(inside)
-        return out
+                reader.take(rows)
+        with log.named(topic):
+            return reader.whole(inside)
 
 
 def split(log: Log, signal: str) -> tuple[str, str]:
@@ -94,12 +77,14 @@ def split(log: Log, signal: str) -> tuple[str, str]:
     topic = max(topics, key=len)
     inside = signal[len(topic) + 1 :]
     if not _PATH.fullmatch(inside):
-        raise LogError(f"{inside!r} is no field's path", where=f"{log.path} {topic}", expected="names and dots: twist.linear.x")
+        raise LogError(f"field {inside!r}", where=f"{log.path} {topic}", expected="names and dots: twist.linear.x")
     return topic, inside
 
 
 def numeric_fields(log: Log, topic: str, *, long: bool = True) -> list[str]:
-    """Paths of the numbers in a topic's first message, `long` arrays by their first elements or not at all; without stamps.
+    """Paths of the numbers in a topic's first message, without stamps.
+
+    `long` arrays are listed by their first elements, else left out.
 
     Raises:
         LogError: no definition or another encoding than ros2msg and cdr.
@@ -111,18 +96,18 @@ def numeric_fields(log: Log, topic: str, *, long: bool = True) -> list[str]:
     return []
 
 
-def others(path: Location, signal: str, most: int = MOST_OTHERS) -> dict[str, Fields]:
-    """Every other number of a log that varies, by TOPIC.field: what might drive a signal. Stamps and covariances are not asked.
+def others(path: Location, signal: str, most: int = MAX_OTHERS) -> dict[str, Fields]:
+    """Every other varying number of a log by TOPIC.field: candidates to drive a signal.
 
-    What cannot serve is left out: constants, NaN, stamps that go back, long arrays (images), topics without a definition, what
-    imutool computed, and all fields behind the first `most` that vary, in the order of the log.
+    Left out are stamps, covariances, constants, NaN, stamps that go back, long arrays (images), topics without a definition or
+    computed by imutool, and all fields behind the first `most` that vary, in the order of the log.
 
     Raises:
         ConfigError, LogError: the log cannot be opened, or is damaged.
     """
     with Log(path) as log:
         readers = {}
-        left = LOOKED_AT * most
+        left = READ_FACTOR * most
         for name, topic in log.topics.items():
             paths = [] if DERIVED_KEY in topic.metadata else _offered(log, name)
             paths = [inside for inside in paths if f"{name}.{inside}" != signal and not _NO_CHANNEL.search(inside)][:left]
@@ -131,17 +116,16 @@ def others(path: Location, signal: str, most: int = MOST_OTHERS) -> dict[str, Fi
         for name, rows in log.rows(list(readers)):
             with log.named(name):
                 readers[name].take(rows)
-    found: dict[str, Fields] = {}
+    found = dict[str, Fields]()
     for name, reader in readers.items():
         for inside in reader.paths:
-            one = reader.usable(inside)
-            if one is not None and len(found) < most:
-                found[f"{name}.{inside}"] = one
+            if len(found) < most and (values := reader.usable(inside)) is not None:
+                found[f"{name}.{inside}"] = values
     return found
 
 
 def _offered(log: Log, topic: str) -> list[str]:
-    """Its numeric fields, none where it has no definition that can be followed."""
+    """Numeric fields of a topic, none where it has no readable definition."""
     try:
         return numeric_fields(log, topic, long=False)
     except LogError:
@@ -149,7 +133,7 @@ def _offered(log: Log, topic: str) -> list[str]:
 
 
 def _definition(log: Log, topic: Topic) -> ros2_definition.Definition:
-    """What the log says of a topic's messages.
+    """Definition of a topic's messages.
 
     Raises:
         LogError: it says nothing, or in another language.
@@ -162,9 +146,9 @@ def _definition(log: Log, topic: Topic) -> ros2_definition.Definition:
             expected="ros2msg and cdr",
             fix="Record it with ROS 2's own MCAP plugin",
         )
-    channel = next(c for c in log.structure.channels.values() if c.topic == topic.name)
+    channel = next(c for c in log.index.channels.values() if c.topic == topic.name)
     with log.named(topic.name):
-        return ros2_definition.parse(topic.schema_name, log.structure.schemas[channel.schema_id].data)
+        return ros2_definition.parse(topic.schema_name, log.index.schemas[channel.schema_id].data)
 
 
 def _paths(walk: ros2_definition.Walk, long: bool = True) -> Iterator[str]:
@@ -173,8 +157,8 @@ def _paths(walk: ros2_definition.Walk, long: bool = True) -> Iterator[str]:
             continue
         if leaf.length is None:
             yield leaf.path
-        elif long or leaf.length <= LONGEST_ROW:
-            yield from (f"{leaf.path}[{k}]" for k in range(min(leaf.length, LONGEST_ROW)))
+        elif long or leaf.length <= MAX_ROW:
+            yield from (f"{leaf.path}[{k}]" for k in range(min(leaf.length, MAX_ROW)))
 
 
 def _listed(names: Collection[str]) -> str:
@@ -189,7 +173,7 @@ class _Place(NamedTuple):
 
 @dataclass(eq=False)
 class _Reader:
-    """Collects some fields of one topic; without `strict`, what a message lacks becomes NaN."""
+    """Collects some fields of one topic; without `strict`, missing fields become NaN."""
 
     log: Log
     topic: Topic
@@ -204,7 +188,7 @@ class _Reader:
         self.definition = _definition(self.log, self.topic)
 
     def take(self, rows: Rows) -> None:
-        """The next messages, all of one size."""
+        """Takes in the next messages, all of one size."""
         for part, places, order in self._runs(rows.payload):
             cut = rows.where(part)
             columns = np.full((len(cut.log_time), len(self.paths)), np.nan)
@@ -217,7 +201,7 @@ class _Reader:
             self.sequences.append(cut.sequence)
 
     def _runs(self, payload: UInt8[np.ndarray, "n L"]) -> Iterator[tuple[slice, Mapping[str, _Place], str]]:
-        """Stretches of messages whose fields lie alike, found by one walk each."""
+        """Stretches of messages with the same field offsets, found by one walk each."""
         pending = [(0, len(payload))] if len(payload) else []
         while pending:
             first, last = pending.pop()
@@ -233,10 +217,10 @@ class _Reader:
             pending += reversed(list(pairwise(edges[1:])))
 
     def _places(self, walk: ros2_definition.Walk) -> dict[str, _Place]:
-        """Where the wanted fields lie, and the header's stamp (`sec`, `nanosec`); the walk ends at the last of them.
+        """Offsets of the wanted fields and of the header's stamp; the walk ends at the last.
 
         Raises:
-            LogError: there is no such number; the message lists those that there are.
+            LogError: no such number; the message lists the known ones.
         """
         asked: dict[str, list[tuple[str, int | None]]] = {}
         for path in self.paths:
@@ -254,20 +238,20 @@ class _Reader:
                 break  # what comes behind need not lie alike
         missing = [path for path in self.paths if path not in found]
         if missing and self.strict:
-            raise self._none(missing[0], walk)
+            raise self._unknown(missing[0], walk)
         return found
 
-    def _none(self, path: str, walk: ros2_definition.Walk) -> LogError:
-        there = list(_paths(ros2_definition.Walk(walk.payload, self.definition)))
-        near = difflib.get_close_matches(path, there, n=1)
+    def _unknown(self, path: str, walk: ros2_definition.Walk) -> LogError:
+        known = list(_paths(ros2_definition.Walk(walk.payload, self.definition)))
+        near = difflib.get_close_matches(path, known, n=1)
         return LogError(
             f"there is no number {path} in {self.topic.schema_name}",
-            expected=_listed(there),
+            expected=_listed(known),
             fix=f"Did you mean {self.topic.name}.{near[0]}?" if near else "",
         )
 
     def t_ns(self) -> Int64[np.ndarray, " n"]:
-        """The headers' stamps; log times where there are no headers, or all of them say zero: nobody ever set those."""
+        """Header stamps; log times where there is no header or all stamps are zero."""
         stamp_ns = np.concatenate(self.stamps)
         return stamp_ns if stamp_ns.any() else np.concatenate(self.log_times)
 
@@ -281,15 +265,14 @@ class _Reader:
             raise LogError("there are no messages", expected="at least one")
         t_ns, sequence = self.t_ns(), np.concatenate(self.sequences)
         values = np.concatenate(self.values)[:, self.paths.index(path)]
-        finite = np.isfinite(values)
-        if not finite.all():
+        if not (finite := np.isfinite(values)).all():
             row = int(np.argmin(finite))
             raise LogError(
                 f"message {row} (sequence {sequence[row]}) has {path} = {values[row]}",
                 expected="finite numbers",
                 fix="Choose another field, or cut the log before or after it",
             )
-        Clock().check(t_ns, sequence)
+        StampCheck().check(t_ns, sequence)
         return Fields(t_ns, values, self.topic.metadata.get(UNIT_KEY, ""))
 
     def usable(self, path: str) -> Fields | None:
@@ -308,7 +291,7 @@ def _column(payload: UInt8[np.ndarray, "n L"], place: _Place, order: str) -> np.
 
 
 def _stamps(rows: Rows, places: Mapping[str, _Place], order: str) -> Int64[np.ndarray, " n"]:
-    """Of the header, zeros where there is none."""
+    """Header stamps, zeros where there is no header."""
     keys = ("stamp header.stamp.sec", "stamp header.stamp.nanosec")
     if not all(key in places for key in keys):
         return np.zeros(len(rows.log_time), np.int64)

@@ -1,4 +1,4 @@
-"""A log opened for reading: whole columns at a time, one chunk in memory, every chunk's CRC checked.
+"""Read an MCAP log: whole columns at a time, one chunk in memory, every CRC checked.
 
 Topics are found by schema, not by name; messages come in file order.
 """
@@ -16,61 +16,70 @@ from mcap.records import Metadata
 
 from imutool.errors import DataError, LogError
 from imutool.location import Location, to_location
-from imutool.mcap_io.batches import Clock, ImuBatch, PoseBatch, ScalarBatch, finite
-from imutool.mcap_io.codec import records, schemas
-from imutool.mcap_io.codec.decode import TwistColumns, decode_image, decode_imu, decode_poses, decode_scalars, decode_twist
-from imutool.mcap_io.codec.records import HEAD
-from imutool.mcap_io.index import Block, LogIndex, Span
-from imutool.mcap_io.losses import Losses
-from imutool.mcap_io.recovery.recovered_index import RecoveredIndex
-from imutool.mcap_io.storage.memory import keep_buffers
+from imutool.mcap_io.blocks import MessageBlock, RecordSpan
+from imutool.mcap_io.codec import messages, records, schemas
+from imutool.mcap_io.codec.decode import decode_image
+from imutool.mcap_io.codec.records import HEAD, keep_buffers
+from imutool.mcap_io.index import LogIndex
 from imutool.mcap_io.storage.source import Source
-from imutool.mcap_io.topics import DERIVED_KEY, ENCODINGS, MESSAGE_POSES, SCALARS, Topic, topics_of
+from imutool.mcap_io.topics import ENCODINGS, MESSAGE_POSES, SCALARS, ImuBatch, PoseBatch, ScalarBatch, StampCheck, Topic
 
 
 class Log:
-    """One MCAP file or object in a store, open for reading: chunked or not, with or without a summary or message indexes.
+    """An MCAP file or object in a store, open for reading.
 
-    Memory is bounded by its largest chunk. Times given to a method select by log time, both ends included.
+    It may have chunks, a summary and message indexes, or not.
 
-    With `salvage` a damaged log opens too: what cannot be proven is left out, and `losses` says what and why. It is complete
-    once everything was read (`check`), because the damage inside a chunk shows when that is unpacked.
+    Memory is bounded by its largest chunk. An open `Source` can be given in place of a path. Times given to a
+    method select by log time, both ends included. The first damage is an error; `recovery.recovered_log.RecoveredLog` reads
+    what is intact of a damaged log.
 
     Raises:
         ConfigError: the file cannot be opened.
-        LogError: empty, not an MCAP log, cut short or damaged; with `salvage`, if there is nothing in it to be saved.
+        LogError: empty, not an MCAP log, cut short or damaged.
     """
 
-    def __init__(self, path: str | Location, *, salvage: bool = False) -> None:
+    index: LogIndex
+
+    def __init__(self, path: str | Location | Source) -> None:
         keep_buffers()
-        self.path = to_location(path) if isinstance(path, str) else path
-        self._source = Source(self.path)
+        place = to_location(path) if isinstance(path, str) else path
+        self._source = place if isinstance(place, Source) else Source(place)
+        self._owns_source, self.path = True, self._source.path
         try:
             with self.named():
-                self.structure = RecoveredIndex(self._source) if salvage else LogIndex(self._source)
-                self.topics = MappingProxyType(topics_of(self.structure))
+                self.index = self._read_index(self._source)
+                self.topics = MappingProxyType(_topics_of(self.index))
         except BaseException:
-            self._source.file.close()
+            self.close()
             raise
+
+    def _read_index(self, source: Source) -> LogIndex:
+        return LogIndex(source)
 
     def __enter__(self) -> Log:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
-        self._source.file.close()
+        self.close()
+
+    def close(self) -> None:
+        """Closes the file, unless another `Log` has taken it over (`RecoveredLog.strict`)."""
+        if self._owns_source:
+            self._source.file.close()
 
     def check(self) -> None:
-        """Reads every chunk and attachment and compares its CRC, so that `losses` is complete.
+        """Reads every chunk and attachment and compares its CRC.
 
         Raises:
-            LogError: without salvage, the first damage.
+            LogError: the first damage.
         """
         with self.named():
-            self.structure.check()
+            self.index.check()
 
     @contextmanager
     def named(self, topic: str = "") -> Iterator[None]:
-        """Gives errors from below their address."""
+        """Adds the log's path and a topic to errors that have no place yet."""
         try:
             yield
         except (LogError, DataError) as error:
@@ -80,30 +89,27 @@ class Log:
             raise LogError(error.what, where=where, expected=error.expected, fix=error.fix) from error
 
     @property
-    def losses(self) -> Losses | None:
-        """What is lost so far, nothing of a whole log; None without salvage, where the first damage is an error."""
-        return self.structure.losses
-
-    @property
     def profile(self) -> str:
         """What the header says the log follows: `ros2`, `ros1` or nothing."""
-        return str(self.structure.header.profile)
+        return str(self.index.header.profile)
 
     @property
     def imu_topics(self) -> list[str]:
-        """Topics with IMU messages, without those that imutool computed itself."""
-        return [t.name for t in self.with_schema((schemas.IMU,)) if DERIVED_KEY not in t.metadata]
+        """Topics with IMU messages, without those that imutool computed."""
+        return [t.name for t in self.with_schema((schemas.IMU,)) if not t.is_derived]
 
     def only_imu(self) -> str:
-        """The log's IMU, where there is one and only one.
+        """The log's IMU, where there is exactly one.
 
         Raises:
             LogError: there are others, or none.
         """
         found = self.imu_topics
-        if len(found) != 1:
-            listed = ", ".join(found) or "none"
-            raise LogError(f"IMU topics: {listed}", where=self.path, expected="one", fix="Choose with --imu" if found else "")
+        if not found:
+            raise LogError("the log has no IMU topic", where=self.path, expected=f"{schemas.IMU} among {self.listing()}")
+        if len(found) > 1:
+            listed = ", ".join(found)
+            raise LogError(f"the log has {len(found)} IMU topics: {listed}", where=self.path, fix="Choose one with `imu`")
         return found[0]
 
     @property
@@ -117,7 +123,7 @@ class Log:
         return [t for t in self.topics.values() if t.schema_name in schema_names]
 
     def topic(self, name: str, schema_names: Collection[str]) -> Topic:
-        """A topic by name, which must carry one of these messages in an encoding that is read here.
+        """A topic by name, which must carry one of these messages in an encoding that imutool reads.
 
         Raises:
             LogError: no such topic, other messages, or another encoding.
@@ -126,22 +132,19 @@ class Log:
             raise LogError(f"there is no topic {name}", where=self.path, expected=self.listing())
         found = self.topics[name]
         if found.schema_name not in schema_names:
-            raise LogError(
-                f"{name} carries {found.schema_name or 'messages without schema'}",
-                where=self.path,
-                expected=" or ".join(schema_names),
-            )
+            carried = found.schema_name or "messages without schema"
+            raise LogError(f"{name} carries {carried}", where=self.path, expected=" or ".join(schema_names))
         if found.message_encoding not in ENCODINGS:
             raise LogError(f"{name} is encoded as {found.message_encoding!r}", where=self.path, expected=" or ".join(ENCODINGS))
         return found
 
     def listing(self) -> str:
-        """The topics there are, for a message."""
+        """The log's topics and their schemas, for a message."""
         every = [f"{t.name} ({t.schema_name or 'no schema'})" for t in self.topics.values()]
         return ", ".join(every) if every else "a log with topics (this one has none)"
 
     def metadata(self) -> dict[str, dict[str, str]]:
-        """The metadata records by name; where a name comes twice, the later record's entries lie over the earlier's."""
+        """Metadata records by name; of two of one name, later entries replace earlier ones."""
         found: dict[str, dict[str, str]] = {}
         for name, values in self.metadata_records():
             found.setdefault(name, {}).update(values)
@@ -155,15 +158,15 @@ class Log:
         """
         found = []
         with self.named():
-            for item in self.structure.items:
-                if isinstance(item, Span) and item.opcode == Opcode.METADATA:
+            for item in self.index.items:
+                if isinstance(item, RecordSpan) and item.opcode == Opcode.METADATA:
                     body = self._source.at(item.offset + HEAD.size, item.length - HEAD.size)
                     record = records.parse(Metadata, body, item.offset)
                     found.append((record.name, dict(record.metadata)))
         return found
 
     def stamps(self, topic: str) -> Iterator[Int64[np.ndarray, " n"]]:
-        """Log times of one topic in file order, from the message indexes where there are any: nothing is unpacked.
+        """Log times of one topic in file order, from message indexes where possible.
 
         Raises:
             LogError: no such topic, or a damaged log.
@@ -172,15 +175,15 @@ class Log:
             raise LogError(f"there is no topic {topic}", where=self.path, expected=self.listing())
         channels = self.channel_ids(topic)
         with self.named(topic):
-            for block in self.structure.blocks:
-                if not block.holds(channels):
+            for block in self.index.blocks:
+                if not block.may_hold(channels):
                     continue
-                indexed = sorted(channels & block.indexes.keys()) if block.vouched and not block.edited else []
-                entries = [self.structure.index(block, c) for c in indexed]
+                indexed = sorted(channels & block.indexes.keys()) if block.trusted and not block.edited else []
+                entries = [self.index.entries(block, c) for c in indexed]
                 if indexed and all(len(entry) for entry in entries):
                     table = np.concatenate(entries)
-                    yield records.signed(table[np.argsort(table[:, 1], kind="stable"), 0])
-                elif (found := self.structure.found(block)) is not None:
+                    yield messages.signed(table[np.argsort(table[:, 1], kind="stable"), 0])
+                elif (found := self.index.unpack_or_lose(block)) is not None:
                     times = found.times()[np.isin(found.heads["channel"], list(channels))]
                     if len(times):
                         yield times
@@ -191,25 +194,12 @@ class Log:
         Raises:
             LogError: no such IMU topic, another encoding, NaN or infinite values, stamps that do not increase, damage.
         """
-        self.topic(topic, (schemas.IMU,))
-        clock = Clock()
-        for rows in self.rows([topic], start_ns, end_ns):
+        described, stamps = self.topic(topic, (schemas.IMU,)), StampCheck()
+        for _, rows in self.rows([topic], start_ns, end_ns):
             with self.named(topic):
-                for batch in self.decode_imu(topic, rows[1]):
-                    clock.take(batch)
+                for batch in described.decode_imu(rows):
+                    stamps.check_imu(batch)
                     yield batch
-
-    def decode_imu(self, topic: str, rows: records.Rows) -> Iterator[ImuBatch]:
-        """IMU messages from their bytes, one batch per stretch with one frame; nothing is asked of their values.
-
-        Raises:
-            LogError: a payload that is no such message.
-        """
-        encoding = self.topics[topic].message_encoding
-        for part, layout in schemas.runs(rows.payload, schemas.IMU, encoding):
-            cut = rows.where(part)
-            columns = decode_imu(cut.payload, encoding, layout)
-            yield ImuBatch(cut.log_time, cut.publish_time, cut.sequence, *columns)
 
     def pose_batches(self, topic: str, start_ns: int | None = None, end_ns: int | None = None) -> Iterator[PoseBatch]:
         """The poses of a topic in file order; of a TFMessage one batch per transform in it.
@@ -217,23 +207,10 @@ class Log:
         Raises:
             LogError: no such pose topic, another encoding, NaN or infinite values, damage.
         """
-        self.topic(topic, (*MESSAGE_POSES, schemas.TF))
-        for rows in self.rows([topic], start_ns, end_ns):
+        described = self.topic(topic, (*MESSAGE_POSES, schemas.TF))
+        for _, rows in self.rows([topic], start_ns, end_ns):
             with self.named(topic):
-                yield from self.decode_poses(topic, rows[1])
-
-    def decode_poses(self, topic: str, rows: records.Rows) -> Iterator[PoseBatch]:
-        """Poses from their bytes, one batch per stretch with the same frames, and per transform in a TFMessage.
-
-        Raises:
-            LogError: a payload that is no such message, NaN or infinite values.
-        """
-        kind, encoding = self.topics[topic].schema_name, self.topics[topic].message_encoding
-        for part, layout in schemas.runs(rows.payload, kind, encoding):
-            cut = rows.where(part)
-            for columns in decode_poses(cut.payload, kind, encoding, layout):
-                finite(cut.sequence, position=columns.p_wb, orientation=columns.q_wb_wxyz)
-                yield PoseBatch(cut.log_time, cut.publish_time, cut.sequence, *columns)
+                yield from described.decode_poses(rows)
 
     def scalar_batches(self, topic: str, start_ns: int | None = None, end_ns: int | None = None) -> Iterator[ScalarBatch]:
         """The messages of a Float64 or Vector3Stamped topic in file order.
@@ -241,34 +218,10 @@ class Log:
         Raises:
             LogError: no such topic, another encoding, NaN or infinite values, damage.
         """
-        self.topic(topic, SCALARS)
-        for rows in self.rows([topic], start_ns, end_ns):
+        described = self.topic(topic, SCALARS)
+        for _, rows in self.rows([topic], start_ns, end_ns):
             with self.named(topic):
-                yield from self.decode_scalars(topic, rows[1])
-
-    def decode_scalars(self, topic: str, rows: records.Rows) -> Iterator[ScalarBatch]:
-        """Numbers from their bytes, one batch per stretch with one frame.
-
-        Raises:
-            LogError: a payload that is no such message, NaN or infinite values.
-        """
-        kind, encoding = self.topics[topic].schema_name, self.topics[topic].message_encoding
-        for part, layout in schemas.runs(rows.payload, kind, encoding):
-            cut = rows.where(part)
-            columns = decode_scalars(cut.payload, kind, encoding, layout)
-            finite(cut.sequence, values=columns.values)
-            stamp_ns = cut.log_time if columns.stamp_ns is None else columns.stamp_ns
-            yield ScalarBatch(cut.log_time, cut.publish_time, cut.sequence, stamp_ns, columns.values, columns.frame_id)
-
-    def decode_twist(self, topic: str, rows: records.Rows) -> Iterator[TwistColumns]:
-        """Biases with their covariance from their bytes, a batch per stretch with one frame; nothing is asked of their values.
-
-        Raises:
-            LogError: a payload that is no such message.
-        """
-        encoding = self.topics[topic].message_encoding
-        for part, layout in schemas.runs(rows.payload, schemas.TWIST, encoding):
-            yield decode_twist(rows.where(part).payload, encoding, layout)
+                yield from described.decode_scalars(rows)
 
     def images(self, topic: str, start_ns: int | None = None, end_ns: int | None = None) -> Iterator[tuple[int, bytes]]:
         """Stamp and encoded bytes of every image of a CompressedImage topic, in file order.
@@ -285,30 +238,54 @@ class Log:
 
     def channel_ids(self, topic: str) -> set[int]:
         """The channels of a topic."""
-        return {i for i, channel in self.structure.channels.items() if channel.topic == topic}
+        return {i for i, channel in self.index.channels.items() if channel.topic == topic}
 
     def rows(
         self, topics: Collection[str], start_ns: int | None = None, end_ns: int | None = None
-    ) -> Iterator[tuple[str, records.Rows]]:
-        """The messages of some topics in file order, every chunk unpacked once whatever the number of topics."""
+    ) -> Iterator[tuple[str, messages.Rows]]:
+        """The messages of some topics in file order; each chunk is unpacked once for all topics."""
         wanted = {topic: self.channel_ids(topic) for topic in topics}
         every = set().union(*wanted.values()) if wanted else set()
         first = -1 if start_ns is None else start_ns
         last = 2**63 - 1 if end_ns is None else end_ns
         with self.named():
-            for block in self.structure.blocks:
-                if block.holds(every) and block.start_ns <= last and block.end_ns >= first:
+            for block in self.index.blocks:
+                if block.may_hold(every) and block.start_ns <= last and block.end_ns >= first:
                     yield from self._rows_of(block, wanted, first, last)
 
     def _rows_of(
-        self, block: Block, wanted: Mapping[str, set[int]], first: int, last: int
-    ) -> Iterator[tuple[str, records.Rows]]:
-        found = self.structure.found(block)
+        self, block: MessageBlock, wanted: Mapping[str, set[int]], first: int, last: int
+    ) -> Iterator[tuple[str, messages.Rows]]:
+        found = self.index.unpack_or_lose(block)
         if found is None:
             return
         times = found.times()
         inside = (times >= first) & (times <= last)
         for topic, channels in wanted.items():
             mask = inside & np.isin(found.heads["channel"], list(channels))
-            for rows in records.rows(found, mask):
+            for rows in messages.rows(found, mask):
                 yield topic, rows
+
+
+def _topics_of(index: LogIndex) -> dict[str, Topic]:
+    """The topics of a log by their names, in order of their channel ids.
+
+    Raises:
+        LogError: two channels of one topic carry different messages.
+    """
+    found: dict[str, Topic] = {}
+    counts = index.counts()
+    for identity, channel in sorted(index.channels.items()):
+        schema, before = index.schemas.get(channel.schema_id), found.get(channel.topic)
+        topic = Topic(
+            channel.topic,
+            schemas.canonical(schema.name) if schema else "",
+            schema.encoding if schema else "",
+            channel.message_encoding,
+            counts.get(identity, 0) + (before.count if before else 0),
+            MappingProxyType(dict(channel.metadata)),
+        )
+        if before and (before.schema_name, before.message_encoding) != (topic.schema_name, topic.message_encoding):
+            raise LogError(f"{channel.topic} carries {before.schema_name} and {topic.schema_name}")
+        found[channel.topic] = topic
+    return found

@@ -1,4 +1,4 @@
-"""Logs read back as recordings; what a topic means is decided here: the IMU, the true poses, the scalar channels."""
+"""Read a log as a recording: its IMU, true poses, scalar channels and images."""
 
 from __future__ import annotations
 
@@ -12,11 +12,10 @@ from jaxtyping import Float64, Int64, UInt32
 
 from imutool.errors import LogError
 from imutool.location import Location
-from imutool.mcap_io.batches import Clock, finite
-from imutool.mcap_io.codec import records, schemas
+from imutool.mcap_io.codec import messages, schemas
 from imutool.mcap_io.codec.decode import decode_image
 from imutool.mcap_io.log import Log
-from imutool.mcap_io.topics import DERIVED_KEY, ENCODINGS, MESSAGE_POSES, SCALARS
+from imutool.mcap_io.topics import DERIVED_KEY, ENCODINGS, MESSAGE_POSES, SCALARS, StampCheck, check_finite
 from imutool.recording import UNIT_QUATERNION_TOLERANCE, Frames, Imu, Poses, Recording, Scalars, unit_quaternions
 
 logger = logging.getLogger(__name__)
@@ -49,10 +48,10 @@ def read(
         LogError: no IMU or several without `imu`, no such topic, values or stamps no recording can hold, a damaged log.
     """
     with Log(path) as log:
-        return recording_in(log, imu=imu, truth=truth, start_ns=start_ns, end_ns=end_ns, samples=samples)
+        return read_recording(log, imu=imu, truth=truth, start_ns=start_ns, end_ns=end_ns, samples=samples)
 
 
-def recording_in(
+def read_recording(
     log: Log,
     *,
     imu: str | None = None,
@@ -65,13 +64,13 @@ def recording_in(
 ) -> Recording:
     """As `read`, in a log that is open.
 
-    Where somebody is to be told (`refused`), poses that a recording cannot hold are left out. Without `derived` the scalars
-    that imutool computed are not read.
+    With `refused`, poses that a recording cannot hold are left out and `refused` is called with topic and error. Without
+    `derived` the scalars that imutool computed are not read.
 
     Raises:
         LogError: as `read`.
     """
-    imu_topic = _choose_imu(log, imu)
+    imu_topic = log.topic(log.only_imu() if imu is None else imu, (schemas.IMU,)).name
     own, metadata = _own_and_user_metadata(log)
     truths = _choose_truths(log, truth)
     velocities = {t.name: t.metadata[VELOCITY_KEY] for t in log.topics.values() if VELOCITY_KEY in t.metadata}
@@ -80,32 +79,21 @@ def recording_in(
         for t in log.with_schema(SCALARS)
         if t.name not in velocities and t.message_encoding in ENCODINGS and (derived or DERIVED_KEY not in t.metadata)
     ]
-    gather = _Gather(log, imu_topic, truths, velocities, scalars, refused)
+    columns = _Columns(log, imu_topic, truths, velocities, scalars, refused)
     with log.named():
-        topics = gather.topics if samples is None else gather.topics[1:]
+        topics = columns.topics if samples is None else columns.topics[1:]
         for topic, rows in log.rows(topics, start_ns, end_ns):
-            gather.take(topic, rows)
+            columns.take(topic, rows)
     return Recording(
         name=own.get("name", log.path.stem),
-        imu=gather.imu() if samples is None else samples,
-        truths=gather.truths(truth),
-        scalars=gather.scalars(),
+        imu=columns.imu() if samples is None else samples,
+        truths=columns.truths(truth),
+        scalars=columns.scalars(),
         frames=_frames(log, start_ns, end_ns),
         metadata=metadata,
         imu_topic=imu_topic,
         source=own.get("source", ""),
     )
-
-
-def _choose_imu(log: Log, imu: str | None) -> str:
-    if imu is not None:
-        return log.topic(imu, (schemas.IMU,)).name
-    found = log.imu_topics
-    if not found:
-        raise LogError("the log has no IMU topic", where=log.path, expected=f"{schemas.IMU} among {log.listing()}")
-    if len(found) > 1:
-        raise LogError(f"the log has {len(found)} IMU topics: {', '.join(found)}", where=log.path, fix="Choose one with --imu")
-    return log.topic(found[0], (schemas.IMU,)).name
 
 
 def _choose_truths(log: Log, truth: str | None) -> list[str]:
@@ -121,7 +109,7 @@ def _choose_truths(log: Log, truth: str | None) -> list[str]:
     return trees
 
 
-class _Gather:
+class _Columns:
     """Collects the columns of every wanted topic in one pass over the log."""
 
     def __init__(
@@ -135,7 +123,7 @@ class _Gather:
     ) -> None:
         self.log, self.imu_topic, self.truth_topics, self.scalar_topics = log, imu, truths, scalars
         self.velocity_topics = {name: of for name, of in velocities.items() if of in truths}
-        self.clocks: dict[str, Clock] = {}
+        self.clocks: dict[str, StampCheck] = {}
         self.kept: dict[str, list[tuple[np.ndarray, ...]]] = {}  # columns, by topic
         self.left_out: set[str] = set()
         self.refused = refused
@@ -144,37 +132,37 @@ class _Gather:
     def topics(self) -> list[str]:
         return [self.imu_topic, *self.truth_topics, *self.velocity_topics, *self.scalar_topics]
 
-    def take(self, topic: str, rows: records.Rows) -> None:
+    def take(self, topic: str, rows: messages.Rows) -> None:
         if topic == self.imu_topic:
             with self.log.named(topic):
-                for imu in self.log.decode_imu(topic, rows):
-                    finite(imu.sequence, angular_velocity=imu.gyro, linear_acceleration=imu.accel)
+                for imu in self.log.topics[topic].decode_imu(rows):
+                    check_finite(imu.sequence, angular_velocity=imu.gyro, linear_acceleration=imu.accel)
                     self._keep(topic, imu.sequence, imu.stamp_ns, imu.gyro, imu.accel)
         elif topic in self.truth_topics:
             if topic not in self.left_out:
-                with self._told(topic), self.log.named(topic):
+                with self._leave_out_on_error(topic), self.log.named(topic):
                     self._take_poses(topic, rows)
         elif topic in self.velocity_topics:
             with self.log.named(topic):
-                for velocity in self.log.decode_scalars(topic, rows):
+                for velocity in self.log.topics[topic].decode_scalars(rows):
                     self._keep(topic, velocity.sequence, velocity.stamp_ns, velocity.values)
         elif topic not in self.left_out:
             try:
-                for scalar in self.log.decode_scalars(topic, rows):
+                for scalar in self.log.topics[topic].decode_scalars(rows):
                     self._keep(topic, scalar.sequence, scalar.stamp_ns, scalar.values)
             except LogError as error:
                 logger.warning("%s %s is left out: %s", self.log.path, topic, error.what)
                 self.left_out.add(topic)
 
-    def _take_poses(self, topic: str, rows: records.Rows) -> None:
+    def _take_poses(self, topic: str, rows: messages.Rows) -> None:
         tree = self.log.topics[topic].schema_name == schemas.TF
-        for pose in self.log.decode_poses(topic, rows):
+        for pose in self.log.topics[topic].decode_poses(rows):
             name = f"{topic}/{pose.child_frame_id.lstrip('/')}" if tree else topic
             self._keep(name, pose.sequence, pose.stamp_ns, pose.p_wb, pose.q_wb_wxyz)
 
     @contextmanager
-    def _told(self, topic: str) -> Iterator[None]:
-        """Leaves a topic out that cannot be held, where somebody is to be told of it."""
+    def _leave_out_on_error(self, topic: str) -> Iterator[None]:
+        """Leaves out a topic that a recording cannot hold, if the caller wants to know of it."""
         try:
             yield
         except LogError as error:
@@ -190,7 +178,7 @@ class _Gather:
         stamp_ns: Int64[np.ndarray, " n"],
         *columns: Float64[np.ndarray, "n _"],
     ) -> None:
-        self.clocks.setdefault(name, Clock()).check(stamp_ns, sequence)
+        self.clocks.setdefault(name, StampCheck()).check(stamp_ns, sequence)
         self.kept.setdefault(name, []).append((stamp_ns, *columns))
 
     def columns(self, name: str, *widths: int) -> tuple[Int64[np.ndarray, " n"], list[Float64[np.ndarray, "n _"]]]:
@@ -227,7 +215,7 @@ class _Gather:
         found = {}
         for name in names:
             if name not in self.left_out:
-                with self._told(name):
+                with self._leave_out_on_error(name):
                     found[name] = self._poses(name)
         return found
 
@@ -255,7 +243,7 @@ class _Gather:
 
 
 def _frames(log: Log, start_ns: int | None, end_ns: int | None) -> dict[str, Frames]:
-    """Image topics, to be opened again when somebody copies them."""
+    """Image topics, opened again when somebody reads them."""
     found = {}
     for topic in log.with_schema((schemas.IMAGE,)):
         if topic.message_encoding in ENCODINGS:
@@ -266,7 +254,7 @@ def _frames(log: Log, start_ns: int | None, end_ns: int | None) -> dict[str, Fra
 
 
 def _format(log: Log, topic: str) -> str:
-    """What the first image says it is."""
+    """Image format, from the first image."""
     for _, rows in log.rows([topic]):
         with log.named(topic):
             return decode_image(rows.payload[0].tobytes(), log.topics[topic].message_encoding)[1]
@@ -282,9 +270,9 @@ def _opener(path: Location, topic: str, start_ns: int | None, end_ns: int | None
 
 
 def _own_and_user_metadata(log: Log) -> tuple[dict[str, str], dict[str, dict[str, str]]]:
-    """What the writer noted about the recording, and the recording's own metadata, which it was laid over.
+    """The writer's notes on the recording, and the recording's own metadata.
 
-    The writer's record is the first `imutool` that names what it shadows; later ones tell of what was done to the log.
+    The writer's record is the first `imutool` that names what it shadows; later ones describe what was done to the log.
     """
     own: dict[str, str] = {}
     found: dict[str, dict[str, str]] = {}
@@ -300,7 +288,7 @@ def _own_and_user_metadata(log: Log) -> tuple[dict[str, str], dict[str, dict[str
 
 
 def _shadowed(text: str) -> Mapping[str, str] | None:
-    """A recording's own entries under the keys the writer uses; None where it had no record `imutool` at all."""
+    """A recording's own entries under our keys; None where it had no record `imutool`."""
     try:
         value = json.loads(text)
     except ValueError:

@@ -1,8 +1,8 @@
-"""A damaged log written anew: what is sound as the bytes it is, every index rebuilt, and a record of what was lost.
+"""Repair a damaged log: copy intact chunks, rebuild every index, record what was lost.
 
-A sound chunk is copied verbatim. Its message indexes are made from its messages, which its CRC proves, never copied.
-Definitions stand in front of everything, so that the next damage costs less. Messages that no CRC covers go into chunks that
-state none: being saved must not make them look proven.
+An intact chunk is copied; its message indexes are made from its messages, which its CRC proves, and never copied. Definitions
+stand in front of everything, so that the next damage costs less. Messages that no CRC covers go into chunks that state none:
+recovery must not make them look proven.
 """
 
 from __future__ import annotations
@@ -17,31 +17,30 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 
 from mcap.opcode import Opcode
-from mcap.records import AttachmentIndex, ChunkIndex, Metadata, MetadataIndex
+from mcap.records import Metadata, MetadataIndex
 
 import imutool
 from imutool.errors import ConfigError, ImutoolError, LogError
-from imutool.location import Location, failures, same
-from imutool.mcap_io.codec import records
-from imutool.mcap_io.codec.attachment import Attached
-from imutool.mcap_io.codec.records import CHUNK_HEAD, HEAD
-from imutool.mcap_io.index import Block, LogIndex, Span
-from imutool.mcap_io.log import Log
-from imutool.mcap_io.losses import Loss, Losses
-from imutool.mcap_io.storage.source import Source
+from imutool.location import Location, io_errors, same_location
+from imutool.mcap_io.blocks import Attachment, MessageBlock, RecordSpan
+from imutool.mcap_io.codec import messages, records
+from imutool.mcap_io.codec.records import CHUNK_HEAD, HEAD, ChunkHead
+from imutool.mcap_io.recovery.losses import Loss, Losses
+from imutool.mcap_io.recovery.recovered_index import RecoveredIndex
+from imutool.mcap_io.recovery.recovered_log import RecoveredLog
+from imutool.mcap_io.storage.source import BLOCK_BYTES, Source
 from imutool.mcap_io.verify import verify
 from imutool.mcap_io.writer import LogWriter
 
 RECORD = "imutool_repair"  # name of the metadata record
 DAMAGED = "imutool/damaged"  # attachments below this name hold damaged bytes as they were found
-COPY_BYTES = 1 << 20
 PART_BYTES = 16 << 20  # readers hold an attachment in memory as a whole
 CRC_AT = HEAD.size + CHUNK_HEAD.size - 8  # in a Chunk record
 
 
 @dataclass(frozen=True)
 class RepairReport:
-    """What a repaired log holds, and what is missing from it."""
+    """Contents of a repaired log, and what is missing from it."""
 
     losses: Losses
     messages: Mapping[str, int]  # saved, by topic
@@ -53,7 +52,7 @@ class RepairReport:
     @property
     def whole(self) -> bool:
         """Whether there was nothing to repair."""
-        return not self.losses and not self.losses.mended
+        return self.losses.intact
 
 
 def repair(
@@ -64,10 +63,10 @@ def repair(
     overwrite: bool = False,
     progress: Callable[[int, int], None] | None = None,
 ) -> RepairReport:
-    """Writes `target`: everything of `source` that is sound, in the order of the file, with all its indexes.
+    """Writes the intact part of `source` to `target`, in the order of the file, with all indexes.
 
-    With `damaged="keep"` the bytes of damaged stretches go along as attachments `imutool/damaged/OFFSET`, which no reader takes
-    for messages. What was lost stands in the metadata record `imutool_repair`; a log that was whole gets none. The result is
+    With `damaged="keep"` the bytes of damaged stretches become attachments `imutool/damaged/OFFSET`, which no reader takes
+    for messages. The metadata record `imutool_repair` lists what was lost; an intact log gets none. The result is
     read back as a whole before it takes its place.
 
     Raises:
@@ -75,31 +74,18 @@ def repair(
         LogError: no MCAP log, or nothing in it that can be saved.
     """
     if damaged not in ("drop", "keep"):
-        raise ConfigError(f"{damaged!r} is nothing to do with damage", where="--damaged", expected="drop or keep")
-    if same(source, target):
+        raise ConfigError(f"unknown treatment of damaged bytes {damaged!r}", where="damaged", expected="drop or keep")
+    if same_location(source, target):
         raise ConfigError("the target is the source", where=target, fix="Choose another name")
     tell = progress or (lambda done, total: None)
-    with Log(source, salvage=True) as log:
-        structure, losses = log.structure, log.losses
-        assert losses is not None, "with salvage there are losses, if perhaps none"
-        size = structure.source.size
-        compression = next((b.compression for b in structure.blocks if b.compression), "zstd")
-        with LogWriter(target, compression=compression, overwrite=overwrite, header=structure.opening) as out:
+    with RecoveredLog(source) as log:
+        index, losses, size = log.index, log.losses, log.index.source.size
+        compression = next((b.compression for b in index.blocks if b.compression), "zstd")
+        with LogWriter(target, compression=compression, overwrite=overwrite, header=index.header_bytes) as out:
             with log.named():
-                structure.prove()
-                saved = _Saved(structure, losses, out)
-                for item in structure.items:
-                    saved.take(item)
-                    tell(item.offset, 2 * size)
-                if losses and not out.contents.counts and not out.contents.attachments:
-                    raise LogError(
-                        f"nothing in it can be saved: {losses.entries[0].reason}", expected="at least one sound chunk"
-                    )
-                kept = [loss for loss in losses.entries if loss.length] if damaged == "keep" else []
-                for loss in kept:
-                    _keep(out, structure.source, loss)
-            if losses or losses.mended:
-                out.metadata(RECORD, _told(source, damaged, losses))
+                kept = _save(log, out, damaged, lambda done: tell(done, 2 * size))
+            if not losses.intact:
+                out.metadata(RECORD, _loss_record(source, damaged, losses))
             out.finish()
             verify(
                 out.target.temporary,
@@ -107,82 +93,93 @@ def repair(
                 progress=lambda done, total: tell(size + size * done // total, 2 * size),
             )
             tell(2 * size, 2 * size)
-            messages: dict[str, int] = {}
+            saved: dict[str, int] = {}
             for channel, count in sorted(out.contents.counts.items()):
-                topic = structure.channels[channel].topic
-                messages[topic] = messages.get(topic, 0) + count
-            return RepairReport(losses, messages, len(out.contents.chunks), len(kept), size, out.target.position)
+                topic = index.channels[channel].topic
+                saved[topic] = saved.get(topic, 0) + count
+            return RepairReport(losses, saved, len(out.contents.chunks), kept, size, out.target.position)
 
 
-def _told(source: Location, damaged: str, losses: Losses) -> dict[str, str]:
-    """The metadata record."""
-    found = losses.plain()
-    unknown = {key: "unknown" if value is None else value for key, value in found.items() if key != "whole"}
-    told = {key: value if isinstance(value, str) else json.dumps(value) for key, value in unknown.items()}
-    return {"version": imutool.__version__, "source_file": source.name, "damaged": damaged, **told}
+def _loss_record(source: Location, damaged: str, losses: Losses) -> dict[str, str]:
+    """The metadata record of what was lost."""
+    values = {key: "unknown" if value is None else value for key, value in losses.plain().items() if key != "whole"}
+    texts = {key: value if isinstance(value, str) else json.dumps(value) for key, value in values.items()}
+    return {"version": imutool.__version__, "source_file": source.name, "damaged": damaged, **texts}
 
 
-class _Saved:
-    """The part of a log that goes on, item by item."""
+def _save(log: RecoveredLog, out: LogWriter, damaged: str, tell: Callable[[int], None]) -> int:
+    """Copies everything intact; returns how many damaged stretches were kept.
 
-    def __init__(self, structure: LogIndex, losses: Losses, out: LogWriter) -> None:
-        self.structure, self.source, self.losses, self.out = structure, structure.source, losses, out
-        out.contents.schemas.update(sorted(structure.schemas.items()))
-        out.contents.channels.update(sorted(structure.channels.items()))
+    Raises:
+        LogError: nothing is intact.
+    """
+    log.check_data_crc()
+    saver = _Saver(log.index, out)
+    for item in log.index.items:
+        saver.copy(item)
+        tell(item.offset)
+    losses = log.losses
+    if losses and not out.contents.counts and not out.contents.attachments:
+        raise LogError(f"nothing in it can be saved: {losses.entries[0].reason}", expected="at least one sound chunk")
+    kept = [loss for loss in losses.entries if loss.length] if damaged == "keep" else []
+    for loss in kept:
+        _attach_damaged(out, log.index.source, loss)
+    return len(kept)
+
+
+class _Saver:
+    """Copies the intact parts of a log, item by item."""
+
+    def __init__(self, index: RecoveredIndex, out: LogWriter) -> None:
+        self.index, self.source, self.out = index, index.source, out
+        out.contents.schemas.update(sorted(index.schemas.items()))
+        out.contents.channels.update(sorted(index.channels.items()))
         for record in (*out.contents.schemas.values(), *out.contents.channels.values()):
             out.target.write(records.build(record))
 
-    def take(self, item: Block | Span) -> None:
-        """Copies one item, or has it counted as lost."""
+    def copy(self, item: MessageBlock | RecordSpan) -> None:
+        """Copies one item, or lists it as lost."""
         try:
-            if isinstance(item, Span):
-                self._span(item)
+            if isinstance(item, RecordSpan):
+                self._copy_record(item)
             elif not item.lost:
-                self._block(item)
+                self._copy_block(item)
         except LogError as error:
-            self.structure.lose(item, error)
+            self.index.lose(item, error)
 
-    def _block(self, block: Block) -> None:
-        raw = self.structure.read(block)
-        found = self.structure.unpacked(block, raw)
+    def _copy_block(self, block: MessageBlock) -> None:
+        raw = self.index.read(block)
+        found = self.index.unpack_bytes(block, raw)
         if block.compression is None or block.edited:
             if len(found.heads):
-                self._anew(block, found)
+                self._new_chunk(block, found)
             return
-        head = records.ChunkHead.of(raw[:128], len(raw), block.offset)
-        self._chunk(raw[: head.data_at], raw[head.data_at :], head, found)
+        head = ChunkHead.of(raw[:128], len(raw), block.offset)
+        self._write_chunk(raw[: head.data_at], raw[head.data_at :], head, found)
 
-    def _anew(self, block: Block, found: records.Messages) -> None:
-        """Messages that cannot go on in the chunk they came from, or came from none."""
+    def _new_chunk(self, block: MessageBlock, found: messages.Messages) -> None:
+        """Packs messages that cannot stay in their chunk, or lie outside chunks."""
         data, times = found.data.tobytes(), found.times()
         compression = block.compression or ""
         if compression not in records.COMPRESSIONS.values():
             compression = "zstd"
         packed = records.pack(compression)(data)
         start = records.chunk_head(data, packed, compression, int(times.min()), int(times.max()))
-        if block.offset in self.losses.unchecked_in:
+        if block.offset in self.index.losses.unchecked_in:
             start = start[:CRC_AT] + bytes(4) + start[CRC_AT + 4 :]
-        self._chunk(start, packed, records.ChunkHead.of(start, len(start) + len(packed), block.offset), found)
+        self._write_chunk(start, packed, ChunkHead.of(start, len(start) + len(packed), block.offset), found)
 
-    def _chunk(self, start: bytes, packed: bytes, head: records.ChunkHead, found: records.Messages) -> None:
-        times, offset = found.times(), self.out.target.position
+    def _write_chunk(self, start: bytes, packed: bytes, head: ChunkHead, found: messages.Messages) -> None:
+        times = found.times()
+        entry = head.index_at(self.out.target.position, len(start) + len(packed))
         self.out.target.write(start)
         self.out.target.write(packed)
-        entry = ChunkIndex(
-            chunk_length=len(start) + len(packed),
-            chunk_start_offset=offset,
-            compression=head.compression,
-            compressed_size=len(packed),
-            message_end_time=int(times.max()) if len(times) else head.end_ns,
-            message_index_length=0,
-            message_index_offsets={},
-            message_start_time=int(times.min()) if len(times) else head.start_ns,
-            uncompressed_size=head.size,
-        )
-        self.out.index(entry, found.heads["channel"].copy(), times, found.offsets)
+        if len(times):
+            entry.message_start_time, entry.message_end_time = int(times.min()), int(times.max())
+        self.out.write_indexes(entry, found.heads["channel"].copy(), times, found.offsets)
 
-    def _span(self, span: Span) -> None:
-        """Anything else as it is; definitions stand in front already, and indexes are made anew."""
+    def _copy_record(self, span: RecordSpan) -> None:
+        """Copies any other record; definitions stand in front already, and indexes are rebuilt."""
         at = self.out.target.position
         if span.opcode in (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE_INDEX):
             return
@@ -191,74 +188,50 @@ class _Saved:
             name = records.parse(Metadata, body, span.offset).name
             self.out.contents.metadata.append(MetadataIndex(offset=at, length=span.length, name=name))
         elif span.opcode == Opcode.ATTACHMENT:
-            attached = Attached.of(self.source, span.offset, span.length - HEAD.size)
-            attached.check(self.source)
-            self._enter(attached, at)
-        for start in range(span.offset, span.offset + span.length, COPY_BYTES):
-            self.out.target.write(self.source.at(start, min(COPY_BYTES, span.offset + span.length - start)))
-
-    def _enter(self, attached: Attached, offset: int) -> None:
-        self.out.contents.attachments.append(
-            AttachmentIndex(
-                offset=offset,
-                length=attached.length,
-                log_time=attached.log_time,
-                create_time=attached.create_time,
-                data_size=attached.size,
-                name=attached.name,
-                media_type=attached.media_type,
-            )
-        )
+            attachment = Attachment.of(self.source, span.offset, span.length - HEAD.size)
+            attachment.check_crc(self.source)
+            self.out.contents.attachments.append(attachment.index_at(at))
+        self.out.target.copy(self.source, span.offset, span.offset + span.length)
 
 
-def _keep(out: LogWriter, source: Source, loss: Loss) -> None:
-    """Damaged bytes as attachments, in parts that a reader can hold."""
+def _attach_damaged(out: LogWriter, source: Source, loss: Loss) -> None:
+    """Writes damaged bytes as attachments, in parts that a reader can hold."""
     for start in range(loss.offset, loss.offset + loss.length, PART_BYTES):
         size = min(PART_BYTES, loss.offset + loss.length - start)
-        name, media = f"{DAMAGED}/{start}".encode(), b"application/octet-stream"
-        body = struct.pack("<QQI", loss.start_ns or 0, 0, len(name)) + name
-        body += struct.pack("<I", len(media)) + media + struct.pack("<Q", size)
-        at, crc = out.target.position, zlib.crc32(body)
-        out.target.write(HEAD.pack(Opcode.ATTACHMENT, len(body) + size + 4) + body)
-        for position in range(start, start + size, COPY_BYTES):
-            part = source.at(position, min(COPY_BYTES, start + size - position))
+        name, media = f"{DAMAGED}/{start}", "application/octet-stream"
+        texts = b"".join(struct.pack("<I", len(text)) + text.encode() for text in (name, media))
+        body = struct.pack("<QQ", loss.start_ns or 0, 0) + texts + struct.pack("<Q", size)
+        at, crc, length = out.target.position, zlib.crc32(body), len(body) + size + 4
+        out.target.write(HEAD.pack(Opcode.ATTACHMENT, length) + body)
+        for position in range(start, start + size, BLOCK_BYTES):
+            part = source.at(position, min(BLOCK_BYTES, start + size - position))
             crc = zlib.crc32(part, crc)
             out.target.write(part)
         out.target.write(struct.pack("<I", crc))
-        out.contents.attachments.append(
-            AttachmentIndex(
-                offset=at,
-                length=out.target.position - at,
-                log_time=loss.start_ns or 0,
-                create_time=0,
-                data_size=size,
-                name=name.decode(),
-                media_type=media.decode(),
-            )
-        )
+        attachment = Attachment(at, HEAD.size + length, loss.start_ns or 0, 0, name, media, size)
+        out.contents.attachments.append(attachment.index_at(at))
 
 
 @contextmanager
 def repaired(source: Location, beside: Location) -> Iterator[tuple[Location, Losses] | None]:
-    """A repaired copy of a damaged log in the folder of `beside`, for as long as it is needed; None if the log is whole.
+    """Temporary repaired copy of a damaged log beside another file; None if the log is intact.
 
     Raises:
         ConfigError: the copy cannot be written.
         LogError: nothing in the log can be saved.
     """
-    with Log(source, salvage=True) as log:
+    with RecoveredLog(source) as log:
         log.check()
-        losses = log.losses
-    assert losses is not None, "with salvage there are losses, if perhaps none"
-    if not losses and not losses.mended:
+        intact = log.losses.intact
+    if intact:
         yield None
         return
     copy = beside.with_name(f".{source.name}.{os.getpid()}.{secrets.token_hex(4)}.partial")
     try:
         yield copy, repair(source, copy).losses
-    except ImutoolError as error:  # the user never heard of the copy
+    except ImutoolError as error:  # the user does not know the copy
         where = None if error.where is None else str(error.where).replace(str(copy), str(source))
         raise type(error)(error.what, where=where, expected=error.expected, fix=error.fix) from error
     finally:
-        with suppress(failures(copy)):
+        with suppress(io_errors(copy)):
             copy.unlink()

@@ -1,20 +1,63 @@
-"""The topics of a log, and what kinds of them are told apart: by their messages, and by who made them."""
+"""Topics of a log, batches of their messages, and checks of numbers and stamps."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from types import MappingProxyType
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float64, Int64, UInt32
 
 from imutool.errors import LogError
 from imutool.mcap_io.codec import schemas
-from imutool.mcap_io.index import LogIndex
+from imutool.mcap_io.codec.decode import TwistColumns, decode_imu, decode_poses, decode_scalars, decode_twist
+from imutool.mcap_io.codec.messages import Rows
 
 ENCODINGS = ("cdr", "ros1")
 DERIVED_KEY = "imutool_source_topic"  # channel metadata: computed by imutool from this topic
-
 MESSAGE_POSES = (schemas.POSE, schemas.ODOMETRY, schemas.TRANSFORM)
 SCALARS = {schemas.FLOAT: 1, schemas.VECTOR3: 3}
+CLEAN_FIX = "See what is wrong with imutool clean LOG, and leave it out with imutool debias --clean"
+
+
+class ImuBatch(NamedTuple):
+    """Consecutive messages of one IMU; times in ns, rad/s, m/s²."""
+
+    log_time: Int64[np.ndarray, " n"]
+    publish_time: Int64[np.ndarray, " n"]
+    sequence: UInt32[np.ndarray, " n"]
+    stamp_ns: Int64[np.ndarray, " n"]
+    gyro: Float64[np.ndarray, "n 3"]
+    accel: Float64[np.ndarray, "n 3"]
+    frame_id: str
+
+
+class PoseBatch(NamedTuple):
+    """Consecutive poses of one frame in another; metres, quaternions as they stand in the log."""
+
+    log_time: Int64[np.ndarray, " n"]
+    publish_time: Int64[np.ndarray, " n"]
+    sequence: UInt32[np.ndarray, " n"]
+    stamp_ns: Int64[np.ndarray, " n"]
+    p_wb: Float64[np.ndarray, "n 3"]
+    q_wb_wxyz: Float64[np.ndarray, "n 4"]
+    frame_id: str
+    child_frame_id: str
+
+
+class ScalarBatch(NamedTuple):
+    """Consecutive messages of a numeric topic.
+
+    `stamp_ns` is the log time where the message has no header.
+    """
+
+    log_time: Int64[np.ndarray, " n"]
+    publish_time: Int64[np.ndarray, " n"]
+    sequence: UInt32[np.ndarray, " n"]
+    stamp_ns: Int64[np.ndarray, " n"]
+    values: Float64[np.ndarray, "n k"]
+    frame_id: str
 
 
 @dataclass(frozen=True)
@@ -28,29 +71,109 @@ class Topic:
     count: int
     metadata: Mapping[str, str]
 
+    @property
+    def is_derived(self) -> bool:
+        """Whether imutool computed the topic from another one."""
+        return DERIVED_KEY in self.metadata
 
-def topics_of(structure: LogIndex) -> dict[str, Topic]:
-    """The topics of a log by their names, in order of their channel ids.
+    def decode_imu(self, rows: Rows) -> Iterator[ImuBatch]:
+        """IMU messages from their bytes, one batch per stretch with one frame, unchecked.
+
+        Raises:
+            LogError: a payload that is no such message.
+        """
+        for part, layout in schemas.runs(rows.payload, schemas.IMU, self.message_encoding):
+            cut = rows.where(part)
+            columns = decode_imu(cut.payload, self.message_encoding, layout)
+            yield ImuBatch(cut.log_time, cut.publish_time, cut.sequence, *columns)
+
+    def decode_poses(self, rows: Rows) -> Iterator[PoseBatch]:
+        """Poses from their bytes, one batch per stretch with one frame and per transform.
+
+        Raises:
+            LogError: a payload that is no such message, NaN or infinite values.
+        """
+        for part, layout in schemas.runs(rows.payload, self.schema_name, self.message_encoding):
+            cut = rows.where(part)
+            for columns in decode_poses(cut.payload, self.schema_name, self.message_encoding, layout):
+                check_finite(cut.sequence, position=columns.p_wb, orientation=columns.q_wb_wxyz)
+                yield PoseBatch(cut.log_time, cut.publish_time, cut.sequence, *columns)
+
+    def decode_scalars(self, rows: Rows) -> Iterator[ScalarBatch]:
+        """Numbers from their bytes, one batch per stretch with one frame.
+
+        Raises:
+            LogError: a payload that is no such message, NaN or infinite values.
+        """
+        for part, layout in schemas.runs(rows.payload, self.schema_name, self.message_encoding):
+            cut = rows.where(part)
+            columns = decode_scalars(cut.payload, self.schema_name, self.message_encoding, layout)
+            check_finite(cut.sequence, values=columns.values)
+            stamp_ns = cut.log_time if columns.stamp_ns is None else columns.stamp_ns
+            yield ScalarBatch(cut.log_time, cut.publish_time, cut.sequence, stamp_ns, columns.values, columns.frame_id)
+
+    def decode_twist(self, rows: Rows) -> Iterator[TwistColumns]:
+        """Biases with covariance from their bytes, one batch per stretch with one frame.
+
+        Raises:
+            LogError: a payload that is no such message.
+        """
+        for part, layout in schemas.runs(rows.payload, schemas.TWIST, self.message_encoding):
+            yield decode_twist(rows.where(part).payload, self.message_encoding, layout)
+
+
+def check_finite(sequence: UInt32[np.ndarray, " n"], **fields: Float64[np.ndarray, "n _"]) -> None:
+    """Refuses NaN and infinity, naming the message.
 
     Raises:
-        LogError: two channels of one topic carry different messages.
+        LogError: a value that is not finite.
     """
-    found: dict[str, Topic] = {}
-    counts = structure.counts()
-    for identity, channel in sorted(structure.channels.items()):
-        kind = structure.schemas.get(channel.schema_id)
-        before = found.get(channel.topic)
-        found[channel.topic] = Topic(
-            channel.topic,
-            schemas.canonical(kind.name) if kind else "",
-            kind.encoding if kind else "",
-            channel.message_encoding,
-            counts.get(identity, 0) + (before.count if before else 0),
-            MappingProxyType(dict(channel.metadata)),
-        )
-        if before and (before.schema_name, before.message_encoding) != (
-            found[channel.topic].schema_name,
-            found[channel.topic].message_encoding,
-        ):
-            raise LogError(f"{channel.topic} carries {before.schema_name} and {found[channel.topic].schema_name}")
-    return found
+    for name, values in fields.items():
+        good = np.isfinite(values).all(axis=1)
+        if not good.all():
+            row = int(np.argmin(good))
+            raise LogError(
+                f"message {sequence[row]} has {name} {values[row].tolist()}",
+                expected="finite numbers",
+                fix="Cut the log before or after it",
+            )
+
+
+@dataclass(slots=True)
+class StampCheck:
+    """Refuses stamps that repeat or go back, across batches."""
+
+    count: int = 0
+    last: int | None = None
+
+    def check(self, stamp_ns: Int64[np.ndarray, " n"], sequence: UInt32[np.ndarray, " n"]) -> None:
+        """Takes in the next stamps.
+
+        Raises:
+            LogError: one does not come after the one before it; the message names the message and both stamps.
+        """
+        if not len(stamp_ns):
+            return
+        before = np.concatenate([[stamp_ns[0] - 1 if self.last is None else self.last], stamp_ns[:-1]])
+        bad = stamp_ns <= before
+        if bad.any():
+            row = int(np.argmax(bad))
+            how = "repeats" if stamp_ns[row] == before[row] else "goes back"
+            raise LogError(
+                f"message {self.count + row} (sequence {sequence[row]}) has the stamp {stamp_ns[row]} ns, which {how}: "
+                f"the message before has {before[row]} ns",
+                expected="stamps that increase",
+            )
+        self.count, self.last = self.count + len(stamp_ns), int(stamp_ns[-1])
+
+    def check_imu(self, batch: ImuBatch) -> None:
+        """Takes in the next samples of an IMU.
+
+        Raises:
+            LogError: NaN, infinity, or a stamp that does not come after the one before it.
+        """
+        try:
+            check_finite(batch.sequence, angular_velocity=batch.gyro, linear_acceleration=batch.accel)
+            self.check(batch.stamp_ns, batch.sequence)
+        except LogError as error:
+            raise LogError(error.what, expected=error.expected, fix=CLEAN_FIX) from error

@@ -1,4 +1,4 @@
-"""A recording written as a log: chunks of one kind of data each.
+"""Write a recording as a log, in chunks of one kind of data each.
 
 An IMU read from a log whose images share its chunks costs the unpacking of every image; so IMU, poses, scalars and images
 each have chunks of their own, about 1 MiB long, interleaved by the time they begin.
@@ -19,7 +19,7 @@ from jaxtyping import Int64, Shaped, UInt8
 import imutool
 from imutool.errors import DataError
 from imutool.location import Location
-from imutool.mcap_io.codec import records, schemas
+from imutool.mcap_io.codec import messages, schemas
 from imutool.mcap_io.codec.encode import encode_float, encode_image, encode_imu, encode_pose, encode_transform, encode_vector3
 from imutool.mcap_io.read import OWN_KEYS, RECORD, SHADOWED_KEY, UNIT_KEY, VELOCITY_KEY
 from imutool.mcap_io.writer import Chunk, LogWriter
@@ -31,7 +31,7 @@ PACKED_IMAGES = ("png", "jpeg", "jpg", "webp")  # compressing these again costs 
 
 
 class Series(NamedTuple):
-    """A topic whose messages are made from slices of its columns when their chunk is due."""
+    """A topic with its columns; messages are encoded when their chunk is due."""
 
     channel: int
     t_ns: Int64[np.ndarray, " n"]
@@ -43,11 +43,13 @@ class Series(NamedTuple):
         payload = self.encode(*(column[part] for column in self.columns))
         times = self.t_ns[part]
         sequence = np.arange(part.start, part.stop, dtype=np.uint32)
-        return records.message_rows(self.channel, times, times, sequence, payload)
+        return messages.message_rows(self.channel, times, times, sequence, payload)
 
 
 def write(recording: Recording, path: Location, *, compression: str = "zstd", overwrite: bool = False) -> None:
-    """Writes a recording as a log, which `read` gives back bit for bit. Log time, publish time and stamp are one.
+    """Writes a recording as a log, which `read` gives back bit for bit.
+
+    Log time, publish time and stamp are equal.
 
     Raises:
         ConfigError: the target exists (without `overwrite`) or cannot be written, or an unknown compression.
@@ -63,7 +65,7 @@ def write(recording: Recording, path: Location, *, compression: str = "zstd", ov
 
 
 def _write_metadata(log: LogWriter, recording: Recording) -> None:
-    """The record `imutool` first, with the recording's own entries of that name laid under it and kept apart."""
+    """Writes the record `imutool` first; the recording's own entries of that name stay apart."""
     given = recording.metadata.get(RECORD)
     shadowed = None if given is None else {k: v for k, v in given.items() if k in OWN_KEYS}
     own = {
@@ -86,7 +88,7 @@ def _imu(log: LogWriter, recording: Recording) -> list[Series]:
 
 
 def _poses(log: LogWriter, recording: Recording) -> list[Series]:
-    """Every truth as PoseStamped, its velocity beside it, and the first also on /tf for the 3D views."""
+    """Every truth as PoseStamped with its velocity, and the first also on /tf."""
     found: list[Series] = []
     for which, (topic, poses) in enumerate(recording.truths.items()):
         t_ns, columns = poses.t_ns, (poses.t_ns, poses.p_wb, poses.q_wb_wxyz)
@@ -116,7 +118,7 @@ def _scalars(log: LogWriter, recording: Recording) -> list[Series]:
 
 
 def chunks(group: Sequence[Series]) -> Iterator[Chunk]:
-    """The messages of some topics in log-time order, cut into chunks.
+    """Messages of some topics in log-time order, cut into chunks.
 
     Raises:
         DataError: a time before 1970, which a log cannot hold.
@@ -141,14 +143,14 @@ def chunks(group: Sequence[Series]) -> Iterator[Chunk]:
             mine = offsets[which[first:last] == index]
             if len(mine):
                 rows = series.records(slice(done[index], done[index] + len(mine)))
-                records.scatter(data, mine, rows)
+                messages.scatter(data, mine, rows)
                 done[index] += len(mine)
         channels = np.array([series.channel for series in group], np.uint16)[which[first:last]]
         yield Chunk(data.tobytes(), channels, times[first:last], offsets)
 
 
 def _images(log: LogWriter, topic: str, frames: Frames) -> Iterator[tuple[Chunk, str | None]]:
-    """The chunks of one camera; its channel is defined at once, its images are fetched when their chunk is due."""
+    """The chunks of one camera; images are fetched when their chunk is due."""
     channel = log.channel(topic, schemas.IMAGE)
     packing = "none" if frames.format.lower() in PACKED_IMAGES else None
     return ((chunk, packing) for chunk in _image_chunks(channel, topic, frames))
@@ -164,7 +166,7 @@ def _image_chunks(channel: int, topic: str, frames: Frames) -> Iterator[Chunk]:
         if t_ns < 0:
             raise DataError(f"an image of {topic} has the time {t_ns} ns", expected="no time before 1970")
         payload = encode_image(t_ns, image, frame_id, frames.format)
-        parts.append(records.message_record(channel, sequence, t_ns, payload))
+        parts.append(messages.message_record(channel, sequence, t_ns, payload))
         times.append(t_ns)
         offsets.append(size)
         size += len(parts[-1])

@@ -1,4 +1,4 @@
-"""A log being written: definitions first, then chunks as they come, and a summary that indexes everything."""
+"""Write a log: definitions first, then chunks, and a summary that indexes everything."""
 
 from __future__ import annotations
 
@@ -29,9 +29,8 @@ from mcap.records import (
 import imutool
 from imutool.errors import DataError
 from imutool.location import Location
-from imutool.mcap_io.codec import records
+from imutool.mcap_io.codec import messages, records
 from imutool.mcap_io.codec import schemas as schema
-from imutool.mcap_io.codec.chunk_index import ChunkIndexes
 from imutool.mcap_io.codec.records import FOOTER_SIZE, MAGIC
 from imutool.mcap_io.storage.target import Target
 
@@ -46,7 +45,7 @@ QOS = (
 
 
 class Chunk(NamedTuple):
-    """Message records in log-time order, and what an index must know of each."""
+    """Message records in log-time order, with the columns of their index."""
 
     data: bytes
     channels: UInt16[np.ndarray, " n"]
@@ -61,11 +60,11 @@ class Chunk(NamedTuple):
 
 @dataclass
 class Contents:
-    """What the summary of a log says, collected while its data section is written."""
+    """Contents of a summary, collected while the data section is written."""
 
     schemas: dict[int, Schema] = field(default_factory=dict)
     channels: dict[int, Channel] = field(default_factory=dict)
-    chunks: ChunkIndexes = field(default_factory=ChunkIndexes)
+    chunks: records.ChunkIndexes = field(default_factory=records.ChunkIndexes)
     attachments: list[AttachmentIndex] = field(default_factory=list)
     metadata: list[MetadataIndex] = field(default_factory=list)
     counts: Counter[int] = field(default_factory=Counter)
@@ -94,7 +93,7 @@ class Contents:
         )
 
     def groups(self) -> Iterator[tuple[Opcode, bytes | bytearray]]:
-        """The bytes of the summary section, its records grouped by opcode as the format demands."""
+        """Bytes of the summary section, its records grouped by opcode."""
         yield Opcode.SCHEMA, _built(self.schemas.values())
         yield Opcode.CHANNEL, _built(self.channels.values())
         yield Opcode.STATISTICS, _built([self.statistics()])
@@ -108,7 +107,7 @@ def _built(group: Iterable[McapRecord]) -> bytes:
 
 
 class LogWriter:
-    """A log being written, as a context manager: complete and in its place on leaving, or gone after any error.
+    """A log being written, as a context manager: complete on leaving, or gone after an error.
 
     Without `data_crc` the log states no CRC of its data section, and bytes may pass into it that nobody has looked at.
 
@@ -152,7 +151,7 @@ class LogWriter:
         self.target.commit()
 
     def channel(self, topic: str, schema_name: str, metadata: Mapping[str, str] | None = None) -> int:
-        """Defines a topic (and its schema, once), and returns its channel id, the largest there is plus one.
+        """Defines a topic and its schema; returns its channel id, the largest plus one.
 
         Raises:
             DataError: the topic is defined already, or no id is left.
@@ -172,7 +171,7 @@ class LogWriter:
         return record.id
 
     def _schema(self, schema_name: str) -> int:
-        """The id of a schema: that of one with the same definition (comments aside), or a new one."""
+        """Id of a schema with the same definition (comments aside), or of a new one."""
         text = schema.definition(schema_name)
         for known in self.contents.schemas.values():
             if known.name == schema_name and known.encoding == "ros2msg" and _bare(known.data) == _bare(text.encode()):
@@ -203,24 +202,10 @@ class LogWriter:
         offset = self.target.position
         self.target.write(head)
         self.target.write(packed)
-        self.index(
-            ChunkIndex(
-                chunk_length=len(head) + len(packed),
-                chunk_start_offset=offset,
-                compression=name,
-                compressed_size=len(packed),
-                message_end_time=end_ns,
-                message_index_length=0,
-                message_index_offsets={},
-                message_start_time=start_ns,
-                uncompressed_size=len(chunk.data),
-            ),
-            chunk.channels,
-            chunk.times,
-            chunk.offsets,
-        )
+        entry = records.ChunkHead.of(head, len(head) + len(packed), offset).index_at(offset, len(head) + len(packed))
+        self.write_indexes(entry, chunk.channels, chunk.times, chunk.offsets)
 
-    def index(
+    def write_indexes(
         self,
         entry: ChunkIndex,
         channels: UInt16[np.ndarray, " n"],
@@ -233,14 +218,14 @@ class LogWriter:
             mask = channels == channel
             counts[channel] = int(mask.sum())
             entry.message_index_offsets[channel] = self.target.position
-            self.target.write(records.message_index(channel, times[mask], offsets[mask]))
+            self.target.write(messages.message_index(channel, times[mask], offsets[mask]))
         entry.message_index_length = self.target.position - first
         self.contents.chunks.append(entry)
         if counts:
             self.contents.add(counts, int(times.min()), int(times.max()))
 
     def finish(self) -> None:
-        """Ends the data section and writes the summary; the file is then complete under its temporary name."""
+        """Ends the data section and writes the summary under the temporary name."""
         if self.finished:
             return
         self.finished = True
@@ -261,7 +246,7 @@ class LogWriter:
 
 
 def _next(taken: Mapping[int, object], what: str) -> int:
-    """The largest id plus one, which keeps all ids there are."""
+    """The largest id plus one."""
     largest = max(taken, default=0)
     if largest >= LARGEST_ID:
         raise DataError(f"a {what} has the id {largest}", expected=f"less than {LARGEST_ID}, so that one more has room")

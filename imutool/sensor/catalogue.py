@@ -1,4 +1,4 @@
-"""Catalogue of effects: the files of `imutool/sensor/effects`, and those that other packages register."""
+"""Catalogue of effects: files of `imutool/sensor/effects`, and those of other packages."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def diagnosed(names: Sequence[str] | None = None) -> tuple[Effect, ...]:
 
 
 def trained(sensor: Sensor, names: Sequence[str] | None = None) -> tuple[LinearForm, ...]:
-    """Every effect on a sensor that a bias model can have, by name; or some, in the order of their names.
+    """Linear forms on a sensor of every trained effect, or of some, in the order of names.
 
     Raises:
         ConfigError: an unknown name (the nearest is given), an effect without a linear form on the sensor, or a name twice.

@@ -1,14 +1,14 @@
-"""The forward side of an effect: what it makes of the ideal signals, in the order in which they meet it.
+"""Effect: equation, parameters and forward model of one deviation of a real sensor.
 
-A file of an effect names it `EFFECT`. Its `forward` takes ideal signals and parameters and gives what comes out; nothing else
-is needed to simulate it, and the estimator differentiates it by differences. Effects act in the order of their `stage`:
+A file of `imutool/sensor/effects` holds one, by the name `EFFECT`. Its `forward` maps ideal signals and parameters to the
+signals behind it. Nothing else is needed: simulation runs it, the diagnosis differentiates it by differences, and the linear
+error of a bias model is derived from it (`imutool.sensor.linear_form`). Effects act in the order of their `stage`:
 
 | stage | acts on | effects |
 |---|---|---|
-| MOTION | `IdealMotion` | what the point where the sensor sits feels: gravity, earth_rotation, lever_arm, size_effect,
-vibration |
-| MOUNT | `IdealMotion` | how the sensor sits: mount_resonance, mount_rotation |
-| BANDWIDTH | `IdealMotion` | what it is too slow for: low_pass |
+| MOTION | `IdealMotion` | motion where the sensor sits: gravity, earth_rotation, lever_arm, size_effect, vibration |
+| MOUNT | `IdealMotion` | how the sensor is mounted: mount_resonance, mount_rotation |
+| BANDWIDTH | `IdealMotion` | the sensor's own bandwidth: low_pass |
 | CLOCK | times | when samples are taken: clock_offset, clock_skew, clock_jump |
 | SENSOR | `SensorSamples` | scale, misalignment, nonlinearity, g-sensitivity, temperature, drift, bias |
 | CONVERTER | `SensorSamples` | saturation, then quantization |
@@ -47,7 +47,7 @@ class Stage(IntEnum):
 
 @dataclass(frozen=True)
 class Parameter:
-    """A parameter of an effect: name, unit, plausible size (one standard deviation of what is met).
+    """Parameter of an effect: name, unit, and plausible size as one standard deviation.
 
     positive: it is positive by nature, so that a fit moves its logarithm.
     null_value: the value at which the effect does nothing: 0, or infinity (a cut-off frequency, a limit). A parameter that
@@ -69,7 +69,7 @@ class Parameter:
 
 @dataclass(frozen=True, slots=True)
 class CompiledEffect:
-    """An effect for given parameters: the error at each sample of a block, and at one sample from its time and columns.
+    """Effect for given parameters: the error in a block, and at one sample by time and columns.
 
     One sample is plain floats: numpy's calls would cost several times the arithmetic.
     """
@@ -86,6 +86,7 @@ class CompiledEffect:
 class Effect:
     """An effect on a sensor: its equation, its parameters and its forward model.
 
+    observable_if: what a log must have for the parameters to show, as the reference of the effects lists it.
     forward: (IdealMotion, theta) -> IdealMotion up to BANDWIDTH; (taken_s, theta) -> taken_s at CLOCK; (SensorSamples, theta)
         -> SensorSamples behind it.
     linear: whether what it adds is proportional to theta (then a fit may start at zero).
@@ -95,6 +96,7 @@ class Effect:
     needs: channels that it cannot do without, such as "temperature"; a channel whose name contains it serves.
     kind: of the catalogue, driven by the channel `variable`, or unknown: a curve of `variable`, or a term, on one `axis`.
     variant: tells effects of one name apart.
+    jumps: what comes out is no smooth function of the parameters: an edge between two samples.
     trained: a bias model can have it: its error follows from the sensor's own samples and is linear in all parameters but those
         `fixed_in_training`.
     diagnosed: a diagnosis may find it.
@@ -107,16 +109,17 @@ class Effect:
     sensors: tuple[Sensor, ...]
     equation: str
     parameters: tuple[Parameter, ...]
-    seen_if: str
+    observable_if: str
     forward: Callable[[Any, Theta], Any]
     linear: bool = True
-    starts: Callable[[IdealMotion, SensorSamples], Sequence[Theta]] | None = None
+    starts: Callable[[Any, Any], Sequence[Theta]] | None = None
     alternatives: Callable[[SensorSamples], int] | None = None
     needs: tuple[str, ...] = ()
     kind: Kind = "catalogue"
     variable: str = ""
     axis: int | None = None
     variant: str = ""
+    jumps: bool = False
     trained: bool = False
     diagnosed: bool = True
     basis: Callable[[Signals], Float64[np.ndarray, "n q"]] | None = None
@@ -148,6 +151,11 @@ def each_pair(unit: str, plausible: float, *, diagonal: bool = True, before: str
     return tuple(Parameter(before + a + b, unit, plausible) for a in AXES for b in AXES if diagonal or a != b)
 
 
+def starts_at(*starts: Sequence[float]) -> Callable[[IdealMotion, SensorSamples], Sequence[Theta]]:
+    """Starts of a fit that are the same for every log."""
+    return lambda _motion, _samples: [np.array(theta) for theta in starts]
+
+
 def matrix(theta: Float64[np.ndarray, "6"]) -> Float64[np.ndarray, "3 3"]:
     """The matrix with these entries off its diagonal, row by row, and zeros on it."""
     out = np.zeros((3, 3))
@@ -167,23 +175,26 @@ def attitude_of(motion: IdealMotion, effect: str) -> Float64[np.ndarray, "n 3 3"
 
 
 def residual(motion: IdealMotion, samples: SensorSamples) -> tuple[Float64[np.ndarray, "n 3"], Float64[np.ndarray, "n 3"]]:
-    """Samples minus the ideal ones at the same stamps: gyro (rad/s), accel (m/s²). Good enough to start a fit from."""
-    ideal = motion.taken(samples.stamp_s, samples.stamp_s)
+    """Residual: samples minus the ideal ones at the same stamps, gyro (rad/s) and accel (m/s²).
+
+    Good enough to start a fit from.
+    """
+    ideal = motion.sample(samples.stamp_s, samples.stamp_s)
     return samples.gyro - ideal.gyro, samples.accel - ideal.accel
 
 
-CONVERTER_ORDER = {"saturation": 1, "quantization": 2}
+WITHIN_STAGE = {"gain": -2, "dead_band": -1, "saturation": 1, "quantization": 2}
 Acting = Sequence[tuple[Effect, Theta]]
 
 
 @dataclass(frozen=True, eq=False)
 class SignalState:
-    """Signals between two effects: a motion and when it is sampled, or, behind the clock, the samples."""
+    """Signals between two effects: a motion and its sample times or, behind the clock, samples."""
 
-    motion: IdealMotion
+    motion: Any  # an `IdealMotion`, or another signal with the same method `sample`
     taken_s: Times
     stamp_s: Times
-    taken: SensorSamples | None = None
+    taken: Any = None
 
     def through(self, effect: Effect, theta: Theta) -> SignalState:
         """The signals behind one more effect, the next in stage order."""
@@ -197,17 +208,44 @@ class SignalState:
         """The signals with the samples taken: behind this, clock and motion do not matter any more."""
         return self if self.taken is not None else SignalState(self.motion, self.taken_s, self.stamp_s, self.samples())
 
-    def samples(self) -> SensorSamples:
+    def samples(self) -> Any:
         """One row a sample."""
-        return self.motion.taken(self.taken_s, self.stamp_s) if self.taken is None else self.taken
+        return self.motion.sample(self.taken_s, self.stamp_s) if self.taken is None else self.taken
 
 
 def simulate_samples(motion: IdealMotion, stamp_s: Times, acting: Acting) -> SensorSamples:
-    """Samples of a sensor with these effects at some stamps: the stages one after another, within a stage by name."""
+    """Samples of a sensor with these effects at some stamps, applied in stage order."""
     state = SignalState(motion, np.asarray(stamp_s, dtype=np.float64), stamp_s)
     for effect, theta in in_stage_order(acting):
         state = state.through(effect, theta)
-    return state.samples()
+    samples: SensorSamples = state.samples()
+    return samples
+
+
+def simulate_stretches(
+    motions: Sequence[IdealMotion], stamps: Sequence[Float64[np.ndarray, " _"]], acting: Acting
+) -> SensorSamples:
+    """Samples of a sensor with these effects over several stretches of one motion.
+
+    As `simulate_samples`, but clock and sensor know of no stretches: a drift goes on from one to the next, a clock jumps once.
+    """
+    order = in_stage_order(acting)
+    for effect, theta in order:
+        if effect.stage < Stage.CLOCK:
+            motions = [effect.forward(motion, theta) for motion in motions]
+    stamp_s = np.concatenate(stamps)
+    taken_s, stretch = stamp_s, np.repeat(np.arange(len(motions)), [len(part) for part in stamps])
+    for effect, theta in order:
+        if effect.stage == Stage.CLOCK:
+            taken_s = effect.forward(taken_s, theta)
+    parts = []
+    for k, motion in enumerate(motions):
+        rows = (stretch == k) & (taken_s >= motion.t_s[0]) & (taken_s <= motion.t_s[-1])
+        if rows.any():
+            parts.append(motion.sample(taken_s[rows], stamp_s[rows]))
+    if not parts:
+        raise DataError("the clock takes every sample outside the motion", expected="a smaller offset")
+    return distort(SensorSamples.joined(parts), acting)
 
 
 def distort(samples: SensorSamples, acting: Acting) -> SensorSamples:
@@ -224,5 +262,5 @@ def in_stage_order(acting: Acting) -> list[tuple[Effect, Theta]]:
 
 
 def stage_order(effect: Effect) -> tuple[int, int, str]:
-    """Sorting key of an effect: its stage, then its place in the converter, then its key."""
-    return effect.stage, CONVERTER_ORDER.get(effect.name, 0), effect.key
+    """Sorting key of an effect: its stage, then its place within it, then its key."""
+    return effect.stage, WITHIN_STAGE.get(effect.name, 0), effect.key

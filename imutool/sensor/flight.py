@@ -1,4 +1,4 @@
-"""Made-up flights: an exactly known motion, and what a low-cost IMU with bias, scale and misalignment makes of it."""
+"""Synthetic flights: an exact motion, and a low-cost IMU with bias, scale and misalignment."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from imutool.errors import ConfigError
 from imutool.inertial.kinematics import DEGREE, Trajectory, Vectors, continuous
 from imutool.recording import Imu, Poses, Recording, Scalars, Times, seconds
 
-EPOCH_NS = 1_700_000_000_000_000_000  # a real epoch, so that whoever drops the last digits of a stamp is found out
+EPOCH_NS = 1_700_000_000_000_000_000  # a real epoch, so that a lost last digit of a stamp shows
 SPACING_NS = 3_600_000_000_000  # flights of neighbouring seeds start an hour apart
 SEEDS_APART = 100_000  # after eleven years the starts begin again, so that no seed overflows the clock
 MARGIN_S = 0.1  # the trajectory exists a little before and after the flight, the truth a part of that
@@ -31,7 +31,7 @@ Positive = Annotated[float, Meta(gt=0.0)]
 
 
 class TriadSettings(config.Settings, frozen=True, kw_only=True):
-    """One triad of a sensor, in its unit u: rad/s for the gyroscope, m/s² for the accelerometer.
+    """Noise and errors of one triad in its unit u: rad/s (gyroscope), m/s² (accelerometer).
 
     Noise densities are a data sheet's; the other entries are standard deviations from which a sensor, or one flight
     of that sensor, is drawn.
@@ -68,7 +68,7 @@ ACCEL = TriadSettings(
 
 
 class FlightSettings(config.Settings, frozen=True, kw_only=True):
-    """One made-up flight: how it moves, how it is sampled, what sensor flies, how good its truth is."""
+    """Settings of a synthetic flight: motion, sampling, sensor and quality of the truth."""
 
     duration_s: Positive = 60.0
     rate_hz: Positive = 200.0
@@ -88,7 +88,7 @@ class FlightSettings(config.Settings, frozen=True, kw_only=True):
 
 
 def flight(seed: int = 0, settings: FlightSettings | None = None, **changes: Any) -> Recording:
-    """A flight of the sensor `sensor_seed`: raw IMU, true poses with velocity, and the true additive biases.
+    """Synthetic flight of sensor `sensor_seed`: raw IMU, true poses with velocity and biases.
 
     accel, gyro = M s + b(t) + noise, with s from the kinematics of the trajectory, M = I + scale + misalignment fixed
     for the sensor, b = turn-on value + warm-up exp(-t / warm_up_s) + random walk. The true bias on
@@ -119,7 +119,7 @@ def flight(seed: int = 0, settings: FlightSettings | None = None, **changes: Any
 
 
 def trajectory(seed: int = 0, settings: FlightSettings | None = None) -> Trajectory:
-    """The exactly known motion of a flight; it exists from a tenth of a second before the flight to one after.
+    """Exact motion of a flight, from a tenth of a second before it to a tenth after.
 
     Uniform quintic B-splines on random control points: their support is local, so equal control points at the start
     make an exactly motionless start, which a spline forced through points would ring into.
@@ -146,7 +146,7 @@ def trajectory(seed: int = 0, settings: FlightSettings | None = None) -> Traject
 
 
 def _points(settings: FlightSettings, knot_s: float) -> tuple[int, int]:
-    """How many control points repeat the first one, so that nothing moves before `still_s`, and how many are free.
+    """Number of control points that repeat the first, for rest until `still_s`, and of free ones.
 
     Point j acts from knot j on, and knot j lies at (j - DEGREE) knot_s - MARGIN_S.
     """
@@ -156,7 +156,7 @@ def _points(settings: FlightSettings, knot_s: float) -> tuple[int, int]:
 
 
 def _spline(points: Float64[np.ndarray, "free k"], still: int, knot_s: float) -> BSpline:
-    """The uniform B-spline on `still` copies of the first control point, then the control points."""
+    """Uniform B-spline on `still` copies of the first control point, then the control points."""
     coefficients = np.concatenate([np.repeat(points[:1], still, axis=0), points])
     knots = (np.arange(len(coefficients) + DEGREE + 1) - DEGREE) * knot_s - MARGIN_S
     spline: BSpline = BSpline(knots, coefficients, DEGREE)
@@ -166,7 +166,7 @@ def _spline(points: Float64[np.ndarray, "free k"], still: int, knot_s: float) ->
 def _wander(
     rng: Generator, count: int, size: Float64[np.ndarray, " k"], centre: Float64[np.ndarray, " k"]
 ) -> Float64[np.ndarray, "count k"]:
-    """A path that leaves zero and then keeps to the centre: first-order autoregression of standard deviation `size`."""
+    """First-order autoregression about a centre, of standard deviation `size`, from near zero."""
     steps = np.sqrt(1.0 - PERSISTENCE**2) * size * rng.normal(size=(count, len(size)))
     path: Float64[np.ndarray, "count k"] = np.zeros_like(steps)
     for row in range(1, count):  # one row per control point: hundreds, not samples
@@ -177,7 +177,7 @@ def _wander(
 def _measure(
     ideal: Vectors, t_ns: Times, triad: TriadSettings, settings: FlightSettings, seed: int, name: str
 ) -> tuple[Vectors, Vectors]:
-    """What the triad reads, and its additive bias."""
+    """Readings of the triad, and its additive bias."""
     sensor, turn_on, walk, noise = (
         _generator(f"{name} sensor", settings.sensor_seed),
         *(_generator(f"{name} {kind}", seed) for kind in ("turn-on", "walk", "noise")),
@@ -211,13 +211,13 @@ def _truth(path: Trajectory, settings: FlightSettings, seed: int) -> Poses:
 
 
 def _clock(start_ns: int, duration_s: float, rate_hz: float) -> Times:
-    """Stamps of a regular clock, each rounded by itself so that no error adds up; the last is in the duration."""
+    """Stamps of a regular clock within the duration, each rounded by itself so that no error adds up."""
     count = int(np.floor(duration_s * rate_hz + 1e-6)) + 1
     return start_ns + np.round(np.arange(count) * (1e9 / rate_hz)).astype(np.int64)
 
 
 def _generator(purpose: str, seed: int) -> Generator:
-    """A stream of its own for each purpose, so that adding one leaves the others' numbers as they were."""
+    """Random numbers by purpose, so that a new purpose does not change those of the others."""
     if seed < 0:
         raise ConfigError(f"seed {seed} is negative", where="flight", expected="0 or more")
     return default_rng([zlib.crc32(purpose.encode()), seed])

@@ -1,4 +1,4 @@
-"""Linear form of an effect on one sensor: error = terms @ matrix(theta), derived from the effect's `forward`.
+"""Linear form of an effect: error = terms @ matrix(theta), derived from its `forward`.
 
 A bias model needs an error that is linear in its parameters: any set of effects is then fitted together by one linear solve a
 Gauss-Newton step, with the covariance of the answer. The error is `sum_p theta_p sum_q pattern[:, q, p] term_q`. Simulation
@@ -28,7 +28,7 @@ SAME = 1e-9  # an effect's own basis may differ by rounding from what `forward` 
 
 @dataclass(frozen=True, eq=False)
 class Probe:
-    """Parameters of a call of `forward`, and the terms that the error's axes then are: (axis, term)."""
+    """Parameters of a call of `forward`, and the terms that its error is: (axis, term)."""
 
     theta: Theta
     terms: tuple[tuple[int, int], ...]
@@ -36,7 +36,7 @@ class Probe:
 
 @dataclass(frozen=True, eq=False)
 class LinearForm:
-    """An effect on one sensor: the parameters that reach this sensor, and its pattern [axis, term, parameter].
+    """Linear form of an effect on a sensor: its parameters and pattern [axis, term, parameter].
 
     columns: the signals' columns that are its terms; none where terms follow from `probes` (or the effect's own `basis`).
     base: values of the effect's parameters, zero but for those that training fixes; free: where the others stand.
@@ -102,7 +102,7 @@ class LinearForm:
 
 @dataclass(frozen=True, eq=False)
 class CompiledEffects:
-    """Several effects for given parameters: one product with all columns, and the effects that no product gives."""
+    """Several effects for given parameters: one matrix on all columns, and effects without one."""
 
     matrix: Float64[np.ndarray, "27 3"]
     others: tuple[CompiledEffect, ...]
@@ -156,7 +156,7 @@ def compiled(forms: Sequence[LinearForm], theta: Float64[np.ndarray, " p"]) -> C
 
 @lru_cache(maxsize=256)
 def linear_form(effect: Effect, sensor: Sensor) -> LinearForm:
-    """The linear form of an effect on a sensor, from the errors that `forward` gives for one parameter at a time."""
+    """Linear form of an effect on a sensor, from errors of `forward` for one parameter at a time."""
     base = np.array([parameter.fixed_in_training or 0.0 for parameter in effect.parameters])
     free = np.flatnonzero([parameter.fixed_in_training is None for parameter in effect.parameters])
     signals = _probe_signals()
@@ -181,7 +181,7 @@ def linear_form(effect: Effect, sensor: Sensor) -> LinearForm:
 
 
 def _error(effect: Effect, sensor: Sensor, signals: Signals, theta: Theta) -> Float64[np.ndarray, "n 3"]:
-    """What the effect adds to a sensor's samples; behind a clock to first order, the shift times the derivative."""
+    """Error of a sensor's samples; of a clock to first order, the shift times the derivative."""
     if effect.stage == Stage.CLOCK:
         shift_s = effect.forward(signals.t_s, theta) - signals.t_s
         return np.asarray(shift_s[:, None] * (signals.gyro_dot if sensor == "gyro" else signals.accel_dot))
@@ -217,7 +217,7 @@ def _found_among(
 def _distinct(
     probed: Float64[np.ndarray, "p all"], errors: Float64[np.ndarray, "n 3 p"]
 ) -> tuple[tuple[Probe, ...], Int64[np.ndarray, "3 p"]]:
-    """The errors that differ from one another, each the term of one probe; and which of them each error is."""
+    """Probes whose errors are the distinct terms, and the term of each error."""
     known: dict[bytes, int] = {}
     probes, found = [], np.full(errors.shape[1:], -1)
     for k, theta in enumerate(probed):

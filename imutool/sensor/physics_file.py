@@ -1,10 +1,10 @@
-"""physics.toml: which effects act on a sensor and how large they are, as `diagnose` finds them and `simulate` takes them.
+"""physics.toml: effects on a sensor and their sizes, from `diagnose` to `simulate`.
 
 ::
 
     [[effect]]
     name = "lever_arm"                 # of the catalogue, or "driven"
-    signal = "accel"                   # where it was seen; it acts wherever it acts
+    signal = "accel"                   # where it was seen
     [effect.parameters.x]
     value = 0.213
     std = 0.004                        # may be left out
@@ -43,24 +43,17 @@ from typing import Annotated, Any, Literal
 
 import msgspec
 import numpy as np
-from jaxtyping import Float64
 from msgspec import Meta
 
 from imutool.config import Settings, build, toml
-from imutool.errors import ConfigError, DataError, ImutoolError
+from imutool.errors import ConfigError, ImutoolError
 from imutool.mcap_io.storage.target import Target
-from imutool.sensor import catalogue
-from imutool.sensor.effect import Effect, Parameter, Stage, Theta
-from imutool.sensor.samples import SensorSamples
-from imutool.sensor.variables import VARIABLES, factor, words
-from imutool.units import AXES, UNITS, Sensor
+from imutool.sensor import catalogue, unnamed_effects
+from imutool.sensor.effect import Effect, Theta
+from imutool.sensor.unnamed_effects import DRIVEN, VARIABLES
+from imutool.units import SENSORS, Sensor
 
 SCHEMA = "imutool.physics/1"
-DRIVEN = "driven"
-# Within the stage SENSOR effects act by name. What has no name was learned from the ideal signals and comes first, upper case
-# sorting before lower; a bias comes last, so that no scale acts on it.
-UNKNOWN, BIAS = "Unknown", "~bias"
-
 Three = tuple[float, float, float]
 NotNegative = Annotated[float, Meta(ge=0.0)]
 ThreeStd = tuple[NotNegative, NotNegative, NotNegative]
@@ -68,7 +61,7 @@ Known = Callable[[Sequence[str]], tuple[Effect, ...]]
 
 
 class Value(Settings, frozen=True, kw_only=True):
-    """A parameter, its standard deviation where that is known, and its unit."""
+    """Value of a parameter, its standard deviation where that is known, and its unit."""
 
     value: float
     std: NotNegative | None = None
@@ -76,7 +69,7 @@ class Value(Settings, frozen=True, kw_only=True):
 
 
 class Entry(Settings, frozen=True, kw_only=True):
-    """An effect by name; `signal` says where it was seen, `driver` the channel that drives what is `driven`."""
+    """Effect by name; `signal` is where it was seen, `driver` the channel behind a `driven` one."""
 
     name: str
     signal: Literal["gyro", "accel", "both", ""] = ""
@@ -86,14 +79,14 @@ class Entry(Settings, frozen=True, kw_only=True):
 
 
 class Bias(Settings, frozen=True, kw_only=True):
-    """A constant: rad/s, m/s²."""
+    """Constant bias (rad/s, m/s²)."""
 
     gyro: Three = (0.0, 0.0, 0.0)
     accel: Three = (0.0, 0.0, 0.0)
 
 
 class Curve(Settings, frozen=True, kw_only=True):
-    """What is added to the axes of a signal as a curve of one variable; `band` is one standard deviation."""
+    """Curve of one variable, added to the axes of a signal; `band` is one standard deviation."""
 
     signal: Sensor
     variable: str
@@ -104,7 +97,7 @@ class Curve(Settings, frozen=True, kw_only=True):
 
 
 class Term(Settings, frozen=True, kw_only=True):
-    """What is added to the axes of a signal as so many times a product of signals."""
+    """Product of variables, added to the axes of a signal so many times."""
 
     signal: Sensor
     term: str
@@ -113,7 +106,7 @@ class Term(Settings, frozen=True, kw_only=True):
 
 
 class PhysicsFile(Settings, frozen=True, kw_only=True):
-    """Everything that a physics.toml says."""
+    """Contents of a physics.toml."""
 
     schema: Literal["imutool.physics/1"] = "imutool.physics/1"
     effect: tuple[Entry, ...] = ()
@@ -122,7 +115,7 @@ class PhysicsFile(Settings, frozen=True, kw_only=True):
     term: tuple[Term, ...] = ()
 
     def acting(self, where: str | Path = "physics", known: Known = catalogue.effects) -> list[tuple[Effect, Theta]]:
-        """The effects as they act, each with its parameters; `known` finds them by name.
+        """Effects with their parameters; `known` finds them by name.
 
         Raises:
             ConfigError: an unknown effect, parameter, unit, signal, variable or term (the nearest is named), or a wrong value.
@@ -130,19 +123,19 @@ class PhysicsFile(Settings, frozen=True, kw_only=True):
         found: list[tuple[Effect, Theta]] = []
         for k, entry in enumerate(self.effect):
             place = f"effect[{k}]"
-            physics = _driven(entry, where, place) if entry.name == DRIVEN else _named(entry.name, known, where, place)
-            found.append((physics, _theta(entry, physics, where, place)))
+            effect = _driven(entry, where, place) if entry.name == DRIVEN else _named(entry.name, known, where, place)
+            found.append((effect, _theta(entry, effect, where, place)))
         for k, curve in enumerate(self.unknown):
             found.append((_curve(curve, k, where), np.zeros(0)))
         for k, term in enumerate(self.term):
             found.append((_term(term, k, where), np.zeros(0)))
         if self.bias is not None:
-            found.append((_constant(self.bias), np.zeros(0)))
+            found.append((unnamed_effects.constant_bias(self.bias.gyro, self.bias.accel), np.zeros(0)))
         return found
 
 
 def read(path: Path) -> PhysicsFile:
-    """What a physics.toml says, checked but for the names, which `acting` looks up.
+    """Read and check a physics.toml; `acting` looks up its names.
 
     Raises:
         ConfigError: no such file, no TOML, an unknown or missing key, a wrong type, a number that is not finite.
@@ -163,7 +156,7 @@ def read(path: Path) -> PhysicsFile:
 
 
 def write(file: PhysicsFile, path: Path, *, overwrite: bool = False) -> None:
-    """Writes a physics.toml, which `read` gives back bit for bit.
+    """Write a physics.toml, which `read` gives back bit for bit.
 
     Raises:
         ConfigError: the file exists (without `overwrite`), or cannot be written.
@@ -173,7 +166,7 @@ def write(file: PhysicsFile, path: Path, *, overwrite: bool = False) -> None:
 
 
 def to_toml(file: PhysicsFile) -> str:
-    """The text of the file."""
+    """Text of the file."""
     lines = ["# Physics of an IMU, as `imutool simulate --physics FILE` takes it", f"schema = {_text(file.schema)}"]
     for entry in file.effect:
         lines += ["", "[[effect]]", f"name = {_text(entry.name)}"]
@@ -199,7 +192,7 @@ def to_toml(file: PhysicsFile) -> str:
 
 
 def _text(text: str) -> str:
-    """A string of TOML, which escapes as JSON does but for one control character."""
+    """String of TOML, which escapes as JSON does but for one control character."""
     return json.dumps(text, ensure_ascii=False).replace("\x7f", "\\u007f")
 
 
@@ -212,7 +205,7 @@ def _row(values: Sequence[float]) -> str:
 
 
 def _refuse_infinite(value: Any, where: Path, place: str = "") -> None:
-    """As `config.build`, with the place in a list."""
+    """Refuse numbers that are not finite, and name their place."""
     if isinstance(value, float) and not np.isfinite(value):
         raise ConfigError(f"{place} is {value}", where=where, expected="a finite number")
     if isinstance(value, dict):
@@ -228,31 +221,31 @@ def _refuse_infinite(value: Any, where: Path, place: str = "") -> None:
 
 def _named(name: str, known: Known, where: str | Path, place: str) -> Effect:
     try:
-        (physics,) = known([name])
+        (effect,) = known([name])
     except ImutoolError as error:
         raise ConfigError(f"{place}.name: {error.what}", where=where, expected=error.expected, fix=error.fix) from error
-    return physics
+    return effect
 
 
-def _theta(entry: Entry, physics: Effect, where: str | Path, place: str) -> Theta:
-    """The parameters in the effect's own order."""
-    if entry.signal not in ("", "both", *physics.sensors):
-        listed = " or ".join(physics.sensors)
+def _theta(entry: Entry, effect: Effect, where: str | Path, place: str) -> Theta:
+    """Parameters in the effect's own order."""
+    if entry.signal not in ("", "both", *effect.sensors):
+        listed = " or ".join(effect.sensors)
         raise ConfigError(f"{place}.signal is {entry.signal}: {entry.name} does not act there", where=where, expected=listed)
-    numbers = {number.name: number for number in physics.parameters}
-    theta = physics.null_value.astype(np.float64)
+    parameters = {parameter.name: parameter for parameter in effect.parameters}
+    theta = effect.null_value.astype(np.float64)
     for name, value in entry.parameters.items():
         key = f"{place}.parameters.{name}"
-        if name not in numbers:
-            raise _unknown(key, name, list(numbers), where)
-        number = numbers[name]
-        if value.unit != number.unit and entry.name != DRIVEN:
-            raise ConfigError(f"{key}.unit is {value.unit!r}", where=where, expected=repr(number.unit))
-        if number.positive and not value.value > 0.0:
+        if name not in parameters:
+            raise _unknown(key, name, list(parameters), where)
+        parameter = parameters[name]
+        if value.unit != parameter.unit and entry.name != DRIVEN:
+            raise ConfigError(f"{key}.unit is {value.unit!r}", where=where, expected=repr(parameter.unit))
+        if parameter.positive and not value.value > 0.0:
             raise ConfigError(f"{key}.value is {value.value:g}", where=where, expected="more than 0")
-        theta[list(numbers).index(name)] = value.value
+        theta[list(parameters).index(name)] = value.value
     if not entry.parameters:
-        raise ConfigError(f"{place}.parameters is empty", where=where, expected=f"some of {', '.join(numbers)}")
+        raise ConfigError(f"{place}.parameters is empty", where=where, expected=f"some of {', '.join(parameters)}")
     return theta
 
 
@@ -262,81 +255,32 @@ def _unknown(key: str, name: str, names: Sequence[str], where: str | Path) -> Co
     return ConfigError(f"{key}: {name!r} is not known", where=where, expected=f"one of {', '.join(names)}", fix=fix)
 
 
-# ── effects without one ──
-
-
-def _constant(bias: Bias) -> Effect:
-    gyro, accel = np.array(bias.gyro), np.array(bias.accel)
-
-    def forward(read: SensorSamples, _: Theta) -> SensorSamples:
-        return read.but(read.gyro + gyro, read.accel + accel)
-
-    return Effect(BIAS, Stage.SENSOR, ("gyro", "accel"), "+ b", (), "always", forward)
+# ── effects without a name ──
 
 
 def _driven(entry: Entry, where: str | Path, place: str) -> Effect:
-    """+ gain (c(t - lag) - mean of c) on the axes of one signal."""
-    if entry.signal not in UNITS:
+    if entry.signal not in SENSORS:
         raise ConfigError(f"{place}.signal is {entry.signal!r}", where=where, expected="gyro or accel for what is driven")
     if not entry.driver:
         raise ConfigError(f"{place}.driver is missing", where=where, expected="the channel that drives it, as TOPIC or TOPIC.x")
-    signal: Sensor = "gyro" if entry.signal == "gyro" else "accel"
-    channel = entry.driver
-
-    def forward(read: SensorSamples, theta: Theta) -> SensorSamples:
-        c = _channel(read, channel)
-        return _added(read, signal, np.outer(np.interp(read.stamp_s - theta[3], read.stamp_s, c) - c.mean(), theta[:3]))
-
-    numbers = (*(Parameter(axis, f"{UNITS[signal]} per unit of {channel}", 1.0) for axis in AXES), Parameter("lag", "s", 0.2))
-    return Effect(DRIVEN, Stage.SENSOR, (signal,), f"{signal} += gain (c(t - lag) - mean)", numbers, "c varies", forward)
+    return unnamed_effects.driven("gyro" if entry.signal == "gyro" else "accel", entry.driver)
 
 
 def _curve(curve: Curve, k: int, where: str | Path) -> Effect:
-    x, y, variable = np.array(curve.x), np.array(curve.y), curve.variable
-    if not variable.startswith("/") and variable not in VARIABLES:
-        raise _unknown(f"unknown[{k}].variable", variable, [*VARIABLES, "/TOPIC"], where)
-
-    def forward(read: SensorSamples, _: Theta) -> SensorSamples:
-        at = VARIABLES[variable](read) if variable in VARIABLES else _channel(read, variable)
-        return _added(read, curve.signal, np.stack([np.interp(at, x, column) for column in y.T], axis=1))
-
-    equation = f"{curve.signal} += curve({variable})"
-    needs = () if variable in VARIABLES else (variable,)
-    return Effect(f"{UNKNOWN}[{k}]", Stage.SENSOR, (curve.signal,), equation, (), "it varies", forward, needs=needs)
+    if not curve.variable.startswith("/") and curve.variable not in VARIABLES:
+        raise _unknown(f"unknown[{k}].variable", curve.variable, [*VARIABLES, "/TOPIC"], where)
+    return unnamed_effects.curve(str(k), curve.signal, curve.variable, np.array(curve.x), np.array(curve.y))
 
 
 def _term(term: Term, k: int, where: str | Path) -> Effect:
-    """Factors are variables, |variable|, variable^n or sign(variable), with a space or a bar between them."""
-    factors = [factor(word) for word in words(term.term)]
-    if not factors or None in factors:
+    """Effect of a product of variables, |variable|, variable^n or sign(variable)."""
+    effect = unnamed_effects.product(f"term {k}", term.signal, term.term, term.value)
+    if effect is None:
         raise _unknown(f"term[{k}].term", term.term, [f"products of {', '.join(VARIABLES)}"], where)
-
-    def forward(read: SensorSamples, _: Theta) -> SensorSamples:
-        size = np.prod([one(read) for one in factors if one is not None], axis=0)
-        return _added(read, term.signal, np.outer(size, term.value))
-
-    return Effect(
-        f"{UNKNOWN}[term {k}]", Stage.SENSOR, (term.signal,), f"{term.signal} += c {term.term}", (), "it varies", forward
-    )
-
-
-def _channel(read: SensorSamples, name: str) -> Float64[np.ndarray, " n"]:
-    """A channel of the log.
-
-    Raises:
-        DataError: there is none of that name.
-    """
-    if name not in read.channels:
-        listed = ", ".join(sorted(read.channels)) or "(none)"
-        raise DataError(f"no channel {name}", where="physics", expected=f"one of the log's channels: {listed}")
-    return read.channels[name]
-
-
-def _added(read: SensorSamples, signal: str, more: Float64[np.ndarray, "n 3"]) -> SensorSamples:
-    return read.but(gyro=read.gyro + more) if signal == "gyro" else read.but(accel=read.accel + more)
+    return effect
 
 
 def plain(file: PhysicsFile) -> dict[str, Any]:
-    """The file as plain JSON values."""
+    """The file as JSON values."""
     values: dict[str, Any] = msgspec.to_builtins(file)
     return values

@@ -1,13 +1,13 @@
-"""What a sensor feels and then reads, on its way from an ideal simulation to the samples of a log.
+"""Ideal motion and sensor samples: signals between a simulation and the samples of a log.
 
-Three clocks meet here. `t_s` is even and belongs to the motion; effects of the motion, the mount and the bandwidth act on it.
+Three clocks meet here. `t_s` is even and belongs to the motion; effects of the motion, the mount and the bandwidth act there.
 `taken_s` says when, on that clock, each sample was taken; effects of the clock act on it. `stamp_s` is what the log says.
-`taken` goes from the first to the second; effects of the sensor and its converter act on what it gives, one row a sample.
+`IdealMotion.sample` goes from the first to the second; effects of the sensor and its converter act on its rows.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from types import MappingProxyType
@@ -18,45 +18,46 @@ from scipy.ndimage import spline_filter1d
 from scipy.sparse import csr_array
 
 from imutool.errors import DataError
+from imutool.recording import Recording, seconds
 from imutool.sensor.signals import FILTERED, SignalFilter, Signals
+from imutool.units import AXES, Sensor
 
 Vectors = Float64[np.ndarray, "n 3"]
 Columns = Float64[np.ndarray, "_ _"]
 Times = Float64[np.ndarray, " n"]
-PAD = 12  # samples beyond the ends over which the spline forgets how it begins: 0.27^12 = 1e-7
+PAD = 12  # samples beyond the ends, over which the spline forgets its start: 0.27^12 = 1e-7
 UNEVEN = 1e-2  # of a period: how far the even clock may be from even
 SAME_S = 1e-7  # a stamp's rounding; the fastest motion goes nowhere in it
-INSTANTS, RECENT = 3, 8  # that a sampler remembers: sets of instants, and columns
+INSTANTS, RECENT = 3, 8  # entries that a sampler keeps: sets of instants, and columns
 NOTHING: Mapping[str, Float64[np.ndarray, " n"]] = MappingProxyType({})
 Instants = tuple[Float64[np.ndarray, " n"], Float64[np.ndarray, " m"], csr_array | None]
 
 
 class Sampler:
-    """Cubic splines over one even clock, taken at some instants; it remembers a few, for most of them stay the same.
+    """Cache of cubic splines over one even clock, evaluated at some instants.
 
-    All that `replace` makes of a `IdealMotion` shares one, so that what an effect leaves alone is worked on once. What it
-    gives cannot
-    be written to; each memory is replaced as a whole, so threads may share it.
+    Every `replace` of an `IdealMotion` shares one, so that a column which an effect leaves alone is evaluated once. The arrays
+    are read-only; each memory is replaced as a whole, so that threads may share it.
     """
 
     def __init__(self) -> None:
         self._instants: tuple[Instants, ...] = ()
-        self._coefficients, self._values, self._beside = _Recent(), _Recent(), _Recent()
+        self._coefficients, self._values, self._others = _Recent(), _Recent(), _Recent()
 
-    def motion(self, felt: IdealMotion, taken_s: Float64[np.ndarray, " m"]) -> tuple[Vectors, ...]:
-        """gyro, accel, alpha."""
-        instants = self._at(felt.t_s, taken_s)
-        return tuple(self._at_instants(x, instants) for x in (felt.gyro, felt.accel, felt.alpha))
+    def signals(self, motion: IdealMotion, taken_s: Float64[np.ndarray, " m"]) -> tuple[Vectors, ...]:
+        """Gyro, accel and alpha at some instants."""
+        instants = self._at(motion.t_s, taken_s)
+        return tuple(self._at_instants(x, instants) for x in (motion.gyro, motion.accel, motion.alpha))
 
-    def beside(self, felt: IdealMotion, taken_s: Float64[np.ndarray, " m"]) -> Float64[np.ndarray, "m k"]:
+    def others(self, motion: IdealMotion, taken_s: Float64[np.ndarray, " m"]) -> Float64[np.ndarray, "m k"]:
         """R_wb row by row, where it is known, then the channels."""
-        instants = self._at(felt.t_s, taken_s)
+        instants = self._at(motion.t_s, taken_s)
 
         def columns() -> Float64[np.ndarray, "n k"]:
-            first = [np.zeros((len(felt.t_s), 0))] if felt.R_wb is None else [felt.R_wb.reshape(-1, 9)]
-            return np.concatenate([*first, *(values[:, None] for values in felt.channels.values())], axis=1)
+            first = [np.zeros((len(motion.t_s), 0))] if motion.R_wb is None else [motion.R_wb.reshape(-1, 9)]
+            return np.concatenate([*first, *(values[:, None] for values in motion.channels.values())], axis=1)
 
-        both = self._beside(felt.R_wb, felt.channels, columns)
+        both = self._others(motion.R_wb, motion.channels, columns)
         return self._at_instants(both, instants)
 
     def _at_instants(self, x: Float64[np.ndarray, "n k"], instants: Instants) -> Float64[np.ndarray, "m k"]:
@@ -67,7 +68,7 @@ class Sampler:
         return self._values(x, instants, lambda: _fixed(np.asarray(weights @ coefficients)))
 
     def _at(self, t_s: Times, taken_s: Float64[np.ndarray, " m"]) -> Instants:
-        """Clock, instants, and what takes splines' coefficients to their values (None: the instants are the clock's own).
+        """Clock, instants, and the matrix from coefficients to values; none at the clock's own instants.
 
         Raises:
             DataError: a clock that is not even.
@@ -82,21 +83,21 @@ class Sampler:
 
 
 class _Recent:
-    """The last few things that were worked out, by the very objects they were worked out from."""
+    """The last few results, by the identity of the objects that they were made from."""
 
     def __init__(self) -> None:
         self._known: tuple[tuple[object, object, Columns], ...] = ()
 
     def __call__(
-        self, of: object, at: object, work_out: Callable[[], Float64[np.ndarray, "n k"]]
+        self, of: object, at: object, evaluate: Callable[[], Float64[np.ndarray, "n k"]]
     ) -> Float64[np.ndarray, "n k"]:
         known = self._known
         for k, entry in enumerate(known):
             if entry[0] is of and entry[1] is at:
-                if k:  # what is asked for again and again stays
+                if k:  # an entry in use moves to the front
                     self._known = (entry, *known[:k], *known[k + 1 :])
                 return entry[2]
-        value = work_out()
+        value = evaluate()
         self._known = ((of, at, value), *known[: RECENT - 1])
         return value
 
@@ -111,7 +112,7 @@ def _fixed(x: Float64[np.ndarray, "n k"]) -> Float64[np.ndarray, "n k"]:
 
 
 def _weights(t_s: Float64[np.ndarray, " n"], taken_s: Float64[np.ndarray, " m"]) -> csr_array:
-    """The four cubic B-splines at each instant."""
+    """The four cubic B-splines that reach each instant."""
     n, period_s = len(t_s), (t_s[-1] - t_s[0]) / (len(t_s) - 1)
     off = np.abs(t_s - (t_s[0] + period_s * np.arange(n)))
     if not off.max() <= UNEVEN * period_s:
@@ -128,7 +129,7 @@ def _weights(t_s: Float64[np.ndarray, " n"], taken_s: Float64[np.ndarray, " m"])
 
 
 def _coefficients(x: Float64[np.ndarray, "n k"]) -> Float64[np.ndarray, "m k"]:
-    """Beyond the ends the columns go on as they came, turned about their last point, so that they bend neither way there."""
+    """Spline coefficients; beyond the ends columns are reflected through their last point."""
     beyond = np.minimum(np.arange(1, PAD + 1), len(x) - 1)
     padded = np.concatenate([2.0 * x[0] - x[beyond[::-1]], x, 2.0 * x[-1] - x[len(x) - 1 - beyond]])
     if not x.shape[1]:
@@ -138,7 +139,7 @@ def _coefficients(x: Float64[np.ndarray, "n k"]) -> Float64[np.ndarray, "m k"]:
 
 @dataclass(frozen=True, eq=False)
 class IdealMotion:
-    """What the tracked point of a body feels, on an even clock of seconds.
+    """Ideal signals of the tracked point of a body, on an even clock of seconds.
 
     gyro: angular rate, body frame (rad/s); accel: specific force R_wb^T (a_w - g_w) (m/s²); alpha: angular acceleration
     (rad/s²); R_wb: attitude, where it is known. `channels` are other numbers of the log on the same clock (temperature in °C, a
@@ -155,25 +156,25 @@ class IdealMotion:
 
     @property
     def rate_hz(self) -> float:
-        """Of the even clock."""
+        """Rate of the even clock."""
         return float((len(self.t_s) - 1) / (self.t_s[-1] - self.t_s[0]))
 
-    def taken(self, taken_s: Float64[np.ndarray, " m"], stamp_s: Float64[np.ndarray, " m"]) -> SensorSamples:
-        """What is felt at other times (cubic splines; held beyond the ends), one row a sample.
+    def sample(self, taken_s: Float64[np.ndarray, " m"], stamp_s: Float64[np.ndarray, " m"]) -> SensorSamples:
+        """Samples at other times (cubic splines; held beyond the ends), one row each.
 
         Raises:
             DataError: `t_s` is not even.
         """
-        gyro, accel, alpha = self.sampler.motion(self, taken_s)
-        beside = self.sampler.beside(self, taken_s)
-        R_wb = None if self.R_wb is None else beside[:, :9].reshape(-1, 3, 3)
-        names = {name: beside[:, k - len(self.channels)] for k, name in enumerate(self.channels)}
+        gyro, accel, alpha = self.sampler.signals(self, taken_s)
+        others = self.sampler.others(self, taken_s)
+        R_wb = None if self.R_wb is None else others[:, :9].reshape(-1, 3, 3)
+        names = {name: others[:, k - len(self.channels)] for k, name in enumerate(self.channels)}
         return SensorSamples(stamp_s, gyro, accel, alpha, R_wb, names)
 
 
 @dataclass(frozen=True, eq=False)
 class SensorSamples:
-    """One row a sample, by the log's own stamps (s): the same signals, on their way through the sensor."""
+    """Samples of a sensor, one row each, by the log's own stamps (s)."""
 
     stamp_s: Times
     gyro: Vectors
@@ -185,13 +186,45 @@ class SensorSamples:
 
     @cached_property
     def signals(self) -> Signals:
-        """The filtered signals: those of a running filter where `online` has them, else of these samples at their mean rate."""
+        """Filtered signals: those of a running filter (`online`), else of these samples at mean rate."""
         if self.online is not None:
             return self.online
         rate_hz = (len(self.stamp_s) - 1) / (self.stamp_s[-1] - self.stamp_s[0])
         return SignalFilter(float(rate_hz), FILTERED.stop)(self.stamp_s, self.gyro, self.accel)
 
-    def but(self, gyro: Vectors | None = None, accel: Vectors | None = None) -> SensorSamples:
-        """With one of the sensors, or both, reading something else."""
+    @classmethod
+    def joined(cls, parts: Sequence[SensorSamples]) -> SensorSamples:
+        """Several stretches end to end; the attitude only where all of them have one."""
+        attitudes = [part.R_wb for part in parts if part.R_wb is not None]
+        return cls(
+            np.concatenate([part.stamp_s for part in parts]),
+            np.concatenate([part.gyro for part in parts]),
+            np.concatenate([part.accel for part in parts]),
+            np.concatenate([part.alpha for part in parts]),
+            np.concatenate(attitudes) if len(attitudes) == len(parts) else None,
+            {name: np.concatenate([part.channels[name] for part in parts]) for name in parts[0].channels},
+        )
+
+    def with_readings(self, gyro: Vectors | None = None, accel: Vectors | None = None) -> SensorSamples:
+        """The samples with other readings of one sensor, or of both."""
         kept = self.gyro if gyro is None else gyro, self.accel if accel is None else accel
         return SensorSamples(self.stamp_s, *kept, self.alpha, self.R_wb, self.channels)
+
+    def with_added(self, sensor: Sensor, added: Vectors) -> SensorSamples:
+        """The samples with something added to one sensor."""
+        if sensor == "gyro":
+            return self.with_readings(gyro=self.gyro + added)
+        return self.with_readings(accel=self.accel + added)
+
+
+def channels_at(
+    recording: Recording, t_s: Times, start_ns: int, least_messages: int = 1
+) -> dict[str, Float64[np.ndarray, " n"]]:
+    """Scalar channels of a log at seconds from `start_ns`, interpolated, by topic or `topic.x`."""
+    out = {}
+    for topic, scalars in recording.scalars.items():
+        if len(scalars) >= least_messages:
+            own_s, width = seconds(scalars.t_ns, start_ns), scalars.values.shape[1]
+            for axis, column in zip(AXES, scalars.values.T, strict=False):
+                out[topic if width == 1 else f"{topic}.{axis}"] = np.interp(t_s, own_s, column)
+    return out

@@ -1,10 +1,10 @@
-"""What effects look at: the samples of an IMU and what a few causal first-order filters make of them.
+"""Causal signals of an IMU: samples behind first-order filters, and their derivatives.
 
 A filter of time constant tau follows dy/dt = (x - y) / tau, so that its input's slow derivative is (x - y) / tau itself (over
 samples: over the lag behind a ramp, a little less than tau, so that a ramp's slope is exact).
-Everything at a sample comes from it and earlier ones, and the blocks in which samples arrive change nothing. The filters start
-at the first sample, as if the sensor had always read it. They count samples: over a gap they stand still. The derivatives
-divide by the stamps' own difference, and by no less than a tenth of a period.
+A row depends on its sample and earlier ones alone, and not on the blocks in which samples arrive. The filters start settled at
+the first sample. They count samples: over a gap they stand still. The derivatives divide by the difference of the stamps, and
+by no less than a tenth of a period.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ POWER_S = 0.5  # of the squared vibration
 TAU_S = np.array([SLOW_S] * 6 + [TURN_S] * 3 + [POWER_S] * 3)
 LEAST_PERIODS = 0.1
 
-# columns of the signals: the samples, what the filters hold (their whole state), and derivatives
+# columns of the signals: the samples, the filters' whole state, and derivatives
 GYRO, ACCEL, SAMPLES = slice(0, 3), slice(3, 6), slice(0, 6)
 GYRO_SLOW, ACCEL_SLOW, SLOW, TURN, VIBRATION = slice(6, 9), slice(9, 12), slice(6, 12), slice(12, 15), slice(15, 18)
 FILTERED = slice(6, 18)
@@ -33,34 +33,34 @@ Vectors = Float64[np.ndarray, "n 3"]
 
 @dataclass(frozen=True, slots=True)
 class Signals:
-    """One row a sample: rad/s, m/s², their derivatives per second, and the vibration's power in (m/s²)² per axis."""
+    """Signals, one row a sample: rad/s, m/s², derivatives, vibration power in (m/s²)²."""
 
     t_s: Float64[np.ndarray, " n"]
     columns: Float64[np.ndarray, "n 27"]
 
     @property
     def gyro(self) -> Vectors:
-        """The angular rate as measured."""
+        """Measured angular rate."""
         return self.columns[:, GYRO]
 
     @property
     def accel(self) -> Vectors:
-        """The specific force as measured."""
+        """Measured specific force."""
         return self.columns[:, ACCEL]
 
     @property
     def gyro_slow(self) -> Vectors:
-        """The rate through a filter of 0.1 s."""
+        """Rate behind a filter of 0.1 s."""
         return self.columns[:, GYRO_SLOW]
 
     @property
     def gyro_dot(self) -> Vectors:
-        """The rate's derivative from one sample to the next: its integral is exact, its noise large."""
+        """Derivative of the rate between two samples: its integral is exact, its noise large."""
         return self.columns[:, GYRO_DOT]
 
     @property
     def accel_dot(self) -> Vectors:
-        """The force's derivative likewise."""
+        """Derivative of the specific force from one sample to the next."""
         return self.columns[:, ACCEL_DOT]
 
     @property
@@ -74,14 +74,14 @@ class Signals:
         return self.columns[:, VIBRATION]
 
     def rows(self, rows: slice | np.ndarray) -> Signals:
-        """Some samples."""
+        """The signals of some rows."""
         return Signals(self.t_s[rows], self.columns[rows])
 
 
 class SignalFilter:
-    """Signals from samples as they arrive, in blocks of any size; all it remembers is the last row, and its time.
+    """Causal filter from samples to signals, in blocks of any size; its state is the last row.
 
-    Of a row's columns the first `wanted` are made, and more where that is no extra work; the others are zero.
+    It fills the first `wanted` columns of a row, and more where that is no extra work; the others are zero.
     """
 
     def __init__(self, rate_hz: float, wanted: int = COUNT) -> None:
@@ -109,7 +109,7 @@ class SignalFilter:
         return Signals(t_s, columns)
 
     def one(self, t_s: float, u: Float64[np.ndarray, "6"]) -> Float64[np.ndarray, "27"]:
-        """The columns at one sample, in a row that the next one overwrites: `_many` would take ten times its arithmetic."""
+        """Columns at one sample, in a row that the next call overwrites; ten times faster than a block."""
         if math.isnan(self._t_s):
             self._begin(t_s, u)
         if self._derives:
@@ -146,13 +146,13 @@ class SignalFilter:
         self._row[:], self._t_s = columns[-1], float(t_s[-1])
 
     def _begin(self, t_s: float, u: Float64[np.ndarray, "6"]) -> None:
-        """As if the sensor had always read this."""
+        """Start settled at the first sample."""
         self._t_s, self._u[:] = t_s - self._period_s, u
         if self._filters:
             self._slow[:], self._turn[:] = u, self._gyro
 
 
 def low_pass(x: Float64[np.ndarray, "n k"], gain: float, before: Float64[np.ndarray, " k"]) -> Float64[np.ndarray, "n k"]:
-    """y_k = y_{k-1} + gain (x_k - y_{k-1}), from a state on; gain = 1 - exp(-period / tau) is the ODE's own solution."""
+    """Low-pass y_k = y_{k-1} + gain (x_k - y_{k-1}) from a state; gain = 1 - exp(-period / tau)."""
     y, _ = lfilter([gain], [1.0, gain - 1.0], x, axis=0, zi=(1.0 - gain) * before[None])
     return np.asarray(y)

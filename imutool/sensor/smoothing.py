@@ -1,4 +1,4 @@
-"""The smooth curve through noisy samples: a spline whose roughness is weighed against its misfit as the data themselves say.
+"""Penalised spline through noisy samples, its smoothness chosen by restricted likelihood.
 
 Quintic B-splines on even knots; the cost sum_k w_k |y_k - s(t_k)|² + lambda sum_j |D³ c_j|² (P-splines: Eilers and Marx,
 Statistical Science 11, 1996, eq. 3) is that of white noise around a curve whose third derivative is white, and lambda is the
@@ -40,7 +40,7 @@ Band = Float64[np.ndarray, "6 c"]
 
 @dataclass(frozen=True, eq=False)
 class Penalised:
-    """A fitted curve: `noise` is the standard deviation of a sample of weight one, `cutoff_hz` where smoothing halves.
+    """Fitted spline; `noise` is a sample's standard deviation at weight 1, `cutoff_hz` halves a motion.
 
     `penalty` is what it was fitted with, `likeliest` the one that the samples ask for.
     """
@@ -53,12 +53,12 @@ class Penalised:
     samples: Samples
 
     def residual(self) -> Values:
-        """Samples minus the curve."""
+        """Residual: samples minus the curve."""
         left: Values = self.samples.y - self.samples.fitted(np.asarray(self.spline.c))
         return left
 
     def std(self, derivative: int) -> float:
-        """Standard deviation of a derivative amid the data, smoothing and noise together, one coordinate.
+        """Standard deviation of a derivative amid the data, by smoothing and noise, one coordinate.
 
         For curves as rough as the likeliest penalty l says: noise² times the mean over theta of |B|² (b + lambda² p / l) /
         (b + lambda p)², B the transform of the basis' derivative, at the knots and halfway between them. With lambda = l that
@@ -76,7 +76,7 @@ class Penalised:
         return self.noise * float(np.sqrt(np.mean(both)))
 
     def end_s(self, derivative: int, worse: float, least: float) -> float:
-        """How far from an end the standard deviation of a derivative is above `least` and `worse` times that farther in.
+        """Time from an end within which a derivative's deviation is above `least` and `worse` times the inner.
 
         From the posterior of an even piece as dense as the data, in full; at most half of that piece.
         """
@@ -98,7 +98,7 @@ class Penalised:
 
 
 class Samples:
-    """Samples with weights on a stretch of time, ready to be fitted with one penalty after another."""
+    """Weighted samples and their matrices, to be fitted with one penalty after another."""
 
     def __init__(self, t_s: Times, y: Values, weights: Times, knot_s: float) -> None:
         pieces = max(1, int(np.ceil((t_s[-1] - t_s[0]) / knot_s)))
@@ -118,12 +118,12 @@ class Samples:
         return np.bincount(self.first + shift, weights=x, minlength=self.count)
 
     def _right(self, column: Times) -> Float64[np.ndarray, " c"]:
-        """B^T W y."""
+        """Right-hand side B^T W y."""
         parts = [self._summed(self.weights * self.values[:, k] * column, k) for k in range(DEGREE + 1)]
         return np.asarray(np.sum(parts, axis=0))
 
     def _normal(self) -> Band:
-        """B^T W B, its upper diagonals as scipy keeps them: the last row is the main one."""
+        """Normal matrix B^T W B, upper diagonals in scipy's order: the last row is the main one."""
         band = np.zeros((DEGREE + 1, self.count))
         for i in range(DEGREE + 1):
             for j in range(i, DEGREE + 1):
@@ -132,23 +132,23 @@ class Samples:
 
     @cached_property
     def symbol(self) -> Float64[np.ndarray, " f"]:
-        """Of the normal matrix, from the means of its diagonals."""
+        """Symbol of the normal matrix, from the means of its diagonals."""
         diagonals = self.normal.sum(axis=1)[::-1] / (self.count - DEGREE)
         symbol = diagonals[0] + 2.0 * np.cos(np.outer(_angles(), np.arange(1, DEGREE + 1))) @ diagonals[1:]
         return np.asarray(np.maximum(symbol, SMALLEST * diagonals[0]))
 
     @property
     def highest_hz(self) -> float:
-        """The highest cut-off that means anything."""
+        """Highest cut-off that the knots can follow."""
         return HIGHEST / self.knot_s
 
     def penalty_for(self, cutoff_hz: float) -> float:
-        """The lambda with which a motion of that frequency comes out at half its size."""
+        """Penalty with which a motion of that frequency comes out at half its size."""
         theta = np.array([2.0 * np.pi * cutoff_hz * self.knot_s])
         return float((np.interp(theta, _angles(), self.symbol) / _penalty_symbol(theta))[0])
 
     def coefficients(self, penalty: float) -> Float64[np.ndarray, "c d"]:
-        """Those of the least cost.
+        """Coefficients of the least cost.
 
         Raises:
             NumericsError: samples so uneven that they define no curve.
@@ -164,11 +164,11 @@ class Samples:
         return np.asarray(cho_solve_banded((factor, False), self.right)) + self.centre  # the basis adds up to one
 
     def fitted(self, coefficients: Float64[np.ndarray, "c d"]) -> Values:
-        """The curve at the samples."""
+        """Values of the curve at the samples."""
         return np.asarray(np.einsum("nk,nkd->nd", self.values, coefficients[self.first[:, None] + np.arange(DEGREE + 1)]))
 
     def unlikelihood(self, cutoff_hz: float) -> tuple[float, float]:
-        """Minus twice the log restricted likelihood, the noise's size profiled out; and that size."""
+        """Minus twice the log restricted likelihood, the noise profiled out; and that noise."""
         penalty = self.penalty_for(cutoff_hz)
         c = self.coefficients(penalty)
         misfit = float(np.sum(self.weights[:, None] * (self.y - self.fitted(c)) ** 2))
@@ -179,7 +179,7 @@ class Samples:
         return free * np.log(variance) + self.y.shape[1] * ratio, float(np.sqrt(variance))
 
     def fit(self, cutoff_hz: float | None = None) -> Penalised:
-        """The likeliest curve, smoothed a little more than that; or that of a given cut-off."""
+        """Likeliest curve, smoothed a little more than that; or the curve of a given cut-off."""
         likeliest = self._likeliest() if cutoff_hz is None else cutoff_hz
         chosen = CAUTION * likeliest if cutoff_hz is None else cutoff_hz
         penalty = self.penalty_for(chosen)
@@ -206,7 +206,7 @@ def _penalty_symbol(theta: Float64[np.ndarray, " f"]) -> Float64[np.ndarray, " f
 
 
 def _penalty(count: int) -> Band:
-    """D^T D of the third differences, upper diagonals as scipy keeps them."""
+    """Penalty D^T D of the third differences, upper diagonals as scipy keeps them."""
     band, difference = np.zeros((DEGREE + 1, count)), np.array([-1.0, 3.0, -3.0, 1.0])
     for i in range(ROUGHNESS + 1):
         for j in range(i, ROUGHNESS + 1):

@@ -1,9 +1,9 @@
-"""The motion behind measured poses: splines smoothed as their noise asks, where they can be trusted, and what a body feels.
+"""Smooth motion behind measured poses: penalised splines, and the ideal IMU signals.
 
 Poses of motion capture or of an estimator are noisy (0.1 to 5 mm, 0.05 to 0.5 degrees), have holes, glitches and steps, and
 are differentiated twice here. So: no curve across a hole; steps of the position (an estimator that takes in a fix) are
-levelled and let back in over seconds; glitches lose their weight; how smooth the curve is, the samples say themselves
-(`penalised_spline`); and the ends, where a derivative hangs on one side alone, are left out.
+levelled and let back in over seconds; glitches lose their weight; the samples themselves say how smooth the curve is
+(`imutool.sensor.smoothing`); and the ends, where a derivative rests on one side alone, are left out.
 """
 
 from __future__ import annotations
@@ -57,10 +57,10 @@ Values = Float64[np.ndarray, "n d"]
 
 @dataclass(frozen=True, eq=False)
 class Stretch:
-    """A stretch of motion without a hole, trusted from `start_s` to `end_s` (s from the first pose).
+    """Stretch of motion without a hole, trusted from `start_s` to `end_s` after the first pose.
 
     noise_m, noise_rad: standard deviation of a pose by coordinate. cutoff_hz: where smoothing halves a motion, of position and
-    rotation. gyro_std (rad/s), accel_std (m/s²): of what is felt, by axis, as far as noise and smoothing explain it.
+    rotation. gyro_std (rad/s), accel_std (m/s²): of the ideal signals, by axis, as far as noise and smoothing explain it.
     """
 
     trajectory: Trajectory
@@ -74,13 +74,13 @@ class Stretch:
 
     @property
     def duration_s(self) -> float:
-        """Trusted time."""
+        """Trusted time (s)."""
         return self.end_s - self.start_s
 
 
 @dataclass(frozen=True, eq=False)
-class Smoothed:
-    """The stretches of a motion, time counted from `start_ns`; poses dropped as glitches, and steps that were levelled."""
+class SmoothMotion:
+    """Stretches of a smooth motion, timed from `start_ns`; dropped glitches, levelled steps."""
 
     start_ns: int
     stretches: tuple[Stretch, ...]
@@ -89,7 +89,7 @@ class Smoothed:
 
     @property
     def duration_s(self) -> float:
-        """Trusted time, all stretches together."""
+        """Trusted time of all stretches (s)."""
         return sum(stretch.duration_s for stretch in self.stretches)
 
     @property
@@ -108,10 +108,10 @@ class Smoothed:
     def covers(self, t_ns: Int64[np.ndarray, " n"]) -> Bool[np.ndarray, " n"]:
         """Which instants lie in a trusted stretch."""
         t_s = seconds(t_ns, self.start_ns)
-        return np.asarray(np.any([(t_s >= one.start_s) & (t_s <= one.end_s) for one in self.stretches], axis=0))
+        return np.asarray(np.any([(t_s >= stretch.start_s) & (t_s <= stretch.end_s) for stretch in self.stretches], axis=0))
 
-    def felt(self, rate_hz: float, g_w: Float[np.ndarray, "3"] = G_W) -> list[IdealMotion]:
-        """What the tracked point feels in each stretch, on the even clock k / rate of seconds from `start_ns`.
+    def ideal_motions(self, rate_hz: float, g_w: Float[np.ndarray, "3"] = G_W) -> list[IdealMotion]:
+        """Ideal IMU signals of the tracked point in each stretch, at k / rate from `start_ns`.
 
         A stretch too short for four samples of that clock is left out.
 
@@ -124,10 +124,10 @@ class Smoothed:
         for stretch in self.stretches:
             first, last = int(np.ceil(stretch.start_s * rate_hz)), int(np.floor(stretch.end_s * rate_hz))
             if last - first >= 3:
-                found.append(self._felt(stretch, np.arange(first, last + 1) / rate_hz, g_w))
+                found.append(self._ideal(stretch, np.arange(first, last + 1) / rate_hz, g_w))
         return found
 
-    def _felt(self, stretch: Stretch, t_s: Times, g_w: Float[np.ndarray, "3"]) -> IdealMotion:
+    def _ideal(self, stretch: Stretch, t_s: Times, g_w: Float[np.ndarray, "3"]) -> IdealMotion:
         from scipy.spatial.transform import Rotation
 
         motion = stretch.trajectory.at(self.start_ns + np.round(t_s * 1e9).astype(np.int64))
@@ -135,13 +135,13 @@ class Smoothed:
         return IdealMotion(t_s, motion.omega_b, motion.specific_force(g_w=g_w), motion.alpha_b, np.ascontiguousarray(R_wb))
 
 
-def smooth_motion(poses: Poses) -> Smoothed:
-    """The smooth motion behind some poses, and where it can be trusted.
+def smooth_motion(poses: Poses) -> SmoothMotion:
+    """Smooth motion behind some poses, and where it can be trusted.
 
     Position and quaternion are quintic splines, so that rate, angular acceleration and specific force follow in closed form
     (`kinematics.Trajectory`). A stretch ends at a hole of more than 0.1 s; glitches are dropped, and where that leaves such a
-    hole the stretch ends too. Trusted is what lies so far from its ends that the rate and the acceleration are as good
-    as amid the data, but for a seventh (on made-up flights the error there is measured at no more than half as much again).
+    hole the stretch ends too. Trusted is the part so far from the ends that the rate and the acceleration
+    err at most a seventh more than amid the data (at most half as much again, measured on synthetic flights).
 
     Raises:
         DataError: no stretch of at least half a second and 25 poses can be trusted.
@@ -173,7 +173,7 @@ def smooth_motion(poses: Poses) -> Smoothed:
             f"no stretch of the {len(poses)} poses can be differentiated",
             expected=f"{LEAST_POSES} poses over {LEAST_S:g} s and more, without a hole of {MAX_GAP_S:g} s",
         )
-    return Smoothed(int(poses.t_ns[0]), tuple(stretches), glitches, steps)
+    return SmoothMotion(int(poses.t_ns[0]), tuple(stretches), glitches, steps)
 
 
 def _unbroken(t_s: Times) -> list[tuple[int, int]]:
@@ -188,22 +188,22 @@ def _long_enough(t_s: Times) -> bool:
 
 
 def _robust(t_s: Times, y: Values) -> tuple[Penalised, Times]:
-    """A fit in which glitches count for little and gross ones for nothing, and the weights it ended with.
+    """Robust fit, in which glitches count little and gross ones not at all; its last weights.
 
     Weights 1 / (1 + (r / 3 sigma)²), those of heavy tails, so that a fit with a few wild samples still converges.
     """
     period_s = float(np.median(np.diff(t_s)))
     knot_s = max(period_s, min(KNOT_PERIODS * period_s, MOST_KNOT_S), LEAST_KNOT_S)
     weights, window = np.ones(len(t_s)), min(2 * round(0.5 * USUAL_S / period_s), len(t_s)) + 1
-    for turn in range(PASSES):
+    for index in range(PASSES):
         samples = Samples(t_s, y, weights, knot_s)
-        fit = samples.fit(min(FIRST_CUTOFF_HZ, samples.highest_hz) if turn == 0 else None)
+        fit = samples.fit(min(FIRST_CUTOFF_HZ, samples.highest_hz) if index == 0 else None)
         size = np.linalg.norm(fit.residual(), axis=1)
         local = percentile_filter(size, USUAL_PERCENTILE, window, mode="nearest")
         usual = np.maximum(np.maximum(local, np.median(size)) / USUAL_NORM, LEAST_NOISE)
-        if turn < PASSES - 1:
+        if index < PASSES - 1:
             weights = 1.0 / (1.0 + (size / (HUMP * usual)) ** 2)
-        if 0 < turn < PASSES - 1:  # the first fit, of a cut-off that nobody chose, condemns nobody
+        if 0 < index < PASSES - 1:  # the first fit has an arbitrary cut-off: it drops nothing
             weights[size > GLITCH * usual] = 0.0
     return fit, weights
 
@@ -211,9 +211,9 @@ def _robust(t_s: Times, y: Values) -> tuple[Penalised, Times]:
 def _stretch(start_ns: int, t_s: Times, position: Penalised, rotation: Penalised) -> Stretch:
     """The stretch and its trusted part."""
     end_s = 0.0
-    for one, derivative, least in ((position, 2, LEAST_ACCEL), (rotation, 1, LEAST_GYRO)):
-        lag_s = 1.0 / (2.0 * np.pi * one.cutoff_hz) if one.std(derivative) > least else 0.0
-        end_s = max(end_s, one.end_s(derivative, END_WORSE, least), END_KNOTS * one.samples.knot_s + lag_s)
+    for curve, derivative, least in ((position, 2, LEAST_ACCEL), (rotation, 1, LEAST_GYRO)):
+        lag_s = 1.0 / (2.0 * np.pi * curve.cutoff_hz) if curve.std(derivative) > least else 0.0
+        end_s = max(end_s, curve.end_s(derivative, END_WORSE, least), END_KNOTS * curve.samples.knot_s + lag_s)
     tilt = GRAVITY_M_S2 * ANGLE * rotation.std(0)
     return Stretch(
         trajectory=Trajectory(start_ns, position.spline, rotation.spline),
@@ -228,10 +228,10 @@ def _stretch(start_ns: int, t_s: Times, position: Penalised, rotation: Penalised
 
 
 def _levelled(t_s: Times, y: Values) -> tuple[Values, int]:
-    """Positions without the steps between one sample and the next, which come back slowly; and how many there were.
+    """Positions with steps between two samples spread over seconds; and the number of steps.
 
-    A step is a difference that its neighbours' (through a cubic) do not explain. How large it is says a line of third degree
-    with a step through the samples around it. Steps that soon go back are a glitch, and stay.
+    A step is a difference that its neighbours' (through a cubic) do not explain. Its size is that of a cubic with a step
+    fitted to the samples around it. Steps that soon go back are a glitch, and stay.
     """
     at = _steps(t_s, y)
     if not len(at) or len(at) > MOST_STEPS * len(t_s):
@@ -251,7 +251,7 @@ def _levelled(t_s: Times, y: Values) -> tuple[Values, int]:
 
 
 def _odd(t_s: Times, y: Values) -> Values:
-    """By how much each position differs from the one before, less what a cubic through its neighbours' differences says."""
+    """Difference of each position to the one before, less a cubic's through its neighbours."""
     dt = np.diff(t_s)[:, None]
     v = np.diff(y, axis=0) / dt
     odd = np.zeros_like(y)

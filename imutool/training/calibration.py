@@ -1,10 +1,10 @@
-"""Which effects the training logs support, and how large they are: one linear solve a step, no descent.
+"""Calibration: effects that the training logs support, fitted by linear least squares.
 
 Effects (`imutool.sensor.effects`) are shared by all logs; rest bias and tilt are each log's own
 (`imutool.training.linearised`).
-Effects are chosen forward by how well the other logs predict each log's long windows (`imutool.training.normal_equations`), and
-refused where most logs do not agree or chance could have done it. What the motion cannot show stays where its prior has it,
-and is named.
+Forward selection: an effect is chosen by how well the other logs predict each log's long windows
+(`imutool.training.normal_equations`), and refused where most logs do not agree or chance explains it. A parameter that the
+motion does not show stays at its prior, and is named.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from imutool.training.normal_equations import Problem
 from imutool.training.segments import Part, Pool
 from imutool.units import Sensor
 
-BY_CHANCE = 0.01  # how often anything may be found where there is nothing
+BY_CHANCE = 0.01  # probability of finding any effect where there is none
 LEAST_GAIN = 0.03  # of the judged loss, for an effect to be worth its parameters
 FOLDS = 3  # parts of a log where there are fewer logs than this
 UNSEEN = 0.9  # of its prior's width: a parameter no narrower was not seen
@@ -35,9 +35,9 @@ UNSEEN = 0.9  # of its prior's width: a parameter no narrower was not seen
 
 @dataclass(frozen=True)
 class Calibration:
-    """What was found: chosen effects, their parameters in order, and how sure they are.
+    """Chosen effects, their parameters in order, and the covariance of these.
 
-    `gains` says what each effect took off the loss of logs that had no part in its fit, as a share, in the order of choice.
+    `gains`: share of the loss that each effect took off logs that had no part in its fit, in the order of choice.
     """
 
     effects: tuple[str, ...]
@@ -49,7 +49,7 @@ class Calibration:
 
 
 def signals_of(pool: Pool) -> Signals:
-    """The signals of all logs, end to end, their filters starting where the pool has them start."""
+    """Signals of all logs, end to end; filters start at each log's first sample in the pool."""
     parts = []
     for log in range(len(pool.names)):
         rows = pool.log == log
@@ -66,7 +66,7 @@ def calibrate(
     part: Part = "train",
     signals: Signals | None = None,
 ) -> Calibration:
-    """The effects that the logs support (or those named), with their parameters.
+    """Fit the effects that the logs support, or those named.
 
     `gyro` is the debiased rate that carries the attitude under the accelerometer, and the gyro's own samples for the gyro.
     `signals` are those of every sample where the logs begin before the pool does.
@@ -96,7 +96,7 @@ def calibrate(
 
 
 def folded(pool: Pool, part: Part) -> Pool:
-    """The pool with what each log has of a part cut in equal folds, where there are too few logs for one to be predicted."""
+    """Pool with each log cut in equal folds where there are too few logs."""
     if len(pool.names) >= FOLDS:
         return pool
     counts = torch.ones_like(pool.held_out) if part == "all" else pool.held_out == (part == "held_out")
@@ -108,13 +108,13 @@ def folded(pool: Pool, part: Part) -> Pool:
 
 
 def _columns(effects: Sequence[LinearForm], names: Sequence[str]) -> list[int]:
-    """Where the parameters of some of the effects are."""
+    """Columns of the parameters of some effects."""
     of = [effect.name for effect in effects for _ in effect.parameters]
     return [k for k, name in enumerate(of) if name in names]
 
 
 def _choose(problem: Problem, effects: Sequence[LinearForm]) -> dict[str, float]:
-    """Forward: the effect that helps most, if it helps enough, most logs, and not by chance; with what each gained."""
+    """Forward selection, by the gain on other logs; stops where the best gain is small."""
     gains: dict[str, float] = {}
     loss = problem.predicted([])
     while True:
@@ -132,10 +132,10 @@ def _choose(problem: Problem, effects: Sequence[LinearForm]) -> dict[str, float]
 
 
 def _beyond_chance(problem: Problem, effects: Sequence[LinearForm], names: Sequence[str]) -> bool:
-    """Whether the last effect's parameters are further from zero than all candidates together come by chance (Wald's test).
+    """Wald's test of the last effect's parameters, corrected for the number of candidates.
 
-    Windows count as independent here, where the covariance takes many to say the same once: this is to keep out what nothing
-    speaks for, not to let in what much does; that is for the held-out loss.
+    Windows count as independent here, though the covariance takes them as correlated: the test only keeps out effects without
+    evidence; the held-out loss decides which come in.
     """
     columns = _columns(effects, names)
     theta, covariance = problem.solve(columns)
@@ -146,7 +146,7 @@ def _beyond_chance(problem: Problem, effects: Sequence[LinearForm], names: Seque
 
 
 def _unseen(effects: Sequence[LinearForm], problem: Problem, covariance: Float[Tensor, "p p"]) -> tuple[str, ...]:
-    """Parameters no surer than their prior: the motion does not show them."""
+    """Parameters whose standard deviation is that of their prior: the motion does not show them."""
     names = [f"{effect.name}.{parameter.name}" for effect in effects for parameter in effect.parameters]
     share = (covariance.diagonal() * problem.prior).sqrt()
     return tuple(name for name, s in zip(names, share, strict=True) if float(s) > UNSEEN)

@@ -18,7 +18,7 @@ from torch import Tensor
 from imutool.bias.model import COLUMNS, BiasModel
 from imutool.errors import DataError
 from imutool.inertial.strapdown import GRAVITY_W
-from imutool.inertial.windows import HUBER_MEDIANS, attitudes, between, huber_weight, rotation_residual, velocity_residual
+from imutool.inertial.windows import HUBER_MEDIANS, attitudes, huber_weight, rotation_residual, step_means, velocity_residual
 from imutool.training.segments import Part, Pool, Windows
 from imutool.units import Sensor
 
@@ -99,7 +99,7 @@ def solve(
             J = _by_rest(A, windows.log, len(pool.names))
             if matrix:
                 u, _ = windows.segment.of(sensor)
-                J = torch.cat([_by_matrix(A, between(u) if sensor == "gyro" else u), J], dim=2)
+                J = torch.cat([_by_matrix(A, step_means(u) if sensor == "gyro" else u), J], dim=2)
             weight = _weight(e, windows.log, len(pool.names))
             H += torch.einsum("m,mij,mik->jk", weight, J, J)
             g += torch.einsum("m,mij,mi->j", weight, J, e)

@@ -23,22 +23,18 @@ from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 from imutool import registry
 from imutool.bias.model import COLUMNS, BiasModel
 from imutool.config import build
-from imutool.errors import DataError, NumericsError
+from imutool.errors import ConfigError, DataError, NumericsError
 from imutool.recording import Recording
 from imutool.training import closed_form, statistics
-from imutool.training.checks import refuse_device
-from imutool.training.corrected import corrected, up_to
-from imutool.training.increments import Increments
-from imutool.training.loss import error
-from imutool.training.objective import Objective, WindowEnds
-from imutool.training.segments import Pool
+from imutool.training.increments import IncrementObjective
+from imutool.training.objective import Objective, RestBiases, WindowEndObjective, error
+from imutool.training.segments import Pool, corrected, sensors_up_to
 from imutool.training.settings import TrainSettings, settings_for
-from imutool.training.tracks import Tracks
 from imutool.units import SENSORS, Sensor
 
 __all__ = ["Epoch", "Stage", "TrainSettings", "Training"]
 
-OBJECTIVES: dict[str, type[Objective]] = {"window_ends": WindowEnds, "increments": Increments}
+OBJECTIVES: dict[str, type[Objective]] = {"window_ends": WindowEndObjective, "increments": IncrementObjective}
 LONGEST_HELD_OUT_S = {"gyro": 20.0, "accel": 5.0}
 HELD_OUT_HOP_S = 1.0
 WARM_UP_STEPS = 20
@@ -74,6 +70,18 @@ class Stage:
     closed_form: dict[str, Tensor] = field(default_factory=dict)  # the model it left, once it is judged
 
 
+def check_device(device: str) -> None:
+    """Refuses a device that is not there.
+
+    Raises:
+        ConfigError: neither cpu nor cuda, or cuda where there is none.
+    """
+    if device.partition(":")[0] not in ("cpu", "cuda"):
+        raise ConfigError(f"{device!r} is no device", where="--device", expected="cpu or cuda")
+    if device.startswith("cuda") and not torch.cuda.is_available():
+        raise ConfigError("no CUDA device here", where="--device", fix="Use --device cpu")
+
+
 class Training:
     """Trains one model on the recordings of one sensor; once `epochs` has ended, `model` is what is kept.
 
@@ -86,7 +94,7 @@ class Training:
         self, recordings: Sequence[Recording], method: str, settings: TrainSettings | None = None, device: str = "cpu"
     ) -> None:
         self.settings = settings_for(method, settings)
-        refuse_device(device)
+        check_device(device)
         module = registry.load("imutool.bias", method)
         self.pool = Pool.of(recordings, device=device)
         torch.manual_seed(self.settings.seed)
@@ -94,7 +102,7 @@ class Training:
         self.model: BiasModel = module.Model(config, self.pool.rate_hz).double().to(device)
         learnt = ~self.pool.held_out
         self.model.see(self.pool.gyro[learnt], self.pool.accel[learnt])
-        self.tracks = Tracks(self.pool, self.settings.track_knot_s)
+        self.tracks = RestBiases(self.pool, self.settings.track_knot_s)
         self.generator = torch.Generator().manual_seed(self.settings.seed)
         self.done: dict[Sensor, float] = {}  # held-out error of each finished stage
         self.stage: Stage | None = None
@@ -114,7 +122,7 @@ class Training:
             self.done[sensor], self.stage = min(last, self.stage.before), None
         lengths: dict[Sensor, tuple[float, ...]] = {sensor: self._window_s(sensor) for sensor in SENSORS}
         self.model.eval()
-        statistics.store(self.model, self.pool, self.tracks.per_log().detach(), lengths)
+        statistics.store_statistics(self.model, self.pool, self.tracks.per_log().detach(), lengths)
         self.model.requires_grad_(False)
 
     def held_out(self, sensor: Sensor, model: BiasModel) -> float:
@@ -126,7 +134,7 @@ class Training:
         rest, lengths = self.tracks.per_log().detach(), self._window_s(sensor)[:2]
         columns = COLUMNS[sensor]
         rest[:, columns] = model.rest_at_work(sensor, rest[:, columns])
-        scored, pool = corrected(model, self.pool, "held_out", up_to(sensor))
+        scored, pool = corrected(model, self.pool, "held_out", sensors_up_to(sensor))
         solved = closed_form.solve(scored, sensor, pool, rest, lengths, matrix=False, part="held_out")
         rest[:, columns] = solved.rest
         with torch.no_grad():
@@ -154,7 +162,7 @@ class Training:
     def _closed_form(self, sensor: Sensor) -> None:
         """Calibration and rest biases, as far as windows and a matrix show them."""
         rest = self.tracks.per_log().detach()
-        scored, pool = corrected(self.model.eval(), self.pool, "train", up_to(sensor))
+        scored, pool = corrected(self.model.eval(), self.pool, "train", sensors_up_to(sensor))
         self._take(sensor, closed_form.solve(scored, sensor, pool, rest, self._window_s(sensor), matrix=True))
 
     def _window_s(self, sensor: Sensor) -> tuple[float, ...]:

@@ -21,24 +21,23 @@ from imutool.bias.model import COLUMNS, Segment
 from imutool.errors import DataError
 from imutool.geometry import so3
 from imutool.inertial.strapdown import GRAVITY_W
-from imutool.inertial.windows import between
+from imutool.inertial.windows import step_means
 from imutool.training import closed_form
 from imutool.training.closed_form import median_per_log
-from imutool.training.corrected import corrected, up_to
-from imutool.training.loss import length
-from imutool.training.objective import USUAL_SAMPLES, Objective
+from imutool.training.objective import USUAL_SAMPLES, Objective, length
+from imutool.training.segments import corrected, sensors_up_to
 
 USUAL_BATCH = 4  # stretches at a time
 
 
-class Errors(NamedTuple):
+class IncrementErrors(NamedTuple):
     """How far increments are off (rad or m/s), and the log each is from."""
 
     size: Float[Tensor, " m"]
     log: Int[Tensor, " m"]
 
 
-class Increments(Objective):
+class IncrementObjective(Objective):
     """Errors of all increments of some lengths in stretches drawn from the training part.
 
     A stretch brings `model.context` samples from before it, which feed the model and are not scored; before a log's first
@@ -68,7 +67,7 @@ class Increments(Objective):
         whole[self.pool.starts(n, "train")] = True
         return whole
 
-    def errors(self, first: Int[Tensor, " batch"]) -> dict[int, Errors]:
+    def errors(self, first: Int[Tensor, " batch"]) -> dict[int, IncrementErrors]:
         """The errors of all increments of the stretches that start at some samples, for each length."""
         pool, before = self.pool, self.model.context
         index = pool.around(first, before, self.stretch)
@@ -82,7 +81,7 @@ class Increments(Objective):
         found = {}
         for n, size in missed(true_u, dt, pool.R_wb[seen], pool.v_w[seen], self.lengths).items():
             counts = self.whole[n][seen[:, :-n]]
-            found[n] = Errors(size[counts], log[:, None].expand_as(counts)[counts])
+            found[n] = IncrementErrors(size[counts], log[:, None].expand_as(counts)[counts])
         return found
 
     def _usual(self) -> dict[int, Float[Tensor, " logs"]]:
@@ -108,7 +107,7 @@ class Increments(Objective):
         window_s = settings.gyro_window_s if self.sensor == "gyro" else settings.accel_window_s
         columns = COLUMNS[self.sensor]
         rest[:, columns] = self.model.eval().rest_at_work(self.sensor, rest[:, columns])
-        model, pool = corrected(self.model, self.pool, "train", up_to(self.sensor))
+        model, pool = corrected(self.model, self.pool, "train", sensors_up_to(self.sensor))
         self.tracks.set(self.sensor, closed_form.solve(model, self.sensor, pool, rest, window_s, matrix=False).rest)
 
 
@@ -123,7 +122,7 @@ def _rotation(
     lengths: list[int],
 ) -> Sizes:
     """|Log(dR_hat^T dR)| in rad, of the increments of some lengths that begin at each sample."""
-    steps = so3.exp(between(gyro) * dt[..., None])
+    steps = so3.exp(step_means(gyro) * dt[..., None])
     sizes = {}
     for n in lengths:
         dR_hat, dR = products(steps, n), R_wb[:, :-n].mT @ R_wb[:, n:]
@@ -140,7 +139,7 @@ def _velocity(
 ) -> Sizes:
     """|dv_hat - dv| in m/s, of the increments of some lengths that begin at each sample; trapezoidal rule."""
     a_w = (R_wb @ accel[..., None])[..., 0] + accel.new_tensor(GRAVITY_W)
-    off = torch.cumsum(between(a_w) * dt[..., None], dim=1) - (v_w[:, 1:] - v_w[:, :1])
+    off = torch.cumsum(step_means(a_w) * dt[..., None], dim=1) - (v_w[:, 1:] - v_w[:, :1])
     off = torch.cat([torch.zeros_like(off[:, :1]), off], dim=1)
     return {n: length(off[:, n:] - off[:, :-n]) for n in lengths}
 

@@ -1,6 +1,6 @@
-"""What integration between two true poses misses, to first order in the parameters of effects and in what is a log's own.
+"""Residuals between true poses, linearised in effect parameters and per-log unknowns.
 
-A log's own are its rest bias and, for the accelerometer, the tilt of its truth's world against gravity. The residual of a
+Unknowns of a log are its rest bias and, for the accelerometer, the tilt of its truth's world against gravity. The residual of a
 window and how each sample moves it come from `imutool.inertial.windows`; an effect's error is linear in its parameters, so
 the rest is
 a product of matrices.
@@ -54,7 +54,7 @@ def prior_std(effect: LinearForm) -> Float64[np.ndarray, " p"]:
 
 @dataclass(frozen=True)
 class Seen:
-    """One sensor's samples in a pool, the signals at each, and the rate that carries the attitude under an accelerometer."""
+    """Samples of one sensor in a pool: signals, and the gyro for an accelerometer's attitude."""
 
     pool: Pool
     sensor: Sensor
@@ -63,13 +63,13 @@ class Seen:
 
     @property
     def own_size(self) -> int:
-        """How many unknowns are a log's own."""
+        """Number of unknowns of each log."""
         return 3 if self.sensor == "gyro" else 5
 
 
 @dataclass(frozen=True)
 class WindowSet:
-    """Windows of n steps, by their first sample; `judged` if they rank calibrations."""
+    """Windows of n steps, by first sample; `judged` if they rank calibrations."""
 
     first: Int[Tensor, " m"]
     n: int
@@ -77,7 +77,7 @@ class WindowSet:
 
 
 def linearise(seen: Seen, effects: Sequence[LinearForm], part: Part) -> Problem:
-    """Gauss-Newton with all effects at once: first on the shortest windows, then on longer ones as well.
+    """Gauss-Newton on all effects at once, from the shortest windows to all lengths.
 
     Raises:
         DataError: a log without a window that is free of gaps.
@@ -90,10 +90,10 @@ def linearise(seen: Seen, effects: Sequence[LinearForm], part: Part) -> Problem:
     theta, own = torch.zeros_like(prior), prior.new_zeros(logs, seen.own_size)
     for step in range(len(sets) + 2):
         fit = judged = Equations.none(prior, logs, len(prior) + seen.own_size)
-        for one in sets[: step + 1]:
-            equations = _equations(seen, effects, theta, own, one)
+        for windows in sets[: step + 1]:
+            equations = _equations(seen, effects, theta, own, windows)
             fit = fit + equations
-            judged = judged + equations if one.judged else judged
+            judged = judged + equations if windows.judged else judged
         problem = Problem(theta, own, prior, own_prior, fit, judged)
         if step < len(sets) + 1:
             theta = problem.solve(range(len(prior))).theta
@@ -157,7 +157,7 @@ def _residual(
     gyro: Float[Tensor, "m n 3"],
     own: Float[Tensor, "logs o"],
 ) -> tuple[Float[Tensor, "m 3"], Float[Tensor, "m k 3 3"], Float[Tensor, "m 3 _"]]:
-    """The residual, how each sample moves it when taken down, and how the log's tilt does."""
+    """Residual, its Jacobian by minus each sample, and its Jacobian by the log's tilt."""
     if sensor == "gyro":
         e, A = rotation_residual(true_u, windows.dt, windows.R_start.mT @ windows.R_end)
         return e, A, e.new_zeros(len(e), 3, 0)
@@ -168,7 +168,7 @@ def _residual(
 
 
 def _summed(e: Float[Tensor, "m 3"], J: Float[Tensor, "m 3 k"], log: Int[Tensor, " m"], logs: int) -> Equations:
-    """Weighted by Huber's weights in units of what is usual for the log and the length."""
+    """Normal equations with Huber's weights, in units of the median of the log and the length."""
     size = e.norm(dim=1)
     delta = HUBER_MEDIANS * median_per_log(size, log, logs)[log]
     weight = huber_weight(size, delta) * 3 / delta**2 / CORRELATED
@@ -182,14 +182,14 @@ def _summed(e: Float[Tensor, "m 3"], J: Float[Tensor, "m 3 k"], log: Int[Tensor,
 def _terms(
     signals: Signals, effects: Sequence[LinearForm], index: Int[np.ndarray, "*shape"]
 ) -> Float64[np.ndarray, "*shape q"]:
-    """The terms of some effects at some samples."""
+    """Terms of the effects at some samples."""
     rows = signals.rows(index.ravel())
     parts = [np.zeros((index.size, 0)), *(effect.terms(rows) for effect in effects)]
     return np.concatenate(parts, axis=1).reshape(*index.shape, -1)
 
 
 def _error(signals: Signals, effects: Sequence[LinearForm], theta: Float64[np.ndarray, " p"]) -> Float[Tensor, "n 3"]:
-    """The error of every sample, a chunk at a time."""
+    """Error of every sample, a chunk at a time."""
     matrix = np.einsum("iqp,p->qi", patterns(effects), theta)
     rows = np.arange(len(signals.t_s))
     starts = range(0, len(rows), CHUNK)

@@ -1,7 +1,7 @@
-"""Least squares over many logs that share parameters: each log's normal equations apart, so that leaving one out is cheap.
+"""Normal equations of many logs that share parameters, kept by log so that one can be left out.
 
-Unknown are theta, shared by all logs, and a few numbers of each log's own, which are eliminated log by log (Schur's
-complement). With the equations of each log at hand, what all the others say of one is a solve of a matrix as small as theta.
+Unknowns are theta, shared by all logs, and a few of each log, which are eliminated log by log (Schur's complement). A
+prediction of one log from all others is then one solve of a matrix as small as theta.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-NEXT_TO_NOTHING = 1e-9  # of a diagonal, so that a log that shows nothing of its own can still be solved for
+RIDGE = 1e-9  # of a diagonal, so that a log without information on its own unknowns can be solved
 
 
 @dataclass(frozen=True)
@@ -27,21 +27,21 @@ class Equations:
 
     @classmethod
     def none(cls, like: Tensor, logs: int, unknowns: int) -> Equations:
-        """Nothing seen yet."""
+        """Equations without any sample."""
         return cls(*(like.new_zeros(logs, *shape) for shape in ((unknowns, unknowns), (unknowns,), ())))
 
     def __add__(self, other: Equations) -> Equations:
         return Equations(self.H + other.H, self.g + other.g, self.c + other.c)
 
     def moved(self, d_theta: Float[Tensor, " p"]) -> Equations:
-        """The same losses about a point moved in theta."""
+        """The same losses about another point, moved in theta."""
         p = len(d_theta)
         Hd = self.H[:, :, :p] @ d_theta
         return Equations(self.H, self.g + Hd, self.c + 2 * self.g[:, :p] @ d_theta + Hd[:, :p] @ d_theta)
 
 
 class Solution(NamedTuple):
-    """Parameters, those not asked for at zero, and the covariance of those asked for."""
+    """Parameters, zero where they were not solved for, and the covariance of the others."""
 
     theta: Float[Tensor, " p"]
     covariance: Float[Tensor, "c c"]
@@ -49,7 +49,7 @@ class Solution(NamedTuple):
 
 @dataclass(frozen=True)
 class Problem:
-    """A point, the losses about it and the priors: theta's about zero, each log's own about zero too."""
+    """Linearisation point, the losses about it, and priors about zero."""
 
     theta: Float[Tensor, " p"]
     own: Float[Tensor, "logs o"]
@@ -59,7 +59,7 @@ class Problem:
     judged: Equations  # what a solution is judged by
 
     def solve(self, columns: Sequence[int], without: int | None = None) -> Solution:
-        """One Gauss-Newton step for some parameters and all logs but one, all other parameters at zero."""
+        """Gauss-Newton step for some parameters, the others at zero, and all logs but one."""
         columns, p = list(columns), len(self.prior)
         at = torch.zeros_like(self.theta)
         at[columns] = self.theta[columns]
@@ -76,18 +76,18 @@ class Problem:
         return Solution(at, covariance)
 
     def own_at(self, theta: Float[Tensor, " p"]) -> Float[Tensor, "logs o"]:
-        """What is each log's own, for given parameters."""
+        """Unknowns of each log, for given parameters."""
         H, g = self._own_equations(self.fit.moved(theta - self.theta))
         own: Tensor = self.own - torch.linalg.solve(H, g)
         return own
 
     def predicted(self, columns: Sequence[int]) -> Float[Tensor, " logs"]:
-        """Each log's judged loss with what the other logs say of some parameters, its own unknowns solved for."""
+        """Loss of each log with parameters from the other logs, its own unknowns solved for."""
         p, losses = len(self.prior), []
         for i in range(len(self.own)):
             judged = self.judged.moved(self.solve(columns, without=i).theta - self.theta)
             H, g = judged.H[i, p:, p:], judged.g[i, p:]
-            least = NEXT_TO_NOTHING * H.diagonal().mean().clamp_min(NEXT_TO_NOTHING)
+            least = RIDGE * H.diagonal().mean().clamp_min(RIDGE)
             own = -torch.linalg.solve(H + least * torch.eye(len(g)).to(H), g)
             losses.append(judged.c[i] + 2 * g @ own + own @ H @ own)
         return torch.stack(losses)

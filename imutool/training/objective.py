@@ -1,24 +1,131 @@
-"""What a stage descends on: an objective draws its own batches from the training part and says what they miss.
+"""Objectives of the descent: window errors, their robust loss, and the free rest bias of each training log.
 
-A model names the one it wants (`BiasModel.objective`); the training calls it without knowing which it is.
+The paper's losses are mean squares (eq. 16, 17). Here the error of a window is divided by the median error of windows of its
+length and log, and goes through Huber's function: an outlier of the motion capture pulls no harder than an ordinary window, and
+windows of every length and every log count alike. An objective draws its own batches from the training part. A model names the
+objective it wants (`BiasModel.objective`).
+
+The rest bias of each log belongs to the run, not to the sensor. It is fitted together with the weights, free but slow, so that
+a turn-on bias or its drift is not attributed to the motion.
 """
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 
 import torch
 from jaxtyping import Float, Int
-from torch import Tensor
+from torch import Tensor, nn
 
-from imutool.bias.model import BiasModel
+from imutool.bias.model import COLUMNS, BiasModel
+from imutool.geometry import so3
+from imutool.inertial.strapdown import GRAVITY_W
+from imutool.inertial.windows import HUBER_MEDIANS, attitudes, huber, step_means
 from imutool.training.closed_form import median_per_log
-from imutool.training.loss import RobustLoss, error
-from imutool.training.segments import Pool
+from imutool.training.segments import Pool, Windows
 from imutool.training.settings import TrainSettings
-from imutool.training.tracks import Tracks
-from imutool.units import Sensor
+from imutool.units import SENSORS, Sensor
+
+TRACK_UNIT = {"gyro": 1e-1, "accel": 1.0}  # one unit of a track's parameter, rad/s and m/s²
+TRACK_WALK = {"gyro": 1e-4, "accel": 2e-3}  # how far a rest bias may walk in a second^1/2, rad/s and m/s²
+
+
+class RestBiases(nn.Module):
+    """The rest bias of each log as a polyline in time, a knot every `knot_s`."""
+
+    def __init__(self, pool: Pool, knot_s: float) -> None:
+        super().__init__()
+        ends = [float(pool.t[pool.log == i].max()) for i in range(len(pool.names))]
+        self.counts = [max(2, round(end / knot_s) + 1) for end in ends]
+        self.knot_s = knot_s
+        device = pool.t.device
+        self.offset = torch.tensor([sum(self.counts[:i]) for i in range(len(ends))], device=device)
+        self.last = torch.tensor(self.counts, device=device) - 1
+        self.knots = nn.Parameter(torch.zeros(sum(self.counts), 6, dtype=pool.t.dtype, device=device))
+        unit = [TRACK_UNIT[sensor] for sensor in SENSORS for _ in range(3)]
+        self.unit = torch.tensor(unit, dtype=pool.t.dtype, device=device)
+
+    def at(self, log: Int[Tensor, " batch"], t: Float[Tensor, " batch"]) -> Float[Tensor, "batch 6"]:
+        """The rest bias of some logs at some times (s from the log's start)."""
+        place = (t / self.knot_s).clamp(min=0)
+        j = torch.minimum(place.long(), self.last[log] - 1)
+        weight = (place - j).clamp(max=1.0)[:, None]
+        first = self.offset[log] + j
+        return torch.lerp(self.knots[first], self.knots[first + 1], weight) * self.unit
+
+    def per_log(self) -> Float[Tensor, "logs 6"]:
+        """The mean rest bias of each log."""
+        means: Tensor = torch.stack([part.mean(0) for part in self._parts()]) * self.unit
+        return means
+
+    def set(self, sensor: Sensor, rest: Float[Tensor, "logs 3"]) -> None:
+        """Makes a sensor's tracks constant."""
+        columns = COLUMNS[sensor]
+        with torch.no_grad():
+            for part, value in zip(self._parts(), rest, strict=True):
+                part[:, columns] = value / self.unit[columns]
+
+    def _parts(self) -> tuple[Tensor, ...]:
+        """The knots of each log."""
+        return torch.split(self.knots, self.counts)
+
+    def wandering(self, sensor: Sensor) -> Float[Tensor, ""]:
+        """Minus the log-likelihood of the tracks as random walks, summed over the logs."""
+        columns = COLUMNS[sensor]
+        step = torch.cat([torch.diff(part[:, columns], dim=0) for part in self._parts()])
+        sigma = TRACK_WALK[sensor] * self.knot_s**0.5 / self.unit[columns]
+        cost: Tensor = 0.5 * (step / sigma).square().sum()
+        return cost
+
+
+def orientation_error(model: BiasModel, windows: Windows) -> Float[Tensor, " batch"]:
+    """|Log(R_hat^T R)| at the end of each window, in rad (paper, eq. 16, at the last sample)."""
+    R_hat = model.end_attitude(windows.R_start, windows.segment, windows.dt)
+    return length(so3.log(R_hat.mT @ windows.R_end))
+
+
+def motion_error(model: BiasModel, windows: Windows) -> Float[Tensor, " batch"]:
+    """|v_hat - v| and |p_hat - p| / window together, at the end of each window, in m/s (paper, eq. 17, in one unit).
+
+    The attitude follows the debiased gyro, whose weights this stage leaves alone.
+    """
+    segment, dt = windows.segment, windows.dt[..., None]
+    with torch.no_grad():
+        R_wb = attitudes(windows.R_start, segment.gyro - model.sensor_bias("gyro", segment), windows.dt)
+    accel = segment.accel - model.sensor_bias("accel", segment)
+    a_w = (R_wb @ accel[..., None])[..., 0] + accel.new_tensor(GRAVITY_W)
+    rise = torch.cumsum(step_means(a_w) * dt, dim=1)
+    velocity = windows.v_start + rise[:, -1] - windows.v_end
+    risen = torch.cat([torch.zeros_like(rise[:, :1]), rise], dim=1)
+    moved = (windows.v_start[:, None] + step_means(risen)) * dt
+    position = (windows.p_start + moved.sum(1) - windows.p_end) / windows.dt.sum(1, keepdim=True)
+    return length(torch.cat([velocity, position], dim=1))
+
+
+def error(model: BiasModel, sensor: Sensor, windows: Windows) -> Float[Tensor, " batch"]:
+    """The error that trains a sensor: orientation for the gyro (rad), motion for the accelerometer (m/s)."""
+    return orientation_error(model, windows) if sensor == "gyro" else motion_error(model, windows)
+
+
+class RobustLoss:
+    """Huber's loss, its width 1.5 medians of the errors that windows of this length of this log had at the stage's start.
+
+    Fixed during a stage, so that the loss can be followed; by log, because truths differ in quality by a factor of eight.
+    """
+
+    def __init__(self, medians: Mapping[int, Float[Tensor, " logs"]]) -> None:
+        self.medians = medians
+
+    def __call__(self, size: Float[Tensor, " batch"], log: Int[Tensor, " batch"], n: int) -> Float[Tensor, ""]:
+        """Mean loss of windows of n steps."""
+        return huber(size, HUBER_MEDIANS * self.medians[n][log]).mean()
+
+
+def length(v: Float[Tensor, "*batch k"]) -> Float[Tensor, "*batch"]:
+    """Euclidean length with a finite gradient at zero."""
+    return (v.square().sum(dim=-1) + 1e-24).sqrt()
+
 
 USUAL_SAMPLES = 200_000  # enough for a median
 BATCH = 64  # windows at a time where no gradient is kept
@@ -31,7 +138,7 @@ class Objective(ABC):
         loss: its widths are fixed from the model as it stands when the objective is made; a checkpoint keeps them.
     """
 
-    def __init__(self, model: BiasModel, sensor: Sensor, pool: Pool, tracks: Tracks, settings: TrainSettings) -> None:
+    def __init__(self, model: BiasModel, sensor: Sensor, pool: Pool, tracks: RestBiases, settings: TrainSettings) -> None:
         self.model, self.sensor, self.pool, self.tracks, self.settings = model, sensor, pool, tracks, settings
         self._choose()
         with torch.no_grad():
@@ -54,12 +161,12 @@ class Objective(ABC):
         """Leaves the tracks as they should be now that the stage is over and the model is the one kept."""
 
 
-class WindowEnds(Objective):
-    """What integration misses at the end of windows of several lengths (`imutool.training.loss`)."""
+class WindowEndObjective(Objective):
+    """What integration misses at the end of windows of several lengths (`imutool.training.objective`)."""
 
     def _choose(self) -> None:
         named = self.settings.gyro_window_s if self.sensor == "gyro" else self.settings.accel_window_s
-        lengths = map(self.pool.samples, named)
+        lengths = dict.fromkeys(self.pool.samples(min(window_s, self.model.longest_window_s)) for window_s in named)
         self.pools = [(n, first) for n in lengths if len(first := self.pool.starts(n, "train"))]
 
     def errors(self, first: Int[Tensor, " m"], n: int) -> Float[Tensor, " m"]:

@@ -1,9 +1,9 @@
-"""How `hybrid` is trained: effects in closed form, then the neural ODE on recordings that they have been taken off.
+"""Training of `hybrid`: effects by least squares, then the ODE on corrected recordings.
 
 Effects are chosen on the training part, and then fitted to the whole logs.
 
-The ODE's training is the one of `neural_ode`, and does not know that its samples were corrected. It is kept where it takes
-at least `LEAST_GAIN` off the held-out error of either sensor, and left out of the model where it does not.
+The ODE is trained as `neural_ode` is. The model keeps it if it takes at least `LEAST_GAIN` off the held-out error of either
+sensor.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ LEAST_GAIN = 0.03  # of the held-out error, for an ODE to be worth its weights
 
 @dataclass(frozen=True)
 class PhysicsFirst:
-    """A hybrid model whose effects are found, and the recordings without them."""
+    """Hybrid model with fitted effects, and the recordings corrected for them."""
 
     model: hybrid.Model
     found: dict[Sensor, Calibration]
@@ -44,9 +44,9 @@ class PhysicsFirst:
 
     @classmethod
     def of(
-        cls, recordings: Sequence[Recording], settings: TrainSettings, device: str, say: Callable[[Epoch], None]
+        cls, recordings: Sequence[Recording], settings: TrainSettings, device: str, report: Callable[[Epoch], None]
     ) -> PhysicsFirst:
-        """Finds the effects of gyro, then accelerometer.
+        """Fit the effects of the gyro, then of the accelerometer.
 
         Raises:
             DataError: no truth, too little of it, or different rates.
@@ -55,10 +55,10 @@ class PhysicsFirst:
         pool = Pool.of(recordings, device=device)
         torch.manual_seed(settings.seed)
         model = hybrid.Model(config_of(settings), pool.rate_hz).double()
-        signals, found = _where_there_is_truth(recordings, pool), {}
+        signals, found = _online_signals(recordings, pool), {}
         gyro = pool.gyro
         for sensor in SENSORS:
-            say(Epoch(sensor, 0, 0, math.nan, math.nan, math.nan, 0.0, f"looking for effects on the {sensor}"))
+            report(Epoch(sensor, 0, 0, math.nan, math.nan, math.nan, 0.0, f"looking for effects on the {sensor}"))
             chosen = calibrate(pool, sensor, gyro, model.named(sensor), "train", signals)
             whole = calibrate(pool, sensor, gyro, chosen.effects, "all", signals)  # nothing is left to be chosen
             found[sensor] = replace(whole, gains=chosen.gains)
@@ -69,12 +69,12 @@ class PhysicsFirst:
         return cls(model, found, _without(model, recordings))
 
     def ode_settings(self, settings: TrainSettings) -> TrainSettings:
-        """The settings of the ODE's own training."""
+        """Settings of the ODE's own training."""
         ode: neural_ode.Config = self.model.config.ode
         return msgspec.structs.replace(settings, model=plain(ode))
 
     def finish(self, learnt: BiasModel) -> hybrid.Model:
-        """The whole model, with the ODE that was trained, or without one where a constant was enough."""
+        """Complete model with the trained ODE, or without one where a constant was enough."""
         model = self.model
         if isinstance(learnt, neural_ode.Model):
             assert model.ode is not None
@@ -87,30 +87,30 @@ class PhysicsFirst:
 
 
 def settings_for(physics: Path) -> tuple[list[str], tuple[str, ...]]:
-    """Settings for `hybrid` with the effects that a physics.toml names, and of those what it has no correction for.
+    """Settings for `hybrid` with the effects of a physics.toml, and names that it cannot have.
 
-    Their numbers are fitted anew to the logs; the latter, and all that has no name, is left to the neural ODE.
+    Their parameters are fitted anew to the logs. Effects that it cannot have, or without a name, are left to the neural ODE.
 
     Raises:
-        ConfigError: the file cannot be read, or names no effect that `hybrid` can take off.
+        ConfigError: the file cannot be read, or names no effect that `hybrid` can have.
     """
     names = tuple(dict.fromkeys(entry.name for entry in physics_file.read(physics).effect))
     by_sensor = {sensor: [form.name for form in catalogue.trained(sensor) if form.name in names] for sensor in SENSORS}
     taken = {name for some in by_sensor.values() for name in some}
     if not taken:
-        raise ConfigError("no effect that a bias model can take off", where=physics, expected="for instance gyro_scale")
+        raise ConfigError("no effect that a bias model can correct", where=physics, expected="for instance gyro_scale")
     words = [f"model.{sensor}_effects={json.dumps(some)}" for sensor, some in by_sensor.items()]
     return words, tuple(name for name in names if name not in taken)
 
 
 def helps(before: dict[Sensor, float], after: dict[Sensor, float]) -> bool:
-    """Whether a descent took enough off the held-out error of one sensor, and did no harm to the other."""
+    """Whether a descent lowers one sensor's held-out error enough, and does not raise the other's."""
     gains = [1 - after[sensor] / before[sensor] for sensor in SENSORS]
     return max(gains) >= LEAST_GAIN and min(gains) > -LEAST_GAIN
 
 
 def config_of(settings: TrainSettings) -> hybrid.Config:
-    """The model's settings, with effects that are known.
+    """Model settings, their effects checked.
 
     Raises:
         ConfigError: an unknown setting or effect (the nearest is named), or an effect on the wrong sensor.
@@ -121,8 +121,8 @@ def config_of(settings: TrainSettings) -> hybrid.Config:
     return config
 
 
-def _where_there_is_truth(recordings: Sequence[Recording], pool: Pool) -> Signals:
-    """The signals of a pool's samples as they are at work: their filters and their time start where the log does."""
+def _online_signals(recordings: Sequence[Recording], pool: Pool) -> Signals:
+    """Signals of a pool's samples as online: filters and time start where the log does."""
     parts: list[Signals] = []
     for recording, count in zip(recordings, torch.bincount(pool.log).tolist(), strict=True):
         first = int(np.searchsorted(recording.imu.t_ns, recording.overlap().imu.t_ns[0]))
@@ -135,7 +135,7 @@ def _signals(imu: Imu, rate_hz: float) -> Signals:
 
 
 def _without(model: hybrid.Model, recordings: Sequence[Recording]) -> list[Recording]:
-    """The recordings with the model's effects taken off their samples."""
+    """Recordings corrected for the model's effects."""
     return [replace(recording, imu=_corrected(model, recording.imu)) for recording in recordings]
 
 
@@ -145,6 +145,6 @@ def _corrected(model: hybrid.Model, imu: Imu) -> Imu:
 
 
 def described(found: dict[Sensor, Calibration]) -> Iterator[tuple[str, dict[str, object]]]:
-    """What a card says of the effects: what each took off the loss of logs that had no part in its fit, what was not seen."""
-    for sensor, one in found.items():
-        yield sensor, {"effects": list(one.effects), "gains": dict(one.gains), "unseen": list(one.unseen)}
+    """Entries of a model card: effects, gains on logs left out of the fit, unseen parameters."""
+    for sensor, fitted in found.items():
+        yield sensor, {"effects": list(fitted.effects), "gains": dict(fitted.gains), "unseen": list(fitted.unseen)}

@@ -14,18 +14,26 @@ from imutool import __version__, registry
 from imutool.bias import hybrid, io, neural_ode, static
 from imutool.bias.model import BiasModel
 from imutool.config import plain
-from imutool.errors import ConfigError
+from imutool.errors import ConfigError, DataError
+from imutool.geometry import so3
+from imutool.inertial.windows import rotation_residual
 from imutool.mcap_io.read import read
-from imutool.mcap_io.storage.digest import sha256
+from imutool.mcap_io.storage.source import sha256
 from imutool.recording import Recording
-from imutool.training import checkpoint, checks
-from imutool.training.fit import Epoch, Training
+from imutool.training import checkpoint
+from imutool.training.fit import Epoch, Training, check_device
 from imutool.training.physics_first import PhysicsFirst, config_of, described, helps
 from imutool.training.segments import Pool
 from imutool.training.settings import TrainSettings, settings_for
 from imutool.units import SENSORS
 
 UNITS = {"gyro": "rad", "accel": "m/s"}
+
+
+LEAST_S = 10.0  # of truth without gaps, in all logs together
+LEAST_TURN_RAD_S = 0.02  # of the rate about its own mean: less is a sensor on a table
+WINDOW_S = 1.0
+WORST_MISS = 0.5  # of a log's largest turns; a scale error of a tenth misses by a tenth
 
 
 def checkpoint_path(out: Path) -> Path:
@@ -65,14 +73,14 @@ def train(
         raise ConfigError(said, where=kept, fix="Give --resume to go on, or --overwrite to start afresh")
     if method == static.Model.method:
         raise ConfigError("static is not trained", where="--method", fix="Choose hybrid, neural_ode, conv or linear")
-    checks.refuse_device(device)
+    check_device(device)
     chosen = settings_for(method, settings)
     if resume and not registry.load("imutool.bias", method).Model.iterative:
         raise ConfigError(f"{method} has no steps to go on with", where="--resume", fix="Train it without --resume")
     if method == hybrid.Model.method:
         config_of(chosen)  # a slip of the pen is told before any log is read
     recordings = [read(log, imu=imu, truth=truth) for log in logs]
-    checks.refuse(recordings, Pool.of(recordings))
+    check_trainable(recordings, Pool.of(recordings))
     say = progress or (lambda epoch: None)
     descent = _Descent(kept, resume, device, say)
     if method == hybrid.Model.method:
@@ -156,3 +164,59 @@ def _card(method: str, settings: TrainSettings, recordings: Sequence[Recording],
         "training": plain(settings),
         "logs": [{"name": r.name, "file": p.name, "sha256": sha256(p)} for r, p in zip(recordings, logs, strict=True)],
     }
+
+
+def check_trainable(recordings: Sequence[Recording], pool: Pool) -> None:
+    """Refuses recordings that no model should be learned from.
+
+    Raises:
+        DataError: different sensors, too short, standing still, or a truth that does not follow the samples.
+    """
+    _one_sensor(recordings)
+    n = pool.samples(WINDOW_S)
+    first = pool.starts(n, "all", hop=n)
+    if len(first) * WINDOW_S < LEAST_S:
+        raise DataError(
+            f"{len(first) * WINDOW_S:.0f} s of truth without gaps in all training logs",
+            where=", ".join(pool.names),
+            expected=f"at least {LEAST_S:g} s, and minutes for a useful model",
+            fix="Add logs, or look at their truth with imutool info",
+        )
+    turning = float((pool.gyro - pool.gyro.mean(0)).norm(dim=1).median())
+    if turning < LEAST_TURN_RAD_S:
+        raise DataError(
+            f"the sensor stands still: half of the time it turns by less than {turning:.3f} rad/s",
+            where=", ".join(pool.names),
+            expected=f"motion, more than {LEAST_TURN_RAD_S:g} rad/s",
+            fix="Add logs in which it turns; for a sensor at rest, imutool debias needs no model",
+        )
+    _truths_follow(pool, first, n)
+
+
+def _one_sensor(recordings: Sequence[Recording]) -> None:
+    said = {r.name: str(r.metadata.get("imutool", {}).get("sensor", "")) for r in recordings}
+    named = {sensor for sensor in said.values() if sensor}
+    if len(named) > 1:
+        listed = ", ".join(f"{name}: {sensor or 'not said'}" for name, sensor in said.items())
+        raise DataError(f"training logs of different sensors ({listed})", expected="logs of one sensor")
+
+
+def _truths_follow(pool: Pool, first: torch.Tensor, n: int) -> None:
+    """Compares what the samples and the true poses say of the same seconds, constants apart."""
+    windows = pool.windows(first, n, pool.t.new_zeros(len(first), 6))
+    R_true = windows.R_start.mT @ windows.R_end
+    e, _ = rotation_residual(windows.segment.gyro, windows.dt, R_true)
+    turned = so3.log(R_true).norm(dim=1)
+    for log, name in enumerate(pool.names):
+        of_log = windows.log == log
+        if not bool(of_log.any()):
+            continue
+        missed = float((e[of_log] - e[of_log].median(0).values).norm(dim=1).median())
+        largest = float(turned[of_log].quantile(0.9))
+        if missed > WORST_MISS * max(largest, LEAST_TURN_RAD_S * WINDOW_S):
+            raise DataError(
+                f"the true poses do not follow the gyro: they miss turns by {missed:.2f} rad a second, of {largest:.2f}",
+                where=name,
+                expected="poses of the IMU's own frame, on its clock",
+                fix="Look at the frame and the time offset of the truth, or leave the log out",
+            )

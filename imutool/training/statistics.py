@@ -11,12 +11,11 @@ from jaxtyping import Float
 from torch import Tensor
 
 from imutool.bias.model import COLUMNS, BiasModel, Segment
-from imutool.bias_start.bias_from_truth import truth_offset
+from imutool.bias_start.bias_from_truth import bias_from_truth
 from imutool.bias_start.initial_bias import TRUTH_S, rest_spread
 from imutool.inertial.stationary import white_noise
 from imutool.training import closed_form
-from imutool.training.corrected import corrected
-from imutool.training.segments import Pool
+from imutool.training.segments import Pool, corrected
 from imutool.units import SENSORS, Sensor
 
 MAD_TO_STD = 1.4826
@@ -26,7 +25,9 @@ LEAST_TRUSTED, FEWEST_STARTS = 0.5, 4
 FLOOR_STD = {"gyro": 5e-5, "accel": 2e-3}
 
 
-def store(model: BiasModel, pool: Pool, rest: Float[Tensor, "logs 6"], window_s: Mapping[Sensor, Sequence[float]]) -> None:
+def store_statistics(
+    model: BiasModel, pool: Pool, rest: Float[Tensor, "logs 6"], window_s: Mapping[Sensor, Sequence[float]]
+) -> None:
     """Fills the model's prior, the spread of starts from truth, and the noise of a sample, from the training part."""
     scored, left = corrected(model, pool)
     for sensor in SENSORS:
@@ -89,7 +90,7 @@ def _start_spread(model: BiasModel, pool: Pool, rest: Float[Tensor, "logs 6"]) -
             segment = Segment(t[None], u[None, :, :3], u[None, :, 3:], rest[log][None])
             left = (u - model(segment)[0]).cpu().double().numpy()
             R_wb, v_w = (x[some].cpu().double() for x in (pool.R_wb, pool.v_w))
-            off.append(truth_offset(t.cpu().double().numpy(), left, R_wb, v_w, trusted.cpu().numpy()))
+            off.append(bias_from_truth(t.cpu().double().numpy(), left, R_wb, v_w, trusted.cpu().numpy()))
     if len(off) < FEWEST_STARTS:
         return torch.tensor([ONE_RUN_STD["gyro"]] * 3 + [ONE_RUN_STD["accel"]] * 3).to(rest)
     floor = torch.tensor([FLOOR_STD["gyro"]] * 3 + [FLOOR_STD["accel"]] * 3)

@@ -1,9 +1,9 @@
-"""Logs in a notebook: the viewer as a widget, or the page that needs nothing but a browser.
+"""Show logs in a notebook: the viewer as a widget, or the HTML report in a frame.
 
 ::
 
-    from imutool.view import notebook
-    from imutool.view.runs import load
+    from imutool.viewing import notebook
+    from imutool.viewing.model.runs import load
 
     notebook.show([load("MH_04.mcap", models=["euroc-adis16448-hybrid"])])
 """
@@ -24,15 +24,15 @@ from imutool.viewing.model.run_data import RunData
 if TYPE_CHECKING:
     from rerun.notebook import Viewer
 
-ASSET = "RERUN_NOTEBOOK_ASSET"  # where Rerun's widget takes its program from; of itself, from a server of Rerun's
-INLINE = "inline"  # from the package that is installed: works without a network, and where the notebook's server is elsewhere
+ASSET = "RERUN_NOTEBOOK_ASSET"  # source of the widget's program; by default a server of Rerun's
+INLINE = "inline"  # the installed package: works without a network and with a remote notebook server
 HEIGHT_PX = 720
 
 
 def show(logs: Sequence[RunData], *, height_px: int = HEIGHT_PX, source: bool = True) -> Viewer:
-    """A viewer of all logs as wide as its cell, which shows itself at the end of one; nothing comes from the network.
+    """Viewer widget with all logs, as wide as its cell; nothing comes from the network.
 
-    The first one of a session takes some seconds. Who wants its program from elsewhere sets RERUN_NOTEBOOK_ASSET before.
+    The first widget of a session takes some seconds. RERUN_NOTEBOOK_ASSET, set before, selects another source of its program.
 
     Raises:
         ConfigError: no log, or the extra `notebook` is not installed.
@@ -43,23 +43,22 @@ def show(logs: Sequence[RunData], *, height_px: int = HEIGHT_PX, source: bool = 
             where="notebook",
             fix="Install it with: pip install 'imutool[notebook]', or show notebook.page(logs) instead",
         )
-    from imutool.viewing.rerun import layout, scene
-    from imutool.viewing.rerun.sdk import FLUSH_S, stream
+    from imutool.viewing.rerun import scene
+    from imutool.viewing.rerun.sdk import FLUSH_S, stream_of_logs
 
-    recording = stream(logs)
-    os.environ.setdefault(ASSET, INLINE)  # read when the next line is first run
+    recording = stream_of_logs(logs)
+    os.environ.setdefault(ASSET, INLINE)  # read when the next line first runs
     from rerun.notebook import Viewer
 
     viewer = Viewer(width="auto", height=height_px, recording=recording)
-    recording.send_blueprint(layout.blueprint(logs, source=source))
-    scene.log(logs, recording, source=source)
-    recording.flush(timeout_sec=FLUSH_S)  # the widget now has everything, and the recording may go
+    scene.send(logs, recording, source=source)
+    recording.flush(timeout_sec=FLUSH_S)  # the widget has everything now
     return viewer
 
 
 @dataclass(frozen=True)
 class Page:
-    """A whole page that a notebook shows in a frame of its own, where it can do nothing but be read."""
+    """HTML page that a notebook shows in a sandboxed frame."""
 
     content: str
     height_px: int = HEIGHT_PX
@@ -70,7 +69,7 @@ class Page:
 
 
 def page(logs: Sequence[RunData], *, height_px: int = HEIGHT_PX) -> Page:
-    """The report of all logs, which also shows where no program runs: in a saved notebook, on a web page made of it.
+    """HTML report of all logs, which also shows in a saved notebook.
 
     Raises:
         ConfigError: no log, or matplotlib is not installed.

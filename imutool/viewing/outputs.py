@@ -1,4 +1,4 @@
-"""What a person asked to see and how: checked before any work, done in one go, each way said in a sentence."""
+"""Requested outputs of a view: checked before any work, then opened, written or served."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ from imutool.errors import ConfigError, DataError
 from imutool.viewing.html import report
 from imutool.viewing.model.output import Output
 from imutool.viewing.model.run_data import RunData
-from imutool.viewing.rerun.sdk import title
+from imutool.viewing.rerun.sdk import recording_name
 
 if TYPE_CHECKING:
-    from imutool.viewing.rerun.connect import Peer
+    from imutool.viewing.rerun.connect import Listener
     from imutool.viewing.rerun.web import Server
 
 logger = logging.getLogger(__name__)
@@ -30,17 +30,17 @@ WORST = "worst"
 
 
 @dataclass(frozen=True)
-class Asked:
-    """The ways to look that were asked for, all of which are taken; with none of them a viewer opens.
+class RequestedOutputs:
+    """Outputs that the user requested; a viewer opens without any of them.
 
-    `at` is where the cursor starts: seconds since the first IMU sample, or `worst`, the largest error of a model.
+    `at` is the start of the cursor: seconds since the first IMU sample, or `worst`, the largest error of a model.
     """
 
     save: Path | None = None
     connect: str | None = None
     web: bool = False
     port: int | None = None
-    export: Path | None = None
+    export_web: Path | None = None
     png: Path | None = None
     html: Path | None = None
     at: str | None = None
@@ -49,45 +49,48 @@ class Asked:
 
     @property
     def opens_viewer(self) -> bool:
-        """Whether a viewer of our own is to open: nothing else was asked for."""
-        return self.connect is None and not self.web and all(p is None for p in (self.save, self.export, self.png, self.html))
+        """Whether a viewer opens: no output was requested."""
+        return (
+            self.connect is None and not self.web and all(p is None for p in (self.save, self.export_web, self.png, self.html))
+        )
 
     @property
     def needs_rerun(self) -> bool:
-        """Whether nothing of what was asked for can be done without Rerun."""
-        return self.connect is not None or self.web or self.save is not None or self.export is not None
+        """Whether a requested output needs Rerun."""
+        return self.connect is not None or self.web or self.save is not None or self.export_web is not None
 
     @property
     def has_cursor(self) -> bool:
-        """Whether one of the ways has a cursor that can be set; a file has none."""
-        return self.opens_viewer or self.connect is not None or self.web or self.export is not None
+        """Whether an output has a cursor; a file has none."""
+        return self.opens_viewer or self.connect is not None or self.web or self.export_web is not None
 
 
 class Outputs:
-    """Everything that can be known before the logs are read: who listens, which port is free; context manager.
+    """Validates and runs the requested outputs; context manager.
 
-    Where nobody listens at `connect`, that is said at once, an .rrd is saved instead, and `refused` is what to end with.
+    Listeners and ports are checked before the logs are read. Without a listener at `connect`, an .rrd file is saved instead
+    and `refused` holds the error to end with.
 
     Raises:
-        ConfigError: contradictory wishes, `connect` is no address, or Rerun is needed and not installed.
+        ConfigError: contradictory outputs, `connect` is not an address, or Rerun is needed and not installed.
     """
 
-    def __init__(self, asked: Asked) -> None:
+    def __init__(self, asked: RequestedOutputs) -> None:
         self.asked = asked
         self.refused: ConfigError | None = None
-        self._peer: Peer | None = None
+        self._peer: Listener | None = None
         self._server: Server | None = None
         self._stack = ExitStack()
-        _refuse_contradictions(asked)
+        _check_contradictions(asked)
         if not asked.needs_rerun:
             return
-        from imutool.viewing.rerun import connect, export, sdk, web
+        from imutool.viewing.rerun import connect, sdk, web
 
-        sdk.need_sdk()
-        if asked.export is not None:
-            export.refuse(asked.export, overwrite=asked.overwrite)
+        sdk.require_rerun()
+        if asked.export_web is not None:
+            web.check_folder(asked.export_web, overwrite=asked.overwrite)
         if asked.connect is not None:
-            self._connect(connect.full(asked.connect))
+            self._connect(connect.full_url(asked.connect))
         if asked.web:
             self._server = self._stack.enter_context(web.Server(asked.port))
 
@@ -101,22 +104,22 @@ class Outputs:
             logger.warning("%s", error)
 
     def show(self, logs: Sequence[RunData]) -> list[Output]:
-        """Takes every way that was asked for, in an order that leaves the longest for last.
+        """Run every requested output, the slowest last.
 
         Raises:
             ConfigError: a target exists or cannot be written, or a viewer stops listening.
-            DataError: `worst` without truth, a time outside the log, or a picture of nothing.
+            DataError: `worst` without truth, a time outside the log, or nothing to draw.
         """
         at_s = None if self.asked.at is None else cursor_s(logs, self.asked.at)
         return [*self._pages(logs), *self._recordings(logs, at_s)]
 
     def versions(self) -> dict[str, str | None]:
-        """Of imutool, of the Rerun that is installed, and of the viewer at `connect`, which may be another."""
+        """Versions of imutool, of the installed Rerun, and of the viewer at `connect`."""
         rerun = version("rerun-sdk") if find_spec("rerun") is not None else None
         return {"imutool": __version__, "rerun": rerun, "viewer": rerun if self._peer is None else self._peer.version}
 
     def serve(self) -> None:
-        """Serves what `web` asked for until Ctrl-C; returns at once where it did not."""
+        """Serve the page of `web` until Ctrl-C; return at once without `web`."""
         if self._server is not None:
             self._server.serve()
 
@@ -127,7 +130,7 @@ class Outputs:
         self._stack.close()
 
     def _pages(self, logs: Sequence[RunData]) -> Iterator[Output]:
-        """What needs no Rerun."""
+        """Outputs without Rerun."""
         if (page := self.asked.html) is not None:
             yield _page(logs, page, self.asked.overwrite)
         if (folder := self.asked.png) is not None:
@@ -137,18 +140,18 @@ class Outputs:
                 yield Output("png", str(folder), f"Drew {listed}" if paths else f"There is nothing to draw of {data.name}")
 
     def _recordings(self, logs: Sequence[RunData], at_s: float | None) -> Iterator[Output]:
-        """What needs Rerun."""
+        """Outputs with Rerun."""
         asked = self.asked
         if asked.opens_viewer:
             yield _open(logs, asked, at_s)
         if not asked.needs_rerun:
             return
-        from imutool.viewing.rerun import connect, export, files, web
+        from imutool.viewing.rerun import connect, scene, web
 
         if asked.save is not None or self.refused is not None:
-            yield files.save(logs, asked.save, source=asked.source, overwrite=asked.overwrite)
-        if asked.export is not None:
-            yield export.export(logs, asked.export, source=asked.source, at_s=at_s, overwrite=asked.overwrite)
+            yield scene.save(logs, asked.save, source=asked.source, overwrite=asked.overwrite)
+        if asked.export_web is not None:
+            yield web.export(logs, asked.export_web, source=asked.source, at_s=at_s, overwrite=asked.overwrite)
         if self._peer is not None:
             yield connect.send(logs, self._peer, source=asked.source, at_s=at_s)
         if self._server is not None:
@@ -156,20 +159,19 @@ class Outputs:
 
 
 def cursor_s(logs: Sequence[RunData], at: str) -> float:
-    """A time since the first IMU sample: as it says, or where the first log with truth has its largest error.
+    """Cursor time (s since the first IMU sample) from `at`: seconds, or `worst`.
 
-    That is the orientation error of a model, of what was recorded where there is no model.
+    The error is the orientation error of the models, of raw without a model.
 
     Raises:
         ConfigError: neither a number nor `worst`.
         DataError: no log has truth, or the time is outside them all.
     """
     if at == WORST:
-        found = [(data, trace) for data in logs for trace in data.models() or data.traces if trace.errors is not None]
-        if not found:
-            raise DataError("no log has truth, so nobody knows its worst error", where="--at", fix="Give the time in seconds")
-        data = found[0][0]
-        peaks = [trace.errors for one, trace in found if one is data and trace.errors is not None]
+        data = next((data for data in logs if any(trace.errors is not None for trace in data.traces)), None)
+        if data is None:
+            raise DataError("no log has truth, so the worst error is unknown", where="at", fix="Give the time in seconds")
+        peaks = [trace.errors for trace in data.models() or data.traces if trace.errors is not None]
         worst = max(peaks, key=lambda errors: float(np.nanmax(errors.orientation_total_deg)))
         row = int(np.nanargmax(worst.orientation_total_deg))
         return float(data.elapsed_s(worst.t_ns[row : row + 1])[0])
@@ -177,21 +179,24 @@ def cursor_s(logs: Sequence[RunData], at: str) -> float:
     try:
         seconds = float(at)
     except ValueError as error:
-        raise ConfigError(f"{at!r}", where="--at", expected="seconds since the first IMU sample, or worst") from error
+        raise ConfigError(f"{at!r}", where="at", expected="seconds since the first IMU sample, or worst") from error
     if not 0.0 <= seconds <= longest:
-        raise DataError(f"{at} s is outside the log", where="--at", expected=f"0 to {longest:.3f} s")
+        raise DataError(f"{at} s is outside the log", where="at", expected=f"0 to {longest:.3f} s")
     return seconds
 
 
-def _open(logs: Sequence[RunData], asked: Asked, at_s: float | None) -> Output:
-    """A viewer; without Rerun the next best thing, a page here."""
+def _open(logs: Sequence[RunData], asked: RequestedOutputs, at_s: float | None) -> Output:
+    """Open a viewer, or write a page without Rerun."""
     if find_spec("rerun") is None:
         no_rerun = "The viewer is not installed (pip install 'imutool[view]')"
         if find_spec("matplotlib") is None:
             raise ConfigError(
-                no_rerun, where="view", expected="it, or matplotlib for a page", fix="pip install 'imutool[view,report]'"
+                no_rerun,
+                where="view",
+                expected="the viewer, or matplotlib for a page",
+                fix="pip install 'imutool[view,report]'",
             )
-        page = _page(logs, Path(f"{title(logs)}.html"), asked.overwrite)
+        page = _page(logs, Path(f"{recording_name(logs)}.html"), asked.overwrite)
         return page._replace(said=f"{no_rerun}. {page.said}")
     from imutool.viewing.rerun import viewer
 
@@ -203,11 +208,11 @@ def _page(logs: Sequence[RunData], path: Path, overwrite: bool) -> Output:
     return Output("html", str(path), f"Wrote {path}. Open it in a browser")
 
 
-def _refuse_contradictions(asked: Asked) -> None:
-    """Raises ConfigError where two wishes exclude each other, or one has nothing to act on."""
+def _check_contradictions(asked: RequestedOutputs) -> None:
+    """Raises ConfigError where two outputs exclude each other, or a setting has no output to act on."""
     if asked.connect is not None and asked.web:
-        raise ConfigError("--connect and --web", where="view", fix="Leave one of the two out")
+        raise ConfigError("`connect` and `web` exclude each other", where="view", fix="Leave one of them out")
     if asked.port is not None and not asked.web:
-        raise ConfigError(f"--port {asked.port} without --web", where="--port", fix="Add --web")
+        raise ConfigError(f"{asked.port} has no effect without `web`", where="port", fix="Add `web`")
     if asked.at is not None and not asked.has_cursor:
-        raise ConfigError("a file has no cursor", where="--at", fix="Leave it out, or give --connect, --web or --export-web")
+        raise ConfigError("a file has no cursor", where="at", fix="Leave it out, or add `connect`, `web` or `export`")

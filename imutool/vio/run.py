@@ -22,7 +22,7 @@ from imutool import config
 from imutool.errors import DataError, NumericsError
 from imutool.evaluation import runs
 from imutool.inertial import metrics
-from imutool.inertial.strapdown import Start, with_velocity
+from imutool.inertial.strapdown import StartPose, with_velocity
 from imutool.mcap_io.read import read
 from imutool.recording import Imu, Poses, Recording, nanoseconds, seconds
 from imutool.vio import features, rig, smoother
@@ -50,7 +50,7 @@ class VioSettings(config.Settings, frozen=True, kw_only=True):
     smoother: SmootherSettings = SmootherSettings()
 
 
-class Course(NamedTuple):
+class VioProblem(NamedTuple):
     """What all runs of a log share: the samples that are keyframes, the truth there, and what the camera saw."""
 
     rows: slice  # of the IMU, from the first keyframe to the last
@@ -107,7 +107,7 @@ def vio(
     return results
 
 
-def plan(recording: Recording, settings: VioSettings) -> Course:
+def plan(recording: Recording, settings: VioSettings) -> VioProblem:
     """Keyframes over the stretch with truth, and what the camera sees there; where the truth has gaps it sees nothing.
 
     Raises:
@@ -136,12 +136,12 @@ def plan(recording: Recording, settings: VioSettings) -> Course:
     rng = np.random.default_rng(settings.seed)
     landmarks_w = features.room(true.p_wb[valid], rng)
     frames, _ = features.observe(true, sighted, landmarks_w, rng, features=settings.features, pixel_noise=settings.pixel_noise)
-    return Course(rows, keyframes, true, valid, frames)
+    return VioProblem(rows, keyframes, true, valid, frames)
 
 
 def score(
     imu: Imu,
-    course: Course,
+    course: VioProblem,
     settings: VioSettings,
     *,
     bias_states: bool,
@@ -151,7 +151,7 @@ def score(
     failed.
     """
     began = time.process_time()
-    start = Start.of(course.true)
+    start = StartPose.of(course.true)
     try:
         found = smoother.estimate(
             imu.rows(course.rows),

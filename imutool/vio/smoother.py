@@ -22,7 +22,7 @@ from scipy.spatial.transform import Rotation
 
 from imutool import config
 from imutool.errors import ConfigError, NumericsError
-from imutool.inertial.strapdown import Start
+from imutool.inertial.strapdown import StartPose
 from imutool.recording import GRAVITY_M_S2, Imu, Poses, seconds
 from imutool.vio.features import Frame
 from imutool.vio.rig import EUROC, StereoRig
@@ -83,7 +83,7 @@ def estimate(
     imu: Imu,
     keyframes: Int64[np.ndarray, " k"],
     frames: Sequence[Frame],
-    start: Start,
+    start: StartPose,
     settings: SmootherSettings,
     *,
     pixel_std: float,
@@ -176,7 +176,7 @@ class _Run:
         self._values.insert(bias, self._bias)
         self._touched += [pose, velocity, bias]
 
-    def begin(self, start: Start) -> None:
+    def begin(self, start: StartPose) -> None:
         """The true start, as surely as the settings say; position and heading fix what nothing measures."""
         gtsam, settings = self._gtsam, self._settings
         pose = gtsam.Pose3(gtsam.Rot3.Quaternion(*start.q_wb_wxyz), start.p_wb)

@@ -53,7 +53,7 @@ def told(path: Path) -> Told:
 
 
 def walked(path: Path) -> tuple[Told, Bag]:
-    with Bag(path, salvage=True) as bag:
+    with Bag(path, recover=True) as bag:
         found = [
             (bag.connections[m.connection].topic, m.time_ns, chunk.data[m.data_at : m.end])
             for chunk in bag.chunks()

@@ -15,7 +15,7 @@ from mcap.data_stream import RecordBuilder
 from mcap.records import Message
 from mcap_ros2._dynamic import generate_dynamic, serialize_dynamic
 
-from imutool.mcap_io.codec import records, schemas
+from imutool.mcap_io.codec import messages, schemas
 from imutool.mcap_io.codec.decode import ImuColumns, decode_imu
 from imutool.mcap_io.codec.encode import encode_imu
 
@@ -41,7 +41,7 @@ def encode(t_ns: np.ndarray, gyro: np.ndarray, accel: np.ndarray) -> list[bytes]
         part = slice(first, first + CHUNK)
         payload = encode_imu(t_ns[part], gyro[part], accel[part], "body")
         sequence = np.arange(first, first + len(payload), dtype=np.uint32)
-        chunks.append(records.message_rows(1, t_ns[part], t_ns[part], sequence, payload).tobytes())
+        chunks.append(messages.message_rows(1, t_ns[part], t_ns[part], sequence, payload).tobytes())
     return chunks
 
 
@@ -49,8 +49,8 @@ def decode(chunks: list[bytes]) -> list[ImuColumns]:
     """The columns in chunks of message records."""
     found = []
     for chunk in chunks:
-        messages = records.messages(chunk, 0)
-        for rows in records.rows(messages, messages.heads["channel"] == 1):
+        found = messages.parse(chunk, 0)
+        for rows in messages.rows(found, found.heads["channel"] == 1):
             for part, layout in schemas.runs(rows.payload, schemas.IMU):
                 found.append(decode_imu(rows.payload[part], "cdr", layout))
     return found

@@ -17,6 +17,7 @@ independent windows, are a little narrow.
 from __future__ import annotations
 
 import argparse
+import sys
 from pathlib import Path
 from typing import NamedTuple
 
@@ -24,16 +25,19 @@ import numpy as np
 import torch
 from jaxtyping import Float64
 
+sys.path.insert(0, str(Path(__file__).parents[1] / "support"))
+
+from nees import consistency
+
 from imutool.bias.io import load
 from imutool.bias.model import BiasModel
-from imutool.bias_start.bias_covariance import BiasCovariance
-from imutool.bias_start.bias_from_truth import truth_offset
+from imutool.bias_start.bias_covariance import BiasEstimator
+from imutool.bias_start.bias_from_truth import bias_from_truth
 from imutool.bias_start.initial_bias import TRUTH_S, find
 from imutool.bias_start.model_choice import smooth_in_memory
 from imutool.geometry import so3
-from imutool.inertial import metrics
 from imutool.inertial.strapdown import with_velocity
-from imutool.inertial.windows import between, running_product
+from imutool.inertial.windows import running_product, step_means
 from imutool.mcap_io.read import read
 from imutool.recording import Recording, seconds
 
@@ -71,15 +75,15 @@ class Seen(NamedTuple):
     def gyro_offset(self, rows: slice, bias: Float64[np.ndarray, "n 6"]) -> Float64[np.ndarray, "3"]:
         """What a bias leaves of the rest bias over a window."""
         left = self.samples[rows] - bias[rows]
-        return truth_offset(self.t_s[rows], left, self.R_wb[rows], self.v_w[rows], self.trusted[rows])[:3]
+        return bias_from_truth(self.t_s[rows], left, self.R_wb[rows], self.v_w[rows], self.trusted[rows])[:3]
 
     def slope_of(
         self, rows: slice, gyro: Float64[np.ndarray, "n 3"], S: Float64[np.ndarray, "n 3 p"]
     ) -> Float64[np.ndarray, "3 p"]:
         """What errors S of a window's debiased rate look like as an offset: the slope of their integral, by least squares."""
         dt, seen = torch.from_numpy(np.diff(self.t_s[rows])), self.trusted[rows][1:]
-        R = running_product(so3.exp(between(torch.from_numpy(gyro[rows])[None]) * dt[None, :, None]))[0] * dt[:, None, None]
-        integral = torch.cumsum(R @ between(torch.from_numpy(S[rows]).movedim(2, 0)).movedim(0, 2), dim=0)[seen]
+        R = running_product(so3.exp(step_means(torch.from_numpy(gyro[rows])[None]) * dt[None, :, None]))[0] * dt[:, None, None]
+        integral = torch.cumsum(R @ step_means(torch.from_numpy(S[rows]).movedim(2, 0)).movedim(0, 2), dim=0)[seen]
         X = torch.cat([torch.cumsum(R, dim=0)[seen], torch.eye(3, dtype=R.dtype).expand(len(integral), 3, 3)], dim=2)
         found = torch.linalg.lstsq(X.flatten(0, 1), integral.flatten(0, 1)).solution[:3]
         return np.asarray(found)
@@ -112,9 +116,7 @@ def windows(
     """Differences of the gyro's rest bias to what the truth says, window by window, and what covariance they should have."""
     imu, seen = recording.imu, Seen.of(recording)
     begun = smooth_in_memory(model, imu, recording.name) if start == "smooth" else find(start, model, recording)
-    stream = begun.stream(model)
-    bias = stream(seen.t_s, imu.gyro, imu.accel)
-    P, roots = BiasCovariance(model, begun, stream).parts(seen.t_s, imu.gyro, imu.accel)
+    bias, P, roots = BiasEstimator(model, begun).parts(seen.t_s, imu.gyro, imu.accel)
     S = roots.get("gyro", np.zeros((len(bias), 3, 0)))
     measured = np.diag(measured_variance(model, seen))
     errors, covariances = [], []
@@ -143,9 +145,9 @@ def measured_variance(model: BiasModel, seen: Seen) -> Float64[np.ndarray, "3"]:
 
 
 def told(logs: list[tuple[np.ndarray, np.ndarray]]) -> str:
-    """The figures of `metrics.consistency` in a line."""
+    """The figures of `support.nees` in a line."""
     e, P = (np.concatenate(parts) for parts in zip(*logs, strict=True))
-    found = metrics.consistency(e, P)
+    found = consistency(e, P)
     bounds = f"95 % bounds {found['nees_lower']:.2f} to {found['nees_upper']:.2f}"
     return f"NEES {found['nees_mean']:6.2f}  {bounds}  windows {found['samples']:3.0f}  consistent: {found['consistent']}"
 

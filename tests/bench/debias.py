@@ -31,8 +31,9 @@ import torch
 
 from imutool.bias import io, neural_ode
 from imutool.bias.model import BiasModel
-from imutool.bias_start.initial_bias import InitialBias, following, prior
-from imutool.debiasing import OnlineDebiaser, debias
+from imutool.bias_start.correction import OnlineDebiaser
+from imutool.bias_start.initial_bias import InitialBias, prior, tracked_from_prior
+from imutool.debiasing import debias
 from imutool.mcap_io.write import write
 from imutool.recording import Imu, seconds
 from imutool.sensor.flight import flight
@@ -112,7 +113,7 @@ def in_memory(names: Iterable[str], imu: Imu, rounds: int) -> None:
         print(f"{first:30}" + "".join(f"{word:>12}" for word in row))
     for name in names:
         model = io.find_model(name)
-        start, followed = prior(model), following(model)
+        start, followed = prior(model), tracked_from_prior(model)
         apart = float(np.abs(in_blocks(model, start, imu) - one_by_one(model, start, imu)).max())
         assert apart < SAME, apart
         racing = {

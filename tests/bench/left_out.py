@@ -15,10 +15,10 @@ from pathlib import Path
 import numpy as np
 
 from imutool.bias.hybrid import Model
+from imutool.bias_start.correction import apply
 from imutool.bias_start.initial_bias import find
 from imutool.bias_start.model_choice import smooth_in_memory
 from imutool.config import load
-from imutool.debiasing import apply
 from imutool.inertial import metrics
 from imutool.inertial.strapdown import along_truth
 from imutool.mcap_io.read import read

@@ -22,7 +22,7 @@ from numpy.random import Generator, default_rng
 from scipy.interpolate import make_interp_spline
 
 from imutool.blind_cases import unnamed
-from imutool.blind_cases.cases import TRUTH_SCHEMA, case_log, write_case
+from imutool.blind_cases.cases import case_log, write_case
 from imutool.blind_cases.envelope import ConcealedEffect, ConcealedTruth, TrueParameter
 from imutool.blind_cases.information import achievable_rms, location
 from imutool.blind_cases.scene import POSE_RATE_HZ, RATE_HZ, SIM_SHARE, stamps_ns
@@ -82,7 +82,6 @@ def conceal_mujoco(folder: Path, *, seed: int, kind: str | None = None, duration
     noisy = _imu(real + bias + NOISE * rng.standard_normal(real.shape))
     sigma = NOISE * np.hypot(1.0, SIM_SHARE)
     case = ConcealedTruth(
-        schema=TRUTH_SCHEMA,
         seed=seed,
         generator="mujoco",
         trajectory="mujoco",

@@ -22,8 +22,9 @@ from PIL import Image
 from imutool.viewing.html import report
 from imutool.viewing.model.run_data import RunData
 from imutool.viewing.model.runs import load
-from imutool.viewing.rerun import export, layout, scene
-from imutool.viewing.rerun.entities.palette import RAW_FADE, XYZ, faded
+from imutool.viewing.rerun import layout, scene
+from imutool.viewing.rerun.entities.styles import RAW_FADE, XYZ, blend_to_grey
+from imutool.viewing.rerun.web import export
 
 VIEWERS = SimpleNamespace(**runpy.run_path(str(Path(__file__).parents[1] / "support" / "viewers.py")))
 
@@ -71,7 +72,7 @@ def paper(browser: Any, page_path: Path, scheme: str) -> Any:
 
 def draws(picture: Any) -> bool:
     """Whether curves of all three axes are there, faint or not."""
-    return all(max(VIEWERS.drawn(picture, c) for c in (color, faded(color, RAW_FADE))) >= LEAST for color in XYZ)
+    return all(max(VIEWERS.drawn(picture, c) for c in (color, blend_to_grey(color, RAW_FADE))) >= LEAST for color in XYZ)
 
 
 def save(picture: Any, path: Path) -> None:
@@ -96,7 +97,7 @@ def main() -> None:
         save(native(logs, tab), options.output / f"viewer-{tab.lower()}.png")
     with tempfile.TemporaryDirectory() as folder, VIEWERS.chromium() as browser:
         report.write_page(logs, Path(folder) / "report.html")
-        export.export(logs, Path(folder) / "web", source=False, at_s=duration_s)
+        export(logs, Path(folder) / "web", source=False, at_s=duration_s)
         for scheme in ("light", "dark"):
             save(paper(browser, Path(folder) / "report.html", scheme), options.output / f"report-{scheme}.png")
             save(web(browser, Path(folder) / "web", scheme), options.output / f"web-{scheme}.png")

@@ -41,7 +41,7 @@ from sensor_tables import (
 )
 
 from imutool.conversion import convert
-from imutool.diagnosis.diagnose import EVERY_UNIT, measured, remaining
+from imutool.diagnosis.effect_sizes import EVERY_UNIT, effect_sizes, residual_to_truth
 from imutool.errors import ImutoolError
 from imutool.evaluation import evaluate
 from imutool.sensor import physics_file
@@ -130,7 +130,7 @@ def diagnosed(logs: Sequence[Path], words: Sequence[str] = ()) -> dict[str, Any]
 
 def fixed(log: Path, effects: Sequence[str], truth: str | None = None) -> dict[str, Any]:
     """Effects fitted together to one sequence: parameters with deviations, and their information."""
-    found = measured(log, truth=truth, effects=effects)
+    found = effect_sizes(log, truth=truth, effects=effects)
     values = {
         f"{physics.name}.{number.name}": [float(value), float(s), number.unit, float(number.plausible)]
         for physics, theta in found.chosen
@@ -190,7 +190,7 @@ def gained(log: Log, physics: Path) -> dict[str, Any]:
     chosen = tuple(physics_file.read(physics).acting(where=physics))
     told: dict[str, Any] = {
         signal: {"before": one.rms_before, "after": one.rms_after, "unit": one.unit}
-        for signal, one in remaining(log.path, chosen).items()
+        for signal, one in residual_to_truth(log.path, chosen).items()
     }
     told["orientation"] = {"raw": {}, "static": {}, "physics": {}}
     for name, model in (("static", "static"), ("physics", physics)):
@@ -267,7 +267,7 @@ class Sensor:
 
     # ── what it says ──
 
-    def measured(self, kind: str = "measured") -> dict[str, dict[str, Value]]:
+    def effect_sizes(self, kind: str = "measured") -> dict[str, dict[str, Value]]:
         """The fixed set by sequence."""
         told = {log.name: self._told(kind, log) for log in self.logs}
         return {name: as_values(one) for name, one in told.items() if "failed" not in one}

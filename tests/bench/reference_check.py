@@ -19,7 +19,7 @@ from scipy.signal import butter, sosfiltfilt
 from sensor_tables import markdown
 
 from imutool.diagnosis.estimation.alignment import with_truth
-from imutool.diagnosis.estimation.gauss_newton import expected
+from imutool.diagnosis.estimation.jacobians import expected
 from imutool.mcap_io.read import read
 from imutool.sensor.trajectory import smooth_motion
 
@@ -66,7 +66,7 @@ def row(log: Path, truth: str | None) -> list[str]:
     if truth is None:
         recording = recording.with_truth(next(iter(recording.truths)))
     motion = smooth_motion(recording.truth)
-    felt = max(motion.felt(1.0 / recording.imu.period_s), key=lambda one: len(one.t_s))
+    felt = max(motion.ideal_motions(1.0 / recording.imu.period_s), key=lambda one: len(one.t_s))
     pair = with_truth(recording, felt, motion.start_ns, FAST_HZ)
     rate_hz = 1.0 / pair.period_s
     there, real = (in_band(x, rate_hz) for x in (expected(pair, ()), pair.real))

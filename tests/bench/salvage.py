@@ -24,10 +24,11 @@ import zstandard
 from mcap.writer import CompressionType, Writer
 
 from imutool.errors import LogError
-from imutool.mcap_io.codec import records, schemas
+from imutool.mcap_io.codec import messages, records, schemas
 from imutool.mcap_io.codec.encode import encode_image, encode_imu
 from imutool.mcap_io.codec.records import HEAD
 from imutool.mcap_io.log import Log
+from imutool.mcap_io.recovery.recovered_log import RecoveredLog
 
 COUNT = 2001
 LIMIT_S = 40
@@ -69,7 +70,7 @@ def digests(messages: Iterable[bytes]) -> list[str]:
 
 def by_imutool(path: Path) -> Iterator[bytes]:
     """Ours."""
-    with Log(path, salvage=True) as log:
+    with RecoveredLog(path) as log:
         for _, rows in log.rows(["/imu0"]):
             yield from (row.tobytes() for row in rows.payload)
 
@@ -142,10 +143,10 @@ def hits(record: bytes, at: int) -> bool:
     for data in (record, record[:at] + bytes([record[at] ^ 1]) + record[at + 1 :]):
         try:
             unpacked = zstandard.ZstdDecompressor().decompress(data[head.data_at :], max_output_size=head.size)
-            found = records.messages(unpacked, 0)
+            found = messages.parse(unpacked, 0)
         except (zstandard.ZstdError, LogError):
             return False
-        contents.append([rows.payload.tobytes() for rows in records.rows(found, found.heads["channel"] == 1)])
+        contents.append([rows.payload.tobytes() for rows in messages.rows(found, found.heads["channel"] == 1)])
     return contents[0] != contents[1] and [len(one) for one in contents[0]] == [len(one) for one in contents[1]]
 
 
@@ -196,10 +197,10 @@ def main() -> None:
         made(log, megabytes)
         whole = log.read_bytes()
         with Log(log) as opened:
-            chunks = [(b.offset, b.length, b.end) for b in opened.structure.blocks]
+            chunks = [(b.offset, b.length, b.end) for b in opened.index.blocks]
             imu = {}
-            for block in opened.structure.blocks:
-                found = opened.structure.unpack(block)
+            for block in opened.index.blocks:
+                found = opened.index.unpack(block)
                 rows = [o for o, c in zip(found.offsets.tolist(), found.heads["channel"].tolist(), strict=True) if c == 1]
                 size = 31
                 imu[block.offset] = [

@@ -21,8 +21,8 @@ METHODS = ("linear", "conv", "neural_ode", "hybrid")
 MOST_BYTES = 2_000_000
 COMMAND = "imutool train {logs} -o {name}.safetensors --method {method} --seed {seed}"
 LIMITS = (
-    "A calibration of one unit: another sensor of the same type has another scale, misalignment and turn-on bias. Trained and "
-    "tested indoors, on runs of one to three minutes, at the temperatures of a laboratory."
+    "This is the calibration of one unit: another sensor of the same type has another scale, misalignment and turn-on bias. It "
+    "was trained and tested indoors, on runs of one to three minutes, at laboratory temperatures."
 )
 
 
@@ -55,16 +55,16 @@ def card(name: str, about: dict[str, Any], rows: list[dict[str, Any]], seeds: in
         "",
         f"Method `{about['method']}`, sensor {about['sensor']}, data set {about['dataset']}, {about['rate_hz']:.1f} Hz.",
         "",
-        f"- Trained on {', '.join(logs)}: the first 80 % of each; by the last 20 % the end of the "
-        f"descent was kept and not the closed form it began with, or the other way round, and one of {seeds} seed(s) chosen.",
+        f"- Trained on {', '.join(logs)}: the first 80 % of each log. The last 20 % chose between the end of the descent "
+        f"and its closed-form start, and one of {seeds} seed(s).",
         f"- Settings: the defaults of imutool {about['imutool']}, torch {about['torch']}, seed {seed}.",
         f"- Command: `{command}`",
-        f"- Held out: {about['held_out']['gyro']['error'] * 180 / np.pi:.3f}° (gyro, 20 s or what fits), "
-        f"{about['held_out']['accel']['error']:.3f} m/s (accelerometer, 5 s), each log's constant solved for.",
+        f"- Held out: {about['held_out']['gyro']['error'] * 180 / np.pi:.3f}° (gyro, windows of up to 20 s), "
+        f"{about['held_out']['accel']['error']:.3f} m/s (accelerometer, 5 s), with each log's constant solved for.",
     ]
     if physics := about.get("physics"):
         found = "; ".join(f"{sensor}: {', '.join(one['effects']) or 'none'}" for sensor, one in physics.items())
-        lines.append(f"- Effects found: {found}. Their fit uses the whole logs; they were chosen by leaving logs out in turn.")
+        lines.append(f"- Effects found: {found}. Their fit uses the whole logs; leaving logs out in turn chose them.")
     lines += ["", "| test sequence | start from truth: AOE ° / APE m | auto: AOE ° | smooth: AOE ° |", "|---|---|---|---|"]
     for log in dict.fromkeys(row["log"] for row in own):
         this = {row["start"]: row for row in own if row["log"] == log and row["seed"] == seed}

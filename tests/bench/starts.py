@@ -25,7 +25,7 @@ import vqf
 from imutool.bias.io import load
 from imutool.bias.model import BiasModel, Vector6
 from imutool.bias_start import initial_bias
-from imutool.bias_start.bias_tracking import Samples, Track, followed
+from imutool.bias_start.bias_tracking import BiasTrajectory, Samples, filter_blocks
 from imutool.bias_start.initial_bias import InitialBias
 from imutool.errors import DataError
 from imutool.inertial import metrics
@@ -33,8 +33,7 @@ from imutool.inertial.strapdown import along_truth
 from imutool.mcap_io.read import read
 from imutool.recording import Imu, Recording, seconds
 from imutool.training import closed_form
-from imutool.training.corrected import corrected
-from imutool.training.segments import Pool
+from imutool.training.segments import Pool, corrected
 
 CLIP_DEG_S = 20.0
 WINDOW_S = {"gyro": (15.0,), "accel": (2.0,)}
@@ -75,7 +74,7 @@ def score(model: BiasModel, recording: Recording, own: Vector6) -> tuple[list[fl
     auto = initial_bias.auto(model, imu)
     auto.stream(model)(*samples(imu))
     halfway = time.perf_counter()
-    smooth = initial_bias.smooth(model, [samples(imu)])
+    smooth = initial_bias.smoothed_start(model, [samples(imu)])
     ended = time.perf_counter()
     starts = {
         "truth": initial_bias.from_truth(model, recording),
@@ -87,7 +86,7 @@ def score(model: BiasModel, recording: Recording, own: Vector6) -> tuple[list[fl
         "smooth": smooth,
         "oracle": InitialBias(own, np.zeros(6), "oracle"),
     }
-    last = list(followed(model, [samples(imu)], initial_bias.known(model)))[-1].step.after
+    last = list(filter_blocks(model, [samples(imu)], initial_bias.bias_prior(model)))[-1].step.after
     row = [aoe(model, starts[column], recording) for column in COLUMNS]
     return row, f"   {halfway - began:.2f} {ended - halfway:.2f}; {auto.how}", (last.bias - own)[:3], last.P[9:12, 9:12]
 
@@ -131,7 +130,7 @@ def by_vqf(model: BiasModel, imu: Imu, *, offline: bool) -> InitialBias:
         found = vqf.VQF(imu.period_s, **settings).updateBatch(rate, force)["bias"]
     rest = np.tile(start.rest, (len(imu), 1))
     rest[:, :3] += found
-    return InitialBias(rest[0], start.std, "VQF", track=Track(t_s, rest, np.tile(start.std, (len(imu), 1))))
+    return InitialBias(rest[0], start.std, "VQF", track=BiasTrajectory(t_s, rest, np.tile(start.std, (len(imu), 1))))
 
 
 def samples(imu: Imu) -> Samples:

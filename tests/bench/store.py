@@ -26,7 +26,7 @@ from imutool.mcap_io.codec import schemas
 from imutool.mcap_io.codec.encode import encode_imu
 from imutool.mcap_io.log import Log
 from imutool.mcap_io.rewrite import rewrite
-from imutool.mcap_io.storage.digest import sha256
+from imutool.mcap_io.storage.source import sha256
 
 MIB = 1 << 20
 SECONDS, RATE_HZ, IMAGE_BYTES = 6, 200, 200_000

@@ -3,7 +3,7 @@
 All contestants take 1000 segments of 16 samples (the paper's batch), gyro stage and accel stage:
 
 (a) fast path: what `imutool train` does with such windows. The rest bias is integrated on the grid of the drift, the
-    curve is one evaluation for all samples, rotations are a product taken as a tree (`imutool.training.loss`).
+    curve is one evaluation for all samples, rotations are a product taken as a tree (`imutool.training.objective`).
 (b) chart ODE: the paper's joint form through `imutool.bias.ode.integrate` with Euler, one step a sample, of the same field with
     the same parts of the same model: state (xi, beta_g), in the accel stage (xi, beta_g, beta_a, v, p) with the gyro frozen.
 (c) with `--released DIR`, the paper's own code, run by its own training functions. DIR holds its BiasDy, SO3diffeq and
@@ -52,7 +52,7 @@ from imutool.inertial.windows import end_attitude
 from imutool.recording import Recording
 from imutool.sensor.flight import flight
 from imutool.training.fit import Training, TrainSettings
-from imutool.training.loss import RobustLoss, error
+from imutool.training.objective import RobustLoss, error
 from imutool.training.segments import Windows
 from imutool.units import Sensor
 
@@ -169,7 +169,7 @@ def chart_solution(model: BiasModel, sensor: Sensor, windows: Windows, method: M
 
 
 def chart_error(model: BiasModel, sensor: Sensor, windows: Windows, method: Method = "euler") -> Tensor:
-    """The error of `imutool.training.loss` at the end of each window, of the chart's solution."""
+    """The error of `imutool.training.objective` at the end of each window, of the chart's solution."""
     R_wb, state = chart_solution(model, sensor, windows, method)
     if sensor == "gyro":
         return (so3.log(R_wb[-1].mT @ windows.R_end).square().sum(1) + 1e-24).sqrt()

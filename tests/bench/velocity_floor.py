@@ -18,9 +18,9 @@ import numpy as np
 from jaxtyping import Float64
 
 from imutool.bias.io import load
+from imutool.bias_start.correction import apply
 from imutool.bias_start.initial_bias import find
-from imutool.debiasing import apply
-from imutool.inertial.strapdown import GRAVITY_W, Start, along_truth, dead_reckon, drift, with_velocity
+from imutool.inertial.strapdown import GRAVITY_W, StartPose, along_truth, dead_reckon, drift, with_velocity
 from imutool.mcap_io.read import read
 from imutool.recording import Imu, Poses, Recording, seconds
 
@@ -82,7 +82,7 @@ def missed(
     out = []
     for first, last in windows:
         rows = slice(first, last + 1)
-        end = dead_reckon(Imu(imu.t_ns[rows], gyro[rows], accel[rows]), Start.of(true, first), (g_w[0], g_w[1], g_w[2]))
+        end = dead_reckon(Imu(imu.t_ns[rows], gyro[rows], accel[rows]), StartPose.of(true, first), (g_w[0], g_w[1], g_w[2]))
         assert end.v_w is not None
         out.append(end.v_w[-1] - true.v_w[last])
     return np.concatenate(out)

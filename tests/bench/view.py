@@ -1,7 +1,7 @@
 """What it costs to make a log ready to be looked at: `python tests/bench/view.py [--minutes 60] [--profile]`.
 
 A made-up log of that length at 200 Hz, truth at 200 Hz too and a debiased channel in it, in a temporary folder. Prints seconds
-of `imutool.viewing.model.runs.load` (all of it), of `rundata.build` (its last part: paths, errors, drift, windows, spectra,
+of `imutool.viewing.model.runs.load` (all of it), of `runs.build` (its last part: paths, errors, drift, windows, spectra,
 events), and
 how much memory the process took at most beyond what the imports take. On one core, the log in the page cache.
 
@@ -30,7 +30,8 @@ from typing import Any
 from imutool.mcap_io.read import read
 from imutool.mcap_io.write import write
 from imutool.sensor.flight import flight
-from imutool.viewing.model import run_data, runs
+from imutool.viewing.model import runs
+from imutool.viewing.model.run_data import RunData
 from imutool.viewing.rerun import layout, scene
 
 TESTS = Path(__file__).parents[1]
@@ -72,13 +73,13 @@ def measure(log: Path, profile: bool) -> dict[str, float]:
     read_only = [trace.run for trace in data.traces]
     recording = read(log)
     began = time.perf_counter()
-    run_data.build(recording, read_only)
+    runs.build(recording, read_only)
     built_s = time.perf_counter() - began
     costs = {"samples": len(recording.imu), "runs": len(read_only), "load_s": loaded_s, "build_s": built_s, "more_mb": more_mb}
     return costs | look(data)
 
 
-def look(data: run_data.RunData) -> dict[str, float]:
+def look(data: RunData) -> dict[str, float]:
     """Seconds and memory of the viewer; nothing where there is no driver to draw with."""
     if VIEWERS.driver() is None:
         print(f"no viewer: apt-get install {' '.join(VIEWERS.PACKAGES['driver'])}", file=sys.stderr)

@@ -11,10 +11,10 @@ import torch
 
 from imutool.bias import hybrid, neural_ode
 from imutool.bias.io import load, save
-from imutool.bias.model import COLUMNS, BiasModel, OneByOne, Segment
+from imutool.bias.model import COLUMNS, BiasModel, SampleStream, Segment
+from imutool.bias_start.correction import OnlineDebiaser, apply
 from imutool.bias_start.initial_bias import prior
 from imutool.config import build as build_settings
-from imutool.debiasing import OnlineDebiaser, apply
 from imutool.errors import ConfigError, ModelError
 from imutool.recording import Imu
 from imutool.sensor import catalogue
@@ -115,7 +115,7 @@ def test_single_samples_and_blocks_mix(
     t, gyro, accel = (value[0].numpy() for value in (seen.t, seen.gyro, seen.accel))
     u = np.concatenate([gyro, accel], axis=1)
     whole, stream = model.stream(seen.rest[0].numpy())(t, gyro, accel), model.stream(seen.rest[0].numpy())
-    assert isinstance(stream, OneByOne)
+    assert isinstance(stream, SampleStream)
     singles: list[np.ndarray] = []
     for k in (0, 120, 240, 360):  # 50 samples of the drift's step do not divide them
         singles.extend(stream.one(float(t[i]), u[i]) for i in range(k, k + 70))

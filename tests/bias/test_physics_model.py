@@ -1,4 +1,4 @@
-"""A physics.toml taken off the samples that it made: what is exact, what is right to first order, what is refused."""
+"""A physics.toml corrects the samples that it made: exactly, to first order, or not at all."""
 
 from __future__ import annotations
 
@@ -13,8 +13,9 @@ import torch
 from imutool.bias.io import find_model
 from imutool.bias.model import Segment
 from imutool.bias.physics_model import MOST_TAU_S, Model
+from imutool.bias_start.correction import apply
 from imutool.bias_start.initial_bias import prior
-from imutool.debiasing import apply, debias
+from imutool.debiasing import debias
 from imutool.errors import ConfigError, ModelError
 from imutool.mcap_io.read import read
 from imutool.mcap_io.write import write
@@ -159,7 +160,7 @@ def test_what_cannot_be_taken_off_is_told(trajectory: Path, caplog: pytest.LogCa
 
 def test_nothing_to_take_off_is_refused(trajectory: Path) -> None:
     file = written(trajectory.with_name("none.toml"), entry("saturation", {"gyro_limit": 5.0}), bias=None)
-    with pytest.raises(ModelError, match=r"nothing in it can be taken off \(saturation\)"):
+    with pytest.raises(ModelError, match=r"nothing in it can be corrected \(saturation\)"):
         find_model(file, RATE_HZ)
 
 

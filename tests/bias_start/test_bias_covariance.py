@@ -7,19 +7,19 @@ import pytest
 import torch
 
 from imutool.bias import hybrid
-from imutool.bias_start.bias_covariance import BiasCovariance
-from imutool.bias_start.bias_tracking import Following, Known, Track
+from imutool.bias_start.bias_covariance import BiasEstimator
+from imutool.bias_start.bias_tracking import BiasPrior, BiasTrajectory
 from imutool.bias_start.initial_bias import InitialBias
 
 RATE_HZ, SIZE = 200.0, 8000
 SCALE_STD, G_STD = 2e-3, 1e-4  # of a share, and of rad/s per m/s²
 REST = np.zeros(6)
 STD = np.array([3e-4] * 3 + [2e-2] * 3)
-KNOWN = Known(REST, STD, STD)
+KNOWN = BiasPrior(REST, STD, STD)
 WAYS = {
     "held": InitialBias(REST, STD, "given"),
     "followed": InitialBias(REST, STD, "followed", follows=KNOWN),
-    "smoothed": InitialBias(REST, STD, "smoothed", track=Track(np.zeros(1), REST[None], STD[None])),
+    "smoothed": InitialBias(REST, STD, "smoothed", track=BiasTrajectory(np.zeros(1), REST[None], STD[None])),
 }
 SAME = 1e-10  # of float64 through a sum over all samples
 MEAN_LEFT = 0.01  # of the variance: a mean so far over 40 turns is not quite zero
@@ -49,12 +49,10 @@ def turning() -> Samples:
 def calibrated(model: hybrid.Model, way: str, samples: Samples, blocks: int = 1) -> tuple[np.ndarray, np.ndarray]:
     """The covariance, and what of it is the rest bias's."""
     found: list[tuple[np.ndarray, np.ndarray]] = []
-    stream = WAYS[way].stream(model)
-    both = [BiasCovariance(model, WAYS[way], stream) for _ in range(2)]
+    both = [BiasEstimator(model, WAYS[way]) for _ in range(2)]
     for rows in np.array_split(np.arange(SIZE), blocks):
         some = tuple(x[rows] for x in samples)
-        stream(*some)
-        found.append((both[0](*some), both[1].parts(*some).rest))
+        found.append((both[0](*some).covariance, both[1].parts(*some).rest))
     return np.concatenate([a for a, _ in found]), np.concatenate([b for _, b in found])
 
 
@@ -88,11 +86,8 @@ def test_blocks_change_nothing(turning: Samples, way: str) -> None:
     np.testing.assert_allclose(parts, whole, rtol=1e-9, atol=SAME * (G_STD * 9.81) ** 2)
 
 
-def test_the_streams_own_covariance_is_left_as_it_is(turning: Samples) -> None:
+@pytest.mark.parametrize("way", WAYS)
+def test_the_bias_of_an_estimate_is_that_of_the_stream(turning: Samples, way: str) -> None:
     model = model_of("gyro_scale")
-    stream = WAYS["followed"].stream(model)
-    assert isinstance(stream, Following)
-    stream(*turning)
-    before = stream.covariance.copy()
-    BiasCovariance(model, WAYS["followed"], stream)(*turning)
-    assert np.array_equal(stream.covariance, before)
+    estimated = BiasEstimator(model, WAYS[way])(*turning)
+    assert np.array_equal(estimated.bias, WAYS[way].stream(model)(*turning))

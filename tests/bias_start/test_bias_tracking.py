@@ -7,11 +7,21 @@ import time
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from support.nees import consistency
 
 from imutool.bias import static
 from imutool.bias.model import BiasModel
-from imutool.bias_start.bias_tracking import CHUNK_S, Following, Known, Passed, RestFilter, Track, followed, smooth, smoothed
-from imutool.inertial.metrics import consistency
+from imutool.bias_start.bias_tracking import (
+    CHUNK_S,
+    BiasFilter,
+    BiasPrior,
+    BiasTrajectory,
+    FilteredBlock,
+    TrackedBiasStream,
+    filter_blocks,
+    smooth_bias,
+    smooth_blocks,
+)
 from imutool.recording import Imu, seconds
 from imutool.sensor.flight import FlightSettings, TriadSettings, flight
 
@@ -27,7 +37,7 @@ SENSOR = {
     ),
 }
 SETTINGS = FlightSettings(**SENSOR, room_m=0.6, position_knot_s=0.9, tilt_rad=0.25)  # speeds of about 1 m/s
-KNOWN = Known(np.zeros(6), PRIOR, GROUND)
+KNOWN = BiasPrior(np.zeros(6), PRIOR, GROUND)
 SEEDS = range(12)
 BOUND = 0.999  # of chi-square: one run of this suite in a thousand would fail by chance, were the seeds not fixed
 
@@ -58,8 +68,8 @@ def model() -> BiasModel:
     return static.Model().double()
 
 
-def forward(imu: Imu, known: Known = KNOWN) -> list[Passed]:
-    return list(followed(model(), [samples(imu)], known))
+def forward(imu: Imu, known: BiasPrior = KNOWN) -> list[FilteredBlock]:
+    return list(filter_blocks(model(), [samples(imu)], known))
 
 
 # ── what it finds ────────────────────────────────────────────────────────────────────────────────────────────────────
@@ -82,7 +92,7 @@ def test_it_is_as_sure_as_it_should_be(still_s: float, way: str) -> None:
     errors, covariances = [], []
     for seed in SEEDS:
         blocks = forward(biased(seed, still_s=still_s))
-        state = blocks[-1].step.after if way == "forward" else [s for _, s in smoothed(blocks)][len(blocks) // 2]
+        state = blocks[-1].step.after if way == "forward" else [s for _, s in smooth_blocks(blocks)][len(blocks) // 2]
         errors.append((state.bias - planted(seed)[0])[:3])
         covariances.append(state.P[9:12, 9:12])
     found = consistency(np.array(errors), np.array(covariances), BOUND)
@@ -102,11 +112,11 @@ def test_a_stop_tells_the_bias_at_rest_from_that_in_motion() -> None:
 def test_rest_at_the_end_is_seen_by_smoothing_and_not_before() -> None:
     imu = biased(4, still_s=6.0, backwards=True)
     bias, ground = planted(4)
-    sure = Known(np.zeros(6), PRIOR, np.array([1e-4] * 3 + [0.03] * 3))  # no difference at rest: the stop shows it all
+    sure = BiasPrior(np.zeros(6), PRIOR, np.array([1e-4] * 3 + [0.03] * 3))  # no difference at rest: the stop shows it all
     imu = Imu(
         imu.t_ns, imu.gyro - np.where(np.arange(len(imu)) > len(imu) - 6 * RATE_HZ, 1, 0)[:, None] * ground[:3], imu.accel
     )
-    track, rested_s = smooth(model(), [samples(imu)], sure)
+    track, rested_s = smooth_bias(model(), [samples(imu)], sure)
     assert 5.4 < rested_s < 6.6  # it comes to rest slowly
     causal = forward(imu, sure)
     half = len(causal) // 2
@@ -120,7 +130,7 @@ def test_rest_at_the_end_is_seen_by_smoothing_and_not_before() -> None:
 def test_smoothing_is_never_less_sure() -> None:
     imu = biased(5, still_s=4.0)
     blocks = forward(imu)
-    for block, state in smoothed(blocks):
+    for block, state in smooth_blocks(blocks):
         less = np.linalg.eigvalsh(block.step.before.P[9:, 9:] - state.P[9:, 9:])
         assert less.min() > -1e-10
 
@@ -130,7 +140,7 @@ def test_biases_are_the_same_in_a_world_turned_about_the_vertical() -> None:
     imu = biased(6)
     turn = Rotation.from_euler("xyz", [0.3, -0.8, 1.2]).as_matrix()
     turned = Imu(imu.t_ns, imu.gyro @ turn.T, imu.accel @ turn.T)
-    even = Known(np.zeros(6), np.array([3e-3] * 3 + [0.1] * 3), GROUND)
+    even = BiasPrior(np.zeros(6), np.array([3e-3] * 3 + [0.1] * 3), GROUND)
     one, other = forward(imu, even)[-1].step.after, forward(turned, even)[-1].step.after
     np.testing.assert_allclose(other.bias[:3], turn @ one.bias[:3], rtol=0, atol=1e-8)
     np.testing.assert_allclose(other.P[9:12, 9:12], turn @ one.P[9:12, 9:12] @ turn.T, rtol=0, atol=1e-9)
@@ -148,7 +158,7 @@ def test_nothing_later_changes_what_came_before() -> None:
         np.concatenate([imu.gyro[:cut], other.gyro[cut:]]),
         np.concatenate([imu.accel[:cut], 2.0 * other.accel[cut:]]),
     )
-    one, two = (Following(model(), KNOWN, np.zeros(6), 0.0)(*samples(some)) for some in (imu, changed))
+    one, two = (TrackedBiasStream(model(), KNOWN, np.zeros(6), 0.0)(*samples(some)) for some in (imu, changed))
     np.testing.assert_array_equal(one[:cut], two[:cut])
     assert np.abs(one[cut + 200 :] - two[cut + 200 :]).max() > 1e-5
 
@@ -156,8 +166,8 @@ def test_nothing_later_changes_what_came_before() -> None:
 @pytest.mark.parametrize("size", [1, 7, 1000])
 def test_batches_of_any_size_give_the_same_numbers(size: int) -> None:
     t, gyro, accel = samples(biased(9, duration_s=12.0, still_s=3.0))
-    whole = Following(model(), KNOWN, np.zeros(6), 0.0)(t, gyro, accel)
-    stream = Following(model(), KNOWN, np.zeros(6), 0.0)
+    whole = TrackedBiasStream(model(), KNOWN, np.zeros(6), 0.0)(t, gyro, accel)
+    stream = TrackedBiasStream(model(), KNOWN, np.zeros(6), 0.0)
     parts = [stream(t[a : a + size], gyro[a : a + size], accel[a : a + size]) for a in range(0, len(t), size)]
     np.testing.assert_array_equal(np.concatenate(parts), whole)
     assert len(np.unique(whole[:, 0])) > 15
@@ -166,10 +176,10 @@ def test_batches_of_any_size_give_the_same_numbers(size: int) -> None:
 def test_chunks_of_smoothing_agree_with_smoothing_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
     blocks = forward(biased(10, duration_s=90.0))
     assert blocks[-1].end_s < CHUNK_S
-    whole = [(state.bias, np.sqrt(np.diag(state.P)[9:15])) for _, state in smoothed(blocks)]
+    whole = [(state.bias, np.sqrt(np.diag(state.P)[9:15])) for _, state in smooth_blocks(blocks)]
     monkeypatch.setattr("imutool.bias_start.bias_tracking.CHUNK_S", 10.0)
     monkeypatch.setattr("imutool.bias_start.bias_tracking.LOOK_AHEAD_S", 60.0)
-    chunks = [(block, state.bias) for block, state in smoothed(blocks)]
+    chunks = [(block, state.bias) for block, state in smooth_blocks(blocks)]
     assert [block.start_s for block, _ in chunks] == [block.start_s for block in blocks]
     away = max(np.abs((bias - best) / std).max() for (_, bias), (best, std) in zip(chunks, whole, strict=True))
     assert 0.0 < away < 1.0  # what comes a minute later moves an estimate by a fraction of its doubt
@@ -190,14 +200,14 @@ def test_a_hole_in_the_samples_makes_it_less_sure_and_a_long_one_starts_the_pose
 def test_less_than_a_block_says_nothing(count: int) -> None:
     imu = biased(1, duration_s=2.0).rows(slice(0, count))
     t, gyro, accel = samples(imu) if count else (np.zeros(0), np.zeros((0, 3)), np.zeros((0, 3)))
-    filter_ = RestFilter(KNOWN, ahead=True)
+    filter_ = BiasFilter(KNOWN, ahead=True)
     assert [*filter_.feed(t, gyro, accel), *filter_.finish()] == []
-    track, rested_s = smooth(model(), [(t, gyro, accel)], KNOWN)
+    track, rested_s = smooth_bias(model(), [(t, gyro, accel)], KNOWN)
     assert (len(track.t_s), rested_s) == (0, 0.0)
 
 
 def test_a_track_holds_each_row_until_the_next() -> None:
-    track = Track(np.array([0.0, 1.0]), np.array([[1.0] * 6, [2.0] * 6]), np.ones((2, 6)))
+    track = BiasTrajectory(np.array([0.0, 1.0]), np.array([[1.0] * 6, [2.0] * 6]), np.ones((2, 6)))
     np.testing.assert_array_equal(track.at(np.array([-1.0, 0.0, 0.99, 1.0, 9.0]))[:, 0], [1, 1, 1, 2, 2])
 
 

@@ -22,17 +22,17 @@ from imutool.bias_start.initial_bias import (
     NoRestError,
     at_rest,
     auto,
+    bias_prior,
     find,
+    from_numbers,
     from_truth,
-    given,
-    known,
     over_all_rest,
     prior,
     rest_spread,
-    smooth,
+    smoothed_start,
 )
 from imutool.errors import ConfigError, DataError
-from imutool.inertial.stationary import Blocks, in_blocks
+from imutool.inertial.stationary import Blocks, block_statistics
 from imutool.inertial.strapdown import dead_reckon
 from imutool.recording import GRAVITY_M_S2, Imu, Poses, Recording, seconds
 from imutool.sensor.flight import FlightSettings as Flight
@@ -66,7 +66,7 @@ def resting(
 
 
 def blocks_of(imu: Imu) -> Blocks:
-    return in_blocks([(imu.t_ns, imu.gyro, imu.accel)], imu.period_s)
+    return block_statistics([(imu.t_ns, imu.gyro, imu.accel)], imu.period_s)
 
 
 def model(mean: float = 0.0, **std: float) -> BiasModel:
@@ -101,7 +101,7 @@ def test_it_is_the_kalman_update_of_the_prior() -> None:
     imu, _ = resting()
     made = model(mean=0.01, prior_std=0.02)
     start = at_rest(made, imu)
-    (stretch, *_) = initial_bias.stretches(imu)
+    (stretch, *_) = initial_bias.rest_stretches(imu)
     still = imu.rows(slice(*stretch))
     x = np.full(6, 0.01)
     P = np.eye(6) * 0.02**2
@@ -346,7 +346,7 @@ def test_an_untrained_model_has_no_prior_to_follow_from() -> None:
 def test_the_whole_log_is_surer_than_its_start_and_later_stops_count() -> None:
     imu, _ = resting([(12.0, 18.0)])
     made = trained(prior_std=0.02)
-    start = smooth(made, [samples(imu)])
+    start = smoothed_start(made, [samples(imu)])
     assert start.track is not None
     assert start.how.startswith(("5.", "6."))
     assert "s at rest in all, gravity in motion, prior of 6 runs, ±0.000" in start.how
@@ -357,11 +357,11 @@ def test_the_whole_log_is_surer_than_its_start_and_later_stops_count() -> None:
 def test_smoothing_needs_something_to_go_by() -> None:
     imu, _ = resting([])
     with pytest.raises(NoRestError, match="here: the log never rests"):
-        smooth(static.Model(), [samples(imu)], "here")
-    wide = smooth(trained(prior_std=0.05), [samples(imu)])
+        smoothed_start(static.Model(), [samples(imu)], "here")
+    wide = smoothed_start(trained(prior_std=0.05), [samples(imu)])
     assert wide.std[:3].max() > 1e-4
     with pytest.raises(DataError, match="too short to be smoothed"):
-        smooth(trained(), [samples(imu.rows(slice(0, 20)))])
+        smoothed_start(trained(), [samples(imu.rows(slice(0, 20)))])
 
 
 def test_what_differs_at_rest_is_told_from_the_logs_own_bias() -> None:
@@ -383,7 +383,7 @@ def test_a_model_that_says_how_rest_differs_is_believed() -> None:
     made = trained(prior_std=3e-3)
     before = auto(made, resting()[0])
     made.register_buffer("rest_std", torch.tensor([2e-3] * 3 + [0.03] * 3))
-    np.testing.assert_allclose(known(made).ground_std[:3], 2e-3)
+    np.testing.assert_allclose(bias_prior(made).ground_std[:3], 2e-3)
     after = auto(made, resting()[0])
     assert (after.std[:3] > 5 * before.std[:3]).all(), "in motion it is less sure"
     np.testing.assert_allclose(after.rest[:3], before.rest[:3], atol=3e-4)  # at rest it is what it is
@@ -399,7 +399,7 @@ def test_the_prior_is_what_the_training_runs_had() -> None:
 
 
 def test_six_numbers_are_taken_as_they_are() -> None:
-    start = given("0.01,-2e-3,0, 1 ,2.5,-3")
+    start = from_numbers("0.01,-2e-3,0, 1 ,2.5,-3")
     assert start.rest.tolist() == [0.01, -2e-3, 0.0, 1.0, 2.5, -3.0]
     assert not start.std.any()
     assert start.how == "given"

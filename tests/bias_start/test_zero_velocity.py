@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from imutool.bias_start.bias_tracking import Known
-from imutool.bias_start.zero_velocity import with_stops
+from imutool.bias_start.bias_tracking import BiasPrior
+from imutool.bias_start.zero_velocity import zero_velocity_trajectory
 from imutool.errors import DataError
-from imutool.inertial.strapdown import Start, dead_reckon
+from imutool.inertial.strapdown import StartPose, dead_reckon
 from imutool.recording import Imu, Poses
 from imutool.sensor.flight import FlightSettings, TriadSettings, flight, trajectory
 
@@ -17,7 +17,7 @@ NOISE = TriadSettings(
 )
 SETTINGS = FlightSettings(gyro=NOISE, accel=NOISE, room_m=0.6, position_knot_s=0.9, tilt_rad=0.25, duration_s=20.0, still_s=4.0)
 LEFT = np.array([5e-4, -3e-4, 4e-4, 0.02, -0.01, 0.015])
-KNOWN = Known(np.zeros(6), np.array([1e-3] * 3 + [0.03] * 3), np.array([1e-4] * 3 + [0.03] * 3))
+KNOWN = BiasPrior(np.zeros(6), np.array([1e-3] * 3 + [0.03] * 3), np.array([1e-4] * 3 + [0.03] * 3))
 
 
 def there_and_back(seed: int = 0) -> tuple[Imu, Poses]:
@@ -39,8 +39,8 @@ def error_m(estimate: Poses, true: Poses) -> np.ndarray:
 
 def test_stops_take_back_what_drifted() -> None:
     imu, true = there_and_back()
-    pure = dead_reckon(imu, Start.of(true))
-    stopped = with_stops(imu, Start.of(true), KNOWN)
+    pure = dead_reckon(imu, StartPose.of(true))
+    stopped = zero_velocity_trajectory(imu, StartPose.of(true), KNOWN)
     assert error_m(pure, true)[-1] > 10.0
     assert error_m(stopped, true)[-1] < 0.2 * error_m(pure, true)[-1]
     assert stopped.v_w is not None
@@ -51,14 +51,14 @@ def test_stops_take_back_what_drifted() -> None:
 def test_it_begins_where_it_is_told_to() -> None:
     imu, true = there_and_back()
     for smooth in (False, True):
-        made = with_stops(imu, Start.of(true), KNOWN, smooth=smooth)
+        made = zero_velocity_trajectory(imu, StartPose.of(true), KNOWN, smooth=smooth)
         np.testing.assert_allclose(made.p_wb[0], true.p_wb[0], rtol=0, atol=5e-3)
         assert np.abs(np.sum(made.q_wb_wxyz[0] * true.q_wb_wxyz[0])) > 1 - 1e-5
 
 
 def test_knowing_the_end_helps_on_the_way() -> None:
     imu, true = there_and_back()
-    causal, smooth = (with_stops(imu, Start.of(true), KNOWN, smooth=way) for way in (False, True))
+    causal, smooth = (zero_velocity_trajectory(imu, StartPose.of(true), KNOWN, smooth=way) for way in (False, True))
     assert np.sqrt((error_m(smooth, true) ** 2).mean()) < np.sqrt((error_m(causal, true) ** 2).mean())
 
 
@@ -66,7 +66,7 @@ def test_causal_means_that_later_samples_change_nothing() -> None:
     imu, true = there_and_back()
     cut = 3000
     other = Imu(imu.t_ns, np.where(np.arange(len(imu))[:, None] < cut, imu.gyro, 0.5), imu.accel)
-    one, two = (with_stops(some, Start.of(true), KNOWN) for some in (imu, other))
+    one, two = (zero_velocity_trajectory(some, StartPose.of(true), KNOWN) for some in (imu, other))
     np.testing.assert_array_equal(one.p_wb[:cut], two.p_wb[:cut])
 
 
@@ -74,8 +74,8 @@ def test_causal_means_that_later_samples_change_nothing() -> None:
 def test_less_than_a_block_is_pure_integration(count: int) -> None:
     imu, true = there_and_back()
     few = imu.rows(slice(1200, 1200 + count))
-    start = Start.of(true, 1200)
-    made, pure = with_stops(few, start, KNOWN), dead_reckon(few, start)
+    start = StartPose.of(true, 1200)
+    made, pure = zero_velocity_trajectory(few, start, KNOWN), dead_reckon(few, start)
     np.testing.assert_allclose(made.p_wb, pure.p_wb, rtol=0, atol=1e-12)
     np.testing.assert_allclose(np.abs((made.q_wb_wxyz * pure.q_wb_wxyz).sum(axis=1)), 1.0, rtol=0, atol=1e-12)
 
@@ -83,4 +83,4 @@ def test_less_than_a_block_is_pure_integration(count: int) -> None:
 def test_no_samples_are_refused() -> None:
     imu, true = there_and_back()
     with pytest.raises(DataError, match="the IMU has no samples"):
-        with_stops(imu.rows(slice(0, 0)), Start.of(true), KNOWN)
+        zero_velocity_trajectory(imu.rows(slice(0, 0)), StartPose.of(true), KNOWN)

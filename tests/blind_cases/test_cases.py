@@ -46,7 +46,7 @@ FLIGHT_S = 30.0
 WHERE = Path("findings.json")
 
 ROOT = Path(__file__).parents[2]
-MAY_IMPORT = {"imutool.errors", "imutool.recording", "imutool.noise.datasheet", "imutool.mcap_io"}
+MAY_IMPORT = {"imutool.errors", "imutool.recording", "imutool.noise.datasheet", "imutool.mcap_io", "imutool.report"}
 
 
 def as_json(report: msgspec.Struct) -> dict[str, Any]:

@@ -11,9 +11,10 @@ from support.imu_defects import batch_of, cut, late, pick, repeated, with_values
 from imutool.cleaning.cleaner import Cleaner
 from imutool.cleaning.first_pass import Survey, examine
 from imutool.cleaning.samples import BLOCK, blocks, padded
-from imutool.cleaning.settings import Rules, every
+from imutool.cleaning.settings import CleaningSettings, every
 from imutool.errors import LogError
-from imutool.mcap_io.batches import Clock, ImuBatch
+from imutool.mcap_io.topics import ImuBatch, StampCheck
+from imutool.report import json_values
 from imutool.sensor.flight import flight
 
 MADE = batch_of(flight(3, duration_s=30.0).imu)
@@ -38,7 +39,7 @@ def spoiled() -> ImuBatch:
 SPOILED = spoiled()
 
 
-def look(batches: list[ImuBatch], rules: Rules | None = None) -> Survey:
+def look(batches: list[ImuBatch], rules: CleaningSettings | None = None) -> Survey:
     return examine(lambda: batches, None, rules)
 
 
@@ -67,7 +68,7 @@ def test_how_messages_are_cut_into_batches_changes_nothing(first_cut, second_cut
 
 def test_what_is_left_is_finite_and_in_order_and_as_it_was_but_for_its_unit():
     clean = Cleaner(WHOLE)(SPOILED)
-    Clock().take(clean)
+    StampCheck().check_imu(clean)
     assert len(clean.stamp_ns) == WHOLE.valid < COUNT
     kept = ~WHOLE.dropped
     for name in ("log_time", "publish_time", "sequence", "stamp_ns", "gyro"):
@@ -102,8 +103,8 @@ def test_whatever_the_stamps_and_values_what_is_left_is_fit_for_a_model(data):
     log_ns = np.where(rng.random(n) < share, rng.integers(-(2**63), 2**63 - 1, n), stamp_ns)
     made = ImuBatch(log_ns, log_ns, np.arange(n, dtype=np.uint32), stamp_ns, values[:, :3].copy(), values[:, 3:].copy(), "imu")
     survey = look([made])
-    survey.plain()
-    Clock().take(Cleaner(survey)(made))
+    json_values(survey.report())
+    StampCheck().check_imu(Cleaner(survey)(made))
     assert 0.0 <= survey.score <= 1.0
 
 
@@ -132,7 +133,7 @@ def test_exactly_what_was_planted_is_dropped_wherever_it_is(places, random):
 @settings(max_examples=20, deadline=None)
 @given(st.sets(st.sampled_from(every())))
 def test_any_rule_can_be_left_out_without_a_warning(without_rules):
-    survey = look([SPOILED], Rules(without=tuple(sorted(without_rules))))
+    survey = look([SPOILED], CleaningSettings(without=tuple(sorted(without_rules))))
     assert not {one.rule for one in survey.findings} & without_rules
     survey.record()
 

@@ -11,9 +11,9 @@ from support.imu_defects import batch_of, late, pick, repeated, with_values, wit
 
 from imutool.cleaning.finding import Finding
 from imutool.cleaning.first_pass import Survey, examine
-from imutool.cleaning.settings import Rules
+from imutool.cleaning.settings import CleaningSettings
 from imutool.cleaning.truth import Truth
-from imutool.mcap_io.batches import ImuBatch
+from imutool.mcap_io.topics import ImuBatch
 from imutool.recording import GRAVITY_M_S2, Poses
 from imutool.sensor.flight import flight
 
@@ -37,7 +37,7 @@ def truth_of(poses: Poses) -> Truth:
     return Truth("/ground_truth/pose", poses.t_ns[::12], poses.p_wb[::12], poses.q_wb_wxyz[::12])
 
 
-def look(batch: ImuBatch, truth: Truth | None = None, rules: Rules | None = None) -> Survey:
+def look(batch: ImuBatch, truth: Truth | None = None, rules: CleaningSettings | None = None) -> Survey:
     return examine(lambda: [batch], truth, rules, where="made.mcap", topic="/imu0")
 
 
@@ -285,7 +285,7 @@ def test_both_units_are_settled_together(made, truth):
 
 
 def test_units_are_only_said_when_asked_so(made, truth):
-    survey = look(made._replace(gyro=made.gyro * DEGREES), truth, Rules(convert_units=False))
+    survey = look(made._replace(gyro=made.gyro * DEGREES), truth, CleaningSettings(convert_units=False))
     assert only(survey, "units").action == "flagged"
     assert (survey.scale == 1.0).all()
     assert survey.verdict == "quarantine"
@@ -333,8 +333,8 @@ def test_a_mirrored_sensor_is_a_defect(made, truth):
 
 def test_rules_can_be_left_out_or_asked_for_alone(made):
     planted = PLANTS["spikes"][2](PLANTS["not finite"][2](made))
-    assert set(found(look(planted, None, Rules(only=("not_finite",))))) == {"not_finite"}
-    assert set(found(look(planted, None, Rules(without=("spikes",))))) == {"not_finite"}
+    assert set(found(look(planted, None, CleaningSettings(only=("not_finite",))))) == {"not_finite"}
+    assert set(found(look(planted, None, CleaningSettings(without=("spikes",))))) == {"not_finite"}
 
 
 def test_an_empty_topic_and_a_single_sample_are_not_trusted(made):

@@ -13,11 +13,11 @@ import numpy as np
 import pytest
 from support.imu_defects import messages, repeated, with_values, without, write_log
 
-from imutool.cleaning import Rules, survey
+from imutool.cleaning import CleaningSettings, survey
 from imutool.debiasing import debias
 from imutool.errors import LogError
-from imutool.mcap_io.batches import Clock, ImuBatch
 from imutool.mcap_io.log import Log
+from imutool.mcap_io.topics import ImuBatch, StampCheck
 from imutool.mcap_io.write import write
 from imutool.sensor.flight import flight
 from imutool.viewing.html import cleaning_page
@@ -92,9 +92,9 @@ def test_with_out_the_debiased_channel_is_the_clean_one_and_the_source_stays(
         rows = {name: list(opened.rows(["/imu0"])) for name, opened in (("raw", raw), ("copy", log))}
         for (_, one), (_, other) in zip(rows["raw"], rows["copy"], strict=True):
             assert one.payload.tobytes() == other.payload.tobytes()
-        clean, clock = list(log.imu_batches("/imu0/debiased")), Clock()
+        clean, clock = list(log.imu_batches("/imu0/debiased")), StampCheck()
         for batch in clean:
-            clock.take(batch)
+            clock.check_imu(batch)
         metadata = log.metadata()["imutool_clean"]
         kept = {(int(t), int(s)) for batch in clean for t, s in zip(batch.log_time, batch.sequence, strict=True)}
     messages_of = [batch for _, rows_ in rows["raw"] for batch in raw_columns(rows_)]
@@ -116,15 +116,17 @@ def test_every_start_finds_in_the_spoiled_log_what_it_finds_in_the_whole_one(
 ) -> None:
     model = logs / "linear.safetensors"
     whole = debias(folder / "whole.mcap", tmp_path / "a.mcap", model=model, init=init)
-    spoiled = debias(folder / "spoiled.mcap", tmp_path / "b.mcap", model=model, init=init, clean=Rules())
+    spoiled = debias(folder / "spoiled.mcap", tmp_path / "b.mcap", model=model, init=init, clean=CleaningSettings())
     a, b = whole.starts["/imu0"].rest, spoiled.starts["/imu0"].rest
     assert b[:3] == pytest.approx(a[:3], abs=TAKEN_OFF["gyro"])
     assert b[3:] == pytest.approx(a[3:], abs=TAKEN_OFF["accel"])
 
 
 def test_smoothing_and_no_model_go_over_the_clean_samples_too(folder: Path, logs: Path, tmp_path: Path) -> None:
-    smooth = debias(folder / "spoiled.mcap", tmp_path / "a.mcap", model=logs / "linear.safetensors", smooth=True, clean=Rules())
-    static = debias(folder / "spoiled.mcap", tmp_path / "b.mcap", clean=Rules())
+    smooth = debias(
+        folder / "spoiled.mcap", tmp_path / "a.mcap", model=logs / "linear.safetensors", smooth=True, clean=CleaningSettings()
+    )
+    static = debias(folder / "spoiled.mcap", tmp_path / "b.mcap", clean=CleaningSettings())
     for report in (smooth, static):
         assert report.rewrite.added["/imu0/debiased"] == report.surveys["/imu0"].valid
 
@@ -132,7 +134,7 @@ def test_smoothing_and_no_model_go_over_the_clean_samples_too(folder: Path, logs
 def test_a_clean_log_is_debiased_as_without_cleaning(folder: Path, logs: Path, tmp_path: Path) -> None:
     model = logs / "linear.safetensors"
     debias(folder / "whole.mcap", tmp_path / "a.mcap", model=model)
-    debias(folder / "whole.mcap", tmp_path / "b.mcap", model=model, clean=Rules())
+    debias(folder / "whole.mcap", tmp_path / "b.mcap", model=model, clean=CleaningSettings())
     for topic in ("/imu0/debiased", "/imu0/bias"):
         found = []
         for name in ("a", "b"):

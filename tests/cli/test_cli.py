@@ -14,7 +14,7 @@ import pytest
 
 from imutool import cli, errors, registry
 from imutool.cli import terminal
-from imutool.cli.figures import epoch_line
+from imutool.cli.terminal import epoch_line
 from imutool.demo import write_asl
 from imutool.sensor.flight import flight
 from imutool.training.fit import Epoch

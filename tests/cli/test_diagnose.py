@@ -6,29 +6,31 @@ import json
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from support import diagnoses
+from support.diagnoses import replace
 from typer.testing import CliRunner, Result
 
 from imutool import diagnosis_output
 from imutool.cli import app
 from imutool.diagnosis.estimation import unnamed_effects as unnamed
 from imutool.diagnosis.result import Curve, Diagnosis, Estimate, Finding, HeldOut
-from imutool.diagnosis.to_physics_file import found
-from imutool.diagnosis.wording import conclusion
+from imutool.diagnosis.to_physics_file import to_physics_file
+from imutool.diagnosis.wording.conclusion import conclusion
 from imutool.errors import ConfigError
 from imutool.mcap_io.read import read
 from imutool.mcap_io.write import write
 from imutool.recording import Recording
+from imutool.report import json_values
 from imutool.sensor import physics_file
 from imutool.sensor.flight import flight
 from imutool.sensor.physics_file import Bias, Entry, PhysicsFile, Value
 from imutool.sensor.samples import SensorSamples
 from imutool.sensor.simulate import simulate
+from imutool.units import AXES
 
 ARM_M = np.array([0.2, -0.1, 0.05])
 GYRO_BIAS, ACCEL_BIAS = (0.01, -0.02, 0.005), (0.1, 0.05, -0.08)
@@ -171,6 +173,23 @@ def test_what_cannot_be_diagnosed_is_refused(
 # ── the folder, of made-up diagnoses ──
 
 
+def test_a_setting_reaches_the_search(folder: Path, tmp_path: Path) -> None:
+    """At a false discovery rate that no gain reaches, a planted lever arm is not found."""
+    config = tmp_path / "settings.toml"
+    config.write_text("[search]\nrounds = 1\n")
+    words = ("diagnose", folder / "arm.mcap", "--config", config, "--json", "-")
+    done = run(*words, "--set", "search.false_discovery_rate=1e-300", "--quiet")
+    assert done.exit_code == 0, done.output
+    assert json.loads(done.stdout)["findings"] == []
+
+
+@pytest.mark.parametrize("word", ["search.false_discovery=1e-3", "search.false_discovery_rate=2", "band.sigma=none"])
+def test_a_wrong_setting_is_refused(folder: Path, word: str) -> None:
+    done = run("diagnose", folder / "arm.mcap", "--set", word)
+    assert done.exit_code == ConfigError.exit_code
+    assert word.partition("=")[0].rpartition(".")[2] in done.stderr
+
+
 def test_other_files_in_the_folder_stay(tmp_path: Path) -> None:
     (tmp_path / "real.mcap").write_bytes(b"mine")
     assert diagnosis_output.write(diagnoses.NOTHING, tmp_path) == []
@@ -178,7 +197,7 @@ def test_other_files_in_the_folder_stay(tmp_path: Path) -> None:
     assert (tmp_path / "real.mcap").read_bytes() == b"mine"
     without_logs = {*diagnosis_output.FILES, "real.mcap"} - {diagnosis_output.LOG}
     assert {path.name for path in tmp_path.iterdir()} == without_logs
-    assert json.loads((tmp_path / "findings.json").read_text()) == diagnosis_output.plain(diagnoses.ARM)
+    assert json.loads((tmp_path / "findings.json").read_text()) == json_values(diagnoses.ARM.report)
 
 
 def test_an_absent_extra_costs_its_file_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -201,9 +220,9 @@ def test_nothing_is_left_of_what_was_interrupted(tmp_path: Path, monkeypatch: py
 
 def test_what_is_no_number_is_null_in_the_json() -> None:
     endless = {"gyro_limit": Estimate(np.inf, np.nan, "rad/s"), "accel_limit": Estimate(80.0, 0.1, "m/s²")}
-    told = diagnosis_output.plain(replace(diagnoses.ARM, findings=(finding("saturation", "accel", endless),)))
+    told = json_values(replace(diagnoses.ARM, findings=(finding("saturation", "accel", endless),)).report)
     assert told["findings"][0]["parameters"]["gyro_limit"] == {"value": None, "std": None, "unit": "rad/s"}
-    (entry,) = found(replace(diagnoses.ARM, findings=(finding("saturation", "accel", endless),))).effect
+    (entry,) = to_physics_file(replace(diagnoses.ARM, findings=(finding("saturation", "accel", endless),))).effect
     assert list(entry.parameters) == ["accel_limit"]
 
 
@@ -219,7 +238,7 @@ def only(*findings: Finding) -> Diagnosis:
 
 
 def test_a_null_diagnosis_is_a_bias_alone() -> None:
-    file = found(diagnoses.NOTHING)
+    file = to_physics_file(diagnoses.NOTHING)
     assert file.effect == ()
     assert file.term == ()
     assert file.unknown == ()
@@ -230,7 +249,7 @@ def test_a_null_diagnosis_is_a_bias_alone() -> None:
 
 @pytest.mark.parametrize("effect", ["dropped_samples", "timestamp_jitter", "reference_error"])
 def test_what_is_no_effect_on_a_reading_stays_out(effect: str) -> None:
-    file = found(only(finding(effect, "both", {"share": Estimate(0.01, 0.001, "-")})))
+    file = to_physics_file(only(finding(effect, "both", {"share": Estimate(0.01, 0.001, "-")})))
     assert file.effect == ()
     assert file.acting()[0][0].name == physics_file.BIAS
 
@@ -238,7 +257,7 @@ def test_what_is_no_effect_on_a_reading_stays_out(effect: str) -> None:
 def test_what_is_driven_keeps_its_driver_and_lag() -> None:
     unit = "m/s² per unit of /motor/current"
     gain = {axis: Estimate(0.1 * k, 0.01, unit) for k, axis in enumerate("xyz")} | {"lag": Estimate(0.05, 0.01, "s")}
-    file = found(only(finding("driven", "accel", gain, driver="/motor/current")))
+    file = to_physics_file(only(finding("driven", "accel", gain, driver="/motor/current")))
     (physics, theta), _ = file.acting()
     assert theta.tolist() == [0.0, 0.1, 0.2, 0.05]
     t = np.arange(50) * 0.01
@@ -247,8 +266,9 @@ def test_what_is_driven_keeps_its_driver_and_lag() -> None:
 
 
 def test_a_term_without_a_name_acts_as_it_was_found() -> None:
-    said = finding("unknown", "gyro", {"c": Estimate(0.3, 0.01, "")}, "gyro.z += c omega_x omega_y")
-    (physics, theta), _ = found(only(said)).acting()
+    c = {"c": Estimate(0.3, 0.01, "")}
+    said = finding("unknown", "gyro", c, kind="unknown", axis="z", variable="omega_x omega_y")
+    (physics, theta), _ = to_physics_file(only(said)).acting()
     gyro = np.random.default_rng(1).normal(size=(20, 3))
     there = SensorSamples(np.arange(20) * 0.01, gyro, gyro, gyro)
     added = physics.forward(there, theta).gyro - gyro
@@ -262,8 +282,9 @@ def test_a_curve_and_the_bias_add_up_to_what_was_fitted() -> None:
     y = np.zeros((41, 3))
     mean = float((shape.basis(x) @ c).mean())
     y[:, 2] = shape.basis(x) @ c - mean
-    curve = Curve("omega_x", "rad/s", x, y, np.full((41, 3), 0.01), mean)
-    acting = found(only(finding("unknown", "accel", {}, "accel.z += curve(omega_x)", curve=curve))).acting()
+    curve = Curve.of_arrays("omega_x", "rad/s", x, y, np.full((41, 3), 0.01), mean)
+    said = finding("unknown", "accel", {}, kind="unknown", axis="z", variable="omega_x", curve=curve)
+    acting = to_physics_file(only(said)).acting()
     gyro = np.stack([x, np.zeros(41), np.zeros(41)], axis=1)
     there = SensorSamples(np.arange(41) * 0.01, gyro, np.zeros((41, 3)), gyro)
     for physics, theta in acting:
@@ -278,7 +299,9 @@ def test_every_term_there_can_be_is_written_as_it_acts() -> None:
     there = SensorSamples(np.arange(30) * 0.01, gyro, accel, alpha)
     for physics in unnamed.terms(there):
         c = {"c": Estimate(0.7, 0.01, physics.parameters[0].unit)}
-        (written, theta), _ = found(only(finding("unknown", physics.sensors[0], c, physics.equation))).acting()
+        assert physics.axis is not None
+        what = {"kind": "unknown", "axis": AXES[physics.axis], "variable": physics.variable}
+        (written, theta), _ = to_physics_file(only(finding("unknown", physics.sensors[0], c, **what))).acting()
         one, other = written.forward(there, theta), physics.forward(there, np.array([0.7]))
         assert np.allclose(one.gyro, other.gyro, rtol=0, atol=EXACT), physics.equation
         assert np.allclose(one.accel, other.accel, rtol=0, atol=EXACT), physics.equation

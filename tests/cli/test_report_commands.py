@@ -16,10 +16,9 @@ from imutool import diagnosis_output
 from imutool.cli import app
 from imutool.errors import DataError
 from imutool.fleet import page as fleet_page
-from imutool.fleet.models import settled
 from imutool.fleet.task import Result as Done
-from imutool.fleet.task import Settings, Source, Task
-from imutool.fleet.work import stands, work
+from imutool.fleet.task import Settings, Source, Task, with_model_hash
+from imutool.fleet.work import is_current, work
 from imutool.location import identity
 from imutool.viewing.html import report, report_paths
 
@@ -85,7 +84,7 @@ def task(logs: Path, tmp_path: Path) -> Task:
     """A log of a fleet, in a folder and of a name that no address may trip over."""
     log = logs / "flight_1.mcap"
     size, stamp = identity(log)
-    settings = settled(Settings(command="debias", model=str(logs / "linear.safetensors"), pages=True))
+    settings = with_model_hash(Settings(command="debias", model=str(logs / "linear.safetensors"), pages=True))
     source = Source(str(log), f"{HOSTILE}/log.mcap", size, stamp)
     return Task(key="k", source=source, out=str(tmp_path / "out"), target=source.name, settings=settings)
 
@@ -96,7 +95,7 @@ def test_a_fleet_leaves_a_page_beside_each_log_and_its_summary_leads_there(task:
     there = tmp_path / "out" / HOSTILE / "log.html"
     assert done.page == f"{HOSTILE}/log.html"
     assert "linear cuts the orientation error" in done.page_says
-    assert stands(done, there.with_suffix(".mcap"))
+    assert is_current(done, there.with_suffix(".mcap"))
     summary = tmp_path / "pages" / "summary.html"
     summary.parent.mkdir()
     fleet_page.write([done], task.settings, summary, out=tmp_path / "out", seconds=1.0, source="logs")
@@ -106,7 +105,7 @@ def test_a_fleet_leaves_a_page_beside_each_log_and_its_summary_leads_there(task:
     assert not set("#?<'") & set(link)
     assert "linear cuts the orientation error" in content
     there.unlink()
-    assert not stands(done, there.with_suffix(".mcap")), "a page that is gone is made again"
+    assert not is_current(done, there.with_suffix(".mcap")), "a page that is gone is made again"
 
 
 def test_a_fleet_replaces_its_own_page_and_nobody_elses(task: Task, tmp_path: Path) -> None:

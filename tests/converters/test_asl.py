@@ -242,7 +242,7 @@ def test_a_missing_image_is_named_with_its_line_unless_all_are_absent(make):
     files = make.files("euroc")
     images = [name for name in files if name.endswith(".png")]
     (partly,) = euroc.sequences(make.folder("partly", {n: c for n, c in files.items() if n != images[2]}))
-    with pytest.raises(DataError, match=r"cam0/data\.csv:4: .* is not in the source.*--no-images"):
+    with pytest.raises(DataError, match=r"cam0/data\.csv:4: .* is not in the source.*`images=False`"):
         euroc.read_sequence(partly)
     assert not euroc.read_sequence(partly, images=False).frames
     (none,) = euroc.read(make.folder("none", {n: c for n, c in files.items() if n not in images}))

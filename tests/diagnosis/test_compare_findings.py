@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from support import planted
+from support.diagnoses import replace
 
 from imutool.diagnosis.compare_findings import ANOTHER_MOTION, remarks, shared
 from imutool.diagnosis.diagnose import diagnose
@@ -54,7 +54,7 @@ def test_curves_are_alike_where_both_reach() -> None:
     def curve(slope: float, first: float) -> Finding:
         x = np.linspace(first, 2.0, 21)
         y = np.outer(slope * x, [1.0, 0.0, 0.0])
-        one = Curve("rate about x", "rad/s", x, y - y.mean(axis=0), np.full((21, 3), 1e-3))
+        one = Curve.of_arrays("rate about x", "rad/s", x, y - y.mean(axis=0), np.full((21, 3), 1e-3))
         return finding("unknown", parameters={}, curve=one)
 
     assert shared(curve(0.1, -2.0), [curve(0.1, -1.0)])

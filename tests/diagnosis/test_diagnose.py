@@ -17,6 +17,7 @@ from imutool.diagnosis.result import Diagnosis
 from imutool.errors import DataError, LogError
 from imutool.mcap_io.read import read
 from imutool.mcap_io.write import write
+from imutool.report import json_values
 
 SURE = 4.0
 ARM = [0.2, -0.05, 0.1]
@@ -132,7 +133,7 @@ KEYS = {"schema", "real", "sim", "mismatch", "located", "findings", "bias", "not
 
 def test_the_json_has_the_fields_that_programs_read(arm: tuple[Path, Path, Diagnosis]) -> None:
     real, sim, found = arm
-    plain = found.plain()
+    plain = json_values(found.report)
     assert json.loads(json.dumps(plain, allow_nan=False)) == plain
     assert set(plain) >= KEYS
     assert plain["schema"] == "imutool.diagnosis/1"
@@ -160,7 +161,7 @@ def test_the_json_has_the_fields_that_programs_read(arm: tuple[Path, Path, Diagn
 
 
 def test_the_json_of_nothing_says_so_and_has_every_field(nothing: tuple[Path, Path, Diagnosis]) -> None:
-    plain = nothing[2].plain()
+    plain = json_values(nothing[2].report)
     json.dumps(plain, allow_nan=False)
     assert set(plain) >= KEYS
     assert plain["mismatch"] is False
@@ -207,7 +208,7 @@ def test_without_a_simulation_the_recordings_own_poses_serve(arm_by_poses: tuple
     found = arm_by_poses[1]
     assert effects(found) == ["lever_arm"]
     assert found.sim is None
-    assert found.plain()["sim"] is None
+    assert json_values(found.report)["sim"] is None
     assert near(found, "lever_arm", dict(zip("xyz", ARM, strict=True)))
 
 
@@ -238,7 +239,7 @@ def test_missing_samples_are_counted_and_a_coarse_grid_is_told_with_its_step(mad
     assert told["dropped_samples"]["missing"].value == 12
     assert told["quantization"]["gyro_lsb"].value == pytest.approx(0.01, rel=1e-3)
     assert told["quantization"]["accel_lsb"].value == pytest.approx(0.1, rel=1e-3)
-    json.dumps(found.plain(), allow_nan=False)
+    json.dumps(json_values(found.report), allow_nan=False)
 
 
 # ── several logs, and what is refused ──
@@ -250,18 +251,18 @@ def test_several_recordings_share_the_physics_and_have_a_bias_each(made: Made, a
     both = diagnose([first, second])
     assert effects(both) == ["lever_arm"]
     assert both.bias.shape == (2, 6)
-    assert len(both.plain()["biases"]) == 2
+    assert len(json_values(both.report)["biases"]) == 2
     assert len(both.traces) == 2
     assert {place.log for place in both.located} == {str(first), str(second)}
-    assert {place["log"] for place in both.plain()["located"]} == set(both.plain()["real"])
-    assert "log" not in alone.plain()["located"][0]
+    assert {place["log"] for place in json_values(both.report)["located"]} == set(json_values(both.report)["real"])
+    assert "log" not in json_values(alone.report)["located"][0]
     assert both.findings[0].parameters["x"].std < alone.findings[0].parameters["x"].std
     assert near(both, "lever_arm", dict(zip("xyz", ARM, strict=True)))
 
 
 def test_neither_truth_nor_simulation_is_refused_with_what_would_help(made: Made) -> None:
     real, _ = made()
-    with pytest.raises(DataError, match=r"no simulation and no true poses.*--sim"):
+    with pytest.raises(DataError, match=r"no simulation and no true poses.*`sim`"):
         diagnose([real])
 
 
@@ -284,7 +285,7 @@ def test_logs_are_left_as_they_are_and_progress_is_told_and_the_answer_is_the_sa
     before = real.read_bytes(), sim.read_bytes()
     told: list[tuple[int, int]] = []
     again = diagnose([real], sim, tell=lambda done, total, _: told.append((done, total)))
-    assert again.plain() == found.plain()
+    assert json_values(again.report) == json_values(found.report)
     assert (real.read_bytes(), sim.read_bytes()) == before
     assert told == sorted(told)
     assert told[0][0] == 0

@@ -7,7 +7,7 @@ import re
 import numpy as np
 import pytest
 
-from imutool.diagnosis.locate import located
+from imutool.diagnosis.localization import locate
 
 RATE_HZ, DURATION_S = 100.0, 40.0
 NOISE = np.array([0.003] * 3 + [0.03] * 3)
@@ -30,16 +30,16 @@ def acting(column: int, rows: np.ndarray, size: float = 5.0) -> np.ndarray:
 
 
 def test_no_misfit_lies_nowhere() -> None:
-    assert located(T, NOTHING, NOISE, {}, {}) == []
+    assert locate(T, NOTHING, NOISE, {}, {}) == []
 
 
 def test_a_misfit_far_below_the_noise_lies_nowhere() -> None:
-    assert located(T, acting(4, T >= 0.0, 0.05), NOISE, {}, {}) == []
+    assert locate(T, acting(4, T >= 0.0, 0.05), NOISE, {}, {}) == []
 
 
 @pytest.mark.parametrize("column", range(6))
 def test_axis_and_seconds_are_those_in_which_it_acts(column: int) -> None:
-    (one,) = located(T, acting(column, (T >= 12.0) & (T < 19.0)), NOISE, {}, {"gyro": 1e-9, "accel": 1e-7})
+    (one,) = locate(T, acting(column, (T >= 12.0) & (T < 19.0)), NOISE, {}, {"gyro": 1e-9, "accel": 1e-7})
     assert one.signal == ("gyro" if column < 3 else "accel")
     assert one.axes == ("xyz"[column % 3],)
     assert one.intervals_s == ((12.0, 19.0),)
@@ -48,25 +48,25 @@ def test_axis_and_seconds_are_those_in_which_it_acts(column: int) -> None:
 
 
 def test_intervals_are_on_the_clock_that_is_given() -> None:
-    (one,) = located(T + 5.0, acting(4, (T >= 12.0) & (T < 19.0)), NOISE, {}, {})
+    (one,) = locate(T + 5.0, acting(4, (T >= 12.0) & (T < 19.0)), NOISE, {}, {})
     assert one.intervals_s == ((17.0, 24.0),)
 
 
 def test_stretches_far_apart_stay_apart_and_close_ones_join() -> None:
     rows = ((T >= 5.0) & (T < 8.0)) | ((T >= 20.0) & (T < 24.0)) | ((T >= 30.0) & (T < 40.0))
-    (one,) = located(T, acting(3, rows), NOISE, {}, {})
+    (one,) = locate(T, acting(3, rows), NOISE, {}, {})
     assert one.intervals_s == ((5.0, 8.0), (20.0, 24.0), (30.0, 40.0))
 
 
 def test_an_axis_that_is_only_touched_is_not_named() -> None:
     rows = (T >= 5.0) & (T < 15.0)
-    (one,) = located(T, acting(3, rows, 20.0) + acting(4, rows, 1.0) + acting(5, rows, 15.0), NOISE, {}, {})
+    (one,) = locate(T, acting(3, rows, 20.0) + acting(4, rows, 1.0) + acting(5, rows, 15.0), NOISE, {}, {})
     assert one.axes == ("x", "z")
 
 
 def test_both_signals_are_told_the_surer_first() -> None:
     rows = (T >= 5.0) & (T < 15.0)
-    found = located(T, acting(0, rows) + acting(5, rows), NOISE, {}, {"gyro": 1e-3, "accel": 1e-8})
+    found = locate(T, acting(0, rows) + acting(5, rows), NOISE, {}, {"gyro": 1e-3, "accel": 1e-8})
     assert [(one.signal, one.axes) for one in found] == [("accel", ("z",)), ("gyro", ("x",))]
 
 
@@ -77,7 +77,7 @@ def test_the_regime_is_the_variable_with_its_threshold(word: str, seed: int) -> 
     at = float(np.quantile(rate, 0.5))
     rows = rate > at if word == "above" else rate < at
     variables = {"temperature": ("°C", 20.0 + other), "angular rate": ("rad/s", rate), "time": ("s", T)}
-    (one,) = located(T, acting(4, rows), NOISE, variables, {})
+    (one,) = locate(T, acting(4, rows), NOISE, variables, {})
     said = re.fullmatch(r"angular rate (above|below) (\S+) rad/s", one.regime)
     assert said is not None, one.regime
     assert said[1] == word
@@ -93,7 +93,7 @@ def test_a_misfit_that_grows_with_a_variable_is_always_there_most_where_that_is_
     rate = wandering(3) + 0.3
     misfit = NOTHING.copy()
     misfit[:, 1] = 10.0 * NOISE[1] * rate * np.sin(2.0 * np.pi * 1.7 * T)
-    (one,) = located(T, misfit, NOISE, {"other": ("", wandering(50)), "angular rate": ("rad/s", rate)}, {})
+    (one,) = locate(T, misfit, NOISE, {"other": ("", wandering(50)), "angular rate": ("rad/s", rate)}, {})
     assert one.regime.startswith("always, most with angular rate above")
     assert one.intervals_s == ((0.0, 40.0),)
 
@@ -101,18 +101,18 @@ def test_a_misfit_that_grows_with_a_variable_is_always_there_most_where_that_is_
 def test_what_follows_none_of_the_variables_is_given_none() -> None:
     rng = np.random.default_rng(0)
     rows = (rng.random(40) < 0.5)[np.floor(T).astype(int)]
-    (one,) = located(T, acting(4, rows), NOISE, {"angular rate": ("rad/s", wandering(7)), "tilt": ("rad", wandering(8))}, {})
+    (one,) = locate(T, acting(4, rows), NOISE, {"angular rate": ("rad/s", wandering(7)), "tilt": ("rad", wandering(8))}, {})
     assert one.regime == "no regime: it comes and goes"
 
 
 def test_a_variable_that_never_changes_is_no_regime() -> None:
     rows = (T >= 12.0) & (T < 19.0)
-    (one,) = located(T, acting(4, rows), NOISE, {"tilt": ("rad", np.zeros(len(T)))}, {})
+    (one,) = locate(T, acting(4, rows), NOISE, {"tilt": ("rad", np.zeros(len(T)))}, {})
     assert "tilt" not in one.regime
 
 
 def test_stretches_of_one_log_are_placed_on_its_clock_and_the_hole_between_them_is_nowhere() -> None:
     there = (T < 10.0) | (T >= 30.0)
     t_s, misfit = T[there], acting(1, np.ones(len(T), bool))[there]
-    (one,) = located(t_s, misfit, NOISE, {}, {"gyro": 1e-9})
+    (one,) = locate(t_s, misfit, NOISE, {}, {"gyro": 1e-9})
     assert one.intervals_s == ((0.0, 10.0), (30.0, DURATION_S))

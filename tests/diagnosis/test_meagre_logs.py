@@ -13,11 +13,12 @@ from support import planted
 
 from imutool.diagnosis.diagnose import diagnose
 from imutool.diagnosis.result import Diagnosis
-from imutool.diagnosis.to_physics_file import found as physics_found
-from imutool.diagnosis.wording import conclusion
+from imutool.diagnosis.to_physics_file import to_physics_file
+from imutool.diagnosis.wording.conclusion import conclusion
 from imutool.errors import DataError, LogError
 from imutool.mcap_io.write import write
 from imutool.recording import Poses
+from imutool.report import json_values
 
 ARM = [0.2, -0.05, 0.1]
 SCALE = [0.03, -0.02, 0.04]
@@ -78,7 +79,7 @@ def resting(
 
 
 def effects(d: Diagnosis) -> list[str]:
-    json.dumps(d.plain(), allow_nan=False)
+    json.dumps(json_values(d.report), allow_nan=False)
     return [one.effect for one in d.findings]
 
 
@@ -198,8 +199,8 @@ def test_poses_too_slow_to_be_differentiated_leave_what_samples_show_by_themselv
     assert "can be differentiated" in said
     assert "Only what stamps and digits show by themselves could be asked" in said
     assert {"lever_arm", "gyro_scale", "clock_offset"} <= set(d.not_identifiable)
-    assert physics_found(d).bias is None  # nobody knows it
-    assert d.plain()["bias"] == {"gyro": None, "accel": None}
+    assert to_physics_file(d).bias is None  # nobody knows it
+    assert json_values(d.report)["bias"] == {"gyro": None, "accel": None}
 
 
 def test_poses_of_a_part_answer_for_that_part(tmp_path: Path) -> None:

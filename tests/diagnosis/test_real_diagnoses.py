@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from support import planted
 
-from imutool.diagnosis.diagnose import remaining
+from imutool.diagnosis.effect_sizes import residual_to_truth
 from imutool.mcap_io.write import write
 
 BENCH = Path(__file__).parents[1] / "bench"
@@ -172,7 +172,7 @@ def test_physics_of_one_recording_removes_its_misfit_of_another(tmp_path: Path) 
     samples = planted.ideal(felt, arm) + planted.BIAS
     log = tmp_path / "flight.mcap"
     write(planted.recording("flight", felt.t_s, samples, poses=planted.poses(path, felt.t_s)), log)
-    without, with_ = remaining(log), remaining(log, arm)
+    without, with_ = residual_to_truth(log), residual_to_truth(log, arm)
     assert without["gyro"].rms_after == without["gyro"].rms_before
     assert with_["accel"].rms_before == without["accel"].rms_before
     assert with_["accel"].rms_after < POSE_NOISE * with_["accel"].rms_before

@@ -6,18 +6,19 @@ import importlib
 import math
 import pkgutil
 import re
-from dataclasses import replace
 from types import SimpleNamespace
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from support import diagnoses
+from support.diagnoses import replace
 
 import imutool.sensor.effects
-from imutool.diagnosis.quantity import grouped, percent, value, vector
 from imutool.diagnosis.result import Estimate, Finding, HeldOut, Located, Unexplained
-from imutool.diagnosis.wording import NULL, SENTENCES, by_chance, conclusion, lines, rms, sentence, signals, table
+from imutool.diagnosis.wording.conclusion import NULL, chance_text, conclusion, lines, rms_text, table
+from imutool.diagnosis.wording.effect_sentences import SENTENCES, named_sentence, signals
+from imutool.diagnosis.wording.quantity import grouped, percent, value, vector
 
 CATALOGUE = [  # of physics: what an ideal simulation leaves out, and what any signal can have
     "gyro_bias", "accel_bias", "gyro_scale", "gyro_misalignment", "gyro_g_sensitivity", "gyro_quadratic", "gyro_bias_drift",
@@ -81,9 +82,9 @@ def test_of_many_findings_the_three_strongest_are_told_in_full() -> None:
 
 
 def test_two_sizes_are_told_apart_with_as_many_digits_as_it_takes() -> None:
-    assert rms(HeldOut(0.8761, 0.8759, "m/s^2", 9.0)) == "rms 0.8761 to 0.8759 m/s²"
-    assert rms(HeldOut(0.52, 0.19, "m/s^2", 9.0)) == "rms 0.52 to 0.19 m/s²"
-    assert rms(HeldOut(0.5, 0.5, "m/s^2", 9.0)) == "rms 0.5 to 0.5 m/s²"
+    assert rms_text(HeldOut(0.8761, 0.8759, "m/s^2", 9.0)) == "rms 0.8761 to 0.8759 m/s²"
+    assert rms_text(HeldOut(0.52, 0.19, "m/s^2", 9.0)) == "rms 0.52 to 0.19 m/s²"
+    assert rms_text(HeldOut(0.5, 0.5, "m/s^2", 9.0)) == "rms 0.5 to 0.5 m/s²"
 
 
 def test_a_driver_is_named_with_its_gain_and_lag() -> None:
@@ -96,14 +97,14 @@ def test_the_unknown_is_said_to_have_no_name() -> None:
         diagnoses.NAMELESS
     )
     equation = finding("unknown", {"a": Estimate(0.3, 0.01, "s²/m")}, equation="accel_x += a f_z^2")
-    assert sentence(diagnoses.ARM, equation) == (
+    assert named_sentence(diagnoses.ARM, equation) == (
         "accel_x += a f_z^2, with a 0.300 ± 0.010 s²/m; this has no name among the known effects (unknown)"
     )
 
 
 def test_what_cannot_be_told_apart_is_said_beside_the_name() -> None:
     one = replace(diagnoses.LAG, similar=("low_pass", "delay"))
-    assert sentence(diagnoses.LATE, one).endswith("by 12.4 ± 0.3 ms (clock_offset; could as well be low_pass or delay)")
+    assert named_sentence(diagnoses.LATE, one).endswith("by 12.4 ± 0.3 ms (clock_offset; could as well be low_pass or delay)")
 
 
 def test_a_place_without_a_name_is_not_passed_over() -> None:
@@ -208,7 +209,7 @@ def test_many_stretches_are_counted_not_listed() -> None:
 @pytest.mark.parametrize("effect", CATALOGUE)
 def test_every_effect_has_a_sentence_with_its_number_its_unit_and_its_name(effect: str) -> None:
     assert effect in SENTENCES
-    said = sentence(diagnoses.ARM, finding(effect, {"k": Estimate(3.25, 0.02, "K")}))
+    said = named_sentence(diagnoses.ARM, finding(effect, {"k": Estimate(3.25, 0.02, "K")}))
     assert "3.25 ± 0.02 K" in said
     assert said.endswith(f"({effect})")
 
@@ -222,16 +223,16 @@ def physics() -> list[object]:
 @pytest.mark.parametrize("one", physics(), ids=lambda one: one.name)
 def test_a_sentence_leaves_no_quantity_of_a_real_effect_out(one: SimpleNamespace) -> None:
     theta = {n.name: Estimate(n.plausible * (0.71 + 0.1 * k), n.plausible * 0.01, n.unit) for k, n in enumerate(one.parameters)}
-    said = sentence(diagnoses.ARM, finding(one.name, theta))
+    said = named_sentence(diagnoses.ARM, finding(one.name, theta))
     for quantity in grouped(theta):
         assert str(quantity) in said, quantity
 
 
 def test_an_effect_nobody_wrote_a_sentence_for_is_still_said_with_its_equation_and_numbers() -> None:
     one = finding("vendor_effect", {"k": Estimate(3.25, 0.02, "K")}, equation="accel += k T")
-    assert sentence(diagnoses.ARM, one) == "it shows vendor_effect, accel += k T, k 3.25 ± 0.02 K (vendor_effect)"
+    assert named_sentence(diagnoses.ARM, one) == "it shows vendor_effect, accel += k T, k 3.25 ± 0.02 K (vendor_effect)"
     bare = finding("reference_error", {}, equation="the truth is late")
-    assert sentence(diagnoses.ARM, bare) == "it shows reference_error, the truth is late (reference_error)"
+    assert named_sentence(diagnoses.ARM, bare) == "it shows reference_error, the truth is late (reference_error)"
 
 
 @pytest.mark.parametrize(
@@ -245,19 +246,21 @@ def test_an_effect_nobody_wrote_a_sentence_for_is_still_said_with_its_equation_a
     ],
 )
 def test_signs_become_words(effect: str, number: Estimate, words: str) -> None:
-    assert sentence(diagnoses.ARM, finding(effect, {"k": number})).startswith(words)
+    assert named_sentence(diagnoses.ARM, finding(effect, {"k": number})).startswith(words)
 
 
 def test_a_jump_says_when_and_how_far() -> None:
     jump = {"t_jump": Estimate(31.02, 0.05, "s"), "step": Estimate(0.02, 0.0004, "s")}
-    assert sentence(diagnoses.ARM, finding("clock_jump", jump)) == (
+    assert named_sentence(diagnoses.ARM, finding("clock_jump", jump)) == (
         "the clock of the recording jumps by 20.0 ± 0.4 ms at 31.02 ± 0.05 s (clock_jump)"
     )
 
 
 def test_a_limit_that_is_never_reached_is_not_news() -> None:
     limits = {"gyro_limit": Estimate(math.inf, 0.0, "rad/s"), "accel_limit": Estimate(39.2, 0.2, "m/s²")}
-    assert sentence(diagnoses.ARM, finding("saturation", limits)) == "it stops at its limit of 39.2 ± 0.2 m/s² (saturation)"
+    assert (
+        named_sentence(diagnoses.ARM, finding("saturation", limits)) == "it stops at its limit of 39.2 ± 0.2 m/s² (saturation)"
+    )
 
 
 # ── numbers ──
@@ -332,10 +335,10 @@ def test_a_share_is_never_nothing_or_all_unless_it_is(share: float, words: str) 
 
 
 def test_a_chance_too_small_for_a_float_is_a_bound() -> None:
-    assert by_chance(0.0) == "less than 1 in 10⁹ by chance"
-    assert by_chance(5e-7) == "1 in 2 000 000 by chance"
-    assert by_chance(0.25) == "25 % by chance"
-    assert by_chance(1e-12, short=True) == "below 10⁻⁹"
+    assert chance_text(0.0) == "less than 1 in 10⁹ by chance"
+    assert chance_text(5e-7) == "1 in 2 000 000 by chance"
+    assert chance_text(0.25) == "25 % by chance"
+    assert chance_text(1e-12, short=True) == "below 10⁻⁹"
 
 
 def test_a_second_simulation_is_told_with_the_share_of_the_misfit_that_is_gone() -> None:
@@ -355,7 +358,8 @@ def test_many_things_that_cannot_be_seen_are_counted() -> None:
 
 
 def test_an_axis_that_is_no_measurement_comes_first() -> None:
-    stuck = Located("accel", ("y",), ((0.0, 90.0),), "always: it reads 3.25 m/s² in every sample", 1.0, 0.0)
+    why = "it reads 3.25 m/s² in every sample"
+    stuck = Located("accel", ("y",), ((0.0, 90.0),), f"always: {why}", 1.0, 0.0, reason=why)
     said = conclusion(replace(diagnoses.LATE, located=(diagnoses.TURNING, stuck)))
     assert said.startswith("The accel's y is no measurement: it reads 3.25 m/s² in every sample. The gyro differs when turning")
 

@@ -19,18 +19,18 @@ import pyarrow.parquet as pq
 import pytest
 from typer.testing import CliRunner
 
-from imutool.cleaning import Rules
+from imutool.cleaning import CleaningSettings
 from imutool.cli import app
 from imutool.debiasing import debias
 from imutool.errors import ConfigError
 from imutool.fleet.engine import Engine
 from imutool.fleet.journal import NAME
-from imutool.fleet.models import settled
-from imutool.fleet.run import Tally, run
-from imutool.fleet.task import Result, Settings, Task
+from imutool.fleet.run import Progress, run
+from imutool.fleet.task import Result, Settings, Task, with_model_hash
 from imutool.fleet.work import work
 from imutool.location import to_location
-from imutool.mcap_io.storage.digest import sha256
+from imutool.mcap_io.storage.source import sha256
+from imutool.report import json_values
 
 Workers = Callable[[], Engine]
 SOON_S = 60.0
@@ -41,7 +41,7 @@ LOGS = 6  # of a fleet that is killed
 
 @pytest.fixture
 def settings(logs: Path) -> Settings:
-    return settled(Settings(command="debias", model=str(logs / "linear.safetensors")))
+    return with_model_hash(Settings(command="debias", model=str(logs / "linear.safetensors")))
 
 
 def rows(out: Path) -> dict[str, dict[str, Any]]:
@@ -64,8 +64,8 @@ def test_one_bad_log_stops_no_other(fleet: Path, engine: Workers, settings: Sett
     out, page = tmp_path / "out", tmp_path / "page.html"
     told: list[str] = []
     report = run(str(fleet), str(out), settings, engine, page=page, tell=lambda done, total, words: told.append(words))
-    assert report.tally.exit_code == 5
-    assert dict(report.tally.statuses) == {"ok": 2, "failed": 2}
+    assert report.progress.exit_code == 5
+    assert dict(report.progress.statuses) == {"ok": 2, "failed": 2}
     found = rows(out)
     assert {name: row["status"] for name, row in found.items()} == {
         "robot_a": "ok",
@@ -83,7 +83,7 @@ def test_one_bad_log_stops_no_other(fleet: Path, engine: Workers, settings: Sett
     assert "robot &lt;script&gt;alert(1)&lt;" in html
     assert "Of 4 logs 2 are whole; 2 failed." in html
     _Whole().feed(html)
-    assert json.dumps(report.plain(), allow_nan=False)
+    assert json.dumps(json_values(report.summary()), allow_nan=False)
 
 
 class _Whole(HTMLParser):
@@ -113,15 +113,15 @@ def test_a_second_run_skips_all_and_a_changed_log_is_done_again(
     out = tmp_path / "out"
     run(str(fleet), str(out), settings, engine)
     before = {path: (path.stat().st_mtime_ns, path.stat().st_ino) for path in out.rglob("*.mcap")}
-    with pytest.raises(ConfigError, match="--resume"):
+    with pytest.raises(ConfigError, match="`resume`"):
         run(str(fleet), str(out), settings, never)
     again = run(str(fleet), str(out), settings, engine, resume=True)
-    assert dict(again.tally.statuses) == {"skipped": 2}
+    assert dict(again.progress.statuses) == {"skipped": 2}
     assert {row["earlier"] for row in rows(out).values()} == {"ok"}
     assert {path: (path.stat().st_mtime_ns, path.stat().st_ino) for path in out.rglob("*.mcap")} == before
     shutil.copy(fleet / "robot_a" / "log.mcap", fleet / "robot_b" / "log.mcap")
     changed = run(str(fleet), str(out), settings, engine, resume=True)
-    assert dict(changed.tally.statuses) == {"skipped": 1, "ok": 1}
+    assert dict(changed.progress.statuses) == {"skipped": 1, "ok": 1}
     assert len(set(digests(out).values())) == 1
 
 
@@ -130,9 +130,9 @@ def test_somebody_elses_file_stays(fleet: Path, engine: Workers, tmp_path: Path)
     theirs.parent.mkdir(parents=True)
     theirs.write_text("theirs")
     report = run(str(fleet), str(tmp_path / "out"), INFO, engine)
-    assert (theirs.read_text(), dict(report.tally.statuses)) == ("theirs", {"failed": 1, "ok": 1})
-    assert "the target exists" in report.trouble[0].error
-    assert dict(run(str(fleet), str(tmp_path / "out"), INFO, engine, overwrite=True).tally.statuses) == {"ok": 2}
+    assert (theirs.read_text(), dict(report.progress.statuses)) == ("theirs", {"failed": 1, "ok": 1})
+    assert "the target exists" in report.not_whole[0].error
+    assert dict(run(str(fleet), str(tmp_path / "out"), INFO, engine, overwrite=True).progress.statuses) == {"ok": 2}
     assert theirs.read_text() != "theirs"
 
 
@@ -154,7 +154,7 @@ def test_without_a_log_nothing_is_begun(tmp_path: Path) -> None:
 
 
 def test_more_memory_than_there_is_is_refused(ray_started: None) -> None:
-    with Engine(memory_bytes=1 << 60) as engine, pytest.raises(ConfigError, match=r"--memory-per-task: 1073741824\.00 GiB"):
+    with Engine(memory_bytes=1 << 60) as engine, pytest.raises(ConfigError, match=r"memory_bytes: 1073741824\.00 GiB"):
         engine.refuse_too_much()
 
 
@@ -167,7 +167,7 @@ def test_where_ray_cannot_start_the_message_says_what_to_do(monkeypatch: pytest.
     monkeypatch.setattr(ray, "is_initialized", lambda: False)
     monkeypatch.setattr(ray, "init", init)
     monkeypatch.setattr(ray, "shutdown", lambda: None)  # the other tests' workers go on
-    with pytest.raises(ConfigError, match=r"cannot be started on this machine \(bind: Operation not permitted\).*--address"):
+    with pytest.raises(ConfigError, match=r"cannot be started on this machine \(bind: Operation not permitted\).*`address`"):
         Engine()
     with pytest.raises(ConfigError, match=r"--address 127\.0\.0\.1:1: nobody answers"):
         Engine("127.0.0.1:1")
@@ -249,7 +249,7 @@ def expected(logs: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, 
         source = folder / "in" / f"log_{k}.mcap"
         source.parent.mkdir(exist_ok=True)
         shutil.copy(logs / f"flight_{1 + k % 2}.mcap", source)
-        debias(source, folder / source.name, model=logs / "linear.safetensors", clean=Rules())
+        debias(source, folder / source.name, model=logs / "linear.safetensors", clean=CleaningSettings())
     return {path.name: sha256(path) for path in folder.glob("*.mcap")}
 
 
@@ -283,13 +283,13 @@ def test_a_killed_worker_takes_its_log_alone(
         killer.kill()
         killer.wait()
     assert told.count("partial") == 1
-    statuses = dict(report.tally.statuses)
+    statuses = dict(report.progress.statuses)
     if retries:
         assert statuses == {"ok": LOGS}
     else:
         assert statuses == {"ok": LOGS - 1, "failed": 1}
-        assert "its worker died" in report.trouble[0].error
-        statuses = dict(run(str(many), str(out), settings, lambda: Engine(workers=2), resume=True).tally.statuses)
+        assert "its worker died" in report.not_whole[0].error
+        statuses = dict(run(str(many), str(out), settings, lambda: Engine(workers=2), resume=True).progress.statuses)
         assert statuses == {"skipped": LOGS - 1, "ok": 1}
     assert digests(out) == expected
     assert not list(out.glob(".*.partial"))
@@ -328,9 +328,9 @@ def test_a_fleet_that_is_ended_goes_on_where_it_was(
     with (out / NAME).open("ab") as journal:
         journal.write(b'{"line":"done","key":"to')  # as a driver does that is killed while it writes
     report = run(str(many), str(out), settings, engine, resume=True)
-    assert report.tally.statuses.total() == LOGS
-    assert report.tally.statuses["skipped"] >= done - 1  # the last one may not have come into the journal
-    assert report.tally.exit_code == 0
+    assert report.progress.statuses.total() == LOGS
+    assert report.progress.statuses["skipped"] >= done - 1  # the last one may not have come into the journal
+    assert report.progress.exit_code == 0
     assert digests(out) == expected
     assert sum(path.stat().st_mtime_ns != before for path, before in kept.items()) <= 1
     assert not list(out.glob(".*.partial"))
@@ -390,7 +390,7 @@ def test_a_fleet_in_a_store_is_that_of_a_folder(fleet: Path, store: Any, setting
     run("s3://fleet/logs", "s3://fleet/out", settings, Inline, page=to_location("s3://fleet/out.html"))
     store.put(left, b"half")
     again = run("s3://fleet/logs", "s3://fleet/out", settings, Inline, resume=True, recheck=True)
-    assert dict(again.tally.statuses) == {"skipped": 2}
+    assert dict(again.progress.statuses) == {"skipped": 2}
     keys = store.keys()
     assert left not in keys
     assert {"out.html", "out/fleet.parquet", "out/fleet.journal/00000000.jsonl"} <= set(keys)
@@ -400,7 +400,7 @@ def test_a_fleet_in_a_store_is_that_of_a_folder(fleet: Path, store: Any, setting
         assert store.get(f"out/{name}") == (tmp_path / "out" / name).read_bytes()
     assert store.secret.encode() not in b"".join(store.get(key) for key in keys if "fleet." in key)
     store.client.delete_object(Bucket="fleet", Key="out/robot_b/log.mcap")
-    assert dict(run("s3://fleet/logs", "s3://fleet/out", settings, Inline, resume=True).tally.statuses) == {
+    assert dict(run("s3://fleet/logs", "s3://fleet/out", settings, Inline, resume=True).progress.statuses) == {
         "skipped": 1,
         "ok": 1,
     }
@@ -408,10 +408,10 @@ def test_a_fleet_in_a_store_is_that_of_a_folder(fleet: Path, store: Any, setting
 
 def test_an_exit_code_tells_the_worst() -> None:
     def ended(*results: tuple[str, int, str | None]) -> int:
-        tally = Tally(len(results), 0)
+        progress = Progress(len(results), 0)
         for status, code, earlier in results:
-            tally.take(Result(key="", source="", target="", status=status, exit_code=code, earlier=earlier))
-        return tally.exit_code
+            progress.add(Result(key="", source="", target="", status=status, exit_code=code, earlier=earlier))
+        return progress.exit_code
 
     assert ended(("ok", 0, None), ("skipped", 0, "ok")) == 0
     assert ended(("ok", 0, None), ("skipped", 0, "lost")) == 3

@@ -70,7 +70,7 @@ def test_a_line_that_cannot_be_read_costs_that_log_alone(tmp_path: Path) -> None
 def test_results_that_are_there_are_not_begun_anew_without_a_word(tmp_path: Path) -> None:
     fill(tmp_path, "a")
     before = (tmp_path / NAME).read_bytes()
-    with pytest.raises(ConfigError, match="Go on with --resume"):
+    with pytest.raises(ConfigError, match="Go on with `resume`"):
         Journal(tmp_path, SETTINGS)
     with pytest.raises(ConfigError, match=r"other settings \(init 'auto', now 'prior'\)"):
         Journal(tmp_path, OTHER, resume=True)
@@ -113,7 +113,7 @@ def test_in_a_store_it_lies_in_pieces(store: Any, monkeypatch: pytest.MonkeyPatc
     fill(out, *"abcdef")
     pieces = len(store.keys())
     assert pieces > 2
-    with pytest.raises(ConfigError, match="Go on with --resume"):
+    with pytest.raises(ConfigError, match="Go on with `resume`"):
         Journal(out, SETTINGS)
     with Journal(out, SETTINGS, resume=True) as journal:
         assert journal.done("f") == result("f", messages=7)

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from imutool.errors import ConfigError
-from imutool.fleet.sources import LONGEST, find, leftovers, relative, remove, within
+from imutool.fleet.sources import LONGEST, find, partial_files, relative, remove_files, within
 from imutool.location import identity, to_location
 
 NOWHERE = Path("/nowhere")
@@ -135,7 +135,7 @@ def test_only_what_was_half_written_beside_these_targets_goes(tmp_path: Path) ->
     ours = [".a.mcap.12.0123abcd.partial", "b/.c.mcap.1.ffffffff.partial"]
     others = [".other.mcap.12.0123abcd.partial", ".a.mcap.partial", "a.mcap", "b/.c.mcap.1.ffffffff.partial.mcap"]
     tree(tmp_path, *ours, *others)
-    remove(leftovers(tmp_path, ["a.mcap", "b/c.mcap", "gone/d.mcap"]))
+    remove_files(partial_files(tmp_path, ["a.mcap", "b/c.mcap", "gone/d.mcap"]))
     assert sorted(str(one.relative_to(tmp_path)) for one in tmp_path.rglob("*") if one.is_file()) == sorted(others)
 
 

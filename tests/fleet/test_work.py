@@ -14,15 +14,15 @@ from rosbags.rosbag1 import Reader, Writer
 from rosbags.typesys import Stores, get_typestore
 
 from imutool.bag.repair import repair_bag
-from imutool.cleaning import Rules
+from imutool.cleaning import CleaningSettings
 from imutool.debiasing import debias
 from imutool.errors import ConfigError
-from imutool.fleet.models import settled
+from imutool.fleet.robots import robot_of, robot_pattern
 from imutool.fleet.sources import find
-from imutool.fleet.task import Result, Settings, Source, Task
-from imutool.fleet.work import called, robot_of, robot_pattern, work
+from imutool.fleet.task import Result, Settings, Source, Task, with_model_hash
+from imutool.fleet.work import target_name, work
 from imutool.mcap_io.read import read
-from imutool.mcap_io.storage.digest import sha256
+from imutool.mcap_io.storage.source import sha256
 from imutool.mcap_io.write import write
 
 
@@ -42,7 +42,7 @@ def done(logs: Path, tmp_path: Path, settings: Settings) -> Result:
 
 
 def test_a_debiased_log_is_what_debias_makes_of_it(done: Result, logs: Path, tmp_path: Path, settings: Settings) -> None:
-    debias(logs / "flight_1.mcap", tmp_path / "alone.mcap", model=settings.model, clean=Rules())
+    debias(logs / "flight_1.mcap", tmp_path / "alone.mcap", model=settings.model, clean=CleaningSettings())
     target = tmp_path / "out" / "a" / "log.mcap"
     assert target.read_bytes() == (tmp_path / "alone.mcap").read_bytes()
     assert (done.status, done.error, done.exit_code) == ("ok", "", 0)
@@ -64,7 +64,7 @@ def test_done_again_it_is_the_same_byte_for_byte(done: Result, logs: Path, tmp_p
 def test_a_machine_without_the_model_gets_it(done: Result, logs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     model = (logs / "linear.safetensors").read_bytes()
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
-    away = settled(Settings(command="debias", model=str(logs / "linear.safetensors")))
+    away = with_model_hash(Settings(command="debias", model=str(logs / "linear.safetensors")))
     away = msgspec.structs.replace(away, model="/not/here/linear.safetensors")
     assert work(task(logs / "flight_1.mcap", tmp_path / "far", away), model).target_sha256 == done.target_sha256
     spoiled = work(task(logs / "flight_1.mcap", tmp_path / "far", away), model + b"more")
@@ -137,7 +137,7 @@ def bag(tmp_path: Path) -> Path:
 
 def bag_task(source: Path, out: Path, settings: Settings) -> Task:
     (one,) = find(str(source), Path("/nowhere"), bags=True).logs
-    return Task(key="k", source=one, out=str(out), target=called(one.name, "repair"), settings=settings)
+    return Task(key="k", source=one, out=str(out), target=target_name(one.name, "repair"), settings=settings)
 
 
 def test_a_bag_is_repaired_as_a_bag(bag: Path, tmp_path: Path) -> None:
@@ -150,7 +150,7 @@ def test_a_bag_is_repaired_as_a_bag(bag: Path, tmp_path: Path) -> None:
     assert (out / "log.bag").read_bytes() == (tmp_path / "alone.bag").read_bytes()
     assert (found.status, found.exit_code) == ("lost", 3)
     assert 0 < found.messages < 40
-    assert "index: it was made anew" in found.warnings[0]
+    assert "index: it was rebuilt" in found.warnings[0]
     with Reader(out / "log.bag") as reader:
         assert len(list(reader.messages())) == found.messages
     again = work(msgspec.structs.replace(bag_task(bag, out, repair), done=found))
@@ -195,10 +195,10 @@ def test_a_robot_is_its_folder_or_what_the_pattern_says(logs: Path, tmp_path: Pa
     assert robot_of("robot_3.mcap", None, log) == "robot_3"
     assert robot_of("site/r3_monday.mcap", r"(r\d+)_", log) == "r3"
     assert robot_of("any.mcap", "metadata:unit.serial", log) == "7"
-    with pytest.raises(ConfigError, match="fits nothing"):
+    with pytest.raises(ConfigError, match="matches nothing"):
         robot_of("site/monday.mcap", r"(r\d+)_", log)
     with pytest.raises(ConfigError, match="has no 'name'"):
         robot_of("any.mcap", "metadata:unit.name", log)
     for wrong in ("(", "metadata:serial"):
-        with pytest.raises(ConfigError, match="--robot-from"):
+        with pytest.raises(ConfigError, match="robot_from"):
             robot_pattern(wrong)

@@ -33,7 +33,7 @@ TO_PI = [
     *(math.pi - 1e-2, math.pi - 1e-3, math.pi - 1e-4, math.pi - 1e-6, math.pi - 1e-9, math.pi),
 ]
 TO_TWO_PI = [*TO_PI, math.pi + 1e-6, 4.0, 5.0, 6.0, 2 * math.pi - 0.1, 2 * math.pi - 0.01]
-FUNCTIONS = [so3.exp, so3.right_jacobian, so3.left_jacobian, so3.right_jacobian_inverse, so3.left_jacobian_inverse]
+FUNCTIONS = [so3.exp, so3.right_jacobian, so3.right_jacobian_inverse]
 
 small_vectors = arrays(np.float64, 3, elements=st.floats(-1.8, 1.8))  # |xi| < 3.12 < pi
 any_quaternions = arrays(np.float64, 4, elements=st.floats(-1.0, 1.0)).filter(lambda q: np.linalg.norm(q) > 1e-3)
@@ -59,21 +59,19 @@ def reference(function: Callable[[Tensor], Tensor], xi: np.ndarray) -> np.ndarra
     if function is so3.exp:
         return scipy.linalg.expm(skew(xi))
     J_r = right_jacobian_by_quadrature(xi)
-    J = J_r.T if function in (so3.left_jacobian, so3.left_jacobian_inverse) else J_r
-    return np.linalg.inv(J) if function in (so3.right_jacobian_inverse, so3.left_jacobian_inverse) else J
+    return np.linalg.inv(J_r) if function is so3.right_jacobian_inverse else J_r
 
 
 @pytest.mark.parametrize("dtype", DTYPES)
-def test_hat_is_the_cross_product_and_vee_its_inverse(dtype: torch.dtype) -> None:
+def test_hat_is_the_cross_product(dtype: torch.dtype) -> None:
     a, b = torch.randn(2, 5, 4, 3, dtype=dtype, generator=torch.Generator().manual_seed(1))
     torch.testing.assert_close((so3.hat(a) @ b[..., None])[..., 0], torch.linalg.cross(a, b))
-    assert torch.equal(so3.vee(so3.hat(a)), a)
 
 
 @pytest.mark.parametrize("dtype", DTYPES)
 @pytest.mark.parametrize("function", FUNCTIONS, ids=lambda f: f.__name__)
 def test_matrices_equal_independent_ones_across_every_threshold(function: Callable, dtype: torch.dtype) -> None:
-    inverse = function in (so3.right_jacobian_inverse, so3.left_jacobian_inverse)
+    inverse = function is so3.right_jacobian_inverse
     xi, exact = sweep(TO_TWO_PI if inverse else TO_PI, dtype)
     got = function(xi)
     assert got.dtype == dtype
@@ -198,7 +196,7 @@ def test_the_right_jacobian_turns_a_change_of_the_vector_into_a_body_rotation(v:
     left = so3.exp(xi + step) @ so3.exp(xi).T
     second_order = 1e-11  # |step|² times the curvature, of order one
     assert (so3.log(right) - so3.right_jacobian(xi) @ step).abs().max() < second_order
-    assert (so3.log(left) - so3.left_jacobian(xi) @ step).abs().max() < second_order
+    assert (so3.log(left) - so3.right_jacobian(-xi) @ step).abs().max() < second_order
 
 
 @pytest.mark.parametrize("batch", [(), (0,), (7,), (2, 1, 3)])

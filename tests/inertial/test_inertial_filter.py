@@ -15,9 +15,9 @@ from imutool.inertial.inertial_filter import (
     State,
     Step,
     level,
-    move,
+    motion_step,
+    rest_step,
     smooth,
-    stand,
     update,
 )
 from imutool.inertial.preintegration import integrate
@@ -43,10 +43,10 @@ def steps(x: State, count: int = 20, seed: int = 0) -> list[Step]:
         gyro, accel = 0.5 * rng.normal(size=(101, 3)), np.array([0.0, 0.5, 9.8]) + rng.normal(size=(101, 3))
         if i % 7 == 3:
             found.append(
-                stand(x, np.concatenate([1e-3 * rng.normal(size=3), accel.mean(axis=0)]), np.full(3, 1e-8), 0.5, WALK, S)
+                rest_step(x, np.concatenate([1e-3 * rng.normal(size=3), accel.mean(axis=0)]), np.full(3, 1e-8), 0.5, WALK, S)
             )
         else:
-            found.append(move(x, integrate(t, gyro - x.bias[:3], accel - x.bias[3:]), 0.0, WALK, S))
+            found.append(motion_step(x, integrate(t, gyro - x.bias[:3], accel - x.bias[3:]), 0.0, WALK, S))
         x = found[-1].after
     return found
 
@@ -94,9 +94,9 @@ def test_a_move_is_linear_in_the_error() -> None:
     x = start(0.7).moved(np.concatenate([np.zeros(3), [0.8, -0.5, 0.3], [1.0, 2.0, -3.0], np.zeros(12)]), start().P)
 
     def expected(y: State) -> State:
-        return move(y, integrate(t, gyro - y.bias[:3], accel - y.bias[3:]), 0.0, WALK, S).expected
+        return motion_step(y, integrate(t, gyro - y.bias[:3], accel - y.bias[3:]), 0.0, WALK, S).expected
 
-    F = move(x, integrate(t, gyro - x.bias[:3], accel - x.bias[3:]), 0.0, WALK, S).F
+    F = motion_step(x, integrate(t, gyro - x.bias[:3], accel - x.bias[3:]), 0.0, WALK, S).F
     size = 1e-6
     for i in range(15):
         e = np.zeros(SIZE)
@@ -133,7 +133,7 @@ def test_smoothing_a_linear_case_is_least_squares() -> None:
     mean = [np.array([1e-3, 0.0, 0.0, 0.5, -0.3, 9.7]), np.array([2e-3, 0.0, 0.0, 0.5, -0.3, 9.7])]
     found = []
     for one in mean:
-        found.append(stand(x, one, np.full(3, 1e-8), 0.5, WALK, S))
+        found.append(rest_step(x, one, np.full(3, 1e-8), 0.5, WALK, S))
         x = found[-1].after
     q, r = WALK[0] ** 2 * 0.5 + inertial_filter.LEAST_VARIANCE, 1e-8 + S.rest_rad_s**2
     # unknown: b0, b1, b2 along x, and d

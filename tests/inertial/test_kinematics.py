@@ -10,9 +10,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.interpolate import make_interp_spline
 from scipy.spatial.transform import Rotation
+from support.rates import rates_from_poses
 
 from imutool.errors import DataError, NumericsError
-from imutool.inertial.kinematics import G_W, Trajectory, rates_from_poses, through
+from imutool.inertial.kinematics import G_W, Trajectory, fit_trajectory
 from imutool.recording import Poses
 
 START_NS = 1_700_000_000_000_000_123
@@ -29,7 +30,7 @@ def follow(
     """The spline through a motion sampled every 10 ms."""
     t = np.arange(0.0, duration_s + 1e-12, 0.01)
     t_ns = START_NS + np.round(t * 1e9).astype(np.int64)
-    return through(Poses(t_ns, p(t), np.ascontiguousarray(rotation(t).as_quat(scalar_first=True))))
+    return fit_trajectory(Poses(t_ns, p(t), np.ascontiguousarray(rotation(t).as_quat(scalar_first=True))))
 
 
 def inside(duration_s: float = 4.0) -> np.ndarray:
@@ -142,7 +143,7 @@ def test_the_spline_passes_through_its_poses_whatever_their_signs() -> None:
     p = np.stack([t, t**2, np.sin(t)], axis=1)
     signs = np.where(np.arange(len(t)) % 3 == 0, -1.0, 1.0)[:, None]
     poses = Poses(ns(t), p, np.ascontiguousarray(q * signs))
-    back = through(poses).poses(poses.t_ns)
+    back = fit_trajectory(poses).poses(poses.t_ns)
     np.testing.assert_allclose(back.p_wb, poses.p_wb, atol=EXACT)
     assert np.abs(np.abs(np.sum(back.q_wb_wxyz * poses.q_wb_wxyz, axis=1)) - 1.0).max() < EXACT
 
@@ -157,8 +158,8 @@ def test_wider_knots_smooth_the_noise_of_the_poses_away() -> None:
     def rms(trajectory: Trajectory) -> float:
         return float(np.sqrt(np.mean((trajectory.at(noisy.t_ns).a_w - truth)[50:-50] ** 2)))
 
-    assert rms(through(noisy)) > 10.0  # 1 mm over (10 ms)²: the reason smoothing exists
-    assert rms(through(noisy, knot_spacing_s=0.5)) < 0.05
+    assert rms(fit_trajectory(noisy)) > 10.0  # 1 mm over (10 ms)²: the reason smoothing exists
+    assert rms(fit_trajectory(noisy, knot_spacing_s=0.5)) < 0.05
 
 
 def test_an_instant_outside_the_trajectory_is_refused() -> None:
@@ -179,9 +180,9 @@ def test_too_few_poses_and_knots_without_poses_are_refused() -> None:
     t = np.array([0.0, 0.1, 0.2, 0.3, 0.4, 5.0, 5.1, 5.2, 5.3])
     poses = Poses(ns(t), still(t), np.tile([1.0, 0.0, 0.0, 0.0], (len(t), 1)))
     with pytest.raises(DataError, match="more than 5"):
-        through(poses.rows(slice(0, 5)))
+        fit_trajectory(poses.rows(slice(0, 5)))
     with pytest.raises(DataError, match="knots without support"):
-        through(poses, knot_spacing_s=0.1)
+        fit_trajectory(poses, knot_spacing_s=0.1)
 
 
 def test_standard_gravity_points_down_and_cannot_be_changed_by_accident() -> None:

@@ -14,9 +14,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
+from support.nees import consistency
 
 from imutool.errors import ConfigError, DataError, NumericsError
-from imutool.inertial.metrics import absolute, align, consistency, evaluate, pairs_by_distance, relative, write_tum
+from imutool.inertial.metrics import absolute, align, evaluate, pairs_by_distance, relative, write_tum
 from imutool.recording import Poses
 
 EVO_TOLERANCE = 1e-9  # measured 4e-16; the same formulas in double precision, summed in another order

@@ -6,7 +6,14 @@ import numpy as np
 import pytest
 
 from imutool.converters import euroc, fetch, tum_vi
-from imutool.inertial.stationary import StationarySettings, Stillness, in_blocks, resting, stretches, white_noise
+from imutool.inertial.stationary import (
+    OnlineRestDetector,
+    StationarySettings,
+    block_statistics,
+    rest_stretches,
+    resting_blocks,
+    white_noise,
+)
 from imutool.recording import GRAVITY_M_S2, Imu
 from imutool.sensor.flight import flight
 
@@ -29,7 +36,7 @@ def made(seconds: float, seed: int = 0) -> tuple[np.ndarray, np.ndarray, np.ndar
 
 
 def in_seconds(imu: Imu, settings: StationarySettings | None = None) -> list[tuple[float, float]]:
-    return [(a / RATE_HZ, b / RATE_HZ) for a, b in stretches(imu, settings)]
+    return [(a / RATE_HZ, b / RATE_HZ) for a, b in rest_stretches(imu, settings)]
 
 
 def test_a_resting_log_is_one_stretch_in_nearly_its_whole_length():
@@ -84,13 +91,13 @@ def test_a_steady_turn_that_disagrees_with_the_other_stretches_is_not_rest():
 
 def test_a_steady_turn_too_fast_for_a_bias_is_not_rest():
     t_ns, gyro, accel = made(10.0)
-    assert stretches(Imu(t_ns, gyro + np.array([0.0, 0.0, 0.5]), accel)) == []
+    assert rest_stretches(Imu(t_ns, gyro + np.array([0.0, 0.0, 0.5]), accel)) == []
 
 
 def test_a_gap_in_the_samples_breaks_a_stretch():
     t_ns, gyro, accel = made(10.0)
     late = t_ns + np.where(np.arange(len(t_ns)) >= 1000, 500_000_000, 0)
-    assert len(stretches(Imu(late, gyro, accel))) == 2
+    assert len(rest_stretches(Imu(late, gyro, accel))) == 2
 
 
 def test_rest_shorter_than_asked_for_is_left_out():
@@ -98,14 +105,14 @@ def test_rest_shorter_than_asked_for_is_left_out():
     t = t_ns * 1e-9
     gyro[(t < 4.0) | (t > 6.5)] += 0.3 * np.sin(2 * np.pi * 0.7 * t[(t < 4.0) | (t > 6.5)])[:, None]
     imu = Imu(t_ns, gyro, accel)
-    assert len(stretches(imu)) == 1
-    assert stretches(imu, StationarySettings(min_s=3.0)) == []
+    assert len(rest_stretches(imu)) == 1
+    assert rest_stretches(imu, StationarySettings(min_s=3.0)) == []
 
 
 @pytest.mark.parametrize("count", [0, 1, 2, 100])
 def test_a_log_shorter_than_a_window_has_no_stretches(count):
     t_ns, gyro, accel = made(1.0)
-    assert stretches(Imu(t_ns[:count], gyro[:count], accel[:count])) == []
+    assert rest_stretches(Imu(t_ns[:count], gyro[:count], accel[:count])) == []
 
 
 def test_a_stuck_sensor_does_not_hide_the_real_rest():
@@ -131,21 +138,21 @@ def truth_labels(recording):
 
 @pytest.mark.parametrize(("place", "module"), [("euroc", euroc), ("fetch", fetch), ("tumvi", tum_vi)])
 def test_rest_agrees_with_the_true_poses_of_the_real_recordings(data, place, module):
-    found_known = wrong = hit = resting = 0
+    found_known = wrong = hit = resting_blocks = 0
     for recording in module.read(data / place):
         rest, motion, known = truth_labels(recording)
         found = np.zeros(len(recording.imu), bool)
-        for a, b in stretches(recording.imu):
+        for a, b in rest_stretches(recording.imu):
             found[a:b] = True
         found_known += int((found & known).sum())
         wrong += int((found & motion).sum())
         hit += int((found & rest).sum())
-        resting += int(rest.sum())
+        resting_blocks += int(rest.sum())
     if place == "tumvi":  # carried in the hand from the first sample to the last
         assert found_known == 0
     else:
         assert 1.0 - wrong / found_known > MIN_PRECISION
-        assert hit / resting > MIN_RECALL
+        assert hit / resting_blocks > MIN_RECALL
 
 
 def test_white_noise_is_found_under_the_motion() -> None:
@@ -163,7 +170,7 @@ def test_white_noise_is_found_under_the_motion() -> None:
 
 
 def told(gyro: np.ndarray, accel: np.ndarray, block: int = 100) -> list[bool]:
-    still = Stillness()
+    still = OnlineRestDetector()
     return [still(gyro[a : a + block], accel[a : a + block]) for a in range(0, len(gyro) - block + 1, block)]
 
 
@@ -185,7 +192,7 @@ def test_what_it_says_depends_on_nothing_later():
 
 def test_missing_samples_and_short_blocks_begin_it_anew():
     _, gyro, accel = made(4.0)
-    still = Stillness()
+    still = OnlineRestDetector()
     answers = [still(gyro[a : a + 100], accel[a : a + 100], whole=a != 400) for a in range(0, 800, 100)]
     assert answers == [False, False, True, True, False, False, False, True]
     assert not any(told(gyro, accel, block=5))
@@ -198,7 +205,7 @@ def test_it_agrees_with_the_whole_log_on_real_recordings(data):
         imu = recording.imu
         block = round(0.5 / imu.period_s)
         mask = np.zeros(len(imu), bool)
-        for a, b in stretches(imu):
+        for a, b in rest_stretches(imu):
             mask[a:b] = True
         share = np.array([mask[a : a + block].mean() for a in range(0, len(imu) - block + 1, block)])
         found = np.array(told(imu.gyro, imu.accel, block))
@@ -215,9 +222,9 @@ def test_the_borders_of_batches_change_nothing(size):
     t_ns = t_ns + np.where(t_ns > 10_000_000_000, 700_000_000, 0)
     imu = Imu(t_ns, gyro, accel)
     parts = [slice(first, first + size) for first in range(0, len(imu), size)]
-    streamed = in_blocks(((t_ns[part], gyro[part], accel[part]) for part in parts), imu.period_s)
-    whole = in_blocks([(t_ns, gyro, accel)], imu.period_s)
+    streamed = block_statistics(((t_ns[part], gyro[part], accel[part]) for part in parts), imu.period_s)
+    whole = block_statistics([(t_ns, gyro, accel)], imu.period_s)
     for ours, theirs in zip(streamed, whole, strict=True):
         np.testing.assert_array_equal(ours, theirs)
-    assert [(a * whole.k, b * whole.k) for a, b in resting(streamed)] == stretches(imu)
-    assert len(stretches(imu)) == 3
+    assert [(a * whole.k, b * whole.k) for a, b in resting_blocks(streamed)] == rest_stretches(imu)
+    assert len(rest_stretches(imu)) == 3

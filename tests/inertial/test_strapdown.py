@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from imutool.errors import DataError, NumericsError
 from imutool.inertial.metrics import absolute
-from imutool.inertial.strapdown import GRAVITY_W, Start, dead_reckon, drift, drifted, truth_velocity
+from imutool.inertial.strapdown import GRAVITY_W, StartPose, dead_reckon, drift, truth_velocity, window_drift
 from imutool.recording import Imu, Poses, unit_quaternions
 
 RATE_NS = 5_000_000
@@ -23,7 +23,7 @@ LOOP_TOLERANCE = 1e-9  # both round once a sample; the prefix product in another
 PUBLISHED_TOLERANCE_DEG = 0.1
 BUDGET_S = 0.05
 
-LEVEL = Start(np.array([1.0, 0.0, 0.0, 0.0]), np.zeros(3), np.zeros(3))
+LEVEL = StartPose(np.array([1.0, 0.0, 0.0, 0.0]), np.zeros(3), np.zeros(3))
 
 
 def made_up(n: int, seed: int = 0) -> Imu:
@@ -40,7 +40,7 @@ def steady(n: int, gyro: tuple[float, ...], accel: tuple[float, ...]) -> Imu:
 @pytest.mark.parametrize("n", [1, 2, 3, 4, 5, 7, 8, 9, 1000])
 def test_integration_is_the_papers_euler_loop(n: int) -> None:
     imu = made_up(n)
-    start = Start(np.array([0.5, -0.5, 0.5, 0.5]), np.array([1.0, 2.0, 3.0]), np.array([0.1, -0.2, 0.3]))
+    start = StartPose(np.array([0.5, -0.5, 0.5, 0.5]), np.array([1.0, 2.0, 3.0]), np.array([0.1, -0.2, 0.3]))
     R, p, v = Rotation.from_quat(start.q_wb_wxyz, scalar_first=True), start.p_wb, start.v_w
     gyro, accel = imu.gyro.copy(), imu.accel.copy()  # scipy wants them writeable
     got = dead_reckon(imu, start)
@@ -93,7 +93,7 @@ def test_a_sample_acts_on_later_poses_only() -> None:
 
 
 def test_other_gravity_and_unnormalised_start_are_taken_as_given() -> None:
-    start = Start(np.array([2.0, 0, 0, 0]), np.zeros(3), np.zeros(3))
+    start = StartPose(np.array([2.0, 0, 0, 0]), np.zeros(3), np.zeros(3))
     moon = dead_reckon(steady(201, (0, 0, 0), (0, 0, 1.62)), start, g_w=(0.0, 0.0, -1.62))
     assert np.abs(moon.p_wb).max() < LOOP_TOLERANCE
     assert np.array_equal(moon.q_wb_wxyz[-1], [1, 0, 0, 0])
@@ -115,15 +115,15 @@ def turned_away(n: int, seed: int) -> tuple[Imu, Poses, Poses]:
     """Samples, what they integrate to from a start of their own, and another motion on the same stamps as the truth."""
     imu, other = made_up(n, seed), made_up(n, seed + 1)
     truth = dead_reckon(Imu(imu.t_ns, other.gyro, other.accel), LEVEL)
-    return imu, dead_reckon(imu, Start(np.array([0.1, 0.7, -0.1, 0.7]), np.array([5.0, 6.0, 7.0]), np.ones(3))), truth
+    return imu, dead_reckon(imu, StartPose(np.array([0.1, 0.7, -0.1, 0.7]), np.array([5.0, 6.0, 7.0]), np.ones(3))), truth
 
 
 def test_one_integration_tells_where_each_from_the_truth_would_have_ended() -> None:
     imu, path, truth = turned_away(2000, 3)
     first, last = np.array([0, 17, 500, 1999]), np.array([1999, 18, 1300, 1999])
-    got = drifted(path, truth, first, last)
+    got = window_drift(path, truth, first, last)
     for row, (a, b) in enumerate(zip(first, last, strict=True)):
-        again = dead_reckon(imu.rows(slice(a, b + 1)), Start.of(truth, int(a)))
+        again = dead_reckon(imu.rows(slice(a, b + 1)), StartPose.of(truth, int(a)))
         assert again.v_w is not None
         assert truth.v_w is not None
         turns = [Rotation.from_quat(q.copy(), scalar_first=True) for q in (truth.q_wb_wxyz[b], again.q_wb_wxyz[-1])]
@@ -152,9 +152,9 @@ def test_paths_of_other_stamps_or_without_velocity_have_no_drift() -> None:
     _, path, truth = turned_away(50, 7)
     rows = np.array([0]), np.array([9])
     with pytest.raises(DataError, match="do not match"):
-        drifted(path, truth.rows(slice(0, 40)), *rows)
+        window_drift(path, truth.rows(slice(0, 40)), *rows)
     with pytest.raises(DataError, match="do not match"):
-        drifted(path, Poses(truth.t_ns, truth.p_wb, truth.q_wb_wxyz), *rows)
+        window_drift(path, Poses(truth.t_ns, truth.p_wb, truth.q_wb_wxyz), *rows)
 
 
 def test_overflow_and_missing_samples_are_refused() -> None:
@@ -168,11 +168,11 @@ def test_overflow_and_missing_samples_are_refused() -> None:
 def test_a_start_needs_a_velocity_and_a_row() -> None:
     poses = Poses(np.array([0, 1], np.int64), np.ones((2, 3)), np.tile([1.0, 0, 0, 0], (2, 1)))
     with pytest.raises(DataError, match="no velocity"):
-        Start.of(poses)
+        StartPose.of(poses)
     moving = Poses(poses.t_ns, poses.p_wb, poses.q_wb_wxyz, np.full((2, 3), 2.0))
-    assert np.array_equal(Start.of(moving, -1).v_w, [2, 2, 2])
+    assert np.array_equal(StartPose.of(moving, -1).v_w, [2, 2, 2])
     with pytest.raises(DataError, match="no row 2"):
-        Start.of(moving, 2)
+        StartPose.of(moving, 2)
 
 
 # --- velocity of the truth ---------------------------------------------------------------------------------------------
@@ -277,7 +277,7 @@ def test_raw_integration_from_the_true_start_gives_the_published_error(data: Pat
     imu = imu.between(int(truth.t_ns[0]), int(truth.t_ns[-1]))
     true, valid = truth.at(imu.t_ns)
     assert valid[0]
-    figures = absolute(dead_reckon(imu, Start.of(true)), true, valid)
+    figures = absolute(dead_reckon(imu, StartPose.of(true)), true, valid)
     assert figures["aoe_deg"] == pytest.approx(published_deg, abs=PUBLISHED_TOLERANCE_DEG)
     if name == "MH_04_difficult":
         assert (len(imu), round(imu.duration_s, 1)) == (19753, 98.8)
@@ -293,5 +293,5 @@ def test_v1_01_gives_the_published_error_against_its_recomputed_truth_once_their
     imu = imu.between(int(truth.t_ns[0]), int(truth.t_ns[-1]))
     true, valid = other.at(imu.t_ns)
     assert valid.all()
-    figures = absolute(dead_reckon(imu, Start(true.q_wb_wxyz[0], true.p_wb[0], np.zeros(3))), true, valid)
+    figures = absolute(dead_reckon(imu, StartPose(true.q_wb_wxyz[0], true.p_wb[0], np.zeros(3))), true, valid)
     assert figures["aoe_deg"] == pytest.approx(113.47, abs=PUBLISHED_TOLERANCE_DEG)

@@ -10,12 +10,12 @@ from hypothesis import strategies as st
 from imutool.geometry import so3
 from imutool.inertial.windows import (
     attitudes,
-    between,
     end_attitude,
     huber,
     huber_weight,
     rotation_residual,
     running_product,
+    step_means,
     velocity_residual,
     whole_product,
 )
@@ -116,7 +116,7 @@ def test_the_rotation_residuals_derivative_is_exact_where_the_steps_are_small() 
         change = torch.randn(1, 9, 3, generator=torch.Generator().manual_seed(6), dtype=torch.float64)
         ahead, behind = (rotation_residual(gyro + s * STEP * change, dt * shrink, R_true)[0] for s in (1, -1))
         _, A = rotation_residual(gyro, dt * shrink, R_true)
-        linear = -(A @ between(change)[..., None]).sum(1)[..., 0]
+        linear = -(A @ step_means(change)[..., None]).sum(1)[..., 0]
         missed.append(float(((ahead - behind) / (2 * STEP) - linear).norm() / linear.norm()))
     assert missed[0] < 0.02
     assert missed[1] == pytest.approx(missed[0] / 10, rel=0.3)

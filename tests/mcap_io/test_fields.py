@@ -19,7 +19,7 @@ from rosbags.typesys import Stores, get_typestore
 from imutool.diagnosis.scalar.diagnose import diagnose_signal
 from imutool.errors import LogError
 from imutool.mcap_io.codec import ros2_definition
-from imutool.mcap_io.fields import numeric_fields, others, read_field, read_fields
+from imutool.mcap_io.fields import numeric_fields, others, read_field
 from imutool.mcap_io.log import Log
 
 START_NS = 1_700_000_000_123_456_789
@@ -91,7 +91,8 @@ def test_numbers_come_back_bit_for_bit_with_the_headers_stamps(
     robot: tuple[Path, np.ndarray, np.ndarray, np.ndarray],
 ) -> None:
     path, twist, position, effort = robot
-    found = read_fields(path, ["/odom.twist.twist.angular.z", "/joint_states.position[2]", "/joint_states.effort[0]"])
+    signals = ["/odom.twist.twist.angular.z", "/joint_states.position[2]", "/joint_states.effort[0]"]
+    found = {signal: read_field(path, signal) for signal in signals}
     stamps = START_NS + PERIOD_NS * np.arange(COUNT)
     assert np.array_equal(found["/odom.twist.twist.angular.z"].t_ns, stamps)
     assert np.array_equal(found["/odom.twist.twist.angular.z"].values, twist[:, 5])
@@ -157,7 +158,7 @@ def test_every_kind_of_number_lies_where_the_other_library_writes_it(
         writer.write_message("/every", schema, dict(zip(names, row, strict=True)), log_time=START_NS)
         writer.finish()
     numbers = [name for name in names if name != "s"]
-    found = read_fields(path, [f"/every.{name}" for name in numbers])
+    found = {f"/every.{name}": read_field(path, f"/every.{name}") for name in numbers}
     assert [found[f"/every.{name}"].values[0] for name in numbers] == [
         float(value) for name, value in zip(names, row, strict=True) if name != "s"
     ]

@@ -215,7 +215,7 @@ def test_chunks_of_other_topics_are_not_unpacked(recording: Recording, tmp_path:
     unpack, seen = LogIndex.unpack, []
     monkeypatch.setattr(LogIndex, "unpack", lambda self, block: (seen.append(block), unpack(self, block))[1])
     with Log(path) as log:
-        blocks = log.structure.blocks
+        blocks = log.index.blocks
         (imu,) = log.channel_ids("/imu0")
         for _ in log.imu_batches("/imu0"):
             pass
@@ -261,7 +261,7 @@ def test_a_log_cut_anywhere_is_refused_with_the_byte(foreign: Foreign, flight: l
 def test_a_cut_log_says_inside_which_record(foreign: Foreign, flight: list[Message]) -> None:
     path = foreign(flight)
     with Log(path) as log:
-        chunk = log.structure.blocks[1]
+        chunk = log.index.blocks[1]
     path.write_bytes(path.read_bytes()[: chunk.offset + 5000])
     expected = rf"byte {chunk.offset + 5000}, inside the Chunk record that begins at byte {chunk.offset}; .*imutool repair"
     with pytest.raises(LogError, match=expected):
@@ -273,7 +273,7 @@ def test_a_flipped_bit_in_any_chunk_is_found(foreign: Foreign, flight: list[Mess
     path = foreign(flight, layout)
     whole = bytearray(path.read_bytes())
     with Log(path) as log:
-        blocks = log.structure.blocks
+        blocks = log.index.blocks
     assert len(blocks) > 2
     for block in blocks:
         damaged = whole.copy()
@@ -307,7 +307,7 @@ def test_random_damage_is_refused_or_harmless_but_never_a_traceback(
 def test_a_chunk_that_claims_to_unpack_to_an_enormous_size_is_refused(foreign: Foreign, flight: list[Message]) -> None:
     path = foreign(flight, "no-summary")
     with Log(path) as log:
-        block = log.structure.blocks[0]
+        block = log.index.blocks[0]
     whole = bytearray(path.read_bytes())
     whole[block.offset + 25 : block.offset + 33] = (2**62).to_bytes(8, "little")
     path.write_bytes(whole)
@@ -324,7 +324,7 @@ def test_a_log_without_imu_lists_its_topics(foreign: Foreign, make: Make) -> Non
 
 def test_several_imus_are_listed(foreign: Foreign, make: Make) -> None:
     path = foreign(imu_messages(make, "/left") + imu_messages(make, "/right"))
-    with pytest.raises(LogError, match=r"2 IMU topics: /left, /right. Choose one with --imu"):
+    with pytest.raises(LogError, match=r"2 IMU topics: /left, /right. Choose one with `imu`"):
         read(path)
     assert read(path, imu="/right").imu_topic == "/right"
 

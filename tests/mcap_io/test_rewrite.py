@@ -17,16 +17,15 @@ from mcap.stream_reader import StreamReader
 from rosbags.highlevel import AnyReader
 
 from imutool.errors import ConfigError, LogError
-from imutool.mcap_io.added_topics import Made, NewTopic
-from imutool.mcap_io.batches import Clock, ImuBatch
+from imutool.mcap_io.added_topics import DerivedBatch, NewTopic
 from imutool.mcap_io.codec import schemas as schema
 from imutool.mcap_io.codec.decode import decode_imu
 from imutool.mcap_io.codec.encode import encode_imu, encode_vector3
 from imutool.mcap_io.log import Log
 from imutool.mcap_io.read import read
 from imutool.mcap_io.rewrite import rewrite
-from imutool.mcap_io.storage.digest import sha256
-from imutool.mcap_io.topics import DERIVED_KEY
+from imutool.mcap_io.storage.source import sha256
+from imutool.mcap_io.topics import DERIVED_KEY, ImuBatch, StampCheck
 from imutool.mcap_io.verify import verify
 from imutool.mcap_io.write import write
 from imutool.recording import Imu, Recording
@@ -48,14 +47,14 @@ class Debias:
             NewTopic(f"{source_topic}/bias/gyro", schema.VECTOR3),
         ]
         self.stamps: list[int] = []
-        self.clock = Clock()
+        self.clock = StampCheck()
 
-    def __call__(self, batch: ImuBatch) -> Made:
-        self.clock.take(batch)
+    def __call__(self, batch: ImuBatch) -> DerivedBatch:
+        self.clock.check_imu(batch)
         self.stamps += batch.stamp_ns.tolist()
         bias = np.tile(BIAS, (len(batch.stamp_ns), 1))
         imu = encode_imu(batch.stamp_ns, batch.gyro - bias, batch.accel, batch.frame_id)
-        return Made(batch, [imu, encode_vector3(batch.stamp_ns, bias, batch.frame_id)])
+        return DerivedBatch(batch, [imu, encode_vector3(batch.stamp_ns, bias, batch.frame_id)])
 
 
 def digest(path: Path, topics: set[str] | None = None) -> dict[str, str]:
@@ -140,9 +139,9 @@ def test_the_summary_indexes_everything(source: Path, tmp_path: Path) -> None:
 def check_message_indexes(path: Path, index: ChunkIndex) -> None:
     """Each entry of each message index leads to a message of its channel and time, and none is missing."""
     with Log(path) as log:
-        block = next(b for b in log.structure.blocks if b.offset == index.chunk_start_offset)
-        found = log.structure.unpack(block)
-        listed = {(c, int(t), int(o)) for c in block.indexes for t, o in log.structure.index(block, c)}
+        block = next(b for b in log.index.blocks if b.offset == index.chunk_start_offset)
+        found = log.index.unpack(block)
+        listed = {(c, int(t), int(o)) for c in block.indexes for t, o in log.index.entries(block, c)}
         actual = zip(found.heads["channel"].tolist(), found.heads["log_time"].tolist(), found.offsets.tolist(), strict=True)
         assert listed == set(actual)
         assert (index.message_start_time, index.message_end_time) == (found.times().min(), found.times().max())
@@ -305,7 +304,7 @@ def test_memory_does_not_grow_with_the_log(tmp_path: Path) -> None:
 def test_a_new_topic_that_is_there_already_is_refused(foreign: Foreign, flight: Messages, tmp_path: Path) -> None:
     once = tmp_path / "once.mcap"
     rewrite(foreign(flight), once, [Debias("/imu/data")], metadata={})
-    with pytest.raises(LogError, match=r"/imu/data/debiased is in this log already; .*--imu.*original log"):
+    with pytest.raises(LogError, match=r"/imu/data/debiased is in this log already; .*`imu`.*original log"):
         rewrite(once, tmp_path / "twice.mcap", [Debias("/imu/data")], metadata={})
     assert not (tmp_path / "twice.mcap").exists()
 
@@ -333,7 +332,7 @@ def test_a_source_topic_that_is_not_there_is_refused(foreign: Foreign, flight: M
 def test_a_corrupt_chunk_is_found_even_of_another_topic_and_nothing_is_left(source: Path, tmp_path: Path) -> None:
     whole = source.read_bytes()
     with Log(source) as log:
-        blocks = log.structure.blocks
+        blocks = log.index.blocks
     folder = tmp_path / "out"
     folder.mkdir()
     for block in blocks:
@@ -369,7 +368,7 @@ def test_verify_finds_a_changed_byte_and_a_missing_message(recording: Recording,
     path = tmp_path / "log.mcap"
     write(recording, path)
     with Log(path) as log:
-        counts, blocks = log.structure.counts(), log.structure.blocks
+        counts, blocks = log.index.counts(), log.index.blocks
     verify(path, counts)
     with pytest.raises(LogError, match=rf"the copy has {sum(counts.values())} messages"):
         verify(path, counts | {1: counts[1] + 1})

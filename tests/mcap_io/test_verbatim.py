@@ -25,16 +25,15 @@ from mcap.stream_reader import StreamReader
 from mcap.writer import CompressionType, IndexType, Writer
 
 from imutool.errors import ConfigError, DataError, LogError
-from imutool.mcap_io.added_topics import Made, NewTopic
-from imutool.mcap_io.batches import ImuBatch
+from imutool.mcap_io.added_topics import DerivedBatch, NewTopic
 from imutool.mcap_io.codec import schemas
 from imutool.mcap_io.codec.encode import encode_imu
-from imutool.mcap_io.codec.records import message_rows
+from imutool.mcap_io.codec.messages import message_rows
 from imutool.mcap_io.log import Log
 from imutool.mcap_io.rewrite import rewrite
 from imutool.mcap_io.storage import target
-from imutool.mcap_io.storage.digest import Digest, sha256
-from imutool.mcap_io.storage.source import Source
+from imutool.mcap_io.storage.source import Digest, Source, sha256
+from imutool.mcap_io.topics import ImuBatch
 from imutool.mcap_io.verify import Verified, verify
 from imutool.mcap_io.write import write
 from imutool.mcap_io.writer import Chunk, LogWriter
@@ -52,8 +51,8 @@ class Half:
         self.source_topic = source_topic
         self.topics = [NewTopic(f"{source_topic}/half", schemas.IMU)]
 
-    def __call__(self, batch: ImuBatch) -> Made:
-        return Made(batch, [encode_imu(batch.stamp_ns, 0.5 * batch.gyro, batch.accel, batch.frame_id)])
+    def __call__(self, batch: ImuBatch) -> DerivedBatch:
+        return DerivedBatch(batch, [encode_imu(batch.stamp_ns, 0.5 * batch.gyro, batch.accel, batch.frame_id)])
 
 
 def data_records(path: Path) -> list[tuple[int, bytes]]:
@@ -157,9 +156,9 @@ def test_any_log_passes_through_and_gains_its_channels(
     assert report.copied == len(rows)
     assert report.added == {f"{d.source_topic}/half": sum(row[0] == d.source_topic for row in rows) for d in derived}
     with Log(copy) as log:
-        verify(copy, log.structure.counts())
-        assert report.verified == Verified(check, report.verified.chunks_checked, len(log.structure.blocks))
-        assert log.structure.vouched
+        verify(copy, log.index.counts())
+        assert report.verified == Verified(check, report.verified.chunks_checked, len(log.index.blocks))
+        assert log.index.definitions_known
 
 
 # ── however the bytes go ─────────────────────────────────────────────────────────────────────────────────────────────
@@ -184,7 +183,7 @@ def without_a_number(_: object) -> None:
 def without_data_crc(path: Path) -> None:
     """Takes out the CRC of the data section, which most recorders leave out too."""
     with Log(path) as log:
-        at = log.structure.data_end + 9
+        at = log.index.data_end + 9
     whole = bytearray(path.read_bytes())
     whole[at : at + 4] = bytes(4)
     path.write_bytes(whole)
@@ -292,7 +291,7 @@ def test_the_data_crc_is_stated_where_the_source_states_one(recording: Recording
             stated = next(r.data_section_crc for r in StreamReader(file).records if type(r).__name__ == "DataEnd")
         assert bool(stated) == states
         with Log(out) as log:
-            verify(out, log.structure.counts())
+            verify(out, log.index.counts())
 
 
 # ── what is checked ──────────────────────────────────────────────────────────────────────────────────────────────────
@@ -302,13 +301,13 @@ def image_chunk(path: Path) -> int:
     """A byte inside the packed data of a chunk of images."""
     with Log(path) as log:
         ids = log.channel_ids("/cam0/image_raw/compressed")
-        block = next(b for b in log.structure.blocks if not ids.isdisjoint(b.indexes))
+        block = next(b for b in log.index.blocks if not ids.isdisjoint(b.indexes))
     return block.offset + block.length - 1000
 
 
 def test_a_chunk_that_is_not_looked_into_is_not_called_checked(source: Path, tmp_path: Path) -> None:
     with Log(source) as log:
-        chunks, imu = len(log.structure.blocks), sum(b.holds(log.channel_ids("/imu0")) for b in log.structure.blocks)
+        chunks, imu = len(log.index.blocks), sum(b.may_hold(log.channel_ids("/imu0")) for b in log.index.blocks)
     reports = {
         check: rewrite(source, tmp_path / f"{check}.mcap", [Half("/imu0")], metadata={}, check=check).verified
         for check in ("all", "imu", "none")
@@ -328,7 +327,7 @@ def test_all_finds_the_damage_that_the_others_pass_on(source: Path, tmp_path: Pa
     with pytest.raises(LogError, match="the chunk at byte"):
         rewrite(source, tmp_path / "all.mcap", [Half("/imu0")], metadata={}, check="all")
     assert not (tmp_path / "all.mcap").exists()
-    with pytest.raises(ConfigError, match="--verify: 'some'; expected all, imu, none"):
+    with pytest.raises(ConfigError, match="check: 'some'; expected all, imu, none"):
         rewrite(source, tmp_path / "some.mcap", [], metadata={}, check="some")
 
 
@@ -338,7 +337,7 @@ def test_no_byte_of_the_indexes_and_the_summary_can_change_unseen(source: Path, 
     path = tmp_path / "out.mcap"
     rewrite(source, path, [Half("/imu0")], metadata={"imutool": {}})
     with Log(path) as log:
-        counts, blocks, start = log.structure.counts(), log.structure.blocks, log.structure.footer.summary_start
+        counts, blocks, start = log.index.counts(), log.index.blocks, log.index.footer.summary_start
     whole = path.read_bytes()
     places = [at for b in blocks for at in range(b.offset, b.offset + 9)]
     if check == "all":
@@ -427,7 +426,7 @@ def test_in_place_of_a_log_that_grows_is_refused(source: Path, tmp_path: Path) -
 KILLED = """
 import os, signal, sys
 from pathlib import Path
-from imutool.mcap_io import target
+from imutool.mcap_io.storage import target
 from imutool.mcap_io.rewrite import rewrite
 place, count = sys.argv[2], int(sys.argv[3])
 
@@ -500,7 +499,7 @@ def test_a_file_that_shrinks_has_no_digest(tmp_path: Path, threads: None, monkey
     with Digest(path) as digest:
         assert digest.result()
     monkeypatch.setattr(
-        "imutool.mcap_io.storage.digest.Source.at", lambda self, at, n: (_ for _ in ()).throw(LogError("cut short"))
+        "imutool.mcap_io.storage.source.Source.at", lambda self, at, n: (_ for _ in ()).throw(LogError("cut short"))
     )
     with Digest(path) as digest, pytest.raises(LogError, match="x: cut short"):
         digest.result()

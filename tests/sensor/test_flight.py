@@ -8,11 +8,11 @@ import msgspec
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from support.rates import rates_from_poses
 
 from imutool import config
 from imutool.errors import ConfigError
-from imutool.inertial.kinematics import rates_from_poses
-from imutool.inertial.strapdown import Start, dead_reckon
+from imutool.inertial.strapdown import StartPose, dead_reckon
 from imutool.recording import Recording, seconds
 from imutool.sensor.flight import ACCEL_BIAS, GYRO_BIAS, FlightSettings, TriadSettings, flight, trajectory
 
@@ -87,7 +87,7 @@ def errors(rate_hz: float) -> tuple[float, float]:
     """Largest orientation (rad) and position (m) error of dead reckoning a perfect IMU over 10 s."""
     settings = perfect(duration_s=10.0, rate_hz=rate_hz)
     imu, exact = flight(4, settings).imu, trajectory(4, settings).poses(flight(4, settings).imu.t_ns)
-    reckoned = dead_reckon(imu, Start.of(exact))
+    reckoned = dead_reckon(imu, StartPose.of(exact))
     true, found = (Rotation.from_quat(poses.q_wb_wxyz, scalar_first=True) for poses in (exact, reckoned))
     return float((true.inv() * found).magnitude().max()), float(np.linalg.norm(reckoned.p_wb - exact.p_wb, axis=1).max())
 

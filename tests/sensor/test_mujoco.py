@@ -8,7 +8,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from imutool.inertial.kinematics import through
+from imutool.inertial.kinematics import fit_trajectory
 from imutool.recording import Poses
 from imutool.sensor.trajectory import smooth_motion
 
@@ -93,7 +93,7 @@ def test_the_motion_is_worth_it(runs: dict[str, Run], name: str) -> None:
 def test_kinematics_reads_what_its_sensors_read(runs: dict[str, Run], name: str) -> None:
     run = runs[name]
     inner = slice(50, -50)  # a spline through points rings at its ends
-    motion = through(run.poses).at(run.poses.t_ns[inner])
+    motion = fit_trajectory(run.poses).at(run.poses.t_ns[inner])
     np.testing.assert_allclose(motion.omega_b, run.gyro[inner], rtol=0, atol=GYRO)
     np.testing.assert_allclose(motion.specific_force(), run.accel[inner], rtol=0, atol=ACCEL[name])
 
@@ -102,7 +102,7 @@ def test_kinematics_reads_what_its_sensors_read(runs: dict[str, Run], name: str)
 def test_a_smoothed_motion_feels_what_its_sensors_read(runs: dict[str, Run], name: str) -> None:
     run = runs[name]
     motion = smooth_motion(run.poses)
-    (felt,) = motion.felt(1.0 / (STEP_S * EACH))
+    (felt,) = motion.ideal_motions(1.0 / (STEP_S * EACH))
     rows = np.round(felt.t_s / (STEP_S * EACH)).astype(int)
     for ours, theirs, usual, worst in (
         (felt.gyro, run.gyro[rows], SMOOTH_GYRO, WORST_GYRO),

@@ -22,10 +22,10 @@ from imutool.mcap_io.writer import LogWriter
 from imutool.noise import datasheet as noises
 from imutool.recording import GRAVITY_M_S2, Imu, Poses, Recording, Scalars, seconds
 from imutool.sensor import catalogue
-from imutool.sensor.effect import Effect, Stage, Theta
+from imutool.sensor.effect import Effect, Stage, Theta, simulate_stretches
 from imutool.sensor.physics_file import PhysicsFile
 from imutool.sensor.samples import SensorSamples
-from imutool.sensor.simulate import MOTION_TOPIC, read_all, simulate, simulated
+from imutool.sensor.simulate import MOTION_TOPIC, simulate, simulated
 
 START_NS = 1_700_000_000_000_000_123
 RATE_HZ = 200.0
@@ -130,8 +130,8 @@ def planted(name: str, stage: Stage, forward: Callable[..., object]) -> tuple[Ef
 def test_effects_act_in_the_order_of_their_stages() -> None:
     """A scale before a bias, whatever order they come in, and a shift of the clock before both."""
     scale = planted("a_scale", Stage.MOTION, lambda felt, _: replace(felt, accel=3.0 * felt.accel))
-    bias = planted("b_bias", Stage.SENSOR, lambda read, _: read.but(accel=read.accel + 1.0))
-    clip = planted("saturation", Stage.CONVERTER, lambda read, _: read.but(accel=np.minimum(read.accel, 10.0)))
+    bias = planted("b_bias", Stage.SENSOR, lambda read, _: read.with_readings(accel=read.accel + 1.0))
+    clip = planted("saturation", Stage.CONVERTER, lambda read, _: read.with_readings(accel=np.minimum(read.accel, 10.0)))
     imu = along(resting(), [clip, bias, scale]).imu
     up = Rotation.from_euler("ZYX", [0.4, 0.3, -0.2]).inv().apply([0.0, 0.0, GRAVITY_M_S2])
     np.testing.assert_allclose(imu.accel, np.tile(np.minimum(3.0 * up + 1.0, 10.0), (len(imu), 1)), atol=3 * ACCEL)
@@ -139,7 +139,7 @@ def test_effects_act_in_the_order_of_their_stages() -> None:
 
 def test_noise_comes_before_the_converter() -> None:
     rounded = planted(
-        "quantization", Stage.CONVERTER, lambda read, _: read.but(np.round(read.gyro, 2), np.round(read.accel, 1))
+        "quantization", Stage.CONVERTER, lambda read, _: read.with_readings(np.round(read.gyro, 2), np.round(read.accel, 1))
     )
     imu = simulated(recording(resting()), [rounded], noises.SHEETS["adis16448"], RATE_HZ, 3).recording.imu
     np.testing.assert_allclose(imu.accel * 10.0, np.round(imu.accel * 10.0), atol=1e-9)
@@ -158,7 +158,7 @@ def test_the_clock_and_the_sensor_know_of_no_holes() -> None:
     hole = (T > 2.8) & (T < 3.3)
     broken = Poses(truth.t_ns[~hole], truth.p_wb[~hole], truth.q_wb_wxyz[~hole])
     drift = planted(
-        "drift", Stage.SENSOR, lambda read, _: read.but(gyro=(read.stamp_s - read.stamp_s[0])[:, None] * np.ones(3))
+        "drift", Stage.SENSOR, lambda read, _: read.with_readings(gyro=(read.stamp_s - read.stamp_s[0])[:, None] * np.ones(3))
     )
     out = along(broken, [drift])
     t = elapsed(out.imu)
@@ -228,10 +228,14 @@ def test_the_truth_is_copied_and_the_exact_motion_lies_beside_it() -> None:
 
 
 def test_several_stretches_are_read_as_one_sensor() -> None:
-    felts = [f for part in (resting(), turning()) for f in simulated(recording(part), [], NONE, RATE_HZ, 0).motion.felt(400.0)]
+    felts = [
+        f
+        for part in (resting(), turning())
+        for f in simulated(recording(part), [], NONE, RATE_HZ, 0).motion.ideal_motions(400.0)
+    ]
     second = replace(felts[1], t_s=felts[1].t_s + 10.0)
     stamps = [felts[0].t_s[::2], second.t_s[::2]]
-    out = read_all([felts[0], second], stamps, [])
+    out = simulate_stretches([felts[0], second], stamps, [])
     assert isinstance(out, SensorSamples)
     np.testing.assert_array_equal(out.stamp_s, np.concatenate(stamps))
     np.testing.assert_allclose(out.gyro[:, 2], np.where(out.stamp_s < 8.0, 0.0, 2.0), atol=GYRO)
@@ -303,7 +307,7 @@ def test_less_than_two_seconds_are_refused() -> None:
 
 @pytest.mark.parametrize("rate_hz", [0.0, 9.0, 1e5, float("nan")])
 def test_an_absurd_rate_is_refused(rate_hz: float) -> None:
-    with pytest.raises(ConfigError, match="--rate: a rate of"):
+    with pytest.raises(ConfigError, match="rate_hz: a rate of"):
         simulated(recording(circling()), [], NONE, rate_hz, 0)
 
 

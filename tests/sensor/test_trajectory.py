@@ -1,4 +1,4 @@
-"""Smoothed poses: how near rate and force come to the exact ones, and that nothing is invented where nothing is known."""
+"""SmoothMotion poses: how near rate and force come to the exact ones, and that nothing is invented where nothing is known."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from imutool.errors import ConfigError, DataError
 from imutool.inertial.kinematics import Trajectory
 from imutool.recording import Poses
 from imutool.sensor.flight import FlightSettings, trajectory
-from imutool.sensor.trajectory import MAX_GAP_S, Smoothed, smooth_motion
+from imutool.sensor.trajectory import MAX_GAP_S, SmoothMotion, smooth_motion
 
 DURATION_S = 30.0
 DEG = np.pi / 180.0
@@ -46,10 +46,10 @@ def turned(q_wb_wxyz: np.ndarray, by: np.ndarray) -> np.ndarray:
     return np.ascontiguousarray(both.as_quat(scalar_first=True))
 
 
-def errors(motion: Smoothed, path: Trajectory) -> tuple[Float64[np.ndarray, "n 3"], Float64[np.ndarray, "n 3"]]:
+def errors(motion: SmoothMotion, path: Trajectory) -> tuple[Float64[np.ndarray, "n 3"], Float64[np.ndarray, "n 3"]]:
     """Of rate and specific force, over all that is trusted."""
     gyro, accel = [], []
-    for felt in motion.felt(200.0):
+    for felt in motion.ideal_motions(200.0):
         exact = path.at(motion.start_ns + np.round(felt.t_s * 1e9).astype(np.int64))
         gyro.append(felt.gyro - exact.omega_b)
         accel.append(felt.accel - exact.specific_force())
@@ -110,7 +110,10 @@ def test_nothing_is_invented_across_a_hole(path: Trajectory) -> None:
     assert before.end_s < 10.0
     assert after.start_s > 10.3
     assert not motion.covers(poses.t_ns)[(t_s > 10.0) & (t_s < 10.3)].any()
-    assert [(len(felt.t_s) > 0 and felt.t_s[-1] < 10.0) or felt.t_s[0] > 10.3 for felt in motion.felt(100.0)] == [True, True]
+    assert [(len(felt.t_s) > 0 and felt.t_s[-1] < 10.0) or felt.t_s[0] > 10.3 for felt in motion.ideal_motions(100.0)] == [
+        True,
+        True,
+    ]
     assert rms(errors(motion, path)[1]) < 0.1  # as without the hole
 
 
@@ -184,7 +187,7 @@ def test_rest_is_rest(path: Trajectory) -> None:
     t_ns = clock(path.start_ns, 120.0, 5.0)
     rng = default_rng(0)
     q_wb = turned(np.tile([1.0, 0.0, 0.0, 0.0], (len(t_ns), 1)), 1e-3 * rng.normal(size=(len(t_ns), 3)))
-    (felt,) = smooth_motion(Poses(t_ns, 1e-3 * rng.normal(size=(len(t_ns), 3)), q_wb)).felt(100.0)
+    (felt,) = smooth_motion(Poses(t_ns, 1e-3 * rng.normal(size=(len(t_ns), 3)), q_wb)).ideal_motions(100.0)
     # differentiated as they are, such poses accelerate by 35 m/s² and turn by 0.17 rad/s
     assert rms(felt.accel - [0.0, 0.0, 9.81]) < 0.02
     assert rms(felt.gyro) < 2e-3
@@ -192,7 +195,7 @@ def test_rest_is_rest(path: Trajectory) -> None:
 
 def test_the_even_clock_is_counted_from_the_first_pose(path: Trajectory) -> None:
     motion = smooth_motion(noisy(path, clock(path.start_ns, 100.0), 1e-4, 0.01))
-    (felt,) = motion.felt(250.0)
+    (felt,) = motion.ideal_motions(250.0)
     np.testing.assert_allclose(felt.t_s * 250.0, np.round(felt.t_s * 250.0), atol=1e-9)
     assert felt.rate_hz == pytest.approx(250.0)
     assert felt.R_wb is not None
@@ -202,7 +205,7 @@ def test_the_even_clock_is_counted_from_the_first_pose(path: Trajectory) -> None
 @pytest.mark.parametrize("rate_hz", [0.0, -5.0, float("nan"), float("inf")])
 def test_a_rate_must_mean_something(path: Trajectory, rate_hz: float) -> None:
     with pytest.raises(ConfigError, match="a rate of"):
-        smooth_motion(noisy(path, clock(path.start_ns, 100.0), 0.0, 0.0)).felt(rate_hz)
+        smooth_motion(noisy(path, clock(path.start_ns, 100.0), 0.0, 0.0)).ideal_motions(rate_hz)
 
 
 @pytest.mark.parametrize("count", [0, 1, 20])

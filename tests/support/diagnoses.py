@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+import dataclasses
+from typing import Any, TypeVar
 
+import msgspec
 import numpy as np
 from scipy.spatial.transform import Rotation
 
@@ -16,7 +18,15 @@ RATE_HZ, DURATION_S, HELD_OUT_S = 200.0, 90.0, 30.0
 GYRO_NOISE, ACCEL_NOISE = 0.004, 0.05
 LEVER_ARM_M = np.array([0.213, -0.051, 0.120])
 LAG_S = 0.0124
+Value = TypeVar("Value")
 HOSTILE = "</script><img src=x onerror=alert(1)>/imu&'\"$x^$"  # a log may be called anything
+
+
+def replace(value: Value, **changes: Any) -> Value:
+    """The same dataclass or Struct with other fields."""
+    if isinstance(value, msgspec.Struct):
+        return msgspec.structs.replace(value, **changes)
+    return dataclasses.replace(value, **changes)  # type: ignore[type-var]
 
 
 def motion(seed: int, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
@@ -107,6 +117,8 @@ DRIVEN = Finding(
     "accel += gain current(t - lag)",
     HeldOut(0.3, 0.1, "m/s^2", HELD_OUT_S),
     driver="/motor.current",
+    kind="driven",
+    variable="/motor.current",
 )
 UNKNOWN = Finding(
     "unknown",
@@ -117,7 +129,9 @@ UNKNOWN = Finding(
     {},
     "gyro += c(omega_z)",
     HeldOut(0.02, 0.01, "rad/s", HELD_OUT_S),
-    curve=Curve(
+    kind="unknown",
+    variable="angular rate z",
+    curve=Curve.of_arrays(
         "angular rate z",
         "rad/s",
         np.linspace(-1.0, 1.0, 41),

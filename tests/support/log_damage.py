@@ -17,10 +17,11 @@ from pathlib import Path
 from mcap.reader import make_reader
 
 from imutool.errors import LogError
-from imutool.mcap_io.codec import records
+from imutool.mcap_io.codec import messages
 from imutool.mcap_io.codec.records import HEAD
 from imutool.mcap_io.log import Log
-from imutool.mcap_io.losses import told
+from imutool.mcap_io.recovery.losses import describe
+from imutool.mcap_io.recovery.recovered_log import RecoveredLog
 from imutool.mcap_io.repair import repair
 
 Message = tuple[str, int, int, int, bytes]  # topic, log time, publish time, sequence, payload
@@ -51,22 +52,22 @@ def in_time() -> Iterator[None]:
 def content(log: Log) -> list[Message]:
     """Every message, as it comes back."""
     found = []
-    for block in log.structure.blocks:
-        each = log.structure.found(block)
+    for block in log.index.blocks:
+        each = log.index.unpack_or_lose(block)
         if each is not None:
             found += of_block(log, each)
     return found
 
 
-def of_block(log: Log, each: records.Messages) -> list[Message]:
-    channels, data = log.structure.channels, each.data
+def of_block(log: Log, each: messages.Messages) -> list[Message]:
+    channels, data = log.index.channels, each.data
     return [
         (
             channels[int(head["channel"])].topic,
             int(head["log_time"]),
             int(head["publish_time"]),
             int(head["sequence"]),
-            data[at + records.MESSAGE.itemsize : at + HEAD.size + int(head["length"])].tobytes(),
+            data[at + messages.MESSAGE.itemsize : at + HEAD.size + int(head["length"])].tobytes(),
         )
         for at, head in zip(each.offsets.tolist(), each.heads, strict=True)
     ]
@@ -76,8 +77,8 @@ def stretches(path: Path) -> list[tuple[int, int, list[Message]]]:
     """First and last byte of every chunk, or message outside chunks, of a whole log, with what is in it."""
     found = []
     with Log(path) as log:
-        for block in log.structure.blocks:
-            each = log.structure.unpack(block)
+        for block in log.index.blocks:
+            each = log.index.unpack(block)
             if block.compression is not None:
                 found.append((block.offset, block.offset + block.length, of_block(log, each)))
                 continue
@@ -134,7 +135,7 @@ def after_a_cut(path: Path) -> Iterator[str]:
         os.truncate(path, cut)
         theory = [message for _, end, each in whole if end <= cut for message in each]
         try:
-            with in_time(), Log(path, salvage=True) as log:
+            with in_time(), RecoveredLog(path) as log:
                 found, losses = content(log), log.losses
         except LogError as error:
             if theory:
@@ -142,8 +143,8 @@ def after_a_cut(path: Path) -> Iterator[str]:
             continue
         assert losses is not None
         if found != theory:
-            yield f"cut at {cut}: {len(found)} messages, not {len(theory)}: {told(losses.plain())}"
-        if not losses and (not losses.mended or cut <= end_of_data):
+            yield f"cut at {cut}: {len(found)} messages, not {len(theory)}: {describe(losses.plain())}"
+        if not losses and (not losses.harmless or cut <= end_of_data):
             yield f"cut at {cut}: not told"
 
 
@@ -153,7 +154,7 @@ def after_corruption(path: Path, other: Path) -> Iterator[str]:
     every = Counter(message for _, _, each in whole for message in each)
     known = set(every) | {message for _, _, each in stretches(other) for message in each}
     with Log(path) as log:
-        chunked = any(block.compression is not None for block in log.structure.blocks)
+        chunked = any(block.compression is not None for block in log.index.blocks)
     for case in range(CASES):
         rng, kind = random.Random(f"{path.name} {case}"), KINDS[case % len(KINDS)]
         broken = damaged(raw, kind, rng, joined)
@@ -174,19 +175,19 @@ def check(
 ) -> Iterator[str]:
     """What is wrong with what comes back from a damaged file."""
     try:
-        with Log(path, salvage=True) as log:
+        with RecoveredLog(path) as log:
             found, losses = content(log), log.losses
     except LogError:
         return
     assert losses is not None
-    lines, broken = told(losses.plain()), path.read_bytes()
-    bad = [message for message in found if message not in known and message[0] not in losses.unproven]
+    lines, broken = describe(losses.plain()), path.read_bytes()
+    bad = [message for message in found if message not in known and message[0] not in losses.unchecked_topics]
     if bad and not losses.unchecked:
         yield f"{len(bad)} bad messages: {lines}"
     if not in_place:
         return
     sound = Counter(m for start, end, each in whole if broken[start:end] == raw[start:end] for m in each)
-    if losses.unproven:  # a topic may be called otherwise now, which is told
+    if losses.unchecked_topics:  # a topic may be called otherwise now, which is told
         sound, found = Counter(("", *m[1:]) for m in sound.elements()), [("", *m[1:]) for m in found]
     missed = (sound - Counter(found)).total()
     if missed > (0 if chunked else DOUBTFUL) and not any("not defined" in line for line in lines):
@@ -200,7 +201,7 @@ def check_repair(path: Path, damage: str) -> Iterator[str]:
     """What is wrong with the log that is written from a damaged one."""
     target = path.with_name("repaired.mcap")
     try:
-        with Log(path, salvage=True) as log:
+        with RecoveredLog(path) as log:
             found = content(log)
         report = repair(path, target, overwrite=True, damaged=damage)
     except LogError as error:

@@ -8,10 +8,9 @@ from dataclasses import replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from imutool.diagnosis.estimation.alignment import Pair, split
-from imutool.diagnosis.estimation.forward_cache import Chosen
-from imutool.diagnosis.estimation.gauss_newton import WhitenedLog
-from imutool.diagnosis.estimation.whitening import Whitener
+from imutool.diagnosis.estimation.aligned_log import Pair, split
+from imutool.diagnosis.estimation.jacobians import Chosen
+from imutool.diagnosis.estimation.whitening import WhitenedImu, Whitener
 from imutool.inertial.kinematics import Trajectory
 from imutool.recording import Imu, Poses, Recording
 from imutool.sensor import catalogue as _catalogue
@@ -107,12 +106,12 @@ def pair(
         real = real + added
     held_out, usable = split(stamp_s)
     names = {name: np.interp(stamp_s, felt.t_s, values) for name, values in felt.channels.items()}
-    return Pair(f"log_{seed}", felt, stamp_s, real, usable & ~held_out, usable & held_out, channels=names)
+    return Pair(f"log_{seed}", stamp_s, real, usable & ~held_out, usable & held_out, felt=felt, channels=names)
 
 
-def weighed(one: Pair) -> WhitenedLog:
+def weighed(one: Pair) -> WhitenedImu:
     """By the noise that was planted, which is white."""
-    return WhitenedLog(one, Whitener(np.ones((6, 1)), NOISE))
+    return WhitenedImu(one, Whitener(np.ones((6, 1)), NOISE))
 
 
 def recording(

@@ -12,7 +12,7 @@ import pyarrow as pa
 from rerun.chunk import RrdReader
 
 from imutool.viewing.model.run_data import RunData
-from imutool.viewing.rerun import files
+from imutool.viewing.rerun import scene
 
 TIMELINES = ("elapsed", "ros2_timestamp", "message_log_time")
 
@@ -41,7 +41,7 @@ class Entity:
 
 
 def written(logs: Sequence[RunData], path: Path, *, source: bool = True) -> Path:
-    path.write_bytes(files.rrd(logs, source=source))
+    path.write_bytes(scene.rrd(logs, source=source))
     return path
 
 

@@ -12,12 +12,12 @@ from imutool.errors import DataError
 from imutool.mcap_io.read import read
 from imutool.recording import Imu, Recording
 from imutool.sensor.flight import flight
-from imutool.training.checks import refuse
+from imutool.training.run import check_trainable
 from imutool.training.segments import Pool
 
 
 def checked(*recordings: Recording) -> None:
-    refuse(recordings, Pool.of(recordings))
+    check_trainable(recordings, Pool.of(recordings))
 
 
 @pytest.fixture(scope="module")

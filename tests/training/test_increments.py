@@ -19,13 +19,11 @@ from imutool.geometry import so3
 from imutool.recording import Imu, Recording
 from imutool.sensor.flight import flight
 from imutool.training import checkpoint
-from imutool.training.corrected import corrected
 from imutool.training.fit import Training, TrainSettings
-from imutool.training.increments import Increments, products
-from imutool.training.loss import orientation_error
-from imutool.training.segments import Pool
+from imutool.training.increments import IncrementObjective, products
+from imutool.training.objective import RestBiases, orientation_error
+from imutool.training.segments import Pool, corrected
 from imutool.training.settings import IncrementSettings, settings_for, settings_of
-from imutool.training.tracks import Tracks
 
 Make = Callable[..., Recording]
 PERIOD_S = 0.005
@@ -39,12 +37,12 @@ SMALL = {"channels": [8, 16], "dilations": [1, 4], "kernel": 5}
 
 def objective(
     recordings: list[Recording], sensor: str, rest: list[float] | None = None, model: BiasModel | None = None
-) -> Increments:
+) -> IncrementObjective:
     pool = Pool.of(recordings)
-    tracks = Tracks(pool, 20.0)
+    tracks = RestBiases(pool, 20.0)
     for name, columns in (("gyro", slice(0, 3)), ("accel", slice(3, 6))):
         tracks.set(name, torch.tensor(rest or [0.0] * 6, dtype=torch.float64)[columns].expand(len(recordings), 3))  # type: ignore[arg-type]
-    return Increments(model or static.Model().double(), sensor, pool, tracks, CHOSEN)  # type: ignore[arg-type]
+    return IncrementObjective(model or static.Model().double(), sensor, pool, tracks, CHOSEN)  # type: ignore[arg-type]
 
 
 # ── the errors ───────────────────────────────────────────────────────────────────────────────────────────────────────
@@ -124,12 +122,12 @@ def test_lengths_that_no_truth_holds_are_left_out_and_if_all_are_it_is_said(perf
             recording = without_truth(recording, k + 0.4, k + 0.55)
     pool = Pool.of([recording])
     chosen = TrainSettings(increments=IncrementSettings(gyro_samples=(16, 120, 4000), stretch_s=0.7))
-    asked = Increments(static.Model().double(), "gyro", pool, Tracks(pool, 20.0), chosen)
+    asked = IncrementObjective(static.Model().double(), "gyro", pool, RestBiases(pool, 20.0), chosen)
     assert asked.lengths == [16, 120]
     assert set(asked.loss.medians) == {16, 120}
     far = TrainSettings(increments=IncrementSettings(gyro_samples=(4000,)))
     with pytest.raises(DataError, match=r"for the gyro: no increment of 4000 samples.*--set increments.gyro_samples"):
-        Increments(static.Model().double(), "gyro", pool, Tracks(pool, 20.0), far)
+        IncrementObjective(static.Model().double(), "gyro", pool, RestBiases(pool, 20.0), far)
 
 
 def test_no_index_leaves_its_log(perfect: Make) -> None:

@@ -24,7 +24,7 @@ from imutool.mcap_io.write import write
 from imutool.recording import Imu, Recording
 from imutool.sensor.flight import flight
 from imutool.training.fit import Epoch, TrainSettings
-from imutool.training.objective import WindowEnds
+from imutool.training.objective import WindowEndObjective
 from imutool.training.physics_first import config_of, helps, settings_for
 from imutool.training.run import checkpoint_path, train
 from imutool.training.settings import settings_of
@@ -114,7 +114,7 @@ def test_ctrl_c_in_the_middle_of_a_step_leaves_no_torn_checkpoint(
     logs: list[Path], expected: bytes, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, place: str
 ) -> None:
     """The draw of a step is done, or its weights half moved; what goes on from there must still be the same training."""
-    calls, whole_update, whole_loss = 0, torch.optim.AdamW.step, WindowEnds.terms
+    calls, whole_update, whole_loss = 0, torch.optim.AdamW.step, WindowEndObjective.terms
 
     def update(*words: Any, **named: Any) -> Any:
         nonlocal calls
@@ -123,7 +123,7 @@ def test_ctrl_c_in_the_middle_of_a_step_leaves_no_torn_checkpoint(
         if calls == 4:
             raise KeyboardInterrupt
 
-    def terms(self: WindowEnds, generator: torch.Generator) -> Iterator[torch.Tensor]:
+    def terms(self: WindowEndObjective, generator: torch.Generator) -> Iterator[torch.Tensor]:
         nonlocal calls
         calls += 1
         for term in whole_loss(self, generator):
@@ -133,7 +133,7 @@ def test_ctrl_c_in_the_middle_of_a_step_leaves_no_torn_checkpoint(
 
     out = tmp_path / "m.safetensors"
     with monkeypatch.context() as patched:
-        patched.setattr(*((torch.optim.AdamW, "step", update) if place == "update" else (WindowEnds, "terms", terms)))
+        patched.setattr(*((torch.optim.AdamW, "step", update) if place == "update" else (WindowEndObjective, "terms", terms)))
         with pytest.raises(KeyboardInterrupt):
             train(logs, out, method="neural_ode", settings=TINY)
     assert calls == 4
@@ -387,7 +387,7 @@ def test_a_physics_file_says_which_effects_hybrid_takes_off_and_what_is_left(tmp
 def test_a_physics_file_of_which_hybrid_knows_nothing_is_refused(tmp_path: Path) -> None:
     file = tmp_path / "physics.toml"
     file.write_text(entry("saturation", "gyro", "rad/s"))
-    with pytest.raises(ConfigError, match="no effect that a bias model can take off"):
+    with pytest.raises(ConfigError, match="no effect that a bias model can correct"):
         settings_for(file)
     said = CliRunner().invoke(app, ["train", "a.mcap", "-o", str(tmp_path / "m"), "--method", "linear", "--physics", str(file)])
     assert said.exit_code == 3

@@ -26,8 +26,8 @@ WIDGET = """
 import gzip, sys
 from pathlib import Path
 gzip.compress = lambda program: program[:1]  # 67 MB, which nobody runs here
-from imutool.view import notebook
-from imutool.view.runs import load
+from imutool.viewing import notebook
+from imutool.viewing.model.runs import load
 viewer = notebook.show([load(Path(sys.argv[1]))], source=False)
 assert not __import__("rerun_notebook").ASSET_IS_URL, "the program would come from the network"
 parts = [buffer for event, buffers in viewer._viewer._event_queue for buffer in buffers]

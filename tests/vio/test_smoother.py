@@ -11,11 +11,11 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from imutool.errors import ConfigError, NumericsError
-from imutool.inertial.strapdown import Start
+from imutool.inertial.strapdown import StartPose
 from imutool.recording import Imu, Recording
 from imutool.vio import smoother
 from imutool.vio.features import Frame
-from imutool.vio.run import Course, VioSettings, plan, score
+from imutool.vio.run import VioProblem, VioSettings, plan, score
 from imutool.vio.smoother import Estimate, SmootherSettings
 
 GYRO_BIAS = np.array([0.05, -0.02, 0.03])  # rad/s
@@ -28,24 +28,24 @@ GYRO_FOUND, ACCEL_FOUND = 3e-3, 0.05  # rad/s, m/s²: after 10 s at the noise th
 
 
 @pytest.fixture(scope="module")
-def course(perfect: Recording) -> Course:
+def course(perfect: Recording) -> VioProblem:
     return plan(perfect, VioSettings())
 
 
-def run(perfect: Recording, course: Course, frames: Sequence[Frame] | None = None, **options: Any) -> Estimate:
+def run(perfect: Recording, course: VioProblem, frames: Sequence[Frame] | None = None, **options: Any) -> Estimate:
     imu = options.pop("imu", perfect.imu)
     return smoother.estimate(
         imu.rows(course.rows),
         course.keyframes,
         course.frames if frames is None else frames,
-        Start.of(course.true),
+        StartPose.of(course.true),
         options.pop("settings", SmootherSettings()),
         pixel_std=1.0,
         **({"bias_states": True} | options),
     )
 
 
-def errors(found: Estimate, course: Course) -> tuple[float, float]:
+def errors(found: Estimate, course: VioProblem) -> tuple[float, float]:
     """Largest error of attitude (degrees) and position (m)."""
     R_est, R_true = (Rotation.from_quat(poses.q_wb_wxyz, scalar_first=True) for poses in (found.poses, course.true))
     turned = np.degrees((R_true.inv() * R_est).magnitude()).max()
@@ -57,7 +57,7 @@ def shifted(imu: Imu) -> Imu:
 
 
 @pytest.mark.parametrize("bias_states", [True, False])
-def test_perfect_samples_and_noisy_tracks_give_small_errors(perfect: Recording, course: Course, bias_states: bool) -> None:
+def test_perfect_samples_and_noisy_tracks_give_small_errors(perfect: Recording, course: VioProblem, bias_states: bool) -> None:
     turned, moved = errors(run(perfect, course, bias_states=bias_states), course)
     assert turned < NOISY_DEG
     assert moved < NOISY_M
@@ -73,7 +73,7 @@ def test_perfect_samples_and_exact_tracks_give_the_truth(perfect: Recording) -> 
 
 
 @pytest.mark.parametrize("bias_states", [True, False])
-def test_without_a_camera_it_is_dead_reckoning(perfect: Recording, course: Course, bias_states: bool) -> None:
+def test_without_a_camera_it_is_dead_reckoning(perfect: Recording, course: VioProblem, bias_states: bool) -> None:
     """A perfect IMU alone follows the truth, a biased one leaves it by all of its bias: what is never seen is never found."""
     dark = [Frame(np.zeros(0, np.int64), np.zeros((0, 3)))] * len(course.frames)
     assert max(errors(run(perfect, course, dark, bias_states=bias_states), course)) < 0.02
@@ -82,7 +82,7 @@ def test_without_a_camera_it_is_dead_reckoning(perfect: Recording, course: Cours
     assert np.abs(blind.bias).max() < 1e-3
 
 
-def test_bias_states_find_a_wrong_bias_and_without_them_it_spoils_the_estimate(perfect: Recording, course: Course) -> None:
+def test_bias_states_find_a_wrong_bias_and_without_them_it_spoils_the_estimate(perfect: Recording, course: VioProblem) -> None:
     wrong = shifted(perfect.imu)
     on = run(perfect, course, imu=wrong)
     off = run(perfect, course, imu=wrong, bias_states=False)
@@ -97,20 +97,20 @@ def test_bias_states_find_a_wrong_bias_and_without_them_it_spoils_the_estimate(p
     assert moved_off > 5 * moved_on
 
 
-def test_the_same_input_gives_the_same_bits(perfect: Recording, course: Course) -> None:
+def test_the_same_input_gives_the_same_bits(perfect: Recording, course: VioProblem) -> None:
     first, again = run(perfect, course), run(perfect, course)
     assert first.poses == again.poses
     np.testing.assert_array_equal(first.bias, again.bias)
 
 
-def test_an_impossible_imu_is_reported_with_its_time(perfect: Recording, course: Course) -> None:
+def test_an_impossible_imu_is_reported_with_its_time(perfect: Recording, course: VioProblem) -> None:
     thrown = Imu(perfect.imu.t_ns, perfect.imu.gyro, perfect.imu.accel + np.array([0.0, 400.0, 0.0]))
     dark = [Frame(np.zeros(0, np.int64), np.zeros((0, 3)))] * len(course.frames)
     with pytest.raises(NumericsError, match=r"diverged after 0\.25 s \(it claims 1\d\d m/s\)"):
         run(perfect, course, dark, imu=thrown, bias_states=False)
 
 
-def test_what_gtsam_throws_is_an_error_of_ours(perfect: Recording, course: Course, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_gtsam_throws_is_an_error_of_ours(perfect: Recording, course: VioProblem, monkeypatch: pytest.MonkeyPatch) -> None:
     def throw(*_: Any) -> None:
         raise RuntimeError("\nIndeterminant linear system detected near\nvariable x7. Thrown when a linear system\nis odd.")
 
@@ -133,14 +133,14 @@ def test_a_longer_hole_than_the_lag_is_survived(perfect: Recording) -> None:
 
 
 def test_a_missing_gtsam_is_said_with_the_extra_that_brings_it(
-    perfect: Recording, course: Course, monkeypatch: pytest.MonkeyPatch
+    perfect: Recording, course: VioProblem, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(sys.modules, "gtsam", None)
     with pytest.raises(ConfigError, match=r"imutool\[vio\]"):
         run(perfect, course)
 
 
-def test_progress_is_told_keyframe_by_keyframe(perfect: Recording, course: Course) -> None:
+def test_progress_is_told_keyframe_by_keyframe(perfect: Recording, course: VioProblem) -> None:
     told: list[tuple[int, int]] = []
     short = course._replace(keyframes=course.keyframes[:5], true=course.true.rows(slice(5)), frames=course.frames[:5])
     run(perfect, short, progress=lambda done, total: told.append((done, total)))

@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float64, Int64
 
 from imutool.cleaning.finding import Finding
 from imutool.cleaning.frames import axis_names, signed_permutations, tilt_misfit
-from imutool.cleaning.rule import Rule, Whole
+from imutool.cleaning.rule import Rule, TopicSummary
 from imutool.cleaning.truth import feeling, turning
 from imutool.recording import seconds
 
@@ -51,7 +51,7 @@ class Axes(Rule):
 
     place = 130
 
-    def findings(self, whole: Whole) -> Iterator[Finding]:
+    def findings(self, whole: TopicSummary) -> Iterator[Finding]:
         """At most one for each sensor."""
         readings = signed_permutations()
         gyro, accel = _against_poses(whole, readings)
@@ -63,7 +63,7 @@ class Axes(Rule):
         if len(wrong) == 2 and turned.any():
             names = axis_names(readings[np.argmax(turned)])
             what = f"the body of the true poses is not the IMU's: its x, y, z seem to be the IMU's {names}"
-            yield Finding("axes", "note", what, 3, values={"mount": names}, sure=0.8)
+            yield Finding("axes", "note", what, 3, values={"mount": names}, confidence=0.8)
             return
         for name, fit in wrong.items():  # where nothing is known of the other sensor, it may still be the mount
             yield _wrong(name, fit, readings, "the true poses", alone=len(fits) == 1)
@@ -85,12 +85,12 @@ def _wrong(sensor: str, fit: Fit, readings: Float64[np.ndarray, "48 3 3"], again
         f"{sensor} contradicts {against}: its true x, y, z seem to be its {names}",
         int((np.abs(chosen - np.eye(3)).sum(axis=1) > 0).sum()),
         values={"sensor": sensor, "reading": names, "as_good": len(alike), "misfit": best, "misfit_as_is": present},
-        sure=0.5 if alone else 0.95 if len(alike) == 1 else 0.7,
+        confidence=0.5 if alone else 0.95 if len(alike) == 1 else 0.7,
         distrust="" if alone else f"the axes of {sensor} contradict {against}",
     )
 
 
-def _against_poses(whole: Whole, readings: Float64[np.ndarray, "48 3 3"]) -> tuple[Fit | None, Fit | None]:
+def _against_poses(whole: TopicSummary, readings: Float64[np.ndarray, "48 3 3"]) -> tuple[Fit | None, Fit | None]:
     """Rate against the turning of the poses; specific force against gravity and the poses' acceleration, in their body."""
     step, raw = whole.motion.table()
     if whole.truth is None or len(step) < 2 or whole.motion.start_ns is None:
@@ -120,7 +120,7 @@ def _fit(true: Float64[np.ndarray, "n 3"], read: Float64[np.ndarray, "n 3"], rea
     return Fit(np.array(misfit), float(np.sqrt(np.median((true**2).sum(axis=1)))))
 
 
-def _against_gravity(whole: Whole, readings: Float64[np.ndarray, "48 3 3"]) -> Fit | None:
+def _against_gravity(whole: TopicSummary, readings: Float64[np.ndarray, "48 3 3"]) -> Fit | None:
     step, raw = whole.motion.table()
     misfit = tilt_misfit(step, raw * whole.scale, np.concatenate([readings, np.zeros((1, 3, 3))]))
     return None if misfit is None else Fit(misfit[:-1], float(misfit[-1]))

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float64, Int64
 
 from imutool.cleaning.finding import MAX_INTERVALS, Finding, runs
-from imutool.cleaning.rule import Rule, Whole
+from imutool.cleaning.rule import Rule, TopicSummary
 from imutool.cleaning.samples import Samples
 
 PART = 64  # samples whose median period is one row
@@ -38,7 +38,7 @@ class ChangedRate(Rule):
             self._ends.append(np.column_stack([edges[:-1], edges[1:]]))
         self._waiting = stamp[parts * PART :]
 
-    def findings(self, whole: Whole) -> Iterator[Finding]:
+    def findings(self, whole: TopicSummary) -> Iterator[Finding]:
         """One, with the rates; where it begins and ends is known to within a part."""
         if not self._rows:
             return
@@ -63,6 +63,6 @@ class ChangedRate(Rule):
             intervals[:MAX_INTERVALS],
             max(0, len(stretches) - MAX_INTERVALS),
             {"usual_hz": 1e9 / usual, "rates_hz": rates[:MAX_INTERVALS], "share": share},
-            sure=0.95,
+            confidence=0.95,
             distrust=distrust,
         )

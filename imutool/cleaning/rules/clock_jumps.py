@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from imutool.cleaning.finding import MAX_INTERVALS, Finding
-from imutool.cleaning.rule import Rule, Whole
+from imutool.cleaning.rule import Rule, TopicSummary
 from imutool.cleaning.samples import Samples
 
 PART = 256  # samples whose median delay is one row
@@ -52,7 +52,7 @@ class ClockJumps(Rule):
         self._rows.append((median, scatter, int(changes[at]), int(table[at, 0]), before_ns, int(table[at, 1]), expected))
         self._last = int(delay[-1]), int(table[-1, 1]), int(table[-1, 0])
 
-    def findings(self, whole: Whole) -> Iterator[Finding]:
+    def findings(self, whole: TopicSummary) -> Iterator[Finding]:
         """One for the stamps' clock, one for the recorder's."""
         if self._waiting and len(self._waiting[0]) > PART // 4:
             self._row(self._waiting[0])
@@ -74,7 +74,7 @@ class ClockJumps(Rule):
                     tuple((first, last) for _, _, first, last in jumps[:MAX_INTERVALS]),
                     max(0, len(jumps) - MAX_INTERVALS),
                     {"clock": clock, "jumps_s": sizes},
-                    sure=0.9,
+                    confidence=0.9,
                 )
 
     def _steps(self) -> Iterator[tuple[tuple[float, float, int, int, int, int, int], float]]:

@@ -6,8 +6,8 @@ from collections.abc import Iterable, Iterator
 
 import numpy as np
 
-from imutool.cleaning.finding import Finding, Places
-from imutool.cleaning.rule import Rule, Whole
+from imutool.cleaning.finding import Finding, Intervals
+from imutool.cleaning.rule import Rule, TopicSummary
 from imutool.cleaning.samples import Samples, joined
 
 MEMORY = 1024  # messages: what a recorder sends again, it sends soon
@@ -20,7 +20,7 @@ class Duplicates(Rule):
 
     def __init__(self) -> None:
         super().__init__()
-        self._places, self._same = Places(), 0
+        self._places, self._same = Intervals(), 0
 
     def __call__(self, stream: Iterable[Samples]) -> Iterator[Samples]:
         """The samples without the repeated ones."""
@@ -40,7 +40,7 @@ class Duplicates(Rule):
             before = both.where(slice(max(0, len(both.number) - MEMORY), None))
             yield left
 
-    def findings(self, whole: Whole) -> Iterator[Finding]:
+    def findings(self, whole: TopicSummary) -> Iterator[Finding]:
         """One, with how many were the same to the last bit."""
         if self._places.count:
             what = "samples with a stamp that an earlier one has"

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float64, Int64
 
 from imutool.cleaning.finding import MAX_INTERVALS, Finding
-from imutool.cleaning.rule import Rule, Whole
+from imutool.cleaning.rule import Rule, TopicSummary
 from imutool.cleaning.samples import Samples
 from imutool.recording import nanoseconds
 
@@ -69,13 +69,13 @@ class Gaps(Rule):
         for row in np.flatnonzero(lost)[: MOST - len(self._rows)]:
             self._rows.append(Gap(int(number[row + 1]), int(stamp[row]), int(stamp[row + 1]), int(lost[row])))
 
-    def findings(self, whole: Whole) -> Iterator[Finding]:
+    def findings(self, whole: TopicSummary) -> Iterator[Finding]:
         """One for what is missing, with the longest gaps, and one for pauses."""
         pauses = [(row.first_ns, row.last_ns) for row in self._pauses if row.number not in whole.jumps]
         if pauses:
             what = f"pauses of more than {PAUSE_NS * 1e-9:g} s"
             left_out = max(0, len(pauses) - MAX_INTERVALS)
-            yield Finding("gaps", "note", what, len(pauses), tuple(pauses[:MAX_INTERVALS]), left_out, sure=0.9)
+            yield Finding("gaps", "note", what, len(pauses), tuple(pauses[:MAX_INTERVALS]), left_out, confidence=0.9)
         rows = [row for row in (self._left(row, whole) for row in self._rows) if row.missing]
         count = self.missing + sum(row.missing for row in rows) - sum(row.missing for row in self._rows)
         if not rows:
@@ -83,7 +83,7 @@ class Gaps(Rule):
         longest = sorted(rows, key=lambda row: row.first_ns - row.last_ns)[:MAX_INTERVALS]
         longest_s = (longest[0].last_ns - longest[0].first_ns) * 1e-9
         share = count / (count + whole.motion.samples)
-        distrust = f"{100 * share:.0f} % of the samples are missing" if share > whole.rules.max_missing_share else ""
+        distrust = f"{100 * share:.0f} % of the samples are missing" if share > whole.settings.max_missing_share else ""
         serious = share > SERIOUS_SHARE or longest_s > SERIOUS_S
         yield Finding(
             "gaps",
@@ -96,7 +96,7 @@ class Gaps(Rule):
             distrust=distrust,
         )
 
-    def _left(self, gap: Gap, whole: Whole) -> Gap:
+    def _left(self, gap: Gap, whole: TopicSummary) -> Gap:
         """A gap less what is explained otherwise."""
         at_other_rate = any(first <= gap.first_ns and gap.last_ns <= last for first, last in whole.other_rate_ns)
         if gap.number in whole.jumps or at_other_rate:

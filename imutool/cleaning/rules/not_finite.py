@@ -6,8 +6,8 @@ from collections.abc import Iterable, Iterator
 
 import numpy as np
 
-from imutool.cleaning.finding import Finding, Places
-from imutool.cleaning.rule import Rule, Whole
+from imutool.cleaning.finding import Finding, Intervals
+from imutool.cleaning.rule import Rule, TopicSummary
 from imutool.cleaning.samples import Samples
 
 NO_SENSOR = 1e7  # 1000 g in mm/s², the smallest unit in use
@@ -21,7 +21,7 @@ class NotFinite(Rule):
 
     def __init__(self) -> None:
         super().__init__()
-        self._places, self._by_axis = Places(), np.zeros(6, np.int64)
+        self._places, self._by_axis = Intervals(), np.zeros(6, np.int64)
 
     def __call__(self, stream: Iterable[Samples]) -> Iterator[Samples]:
         """The samples that are all numbers."""
@@ -34,7 +34,7 @@ class NotFinite(Rule):
                 self.dropped.append(samples.number[~good])
             yield samples.where(good)
 
-    def findings(self, whole: Whole) -> Iterator[Finding]:
+    def findings(self, whole: TopicSummary) -> Iterator[Finding]:
         """One, with the count by axis."""
         if self._places.count:
             by_axis = {name: int(count) for name, count in zip(AXES, self._by_axis, strict=True) if count}

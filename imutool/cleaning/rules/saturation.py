@@ -8,8 +8,8 @@ from itertools import product
 import numpy as np
 from jaxtyping import Float64
 
-from imutool.cleaning.finding import Finding, Places
-from imutool.cleaning.rule import Rule, Whole
+from imutool.cleaning.finding import Finding, Intervals
+from imutool.cleaning.rule import Rule, TopicSummary
 from imutool.cleaning.rules.not_finite import AXES
 from imutool.cleaning.samples import Samples
 
@@ -68,7 +68,7 @@ class Saturation(Rule):
     def __init__(self) -> None:
         super().__init__()
         self._ends = [Ends() for _ in AXES]
-        self._places: dict[tuple[int, int], tuple[float, Places]] = {}
+        self._places: dict[tuple[int, int], tuple[float, Intervals]] = {}
 
     def see(self, samples: Samples) -> None:
         """Places are those of the extreme so far: a larger value makes those before it ordinary."""
@@ -79,11 +79,11 @@ class Saturation(Rule):
                 level = ends.extreme(side)
                 known = self._places.get((axis, side))
                 if known is None or known[0] != level:
-                    known = self._places[axis, side] = level, Places()
+                    known = self._places[axis, side] = level, Intervals()
                 at = values == level
                 known[1].add(samples.number[at], samples.stamp_ns[at])
 
-    def findings(self, whole: Whole) -> Iterator[Finding]:
+    def findings(self, whole: TopicSummary) -> Iterator[Finding]:
         """One for each axis and end."""
         for axis, side in product(range(6), (-1, 1)):
             limit = self._ends[axis].limit(side)
@@ -91,4 +91,4 @@ class Saturation(Rule):
                 places = self._places[axis, side][1]
                 what = f"samples with {AXES[axis]} at the end of its range"
                 values = {"axis": AXES[axis], "limit": limit * float(whole.scale[axis])}
-                yield Finding("saturation", "warning", what, **places.where(), values=values, sure=0.9)
+                yield Finding("saturation", "warning", what, **places.where(), values=values, confidence=0.9)

@@ -15,8 +15,8 @@ import numpy as np
 from jaxtyping import Bool, Float64
 from numpy.lib.stride_tricks import sliding_window_view
 
-from imutool.cleaning.finding import Finding, Places
-from imutool.cleaning.rule import Rule, Whole
+from imutool.cleaning.finding import Finding, Intervals
+from imutool.cleaning.rule import Rule, TopicSummary
 from imutool.cleaning.rules.not_finite import AXES
 from imutool.cleaning.samples import Samples, padded
 
@@ -33,7 +33,7 @@ class Spikes(Rule):
 
     def __init__(self) -> None:
         super().__init__()
-        self._places, self._by_axis, self._largest = Places(), np.zeros(6, np.int64), np.zeros(6)
+        self._places, self._by_axis, self._largest = Intervals(), np.zeros(6, np.int64), np.zeros(6)
 
     def __call__(self, stream: Iterable[Samples]) -> Iterator[Samples]:
         """The samples without spikes."""
@@ -49,7 +49,7 @@ class Spikes(Rule):
                 self.dropped.append(samples.number[bad])
             yield samples.where(~bad)
 
-    def findings(self, whole: Whole) -> Iterator[Finding]:
+    def findings(self, whole: TopicSummary) -> Iterator[Finding]:
         """One, with count and largest step by axis."""
         if self._places.count:
             axes = [i for i in range(6) if self._by_axis[i]]
@@ -58,7 +58,7 @@ class Spikes(Rule):
                 "largest_step": {AXES[i]: float(self._largest[i]) for i in axes},
             }
             what = f"samples that stand out by {TIMES:g} times the largest step near them"
-            yield Finding("spikes", "warning", what, **self._places.where(), values=values, action="dropped", sure=0.95)
+            yield Finding("spikes", "warning", what, **self._places.where(), values=values, action="dropped", confidence=0.95)
 
 
 def spikes(values: Float64[np.ndarray, "n k"]) -> tuple[Bool[np.ndarray, "n k"], Float64[np.ndarray, "n k"]]:

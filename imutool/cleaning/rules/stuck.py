@@ -12,8 +12,8 @@ from collections.abc import Iterable, Iterator
 import numpy as np
 from jaxtyping import Bool, Float64
 
-from imutool.cleaning.finding import Finding, Places, runs
-from imutool.cleaning.rule import Rule, Whole
+from imutool.cleaning.finding import Finding, Intervals, runs
+from imutool.cleaning.rule import Rule, TopicSummary
 from imutool.cleaning.rules.not_finite import AXES
 from imutool.cleaning.samples import Samples, padded
 
@@ -30,7 +30,7 @@ class Stuck(Rule):
 
     def __init__(self) -> None:
         super().__init__()
-        self._places, self._quiet = Places(), Places()
+        self._places, self._quiet = Intervals(), Intervals()
         self._noisy = True
         self._equal, self._pairs = 0, 0
         self._axes = [_Axis() for _ in AXES]
@@ -56,18 +56,18 @@ class Stuck(Rule):
                 axis.see(values, samples)
             yield samples
 
-    def findings(self, whole: Whole) -> Iterator[Finding]:
+    def findings(self, whole: TopicSummary) -> Iterator[Finding]:
         """Repeats, values held by a topic faster than its sensor, and axes that stand still."""
         if self._places.count:
             what = f"samples that repeat the one before, in runs of {LEAST} and more: the sensor was stuck"
-            yield Finding("stuck", "warning", what, **self._places.where(), action="dropped", sure=0.95)
+            yield Finding("stuck", "warning", what, **self._places.where(), action="dropped", confidence=0.95)
         if self._quiet.count:
             what = "samples that repeat the one before, of a sensor without noise: simulated, or stuck"
-            yield Finding("stuck", "note", what, **self._quiet.where(), sure=0.5)
+            yield Finding("stuck", "note", what, **self._quiet.where(), confidence=0.5)
         if self._equal - self._places.count - self._quiet.count > HELD_SHARE * self._pairs:
             share = self._equal / self._pairs
             what = "samples equal to the one before: the topic is faster than its sensor"
-            yield Finding("stuck", "warning", what, self._equal, values={"share": share}, sure=0.9)
+            yield Finding("stuck", "warning", what, self._equal, values={"share": share}, confidence=0.9)
         total_s = (whole.motion.end_ns - (whole.motion.start_ns or 0)) * 1e-9
         for name, axis in zip(AXES, self._axes, strict=True):
             axis.close()
@@ -85,7 +85,7 @@ class _Axis:
     """Runs of one value on one axis, across blocks."""
 
     def __init__(self) -> None:
-        self.places, self.still_s = Places(), 0.0
+        self.places, self.still_s = Intervals(), 0.0
         self._value, self._numbers, self._stamps, self._count = np.nan, (0, 0), (0, 0), 0
 
     def see(self, values: Float64[np.ndarray, " n"], samples: Samples) -> None:

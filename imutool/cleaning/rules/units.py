@@ -14,8 +14,8 @@ from jaxtyping import Float64
 
 from imutool.cleaning.finding import Finding, Severity
 from imutool.cleaning.frames import tilt_misfit
-from imutool.cleaning.motion import Motion
-from imutool.cleaning.rule import Rule, Whole
+from imutool.cleaning.rule import Rule, TopicSummary
+from imutool.cleaning.samples import Motion
 from imutool.cleaning.truth import Truth, turning
 from imutool.recording import GRAVITY_M_S2, seconds
 
@@ -44,12 +44,12 @@ class Units(Rule):
 
     place = 120
 
-    def findings(self, whole: Whole) -> Iterator[Finding]:
+    def findings(self, whole: TopicSummary) -> Iterator[Finding]:
         """One for each sensor in another unit; `whole.scale` then converts."""
         yield from self._accel(whole)
         yield from self._gyro(whole)
 
-    def _accel(self, whole: Whole) -> Iterator[Finding]:
+    def _accel(self, whole: TopicSummary) -> Iterator[Finding]:
         level, at_rest = gravity_level(whole.motion)
         if level is None:
             return
@@ -58,25 +58,25 @@ class Units(Rule):
         values = {"reading": level, "at_rest": at_rest, "unit": unit or "unknown"}
         if unit == "m/s^2":
             return
-        if unit and at_rest and whole.rules.convert_units:
+        if unit and at_rest and whole.settings.convert_units:
             whole.scale[3:] = factor = FACTORS[unit]
             what = f"accel is in {unit}, not m/s^2: it reads {level:.4g} when calm"
-            yield Finding("units", "warning", what, 3, values=values | {"factor": factor}, action="converted", sure=0.98)
+            yield Finding("units", "warning", what, 3, values=values | {"factor": factor}, action="converted", confidence=0.98)
         elif unit:
             what = f"accel looks like {unit}, not m/s^2: it reads {level:.4g}"
-            yield Finding("units", "error", what, 3, values=values, sure=0.7, distrust=f"accel may be in {unit}")
+            yield Finding("units", "error", what, 3, values=values, confidence=0.7, distrust=f"accel may be in {unit}")
         elif level < FREE_OF_GRAVITY_M_S2:
             what = f"accel reads {level:.4g} in the median: gravity was taken out, or it measures nothing"
-            yield Finding("units", "error", what, 3, values=values, sure=0.9, distrust="accel has no gravity in it")
+            yield Finding("units", "error", what, 3, values=values, confidence=0.9, distrust="accel has no gravity in it")
         else:
             off = abs(level / GRAVITY_M_S2 - 1.0)
             distrust = f"the unit of accel is unknown: it reads {level:.4g}" if off > MOVING_TOLERANCE else ""
             values["unit"] = "unknown" if distrust else "m/s^2"
             what = f"accel reads {level:.4g} {'when calm' if at_rest else 'in the median'}, gravity is {GRAVITY_M_S2} m/s^2"
             severity: Severity = "error" if distrust else "warning" if off > BIASED else "note"
-            yield Finding("units", severity, what, 3, values=values, sure=0.8, distrust=distrust)
+            yield Finding("units", severity, what, 3, values=values, confidence=0.8, distrust=distrust)
 
-    def _gyro(self, whole: Whole) -> Iterator[Finding]:
+    def _gyro(self, whole: TopicSummary) -> Iterator[Finding]:
         ratio = None if whole.truth is None else rate_ratio(whole.motion, whole.truth)
         share = None if ratio is None else ratio / DEGREES
         if share is not None and DEGREES_BAND[0] <= share <= DEGREES_BAND[1]:
@@ -95,13 +95,15 @@ class Units(Rule):
                 ["gravity turns as if it were"] * turns + [f"it reaches {fastest:.4g}"] * (fastest > FULL_SCALE_RAD_S)
             )
         values: dict[str, Any] = {"unit": "deg/s", "ratio": ratio}
-        if sure and whole.rules.convert_units:
+        if sure and whole.settings.convert_units:
             whole.scale[:3] = 1.0 / DEGREES
             what = f"gyro is in deg/s, not rad/s: {how}"
-            yield Finding("units", "warning", what, 3, values=values | {"factor": 1.0 / DEGREES}, action="converted", sure=0.98)
+            yield Finding(
+                "units", "warning", what, 3, values=values | {"factor": 1.0 / DEGREES}, action="converted", confidence=0.98
+            )
         else:
             what = f"gyro looks like deg/s, not rad/s: {how}"
-            yield Finding("units", "error", what, 3, values=values, sure=0.7, distrust="gyro may be in deg/s")
+            yield Finding("units", "error", what, 3, values=values, confidence=0.7, distrust="gyro may be in deg/s")
 
 
 def accel_unit(level: float, tolerance: float) -> str:

@@ -8,8 +8,7 @@ away.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Bool, Float64
@@ -18,22 +17,20 @@ from scipy.ndimage import uniform_filter1d
 from scipy.signal import correlate, correlation_lags
 from scipy.spatial.transform import Rotation
 
+from imutool.diagnosis.estimation.aligned_log import GAP_PERIODS, Pair, split
 from imutool.errors import DataError
-from imutool.inertial.kinematics import through
+from imutool.inertial.kinematics import fit_trajectory
 from imutool.inertial.stationary import white_noise
 from imutool.inertial.strapdown import with_velocity
 from imutool.recording import Imu, Poses, Recording, seconds
-from imutool.sensor.samples import NOTHING, IdealMotion
+from imutool.sensor.samples import IdealMotion, channels_at
 
 LEAST_S = 8.0  # below, nothing can be learned and tested
 ALIGN_HZ = 100.0
 FARTHEST_S = 5.0  # by which clocks of one epoch may differ
 ALIKE = 0.6  # correlation of the turning below which two logs are of different motions
-BLOCK_S, HELD_OUT_EACH = 6.0, 3  # every third block of six seconds is never fitted
-BUFFER_S = 0.3  # around a border between blocks, counted for neither
 NOISE_BAND = 0.8  # of Nyquist: above, a simulated motion has nothing
 SMOOTHED_BINS = 15
-GAP_PERIODS = 3.0
 KNOWN_SHARE = 0.5  # of the samples that have a true pose, from which on the poses are worth drawing
 MOST_OF_IT = 0.9  # of the simulation that its poses must cover to stand for it
 POSES_HZ = 40.0  # slower poses cannot be differentiated twice
@@ -41,53 +38,6 @@ MEANS, LEAST_MEANS = (20, 200), 8  # samples of a mean, and how many means there
 TOLERATED_MEAN = 1.8  # by which they may scatter more than noise is measured, which finds five sixths of it
 COARSE, TOLERATED = 5, 1.3
 LEAST_NOISE = np.array([1e-4] * 3 + [1e-3] * 3)
-
-
-@dataclass(frozen=True, eq=False)
-class Pair:
-    """Ideal signals on an even clock, and real samples by their stamps on that clock (s from the first sample).
-
-    `fitted` and `held_out` are rows; rows in neither are borders, gaps and ends. `band_hz` is where what is expected ends to be
-    known (none: nowhere), `sim_noise` what was filtered out of a simulation's samples (nothing where its poses stand in for
-    them), `truth` the true poses at its stamps, `aligned_s` what was added to the stamps where the two clocks share no epoch.
-    `known` says which samples tell what an axis felt (none: all): those of a converter at its end and of an axis that is
-    stuck do not.
-    """
-
-    name: str
-    felt: IdealMotion
-    stamp_s: Float64[np.ndarray, " n"]
-    real: Float64[np.ndarray, "n 6"]
-    fitted: Bool[np.ndarray, " n"]
-    held_out: Bool[np.ndarray, " n"]
-    truth: Poses | None = None
-    aligned_s: float = 0.0
-    against: str = "simulation"
-    start_ns: int = 0
-    band_hz: float | None = None
-    sim_noise: Float64[np.ndarray, "6"] = field(default_factory=lambda: np.zeros(6))
-    channels: Mapping[str, Float64[np.ndarray, " n"]] = field(default_factory=lambda: NOTHING)
-    known: Bool[np.ndarray, "n 6"] | None = None
-
-    @property
-    def usable(self) -> Bool[np.ndarray, "n 6"]:
-        """Samples that count, fitted or held out."""
-        rows = (self.fitted | self.held_out)[:, None]
-        return np.asarray(np.broadcast_to(rows, self.real.shape) if self.known is None else rows & self.known)
-
-    @property
-    def axes(self) -> Bool[np.ndarray, "6"]:
-        """Of which anything is known at all."""
-        return np.ones(6, bool) if self.known is None else np.asarray(self.known.any(axis=0))
-
-    @property
-    def period_s(self) -> float:
-        """Median time between real samples."""
-        return float(np.median(np.diff(self.stamp_s)))
-
-    def within(self, band_hz: float) -> Pair:
-        """Where what is expected is known to less: the poses turn out to be worse than their noise says."""
-        return replace(self, band_hz=band_hz)
 
 
 def with_simulation(real: Recording, sim: Recording) -> Pair:
@@ -158,47 +108,23 @@ def _pair(
         truth = poses if known.mean() > KNOWN_SHARE else None
     return Pair(
         real.name,
-        felt,
         stamp_s,
         samples,
         usable & ~held_out,
         usable & held_out,
-        truth,
-        aligned_s,
-        against,
-        int(t_ns[0]),
+        felt=felt,
+        truth=truth,
+        aligned_s=aligned_s,
+        against=against,
+        start_ns=int(t_ns[0]),
         sim_noise=sim_noise,
         channels={name: values for name, values in _channels(real, t_ns).items() if np.ptp(values) > 0},
     )
 
 
-def split(stamp_s: Float64[np.ndarray, " n"]) -> tuple[Bool[np.ndarray, " n"], Bool[np.ndarray, " n"]]:
-    """Rows that are held out, and rows that count at all: away from borders between the two and from gaps."""
-    since = stamp_s - stamp_s[0]
-    block_s = min(BLOCK_S, since[-1] / (2 * HELD_OUT_EACH))
-    block = np.floor(since / block_s).astype(int)
-    held_out = block % HELD_OUT_EACH == HELD_OUT_EACH - 1
-    inside = since - block * block_s
-    kind_before, kind_after = held_out != ((block - 1) % HELD_OUT_EACH == 2), held_out != ((block + 1) % HELD_OUT_EACH == 2)
-    usable = ~(((inside < BUFFER_S) & kind_before & (block > 0)) | ((inside > block_s - BUFFER_S) & kind_after))
-    usable &= (since > BUFFER_S) & (since < since[-1] - BUFFER_S)
-    step = np.diff(stamp_s)
-    for k in np.flatnonzero(step > GAP_PERIODS * np.median(step)):
-        usable &= (stamp_s < stamp_s[k] - BUFFER_S) | (stamp_s > stamp_s[k + 1] + BUFFER_S)
-    return held_out, usable
-
-
 def _channels(recording: Recording, t_ns: np.ndarray) -> dict[str, Float64[np.ndarray, " n"]]:
-    """Every other number of a log at some times, linearly between its messages, by `topic.field`."""
-    out: dict[str, Float64[np.ndarray, " n"]] = {}
-    for topic, scalars in recording.scalars.items():
-        if len(scalars.t_ns) < 2:
-            continue
-        start = int(scalars.t_ns[0])
-        for k in range(scalars.values.shape[1]):
-            name = topic if scalars.values.shape[1] == 1 else f"{topic}.{'xyz'[k]}"
-            out[name] = np.interp(seconds(t_ns, start), seconds(scalars.t_ns, start), scalars.values[:, k])
-    return out
+    """Scalar channels of a log at some times; a single message is no course."""
+    return channels_at(recording, seconds(t_ns, int(t_ns[0])), int(t_ns[0]), least_messages=2)
 
 
 def _simulated(
@@ -233,7 +159,7 @@ def _by_poses(
     poses = sim.truth
     if poses.period_s * POSES_HZ > 1.0 or np.diff(poses.t_ns).max() > 1e9 * GAP_PERIODS * poses.period_s:
         return None
-    trajectory = through(poses)  # a simulation's poses are exact, or the test below fails
+    trajectory = fit_trajectory(poses)  # a simulation's poses are exact, or the test below fails
     t_ns = poses.t_ns[0] + np.arange(int(poses.duration_s * rate_hz) + 1) * round(1e9 / rate_hz)
     motion = trajectory.at(t_ns[t_ns <= poses.t_ns[-1]])
     R_wb = Rotation.from_quat(motion.q_wb_wxyz, scalar_first=True).as_matrix()
@@ -243,7 +169,7 @@ def _by_poses(
     rows = (t_s >= felt.t_s[0]) & (t_s <= felt.t_s[-1])
     if rows.mean() < MOST_OF_IT:
         return None
-    read = felt.taken(t_s[rows], t_s[rows])
+    read = felt.sample(t_s[rows], t_s[rows])
     left = samples[rows] - np.concatenate([read.gyro, read.accel], axis=1)
     left = left - left.mean(axis=0)
     coarse = (

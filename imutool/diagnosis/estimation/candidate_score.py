@@ -1,4 +1,4 @@
-"""One more effect beside those of a fit: what a single linear step of it would gain, without a fit for each candidate."""
+"""Score test of candidate effects: the gain of one linear step beside a fit, and candidates ranked by its p-value."""
 
 from __future__ import annotations
 
@@ -8,73 +8,145 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float64, Int64
 
-from imutool.diagnosis.estimation.forward_cache import ForwardPass
-from imutool.diagnosis.estimation.gauss_newton import Fit, WhitenedLog, direction, priors
-from imutool.diagnosis.estimation.jacobians import effect_jacobian
+from imutool.diagnosis.estimation.gauss_newton import Fit, direction, parameters_of, priors
+from imutool.diagnosis.estimation.jacobians import ForwardPass, effect_jacobian
+from imutool.diagnosis.estimation.significance import log_p_value
+from imutool.diagnosis.estimation.whitening import WhitenedLog
 from imutool.sensor.effect import Effect, Theta
 
 RIDGE = 1e-9
 
 
 class _Axis(NamedTuple):
-    """White rows of one axis of a log that are fitted, zero elsewhere, without what the bias takes of them."""
+    """White rows of one axis of a log that are fitted, zero elsewhere, orthogonal to the bias."""
 
     counts: Float64[np.ndarray, " m"]  # 1 for rows that are fitted
-    bias: Float64[np.ndarray, " m"]  # a constant as it is behind the filter, of length 1
+    bias: Float64[np.ndarray, " m"]  # a constant behind the filter, of length 1
     where: Int64[np.ndarray, " q"]
     A: Float64[np.ndarray, "q m"]
     r: Float64[np.ndarray, " m"]
 
     def free(self, x: Float64[np.ndarray, "*k m"]) -> Float64[np.ndarray, "*k m"]:
-        """What is left of some rows beside the bias."""
+        """Rows less their projection on the bias."""
         x = x * self.counts
         return np.asarray(x - (x @ self.bias)[..., None] * self.bias)
 
 
 class CandidateScore:
-    """The normal equations of a fit, with a place left for one more effect."""
+    """Normal equations of a fit, to which the Schur complement of one more effect is added."""
 
     def __init__(self, logs: Sequence[WhitenedLog], now: Fit) -> None:
         self.logs, self.now = logs, now
         q = sum(len(theta) for _, theta in now.chosen)
         self.N, self.g, self.total, self.axes = RIDGE * np.eye(q), np.zeros(q), 0.0, []
-        for number, (log, course) in enumerate(zip(logs, now.courses, strict=True)):
-            counts, residual = log.rows("fitted").astype(float), log.residual(course)
+        for number, (log, forward) in enumerate(zip(logs, now.passes, strict=True)):
+            counts, residual = log.rows("fitted").astype(float), log.residual(forward.expected)
             everything = np.ones(len(counts), bool)
-            for k in range(6):
+            for k in range(log.pair.columns):
                 bias = log.constants[:, k] * counts
-                where, A = now.slopes.on_axis(number, k, everything)
-                one = _Axis(counts, direction(bias), where, A, residual[:, k])
-                one = one._replace(A=one.free(A), r=one.free(residual[:, k]))
-                self.axes.append(one)
-                self.N[np.ix_(where, where)] += one.A @ one.A.T
-                self.g[where] += one.A @ one.r
-                self.total += float(one.r @ one.r)
+                where, A = now.jacobians.on_axis(number, k, everything)
+                axis = _Axis(counts, direction(bias), where, A, residual[:, k])
+                axis = axis._replace(A=axis.free(A), r=axis.free(residual[:, k]))
+                self.axes.append(axis)
+                self.N[np.ix_(where, where)] += axis.A @ axis.A.T
+                self.g[where] += axis.A @ axis.r
+                self.total += float(axis.r @ axis.r)
         self.left = self.total - float(self.g @ np.linalg.solve(self.N, self.g))
 
-    def gain(self, physics: Effect, start: Theta) -> float:
-        """Squares that one linear step from a start takes off, no positive parameter changing by more than a factor of e."""
-        chosen, p = (*self.now.chosen, (physics, start)), len(start)
-        moves = np.array([not number.begins for number in physics.parameters])  # the others are gone through, not stepped
+    def gain(self, effect: Effect, start: Theta) -> float:
+        """Gain in squares of one linear step from a start, no positive parameter changing by more than a factor of e."""
+        chosen, p = (*self.now.chosen, (effect, start)), len(start)
+        moves = np.array([not parameter.begins for parameter in effect.parameters])  # onsets are searched, not stepped
         N_bb, N_ab, g_b = np.zeros((p, p)), np.zeros((len(self.N), p)), np.zeros(p)
         g_a, total = self.g.copy(), self.total
-        for k, (log, course) in enumerate(zip(self.logs, self.now.courses, strict=True)):
-            with_it = course if physics.linear else ForwardPass(log.pair, chosen, course)
-            B, added = effect_jacobian(log.whiten, with_it, physics), with_it.added(course)
-            for axis, one in enumerate(self.axes[6 * k : 6 * k + 6]):
-                js, r = np.flatnonzero(B.on[axis] & moves), one.r
-                if axis in added:
-                    r = r - one.free(log.whiten.rows(added[axis][None], np.array([axis]))[0])
-                    total += float(r @ r - one.r @ one.r)
-                    g_a[one.where] += one.A @ (r - one.r)
+        for k, (log, forward) in enumerate(zip(self.logs, self.now.passes, strict=True)):
+            with_it = forward if effect.linear else ForwardPass(log.pair, chosen, forward)
+            B, added = effect_jacobian(log.whiten, with_it, effect), with_it.added(forward)
+            for column in range(log.pair.columns):
+                axis = self.axes[log.pair.columns * k + column]
+                js, r = np.flatnonzero(B.on[column] & moves), axis.r
+                if column in added:
+                    r = r - axis.free(log.whiten.rows(added[column][None], np.array([column]))[0])
+                    total += float(r @ r - axis.r @ axis.r)
+                    g_a[axis.where] += axis.A @ (r - axis.r)
                 if len(js):
-                    b = one.free(B.white[axis, js])
+                    b = axis.free(B.white[column, js])
                     N_bb[np.ix_(js, js)] += b @ b.T
-                    N_ab[np.ix_(one.where, js)] += one.A @ b.T
+                    N_ab[np.ix_(axis.where, js)] += axis.A @ b.T
                     g_b[js] += b @ r
-        _, std = priors((chosen[-1],), (chosen[-1],))
+        _, std = priors(chosen[-1:])
         beside = np.linalg.solve(self.N, np.concatenate([N_ab, g_a[:, None]], axis=1))
         S, g = N_bb + np.diag(1.0 / std**2) - N_ab.T @ beside[:, :p], g_b - N_ab.T @ beside[:, p]
         step = np.linalg.solve(S, g)
-        far = float(np.abs(step[[number.positive for number in physics.parameters]]).max(initial=1.0))
+        far = float(np.abs(step[[parameter.positive for parameter in effect.parameters]]).max(initial=1.0))
         return float(self.left - total + g_a @ beside[:, p] + (2.0 / far - 1.0 / far**2) * (g @ step))
+
+
+def _exclude(a: Effect, b: Effect) -> bool:
+    """Whether two effects never act together: variants of one effect of the catalogue on one sensor."""
+    one_sensor = a.sensors == b.sensors or bool(set(a.sensors) & set(b.sensors))
+    variants = a.kind == b.kind == "catalogue" and a.name == b.name and one_sensor
+    return a.key == b.key or variants
+
+
+class Scored(NamedTuple):
+    """A candidate with the log p-value of its score from its best start, and the gain in squares."""
+
+    log_p: float
+    effect: Effect
+    start: Theta
+    gain: float
+
+    @property
+    def aic_gain(self) -> float:
+        """Gain less the expectation for as many parameters (Akaike)."""
+        return self.gain - 2.0 * len(self.start)
+
+
+class Candidates:
+    """Candidate effects with the starts of their fits, and their scores beside the last fit that was asked for."""
+
+    def __init__(self, logs: Sequence[WhitenedLog], effects: Sequence[Effect]) -> None:
+        self.logs = logs
+        self.starts: dict[str, list[Theta]] = {}
+        self.log_choices: dict[str, float] = {}
+        self.scores: dict[str, Scored] = {}
+        self.scored_fit: Fit | None = None
+        pair = logs[0].pair
+        for effect in effects:
+            if effect.key not in self.starts:
+                starts = self.starts[effect.key] = pair.starts(effect)
+                self.log_choices[effect.key] = float(np.log(max(1.0, pair.alternatives(effect) / len(starts))))
+
+    def count(self, effects: Sequence[Effect]) -> int:
+        """Number of starts of some candidates: the hypotheses of the Bonferroni correction."""
+        return sum(len(self.starts[effect.key]) for effect in effects)
+
+    def log_p(self, effect: Effect, gain: float) -> float:
+        """Log p-value of a gain by an effect; starts that are the best of many choices make chance likelier."""
+        return log_p_value(gain, len(effect.parameters)) + self.log_choices[effect.key]
+
+    def ranked(self, now: Fit, candidates: Sequence[Effect]) -> list[Scored]:
+        """Candidates beside a fit by their score, each from its best start."""
+        if self.scored_fit is not now:
+            self.scored_fit, self.scores = now, {}
+        asked = [effect for effect in candidates if not any(_exclude(effect, other) for other, _ in now.chosen)]
+        score = None
+        for effect in asked:
+            if effect.key not in self.scores:
+                score = score or CandidateScore(self.logs, now)
+                gains = [(score.gain(effect, start), start) for start in self.starts[effect.key]]
+                gain, start = max(gains, key=lambda pair: pair[0])
+                self.scores[effect.key] = Scored(self.log_p(effect, gain), effect, start, gain)
+        return sorted((self.scores[effect.key] for effect in asked), key=lambda entry: entry.log_p)
+
+
+def unnamed_count(found: Fit) -> int:
+    """Number of effects that are not of the catalogue."""
+    return sum(effect.kind != "catalogue" for effect, _ in found.chosen)
+
+
+def bic(found: Fit, unnamed_penalty: float) -> float:
+    """Squares left and the cost of the parameters (BIC); an effect outside the catalogue costs more."""
+    count = len(parameters_of(found.chosen))
+    return found.objective + count * float(np.log(found.numbers)) + unnamed_penalty * unnamed_count(found)

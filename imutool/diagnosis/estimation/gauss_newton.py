@@ -1,10 +1,9 @@
-"""Effects fitted to pairs, together, with a constant bias for each log, weighed by the noise.
+"""Gauss-Newton fit of effects to whitened logs together, with a constant bias for each log and axis.
 
-Gauss-Newton on whitened residuals, and between its steps a look at all times at which an effect may set in. Derivatives cost as
-many evaluations as there are parameters, and a step one: they stay as long as steps do what they say (`STRAIGHT`), and a fit
-may begin with those of another nearby. Every parameter has a weak prior, `PRIOR` times its plausible size: what the motion
-cannot show stays at nothing instead of becoming a large number, and its standard deviation says so. Positive parameters are
-fitted by their logarithm.
+Between the steps all times are searched at which an effect may set in. A Jacobian costs an evaluation for each parameter, a
+step one: a Jacobian is kept as long as steps do what it predicts, and a fit may begin with that of another fit nearby.
+Every parameter has a weak prior, `PRIOR` times its plausible size: what the motion does not show stays at its null value
+instead of becoming a large number, and its standard deviation says so. Positive parameters are fitted by their logarithm.
 """
 
 from __future__ import annotations
@@ -15,123 +14,107 @@ from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float64
+from jaxtyping import Float64
 
-from imutool.diagnosis.estimation.alignment import Pair
-from imutool.diagnosis.estimation.forward_cache import Chosen, ForwardPass, bound, free
-from imutool.diagnosis.estimation.jacobians import Jacobians
-from imutool.diagnosis.estimation.whitening import Whitener, settled
-from imutool.sensor.effect import Theta
+from imutool.diagnosis.estimation.jacobians import Chosen, ForwardPass, Jacobians, bound, free, step_of
+from imutool.diagnosis.estimation.whitening import WhitenedLog
+from imutool.sensor.effect import Parameter, Theta
 
-PRIOR = 3.0
+PRIOR = 3.0  # standard deviation of a parameter's prior, over its plausible size
 LOG_PRIOR = 1.5  # of a positive parameter about where its fit began, in powers of e
-ITERATIONS = 8
-BIAS_PRIOR = np.array([0.5] * 3 + [5.0] * 3)
-BACKTRACKS = 4
-SETTLED = 1e-2  # squares: less is no step any more
-PATIENCE = 3  # steps, after which a fit has to be below what was hoped for
-STRAIGHT = 0.05  # of a step's length in white samples: by how much it may miss what the derivatives say of it
+ITERATIONS, BACKTRACKS = 8, 4
+CONVERGED = 1e-2  # squares: a smaller gain ends the fit
+PATIENCE = 3  # steps, after which a fit has to be below `give_up_above`
+PREDICTED = 0.05  # of a step's length in white samples: the error up to which its Jacobian is kept
+POLISHED = 8  # times that steps of a parameter that jumps are halved
+BETWEEN_SAMPLES = 2.0  # an edge lies somewhere between two samples, which least squares ignore (20 cases: 1.7)
 
 
-@dataclass(frozen=True, eq=False)
-class WhitenedLog:
-    """A pair with the noise it is weighed by, and rows by what they are for."""
+def parameters_of(chosen: Chosen) -> list[Parameter]:
+    """All parameters in order."""
+    return [parameter for effect, _ in chosen for parameter in effect.parameters]
 
-    pair: Pair
-    whiten: Whitener
 
-    def numbers(self, part: str) -> int:
-        """White values of a part that tell anything."""
-        rows, counts = self.rows(part), self.whiten.counts
-        return int(6 * rows.sum() if counts is None else counts[rows].sum())
+def free_of(chosen: Chosen) -> Theta:
+    """All free parameters in order."""
+    return np.concatenate([np.zeros(0), *(free(effect, theta) for effect, theta in chosen)])
 
-    def rows(self, part: str) -> Bool[np.ndarray, " n"]:
-        """`fitted`, `held_out` or `all`, behind the filter's start."""
-        fitted, held_out = self._rows
-        return fitted | held_out if part == "all" else fitted if part == "fitted" else held_out
 
-    @cached_property
-    def _rows(self) -> tuple[Bool[np.ndarray, " n"], Bool[np.ndarray, " n"]]:
-        every, order = self.whiten.every, self.whiten.order
-        return settled(self.pair.fitted[::every], order), settled(self.pair.held_out[::every], order)
-
-    @cached_property
-    def constants(self) -> Float64[np.ndarray, "n 6"]:
-        """What a constant on each axis becomes behind the filter."""
-        return self.whiten(np.ones_like(self.pair.real))
-
-    def residual(self, course: ForwardPass) -> Float64[np.ndarray, "n 6"]:
-        """White residuals, with the bias."""
-        return self.whiten(self.pair.real - course.expected)
+def with_value(chosen: Chosen, k: int, j: int, value: float) -> Chosen:
+    """The effects with another value of one parameter."""
+    theta = chosen[k][1].copy()
+    theta[j] = value
+    return (*chosen[:k], (chosen[k][0], theta), *chosen[k + 1 :])
 
 
 @dataclass(frozen=True, eq=False)
 class Fit:
-    """Effects with their parameters, each log's bias, and how well they fit.
+    """Effects with their parameters, each log's bias, and the sum of squares of white residuals and of the prior.
 
-    `objective` is the sum of squares of white residuals and of the prior; `numbers` are the white values that were weighed, in
-    so many rows.
+    `numbers` is the count of the white values that were fitted.
     """
 
     chosen: Chosen
-    bias: Float64[np.ndarray, "logs 6"]
+    bias: Float64[np.ndarray, "logs k"]
     objective: float
-    rows: int
     numbers: int
     logs: tuple[WhitenedLog, ...]
     part: str
-    courses: tuple[ForwardPass, ...]
+    passes: tuple[ForwardPass, ...]
     prior: Float64[np.ndarray, " p"]
 
     @property
     def keys(self) -> tuple[str, ...]:
         """The effects' keys."""
-        return tuple(physics.key for physics, _ in self.chosen)
+        return tuple(effect.key for effect, _ in self.chosen)
+
+    @property
+    def reduced_chi_square(self) -> float:
+        """Squares left for each white value."""
+        return self.objective / max(self.numbers, 1)
 
     @cached_property
-    def slopes(self) -> Jacobians:
+    def jacobians(self) -> Jacobians:
         """Derivatives of the white samples, where the fit ended."""
-        return Jacobians([log.whiten for log in self.logs], self.courses, self.chosen)
+        return Jacobians([log.whiten for log in self.logs], self.passes, self.chosen)
 
     @cached_property
     def information(self) -> Float64[np.ndarray, "p p"]:
-        """The data's alone, without the prior, biases taken out."""
-        p, masks = len(self.prior), [log.rows(self.part) for log in self.logs]
-        nothing = [np.zeros((len(mask), 6)) for mask in masks]
-        N, _ = _normal(self.logs, self.slopes, nothing, np.zeros((len(self.logs), 6)), masks)
+        """Fisher information of the data alone, without the prior, biases marginalised."""
+        p = len(self.prior)
+        N, _ = _normal(_Problem(self.logs, self.chosen, self.part), self.jacobians, None, self.bias)
         out: Float64[np.ndarray, "p p"] = N[:p, :p] - N[:p, p:] @ np.linalg.solve(N[p:, p:], N[p:, :p])
         return out
 
     @cached_property
     def covariance(self) -> Float64[np.ndarray, "p p"]:
-        """Of the parameters of all effects in order (logarithms for positive ones), biases taken out."""
+        """Covariance of the free parameters in order (logarithms for positive ones), biases marginalised."""
         return np.linalg.inv(self.information + np.diag(1.0 / self.prior**2)) if len(self.prior) else np.zeros((0, 0))
+
+    def place(self, key: str) -> slice:
+        """Where an effect's parameters are among all."""
+        k = self.keys.index(key)
+        first = sum(len(theta) for _, theta in self.chosen[:k])
+        return slice(first, first + len(self.chosen[k][1]))
 
     def stds(self) -> dict[str, Float64[np.ndarray, " p"]]:
         """Standard deviations by effect, in the parameters' units."""
-        out, first = {}, 0
-        for physics, theta in self.chosen:
-            std = np.sqrt(np.diag(self.covariance)[first : first + len(theta)])
-            out[physics.key] = np.array(
-                [s * t if n.positive else s for s, t, n in zip(std, theta, physics.parameters, strict=True)]
+        out, all_ = {}, np.sqrt(np.diag(self.covariance))
+        for effect, theta in self.chosen:
+            std = all_[self.place(effect.key)] * (BETWEEN_SAMPLES if effect.jumps else 1.0)
+            out[effect.key] = np.array(
+                [s * t if n.positive else s for s, t, n in zip(std, theta, effect.parameters, strict=True)]
             )
-            first += len(theta)
         return out
 
 
-def expected(pair: Pair, chosen: Chosen) -> Float64[np.ndarray, "n 6"]:
-    """What the sensor would read, without bias."""
-    return ForwardPass(pair, chosen).expected
-
-
-def priors(chosen: Chosen, begun: Chosen) -> tuple[Float64[np.ndarray, " p"], Float64[np.ndarray, " p"]]:
-    """Mean and standard deviation of the free parameters."""
+def priors(begun: Chosen) -> tuple[Float64[np.ndarray, " p"], Float64[np.ndarray, " p"]]:
+    """Mean and standard deviation of the free parameters: about the null value, or the start where that is infinite."""
     mean, std = [], []
-    for (physics, theta), (_, at) in zip(chosen, begun, strict=True):
-        for number, x in zip(physics.parameters, free(physics, at), strict=True):
-            mean.append(x if number.positive else 0.0)
-            std.append(LOG_PRIOR if number.positive else PRIOR * number.plausible)
-        assert len(theta) == len(physics.parameters)
+    for parameter, x in zip(parameters_of(begun), free_of(begun), strict=True):
+        at_start = parameter.positive or not np.isfinite(parameter.null_value)
+        mean.append(x if at_start else parameter.null_value)
+        std.append(LOG_PRIOR if parameter.positive else PRIOR * parameter.plausible)
     return np.array(mean), np.array(std)
 
 
@@ -141,193 +124,168 @@ def fit(
     part: str = "fitted",
     iterations: int = ITERATIONS,
     near: Fit | None = None,
-    hopeful: float = np.inf,
+    give_up_above: float = np.inf,
 ) -> Fit:
-    """The effects fitted together from where they begin, and a bias for each log.
+    """Fit effects together from where they begin, and a bias for each log.
 
-    `near` is a fit of the same logs whose derivatives serve for the first step, as far as its effects are the same. A fit whose
-    objective is not below `hopeful` after a few steps goes no further.
+    `near` is a fit of the same logs: the Jacobians of the effects that both share serve for the first step. A fit whose
+    objective is not below `give_up_above` after a few steps goes no further.
     """
-    mean, std = priors(begun, begun)
-    masks, whiteners = [log.rows(part) for log in logs], [log.whiten for log in logs]
-
-    def tried(chosen: Chosen, like: _State | None) -> _State:
-        courses = [ForwardPass(log.pair, chosen, None if like is None else like.courses[k]) for k, log in enumerate(logs)]
-        residuals = [log.residual(course) for log, course in zip(logs, courses, strict=True)]
-        return _State(chosen, courses, residuals, *_biases(logs, residuals, masks, _penalty(chosen, mean, std)))
-
-    now, steps = tried(begun, None), 0
-    known = None if near is None else near.slopes
-    while len(mean) and steps < iterations:
-        before = now.objective
-        for moved in _set_in(logs, now, masks):
-            now = min(now, tried(moved, now), key=_objective)
-        slopes = Jacobians(whiteners, now.courses, now.chosen, known)
-        sizes = (_step(logs, slopes, now, masks, mean, std) * 0.5**back for back in range(BACKTRACKS))
-        x = np.concatenate([free(physics, theta) for physics, theta in now.chosen])
-        tries = ((step, tried(_moved(now.chosen, x + step), now)) for step in sizes)
-        step, better = next((one for one in tries if one[1].objective < now.objective), (x, now))
-        if better is now:
-            if slopes.fresh:
-                break
-            known = None
-            continue
-        straight = _straight(logs, slopes, now, better, step, masks)
-        now, steps = better, steps + 1
-        settled = before - now.objective < SETTLED and (slopes.fresh or straight)
-        if settled or (steps == PATIENCE and now.objective >= hopeful):
-            break
-        known = slopes if straight else slopes.linear()
-    rows, numbers = int(sum(mask.sum() for mask in masks)), sum(log.numbers(part) for log in logs)
-    return Fit(now.chosen, now.bias, now.objective, rows, numbers, tuple(logs), part, tuple(now.courses), std)
+    problem = _Problem(logs, begun, part)
+    now = _descended(problem, problem.state(begun, None), iterations, near, give_up_above)
+    if iterations and any(effect.jumps for effect, _ in begun):
+        now = _descended(problem, _polished(problem, now), iterations, None, np.inf)
+    numbers = sum(log.count(part) for log in logs)
+    return Fit(now.chosen, now.bias, now.objective, numbers, tuple(logs), part, tuple(now.passes), problem.std)
 
 
 class _State(NamedTuple):
-    """How far a fit has come."""
+    """Parameters on the way of a fit, with residuals and the objective."""
 
     chosen: Chosen
-    courses: list[ForwardPass]
-    residuals: list[Float64[np.ndarray, "n 6"]]
-    bias: Float64[np.ndarray, "logs 6"]
+    passes: list[ForwardPass]
+    residuals: list[Float64[np.ndarray, "n k"]]
+    bias: Float64[np.ndarray, "logs k"]
     objective: float
 
 
-def _step(
-    logs: Sequence[WhitenedLog],
-    slopes: Jacobians,
-    now: _State,
-    masks: Sequence[Bool[np.ndarray, " n"]],
-    mean: Float64[np.ndarray, " p"],
-    std: Float64[np.ndarray, " p"],
-) -> Theta:
-    """Gauss and Newton's, of the free parameters."""
-    N, g = _normal(logs, slopes, now.residuals, now.bias, masks)
-    x = np.concatenate([free(physics, theta) for physics, theta in now.chosen])
-    N[: len(x), : len(x)] += np.diag(1.0 / std**2)
-    g[: len(x)] -= (x - mean) / std**2
-    return _within(_solved(N, g, now.chosen), now.chosen)
+class _Problem:
+    """Least squares of white residuals on some rows, with a prior about the start."""
+
+    def __init__(self, logs: Sequence[WhitenedLog], begun: Chosen, part: str) -> None:
+        self.logs, self.masks = logs, [log.rows(part) for log in logs]
+        self.mean, self.std = priors(begun)
+
+    def state(self, chosen: Chosen, like: _State | None) -> _State:
+        """Parameters with their residuals and objective; forward passes are continued from a state like it."""
+        passes = [ForwardPass(log.pair, chosen, None if like is None else like.passes[k]) for k, log in enumerate(self.logs)]
+        residuals = [log.residual(forward.expected) for log, forward in zip(self.logs, passes, strict=True)]
+        total = float((((free_of(chosen) - self.mean) / self.std) ** 2).sum()) if len(self.mean) else 0.0
+        bias = np.zeros((len(self.logs), self.logs[0].pair.columns))
+        for k, (log, residual, mask) in enumerate(zip(self.logs, residuals, self.masks, strict=True)):
+            constant, r, prior = log.constants[mask], residual[mask], log.pair.bias_std
+            bias[k] = (constant * r).sum(0) / ((constant * constant).sum(0) + 1.0 / prior**2)
+            total += float(((r - constant * bias[k]) ** 2).sum() + ((bias[k] / prior) ** 2).sum())
+        return _State(chosen, passes, residuals, bias, total)
+
+    def step(self, jacobians: Jacobians, now: _State) -> Theta:
+        """Gauss-Newton step of the free parameters; no positive one changes by more than a factor of e, onsets stay."""
+        N, g = _normal(self, jacobians, now.residuals, now.bias)
+        x, parameters = free_of(now.chosen), parameters_of(now.chosen)
+        N[: len(x), : len(x)] += np.diag(1.0 / self.std**2)
+        g[: len(x)] -= (x - self.mean) / self.std**2
+        begins = np.array([parameter.begins for parameter in parameters], bool)
+        moves = np.concatenate([~begins, np.ones(len(g) - len(begins), bool)])
+        delta = np.zeros(len(g))
+        delta[moves] = np.linalg.solve(N[np.ix_(moves, moves)], g[moves])
+        delta = delta[: len(begins)]
+        positive = np.array([parameter.positive for parameter in parameters])
+        return delta / max(1.0, float(np.abs(delta[positive]).max(initial=0.0)))
+
+    def as_predicted(self, jacobians: Jacobians, before: _State, after: _State, step: Theta) -> bool:
+        """Whether a step changed the residuals as the Jacobians predict, so that they may be kept."""
+        missed = length = 0.0
+        for k, (log, mask) in enumerate(zip(self.logs, self.masks, strict=True)):
+            change, constant = (before.residuals[k] - after.residuals[k])[mask], log.constants[mask]
+            for axis in range(log.pair.columns):
+                predicted, bias = jacobians.along(k, axis, step, mask), direction(constant[:, axis])
+                off = change[:, axis] - predicted
+                missed += float(off @ off - (off @ bias) ** 2)
+                length += float(predicted @ predicted - (predicted @ bias) ** 2)
+        return missed <= PREDICTED**2 * max(length, 1.0)
 
 
-def _straight(
-    logs: Sequence[WhitenedLog],
-    slopes: Jacobians,
-    before: _State,
-    after: _State,
-    step: Theta,
-    masks: Sequence[Bool[np.ndarray, " n"]],
-) -> bool:
-    """Whether a step went where the derivatives said: else they are to be taken anew."""
-    missed = length = 0.0
-    for k, (log, mask) in enumerate(zip(logs, masks, strict=True)):
-        done, one = (before.residuals[k] - after.residuals[k])[mask], log.constants[mask]
-        for axis in range(6):
-            said, bias = slopes.along(k, axis, step, mask), direction(one[:, axis])
-            off = done[:, axis] - said
-            missed += float(off @ off - (off @ bias) ** 2)
-            length += float(said @ said - (said @ bias) ** 2)
-    return missed <= STRAIGHT**2 * max(length, 1.0)
+def _descended(problem: _Problem, now: _State, iterations: int, near: Fit | None, give_up_above: float) -> _State:
+    """The state after Gauss-Newton steps, each shortened until the objective falls."""
+    steps, known = 0, None if near is None or not len(problem.mean) else near.jacobians
+    whiteners = [log.whiten for log in problem.logs]
+    while len(problem.mean) and steps < iterations:
+        before = now.objective
+        for moved in _onsets(problem, now):
+            now = min(now, problem.state(moved, now), key=_objective)
+        jacobians = Jacobians(whiteners, now.passes, now.chosen, known)
+        x, whole = free_of(now.chosen), problem.step(jacobians, now)
+        tries = (
+            (step, problem.state(_bound(now.chosen, x + step), now)) for step in (whole * 0.5**k for k in range(BACKTRACKS))
+        )
+        step, better = next((taken for taken in tries if taken[1].objective < now.objective), (x, now))
+        if better is now:
+            if jacobians.fresh:
+                break
+            known = None
+            continue
+        predicted = problem.as_predicted(jacobians, now, better, step)
+        now, steps = better, steps + 1
+        converged = before - now.objective < CONVERGED and (jacobians.fresh or predicted)
+        if converged or (steps == PATIENCE and now.objective >= give_up_above):
+            break
+        known = jacobians if predicted else jacobians.linear()
+    return now
 
 
-def direction(x: Float64[np.ndarray, " n"]) -> Float64[np.ndarray, " n"]:
-    """Of length one; nothing stays nothing, as a constant is on an axis that tells nothing."""
-    return x / max(float(np.linalg.norm(x)), 1e-300)
+def _polished(problem: _Problem, now: _State) -> _State:
+    """The state after ever smaller steps of single parameters of what jumps, where derivatives lead only from afar."""
+    moving = [(effect.jumps, step_of(parameter)) for effect, _ in now.chosen for parameter in effect.parameters]
+    for halved in range(POLISHED):
+        for j, (jumps, h) in enumerate(moving):
+            for sign in (1.0, -1.0) if jumps else ():
+                x = free_of(now.chosen)
+                x[j] += sign * h * 2.0 ** (1 - halved)
+                now = min(now, problem.state(_bound(now.chosen, x), now), key=_objective)
+    return now
 
 
 def _objective(state: _State) -> float:
     return state.objective
 
 
-def _solved(N: Float64[np.ndarray, "q q"], g: Float64[np.ndarray, " q"], chosen: Chosen) -> Float64[np.ndarray, " p"]:
-    """The step of the parameters; times at which effects set in stay."""
-    begins = np.array([number.begins for physics, _ in chosen for number in physics.parameters], bool)
-    moves = np.concatenate([~begins, np.ones(len(g) - len(begins), bool)])
-    delta = np.zeros(len(g))
-    delta[moves] = np.linalg.solve(N[np.ix_(moves, moves)], g[moves])
-    return delta[: len(begins)]
+def _bound(chosen: Chosen, x: Theta) -> Chosen:
+    """Effects with their parameters from free ones."""
+    cuts = np.cumsum([len(theta) for _, theta in chosen])[:-1]
+    return tuple((effect, bound(effect, part)) for (effect, _), part in zip(chosen, np.split(x, cuts), strict=True))
 
 
-def _set_in(logs: Sequence[WhitenedLog], now: _State, masks: Sequence[Bool[np.ndarray, " n"]]) -> Iterator[Chosen]:
-    """With one effect setting in at its best time: before it squares left without the effect count, behind it those with it."""
-    chosen = now.chosen
-    for k, (physics, _) in enumerate(chosen):
-        for j, number in enumerate(physics.parameters):
-            if not number.begins:
+def direction(x: Float64[np.ndarray, " n"]) -> Float64[np.ndarray, " n"]:
+    """Unit vector; zero stays zero, as a constant is on an axis without known samples."""
+    return x / max(float(np.linalg.norm(x)), 1e-300)
+
+
+def _onsets(problem: _Problem, now: _State) -> Iterator[Chosen]:
+    """Effects with one onset at the time that minimises the cost: no effect before it, the effect after."""
+    for k, (effect, _) in enumerate(now.chosen):
+        for j, parameter in enumerate(effect.parameters):
+            if not parameter.begins:
                 continue
             at, excess = [], []
-            for log, mask, bias, course in zip(logs, masks, now.bias, now.courses, strict=True):
-                courses = (ForwardPass(log.pair, _but(chosen, k, j, t), course) for t in (np.inf, -np.inf))
-                ends = (log.residual(one) - log.constants * bias for one in courses)
-                never, always = ((one[mask] ** 2).sum(1) for one in ends)
-                stamp_s = log.pair.stamp_s
-                at.append(stamp_s[:: log.whiten.every][mask])
+            for log, mask, bias, forward in zip(problem.logs, problem.masks, now.bias, now.passes, strict=True):
+                passes = (ForwardPass(log.pair, with_value(now.chosen, k, j, t), forward) for t in (np.inf, -np.inf))
+                ends = (log.residual(end.expected) - log.constants * bias for end in passes)
+                never, always = ((end[mask] ** 2).sum(1) for end in ends)
+                at.append(log.pair.stamp_s[:: log.whiten.every][mask])
                 excess.append(never - always)
             order = np.argsort(np.concatenate(at), kind="stable")
             t_s, cost = np.concatenate(at)[order], np.cumsum(np.concatenate(excess)[order])
             best = int(np.argmin(cost[:-1]))
-            yield _but(chosen, k, j, float(t_s[best] + t_s[best + 1]) / 2.0)
-
-
-def _but(chosen: Chosen, k: int, j: int, value: float) -> Chosen:
-    """With another value of one parameter."""
-    theta = chosen[k][1].copy()
-    theta[j] = value
-    return (*chosen[:k], (chosen[k][0], theta), *chosen[k + 1 :])
-
-
-def _within(delta: Theta, chosen: Chosen) -> Theta:
-    """A step in which no positive parameter changes by more than a factor of e."""
-    positive = np.array([number.positive for physics, _ in chosen for number in physics.parameters])
-    most = float(np.abs(delta[positive]).max(initial=0.0))
-    return delta / max(1.0, most)
-
-
-def _moved(chosen: Chosen, x: Theta) -> Chosen:
-    out, first = [], 0
-    for physics, theta in chosen:
-        out.append((physics, bound(physics, x[first : first + len(theta)])))
-        first += len(theta)
-    return tuple(out)
-
-
-def _penalty(chosen: Chosen, mean: Theta, std: Theta) -> float:
-    if not len(mean):
-        return 0.0
-    x = np.concatenate([free(physics, theta) for physics, theta in chosen])
-    return float((((x - mean) / std) ** 2).sum())
-
-
-def _biases(
-    logs: Sequence[WhitenedLog],
-    residuals: Sequence[Float64[np.ndarray, "n 6"]],
-    masks: Sequence[Bool[np.ndarray, " n"]],
-    penalty: float,
-) -> tuple[Float64[np.ndarray, "logs 6"], float]:
-    """The best constants for some residuals, and the objective with them."""
-    b, total = np.zeros((len(logs), 6)), penalty
-    for k, (log, residual, mask) in enumerate(zip(logs, residuals, masks, strict=True)):
-        one, r = log.constants[mask], residual[mask]
-        b[k] = (one * r).sum(0) / ((one * one).sum(0) + 1.0 / BIAS_PRIOR**2)
-        total += float(((r - one * b[k]) ** 2).sum() + ((b[k] / BIAS_PRIOR) ** 2).sum())
-    return b, total
+            yield with_value(now.chosen, k, j, float(t_s[best] + t_s[best + 1]) / 2.0)
 
 
 def _normal(
-    logs: Sequence[WhitenedLog],
-    slopes: Jacobians,
-    residuals: Sequence[Float64[np.ndarray, "n 6"]],
-    b: Float64[np.ndarray, "logs 6"],
-    masks: Sequence[Bool[np.ndarray, " n"]],
+    problem: _Problem,
+    jacobians: Jacobians,
+    residuals: Sequence[Float64[np.ndarray, "n k"]] | None,
+    bias: Float64[np.ndarray, "logs k"],
 ) -> tuple[Float64[np.ndarray, "q q"], Float64[np.ndarray, " q"]]:
-    """Normal equations of all free parameters, then each log's bias."""
-    p = sum(len(theta) for _, theta in slopes.chosen)
-    N, g = np.zeros((p + 6 * len(logs),) * 2), np.zeros(p + 6 * len(logs))
-    for k, (log, residual, mask) in enumerate(zip(logs, residuals, masks, strict=True)):
-        for axis in range(6):
-            where, A = slopes.on_axis(k, axis, mask)
-            one, bias = log.constants[mask, axis], p + 6 * k + axis
+    """Normal equations of all free parameters, then each log's bias; no right-hand side without residuals."""
+    p = sum(len(theta) for _, theta in jacobians.chosen)
+    N, g = np.zeros((p + bias.size,) * 2), np.zeros(p + bias.size)
+    for k, (log, mask) in enumerate(zip(problem.logs, problem.masks, strict=True)):
+        for axis in range(log.pair.columns):
+            where, A = jacobians.on_axis(k, axis, mask)
+            constant, at = log.constants[mask, axis], p + log.pair.columns * k + axis
             N[np.ix_(where, where)] += A @ A.T
-            N[where, bias] += A @ one
-            N[bias, where] += A @ one
-            N[bias, bias] += one @ one + 1.0 / BIAS_PRIOR[axis] ** 2
-            g[where] += A @ (residual[mask, axis] - one * b[k, axis])
+            N[where, at] += A @ constant
+            N[at, where] += A @ constant
+            N[at, at] += constant @ constant + 1.0 / log.pair.bias_std[axis] ** 2
+            if residuals is not None:
+                g[where] += A @ (residuals[k][mask, axis] - constant * bias[k, axis])
     return N, g

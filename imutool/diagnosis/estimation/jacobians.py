@@ -1,34 +1,123 @@
-"""Derivatives of the white samples of logs by the parameters of the effects that they are fitted with.
+"""Cached forward passes through effects, and finite-difference Jacobians of whitened samples.
 
-They are what a fit costs: an evaluation for each parameter and log. So they are kept by effect, and only what is not known is
-worked out.
+A forward pass keeps the signals before each effect, so that a change of one effect evaluates only the effects behind it.
+Derivatives are differences of the effects' own forward models: an effect is one function. They cost an evaluation for each
+parameter and log, so a fit keeps them by effect and evaluates only the missing ones.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from bisect import bisect
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float64, Int64
 
-from imutool.diagnosis.estimation.forward_cache import Chosen, ForwardPass
+from imutool.diagnosis.estimation.aligned_log import AlignedLog
 from imutool.diagnosis.estimation.whitening import Whitener
-from imutool.sensor.effect import Effect, Theta
+from imutool.sensor.effect import Effect, Parameter, SignalState, Stage, Theta, in_stage_order, stage_order
+
+STEP, LOG_STEP = 1e-3, 1e-3  # of the plausible size, or of the logarithm
+
+Chosen = tuple[tuple[Effect, Theta], ...]
+
+
+class ForwardPass:
+    """Ideal signals of a log through effects to its readings; states shared with another pass are taken from there."""
+
+    def __init__(self, pair: AlignedLog, chosen: Chosen, like: ForwardPass | None = None) -> None:
+        self.pair, self.acting = pair, in_stage_order(chosen)
+        same = 0 if like is None else _shared(self.acting, like.acting)
+        self._states: list[SignalState] = [pair.state()] if like is None else like._states[: same + 1]
+        for effect, theta in self.acting[same:]:
+            if effect.stage > Stage.CLOCK:
+                self._states[-1] = self._states[-1].sampled()
+            self._states.append(self._states[-1].through(effect, theta))
+        self.blocks = pair.blocks(self._states[-1].samples())
+
+    @property
+    def expected(self) -> Float64[np.ndarray, "n k"]:
+        """Readings without bias."""
+        return np.concatenate([block for _, block in self.blocks], axis=1)
+
+    def added(self, to: ForwardPass) -> dict[int, Float64[np.ndarray, " n"]]:
+        """Readings less those of another pass, by the axes on which they differ."""
+        both = ((first, here, there) for (first, here), (_, there) in zip(self.blocks, to.blocks, strict=True))
+        rows = {first + k: row for first, here, there in both if here is not there for k, row in enumerate((here - there).T)}
+        return {axis: row for axis, row in rows.items() if row.any()}
+
+    def derivatives(self, effect: Effect) -> Iterator[tuple[int, int, Float64[np.ndarray, " n"]]]:
+        """d expected / d (free parameters) of an effect, by forward differences: axis, parameter, and a row that is not zero.
+
+        An effect outside this pass is inserted at its null value, for which it has to be linear.
+        """
+        place = next((k for k, (other, _) in enumerate(self.acting) if other is effect), None)
+        if place is None:
+            place = bisect([stage_order(other) for other, _ in self.acting], stage_order(effect))
+            theta, behind = effect.null_value.astype(float), self.acting[place:]
+        else:
+            theta, behind = self.acting[place][1], self.acting[place + 1 :]
+        if effect.stage > Stage.CLOCK:
+            self._states[place] = self._states[place].sampled()
+        x, before = free(effect, theta), self._states[place]
+        for j, parameter in enumerate(effect.parameters):
+            h = step_of(parameter)
+            moved = x.copy()
+            moved[j] += h
+            state = before.through(effect, bound(effect, moved))
+            for other, values in behind:
+                state = state.through(other, values)
+            for (first, then), (_, now) in zip(self.pair.blocks(state.samples()), self.blocks, strict=True):
+                if then is not now:
+                    rows = ((then - now) / h).T
+                    yield from ((first + k, j, row) for k, row in enumerate(rows) if row.any())
+
+
+def _shared(a: list[tuple[Effect, Theta]], b: list[tuple[Effect, Theta]]) -> int:
+    """Number of effects that two passes share from the start."""
+    count = 0
+    for (effect, theta), (other, same) in zip(a, b, strict=False):
+        if effect is not other or not np.array_equal(theta, same):
+            break
+        count += 1
+    return count
+
+
+def expected(pair: AlignedLog, chosen: Chosen) -> Float64[np.ndarray, "n k"]:
+    """Readings of a sensor with some effects, without bias."""
+    return ForwardPass(pair, chosen).expected
+
+
+def free(effect: Effect, theta: Theta) -> Theta:
+    """Parameters as they are fitted: logarithms of the positive ones."""
+    return np.array([np.log(t) if n.positive else t for t, n in zip(theta, effect.parameters, strict=True)])
+
+
+def bound(effect: Effect, x: Theta) -> Theta:
+    """Parameters from the free ones: the inverse of `free`."""
+    return np.array([np.exp(np.clip(v, -50, 50)) if n.positive else v for v, n in zip(x, effect.parameters, strict=True)])
+
+
+def step_of(parameter: Parameter) -> float:
+    """Step of the finite difference."""
+    if parameter.step is not None:
+        return parameter.step
+    return LOG_STEP if parameter.positive else STEP * parameter.plausible
 
 
 class EffectJacobian(NamedTuple):
-    """Of one effect on one log, by axis and parameter; `on` says which of them are anything but zero."""
+    """White derivatives of one effect on one log, by axis and parameter; `on` marks those that are not zero."""
 
-    white: Float64[np.ndarray, "6 p n"]
-    on: Bool[np.ndarray, "6 p"]
+    white: Float64[np.ndarray, "k p n"]
+    on: Bool[np.ndarray, "k p"]
 
 
-def effect_jacobian(whiten: Whitener, course: ForwardPass, physics: Effect) -> EffectJacobian:
-    """Of an effect on a course, or of a linear one that is not."""
-    shape = 6, len(physics.parameters)
-    white, on = np.zeros((*shape, len(range(0, len(course.pair.stamp_s), whiten.every)))), np.zeros(shape, bool)
-    found = list(course.slope(physics))
+def effect_jacobian(whiten: Whitener, forward: ForwardPass, effect: Effect) -> EffectJacobian:
+    """Jacobian of an effect in a forward pass, or of a linear one outside it."""
+    shape = forward.pair.columns, len(effect.parameters)
+    white, on = np.zeros((*shape, len(range(0, len(forward.pair.stamp_s), whiten.every)))), np.zeros(shape, bool)
+    found = list(forward.derivatives(effect))
     if found:
         axes, js = np.array([axis for axis, _, _ in found]), np.array([j for _, j, _ in found])
         white[axes, js], on[axes, js] = whiten.rows(np.stack([row for _, _, row in found]), axes), True
@@ -36,41 +125,41 @@ def effect_jacobian(whiten: Whitener, course: ForwardPass, physics: Effect) -> E
 
 
 class Jacobians:
-    """Of effects together; those that are `known` from elsewhere are taken as they are, the very same effect there and here."""
+    """Jacobians of effects that act together; those of the very same effect in `known` are taken from there."""
 
     def __init__(
-        self, whiteners: Sequence[Whitener], courses: Sequence[ForwardPass], chosen: Chosen, known: Jacobians | None = None
+        self, whiteners: Sequence[Whitener], passes: Sequence[ForwardPass], chosen: Chosen, known: Jacobians | None = None
     ) -> None:
         theirs: dict[int, tuple[EffectJacobian, ...]] = {} if known is None else known._by_effect
-        self.fresh = not any(id(physics) in theirs for physics, _ in chosen)
+        self.fresh = not any(id(effect) in theirs for effect, _ in chosen)
         self.chosen = chosen
         self._by_effect: dict[int, tuple[EffectJacobian, ...]] = {}
-        for physics, _ in chosen:
-            there = theirs.get(id(physics))
-            mine = (effect_jacobian(whiten, course, physics) for whiten, course in zip(whiteners, courses, strict=True))
-            self._by_effect[id(physics)] = tuple(mine) if there is None else there
+        for effect, _ in chosen:
+            there = theirs.get(id(effect))
+            mine = (effect_jacobian(whiten, forward, effect) for whiten, forward in zip(whiteners, passes, strict=True))
+            self._by_effect[id(effect)] = tuple(mine) if there is None else there
 
     def linear(self) -> Jacobians:
-        """Of the linear effects alone, which change least from step to step."""
+        """Those of the linear effects alone, which change least from step to step."""
         out = Jacobians((), (), ())
-        out.chosen = tuple(one for one in self.chosen if one[0].linear)
-        out._by_effect = {id(physics): self._by_effect[id(physics)] for physics, _ in out.chosen}
+        out.chosen = tuple(pair for pair in self.chosen if pair[0].linear)
+        out._by_effect = {id(effect): self._by_effect[id(effect)] for effect, _ in out.chosen}
         return out
 
     def on_axis(
         self, log: int, axis: int, mask: Bool[np.ndarray, " n"]
     ) -> tuple[Int64[np.ndarray, " q"], Float64[np.ndarray, "q m"]]:
-        """Which parameters of all act on an axis of a log, and the derivatives by them there, on some rows."""
+        """Places of the parameters that act on an axis of a log, and their derivatives on some rows."""
         where, rows, first = [np.zeros(0, np.int64)], [], 0
-        for slopes in self._by_effect.values():
-            one = slopes[log]
-            js = np.flatnonzero(one.on[axis])
+        for jacobians in self._by_effect.values():
+            jacobian = jacobians[log]
+            js = np.flatnonzero(jacobian.on[axis])
             where.append(first + js)
-            rows += [one.white[axis, j][mask] for j in js]
-            first += one.white.shape[1]
+            rows += [jacobian.white[axis, j][mask] for j in js]
+            first += jacobian.white.shape[1]
         return np.concatenate(where), np.stack(rows) if rows else np.zeros((0, int(mask.sum())))
 
     def along(self, log: int, axis: int, step: Theta, mask: Bool[np.ndarray, " n"]) -> Float64[np.ndarray, " m"]:
-        """By how much they say that white samples of an axis change in a step of all parameters."""
+        """Predicted change of an axis' white samples in a step of all parameters."""
         where, rows = self.on_axis(log, axis, mask)
         return np.asarray(step[where] @ rows)

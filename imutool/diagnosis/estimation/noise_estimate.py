@@ -1,59 +1,60 @@
-"""Recordings with the noise they are weighed by: what is left when everything in the catalogue has had its way.
+"""Noise model from the residuals of the full-catalogue fit, and the band up to which poses know the motion.
 
-Beside poses nobody states the noise: that of the poses, differentiated, has every colour, and that of the sensor lies under it.
-It is taken from what a rich model leaves: every effect of the catalogue, those that are not linear by their derivatives where
-a fit of them would start. An effect left out here would be taken for noise, and never be seen again.
+Beside poses the noise is unknown: that of the poses, differentiated, has every colour, and that of the sensor lies under it.
+It is estimated from what a rich model leaves: every effect of the catalogue, the nonlinear ones by their derivatives where a
+fit of them would start. An effect left out here would be taken for noise, and never be seen again.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Bool, Float64
+from scipy.signal import csd, welch
 
-from imutool.diagnosis.estimation.alignment import Pair
-from imutool.diagnosis.estimation.forward_cache import Chosen, ForwardPass
-from imutool.diagnosis.estimation.gauss_newton import WhitenedLog, expected
-from imutool.diagnosis.estimation.known_band import known_band_hz
-from imutool.diagnosis.estimation.whitening import Band, Whitener, level, settled, whitener
-from imutool.sensor.effect import Effect, Theta
-from imutool.sensor.samples import SensorSamples
+from imutool.diagnosis.estimation.aligned_log import Pair
+from imutool.diagnosis.estimation.jacobians import Chosen, ForwardPass, expected
+from imutool.diagnosis.estimation.whitening import Band, WhitenedImu, Whitener, level, settled, whitener
+from imutool.diagnosis.settings import BandSettings
+from imutool.sensor.effect import Effect
 
-ORDER_SIM, ORDER_TRUTH = 6, 6  # of the autoregression: the noise of a sensor; of poses, on rows that just hold their band
+ORDER = 6  # of the autoregression: the noise of a sensor; of poses, on rows that just hold their band
 RIDGE = 1e-8
-TURNS = 2  # of noise and model beside poses, each asked of the other
-MUCH = 3.0  # times the noise of another axis
-SAME = 1e-3  # of a column, left when those before it are taken out: it says nothing of its own
+ROUNDS = 2  # alternations of noise and model beside poses
+INDEPENDENT = 1e-3  # of the largest singular value, below which a column is a combination of others
+EDGES_HZ = (0.5, 0.8, 1.25, 2.0, 3.0, 4.5, 6.5, 9.0, 13.0, 18.0, 25.0)  # of the bands in which the poses are checked
 
 
-def whitened(pair: Pair, candidates: Sequence[Effect]) -> WhitenedLog:
-    """The pair with its noise; beside poses also with the band up to which they are seen to know the motion."""
-    if pair.against == "simulation":
-        return _counting(pair, level(_left(pair, candidates), pair.usable, 1.0 / pair.period_s, ORDER_SIM))
+def whitened(pair: Pair, candidates: Sequence[Effect], settings: BandSettings) -> WhitenedImu:
+    """The log with its noise model; beside poses also with the band up to which they are seen to know the motion."""
+    if pair.exact:
+        return _counting(pair, level(_left(pair, candidates), pair.usable, 1.0 / pair.period_s, ORDER))
     assert pair.band_hz is not None
     found, left = _in_band(pair, candidates, pair.band_hz)
     assert found.band is not None
     rate_hz = 1.0 / (pair.period_s * found.every)
-    band_hz = known_band_hz(found.band(pair.real), left, rate_hz, pair.band_hz)
+    band_hz = known_band_hz(found.band(pair.real), left, rate_hz, pair.band_hz, settings)
     if band_hz < pair.band_hz:
-        pair = pair.within(band_hz)
+        pair = replace(pair, band_hz=band_hz)
         found, _ = _in_band(pair, candidates, band_hz)
-    return _counting(pair, limited_to_quiet_axes(found))
+    return _counting(pair, limited_to_quiet_axes(found, settings.noisy_axis))
 
 
-def _counting(pair: Pair, white: Whitener) -> WhitenedLog:
-    """Without the values into which samples that tell nothing have gone."""
-    return WhitenedLog(pair, white if pair.known is None else white.counting(pair.known))
+def _counting(pair: Pair, white: Whitener) -> WhitenedImu:
+    """The whitened log, without values that depend on unknown samples."""
+    return WhitenedImu(pair, white if pair.known is None else white.counting(pair.known))
 
 
 def _in_band(pair: Pair, candidates: Sequence[Effect], band_hz: float) -> tuple[Whitener, Float64[np.ndarray, "m 6"]]:
-    """The noise of rows up to a frequency, and what a rich model leaves there."""
+    """The noise of rows up to a frequency, and the residual of a rich model there."""
     band = Band.below(band_hz, 1.0 / pair.period_s)
     columns, misfit = _rich(pair, candidates, band), band(pair.real - expected(pair, ()))
     usable = pair.usable[:: band.every]
     found = Whitener(np.ones((6, 1)), np.ones(6))
-    for _ in range(TURNS):
+    for _ in range(ROUNDS):
         left, spent = misfit.copy(), np.zeros(6)
         for axis in np.flatnonzero(usable.any(axis=0)).tolist():
             rows = settled(usable[:, axis], found.order)
@@ -61,16 +62,16 @@ def _in_band(pair: Pair, candidates: Sequence[Effect], band_hz: float) -> tuple[
             white = found.rows(both, np.full(len(both), axis))[:, rows]
             x, spent[axis] = _solved(white[:-1], white[-1])
             left[:, axis] -= x @ columns[axis]
-        found = whitener(left, usable, ORDER_TRUTH)
-        count = np.maximum(usable.sum(axis=0), 1.0)  # the noise before so many numbers were fitted to it
+        found = whitener(left, usable, ORDER)
+        count = np.maximum(usable.sum(axis=0), 1.0)  # the noise before so many parameters were fitted to it
         found = Whitener(found.filters, found.std * np.sqrt(count / np.maximum(count - spent, 0.5 * count)))
     return Whitener(found.filters, found.std, band), left
 
 
-def limited_to_quiet_axes(found: Whitener) -> Whitener:
-    """With no axis much noisier than the quiet ones of its sensor.
+def limited_to_quiet_axes(found: Whitener, most: float) -> Whitener:
+    """The whitener with no axis more than `most` times as noisy as the middle one of its sensor.
 
-    Poses err alike in all directions, and a sensor's axes are noisy alike; an axis in which much more is left holds what
+    Poses err alike in all directions, and a sensor's axes are equally noisy; an axis with a much larger residual holds what
     the catalogue has no name for.
     """
     filters, std = found.filters.copy(), found.std.copy()
@@ -78,56 +79,91 @@ def limited_to_quiet_axes(found: Whitener) -> Whitener:
     for part in (slice(0, 3), slice(3, 6)):
         middle = int(np.argsort(total[part])[1]) + part.start
         for axis in range(part.start, part.stop):
-            if total[axis] > MUCH * total[middle]:
-                filters[axis], std[axis] = found.filters[middle], MUCH * found.std[middle]
+            if total[axis] > most * total[middle]:
+                filters[axis], std[axis] = found.filters[middle], most * found.std[middle]
     return Whitener(filters, std, found.band)
 
 
-def noise_std(found: Whitener) -> Float64[np.ndarray, "6"]:
-    """The noise of a row by axis, before it is made white."""
+def noise_std(found: Whitener) -> Float64[np.ndarray, " k"]:
+    """Standard deviation of the noise of a row by axis, before whitening."""
     response = np.array([np.abs(np.fft.rfft(a, 512)) ** 2 for a in found.filters])
     return np.asarray(found.std * np.sqrt((1.0 / response).mean(axis=1)))
 
 
 def _left(pair: Pair, candidates: Sequence[Effect]) -> Float64[np.ndarray, "n 6"]:
-    """What is left of a simulation's misfit when everything linear has had its way."""
-    linear: Chosen = tuple((one, one.null_value.astype(float)) for one in candidates if one.linear)
-    course = ForwardPass(pair, linear)
-    left: Float64[np.ndarray, "n 6"] = pair.real - course.expected
+    """Residual of a simulation's misfit after a fit of every linear effect."""
+    linear: Chosen = tuple((effect, effect.null_value.astype(float)) for effect in candidates if effect.linear)
+    forward = ForwardPass(pair, linear)
+    left: Float64[np.ndarray, "n 6"] = pair.real - forward.expected
     columns: list[list[np.ndarray]] = [[np.ones(len(left))] for _ in range(6)]
-    for one, _ in linear:
-        for axis, _, row in course.slope(one):
+    for effect, _ in linear:
+        for axis, _, row in forward.derivatives(effect):
             columns[axis].append(row)
     for axis, rows in enumerate(pair.usable.T):
-        A = np.stack(columns[axis], axis=1)
-        size = np.linalg.norm(A[rows], axis=0)
-        A = A[:, size > 0] / size[size > 0]
-        N = A[rows].T @ A[rows] + RIDGE * np.eye(A.shape[1])
-        left[:, axis] -= A @ np.linalg.solve(N, A[rows].T @ left[rows, axis])
+        left[:, axis] -= ridge_fit(np.stack(columns[axis], axis=1), left[:, axis], rows)
     return left
 
 
+def ridge_fit(
+    A: Float64[np.ndarray, "n q"], y: Float64[np.ndarray, " n"], rows: Bool[np.ndarray, " n"]
+) -> Float64[np.ndarray, " n"]:
+    """Combination of columns that fits y best on some rows, on all rows."""
+    size = np.linalg.norm(A[rows], axis=0)
+    A = A[:, size > 0] / size[size > 0]
+    N = A[rows].T @ A[rows] + RIDGE * np.eye(A.shape[1])
+    return np.asarray(A @ np.linalg.solve(N, A[rows].T @ y[rows]))
+
+
 def _rich(pair: Pair, candidates: Sequence[Effect], band: Band) -> list[Float64[np.ndarray, "_ m"]]:
-    """For each axis a constant, and derivatives of everything in the catalogue at the places where fits begin, in a band."""
-    samples = SensorSamples(pair.stamp_s, pair.real[:, :3], pair.real[:, 3:], np.zeros((len(pair.real), 3)))
+    """For each axis a constant, and derivatives of the whole catalogue where fits begin, in a band."""
     columns = [[np.ones(len(pair.real))] for _ in range(6)]
     nothing = ForwardPass(pair, ())
-    for physics in candidates:
-        starts: Sequence[Theta] = ()
-        if physics.starts is not None and not physics.linear:
-            starts = physics.starts(pair.felt, samples)
-        courses = [ForwardPass(pair, ((physics, np.asarray(start, dtype=float)),), nothing) for start in starts] or [nothing]
-        for course in courses:
-            for axis, j, row in course.slope(physics):
-                if not physics.parameters[j].begins:
+    for effect in candidates:
+        passes = [nothing]
+        if effect.starts is not None and not effect.linear:
+            passes = [ForwardPass(pair, ((effect, start),), nothing) for start in pair.starts(effect)] or passes
+        for forward in passes:
+            for axis, j, row in forward.derivatives(effect):
+                if not effect.parameters[j].begins:
                     columns[axis].append(row)
     return [band.rows(np.stack(rows)) for rows in columns]
 
 
 def _solved(A: Float64[np.ndarray, "q m"], y: Float64[np.ndarray, " m"]) -> tuple[Float64[np.ndarray, " q"], float]:
-    """Least squares by the columns that say something of their own, and how many that are."""
+    """Least squares by the independent columns, and their number."""
     size = np.linalg.norm(A, axis=1)
     size = np.where(size > 0, size, 1.0)
     left, singular, right = np.linalg.svd((A / size[:, None]).T, full_matrices=False)
-    told = singular > SAME * singular[0]
-    return right[told].T @ ((left[:, told].T @ y) / singular[told]) / size, float(told.sum())
+    kept = singular > INDEPENDENT * singular[0]
+    return right[kept].T @ ((left[:, kept].T @ y) / singular[kept]) / size, float(kept.sum())
+
+
+def known_band_hz(
+    real: Float64[np.ndarray, "m 6"], left: Float64[np.ndarray, "m 6"], rate_hz: float, most_hz: float, settings: BandSettings
+) -> float:
+    """Frequency (Hz, up to `most_hz`) below which the expectation has hardly any error of the poses.
+
+    An error of the expectation does two things together: the recording shares less of it (coherence), and follows it with a
+    gain that is too small by as much (regression dilution; Fuller, Measurement Error Models, 1987, eq. 1.1.7: gain = true gain
+    x reliability), which passes for a scale. Noise of the sensor lowers the coherence alone, a slow sensor the gain alone.
+    The standard deviation of the gain is Bendat and Piersol's (Random Data, 4th ed., eq. 9.89).
+
+    `left` is the residual of a rich model of the sensor; the rest of the recording `real` is the expectation.
+    """
+    expectation, size = real - left, min(int(settings.segment_s * rate_hz), len(left))
+    f_hz, power = welch(expectation, rate_hz, nperseg=size, axis=0)
+    _, recorded = welch(real, rate_hz, nperseg=size, axis=0)
+    _, cross = csd(expectation, real, rate_hz, nperseg=size, axis=0)
+    duration_s = len(left) / rate_hz
+    for low, high in pairwise(EDGES_HZ):
+        if low >= most_hz:
+            break
+        band = (f_hz >= low) & (f_hz < high)
+        for part in (slice(0, 3), slice(3, 6)):
+            e, r, x = (float(abs(density[band, part].sum())) for density in (power, recorded, cross))
+            gain, coherence = x / e, x * x / (e * r)
+            std = np.sqrt((1.0 - coherence) / (2.0 * 3.0 * duration_s * (high - low))) * np.sqrt(r / e)
+            diluted = min(1.0 - gain - settings.sigma * std, 1.0 - coherence) > settings.diluted_share
+            if low >= settings.least_hz and diluted:
+                return low
+    return most_hz

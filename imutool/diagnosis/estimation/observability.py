@@ -1,57 +1,146 @@
-"""What the motion of some logs can show of the catalogue at all: what would drown in the noise even if it were there.
-
-A number of an effect that is as large as is plausible adds some squares to the white residuals, less what a constant bias would
-take of them. Where those are fewer than a search asks of a finding, the number cannot be seen, and nothing is said of it.
-"""
+"""Observability: which parameters the motion can show, which are fixed at their null value, which drown in a model's error."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float64
 
-from imutool.diagnosis.estimation.gauss_newton import WhitenedLog, expected
-from imutool.sensor.effect import Effect
+from imutool.diagnosis.estimation.jacobians import Chosen, expected
+from imutool.diagnosis.estimation.whitening import WhitenedLog
+from imutool.diagnosis.settings import SearchSettings
+from imutool.sensor.effect import Effect, Theta
 
-ENOUGH = 36.0  # squares: six standard deviations, as what is tried some thousand times has to be
 SMALL = 1e-2  # of the plausible size, at which an effect is still proportional to it
-BEHIND: Mapping[str, tuple[str, ...]] = {"clock_offset": ("clock_skew", "clock_jump", "low_pass", "mount_resonance")}
-"""What delays, swings or jumps needs the motion that shows a delay."""
+NEEDS_DELAY: Mapping[str, tuple[str, ...]] = {"clock_offset": ("clock_skew", "clock_jump", "low_pass", "mount_resonance")}
+"""What delays, rings or jumps needs the motion that shows a delay."""
+FOLLOWING = frozenset({"clock_offset", "clock_skew", "clock_jump", "low_pass", "mount_resonance"})
 
 
-def unobservable(logs: Sequence[WhitenedLog], candidates: Sequence[Effect]) -> tuple[str, ...]:
-    """`effect.parameter` of what cannot be seen, and `effect` where that is all of it."""
+# ── what the motion can show ──
+
+
+def unobservable(logs: Sequence[WhitenedLog], candidates: Sequence[Effect], settings: SearchSettings) -> tuple[str, ...]:
+    """`effect.parameter` of what would drown in the noise at its plausible size, and `effect` where that is all of it.
+
+    A parameter at its plausible size adds squares to the white residuals, less those that a constant bias takes. Fewer than
+    `observable_squares` cannot be seen.
+    """
     out: list[str] = []
-    for physics in candidates:
-        if not _asked(physics):
+    names = {effect.name for effect in candidates}
+    for effect in candidates:
+        if not _proportional(effect):
             continue
-        hidden = [number.name for number, gain in zip(physics.parameters, _gains(logs, physics), strict=True) if gain < ENOUGH]
-        if len(hidden) == len(physics.parameters):
-            out += [physics.name, *_behind(physics, candidates)]
+        gains = zip(effect.parameters, _gains(logs, effect), strict=True)
+        hidden = [parameter.name for parameter, gain in gains if gain < settings.observable_squares]
+        if len(hidden) == len(effect.parameters):
+            out += [effect.name, *(name for name in NEEDS_DELAY.get(effect.name, ()) if name in names)]
         else:
-            out += [f"{physics.name}.{name}" for name in hidden]
+            out += [f"{effect.name}.{name}" for name in hidden]
     return tuple(dict.fromkeys(out))
 
 
-def _asked(physics: Effect) -> bool:
-    """What is proportional to its numbers near nothing."""
-    return bool(np.isfinite(physics.null_value).all()) and not any(n.positive or n.begins for n in physics.parameters)
+def _proportional(effect: Effect) -> bool:
+    """Whether an effect is proportional to its parameters near zero."""
+    return bool(np.isfinite(effect.null_value).all()) and not any(n.positive or n.begins for n in effect.parameters)
 
 
-def _behind(physics: Effect, candidates: Sequence[Effect]) -> Iterator[str]:
-    there = {one.name for one in candidates}
-    return (name for name in BEHIND.get(physics.name, ()) if name in there)
-
-
-def _gains(logs: Sequence[WhitenedLog], physics: Effect) -> Float64[np.ndarray, " p"]:
-    """Squares that each number adds at its plausible size, less those of the constant that hides most of it."""
-    total = np.zeros(len(physics.parameters))
+def _gains(logs: Sequence[WhitenedLog], effect: Effect) -> Float64[np.ndarray, " p"]:
+    """Squares that each parameter adds at its plausible size, less those that a constant takes."""
+    total = np.zeros(len(effect.parameters))
     for log in logs:
         rows, nothing = log.rows("all"), expected(log.pair, ())
-        added = [expected(log.pair, ((physics, theta),)) - nothing for theta in np.diag(SMALL * physics.plausible)]
+        added = [expected(log.pair, ((effect, theta),)) - nothing for theta in np.diag(SMALL * effect.plausible)]
         B = log.whiten(np.stack(added, axis=2))[rows] / SMALL
-        one = log.whiten(np.ones_like(log.pair.real))[rows]
-        cross = np.einsum("na,nap->ap", one, B)
-        total += (B**2).sum(axis=(0, 1)) - (cross**2 / np.maximum((one**2).sum(axis=0), 1e-300)[:, None]).sum(axis=0)
+        constant = log.constants[rows]
+        cross = np.einsum("na,nap->ap", constant, B)
+        total += (B**2).sum(axis=(0, 1)) - (cross**2 / np.maximum((constant**2).sum(axis=0), 1e-300)[:, None]).sum(axis=0)
     return total
+
+
+# ── fixed parameters ──
+
+
+class FixedParameters:
+    """Forward model of an effect whose other parameters are fixed at their null value."""
+
+    def __init__(self, effect: Effect, free: Sequence[int]) -> None:
+        self.effect, self.free = effect, list(free)
+
+    def __call__(self, signals: Any, theta: Theta) -> Any:
+        """Signals behind the effect."""
+        every = self.effect.null_value.astype(float)
+        every[self.free] = theta
+        return self.effect.forward(signals, every)
+
+
+def with_free(effect: Effect, free: Sequence[int]) -> Effect:
+    """The effect with only these parameters, by place; itself where they are all."""
+    if len(free) == len(effect.parameters):
+        return effect
+    return replace(effect, parameters=tuple(effect.parameters[k] for k in free), forward=FixedParameters(effect, free))
+
+
+def without_implausible(effect: Effect, theta: Theta, factor: float) -> Effect:
+    """The effect without parameters `factor` times larger than plausible, which are a fit to noise."""
+    if not effect.linear or effect.kind != "catalogue":
+        return effect
+    return with_free(effect, [k for k, n in enumerate(effect.parameters) if abs(theta[k]) <= factor * n.plausible])
+
+
+def values_of(effect: Effect, reduced: Effect, theta: Theta) -> Theta:
+    """Values of the parameters that a reduced effect still has."""
+    names = [parameter.name for parameter in reduced.parameters]
+    return np.array([value for parameter, value in zip(effect.parameters, theta, strict=True) if parameter.name in names])
+
+
+def plausible_part(chosen: Chosen, factor: float) -> Chosen | None:
+    """The effects without implausible parameters; none if all are plausible."""
+    reduced = [without_implausible(effect, theta, factor) for effect, theta in chosen]
+    if all(new is effect for new, (effect, _) in zip(reduced, chosen, strict=True)):
+        return None
+    left = [(new, values_of(effect, new, theta)) for new, (effect, theta) in zip(reduced, chosen, strict=True)]
+    return tuple(pair for pair in left if len(pair[1]))
+
+
+def unidentified(effect: Effect, std: Theta, log_prior: float, *, curve: bool) -> Iterator[str]:
+    """`effect.parameter` of what is no surer than its prior, and of what is fixed; a curve's coefficients are not named."""
+    for parameter, s in zip(effect.parameters, std, strict=True):
+        if s > (log_prior if parameter.positive else parameter.plausible) and not curve:
+            yield f"{effect.key}.{parameter.name}"
+    if isinstance(effect.forward, FixedParameters):
+        free = {parameter.name for parameter in effect.parameters}
+        yield from (f"{effect.key}.{n.name}" for n in effect.forward.effect.parameters if n.name not in free)
+
+
+# ── the error of models ──
+
+
+def below_model_error(gains: Mapping[str, float], denoised: bool, settings: SearchSettings) -> frozenset[str]:
+    """Effects that follow the motion and explain no more than the model error of a far larger effect.
+
+    A filter and a clock say how a sensor follows its motion, and so does the error of any other model: a mass on springs moves,
+    and its lever arm with it; a simulator that holds its forces for a step reads accelerations half a step early; noise that
+    was filtered out of a simulation took a little of its motion along. Such an error is a share of the large effect, however
+    certain against the noise. `gains` are squares that leaving an effect out costs, by key; `denoised` says whether noise was
+    filtered out of a simulation.
+    """
+    allowed = settings.model_error_denoised if denoised else settings.model_error
+    simplified = {"mount_resonance": settings.model_error_resonance}  # models that are simpler than what they stand for
+    return frozenset(
+        key
+        for key, gain in gains.items()
+        if key in FOLLOWING
+        and any(gain < max(allowed, simplified.get(other, 0.0)) * more for other, more in gains.items() if other != key)
+    )
+
+
+def beyond_the_band(effect: Effect, theta: Theta, logs: Sequence[WhitenedLog], settings: SearchSettings) -> bool:
+    """Whether a frequency is one at which smoothed poses, which lose and lag by themselves, look alike, or too slow."""
+    factor = settings.beyond_band_low_pass if effect.name == "low_pass" else settings.beyond_band
+    reach = [factor * log.pair.band_hz for log in logs if log.pair.band_hz is not None]
+    hertz = [value for parameter, value in zip(effect.parameters, theta, strict=True) if parameter.unit == "Hz"]
+    return bool(reach and hertz and (max(hertz) > min(reach) or min(hertz) < settings.slowest_hz))

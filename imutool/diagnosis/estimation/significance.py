@@ -1,33 +1,52 @@
-"""What speaks for an effect: the chance of its gain, and what it brings on blocks of time that a fit has not seen."""
+"""Significance of an effect: p-values of its gain, gain on held-out blocks, robust covariance, and its onset's posterior.
+
+A fit's information holds where its white residuals are white. Beside poses they seldom are: the poses' errors come with the
+motion and last. The sum of J^T r over a block of some seconds scatters by the real errors, and a covariance made of those
+sums ("sandwich": Liang and Zeger, Biometrika 1986) is right whatever the residuals are within a block. Few blocks
+underestimate it, for the fit went through each; the leverage is taken off (CR2: Bell and McCaffrey, Survey Methodology 2002).
+A gain in squares is divided by the mean ratio of the two covariances (the design effect: Rao and Scott, JASA 1981) and becomes
+an F.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import dataclass
+
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Bool, Float64
+from scipy.linalg import solve_triangular
 from scipy.special import gammaincc, gammainccinv, gammaln
+from scipy.stats import f as fisher
 from scipy.stats import norm, wilcoxon
 from scipy.stats import t as student
 
-from imutool.diagnosis.estimation.forward_cache import Chosen
-from imutool.diagnosis.estimation.gauss_newton import Fit, WhitenedLog, expected
+from imutool.diagnosis.estimation.gauss_newton import Fit, fit, parameters_of, priors, with_value
+from imutool.diagnosis.estimation.jacobians import Chosen, expected
+from imutool.diagnosis.estimation.whitening import WhitenedLog
 
-BLOCK_S = 2.0
-FAR_OUT = 300.0  # half the gain, above which the tail itself is less than a number can hold
+TAIL = 300.0  # half the gain, above which the tail itself underflows
+LEAST_BLOCKS = 6
+PRIOR_BLOCKS = 6.0  # weight, in blocks, of the variance ratio of all rows together
+FIXED_STD = 1e-6  # deviation of a parameter that is taken as it is
+LEVERAGE = 0.95  # of one block on a parameter, above which its residuals carry no information on it
+ONSET_NEAR_S, ONSET_TIMES = 0.4, 41  # searched around an onset: as far as the filter of a band smears it
+Matrix = Float64[np.ndarray, "p p"]
 
 
 def log_p_value(gain: float, parameters: int) -> float:
-    """The logarithm of the chance that noise alone gains as much by so many parameters (far out, the tail's leading term)."""
+    """Logarithm of the p-value of a gain in squares under H0, by chi-square (far out, the tail's leading term)."""
     half, k = 0.5 * max(gain, 0.0), 0.5 * parameters
-    return float(np.log(gammaincc(k, half))) if half < FAR_OUT else float((k - 1.0) * np.log(half) - half - gammaln(k))
+    return float(np.log(gammaincc(k, half))) if half < TAIL else float((k - 1.0) * np.log(half) - half - gammaln(k))
 
 
-def gain_for(log_chance: float, parameters: int) -> float:
-    """The squares that so many parameters gain with such a chance."""
-    return float(2.0 * gammainccinv(0.5 * parameters, np.exp(max(log_chance, -FAR_OUT))))
+def gain_for(log_p: float, parameters: int) -> float:
+    """Gain in squares with a given p-value: the inverse of `log_p_value`."""
+    return float(2.0 * gammainccinv(0.5 * parameters, np.exp(max(log_p, -TAIL))))
 
 
 def held_out_p_value(gained: Float64[np.ndarray, " b"]) -> float:
-    """The chance of blocks gaining so much when they gain nothing: by Student's test, or by ranks where a few gain most."""
+    """p-value of the held-out improvement under H0, by Student's test or by ranks, which one outlying block does not decide."""
     if len(gained) < 3 or not gained.std():
         return 1.0
     z = gained.mean() / (gained.std(ddof=1) / np.sqrt(len(gained)))
@@ -36,25 +55,166 @@ def held_out_p_value(gained: Float64[np.ndarray, " b"]) -> float:
 
 
 def prediction_p_value(blocks: Float64[np.ndarray, "b 2"]) -> float:
-    """The chance of unseen noise following what is predicted so well: 2 u.n - |u|² has mean -|u|² and variance 4 |u|²."""
+    """p-value of held-out noise following a prediction u: 2 u.n - |u|² has mean -|u|² and variance 4 |u|² under H0."""
     gain, size = blocks.sum(axis=0)
     return float(norm.sf((gain + size) / (2.0 * np.sqrt(size)))) if size > 0 else 1.0
 
 
-def held_out_gains(log: WhitenedLog, fitted: Fit, k: int, part: str) -> Float64[np.ndarray, "b 2"]:
-    """Squares by which each block of a part that was not fitted is better with an effect, and those of what it adds."""
+def held_out_gains(log: WhitenedLog, fitted: Fit, k: int, part: str, block_s: float) -> Float64[np.ndarray, "b 2"]:
+    """Gain in squares by an effect, and squares of what it predicts, on blocks of a part that was not fitted."""
     chosen = fitted.chosen
-    with_, without = (_white(log, one, part) for one in (chosen, (*chosen[:k], *chosen[k + 1 :])))
+    with_, without = (_white(log, effects, part) for effects in (chosen, (*chosen[:k], *chosen[k + 1 :])))
     rows = log.rows(part)
-    block = np.floor(log.pair.stamp_s[:: log.whiten.every][rows] / BLOCK_S).astype(int)
+    block = np.floor(log.pair.stamp_s[:: log.whiten.every][rows] / block_s).astype(int)
     each = np.stack([(without**2).sum(1) - (with_**2).sum(1), ((without - with_) ** 2).sum(1)], axis=1)
     names, inverse = np.unique(block, return_inverse=True)
     return np.stack([np.bincount(inverse, weights=column, minlength=len(names)) for column in each.T], axis=1)
 
 
-def _white(log: WhitenedLog, chosen: Chosen, part: str) -> Float64[np.ndarray, "n 6"]:
+def _white(log: WhitenedLog, chosen: Chosen, part: str) -> Float64[np.ndarray, "n k"]:
     """White residuals of a part, with the best constant for that part."""
     rows = log.rows(part)
-    residual = log.whiten(log.pair.real - expected(log.pair, chosen))[rows]
-    one = log.constants[rows]
-    return np.asarray(residual - one * ((one * residual).sum(0) / np.maximum((one * one).sum(0), 1e-300)))
+    residual = log.residual(expected(log.pair, chosen))[rows]
+    constant = log.constants[rows]
+    return np.asarray(residual - constant * ((constant * residual).sum(0) / np.maximum((constant * constant).sum(0), 1e-300)))
+
+
+# ── robust covariance ──
+
+
+@dataclass(frozen=True, eq=False)
+class Scatter:
+    """Robust standard deviations by effect, no less than by information, with their inflation and degrees of freedom.
+
+    `inflation` is the ratio of the blocks' variance to the information's by effect, at least 1; `blocks` the number of
+    independent blocks less one that it rests on.
+    """
+
+    std: dict[str, Float64[np.ndarray, " _"]]
+    inflation: dict[str, float]
+    blocks: dict[str, float]
+
+    def log_p_value(self, key: str, gain: float, parameters: int) -> float:
+        """Logarithm of the p-value of a gain in squares, by F."""
+        f = max(gain, 0.0) / (parameters * self.inflation[key])
+        return float(fisher.logsf(f, parameters, parameters * self.blocks[key]))
+
+
+def scatter(logs: Sequence[WhitenedLog], found: Fit, part: str, block_s: float) -> Scatter:
+    """Robust covariance of a fit's free parameters, from blocks of the rows that were fitted."""
+    blocks = [block for k, log in enumerate(logs) for block in _blocks(log, found, k, part, block_s)]
+    _, prior_std = priors(found.chosen)
+    prior = np.diag(1.0 / np.where(_begins(found), FIXED_STD, prior_std) ** 2)
+    lower = np.linalg.cholesky(sum((H for H, _ in blocks), start=prior))
+    middle = _seen_from(lower, prior)
+    shares = []
+    for H, score in blocks:
+        share = _seen_from(lower, H)
+        leverage, axes = np.linalg.eigh(share)
+        turned = axes.T @ solve_triangular(lower, score, lower=True)
+        even = axes @ (turned / np.sqrt(1.0 - np.clip(leverage, 0.0, LEVERAGE)))
+        middle += np.outer(even, even)
+        shares.append(share)
+    outer = solve_triangular(lower, np.eye(len(lower)), lower=True)  # covariance by information: outer.T @ outer
+    by_blocks, by_information = outer.T @ middle @ outer, outer.T @ outer
+    return _by_effect(found, by_blocks, by_information, [outer.T @ share @ outer for share in shares])
+
+
+def _begins(found: Fit) -> Bool[np.ndarray, " p"]:
+    """Parameters that are onsets: nothing is smooth in them, so they are taken as they are."""
+    return np.array([parameter.begins for parameter in parameters_of(found.chosen)], dtype=bool)
+
+
+def _by_effect(found: Fit, by_blocks: Matrix, by_information: Matrix, shares: Sequence[Matrix]) -> Scatter:
+    std, inflation, count = {}, {}, {}
+    usual, stated = max(1.0, found.reduced_chi_square), found.stds()
+    for key in found.keys:
+        part = found.place(key)
+        own, seen = by_information[part, part], by_blocks[part, part]
+        each = np.array([np.diag(share)[part] for share in shares]) / np.diag(own)
+        ratio, blocks = _moderated(np.diag(seen) / np.diag(own), _effective(each), usual)
+        std[key] = stated[key] * np.sqrt(np.maximum(1.0, np.where(_begins(found)[part], 1.0, ratio)))
+        mean = np.asarray(np.trace(np.linalg.solve(own, seen)) / len(own))
+        taken = np.array([np.trace(np.linalg.solve(own, share[part, part])) for share in shares])
+        ratio, blocks = _moderated(mean, _effective(taken), usual)
+        inflation[key], count[key] = max(1.0, float(ratio)), float(blocks)
+    return Scatter(std, inflation, count)
+
+
+def _effective(shares: Float64[np.ndarray, "b ..."]) -> Float64[np.ndarray, "..."]:
+    """Effective number of blocks, where a few may hold most of the information."""
+    return np.asarray(shares.sum(axis=0) ** 2 / np.maximum((shares**2).sum(axis=0), 1e-300))
+
+
+def _moderated(
+    ratio: Float64[np.ndarray, "..."], blocks: Float64[np.ndarray, "..."], usual: float
+) -> tuple[Float64[np.ndarray, "..."], Float64[np.ndarray, "..."]]:
+    """A variance ratio shrunk to that of all rows, and its degrees of freedom (Smyth 2004)."""
+    own = np.maximum(blocks - 1.0, 0.0)
+    return np.asarray((own * ratio + PRIOR_BLOCKS * usual) / (own + PRIOR_BLOCKS)), np.asarray(own + PRIOR_BLOCKS)
+
+
+def _seen_from(lower: Matrix, H: Matrix) -> Matrix:
+    """H in coordinates in which the whole information is the identity."""
+    half = solve_triangular(lower, H, lower=True)
+    out = np.asarray(solve_triangular(lower, half.T, lower=True))
+    return np.asarray(0.5 * (out + out.T))
+
+
+def _blocks(log: WhitenedLog, found: Fit, k: int, part: str, block_s: float) -> list[tuple[Matrix, Float64[np.ndarray, " p"]]]:
+    """Information on the effects and score J^T r of each block, a constant taken out of the whole log."""
+    rows, begins = log.rows(part), _begins(found)
+    left = log.residual(found.passes[k].expected)[rows] - log.constants[rows] * found.bias[k]
+    J = np.zeros((log.pair.columns, len(begins), int(rows.sum())))
+    for axis in range(log.pair.columns):
+        where, J_axis = found.jacobians.on_axis(k, axis, rows)
+        constant = log.constants[rows, axis]
+        J[axis, where] = J_axis - np.outer(J_axis @ constant, constant) / max(float(constant @ constant), 1e-300)
+    J[:, begins] = 0.0
+    t_s = log.pair.stamp_s[:: log.whiten.every][rows]
+    duration_s = float(t_s[-1] - t_s[0])
+    block = np.floor((t_s - t_s[0]) / min(block_s, duration_s / LEAST_BLOCKS)).astype(int)
+    out = []
+    for which in np.unique(block):
+        here = block == which
+        flat = J[:, :, here].transpose(1, 0, 2).reshape(len(begins), -1)
+        out.append((flat @ flat.T, flat @ left[here].T.reshape(-1)))
+    return out
+
+
+# ── onsets ──
+
+
+def estimate_onsets(
+    logs: Sequence[WhitenedLog], found: Fit, part: str, inflation: float
+) -> tuple[Fit, dict[tuple[str, int], float]]:
+    """The fit with each onset at its posterior mean, and the standard deviations (s) by effect and parameter.
+
+    Nothing is smooth in an onset, so the times near it are searched. A time is as likely as exp(-squares / 2), the squares
+    divided by `inflation` where they are more than noise.
+    """
+    period_s = max(log.pair.period_s for log in logs)
+    spread: dict[tuple[str, int], float] = {}
+    for k, (effect, theta) in enumerate(found.chosen):
+        for j, parameter in enumerate(effect.parameters):
+            if not parameter.begins or not np.isfinite(theta[j]):
+                continue
+            step_s = max(period_s, 2.0 * ONSET_NEAR_S / (ONSET_TIMES - 1))
+            t_s = theta[j] + step_s * np.arange(-(ONSET_TIMES // 2), ONSET_TIMES // 2 + 1)
+            moved = (with_value(found.chosen, k, j, float(t)) for t in t_s)  # all else as it is but for the constants
+            squares = np.array([fit(logs, chosen, part=part, iterations=0).objective for chosen in moved])
+            likely = np.exp(-(squares - squares.min()) / (2.0 * inflation))
+            likely /= likely.sum()
+            mean = float(likely @ t_s)
+            spread[effect.key, j] = float(np.sqrt(likely @ (t_s - mean) ** 2 + step_s**2 / 12.0))
+            found = fit(logs, with_value(found.chosen, k, j, mean), part=part, iterations=0)
+    return found, spread
+
+
+def with_onsets_of(fitted: Chosen, whole: Chosen) -> Chosen:
+    """Effects with the onsets that all rows show: fitted rows do not show one between them."""
+    out = []
+    for (effect, theta), (_, seen) in zip(fitted, whole, strict=True):
+        begins = np.array([parameter.begins for parameter in effect.parameters])
+        out.append((effect, np.where(begins, seen, theta)))
+    return tuple(out)

@@ -7,9 +7,10 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Bool, Float64
 from scipy.ndimage import binary_dilation, median_filter
-from scipy.stats import binom
+from scipy.signal import savgol_filter
+from scipy.stats import binom, norm
 
-from imutool.diagnosis.estimation.alignment import Pair
+from imutool.diagnosis.estimation.aligned_log import Pair
 from imutool.diagnosis.result import Estimate, Finding, HeldOut
 from imutool.sensor.effect import Effect, Parameter, Stage, Theta
 from imutool.sensor.samples import IdealMotion, SensorSamples
@@ -24,7 +25,11 @@ SHARES = (0.999, 0.99, 0.97, 0.9, 0.8)  # of the largest reading, where a soft l
 LEAST_JITTER_S = 2e-5
 LEAST_DIGITS = 0.3  # of the noise: finer steps leave no trace in it
 ON_GRID = 0.98  # of the samples
-LEAST_VALUES = 3  # that a grid is told from
+LEAST_VALUES = 3  # of a grid
+AROUND, DEGREE = 15, 3  # samples of a line, and what it may bend
+EVENLY = 5.0  # standard deviations by which samples must be nearer to even than to their stamps
+LEAST_ROWS = 100
+TINY = 1e-300
 
 
 def even(stamp_s: Float64[np.ndarray, " n"]) -> tuple[Float64[np.ndarray, " n"], int]:
@@ -198,7 +203,7 @@ class _Clip:
     def __call__(self, read: SensorSamples, theta: Theta) -> SensorSamples:
         x = read.gyro if self.sensor == 0 else read.accel
         out = np.clip(x + self.bias, -theta[0], theta[0]) - self.bias
-        return read.but(gyro=out) if self.sensor == 0 else read.but(accel=out)
+        return read.with_readings(gyro=out) if self.sensor == 0 else read.with_readings(accel=out)
 
 
 class _Starts:
@@ -254,3 +259,41 @@ def saturated(pairs: Sequence[Pair], expected: Sequence[Float64[np.ndarray, "n 6
     )
     share = float(np.clip(1.0 - powers[1] / max(powers[0], 1e-300), 0.0, 1.0))
     return [Finding("saturation", seen_in, share, min(p, 1.0), min(p, 1.0), told, "readings are clipped at +-limit", held)]
+
+
+def late_stamps(pairs: Sequence[Pair]) -> list[Finding]:
+    """`timestamp_jitter` with its standard deviation (s), where stamps are uneven and samples are seen not to be."""
+    off = [pair.stamp_s - even(pair.stamp_s)[0] for pair in pairs]
+    if min(float(x.std()) for x in off) < LEAST_JITTER_S:
+        return []
+    followed, weight = 0.0, 0.0
+    for pair, late in zip(pairs, off, strict=True):
+        for column in pair.real.T:
+            share, size = _followed(column, late, pair.period_s)
+            followed, weight = followed + share * size, weight + size
+    if weight <= 0.0:
+        return []
+    share, sigma = followed / weight, 1.0 / np.sqrt(weight)
+    if share > 0.5 or 1.0 - share < EVENLY * sigma:
+        return []
+    every = np.concatenate(off)
+    std = float(every.std())
+    length = sum(float(pair.stamp_s[-1] - pair.stamp_s[0]) for pair in pairs)
+    chance = float(norm.sf((1.0 - share) / sigma))
+    told = {"std": Estimate(std, std / np.sqrt(2.0 * len(every)), "s")}
+    nothing = HeldOut(0.0, 0.0, "-", round(length, 1))
+    return [Finding("timestamp_jitter", "both", 0.0, chance, chance, told, "stamps jitter, samples do not", nothing)]
+
+
+def _followed(column: Float64[np.ndarray, " n"], late_s: Float64[np.ndarray, " n"], period_s: float) -> tuple[float, float]:
+    """How much of their stamps' lateness samples took part in, between 0 and 1, and one over the variance of that."""
+    if len(column) < LEAST_ROWS:
+        return 0.0, 0.0
+    slope = savgol_filter(column, AROUND, DEGREE, deriv=1, delta=period_s)
+    moved = slope * late_s
+    moved = moved - savgol_filter(moved, AROUND, DEGREE)
+    rest = column - savgol_filter(column, AROUND, DEGREE)
+    size = float(moved @ moved)
+    share = float(moved @ rest) / max(size, TINY)
+    left = float(np.mean((rest - share * moved) ** 2))
+    return share, size / max(left, TINY)

@@ -15,11 +15,11 @@ import numpy as np
 from jaxtyping import Float64
 from scipy.interpolate import BSpline
 
-from imutool.diagnosis.estimation.alignment import Pair
+from imutool.diagnosis.estimation.aligned_log import Pair
 from imutool.sensor import catalogue
 from imutool.sensor.effect import Effect, Parameter, Stage, Theta
 from imutool.sensor.samples import SensorSamples, Vectors
-from imutool.sensor.variables import VARIABLES
+from imutool.sensor.unnamed_effects import VARIABLES
 from imutool.units import AXES, Sensor
 
 LAGS_S = (-0.5, -0.2, -0.1, -0.05, 0.0, 0.05, 0.1, 0.2, 0.5)
@@ -71,7 +71,7 @@ class _Driven:
     def __call__(self, read: SensorSamples, theta: Theta) -> SensorSamples:
         x = np.interp(read.stamp_s - theta[3], read.stamp_s, read.channels[self.channel]) - self.center
         added = x[:, None] * theta[:3]
-        return read.but(gyro=read.gyro + added) if self.sensor == 0 else read.but(accel=read.accel + added)
+        return read.with_readings(gyro=read.gyro + added) if self.sensor == 0 else read.with_readings(accel=read.accel + added)
 
 
 UNIT_OF = {"omega": "rad/s", "f": "m/s²", "alpha": "rad/s²", "t": "s"}
@@ -128,14 +128,14 @@ def _curve(variable: str, sensor: int, axis: int, inner: Float64[np.ndarray, " p
     )
 
 
-class Curve:
-    """+ a cubic spline of one variable on one axis, held beyond its ends.
+class SplineCurve:
+    """A cubic spline of one variable, constant beyond its ends: coefficients of B-splines, or of sums of them.
 
     Where samples are many, knots are close: at even distances, what the motion rarely does would bend all the rest.
     """
 
-    def __init__(self, variable: str, sensor: int, axis: int, inner: Float64[np.ndarray, " p"]) -> None:
-        self.variable, self.sensor, self.axis, self.inner = variable, sensor, axis, inner
+    def __init__(self, variable: str, inner: Float64[np.ndarray, " p"]) -> None:
+        self.variable, self.inner = variable, inner
         self._last: tuple[np.ndarray, np.ndarray] | None = None
         self.knots = np.concatenate([[inner[0]] * 3, inner, [inner[-1]] * 3])
 
@@ -144,11 +144,23 @@ class Curve:
         return np.asarray(np.interp(np.linspace(0.0, 1.0, count), np.linspace(0.0, 1.0, len(self.inner)), self.inner))
 
     def basis(self, x: Float64[np.ndarray, " n"]) -> Float64[np.ndarray, "n q"]:
-        """The B-splines at some values."""
+        """The curve's basis functions at some values."""
         if self._last is None or not np.array_equal(self._last[0], x):  # derivatives ask for the same again and again
             inside = np.clip(x, self.inner[0], self.inner[-1])
-            self._last = x.copy(), np.asarray(BSpline.design_matrix(inside, self.knots, 3).toarray()[:, : len(self.inner) + 2])
+            splines = BSpline.design_matrix(inside, self.knots, 3).toarray()[:, : len(self.inner) + 2]
+            self._last = x.copy(), self._combined(np.asarray(splines))
         return self._last[1]
+
+    def _combined(self, splines: Float64[np.ndarray, "n q"]) -> Float64[np.ndarray, "n q"]:
+        return splines
+
+
+class Curve(SplineCurve):
+    """+ a spline of one variable on one axis of an IMU."""
+
+    def __init__(self, variable: str, sensor: int, axis: int, inner: Float64[np.ndarray, " p"]) -> None:
+        super().__init__(variable, inner)
+        self.sensor, self.axis = sensor, axis
 
     def __call__(self, read: SensorSamples, theta: Theta) -> SensorSamples:
         """The reading with the curve on it."""
@@ -211,11 +223,11 @@ class _Term:
 def _on_axis(read: SensorSamples, sensor: int, axis: int, added: Float64[np.ndarray, " n"]) -> SensorSamples:
     out: Vectors = (read.gyro if sensor == 0 else read.accel).copy()
     out[:, axis] += added
-    return read.but(gyro=out) if sensor == 0 else read.but(accel=out)
+    return read.with_readings(gyro=out) if sensor == 0 else read.with_readings(accel=out)
 
 
 def like(pairs: Sequence[Pair]) -> SensorSamples:
     """Ideal signals at the samples of the first log that are fitted: what ranges there are."""
     pair = pairs[0]
     stamp_s = pair.stamp_s[pair.fitted]
-    return pair.felt.taken(stamp_s, stamp_s)
+    return pair.felt.sample(stamp_s, stamp_s)

@@ -9,11 +9,14 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from jaxtyping import Bool, Float64, Int64
 from scipy.ndimage import median_filter, minimum_filter1d
 from scipy.signal import firwin, lfilter, periodogram, upfirdn
+
+from imutool.diagnosis.estimation.aligned_log import AlignedLog, Pair
 
 MAD_TO_STD = 1.4826
 LEAST_STD = 1e-12
@@ -37,7 +40,7 @@ class Band:
         every = max(1, int(rate_hz / (OVER * band_hz)))
         return Band(firwin(count, min(band_hz, 0.45 * rate_hz), fs=rate_hz), every)
 
-    def __call__(self, x: Float64[np.ndarray, "n 6 *k"]) -> Float64[np.ndarray, "m 6 *k"]:
+    def __call__(self, x: Float64[np.ndarray, "n k *p"]) -> Float64[np.ndarray, "m k *p"]:
         """The slow part of some columns."""
         slow = self.rows(np.moveaxis(x, 0, -1).reshape(math.prod(x.shape[1:]), len(x)))
         return np.moveaxis(slow.reshape(*x.shape[1:], slow.shape[1]), -1, 0)
@@ -55,19 +58,19 @@ class Band:
 
 @dataclass(frozen=True, eq=False)
 class Whitener:
-    """For each of the six axes a filter and the size of what comes out of it, so that it has unit variance.
+    """For each axis a filter and the size of what comes out of it, so that it has unit variance.
 
     `counts` are the values that come out and tell anything (none: all); the others come out as zero, whatever goes in.
     """
 
-    filters: Float64[np.ndarray, "6 order"]
-    std: Float64[np.ndarray, "6"]
+    filters: Float64[np.ndarray, "k order"]
+    std: Float64[np.ndarray, " k"]
     band: Band | None = None
-    counts: Bool[np.ndarray, "m 6"] | None = None
+    counts: Bool[np.ndarray, "m k"] | None = None
 
-    def __call__(self, x: Float64[np.ndarray, "n 6 *k"]) -> Float64[np.ndarray, "m 6 *k"]:
+    def __call__(self, x: Float64[np.ndarray, "n k *p"]) -> Float64[np.ndarray, "m k *p"]:
         """White rows from coloured ones (fewer, where only a band is looked at); columns of zeros stay zeros."""
-        columns = x.reshape(len(x), 6, math.prod(x.shape[2:]))
+        columns = x.reshape(len(x), x.shape[1], math.prod(x.shape[2:]))
         axes, ks = np.nonzero(columns.any(axis=0))
         out = np.zeros((len(range(0, len(x), self.every)), *columns.shape[1:]))
         out[:, axes, ks] = self.rows(columns[:, axes, ks].T, axes).T
@@ -86,7 +89,7 @@ class Whitener:
             out[~self.counts.T[axes]] = 0.0
         return out
 
-    def counting(self, known: Bool[np.ndarray, "n 6"]) -> Whitener:
+    def counting(self, known: Bool[np.ndarray, "n k"]) -> Whitener:
         """Where only some samples tell anything: neither do values that others have gone into."""
         if self.band is not None:
             known = np.asarray(minimum_filter1d(known, len(self.band.taps), axis=0, mode="nearest"))[:: self.every]
@@ -103,18 +106,57 @@ class Whitener:
         return int(self.filters.shape[1] - 1)
 
 
+@dataclass(frozen=True, eq=False)
+class WhitenedLog:
+    """An aligned log with the filter that makes its noise white; rows are fitted, held out, or neither."""
+
+    pair: AlignedLog
+    whiten: Whitener
+
+    def count(self, part: str) -> int:
+        """Number of white values of a part that depend on known samples."""
+        rows, counts = self.rows(part), self.whiten.counts
+        return int(self.pair.columns * rows.sum() if counts is None else counts[rows].sum())
+
+    def rows(self, part: str) -> Bool[np.ndarray, " n"]:
+        """Rows that are `fitted`, `held_out` or `all`, behind the filter's start."""
+        fitted, held_out = self._rows
+        return fitted | held_out if part == "all" else fitted if part == "fitted" else held_out
+
+    @cached_property
+    def _rows(self) -> tuple[Bool[np.ndarray, " n"], Bool[np.ndarray, " n"]]:
+        every, order = self.whiten.every, self.whiten.order
+        return settled(self.pair.fitted[::every], order), settled(self.pair.held_out[::every], order)
+
+    @cached_property
+    def constants(self) -> Float64[np.ndarray, "n k"]:
+        """A constant on each axis, whitened."""
+        return self.whiten(np.ones_like(self.pair.real))
+
+    def residual(self, expected: Float64[np.ndarray, "m k"]) -> Float64[np.ndarray, "n k"]:
+        """White residuals, bias included."""
+        return self.whiten(self.pair.real - expected)
+
+
+@dataclass(frozen=True, eq=False)
+class WhitenedImu(WhitenedLog):
+    """An aligned IMU log with the filter that makes its noise white."""
+
+    pair: Pair
+
+
 def whitener(
-    residual: Float64[np.ndarray, "n 6"], usable: Bool[np.ndarray, "n ..."], order: int, band: Band | None = None
+    residual: Float64[np.ndarray, "n k"], usable: Bool[np.ndarray, "n ..."], order: int, band: Band | None = None
 ) -> Whitener:
     """From a residual and the rows of it that count, or the samples; an axis without any is left as it is.
 
     The size is robust (a few spikes are not the noise), but no less than half of what the plain one is.
     """
-    filters, std = np.zeros((6, order + 1)), np.ones(6)
+    filters, std = np.zeros((residual.shape[1], order + 1)), np.ones(residual.shape[1])
     if band is not None:
         residual, usable = band(residual), usable[:: band.every]
     filters[:, 0] = 1.0
-    for axis, counts in enumerate(_by_axis(usable)):
+    for axis, counts in enumerate(_by_axis(usable, residual.shape[1])):
         rows = settled(counts, order)
         if not rows.any():
             continue
@@ -125,31 +167,35 @@ def whitener(
     return Whitener(filters, std, band)
 
 
-def level(residual: Float64[np.ndarray, "n 6"], usable: Bool[np.ndarray, "n ..."], rate_hz: float, order: int) -> Whitener:
+def level(residual: Float64[np.ndarray, "n k"], usable: Bool[np.ndarray, "n ..."], rate_hz: float, order: int) -> Whitener:
     """As `whitener`, for a sensor beside an exact simulation: below `MOTION_HZ` its noise is taken to be what it is above.
 
     What is left down there may be physics that nobody thought of, and must not be taken for noise.
     """
-    from scipy.linalg import solve_toeplitz
-
-    filters, std = np.zeros((6, order + 1)), np.ones(6)
+    filters, std = np.zeros((residual.shape[1], order + 1)), np.ones(residual.shape[1])
     filters[:, 0] = 1.0
-    for axis, counts in enumerate(_by_axis(usable)):
+    for axis, counts in enumerate(_by_axis(usable, residual.shape[1])):
         if not counts.any():
             continue
         f_hz, power = spectrum(residual[:, axis], counts, rate_hz)
         power = median_filter(power, LINES, mode="nearest")  # a line is no noise
         low, high = min(MOTION_HZ, 0.3 * rate_hz), min(REFERENCE_HZ, 0.45 * rate_hz)
         power[f_hz < low] = np.median(power[(f_hz >= low) & (f_hz <= high)])
-        covariance = np.fft.irfft(power * rate_hz / 2.0)[: order + 1] + np.concatenate([[LEAST_STD**2], np.zeros(order)])
-        a = -solve_toeplitz(covariance[:-1], covariance[1:]) if order else np.zeros(0)
-        filters[axis] = np.concatenate([[1.0], a])
-        std[axis] = np.sqrt(max(float(covariance[0] + a @ covariance[1:]), LEAST_STD**2))
+        filters[axis], std[axis] = autoregression(power, rate_hz, order)
     return Whitener(filters, std)
 
 
-def _by_axis(usable: Bool[np.ndarray, "n ..."]) -> Bool[np.ndarray, "6 n"]:
-    return np.asarray(np.broadcast_to(usable.reshape(len(usable), -1).T, (6, len(usable))))
+def autoregression(power: Float64[np.ndarray, " f"], rate_hz: float, order: int) -> tuple[Float64[np.ndarray, " _"], float]:
+    """Coefficients (1, a_1, ..., a_order) and standard deviation of the innovations, from a power density (Yule-Walker)."""
+    from scipy.linalg import solve_toeplitz
+
+    covariance = np.fft.irfft(power * rate_hz / 2.0)[: order + 1] + np.concatenate([[LEAST_STD**2], np.zeros(order)])
+    a = -solve_toeplitz(covariance[:-1], covariance[1:]) if order else np.zeros(0)
+    return np.concatenate([[1.0], a]), float(np.sqrt(max(float(covariance[0] + a @ covariance[1:]), LEAST_STD**2)))
+
+
+def _by_axis(usable: Bool[np.ndarray, "n ..."], columns: int) -> Bool[np.ndarray, "k n"]:
+    return np.asarray(np.broadcast_to(usable.reshape(len(usable), -1).T, (columns, len(usable))))
 
 
 def spectrum(

@@ -1,18 +1,18 @@
-"""A number of a recording beside that of a simulation: one clock, the simulation without its noise, rows that count."""
+"""Alignment of a recorded number with its simulation: one clock, the simulation without its noise, rows that count."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float64
+from jaxtyping import Float64
 from scipy.interpolate import make_interp_spline
 from scipy.signal import correlate, correlation_lags, welch
 
-from imutool.diagnosis.estimation.alignment import BUFFER_S, FARTHEST_S, GAP_PERIODS, split, wiener_filter
-from imutool.diagnosis.scalar.effects import Column, Ideal, Samples
-from imutool.diagnosis.scalar.fit import SEGMENT, TOP
+from imutool.diagnosis.estimation.aligned_log import GAP_PERIODS, MARGIN_S, split
+from imutool.diagnosis.estimation.alignment import FARTHEST_S, wiener_filter
+from imutool.diagnosis.estimation.whitening import SEGMENT
+from imutool.diagnosis.scalar.signal import AlignedSignal, Column, IdealSignal
 from imutool.errors import DataError
 from imutool.mcap_io.fields import Fields
 from imutool.recording import seconds
@@ -22,30 +22,11 @@ OVERSAMPLED = 4.0  # so that a straight line between fine samples is the signal
 ALIGN_HZ = 100.0
 ALIKE = 0.3  # correlation below which nothing says that the two are one motion
 MOVES = 1e-9  # of its largest value, below which a signal is constant
-TOP_BAND = 0.4  # of the rate: above, a simulation's spectrum is its noise
+TOP_BAND, TOP = 0.4, 0.45  # of the rate: between, a simulation's spectrum is its noise
 MOST_FINE = 20_000_000  # samples
 
 
-@dataclass(frozen=True, eq=False)
-class Beside:
-    """What the estimator is given.
-
-    `aligned_s` is what was added to the recording's stamps because the clocks share no epoch (None: they do), `lag_s` how much
-    later the recording follows the simulation at first sight, `simulated` the density of the simulation's own noise.
-    """
-
-    ideal: Ideal
-    real: Samples
-    fitted: Bool[np.ndarray, " n"]
-    held_out: Bool[np.ndarray, " n"]
-    rate_hz: float
-    lag_s: float
-    aligned_s: float | None
-    simulated: float
-    start_ns: int
-
-
-def beside(real: Fields, sim: Fields, others: Mapping[str, Fields], name: str) -> Beside:
+def aligned(real: Fields, sim: Fields, others: Mapping[str, Fields], name: str) -> AlignedSignal:
     """Both on the recording's clock, in seconds from its first sample that the simulation covers.
 
     Raises:
@@ -70,22 +51,25 @@ def beside(real: Fields, sim: Fields, others: Mapping[str, Fields], name: str) -
             fix="Give logs of the same time, or longer ones",
         )
     part = slice(int(rows[0]), int(rows[-1]) + 1)
-    ideal, simulated = _ideal(t_sim, sim.values, period_sim, period_real, t_real[part])
-    ideal.channels = {other: (seconds(one.t_ns, start_ns), one.values) for other, one in others.items() if len(one) > 1}
+    channels = {other: (seconds(one.t_ns, start_ns), one.values) for other, one in others.items() if len(one) > 1}
+    ideal, sim_density = _ideal(t_sim, sim.values, period_sim, period_real, channels)
     held_out, usable = split(t_real[part])
     step = np.diff(t_sim)
     for k in np.flatnonzero(step > max(GAP_PERIODS * period_sim, 0.1)):  # what was never simulated
-        usable &= (t_real[part] < t_sim[k] + early - BUFFER_S) | (t_real[part] > t_sim[k + 1] + late + BUFFER_S)
-    return Beside(
-        ideal,
-        real.values[part],
+        usable &= (t_real[part] < t_sim[k] + early - MARGIN_S) | (t_real[part] > t_sim[k + 1] + late + MARGIN_S)
+    return AlignedSignal(
+        name,
+        t_real[part],
+        real.values[part, None],
         usable & ~held_out,
         usable & held_out,
-        1.0 / period_real,
-        lag_s,
-        aligned_s,
-        simulated,
-        start_ns,
+        aligned_s=aligned_s or 0.0,
+        start_ns=start_ns,
+        ideal=ideal,
+        unit=real.unit or sim.unit,
+        lag_s=lag_s,
+        sim_density=sim_density,
+        shares_epoch=aligned_s is None,
     )
 
 
@@ -120,7 +104,9 @@ def _check(one: Fields, what: str, name: str) -> None:
         )
 
 
-def _ideal(t_sim: Column, values: Column, period_sim: float, period_real: float, t_s: Samples) -> tuple[Ideal, float]:
+def _ideal(
+    t_sim: Column, values: Column, period_sim: float, period_real: float, channels: Mapping[str, tuple[Column, Column]]
+) -> tuple[IdealSignal, float]:
     """The simulation without white noise on a fine clock, and the density of that noise."""
     t_even = t_sim[0] + period_sim * np.arange(int((t_sim[-1] - t_sim[0]) / period_sim) + 1)
     even = np.interp(t_even, t_sim, values) if _jumps(values) else np.asarray(make_interp_spline(t_sim, values, k=3)(t_even))
@@ -130,7 +116,7 @@ def _ideal(t_sim: Column, values: Column, period_sim: float, period_real: float,
     t_fine = t_even[0] + np.arange(int((t_even[-1] - t_even[0]) * rate_hz) + 1) / rate_hz
     clean = wiener_filter(even)
     fine = np.interp(t_fine, t_even, clean) if _jumps(values) else np.asarray(make_interp_spline(t_even, clean, k=3)(t_fine))
-    return Ideal(float(t_fine[0]), rate_hz, fine, t_s, {}), float(np.median(power[top]))
+    return IdealSignal(float(t_fine[0]), rate_hz, fine, channels), float(np.median(power[top]))
 
 
 def _jumps(values: Column) -> bool:

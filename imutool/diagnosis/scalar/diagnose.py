@@ -1,41 +1,44 @@
-"""Where a signal of any kind and its simulation differ, and what was left out: the IMU's diagnosis for one number of a log.
-
-fields ─ beside ─> one clock ─ noise ─> Weighed ─ Search ─> Found ─> SignalDiagnosis, in the words of `diagnosis`.
-"""
+"""Diagnosis of one scalar signal of a log: aligned, whitened, searched by the engine with one column, reported."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float64
-from scipy.interpolate import BSpline
+from jaxtyping import Bool
+from scipy.ndimage import median_filter
+from scipy.signal import welch
 
+from imutool.diagnosis.estimation.jacobians import Chosen, expected
+from imutool.diagnosis.estimation.model_selection import SelectedEffect, Selection, select_effects
+from imutool.diagnosis.estimation.noise_estimate import ORDER, noise_std, ridge_fit
 from imutool.diagnosis.estimation.timestamps import LEAST_DIGITS, grid
-from imutool.diagnosis.locate import regime
-from imutool.diagnosis.result import Curve as ToldCurve
-from imutool.diagnosis.result import Estimate, Finding, HeldOut, Located, SignalTraces, Unexplained
-from imutool.diagnosis.scalar import effects, fit
-from imutool.diagnosis.scalar.alignment import Beside, beside
-from imutool.diagnosis.scalar.effects import Chosen, Column, Curve, Samples
-from imutool.diagnosis.scalar.fit import Fit, WhitenedLog
-from imutool.diagnosis.scalar.search import Found, Judged, Search
+from imutool.diagnosis.estimation.unnamed_effects import SplineCurve
+from imutool.diagnosis.estimation.whitening import LINES, SEGMENT, WhitenedLog, Whitener, autoregression
+from imutool.diagnosis.localization import CLEAR, WINDOW_S, intervals, regime
+from imutool.diagnosis.result import Curve, Estimate, Finding, HeldOut, Located, SignalTraces, Unexplained
+from imutool.diagnosis.scalar import effects
+from imutool.diagnosis.scalar.alignment import TOP, aligned
+from imutool.diagnosis.scalar.effects import SignalCurve
+from imutool.diagnosis.scalar.signal import AlignedSignal, Column, Samples
+from imutool.diagnosis.settings import SearchSettings
 from imutool.mcap_io.fields import Fields
 
-BETTER_NOISE = 0.95  # of what the noise was first taken for, below which effects are asked once more
-WINDOW_S, CLEAR, JOIN_S = 1.0, 12.0, 1.5  # as `locate` has it for the IMU
+BETTER_NOISE = 0.95  # of what the noise was first taken for, below which effects are searched once more
+IN_BAND, ABOVE = 0.999, 1.3  # of the signal's power lie below its edge, and noise is measured from a little above that
+LOWEST, HIGHEST = 0.05, 0.3  # of the sample rate: least and most for the edge
 SHOWN_KNOTS = 41
 WHITE = 1.15
 EXACT = 1e-3
 SAME_GRID = 0.01
-RIDGE = 1e-8
 RICH_KNOTS = 12
+NO_EPOCH = "{}: the two clocks share no epoch; aligned by the signal ({:+.3f} s), so that a delay between them cannot be seen"
 
 
 @dataclass(frozen=True, eq=False)
 class SignalDiagnosis:
-    """The answer for one signal, in parts that a `Diagnosis` takes; findings come strongest first."""
+    """Diagnosis of one signal, in parts that a `Diagnosis` takes; findings come strongest first."""
 
     signal: str
     unit: str
@@ -49,8 +52,10 @@ class SignalDiagnosis:
     traces: SignalTraces
 
 
-def diagnose_signal(real: Fields, sim: Fields, others: Mapping[str, Fields], name: str) -> SignalDiagnosis:
-    """What separates a recorded signal from its simulation, but for a constant and noise.
+def diagnose_signal(
+    real: Fields, sim: Fields, others: Mapping[str, Fields], name: str, settings: SearchSettings | None = None
+) -> SignalDiagnosis:
+    """Diagnose what separates a recorded signal from its simulation, but for a constant and noise.
 
     `others` are further numbers of the recording, on its clock, which may drive the misfit; `name` is TOPIC.field, as findings
     have it.
@@ -58,208 +63,184 @@ def diagnose_signal(real: Fields, sim: Fields, others: Mapping[str, Fields], nam
     Raises:
         DataError: constant, too short, or not of one motion; the message says what to do.
     """
-    pair = beside(real, sim, others, name)
-    unit = real.unit or sim.unit
+    pair = aligned(real, sim, others, name)
     lsb = _lsb(real, sim)
-    always: Chosen = ((effects.offset(float(np.ptp(pair.real)), unit), np.zeros(1)),)
-    if pair.aligned_s is not None:
-        always = ((effects.delay(0.0, effects.step_s(pair.ideal)), np.zeros(1)), *always)
-    candidates = [
-        one for one in effects.named(pair.ideal, pair.real, pair.lag_s, unit) if one.name != "delay" or pair.aligned_s is None
-    ]
-    later = [list(effects.driven(pair.ideal, pair.real, unit)), list(effects.unknown(pair.ideal, unit))]
-    signal = _weighed(pair, pair.real - _rich(pair), lsb)
-    found = Search(signal, always, candidates, later).run()
-    again = _weighed(pair, pair.real - pair.ideal.expected(found.whole.chosen), lsb)
-    if again.noise.level < BETTER_NOISE * signal.noise.level:  # the effects' own high frequencies were taken for noise
-        signal = again
-        found = Search(signal, always, candidates, later).run(found.whole.chosen[len(always) :])
-    return _told(pair, signal, found, len(always), name, unit, lsb)
+    always: Chosen = ((effects.offset(float(np.ptp(pair.real)), pair.unit), np.zeros(1)),)
+    if not pair.shares_epoch:
+        always = ((effects.delay(0.0, effects.delay_step_s(pair)), np.zeros(1)), *always)
+    candidates = [effect for effect in effects.named(pair) if effect.name != "delay" or pair.shares_epoch]
+    later = [list(effects.driven(pair)), list(effects.unknown(pair))]
+    log = _whitened(pair, _rich_residual(pair), lsb)
+    found = select_effects([log], candidates, later, always=always, settings=settings)
+    again = _whitened(pair, (pair.real - expected(pair, found.whole.chosen))[:, 0], lsb)
+    if _level(again) < BETTER_NOISE * _level(log):  # the effects' own high frequencies were taken for noise
+        log = again
+        found = select_effects([log], candidates, later, always=always, settings=settings)
+    return _summarized(pair, log, found, len(always), lsb)
 
 
-def _weighed(pair: Beside, residual: Samples, lsb: float) -> WhitenedLog:
-    usable = pair.fitted | pair.held_out
-    x = pair.ideal.taken(()).x
-    rounding = None
-    if lsb:  # an error of rounding is no white noise where the signal is slow
-        model = pair.real - residual
-        _, rounding = fit.density(np.rint(model / lsb) * lsb - model, usable, pair.rate_hz)
-    noise = fit.noise(residual, usable, pair.rate_hz, fit.edge_hz(x, pair.rate_hz), pair.simulated, rounding)
-    return WhitenedLog(pair.ideal, pair.real, pair.fitted, pair.held_out, noise)
+# ── noise ──
 
 
-def _rich(pair: Beside) -> Samples:
-    """The recording as far as anything smooth in signal, derivatives and time follows it: what it leaves is noise, or sharp."""
-    usable = pair.fitted | pair.held_out
-    centred = pair.ideal.t_s - pair.lag_s
-    at = (centred - pair.ideal.start_s) * pair.ideal.rate_hz
-    fine = pair.ideal.fine
-    k = np.arange(len(fine))
-    derivatives = [fine]
+def _whitened(pair: AlignedSignal, residual: Samples, lsb: float) -> WhitenedLog:
+    """The signal with its noise model.
+
+    Where the simulated signal has its power, the noise density is taken from just above, so that an effect that nobody has
+    modelled is not taken for noise; the simulation's own noise, which is in its band, comes on top. An error of rounding is no
+    white noise where the signal is slow: the density is no less than that.
+    """
+    usable, rate_hz = pair.usable[:, 0], 1.0 / pair.period_s
+    edge = _edge_hz(pair.sampled.x, rate_hz)
+    f_hz, power = _density(residual, usable, rate_hz)
+    near = (f_hz >= edge) & (f_hz <= min(2.0 * edge, TOP * rate_hz))
+    far = (f_hz >= edge) & (f_hz <= TOP * rate_hz)
+    power[f_hz < edge] = max(float(np.median(power[near])), float(np.median(power[far]))) + pair.sim_density
+    if lsb:
+        model = pair.real[:, 0] - residual
+        power = np.maximum(power, _density(np.rint(model / lsb) * lsb - model, usable, rate_hz)[1])
+    filter_, std = autoregression(power, rate_hz, ORDER)
+    return WhitenedLog(pair, Whitener(filter_[None], np.array([std])))
+
+
+def _edge_hz(x: Samples, rate_hz: float) -> float:
+    """Frequency where a signal's power ends, within what a noise can be measured above."""
+    f_hz, power = welch(x, rate_hz, nperseg=min(SEGMENT, len(x)))
+    share = np.cumsum(power) / max(float(power.sum()), 1e-300)
+    return float(np.clip(ABOVE * f_hz[np.searchsorted(share, IN_BAND)], LOWEST * rate_hz, HIGHEST * rate_hz))
+
+
+def _density(x: Samples, usable: Bool[np.ndarray, " n"], rate_hz: float) -> tuple[Column, Column]:
+    """Frequencies, and the one-sided density of the usable part of a signal, without lines."""
+    f_hz, power = welch(np.where(usable, x, 0.0), rate_hz, nperseg=min(SEGMENT, len(x)), average="median")
+    return f_hz, np.asarray(median_filter(power, LINES, mode="nearest")) / max(float(usable.mean()), 1e-3)
+
+
+def _level(log: WhitenedLog) -> float:
+    """Standard deviation of the noise of a sample."""
+    return float(noise_std(log.whiten)[0])
+
+
+def _rich_residual(pair: AlignedSignal) -> Samples:
+    """What a smooth function of signal, derivatives and time leaves of the recording: noise, or what is sharp."""
+    ideal, k = pair.ideal, np.arange(len(pair.ideal.fine))
+    at = (pair.stamp_s - pair.lag_s - ideal.start_s) * ideal.rate_hz
+    derivatives = [ideal.fine]
     for _ in range(3):
-        derivatives.append(np.gradient(derivatives[-1]) * pair.ideal.rate_hz)
+        derivatives.append(np.gradient(derivatives[-1]) * ideal.rate_hz)
     columns = [np.interp(at, k, column) for column in derivatives]
     x, dx = columns[0], columns[1]
-    columns += [np.sign(x), np.sign(dx), *_splines(x).T, *_splines(dx).T, *_splines(pair.ideal.t_s).T]
-    A = np.stack(columns, axis=1)
-    size = np.linalg.norm(A[usable], axis=0)
-    A = A[:, size > 0] / size[size > 0]
-    N = A[usable].T @ A[usable] + RIDGE * np.eye(A.shape[1])
-    return np.asarray(A @ np.linalg.solve(N, A[usable].T @ pair.real[usable]))
-
-
-def _splines(x: Samples) -> Float64[np.ndarray, "n q"]:
-    first, last = float(x.min()), float(x.max())
-    knots = np.concatenate([[first] * 3, np.linspace(first, last, RICH_KNOTS - 2), [last] * 3])
-    return np.asarray(BSpline.design_matrix(np.clip(x, first, last), knots, 3).toarray()[:, :RICH_KNOTS])
+    columns += [np.sign(x), np.sign(dx)]
+    for of in (x, dx, pair.stamp_s):
+        columns += [*SplineCurve("", np.linspace(of.min(), of.max(), RICH_KNOTS - 2)).basis(of).T]
+    return np.asarray(pair.real[:, 0] - ridge_fit(np.stack(columns, axis=1), pair.real[:, 0], pair.usable[:, 0]))
 
 
 def _lsb(real: Fields, sim: Fields) -> float:
-    """The step that recorded values are multiples of, 0 where they are of none or the simulation's are of the same."""
-    step, there = grid(real.values), grid(sim.values)
-    return 0.0 if there and abs(step / there - 1.0) < SAME_GRID else step
+    """Step that recorded values are multiples of, 0 where they are of none or the simulation's are of the same."""
+    step, simulated = grid(real.values), grid(sim.values)
+    return 0.0 if simulated and abs(step / simulated - 1.0) < SAME_GRID else step
 
 
-# ── what is told ──
+# ── report ──
 
 
-def _told(pair: Beside, signal: WhitenedLog, found: Found, always: int, name: str, unit: str, lsb: float) -> SignalDiagnosis:
-    level = signal.noise.level
-    chosen, held = found.whole.chosen, pair.held_out
-    before, after = pair.ideal.expected(()), pair.ideal.expected(chosen)
-    before = before + (pair.real - before)[pair.fitted | held].mean()
-    findings = [_finding(pair, found, one, always + k, always, level, name, unit) for k, one in enumerate(found.judged)]
+def _summarized(pair: AlignedSignal, log: WhitenedLog, found: Selection, always: int, lsb: float) -> SignalDiagnosis:
+    level, name, unit = _level(log), pair.name, pair.unit
+    real, chosen, held_out = pair.real[:, 0], found.whole.chosen, pair.held_out
+    before, after = _column(pair, ()), _column(pair, chosen)
+    before = before + (real - before)[pair.usable[:, 0]].mean()
+    findings = [_finding(pair, found, one, always, level) for one in found.selected]
     rounded = lsb > LEAST_DIGITS * level
     if rounded:
-        digits = _rounded(pair, after, lsb, name, unit)
-        findings.append(digits)
-        phase = float(np.median(np.mod(pair.real + 0.5 * lsb, lsb))) - 0.5 * lsb
-        after = (
-            np.rint((after - phase) / lsb) * lsb + phase if digits.held_out.rms_after < digits.held_out.rms_before else after
-        )
-    p_value = min((one.p_value for one in found.judged), default=1.0)
-    places = _located(pair, after - before, level, name, unit, p_value) if found.judged else ()
-    place = next(k for k in range(always) if chosen[k][0].name == "offset")
-    rms = _rms(pair.real - after, held)
+        phase = float(np.median(np.mod(real + 0.5 * lsb, lsb))) - 0.5 * lsb
+        digits = np.rint((after - phase) / lsb) * lsb + phase
+        held = _held_out(pair, after, digits)
+        share = float(np.clip(1.0 - (held.rms_after / max(held.rms_before, 1e-300)) ** 2, 0.0, 1.0))
+        parameters = {"lsb": Estimate(lsb, EXACT * lsb, unit)}  # no noise puts every value on a grid by chance
+        findings.append(Finding("quantization", name, share, 0.0, 0.0, parameters, "y = lsb round(x / lsb)", held))
+        after = digits if held.rms_after < held.rms_before else after
+    p_value = min((one.p_value for one in found.selected), default=1.0)
+    offset = found.whole.stds()["offset"]
+    rms = float(np.sqrt(np.mean((real - after)[held_out] ** 2)))
     floor = float(np.hypot(level, lsb / np.sqrt(12.0))) if rounded else level
     return SignalDiagnosis(
         signal=name,
         unit=unit,
-        located=places,
+        located=_located(pair, after - before, level, p_value) if found.selected else (),
         findings=tuple(findings),
-        offset=Estimate(float(chosen[place][1][0]), float(found.whole.std(place)[0]), unit),
-        not_identifiable=tuple(f"{name}.delay" for _ in range(int(pair.aligned_s is not None))),
+        offset=Estimate(float({e.key: theta for e, theta in chosen}["offset"][0]), float(offset[0]), unit),
+        not_identifiable=() if pair.shares_epoch else (f"{name}.delay",),
         unexplained=Unexplained(rms, level, rms < WHITE * floor),
-        closer=_held_out(pair, before, after, unit),
-        remarks=_remarks(pair, name),
-        traces=SignalTraces(pair.ideal.t_s, pair.real, before, after, held, unit),
+        closer=_held_out(pair, before, after),
+        remarks=() if pair.shares_epoch else (NO_EPOCH.format(name, pair.aligned_s),),
+        traces=SignalTraces(pair.stamp_s, real, before, after, held_out, unit),
     )
 
 
-def _remarks(pair: Beside, name: str) -> tuple[str, ...]:
-    if pair.aligned_s is None:
-        return ()
-    return (
-        f"{name}: the two clocks share no epoch; aligned by the signal ({pair.aligned_s:+.3f} s), so that a delay between them "
-        "cannot be seen",
-    )
+def _column(pair: AlignedSignal, chosen: Chosen) -> Samples:
+    return np.asarray(expected(pair, chosen)[:, 0])
 
 
-def _rms(residual: Samples, rows: Bool[np.ndarray, " n"]) -> float:
-    return float(np.sqrt(np.mean(residual[rows] ** 2)))
+def _held_out(pair: AlignedSignal, before: Samples, after: Samples) -> HeldOut:
+    rms = [float(np.sqrt(np.mean((pair.real[:, 0] - model)[pair.held_out] ** 2))) for model in (before, after)]
+    return HeldOut(rms[0], rms[1], pair.unit, round(float(pair.held_out.sum()) * pair.period_s, 1))
 
 
-def _held_out(pair: Beside, before: Samples, after: Samples, unit: str) -> HeldOut:
-    rms = [_rms(pair.real - there, pair.held_out) for there in (before, after)]
-    return HeldOut(rms[0], rms[1], unit, round(float(pair.held_out.sum()) / pair.rate_hz, 1))
-
-
-def _finding(pair: Beside, found: Found, one: Judged, k: int, always: int, level: float, name: str, unit: str) -> Finding:
-    """One effect: what leaving it out costs on time that its parameters were not fitted to."""
-    fitted = found.fitted
-    without = (*fitted.chosen[:k], *fitted.chosen[k + 1 :])
-    with_, alone, nothing = (pair.ideal.expected(these) for these in (fitted.chosen, without, fitted.chosen[:always]))
-    usable = pair.fitted
-    alone, nothing = (there + (pair.real - there)[usable].mean() for there in (alone, nothing))
-    held, all_ = _held_out(pair, alone, with_, unit), _held_out(pair, nothing, with_, unit)
+def _finding(pair: AlignedSignal, found: Selection, one: SelectedEffect, always: int, level: float) -> Finding:
+    """A finding, with what leaving it out costs on time that its parameters were not fitted to."""
+    effect, chosen = one.physics, found.fitted.chosen
+    without = tuple(pair for pair in chosen if pair[0].key != effect.key)
+    with_, alone, nothing = (_column(pair, these) for these in (chosen, without, chosen[:always]))
+    alone, nothing = (model + (pair.real[:, 0] - model)[pair.fitted].mean() for model in (alone, nothing))
+    held, all_ = _held_out(pair, alone, with_), _held_out(pair, nothing, with_)
     misfit = max(all_.rms_before**2 - level**2, 1e-300)
+    numbers = zip(effect.parameters, one.theta, one.std, strict=True)
+    curve = isinstance(effect.forward, SignalCurve)
     return Finding(
-        effect=one.effect.name,
-        signal=name,
+        effect=effect.name,
+        signal=pair.name,
         share=float(np.clip((held.rms_before**2 - held.rms_after**2) / misfit, 0.0, 1.0)),
         p_value=one.p_value,
         false_discovery_rate=one.false_discovery_rate,
-        parameters=_parameters(found.whole, k),
-        equation=one.effect.equation,
+        parameters={} if curve else {n.name: Estimate(float(value), float(std), n.unit) for n, value, std in numbers},
+        equation=effect.equation,
         held_out=held,
-        driver=one.effect.driver,
+        driver=effect.variable if effect.kind == "driven" else "",
         similar=one.similar,
-        curve=_curve(found.whole, k, unit),
+        curve=_curve(found, one),
+        kind=effect.kind,
+        variable=effect.variable,
     )
 
 
-def _parameters(whole: Fit, k: int) -> dict[str, Estimate]:
-    """As they were fitted; a curve is told by its values instead."""
-    effect, theta = whole.chosen[k]
-    if isinstance(effect.forward, Curve):
-        return {}
-    return {
-        number.name: Estimate(float(value), float(std), number.unit)
-        for number, value, std in zip(effect.numbers, theta, whole.std(k), strict=True)
-    }
-
-
-def _curve(whole: Fit, k: int, unit: str) -> ToldCurve | None:
-    """A curve without a name by its values, with what they are sure to; its mean belongs to the offset."""
-    forward, theta = whole.chosen[k][0].forward, whole.chosen[k][1]
-    if not isinstance(forward, Curve):
+def _curve(found: Selection, one: SelectedEffect) -> Curve | None:
+    """A curve by its values, with their standard deviations; its mean belongs to the offset."""
+    forward = one.physics.forward
+    if not isinstance(forward, SignalCurve):
         return None
-    x = np.linspace(forward.first, forward.last, SHOWN_KNOTS)
+    x = forward.points(SHOWN_KNOTS)
     basis = forward.basis(x)
     centred = basis - basis.mean(axis=0)
-    covariance = whole.covariance[whole.place(k), whole.place(k)]
-    band = np.sqrt(np.einsum("nq,qp,np->n", centred, covariance, centred))
-    return ToldCurve(forward.variable, forward.unit, x, (centred @ theta)[:, None], band[:, None])
+    place = found.whole.place(one.physics.key)
+    band = np.sqrt(np.einsum("nq,qp,np->n", centred, found.whole.covariance[place, place], centred))
+    return Curve.of_arrays(forward.variable, forward.unit, x, (centred @ one.theta)[:, None], band[:, None])
 
 
-def _rounded(pair: Beside, model: Samples, lsb: float, name: str, unit: str) -> Finding:
-    """Values on a grid, which they show exactly; that the same noise put all of them there by chance is out of the question."""
-    phase = float(np.median(np.mod(pair.real + 0.5 * lsb, lsb))) - 0.5 * lsb
-    held = _held_out(pair, model, np.rint((model - phase) / lsb) * lsb + phase, unit)
-    share = float(np.clip(1.0 - (held.rms_after / max(held.rms_before, 1e-300)) ** 2, 0.0, 1.0))
-    parameters = {"lsb": Estimate(lsb, EXACT * lsb, unit)}
-    return Finding("quantization", name, share, 0.0, 0.0, parameters, "y = lsb round(x / lsb)", held)
-
-
-def _located(pair: Beside, misfit: Samples, level: float, name: str, unit: str, p_value: float) -> tuple[Located, ...]:
+def _located(pair: AlignedSignal, misfit: Samples, level: float, p_value: float) -> tuple[Located, ...]:
     """Seconds in which what the findings add stands out of the noise, and in which regime they are."""
-    t_s = pair.ideal.t_s
+    t_s, sampled = pair.stamp_s, pair.sampled
     window = np.floor((t_s - t_s[0]) / WINDOW_S).astype(int)
     power = np.bincount(window, weights=((misfit - np.median(misfit)) / level) ** 2)
     inside = power > CLEAR
     if not inside.any():
         return ()
-    taken = pair.ideal.taken(())
     variables: dict[str, tuple[str, Column]] = {
-        "its value": (unit, taken.x),
-        "its size": (unit, np.abs(taken.x - np.median(taken.x))),
-        "its rate of change": (f"{unit}/s", np.abs(taken.dx)),
+        "its value": (pair.unit, sampled.x),
+        "its size": (pair.unit, np.abs(sampled.x - np.median(sampled.x))),
+        "its rate of change": (f"{pair.unit}/s", np.abs(sampled.dx)),
         "time": ("s", t_s),
     }
-    for other, (at, values) in pair.ideal.channels.items():
-        variables[other] = "", np.interp(t_s, at, values)
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], inside.astype(int), [0]])))
-    spans = [(float(t_s[0]) + first * WINDOW_S, float(t_s[0]) + last * WINDOW_S) for first, last in edges.reshape(-1, 2)]
+    variables |= {other: ("", np.interp(t_s, at, values)) for other, (at, values) in pair.ideal.channels.items()}
+    spans = intervals(float(t_s[0]) + WINDOW_S * np.flatnonzero(inside))
     where = regime(inside, power, window, variables)
-    return (Located(name, (), tuple(_joined(spans)), where, float(power[inside].sum() / power.sum()), p_value),)
-
-
-def _joined(spans: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
-    """Those close to one another as one."""
-    out: list[tuple[float, float]] = []
-    for begin, end in spans:
-        if out and begin - out[-1][1] < JOIN_S - WINDOW_S:
-            out[-1] = out[-1][0], end
-        else:
-            out.append((begin, end))
-    return out
+    return (Located(pair.name, (), tuple(spans), where, float(power[inside].sum() / power.sum()), p_value),)

@@ -1,4 +1,4 @@
-"""Columns of messages from their bytes: every number of a stretch of messages in one numpy pass.
+"""Decode messages into columns, in one numpy pass for many messages.
 
 Quaternions are xyzw in messages and wxyz in memory; here they change.
 """
@@ -40,7 +40,7 @@ class ImuColumns(NamedTuple):
 
 
 class PoseColumns(NamedTuple):
-    """Consecutive poses of one frame in another; `child_frame_id` is empty where the message names none."""
+    """Consecutive poses of one frame in another; `child_frame_id` may be empty."""
 
     stamp_ns: Int64[np.ndarray, " n"]
     p_wb: Float64[np.ndarray, "n 3"]
@@ -50,7 +50,7 @@ class PoseColumns(NamedTuple):
 
 
 class ScalarColumns(NamedTuple):
-    """Consecutive numbers; `stamp_ns` is None for a message without a header, which the log's own time then carries."""
+    """Consecutive numbers; `stamp_ns` is None for a message without a header."""
 
     stamp_ns: Int64[np.ndarray, " n"] | None
     values: Float64[np.ndarray, "n k"]
@@ -58,7 +58,10 @@ class ScalarColumns(NamedTuple):
 
 
 class TwistColumns(NamedTuple):
-    """Consecutive TwistWithCovarianceStamped of one frame; `variance` is of angular then linear, in messages the other way."""
+    """Consecutive TwistWithCovarianceStamped of one frame.
+
+    `variance` is of angular then linear; a message has them the other way round.
+    """
 
     stamp_ns: Int64[np.ndarray, " n"]
     angular: Float64[np.ndarray, "n 3"]
@@ -87,7 +90,7 @@ def _one_layout(rows: UInt8[np.ndarray, "n L"], schema_name: str, encoding: str)
 
 
 def decode_imu(rows: UInt8[np.ndarray, "n L"], encoding: str = "cdr", layout: Layout | None = None) -> ImuColumns:
-    """The columns of Imu messages that share one layout (`runs` splits those that do not).
+    """Columns of Imu messages that share one layout (`schemas.runs` splits them by layout).
 
     Raises:
         LogError: no rows, more than one layout, a payload too short, an unknown encoding.
@@ -100,7 +103,7 @@ def decode_imu(rows: UInt8[np.ndarray, "n L"], encoding: str = "cdr", layout: La
 def decode_poses(
     rows: UInt8[np.ndarray, "n L"], schema_name: str = POSE, encoding: str = "cdr", layout: Layout | None = None
 ) -> list[PoseColumns]:
-    """The columns of PoseStamped, Odometry, TransformStamped or TFMessage: one entry per transform in a message.
+    """Columns of PoseStamped, Odometry, TransformStamped or TFMessage, per transform.
 
     Raises:
         LogError: no rows, more than one layout, a payload too short, an unknown encoding.
@@ -120,7 +123,7 @@ def decode_poses(
 def decode_scalars(
     rows: UInt8[np.ndarray, "n L"], schema_name: str, encoding: str = "cdr", layout: Layout | None = None
 ) -> ScalarColumns:
-    """The columns of Float64 (one) or Vector3Stamped (three).
+    """Columns of Float64 (one) or Vector3Stamped (three).
 
     Raises:
         LogError: no rows, more than one layout, a payload too short, an unknown encoding.
@@ -132,7 +135,7 @@ def decode_scalars(
 
 
 def decode_twist(rows: UInt8[np.ndarray, "n L"], encoding: str = "cdr", layout: Layout | None = None) -> TwistColumns:
-    """The columns of TwistWithCovarianceStamped.
+    """Columns of TwistWithCovarianceStamped.
 
     Raises:
         LogError: no rows, more than one layout, a payload too short, an unknown encoding.

@@ -1,4 +1,4 @@
-"""Columns into the bytes of messages, as ROS 2 writes them: every number of all of them in one numpy pass.
+"""Encode columns as ROS 2 messages, in one numpy pass for many messages.
 
 Quaternions are wxyz in memory and xyzw in messages; here they change.
 """
@@ -35,11 +35,11 @@ _XYZW_FROM_WXYZ = [1, 2, 3, 0]
 
 
 def _blank(count: int, layout: Layout) -> UInt8[np.ndarray, "n L"]:
-    """As many messages as asked for, with everything filled in that they share."""
-    one = np.zeros(layout.size, np.uint8)
+    """Messages with every byte filled in that they share."""
+    message = np.zeros(layout.size, np.uint8)
     for at, value in layout.constants:
-        one[at : at + len(value)] = np.frombuffer(value, np.uint8)
-    return np.repeat(one[None, :], count, axis=0)
+        message[at : at + len(value)] = np.frombuffer(value, np.uint8)
+    return np.repeat(message[None, :], count, axis=0)
 
 
 def _put_stamp(rows: UInt8[np.ndarray, "n L"], layout: Layout, stamp_ns: Int64[np.ndarray, " n"]) -> None:
@@ -67,8 +67,10 @@ def encode_imu(
     gyro_covariance: Float64[np.ndarray, "9"] | Float64[np.ndarray, "n 9"] | None = None,
     accel_covariance: Float64[np.ndarray, "9"] | Float64[np.ndarray, "n 9"] | None = None,
 ) -> UInt8[np.ndarray, "n L"]:
-    """One Imu message per row. Orientation is (0, 0, 0, 1) and marked as not measured; covariances, row-major, are one
-    for all or one per row, and all zeros ("unknown", says the message's definition) where not given.
+    """One Imu message per row.
+
+    Orientation is (0, 0, 0, 1) and marked as not measured; covariances, row-major, are one
+    for all or one per row, and all zeros ("unknown" in the message's definition) where not given.
 
     Raises:
         DataError: a stamp beyond the 32-bit seconds of ROS 2.
@@ -151,7 +153,9 @@ def encode_twist(
     covariance: Float64[np.ndarray, "n 6 6"],
     frame_id: str,
 ) -> UInt8[np.ndarray, "n L"]:
-    """One TwistWithCovarianceStamped message per row; `covariance` is of angular then linear, in messages the other way round.
+    """One TwistWithCovarianceStamped message per row.
+
+    `covariance` is of angular then linear; a message has them the other way round.
 
     Raises:
         DataError: a stamp beyond the 32-bit seconds of ROS 2.
@@ -166,7 +170,7 @@ def encode_twist(
 
 
 def encode_float(values: Float64[np.ndarray, " n"]) -> UInt8[np.ndarray, "n L"]:
-    """One Float64 message per row; it has no stamp, so the log's own time carries it."""
+    """One Float64 message per row, without a stamp: the log time carries it."""
     layout = layout_of(FLOAT, "cdr")
     rows = _blank(len(values), layout)
     _numbers_of(rows, layout)[:, 0] = values

@@ -1,4 +1,4 @@
-"""Where every number lies in a message of which only its `ros2msg` definition is known: one walk over its bytes.
+"""Find every number in a message from its `ros2msg` definition, in one walk over its bytes.
 
 Grammar and alignment are those of ROS 2 (docs.ros.org, "About internal ROS 2 interfaces"; classic CDR: each primitive is
 aligned to its own size, counted from behind the 4-byte encapsulation). A log's definitions are taken for hostile: how deep they
@@ -33,7 +33,7 @@ _SEPARATOR = re.compile(r"^=+\s*$", re.MULTILINE)
 
 
 class Field(NamedTuple):
-    """One line of a definition; `length` is None for a single value, 0 for a sequence of any length."""
+    """One line of a definition; `length` is None for one value, 0 for a sequence."""
 
     name: str
     kind: str
@@ -41,7 +41,7 @@ class Field(NamedTuple):
 
 
 class Leaf(NamedTuple):
-    """A number, or a row of `length` of them, in one message; `kind` is numpy's without byte order."""
+    """A number, or a row of `length` of them; `kind` is numpy's without byte order."""
 
     path: str
     offset: int
@@ -53,7 +53,7 @@ Definition = Mapping[str, tuple[Field, ...]]
 
 
 def parse(schema_name: str, text: bytes) -> Definition:
-    """The fields of a message and of all that it is made of, by `package/Name`.
+    """Fields of a message and of all nested messages, by `package/Name`.
 
     Raises:
         LogError: a line that is none of a definition, a message that is not defined, or one that contains itself.
@@ -98,7 +98,7 @@ def _fields(of: str, body: str) -> Iterator[Field]:
 
 
 def _check(name: str, known: Definition, sound: dict[str, int], depth: int) -> int:
-    """How deep a message nests; each is looked at once.
+    """Depth to which a message nests; each message is checked once.
 
     Raises:
         LogError: one is not defined, or they nest too deep (which one that contains itself does).
@@ -116,7 +116,9 @@ def _check(name: str, known: Definition, sound: dict[str, int], depth: int) -> i
 
 
 class Walk:
-    """One message, gone through in order; `constants` are the bytes that another one must share to lie the same way.
+    """A walk over one message, in order.
+
+    `constants` are the bytes that another message must share to have the same layout.
 
     Raises:
         LogError: not plain CDR, or the message ends before its fields do.

@@ -1,4 +1,4 @@
-"""What messages look like: their definitions, and where in their bytes the fields lie.
+"""Definitions and byte layouts of the messages that imutool reads and writes.
 
 A message is walked once, field by field, to find where its numbers lie (a `Layout`); every further message with the same
 texts lies the same way, so whole columns are then cut out of a byte matrix (`decode`), or written into one (`encode`). Two
@@ -68,14 +68,14 @@ TYPE_HASHES = {
 
 
 def definition(schema_name: str) -> str:
-    """The `ros2msg` text of a message: its fields, then every nested message after a line of 80 `=`."""
+    """The `ros2msg` text of a message and of its nested messages."""
     order: list[str] = []
     _collect(schema_name.replace("/msg/", "/"), order)
     return f"{'=' * 80}\nMSG: ".join([_FIELDS[order[0]], *(f"{name}\n{_FIELDS[name]}" for name in order[1:])])
 
 
 def _collect(name: str, order: list[str]) -> None:
-    """A message's name and those of all it is made of, depth first, each once."""
+    """Adds a message's name and those of its nested messages, depth first, each once."""
     order.append(name)
     for line in _FIELDS[name].splitlines():
         nested = line.split()[0].split("[")[0]
@@ -84,7 +84,7 @@ def _collect(name: str, order: list[str]) -> None:
 
 
 def canonical(schema_name: str) -> str:
-    """The ROS 2 spelling of a schema's name: ROS 1 says `sensor_msgs/Imu`, ROS 2 `sensor_msgs/msg/Imu`."""
+    """ROS 2 spelling of a schema's name: `sensor_msgs/msg/Imu` for `sensor_msgs/Imu`."""
     package, slash, name = schema_name.partition("/")
     return f"{package}/msg/{name}" if slash and "/" not in name else schema_name
 
@@ -110,7 +110,7 @@ POSITION, XYZW = slice(0, 3), slice(3, 7)
 
 @dataclass(frozen=True, slots=True)
 class Layout:
-    """Where the fields of a message lie, and the bytes that make other messages lie the same way."""
+    """Byte offsets of a message's fields, and the bytes that messages of one layout share."""
 
     order: str  # "<" or ">"
     seconds: str  # "i4" in ROS 2, "u4" in ROS 1
@@ -123,7 +123,7 @@ class Layout:
 
 
 class _Walk:
-    """A position in a message, moving over one field at a time; texts and counts are read, or given."""
+    """A position in a message, moving by one field; texts and counts are read, or given."""
 
     def __init__(self, encoding: str, message: bytes | None, texts: Sequence[str] = ()) -> None:
         self.message, self.given, self.ros1 = message, list(texts), encoding == "ros1"
@@ -152,7 +152,7 @@ class _Walk:
         return at
 
     def word(self, value: int) -> int:
-        """A uint32, which every message of the layout shares."""
+        """A uint32 that every message of the layout shares."""
         self.align(4)
         at = self.skip(4)
         raw = struct.pack("<I", value) if self.message is None else self.message[at : at + 4]
@@ -172,7 +172,7 @@ class _Walk:
 def layout_of(
     schema_name: str, encoding: str, *, message: bytes | None = None, texts: Sequence[str] = (), data_size: int = 0
 ) -> Layout:
-    """The layout of one message: of the given one, or of the one to be written with the given texts.
+    """Layout of the given message, or of one to be written with the given texts.
 
     Raises:
         LogError: the message is shorter than its fields, or its encoding is not known.
@@ -204,7 +204,7 @@ def layout_of(
 
 
 def runs(rows: UInt8[np.ndarray, "n L"], schema_name: str, encoding: str = "cdr") -> Iterator[tuple[slice, Layout]]:
-    """Stretches of consecutive messages that share one layout; nearly always one, and checked in one pass.
+    """Stretches of consecutive messages that share one layout: nearly always one stretch.
 
     Raises:
         LogError: a message is shorter than its fields, or the encoding is not known.

@@ -1,6 +1,6 @@
-"""What can be had of a chunk that is damaged: its contents where only its head is, else the definitions it begins with.
+"""Repair the head of a damaged chunk, or find the definitions at its beginning.
 
-What a damaged head said can be known from elsewhere, and the CRC proves it.
+The fields of a damaged head are known from the summary or from the packed data, and the CRC of the contents proves them.
 """
 
 from __future__ import annotations
@@ -18,20 +18,20 @@ from imutool.errors import LogError
 from imutool.mcap_io.codec import records
 from imutool.mcap_io.codec.records import CHUNK_HEAD, HEAD
 
-FRAMES = (b"\x28\xb5\x2f\xfd", b"\x04\x22\x4d\x18")  # how what zstd and lz4 packed begins
+FRAME_MAGICS = (b"\x28\xb5\x2f\xfd", b"\x04\x22\x4d\x18")  # of zstd and lz4
 CHUNK_OPCODE = bytes([Opcode.CHUNK])
 DEFINITIONS = {int(Opcode.SCHEMA): Schema, int(Opcode.CHANNEL): Channel}
-MOST_SEARCHED = 1 << 20
-MOST_BEGUN = 4 << 20  # bytes to look for definitions in: they come first
+MAX_SEARCHED = 1 << 20  # bytes in which packed data must begin
+MAX_UNPACKED = 4 << 20  # bytes in which definitions are sought: they come first
 STEP = 256
 
 
-def mended(raw: bytes, offset: int, known: ChunkIndex | None) -> bytes | None:
-    """The record with a head that its contents prove; None if its head is in order, or none can be proven.
+def repair_head(raw: bytes, offset: int, known: ChunkIndex | None) -> bytes | None:
+    """The Chunk record with a head that its contents prove; None if intact or unprovable.
 
-    `known` is what a sound summary says of the chunk. The CRC itself must stand in the record as it was written.
+    `known` is the chunk's entry in an intact summary. The CRC itself must stand in the record as it was written.
     """
-    if in_order(raw, offset, known) or len(raw) < HEAD.size + CHUNK_HEAD.size + 8:
+    if is_consistent(raw, offset, known) or len(raw) < HEAD.size + CHUNK_HEAD.size + 8:
         return None
     for candidate in _candidates(raw, known):
         try:
@@ -43,8 +43,8 @@ def mended(raw: bytes, offset: int, known: ChunkIndex | None) -> bytes | None:
     return None
 
 
-def in_order(raw: bytes, offset: int, known: ChunkIndex | None) -> bool:
-    """Whether the head agrees with itself, with its data and with what is known of it."""
+def is_consistent(raw: bytes, offset: int, known: ChunkIndex | None) -> bool:
+    """Whether a chunk's head agrees with itself, with its data and with the summary's entry."""
     if len(raw) < HEAD.size or HEAD.unpack_from(raw) != (Opcode.CHUNK, len(raw) - HEAD.size):
         return False
     try:
@@ -58,7 +58,7 @@ def in_order(raw: bytes, offset: int, known: ChunkIndex | None) -> bool:
 
 
 def _size(packed: bytes, compression: str, stated: int) -> int:
-    """The size of the contents as the packed bytes themselves tell it, or what the head states."""
+    """Size of the contents from the packed bytes, or as the head states it."""
     if compression == "":
         return len(packed)
     if compression == "zstd":
@@ -71,7 +71,7 @@ def _size(packed: bytes, compression: str, stated: int) -> int:
 
 
 def _candidates(raw: bytes, known: ChunkIndex | None) -> Iterator[bytes]:
-    """The record under every head it may have had."""
+    """The record with every head it may have had."""
     start_ns, end_ns, stated, crc, _ = CHUNK_HEAD.unpack_from(raw, HEAD.size)
     if known is not None:
         start_ns, end_ns = known.message_start_time, known.message_end_time
@@ -84,14 +84,16 @@ def _candidates(raw: bytes, known: ChunkIndex | None) -> Iterator[bytes]:
             yield HEAD.pack(Opcode.CHUNK, len(raw) - HEAD.size) + body + struct.pack("<Q", len(packed)) + packed
 
 
-def definitions(raw: bytes) -> Iterator[tuple[int, bytes]]:
-    """Schema and Channel records (opcode and body) in what can still be unpacked of a damaged stretch: nothing proves them.
+def find_definitions(raw: bytes) -> Iterator[tuple[int, bytes]]:
+    """Finds Schema and Channel records at the start of a damaged chunk; nothing proves them.
 
-    A writer may define its channels in its first chunk alone; without them every sound chunk behind it means nothing.
+    A writer may define its channels in its first chunk alone; without them no later chunk can be read.
     """
-    starts = [raw.find(magic, 0, MOST_SEARCHED) for magic in FRAMES] + ([_uncompressed(raw)] if raw[:1] == CHUNK_OPCODE else [])
+    starts = [raw.find(magic, 0, MAX_SEARCHED) for magic in FRAME_MAGICS] + (
+        [_records_start(raw)] if raw[:1] == CHUNK_OPCODE else []
+    )
     for start in sorted(start for start in starts if start >= 0):
-        data, at = _begun(raw[start:]), 0
+        data, at = _unpack_start(raw[start:]), 0
         while len(data) - at >= HEAD.size:
             opcode, length = HEAD.unpack_from(data, at)
             whole = data[at : at + HEAD.size + length] if length <= len(data) - at - HEAD.size else b""
@@ -104,34 +106,34 @@ def definitions(raw: bytes) -> Iterator[tuple[int, bytes]]:
             at += len(whole)
 
 
-def _uncompressed(raw: bytes) -> int:
+def _records_start(raw: bytes) -> int:
     """Where the records of a chunk without compression begin."""
     at = HEAD.size + CHUNK_HEAD.size
     return at + 8 if raw[at - 4 : at] == bytes(4) else -1
 
 
-def _begun(packed: bytes) -> bytes:
-    """As much as unpacks before the damage, from a stretch that begins as its magic says; at most `MOST_BEGUN` bytes."""
-    if not packed.startswith(FRAMES):
-        return packed[:MOST_BEGUN]
+def _unpack_start(packed: bytes) -> bytes:
+    """The contents before the damage, at most `MAX_UNPACKED` bytes."""
+    if not packed.startswith(FRAME_MAGICS):
+        return packed[:MAX_UNPACKED]
     data = b""
     try:
-        for piece in _unpacked(packed):
+        for piece in _unpack_steps(packed):
             data += piece
-            if len(data) >= MOST_BEGUN:
+            if len(data) >= MAX_UNPACKED:
                 break
     except (zstandard.ZstdError, RuntimeError, EOFError, ValueError):
-        pass  # what came before is what there is
-    return data[:MOST_BEGUN]
+        pass  # the contents before the damage are kept
+    return data[:MAX_UNPACKED]
 
 
-def _unpacked(packed: bytes) -> Iterator[bytes]:
-    """The contents of a frame, bit by bit; a piece may be as long as a bomb makes it, but no longer than `MOST_BEGUN`."""
-    if packed.startswith(FRAMES[0]):
-        with zstandard.ZstdDecompressor().stream_reader(packed[:MOST_BEGUN]) as stream:
+def _unpack_steps(packed: bytes) -> Iterator[bytes]:
+    """Contents of a frame in pieces of at most `MAX_UNPACKED` bytes."""
+    if packed.startswith(FRAME_MAGICS[0]):
+        with zstandard.ZstdDecompressor().stream_reader(packed[:MAX_UNPACKED]) as stream:
             while piece := stream.read(STEP):
                 yield piece
     else:
         frame = lz4.frame.LZ4FrameDecompressor()
-        for at in range(0, min(len(packed), MOST_BEGUN), STEP):
-            yield frame.decompress(packed[at : at + STEP], max_length=MOST_BEGUN)
+        for at in range(0, min(len(packed), MAX_UNPACKED), STEP):
+            yield frame.decompress(packed[at : at + STEP], max_length=MAX_UNPACKED)

@@ -1,15 +1,18 @@
-"""Where records go on after a place at which they do not: every byte is looked at once, by numpy, and little believed.
+"""Find the next valid record after corrupt bytes.
 
-A record convinces by lengths inside it that agree with one another (a chunk's data with the chunk, an index's entries with the
-index, the texts of a definition with the definition); a message, which has none, by the records that follow it.
+A record is valid when the lengths inside it agree (a chunk's data with the chunk, an index's entries with the index, the texts
+of a definition with the definition). A message has no such lengths: the records that follow it must be valid.
 """
 
 from __future__ import annotations
 
 import struct
+from collections import Counter
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
+from jaxtyping import Int64, UInt64
 from mcap.opcode import Opcode
 from mcap.records import (
     AttachmentIndex,
@@ -26,15 +29,18 @@ from mcap.records import (
 )
 
 from imutool.errors import LogError
+from imutool.mcap_io.blocks import Attachment
 from imutool.mcap_io.codec import records
-from imutool.mcap_io.codec.attachment import Attached
-from imutool.mcap_io.codec.records import CHUNK_HEAD, FIXED, HEAD, MAGIC
+from imutool.mcap_io.codec.messages import FIXED
+from imutool.mcap_io.codec.records import CHUNK_HEAD, HEAD, MAGIC
+from imutool.mcap_io.recovery.losses import LATEST_NS
 from imutool.mcap_io.storage.source import Source
 
 WINDOW = 1 << 20
-MOST_SMALL = 1 << 24  # bytes of a record that is parsed whole: a definition, metadata, an entry of the summary
-MOST_TRIED = 1 << 17  # candidates looked at closely; beyond, a file is made to be searched for ever
-CHAIN = 3  # records in a row that a message needs to be believed after a gap
+MAX_SMALL = 1 << 24  # bytes of a record that is parsed whole: a definition, metadata, an entry of the summary
+MAX_CANDIDATES = 1 << 17  # parsed in one file; more occur only in a file made to be searched forever
+CHAIN = 3  # records in a row that prove a message after a gap
+LOG_START = MAGIC + bytes([Opcode.HEADER])
 PRIVATE = 0x80  # opcodes from here on belong to whoever writes them
 
 SMALL: dict[int, Any] = {
@@ -50,7 +56,7 @@ SMALL: dict[int, Any] = {
     Opcode.SUMMARY_OFFSET: SummaryOffset,
     Opcode.DATA_END: DataEnd,
 }
-HELD = {Opcode.MESSAGE, Opcode.CHUNK, Opcode.MESSAGE_INDEX}  # what comes into memory as a whole
+IN_MEMORY = {Opcode.MESSAGE, Opcode.CHUNK, Opcode.MESSAGE_INDEX}  # as a whole
 SUMMARY = {
     Opcode.CHUNK_INDEX,
     Opcode.ATTACHMENT_INDEX,
@@ -58,8 +64,8 @@ SUMMARY = {
     Opcode.METADATA_INDEX,
     Opcode.SUMMARY_OFFSET,
 }
-# The shortest body each can have
-LEAST = {
+# The shortest body of each
+MIN_LENGTH = {
     Opcode.HEADER: 8,
     Opcode.FOOTER: 20,
     Opcode.SCHEMA: 14,
@@ -76,39 +82,62 @@ LEAST = {
     Opcode.SUMMARY_OFFSET: 17,
     Opcode.DATA_END: 4,
 }
-_LEAST = np.full(256, 2**63, np.uint64)
-_LEAST[[int(o) for o in LEAST]] = list(LEAST.values())
-_KNOWN = _LEAST < 2**63
+_MIN_LENGTH = np.full(256, 2**63, np.uint64)
+_MIN_LENGTH[[int(o) for o in MIN_LENGTH]] = list(MIN_LENGTH.values())
+_KNOWN = _MIN_LENGTH < 2**63
 _CANDIDATE = np.dtype([("opcode", "u1"), ("length", "<u8")])
 
 
-class Frames:
-    """What records say of themselves, in one file up to a byte.
+@dataclass
+class Gap:
+    """A stretch without a valid record."""
+
+    offset: int
+    length: int
+    reason: str
+    counts: Counter[int] = field(default_factory=Counter)  # by the channel ids of its section
+    counted: bool = False  # from message indexes that survived behind it
+    start_ns: int | None = None
+    end_ns: int | None = None
+
+    def count(self, channel: int, entries: UInt64[np.ndarray, "n 2"]) -> None:
+        """Counts the messages of a lost chunk from the entries of a message index behind it."""
+        if not self.counted:
+            self.counts, self.counted = Counter(), True
+        self.counts[channel] += len(entries)
+        if len(entries) and entries[:, 0].max() < LATEST_NS:
+            first, last = int(entries[:, 0].min()), int(entries[:, 0].max())
+            self.start_ns = first if self.start_ns is None else min(first, self.start_ns)
+            self.end_ns = last if self.end_ns is None else max(last, self.end_ns)
+
+
+class RecordFrames:
+    """Checks of record framing in one file, up to a byte.
 
     Raises (everywhere):
         LogError: the disk does not give the bytes.
     """
 
     def __init__(self, source: Source, limit: int) -> None:
-        self.source, self.limit, self.tried = source, limit, 0
+        self.source, self.limit, self.candidates = source, limit, 0
 
     def head(self, position: int) -> tuple[int, int] | None:
-        """Opcode and length of a record that fits into the file, if one can begin there."""
+        """Opcode and length of a record that fits into the file, or None."""
         if not 0 <= position <= self.limit - HEAD.size:
             return None
         opcode, length = self.source.head(position)
-        if length > self.limit - position - HEAD.size or (opcode < PRIVATE and length < int(_LEAST[opcode])):
+        if length > self.limit - position - HEAD.size or (opcode < PRIVATE and length < int(_MIN_LENGTH[opcode])):
             return None
-        if opcode in HELD and length > records.CHUNK_LIMIT:
+        if opcode in IN_MEMORY and length > records.CHUNK_LIMIT:
             return None
         return opcode, length
 
-    def magic(self, position: int) -> bool:
-        """Whether a log begins or ends there."""
+    def is_magic(self, position: int) -> bool:
+        """Whether the magic of a log stands there."""
         return position + len(MAGIC) <= self.limit and self.source.at(position, len(MAGIC)) == MAGIC
 
     def find(self, start: int, end: int, needle: bytes) -> int:
-        """Where some bytes begin in a stretch, be it that they end behind it; -1 if they do not."""
+        """First offset of `needle` that begins in a stretch, or -1."""
         over = len(needle) - 1
         for at in range(start, end, WINDOW):
             raw = self.source.at(at, min(WINDOW + over, end + over - at, self.limit - at))
@@ -116,16 +145,16 @@ class Frames:
                 return at + found
         return -1
 
-    def empty(self, start: int, end: int) -> bool:
+    def is_zero(self, start: int, end: int) -> bool:
         """Whether all bytes of a stretch are zero."""
         return not any(self.source.at(at, min(WINDOW, end - at)).strip(b"\0") for at in range(start, end, WINDOW))
 
-    def leads_on(self, position: int) -> bool:
-        """Whether what came before ended well: the file ends here, or what may be a record begins."""
-        return position == self.limit or self.magic(position) or self.head(position) is not None
+    def is_boundary(self, position: int) -> bool:
+        """Whether a record can end here: the file ends, or another record or a log begins."""
+        return position == self.limit or self.is_magic(position) or self.head(position) is not None
 
-    def agrees(self, position: int, opcode: int, length: int) -> bool:
-        """Whether the lengths inside a record agree with its own; nothing can be said so of a message."""
+    def is_valid(self, position: int, opcode: int, length: int) -> bool:
+        """Whether the lengths inside a record agree with its own; always False for a message."""
         if opcode == Opcode.CHUNK:
             return self.chunk(position, length) is not None
         if opcode == Opcode.MESSAGE_INDEX:
@@ -133,9 +162,9 @@ class Frames:
             return bool(size == length - 6 and size % 16 == 0)
         try:
             if opcode == Opcode.ATTACHMENT:
-                return Attached.of(self.source, position, length).length == HEAD.size + length
+                return Attachment.of(self.source, position, length).length == HEAD.size + length
             kind = SMALL.get(opcode)
-            if kind is None or length > MOST_SMALL:
+            if kind is None or length > MAX_SMALL:
                 return False
             raw = self.source.at(position, HEAD.size + length)
             return records.build(records.parse(kind, raw[HEAD.size :], position)) == raw
@@ -143,7 +172,7 @@ class Frames:
             return False
 
     def chunk(self, position: int, length: int) -> records.ChunkHead | None:
-        """The head of a chunk whose record has this length, if it is one in a compression that is known."""
+        """The head of a chunk whose record has this length, or None; its compression must be known."""
         whole = HEAD.size + length
         try:
             head = records.ChunkHead.of(self.source.at(position, min(128, whole, self.limit - position)), whole, position)
@@ -151,8 +180,8 @@ class Frames:
             return None
         return head if head.compression in records.COMPRESSIONS.values() else None
 
-    def own_length(self, position: int) -> int | None:
-        """The length a Chunk record has by what stands inside it, where its own length field is damaged."""
+    def chunk_length(self, position: int) -> int | None:
+        """Length of a Chunk record from the fields inside it, where its own length field is damaged."""
         first = self.source.at(position, min(128, self.limit - position))
         if len(first) < HEAD.size + CHUNK_HEAD.size:
             return None
@@ -166,21 +195,21 @@ class Frames:
         length = at - HEAD.size + 8 + packed
         return int(length) if packed and length <= self.limit - position - HEAD.size else None
 
-    def next(self, start: int, limit: int, channels: set[int]) -> int:
-        """The first byte from `start` on at which a record convincingly begins, or a log; `limit` if there is none."""
+    def find_next(self, start: int, limit: int, channels: set[int]) -> int:
+        """Offset of the next valid record or log from `start` on; `limit` if there is none."""
         for at in range(start, limit, WINDOW):
             raw = self.source.at(at, min(WINDOW + len(MAGIC), self.limit - at))
             for offset in self._candidates(raw, at):
                 position = at + offset
-                if position >= limit or self.tried > MOST_TRIED:
+                if position >= limit or self.candidates > MAX_CANDIDATES:
                     return limit
-                self.tried += 1
-                if self.magic(position) or self._convinces(position, channels):
+                self.candidates += 1
+                if self.is_magic(position) or self._is_plausible(position, channels):
                     return position
         return limit
 
     def _candidates(self, raw: bytes, at: int) -> list[int]:
-        """Where a known opcode is followed by a length that fits, and where the magic stands, in the first `WINDOW` bytes."""
+        """Offsets of a known opcode with a length that fits, and of the magic, in the first `WINDOW` bytes."""
         view = np.frombuffer(raw, np.uint8)
         found: list[int] = []
         if len(view) >= HEAD.size:
@@ -189,7 +218,7 @@ class Frames:
             offsets = np.flatnonzero(small[:WINDOW])
             heads = np.lib.stride_tricks.sliding_window_view(view, HEAD.size)[offsets].view(_CANDIDATE)[:, 0]
             room = self.limit - at - HEAD.size - offsets
-            fits = (heads["length"] >= _LEAST[heads["opcode"]]) & (heads["length"].astype(np.int64) <= room)
+            fits = (heads["length"] >= _MIN_LENGTH[heads["opcode"]]) & (heads["length"].astype(np.int64) <= room)
             found = offsets[fits].tolist()
         magic = raw.find(MAGIC)
         while 0 <= magic < WINDOW:
@@ -197,14 +226,14 @@ class Frames:
             magic = raw.find(MAGIC, magic + 1)
         return sorted(found)
 
-    def _convinces(self, position: int, channels: set[int]) -> bool:
+    def _is_plausible(self, position: int, channels: set[int]) -> bool:
         found = self.head(position)
         if found is None:
             return False
         opcode, length = found
         end = position + HEAD.size + length
         if opcode != Opcode.MESSAGE:
-            return self.agrees(position, opcode, length) and (opcode == Opcode.CHUNK or self.leads_on(end))
+            return self.is_valid(position, opcode, length) and (opcode == Opcode.CHUNK or self.is_boundary(end))
         for _ in range(CHAIN):
             if channels and int.from_bytes(self.source.at(position + HEAD.size, 2), "little") not in channels:
                 return False
@@ -214,5 +243,57 @@ class Frames:
                 return position == self.limit
             opcode, length = found
             if opcode != Opcode.MESSAGE:
-                return self.agrees(position, opcode, length)
+                return self.is_valid(position, opcode, length)
         return True
+
+    def overlaps_next(self, position: int, opcode: int, length: int) -> bool:
+        """Whether a record was cut off and the next one overwrites its end.
+
+        Then another log begins inside it, or no record follows a chunk; and its CRC does not prove it whole.
+        """
+        end = position + HEAD.size + length
+        unframed = opcode == Opcode.CHUNK and not self.is_boundary(end)
+        if not (unframed or self.find(position, end, LOG_START) >= 0):
+            return False
+        try:
+            if opcode == Opcode.CHUNK:
+                records.unpack(self.source.at(position, end - position), position)
+            elif opcode == Opcode.ATTACHMENT:
+                return not Attachment.of(self.source, position, length).check_crc(self.source)
+        except LogError:
+            return True
+        return opcode != Opcode.CHUNK
+
+    def ends_run(self, end: int, raw: bytes, offsets: Int64[np.ndarray, " n"], channels: set[int]) -> bool:
+        """Whether the last message of a run ends at `end`: a record follows, perhaps a damaged one."""
+        if self.is_boundary(end):
+            return True
+        room = self.limit - end
+        if room >= HEAD.size:
+            opcode, length = self.source.head(end)
+            if opcode in MIN_LENGTH and opcode != Opcode.MESSAGE and length < 1 << 48:
+                return True  # a record of another kind, which goes on beyond the end of the file or is damaged
+        if room < HEAD.size + 2:
+            return self.source.at(end, 1)[0] in MIN_LENGTH
+        heads = [raw[at : at + HEAD.size + 2] for at in offsets[-256:].tolist()]
+        if heads[-1] in heads[:-1]:
+            return True  # as long as one before it on its channel
+        following = self.source.at(end, HEAD.size + 2)
+        opcode, length = HEAD.unpack_from(following)
+        known = channels | {int.from_bytes(head[HEAD.size :], "little") for head in heads}
+        if opcode == Opcode.MESSAGE and int.from_bytes(following[HEAD.size :], "little") in known:
+            return True
+        return bool(length <= room - HEAD.size and length >= FIXED and self.is_boundary(end + HEAD.size + length))
+
+    def broken_framing(self, position: int) -> str:
+        """Describes what is wrong with the record at a position."""
+        room = self.limit - position - HEAD.size
+        if room < 0:
+            return "the log is cut short here, inside the head of a record"
+        opcode, length = self.source.head(position)
+        if opcode not in set(Opcode):
+            return "no record begins here"
+        name = records.name_of(opcode)
+        if length > room:
+            return f"the {name} record here says it has {length} bytes, and {room} are there"
+        return f"the {name} record here is damaged"

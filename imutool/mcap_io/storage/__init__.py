@@ -1,1 +1,1 @@
-"""Byte sources and targets: files and object stores."""
+"""Read a log from, and write it to, a disk or an object store."""

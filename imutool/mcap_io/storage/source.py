@@ -1,21 +1,26 @@
-"""The bytes of a log, wherever it lies: read only, by offset and length, never a byte fewer than asked for."""
+"""Read the bytes of a log by offset, and its SHA-256; a short read is an error."""
 
 from __future__ import annotations
 
-from imutool.errors import ConfigError, LogError
-from imutool.location import Location, failures, opened, reason
-from imutool.mcap_io.codec.records import HEAD
+import hashlib
+import threading
+from types import TracebackType
 
-CUT_SHORT = "Save what is there with `imutool repair`, or copy it again from where it was recorded"
+from imutool.errors import ConfigError, ImutoolError, LogError
+from imutool.location import Location, io_errors, open_location, reason
+from imutool.mcap_io.codec.records import HEAD, crc32
+
+BLOCK_BYTES = 1 << 20
+CUT_SHORT = "Save the rest with `imutool repair`, or copy it again from where it was recorded"
 
 
 class Source:
-    """The bytes of a file or an object in a store that is only ever read, with a refusal in place of a short read."""
+    """Bytes of a file or object, read only; a short read is an error."""
 
     def __init__(self, path: Location, expected: str = "an MCAP log") -> None:
         try:
-            self.file, self.size = opened(path)
-        except failures(path) as error:
+            self.file, self.size, self.identity = open_location(path)
+        except io_errors(path) as error:
             raise ConfigError(f"cannot be opened ({reason(error)})", where=path, expected=expected) from error
         self.path = path
 
@@ -30,7 +35,7 @@ class Source:
             parts = self.file.read(length)
             while len(parts) < length and (part := self.file.read(length - len(parts))):
                 parts += part
-        except failures(self.path) as error:
+        except io_errors(self.path) as error:
             raise LogError(f"cannot be read at byte {offset} ({reason(error)})") from error
         if len(parts) != length:
             raise LogError(f"the log is cut short at byte {offset + len(parts)}", fix=CUT_SHORT)
@@ -42,9 +47,72 @@ class Source:
         return opcode, length
 
 
+def crc_of(source: Source, start: int, end: int, crc: int = 0) -> int:
+    """CRC-32 of the bytes from `start` to `end`, continued from that of the bytes before them."""
+    for at in range(start, end, BLOCK_BYTES):
+        crc = crc32(source.at(at, min(BLOCK_BYTES, end - at)), crc)
+    return crc
+
+
 def descriptor(file: object) -> int | None:
-    """The number under which the system knows an open file; none for what only looks like one, as in an object store."""
+    """The system's number of an open file; None in an object store."""
     try:
         return int(file.fileno())  # type: ignore[attr-defined]  # asked for, not demanded
     except (AttributeError, OSError):
         return None
+
+
+def sha256(path: Location) -> str:
+    """SHA-256 of a file, in hex, a block at a time.
+
+    Raises:
+        ConfigError: the file cannot be read.
+    """
+    try:
+        with open_location(path).file as file:
+            return hashlib.file_digest(file, "sha256").hexdigest()  # type: ignore[arg-type]  # readinto: all that `open_location` gives
+    except io_errors(path) as error:
+        raise ConfigError(f"cannot be read ({reason(error)})", where=path) from error
+
+
+class Digest:
+    """SHA-256 of a file in a thread, while the caller reads it: the disk reads a block once.
+
+    A context manager: leaving it ends the thread, whether or not anybody asked for the result.
+    """
+
+    def __init__(self, path: Location) -> None:
+        self._source, self._sum = Source(path), hashlib.sha256()
+        self._error: ImutoolError | None = None
+        self._left = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="sha256", daemon=True)
+        self._thread.start()
+
+    def _run(self) -> None:
+        size = self._source.size
+        try:
+            for at in range(0, size, BLOCK_BYTES):
+                if self._left.is_set():
+                    return
+                self._sum.update(self._source.at(at, min(BLOCK_BYTES, size - at)))
+        except LogError as error:  # raised by `result`
+            self._error = error.at(self._source.path)
+
+    def result(self) -> str:
+        """The digest, in hex, once the whole file has been read.
+
+        Raises:
+            LogError: the file has become shorter, or the disk does not give it.
+        """
+        self._thread.join()
+        if self._error is not None:
+            raise self._error
+        return self._sum.hexdigest()
+
+    def __enter__(self) -> Digest:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+        self._left.set()
+        self._thread.join()
+        self._source.file.close()

@@ -1,4 +1,4 @@
-"""A file that appears whole or not at all: written beside its place under another name, renamed when it is complete.
+"""Write a file that appears whole or not at all: under a temporary name, then renamed.
 
 What another file holds is copied by the kernel where its blocks stay blocks: a file system that shares them between files
 copies nothing at all. Where they move by part of a block it could only cut each in two, and costs more than reading and
@@ -18,17 +18,16 @@ from types import TracebackType
 from typing import BinaryIO, Protocol
 
 from imutool.errors import ConfigError
-from imutool.location import Location, failures, reason
-from imutool.mcap_io.codec.crc import crc32
-from imutool.mcap_io.storage.source import Source, descriptor
+from imutool.location import Location, io_errors, reason
+from imutool.mcap_io.codec.records import crc32
+from imutool.mcap_io.storage.source import BLOCK_BYTES, Source, crc_of, descriptor
 from imutool.mcap_io.storage.upload import Upload
 
-COPY_BYTES = 1 << 20  # what passes through memory stays in the processor's cache
-BLOCK_BYTES = 1 << 12  # of a file system
+PAGE_BYTES = 1 << 12  # of a file system
 
 
 class _Medium(Protocol):
-    """What is being written under its temporary name."""
+    """A file or object written under its temporary name."""
 
     @property
     def temporary(self) -> Location: ...
@@ -47,11 +46,11 @@ class _Medium(Protocol):
         """Puts it in its place."""
 
     def discard(self) -> None:
-        """Removes it; what cannot be removed is left without a word."""
+        """Removes the temporary file, silently if that fails."""
 
 
 class Target:
-    """Context manager over the file being written; leaving it without an error puts the file in its place.
+    """The file being written; leaving the context without an error puts it in its place.
 
     Any error, Ctrl-C included, removes what was written. `crc` is the CRC-32 of everything written while `summing`. In a store
     it is an object under another key, copied to its own by the store when it is complete; between the last look whether the
@@ -67,9 +66,9 @@ class Target:
         name = f".{path.name}.{os.getpid()}.{secrets.token_hex(4)}.partial"
         self._medium: _Medium = _File(path, name) if isinstance(path, Path) else Upload(path, name)
         self.temporary = self._medium.temporary
-        # Ctrl-C may come between two lines, before anybody is there to call `abandon`: then the file goes with this object
+        # Ctrl-C may come between two lines, before `abandon` can be called: then the file goes with this object
         self._remove = weakref.finalize(self, self._medium.discard)
-        with self._told():
+        with self._system_errors():
             self._refuse_existing()
             self._medium.open()
 
@@ -77,15 +76,15 @@ class Target:
         if self.path.is_dir():
             raise ConfigError("the target is a folder", where=self.path, expected="the name of a file")
         if self.path.exists() and not self.overwrite:
-            raise ConfigError("the target exists", where=self.path, fix="Choose another name, or add --overwrite")
+            raise ConfigError("the target exists", where=self.path, fix="Choose another name, or add `overwrite=True`")
 
     @contextmanager
-    def _told(self) -> Iterator[None]:
+    def _system_errors(self) -> Iterator[None]:
         try:
             yield
         except ConfigError:
             raise
-        except failures(self.path) as error:
+        except io_errors(self.path) as error:
             raise ConfigError(
                 f"cannot be written ({reason(error)})", where=self.path, fix="Choose a place that can be written and has room"
             ) from error
@@ -96,7 +95,7 @@ class Target:
         Raises:
             ConfigError: the system refuses; the message gives its reason.
         """
-        with self._told():
+        with self._system_errors():
             self._medium.write(data)
         self.position += len(data)
         if self.summing:
@@ -110,15 +109,15 @@ class Target:
             LogError: the source does not have the bytes, or the disk does not give them.
         """
         if not self.summing:
-            with self._told():
+            with self._system_errors():
                 stopped = self._medium.copy(source, start, end)
             self.position, start = self.position + stopped - start, stopped
-        for at in range(start, end, COPY_BYTES):
-            self.write(source.at(at, min(COPY_BYTES, end - at)))
+        for at in range(start, end, BLOCK_BYTES):
+            self.write(source.at(at, min(BLOCK_BYTES, end - at)))
 
     def flush(self) -> None:
-        """Hands everything over, so that it can be read back under its temporary name; nothing can be written after."""
-        with self._told():
+        """Makes all bytes readable under the temporary name; nothing can be written after."""
+        with self._system_errors():
             self._medium.complete()
 
     def __enter__(self) -> Target:
@@ -137,7 +136,7 @@ class Target:
             ConfigError: the system refuses, or somebody else wrote the target meanwhile; nothing is left behind.
         """
         try:
-            with self._told():
+            with self._system_errors():
                 self._medium.complete()
                 self._refuse_existing()
                 self._medium.publish()
@@ -168,7 +167,7 @@ class _File:
     def copy(self, source: Source, start: int, end: int) -> int:
         """By the kernel; where it began, if the kernel cannot do it, or not without cutting blocks in two."""
         theirs, ours = descriptor(source.file), descriptor(self.file)
-        if theirs is None or ours is None or (start - self.file.tell()) % BLOCK_BYTES:
+        if theirs is None or ours is None or (start - self.file.tell()) % PAGE_BYTES:
             return start
         calls: tuple[Callable[[int], int], ...] = (
             lambda at: os.copy_file_range(theirs, ours, end - at, offset_src=at),
@@ -198,7 +197,7 @@ class _File:
 
 
 def _settle(folder: Path) -> None:
-    """Has the new name written to the disk, so that a power cut does not bring back the old file; Windows has no way."""
+    """Writes the new name to disk, so that a power cut does not restore the old file."""
     with contextlib.suppress(OSError):
         handle = os.open(folder, os.O_RDONLY)
         try:
@@ -208,8 +207,55 @@ def _settle(folder: Path) -> None:
 
 
 def _tried(call: Callable[[int], int], at: int) -> int:
-    """Bytes that were copied; 0 if this call cannot do it, whatever the reason: reading and writing then say which."""
+    """Bytes copied by the call; 0 if the call fails, then reading and writing show why."""
     try:
         return call(at)
     except OSError:
         return 0
+
+
+class PassThrough:
+    """Copies a source into a target in order, with new records between those of the source."""
+
+    def __init__(self, source: Source, target: Target) -> None:
+        self.source, self.target = source, target
+        self.copied = self.crc = 0  # bytes of the source so far, and their CRC if it states one
+        self.pending_end = 0  # the bytes from `copied` to here are to be copied, but not yet
+
+    @property
+    def pending(self) -> int:
+        """Bytes to be copied later."""
+        return self.pending_end - self.copied
+
+    def defer(self, end: int) -> int:
+        """Marks the source up to here to be copied now or later; returns by how much its bytes move."""
+        self.pending_end = end
+        return self.target.position - self.copied
+
+    def flush(self) -> None:
+        """Copies the pending bytes."""
+        start, end, out = self.copied, self.pending_end, self.target
+        self.copied = end
+        if not out.summing:
+            out.copy(self.source, start, end)
+            return
+        for at in range(start, end, BLOCK_BYTES):  # read once for the CRC of the source and that of the copy
+            raw = self.source.at(at, min(BLOCK_BYTES, end - at))
+            self.crc = crc32(raw, self.crc)
+            out.write(raw)
+
+    def skip(self, end: int) -> None:
+        """Leaves out the bytes of the source up to here, which are written in another form or not at all."""
+        if self.target.summing:
+            self.crc = crc_of(self.source, self.copied, end, self.crc)
+        self.copied = self.pending_end = end
+
+    def write(self, raw: memoryview) -> int:
+        """Copies bytes of the source that are in memory already; returns where they went."""
+        self.flush()
+        at = self.target.position
+        if self.target.summing:
+            self.crc = crc32(raw, self.crc)
+        self.target.write(raw)
+        self.copied = self.pending_end = self.copied + len(raw)
+        return at

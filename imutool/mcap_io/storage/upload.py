@@ -1,4 +1,4 @@
-"""An object being written to a store: in parts, under a temporary key, then copied to its own by the store."""
+"""Write an object to a store: in parts, under a temporary key, then copied by the store."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ LARGE_AFTER, LARGE_PART_BYTES = 32 << 30, 64 << 20  # S3 takes 10 000 parts: so 
 
 
 class Upload:
-    """One object under its temporary key; nothing of it can be seen before `complete`."""
+    """One object under its temporary key, invisible before `complete`."""
 
     def __init__(self, path: UPath, name: str) -> None:
         self.path, self.temporary = path, path.with_name(name)
-        self.size, self.seal = 0, ""
+        self.size, self.etag = 0, ""
         self.file: Any = None
 
     def open(self) -> None:
@@ -40,14 +40,14 @@ class Upload:
         self.size += len(data)
 
     def copy(self, source: Source, start: int, end: int) -> int:
-        """Nothing: a part of one object is not asked for as a part of another here."""
+        """Copies nothing: parts of objects are not copied within the store."""
         return start
 
     def complete(self) -> None:
-        """Sends the last part: the object is then there under its temporary key. Does nothing when it is there already."""
+        """Sends the last part, unless that is done: the temporary object then exists."""
         if not self.file.closed:
             self.file.close()
-            self.seal = self._seal(self.temporary)
+            self.etag = self._check_size(self.temporary)
 
     def publish(self) -> None:
         """Copies the object to its own key, within the store, and removes the temporary one.
@@ -55,11 +55,11 @@ class Upload:
         Raises:
             ConfigError: the store holds something else than what was written.
         """
-        if self._seal(self.temporary) != self.seal:
-            raise ConfigError("was changed by somebody while it was written", where=self.temporary)
+        if self._check_size(self.temporary) != self.etag:
+            raise ConfigError("was changed while it was written", where=self.temporary)
         with self._no_parts_left():
             self.path.fs.cp_file(self.temporary.path, self.path.path)
-        self._seal(self.path)
+        self._check_size(self.path)
         try:
             self.path.fs.rm_file(self.temporary.path)
         except Exception as error:  # the object is in its place, and whole: that is what was asked for  # noqa: BLE001
@@ -67,26 +67,26 @@ class Upload:
 
     @contextmanager
     def _no_parts_left(self) -> Iterator[None]:
-        """S3 copies large objects in parts, and s3fs leaves those of a copy that fails lying there: they are aborted here."""
+        """Aborts the parts of a large copy in S3 that failed: s3fs leaves them there."""
         before = self._uploads()
         try:
             yield
         except BaseException:
-            with suppress(Exception):  # one thing after another can fail; the first is what is said
+            with suppress(Exception):  # the first error is raised
                 for upload in self._uploads() - before:  # the others are somebody else's
                     self.path.fs.abort_mpu(*upload)
             raise
 
     def _uploads(self) -> set[tuple[str, str, str]]:
-        """Bucket, key and id of every unfinished upload to the target's key, in stores that tell."""
+        """Bucket, key and id of every unfinished upload to the target's key."""
         bucket, _, key = self.path.path.partition("/")
         with suppress(Exception):  # no such call, or not allowed
             found = self.path.fs.list_multipart_uploads(bucket)
             return {(bucket, key, entry["UploadId"]) for entry in found if entry["Key"] == key}
         return set()
 
-    def _seal(self, place: UPath) -> str:
-        """What identifies the contents of an object that must be as long as what was written."""
+    def _check_size(self, place: UPath) -> str:
+        """ETag of an object, whose size must be that of the bytes written."""
         info: dict[str, Any] = place.fs.info(place.path)
         if info["size"] != self.size:
             raise ConfigError(f"the store holds {info['size']} bytes", where=place, expected=str(self.size))

@@ -1,1 +1,1 @@
-"""Effects an ideal IMU leaves out, one file each; the file's name is the key (`effect(sensor) -> Effect`, `SENSORS`)."""
+"""Effects that an ideal IMU leaves out, one file and one `EFFECT` each; the file's name is the key."""

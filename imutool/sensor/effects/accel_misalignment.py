@@ -7,7 +7,7 @@ from imutool.sensor.samples import SensorSamples
 
 
 def _forward(samples: SensorSamples, m: Theta) -> SensorSamples:
-    return samples.but(accel=samples.accel + samples.accel @ matrix(m).T)
+    return samples.with_readings(accel=samples.accel + samples.accel @ matrix(m).T)
 
 
 EFFECT = Effect(

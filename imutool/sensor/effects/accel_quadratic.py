@@ -7,7 +7,7 @@ from imutool.sensor.samples import SensorSamples
 
 
 def _forward(samples: SensorSamples, k: Theta) -> SensorSamples:
-    return samples.but(accel=samples.accel * (1.0 + k * samples.accel))
+    return samples.with_readings(accel=samples.accel * (1.0 + k * samples.accel))
 
 
 EFFECT = Effect(

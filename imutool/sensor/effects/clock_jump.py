@@ -16,12 +16,12 @@ def _forward(taken_s: Times, theta: Theta) -> Times:
 
 
 def _starts(motion: IdealMotion, samples: SensorSamples) -> list[Theta]:
-    """Where one offset before and another after explain most of the gyro's residual, to first order, by part of the log.
+    """Times at which two offsets explain most of the gyro's residual, to first order, by part.
 
     An offset tau adds tau d omega/dt, so that sums up to each sample and from it on tell what any jump would bring.
     """
     error, _ = residual(motion, samples)
-    slope = np.gradient(motion.taken(samples.stamp_s, samples.stamp_s).gyro, samples.stamp_s, axis=0)
+    slope = np.gradient(motion.sample(samples.stamp_s, samples.stamp_s).gyro, samples.stamp_s, axis=0)
     common = np.cumsum(np.sum(slope * (error - np.median(error, axis=0)), axis=1))
     power = np.cumsum(np.sum(slope**2, axis=1)) + np.finfo(np.float64).tiny
     before = common[:-1] / power[:-1]

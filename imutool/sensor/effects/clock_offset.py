@@ -7,17 +7,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from imutool.sensor.effect import Effect, Parameter, Stage, Theta
-from imutool.sensor.samples import IdealMotion, SensorSamples, Times
+from imutool.sensor.effect import Effect, Parameter, Stage, Theta, starts_at
+from imutool.sensor.samples import Times
 
 
 def _forward(taken_s: Times, tau_s: Theta) -> Times:
     return np.asarray(taken_s + tau_s[0])
-
-
-def _starts(_motion: IdealMotion, _samples: SensorSamples) -> list[Theta]:
-    """From no offset, and from beyond half a period of motion at a few hertz either way."""
-    return [np.array([tau_s]) for tau_s in (0.0, -0.05, 0.05)]
 
 
 EFFECT = Effect(
@@ -29,6 +24,6 @@ EFFECT = Effect(
     "it moves",
     _forward,
     linear=False,
-    starts=_starts,
+    starts=starts_at([0.0], [-0.05], [0.05]),  # beyond half a period of motion at a few hertz, either way
     trained=True,
 )

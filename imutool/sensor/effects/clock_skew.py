@@ -4,17 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from imutool.sensor.effect import Effect, Parameter, Stage, Theta
-from imutool.sensor.samples import IdealMotion, SensorSamples, Times
+from imutool.sensor.effect import Effect, Parameter, Stage, Theta, starts_at
+from imutool.sensor.samples import Times
 
 
 def _forward(taken_s: Times, eps: Theta) -> Times:
     """t from the log's start; further in, the log's clock and that of the motion are eps t apart."""
     return np.asarray(taken_s + eps[0] * taken_s)
-
-
-def _starts(_motion: IdealMotion, _samples: SensorSamples) -> list[Theta]:
-    return [np.array([eps]) for eps in (0.0, -1e-3, 1e-3)]
 
 
 EFFECT = Effect(
@@ -26,5 +22,5 @@ EFFECT = Effect(
     "the log is long, and it moves",
     _forward,
     linear=False,
-    starts=_starts,
+    starts=starts_at([0.0], [-1e-3], [1e-3]),
 )

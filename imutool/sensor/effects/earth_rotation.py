@@ -8,14 +8,14 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Float64
 
-from imutool.sensor.effect import Effect, Parameter, Stage, Theta, attitude_of
-from imutool.sensor.samples import IdealMotion, SensorSamples
+from imutool.sensor.effect import Effect, Parameter, Stage, Theta, attitude_of, starts_at
+from imutool.sensor.samples import IdealMotion
 
 EARTH_RAD_S = 7.292115e-5  # WGS 84
 
 
 def omega_w(latitude: float, heading: float) -> Float64[np.ndarray, "3"]:
-    """The earth's rate in the world frame, z up (rad/s); heading is north's angle about z from the world's x axis (rad)."""
+    """Earth rate in the world frame, z up (rad/s); heading is north's angle from x about z (rad)."""
     level = math.cos(latitude)
     return EARTH_RAD_S * np.array([level * math.cos(heading), level * math.sin(heading), math.sin(latitude)])
 
@@ -30,10 +30,6 @@ def _forward(motion: IdealMotion, theta: Theta) -> IdealMotion:
     )
 
 
-def _starts(_motion: IdealMotion, _samples: SensorSamples) -> list[Theta]:
-    return [np.array([latitude, heading]) for latitude in (-0.8, 0.8) for heading in (-3.0, -1.0, 1.0, 3.0)]
-
-
 EFFECT = Effect(
     "earth_rotation",
     Stage.MOTION,
@@ -43,6 +39,6 @@ EFFECT = Effect(
     "the noise is that of a navigation-grade gyro, and the attitude varies",
     _forward,
     linear=False,
-    starts=_starts,
+    starts=starts_at(*((latitude, heading) for latitude in (-0.8, 0.8) for heading in (-3.0, -1.0, 1.0, 3.0))),
     needs=("attitude",),
 )

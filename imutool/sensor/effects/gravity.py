@@ -8,8 +8,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from imutool.recording import GRAVITY_M_S2
-from imutool.sensor.effect import Effect, Parameter, Stage, Theta, attitude_of
-from imutool.sensor.samples import IdealMotion, SensorSamples
+from imutool.sensor.effect import Effect, Parameter, Stage, Theta, attitude_of, starts_at
+from imutool.sensor.samples import IdealMotion
 
 
 def _forward(motion: IdealMotion, theta: Theta) -> IdealMotion:
@@ -18,10 +18,6 @@ def _forward(motion: IdealMotion, theta: Theta) -> IdealMotion:
     up = Rotation.from_rotvec([tilt_x, tilt_y, 0.0]).apply([0.0, 0.0, 1.0])
     more_w = (GRAVITY_M_S2 + dg) * up - np.array([0.0, 0.0, GRAVITY_M_S2])
     return replace(motion, accel=motion.accel + np.einsum("nji,j->ni", attitude_of(motion, "gravity"), more_w))
-
-
-def _starts(_motion: IdealMotion, _samples: SensorSamples) -> list[Theta]:
-    return [np.zeros(3)]
 
 
 EFFECT = Effect(
@@ -33,6 +29,6 @@ EFFECT = Effect(
     "the attitude varies (against the bias)",
     _forward,
     linear=False,
-    starts=_starts,
+    starts=starts_at([0.0, 0.0, 0.0]),
     needs=("attitude",),
 )

@@ -1,4 +1,4 @@
-"""Warm-up of the gyro: + A (1 - exp(-t/tau)), t from the log's start. Every log is taken to begin with a cold sensor."""
+"""Warm-up of the gyro: + A (1 - exp(-t/tau)), t from the log's start with a cold sensor."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def warm_up(sensor: Sensor, unit: str, plausible: float) -> Effect:
 
     def forward(samples: SensorSamples, theta: Theta) -> SensorSamples:
         added = _course(samples.stamp_s, float(theta[3]))[:, None] * theta[:3]
-        return samples.but(samples.gyro + added) if sensor == "gyro" else samples.but(accel=samples.accel + added)
+        return samples.with_added(sensor, added)
 
     def starts(motion: IdealMotion, samples: SensorSamples) -> list[Theta]:
         """Amplitudes by least squares, with a constant, for each tau."""

@@ -7,7 +7,7 @@ from imutool.sensor.samples import SensorSamples
 
 
 def _forward(samples: SensorSamples, g: Theta) -> SensorSamples:
-    return samples.but(gyro=samples.gyro + samples.accel @ g.reshape(3, 3).T)
+    return samples.with_readings(gyro=samples.gyro + samples.accel @ g.reshape(3, 3).T)
 
 
 EFFECT = Effect(

@@ -1,4 +1,7 @@
-"""Misalignment of the gyro's axes: off-diagonal 3x3 on omega. A rotation common to both sensors is a mount rotation."""
+"""Misalignment of the gyro's axes: off-diagonal 3x3 on omega.
+
+A rotation common to both sensors is a mount rotation.
+"""
 
 from __future__ import annotations
 
@@ -7,7 +10,7 @@ from imutool.sensor.samples import SensorSamples
 
 
 def _forward(samples: SensorSamples, m: Theta) -> SensorSamples:
-    return samples.but(gyro=samples.gyro + samples.gyro @ matrix(m).T)
+    return samples.with_readings(gyro=samples.gyro + samples.gyro @ matrix(m).T)
 
 
 EFFECT = Effect(

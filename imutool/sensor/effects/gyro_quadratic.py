@@ -7,7 +7,7 @@ from imutool.sensor.samples import SensorSamples
 
 
 def _forward(samples: SensorSamples, k: Theta) -> SensorSamples:
-    return samples.but(gyro=samples.gyro * (1.0 + k * samples.gyro))
+    return samples.with_readings(gyro=samples.gyro * (1.0 + k * samples.gyro))
 
 
 EFFECT = Effect(

@@ -1,4 +1,4 @@
-"""Resonance of a soft mount: the accelerometer feels the force through a spring and a damper, each axis to its own share."""
+"""Resonance of a soft mount: force through a spring and a damper, each axis to its own share."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from imutool.sensor.effect import Effect, Parameter, Stage, Theta, each_axis
-from imutool.sensor.filters import OMEGA, filtered
-from imutool.sensor.samples import IdealMotion, SensorSamples
+from imutool.sensor.effect import Effect, Parameter, Stage, Theta, each_axis, starts_at
+from imutool.sensor.effects.low_pass import OMEGA, filtered
+from imutool.sensor.samples import IdealMotion
 
 START_HZ = (4.0, 8.0, 15.0, 30.0, 50.0)
 
@@ -33,10 +33,6 @@ def _forward(motion: IdealMotion, theta: Theta) -> IdealMotion:
     return replace(motion, accel=motion.accel + share * (filtered(motion.accel, through, denominator) - motion.accel))
 
 
-def _starts(_motion: IdealMotion, _samples: SensorSamples) -> list[Theta]:
-    return [np.array([hz, 0.1, 0.5, 0.5, 0.5]) for hz in START_HZ]
-
-
 EFFECT = Effect(
     "mount_resonance",
     Stage.MOUNT,
@@ -50,5 +46,5 @@ EFFECT = Effect(
     "motion or shocks excite it",
     _forward,
     linear=False,
-    starts=_starts,
+    starts=starts_at(*([hz, 0.1, 0.5, 0.5, 0.5] for hz in START_HZ)),
 )

@@ -1,24 +1,19 @@
-"""Rotation of the mount: the sensor's axes against the body's, the same for gyro and accelerometer."""
+"""Rotation of the mount: the axes of both sensors against the body's."""
 
 from __future__ import annotations
 
 from dataclasses import replace
 
-import numpy as np
 from scipy.spatial.transform import Rotation
 
-from imutool.sensor.effect import Effect, Parameter, Stage, Theta
-from imutool.sensor.samples import IdealMotion, SensorSamples
+from imutool.sensor.effect import Effect, Parameter, Stage, Theta, starts_at
+from imutool.sensor.samples import IdealMotion
 
 
 def _forward(motion: IdealMotion, phi: Theta) -> IdealMotion:
     """R_bi = Exp(phi) takes the sensor's vectors to the body; R_wb stays the body's attitude."""
     R_bi = Rotation.from_rotvec(phi).as_matrix()
     return replace(motion, gyro=motion.gyro @ R_bi, accel=motion.accel @ R_bi, alpha=motion.alpha @ R_bi)
-
-
-def _starts(_motion: IdealMotion, _samples: SensorSamples) -> list[Theta]:
-    return [np.zeros(3)]
 
 
 EFFECT = Effect(
@@ -30,5 +25,5 @@ EFFECT = Effect(
     "two axes turn, or one turns and gravity tilts",
     _forward,
     linear=False,
-    starts=_starts,
+    starts=starts_at([0.0, 0.0, 0.0]),
 )

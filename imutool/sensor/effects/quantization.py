@@ -14,14 +14,14 @@ FINE = 1e-3  # of the smallest step is none
 
 def _forward(samples: SensorSamples, lsb: Theta) -> SensorSamples:
     gyro, accel = lsb.tolist()
-    return samples.but(
+    return samples.with_readings(
         np.rint(samples.gyro / gyro) * gyro if gyro else None,
         np.rint(samples.accel / accel) * accel if accel else None,
     )
 
 
 def _smallest_step(values: Float64[np.ndarray, "n 3"]) -> float:
-    """Between distinct values of one axis; where every axis reads one value all along, a step too small to be one."""
+    """Smallest step between distinct values of an axis; negligible where every axis is constant."""
     least = max(SAME * float(np.abs(values).max()), np.finfo(np.float64).tiny)
     steps = np.diff(np.sort(values, axis=0), axis=0)
     return float(steps[steps > least].min(initial=np.inf)) if (steps > least).any() else least

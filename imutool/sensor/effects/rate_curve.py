@@ -1,4 +1,4 @@
-"""Curve of each axis's own rate, for a gyro that no named effect describes: + c(omega) + d(omega, filtered).
+"""Curve of each axis's own rate, for unnamed gyro errors: + c(omega) + d(omega, filtered).
 
 Piecewise linear between knots that lie closer near zero, where cheap gyros have dead bands and signs; zero at zero, so that the
 rest bias stays what the sensor reads at rest. The second curve sees the rate through a filter of 0.1 s, for sensors whose
@@ -23,7 +23,7 @@ NONZERO = KNOTS_RAD_S != 0.0
 
 
 def _forward(samples: SensorSamples, theta: Theta) -> SensorSamples:
-    return samples.but(gyro=samples.gyro + _curves(samples.signals, _values(theta)))
+    return samples.with_readings(gyro=samples.gyro + _curves(samples.signals, _values(theta)))
 
 
 def _values(theta: Theta) -> Float64[np.ndarray, "2 3 k"]:
@@ -40,7 +40,7 @@ def _curves(signals: Signals, values: Float64[np.ndarray, "2 3 k"]) -> Float64[n
 
 
 def hats(x: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n q"]:
-    """The tent functions of all knots but zero, axis by axis; beyond the last knot they stay what they are there."""
+    """Tent functions of all knots but zero, axis by axis; constant beyond the last knot."""
     inside = np.clip(x, KNOTS_RAD_S[0], KNOTS_RAD_S[-1])
     j = np.clip(np.searchsorted(KNOTS_RAD_S, inside, side="right") - 1, 0, len(KNOTS_RAD_S) - 2)
     weight = (inside - KNOTS_RAD_S[j]) / (KNOTS_RAD_S[j + 1] - KNOTS_RAD_S[j])

@@ -14,14 +14,14 @@ NEVER = 100.0  # times the largest reading is not reached
 
 def _forward(samples: SensorSamples, limit: Theta) -> SensorSamples:
     gyro, accel = (None if math.isinf(most) else most for most in limit.tolist())
-    return samples.but(
+    return samples.with_readings(
         None if gyro is None else np.clip(samples.gyro, -gyro, gyro),
         None if accel is None else np.clip(samples.accel, -accel, accel),
     )
 
 
 def _starts(_motion: IdealMotion, samples: SensorSamples) -> list[Theta]:
-    """One sensor limited, the other, both: at the largest reading, which is the limit wherever one is reached."""
+    """Limits of one sensor, the other, both: the largest readings, for these are limits if reached."""
     gyro, accel = (float(np.abs(values).max()) or 1.0 for values in (samples.gyro, samples.accel))
     return [np.array(limit) for limit in ((gyro, NEVER * accel), (NEVER * gyro, accel), (gyro, accel))]
 

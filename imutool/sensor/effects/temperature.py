@@ -8,7 +8,7 @@ from imutool.sensor.samples import SensorSamples
 
 
 def _forward(samples: SensorSamples, k: Theta) -> SensorSamples:
-    """k of the gyro, then of the accelerometer; T0 is the channel's mean. With several such channels: the first by name.
+    """k of the gyro, then of the accelerometer; T0 is the mean of the first channel by name.
 
     Raises:
         DataError: no channel with a temperature in its name.
@@ -18,7 +18,7 @@ def _forward(samples: SensorSamples, k: Theta) -> SensorSamples:
         raise DataError("no temperature channel", where="temperature", expected="a channel with temperature in its name")
     T = samples.channels[names[0]]
     warmer = (T - T.mean())[:, None]
-    return samples.but(samples.gyro + warmer * k[:3], samples.accel + warmer * k[3:])
+    return samples.with_readings(samples.gyro + warmer * k[:3], samples.accel + warmer * k[3:])
 
 
 EFFECT = Effect(

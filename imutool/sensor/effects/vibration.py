@@ -30,7 +30,7 @@ def _forward(motion: IdealMotion, theta: Theta) -> IdealMotion:
 
 
 def _starts(motion: IdealMotion, samples: SensorSamples) -> list[Theta]:
-    """The lines that stand out most from the spectrum of what is read more, with their amplitudes."""
+    """Lines that stand out most from the residual's spectrum, with their amplitudes."""
     gyro, accel = residual(motion, samples)
     error, t_s = np.concatenate([accel, gyro], axis=1), samples.stamp_s
     error = error - error.mean(axis=0)
@@ -49,7 +49,7 @@ def _starts(motion: IdealMotion, samples: SensorSamples) -> list[Theta]:
 
 
 def _top(f_hz: Float64[np.ndarray, " n"], level: Float64[np.ndarray, " n"], peak: int) -> float:
-    """Of the parabola through a peak and its neighbours: a line under Hann's window is one in its logarithm, nearly."""
+    """Top of the parabola through a peak and its neighbours, as Hann's window nearly has in its logarithm."""
     before, at, after = level[peak - 1 : peak + 2]
     bend = before - 2.0 * at + after
     return float(f_hz[peak] + (0.5 * (before - after) / bend if bend else 0.0) * f_hz[1])

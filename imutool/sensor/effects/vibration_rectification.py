@@ -1,4 +1,4 @@
-"""Rectified vibration: + K v², v² the power of the specific force above 1.6 Hz, over half a second.
+"""Rectified vibration: + K v², v² the specific force's power above 1.6 Hz over half a second.
 
 Known of accelerometers as vibration rectification error and of gyros as g²-sensitivity (IEEE 1293, 952): a sensor that reads
 one bias on the ground and another with its motors running.
@@ -13,7 +13,7 @@ from imutool.sensor.samples import SensorSamples
 def _forward(samples: SensorSamples, k: Theta) -> SensorSamples:
     """K of the gyro, then of the accelerometer."""
     power = samples.signals.vibration
-    return samples.but(samples.gyro + power @ k[:9].reshape(3, 3).T, samples.accel + power @ k[9:].reshape(3, 3).T)
+    return samples.with_readings(samples.gyro + power @ k[:9].reshape(3, 3).T, samples.accel + power @ k[9:].reshape(3, 3).T)
 
 
 EFFECT = Effect(

@@ -1,4 +1,4 @@
-"""A picture of Allan deviations on paper, with the slopes that were read off them."""
+"""Plot of Allan deviations with the fitted noise terms, as a PNG."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ import numpy as np
 
 from imutool.mcap_io.storage.target import Target
 from imutool.noise import allan
-from imutool.noise_identification import SENSORS, Identified, Sensor, Sight
+from imutool.noise_identification import SENSORS, CurveSource, IdentifiedNoise, Sensor
 from imutool.units import AXES, UNITS
-from imutool.viewing.html.drawing import Panel, Picture, legend, plain_numbers
+from imutool.viewing.html.drawing import Panel, Picture, legend, plain_tick_labels
 from imutool.viewing.html.drawing import png as drawn
-from imutool.viewing.html.theme import AXIS_COLORS, SOFT, TITLES
+from imutool.viewing.html.page import AXIS_COLORS, SOFT, TITLES
 
 LINES = {
     "quantisation": (0, (1, 3)),
@@ -26,10 +26,10 @@ LINES = {
 HEIGHT_INCH = 3.8
 
 
-def deviations(found: Identified, path: Path, *, overwrite: bool = False) -> None:
-    """Writes a PNG: the deviation of each axis as points, the fitted sum as a line, each slope seen as its own.
+def write_png(found: IdentifiedNoise, path: Path, *, overwrite: bool = False) -> None:
+    """Write a PNG of the Allan deviation of each axis, the fitted sum and each noise term.
 
-    Above what was seen at rest, below what was left in motion; only one of them where there is only one.
+    Above from rest, below from the residual in motion, where the log has them.
 
     Raises:
         ConfigError: matplotlib is not installed, or the file exists or cannot be written.
@@ -38,8 +38,8 @@ def deviations(found: Identified, path: Path, *, overwrite: bool = False) -> Non
         target.write(png(found))
 
 
-def png(found: Identified) -> bytes:
-    """The picture of `deviations` as the content of a file.
+def png(found: IdentifiedNoise) -> bytes:
+    """Content of the PNG file of `write_png`.
 
     Raises:
         ConfigError: matplotlib is not installed.
@@ -53,7 +53,7 @@ def png(found: Identified) -> bytes:
     return drawn(Picture("allan", "Allan deviation", "", tuple(panels)), f"{found.log} {found.topic}")
 
 
-def _draw(figure: Any, *, sight: Sight, sensor: Sensor) -> None:
+def _draw(figure: Any, *, sight: CurveSource, sensor: Sensor) -> None:
     axes = figure.subplots()
     curve = sight.curves[sensor]
     for axis, (slopes, color) in enumerate(zip(sight.slopes[sensor], AXIS_COLORS, strict=True)):
@@ -73,7 +73,7 @@ def _draw(figure: Any, *, sight: Sight, sensor: Sensor) -> None:
     axes.set_title(f"{TITLES[sensor]}: {sight.how}".replace(", ", ",\n"), fontsize=9)
     axes.set_xlabel("averaging time (s)")
     axes.set_ylabel(f"Allan deviation ({UNITS[sensor]})")
-    plain_numbers(axes.xaxis, axes.yaxis)
+    plain_tick_labels(axes.xaxis, axes.yaxis)
     named = sorted({name for slopes in sight.slopes[sensor] for name in slopes.seen}, key=list(LINES).index)
     for name in named:
         axes.plot([], [], color=SOFT, lw=0.9, ls=LINES[name], label=name)

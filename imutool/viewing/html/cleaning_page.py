@@ -1,4 +1,4 @@
-"""One page about what is wrong inside a log: a verdict for each IMU, its findings, and where in the log they lie."""
+"""HTML page of a cleaning survey: verdict, findings and their times in the log, per IMU."""
 
 from __future__ import annotations
 
@@ -12,17 +12,17 @@ from imutool.mcap_io.storage.target import Target
 from imutool.viewing.html.page import document, text
 
 VERDICTS = {
-    "good": "nothing is wrong with it",
-    "usable": "it can be used; what is no measurement is left out of the clean channel, the rest is said below",
-    "quarantine": "it cannot be trusted, and is left alone",
+    "good": "no faults",
+    "usable": "usable; the clean channel leaves out invalid samples, as listed below",
+    "quarantine": "not trustworthy; it is not cleaned",
 }
 COLORS = {"note": "var(--held)", "warning": "var(--mark)", "error": "var(--before)"}
 STRIP = "display: block; width: 100%; min-width: 300px; height: 14px; background: var(--panel)"
-LEAST_SHARE = 0.002  # of the strip's width, so that one sample in an hour is seen
+MIN_WIDTH = 0.002  # of the strip, so that one sample in an hour is visible
 
 
 def write(surveys: Sequence[Survey], path: Path, *, overwrite: bool = False) -> None:
-    """Writes the page: one file without any request to elsewhere; everything that comes from the log is escaped.
+    """Write the page as one file; text from the log is escaped, and no request leaves the page.
 
     Raises:
         ConfigError: the file exists (without `overwrite`) or cannot be written.
@@ -32,9 +32,9 @@ def write(surveys: Sequence[Survey], path: Path, *, overwrite: bool = False) -> 
 
 
 def html(surveys: Sequence[Survey]) -> str:
-    """The page of `write` as text."""
-    logs = ", ".join(sorted({Path(one.log).name for one in surveys}))
-    return document(logs, [f"<h1>{text(logs)}</h1>", *(line for one in surveys for line in _imu(one))])
+    """Text of the page of `write`."""
+    logs = ", ".join(sorted({Path(survey.log).name for survey in surveys}))
+    return document(logs, [f"<h1>{text(logs)}</h1>", *(line for survey in surveys for line in _imu(survey))])
 
 
 def _imu(survey: Survey) -> Iterator[str]:
@@ -42,9 +42,11 @@ def _imu(survey: Survey) -> Iterator[str]:
     yield f'<p class="conclusion">{text(_sentence(survey))}</p>'
     yield from (f"<p>{text(reason)}</p>" for reason in survey.reasons)
     if survey.findings:
-        head = "".join(f"<th>{one}</th>" for one in ("Rule", "Count", "What was found", "Done", "Sure", "Where in the log"))
+        head = "".join(
+            f"<th>{title}</th>" for title in ("Rule", "Count", "What was found", "Action", "Confidence", "Where in the log")
+        )
         yield f'<div class="scroll"><table><thead><tr>{head}</tr></thead><tbody>'
-        yield from (_row(one, survey) for one in survey.findings)
+        yield from (_row(finding, survey) for finding in survey.findings)
         yield "</tbody></table></div>"
 
 
@@ -60,30 +62,30 @@ def _sentence(survey: Survey) -> str:
 
 
 def _row(finding: Finding, survey: Survey) -> str:
-    values = f'<div class="note">{text(_told(finding.values))}</div>' if finding.values else ""
-    short = [text(finding.rule), str(finding.count), finding.action, f"{finding.sure:.2f}"]
+    values = f'<div class="note">{text(_as_text(finding.values))}</div>' if finding.values else ""
+    short = [text(finding.rule), str(finding.count), finding.action, f"{finding.confidence:.2f}"]
     rule, count, action, sure = (f'<td class="number">{cell}</td>' for cell in short)
     return f"<tr>{rule}{count}<td>{text(finding.what)}{values}</td>{action}{sure}<td>{_strip(finding, survey)}</td></tr>"
 
 
-def _told(value: Any) -> str:
-    """Values as words, numbers to five digits."""
+def _as_text(value: Any) -> str:
+    """Values as text, numbers to five digits."""
     if isinstance(value, dict):
-        return ", ".join(f"{name.replace('_', ' ')} {_told(inner)}" for name, inner in value.items())
+        return ", ".join(f"{name.replace('_', ' ')} {_as_text(inner)}" for name, inner in value.items())
     if isinstance(value, list | tuple):
-        return ", ".join(map(_told, value))
+        return ", ".join(map(_as_text, value))
     return f"{value:.5g}" if isinstance(value, float) else str(value)
 
 
 def _strip(finding: Finding, survey: Survey) -> str:
-    """The log from its first sample to its last, and the finding's intervals in it."""
+    """Intervals of a finding, drawn along the log."""
     length = max(survey.end_ns - survey.start_ns, 1)
     if not finding.intervals_ns:
         return "whole log"
     marks = []
     for first, last in finding.intervals_ns:
-        at = min(max((first - survey.start_ns) / length, 0.0), 1.0 - LEAST_SHARE)
-        width = min(max((last - first) / length, LEAST_SHARE), 1.0 - at)
+        at = min(max((first - survey.start_ns) / length, 0.0), 1.0 - MIN_WIDTH)
+        width = min(max((last - first) / length, MIN_WIDTH), 1.0 - at)
         marks.append(f'<rect x="{1000 * at:.2f}" width="{1000 * width:.2f}" height="14" fill="{COLORS[finding.severity]}"/>')
     more = f'<div class="note">and {finding.intervals_left_out} more</div>' if finding.intervals_left_out else ""
     return f'<svg viewBox="0 0 1000 14" preserveAspectRatio="none" style="{STRIP}">{"".join(marks)}</svg>{more}'

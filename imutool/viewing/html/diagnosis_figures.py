@@ -1,6 +1,6 @@
-"""Figures of a diagnosis as inline SVG: where the misfit lies, and how it looks before and after, all on unseen time if any.
+"""Figures of a diagnosis as inline SVG: location of the misfit, residuals, spectra, trends.
 
-Colours are left to the page: each stands for a variable of its style sheet, so that one drawing serves light, dark and print.
+Colours are variables of the page's style sheet, so that one drawing serves light, dark and print.
 """
 
 from __future__ import annotations
@@ -15,25 +15,33 @@ from scipy.spatial.transform import Rotation
 
 from imutool.diagnosis.estimation.whitening import Band
 from imutool.diagnosis.result import Curve, Diagnosis, Located, SignalTraces, Traces
-from imutool.diagnosis.wording import signals
+from imutool.diagnosis.wording.effect_sentences import signals
 from imutool.units import AXES, UNITS
-from imutool.viewing.html.drawing import Line, Thin, averaged, extremes, plain_numbers, spans, svg
-from imutool.viewing.html.theme import AFTER, BEFORE, HELD, INK, MARK, TITLES
+from imutool.viewing.html.drawing import (
+    DecimatedLine,
+    Line,
+    average_log_bins,
+    decimate_extremes,
+    plain_tick_labels,
+    svg,
+    true_intervals,
+)
+from imutool.viewing.html.page import AFTER, BEFORE, HELD, INK, MARK, TITLES
 
 SIGNALS = {"gyro": slice(0, 3), "accel": slice(3, 6)}
 
-BUCKETS = 600  # a column of the page each: its lowest and its highest sample are drawn
+BUCKETS = 600  # of a line; each draws its lowest and its highest sample
 STRIP_BINS = 400
-WELCH_S = 8.0  # the longest window; shorter where unseen stretches are
-FEWEST = 32  # samples in a window, below which there is no spectrum
+WELCH_S = 8.0  # longest window; shorter for short unseen stretches
+MIN_SAMPLES = 32  # samples in a window, below which there is no spectrum
 BINS = 16
 LEAST_BLOCKS = 3  # in a bin
-BLOCK_S = 0.5  # one independent value each: misfits of a motion last about so long
-GAP = 1.5  # periods without a sample that end a stretch
+BLOCK_S = 0.5  # one independent value each: the misfit of a motion lasts about this long
+GAP_PERIODS = 1.5  # sample periods without a sample that end a stretch
 
 
-def where(d: Diagnosis, trace: Traces) -> str:
-    """The misfit of each axis along one log as a strip of its height, located stretches shaded, unseen time below."""
+def misfit_strip(d: Diagnosis, trace: Traces) -> str:
+    """Local misfit of each axis along one log, with located intervals and unseen time."""
 
     def draw(figure: Any) -> None:
         axes = figure.subplots()
@@ -46,11 +54,11 @@ def where(d: Diagnosis, trace: Traces) -> str:
             if top > 0.0:
                 area = np.nan_to_num(heights[:, row]) / top * 0.9
                 axes.fill_between(edges[:-1], -row, -row + area, step="post", color=INK, alpha=0.55, lw=0)
-            for place in d.located:
-                if axis in place.axes and signal in signals(place.signal):
-                    for first, last in located_in(trace, place):
+            for located in d.located:
+                if axis in located.axes and signal in signals(located.signal):
+                    for first, last in intervals_in_log(trace, located):
                         axes.fill_between([first, last], -row, -row + 0.94, color=MARK, alpha=0.3, lw=0)
-        for first, last in spans(trace.t_s, trace.held_out):
+        for first, last in true_intervals(trace.t_s, trace.held_out):
             axes.fill_between([first, last], -6.0, -5.3, color=HELD, alpha=0.5, lw=0)
         axes.set_yticks([0.45 - row for row in range(7)], [*names, "unseen"])
         axes.set(xlim=(trace.t_s[0], trace.t_s[-1]), ylim=(-6.1, 1.0), xlabel="time (s)")
@@ -61,16 +69,16 @@ def where(d: Diagnosis, trace: Traces) -> str:
 
 
 def residual(trace: Traces, *, found: bool) -> str:
-    """Real minus expected of one log over time, per axis, before and (if anything was `found`) after; unseen time shaded."""
+    """Residual of one log over time by axis, before and after; unseen time is shaded."""
 
     def draw(figure: Any) -> None:
         panels = figure.subplots(3, 2, sharex=True, sharey="col")
         for column, (signal, part) in enumerate(SIGNALS.items()):
             for row, axes in enumerate(panels[:, column]):
                 for expected, color in _sides(trace, found):
-                    left = known(trace, expected)[:, part][:, row]
-                    axes.plot(*extremes(trace.t_s, left, BUCKETS), color=color, lw=0.6)
-                for first, last in spans(trace.t_s, trace.held_out):
+                    left = residual_in_band(trace, expected)[:, part][:, row]
+                    axes.plot(*decimate_extremes(trace.t_s, left, BUCKETS), color=color, lw=0.6)
+                for first, last in true_intervals(trace.t_s, trace.held_out):
                     axes.axvspan(first, last, color=HELD, alpha=0.15, lw=0)
                 axes.set_ylabel(f"{AXES[row]} ({UNITS[signal]})")
             panels[0, column].set_title(f"{TITLES[signal]}: real minus expected")
@@ -79,27 +87,27 @@ def residual(trace: Traces, *, found: bool) -> str:
     return svg(draw, 4.4, "residual")
 
 
-def signal(beside: SignalTraces, *, found: bool) -> str:
-    """Another signal as it was recorded and expected, and real minus expected before and (if `found`) after, over time."""
+def scalar_signal(traces: SignalTraces, *, found: bool) -> str:
+    """Another signal over time: recorded, expected, and its residual before and after."""
 
     def draw(figure: Any) -> None:
         above, below = figure.subplots(2, 1, sharex=True)
-        above.plot(*extremes(beside.t_s, beside.real, BUCKETS), color=INK, lw=0.9)
-        for expected, color in [(beside.before, BEFORE), (beside.after, AFTER)][: 1 + found]:
-            above.plot(*extremes(beside.t_s, expected, BUCKETS), color=color, lw=0.8)
-            below.plot(*extremes(beside.t_s, beside.real - expected, BUCKETS), color=color, lw=0.6)
+        above.plot(*decimate_extremes(traces.t_s, traces.real, BUCKETS), color=INK, lw=0.9)
+        for expected, color in [(traces.before, BEFORE), (traces.after, AFTER)][: 1 + found]:
+            above.plot(*decimate_extremes(traces.t_s, expected, BUCKETS), color=color, lw=0.8)
+            below.plot(*decimate_extremes(traces.t_s, traces.real - expected, BUCKETS), color=color, lw=0.6)
         for axes, title in ((above, "Recorded (ink) and expected"), (below, "Real minus expected")):
-            for first, last in spans(beside.t_s, beside.held_out):
+            for first, last in true_intervals(traces.t_s, traces.held_out):
                 axes.axvspan(first, last, color=HELD, alpha=0.15, lw=0)
             axes.set_title(title)
-            axes.set_ylabel(f"({beside.unit})" if beside.unit else "value")
-        below.set(xlabel="time (s)", xlim=(beside.t_s[0], beside.t_s[-1]))
+            axes.set_ylabel(f"({traces.unit})" if traces.unit else "value")
+        below.set(xlabel="time (s)", xlim=(traces.t_s[0], traces.t_s[-1]))
 
     return svg(draw, 3.6, "signal")
 
 
 def spectrum(d: Diagnosis) -> str | None:
-    """Welch's estimate of the residual's amplitude density (root mean square over axes and logs); nothing if too short."""
+    """Amplitude density of the residual by Welch's method; None if too short."""
     density = {signal: [_density(d.traces, part, after) for after in (False, True)] for signal, part in SIGNALS.items()}
     if any(found is None for both in density.values() for found in both):
         return None
@@ -107,12 +115,12 @@ def spectrum(d: Diagnosis) -> str | None:
     def draw(figure: Any) -> None:
         for axes, (signal, both) in zip(figure.subplots(1, 2), density.items(), strict=True):
             for found, color in list(zip(both, (BEFORE, AFTER), strict=True))[: 1 + bool(d.findings)]:
-                assert found is not None, "looked at above"
+                assert found is not None, "checked above"
                 axes.loglog(found[0], found[1], color=color, lw=1.1)
             if signal in d.unexplained:
                 floor = d.unexplained[signal].noise_floor * np.sqrt(2.0 / rate_hz(d.traces[0]))
                 axes.axhline(floor, color=INK, lw=1.0, ls=(0, (4, 3)))
-            plain_numbers(axes.xaxis, axes.yaxis)
+            plain_tick_labels(axes.xaxis, axes.yaxis)
             low, high = axes.get_ylim()
             axes.set_ylim(10.0 ** np.floor(np.log10(low)), 10.0 ** np.ceil(np.log10(high)))  # whole decades have labels
             axes.set(xlabel="frequency (Hz)", ylabel=f"density ({UNITS[signal]}/√Hz)", title=TITLES[signal])
@@ -120,8 +128,8 @@ def spectrum(d: Diagnosis) -> str | None:
     return svg(draw, 2.9, "spectrum")
 
 
-def against_rate(d: Diagnosis) -> str | None:
-    """Mean residual in bins of turning rate: the gyro's against that about the same axis, the accel's against its size."""
+def residual_against_rate(d: Diagnosis) -> str | None:
+    """Mean residual in bins of turning rate: gyro about its own axis, accel by the total rate."""
 
     def variable(trace: Traces, signal: str, axis: int) -> Line:
         rate: Line = trace.before[:, axis] if signal == "gyro" else np.linalg.norm(trace.before[:, :3], axis=1)
@@ -131,11 +139,11 @@ def against_rate(d: Diagnosis) -> str | None:
     return _binned(d, variable, names, "rate")
 
 
-def against_attitude(d: Diagnosis) -> str | None:
-    """Mean residual in bins of how far its axis rises above the horizon; nothing where no attitude is known."""
+def residual_against_attitude(d: Diagnosis) -> str | None:
+    """Mean residual in bins of an axis's elevation above the horizon; None without attitude."""
 
     def variable(trace: Traces, signal: str, axis: int) -> Line:
-        assert trace.truth is not None, "looked at before"
+        assert trace.truth is not None, "checked by the caller"
         up_b = Rotation.from_quat(trace.truth.q_wb_wxyz, scalar_first=True).apply([0.0, 0.0, 1.0], inverse=True)
         rise: Line = np.degrees(np.arcsin(np.clip(up_b[:, axis], -1.0, 1.0)))
         return rise
@@ -146,14 +154,15 @@ def against_attitude(d: Diagnosis) -> str | None:
 
 
 def curve(found: Curve, signal: str) -> str:
-    """A misfit without a name as a curve of one variable with its band, a panel for each axis that has one."""
+    """Curve of a finding without a name over its variable, one panel per axis, with its band."""
+    all_y, all_bands = np.array(found.y), np.array(found.band)
 
     def draw(figure: Any) -> None:
-        count = found.y.shape[1]
-        told = [k for k in range(count) if found.y[:, k].any() or found.band[:, k].any()]  # the others have no part in it
-        panels = figure.subplots(1, max(len(told), 1), squeeze=False, sharey=True)[0]
-        for k, axes in zip(told, panels, strict=False):
-            y, band = found.y[:, k], found.band[:, k]
+        count = all_y.shape[1]
+        drawn = [k for k in range(count) if all_y[:, k].any() or all_bands[:, k].any()]
+        panels = figure.subplots(1, max(len(drawn), 1), squeeze=False, sharey=True)[0]
+        for k, axes in zip(drawn, panels, strict=False):
+            y, band = all_y[:, k], all_bands[:, k]
             axes.fill_between(found.x, y - band, y + band, color=AFTER, alpha=0.3, lw=0)
             axes.plot(found.x, y, color=AFTER, lw=1.4)
             axes.axhline(0.0, color=INK, lw=0.6)
@@ -165,18 +174,18 @@ def curve(found: Curve, signal: str) -> str:
     return svg(draw, 2.6, "curve")
 
 
-def located_in(trace: Traces, place: Located) -> Iterator[tuple[float, float]]:
-    """What of a place lies in a stretch of a log; a place of no log in particular is on the clock of all."""
-    if place.log not in ("", trace.path):
+def intervals_in_log(trace: Traces, located: Located) -> Iterator[tuple[float, float]]:
+    """Intervals of a located misfit within a log; without a log's name they hold for all logs."""
+    if located.log not in ("", trace.path):
         return
-    for first, last in place.intervals_s:
+    for first, last in located.intervals_s:
         low, high = max(first, float(trace.t_s[0])), min(last, float(trace.t_s[-1]))
         if low < high:
             yield low, high
 
 
-def known(trace: Traces, expected: Float64[np.ndarray, "n 6"]) -> Float64[np.ndarray, "n 6"]:
-    """Real minus expected, without what is faster than the expected is known."""
+def residual_in_band(trace: Traces, expected: Float64[np.ndarray, "n 6"]) -> Float64[np.ndarray, "n 6"]:
+    """Residual below the frequency up to which the expected signal is known."""
     left: Float64[np.ndarray, "n 6"] = trace.real - expected
     if trace.band_hz is None:
         return np.asarray(left)
@@ -184,13 +193,13 @@ def known(trace: Traces, expected: Float64[np.ndarray, "n 6"]) -> Float64[np.nda
     return np.asarray(fftconvolve(left, taps[:, None], mode="same", axes=0))
 
 
-def unseen(trace: Traces) -> Bool[np.ndarray, " n"]:
-    """Samples that no fit has seen; all of them where none was held out."""
+def held_out_mask(trace: Traces) -> Bool[np.ndarray, " n"]:
+    """Mask of the samples that no fit has seen; all samples where none was held out."""
     return trace.held_out if trace.held_out.any() else np.ones_like(trace.held_out)
 
 
 def rate_hz(trace: Traces) -> float:
-    """Samples a second, by the median step."""
+    """Sample rate by the median step."""
     return 1.0 / float(np.median(np.diff(trace.t_s)))
 
 
@@ -199,23 +208,23 @@ def _sides(trace: Traces, found: bool) -> list[tuple[Float64[np.ndarray, "n 6"],
 
 
 def _local_rms(trace: Traces, edges: Line) -> Float64[np.ndarray, "bins 6"]:
-    """Root mean square of the misfit before, a row each between edges; NaN where there is no sample."""
-    squares = known(trace, trace.before) ** 2
-    there = np.isfinite(squares)
+    """Root mean square of the misfit before between edges; NaN without samples."""
+    squares = residual_in_band(trace, trace.before) ** 2
+    finite = np.isfinite(squares)
     bins = np.clip(np.searchsorted(edges, trace.t_s, side="right") - 1, 0, len(edges) - 2)
     sums, counts = np.zeros((2, len(edges) - 1, 6))
-    np.add.at(sums, bins, np.where(there, squares, 0.0))
-    np.add.at(counts, bins, there)
+    np.add.at(sums, bins, np.where(finite, squares, 0.0))
+    np.add.at(counts, bins, finite)
     out: Float64[np.ndarray, "bins 6"] = np.sqrt(np.where(counts > 0, sums, np.nan) / np.maximum(counts, 1))
     return out
 
 
 def _density(traces: Sequence[Traces], part: slice, after: bool) -> tuple[Line, Line] | None:
-    """Frequencies and amplitude density over the unseen stretches of all logs, each as long as its windows count."""
+    """Frequencies and amplitude density over the unseen stretches of all logs, weighted by their length."""
     pieces = [(rate_hz(trace), piece) for trace in traces for piece in _stretches(trace, part, after)]
     longest_s = max((len(piece) / rate for rate, piece in pieces), default=0.0)
     window_s = min(WELCH_S, 2.0 ** np.floor(np.log2(max(longest_s, 1e-9))))
-    pieces = [(rate, piece) for rate, piece in pieces if len(piece) >= max(round(window_s * rate), FEWEST)]
+    pieces = [(rate, piece) for rate, piece in pieces if len(piece) >= max(round(window_s * rate), MIN_SAMPLES)]
     if not pieces:
         return None
     highest = min(rate for rate, _ in pieces) / 2.0
@@ -225,23 +234,22 @@ def _density(traces: Sequence[Traces], part: slice, after: bool) -> tuple[Line, 
         at, power = welch(piece, fs=rate, nperseg=round(window_s * rate), axis=0)
         total += len(piece) * np.interp(frequency, at, power.mean(axis=1))
         weight += len(piece)
-    at, density = averaged(frequency, total / weight, 1.0 / window_s)
+    at, density = average_log_bins(frequency, total / weight, 1.0 / window_s)
     return at, np.sqrt(density)
 
 
 def _stretches(trace: Traces, part: slice, after: bool) -> Iterator[Float64[np.ndarray, "m 3"]]:
-    """The residual over unseen time, cut where samples are missing."""
+    """Residual over unseen time, split where samples are missing."""
     left = (trace.real - (trace.after if after else trace.before))[:, part]
-    good = unseen(trace) & np.isfinite(left).all(axis=1)
-    rows = np.flatnonzero(good)
-    steps = np.diff(trace.t_s[rows]) > GAP / rate_hz(trace)
+    rows = np.flatnonzero(held_out_mask(trace) & np.isfinite(left).all(axis=1))
+    steps = np.diff(trace.t_s[rows]) > GAP_PERIODS / rate_hz(trace)
     for piece in np.split(rows, np.flatnonzero(steps) + 1):
-        if len(piece) >= FEWEST:
+        if len(piece) >= MIN_SAMPLES:
             yield left[piece]
 
 
 def _binned(d: Diagnosis, variable: Callable[[Traces, str, int], Line], names: dict[str, str], name: str) -> str | None:
-    """A panel for each signal and axis: means in bins of a variable over all logs, before and after."""
+    """Means in bins of a variable over all logs, before and after, one panel per signal and axis."""
     if not d.traces:
         return None
 
@@ -249,11 +257,11 @@ def _binned(d: Diagnosis, variable: Callable[[Traces, str, int], Line], names: d
         panels = figure.subplots(2, 3, sharey="row")
         for row, (signal, part) in enumerate(SIGNALS.items()):
             for axis, axes in enumerate(panels[row]):
-                x = np.concatenate([variable(trace, signal, axis)[unseen(trace)] for trace in d.traces])
-                blocks = np.concatenate([_blocks(trace, k)[unseen(trace)] for k, trace in enumerate(d.traces)])
+                x = np.concatenate([variable(trace, signal, axis)[held_out_mask(trace)] for trace in d.traces])
+                blocks = np.concatenate([_blocks(trace, k)[held_out_mask(trace)] for k, trace in enumerate(d.traces)])
                 for side, color in enumerate((BEFORE, AFTER)[: 1 + bool(d.findings)]):
-                    left = [known(trace, trace.after if side else trace.before) for trace in d.traces]
-                    y = np.concatenate([one[unseen(t), part][:, axis] for one, t in zip(left, d.traces, strict=True)])
+                    left = [residual_in_band(trace, trace.after if side else trace.before) for trace in d.traces]
+                    y = np.concatenate([one[held_out_mask(t), part][:, axis] for one, t in zip(left, d.traces, strict=True)])
                     centre, mean, band = means(x, y, blocks)
                     axes.fill_between(centre, mean - band, mean + band, color=color, alpha=0.25, lw=0)
                     axes.plot(centre, mean, color=color, lw=1.2, marker="o", ms=2.5)
@@ -266,8 +274,8 @@ def _binned(d: Diagnosis, variable: Callable[[Traces, str, int], Line], names: d
     return svg(draw, 4.2, name)
 
 
-def means(x: Line, y: Line, blocks: Float64[np.ndarray, " n"]) -> tuple[Thin, Thin, Thin]:
-    """Centres of even bins, the mean in each, and two standard errors, one independent value a block of time."""
+def means(x: Line, y: Line, blocks: Float64[np.ndarray, " n"]) -> tuple[DecimatedLine, DecimatedLine, DecimatedLine]:
+    """Bin centres, means and two standard errors, with one independent value per block of time."""
     good = np.isfinite(x) & np.isfinite(y)
     x, y, blocks = x[good], y[good], blocks[good]
     if not len(x):
@@ -287,6 +295,5 @@ def means(x: Line, y: Line, blocks: Float64[np.ndarray, " n"]) -> tuple[Thin, Th
 
 
 def _blocks(trace: Traces, log: int) -> Float64[np.ndarray, " n"]:
-    """A number of its own for each block of time of each log."""
-    block: Float64[np.ndarray, " n"] = np.floor((trace.t_s - trace.t_s[0]) / BLOCK_S) + 1e6 * log
-    return block
+    """Block number of each sample, different for each log."""
+    return np.asarray(np.floor((trace.t_s - trace.t_s[0]) / BLOCK_S) + 1e6 * log)

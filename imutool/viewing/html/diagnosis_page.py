@@ -1,4 +1,4 @@
-"""One page about a diagnosis that a person reads in a minute: the conclusion, what was found, where, before and after."""
+"""HTML page of a diagnosis: conclusion, findings, locations, figures before and after."""
 
 from __future__ import annotations
 
@@ -7,40 +7,38 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from imutool import __version__
-from imutool.diagnosis.quantity import SHOWN, each, grouped, percent, symbol
 from imutool.diagnosis.result import SCHEMA, Diagnosis, Finding, Traces
-from imutool.diagnosis.wording import (
-    answer,
-    before_after,
-    besides,
-    by_chance,
-    came_closer,
-    cannot_show,
-    does,
-    measured,
-    name,
-    remains,
-    unseen,
-    where,
-    with_all,
+from imutool.diagnosis.wording.conclusion import (
+    chance_text,
+    gain_source,
+    gain_text,
+    headline,
+    held_out_time,
+    improvement,
+    location_text,
+    notes,
+    residual_text,
+    unobservable,
 )
+from imutool.diagnosis.wording.effect_sentences import effect_sentence, has_gain, label
+from imutool.diagnosis.wording.quantity import SHOWN, each, grouped, percent, symbol
 from imutool.mcap_io.storage.target import Target
 from imutool.units import ASCII_UNITS
 from imutool.viewing.html import diagnosis_figures as figures
 from imutool.viewing.html import diagnosis_paths
-from imutool.viewing.html.drawing import apart
+from imutool.viewing.html.drawing import prefix_ids
 from imutool.viewing.html.page import document, text
 
 BAR_PIXELS = 80.0
-MOST_LOGS = 4  # that are drawn one by one; what is pooled takes all
+MAX_LOGS = 4  # with figures of their own; pooled figures use all logs
 BEFORE = '<span class="key" style="background: var(--before)"></span>before'
-AFTER = '<span class="key" style="background: var(--after)"></span>with what was found'
+AFTER = '<span class="key" style="background: var(--after)"></span>with the findings'
 DIFFERENCE = '<span class="key" style="background: var(--before)"></span>real minus expected'
-HELD = '<span class="key" style="background: var(--held); opacity: 0.5"></span>time that no fit has seen'
+HELD = '<span class="key" style="background: var(--held); opacity: 0.5"></span>time unseen by any fit'
 
 
 def write(d: Diagnosis, path: Path, *, logs: str | None = None, overwrite: bool = False) -> None:
-    """Writes the page: one file without any request to elsewhere, for light and dark screens and for paper.
+    """Write the page as one file from which no request leaves, for screens and paper.
 
     Raises:
         ConfigError: matplotlib is not installed, or the file exists (without `overwrite`) or cannot be written.
@@ -50,12 +48,12 @@ def write(d: Diagnosis, path: Path, *, logs: str | None = None, overwrite: bool 
 
 
 def html(d: Diagnosis, *, logs: str | None = None) -> str:
-    """The page of `write` as text; `logs` is the name of a page about the logs themselves, in the same folder.
+    """Text of the page of `write`; `logs` names a page about the logs in the same folder.
 
     Raises:
         ConfigError: matplotlib is not installed.
     """
-    names = ", ".join(Path(one).name for one in d.real)
+    names = ", ".join(Path(real).name for real in d.real)
     against = (
         f"against {Path(d.sim).name}"
         if d.sim is not None
@@ -63,12 +61,12 @@ def html(d: Diagnosis, *, logs: str | None = None) -> str:
     )
     body = [
         f"<h1>{text(names)} {text(against)}</h1>",
-        f'<p class="conclusion">{text(" ".join(answer(d)))}</p>',
-        *(f'<p class="note">{text(one)}</p>' for one in besides(d)),
-        *(f'<p class="note">{text(one)}</p>' for one in d.remarks),
+        f'<p class="conclusion">{text(" ".join(headline(d)))}</p>',
+        *(f'<p class="note">{text(line)}</p>' for line in notes(d)),
+        *(f'<p class="note">{text(line)}</p>' for line in d.remarks),
         *([f'<p><a href="{text(logs)}">The recordings themselves</a>: signals, spectra, events.</p>'] if logs else []),
         *_findings(d),
-        *_places(d),
+        *_locations(d),
         *_before_and_after(d),
         *_curves(d),
         *_left(d),
@@ -80,39 +78,40 @@ def html(d: Diagnosis, *, logs: str | None = None) -> str:
 def _findings(d: Diagnosis) -> Iterator[str]:
     if not d.findings:
         return
-    head = "".join(f"<th>{one}</th>" for one in ("What", "Equation", "Removes", "By chance"))
-    yield "<h2>What was left out</h2>"
+    head = "".join(f"<th>{title}</th>" for title in ("Effect", "Equation", "Removes", "By chance"))
+    yield "<h2>Unmodelled effects</h2>"
     yield f'<div class="scroll"><table class="findings"><thead><tr>{head}</tr></thead><tbody>'
-    for one in d.findings:
+    for finding in d.findings:
         cells = [
-            f"<strong>{text(name(one))}</strong> {text(one.signal)}<br>{text(does(d, one))}{_similar(one)}",
-            f"<code>{text(one.equation)}</code>{_entries(one)}",
-            _gain(one),
-            f"<span class=entry>{text(by_chance(one.false_discovery_rate, short=True))}</span>",
+            f"<strong>{text(label(finding))}</strong> {text(finding.signal)}"
+            f"<br>{text(effect_sentence(d, finding))}{_similar(finding)}",
+            f"<code>{text(finding.equation)}</code>{_entries(finding)}",
+            _gain(finding),
+            f"<span class=entry>{text(chance_text(finding.false_discovery_rate, short=True))}</span>",
         ]
         yield f"<tr>{''.join(f'<td>{cell}</td>' for cell in cells)}</tr>"
     yield "</tbody></table></div>"
 
 
-def _gain(one: Finding) -> str:
-    """The share of the misfit as a number and a bar, and the root mean squares behind it."""
-    if not measured(one):
+def _gain(finding: Finding) -> str:
+    """Share of the misfit as a number and a bar, with the root mean squares."""
+    if not has_gain(finding):
         return "–"
-    width = 0 if math.isnan(one.share) else round(BAR_PIXELS * min(max(one.share, 0.0), 1.0))
-    unseen = text(before_after(one.held_out).removesuffix(" of unseen data"))
-    return f'{percent(one.share)}<span class="bar" style="width: {width}px"></span><br>{unseen}'
+    width = 0 if math.isnan(finding.share) else round(BAR_PIXELS * min(max(finding.share, 0.0), 1.0))
+    unseen = text(gain_text(finding.held_out).removesuffix(" of unseen data"))
+    return f'{percent(finding.share)}<span class="bar" style="width: {width}px"></span><br>{unseen}'
 
 
-def _similar(one: Finding) -> str:
-    return f"<br>could as well be {text(' or '.join(one.similar))}" if one.similar else ""
+def _similar(finding: Finding) -> str:
+    return f"<br>could as well be {text(' or '.join(finding.similar))}" if finding.similar else ""
 
 
-def _entries(one: Finding) -> str:
-    """All entries of a matrix, of which the sentence tells the clearest; a curve is drawn instead."""
-    if one.curve is not None:
-        return f"<br>a curve of {text(one.curve.variable)}, drawn below"
+def _entries(finding: Finding) -> str:
+    """All entries of a matrix, of which the sentence names only the clearest."""
+    if finding.curve is not None:
+        return f"<br>a curve of {text(finding.curve.variable)}, drawn below"
     out = []
-    for quantity in grouped(one.parameters):
+    for quantity in grouped(finding.parameters):
         if len(quantity.estimates) > SHOWN:
             entries, unit = each(quantity.estimates, quantity.axes)
             listed = "; ".join(f"<span class=entry>{text(entry)}</span>" for entry in entries)
@@ -120,88 +119,91 @@ def _entries(one: Finding) -> str:
     return "".join(out)
 
 
-def _places(d: Diagnosis) -> Iterator[str]:
+def _locations(d: Diagnosis) -> Iterator[str]:
     if not d.located:
         return
-    yield "<h2>Where it lies</h2>"
-    rows = "".join(f"<tr><td>{text(where(one))}</td><td class=number>{percent(one.share)}</td></tr>" for one in d.located)
+    yield "<h2>Location of the misfit</h2>"
+    rows = "".join(
+        f"<tr><td>{text(location_text(located))}</td><td class=number>{percent(located.share)}</td></tr>"
+        for located in d.located
+    )
     head = "<tr><th>Signal, regime, time</th><th>Share of the misfit</th></tr>"
     yield f'<div class="scroll"><table><thead>{head}</thead><tbody>{rows}</tbody></table></div>'
-    for k, trace in enumerate(d.traces[:MOST_LOGS]):
+    for k, trace in enumerate(d.traces[:MAX_LOGS]):
         caption = (
             f"{text(trace.log)}: local size of the misfit{_band(trace)}, by axis (each sensor to its own largest). "
-            '<span class="key" style="background: var(--mark)"></span>where it was located' + HELD
+            '<span class="key" style="background: var(--mark)"></span>located misfit' + HELD
         )
-        yield _figure(figures.where(d, trace), f"w{k}", caption)
+        yield _figure(figures.misfit_strip(d, trace), f"w{k}", caption)
 
 
 def _before_and_after(d: Diagnosis) -> Iterator[str]:
     if not d.traces:
         return
     found = bool(d.findings)
-    both = BEFORE + AFTER if found else DIFFERENCE
+    legend = BEFORE + AFTER if found else DIFFERENCE
     over = "unseen time of all logs" if any(one.held_out.any() for one in d.traces) else "all time: none was held out"
-    yield f"<h2>{'Before and after' if found else 'What separates the two'}</h2>"
-    for k, trace in enumerate(d.traces[:MOST_LOGS]):
+    yield f"<h2>{'Before and after' if found else 'Difference'}</h2>"
+    for k, trace in enumerate(d.traces[:MAX_LOGS]):
         drawn = figures.residual(trace, found=found)
-        yield _figure(drawn, f"r{k}", f"{text(trace.log)}: over time{_band(trace)}. {both}{HELD}")
-    for k, (signal, beside) in enumerate(d.signals.items()):
-        drawn = figures.signal(beside, found=any(one.signal == signal for one in d.findings))
-        yield _figure(drawn, f"g{k}", f"{text(signal)}: over time. {both}{HELD}")
-    if len(d.traces) > MOST_LOGS:
-        yield f'<p class="note">The first {MOST_LOGS} of {len(d.traces)} logs are drawn; all are in the .rrd.</p>'
-    spectrum, rate, attitude = figures.spectrum(d), figures.against_rate(d), figures.against_attitude(d)
+        yield _figure(drawn, f"r{k}", f"{text(trace.log)}: over time{_band(trace)}. {legend}{HELD}")
+    for k, (signal, traces) in enumerate(d.signals.items()):
+        drawn = figures.scalar_signal(traces, found=any(one.signal == signal for one in d.findings))
+        yield _figure(drawn, f"g{k}", f"{text(signal)}: over time. {legend}{HELD}")
+    if len(d.traces) > MAX_LOGS:
+        yield f'<p class="note">The first {MAX_LOGS} of {len(d.traces)} logs are drawn; all are in the .rrd.</p>'
+    spectrum, rate, attitude = figures.spectrum(d), figures.residual_against_rate(d), figures.residual_against_attitude(d)
     if spectrum is not None:
         yield _figure(
-            spectrum, "s", f"Spectrum over {over} (Welch, mean of the axes); dashed: white noise of the floor's size. {both}"
+            spectrum, "s", f"Spectrum over {over} (Welch, mean of the axes); dashed: white noise of the floor's size. {legend}"
         )
     else:
-        yield '<p class="note">No unseen stretch is long enough for a spectrum.</p>'
+        yield '<p class="note">Every unseen stretch is too short for a spectrum.</p>'
     paths = diagnosis_paths.paths(d)
     if paths is not None:
         true = '<span class="key" style="background: var(--ink); opacity: 0.4"></span>true'
         yield _figure(
-            paths, "p", f"Integrated from the true start of each stretch of {over}; drift as root mean square.{true}{both}"
+            paths, "p", f"Integrated from the true start of each stretch of {over}; drift as root mean square.{true}{legend}"
         )
     bands = "means in bins, with two standard errors"
     if rate is not None:
-        yield _figure(rate, "t", f"Against turning rate over {over}: {bands}. {both}")
+        yield _figure(rate, "t", f"Against turning rate over {over}: {bands}. {legend}")
     if attitude is not None:
-        yield _figure(attitude, "a", f"Against attitude over {over}: {bands}. {both}")
+        yield _figure(attitude, "a", f"Against attitude over {over}: {bands}. {legend}")
     else:
-        yield '<p class="note">No attitude is known, so nothing is drawn against it.</p>'
+        yield '<p class="note">The attitude is unknown, so there is no figure against it.</p>'
 
 
 def _curves(d: Diagnosis) -> Iterator[str]:
-    for k, one in enumerate(d.findings):
-        if one.curve is not None:
-            yield "<h2>A misfit without a name</h2>"
-            caption = f"{text(one.equation)}: a smooth curve of {text(one.curve.variable)}, with one standard deviation"
-            yield _figure(figures.curve(one.curve, one.signal), f"c{k}", caption)
+    for k, finding in enumerate(d.findings):
+        if finding.curve is not None:
+            yield "<h2>Unnamed misfit</h2>"
+            caption = f"{text(finding.equation)}: a smooth curve of {text(finding.curve.variable)}, with one standard deviation"
+            yield _figure(figures.curve(finding.curve, finding.signal), f"c{k}", caption)
 
 
 def _left(d: Diagnosis) -> Iterator[str]:
     if d.unexplained:
-        yield "<h2>What remains</h2>"
-        head = "".join(f"<th>{one}</th>" for one in ("Signal", "Remains (rms)", "Noise (rms)", "Ratio", ""))
-        units = {one.signal: one.held_out.unit for one in d.findings} | ASCII_UNITS
+        yield "<h2>Remaining misfit</h2>"
+        head = "".join(f"<th>{title}</th>" for title in ("Signal", "Remains (rms)", "Noise (rms)", "Ratio", ""))
+        units = {finding.signal: finding.held_out.unit for finding in d.findings} | ASCII_UNITS
         rows = []
-        for signal, one in d.unexplained.items():
+        for signal, residual in d.unexplained.items():
             unit = symbol(units.get(signal, ""))
-            ratio = f"{one.rms / one.noise_floor:.2f}" if one.noise_floor > 0.0 else "–"
-            numbers = (f"{one.rms:.3g} {unit}", f"{one.noise_floor:.3g} {unit}", ratio)
+            ratio = f"{residual.rms / residual.noise_floor:.2f}" if residual.noise_floor > 0.0 else "–"
+            numbers = (f"{residual.rms:.3g} {unit}", f"{residual.noise_floor:.3g} {unit}", ratio)
             cells = "".join(f"<td class=number>{text(number)}</td>" for number in numbers)
-            rows.append(f"<tr><td>{text(signal)}</td>{cells}<td>{text(remains(one, unit))}</td></tr>")
+            rows.append(f"<tr><td>{text(signal)}</td>{cells}<td>{text(residual_text(residual, unit))}</td></tr>")
         yield f"<table><thead><tr>{head}</tr></thead><tbody>{''.join(rows)}</tbody></table>"
     if d.closer and d.findings:
-        yield f"<h2>How much closer it comes</h2><p class=note>{text(with_all(d) + unseen(d))}.</p><dl>"
+        yield f"<h2>Improvement</h2><p class=note>{text(gain_source(d) + held_out_time(d))}.</p><dl>"
         for signal, again in d.closer.items():
-            yield f"<dt>{text(signal)}</dt><dd>{text(came_closer(again))}</dd>"
+            yield f"<dt>{text(signal)}</dt><dd>{text(improvement(again))}</dd>"
         yield "</dl>"
 
 
 def _provenance(d: Diagnosis) -> Iterator[str]:
-    yield "<h2>What this is about</h2><dl>"
+    yield "<h2>Provenance</h2><dl>"
     for real in d.real:
         yield f"<dt>real</dt><dd>{text(real)}</dd>"
     yield f"<dt>expected from</dt><dd>{text(d.sim) if d.sim is not None else 'the true poses of the recording itself'}</dd>"
@@ -211,7 +213,7 @@ def _provenance(d: Diagnosis) -> Iterator[str]:
         gyro, accel = (", ".join(f"{b:+.4g}" for b in part) for part in (bias[:3], bias[3:]))
         yield f"<dt>constant bias</dt><dd>gyro ({gyro}) rad/s, accel ({accel}) m/s²</dd>"
     if d.not_identifiable:
-        yield f"<dt>these logs cannot show</dt><dd>{text(', '.join(cannot_show(d)))}</dd>"
+        yield f"<dt>these logs cannot show</dt><dd>{text(', '.join(unobservable(d)))}</dd>"
     yield f"<dt>made by</dt><dd>imutool {text(__version__)}, {SCHEMA}</dd></dl>"
 
 
@@ -222,9 +224,9 @@ def _samples(trace: Traces) -> str:
 
 
 def _band(trace: Traces) -> str:
-    """Up to where what is expected is known."""
+    """Frequency up to which the expected signal is known."""
     return "" if trace.band_hz is None else f" below {trace.band_hz:.2g} Hz, up to where the poses know the motion"
 
 
 def _figure(svg: str, prefix: str, caption: str) -> str:
-    return f"<figure>{apart(svg, prefix)}<figcaption>{caption}</figcaption></figure>"
+    return f"<figure>{prefix_ids(svg, prefix)}<figcaption>{caption}</figcaption></figure>"

@@ -1,6 +1,6 @@
-"""What a diagnosis is worth to who integrates: unseen stretches, each from its true start, without and with what was found.
+"""Integrated paths of a diagnosis: unseen stretches from a true start, before and after.
 
-A stretch's samples are what a perfect sensor would have read plus what is left over, before or after the findings are modelled
+The samples of a stretch are those of a perfect sensor plus the residual before or after the findings are modelled
 (a constant bias is taken off either way). Their integral is `strapdown.dead_reckon`.
 """
 
@@ -14,30 +14,30 @@ from jaxtyping import Float64
 from scipy.spatial.transform import Rotation
 
 from imutool.diagnosis.result import Diagnosis, Traces
-from imutool.inertial.strapdown import Start, dead_reckon
+from imutool.inertial.strapdown import StartPose, dead_reckon
 from imutool.recording import Imu, Poses
-from imutool.viewing.html.diagnosis_figures import GAP, rate_hz, unseen
+from imutool.viewing.html.diagnosis_figures import GAP_PERIODS, held_out_mask, rate_hz
 from imutool.viewing.html.drawing import svg
-from imutool.viewing.html.theme import AFTER, BEFORE, INK
+from imutool.viewing.html.page import AFTER, BEFORE, INK
 
 LEAST_S, MOST_S = 2.0, 10.0  # of a stretch; a longer one is cut
 GRID_S = 0.05  # of the drift's clock
 
 
 class Stretch(NamedTuple):
-    """True poses of one unseen stretch, and what integration from its start makes of it, before and after."""
+    """True poses of one unseen stretch, and its integrated poses before and after the findings."""
 
     truth: Poses
     before: Poses
     after: Poses
 
 
-def stretches(trace: Traces) -> Iterator[Stretch]:
-    """Unseen stretches without gaps that have poses, ten seconds long at most; none where no poses are known."""
+def held_out_stretches(trace: Traces) -> Iterator[Stretch]:
+    """Unseen stretches without gaps, at most ten seconds long; none without known poses."""
     if trace.truth is None or trace.ideal is None:
         return
-    rows = np.flatnonzero(unseen(trace) & np.isfinite(trace.ideal).all(axis=1))
-    breaks = np.flatnonzero(np.diff(trace.t_s[rows]) > GAP / rate_hz(trace)) + 1
+    rows = np.flatnonzero(held_out_mask(trace) & np.isfinite(trace.ideal).all(axis=1))
+    breaks = np.flatnonzero(np.diff(trace.t_s[rows]) > GAP_PERIODS / rate_hz(trace)) + 1
     for piece in np.split(rows, breaks):
         count = max(1, int(np.ceil(len(piece) / (MOST_S * rate_hz(trace)))))
         for part in np.array_split(piece, count):
@@ -46,57 +46,57 @@ def stretches(trace: Traces) -> Iterator[Stretch]:
 
 
 def paths(d: Diagnosis) -> str | None:
-    """Unseen stretches of the first log seen from above, and how orientation and position drift from a true start, over all.
+    """Unseen stretches of the first log from above, and drift from a true start over all logs.
 
     None where no stretch has poses, or nothing was found.
     """
-    drawn = [list(stretches(trace)) for trace in d.traces]
-    everything = [one for log in drawn for one in log]
+    drawn = [list(held_out_stretches(trace)) for trace in d.traces]
+    everything = [stretch for log in drawn for stretch in log]
     if not everything or not d.findings:
         return None
 
     def draw(figure: Any) -> None:
         above, turned, moved = figure.subplots(1, 3, width_ratios=[1.2, 1.0, 1.0])
-        for one in drawn[0] or everything[:1]:
-            for poses, color, width in ((one.truth, INK, 2.0), (one.before, BEFORE, 1.0), (one.after, AFTER, 1.0)):
+        for stretch in drawn[0] or everything[:1]:
+            for poses, color, width in ((stretch.truth, INK, 2.0), (stretch.before, BEFORE, 1.0), (stretch.after, AFTER, 1.0)):
                 above.plot(*poses.p_wb[:, :2].T, color=color, lw=width, alpha=0.4 if color == INK else 1.0)
-            above.plot(*one.truth.p_wb[0, :2], "o", color=INK, ms=2.5)
+            above.plot(*stretch.truth.p_wb[0, :2], "o", color=INK, ms=2.5)
         above.set(xlabel="x (m)", ylabel="y (m)", title="Seen from above")
         above.set_aspect("equal", adjustable="datalim")
         for axes, name, column in ((turned, "orientation error (°)", 0), (moved, "position error (m)", 1)):
             for side, color in ((1, BEFORE), (2, AFTER)):
-                t_s, rms = drift(everything, side)
+                t_s, rms = rms_drift(everything, side)
                 axes.plot(t_s, rms[:, column], color=color, lw=1.3)
             axes.set(xlabel="time since the true start (s)", title=name.capitalize(), xlim=(0.0, None), ylim=(0.0, None))
 
     return svg(draw, 3.0, "paths")
 
 
-def drift(found: Sequence[Stretch], side: int) -> tuple[Float64[np.ndarray, " k"], Float64[np.ndarray, "k 2"]]:
-    """Root mean square orientation error (deg) and position error (m) over stretches, by time since their start.
+def rms_drift(found: Sequence[Stretch], side: int) -> tuple[Float64[np.ndarray, " k"], Float64[np.ndarray, "k 2"]]:
+    """Root mean square orientation (deg) and position error (m) by time since the start.
 
     `side` is 1 for before, 2 for after. As far as half of the stretches reach.
     """
-    lasting = float(np.median([one.truth.duration_s for one in found]))
+    lasting = float(np.median([stretch.truth.duration_s for stretch in found]))
     t_s = np.arange(0.0, lasting + 1e-9, GRID_S)
     squares = np.full((len(found), len(t_s), 2), np.nan)
-    for k, one in enumerate(found):
-        own_s = (one.truth.t_ns - one.truth.t_ns[0]) * 1e-9
+    for k, stretch in enumerate(found):
+        own_s = (stretch.truth.t_ns - stretch.truth.t_ns[0]) * 1e-9
         reach = t_s <= own_s[-1]
-        for column, error in enumerate(_errors(one.truth, one[side])):
+        for column, error in enumerate(_errors(stretch.truth, stretch[side])):
             squares[k, reach, column] = np.interp(t_s[reach], own_s, error) ** 2
     return t_s, np.sqrt(np.nanmean(squares, axis=0))
 
 
 def _stretch(trace: Traces, rows: slice) -> Stretch:
-    assert trace.truth is not None, "looked at before"
-    assert trace.ideal is not None, "looked at before"
+    assert trace.truth is not None, "checked by the caller"
+    assert trace.ideal is not None, "checked by the caller"
     truth: Poses = trace.truth.rows(rows)
     sides = []
     for expected in (trace.before, trace.after):
         read = trace.ideal[rows] + trace.real[rows] - expected[rows]
         imu = Imu(truth.t_ns, np.ascontiguousarray(read[:, :3]), np.ascontiguousarray(read[:, 3:]))
-        sides.append(dead_reckon(imu, Start.of(truth)))
+        sides.append(dead_reckon(imu, StartPose.of(truth)))
     return Stretch(truth, *sides)
 
 

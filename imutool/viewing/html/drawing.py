@@ -1,4 +1,4 @@
-"""Drawings by matplotlib: inline SVG whose colours are the page's, so that one serves light, dark and print; or a PNG."""
+"""Drawings by matplotlib: inline SVG in the colours of the page, or PNG."""
 
 from __future__ import annotations
 
@@ -16,25 +16,24 @@ import numpy as np
 from jaxtyping import Bool, Float64
 
 from imutool.errors import ConfigError
-from imutool.viewing.html.page import plain, text
-from imutool.viewing.html.theme import GRID, INK, LIGHT
+from imutool.viewing.html.page import GRID, INK, LIGHT, printable, text
 
-WIDTH_INCH = 11.5  # at the page's 1150 pixels a letter of 9 points is 12 pixels high
-HALF_INCH = 5.6  # two of these side by side, or one on a phone, where the letters are 9 pixels high
+WIDTH_INCH = 11.5  # on a page of 1150 pixels, letters of 9 points are 12 pixels high
+HALF_INCH = 5.6  # two side by side, or one on a phone, where letters are 9 pixels high
 DOTS_PER_INCH = 200  # sharp in print
 HEADING_INCH = 0.45
 PER_DECADE = 40  # points of a spectrum
 LEGEND_LETTERS, HANDLE_LETTERS = 76, 8  # in a row of a legend at half width
-MOST_LETTERS = 48  # of a name in a legend
-BUCKETS = 400  # of a line that is drawn at half width: its lowest and its highest sample in each
+MAX_LETTERS = 48  # of a name in a legend
+BUCKETS = 400  # of a line at half width; each draws its lowest and its highest sample
 
-# a colour that stands for each of the theme's while an SVG is drawn; none may be one of matplotlib's own
+# placeholder colour for each of the page's colours in an SVG; none is one of matplotlib's own
 VARIABLES = {f"#{3 * k + 1:02x}{3 * k + 2:02x}{3 * k + 3:02x}": name for k, name in enumerate(LIGHT)}
-PLACES = {f"imutool:{name}": color for color, name in VARIABLES.items()}
-SHOWN = {f"imutool:{name}": color for name, color in LIGHT.items()}
+PLACEHOLDER_COLORS = {f"imutool:{name}": color for color, name in VARIABLES.items()}
+LIGHT_COLORS = {f"imutool:{name}": color for name, color in LIGHT.items()}
 
 Line = Float64[np.ndarray, " n"]
-Thin = Float64[np.ndarray, " m"]  # of another length than what it was made of
+DecimatedLine = Float64[np.ndarray, " m"]  # shorter than the line it comes from
 STYLE = {
     "font.size": 9,
     "axes.titlesize": 10,
@@ -53,18 +52,18 @@ STYLE = {
     "xtick.color": INK,
     "ytick.color": INK,
     "svg.fonttype": "none",
-    "text.parse_math": False,  # a dollar in the name of a channel is a dollar
-    "axes.formatter.useoffset": False,  # an axis that says +1.2e-3 in a corner is misread
-    "axes.formatter.limits": (-6, 9),  # nor is a power of ten above an axis seen
+    "text.parse_math": False,  # channel names may contain a dollar
+    "axes.formatter.useoffset": False,  # readers overlook +1.2e-3 in a corner
+    "axes.formatter.limits": (-6, 9),  # or a power of ten above an axis
     "axes.formatter.use_mathtext": False,
     "axes.unicode_minus": True,
 }
-_drawing = threading.RLock()  # matplotlib's settings and names of colours are the whole program's
+_drawing = threading.RLock()  # matplotlib's settings and colour names are global
 
 
 @dataclass(frozen=True)
 class Panel:
-    """One drawing of half a page's width, or of all of it: on a figure or a part of one; `label` tells what it shows."""
+    """One drawing of half or the whole width of a page; `label` describes it for screen readers."""
 
     draw: Callable[[Any], None]
     height_inch: float
@@ -74,7 +73,7 @@ class Panel:
 
 @dataclass(frozen=True)
 class Picture:
-    """Panels that belong together, under one title; `name` ends the name of their file."""
+    """Panels under one title; `name` ends the name of their file."""
 
     name: str
     title: str
@@ -83,14 +82,14 @@ class Picture:
 
 
 def svg(draw: Callable[[Any], None], height_inch: float, name: str, *, width_inch: float = WIDTH_INCH, label: str = "") -> str:
-    """What `draw` draws on a figure, as an `<svg>` element: colours are variables, two decimals, identifiers the figure's own.
+    """Draw an `<svg>` element: colours are CSS variables, numbers have two decimals.
 
-    Every curve that has a label carries it as its `<title>`, which a browser shows under the pointer.
+    Every labelled curve has a `<title>`, which a browser shows as a tooltip.
 
     Raises:
         ConfigError: matplotlib is not installed.
     """
-    with _inked(PLACES, name):
+    with _inked(PLACEHOLDER_COLORS, name):
         from matplotlib.backends.backend_svg import FigureCanvasSVG
         from matplotlib.figure import Figure
 
@@ -112,7 +111,7 @@ def svg(draw: Callable[[Any], None], height_inch: float, name: str, *, width_inc
 
 
 def png(picture: Picture, heading: str) -> bytes:
-    """A picture in light colours as the content of a file: its panels two in a row, under a heading.
+    """Content of a PNG file in light colours: two panels per row under a heading.
 
     Raises:
         ConfigError: matplotlib is not installed.
@@ -120,13 +119,13 @@ def png(picture: Picture, heading: str) -> bytes:
     rows = _rows(picture.panels)
     heights = [max(panel.height_inch for panel in row) for row in rows]
     columns = 2 if any(len(row) > 1 or row[0].wide for row in rows) else 1
-    with _inked(SHOWN, picture.name):
+    with _inked(LIGHT_COLORS, picture.name):
         from matplotlib.backends.backend_agg import FigureCanvasAgg
         from matplotlib.figure import Figure
 
         figure = Figure(figsize=(HALF_INCH * columns, sum(heights) + HEADING_INCH), dpi=DOTS_PER_INCH)
         FigureCanvasAgg(figure)
-        figure.suptitle(plain(heading), x=0.01, ha="left", fontsize=12, fontweight="bold")
+        figure.suptitle(printable(heading), x=0.01, ha="left", fontsize=12, fontweight="bold")
         parts = figure.subfigures(len(rows), 1, squeeze=False, height_ratios=heights)[:, 0]
         for part, row in zip(parts, rows, strict=True):
             alone = part.subfigures(1, 1 if row[0].wide else columns, squeeze=False)[0]
@@ -137,28 +136,28 @@ def png(picture: Picture, heading: str) -> bytes:
     return buffer.getvalue()
 
 
-def apart(drawn: str, prefix: str) -> str:
-    """An `<svg>` element whose identifiers begin with a prefix: a page holds several, and `use` finds the first of a name."""
+def prefix_ids(drawn: str, prefix: str) -> str:
+    """Prefix all identifiers of an `<svg>` element: a page holds several drawings."""
     return re.sub(r'(?<= id=")|(?<=href="#)|(?<=url\(#)', f"{prefix}-", drawn)
 
 
 def legend(figure: Any, artists: Sequence[Any]) -> None:
-    """The artists' names in rows above everything: inside the axes they would cover a curve sooner or later."""
-    names = [short(str(artist.get_label())) for artist in artists]
+    """Legend in rows above the axes, where it covers no curve."""
+    names = [legend_name(str(artist.get_label())) for artist in artists]
     widths = [len(name) + HANDLE_LETTERS for name in names]
     columns = len(names) if sum(widths) <= LEGEND_LETTERS else max(1, min(len(names), LEGEND_LETTERS // max(widths)))
     figure.legend(artists, names, loc="outside upper left", ncols=columns, handlelength=1.6, fontsize=8.5)
 
 
-def short(name: str) -> str:
-    """A name that fits a legend, and begins with no underscore, which matplotlib would take for a word to itself."""
-    name = plain(name).strip() or "?"
-    name = name if len(name) <= MOST_LETTERS else f"{name[: MOST_LETTERS - 1]}…"
+def legend_name(name: str) -> str:
+    """Name for a legend: short, and without a leading underscore, which matplotlib would hide."""
+    name = printable(name).strip() or "?"
+    name = name if len(name) <= MAX_LETTERS else f"{name[: MAX_LETTERS - 1]}…"
     return f"\u200a{name}" if name.startswith("_") else name
 
 
-def extremes(t: Line, y: Line, buckets: int = BUCKETS) -> tuple[Thin, Thin]:
-    """A line of at most two points a bucket, the lowest and the highest sample of each in their order; gaps stay gaps."""
+def decimate_extremes(t: Line, y: Line, buckets: int = BUCKETS) -> tuple[DecimatedLine, DecimatedLine]:
+    """Decimate a line to the lowest and highest sample of each bucket; gaps stay gaps."""
     if len(t) <= 2 * buckets:
         return t, y
     edges = np.unique(np.linspace(0, len(t), buckets + 1).astype(int))
@@ -172,18 +171,18 @@ def extremes(t: Line, y: Line, buckets: int = BUCKETS) -> tuple[Thin, Thin]:
     return t[keep], y[keep]
 
 
-def spans(t: Line, mask: Bool[np.ndarray, " n"]) -> list[tuple[float, float]]:
-    """Where a mask is true, as stretches of time."""
+def true_intervals(t: Line, mask: Bool[np.ndarray, " n"]) -> list[tuple[float, float]]:
+    """Intervals of time in which a mask is true."""
     turns = np.flatnonzero(np.diff(np.concatenate([[False], mask, [False]]).astype(int)))
     return [(float(t[first]), float(t[last - 1])) for first, last in zip(turns[::2], turns[1::2], strict=True)]
 
 
-def averaged(
+def average_log_bins(
     frequency_hz: Line, power: Float64[np.ndarray, " n *k"], lowest_hz: float
-) -> tuple[Thin, Float64[np.ndarray, " m *k"]]:
-    """A spectrum whose neighbours are averaged, forty points a decade above `lowest_hz`.
+) -> tuple[DecimatedLine, Float64[np.ndarray, " m *k"]]:
+    """Average a spectrum in forty bins a decade above `lowest_hz`.
 
-    Further up than there is room for, a line of noise would otherwise be as broad as it is high.
+    Without it, noise at high frequencies would draw a band instead of a line.
     """
     decade = np.round(PER_DECADE * np.log10(frequency_hz / lowest_hz)).astype(int)
     starts = np.flatnonzero(np.diff(decade, prepend=decade[0] - 1))
@@ -192,8 +191,8 @@ def averaged(
     return np.add.reduceat(frequency_hz, starts) / count, sums / count.reshape(-1, *[1] * (power.ndim - 1))
 
 
-def plain_numbers(*rulers: Any) -> None:
-    """Numbers along logarithmic axes as people write them, at the decades alone."""
+def plain_tick_labels(*rulers: Any) -> None:
+    """Label logarithmic axes with plain numbers at the decades."""
     from matplotlib.ticker import FuncFormatter, NullFormatter
 
     for ruler in rulers:
@@ -201,8 +200,8 @@ def plain_numbers(*rulers: Any) -> None:
         ruler.set_minor_formatter(NullFormatter())
 
 
-def library() -> Any:
-    """matplotlib, imported when first asked for.
+def require_matplotlib() -> Any:
+    """Import matplotlib at its first use.
 
     Raises:
         ConfigError: it is not installed.
@@ -218,10 +217,10 @@ def library() -> Any:
 
 @contextmanager
 def _inked(colors: Mapping[str, str], salt: str) -> Iterator[None]:
-    """Our style, and our names for colours, for as long as something is drawn; they are no one's else afterwards."""
-    matplotlib = library()
+    """Our style and names of colours, set only while something is drawn."""
+    matplotlib = require_matplotlib()
     known = matplotlib.colors.get_named_colors_mapping()
-    with _drawing, warnings.catch_warnings():  # letters that this font lacks are the browser's to draw
+    with _drawing, warnings.catch_warnings():  # the browser draws letters that this font lacks
         warnings.filterwarnings("ignore", message="Glyph .* missing from")
         for name, color in colors.items():
             known[name] = color
@@ -234,7 +233,7 @@ def _inked(colors: Mapping[str, str], salt: str) -> Iterator[None]:
 
 
 def _curves(figure: Any) -> dict[str, str]:
-    """Gives every curve with a label an identifier; returns the labels by it."""
+    """Give every labelled curve an identifier; returns the labels by identifier."""
     from matplotlib.collections import Collection
     from matplotlib.lines import Line2D
 
@@ -249,7 +248,7 @@ def _curves(figure: Any) -> dict[str, str]:
 
 
 def _rows(panels: Sequence[Panel]) -> list[list[Panel]]:
-    """Two panels a row; a wide one has its own."""
+    """Panels in rows of two; a wide one has its own row."""
     rows: list[list[Panel]] = []
     for panel in panels:
         if rows and len(rows[-1]) == 1 and not panel.wide and not rows[-1][0].wide:

@@ -1,4 +1,4 @@
-"""A report about logs: one page that holds everything, to be read, printed and sent, or the same pictures as PNGs."""
+"""HTML report of logs as one self-contained page, or its pictures as PNG files."""
 
 from __future__ import annotations
 
@@ -14,24 +14,32 @@ from imutool import __version__
 from imutool.errors import ConfigError
 from imutool.location import Location
 from imutool.mcap_io.storage.target import Target
-from imutool.viewing.html import report_errors, report_events, report_paths, report_signals
-from imutool.viewing.html.drawing import HALF_INCH, WIDTH_INCH, Panel, Picture, apart, library, png, svg
+from imutool.viewing.html import report_errors, report_paths, report_signals
+from imutool.viewing.html.drawing import HALF_INCH, WIDTH_INCH, Panel, Picture, png, prefix_ids, require_matplotlib, svg
 from imutool.viewing.html.page import cards, document, text
-from imutool.viewing.html.report_wording import best, conclusion, label, lowest, number, overall, worst
-from imutool.viewing.html.report_wording import cards as numbers
+from imutool.viewing.html.report_wording import (
+    best_run,
+    conclusion,
+    figure_label,
+    format_number,
+    index_of_best,
+    key_numbers,
+    summary_of_logs,
+    worst_orientation_error,
+)
 from imutool.viewing.model.run_data import RunData
 
 PICTURES: tuple[Callable[[RunData], Picture | None], ...] = (
     report_paths.paths,
-    report_paths.heat,
-    report_errors.errors,
-    report_errors.drift,
+    report_paths.error_map,
+    report_errors.error_curves,
+    report_errors.drift_curves,
     report_signals.signals,
     report_signals.zoom,
     report_signals.biases,
     report_signals.spectrum,
-    report_signals.at_rest,
-    report_events.lanes,
+    report_signals.allan_deviation,
+    report_errors.event_lanes,
 )
 STYLE = """
 h1 { font-size: 22px; color: var(--ink); margin: 0 0 8px; }
@@ -56,28 +64,28 @@ summary { cursor: pointer; font-size: 15px; padding: 8px 0; color: var(--soft); 
 
 
 def page(logs: Sequence[RunData]) -> str:
-    """The page: of one log its conclusion, figures and pictures; of several a comparison first, then each.
+    """HTML of the report; several logs are compared first.
 
-    No request leaves it, it needs no program to be read, and what a log is called never becomes markup. A part that the data
-    do not have (truth, models, events) is left out.
+    No request leaves the page, it needs no script, and text from the logs is escaped. Parts without data (truth, models,
+    events) are left out.
 
     Raises:
         ConfigError: no logs, or matplotlib is not installed.
     """
     if not logs:
         raise ConfigError("no logs", where="report", expected="at least one")
-    library()
+    require_matplotlib()
     if len(logs) == 1:
         body = [f"<h1>{text(logs[0].name)}</h1>", *_log(logs[0], "log1", alone=True), *_made()]
         return document(logs[0].name, body, STYLE)
-    body = [f"<h1>{len(logs)} logs</h1>", f'<p class="conclusion">{text(overall(logs))}</p>', *_compared(logs)]
+    body = [f"<h1>{len(logs)} logs</h1>", f'<p class="conclusion">{text(summary_of_logs(logs))}</p>', *_compared(logs)]
     for k, data in enumerate(logs, start=1):
         body += [f'<h2 class="log" id="log{k}">{text(data.name)}</h2>', *_log(data, f"log{k}", alone=False)]
     return document(f"{len(logs)} logs", [*body, *_made()], STYLE)
 
 
 def write_page(logs: Sequence[RunData], path: Location, *, overwrite: bool = False) -> None:
-    """Writes the page.
+    """Write the page.
 
     Raises:
         ConfigError: as `page`, or the file exists (without `overwrite`) or cannot be written.
@@ -87,17 +95,17 @@ def write_page(logs: Sequence[RunData], path: Location, *, overwrite: bool = Fal
 
 
 def write_pngs(data: RunData, folder: Path, *, overwrite: bool = False) -> list[Path]:
-    """Writes every picture of the page that there is, NAME-paths.png and so on, and returns their paths.
+    """Write every picture of the page as NAME-paths.png and so on, and return their paths.
 
     Raises:
         ConfigError: matplotlib is not installed, or a file exists (without `overwrite`) or cannot be written.
     """
-    library()
+    require_matplotlib()
     pictures = [picture for picture in _pictures(data) if picture is not None]
     paths = [folder / f"{file_name(data.name)}-{picture.name}.png" for picture in pictures]
-    there = [path for path in paths if path.exists()]
-    if there and not overwrite:  # before anything is drawn
-        raise ConfigError("the target exists", where=there[0], fix="Choose another folder, or add --overwrite")
+    existing = [path for path in paths if path.exists()]
+    if existing and not overwrite:  # before anything is drawn
+        raise ConfigError("the target exists", where=existing[0], fix="Choose another folder, or add `overwrite`")
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -109,24 +117,24 @@ def write_pngs(data: RunData, folder: Path, *, overwrite: bool = False) -> list[
 
 
 def file_name(name: str) -> str:
-    """What files about a log are called: its name without anything that leads elsewhere or hides the file."""
+    """File name for a log: its name without separators, leading dots and unsafe characters."""
     return re.sub(r"[^\w.+-]", "_", name).lstrip(".-")[:100] or "_"
 
 
-def by_topic(logs: Sequence[RunData], topics: Sequence[str]) -> list[RunData]:
-    """Several IMUs of one log, each called by its topic too; a single one keeps the log's name."""
+def name_by_topic(logs: Sequence[RunData], topics: Sequence[str]) -> list[RunData]:
+    """Name several IMUs of one log by their topics too; a single one keeps the log's name."""
     if len(logs) < 2:
         return list(logs)
     return [replace(data, name=f"{data.name} {topic}") for data, topic in zip(logs, topics, strict=True)]
 
 
-def refuse(path: Location, *, overwrite: bool = False) -> None:
-    """Nothing, where a page can be written; to be asked before the work is done.
+def check_target(path: Location, *, overwrite: bool = False) -> None:
+    """Check before the work that a page can be written.
 
     Raises:
         ConfigError: matplotlib is not installed, or the file exists (without `overwrite`) or cannot be written.
     """
-    library()
+    require_matplotlib()
     Target(path, overwrite=overwrite).abandon()
 
 
@@ -136,22 +144,22 @@ def _pictures(data: RunData) -> Iterator[Picture | None]:
 
 
 def _log(data: RunData, key: str, *, alone: bool) -> Iterator[str]:
-    """Everything about one log; among several its pictures are folded, on paper they are not."""
+    """Section of one log; among several logs its pictures are folded on screen."""
     pictures = [picture for picture in _pictures(data) if picture is not None]
     yield f'<p class="conclusion">{text(conclusion(data))}</p>'
-    yield cards(numbers(data))
+    yield cards(key_numbers(data))
     entries = {picture.name: picture.title for picture in pictures}
     links = [("figures", "Figures")] * bool(data.table()) + list(entries.items()) + [("provenance", "Provenance")]
     yield f'<nav aria-label="Parts of the report about {text(data.name)}">'
     yield "".join(f'<a href="#{key}-{name}">{text(title)}</a>' for name, title in links) + "</nav>"
     yield f'<div class="pair">{"".join((*_figures(data, key), *_windows(data)))}</div>'
-    yield from (f'<p class="note">{text(note)}</p>' for note in (*data.notes, *report_signals.left_out()))
+    yield from (f'<p class="note">{text(note)}</p>' for note in (*data.notes, *report_signals.missing_pictures()))
     if not alone:
         yield "<details><summary>Pictures, events and provenance</summary>"
     for picture in pictures:
         yield from _drawn(picture, key)
         if picture.name == "events":
-            yield from report_events.table(data)
+            yield from report_errors.event_table(data)
     yield from _provenance(data, key)
     if not alone:
         yield "</details>"
@@ -163,7 +171,7 @@ def _drawn(picture: Picture, key: str) -> Iterator[str]:
         yield f'<p class="note">{text(picture.caption)}</p>'
     yield '<div class="pair">' if not picture.panels[0].wide else "<div>"
     for k, panel in enumerate(picture.panels):
-        yield f"<figure>{apart(_svg(panel, f'{picture.name}-{k}'), f'{key}-{picture.name}-{k}')}</figure>"
+        yield f"<figure>{prefix_ids(_svg(panel, f'{picture.name}-{k}'), f'{key}-{picture.name}-{k}')}</figure>"
     yield "</div></section>"
 
 
@@ -173,7 +181,7 @@ def _svg(panel: Panel, name: str) -> str:
 
 
 def _figures(data: RunData, key: str) -> Iterator[str]:
-    """Errors of every run, the best of each marked."""
+    """Table of the errors of every run, the best of each marked."""
     rows = [(name, values) for name, values in data.table() if name not in ("samples", "duration_s")]
     rows = [(name, values) for name, values in rows if any(value is not None for value in values)]
     if not rows:
@@ -182,25 +190,25 @@ def _figures(data: RunData, key: str) -> Iterator[str]:
     yield f'<section id="{key}-figures"><h3>Figures</h3>'
     yield f'<div class="scroll"><table class="numeric"><thead><tr>{head}</tr></thead><tbody>'
     for name, values in rows:
-        yield f"<tr><td>{text(label(name))}</td>{_cells(values, lowest(values, name))}</tr>"
+        yield f"<tr><td>{text(figure_label(name))}</td>{_cells(values, index_of_best(values, name))}</tr>"
     counted = {trace.name: trace.figures for trace in data.traces if trace.figures}
     samples, seconds = next(((one["samples"], one["duration_s"]) for one in counted.values()), (0, 0.0))
-    yield f'</tbody></table></div><p class="note">Root mean squares over {samples:,} samples in {number(seconds)} s from the '
-    yield "true start, and means over stretches of the true path; the best in bold.</p></section>"
+    yield f'</tbody></table></div><p class="note">Root mean squares over {samples:,} samples in {format_number(seconds)} s '
+    yield "from the true start, and means over stretches of the true path; the best in bold.</p></section>"
 
 
 def _cells(values: Sequence[float | None], marked: int | None) -> str:
-    """Numbers as cells; the whole number is under the pointer."""
+    """Numbers as cells, with all digits in a tooltip."""
     out = []
     for k, value in enumerate(values):
         kind = 'class="number best"' if k == marked else 'class="number"'
-        whole = "" if value is None else f' title="{value!r}"'
-        out.append(f"<td {kind}{whole}>{number(value)}</td>")
+        tooltip = "" if value is None else f' title="{value!r}"'
+        out.append(f"<td {kind}{tooltip}>{format_number(value)}</td>")
     return "".join(out)
 
 
 def _windows(data: RunData) -> Iterator[str]:
-    """How far windows of each length drift that each start from the truth."""
+    """Table of the drift over windows that each start from the truth."""
     lengths = sorted({window.length_s for trace in data.traces for window in trace.windows})
     if not lengths:
         return
@@ -215,24 +223,24 @@ def _windows(data: RunData) -> Iterator[str]:
             values = [None if one is None else float(getattr(one, name)) for one in found]
             values = [value if value is not None and np.isfinite(value) else None for value in values]
             words = f"{name.split('_')[0].capitalize()} after {length:g} s ({unit})"
-            yield f"<tr><td>{words}</td>{_cells(values, lowest(values, name))}</tr>"
+            yield f"<tr><td>{words}</td>{_cells(values, index_of_best(values, name))}</tr>"
     yield '</tbody></table></div><p class="note">Root mean squares at the ends of windows that each start from the truth.</p>'
     yield "</section>"
 
 
 def _compared(logs: Sequence[RunData]) -> Iterator[str]:
-    """Every run of every log in one row."""
+    """Table with one row for every run of every log."""
     head = ("Log", "Run", "Seconds", "Orientation error (°)", "Position error (m)", "Velocity error (m/s)", "Largest (°)")
     yield '<div class="scroll"><table class="numeric"><thead><tr>'
     yield "".join(f"<th{' class=word' * (one == 'Run')}>{one}</th>" for one in head) + "</tr></thead><tbody>"
     for k, data in enumerate(logs, start=1):
-        chosen = best(data)
+        chosen = best_run(data)
         for trace in data.traces:
-            found = worst(trace, data)
+            found = worst_orientation_error(trace, data)
             values = [trace.figures.get(name) for name in ("aoe_deg", "ape_m", "velocity_rmse_m_s")]
             cells = _cells([*values, None if found is None else found[0]], 0 if trace is chosen else None)
             name = f'<td><a href="#log{k}">{text(data.name)}</a></td><td class=word>{text(trace.name)}</td>'
-            yield f"<tr>{name}<td class=number>{number(data.duration_s)}</td>{cells}</tr>"
+            yield f"<tr>{name}<td class=number>{format_number(data.duration_s)}</td>{cells}</tr>"
     yield "</tbody></table></div>"
 
 
@@ -250,6 +258,6 @@ def _provenance(data: RunData, key: str) -> Iterator[str]:
 
 
 def _made() -> Iterator[str]:
-    """The versions of what made the page."""
-    drawn = f"numpy {np.__version__}, matplotlib {library().__version__}"
+    """Versions of the software that made the page."""
+    drawn = f"numpy {np.__version__}, matplotlib {require_matplotlib().__version__}"
     yield f'<p class="note">Made by imutool {text(__version__)}, Python {platform.python_version()}, {drawn}.</p>'

@@ -1,31 +1,32 @@
-"""How wrong each way of reading the IMU is over time: from the start, by angle and direction, and since each reset."""
+"""Pictures of errors over time, drift since each reset, and events."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from functools import partial
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float64, Int64
 
-from imutool.viewing.html.drawing import Panel, Picture, Thin, extremes, legend, plain_numbers
+from imutool.viewing.html.drawing import DecimatedLine, Panel, Picture, decimate_extremes, legend, plain_tick_labels
+from imutool.viewing.html.page import AFTER, BEFORE, HELD, INK, MARK, text
 from imutool.viewing.html.report_paths import color_of
-from imutool.viewing.html.report_wording import aligned
-from imutool.viewing.html.theme import INK
+from imutool.viewing.html.report_wording import alignment_text, format_number
+from imutool.viewing.model.events import KINDS, Event
 from imutool.viewing.model.run_data import RunData, Trace
 from imutool.viewing.model.trajectory_error import Drift
 
-DECADES = 2.5  # shown below the largest error of the best run: nothing is decided further down
-APART = 8.0  # times between the largest errors of two runs: beyond, one scale for both is logarithmic, or leaves one out
-MOST_RESETS = 60  # that can be told apart in a picture
-HEIGHTS_INCH = {1: 2.6, 3: 5.6, 4: 5.6}  # of one and of several rows: what stands side by side is of one height
+DECADES = 2.5  # shown below the largest error of the best run
+LINEAR_RATIO = 8.0  # of the largest errors of two runs; above it a scale is logarithmic, or one run leaves the panel
+MAX_RESETS = 60  # that stay distinguishable in a picture
+HEIGHTS_INCH = {1: 2.6, 3: 5.6, 4: 5.6}  # by number of rows: panels side by side have one height
 
 Line = Float64[np.ndarray, " n"]
 
 
-def errors(data: RunData) -> Picture | None:
-    """Orientation (total, roll, pitch, yaw) and position (total, horizontal, vertical); nothing without truth."""
+def error_curves(data: RunData) -> Picture | None:
+    """Orientation and position error, total and by direction; None without truth."""
     scored = [trace for trace in data.traces if trace.errors is not None]
     if not scored:
         return None
@@ -44,22 +45,22 @@ def errors(data: RunData) -> Picture | None:
         _panel(data, scored, times, moved, "Position error", "m"),
     )
     signed = [values for rows in (turned, moved) for name, values in rows.items() if name not in ("total", "horizontal")]
-    out = any(_leaving(values) for values in signed)
-    note = " Where an error with a sign is far larger than the others', it leaves its panel; the total shows all of it." * out
-    return Picture("errors", "Errors over time", f"Integrated from the true start, {aligned(data)}.{note}", panels)
+    out = any(_leaves_panel(values) for values in signed)
+    note = " A signed error far above the others leaves its panel; the total shows it whole." * out
+    return Picture("errors", "Errors over time", f"Integrated from the true start, {alignment_text(data)}.{note}", panels)
 
 
-def drift(data: RunData) -> Picture | None:
-    """Orientation and position since integration was last set to the truth; nothing where that was not computed."""
+def drift_curves(data: RunData) -> Picture | None:
+    """Orientation and position drift since the last reset to the truth; None without truth."""
     with_drift = [(trace, trace.drift) for trace in data.traces if trace.drift is not None]
     if not with_drift:
         return None
     scored, drifts = [trace for trace, _ in with_drift], [drift for _, drift in with_drift]
     caption = f"Set to the truth every {drifts[0].reset_s:g} s."
-    curves = [(data.elapsed_s(one.t_ns), one.orientation_deg, one.position_m) for one in drifts]
-    if any(len(_resets(one)) > MOST_RESETS for one in drifts):
-        curves = [_largest(one, *rows) for one, rows in zip(drifts, curves, strict=True)]
-        caption += " Drawn is the largest drift of each such stretch."
+    curves = [(data.elapsed_s(drift.t_ns), drift.orientation_deg, drift.position_m) for drift in drifts]
+    if any(len(_resets(drift)) > MAX_RESETS for drift in drifts):
+        curves = [_largest(drift, *rows) for drift, rows in zip(drifts, curves, strict=True)]
+        caption += " Each stretch shows its largest drift."
     times, turned, moved = (list(rows) for rows in zip(*curves, strict=True))
     panels = (
         _panel(data, scored, times, {"total": turned}, "Orientation drift", "°"),
@@ -69,18 +70,18 @@ def drift(data: RunData) -> Picture | None:
 
 
 def _resets(drift: Drift) -> Int64[np.ndarray, " k"]:
-    """The rows at which integration begins anew."""
+    """Rows at which integration starts again."""
     return np.flatnonzero(np.diff(drift.since_s, prepend=np.inf) <= 0.0)
 
 
-def _largest(drift: Drift, t: Line, turned: Line, moved: Line) -> tuple[Thin, Thin, Thin]:
-    """The largest of each stretch between resets, at its beginning."""
+def _largest(drift: Drift, t: Line, turned: Line, moved: Line) -> tuple[DecimatedLine, DecimatedLine, DecimatedLine]:
+    """Largest drift between two resets, at the first of them."""
     starts = _resets(drift)
     return t[starts], np.fmax.reduceat(turned, starts), np.fmax.reduceat(moved, starts)
 
 
 def _of(trace: Trace) -> Any:
-    assert trace.errors is not None, "looked at before"
+    assert trace.errors is not None, "only runs with errors come here"
     return trace.errors
 
 
@@ -105,11 +106,13 @@ def _draw(
     lines: list[Any] = []
     for axes, (name, values) in zip(panels, rows.items(), strict=True):
         signed = name not in {"total", "horizontal"}
-        log = not signed and _apart(values)
+        log = not signed and _needs_log_scale(values)
         for trace, t, error in zip(scored, times, values, strict=True):
-            shown = np.where(error > 0.0, error, np.nan) if log else error  # the start is exact, which a logarithm cannot show
+            shown = np.where(error > 0.0, error, np.nan) if log else error  # the start is exact: log(0)
             label = f"{trace.name}: {title.lower()}, {name}" if axes is not panels[0] else trace.name
-            line = axes.plot(*extremes(t, shown), color=color_of(data, trace), lw=0.9 if trace.is_raw else 1.3, label=label)
+            line = axes.plot(
+                *decimate_extremes(t, shown), color=color_of(data, trace), lw=0.9 if trace.is_raw else 1.3, label=label
+            )
             lines += line if axes is panels[0] else []
         _limits(axes, values, signed=signed, log=log)
         axes.set_ylabel(f"{name} ({unit})" if len(rows) > 1 else f"{title.lower()} ({unit})")
@@ -120,26 +123,93 @@ def _draw(
 
 
 def _limits(axes: Any, values: Sequence[Line], *, signed: bool, log: bool) -> None:
-    """So that the best and the worst run can be read: by a logarithm, or by leaving a far larger one out of the picture."""
-    tops = [float(np.nanmax(np.abs(one))) for one in values if np.isfinite(one).any()]
+    """Axis limits that keep the best and the worst run readable."""
+    tops = [float(np.nanmax(np.abs(errors))) for errors in values if np.isfinite(errors).any()]
     if log:
         axes.set_yscale("log")
-        plain_numbers(axes.yaxis)
+        plain_tick_labels(axes.yaxis)
         axes.set_ylim(min(tops) * 10.0**-DECADES, max(tops) * 2.0)
     elif signed:
         axes.axhline(0.0, color=INK, lw=0.6)
-        near = [top for top in tops if top <= APART * min(tops)]
+        near = [top for top in tops if top <= LINEAR_RATIO * min(tops)]
         most = max(near, default=0.0)
         axes.set_ylim(-1.15 * most, 1.15 * most) if most > 0.0 else None
     else:
         axes.set_ylim(0.0, 1.1 * max(tops, default=1.0) or 1.0)
 
 
-def _apart(values: Sequence[Line]) -> bool:
-    """Whether one scale cannot show them all: the largest errors differ by far."""
-    tops = [float(np.nanmax(one)) for one in values if np.isfinite(one).any()]
-    return len(tops) > 1 and min(tops) > 0.0 and max(tops) > APART * min(tops)
+def _needs_log_scale(values: Sequence[Line]) -> bool:
+    """Whether the largest errors differ too much for one linear scale."""
+    tops = [float(np.nanmax(errors)) for errors in values if np.isfinite(errors).any()]
+    return len(tops) > 1 and min(tops) > 0.0 and max(tops) > LINEAR_RATIO * min(tops)
 
 
-def _leaving(values: Sequence[Line]) -> bool:
-    return _apart([np.abs(one) for one in values])
+def _leaves_panel(values: Sequence[Line]) -> bool:
+    return _needs_log_scale([np.abs(errors) for errors in values])
+
+
+MAX_ROWS = 40
+MIN_EVENT_SHARE = 0.002  # of the duration, so that one sample in an hour is visible
+LANE_INCH, EDGES_INCH = 0.24, 0.75
+EVENT_COLORS = {"stop": HELD, "finding": AFTER, "worst": BEFORE}
+
+
+def event_lanes(data: RunData) -> Picture | None:
+    """Lane for each kind of event; None without events."""
+    kinds = [kind for kind in KINDS if any(event.kind == kind for event in data.events)]
+    if not kinds:
+        return None
+    height = EDGES_INCH + LANE_INCH * len(kinds)
+    panel = Panel(
+        partial(_draw_lanes, data=data, kinds=kinds),
+        height,
+        f"Events over time: {', '.join(map(event_label, kinds))}",
+        wide=True,
+    )
+    return Picture("events", "Events", "", (panel,))
+
+
+def event_table(data: RunData) -> Iterator[str]:
+    """Table of the first events of each kind by time, with the number of the others."""
+    shown = sorted(_first(data.events), key=lambda event: event.start_ns)
+    yield '<div class="scroll"><table><thead><tr><th>From (s)</th><th>For</th><th>What</th><th></th></tr></thead><tbody>'
+    for event in shown:
+        start_s, seconds = (event.start_ns - data.start_ns) * 1e-9, (event.end_ns - event.start_ns) * 1e-9
+        length = f"{format_number(seconds)} s" if seconds > 0.0 else "a moment"
+        yield (
+            f"<tr><td class=number>{start_s:.3f}</td><td class=number>{length}</td>"
+            f"<td class=entry>{event_label(event.kind)}</td><td>{text(event.text)}</td></tr>"
+        )
+    yield "</tbody></table></div>"
+    if len(shown) < len(data.events):
+        yield f'<p class="note">{len(data.events) - len(shown):,} more are drawn above but not listed.</p>'
+
+
+def event_label(kind: str) -> str:
+    """Kind of event as text."""
+    return {"worst": "worst error"}.get(kind, kind.replace("_", " "))
+
+
+def _first(events: Sequence[Event]) -> list[Event]:
+    """First events of every kind, the same number of each."""
+    kinds = {event.kind for event in events}
+    share = max(1, MAX_ROWS // max(len(kinds), 1))
+    return [event for kind in kinds for event in [other for other in events if other.kind == kind][:share]]
+
+
+def _draw_lanes(figure: Any, *, data: RunData, kinds: Sequence[str]) -> None:
+    axes = figure.subplots()
+    least = MIN_EVENT_SHARE * data.duration_s
+    for lane, kind in enumerate(kinds):
+        bars = []
+        for event in data.events:
+            if event.kind == kind:
+                first, length = (event.start_ns - data.start_ns) * 1e-9, (event.end_ns - event.start_ns) * 1e-9
+                bars.append((min(first, data.duration_s - least), max(length, least)))
+        axes.broken_barh(
+            bars, (-lane - 0.4, 0.8), color=EVENT_COLORS.get(kind, MARK), lw=0, label=f"{event_label(kind)}: {len(bars)}"
+        )
+    axes.set_yticks([-lane for lane in range(len(kinds))], [event_label(kind) for kind in kinds])
+    axes.tick_params(axis="y", length=0)
+    axes.set(xlim=(0.0, data.duration_s), ylim=(-len(kinds) + 0.4, 0.6), xlabel="time (s)")
+    axes.grid(visible=False, axis="y")

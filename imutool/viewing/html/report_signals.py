@@ -1,4 +1,4 @@
-"""What was measured and what was taken off it, by axis: samples, biases, spectra, and Allan deviations at rest."""
+"""Pictures of samples, biases, spectra and Allan deviations, by axis."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from imutool.inertial import stationary
 from imutool.noise import allan
 from imutool.recording import Imu
 from imutool.units import AXES, UNITS
-from imutool.viewing.html.drawing import Panel, Picture, averaged, extremes, legend, plain_numbers
+from imutool.viewing.html.drawing import Panel, Picture, average_log_bins, decimate_extremes, legend, plain_tick_labels
+from imutool.viewing.html.page import AXIS_COLORS, INK, TITLES
 from imutool.viewing.html.report_paths import color_of
-from imutool.viewing.html.report_wording import best, number, spoken, worst
-from imutool.viewing.html.theme import AXIS_COLORS, INK, TITLES
+from imutool.viewing.html.report_wording import best_run, format_number, run_name, worst_orientation_error
 from imutool.viewing.model.run_data import RunData, Trace
 
 SENSORS = ("gyro", "accel")
@@ -25,7 +25,7 @@ HEIGHT_INCH = 4.2
 ZOOM_S = 4.0
 SIGMAS = 3.0
 BAND_POINTS = 300
-LEAST_REST_S = 4.0  # in one piece, from which an Allan deviation says something
+MIN_REST_S = 4.0  # in one piece, for an Allan deviation
 NOUNS = {"gyro": "Angular rate", "accel": "Specific force"}
 
 Vectors = Float64[np.ndarray, "_ 3"]
@@ -33,35 +33,35 @@ Values = Float64[np.ndarray, " _"]
 
 
 def signals(data: RunData) -> Picture:
-    """Raw and corrected samples, each axis in a row: the lowest and the highest of every stretch are drawn."""
-    return _samples(data, "signals", "Signals", "Thinned without losing a peak.", (0.0, data.duration_s))
+    """Raw and corrected samples by axis, decimated with their extremes."""
+    return _samples(data, "signals", "Signals", "Decimated without losing a peak.", (0.0, data.duration_s))
 
 
 def zoom(data: RunData) -> Picture | None:
-    """The seconds around the largest orientation error of the best model; nothing without truth or model."""
-    chosen = best(data)
-    found = None if chosen is None or chosen.is_raw else worst(chosen, data)
+    """Samples around the largest orientation error of the best model."""
+    chosen = best_run(data)
+    found = None if chosen is None or chosen.is_raw else worst_orientation_error(chosen, data)
     if found is None or data.duration_s <= 2.0 * ZOOM_S:
         return None
     assert chosen is not None, "then nothing was found"
     first = min(max(found[1] - ZOOM_S / 2.0, 0.0), data.duration_s - ZOOM_S)
-    caption = f"Every sample of {ZOOM_S:g} s around the largest orientation error of {spoken(chosen)}."
+    caption = f"Every sample of {ZOOM_S:g} s around the largest orientation error of {run_name(chosen)}."
     return _samples(data, "zoom", "Signals where the error is largest", caption, (first, first + ZOOM_S))
 
 
 def biases(data: RunData) -> Picture | None:
-    """What each model took off, with three standard deviations where it states them, and the truth where known."""
+    """Bias of each model with three standard deviations where stated, and the true bias."""
     models = data.models()
     if not models:
         return None
     panels = [Panel(partial(_draw_bias, data=data, sensor=one), HEIGHT_INCH, f"{TITLES[one]} bias by axis") for one in SENSORS]
     band = " Bands: three standard deviations, as the model states them." * any(t.run.bias_std is not None for t in models)
     true = " Dashed: the true bias." * bool(data.true_bias)
-    return Picture("bias", "Biases", f"What each model took off the samples.{band}{true}", tuple(panels))
+    return Picture("bias", "Biases", f"The bias that each model subtracts.{band}{true}", tuple(panels))
 
 
 def spectrum(data: RunData) -> Picture | None:
-    """Amplitude densities of the samples up to half their rate; nothing for a log too short to have one."""
+    """Amplitude density of the samples up to half their rate; None for a short log."""
     if not any(trace.spectra for trace in data.traces):
         return None
     curves = {
@@ -80,15 +80,15 @@ def spectrum(data: RunData) -> Picture | None:
     return Picture("spectrum", "Spectra", "Amplitude density of the samples (Welch), up to half their rate.", tuple(panels))
 
 
-def at_rest(data: RunData) -> Picture | None:
-    """Allan deviations, raw and corrected, over the time in which the log rests.
+def allan_deviation(data: RunData) -> Picture | None:
+    """Allan deviations at rest, raw and corrected.
 
     Nothing where it does not rest for long, or where allantools is not installed (`left_out` says so).
     """
     if find_spec("allantools") is None:
         return None
     imu = data.traces[0].run.imu
-    ranges = [(a, b) for a, b in stationary.stretches(imu) if (b - a) * imu.period_s >= LEAST_REST_S]
+    ranges = [(a, b) for a, b in stationary.rest_stretches(imu) if (b - a) * imu.period_s >= MIN_REST_S]
     if not ranges:
         return None
     rest_s = sum(b - a for a, b in ranges) * imu.period_s
@@ -102,15 +102,15 @@ def at_rest(data: RunData) -> Picture | None:
         Panel(partial(_draw_allan, data=data, sensor=one, curves=curves[one]), HEIGHT_INCH, f"{TITLES[one]} Allan deviation")
         for one in SENSORS
     ]
-    caption = f"Over {number(rest_s)} s at rest in {len(ranges)} stretch{'es' * (len(ranges) > 1)}; overlapping."
+    caption = f"Over {format_number(rest_s)} s at rest in {len(ranges)} stretch{'es' * (len(ranges) > 1)}; overlapping."
     return Picture("allan", "Allan deviation at rest", caption, tuple(panels))
 
 
-def left_out() -> list[str]:
-    """Sentences about pictures that there could be if more were installed."""
+def missing_pictures() -> list[str]:
+    """Notes on pictures that need a package which is not installed."""
     if find_spec("allantools") is not None:
         return []
-    return ["Allan deviations are left out: allantools is not installed (pip install 'imutool[report]')."]
+    return ["Without Allan deviations: allantools is not installed (pip install 'imutool[report]')."]
 
 
 def _samples(data: RunData, name: str, title: str, caption: str, span_s: tuple[float, float]) -> Picture:
@@ -122,7 +122,7 @@ def _samples(data: RunData, name: str, title: str, caption: str, span_s: tuple[f
 
 
 def _by_axis(figure: Any, sensor: str, title: str, unit: str) -> list[Any]:
-    """Three panels under each other, x, y and z in their colours."""
+    """Three panels for x, y and z in their colours."""
     panels: list[Any] = list(figure.subplots(3, 1, sharex=True))
     for axis, axes in enumerate(panels):
         axes.set_ylabel(f"{AXES[axis]} ({unit})" if unit else AXES[axis], color=AXIS_COLORS[axis], fontweight="bold")
@@ -169,7 +169,7 @@ def _draw_bias(figure: Any, *, data: RunData, sensor: str) -> None:
 
 
 def _bands(panels: Sequence[Any], t: Values, bias: Vectors, half: Vectors, color: str) -> None:
-    """Three standard deviations about each axis: of every stretch that is a pixel wide, from its lowest to its highest."""
+    """Three standard deviations about each axis, per pixel from the lowest to the highest."""
     starts = np.unique(np.linspace(0, len(t) - 1, BAND_POINTS).astype(int))
     low, high = np.minimum.reduceat(bias - half, starts), np.maximum.reduceat(bias + half, starts)
     for k, axes in enumerate(panels):
@@ -180,7 +180,7 @@ def _draw_spectrum(figure: Any, *, data: RunData, sensor: str, curves: Sequence[
     panels = _by_axis(figure, sensor, f"{NOUNS[sensor]} ({UNITS[sensor]}/√Hz)", "")
     lines = []
     for trace, frequency_hz, density in curves:
-        at, power = averaged(frequency_hz, density, frequency_hz[0])
+        at, power = average_log_bins(frequency_hz, density, frequency_hz[0])
         drawn = [_log_line(axes, at, np.sqrt(power[:, k]), data, trace, k) for k, axes in enumerate(panels)]
         lines.append(drawn[0])
     _decades(panels)
@@ -200,25 +200,25 @@ def _draw_allan(figure: Any, *, data: RunData, sensor: str, curves: Sequence[Any
 
 
 def _line(axes: Any, t: Any, y: Any, name: str, axis: int, style: Mapping[str, Any]) -> Any:
-    return axes.plot(*extremes(t, y), label=name if axis == 0 else f"{name}, {AXES[axis]}", **style)[0]
+    return axes.plot(*decimate_extremes(t, y), label=name if axis == 0 else f"{name}, {AXES[axis]}", **style)[0]
 
 
 def _log_line(axes: Any, x: Any, y: Any, data: RunData, trace: Trace, axis: int) -> Any:
     name = trace.name if axis == 0 else f"{trace.name}, {AXES[axis]}"
-    shown = np.where(y > 0.0, y, np.nan)  # a constant has no density
+    shown = np.where(y > 0.0, y, np.nan)  # a constant has no spectrum
     under = trace.is_raw and bool(data.models())
     style: dict[str, Any] = {"color": color_of(data, trace), "lw": 1.8 if under else 1.0, "alpha": 0.55 if under else 1.0}
     return axes.plot(x, shown, label=name, **style)[0]
 
 
 def _decades(panels: Sequence[Any]) -> None:
-    """Logarithmic axes whose ends are whole decades upwards, so that every panel has labels."""
+    """Logarithmic axes with limits at whole decades, so that every panel has tick labels."""
     for axes in panels:
         axes.set_xscale("log")
         axes.set_yscale("log")
         low, high = axes.get_ylim()
         axes.set_ylim(10.0 ** np.floor(np.log10(low)), 10.0 ** np.ceil(np.log10(high)))
-        plain_numbers(axes.xaxis, axes.yaxis)
+        plain_tick_labels(axes.xaxis, axes.yaxis)
 
 
 def _both(imu: Imu) -> dict[str, Vectors]:

@@ -1,4 +1,4 @@
-"""What a report says in words and numbers: the conclusion, the cards, the labels of figures."""
+"""Words and numbers of a report: conclusion, key numbers, labels of figures."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 
 from imutool.viewing.model.run_data import RunData, Trace
 
-LABELS = {
+FIGURE_LABELS = {
     "aoe_deg": "Orientation error (AOE, °)",
     "aoe_aligned_deg": "Orientation error, aligned (°)",
     "ape_m": "Position error (APE, m)",
@@ -18,29 +18,29 @@ LABELS = {
     "roe_deg": "Turn over {} m (ROE, °)",
     "rpe_m": "Motion over {} m (RPE, m)",
 }
-SAME = 0.05  # closer than that, two errors are about the same
-COUNTS = ("samples", "duration_s")  # no errors
+SAME_WITHIN = 0.05  # relative difference up to which two errors count as the same
+NOT_ERRORS = ("samples", "duration_s")  # no errors
 
 
-def best(data: RunData) -> Trace | None:
-    """The model with the smallest orientation error, raw where there is none; nothing without truth."""
+def best_run(data: RunData) -> Trace | None:
+    """Run with the smallest orientation error, a model if there is one; None without truth."""
     scored = [trace for trace in data.traces if trace.figures.get("aoe_deg") is not None]
     models = [trace for trace in scored if not trace.is_raw]
     return min(models or scored, key=lambda trace: float(trace.figures["aoe_deg"]), default=None)
 
 
-def raw(data: RunData) -> Trace | None:
-    """The run as recorded, where it is among those shown."""
+def raw_run(data: RunData) -> Trace | None:
+    """Run as recorded, if it is shown."""
     return next((trace for trace in data.traces if trace.is_raw), None)
 
 
-def spoken(trace: Trace) -> str:
-    """A run's name within a sentence."""
+def run_name(trace: Trace) -> str:
+    """Name of a run within a sentence."""
     return trace.name.removeprefix("in the log: ")
 
 
-def number(value: float | None) -> str:
-    """A number as people read it: three digits, thousands as they are."""
+def format_number(value: float | None) -> str:
+    """Number with three digits and thousands separators."""
     if value is None or not np.isfinite(value):
         return "–"
     value = float(f"{value:.2e}") if abs(value) < 999.5 else value  # 0.9996 has two digits behind the point, as 1.00
@@ -51,27 +51,27 @@ def number(value: float | None) -> str:
     return f"{value:.{digits}f}" if size == 0.0 or size >= 1e-4 else f"{value:.1e}"
 
 
-def measure(value: float, unit: str) -> str:
-    """A number with its unit; from a kilometre on in kilometres."""
+def format_quantity(value: float, unit: str) -> str:
+    """Number with its unit; from one kilometre on in kilometres."""
     if unit == "m" and abs(value) >= 1000.0:
-        return f"{number(value / 1000.0)} km"
-    return f"{number(value)}{'' if unit == '°' else ' '}{unit}"
+        return f"{format_number(value / 1000.0)} km"
+    return f"{format_number(value)}{'' if unit == '°' else ' '}{unit}"
 
 
-def label(name: str) -> str:
-    """What a figure is called in a table: `roe_deg 5` is turned into words."""
+def figure_label(name: str) -> str:
+    """Label of a figure in a table, such as that of `roe_deg 5`."""
     key, _, distance = name.partition(" ")
-    return LABELS[key].format(distance) if key in LABELS else name.replace("_", " ")
+    return FIGURE_LABELS[key].format(distance) if key in FIGURE_LABELS else name.replace("_", " ")
 
 
-def aligned(data: RunData) -> str:
-    """What was done before errors were taken, in words."""
+def alignment_text(data: RunData) -> str:
+    """Alignment before errors are computed, as text."""
     how = {"none": "without alignment", "origin": "aligned at the start", "yaw": "aligned in position and heading"}
     return how.get(data.alignment, "aligned by a rigid motion")
 
 
-def worst(trace: Trace, data: RunData) -> tuple[float, float] | None:
-    """The largest orientation error (degrees) and when it was (s from the start)."""
+def worst_orientation_error(trace: Trace, data: RunData) -> tuple[float, float] | None:
+    """Largest orientation error (deg) and its time (s from the start)."""
     if trace.errors is None or not np.isfinite(trace.errors.orientation_total_deg).any():
         return None
     row = int(np.nanargmax(trace.errors.orientation_total_deg))
@@ -80,103 +80,105 @@ def worst(trace: Trace, data: RunData) -> tuple[float, float] | None:
 
 
 def conclusion(data: RunData) -> str:
-    """What a reader is to know first, in a sentence or two; figures are without alignment, whatever the pictures are."""
-    chosen, before = best(data), raw(data)
+    """Conclusion in one or two sentences, from figures without alignment."""
+    chosen, before = best_run(data), raw_run(data)
     if chosen is None:
         return _without_truth(data)
     if chosen.is_raw or before is None:
-        told = f"{spoken(chosen)} is wrong by {_errors(chosen)} over {number(data.duration_s)} s, without alignment"
+        text = f"{run_name(chosen)} has errors of {_errors(chosen)} over {format_number(data.duration_s)} s, without alignment"
     else:
-        told = f"{compared(chosen, before)} over {number(chosen.figures['duration_s'])} s, without alignment"
-    found = worst(chosen, data)
-    at = "" if found is None else f"; at worst by {measure(found[0], '°')}, {number(found[1])} s after the start"
-    at += f" ({aligned(data)})" * (found is not None and data.alignment != "none")
-    return f"{data.name}: {told}{at}."
+        text = f"{comparison(chosen, before)} over {format_number(chosen.figures['duration_s'])} s, without alignment"
+    found = worst_orientation_error(chosen, data)
+    at = "" if found is None else f"; at worst by {format_quantity(found[0], '°')}, {format_number(found[1])} s after the start"
+    at += f" ({alignment_text(data)})" * (found is not None and data.alignment != "none")
+    return f"{data.name}: {text}{at}."
 
 
-def compared(chosen: Trace, before: Trace) -> str:
-    """How a model stands to raw: orientation first, then position."""
+def comparison(chosen: Trace, before: Trace) -> str:
+    """Comparison of a model with raw: orientation first, then position."""
     parts: list[tuple[str, str]] = []
     for figure, what, unit in (("aoe_deg", "orientation", "°"), ("ape_m", "position", "m")):
         old, new = float(before.figures[figure]), float(chosen.figures[figure])
-        span = f"the {what} error from {measure(old, unit)} to {measure(new, unit)}"
-        if abs(new - old) <= SAME * max(old, new):
-            parts.append(("leaves", f"the {what} error about as it was ({measure(old, unit)}, now {measure(new, unit)})"))
+        span = f"the {what} error from {format_quantity(old, unit)} to {format_quantity(new, unit)}"
+        if abs(new - old) <= SAME_WITHIN * max(old, new):
+            parts.append(
+                ("leaves", f"the {what} error about as it was ({format_quantity(old, unit)}, now {format_quantity(new, unit)})")
+            )
         elif new < old:
-            parts.append(("cuts", f"{span} ({times(old, new)})"))
+            parts.append(("cuts", f"{span} ({ratio_text(old, new)})"))
         else:
-            parts.append(("raises", f"{span} ({times(new, old)})"))
+            parts.append(("raises", f"{span} ({ratio_text(new, old)})"))
     (does, first), (also, second) = parts
-    return f"{spoken(chosen)} {does} {first} and {second if also == does else f'{also} {second}'}"
+    return f"{run_name(chosen)} {does} {first} and {second if also == does else f'{also} {second}'}"
 
 
-def times(large: float, small: float) -> str:
-    """How many times: `31 times`."""
+def ratio_text(large: float, small: float) -> str:
+    """Ratio as text: `31 times`."""
     if small <= 0.0:
         return "to nothing"
     ratio = large / small
     return f"{ratio:.0f} times" if ratio >= 9.5 else f"{ratio:.1f} times"
 
 
-def overall(logs: Sequence[RunData]) -> str:
-    """The same of several logs: how often a model is better than raw, and the middle of what it brings."""
-    pairs = [(best(one), raw(one)) for one in logs]
+def summary_of_logs(logs: Sequence[RunData]) -> str:
+    """Summary of several logs: how often a model beats raw, and the median errors."""
+    pairs = [(best_run(data), raw_run(data)) for data in logs]
     scored = [(a, b) for a, b in pairs if a is not None and b is not None and not a.is_raw]
     if not scored:
-        with_truth = sum(one.truth is not None for one in logs)
-        return f"{len(logs)} logs, {with_truth} of them with truth, none of them both with truth and with a model."
+        with_truth = sum(data.truth is not None for data in logs)
+        return f"{len(logs)} logs, {with_truth} of them with truth, none with both truth and a model."
     better = sum(float(a.figures["aoe_deg"]) < float(b.figures["aoe_deg"]) for a, b in scored)
     new, old = (float(np.median([run.figures["aoe_deg"] for run in side])) for side in zip(*scored, strict=True))
     return (
         f"In {better} of {len(scored)} logs the best model has a smaller orientation error than raw: "
-        f"{measure(new, '°')} instead of {measure(old, '°')} in the middle (median), without alignment."
+        f"{format_quantity(new, '°')} instead of {format_quantity(old, '°')} (medians), without alignment."
     )
 
 
-def cards(data: RunData) -> list[tuple[str, str]]:
-    """The numbers to be seen first, each with what it is of."""
-    told = [(f"{number(data.duration_s)} s", f"{len(data.traces[0].run.imu):,} samples at {rate_hz(data):.0f} Hz")]
-    chosen, before = best(data), raw(data)
-    for trace in dict.fromkeys(one for one in (before, chosen) if one is not None and one.figures):
-        told.append((measure(float(trace.figures["aoe_deg"]), "°"), f"orientation error, {spoken(trace)}"))
-        told.append((measure(float(trace.figures["ape_m"]), "m"), f"position error, {spoken(trace)}"))
+def key_numbers(data: RunData) -> list[tuple[str, str]]:
+    """Key numbers of a log, each with its caption."""
+    numbers = [(f"{format_number(data.duration_s)} s", f"{len(data.traces[0].run.imu):,} samples at {rate_hz(data):.0f} Hz")]
+    chosen, before = best_run(data), raw_run(data)
+    for trace in dict.fromkeys(trace for trace in (before, chosen) if trace is not None and trace.figures):
+        numbers.append((format_quantity(float(trace.figures["aoe_deg"]), "°"), f"orientation error, {run_name(trace)}"))
+        numbers.append((format_quantity(float(trace.figures["ape_m"]), "m"), f"position error, {run_name(trace)}"))
     if chosen is not None and (window := _window(chosen, 10.0)) is not None:
-        told.append((measure(window, "°"), f"drift in 10 s, {spoken(chosen)}"))
+        numbers.append((format_quantity(window, "°"), f"drift in 10 s, {run_name(chosen)}"))
     if (count := sum(event.kind != "worst" for event in data.events)) > 0:
-        told.append((f"{count:,}", "events"))
-    return told
+        numbers.append((f"{count:,}", "events"))
+    return numbers
 
 
 def rate_hz(data: RunData) -> float:
-    """Samples a second, by the median step."""
+    """Sample rate by the median step."""
     return 1.0 / data.traces[0].run.imu.period_s
 
 
-def lowest(values: Sequence[float | None], name: str) -> int | None:
-    """Which of several figures is the best one; none where there is nothing to choose from, or what is counted is no error."""
+def index_of_best(values: Sequence[float | None], name: str) -> int | None:
+    """Index of the smallest error; None for fewer than two values or for counts."""
     known = [(value, k) for k, value in enumerate(values) if value is not None]
-    if name in COUNTS or len(known) < 2 or min(known)[0] == max(known)[0]:
+    if name in NOT_ERRORS or len(known) < 2 or min(known)[0] == max(known)[0]:
         return None
     return min(known)[1]
 
 
 def unit_of(name: str) -> str:
-    """The unit that ends the name of a figure."""
+    """Unit at the end of a figure's name."""
     return "°" if re.search(r"_deg\b", name) else "m" if re.search(r"_m\b", name) else ""
 
 
 def _window(trace: Trace, length_s: float) -> float | None:
-    return next((one.orientation_deg for one in trace.windows if one.length_s == length_s), None)
+    return next((window.orientation_deg for window in trace.windows if window.length_s == length_s), None)
 
 
 def _errors(trace: Trace) -> str:
-    return f"{measure(float(trace.figures['aoe_deg']), '°')} and {measure(float(trace.figures['ape_m']), 'm')}"
+    return f"{format_quantity(float(trace.figures['aoe_deg']), '°')} and {format_quantity(float(trace.figures['ape_m']), 'm')}"
 
 
 def _without_truth(data: RunData) -> str:
-    told = f"{data.name}: {number(data.duration_s)} s without truth, so nothing says how wrong it is."
+    sentence = f"{data.name}: {format_number(data.duration_s)} s without truth, so its errors are unknown."
     for trace in data.models():
         gyro, accel = (np.linalg.norm(bias.mean(axis=0)) for bias in (trace.run.gyro_bias, trace.run.accel_bias))
-        off = f"{np.degrees(gyro):.3g}°/s off the angular rate and {accel:.3g} m/s² off the specific force"
-        told += f" {spoken(trace)} takes {off}."
-    return told
+        off = f"{np.degrees(gyro):.3g}°/s from the angular rate and {accel:.3g} m/s² from the specific force"
+        sentence += f" {run_name(trace)} subtracts {off}."
+    return sentence

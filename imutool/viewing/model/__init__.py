@@ -1,1 +1,1 @@
-"""What a picture of a log shows, free of any viewer."""
+"""Data of a view, free of any viewer."""

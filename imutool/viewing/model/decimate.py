@@ -1,21 +1,21 @@
-"""Which rows of a long curve or path to draw, so that nothing a person would see is lost."""
+"""Decimate curves and paths for drawing without losing a visible detail."""
 
 from __future__ import annotations
 
 import numpy as np
 from jaxtyping import Float64, Int64
 
-MOST = 300_000  # rows of a curve: up to here it is drawn whole (25 minutes at 200 Hz); an hour would take a viewer over 1 GB
-MOST_IN_3D = 20_000  # rows of a path: the screen has no more pixels along it
+MAX_CURVE_ROWS = 300_000  # of a curve that is drawn whole (25 minutes at 200 Hz); an hour would take a viewer over 1 GB
+MAX_PATH_ROWS = 20_000  # of a path: a screen has no more pixels along it
 
 Rows = Int64[np.ndarray, " m"]
 
 
-def curve_rows(values: Float64[np.ndarray, "n k"], most: int = MOST) -> Rows:
-    """Rows of a curve to draw, at most `most`, in order: all, or of equal buckets the lowest and highest of every column.
+def curve_rows(values: Float64[np.ndarray, "n k"], most: int = MAX_CURVE_ROWS) -> Rows:
+    """Decimate a curve to `most` rows: per bucket the lowest and highest of every column.
 
-    The first and the last row are always among them; of a bucket with rows that are not a number one such row, so that a hole
-    stays a hole. `most` is at least 2 k + 3.
+    The first and the last row are always drawn, and of a bucket with NaN rows one such row, so that a hole stays a hole.
+    `most` is at least 2 k + 3.
     """
     n, columns = values.shape
     if n <= most:
@@ -23,7 +23,7 @@ def curve_rows(values: Float64[np.ndarray, "n k"], most: int = MOST) -> Rows:
     buckets = max(1, (most - 2) // (2 * columns + 1))
     size = -(-n // buckets)
     starts = np.arange(0, n, size)
-    padded = np.full((columns, len(starts) * size), np.nan)  # by column: what lies side by side is searched many times faster
+    padded = np.full((columns, len(starts) * size), np.nan)  # by column: contiguous values are searched many times faster
     padded[:, :n] = values.T
     cut = padded.reshape(columns, len(starts), size)
     hole = np.isnan(cut)
@@ -37,12 +37,11 @@ def curve_rows(values: Float64[np.ndarray, "n k"], most: int = MOST) -> Rows:
     return rows
 
 
-def path_rows(p_wb: Float64[np.ndarray, "n 3"], most: int = MOST_IN_3D) -> Rows:
-    """Rows of a path to draw, at most `most`, in order: all, or half of them even in time and half even along the path.
+def path_rows(p_wb: Float64[np.ndarray, "n 3"], most: int = MAX_PATH_ROWS) -> Rows:
+    """Decimate a path to at most `most` rows: half even in time, half even along the path.
 
-    So a row left out follows one that is drawn by less than 2 / (most - 2) of the path's length and of its rows: a fast stretch
-    keeps its shape, and so does a small one beside a path that left for kilometres. The first and the last row are always among
-    them.
+    A row left out follows a drawn one by less than 2 / (most - 2) of the path's length and of its rows: a fast part keeps its
+    shape, and so does a small part of a path that left for kilometres. The first and the last row are always drawn.
     """
     n = len(p_wb)
     if n <= most:

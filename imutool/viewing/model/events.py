@@ -1,16 +1,21 @@
-"""What happened in a log and when: gaps, stops, saturation, clock jumps, the worst error, what a diagnosis found."""
+"""Events in a log: gaps, rest, saturation, clock jumps, the worst error."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
-from typing import Literal, get_args
+from pathlib import Path
+from typing import Annotated, Literal, get_args
 
+import msgspec
 import numpy as np
+from msgspec import Meta
 
 from imutool.cleaning import Survey
+from imutool.diagnosis.result import SCHEMA
+from imutool.errors import ConfigError, DataError
 from imutool.inertial import stationary
-from imutool.recording import Imu
+from imutool.recording import Imu, nanoseconds
 from imutool.viewing.model.trajectory_error import Errors
 
 Kind = Literal[
@@ -18,7 +23,7 @@ Kind = Literal[
 ]
 KINDS: tuple[Kind, ...] = get_args(Kind)
 
-OF_RULE: Mapping[str, Kind] = {
+KIND_OF_RULE: Mapping[str, Kind] = {
     "gaps": "gap",
     "time_back": "out_of_order",
     "clock_jumps": "clock_jump",
@@ -28,14 +33,14 @@ OF_RULE: Mapping[str, Kind] = {
     "duplicates": "duplicate",
     "not_finite": "not_finite",
 }
-MOST_PER_KIND = 100
-DIGITS = 1000.0  # from here on all digits before the point, rather than an exponent
-LONGEST_TEXT = 300  # letters; some come from files of others
+MAX_EVENTS_PER_KIND = 100
+EXPONENT_FROM = 1000.0  # a larger error is written with all digits instead of an exponent
+MAX_TEXT_LENGTH = 300  # letters; some come from files of others
 
 
 @dataclass(frozen=True)
 class Event:
-    """A stretch of time (or a moment: `start_ns == end_ns`) by header stamp, and what happened in words."""
+    """Event from `start_ns` to `end_ns` (equal for a moment) by header stamp, with a text."""
 
     kind: Kind
     start_ns: int
@@ -43,13 +48,13 @@ class Event:
     text: str
 
 
-def of_survey(survey: Survey) -> tuple[list[Event], list[str]]:
-    """What `imutool.cleaning` found at some time, and sentences for what it found without one, or at more times than it
+def survey_events(survey: Survey) -> tuple[list[Event], list[str]]:
+    """Events from a cleaning survey, and notes on findings without times or with too many.
     kept.
     """
     found, notes = [], []
     for finding in survey.findings:
-        kind = OF_RULE.get(finding.rule)
+        kind = KIND_OF_RULE.get(finding.rule)
         if kind is None or not finding.intervals_ns:
             notes.append(f"{finding.what}.")
             continue
@@ -57,45 +62,130 @@ def of_survey(survey: Survey) -> tuple[list[Event], list[str]]:
             length = f" for {(end_ns - start_ns) * 1e-9:.3g} s" if end_ns > start_ns else ""
             found.append(Event(kind, start_ns, end_ns, f"{finding.what}{length} ({finding.count} in the log)"))
         if finding.intervals_left_out:
-            notes.append(f"{finding.what}: {finding.intervals_left_out} more places than the events name.")
+            notes.append(f"{finding.what}: {finding.intervals_left_out} more intervals are not listed as events.")
     return found, notes
 
 
-def of_stops(imu: Imu) -> list[Event]:
-    """The stretches in which the IMU rests (`imutool.inertial.stationary`)."""
-    ends = ((int(imu.t_ns[first]), int(imu.t_ns[end - 1])) for first, end in stationary.stretches(imu))
+def stop_events(imu: Imu) -> list[Event]:
+    """Intervals in which the IMU rests (`imutool.inertial.stationary`)."""
+    ends = ((int(imu.t_ns[first]), int(imu.t_ns[end - 1])) for first, end in stationary.rest_stretches(imu))
     return [Event("stop", first, last, f"at rest for {(last - first) * 1e-9:.1f} s") for first, last in ends]
 
 
-def of_worst(name: str, errors: Errors) -> Iterator[Event]:
-    """The moments of a run's largest orientation and position error; none where no error is known."""
+def worst_error_events(name: str, errors: Errors) -> Iterator[Event]:
+    """Moments of a run's largest orientation and position error; none without errors."""
     of_kind = (("orientation", errors.orientation_total_deg, "deg"), ("position", errors.position_total_m, "m"))
     for kind, total, unit in of_kind:
         if np.isfinite(total).any():
             row = int(np.nanargmax(total))
             at_ns = int(errors.t_ns[row])
-            size = f"{total[row]:.3g}" if total[row] < DIGITS else f"{total[row]:.0f}"
+            size = f"{total[row]:.3g}" if total[row] < EXPONENT_FROM else f"{total[row]:.0f}"
             yield Event("worst", at_ns, at_ns, f"{name}: largest {kind} error, {size} {unit}")
 
 
-def gathered(events: Iterable[Event], start_ns: int, end_ns: int) -> tuple[tuple[Event, ...], tuple[str, ...]]:
-    """The events within the log, by time; of a kind with more than `MOST_PER_KIND` the longest, the others counted in a note.
+def events_within(events: Iterable[Event], start_ns: int, end_ns: int) -> tuple[tuple[Event, ...], tuple[str, ...]]:
+    """Events within a log by time, the longest of each kind, with notes that count the others.
 
-    Events partly outside are cut to the log's time, those wholly outside (stamps of another century) counted in a note.
+    An event that is partly outside is cut to the log's time; a note counts those wholly outside (stamps of another century).
     """
     kept: list[Event] = []
     notes = []
     events = list(events)
     for kind in KINDS:
-        every = [event for event in events if event.kind == kind]
-        inside = [event for event in every if event.start_ns <= end_ns and event.end_ns >= start_ns]
-        longest = sorted(inside, key=lambda event: event.start_ns - event.end_ns)[:MOST_PER_KIND]
+        of_kind = [event for event in events if event.kind == kind]
+        inside = [event for event in of_kind if event.start_ns <= end_ns and event.end_ns >= start_ns]
+        longest = sorted(inside, key=lambda event: event.start_ns - event.end_ns)[:MAX_EVENTS_PER_KIND]
         named = kind.replace("_", " ")
-        if len(every) > len(inside):
-            notes.append(
-                f"Events of kind {named}: {len(every) - len(inside)} lie outside the log's own time and are not shown."
-            )
+        if len(of_kind) > len(inside):
+            notes.append(f"Events of kind {named}: {len(of_kind) - len(inside)} lie outside the log and are not shown.")
         if len(inside) > len(longest):
             notes.append(f"Events of kind {named}: the {len(longest)} longest are shown, {len(inside) - len(longest)} are not.")
-        kept += (Event(kind, max(one.start_ns, start_ns), min(one.end_ns, end_ns), one.text[:LONGEST_TEXT]) for one in longest)
+        kept += (
+            Event(kind, max(one.start_ns, start_ns), min(one.end_ns, end_ns), one.text[:MAX_TEXT_LENGTH]) for one in longest
+        )
     return tuple(sorted(kept, key=lambda event: (event.start_ns, event.end_ns))), tuple(notes)
+
+
+FINDINGS = "findings.json"
+MAX_BYTES = 64 << 20  # a diagnosis of hours has some 100 kB
+MAX_NAMED_EFFECTS = 3  # effects in an event's words
+MAX_TIME_S = 1e9  # thirty years: beyond, a number is no time in a log
+
+Time = Annotated[float, Meta(ge=-MAX_TIME_S, le=MAX_TIME_S)]
+
+
+class _Located(msgspec.Struct):
+    signal: str
+    axes: list[str] = []
+    intervals_s: list[tuple[Time, Time]] = []
+    regime: str = ""
+    share: float | None = None
+    log: str = ""
+
+
+class _Finding(msgspec.Struct):
+    effect: str
+    signal: str = ""
+    driver: str = ""
+
+
+class _Diagnosis(msgspec.Struct):
+    schema: Literal["imutool.diagnosis/1"]
+    real: list[str]
+    located: list[_Located] = []
+    findings: list[_Finding] = []
+
+
+def finding_events(folder: Path, log: str, start_ns: int, end_ns: int) -> tuple[list[Event], list[str]]:
+    """Events of the located findings of a log (by file name), and notes on the others.
+
+    Times of a place count from the start of its log, or of the first where it names none. What is located without a time acts
+    everywhere. Of a place with more stretches than are ever shown, the longest.
+
+    Raises:
+        ConfigError: the folder holds no diagnosis, or it cannot be read.
+        DataError: its findings.json is not one.
+    """
+    found = _read(folder / FINDINGS)
+    first = found.real[0] if found.real else "no log"
+    here = [place for place in found.located if Path(place.log or first).name == log]
+    if Path(first).name != log and not here:
+        return [], [f"The findings of {folder.name} are on the clock of {Path(first).name} and are not marked in {log}."]
+    events, notes = [], []
+    for place in here:
+        text = _words(place, found.findings)
+        longest = sorted(place.intervals_s, key=lambda one: one[0] - one[1])
+        if len(longest) > MAX_EVENTS_PER_KIND:
+            notes.append(f"{text}: {len(longest) - MAX_EVENTS_PER_KIND} shorter stretches are not marked.")
+        for first_s, last_s in longest[:MAX_EVENTS_PER_KIND] or [(0.0, (end_ns - start_ns) * 1e-9)]:
+            low, high = sorted((start_ns + nanoseconds(first_s), start_ns + nanoseconds(last_s)))
+            events.append(Event("finding", low, high, text))
+    unplaced = found.findings if not found.located else []
+    notes += [f"Diagnosis: {one.effect} on {one.signal}, at no time of its own." for one in unplaced[:MAX_EVENTS_PER_KIND]]
+    return events, notes
+
+
+def _words(place: _Located, findings: list[_Finding]) -> str:
+    """Signal, axes, regime and share, and the strongest effects found on that signal."""
+    what = f"{place.signal} {', '.join(place.axes)}".strip()
+    share = "" if place.share is None else f", {100.0 * place.share:.0f} % of its misfit"
+    of_signal = [one for one in findings if place.signal in one.signal or one.signal in ("both", "imu")]
+    effects = [f"{one.effect} ({one.driver})" if one.driver else one.effect for one in of_signal[:MAX_NAMED_EFFECTS]]
+    because = f": {', '.join(effects)}" if effects else ""
+    return f"{what}{f', {place.regime}' if place.regime else ''}{share}{because}"
+
+
+def _read(path: Path) -> _Diagnosis:
+    try:
+        with path.open("rb") as file:
+            raw = file.read(MAX_BYTES + 1)
+    except OSError as error:
+        raise ConfigError(
+            f"cannot be read ({error.strerror})", where=path, expected="the folder of a diagnosis (imutool diagnose -o DIR)"
+        ) from error
+    if len(raw) > MAX_BYTES:
+        raise DataError(f"is longer than {MAX_BYTES} bytes", where=path, expected="the findings of one diagnosis")
+    try:
+        return msgspec.json.decode(raw, type=_Diagnosis)
+    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
+        raise DataError(f"is no diagnosis ({error})", where=path, expected=f"JSON of {SCHEMA}") from error

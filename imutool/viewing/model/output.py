@@ -1,4 +1,4 @@
-"""What was opened or written to be looked at, in a sentence for people and in fields for programs."""
+"""Output that was opened or written, as a sentence and as fields."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ How = Literal["viewer", "connect", "rrd", "web", "folder", "png", "html"]
 
 
 class Output(NamedTuple):
-    """One way to look that was taken: `place` is a URL or a path, `said` says it and how to go on."""
+    """Output of a view: `place` is a URL or a path, `said` a sentence on how to open it."""
 
     how: How
     place: str

@@ -1,19 +1,30 @@
-"""From a log on disk to what there is to see of it: raw, as it was debiased in the log, and with each model asked for."""
+"""Load a log for viewing: raw and debiased runs with errors, events and provenance."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import platform
+from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
+from types import MappingProxyType
+from typing import NamedTuple
 
+import numpy as np
+from jaxtyping import Bool
+
+from imutool import __version__
+from imutool.errors import ConfigError
+from imutool.inertial.metrics import evaluate
+from imutool.inertial.strapdown import StartPose, dead_reckon, stretch_with_truth, with_velocity
 from imutool.location import Location
-from imutool.recording import Recording
-from imutool.viewing.model.events import of_survey
-from imutool.viewing.model.findings import of_findings
-from imutool.viewing.model.provenance import provenance
-from imutool.viewing.model.read_log import recorded
-from imutool.viewing.model.run_data import Run, RunData, build
-from imutool.viewing.model.trajectory_error import Alignment
+from imutool.recording import Imu, Poses, Recording, Scalars, seconds
+from imutool.viewing.model.decimate import MAX_CURVE_ROWS
+from imutool.viewing.model.events import Event, events_within, finding_events, stop_events, survey_events, worst_error_events
+from imutool.viewing.model.read_log import read_log
+from imutool.viewing.model.run_data import LEVELLING_S, TRUE_BIAS, TRUTH, Run, RunData, Trace, level_start, spectra
+from imutool.viewing.model.trajectory_error import Alignment, aligned, drift_since_reset, errors, windows
 
 
 def load(
@@ -27,50 +38,190 @@ def load(
     align: Alignment = "none",
     findings: Path | None = None,
 ) -> RunData:
-    """Everything to be shown of one log; with `findings`, the folder of a diagnosis, also where they act in it.
+    """Load all data of one log for viewing, with the events of a diagnosis in `findings`.
 
     Raises:
         ConfigError: the log or the folder cannot be read; two models of one name; `smooth` with another `init` than auto.
-        LogError, DataError: no IMU, a log in which nothing can be saved, findings that are none, or as `rundata.build`.
+        LogError, DataError: no IMU, a log from which nothing can be recovered, an invalid findings.json, or as `build`.
         ModelError: a model that cannot be used with this log.
     """
-    found = recorded(log, imu=imu, truth=truth)
-    recording = found.recording
+    contents = read_log(log, imu=imu, truth=truth)
+    recording = contents.recording
     if recording.truths:
         recording = recording.with_truth(truth or next(iter(recording.truths)))
-    with_models, told = _with_models(recording, models, init, str(log), smooth) if models else ([], {})
-    events, notes = of_survey(found.survey)
+    with_models, origins = _with_models(recording, models, init, str(log), smooth) if models else ([], {})
+    events, notes = survey_events(contents.survey)
     if findings is not None:
         start_ns, end_ns = int(recording.imu.t_ns[0]), int(recording.imu.t_ns[-1])
-        more = of_findings(findings, log.name, start_ns, end_ns)
-        events, notes = [*events, *more[0]], [*notes, *more[1]]
+        more_events, more_notes = finding_events(findings, log.name, start_ns, end_ns)
+        events, notes = [*events, *more_events], [*notes, *more_notes]
     data = build(
         recording,
-        [Run.raw(recording.imu), *with_models, *found.debiased],
+        [Run.raw(recording.imu), *with_models, *contents.debiased],
         align=align,
         events=events,
-        notes=[*found.notes, *notes],
+        notes=[*contents.notes, *notes],
     )
-    asked = {"start": init, "smooth": "yes"} if smooth else {"start": init} if models else {}
+    settings = {"start": init, "smooth": "yes"} if smooth else {"start": init} if models else {}
     return replace(
         data,
-        provenance=provenance(log, recording, found.metadata, told, asked),
+        provenance=provenance(log, recording, contents.metadata, origins, settings),
         source=log if isinstance(log, Path) else None,
-        logged=found.logged,
+        logged=contents.logged,
     )
 
 
 def _with_models(
     recording: Recording, models: Sequence[str | Path], init: str, log: str, smooth: bool
 ) -> tuple[list[Run], dict[str, str]]:
-    """As each model corrects the samples, and in words which file that is and how it started; only this needs torch."""
-    from imutool.debiasing import apply_with_std
+    """Run of each model, and by its name its file digest, method and start bias."""
+    from imutool.bias_start.correction import apply_with_std
     from imutool.evaluation import started
 
-    runs, told = [], {}
+    runs, origins = [], {}
     for name, model, start in started(recording, models, init, log, smooth=smooth):
         debiased, std = apply_with_std(model, start, recording.imu)
         runs.append(Run(name, debiased.imu, debiased.bias[:, :3], debiased.bias[:, 3:], std))
         digest = model.card.get("sha256")
-        told[name] = f"{f'sha256 {digest}, ' if digest else ''}{model.method}, start: {start.how}"
-    return runs, told
+        origins[name] = f"{f'sha256 {digest}, ' if digest else ''}{model.method}, start: {start.how}"
+    return runs, origins
+
+
+def build(
+    recording: Recording,
+    runs: Sequence[Run],
+    *,
+    align: Alignment = "none",
+    events: Sequence[Event] = (),
+    notes: Sequence[str] = (),
+) -> RunData:
+    """Build the data of a view from a recording and its runs.
+
+    With truth every path starts at the true pose and velocity of the first sample that has one and ends with the last such
+    sample; figures, drift and windows are of that path, errors after the alignment asked for. Without, a path starts at the
+    origin, at rest, level by the first half second of its own specific force and with heading zero, and there are no errors.
+
+    Raises:
+        ConfigError: no run, or two of one name.
+        DataError: IMU and truth share fewer than two samples, or leave the alignment open.
+        NumericsError: an integration overflows.
+    """
+    names = [run.name for run in runs]
+    if not names or len(set(names)) < len(names) or TRUTH in names:
+        raise ConfigError(
+            f"the runs have the names {names}", where=recording.name, expected="different names, none of them 'truth'"
+        )
+    imu = recording.imu
+    start_ns, end_ns = int(imu.t_ns[0]), int(imu.t_ns[-1])
+    if recording.truths:
+        truth = with_velocity(recording.truth)
+        traces, of_paths = _scored(runs, truth, recording.name, align)
+    else:
+        truth, align = None, "none"
+        traces = tuple(Trace(run, dead_reckon(run.imu, level_start(run.imu)), None, spectra=spectra(run.imu)) for run in runs)
+        of_paths = [
+            f"This log has no truth, so there are no errors and nothing to align with. Paths start at the origin, at rest, "
+            f"heading 0, levelled by the first {LEVELLING_S:g} s of specific force."
+        ]
+    with_worst = [trace for trace in traces if not trace.is_raw] or traces
+    worst = [one for trace in with_worst if trace.errors is not None for one in worst_error_events(trace.name, trace.errors)]
+    shown, of_events = events_within([*events, *stop_events(imu), *worst], start_ns, end_ns)
+    return RunData(
+        name=recording.name,
+        start_ns=start_ns,
+        end_ns=end_ns,
+        truth=None if truth is None else truth.between(start_ns, end_ns),
+        true_bias=_true_bias(recording),
+        traces=traces,
+        notes=(*of_paths, *_decimation_note(imu), *notes, *of_events),
+        alignment=align,
+        events=shown,
+    )
+
+
+def _true_bias(recording: Recording) -> Mapping[str, Scalars]:
+    """True biases in the log, while the IMU runs."""
+    imu = recording.imu
+    known = {kind: recording.scalars[topic] for kind, topic in TRUE_BIAS.items() if topic in recording.scalars}
+    return MappingProxyType({kind: b.between(int(imu.t_ns[0]), int(imu.t_ns[-1])) for kind, b in known.items()})
+
+
+def _scored(runs: Sequence[Run], truth: Poses, where: str, align: Alignment) -> tuple[tuple[Trace, ...], list[str]]:
+    """Runs from the first to the last sample with truth, with their errors and figures, and notes."""
+    known: list[TruthSpan] = []
+    for k, run in enumerate(runs):
+        alike = k > 0 and np.array_equal(run.imu.t_ns, runs[k - 1].imu.t_ns)
+        known.append(known[-1] if alike else TruthSpan(*stretch_with_truth(run.imu.t_ns, truth, where)))
+    with ThreadPoolExecutor() as pool:  # nearly all of it is numpy's, which lets other threads work
+        scored = list(pool.map(partial(_score, align=align), runs, known))
+    traces, motions = tuple(trace for trace, _ in scored), [motion for _, motion in scored if motion]
+    started = seconds(traces[0].path.t_ns[:1], int(runs[0].imu.t_ns[0]))[0]
+    how = "errors are without alignment" if align == "none" else f"paths and errors are shown after alignment {align}"
+    return traces, [
+        f"Paths start at the true pose, {started:.2f} s into the log; {how}.",
+        *(["The figures, drift and windows are without alignment."] if motions else []),
+        *motions,
+    ]
+
+
+class TruthSpan(NamedTuple):
+    """Span with truth: rows of the IMU, true poses, and a mask of the rows outside gaps."""
+
+    rows: slice
+    true: Poses
+    valid: Bool[np.ndarray, " n"]
+
+
+def _score(run: Run, known: TruthSpan, align: Alignment) -> tuple[Trace, str]:
+    """One run with its errors and figures, and a note on its alignment, if any."""
+    rows, true, valid = known
+    path = dead_reckon(run.imu.rows(rows), StartPose.of(true))
+    moved, motion = aligned(path, true, valid, align)
+    of_truth = (drift_since_reset(path, true, valid), windows(path, true, valid), MappingProxyType(evaluate(path, true, valid)))
+    trace = Trace(run, moved, errors(moved, true, valid), *of_truth, spectra=spectra(run.imu))
+    if align == "none":
+        return trace, ""
+    shift_m = np.linalg.norm(moved.p_wb[valid].mean(axis=0) - path.p_wb[valid].mean(axis=0))
+    turn_deg = np.rad2deg(motion.rotation.magnitude())
+    return trace, f"{run.name}: alignment {align} turned the path by {turn_deg:.3g} deg, its centre moved {shift_m:.3g} m."
+
+
+def _decimation_note(imu: Imu) -> list[str]:
+    """Note on a log too long to be drawn whole."""
+    if len(imu) <= MAX_CURVE_ROWS:
+        return []
+    return [f"Curves of {len(imu)} samples are drawn with at most {MAX_CURVE_ROWS} rows that include every local extreme."]
+
+
+METADATA_PREFIX = "imutool"  # of the names of metadata records that imutool writes
+MAX_ENTRIES = 60  # from the log's records, which anybody may have written
+MAX_VALUE_LENGTH = 200  # letters
+
+
+def provenance(
+    log: Location,
+    recording: Recording,
+    metadata: Sequence[tuple[str, Mapping[str, str]]],
+    models: Mapping[str, str],
+    settings: Mapping[str, str],
+) -> dict[str, str]:
+    """Provenance by name: file, topics, settings, models, versions, imutool's metadata records.
+
+    There is no digest of the log, which may have terabytes. Long values are cut, entries beyond MAX_ENTRIES counted.
+    """
+    entries = {"file": log.name, "size": f"{log.stat().st_size} bytes", "IMU": recording.imu_topic}
+    if recording.truths:
+        entries["truth"] = next(iter(recording.truths))
+    entries |= {**settings, **{f"model {name}": how for name, how in models.items()}}
+    entries |= {"imutool": __version__, "numpy": np.__version__, "python": platform.python_version()}
+    records = [
+        (name, key, value) for name, values in metadata if name.startswith(METADATA_PREFIX) for key, value in values.items()
+    ]
+    entries |= {_cut(f"{name}: {key}"): value for name, key, value in records[:MAX_ENTRIES]}
+    if len(records) > MAX_ENTRIES:
+        entries["more in the log's records"] = f"{len(records) - MAX_ENTRIES} entries"
+    return {key: _cut(value) for key, value in entries.items()}
+
+
+def _cut(text: str) -> str:
+    return text if len(text) <= MAX_VALUE_LENGTH else f"{text[: MAX_VALUE_LENGTH - 1]}…"

@@ -1,4 +1,4 @@
-"""How far an estimate is from the truth over time: errors by axis, by angle and by direction, drift since a reset, windows."""
+"""Trajectory errors over time, drift since a reset, and drift over windows."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from imutool.errors import DataError
 from imutool.geometry import quaternion
 from imutool.inertial.metrics import align
-from imutool.inertial.strapdown import drift, drifted
+from imutool.inertial.strapdown import drift, window_drift
 from imutool.recording import Poses, Times, nanoseconds
 
 Alignment = Literal["none", "origin", "yaw", "se3"]
@@ -23,7 +23,7 @@ WINDOWS_S = (1.0, 5.0, 10.0, 30.0)
 
 @dataclass(frozen=True, eq=False)
 class Errors:
-    """How far an estimate is from the truth at its own stamps; a row is NaN where there is no truth to compare with."""
+    """Errors of an estimate at its own stamps; NaN where the truth is unknown."""
 
     t_ns: Times
     orientation_deg: Float64[np.ndarray, "n 3"]  # Log(R_true^T R_estimated), in the true body frame
@@ -32,28 +32,28 @@ class Errors:
 
     @property
     def orientation_total_deg(self) -> Float64[np.ndarray, " n"]:
-        """The angle of the orientation error, 0 to 180 degrees."""
+        """Angle of the orientation error, 0 to 180 degrees."""
         return quaternion.length(self.orientation_deg)
 
     @property
     def position_total_m(self) -> Float64[np.ndarray, " n"]:
-        """The length of the position error."""
+        """Length of the position error."""
         return quaternion.length(self.position_m)
 
     @property
     def horizontal_m(self) -> Float64[np.ndarray, " n"]:
-        """The length of the position error in the world's horizontal plane."""
+        """Length of the position error in the world's horizontal plane."""
         return quaternion.length(self.position_m[:, :2])
 
     @property
     def vertical_m(self) -> Float64[np.ndarray, " n"]:
-        """The position error upwards, with its sign."""
+        """Signed position error upwards."""
         return self.position_m[:, 2]
 
 
 @dataclass(frozen=True, eq=False)
 class Drift:
-    """How far integration has drifted since it was last set to the truth, every `reset_s`; NaN where there is no truth."""
+    """Drift since the last reset to the truth, every `reset_s`; NaN where the truth is unknown."""
 
     reset_s: float
     t_ns: Times
@@ -65,7 +65,7 @@ class Drift:
 
 @dataclass(frozen=True)
 class Window:
-    """Root mean square errors at the ends of windows of one length that each start from the truth."""
+    """Root mean square drift over windows of one length that each start from the truth."""
 
     length_s: float
     count: int
@@ -75,7 +75,7 @@ class Window:
 
 
 def errors(estimate: Poses, truth: Poses, valid: Bool[np.ndarray, " n"]) -> Errors:
-    """The error of an estimate against the truth at the same stamps, NaN where `valid` is false."""
+    """Error of an estimate against the truth at the same stamps; NaN where `valid` is false."""
     q_true, q = truth.q_wb_wxyz, estimate.q_wb_wxyz
     back = quaternion.inverse(q_true)
     hole = np.where(valid, 0.0, np.nan)[:, None]
@@ -84,15 +84,15 @@ def errors(estimate: Poses, truth: Poses, valid: Bool[np.ndarray, " n"]) -> Erro
     return Errors(estimate.t_ns, turned + hole, roll_pitch_yaw + hole, estimate.p_wb - truth.p_wb + hole)
 
 
-class Motion(NamedTuple):
-    """The rigid motion that brought an estimate nearest to the truth: a turn, then a shift, both in the world."""
+class RigidMotion(NamedTuple):
+    """Rigid motion of an alignment: a rotation, then a shift, both in the world frame."""
 
-    turn: Rotation
+    rotation: Rotation
     shift_m: Float64[np.ndarray, "3"]
 
 
-def aligned(estimate: Poses, truth: Poses, valid: Bool[np.ndarray, " n"], alignment: Alignment) -> tuple[Poses, Motion]:
-    """The estimate after a rigid motion of all of it, found over the rows where the truth is known, and that motion.
+def aligned(estimate: Poses, truth: Poses, valid: Bool[np.ndarray, " n"], alignment: Alignment) -> tuple[Poses, RigidMotion]:
+    """Align an estimate with the truth by one rigid motion.
 
     `origin`: its first pose becomes the true one. `yaw`: positions are nearest by least squares among turns about the vertical,
     theta = atan2(sum (p x p_true)_z, sum (p . p_true)_xy) about the means, the four directions an inertial sensor cannot know.
@@ -105,15 +105,15 @@ def aligned(estimate: Poses, truth: Poses, valid: Bool[np.ndarray, " n"], alignm
     if not valid.any():
         raise DataError("the truth is known at none of the estimate's stamps", expected="some overlap")
     if alignment == "none":
-        return estimate, Motion(Rotation.identity(), np.zeros(3))
+        return estimate, RigidMotion(Rotation.identity(), np.zeros(3))
     motion = _motion(estimate, truth, valid, alignment)
-    R = motion.turn.as_matrix()
+    R = motion.rotation.as_matrix()
     v_w = None if estimate.v_w is None else estimate.v_w @ R.T
-    q_wb_wxyz = quaternion.multiply(motion.turn.as_quat(scalar_first=True)[None], estimate.q_wb_wxyz)
+    q_wb_wxyz = quaternion.multiply(motion.rotation.as_quat(scalar_first=True)[None], estimate.q_wb_wxyz)
     return Poses(estimate.t_ns, estimate.p_wb @ R.T + motion.shift_m, q_wb_wxyz, v_w), motion
 
 
-def _motion(estimate: Poses, truth: Poses, valid: Bool[np.ndarray, " n"], alignment: Alignment) -> Motion:
+def _motion(estimate: Poses, truth: Poses, valid: Bool[np.ndarray, " n"], alignment: Alignment) -> RigidMotion:
     if alignment == "origin":
         row = int(np.argmax(valid))
         found, true = (Rotation.from_quat(poses.q_wb_wxyz[row], scalar_first=True) for poses in (estimate, truth))
@@ -127,26 +127,26 @@ def _motion(estimate: Poses, truth: Poses, valid: Bool[np.ndarray, " n"], alignm
     motion = align(p, p_true)
     if motion is None:
         raise DataError(
-            "positions lie on a line and leave the turn about it open", where="--align", fix="Use --align yaw, origin or none"
+            "positions lie on a line and leave the turn about it open", where="align", fix="Use yaw, origin or none for `align`"
         )
-    return Motion(*motion)
+    return RigidMotion(*motion)
 
 
-def _about(turn: Rotation, centre: Float64[np.ndarray, "3"], goal: Float64[np.ndarray, "3"]) -> Motion:
-    """The turn that takes a point to another."""
-    return Motion(turn, goal - turn.as_matrix() @ centre)
+def _about(rotation: Rotation, centre: Float64[np.ndarray, "3"], goal: Float64[np.ndarray, "3"]) -> RigidMotion:
+    """Rotation about a centre that moves it to another point."""
+    return RigidMotion(rotation, goal - rotation.as_matrix() @ centre)
 
 
 def drift_since_reset(path: Poses, truth: Poses, valid: Bool[np.ndarray, " n"], reset_s: float = RESET_S) -> Drift:
-    """How far the integration of `path` would have drifted, had it been set to the truth every `reset_s`, at every sample.
+    """Drift of `path` at every sample, with a reset to the truth every `reset_s`.
 
-    A reset that falls where the truth is unknown happens as soon as it is known again.
+    Where the truth is unknown, the reset waits until it is known again.
     """
     known = np.flatnonzero(valid)
     turn_of = (path.t_ns[known] - path.t_ns[0]) // nanoseconds(reset_s)
     resets = np.diff(turn_of, prepend=-1) > 0
     last_reset = known[resets][np.cumsum(resets) - 1]
-    found = drifted(path, truth, last_reset, slice(None) if valid.all() else known)
+    found = window_drift(path, truth, last_reset, slice(None) if valid.all() else known)
     since_s, *errors = (np.full(len(path), np.nan) for _ in range(4))
     since_s[known] = (path.t_ns[known] - path.t_ns[last_reset]) * 1e-9
     for column, values in zip(errors, found._replace(orientation_rad=np.rad2deg(found.orientation_rad)), strict=True):
@@ -155,7 +155,7 @@ def drift_since_reset(path: Poses, truth: Poses, valid: Bool[np.ndarray, " n"], 
 
 
 def windows(path: Poses, truth: Poses, valid: Bool[np.ndarray, " n"]) -> tuple[Window, ...]:
-    """The drift over windows of each length in `WINDOWS_S` of which at least one fits (`strapdown.drift`)."""
+    """Drift over windows of each length in `WINDOWS_S` that fits (`strapdown.drift`)."""
     found = []
     for length_s in WINDOWS_S:
         ends = drift(path, truth, valid, length_s)

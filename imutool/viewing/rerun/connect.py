@@ -1,4 +1,4 @@
-"""A viewer that runs already, here or on another machine: asked who it is before anything is sent to it."""
+"""Connection to a running viewer, which is checked before anything is sent."""
 
 from __future__ import annotations
 
@@ -14,137 +14,135 @@ from urllib.parse import SplitResult, urlsplit
 from imutool.errors import ConfigError
 from imutool.viewing.model.output import Output
 from imutool.viewing.model.run_data import RunData
-from imutool.viewing.rerun import layout, scene
-from imutool.viewing.rerun.entities import clock
-from imutool.viewing.rerun.sdk import FLUSH_S, need_sdk, stream, version
+from imutool.viewing.rerun import scene, sdk
+from imutool.viewing.rerun.sdk import FLUSH_S, require_rerun, rerun_version, stream_of_logs
 
-REACH_S = 0.6  # for a connection to open, for the first words of whoever is there, and for a viewer to say what it is
-MOVE_S = 1.5  # for a recording to arrive whose cursor is to be set
+ANSWER_TIMEOUT_S = 0.6  # for a connection to open, for the first bytes of the listener, and for a viewer's version
+CURSOR_TIMEOUT_S = 1.5  # for a recording to arrive before its cursor can be set
 PLAIN, SECURE = "rerun+http", ("rerun", "rerun+https")
 PATH = "/proxy"
 DEFAULT_PORT = 9876
 
-# RFC 9113, 3.4: a client begins with these words and a SETTINGS frame, and whoever speaks HTTP/2 answers with one.
+# RFC 9113, 3.4: a client begins with this preface and a SETTINGS frame, and an HTTP/2 server answers with one.
 PREFACE = b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n"
 EMPTY_SETTINGS = b"\x00\x00\x00\x04\x00\x00\x00\x00\x00"
 FRAME_HEAD_BYTES, SETTINGS = 9, 4
 
 
-class Peer(NamedTuple):
-    """Who listens at a URL: `version` is that of the viewer, None where none answered (a server without one, for instance)."""
+class Listener(NamedTuple):
+    """Listener at a URL with the version of its viewer; None where no viewer answered."""
 
     url: str
     version: str | None
 
 
-def probe(url: str) -> Peer:
-    """Who listens there, found out in less than two seconds.
+def probe(url: str) -> Listener:
+    """Find the listener at a URL, in less than two seconds.
 
     Raises:
-        ConfigError: Rerun is not installed, the URL is none of a viewer, nobody listens, or somebody else does.
+        ConfigError: Rerun is not installed, the URL is not a viewer's, nothing listens, or it is not a viewer.
     """
-    need_sdk()
-    place = full(url)
-    _speaks(place)
-    return Peer(place, _version(place))
+    require_rerun()
+    url = full_url(url)
+    _check_http2(url)
+    return Listener(url, _viewer_version(url))
 
 
-def send(logs: Sequence[RunData], peer: Peer, *, source: bool = True, at_s: float | None = None) -> Output:
-    """Sends all logs to whoever `probe` found, the cursor set to `at_s` seconds where a viewer can be told.
+def send(logs: Sequence[RunData], peer: Listener, *, source: bool = True, at_s: float | None = None) -> Output:
+    """Send all logs to the listener that `probe` found, and set the cursor to `at_s` seconds.
 
     Raises:
-        ConfigError: it stopped listening.
+        ConfigError: the listener stopped.
     """
-    _speaks(peer.url)  # logs may have taken minutes to read
-    recording = stream(logs)
+    _check_http2(peer.url)  # logs may have taken minutes to read
+    recording = stream_of_logs(logs)
     recording.connect_grpc(peer.url)
-    recording.send_blueprint(layout.blueprint(logs, source=source))
-    scene.log(logs, recording, source=source)
+    scene.send(logs, recording, source=source)
     try:
         recording.flush(timeout_sec=FLUSH_S)
     except (RuntimeError, ValueError) as error:
-        raise ConfigError(f"stopped listening ({error})", where=peer.url, fix="Start it again, or use --save") from error
+        raise ConfigError(f"stopped listening ({error})", where=peer.url, fix="Start it again, or use `save`") from error
     finally:
         recording.disconnect()
     if at_s is not None and peer.version is not None:
-        move(peer, at_s)
-    return Output("connect", peer.url, f"Sent to {peer.url}{told(peer)}.")
+        set_cursor(peer, at_s)
+    return Output("connect", peer.url, f"Sent to {peer.url}{version_mismatch(peer)}.")
 
 
-def move(peer: Peer, at_s: float) -> None:
-    """Sets a viewer's cursor to a time since the first IMU sample; what it shows then stands still.
+def set_cursor(peer: Listener, at_s: float) -> None:
+    """Set a viewer's cursor to a time since the first IMU sample, paused.
 
     Raises:
         ConfigError: the viewer is gone.
     """
     from rerun.experimental import ViewerClient
 
-    end = time.monotonic() + MOVE_S
+    end = time.monotonic() + CURSOR_TIMEOUT_S
     while True:
         try:
-            ViewerClient.connect(peer.url).set_time(clock.ELAPSED, duration=at_s, play_state="paused")
+            ViewerClient.connect(peer.url).set_time(sdk.ELAPSED, duration=at_s, play_state="paused")
         except (ConnectionError, TimeoutError, RuntimeError, ValueError) as error:
             if time.monotonic() > end:  # until then the recording may be on its way
-                raise ConfigError(f"the cursor cannot be set ({error})", where=peer.url, fix="Leave --at out") from error
+                raise ConfigError(f"the cursor cannot be set ({error})", where=peer.url, fix="Leave `at` out") from error
             time.sleep(0.05)
         else:
             return
 
 
-def told(peer: Peer) -> str:
-    """Both versions in words where they differ; nothing where they are the same or the other one is not known."""
-    if peer.version is None or peer.version == version():
+def version_mismatch(peer: Listener) -> str:
+    """Text that names both versions where they differ; empty where they agree or one is unknown."""
+    if peer.version is None or peer.version == rerun_version():
         return ""
-    return f", which is Rerun {peer.version}, not {version()} as here: if something is missing, start that one with `rerun`"
+    return f", which is Rerun {peer.version}, not {rerun_version()} as here. If something is missing, start it with `rerun`"
 
 
-def full(url: str) -> str:
-    """The whole URL of a viewer; HOST, HOST:PORT and PORT alone are taken for one.
+def full_url(url: str) -> str:
+    """Complete the URL of a viewer from HOST, HOST:PORT or PORT.
 
     Raises:
-        ConfigError: it is none.
+        ConfigError: the URL is not a viewer's.
     """
-    words = f"{PLAIN}://127.0.0.1:{url}" if url.isdecimal() else url if "://" in url else f"{PLAIN}://{url}"
+    complete = f"{PLAIN}://127.0.0.1:{url}" if url.isdecimal() else url if "://" in url else f"{PLAIN}://{url}"
     expected = f"{PLAIN}://HOST:PORT{PATH}, HOST:PORT or PORT"
     try:
-        parts = urlsplit(words)
-        port = parts.port  # refuses what is no number
+        parts = urlsplit(complete)
+        port = parts.port  # refuses other than a number
     except ValueError as error:
-        raise ConfigError(f"{url!r} ({error})", where="--connect", expected=expected) from error
+        raise ConfigError(f"{url!r} ({error})", where="connect", expected=expected) from error
     if parts.scheme not in (PLAIN, *SECURE) or not parts.hostname or parts.path.rstrip("/") not in ("", PATH) or parts.query:
-        raise ConfigError(f"{url!r}", where="--connect", expected=expected)
-    place = parts.netloc if port else f"{parts.netloc}:{DEFAULT_PORT}"
-    return parts._replace(netloc=place, path=PATH).geturl()
+        raise ConfigError(f"{url!r}", where="connect", expected=expected)
+    netloc = parts.netloc if port else f"{parts.netloc}:{DEFAULT_PORT}"
+    return parts._replace(netloc=netloc, path=PATH).geturl()
 
 
-def _speaks(url: str) -> None:
-    """Nothing, if somebody is there who speaks HTTP/2; Rerun's own client would wait for a silent one without an end.
+def _check_http2(url: str) -> None:
+    """Check that the listener speaks HTTP/2: Rerun's client would wait forever for a silent one.
 
     Raises:
-        ConfigError: nobody, or somebody else.
+        ConfigError: nothing listens there, or something else.
     """
     parts = urlsplit(url)
     try:
-        plain = socket.create_connection((parts.hostname, parts.port), timeout=REACH_S)
+        plain = socket.create_connection((parts.hostname, parts.port), timeout=ANSWER_TIMEOUT_S)
     except OSError as error:
         raise ConfigError(
-            f"nobody listens there ({error.strerror or error})",
+            f"nothing listens there ({error.strerror or error})",
             where=url,
             expected="a running viewer",
-            fix="Start one with `rerun`, or use --save",
+            fix="Start one with `rerun`, or use `save`",
         ) from error
     try:
-        with plain, _dressed(plain, parts) as line:
+        with plain, _encrypted(plain, parts) as line:
             line.sendall(PREFACE + EMPTY_SETTINGS)
             first = line.recv(FRAME_HEAD_BYTES, socket.MSG_WAITALL) if line is plain else line.recv(FRAME_HEAD_BYTES)
     except OSError as error:
-        raise _foreign(url) from error
+        raise _not_a_viewer(url) from error
     if len(first) < FRAME_HEAD_BYTES or first[3] != SETTINGS:
-        raise _foreign(url)
+        raise _not_a_viewer(url)
 
 
-def _dressed(plain: socket.socket, parts: SplitResult) -> socket.socket:
-    """The connection, encrypted where the URL says so."""
+def _encrypted(plain: socket.socket, parts: SplitResult) -> socket.socket:
+    """Connection, encrypted where the URL says so."""
     if parts.scheme not in SECURE:
         return plain
     context = ssl.create_default_context()
@@ -152,11 +150,11 @@ def _dressed(plain: socket.socket, parts: SplitResult) -> socket.socket:
     return context.wrap_socket(plain, server_hostname=parts.hostname)
 
 
-def _version(url: str) -> str | None:
-    """What a viewer says it is; None for a server without one, and for one that is too old or too busy to answer at once.
+def _viewer_version(url: str) -> str | None:
+    """Version of a viewer; None for a server without a viewer and for a viewer too old or too busy to answer.
 
     Raises:
-        ConfigError: it is no viewer.
+        ConfigError: the listener is not a viewer.
     """
     from rerun.experimental import ViewerClient
 
@@ -170,23 +168,23 @@ def _version(url: str) -> str | None:
         except (RuntimeError, TimeoutError):
             answers.put(None)
 
-    # A server that passes on what it gets holds the question for fifteen seconds: nobody waits for that thread.
+    # a relay server keeps the request for fifteen seconds: nothing waits for that thread
     threading.Thread(target=ask, daemon=True).start()
     try:
-        answer = answers.get(timeout=REACH_S)
+        answer = answers.get(timeout=ANSWER_TIMEOUT_S)
     except queue.Empty:
         return None
     if isinstance(answer, ConnectionError):
         if "Unimplemented" in str(answer):
             return None
-        raise _foreign(url) from answer
+        raise _not_a_viewer(url) from answer
     return answer
 
 
-def _foreign(url: str) -> ConfigError:
+def _not_a_viewer(url: str) -> ConfigError:
     return ConfigError(
-        "somebody listens there, but it is no viewer",
+        "the program that listens there is not a viewer",
         where=url,
-        expected="the address that a viewer says it listens on",
-        fix="Start a viewer with `rerun --port auto`, or use --save",
+        expected="the address that a viewer prints",
+        fix="Start a viewer with `rerun --port auto`, or use `save`",
     )

@@ -1,4 +1,4 @@
-"""How the viewer is laid out: paths over errors on the left, all else in tabs on the right; several logs side by side first."""
+"""Viewer layouts of one log, of several logs, and of a live view."""
 
 from __future__ import annotations
 
@@ -7,137 +7,137 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from jaxtyping import Float64
 
 from imutool.viewing.model.run_data import RunData, Trace
-from imutool.viewing.rerun import panels
-from imutool.viewing.rerun.entities import clock, errors, names, styles
-from imutool.viewing.rerun.entities.names import Scope
-from imutool.viewing.rerun.entities.palette import GROUND, MODEL_COLORS, RAW_FADE, Color, faded
-from imutool.viewing.rerun.entities.paths import LEGEND_X, LEGEND_Y, error_rows, heat_top
-from imutool.viewing.rerun.entities.plots import plot
-from imutool.viewing.rerun.sdk import need_sdk
+from imutool.viewing.rerun import plots, tabs
+from imutool.viewing.rerun.entities import errors, styles
+from imutool.viewing.rerun.entities.paths import LEGEND_X, LEGEND_Y, error_rows, error_scale_top
+from imutool.viewing.rerun.entities.styles import BACKGROUND, MODEL_COLORS, RAW_FADE, Color, blend_to_grey
+from imutool.viewing.rerun.plots import Box, plot
+from imutool.viewing.rerun.sdk import Scope, entity_path, label, require_rerun, role, scopes, trace_path
 
 if TYPE_CHECKING:
     import rerun as rr
     import rerun.blueprint as rrb
 
-SHARES = {"paths": 6.0, "legend": 0.9, "error": 2.6}
+ROW_SHARES = {"paths": 6.0, "legend": 0.9, "error": 2.6}
+LIVE_WINDOW_S = 20.0  # of the plots in a live view
 
 
 def blueprint(logs: Sequence[RunData], *, source: bool = True) -> rrb.Blueprint:
-    """The layout of what `scene.log` logs of the same logs with the same `source`; no empty panel.
+    """Layout of what `scene.log` logs for the same logs and `source`; every view has content.
 
-    It opens at the end of the log, on `elapsed`, so that whole paths are seen.
+    The cursor starts at the end of the log on `elapsed`, where whole paths are visible.
 
     Raises:
         ConfigError: Rerun is not installed.
     """
-    need_sdk()
+    require_rerun()
     import rerun.blueprint as rrb
 
-    scopes = names.scopes(logs)
-    shown = [_of_one(data, scope, source) for data, scope in zip(logs, scopes, strict=True)]
-    whole: Any = shown[0] if len(logs) == 1 else rrb.Tabs(_comparison(logs, scopes), *shown, active_tab=0)
-    return rrb.Blueprint(
-        whole,
-        rrb.BlueprintPanel(state="collapsed"),
-        rrb.SelectionPanel(state="collapsed"),
-        rrb.TimePanel(state="collapsed", timeline=clock.ELAPSED, play_state="following"),
-        auto_layout=False,
-        auto_views=False,
-    )
+    of_logs = scopes(logs)
+    views = [_log_view(data, scope, source) for data, scope in zip(logs, of_logs, strict=True)]
+    return plots.frame(views[0] if len(logs) == 1 else rrb.Tabs(_comparison(logs, of_logs), *views, active_tab=0))
 
 
-def _of_one(data: RunData, scope: Scope, source: bool) -> rrb.Horizontal:
-    """One log: what it is about on the left, all the rest on the right."""
+def live_blueprint(scopes: Mapping[str, Scope], boxes: Mapping[str, Box] | None = None) -> rrb.Blueprint:
+    """Layout of a live view: paths beside signals and biases, a tab for each of several IMUs.
+
+    Args:
+        scopes: the scope of each IMU topic.
+        boxes: the extent of each debiased path once it is complete; without them plots follow the last seconds.
+    """
+    import rerun.blueprint as rrb
+
+    views = [_live_view(topic, scope, None if boxes is None else boxes[topic]) for topic, scope in scopes.items()]
+    return plots.frame(views[0] if len(views) == 1 else rrb.Tabs(*views, active_tab=0))
+
+
+def _log_view(data: RunData, scope: Scope, source: bool) -> rrb.Horizontal:
+    """One log: paths and total errors on the left, tabs on the right."""
     import rerun.blueprint as rrb
 
     left: list[Any] = [paths_view(data, scope)]
-    shares = [SHARES["paths"]]
-    if heat_top(data) is not None:
+    shares = [ROW_SHARES["paths"]]
+    if error_scale_top(data) is not None:
         left.append(_legend(scope))
-        shares.append(SHARES["legend"])
-    curves = panels.total_errors(data, scope)
+        shares.append(ROW_SHARES["legend"])
+    curves = tabs.total_errors(data, scope)
     left += curves
-    shares += [SHARES["error"]] * len(curves)
-    right = rrb.Tabs(*panels.tabs(data, scope, source), active_tab=0)
+    shares += [ROW_SHARES["error"]] * len(curves)
+    right = rrb.Tabs(*tabs.tabs(data, scope, source), active_tab=0)
     return rrb.Horizontal(
         rrb.Vertical(*left, row_shares=shares), right, column_shares=[1, 1], name=scope[-1] if scope else None
     )
 
 
 def paths_view(data: RunData, scope: Scope) -> rrb.Spatial3DView:
-    """Paths up to the cursor on every timeline, and the bodies at it."""
-    import rerun as rr
+    """3D view of the paths up to the cursor and of the bodies at the cursor.
+
+    The camera looks at the truth, without truth at all paths: raw paths often leave for kilometres.
+    """
     import rerun.blueprint as rrb
 
-    begin, cursor = rr.TimeRangeBoundary.infinite(), rr.TimeRangeBoundary.cursor_relative()
-    homes = [names.of(data, trace, scope, "world", names.role(trace)) for trace in data.traces]
-    homes += [names.path(scope, "world", "gt")] if data.truth is not None else []
+    entities = [trace_path(data, trace, scope, "world", role(trace)) for trace in data.traces]
+    entities += [entity_path(scope, "world", "gt")] if data.truth is not None else []
     vectors = _error_vectors(data, scope)
     return rrb.Spatial3DView(
-        origin=names.path(scope, "world"),
-        contents=[*(f"{home}/**" for home in homes), *map(str, vectors)],
+        origin=entity_path(scope, "world"),
+        contents=[*(f"{entity}/**" for entity in entities), *map(str, vectors)],
         overrides=vectors,
         name="Paths",
-        background=GROUND,
-        eye_controls=_eye(data),
-        time_ranges=[rrb.VisibleTimeRange(timeline, start=begin, end=cursor) for timeline in clock.TIMELINES],
+        background=BACKGROUND,
+        eye_controls=plots.camera_on(scene_box(data)),
+        time_ranges=plots.visible_until_cursor(),
     )
 
 
 def _error_vectors(data: RunData, scope: Scope) -> Mapping[rr.EntityPath | str, rrb.VisibleTimeRanges]:
-    """Where each model's error vectors are, and that of those the one at the cursor is seen."""
-    import rerun as rr
+    """Entity of each model's error vectors, of which only the one at the cursor is visible."""
     import rerun.blueprint as rrb
 
-    found: dict[rr.EntityPath | str, rrb.VisibleTimeRanges] = {}
+    vectors: dict[rr.EntityPath | str, rrb.VisibleTimeRanges] = {}
     for trace in data.models():
         if trace.errors is not None and len(rows := error_rows(trace, trace.errors)) > 1:
             step_s = float(np.diff(trace.path.t_ns[rows]).max()) * 1e-9
-            begin, cursor = (rr.TimeRangeBoundary.cursor_relative(seconds=s) for s in (-step_s, 0.0))
-            ranges = [rrb.VisibleTimeRange(timeline, start=begin, end=cursor) for timeline in clock.TIMELINES]
-            found[names.of(data, trace, scope, "world", "error_vec")] = rrb.VisibleTimeRanges(ranges)
-    return found
+            ranges = rrb.VisibleTimeRanges(plots.visible_until_cursor(step_s))
+            vectors[trace_path(data, trace, scope, "world", "error_vec")] = ranges
+    return vectors
 
 
 def _legend(scope: Scope) -> rrb.Spatial2DView:
-    """What the colours of the debiased path mean, in numbers."""
+    """Colour scale of the debiased path."""
     import rerun.blueprint as rrb
 
     return rrb.Spatial2DView(
-        origin=names.path(scope, "legend"),
+        origin=entity_path(scope, "legend"),
         name="Orientation error of the debiased path",
         titlebar=False,
-        background=GROUND,
+        background=BACKGROUND,
         visual_bounds=rrb.VisualBounds2D(x_range=LEGEND_X, y_range=LEGEND_Y),
     )
 
 
 def _comparison(logs: Sequence[RunData], scopes: Sequence[Scope]) -> rrb.Vertical:
-    """The errors of all logs over elapsed time, and their figures side by side."""
+    """Errors of all logs over elapsed time, above a table of their figures."""
     import rerun.blueprint as rrb
 
     rows: list[Any] = []
-    scored = _scored(logs, scopes)
+    scored = _runs_with_errors(logs, scopes)
     for kind in errors.KINDS:
         overrides = {}
-        for (data, trace, scope), color in zip(scored, _colors(scored), strict=True):
-            name = f"{scope[-1]}: {names.label(data, trace)}"
-            overrides[names.of(data, trace, scope, "error", kind, names.role(trace))] = styles.total(
-                names.role(trace), name, color
-            )
+        for (data, trace, scope), color in zip(scored, _comparison_colors(scored), strict=True):
+            style = styles.total_error_curve(role(trace), f"{scope[-1]}: {label(data, trace)}", color)
+            overrides[trace_path(data, trace, scope, "error", kind, role(trace))] = style
         if overrides:
-            reach = max((panels.error_limit(data, kind) or 0.0 for data in logs), default=0.0)
+            limit = max((tabs.error_limit(data, kind) or 0.0 for data in logs), default=0.0)
             title = f"{kind.capitalize()} error ({errors.UNITS[kind]})"
-            rows.append(plot(list(overrides), title, height=(0.0, reach) if reach else None, overrides=overrides))
+            rows.append(plot(list(overrides), title, height=(0.0, limit) if limit else None, overrides=overrides))
     figures = rrb.TextDocumentView(origin="/compare", name="Figures")
     return rrb.Vertical(*([rrb.Horizontal(*rows)] if rows else []), figures, name="Compare")
 
 
-def _scored(logs: Sequence[RunData], scopes: Sequence[Scope]) -> list[tuple[RunData, Trace, Scope]]:
-    """Every run of every log that has errors."""
+def _runs_with_errors(logs: Sequence[RunData], scopes: Sequence[Scope]) -> list[tuple[RunData, Trace, Scope]]:
     return [
         (data, trace, scope)
         for data, scope in zip(logs, scopes, strict=True)
@@ -146,38 +146,61 @@ def _scored(logs: Sequence[RunData], scopes: Sequence[Scope]) -> list[tuple[RunD
     ]
 
 
-def _colors(scored: Sequence[tuple[RunData, Trace, Scope]]) -> list[Color]:
-    """A colour for each model of each log, told apart by colour-blind eyes while they last; raw has its log's, greyed."""
+def _comparison_colors(scored: Sequence[tuple[RunData, Trace, Scope]]) -> list[Color]:
+    """Colour of each run: colour-blind safe while they last for models, the log's colour towards grey for raw."""
     models = [(scope, trace.name) for data, trace, scope in scored if not trace.is_raw or not data.models()]
-    hues = MODEL_COLORS if len(models) <= len(MODEL_COLORS) else _circle(len(models))
+    hues = MODEL_COLORS if len(models) <= len(MODEL_COLORS) else _color_wheel(len(models))
     by_model = dict(zip(models, hues, strict=False))
     by_log = {scope: color for (scope, _), color in reversed(by_model.items())}
-    return [by_model.get((scope, trace.name)) or faded(by_log[scope], RAW_FADE) for _, trace, scope in scored]
+    return [by_model.get((scope, trace.name)) or blend_to_grey(by_log[scope], RAW_FADE) for _, trace, scope in scored]
 
 
-def _circle(count: int) -> list[Color]:
-    """As many colours as that, as far from each other as they can be, all of about one brightness."""
+def _color_wheel(count: int) -> list[Color]:
+    """Colours of equal lightness, evenly spaced in hue."""
     turns = [colorsys.hls_to_rgb((0.55 + k / count) % 1.0, 0.55, 0.65) for k in range(count)]
     return [(round(255 * red), round(255 * green), round(255 * blue)) for red, green, blue in turns]
 
 
-def _eye(data: RunData) -> rrb.EyeControls3D:
-    """A look at the truth (without it, at everything) from above one corner: raw paths often leave for kilometres."""
-    import rerun.blueprint as rrb
-
-    low, high = box(data)
-    centre, size = (low + high) / 2.0, size_m(data)
-    return rrb.EyeControls3D(position=centre + size * np.array([-0.7, -0.7, 0.5]), look_target=centre, eye_up=[0.0, 0.0, 1.0])
-
-
-def box(data: RunData) -> tuple[Float64[np.ndarray, "3"], Float64[np.ndarray, "3"]]:
-    """The corners of what matters in 3D."""
+def scene_box(data: RunData) -> Box:
+    """Corners of the scene: of the true path, or of all paths without truth."""
     shown = [data.truth] if data.truth is not None else [trace.path for trace in data.traces]
     points = np.concatenate([poses.p_wb for poses in shown])
     return points.min(axis=0), points.max(axis=0)
 
 
-def size_m(data: RunData) -> float:
-    """The diagonal of what matters in 3D, at least a metre."""
-    low, high = box(data)
-    return max(float(np.linalg.norm(high - low)), 1.0)
+def _live_view(topic: str, scope: Scope, box: Box | None) -> rrb.Horizontal:
+    """Paths, signals and biases of one IMU; the camera follows the body until the box is known."""
+    import rerun.blueprint as rrb
+
+    body = entity_path(scope, "world", "debiased", "body")
+    paths = rrb.Spatial3DView(
+        origin=entity_path(scope, "world"),
+        name="Paths",
+        background=BACKGROUND,
+        # without truth, integration leaves for kilometres: while the path grows, the camera follows the body
+        eye_controls=rrb.EyeControls3D(eye_up=(0.0, 0.0, 1.0), tracking_entity=body) if box is None else plots.camera_on(box),
+        time_ranges=plots.visible_until_cursor(),
+    )
+    live = box is None
+    signals = [_live_plot(scope, ("imu", kind), ("raw", "debiased"), title, live) for kind, title in tabs.TITLES.items()]
+    biases = [
+        _live_plot(scope, ("bias", kind), ("sigma", "estimated"), title, live) for kind, title in tabs.BIAS_TITLES.items()
+    ]
+    return rrb.Horizontal(paths, rrb.Vertical(*signals, *biases), column_shares=[1, 1], name=topic)
+
+
+def _live_plot(scope: Scope, of: tuple[str, str], names: tuple[str, ...], title: str, live: bool) -> rrb.TimeSeriesView:
+    import rerun.blueprint as rrb
+
+    contents = [entity_path(scope, *of, name) for name in names]
+    if not live:
+        return plot(contents, title, legend=False)
+    ranges = plots.visible_until_cursor(LIVE_WINDOW_S)
+    return rrb.TimeSeriesView(
+        origin="/",
+        contents=contents,
+        name=title,
+        plot_legend=rrb.PlotLegend(visible=False),
+        axis_x=rrb.TimeAxis(link="Independent", view_range=ranges[0].range),
+        time_ranges=ranges,
+    )

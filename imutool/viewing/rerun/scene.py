@@ -1,45 +1,89 @@
-"""What is logged to Rerun of one or several logs, entity by entity; how it is laid out is the layout's."""
+"""Log all entities of logs into a Rerun recording, or save them as an .rrd file."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING
 
+from imutool.mcap_io.storage.target import Target
+from imutool.viewing.model.output import Output
 from imutool.viewing.model.run_data import RunData
+from imutool.viewing.rerun import layout
 from imutool.viewing.rerun import source as other_topics
-from imutool.viewing.rerun.entities import errors, events, names, paths, report, signals, spectrum
-from imutool.viewing.rerun.layout import size_m
-from imutool.viewing.rerun.sdk import need_sdk
+from imutool.viewing.rerun.entities import errors, paths, report, signals
+from imutool.viewing.rerun.plots import diagonal_m
+from imutool.viewing.rerun.sdk import FLUSH_S, Scope, recording_name, require_rerun, scopes, stream_of_logs
 
 if TYPE_CHECKING:
     import rerun as rr
 
 
 def log(logs: Sequence[RunData], to: rr.RecordingStream, *, source: bool = True) -> None:
-    """Everything there is to see, into one Rerun recording: whole columns on `elapsed`, `ros2_timestamp`, `message_log_time`.
+    """Log all entities as whole columns on `elapsed`, `ros2_timestamp` and `message_log_time`.
 
-    One log lies at the root, several each under `run/NAME`; of several models each lies under its own name (see `entities`).
+    One log lies at the root, several each under `run/NAME`; each of several models lies under its own name.
     `world/{gt,raw,debiased}/{path,body}`, `imu/{gyro,accel}/{raw,debiased}`, `bias/{gyro,accel}/{estimated,true,sigma}`,
-    `error/{orientation,position}/{raw,debiased}` (degrees and metres; in parts below it), `error/drift/…`,
+    `error/{orientation,position}/{raw,debiased}` (degrees and metres; parts below), `error/drift/…`,
     `spectrum/{gyro,accel}/…`, `events/KIND`, `report`; with `source` the log's other topics under their own names.
 
     Raises:
         ConfigError: Rerun is not installed.
     """
-    need_sdk()
+    require_rerun()
     to.set_log_time_enabled(False)
     to.set_log_tick_enabled(False)
-    if len(logs) > 1:  # first: it is what is seen first, and a page receives slowly
+    if len(logs) > 1:  # first: the user sees it first, and a page receives slowly
         report.log_comparison(logs, to)
-    for data, scope in zip(logs, names.scopes(logs), strict=True):
+    for data, scope in zip(logs, scopes(logs), strict=True):
         _log_one(data, to, scope, source)
 
 
-def _log_one(data: RunData, to: rr.RecordingStream, scope: names.Scope, with_source: bool) -> None:
-    paths.log(data, to, scope, size_m(data))
-    signals.log(data, to, scope)
-    errors.log(data, to, scope)
-    spectrum.log(data, to, scope)
-    events.log(data, to, scope)
-    said = other_topics.log(data, to, scope) if with_source else []
-    report.log(data, to, scope, [*signals.thinning(data), *said])
+def send(logs: Sequence[RunData], to: rr.RecordingStream, *, source: bool = True) -> None:
+    """Send the layout, then log all entities.
+
+    Raises:
+        ConfigError: Rerun is not installed.
+    """
+    to.send_blueprint(layout.blueprint(logs, source=source))
+    log(logs, to, source=source)
+
+
+def save(logs: Sequence[RunData], path: Path | None = None, *, source: bool = True, overwrite: bool = False) -> Output:
+    """Write all logs into one .rrd file: `path`, or NAME.rrd in the folder `path` or here.
+
+    Raises:
+        ConfigError: no log, Rerun is not installed, the file exists (without `overwrite`) or cannot be written.
+    """
+    place = path or Path()
+    target = place / f"{recording_name(logs)}.rrd" if place.is_dir() else place
+    require_rerun()
+    with Target(target, overwrite=overwrite) as file:  # refuses before the work is done, leaves nothing after a failure
+        file.write(rrd(logs, source=source))
+    return Output("rrd", str(target), f"Saved {target}. Open with: rerun {target}")
+
+
+def rrd(logs: Sequence[RunData], *, source: bool = True) -> bytes:
+    """Content of an .rrd file with all logs and their layout.
+
+    Raises:
+        ConfigError: no log, or Rerun is not installed.
+    """
+    recording = stream_of_logs(logs)
+    import rerun as rr
+
+    written = rr.binary_stream(recording)
+    send(logs, recording, source=source)
+    content = written.read(flush_timeout_sec=FLUSH_S)
+    assert content, "a stream that was written to holds bytes"
+    return bytes(content)
+
+
+def _log_one(data: RunData, to: rr.RecordingStream, scope: Scope, with_source: bool) -> None:
+    paths.log_paths(data, to, scope, diagonal_m(layout.scene_box(data)))
+    signals.log_signals(data, to, scope)
+    errors.log_errors(data, to, scope)
+    signals.log_spectra(data, to, scope)
+    errors.log_events(data, to, scope)
+    notes = other_topics.log(data, to, scope) if with_source else []
+    report.log_report(data, to, scope, [*signals.decimation_note(data), *notes])

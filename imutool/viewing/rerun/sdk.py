@@ -1,4 +1,4 @@
-"""What everything that talks to Rerun needs: the library or a clear word that it is missing, recordings and entity paths."""
+"""Rerun SDK access: recording streams, entity paths and the three timelines."""
 
 from __future__ import annotations
 
@@ -6,26 +6,33 @@ import os
 import re
 import uuid
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 from imutool.errors import ConfigError
-from imutool.viewing.model.run_data import RunData
+from imutool.recording import Times
+from imutool.viewing.model.run_data import RunData, Trace
 
 if TYPE_CHECKING:
     import rerun as rr
 
+Role = Literal["raw", "debiased"]
+Scope = tuple[str, ...]  # leading parts of the entity paths of one log; empty for the root
+
 FLUSH_S = 30.0
 LOGGING = "RUST_LOG"
-ONLY_NEW = "warn,re_grpc_client=off,re_sdk=off,re_log_encoding=off"  # of Rerun's own lines, those that say what we do not say
+LOG_LEVELS = "warn,re_grpc_client=off,re_sdk=off,re_log_encoding=off"  # drops Rerun's lines that repeat our own messages
+
+# Rerun's MCAP reader gives the last two names to header stamps and log times, so that the log's other topics line up.
+ELAPSED, STAMP, LOG_TIME = TIMELINES = ("elapsed", "ros2_timestamp", "message_log_time")
 
 
-def need_sdk() -> None:
-    """Nothing, if Rerun is there.
+def require_rerun() -> None:
+    """Check that Rerun can be imported.
 
     Raises:
-        ConfigError: it is not installed.
+        ConfigError: Rerun is not installed.
     """
-    os.environ.setdefault(LOGGING, ONLY_NEW)  # read when Rerun is first imported
+    os.environ.setdefault(LOGGING, LOG_LEVELS)  # read when Rerun is first imported
     try:
         import rerun  # noqa: F401
     except ImportError as error:
@@ -34,35 +41,35 @@ def need_sdk() -> None:
         ) from error
 
 
-def stream(logs: Sequence[RunData]) -> rr.RecordingStream:
-    """A recording of its own for these logs.
+def stream_of_logs(logs: Sequence[RunData]) -> rr.RecordingStream:
+    """Create a recording stream named after some logs.
 
     Raises:
         ConfigError: no log, or Rerun is not installed.
     """
-    return named(title(logs))
+    return new_stream(recording_name(logs))
 
 
-def named(name: str) -> rr.RecordingStream:
-    """A recording of its own, in an application of its own: Rerun keeps one layout per application.
+def new_stream(name: str) -> rr.RecordingStream:
+    """Create a recording stream in an application of its own: Rerun keeps a layout for each.
 
-    It has no `log_time` and no `log_tick`: when we drew something is nothing to look at.
+    The stream has no `log_time` and no `log_tick`: the time of drawing tells the user nothing.
 
     Raises:
         ConfigError: Rerun is not installed.
     """
-    need_sdk()
+    require_rerun()
     import rerun as rr
 
-    short = plain(name)
+    short = safe_name(name)
     recording = rr.RecordingStream(f"imutool {short}", recording_id=f"{short}-{uuid.uuid4().hex[:8]}")
     recording.set_log_time_enabled(False)
     recording.set_log_tick_enabled(False)
     return recording
 
 
-def title(logs: Sequence[RunData]) -> str:
-    """A name for one or several logs, of letters that files and applications may have.
+def recording_name(logs: Sequence[RunData]) -> str:
+    """Name of a recording of one or several logs, valid as a file name and as an application id.
 
     Raises:
         ConfigError: no log.
@@ -70,23 +77,90 @@ def title(logs: Sequence[RunData]) -> str:
     if not logs:
         raise ConfigError("there is no log to show", where="view")
     more = f"_and_{len(logs) - 1}_more" if len(logs) > 1 else ""
-    return plain(logs[0].name) + more
+    return safe_name(logs[0].name) + more
 
 
-def plain(name: str) -> str:
-    """A name of which nothing is left that a file or an application may not be called, or that leads elsewhere."""
+def safe_name(name: str) -> str:
+    """Name with every character replaced that is unsafe in file names, paths or application ids."""
     return re.sub(r"[^A-Za-z0-9_-]", "_", name)[:100] or "_"
 
 
-def version() -> str:
-    """The version of the installed Rerun, which is also that of the viewer beside it."""
+def rerun_version() -> str:
+    """Version of the installed Rerun SDK and of the viewer that ships with it."""
     import rerun as rr
 
     return str(rr.__version__)
 
 
-def entity_path(*parts: str) -> str:
-    """An entity path of which every part may hold any character."""
+def scopes(logs: Sequence[RunData]) -> list[Scope]:
+    """Scope of each log: the root for one log, `run/NAME` for several."""
+    if len(logs) == 1:
+        return [()]
+    return [("run", name) for name in unique_names([data.name or "log" for data in logs])]
+
+
+def unique_names(names: Sequence[str], taken: Sequence[str] = ()) -> list[str]:
+    """Names that differ from each other and from `taken`: repeated ones get a number from 2 on."""
+    unique: list[str] = []
+    for name in names:
+        candidate, number = name, 2
+        while candidate in unique or candidate in taken:
+            candidate, number = f"{name} ({number})", number + 1
+        unique.append(candidate)
+    return unique
+
+
+def role(trace: Trace) -> Role:
+    """Name of a trace in an entity path."""
+    return "raw" if trace.is_raw else "debiased"
+
+
+def label(data: RunData, trace: Trace) -> str:
+    """Name of a trace in a title; model names without their common first words."""
+    if trace.is_raw or len(data.models()) < 2:
+        return role(trace)
+    return trace.name[_common_prefix_length([model.name for model in data.models()]) :] or trace.name
+
+
+def _common_prefix_length(names: Sequence[str]) -> int:
+    """Number of letters in the hyphen-ended words that all names begin with."""
+    shortest = min(map(len, names))
+    same = next((k for k in range(shortest) if len({name[k] for name in names}) > 1), shortest)
+    return names[0].rfind("-", 0, same) + 1
+
+
+def entity_path(scope: Scope, *parts: str) -> str:
+    """Entity path from the root; each part may hold any character."""
     import rerun as rr
 
-    return str(rr.new_entity_path(list(parts)))
+    return f"/{str(rr.new_entity_path([*scope, *parts])).removeprefix('/')}"
+
+
+def trace_path(data: RunData, trace: Trace, scope: Scope, *parts: str) -> str:
+    """Entity path of one trace; each of several models has its own scope."""
+    if not trace.is_raw and len(data.models()) > 1:
+        scope = (*(scope or ("run",)), trace.name)
+    return entity_path(scope, *parts)
+
+
+def time_columns(stamp_ns: Times, log_ns: Times, start_ns: int) -> list[rr.TimeColumn]:
+    """Time columns in nanoseconds: time since the first IMU sample, header stamp, log time."""
+    import rerun as rr
+
+    return [
+        elapsed_column(stamp_ns - start_ns),
+        rr.TimeColumn(STAMP, timestamp=stamp_ns.astype("datetime64[ns]")),
+        rr.TimeColumn(LOG_TIME, timestamp=log_ns.astype("datetime64[ns]")),
+    ]
+
+
+def elapsed_column(elapsed_ns: Times) -> rr.TimeColumn:
+    """Time column of nanoseconds since the start."""
+    import rerun as rr
+
+    return rr.TimeColumn(ELAPSED, duration=elapsed_ns.astype("timedelta64[ns]"))
+
+
+def data_times(data: RunData, stamp_ns: Times) -> list[rr.TimeColumn]:
+    """Time columns for header stamps of one log."""
+    return time_columns(stamp_ns, data.log_ns(stamp_ns), data.start_ns)

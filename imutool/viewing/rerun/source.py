@@ -1,4 +1,4 @@
-"""The log itself in the same recording, read by Rerun: cameras and other topics on our timelines, under their own names."""
+"""Import cameras and other topics of the log into the recording, through Rerun."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ import numpy as np
 
 from imutool.errors import LogError
 from imutool.mcap_io.codec import schemas
-from imutool.mcap_io.log import Log
+from imutool.mcap_io.recovery.recovered_log import RecoveredLog
 from imutool.mcap_io.topics import DERIVED_KEY, Topic
 from imutool.recording import Times
 from imutool.viewing.model.run_data import TRUE_BIAS, RunData
-from imutool.viewing.rerun.entities import clock
-from imutool.viewing.rerun.entities.names import Scope, path
+from imutool.viewing.rerun import sdk
+from imutool.viewing.rerun.sdk import Scope, entity_path
 
 if TYPE_CHECKING:
     import rerun as rr
@@ -26,16 +26,16 @@ if TYPE_CHECKING:
 
 logger = logging.getLogger(__name__)
 
-SOURCE_LIMIT = 256_000_000  # bytes of a log that are read into a viewer's memory unasked
-DECODERS = ("ros2msg", "ros2_reflection", "foxglove", "protobuf")  # not `raw`: bytes that nobody can look at
-MARGIN_NS = 60_000_000_000  # header stamps further outside the IMU's time are another clock's
-OURS = {"world", "imu", "bias", "error", "spectrum", "events", "report", "legend", "compare", "run", "source"}
-SENTENCE = "The log's other topics are not shown"
+SOURCE_LIMIT = 256_000_000  # bytes: a larger log is not imported into the viewer's memory
+DECODERS = ("ros2msg", "ros2_reflection", "foxglove", "protobuf")  # not `raw`: bytes without a meaning
+MARGIN_NS = 60_000_000_000  # header stamps further outside the IMU's time come from another clock
+OWN_ENTITIES = {"world", "imu", "bias", "error", "spectrum", "events", "report", "legend", "compare", "run", "source"}
+NOT_SHOWN = "The log's other topics are not shown"
 
 
 @dataclass(frozen=True)
-class Import:
-    """What of a log Rerun reads: every topic but those that are drawn already, cameras among them; and why not, in words."""
+class ImportPlan:
+    """Import of a log by Rerun: cameras, topics already drawn, and the reason for no import."""
 
     wanted: bool = False
     left_out: tuple[str, ...] = ()
@@ -43,97 +43,97 @@ class Import:
     sentence: str = ""
 
 
-def plan(data: RunData, scope: Scope) -> Import:
-    """What will be read of a log's file: nothing where there is none, or where it is larger than SOURCE_LIMIT bytes."""
+def plan_import(data: RunData, scope: Scope) -> ImportPlan:
+    """Plan the import of a log's file; no import without a file or above SOURCE_LIMIT bytes."""
     if not isinstance(data.source, Path):
-        return Import()
+        return ImportPlan()
     try:
         size = data.source.stat().st_size
         if size > SOURCE_LIMIT:
-            return Import(
-                sentence=f"{SENTENCE}: it has {size / 1e6:.0f} MB, and {SOURCE_LIMIT / 1e6:.0f} is the most that is read."
+            return ImportPlan(
+                sentence=f"{NOT_SHOWN}: the log has {size / 1e6:.0f} MB, more than the limit of {SOURCE_LIMIT / 1e6:.0f} MB."
             )
-        with Log(data.source, salvage=True) as log:
+        with RecoveredLog(data.source) as log:
             topics = tuple(log.topics.values())
     except (OSError, LogError) as error:
-        return Import(sentence=f"{SENTENCE}: {error}")
+        return ImportPlan(sentence=f"{NOT_SHOWN}: {error}")
     drawn = {data.provenance[key] for key in ("IMU", "truth") if key in data.provenance}
     drawn |= {TRUE_BIAS[kind] for kind in data.true_bias}
     left_out = tuple(topic.name for topic in topics if topic.name in drawn or topic.metadata.get(DERIVED_KEY) in drawn)
     sentence = ""
     if scope and (frames := tuple(topic.name for topic in topics if topic.schema_name in (schemas.TF, schemas.TRANSFORM))):
-        left_out += frames  # a viewer has one set of frames, and both logs would move the same
-        sentence = f"Its transforms ({', '.join(frames)}) are not shown: other logs are, which may name the same frames."
+        left_out += frames  # a viewer has one set of frames, and both logs would move the same ones
+        sentence = f"Its transforms ({', '.join(frames)}) are not shown: the other logs may name the same frames."
     cameras = tuple(_camera(topic, data, scope) for topic in topics if topic.schema_name == schemas.IMAGE and topic.count)
-    return Import(True, left_out, cameras, sentence)
+    return ImportPlan(True, left_out, cameras, sentence)
 
 
 def log(data: RunData, to: rr.RecordingStream, scope: Scope) -> list[str]:
-    """Sends the log's other topics, and returns sentences about what is missing.
+    """Log the log's other topics and return notes on missing ones.
 
-    Times are those of the log on `ros2_timestamp` and `message_log_time`; `elapsed` follows from the header stamp, or from
+    Times are the log's own on `ros2_timestamp` and `message_log_time`; `elapsed` follows from the header stamp, or from
     the log time where a message has none on the IMU's clock.
     """
-    what = plan(data, scope)
-    said = [what.sentence] if what.sentence else []
-    if not what.wanted or data.source is None:
-        return said
+    plan = plan_import(data, scope)
+    notes = [plan.sentence] if plan.sentence else []
+    if not plan.wanted or data.source is None:
+        return notes
     from rerun.chunk import McapReader
 
-    exclude = [f"^{re.escape(topic)}$" for topic in what.left_out]
+    exclude = [f"^{re.escape(topic)}$" for topic in plan.left_out]
     try:
         reader = McapReader(data.source, decoders=DECODERS, exclude_topic_regex=exclude, recover=True)
-        to.send_chunks(_placed(reader.stream(), data, scope))
+        to.send_chunks(_on_our_timelines(reader.stream(), data, scope))
     except (ValueError, RuntimeError, OSError) as error:
         logger.debug("%s", error, exc_info=True)
-        return [*said, f"{SENTENCE}: Rerun cannot read them ({error})."]
-    return said
+        return [*notes, f"{NOT_SHOWN}: Rerun cannot read them ({error})."]
+    return notes
 
 
 def _camera(topic: Topic, data: RunData, scope: Scope) -> str:
-    return _place(path((), *(part for part in topic.name.split("/") if part)), data, scope)
+    return _entity_of_topic(entity_path((), *(part for part in topic.name.split("/") if part)), data, scope)
 
 
-def _place(entity: str, data: RunData, scope: Scope) -> str:
-    """Where a topic's entity lies: under its own name, below `source` where that is a name of ours."""
+def _entity_of_topic(entity: str, data: RunData, scope: Scope) -> str:
+    """Entity path of a topic: its own name, below `source` where we use that name."""
     first = entity.removeprefix("/").partition("/")[0]
-    taken = OURS | {path((), trace.name).removeprefix("/") for trace in data.traces}
+    taken = OWN_ENTITIES | {entity_path((), trace.name).removeprefix("/") for trace in data.traces}
     below = (*scope, "source") if first in taken else scope
-    return f"{path(below) if below else ''}{entity}"
+    return f"{entity_path(below) if below else ''}{entity}"
 
 
-def _placed(chunks: Iterable[Chunk], data: RunData, scope: Scope) -> Iterator[Chunk]:
-    """The chunks of topics, in place and on our timelines."""
+def _on_our_timelines(chunks: Iterable[Chunk], data: RunData, scope: Scope) -> Iterator[Chunk]:
+    """Chunks of topics at their entity paths, on our timelines."""
     for chunk in chunks:
-        if chunk.is_empty or chunk.entity_path.startswith("/__"):  # properties of the file as Rerun sees it
+        if chunk.is_empty or chunk.entity_path.startswith("/__"):  # properties of the file
             continue
-        moved = chunk.with_entity_path(_place(chunk.entity_path, data, scope))
-        yield from [moved] if chunk.is_static else _timed(moved, data)
+        moved = chunk.with_entity_path(_entity_of_topic(chunk.entity_path, data, scope))
+        yield from [moved] if chunk.is_static else _with_elapsed(moved, data)
 
 
-def _timed(chunk: Chunk, data: RunData) -> list[Chunk]:
-    """A chunk with `elapsed`, and without the publish time that nothing else here is on."""
+def _with_elapsed(chunk: Chunk, data: RunData) -> list[Chunk]:
+    """Chunk with `elapsed` and without the publish time, on which nothing else lies."""
     import pyarrow as pa
     from rerun.chunk import Chunk
 
     batch = chunk.to_record_batch()
-    elapsed = elapsed_ns(_ns(batch, clock.STAMP), _ns(batch, clock.LOG_TIME), data)
+    elapsed = elapsed_ns(_times_ns(batch, sdk.STAMP), _times_ns(batch, sdk.LOG_TIME), data)
     fields, columns = [], []
     for field, column in zip(batch.schema, batch.columns, strict=True):
         if field.name == "message_publish_time":
             continue
         fields.append(field)
         columns.append(column)
-        if field.name == clock.LOG_TIME:
-            metadata = {**(field.metadata or {}), b"rerun:index_name": clock.ELAPSED.encode()}
+        if field.name == sdk.LOG_TIME:
+            metadata = {**(field.metadata or {}), b"rerun:index_name": sdk.ELAPSED.encode()}
             metadata.pop(b"rerun:is_sorted", None)  # of the log time; header stamps may be in another order
-            fields.append(pa.field(clock.ELAPSED, pa.duration("ns"), nullable=False, metadata=metadata))
+            fields.append(pa.field(sdk.ELAPSED, pa.duration("ns"), nullable=False, metadata=metadata))
             columns.append(pa.array(elapsed, pa.duration("ns")))
     return Chunk.from_record_batch(pa.record_batch(columns, schema=pa.schema(fields, metadata=batch.schema.metadata)))
 
 
 def elapsed_ns(stamp_ns: Times | None, log_ns: Times | None, data: RunData) -> Times:
-    """Time since the first IMU sample, by header stamps if all are on its clock, else by log times."""
+    """Time since the first IMU sample, by header stamps on its clock, else by log times."""
     if stamp_ns is not None:
         inside = (stamp_ns > data.start_ns - MARGIN_NS) & (stamp_ns < data.end_ns + MARGIN_NS)
         if inside.all():
@@ -145,8 +145,8 @@ def elapsed_ns(stamp_ns: Times | None, log_ns: Times | None, data: RunData) -> T
     return since
 
 
-def _ns(batch: Any, name: str) -> Times | None:
-    """A timeline of a batch as int64 nanoseconds; none where it has none."""
+def _times_ns(batch: Any, name: str) -> Times | None:
+    """Timeline of a batch as int64 nanoseconds, or None."""
     if name not in batch.schema.names:
         return None
     times: Times = batch.column(name).cast("int64").to_numpy()

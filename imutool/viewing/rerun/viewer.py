@@ -1,4 +1,4 @@
-"""A viewer of our own: started, given the logs, and left to the person; or the next best thing."""
+"""Start a native viewer with the logs, or save an .rrd file where no viewer can open."""
 
 from __future__ import annotations
 
@@ -16,38 +16,38 @@ from typing import Any, NamedTuple
 from imutool.errors import ConfigError
 from imutool.viewing.model.output import Output
 from imutool.viewing.model.run_data import RunData
-from imutool.viewing.rerun import connect, files
-from imutool.viewing.rerun.connect import Peer
-from imutool.viewing.rerun.sdk import LOGGING, ONLY_NEW, need_sdk, title, version
+from imutool.viewing.rerun import connect, scene
+from imutool.viewing.rerun.connect import Listener
+from imutool.viewing.rerun.sdk import LOG_LEVELS, LOGGING, recording_name, require_rerun, rerun_version
 
-MEMORY_LIMIT = "50%"  # of the machine, for a viewer of our own: by default it takes three quarters
-STARTS_S = 10.0  # for a viewer that lives but does not listen yet, as from a slow disk; one that dies is seen at once
-SETTLES_S = 1.0  # within which one that finds no window or no graphics has died, though it listened
+MEMORY_LIMIT = "50%"  # of the machine's memory; the viewer's default is three quarters
+START_TIMEOUT_S = 10.0  # for a viewer that runs but does not listen yet, as from a slow disk; a dead one is seen at once
+DIES_WITHIN_S = 1.0  # a viewer without a window or graphics listens first and dies within this time
 
-VIEWERS: list[subprocess.Popen[bytes]] = []  # they outlive us; held so that Python does not warn of a lost child
+VIEWERS: list[subprocess.Popen[bytes]] = []  # they outlive us; kept so that Python does not warn of a lost child
 
 
 def show(logs: Sequence[RunData], *, source: bool = True, at_s: float | None = None, overwrite: bool = False) -> Output:
-    """Opens a viewer; where there is no display or the viewer does not start, saves NAME.rrd here, and says so.
+    """Open a viewer, or save NAME.rrd here where no viewer can open.
 
     Raises:
         ConfigError: no log, Rerun is not installed, or the file exists (without `overwrite`) or cannot be written.
     """
-    title(logs)  # refuses where there is no log
-    need_sdk()
+    recording_name(logs)  # refuses where there is no log
+    require_rerun()
     try:
         return open_viewer(logs, source=source, at_s=at_s)
     except ConfigError as error:
-        trouble = sentence(error)
-    saved = files.save(logs, source=source, overwrite=overwrite)
-    return saved._replace(said=f"{trouble}{saved.said}, or look in a browser: imutool view --web")
+        trouble = as_sentence(error)
+    saved = scene.save(logs, source=source, overwrite=overwrite)
+    return saved._replace(said=f"{trouble}{saved.said}, or use a browser: imutool view --web")
 
 
 def open_viewer(logs: Sequence[RunData], *, source: bool = True, at_s: float | None = None) -> Output:
-    """Opens a viewer of our own with all logs, the cursor at `at_s` seconds.
+    """Open a viewer with all logs, the cursor at `at_s` seconds.
 
     Raises:
-        ConfigError: no display, no viewer, or it does not live long enough to take the logs.
+        ConfigError: no display, no viewer, or it dies before it has the logs.
     """
     viewer = start()
     if trouble := viewer.trouble():  # before anything is sent: Rerun's client tries for 40 s to reach one that has died
@@ -61,8 +61,8 @@ def open_viewer(logs: Sequence[RunData], *, source: bool = True, at_s: float | N
     return Output("viewer", viewer.peer.url, "The viewer is open.")
 
 
-def open_empty() -> Peer:
-    """Opens a viewer of our own for what is still to come.
+def open_empty() -> Listener:
+    """Open an empty viewer for a live view.
 
     Raises:
         ConfigError: no display, no viewer, or it dies at once.
@@ -74,51 +74,51 @@ def open_empty() -> Peer:
 
 
 def has_display() -> bool:
-    """Whether a window can open here: always asked before a viewer is, since Rerun finds out only after 18 s."""
+    """Whether a window can open here; Rerun itself finds out only after 18 s."""
     if sys.platform in ("darwin", "win32"):
         return True
     return bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
 
 
 class Viewer(NamedTuple):
-    """A viewer of our own that was started, and where it listens."""
+    """Started viewer and the address where it listens."""
 
     process: subprocess.Popen[bytes]
-    peer: Peer
+    peer: Listener
 
-    def trouble(self, wait_s: float = SETTLES_S) -> ConfigError | None:
-        """What became of it, if it has died or does so now: one that finds no window listens before it notices."""
+    def trouble(self, wait_s: float = DIES_WITHIN_S) -> ConfigError | None:
+        """Error if the viewer has died or dies within `wait_s`."""
         with contextlib.suppress(subprocess.TimeoutExpired):
             self.process.wait(wait_s)
         return None if self.process.returncode is None else _stopped(self.process)
 
 
 def start() -> Viewer:
-    """Starts a viewer of our own, on loopback and a free port.
+    """Start a viewer on loopback and a free port.
 
     Raises:
         ConfigError: no display, no viewer, or it dies at once or does not listen.
     """
     if not has_display():
-        raise _trouble("there is no display here")
+        raise _no_viewer("there is no display here")
     port = free_port()
     process = run("--port", str(port), "--memory-limit", MEMORY_LIMIT, "--hide-welcome-screen")
     VIEWERS.append(process)
-    if not listens(process, port, STARTS_S):
+    if not listens(process, port, START_TIMEOUT_S):
         if process.poll() is not None:
             raise _stopped(process)
         process.terminate()
-        raise _trouble(f"the viewer did not listen within {STARTS_S:g} s")
-    return Viewer(process, Peer(f"{connect.PLAIN}://127.0.0.1:{port}{connect.PATH}", version()))
+        raise _no_viewer(f"the viewer did not listen within {START_TIMEOUT_S:g} s")
+    return Viewer(process, Listener(f"{connect.PLAIN}://127.0.0.1:{port}{connect.PATH}", rerun_version()))
 
 
 def run(*arguments: str) -> subprocess.Popen[bytes]:
-    """Rerun's own program, silent, reachable from this machine only and alive after us.
+    """Start Rerun's program: silent, reachable from this machine only, and not stopped with us.
 
     Raises:
-        ConfigError: it is missing or the system does not run it.
+        ConfigError: the program is missing or cannot be started.
     """
-    env = {name: value for name, value in os.environ.items() if (name, value) != (LOGGING, ONLY_NEW)}  # it may say all
+    env = {name: value for name, value in os.environ.items() if (name, value) != (LOGGING, LOG_LEVELS)}
     quiet: Mapping[str, Any] = {
         "env": env,
         "stdin": subprocess.DEVNULL,
@@ -128,11 +128,11 @@ def run(*arguments: str) -> subprocess.Popen[bytes]:
     try:
         return subprocess.Popen([str(binary()), "--bind", "127.0.0.1", *arguments], **quiet, start_new_session=True)
     except OSError as error:
-        raise _trouble(f"the viewer cannot be started ({error.strerror})") from error
+        raise _no_viewer(f"the viewer cannot be started ({error.strerror})") from error
 
 
 def listens(process: subprocess.Popen[bytes], port: int, within_s: float) -> bool:
-    """Whether a program listens on a port of this machine before it dies or the time is up."""
+    """Whether a program listens on a local port before it dies or the time is up."""
     end = time.monotonic() + within_s
     while time.monotonic() < end and process.poll() is None:
         with socket.socket() as line:
@@ -144,27 +144,27 @@ def listens(process: subprocess.Popen[bytes], port: int, within_s: float) -> boo
 
 
 def free_port() -> int:
-    """A port of this machine on which nobody listened a moment ago."""
+    """Local port that was free a moment ago."""
     with socket.socket() as line:
         line.bind(("127.0.0.1", 0))
         return int(line.getsockname()[1])
 
 
 def binary() -> Path:
-    """The viewer itself: its Python wrapper needs a PATH, and outlives nothing it starts."""
+    """Path of the viewer's program; its Python wrapper leaves the viewer running when killed."""
     spec = importlib.util.find_spec("rerun_cli")  # comes with rerun-sdk
     folders = list(spec.submodule_search_locations or ()) if spec else [""]
     return Path(folders[0]) / ("rerun.exe" if sys.platform == "win32" else "rerun")
 
 
-def sentence(error: ConfigError) -> str:
-    """What went wrong as the beginning of what is said."""
+def as_sentence(error: ConfigError) -> str:
+    """Error as a sentence."""
     return f"{error.what[0].upper()}{error.what[1:]}. "
 
 
-def _trouble(what: str) -> ConfigError:
-    return ConfigError(what, where="view", fix="Use --save for a file, or --web for a browser")
+def _no_viewer(what: str) -> ConfigError:
+    return ConfigError(what, where="view", fix="Use `save` for a file, or `web` for a browser")
 
 
 def _stopped(process: subprocess.Popen[bytes]) -> ConfigError:
-    return _trouble(f"the viewer stopped at once (exit code {process.returncode})")
+    return _no_viewer(f"the viewer stopped at once (exit code {process.returncode})")

@@ -1,12 +1,16 @@
-"""The viewer as a web page: its files out of the installed Rerun, the recording beside them, served to this machine only."""
+"""Rerun's web viewer with a recording, served to this machine or exported as a folder."""
 
 from __future__ import annotations
 
 import contextlib
 import html
 import http.server
+import os
+import secrets
+import shutil
 import urllib.request
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -15,22 +19,22 @@ from imutool.recording import nanoseconds
 from imutool.viewing.model.output import Output
 from imutool.viewing.model.run_data import RunData
 from imutool.viewing.rerun import viewer
-from imutool.viewing.rerun.files import rrd
-from imutool.viewing.rerun.sdk import need_sdk, title
+from imutool.viewing.rerun.scene import rrd
+from imutool.viewing.rerun.sdk import recording_name, require_rerun
 
 PAGE, START, RECORDING = "index.html", "start.js", "recording.rrd"
-THEIRS = ("re_viewer.js", "re_viewer_bg.wasm")  # Rerun's own, as built for the installed version
-FILES = (PAGE, START, RECORDING, *THEIRS)
+RERUN_FILES = ("re_viewer.js", "re_viewer_bg.wasm")  # built for the installed version
+FILES = (PAGE, START, RECORDING, *RERUN_FILES)
 TYPES = {
     ".html": "text/html; charset=utf-8",
     ".js": "text/javascript",
     ".wasm": "application/wasm",
     ".rrd": "application/octet-stream",
 }
-STARTS_S, FETCH_S = 1.5, 10.0
+START_TIMEOUT_S, FETCH_TIMEOUT_S = 1.5, 10.0
 LOCAL = ("127.0.0.1", "localhost")
 
-# Rerun's page asks four hosts for fonts, news and statistics; this one may ask nobody but the server it came from.
+# Rerun's own page asks four hosts for fonts, news and statistics; this one may ask only the server it came from.
 POLICY = (
     "default-src 'none'; script-src 'self' 'wasm-unsafe-eval'; connect-src 'self'; img-src 'self' data: blob:; "
     "style-src 'unsafe-inline'; worker-src 'self' blob:; base-uri 'none'; form-action 'none'"
@@ -38,48 +42,48 @@ POLICY = (
 
 
 def site(logs: Sequence[RunData], *, source: bool = True, at_s: float | None = None) -> dict[str, bytes]:
-    """The files of a web page that shows all logs: its own, the viewer's and the recording, by name.
+    """Files of a web page with all logs: page, viewer and recording, by name.
 
     Raises:
         ConfigError: no log, Rerun is not installed, or its program does not run.
     """
-    need_sdk()
-    ours = Path(__file__).parent / "site"
-    words = {"$POLICY": POLICY, "$TITLE": title(logs), "$RECORDING": RECORDING}
-    words["$AT_NS"] = "" if at_s is None else str(nanoseconds(at_s))
-    page = (ours / PAGE).read_text(encoding="utf-8")
-    for word, value in words.items():
-        page = page.replace(word, html.escape(value))
-    return {PAGE: page.encode(), START: (ours / START).read_bytes(), **assets(), RECORDING: rrd(logs, source=source)}
+    require_rerun()
+    folder = Path(__file__).parent / "site"
+    values = {"$POLICY": POLICY, "$TITLE": recording_name(logs), "$RECORDING": RECORDING}
+    values["$AT_NS"] = "" if at_s is None else str(nanoseconds(at_s))
+    page = (folder / PAGE).read_text(encoding="utf-8")
+    for name, value in values.items():
+        page = page.replace(name, html.escape(value))
+    return {PAGE: page.encode(), START: (folder / START).read_bytes(), **viewer_files(), RECORDING: rrd(logs, source=source)}
 
 
-def assets() -> dict[str, bytes]:
-    """The viewer's own files. They are inside Rerun's program, which hands them out as a web server: asked on loopback.
+def viewer_files() -> dict[str, bytes]:
+    """Viewer files, downloaded on loopback from Rerun's program, which contains and serves them.
 
     Raises:
-        ConfigError: the program is missing, does not run, or does not hand them out.
+        ConfigError: the program is missing, does not run, or does not serve them.
     """
     grpc, port = viewer.free_port(), viewer.free_port()
     process = viewer.run("--serve-web", "--port", str(grpc), "--web-viewer-port", str(port))
     try:
-        if not viewer.listens(process, port, STARTS_S):
-            raise ConfigError("the viewer's web page cannot be had: Rerun's program does not serve it", where=viewer.binary())
-        found = {}
-        for name in THEIRS:
-            with urllib.request.urlopen(f"http://127.0.0.1:{port}/{name}", timeout=FETCH_S) as answer:
-                found[name] = answer.read()
-        return found
+        if not viewer.listens(process, port, START_TIMEOUT_S):
+            raise ConfigError("Rerun's program does not serve the viewer's web page", where=viewer.binary())
+        files = {}
+        for name in RERUN_FILES:
+            with urllib.request.urlopen(f"http://127.0.0.1:{port}/{name}", timeout=FETCH_TIMEOUT_S) as answer:
+                files[name] = answer.read()
+        return files
     except OSError as error:
-        raise ConfigError(f"the viewer's web page cannot be had ({error})", where=viewer.binary()) from error
+        raise ConfigError(f"the viewer's web page cannot be read ({error})", where=viewer.binary()) from error
     finally:
         process.kill()
         process.wait()
 
 
 class Server:
-    """A web server on loopback, bound at once, so that a taken port is known before any work; context manager.
+    """Web server on loopback, bound at once so that a used port is known before any work.
 
-    `moved` says that the port asked for was taken and another one is used.
+    `moved` is a sentence where the requested port is in use and another one serves.
     """
 
     def __init__(self, port: int | None = None) -> None:
@@ -90,36 +94,36 @@ class Server:
             self._http = http.server.ThreadingHTTPServer(("127.0.0.1", port or 0), handler)
         except (OSError, OverflowError) as error:
             if not isinstance(error, OSError):
-                raise ConfigError(f"{port} is no port", where="--port", expected="1 to 65535") from error
+                raise ConfigError(f"{port} is not a port", where="port", expected="1 to 65535") from error
             self._http = http.server.ThreadingHTTPServer(("127.0.0.1", 0), handler)
-            self.moved = f"Port {port} cannot be had ({error.strerror}). "
+            self.moved = f"Port {port} cannot be used ({error.strerror}). "
 
     @property
     def port(self) -> int:
-        """The port it listens on."""
+        """Port of the server."""
         return int(self._http.server_port)
 
     @property
     def url(self) -> str:
-        """The address for a browser on this machine."""
+        """Address for a browser on this machine."""
         return f"http://127.0.0.1:{self.port}/"
 
     def file(self, name: str) -> bytes | None:
-        """What is served under a name; the page itself under none."""
+        """Content of a file; the page for an empty name."""
         return self._files.get(name or PAGE)
 
     def offer(self, files: Mapping[str, bytes]) -> Output:
-        """Takes what is to be served, and says where it is; `serve` then serves it."""
+        """Set the files that `serve` serves."""
         self._files = files
         return Output("web", self.url, f"{self.moved}Open {self.url} in a browser on this machine; Ctrl-C ends it.")
 
     def serve(self) -> None:
-        """Serves until Ctrl-C or `close`."""
+        """Serve until Ctrl-C or `close`."""
         with contextlib.suppress(KeyboardInterrupt):
             self._http.serve_forever(poll_interval=0.1)
 
     def close(self) -> None:
-        """Stops serving, also from another thread, and gives the port back."""
+        """Stop serving, also from another thread, and release the port."""
         self._http.shutdown()
         self._http.server_close()
 
@@ -132,15 +136,15 @@ class Server:
 
 def _handler(server: Server) -> type[http.server.BaseHTTPRequestHandler]:
     class Handler(http.server.BaseHTTPRequestHandler):
-        """Gives the files that are there, and nothing else, to a browser that asked for this machine by its own name."""
+        """Serves the files to a browser that addressed this machine by a local name."""
 
         protocol_version = "HTTP/1.1"
 
         def do_GET(self) -> None:
             name = self.path.partition("?")[0].lstrip("/")
-            # A page from elsewhere whose name was made to lead here would still say its own name: it gets nothing.
-            known = self.headers.get("Host", "").partition(":")[0] in LOCAL
-            content = server.file(name) if known else None
+            # DNS rebinding: a foreign page whose name resolves to this machine still sends its own name, and gets nothing
+            local = self.headers.get("Host", "").partition(":")[0] in LOCAL
+            content = server.file(name) if local else None
             self.send_response(200 if content is not None else 404)
             self.send_header("Content-Length", str(len(content or b"")))
             self.send_header("Content-Type", TYPES[Path(name or PAGE).suffix] if content is not None else "text/plain")
@@ -150,12 +154,79 @@ def _handler(server: Server) -> type[http.server.BaseHTTPRequestHandler]:
             self.send_header("Cache-Control", "no-store")
             self.end_headers()
             if content and self.command == "GET":
-                with contextlib.suppress(ConnectionError):  # a browser that was closed meanwhile
+                with contextlib.suppress(ConnectionError):  # the browser was closed meanwhile
                     self.wfile.write(content)
 
-        do_HEAD = do_GET  # noqa: N815  the library finds it by this name
+        do_HEAD = do_GET  # noqa: N815  http.server calls this name
 
         def log_message(self, *_: Any) -> None:
-            """Nobody wants to read every request."""
+            """Log nothing."""
 
     return Handler
+
+
+def check_folder(folder: Path, *, overwrite: bool = False) -> None:
+    """Check before the work that the folder can be written.
+
+    Raises:
+        ConfigError: a file has that name, the folder has other content, or it exists (without `overwrite`).
+    """
+    if not folder.exists():
+        return
+    if not folder.is_dir():
+        raise ConfigError("is a file", where=folder, expected="a folder or a new name")
+    others = sorted({path.name for path in folder.iterdir()} - set(FILES))
+    if others:
+        raise ConfigError(f"has other content ({others[0]})", where=folder, fix="Choose another folder")
+    if not overwrite and any(folder.iterdir()):
+        raise ConfigError("the target exists", where=folder, fix="Choose another folder, or add `overwrite`")
+
+
+def export(
+    logs: Sequence[RunData], folder: Path, *, source: bool = True, at_s: float | None = None, overwrite: bool = False
+) -> Output:
+    """Write the folder, whole or not at all: the page, the viewer's files and the recording.
+
+    Raises:
+        ConfigError: as `check_folder`, Rerun is not installed or does not run, or the system refuses to write.
+    """
+    check_folder(folder, overwrite=overwrite)
+    require_rerun()
+    files = site(logs, source=source, at_s=at_s)
+    place = folder.absolute()  # "." has no name
+    partial = place.with_name(f".{place.name}.{os.getpid()}.{secrets.token_hex(4)}.partial")
+    with _os_error_as_config_error(folder):
+        try:
+            partial.mkdir(parents=True)
+            for name, content in files.items():
+                (partial / name).write_bytes(content)
+            check_folder(folder, overwrite=overwrite)
+            _replace_folder(partial, place)
+        finally:
+            with contextlib.suppress(FileNotFoundError):
+                shutil.rmtree(partial)
+    served = f"python -m http.server --bind 127.0.0.1 --directory {folder}"
+    return Output("folder", str(folder / PAGE), f"Exported {folder} for any web server, for instance: {served}")
+
+
+def _replace_folder(source: Path, target: Path) -> None:
+    """Move a folder to its place; an existing one is removed after the move, and restored if it fails."""
+    if not target.exists():
+        source.rename(target)
+        return
+    old = source.with_suffix(".replaced")
+    target.rename(old)
+    try:
+        source.rename(target)
+    except BaseException:
+        old.rename(target)
+        raise
+    shutil.rmtree(old)
+
+
+@contextmanager
+def _os_error_as_config_error(folder: Path) -> Iterator[None]:
+    try:
+        yield
+    except OSError as error:
+        raise ConfigError(f"cannot be written ({error.strerror})", where=folder, fix="Choose another place") from error

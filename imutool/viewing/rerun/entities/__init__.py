@@ -1,1 +1,1 @@
-"""What is logged to Rerun, one kind of entity a file."""
+"""Entities of a Rerun recording: paths, signals, errors, events and the report."""

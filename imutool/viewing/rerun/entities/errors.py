@@ -1,4 +1,4 @@
-"""How far each run is from the truth: in total, by axis, by angle and by direction, since its last reset, at its worst."""
+"""Entities of errors (total, by axis, drift, worst moment) and of events (states and texts)."""
 
 from __future__ import annotations
 
@@ -6,24 +6,15 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from imutool.units import AXES
+from imutool.viewing.model import events
 from imutool.viewing.model.run_data import RunData, Trace
 from imutool.viewing.model.trajectory_error import Drift, Errors
-from imutool.viewing.rerun.entities import names as entities
+from imutool.viewing.rerun import sdk
 from imutool.viewing.rerun.entities import styles
-from imutool.viewing.rerun.entities.names import Scope
-from imutool.viewing.rerun.entities.palette import (
-    BOLD_WIDTH,
-    RAW_FADE,
-    RAW_WIDTH,
-    WORST_COLOR,
-    Color,
-    axis_colors,
-    color_of,
-    faded,
-)
-from imutool.viewing.rerun.entities.paths import worst
-from imutool.viewing.rerun.entities.signals import rank, scalars
+from imutool.viewing.rerun.entities.paths import row_of_largest
+from imutool.viewing.rerun.entities.signals import log_axes, log_curves
+from imutool.viewing.rerun.entities.styles import EVENT_COLOR, GREY, MODEL_COLORS, RAW_FADE, WORST_COLOR, Color, color_of
+from imutool.viewing.rerun.sdk import Scope
 
 if TYPE_CHECKING:
     import rerun as rr
@@ -32,15 +23,17 @@ KINDS = ("orientation", "position")
 UNITS = {"orientation": "deg", "position": "m"}
 ANGLES = ("roll", "pitch", "yaw")
 MARKER_SIZE = 6.0
+MIN_EVENT_SHARE = 0.003  # of the log: width of a moment in its lane, where it would else be invisible; its text is exact
+EVENT_COLORS: dict[str, Color] = {"stop": GREY, "worst": WORST_COLOR, "finding": MODEL_COLORS[0]}  # the others are faults
 
 
-def total(errors: Errors, kind: str) -> np.ndarray:
-    """The size of the error of one kind, degrees or metres."""
+def total_error(errors: Errors, kind: str) -> np.ndarray:
+    """Total error of one kind, deg or m."""
     return errors.orientation_total_deg if kind == "orientation" else errors.position_total_m
 
 
-def log(data: RunData, to: rr.RecordingStream, scope: Scope) -> None:
-    """The errors of every run that has any."""
+def log_errors(data: RunData, to: rr.RecordingStream, scope: Scope) -> None:
+    """Log the errors of every run: `error/{orientation,position}/…` and `error/drift/…`."""
     for trace in data.traces:
         if trace.errors is not None:
             _log_errors(data, to, scope, trace, trace.errors)
@@ -49,52 +42,69 @@ def log(data: RunData, to: rr.RecordingStream, scope: Scope) -> None:
 
 
 def _log_errors(data: RunData, to: rr.RecordingStream, scope: Scope, trace: Trace, errors: Errors) -> None:
-    role, name, color = entities.role(trace), entities.label(data, trace), color_of(data, trace)
-    parts = {"orientation": errors.orientation_deg, "position": errors.position_m}
-    for kind in KINDS:
-        home = entities.of(data, trace, scope, "error", kind, role)
-        whole = total(errors, kind)
-        scalars(to, data, home, errors.t_ns, whole[:, None], styles.total(role, name, color))
-        by_axis = _three(data, trace, AXES)
-        scalars(to, data, f"{home}/axes", errors.t_ns, parts[kind], by_axis)
+    role, name, color = sdk.role(trace), sdk.label(data, trace), color_of(data, trace)
+    orientation, position = (sdk.trace_path(data, trace, scope, "error", kind, role) for kind in KINDS)
+    for kind, entity, by_axis in zip(KINDS, (orientation, position), (errors.orientation_deg, errors.position_m), strict=True):
+        total = total_error(errors, kind)
+        log_curves(to, data, entity, errors.t_ns, total[:, None], styles.total_error_curve(role, name, color))
+        log_axes(to, data, trace, f"{entity}/axes", errors.t_ns, by_axis)
         if not trace.is_raw:
-            _log_worst(data, to, home, errors, whole)
-    home = entities.of(data, trace, scope, "error", "orientation", role)
-    scalars(to, data, f"{home}/rpy", errors.t_ns, errors.roll_pitch_yaw_deg, _three(data, trace, ANGLES))
-    home = entities.of(data, trace, scope, "error", "position", role)
-    for direction, values, shade in (
-        ("horizontal", errors.horizontal_m, color),
-        ("vertical", errors.vertical_m, _other(color)),
-    ):
-        style = styles.total(role, f"{direction} {name}", shade)
-        scalars(to, data, f"{home}/{direction}", errors.t_ns, values[:, None], style)
+            _log_worst(data, to, entity, errors, total)
+    log_axes(to, data, trace, f"{orientation}/rpy", errors.t_ns, errors.roll_pitch_yaw_deg, ANGLES)
+    shades = {"horizontal": color, "vertical": styles.blend_to_grey(color, RAW_FADE)}
+    for (direction, shade), values in zip(shades.items(), (errors.horizontal_m, errors.vertical_m), strict=True):
+        style = styles.total_error_curve(role, f"{direction} {name}", shade)
+        log_curves(to, data, f"{position}/{direction}", errors.t_ns, values[:, None], style)
 
 
 def _log_drift(data: RunData, to: rr.RecordingStream, scope: Scope, trace: Trace, drift: Drift) -> None:
-    role, name = entities.role(trace), entities.label(data, trace)
-    for kind, values in (("orientation", drift.orientation_deg), ("position", drift.position_m)):
-        style = styles.total(role, name, color_of(data, trace))
-        scalars(to, data, entities.of(data, trace, scope, "error", "drift", kind, role), drift.t_ns, values[:, None], style)
+    role = sdk.role(trace)
+    style = styles.total_error_curve(role, sdk.label(data, trace), color_of(data, trace))
+    for kind, values in zip(KINDS, (drift.orientation_deg, drift.position_m), strict=True):
+        log_curves(
+            to, data, sdk.trace_path(data, trace, scope, "error", "drift", kind, role), drift.t_ns, values[:, None], style
+        )
 
 
-def _log_worst(data: RunData, to: rr.RecordingStream, home: str, errors: Errors, whole: np.ndarray) -> None:
-    """One point in the plot of totals."""
+def _log_worst(data: RunData, to: rr.RecordingStream, entity: str, errors: Errors, total: np.ndarray) -> None:
+    """One point at the largest total error."""
     import rerun as rr
 
-    row = worst(errors.t_ns, whole)
+    row = row_of_largest(errors.t_ns, total)
     if row is not None:
         style = rr.SeriesPoints(names=["worst"], colors=[WORST_COLOR], markers=["diamond"], marker_sizes=[MARKER_SIZE])
-        scalars(to, data, f"{home}/worst", errors.t_ns[row : row + 1], whole[row : row + 1, None], style)
+        log_curves(to, data, f"{entity}/worst", errors.t_ns[row : row + 1], total[row : row + 1, None], style)
 
 
-def _three(data: RunData, trace: Trace, names: tuple[str, ...]) -> rr.SeriesLines:
-    """Curves about or along x, y and z: raw thin and faint, a model's bold."""
-    label = entities.label(data, trace)
-    faint = trace.is_raw and bool(data.models())
-    colors = [faded(c, RAW_FADE) if faint else c for c in axis_colors(rank(data, trace))]
-    return styles.curves([f"{name} {label}" for name in names], colors, RAW_WIDTH if faint else BOLD_WIDTH)
+def event_kinds(data: RunData) -> list[str]:
+    """Kinds of event in the log, in the order of `events.KINDS`."""
+    found = {event.kind for event in data.events}
+    return [kind for kind in events.KINDS if kind in found]
 
 
-def _other(color: Color) -> Color:
-    """A second shade of a run's colour."""
-    return faded(color, RAW_FADE)
+def log_events(data: RunData, to: rr.RecordingStream, scope: Scope) -> None:
+    """Log `events/KIND`: states for the lane, and a text at the start of each event."""
+    import rerun as rr
+
+    for kind in event_kinds(data):
+        of_kind = sorted((event for event in data.events if event.kind == kind), key=lambda event: event.start_ns)
+        entity = sdk.entity_path(scope, "events", kind)
+        to.log(
+            entity, styles.state_style(kind.replace("_", " "), EVENT_COLORS.get(kind, EVENT_COLOR)), static=True, strict=True
+        )
+        times, states = styles.state_changes([_visible_interval(event, data) for event in of_kind], data.start_ns)
+        changes = rr.StateChange.columns(state=states)
+        to.send_columns(entity, sdk.data_times(data, np.array(times, dtype=np.int64)), changes, strict=True)
+        level = "INFO" if kind == "stop" else "WARN"
+        texts = rr.TextLog.columns(text=[event.text for event in of_kind], level=[level] * len(of_kind))
+        stamps = np.array([event.start_ns for event in of_kind], dtype=np.int64)
+        to.send_columns(entity, sdk.data_times(data, stamps), texts, strict=True)
+
+
+def _visible_interval(event: events.Event, data: RunData) -> tuple[int, int]:
+    """Interval of an event, widened to a visible width; backwards where the log ends before."""
+    least_ns = round(MIN_EVENT_SHARE * (data.end_ns - data.start_ns))
+    if event.end_ns - event.start_ns >= least_ns:
+        return event.start_ns, event.end_ns
+    start_ns = min(event.start_ns, data.end_ns - least_ns)
+    return start_ns, start_ns + least_ns

@@ -1,4 +1,4 @@
-"""Paths that grow with the cursor, the bodies that move along them, and the legend of a path coloured by its error."""
+"""Entities of paths, bodies, error vectors, worst moments and the colour scale of errors."""
 
 from __future__ import annotations
 
@@ -11,30 +11,31 @@ from jaxtyping import Float64, Int64
 
 from imutool.recording import Poses, Times, nanoseconds
 from imutool.viewing.model.decimate import Rows, path_rows
-from imutool.viewing.model.run_data import TRUTH, RunData, Trace, stretches
+from imutool.viewing.model.run_data import TRUTH, RunData, Trace, split_at_gaps
 from imutool.viewing.model.trajectory_error import Errors
-from imutool.viewing.rerun.entities import clock, names, styles
-from imutool.viewing.rerun.entities.names import Scope
-from imutool.viewing.rerun.entities.palette import INK, TRUTH_COLOR, WORST_COLOR, Color, color_of, end_of_scale, heat
+from imutool.viewing.rerun import sdk
+from imutool.viewing.rerun.entities import styles
+from imutool.viewing.rerun.entities.styles import INK, TRUTH_COLOR, WORST_COLOR, Color, color_of, heat_colors, round_up_125
+from imutool.viewing.rerun.sdk import Scope
 
 if TYPE_CHECKING:
     import rerun as rr
 
-ROW_S = 1.0  # of path in one row: with a row per sample the viewer slows down
-MOST_ROWS = 3_600  # of one path; longer logs have longer ones
+ROW_S = 1.0  # length of one row of a path: with a row per sample the viewer slows down
+MAX_ROWS = 3_600  # of one path; a longer log has longer rows
 Q_XYZW = [1, 2, 3, 0]  # columns of wxyz
 LEGEND_STEPS, LEGEND_WIDTH, LEGEND_TICKS = 60, 100.0, 5
-LEGEND_X, LEGEND_Y = (-50.0, 1.08 * LEGEND_WIDTH), (-3.0, 8.0)  # what is shown of the drawing
-LEGEND_WORDS = "debiased: orientation error"
-ERROR_RADIUS = 0.8  # in points of the screen
-WORST_RADIUS, POLE_SHARE = 5.0, 0.2  # in points of the screen; of the size of the scene, so that labels do not meet
+LEGEND_X, LEGEND_Y = (-50.0, 1.08 * LEGEND_WIDTH), (-3.0, 8.0)  # visible part of the drawing
+LEGEND_TITLE = "debiased: orientation error"
+ERROR_RADIUS = 0.8  # screen points
+WORST_RADIUS, POLE_SHARE = 5.0, 0.2  # screen points; share of the scene, so that labels do not meet
 
 
 @dataclass(frozen=True, eq=False)
 class Pieces:
-    """Straight pieces of a path between samples `first` and `last`, none across a gap, `counts` of them in each row.
+    """Straight pieces of a path between samples `first` and `last`, `counts` of them per row.
 
-    A row stands at the stamp of its last sample: what the cursor shows has happened.
+    A row has the stamp of its last sample: what the cursor shows has happened.
     """
 
     first: Int64[np.ndarray, " m"]
@@ -43,111 +44,113 @@ class Pieces:
     stamp_ns: Int64[np.ndarray, " k"]
 
 
-def pieces(poses: Poses) -> Pieces:
-    """A path cut into straight pieces, in rows of ROW_S; longer ones where there would be too many."""
+def path_pieces(poses: Poses) -> Pieces:
+    """Cut a path into straight pieces in rows of ROW_S, or in MAX_ROWS longer rows."""
     if len(poses) < 2:
-        nothing = np.zeros(0, dtype=np.int64)
-        return Pieces(nothing, nothing, nothing, nothing)
-    lengths = [len(stretch) for stretch in stretches(poses)]
+        none = np.zeros(0, dtype=np.int64)
+        return Pieces(none, none, none, none)
+    lengths = [len(stretch) for stretch in split_at_gaps(poses)]
     of_stretch = np.repeat(np.arange(len(lengths)), lengths)
     ends = np.cumsum(lengths)
     rows = np.union1d(path_rows(poses.p_wb), np.concatenate([ends - lengths, ends - 1]))
     first, last = rows[:-1], rows[1:]
-    whole = of_stretch[first] == of_stretch[last]
-    first, last = first[whole], last[whole]
+    unbroken = of_stretch[first] == of_stretch[last]
+    first, last = first[unbroken], last[unbroken]
     since_ns = poses.t_ns[last] - poses.t_ns[0]
-    row_ns = nanoseconds(max(ROW_S, (int(poses.t_ns[-1]) - int(poses.t_ns[0])) * 1e-9 / MOST_ROWS))
+    row_ns = nanoseconds(max(ROW_S, (int(poses.t_ns[-1]) - int(poses.t_ns[0])) * 1e-9 / MAX_ROWS))
     starts = np.flatnonzero(np.diff((since_ns - 1) // row_ns, prepend=-1))  # of each row among the pieces
     counts = np.diff(np.append(starts, len(last)))
     return Pieces(first, last, counts, poses.t_ns[last[starts + counts - 1]])
 
 
-def log(data: RunData, to: rr.RecordingStream, scope: Scope, size: float) -> None:
-    """World, paths and bodies of one log; `size` is the size of the scene in metres."""
+def log_paths(data: RunData, to: rr.RecordingStream, scope: Scope, size: float) -> None:
+    """Log world, paths and bodies of one log; `size` is the diagonal of the scene, m."""
     import rerun as rr
 
-    to.log(names.path(scope, "world"), rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True, strict=True)
+    to.log(sdk.entity_path(scope, "world"), rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True, strict=True)
     if data.truth is not None and len(data.truth):
-        _log_path(to, data, names.path(scope, "world", "gt"), data.truth, None, "gt", TRUTH_COLOR)
-        _log_body(to, data, names.path(scope, "world", "gt"), data.truth, styles.body("gt", TRUTH, TRUTH_COLOR, size))
-    top = heat_top(data)
+        _log_path(to, data, sdk.entity_path(scope, "world", "gt"), data.truth, None, "gt", TRUTH_COLOR)
+        _log_body(
+            to, data, sdk.entity_path(scope, "world", "gt"), data.truth, styles.body_style("gt", TRUTH, TRUTH_COLOR, size)
+        )
+    top = error_scale_top(data)
     for trace in data.traces:
-        role = names.role(trace)
-        home, color = names.of(data, trace, scope, "world", role), color_of(data, trace)
+        role = sdk.role(trace)
+        entity, color = sdk.trace_path(data, trace, scope, "world", role), color_of(data, trace)
         error = None if trace.is_raw or top is None or trace.errors is None else trace.errors.orientation_total_deg
         colors = None if error is None or top is None else (error, top)
-        _log_path(to, data, home, trace.path, colors, role, color)
-        _log_body(to, data, home, trace.path, styles.body(role, names.label(data, trace), color, size))
-        _log_worst(to, data, trace, home, size)
+        _log_path(to, data, entity, trace.path, colors, role, color)
+        _log_body(to, data, entity, trace.path, styles.body_style(role, sdk.label(data, trace), color, size))
+        _log_worst(to, data, trace, entity, size)
         if not trace.is_raw and trace.errors is not None:
-            _log_error_vectors(to, data, trace, trace.errors, names.of(data, trace, scope, "world", "error_vec"))
+            _log_error_vectors(to, data, trace, trace.errors, sdk.trace_path(data, trace, scope, "world", "error_vec"))
     if top is not None:
         _log_legend(to, scope, top)
 
 
-def heat_top(data: RunData) -> float | None:
-    """The orientation error (deg) at the end of the path's scale of colours; none without truth, or with several models.
+def error_scale_top(data: RunData) -> float | None:
+    """Upper end of the path's colour scale, deg; None without truth or with several models.
 
-    Several models have a colour each, by which their paths are told apart; their errors are in the plots.
+    Of several models each path has a colour of its own; the plots show their errors.
     """
     if len(data.models()) != 1 or (errors := data.models()[0].errors) is None:
         return None
     known = errors.orientation_total_deg[np.isfinite(errors.orientation_total_deg)]
-    return end_of_scale(float(known.max())) if len(known) else None
+    return round_up_125(float(known.max())) if len(known) else None
 
 
 def _log_path(
     to: rr.RecordingStream,
     data: RunData,
-    home: str,
+    entity: str,
     poses: Poses,
     by_error: tuple[Float64[np.ndarray, " n"], float] | None,
     role: str,
     color: Color,
 ) -> None:
-    """Rows of pieces, in the colour of the largest error in each piece where that is asked for."""
+    """Rows of pieces, coloured by the largest error in each piece where `by_error` gives errors and scale."""
     import rerun as rr
 
-    cut = pieces(poses)
+    cut = path_pieces(poses)
     if not len(cut.first):
         return
     strips = np.stack([poses.p_wb[cut.first], poses.p_wb[cut.last]], axis=1)
     colors = None
     if by_error is not None:
         error, top = by_error
-        colors = heat(_largest(error, cut), top)
-    to.log(f"{home}/path", styles.path(role, None if colors is not None else color), static=True, strict=True)
+        colors = heat_colors(_largest(error, cut), top)
+    to.log(f"{entity}/path", styles.path_style(role, None if colors is not None else color), static=True, strict=True)
     columns = rr.LineStrips3D.columns(strips=strips, colors=colors).partition(cut.counts)
-    to.send_columns(f"{home}/path", clock.at(data, cut.stamp_ns), columns, strict=True)
+    to.send_columns(f"{entity}/path", sdk.data_times(data, cut.stamp_ns), columns, strict=True)
 
 
 def _largest(error: Float64[np.ndarray, " n"], cut: Pieces) -> Float64[np.ndarray, " m"]:
-    """The largest error within each piece, NaN where none is known."""
+    """Largest error within each piece, NaN where none is known."""
     edges = np.stack([cut.first, cut.last + 1], axis=1).ravel()
     padded = np.append(error, np.nan)  # so that the last piece may end with the last sample
     largest: Float64[np.ndarray, " m"] = np.fmax.reduceat(padded, edges)[::2]
     return largest
 
 
-def _log_body(to: rr.RecordingStream, data: RunData, home: str, path: Poses, style: list[rr.AsComponents]) -> None:
-    """Poses over time, and what is drawn at them."""
+def _log_body(to: rr.RecordingStream, data: RunData, entity: str, path: Poses, style: list[rr.AsComponents]) -> None:
+    """Poses over time, and the style of the body."""
     import rerun as rr
 
     rows = path_rows(path.p_wb)
-    to.log(f"{home}/body", *style, static=True, strict=True)
+    to.log(f"{entity}/body", *style, static=True, strict=True)
     columns = rr.Transform3D.columns(translation=path.p_wb[rows], quaternion=path.q_wb_wxyz[rows][:, Q_XYZW])
-    to.send_columns(f"{home}/body", clock.at(data, path.t_ns[rows]), columns, strict=True)
+    to.send_columns(f"{entity}/body", sdk.data_times(data, path.t_ns[rows]), columns, strict=True)
 
 
 def error_rows(trace: Trace, errors: Errors) -> Rows:
-    """The rows of a path at which its error is drawn in space."""
+    """Rows of a path at which its error vector is drawn."""
     rows = path_rows(trace.path.p_wb)
     known: Rows = rows[np.isfinite(errors.position_m[rows]).all(axis=1)]
     return known
 
 
 def _log_error_vectors(to: rr.RecordingStream, data: RunData, trace: Trace, errors: Errors, entity: str) -> None:
-    """From the true place to the estimated one, at the cursor."""
+    """Vectors from the true to the estimated position."""
     import rerun as rr
 
     rows = error_rows(trace, errors)
@@ -158,47 +161,46 @@ def _log_error_vectors(to: rr.RecordingStream, data: RunData, trace: Trace, erro
     style = rr.LineStrips3D.from_fields(radii=rr.Radius.ui_points([ERROR_RADIUS]), colors=[WORST_COLOR])
     to.log(entity, style, static=True, strict=True)
     columns = rr.LineStrips3D.columns(strips=strips)
-    to.send_columns(entity, clock.at(data, trace.path.t_ns[rows]), columns, strict=True)
+    to.send_columns(entity, sdk.data_times(data, trace.path.t_ns[rows]), columns, strict=True)
 
 
-def worst(t_ns: Times, values: Float64[np.ndarray, " n"]) -> int | None:
-    """The row of the largest value; none where none is known."""
+def row_of_largest(t_ns: Times, values: Float64[np.ndarray, " n"]) -> int | None:
+    """Row of the largest value; None where no value is finite."""
     return int(np.nanargmax(values)) if len(t_ns) and np.isfinite(values).any() else None
 
 
-def _log_worst(to: rr.RecordingStream, data: RunData, trace: Trace, home: str, size: float) -> None:
-    """Where on the true path a model's orientation was furthest off, by how much and when: its own path may be far off."""
+def _log_worst(to: rr.RecordingStream, data: RunData, trace: Trace, entity: str, size: float) -> None:
+    """Pole on the true path at a model's largest orientation error: the model's own path may be far off."""
     import rerun as rr
 
     if trace.is_raw or trace.errors is None or data.truth is None:
         return
     errors = trace.errors
-    row = worst(errors.t_ns, errors.orientation_total_deg)
+    row = row_of_largest(errors.t_ns, errors.orientation_total_deg)
     if row is None:
         return
     at_s = data.elapsed_s(errors.t_ns[row : row + 1])[0]
     rank = data.models().index(trace)
-    whose = f"{names.label(data, trace)} " if len(data.models()) > 1 else ""
-    words = f"{whose}worst: {errors.orientation_total_deg[row]:.2f}° at {at_s:.1f} s"
-    nearest = int(np.abs(data.truth.t_ns - errors.t_ns[row]).argmin())
-    foot = data.truth.p_wb[nearest]
+    prefix = f"{sdk.label(data, trace)} " if len(data.models()) > 1 else ""
+    words = f"{prefix}worst: {errors.orientation_total_deg[row]:.2f}° at {at_s:.1f} s"
+    foot = data.truth.p_wb[int(np.abs(data.truth.t_ns - errors.t_ns[row]).argmin())]
     top = foot + np.array([0.0, 0.0, POLE_SHARE * (1 + rank) * size])
     pole = rr.LineStrips3D([[foot, top]], colors=[WORST_COLOR], radii=rr.Radius.ui_points(1.0))
     radii = rr.Radius.ui_points([WORST_RADIUS, 0.0])
     dots = rr.Points3D([foot, top], labels=["", words], colors=[WORST_COLOR, INK], radii=radii, show_labels=True)
-    to.log(f"{home}/worst", pole, dots, static=True, strict=True)
+    to.log(f"{entity}/worst", pole, dots, static=True, strict=True)
 
 
 def _log_legend(to: rr.RecordingStream, scope: Scope, top: float) -> None:
-    """A strip of the path's colours with numbers under it, LEGEND_WIDTH wide, and what they mean left of it."""
+    """Colour scale of a path, LEGEND_WIDTH wide, with tick labels below and its title on the left."""
     import rerun as rr
 
     strips = [[[left, 0.0], [right, 0.0]] for left, right in pairwise(np.linspace(0.0, LEGEND_WIDTH, LEGEND_STEPS + 1))]
     shares = (np.arange(LEGEND_STEPS) + 0.5) / LEGEND_STEPS
-    bar = rr.LineStrips2D(strips, colors=heat(shares, 1.0), radii=rr.Radius.ui_points(6.0))
-    to.log(names.path(scope, "legend", "colors"), bar, static=True, strict=True)
+    bar = rr.LineStrips2D(strips, colors=heat_colors(shares, 1.0), radii=rr.Radius.ui_points(6.0))
+    to.log(sdk.entity_path(scope, "legend", "colors"), bar, static=True, strict=True)
     ticks = np.linspace(0.0, 1.0, LEGEND_TICKS)
-    words = [f"{share * top:g}°" for share in ticks] + [LEGEND_WORDS]
+    words = [f"{share * top:g}°" for share in ticks] + [LEGEND_TITLE]
     places = [[share * LEGEND_WIDTH, 1.0] for share in ticks] + [[LEGEND_X[0] / 2.0, -2.5]]
     dots = rr.Points2D(places, labels=words, colors=[INK] * len(words), radii=rr.Radius.ui_points(0.0), show_labels=True)
-    to.log(names.path(scope, "legend", "ticks"), dots, static=True, strict=True)
+    to.log(sdk.entity_path(scope, "legend", "ticks"), dots, static=True, strict=True)

@@ -1,40 +1,40 @@
-"""The report in the viewer, as Markdown: figures, windows, events, alignment, notes and what it was made from."""
+"""Markdown report in the viewer: figures, windows, events, notes and provenance."""
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from imutool.viewing.model.run_data import RunData
-from imutool.viewing.rerun.entities import names
-from imutool.viewing.rerun.entities.markdown import escape, table
-from imutool.viewing.rerun.entities.names import Scope
-from imutool.viewing.rerun.entities.palette import color_name
-from imutool.viewing.rerun.entities.paths import heat_top
+from imutool.viewing.rerun import sdk
+from imutool.viewing.rerun.entities.paths import error_scale_top
+from imutool.viewing.rerun.entities.styles import color_name
+from imutool.viewing.rerun.sdk import Scope
 
 if TYPE_CHECKING:
     import rerun as rr
 
-MOST_EVENTS = 40  # in the list; the lanes and their texts hold all
+MAX_EVENTS = 40  # in the list; the Events tab shows all
 
 
-def log(data: RunData, to: rr.RecordingStream, scope: Scope, more: Sequence[str] = ()) -> None:
-    """`report`: what `markdown` says, with sentences of the one who logs after the log's own notes."""
+def log_report(data: RunData, to: rr.RecordingStream, scope: Scope, more: Sequence[str] = ()) -> None:
+    """Log the text of `markdown` as `report`."""
     import rerun as rr
 
     text = rr.TextDocument(markdown(data, more), media_type="text/markdown")
-    to.log(names.path(scope, "report"), text, static=True, strict=True)
+    to.log(sdk.entity_path(scope, "report"), text, static=True, strict=True)
 
 
 def log_comparison(logs: Sequence[RunData], to: rr.RecordingStream) -> None:
-    """`compare`: the figures of several logs side by side."""
+    """Log a table of the figures of several logs as `compare`."""
     import rerun as rr
 
     to.log("compare", rr.TextDocument(comparison(logs), media_type="text/markdown"), static=True, strict=True)
 
 
 def markdown(data: RunData, more: Sequence[str] = ()) -> str:
-    """All the words about one log."""
+    """Report on one log as Markdown; `more` are sentences after the log's own notes."""
     lines = [f"# {escape(data.name)}", ""]
     lines += [f"{data.duration_s:.1f} s, read {' and '.join(escape(trace.name) for trace in data.traces)}.", ""]
     for note in (*data.notes, *_colors(data), *more):
@@ -47,21 +47,21 @@ def markdown(data: RunData, more: Sequence[str] = ()) -> str:
 
 
 def comparison(logs: Sequence[RunData]) -> str:
-    """One table: a row for each run of each log, a column for each figure that any has."""
+    """Table with a row for each run of each log and a column for each figure."""
     labels = list(dict.fromkeys(label for data in logs for label, _ in data.table()))
     rows = []
     for data in logs:
         values = dict(data.table())
-        for place, trace in enumerate(data.traces):
-            cells = [_cell(values[label][place]) if label in values else "" for label in labels]
+        for k, trace in enumerate(data.traces):
+            cells = [_cell(values[label][k]) if label in values else "" for label in labels]
             rows.append([escape(data.name), escape(trace.name), *cells])
     heads = ["log", "run", *labels]
     return "\n".join([f"# {len(logs)} logs", "", *table(heads, rows)])
 
 
 def _colors(data: RunData) -> list[str]:
-    """What the colours of the paths mean."""
-    top = heat_top(data)
+    """Meaning of the colours of the paths."""
+    top = error_scale_top(data)
     if top is not None:
         return [
             f"The debiased path is coloured by its orientation error: dark blue is none, yellow is {top:g} degrees and more."
@@ -78,15 +78,15 @@ def _figures(data: RunData) -> list[str]:
 
 
 def _windows(data: RunData) -> list[str]:
-    """Root mean square errors at the ends of windows, a row for each length and run."""
+    """Root mean square errors at the ends of windows, one row for each length and run."""
     rows = [
         [f"{w.length_s:g} s", escape(trace.name), str(w.count), *map(_cell, (w.orientation_deg, w.velocity_m_s, w.position_m))]
         for trace in data.traces
         for w in trace.windows
     ]
     heads = ["window", "run", "count", "orientation (deg)", "velocity (m/s)", "position (m)"]
-    said = "Root mean square errors at the ends of windows that each start from the truth."
-    return ["## Windows", "", said, "", *table(heads, rows), ""] if rows else []
+    caption = "Root mean square errors at the ends of windows that each start from the truth."
+    return ["## Windows", "", caption, "", *table(heads, rows), ""] if rows else []
 
 
 def _events(data: RunData) -> list[str]:
@@ -100,10 +100,10 @@ def _events(data: RunData) -> list[str]:
             e.kind.replace("_", " "),
             escape(e.text),
         ]
-        for e in data.events[:MOST_EVENTS]
+        for e in data.events[:MAX_EVENTS]
     ]
-    left = len(data.events) - len(rows)
-    more = [f"{left} more are in the tab Events.", ""] if left > 0 else []
+    hidden = len(data.events) - len(rows)
+    more = [f"The tab Events shows {hidden} more.", ""] if hidden > 0 else []
     return ["## Events", "", *table(["at (s)", "for (s)", "kind", "what"], rows), "", *more]
 
 
@@ -112,7 +112,22 @@ def _names(data: RunData) -> list[str]:
 
 
 def _cell(value: float | None) -> str:
-    """Four digits are enough to compare; no exponent for what has more."""
+    """Four digits, without an exponent for larger numbers."""
     if value is None:
         return ""
     return f"{value:.0f}" if abs(value) >= 1000.0 else f"{value:.4g}"
+
+
+def escape(text: str) -> str:
+    """Escape a text from a log on one line of Markdown."""
+    plain = "".join(letter if letter.isprintable() else " " for letter in text)
+    return re.sub(r"([\\`*_{}\[\]<>#|!~&])", r"\\\1", plain)
+
+
+def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
+    """Lines of a Markdown table; its cells must be escaped already."""
+    return [_row(head), _row(["---"] * len(head)), *map(_row, rows)]
+
+
+def _row(cells: Sequence[str]) -> str:
+    return f"| {' | '.join(cells)} |"

@@ -1,0 +1,164 @@
+"""Aligned logs: samples in k columns on one clock with what was expected of them, and the rows that a fit sees."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float64
+
+from imutool.recording import Poses
+from imutool.sensor.effect import Effect, SignalState, Theta
+from imutool.sensor.samples import NOTHING, IdealMotion, SensorSamples
+
+BLOCK_S, HELD_OUT_EACH = 6.0, 3  # every third block of six seconds is never fitted
+MARGIN_S = 0.3  # around a border between blocks, counted for neither
+GAP_PERIODS = 3.0  # a longer step between samples is a gap
+BIAS_STD = np.array([0.5] * 3 + [5.0] * 3)  # prior of a log's constant bias: rad/s, m/s²
+
+Blocks = tuple[tuple[int, Float64[np.ndarray, "n _"]], ...]
+
+
+@dataclass(frozen=True, eq=False)
+class AlignedLog(ABC):
+    """Recorded samples by their stamps (s from the log's start), and a forward model of what was expected.
+
+    `fitted` and `held_out` are rows; rows in neither are borders, gaps and ends. `known` marks samples that measure their axis
+    (none: all): those of a converter at its end and of an axis that is stuck do not. Above `band_hz` the expectation is wrong
+    (none: nowhere). `aligned_s` was added to the stamps where the two clocks share no epoch.
+    """
+
+    name: str
+    stamp_s: Float64[np.ndarray, " n"]
+    real: Float64[np.ndarray, "n k"]
+    fitted: Bool[np.ndarray, " n"]
+    held_out: Bool[np.ndarray, " n"]
+    known: Bool[np.ndarray, "n k"] | None = field(default=None, kw_only=True)
+    band_hz: float | None = field(default=None, kw_only=True)
+    aligned_s: float = field(default=0.0, kw_only=True)
+    start_ns: int = field(default=0, kw_only=True)
+
+    @property
+    @abstractmethod
+    def bias_std(self) -> Float64[np.ndarray, " k"]:
+        """Standard deviation of the prior of a constant bias, by column."""
+
+    @property
+    @abstractmethod
+    def exact(self) -> bool:
+        """Whether the expectation is a simulation, which errs by white noise alone, and not poses."""
+
+    @property
+    @abstractmethod
+    def denoised(self) -> bool:
+        """Whether the expectation had noise of its own, which was filtered out."""
+
+    @abstractmethod
+    def state(self) -> SignalState:
+        """Ideal signals before any effect, to be sampled at the log's stamps."""
+
+    @abstractmethod
+    def blocks(self, samples: Any) -> Blocks:
+        """Sampled signals by sensor: first column and columns; effects leave arrays of other sensors as they are."""
+
+    @abstractmethod
+    def recorded(self) -> tuple[Any, Any]:
+        """Ideal signals, and the recorded samples in the form that effects take."""
+
+    @property
+    def usable(self) -> Bool[np.ndarray, "n k"]:
+        """Samples that count, fitted or held out."""
+        rows = (self.fitted | self.held_out)[:, None]
+        return np.asarray(np.broadcast_to(rows, self.real.shape) if self.known is None else rows & self.known)
+
+    @property
+    def axes(self) -> Bool[np.ndarray, " k"]:
+        """Columns of which any sample is known."""
+        return np.ones(self.columns, bool) if self.known is None else np.asarray(self.known.any(axis=0))
+
+    @property
+    def columns(self) -> int:
+        """Number of columns k."""
+        return int(self.real.shape[1])
+
+    @property
+    def period_s(self) -> float:
+        """Median time between recorded samples."""
+        return float(np.median(np.diff(self.stamp_s)))
+
+    def starts(self, effect: Effect) -> list[Theta]:
+        """Parameters to start a fit of an effect from."""
+        if effect.starts is None:
+            return [effect.null_value.astype(float)]
+        return [np.asarray(start, dtype=float) for start in effect.starts(*self.recorded())]
+
+    def alternatives(self, effect: Effect) -> int:
+        """Number of choices of which the effect's starts are the best."""
+        return 0 if effect.alternatives is None else effect.alternatives(self.recorded()[1])
+
+
+@dataclass(frozen=True, eq=False)
+class Pair(AlignedLog):
+    """An IMU's samples (rad/s, m/s²) with the ideal motion `felt` on an even clock.
+
+    `sim_noise` was filtered out of a simulation's samples (zero where its poses replace them), `truth` are the true poses at
+    the stamps.
+    """
+
+    felt: IdealMotion = field(kw_only=True)
+    truth: Poses | None = field(default=None, kw_only=True)
+    against: str = field(default="simulation", kw_only=True)
+    sim_noise: Float64[np.ndarray, "6"] = field(default_factory=lambda: np.zeros(6), kw_only=True)
+    channels: Mapping[str, Float64[np.ndarray, " n"]] = field(default_factory=lambda: NOTHING, kw_only=True)
+
+    @property
+    def bias_std(self) -> Float64[np.ndarray, " k"]:
+        """Prior of a turn-on bias, by axis (rad/s, m/s²)."""
+        return BIAS_STD
+
+    @property
+    def exact(self) -> bool:
+        """Whether the expectation is a simulation."""
+        return self.against == "simulation"
+
+    @property
+    def denoised(self) -> bool:
+        """Whether the simulation's samples were filtered."""
+        return bool(self.sim_noise.any())
+
+    def state(self) -> SignalState:
+        """The ideal motion, to be sampled at the stamps."""
+        return SignalState(self.felt, self.stamp_s, self.stamp_s)
+
+    def blocks(self, samples: SensorSamples) -> Blocks:
+        """Gyro, then accelerometer."""
+        return (0, samples.gyro), (3, samples.accel)
+
+    def recorded(self) -> tuple[IdealMotion, SensorSamples]:
+        """The ideal motion and the recorded samples; angular acceleration is not recorded."""
+        return self.felt, SensorSamples(self.stamp_s, self.real[:, :3], self.real[:, 3:], np.zeros((len(self.real), 3)))
+
+
+def split(stamp_s: Float64[np.ndarray, " n"]) -> tuple[Bool[np.ndarray, " n"], Bool[np.ndarray, " n"]]:
+    """Rows that are held out, and rows that count at all: away from borders between the two and from gaps."""
+    since = stamp_s - stamp_s[0]
+    block_s = min(BLOCK_S, since[-1] / (2 * HELD_OUT_EACH))
+    block = np.floor(since / block_s).astype(int)
+    held_out = block % HELD_OUT_EACH == HELD_OUT_EACH - 1
+    inside = since - block * block_s
+    changed_before = held_out != ((block - 1) % HELD_OUT_EACH == 2)
+    changes_after = held_out != ((block + 1) % HELD_OUT_EACH == 2)
+    usable = ~(((inside < MARGIN_S) & changed_before & (block > 0)) | ((inside > block_s - MARGIN_S) & changes_after))
+    usable &= (since > MARGIN_S) & (since < since[-1] - MARGIN_S)
+    step = np.diff(stamp_s)
+    for k in np.flatnonzero(step > GAP_PERIODS * np.median(step)):
+        usable &= (stamp_s < stamp_s[k] - MARGIN_S) | (stamp_s > stamp_s[k + 1] + MARGIN_S)
+    return held_out, usable
+
+
+def shared_channels(logs: Sequence[Pair]) -> set[str]:
+    """Names of the other channels that every log has."""
+    return set.intersection(*(set(log.channels) for log in logs))

@@ -1,0 +1,1 @@
+"""English sentences of a diagnosis, from its report alone."""

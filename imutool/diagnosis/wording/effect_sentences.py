@@ -1,0 +1,156 @@
+"""Sentence of each effect: what it does to the reading, with its numbers."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+from imutool.diagnosis.result import Diagnosis, Finding
+from imutool.diagnosis.wording.quantity import Quantity, grouped
+
+
+@dataclass(frozen=True)
+class Words:
+    """Words of a sentence: pronoun of the signal, name of the reference, quantities.
+
+    it: the pronoun; other: the reference; main: the first quantity; rest: the others.
+    """
+
+    it: str
+    other: str
+    main: Quantity
+    rest: tuple[Quantity, ...]
+    finding: Finding
+
+    def left_out(self, text: str) -> str:
+        """Quantities that the sentence does not mention; a curve's coefficients are never listed."""
+        quiet = () if self.finding.curve is not None else tuple(one for one in self.rest if str(one) not in text)
+        return "".join(f", {one.labelled}" for one in quiet)
+
+
+def _clock_offset(w: Words) -> str:
+    """tau > 0: a sample shows what happens later, so the reading is ahead."""
+    return f"{w.it} {'lags' if w.main.sign < 0 else 'is ahead of'} {w.other} by {w.main.size}"
+
+
+def _delay(w: Words) -> str:
+    return f"{w.it} {'comes before' if w.main.sign < 0 else 'lags'} {w.other} by {w.main.size}"
+
+
+def _clock_skew(w: Words) -> str:
+    """t (1 + eps): with eps > 0 the motion between two stamps is more than their difference says."""
+    return f"the clock of the recording runs {'slow' if w.main.sign > 0 else 'fast'} by {w.main.size}"
+
+
+def _clock_jump(w: Words) -> str:
+    """When, and by how much."""
+    how_far = f" by {w.rest[0]}" if w.rest else ""
+    return f"the clock of the recording jumps{how_far} at {w.main}"
+
+
+def _driven(w: Words) -> str:
+    return f"{w.it} follows {w.finding.driver or 'another channel of the log'} with {w.main.labelled}"
+
+
+def _unknown(w: Words) -> str:
+    """An equation with its coefficients, or a curve that has none."""
+    curve = w.finding.curve
+    if curve is not None:
+        return f"{w.it} follows a smooth curve of {curve.variable} that has no name among the known effects"
+    return f"{w.finding.equation}, with {w.main.labelled}; this has no name among the known effects"
+
+
+SENTENCES: Mapping[str, str | Callable[[Words], str]] = {
+    "gyro_bias": "{w.it} reads a constant {w.main} too much",
+    "accel_bias": "{w.it} reads a constant {w.main} too much",
+    "gyro_scale": "its scale is off by {w.main}",
+    "accel_scale": "its scale is off by {w.main}",
+    "gyro_misalignment": "its axes are not square: one shows on another by {w.main}",
+    "accel_misalignment": "its axes are not square: one shows on another by {w.main}",
+    "gyro_g_sensitivity": "{w.it} feels the specific force, with {w.main}",
+    "gyro_quadratic": "{w.it} bends with the square of the rate, by {w.main}",
+    "accel_quadratic": "{w.it} bends with the square of the specific force, by {w.main}",
+    "gyro_bias_drift": "its bias drifts by {w.main} in all",
+    "accel_bias_drift": "its bias drifts by {w.main} in all",
+    "rate_curve": "{w.it} errs by a curve of the rate, with {w.main}",
+    "vibration_rectification": "{w.it} turns vibration into a constant, with {w.main}",
+    "lever_arm": "{w.it} sits {w.main} from the tracked point",
+    "size_effect": "its three axes sit apart, by {w.main}",
+    "mount_rotation": "{w.it} is mounted turned by {w.main}",
+    "clock_offset": _clock_offset,
+    "clock_skew": _clock_skew,
+    "clock_jump": _clock_jump,
+    "low_pass": "{w.it} is too slow for what happens above {w.main} (first-order low-pass)",
+    "saturation": "{w.it} stops at its limit of {w.main}",
+    "quantization": "{w.it} comes in steps of {w.main}",
+    "gravity": "gravity differs from what {w.other} takes it for, {w.main.labelled}",
+    "earth_rotation": "{w.it} feels the Earth turn, {w.main.labelled}",
+    "vibration": "{w.it} vibrates at {w.main}",
+    "mount_resonance": "the mount swings at {w.main}",
+    "temperature": "{w.it} follows the temperature, with {w.main}",
+    "dropped_samples": "samples are missing, {w.main.labelled}",
+    "timestamp_jitter": "samples are late by turns, {w.main.labelled}",
+    "reference_error": "the reference is wrong, not the sensor, {w.main.labelled}",
+    "gain": "its gain is off by {w.main}",
+    "offset": "{w.it} reads a constant {w.main} too much",
+    "delay": _delay,
+    "dead_band": "{w.it} stays still within {w.main} of rest",
+    "drift": "{w.it} drifts by {w.main}",
+    "friction": "{w.it} is held back by friction of {w.main}, which turns with the sign of the motion",
+    "driven": _driven,
+    "unknown": _unknown,
+}
+"""By effect, what it does to a reading. What a sentence leaves out of its quantities is added behind it."""
+
+
+def named_sentence(d: Diagnosis, finding: Finding) -> str:
+    """Sentence of a finding with its name: `it lags the simulation by 12.4 ± 0.3 ms (clock_offset)`."""
+    could = f"; could as well be {' or '.join(finding.similar)}" if finding.similar else ""
+    return f"{effect_sentence(d, finding)} ({finding.effect}{could})"
+
+
+def effect_sentence(d: Diagnosis, finding: Finding) -> str:
+    """What a finding does to the reading, with its numbers."""
+    quantities = grouped(finding.parameters)
+    main = quantities[0] if quantities else Quantity("", (), ())
+    words = Words(_pronoun(finding.signal), _reference(d), main, tuple(quantities[1:]), finding)
+    template = SENTENCES.get(finding.effect)
+    if template is None or not (quantities or finding.curve):
+        text = f"{words.it} shows {finding.effect}, {finding.equation}"
+        text += f", {main.labelled}" if quantities else ""
+    else:
+        text = template(words) if callable(template) else template.format(w=words)
+    return f"{text}{words.left_out(text)}"
+
+
+def label(finding: Finding) -> str:
+    """Name of the effect, with its driver if it has one."""
+    return f"{finding.effect} by {finding.driver}" if finding.driver else finding.effect
+
+
+def has_gain(finding: Finding) -> bool:
+    """Whether its gain was measured: missing samples and quantization are seen without a fit."""
+    return finding.held_out.rms_before > 0.0
+
+
+def parameters_text(finding: Finding) -> str:
+    """Quantities of a finding: `r (0.213, -0.051, 0.120) ± 0.004 m`; of a curve its variable."""
+    if finding.curve is not None:
+        return f"a curve of {finding.curve.variable}"
+    return ", ".join(q.labelled for q in grouped(finding.parameters)) or finding.equation
+
+
+def signals(signal: str) -> tuple[str, ...]:
+    """Single signals of a finding: gyro and accel for `both`; any other signal alone."""
+    if signal in {"both", "imu"}:
+        return ("gyro", "accel")
+    return tuple(part for part in re.split(r"\s*(?:\+|,|\band\b)\s*", signal) if part) or (signal,)
+
+
+def _pronoun(signal: str) -> str:
+    return "it" if len(signals(signal)) == 1 else "the sensor"
+
+
+def _reference(d: Diagnosis) -> str:
+    return "the simulation" if d.sim is not None else "the true poses"

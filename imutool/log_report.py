@@ -1,0 +1,105 @@
+"""Report of `imutool info`: topics, IMUs, truth and losses of a log."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from imutool.report import UNSET, Report, Section, UnsetType
+
+
+class TopicInfo(Section, frozen=True):
+    """A topic and its clock, from the log times. Null where it has too few messages.
+
+    `rate_hz` is one over the median period, so that drop-outs do not lower it; `jitter_s` is the periods' standard deviation.
+    """
+
+    name: str
+    type: str
+    encoding: str
+    count: int
+    rate_hz: float | None
+    jitter_s: float | None
+    largest_gap_s: float | None
+    first_ns: int | None
+    last_ns: int | None
+
+
+class Interval(Section, frozen=True):
+    """A stretch of time, by the stamps of its first and last sample."""
+
+    first_ns: int
+    last_ns: int
+
+
+class ImuNoise(Section, frozen=True):
+    """White noise by axis at rest: standard deviation of a sample, and density = std * sqrt(period)."""
+
+    gyro_std_rad_s: list[float]
+    gyro_density: list[float]
+    accel_std_m_s2: list[float]
+    accel_density: list[float]
+    gyro_density_unit: str = "rad/s/sqrt(Hz)"
+    accel_density_unit: str = "m/s^2/sqrt(Hz)"
+
+
+class ImuInfo(Section, frozen=True, kw_only=True):
+    """An IMU topic: clock from the header stamps, defects, rest and noise; only warnings where its encoding is unknown."""
+
+    topic: str
+    warnings: list[str]
+    derived_from: str | UnsetType = UNSET
+    samples: int | UnsetType = UNSET
+    rate_hz: float | UnsetType | None = UNSET
+    jitter_s: float | UnsetType | None = UNSET
+    largest_gap_s: float | UnsetType | None = UNSET
+    first_ns: int | UnsetType | None = UNSET
+    last_ns: int | UnsetType | None = UNSET
+    out_of_order: int | UnsetType = UNSET
+    duplicated: int | UnsetType = UNSET
+    missing: int | UnsetType = UNSET
+    not_finite: int | UnsetType = UNSET
+    saturated: int | UnsetType = UNSET
+    saturation_rule: str | UnsetType = UNSET
+    stationary_s: float | UnsetType = UNSET
+    stationary: list[Interval] | UnsetType = UNSET
+    accel_at_rest_m_s2: float | UnsetType | None = UNSET
+    noise: ImuNoise | UnsetType | None = UNSET
+
+
+class TruthInfo(Section, frozen=True):
+    """A topic of true poses: the share of the IMU's samples between two poses that are not too far apart."""
+
+    topic: str
+    poses: int
+    coverage: float = 0.0
+    gaps: int = 0
+    longest_gap_s: float = 0.0
+    starts_after_s: float | UnsetType = UNSET
+    ends_before_s: float | UnsetType = UNSET
+
+
+class LogInfo(Report, frozen=True, kw_only=True, tag="imutool.info/1"):
+    """The report of `imutool info` about one log."""
+
+    log: str
+    path: str
+    bytes: int
+    profile: str
+    messages: int
+    first_ns: int | None
+    last_ns: int | None
+    duration_s: float | None
+    topics: list[TopicInfo]
+    imu: list[ImuInfo]
+    truth: list[TruthInfo]
+    metadata: list[str]
+    warnings: list[str]
+    checked: bool
+    losses: dict[str, Any]
+    noise: dict[str, Any] | UnsetType = UNSET
+
+
+class LogInfos(Report, frozen=True, tag="imutool.infos/1"):
+    """The report of `imutool info` about several logs."""
+
+    logs: list[LogInfo]

@@ -1,0 +1,91 @@
+"""Every `--json` report is valid against the schema that `imutool schema` prints, and so is every JSON file of a fleet."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import jsonschema
+import pytest
+from typer.testing import CliRunner
+
+from imutool.cli import app
+from imutool.demo import write_asl
+from imutool.report import REPORTS, json_schema
+from imutool.sensor.flight import flight
+
+COMMANDS = [command.name or command.callback.__name__ for command in app.registered_commands if command.callback]
+SILENT = {"schema"}  # commands without --json
+
+# words of the command; {} is the folder of the logs, and a test runs in a folder of its own
+LINES: dict[str, Sequence[str]] = {
+    "info": ["info", "{}/flight_1.mcap"],
+    "infos": ["info", "{}/flight_1.mcap", "{}/flight_2.mcap"],
+    "noise": ["info", "{}/flight_1.mcap", "--noise"],
+    "damage": ["info", "damaged.mcap"],
+    "clean": ["clean", "{}/flight_1.mcap"],
+    "clean-out": ["clean", "{}/flight_1.mcap", "out.mcap"],
+    "convert": ["convert", "seq", "seq.mcap"],
+    "export": ["export", "{}/flight_1.mcap", "out", "--format", "euroc"],
+    "export-rosbag2": ["export", "{}/flight_1.mcap", "out", "--format", "rosbag2"],
+    "repair": ["repair", "damaged.mcap", "out.mcap"],
+    "debias": ["debias", "{}/flight_2.mcap", "out.mcap", "--clean", "--save-view", "out.rrd", "--report", "out.html"],
+    "train": ["train", "{}/flight_1.mcap", "--method", "linear", "-o", "m.safetensors"],
+    "evaluate": ["evaluate", "{}/flight_2.mcap", "--model", "static", "--zupt"],
+    "view": ["view", "{}/flight_2.mcap", "--html", "out.html"],
+    "vio": ["vio", "{}/flight_2.mcap", "--model", "static", "--duration", "6", "--no-bias-states"],
+    "simulate": ["simulate", "{}/flight_2.mcap", "sim.mcap", "--noise", "bmi160"],
+    "models": ["models"],
+    "fleet-info": ["fleet", "info", "{}/flight_1.mcap", "out"],
+    "fleet-diagnose": ["fleet", "diagnose", "{}/flight_1.mcap", "out", "--no-search"],
+}
+ELSEWHERE = {"demo", "diagnose", "conceal"}  # slow: their own tests call `hold`
+
+
+def hold(report: dict[str, Any]) -> None:
+    """Validate a report against its schema.
+
+    Raises:
+        AssertionError: it has no schema, or violates it.
+    """
+    validator = jsonschema.Draft202012Validator(json_schema(report["schema"]))
+    problems = [f"{error.json_path}: {error.message}" for error in validator.iter_errors(report)]
+    assert not problems, problems[:5]
+
+
+@pytest.fixture
+def folder(tmp_path: Path, logs: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Folder with a raw sequence and a log cut short."""
+    monkeypatch.chdir(tmp_path)
+    write_asl(flight(1, duration_s=1.0), tmp_path / "seq")
+    raw = (logs / "flight_1.mcap").read_bytes()
+    (tmp_path / "damaged.mcap").write_bytes(raw[: len(raw) // 2])
+    return tmp_path
+
+
+@pytest.mark.parametrize("words", LINES.values(), ids=LINES)
+def test_a_report_is_valid_against_its_schema(folder: Path, logs: Path, words: Sequence[str]) -> None:
+    done = CliRunner().invoke(app, [*(word.format(logs) for word in words), "--json", "report.json"])
+    assert done.exit_code in {0, 3}, done.output
+    hold(json.loads((folder / "report.json").read_text()))
+    if words[0] == "fleet":
+        for path in (folder / "out").rglob("*.json"):
+            hold(json.loads(path.read_text()))
+
+
+def test_every_command_is_covered() -> None:
+    assert set(COMMANDS) - SILENT == {words[0] for words in LINES.values()} - {"fleet"} | ELSEWHERE
+
+
+def test_the_demo_is_valid_against_its_schema(demonstration: Path) -> None:
+    hold(json.loads((demonstration / "report.json").read_text()))
+
+
+def test_schema_lists_the_reports_and_prints_the_schema_of_one() -> None:
+    listed = CliRunner().invoke(app, ["schema"])
+    assert listed.stdout.split() == sorted(REPORTS)
+    printed = CliRunner().invoke(app, ["schema", "info"])
+    assert json.loads(printed.stdout) == json_schema("info")
+    assert CliRunner().invoke(app, ["schema", "inof"]).exit_code == 3

@@ -1,0 +1,251 @@
+"""A recording beside a simulation or its own truth: one clock, no noise of the simulation's, tests apart from fits."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from support import planted
+
+from imutool.diagnosis.estimation.aligned_log import Pair, split
+from imutool.diagnosis.estimation.alignment import wiener_filter, with_simulation, with_truth
+from imutool.errors import DataError
+from imutool.recording import Recording, Scalars
+
+KEPT = 0.01  # of a signal below a tenth of Nyquist that the filter may change
+NOISE_LEFT = 0.25  # of the noise's size above the signal's band: one smoothed bin in eighty stands out by twice, by chance
+MARGIN_S = 0.25  # a little less than what lies around a border
+GRID_S = 0.011  # the step of the correlation that aligns two clocks
+SLACK = 1.05  # over the noise: what reading a spline between samples may add
+YEAR_NS = 365 * 86_400 * 1_000_000_000
+
+
+def slow(t: np.ndarray, seed: int) -> np.ndarray:
+    """Thirty cosines up to 5 Hz, of unit size, on a ramp."""
+    rng = np.random.default_rng(seed)
+    f, phase = rng.uniform(0.05, 5.0, 30), rng.uniform(0.0, 2.0 * np.pi, 30)
+    return np.asarray(np.cos(2.0 * np.pi * np.outer(t, f) + phase).sum(1) / np.sqrt(15.0) + 0.1 * t)
+
+
+def rms(x: np.ndarray) -> float:
+    return float(np.sqrt(np.mean(x**2)))
+
+
+def left(pair: Pair) -> np.ndarray:
+    """Real minus expected, by column, without its mean."""
+    there = pair.felt.sample(pair.stamp_s, pair.stamp_s)
+    out = pair.real - np.concatenate([there.gyro, there.accel], axis=1)
+    return np.asarray(out - out.mean(axis=0))
+
+
+def logs(
+    *,
+    sim_hz: float = 200.0,
+    sim_start_ns: int = planted.START_NS,
+    sim_noise: bool = True,
+    with_poses: bool = False,
+    late_s: float = 0.0,
+    seed: int = 1,
+) -> tuple[Recording, Recording]:
+    """Real at 100 Hz from second 1 to 21, simulation from 0 to 24; real samples taken `late_s` later than their stamps say."""
+    path = planted.moving(seed)
+
+    def at(t_s: np.ndarray) -> np.ndarray:
+        imu = path.imu(path.start_ns + np.round(t_s * 1e9).astype(np.int64))
+        return np.concatenate([imu.gyro, imu.accel], axis=1)
+
+    t_real, t_sim = 1.0 + planted.clock(20.0), planted.clock(24.0, sim_hz)
+    real = at(t_real + late_s) + planted.noise(len(t_real), 3) + planted.BIAS
+    sim = at(t_sim) + (planted.noise(len(t_sim), 4) if sim_noise else 0.0)
+    poses = planted.poses(path, t_sim, sim_start_ns) if with_poses else None
+    return planted.recording("real", t_real, real), planted.recording("sim", t_sim, sim, sim_start_ns, poses)
+
+
+# ── the filter ──
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_band_limited_signal_without_noise_passes_to_a_per_cent(seed: int) -> None:
+    x = slow(planted.clock(20.0), seed)
+    assert rms(wiener_filter(x) - x) < KEPT * rms(x)
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("size", [0.03, 0.1])
+def test_white_noise_above_the_signals_band_is_taken_away(seed: int, size: float) -> None:
+    t = planted.clock(40.0)
+    x = slow(t, seed)
+    noise = size * np.random.default_rng([seed, 1]).normal(size=len(t))
+    error = wiener_filter(x + noise) - x
+    above = np.fft.rfftfreq(len(t), 0.01) > 8.0
+    window = np.hanning(len(t))
+    passed = rms(np.abs(np.fft.rfft(window * error)[above])) / rms(np.abs(np.fft.rfft(window * noise)[above]))
+    assert passed < NOISE_LEFT
+    # what no filter can take is the noise in the signal's own band, a tenth of its power: 0.32 of its size
+    assert rms(error) < 0.45 * size + KEPT * rms(x)
+
+
+def test_white_noise_alone_goes_almost_altogether() -> None:
+    noise = np.random.default_rng(0).normal(size=4000)
+    assert rms(wiener_filter(noise)) < 0.35  # what happens to stand out of a smoothed spectrum
+
+
+# ── beside a simulation ──
+
+
+@pytest.mark.parametrize("sim_hz", [100.0, 137.0, 200.0, 400.0])
+def test_rates_that_differ_leave_nothing_but_noise(sim_hz: float) -> None:
+    pair = with_simulation(*logs(sim_hz=sim_hz, sim_noise=False))
+    assert (left(pair).std(axis=0) < SLACK * planted.NOISE).all()
+
+
+def test_noise_of_the_simulation_does_not_add_to_that_of_the_recording() -> None:
+    real, sim = logs()
+    pair = with_simulation(real, sim)
+    assert (left(pair).std(axis=0) < 1.15 * planted.NOISE).all()  # of equal noise, plain samples leave 1.41
+    assert (np.abs(pair.sim_noise / planted.NOISE - 1.0) < 0.3).all()  # a calm estimate: it finds five sixths
+
+
+def test_poses_of_the_simulation_stand_in_for_its_samples_and_bring_the_attitude() -> None:
+    pair = with_simulation(*logs(with_poses=True))
+    path = planted.moving()
+    exact = path.imu(path.start_ns + np.round((pair.stamp_s + 1.0) * 1e9).astype(np.int64))
+    there = pair.felt.sample(pair.stamp_s, pair.stamp_s)
+    inner = slice(50, -50)  # splines through poses know less at their ends
+    assert np.abs(there.gyro - exact.gyro)[inner].max() < planted.NOISE[0] / 10.0
+    assert np.abs(there.accel - exact.accel)[inner].max() < planted.NOISE[3] / 3.0
+    assert pair.felt.R_wb is not None
+    assert not pair.sim_noise.any()  # nothing had to be filtered
+
+
+def test_poses_that_disagree_with_the_simulations_samples_do_not_stand_in_for_them() -> None:
+    real, sim = logs(with_poses=True)
+    other = planted.poses(planted.moving(9), planted.clock(24.0, 200.0))
+    pair = with_simulation(real, replace(sim, truths={"/ground_truth/pose": other}))
+    assert (left(pair).std(axis=0) < 1.15 * planted.NOISE).all()
+
+
+def test_clocks_of_one_epoch_are_left_alone_so_that_an_offset_between_them_shows() -> None:
+    pair = with_simulation(*logs(late_s=0.02))
+    assert pair.aligned_s == 0.0
+    there = pair.felt.sample(pair.stamp_s, pair.stamp_s)
+    rate = there.alpha[:, 0]
+    assert float(rate @ left(pair)[:, 0] / (rate @ rate)) == pytest.approx(0.02, rel=0.1)  # first order of 20 ms
+
+
+@pytest.mark.parametrize("away_ns", [YEAR_NS, -YEAR_NS, 3_600_000_000_000])
+def test_clocks_without_a_common_epoch_are_aligned_by_the_motion(away_ns: int) -> None:
+    pair = with_simulation(*logs(sim_start_ns=planted.START_NS + away_ns))
+    assert pair.aligned_s - away_ns * 1e-9 == pytest.approx(0.0, abs=GRID_S)
+    same = with_simulation(*logs())
+    ratio = left(pair)[:, :3].std(axis=0) / same.real[:, :3].std(axis=0)
+    assert (ratio < 0.05).all()  # ten milliseconds of a motion at a hertz
+
+
+def test_clocks_aligned_by_the_motion_leave_the_same_misfit_but_for_the_step_of_the_search() -> None:
+    pair = with_simulation(*logs(sim_start_ns=planted.START_NS + YEAR_NS, with_poses=True))
+    there = pair.felt.sample(pair.stamp_s, pair.stamp_s)
+    offset = float((there.alpha * left(pair)[:, :3]).sum() / (there.alpha**2).sum())
+    assert abs(offset) < GRID_S / 2.0
+
+
+@pytest.mark.parametrize("away_ns", [0, YEAR_NS])
+def test_another_motion_is_refused(away_ns: int) -> None:
+    real, _ = logs()
+    _, sim = logs(seed=5, sim_start_ns=planted.START_NS + away_ns)
+    with pytest.raises(DataError, match="turns otherwise"):
+        with_simulation(real, sim)
+
+
+def test_too_little_shared_time_is_refused_with_how_much_there_is() -> None:
+    real, sim = logs()
+    short = replace(real, imu=real.imu.rows(slice(0, 601)))
+    with pytest.raises(DataError, match=r"^real: 6\.0 s shared with the simulation"):
+        with_simulation(short, sim)
+
+
+def test_too_little_shared_time_is_refused() -> None:
+    real, sim = logs()
+    with pytest.raises(DataError):
+        with_simulation(replace(real, imu=real.imu.rows(slice(0, 601))), sim)
+
+
+def test_a_part_of_the_motion_on_another_epoch_is_found_in_the_whole() -> None:
+    real, sim = logs(sim_start_ns=planted.START_NS + YEAR_NS)
+    pair = with_simulation(replace(real, imu=real.imu.rows(slice(400, 1301))), sim)  # nine seconds
+    assert pair.aligned_s - YEAR_NS * 1e-9 == pytest.approx(0.0, abs=GRID_S)
+
+
+def test_only_what_both_cover_is_compared() -> None:
+    real, sim = logs()
+    part = replace(sim, imu=sim.imu.rows(slice(5 * 200, 17 * 200 + 1)))  # 5 to 17 s
+    pair = with_simulation(real, part)
+    assert pair.start_ns - planted.START_NS == pytest.approx(5e9, abs=1.1e7)
+    assert pair.stamp_s[-1] - pair.stamp_s[0] == pytest.approx(12.0, abs=0.03)
+    assert len(pair.real) == len(pair.fitted) == len(pair.held_out) == len(pair.stamp_s)
+
+
+def test_channels_come_along_at_the_samples_and_constant_ones_do_not() -> None:
+    real, sim = logs()
+    t_ns = planted.START_NS + np.arange(0, 24_000_000_001, 50_000_000)
+    ramp = np.linspace(0.0, 24.0, len(t_ns))
+    scalars = {
+        "/motor/current": Scalars(t_ns, ramp[:, None]),
+        "/wheel": Scalars(t_ns, np.stack([ramp, ramp * 0.0 + 3.0, -ramp], axis=1)),
+    }
+    pair = with_simulation(replace(real, scalars=scalars), sim)
+    assert set(pair.channels) == {"/motor/current", "/wheel.x", "/wheel.z"}
+    np.testing.assert_allclose(pair.channels["/motor/current"], pair.stamp_s + 1.0, atol=1e-6)
+    np.testing.assert_allclose(pair.felt.channels["/wheel.z"], -(pair.felt.t_s + 1.0).clip(0.0, 24.0), atol=1e-6)
+
+
+def test_without_a_simulation_the_motion_itself_is_expected() -> None:
+    real, _ = logs()
+    felt = planted.rich()
+    pair = with_truth(real, felt, planted.START_NS, 12.0)
+    assert (left(pair).std(axis=0) < SLACK * planted.NOISE).all()
+    assert pair.band_hz == 12.0
+    assert pair.against == "true poses"
+    assert pair.aligned_s == 0.0
+
+
+def test_true_poses_of_another_time_are_refused() -> None:
+    real, _ = logs()
+    with pytest.raises(DataError, match="shared with the true poses"):
+        with_truth(real, planted.rich(), planted.START_NS + YEAR_NS, 12.0)
+
+
+# ── what is fitted and what is held out ──
+
+
+@pytest.mark.parametrize("duration_s", [12.0, 20.0, 31.0, 90.0, 300.0])
+def test_about_a_third_is_held_out_and_apart_from_what_is_fitted(duration_s: float) -> None:
+    t = planted.clock(duration_s)
+    held_out, usable = split(t)
+    fitted, unseen = usable & ~held_out, usable & held_out
+    assert 0.2 < unseen.sum() / usable.sum() < 0.45
+    assert usable.mean() > 0.6
+    times = np.concatenate([t[fitted], t[unseen]])
+    kinds = np.concatenate([np.zeros(fitted.sum()), np.ones(unseen.sum())])
+    order = np.argsort(times)
+    border = np.diff(kinds[order]) != 0
+    assert border.sum() >= 2
+    assert np.diff(times[order])[border].min() > 2.0 * MARGIN_S  # neither looks over it
+
+
+def test_gaps_and_ends_count_for_neither() -> None:
+    t = planted.clock(40.0)
+    keep = (t < 14.0) | (t > 15.5)
+    t = t[keep]
+    _, usable = split(t)
+    near = (np.abs(t - 14.0) < MARGIN_S) | (np.abs(t - 15.5) < MARGIN_S) | (t < MARGIN_S) | (t > t[-1] - MARGIN_S)
+    assert near.sum() > 80
+    assert not usable[near].any()
+
+
+def test_every_row_counts_for_one_part_at_most() -> None:
+    pair = with_simulation(*logs())
+    assert not (pair.fitted & pair.held_out).any()
+    assert pair.fitted.any()
+    assert pair.held_out.any()

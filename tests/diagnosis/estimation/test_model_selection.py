@@ -1,0 +1,238 @@
+"""The right effects and no others: none on noise, one, two, the channel that drives beside its like, none by a wrong name."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.special import gammaincc
+from scipy.stats import chi2
+from support import planted
+
+from imutool.diagnosis.estimation import unnamed_effects as unnamed
+from imutool.diagnosis.estimation.aligned_log import Pair
+from imutool.diagnosis.estimation.model_selection import Selection, select_effects
+from imutool.diagnosis.estimation.significance import log_p_value
+from imutool.diagnosis.settings import SearchSettings
+
+SURE = 4.0
+DURATION_S = 20.0
+NULL_SEEDS, WITH_ALL = 10, 2  # what has no name takes a second more
+TAIL = 0.02  # in natural logarithms: what the next term of the tail's expansion takes for nine parameters
+
+SINGLE = {
+    "lever_arm": [0.2, -0.05, 0.1],
+    "clock_offset": [0.01],
+    "low_pass": [12.0],
+    "gyro_scale": [0.02, -0.03, 0.01],
+    "accel_misalignment": [0.01, -0.02, 0.005, 0.01, -0.01, 0.02],
+    "mount_rotation": [0.03, -0.02, 0.04],
+    "gyro_g_sensitivity": [1e-3, 0.0, 0.0, 0.0, -1e-3, 0.0, 0.0, 0.0, 2e-3],
+    "gravity": [0.05, 0.02, -0.02],
+}
+
+
+def asked(pair: Pair, beyond: bool = True) -> Selection:
+    """The catalogue, then (beyond it) channels, then what has no name."""
+    if not beyond:
+        return select_effects([planted.weighed(pair)], planted.catalogue())
+    like = unnamed.like([pair])
+    later = [tuple(unnamed.driven([pair])), (*unnamed.curves(like), *unnamed.terms(like))]
+    return select_effects([planted.weighed(pair)], planted.catalogue(), later)
+
+
+def names(found: Selection) -> list[str]:
+    return [one.physics.key for one in found.selected]
+
+
+def sure(found: Selection, name: str, truth: list[float]) -> bool:
+    one = next(one for one in found.selected if one.physics.key == name)
+    return bool((np.abs(one.theta - truth) < SURE * one.std).all())
+
+
+# ── log_p_value ──
+
+
+@pytest.mark.parametrize("k", [1, 2, 3, 6, 9])
+def test_chance_is_the_tail_of_chi_square(k: int) -> None:
+    for gain in (0.0, 1.0, 10.0, 100.0, 500.0):
+        assert log_p_value(gain, k) == pytest.approx(float(np.log(gammaincc(k / 2.0, gain / 2.0))), rel=1e-9, abs=1e-12)
+
+
+@pytest.mark.parametrize("k", [1, 2, 3, 6, 9])
+def test_chance_goes_on_smoothly_where_the_tail_is_less_than_a_number_holds(k: int) -> None:
+    gains = np.concatenate([np.arange(500.0, 1600.0, 1.0), np.geomspace(1600.0, 1e8, 200)])
+    log_p = np.array([log_p_value(float(gain), k) for gain in gains])
+    assert np.isfinite(log_p).all()
+    assert (np.diff(log_p) < 0).all()
+    step = np.diff(log_p[:1100])
+    # each square costs half a logarithm, less what the power in front of the exponential gives back: (k/2 - 1) / 250
+    assert np.abs(step + 0.5).max() < 0.016 + TAIL
+    with np.errstate(divide="ignore"):
+        known = chi2.logsf(gains[:900], k)
+    np.testing.assert_allclose(log_p[:900][np.isfinite(known)], known[np.isfinite(known)], atol=TAIL)
+
+
+def test_chance_of_two_parameters_is_known_in_closed_form() -> None:
+    for gain in (1.0, 599.0, 601.0, 1e4, 1e7):
+        assert log_p_value(gain, 2) == pytest.approx(-gain / 2.0, rel=1e-12)
+
+
+def test_more_parameters_need_a_larger_gain() -> None:
+    for gain in (30.0, 1000.0):
+        log_p = [log_p_value(gain, k) for k in (1, 3, 6, 9)]
+        assert log_p == sorted(log_p)
+
+
+def test_a_loss_is_no_evidence() -> None:
+    assert log_p_value(-5.0, 3) == 0.0
+
+
+# ── nothing ──
+
+
+@pytest.mark.parametrize("seed", range(NULL_SEEDS))
+def test_noise_and_a_bias_are_nothing(seed: int) -> None:
+    pair = planted.pair(planted.rich(seed, DURATION_S), None, seed)
+    found = asked(pair, beyond=seed < WITH_ALL)
+    assert names(found) == []
+    np.testing.assert_allclose(found.whole.bias[0], planted.BIAS, atol=float(SURE * planted.NOISE[3] / np.sqrt(1000)))
+    assert found.tried > len(planted.catalogue())
+
+
+# ── one, two ──
+
+
+@pytest.mark.parametrize("name", SINGLE)
+def test_a_single_effect_is_found_alone_and_by_its_name(name: str) -> None:
+    found = asked(
+        planted.pair(planted.rich(2, DURATION_S), {name: SINGLE[name]}, 2),
+        beyond=name in ("lever_arm", "low_pass"),
+    )
+    assert names(found) == [name]
+    assert sure(found, name, SINGLE[name])
+    assert found.selected[0].false_discovery_rate <= SearchSettings().false_discovery_rate
+    assert found.selected[0].unidentified == ()
+
+
+@pytest.mark.parametrize(
+    "both", [("lever_arm", "clock_offset"), ("gyro_scale", "low_pass"), ("mount_rotation", "accel_misalignment")], ids="+".join
+)
+def test_a_pair_is_found_both_by_name(both: tuple[str, str]) -> None:
+    planted = {name: SINGLE[name] for name in both}
+    found = asked(planted.pair(planted.rich(3, DURATION_S), planted, 3), beyond=False)
+    assert sorted(names(found)) == sorted(both)
+    assert found.selected[0].gain >= found.selected[1].gain  # strongest first
+    assert all(sure(found, name, planted[name]) for name in both)
+
+
+def test_two_logs_show_together_what_each_shows_alone() -> None:
+    logs = [
+        planted.weighed(planted.pair(planted.rich(seed, DURATION_S), {"lever_arm": [0.1, 0.0, 0.05]}, seed)) for seed in (4, 5)
+    ]
+    found = select_effects(logs, planted.catalogue())
+    assert names(found) == ["lever_arm"]
+    assert found.whole.bias.shape == (2, 6)
+
+
+def test_what_the_motion_cannot_show_of_a_found_effect_is_named() -> None:
+    found = asked(planted.pair(planted.planar(DURATION_S), {"lever_arm": [0.3, 0.1, 0.0]}, 6), beyond=False)
+    assert names(found) == ["lever_arm"]
+    assert found.selected[0].unidentified == ("lever_arm.z",)
+
+
+# ── by another channel, or by nothing that has a name ──
+
+
+def current(seed: int, t: np.ndarray) -> np.ndarray:
+    """Twenty cosines below 1 Hz."""
+    rng = np.random.default_rng([seed, 5])
+    f, phase = rng.uniform(0.05, 1.0, 20), rng.uniform(0.0, 2.0 * np.pi, 20)
+    return np.asarray(np.cos(2.0 * np.pi * np.outer(t, f) + phase).sum(1) / np.sqrt(10.0))
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_the_channel_that_drives_is_told_from_one_like_it(seed: int) -> None:
+    t = planted.clock(DURATION_S)
+    true, other = current(seed, t), current(seed + 50, t)
+    decoy = 0.9 * true + np.sqrt(1.0 - 0.9**2) * other  # correlated by 0.9
+    felt = planted.rich(seed + 1, DURATION_S, {"/a_decoy": decoy, "/motor": true})
+    added = np.zeros((len(t), 6))
+    added[:, 3:] = np.interp(t - 0.06, t, true - true.mean())[:, None] * [0.1, 0.0, -0.06]
+    found = asked(planted.pair(felt, None, seed, added=added))
+    assert names(found) == ["driven:/motor:accel"]
+    assert sure(found, "driven:/motor:accel", [0.1, 0.0, -0.06, 0.06])
+
+
+def test_channels_that_drive_nothing_are_not_named() -> None:
+    t = planted.clock(DURATION_S)
+    felt = planted.rich(7, DURATION_S, {"/motor": current(1, t), "/wheel": current(2, t)})
+    assert names(asked(planted.pair(felt, {"lever_arm": [0.2, -0.05, 0.1]}, 7))) == ["lever_arm"]
+
+
+@pytest.mark.parametrize(("column", "seed"), [(1, 0), (4, 1)])
+def test_a_misfit_without_a_name_gets_none_of_the_catalogues(column: int, seed: int) -> None:
+    felt = planted.shaken(seed + 8, DURATION_S)
+    added = np.zeros((len(felt.t_s), 6))
+    added[:, column] = (0.05 if column < 3 else 0.5) * np.tanh(felt.gyro[:, 2] / 0.4)
+    found = asked(planted.pair(felt, None, seed, added=added))
+    assert found.selected
+    assert all(name.startswith("unknown:") for name in names(found)), names(found)
+    before, after = fit_cost(found)
+    assert after < 0.2 * before  # of the squares above the noise
+
+
+def fit_cost(found: Selection) -> tuple[float, float]:
+    """Squares above the noise that the effects took, with those that are left; and those that are left."""
+    left = max(found.whole.objective - 6.0 * found.whole.rows, 0.0)
+    return left + sum(one.gain for one in found.selected), left
+
+
+# ── rivals, and what sets in ──
+
+
+def test_a_temperature_that_rises_as_the_bias_does_is_named_beside_the_drift() -> None:
+    """Both say the same with this channel, so that neither can be ruled out; with another course of it one of them can."""
+    felt = planted.shaken(2, DURATION_S)
+    rising = 20.0 + 5.0 * (1.0 - np.exp(-felt.t_s / 8.0))
+    effects = {"gyro_bias_drift": [0.01, -0.02, 0.015, 8.0]}
+
+    def told(temperature: np.ndarray) -> dict[str, tuple[str, ...]]:
+        pair = planted.pair(planted.shaken(2, DURATION_S), effects, 5)
+        pair = replace(pair, felt=replace(pair.felt, channels={"/temperature.data": temperature}))
+        pair = replace(pair, channels={"/temperature.data": temperature})
+        drift, temp = (
+            planted.acting({name: size})[0][0] for name, size in (("gyro_bias_drift", [0] * 4), ("temperature", [0] * 6))
+        )
+        return {one.physics.key: one.similar for one in select_effects([planted.weighed(pair)], (drift, temp)).selected}
+
+    (name, rivals), *more = told(rising).items()
+    assert {name, *rivals} == {"gyro_bias_drift", "temperature"}
+    assert not more
+    assert told(20.0 + np.sin(felt.t_s)) == {"gyro_bias_drift": ()}
+
+
+@pytest.mark.parametrize("t_jump", [4.8, 9.1, 10.9, 15.2])
+def test_the_time_of_a_jump_is_found_also_beside_another_effect_and_between_fitted_rows(t_jump: float) -> None:
+    pair = planted.pair(planted.rich(3, DURATION_S), {"clock_jump": [t_jump, -0.02], "gyro_scale": [0.02, -0.03, 0.01]}, 3)
+    found = asked(pair, beyond=False)
+    assert sorted(names(found)) == ["clock_jump", "gyro_scale"]
+    jump = next(one for one in found.selected if one.physics.key == "clock_jump")
+    assert abs(jump.theta[0] - t_jump) < 0.05  # s: five samples, in which it may hardly move
+    assert jump.theta[1] == pytest.approx(-0.02, abs=2e-4)
+
+
+def test_a_lever_arm_beside_a_resonance_is_not_called_a_size_effect() -> None:
+    """On level ground nine numbers do what three do, and a little more as long as nobody thinks of the resonance."""
+    pair = planted.pair(planted.planar(), {"lever_arm": [-0.4, -0.9, 0.0], "mount_resonance": [3.0, 0.2, 0.3, 1.0, 0.0]})
+    assert set(names(asked(pair, beyond=False))) == {"lever_arm", "mount_resonance"}
+
+
+def test_a_low_pass_above_what_samples_can_show_is_told_by_its_delay() -> None:
+    """Beside an exact simulation; what smoothed poses say ends six times above their band, and beyond it is a delay."""
+    pair = planted.pair(planted.shaken(), {"low_pass": [48.0]})
+    found = asked(pair, beyond=False)
+    assert names(found) == ["low_pass"]
+    assert sure(found, "low_pass", [48.0])
+    assert names(asked(replace(pair, against="true poses", band_hz=7.0), beyond=False)) == ["clock_offset"]

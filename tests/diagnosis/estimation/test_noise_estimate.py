@@ -1,0 +1,94 @@
+"""Noise beside poses is what poses and sensor have, not what an effect does; a band ends where the poses' own errors begin."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.signal import butter, sosfiltfilt
+from support import planted
+
+from imutool.diagnosis.estimation.aligned_log import Pair
+from imutool.diagnosis.estimation.noise_estimate import known_band_hz, noise_std, whitened
+from imutool.diagnosis.estimation.whitening import WhitenedImu
+from imutool.diagnosis.settings import BandSettings
+
+FELT = planted.rich(duration_s=45.0)
+BAND = BandSettings()
+BAND_HZ = 6.0
+NEAR = 1.35  # of the noise: three axes of a few hundred rows, and what a rich model spends
+NEAR_A_JUMP = 2.0  # until a fit finds its time, the part of a second around it is misfit: left out altogether it is twenty
+WITHOUT = planted.catalogue()
+
+
+def beside_poses(effects: dict[str, list[float]] | None = None, added: np.ndarray | None = None) -> Pair:
+    pair: Pair = planted.pair(FELT, effects, added=added)
+    return replace(pair, against="true poses", band_hz=BAND_HZ)
+
+
+def noise(log: WhitenedImu) -> np.ndarray:
+    return np.asarray(noise_std(log.whiten))
+
+
+QUIET = noise(whitened(beside_poses(), WITHOUT, BAND))
+
+
+@pytest.mark.parametrize(
+    "effects",
+    [
+        {"gyro_bias_drift": [0.02, -0.02, 0.02, 12.0]},
+        {"gravity": [0.05, 0.05, -0.05]},
+        {"clock_jump": [21.0, 0.02]},
+        {"mount_rotation": [0.1, -0.1, 0.05]},
+        {"lever_arm": [0.3, 0.1, -0.2]},
+    ],
+)
+def test_an_effect_is_not_taken_for_noise(effects: dict[str, list[float]]) -> None:
+    with_it = noise(whitened(beside_poses(effects), WITHOUT, BAND))
+    near = NEAR_A_JUMP if "clock_jump" in effects else NEAR
+    assert (with_it / QUIET < near).all(), with_it / QUIET
+
+
+def test_rows_of_noise_have_the_size_that_is_told() -> None:
+    log = whitened(beside_poses(), WITHOUT, BAND)
+    pair = log.pair
+    white = log.whiten(pair.real - planted.ideal(FELT) - planted.BIAS)[log.rows("all")]
+    assert np.abs((white**2).mean(axis=0) - 1.0).max() < 0.25
+
+
+def test_what_has_no_name_on_one_axis_makes_that_axis_little_noisier() -> None:
+    odd = np.zeros((len(FELT.t_s), 6))
+    odd[:, 2] = 0.5 * np.sign(np.sin(40.0 * FELT.gyro[:, 0]))
+    with_it = noise(whitened(beside_poses(added=odd), WITHOUT, BAND))
+    assert with_it[2] <= 1.01 * BAND.noisy_axis * np.median(with_it[:3])
+    assert (with_it[[0, 1, 3, 4, 5]] / QUIET[[0, 1, 3, 4, 5]] < NEAR).all()
+
+
+# ── the band ──
+
+
+def errors(above_hz: float, size: float) -> np.ndarray:
+    """Of what is expected of the accelerometer: noise faster than a frequency."""
+    white = np.random.default_rng(5).normal(size=(len(FELT.t_s), 3))
+    return size * np.asarray(sosfiltfilt(butter(4, [above_hz, 20.0], "band", fs=planted.RATE_HZ, output="sos"), white, axis=0))
+
+
+def test_a_sensor_noisier_than_the_motion_leaves_the_band_as_it_is() -> None:
+    pair = beside_poses(added=10.0 * planted.noise(len(FELT.t_s), 9))
+    left = pair.real - planted.ideal(FELT)
+    assert known_band_hz(pair.real, left, planted.RATE_HZ, BAND_HZ, BAND) == BAND_HZ
+
+
+def test_poses_that_err_faster_than_a_frequency_end_the_band_there() -> None:
+    pair = beside_poses()
+    wrong = planted.ideal(FELT)
+    wrong[:, 3:] += errors(3.0, 5.0)
+    ends_hz = known_band_hz(pair.real, pair.real - wrong, planted.RATE_HZ, BAND_HZ, BAND)
+    assert 1.25 <= ends_hz <= 3.0
+    assert ends_hz < BAND_HZ
+
+
+def test_a_sensor_that_is_too_slow_leaves_the_band_as_it_is() -> None:
+    pair = beside_poses({"low_pass": [6.0]})
+    assert known_band_hz(pair.real, pair.real - planted.ideal(FELT), planted.RATE_HZ, BAND_HZ, BAND) == BAND_HZ

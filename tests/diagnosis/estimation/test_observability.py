@@ -1,0 +1,89 @@
+"""What a motion can show of the catalogue: closed forms of what an effect adds, and motions that show little."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from support import planted
+
+from imutool.diagnosis.estimation.observability import FOLLOWING, below_model_error, unobservable
+from imutool.diagnosis.estimation.whitening import WhitenedLog, Whitener
+from imutool.diagnosis.settings import SearchSettings
+from imutool.sensor import catalogue
+
+SETTINGS = SearchSettings()
+
+
+def shown(felt: object, names: list[str] | None = None, *, noise: float = 1.0, known: np.ndarray | None = None) -> set[str]:
+    """What is not seen of some effects, at so many times the planted noise."""
+    pair = replace(planted.pair(felt), known=known)
+    white = Whitener(np.ones((6, 1)), noise * planted.NOISE)
+    log = WhitenedLog(pair, white if known is None else white.counting(known))
+    some = [one for one in planted.catalogue() if names is None or one.name in names]
+    return set(unobservable([log], some, SETTINGS))
+
+
+def test_a_motion_about_every_axis_shows_every_scale() -> None:
+    assert shown(planted.rich(), ["gyro_scale", "gyro_misalignment", "lever_arm", "clock_offset", "mount_rotation"]) == set()
+
+
+def test_a_planar_robot_shows_no_scale_of_axes_that_never_turn() -> None:
+    hidden = shown(planted.planar(), ["gyro_scale", "gyro_misalignment", "gyro_quadratic", "lever_arm"])
+    assert hidden == {"gyro_scale.x", "gyro_scale.y", "gyro_quadratic.x", "gyro_quadratic.y", "lever_arm.z"} | {
+        f"gyro_misalignment.{entry}" for entry in ("xy", "yx", "zx", "zy")
+    }
+
+
+@pytest.mark.parametrize(("share", "seen"), [(0.98, True), (1.02, False)])
+def test_a_number_is_seen_where_its_plausible_size_adds_enough_squares(share: float, seen: bool) -> None:
+    felt = planted.planar()
+    pair = planted.pair(felt)
+    rows = pair.fitted | pair.held_out
+    rate = felt.gyro[rows, 2]
+    plausible = next(one for one in planted.catalogue() if one.name == "gyro_scale").plausible[2]
+    noise = plausible * np.sqrt(((rate - rate.mean()) ** 2).sum() / SETTINGS.observable_squares)
+    hidden = shown(felt, ["gyro_scale"], noise=share * noise / planted.NOISE[0])
+    assert ("gyro_scale" not in hidden) == seen
+
+
+def test_what_delays_is_seen_by_a_delay_and_at_rest_by_nothing() -> None:
+    felt = planted.planar()
+    rest = replace(felt, gyro=0 * felt.gyro, accel=np.tile([0.0, 0.0, 9.81], (len(felt.t_s), 1)), alpha=0 * felt.alpha)
+    hidden = shown(replace(rest, R_wb=np.tile(np.eye(3), (len(felt.t_s), 1, 1))))
+    assert {"clock_offset", "clock_skew", "clock_jump", "low_pass", "mount_resonance", "lever_arm", "gyro_scale"} <= hidden
+    assert not {"vibration", "gyro_bias_drift", "accel_bias_drift"} & hidden
+
+
+def test_an_axis_of_which_nothing_is_known_shows_nothing() -> None:
+    felt = planted.rich()
+    known = np.ones((len(felt.t_s), 6), bool)
+    known[:, 1] = False
+    assert shown(felt, ["gyro_scale", "accel_scale"], known=known) == {"gyro_scale.y"}
+
+
+def test_every_effect_with_a_model_error_floor_is_in_the_catalogue() -> None:
+    assert {one.name for one in catalogue.diagnosed(sorted(FOLLOWING))} == FOLLOWING
+
+
+@pytest.mark.parametrize(("denoised", "allowed"), [(False, SETTINGS.model_error), (True, SETTINGS.model_error_denoised)])
+def test_a_filter_or_a_clock_must_explain_more_than_a_larger_models_error(denoised: bool, allowed: float) -> None:
+    for name in FOLLOWING:
+        assert below_model_error({"lever_arm": 1e8, name: 0.9e8 * allowed}, denoised, SETTINGS) == {name}
+        assert not below_model_error({"lever_arm": 1e8, name: 1.1e8 * allowed}, denoised, SETTINGS)
+
+
+def test_a_mass_on_springs_does_more_than_its_model_says() -> None:
+    between = 0.5 * SETTINGS.model_error_resonance
+    assert below_model_error({"mount_resonance": 1.0, "clock_offset": between}, False, SETTINGS) == {"clock_offset"}
+    assert not below_model_error({"lever_arm": 1.0, "clock_offset": between}, False, SETTINGS)
+
+
+def test_what_does_not_follow_the_motion_is_told_however_faint() -> None:
+    assert not below_model_error({"timestamp_jitter": 1e9, "temperature": 300.0, "gyro_scale": 30.0}, True, SETTINGS)
+
+
+def test_an_effect_alone_is_told() -> None:
+    assert not below_model_error({"clock_offset": 25.0}, True, SETTINGS)
+    assert not below_model_error({}, False, SETTINGS)

@@ -1,0 +1,92 @@
+"""What blocks of time say of a fit: the truth about noise that lasts, and no more than the information where noise is white."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.signal import lfilter
+from support import planted
+
+from imutool.diagnosis.estimation.gauss_newton import Fit, fit
+from imutool.diagnosis.estimation.significance import Scatter, scatter
+from imutool.diagnosis.estimation.whitening import WhitenedLog
+
+FELT = planted.shaken(duration_s=45.0)
+BLOCK_S = 5.0
+SEEDS = 16
+LASTS = 0.98  # from one sample at 100 Hz to the next: half a second
+SPREAD = (0.7, 1.35)  # of sixteen times three numbers of unit variance, not quite independent
+SCALE = [0.02, -0.01, 0.015]
+
+
+def noisy(seed: int, lasting: bool) -> tuple[WhitenedLog, Fit, Scatter]:
+    """A scale that is fitted as if the noise were white."""
+    added = None
+    if lasting:
+        white = np.random.default_rng([seed, 11]).normal(size=(len(FELT.t_s), 6))
+        added = 2.0 * planted.NOISE * lfilter([np.sqrt(1.0 - LASTS**2)], [1.0, -LASTS], white, axis=0)
+    log = planted.weighed(planted.pair(FELT, {"gyro_scale": SCALE}, seed, added=added))
+    found = fit([log], planted.acting({"gyro_scale": [0.0] * 3}), part="all")
+    return log, found, scatter([log], found, "all", BLOCK_S)
+
+
+def z(found: Fit, std: np.ndarray) -> np.ndarray:
+    return np.asarray((found.chosen[0][1] - SCALE) / std)
+
+
+def test_white_noise_scatters_as_the_information_says() -> None:
+    ratio = []
+    for seed in range(SEEDS // 2):
+        _, found, seen = noisy(seed, lasting=False)
+        ratio.append(seen.std["gyro_scale"] / found.stds()["gyro_scale"])
+    assert np.min(ratio) >= 1.0  # never surer than the information
+    assert np.mean(ratio) < 1.15
+
+
+def test_noise_that_lasts_spreads_as_the_blocks_say_and_more_than_the_information() -> None:
+    stated, honest = [], []
+    for seed in range(SEEDS):
+        _, found, seen = noisy(seed, lasting=True)
+        stated.append(z(found, found.stds()["gyro_scale"]))
+        honest.append(z(found, seen.std["gyro_scale"]))
+    assert np.std(stated) > 1.5
+    assert SPREAD[0] < np.std(honest) < SPREAD[1]
+
+
+def test_a_gain_is_as_likely_as_it_comes_where_noise_lasts() -> None:
+    """An effect that is not there: chances below a twentieth come about that often, by chi-square far more."""
+    often = {"blocks": 0, "squares": 0}
+    for seed in range(SEEDS):
+        log, _, _ = noisy(seed, lasting=True)
+        start = planted.acting({"gyro_scale": SCALE, "gyro_quadratic": [0.0] * 3})
+        whole, without = fit([log], start, part="all"), fit([log], start[:1], part="all")
+        gain = without.objective - whole.objective
+        often["blocks"] += scatter([log], whole, "all", BLOCK_S).log_p_value("gyro_quadratic", gain, 3) < np.log(0.05)
+        often["squares"] += gain > 7.81  # chi-square of three, one in twenty
+    assert often["blocks"] <= 4  # of sixteen, where one is expected
+    assert often["squares"] >= 8
+
+
+def test_a_time_at_which_something_begins_is_taken_as_it_is() -> None:
+    log = planted.weighed(planted.pair(FELT, {"clock_jump": [21.3, 0.02]}))
+    found = fit([log], planted.acting({"clock_jump": [20.0, 0.01]}), part="all")
+    seen = scatter([log], found, "all", BLOCK_S)
+    begins, step = seen.std["clock_jump"]
+    assert begins == found.stds()["clock_jump"][0]
+    assert abs(found.chosen[0][1][1] - 0.02) < 4.0 * step < 1e-3
+
+
+def test_logs_lend_each_other_their_blocks() -> None:
+    logs = [planted.weighed(planted.pair(FELT, {"gyro_scale": SCALE}, seed)) for seed in range(2)]
+    begun = planted.acting({"gyro_scale": [0.0] * 3})
+    one, both = (scatter(some, fit(some, begun, part="all"), "all", BLOCK_S) for some in (logs[:1], logs))
+    assert both.blocks["gyro_scale"] > 1.4 * one.blocks["gyro_scale"]
+    assert (both.std["gyro_scale"] < one.std["gyro_scale"]).all()
+
+
+def test_what_the_motion_does_not_show_stays_unsure() -> None:
+    felt = planted.planar(60.0)
+    log = planted.weighed(planted.pair(felt, {"gyro_scale": [0.0, 0.0, 0.02]}))
+    found = fit([log], planted.acting({"gyro_scale": [0.0] * 3}), part="all")
+    std = scatter([log], found, "all", BLOCK_S).std["gyro_scale"]
+    assert (std[:2] > 0.1).all()
+    assert std[2] < 1e-3

@@ -1,0 +1,43 @@
+"""Reading a log does not fault its buffers in anew for every chunk."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from imutool.mcap_io.codec.records import keep_buffers
+from imutool.mcap_io.write import write
+from imutool.recording import Frames, Imu, Recording
+
+PAGE = 4096
+COUNT_FAULTS = """
+import resource, sys
+from pathlib import Path
+from imutool.mcap_io.log import Log
+with Log(Path(sys.argv[1])) as log:
+    topic, = log.topics.keys() - log.imu_topics
+    def run():
+        for block in log.index.blocks:
+            log.index.unpack(block)
+    run()
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+    run()
+    print(resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before)
+"""
+
+
+def test_buffers_are_used_again_from_chunk_to_chunk(tmp_path: Path) -> None:
+    if not keep_buffers():
+        pytest.skip("the allocator of this system is not glibc's, which alone is told here")
+    images = [(1000 + i, np.random.default_rng(i).bytes(1 << 20)) for i in range(30)]
+    nothing = Imu(np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 3)))
+    frames = {"/cam0/image_raw": Frames("raw", len(images), lambda: iter(images))}
+    path = tmp_path / "log.mcap"
+    write(Recording("x", nothing, frames=frames), path, compression="lz4")
+    done = subprocess.run([sys.executable, "-c", COUNT_FAULTS, path], capture_output=True, text=True, check=True)
+    unpacked_pages = len(images) * (1 << 20) // PAGE
+    assert int(done.stdout) < unpacked_pages / 4  # unhelped it is twice the pages, one for the packed and one for the unpacked

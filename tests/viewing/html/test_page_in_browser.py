@@ -1,0 +1,163 @@
+"""The pages in a real browser: no error, no request to anybody, light, dark, narrow and on paper, every figure drawn."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from support import diagnoses, image_difference, viewers
+
+from imutool.viewing.html import diagnosis_page, report
+from imutool.viewing.model.runs import build
+
+TESTS = Path(__file__).parents[1]
+
+WIDE, NARROW, PAPER = 1280, 400, 794  # CSS pixels; the last is A4 at 96 dots per inch
+HEIGHT = 720
+READABLE = 4.5  # contrast of text, the least that WCAG 2 calls AA
+INKED = 0.002  # of a figure's area: frame and labels alone reach it, an empty box does not
+ADDRESSED = "http://127.0.0.1:9/elsewhere.png"  # nobody listens there
+PAGES = ("one model", "nothing known", "two logs", "diagnosis")
+HOSTILE = "<img src=x onerror=alert(1)>"  # a log may be called anything
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Any]:
+    with viewers.chromium() as running:
+        yield running
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Each page as NAME.html."""
+    folder = tmp_path_factory.mktemp("pages")
+    flights = [image_difference.recording(seed) for seed in (3, 4)]
+    hostile = replace(flights[1], name=HOSTILE)
+    logs = {
+        "one model": [build(flights[0], image_difference.runs(flights[0]))],
+        "nothing known": [build(replace(flights[0], truths={}, scalars={}), image_difference.runs(flights[0], models=0))],
+        "two logs": [build(one, image_difference.runs(one)) for one in (flights[0], hostile)],
+    }
+    for name, shown in logs.items():
+        report.write_page(shown, folder / f"{name}.html")
+    diagnosis_page.write(diagnoses.LATE, folder / "diagnosis.html")
+    return folder
+
+
+@dataclass
+class Visit:
+    """A page that is open, and what it said and asked for."""
+
+    page: Any
+    said: list[str] = field(default_factory=list)
+    asked: list[str] = field(default_factory=list)
+
+    def numbers(self, script: str) -> list[float]:
+        return list(self.page.evaluate(script))
+
+
+@pytest.fixture
+def visit(browser: Any) -> Iterator[Any]:
+    contexts = []
+
+    def open_page(path: Path, *, scheme: str = "light", width: int = WIDE) -> Visit:
+        context = browser.new_context(color_scheme=scheme, viewport={"width": width, "height": HEIGHT})
+        contexts.append(context)
+        one = Visit(context.new_page())
+        one.page.on("console", lambda message: one.said.append(f"{message.type}: {message.text}"))
+        one.page.on("pageerror", lambda error: one.said.append(str(error)))
+        one.page.on("request", lambda request: one.asked.append(request.url))
+        one.page.goto(path.as_uri(), wait_until="networkidle")
+        return one
+
+    yield open_page
+    for context in contexts:
+        context.close()
+
+
+def fits(one: Visit) -> bool:
+    """Whether nothing has to be scrolled sideways for."""
+    scroll, client = one.numbers("[document.documentElement.scrollWidth, document.documentElement.clientWidth]")
+    return scroll <= client
+
+
+@pytest.mark.parametrize("name", PAGES)
+@pytest.mark.parametrize("width", [WIDE, NARROW])
+def test_a_page_says_nothing_asks_for_nothing_and_fits(visit: Any, folder: Path, name: str, width: int) -> None:
+    path = folder / f"{name}.html"
+    one = visit(path, width=width)
+    assert one.said == []
+    assert one.asked == [path.as_uri()]
+    assert fits(one)
+
+
+def test_what_says_asks_and_does_not_fit_is_seen(visit: Any, tmp_path: Path) -> None:
+    path = tmp_path / "bad.html"
+    script = "<script>console.error('heard'); undefined_function()</script>"
+    path.write_text(f"<div style='width: 3000px'>x</div><img src='{ADDRESSED}'>{script}")
+    one = visit(path)
+    assert any("heard" in line for line in one.said)
+    assert any("undefined_function" in line for line in one.said)
+    assert one.asked == [path.as_uri(), ADDRESSED]
+    assert not fits(one)
+
+
+@pytest.mark.parametrize(("scheme", "darkest", "lightest"), [("light", 0.8, 1.0), ("dark", 0.0, 0.1)])
+@pytest.mark.parametrize("name", PAGES)
+def test_its_words_can_be_read_and_every_figure_is_drawn(
+    visit: Any, folder: Path, name: str, scheme: str, darkest: float, lightest: float
+) -> None:
+    one = visit(folder / f"{name}.html", scheme=scheme)
+    ink, ground = (color(one, prop) for prop in ("color", "backgroundColor"))
+    assert darkest <= luminance(ground) <= lightest
+    assert contrast(ink, ground) > READABLE
+    one.page.evaluate("document.querySelectorAll('details').forEach(d => d.open = true)")
+    boxes = one.page.evaluate(
+        "[...document.querySelectorAll('svg, img')].map(f => f.getBoundingClientRect())"
+        ".map(b => [b.x + scrollX, b.y + scrollY, b.width, b.height])"
+    )
+    whole = viewers.pixels(one.page.screenshot(full_page=True)).astype(np.int16)
+    np.testing.assert_array_equal(whole[2, 2], ground)  # it is painted as it says
+    assert boxes
+    for k, (x, y, width, height) in enumerate(boxes):
+        figure = whole[round(y) : round(y + height), round(x) : round(x + width)]
+        assert figure.size, f"figure {k} has no room"
+        empty = np.median(figure[::5, ::5], axis=(0, 1))  # most of a figure is
+        inked = (np.abs(figure - empty).max(axis=-1) > 40).mean()
+        assert inked > INKED, f"figure {k} of {len(boxes)} is empty"
+
+
+def color(one: Visit, prop: str) -> np.ndarray:
+    """A colour of the page itself; a body without a ground shows the root's, and that without one is the browser's canvas."""
+    script = f"['body', 'html'].map(n => getComputedStyle(document.querySelector(n)).{prop})"
+    shown = next(text for text in one.page.evaluate(script) if text != "rgba(0, 0, 0, 0)")
+    return np.array(re.findall(r"[\d.]+", shown)[:3], dtype=float)
+
+
+def luminance(rgb: np.ndarray) -> float:
+    """Relative luminance of WCAG 2."""
+    part = rgb / 255.0
+    linear = np.where(part <= 0.04045, part / 12.92, ((part + 0.055) / 1.055) ** 2.4)
+    return float(linear @ [0.2126, 0.7152, 0.0722])
+
+
+def contrast(one: np.ndarray, other: np.ndarray) -> float:
+    """Contrast ratio of WCAG 2, 1 to 21."""
+    low, high = sorted((luminance(one), luminance(other)))
+    return (high + 0.05) / (low + 0.05)
+
+
+@pytest.mark.parametrize("name", PAGES)
+def test_it_prints_on_white_paper_and_nothing_is_cut_off(visit: Any, folder: Path, name: str) -> None:
+    one = visit(folder / f"{name}.html", scheme="dark", width=PAPER)
+    one.page.emulate_media(media="print", color_scheme="dark")
+    assert fits(one)
+    assert luminance(color(one, "backgroundColor")) > 0.95
+    printed = one.page.pdf(format="A4")
+    assert printed.startswith(b"%PDF")
+    assert len(re.findall(rb"/Type\s*/Page\b", printed)) >= 2
