@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -157,8 +157,3 @@ def split(stamp_s: Float64[np.ndarray, " n"]) -> tuple[Bool[np.ndarray, " n"], B
     for k in np.flatnonzero(step > GAP_PERIODS * np.median(step)):
         usable &= (stamp_s < stamp_s[k] - MARGIN_S) | (stamp_s > stamp_s[k + 1] + MARGIN_S)
     return held_out, usable
-
-
-def shared_channels(logs: Sequence[Pair]) -> set[str]:
-    """Names of the other channels that every log has."""
-    return set.intersection(*(set(log.channels) for log in logs))

@@ -1,4 +1,4 @@
-"""A recording beside what a simulation, or its own true poses, say it should read: one clock, one row a sample.
+"""Alignment of a recording with a simulation, or with its own true poses: one clock, one row a sample.
 
 A simulation's samples carry noise of their own, and a term that can shrink the simulation would shrink its noise as well and
 look like physics. Where the simulation's poses explain its samples but for white noise, they stand in for them, without noise

@@ -1,4 +1,4 @@
-"""What stamps and digits show without any simulation: samples that are missing, stamps that jitter, values on a grid."""
+"""Timestamps and converter: missing samples, stamp jitter, quantization and saturation, from the samples themselves."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ TINY = 1e-300
 
 
 def even(stamp_s: Float64[np.ndarray, " n"]) -> tuple[Float64[np.ndarray, " n"], int]:
-    """Stamps of an even clock through some stamps, and how many samples it misses.
+    """Stamps of an even clock fitted to the stamps, and the number of missing samples.
 
     The period is the one in which the stamps agree best, which samples that are missing do not change; a running median of what
     each stamp counts, less its number, says which samples those are though every stamp jitters.
@@ -105,7 +105,7 @@ def jitter(pairs: Sequence[Pair]) -> tuple[Effect, ...]:
 
 
 def dropped(pairs: Sequence[Pair]) -> list[Finding]:
-    """Samples that an even clock would have had."""
+    """Finding of samples that an even clock would have had."""
     missing, total, length = 0, 0, 0.0
     for pair in pairs:
         missing, total = missing + even(pair.stamp_s)[1], total + len(pair.stamp_s)
@@ -122,7 +122,7 @@ def dropped(pairs: Sequence[Pair]) -> list[Finding]:
 
 
 def rounded(pairs: Sequence[Pair], floor: Float64[np.ndarray, "6"]) -> list[Finding]:
-    """Values on a grid as coarse as the noise."""
+    """Finding of quantization: values on a grid as coarse as the noise."""
     lsb = {}
     for k, signal in enumerate(("gyro", "accel")):
         axes = [pair.real[:, a] for pair in pairs for a in range(3 * k, 3 * k + 3)]
@@ -217,7 +217,7 @@ class _Starts:
 
 
 def clipped(real: Float64[np.ndarray, "n 6"]) -> Bool[np.ndarray, "n 6"]:
-    """Samples of an axis whose converter is at its end, and those beside them: what they would have been nobody knows."""
+    """Samples of an axis whose converter is at its limit, and their neighbours, which filters mix with them."""
     at, most = np.zeros(real.shape, bool), limits(real)
     for k, signal in enumerate(("gyro", "accel")):
         if signal in most:

@@ -1,4 +1,4 @@
-"""The noise that a fit is weighed by: an autoregression for each axis, from what a rich model leaves.
+"""Whitening of residuals: an autoregressive filter for each axis, from what a rich model leaves.
 
 Poses that were differentiated leave noise of every colour; least squares on such residuals is sure of the wrong things. An
 autoregressive filter makes it white (Box and Jenkins; here by Burg's recursion over stretches that count), and what is
