@@ -7,20 +7,31 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
+from jaxtyping import Float64
 
 from imutool.diagnosis import summarize
 from imutool.diagnosis.compare_findings import ANOTHER_MOTION
 from imutool.diagnosis.estimation import timestamps
 from imutool.diagnosis.estimation import unnamed_effects as unnamed
 from imutool.diagnosis.estimation.aligned_log import Pair
-from imutool.diagnosis.estimation.jacobians import expected
+from imutool.diagnosis.estimation.gauss_newton import fit
+from imutool.diagnosis.estimation.jacobians import Chosen, expected
 from imutool.diagnosis.estimation.model_selection import Selection, select_effects
 from imutool.diagnosis.estimation.noise_estimate import whitened
-from imutool.diagnosis.estimation.observability import unobservable
+from imutool.diagnosis.estimation.observability import unobservable, with_free
+from imutool.diagnosis.estimation.significance import scatter
 from imutool.diagnosis.estimation.whitening import WhitenedImu
-from imutool.diagnosis.reference import align_all, is_another_motion, reference_errors, with_unique_names
+from imutool.diagnosis.reference import (
+    align,
+    align_all,
+    is_another_motion,
+    reference_errors,
+    with_unique_names,
+    without_unusable,
+)
 from imutool.diagnosis.reference_free_checks import check_without_reference
 from imutool.diagnosis.resimulation import resimulate
 from imutool.diagnosis.result import Closer, Diagnosis, Finding
@@ -144,3 +155,58 @@ def unnamed_candidates(pairs: Sequence[Pair]) -> list[tuple[Effect, ...]]:
     """Effects that are tried after the catalogue: driven by other channels, then unknown curves and terms."""
     like = unnamed.like(pairs)
     return [tuple(unnamed.driven(pairs)), (*unnamed.curves(like), *unnamed.terms(like))]
+
+
+# ── sizes of chosen effects ──
+
+EVERY_UNIT = (
+    "mount_rotation",
+    "gyro_scale",
+    "accel_scale",
+    "lever_arm",
+    "clock_offset",
+)  # of these every unit has a little
+
+
+class EffectSizes(NamedTuple):
+    """Sizes of effects fitted together, with robust standard deviations by effect, and the bias of each stretch.
+
+    `information` is the Fisher information of the noise alone, over all parameters in order.
+    """
+
+    chosen: Chosen
+    std: dict[str, Float64[np.ndarray, " p"]]
+    information: Float64[np.ndarray, "q q"]
+    bias: Float64[np.ndarray, "stretches 6"]
+
+
+def effect_sizes(
+    real: Location,
+    sim: Location | None = None,
+    *,
+    imu: str | None = None,
+    truth: str | None = None,
+    effects: Sequence[str] = EVERY_UNIT,
+    settings: DiagnoseSettings | None = None,
+) -> EffectSizes:
+    """Fit effects of the catalogue together to a recording, significant or not, to compare units.
+
+    Unobservable parameters are left out, for example the scale of a gyro axis that never turns.
+
+    Raises:
+        ConfigError, LogError, DataError: as `diagnose`; or an effect that has nothing to be fitted to here.
+    """
+    simulated = None if sim is None else read_log(sim, imu=imu)
+    pairs = [without_unusable(pair) for pair in align(read_log(real, imu=imu, truth=truth), simulated, truth)]
+    candidates = candidates_for(pairs)
+    settings = settings or DiagnoseSettings()
+    logs = [whitened(pair, candidates, settings.band) for pair in pairs]
+    wanted = catalogue.diagnosed(effects)
+    hidden = set(unobservable(logs, wanted, settings.search))
+    observable = []
+    for effect in wanted:
+        free = [k for k, p in enumerate(effect.parameters) if not {effect.name, f"{effect.name}.{p.name}"} & hidden]
+        observable += [with_free(effect, free)] if free else []
+    fitted = fit(logs, tuple((effect, effect.null_value.astype(float)) for effect in observable), part="all")
+    std = scatter(logs, fitted, "all", settings.search.robust_block_s).std if observable else {}
+    return EffectSizes(fitted.chosen, {key: np.asarray(s) for key, s in std.items()}, fitted.information, fitted.bias)

@@ -17,7 +17,7 @@ from scipy.ndimage import uniform_filter1d
 from scipy.stats import chi2, mannwhitneyu
 
 from imutool.diagnosis.estimation.aligned_log import Pair
-from imutool.diagnosis.result import Finding, Located
+from imutool.diagnosis.result import ALWAYS, NO_REGIME, Finding, Located
 from imutool.units import AXES, SENSORS
 
 WINDOW_S = 1.0
@@ -163,7 +163,7 @@ def regime(inside: Bool[np.ndarray, " w"], power: Float64[np.ndarray, " w"], win
     """Regime in words: "angular rate above 0.4 rad/s", or "always"."""
     high = inside if not inside.all() else power > np.median(power)
     if high.all() or not high.any():
-        return "always"
+        return ALWAYS
     counts = np.maximum(np.bincount(window), 1)
     best: tuple[float, str] | None = None
     for name, (unit, values) in variables.items():
@@ -174,8 +174,8 @@ def regime(inside: Bool[np.ndarray, " w"], power: Float64[np.ndarray, " w"], win
             if p < CHANCE and index > LEAST_YOUDEN and (best is None or index > best[0]):
                 best = index, f"{name} {word} {sign * threshold:.2g} {unit}".strip()
     if best is None:
-        return "no regime: it comes and goes" if not inside.all() else "always"
-    return best[1] if not inside.all() else f"always, most with {best[1]}"
+        return f"{NO_REGIME}: it comes and goes" if not inside.all() else ALWAYS
+    return best[1] if not inside.all() else f"{ALWAYS}, most with {best[1]}"
 
 
 def _youden(level: Float64[np.ndarray, " w"], high: Sequence[bool] | Bool[np.ndarray, " w"]) -> tuple[float, float]:

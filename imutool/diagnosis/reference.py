@@ -19,7 +19,7 @@ from imutool.diagnosis.estimation.alignment import LEAST_S, same_motion, with_si
 from imutool.diagnosis.estimation.jacobians import expected
 from imutool.diagnosis.estimation.whitening import WhitenedImu
 from imutool.diagnosis.reference_free_checks import unusable_axes
-from imutool.diagnosis.result import Estimate, Finding, HeldOut, Located
+from imutool.diagnosis.result import NO_REGIME, Estimate, Finding, HeldOut, Located
 from imutool.errors import DataError, ImutoolError, NumericsError
 from imutool.recording import Recording
 from imutool.sensor.trajectory import smooth_motion
@@ -194,7 +194,7 @@ def _where(
 ) -> Located:
     power = (white[inside] ** 2).mean(axis=0)
     axes = tuple(axis for axis, value in zip(AXES, power, strict=True) if value > 1.3)
-    return Located(signal, axes or AXES, tuple(runs), "no regime: the reference's own moments", share, STANDS_OUT)
+    return Located(signal, axes or AXES, tuple(runs), f"{NO_REGIME}: the reference's own moments", share, STANDS_OUT)
 
 
 def _runs(loud: np.ndarray, start_s: float) -> list[tuple[float, float]]:

@@ -7,8 +7,8 @@ from jaxtyping import Bool
 
 from imutool.diagnosis.estimation import timestamps
 from imutool.diagnosis.estimation.aligned_log import Pair
+from imutool.diagnosis.quantity import percent
 from imutool.diagnosis.result import Diagnosis, Estimate, Finding, HeldOut
-from imutool.diagnosis.wording.quantity import percent
 from imutool.inertial.stationary import white_noise
 from imutool.recording import Recording, seconds
 from imutool.sensor import catalogue

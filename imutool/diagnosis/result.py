@@ -17,6 +17,7 @@ from imutool.report import Report, Section
 from imutool.units import ASCII_UNITS
 
 SCHEMA = "imutool.diagnosis/1"
+ALWAYS, NO_REGIME = "always", "no regime"  # how `Located.regime` begins where no regime bounds the misfit
 LEAST_MISFIT = 0.1  # of the noise's power: with less misfit than that, a share of it means nothing
 
 Kind = Literal["catalogue", "driven", "unknown"]
@@ -41,6 +42,16 @@ class Located(Section, frozen=True, omit_defaults=True):
     p_value: Number
     log: str = ""
     reason: str = ""
+
+    @property
+    def everywhere(self) -> bool:
+        """Whether the misfit lies in all of the log, perhaps most in one regime."""
+        return self.regime.startswith(ALWAYS)
+
+    @property
+    def intermittent(self) -> bool:
+        """Whether the misfit comes and goes without a regime."""
+        return self.regime.startswith(NO_REGIME)
 
 
 class Estimate(Section, frozen=True):

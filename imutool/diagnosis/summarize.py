@@ -22,7 +22,7 @@ from imutool.diagnosis.estimation.whitening import WhitenedImu
 from imutool.diagnosis.held_out import gains, held_out_rms, known_sensors, noise_floor, unexplained_residuals, with_effects
 from imutool.diagnosis.localization import locate_findings, locate_residual
 from imutool.diagnosis.reference_free_checks import at_limit, unusable_axes
-from imutool.diagnosis.result import Curve, Diagnosis, Estimate, Finding, Located, Traces
+from imutool.diagnosis.result import ALWAYS, Curve, Diagnosis, Estimate, Finding, Located, Traces
 from imutool.diagnosis.to_physics_file import to_physics_file
 from imutool.inertial.stationary import white_noise
 from imutool.sensor.physics_file import PhysicsFile
@@ -145,7 +145,7 @@ def _stuck(pair: Pair, floor: Float64[np.ndarray, "6"], *, several: bool) -> Ite
         signal = SENSORS[a // 3]
         reason = f"it reads {pair.real[0, a]:.4g} {UNITS[signal]} in every sample"
         span = ((float(pair.stamp_s[0]), float(pair.stamp_s[-1])),)
-        yield Located(signal, (AXES[a % 3],), span, f"always: {reason}", 1.0, 0.0, pair.name if several else "", reason)
+        yield Located(signal, (AXES[a % 3],), span, f"{ALWAYS}: {reason}", 1.0, 0.0, pair.name if several else "", reason)
 
 
 def _finding(logs: Sequence[WhitenedImu], found: Selection, one: SelectedEffect, floor: Float64[np.ndarray, "6"]) -> Finding:

@@ -8,9 +8,9 @@ from itertools import groupby
 from pathlib import Path
 from textwrap import fill
 
-from imutool.diagnosis.result import Diagnosis, HeldOut, Located, Unexplained
+from imutool.diagnosis.quantity import grouped, percent, symbol
+from imutool.diagnosis.result import ALWAYS, Diagnosis, HeldOut, Located, Unexplained
 from imutool.diagnosis.wording.effect_sentences import has_gain, label, named_sentence, parameters_text, signals
-from imutool.diagnosis.wording.quantity import grouped, percent, symbol
 from imutool.units import UNITS
 
 QUIET = "nothing else stands above the noise"
@@ -230,10 +230,11 @@ def _regime(located: Sequence[Located], signal: str) -> str:
     ]
     if not here:
         return ""
-    regime = max(here, key=lambda place: place.share).regime
-    if regime.startswith("always"):
-        return regime.replace("always", " throughout", 1)
-    if regime.startswith("no regime"):
+    place = max(here, key=lambda place: place.share)
+    regime = place.regime
+    if place.everywhere:
+        return f" throughout{regime.removeprefix(ALWAYS)}"
+    if place.intermittent:
         return " off and on"
     word = regime.split()[0].lower()
     goes_on = {"when", "while", "where", "at", "in", "on", "above", "below", "during", "all", "throughout", "after", "before"}
