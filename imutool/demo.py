@@ -16,7 +16,7 @@ from imutool.debiasing import debias
 from imutool.errors import ConfigError
 from imutool.evaluation import evaluate
 from imutool.recording import Recording
-from imutool.sensor.flight import ACCEL, GYRO, FlightSettings, flight
+from imutool.sensor.made_up_flight import ACCEL, GYRO, FlightSettings, flight
 from imutool.training.fit import Epoch, TrainSettings
 from imutool.training.run import train
 from imutool.viewing.html import report

@@ -97,7 +97,7 @@ def made_once(factory: pytest.TempPathFactory, name: str, make: Callable[[Path],
 def logs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with flight_1.mcap and flight_2.mcap (20 s, 200 Hz, 3 s at rest), linear.safetensors of the first."""
     from imutool.mcap_io.write import write
-    from imutool.sensor.flight import flight
+    from imutool.sensor.made_up_flight import flight
     from imutool.training.run import train
 
     def make(folder: Path) -> None:

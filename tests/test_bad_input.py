@@ -27,7 +27,7 @@ from imutool.mcap_io.codec import schemas
 from imutool.mcap_io.log import Log
 from imutool.mcap_io.storage.target import Target
 from imutool.mcap_io.write import write
-from imutool.sensor.flight import flight
+from imutool.sensor.made_up_flight import flight
 
 Run = Callable[..., subprocess.CompletedProcess[str]]
 Refuse = Callable[..., str]

@@ -45,7 +45,7 @@ from imutool.mcap_io.read import read
 from imutool.mcap_io.storage.source import Source, sha256
 from imutool.mcap_io.write import write
 from imutool.recording import Frames, Recording, Scalars, seconds
-from imutool.sensor.flight import flight
+from imutool.sensor.made_up_flight import flight
 
 RATE_HZ = 200.0
 ONLINE = 1e-6  # rad/s and m/s²: the contract's figure

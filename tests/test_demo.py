@@ -13,7 +13,7 @@ from imutool.errors import ConfigError
 from imutool.evaluation import evaluate
 from imutool.mcap_io.log import Log
 from imutool.mcap_io.write import write
-from imutool.sensor.flight import flight
+from imutool.sensor.made_up_flight import flight
 
 FLIGHT_SAMPLES = 12_001  # 60 s at 200 Hz, both ends included
 SMALLEST_PICTURE = 20_000  # bytes; an empty figure of this size has under 10 kB

@@ -21,7 +21,7 @@ import pytest
 
 from imutool import __version__
 from imutool.demo import write_asl
-from imutool.sensor.flight import flight
+from imutool.sensor.made_up_flight import flight
 
 ROOT = Path(__file__).parents[1]
 

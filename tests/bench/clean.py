@@ -28,7 +28,7 @@ import numpy as np
 from imutool.cleaning import survey
 from imutool.mcap_io.write import write
 from imutool.recording import Imu, Poses, Recording
-from imutool.sensor.flight import flight
+from imutool.sensor.made_up_flight import flight
 
 RATE_HZ = 200.0
 PIECE_S = 60.0  # of motion, again and again

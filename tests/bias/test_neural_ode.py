@@ -18,7 +18,7 @@ from imutool.bias.ode import HermitePath, integrate
 from imutool.geometry import so3
 from imutool.inertial.windows import attitudes
 from imutool.recording import seconds
-from imutool.sensor.flight import flight
+from imutool.sensor.made_up_flight import flight
 from imutool.units import Sensor
 
 RATE_HZ = 200.0

@@ -21,7 +21,7 @@ from imutool.mcap_io.read import read
 from imutool.mcap_io.write import write
 from imutool.recording import Imu, Recording, seconds
 from imutool.sensor import catalogue, physics_file
-from imutool.sensor.flight import flight
+from imutool.sensor.made_up_flight import flight
 from imutool.sensor.physics_file import Bias, Curve, Entry, PhysicsFile, Term, Value
 from imutool.sensor.simulate import simulate
 

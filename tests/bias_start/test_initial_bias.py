@@ -35,8 +35,8 @@ from imutool.errors import ConfigError, DataError
 from imutool.inertial.stationary import Blocks, block_statistics
 from imutool.inertial.strapdown import dead_reckon
 from imutool.recording import GRAVITY_M_S2, Imu, Poses, Recording, seconds
-from imutool.sensor.flight import FlightSettings as Flight
-from imutool.sensor.flight import TriadSettings, flight, trajectory
+from imutool.sensor.made_up_flight import FlightSettings as Flight
+from imutool.sensor.made_up_flight import TriadSettings, flight, trajectory
 
 RATE_HZ = 200.0
 NOISE = np.array([2.4e-3] * 3 + [0.03] * 3)  # of a sample: the ADIS16448 at 200 Hz

@@ -34,7 +34,7 @@ from imutool.mcap_io.log import Log
 from imutool.mcap_io.read import read
 from imutool.mcap_io.write import write
 from imutool.recording import GRAVITY_M_S2, Poses
-from imutool.sensor.flight import flight
+from imutool.sensor.made_up_flight import flight
 
 EXACT = 1e-12  # float64 arithmetic of a few products of numbers of order one
 SPLINE = 2e-4  # rad/s, m/s²: what a spline of degree 5 with knots 50 ms apart, smoothed at 8 Hz, leaves of a slow circle

@@ -19,7 +19,7 @@ from imutool.errors import LogError
 from imutool.mcap_io.log import Log
 from imutool.mcap_io.topics import ImuBatch, StampCheck
 from imutool.mcap_io.write import write
-from imutool.sensor.flight import flight
+from imutool.sensor.made_up_flight import flight
 from imutool.viewing.html import cleaning_page
 
 Command = Callable[..., subprocess.CompletedProcess[str]]

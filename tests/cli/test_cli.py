@@ -16,7 +16,7 @@ from imutool import cli, errors, registry
 from imutool.cli import terminal
 from imutool.cli.terminal import epoch_line
 from imutool.demo import write_asl
-from imutool.sensor.flight import flight
+from imutool.sensor.made_up_flight import flight
 from imutool.training.fit import Epoch
 
 Run = Callable[..., subprocess.CompletedProcess[str]]

@@ -26,7 +26,7 @@ from imutool.mcap_io.write import write
 from imutool.recording import Recording
 from imutool.report import json_values
 from imutool.sensor import physics_file
-from imutool.sensor.flight import flight
+from imutool.sensor.made_up_flight import flight
 from imutool.sensor.physics_file import Bias, Entry, PhysicsFile, Value
 from imutool.sensor.samples import SensorSamples
 from imutool.sensor.simulate import simulate

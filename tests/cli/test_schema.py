@@ -14,7 +14,7 @@ from typer.testing import CliRunner
 from imutool.cli import app
 from imutool.demo import write_asl
 from imutool.report import REPORTS, json_schema
-from imutool.sensor.flight import flight
+from imutool.sensor.made_up_flight import flight
 
 COMMANDS = [command.name or command.callback.__name__ for command in app.registered_commands if command.callback]
 SILENT = {"schema"}  # commands without --json

@@ -33,7 +33,7 @@ from imutool.mcap_io.read import read
 from imutool.mcap_io.write import write
 from imutool.noise import datasheet
 from imutool.recording import Frames, Imu, Poses, Recording, Scalars
-from imutool.sensor.flight import flight
+from imutool.sensor.made_up_flight import flight
 
 Run = Callable[..., subprocess.CompletedProcess[str]]
 

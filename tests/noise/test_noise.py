@@ -21,7 +21,7 @@ from imutool.noise.datasheet import SHEETS, UNITS, Noise
 from imutool.noise.residual import curves
 from imutool.noise_identification import identify, plain, rows
 from imutool.recording import GRAVITY_M_S2, Imu, Poses, Recording
-from imutool.sensor.flight import GYRO, flight
+from imutool.sensor.made_up_flight import GYRO, flight
 
 Run = Callable[..., subprocess.CompletedProcess[str]]
 

@@ -15,7 +15,7 @@ from imutool.inertial.kinematics import Trajectory
 from imutool.recording import Imu, Poses, Recording
 from imutool.sensor import catalogue as _catalogue
 from imutool.sensor.effect import Effect, simulate_samples
-from imutool.sensor.flight import FlightSettings, trajectory
+from imutool.sensor.made_up_flight import FlightSettings, trajectory
 from imutool.sensor.samples import IdealMotion
 
 RATE_HZ, DURATION_S = 100.0, 24.0

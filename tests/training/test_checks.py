@@ -11,7 +11,7 @@ import pytest
 from imutool.errors import DataError
 from imutool.mcap_io.read import read
 from imutool.recording import Imu, Recording
-from imutool.sensor.flight import flight
+from imutool.sensor.made_up_flight import flight
 from imutool.training.run import check_trainable
 from imutool.training.segments import Pool
 

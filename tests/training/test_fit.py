@@ -21,7 +21,7 @@ from imutool.errors import ConfigError, DataError, ModelError, NumericsError
 from imutool.inertial import metrics
 from imutool.inertial.strapdown import along_truth
 from imutool.recording import Imu, Recording
-from imutool.sensor.flight import flight
+from imutool.sensor.made_up_flight import flight
 from imutool.training import checkpoint
 from imutool.training.fit import Epoch, Training, TrainSettings
 

@@ -22,7 +22,7 @@ from imutool.config import load as load_settings
 from imutool.errors import ConfigError, DataError, LogError, ModelError, NumericsError
 from imutool.mcap_io.write import write
 from imutool.recording import Imu, Recording
-from imutool.sensor.flight import flight
+from imutool.sensor.made_up_flight import flight
 from imutool.training.fit import Epoch, TrainSettings
 from imutool.training.objective import WindowEndObjective
 from imutool.training.physics_first import config_of, helps, settings_for
