@@ -120,11 +120,11 @@ def test_a_single_effect_is_found_alone_and_by_its_name(name: str) -> None:
     "both", [("lever_arm", "clock_offset"), ("gyro_scale", "low_pass"), ("mount_rotation", "accel_misalignment")], ids="+".join
 )
 def test_a_pair_is_found_both_by_name(both: tuple[str, str]) -> None:
-    planted = {name: SINGLE[name] for name in both}
-    found = asked(planted.pair(planted.rich(3, DURATION_S), planted, 3), beyond=False)
+    effects = {name: SINGLE[name] for name in both}
+    found = asked(planted.pair(planted.rich(3, DURATION_S), effects, 3), beyond=False)
     assert sorted(names(found)) == sorted(both)
     assert found.selected[0].gain >= found.selected[1].gain  # strongest first
-    assert all(sure(found, name, planted[name]) for name in both)
+    assert all(sure(found, name, effects[name]) for name in both)
 
 
 def test_two_logs_show_together_what_each_shows_alone() -> None:
@@ -185,7 +185,7 @@ def test_a_misfit_without_a_name_gets_none_of_the_catalogues(column: int, seed: 
 
 def fit_cost(found: Selection) -> tuple[float, float]:
     """Squares above the noise that the effects took, with those that are left; and those that are left."""
-    left = max(found.whole.objective - 6.0 * found.whole.rows, 0.0)
+    left = max(found.whole.objective - found.whole.numbers, 0.0)
     return left + sum(one.gain for one in found.selected), left
 
 
