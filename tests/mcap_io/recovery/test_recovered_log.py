@@ -26,7 +26,7 @@ from rosbags.highlevel import AnyReader
 from support import log_damage
 
 from imutool.errors import ConfigError, LogError
-from imutool.log_info import inspect
+from imutool.log_info.inspection import inspect
 from imutool.mcap_io import index
 from imutool.mcap_io.codec import records
 from imutool.mcap_io.codec.records import HEAD, MAGIC

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from imutool import demo
+from imutool.cli import demo
 from imutool.errors import ConfigError
 from imutool.evaluation import evaluate
 from imutool.mcap_io.log import Log
