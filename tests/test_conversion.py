@@ -13,8 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from imutool import conversion as convert_module
-from imutool import registry
+from imutool import conversion_workers, registry
 from imutool.conversion import ConvertReport, convert
 from imutool.errors import ConfigError, DataError
 from imutool.mcap_io.log import Log
@@ -215,7 +214,7 @@ def test_an_interrupt_ends_all_processes_and_leaves_nothing_half_written(tmp_pat
 
 
 def test_a_process_that_dies_is_a_failure_of_its_sequence_not_of_the_tool(source, tmp_path, monkeypatch):
-    monkeypatch.setattr(convert_module, "_convert_in_process", _die)
+    monkeypatch.setattr(conversion_workers, "_convert_in_process", _die)
     report = convert(source, tmp_path / "out", workers=2)
     assert [failure.name for failure in report.failures] == ["a", "b", "c"]
     assert "its process died" in report.failures[0].message

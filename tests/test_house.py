@@ -35,7 +35,7 @@ TIERS = (
     ("bias",),
     ("bias_start",),
     ("debiasing",),
-    ("training", "evaluation", "conversion", "diagnosis", "blind_cases"),
+    ("training", "evaluation", "conversion", "conversion_workers", "diagnosis", "blind_cases"),
     ("noise_identification",),
     ("viewing", "vio"),
     ("diagnosis_output",),
