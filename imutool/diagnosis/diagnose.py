@@ -82,7 +82,7 @@ def diagnose(
         say(0, 4, "the simulation, of another motion")
         known, simulated = diagnose([sim], imu=imu, settings=settings).findings, None
     apart = sim is not None and simulated is None
-    pairs, left_out = align_all(recordings, simulated, truth)
+    pairs, left_out = align_all(recordings, simulated, truth, settings.reference)
     if not pairs:
         return check_without_reference(recordings[0], str(reals[0]), left_out[0])
     say(1, 4, "noise")
@@ -90,14 +90,13 @@ def diagnose(
     logs = [whitened(pair, (*candidates, *unnamed.driven([pair])), settings.band) for pair in pairs]
     pairs = [log.pair for log in logs]
     say(2, 4, "searching")
-    moments = reference_errors(logs)
+    moments = reference_errors(logs, settings.reference)
     asked, unnamed_too = ((), ()) if moments[0] else (candidates, unnamed_candidates(pairs))
     found = select_effects(logs, asked, unnamed_too, lambda word: say(2, 4, f"trying {word}"), settings=settings.search)
     say(3, 4, "locating")
     paths = {recording.name: str(real) for recording, real in zip(recordings, reals, strict=True)}
-    diagnosis = summarize.summarize(
-        logs, found, paths, None if sim is None else str(sim), known, unobservable(logs, candidates, settings.search)
-    )
+    hidden = unobservable(logs, candidates, settings.search)
+    diagnosis = summarize.summarize(logs, found, paths, None if sim is None else str(sim), known, hidden, settings)
     if simulated is not None and any(one.effect not in NO_EFFECT for one in diagnosis.findings):
         say(3, 4, "simulating again")
         diagnosis = _resimulated(diagnosis, logs, found, simulated)
@@ -105,7 +104,7 @@ def diagnose(
     diagnosis = replace(diagnosis, findings=(*moments[0], *diagnosis.findings), located=tuple(moments[1]) or diagnosis.located)
     for signal, real, there in beside:
         say(3, 4, signal)
-        diagnosis = _with_signal(diagnosis, diagnose_signal(real, there, others(reals[0], signal), signal, settings.search))
+        diagnosis = _with_signal(diagnosis, diagnose_signal(real, there, others(reals[0], signal), signal, settings))
     say(4, 4, "")
     return diagnosis
 
@@ -197,9 +196,10 @@ def effect_sizes(
         ConfigError, LogError, DataError: as `diagnose`; or an effect that has nothing to be fitted to here.
     """
     simulated = None if sim is None else read_log(sim, imu=imu)
-    pairs = [without_unusable(pair) for pair in align(read_log(real, imu=imu, truth=truth), simulated, truth)]
-    candidates = candidates_for(pairs)
     settings = settings or DiagnoseSettings()
+    aligned = align(read_log(real, imu=imu, truth=truth), simulated, truth, settings.reference)
+    pairs = [without_unusable(pair, settings.reference) for pair in aligned]
+    candidates = candidates_for(pairs)
     logs = [whitened(pair, candidates, settings.band) for pair in pairs]
     wanted = catalogue.diagnosed(effects)
     hidden = set(unobservable(logs, wanted, settings.search))

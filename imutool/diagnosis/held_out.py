@@ -15,11 +15,8 @@ from imutool.diagnosis.estimation.jacobians import Chosen, expected
 from imutool.diagnosis.estimation.noise_estimate import noise_std
 from imutool.diagnosis.estimation.whitening import WhitenedImu
 from imutool.diagnosis.result import Closer, HeldOut, Unexplained
+from imutool.diagnosis.settings import HeldOutSettings
 from imutool.units import ASCII_UNITS, SENSORS
-
-WHITE = 1.15  # ratio of residual and noise up to which the residual is white
-BLOCK_S, DOUBTED = 3.0, 0.01  # s of held-out time; p-value below which a residual against poses is not white
-BY_CHANCE = 1e-3  # p-value of a larger ratio where few values are left
 
 
 def with_effects(pair: Pair, chosen: Chosen) -> Float64[np.ndarray, "n 6"]:
@@ -84,7 +81,10 @@ def held_out_rms(
 
 
 def unexplained_residuals(
-    logs: Sequence[WhitenedImu], after: Sequence[Float64[np.ndarray, "n 6"]], noises: Float64[np.ndarray, "6"]
+    logs: Sequence[WhitenedImu],
+    after: Sequence[Float64[np.ndarray, "n 6"]],
+    noises: Float64[np.ndarray, "6"],
+    settings: HeldOutSettings,
 ) -> dict[str, Unexplained]:
     """Residuals by sensor with their noise; against poses, whose errors vary, whiteness is tested by blocks."""
     out, beside_poses = {}, any(log.whiten.band is not None for log in logs)
@@ -93,15 +93,19 @@ def unexplained_residuals(
         part = slice(3 * k, 3 * k + 3)
         unseen = sum(len(_residual(log, there, part)) for log, there in zip(logs, after, strict=True))
         seen = sum(log.count("fitted") for log in logs) / 2.0  # of both sensors
-        most = max(WHITE, float(np.sqrt(fisher.isf(BY_CHANCE, unseen, max(seen, 1.0))))) if unseen else WHITE
+        most = settings.white_ratio
+        if unseen:
+            most = max(most, float(np.sqrt(fisher.isf(settings.few_samples_p_value, unseen, max(seen, 1.0)))))
         white = held.rms_after < most * noise
         if not white and beside_poses:
-            white = _p_value(logs, after, k, noise) > DOUBTED
+            white = _p_value(logs, after, k, noise, settings) > settings.white_p_value
         out[signal] = Unexplained(held.rms_after, noise, white)
     return out
 
 
-def _p_value(logs: Sequence[WhitenedImu], after: Sequence[Float64[np.ndarray, "n 6"]], k: int, noise: float) -> float:
+def _p_value(
+    logs: Sequence[WhitenedImu], after: Sequence[Float64[np.ndarray, "n 6"]], k: int, noise: float, settings: HeldOutSettings
+) -> float:
     """p-value of the power of held-out blocks under white noise (Student's t over blocks)."""
     powers: list[float] = []
     for log, there in zip(logs, after, strict=True):
@@ -110,11 +114,11 @@ def _p_value(logs: Sequence[WhitenedImu], after: Sequence[Float64[np.ndarray, "n
         rows = log.pair.held_out[:: log.whiten.every]
         left = log.pair.real - there if log.whiten.band is None else log.whiten.band(log.pair.real - there)
         power = (left[rows, 3 * k : 3 * k + 3][:, log.pair.axes[3 * k : 3 * k + 3]] ** 2).mean(axis=1)
-        block = np.floor(log.pair.stamp_s[:: log.whiten.every][rows] / BLOCK_S).astype(int)
+        block = np.floor(log.pair.stamp_s[:: log.whiten.every][rows] / settings.block_s).astype(int)
         powers += [float(power[block == one].mean()) for one in np.unique(block)]
     if len(powers) < 2:
         return 1.0
-    return float(ttest_1samp(powers, (WHITE * noise) ** 2, alternative="greater").pvalue)
+    return float(ttest_1samp(powers, (settings.white_ratio * noise) ** 2, alternative="greater").pvalue)
 
 
 def known_sensors(pairs: Sequence[Pair]) -> dict[str, int]:

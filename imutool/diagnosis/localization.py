@@ -18,15 +18,8 @@ from scipy.stats import chi2, mannwhitneyu
 
 from imutool.diagnosis.estimation.aligned_log import Pair
 from imutool.diagnosis.result import ALWAYS, NO_REGIME, Finding, Located
+from imutool.diagnosis.settings import LocalizationSettings
 from imutool.units import AXES, SENSORS
-
-WINDOW_S = 1.0
-CLEAR = 12.0  # squares of misfit over noise by which a second, or an axis, stands out of it
-AXIS_SHARE = 0.02  # of the strongest axis' squares, below which an axis is not named
-JOIN_S = 1.5  # intervals closer than this are joined
-LEAST_YOUDEN = 0.35  # Youden's index from which a regime is named
-CHANCE = 1e-3
-MEAN_SAMPLES = 9  # of a running mean
 
 Samples = Float64[np.ndarray, "_ 6"]
 Variables = Mapping[str, tuple[str, Float64[np.ndarray, " n"]]]
@@ -39,40 +32,51 @@ def locate_findings(
     floor: Float64[np.ndarray, "6"],
     findings: Sequence[Finding],
     p_values: Mapping[str, float],
+    settings: LocalizationSettings,
 ) -> list[Located]:
     """Locations where the findings change the expected samples: `after` minus `before` of each pair."""
     misfits = [_converter_output(a, findings) - b for a, b in zip(after, before, strict=True)]
-    return _locate_logs(pairs, misfits, floor, p_values)
+    return _locate_logs(pairs, misfits, floor, p_values, settings)
 
 
-def locate_residual(pairs: Sequence[Pair], after: Sequence[Samples], floor: Float64[np.ndarray, "6"]) -> list[Located]:
+def locate_residual(
+    pairs: Sequence[Pair], after: Sequence[Samples], floor: Float64[np.ndarray, "6"], settings: LocalizationSettings
+) -> list[Located]:
     """Locations of an unexplained residual: running means that stand out of the noise."""
-    means = [np.asarray(uniform_filter1d(pair.real - a, MEAN_SAMPLES, axis=0)) for pair, a in zip(pairs, after, strict=True)]
-    return _locate_logs(pairs, means, floor / np.sqrt(MEAN_SAMPLES), {})
+    count = settings.mean_samples
+    means = [np.asarray(uniform_filter1d(pair.real - a, count, axis=0)) for pair, a in zip(pairs, after, strict=True)]
+    return _locate_logs(pairs, means, floor / np.sqrt(count), {}, settings)
 
 
 def _locate_logs(
-    pairs: Sequence[Pair], misfits: Sequence[Samples], floor: Float64[np.ndarray, "6"], p_values: Mapping[str, float]
+    pairs: Sequence[Pair],
+    misfits: Sequence[Samples],
+    floor: Float64[np.ndarray, "6"],
+    p_values: Mapping[str, float],
+    settings: LocalizationSettings,
 ) -> list[Located]:
     """Strongest first, log by log: `log` is the pair's name where there are several."""
     logs = list(dict.fromkeys(pair.name for pair in pairs))
     out = []
     for log in logs:
         segments = [(pair, misfit) for pair, misfit in zip(pairs, misfits, strict=True) if pair.name == log]
-        located = _locate_log(segments, floor, p_values)
+        located = _locate_log(segments, floor, p_values, settings)
         out += [msgspec.structs.replace(place, log=log) if len(logs) > 1 else place for place in located]
     return sorted(out, key=lambda place: place.p_value)
 
 
 def _locate_log(
-    segments: Sequence[tuple[Pair, Samples]], floor: Float64[np.ndarray, "6"], p_values: Mapping[str, float]
+    segments: Sequence[tuple[Pair, Samples]],
+    floor: Float64[np.ndarray, "6"],
+    p_values: Mapping[str, float],
+    settings: LocalizationSettings,
 ) -> list[Located]:
     """Segments of one log share its clock; each has its own constant."""
     t_s = np.concatenate([pair.stamp_s for pair, _ in segments])
     misfit = np.concatenate([misfit - np.median(misfit, axis=0) for _, misfit in segments])
     each = [_variables(pair) for pair, _ in segments]
     variables = {name: (unit, np.concatenate([own[name][1] for own in each])) for name, (unit, _) in each[0].items()}
-    return locate(t_s, misfit, floor, variables, p_values)
+    return locate(t_s, misfit, floor, variables, p_values, settings)
 
 
 def _converter_output(samples: Float64[np.ndarray, "n 6"], findings: Sequence[Finding]) -> Float64[np.ndarray, "n 6"]:
@@ -112,6 +116,7 @@ def locate(
     noise: Float64[np.ndarray, "6"],
     variables: Variables,
     p_values: Mapping[str, float],
+    settings: LocalizationSettings | None = None,
 ) -> list[Located]:
     """Location of a misfit by sensor, strongest first; samples may be of several segments of one log.
 
@@ -121,17 +126,19 @@ def locate(
         noise: standard deviation of a sample, by column.
         variables: what a regime can be of, by name, with unit and values at the samples.
         p_values: of the findings by sensor; one that is too small for any single second to show it lies everywhere.
+        settings: those of a diagnosis by default.
     """
+    settings = settings or LocalizationSettings()
     found = []
     scaled = (misfit - np.median(misfit, axis=0)) / noise
-    seconds, window = np.unique(np.floor((t_s - t_s[0]) / WINDOW_S), return_inverse=True)
+    seconds, window = np.unique(np.floor((t_s - t_s[0]) / settings.window_s), return_inverse=True)
     for k, sensor in enumerate(SENSORS):
         part = scaled[:, 3 * k : 3 * k + 3] ** 2
         axes_power = part.sum(axis=0)
-        axes = [a for a in range(3) if axes_power[a] > max(CLEAR, AXIS_SHARE * axes_power.max())]
+        axes = [a for a in range(3) if axes_power[a] > max(settings.clear_squares, settings.axis_share * axes_power.max())]
         power = np.bincount(window, weights=part.sum(axis=1))
-        inside = power > CLEAR
-        if axes and not inside.any() and p_values.get(sensor, 1.0) < CHANCE:
+        inside = power > settings.clear_squares
+        if axes and not inside.any() and p_values.get(sensor, 1.0) < settings.p_value:
             inside = np.ones(len(power), bool)
         if not axes or not inside.any():
             continue
@@ -139,8 +146,8 @@ def locate(
             Located(
                 sensor,
                 tuple(AXES[a] for a in axes),
-                tuple(intervals(float(t_s[0]) + WINDOW_S * seconds[inside])),
-                regime(inside, power, window, variables),
+                tuple(intervals(float(t_s[0]) + settings.window_s * seconds[inside], settings)),
+                regime(inside, power, window, variables, settings),
                 float(power[inside].sum() / max(power.sum(), 1e-300)),
                 p_values.get(sensor, float(chi2.sf(axes_power.sum(), 3))),
             )
@@ -148,18 +155,24 @@ def locate(
     return sorted(found, key=lambda place: place.p_value)
 
 
-def intervals(begins_s: Float64[np.ndarray, " w"]) -> list[tuple[float, float]]:
+def intervals(begins_s: Float64[np.ndarray, " w"], settings: LocalizationSettings) -> list[tuple[float, float]]:
     """Intervals of windows, by where each begins; neighbours are joined."""
     out: list[tuple[float, float]] = []
     for begin in begins_s.tolist():
-        if out and begin - out[-1][1] < JOIN_S - WINDOW_S:
-            out[-1] = out[-1][0], begin + WINDOW_S
+        if out and begin - out[-1][1] < settings.join_s - settings.window_s:
+            out[-1] = out[-1][0], begin + settings.window_s
         else:
-            out.append((begin, begin + WINDOW_S))
+            out.append((begin, begin + settings.window_s))
     return out
 
 
-def regime(inside: Bool[np.ndarray, " w"], power: Float64[np.ndarray, " w"], window: np.ndarray, variables: Variables) -> str:
+def regime(
+    inside: Bool[np.ndarray, " w"],
+    power: Float64[np.ndarray, " w"],
+    window: np.ndarray,
+    variables: Variables,
+    settings: LocalizationSettings,
+) -> str:
     """Regime in words: "angular rate above 0.4 rad/s", or "always"."""
     high = inside if not inside.all() else power > np.median(power)
     if high.all() or not high.any():
@@ -171,7 +184,7 @@ def regime(inside: Bool[np.ndarray, " w"], power: Float64[np.ndarray, " w"], win
         for sign, word in ((1.0, "above"), (-1.0, "below")):
             index, threshold = _youden(sign * level, high)
             p = float(mannwhitneyu(sign * level[high], sign * level[~high], alternative="greater").pvalue) * 2 * len(variables)
-            if p < CHANCE and index > LEAST_YOUDEN and (best is None or index > best[0]):
+            if p < settings.p_value and index > settings.least_youden and (best is None or index > best[0]):
                 best = index, f"{name} {word} {sign * threshold:.2g} {unit}".strip()
     if best is None:
         return f"{NO_REGIME}: it comes and goes" if not inside.all() else ALWAYS

@@ -23,6 +23,7 @@ from imutool.diagnosis.held_out import gains, held_out_rms, known_sensors, noise
 from imutool.diagnosis.localization import locate_findings, locate_residual
 from imutool.diagnosis.reference_free_checks import at_limit, unusable_axes
 from imutool.diagnosis.result import ALWAYS, Curve, Diagnosis, Estimate, Finding, Located, Traces
+from imutool.diagnosis.settings import DiagnoseSettings
 from imutool.diagnosis.to_physics_file import to_physics_file
 from imutool.inertial.stationary import white_noise
 from imutool.sensor.physics_file import PhysicsFile
@@ -40,6 +41,7 @@ def summarize(
     sim: str | None,
     known: Sequence[Finding],
     hidden: Sequence[str],
+    settings: DiagnoseSettings,
 ) -> Diagnosis:
     """Diagnosis from a selection of effects; findings that the simulation shares (`known`) are no difference.
 
@@ -65,12 +67,12 @@ def summarize(
     }
     quiet = expected_too | {JITTER}  # where stamps are wrong, signals are not
     still = [with_effects(pair, tuple(one for one in found.fitted.chosen if one[0].key in quiet)) for pair in pairs]
-    unexplained = unexplained_residuals(logs, after, noise)
+    unexplained = unexplained_residuals(logs, after, noise, settings.held_out)
     if findings:
-        places = locate_findings(pairs, still, after, noise, findings, p_values)
+        places = locate_findings(pairs, still, after, noise, findings, p_values, settings.localization)
     else:  # where something is left all the same, it is said where
         odd = {name for name, one in unexplained.items() if not one.white}
-        places = [place for place in locate_residual(pairs, after, noise) if place.signal in odd]
+        places = [at for at in locate_residual(pairs, after, noise, settings.localization) if at.signal in odd]
     places += [place for pair in pairs for place in _stuck(pair, noise, several=len(reals) > 1)]
     return Diagnosis(
         real=tuple(reals.values()),

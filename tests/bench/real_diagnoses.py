@@ -200,10 +200,12 @@ def residual_to_truth(
     Raises:
         ConfigError, LogError, DataError: as `diagnose`.
     """
-    pairs = [without_unusable(pair) for pair in align(read_log(real, imu=imu, truth=truth), None, truth)]
+    settings = DiagnoseSettings()
+    aligned = align(read_log(real, imu=imu, truth=truth), None, truth, settings.reference)
+    pairs = [without_unusable(pair, settings.reference) for pair in aligned]
     candidates = candidates_for(pairs)
     logs = []
-    for log in (whitened(pair, candidates, DiagnoseSettings().band) for pair in pairs):
+    for log in (whitened(pair, candidates, settings.band) for pair in pairs):
         unseen = replace(log.pair, fitted=np.zeros_like(log.pair.fitted), held_out=log.pair.fitted | log.pair.held_out)
         logs.append(replace(log, pair=unseen))
     before, after = ([with_constant(log.pair, expected(log.pair, effects)) for log in logs] for effects in ((), chosen))

@@ -16,20 +16,19 @@ from imutool.diagnosis.estimation.noise_estimate import ORDER, noise_std, ridge_
 from imutool.diagnosis.estimation.timestamps import LEAST_DIGITS, grid
 from imutool.diagnosis.estimation.unnamed_effects import SplineCurve
 from imutool.diagnosis.estimation.whitening import LINES, SEGMENT, WhitenedLog, Whitener, autoregression
-from imutool.diagnosis.localization import CLEAR, WINDOW_S, intervals, regime
+from imutool.diagnosis.localization import intervals, regime
 from imutool.diagnosis.result import Curve, Estimate, Finding, HeldOut, Located, SignalTraces, Unexplained
 from imutool.diagnosis.scalar import effects
 from imutool.diagnosis.scalar.alignment import TOP, aligned
 from imutool.diagnosis.scalar.effects import SignalCurve
 from imutool.diagnosis.scalar.signal import AlignedSignal, Column, Samples
-from imutool.diagnosis.settings import SearchSettings
+from imutool.diagnosis.settings import DiagnoseSettings, LocalizationSettings
 from imutool.mcap_io.fields import Fields
 
 BETTER_NOISE = 0.95  # of what the noise was first taken for, below which effects are searched once more
 IN_BAND, ABOVE = 0.999, 1.3  # of the signal's power lie below its edge, and noise is measured from a little above that
 LOWEST, HIGHEST = 0.05, 0.3  # of the sample rate: least and most for the edge
 SHOWN_KNOTS = 41
-WHITE = 1.15
 EXACT = 1e-3
 SAME_GRID = 0.01
 RICH_KNOTS = 12
@@ -53,7 +52,7 @@ class SignalDiagnosis:
 
 
 def diagnose_signal(
-    real: Fields, sim: Fields, others: Mapping[str, Fields], name: str, settings: SearchSettings | None = None
+    real: Fields, sim: Fields, others: Mapping[str, Fields], name: str, settings: DiagnoseSettings | None = None
 ) -> SignalDiagnosis:
     """Diagnose what separates a recorded signal from its simulation, but for a constant and noise.
 
@@ -63,6 +62,7 @@ def diagnose_signal(
     Raises:
         DataError: constant, too short, or not of one motion; the message says what to do.
     """
+    settings = settings or DiagnoseSettings()
     pair = aligned(real, sim, others, name)
     lsb = _lsb(real, sim)
     always: Chosen = ((effects.offset(float(np.ptp(pair.real)), pair.unit), np.zeros(1)),)
@@ -71,12 +71,12 @@ def diagnose_signal(
     candidates = [effect for effect in effects.named(pair) if effect.name != "delay" or pair.shares_epoch]
     later = [list(effects.driven(pair)), list(effects.unknown(pair))]
     log = _whitened(pair, _rich_residual(pair), lsb)
-    found = select_effects([log], candidates, later, always=always, settings=settings)
+    found = select_effects([log], candidates, later, always=always, settings=settings.search)
     again = _whitened(pair, (pair.real - expected(pair, found.whole.chosen))[:, 0], lsb)
     if _level(again) < BETTER_NOISE * _level(log):  # the effects' own high frequencies were taken for noise
         log = again
-        found = select_effects([log], candidates, later, always=always, settings=settings)
-    return _summarized(pair, log, found, len(always), lsb)
+        found = select_effects([log], candidates, later, always=always, settings=settings.search)
+    return _summarized(pair, log, found, len(always), lsb, settings)
 
 
 # ── noise ──
@@ -144,7 +144,9 @@ def _lsb(real: Fields, sim: Fields) -> float:
 # ── report ──
 
 
-def _summarized(pair: AlignedSignal, log: WhitenedLog, found: Selection, always: int, lsb: float) -> SignalDiagnosis:
+def _summarized(
+    pair: AlignedSignal, log: WhitenedLog, found: Selection, always: int, lsb: float, settings: DiagnoseSettings
+) -> SignalDiagnosis:
     level, name, unit = _level(log), pair.name, pair.unit
     real, chosen, held_out = pair.real[:, 0], found.whole.chosen, pair.held_out
     before, after = _column(pair, ()), _column(pair, chosen)
@@ -166,11 +168,11 @@ def _summarized(pair: AlignedSignal, log: WhitenedLog, found: Selection, always:
     return SignalDiagnosis(
         signal=name,
         unit=unit,
-        located=_located(pair, after - before, level, p_value) if found.selected else (),
+        located=_located(pair, after - before, level, p_value, settings.localization) if found.selected else (),
         findings=tuple(findings),
         offset=Estimate(float({e.key: theta for e, theta in chosen}["offset"][0]), float(offset[0]), unit),
         not_identifiable=() if pair.shares_epoch else (f"{name}.delay",),
-        unexplained=Unexplained(rms, level, rms < WHITE * floor),
+        unexplained=Unexplained(rms, level, rms < settings.held_out.white_ratio * floor),
         closer=_held_out(pair, before, after),
         remarks=() if pair.shares_epoch else (NO_EPOCH.format(name, pair.aligned_s),),
         traces=SignalTraces(pair.stamp_s, real, before, after, held_out, unit),
@@ -226,12 +228,14 @@ def _curve(found: Selection, one: SelectedEffect) -> Curve | None:
     return Curve.of_arrays(forward.variable, forward.unit, x, (centred @ one.theta)[:, None], band[:, None])
 
 
-def _located(pair: AlignedSignal, misfit: Samples, level: float, p_value: float) -> tuple[Located, ...]:
+def _located(
+    pair: AlignedSignal, misfit: Samples, level: float, p_value: float, settings: LocalizationSettings
+) -> tuple[Located, ...]:
     """Seconds in which what the findings add stands out of the noise, and in which regime they are."""
     t_s, sampled = pair.stamp_s, pair.sampled
-    window = np.floor((t_s - t_s[0]) / WINDOW_S).astype(int)
+    window = np.floor((t_s - t_s[0]) / settings.window_s).astype(int)
     power = np.bincount(window, weights=((misfit - np.median(misfit)) / level) ** 2)
-    inside = power > CLEAR
+    inside = power > settings.clear_squares
     if not inside.any():
         return ()
     variables: dict[str, tuple[str, Column]] = {
@@ -241,6 +245,6 @@ def _located(pair: AlignedSignal, misfit: Samples, level: float, p_value: float)
         "time": ("s", t_s),
     }
     variables |= {other: ("", np.interp(t_s, at, values)) for other, (at, values) in pair.ideal.channels.items()}
-    spans = intervals(float(t_s[0]) + WINDOW_S * np.flatnonzero(inside))
-    where = regime(inside, power, window, variables)
+    spans = intervals(float(t_s[0]) + settings.window_s * np.flatnonzero(inside), settings)
+    where = regime(inside, power, window, variables, settings)
     return (Located(pair.name, (), tuple(spans), where, float(power[inside].sum() / power.sum()), p_value),)
