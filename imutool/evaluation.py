@@ -15,8 +15,8 @@ from imutool.bias.io import check_rate, find_model
 from imutool.bias.model import BiasModel
 from imutool.bias_start.bias_tracking import BiasPrior
 from imutool.bias_start.correction import DebiasedImu, apply
-from imutool.bias_start.initial_bias import AT_REST_STD, LEAST_STD, InitialBias, find
-from imutool.bias_start.model_choice import check_smooth, estimate_at_rest, smooth_in_memory
+from imutool.bias_start.initial_bias import AT_REST_STD, LEAST_STD, InitialBias
+from imutool.bias_start.model_choice import check_smooth, estimate_at_rest, find_initial_bias, smooth_in_memory
 from imutool.bias_start.zero_velocity import zero_velocity_trajectory
 from imutool.errors import ConfigError
 from imutool.inertial import metrics
@@ -139,7 +139,7 @@ def _model_and_start(
         check_rate(model, 1.0 / recording.imu.period_s, where)
     if smooth:
         return model, smooth_in_memory(model, recording.imu, where)
-    return model, find(init, model, recording)
+    return model, find_initial_bias(init, model, recording)
 
 
 def _refuse_twins(models: Sequence[str | Path]) -> None:

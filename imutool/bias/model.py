@@ -98,7 +98,7 @@ class BiasModel(nn.Module, ABC):
 
     Attributes:
         prior_mean, prior_std: rest bias over the training runs, and its spread from run to run.
-        truth_std: spread of a rest bias estimated from `imutool.bias_start.initial_bias.TRUTH_S` seconds of this data's own
+        truth_std: spread of a rest bias estimated from `imutool.bias_start.bias_from_truth.TRUTH_S` seconds of this data's own
             truth.
         rest_std: how far the bias at rest lies from that in motion.
         walk_std: how far a rest bias walks in a second^1/2.

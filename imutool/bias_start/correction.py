@@ -50,9 +50,8 @@ def apply_with_std(model: BiasModel, start: InitialBias, imu: Imu) -> tuple[Debi
 class OnlineDebiaser:
     """Corrects one sample at a time, for a live node.
 
-    The start is a rest bias from `imutool.bias_start.initial_bias`, for instance `at_rest` over the first seconds, or
-    `prior`. Without one, it
-    begins at the prior and follows the samples, as `init="auto"` does.
+    `start` is a rest bias, for instance `bias_at_rest.at_rest` over the first seconds, or `initial_bias.prior`. Without `start`
+    it begins at the prior and tracks the rest bias, as `init="auto"` does.
     """
 
     def __init__(self, model: BiasModel, start: InitialBias | None = None) -> None:
