@@ -290,9 +290,9 @@ def rows(identified: IdentifiedNoise) -> list[tuple[str, ...]]:
             table.append((f"{name} at most", *map(_number, identified.at_most[sensor]), unit, identified.at_rest.how))
         differences = map(_number, identified.samples[sensor])
         table.append((f"{name} of samples", *differences, unit, "second differences of the samples"))
-        for kind in ("density", "walk"):
-            if motion is not None and (axes := motion.axes(sensor, kind)) != UNKNOWN:
-                table.append((f"{sensor}_{kind} in motion", *map(_number, axes), UNITS[f"{sensor}_{kind}"], motion.how))
+        if motion is not None:
+            axes = {f"{sensor}_{kind}": motion.axes(sensor, kind) for kind in ("density", "walk")}
+            table += [(f"{n} in motion", *map(_number, v), UNITS[n], motion.how) for n, v in axes.items() if v != UNKNOWN]
     return table
 
 
