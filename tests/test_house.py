@@ -20,7 +20,7 @@ from typing import Any
 import pytest
 
 from imutool import __version__
-from imutool.demo import write_asl
+from imutool.cli.demo import write_asl
 from imutool.sensor.made_up_flight import flight
 
 ROOT = Path(__file__).parents[1]
@@ -31,16 +31,16 @@ TIERS = (
     ("config", "location", "registry", "report", "units", "geometry", "recording"),
     ("inertial", "mcap_io", "bag"),
     ("noise", "cleaning"),
-    ("sensor", "log_info", "log_report", "exporting"),
+    ("sensor", "log_info", "exporting"),
     ("bias",),
     ("bias_start",),
     ("debiasing",),
-    ("training", "evaluation", "conversion", "conversion_workers", "diagnosis", "blind_cases"),
+    ("training", "evaluation", "conversion", "diagnosis", "blind_cases"),
     ("noise_identification",),
     ("viewing", "vio"),
     ("diagnosis_output",),
     ("fleet",),
-    ("demo", "api"),
+    ("api",),
     ("cli",),
 )
 LEVEL = {room: level for level, rooms in enumerate(TIERS) for room in rooms}

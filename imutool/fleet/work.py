@@ -187,7 +187,7 @@ def _page(job: _Job, topics: Sequence[str], warnings: tuple[str, ...]) -> dict[s
 
 
 def _info(job: _Job) -> dict[str, Any]:
-    from imutool.log_info import inspect
+    from imutool.log_info.inspection import inspect
 
     report = inspect(job.source)
     write_json(report, job.target)

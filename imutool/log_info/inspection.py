@@ -27,7 +27,7 @@ from imutool.cleaning.rules.units import (
 from imutool.errors import LogError
 from imutool.inertial.stationary import rest_stretches
 from imutool.location import Location
-from imutool.log_report import Clock, ImuInfo, ImuNoise, Interval, LogInfo, TopicInfo, TruthInfo
+from imutool.log_info.report import Clock, ImuInfo, ImuNoise, Interval, LogInfo, TopicInfo, TruthInfo
 from imutool.mcap_io.codec import schemas
 from imutool.mcap_io.codec.decode import decode_imu
 from imutool.mcap_io.log import Log

@@ -15,7 +15,7 @@ from pathlib import Path
 from types import ModuleType
 
 from imutool import registry
-from imutool.conversion_workers import GROUP, Job, run_jobs
+from imutool.conversion.workers import GROUP, Job, run_jobs
 from imutool.errors import ConfigError, DataError, ImutoolError
 from imutool.mcap_io.write import write
 from imutool.recording import Recording
