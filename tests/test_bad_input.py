@@ -21,7 +21,7 @@ import pytest
 from mcap_ros2.writer import Writer
 
 from imutool.bias import io
-from imutool.demo import write_asl
+from imutool.cli.demo import write_asl
 from imutool.errors import ConfigError
 from imutool.mcap_io.codec import schemas
 from imutool.mcap_io.log import Log

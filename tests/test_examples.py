@@ -13,8 +13,8 @@ from pathlib import Path
 
 import pytest
 
+from imutool.cli.demo import write_asl
 from imutool.debiasing import debias
-from imutool.demo import write_asl
 from imutool.sensor.made_up_flight import flight
 
 EXAMPLES = Path(__file__).parents[1] / "examples"

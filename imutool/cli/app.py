@@ -83,7 +83,7 @@ class App(typer.Typer):
 
 
 def listing(group: str, option: str) -> type[TyperCommand]:
-    """A command whose help also lists what can be named, found (and nothing of it imported) when help is asked for."""
+    """Command class whose help also lists the names of a plugin group, read from the files without an import."""
 
     class Listing(Command):
         values = (group, option)  # for the documentation

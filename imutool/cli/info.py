@@ -15,7 +15,7 @@ from imutool.location import to_location
 from imutool.report import json_values
 
 if TYPE_CHECKING:
-    from imutool.log_report import LogInfo
+    from imutool.log_info.report import LogInfo
     from imutool.noise_identification import IdentifiedNoise
 
 
@@ -37,8 +37,8 @@ def info(
     quiet: Quiet = False,
 ) -> None:
     """Say what is in a log and what looks wrong with it; with --noise, how noisy its IMU is."""
-    from imutool.log_info import inspect
-    from imutool.log_report import LogInfos
+    from imutool.log_info.inspection import inspect
+    from imutool.log_info.report import LogInfos
 
     log_to_stderr(verbose, quiet)
     asked = {"--model": model, "--imu": imu, "--truth": truth, "--noise-plot": noise_plot, "--noise-toml": noise_toml}

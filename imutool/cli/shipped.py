@@ -84,7 +84,7 @@ def demo(
     quiet: Quiet = False,
 ) -> None:
     """Go the whole way on a made-up recording: convert, train, debias, evaluate, view. No download."""
-    from imutool.demo import run
+    from imutool.cli.demo import run
 
     def announce(line: str) -> None:
         if not quiet:

@@ -187,7 +187,7 @@ def _page(job: _Job, topics: Sequence[str], warnings: tuple[str, ...]) -> dict[s
 
 
 def _info(job: _Job) -> dict[str, Any]:
-    from imutool.log_info import inspect
+    from imutool.log_info.inspection import inspect
 
     report = inspect(job.source)
     write_json(report, job.target)
@@ -223,8 +223,7 @@ def _lost(losses: Mapping[str, Any] | None) -> dict[str, Any]:
 
 
 def _diagnose(job: _Job) -> dict[str, Any]:
-    from imutool.diagnosis.diagnose import diagnose
-    from imutool.diagnosis.effect_sizes import effect_sizes
+    from imutool.diagnosis.diagnose import diagnose, effect_sizes
     from imutool.fleet.robots import robot_of
 
     s = job.settings

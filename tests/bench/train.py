@@ -45,7 +45,7 @@ from torch import Tensor
 
 from imutool.bias.model import COLUMNS, BiasModel
 from imutool.bias.ode import HermitePath, Method, integrate
-from imutool.demo import write_asl
+from imutool.cli.demo import write_asl
 from imutool.geometry import so3
 from imutool.inertial.strapdown import GRAVITY_W
 from imutool.inertial.windows import end_attitude

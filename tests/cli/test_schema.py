@@ -12,7 +12,7 @@ import pytest
 from typer.testing import CliRunner
 
 from imutool.cli import app
-from imutool.demo import write_asl
+from imutool.cli.demo import write_asl
 from imutool.report import REPORTS, json_schema
 from imutool.sensor.made_up_flight import flight
 

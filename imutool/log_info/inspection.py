@@ -27,7 +27,7 @@ from imutool.cleaning.rules.units import (
 from imutool.errors import LogError
 from imutool.inertial.stationary import rest_stretches
 from imutool.location import Location
-from imutool.log_report import ImuInfo, ImuNoise, Interval, LogInfo, TopicInfo, TruthInfo
+from imutool.log_info.report import Clock, ImuInfo, ImuNoise, Interval, LogInfo, TopicInfo, TruthInfo
 from imutool.mcap_io.codec import schemas
 from imutool.mcap_io.codec.decode import decode_imu
 from imutool.mcap_io.log import Log
@@ -38,14 +38,6 @@ from imutool.report import UNSET
 
 CALM_SHARE = 0.25  # of the resting windows, the calmest, that give the noise: motors may idle in the others
 NOISE_WINDOW_S = 1.0
-
-
-class _Clock(NamedTuple):
-    rate_hz: float | None
-    jitter_s: float | None
-    largest_gap_s: float | None
-    first_ns: int | None
-    last_ns: int | None
 
 
 def inspect(path: Location, *, check: bool = True) -> LogInfo:
@@ -96,13 +88,13 @@ def _topic(topic: Topic, log_times: Int64[np.ndarray, " n"]) -> TopicInfo:
     return TopicInfo(topic.name, topic.schema_name, topic.message_encoding, len(log_times), *_clock(log_times))
 
 
-def _clock(t_ns: Int64[np.ndarray, " n"]) -> _Clock:
+def _clock(t_ns: Int64[np.ndarray, " n"]) -> Clock:
     """Rate, jitter, largest gap and ends of the sorted times."""
     ordered = np.sort(t_ns)
     periods = np.diff(ordered)
     known = len(periods) > 0
     median = float(np.median(periods)) if known else 0.0
-    return _Clock(
+    return Clock(
         rate_hz=1e9 / median if median > 0 else None,
         jitter_s=float(np.std(periods)) * 1e-9 if known else None,
         largest_gap_s=float(periods.max()) * 1e-9 if known else None,

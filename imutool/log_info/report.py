@@ -2,9 +2,19 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 from imutool.report import UNSET, Report, Section, UnsetType
+
+
+class Clock(NamedTuple):
+    """Clock of a topic: rate, jitter, largest gap (null for fewer than two messages), first and last stamp."""
+
+    rate_hz: float | None
+    jitter_s: float | None
+    largest_gap_s: float | None
+    first_ns: int | None
+    last_ns: int | None
 
 
 class TopicInfo(Section, frozen=True):
