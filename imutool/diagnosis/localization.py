@@ -1,4 +1,4 @@
-"""Localization of a misfit: axes of a signal, intervals of time, and the regime of the motion.
+"""Localization of a misfit: axes of a signal, intervals, and the regime of the motion.
 
 The misfit that the findings explain is known almost without noise, so the location is read from it: a second counts when the
 misfit in it would stand out of the noise by itself. The regime is the variable, with a threshold, that best separates the
@@ -34,7 +34,7 @@ def locate_findings(
     p_values: Mapping[str, float],
     settings: LocalizationSettings,
 ) -> list[Located]:
-    """Locations where the findings change the expected samples: `after` minus `before` of each pair."""
+    """Locations where the findings change the expected samples (`after` minus `before`)."""
     misfits = [_converter_output(a, findings) - b for a, b in zip(after, before, strict=True)]
     return _locate_logs(pairs, misfits, floor, p_values, settings)
 
@@ -94,7 +94,7 @@ def _converter_output(samples: Float64[np.ndarray, "n 6"], findings: Sequence[Fi
 
 def _variables(pair: Pair) -> Variables:
     """Variables of a regime at the samples, with their units."""
-    read = pair.felt.sample(pair.stamp_s, pair.stamp_s)
+    read = pair.ideal.sample(pair.stamp_s, pair.stamp_s)
     rate, force = np.linalg.norm(read.gyro, axis=1), np.linalg.norm(read.accel, axis=1)
     out = {
         "angular rate": ("rad/s", rate),
@@ -118,7 +118,7 @@ def locate(
     p_values: Mapping[str, float],
     settings: LocalizationSettings | None = None,
 ) -> list[Located]:
-    """Location of a misfit by sensor, strongest first; samples may be of several segments of one log.
+    """Locations of a misfit by sensor, strongest first; samples may span several segments.
 
     Args:
         t_s: stamps of the samples.
@@ -192,7 +192,7 @@ def regime(
 
 
 def _youden(level: Float64[np.ndarray, " w"], high: Sequence[bool] | Bool[np.ndarray, " w"]) -> tuple[float, float]:
-    """Youden's index of the best threshold between high windows and the others, and that threshold."""
+    """Youden's index of the best threshold between high windows and others, and the threshold."""
     order = np.argsort(level)
     flags = np.asarray(high)[order]
     above_high = 1.0 - np.cumsum(flags) / max(flags.sum(), 1)

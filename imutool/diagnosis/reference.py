@@ -37,53 +37,53 @@ def align_all(
     """
     pairs: list[Pair] = []
     refused: list[ImutoolError] = []
-    said: list[str] = []
+    remarks: list[str] = []
     for recording in recordings:
         try:
-            here = list(align(recording, sim, truth, settings))
+            aligned = list(align(recording, sim, truth, settings))
         except (DataError, NumericsError) as error:
             if sim is not None or not recording.truths:
                 raise
             refused.append(error.at(recording.name))
             continue
-        pairs += [without_unusable(pair, settings) for pair in here]
-        covered = sum(float(pair.stamp_s[-1] - pair.stamp_s[0]) for pair in here)
+        pairs += [without_unusable(pair, settings) for pair in aligned]
+        covered = sum(float(pair.stamp_s[-1] - pair.stamp_s[0]) for pair in aligned)
         if covered < settings.covered_share * recording.imu.duration_s:
             what = "its true poses cover" if sim is None else "the simulation covers"
-            said.append(
+            remarks.append(
                 f"{recording.name}: {what} {covered:.0f} of {recording.imu.duration_s:.0f} s; the rest was not looked at"
             )
     if refused and not pairs and len(recordings) > 1:
         raise refused[0]
-    return pairs, said + [f"left out, {error}" if pairs else str(error) for error in refused]
+    return pairs, remarks + [f"left out, {error}" if pairs else str(error) for error in refused]
 
 
 def with_unique_names(recordings: Sequence[Recording]) -> list[Recording]:
     """Recordings with unique names: logs of several folders may have the same."""
     out: list[Recording] = []
-    for one in recordings:
-        name, number, taken = one.name, 2, {other.name for other in out}
+    for recording in recordings:
+        name, number, taken = recording.name, 2, {other.name for other in out}
         while name in taken:
-            name, number = f"{one.name} ({number})", number + 1
-        out.append(one if name == one.name else replace(one, name=name))
+            name, number = f"{recording.name} ({number})", number + 1
+        out.append(recording if name == recording.name else replace(recording, name=name))
     return out
 
 
 def is_another_motion(reals: Sequence[Recording], sim: Recording, signals: Sequence[str]) -> bool:
-    """Whether the simulation is of another motion than every recording, which all have true poses.
+    """Whether the simulation is of another motion than every recording with true poses.
 
     Raises:
         DataError: it is of the motion of some only, or other signals are to be compared with it.
     """
-    of_one = [same_motion(real.imu, sim.imu) for real in reals]
-    if all(of_one) or not all(real.truths for real in reals):
+    alike = [same_motion(real.imu, sim.imu) for real in reals]
+    if all(alike) or not all(real.truths for real in reals):
         return False
-    if any(of_one):
+    if any(alike):
         raise DataError(
             "the simulation is of the same motion as some recordings only",
             where=sim.name,
             expected="one motion, or as many as logs",
-            fix=f"Diagnose separately: {', '.join(real.name for real, same in zip(reals, of_one, strict=True) if same)}",
+            fix=f"Diagnose separately: {', '.join(real.name for real, same in zip(reals, alike, strict=True) if same)}",
         )
     if signals:
         raise DataError(
@@ -101,7 +101,7 @@ def align(real: Recording, sim: Recording | None, truth: str | None, settings: R
         raise DataError("no simulation and no true poses", where=real.name, expected="`sim`, or poses in the log")
     chosen = real if truth is not None else real.with_truth(next(iter(real.truths)))
     motion = smooth_motion(chosen.truth)
-    parts = [felt for felt in motion.ideal_motions(1.0 / real.imu.period_s) if felt.t_s[-1] - felt.t_s[0] >= LEAST_S]
+    parts = [ideal for ideal in motion.ideal_motions(1.0 / real.imu.period_s) if ideal.t_s[-1] - ideal.t_s[0] >= LEAST_S]
     if not parts:
         raise DataError(
             f"the true poses have no stretch of {LEAST_S:g} s that can be differentiated",
@@ -109,10 +109,10 @@ def align(real: Recording, sim: Recording | None, truth: str | None, settings: R
             expected="poses at 40 Hz or more, without holes",
             fix="Give a simulation with `sim`",
         )
-    for felt in parts:
-        stretch = next(one for one in motion.stretches if one.start_s <= felt.t_s[0] <= one.end_s)
+    for ideal in parts:
+        stretch = next(one for one in motion.stretches if one.start_s <= ideal.t_s[0] <= one.end_s)
         started_ns = int(chosen.imu.t_ns[0])  # times are told from the log's start, also where its poses begin later
-        since = replace(felt, t_s=felt.t_s + (motion.start_ns - started_ns) * 1e-9)
+        since = replace(ideal, t_s=ideal.t_s + (motion.start_ns - started_ns) * 1e-9)
         yield with_truth(chosen, since, started_ns, max(settings.band_share * min(stretch.cutoff_hz), settings.least_band_hz))
 
 
@@ -125,21 +125,21 @@ def without_unusable(pair: Pair, settings: ReferenceSettings) -> Pair:
     known = ~(timestamps.clipped(pair.real) | timestamps.stuck(pair.real))
     if known.all():
         return pair
-    rest = replace(pair, known=known)
+    reduced = replace(pair, known=known)
     for part in (pair.fitted, pair.held_out):
         known &= (known[part].sum(axis=0) * pair.period_s >= settings.least_known_s) | (known[part].all(axis=0))
     if not known.any():
         raise DataError(
-            "; ".join(unusable_axes(rest)),
+            "; ".join(unusable_axes(reduced)),
             where=pair.name,
             expected=f"{settings.least_known_s:g} s or more of an axis that moves within its range",
             fix="Record with a sensor that works, of a wider range or of finer digits",
         )
-    return rest
+    return reduced
 
 
 def reference_errors(logs: Sequence[WhitenedImu], settings: ReferenceSettings) -> tuple[list[Finding], list[Located]]:
-    """Intervals of a wrong reference, as a finding and their locations; nothing for any other misfit."""
+    """Intervals of a wrong reference, as a finding and locations; none for another misfit."""
     if len(logs) != 1:
         return [], []
     (log,), block_s, p_value = logs, settings.block_s, settings.p_value
@@ -148,8 +148,10 @@ def reference_errors(logs: Sequence[WhitenedImu], settings: ReferenceSettings) -
         return [], []
     t_s = log.pair.stamp_s[:: log.whiten.every][rows]
     white = log.whiten(log.pair.real - expected(log.pair, ()))[rows]
-    one = log.constants[rows]
-    white = white - np.median(white / np.where(one == 0, 1.0, one), axis=0) * one  # a mean would carry the moments' own misfit
+    constant = log.constants[rows]
+    white = (
+        white - np.median(white / np.where(constant == 0, 1.0, constant), axis=0) * constant
+    )  # a mean would carry the misfit
     block = np.floor((t_s - t_s[0]) / block_s).astype(int)
     count = np.maximum(np.bincount(block), 1)
     power = np.stack([np.bincount(block, weights=(white[:, k : k + 3] ** 2).sum(axis=1)) for k in (0, 3)])
@@ -169,14 +171,14 @@ def reference_errors(logs: Sequence[WhitenedImu], settings: ReferenceSettings) -
     parameters |= {f"t_{k}": Estimate(a, block_s, "s") for k, (a, _) in enumerate(runs)}
     excess = (white[inside] ** 2).sum() - 6.0 * inside.sum()
     share = float(np.clip(excess / max(float((white**2).sum() - 6.0 * len(white)), 1e-300), 0.0, 1.0))
-    left = log.pair.real - expected(log.pair, ())
-    left = left - np.median(left, axis=0)
-    unseen = log.pair.held_out
+    residual = log.pair.real - expected(log.pair, ())
+    residual = residual - np.median(residual, axis=0)
+    held_rows = log.pair.held_out
     t_all = log.pair.stamp_s
-    away = unseen & ~np.any([(t_all >= a - block_s) & (t_all <= b + block_s) for a, b in runs], axis=0)
-    before, after = (float(np.sqrt((left[mask, 3:] ** 2).mean())) for mask in (unseen, away))
-    held = HeldOut(before, after, ASCII_UNITS["accel"], round(float(unseen.sum()) * log.pair.period_s, 1))
-    finding = Finding("reference_error", "both", share, p_value, p_value, parameters, "the reference is wrong there", held)
+    away = held_rows & ~np.any([(t_all >= a - block_s) & (t_all <= b + block_s) for a, b in runs], axis=0)
+    before, after = (float(np.sqrt((residual[mask, 3:] ** 2).mean())) for mask in (held_rows, away))
+    held_out = HeldOut(before, after, ASCII_UNITS["accel"], round(float(held_rows.sum()) * log.pair.period_s, 1))
+    finding = Finding("reference_error", "both", share, p_value, p_value, parameters, "the reference is wrong there", held_out)
     return [finding], [
         _where(signal, white[:, 3 * k : 3 * k + 3], inside, runs, share, p_value) for k, signal in enumerate(SENSORS)
     ]

@@ -28,7 +28,7 @@ else:
 
 
 class Located(Section, frozen=True, omit_defaults=True):
-    """Location of a misfit: axes of a signal, intervals (s from the start of the log) and regime.
+    """Location of a misfit: axes of a signal, intervals (s from the log's start) and regime.
 
     `share` is the part of the signal's misfit above the noise that lies there; `p_value` is that of noise alone.
     `log` is the path of the log where there are several; `reason` says why an unusable axis is no measurement.
@@ -147,7 +147,7 @@ class Finding(Section, frozen=True, omit_defaults=True):
 
 
 class Unexplained(Section, frozen=True):
-    """Residual of a signal after all findings: root mean square, noise floor, and whether it is white."""
+    """Residual of a signal after all findings: root mean square, noise floor, whiteness."""
 
     rms: Number
     noise_floor: Number

@@ -1,4 +1,4 @@
-"""Settings of a diagnosis: every number that was tuned, with its unit, its meaning and where it was chosen.
+"""Settings of a diagnosis: tuned numbers with unit, meaning and origin.
 
 `imutool diagnose --set search.false_discovery_rate=1e-3` sets one; `--config FILE.toml` several. The chosen values come from
 planted effects of the tests, from the blind cases, and from the 23 logs of EuRoC, TUM-VI and Fetch.
@@ -18,7 +18,10 @@ Count = Annotated[int, msgspec.Meta(ge=1)]
 
 
 class SearchSettings(Settings, frozen=True):
-    """The search for effects. Squares are of white residuals: their number is chi-square under H0."""
+    """Search for effects.
+
+    Squares are of white residuals: their number is chi-square under H0.
+    """
 
     false_discovery_rate: Share = 5e-3  # of all that was tried; none in 20 logs of noise alone
     held_out_p_value: Share = 0.05  # a finding has to improve held-out blocks at this level
@@ -50,7 +53,10 @@ class SearchSettings(Settings, frozen=True):
 
 
 class BandSettings(Settings, frozen=True):
-    """The band up to which poses know the motion: chosen on EuRoC and TUM-VI, where two references disagree above it."""
+    """Band up to which poses know the motion.
+
+    Chosen on EuRoC and TUM-VI, where two references disagree above it.
+    """
 
     segment_s: Positive = 4.0  # of the spectra
     diluted_share: Share = 0.04  # of the expectation that is its own error, from which on it is not known
@@ -60,7 +66,10 @@ class BandSettings(Settings, frozen=True):
 
 
 class ReferenceSettings(Settings, frozen=True):
-    """Coverage and errors of the reference: chosen on poses with planted gaps and on the real logs."""
+    """Coverage and errors of the reference.
+
+    Chosen on poses with planted gaps and on the real logs.
+    """
 
     least_band_hz: Positive = 1.0  # of poses, at least: smoothing does not change a motion at rest
     band_share: Share = 0.45  # of the frequency at which smoothing halves a motion: there it takes one per cent

@@ -83,7 +83,7 @@ def test_the_numbers_are_those_of_the_files_and_change_with_the_flight(
 
 def test_an_earlier_demo_stays_without_overwrite(made: tuple[Path, dict[str, Any]]) -> None:
     before = sorted(made[0].rglob("*"))
-    with pytest.raises(ConfigError, match="--overwrite"):
+    with pytest.raises(ConfigError, match="overwrite"):
         demo.run(made[0] / "demo-out", lambda _: None)
     assert sorted(made[0].rglob("*")) == before
 

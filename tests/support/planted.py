@@ -106,7 +106,7 @@ def pair(
         real = real + added
     held_out, usable = split(stamp_s)
     names = {name: np.interp(stamp_s, felt.t_s, values) for name, values in felt.channels.items()}
-    return Pair(f"log_{seed}", stamp_s, real, usable & ~held_out, usable & held_out, felt=felt, channels=names)
+    return Pair(f"log_{seed}", stamp_s, real, usable & ~held_out, usable & held_out, ideal=felt, channels=names)
 
 
 def weighed(one: Pair) -> WhitenedImu:

@@ -43,11 +43,11 @@ def asked(pair: Pair, beyond: bool = True) -> Selection:
 
 
 def names(found: Selection) -> list[str]:
-    return [one.physics.key for one in found.selected]
+    return [one.effect.key for one in found.selected]
 
 
 def sure(found: Selection, name: str, truth: list[float]) -> bool:
-    one = next(one for one in found.selected if one.physics.key == name)
+    one = next(one for one in found.selected if one.effect.key == name)
     return bool((np.abs(one.theta - truth) < SURE * one.std).all())
 
 
@@ -200,12 +200,12 @@ def test_a_temperature_that_rises_as_the_bias_does_is_named_beside_the_drift() -
 
     def told(temperature: np.ndarray) -> dict[str, tuple[str, ...]]:
         pair = planted.pair(planted.shaken(2, DURATION_S), effects, 5)
-        pair = replace(pair, felt=replace(pair.felt, channels={"/temperature.data": temperature}))
+        pair = replace(pair, ideal=replace(pair.ideal, channels={"/temperature.data": temperature}))
         pair = replace(pair, channels={"/temperature.data": temperature})
         drift, temp = (
             planted.acting({name: size})[0][0] for name, size in (("gyro_bias_drift", [0] * 4), ("temperature", [0] * 6))
         )
-        return {one.physics.key: one.similar for one in select_effects([planted.weighed(pair)], (drift, temp)).selected}
+        return {one.effect.key: one.similar for one in select_effects([planted.weighed(pair)], (drift, temp)).selected}
 
     (name, rivals), *more = told(rising).items()
     assert {name, *rivals} == {"gyro_bias_drift", "temperature"}
@@ -218,7 +218,7 @@ def test_the_time_of_a_jump_is_found_also_beside_another_effect_and_between_fitt
     pair = planted.pair(planted.rich(3, DURATION_S), {"clock_jump": [t_jump, -0.02], "gyro_scale": [0.02, -0.03, 0.01]}, 3)
     found = asked(pair, beyond=False)
     assert sorted(names(found)) == ["clock_jump", "gyro_scale"]
-    jump = next(one for one in found.selected if one.physics.key == "clock_jump")
+    jump = next(one for one in found.selected if one.effect.key == "clock_jump")
     assert abs(jump.theta[0] - t_jump) < 0.05  # s: five samples, in which it may hardly move
     assert jump.theta[1] == pytest.approx(-0.02, abs=2e-4)
 
