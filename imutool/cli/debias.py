@@ -203,15 +203,15 @@ def assigned(words: Sequence[str]) -> dict[str, str]:
     Raises:
         ConfigError: two models for the same IMUs, or nothing on one side of the sign.
     """
-    found: dict[str, str] = {}
+    models: dict[str, str] = {}
     for word in words:
         topic, sign, name = word.partition("=")
         if not sign or Path(word).exists():
             topic, name = "", word
         elif not topic or not name:
             raise ConfigError(f"{word!r}", where="--model", expected="MODEL or TOPIC=MODEL")
-        if topic in found:
+        if topic in models:
             whom = topic or "all IMUs"
-            raise ConfigError(f"{found[topic]} and {name} for {whom}", where="--model", expected="one model for each IMU")
-        found[topic] = name
-    return found
+            raise ConfigError(f"{models[topic]} and {name} for {whom}", where="--model", expected="one model for each IMU")
+        models[topic] = name
+    return models

@@ -67,18 +67,18 @@ def diagnose(
     if folder is not None:
         diagnosis_output.refuse(folder, overwrite=overwrite)
     with progress("Diagnosing", verbose, quiet) as tell:
-        found = run(reals, sim, imu=imu, truth=truth, signals=signal or (), tell=tell, settings=settings)
+        diagnosis = run(reals, sim, imu=imu, truth=truth, signals=signal or (), tell=tell, settings=settings)
         if folder is not None:
             tell(0, 1, "writing")
-            for remark in diagnosis_output.write(found, folder, logs=look, overwrite=overwrite):
+            for remark in diagnosis_output.write(diagnosis, folder, logs=look, overwrite=overwrite):
                 logger.warning("%s", remark)
-    if write_json(found.report, json_to):
+    if write_json(diagnosis.report, json_to):
         return
-    say(conclusion(found))
-    if found.findings:
+    say(conclusion(diagnosis))
+    if diagnosis.findings:
         say("")
-        table(findings_table(found), keys=1)
-    for line in below(found):
+        table(findings_table(diagnosis), keys=1)
+    for line in below(diagnosis):
         say(line)
     if folder is not None:
         say(f"{folder}: {', '.join(name for name in diagnosis_output.FILES if (folder / name).exists())}")
