@@ -15,8 +15,8 @@ from safetensors.torch import save_file
 from imutool.bias import io
 from imutool.bias.io import load
 from imutool.bias_start import initial_bias
+from imutool.bias_start.bias_from_truth import from_truth
 from imutool.bias_start.correction import apply
-from imutool.bias_start.initial_bias import from_truth
 from imutool.errors import ConfigError, DataError, ModelError, NumericsError
 from imutool.inertial import metrics
 from imutool.inertial.strapdown import along_truth
