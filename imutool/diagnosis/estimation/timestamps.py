@@ -29,7 +29,6 @@ LEAST_VALUES = 3  # of a grid
 AROUND, DEGREE = 15, 3  # samples of a line, and what it may bend
 EVENLY = 5.0  # standard deviations by which samples must be nearer to even than to their stamps
 LEAST_ROWS = 100
-TINY = 1e-300
 
 
 def even(stamp_s: Float64[np.ndarray, " n"]) -> tuple[Float64[np.ndarray, " n"], int]:
@@ -296,6 +295,6 @@ def _followed(column: Float64[np.ndarray, " n"], late_s: Float64[np.ndarray, " n
     moved = moved - savgol_filter(moved, AROUND, DEGREE)
     rest = column - savgol_filter(column, AROUND, DEGREE)
     size = float(moved @ moved)
-    share = float(moved @ rest) / max(size, TINY)
+    share = float(moved @ rest) / max(size, 1e-300)
     variance = float(np.mean((rest - share * moved) ** 2))
-    return share, size / max(variance, TINY)
+    return share, size / max(variance, 1e-300)
