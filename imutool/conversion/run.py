@@ -1,4 +1,4 @@
-"""Conversion of data sets to MCAP: finds the sequences, chooses a converter for each, and writes one log for each.
+"""Conversion of data sets to MCAP: find the sequences, choose a converter, write the logs.
 
 Sequences convert in worker processes, one log a sequence; a sequence that fails is reported and the others go on.
 A script that calls `convert` with several workers needs the usual `if __name__ == "__main__":` (processes are spawned).
@@ -27,7 +27,7 @@ Progress = Callable[[int, int, str], None]  # sequences done, sequences in all, 
 
 @dataclass(frozen=True)
 class Failure:
-    """A sequence that was not written, with the reason."""
+    """Failed sequence, with the reason."""
 
     name: str
     message: str
@@ -35,7 +35,7 @@ class Failure:
 
 @dataclass(frozen=True)
 class ConvertReport:
-    """Logs written, in the order of the source, and failures."""
+    """Written logs, in the order of the source, and failures."""
 
     written: list[Path] = field(default_factory=list)
     failures: list[Failure] = field(default_factory=list)
@@ -43,7 +43,7 @@ class ConvertReport:
 
 @dataclass
 class _Found:
-    """Sequences of a source: those that a converter recognises, and the others with their errors."""
+    """Recognised sequences of a source, and the others with their errors."""
 
     jobs: list[Job] = field(default_factory=list)
     errors: list[tuple[str, ImutoolError]] = field(default_factory=list)
@@ -64,7 +64,7 @@ def convert(
     workers: int | None = None,
     progress: Progress | None = None,
 ) -> ConvertReport:
-    """Write the log of one sequence to the file `out`, or the logs of several to the folder `out`.
+    """Convert one sequence to the file `out`, or several sequences to the folder `out`.
 
     `workers` is the number of processes, by default one a processor; with 1, or for one sequence, all happens here.
 
@@ -183,7 +183,7 @@ def _targets(names: Sequence[str], out: Path, *, many: bool) -> list[Path]:
 
 
 def _check_targets(jobs: Sequence[Job]) -> None:
-    """Refuse, before anything is written, to overwrite a log, a source, or another log of the same run."""
+    """Refuse to overwrite a log, a source, or another log of the same run."""
     seen: dict[Path, Job] = {}
     for job in jobs:
         if (other := seen.setdefault(job.target, job)) is not job:
@@ -200,7 +200,10 @@ def _check_targets(jobs: Sequence[Job]) -> None:
 
 
 def _is_part_of(target: Path, source: Path) -> bool:
-    """Whether a target is the source or one of its files; a log lying in the source's folder is not."""
+    """Whether a target is the source or one of its files.
+
+    A log in the source's folder is not one of its files.
+    """
     if not target.exists():
         return False
     inside = source.is_dir() and target.resolve().is_relative_to(source.resolve()) and target.suffix != SUFFIX
@@ -224,7 +227,10 @@ def _from_stream(
     overwrite: bool,
     progress: Progress | None,
 ) -> ConvertReport:
-    """Convert with a converter that has `read` alone: in sequence, and the first failure ends it."""
+    """Convert one after the other, with a converter that only has `read`.
+
+    The first failure ends the conversion.
+    """
     recordings: Iterable[Recording] = (r for r in module.read(source) if not wanted or r.name in wanted)
     recordings = iter(recordings)
     first = list(islice(recordings, 2))

@@ -56,7 +56,7 @@ def _convert_one(job: Job) -> ImutoolError | None:
 
 
 def _run_in_processes(jobs: Sequence[Job], workers: int) -> Iterator[tuple[int, ImutoolError | None]]:
-    """Run jobs in processes; on an interrupt each removes its partial file, and all end before this returns."""
+    """Run jobs in processes; on an interrupt, wait until all have removed their partial files."""
     others = set(multiprocessing.active_children())
     waiting = iter(enumerate(jobs))
     running: dict[Future[ImutoolError | None], int] = {}
@@ -114,7 +114,7 @@ def _convert_in_process(job: Job) -> ImutoolError | None:
 
 
 def _interrupt_once(_number: int, _frame: FrameType | None) -> None:
-    """Ignore a second interrupt (from the terminal, or the parent) while the first one's clean-up runs."""
+    """Raise KeyboardInterrupt once; ignore further interrupts during the clean-up."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     raise KeyboardInterrupt
 

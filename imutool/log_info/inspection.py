@@ -1,4 +1,4 @@
-"""Contents and quality of a log: clock of every topic, defects and noise of its IMUs, coverage by the truth.
+"""Inspection of a log: clocks, IMU defects and noise, coverage by the truth.
 
 Images are never unpacked; an IMU's columns are held in memory. Defects are counted where reading the log would stop at the
 first: stamps that go back, repeated stamps, and values that are not finite.
@@ -104,7 +104,7 @@ def _clock(t_ns: Int64[np.ndarray, " n"]) -> Clock:
 
 
 def _imu(log: Log, topic: Topic) -> ImuInfo:
-    """Defects, rest and noise of one IMU; of one in an unknown encoding only a warning."""
+    """Defects, rest and noise of an IMU; only a warning if its encoding is unknown."""
     derived_from = topic.metadata.get(DERIVED_KEY, UNSET)
     if topic.message_encoding not in ENCODINGS:
         warnings = [f"encoding {topic.message_encoding!r} is not read"]
@@ -138,7 +138,7 @@ def _imu(log: Log, topic: Topic) -> ImuInfo:
 
 
 def _columns(log: Log, topic: Topic) -> tuple[Int64[np.ndarray, " n"], Float64[np.ndarray, "n 3"], Float64[np.ndarray, "n 3"]]:
-    """Header stamps, rates and specific forces in the order of the file, with no demand on them."""
+    """Unchecked header stamps, rates and specific forces, in the order of the file."""
     stamps, gyro, accel = [np.empty(0, np.int64)], [np.empty((0, 3))], [np.empty((0, 3))]
     for _, rows in log.rows([topic.name], None, None):
         for part, layout in schemas.runs(rows.payload, schemas.IMU, topic.message_encoding):
@@ -150,7 +150,7 @@ def _columns(log: Log, topic: Topic) -> tuple[Int64[np.ndarray, " n"], Float64[n
 
 
 def _missing(ordered_ns: Int64[np.ndarray, " n"]) -> int:
-    """How many samples would fill the steps of at least 1.5 median periods."""
+    """Number of samples that would fill the steps of at least 1.5 median periods."""
     steps = np.diff(ordered_ns)
     return int(missing(steps, float(np.median(steps))).sum()) if len(steps) else 0
 
@@ -240,13 +240,13 @@ def _accel_warnings(level: float, when: str) -> list[str]:
 
 
 def _coverage(name: str, truth_ns: Int64[np.ndarray, " n"], imu_ns: Int64[np.ndarray, " m"]) -> TruthInfo:
-    """Share of the IMU's time between two true poses that are not too far apart (4 median periods, 60 ms)."""
+    """Truth coverage: share of the IMU's time between neighbouring true poses."""
     knots = np.unique(truth_ns)
     if len(knots) < 2 or not len(imu_ns):
         return TruthInfo(name, len(truth_ns))
     start, end = int(imu_ns.min()), int(imu_ns.max())
     steps = np.diff(knots)
-    limit = max(GAP_FACTOR * float(np.median(steps)), nanoseconds(MIN_GAP_S))
+    limit = max(GAP_FACTOR * float(np.median(steps)), nanoseconds(MIN_GAP_S))  # 4 median periods, 60 ms
     gap = (steps > limit) & (knots[1:] > start) & (knots[:-1] < end)
     after = np.searchsorted(knots, imu_ns, side="left")
     inside = (imu_ns >= knots[0]) & (imu_ns <= knots[-1])
@@ -279,7 +279,7 @@ def _truth_warnings(log: Log, imus: list[ImuInfo], truths: list[TruthInfo]) -> l
 
 
 def _rate_warning(log: Log, imu_topic: str, truth_topic: str) -> list[str]:
-    """Compares the spread of the gyro with the rate of the true orientation: they differ by 57.3 if it is in degrees."""
+    """Warn if the gyro's spread is about 57.3 times the true rate: it reads deg/s."""
     batches = list(log.pose_batches(truth_topic))
     t_ns, first = np.unique(_joined(batch.stamp_ns for batch in batches), return_index=True)
     if len(t_ns) < 3:

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from support import diagnoses
 from support.diagnoses import replace
+from support.report_schema import assert_valid
 from typer.testing import CliRunner, Result
 
 from imutool import diagnosis_output
@@ -83,6 +84,7 @@ def test_the_planted_lever_arm_is_found_and_written(diagnosed: tuple[Path, Done]
     assert "lever_arm" in page  # its finding, where it acts
     assert ".partial" not in page
     told = json.loads((place / "findings.json").read_text())
+    assert_valid(told)
     assert told["schema"] == "imutool.diagnosis/1"
     assert told["mismatch"]
     assert [one["effect"] for one in told["findings"]] == ["lever_arm"]

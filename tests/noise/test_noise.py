@@ -343,7 +343,7 @@ def test_noise_options_without_noise_are_refused(imutool: Run, tmp_path: Path) -
     write(Recording("still", still(5.0)), tmp_path / "still.mcap")
     done = imutool("info", "still.mcap", "--noise-toml", "n.toml", cwd=tmp_path)
     assert done.returncode == 3
-    assert "--noise-toml says nothing without --noise" in done.stderr
+    assert "--noise-toml needs --noise" in done.stderr
     assert not (tmp_path / "n.toml").exists()
 
 

@@ -53,10 +53,7 @@ def even(stamp_s: Float64[np.ndarray, " n"]) -> tuple[Float64[np.ndarray, " n"],
 
 
 def _by_level(stamp_s: Float64[np.ndarray, " n"], k: Float64[np.ndarray, " n"]) -> tuple[Float64[np.ndarray, " n"], int]:
-    """Even stamps where the jitter is a large part of a period.
-
-    A missing sample lifts the level of all later ones.
-    """
+    """Even stamps under large jitter: a missing sample lifts the level of all later ones."""
     period = float(np.median(stamp_s[LAG:] - stamp_s[:-LAG])) / LAG
     missing = np.zeros(len(stamp_s))
     for _ in range(4):
@@ -82,10 +79,7 @@ def _period(since_s: Float64[np.ndarray, " n"]) -> tuple[float, float, float]:
 
 
 def jitter(pairs: Sequence[Pair]) -> tuple[Effect, ...]:
-    """Timestamp jitter of evenly taken samples as an effect; none where the stamps are even.
-
-    A share of one is all of the jitter.
-    """
+    """Timestamp jitter of evenly taken samples as an effect; a share of one is all of it."""
     corrections = [(pair.stamp_s, even(pair.stamp_s)[0] - pair.stamp_s) for pair in pairs]
     if min(float(x.std()) for _, x in corrections) < LEAST_JITTER_S:
         return ()
@@ -223,10 +217,7 @@ class _Starts:
 
 
 def clipped(real: Float64[np.ndarray, "n 6"]) -> Bool[np.ndarray, "n 6"]:
-    """Clipped samples of an axis, and their neighbours.
-
-    Filters mix the neighbours with them.
-    """
+    """Clipped samples of an axis, and their neighbours, which filters mix with them."""
     at, most = np.zeros(real.shape, bool), limits(real)
     for k, signal in enumerate(("gyro", "accel")):
         if signal in most:
