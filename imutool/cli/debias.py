@@ -24,6 +24,7 @@ MODEL_HELP = (
     "Model file, physics.toml or a name that ships; else a static estimate. TOPIC=MODEL sets the model of one IMU. Repeatable."
 )
 CLEAN_HELP = "Drop invalid samples and convert units, as imutool clean does."
+REPORT_HELP = "Write an HTML page about the debiased log."
 VERIFY_HELP = "Chunks of OUT to read back: all, those with IMU messages (imu), or none."
 
 
@@ -46,9 +47,7 @@ def debias(
         str | None, typer.Option(metavar="URL", help="Show the progress in a running viewer: HOST:PORT.")
     ] = None,
     save_view: Annotated[Path | None, typer.Option(metavar="F.rrd", help="Save the viewer's data to a file.")] = None,
-    report_to: Annotated[
-        Path | None, typer.Option("--report", metavar="F.html", help="Write an HTML page about the debiased log.")
-    ] = None,
+    report_to: Annotated[Path | None, typer.Option("--report", metavar="F.html", help=REPORT_HELP)] = None,
     overwrite: Overwrite = False,
     json_to: Json = None,
     verbose: Verbose = False,

@@ -11,6 +11,7 @@ from imutool.cli.app import Imu, Json, Overwrite, Quiet, Truth, Verbose, app
 from imutool.cli.terminal import logger, progress, say, table, write_json
 
 if TYPE_CHECKING:
+    from imutool.diagnosis.result import Diagnosis
     from imutool.viewing.model.run_data import RunData
 
 
@@ -56,8 +57,6 @@ def diagnose(
     from imutool.config import load as load_settings
     from imutool.diagnosis.diagnose import diagnose as run
     from imutool.diagnosis.settings import DiagnoseSettings
-    from imutool.diagnosis.wording.conclusion import below, conclusion
-    from imutool.diagnosis.wording.conclusion import table as findings_table
     from imutool.viewing.model.runs import load
 
     def look(findings: Path) -> list[RunData]:
@@ -74,6 +73,14 @@ def diagnose(
                 logger.warning("%s", remark)
     if write_json(diagnosis.report, json_to):
         return
+    _say(diagnosis, folder)
+
+
+def _say(diagnosis: Diagnosis, folder: Path | None) -> None:
+    from imutool import diagnosis_output
+    from imutool.diagnosis.wording.conclusion import below, conclusion
+    from imutool.diagnosis.wording.conclusion import table as findings_table
+
     say(conclusion(diagnosis))
     if diagnosis.findings:
         say("")
