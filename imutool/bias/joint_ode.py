@@ -1,4 +1,4 @@
-"""Joint ODE of attitude and bias on SO(3): the paper's own scheme of the neural ODE, for the gyroscope.
+"""Joint ODE of attitude and gyro bias on SO(3): the paper's own scheme of the neural ODE.
 
 One vector field drives attitude and bias together (paper, eq. 3, 10, 15 and 31)::
 

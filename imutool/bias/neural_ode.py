@@ -1,4 +1,4 @@
-"""Neural ODE of the bias dynamics, learned from poses only: db/dt = f(b, u, du/dt), u the measured samples.
+"""Neural ODE of the bias dynamics, learned from poses: db/dt = f(b, u, du/dt), u the samples.
 
 The paper writes db_g/dt = f_g(b_g, gyro, dgyro/dt; theta) with one network (eq. 10, 31), and likewise for accel. Trained that
 way the network forgets its state within two samples and is valid for one step size only. Here the field has two parts whose

@@ -1,4 +1,4 @@
-"""Neural ODEs on SO(3): a causal path through sampled controls, and integration in charts of the rotation group.
+"""Neural ODEs on SO(3): a causal path through sampled controls, and integration in charts.
 
 A rotation is R = R_0 Exp(xi) with dxi/dt = J_r^{-1}(xi) omega (paper, theorem 1, eq. 15): the state of the solver is
 Euclidean, so torchdiffeq and its adjoint apply unchanged. Where |xi| exceeds pi the chart changes: R_0 <- R_0 Exp(xi),

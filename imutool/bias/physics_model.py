@@ -1,4 +1,4 @@
-"""Bias model from a physics.toml: it corrects the file's effects, and its prior is the file's bias.
+"""Bias model from a physics.toml: corrects the file's effects; the prior is the file's bias.
 
 Scale, misalignment and the rotation of the mount are one matrix, reading = T f + b with T = (I + S)(I + M) R^T (they act in
 this order), and its inverse is exact: f = (u - b) - (I - T^-1)(u - b). Everything else in closed form is of the measured

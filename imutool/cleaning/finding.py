@@ -135,7 +135,7 @@ def score(messages: int, valid: int, missing: int, findings: Sequence[Finding]) 
     """
     whole = messages + missing
     value = valid / whole if whole else 0.0
-    for _, cost in {(one.rule, _cost(one)) for one in findings}:
+    for _, cost in {(finding.rule, _cost(finding)) for finding in findings}:
         value *= 1.0 - cost
     return value
 
@@ -155,4 +155,4 @@ def verdict(findings: Sequence[Finding], reasons: Sequence[str]) -> Verdict:
     """
     if reasons:
         return "quarantine"
-    return "usable" if any(one.severity != "note" for one in findings) else "good"
+    return "usable" if any(finding.severity != "note" for finding in findings) else "good"

@@ -15,13 +15,13 @@ LEAST_TURN_RAD = 0.3  # over a window; less says nothing of axes
 
 def signed_permutations() -> Float64[np.ndarray, "48 3 3"]:
     """Signed permutations of three axes: 24 rotations and 24 reflections, the identity first."""
-    found = []
+    signed = []
     for order in permutations(range(3)):
         for signs in product((1.0, -1.0), repeat=3):
             P = np.zeros((3, 3))
             P[range(3), order] = signs
-            found.append(P)
-    return np.stack(found)
+            signed.append(P)
+    return np.stack(signed)
 
 
 def axis_names(P: Float64[np.ndarray, "3 3"]) -> str:

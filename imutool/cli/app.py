@@ -62,14 +62,14 @@ class Command(TyperCommand):
         Raises:
             ImutoolError: the command failed.
         """
-        known = flags(self)
-        current.set(known)
+        flag_of = flags(self)
+        current.set(flag_of)
         try:
             return super().invoke(ctx)
         except ImutoolError as error:
-            raise error_with_flags(error, known) from error
+            raise error_with_flags(error, flag_of) from error
         except KeyboardInterrupt as interrupt:
-            raise KeyboardInterrupt(with_flags(str(interrupt), known)) from interrupt
+            raise KeyboardInterrupt(with_flags(str(interrupt), flag_of)) from interrupt
 
 
 class App(typer.Typer):

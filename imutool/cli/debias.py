@@ -24,6 +24,7 @@ MODEL_HELP = (
     "Model file, physics.toml or a name that ships; else a static estimate. TOPIC=MODEL sets the model of one IMU. Repeatable."
 )
 CLEAN_HELP = "Drop invalid samples and convert units, as imutool clean does."
+REPORT_HELP = "Write an HTML page about the debiased log."
 VERIFY_HELP = "Chunks of OUT to read back: all, those with IMU messages (imu), or none."
 
 
@@ -46,9 +47,7 @@ def debias(
         str | None, typer.Option(metavar="URL", help="Show the progress in a running viewer: HOST:PORT.")
     ] = None,
     save_view: Annotated[Path | None, typer.Option(metavar="F.rrd", help="Save the viewer's data to a file.")] = None,
-    report_to: Annotated[
-        Path | None, typer.Option("--report", metavar="F.html", help="Write an HTML page about the debiased log.")
-    ] = None,
+    report_to: Annotated[Path | None, typer.Option("--report", metavar="F.html", help=REPORT_HELP)] = None,
     overwrite: Overwrite = False,
     json_to: Json = None,
     verbose: Verbose = False,
@@ -203,15 +202,15 @@ def assigned(words: Sequence[str]) -> dict[str, str]:
     Raises:
         ConfigError: two models for the same IMUs, or nothing on one side of the sign.
     """
-    found: dict[str, str] = {}
+    models: dict[str, str] = {}
     for word in words:
         topic, sign, name = word.partition("=")
         if not sign or Path(word).exists():
             topic, name = "", word
         elif not topic or not name:
             raise ConfigError(f"{word!r}", where="--model", expected="MODEL or TOPIC=MODEL")
-        if topic in found:
+        if topic in models:
             whom = topic or "all IMUs"
-            raise ConfigError(f"{found[topic]} and {name} for {whom}", where="--model", expected="one model for each IMU")
-        found[topic] = name
-    return found
+            raise ConfigError(f"{models[topic]} and {name} for {whom}", where="--model", expected="one model for each IMU")
+        models[topic] = name
+    return models

@@ -11,6 +11,7 @@ from imutool.cli.app import Imu, Json, Overwrite, Quiet, Truth, Verbose, app
 from imutool.cli.terminal import logger, progress, say, table, write_json
 
 if TYPE_CHECKING:
+    from imutool.diagnosis.result import Diagnosis
     from imutool.viewing.model.run_data import RunData
 
 
@@ -56,8 +57,6 @@ def diagnose(
     from imutool.config import load as load_settings
     from imutool.diagnosis.diagnose import diagnose as run
     from imutool.diagnosis.settings import DiagnoseSettings
-    from imutool.diagnosis.wording.conclusion import below, conclusion
-    from imutool.diagnosis.wording.conclusion import table as findings_table
     from imutool.viewing.model.runs import load
 
     def look(findings: Path) -> list[RunData]:
@@ -67,18 +66,26 @@ def diagnose(
     if folder is not None:
         diagnosis_output.refuse(folder, overwrite=overwrite)
     with progress("Diagnosing", verbose, quiet) as tell:
-        found = run(reals, sim, imu=imu, truth=truth, signals=signal or (), tell=tell, settings=settings)
+        diagnosis = run(reals, sim, imu=imu, truth=truth, signals=signal or (), tell=tell, settings=settings)
         if folder is not None:
             tell(0, 1, "writing")
-            for remark in diagnosis_output.write(found, folder, logs=look, overwrite=overwrite):
+            for remark in diagnosis_output.write(diagnosis, folder, logs=look, overwrite=overwrite):
                 logger.warning("%s", remark)
-    if write_json(found.report, json_to):
+    if write_json(diagnosis.report, json_to):
         return
-    say(conclusion(found))
-    if found.findings:
+    _say(diagnosis, folder)
+
+
+def _say(diagnosis: Diagnosis, folder: Path | None) -> None:
+    from imutool import diagnosis_output
+    from imutool.diagnosis.wording.conclusion import below, conclusion
+    from imutool.diagnosis.wording.conclusion import table as findings_table
+
+    say(conclusion(diagnosis))
+    if diagnosis.findings:
         say("")
-        table(findings_table(found), keys=1)
-    for line in below(found):
+        table(findings_table(diagnosis), keys=1)
+    for line in below(diagnosis):
         say(line)
     if folder is not None:
         say(f"{folder}: {', '.join(name for name in diagnosis_output.FILES if (folder / name).exists())}")

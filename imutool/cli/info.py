@@ -51,23 +51,23 @@ def info(
     places = [to_location(log) for log in logs]
     reports = [inspect(log, check=not quick) for log in places]
     lost = any(report.losses["stretches"] for report in reports)
-    found = []
+    identified_noises = []
     if noise:
         from imutool import noise_identification
 
-        found = [noise_identification.identify(log, imu=imu, truth=truth, model=model) for log in places]
-        noises = [noise_identification.plain(identified) for identified in found]
+        identified_noises = [noise_identification.identify(log, imu=imu, truth=truth, model=model) for log in places]
+        noises = [noise_identification.plain(identified) for identified in identified_noises]
         reports = [replace(report, noise=noise) for report, noise in zip(reports, noises, strict=True)]
-        _write_noise(found[0], noise_plot, noise_toml, overwrite)
+        _write_noise(identified_noises[0], noise_plot, noise_toml, overwrite)
     if write_json(reports[0] if len(reports) == 1 else LogInfos(reports), json_to):
         _leave(lost)
     for number, (log, report) in enumerate(zip(logs, reports, strict=True)):
         say(log)
         table(topic_rows(report), keys=1)
         table(imu_rows(report), keys=2)
-        if found:
-            table(noise_identification.rows(found[number]), keys=1)
-            for remark in found[number].remarks:
+        if identified_noises:
+            table(noise_identification.rows(identified_noises[number]), keys=1)
+            for remark in identified_noises[number].remarks:
                 out.print(f"[cyan]noise:[/] {plain(remark)}", highlight=False, soft_wrap=True)
         for warning in report.warnings:
             out.print(f"[yellow]warning:[/] {plain(warning)}", highlight=False, soft_wrap=True)
@@ -79,16 +79,16 @@ def _leave(lost: bool) -> NoReturn:
     raise typer.Exit(LOST if lost else 0)
 
 
-def _write_noise(found: IdentifiedNoise, plot: Path | None, toml: Path | None, overwrite: bool) -> None:
+def _write_noise(identified: IdentifiedNoise, plot: Path | None, toml: Path | None, overwrite: bool) -> None:
     """Write the requested noise files."""
     if plot is not None:
         from imutool.viewing.html.allan_plot import write_png
 
-        write_png(found, plot, overwrite=overwrite)
+        write_png(identified, plot, overwrite=overwrite)
     if toml is not None:
         from imutool.noise.datasheet import write
 
-        write(found.noise, toml, overwrite=overwrite)
+        write(identified.noise, toml, overwrite=overwrite)
 
 
 def topic_rows(report: LogInfo) -> list[tuple[str, ...]]:

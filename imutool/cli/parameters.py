@@ -41,12 +41,12 @@ def flags(command: Any) -> dict[str, str]:
     The flag of an argument is its word in the usage.
     """
     own = {parameter.name: _flag(parameter) for parameter in command.params}
-    known = {name.rstrip("_"): flag for name, flag in own.items()}
+    flag_of = {name.rstrip("_"): flag for name, flag in own.items()}
     for name, others in ALIASES.items():
         flag = next((own[other] for other in others if other in own), None)
         if flag is not None:
-            known.setdefault(name, flag)
-    return known
+            flag_of.setdefault(name, flag)
+    return flag_of
 
 
 def _flag(parameter: Any) -> str:
@@ -55,33 +55,33 @@ def _flag(parameter: Any) -> str:
     return str(max(parameter.opts, key=len))
 
 
-def with_flags(text: str, known: Mapping[str, str] | None = None) -> str:
+def with_flags(text: str, flag_of: Mapping[str, str] | None = None) -> str:
     """Text with flags for backquoted parameters; other words stay.
 
     By default the flags are those of the running command.
     """
-    known = current.get() if known is None else known
-    return QUOTED.sub(lambda match: _shown(match[1], match[2], known) or match[0], text)
+    flag_of = current.get() if flag_of is None else flag_of
+    return QUOTED.sub(lambda match: _shown(match[1], match[2], flag_of) or match[0], text)
 
 
-def _shown(name: str, value: str | None, known: Mapping[str, str]) -> str | None:
+def _shown(name: str, value: str | None, flag_of: Mapping[str, str]) -> str | None:
     """Flag and value: `init=prior` is --init prior, `smooth=True` is --smooth.
 
     `images=False` is --no-images.
     """
     if value == "False":
-        return known.get(f"no_{name}")
-    flag = known.get(name)
+        return flag_of.get(f"no_{name}")
+    flag = flag_of.get(name)
     return flag if flag is None or value in {None, "True"} else f"{flag} {str(value).strip(chr(34))}"
 
 
-def error_with_flags(error: ImutoolError, known: Mapping[str, str]) -> ImutoolError:
+def error_with_flags(error: ImutoolError, flag_of: Mapping[str, str]) -> ImutoolError:
     """Error with flags for parameters."""
     where = error.where
     if where is not None:
         parts = [PLACE.fullmatch(part) for part in where.split(", ")]
-        shown = [None if part is None else _shown(part[1], part[2], known) for part in parts]
+        shown = [None if part is None else _shown(part[1], part[2], flag_of) for part in parts]
         if None not in shown:
             where = ", ".join(map(str, shown))
-    what, expected, fix = (with_flags(text, known) for text in (error.what, error.expected, error.fix))
+    what, expected, fix = (with_flags(text, flag_of) for text in (error.what, error.expected, error.fix))
     return type(error)(what, where=where, expected=expected, fix=fix)

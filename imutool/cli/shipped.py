@@ -47,15 +47,15 @@ def models(json_to: Json = None, verbose: Verbose = False, quiet: Quiet = False)
     from imutool.bias.io import header_of, library
 
     log_to_stderr(verbose, quiet)
-    found = []
+    entries = []
     for path in sorted(library().glob("*.safetensors")):
         about = header_of(path)
         rate_hz = round(float(about["rate_hz"]), 1)
-        found.append(ModelEntry(path.stem, about["method"], about.get("sensor"), about.get("dataset"), rate_hz))
-    if write_json(Models(found), json_to):
+        entries.append(ModelEntry(path.stem, about["method"], about.get("sensor"), about.get("dataset"), rate_hz))
+    if write_json(Models(entries), json_to):
         return
-    if found:
-        table([ModelEntry.__struct_fields__, *(tuple(map(str, astuple(model))) for model in found)], keys=1)
+    if entries:
+        table([ModelEntry.__struct_fields__, *(tuple(map(str, astuple(model))) for model in entries)], keys=1)
     else:
         say("No model ships with this version; train one with: imutool train")
 
@@ -69,8 +69,8 @@ def schema(
     """Print the JSON Schema of a report, or list the reports."""
     log_to_stderr(verbose, quiet)
     if name is None:
-        for known in sorted(REPORTS):
-            say(known)
+        for report in sorted(REPORTS):
+            say(report)
     else:
         write_json(json_schema(name), "-")
 

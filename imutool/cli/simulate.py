@@ -62,7 +62,7 @@ def simulate(
     from imutool.sensor.simulate import simulate as run
 
     with progress("Simulating", verbose, quiet) as tell:
-        found = run(
+        simulation = run(
             trajectory,
             target,
             physics=physics,
@@ -73,9 +73,9 @@ def simulate(
             overwrite=overwrite,
             progress=tell,
         )
-        for remark in found.remarks:
+        for remark in simulation.remarks:
             logger.warning("%s", remark)
-    values = {key: value for key, value in found.plain().items() if key != "schema"}
+    values = {key: value for key, value in simulation.plain().items() if key != "schema"}
     report = SimulationReport(**values | {"motion": MotionQuality(**values["motion"])})
     if write_json(report, json_to):
         return
@@ -83,7 +83,7 @@ def simulate(
     acting += [f"a curve of {curve['variable']}" for curve in report.physics["unknown"]]
     acting += [term["term"] for term in report.physics["term"]] + ["bias"] * (report.physics["bias"] is not None)
     names = ", ".join(acting) or "ideal"
-    pieces = len(found.motion.stretches)
+    pieces = len(simulation.motion.stretches)
     where = f"{report.duration_s:.1f} s" + (f" in {pieces} stretches" if pieces > 1 else "")
     say(f"{target}: {report.samples} samples at {report.rate_hz:g} Hz over {where}; physics {names}; noise {noise}")
     motion = report.motion

@@ -42,7 +42,7 @@ class ConvertReport:
 
 
 @dataclass
-class _Found:
+class _Sequences:
     """Recognised sequences of a source, and the others with their errors."""
 
     jobs: list[Job] = field(default_factory=list)
@@ -76,20 +76,20 @@ def convert(
     """
     if format != AUTO and not hasattr(module := registry.load(GROUP, format), "sequences"):
         return _from_stream(module, source, out, sequences, compression, images, overwrite, progress)
-    found = _find(source, format)
+    source_sequences = _find(source, format)
     if sequences:
-        found = _only(found, sequences)
-    names = found.names()
-    targets = _targets([job.sequence.name for job in found.jobs], out, many=len(names) > 1)
+        source_sequences = _only(source_sequences, sequences)
+    names = source_sequences.names()
+    targets = _targets([job.sequence.name for job in source_sequences.jobs], out, many=len(names) > 1)
     jobs = [
         replace(job, target=target, compression=compression, images=images, overwrite=overwrite)
-        for job, target in zip(found.jobs, targets, strict=True)
+        for job, target in zip(source_sequences.jobs, targets, strict=True)
     ]
-    if len(names) == 1 and found.errors:
-        raise found.errors[0][1]
+    if len(names) == 1 and source_sequences.errors:
+        raise source_sequences.errors[0][1]
     _check_targets(jobs)
     outcomes: dict[int, ImutoolError | None] = {}
-    done = len(found.errors)
+    done = len(source_sequences.errors)
     for number, error in run_jobs(jobs, _worker_count(workers, len(jobs))):
         outcomes[number] = error
         done += 1
@@ -100,11 +100,11 @@ def convert(
         raise failed[0][1]
     return ConvertReport(
         written=[jobs[n].target for n, error in sorted(outcomes.items()) if error is None],
-        failures=[Failure(name, str(error)) for name, error in [*found.errors, *failed]],
+        failures=[Failure(name, str(error)) for name, error in [*source_sequences.errors, *failed]],
     )
 
 
-def _find(source: Path, format: str) -> _Found:
+def _find(source: Path, format: str) -> _Sequences:
     """Find every sequence of the source, with its converter.
 
     Raises:
@@ -137,31 +137,31 @@ def _find(source: Path, format: str) -> _Found:
         if len(jobs) > 1:
             keys = " and ".join(job.converter for job in jobs)
             raise ConfigError(f"is recognised as {keys}", where=place, fix="Choose one with `format`")
-    return _Found(
+    return _Sequences(
         [job for jobs in claims.values() for job in jobs],
         [error for place, error in errors.items() if not claims[place]],
     )
 
 
-def _only(found: _Found, wanted: Sequence[str]) -> _Found:
+def _only(source_sequences: _Sequences, wanted: Sequence[str]) -> _Sequences:
     """Requested sequences.
 
     Raises:
         ConfigError: a sequence is not in the source; the message names the nearest.
     """
-    known = found.names()
+    names = source_sequences.names()
     for name in wanted:
-        if name not in known:
-            near = difflib.get_close_matches(name, known, n=1)
+        if name not in names:
+            near = difflib.get_close_matches(name, names, n=1)
             raise ConfigError(
                 f"{name!r} is not in the source",
                 where="sequences",
-                expected=f"one of {', '.join(sorted(known))}",
+                expected=f"one of {', '.join(sorted(names))}",
                 fix=f"Did you mean {near[0]!r}?" if near else "",
             )
-    return _Found(
-        [job for job in found.jobs if job.sequence.name in wanted],
-        [(name, error) for name, error in found.errors if name in wanted],
+    return _Sequences(
+        [job for job in source_sequences.jobs if job.sequence.name in wanted],
+        [(name, error) for name, error in source_sequences.errors if name in wanted],
     )
 
 
@@ -184,9 +184,9 @@ def _targets(names: Sequence[str], out: Path, *, many: bool) -> list[Path]:
 
 def _check_targets(jobs: Sequence[Job]) -> None:
     """Refuse to overwrite a log, a source, or another log of the same run."""
-    seen: dict[Path, Job] = {}
+    jobs_by_target: dict[Path, Job] = {}
     for job in jobs:
-        if (other := seen.setdefault(job.target, job)) is not job:
+        if (other := jobs_by_target.setdefault(job.target, job)) is not job:
             raise ConfigError(
                 f"two sequences are named {job.sequence.name}: {other.sequence} and {job.sequence}",
                 where="source",

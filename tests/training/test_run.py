@@ -206,7 +206,7 @@ def test_refusals_come_before_the_work_and_leave_nothing(
 ) -> None:
     there = tmp_path / "there.safetensors"
     there.write_bytes(b"mine")
-    with pytest.raises(ConfigError, match=r"exists already.*`overwrite`"):
+    with pytest.raises(ConfigError, match=r"exists already.*overwrite"):
         train(logs, there, method="neural_ode", settings=TINY)
     with pytest.raises(ConfigError, match="the folder does not exist"):
         train(logs, tmp_path / "no" / "m.safetensors", method="neural_ode", settings=TINY)

@@ -163,10 +163,7 @@ class _Problem:
         self.mean, self.std = priors(begun)
 
     def state(self, chosen: Chosen, like: _State | None) -> _State:
-        """Residuals and objective of some parameters.
-
-        Forward passes continue from a state like it.
-        """
+        """Residuals and objective of parameters; forward passes continue from a state like it."""
         passes = [ForwardPass(log.pair, chosen, None if like is None else like.passes[k]) for k, log in enumerate(self.logs)]
         residuals = [log.residual(forward.expected) for log, forward in zip(self.logs, passes, strict=True)]
         total = float((((free_of(chosen) - self.mean) / self.std) ** 2).sum()) if len(self.mean) else 0.0
@@ -236,10 +233,7 @@ def _descended(problem: _Problem, now: _State, iterations: int, near: Fit | None
 
 
 def _polished(problem: _Problem, now: _State) -> _State:
-    """State after ever smaller steps of single parameters of effects that jump.
-
-    Derivatives lead there only from afar.
-    """
+    """State after ever smaller steps of jumping effects: derivatives lead only from afar."""
     moving = [(effect.jumps, step_of(parameter)) for effect, _ in now.chosen for parameter in effect.parameters]
     for halved in range(POLISHED):
         for j, (jumps, h) in enumerate(moving):
@@ -290,10 +284,7 @@ def _normal(
     residuals: Sequence[Float64[np.ndarray, "n k"]] | None,
     bias: Float64[np.ndarray, "logs k"],
 ) -> tuple[Float64[np.ndarray, "q q"], Float64[np.ndarray, " q"]]:
-    """Normal equations of all free parameters, then of each log's bias.
-
-    No right-hand side without residuals.
-    """
+    """Normal equations of free parameters and biases; no right-hand side without residuals."""
     p = sum(len(theta) for _, theta in jacobians.chosen)
     N, g = np.zeros((p + bias.size,) * 2), np.zeros(p + bias.size)
     for k, (log, mask) in enumerate(zip(problem.logs, problem.masks, strict=True)):

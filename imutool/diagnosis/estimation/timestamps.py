@@ -29,7 +29,6 @@ LEAST_VALUES = 3  # of a grid
 AROUND, DEGREE = 15, 3  # samples of a line, and what it may bend
 EVENLY = 5.0  # standard deviations by which samples must be nearer to even than to their stamps
 LEAST_ROWS = 100
-TINY = 1e-300
 
 
 def even(stamp_s: Float64[np.ndarray, " n"]) -> tuple[Float64[np.ndarray, " n"], int]:
@@ -53,10 +52,7 @@ def even(stamp_s: Float64[np.ndarray, " n"]) -> tuple[Float64[np.ndarray, " n"],
 
 
 def _by_level(stamp_s: Float64[np.ndarray, " n"], k: Float64[np.ndarray, " n"]) -> tuple[Float64[np.ndarray, " n"], int]:
-    """Even stamps where the jitter is a large part of a period.
-
-    A missing sample lifts the level of all later ones.
-    """
+    """Even stamps under large jitter: a missing sample lifts the level of all later ones."""
     period = float(np.median(stamp_s[LAG:] - stamp_s[:-LAG])) / LAG
     missing = np.zeros(len(stamp_s))
     for _ in range(4):
@@ -82,10 +78,7 @@ def _period(since_s: Float64[np.ndarray, " n"]) -> tuple[float, float, float]:
 
 
 def jitter(pairs: Sequence[Pair]) -> tuple[Effect, ...]:
-    """Timestamp jitter of evenly taken samples as an effect; none where the stamps are even.
-
-    A share of one is all of the jitter.
-    """
+    """Timestamp jitter of evenly taken samples as an effect; a share of one is all of it."""
     corrections = [(pair.stamp_s, even(pair.stamp_s)[0] - pair.stamp_s) for pair in pairs]
     if min(float(x.std()) for _, x in corrections) < LEAST_JITTER_S:
         return ()
@@ -223,10 +216,7 @@ class _Starts:
 
 
 def clipped(real: Float64[np.ndarray, "n 6"]) -> Bool[np.ndarray, "n 6"]:
-    """Clipped samples of an axis, and their neighbours.
-
-    Filters mix the neighbours with them.
-    """
+    """Clipped samples of an axis, and their neighbours, which filters mix with them."""
     at, most = np.zeros(real.shape, bool), limits(real)
     for k, signal in enumerate(("gyro", "accel")):
         if signal in most:
@@ -305,6 +295,6 @@ def _followed(column: Float64[np.ndarray, " n"], late_s: Float64[np.ndarray, " n
     moved = moved - savgol_filter(moved, AROUND, DEGREE)
     rest = column - savgol_filter(column, AROUND, DEGREE)
     size = float(moved @ moved)
-    share = float(moved @ rest) / max(size, TINY)
+    share = float(moved @ rest) / max(size, 1e-300)
     variance = float(np.mean((rest - share * moved) ** 2))
-    return share, size / max(variance, TINY)
+    return share, size / max(variance, 1e-300)
