@@ -1,4 +1,4 @@
-"""Readers of raw inertial data sets: one file a data set, `read(source) -> Iterator[Recording]`.
+"""Converters of raw data sets: one file each, `read(source) -> Iterator[Recording]`.
 
 A converter is a module, in this folder or behind the entry-point group `imutool.converters`, that holds::
 
@@ -21,7 +21,9 @@ from pathlib import Path
 
 @dataclass(frozen=True)
 class Sequence:
-    """A sequence found but not read: `path` is a folder, an archive or a bag, `inside` the folder in the archive.
+    """Sequence found but not read.
+
+    `path` is a folder, an archive or a bag; `inside` is the sequence's folder in the archive.
 
     Small and picklable, so that it can be handed to a worker process.
     """

@@ -1,4 +1,4 @@
-"""Archives that are trusted with neither names nor sizes: what a .zip or .tar holds, and its members' bytes under bounds.
+"""Archive members with checked names and sizes: list and read a .zip or .tar safely.
 
 An archive is refused whole when a member's name is absolute or climbs with `..`, when a link leaves the archive, or
 when a member is a device. A link below `mav0` is refused too; one elsewhere that stays inside is never followed.
@@ -38,7 +38,10 @@ BLOCK = 512  # tar's unit
 
 @dataclass
 class Listing:
-    """Regular members of an archive by name, with their sizes; of a tar where they begin, and its tables' first bytes."""
+    """Regular members of an archive with their sizes.
+
+    For a tar also their offsets, and the first bytes of its tables.
+    """
 
     sizes: dict[str, int] = field(default_factory=dict)
     offsets: dict[str, int] = field(default_factory=dict)
@@ -46,7 +49,7 @@ class Listing:
 
 
 def list_members(path: Path) -> Listing:
-    """What an archive holds; a tar is gone through from front to back, and the answer kept while the file is the same.
+    """List the members of an archive; the list is cached until the file changes.
 
     Raises:
         DataError: empty, damaged, cut off, hostile, or a member larger than its kind may be; the member is named.
@@ -124,12 +127,12 @@ def _add(listing: Listing, path: Path, name: str, size: int) -> None:
 
 
 def plain_name(name: str) -> str:
-    """A member's name without a leading `./`."""
+    """Member name without a leading `./`."""
     return name.removeprefix("./").rstrip("/")
 
 
 def _checked_name(path: Path, name: str, number: int) -> str:
-    """The member's name, without a leading `./`.
+    """Member name without a leading `./`, checked.
 
     Raises:
         DataError: it points outside the archive, or there are too many members.
@@ -157,7 +160,7 @@ def _check_link(path: Path, name: str, target: str, base: str | None = None) -> 
 
 
 def check_size(where: str, name: str, size: int) -> None:
-    """Refuses a declared size beyond what the kind of file may have.
+    """Refuse a declared size above the limit for the kind of file.
 
     Raises:
         DataError: with both sizes.
@@ -168,7 +171,7 @@ def check_size(where: str, name: str, size: int) -> None:
 
 
 def read_bounded(read: Callable[[int], bytes], where: str, name: str) -> bytes:
-    """All bytes of an open member, never more than its kind may have, whatever size it declared."""
+    """Read all bytes of a member, up to the limit for its kind, whatever size it declares."""
     limit = LIMITS.get(PurePosixPath(name).suffix.lower(), MIB)
     parts: list[bytes] = []
     total = 0
@@ -181,7 +184,7 @@ def read_bounded(read: Callable[[int], bytes], where: str, name: str) -> bytes:
 
 
 def is_zip(path: Path) -> bool:
-    """Whether an archive is a .zip by its name; the others are tars."""
+    """Whether an archive is a .zip, by its name; all others are tars."""
     return path.name.lower().endswith(".zip")
 
 
@@ -193,7 +196,7 @@ def is_packed(path: Path) -> bool:
 
 @contextmanager
 def refusing(where: Path | str) -> Iterator[None]:
-    """Whatever the archive readers raise on damaged input becomes a DataError with the place in it."""
+    """Turn errors of the archive modules on damaged input into a DataError with the place."""
     try:
         yield
     except (OSError, EOFError, zipfile.BadZipFile, tarfile.TarError, zlib.error, RuntimeError, ValueError) as error:
@@ -202,7 +205,7 @@ def refusing(where: Path | str) -> Iterator[None]:
 
 
 class _Bounded:
-    """A tar's bytes, refused once they unpack beyond all proportion or a header asks for megabytes at once."""
+    """Tar stream with bounds: it refuses extreme compression ratios and huge headers."""
 
     def __init__(self, path: Path, file: BufferedReader | gzip.GzipFile, limit: int | None) -> None:
         self._path, self._file, self._limit = path, file, limit
@@ -229,7 +232,7 @@ class _Bounded:
 
 @contextmanager
 def open_tar(path: Path) -> Iterator[tarfile.TarFile]:
-    """A tar, packed or not, whose reading is bounded.
+    """Open a tar, compressed or not, with bounded reading.
 
     Raises:
         DataError: damaged, or unpacking beyond all proportion.
@@ -243,7 +246,7 @@ def open_tar(path: Path) -> Iterator[tarfile.TarFile]:
 
 
 def each_member(archive: tarfile.TarFile) -> Iterator[tarfile.TarInfo]:
-    """Members one by one; `tarfile` would remember each, a kilobyte a piece."""
+    """Yield the members one by one; `tarfile` would cache each, a kilobyte a piece."""
     kept: list[tarfile.TarInfo] = vars(archive)["members"]
     while (member := archive.next()) is not None:
         yield member
@@ -251,7 +254,10 @@ def each_member(archive: tarfile.TarFile) -> Iterator[tarfile.TarInfo]:
 
 
 def _check_end(path: Path, archive: tarfile.TarFile) -> None:
-    """`tarfile` takes a damaged header in the middle for the end; a whole tar ends with a block of zeros."""
+    """Check that a tar ends with a block of zeros.
+
+    `tarfile` takes a damaged header in the middle for the end.
+    """
     assert isinstance(archive.fileobj, _Bounded)
     if archive.fileobj.last != bytes(BLOCK):
         raise DataError(f"is cut off or damaged at byte {archive.offset}", where=path)

@@ -1,4 +1,4 @@
-"""Makes a Recording of an ASL sequence (`mav0/imu0/data.csv` and its neighbours), the form all three data sets share.
+"""Recording of an ASL sequence (`mav0/imu0/data.csv` and the other sensor folders).
 
 Repairs: a true pose whose stamp repeats the one before is dropped, the first is kept, and the number is written to the
 metadata record `imutool/repairs`. Nothing of the IMU is ever repaired: a defect there stops the sequence at its line.
@@ -26,12 +26,12 @@ IMAGE_FORMATS = {".png": "png", ".jpg": "jpeg", ".jpeg": "jpeg"}
 
 
 def float_stamps(tree: Tree) -> bool:
-    """Whether the IMU's stamps are in scientific notation, by which FETCH differs from the others."""
+    """Whether the IMU's stamps are in scientific notation; only FETCH writes them so."""
     return b"e" in _table.first_row(tree.head(f"{IMU}/data.csv")).partition(b",")[0].lower()
 
 
 def recording(sequence: Sequence, *, dataset: str, sensor: str, truths: Mapping[str, str], images: bool = True) -> Recording:
-    """The sequence as a Recording; `truths` maps sensor folders to pose topics, the first is the truth.
+    """Recording of a sequence; `truths` maps sensor folders to pose topics, truth first.
 
     Velocity and biases are kept where the table has them; rows of unknown bias (nan) are left out of the bias channels.
 
@@ -76,7 +76,7 @@ def recording(sequence: Sequence, *, dataset: str, sensor: str, truths: Mapping[
 
 
 def imu(table: _table.Table) -> Imu:
-    """The IMU's samples.
+    """IMU samples.
 
     Raises:
         DataError: a value that is no finite number, or time not increasing, with its line.
@@ -87,7 +87,7 @@ def imu(table: _table.Table) -> Imu:
 
 
 def add_truth(table: _table.Table, topic: str, poses: dict[str, Poses], scalars: dict[str, Scalars]) -> int:
-    """Puts poses and bias channels under their topics and counts the repeated stamps it left out.
+    """Add poses and bias channels under their topics; count dropped repeated stamps.
 
     Raises:
         DataError: a value that is no finite number, time going back, or a quaternion that is none, with its line.
@@ -113,7 +113,7 @@ def add_truth(table: _table.Table, topic: str, poses: dict[str, Poses], scalars:
 
 
 def _frames(tree: Tree, camera: str, content: bytes) -> Frames | str:
-    """The camera's images, left where they are; or why there are none.
+    """Camera frames by reference, or the reason why there are none.
 
     Raises:
         DataError: some images of the list are missing, listed twice, or of an unknown kind, with the line of the list.

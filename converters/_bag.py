@@ -1,4 +1,4 @@
-"""Makes a Recording of a ROS 1 bag: topics are found by their type, the data sets' own names are preferred.
+"""Recording of a ROS 1 bag; topics are found by type, the data sets' names first.
 
 The stamps are those of the message headers. Raw images (`sensor_msgs/Image`) and positions without orientation
 (`PointStamped`) are not carried over; the metadata record `imutool/skipped` names them. A bag that its recorder did not
@@ -35,7 +35,7 @@ SKIPPED = {
 
 
 def topics(path: Path) -> dict[str, str]:
-    """Message type by topic, in ROS 2 spelling.
+    """Message types by topic, in ROS 2 spelling.
 
     Raises:
         DataError: the bag cannot be read.
@@ -44,7 +44,10 @@ def topics(path: Path) -> dict[str, str]:
 
 
 def _known(path: Path) -> tuple[dict[str, str], str]:
-    """Message type by topic; and what is wrong with the bag, or nothing. Without an index, all of it is gone through."""
+    """Message types by topic, and the bag's defect or "".
+
+    A bag without an index is scanned completely.
+    """
     try:
         status = path.stat()
     except OSError as error:
@@ -66,13 +69,13 @@ def _known_once(path: Path, mtime_ns: int, size: int) -> tuple[dict[str, str], s
 
 
 def _ros2(kind: str) -> str:
-    """A message type as ROS 2 spells it."""
+    """Message type in ROS 2 spelling."""
     package, _, name = kind.partition("/")
     return f"{package}/msg/{name}" if "/" not in name else kind
 
 
 def recording(sequence: Sequence, *, dataset: str, sensor: str, truths: tuple[str, ...], images: bool = True) -> Recording:
-    """The bag as a Recording; of several true trajectories the first of `truths` is the truth, then alphabetically.
+    """Recording of a bag; the first topic of `truths` is the truth, then alphabetically.
 
     Raises:
         ConfigError: rosbags is not installed.
@@ -151,7 +154,7 @@ def _poses(path: Path, topic: str) -> Table | None:
 
 
 def _table(path: Path, topic: str, rows: list[tuple[int, list[float]]], columns: dict[str, slice]) -> Table | None:
-    """The rows as a table whose "lines" are message numbers; nothing where there are none."""
+    """Table of rows whose "lines" are message numbers; empty without rows."""
     if not rows:
         return None
     values = np.array([value for _, value in rows], np.float64)
@@ -179,7 +182,7 @@ def _each(path: Path, topic: str) -> Iterator[tuple[int, bytes]]:
 
 
 def _messages(path: Path, topic: str) -> Iterator[tuple[int, Any]]:
-    """Header stamp (ns) and message, in the order of the file."""
+    """Header stamps (ns) and messages, in the order of the file."""
     decode = _decoder(path)
     for kind, raw in _payloads(path, topic):
         message = decode(raw, kind)
@@ -187,7 +190,7 @@ def _messages(path: Path, topic: str) -> Iterator[tuple[int, Any]]:
 
 
 def _payloads(path: Path, topic: str) -> Iterator[tuple[str, bytes]]:
-    """Type and bytes of every message of a topic."""
+    """Types and bytes of every message of a topic."""
     with _open(path) as bag:
         for chunk in bag.chunks():
             for message in chunk.messages:
@@ -197,7 +200,7 @@ def _payloads(path: Path, topic: str) -> Iterator[tuple[str, bytes]]:
 
 
 def _decoder(path: Path) -> Callable[[bytes, str], Any]:
-    """What makes a message of its bytes and its type.
+    """Decoder from type and bytes to a message.
 
     Raises:
         ConfigError: rosbags is not installed.
@@ -221,7 +224,7 @@ def _decoder(path: Path) -> Callable[[bytes, str], Any]:
 
 @contextmanager
 def _open(path: Path) -> Iterator[Bag]:
-    """The bag, open; one with an index must be whole, of any other what can be read is taken."""
+    """Open a bag; with an index it must be intact, without one the readable part is taken."""
     try:
         with Bag(path) as bag:
             bag.recover = not bag.indexed

@@ -1,4 +1,4 @@
-"""Finds sequences in folders and archives and reads their files.
+"""Sequences in folders and archives, and their files.
 
 Nothing is ever unpacked on disk: members are read one by one, each under a bound, and a .tar.gz is streamed.
 """
@@ -34,7 +34,9 @@ DEPTH = 4  # folders below the source that are searched
 
 
 def find(source: Path) -> list[Sequence]:
-    """The sequences in a folder, an archive, or a folder of these; unreadable archives in a folder are listed too.
+    """Find the sequences in a folder, an archive, or a folder of these.
+
+    Unreadable archives in a folder are listed too.
 
     Raises:
         DataError: the source does not exist, or is itself an archive that cannot be read.
@@ -53,7 +55,7 @@ def is_bag(path: Path) -> bool:
 
 
 def stem(path: Path) -> str:
-    """The name of an archive without its endings."""
+    """Archive name without its endings."""
     for ending in (*SUFFIXES, BAG):
         if path.name.lower().endswith(ending):
             return path.name[: -len(ending)]
@@ -100,7 +102,7 @@ def _in_file(path: Path) -> list[Sequence]:
 
 
 class Tree:
-    """The files of one ASL sequence, named from its root (`imu0/data.csv`), wherever they lie."""
+    """Files of an ASL sequence in a folder or archive, named from its root."""
 
     def __init__(self, sequence: Sequence) -> None:
         self.sequence = sequence
@@ -119,15 +121,15 @@ class Tree:
         return name in self.sizes
 
     def where(self, name: str) -> str:
-        """The address of a file for messages: archive (or folder) and member."""
+        """Address of a file for messages: archive (or folder) and member."""
         return f"{self.path}/{self._prefix}{name}"
 
     def sensors(self) -> list[str]:
-        """The folders directly below the root that hold a table."""
+        """Sensor folders: those directly below the root that hold a table."""
         return sorted(name.split("/")[0] for name in self.sizes if re.fullmatch(r"[^/]+/data\.csv", name))
 
     def head(self, name: str) -> bytes:
-        """The first bytes of a table; none where there is no such table."""
+        """First bytes of a table; empty without such a table."""
         if name not in self:
             return b""
         if self.path.is_dir():
@@ -139,11 +141,11 @@ class Tree:
             return file.read(HEAD)
 
     def load(self, names: Collection[str]) -> dict[str, bytes]:
-        """Some files whole."""
+        """Load some files completely."""
         return dict(self.each(names))
 
     def each(self, names: Collection[str]) -> Iterator[tuple[str, bytes]]:
-        """Name and content of some files, in the order in which the source holds them.
+        """Yield names and contents of some files, in the order of the source.
 
         Raises:
             DataError: a file is missing, damaged, or larger than its kind may be.
@@ -175,7 +177,10 @@ class Tree:
                 yield name, content
 
     def _each_in_plain_tar(self, names: Collection[str]) -> Iterator[tuple[str, bytes]]:
-        """In the order asked for: a tar's own is often the folder's hash order, and images should come in time."""
+        """Yield the files in the requested order.
+
+        A tar's own order is often a folder's hash order; images should come in time order.
+        """
         with refusing(self.path), self.path.open("rb") as file:
             for name in names:
                 file.seek(self._listing.offsets[self._prefix + name])
@@ -201,7 +206,7 @@ class Tree:
 
 
 def _folder_sizes(root: Path, prefix: str = "") -> dict[str, int]:
-    """Sizes of the files below a folder by their names from it (four times as fast as `Path.rglob`)."""
+    """Sizes of files below a folder (four times as fast as `Path.rglob`)."""
     sizes: dict[str, int] = {}
     with refusing(root), os.scandir(root) as entries:
         for entry in sorted(entries, key=lambda entry: entry.name):

@@ -1,4 +1,4 @@
-"""Reads the tables of ASL folders: exact integer stamps, float64 columns found by header name, a line for every row."""
+"""CSV tables of ASL folders: exact integer stamps, float64 columns by header name."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ ORDERS = {
 
 @dataclass(frozen=True)
 class Table:
-    """Stamps (ns, in the order of the file, not yet checked), values by quantity, and the line of each row."""
+    """Table: unchecked stamps (ns, file order), values by quantity, and line numbers."""
 
     where: str
     t_ns: Int64[np.ndarray, " n"]
@@ -44,11 +44,11 @@ class Table:
     lines: Int64[np.ndarray, " n"]
 
     def fault(self, row: int, what: str, expected: str) -> DataError:
-        """An error at the line of a row."""
+        """Error at the line of a row."""
         return DataError(what, where=f"{self.where}:{self.lines[row]}", expected=expected)
 
     def require(self, *names: str) -> None:
-        """Refuses a table that lacks a quantity or holds a value of it that is no finite number.
+        """Refuse a table that lacks a quantity, or has a value that is not finite.
 
         Raises:
             DataError: at the line and with the value.
@@ -62,7 +62,7 @@ class Table:
                 raise self.fault(row, f"{name} is {self.columns[name][row].tolist()}", "finite numbers")
 
     def check_clock(self) -> None:
-        """Refuses stamps that repeat or go back.
+        """Refuse stamps that repeat or go back.
 
         Raises:
             DataError: at the line, with both stamps.
@@ -74,7 +74,7 @@ class Table:
 
 
 def parse(content: bytes, where: str, kind: str) -> Table:
-    """The table in a file's bytes; `kind` (`imu`, `truth`) says which order its columns have without a header.
+    """Parse a table from bytes; `kind` (`imu`, `truth`) sets the columns without a header.
 
     Raises:
         DataError: empty, no row, a row with another number of columns or a field that is no number (with its line),
@@ -98,13 +98,13 @@ def parse(content: bytes, where: str, kind: str) -> Table:
 
 
 def first_row(head: bytes) -> bytes:
-    """The first row in a table's first bytes (empty where there is none)."""
+    """First row in a table's first bytes (empty if there is none)."""
     lines = head.removeprefix(b"\xef\xbb\xbf").splitlines()
     return next((line for line in lines[_header(lines)[1] :] if line.strip()), b"")
 
 
 def pairs(content: bytes, where: str) -> Iterator[tuple[int, str, int]]:
-    """Stamp (ns), text and line number of the rows of a two-column table, such as a camera's list of images.
+    """Parse a two-column table, such as a camera's image list: stamp (ns), text, line number.
 
     Raises:
         DataError: a row without a stamp or a text, with its line.
@@ -133,7 +133,7 @@ def _lines(content: bytes, where: str) -> list[bytes]:
 
 
 def _header(lines: list[bytes]) -> tuple[list[str], int]:
-    """Names in the last header line, without units, in lower case; and how many lines come before the rows.
+    """Names in the last header line (lower case, without units), and number of header lines.
 
     A header starts with `#`; one without it is taken for a header only on the first line and when no field is a number.
     """
@@ -212,7 +212,7 @@ def _spelled(quantity: str) -> str:
 def _block(
     rows: list[bytes], width: int, where: str, numbers: list[int]
 ) -> tuple[Int64[np.ndarray, " n"], Float64[np.ndarray, "n k"]]:
-    """Stamps and values of some rows; on any fault the rows are gone through again for the first bad line."""
+    """Stamps and values of some rows; after a fault, search the rows for the bad line."""
     fields = list(chain.from_iterable(row.split(b",") for row in rows))
     commas = width - 1
     if len(fields) == width * len(rows) and all(row.count(b",") == commas for row in rows):
@@ -230,7 +230,7 @@ def _block(
 
 
 def _check_row(row: bytes, width: int, where: str) -> None:
-    """The reason why a row cannot be read, if there is one."""
+    """Reason why a row cannot be read, if there is one."""
     fields = row.split(b",")
     if len(fields) != width:
         raise DataError(f"row has {len(fields)} columns: {_shown(row)}", where=where, expected=f"{width} columns")
@@ -259,7 +259,7 @@ def _stamps(texts: list[bytes]) -> Int64[np.ndarray, " n"]:
 
 
 def _stamp(text: bytes) -> int:
-    """Whole nanoseconds from any decimal notation, exactly: `1.691117558834970368e+18` keeps its nineteen digits.
+    """Exact integer nanoseconds of a decimal: `1.691117558834970368e+18` keeps 19 digits.
 
     Raises:
         ValueError: not a number, a fraction of a nanosecond, negative, or beyond 63 bits.

@@ -1,4 +1,6 @@
-"""EuRoC MAV (Burri et al., IJRR 2016): ADIS16448, 200 Hz, Leica or Vicon truth; ASL folder, .zip, .tar or .bag.
+"""EuRoC MAV: ADIS16448, 200 Hz, Leica or Vicon truth; ASL folder, .zip, .tar or .bag.
+
+Source: Burri et al., IJRR 2016.
 
 Frames: the IMU frame is the body frame, `state_groundtruth_estimate0` holds R_world_imu (its T_BS is the identity).
 `vicon0` holds poses of the marker body, not of the IMU; they are kept as they are, their T_BS stands in the metadata.
@@ -24,12 +26,15 @@ BAG_TRUTHS = ("/vicon/firefly_sbx/firefly_sbx",)
 
 
 def sequences(source: Path) -> list[Sequence]:
-    """Every ASL sequence and bag in the source, by the names of their folders or archives."""
+    """Sequences in the source: ASL folders and bags, named like the folder or archive."""
     return find(source)
 
 
 def recognises(sequence: Sequence) -> bool:
-    """ASL folders without motion capture of TUM-VI's kind and with whole-number stamps; bags with /imu0 but no vrpn."""
+    """Whether a sequence is EuRoC: whole-number stamps and no motion capture as in TUM-VI.
+
+    A bag needs /imu0 and no vrpn topic.
+    """
     if is_bag(sequence.path):
         topics = _bag.topics(sequence.path)
         return _asl.IMU_TOPIC in topics and "/vrpn_client/raw_transform" not in topics
@@ -38,7 +43,7 @@ def recognises(sequence: Sequence) -> bool:
 
 
 def read_sequence(sequence: Sequence, *, images: bool = True) -> Recording:
-    """One sequence as a Recording.
+    """Recording of one sequence.
 
     Raises:
         DataError: the sequence contradicts its format, with file and line.
@@ -50,5 +55,5 @@ def read_sequence(sequence: Sequence, *, images: bool = True) -> Recording:
 
 
 def read(source: Path) -> Iterator[Recording]:
-    """Every sequence of the source, one after the other."""
+    """Recordings of all sequences of the source, one after the other."""
     return map(read_sequence, sequences(source))

@@ -1,4 +1,6 @@
-"""FETCH (mobile base, released with the neural-ODE bias paper): 100 Hz, motion capture; ASL folder, archive or .bag.
+"""FETCH mobile base: 100 Hz, motion capture; ASL folder, archive or .bag.
+
+Source: released with the neural-ODE bias paper.
 
 The stamps are nanoseconds printed in scientific notation with 19 digits; they are read exactly, with no float between.
 """
@@ -18,12 +20,15 @@ TRUTHS = {"mocap0": "/ground_truth/pose"}
 
 
 def sequences(source: Path) -> list[Sequence]:
-    """Every ASL sequence and bag in the source, by the names of their folders or archives."""
+    """Sequences in the source: ASL folders and bags, named like the folder or archive."""
     return find(source)
 
 
 def recognises(sequence: Sequence) -> bool:
-    """ASL folders whose stamps are in scientific notation; bags with an IMU (not on /imu0) and PoseStamped truth."""
+    """Whether a sequence is FETCH: stamps in scientific notation.
+
+    A bag needs an IMU (not on /imu0) and PoseStamped truth.
+    """
     if is_bag(sequence.path):
         topics = _bag.topics(sequence.path)
         kinds = set(topics.values())
@@ -32,7 +37,7 @@ def recognises(sequence: Sequence) -> bool:
 
 
 def read_sequence(sequence: Sequence, *, images: bool = True) -> Recording:
-    """One sequence as a Recording.
+    """Recording of one sequence.
 
     Raises:
         DataError: the sequence contradicts its format, with file and line.
@@ -44,5 +49,5 @@ def read_sequence(sequence: Sequence, *, images: bool = True) -> Recording:
 
 
 def read(source: Path) -> Iterator[Recording]:
-    """Every sequence of the source, one after the other."""
+    """Recordings of all sequences of the source, one after the other."""
     return map(read_sequence, sequences(source))

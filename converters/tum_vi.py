@@ -1,4 +1,6 @@
-"""TUM-VI (Schubert et al., IROS 2018): BMI160, 200 Hz, motion capture; ASL folder, .tar, .tar.gz, .zip or .bag.
+"""TUM-VI: BMI160, 200 Hz, motion capture; ASL folder, .tar, .tar.gz, .zip or .bag.
+
+Source: Schubert et al., IROS 2018.
 
 Frames: `mocap0` holds R_world_imu and the IMU's position; a bag's `/vrpn_client/raw_transform` holds the marker body.
 """
@@ -21,7 +23,7 @@ BAG_TRUTHS = ("/vrpn_client/raw_transform",)
 
 
 def sequences(source: Path) -> list[Sequence]:
-    """Every ASL sequence and bag in the source; `dataset-room2_512_16` is named `room2`."""
+    """Sequences in the source; `dataset-room2_512_16` is named `room2`."""
     return [replace(found, name=_short(found.name)) for found in find(source)]
 
 
@@ -31,7 +33,10 @@ def _short(name: str) -> str:
 
 
 def recognises(sequence: Sequence) -> bool:
-    """ASL folders with motion capture and whole-number stamps; bags with the vrpn topic."""
+    """Whether a sequence is TUM-VI: motion capture and whole-number stamps.
+
+    A bag needs the vrpn topic.
+    """
     if is_bag(sequence.path):
         return "/vrpn_client/raw_transform" in _bag.topics(sequence.path)
     tree = Tree(sequence)
@@ -39,7 +44,7 @@ def recognises(sequence: Sequence) -> bool:
 
 
 def read_sequence(sequence: Sequence, *, images: bool = True) -> Recording:
-    """One sequence as a Recording.
+    """Recording of one sequence.
 
     Raises:
         DataError: the sequence contradicts its format, with file and line.
@@ -51,5 +56,5 @@ def read_sequence(sequence: Sequence, *, images: bool = True) -> Recording:
 
 
 def read(source: Path) -> Iterator[Recording]:
-    """Every sequence of the source, one after the other."""
+    """Recordings of all sequences of the source, one after the other."""
     return map(read_sequence, sequences(source))

@@ -19,7 +19,7 @@ def show(epoch: Any) -> None:
 
 def main(model: str, logs: Sequence[str], settings: dict[str, Any]) -> None:
     for log in logs:
-        for warning in imutool.info(log)["warnings"]:
+        for warning in imutool.info(log).warnings:
             print(f"{log}: {warning}")
     trained = imutool.train(logs, model, settings=settings, overwrite=True, progress=show)
     for sensor, figures in trained.card["held_out"].items():

@@ -1,4 +1,4 @@
-"""Typed settings: a frozen `Settings` class per room, read from TOML and `key=value` words, checked by msgspec."""
+"""Typed settings of the rooms, read from TOML and `key=value` words."""
 
 from __future__ import annotations
 
@@ -15,7 +15,10 @@ from imutool.errors import ConfigError
 
 
 class Settings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Base of all settings. Names end in their unit (`window_s`); limits stand in `Annotated[..., msgspec.Meta()]`."""
+    """Base class of all settings, checked by msgspec.
+
+    Names end in their unit (`window_s`); limits stand in `Annotated[..., msgspec.Meta()]`.
+    """
 
 
 S = TypeVar("S", bound=Settings)
@@ -23,7 +26,7 @@ MOST_BYTES = 1 << 20  # of a TOML file: a physics.toml of twenty curves has 50 k
 
 
 def load(cls: type[S], path: Path | None = None, overrides: Iterable[str] = ()) -> S:
-    """Settings of type `cls` from a TOML file, with `key=value` words (dots for tables) laid over it.
+    """Settings from a TOML file; `key=value` words (dots for tables) override it.
 
     Raises:
         ConfigError: file unreadable or not TOML, unknown key (the nearest is named), wrong type, out of range.
@@ -35,7 +38,7 @@ def load(cls: type[S], path: Path | None = None, overrides: Iterable[str] = ()) 
 
 
 def toml(path: Path, what: str) -> dict[str, Any]:
-    """The values in a TOML file of settings, noise or physics; `what` names it in errors.
+    """Values in a TOML file of settings, noise or physics; `what` names it in errors.
 
     Raises:
         ConfigError: file unreadable, not TOML, larger than a megabyte or nested without end.
@@ -58,7 +61,7 @@ def toml(path: Path, what: str) -> dict[str, Any]:
 
 
 def build(cls: type[S], values: dict[str, Any], where: str | Path | None = None) -> S:
-    """Settings of type `cls` from plain values, as they come from TOML or from a model file's header.
+    """Settings from plain values, as in TOML or in a model file's header.
 
     Raises:
         ConfigError: unknown key (the nearest is named), wrong type, out of range, not finite.
@@ -79,7 +82,7 @@ def plain(settings: Settings) -> dict[str, Any]:
 
 
 def _put(values: dict[str, Any], word: str) -> None:
-    """Lays one `a.b=value` word into nested tables; the value is read as TOML, else taken as a string."""
+    """Put a `a.b=value` word into nested tables; the value is TOML, or else a string."""
     key, equals, text = word.partition("=")
     if not equals or not key:
         raise ConfigError(f"{word!r} sets nothing", where="set", expected="key=value")
@@ -96,7 +99,7 @@ def _put(values: dict[str, Any], word: str) -> None:
 
 
 def _refuse_unknown(cls: type[Settings], values: dict[str, Any], where: str | Path | None, prefix: str = "") -> None:
-    """msgspec names an unknown key; this also names the key that was probably meant, at any depth."""
+    """Refuse unknown keys at any depth, and name the nearest known key."""
     fields = {field.encode_name: field.type for field in msgspec.structs.fields(cls)}
     for key, value in values.items():
         if key not in fields:
@@ -113,7 +116,7 @@ def _refuse_unknown(cls: type[Settings], values: dict[str, Any], where: str | Pa
 
 
 def _refuse_infinite(value: Any, where: str | Path | None, place: str = "") -> None:
-    """No setting means anything when infinite or NaN, and TOML can spell both."""
+    """Refuse infinite and NaN values, which TOML can hold."""
     if isinstance(value, float) and not math.isfinite(value):
         raise ConfigError(f"{place} is {value}", where=where or "settings", expected="a finite number")
     if isinstance(value, dict):

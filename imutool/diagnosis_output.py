@@ -1,4 +1,4 @@
-"""What a diagnosis leaves behind: findings.json, physics.toml, report.html, log.html and view.rrd in one folder.
+"""Output folder of a diagnosis: findings.json, physics.toml, report, log and view.
 
 The files are made in a folder beside it and moved when all are there, so that a reader never finds half a diagnosis. Other
 files in the folder, the logs themselves for instance, stay as they are.
@@ -33,24 +33,24 @@ NEEDS = {LOG: DRAWN, REPORT: DRAWN, VIEW: ("rerun", "view")}
 
 
 def refuse(folder: Path, *, overwrite: bool = False) -> None:
-    """Nothing, where a diagnosis may be written; to be asked before hours of work.
+    """Refuse a folder that cannot take a diagnosis; ask before hours of work.
 
     Raises:
         ConfigError: a file of that name, or a diagnosis in it already (without `overwrite`).
     """
     if folder.exists() and not folder.is_dir():
         raise ConfigError("is a file", where=folder, expected="a folder, which need not exist")
-    there = [name for name in FILES if (folder / name).exists()]
-    if there and not overwrite:
+    existing = [name for name in FILES if (folder / name).exists()]
+    if existing and not overwrite:
         raise ConfigError(
-            f"holds a diagnosis already ({', '.join(there)})", where=folder, fix="Choose another folder, or add --overwrite"
+            f"holds a diagnosis already ({', '.join(existing)})", where=folder, fix="Choose another folder, or add --overwrite"
         )
 
 
 def write(
     d: Diagnosis, folder: Path, *, logs: Callable[[Path], list[RunData]] | None = None, overwrite: bool = False
 ) -> list[str]:
-    """Writes the folder; gives a remark for each file that was left out because an extra is not installed.
+    """Write the folder of a diagnosis; return a remark for each file without its extra.
 
     With `logs`, which looks at the logs again with the folder's findings in hand, there is a page of them too.
     A diagnosis that is replaced goes whole: of its files none is kept.
@@ -59,18 +59,18 @@ def write(
         ConfigError: as `refuse`, or the system refuses to write.
     """
     refuse(folder, overwrite=overwrite)
-    place = folder.absolute()  # "." has no name of its own
-    partial = place.parent / f".{place.name}.{os.getpid()}.{secrets.token_hex(4)}.partial"
-    beside = partial / place.name  # what is written names the folder as it will be called
+    target = folder.absolute()  # "." has no name of its own
+    partial = target.parent / f".{target.name}.{os.getpid()}.{secrets.token_hex(4)}.partial"
+    complete = partial / target.name  # what is written names the folder as it will be called
     with _told(folder):
         try:
-            beside.mkdir(parents=True)
-            remarks = _make(d, beside, logs)
+            complete.mkdir(parents=True)
+            remarks = _make(d, complete, logs)
             refuse(folder, overwrite=overwrite)
             if folder.exists():
-                _move(beside, folder)
+                _move(complete, folder)
             else:
-                beside.rename(folder)
+                complete.rename(folder)
         finally:
             with contextlib.suppress(FileNotFoundError):
                 shutil.rmtree(partial)
@@ -117,11 +117,11 @@ def _recording(d: Diagnosis, path: Path) -> None:
     save(d, path)
 
 
-def _move(beside: Path, folder: Path) -> None:
-    """Each file over the old one; an old one without a new one is a stranger's to the new diagnosis, and goes."""
+def _move(complete: Path, folder: Path) -> None:
+    """Replace each file of an old diagnosis; remove those without a new one."""
     for name in FILES:
-        if (beside / name).exists():
-            (beside / name).replace(folder / name)
+        if (complete / name).exists():
+            (complete / name).replace(folder / name)
         else:
             (folder / name).unlink(missing_ok=True)
 

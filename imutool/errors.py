@@ -23,7 +23,7 @@ from typing import ClassVar
 
 
 class ImutoolError(Exception):
-    """Error with four parts: where it happened, what was found, what was expected, what to do.
+    """Error with four parts: place, problem, expectation, fix.
 
     Args:
         what: what happened, with the offending value in it.
@@ -46,11 +46,11 @@ class ImutoolError(Exception):
         return f"{place}{self.what}{expected}.{fix}"
 
     def at(self, where: object) -> ImutoolError:
-        """Return the error with its place filled in, for a caller that knows the file when the raiser did not."""
+        """Error with its place filled in, for a caller that knows the file."""
         return self if self.where is not None else type(self)(self.what, where=where, expected=self.expected, fix=self.fix)
 
     def __reduce__(self) -> tuple[object, ...]:
-        """Pickle with keyword arguments: errors cross process borders when many sequences convert at once."""
+        """Pickle with keyword arguments: errors of worker processes return to the parent."""
         return _rebuild, (type(self), self.what, self.where, self.expected, self.fix)
 
 

@@ -1,4 +1,4 @@
-"""How far pure integration drifts, raw and with each model: the figures of the paper's tables, for any log with true poses."""
+"""Evaluate pure integration, raw and with each model: the paper's error metrics for a log with true poses."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ from imutool.bias.io import check_rate, find_model
 from imutool.bias.model import BiasModel
 from imutool.bias_start.bias_tracking import BiasPrior
 from imutool.bias_start.correction import DebiasedImu, apply
-from imutool.bias_start.initial_bias import AT_REST_STD, LEAST_STD, InitialBias, find
-from imutool.bias_start.model_choice import check_smooth, estimate_at_rest, smooth_in_memory
+from imutool.bias_start.initial_bias import AT_REST_STD, LEAST_STD, InitialBias
+from imutool.bias_start.model_choice import check_smooth, estimate_at_rest, find_initial_bias, smooth_in_memory
 from imutool.bias_start.zero_velocity import zero_velocity_trajectory
 from imutool.errors import ConfigError
 from imutool.inertial import metrics
@@ -88,7 +88,7 @@ def evaluate(
 
 
 def _drift(path: Poses, truth: Poses, valid: Bool[np.ndarray, " n"]) -> dict[str, float | None]:
-    """What windows that each start from the truth drift by: root mean squares, none where no window fits."""
+    """Drift of windows that start from the truth: root mean squares, None if no window fits."""
     found = drift(path, truth, valid, DRIFT_S)
     if not len(found.orientation_rad):
         return {"drift_orientation_deg": None, "drift_velocity_m_s": None, "drift_window_s": DRIFT_S}
@@ -103,7 +103,7 @@ def _over(imu: Imu, true: Poses) -> Imu:
 
 
 def _left(start: InitialBias | None) -> BiasPrior:
-    """What may be left of the bias after debiasing: the start's uncertainty, or anything where nothing was taken off."""
+    """Prior of the residual bias: the start's standard deviation, or a wide one for raw samples."""
     std = np.array(RAW_STD) if start is None else np.maximum(start.std, LEAST_STD)
     return BiasPrior(np.zeros(6), std, AT_REST_STD)
 
@@ -111,7 +111,7 @@ def _left(start: InitialBias | None) -> BiasPrior:
 def runs(
     recording: Recording, models: Sequence[str | Path], init: str, where: str | Path, *, smooth: bool = False
 ) -> Iterator[tuple[str, DebiasedImu, InitialBias | None]]:
-    """The samples as recorded, then as each model corrects them: name, samples and bias, and the start."""
+    """Samples as recorded, then corrected by each model: name, samples and bias, initial bias."""
     check_smooth(init, smooth)
     yield RAW, DebiasedImu(recording.imu, np.zeros((len(recording.imu), 6))), None
     for name, model, start in started(recording, models, init, where, smooth=smooth):
@@ -121,7 +121,7 @@ def runs(
 def started(
     recording: Recording, models: Sequence[str | Path], init: str, where: str | Path, *, smooth: bool = False
 ) -> Iterator[tuple[str, BiasModel, InitialBias]]:
-    """Each model asked for, its name, and the start it gets in this recording."""
+    """Model name, model and initial bias in this recording, for each requested model."""
     check_smooth(init, smooth)
     for given in models:
         model, start = _model_and_start(given, recording, init, where, smooth)
@@ -139,7 +139,7 @@ def _model_and_start(
         check_rate(model, 1.0 / recording.imu.period_s, where)
     if smooth:
         return model, smooth_in_memory(model, recording.imu, where)
-    return model, find(init, model, recording)
+    return model, find_initial_bias(init, model, recording)
 
 
 def _refuse_twins(models: Sequence[str | Path]) -> None:
@@ -147,7 +147,7 @@ def _refuse_twins(models: Sequence[str | Path]) -> None:
     names = [Path(model).stem for model in models]
     for name in names:
         if names.count(name) > 1:
-            raise ConfigError(f"two models are called {name!r}", where="--trajectories", fix="Rename one of the files")
+            raise ConfigError(f"two models are called {name!r}", where="trajectories", fix="Rename one of the files")
 
 
 def _write(folder: Path, log: str, model: str, estimate: Poses, true: Poses, valid: Any, *, overwrite: bool) -> None:

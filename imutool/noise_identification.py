@@ -1,7 +1,6 @@
-"""The noise of the IMU in a log: at rest by its Allan deviation, in motion by what is left against the truth.
+"""Noise of an IMU from a log: Allan deviation at rest, and residuals against the truth in motion.
 
-Rest is believed before motion: there, nothing but the sensor (and what shakes it) is in the samples. What the log cannot show
-is left unknown, and the report says why.
+Rest has priority: there the samples hold only noise and vibration. A value that the log does not show stays unknown.
 """
 
 from __future__ import annotations
@@ -9,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float64
@@ -24,26 +23,22 @@ from imutool.noise import datasheet as noise
 from imutool.noise.allan import Curve, Slopes
 from imutool.noise.datasheet import UNITS, Noise
 from imutool.recording import Imu, Recording
+from imutool.units import SENSORS, Sensor
 
-Sensor = Literal["gyro", "accel"]
-SENSORS: tuple[Sensor, Sensor] = ("gyro", "accel")
 KINDS = ("density", "walk", "instability")  # of each sensor, as `Noise` has them
 VIBRATES = 2.0  # times the white variance at shorter averaging times: more than any filter or misfit
-SURE = 10.0  # differences worth this many independent ones bound a density from above
-CHANCE = 0.002  # that one averaging time puts the bound too low
-SHORT = 2.5  # samples: over longer windows a vibration of the samples averages out, and is no measure of what must be left
-MADE_FROM_IT = 0.25  # of a sample's white noise: an independent truth disagrees by more than that
-EXPLAINED = 3.0  # times a sample's white noise: what is above comes from the truth or the calibration
+LEAST_FREEDOM = 10.0  # degrees of freedom that an averaging time needs to bound a density from above
+BOUND_RISK = 0.002  # probability that one averaging time puts the bound too low
+SHORT = 2.5  # samples: over longer windows vibration averages out, and no longer bounds the residual from below
+DEPENDENT_TRUTH = 0.25  # of a sample's white noise: an independent truth differs by more
+EXPLAINED = 3.0  # times a sample's white noise: a larger residual comes from the truth or the calibration
 UNKNOWN: list[float | None] = [None] * 3
-WINDOWS_S: Mapping[Sensor, tuple[float, float]] = {
-    "gyro": (1.0, 4.0),
-    "accel": (0.5, 2.0),
-}  # for the calibration on the log itself
+WINDOWS_S: Mapping[Sensor, tuple[float, float]] = {"gyro": (1.0, 4.0), "accel": (0.5, 2.0)}  # of the calibration
 
 
 @dataclass(frozen=True)
 class CurveSource:
-    """One way of seeing the noise: over how many seconds, in words, the curve of each sensor, and what its slopes say."""
+    """Allan curves of both sensors from one source: its name in words, seconds, curves and their slopes."""
 
     how: str
     seconds: float
@@ -52,25 +47,23 @@ class CurveSource:
 
     @classmethod
     def of(cls, how: str, seconds: float, curves: Mapping[Sensor, Curve]) -> CurveSource:
-        """The sight with its slopes read off."""
+        """Source with the slopes of its curves."""
         return cls(how, seconds, curves, {sensor: allan.slopes(curve) for sensor, curve in curves.items()})
 
     def axes(self, sensor: Sensor, kind: str) -> list[float | None]:
-        """What was seen, by axis."""
-        return [one.seen.get(kind) for one in self.slopes[sensor]]
+        """Noise value of one kind, by axis."""
+        return [slopes.seen.get(kind) for slopes in self.slopes[sensor]]
 
 
 @dataclass(frozen=True)
 class IdentifiedNoise:
-    """The noise, with what it was read from and what has to be said about it."""
+    """Identified noise with its sources, bounds and remarks."""
 
     log: str
     topic: str
     noise: Noise
-    at_most: Mapping[Sensor, list[float | None]]  # density of each sensor, as rest bounds it from above
-    samples: Mapping[
-        Sensor, Float64[np.ndarray, "3"]
-    ]  # density of each sensor as the second differences of its samples have it
+    at_most: Mapping[Sensor, list[float | None]]  # upper bound of each sensor's density from rest
+    samples: Mapping[Sensor, Float64[np.ndarray, "3"]]  # density of each sensor from the second differences of its samples
     at_rest: CurveSource | None
     in_motion: CurveSource | None
     remarks: list[str]
@@ -79,13 +72,13 @@ class IdentifiedNoise:
 def identify(
     path: Location, *, imu: str | None = None, truth: str | None = None, model: str | Path | None = None
 ) -> IdentifiedNoise:
-    """The noise of one IMU of a log, from its time at rest and, where there is truth, from its motion.
+    """Noise of one IMU of a log: from rest, and with true poses from motion.
 
     In motion the samples are first corrected: by `model`, else by a matrix and a constant fitted to this log's own truth.
 
     Raises:
-        DataError: the log neither rests nor has a truth that shows anything.
-        LogError, ConfigError, ModelError: the log or the model cannot be used.
+        DataError: the log neither rests nor has a usable truth.
+        LogError, ConfigError, ModelError: the log or the model is not usable.
     """
     allan.library()
     recording = read(path, imu=imu, truth=truth)
@@ -101,63 +94,59 @@ def identify(
             remarks.append(f"in motion: {error.what}")
     else:
         remarks.append("in motion: the log has no true poses")
-    samples = {
-        sensor: white_noise(u) * np.sqrt(recording.imu.period_s)
-        for sensor, u in zip(SENSORS, _columns(recording.imu), strict=True)
-    }
+    root_s = np.sqrt(recording.imu.period_s)
+    samples = {sensor: white_noise(getattr(recording.imu, sensor)) * root_s for sensor in SENSORS}
     at_most = {sensor: _bound(rest.curves[sensor]) if rest is not None else UNKNOWN for sensor in SENSORS}
-    found = _combine(rest, motion, samples, at_most, recording.imu.period_s, remarks)
+    combined = _combine(rest, motion, samples, at_most, recording.imu.period_s, remarks)
     if rest is None and motion is None:
         raise DataError(
-            "the log shows no noise: " + "; ".join(remarks),
+            f"the log shows no noise: {'; '.join(remarks)}",
             where=path,
             expected="a stretch at rest, or true poses",
-            fix="Record the sensor at rest, for hours if its bias walk is wanted",
+            fix="Record the sensor at rest, for hours to see its bias walk",
         )
-    return IdentifiedNoise(recording.name, recording.imu_topic, found, at_most, samples, rest, motion, remarks)
+    return IdentifiedNoise(recording.name, recording.imu_topic, combined, at_most, samples, rest, motion, remarks)
 
 
 def _at_rest(imu: Imu, remarks: list[str]) -> CurveSource | None:
-    found = rest_stretches(imu)
-    if not found:
+    stretches = rest_stretches(imu)
+    if not stretches:
         remarks.append("at rest: the log never rests")
         return None
-    lengths = [float(imu.t_ns[b - 1] - imu.t_ns[a]) * 1e-9 for a, b in found]
-    curves = {
-        sensor: allan.curve([u[a:b] for a, b in found], imu.period_s) for sensor, u in zip(SENSORS, _columns(imu), strict=True)
-    }
-    sight = CurveSource.of(f"{_duration(sum(lengths))} at rest", sum(lengths), curves)
+    parts = [imu.rows(slice(*bounds)) for bounds in stretches]
+    total_s = sum(part.duration_s for part in parts)
+    curves = {sensor: allan.curve([getattr(part, sensor) for part in parts], imu.period_s) for sensor in SENSORS}
+    source = CurveSource.of(f"{_duration(total_s)} at rest", total_s, curves)
     for sensor in SENSORS:
-        shaken = ["xyz"[axis] for axis, one in enumerate(sight.slopes[sensor]) if _vibrates(one)]
-        if shaken:
+        vibrating = ["xyz"[axis] for axis, slopes in enumerate(source.slopes[sensor]) if _vibrates(slopes)]
+        if vibrating:
             remarks.append(
-                f"at rest: the {sensor}'s deviation on {', '.join(shaken)} does not fall as tau^-1/2 from the shortest times "
-                "on: something vibrates (idling motors?), and what is read there is no data-sheet noise"
+                f"at rest: the {sensor}'s deviation on {', '.join(vibrating)} does not fall as tau^-1/2 from the shortest on: "
+                "something vibrates (idling motors?), so its noise is above the data sheet's"
             )
-        if all(walk is None for walk in sight.axes(sensor, "walk")) and len(curves[sensor].tau_s):
+        if all(walk is None for walk in source.axes(sensor, "walk")) and len(curves[sensor].tau_s):
             longest = float(curves[sensor].tau_s[-1])
             remarks.append(f"at rest: no bias walk of the {sensor} shows up to averages of {_duration(longest)}")
-    return sight
+    return source
 
 
-def _vibrates(one: Slopes) -> bool:
-    return one.excess > VIBRATES or "quantisation" in one.seen or not one.powers
+def _vibrates(slopes: Slopes) -> bool:
+    return slopes.excess > VIBRATES or "quantisation" in slopes.seen or not slopes.powers
 
 
 def _in_motion(recording: Recording, model: str | Path | None, path: Location) -> CurveSource:
-    """Deviation of what is left of the samples against the truth.
+    """Allan deviation of the residuals against the truth.
 
     Raises:
         DataError: too little truth.
-        ModelError: a model that cannot be used with this log.
+        ModelError: a model that does not fit this log.
     """
     from imutool.noise.residual import curves
 
     corrected, by = _by_model(recording, model, path) if model is not None else _by_fit(recording)
     both = dict(zip(SENSORS, curves(corrected, recording.truth), strict=True))
-    seconds = recording.overlap().imu.duration_s
-    topic = next(iter(recording.truths))
-    return CurveSource.of(f"{_duration(seconds)} in motion against {topic}, {by}", seconds, both)
+    length_s, topic = recording.overlap().imu.duration_s, next(iter(recording.truths))
+    return CurveSource.of(f"{_duration(length_s)} in motion against {topic}, {by}", length_s, both)
 
 
 def _by_model(recording: Recording, model: str | Path, path: Location) -> tuple[Imu, str]:
@@ -168,10 +157,10 @@ def _by_model(recording: Recording, model: str | Path, path: Location) -> tuple[
 
 
 def _by_fit(recording: Recording) -> tuple[Imu, str]:
-    """Samples less the matrix and the constant that this log's truth asks for: a wrong scale is no noise.
+    """Samples corrected by a matrix and a constant fitted to this log's truth: a wrong scale is not noise.
 
-    A bias that walks far bends the matrix too: a walk of 0.006 rad/s/sqrt(s) was read a third too large after this fit, and a
-    tenth with the true matrix. Data sheets have a hundredth of it.
+    A large bias walk disturbs the matrix: a walk of 0.006 rad/s/sqrt(s) came out a third too large after this fit, and a tenth
+    too large with the true matrix. Data sheets list a hundredth of that walk.
     """
     import torch
 
@@ -180,11 +169,12 @@ def _by_fit(recording: Recording) -> tuple[Imu, str]:
     from imutool.training.segments import Pool
 
     pool = Pool.of([recording])
-    known = static.Model(rate_hz=pool.rate_hz).double()
+    model = static.Model(rate_hz=pool.rate_hz).double()
     rest = torch.zeros(1, 6, dtype=torch.float64)
     corrected = []
-    for column, (sensor, u) in enumerate(zip(SENSORS, _columns(recording.imu), strict=True)):
-        solution = closed_form.solve(known, sensor, pool, rest, WINDOWS_S[sensor], matrix=True, part="all")
+    for column, sensor in enumerate(SENSORS):
+        u = getattr(recording.imu, sensor)
+        solution = closed_form.solve(model, sensor, pool, rest, WINDOWS_S[sensor], matrix=True, part="all")
         rest[:, 3 * column : 3 * column + 3] = solution.rest
         corrected.append(u - u @ solution.W.numpy().T - solution.rest.numpy())
     return Imu(recording.imu.t_ns, *corrected), "corrected by a matrix and a constant fitted to it"
@@ -198,25 +188,23 @@ def _combine(
     period_s: float,
     remarks: list[str],
 ) -> Noise:
-    """The noise from both sights, rest first; from motion only on axes on which it shows the sensor alone."""
+    """Noise from rest, else from motion on axes where the residual is the sensor's own noise."""
     values: dict[str, list[float | None]] = dict.fromkeys(UNITS, UNKNOWN)
     sources: dict[str, str] = {}
     for sensor in SENSORS:
-        believed = (
-            [False] * 3
-            if motion is None
-            else _well_determined(sensor, motion, samples[sensor], at_most[sensor], period_s, remarks)
-        )
+        accepted = [False] * 3
+        if motion is not None:
+            accepted = _well_determined(sensor, motion, samples[sensor], at_most[sensor], period_s, remarks)
         for kind in KINDS:
             name = f"{sensor}_{kind}"
             still = UNKNOWN if rest is None else rest.axes(sensor, kind)
-            if kind == "density":  # a fit to vibration may claim more than the least that was seen
+            if kind == "density":  # a fit to vibration may exceed the upper bound
                 still = [s if s is None or b is None or s <= b else None for s, b in zip(still, at_most[sensor], strict=True)]
             moving = UNKNOWN if motion is None or kind == "instability" else motion.axes(sensor, kind)
-            values[name] = [s if s is not None else m if b else None for s, m, b in zip(still, moving, believed, strict=True)]
+            values[name] = [s if s is not None else m if b else None for s, m, b in zip(still, moving, accepted, strict=True)]
             used = (rest, still != UNKNOWN), (motion, values[name] != still)
-            if ways := [sight.how for sight, is_used in used if sight is not None and is_used]:
-                sources[name] = "; ".join(ways)
+            if names := [source.how for source, is_used in used if source is not None and is_used]:
+                sources[name] = "; ".join(names)
     return build(Noise, {**values, "sources": sources})
 
 
@@ -228,86 +216,83 @@ def _well_determined(
     period_s: float,
     remarks: list[str],
 ) -> list[bool]:
-    """Axes on which motion shows the sensor's own noise, and words about those on which it does not."""
+    """Axes on which motion shows the sensor's own noise; remarks explain the others."""
     curve = motion.curves[sensor]
     shortest = curve.deviation[0] * np.sqrt(curve.tau_s[0])
-    if curve.tau_s[0] < SHORT * period_s and float(np.median(shortest / np.maximum(sample, 1e-300))) < MADE_FROM_IT:
+    if curve.tau_s[0] < SHORT * period_s and float(np.median(shortest / np.maximum(sample, 1e-300))) < DEPENDENT_TRUTH:
         remarks.append(
-            f"in motion: the truth follows the {sensor} more closely than the {sensor}'s own noise lets an independent one: "
-            "it was made from it, and shows nothing of it"
+            f"in motion: the truth follows the {sensor} more closely than the {sensor}'s own noise allows for independent "
+            "truth: it was computed from the same samples, and does not show their noise"
         )
         return [False] * 3
     density = [np.inf if value is None else value for value in motion.axes(sensor, "density")]
     ratio = np.array(density) / np.maximum(sample, 1e-300)
     if (ratio > EXPLAINED).any():
         remarks.append(
-            f"in motion: more of the {sensor}'s error is left than the noise of its samples explains; "
-            "it is the truth's, or the calibration's"
+            f"in motion: the {sensor}'s residual is larger than the noise of its samples explains; "
+            "the rest comes from the truth or the calibration"
         )
     bounds = [np.inf if value is None else value for value in at_most]
     return [bool(r <= EXPLAINED and d <= bound) for r, d, bound in zip(ratio, density, bounds, strict=True)]
 
 
 def _bound(curve: Curve) -> list[float | None]:
-    """The least that deviation * sqrt(tau) comes to, by axis, at the end of its confidence: white noise cannot be more."""
+    """Upper bound of the white density by axis: least of deviation * sqrt(tau) with its confidence."""
     from scipy.special import gammaincinv
 
-    sure = curve.freedom >= SURE
-    if not sure.any():
+    enough = curve.freedom >= LEAST_FREEDOM
+    if not enough.any():
         return UNKNOWN
-    freedom = curve.freedom[sure]
-    stretch = np.sqrt(freedom / (2.0 * gammaincinv(freedom / 2.0, CHANCE)))  # the quantile of chi²
-    seen = curve.deviation[sure] * (np.sqrt(curve.tau_s[sure]) * stretch)[:, None]
-    return [float(value) for value in seen.min(axis=0)]
-
-
-def _columns(imu: Imu) -> tuple[Float64[np.ndarray, "n 3"], Float64[np.ndarray, "n 3"]]:
-    return imu.gyro, imu.accel
+    freedom = curve.freedom[enough]
+    stretch = np.sqrt(freedom / (2.0 * gammaincinv(freedom / 2.0, BOUND_RISK)))  # the quantile of chi²
+    bounds = curve.deviation[enough] * (np.sqrt(curve.tau_s[enough]) * stretch)[:, None]
+    return [float(value) for value in bounds.min(axis=0)]
 
 
 def _duration(seconds: float) -> str:
     return f"{seconds / 3600:.1f} h" if seconds >= 5400 else f"{seconds / 60:.1f} min" if seconds >= 90 else f"{seconds:.3g} s"
 
 
-def plain(found: IdentifiedNoise) -> dict[str, Any]:
-    """Everything found as plain JSON values: null is what the log cannot show."""
-    report: dict[str, Any] = {"imu": found.topic, **noise.plain(found.noise)}
-    report["at_most"] = {f"{sensor}_density": axes for sensor, axes in found.at_most.items()}
-    report["samples"] = {f"{sensor}_density": axes.tolist() for sensor, axes in found.samples.items()}
-    for name, sight in (("at_rest", found.at_rest), ("in_motion", found.in_motion)):
-        report[name] = None if sight is None else _plain_sight(sight)
-    return {**report, "remarks": list(found.remarks)}
+def plain(identified: IdentifiedNoise) -> dict[str, Any]:
+    """Identified noise as plain JSON values; null where the log does not show it."""
+    report: dict[str, Any] = {"imu": identified.topic, **noise.plain(identified.noise)}
+    report["at_most"] = {f"{sensor}_density": axes for sensor, axes in identified.at_most.items()}
+    report["samples"] = {f"{sensor}_density": axes.tolist() for sensor, axes in identified.samples.items()}
+    for name, source in (("at_rest", identified.at_rest), ("in_motion", identified.in_motion)):
+        report[name] = None if source is None else _plain_source(source)
+    return {**report, "remarks": list(identified.remarks)}
 
 
-def _plain_sight(sight: CurveSource) -> dict[str, Any]:
-    report: dict[str, Any] = {"how": sight.how, "seconds": sight.seconds}
+def _plain_source(source: CurveSource) -> dict[str, Any]:
+    report: dict[str, Any] = {"how": source.how, "seconds": source.seconds}
     for sensor in SENSORS:
-        curve = sight.curves[sensor]
+        curve = source.curves[sensor]
         report[sensor] = {
-            **{kind: sight.axes(sensor, kind) for kind in KINDS},
-            **{f"{kind}_std": [one.std.get(kind) for one in sight.slopes[sensor]] for kind in KINDS},
-            "holds_from_s": [one.from_s if one.powers else None for one in sight.slopes[sensor]],
+            **{kind: source.axes(sensor, kind) for kind in KINDS},
+            **{f"{kind}_std": [slopes.std.get(kind) for slopes in source.slopes[sensor]] for kind in KINDS},
+            "holds_from_s": [slopes.from_s if slopes.powers else None for slopes in source.slopes[sensor]],
             "tau_s": curve.tau_s.tolist(),
             "deviation": curve.deviation.tolist(),
         }
     return report
 
 
-def rows(found: IdentifiedNoise) -> list[tuple[str, ...]]:
-    """What was found as rows of text for a table, the first its header."""
+def rows(identified: IdentifiedNoise) -> list[tuple[str, ...]]:
+    """Identified noise as rows of text for a table, the first its header."""
     table: list[tuple[str, ...]] = [("noise", "x", "y", "z", "unit", "source")]
     for name, unit in UNITS.items():
-        table.append((name, *map(_number, getattr(found.noise, name)), unit, found.noise.sources.get(name, "not seen")))
+        source = identified.noise.sources.get(name, "not seen")
+        table.append((name, *map(_number, getattr(identified.noise, name)), unit, source))
+    motion = identified.in_motion
     for sensor in SENSORS:
         name, unit = f"{sensor}_density", UNITS[f"{sensor}_density"]
-        if found.at_rest is not None and None in getattr(found.noise, name):
-            table.append((f"{name} at most", *map(_number, found.at_most[sensor]), unit, found.at_rest.how))
-        table.append((f"{name} of samples", *map(_number, found.samples[sensor]), unit, "second differences of the samples"))
-        for kind in ("density", "walk"):
-            axes = UNKNOWN if found.in_motion is None else found.in_motion.axes(sensor, kind)
-            if found.in_motion is not None and axes != UNKNOWN:
-                name = f"{sensor}_{kind}"
-                table.append((f"{name} in motion", *map(_number, axes), UNITS[name], found.in_motion.how))
+        if identified.at_rest is not None and None in getattr(identified.noise, name):
+            table.append((f"{name} at most", *map(_number, identified.at_most[sensor]), unit, identified.at_rest.how))
+        differences = map(_number, identified.samples[sensor])
+        table.append((f"{name} of samples", *differences, unit, "second differences of the samples"))
+        if motion is not None:
+            axes = {f"{sensor}_{kind}": motion.axes(sensor, kind) for kind in ("density", "walk")}
+            table += [(f"{n} in motion", *map(_number, v), UNITS[n], motion.how) for n, v in axes.items() if v != UNKNOWN]
     return table
 
 

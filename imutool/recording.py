@@ -1,8 +1,7 @@
-"""What a log means in memory: immutable, validated arrays on integer-nanosecond clocks.
+"""Recording of a log in memory: immutable, validated arrays on integer-nanosecond clocks.
 
-Everything in the project passes through a `Recording`; at rest everything is MCAP, and `read(write(r)) == r` bit for bit.
-Time is int64 nanoseconds here; `seconds` is the one function that turns it into the float seconds of the mathematics,
-always relative to a start (float64 seconds at an epoch of 2014 are only good to 384 ns).
+All data pass through a `Recording`; files are MCAP, and `read(write(r)) == r` bit for bit. Time is int64 nanoseconds. Only
+`seconds` converts it to float seconds, always relative to a start (float64 seconds at an epoch of 2014 resolve 384 ns only).
 """
 
 from __future__ import annotations
@@ -15,113 +14,30 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float64, Int64
 
+from imutool.columns import Columns
 from imutool.errors import DataError
 from imutool.geometry import quaternion
 
 GRAVITY_M_S2 = 9.81
-UNIT_QUATERNION_TOLERANCE = 1e-6  # six printed decimals, as in the EuRoC truth after normalising
-GAP_FACTOR = 4.0  # a hole is this many median periods without truth
-MIN_GAP_S = 0.08  # but never shorter than this: a 20 Hz truth, or the 70 ms jitter of FETCH, is no gap
+UNIT_QUATERNION_TOLERANCE = 1e-6  # six printed decimals, as in the normalised EuRoC truth
+GAP_FACTOR = 4.0  # length of a gap in the truth, in median periods
+MIN_GAP_S = 0.08  # least length of a gap: a 20 Hz truth, and the 70 ms jitter of FETCH, have no gap
 
 Times = Int64[np.ndarray, " n"]
 
 
 def seconds(t_ns: Int64[np.ndarray, "*n"], start_ns: int) -> Float64[np.ndarray, "*n"]:
-    """Seconds since `start_ns`; the subtraction is done on integers, so nothing is rounded before it is small."""
+    """Seconds since `start_ns`; the subtraction is exact because it uses integers."""
     return (t_ns - np.int64(start_ns)).astype(np.float64) * 1e-9
 
 
 def nanoseconds(duration_s: float) -> int:
-    """A duration in whole nanoseconds."""
+    """Nanoseconds of a duration, rounded to an integer."""
     return round(duration_s * 1e9)
 
 
-class _Columns:
-    """Shared by the array types: freeze, check the clock, compare bit for bit, slice by row or by time."""
-
-    t_ns: Times
-
-    def _freeze(self) -> None:
-        for column in fields(self):  # type: ignore[arg-type]
-            value = getattr(self, column.name)
-            if isinstance(value, np.ndarray):
-                if not (value.flags.c_contiguous and _is_fixed(value)):
-                    value = np.array(value, order="C")
-                    value.flags.writeable = False
-                object.__setattr__(self, column.name, value)
-
-    def _check(self, **shapes: tuple[int, ...]) -> None:
-        """Types, lengths, finite values, strictly increasing time; the message names the row."""
-        kind = type(self).__name__
-        if self.t_ns.dtype != np.int64 or self.t_ns.ndim != 1:
-            raise DataError(f"{kind}.t_ns is {self.t_ns.dtype}{list(self.t_ns.shape)}", expected="int64[n]")
-        for name, tail in shapes.items():
-            value = getattr(self, name)
-            if value is None:
-                continue
-            if value.dtype != np.float64 or value.shape != (len(self.t_ns), *tail):
-                raise DataError(
-                    f"{kind}.{name} is {value.dtype}{list(value.shape)}",
-                    expected=f"float64{[len(self.t_ns), *tail]}",
-                )
-            if not np.isfinite(value).all():
-                row = int(np.argmin(np.isfinite(value).reshape(len(value), -1).all(axis=1)))
-                raise DataError(f"{kind}.{name} row {row} is {value[row].tolist()}", expected="finite numbers")
-        backward = np.flatnonzero(np.diff(self.t_ns) <= 0)
-        if len(backward):
-            row = int(backward[0]) + 1
-            raise DataError(
-                f"{kind} time goes from {self.t_ns[row - 1]} to {self.t_ns[row]} ns at row {row}",
-                expected="strictly increasing stamps",
-            )
-
-    def __len__(self) -> int:
-        return len(self.t_ns)
-
-    def __eq__(self, other: object) -> bool:
-        if type(other) is not type(self):
-            return NotImplemented
-        return all(_same(getattr(self, c.name), getattr(other, c.name)) for c in fields(self))  # type: ignore[arg-type]
-
-    __hash__ = None  # type: ignore[assignment]
-
-    def __reduce__(self) -> tuple[object, ...]:
-        """Arrays come out of a pickle writeable; the constructor fixes them again."""
-        return type(self), tuple(getattr(self, c.name) for c in fields(self))  # type: ignore[arg-type]
-
-    def rows(self, index: slice | Bool[np.ndarray, " n"]) -> Any:
-        """The same columns at some rows."""
-        cut = {
-            c.name: value[index]
-            for c in fields(self)  # type: ignore[arg-type]
-            if isinstance(value := getattr(self, c.name), np.ndarray)
-        }
-        return replace(self, **cut)  # type: ignore[type-var]
-
-    def between(self, start_ns: int, end_ns: int) -> Any:
-        """The rows with `start_ns <= t_ns <= end_ns`."""
-        first, last = np.searchsorted(self.t_ns, start_ns), np.searchsorted(self.t_ns, end_ns, side="right")
-        return self.rows(slice(int(first), int(last)))
-
-    @property
-    def period_s(self) -> float:
-        """Median time between rows.
-
-        Raises:
-            DataError: fewer than two rows.
-        """
-        if len(self.t_ns) < 2:
-            raise DataError(f"{type(self).__name__} has {len(self.t_ns)} rows", expected="at least 2")
-        return float(np.median(np.diff(self.t_ns))) * 1e-9
-
-    @property
-    def duration_s(self) -> float:
-        """Time from the first row to the last."""
-        return float(self.t_ns[-1] - self.t_ns[0]) * 1e-9 if len(self.t_ns) else 0.0
-
-
 @dataclass(frozen=True, eq=False)
-class Imu(_Columns):
+class Imu(Columns):
     """Angular rate (rad/s) and specific force (m/s², at rest it reads +g up) in the body frame b, as measured."""
 
     t_ns: Times
@@ -129,13 +45,13 @@ class Imu(_Columns):
     accel: Float64[np.ndarray, "n 3"]
 
     def __post_init__(self) -> None:
-        self._freeze()
-        self._check(gyro=(3,), accel=(3,))
+        self.freeze()
+        self.check(gyro=(3,), accel=(3,))
 
 
 @dataclass(frozen=True, eq=False)
-class Poses(_Columns):
-    """Where the body is in the world (m), `q_wb` taking body vectors to world, and its world velocity (m/s) if known."""
+class Poses(Columns):
+    """Poses of the body in the world (m); `q_wb` takes body vectors to world; world velocity (m/s) if known."""
 
     t_ns: Times
     p_wb: Float64[np.ndarray, "n 3"]
@@ -143,20 +59,19 @@ class Poses(_Columns):
     v_w: Float64[np.ndarray, "n 3"] | None = None
 
     def __post_init__(self) -> None:
-        self._freeze()
-        self._check(p_wb=(3,), q_wb_wxyz=(4,), v_w=(3,))
+        self.freeze()
+        self.check(p_wb=(3,), q_wb_wxyz=(4,), v_w=(3,))
         error = np.abs(quaternion.length(self.q_wb_wxyz) - 1.0)
         if len(error) and error.max() > UNIT_QUATERNION_TOLERANCE:
             row = int(np.argmax(error))
             raise DataError(f"Poses.q_wb_wxyz row {row} is {self.q_wb_wxyz[row].tolist()}", expected="norm 1")
 
     def at(self, t_ns: Times, max_gap_s: float | None = None) -> tuple[Poses, Bool[np.ndarray, " n"]]:
-        """Poses at other times, and where they can be trusted.
+        """Poses interpolated at other times, and a mask of the valid ones.
 
         Position (and velocity) linearly, orientation by slerp along the shorter arc. The mask is false before the first
         pose, after the last, and inside a gap longer than `max_gap_s` (by default four median periods, at least
-        80 ms). Masked rows hold the end's pose or what lies across the gap, so that
-        every row stays a valid one.
+        80 ms). Masked rows hold the pose of the end or the interpolation across the gap.
 
         Raises:
             DataError: fewer than two poses.
@@ -179,31 +94,31 @@ class Poses(_Columns):
 
 
 @dataclass(frozen=True, eq=False)
-class Scalars(_Columns):
-    """Any other numeric channel on its own clock: one column (a temperature) or three (a vector), and its unit."""
+class Scalars(Columns):
+    """Numeric channel on its own clock: one column (a temperature) or three (a vector), and its unit."""
 
     t_ns: Times
     values: Float64[np.ndarray, "n k"]
     unit: str = ""
 
     def __post_init__(self) -> None:
-        self._freeze()
-        self._check(values=self.values.shape[1:])
+        self.freeze()
+        self.check(values=self.values.shape[1:])
         if self.values.ndim != 2 or self.values.shape[1] not in (1, 3):
             raise DataError(f"Scalars.values is {list(self.values.shape)}", expected="[n, 1] or [n, 3]")
 
 
 @dataclass(frozen=True)
 class Frames:
-    """Camera frames that stay in their source: opened only to be copied, in the order the source holds them."""
+    """Camera frames that stay in their source; a writer copies them in the order of the source."""
 
     format: str
     count: int
-    each: Callable[[], Iterator[tuple[int, bytes]]]  # (t_ns, the encoded image, byte for byte)
+    each: Callable[[], Iterator[tuple[int, bytes]]]  # (t_ns, bytes of the encoded image)
 
 
 def _mapping(value: Mapping[str, Any]) -> Mapping[str, Any]:
-    """A copy that cannot be changed, nor what mappings are in it."""
+    """Read-only copy of a mapping and the mappings in it."""
     return MappingProxyType({k: _mapping(v) if isinstance(v, Mapping) else v for k, v in value.items()})
 
 
@@ -213,10 +128,10 @@ def _dict(value: Any) -> Any:
 
 @dataclass(frozen=True, eq=False)
 class Recording:
-    """One IMU, what is known of the truth, and everything else that came with them.
+    """Recording of one IMU with its true poses, scalar channels, camera frames and metadata.
 
-    `truths` and `scalars` are keyed by topic (`/ground_truth/pose`), `frames` likewise, `metadata` by record name.
-    Frames are not compared: they are copied byte for byte by the writer, and a test there holds it to that.
+    `truths`, `scalars` and `frames` are keyed by topic (`/ground_truth/pose`), `metadata` by record name. Equality ignores
+    frames: the writer copies them byte for byte, which its tests check.
     """
 
     name: str
@@ -241,12 +156,12 @@ class Recording:
     __hash__ = None  # type: ignore[assignment]
 
     def __reduce__(self) -> tuple[object, ...]:
-        """Mapping proxies do not pickle; plain dicts do (recordings cross to worker processes)."""
+        """Pickle with plain dicts, because mapping proxies do not pickle (recordings go to worker processes)."""
         return type(self), tuple(_dict(getattr(self, f.name)) for f in fields(self))
 
     @property
     def truth(self) -> Poses:
-        """The first true trajectory.
+        """First true trajectory.
 
         Raises:
             DataError: the recording has none.
@@ -256,10 +171,10 @@ class Recording:
         return next(iter(self.truths.values()))
 
     def with_truth(self, topic: str) -> Recording:
-        """The same recording with one of its true trajectories alone.
+        """Recording with only one of its true trajectories.
 
         Raises:
-            DataError: no such topic; the message lists those there are.
+            DataError: no such topic; the message lists the available ones.
         """
         if topic not in self.truths:
             raise DataError(
@@ -268,7 +183,7 @@ class Recording:
         return replace(self, truths={topic: self.truths[topic]})
 
     def between(self, start_ns: int, end_ns: int) -> Recording:
-        """Everything but the frames, cut to `start_ns <= t_ns <= end_ns`."""
+        """Recording without frames, cut to `start_ns <= t_ns <= end_ns`."""
         return replace(
             self,
             imu=self.imu.between(start_ns, end_ns),
@@ -278,7 +193,7 @@ class Recording:
         )
 
     def overlap(self) -> Recording:
-        """The stretch in which both the IMU and the (first) truth exist.
+        """Recording cut to the time that IMU and (first) truth share.
 
         Raises:
             DataError: no truth, or the two share less than two samples.
@@ -293,10 +208,10 @@ class Recording:
 
 
 def unit_quaternions(q_wxyz: Float64[np.ndarray, "n 4"], tolerance: float = 1e-2) -> Float64[np.ndarray, "n 4"]:
-    """Quaternions made unit; rows that already are (to 1e-9) keep every bit.
+    """Unit quaternions; rows that already are unit (to 1e-9) keep every bit.
 
     Raises:
-        DataError: a norm is further than `tolerance` from one; the message names the row.
+        DataError: a norm differs from one by more than `tolerance`; the message names the row.
     """
     norm = np.linalg.norm(q_wxyz, axis=1)
     bad = ~(np.abs(norm - 1.0) <= tolerance)
@@ -310,22 +225,3 @@ def _interpolate(
     t: Float64[np.ndarray, " n"], knots: Float64[np.ndarray, " m"], values: Float64[np.ndarray, "m k"]
 ) -> Float64[np.ndarray, "n k"]:
     return np.stack([np.interp(t, knots, column) for column in values.T], axis=1)
-
-
-def _same(a: object, b: object) -> bool:
-    """Equal to the last bit (so that -0.0 and 0.0 differ, as they do in a file)."""
-    if isinstance(a, np.ndarray) or isinstance(b, np.ndarray):
-        if not (isinstance(a, np.ndarray) and isinstance(b, np.ndarray)):
-            return False
-        return a.dtype == b.dtype and a.shape == b.shape and a.tobytes() == b.tobytes()
-    return bool(a == b)
-
-
-def _is_fixed(array: np.ndarray) -> bool:
-    """Whether nobody can write to an array, also not through the one it is a view of."""
-    owner: object = array
-    while isinstance(owner, np.ndarray):
-        if owner.flags.writeable:
-            return False
-        owner = owner.base
-    return owner is None or isinstance(owner, bytes)

@@ -1,4 +1,4 @@
-"""Finds converters, bias models and effects: one file each, its name the key, or an entry point of another package."""
+"""Registry of converters, bias models, effects and rules: one file or entry point each."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ NOT_PLUGINS = {"imutool.bias": frozenset({"io", "joint_ode", "model", "neural_st
 
 
 def names(group: str) -> list[str]:
-    """The keys of a group, sorted, without importing any of them (so listing the bias models costs no torch)."""
+    """Sorted keys of a group, without an import: a list of bias models needs no torch."""
     return sorted(_own(group) | {point.name for point in entry_points(group=group)})
 
 
 def _own(group: str) -> set[str]:
-    """The keys that are files of this package."""
+    """Keys of the files in this package."""
     spec = importlib.util.find_spec(GROUPS[group])
     places = list(spec.submodule_search_locations or ()) if spec else []
     found = {module.name for module in pkgutil.iter_modules(places) if not module.name.startswith("_")}
@@ -36,7 +36,7 @@ def _own(group: str) -> set[str]:
 
 
 def load(group: str, name: str) -> ModuleType:
-    """The module behind a key.
+    """Module of a key.
 
     Raises:
         ConfigError: no such key; the message names the nearest.
@@ -54,7 +54,10 @@ def load(group: str, name: str) -> ModuleType:
 
 
 def every(group: str) -> dict[str, ModuleType]:
-    """All modules of a group by key, sorted: what is installed is searched for entry points once, not for each key."""
+    """Modules of a group by key, sorted.
+
+    The entry points are listed once, not for each key.
+    """
     points = {point.name: point for point in entry_points(group=group)}
     return {name: _loaded(group, name, points) for name in sorted(_own(group) | set(points))}
 
@@ -68,7 +71,7 @@ def _loaded(group: str, name: str, points: dict[str, EntryPoint]) -> ModuleType:
 
 
 def summary(group: str, name: str) -> str:
-    """The first line of a module's docstring, read from its source so that it is not imported; empty where there is none."""
+    """First line of a module's docstring, without an import; empty if there is none."""
     outside = {point.name: point.module for point in entry_points(group=group)}
     try:
         spec = importlib.util.find_spec(outside.get(name, f"{GROUPS[group]}.{name}"))

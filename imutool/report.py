@@ -1,4 +1,4 @@
-"""Reports for programs: typed Structs, their JSON values, and their JSON Schema.
+"""JSON reports: typed Structs, their JSON values, and their JSON Schema.
 
 A command's `--json` report is one `Report`: a frozen msgspec Struct whose tag is the first key, `"schema": "imutool.NAME/1"`.
 Objects inside it are `Section`s. Text output reads the same Structs. To add a report: derive it, name it in `REPORTS`.
@@ -37,8 +37,8 @@ REPORTS = {
     "export": "imutool.cli.convert:Export",
     "fleet": "imutool.fleet.results:FleetSummary",
     "fleet-diagnosis": "imutool.fleet.robots:FleetDiagnosis",
-    "info": "imutool.log_report:LogInfo",
-    "infos": "imutool.log_report:LogInfos",
+    "info": "imutool.log_info.report:LogInfo",
+    "infos": "imutool.log_info.report:LogInfos",
     "models": "imutool.cli.shipped:Models",
     "repair": "imutool.cli.repair:Repair",
     "score": "imutool.blind_cases.cases:OpenedCase",
@@ -51,22 +51,25 @@ REPORTS = {
 
 
 class Section(msgspec.Struct, frozen=True):
-    """An object inside a report; numpy scalars and arrays may stand for its numbers and lists."""
+    """Section of a report; numbers and lists may be numpy scalars and arrays."""
 
 
 class Report(msgspec.Struct, frozen=True, tag_field="schema"):
-    """What a command reports; a subclass gives its schema's name and version as `tag`."""
+    """Report of a command; the `tag` of a subclass is its schema's name and version."""
 
 
 def json_values(report: msgspec.Struct | Mapping[str, Any]) -> dict[str, Any]:
-    """The report as plain JSON values: arrays as lists, paths as text, NaN and infinity as null; unset keys are left out."""
+    """Plain JSON values of a report: arrays as lists, paths as text.
+
+    NaN and infinity become null; unset keys are left out.
+    """
     values = _finite(msgspec.to_builtins(report, enc_hook=_plain))
     assert isinstance(values, dict)
     return values
 
 
 def report_type(name: str) -> type[Report]:
-    """The type of a report by its name, `info` or `imutool.info/1`.
+    """Report type by name: `info` or `imutool.info/1`.
 
     Raises:
         ConfigError: no report has this name; the message names the nearest.
@@ -98,7 +101,7 @@ def json_schema(name: str) -> dict[str, Any]:
 
 
 def _plain(value: Any) -> Any:
-    """numpy arrays and scalars as Python's (without an import of numpy), anything else as text."""
+    """Python values of numpy arrays and scalars (without an import of numpy), else text."""
     return value.tolist() if hasattr(value, "tolist") else str(value)
 
 

@@ -5,6 +5,7 @@ The installed command, made-up logs and a model trained on them are here too, fo
 
 from __future__ import annotations
 
+import logging
 import os
 import signal
 import subprocess
@@ -41,6 +42,16 @@ def data() -> Path:
     if not DATA.is_dir():
         pytest.skip(f"real recordings are not at {DATA}")
     return DATA
+
+
+@pytest.fixture(autouse=True)
+def logging_as_before() -> Iterator[None]:
+    """Restores the log levels that a command in this process sets: with --quiet later tests would see no warnings."""
+    loggers = [logging.getLogger(name) for name in (None, "imutool")]
+    levels = [logger.level for logger in loggers]
+    yield
+    for logger, level in zip(loggers, levels, strict=True):
+        logger.setLevel(level)
 
 
 @pytest.fixture(scope="session")
@@ -97,7 +108,7 @@ def made_once(factory: pytest.TempPathFactory, name: str, make: Callable[[Path],
 def logs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with flight_1.mcap and flight_2.mcap (20 s, 200 Hz, 3 s at rest), linear.safetensors of the first."""
     from imutool.mcap_io.write import write
-    from imutool.sensor.flight import flight
+    from imutool.sensor.made_up_flight import flight
     from imutool.training.run import train
 
     def make(folder: Path) -> None:

@@ -19,7 +19,7 @@ import numpy as np
 import pytest
 
 import imutool
-from imutool.demo import write_asl
+from imutool.cli.demo import write_asl
 
 ROOT = Path(__file__).parents[1]
 IMPORT_SHARE = 0.1  # of the time that `import torch` takes

@@ -21,13 +21,13 @@ import pytest
 from mcap_ros2.writer import Writer
 
 from imutool.bias import io
-from imutool.demo import write_asl
+from imutool.cli.demo import write_asl
 from imutool.errors import ConfigError
 from imutool.mcap_io.codec import schemas
 from imutool.mcap_io.log import Log
 from imutool.mcap_io.storage.target import Target
 from imutool.mcap_io.write import write
-from imutool.sensor.flight import flight
+from imutool.sensor.made_up_flight import flight
 
 Run = Callable[..., subprocess.CompletedProcess[str]]
 Refuse = Callable[..., str]

@@ -17,7 +17,7 @@ from imutool.config import MOST_BYTES, Settings, build, load, plain
 from imutool.errors import ConfigError
 from imutool.inertial.stationary import StationarySettings
 from imutool.noise.datasheet import read as read_noise
-from imutool.sensor.flight import FlightSettings
+from imutool.sensor.made_up_flight import FlightSettings
 from imutool.sensor.physics_file import read as read_physics
 from imutool.training.fit import TrainSettings
 

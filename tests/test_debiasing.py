@@ -20,21 +20,14 @@ from rosbags.highlevel import AnyReader
 from imutool.bias import linear, neural_ode, static
 from imutool.bias.io import load, save
 from imutool.bias.model import BiasModel, Segment
+from imutool.bias_start.bias_at_rest import at_rest, auto
+from imutool.bias_start.bias_from_truth import from_truth
 from imutool.bias_start.correction import OnlineDebiaser, apply
-from imutool.bias_start.initial_bias import (
-    InitialBias,
-    at_rest,
-    auto,
-    from_numbers,
-    from_truth,
-    prior,
-    smoothed_start,
-    tracked_from_prior,
-)
+from imutool.bias_start.initial_bias import InitialBias, from_numbers, prior, smoothed_start, tracked_from_prior
 from imutool.bias_start.model_choice import estimate_at_rest
 from imutool.cleaning import CleaningSettings
 from imutool.cli.debias import assigned
-from imutool.conversion import convert
+from imutool.conversion.run import convert
 from imutool.debiasing import debias
 from imutool.errors import ConfigError, LogError, ModelError
 from imutool.mcap_io.codec import schemas
@@ -45,7 +38,7 @@ from imutool.mcap_io.read import read
 from imutool.mcap_io.storage.source import Source, sha256
 from imutool.mcap_io.write import write
 from imutool.recording import Frames, Recording, Scalars, seconds
-from imutool.sensor.flight import flight
+from imutool.sensor.made_up_flight import flight
 
 RATE_HZ = 200.0
 ONLINE = 1e-6  # rad/s and m/s²: the contract's figure
@@ -611,7 +604,7 @@ def test_a_topic_that_is_no_imu_is_refused(source: Path, model_file: Path, tmp_p
     for topic in ("/imu9", "/ground_truth/pose"):
         with pytest.raises(LogError, match=topic):
             debias(source, tmp_path / "out.mcap", model=model_file, imus=[topic])
-    with pytest.raises(ConfigError, match="--init"):
+    with pytest.raises(ConfigError, match="init"):
         debias(source, tmp_path / "out.mcap", model=model_file, init="sometimes")
     assert not (tmp_path / "out.mcap").exists()
 

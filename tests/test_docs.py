@@ -51,7 +51,7 @@ def test_every_command_and_option_stands_in_the_reference(site: Path) -> None:
 
     text = text_of(site / "reference" / "commands.html")
     root = typer.main.get_command(app)
-    assert len(COMMANDS) >= 16
+    assert len(root.commands) >= len(COMMANDS)
     for name, command in root.commands.items():
         assert f"imutool {name}" in text
         for option in (word for parameter in command.params for word in parameter.opts if word.startswith("--")):

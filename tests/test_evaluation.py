@@ -19,7 +19,7 @@ from scipy.spatial.transform import Rotation
 
 from imutool.bias import linear
 from imutool.bias.io import save
-from imutool.conversion import convert
+from imutool.conversion.run import convert
 from imutool.errors import ConfigError, DataError, LogError, ModelError, NumericsError
 from imutool.evaluation import evaluate, runs
 from imutool.inertial import metrics
@@ -27,7 +27,7 @@ from imutool.inertial.metrics import DISTANCES_M
 from imutool.inertial.strapdown import along_truth
 from imutool.mcap_io.write import write
 from imutool.recording import Imu, Poses, Recording
-from imutool.sensor.flight import ACCEL_BIAS, GYRO_BIAS, FlightSettings, TriadSettings, flight
+from imutool.sensor.made_up_flight import ACCEL_BIAS, GYRO_BIAS, FlightSettings, TriadSettings, flight
 
 # AOE of the raw samples in degrees, unaligned, from the true start: the published column (method.md), rooms as in issue 2.
 PUBLISHED = {

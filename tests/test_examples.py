@@ -13,9 +13,9 @@ from pathlib import Path
 
 import pytest
 
+from imutool.cli.demo import write_asl
 from imutool.debiasing import debias
-from imutool.demo import write_asl
-from imutool.sensor.flight import flight
+from imutool.sensor.made_up_flight import flight
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
 SAMPLES = 4001  # 20 s at 200 Hz, both ends included

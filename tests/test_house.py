@@ -20,18 +20,18 @@ from typing import Any
 import pytest
 
 from imutool import __version__
-from imutool.demo import write_asl
-from imutool.sensor.flight import flight
+from imutool.cli.demo import write_asl
+from imutool.sensor.made_up_flight import flight
 
 ROOT = Path(__file__).parents[1]
 
 # docs/architecture.md, Rooms: lower never imports higher. A room is a module of imutool or a folder of them.
 TIERS = (
     ("errors",),
-    ("config", "location", "registry", "report", "units", "geometry", "recording"),
+    ("columns", "config", "location", "registry", "report", "units", "geometry", "recording"),
     ("inertial", "mcap_io", "bag"),
     ("noise", "cleaning"),
-    ("sensor", "log_info", "log_report", "exporting"),
+    ("sensor", "log_info", "exporting"),
     ("bias",),
     ("bias_start",),
     ("debiasing",),
@@ -40,7 +40,7 @@ TIERS = (
     ("viewing", "vio"),
     ("diagnosis_output",),
     ("fleet",),
-    ("demo", "api"),
+    ("api",),
     ("cli",),
 )
 LEVEL = {room: level for level, rooms in enumerate(TIERS) for room in rooms}
@@ -118,6 +118,30 @@ def test_the_order_is_really_looked_at() -> None:
     ]
 
 
+# Floors of imutool/diagnosis, lowest first: report and settings, estimator, one scalar signal, the diagnosis, sentences.
+DIAGNOSIS = "imutool.diagnosis"
+DIAGNOSIS_FLOORS = (
+    tuple(f"{DIAGNOSIS}.{module}" for module in ("result", "settings")),
+    (f"{DIAGNOSIS}.estimation",),
+    (f"{DIAGNOSIS}.localization",),  # of the IMU and of scalar signals
+    (f"{DIAGNOSIS}.scalar",),
+    (DIAGNOSIS,),
+    (f"{DIAGNOSIS}.wording",),
+)
+
+
+def floor_of(module: str) -> int:
+    """The floor in `DIAGNOSIS_FLOORS` whose name is the longest beginning of a module's name."""
+    floors = {name: level for level, names in enumerate(DIAGNOSIS_FLOORS) for name in names}
+    return floors[max((name for name in floors if f"{module}.".startswith(f"{name}.")), key=len)]
+
+
+def test_lower_floors_of_the_diagnosis_never_import_higher_ones() -> None:
+    inside = {name: tree for name, tree in IMUTOOL.items() if name.startswith(f"{DIAGNOSIS}.")}
+    pairs = [(name, other) for name, tree in inside.items() for other in imports(tree, set(IMUTOOL)) if other in inside]
+    assert [f"{name} imports {other}" for name, other in pairs if floor_of(other) > floor_of(name)] == []
+
+
 def test_no_two_modules_import_each_other() -> None:
     """But for the package itself, which imports its public names when they are first used."""
     known = set(EVERYTHING) - {"imutool"}
@@ -186,6 +210,10 @@ def test_functions_are_short() -> None:
 FIRST_LINE = 90  # characters of a docstring's first line
 
 
+def is_overload(node: ast.FunctionDef | ast.ClassDef) -> bool:
+    return any(isinstance(d, ast.Name) and d.id == "overload" for d in node.decorator_list)
+
+
 def is_private(name: str) -> bool:
     return any(part.startswith("_") and not part.startswith("__") for part in name.split("."))
 
@@ -210,7 +238,7 @@ def test_every_public_function_and_class_says_in_one_line_what_it_is() -> None:
     found = []
     for name, tree in EVERYTHING.items():
         for node in tree.body:
-            if isinstance(node, ast.FunctionDef | ast.ClassDef) and not node.name.startswith("_"):
+            if isinstance(node, ast.FunctionDef | ast.ClassDef) and not (node.name.startswith("_") or is_overload(node)):
                 line = (ast.get_docstring(node) or "").partition("\n")[0]
                 if not 0 < len(line) <= FIRST_LINE:
                     found.append(f"{name}.{node.name}: {line}")

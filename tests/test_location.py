@@ -18,7 +18,7 @@ import pytest
 from imutool.debiasing import debias
 from imutool.errors import ConfigError, LogError
 from imutool.location import BLOCK_BYTES, reason, same_location, to_location
-from imutool.log_info import inspect
+from imutool.log_info.inspection import inspect
 from imutool.mcap_io.log import Log
 from imutool.mcap_io.rewrite import rewrite
 from imutool.mcap_io.storage import upload

@@ -5,12 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from imutool import conversion, log_info
 from imutool.api.paths import LogPath, local, location
-from imutool.conversion import ConvertReport
+from imutool.conversion import run as conversion
+from imutool.conversion.run import ConvertReport
 from imutool.exporting.export import export as export_log
 from imutool.exporting.folder import ExportReport
-from imutool.log_report import LogInfo
+from imutool.log_info import inspection
+from imutool.log_info.report import LogInfo
 from imutool.mcap_io.read import read as read_log
 from imutool.mcap_io.write import write as write_log
 from imutool.recording import Recording
@@ -148,7 +149,7 @@ def info(path: LogPath, *, check: bool = True) -> LogInfo:
         >>> report.imu[0].topic, round(report.imu[0].rate_hz)
         ('/imu0', 200)
     """
-    return log_info.inspect(location(path), check=check)
+    return inspection.inspect(location(path), check=check)
 
 
 def export(

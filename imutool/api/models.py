@@ -17,9 +17,10 @@ from imutool.api.paths import LogPath, location
 from imutool.bias import static
 from imutool.bias.io import find_model, shipped_for
 from imutool.bias.model import BiasModel
+from imutool.bias_start.bias_at_rest import at_rest
 from imutool.bias_start.correction import apply_with_std
-from imutool.bias_start.initial_bias import InitialBias, at_rest, find
-from imutool.bias_start.model_choice import check_smooth, smooth_in_memory
+from imutool.bias_start.initial_bias import InitialBias
+from imutool.bias_start.model_choice import check_smooth, find_initial_bias, smooth_in_memory
 from imutool.debiasing import DebiasReport
 from imutool.errors import ConfigError
 from imutool.recording import Imu, Recording
@@ -196,5 +197,5 @@ def _model_and_start(recording: Recording, model: Model | None, init: str, smoot
         ((name, chosen, start),) = evaluation.started(recording, [given], init, recording.name, smooth=smooth)
         return name, chosen, start
     check_smooth(init, smooth)
-    start = smooth_in_memory(model, recording.imu, recording.name) if smooth else find(init, model, recording)
+    start = smooth_in_memory(model, recording.imu, recording.name) if smooth else find_initial_bias(init, model, recording)
     return str(model.card.get("name", model.method)), model, start

@@ -14,7 +14,7 @@ from imutool.api.paths import LogPath, local, location
 from imutool.diagnosis.diagnose import diagnose as diagnose_logs
 from imutool.diagnosis.result import Diagnosis
 from imutool.recording import Recording
-from imutool.sensor.flight import FlightSettings, flight
+from imutool.sensor.made_up_flight import FlightSettings, flight
 from imutool.sensor.simulate import Simulation
 from imutool.sensor.simulate import simulate as simulate_log
 

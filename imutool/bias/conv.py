@@ -1,20 +1,20 @@
-"""A convolutional correction: dilated causal convolutions over two and a half seconds of samples, beside a matrix.
+"""Convolutional bias model: a matrix, and dilated causal convolutions over 2.5 s of samples.
 
 Brossard, Bonnabel and Barrau correct a gyro by omega_hat = C omega + net(last samples of gyro and accel); here, as a bias::
 
     b_k = rest + (I - C) u_k - (N(x_{k-510..k}) - N(0))
 
 with x all six measured channels in units of their spread in the training data. N is four convolutions of kernel 7 and
-dilations 1, 4, 16, 64, each with batch norm, GELU and dropout, and a linear layer. The accelerometer has a network of its own
-of the same form, on the same six channels. N(0), the answer to no rate and no force for all time, is taken off so that a
-model adds nothing to the rest bias where there is no motion; being a constant, it goes into the rest bias of every run.
+dilations 1, 4, 16, 64, each with batch norm, GELU and dropout, and a linear layer. The accelerometer has its own network
+of the same form, on the same six channels. N(0) is the output for zero rate and zero force for all time. It is subtracted so
+that a model without motion adds nothing to the rest bias; as a constant, it is part of the rest bias of every run.
 
-Before the first sample of a segment or log that sample is taken to have stood for ever (replicate padding, as in the original).
-Samples are counted, not timed: a gap between them goes unnoticed, and a model belongs to one rate.
+Before the first sample of a segment or log the input is that sample (replicate padding, as in the original). The network
+counts samples and ignores their stamps: it does not see gaps, and a model belongs to one rate.
 
-In training the network computes in float32 (three times as fast; its weights stay float64), at work in float64 with the batch
-norm folded into the convolutions. The original is for the gyro alone and has no rest bias a run; it starts C at the identity,
-where this starts from the closed form unless told otherwise (`start`).
+Training computes in float32 (three times as fast; the weights stay float64), inference in float64 with the batch norm folded
+into the convolutions. The original is for the gyro only and has no rest bias per run. It starts C at the identity; here C
+starts from the closed form, unless `start` says `identity`.
 """
 
 from __future__ import annotations
@@ -40,14 +40,14 @@ Channels = Annotated[tuple[Annotated[int, msgspec.Meta(ge=1, le=512)], ...], msg
 Dilations = Annotated[tuple[Annotated[int, msgspec.Meta(ge=1, le=1024)], ...], msgspec.Meta(min_length=1, max_length=8)]
 Array = Float64[np.ndarray, "..."]
 
-EPSILON = 1e-5  # under a variance's root, and the momentum of its running mean: batch norm's usual figures
+EPSILON = 1e-5  # under the root of a variance; with the momentum of the running mean, batch norm's usual values
 MOMENTUM = 0.1
-LEAST_SCALE = (1e-2, 1e-2, 1e-2, 1e-1, 1e-1, 1e-1)  # rad/s, m/s²: a channel that never moved is not blown up
-BLOCK = 2048  # samples a stream convolves at once, so that its memory does not grow with what it is given
+LEAST_SCALE = (1e-2, 1e-2, 1e-2, 1e-1, 1e-1, 1e-1)  # rad/s, m/s²: limits the gain of a channel without motion
+BLOCK = 2048  # samples that a stream convolves at once: bounds its memory
 
 
 class Config(Settings, frozen=True):
-    """Sizes, and where a unit of the networks' output lies; channels and dilations one a layer, dilations in samples."""
+    """Sizes and output units of the networks; one channel count and one dilation (samples) per layer."""
 
     channels: Channels = (16, 32, 64, 128)
     dilations: Dilations = (1, 4, 16, 64)
@@ -59,15 +59,15 @@ class Config(Settings, frozen=True):
 
 
 class FoldedLayer(NamedTuple):
-    """A layer at work, on deviations from what it gives without motion: y = GELU(weight * x + there) - GELU(there)."""
+    """Layer with folded batch norm, for deviations from rest: y = GELU(weight * x + offset) - GELU(offset)."""
 
     weight: Float[Tensor, "after before kernel"]
-    there: Float[Tensor, " after"]
+    offset: Float[Tensor, " after"]
     dilation: int
 
 
 class Layer(nn.Module):
-    """Convolution, batch norm, GELU, dropout; the convolution has no constant, the batch norm brings one."""
+    """Convolution, batch norm, GELU, dropout; only the batch norm has a constant."""
 
     def __init__(self, before: int, after: int, kernel: int, dilation: int, dropout: float) -> None:
         super().__init__()
@@ -81,24 +81,24 @@ class Layer(nn.Module):
         self.register_buffer("var", torch.ones(after))
 
     def forward(self, x: Float[Tensor, "batch before n"]) -> Float[Tensor, "batch after n"]:
-        """The layer as it is in training, in the precision of what it is given, or unfolded."""
+        """Output of the unfolded layer, in the precision of its input."""
         y = functional.conv1d(causal(x, self.reach), self.weight.to(x), dilation=self.dilation)
         mean, var = self.mean.to(x), self.var.to(x)
         y = functional.batch_norm(y, mean, var, self.gain.to(x), self.shift.to(x), self.training, MOMENTUM, EPSILON)
-        if self.training:  # batch_norm has moved the two, which may be copies
+        if self.training:  # batch_norm updated the two, which may be copies
             self.mean.copy_(mean)
             self.var.copy_(var)
         return functional.dropout(functional.gelu(y), self.dropout, self.training)
 
     def folded(self, x: Float[Tensor, " before"]) -> FoldedLayer:
-        """The layer at work, around what it gives for a constant input."""
+        """Folded layer for deviations from the constant input `x`."""
         gain = self.gain * (self.var + EPSILON).rsqrt()
         weight = self.weight * gain[:, None, None]
         return FoldedLayer(weight, weight.sum(2) @ x + self.shift - self.mean * gain, self.dilation)
 
 
 class Net(nn.Module):
-    """N: six channels in, a correction of three out; zero until it is trained."""
+    """Network N: six channels to a correction of three; zero before training."""
 
     def __init__(self, config: Config, unit: float) -> None:
         super().__init__()
@@ -112,41 +112,41 @@ class Net(nn.Module):
         self.register_buffer("scale", torch.tensor([1.0, 1.0, 1.0, 10.0, 10.0, 10.0]))
 
     def forward(self, u: Float[Tensor, "batch n 6"]) -> Float[Tensor, "batch n 3"]:
-        """N(x) in training, where N(0) would be the answer of weights that are not there yet; N(x) - N(0) at work."""
-        return self._in_training(u) if self.training else self._at_work(u)
+        """N(x) in training, where the weights still change; N(x) - N(0) in inference."""
+        return self._training_output(u) if self.training else self._inference_output(u)
 
-    def _in_training(self, u: Float[Tensor, "batch n 6"]) -> Float[Tensor, "batch n 3"]:
+    def _training_output(self, u: Float[Tensor, "batch n 6"]) -> Float[Tensor, "batch n 3"]:
         x = ((u - self.centre) / self.scale).mT.float()
         for layer in self.layers:
             x = layer(x)
         y: Tensor = (self.unit * (self.out.to(x) @ x)).mT.to(u)
         return y
 
-    def _at_work(self, u: Float[Tensor, "batch n 6"]) -> Float[Tensor, "batch n 3"]:
+    def _inference_output(self, u: Float[Tensor, "batch n 6"]) -> Float[Tensor, "batch n 3"]:
         x = (u / self.scale).mT
-        for weight, there, dilation in self.folded():
+        for weight, offset, dilation in self.folded():
             reach = (weight.shape[2] - 1) * dilation
-            y = functional.conv1d(causal(x, reach), weight, there, dilation=dilation)
-            x = functional.gelu(y) - functional.gelu(there)[:, None]
+            y = functional.conv1d(causal(x, reach), weight, offset, dilation=dilation)
+            x = functional.gelu(y) - functional.gelu(offset)[:, None]
         return (self.unit * (self.out @ x)).mT
 
     def at_rest(self) -> Float[Tensor, "3"]:
-        """N(0): the answer to no rate and no force, for all time."""
-        level: Tensor = self.unit * (self.out @ functional.gelu(self.folded()[-1].there))
+        """N(0): output for zero rate and zero force for all time."""
+        level: Tensor = self.unit * (self.out @ functional.gelu(self.folded()[-1].offset))
         return level
 
     def folded(self) -> list[FoldedLayer]:
-        """The layers at work; the first is given u / scale, the deviation of its input from that of no motion."""
-        x, found = -self.centre / self.scale, []
+        """Folded layers; the input of the first is u / scale, the deviation from zero motion."""
+        x, layers = -self.centre / self.scale, []
         for layer in self.layers:
             assert isinstance(layer, Layer)
-            found.append(layer.folded(x))
-            x = functional.gelu(found[-1].there)
-        return found
+            layers.append(layer.folded(x))
+            x = functional.gelu(layers[-1].offset)
+        return layers
 
 
 class Model(BiasModel):
-    """b = rest + (I - C) u - (N(x) - N(0)) for gyro and accel apart; see the module's head.
+    """Bias b = rest + (I - C) u - (N(x) - N(0)), for gyro and accel separately.
 
     Source: Brossard, Bonnabel and Barrau, "Denoising IMU Gyroscopes with Deep Learning for Open-Loop Attitude Estimation",
     RA-L 2020, arXiv:2002.10718, eq. 5 to 9 and fig. 2.
@@ -173,7 +173,7 @@ class Model(BiasModel):
             raise ConfigError(
                 f"{len(chosen.channels)} channels and {len(chosen.dilations)} dilations",
                 where="model.channels",
-                expected="one of each a layer",
+                expected="one of each per layer",
             )
         super().__init__(chosen, rate_hz)
         self.W = nn.ParameterDict({sensor: nn.Parameter(torch.zeros(3, 3)) for sensor in SENSORS})  # I - C
@@ -181,7 +181,7 @@ class Model(BiasModel):
         self.context = (chosen.kernel - 1) * sum(chosen.dilations)
 
     def see(self, gyro: Float[Tensor, "n 3"], accel: Float[Tensor, "n 3"]) -> None:
-        """Takes the mean and the spread of each channel as its origin and unit."""
+        """Set origin and unit of each channel to its mean and standard deviation."""
         u = torch.cat([gyro, accel], dim=1)
         scale = torch.maximum(u.std(0), u.new_tensor(LEAST_SCALE))
         for sensor in SENSORS:
@@ -190,24 +190,24 @@ class Model(BiasModel):
             net.scale.copy_(scale)
 
     def rest_at_work(self, sensor: Sensor, rest: Float[Tensor, "*logs 3"]) -> Float[Tensor, "*logs 3"]:
-        """Less N(0), which is not taken off the network in training but is at work."""
+        """Rest biases minus N(0), which only inference subtracts from the network."""
         return rest - self._net(sensor).at_rest().detach()
 
     def sensor_bias(self, sensor: Sensor, segment: Segment) -> Float[Tensor, "batch n 3"]:
-        """rest + W u - N at each sample."""
+        """Bias rest + W u - N at each sample."""
         u, rest = segment.of(sensor)
         W: Tensor = self.W[sensor]
         correction: Tensor = self._net(sensor)(torch.cat([segment.gyro, segment.accel], dim=-1))
         return rest[:, None] + u @ W.mT - correction
 
     def begin_at(self, sensor: Sensor, W: Float[Tensor, "3 3"]) -> None:
-        """The matrix beside the network; with the original's start, nothing."""
+        """Set the matrix W; with `start="identity"` do nothing."""
         if self.config.start == "closed_form":
             with torch.no_grad():
                 self.W[sensor].copy_(W)
 
     def stream(self, rest: Vector6) -> Stream:
-        """The same in numpy; each layer keeps the last of its inputs that its convolution reaches."""
+        """Bias stream in numpy; each layer keeps the inputs that its convolution reaches."""
         return _Stream(self, rest)
 
     def _net(self, sensor: Sensor) -> Net:
@@ -217,15 +217,15 @@ class Model(BiasModel):
 
 
 def causal(x: Float[Tensor, "batch channels n"], reach: int) -> Float[Tensor, "batch channels m"]:
-    """Padded on the left with its first sample, which equals padding the very first layer's input with its first sample.
+    """Pad on the left with the first sample; equals padding the input of the first layer.
 
-    All that a layer sees of the time before is then constant, and so is what it answers.
+    A constant input before the first sample gives a constant output of every layer.
     """
     return functional.pad(x, (reach, 0), mode="replicate") if reach else x
 
 
 class _Stream:
-    """Both networks over samples as they come."""
+    """Bias stream of both networks."""
 
     def __init__(self, model: Model, rest: Vector6) -> None:
         self.rest = rest.astype(np.float64)
@@ -251,18 +251,18 @@ class _Stream:
 
 
 class _Convolution:
-    """One layer on samples as they come.
+    """Causal convolution of one layer on a stream.
 
-    The past lies before the present in one buffer, where a sample's taps are rows at even distances; only when the buffer is
-    full is the past moved to its front, so that a single sample costs no copy of it.
+    One buffer holds past and present inputs, so the taps of a sample are rows at equal distances. The past moves to the front
+    only when the buffer is full: a single sample costs no copy.
     """
 
     def __init__(self, folded: FoldedLayer) -> None:
         out, channels, self.kernel = folded.weight.shape
         self.dilation, self.reach = folded.dilation, (self.kernel - 1) * folded.dilation
         self.weight = _array(folded.weight).transpose(2, 1, 0).reshape(self.kernel * channels, out).copy()
-        self.there, self.level = _array(folded.there), _array(functional.gelu(folded.there))
-        self.buffer, self.end = np.empty((self.reach + BLOCK, channels)), -1  # -1: nothing seen yet
+        self.offset, self.level = _array(folded.offset), _array(functional.gelu(folded.offset))
+        self.buffer, self.end = np.empty((self.reach + BLOCK, channels)), -1  # -1: no sample yet
 
     def __call__(self, x: Array) -> Array:
         n = len(x)
@@ -278,7 +278,7 @@ class _Convolution:
         taps = np.lib.stride_tricks.as_strided(
             self.buffer[first:], (n, self.kernel, x.shape[1]), (row, self.dilation * row, column), writeable=False
         )
-        y: Array = _gelu(taps.reshape(n, -1) @ self.weight + self.there) - self.level
+        y: Array = _gelu(taps.reshape(n, -1) @ self.weight + self.offset) - self.level
         return y
 
 

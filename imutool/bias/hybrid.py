@@ -27,11 +27,11 @@ from imutool.sensor.linear_form import CompiledEffects, LinearForm, compiled, pa
 from imutool.sensor.signals import POWER_S, SignalFilter, Signals
 from imutool.units import SENSORS, Sensor
 
-FORGOTTEN = 10.0  # time constants after which the start of a filter no longer matters
+SETTLING = 10.0  # time constants after which the start of a filter no longer matters
 
 
 class Config(Settings, frozen=True):
-    """Effects of each sensor by name (none given: the training chooses), and the neural ODE."""
+    """Effects of each sensor by name (None: the training chooses), and the neural ODE."""
 
     gyro_effects: tuple[str, ...] | None = None
     accel_effects: tuple[str, ...] | None = None
@@ -40,12 +40,12 @@ class Config(Settings, frozen=True):
 
 
 class Model(BiasModel):
-    """b = rest + E_theta(signals) + C(u - E) + drift; see the module's head.
+    """Bias b = rest + E_theta(signals) + C(u - E) + drift.
 
-    Sources: those of the effects' files; Rehder et al., ICRA 2016, for fitting them together; `imutool.bias.neural_ode`.
+    Sources: the effects' files; Rehder et al., ICRA 2016, for the joint fit; `imutool.bias.neural_ode`.
 
     Raises:
-        ConfigError: an effect that is not known, or that does not act on its sensor.
+        ConfigError: an unknown effect, or an effect that does not act on its sensor.
     """
 
     method: ClassVar[str] = "hybrid"
@@ -57,28 +57,28 @@ class Model(BiasModel):
         super().__init__(chosen, rate_hz)
         self.effects: dict[Sensor, tuple[LinearForm, ...]] = {"gyro": (), "accel": ()}
         for sensor in SENSORS:
-            self._hold(sensor, self.named(sensor) or ())
+            self._set_effects(sensor, self.named(sensor) or ())
         self.ode = neural_ode.Model(chosen.ode, rate_hz) if chosen.remainder else None
 
     def named(self, sensor: Sensor) -> tuple[str, ...] | None:
-        """Effects that the settings name for a sensor; none if the training is to choose them."""
+        """Effects that the settings name for a sensor; None if the training chooses."""
         return self.config.gyro_effects if sensor == "gyro" else self.config.accel_effects
 
     def take(self, sensor: Sensor, names: Sequence[str], theta: Float[Tensor, " p"], covariance: Float[Tensor, "p p"]) -> None:
         """Take over effects and their fitted parameters, in the order of `names`."""
         key = f"{sensor}_effects"
         self.config = msgspec.structs.replace(self.config, **{key: tuple(names)})
-        self._hold(sensor, tuple(names))
+        self._set_effects(sensor, tuple(names))
         with torch.no_grad():
             getattr(self, f"theta_{sensor}").copy_(theta)
             getattr(self, f"covariance_{sensor}").copy_(covariance)
 
     def drop_remainder(self) -> None:
-        """Drop the neural ODE, and keep the effects alone."""
+        """Drop the neural ODE and keep only the effects."""
         self.config, self.ode = msgspec.structs.replace(self.config, remainder=False), None
 
     def begin_at(self, sensor: Sensor, W: Float[Tensor, "3 3"]) -> None:
-        """Refuse a start from a matrix: effects are fitted and chosen all together.
+        """Refuse a start from a matrix, because all effects are fitted together.
 
         Raises:
             ConfigError: always; `imutool.training.run.train` knows how a hybrid is trained.
@@ -94,7 +94,7 @@ class Model(BiasModel):
         return self._compiled(sensor)(signals)
 
     def sensor_bias(self, sensor: Sensor, segment: Segment) -> Float[Tensor, "batch n 3"]:
-        """Error of the effects plus the neural ODE's; filters start at the first sample."""
+        """Bias of the effects plus the neural ODE; filters start at the first sample."""
         error = self._on(sensor, segment)
         if self.ode is None:
             return segment.rest[:, None, COLUMNS[sensor]] + error
@@ -103,7 +103,7 @@ class Model(BiasModel):
         return error + self.ode.sensor_bias(sensor, Segment(segment.t, corrected["gyro"], corrected["accel"], segment.rest))
 
     def stream(self, rest: Vector6) -> Stream:
-        """The model in numpy, from the log's first sample on."""
+        """Bias stream in numpy, from the log's first sample on."""
         ode = None if self.ode is None else self.ode.stream(rest)
         gyro, accel = (self._compiled(sensor) for sensor in SENSORS)
         return _Stream(self.rate_hz, gyro, accel, ode, rest.astype(np.float64))
@@ -141,14 +141,14 @@ class Model(BiasModel):
             rows.append(torch.from_numpy(self.error(sensor, SignalFilter(self.rate_hz)(*arrays))))
         return torch.stack(rows).to(segment.t)
 
-    def _hold(self, sensor: Sensor, names: tuple[str, ...]) -> None:
+    def _set_effects(self, sensor: Sensor, names: tuple[str, ...]) -> None:
         self.effects[sensor] = catalogue.trained(sensor, names)
         size = sum(len(effect.parameters) for effect in self.effects[sensor])
         like = self.prior_mean
         self.register_buffer(f"theta_{sensor}", like.new_zeros(size))
         self.register_buffer(f"covariance_{sensor}", like.new_zeros(size, size))
         looks_back = any(self.effects.values())
-        self.context = math.ceil(FORGOTTEN * POWER_S * self.rate_hz) if looks_back else 0
+        self.context = math.ceil(SETTLING * POWER_S * self.rate_hz) if looks_back else 0
 
     def _compiled(self, sensor: Sensor) -> CompiledEffects:
         theta: Tensor = getattr(self, f"theta_{sensor}")
@@ -156,7 +156,7 @@ class Model(BiasModel):
 
 
 class _Stream:
-    """Effects, then the neural ODE on the corrected samples; its state is that of the filters."""
+    """Bias stream: effects, then the neural ODE on the corrected samples."""
 
     def __init__(
         self, rate_hz: float, gyro: CompiledEffects, accel: CompiledEffects, ode: SampleStream | None, rest: Vector6
@@ -184,7 +184,7 @@ class _Stream:
         return error
 
     def one(self, t_s: float, u: Vector6) -> Vector6:
-        """The same for one sample."""
+        """Bias at one sample."""
         if math.isnan(self._start_s):
             self._start_s = t_s
         since_s = t_s - self._start_s

@@ -1,4 +1,4 @@
-"""Model files: safetensors with a JSON header; every size and shape is checked before a number is used, nothing is executed."""
+"""Model files: safetensors with a JSON header; sizes and shapes are checked, no code runs."""
 
 from __future__ import annotations
 
@@ -21,16 +21,16 @@ from imutool.config import build, plain
 from imutool.errors import ConfigError, ImutoolError, ModelError
 
 FORMAT = "imutool.model/1"
-MAX_BYTES = 64 << 20  # ours are under 2 MB; a file this large is no bias model
+MAX_BYTES = 64 << 20  # the shipped models are under 2 MB
 MAX_RATE_HZ = 1e6
-MAX_TOML = 1 << 20  # bytes of a physics.toml; ours have a few thousand
-MAX_SETTINGS = 16 << 10  # characters; ours have a few hundred
-BEST_FIRST = ("hybrid", "neural_ode", "linear")  # by the published and own tables (docs/accuracy.md)
-RATE_TOLERANCE = 0.05  # a sensor's real rate differs from its name by a few per mille (BMI160: 199.4 for 200)
+MAX_TOML = 1 << 20  # bytes of a physics.toml; usual files have a few thousand
+MAX_SETTINGS = 16 << 10  # characters; usual settings have a few hundred
+BEST_FIRST = ("hybrid", "neural_ode", "linear")  # by published results and docs/accuracy.md
+RATE_TOLERANCE = 0.05  # a real rate differs from its nominal one by a few per mille (BMI160: 199.4 for 200)
 
 
 def save(model: BiasModel, path: Path, *, overwrite: bool = False) -> None:
-    """Writes a model and its card, beside the target first.
+    """Write a model and its card to a file, whole or not at all.
 
     Raises:
         ConfigError: the target exists, or cannot be written.
@@ -47,25 +47,25 @@ def save(model: BiasModel, path: Path, *, overwrite: bool = False) -> None:
 
 
 def write_tensors(tensors: Mapping[str, torch.Tensor], header: Mapping[str, str], path: Path, overwrite: bool) -> None:
-    """Tensors and a header of strings, beside the target and then renamed.
+    """Write tensors and a header of strings to a temporary file, then rename it.
 
     Raises:
         ConfigError: the target exists, or cannot be written.
     """
     if path.exists() and not overwrite:
-        raise ConfigError("exists already", where=path, fix="Choose another name or give --overwrite")
-    beside = path.with_name(f".{path.name}.{os.getpid()}.part")
+        raise ConfigError("exists already", where=path, fix="Choose another name or give `overwrite`")
+    part = path.with_name(f".{path.name}.{os.getpid()}.part")
     try:
-        beside.write_bytes(_in_order(save_bytes(dict(tensors), metadata=dict(header))))
-        beside.replace(path)
+        part.write_bytes(_in_order(save_bytes(dict(tensors), metadata=dict(header))))
+        part.replace(path)
     except (OSError, SafetensorError) as error:
         raise ConfigError(f"cannot be written ({error})", where=path, fix="Choose another place") from error
     finally:
-        beside.unlink(missing_ok=True)
+        part.unlink(missing_ok=True)
 
 
 def _in_order(raw: bytes) -> bytes:
-    """A safetensors file with its header sorted: the library's order is random, and equal models should be equal files."""
+    """Sort the header of a safetensors file: the library's order is random, and equal models get equal files."""
     size = int.from_bytes(raw[:8], "little")
     header = json.dumps(json.loads(raw[8 : 8 + size]), sort_keys=True, separators=(",", ":")).encode()
     header += b" " * (-len(header) % 8)  # the format's alignment
@@ -91,27 +91,27 @@ def read_tensors(path: Path, kind: str) -> tuple[dict[str, torch.Tensor], dict[s
                 )
             return {name: file.get_tensor(name) for name in file.keys()}, header  # noqa: SIM118  not a dict
     except (OSError, SafetensorError) as error:
-        raise ModelError(f"is no model file ({error})", where=path, expected="safetensors by imutool train") from error
+        raise ModelError(f"is not a model file ({error})", where=path, expected="safetensors by imutool train") from error
 
 
 def _refuse_size(path: Path, most: int) -> None:
-    """Nothing is opened that is not a file of a sensible size; a pipe would be waited for.
+    """Refuse a path that is not a regular file, or is larger than `most` bytes; reading a pipe would block.
 
     Raises:
-        ModelError: too large, or there and no file.
-        OSError: not there.
+        ModelError: too large, or not a regular file.
+        OSError: no such file.
     """
     size = path.stat().st_size
     if not path.is_file():
         raise ModelError(
-            "is no model file (it is a folder, a pipe or a device)", where=path, expected="safetensors by imutool train"
+            "is not a model file (it is a folder, a pipe or a device)", where=path, expected="safetensors by imutool train"
         )
     if size > most:
         raise ModelError(f"{size} bytes", where=path, expected=f"a model of at most {most}")
 
 
 def load(path: Path) -> BiasModel:
-    """The model in a file.
+    """Model from a file.
 
     Raises:
         ModelError: damaged, of another version or unknown method, or with tensors that do not fit its settings.
@@ -124,12 +124,12 @@ def load(path: Path) -> BiasModel:
         with torch.device("meta"):  # shapes without memory: the settings may ask for any
             shapes: BiasModel = module.Model(settings, header.rate_hz)
     except (ValueError, OverflowError, RuntimeError, ImutoolError) as error:
-        raise ModelError(f"has a header that cannot be used ({error})", where=path) from error
+        raise ModelError(f"has an invalid header ({error})", where=path) from error
     expected = {k: (tuple(v.shape), torch.float32) for k, v in shapes.state_dict().items()}
     found = {k: (tuple(v.shape), v.dtype) for k, v in tensors.items()}
     if found != expected:
-        odd = sorted(k for k in expected.keys() | found.keys() if expected.get(k) != found.get(k))
-        raise ModelError(f"tensors {', '.join(odd[:5])} do not fit", where=path, expected=f"those of {header.method}")
+        wrong = sorted(k for k in expected.keys() | found.keys() if expected.get(k) != found.get(k))
+        raise ModelError(f"tensors {', '.join(wrong[:5])} do not fit", where=path, expected=f"those of {header.method}")
     if any(not bool(torch.isfinite(v).all()) for v in tensors.values()):
         raise ModelError("holds numbers that are not finite", where=path)
     model: BiasModel = module.Model(settings, header.rate_hz)
@@ -140,27 +140,25 @@ def load(path: Path) -> BiasModel:
 
 
 def library() -> Path:
-    """The folder of models that ship: inside the installed package, or beside it in a checkout."""
+    """Folder of the shipped models: inside the installed package, or beside it in a checkout."""
     inside = Path(__file__).parents[1] / "_models"
     return inside if inside.is_dir() else Path(__file__).parents[2] / "models"
 
 
 def find_model(name: str | Path, rate_hz: float | None = None) -> BiasModel:
-    """The model in a file, or the one that ships under a name.
-
-    A physics.toml is one as well: it knows no rate of its own, and becomes a model for samples at `rate_hz`.
+    """Model from a file (also a physics.toml, for samples at `rate_hz`), or a shipped model by name.
 
     Raises:
-        ModelError: neither (the nearest name is given); or a physics.toml without a rate, or of which nothing can be taken off.
-        ConfigError: a physics.toml that cannot be read.
+        ModelError: neither (the message names the nearest); a physics.toml without `rate_hz`, or with no effect to correct.
+        ConfigError: an unreadable physics.toml.
     """
     path = Path(name)
     if path.suffix == ".toml":
         if rate_hz is None:
-            raise ModelError("a physics.toml says no rate", where=path, expected="samples to use it on")
+            raise ModelError("a physics.toml has no sample rate", where=path, expected="`rate_hz`")
         from imutool.bias import physics_model
 
-        with suppress(OSError):  # said by whoever reads it
+        with suppress(OSError):  # the reader reports it
             _refuse_size(path, MAX_TOML)
         return physics_model.load(path, rate_hz)
     if path.suffix == ".safetensors" or path.exists():
@@ -169,26 +167,26 @@ def find_model(name: str | Path, rate_hz: float | None = None) -> BiasModel:
 
 
 def shipped(name: str) -> Path:
-    """The file of a model that ships, by its name alone: the name may come from a log, and a log may name no other file.
+    """File of a shipped model by name only: a name from a log cannot reach other files.
 
     Raises:
-        ModelError: no such model (the nearest is named).
+        ModelError: no such model (the message names the nearest).
     """
-    every = {model.stem: model for model in library().glob("*.safetensors")}
-    if name not in every:
-        near = difflib.get_close_matches(name, every, n=1)
+    files = {model.stem: model for model in library().glob("*.safetensors")}
+    if name not in files:
+        near = difflib.get_close_matches(name, files, n=1)
         raise ModelError(
             f"no model {name[:200]!r}",
-            expected=f"a file, or one of {', '.join(sorted(every)) or '(none ship)'}",
+            expected=f"a file, or one of {', '.join(sorted(files)) or '(none ship)'}",
             fix=f"Did you mean {near[0]!r}?" if near else "",
         )
-    return every[name]
+    return files[name]
 
 
 def shipped_for(sensor: str | None, dataset: str | None) -> str | None:
-    """The name of the model that ships for a sensor as a data set holds it, the best method first; none for any other.
+    """Name of the shipped model for the sensor of a data set, by the best method; None if there is none.
 
-    A calibration belongs to one unit of a sensor, not to its type: another ADIS16448 is another sensor.
+    A calibration belongs to one unit of a sensor, not to its type: another ADIS16448 needs its own model.
     """
     for method in BEST_FIRST if sensor and dataset else ():
         for path in sorted(library().glob(f"*{method}.safetensors")):
@@ -204,7 +202,7 @@ def digest(path: Path) -> str:
 
 
 def check_rate(model: BiasModel, rate_hz: float, where: object) -> None:
-    """Refuses a log sampled at another rate than the model's training logs.
+    """Refuse a log at another sample rate than the model's training logs.
 
     Raises:
         ModelError: the rates differ by more than 5 %.
@@ -222,14 +220,14 @@ def header_of(path: Path) -> dict[str, Any]:
     """Method, rate, settings and card of a model file, without building it.
 
     Raises:
-        ModelError: as `read_tensors`, or the header makes no sense.
+        ModelError: as `read_tensors`, or an invalid header.
     """
     header = _header(read_tensors(path, FORMAT)[1], path)
     return {**header.card, "method": header.method, "rate_hz": header.rate_hz}
 
 
 class _Header(NamedTuple):
-    """What a model file says of itself."""
+    """Header of a model file."""
 
     method: str
     rate_hz: float
@@ -238,10 +236,10 @@ class _Header(NamedTuple):
 
 
 def _header(raw: Mapping[str, str], path: Path) -> _Header:
-    """A model's header, read as what it must be; it may come from anybody.
+    """Validated header of a model file from an unknown source.
 
     Raises:
-        ModelError: an entry is missing, is not JSON, or is of another kind.
+        ModelError: an entry is missing, is not JSON, or has another type.
     """
     try:
         if len(raw["settings"]) > MAX_SETTINGS:
@@ -253,6 +251,6 @@ def _header(raw: Mapping[str, str], path: Path) -> _Header:
             raise ValueError("settings and card are tables")
         return _Header(raw["method"], rate_hz, settings, card)
     except KeyError as error:
-        raise ModelError(f"has a header that cannot be used (no {error})", where=path) from error
+        raise ModelError(f"has an invalid header (no {error})", where=path) from error
     except (ValueError, RecursionError) as error:
-        raise ModelError(f"has a header that cannot be used ({error})", where=path) from error
+        raise ModelError(f"has an invalid header ({error})", where=path) from error

@@ -1,4 +1,4 @@
-"""Joint ODE of attitude and bias on SO(3): the paper's own scheme of the neural ODE, for the gyroscope.
+"""Joint ODE of attitude and gyro bias on SO(3): the paper's own scheme of the neural ODE.
 
 One vector field drives attitude and bias together (paper, eq. 3, 10, 15 and 31)::
 
@@ -7,8 +7,8 @@ One vector field drives attitude and bias together (paper, eq. 3, 10, 15 and 31)
 with u(t) the causal Hermite path through the gyro samples and f the residual perceptron of the paper's size. W du/dt is the
 term that the paper derives for a linear sensor (after eq. 31); it carries the calibration that was solved in closed form.
 Training integrates both states from sample to sample with the chosen solver in charts of SO(3)
-(`imutool.bias.ode.integrate`), and its loss is the attitude error at the end of a window (eq. 16). f does not depend on R: at
-work the bias is integrated alone, by Euler, which is the solver of the paper.
+(`imutool.bias.ode.integrate`), and its loss is the attitude error at the end of a window (eq. 16). f does not depend on R:
+inference integrates only the bias, by Euler, which is the solver of the paper.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from imutool.bias.model import SampleStream, Segment, Vector6
 from imutool.bias.neural_stream import Array, DriftRate
 from imutool.bias.ode import HermitePath, Method, integrate
 
-WINDOW_S = 1.0  # longest window of the training: a step of the solver at every sample makes longer ones cost minutes a step
+WINDOW_S = 1.0  # longest training window: with a solver step at every sample, a longer one costs minutes
 
 
 class JointField(nn.Module):
@@ -34,7 +34,7 @@ class JointField(nn.Module):
         self.drift, self.W = drift, nn.Parameter(torch.zeros(3, 3))
 
     def forward(self, bias: Float[Tensor, "b 3"], u: Float[Tensor, "b 3"], du: Float[Tensor, "b 3"]) -> Float[Tensor, "b 3"]:
-        """db/dt per second."""
+        """Bias rate db/dt per second."""
         rate: Tensor = du @ self.W.mT + self.drift(bias, u, du)
         return rate
 
@@ -51,11 +51,11 @@ class JointPath(nn.Module):
         self.grid = self.path.t
 
     def controls(self, index: Float[Tensor, ""]) -> tuple[Float[Tensor, "b 3"], Float[Tensor, "b 3"]]:
-        """u and du/dt (per second)."""
+        """Controls u and du/dt (per second)."""
         return self.path.value(index), self.path.derivative(index) / self.step_s
 
     def forward(self, index: Float[Tensor, ""], bias: Float[Tensor, "b 3"]) -> Float[Tensor, "b 3"]:
-        """db / d(index)."""
+        """Bias rate db / d(index)."""
         rate: Tensor = self.field(bias, *self.controls(index))
         return self.step_s * rate
 
@@ -76,7 +76,7 @@ class _JointField(nn.Module):
 def bias_path(
     field: nn.Module, segment: Segment, start: Float[Tensor, "b 3"], solver: Method, *, adjoint: bool
 ) -> Float[Tensor, "b n 3"]:
-    """The bias at each sample, integrated from `start` at the first."""
+    """Bias at each sample, integrated from `start` at the first."""
     if segment.gyro.shape[1] == 1:
         return start[:, None]
     joint = JointPath(field, segment)
@@ -100,7 +100,7 @@ def end_attitude(
 
 
 class JointStream:
-    """The scheme at work: gyro bias by Euler from sample to sample; the accelerometer's from the stream of its curve."""
+    """Bias stream of the joint scheme: gyro by Euler from sample to sample, accelerometer from its curve."""
 
     def __init__(self, rate: DriftRate, W: Array, rest: Vector6, others: SampleStream) -> None:
         self._rate, self._W, self._rest, self._others = rate, W, rest[:3].astype(np.float64), others
@@ -109,20 +109,20 @@ class JointStream:
     def __call__(
         self, t_s: Float64[np.ndarray, " n"], gyro: Float64[np.ndarray, "n 3"], accel: Float64[np.ndarray, "n 3"]
     ) -> Float64[np.ndarray, "n 6"]:
-        """The bias at each sample."""
+        """Bias at each sample."""
         bias = self._others(t_s, gyro, accel)
         for k, (t, u) in enumerate(zip(t_s.tolist(), gyro, strict=True)):
             bias[k, :3] = self._next(t, u)
         return bias
 
     def one(self, t_s: float, u: Vector6) -> Vector6:
-        """The same for one sample."""
+        """Bias at one sample."""
         bias = self._others.one(t_s, u)
         bias[:3] = self._next(t_s, u[:3])
         return bias
 
     def _next(self, t_s: float, u: Array) -> Array:
-        """The bias at the next sample, from the field at the one before it."""
+        """Gyro bias at the next sample, from the field at the previous one."""
         if np.isnan(self._t_s):
             self._bias, self._slope = self._rest + self._W @ u, np.zeros(3)
         else:

@@ -1,4 +1,7 @@
-"""Scale and misalignment: bias = rest + W u, solved in closed form and held at the identity where the motion shows nothing."""
+"""Linear bias model: scale and misalignment, bias = rest + W u.
+
+W is solved in closed form; a direction that the motion does not excite keeps the identity.
+"""
 
 from __future__ import annotations
 
@@ -15,11 +18,11 @@ from imutool.units import SENSORS, Sensor
 
 
 class Config(Settings, frozen=True):
-    """Nothing to set: what there is to choose belongs to the training."""
+    """No settings; the training has its own."""
 
 
 class Model(BiasModel):
-    """gyro_hat = (I - W_g) gyro - rest_g, likewise for accel: the paper's linear method with A = I - W.
+    """Linear model gyro_hat = (I - W_g) gyro - rest_g, likewise for accel: the paper's linear method with A = I - W.
 
     Source: "Debiasing 6-DOF IMU via Hierarchical Learning of Continuous Bias Dynamics", sec. V-C (method "Linear");
     Rehder et al., ICRA 2016, eq. 5 and 10 for the calibration it stands for.
@@ -33,18 +36,18 @@ class Model(BiasModel):
         self.W = nn.ParameterDict({sensor: nn.Parameter(torch.zeros(3, 3)) for sensor in SENSORS})
 
     def sensor_bias(self, sensor: Sensor, segment: Segment) -> Float[Tensor, "batch n 3"]:
-        """`rest + W u` at every sample."""
+        """Bias rest + W u at every sample."""
         u, rest = segment.of(sensor)
         W: Tensor = self.W[sensor]
         return rest[:, None] + u @ W.mT
 
     def begin_at(self, sensor: Sensor, W: Float[Tensor, "3 3"]) -> None:
-        """The closed form is the model."""
+        """Set the matrix W: the closed form is the whole model."""
         with torch.no_grad():
             self.W[sensor].copy_(W)
 
     def stream(self, rest: Vector6) -> Stream:
-        """`rest + W u` at every sample."""
+        """Bias rest + W u at every sample."""
         W_gyro, W_accel = (self.W[sensor].detach().cpu().double().numpy() for sensor in SENSORS)
 
         def affine(

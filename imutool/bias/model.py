@@ -1,8 +1,8 @@
-"""What every bias model is: a causal map from measured samples and a rest bias to the bias at each sample.
+"""Bias model: a causal map from measured samples and a rest bias to the bias at each sample.
 
-The *rest bias* is what differs from run to run (the turn-on bias): the state the dynamics start from. What the motion adds
-(scale, misalignment, curvature) belongs to the sensor. Models add the two, `bias = rest + ...`, so an error of the start is
-the same error at every sample, which is what lets `imutool.bias_start.initial_bias` solve for it with any model.
+The *rest bias* differs from run to run (the turn-on bias); the dynamics start from it. The part that the motion adds (scale,
+misalignment, curvature) belongs to the sensor. Models add the two, `bias = rest + ...`: an error of the rest bias is the same
+error at every sample, so `imutool.bias_start.initial_bias` can solve for it with any model.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from imutool.config import Settings
 from imutool.inertial.windows import end_attitude
 from imutool.units import SENSORS, Sensor
 
-COLUMNS = {"gyro": slice(0, 3), "accel": slice(3, 6)}  # of every vector of six
+COLUMNS = {"gyro": slice(0, 3), "accel": slice(3, 6)}  # of a vector of six
 
 Vector6 = Float64[np.ndarray, "6"]  # gyro (rad/s) then accel (m/s²)
 Covariances = Float64[np.ndarray, "n 6 6"]
@@ -31,7 +31,7 @@ Covariances = Float64[np.ndarray, "n 6 6"]
 
 @dataclass(frozen=True)
 class Segment:
-    """Samples a model is shown: `t` in seconds from the segment's first sample, and the bias it starts from."""
+    """Samples of a segment: `t` in seconds from its first sample, and the rest bias at its start."""
 
     t: Float[Tensor, "batch n"]
     gyro: Float[Tensor, "batch n 3"]
@@ -45,16 +45,16 @@ class Segment:
 
 @runtime_checkable
 class Stream(Protocol):
-    """A model at work on samples as they arrive, in blocks of any size; it keeps what it must remember between them."""
+    """Bias stream of a model: samples arrive in blocks of any size, and the stream keeps its state between them."""
 
     def __call__(
         self, t_s: Float64[np.ndarray, " n"], gyro: Float64[np.ndarray, "n 3"], accel: Float64[np.ndarray, "n 3"]
     ) -> Float64[np.ndarray, "n 6"]:
-        """The bias at each sample, from this and earlier samples only; the blocks' borders change nothing."""
+        """Bias at each sample from this and earlier samples only; block borders change nothing."""
 
 
 class BiasEstimate(NamedTuple):
-    """A bias at each sample, gyro (rad/s) then accel (m/s²), and its covariance."""
+    """Bias at each sample, gyro (rad/s) then accel (m/s²), and its covariance."""
 
     bias: Float64[np.ndarray, "n 6"]
     covariance: Covariances
@@ -62,56 +62,55 @@ class BiasEstimate(NamedTuple):
 
 @runtime_checkable
 class RestBiasEstimator(Protocol):
-    """A model at work with the covariance of its rest bias, for samples as they arrive in blocks of any size."""
+    """Bias stream with the covariance of the rest bias, for blocks of any size."""
 
     def estimate(
         self, t_s: Float64[np.ndarray, " n"], gyro: Float64[np.ndarray, "n 3"], accel: Float64[np.ndarray, "n 3"]
     ) -> BiasEstimate:
-        """The bias at each sample, and the covariance of the rest bias in it."""
+        """Bias at each sample, and the covariance of its rest bias."""
 
 
 @runtime_checkable
 class SampleStream(Stream, Protocol):
-    """A stream with a shorter way for a single sample, for live use: half of such a call is cutting and joining arrays."""
+    """Bias stream with a fast path for one sample: a block call spends half its time on slicing arrays."""
 
     def one(self, t_s: float, u: Vector6) -> Vector6:
-        """The bias at one sample (gyro, then accel): what a block of it alone would give. The array is the caller's."""
+        """Bias at one sample (gyro, then accel), as a block of this sample gives; the caller owns the array."""
 
 
 @runtime_checkable
 class CovarianceModel(Protocol):
-    """Roots S of the covariance S S^T of what the motion adds, for samples as they arrive, by sensor.
+    """Roots S of the covariance S S^T of the motion-dependent bias, by sensor, for a stream of samples.
 
-    The columns of S are the same unknowns at every sample: a mean over samples has the mean of S.
+    The columns of S belong to the same unknowns at every sample: the covariance root of a mean is the mean of S.
     """
 
     def __call__(
         self, t_s: Float64[np.ndarray, " n"], gyro: Float64[np.ndarray, "n 3"], accel: Float64[np.ndarray, "n 3"]
     ) -> Mapping[Sensor, Float64[np.ndarray, "n 3 p"]]:
-        """One matrix a sample, from it and earlier ones; nothing for a sensor that nothing is known of."""
+        """Roots at each sample, from it and earlier ones; no entry for a sensor without covariance."""
 
 
 class BiasModel(nn.Module, ABC):
-    """A bias model, with the statistics of its sensor's training runs that every start needs.
+    """Bias model with the statistics of its sensor's training runs, from which every run starts.
 
-    At work in float64 (`imutool.bias.io.load`, `imutool.training.fit`); at rest, in a file, in float32.
+    It computes in float64 (`imutool.bias.io.load`, `imutool.training.fit`); files hold float32.
 
     Attributes:
         prior_mean, prior_std: rest bias over the training runs, and its spread from run to run.
-        truth_std: spread of a rest bias estimated from `imutool.bias_start.initial_bias.TRUTH_S` seconds of this data's own
-            truth.
-        rest_std: how far the bias at rest lies from that in motion.
-        walk_std: how far a rest bias walks in a second^1/2.
-        noise_std: white noise of a sample, as seen in the residuals, for the debiased message's covariance.
+        truth_std: spread of a rest bias estimated from `imutool.bias_start.bias_from_truth.TRUTH_S` seconds of truth.
+        rest_std: spread of the bias at rest minus the bias in motion.
+        walk_std: random walk of the rest bias per second^1/2.
+        noise_std: white noise of a sample from the residuals, for the covariance of the debiased message.
     """
 
     method: ClassVar[str]
-    iterative: ClassVar[bool] = True  # false where the closed form leaves nothing to descend on
-    objective: ClassVar[Literal["window_ends", "increments"]] = "window_ends"  # what the descent minimises (imutool.training)
+    iterative: ClassVar[bool] = True  # false where the closed form is the whole solution
+    objective: ClassVar[Literal["window_ends", "increments"]] = "window_ends"  # loss of the training (imutool.training)
     prefers: ClassVar[Mapping[str, Any]] = MappingProxyType({})  # TrainSettings that differ from the general defaults
-    undecayed: ClassVar[tuple[str, ...]] = ()  # beginnings of the names of parameters that weight decay leaves alone
-    longest_window_s: float = math.inf  # of the training: a longer one is cut to it
-    context: int = 0  # samples from before a segment that the answer over it depends on; such a bias is rest + f(samples)
+    undecayed: ClassVar[tuple[str, ...]] = ()  # name prefixes of parameters without weight decay
+    longest_window_s: float = math.inf  # upper limit for the training
+    context: int = 0  # samples before a segment that its bias depends on; such a bias is rest + f(samples)
     prior_mean: Tensor
     prior_std: Tensor
     truth_std: Tensor
@@ -127,21 +126,21 @@ class BiasModel(nn.Module, ABC):
             self.register_buffer(name, torch.zeros(6))
 
     def see(self, gyro: Float[Tensor, "n 3"], accel: Float[Tensor, "n 3"]) -> None:
-        """Shown every sample of the training part once, before the first step: the place to find the inputs' scales."""
+        """Set the scales of the inputs from all training samples, before the first step."""
 
     def rest_at_work(self, sensor: Sensor, rest: Float[Tensor, "*logs 3"]) -> Float[Tensor, "*logs 3"]:
-        """Rest biases found beside the model in training mode, as they must be beside it at work: the same for most."""
+        """Rest biases for inference from those of training mode; equal for most models."""
         return rest
 
     @abstractmethod
     def sensor_bias(self, sensor: Sensor, segment: Segment) -> Float[Tensor, "batch n 3"]:
-        """The bias of one sensor at each sample; row k depends on samples up to k. Differentiable.
+        """Bias of one sensor at each sample; row k depends on samples up to k. Differentiable.
 
-        The two sensors are apart because training is: the gyro first, then the accelerometer on top of it.
+        The sensors are separate because the training is: first the gyro, then the accelerometer with the trained gyro.
         """
 
     def forward(self, segment: Segment) -> Float[Tensor, "batch n 6"]:
-        """The bias at each sample: gyro (rad/s), then accel (m/s²)."""
+        """Bias at each sample: gyro (rad/s), then accel (m/s²)."""
         return torch.cat([self.sensor_bias(sensor, segment) for sensor in SENSORS], dim=-1)
 
     def end_attitude(
@@ -151,17 +150,17 @@ class BiasModel(nn.Module, ABC):
         return end_attitude(R_start, segment.gyro - self.sensor_bias("gyro", segment), dt)
 
     def rest_dynamics(self) -> Float64[np.ndarray, "6 6"]:
-        """d(drift of the rest bias) / d(rest bias), a second: how an error of the start grows or dies. Zero for most."""
+        """Rest dynamics d(drift of the rest bias) / d(rest bias) per second; zero for most models."""
         return np.zeros((6, 6))
 
     def calibration_covariance(self) -> CovarianceModel | None:
-        """What is left open of the motion-dependent part, for each sample as a root; none where it is not known."""
+        """Covariance of the motion-dependent part as a root for each sample; None if unknown."""
         return None
 
     @abstractmethod
     def begin_at(self, sensor: Sensor, W: Float[Tensor, "3 3"]) -> None:
-        """Takes over a calibration solved in closed form, as the point the training starts from."""
+        """Set the calibration matrix, solved in closed form, from which the training starts."""
 
     @abstractmethod
     def stream(self, rest: Vector6) -> Stream:
-        """The same map in numpy, from a start on, for logs of any length and for live use; equals `forward` to 1e-6."""
+        """Bias stream in numpy from a rest bias, for long logs and live use; equals `forward` to 1e-6."""

@@ -1,18 +1,18 @@
-"""Bias dynamics learned from poses alone: db/dt = f(b, u, du/dt), a neural ODE driven by the measured samples.
+"""Neural ODE of the bias dynamics, learned from poses: db/dt = f(b, u, du/dt), u the samples.
 
-The paper writes db_g/dt = f_g(b_g, gyro, dgyro/dt; theta) with one network for everything (eq. 10, 31), and likewise for
-accel. Trained that way the network forgets its state within two samples and holds for one step size only. Here the same field
-is written in two parts whose time scales differ by four orders of magnitude::
+The paper writes db_g/dt = f_g(b_g, gyro, dgyro/dt; theta) with one network (eq. 10, 31), and likewise for accel. Trained that
+way the network forgets its state within two samples and is valid for one step size only. Here the field has two parts whose
+time scales differ by four orders of magnitude::
 
     db/dt = dC(u)/dt + g(b - C(u), u, du/dt)
 
-*C*, the curve, is what the motion adds: scale, misalignment, curvature. Its term is the one the paper derives
-for a linear sensor, (I - A^{-1}) du/dt (after eq. 31), for any smooth sensor; being a total derivative it integrates to
-C exactly, with every solver and step. Beside the samples the curve sees them through a filter of 0.1 s (ds/dt = (u - s) / tau,
-a state solved exactly), for sensors whose error lags their motion. *g*, the drift, moves the rest bias beta = b - C, the
-turn-on bias that a run starts with, and is slow by its scale; it is a residual perceptron of the paper's size,
-integrated by torchdiffeq along a causal Hermite path through the samples filtered over half a second, so that the
-step of the solver changes neither what it sees nor, but for the step's own error, the answer. So b(t) = beta(t) + C(t).
+*C*, the curve, is the part that the motion adds: scale, misalignment, curvature. Its term generalizes the paper's term for a
+linear sensor, (I - A^{-1}) du/dt (after eq. 31), to any smooth sensor. As a total derivative it integrates to C exactly, with
+every solver and step. C also depends on the samples filtered over 0.1 s (ds/dt = (u - s) / tau, solved exactly), for sensors
+whose error lags their motion. *g*, the drift, moves the rest bias beta = b - C, the turn-on bias of a run; its scale makes it
+slow. It is a residual perceptron of the paper's size. torchdiffeq integrates it along a causal Hermite path through the
+samples filtered over half a second, so the step of the solver changes the solution only by its own error. So
+b(t) = beta(t) + C(t).
 """
 
 from __future__ import annotations
@@ -36,9 +36,9 @@ from imutool.config import Settings
 from imutool.errors import ConfigError
 from imutool.units import SENSORS, Sensor
 
-SLOW_S, DRIFT_SEES_S = 0.1, 0.5  # time constants of what the curve and the drift see
+SLOW_S, DRIFT_FILTER_S = 0.1, 0.5  # filter time constants of the inputs of curve and drift
 NEAR_ZERO = 10.0
-GYRO_HIDDEN = (128, 128), (512,)  # of both residual blocks, as released
+GYRO_HIDDEN = (128, 128), (512,)  # of both residual blocks, as in the released networks
 NEGLIGIBLE = 1e-15
 
 Positive = Annotated[float, msgspec.Meta(gt=0)]
@@ -46,10 +46,10 @@ Width = Annotated[int, msgspec.Meta(ge=1, le=4096)]
 
 
 class Config(Settings, frozen=True):
-    """Scheme, sizes, solver, and whose rest bias drifts. The scales are units of network inputs and outputs, no limits.
+    """Scheme, sizes, solver, and the sensors with a drift; scales are units of inputs and outputs, not limits.
 
-    The accelerometer's does not drift unless asked: it is judged over the five seconds that attitude errors leave it, and
-    what drifts by a hundredth in five seconds is nowhere after a minute (seen: 0.3 m/s² on FETCH).
+    By default the accelerometer's rest bias does not drift. Attitude errors limit its training windows to five seconds, and a
+    drift of a hundredth in five seconds is far off after a minute (0.3 m/s² on FETCH).
     """
 
     scheme: Literal["split", "joint"] | msgspec.UnsetType = msgspec.UNSET  # joint: the paper's (`joint_ode`)
@@ -67,9 +67,9 @@ class Config(Settings, frozen=True):
 
 
 class Curve(nn.Module):
-    """C(u, s) = W u + curve (N(u, s) - N(0, 0)), zero without motion; N a perceptron that starts at zero.
+    """Curve C(u, s) = W u + curve (N(u, s) - N(0, 0)), zero without motion; N a perceptron that starts at zero.
 
-    N sees its arguments in units of the scale, and once more through asinh(10 x), which resolves what happens near zero.
+    Inputs of N: its arguments in units of the scale, and asinh(10 x) of them, which resolves small motion.
     """
 
     def __init__(self, width: int, scale: float, curve: float) -> None:
@@ -83,20 +83,20 @@ class Curve(nn.Module):
         self.net = nn.Sequential(layers[0], nn.GELU(), layers[1], nn.Tanh(), layers[2])
 
     def forward(self, u: Float[Tensor, "*batch 3"], slow: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
-        """What the motion adds to the bias: `u` the samples, `slow` the filtered ones."""
+        """Motion-dependent bias: `u` the samples, `slow` the filtered ones."""
         x, s = u / self.scale, slow / self.scale
-        seen = torch.cat([x, torch.asinh(NEAR_ZERO * x), torch.asinh(NEAR_ZERO * s)], dim=-1)
-        bend: Tensor = self.net(seen) - self.net(u.new_zeros(9))
+        inputs = torch.cat([x, torch.asinh(NEAR_ZERO * x), torch.asinh(NEAR_ZERO * s)], dim=-1)
+        bend: Tensor = self.net(inputs) - self.net(u.new_zeros(9))
         return u @ self.W.mT + self.curve * bend
 
     def weights(self) -> CurveWeights:
-        """The same curve for numpy."""
+        """Curve weights for numpy."""
         first, second, last = (layer for layer in self.net if isinstance(layer, nn.Linear))
         return CurveWeights(self.W.detach().cpu().double().numpy(), (first, second, last), self.scale, NEAR_ZERO, self.curve)
 
 
 class Drift(nn.Module):
-    """g: the slow rate of the rest bias, a perceptron with two residual blocks (the released networks' sizes)."""
+    """Drift g: the slow rate of the rest bias, a perceptron with two residual blocks of the released sizes."""
 
     def __init__(self, hidden: tuple[tuple[int, ...], tuple[int, ...]], scale: float, curve: float, rate: float) -> None:
         super().__init__()
@@ -105,14 +105,14 @@ class Drift(nn.Module):
         self.out = nn.Linear(9, 3)
         nn.init.zeros_(self.out.weight)
         nn.init.zeros_(self.out.bias)
-        # the state is seen from the prior's mean, in units of the curve; motion in its own
+        # inputs: the state relative to the prior's mean in units of the curve; the motion in its own
         self.centre: Tensor
         self.units: Tensor
         self.register_buffer("centre", torch.zeros(3))
         self.register_buffer("units", torch.tensor([curve] * 3 + [scale] * 6))
 
     def forward(self, beta: Float[Tensor, "b 3"], u: Float[Tensor, "b 3"], du: Float[Tensor, "b 3"]) -> Float[Tensor, "b 3"]:
-        """dbeta/dt per second."""
+        """Drift dbeta/dt per second."""
         x = torch.cat([beta - self.centre, u, du], dim=-1) / self.units
         x = x + self.block1(x)
         x = x + self.block2(x)
@@ -120,7 +120,7 @@ class Drift(nn.Module):
         return y
 
     def numpy(self) -> DriftRate:
-        """The same rate in float64 numpy."""
+        """Drift in float64 numpy."""
         block1, block2, out = perceptron(self.block1), perceptron(self.block2), perceptron(self.out)
         centre, units = (x.detach().cpu().double().numpy() for x in (self.centre, self.units))
 
@@ -133,7 +133,7 @@ class Drift(nn.Module):
 
 
 class Model(BiasModel):
-    """b(t) = beta(t) + C(u(t)) for gyro and accel apart; see the module's head.
+    """Bias b(t) = beta(t) + C(u(t)), for gyro and accel separately.
 
     Source: "Debiasing 6-DOF IMU via Hierarchical Learning of Continuous Bias Dynamics", eq. 6, 10, 31 and spline.
     """
@@ -146,7 +146,7 @@ class Model(BiasModel):
         assert isinstance(chosen, Config)
         if chosen.adjoint and chosen.solver == "euler":
             raise ConfigError(
-                "the adjoint of Euler's coarse steps is off by its own order of error",
+                "the adjoint of Euler's coarse steps has an error of Euler's order",
                 where="model.adjoint",
                 fix="Use model.solver=rk4 or dopri5 with it, or backpropagation",
             )
@@ -155,12 +155,9 @@ class Model(BiasModel):
         super().__init__(chosen, rate_hz)
         c = chosen
         self.stride = max(1, round(c.drift_step_s * rate_hz))
-        self.curve = nn.ModuleDict(
-            {
-                "gyro": Curve(c.curve_width, c.gyro_scale_rad_s, c.gyro_curve_rad_s),
-                "accel": Curve(c.curve_width, c.accel_scale_m_s2, c.accel_curve_m_s2),
-            }
-        )
+        gyro = Curve(c.curve_width, c.gyro_scale_rad_s, c.gyro_curve_rad_s)
+        accel = Curve(c.curve_width, c.accel_scale_m_s2, c.accel_curve_m_s2)
+        self.curve = nn.ModuleDict({"gyro": gyro, "accel": accel})
         drifts: dict[str, nn.Module] = {
             "gyro": Drift(GYRO_HIDDEN, c.gyro_scale_rad_s, c.gyro_curve_rad_s, c.gyro_drift_rad_s2),
             "accel": Drift(((256, 512), (256, 256)), c.accel_scale_m_s2, c.accel_curve_m_s2, c.accel_drift_m_s3),
@@ -177,7 +174,7 @@ class Model(BiasModel):
         return self.config.scheme == "joint"
 
     def _joint_start(self, segment: Segment) -> tuple[JointField, Float[Tensor, "b 3"]]:
-        """The joint field, and the bias at the first sample."""
+        """Joint field, and bias at the first sample."""
         field = _part(self.drift, "gyro", JointField)
         return field, segment.rest[:, :3] + segment.gyro[:, 0] @ field.W.mT
 
@@ -191,7 +188,7 @@ class Model(BiasModel):
         return joint_ode.end_attitude(field, segment, start, R_start, self.config.solver, adjoint=self.config.adjoint)
 
     def sensor_bias(self, sensor: Sensor, segment: Segment) -> Float[Tensor, "batch n 3"]:
-        """beta + C(u) at each sample; beta goes on straight between the drift's steps."""
+        """Bias beta + C(u) at each sample; beta is linear between the steps of the drift."""
         if self.joint and sensor == "gyro":
             field, start = self._joint_start(segment)
             return joint_ode.bias_path(field, segment, start, self.config.solver, adjoint=self.config.adjoint)
@@ -202,7 +199,7 @@ class Model(BiasModel):
         return self._rest_path(segment.t, u, rest, self.drift[sensor]) + motion
 
     def begin_at(self, sensor: Sensor, W: Float[Tensor, "3 3"]) -> None:
-        """The linear part of the curve, or of the joint field."""
+        """Set the linear part of the curve, or of the joint field."""
         joint = self.joint and sensor == "gyro"
         with torch.no_grad():
             (_part(self.drift, sensor, JointField) if joint else _part(self.curve, sensor, Curve)).W.copy_(W)
@@ -210,36 +207,35 @@ class Model(BiasModel):
     def _rest_path(
         self, t: Float[Tensor, "b n"], u: Float[Tensor, "b n 3"], rest: Float[Tensor, "b 3"], drift: nn.Module
     ) -> Float[Tensor, "b n 3"]:
-        """beta at each sample: the ODE is solved on a grid of `stride` samples, whose index is its time."""
+        """beta at each sample; the ODE's time is the index on a grid of `stride` samples."""
         n, stride = u.shape[1], self.stride
         if n == 1:
             return rest[:, None]
         steps = math.ceil((n - 1) / stride)
         whole = (n - 1) // stride
-        seen = self._filtered(u, DRIFT_SEES_S)[:, : whole * stride + 1 : stride][:, :steps]
-        path = HermitePath(torch.arange(steps + 1, device=u.device), torch.cat([seen, seen[:, -1:]], dim=1))
+        knots = self._filtered(u, DRIFT_FILTER_S)[:, : whole * stride + 1 : stride][:, :steps]
+        path = HermitePath(torch.arange(steps + 1, device=u.device), torch.cat([knots, knots[:, -1:]], dim=1))
         step_s = ((t[:, -1] - t[:, 0]) / (n - 1) * stride)[:, None]
 
         beta = _solve(_OnGrid(drift, path, step_s), rest, steps, self.config.solver, self.config.adjoint)
-        place = torch.arange(n, device=u.device) / stride
-        j = place.long().clamp(max=steps - 1)
-        return torch.lerp(beta[j], beta[j + 1], (place - j)[:, None, None].to(u)).transpose(0, 1)
+        index = torch.arange(n, device=u.device) / stride
+        j = index.long().clamp(max=steps - 1)
+        return torch.lerp(beta[j], beta[j + 1], (index - j)[:, None, None].to(u)).transpose(0, 1)
 
     def rest_dynamics(self) -> Float64[np.ndarray, "6 6"]:
-        """d g / d beta without motion, at the prior: how fast an error of the start dies, a second."""
+        """Rest dynamics d g / d beta per second, without motion, at the prior."""
         F = np.zeros((6, 6))
         still = self.prior_mean.new_zeros(1, 3)
         for sensor in self.config.drift:
-            at = COLUMNS[sensor]
-            drift = self.drift[sensor]
+            columns, drift = COLUMNS[sensor], self.drift[sensor]
             by_rest = torch.autograd.functional.jacobian(  # type: ignore[no-untyped-call]  # torch gives it no type
-                lambda beta, g=drift: g(beta, still, still)[0], self.prior_mean[None, at]
+                lambda beta, g=drift: g(beta, still, still)[0], self.prior_mean[None, columns]
             )
-            F[at, at] = by_rest[:, 0].detach().cpu().double().numpy()
+            F[columns, columns] = by_rest[:, 0].detach().cpu().double().numpy()
         return F
 
     def _filtered(self, u: Float[Tensor, "b n 3"], tau_s: float) -> Float[Tensor, "b n 3"]:
-        """Samples through dy/dt = (u - y) / tau, from the first on, in log2(n) passes (a scan of the recurrence)."""
+        """Samples filtered by dy/dt = (u - y) / tau, in log2(n) passes (a scan of the recurrence)."""
         keep = math.exp(-1.0 / (self.rate_hz * tau_s))
         y = torch.cat([u[:, :1], (1.0 - keep) * u[:, 1:]], dim=1)
         shift = 1
@@ -249,12 +245,12 @@ class Model(BiasModel):
         return y
 
     def stream(self, rest: Vector6) -> SampleStream:
-        """The same in numpy, by Euler: a step every `stride` samples, or at every sample in the joint scheme."""
+        """Bias stream in numpy by Euler: a step every `stride` samples, or every sample in the joint scheme."""
         if self.joint:
             return self._joint_stream(rest)
         gyro, accel = (_part(self.curve, sensor, Curve).weights() for sensor in SENSORS)
         drifts = {sensor: _part(self.drift, sensor, Drift).numpy() for sensor in self.config.drift}
-        return NeuralStream(Curves(gyro, accel), drifts, self.stride, self.rate_hz, (SLOW_S, DRIFT_SEES_S), rest)
+        return NeuralStream(Curves(gyro, accel), drifts, self.stride, self.rate_hz, (SLOW_S, DRIFT_FILTER_S), rest)
 
     def _joint_stream(self, rest: Vector6) -> SampleStream:
         field, accel = _part(self.drift, "gyro", JointField), _part(self.curve, "accel", Curve)
@@ -262,13 +258,13 @@ class Model(BiasModel):
         curves = Curves(without_motion.double().weights(), accel.weights())
         others: tuple[Sensor, ...] = tuple(sensor for sensor in self.config.drift if sensor != "gyro")
         drifts = {sensor: _part(self.drift, sensor, Drift).numpy() for sensor in others}
-        own = NeuralStream(curves, drifts, self.stride, self.rate_hz, (SLOW_S, DRIFT_SEES_S), rest)
+        own = NeuralStream(curves, drifts, self.stride, self.rate_hz, (SLOW_S, DRIFT_FILTER_S), rest)
         rate = _part(field, "drift", Drift).numpy()
         return joint_ode.JointStream(rate, field.W.detach().cpu().double().numpy(), rest, own)
 
 
 class _OnGrid(nn.Module):
-    """The drift as torchdiffeq wants it: time is the grid's index, controls come from the path."""
+    """Drift as a field for torchdiffeq: time is the grid's index, the path gives the controls."""
 
     def __init__(self, drift: nn.Module, path: HermitePath, step_s: Float[Tensor, "b 1"]) -> None:
         super().__init__()
@@ -296,10 +292,8 @@ def _part(parts: nn.Module, name: str, kind: type[P]) -> P:
 
 
 def _perceptron(hidden: tuple[int, ...]) -> nn.Sequential:
-    """9 -> hidden -> 9, GELU between hidden layers and tanh before the last."""
+    """Perceptron 9 -> hidden -> 9: GELU between hidden layers, tanh before the last."""
     layers: list[nn.Module] = []
-    before = 9
-    for i, width in enumerate(hidden):
+    for i, (before, width) in enumerate(zip((9, *hidden), hidden, strict=False)):
         layers += [nn.Linear(before, width), nn.Tanh() if i == len(hidden) - 1 else nn.GELU()]
-        before = width
-    return nn.Sequential(*layers, nn.Linear(before, 9))
+    return nn.Sequential(*layers, nn.Linear(hidden[-1], 9))

@@ -1,4 +1,4 @@
-"""Neural ODE in numpy for live use: torch would take twenty times as long for a sample."""
+"""Neural ODE in numpy for live use; torch takes twenty times as long for one sample."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ from imutool.bias.model import COLUMNS, Vector6
 from imutool.sensor.signals import low_pass
 from imutool.units import Sensor
 
-ROWS = 64  # at a time: they stay in the cache, and a product this small is never handed to threads that must be woken first
+ROWS = 64  # per product: they fit in the cache, and BLAS starts no threads for such a small product
 HALF_ROOT = math.sqrt(0.5)
-ALWAYS = 8.0  # erf of it is one, to the last bit: GELU makes a constant of a constant
+CONSTANT = 8.0  # its erf is exactly one: GELU maps a constant to a constant
 
 Array = Float64[np.ndarray, "..."]
 DriftRate = Callable[[Array, Array, Array], Array]
@@ -26,7 +26,10 @@ DriftRate = Callable[[Array, Array, Array], Array]
 
 @dataclass(frozen=True)
 class CurveWeights:
-    """One sensor's C(u, s) = W u + size (N(u, s) - N(0, 0)); N sees u, asinh(near_zero u) and asinh(near_zero s)."""
+    """Curve weights of one sensor: C(u, s) = W u + size (N(u, s) - N(0, 0)).
+
+    Inputs of N: u, asinh(near_zero u) and asinh(near_zero s).
+    """
 
     W: Float64[np.ndarray, "3 3"]
     layers: tuple[nn.Linear, nn.Linear, nn.Linear]
@@ -36,89 +39,89 @@ class CurveWeights:
 
 
 class Curves:
-    """Curves of gyro and accelerometer, stacked: two networks of one shape cost half the calls.
+    """Curves of gyro and accelerometer, stacked: two networks of one shape need half the calls.
 
-    GELU(h) = h (1 + erf(h / sqrt 2)) / 2; its constants, the layers' own and N(0, 0) are folded into the matrices. Features are
-    rows and samples columns, or there is one sample and no such axis: every part of a layer is then one piece of memory.
-    Rows of the hidden layer: gyro's, one that is always the same, accel's; each sensor's second matrix sees its own and the
-    one between. For a single sample the last matrix has the rest bias in it too.
+    GELU(h) = h (1 + erf(h / sqrt 2)) / 2; its constants, the layers' biases and N(0, 0) are folded into the matrices. Features
+    are rows and samples columns (a single sample has no column axis): every part of a layer is contiguous in memory. Rows of
+    the hidden layer: gyro, a constant, accel; each sensor's second matrix uses its own rows and the constant. For a single
+    sample the last matrix also contains the rest bias.
     """
 
     def __init__(self, gyro: CurveWeights, accel: CurveWeights) -> None:
         both = (gyro, accel)
         self._width = width = gyro.layers[0].out_features
-        self._units = np.repeat([one.near_zero / one.scale for one in both], 3)
-        self._bent = any(bool(one.layers[2].weight.any()) for one in both)
+        self._units = np.repeat([curve.near_zero / curve.scale for curve in both], 3)
+        self._bent = any(bool(curve.layers[2].weight.any()) for curve in both)
         self._first = np.zeros((2 * width + 1, 19))
-        self._first[width, 6] = ALWAYS
+        self._first[width, 6] = CONSTANT
         self._second = np.empty((2, width, width + 1))
         self._last = np.zeros((6, 2 * width + 8))
-        for k, one in enumerate(both):
+        for k, curve in enumerate(both):
             unit, own = k * (width + 1), slice(3 * k, 3 * k + 3)
-            first, second, last = (_array(layer.weight) for layer in one.layers)
+            first, second, last = (_array(layer.weight) for layer in curve.layers)
             for part, start in enumerate((0, 7, 13)):  # u, asinh of u, asinh of s
-                seen = first[:, 3 * part : 3 * part + 3] / (1.0 if part else one.scale)
-                self._first[unit : unit + width, start + 3 * k : start + 3 * k + 3] = HALF_ROOT * seen
-            self._first[unit : unit + width, 6] = HALF_ROOT * _array(one.layers[0].bias)
-            always = _array(one.layers[1].bias)[:, None] / (2.0 * ALWAYS)
-            self._second[k] = np.concatenate([HALF_ROOT * second, always][:: 1 - 2 * k], axis=1)
-            self._last[own, k * width : (k + 1) * width] = one.size * last
-            self._last[own, 2 * width + 1 :][:, own] = one.W
-        self._rooms: dict[int, _Room] = {}
+                columns = first[:, 3 * part : 3 * part + 3] / (1.0 if part else curve.scale)
+                self._first[unit : unit + width, start + 3 * k : start + 3 * k + 3] = HALF_ROOT * columns
+            self._first[unit : unit + width, 6] = HALF_ROOT * _array(curve.layers[0].bias)
+            constant = _array(curve.layers[1].bias)[:, None] / (2.0 * CONSTANT)
+            self._second[k] = np.concatenate([HALF_ROOT * second, constant][:: 1 - 2 * k], axis=1)
+            self._last[own, k * width : (k + 1) * width] = curve.size * last
+            self._last[own, 2 * width + 1 :][:, own] = curve.W
+        self._buffers: dict[int, _Buffers] = {}
         self._last_and_rest = self._last.copy()
         self._last[:, -1] -= self.one(np.zeros(6), np.zeros(6), 0.0)
         self.add_line(np.zeros(6), np.zeros(6))
 
     def __call__(self, u: Float64[np.ndarray, "n 6"], slow: Float64[np.ndarray, "n 6"]) -> Float64[np.ndarray, "n 6"]:
-        """What the motion adds to both biases."""
+        """Motion-dependent bias of both sensors."""
         out = np.empty((len(u), 6))
         for k in range(0, len(u), ROWS):
             rows = slice(k, k + ROWS)
-            out[rows] = self._last.dot(self._bend(u[rows].T, slow[rows].T, self._room(len(u[rows])))).T
+            out[rows] = self._last.dot(self._bend(u[rows].T, slow[rows].T, self._buffers_of(len(u[rows])))).T
         return out
 
     def add_line(self, rest: Vector6, slope: Vector6) -> None:
-        """From now on `one` adds rest + since_s slope."""
+        """Set the line rest + since_s slope that `one` adds."""
         self._last_and_rest[:, -1] = self._last[:, -1] + rest
         self._last_and_rest[:, 2 * self._width] = slope
 
     def one(self, u: Vector6, slow: Vector6, since_s: float) -> Vector6:
-        """The bias at one sample: what the motion adds, and the rest bias."""
-        room = self._room(0)
-        room.z[2 * self._width] = since_s
-        out: Vector6 = self._last_and_rest.dot(self._bend(u, slow, room))
+        """Bias at one sample: motion-dependent part plus rest bias."""
+        buffers = self._buffers_of(0)
+        buffers.z[2 * self._width] = since_s
+        out: Vector6 = self._last_and_rest.dot(self._bend(u, slow, buffers))
         return out
 
-    def _room(self, n: int) -> _Room:
-        """Room for n samples, or for a single one without their axis (n = 0)."""
-        room = self._rooms.get(n)
-        if room is None:
-            room = self._rooms[n] = _Room(self._width, (n,) if n else (), self._units)
-        return room
+    def _buffers_of(self, n: int) -> _Buffers:
+        """Buffers for n samples, or for a single one without the sample axis (n = 0)."""
+        buffers = self._buffers.get(n)
+        if buffers is None:
+            buffers = self._buffers[n] = _Buffers(self._width, (n,) if n else (), self._units)
+        return buffers
 
-    def _bend(self, u: Array, slow: Array, room: _Room) -> Array:
-        """The last layer's input."""
-        room.u[:] = u
+    def _bend(self, u: Array, slow: Array, buffers: _Buffers) -> Array:
+        """Input of the last layer."""
+        buffers.u[:] = u
         if not self._bent:
-            return room.outs
-        a, b = room.a, room.b
-        np.multiply(u, room.units, room.near_u)
-        np.multiply(slow, room.units, room.near_slow)
-        np.arcsinh(room.near, room.near)
-        self._first.dot(room.seen, a)
+            return buffers.outs
+        a, b = buffers.a, buffers.b
+        np.multiply(u, buffers.units, buffers.near_u)
+        np.multiply(slow, buffers.units, buffers.near_slow)
+        np.arcsinh(buffers.near, buffers.near)
+        self._first.dot(buffers.seen, a)
         erf(a, b)
         b *= a
         b += a
-        self._second[0].dot(room.b_gyro, room.c_gyro)
-        self._second[1].dot(room.b_accel, room.c_accel)
-        np.tanh(room.c, room.flat)
-        return room.outs
+        self._second[0].dot(buffers.b_gyro, buffers.c_gyro)
+        self._second[1].dot(buffers.b_accel, buffers.c_accel)
+        np.tanh(buffers.c, buffers.flat)
+        return buffers.outs
 
 
-class _Room:
-    """Where the layers' numbers lie, and its parts, cut once: numpy takes as long to cut as to add.
+class _Buffers:
+    """Buffers of the layers and views of their parts, made once: numpy takes as long to slice as to add.
 
-    Rows of `z`: what tanh gives (gyro, accel), seconds on the rest bias's line, u, one, asinh of u, asinh of s.
+    Rows of `z`: outputs of tanh (gyro, accel), seconds on the line of the rest bias, u, 1, asinh of u, asinh of s.
     """
 
     def __init__(self, width: int, samples: tuple[int, ...], units: Vector6) -> None:
@@ -133,9 +136,9 @@ class _Room:
 
 
 class NeuralStream:
-    """Curves on the samples, and the drift's rest bias by one Euler step every `stride` samples.
+    """Bias stream: the curves, and the rest bias by one Euler step of the drift every `stride` samples.
 
-    Remembers the rest bias, its rate, the filtered samples, and how many there were since the drift's last step.
+    State: the rest bias, its rate, the filtered samples, and the count of samples since the last step of the drift.
     """
 
     def __init__(
@@ -150,8 +153,11 @@ class NeuralStream:
         self._curves, self._drifts, self._stride = curves, drifts, stride
         self._rest, self._slope = rest.astype(np.float64), np.zeros(6)
         self._gain = np.array([-math.expm1(-1.0 / (rate_hz * tau)) for tau in tau_s])[:, None]
-        self._state, self._step_by = np.zeros((2, 6)), np.zeros((2, 6))  # what curve and drift see, and how it moves
-        self._slow, self._seen = self._state
+        self._state, self._step_by = (
+            np.zeros((2, 6)),
+            np.zeros((2, 6)),
+        )  # filtered inputs of curve and drift, and their increments
+        self._slow, self._drift_input = self._state
         self._before, self._t_step, self._count, self._began = np.zeros(6), 0.0, -1, False
 
     def __call__(
@@ -166,13 +172,13 @@ class NeuralStream:
         if not self._began:
             self._begin(float(t_s[0]), u[0])
         slow, seen = (low_pass(u, float(g), y) for g, y in zip(self._gain[:, 0], self._state, strict=True))
-        self._slow[:], self._seen[:] = slow[-1], seen[-1]
+        self._slow[:], self._drift_input[:] = slow[-1], seen[-1]
         bias = self._curves(u, slow)
         bias += self._rest_path(t_s, seen) if self._drifts else self._rest
         return bias
 
     def one(self, t_s: float, u: Vector6) -> Vector6:
-        """The same for one sample."""
+        """Bias at one sample."""
         if not self._began:
             self._begin(t_s, u)
         step = self._step_by
@@ -184,11 +190,11 @@ class NeuralStream:
         if self._drifts:
             self._count += 1
             if self._count == self._stride:
-                self._step(t_s, self._rest + since_s * self._slope, self._seen)
+                self._step(t_s, self._rest + since_s * self._slope, self._drift_input)
         return bias
 
     def _rest_path(self, t_s: Float64[np.ndarray, " n"], seen: Float64[np.ndarray, "n 6"]) -> Float64[np.ndarray, "n 6"]:
-        """The rest bias at each sample."""
+        """Rest bias at each sample."""
         rest, k = np.empty((len(t_s), 6)), 0
         while k < len(t_s):
             last = min(len(t_s), k + self._stride - self._count)
@@ -200,7 +206,7 @@ class NeuralStream:
         return rest
 
     def _begin(self, t_s: float, u: Array) -> None:
-        """The first sample is the drift's start, and not counted among those that follow it."""
+        """Start the drift at the first sample, which does not count towards the next step."""
         self._began, self._state[:] = True, u
         self._t_step, self._before = t_s, u.copy()
         self._set_slope(u, np.zeros(6))
@@ -218,7 +224,7 @@ class NeuralStream:
 
 
 def perceptron(module: nn.Module) -> Callable[[Array], Array]:
-    """Linear layers with tanh and GELU between them, as a numpy function."""
+    """Perceptron (linear layers with tanh and GELU between them) as a numpy function."""
     steps: list[Callable[[Array], Array]] = []
     for layer in module if isinstance(module, nn.Sequential) else [module]:
         if isinstance(layer, nn.Linear):

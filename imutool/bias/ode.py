@@ -1,8 +1,8 @@
-"""Neural ODEs on SO(3): a causal path through sampled controls, and integration in charts of the rotation group.
+"""Neural ODEs on SO(3): a causal path through sampled controls, and integration in charts.
 
-A rotation is carried as R = R_0 Exp(xi) with dxi/dt = J_r^{-1}(xi) omega (paper, theorem 1, eq. 15), so the state of
-the solver is Euclidean and torchdiffeq, with its adjoint, applies unchanged. Where |xi| has passed pi the chart is
-moved: R_0 <- R_0 Exp(xi), xi <- 0 (algorithm 1), for each element of the batch by itself.
+A rotation is R = R_0 Exp(xi) with dxi/dt = J_r^{-1}(xi) omega (paper, theorem 1, eq. 15): the state of the solver is
+Euclidean, so torchdiffeq and its adjoint apply unchanged. Where |xi| exceeds pi the chart changes: R_0 <- R_0 Exp(xi),
+xi <- 0 (algorithm 1), for each element of the batch separately.
 """
 
 from __future__ import annotations
@@ -24,18 +24,18 @@ Method = Literal["euler", "rk4", "dopri5"]
 Field = Callable[[Tensor, Tensor, Tensor], tuple[Tensor, Tensor]]
 
 FIXED_STEP: tuple[Method, ...] = ("euler", "rk4")
-FIRST_STRETCH, LONGEST_STRETCH = 32, 128  # outputs per call of a fixed-step solver: a call costs a third of a step, a
-# chart change wastes the rest of its stretch; so stretches double while none is needed and are cut to fit when one is
-MAX_STEPS_PER_OUTPUT = 10_000  # an adaptive solver that needs more between two outputs is at a singularity
+FIRST_STRETCH, LONGEST_STRETCH = 32, 128  # outputs per call of a fixed-step solver. A call costs a third of a step, and
+# a chart change wastes the rest of its stretch: stretches double without chart changes, and end at the next one
+MAX_STEPS_PER_OUTPUT = 10_000  # an adaptive solver that needs more steps is at a singularity
 REDUCE = "Reduce the step, or ask for output more often"
 
 
 class HermitePath:
-    """Sampled controls as a causal cubic Hermite spline with backward differences (paper, eq. spline; Morrill 2022).
+    """Causal cubic Hermite spline of sampled controls, with backward differences (paper; Morrill 2022).
 
     S(t_i) = u_i and dS/dt(t_i) = (u_i - u_{i-1}) / (t_i - t_{i-1}); the slope at the first knot, which has no
     predecessor, is 0. Causal: up to t_{i+1} the path depends on samples up to i+1 only, and its slope at t_i on samples
-    up to i. Outside its knots it goes on straight with the slope of the end knot (a solver may look just past the end).
+    up to i. Outside its knots it is linear with the slope of the end knot (a solver may evaluate just past the end).
 
     Args:
         t: knot times in s, strictly increasing, best float64 (float32 seconds lose the spacing of samples within a
@@ -56,7 +56,7 @@ class HermitePath:
         self._slope = torch.cat([torch.zeros_like(u[..., :1, :]), slope], dim=-2)
 
     def value(self, t: Float[Tensor, "*m"]) -> Float[Tensor, "*batch_m_k"]:
-        """S(t): for one time [*batch, k], for m times [*batch, m, k]."""
+        """Values S(t): for one time [*batch, k], for m times [*batch, m, k]."""
         i, s, h = self._locate(t)
         start_rise, rise = self._slope[..., i, :] * h, self._rise[..., i, :]
         inside = self.u[..., i, :] + s * (1 - s) ** 2 * start_rise + s**2 * (2 - s) * rise
@@ -64,17 +64,17 @@ class HermitePath:
         return inside + past * (self._slope[..., -1, :] if t.ndim == 0 else self._slope[..., -1:, :])
 
     def derivative(self, t: Float[Tensor, "*m"]) -> Float[Tensor, "*batch_m_k"]:
-        """dS/dt, shaped as `value`."""
+        """Slopes dS/dt, shaped as `value`."""
         i, s, h = self._locate(t)
         start_rise, rise = self._slope[..., i, :] * h, self._rise[..., i, :]
         return ((1 - s) * (1 - 3 * s) * start_rise + s * (4 - 3 * s) * rise) / h
 
     def at_knots(self) -> tuple[Float[Tensor, "*batch n k"], Float[Tensor, "*batch n k"]]:
-        """Values and slopes at all knots, without a search: all that a solver stepping from knot to knot needs."""
+        """Values and slopes at all knots without a search, for a solver that steps from knot to knot."""
         return self.u, self._slope
 
     def _locate(self, t: Float[Tensor, "*m"]) -> tuple[Tensor, Float[Tensor, "*m 1"], Float[Tensor, "*m 1"]]:
-        """Interval index, place in it from 0 to 1, and its length, by binary search."""
+        """Interval index, position in the interval from 0 to 1, and its length, by binary search."""
         inside = t.to(self.t.dtype).clamp(self.t[0], self.t[-1])
         i = (torch.searchsorted(self.t, inside, right=True) - 1).clamp(0, len(self.t) - 2)
         h = self.t[i + 1] - self.t[i]
@@ -95,20 +95,20 @@ def integrate(
     atol: float = 1e-8,
     parameters: Iterable[Tensor] = (),
 ) -> tuple[Float[Tensor, "n *batch 3 3"], Float[Tensor, "n *batch m"]]:
-    """Rotations and Euclidean states at the times `t`, starting from `R0` and `state0` at `t[0]`.
+    """Rotations and Euclidean states at the times `t`, from `R0` and `state0` at `t[0]`.
 
     Solves dR_wb/dt = R_wb [omega_b]x together with the Euclidean states, from output to output. Gradients reach
-    `state0`, `R0` and the field's parameters, through chart changes too: a change only renames the same rotation.
+    `state0`, `R0` and the field's parameters, also through chart changes: a change only renames the same rotation.
 
     Args:
-        field: `field(t, R_wb, state) -> (omega_b, dstate/dt)`; t comes as a scalar in the dtype of `t`.
+        field: `field(t, R_wb, state) -> (omega_b, dstate/dt)`; t is a scalar in the dtype of `t`.
         state0: states at `t[0]`; m may be 0.
         t: output times in s, strictly increasing, best float64.
         R0: rotation at `t[0]`, body to world.
         method: `euler` and `rk4` take one step from each output to the next; `dopri5` chooses its own, never over one.
         adjoint: gradients from the adjoint equation, in memory that does not grow with the steps between outputs. They
             equal those of the discrete steps as far as the solver has converged.
-        max_angle: a chart is left at the first output where |xi| exceeds this; less than 2 pi, where it ends.
+        max_angle: the chart changes at the first output where |xi| exceeds this; less than 2 pi, where a chart ends.
         rtol: relative tolerance of `dopri5`, on the root mean square over the batch.
         atol: absolute tolerance of `dopri5`, likewise.
         parameters: for the adjoint, tensors the field depends on beyond its own as an `nn.Module`, none computed from
@@ -126,7 +126,7 @@ def integrate(
         leave, end = _first_leaving(y, max_angle)
         if end == len(times) - 1:
             stretch = solve.next_stretch(stretch)
-        else:  # what lies past the change is dropped, and must not enter a backward solution either
+        else:  # outputs past the change are dropped, and must not enter a backward solution either
             stretch, times = end, times[: end + 1]
             y = solve(times, R0, xi0, state0) if adjoint else y[: end + 1]
         _check(y, times)
@@ -140,12 +140,12 @@ def integrate(
 
 
 class _Chart(nn.Module):
-    """The right-hand side in one chart: state (xi, Euclidean states), time from the start of the stretch.
+    """Right-hand side in one chart: state (xi, Euclidean states), time from the start of the stretch.
 
     Time is local because torchdiffeq casts it to the state's dtype, and float32 seconds blur the samples of a long log.
 
-    For the adjoint R0 rides along as nine constant states. It cannot be one of the adjoint's parameters: after a chart
-    change it depends on the field's own, and torch.autograd.grad would then count those twice.
+    For the adjoint, R0 is nine constant states. It cannot be one of the adjoint's parameters: after a chart change it depends
+    on the field's parameters, and torch.autograd.grad would count those twice.
     """
 
     def __init__(self, field: Field, start: Float[Tensor, ""], R0: Float[Tensor, "*batch 3 3"] | None) -> None:
@@ -164,7 +164,7 @@ class _Chart(nn.Module):
 
 @dataclass(frozen=True)
 class _Solver:
-    """torchdiffeq with our options, and its failures as ours."""
+    """Solver of torchdiffeq with the options for one chart; its failures become NumericsError."""
 
     field: Field
     parameters: tuple[Tensor, ...]
@@ -175,11 +175,11 @@ class _Solver:
 
     @property
     def first_stretch(self) -> int:
-        """Outputs of the first call. An adaptive solver must not run into the end of a chart, so it gets one at a time."""
+        """Outputs of the first call: one for an adaptive solver, which must not reach the end of a chart."""
         return FIRST_STRETCH if self.method in FIXED_STEP else 1
 
     def next_stretch(self, stretch: int) -> int:
-        """Outputs of the call after one that needed no chart change."""
+        """Outputs of the call after one without a chart change."""
         return min(2 * stretch, LONGEST_STRETCH) if self.method in FIXED_STEP else 1
 
     def __call__(
@@ -189,7 +189,7 @@ class _Solver:
         xi0: Float[Tensor, "*batch 3"],
         state0: Float[Tensor, "*batch m"],
     ) -> Float[Tensor, "n *batch k"]:
-        """(xi, state) at the times, in the chart at R0.
+        """States (xi, state) at the times, in the chart at R0.
 
         Raises:
             NumericsError: dopri5 could not keep its tolerance.
@@ -214,7 +214,7 @@ class _Solver:
                 adjoint_params=(*chart.parameters(), *self.parameters),
                 **tolerances,
             )
-        except AssertionError as error:  # torchdiffeq's way to say that the step underflowed or the state is not finite
+        except AssertionError as error:  # torchdiffeq: the step underflowed, or the state is not finite
             raise NumericsError(
                 f"{self.method} failed after t = {float(times[0]):.6g} s ({str(error).splitlines()[0][:80]})",
                 expected="a solution within tolerance",
@@ -223,7 +223,7 @@ class _Solver:
         return solution[..., :-9]
 
     def _options(self, local: Float[Tensor, " n"]) -> tuple[dict[str, Any], dict[str, Any]]:
-        """Forward and backward: try the whole interval first, stop at its end, measure errors on what can err."""
+        """Options of the forward and backward solution: try the whole interval first, stop at its end."""
         if self.method in FIXED_STEP:
             return {}, {}
         limit = {"max_num_steps": MAX_STEPS_PER_OUTPUT}
@@ -236,7 +236,7 @@ def _norm_without_chart(y: Float[Tensor, "*batch m"]) -> Float[Tensor, ""]:
 
 
 def _first_leaving(y: Float[Tensor, "n *batch m"], max_angle: float) -> tuple[Bool[Tensor, "*batch"], int]:
-    """The first output at which some element must change its chart (or the last one), and which elements must there."""
+    """Elements that must change their chart, at the first output where one must (else the last), and that output."""
     outside = y[..., :3].detach().square().sum(dim=-1) > max_angle**2
     some = outside.reshape(len(y), -1).any(dim=1)
     end = int(some.int().argmax()) if bool(some[1:].any()) else len(y) - 1

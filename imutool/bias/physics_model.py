@@ -1,9 +1,9 @@
-"""Bias model from a physics.toml: its effects are corrected for, its bias is the prior.
+"""Bias model from a physics.toml: corrects the file's effects; the prior is the file's bias.
 
 Scale, misalignment and the rotation of the mount are one matrix, reading = T f + b with T = (I + S)(I + M) R^T (they act in
 this order), and its inverse is exact: f = (u - b) - (I - T^-1)(u - b). Everything else in closed form is of the measured
-signals without the bias, where it should be of the true ones: right to first order in its size. A rotation of the mount
-is undone, so that samples are in the body's axes and no longer in the sensor's.
+signals without the bias, instead of the true ones: right to first order in its size. The model inverts a rotation of the
+mount: corrected samples are in the body's axes, not in the sensor's.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ from imutool.units import AXES, SENSORS, Sensor
 # Spread of a bias from run to run: of the ADIS16448 in EuRoC's training sequences, 2 mrad/s and 0.02 m/s². Where the file
 # has no bias: data sheet of a consumer sensor, as in `imutool.bias.static`.
 TURN_ON_STD, UNKNOWN_STD = (2e-3, 0.02), (0.05, 0.4)
-MOST_TAU_S = 0.01  # for a larger clock offset the derivative's noise exceeds the error that it removes
+MOST_TAU_S = 0.01  # for a larger clock offset the derivative's noise exceeds the removed error
 MOUNT = "mount_rotation"
 MATRIX = {  # effects that are a factor of a sensor's matrix
     "gyro_scale": "gyro",
@@ -52,7 +52,7 @@ Part = tuple[LinearForm, Theta, Theta]  # an effect, its parameters, their stand
 
 
 class Model(hybrid.Model):
-    """b = rest + E(u - b_0), b_0 the file's own bias: an error of the start stays the same error at every sample."""
+    """Bias b = rest + E(u - b_0), b_0 the file's bias: an error of the initial bias stays constant."""
 
     method: ClassVar[str] = "physics"
 
@@ -60,10 +60,10 @@ class Model(hybrid.Model):
         super().__init__(hybrid.Config(gyro_effects=(), accel_effects=(), remainder=False), rate_hz)
         self.double()
         for sensor in SENSORS:
-            of = parts[sensor]
-            self._hold(sensor, ())
-            self.effects[sensor] = tuple(effect for effect, _, _ in of)
-            theta, std = (np.concatenate([np.zeros(0), *(part[k] for part in of)]) for k in (1, 2))
+            sensor_parts = parts[sensor]
+            self._set_effects(sensor, ())
+            self.effects[sensor] = tuple(effect for effect, _, _ in sensor_parts)
+            theta, std = (np.concatenate([np.zeros(0), *(part[k] for part in sensor_parts)]) for k in (1, 2))
             self.register_buffer(f"theta_{sensor}", torch.from_numpy(theta))
             self.register_buffer(f"covariance_{sensor}", torch.from_numpy(np.diag(std**2)))
         self.config = msgspec.structs.replace(
@@ -71,40 +71,40 @@ class Model(hybrid.Model):
             gyro_effects=tuple(effect.name for effect in self.effects["gyro"]),
             accel_effects=tuple(effect.name for effect in self.effects["accel"]),
         )
-        looks_back = any(effect.columns is None for of in self.effects.values() for effect in of)
-        self.context = int(np.ceil(hybrid.FORGOTTEN * POWER_S * rate_hz)) if looks_back else 0
+        looks_back = any(effect.columns is None for effects in self.effects.values() for effect in effects)
+        self.context = int(np.ceil(hybrid.SETTLING * POWER_S * rate_hz)) if looks_back else 0
         self._b = np.zeros(6) if bias is None else np.array([*bias.gyro, *bias.accel])
         self.prior_mean.copy_(torch.from_numpy(self._b))
         self.prior_std.copy_(torch.tensor(np.repeat(UNKNOWN_STD if bias is None else TURN_ON_STD, 3)))
         self.truth_std.copy_(torch.tensor([2e-3] * 3 + [0.1] * 3))  # as `imutool.bias.static`
 
     def sensor_bias(self, sensor: Sensor, segment: Segment) -> Float[Tensor, "batch n 3"]:
-        """Rest bias, and the error of the effects at the samples without the file's bias."""
+        """Rest bias plus the error of the effects at the samples without the file's bias."""
         b = torch.from_numpy(self._b).to(segment.gyro)
-        less = Segment(segment.t, segment.gyro - b[:3], segment.accel - b[3:], segment.rest)
-        return super().sensor_bias(sensor, less)
+        shifted = Segment(segment.t, segment.gyro - b[:3], segment.accel - b[3:], segment.rest)
+        return super().sensor_bias(sensor, shifted)
 
     def stream(self, rest: Vector6) -> Stream:
-        """The model in numpy."""
+        """Bias stream in numpy."""
         inner = super().stream(rest)
         assert isinstance(inner, SampleStream)
-        return _Less(inner, self._b)
+        return _ShiftedStream(inner, self._b)
 
     def calibration_covariance(self) -> CovarianceModel | None:
         """Covariance from the parameters' standard deviations, taken as independent."""
         root_at = super().calibration_covariance()
         assert root_at is not None
 
-        def less(
+        def shifted(
             t_s: Float64[np.ndarray, " n"], gyro: Float64[np.ndarray, "n 3"], accel: Float64[np.ndarray, "n 3"]
         ) -> Mapping[Sensor, Float64[np.ndarray, "n 3 p"]]:
             return root_at(t_s, gyro - self._b[:3], accel - self._b[3:])
 
-        return less
+        return shifted
 
 
-class _Less:
-    """Stream that sees samples without a constant."""
+class _ShiftedStream:
+    """Stream that gets the samples minus a constant."""
 
     def __init__(self, inner: SampleStream, b: Vector6) -> None:
         self._inner, self._b = inner, b
@@ -122,16 +122,16 @@ def load(path: Path, rate_hz: float) -> Model:
     """Bias model from a physics.toml at a sample rate; warns of effects that it cannot correct.
 
     Raises:
-        ConfigError: the file cannot be read, or has an unknown name.
-        ModelError: the file has nothing to correct.
+        ConfigError: the file is unreadable, or has an unknown name.
+        ModelError: the file has no effect that a model can correct.
     """
     file = physics_file.read(path)
     acting = file.acting(where=path)
     parts: dict[Sensor, list[Part]] = {"gyro": [], "accel": []}
-    kept = [entry.name for entry in file.effect if not _taken(entry, parts)]
+    kept = [entry.name for entry in file.effect if not _is_corrected(entry, parts)]
     without_name = acting[len(file.effect) : len(acting) - (file.bias is not None)]
-    for (effect, theta), words in zip(without_name, _words(file), strict=True):
-        if _needs_more(words):
+    for (effect, theta), variables in zip(without_name, _variables(file), strict=True):
+        if _needs_channel(variables):
             kept.append(effect.equation)
         else:
             for sensor in effect.sensors:
@@ -142,13 +142,11 @@ def load(path: Path, rate_hz: float) -> Model:
             parts[sensor].append(part)
     if not any(parts.values()) and file.bias is None:
         listed = ", ".join(kept) or "nothing at all"
-        raise ModelError(
-            f"nothing in it can be corrected ({listed})", where=path, expected="a bias, or an effect in closed form"
-        )
+        raise ModelError(f"no effect can be corrected ({listed})", where=path, expected="a bias, or an effect in closed form")
     if kept:
-        logger.warning("%s: cannot be corrected, and stays in the samples: %s", path, ", ".join(kept))
+        logger.warning("%s: not corrected, stays in the samples: %s", path, ", ".join(kept))
     if any(entry.name == MOUNT for entry in file.effect):
-        logger.warning("%s: mount_rotation is undone, so that samples are in the body's axes, not the sensor's", path)
+        logger.warning("%s: mount_rotation is inverted: corrected samples are in the body's axes, not the sensor's", path)
     model = Model(parts, file.bias, rate_hz)
     sha256 = hashlib.sha256(path.read_bytes()).hexdigest()
     model.card = {"name": path.stem, "sha256": sha256, "prior": f"bias of {path.name}", "not_taken": kept}
@@ -156,7 +154,7 @@ def load(path: Path, rate_hz: float) -> Model:
     return model.eval()
 
 
-def _taken(entry: Entry, parts: Mapping[Sensor, list[Part]]) -> bool:
+def _is_corrected(entry: Entry, parts: Mapping[Sensor, list[Part]]) -> bool:
     """Whether an effect can be corrected; one with a linear form is added to the parts."""
     if entry.name in MATRIX or entry.name == MOUNT:
         return True
@@ -171,13 +169,13 @@ def _taken(entry: Entry, parts: Mapping[Sensor, list[Part]]) -> bool:
     for sensor in effect.sensors:
         form = linear_form(effect, sensor)
         names = [effect.parameters[k].name for k in form.free]
-        theta, std = (np.array([of(entry, name) for name in names]) for of in (_value, _std))
+        theta, std = (np.array([value(entry, name) for name in names]) for value in (_value, _std))
         parts[sensor].append((form, theta, std))
     return True
 
 
 def _value(entry: Entry, name: str) -> float:
-    """Value in the file; a parameter that it leaves out does nothing."""
+    """Value in the file; its null value for an absent parameter."""
     return entry.parameters[name].value if name in entry.parameters else _null_value(entry, name)
 
 
@@ -190,14 +188,14 @@ def _null_value(entry: Entry, name: str) -> float:
     return next((parameter.null_value for parameter in effect.parameters if parameter.name == name), 0.0)
 
 
-def _words(file: PhysicsFile) -> list[str]:
+def _variables(file: PhysicsFile) -> list[str]:
     """Variables of each part without a name, in the order in which they act."""
     return [*(curve.variable for curve in file.unknown), *(term.term for term in file.term)]
 
 
-def _needs_more(words: str) -> bool:
+def _needs_channel(variables: str) -> bool:
     """Whether a part needs a channel, or the time since the log's start."""
-    return words.startswith("/") or "t" in words.replace("|", " ").split()
+    return variables.startswith("/") or "t" in variables.replace("|", " ").split()
 
 
 def _of_size_one(effect: Effect, theta: Theta, sensor: Sensor) -> Part:
@@ -228,7 +226,7 @@ def _matrix(file: PhysicsFile, sensor: Sensor) -> Part | None:
             factors.append(np.eye(3) + M)
             variance += std**2
     if MOUNT in entries:
-        phi, std = (np.array([of(entries[MOUNT], f"phi_{axis}") for axis in AXES]) for of in (_value, _std))
+        phi, std = (np.array([value(entries[MOUNT], f"phi_{axis}") for axis in AXES]) for value in (_value, _std))
         factors.append(Rotation.from_rotvec(phi).as_matrix().T)
         variance += np.array([[0.0, std[2], std[1]], [std[2], 0.0, std[0]], [std[1], std[0], 0.0]]) ** 2
     T = np.linalg.multi_dot([np.eye(3), np.eye(3), *factors])

@@ -1,1 +1,1 @@
-"""The bias a run starts with, and how it is tracked from there."""
+"""Initial bias of a run, and its tracking from there."""

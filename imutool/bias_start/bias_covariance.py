@@ -1,17 +1,17 @@
-"""Bias and its covariance, sample by sample: of the rest bias through the learned dynamics, and of the calibration.
+"""Bias covariance at each sample: of the rest bias through the learned dynamics, and of the calibration.
 
 For a rest bias that stays constant over the whole log::
 
     dP/dt = F P + P F^T + Q,   F = d g / d beta at the prior,   Q = walk^2 per second,
 
-with g the drift that the model learned (zero for most models) and Q the random walk of rest biases in the training logs. A
-tracked rest bias brings the covariance of its filter. The fit of the effects leaves an uncertainty of its own, added at each
-sample: S S^T with S = T Sigma^1/2, T the derivative of the error with respect to the parameters.
+with g the learned drift (zero for most models) and Q the random walk of rest biases in the training logs. A tracked rest bias
+has the covariance of its filter. The fit of the effects adds S S^T at each sample, with S = T Sigma^1/2 and T the derivative
+of the error with respect to the parameters.
 
-Under a tracked bias, S counts as far as it differs from its mean so far. The constant part of an effect is a rest
-bias: neither the training logs nor the filter can separate the two. The fit determines it poorly, but their sum is well known,
-and the filter's covariance is that of the sum. Adding the whole S S^T would count it twice (on EuRoC, 2e-3 rad/s with errors of
-5e-4). The paper leaves all this to later work.
+With a tracked bias, only the difference of S from its running mean counts. The constant part of an effect acts like a rest
+bias: neither the training logs nor the filter can separate the two. The fit determines each poorly but their sum well, and the
+filter's covariance is that of the sum. Adding the whole S S^T would count it twice (on EuRoC, 2e-3 rad/s with errors of 5e-4).
+The paper leaves this to later work.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ class BiasEstimator:
     def __call__(
         self, t_s: Float64[np.ndarray, " n"], gyro: Float64[np.ndarray, "n 3"], accel: Float64[np.ndarray, "n 3"]
     ) -> BiasEstimate:
-        """The bias at each sample, and its covariance."""
+        """Bias and its covariance at each sample."""
         bias, P, calibration = self.parts(t_s, gyro, accel)
         for sensor, S in calibration.items():
             P[:, COLUMNS[sensor], COLUMNS[sensor]] += S @ S.transpose(0, 2, 1)
@@ -56,21 +56,21 @@ class BiasEstimator:
     def parts(
         self, t_s: Float64[np.ndarray, " n"], gyro: Float64[np.ndarray, "n 3"], accel: Float64[np.ndarray, "n 3"]
     ) -> EstimateParts:
-        """The same with the calibration's covariance as roots, for means over many samples."""
+        """Bias with the calibration's covariance as roots, for means over many samples."""
         bias, P = self._rest.estimate(t_s, gyro, accel)
         roots: Roots = {} if self._calibration is None or not len(t_s) else self._calibration(t_s, gyro, accel)
         return EstimateParts(bias, P, roots if self._mean is None or not roots else self._mean.subtract(roots))
 
 
 class _RunningMean:
-    """Mean of the roots from the first sample to the present one; the borders of blocks change nothing."""
+    """Mean of the roots from the first sample to the current one; block borders change nothing."""
 
     def __init__(self) -> None:
         self._sum: dict[Sensor, Float64[np.ndarray, "3 p"]] = {}
         self._count = 0
 
     def subtract(self, roots: Roots) -> Roots:
-        """The roots less their running means."""
+        """Roots minus their running means."""
         out: dict[Sensor, Float64[np.ndarray, "n 3 p"]] = {}
         n = 0
         for sensor, S in roots.items():

@@ -1,8 +1,6 @@
-"""The rest bias followed through a log: by each sample from what came before it, or from the whole log.
+"""Rest bias tracked through a log: causally from earlier samples, or smoothed from the whole log.
 
-Samples, less what the model says the motion adds, go through `imutool.inertial.inertial_filter` in blocks of half a second.
-`TrackedBiasStream`
-and `TrajectoryBiasStream` are streams (`imutool.bias.model.Stream`) like the one a model gives for a constant rest bias.
+Samples, minus the model's motion-dependent bias, go through `imutool.inertial.inertial_filter` in blocks of half a second.
 """
 
 from __future__ import annotations
@@ -24,16 +22,16 @@ from imutool.inertial.stationary import GAP_PERIODS, OnlineRestDetector
 
 BLOCK_S = 0.5
 STEP_S = 1.0  # of the covariance of a constant rest bias, whose dynamics take minutes
-USUAL_WALK = np.array([1e-4] * 3 + [2e-3] * 3)  # of a sensor nobody trained a model for
-LOST_S = 1.0  # without samples for longer, attitude and velocity are anybody's guess
-CHUNK_S, LOOK_AHEAD_S = 600.0, 600.0  # of smoothing: a bias has walked away from what it was ten minutes ago
+USUAL_WALK = np.array([1e-4] * 3 + [2e-3] * 3)  # of a sensor without a trained model
+LOST_S = 1.0  # after a longer gap, attitude and velocity are unknown
+CHUNK_S, LOOK_AHEAD_S = 600.0, 600.0  # of smoothing: a bias ten minutes later says nothing about the present one
 
 Samples = tuple[Float64[np.ndarray, " n"], Float64[np.ndarray, "n 3"], Float64[np.ndarray, "n 3"]]
 
 
 @dataclass(frozen=True)
 class BiasPrior:
-    """What is known of a run's biases before it: b in motion, by how much it differs at rest (mean zero), how far b walks.
+    """Prior of a run's biases: bias b in motion, offset at rest (mean zero), and random walk of b.
 
     `walk` is in rad/s and m/s² per second^1/2.
     """
@@ -45,18 +43,18 @@ class BiasPrior:
 
 
 class BiasTrajectory(NamedTuple):
-    """A rest bias in time (s from the first sample): each row holds until the next."""
+    """Rest bias in time (s from the first sample): each row holds until the next."""
 
     t_s: Float64[np.ndarray, " m"]
     rest: Float64[np.ndarray, "m 6"]
     std: Float64[np.ndarray, "m 6"]
 
     def at(self, t_s: Float64[np.ndarray, " n"]) -> Float64[np.ndarray, "n 6"]:
-        """The rest bias at some times."""
+        """Rest bias at some times."""
         return np.asarray(self.rest[self._row(t_s)])
 
     def std_at(self, t_s: Float64[np.ndarray, " n"]) -> Float64[np.ndarray, "n 6"]:
-        """How sure it is at some times, as a standard deviation."""
+        """Standard deviation of the rest bias at some times."""
         return np.asarray(self.std[self._row(t_s)])
 
     def _row(self, t_s: Float64[np.ndarray, " n"]) -> Int64[np.ndarray, " n"]:
@@ -65,7 +63,7 @@ class BiasTrajectory(NamedTuple):
 
 
 class FilteredBlock(NamedTuple):
-    """A block that went through the filter: when it began and ended, whether at rest, and the step (none: it only levels)."""
+    """Block after the filter: start, end, whether at rest, and the filter step."""
 
     start_s: float
     end_s: float
@@ -74,7 +72,7 @@ class FilteredBlock(NamedTuple):
 
 
 class _Block(NamedTuple):
-    """Samples from one boundary to the next, both included; at rest the last is left to the next block."""
+    """Block of samples from one boundary to the next, both included; at rest the last belongs to the next block."""
 
     t_s: Float64[np.ndarray, " n"]
     u: Float64[np.ndarray, "n 6"]
@@ -83,41 +81,41 @@ class _Block(NamedTuple):
 
 
 class BiasFilter:
-    """The filter over samples as they arrive, in batches of any size: the borders of batches change nothing.
+    """Bias filter for a stream of samples in batches of any size; batch borders change nothing.
 
-    With `ahead`, blocks wait until it is known whether a stop begins with them, which takes `OnlineRestDetector` 1.5 s.
+    With `ahead`, blocks wait until `OnlineRestDetector` knows whether a stop begins with them, which takes 1.5 s.
     """
 
-    def __init__(self, known: BiasPrior, settings: FilterSettings | None = None, *, ahead: bool = False) -> None:
+    def __init__(self, prior: BiasPrior, settings: FilterSettings | None = None, *, ahead: bool = False) -> None:
         self.settings = settings or FilterSettings()
         self.state: State | None = None
-        self._known, self._still = known, OnlineRestDetector()
-        self._wait = self._still.blocks_needed - 1 if ahead else 0
+        self._prior, self._rest_detector = prior, OnlineRestDetector()
+        self._wait = self._rest_detector.blocks_needed - 1 if ahead else 0
         self._waiting: deque[tuple[_Block, bool]] = deque()
-        self._left: list[tuple[Float64[np.ndarray, " n"], Float64[np.ndarray, "n 6"]]] = []
+        self._pending: list[tuple[Float64[np.ndarray, " n"], Float64[np.ndarray, "n 6"]]] = []
         self._close_s = -np.inf
 
     def feed(
         self, t_s: Float64[np.ndarray, " n"], gyro: Float64[np.ndarray, "n 3"], accel: Float64[np.ndarray, "n 3"]
     ) -> Iterator[FilteredBlock]:
-        """The blocks that these samples bring to an end."""
+        """Filtered blocks that these samples complete."""
         if not len(t_s):
             return
-        if not self._left:
+        if not self._pending:
             self._close_s = float(t_s[0]) + BLOCK_S
-        self._left.append((t_s, np.concatenate([gyro, accel], axis=1)))
+        self._pending.append((t_s, np.concatenate([gyro, accel], axis=1)))
         if t_s[-1] < self._close_s:
             return
-        t, u = (np.concatenate(parts) for parts in zip(*self._left, strict=True))
+        t, u = (np.concatenate(parts) for parts in zip(*self._pending, strict=True))
         first = 0
         while t[-1] >= self._close_s:
             last = int(np.searchsorted(t, self._close_s))
             yield from self._arrived(t[first : last + 1], u[first : last + 1])
             first, self._close_s = last, float(t[last]) + BLOCK_S
-        self._left = [(t[first:].copy(), u[first:].copy())]
+        self._pending = [(t[first:].copy(), u[first:].copy())]
 
     def finish(self) -> Iterator[FilteredBlock]:
-        """The blocks that still waited."""
+        """Filtered blocks that were still waiting."""
         while self._waiting:
             yield self._pass(*self._waiting.popleft())
 
@@ -125,7 +123,7 @@ class BiasFilter:
         dt = np.diff(t)
         late = dt > GAP_PERIODS * np.median(dt) if len(dt) > 1 else dt > BLOCK_S * 1.5
         block = _Block(t, u, float(dt.max()), float(dt[late].sum()))
-        rests = self._still(u[:-1, :3], u[:-1, 3:], whole=not late.any())
+        rests = self._rest_detector(u[:-1, :3], u[:-1, 3:], whole=not late.any())
         self._waiting.append((block, rests))
         if rests:
             for i in range(max(0, len(self._waiting) - 1 - self._wait), len(self._waiting)):
@@ -136,52 +134,52 @@ class BiasFilter:
     def _pass(self, block: _Block, rests: bool) -> FilteredBlock:
         t, u, s = block.t_s, block.u, self.settings
         if self.state is None:
-            k = self._known
-            P = np.diag(np.concatenate([k.std, k.ground_std]) ** 2)
-            self.state = inertial_filter.level(u[:, 3:].mean(axis=0), k.mean, np.zeros(6), P, s)
+            prior = self._prior
+            P = np.diag(np.concatenate([prior.std, prior.ground_std]) ** 2)
+            self.state = inertial_filter.level(u[:, 3:].mean(axis=0), prior.mean, np.zeros(6), P, s)
         x = self.state
         if block.longest_s > LOST_S:
             step = inertial_filter.reset_pose(x, u[-1, 3:], s)
         elif rests:
-            still = u[:-1]
-            variance = still[:, :3].var(axis=0) / len(still)
-            step = inertial_filter.rest_step(x, still.mean(axis=0), variance, float(t[-1] - t[0]), self._known.walk, s)
+            resting = u[:-1]
+            variance = resting[:, :3].var(axis=0) / len(resting)
+            step = inertial_filter.rest_step(x, resting.mean(axis=0), variance, float(t[-1] - t[0]), self._prior.walk, s)
         else:
             motion = integrate(t, u[:, :3] - x.bias[:3], u[:, 3:] - x.bias[3:])
-            step = inertial_filter.motion_step(x, motion, block.missing_s, self._known.walk, s)
+            step = inertial_filter.motion_step(x, motion, block.missing_s, self._prior.walk, s)
         self.state = step.after
         return FilteredBlock(float(t[0]), float(t[-1]), rests, step)
 
 
 class TrackedBiasStream:
-    """A model with a rest bias that is followed causally: row k depends on samples up to k, and on the start.
+    """Bias stream with a causally tracked rest bias: row k depends on samples up to k, and on the start.
 
-    Until `hold_s` the start's own rest bias stands: the stop that the log begins with, seen whole.
+    Until `hold_s` the rest bias is `rest`, measured on the whole stop at the log's start.
     """
 
-    def __init__(self, model: BiasModel, known: BiasPrior, rest: Vector6, hold_s: float) -> None:
-        self._motion, self._mean = model.stream(known.mean), known.mean
-        self.filter = BiasFilter(known)
+    def __init__(self, model: BiasModel, prior: BiasPrior, rest: Vector6, hold_s: float) -> None:
+        self._motion, self._mean = model.stream(prior.mean), prior.mean
+        self.filter = BiasFilter(prior)
         self._rest, self._now, self._hold_s = rest, rest, hold_s
-        self._covariance = np.diag(known.std**2)
+        self._covariance = np.diag(prior.std**2)
 
     def __call__(
         self, t_s: Float64[np.ndarray, " n"], gyro: Float64[np.ndarray, "n 3"], accel: Float64[np.ndarray, "n 3"]
     ) -> Float64[np.ndarray, "n 6"]:
-        """The bias at each sample."""
+        """Bias at each sample."""
         return self.estimate(t_s, gyro, accel).bias
 
     def estimate(
         self, t_s: Float64[np.ndarray, " n"], gyro: Float64[np.ndarray, "n 3"], accel: Float64[np.ndarray, "n 3"]
     ) -> BiasEstimate:
-        """The bias at each sample, and the filter's covariance of the rest bias."""
+        """Bias at each sample, and the filter's covariance of the rest bias."""
         bias = self._motion(t_s, gyro, accel) - self._mean
         rest, covariance = np.empty_like(bias), np.empty((len(bias), 6, 6))
         done = 0
         for block in self.filter.feed(t_s, gyro - bias[:, :3], accel - bias[:, 3:]):
-            known_from = int(np.searchsorted(t_s, block.end_s))
-            rest[done:known_from], covariance[done:known_from] = self._now, self._covariance
-            done, self._now = known_from, block.step.after.rest_bias(block.resting)
+            row = int(np.searchsorted(t_s, block.end_s))
+            rest[done:row], covariance[done:row] = self._now, self._covariance
+            done, self._now = row, block.step.after.rest_bias(block.resting)
             self._covariance = block.step.after.covariance(block.resting)
         rest[done:], covariance[done:] = self._now, self._covariance
         rest[t_s < self._hold_s] = self._rest
@@ -189,7 +187,7 @@ class TrackedBiasStream:
 
 
 class TrajectoryBiasStream:
-    """A model with a rest bias that is known in time, on the clock of the samples."""
+    """Bias stream with a given rest bias in time, on the clock of the samples."""
 
     def __init__(self, model: BiasModel, track: BiasTrajectory) -> None:
         self.track, self._mean = track, track.rest.mean(axis=0)
@@ -198,21 +196,21 @@ class TrajectoryBiasStream:
     def __call__(
         self, t_s: Float64[np.ndarray, " n"], gyro: Float64[np.ndarray, "n 3"], accel: Float64[np.ndarray, "n 3"]
     ) -> Float64[np.ndarray, "n 6"]:
-        """The bias at each sample."""
+        """Bias at each sample."""
         total: Float64[np.ndarray, "n 6"] = self._motion(t_s, gyro, accel) - self._mean + self.track.at(t_s)
         return total
 
     def estimate(
         self, t_s: Float64[np.ndarray, " n"], gyro: Float64[np.ndarray, "n 3"], accel: Float64[np.ndarray, "n 3"]
     ) -> BiasEstimate:
-        """The bias at each sample, and the smoother's variances of the rest bias."""
+        """Bias at each sample, and the smoother's variances of the rest bias."""
         covariance = np.zeros((len(t_s), 6, 6))
         covariance[:, range(6), range(6)] = self.track.std_at(t_s) ** 2
         return BiasEstimate(self(t_s, gyro, accel), covariance)
 
 
 class ConstantBiasStream:
-    """A model with a constant rest bias whose covariance grows with the random walk and the model's drift."""
+    """Bias stream with a constant rest bias; its covariance grows by random walk and the model's drift."""
 
     def __init__(self, model: BiasModel, rest: Vector6, std: Vector6) -> None:
         self._stream = model.stream(rest)
@@ -223,7 +221,7 @@ class ConstantBiasStream:
     def estimate(
         self, t_s: Float64[np.ndarray, " n"], gyro: Float64[np.ndarray, "n 3"], accel: Float64[np.ndarray, "n 3"]
     ) -> BiasEstimate:
-        """The bias at each sample, and the covariance of the rest bias, in steps of `STEP_S`."""
+        """Bias at each sample, and the covariance of the rest bias in steps of `STEP_S`."""
         covariance = np.empty((len(t_s), 6, 6))
         first = 0
         while first < len(t_s):
@@ -238,41 +236,41 @@ class ConstantBiasStream:
 
 
 def filter_blocks(
-    model: BiasModel, batches: Iterable[Samples], known: BiasPrior, *, ahead: bool = False
+    model: BiasModel, batches: Iterable[Samples], prior: BiasPrior, *, ahead: bool = False
 ) -> Iterator[FilteredBlock]:
-    """Every block of some samples, with what the model says of the motion taken off."""
-    motion = model.stream(known.mean)
-    filter_ = BiasFilter(known, ahead=ahead)
+    """Filtered blocks of samples, minus the model's motion-dependent bias."""
+    motion = model.stream(prior.mean)
+    filter_ = BiasFilter(prior, ahead=ahead)
     for t_s, gyro, accel in batches:
-        bias = motion(t_s, gyro, accel) - known.mean
+        bias = motion(t_s, gyro, accel) - prior.mean
         yield from filter_.feed(t_s, gyro - bias[:, :3], accel - bias[:, 3:])
     yield from filter_.finish()
 
 
 def smooth_blocks(blocks: Iterable[FilteredBlock]) -> Iterator[tuple[FilteredBlock, State]]:
-    """Each block with the estimate that holds over it, given everything up to at least `LOOK_AHEAD_S` later."""
+    """Smoothed estimate of each block, given the samples up to at least `LOOK_AHEAD_S` later."""
     kept: deque[FilteredBlock] = deque()
     for block in blocks:
         kept.append(block)
         if kept[-1].end_s - kept[0].start_s >= CHUNK_S + LOOK_AHEAD_S:
-            states = inertial_filter.smooth([one.step for one in kept])
+            states = inertial_filter.smooth([block.step for block in kept])
             until_s = kept[0].start_s + CHUNK_S
             for state in states:
                 if kept[0].start_s >= until_s:
                     break
                 yield kept.popleft(), state
     if kept:
-        states = inertial_filter.smooth([one.step for one in kept])
-        yield from zip(kept, states, strict=False)  # the last is the end's
+        states = inertial_filter.smooth([block.step for block in kept])
+        yield from zip(kept, states, strict=False)  # the last state is that of the end
 
 
-def smooth_bias(model: BiasModel, batches: Iterable[Samples], known: BiasPrior) -> tuple[BiasTrajectory, float]:
-    """The rest bias over a log from all of it, and how long the sensor rested (s). Memory: thirteen numbers a block.
+def smooth_bias(model: BiasModel, batches: Iterable[Samples], prior: BiasPrior) -> tuple[BiasTrajectory, float]:
+    """Smoothed rest bias over a whole log, and the time at rest (s); memory: thirteen numbers per block.
 
-    The track is empty for a log shorter than a block.
+    The trajectory is empty for a log shorter than a block.
     """
     rows, rested_s = [], 0.0
-    for block, state in smooth_blocks(filter_blocks(model, batches, known, ahead=True)):
+    for block, state in smooth_blocks(filter_blocks(model, batches, prior, ahead=True)):
         std = np.sqrt(np.diag(state.covariance(block.resting)))
         rows.append(np.concatenate([[block.start_s], state.rest_bias(block.resting), std]))
         rested_s += (block.end_s - block.start_s) * block.resting

@@ -1,6 +1,6 @@
 """Correct IMU samples with a bias model: all in memory, or one at a time.
 
-Causal: the bias at a sample comes from that sample and earlier ones, once the initial bias is known.
+Causal: after the initial bias, the bias at a sample depends on that sample and earlier ones.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from imutool.bias_start.bias_covariance import BiasEstimator
 from imutool.bias_start.initial_bias import InitialBias, tracked_from_prior
 from imutool.recording import Imu, seconds
 
-BLOCK_SAMPLES = 1 << 14  # are corrected at once: a covariance has 288 bytes
+BLOCK_SAMPLES = 1 << 14  # corrected at once: a covariance has 288 bytes
 
 
 class DebiasedImu(NamedTuple):
@@ -27,15 +27,15 @@ class DebiasedImu(NamedTuple):
 
 
 def apply(model: BiasModel, start: InitialBias, imu: Imu) -> DebiasedImu:
-    """Corrected samples of a model, from their first on."""
+    """Corrected samples and bias of a model."""
     bias = start.stream(model)(seconds(imu.t_ns, int(imu.t_ns[0])), imu.gyro, imu.accel)
     return DebiasedImu(Imu(imu.t_ns, imu.gyro - bias[:, :3], imu.accel - bias[:, 3:]), bias)
 
 
 def apply_with_std(model: BiasModel, start: InitialBias, imu: Imu) -> tuple[DebiasedImu, Float64[np.ndarray, "n 6"]]:
-    """Corrected samples as `apply`, and one standard deviation of the bias at each sample.
+    """Corrected samples as `apply`, and the standard deviation of the bias at each sample.
 
-    Gyro (rad/s), then accel (m/s²); see `imutool.bias_start.bias_covariance`. Computed in blocks, as a log is debiased.
+    Gyro (rad/s), then accel (m/s²); see `imutool.bias_start.bias_covariance`. Computed in blocks, as for a log.
     """
     estimator = BiasEstimator(model, start)
     t_s = seconds(imu.t_ns, int(imu.t_ns[0]))
@@ -48,11 +48,10 @@ def apply_with_std(model: BiasModel, start: InitialBias, imu: Imu) -> tuple[Debi
 
 
 class OnlineDebiaser:
-    """Corrects one sample at a time, for a live node.
+    """Corrects IMU samples one at a time, for a live node.
 
-    The start is a rest bias from `imutool.bias_start.initial_bias`, for instance `at_rest` over the first seconds, or
-    `prior`. Without one, it
-    begins at the prior and follows the samples, as `init="auto"` does.
+    `start` is a rest bias, for instance `bias_at_rest.at_rest` over the first seconds, or `initial_bias.prior`. Without `start`
+    it begins at the prior and tracks the rest bias, as `init="auto"` does.
     """
 
     def __init__(self, model: BiasModel, start: InitialBias | None = None) -> None:
@@ -62,7 +61,7 @@ class OnlineDebiaser:
     def __call__(
         self, stamp_ns: int, gyro: Float64[np.ndarray, "3"], accel: Float64[np.ndarray, "3"]
     ) -> tuple[Float64[np.ndarray, "3"], Float64[np.ndarray, "3"], Float64[np.ndarray, "6"]]:
-        """Corrected angular rate (rad/s) and specific force (m/s²), and the bias that was subtracted."""
+        """Corrected angular rate (rad/s), specific force (m/s²), and the subtracted bias."""
         if self._start_ns < 0:
             self._start_ns = stamp_ns
         u = np.concatenate((gyro, accel))
@@ -72,7 +71,7 @@ class OnlineDebiaser:
 
 
 def _by_blocks(stream: Stream) -> Callable[[float, Vector6], Vector6]:
-    """Corrects one sample as a block of one, for a stream without a shorter way."""
+    """Corrects one sample as a block, for a stream without a path for single samples."""
 
     def correct(t_s: float, u: Vector6) -> Vector6:
         bias: Vector6 = stream(np.array([t_s]), u[None, :3], u[None, 3:])[0]

@@ -1,10 +1,11 @@
 """Choose the bias model and the initial bias for an IMU of a log.
 
-Samples are cleaned where there is a survey (`imutool.cleaning`). Memory does not grow with the log.
+With a survey the samples are cleaned (`imutool.cleaning`). Memory does not grow with the log.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -15,8 +16,17 @@ from jaxtyping import Float64
 from imutool.bias import static
 from imutool.bias.io import check_rate, find_model
 from imutool.bias.model import BiasModel
+from imutool.bias_start.bias_at_rest import at_rest, auto, over_all_rest
+from imutool.bias_start.bias_from_truth import TRUTH_S, from_truth
 from imutool.bias_start.bias_tracking import Samples
-from imutool.bias_start.initial_bias import InitialBias, NoRestError, find, over_all_rest, smoothed_start
+from imutool.bias_start.initial_bias import (
+    InitialBias,
+    NoRestError,
+    from_numbers,
+    prior,
+    relative_samples,
+    smoothed_start,
+)
 from imutool.cleaning import Survey, cleaned
 from imutool.errors import ConfigError, DataError, LogError, ModelError
 from imutool.inertial.stationary import Blocks, block_statistics, white_noise
@@ -26,23 +36,58 @@ from imutool.mcap_io.read import read_recording
 from imutool.mcap_io.topics import ImuBatch
 from imutool.recording import Imu, Recording, nanoseconds, seconds
 
-HEAD_S = 60.0  # of a log are read to find the initial bias, however long the log
+HEAD_S = 60.0  # start of a log that the search for the initial bias reads
 
 
 def check_smooth(init: str, smooth: bool) -> None:
-    """Refuses smoothing together with a given start: smoothing finds its own.
+    """Refuse smoothing with a given initial bias, because smoothing estimates its own.
 
     Raises:
-        ConfigError: both are asked for.
+        ConfigError: `smooth` with an `init` other than `auto`.
     """
     if smooth and init != "auto":
         raise ConfigError(f"`smooth` with `init={init}`", where="smooth", expected="`init=auto`", fix="Give one of the two")
 
 
+def find_initial_bias(init: str, model: BiasModel, recording: Recording) -> InitialBias:
+    """Initial bias by the method that `init` names.
+
+    Raises:
+        ConfigError: an unknown method, or not six numbers.
+        DataError: `stationary` on a log that does not start at rest, `truth` without truth at its start, or `auto` with an
+            untrained model and no stationary stretch.
+    """
+    if init == "prior":
+        return prior(model)
+    if init == "truth" or init.startswith("truth:"):
+        return from_truth(model, recording, _truth_s(init))
+    if init == "stationary":
+        return at_rest(model, recording.imu)
+    if init == "auto":
+        return auto(model, recording.imu)
+    return from_numbers(init)
+
+
+def _truth_s(init: str) -> float:
+    """Seconds of `truth:SECONDS`.
+
+    Raises:
+        ConfigError: not a positive number.
+    """
+    text = init.partition(":")[2] or str(TRUTH_S)
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not 0.0 < value < math.inf:
+        raise ConfigError(f"{init!r}", where="init", expected="truth:SECONDS, for instance truth:5")
+    return value
+
+
 def choose_model_and_start(
     log: Log, topic: str, name: str | Path | None, init: str, smooth: bool, survey: Survey | None
 ) -> tuple[BiasModel, InitialBias]:
-    """Model and initial bias for one IMU of a log."""
+    """Bias model and initial bias for one IMU of a log."""
     untrained = name is None or str(name) == static.Model.method
     first_minute = _first_minute(log, topic, init, survey)
     period_s = first_minute.imu.period_s
@@ -52,19 +97,18 @@ def choose_model_and_start(
     model: BiasModel = static.Model() if name is None or untrained else find_model(name, 1.0 / period_s)
     if not untrained:
         check_rate(model, 1.0 / period_s, log.path)
-    start = _smoothed(model, _batches(log, topic, survey), log.path) if smooth else find(init, model, first_minute)
+    start = _smoothed(model, _batches(log, topic, survey), log.path) if smooth else find_initial_bias(init, model, first_minute)
     return model, start if start.noise.any() else replace(start, noise=_noise(first_minute.imu))
 
 
 def smooth_in_memory(model: BiasModel, imu: Imu, where: str | Location) -> InitialBias:
-    """The rest bias in time from all of some samples.
+    """Smoothed rest bias in time from all samples.
 
     Raises:
         DataError: too few samples.
         ModelError: an untrained model, and no rest to measure a bias on.
     """
-    t_s = seconds(imu.t_ns, int(imu.t_ns[0]) if len(imu) else 0)
-    return _smoothed(model, [(t_s, imu.gyro, imu.accel)], where)
+    return _smoothed(model, [relative_samples(imu)], where)
 
 
 def _smoothed(model: BiasModel, batches: Iterable[Samples], where: str | Location) -> InitialBias:
@@ -75,12 +119,12 @@ def _smoothed(model: BiasModel, batches: Iterable[Samples], where: str | Locatio
 
 
 def _imu_batches(log: Log, topic: str, survey: Survey | None, end_ns: int | None = None) -> Iterator[ImuBatch]:
-    """An IMU's messages, cleaned where there is a survey."""
+    """IMU messages, cleaned where there is a survey."""
     return log.imu_batches(topic, end_ns=end_ns) if survey is None else cleaned(log, survey, end_ns)
 
 
 def _batches(log: Log, topic: str, survey: Survey | None) -> Iterator[Samples]:
-    """An IMU's samples, with seconds since the first."""
+    """IMU samples, with seconds since the first."""
     start_ns = None
     for batch in _imu_batches(log, topic, survey):
         if len(batch.stamp_ns):
@@ -89,7 +133,7 @@ def _batches(log: Log, topic: str, survey: Survey | None) -> Iterator[Samples]:
 
 
 def _first_minute(log: Log, topic: str, init: str, survey: Survey | None) -> Recording:
-    """The first minute of a log, with its truth only where `init` asks for it."""
+    """First minute of a log, with truth only where `init` asks for it."""
     first = next((int(times.min()) for times in log.stamps(topic) if len(times)), None)
     end_ns = None if first is None else first + nanoseconds(HEAD_S)
     if init.partition(":")[0] == "truth" and survey is None:
@@ -101,10 +145,10 @@ def _first_minute(log: Log, topic: str, init: str, survey: Survey | None) -> Rec
 
 
 def _samples(log: Log, topic: str, survey: Survey | None, end_ns: int | None = None) -> Imu:
-    """The samples of one IMU, cleaned where there is a survey, whose end is then by stamp.
+    """Samples of one IMU; with a survey they are cleaned, and `end_ns` refers to stamps.
 
     Raises:
-        LogError: fewer than two, or none that a recording could hold.
+        LogError: fewer than two samples, or none that a recording accepts.
     """
     batches = list(_imu_batches(log, topic, survey, end_ns))
     count = sum(len(batch.stamp_ns) for batch in batches)
@@ -115,12 +159,12 @@ def _samples(log: Log, topic: str, survey: Survey | None, end_ns: int | None = N
 
 
 def _noise(imu: Imu) -> Float64[np.ndarray, "6"]:
-    """White noise of a sample, for a model that does not know it and a log that does not rest."""
+    """White noise of a sample, for a model without noise figures and a log without rest."""
     return white_noise(np.concatenate([imu.gyro, imu.accel], axis=1))
 
 
 def estimate_at_rest(imu: Imu, where: str | Location) -> tuple[BiasModel, InitialBias]:
-    """The static model with the mean bias over all rest, for a log without a model.
+    """Static model and the mean bias over all rest, for a log without a model.
 
     Raises:
         DataError: fewer than two samples.

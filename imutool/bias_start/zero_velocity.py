@@ -1,8 +1,7 @@
-"""Dead reckoning that knows when it stands: debiased samples through the inertial filter, from a known pose.
+"""Zero-velocity updates: dead reckoning of debiased samples through the inertial filter, from a known pose.
 
-At every stop velocity and rate are zero, in between speed is bounded (`imutool.inertial.inertial_filter`); each correction
-also moves
-the position as far as it had drifted with the velocity. Without a stop, what remains is the bounded speed.
+At every stop velocity and rate are zero, in between speed is bounded (`imutool.inertial.inertial_filter`). Each correction of
+the velocity also corrects the position for its drift. Without a stop, only the bound on the speed acts.
 """
 
 from __future__ import annotations
@@ -18,21 +17,21 @@ from imutool.inertial.inertial_filter import SIZE, State
 from imutool.inertial.strapdown import StartPose, dead_reckon
 from imutool.recording import Imu, Poses, seconds
 
-START_STD = np.array([1e-3] * 3 + [1e-2] * 3 + [1e-3] * 3)  # rad, m/s, m: of the pose it starts from
+START_STD = np.array([1e-3] * 3 + [1e-2] * 3 + [1e-3] * 3)  # rad, m/s, m: of the start pose
 
 
-def zero_velocity_trajectory(imu: Imu, start: StartPose, known: BiasPrior, *, smooth: bool = False) -> Poses:
-    """The trajectory at the IMU's stamps, from `start` at its first; with `smooth` each pose is given all samples.
+def zero_velocity_trajectory(imu: Imu, start: StartPose, prior: BiasPrior, *, smooth: bool = False) -> Poses:
+    """Trajectory at the IMU's stamps from `start` at the first; with `smooth` each pose uses all samples.
 
-    `imu` is debiased, `known` what may be left of the bias. Between the filter's blocks of half a second the samples are
-    integrated as in pure integration. A recording shorter than a block is pure integration.
+    `imu` is debiased; `prior` is that of the residual bias. Between the filter's blocks of half a second, and in a recording
+    shorter than a block, samples are integrated as in pure integration.
 
     Raises:
         DataError: no samples.
         NumericsError: the numbers overflow.
     """
-    filter_ = BiasFilter(known, ahead=smooth)
-    filter_.state = _state(start, known)
+    filter_ = BiasFilter(prior, ahead=smooth)
+    filter_.state = _state(start, prior)
     t_s = seconds(imu.t_ns, int(imu.t_ns[0]) if len(imu) else 0)
     estimates = _estimates(filter_, imu, t_s, smooth)
     pieces, first, state = [], 0, filter_.state
@@ -46,7 +45,7 @@ def zero_velocity_trajectory(imu: Imu, start: StartPose, known: BiasPrior, *, sm
 
 
 def _estimates(filter_: BiasFilter, imu: Imu, t_s: np.ndarray, smooth: bool) -> Iterator[tuple[float, bool, State, State]]:
-    """Of each block: its end, whether at rest, the estimate at its start and at its end."""
+    """End of each block, whether it is at rest, and the estimates at its start and end."""
 
     def blocks() -> Iterator[FilteredBlock]:
         yield from filter_.feed(t_s, imu.gyro, imu.accel)
@@ -56,26 +55,31 @@ def _estimates(filter_: BiasFilter, imu: Imu, t_s: np.ndarray, smooth: bool) -> 
         for block in blocks():
             yield block.end_s, block.resting, block.step.before, block.step.after
         return
-    held: tuple[FilteredBlock, State] | None = None
+    previous: tuple[FilteredBlock, State] | None = None
     for block, state in smooth_blocks(blocks()):
-        if held is not None:
-            yield held[0].end_s, held[0].resting, held[1], state
-        held = block, state
-    if held is not None:
-        yield held[0].end_s, held[0].resting, held[1], held[0].step.after  # at the end there is nothing later
+        if previous is not None:
+            yield previous[0].end_s, previous[0].resting, previous[1], state
+        previous = block, state
+    if previous is not None:
+        yield (
+            previous[0].end_s,
+            previous[0].resting,
+            previous[1],
+            previous[0].step.after,
+        )  # the last block has no later estimate
 
 
-def _state(start: StartPose, known: BiasPrior) -> State:
+def _state(start: StartPose, prior: BiasPrior) -> State:
     R_wb = Rotation.from_quat(start.q_wb_wxyz, scalar_first=True).as_matrix()
     P = np.zeros((SIZE, SIZE))
-    # the errors are the invariant ones: an error of the attitude turns velocity and position about the origin with it
-    P[range(SIZE), range(SIZE)] = np.concatenate([START_STD, known.std, known.ground_std]) ** 2
-    return State(R_wb, start.v_w.copy(), start.p_wb.copy(), known.mean.copy(), np.zeros(6), P)
+    # invariant errors: an attitude error rotates velocity and position about the origin
+    P[range(SIZE), range(SIZE)] = np.concatenate([START_STD, prior.std, prior.ground_std]) ** 2
+    return State(R_wb, start.v_w.copy(), start.p_wb.copy(), prior.mean.copy(), np.zeros(6), P)
 
 
 def _between(imu: Imu, state: State, resting: bool) -> Poses:
-    """Pure integration over a block, with what the filter knows of the bias at its start."""
-    left: Vector6 = state.rest_bias(resting)
+    """Pure integration over a block, with the filter's bias at its start."""
+    bias: Vector6 = state.rest_bias(resting)
     q_wb_wxyz = Rotation.from_matrix(state.R_wb).as_quat(scalar_first=True)
-    corrected = Imu(imu.t_ns, imu.gyro - left[:3], imu.accel - left[3:])
+    corrected = Imu(imu.t_ns, imu.gyro - bias[:3], imu.accel - bias[3:])
     return dead_reckon(corrected, (q_wb_wxyz, state.p_wb, state.v_w))

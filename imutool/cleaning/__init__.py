@@ -1,4 +1,4 @@
-"""What is wrong inside a log's IMU, and the log without it: `survey` looks, a `Cleaner` leaves out and converts."""
+"""Cleaning of a log's IMU: `survey` finds the defects, a `Cleaner` removes them."""
 
 from imutool.cleaning.cleaner import Cleaner, cleaned
 from imutool.cleaning.finding import Finding

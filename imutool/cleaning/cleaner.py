@@ -1,4 +1,4 @@
-"""A log's IMU as a first pass says it should be: what is no measurement left out, units put right, batch by batch."""
+"""Clean IMU messages of a surveyed log, batch by batch: defects dropped, units converted."""
 
 from __future__ import annotations
 
@@ -14,14 +14,17 @@ from imutool.mcap_io.topics import ImuBatch
 
 
 class Cleaner:
-    """Takes all messages of the surveyed topic in file order, in batches of any size; how they are cut changes nothing."""
+    """Drop and convert the messages of a surveyed topic, in file order.
+
+    Batches may have any size: the result does not depend on it.
+    """
 
     def __init__(self, survey: Survey) -> None:
         self._survey, self._count = survey, 0
         self._scales = bool((survey.scale != 1.0).any())
 
     def __call__(self, batch: ImuBatch) -> ImuBatch:
-        """The messages that are left, converted where the survey says so.
+        """Remaining messages, in SI units where the survey settled the unit.
 
         Raises:
             LogError: more messages than were surveyed.
@@ -46,12 +49,12 @@ class Cleaner:
 
 
 def rows(batch: ImuBatch, index: slice | Bool[np.ndarray, " n"]) -> ImuBatch:
-    """Some of a batch's messages."""
+    """Rows of a batch."""
     return batch._replace(**{name: getattr(batch, name)[index] for name in batch._fields if name != "frame_id"})
 
 
 def cleaned(log: Log, survey: Survey, end_ns: int | None = None) -> Iterator[ImuBatch]:
-    """A surveyed IMU's clean messages, up to a stamp (its last sample at or before it included).
+    """Clean messages of a surveyed IMU, up to and including the stamp `end_ns`.
 
     Raises:
         LogError: damage, or a log that has grown since it was surveyed.

@@ -78,7 +78,10 @@ class FindingReport(Section, frozen=True):
 
 
 class Intervals:
-    """Intervals of affected samples: neighbours join, at most `MAX_INTERVALS` are kept, the rest is counted."""
+    """Intervals of affected samples; neighbours join, and the first `MAX_INTERVALS` are kept.
+
+    Further intervals are only counted.
+    """
 
     def __init__(self) -> None:
         self.count = 0
@@ -87,7 +90,7 @@ class Intervals:
         self._last: int | None = None
 
     def add(self, number: Numbers, stamp_ns: Int64[np.ndarray, " n"]) -> None:
-        """Takes in the next samples, in order."""
+        """Add the next samples, in order."""
         if not len(number):
             return
         before = number[0] - JOIN - 1 if self._last is None else self._last
@@ -106,7 +109,7 @@ class Intervals:
         self.count += len(number)
 
     def add_run(self, numbers: tuple[int, int], stamps_ns: tuple[int, int], count: int) -> None:
-        """Takes in a stretch of samples by its first and last."""
+        """Add a run of samples by its first and last one."""
         self.add(np.array(numbers), np.array(stamps_ns))
         self.count += count - 2
 
@@ -146,7 +149,10 @@ def _cost(finding: Finding) -> float:
 
 
 def verdict(findings: Sequence[Finding], reasons: Sequence[str]) -> Verdict:
-    """Verdict on the log: `quarantine` with a reason not to trust it, `good` with nothing but notes, else `usable`."""
+    """Verdict on the log: `good`, `usable` or `quarantine`.
+
+    `quarantine`: there is a reason not to trust the log. `good`: all findings are notes.
+    """
     if reasons:
         return "quarantine"
     return "usable" if any(one.severity != "note" for one in findings) else "good"

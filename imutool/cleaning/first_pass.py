@@ -1,4 +1,4 @@
-"""Survey of a log's IMU: its defects, the messages to leave out, and whether to trust the rest."""
+"""Survey of a log's IMU: defects, messages to drop, and whether the log can be trusted."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ class Survey:
 
     @cached_property
     def valid(self) -> int:
-        """Number of messages that are left."""
+        """Number of messages that the rules keep."""
         return self.messages - int(self.dropped.sum())
 
     @property
@@ -107,7 +107,10 @@ class Survey:
         )
 
     def record(self) -> dict[str, str]:
-        """The report as text for a log's metadata, with at most `RECORDED` intervals of each finding."""
+        """Survey report as JSON text for a log's metadata.
+
+        Each finding has at most `RECORDED` intervals.
+        """
         values = json_values(self.report())
         findings = values.pop("findings")
         for finding in findings:
@@ -136,7 +139,7 @@ class SurveyReport(Section, frozen=True, kw_only=True):
 
 
 class CleaningReport(Report, frozen=True, kw_only=True, tag=SCHEMA):
-    """The report of `imutool clean`; `output` and `added` (messages by topic) where a log was written."""
+    """Report of `imutool clean`; with a new log also `output` and `added`, messages by topic."""
 
     log: str
     imus: list[SurveyReport]
@@ -146,7 +149,9 @@ class CleaningReport(Report, frozen=True, kw_only=True, tag=SCHEMA):
 
 
 def survey(path: Location, topic: str | None = None, settings: CleaningSettings | None = None) -> Survey:
-    """Survey one IMU of a log; memory grows by some 6 kB for each of its seconds (`tests/bench/clean.py`).
+    """Survey one IMU of a log.
+
+    Memory grows by about 6 kB for each second of the log (`tests/bench/clean.py`).
 
     Raises:
         ConfigError: the file cannot be opened, or a rule is not known.
@@ -174,7 +179,7 @@ def examine(
     where: str = "",
     topic: str = "",
 ) -> Survey:
-    """Survey messages that can be read twice (that a clock was set is known only at the end).
+    """Survey messages from `each`; a log with a clock that was set is read twice.
 
     Raises:
         ConfigError: a rule is not known.
@@ -182,16 +187,16 @@ def examine(
     settings = settings or CleaningSettings()
     names = settings.names()
     stages, whole = _through(each(), truth, settings, {name: _rule(name)() for name in names})
-    again = {name: stage.second_pass(whole.messages) for name, stage in stages.items()}
-    if any(stage is not None for stage in again.values()):
-        stages, whole = _through(each(), truth, settings, {name: again[name] or _rule(name)() for name in names})
+    second = {name: stage.second_pass(whole.messages) for name, stage in stages.items()}
+    if any(stage is not None for stage in second.values()):
+        stages, whole = _through(each(), truth, settings, {name: second[name] or _rule(name)() for name in names})
     findings = tuple(finding for stage in stages.values() for finding in stage.findings(whole))
     dropped = np.zeros(whole.messages, bool)
     for stage in stages.values():
         for numbers in stage.dropped:
             dropped[numbers] = True
-    missing = sum(one.count for one in findings if one.rule == "gaps" and one.what == MISSING)
-    surplus = sum(one.values["identical"] for one in findings if one.rule == "duplicates")
+    missing = sum(finding.count for finding in findings if finding.rule == "gaps" and finding.what == MISSING)
+    surplus = sum(finding.values["identical"] for finding in findings if finding.rule == "duplicates")
     reasons = tuple(_reasons(settings, whole, int(dropped.sum()) - surplus, findings))
     start_ns, end_ns = whole.motion.start_ns or 0, whole.motion.end_ns
     counts = whole.messages, start_ns, end_ns, missing, surplus
@@ -201,7 +206,10 @@ def examine(
 def _through(
     batches: Iterable[ImuBatch], truth: Truth | None, settings: CleaningSettings, rules: Mapping[str, Rule]
 ) -> tuple[dict[str, Rule], TopicSummary]:
-    """One pass: the rules in their order, each of which has seen what those before it left, and the topic's totals."""
+    """Run the rules in their order, each on the samples that the rules before it left.
+
+    The second value is the topic's totals.
+    """
     stages = dict(sorted(rules.items(), key=lambda item: item[1].place))
     motion, counter = Motion(), _Counter()
     stream: Iterable[Samples] = counter(blocks(batches))
@@ -214,10 +222,10 @@ def _through(
 
 @cache
 def _rule(name: str) -> type[Rule]:
-    """The rule in the file of that name."""
+    """Rule class in the file of that name."""
     module = registry.load(GROUP, name)
-    own = (one for one in vars(module).values() if isinstance(one, type) and one.__module__ == module.__name__)
-    return next(one for one in own if issubclass(one, Rule))
+    own = (value for value in vars(module).values() if isinstance(value, type) and value.__module__ == module.__name__)
+    return next(cls for cls in own if issubclass(cls, Rule))
 
 
 class _Counter:

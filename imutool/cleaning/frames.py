@@ -14,7 +14,7 @@ LEAST_TURN_RAD = 0.3  # over a window; less says nothing of axes
 
 
 def signed_permutations() -> Float64[np.ndarray, "48 3 3"]:
-    """All 48, the identity first; 24 are rotations, 24 mirror."""
+    """Signed permutations of three axes: 24 rotations and 24 reflections, the identity first."""
     found = []
     for order in permutations(range(3)):
         for signs in product((1.0, -1.0), repeat=3):
@@ -25,14 +25,14 @@ def signed_permutations() -> Float64[np.ndarray, "48 3 3"]:
 
 
 def axis_names(P: Float64[np.ndarray, "3 3"]) -> str:
-    """What the sensor's axes seem to be in terms of those it should have: `+x +z -y`."""
+    """Axis names of a signed permutation, as `+x +z -y`."""
     return " ".join(f"{'+' if row[np.argmax(np.abs(row))] > 0 else '-'}{'xyz'[int(np.argmax(np.abs(row)))]}" for row in P)
 
 
 def tilt_misfit(
     step: Int64[np.ndarray, " m"], mean: Float64[np.ndarray, "m 6"], candidates: Float64[np.ndarray, "c 3 3"]
 ) -> Float64[np.ndarray, " c"] | None:
-    """How far gravity, carried along by the gyro through two seconds, misses what the accelerometer says, for each M omega.
+    """Gravity misfit (rad) of each candidate M: gyro rates M omega carry gravity for 2 s.
 
     In the frame of a window's start, the mean specific force of its first half and of its second are both gravity and what is
     left of the motion, whose velocity has bounds; the angle between them (rad), root median square over windows that turn.
@@ -47,7 +47,7 @@ def tilt_misfit(
 def _windows(
     step: Int64[np.ndarray, " m"], mean: Float64[np.ndarray, "m 6"]
 ) -> tuple[Float64[np.ndarray, "w n 3"], Float64[np.ndarray, "w n 3"]]:
-    """Angular rate and specific force of windows without a gap that turn, evenly taken from all."""
+    """Angular rate and specific force in windows that turn and have no gap."""
     count = len(step) // WINDOW
     cut = mean[: count * WINDOW].reshape(count, WINDOW, 6)
     ends = step[: count * WINDOW].reshape(count, WINDOW)[:, [0, -1]]

@@ -1,4 +1,4 @@
-"""Base class of the rules: a stage of the pipeline that samples pass once, with findings at the end."""
+"""Base class of the cleaning rules: a pipeline stage with findings at its end."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from imutool.cleaning.truth import Truth
 
 @dataclass
 class TopicSummary:
-    """Totals of a topic after all its samples have passed; rules read them in their order and may add to them.
+    """Totals of a topic after the pass; rules read them in order and may add to them.
 
     Attributes:
         scale: factors from the log's units to rad/s and m/s², gyro then accel.
@@ -38,7 +38,9 @@ class TopicSummary:
 
 
 class Rule(ABC):
-    """One kind of defect. Each pass has its own instance; its memory is bounded, but for a row a second.
+    """Rule for one kind of defect; each pass over a log has its own instance.
+
+    A rule may hold a row for each second of the log; all else has a fixed size.
 
     Attributes:
         place: position in the pipeline; rules that drop samples come before those that measure the rest.
@@ -51,17 +53,17 @@ class Rule(ABC):
         self.dropped: list[Numbers] = []
 
     def __call__(self, stream: Iterable[Samples]) -> Iterator[Samples]:
-        """Pass on the samples that are left; a rule that drops none overrides `see` alone."""
+        """Yield the samples that the rule keeps; a rule that drops none overrides `see` alone."""
         for samples in stream:
             self.see(samples)
             yield samples
 
     def see(self, samples: Samples) -> None:
-        """Take in the next samples; none is dropped."""
+        """Process the next samples; none is dropped."""
         return
 
     def second_pass(self, messages: int) -> Rule | None:
-        """The instance for a second pass over the log, from the first one's totals; None where one pass is enough."""
+        """Rule for a second pass over the log, from the totals of the first; None if not needed."""
         return None
 
     @abstractmethod

@@ -1,4 +1,4 @@
-"""Samples that the rules see: numbered columns in blocks, blocks with context, and means over tenths of a second."""
+"""Samples for the rules: numbered columns in blocks, with context, and 0.1 s means."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ Numbers = Int64[np.ndarray, " n"]
 
 
 class Samples(NamedTuple):
-    """Consecutive messages, those dropped so far left out; `number` counts every message from 0, in file order."""
+    """Consecutive messages that are still kept; `number` counts all messages from 0."""
 
     number: Numbers
     log_ns: Int64[np.ndarray, " n"]
@@ -27,17 +27,17 @@ class Samples(NamedTuple):
     values: Float64[np.ndarray, "n 6"]  # gyro, accel, in the log's own units
 
     def where(self, index: slice | Bool[np.ndarray, " n"]) -> Samples:
-        """The chosen rows."""
+        """Selected rows."""
         return Samples(*(column[index] for column in self))
 
 
 def joined(parts: list[Samples]) -> Samples:
-    """Parts in a row as one."""
+    """Concatenated samples."""
     return parts[0] if len(parts) == 1 else Samples(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
 
 
 def blocks(batches: Iterable[ImuBatch]) -> Iterator[Samples]:
-    """The messages in blocks of `BLOCK`, the last one shorter, whatever the batches were."""
+    """Blocks of `BLOCK` messages, the last one shorter, whatever the batch sizes."""
     parts: list[Samples] = []
     count, waiting = 0, 0
     for batch in batches:
@@ -56,7 +56,7 @@ def blocks(batches: Iterable[ImuBatch]) -> Iterator[Samples]:
 
 
 def padded(stream: Iterable[Samples], margin: int) -> Iterator[tuple[Samples, slice]]:
-    """The samples with up to `margin` before and after each: rows, and which of them are now to be judged."""
+    """Samples with up to `margin` neighbours on each side: rows, and the slice to judge."""
     waiting: list[Samples] = []
     before = 0
     for block in stream:
@@ -86,7 +86,7 @@ class Motion:
         self._mean: tuple[Int64[np.ndarray, " m"], Float64[np.ndarray, "m 6"]] | None = None
 
     def see(self, samples: Samples) -> None:
-        """The next samples, their stamps in order."""
+        """Add samples, with increasing stamps."""
         if not len(samples.number):
             return
         if self.start_ns is None:
@@ -108,9 +108,11 @@ class Motion:
         self._sums.append(sums[:-1])
 
     def table(self) -> tuple[Int64[np.ndarray, " m"], Float64[np.ndarray, "m 6"]]:
-        """Steps (tenths of a second since the first sample), and the mean of gyro and accel in each that has samples.
+        """Steps of 0.1 s since the first sample, and the mean gyro and accel in each.
 
-        Once everything has been seen; the arrays are the same ones each time.
+        Steps without a sample are left out.
+
+        Call it after the last sample; each call returns the same arrays.
         """
         if self._open is not None:
             self._steps.append(np.array([self._open[0]]))

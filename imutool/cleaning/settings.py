@@ -1,4 +1,4 @@
-"""What a clean-up looks for, and from when on it does not trust a log: settings, so that a fleet can carry them."""
+"""Cleaning settings: the rules that run, and the limits of trust."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ Share = Annotated[float, Meta(ge=0.0, le=1.0)]
 
 
 class CleaningSettings(Settings, frozen=True, kw_only=True):
-    """Which rules run (by name; all where none is named, less those left out), and the limits of trust."""
+    """Rules that run (by default all), and the limits of trust."""
 
     only: tuple[str, ...] = ()
     without: tuple[str, ...] = ()
@@ -28,7 +28,7 @@ class CleaningSettings(Settings, frozen=True, kw_only=True):
     force: bool = False  # clean what cannot be trusted all the same
 
     def names(self) -> list[str]:
-        """The rules that run, sorted.
+        """Rules that run, sorted by name.
 
         Raises:
             ConfigError: a name that is no rule; the message names the nearest.
@@ -42,12 +42,12 @@ class CleaningSettings(Settings, frozen=True, kw_only=True):
 
 @cache
 def every() -> tuple[str, ...]:
-    """All rules there are, sorted; the packages installed are asked once."""
+    """Rules, sorted by name; the installed packages are listed once."""
     return tuple(registry.names(GROUP))
 
 
 def chosen(only: Iterable[str], without: Iterable[str], force: bool = False) -> CleaningSettings:
-    """The rules of a command line.
+    """Settings for the rules of a command line.
 
     Raises:
         ConfigError: a name that is no rule, or one both asked for and left out.

@@ -1,4 +1,4 @@
-"""True poses beside an IMU, thinned to ten a second: what they say of angular rate and specific force."""
+"""True poses at 10 Hz, and the angular rate and specific force that follow from them."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from imutool.recording import GRAVITY_M_S2, Poses, seconds
 
 
 class Truth(NamedTuple):
-    """Poses at least a tenth of a second apart, in order."""
+    """True poses at least 0.1 s apart, in order."""
 
     topic: str
     t_ns: Int64[np.ndarray, " n"]
@@ -23,7 +23,7 @@ class Truth(NamedTuple):
 
 
 def read_truth(log: Log) -> Truth | None:
-    """The first pose topic of a log; none where it has none that can be read, or fewer than three poses."""
+    """Poses of the log's first readable pose topic; None with fewer than three poses."""
     for topic in log.pose_topics:
         times, places, turns = [], [], []
         last = -(2**62)
@@ -46,7 +46,7 @@ def read_truth(log: Log) -> Truth | None:
 
 
 def of_poses(topic: str, poses: Poses) -> Truth | None:
-    """The same of poses that are in memory; none of fewer than three."""
+    """True poses at 10 Hz of poses in memory; None with fewer than three."""
     if len(poses) < 3:
         return None
     keep = _thinned(poses.t_ns, -(2**62))
@@ -54,14 +54,14 @@ def of_poses(topic: str, poses: Poses) -> Truth | None:
 
 
 def _thinned(stamp_ns: Int64[np.ndarray, " n"], last_ns: int) -> Int64[np.ndarray, " m"]:
-    """The first row of each tenth of a second after that of `last_ns`; what goes back in time is left out."""
+    """First row of each 0.1 s after `last_ns`; rows that go back in time are left out."""
     step = stamp_ns // STEP_NS
     before = np.maximum.accumulate(np.concatenate([[last_ns // STEP_NS], step]))[:-1]
     return np.flatnonzero(step > before)
 
 
 def turning(truth: Truth) -> tuple[Int64[np.ndarray, " m"], Int64[np.ndarray, " m"], Float64[np.ndarray, "m 3"]]:
-    """Start, end and mean angular rate (rad/s, body frame) between neighbouring poses."""
+    """Angular rate (rad/s, body frame) between neighbouring poses, with start and end (ns)."""
     from scipy.spatial.transform import Rotation
 
     R = Rotation.from_quat(truth.q_wb_wxyz, scalar_first=True)
@@ -70,7 +70,7 @@ def turning(truth: Truth) -> tuple[Int64[np.ndarray, " m"], Int64[np.ndarray, " 
 
 
 def feeling(truth: Truth) -> tuple[Int64[np.ndarray, " m"], Float64[np.ndarray, "m 3"]]:
-    """Specific force (m/s², body frame) at each pose between two others, from second differences of their positions."""
+    """Specific force (m/s², body frame) at each inner pose, from second differences."""
     from scipy.spatial.transform import Rotation
 
     t_s = seconds(truth.t_ns, int(truth.t_ns[0]))

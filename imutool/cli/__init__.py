@@ -1,6 +1,6 @@
-"""The command line: parse, call, print. Results go to stdout; log lines and progress to stderr; one place catches.
+"""Command line: each command is a file that is imported here.
 
-A command is a file, and being imported here is what makes it one.
+Results go to stdout; log lines and progress go to stderr.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""What the commands share: the application, options, and the one place that catches."""
+"""Application, shared options and error handling of the commands."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ NOTHING_LEFT = "Nothing half-written is left"
 
 
 class _Commands(TyperGroup):
-    """Commands whose interrupt is told here: typer would end the program without a word."""
+    """Group of commands that reports an interrupt; typer would exit without a message."""
 
     def invoke(self, ctx: Any) -> Any:
         with caught():
@@ -36,7 +36,7 @@ class _Commands(TyperGroup):
 
 @contextmanager
 def caught() -> Iterator[None]:
-    """The one place that catches: what went wrong becomes a sentence and an exit code."""
+    """Turn every error into a message and an exit code; no other place catches."""
     try:
         yield
     except ImutoolError as error:
@@ -54,7 +54,7 @@ def caught() -> Iterator[None]:
 
 
 class Command(TyperCommand):
-    """A command whose errors name its flags where the library names parameters."""
+    """Command whose errors name flags where the library names parameters."""
 
     def invoke(self, ctx: Any) -> Any:
         """Run the command.
@@ -73,7 +73,7 @@ class Command(TyperCommand):
 
 
 class App(typer.Typer):
-    """An application whose commands are `Command`s."""
+    """Application whose commands are `Command`s."""
 
     def command(
         self, name: str | None = None, *, cls: type[TyperCommand] | None = None, **settings: Any
@@ -83,7 +83,7 @@ class App(typer.Typer):
 
 
 def listing(group: str, option: str) -> type[TyperCommand]:
-    """A command whose help also lists what can be named, found (and nothing of it imported) when help is asked for."""
+    """Command class whose help lists the names of a plugin group, without an import."""
 
     class Listing(Command):
         values = (group, option)  # for the documentation
@@ -98,7 +98,7 @@ def listing(group: str, option: str) -> type[TyperCommand]:
 
 app = App(
     name="imutool",
-    help="Raw inertial data to MCAP, learned IMU bias dynamics, debiased logs, and a picture of what changed.",
+    help="Convert IMU recordings to MCAP, train bias models, debias logs, diagnose and view them.",
     cls=_Commands,
     no_args_is_help=True,
     rich_markup_mode="rich",
@@ -109,14 +109,16 @@ app = App(
 Logs = Annotated[list[Path], typer.Argument(metavar="LOG...", help="MCAP logs.")]
 Models = Annotated[list[str] | None, typer.Option("--model", help="Model file, a name that ships, or 'static'. Repeatable.")]
 Init = Annotated[str, typer.Option(help="Start bias: auto, stationary, prior, truth, or gx,gy,gz,ax,ay,az (rad/s, m/s²).")]
-Smooth = Annotated[bool, typer.Option("--smooth", help="Take the whole log for every sample's bias: better, not causal.")]
+Smooth = Annotated[bool, typer.Option("--smooth", help="Use the whole log for each sample's bias: more accurate, not causal.")]
 Imu = Annotated[str | None, typer.Option(help="IMU topic, where a log has several.")]
 Truth = Annotated[str | None, typer.Option(help="Topic of the true poses, where a log has several.")]
 Json = Annotated[str | None, typer.Option("--json", metavar="FILE|-", help="Write the report as JSON; - is stdout.")]
-ReportPage = Annotated[Path | None, typer.Option(metavar="F.html", help="Write a page of figures, paths, errors and spectra.")]
-Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace what is there.")]
-Verbose = Annotated[bool, typer.Option("-v", "--verbose", help="Say more.")]
-Quiet = Annotated[bool, typer.Option("-q", "--quiet", help="Say only results and errors.")]
+ReportPage = Annotated[
+    Path | None, typer.Option(metavar="F.html", help="Write an HTML page with figures, paths, errors and spectra.")
+]
+Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace existing files.")]
+Verbose = Annotated[bool, typer.Option("-v", "--verbose", help="Print more.")]
+Quiet = Annotated[bool, typer.Option("-q", "--quiet", help="Print only results and errors.")]
 
 
 def _fail(message: str, code: int) -> NoReturn:
@@ -125,7 +127,7 @@ def _fail(message: str, code: int) -> NoReturn:
 
 
 def _forget_stdout() -> None:
-    """What is still to be flushed into a closed pipe or a full disk goes nowhere, so that leaving raises nothing more."""
+    """Point stdout at /dev/null: flushing a closed pipe at exit then raises nothing."""
     os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
@@ -138,6 +140,8 @@ def _version(show: bool) -> bool:
 
 @app.callback()
 def options(
-    show_version: Annotated[bool, typer.Option("--version", callback=_version, is_eager=True, help="Say the version.")] = False,
+    show_version: Annotated[
+        bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version.")
+    ] = False,
 ) -> None:
     """Options of imutool itself."""

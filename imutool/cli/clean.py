@@ -25,13 +25,15 @@ SHOWN = 3  # intervals of a finding in the table; all of them are in the JSON
 @app.command(cls=listing("imutool.clean", "--rule"), epilog="Example: [bold]imutool clean robot.mcap robot_clean.mcap[/]")
 def clean(
     source: Annotated[str, typer.Argument(metavar="LOG", help="An MCAP log: a file, or a URL such as s3://bucket/log.mcap.")],
-    target: Annotated[str | None, typer.Argument(metavar="OUT", help="The log with a clean, debiased IMU beside it.")] = None,
+    target: Annotated[str | None, typer.Argument(metavar="OUT", help="New log with a clean, debiased IMU topic.")] = None,
     model: Annotated[str | None, typer.Option(help="For OUT: model file, physics.toml or a name that ships.")] = None,
     imu: Annotated[list[str] | None, typer.Option(help="IMU topic, where a log has several. Repeatable.")] = None,
-    rule: Annotated[list[str] | None, typer.Option("--rule", metavar="NAME", help="This rule alone. Repeatable.")] = None,
-    no_rule: Annotated[list[str] | None, typer.Option("--no-rule", metavar="NAME", help="Not this rule. Repeatable.")] = None,
-    force: Annotated[bool, typer.Option("--force", help="Write OUT even from a log that cannot be trusted.")] = False,
-    report_to: Annotated[Path | None, typer.Option("--report", metavar="F.html", help="Write the findings as a page.")] = None,
+    rule: Annotated[list[str] | None, typer.Option("--rule", metavar="NAME", help="Run only this rule. Repeatable.")] = None,
+    no_rule: Annotated[list[str] | None, typer.Option("--no-rule", metavar="NAME", help="Skip this rule. Repeatable.")] = None,
+    force: Annotated[bool, typer.Option("--force", help="Write OUT even if the log cannot be trusted.")] = False,
+    report_to: Annotated[
+        Path | None, typer.Option("--report", metavar="F.html", help="Write the findings as an HTML page.")
+    ] = None,
     init: Init = "auto",
     smooth: Smooth = False,
     overwrite: Overwrite = False,
@@ -39,14 +41,17 @@ def clean(
     verbose: Verbose = False,
     quiet: Quiet = False,
 ) -> None:
-    """Say what is wrong inside a log's IMU and whether to trust it; with OUT, write the log with a clean IMU beside the raw."""
+    """Find the defects of a log's IMU, and say whether the log can be trusted.
+
+    With OUT, write the log with a clean IMU beside the raw one.
+    """
     from imutool.cleaning.settings import chosen
     from imutool.mcap_io.storage.target import Target
 
     rules = chosen(rule or (), no_rule or (), force)
     given = {"--model": model, "--smooth": smooth, "--force": force, "--overwrite": overwrite and report_to is None}
     if target is None and (idle := [name for name, value in given.items() if value]):
-        raise ConfigError(f"{idle[0]} says nothing without OUT", where="clean", fix="Name the log to be written")
+        raise ConfigError(f"{idle[0]} needs OUT", where="clean", fix="Name the log to be written")
     if report_to is not None:
         Target(report_to, overwrite=overwrite).abandon()  # a page that cannot be written is refused before the work is done
     added: dict[str, int] = {}
@@ -79,7 +84,7 @@ def clean(
 def _tell(
     source: str, surveys: Sequence[Survey], losses: Losses, target: str | None, added: Mapping[str, int], json_to: str | None
 ) -> None:
-    """Report findings and output, as JSON or as text; losses become the exit code."""
+    """Report findings and output as JSON or text; with losses the exit code is 3."""
     from imutool.cleaning.first_pass import CleaningReport
 
     report = CleaningReport(

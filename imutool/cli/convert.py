@@ -16,7 +16,7 @@ from imutool.report import Report, Section
 
 
 class Compression(StrEnum):
-    """How chunks of a log are packed."""
+    """Compression of a log's chunks."""
 
     zstd = "zstd"
     lz4 = "lz4"
@@ -24,21 +24,21 @@ class Compression(StrEnum):
 
 
 class Failure(Section, frozen=True):
-    """A sequence that was not written."""
+    """Failed sequence, with the reason."""
 
     name: str
     message: str
 
 
 class Conversion(Report, frozen=True, tag="imutool.conversion/1"):
-    """The report of `imutool convert`."""
+    """Report of `imutool convert`."""
 
     written: list[str]
     failures: list[Failure]
 
 
 class Export(Report, frozen=True, tag="imutool.export/1"):
-    """The report of `imutool export`: messages or rows by file, and the topics left out."""
+    """Report of `imutool export`: messages or rows by file, and the topics left out."""
 
     output: str
     format: str
@@ -52,19 +52,19 @@ class Export(Report, frozen=True, tag="imutool.export/1"):
 )
 def convert(
     source: Annotated[Path, typer.Argument(help="Sequence folder, .zip, .tar, .tar.gz, .bag, or a folder of them.")],
-    target: Annotated[Path, typer.Argument(metavar="OUT", help="A file for one sequence, a folder for many.")],
-    format: Annotated[str, typer.Option(help="auto, or one of those listed below.")] = "auto",
-    sequence: Annotated[list[str] | None, typer.Option(help="Convert only this one. Repeatable.")] = None,
-    compression: Annotated[Compression, typer.Option(help="How chunks are packed.")] = Compression.zstd,
+    target: Annotated[Path, typer.Argument(metavar="OUT", help="File for one sequence, folder for several.")],
+    format: Annotated[str, typer.Option(help="auto, or a name from the list below.")] = "auto",
+    sequence: Annotated[list[str] | None, typer.Option(help="Convert only this sequence. Repeatable.")] = None,
+    compression: Annotated[Compression, typer.Option(help="Compression of the chunks.")] = Compression.zstd,
     no_images: Annotated[bool, typer.Option("--no-images", help="Leave camera frames out.")] = False,
-    workers: Annotated[int | None, typer.Option(min=1, help="Processes; by default one a processor.")] = None,
+    workers: Annotated[int | None, typer.Option(min=1, help="Number of processes; by default one per processor.")] = None,
     overwrite: Overwrite = False,
     json_to: Json = None,
     verbose: Verbose = False,
     quiet: Quiet = False,
 ) -> None:
-    """Convert a data set to MCAP logs, one a sequence."""
-    from imutool.conversion import convert as run
+    """Convert a data set to MCAP: each sequence becomes a log."""
+    from imutool.conversion.run import convert as run
 
     with progress("Converting", verbose, quiet) as tell:
         report = run(
@@ -91,7 +91,7 @@ def convert(
 @app.command(epilog="Example: [bold]imutool export MH_04_debiased.mcap MH_04_debiased --format euroc[/]")
 def export(
     log: Annotated[Path, typer.Argument(metavar="LOG", help="An MCAP log.")],
-    target: Annotated[Path, typer.Argument(metavar="OUT", help="The folder that is made.")],
+    target: Annotated[Path, typer.Argument(metavar="OUT", help="New folder.")],
     format: Annotated[str, typer.Option(help="euroc: an ASL folder; rosbag2: a folder around a copy of the log.")],
     imu: Annotated[str | None, typer.Option(help="IMU topic of a EuRoC folder; by default the debiased one.")] = None,
     noise: Annotated[

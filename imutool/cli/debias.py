@@ -21,10 +21,10 @@ if TYPE_CHECKING:
     from imutool.viewing.rerun.live import Live
 
 MODEL_HELP = (
-    "Model file, physics.toml or a name that ships; else a static estimate. TOPIC=MODEL is for one IMU of several. Repeatable."
+    "Model file, physics.toml or a name that ships; else a static estimate. TOPIC=MODEL sets the model of one IMU. Repeatable."
 )
-CLEAN_HELP = "Leave out what is no measurement, convert units (imutool clean)."
-VERIFY_HELP = "What of OUT is checked beside its structure: all chunks, those with IMU messages (imu), or none."
+CLEAN_HELP = "Drop invalid samples and convert units, as imutool clean does."
+VERIFY_HELP = "Chunks of OUT to read back: all, those with IMU messages (imu), or none."
 
 
 @app.command(epilog="Example: [bold]imutool debias MH_04.mcap MH_04_debiased.mcap --model adis.safetensors[/]")
@@ -32,27 +32,29 @@ def debias(
     source: Annotated[str, typer.Argument(metavar="IN", help="An MCAP log: a file, or a URL such as s3://bucket/log.mcap.")],
     target: Annotated[
         str | None,
-        typer.Argument(metavar="OUT", help="The log with the debiased IMU beside the raw one.", show_default=False),
+        typer.Argument(metavar="OUT", help="New log with the debiased IMU beside the raw one.", show_default=False),
     ] = None,
     model: Annotated[list[str] | None, typer.Option(help=MODEL_HELP)] = None,
     imu: Annotated[list[str] | None, typer.Option(help="IMU topic, where a log has several. Repeatable.")] = None,
     init: Init = "auto",
     smooth: Smooth = False,
     verify: Annotated[str, typer.Option(metavar="all|imu|none", help=VERIFY_HELP)] = "imu",
-    in_place: Annotated[bool, typer.Option("--in-place", help="Put the result in the place of IN, when it is whole.")] = False,
+    in_place: Annotated[bool, typer.Option("--in-place", help="Replace IN with the complete result.")] = False,
     clean: Annotated[bool, typer.Option("--clean", help=CLEAN_HELP)] = False,
-    view: Annotated[bool, typer.Option("--view", help="Show it in a viewer as it goes.")] = False,
-    connect: Annotated[str | None, typer.Option(metavar="URL", help="Show it in a viewer that runs: HOST:PORT.")] = None,
-    save_view: Annotated[Path | None, typer.Option(metavar="F.rrd", help="Keep what a viewer would show in a file.")] = None,
+    view: Annotated[bool, typer.Option("--view", help="Show the progress in a new viewer.")] = False,
+    connect: Annotated[
+        str | None, typer.Option(metavar="URL", help="Show the progress in a running viewer: HOST:PORT.")
+    ] = None,
+    save_view: Annotated[Path | None, typer.Option(metavar="F.rrd", help="Save the viewer's data to a file.")] = None,
     report_to: Annotated[
-        Path | None, typer.Option("--report", metavar="F.html", help="Write a page about the debiased log.")
+        Path | None, typer.Option("--report", metavar="F.html", help="Write an HTML page about the debiased log.")
     ] = None,
     overwrite: Overwrite = False,
     json_to: Json = None,
     verbose: Verbose = False,
     quiet: Quiet = False,
 ) -> None:
-    """Rewrite a log with a debiased IMU channel; everything else passes through unchanged."""
+    """Write a log with a debiased IMU topic; all other messages stay unchanged."""
     _refuse_contradictions(target, in_place, overwrite)
     models = assigned(model or ())
     if report_to is not None:
@@ -101,7 +103,7 @@ class DebiasedImu(Section, frozen=True):
 
 
 class Verified(Section, frozen=True):
-    """The chunks of the new log that were read back."""
+    """Chunks of the new log that were read back."""
 
     mode: str
     chunks_checked: int
@@ -109,7 +111,7 @@ class Verified(Section, frozen=True):
 
 
 class DebiasSummary(Report, frozen=True, kw_only=True, tag="imutool.debias/1"):
-    """The report of `imutool debias`; `shown`, `report` and `clean` only where they were asked for."""
+    """Report of `imutool debias`; `shown`, `report` and `clean` only if requested."""
 
     output: str
     imus: dict[str, DebiasedImu]
@@ -145,7 +147,7 @@ def _summary(
 
 
 def _say(report: DebiasReport, summary: DebiasSummary, shown: Sequence[Output]) -> None:
-    """Print what was done."""
+    """Print starts, counts and verification."""
     for topic, survey in report.surveys.items():
         say(f"{topic}: {survey.verdict}, score {survey.score:.3f}, {survey.valid} of {survey.messages} samples valid")
     for topic, imu in summary.imus.items():
@@ -165,7 +167,7 @@ def _say(report: DebiasReport, summary: DebiasSummary, shown: Sequence[Output]) 
 def _watching(
     source: str, target: str | None, view: bool, connect: str | None, save: Path | None, overwrite: bool
 ) -> AbstractContextManager[Live | None]:
-    """Whoever is to watch; without that nothing of the viewer is imported."""
+    """Live view of the debiasing; without one no viewer module is imported."""
     if not view and connect is None and save is None:
         return nullcontext()
     from imutool.viewing.rerun.live import live_view
@@ -175,7 +177,7 @@ def _watching(
 
 
 def _draw(log: Location, topics: Sequence[str], page: Path, overwrite: bool) -> None:
-    """A page about the debiased log, each of its IMUs under its own topic where there are several."""
+    """Write a page about the debiased log; of several IMUs each has its topic as name."""
     from imutool.viewing.html.report import name_by_topic, write_page
     from imutool.viewing.model.runs import load
 
@@ -194,7 +196,9 @@ def _refuse_contradictions(target: str | None, in_place: bool, overwrite: bool) 
 
 
 def assigned(words: Sequence[str]) -> dict[str, str]:
-    """Models by IMU topic, "" for all that are not named: TOPIC=MODEL, where no file has that name as a whole, else MODEL.
+    """Models by IMU topic; the key "" holds the model of all other IMUs.
+
+    A word is TOPIC=MODEL, or MODEL if a file has the whole word as its name.
 
     Raises:
         ConfigError: two models for the same IMUs, or nothing on one side of the sign.

@@ -17,26 +17,30 @@ if TYPE_CHECKING:
 @app.command(epilog="Example: [bold]imutool diagnose real.mcap --sim sim.mcap -o diagnosis[/]")
 def diagnose(
     reals: Annotated[
-        list[Path], typer.Argument(metavar="REAL...", help="Recordings; several share the physics, with a bias each.")
+        list[Path], typer.Argument(metavar="REAL...", help="Recordings; several share the physics, each has its own bias.")
     ],
     sim: Annotated[
         Path | None,
-        typer.Option(metavar="SIM", help="The simulation, of any motion if both have poses; else the recording's own poses."),
+        typer.Option(
+            metavar="SIM", help="Simulation, of any motion if both have poses; by default along the recording's poses."
+        ),
     ] = None,
     signal: Annotated[
-        list[str] | None, typer.Option(metavar="TOPIC.field", help="Compare this field of both logs as well. Repeatable.")
+        list[str] | None, typer.Option(metavar="TOPIC.field", help="Also compare this field of both logs. Repeatable.")
     ] = None,
     folder: Annotated[
         Path | None,
         typer.Option(
-            "-o", "--output", metavar="DIR", help="For findings.json, physics.toml, report.html, log.html and view.rrd."
+            "-o", "--output", metavar="DIR", help="Folder for findings.json, physics.toml, report.html, log.html and view.rrd."
         ),
     ] = None,
     config: Annotated[
         Path | None,
         typer.Option(metavar="FILE.toml", help="Settings; imutool.diagnosis.settings.DiagnoseSettings lists them."),
     ] = None,
-    set_: Annotated[list[str] | None, typer.Option("--set", metavar="key=value", help="One setting. Repeatable.")] = None,
+    set_: Annotated[
+        list[str] | None, typer.Option("--set", metavar="key=value", help="Change one setting. Repeatable.")
+    ] = None,
     imu: Imu = None,
     truth: Truth = None,
     overwrite: Overwrite = False,
@@ -44,7 +48,10 @@ def diagnose(
     verbose: Verbose = False,
     quiet: Quiet = False,
 ) -> None:
-    """Find where a recording differs from a simulation, name what physics was left out, model it, and show the gain."""
+    """Find physics that a simulation leaves out, by comparison with a recording.
+
+    Name each effect, estimate its parameters, and show how much closer the simulation comes.
+    """
     from imutool import diagnosis_output
     from imutool.config import load as load_settings
     from imutool.diagnosis.diagnose import diagnose as run

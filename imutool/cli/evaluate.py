@@ -15,7 +15,7 @@ from imutool.report import Report
 
 
 class Evaluation(Report, frozen=True, tag="imutool.evaluation/1"):
-    """The report of `imutool evaluate`: scores of each log, model and estimate."""
+    """Report of `imutool evaluate`: scores of each log, model and estimate."""
 
     results: list[dict[str, Any]]
 
@@ -26,17 +26,17 @@ def evaluate(
     model: Models = None,
     init: Init = "auto",
     smooth: Smooth = False,
-    zupt: Annotated[bool, typer.Option("--zupt", help="Also dead reckoning that knows when it stands still.")] = False,
+    zupt: Annotated[bool, typer.Option("--zupt", help="Also score dead reckoning with zero-velocity updates.")] = False,
     truth: Truth = None,
     imu: Imu = None,
-    trajectories: Annotated[Path | None, typer.Option(metavar="DIR", help="Write TUM-format trajectories there.")] = None,
+    trajectories: Annotated[Path | None, typer.Option(metavar="DIR", help="Folder for trajectories in TUM format.")] = None,
     report: ReportPage = None,
     overwrite: Overwrite = False,
     json_to: Json = None,
     verbose: Verbose = False,
     quiet: Quiet = False,
 ) -> None:
-    """Integrate the IMU alone from the true start, raw and with each model, and score it against the truth."""
+    """Integrate the IMU from the true start, raw and debiased, and score it on the truth."""
     from imutool.evaluation import evaluate as run
     from imutool.viewing.html import report as pages
     from imutool.viewing.model.runs import load
@@ -44,11 +44,11 @@ def evaluate(
     if report is not None:
         pages.check_target(report, overwrite=overwrite)
     results: list[dict[str, Any]] = []
-    logs_seen = []
+    loaded = []
     with progress("Evaluating", verbose, quiet) as tell:
         for done, log in enumerate(logs):
             tell(done, len(logs), log.name)
-            told = len(results)
+            first = len(results)
             results += run(
                 log,
                 models=model or (),
@@ -61,23 +61,26 @@ def evaluate(
                 overwrite=overwrite,
             )
             if report is not None:
-                seen = load(log, models=model or (), init=init, smooth=smooth, truth=truth, imu=imu)
-                logs_seen.append(replace(seen, notes=(*seen.notes, *_stops(results[told:]))))
+                run_data = load(log, models=model or (), init=init, smooth=smooth, truth=truth, imu=imu)
+                loaded.append(replace(run_data, notes=(*run_data.notes, *_stops(results[first:]))))
         if report is not None:
             tell(len(logs), len(logs), "drawing")
-            pages.write_page(logs_seen, report, overwrite=overwrite)
+            pages.write_page(loaded, report, overwrite=overwrite)
         tell(len(logs), len(logs), "")
     if not write_json(Evaluation(results), json_to):
-        figures([{**one, "model": f"{one['model']} zupt"} if one["estimate"] == "zupt" else one for one in results])
+        figures([{**row, "model": f"{row['model']} zupt"} if row["estimate"] == "zupt" else row for row in results])
         if report is not None:
             say(f"Report: {report}")
 
 
 def _stops(results: Sequence[dict[str, Any]]) -> list[str]:
-    """What the table says of dead reckoning that knows its stops, in sentences: the report draws pure integration."""
+    """Sentences about the scores with zero-velocity updates.
+
+    The report draws pure integration.
+    """
     return [
-        f"With zero-velocity updates {one['model']} has an orientation error of {one['aoe_deg']:.2f}° and a position error of "
-        f"{one['ape_m']:.2f} m."
-        for one in results
-        if one["estimate"] == "zupt"
+        f"With zero-velocity updates {row['model']} has an orientation error of {row['aoe_deg']:.2f}° and a position error of "
+        f"{row['ape_m']:.2f} m."
+        for row in results
+        if row["estimate"] == "zupt"
     ]

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 fleet = App(
     name="fleet",
-    help="The same for many logs: on all cores of this machine, or on a Ray cluster.",
+    help="Process many logs on all cores of this machine, or on a Ray cluster.",
     no_args_is_help=True,
     rich_markup_mode="rich",
 )
@@ -29,33 +29,33 @@ app.add_typer(fleet)
 
 UNITS = {"": 1, "K": 1 << 10, "M": 1 << 20, "G": 1 << 30, "T": 1 << 40}
 SHOWN = 10  # logs that are not whole; all are in fleet.parquet
-PAGES_HELP = "Also a page about each log beside it, which the --report links to; five to ten seconds a log of minutes."
-RESUME = "Go on: what is done and still stands is skipped."
-CODES = "\n\nExit code: 0 all whole; 3 something lost or quarantined; else the largest code of the logs that failed."
+PAGES_HELP = "Also write a page beside each log, with a link from --report; 5 to 10 s for a log of minutes."
+RESUME = "Continue an earlier run: skip finished logs."
+CODES = "\n\nExit code: 0 all logs are intact; 3 data were lost or quarantined; else the largest code of the failed logs."
 
 
 def _common(
     source: Annotated[str, typer.Argument(metavar="SRC", help="A folder, pattern, log or URL.")],
     target: Annotated[str, typer.Argument(metavar="OUT", help="Folder or URL; every log keeps its path below SRC.")],
     *,
-    address: Annotated[str | None, typer.Option(help="Of a Ray cluster, or auto; without, this machine's cores.")] = None,
+    address: Annotated[str | None, typer.Option(help="Address of a Ray cluster, or auto; by default this machine.")] = None,
     resume: Annotated[bool, typer.Option("--resume", help=RESUME)] = False,
-    recheck: Annotated[bool, typer.Option("--recheck", help="With --resume: read all that is done again.")] = False,
-    report: Annotated[str | None, typer.Option(metavar="F.html", help="Write a page about the fleet.")] = None,
-    workers: Annotated[int | None, typer.Option(min=1, help="Logs worked on at once; else one per core.")] = None,
-    memory: Annotated[str, typer.Option("--memory-per-task", metavar="SIZE", help="Set aside for a log: 800M, 2G.")] = "1G",
-    retries: Annotated[int, typer.Option(min=0, help="Times a log is given to another worker when one dies.")] = 3,
-    dashboard: Annotated[bool, typer.Option("--dashboard", help="Start Ray's, on 127.0.0.1.")] = False,
+    recheck: Annotated[bool, typer.Option("--recheck", help="With --resume: read all finished results again.")] = False,
+    report: Annotated[str | None, typer.Option(metavar="F.html", help="Write an HTML page about the fleet.")] = None,
+    workers: Annotated[int | None, typer.Option(min=1, help="Number of logs at once; by default one per core.")] = None,
+    memory: Annotated[str, typer.Option("--memory-per-task", metavar="SIZE", help="Memory for each log: 800M, 2G.")] = "1G",
+    retries: Annotated[int, typer.Option(min=0, help="Number of retries after a worker died.")] = 3,
+    dashboard: Annotated[bool, typer.Option("--dashboard", help="Start the Ray dashboard on 127.0.0.1.")] = False,
     overwrite: Overwrite = False,
     json_to: Json = None,
     verbose: Verbose = False,
     quiet: Quiet = False,
 ) -> None:
-    """The options of every fleet command."""
+    """Options of every fleet command."""
 
 
 def _command(example: str) -> Callable[[Callable[..., Settings]], Callable[..., Settings]]:
-    """A command made of a function from its own options to settings, with the options of all around them."""
+    """Decorator that makes a fleet command of a function from its own options to settings."""
 
     def made(settings_of: Callable[..., Settings]) -> Callable[..., Settings]:
         shared, own = (inspect.signature(f, eval_str=True).parameters for f in (_common, settings_of))
@@ -64,10 +64,10 @@ def _command(example: str) -> Callable[[Callable[..., Settings]], Callable[..., 
             _run(settings_of(**{name: words.pop(name) for name in own}), **words)
 
         order = [shared["source"], shared["target"], *own.values(), *list(shared.values())[2:]]
-        as_options = [one.replace(kind=inspect.Parameter.KEYWORD_ONLY) for one in order]
+        as_options = [parameter.replace(kind=inspect.Parameter.KEYWORD_ONLY) for parameter in order]
         command.__name__, command.__doc__ = settings_of.__name__, settings_of.__doc__
         command.__signature__ = inspect.Signature(as_options)  # type: ignore[attr-defined]
-        command.__annotations__ = {one.name: one.annotation for one in as_options}
+        command.__annotations__ = {parameter.name: parameter.annotation for parameter in as_options}
         fleet.command(epilog=f"Example: [bold]imutool fleet {example}[/]{CODES}")(command)
         return settings_of
 
@@ -76,10 +76,12 @@ def _command(example: str) -> Callable[[Callable[..., Settings]], Callable[..., 
 
 @_command("debias logs/ clean/ --model euroc-adis16448-hybrid --report clean.html")
 def debias(
-    model: Annotated[str | None, typer.Option(help="Model file or a name that ships; else as each log's metadata say.")] = None,
+    model: Annotated[
+        str | None, typer.Option(help="Model file or a name that ships; by default from the log's metadata.")
+    ] = None,
     init: Init = "auto",
     smooth: Smooth = False,
-    clean: Annotated[bool, typer.Option(help="Clean the IMU too, and leave alone what cannot be trusted.")] = True,
+    clean: Annotated[bool, typer.Option(help="Also clean the IMU; skip logs that cannot be trusted.")] = True,
     verify: Annotated[str, typer.Option(metavar="all|imu|none", help=VERIFY_HELP)] = "imu",
     pages: Annotated[bool, typer.Option("--pages", help=PAGES_HELP)] = False,
 ) -> Settings:
@@ -100,9 +102,11 @@ def debias(
 
 @_command("repair logs/ repaired/ --report repaired.html")
 def repair(
-    damaged: Annotated[str, typer.Option(metavar="drop|keep", help="Leave damaged bytes out, or keep them marked.")] = "drop",
+    damaged: Annotated[
+        str, typer.Option(metavar="drop|keep", help="Drop damaged bytes, or keep them as attachments.")
+    ] = "drop",
 ) -> Settings:
-    """Save of every log and ROS 1 bag what can be saved, as `imutool repair` does; a whole one is copied."""
+    """Repair every log and ROS 1 bag, as `imutool repair` does; copy intact ones."""
     if damaged not in {"drop", "keep"}:
         raise ConfigError(f"{damaged!r} is nothing to do with damage", where="damaged", expected="drop or keep")
     return Settings(command="repair", damaged=damaged)
@@ -110,34 +114,36 @@ def repair(
 
 @_command("info logs/ about/ --report logs.html")
 def info() -> Settings:
-    """Say of every log what is in it, as `imutool info --json` does."""
+    """Report the contents of every log, as `imutool info --json` does."""
     return Settings(command="info")
 
 
 @_command("diagnose logs/ diagnosis/ --robot-from '^([^/]+)/' --report robots.html")
 def diagnose(
     sim: Annotated[
-        str | None, typer.Option(metavar="DIR", help="Simulations under the logs' names; else their own true poses.")
+        str | None, typer.Option(metavar="DIR", help="Simulations under the logs' names; by default the true poses.")
     ] = None,
     robot_from: Annotated[
         str | None,
         typer.Option(
-            "--robot-from", metavar="PATTERN", help="Regular expression on names, or metadata:RECORD.KEY; else folder."
+            "--robot-from",
+            metavar="PATTERN",
+            help="Regular expression on names, or metadata:RECORD.KEY; by default the folder.",
         ),
     ] = None,
-    search: Annotated[bool, typer.Option(help="Also search each log for physics beyond what robots are compared by.")] = True,
+    search: Annotated[bool, typer.Option(help="Also search each log for other physics.")] = True,
     imu: Imu = None,
     truth: Truth = None,
 ) -> Settings:
-    """One kind of sensor on many robots: what all share, and which robot is unlike the others."""
+    """Compare one kind of sensor on many robots: shared parameters and outliers."""
     from pathlib import Path
 
     from imutool.fleet.robots import robot_pattern
     from imutool.location import to_location
 
     robot_pattern(robot_from)
-    there = None if sim is None else to_location(sim)
-    where = there.absolute() if isinstance(there, Path) else there
+    place = None if sim is None else to_location(sim)
+    where = place.absolute() if isinstance(place, Path) else place
     return Settings(
         command="diagnose",
         sim=None if where is None else str(where),
@@ -205,12 +211,12 @@ def _show(done: FleetReport, report: str | None) -> None:
 
 
 def memory_bytes(text: str) -> int:
-    """Bytes of `800M`, `2G` or `2GiB`.
+    """Number of bytes in a size such as `800M`, `2G` or `2GiB`.
 
     Raises:
         ConfigError: no such size.
     """
     match = re.fullmatch(r"(\d+(?:\.\d+)?)\s*([KMGT]?)(?:i?B)?", text.strip(), re.IGNORECASE)
     if match is None:
-        raise ConfigError(f"{text!r} is no size", where="memory_bytes", expected="bytes, or a number with K, M, G or T")
+        raise ConfigError(f"{text!r} is not a size", where="memory_bytes", expected="bytes, or a number with K, M, G or T")
     return int(float(match[1]) * UNITS[match[2].upper()])

@@ -15,7 +15,7 @@ from imutool.location import to_location
 from imutool.report import json_values
 
 if TYPE_CHECKING:
-    from imutool.log_report import LogInfo
+    from imutool.log_info.report import LogInfo
     from imutool.noise_identification import IdentifiedNoise
 
 
@@ -30,20 +30,22 @@ def info(
     truth: Annotated[str | None, typer.Option(help="For --noise: topic of the true poses, where a log has several.")] = None,
     noise_plot: Annotated[Path | None, typer.Option(metavar="F.png", help="Draw the Allan deviations (with --noise).")] = None,
     noise_toml: Annotated[Path | None, typer.Option(metavar="F.toml", help="Write the noise as TOML (with --noise).")] = None,
-    quick: Annotated[bool, typer.Option("--quick", help="Read no chunk without need: damage may go unnoticed.")] = False,
+    quick: Annotated[
+        bool, typer.Option("--quick", help="Read only the chunks with IMU messages; this may miss damage.")
+    ] = False,
     overwrite: Overwrite = False,
     json_to: Json = None,
     verbose: Verbose = False,
     quiet: Quiet = False,
 ) -> None:
-    """Say what is in a log and what looks wrong with it; with --noise, how noisy its IMU is."""
-    from imutool.log_info import inspect
-    from imutool.log_report import LogInfos
+    """Report the topics, quality and damage of a log; with --noise, also its IMU noise."""
+    from imutool.log_info.inspection import inspect
+    from imutool.log_info.report import LogInfos
 
     log_to_stderr(verbose, quiet)
     asked = {"--model": model, "--imu": imu, "--truth": truth, "--noise-plot": noise_plot, "--noise-toml": noise_toml}
     if not noise and (idle := [name for name, value in asked.items() if value is not None]):
-        raise ConfigError(f"{idle[0]} says nothing without --noise", where="info", fix="Add --noise")
+        raise ConfigError(f"{idle[0]} needs --noise", where="info", fix="Add --noise")
     if len(logs) > 1 and (noise_plot or noise_toml):
         raise ConfigError(f"{len(logs)} logs do not fit one file", where="--noise-plot, --noise-toml", expected="one log")
     places = [to_location(log) for log in logs]
@@ -78,7 +80,7 @@ def _leave(lost: bool) -> NoReturn:
 
 
 def _write_noise(found: IdentifiedNoise, plot: Path | None, toml: Path | None, overwrite: bool) -> None:
-    """The files that were asked for."""
+    """Write the requested noise files."""
     if plot is not None:
         from imutool.viewing.html.allan_plot import write_png
 
@@ -90,7 +92,7 @@ def _write_noise(found: IdentifiedNoise, plot: Path | None, toml: Path | None, o
 
 
 def topic_rows(report: LogInfo) -> list[tuple[str, ...]]:
-    """Rows of the table of topics, the header first."""
+    """Rows of the topic table, the header first."""
     header = ("topic", "type", "count", "rate Hz", "jitter ms", "largest gap s", "first s", "last s")
     rows = [
         (
@@ -109,7 +111,7 @@ def topic_rows(report: LogInfo) -> list[tuple[str, ...]]:
 
 
 def imu_rows(report: LogInfo) -> list[tuple[str, ...]]:
-    """Rows of the table of properties of each IMU and truth, the header first."""
+    """Rows of the property table of IMUs and truth, the header first."""
     rows: list[tuple[str, ...]] = [("topic", "property", "value")]
     for imu in map(json_values, report.imu):
         if "samples" not in imu:

@@ -1,4 +1,4 @@
-"""Flags for parameters: turns the library's `init` into the command line's --init, in errors and messages."""
+"""Flags for parameter names: the library's `init` is --init in errors and messages."""
 
 from __future__ import annotations
 
@@ -36,7 +36,10 @@ PLACE = re.compile(r"([a-z_]+)(?:=(\S*))?")
 
 
 def flags(command: Any) -> dict[str, str]:
-    """The flag of each parameter of a click command, by the library's names; an argument's is its word in the usage."""
+    """Flags of a click command by the library's parameter names.
+
+    The flag of an argument is its word in the usage.
+    """
     own = {parameter.name: _flag(parameter) for parameter in command.params}
     known = {name.rstrip("_"): flag for name, flag in own.items()}
     for name, others in ALIASES.items():
@@ -53,13 +56,19 @@ def _flag(parameter: Any) -> str:
 
 
 def with_flags(text: str, known: Mapping[str, str] | None = None) -> str:
-    """The text with each backquoted parameter as its flag, by default of the command that runs; other words stay."""
+    """Text with flags for backquoted parameters; other words stay.
+
+    By default the flags are those of the running command.
+    """
     known = current.get() if known is None else known
     return QUOTED.sub(lambda match: _shown(match[1], match[2], known) or match[0], text)
 
 
 def _shown(name: str, value: str | None, known: Mapping[str, str]) -> str | None:
-    """`init` as --init, `init=prior` as --init prior, `smooth=True` as --smooth, `images=False` as --no-images."""
+    """Flag and value: `init=prior` is --init prior, `smooth=True` is --smooth.
+
+    `images=False` is --no-images.
+    """
     if value == "False":
         return known.get(f"no_{name}")
     flag = known.get(name)
@@ -67,7 +76,7 @@ def _shown(name: str, value: str | None, known: Mapping[str, str]) -> str | None
 
 
 def error_with_flags(error: ImutoolError, known: Mapping[str, str]) -> ImutoolError:
-    """The error as the command line shows it."""
+    """Error with flags for parameters."""
     where = error.where
     if where is not None:
         parts = [PLACE.fullmatch(part) for part in where.split(", ")]

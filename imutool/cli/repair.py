@@ -15,14 +15,14 @@ from imutool.report import UNSET, Report, UnsetType
 
 
 class Damaged(StrEnum):
-    """What becomes of bytes that are damaged."""
+    """Treatment of damaged bytes."""
 
     drop = "drop"
     keep = "keep"
 
 
 class Repair(Report, frozen=True, kw_only=True, tag="imutool.repair/1"):
-    """The report of `imutool repair`; `kept` counts the damaged stretches kept as attachments (MCAP)."""
+    """Report of `imutool repair`; `kept` counts damaged stretches kept as attachments (MCAP)."""
 
     output: str
     whole: bool
@@ -33,11 +33,11 @@ class Repair(Report, frozen=True, kw_only=True, tag="imutool.repair/1"):
 
 
 @app.command(
-    epilog="Example: [bold]imutool repair crashed.mcap saved.mcap[/]. Exit code 0: the log was whole; 3: something is lost."
+    epilog="Example: [bold]imutool repair crashed.mcap saved.mcap[/]. Exit code 0: the log was intact; 3: data are lost."
 )
 def repair(
     source: Annotated[str, typer.Argument(metavar="IN", help="A damaged MCAP log or ROS 1 bag: a file or a URL.")],
-    target: Annotated[str, typer.Argument(metavar="OUT", help="The same with everything in it that is sound.")],
+    target: Annotated[str, typer.Argument(metavar="OUT", help="New log with all intact messages.")],
     damaged: Annotated[
         Damaged, typer.Option(help="Damaged stretches: drop them, or keep their bytes as attachments (MCAP).")
     ] = Damaged.drop,
@@ -46,20 +46,23 @@ def repair(
     verbose: Verbose = False,
     quiet: Quiet = False,
 ) -> None:
-    """Save what is sound in a damaged log: cut short, overwritten, unfinished, joined; say what is lost."""
+    """Save the intact messages of a damaged log or ROS 1 bag, and report the losses.
+
+    The log may be cut short, overwritten, unfinished, or joined from parts.
+    """
     from imutool.bag.repair import NO_ATTACHMENTS, is_bag, repair_bag
     from imutool.mcap_io.repair import repair as repair_log
 
-    here, there = to_location(source), to_location(target)
+    log_in, log_out = to_location(source), to_location(target)
     with progress("Repairing", verbose, quiet) as tell:
-        if is_bag(here):
+        if is_bag(log_in):
             if damaged is Damaged.keep:
                 raise ConfigError(NO_ATTACHMENTS, where="damaged=keep", fix="Leave `damaged` out")
-            bag = repair_bag(here, there, overwrite=overwrite, progress=lambda done, total: tell(done, total, ""))
+            bag = repair_bag(log_in, log_out, overwrite=overwrite, progress=lambda done, total: tell(done, total, ""))
             report = Repair(output=target, whole=bag.whole, messages=dict(bag.messages), chunks=bag.chunks, losses=bag.plain())
         else:
             log = repair_log(
-                here, there, damaged=damaged.value, overwrite=overwrite, progress=lambda done, total: tell(done, total, "")
+                log_in, log_out, damaged=damaged.value, overwrite=overwrite, progress=lambda done, total: tell(done, total, "")
             )
             report = Repair(
                 output=target,

@@ -14,7 +14,7 @@ from imutool.report import REPORTS, Report, Section, json_schema
 
 
 class DemoReport(Report, frozen=True, tag="imutool.demo/1"):
-    """The report of `imutool demo`: scores as `imutool evaluate` gives them, and the files written."""
+    """Report of `imutool demo`: scores of `imutool evaluate`, and the files written."""
 
     results: list[dict[str, Any]]
     log: str
@@ -26,7 +26,7 @@ class DemoReport(Report, frozen=True, tag="imutool.demo/1"):
 
 
 class ModelEntry(Section, frozen=True):
-    """A model that ships."""
+    """Model that ships with imutool."""
 
     name: str
     method: str
@@ -36,7 +36,7 @@ class ModelEntry(Section, frozen=True):
 
 
 class Models(Report, frozen=True, tag="imutool.models/1"):
-    """The models that ship."""
+    """Report of `imutool models`."""
 
     models: list[ModelEntry]
 
@@ -77,14 +77,17 @@ def schema(
 
 @app.command(epilog="Example: [bold]imutool demo -o demo-out[/]")
 def demo(
-    folder: Annotated[Path, typer.Option("-o", "--output", metavar="DIR", help="Where everything goes.")] = Path("demo-out"),
+    folder: Annotated[Path, typer.Option("-o", "--output", metavar="DIR", help="Output folder.")] = Path("demo-out"),
     overwrite: Overwrite = False,
     json_to: Json = None,
     verbose: Verbose = False,
     quiet: Quiet = False,
 ) -> None:
-    """Go the whole way on a made-up recording: convert, train, debias, evaluate, view. No download."""
-    from imutool.demo import run
+    """Run a demo without download: convert, train, debias, evaluate, view.
+
+    The recording is made up.
+    """
+    from imutool.cli.demo import run
 
     def announce(line: str) -> None:
         if not quiet:

@@ -13,7 +13,7 @@ from imutool.report import Report, Section
 
 
 class MotionQuality(Section, frozen=True):
-    """Noise of the poses and of the motion smoothed from them, by stretch; glitches dropped and steps levelled."""
+    """Noise of the poses and of the smoothed motion, with glitches and steps removed."""
 
     pose_noise_m: list[float]
     pose_noise_rad: list[float]
@@ -25,7 +25,7 @@ class MotionQuality(Section, frozen=True):
 
 
 class SimulationReport(Report, frozen=True, kw_only=True, tag="imutool.simulation/1"):
-    """The report of `imutool simulate`."""
+    """Report of `imutool simulate`."""
 
     command: str
     trajectory: str
@@ -45,22 +45,20 @@ class SimulationReport(Report, frozen=True, kw_only=True, tag="imutool.simulatio
 @app.command(epilog="Example: [bold]imutool simulate V1_02.mcap sim.mcap --physics physics.toml --noise adis16448 --seed 1[/]")
 def simulate(
     trajectory: Annotated[Path, typer.Argument(metavar="TRAJECTORY", help="An MCAP log with poses.")],
-    target: Annotated[Path, typer.Argument(metavar="OUT", help="The log with the simulated IMU beside the poses.")],
-    physics: Annotated[
-        Path | None, typer.Option(metavar="FILE.toml", help="What acts on the sensor; else it is ideal.")
-    ] = None,
+    target: Annotated[Path, typer.Argument(metavar="OUT", help="New log with the simulated IMU and the poses.")],
+    physics: Annotated[Path | None, typer.Option(metavar="FILE.toml", help="Physics of the sensor; by default ideal.")] = None,
     noise: Annotated[str, typer.Option(metavar="NAME|FILE.toml", help="none, adis16448, bmi160, or a TOML file.")] = "none",
     rate: Annotated[
-        float | None, typer.Option(metavar="HZ", help="Samples a second; else as the log's own IMU, or 200.")
+        float | None, typer.Option(metavar="HZ", help="Samples per second; by default the log's IMU rate, or 200.")
     ] = None,
-    seed: Annotated[int, typer.Option(help="Of the noise.")] = 0,
+    seed: Annotated[int, typer.Option(help="Seed of the noise.")] = 0,
     truth: Truth = None,
     overwrite: Overwrite = False,
     json_to: Json = None,
     verbose: Verbose = False,
     quiet: Quiet = False,
 ) -> None:
-    """Simulate an IMU along the poses of a log, with the physics and the noise of a sensor."""
+    """Simulate an IMU along the poses of a log, with a sensor's physics and noise."""
     from imutool.sensor.simulate import simulate as run
 
     with progress("Simulating", verbose, quiet) as tell:

@@ -1,4 +1,4 @@
-"""What the command line shows: tables that fit the terminal, JSON, lines, and a progress bar; stdout for results alone."""
+"""Terminal output: tables, JSON, lines and a progress bar; stdout holds only results."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ logger = logging.getLogger("imutool")
 
 
 class _Console(Console):
-    """Rich's console would end the program itself, with the code of a bug, when nobody reads on."""
+    """Console that raises BrokenPipeError; Rich's own would exit with the code of a bug."""
 
     def on_broken_pipe(self) -> None:
         raise BrokenPipeError
@@ -43,30 +43,33 @@ out, err = _Console(), _Console(stderr=True)
 
 
 def plain(text: str) -> str:
-    """Text from logs and files as it is: no markup, no control characters that a terminal would obey."""
+    """Text without markup and without control characters, for a terminal."""
     shown = "".join(c if c.isprintable() or c == "\n" else repr(c)[1:-1] for c in text)
     return shown.replace("[", r"\[")
 
 
 def say(line: str) -> None:
-    """A line of results, whole however long."""
+    """Print a line of results; it is never folded."""
     out.print(plain(line), highlight=False, soft_wrap=True)
 
 
 def tell_error(message: str) -> None:
-    """A line that begins with "error:", on stderr."""
+    """Print a line that begins with "error:" on stderr."""
     err.print(f"[bold red]error:[/] {plain(message)}", highlight=False, soft_wrap=True)
 
 
 def tell_losses(losses: Mapping[str, Any]) -> None:
-    """What is wrong with a log (`mcap_io.recovery.losses.Losses.plain`), one line a stretch."""
+    """Print a log's losses (`mcap_io.recovery.losses.Losses.plain`), one line a stretch."""
     for line in describe(losses):
         kind, _, rest = line.partition(": ")
         out.print(f"[yellow]{kind}:[/] {plain(rest)}", highlight=False, soft_wrap=True)
 
 
 def table(rows: Sequence[Sequence[str]], *, keys: int) -> None:
-    """Rows of text, the first one the header; what is too wide goes on below, under the first `keys` columns again."""
+    """Print rows of text as a table, the first row as its header.
+
+    Columns that do not fit go below, with the first `keys` columns repeated.
+    """
     columns = [[plain(cell) for cell in column] for column in zip(*rows, strict=True)]
     widths = [2 + max(len(line) for cell in column for line in cell.split("\n")) for column in columns]
     room = out.width - sum(widths[:keys])
@@ -80,7 +83,7 @@ def table(rows: Sequence[Sequence[str]], *, keys: int) -> None:
 
 
 def _split(widths: Sequence[int], room: int) -> list[int]:
-    """How many columns go side by side, at least one at a time."""
+    """Numbers of columns side by side, at least one each."""
     counts, used = [0], 0
     for width in widths:
         if counts[-1] and used + width > room:
@@ -105,7 +108,7 @@ def _print(columns: Sequence[Sequence[str]], width: int) -> None:
 
 
 def write_json(report: Any, where: str | None) -> bool:
-    """Writes the report where `--json` says; true if stdout is taken by it.
+    """Write the report where `--json` says; True if stdout holds it.
 
     Raises:
         ConfigError: the file cannot be written.
@@ -129,21 +132,24 @@ def write_json(report: Any, where: str | None) -> bool:
 
 
 class _Lines(logging.Handler):
-    """Log records as lines on stderr, above the progress bar where there is one."""
+    """Handler that prints log records on stderr, above the progress bar."""
 
     def emit(self, record: logging.LogRecord) -> None:
         err.print(plain(with_flags(f"{record.levelname.lower()}: {record.getMessage()}")), highlight=False, soft_wrap=True)
 
 
 def log_to_stderr(verbose: bool, quiet: bool) -> None:
-    """Sends warnings to stderr: with `verbose` what the tool does besides, with `quiet` errors alone."""
+    """Send log records to stderr: warnings, with `verbose` more, with `quiet` errors only."""
     logging.basicConfig(level=logging.ERROR if quiet else logging.WARNING, handlers=[_Lines()], force=True)
     logger.setLevel(logging.INFO if verbose else logging.NOTSET)
 
 
 @contextmanager
 def progress(what: str, verbose: bool, quiet: bool) -> Iterator[Callable[[int, int, str], None]]:
-    """A bar on stderr, told how much is done, of how much, and a word on it; with --verbose the words stay as lines."""
+    """Progress bar on stderr; the callback takes steps done, steps in all, and a word.
+
+    With --verbose the words stay as lines.
+    """
     log_to_stderr(verbose, quiet)
     columns = (TextColumn("{task.description}"), BarColumn(bar_width=16), TextColumn("{task.percentage:>3.0f} %"))
     with Progress(*columns, TextColumn("{task.fields[word]}"), console=err, disable=quiet, transient=True) as bar:
@@ -158,7 +164,7 @@ def progress(what: str, verbose: bool, quiet: bool) -> Iterator[Callable[[int, i
 
 
 def epoch_line(epoch: Epoch) -> tuple[int, int, str]:
-    """A line of training as progress: steps done, steps in all, the figures in words."""
+    """Progress of training: steps done, steps in all, and the scores as text."""
     if epoch.note:
         return 0, 1, epoch.note
     scale, unit = (180.0 / math.pi, "°") if epoch.sensor == "gyro" else (1.0, " m/s")
@@ -170,7 +176,7 @@ def epoch_line(epoch: Epoch) -> tuple[int, int, str]:
 
 
 def figures(results: Sequence[dict[str, Any]]) -> None:
-    """Evaluation results as two tables: over the whole path, and per metres flown."""
+    """Print evaluation results as tables: over the whole path, and by distance."""
 
     def number(value: float | None) -> str:
         return "–" if value is None else format(value, ".2f")
@@ -180,9 +186,9 @@ def figures(results: Sequence[dict[str, Any]]) -> None:
     whole = [("log", "model", "AOE\n°", "aligned\n°", "APE\nm", "aligned\nm", "velocity\nm/s")]
     roe = [("log", "model", *(f"ROE °\n{d} m" for d in distances))]
     rpe = [("log", "model", *(f"RPE m\n{d} m" for d in distances))]
-    for one in results:
-        whole.append((one["log"], one["model"], *(number(one[name]) for name in names)))
-        roe.append((one["log"], one["model"], *(number(one["roe_deg"][d]) for d in distances)))
-        rpe.append((one["log"], one["model"], *(number(one["rpe_m"][d]) for d in distances)))
+    for result in results:
+        whole.append((result["log"], result["model"], *(number(result[name]) for name in names)))
+        roe.append((result["log"], result["model"], *(number(result["roe_deg"][d]) for d in distances)))
+        rpe.append((result["log"], result["model"], *(number(result["rpe_m"][d]) for d in distances)))
     for rows in (whole, roe, rpe):
         table(rows, keys=2)

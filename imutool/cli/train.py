@@ -22,28 +22,30 @@ from imutool.report import UNSET, Report, Section, UnsetType
 )
 def train(
     logs: Logs,
-    model: Annotated[Path, typer.Option("-o", "--output", metavar="MODEL.safetensors", help="Where the model goes.")],
-    method: Annotated[str, typer.Option(help="The bias model, one of those listed below.")] = "hybrid",
+    model: Annotated[Path, typer.Option("-o", "--output", metavar="MODEL.safetensors", help="File of the new model.")],
+    method: Annotated[str, typer.Option(help="Bias model from the list below.")] = "hybrid",
     config: Annotated[
-        Path | None, typer.Option(metavar="FILE.toml", help="Settings; imutool.training.fit.TrainSettings says which.")
+        Path | None, typer.Option(metavar="FILE.toml", help="Settings; imutool.training.fit.TrainSettings lists them.")
     ] = None,
-    set_: Annotated[list[str] | None, typer.Option("--set", metavar="key=value", help="One setting. Repeatable.")] = None,
+    set_: Annotated[
+        list[str] | None, typer.Option("--set", metavar="key=value", help="Change one setting. Repeatable.")
+    ] = None,
     physics: Annotated[
         Path | None,
-        typer.Option(metavar="physics.toml", help="For hybrid: the effects that it names; the neural ODE learns the rest."),
+        typer.Option(metavar="physics.toml", help="For hybrid: effects to fit; the neural ODE learns the rest."),
     ] = None,
-    device: Annotated[str, typer.Option(help="cpu or cuda.")] = "cpu",
+    device: Annotated[str, typer.Option(help="Device: cpu or cuda.")] = "cpu",
     seed: Annotated[int | None, typer.Option(help="Seed of everything random.")] = None,
     imu: Imu = None,
     truth: Truth = None,
-    resume: Annotated[bool, typer.Option("--resume", help="Go on from an interrupted training's checkpoint.")] = False,
+    resume: Annotated[bool, typer.Option("--resume", help="Continue an interrupted training from its checkpoint.")] = False,
     overwrite: Overwrite = False,
     json_to: Json = None,
     verbose: Verbose = False,
     quiet: Quiet = False,
 ) -> None:
     """Train a bias model on logs of one sensor with true poses."""
-    registry.load("imutool.bias", method)  # a slip of the pen is told before any log is read
+    registry.load("imutool.bias", method)  # refuse a wrong name before reading any log
     from imutool.config import load
     from imutool.training.run import train as run
     from imutool.training.settings import settings_of
@@ -73,7 +75,7 @@ def train(
 
 
 class TrainingLog(Section, frozen=True):
-    """A log that a model was trained on."""
+    """Log that a model was trained on."""
 
     name: str
     file: str
@@ -81,7 +83,7 @@ class TrainingLog(Section, frozen=True):
 
 
 class TrainingReport(Report, frozen=True, kw_only=True, tag="imutool.training/1"):
-    """The report of `imutool train`: the new model's card; `compared` and `physics` for a hybrid model."""
+    """Report of `imutool train`: the model's card; a hybrid adds `compared` and `physics`."""
 
     model: str
     imutool: str
@@ -105,7 +107,7 @@ def training_report(model: Path, card: Mapping[str, Any]) -> TrainingReport:
 
 
 def _named_by(physics: Path, method: str) -> tuple[list[str], tuple[str, ...]]:
-    """Settings with the effects of a physics.toml, and what is left of it.
+    """Settings for the effects of a physics.toml, and the names of the effects left out.
 
     Raises:
         ConfigError: another method than `hybrid`, or a file that says nothing to it.

@@ -17,13 +17,13 @@ from imutool.report import Report
 if TYPE_CHECKING:
     from imutool.viewing.model.trajectory_error import Alignment
 
-AT_HELP = "Where the cursor starts: seconds, or worst, the largest orientation error of a model."
-ALIGN_HELP = "Move each path onto the truth before its errors are taken: by its start, its heading, or as a whole."
-SOURCE_HELP = "Also show what else the log holds, cameras for instance."
+AT_HELP = "Start of the cursor: seconds, or worst (the largest orientation error of a model)."
+ALIGN_HELP = "Align each path with the truth before taking errors: by its start, heading, or completely."
+SOURCE_HELP = "Also show other topics of the log, such as cameras."
 
 
 class View(Report, frozen=True, tag="imutool.view/1"):
-    """The report of `imutool view`, with the versions of imutool, of the Rerun installed, and of the viewer."""
+    """Report of `imutool view`: outputs, and the versions of imutool, Rerun and the viewer."""
 
     logs: list[str]
     shown: list[dict[str, str]]
@@ -41,11 +41,11 @@ def view(
     truth: Truth = None,
     imu: Imu = None,
     align: Annotated[str, typer.Option(metavar="none|origin|yaw|se3", help=ALIGN_HELP)] = "none",
-    findings: Annotated[Path | None, typer.Option(metavar="DIR", help="Mark what a diagnosis found, where it acts.")] = None,
+    findings: Annotated[Path | None, typer.Option(metavar="DIR", help="Mark the findings of this diagnosis folder.")] = None,
     source: Annotated[bool, typer.Option("--source/--no-source", help=SOURCE_HELP)] = True,
     at: Annotated[str | None, typer.Option(metavar="SECONDS|worst", help=AT_HELP)] = None,
     save: Annotated[Path | None, typer.Option(metavar="F.rrd", help="Save a file for the viewer.")] = None,
-    connect: Annotated[str | None, typer.Option(metavar="URL", help="Send to a viewer that runs: HOST:PORT.")] = None,
+    connect: Annotated[str | None, typer.Option(metavar="URL", help="Send to a running viewer: HOST:PORT.")] = None,
     web: Annotated[bool, typer.Option("--web", help="Serve to a browser on this machine, until Ctrl-C.")] = False,
     port: Annotated[int | None, typer.Option(min=1, max=65535, help="Port of --web; else a free one.")] = None,
     export_web: Annotated[
@@ -54,13 +54,13 @@ def view(
     png: Annotated[
         Path | None, typer.Option(metavar="DIR", help="Draw pictures, LOG-errors.png and so on; without Rerun.")
     ] = None,
-    html: Annotated[Path | None, typer.Option(metavar="F.html", help="Write a page of its own, without Rerun.")] = None,
+    html: Annotated[Path | None, typer.Option(metavar="F.html", help="Write an HTML page, without Rerun.")] = None,
     overwrite: Overwrite = False,
     json_to: Json = None,
     verbose: Verbose = False,
     quiet: Quiet = False,
 ) -> None:
-    """Show truth, raw and debiased in the Rerun viewer, in a browser, or as files to look at later.
+    """Show truth, raw and debiased: in the Rerun viewer, in a browser, or as files.
 
     Without one of --save, --connect, --web, --export-web, --png and --html a viewer opens; where it cannot, an .rrd is
     saved.
@@ -89,7 +89,7 @@ def view(
 
 
 def _alignment(word: str) -> Alignment:
-    """The alignment of that name.
+    """Alignment by name.
 
     Raises:
         ConfigError: there is none.

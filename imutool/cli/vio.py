@@ -12,7 +12,7 @@ from imutool.report import Report
 
 
 class VioReport(Report, frozen=True, tag="imutool.vio/1"):
-    """The report of `imutool vio`: scores of each log, model and choice of bias states."""
+    """Report of `imutool vio`: scores of each log, model and choice of bias states."""
 
     results: list[dict[str, Any]]
 
@@ -27,15 +27,16 @@ def vio(
     bias_states: Annotated[
         bool | None, typer.Option("--bias-states/--no-bias-states", help="Estimate biases, or trust the IMU; by default both.")
     ] = None,
-    lag: Annotated[float, typer.Option(metavar="S", help="How far back the smoother still changes its mind.")] = 3.0,
-    keyframes: Annotated[float, typer.Option(metavar="HZ", help="Camera frames taken a second.")] = 4.0,
-    features: Annotated[int, typer.Option(help="Tracks in a frame.")] = 30,
+    lag: Annotated[float, typer.Option(metavar="S", help="Lag of the fixed-lag smoother.")] = 3.0,
+    keyframes: Annotated[float, typer.Option(metavar="HZ", help="Camera keyframes per second.")] = 4.0,
+    features: Annotated[int, typer.Option(help="Feature tracks in a frame.")] = 30,
     pixel_noise: Annotated[float, typer.Option(metavar="PX", help="White noise of a pixel coordinate.")] = 1.0,
-    blackout: Annotated[float, typer.Option(metavar="S", help="The camera sees nothing so long of every 15 s.")] = 0.0,
-    duration: Annotated[float | None, typer.Option(metavar="S", help="Only so much of each log.")] = None,
-    seed: Annotated[int, typer.Option(help="Of landmarks, tracks and pixel noise.")] = 0,
+    blackout: Annotated[float, typer.Option(metavar="S", help="Length of a camera blackout in every 15 s.")] = 0.0,
+    duration: Annotated[float | None, typer.Option(metavar="S", help="Use only this much of each log.")] = None,
+    seed: Annotated[int, typer.Option(help="Seed of landmarks, tracks and pixel noise.")] = 0,
     set_: Annotated[
-        list[str] | None, typer.Option("--set", metavar="key=value", help="Another of imutool.vio.run.VioSettings. Repeatable.")
+        list[str] | None,
+        typer.Option("--set", metavar="key=value", help="Change a setting of imutool.vio.run.VioSettings. Repeatable."),
     ] = None,
     json_to: Json = None,
     verbose: Verbose = False,
@@ -64,6 +65,6 @@ def vio(
     for rows in tabulate(results):
         table(rows, keys=3)
     say(f"Camera, simulated along the truth: {results[0]['camera']}; {results[0]['tracks']} tracks in a frame")
-    for one in results:
-        if one["failed"]:
-            say(f"{one['log']}, {one['model']}, bias states {'on' if one['bias_states'] else 'off'}: {one['failed']}")
+    for row in results:
+        if row["failed"]:
+            say(f"{row['log']}, {row['model']}, bias states {'on' if row['bias_states'] else 'off'}: {row['failed']}")

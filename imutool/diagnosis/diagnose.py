@@ -1,4 +1,4 @@
-"""Diagnosis of recordings: alignment, whitening, selection of effects, localization, held-out gain.
+"""Diagnosis of recordings: alignment, whitening, effects, localization, held-out gain.
 
 logs ─ align_all ─> Pair[] ─ whitened ─> WhitenedImu[] ─ select_effects ─> Selection ─ summarize ─> Diagnosis
 """
@@ -7,20 +7,31 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
+from jaxtyping import Float64
 
 from imutool.diagnosis import summarize
 from imutool.diagnosis.compare_findings import ANOTHER_MOTION
 from imutool.diagnosis.estimation import timestamps
 from imutool.diagnosis.estimation import unnamed_effects as unnamed
 from imutool.diagnosis.estimation.aligned_log import Pair
-from imutool.diagnosis.estimation.jacobians import expected
+from imutool.diagnosis.estimation.gauss_newton import fit
+from imutool.diagnosis.estimation.jacobians import Chosen, expected
 from imutool.diagnosis.estimation.model_selection import Selection, select_effects
 from imutool.diagnosis.estimation.noise_estimate import whitened
-from imutool.diagnosis.estimation.observability import unobservable
+from imutool.diagnosis.estimation.observability import unobservable, with_free
+from imutool.diagnosis.estimation.significance import scatter
 from imutool.diagnosis.estimation.whitening import WhitenedImu
-from imutool.diagnosis.reference import align_all, is_another_motion, reference_errors, with_unique_names
+from imutool.diagnosis.reference import (
+    align,
+    align_all,
+    is_another_motion,
+    reference_errors,
+    with_unique_names,
+    without_unusable,
+)
 from imutool.diagnosis.reference_free_checks import check_without_reference
 from imutool.diagnosis.resimulation import resimulate
 from imutool.diagnosis.result import Closer, Diagnosis, Finding
@@ -59,88 +70,145 @@ def diagnose(
         ConfigError, LogError: a log cannot be read, or has no such topic; signals without a simulation, or of several logs.
         DataError: no truth and no simulation, too little shared time, another motion, no usable axis.
     """
-    say, settings = tell or (lambda done, total, text: None), settings or DiagnoseSettings()
+    report, settings = tell or (lambda done, total, text: None), settings or DiagnoseSettings()
     if signals and (sim is None or len(reals) != 1):
         raise ConfigError("`signals` compare one recording with its simulation", where="signals", fix="Give one log and `sim`")
-    say(0, 4, "reading")
-    beside = [] if sim is None else [(one, read_field(reals[0], one), read_field(sim, one)) for one in signals]
+    report(0, 4, "reading")
+    signal_fields = [] if sim is None else [(name, read_field(reals[0], name), read_field(sim, name)) for name in signals]
     recordings = with_unique_names([read_log(real, imu=imu, truth=truth) for real in reals])
     simulated = None if sim is None else read_log(sim, imu=imu)
-    known: tuple[Finding, ...] = ()
+    sim_findings: tuple[Finding, ...] = ()
     if sim is not None and simulated is not None and simulated.truths and is_another_motion(recordings, simulated, signals):
-        say(0, 4, "the simulation, of another motion")
-        known, simulated = diagnose([sim], imu=imu, settings=settings).findings, None
-    apart = sim is not None and simulated is None
-    pairs, left_out = align_all(recordings, simulated, truth)
+        report(0, 4, "the simulation, of another motion")
+        sim_findings, simulated = diagnose([sim], imu=imu, settings=settings).findings, None
+    another_motion = sim is not None and simulated is None
+    pairs, left_out = align_all(recordings, simulated, truth, settings.reference)
     if not pairs:
         return check_without_reference(recordings[0], str(reals[0]), left_out[0])
-    say(1, 4, "noise")
+    report(1, 4, "noise")
     candidates = candidates_for(pairs)
     logs = [whitened(pair, (*candidates, *unnamed.driven([pair])), settings.band) for pair in pairs]
     pairs = [log.pair for log in logs]
-    say(2, 4, "searching")
-    moments = reference_errors(logs)
-    asked, unnamed_too = ((), ()) if moments[0] else (candidates, unnamed_candidates(pairs))
-    found = select_effects(logs, asked, unnamed_too, lambda word: say(2, 4, f"trying {word}"), settings=settings.search)
-    say(3, 4, "locating")
-    paths = {recording.name: str(real) for recording, real in zip(recordings, reals, strict=True)}
-    diagnosis = summarize.summarize(
-        logs, found, paths, None if sim is None else str(sim), known, unobservable(logs, candidates, settings.search)
+    report(2, 4, "searching")
+    wrong, wrong_at = reference_errors(logs, settings.reference)
+    named, unnamed_groups = ((), ()) if wrong else (candidates, unnamed_candidates(pairs))
+    selection = select_effects(
+        logs, named, unnamed_groups, lambda word: report(2, 4, f"trying {word}"), settings=settings.search
     )
-    if simulated is not None and any(one.effect not in NO_EFFECT for one in diagnosis.findings):
-        say(3, 4, "simulating again")
-        diagnosis = _resimulated(diagnosis, logs, found, simulated)
-    diagnosis = replace(diagnosis, remarks=(*([ANOTHER_MOTION] if apart else []), *left_out, *diagnosis.remarks))
-    diagnosis = replace(diagnosis, findings=(*moments[0], *diagnosis.findings), located=tuple(moments[1]) or diagnosis.located)
-    for signal, real, there in beside:
-        say(3, 4, signal)
-        diagnosis = _with_signal(diagnosis, diagnose_signal(real, there, others(reals[0], signal), signal, settings.search))
-    say(4, 4, "")
+    report(3, 4, "locating")
+    paths = {recording.name: str(real) for recording, real in zip(recordings, reals, strict=True)}
+    hidden = unobservable(logs, candidates, settings.search)
+    diagnosis = summarize.summarize(logs, selection, paths, None if sim is None else str(sim), sim_findings, hidden, settings)
+    if simulated is not None and any(finding.effect not in NO_EFFECT for finding in diagnosis.findings):
+        report(3, 4, "simulating again")
+        diagnosis = _resimulated(diagnosis, logs, selection, simulated)
+    diagnosis = replace(diagnosis, remarks=(*([ANOTHER_MOTION] if another_motion else []), *left_out, *diagnosis.remarks))
+    diagnosis = replace(diagnosis, findings=(*wrong, *diagnosis.findings), located=tuple(wrong_at) or diagnosis.located)
+    for signal, real, simulated_field in signal_fields:
+        report(3, 4, signal)
+        diagnosis = _with_signal(diagnosis, diagnose_signal(real, simulated_field, others(reals[0], signal), signal, settings))
+    report(4, 4, "")
     return diagnosis
 
 
-def _resimulated(diagnosis: Diagnosis, logs: Sequence[WhitenedImu], found: Selection, sim: Recording) -> Diagnosis:
+def _resimulated(diagnosis: Diagnosis, logs: Sequence[WhitenedImu], selection: Selection, sim: Recording) -> Diagnosis:
     """Adds the gain of a second simulation, or the reason why there is none."""
-    if any(one.effect == summarize.JITTER for one in diagnosis.findings):  # stamps that jitter are no physics to simulate
+    if any(finding.effect == summarize.JITTER for finding in diagnosis.findings):  # jitter of stamps is not simulated
         return diagnosis
     try:
-        closer = resimulate(logs, sim, summarize.physics_of_fitted_time(logs, found, diagnosis))
+        closer = resimulate(logs, sim, summarize.physics_of_fitted_time(logs, selection, diagnosis))
     except ImutoolError as error:
         why = f"How much closer it comes is computed, not simulated again: {error}"
         return replace(diagnosis, remarks=(*diagnosis.remarks, why))
     return replace(diagnosis, closer=closer)
 
 
-def _with_signal(diagnosis: Diagnosis, one: SignalDiagnosis) -> Diagnosis:
+def _with_signal(diagnosis: Diagnosis, added: SignalDiagnosis) -> Diagnosis:
     """Adds the diagnosis of another signal."""
-    signal = one.signal
+    signal = added.signal
     return replace(
         diagnosis,
-        located=(*diagnosis.located, *one.located),
-        findings=(*diagnosis.findings, *one.findings),
-        not_identifiable=(*diagnosis.not_identifiable, *one.not_identifiable),
-        unexplained={**diagnosis.unexplained, signal: one.unexplained},
-        closer={**diagnosis.closer, signal: Closer.computed(one.closer, one.unexplained.noise_floor)},
-        remarks=(*diagnosis.remarks, *one.remarks),
-        signals={**diagnosis.signals, signal: one.traces},
+        located=(*diagnosis.located, *added.located),
+        findings=(*diagnosis.findings, *added.findings),
+        not_identifiable=(*diagnosis.not_identifiable, *added.not_identifiable),
+        unexplained={**diagnosis.unexplained, signal: added.unexplained},
+        closer={**diagnosis.closer, signal: Closer.computed(added.closer, added.unexplained.noise_floor)},
+        remarks=(*diagnosis.remarks, *added.remarks),
+        signals={**diagnosis.signals, signal: added.traces},
     )
 
 
 def candidates_for(pairs: Sequence[Pair]) -> tuple[Effect, ...]:
     """Effects of the catalogue that the logs can have, and jittering stamps."""
-    attitude = all(pair.felt.R_wb is not None for pair in pairs)
+    attitude = all(pair.ideal.R_wb is not None for pair in pairs)
     channels = set.intersection(*(set(pair.channels) for pair in pairs))
 
-    def thinkable(physics: Effect) -> bool:
-        return all(attitude if need == "attitude" else any(need in name for name in channels) for need in physics.needs)
+    def thinkable(effect: Effect) -> bool:
+        return all(attitude if need == "attitude" else any(need in name for name in channels) for need in effect.needs)
 
-    found = [one for one in catalogue.diagnosed() if thinkable(one) and one.name not in SHOWN_BY_SAMPLES]
+    effects = [effect for effect in catalogue.diagnosed() if thinkable(effect) and effect.name not in SHOWN_BY_SAMPLES]
     biases = [np.median(pair.real - expected(pair, ()), axis=0) for pair in pairs]
     exact = all(pair.against == "simulation" for pair in pairs)  # poses know nothing of a millisecond: `late_stamps`
-    return (*found, *(timestamps.jitter(pairs) if exact else ()), *timestamps.soft_limits(pairs, biases))
+    return (*effects, *(timestamps.jitter(pairs) if exact else ()), *timestamps.soft_limits(pairs, biases))
 
 
 def unnamed_candidates(pairs: Sequence[Pair]) -> list[tuple[Effect, ...]]:
-    """Effects that are tried after the catalogue: driven by other channels, then unknown curves and terms."""
+    """Candidates after the catalogue: driven by other channels, then curves and terms."""
     like = unnamed.like(pairs)
     return [tuple(unnamed.driven(pairs)), (*unnamed.curves(like), *unnamed.terms(like))]
+
+
+# ── sizes of chosen effects ──
+
+EVERY_UNIT = (
+    "mount_rotation",
+    "gyro_scale",
+    "accel_scale",
+    "lever_arm",
+    "clock_offset",
+)  # of these every unit has a little
+
+
+class EffectSizes(NamedTuple):
+    """Sizes of effects fitted together, with robust standard deviations and biases.
+
+    `information` is the Fisher information of the noise alone, over all parameters in order.
+    """
+
+    chosen: Chosen
+    std: dict[str, Float64[np.ndarray, " p"]]
+    information: Float64[np.ndarray, "q q"]
+    bias: Float64[np.ndarray, "stretches 6"]
+
+
+def effect_sizes(
+    real: Location,
+    sim: Location | None = None,
+    *,
+    imu: str | None = None,
+    truth: str | None = None,
+    effects: Sequence[str] = EVERY_UNIT,
+    settings: DiagnoseSettings | None = None,
+) -> EffectSizes:
+    """Fit effects of the catalogue to a recording, significant or not.
+
+    Unobservable parameters are left out, for example the scale of a gyro axis that never turns.
+
+    Raises:
+        ConfigError, LogError, DataError: as `diagnose`; or an effect that has nothing to be fitted to here.
+    """
+    simulated = None if sim is None else read_log(sim, imu=imu)
+    settings = settings or DiagnoseSettings()
+    aligned = align(read_log(real, imu=imu, truth=truth), simulated, truth, settings.reference)
+    pairs = [without_unusable(pair, settings.reference) for pair in aligned]
+    candidates = candidates_for(pairs)
+    logs = [whitened(pair, candidates, settings.band) for pair in pairs]
+    wanted = catalogue.diagnosed(effects)
+    hidden = set(unobservable(logs, wanted, settings.search))
+    observable = []
+    for effect in wanted:
+        free = [k for k, p in enumerate(effect.parameters) if not {effect.name, f"{effect.name}.{p.name}"} & hidden]
+        observable += [with_free(effect, free)] if free else []
+    fitted = fit(logs, tuple((effect, effect.null_value.astype(float)) for effect in observable), part="all")
+    std = scatter(logs, fitted, "all", settings.search.robust_block_s).std if observable else {}
+    return EffectSizes(fitted.chosen, {key: np.asarray(s) for key, s in std.items()}, fitted.information, fitted.bias)

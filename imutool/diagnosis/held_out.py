@@ -1,4 +1,4 @@
-"""Held-out residuals: root mean squares, gain of the findings, and whether the rest is white."""
+"""Held-out residuals: root mean squares, gain of the findings, whiteness."""
 
 from __future__ import annotations
 
@@ -15,11 +15,8 @@ from imutool.diagnosis.estimation.jacobians import Chosen, expected
 from imutool.diagnosis.estimation.noise_estimate import noise_std
 from imutool.diagnosis.estimation.whitening import WhitenedImu
 from imutool.diagnosis.result import Closer, HeldOut, Unexplained
+from imutool.diagnosis.settings import HeldOutSettings
 from imutool.units import ASCII_UNITS, SENSORS
-
-WHITE = 1.15  # ratio of residual and noise up to which the residual is white
-BLOCK_S, DOUBTED = 3.0, 0.01  # s of held-out time; p-value below which a residual against poses is not white
-BY_CHANCE = 1e-3  # p-value of a larger ratio where few values are left
 
 
 def with_effects(pair: Pair, chosen: Chosen) -> Float64[np.ndarray, "n 6"]:
@@ -27,33 +24,33 @@ def with_effects(pair: Pair, chosen: Chosen) -> Float64[np.ndarray, "n 6"]:
     return with_constant(pair, expected(pair, chosen))
 
 
-def with_constant(pair: Pair, there: Float64[np.ndarray, "n 6"]) -> Float64[np.ndarray, "n 6"]:
+def with_constant(pair: Pair, model: Float64[np.ndarray, "n 6"]) -> Float64[np.ndarray, "n 6"]:
     """Expected samples with the best constant; none for an unusable axis."""
-    counts = pair.usable
-    constant = np.where(counts, pair.real - there, 0.0).sum(axis=0) / np.maximum(counts.sum(axis=0), 1)
-    return np.asarray(there + constant)
+    usable = pair.usable
+    constant = np.where(usable, pair.real - model, 0.0).sum(axis=0) / np.maximum(usable.sum(axis=0), 1)
+    return np.asarray(model + constant)
 
 
 def noise_floor(logs: Sequence[WhitenedImu]) -> Float64[np.ndarray, "6"]:
-    """Standard deviation of a sample's noise by axis; of an unusable axis that of its neighbours."""
+    """Noise standard deviation of a sample by axis; neighbours stand in for an unusable one."""
     total, count = np.zeros(6), np.zeros(6)
     for log in logs:
         total += log.pair.axes * noise_std(log.whiten) ** 2
         count += log.pair.axes
     variance = total / np.maximum(count, 1.0)
     for part in (slice(0, 3), slice(3, 6)):
-        there = count[part] > 0
-        variance[part][~there] = variance[part][there].mean() if there.any() else LEAST_NOISE[part][0] ** 2
+        known = count[part] > 0
+        variance[part][~known] = variance[part][known].mean() if known.any() else LEAST_NOISE[part][0] ** 2
     return np.asarray(np.sqrt(variance))
 
 
-def _residual(log: WhitenedImu, there: Float64[np.ndarray, "n 6"], part: slice) -> Float64[np.ndarray, " m"]:
+def _residual(log: WhitenedImu, model: Float64[np.ndarray, "n 6"], part: slice) -> Float64[np.ndarray, " m"]:
     """Residual of usable held-out samples, within the band in which the reference is known."""
     pair, counts = log.pair, log.whiten.counts
-    left, rows = pair.real - there, pair.held_out[:: log.whiten.every]
+    residual, rows = pair.real - model, pair.held_out[:: log.whiten.every]
     if log.whiten.band is not None:
-        left = log.whiten.band(left)
-    return np.asarray(left[rows, part].ravel() if counts is None else left[rows, part][counts[rows, part]])
+        residual = log.whiten.band(residual)
+    return np.asarray(residual[rows, part].ravel() if counts is None else residual[rows, part][counts[rows, part]])
 
 
 def gains(logs: Sequence[WhitenedImu], before: Sequence[np.ndarray], after: Sequence[np.ndarray]) -> dict[str, Closer]:
@@ -71,50 +68,57 @@ def sensor_noise(logs: Sequence[WhitenedImu], floor: Float64[np.ndarray, "6"], k
 
 
 def held_out_rms(
-    logs: Sequence[WhitenedImu], before: Sequence[np.ndarray], after: Sequence[np.ndarray], k: int, unit_: str
+    logs: Sequence[WhitenedImu], before: Sequence[np.ndarray], after: Sequence[np.ndarray], k: int, unit: str
 ) -> HeldOut:
     """Root mean square residuals over held-out samples of a sensor; NaN where none are usable."""
     part = slice(3 * k, 3 * k + 3)
     rms = []
-    for those in (before, after):
-        left = np.concatenate([_residual(log, there, part) for log, there in zip(logs, those, strict=True)])
-        rms.append(float(np.sqrt((left**2).mean())) if len(left) else float("nan"))
+    for models in (before, after):
+        residual = np.concatenate([_residual(log, model, part) for log, model in zip(logs, models, strict=True)])
+        rms.append(float(np.sqrt((residual**2).mean())) if len(residual) else float("nan"))
     length = sum(float(log.pair.held_out.sum()) * log.pair.period_s for log in logs)
-    return HeldOut(rms[0], rms[1], unit_, round(length, 1))
+    return HeldOut(rms[0], rms[1], unit, round(length, 1))
 
 
 def unexplained_residuals(
-    logs: Sequence[WhitenedImu], after: Sequence[Float64[np.ndarray, "n 6"]], noises: Float64[np.ndarray, "6"]
+    logs: Sequence[WhitenedImu],
+    after: Sequence[Float64[np.ndarray, "n 6"]],
+    noises: Float64[np.ndarray, "6"],
+    settings: HeldOutSettings,
 ) -> dict[str, Unexplained]:
-    """Residuals by sensor with their noise; against poses, whose errors vary, whiteness is tested by blocks."""
+    """Residuals by sensor with their noise; beside poses, blocks decide on whiteness."""
     out, beside_poses = {}, any(log.whiten.band is not None for log in logs)
     for signal, k in known_sensors([log.pair for log in logs]).items():
-        held, noise = held_out_rms(logs, after, after, k, ASCII_UNITS[signal]), sensor_noise(logs, noises, k)
+        held_out, noise = held_out_rms(logs, after, after, k, ASCII_UNITS[signal]), sensor_noise(logs, noises, k)
         part = slice(3 * k, 3 * k + 3)
-        unseen = sum(len(_residual(log, there, part)) for log, there in zip(logs, after, strict=True))
-        seen = sum(log.count("fitted") for log in logs) / 2.0  # of both sensors
-        most = max(WHITE, float(np.sqrt(fisher.isf(BY_CHANCE, unseen, max(seen, 1.0))))) if unseen else WHITE
-        white = held.rms_after < most * noise
+        held_out_count = sum(len(_residual(log, model, part)) for log, model in zip(logs, after, strict=True))
+        fitted_count = sum(log.count("fitted") for log in logs) / 2.0  # of both sensors
+        most = settings.white_ratio
+        if held_out_count:
+            most = max(most, float(np.sqrt(fisher.isf(settings.few_samples_p_value, held_out_count, max(fitted_count, 1.0)))))
+        white = held_out.rms_after < most * noise
         if not white and beside_poses:
-            white = _p_value(logs, after, k, noise) > DOUBTED
-        out[signal] = Unexplained(held.rms_after, noise, white)
+            white = _p_value(logs, after, k, noise, settings) > settings.white_p_value
+        out[signal] = Unexplained(held_out.rms_after, noise, white)
     return out
 
 
-def _p_value(logs: Sequence[WhitenedImu], after: Sequence[Float64[np.ndarray, "n 6"]], k: int, noise: float) -> float:
+def _p_value(
+    logs: Sequence[WhitenedImu], after: Sequence[Float64[np.ndarray, "n 6"]], k: int, noise: float, settings: HeldOutSettings
+) -> float:
     """p-value of the power of held-out blocks under white noise (Student's t over blocks)."""
     powers: list[float] = []
-    for log, there in zip(logs, after, strict=True):
+    for log, model in zip(logs, after, strict=True):
         if not log.pair.axes[3 * k : 3 * k + 3].any():
             continue
         rows = log.pair.held_out[:: log.whiten.every]
-        left = log.pair.real - there if log.whiten.band is None else log.whiten.band(log.pair.real - there)
-        power = (left[rows, 3 * k : 3 * k + 3][:, log.pair.axes[3 * k : 3 * k + 3]] ** 2).mean(axis=1)
-        block = np.floor(log.pair.stamp_s[:: log.whiten.every][rows] / BLOCK_S).astype(int)
-        powers += [float(power[block == one].mean()) for one in np.unique(block)]
+        residual = log.pair.real - model if log.whiten.band is None else log.whiten.band(log.pair.real - model)
+        power = (residual[rows, 3 * k : 3 * k + 3][:, log.pair.axes[3 * k : 3 * k + 3]] ** 2).mean(axis=1)
+        block = np.floor(log.pair.stamp_s[:: log.whiten.every][rows] / settings.block_s).astype(int)
+        powers += [float(power[block == number].mean()) for number in np.unique(block)]
     if len(powers) < 2:
         return 1.0
-    return float(ttest_1samp(powers, (WHITE * noise) ** 2, alternative="greater").pvalue)
+    return float(ttest_1samp(powers, (settings.white_ratio * noise) ** 2, alternative="greater").pvalue)
 
 
 def known_sensors(pairs: Sequence[Pair]) -> dict[str, int]:

@@ -1,4 +1,4 @@
-"""Localization of a misfit: axes of a signal, intervals of time, and the regime of the motion.
+"""Localization of a misfit: axes of a signal, intervals, and the regime of the motion.
 
 The misfit that the findings explain is known almost without noise, so the location is read from it: a second counts when the
 misfit in it would stand out of the noise by itself. The regime is the variable, with a threshold, that best separates the
@@ -17,16 +17,9 @@ from scipy.ndimage import uniform_filter1d
 from scipy.stats import chi2, mannwhitneyu
 
 from imutool.diagnosis.estimation.aligned_log import Pair
-from imutool.diagnosis.result import Finding, Located
+from imutool.diagnosis.result import ALWAYS, NO_REGIME, Finding, Located
+from imutool.diagnosis.settings import LocalizationSettings
 from imutool.units import AXES, SENSORS
-
-WINDOW_S = 1.0
-CLEAR = 12.0  # squares of misfit over noise by which a second, or an axis, stands out of it
-AXIS_SHARE = 0.02  # of the strongest axis' squares, below which an axis is not named
-JOIN_S = 1.5  # intervals closer than this are joined
-LEAST_YOUDEN = 0.35  # Youden's index from which a regime is named
-CHANCE = 1e-3
-MEAN_SAMPLES = 9  # of a running mean
 
 Samples = Float64[np.ndarray, "_ 6"]
 Variables = Mapping[str, tuple[str, Float64[np.ndarray, " n"]]]
@@ -39,40 +32,51 @@ def locate_findings(
     floor: Float64[np.ndarray, "6"],
     findings: Sequence[Finding],
     p_values: Mapping[str, float],
+    settings: LocalizationSettings,
 ) -> list[Located]:
-    """Locations where the findings change the expected samples: `after` minus `before` of each pair."""
+    """Locations where the findings change the expected samples (`after` minus `before`)."""
     misfits = [_converter_output(a, findings) - b for a, b in zip(after, before, strict=True)]
-    return _locate_logs(pairs, misfits, floor, p_values)
+    return _locate_logs(pairs, misfits, floor, p_values, settings)
 
 
-def locate_residual(pairs: Sequence[Pair], after: Sequence[Samples], floor: Float64[np.ndarray, "6"]) -> list[Located]:
+def locate_residual(
+    pairs: Sequence[Pair], after: Sequence[Samples], floor: Float64[np.ndarray, "6"], settings: LocalizationSettings
+) -> list[Located]:
     """Locations of an unexplained residual: running means that stand out of the noise."""
-    means = [np.asarray(uniform_filter1d(pair.real - a, MEAN_SAMPLES, axis=0)) for pair, a in zip(pairs, after, strict=True)]
-    return _locate_logs(pairs, means, floor / np.sqrt(MEAN_SAMPLES), {})
+    count = settings.mean_samples
+    means = [np.asarray(uniform_filter1d(pair.real - a, count, axis=0)) for pair, a in zip(pairs, after, strict=True)]
+    return _locate_logs(pairs, means, floor / np.sqrt(count), {}, settings)
 
 
 def _locate_logs(
-    pairs: Sequence[Pair], misfits: Sequence[Samples], floor: Float64[np.ndarray, "6"], p_values: Mapping[str, float]
+    pairs: Sequence[Pair],
+    misfits: Sequence[Samples],
+    floor: Float64[np.ndarray, "6"],
+    p_values: Mapping[str, float],
+    settings: LocalizationSettings,
 ) -> list[Located]:
     """Strongest first, log by log: `log` is the pair's name where there are several."""
     logs = list(dict.fromkeys(pair.name for pair in pairs))
     out = []
     for log in logs:
         segments = [(pair, misfit) for pair, misfit in zip(pairs, misfits, strict=True) if pair.name == log]
-        located = _locate_log(segments, floor, p_values)
+        located = _locate_log(segments, floor, p_values, settings)
         out += [msgspec.structs.replace(place, log=log) if len(logs) > 1 else place for place in located]
     return sorted(out, key=lambda place: place.p_value)
 
 
 def _locate_log(
-    segments: Sequence[tuple[Pair, Samples]], floor: Float64[np.ndarray, "6"], p_values: Mapping[str, float]
+    segments: Sequence[tuple[Pair, Samples]],
+    floor: Float64[np.ndarray, "6"],
+    p_values: Mapping[str, float],
+    settings: LocalizationSettings,
 ) -> list[Located]:
     """Segments of one log share its clock; each has its own constant."""
     t_s = np.concatenate([pair.stamp_s for pair, _ in segments])
     misfit = np.concatenate([misfit - np.median(misfit, axis=0) for _, misfit in segments])
     each = [_variables(pair) for pair, _ in segments]
     variables = {name: (unit, np.concatenate([own[name][1] for own in each])) for name, (unit, _) in each[0].items()}
-    return locate(t_s, misfit, floor, variables, p_values)
+    return locate(t_s, misfit, floor, variables, p_values, settings)
 
 
 def _converter_output(samples: Float64[np.ndarray, "n 6"], findings: Sequence[Finding]) -> Float64[np.ndarray, "n 6"]:
@@ -90,7 +94,7 @@ def _converter_output(samples: Float64[np.ndarray, "n 6"], findings: Sequence[Fi
 
 def _variables(pair: Pair) -> Variables:
     """Variables of a regime at the samples, with their units."""
-    read = pair.felt.sample(pair.stamp_s, pair.stamp_s)
+    read = pair.ideal.sample(pair.stamp_s, pair.stamp_s)
     rate, force = np.linalg.norm(read.gyro, axis=1), np.linalg.norm(read.accel, axis=1)
     out = {
         "angular rate": ("rad/s", rate),
@@ -112,8 +116,9 @@ def locate(
     noise: Float64[np.ndarray, "6"],
     variables: Variables,
     p_values: Mapping[str, float],
+    settings: LocalizationSettings | None = None,
 ) -> list[Located]:
-    """Location of a misfit by sensor, strongest first; samples may be of several segments of one log.
+    """Locations of a misfit by sensor, strongest first; samples may span several segments.
 
     Args:
         t_s: stamps of the samples.
@@ -121,17 +126,19 @@ def locate(
         noise: standard deviation of a sample, by column.
         variables: what a regime can be of, by name, with unit and values at the samples.
         p_values: of the findings by sensor; one that is too small for any single second to show it lies everywhere.
+        settings: those of a diagnosis by default.
     """
+    settings = settings or LocalizationSettings()
     found = []
     scaled = (misfit - np.median(misfit, axis=0)) / noise
-    seconds, window = np.unique(np.floor((t_s - t_s[0]) / WINDOW_S), return_inverse=True)
+    seconds, window = np.unique(np.floor((t_s - t_s[0]) / settings.window_s), return_inverse=True)
     for k, sensor in enumerate(SENSORS):
         part = scaled[:, 3 * k : 3 * k + 3] ** 2
         axes_power = part.sum(axis=0)
-        axes = [a for a in range(3) if axes_power[a] > max(CLEAR, AXIS_SHARE * axes_power.max())]
+        axes = [a for a in range(3) if axes_power[a] > max(settings.clear_squares, settings.axis_share * axes_power.max())]
         power = np.bincount(window, weights=part.sum(axis=1))
-        inside = power > CLEAR
-        if axes and not inside.any() and p_values.get(sensor, 1.0) < CHANCE:
+        inside = power > settings.clear_squares
+        if axes and not inside.any() and p_values.get(sensor, 1.0) < settings.p_value:
             inside = np.ones(len(power), bool)
         if not axes or not inside.any():
             continue
@@ -139,8 +146,8 @@ def locate(
             Located(
                 sensor,
                 tuple(AXES[a] for a in axes),
-                tuple(intervals(float(t_s[0]) + WINDOW_S * seconds[inside])),
-                regime(inside, power, window, variables),
+                tuple(intervals(float(t_s[0]) + settings.window_s * seconds[inside], settings)),
+                regime(inside, power, window, variables, settings),
                 float(power[inside].sum() / max(power.sum(), 1e-300)),
                 p_values.get(sensor, float(chi2.sf(axes_power.sum(), 3))),
             )
@@ -148,22 +155,28 @@ def locate(
     return sorted(found, key=lambda place: place.p_value)
 
 
-def intervals(begins_s: Float64[np.ndarray, " w"]) -> list[tuple[float, float]]:
+def intervals(begins_s: Float64[np.ndarray, " w"], settings: LocalizationSettings) -> list[tuple[float, float]]:
     """Intervals of windows, by where each begins; neighbours are joined."""
     out: list[tuple[float, float]] = []
     for begin in begins_s.tolist():
-        if out and begin - out[-1][1] < JOIN_S - WINDOW_S:
-            out[-1] = out[-1][0], begin + WINDOW_S
+        if out and begin - out[-1][1] < settings.join_s - settings.window_s:
+            out[-1] = out[-1][0], begin + settings.window_s
         else:
-            out.append((begin, begin + WINDOW_S))
+            out.append((begin, begin + settings.window_s))
     return out
 
 
-def regime(inside: Bool[np.ndarray, " w"], power: Float64[np.ndarray, " w"], window: np.ndarray, variables: Variables) -> str:
+def regime(
+    inside: Bool[np.ndarray, " w"],
+    power: Float64[np.ndarray, " w"],
+    window: np.ndarray,
+    variables: Variables,
+    settings: LocalizationSettings,
+) -> str:
     """Regime in words: "angular rate above 0.4 rad/s", or "always"."""
     high = inside if not inside.all() else power > np.median(power)
     if high.all() or not high.any():
-        return "always"
+        return ALWAYS
     counts = np.maximum(np.bincount(window), 1)
     best: tuple[float, str] | None = None
     for name, (unit, values) in variables.items():
@@ -171,15 +184,15 @@ def regime(inside: Bool[np.ndarray, " w"], power: Float64[np.ndarray, " w"], win
         for sign, word in ((1.0, "above"), (-1.0, "below")):
             index, threshold = _youden(sign * level, high)
             p = float(mannwhitneyu(sign * level[high], sign * level[~high], alternative="greater").pvalue) * 2 * len(variables)
-            if p < CHANCE and index > LEAST_YOUDEN and (best is None or index > best[0]):
+            if p < settings.p_value and index > settings.least_youden and (best is None or index > best[0]):
                 best = index, f"{name} {word} {sign * threshold:.2g} {unit}".strip()
     if best is None:
-        return "no regime: it comes and goes" if not inside.all() else "always"
-    return best[1] if not inside.all() else f"always, most with {best[1]}"
+        return f"{NO_REGIME}: it comes and goes" if not inside.all() else ALWAYS
+    return best[1] if not inside.all() else f"{ALWAYS}, most with {best[1]}"
 
 
 def _youden(level: Float64[np.ndarray, " w"], high: Sequence[bool] | Bool[np.ndarray, " w"]) -> tuple[float, float]:
-    """Youden's index of the best threshold between high windows and the others, and that threshold."""
+    """Youden's index of the best threshold between high windows and others, and the threshold."""
     order = np.argsort(level)
     flags = np.asarray(high)[order]
     above_high = 1.0 - np.cumsum(flags) / max(flags.sum(), 1)

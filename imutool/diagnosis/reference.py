@@ -19,25 +19,17 @@ from imutool.diagnosis.estimation.alignment import LEAST_S, same_motion, with_si
 from imutool.diagnosis.estimation.jacobians import expected
 from imutool.diagnosis.estimation.whitening import WhitenedImu
 from imutool.diagnosis.reference_free_checks import unusable_axes
-from imutool.diagnosis.result import Estimate, Finding, HeldOut, Located
+from imutool.diagnosis.result import NO_REGIME, Estimate, Finding, HeldOut, Located
+from imutool.diagnosis.settings import ReferenceSettings
 from imutool.errors import DataError, ImutoolError, NumericsError
 from imutool.recording import Recording
 from imutool.sensor.trajectory import smooth_motion
 from imutool.units import ASCII_UNITS, AXES, SENSORS
 
-LEAST_BAND_HZ = 1.0  # at least: smoothing does not change a motion at rest
-KNOWN_BAND = 0.45  # of the frequency at which smoothing halves a motion: there it takes one per cent
-MOST_OF_IT = 0.9  # of a recording: less coverage gives a remark
-LEAST_KNOWN_S = 2.0  # of unclipped samples of an axis, both to fit and to test it
-BLOCK_S = 0.25
-STANDS_OUT = 1e-7  # chance of a block of noise
-MOST_OF_TIME = 0.15
-MOST_RUNS, LONGEST_S = 8, 4.0
-QUIET = 1.1  # squares left a row outside
-JOIN_S = 0.6
 
-
-def align_all(recordings: Sequence[Recording], sim: Recording | None, truth: str | None) -> tuple[list[Pair], list[str]]:
+def align_all(
+    recordings: Sequence[Recording], sim: Recording | None, truth: str | None, settings: ReferenceSettings
+) -> tuple[list[Pair], list[str]]:
     """Recordings aligned with their references, and remarks on what is left out.
 
     Raises:
@@ -45,53 +37,53 @@ def align_all(recordings: Sequence[Recording], sim: Recording | None, truth: str
     """
     pairs: list[Pair] = []
     refused: list[ImutoolError] = []
-    said: list[str] = []
+    remarks: list[str] = []
     for recording in recordings:
         try:
-            here = list(align(recording, sim, truth))
+            aligned = list(align(recording, sim, truth, settings))
         except (DataError, NumericsError) as error:
             if sim is not None or not recording.truths:
                 raise
             refused.append(error.at(recording.name))
             continue
-        pairs += [without_unusable(pair) for pair in here]
-        covered = sum(float(pair.stamp_s[-1] - pair.stamp_s[0]) for pair in here)
-        if covered < MOST_OF_IT * recording.imu.duration_s:
+        pairs += [without_unusable(pair, settings) for pair in aligned]
+        covered = sum(float(pair.stamp_s[-1] - pair.stamp_s[0]) for pair in aligned)
+        if covered < settings.covered_share * recording.imu.duration_s:
             what = "its true poses cover" if sim is None else "the simulation covers"
-            said.append(
+            remarks.append(
                 f"{recording.name}: {what} {covered:.0f} of {recording.imu.duration_s:.0f} s; the rest was not looked at"
             )
     if refused and not pairs and len(recordings) > 1:
         raise refused[0]
-    return pairs, said + [f"left out, {error}" if pairs else str(error) for error in refused]
+    return pairs, remarks + [f"left out, {error}" if pairs else str(error) for error in refused]
 
 
 def with_unique_names(recordings: Sequence[Recording]) -> list[Recording]:
     """Recordings with unique names: logs of several folders may have the same."""
     out: list[Recording] = []
-    for one in recordings:
-        name, number, taken = one.name, 2, {other.name for other in out}
+    for recording in recordings:
+        name, number, taken = recording.name, 2, {other.name for other in out}
         while name in taken:
-            name, number = f"{one.name} ({number})", number + 1
-        out.append(one if name == one.name else replace(one, name=name))
+            name, number = f"{recording.name} ({number})", number + 1
+        out.append(recording if name == recording.name else replace(recording, name=name))
     return out
 
 
 def is_another_motion(reals: Sequence[Recording], sim: Recording, signals: Sequence[str]) -> bool:
-    """Whether the simulation is of another motion than every recording, which all have true poses.
+    """Whether the simulation is of another motion than every recording with true poses.
 
     Raises:
         DataError: it is of the motion of some only, or other signals are to be compared with it.
     """
-    of_one = [same_motion(real.imu, sim.imu) for real in reals]
-    if all(of_one) or not all(real.truths for real in reals):
+    alike = [same_motion(real.imu, sim.imu) for real in reals]
+    if all(alike) or not all(real.truths for real in reals):
         return False
-    if any(of_one):
+    if any(alike):
         raise DataError(
             "the simulation is of the same motion as some recordings only",
             where=sim.name,
             expected="one motion, or as many as logs",
-            fix=f"Diagnose separately: {', '.join(real.name for real, same in zip(reals, of_one, strict=True) if same)}",
+            fix=f"Diagnose separately: {', '.join(real.name for real, same in zip(reals, alike, strict=True) if same)}",
         )
     if signals:
         raise DataError(
@@ -100,7 +92,7 @@ def is_another_motion(reals: Sequence[Recording], sim: Recording, signals: Seque
     return True
 
 
-def align(real: Recording, sim: Recording | None, truth: str | None) -> Iterator[Pair]:
+def align(real: Recording, sim: Recording | None, truth: str | None, settings: ReferenceSettings) -> Iterator[Pair]:
     """The recording aligned with the simulation, or each interval of it with its own poses."""
     if sim is not None:
         yield with_simulation(real, sim)
@@ -109,7 +101,7 @@ def align(real: Recording, sim: Recording | None, truth: str | None) -> Iterator
         raise DataError("no simulation and no true poses", where=real.name, expected="`sim`, or poses in the log")
     chosen = real if truth is not None else real.with_truth(next(iter(real.truths)))
     motion = smooth_motion(chosen.truth)
-    parts = [felt for felt in motion.ideal_motions(1.0 / real.imu.period_s) if felt.t_s[-1] - felt.t_s[0] >= LEAST_S]
+    parts = [ideal for ideal in motion.ideal_motions(1.0 / real.imu.period_s) if ideal.t_s[-1] - ideal.t_s[0] >= LEAST_S]
     if not parts:
         raise DataError(
             f"the true poses have no stretch of {LEAST_S:g} s that can be differentiated",
@@ -117,14 +109,14 @@ def align(real: Recording, sim: Recording | None, truth: str | None) -> Iterator
             expected="poses at 40 Hz or more, without holes",
             fix="Give a simulation with `sim`",
         )
-    for felt in parts:
-        stretch = next(one for one in motion.stretches if one.start_s <= felt.t_s[0] <= one.end_s)
+    for ideal in parts:
+        stretch = next(one for one in motion.stretches if one.start_s <= ideal.t_s[0] <= one.end_s)
         started_ns = int(chosen.imu.t_ns[0])  # times are told from the log's start, also where its poses begin later
-        since = replace(felt, t_s=felt.t_s + (motion.start_ns - started_ns) * 1e-9)
-        yield with_truth(chosen, since, started_ns, max(KNOWN_BAND * min(stretch.cutoff_hz), LEAST_BAND_HZ))
+        since = replace(ideal, t_s=ideal.t_s + (motion.start_ns - started_ns) * 1e-9)
+        yield with_truth(chosen, since, started_ns, max(settings.band_share * min(stretch.cutoff_hz), settings.least_band_hz))
 
 
-def without_unusable(pair: Pair) -> Pair:
+def without_unusable(pair: Pair, settings: ReferenceSettings) -> Pair:
     """Pair without clipped samples, and without axes that are stuck or nearly always clipped.
 
     Raises:
@@ -133,77 +125,85 @@ def without_unusable(pair: Pair) -> Pair:
     known = ~(timestamps.clipped(pair.real) | timestamps.stuck(pair.real))
     if known.all():
         return pair
-    rest = replace(pair, known=known)
+    reduced = replace(pair, known=known)
     for part in (pair.fitted, pair.held_out):
-        known &= (known[part].sum(axis=0) * pair.period_s >= LEAST_KNOWN_S) | (known[part].all(axis=0))
+        known &= (known[part].sum(axis=0) * pair.period_s >= settings.least_known_s) | (known[part].all(axis=0))
     if not known.any():
         raise DataError(
-            "; ".join(unusable_axes(rest)),
+            "; ".join(unusable_axes(reduced)),
             where=pair.name,
-            expected=f"{LEAST_KNOWN_S:g} s or more of an axis that moves within its range",
+            expected=f"{settings.least_known_s:g} s or more of an axis that moves within its range",
             fix="Record with a sensor that works, of a wider range or of finer digits",
         )
-    return rest
+    return reduced
 
 
-def reference_errors(logs: Sequence[WhitenedImu]) -> tuple[list[Finding], list[Located]]:
-    """Intervals of a wrong reference, as a finding and their locations; nothing for any other misfit."""
+def reference_errors(logs: Sequence[WhitenedImu], settings: ReferenceSettings) -> tuple[list[Finding], list[Located]]:
+    """Intervals of a wrong reference, as a finding and locations; none for another misfit."""
     if len(logs) != 1:
         return [], []
-    (log,) = logs
+    (log,), block_s, p_value = logs, settings.block_s, settings.p_value
     rows = log.rows("all")
     if not rows.any():
         return [], []
     t_s = log.pair.stamp_s[:: log.whiten.every][rows]
     white = log.whiten(log.pair.real - expected(log.pair, ()))[rows]
-    one = log.constants[rows]
-    white = white - np.median(white / np.where(one == 0, 1.0, one), axis=0) * one  # a mean would carry the moments' own misfit
-    block = np.floor((t_s - t_s[0]) / BLOCK_S).astype(int)
+    constant = log.constants[rows]
+    white = (
+        white - np.median(white / np.where(constant == 0, 1.0, constant), axis=0) * constant
+    )  # a mean would carry the misfit
+    block = np.floor((t_s - t_s[0]) / block_s).astype(int)
     count = np.maximum(np.bincount(block), 1)
     power = np.stack([np.bincount(block, weights=(white[:, k : k + 3] ** 2).sum(axis=1)) for k in (0, 3)])
-    loud = chi2.logsf(power, 3 * count) < np.log(STANDS_OUT)
-    runs = _runs(loud.any(axis=0), float(t_s[0]))
+    loud = chi2.logsf(power, 3 * count) < np.log(p_value)
+    runs = _runs(loud.any(axis=0), float(t_s[0]), settings)
     inside = (
-        np.any([(t_s >= a - BLOCK_S) & (t_s <= b + BLOCK_S) for a, b in runs], axis=0) if runs else np.zeros(len(t_s), bool)
+        np.any([(t_s >= a - block_s) & (t_s <= b + block_s) for a, b in runs], axis=0) if runs else np.zeros(len(t_s), bool)
     )
     outside = white[~inside]
-    at = t_s[0] + BLOCK_S * np.arange(len(count))
-    both = all(loud[:, (at >= a - 1e-6) & (at < b)].any(axis=1).all() and b - a <= LONGEST_S for a, b in runs)
-    if not runs or not both or len(runs) > MOST_RUNS or inside.mean() > MOST_OF_TIME or (outside**2).mean() > QUIET:
+    at = t_s[0] + block_s * np.arange(len(count))
+    both = all(loud[:, (at >= a - 1e-6) & (at < b)].any(axis=1).all() and b - a <= settings.longest_s for a, b in runs)
+    few = len(runs) <= settings.most_intervals and inside.mean() <= settings.most_of_time
+    if not runs or not both or not few or (outside**2).mean() > settings.quiet_chi_square:
         return [], []
     length = float(np.mean([b - a for a, b in runs]))
-    parameters = {"length": Estimate(length, BLOCK_S / np.sqrt(6.0 * len(runs)) + 0.1 * length, "s")}
-    parameters |= {f"t_{k}": Estimate(a, BLOCK_S, "s") for k, (a, _) in enumerate(runs)}
+    parameters = {"length": Estimate(length, block_s / np.sqrt(6.0 * len(runs)) + 0.1 * length, "s")}
+    parameters |= {f"t_{k}": Estimate(a, block_s, "s") for k, (a, _) in enumerate(runs)}
     excess = (white[inside] ** 2).sum() - 6.0 * inside.sum()
     share = float(np.clip(excess / max(float((white**2).sum() - 6.0 * len(white)), 1e-300), 0.0, 1.0))
-    left = log.pair.real - expected(log.pair, ())
-    left = left - np.median(left, axis=0)
-    unseen = log.pair.held_out
+    residual = log.pair.real - expected(log.pair, ())
+    residual = residual - np.median(residual, axis=0)
+    held_rows = log.pair.held_out
     t_all = log.pair.stamp_s
-    away = unseen & ~np.any([(t_all >= a - BLOCK_S) & (t_all <= b + BLOCK_S) for a, b in runs], axis=0)
-    before, after = (float(np.sqrt((left[mask, 3:] ** 2).mean())) for mask in (unseen, away))
-    held = HeldOut(before, after, ASCII_UNITS["accel"], round(float(unseen.sum()) * log.pair.period_s, 1))
-    finding = Finding(
-        "reference_error", "both", share, STANDS_OUT, STANDS_OUT, parameters, "the reference is wrong there", held
-    )
-    return [finding], [_where(signal, white[:, 3 * k : 3 * k + 3], inside, runs, share) for k, signal in enumerate(SENSORS)]
+    away = held_rows & ~np.any([(t_all >= a - block_s) & (t_all <= b + block_s) for a, b in runs], axis=0)
+    before, after = (float(np.sqrt((residual[mask, 3:] ** 2).mean())) for mask in (held_rows, away))
+    held_out = HeldOut(before, after, ASCII_UNITS["accel"], round(float(held_rows.sum()) * log.pair.period_s, 1))
+    finding = Finding("reference_error", "both", share, p_value, p_value, parameters, "the reference is wrong there", held_out)
+    return [finding], [
+        _where(signal, white[:, 3 * k : 3 * k + 3], inside, runs, share, p_value) for k, signal in enumerate(SENSORS)
+    ]
 
 
 def _where(
-    signal: str, white: Float64[np.ndarray, "n 3"], inside: np.ndarray, runs: list[tuple[float, float]], share: float
+    signal: str,
+    white: Float64[np.ndarray, "n 3"],
+    inside: np.ndarray,
+    runs: list[tuple[float, float]],
+    share: float,
+    p_value: float,
 ) -> Located:
     power = (white[inside] ** 2).mean(axis=0)
     axes = tuple(axis for axis, value in zip(AXES, power, strict=True) if value > 1.3)
-    return Located(signal, axes or AXES, tuple(runs), "no regime: the reference's own moments", share, STANDS_OUT)
+    return Located(signal, axes or AXES, tuple(runs), f"{NO_REGIME}: the reference's own moments", share, p_value)
 
 
-def _runs(loud: np.ndarray, start_s: float) -> list[tuple[float, float]]:
+def _runs(loud: np.ndarray, start_s: float, settings: ReferenceSettings) -> list[tuple[float, float]]:
     """Stretches of loud blocks (s), those close to one another joined."""
     edges = np.diff(np.concatenate([[0], loud.astype(int), [0]]))
     out: list[tuple[float, float]] = []
     for first, last in zip(np.flatnonzero(edges == 1), np.flatnonzero(edges == -1), strict=True):
-        begin, end = start_s + float(first) * BLOCK_S, start_s + float(last) * BLOCK_S
-        if out and begin - out[-1][1] < JOIN_S:
+        begin, end = start_s + float(first) * settings.block_s, start_s + float(last) * settings.block_s
+        if out and begin - out[-1][1] < settings.join_s:
             out[-1] = out[-1][0], end
         else:
             out.append((begin, end))

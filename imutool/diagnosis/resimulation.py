@@ -1,4 +1,4 @@
-"""The simulation once more, with the physics that was found: how much closer to the recording it comes.
+"""Resimulation with the physics that was found: how much closer to the recording it comes.
 
 Nothing of the search is used but its answer, as physics.toml says it, fitted without the time that it is compared on. The
 simulation's own poses become a smooth motion as `imutool simulate` makes it, the effects act on that, and samples are taken at
@@ -32,7 +32,7 @@ MOST_OF_IT = 0.8  # of the held-out samples that the poses have to cover
 
 
 def resimulate(logs: Sequence[WhitenedImu], sim: Recording, physics: PhysicsFile) -> Mapping[str, Closer]:
-    """By signal, the misfit of the simulation as it was given and as it is with some physics, on held-out time.
+    """Gain of a second simulation with some physics by signal, on held-out time.
 
     Raises:
         DataError: the simulation has no poses that stand for its samples, or they cover too little of a log.
@@ -42,44 +42,46 @@ def resimulate(logs: Sequence[WhitenedImu], sim: Recording, physics: PhysicsFile
         raise DataError("it has no poses", where=sim.name, expected="poses to simulate along")
     motion = smooth_motion(sim.truth)
     rate_hz = 1.0 / sim.imu.period_s
-    felts = motion.ideal_motions(rate_hz * max(1, int(np.ceil(MOTION_HZ / rate_hz))))
+    ideals = motion.ideal_motions(rate_hz * max(1, int(np.ceil(MOTION_HZ / rate_hz))))
     acting = physics.acting()
-    there, before, after = [], [], []
+    covered, before, after = [], [], []
     for log in logs:
-        on_its_clock = [_felt(one, motion.start_ns, log.pair) for one in felts]
-        plain, found = (_read(log.pair, on_its_clock, some) for some in ((), acting))
-        good = np.isfinite(plain).all(axis=1) & np.isfinite(found).all(axis=1)
-        pair = replace(log.pair, fitted=log.pair.fitted & good, held_out=log.pair.held_out & good)
+        on_its_clock = [_on_clock_of(one, motion.start_ns, log.pair) for one in ideals]
+        plain, simulated = (_read(log.pair, on_its_clock, effects) for effects in ((), acting))
+        finite = np.isfinite(plain).all(axis=1) & np.isfinite(simulated).all(axis=1)
+        pair = replace(log.pair, fitted=log.pair.fitted & finite, held_out=log.pair.held_out & finite)
         if pair.held_out.sum() < MOST_OF_IT * log.pair.held_out.sum():
             raise DataError("its poses cover too little of the recording", where=sim.name)
-        there.append(WhitenedImu(pair, log.whiten))
+        covered.append(WhitenedImu(pair, log.whiten))
         before.append(with_constant(pair, expected(pair, ())))
-        after.append(with_constant(pair, found))
-        _refuse_unlike(there[-1], before[-1], with_constant(pair, plain), sim)
-    return {signal: msgspec.structs.replace(one, by="second simulation") for signal, one in gains(there, before, after).items()}
+        after.append(with_constant(pair, simulated))
+        _refuse_unlike(covered[-1], before[-1], with_constant(pair, plain), sim)
+    return {
+        signal: msgspec.structs.replace(one, by="second simulation") for signal, one in gains(covered, before, after).items()
+    }
 
 
-def _felt(felt: IdealMotion, start_ns: int, pair: Pair) -> IdealMotion:
+def _on_clock_of(ideal: IdealMotion, start_ns: int, pair: Pair) -> IdealMotion:
     """On the recording's clock, with its channels."""
     first_ns = pair.start_ns - round(float(pair.stamp_s[0]) * 1e9)
-    t_s = felt.t_s + (start_ns - first_ns) * 1e-9 - pair.aligned_s
-    channels = {name: np.interp(t_s, pair.felt.t_s, values) for name, values in pair.felt.channels.items()}
-    return replace(felt, t_s=t_s, channels=channels)
+    t_s = ideal.t_s + (start_ns - first_ns) * 1e-9 - pair.aligned_s
+    channels = {name: np.interp(t_s, pair.ideal.t_s, values) for name, values in pair.ideal.channels.items()}
+    return replace(ideal, t_s=t_s, channels=channels)
 
 
-def _read(pair: Pair, felts: Sequence[IdealMotion], acting: Acting) -> Float64[np.ndarray, "n 6"]:
+def _read(pair: Pair, ideals: Sequence[IdealMotion], acting: Acting) -> Float64[np.ndarray, "n 6"]:
     """What the second simulation reads at the recording's stamps; NaN where it has no motion."""
-    stamps = [pair.stamp_s[(pair.stamp_s >= one.t_s[0]) & (pair.stamp_s <= one.t_s[-1])] for one in felts]
-    got = simulate_stretches(felts, stamps, acting)
+    stamps = [pair.stamp_s[(pair.stamp_s >= one.t_s[0]) & (pair.stamp_s <= one.t_s[-1])] for one in ideals]
+    samples = simulate_stretches(ideals, stamps, acting)
     out = np.full(pair.real.shape, np.nan)
-    out[np.searchsorted(pair.stamp_s, got.stamp_s)] = np.concatenate([got.gyro, got.accel], axis=1)
+    out[np.searchsorted(pair.stamp_s, samples.stamp_s)] = np.concatenate([samples.gyro, samples.accel], axis=1)
     return out
 
 
 def _refuse_unlike(
     log: WhitenedImu, given: Float64[np.ndarray, "n 6"], plain: Float64[np.ndarray, "n 6"], sim: Recording
 ) -> None:
-    """Poses that are too coarse or too noisy give another simulation than the one that was given, whatever the physics.
+    """Refuse poses so coarse or noisy that they give another simulation than the given one.
 
     Raises:
         DataError: so it is here.

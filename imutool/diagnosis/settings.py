@@ -1,4 +1,4 @@
-"""Settings of a diagnosis: every number that was tuned, with its unit, its meaning and where it was chosen.
+"""Settings of a diagnosis: tuned numbers with unit, meaning and origin.
 
 `imutool diagnose --set search.false_discovery_rate=1e-3` sets one; `--config FILE.toml` several. The chosen values come from
 planted effects of the tests, from the blind cases, and from the 23 logs of EuRoC, TUM-VI and Fetch.
@@ -18,7 +18,10 @@ Count = Annotated[int, msgspec.Meta(ge=1)]
 
 
 class SearchSettings(Settings, frozen=True):
-    """The search for effects. Squares are of white residuals: their number is chi-square under H0."""
+    """Search for effects.
+
+    Squares are of white residuals: their number is chi-square under H0.
+    """
 
     false_discovery_rate: Share = 5e-3  # of all that was tried; none in 20 logs of noise alone
     held_out_p_value: Share = 0.05  # a finding has to improve held-out blocks at this level
@@ -50,7 +53,10 @@ class SearchSettings(Settings, frozen=True):
 
 
 class BandSettings(Settings, frozen=True):
-    """The band up to which poses know the motion: chosen on EuRoC and TUM-VI, where two references disagree above it."""
+    """Band up to which poses know the motion.
+
+    Chosen on EuRoC and TUM-VI, where two references disagree above it.
+    """
 
     segment_s: Positive = 4.0  # of the spectra
     diluted_share: Share = 0.04  # of the expectation that is its own error, from which on it is not known
@@ -59,8 +65,51 @@ class BandSettings(Settings, frozen=True):
     noisy_axis: Positive = 3.0  # over the middle axis of a sensor: a noisier one holds what has no name
 
 
+class ReferenceSettings(Settings, frozen=True):
+    """Coverage and errors of the reference.
+
+    Chosen on poses with planted gaps and on the real logs.
+    """
+
+    least_band_hz: Positive = 1.0  # of poses, at least: smoothing does not change a motion at rest
+    band_share: Share = 0.45  # of the frequency at which smoothing halves a motion: there it takes one per cent
+    covered_share: Share = 0.9  # of a recording: less coverage gives a remark
+    least_known_s: Positive = 2.0  # of unclipped samples of an axis, both to fit and to test it
+    block_s: Positive = 0.25  # of the search for intervals with a wrong reference
+    p_value: Share = 1e-7  # below which a block is no noise
+    most_of_time: Share = 0.15  # that such intervals may take; more is another misfit
+    most_intervals: Count = 8
+    longest_s: Positive = 4.0  # of one interval
+    quiet_chi_square: Positive = 1.1  # reduced: up to it all the rest is noise
+    join_s: Positive = 0.6  # intervals closer than this are joined
+
+
+class LocalizationSettings(Settings, frozen=True):
+    """Axes, intervals and regimes of a misfit: chosen on planted effects."""
+
+    window_s: Positive = 1.0  # of which an interval is made
+    clear_squares: Positive = 12.0  # of misfit over noise by which a window, or an axis, stands out
+    axis_share: Share = 0.02  # of the strongest axis' squares, below which an axis is not named
+    join_s: Positive = 1.5  # intervals closer than this are joined
+    least_youden: Share = 0.35  # Youden's index from which a regime is named
+    p_value: Share = 1e-3  # of a regime, and of a finding that no single window shows
+    mean_samples: Count = 9  # of the running mean of an unexplained residual
+
+
+class HeldOutSettings(Settings, frozen=True):
+    """Whiteness of held-out residuals: chosen on logs of noise alone."""
+
+    white_ratio: Positive = 1.15  # of residual and noise, up to which the residual is white
+    white_p_value: Share = 0.01  # below which a residual beside poses is not white
+    block_s: Positive = 3.0  # of held-out time for that test
+    few_samples_p_value: Share = 1e-3  # of a larger ratio, where few values are left
+
+
 class DiagnoseSettings(Settings, frozen=True):
     """All settings of `imutool diagnose`."""
 
     search: SearchSettings = SearchSettings()
     band: BandSettings = BandSettings()
+    reference: ReferenceSettings = ReferenceSettings()
+    localization: LocalizationSettings = LocalizationSettings()
+    held_out: HeldOutSettings = HeldOutSettings()

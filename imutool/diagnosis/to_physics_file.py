@@ -21,7 +21,7 @@ NO_EFFECT = frozenset({"dropped_samples", "timestamp_jitter", "reference_error"}
 
 
 def to_physics_file(d: Diagnosis) -> PhysicsFile:
-    """Physics file with the findings, and with the constant bias of the first log if it is known.
+    """Physics file with the findings, and the constant bias of the first log if known.
 
     The values of a curve are about its mean, which is added to the bias.
     """

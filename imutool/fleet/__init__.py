@@ -1,4 +1,4 @@
-"""Many logs, one task each: what to do (`task`, `work`), where (`sources`), on whom (`engine`), what is done (`journal`).
+"""Fleet: one command on many logs, one task each.
 
 source logs ─ sources.plan ─> Task[] ─ engine.run(work) ─> Result[] ─ journal ─> fleet.parquet, report
 """

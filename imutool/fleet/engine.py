@@ -1,4 +1,4 @@
-"""Workers on Ray: the cores of this machine or a cluster, one task for each log.
+"""Ray workers: the cores of this machine or a cluster, one task for each log.
 
 Only this file uses Ray. Without an address Ray is started for this run alone: on the loopback interface, with a token that is
 never written to a disk, without dashboard and usage statistics, in a temporary folder that is removed at the end.
@@ -45,7 +45,7 @@ _decode_result = msgspec.json.Decoder(Result).decode
 
 
 def _work(raw: bytes, model: bytes | None) -> bytes:
-    """`work` with task and result as bytes that any version of Python reads."""
+    """Run `work` with task and result as JSON bytes, which any version of Python reads."""
     return msgspec.json.encode(work(_decode(raw), model))
 
 
@@ -96,7 +96,7 @@ class Engine:
 
     @property
     def slots(self) -> int:
-        """Number of logs that can be worked on at once now; a cluster may grow."""
+        """Number of logs that can run at once now; a cluster may grow."""
         fits = 0
         for node in self._ray.nodes():
             if node["Alive"]:
@@ -107,7 +107,9 @@ class Engine:
     def run(
         self, tasks: Iterable[Task], tick: Callable[[int], None] = lambda running: None, model: bytes | None = None
     ) -> Generator[Result]:
-        """Yield results as tasks end; `tick` gets the number of tasks in flight, `model` goes to every worker.
+        """Yield results as tasks end; `tick` gets the number of running tasks.
+
+        Every worker gets `model`.
 
         The task of a worker that dies goes to another one, up to `retries` times.
 
@@ -219,7 +221,10 @@ class Engine:
 
 @contextmanager
 def _interrupts_kept() -> Iterator[Callable[[], None]]:
-    """Gives a function that raises KeyboardInterrupt once Ctrl-C has come: while Ray calls back, one would be lost in it."""
+    """Keep Ctrl-C: the function in the context raises KeyboardInterrupt once it has come.
+
+    While Ray calls back, Python would lose the exception.
+    """
     came: list[int] = []
 
     def refuse() -> None:

@@ -1,4 +1,4 @@
-"""Journal of a fleet, OUT/fleet.journal: an append-only file of JSON lines, each flushed to the disk.
+"""Journal of a fleet, OUT/fleet.journal: appended JSON lines, each flushed to the disk.
 
 A line notes that a target was begun (a later run then knows it as the fleet's own), or the result of a log. One process writes,
 and holds a lock. A line that a dying process left incomplete is cut off; an unreadable line is skipped, and its log done again.
@@ -30,7 +30,7 @@ PIECE_BYTES = 256 << 10  # of a journal in a store
 
 
 class Run(msgspec.Struct, frozen=True, tag_field="line", tag="run"):
-    """Start of a run: its settings, the version of the tool, and whether all logs are done anew."""
+    """Line of a run: its settings, the version of the tool, and whether all logs start anew."""
 
     settings: Settings
     digest: str
@@ -39,7 +39,7 @@ class Run(msgspec.Struct, frozen=True, tag_field="line", tag="run"):
 
 
 class TargetBegun(msgspec.Struct, frozen=True, tag_field="line", tag="began"):
-    """A target is about to be written."""
+    """Line of a target that is about to be written."""
 
     key: str
     target: str
@@ -91,7 +91,7 @@ class Journal:
         self._file.close()
 
     def ours(self, target: str) -> bool:
-        """Whether the fleet has begun this target, in this run or an earlier one."""
+        """Whether the fleet has begun this target in this run or an earlier one."""
         return target in self._begun
 
     def done(self, key: str) -> Result | None:
@@ -190,28 +190,30 @@ class _Pieces:
     """Journal in an object store; `file` gets its content."""
 
     def __init__(self, folder: Location, file: IO[bytes]) -> None:
-        self._folder, self._held = folder, bytearray()
-        there: list[Location] = sorted(folder.glob("*.jsonl"), key=str)
-        for piece in there:
+        self._folder, self._last = folder, bytearray()
+        pieces: list[Location] = sorted(folder.glob("*.jsonl"), key=str)
+        for piece in pieces:
             raw = piece.read_bytes()
             file.write(raw if raw.endswith(b"\n") or not raw else raw + b"\n")
-        self._number = 1 + max((int(one.stem) for one in there if one.stem.isdecimal()), default=-1)
+        self._number = 1 + max((int(piece.stem) for piece in pieces if piece.stem.isdecimal()), default=-1)
 
     def append(self, raw: bytes) -> None:
         """Write the piece again with one more line."""
-        if len(self._held) > PIECE_BYTES:
-            self._held.clear()
+        if len(self._last) > PIECE_BYTES:
+            self._last.clear()
             self._number += 1
-        self._held += raw
-        (self._folder / f"{self._number:08d}.jsonl").write_bytes(bytes(self._held))
+        self._last += raw
+        (self._folder / f"{self._number:08d}.jsonl").write_bytes(bytes(self._last))
 
 
 def _difference(known: Run, settings: Settings) -> str:
-    """The settings that differ, as then and now."""
+    """Differences between settings, as old and new values."""
     then, now = msgspec.to_builtins(known.settings), msgspec.to_builtins(settings)
-    told = [f"{name} {then[name]!r}, now {now[name]!r}" for name in now if then[name] != now[name] and name != "model_sha256"]
-    if then["model_sha256"] != now["model_sha256"] and not told:
-        told.append("another content of the model")
+    changes = [
+        f"{name} {then[name]!r}, now {now[name]!r}" for name in now if then[name] != now[name] and name != "model_sha256"
+    ]
+    if then["model_sha256"] != now["model_sha256"] and not changes:
+        changes.append("another content of the model")
     if known.version != __version__:
-        told.append(f"imutool {known.version}, now {__version__}")
-    return "; ".join(told) or "unknown"
+        changes.append(f"imutool {known.version}, now {__version__}")
+    return "; ".join(changes) or "unknown"

@@ -1,4 +1,4 @@
-"""HTML page about a fleet: whole logs, the others with their reason, and the distribution of what was found."""
+"""HTML page about a fleet: intact logs, the others with the reason, and histograms."""
 
 from __future__ import annotations
 
@@ -31,7 +31,10 @@ OWN_STYLE = """
 
 @dataclass(frozen=True)
 class Links:
-    """Links from the page to files below OUT: relative where both are on one disk, so that both can move together."""
+    """Links from the page to files below OUT.
+
+    They are relative if both are on one disk, so that both can move together.
+    """
 
     page: Location
     out: Location | None
@@ -39,8 +42,8 @@ class Links:
     def to(self, name: str) -> str:
         """URL of a file, escaped."""
         if isinstance(self.page, Path) and isinstance(self.out, Path):
-            there = os.path.relpath(self.out / name, self.page.parent.absolute())
-            return quote(Path(there).as_posix())
+            relative = os.path.relpath(self.out / name, self.page.parent.absolute())
+            return quote(Path(relative).as_posix())
         return quote(str(self.out / name if self.out is not None else name), safe="/:")
 
 
@@ -55,7 +58,7 @@ def write(
     comparison: Comparison | None = None,
     overwrite: bool = False,
 ) -> None:
-    """Writes the page: one file without any request to elsewhere, for light and dark screens and for paper.
+    """Write the page as one HTML file without external requests.
 
     Raises:
         ConfigError: matplotlib is not installed, or the file exists (without `overwrite`) or cannot be written.
@@ -74,10 +77,10 @@ def html(
     link: Links | None = None,
     comparison: Comparison | None = None,
 ) -> str:
-    """The page of `write` as text; with `link` it leads to the pages of the logs."""
+    """HTML text of the page; with `link` it has links to the pages of the logs."""
     statistics = Statistics()
-    for one in results:
-        statistics.add(one)
+    for result in results:
+        statistics.add(result)
     body = [
         f"<h1>imutool fleet {text(settings.command)} of {text(source)}</h1>",
         f'<p class="conclusion">{text(_conclusion(statistics, comparison))}</p>',
@@ -130,10 +133,10 @@ def _trouble(statistics: Statistics) -> Iterator[str]:
     yield "<h2>Not whole</h2>"
     rows = []
     order = {name: k for k, name in enumerate(TROUBLE)}
-    for one in sorted(statistics.trouble, key=lambda r: (order[r.earlier or r.status], r.source)):
-        status = one.earlier or one.status
-        why = one.error or "; ".join(one.losses) or "; ".join(one.warnings)
-        rows.append(f'<tr><td class="{status}">{status}</td><td>{text(one.source)}</td><td>{text(why)}</td></tr>')
+    for result in sorted(statistics.trouble, key=lambda r: (order[r.earlier or r.status], r.source)):
+        status = result.earlier or result.status
+        why = result.error or "; ".join(result.losses) or "; ".join(result.warnings)
+        rows.append(f'<tr><td class="{status}">{status}</td><td>{text(result.source)}</td><td>{text(why)}</td></tr>')
     yield f"<table><thead><tr><th>Status</th><th>Log</th><th>Why</th></tr></thead><tbody>{''.join(rows)}</tbody></table>"
     more = sum(statistics.statuses[name] for name in TROUBLE) - len(statistics.trouble)
     if more:
@@ -141,14 +144,14 @@ def _trouble(statistics: Statistics) -> Iterator[str]:
 
 
 def _logs(statistics: Statistics, link: Links) -> Iterator[str]:
-    """A line for each log that has a page, and the way there."""
+    """Table of the logs that have a page, with links."""
     if not statistics.drawn:
         return
     yield "<h2>Logs</h2>"
     rows = "".join(
-        f'<tr><td><a href="{text(link.to(one.page))}">{text(one.page.removesuffix(".html"))}</a></td>'
-        f"<td>{text(one.page_says)}</td></tr>"
-        for one in statistics.drawn
+        f'<tr><td><a href="{text(link.to(result.page))}">{text(result.page.removesuffix(".html"))}</a></td>'
+        f"<td>{text(result.page_says)}</td></tr>"
+        for result in statistics.drawn
     )
     yield f"<table><thead><tr><th>Log</th><th>What its page says</th></tr></thead><tbody>{rows}</tbody></table>"
     if statistics.pages > len(statistics.drawn):
@@ -171,15 +174,15 @@ def _outliers(comparison: Comparison) -> Iterator[str]:
     if not comparison.outliers:
         yield f'<p class="note">{"None." if comparison.robots >= FEWEST else "Nobody can tell among so few."}</p>'
     else:
-        head = "".join(f"<th>{one}</th>" for one in ("Robot", "What", "Here", "The others", "Distance", "False discovery"))
-        rows = "".join(_outlier(one) for one in comparison.outliers[:MOST_ROWS])
+        head = "".join(f"<th>{row}</th>" for row in ("Robot", "What", "Here", "The others", "Distance", "False discovery"))
+        rows = "".join(_outlier(row) for row in comparison.outliers[:MOST_ROWS])
         yield f'<div class="scroll"><table><thead><tr>{head}</tr></thead><tbody>{rows}</tbody></table></div>'
     if comparison.shared:
         yield "<h2>What all share</h2>"
-        head = "".join(f"<th>{one}</th>" for one in ("Effect", "Middle of the robots ± their spread", "Robots"))
+        head = "".join(f"<th>{row}</th>" for row in ("Effect", "Middle of the robots ± their spread", "Robots"))
         rows = "".join(
-            f"<tr><td>{text(one.label)}</td><td class=number>{text(one.text)}</td><td class=number>{one.robots}</td></tr>"
-            for one in comparison.shared
+            f"<tr><td>{text(row.label)}</td><td class=number>{text(row.text)}</td><td class=number>{row.robots}</td></tr>"
+            for row in comparison.shared
         )
         yield f"<table><thead><tr>{head}</tr></thead><tbody>{rows}</tbody></table>"
     if comparison.effects:
@@ -192,9 +195,9 @@ def _outliers(comparison: Comparison) -> Iterator[str]:
         yield f"<table><thead><tr><th>Effect</th><th>Robots</th><th>Which</th></tr></thead><tbody>{rows}</tbody></table>"
 
 
-def _outlier(one: Outlier) -> str:
-    cells = (one.robot, one.label, one.here, one.others)
-    numbers = (f"{one.sigma:.1f} σ", f"{one.false_discovery_rate:.1g}")
+def _outlier(outlier: Outlier) -> str:
+    cells = (outlier.robot, outlier.label, outlier.here, outlier.others)
+    numbers = (f"{outlier.sigma:.1f} σ", f"{outlier.false_discovery_rate:.1g}")
     return (
         "<tr>"
         + "".join(f"<td>{text(cell)}</td>" for cell in cells)
@@ -214,12 +217,12 @@ def _spread(statistics: Statistics) -> Iterator[str]:
             yield _figure(_axes(rows, f"{signal} bias ({UNITS[signal]})"), f"b{k}", caption)
     times = [(statistics.seconds, "seconds a log"), (statistics.speeds, "MB/s of one worker")]
     yield _figure(
-        _one(times, "times"),
+        _histograms(times, "times"),
         "t",
         "Time and speed by log",
     )
     if len(statistics.scores) > 1 and min(statistics.scores) < max(statistics.scores):
-        yield _figure(_one([(statistics.scores, "quality score")], "scores"), "q", "Quality")
+        yield _figure(_histograms([(statistics.scores, "quality score")], "scores"), "q", "Quality")
 
 
 def _axes(rows: Float64[np.ndarray, "n 3"], label: str) -> str:
@@ -230,7 +233,7 @@ def _axes(rows: Float64[np.ndarray, "n 3"], label: str) -> str:
     return svg(draw, 2.2, label)
 
 
-def _one(columns: Sequence[tuple[Sequence[float], str]], name: str) -> str:
+def _histograms(columns: Sequence[tuple[Sequence[float], str]], name: str) -> str:
     def draw(figure: Any) -> None:
         for axes, (values, label) in zip(np.atleast_1d(figure.subplots(1, len(columns))), columns, strict=True):
             _histogram(axes, np.array(values), label, AFTER)
@@ -258,8 +261,8 @@ def _provenance(settings: Settings) -> Iterator[str]:
         "model sha256": settings.model_sha256,
     }
     if settings.command == "debias":
-        said = {True: "yes", False: "no"}
-        entries |= {"init": settings.init, "smooth": said[settings.smooth], "clean": said[settings.clean]}
+        words = {True: "yes", False: "no"}
+        entries |= {"init": settings.init, "smooth": words[settings.smooth], "clean": words[settings.clean]}
         entries["verified"] = f"structure, and contents: {settings.check}"
     for name, value in entries.items():
         if value and (settings.command == "debias" or not name.startswith("model")):
@@ -268,7 +271,7 @@ def _provenance(settings: Settings) -> Iterator[str]:
 
 
 def size(count: int) -> str:
-    """Bytes in a unit that suits them: `52.6 MB`."""
+    """File size with its unit: `52.6 MB`."""
     units = ("B", "kB", "MB", "GB", "TB", "PB")
     value, step = float(count), 0
     while value >= 999.5 and step < len(units) - 1:
@@ -277,7 +280,7 @@ def size(count: int) -> str:
 
 
 def duration(seconds: float) -> str:
-    """`37.9 s`, `12:05 min`, `3:20 h`."""
+    """Duration as text: `37.9 s`, `12:05 min`, `3:20 h`."""
     if seconds < 60.0:
         return f"{seconds:.3g} s"
     whole = round(seconds)

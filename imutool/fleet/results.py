@@ -24,7 +24,7 @@ TROUBLE = ("failed", "quarantined", "lost")
 
 
 class LogProblem(Section, frozen=True):
-    """A log that is not whole."""
+    """Log with a problem."""
 
     source: str
     status: str
@@ -34,7 +34,7 @@ class LogProblem(Section, frozen=True):
 
 
 class FleetSummary(Report, frozen=True, kw_only=True, tag="imutool.fleet/1"):
-    """The report of `imutool fleet`; `not_whole` lists the first thousand logs with a problem."""
+    """Report of `imutool fleet`; `not_whole` lists the first 1000 logs with a problem."""
 
     command: str
     source: str
@@ -51,7 +51,7 @@ class FleetSummary(Report, frozen=True, kw_only=True, tag="imutool.fleet/1"):
 
 
 def arrow() -> Any:
-    """The library that writes Parquet.
+    """Module pyarrow, with its Parquet writer.
 
     Raises:
         ConfigError: it is not installed.
@@ -139,8 +139,7 @@ def row(result: Result) -> dict[str, Any]:
         "robot": result.robot or None,
         "effects": None if result.effects is None else list(result.effects),
         "parameters": [
-            {"effect": one.effect, "name": one.name, "value": one.value, "std": one.std, "unit": one.unit}
-            for one in result.parameters
+            {"effect": p.effect, "name": p.name, "value": p.value, "std": p.std, "unit": p.unit} for p in result.parameters
         ],
         "peak_bytes": result.peak_bytes or None,
         "host": result.host or None,
@@ -150,7 +149,7 @@ def row(result: Result) -> dict[str, Any]:
 
 @dataclass
 class Statistics:
-    """Statistics of all results, gathered in result pass: counts, numbers for the histograms, and rows of the tables."""
+    """Statistics of all results in one pass: counts, histogram values, and table rows."""
 
     statuses: Counter[str] = field(default_factory=Counter)
     bytes_in: int = 0
@@ -167,7 +166,7 @@ class Statistics:
     pages: int = 0
 
     def add(self, result: Result) -> None:
-        """Take in a result."""
+        """Add a result."""
         status = result.earlier if result.status == "skipped" and result.earlier else result.status
         self.statuses[status] += 1
         self.statuses["skipped"] += result.status == "skipped"
@@ -193,7 +192,7 @@ class Statistics:
 
 def _batches(results: Iterable[Result]) -> Iterator[list[dict[str, Any]]]:
     waiting = iter(results)
-    while rows := [row(one) for one in islice(waiting, ROWS)]:
+    while rows := [row(result) for result in islice(waiting, ROWS)]:
         yield rows
 
 
@@ -206,7 +205,7 @@ class _Sink:
         self._target = target
 
     def write(self, data: Any) -> int:
-        """Appends bytes."""
+        """Append bytes."""
         raw = memoryview(data)
         self._target.write(raw)
         return raw.nbytes
@@ -216,4 +215,4 @@ class _Sink:
         return self._target.position
 
     def flush(self) -> None:
-        """The target does so when it is whole."""
+        """Do nothing: the target flushes at its end."""

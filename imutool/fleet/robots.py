@@ -6,9 +6,9 @@ robot's value x is compared with the median m of all robots and the robust sprea
 
     z = (x - m) / sqrt(s^2 + std^2)
 
-s is itself known from a few robots: z is held against Student's t with 0.7 (n - 1) degrees of freedom, the efficiency of Qn
-among a few dozen. An effect's most striking parameter stands for it, its chance multiplied by how many there are (Bonferroni);
-of all robots and effects those are told whose false discovery rate (Benjamini and Hochberg 1995) is below a limit.
+s itself comes from a few robots: z is compared with Student's t with 0.7 (n - 1) degrees of freedom (0.7: the efficiency of Qn
+among a few dozen). An effect counts with its most deviating parameter; its p-value is multiplied by the number of
+parameters (Bonferroni). An outlier has a false discovery rate (Benjamini and Hochberg 1995) below a limit.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ import numpy as np
 from jaxtyping import Float64
 from scipy.stats import t as student
 
+from imutool.diagnosis.quantity import value as value_text
 from imutool.diagnosis.result import Estimate
-from imutool.diagnosis.wording.quantity import value as value_text
 from imutool.errors import ConfigError
 from imutool.fleet.task import Parameter, Result
 from imutool.location import Location
@@ -35,12 +35,12 @@ QN_OF_FEW = {2: 0.399, 3: 0.994, 4: 0.512, 5: 0.844, 6: 0.611, 7: 0.857, 8: 0.66
 MANY = 1000  # robots, above which the median absolute deviation is sure enough; Qn takes every pair
 EFFICIENCY = 0.7
 FALSE_DISCOVERY = 0.01
-FEWEST = 5  # robots: among fewer the odd one cannot be told
+FEWEST = 5  # robots: fewer do not show an outlier
 SMALLEST = 0.01  # of the median uncertainty: a spread of nothing at all is rounding
 
 
 class SharedParameter(NamedTuple):
-    """A parameter over all robots: its median, the robust spread between robots, and their number."""
+    """Parameter over all robots: median, robust spread, and number of robots."""
 
     label: str
     unit: str
@@ -50,12 +50,12 @@ class SharedParameter(NamedTuple):
 
     @property
     def text(self) -> str:
-        """`0.13 ± 0.19 %`: the middle, and the spread between robots."""
+        """Median and spread as text: `0.13 ± 0.19 %`."""
         return value_text(Estimate(self.middle, self.spread, self.unit))
 
 
 class Outlier(NamedTuple):
-    """An outlier: a robot whose effect differs from the others', by its most deviating parameter."""
+    """Outlier: a robot with another effect than the others, by its most deviating parameter."""
 
     robot: str
     effect: str
@@ -71,22 +71,22 @@ class Outlier(NamedTuple):
 
     @property
     def label(self) -> str:
-        """The effect and the parameter, in words."""
+        """Effect and parameter, in words."""
         return label(self.effect, self.parameter)
 
     @property
     def here(self) -> str:
-        """What this robot shows."""
+        """Value of this robot."""
         return value_text(Estimate(self.value, self.std, self.unit))
 
     @property
     def others(self) -> str:
-        """What the others show: their middle and their spread."""
+        """Median and spread of the others."""
         return value_text(Estimate(self.middle, self.spread, self.unit))
 
     @property
     def sentence(self) -> str:
-        """`robot 12: mount rotation phi x 2.1 ± 0.1° against 0.1 ± 0.2° of the others, 9 sigma`."""
+        """Sentence: `robot 12: mount rotation phi x 2.1 ± 0.1° against ... of the others, 9 sigma`."""
         return f"{self.robot}: {self.label} {self.here} against {self.others} of the others, {self.sigma:.1f} sigma"
 
 
@@ -102,10 +102,10 @@ class Comparison:
 
     @property
     def summary(self) -> str:
-        """In a sentence."""
+        """Summary in one sentence."""
         if self.robots < FEWEST:
             return f"{self.robots} robots are too few to tell which is unlike the others; {FEWEST} or more are needed."
-        odd = len({one.robot for one in self.outliers})
+        odd = len({outlier.robot for outlier in self.outliers})
         count = f"{odd} of {self.robots} robots {'is' if odd == 1 else 'are'}" if odd else f"None of {self.robots} robots is"
         return f"{count} unlike the others (false discovery rate below {FALSE_DISCOVERY:.0%}, {self.logs} logs)."
 
@@ -123,7 +123,7 @@ class Comparison:
 
 
 class FleetDiagnosis(Report, frozen=True, kw_only=True, tag="imutool.fleet-diagnosis/1"):
-    """The comparison of robots; `effects` are those that a search found beyond the compared ones, with their robots."""
+    """Comparison of robots; `effects` maps further effects that a search found to robots."""
 
     robots: int
     logs: int
@@ -135,63 +135,67 @@ class FleetDiagnosis(Report, frozen=True, kw_only=True, tag="imutool.fleet-diagn
 
 
 def label(effect: str, parameter: str) -> str:
-    """An effect and its parameter, in words."""
+    """Effect and parameter, in words."""
     return f"{effect} {parameter}".replace("_", " ")
 
 
 def compare(results: Iterable[Result]) -> Comparison:
     """Compare robots by the parameters of their logs; failed logs are left out."""
     logs: dict[str, list[Result]] = {}
-    for one in results:
-        if one.parameters:
-            logs.setdefault(one.robot, []).append(one)
-    pooled = {robot: _pooled([one.parameters for one in own]) for robot, own in sorted(logs.items())}
-    units = {(p.effect, p.name): p.unit for own in logs.values() for one in own for p in one.parameters}
+    for result in results:
+        if result.parameters:
+            logs.setdefault(result.robot, []).append(result)
+    pooled = {robot: _pooled([result.parameters for result in own]) for robot, own in sorted(logs.items())}
+    units = {(p.effect, p.name): p.unit for own in logs.values() for result in own for p in result.parameters}
     names = list(units)
     values = np.array([[pooled[robot].get(name, (np.nan, np.nan)) for name in names] for robot in pooled]).reshape(
         -1, len(names), 2
     )
     x, std = values[..., 0], values[..., 1]
-    shared, found = [], []
+    shared: list[SharedParameter] = []
+    outliers: list[Outlier] = []
     for k, name in enumerate(names):
-        there = np.isfinite(x[:, k])
-        middle, spread = _robust(x[there, k])
-        shared.append(SharedParameter(label(*name), units[name], middle, spread, int(there.sum())))
+        finite = np.isfinite(x[:, k])
+        middle, spread = _robust(x[finite, k])
+        shared.append(SharedParameter(label(*name), units[name], middle, spread, int(finite.sum())))
     if len(pooled) >= FEWEST:
-        found = _outliers(list(pooled), names, units, x, std)
+        outliers = _outliers(list(pooled), names, units, x, std)
     beyond: dict[str, set[str]] = {}
     for robot, own in logs.items():
-        for effect in {effect for one in own for effect in one.effects or ()} - {effect for effect, _ in names}:
+        for effect in {effect for result in own for effect in result.effects or ()} - {effect for effect, _ in names}:
             beyond.setdefault(effect, set()).add(robot)
     return Comparison(
         len(pooled),
         sum(map(len, logs.values())),
         tuple(shared),
-        tuple(found),
+        tuple(outliers),
         {effect: tuple(sorted(robots)) for effect, robots in sorted(beyond.items())},
     )
 
 
 def _pooled(logs: Sequence[Sequence[Parameter]]) -> dict[tuple[str, str], tuple[float, float]]:
-    """Inverse-variance mean of each parameter over a robot's logs; disagreement of the logs enlarges its uncertainty."""
+    """Inverse-variance mean of each parameter over a robot's logs.
+
+    Disagreement between the logs enlarges its uncertainty.
+    """
     columns: dict[tuple[str, str], list[tuple[float, float]]] = {}
     for parameters in logs:
-        for one in parameters:
-            if np.isfinite(one.value) and np.isfinite(one.std) and one.std > 0.0:
-                columns.setdefault((one.effect, one.name), []).append((one.value, one.std))
-    out = {}
+        for parameter in parameters:
+            if np.isfinite(parameter.value) and np.isfinite(parameter.std) and parameter.std > 0.0:
+                columns.setdefault((parameter.effect, parameter.name), []).append((parameter.value, parameter.std))
+    pooled = {}
     for name, pairs in columns.items():
         value, std = np.array(pairs).T
         weight = 1.0 / std**2
         mean = float((weight * value).sum() / weight.sum())
         own = 1.0 / weight.sum()
         among = 0.0 if len(pairs) < 2 else float((weight * (value - mean) ** 2).sum() / weight.sum() / (len(pairs) - 1))
-        out[name] = (mean, float(np.sqrt(max(own, among))))
-    return out
+        pooled[name] = (mean, float(np.sqrt(max(own, among))))
+    return pooled
 
 
 def _robust(x: Float64[np.ndarray, " n"]) -> tuple[float, float]:
-    """Median and robust standard deviation; zero for fewer than two."""
+    """Median and robust standard deviation; 0 for fewer than two."""
     n = len(x)
     if not n:
         return float("nan"), float("nan")
@@ -199,10 +203,10 @@ def _robust(x: Float64[np.ndarray, " n"]) -> tuple[float, float]:
     if n < 2 or n > MANY:
         return middle, float(MAD * np.median(np.abs(x - middle)))
     half = n // 2 + 1
-    apart = np.abs(x[:, None] - x[None, :])[np.triu_indices(n, 1)]
+    distance = np.abs(x[:, None] - x[None, :])[np.triu_indices(n, 1)]
     k = half * (half - 1) // 2 - 1
     correction = QN_OF_FEW.get(n, n / (n + (1.4 if n % 2 else 3.8)))
-    return middle, float(QN * correction * np.partition(apart, k)[k])
+    return middle, float(QN * correction * np.partition(distance, k)[k])
 
 
 def _outliers(
@@ -212,34 +216,41 @@ def _outliers(
     x: Float64[np.ndarray, "robots names"],
     std: Float64[np.ndarray, "robots names"],
 ) -> list[Outlier]:
-    """Most deviating parameter by robot and effect; those beyond the false discovery rate, the clearest first."""
+    """Outliers within the false discovery rate, the clearest first.
+
+    Each is the most deviating parameter of a robot's effect.
+    """
     tested: list[Outlier] = []
     known = [(np.isfinite(column), *_robust(column[np.isfinite(column)])) for column in x.T]
     for r, robot in enumerate(robots):
         by_effect: dict[str, list[Outlier]] = {}
         for k, (effect, parameter) in enumerate(names):
-            there, middle, spread = known[k]
-            n = int(there.sum())
-            if not there[r] or n < FEWEST:
+            finite, middle, spread = known[k]
+            n = int(finite.sum())
+            if not finite[r] or n < FEWEST:
                 continue
-            spread = max(spread, SMALLEST * float(np.median(std[there, k])))
+            spread = max(spread, SMALLEST * float(np.median(std[finite, k])))
             sigma = float(abs(x[r, k] - middle) / np.hypot(std[r, k], spread))
             p = 2.0 * float(student.sf(sigma, EFFICIENCY * (n - 1)))
             own = float(x[r, k]), float(std[r, k])
-            one = Outlier(robot, effect, parameter, *own, middle, spread, units[effect, parameter], sigma, p, 1.0)
-            by_effect.setdefault(effect, []).append(one)
+            outlier = Outlier(robot, effect, parameter, *own, middle, spread, units[effect, parameter], sigma, p, 1.0)
+            by_effect.setdefault(effect, []).append(outlier)
         for several in by_effect.values():
-            clearest = min(several, key=lambda one: one.p_value)
+            clearest = min(several, key=lambda outlier: outlier.p_value)
             tested.append(clearest._replace(p_value=min(1.0, clearest.p_value * len(several))))
-    tested.sort(key=lambda one: one.p_value)
-    rates = np.array([one.p_value * len(tested) / (k + 1) for k, one in enumerate(tested)])
+    tested.sort(key=lambda outlier: outlier.p_value)
+    rates = np.array([outlier.p_value * len(tested) / (k + 1) for k, outlier in enumerate(tested)])
     rates = np.minimum.accumulate(rates[::-1])[::-1]
-    ranked = [one._replace(false_discovery_rate=float(rate)) for one, rate in zip(tested, rates, strict=True)]
-    return sorted((one for one in ranked if one.false_discovery_rate <= FALSE_DISCOVERY), key=lambda one: -one.sigma)
+    ranked = [outlier._replace(false_discovery_rate=float(rate)) for outlier, rate in zip(tested, rates, strict=True)]
+    return sorted(
+        (outlier for outlier in ranked if outlier.false_discovery_rate <= FALSE_DISCOVERY), key=lambda outlier: -outlier.sigma
+    )
 
 
 def robot_of(name: str, pattern: str | None, log: Location) -> str:
-    """Name of the robot of a log: by a pattern on the log's name, by its metadata (`metadata:RECORD.KEY`), else by its folder.
+    """Robot name of a log: from the log's name, its metadata, or its folder.
+
+    `pattern` is a regular expression or `metadata:RECORD.KEY`; None takes the folder.
 
     Raises:
         ConfigError: the pattern is invalid, or does not match.

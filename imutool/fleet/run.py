@@ -1,4 +1,4 @@
-"""Run of a fleet: lists the logs, skips those done, gives the rest to the engine, and writes the results."""
+"""Run of a fleet: list the logs, skip finished ones, run the rest, write the results."""
 
 from __future__ import annotations
 
@@ -57,11 +57,11 @@ class Progress:
 
     @property
     def exit_code(self) -> int:
-        """0: every log whole; a bug above all, then the largest code of the logs that failed, then 3 for what was lost."""
+        """Exit code: 0 for intact logs, 1 for a bug, else the largest of failed and lost logs."""
         return BUG if BUG in self.codes else max(self.codes, default=0)
 
     def line(self, running: int = 0) -> str:
-        """`12 of 40 done, 1 failed, 2 running, 35 MB/s, 1:20 left`."""
+        """Progress line: `12 of 40 done, 1 failed, 2 running, 35 MB/s, 1:20 left`."""
         elapsed = time.perf_counter() - self.began
         parts = [f"{self.statuses.total()} of {self.logs} done"]
         parts += [
@@ -80,7 +80,7 @@ class Progress:
 
 @dataclass(frozen=True)
 class FleetReport:
-    """Outcome of a fleet; `not_whole` are the results with a problem, at most the first thousand."""
+    """Outcome of a fleet; `not_whole` holds the first 1000 results with a problem."""
 
     source: str
     out: Location
@@ -124,7 +124,7 @@ def run(
     page: Location | None = None,
     tell: Tell = lambda done, total, words: None,
 ) -> FleetReport:
-    """Apply `settings` to every log of `source`, into `out`; write fleet.parquet there, and the page where asked.
+    """Run a command on every log of `source`; write the results and fleet.parquet to `out`.
 
     Raises:
         ConfigError: no logs; an `out` that holds results already, or cannot be written; a page that exists (without `overwrite`
@@ -168,7 +168,7 @@ def run(
 def _report(
     fleet: _Fleet, journal: Journal, source: str, progress: Progress, began: float, page: Location | None
 ) -> FleetReport:
-    """Table, comparison and page from the results, which are read from the journal each time and never held in memory."""
+    """Write table, comparison and page from the results in the journal, read one by one."""
     settings, out = fleet.settings, fleet.out
     results.write(fleet.results(journal), out / results.NAME)
     comparison = None
@@ -187,7 +187,7 @@ def _report(
 
 
 class _Fleet:
-    """Logs and tasks of a fleet; tasks are made one at a time, since a fleet may have a million logs."""
+    """Logs and tasks of a fleet; tasks are made one at a time for up to a million logs."""
 
     def __init__(self, found: Found, out: Location, settings: Settings, overwrite: bool, recheck: bool) -> None:
         self.found, self.out, self.settings = found, out, settings
@@ -201,7 +201,7 @@ class _Fleet:
         remove_files(partial_files(self.out, [*names, *pages]))
 
     def refused(self, journal: Journal) -> Iterator[Result]:
-        """Results of logs with an unusable name, and of those whose target is a file that no fleet has written."""
+        """Results of refused logs: an unusable name, or a target that no fleet has written."""
         for where, why in self.found.refused:
             yield Result(key=_key(where), source=where, target="", status="failed", error=why, exit_code=ConfigError.exit_code)
         for source in self.found.logs:

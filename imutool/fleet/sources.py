@@ -1,4 +1,4 @@
-"""Source logs of a fleet, and the name of each below OUT: never outside of it, never the same for two logs."""
+"""Source logs of a fleet, and their unique names below OUT."""
 
 from __future__ import annotations
 
@@ -35,7 +35,9 @@ class _File(NamedTuple):
 
 
 def find(text: str, out: Location, *, bags: bool = False) -> Found:
-    """Find the logs of a path, a glob, a folder or a URL, with `bags` ROS 1 bags too; logs below `out` are left out.
+    """Find the logs of a path, a glob, a folder or a URL; logs below `out` are left out.
+
+    With `bags` ROS 1 bags are logs too.
 
     The name of a log is its path from the folder, or from the last part of a pattern before its first wildcard; a single log
     keeps its own name. Links are followed. A log without a usable name below OUT is refused, and the others go on.
@@ -61,7 +63,7 @@ def find(text: str, out: Location, *, bags: bool = False) -> Found:
         raise ConfigError(
             f"no {' or '.join(endings)} log", where=text, expected="a log, a folder with logs, or a pattern that fits some"
         )
-    logs.sort(key=lambda one: one.name)
+    logs.sort(key=lambda source: source.name)
     return Found(logs, sorted(refused))
 
 
@@ -87,12 +89,12 @@ def relative(file: str, root: str) -> str:
 
 
 def _shown(name: str) -> str:
-    """A name as text that can be written anywhere: bytes that are no UTF-8 as escapes."""
+    """Printable name: bytes that are not UTF-8 become escapes."""
     return name.encode("utf-8", "surrogateescape").decode("utf-8", "backslashreplace")
 
 
 def _files(text: str, endings: tuple[str, ...]) -> tuple[str, Iterator[_File]]:
-    """Root of the names, and the files."""
+    """Root folder of the names, and the files."""
     where = to_location(text)
     if not isinstance(where, Path):
         return _in_store(text, endings)
@@ -109,21 +111,21 @@ def _files(text: str, endings: tuple[str, ...]) -> tuple[str, Iterator[_File]]:
             break
         root /= part
     named = sorted(globs.iglob(str(where), recursive=True))  # noqa: PTH207  Path.glob takes no absolute pattern
-    files = (os.path.abspath(one) for one in named)  # noqa: PTH100  Path.resolve would follow links
-    return os.path.abspath(root), (_File(one) for one in files if one.endswith(endings) and Path(one).is_file())  # noqa: PTH100
+    files = (os.path.abspath(name) for name in named)  # noqa: PTH100  Path.resolve would follow links
+    return os.path.abspath(root), (_File(file) for file in files if file.endswith(endings) and Path(file).is_file())  # noqa: PTH100
 
 
 def _walk(folder: Path, endings: tuple[str, ...], above: frozenset[tuple[int, int]]) -> Iterator[_File]:
-    """The logs below a folder, through links too, but never into a folder that one is in already."""
+    """Logs below a folder, through links too, but never through a link to a parent folder."""
     try:
         status = folder.stat()
-        here = (status.st_dev, status.st_ino)
-        entries = [] if here in above else sorted(os.scandir(folder), key=lambda entry: entry.name)
+        inode = (status.st_dev, status.st_ino)
+        entries = [] if inode in above else sorted(os.scandir(folder), key=lambda entry: entry.name)
     except OSError as error:
         raise ConfigError(f"cannot be read ({error.strerror})", where=folder) from error
     for entry in entries:
         if entry.is_dir():
-            yield from _walk(folder / entry.name, endings, above | {here})
+            yield from _walk(folder / entry.name, endings, above | {inode})
         elif entry.name.endswith(endings):
             yield _File(str(folder / entry.name))
 
@@ -133,7 +135,7 @@ def _in_store(text: str, endings: tuple[str, ...]) -> tuple[str, Iterator[_File]
     match = PATTERN.search(text)
     fixed = text.rstrip("/") if match is None else text[: match.start()].rpartition("/")[0]
     root = to_location(fixed)
-    assert not isinstance(root, Path), "who calls has seen that it is none"
+    assert not isinstance(root, Path), "a URL, not a path"
     try:
         if match is None:
             found = root.fs.find(root.path, detail=True)
@@ -144,7 +146,7 @@ def _in_store(text: str, endings: tuple[str, ...]) -> tuple[str, Iterator[_File]
     whole = fixed.rpartition("/")[0] if list(found) == [root.path] else fixed  # a log alone, by its own name
     files = [_File(fixed + path[len(root.path.rstrip("/")) :], about) for path, about in sorted(found.items())]
     return whole, (
-        one for one in files if one.where.endswith(endings) and one.about and one.about.get("type", "file") == "file"
+        file for file in files if file.where.endswith(endings) and file.about and file.about.get("type", "file") == "file"
     )
 
 

@@ -1,4 +1,4 @@
-"""Settings, tasks and results of a fleet: plain data that the planner and the workers exchange."""
+"""Settings, tasks and results of a fleet, as plain data for planner and workers."""
 
 from __future__ import annotations
 
@@ -17,7 +17,10 @@ FINAL = frozenset({"ok", "lost", "quarantined"})  # with `resume` a failed log i
 
 
 class Settings(msgspec.Struct, frozen=True, kw_only=True):
-    """Settings of the work on every log; paths are absolute, `model_sha256` is of the model file or of all that ship."""
+    """Settings of a fleet's command on every log.
+
+    Paths are absolute; `model_sha256` is of the model file, or of all models that ship.
+    """
 
     command: Command
     model: str | None = None
@@ -36,12 +39,12 @@ class Settings(msgspec.Struct, frozen=True, kw_only=True):
 
     @property
     def digest(self) -> str:
-        """SHA-256 over all that decides the results, the version of the tool included."""
+        """SHA-256 of everything that decides the results, with the version of the tool."""
         return _sha256(__version__, msgspec.json.encode(self).decode())
 
 
 def with_model_hash(settings: Settings) -> Settings:
-    """Settings with the model's absolute path and SHA-256: the same name may stand for another file tomorrow.
+    """Settings with the model's absolute path and SHA-256, since the file may change.
 
     Without a model the hash is that of all that ship, since each log chooses one of them.
 
@@ -63,7 +66,7 @@ def with_model_hash(settings: Settings) -> Settings:
 
 
 class Source(msgspec.Struct, frozen=True):
-    """A source log: its place, its name below OUT, and its identity (size and stamp).
+    """Source log: its place, its name below OUT, and its identity (size and stamp).
 
     `stamp` is the store's etag, or the time of the last change in nanoseconds.
     """
@@ -74,12 +77,12 @@ class Source(msgspec.Struct, frozen=True):
     stamp: str
 
     def key(self, settings: Settings) -> str:
-        """Key of its result: changes with the content and with the settings."""
+        """Key of the result; it changes with the content and with the settings."""
         return _sha256(self.place, str(self.size), self.stamp, settings.digest)
 
 
 class Imu(msgspec.Struct, frozen=True):
-    """Start bias of an IMU, gyro (rad/s) and accel (m/s²), with its model and how the start was found."""
+    """Start bias of an IMU, gyro (rad/s) and accel (m/s²), with model and method."""
 
     topic: str
     model: str
@@ -99,7 +102,9 @@ class Parameter(msgspec.Struct, frozen=True):
 
 
 class Result(msgspec.Struct, frozen=True, kw_only=True, tag_field="line", tag="done"):
-    """Result of one log. `target` is relative to OUT; `exit_code` is that of the command on this log alone.
+    """Result of one log; `target` is relative to OUT.
+
+    `exit_code` is the code of the command on this log alone.
 
     `earlier` is the status of a skipped log from the run that did it.
     """
@@ -132,7 +137,7 @@ class Result(msgspec.Struct, frozen=True, kw_only=True, tag_field="line", tag="d
 
 
 class Task(msgspec.Struct, frozen=True, kw_only=True):
-    """Task of one log. `done` is the result of an earlier run, to be checked before it is used.
+    """Task of one log; `done` is the result of an earlier run, to be checked first.
 
     An existing target is replaced: the planner has checked that it is the fleet's own, or may be replaced.
     """

@@ -1,4 +1,4 @@
-"""Work on one log: debias, repair, info or diagnose. A task comes in, a result goes out; no cluster is involved."""
+"""Task on one log: debias, repair, info or diagnose; no cluster is involved."""
 
 from __future__ import annotations
 
@@ -28,14 +28,14 @@ from imutool.mcap_io.storage.target import Target
 from imutool.report import UNSET, Report, UnsetType, json_values
 
 LOST = 3  # exit code: something of the log was lost
-MOST_LOSSES = 20  # stretches told of a log; its metadata and its repair tell all
+MOST_LOSSES = 20  # stretches listed for a log; its metadata and its repair list all
 MOST_LETTERS = 300  # of what a page says
 MAXRSS = 1 if sys.platform == "darwin" else 1024  # bytes in what the system counts memory in
 
 
 @dataclass(frozen=True)
 class _Job:
-    """A task with its places as locations."""
+    """Task with its places as locations."""
 
     name: str
     source: Location
@@ -44,7 +44,7 @@ class _Job:
 
 
 def work(task: Task, model: bytes | None = None) -> Result:
-    """Run one task. An `ImutoolError` becomes a failed result; a bug is raised.
+    """Run one task; an `ImutoolError` becomes a failed result, a bug is raised.
 
     `model` is the content of the model file, where the settings name one: this machine may not have it. The target is written
     whole or not at all, and with the same bytes each time. Partial files of a killed attempt are removed.
@@ -91,7 +91,10 @@ def page_name(log: str) -> str:
 
 
 def is_current(done: Result, target: Location, *, whole: bool = False) -> bool:
-    """Whether a target still has its recorded size and opens as a log; with `whole`, whether its SHA-256 is unchanged."""
+    """Whether a target still has its recorded size and opens as a log.
+
+    With `whole`, whether its SHA-256 is unchanged.
+    """
     if done.status == "quarantined":  # nothing was written
         return True
     try:
@@ -115,12 +118,12 @@ def _at_hand(settings: Settings, model: bytes | None) -> Settings:
         return settings
     if hashlib.sha256(model).hexdigest() != settings.model_sha256:
         raise ModelError("has changed since the fleet was begun", where=settings.model, fix="Begin again with `overwrite`")
-    there = Path(tempfile.gettempdir(), f"imutool-models.{os.getuid()}", settings.model_sha256, Path(settings.model).name)
-    if not there.is_file() or sha256(there) != settings.model_sha256:
-        there.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
-        with Target(there, overwrite=True) as out:
+    copy = Path(tempfile.gettempdir(), f"imutool-models.{os.getuid()}", settings.model_sha256, Path(settings.model).name)
+    if not copy.is_file() or sha256(copy) != settings.model_sha256:
+        copy.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
+        with Target(copy, overwrite=True) as out:
             out.write(model)
-    return msgspec.structs.replace(settings, model=str(there))
+    return msgspec.structs.replace(settings, model=str(copy))
 
 
 def _refuse_changed(task: Task, source: Location) -> None:
@@ -130,7 +133,7 @@ def _refuse_changed(task: Task, source: Location) -> None:
 
 
 def _clear(task: Task, target: Location) -> None:
-    """Make the folder, and remove the partial files of a killed attempt."""
+    """Make the target's folder, and remove partial files of a killed attempt."""
     if isinstance(target, Path):
         target.parent.mkdir(parents=True, exist_ok=True)
     remove_files(partial_files(to_location(task.out), [task.target, page_name(task.target)]))
@@ -169,7 +172,7 @@ def _debias(job: _Job) -> dict[str, Any]:
 
 
 def _page(job: _Job, topics: Sequence[str], warnings: tuple[str, ...]) -> dict[str, Any]:
-    """Write a page about a debiased log beside it; if it cannot be drawn, the result has a warning."""
+    """Write a page beside a debiased log; on failure the result has a warning."""
     from imutool.viewing.html import report
     from imutool.viewing.html.page import is_imutool_page
     from imutool.viewing.html.report_wording import conclusion
@@ -187,13 +190,13 @@ def _page(job: _Job, topics: Sequence[str], warnings: tuple[str, ...]) -> dict[s
 
 
 def _info(job: _Job) -> dict[str, Any]:
-    from imutool.log_info import inspect
+    from imutool.log_info.inspection import inspect
 
     report = inspect(job.source)
     write_json(report, job.target)
-    told = {"messages": report.messages, "duration_s": report.duration_s}
+    counts = {"messages": report.messages, "duration_s": report.duration_s}
     lost = _lost(report.losses)
-    return told | lost | {"warnings": (*lost.get("warnings", ()), *report.warnings)}
+    return counts | lost | {"warnings": (*lost.get("warnings", ()), *report.warnings)}
 
 
 def _repair(job: _Job) -> dict[str, Any]:
@@ -210,21 +213,23 @@ def _repair(job: _Job) -> dict[str, Any]:
 
 
 def _lost(losses: Mapping[str, Any] | None) -> dict[str, Any]:
-    """Status, losses and warnings of a result, from the log's losses in JSON; at most `MOST_LOSSES` stretches."""
+    """Status, losses and warnings of a result, from the log's losses in JSON.
+
+    It lists at most `MOST_LOSSES` stretches.
+    """
     if not losses:
         return {}
-    stretches, told = losses["stretches"], []
-    for one in stretches[:MOST_LOSSES]:
-        count = "an unknown number of" if one["messages"] is None else one["messages"]
-        told.append(f"byte {one['offset']}, {one['bytes']} bytes: {one['reason']} ({count} messages lost)")
-    more = len(stretches) - len(told) + losses["stretches_not_listed"]
+    stretches, lines = losses["stretches"], []
+    for stretch in stretches[:MOST_LOSSES]:
+        count = "an unknown number of" if stretch["messages"] is None else stretch["messages"]
+        lines.append(f"byte {stretch['offset']}, {stretch['bytes']} bytes: {stretch['reason']} ({count} messages lost)")
+    more = len(stretches) - len(lines) + losses["stretches_not_listed"]
     status = {"status": "lost", "exit_code": LOST} if stretches else {}
-    return {**status, "losses": (*told, *([f"{more} more stretches"] if more else ())), "warnings": tuple(losses["mended"])}
+    return {**status, "losses": (*lines, *([f"{more} more stretches"] if more else ())), "warnings": tuple(losses["mended"])}
 
 
 def _diagnose(job: _Job) -> dict[str, Any]:
-    from imutool.diagnosis.diagnose import diagnose
-    from imutool.diagnosis.effect_sizes import effect_sizes
+    from imutool.diagnosis.diagnose import diagnose, effect_sizes
     from imutool.fleet.robots import robot_of
 
     s = job.settings
@@ -278,5 +283,5 @@ COMMANDS: dict[str, Callable[[_Job], dict[str, Any]]] = {
 
 
 def target_name(name: str, command: str) -> str:
-    """Name of a command's output for a log: logs and bags keep their names, reports end in .json."""
+    """Output name for a log: logs and bags keep their names, reports end in .json."""
     return name if command in {"debias", "repair"} else f"{name.removesuffix('.mcap')}.json"

@@ -1,1 +1,1 @@
-"""Rotations: SO(3) on tensors, unit quaternions in bulk."""
+"""Rotations: SO(3) on tensors, unit quaternions in numpy."""

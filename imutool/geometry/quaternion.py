@@ -1,6 +1,6 @@
-"""Unit quaternions as rows wxyz, in bulk: numpy, ten times as fast as rotation objects where there are many; torch has `so3`.
+"""Unit quaternions as rows wxyz in numpy; for many rows ten times as fast as rotation objects.
 
-Hamilton's convention: `multiply(a, b)` turns first by b, then by a, and a row of `rotate(q, v)` is R(q) v.
+Hamilton's convention: `multiply(a, b)` turns first by b, then by a, and a row of `rotate(q, v)` is R(q) v. For torch: `so3`.
 """
 
 from __future__ import annotations
@@ -15,12 +15,12 @@ OneOrMany = Float64[np.ndarray, "#n 4"]
 
 
 def length(rows: Float64[np.ndarray, "n k"]) -> Column:
-    """Of each row: what `numpy.linalg.norm` says, in a fifth of the time for short rows."""
+    """Length of each row, as `numpy.linalg.norm`, in a fifth of its time for short rows."""
     return np.asarray(np.sqrt(np.einsum("nk,nk->n", rows, rows)))
 
 
 def multiply(a: OneOrMany, b: OneOrMany) -> Quaternions:
-    """The Hamilton product of each pair of rows; one row may stand against many."""
+    """Hamilton product of each pair of rows; a single row broadcasts."""
     aw, ax, ay, az = a.T
     bw, bx, by, bz = b.T
     out = np.empty(np.broadcast_shapes(a.shape, b.shape))
@@ -32,18 +32,18 @@ def multiply(a: OneOrMany, b: OneOrMany) -> Quaternions:
 
 
 def inverse(q: Quaternions) -> Quaternions:
-    """Of unit quaternions: the turn back."""
+    """Inverse of unit quaternions."""
     return np.asarray(q * np.array([1.0, -1.0, -1.0, -1.0]))
 
 
 def unit(q: Quaternions) -> Quaternions:
-    """Made unit; not of zeros."""
-    of_length_one: Quaternions = q / length(q)[:, None]
-    return of_length_one
+    """Unit quaternions of rows that are not zero."""
+    normalised: Quaternions = q / length(q)[:, None]
+    return normalised
 
 
 def rotate(q: Quaternions, v: Vectors) -> Vectors:
-    """R(q) v = v + w t + u x t with t = 2 u x v, u being x, y, z of q."""
+    """Rotated vectors R(q) v = v + w t + u x t with t = 2 u x v, u being x, y, z of q."""
     w, x, y, z = q.T
     v_x, v_y, v_z = v.T
     t_x, t_y, t_z = 2.0 * (y * v_z - z * v_y), 2.0 * (z * v_x - x * v_z), 2.0 * (x * v_y - y * v_x)
@@ -55,7 +55,7 @@ def rotate(q: Quaternions, v: Vectors) -> Vectors:
 
 
 def exp(xi: Vectors) -> Quaternions:
-    """The turn by rotation vectors (rad)."""
+    """Quaternions of rotation vectors (rad)."""
     angle = length(xi)[:, None]
     return np.concatenate([np.cos(0.5 * angle), 0.5 * np.sinc(angle / (2 * np.pi)) * xi], axis=1)
 
@@ -71,13 +71,13 @@ def log(q: Quaternions) -> Vectors:
 
 
 def angle_between(a: Quaternions, b: Quaternions) -> Column:
-    """The angle (rad, 0 to pi) of the turn from each row to the other, exact also where small: 4 atan2(|a - b|, |a + b|)."""
-    apart, along = length(a - b), length(a + b)  # a quaternion is its negative
-    return np.asarray(4.0 * np.arctan2(np.minimum(apart, along), np.maximum(apart, along)))
+    """Angles (rad, 0 to pi) between rows, exact also for small ones: 4 atan2(|a - b|, |a + b|)."""
+    difference, total = length(a - b), length(a + b)  # q and -q are one rotation
+    return np.asarray(4.0 * np.arctan2(np.minimum(difference, total), np.maximum(difference, total)))
 
 
 def slerp(a: Quaternions, b: Quaternions, share: Column) -> Quaternions:
-    """Along the shorter arc from a (share 0, where it is a to the bit) to b (share 1, b or its negative)."""
+    """Slerp along the shorter arc from a (share 0, exactly a) to b (share 1, b or its negative)."""
     b = np.where(np.einsum("ni,ni->n", a, b)[:, None] < 0.0, -b, b)
     angle = 2.0 * np.arctan2(length(a - b), length(a + b)) / np.pi
     whole = np.sinc(angle)
@@ -86,9 +86,9 @@ def slerp(a: Quaternions, b: Quaternions, share: Column) -> Quaternions:
 
 
 def roll_pitch_yaw(q: Quaternions) -> Vectors:
-    """Angles (rad) about the fixed x, then y, then z axis: R = R_z(yaw) R_y(pitch) R_x(roll); pitch within a quarter turn.
+    """Roll, pitch and yaw (rad) with R = R_z(yaw) R_y(pitch) R_x(roll); pitch within a quarter turn.
 
-    Within 1e-7 rad of a pitch of a quarter turn, roll and yaw are as they come: only their sum or difference means something.
+    Within 1e-7 rad of a pitch of a quarter turn, roll and yaw are arbitrary: only their sum or difference has a meaning.
     """
     w, x, y, z = q.T
     roll = np.arctan2(2.0 * (w * x + y * z), 1.0 - 2.0 * (x * x + y * y))

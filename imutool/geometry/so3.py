@@ -1,19 +1,19 @@
-"""Rotations on tensors: exponential, logarithm, Jacobians and quaternions, for any batch, in float32 and float64.
+"""Rotations (SO(3)) on tensors: exponential, logarithm, Jacobians, quaternions; float32 and float64.
 
 Right convention throughout: `R_wb` takes body vectors to world and dR/dt = R_wb [omega_b]x, hence
 d Exp(xi)/dt = Exp(xi) [J_r(xi) dxi/dt]x (Barfoot, State Estimation for Robotics, 2017, eq. 7.77a; Chirikjian 2012).
 
-Every function of the angle is written as a function of s = |xi|², which is analytic: no square root is differentiated
-at zero, so values and all derivatives are finite everywhere, xi = 0 included. Below `_SERIES[dtype].below` a Taylor
-series in s stands in for the closed form.
+Every function of the angle is a function of s = |xi|², which is analytic: no square root is differentiated at zero, so
+values and all derivatives are finite everywhere, also at xi = 0. Below `_SERIES[dtype].below` a Taylor series in s replaces
+the closed form.
 
-Where the threshold comes from: the closed forms subtract nearly equal numbers. In the matrices the loss stays at one
-rounding (what is lost in the coefficient is multiplied by s), but their first derivative loses 1/angle and the second
-1/angle² roundings; at an angle of 0.5 that is 2 and 4. The series must reach there with a remainder under one rounding:
-the k-th term of the slowest one falls as (s / 4 pi²)^k, so 4 terms for float32 and 8 for float64, with one more each
-because a derivative costs one. So it is the number of terms that depends on the dtype. An angle of 1e-4 or less as
-threshold, as is common, is too small for float32: its derivatives are noise long before that. Both branches of every
-`torch.where` are fed arguments on which they are finite, so no NaN can leak through the branch not taken.
+Reason for the threshold: the closed forms subtract nearly equal numbers. In the matrices the loss stays at one rounding (the
+coefficient's error is multiplied by s), but their first derivative loses 1/angle and the second 1/angle² roundings; at an
+angle of 0.5 that is 2 and 4. The series must reach this angle with a remainder under one rounding. The k-th term of the
+slowest series falls as (s / 4 pi²)^k: 4 terms for float32 and 8 for float64, plus one because a derivative costs one. So the
+number of terms depends on the dtype. The common threshold of 1e-4 or less is too small for float32: its derivatives are noise
+at much larger angles. Both branches of every `torch.where` get arguments with finite results, so no NaN leaks from the branch
+not taken.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ Angles2 = Float[Tensor, "*batch"]
 
 
 class _Series(NamedTuple):
-    """Use the first `terms` of a Taylor series in the squared angle where that is under `below`."""
+    """Taylor series in the squared angle: its threshold `below` and number of `terms`."""
 
     below: float
     terms: int
@@ -73,7 +73,7 @@ _ATAN = tuple((-1) ** k / (2 * k + 1) for k in range(9))
 
 
 def hat(v: Vectors) -> Rotations:
-    """The skew matrix [v]x with [v]x a = v x a."""
+    """Skew matrix [v]x with [v]x a = v x a."""
     x, y, z = v.unbind(-1)
     zero = torch.zeros_like(x)
     flat = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], dim=-1)
@@ -81,17 +81,17 @@ def hat(v: Vectors) -> Rotations:
 
 
 def exp(xi: Vectors) -> Rotations:
-    """The rotation Exp(xi) = I + sin(a)/a [xi]x + (1 - cos a)/a² [xi]x², a = |xi| (Rodrigues)."""
+    """Rotation Exp(xi) = I + sin(a)/a [xi]x + (1 - cos a)/a² [xi]x², a = |xi| (Rodrigues)."""
     s = _squared(xi)
     return _quadratic(xi, s, _sinc(s), _versine(s))
 
 
 def log(R: Rotations) -> Vectors:
-    """The rotation vector of R, 0 <= |xi| <= pi, accurate to a few roundings over the whole range.
+    """Rotation vector of R, 0 <= |xi| <= pi, accurate to a few roundings over the whole range.
 
-    Through the quaternion, whose vector part is well conditioned where the trace is not (near pi) and the other way
-    round. At exactly pi two opposite vectors are right and one of them is returned; approaching it from below the
-    derivative stays finite. R is taken to be a rotation: what is off the manifold is projected, not diagnosed.
+    Computed through the quaternion: its vector part is well conditioned where the trace is not (near pi), and vice versa. At
+    exactly pi two opposite vectors are correct and one is returned; below pi the derivative is finite. R must be a rotation:
+    an error off the manifold is projected, not reported.
     """
     q = quaternion_wxyz_from_matrix(R)
     w, v = q[..., :1], q[..., 1:]
@@ -99,22 +99,25 @@ def log(R: Rotations) -> Vectors:
 
 
 def right_jacobian(xi: Vectors) -> Rotations:
-    """J_r(xi) = I - (1 - cos a)/a² [xi]x + (a - sin a)/a³ [xi]x², which is the mean of Exp(-u xi) over u in [0, 1]."""
+    """Right Jacobian J_r(xi) = I - (1 - cos a)/a² [xi]x + (a - sin a)/a³ [xi]x².
+
+    It is the mean of Exp(-u xi) over u in [0, 1].
+    """
     s = _squared(xi)
     return _quadratic(xi, s, -_versine(s), _defect(s))
 
 
 def right_jacobian_inverse(xi: Vectors) -> Rotations:
-    """J_r^{-1}(xi) = I + [xi]x / 2 + (1/a² - cot(a/2) / (2a)) [xi]x², defined for |xi| < 2 pi.
+    """Inverse right Jacobian J_r^{-1}(xi) = I + [xi]x / 2 + (1/a² - cot(a/2) / (2a)) [xi]x².
 
-    It grows as 2 pi / (2 pi - |xi|) towards the edge, and is meaningless beyond it; `ode.integrate` watches for that.
+    It is defined for |xi| < 2 pi and grows as 2 pi / (2 pi - |xi|) towards this limit; `ode.integrate` checks it.
     """
     s = _squared(xi)
     return _quadratic(xi, s, torch.full_like(s, 0.5), _half_cot(s))
 
 
 def chart_rate(xi: Vectors, omega_b: Vectors) -> Vectors:
-    """dxi/dt = J_r^{-1}(xi) omega_b (paper, eq. 15) without forming the matrix: what an integrator calls at each stage.
+    """Chart rate dxi/dt = J_r^{-1}(xi) omega_b (paper, eq. 15), without the matrix.
 
     [xi]x² w = xi (xi . w) - s w, so one cross product is enough.
     """
@@ -124,9 +127,9 @@ def chart_rate(xi: Vectors, omega_b: Vectors) -> Vectors:
 
 
 def quaternion_wxyz_from_matrix(R: Rotations) -> Quaternions:
-    """The unit quaternion of a rotation, with w >= 0 (the shorter arc, and continuous up to half a turn).
+    """Unit quaternion of a rotation, with w >= 0 (the shorter arc, and continuous up to half a turn).
 
-    4 q q^T is linear in R; its row with the largest diagonal is at least 2 long, so normalising it is safe and smooth
+    4 q q^T is linear in R; its row with the largest diagonal has length 2 or more, so it is normalised safely and smoothly
     (the idea of Shepperd 1978, without his square roots).
     """
     outer = _quaternion_outer(R)
@@ -137,7 +140,7 @@ def quaternion_wxyz_from_matrix(R: Rotations) -> Quaternions:
 
 
 def matrix_from_quaternion_wxyz(q_wxyz: Quaternions) -> Rotations:
-    """The rotation of a quaternion, whose length does not matter but must not be zero."""
+    """Rotation of a quaternion of any length but zero."""
     q: Tensor = q_wxyz / torch.linalg.vector_norm(q_wxyz, dim=-1, keepdim=True)
     w, v = q[..., 0, None, None], q[..., 1:]
     skew = hat(v)
@@ -169,7 +172,7 @@ def _horner(coefficients: tuple[float, ...], s: Float[Tensor, "*batch"]) -> Floa
 
 
 def _branches(s: Angles2, coefficients: tuple[float, ...]) -> tuple[Bool[Tensor, "*batch"], Angles2, Angles2]:
-    """Where to use the series, its value, and an angle for the closed form that is never small."""
+    """Mask of the series branch, its value, and an angle for the closed form that is never small."""
     series = _series_of(s.dtype)
     small = s < series.below
     value = _horner(coefficients[: series.terms], torch.where(small, s, torch.zeros_like(s)))

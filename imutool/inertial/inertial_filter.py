@@ -1,22 +1,22 @@
-"""Attitude, velocity, position and the biases of an inertial sensor from its own samples: an invariant Kalman filter.
+"""Invariant Kalman filter of attitude, velocity, position and biases from the samples of one IMU.
 
-Errors are right-invariant on SE_2(3), with the biases beside them (Barrau and Bonnabel, "The invariant extended Kalman filter
+Errors are right-invariant on SE_2(3), augmented by the biases (Barrau and Bonnabel, "The invariant extended Kalman filter
 as a stable observer", TAC 2017; the "imperfect" filter with biases: Hartley et al., IJRR 2020, section 5)::
 
     (R^, v^, p^) = Exp(xi_R, xi_v, xi_p) (R, v, p)        zeta = b^ - b
     d xi_R/dt = -R zeta_g        d xi_v/dt = g x xi_R - [v]x R zeta_g - R zeta_a        d xi_p/dt = xi_v - [p]x R zeta_g
 
-Without biases the estimate enters no Jacobian, and "the body does not move" observes xi_v alone, by a constant matrix: a
-heading that nothing shows cannot be taken for one that is known. Heading starts at zero with no uncertainty, which only names
-the horizontal axes: the equations do not depend on it.
+Without biases the Jacobians do not depend on the estimate, and "the body does not move" observes only xi_v, by a constant
+matrix: the filter cannot become certain of an unobservable heading. Heading starts at zero with zero variance, which only
+names the horizontal axes: the equations do not depend on it.
 
-The bias in motion is b; at rest on the ground it is b + d. The two differ (motors; on EuRoC by 1e-3 rad/s), and d is unknown
-but stays for the run. Measured are: at rest, that velocity and rate are zero; in motion, that velocity is bounded,
-v ~ N(0, speed²) forgotten after `speed_correlation_s`, which over tens of seconds shows tilt, and with it the bias across
-gravity, by gravity itself. A body that travels at several times `speed_m_s` has the measurement weakened (Huber).
+The bias in motion is b; at rest on the ground it is b + d. The two differ (motors; on EuRoC by 1e-3 rad/s); d is unknown and
+constant for the run. Measurements: at rest, velocity and rate are zero; in motion, velocity is bounded, v ~ N(0, speed²) with
+correlation time `speed_correlation_s`. Over tens of seconds the bound makes tilt observable through gravity, and with it the
+bias across gravity. For a body at several times `speed_m_s` the measurement gets less weight (Huber).
 
-Settings: some two dozen were compared on the training sequences, one changed at a time, with models trained on the test
-sequences; `tests/bench/starts.py` shows on the same sequences what came of it, which is therefore a little optimistic.
+Settings: about two dozen variants were compared on the training sequences, one changed at a time, with models trained on the
+test sequences. `tests/bench/starts.py` measures the result on the same sequences, so it is slightly optimistic.
 """
 
 from __future__ import annotations
@@ -41,9 +41,9 @@ STOPPED = np.zeros((3, SIZE))  # rows of d(velocity)/d(error)
 STOPPED[:, VELOCITY] = np.eye(3)
 STILL = np.zeros((3, SIZE))  # rows of d(gyro bias at rest)/d(error)
 STILL[:, 9:12] = STILL[:, 15:18] = np.eye(3)
-HUBER = 2.0  # standard deviations of a speed, above which it counts less
-LEAST_VARIANCE = 1e-14  # of every error a step adds: keeps the covariance invertible
-MISSING_RAD_S, MISSING_M_S2 = 2.0, 10.0  # what motion may do unseen where samples are missing
+HUBER = 2.0  # standard deviations of a speed, above which it gets less weight
+LEAST_VARIANCE = 1e-14  # that a step adds to every error: keeps the covariance invertible
+MISSING_RAD_S, MISSING_M_S2 = 2.0, 10.0  # standard deviation of the motion during missing samples
 
 Covariance = Float64[np.ndarray, "21 21"]
 Vector6 = Float64[np.ndarray, "6"]
@@ -52,7 +52,7 @@ Positive = Annotated[float, Meta(gt=0)]
 
 
 class FilterSettings(Settings, frozen=True, kw_only=True):
-    """Noise of the samples, and what motion and rest are like."""
+    """Filter settings: noise of the samples, and statistics of motion and rest."""
 
     gyro_density: Positive = 5e-4  # rad/s/sqrt(Hz)
     accel_density: Positive = 0.02  # m/s²/sqrt(Hz): of a calibration in motion rather than of the sensor
@@ -60,13 +60,13 @@ class FilterSettings(Settings, frozen=True, kw_only=True):
     speed_m_s: Positive = 1.0  # per axis
     speed_correlation_s: Positive = 0.5
     rest_m_s: Positive = 0.05  # of a block at rest
-    rest_rad_s: Positive = 2e-4  # motion that is taken for rest: a stop begins and ends slowly
-    start_m_s2: Positive = 1.5  # mean acceleration over the first block: how far it tilts "up"
+    rest_rad_s: Positive = 2e-4  # motion within a stop: it begins and ends slowly
+    start_m_s2: Positive = 1.5  # mean acceleration over the first block: its tilt of "up"
 
 
 @dataclass(frozen=True)
 class State:
-    """An estimate: pose, the bias b in motion (gyro rad/s, accel m/s²), d to be added at rest, and the covariance."""
+    """Filter state: pose, bias b in motion (gyro rad/s, accel m/s²), offset d at rest, and covariance."""
 
     R_wb: Matrix3
     v_w: Vector3
@@ -76,17 +76,17 @@ class State:
     P: Covariance
 
     def rest_bias(self, resting: bool) -> Vector6:
-        """The sensor's bias now."""
+        """Bias of the sensor, at rest or in motion."""
         return self.bias + self.ground if resting else self.bias
 
     def covariance(self, resting: bool) -> Float64[np.ndarray, "6 6"]:
-        """Of `rest_bias`."""
+        """Covariance of `rest_bias`."""
         P = self.P
         both = P[BIAS, BIAS] + P[BIAS, GROUND] + P[GROUND, BIAS] + P[GROUND, GROUND]
         return both if resting else P[BIAS, BIAS]
 
     def moved(self, e: Error, P: Covariance) -> State:
-        """The estimate with an error of e put on top: Exp(e) of the pose, and sums."""
+        """State with an added error e: Exp(e) of the pose, and sums."""
         E, J = exp(e[TURN]), _left_jacobian(e[TURN])
         return State(
             E @ self.R_wb,
@@ -98,7 +98,7 @@ class State:
         )
 
     def minus(self, other: State) -> Error:
-        """The error e for which this is `other.moved(e)`."""
+        """Error e with `self == other.moved(e)`."""
         E = self.R_wb @ other.R_wb.T
         xi = _log(E)
         J = _left_jacobian(xi)
@@ -107,7 +107,7 @@ class State:
 
 
 class Step(NamedTuple):
-    """One block: the estimate before it, what was expected after it, the transition, and the estimate after it."""
+    """Filter step over a block: state before, predicted state, transition, and state after the measurements."""
 
     before: State
     expected: State
@@ -116,7 +116,7 @@ class Step(NamedTuple):
 
 
 def level(accel: Vector3, bias: Vector6, ground: Vector6, P_bias: Float64[np.ndarray, "12 12"], s: FilterSettings) -> State:
-    """An estimate from nothing but the direction of the mean specific force: heading 0, some velocity, at the origin."""
+    """Levelled state from the direction of the mean specific force: heading 0, unknown velocity, at the origin."""
     up_b = (accel - bias[3:]) / np.linalg.norm(accel - bias[3:])
     axis = np.array([up_b[1], -up_b[0], 0.0])  # up_b x z
     sine = float(np.linalg.norm(axis))
@@ -130,12 +130,15 @@ def level(accel: Vector3, bias: Vector6, ground: Vector6, P_bias: Float64[np.nda
 
 
 def motion_step(x: State, motion: Increment, missing_s: float, walk: Vector6, s: FilterSettings) -> Step:
-    """Through a block in motion, integrated with the bias of `x`; then the bounded velocity. `walk` is b's in a second^1/2."""
+    """Filter step over a block in motion: prediction with the bias of `x`, then the bounded velocity.
+
+    `walk` is the random walk of b per second^1/2.
+    """
     T = motion.duration_s
     R = x.R_wb @ motion.R
     turn = s.gyro_density**2 * T + (s.gyro_scale * motion.turned_rad) ** 2 + (MISSING_RAD_S * missing_s) ** 2
     push = s.accel_density**2 * T + (MISSING_M_S2 * missing_s) ** 2
-    step = _expect(x, R, motion.v, motion.p, motion.by_bias, T, (turn, push), walk, resting=False)
+    step = _predict(x, R, motion.v, motion.p, motion.by_bias, T, (turn, push), walk, resting=False)
     noise = 2.0 * s.speed_m_s**2 * s.speed_correlation_s / T
     v = step.expected.v_w
     size = np.sqrt(v @ v / 3.0 / (np.trace(step.expected.P[VELOCITY, VELOCITY]) / 3.0 + noise))
@@ -144,18 +147,18 @@ def motion_step(x: State, motion: Increment, missing_s: float, walk: Vector6, s:
 
 
 def rest_step(x: State, mean: Vector6, variance: Float64[np.ndarray, "3"], T: float, walk: Vector6, s: FilterSettings) -> Step:
-    """Through a block at rest, from the samples' mean and the variance of the gyro's: no velocity, no rate."""
+    """Filter step over a block at rest, from the samples' mean and the variance of the gyro's mean."""
     dv = (mean[3:] - x.bias[3:] - x.ground[3:]) * T
     by_bias = np.zeros((9, 6))
     by_bias[3:6, 3:], by_bias[6:, 3:] = -T * np.eye(3), -0.5 * T**2 * np.eye(3)
     push = s.accel_density**2 * T
-    step = _expect(x, x.R_wb, dv, 0.5 * T * dv, by_bias, T, (LEAST_VARIANCE, push), walk, resting=True)
+    step = _predict(x, x.R_wb, dv, 0.5 * T * dv, by_bias, T, (LEAST_VARIANCE, push), walk, resting=True)
     after = update(step.expected, STOPPED, step.expected.v_w, np.full(3, s.rest_m_s**2))
     rate = after.rest_bias(True)[:3] - mean[:3]
     return step._replace(after=update(after, STILL, rate, variance + s.rest_rad_s**2))
 
 
-def _expect(
+def _predict(
     x: State,
     R: Matrix3,
     dv: Vector3,
@@ -167,7 +170,7 @@ def _expect(
     *,
     resting: bool,
 ) -> Step:
-    """The estimate after a block, before anything is measured."""
+    """Predicted state after a block."""
     v = x.v_w + G_W * T + x.R_wb @ dv
     p = x.p_wb + x.v_w * T + 0.5 * T**2 * G_W + x.R_wb @ dp
     F = np.eye(SIZE)
@@ -190,7 +193,7 @@ def _expect(
 
 
 def update(x: State, H: Float64[np.ndarray, "k 21"], z: Float64[np.ndarray, " k"], noise: Float64[np.ndarray, " k"]) -> State:
-    """The Kalman update by z = H e + n, where e is the error of the estimate and n has these variances."""
+    """Kalman update by z = H e + n, with e the error of the estimate and `noise` the variances of n."""
     PH = x.P @ H.T
     K = np.linalg.solve(H @ PH + np.diag(noise), PH.T).T
     I_KH = np.eye(SIZE) - K @ H
@@ -199,21 +202,21 @@ def update(x: State, H: Float64[np.ndarray, "k 21"], z: Float64[np.ndarray, " k"
 
 
 def smooth(steps: Sequence[Step]) -> list[State]:
-    """Rauch, Tung and Striebel's backward pass: the estimates before the first block and after each, given all blocks."""
+    """Smoothed states (Rauch, Tung and Striebel) before the first block and after each block."""
     later = steps[-1].after
-    found = [later]
+    states = [later]
     for step in reversed(steps):
-        scale = np.sqrt(np.diag(step.expected.P))  # units of rad/s beside metres: solved in units of one
+        scale = np.sqrt(np.diag(step.expected.P))  # rad/s and metres differ in size: solved with unit variances
         scaled = step.expected.P / scale[:, None] / scale
         C = np.linalg.solve(scaled, (step.F @ step.before.P) / scale[:, None]).T / scale
         P = step.before.P + C @ (later.P - step.expected.P) @ C.T
         later = step.before.moved(C @ later.minus(step.expected), 0.5 * (P + P.T))
-        found.append(later)
-    return found[::-1]
+        states.append(later)
+    return states[::-1]
 
 
 def reset_pose(x: State, accel: Vector3, s: FilterSettings) -> Step:
-    """Pose anew, biases kept: after a time without samples, in which anything may have happened."""
+    """Reset of the pose after a gap in the samples; the biases stay."""
     fresh = level(accel, x.bias, x.ground, x.P[9:, 9:], s)
     P = fresh.P + LEAST_VARIANCE * np.eye(SIZE)
     F = np.zeros((SIZE, SIZE))

@@ -1,8 +1,8 @@
-"""What an ideal IMU would read along a true trajectory: angular rate, angular acceleration, specific force at a point.
+"""Kinematics of a trajectory: angular rate, angular acceleration and specific force, as of an ideal IMU.
 
 The trajectory is a pair of splines, one for the position, one for the quaternion. The quaternion spline need not stay
-on the unit sphere: any positive multiple of a unit quaternion stands for the same rotation, so four free coordinates
-have no singularity to steer around, whatever the angles, and every derivative follows in closed form.
+on the unit sphere: any positive multiple of a unit quaternion is the same rotation. So four free coordinates have no
+singularity, whatever the angles, and every derivative has a closed form.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from imutool.errors import DataError, NumericsError
 from imutool.recording import GRAVITY_M_S2, Imu, Poses, Times, seconds
 
 DEGREE = 5  # continuous angular acceleration needs 3; 5 also keeps its slope and the jerk continuous
-SMALLEST_NORM = 0.1  # a quaternion spline that comes nearer to zero has knots too far apart to mean a rotation
+SMALLEST_NORM = 0.1  # a quaternion spline of smaller norm has knots too far apart
 G_W = np.array([0.0, 0.0, -GRAVITY_M_S2])
 G_W.flags.writeable = False
 
@@ -27,10 +27,10 @@ Vectors = Float64[np.ndarray, "n 3"]
 
 
 def lever_acceleration(omega: Any, alpha: Any, arms: Any) -> tuple[Any, Any, Any]:
-    """Acceleration alpha x r + omega x (omega x r) of a point r away on a rigid body (m/s²), by axis.
+    """Lever-arm acceleration alpha x r + omega x (omega x r) of a rigid body at r (m/s²), by axis.
 
-    Component i is that of the point `arms[i]`: an accelerometer's axes may lie apart. omega and alpha are three floats or three
-    columns each; written out, because for floats numpy would cost several times the arithmetic.
+    Component i is that of the point `arms[i]`, because the axes of an accelerometer may be at different points. omega and alpha
+    are three floats or three columns each; written out, because for floats numpy costs several times the arithmetic.
     """
     (wx, wy, wz), (ax, ay, az) = omega, alpha
     (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = arms
@@ -44,7 +44,7 @@ def lever_acceleration(omega: Any, alpha: Any, arms: Any) -> tuple[Any, Any, Any
 
 @dataclass(frozen=True, eq=False)
 class Motion:
-    """A trajectory and its derivatives at some instants; the suffix names the frame, world or body."""
+    """Motion at some instants: poses and derivatives; the suffix names the frame, world or body."""
 
     p_wb: Vectors
     q_wb_wxyz: Float64[np.ndarray, "n 4"]
@@ -54,7 +54,7 @@ class Motion:
     alpha_b: Vectors
 
     def acceleration(self, r_b: Float[np.ndarray, "3"] | None = None) -> Vectors:
-        """World acceleration (m/s²) of the tracked point, or of the point `r_b` (m) away from it in the body.
+        """World acceleration (m/s²) of the tracked point, or of the point at `r_b` (m) from it in the body.
 
         a_w + R_wb (alpha x r + omega x (omega x r)), the rigid-body law.
         """
@@ -63,9 +63,9 @@ class Motion:
         return self.a_w + self._rotation().apply(self._lever(r_b))
 
     def specific_force(self, r_b: Float[np.ndarray, "3"] | None = None, g_w: Float[np.ndarray, "3"] = G_W) -> Vectors:
-        """What an ideal accelerometer at `r_b` reads, in the body frame (m/s²): R_wb^T (a_w - g_w); at rest +g up."""
-        felt = self._rotation().apply(self.a_w - g_w, inverse=True)
-        return felt if r_b is None else felt + self._lever(r_b)
+        """Specific force at `r_b` in the body frame (m/s²): R_wb^T (a_w - g_w); at rest +g up."""
+        force = self._rotation().apply(self.a_w - g_w, inverse=True)
+        return force if r_b is None else force + self._lever(r_b)
 
     def _lever(self, r_b: Float[np.ndarray, "3"]) -> Vectors:
         return np.stack(lever_acceleration(self.omega_b.T, self.alpha_b.T, (r_b, r_b, r_b)), axis=1)
@@ -76,20 +76,20 @@ class Motion:
 
 @dataclass(frozen=True, eq=False)
 class Trajectory:
-    """A smooth motion: splines from seconds since `start_ns` to position (m) and to a multiple of `q_wb_wxyz`."""
+    """Smooth trajectory: splines of position (m) and of a multiple of `q_wb_wxyz` over seconds since `start_ns`."""
 
     start_ns: int
     position: BSpline
     quaternion: BSpline
 
     def at(self, t_ns: Times) -> Motion:
-        """The motion at some instants.
+        """Motion at some instants.
 
-        With Q the spline and n = |Q|², differentiating R(Q) gives omega_b = 2 Im(Q* Q') / n, and once more
-        alpha_b = 2 Im(Q* Q'') / n - omega_b n' / n: Im(Q'* Q') vanishes, so no further term is left.
+        With Q the spline and n = |Q|², the derivative of R(Q) is omega_b = 2 Im(Q* Q') / n, and the second one
+        alpha_b = 2 Im(Q* Q'') / n - omega_b n' / n, because Im(Q'* Q') is zero.
 
         Raises:
-            NumericsError: an instant outside the splines, or a quaternion too near zero to name a rotation.
+            NumericsError: an instant outside the splines, or a quaternion too near zero for a rotation.
         """
         t = seconds(t_ns, self.start_ns)
         self._inside(t)
@@ -107,7 +107,7 @@ class Trajectory:
         return Motion(p, q / np.sqrt(n), v, a, omega_b, alpha_b)
 
     def poses(self, t_ns: Times) -> Poses:
-        """The true poses and velocities at some instants.
+        """Poses and velocities at some instants.
 
         Raises:
             NumericsError: as `at`.
@@ -116,7 +116,7 @@ class Trajectory:
         return Poses(t_ns, motion.p_wb, motion.q_wb_wxyz, motion.v_w)
 
     def imu(self, t_ns: Times, r_b: Float[np.ndarray, "3"] | None = None, g_w: Float[np.ndarray, "3"] = G_W) -> Imu:
-        """What an ideal IMU at `r_b` reads at some instants: no bias, no noise, no filter.
+        """Samples of an ideal IMU at `r_b`: no bias, no noise, no filter.
 
         Raises:
             NumericsError: as `at`.
@@ -135,13 +135,13 @@ class Trajectory:
 
 
 def fit_trajectory(poses: Poses, knot_spacing_s: float | None = None, degree: int = DEGREE) -> Trajectory:
-    """The smooth trajectory through true poses, time counted from the first of them.
+    """Smooth trajectory through true poses, with time from the first pose.
 
-    Without `knot_spacing_s` the splines pass through every pose, noise included: its second derivative is then noise
-    times 1/dt². With it they are the least-squares splines on knots that far apart, which is the smoothing.
+    Without `knot_spacing_s` the splines pass through every pose, and the noise of the second derivative is that of the poses
+    times 1/dt². With it they are least-squares splines on knots of this spacing, which smooths the poses.
 
     Raises:
-        DataError: too few poses, or a gap that leaves knots without poses.
+        DataError: too few poses, or a gap with knots but without poses.
     """
     if len(poses) <= degree:
         raise DataError(f"{len(poses)} true poses", expected=f"more than {degree} for a spline of degree {degree}")
@@ -171,7 +171,7 @@ def _conjugate_product(a: Float64[np.ndarray, "n 4"], b: Float64[np.ndarray, "n 
 
 
 def continuous(q_wxyz: Float64[np.ndarray, "n 4"]) -> Float64[np.ndarray, "n 4"]:
-    """The same rotations with signs chosen so that neighbours lie in one hemisphere (q and -q are one rotation)."""
+    """Quaternions with signs such that neighbours are in one hemisphere (q and -q are one rotation)."""
     flips = np.where(np.sum(q_wxyz[1:] * q_wxyz[:-1], axis=1) < 0.0, -1.0, 1.0)
     signed: Float64[np.ndarray, "n 4"] = q_wxyz * np.concatenate([[1.0], np.cumprod(flips)])[:, None]
     return signed

@@ -1,8 +1,8 @@
-"""How far an estimated trajectory is from the truth: plain dicts, the unit in every key, ready for JSON.
+"""Error metrics of an estimated trajectory: plain dicts for JSON, with the unit in every key.
 
-Definitions are the paper's (section "Evaluation Metric"), which are those of evo; equality with evo's command line is
-tested. Both trajectories are on the same stamps, with a mask of the rows where the truth is known; masked rows count
-nowhere, as if they had been left out of exported files. A figure that the data do not determine is None (JSON null).
+Definitions are the paper's (section "Evaluation Metric"), which are those of evo; a test compares with evo's command line.
+Both trajectories have the same stamps, and a mask marks the rows with truth; other rows count nowhere. A figure that the
+data do not determine is None (JSON null).
 
 ==================  ===================================================================================================
 aoe_deg, ape_m      root mean square of the rotation angle and of the distance between estimate and truth, not aligned:
@@ -31,18 +31,17 @@ from imutool.geometry import quaternion
 from imutool.recording import Poses
 
 DISTANCES_M = (5.0, 10.0, 15.0, 20.0)
-PAIR_TOLERANCE = 0.1  # a pair counts when its distance is within this share of the one asked for: evo's default
-AT_ONCE = 1 << 13  # pairs, so that what is made of them stays near the processor
-FLAT = np.finfo(
-    np.float64
-).eps  # singular value (m²) under which positions lie on a line for evo, and rotation about it is free
+PAIR_TOLERANCE = 0.1  # relative tolerance of a pair's distance: evo's default
+AT_ONCE = 1 << 13  # pairs, so that their arrays stay in the cache
+# least singular value (m²): below it positions lie on a line for evo, and rotation about the line is free
+FLAT = np.finfo(np.float64).eps
 
 Mask = Bool[np.ndarray, " n"]
 Points = Float64[np.ndarray, "n 3"]
 
 
 def evaluate(estimate: Poses, truth: Poses, valid: Mask, distances_m: Sequence[float] = DISTANCES_M) -> dict[str, Any]:
-    """All figures of the module's table, with `samples` (rows that count) and `duration_s` (first such row to last).
+    """Error metrics of the module's table, with `samples` (rows that count) and `duration_s` (first such row to last).
 
     Raises:
         DataError: stamps differ, or no row is valid.
@@ -59,15 +58,14 @@ def evaluate(estimate: Poses, truth: Poses, valid: Mask, distances_m: Sequence[f
 
 
 def orientation_errors(estimate: Poses, truth: Poses) -> Float64[np.ndarray, " n"]:
-    """The angle between estimate and truth at every row, in rad."""
+    """Orientation errors at every row, in rad."""
     return quaternion.angle_between(_unit(estimate), _unit(truth))
 
 
 def absolute(estimate: Poses, truth: Poses, valid: Mask) -> dict[str, float | None]:
-    """`aoe_deg`, `aoe_aligned_deg`, `ape_m`, `ape_aligned_m`, `velocity_rmse_m_s`.
+    """Absolute errors: `aoe_deg`, `aoe_aligned_deg`, `ape_m`, `ape_aligned_m`, `velocity_rmse_m_s`.
 
-    The aligned figures are None where positions (of either) do not span a plane, the velocity figure where a
-    velocity is missing.
+    The aligned figures are None if positions (of either) do not span a plane, the velocity figure if a velocity is missing.
 
     Raises:
         DataError: stamps differ, or no row is valid.
@@ -76,7 +74,7 @@ def absolute(estimate: Poses, truth: Poses, valid: Mask) -> dict[str, float | No
     estimate, truth = _scored(estimate, truth, valid)
     q_est, q_true = _unit(estimate), _unit(truth)
     p_est, p_true = estimate.p_wb, truth.p_wb
-    with np.errstate(over="ignore", invalid="ignore"):  # judged at the end, by the figures themselves
+    with np.errstate(over="ignore", invalid="ignore"):  # `_check_finite` checks the figures
         motion = align(p_est, p_true)
         aligned: tuple[float | None, float | None] = (None, None)
         if motion is not None:
@@ -101,15 +99,15 @@ def absolute(estimate: Poses, truth: Poses, valid: Mask) -> dict[str, float | No
 def relative(
     estimate: Poses, truth: Poses, valid: Mask, distances_m: Sequence[float] = DISTANCES_M
 ) -> dict[str, dict[str, float | None]]:
-    """`roe_deg` and `rpe_m`, each keyed by the distance in metres ("5"); None where the true path is too short.
+    """Relative errors `roe_deg` and `rpe_m`, keyed by the distance in metres ("5"); None if the true path is too short.
 
     Raises:
         DataError: stamps differ, or no row is valid.
         NumericsError: a figure is not finite.
     """
     estimate, truth = _scored(estimate, truth, valid)
-    # With C = R_true R_est^T, R_true,i^T (dp_true - C_i dp_est) is the difference of motions, and C_i C_j^T that of their turns
-    # seen from elsewhere: the length and the angle are the same, for a fraction of the products.
+    # With C = R_true R_est^T, R_true,i^T (dp_true - C_i dp_est) is the difference of motions, and C_i C_j^T that of their
+    # rotations in another frame: length and angle are the same, for a fraction of the products.
     C = quaternion.multiply(_unit(truth), quaternion.inverse(_unit(estimate)))
     roe: dict[str, float | None] = {}
     rpe: dict[str, float | None] = {}
@@ -132,9 +130,9 @@ def relative(
 
 
 def align(p: Points, p_target: Points) -> tuple[Rotation, Float64[np.ndarray, "3"]] | None:
-    """Rotation and shift that bring points nearest to others by least squares (Umeyama 1991, eq. 40-42, scale 1).
+    """Rotation and shift of the least-squares alignment of points (Umeyama 1991, eq. 40-42, scale 1).
 
-    None where the points leave the rotation free: fewer than two directions in their covariance.
+    None if the points do not determine the rotation: fewer than two directions in their covariance.
 
     Raises:
         NumericsError: the covariance of the positions overflows.
@@ -154,10 +152,10 @@ def align(p: Points, p_target: Points) -> tuple[Rotation, Float64[np.ndarray, "3
 def pairs_by_distance(
     p: Points, distance_m: float, tolerance: float = PAIR_TOLERANCE
 ) -> tuple[Int64[np.ndarray, " m"], Int64[np.ndarray, " m"]]:
-    """For each point i the later point j nearest to `distance_m` further along the path, where one is within tolerance.
+    """Pairs (i, j): for each point i the later point j nearest to `distance_m` along the path, within tolerance.
 
-    The rule of evo's `--all_pairs`: of equally near points the first. Found by bisection, since distance along a path
-    only grows (evo searches every pair; 30 000 poses would take it minutes).
+    The rule of evo's `--all_pairs`: of equally near points the first. Bisection applies because distance along a path only
+    grows (evo searches every pair, minutes for 30 000 poses).
     """
     travelled = np.concatenate([[0.0], np.cumsum(quaternion.length(np.diff(p, axis=0)))])
     i = np.arange(len(p) - 1)
@@ -173,24 +171,24 @@ def pairs_by_distance(
 
 
 def write_tum(poses: Poses, path: Path, overwrite: bool = False) -> None:
-    """Writes `t x y z qx qy qz qw` lines (TUM RGB-D format): stamps with nine decimals, numbers that read back exactly.
+    """Write `t x y z qx qy qz qw` lines (TUM RGB-D format): stamps with nine decimals, exact numbers.
 
     Raises:
         ConfigError: the target exists and `overwrite` is false, or cannot be written.
     """
     if path.exists() and not overwrite:
-        raise ConfigError("the file exists", where=path, expected="a new file", fix="Add --overwrite to replace it")
+        raise ConfigError("the file exists", where=path, expected="a new file", fix="Give `overwrite` to replace it")
     columns = np.concatenate([poses.p_wb, poses.q_wb_wxyz[:, [1, 2, 3, 0]]], axis=1).tolist()
     stamps = (f"{'-' * (t < 0)}{abs(t) // 10**9}.{abs(t) % 10**9:09d}" for t in poses.t_ns.tolist())
     text = "".join(f"{stamp} {' '.join(map(repr, row))}\n" for stamp, row in zip(stamps, columns, strict=True))
-    beside = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    part = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     try:
-        beside.write_text(text, encoding="ascii")
-        beside.replace(path)
+        part.write_text(text, encoding="ascii")
+        part.replace(path)
     except OSError as error:
         raise ConfigError(f"cannot be written ({error.strerror})", where=path, expected="a writable folder") from error
     finally:
-        beside.unlink(missing_ok=True)
+        part.unlink(missing_ok=True)
 
 
 def _scored(estimate: Poses, truth: Poses, valid: Mask) -> tuple[Poses, Poses]:
@@ -201,12 +199,12 @@ def _scored(estimate: Poses, truth: Poses, valid: Mask) -> tuple[Poses, Poses]:
             expected="the same stamps (Poses.at)",
         )
     if not valid.any():
-        raise DataError("the truth is known at none of the estimate's stamps", expected="some overlap")
+        raise DataError("no stamp of the estimate has truth", expected="an overlap")
     return (estimate, truth) if valid.all() else (estimate.rows(valid), truth.rows(valid))
 
 
 def _unit(poses: Poses) -> Float64[np.ndarray, "n 4"]:
-    """Orientations as unit as float64 can; a file's six decimals would count as an angle."""
+    """Unit orientations in float64; the six decimals of a file would count as an angle."""
     return quaternion.unit(poses.q_wb_wxyz)
 
 
@@ -218,6 +216,4 @@ def _rms(errors: Float64[np.ndarray, " n *k"]) -> float:
 def _check_finite(figures: dict[str, float | None]) -> None:
     for name, value in figures.items():
         if value is not None and not np.isfinite(value):
-            raise NumericsError(
-                f"{name} is {value}", expected="a finite error", fix="The estimate diverged; look at its inputs"
-            )
+            raise NumericsError(f"{name} is {value}", expected="a finite error", fix="The estimate diverged: check its inputs")

@@ -1,9 +1,8 @@
-"""What a stretch of inertial samples adds to attitude, velocity and position, and how a bias changes that; numpy, no torch.
+"""Preintegration: increments of attitude, velocity and position, with their bias Jacobians; numpy, no torch.
 
-Forster, Carlone, Dellaert, Scaramuzza, "On-Manifold Preintegration", TRO 2017, eq. 33-36 and 44, here with the mean of two
-samples over the step between them (`imutool.inertial.windows` says why) and with sums in place of the recursions, so that a
-block of a
-hundred samples costs a few dozen array operations.
+Forster, Carlone, Dellaert, Scaramuzza, "On-Manifold Preintegration", TRO 2017, eq. 33-36 and 44. Here a step uses the mean of
+its two samples (reason: `imutool.inertial.windows`), and sums replace the recursions: a block of a hundred samples costs a few
+dozen array operations.
 """
 
 from __future__ import annotations
@@ -20,9 +19,9 @@ SMALL_RAD2 = 1e-8  # below, two terms of the series are exact to 1e-17
 
 
 class Increment(NamedTuple):
-    """The motion over a block, seen from the body at its start and without gravity.
+    """Increment over a block, in the body frame at its start and without gravity.
 
-    `by_bias` is the derivative of (turn in rad seen from the body at the end, v, p) by a constant added to the bias.
+    `by_bias` is the derivative of (rotation in rad in the body frame at the end, v, p) by a constant added to the bias.
     """
 
     duration_s: float
@@ -30,11 +29,11 @@ class Increment(NamedTuple):
     v: Vector3
     p: Vector3
     by_bias: Float64[np.ndarray, "9 6"]
-    turned_rad: float  # the length of the way, not of the chord
+    turned_rad: float  # length of the path, not of the chord
 
 
 def hat(x: Float64[np.ndarray, "*batch 3"]) -> Float64[np.ndarray, "*batch 3 3"]:
-    """The matrix of `x ×`."""
+    """Skew matrix of `x ×`."""
     out = np.zeros((*x.shape, 3))
     out[..., 0, 1], out[..., 0, 2], out[..., 1, 2] = -x[..., 2], x[..., 1], -x[..., 0]
     out[..., 1, 0], out[..., 2, 0], out[..., 2, 1] = x[..., 2], -x[..., 1], x[..., 0]
@@ -42,7 +41,7 @@ def hat(x: Float64[np.ndarray, "*batch 3"]) -> Float64[np.ndarray, "*batch 3 3"]
 
 
 def exp(xi: Float64[np.ndarray, "*batch 3"]) -> Float64[np.ndarray, "*batch 3 3"]:
-    """The rotation by a rotation vector (Rodrigues)."""
+    """Rotation by a rotation vector (Rodrigues)."""
     square = (xi * xi).sum(-1)[..., None, None]
     small = square < SMALL_RAD2
     angle = np.sqrt(np.where(small, 1.0, square))
@@ -54,11 +53,11 @@ def exp(xi: Float64[np.ndarray, "*batch 3"]) -> Float64[np.ndarray, "*batch 3 3"
 
 
 def integrate(t_s: Float64[np.ndarray, " n"], gyro: Vectors, accel: Vectors) -> Increment:
-    """The increment from the first sample to the last, of samples that a bias has been taken off already."""
+    """Increment from the first sample to the last; the samples are already minus their bias."""
     dt = np.diff(t_s)
     step = 0.5 * (gyro[:-1] + gyro[1:]) * dt[:, None]
     R = np.concatenate([np.eye(3)[None], _running_product(exp(step))])  # body at each sample to body at the first
-    # a constant c added to the bias turns step k by -Jr c dt, seen through what comes after
+    # a constant c added to the bias turns step k by -Jr c dt, transformed by the later steps
     right_jacobian = (np.eye(3) - 0.5 * hat(step)) * dt[:, None, None]
     turned = np.concatenate([np.zeros((1, 3, 3)), np.cumsum(R[1:] @ right_jacobian, axis=0)])
     R_by_bias = -R.swapaxes(-1, -2) @ turned
@@ -73,8 +72,8 @@ def integrate(t_s: Float64[np.ndarray, " n"], gyro: Vectors, accel: Vectors) -> 
     for rows, weights in ((slice(3, 6), to_velocity), (slice(6, 9), to_position)):
         by_bias[rows, :3] = np.einsum("n,nij->ij", weights, force_by_gyro_bias)
         by_bias[rows, 3:] = -np.einsum("n,nij->ij", weights, R)
-    way = float(np.sqrt((step * step).sum(axis=1)).sum())
-    return Increment(float(t_s[-1] - t_s[0]), R[-1], to_velocity @ force, to_position @ force, by_bias, way)
+    turned_rad = float(np.sqrt((step * step).sum(axis=1)).sum())
+    return Increment(float(t_s[-1] - t_s[0]), R[-1], to_velocity @ force, to_position @ force, by_bias, turned_rad)
 
 
 def _running_product(R: Float64[np.ndarray, "n 3 3"]) -> Float64[np.ndarray, "n 3 3"]:

@@ -1,13 +1,13 @@
-"""Finds the stretches in which an IMU rests, from its samples alone.
+"""Rest detection: the stretches in which an IMU rests, from its samples only.
 
-At rest, what is left of the angular rate is a constant and noise (with idling motors: vibration). Both average out:
-the means of blocks of k samples scatter by the standard deviation within the blocks over sqrt(k). Motion does not average
-out. A window rests when its block means scatter no more than that (or no more than the calmest windows of the log do,
-for sensors whose filter makes neighbouring samples alike), within absolute caps that hold whatever the log looks like.
+At rest, the angular rate is a constant plus noise (with idling motors: vibration). Noise averages out: the means of blocks of
+k samples scatter by the standard deviation within the blocks over sqrt(k). Motion does not average out. A window rests if its
+block means scatter no more than that (or no more than the calmest windows of the log, for sensors whose filter correlates
+neighbouring samples), within absolute caps for every log.
 
 Chosen on the 23 recordings of EuRoC, TUM-VI and FETCH against their true poses: the scatter of 0.1 s means over 1 s is
 at most 0.007 rad/s on the ground with motors running, and at least 0.008 in hovering flight, 0.03 in the hand.
-A steady turn about the vertical looks like a bias; only its disagreement with the rest of the log gives it away.
+A steady turn about the vertical looks like a bias; only its difference from the other rest of the log shows it.
 """
 
 from __future__ import annotations
@@ -24,11 +24,11 @@ from msgspec import Meta
 from imutool.config import Settings
 from imutool.recording import Imu, nanoseconds
 
-WHITE_MARGIN = 1.3  # of block means over white noise; with 10 blocks of 3 axes its own scatter is 0.14
-FLOOR_MARGIN = 2.5  # over the calmest windows of the log
-FLOOR_RANK = 10  # the window that sets the floor, from the calmest: one stuck or lucky window must not
+WHITE_MARGIN = 1.3  # ratio of block means to white noise; with 10 blocks of 3 axes it scatters by 0.14
+FLOOR_MARGIN = 2.5  # ratio to the calmest windows of the log
+FLOOR_RANK = 10  # rank of the window that sets the floor: a single stuck window must not
 NOISE_BLOCK, CALMEST = 20, 0.25
-KEPT_MEANS = 100  # of windows at rest, for the usual one
+KEPT_MEANS = 100  # of windows at rest, for their median
 GAP_PERIODS = 3.0  # a longer step between samples breaks a window
 
 AT_ONCE = 1 << 14  # windows
@@ -38,7 +38,7 @@ Positive = Annotated[float, Meta(gt=0)]
 
 
 class StationarySettings(Settings, frozen=True, kw_only=True):
-    """Lengths of blocks, windows and stretches, and the caps no resting sensor exceeds."""
+    """Settings of rest detection: lengths of blocks, windows and stretches, and caps of a resting sensor."""
 
     block_s: Positive = 0.1
     window_s: Positive = 1.0
@@ -52,7 +52,7 @@ class StationarySettings(Settings, frozen=True, kw_only=True):
 
 
 class Blocks(NamedTuple):
-    """Samples in blocks of `k`, as what rest is told by: 113 bytes for each, 4 MB an hour, whatever the rate."""
+    """Block statistics of samples in blocks of `k`: 113 bytes per block, 4 MB per hour at any rate."""
 
     k: int
     period_s: float
@@ -64,7 +64,7 @@ class Blocks(NamedTuple):
 
 
 def block_statistics(batches: Iterable[Batch], period_s: float, settings: StationarySettings | None = None) -> Blocks:
-    """The blocks of some samples, of which no more than a batch is held; what does not fill a block at the end is left out."""
+    """Block statistics of batches of samples; memory holds one batch, an incomplete last block is ignored."""
     k = max(2, round((settings or StationarySettings()).block_s / period_s))
     parts = [_blocks_of(np.zeros(0, np.int64), np.zeros((0, 6)), k, 0, period_s)]
     t_left, u_left = np.zeros(0, np.int64), np.zeros((0, 6))
@@ -81,7 +81,7 @@ def block_statistics(batches: Iterable[Batch], period_s: float, settings: Statio
 
 
 def _blocks_of(t_ns: Int64[np.ndarray, " n"], u: Float64[np.ndarray, "n 6"], k: int, before_ns: int, period_s: float) -> Blocks:
-    """The blocks of samples that fill them exactly."""
+    """Block statistics of samples that fill their blocks exactly."""
     t, cut = t_ns.reshape(-1, k), u.reshape(-1, k, 6)
     late = np.diff(t_ns, prepend=np.int64(before_ns)) > nanoseconds(GAP_PERIODS * period_s)
     inside: Bool[np.ndarray, " m"] = np.asarray(late.reshape(-1, k).any(axis=1))
@@ -89,9 +89,9 @@ def _blocks_of(t_ns: Int64[np.ndarray, " n"], u: Float64[np.ndarray, "n 6"], k: 
 
 
 def rest_stretches(imu: Imu, settings: StationarySettings | None = None) -> list[tuple[int, int]]:
-    """Index ranges `[start, end)` in which the sensor rests for at least `min_s`, in order and apart.
+    """Rest stretches of at least `min_s` as ordered, disjoint index ranges `[start, end)`.
 
-    An IMU with fewer samples than a window, or less than two a block, has no stretches.
+    Empty for fewer samples than a window, or fewer than two per block.
     """
     if len(imu) < 2:
         return []
@@ -100,7 +100,7 @@ def rest_stretches(imu: Imu, settings: StationarySettings | None = None) -> list
 
 
 def resting_blocks(blocks: Blocks, settings: StationarySettings | None = None) -> list[tuple[int, int]]:
-    """Ranges `[first, end)` of blocks over which the sensor rests for at least `min_s`, in order and apart.
+    """Rest stretches of at least `min_s` as ordered, disjoint ranges `[first, end)` of blocks.
 
     Window statistics: block means m_j and variances s_j^2 over k samples each; rest when
     std(m) <= max(1.3 sqrt(mean(s^2) / k), 2.5 floor) for the gyro, and all four figures are within their caps.
@@ -123,7 +123,7 @@ def resting_blocks(blocks: Blocks, settings: StationarySettings | None = None) -
         & (np.linalg.norm(gyro_mean, axis=1) <= settings.gyro_mean_rad_s)
         & ~np.lib.stride_tricks.sliding_window_view(blocks.late, width).any(axis=-1)
     )
-    if rests.any():  # a turn-on bias does not jump: what disagrees with most of the rest is a steady turn
+    if rests.any():  # a turn-on bias does not jump: an outlier among the resting windows is a steady turn
         rests &= np.linalg.norm(gyro_mean - np.median(gyro_mean[rests], axis=0), axis=1) <= settings.gyro_agreement_rad_s
     resting_blocks = np.zeros(count, bool)
     for shift in range(width):
@@ -133,10 +133,10 @@ def resting_blocks(blocks: Blocks, settings: StationarySettings | None = None) -
 
 
 class OnlineRestDetector:
-    """The same rule for samples as they come: told block after block, it says whether the sensor has rested until now.
+    """Online rest detector: the same rule, causally, from block to block.
 
-    What `stretches` takes from the whole log is taken from what there was of it so far: the calmest windows, and the usual
-    mean at rest. A block holds half a window; a longer or shorter one shifts the lengths in proportion.
+    The calmest windows and the median mean at rest come from the samples so far, not from the whole log. A block holds half
+    a window; a longer or shorter block changes the lengths in proportion.
     """
 
     def __init__(self, settings: StationarySettings | None = None) -> None:
@@ -150,7 +150,7 @@ class OnlineRestDetector:
         self._windows, self._resting = 0, 0
 
     def __call__(self, gyro: Float64[np.ndarray, "n 3"], accel: Float64[np.ndarray, "n 3"], *, whole: bool = True) -> bool:
-        """Whether the sensor has rested for `min_s` up to the end of these samples; `whole` if none is missing."""
+        """Whether the sensor rests for `min_s` up to the last sample; `whole` if no sample is missing."""
         k = len(gyro) // self.parts
         if k < 2 or not whole:
             self._last, self._resting = None, 0
@@ -179,15 +179,15 @@ class OnlineRestDetector:
         if not (calm and quiet and np.linalg.norm(centre) <= s.gyro_mean_rad_s):
             return False
         self._means.append(centre)
-        usual = np.median(np.array(self._means), axis=0)
-        return bool(np.linalg.norm(centre - usual) <= s.gyro_agreement_rad_s)
+        median = np.median(np.array(self._means), axis=0)
+        return bool(np.linalg.norm(centre - median) <= s.gyro_agreement_rad_s)
 
 
 def white_noise(values: Float64[np.ndarray, "n k"]) -> Float64[np.ndarray, " k"]:
-    """Standard deviation of a sample's white noise, moving or not: second differences where they are calm.
+    """White noise of a sample (standard deviation) from calm second differences, at rest or in motion.
 
-    Their variance is 6 sigma² and motion hardly shows in them; blocks of `NOISE_BLOCK` samples, the one a quarter from the
-    calmest. Of plain white noise this finds five sixths. Zero for fewer samples than a block.
+    The variance of second differences is 6 sigma², with little motion in it. The figure is the lower quartile over blocks of
+    `NOISE_BLOCK` samples: five sixths of pure white noise. Zero for fewer samples than a block.
     """
     second = np.diff(values, n=2, axis=0) ** 2
     if len(second) < NOISE_BLOCK:
@@ -199,9 +199,9 @@ def white_noise(values: Float64[np.ndarray, "n k"]) -> Float64[np.ndarray, " k"]
 def _window_statistics(
     mean: Float64[np.ndarray, "m 3"], var: Float64[np.ndarray, "m 3"], width: int
 ) -> tuple[Float64[np.ndarray, " w"], Float64[np.ndarray, " w"], Float64[np.ndarray, "w 3"]]:
-    """Of each window of consecutive blocks: scatter of the block means, noise within blocks, and the mean."""
+    """Scatter of the block means, noise within blocks, and mean of each window of consecutive blocks."""
     scatter, noise, means = [], [], []
-    for first in range(0, len(mean) - width + 1, AT_ONCE):  # numpy holds ten times the windows it is given
+    for first in range(0, len(mean) - width + 1, AT_ONCE):  # numpy needs ten times the memory of its windows
         part = slice(first, first + AT_ONCE + width - 1)
         m = np.lib.stride_tricks.sliding_window_view(mean[part], width, axis=0)
         v = np.lib.stride_tricks.sliding_window_view(var[part].sum(axis=1), width, axis=0)

@@ -1,12 +1,12 @@
-"""Pure inertial integration at the IMU's own stamps, and the velocity of a truth that has only poses; numpy, no torch.
+"""Strapdown integration at the IMU's stamps, and velocity from true poses; numpy, no torch.
 
-The rule is the paper's Euler step, each sample held until the next::
+The rule is the paper's Euler step, each sample constant until the next::
 
     R_{k+1} = R_k Exp(gyro_k dt_k)
     v_{k+1} = v_k + (R_k accel_k + g_w) dt_k          dt_k = t_{k+1} - t_k
     p_{k+1} = p_k + v_k dt_k
 
-so the last sample is not used, and sample k of the answer depends on samples before k only.
+so the last sample is not used, and row k of the trajectory depends on samples before k only.
 """
 
 from __future__ import annotations
@@ -24,14 +24,14 @@ from imutool.recording import GAP_FACTOR, GRAVITY_M_S2, MIN_GAP_S, Imu, Poses, T
 GRAVITY_W = (0.0, 0.0, -GRAVITY_M_S2)
 VELOCITY_WINDOW_S = 0.2
 VELOCITY_ORDER = 3
-SAMPLES_PER_COEFFICIENT = 3  # a stretch shorter than the window gets a lower order rather than its own noise
+SAMPLES_PER_COEFFICIENT = 3  # a stretch shorter than the window gets a lower order, against noise
 
 Vectors = Float64[np.ndarray, "n 3"]
 Quaternions = Float64[np.ndarray, "n 4"]
 
 
 class StartPose(NamedTuple):
-    """Where an integration begins: orientation (body to world), position in m, world velocity in m/s."""
+    """Start pose of an integration: orientation (body to world), position in m, world velocity in m/s."""
 
     q_wb_wxyz: Float64[np.ndarray, "4"]
     p_wb: Float64[np.ndarray, "3"]
@@ -39,7 +39,7 @@ class StartPose(NamedTuple):
 
     @classmethod
     def of(cls, poses: Poses, row: int = 0) -> StartPose:
-        """The start at one row of a trajectory.
+        """Start pose at one row of a trajectory.
 
         Raises:
             DataError: the trajectory has no velocity (`truth_velocity` derives one), or no such row.
@@ -56,7 +56,7 @@ def dead_reckon(
     start: tuple[Float64[np.ndarray, "4"], Float64[np.ndarray, "3"], Float64[np.ndarray, "3"]],
     g_w: tuple[float, float, float] = GRAVITY_W,
 ) -> Poses:
-    """The trajectory that the IMU alone gives, at every one of its stamps, the first being `start` (a `StartPose`).
+    """Dead-reckoned trajectory at the IMU's stamps, from `start` (a `StartPose`) at the first.
 
     Rotations are a prefix product of quaternions in log depth, velocity and position cumulative sums; the rounding
     grows with the logarithm of the length. 30 000 samples take about 10 ms.
@@ -70,7 +70,7 @@ def dead_reckon(
     q_0, p_0, v_0 = (np.asarray(part, dtype=np.float64) for part in start)
     t = seconds(imu.t_ns, int(imu.t_ns[0]))
     dt = np.diff(t)[:, None]
-    with np.errstate(over="ignore", invalid="ignore"):  # overflow is reported below, with its row
+    with np.errstate(over="ignore", invalid="ignore"):  # overflow is reported below with its row
         steps = quaternion.exp(imu.gyro[:-1] * dt)
         q_wb = quaternion.unit(_prefix_product(np.concatenate([quaternion.unit(q_0[None]), steps])))
         a_w = quaternion.rotate(q_wb[:-1], imu.accel[:-1]) + np.asarray(g_w, dtype=np.float64)
@@ -81,19 +81,19 @@ def dead_reckon(
         raise NumericsError(
             f"integration overflows at sample {row}",
             expected="rates and forces of a moving body",
-            fix="Look at gyro and accel just before that sample",
+            fix="Check gyro and accel just before that sample",
         )
     return Poses(imu.t_ns, p_wb, q_wb, v_w)
 
 
 def along_truth(imu: Imu, truth: Poses, where: str) -> tuple[Poses, Poses, Bool[np.ndarray, " n"]]:
-    """What the IMU alone makes of the stretch that has truth, the truth on the same stamps, and where it can be scored.
+    """Dead-reckoned trajectory over the stretch with truth, the truth on the same stamps, and the mask of valid rows.
 
-    The stretch runs from the first sample at which the truth is known to the last; the start is the truth there, its velocity
-    derived where it has none.
+    The stretch is from the first sample with truth to the last. The start is the truth there; its velocity is derived if it has
+    none.
 
     Raises:
-        DataError: the truth is known at fewer than two samples.
+        DataError: fewer than two samples with truth.
         NumericsError: the numbers overflow.
     """
     rows, true, valid = stretch_with_truth(imu.t_ns, truth, where)
@@ -101,10 +101,10 @@ def along_truth(imu: Imu, truth: Poses, where: str) -> tuple[Poses, Poses, Bool[
 
 
 def stretch_with_truth(t_ns: Times, truth: Poses, where: str) -> tuple[slice, Poses, Bool[np.ndarray, " m"]]:
-    """The rows from the first stamp at which the truth is known to the last, the truth with velocity there, and where it is.
+    """Rows from the first stamp with truth to the last, the truth with velocity there, and the mask of valid rows.
 
     Raises:
-        DataError: the truth is known at fewer than two stamps.
+        DataError: fewer than two stamps with truth.
     """
     true, valid = with_velocity(truth).at(t_ns)
     known = np.flatnonzero(valid)
@@ -115,7 +115,7 @@ def stretch_with_truth(t_ns: Times, truth: Poses, where: str) -> tuple[slice, Po
 
 
 class Drift(NamedTuple):
-    """Errors of integrations that each start from the truth: orientation (rad), velocity (m/s) and position (m)."""
+    """Drift of integrations that start from the truth: orientation (rad), velocity (m/s), position (m)."""
 
     orientation_rad: Float64[np.ndarray, " m"]
     velocity_m_s: Float64[np.ndarray, " m"]
@@ -123,16 +123,16 @@ class Drift(NamedTuple):
 
 
 def window_drift(path: Poses, truth: Poses, first: Int64[np.ndarray, " m"], last: Int64[np.ndarray, " m"] | slice) -> Drift:
-    """How far integrations that start from the truth at rows `first` are from it at rows `last`, all from one integration.
+    """Drift at rows `last` of integrations from the truth at rows `first`, from a single integration.
 
-    `path` is that of the same samples from any start, on the stamps of `truth`. Had it started from the truth at row s, all of
-    it from there on would be turned by C = R_true,s R_s^T, so that none of it is integrated again::
+    `path` is the integration of the same samples from any start, on the stamps of `truth`. An integration from the truth at row
+    s equals `path` rotated by C = R_true,s R_s^T from there on, so nothing is integrated again::
 
         R'_k = C R_k
         v'_k = v_true,s + C (v_k - v_s - g_w T) + g_w T                             T = t_k - t_s
         p'_k = p_true,s + v_true,s T + C (p_k - p_s - v_s T - g_w S) + g_w S        S = (T^2 - sum dt^2) / 2
 
-    S being the rule's own double sum of dt, so that the answer is that of `dead_reckon` over each window, to rounding.
+    S is the double sum of dt by the Euler rule: the result equals `dead_reckon` over each window, to rounding.
 
     Raises:
         DataError: one of the two carries no velocity, or they are on different stamps.
@@ -154,13 +154,12 @@ def window_drift(path: Poses, truth: Poses, first: Int64[np.ndarray, " m"], last
 
 
 def drift(path: Poses, truth: Poses, valid: Bool[np.ndarray, " n"], window_s: float) -> Drift:
-    """How far integration drifts in a window, at the end of each, of what `along_truth` gives.
+    """Drift at the end of consecutive windows of the trajectories that `along_truth` gives.
 
-    Windows follow one another through the log; each starts from the truth and counts if the truth is known at both ends and the
-    IMU has no gap in between. Empty where none does.
+    Each window starts from the truth. It counts if both ends have truth and the IMU has no gap in between. Empty if none does.
 
     Raises:
-        DataError: as `drifted`.
+        DataError: as `window_drift`.
     """
     t = seconds(path.t_ns, int(path.t_ns[0]))
     dt = np.diff(t)
@@ -181,7 +180,7 @@ def drift(path: Poses, truth: Poses, valid: Bool[np.ndarray, " n"], window_s: fl
 
 
 def with_velocity(poses: Poses) -> Poses:
-    """The same trajectory with a velocity: its own, or `truth_velocity` where it has none."""
+    """Trajectory with velocity: its own, or `truth_velocity` if it has none."""
     return poses if poses.v_w is not None else replace(poses, v_w=truth_velocity(poses))
 
 
@@ -191,18 +190,17 @@ def truth_velocity(
     order: int = VELOCITY_ORDER,
     max_gap_s: float | None = None,
 ) -> Vectors:
-    """World velocity (m/s) at every pose, from positions: a Savitzky-Golay derivative on the poses' own stamps.
+    """World velocity (m/s) at every pose: a Savitzky-Golay derivative of positions on the poses' stamps.
 
-    Recipe: around each pose the `window_s` worth of poses (an odd number m, by the median period, over `order`) is
-    fitted by a polynomial of degree `order` in time, by least squares on the true stamps, and its slope taken. On an
-    even clock this is `scipy.signal.savgol_filter(p, m, order, deriv=1, delta=period, mode="interp")`; jitter does no
-    harm. Windows never cross a gap longer than `max_gap_s` (default as in `Poses.at`: four median periods, at least
-    80 ms); near the ends of a stretch they stay inside and the slope is taken off their centre. A stretch shorter than
-    the window lowers the order to keep three poses per coefficient, at least 1; a pose alone between two gaps gets the
-    slope between its neighbours, the only thing known about it.
+    Around each pose, a polynomial of degree `order` in time is fitted to the poses of `window_s` (an odd number m, by the
+    median period, over `order`) by least squares on the true stamps; the velocity is its slope. On an even clock this is
+    `scipy.signal.savgol_filter(p, m, order, deriv=1, delta=period, mode="interp")`; jitter does no harm. Windows never cross a
+    gap longer than `max_gap_s` (default as in `Poses.at`: four median periods, at least 80 ms). Near the ends of a stretch they
+    stay inside, with the slope off their centre. A stretch shorter than the window lowers the order to keep three poses per
+    coefficient, at least 1; a single pose between two gaps gets the slope between its neighbours.
 
     0.2 s and order 3 agree best with the accelerometer over a quarter second on TUM-VI (median 10 mm/s on room2 against
-    15 for 0.1 s and order 5) and FETCH; on EuRoC, which brings its own velocity, they are within 6-8 mm/s of that.
+    15 for 0.1 s and order 5) and FETCH; on EuRoC, which has its own velocity, they are within 6-8 mm/s of that.
 
     Raises:
         DataError: fewer than two poses.
@@ -231,7 +229,7 @@ def _slopes(t: Float64[np.ndarray, " n"], p: Vectors, window: int, order: int) -
     first = np.clip(np.arange(n) - window // 2, 0, n - window)
     rows = first[:, None] + np.arange(window)
     span = t[rows[:, -1]] - t[rows[:, 0]]
-    u = (t[rows] - t[:, None]) / span[:, None]  # about the pose itself, so the slope is one coefficient
+    u = (t[rows] - t[:, None]) / span[:, None]  # relative to the pose: the slope is one coefficient
     basis = np.stack([u**power for power in range(order + 1)], axis=-1)
     weights = np.linalg.pinv(basis)[:, 1, :] / span[:, None]
     slopes: Vectors = np.einsum("nm,nmk->nk", weights, p[rows])
@@ -239,7 +237,7 @@ def _slopes(t: Float64[np.ndarray, " n"], p: Vectors, window: int, order: int) -
 
 
 def _prefix_product(q: Quaternions) -> Quaternions:
-    """q_0, q_0 q_1, q_0 q_1 q_2, ...: pairs are multiplied, their prefixes found likewise, the even ones filled in."""
+    """Products q_0, q_0 q_1, q_0 q_1 q_2, ...: recursively of pairs, then the even ones filled in."""
     if len(q) == 1:
         return q
     pairs = _prefix_product(quaternion.multiply(q[: len(q) // 2 * 2 : 2], q[1::2]))

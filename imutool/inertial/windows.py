@@ -1,11 +1,11 @@
-"""What two true poses say of the samples between them: residuals over a window, and their derivative.
+"""Residuals of samples over windows between two true poses, and their derivatives.
 
 A window is n + 1 samples, the first and last at the two true poses. Samples are points of the signal, so the rate over a step
-is the mean of its two ends. The paper's Euler rule, which holds each sample until the next, is late by half a step: against
-the truth of EuRoC by 2.3 to 2.5 ms, where the mean is by less than 0.2 (`tests/bench/truth_delay.py`). Products over a window
-are taken as a tree, so that a thousand samples cost ten batched multiplications and no Python loop.
+is the mean of its two ends. The paper's Euler rule, which keeps each sample until the next, is late by half a step: 2.3 to
+2.5 ms against the truth of EuRoC, where the mean is late by less than 0.2 ms (`tests/bench/truth_delay.py`). Products over a
+window are a tree, so a thousand samples cost ten batched multiplications and no Python loop.
 
-Used with the measured samples to solve for a constant (`turn_on`), for a calibration (`train.closed_form`), and by the loss.
+Users: the constant bias (`bias_start.bias_from_truth`), the calibration (`training.closed_form`), and the training loss.
 """
 
 from __future__ import annotations
@@ -16,14 +16,14 @@ from torch import Tensor
 
 from imutool.geometry import so3
 
-HUBER_MEDIANS = 1.5  # where a residual begins to count as an outlier, in medians of its kind
+HUBER_MEDIANS = 1.5  # threshold of an outlier, in medians of the residuals
 
 Samples = Float[Tensor, "batch n 3"]
 Steps = Float[Tensor, "batch n-1"]
 
 
 def step_means(u: Samples) -> Float[Tensor, "batch n-1 3"]:
-    """The mean of each sample and the next: what a step from one to the other sees."""
+    """Means of each sample and the next: the value over the step between them."""
     return 0.5 * (u[:, :-1] + u[:, 1:])
 
 
@@ -37,7 +37,7 @@ def running_product(increments: Float[Tensor, "batch n 3 3"]) -> Float[Tensor, "
 
 
 def whole_product(increments: Float[Tensor, "batch n 3 3"]) -> Float[Tensor, "batch 3 3"]:
-    """The product of all increments alone, at half the cost of the running one."""
+    """Product of all increments, at half the cost of the running product."""
     while increments.shape[1] > 1:
         odd = increments[:, increments.shape[1] // 2 * 2 :]
         pairs = increments[:, : increments.shape[1] // 2 * 2]
@@ -52,18 +52,18 @@ def attitudes(R_start: Float[Tensor, "batch 3 3"], gyro: Samples, dt: Steps) -> 
 
 
 def end_attitude(R_start: Float[Tensor, "batch 3 3"], gyro: Samples, dt: Steps) -> Float[Tensor, "batch 3 3"]:
-    """Attitude at the last sample alone, at half the cost."""
+    """Attitude at the last sample only, at half the cost."""
     return R_start @ whole_product(so3.exp(step_means(gyro) * dt[..., None]))
 
 
 def rotation_residual(
     gyro: Samples, dt: Steps, R_true: Float[Tensor, "batch 3 3"]
 ) -> tuple[Float[Tensor, "batch 3"], Float[Tensor, "batch n-1 3 3"]]:
-    """How far the integrated window misses the true increment `R_start^T R_end`, and how the rate of each step moves it.
+    """Rotation residual of the integrated window, and its derivative by the rate of each step.
 
     Returns:
         e = Log(R_hat^T R_true) in rad, and A with e(gyro + d) = e - sum_k A_k d_k to first order in a small e, d_k the
-        change of the rate over step k (`between`): it turns the step's end by d_k dt_k, seen through what comes after.
+        change of the rate over step k (`between`): it turns the step's end by d_k dt_k, transformed by the later steps.
     """
     running = running_product(so3.exp(step_means(gyro) * dt[..., None]))
     R_hat = running[:, -1]
@@ -74,7 +74,7 @@ def rotation_residual(
 def velocity_residual(
     accel: Samples, dt: Steps, R_wb: Float[Tensor, "batch n 3 3"], dv_true: Float[Tensor, "batch 3"], g_w: Float[Tensor, "3"]
 ) -> tuple[Float[Tensor, "batch 3"], Float[Tensor, "batch n 3 3"]]:
-    """How far the integrated specific force misses the true change of velocity (m/s), and how each sample moves it.
+    """Velocity residual of the integrated specific force (m/s), and its derivative by each sample.
 
     Returns:
         e = dv_true - sum_k (R_k a_k + g) h_k, h the weights of the trapezoidal rule (s), and A_k = R_k h_k, so that
@@ -91,6 +91,6 @@ def huber_weight(size: Float[Tensor, " m"], delta: Float[Tensor, " m"]) -> Float
 
 
 def huber(size: Float[Tensor, " m"], delta: Float[Tensor, " m"]) -> Float[Tensor, " m"]:
-    """Huber's loss of normalised sizes: (size/delta)²/2 up to `delta`, then linear, so that outliers pull no harder."""
+    """Huber's loss of normalised sizes: (size/delta)²/2 up to `delta`, then linear, which limits outliers."""
     x = size / delta
     return torch.where(x <= 1, 0.5 * x * x, x - 0.5)

@@ -1,13 +1,13 @@
-"""Allan deviation of samples at rest, and what its slopes say: density at -1/2, instability at 0, bias walk at +1/2.
+"""Allan deviation at rest and its slopes: density at -1/2, instability at 0, bias walk at +1/2.
 
 A stretch of T seconds shows averaging times up to T/4. Over these the variance is a sum of powers (IEEE 952, annex C)::
 
     sigma²(tau) = 3 Q²/tau² + N²/tau + (2 ln 2/pi) B² + K² tau/3 + R² tau²/2
 
 (quantisation or vibration, white density, instability, bias walk, ramp; none negative), fitted to the relative deviations with
-Huber's weights. A power that the fit does without is taken out, one that another could stand in for or that nowhere makes up
-half of the variance is not said to have been seen. Where the shortest times do not follow any sum of powers (a sensor's own
-filter, a motor's vibration) they are left out one by one until the rest does.
+Huber's weights. The fit drops a power that it does not need. A power counts as unseen if a neighbour could replace it, or if it
+is nowhere half of the variance. If the shortest times do not follow a sum of powers (a sensor's filter, a motor's vibration),
+they are dropped one by one until the rest does.
 """
 
 from __future__ import annotations
@@ -57,11 +57,10 @@ class Curve:
 
 @dataclass(frozen=True)
 class Slopes:
-    """What one axis shows: a value for each of `POWERS` that was seen, its standard deviation, and where it holds.
+    """Slopes of one axis: values of the seen `POWERS`, their standard deviations, and the range of the fit.
 
-    `powers` holds all that was fitted, seen or not, for drawing. From `from_s` on the fit holds; `excess` is how many times
-    larger than fitted the variance is at worst below that (less than 1: smaller, as filters make it), 1 where nothing was
-    left out.
+    `powers` holds all fitted values, seen or not, for drawing. The fit holds from `from_s` on. `excess` is the worst ratio of
+    variance to fit below `from_s` (less than 1: smaller, as with filters), 1 if no time was dropped.
     """
 
     seen: dict[str, float] = field(default_factory=dict)
@@ -72,7 +71,7 @@ class Slopes:
 
 
 def library() -> ModuleType:
-    """The library that computes the deviation.
+    """Library that computes Allan deviations.
 
     Raises:
         ConfigError: it is not installed.
@@ -81,14 +80,14 @@ def library() -> ModuleType:
         import allantools
     except ImportError as error:
         raise ConfigError(
-            "Allan deviations need the package allantools", where="--noise", fix="Install it with: pip install 'imutool[noise]'"
+            "Allan deviations need the package allantools", where="noise", fix="Install it with: pip install 'imutool[noise]'"
         ) from error
     module: ModuleType = allantools
     return module
 
 
 def curve(stretches: Iterable[Samples], period_s: float) -> Curve:
-    """The overlapping Allan deviation over several stretches of one sensor, at averaging times an octave apart.
+    """Overlapping Allan deviation over stretches of one sensor, at averaging times an octave apart.
 
     Squared differences of all stretches are averaged together; none reaches across from one stretch to the next. Empty
     where no stretch has 8 samples.
@@ -117,7 +116,7 @@ def freedom(tools: ModuleType, count: int, m: int) -> float:
 
 
 def slopes(curve: Curve) -> list[Slopes]:
-    """What the curve shows of each axis."""
+    """Slopes of each axis of a curve."""
     return [_slopes(curve.tau_s, curve.deviation[:, axis] ** 2, curve.freedom) for axis in range(3)]
 
 
@@ -139,7 +138,7 @@ def _slopes(
 
 
 class _Fit(NamedTuple):
-    """The powers that are needed, their standard deviations, those that could be another, and the largest misfit."""
+    """Fitted powers, their standard deviations, the ambiguous ones, and the largest misfit."""
 
     powers: dict[str, float]
     std: dict[str, float]
@@ -208,7 +207,7 @@ def _sum(powers: dict[str, float], tau_s: Float64[np.ndarray, " m"]) -> Float64[
 
 
 def part(name: str, value: float, tau_s: Float64[np.ndarray, " m"]) -> Float64[np.ndarray, " m"]:
-    """The Allan deviation that one power alone would have."""
+    """Allan deviation of a single power."""
     factor, exponent = POWERS[name]
     return np.asarray(value * np.sqrt(factor * tau_s ** float(exponent)))
 

@@ -1,8 +1,8 @@
-"""How noisy an IMU is: densities, walks and instabilities by axis, with where each comes from; data sheets by name.
+"""Noise of an IMU: densities, walks and instabilities by axis, with their sources; data sheets by name.
 
 The model is that of IEEE 952 and 1293, as Kalibr and the ASL `sensor.yaml` write it: a sample reads truth + b(t) + n(t), n
 white with a density, b a random walk with a walk density, plus a flicker floor (instability) that no averaging gets below.
-What is not known is None, in a file `"unknown"`: never zero, which says that there is none.
+An unknown value is None, in a file `"unknown"`; zero means no noise.
 """
 
 from __future__ import annotations
@@ -56,11 +56,11 @@ class Noise(Settings, frozen=True, kw_only=True):
     sources: dict[str, str] = msgspec.field(default_factory=dict)
 
     def values(self, quantity: str) -> Float64[np.ndarray, "3"]:
-        """One of the quantities as numbers, NaN where it is not known."""
+        """Values of a quantity by axis, NaN if unknown."""
         return np.array([np.nan if value is None else value for value in getattr(self, quantity)])
 
     def known(self) -> bool:
-        """Whether anything is known at all."""
+        """Whether any value is known."""
         return any(value is not None for quantity in UNITS for value in getattr(self, quantity))
 
 
@@ -112,7 +112,7 @@ bmi160: Bosch Sensortec, BST-BMI160-DS000, table 3. Walks: Schubert et al., The 
 
 
 def read(name: str | Path) -> Noise:
-    """The noise of a sensor in `SHEETS`, or of a TOML file as `write` writes it; one number stands for all three axes.
+    """Noise of a sensor in `SHEETS`, or from a TOML file of `write`; a single number holds for all three axes.
 
     Raises:
         ConfigError: no such name or file (the nearest name is given), no TOML, unknown key, negative or infinite value.
@@ -142,7 +142,7 @@ def _axes(value: Any) -> Any:
 
 
 def to_toml(noise: Noise) -> str:
-    """The text of a file that `read` reads back to the same numbers, bit for bit."""
+    """TOML text of the noise; `read` returns the same numbers, bit for bit."""
     lines = ["# Noise of an IMU by axis x, y, z, as `imutool simulate --noise FILE` takes it"]
     for name, unit in UNITS.items():
         axes = ", ".join(f'"{UNKNOWN}"' if value is None else repr(float(value)) for value in getattr(noise, name))
@@ -160,7 +160,7 @@ def _text(text: str, *, bare: bool = False) -> str:
 
 
 def write(noise: Noise, path: Path, *, overwrite: bool = False) -> None:
-    """Writes the noise as TOML.
+    """Write the noise as TOML.
 
     Raises:
         ConfigError: the file exists (without `overwrite`), or cannot be written.
@@ -170,7 +170,7 @@ def write(noise: Noise, path: Path, *, overwrite: bool = False) -> None:
 
 
 def plain(noise: Noise) -> dict[str, Any]:
-    """The noise as plain JSON values, with its units."""
+    """Noise as plain JSON values, with its units."""
     return {**{name: list(getattr(noise, name)) for name in UNITS}, "units": dict(UNITS), "sources": dict(noise.sources)}
 
 

@@ -1,4 +1,4 @@
-"""The noise of an IMU in motion: Allan deviation of its rate error against true poses, over windows between two of them.
+"""Noise of an IMU in motion: Allan deviation of its error over windows between true poses.
 
 Over a window of length T, integration misses the truth by e = n_end - n_start - G b - noise (`imutool.inertial.windows`), n the
 truth's own error and G = sum_k A_k how a constant b shows; y = -G^-1 e is the mean error of the rate (or specific force).
@@ -34,7 +34,7 @@ Rows = Float64[np.ndarray, "n 3"]
 
 
 def curves(imu: Imu, truth: Poses) -> tuple[Curve, Curve]:
-    """Allan deviation of the error of the gyro (rad/s) and of the accelerometer (m/s²), window lengths an octave apart.
+    """Allan deviations of the errors of gyro (rad/s) and accelerometer (m/s²), window lengths an octave apart.
 
     Outliers of the truth do no harm: the spread is the median's. Windows touch no gap in truth or samples. Lengths that fewer
     than 9 windows have are left out.

@@ -156,7 +156,7 @@ def compiled(forms: Sequence[LinearForm], theta: Float64[np.ndarray, " p"]) -> C
 
 @lru_cache(maxsize=256)
 def linear_form(effect: Effect, sensor: Sensor) -> LinearForm:
-    """Linear form of an effect on a sensor, from errors of `forward` for one parameter at a time."""
+    """Linear form of an effect on a sensor, from errors of `forward` for single parameters."""
     base = np.array([parameter.fixed_in_training or 0.0 for parameter in effect.parameters])
     free = np.flatnonzero([parameter.fixed_in_training is None for parameter in effect.parameters])
     signals = _probe_signals()

@@ -68,7 +68,7 @@ class Sampler:
         return self._values(x, instants, lambda: _fixed(np.asarray(weights @ coefficients)))
 
     def _at(self, t_s: Times, taken_s: Float64[np.ndarray, " m"]) -> Instants:
-        """Clock, instants, and the matrix from coefficients to values; none at the clock's own instants.
+        """Clock, instants, and matrix from coefficients to values; none at the clock's instants.
 
         Raises:
             DataError: a clock that is not even.
@@ -91,14 +91,14 @@ class _Recent:
     def __call__(
         self, of: object, at: object, evaluate: Callable[[], Float64[np.ndarray, "n k"]]
     ) -> Float64[np.ndarray, "n k"]:
-        known = self._known
-        for k, entry in enumerate(known):
+        entries = self._known
+        for k, entry in enumerate(entries):
             if entry[0] is of and entry[1] is at:
                 if k:  # an entry in use moves to the front
-                    self._known = (entry, *known[:k], *known[k + 1 :])
+                    self._known = (entry, *entries[:k], *entries[k + 1 :])
                 return entry[2]
         value = evaluate()
-        self._known = ((of, at, value), *known[: RECENT - 1])
+        self._known = ((of, at, value), *entries[: RECENT - 1])
         return value
 
 
@@ -186,7 +186,7 @@ class SensorSamples:
 
     @cached_property
     def signals(self) -> Signals:
-        """Filtered signals: those of a running filter (`online`), else of these samples at mean rate."""
+        """Filtered signals: of a running filter (`online`), else of these samples at mean rate."""
         if self.online is not None:
             return self.online
         rate_hz = (len(self.stamp_s) - 1) / (self.stamp_s[-1] - self.stamp_s[0])

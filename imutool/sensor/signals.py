@@ -109,7 +109,7 @@ class SignalFilter:
         return Signals(t_s, columns)
 
     def one(self, t_s: float, u: Float64[np.ndarray, "6"]) -> Float64[np.ndarray, "27"]:
-        """Columns at one sample, in a row that the next call overwrites; ten times faster than a block."""
+        """Columns at one sample, in a row that the next call overwrites; 10 times faster."""
         if math.isnan(self._t_s):
             self._begin(t_s, u)
         if self._derives:

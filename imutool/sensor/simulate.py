@@ -107,23 +107,23 @@ def simulate(
     own_rate = 1.0 / source.imu.period_s if len(source.imu) > 1 else RATE_HZ
     report(1, 4, "smoothing")
     try:
-        found = simulated(source, acting, sheet, _rounded(own_rate) if rate_hz is None else rate_hz, seed)
+        simulation = simulated(source, acting, sheet, _rounded(own_rate) if rate_hz is None else rate_hz, seed)
     except ImutoolError as error:
         raise error.at(trajectory) from error
     report(2, 4, "writing")
-    asked = {
+    settings = {
         "command": "simulate",
         "trajectory": trajectory.name,
         "truth": next(iter(source.truths)),
         "physics": physics_file.plain(file),
         "noise": noises.plain(sheet) | {"name": str(noise)},
-        **found.settings,
+        **simulation.settings,
     }
-    texts = {key: value if isinstance(value, str) else json.dumps(value, ensure_ascii=False) for key, value in asked.items()}
-    recording = replace(found.recording, name=out.stem, metadata={**source.metadata, "imutool": texts})
+    texts = {key: value if isinstance(value, str) else json.dumps(value, ensure_ascii=False) for key, value in settings.items()}
+    recording = replace(simulation.recording, name=out.stem, metadata={**source.metadata, "imutool": texts})
     write(recording, out, overwrite=overwrite)
     report(4, 4, "")
-    return replace(found, recording=recording, settings=asked | {"output": str(out)})
+    return replace(simulation, recording=recording, settings=settings | {"output": str(out)})
 
 
 def simulated(source: Recording, acting: Acting, noise: noises.Noise, rate_hz: float, seed: int) -> Simulation:
@@ -201,16 +201,19 @@ def _nanoseconds(motion: SmoothMotion, stamp_s: Float64[np.ndarray, " m"]) -> In
 
 
 def _noise(noise: noises.Noise, rate_hz: float, seed: int) -> Effect:
-    """Effect of white noise and a walking bias, each from its own stream; unknown densities are zero."""
-    known = {name: np.nan_to_num(noise.values(name)) for name in noises.UNITS}
+    """Effect of white noise and a walking bias, each from its own stream.
+
+    Unknown densities are zero.
+    """
+    densities = {name: np.nan_to_num(noise.values(name)) for name in noises.UNITS}
 
     def forward(samples: SensorSamples, _: Theta) -> SensorSamples:
         dt = np.diff(samples.stamp_s, prepend=samples.stamp_s[0])[:, None]  # a walk goes on in a hole
         out = []
         for k, (name, values) in enumerate((("gyro", samples.gyro), ("accel", samples.accel))):
             white, walk = (np.random.default_rng([seed, k, kind]).normal(size=values.shape) for kind in (0, 1))
-            bias = np.cumsum(known[f"{name}_walk"] * np.sqrt(np.abs(dt)) * walk, axis=0)
-            out.append(values + known[f"{name}_density"] * np.sqrt(rate_hz) * white + bias)
+            bias = np.cumsum(densities[f"{name}_walk"] * np.sqrt(np.abs(dt)) * walk, axis=0)
+            out.append(values + densities[f"{name}_density"] * np.sqrt(rate_hz) * white + bias)
         return samples.with_readings(*out)
 
     return Effect(NOISE, Stage.SENSOR, ("gyro", "accel"), "+ n + b(t)", (), "always", forward)
@@ -248,7 +251,7 @@ def _source(path: Path, truth: str | None) -> Recording:
 
 
 def _without_imu(log: Log, truth: str | None) -> Recording:
-    """Poses of the first pose topic or `truth`; of transforms TOPIC/CHILD_FRAME or the only child."""
+    """Poses of a topic, the first or `truth`; of transforms TOPIC/CHILD_FRAME or the only child."""
     if not log.pose_topics:
         raise LogError("the log has no poses", where=log.path, expected=f"poses among {log.listing()}")
     name = truth or log.pose_topics[0]

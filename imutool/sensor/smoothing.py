@@ -40,7 +40,9 @@ Band = Float64[np.ndarray, "6 c"]
 
 @dataclass(frozen=True, eq=False)
 class Penalised:
-    """Fitted spline; `noise` is a sample's standard deviation at weight 1, `cutoff_hz` halves a motion.
+    """Penalised spline fitted to noisy samples.
+
+    `noise` is a sample's standard deviation at weight 1; a motion at `cutoff_hz` comes out at half its size.
 
     `penalty` is what it was fitted with, `likeliest` the one that the samples ask for.
     """
@@ -76,7 +78,9 @@ class Penalised:
         return self.noise * float(np.sqrt(np.mean(both)))
 
     def end_s(self, derivative: int, worse: float, least: float) -> float:
-        """Time from an end within which a derivative's deviation is above `least` and `worse` times the inner.
+        """Time (s) from an end within which a derivative is uncertain.
+
+        There its deviation is above `least` and `worse` times the inner one.
 
         From the posterior of an even piece as dense as the data, in full; at most half of that piece.
         """

@@ -240,31 +240,33 @@ def _levelled(t_s: Times, y: Values) -> tuple[Values, int]:
     runs = np.split(at, np.flatnonzero(np.diff(at) > GLITCH_SAMPLES) + 1)
     for run in runs:
         jump[run] = [_step_size(t_s, y, at, int(k)) for k in run]
-    odd, left = (np.linalg.norm(_odd(t_s, values), axis=1) for values in (y, y - np.cumsum(jump, axis=0)))
+    before, after = (
+        np.linalg.norm(_unexplained_difference(t_s, values), axis=1) for values in (y, y - np.cumsum(jump, axis=0))
+    )
     for run in runs:
         back = np.linalg.norm(jump[run].sum(axis=0)) < NOT_BACK * np.linalg.norm(jump[run], axis=1).max()
         near = slice(max(0, int(run[0]) - GLITCH_SAMPLES), int(run[-1]) + GLITCH_SAMPLES + 1)
-        if back or left[near].max() > EXPLAINED * odd[run].min():
+        if back or after[near].max() > EXPLAINED * before[run].min():
             jump[run] = 0.0
     slow = Samples(t_s, np.cumsum(jump, axis=0), np.ones(len(t_s)), 0.25 / STEP_SMOOTH_HZ)
     return y - slow.fit(STEP_SMOOTH_HZ).residual(), int(np.count_nonzero(jump.any(axis=1)))
 
 
-def _odd(t_s: Times, y: Values) -> Values:
+def _unexplained_difference(t_s: Times, y: Values) -> Values:
     """Difference of each position to the one before, less a cubic's through its neighbours."""
     dt = np.diff(t_s)[:, None]
     v = np.diff(y, axis=0) / dt
-    odd = np.zeros_like(y)
-    odd[3:-2] = (v[2:-2] - (4.0 * (v[1:-3] + v[3:-1]) - (v[:-4] + v[4:])) / 6.0) * dt[2:-2]
-    return odd
+    difference = np.zeros_like(y)
+    difference[3:-2] = (v[2:-2] - (4.0 * (v[1:-3] + v[3:-1]) - (v[:-4] + v[4:])) / 6.0) * dt[2:-2]
+    return difference
 
 
 def _steps(t_s: Times, y: Values) -> Int64[np.ndarray, " s"]:
     """Rows before which the position seems to step."""
-    odd = np.linalg.norm(_odd(t_s, y), axis=1)
-    usual = np.maximum(np.maximum(median_filter(odd, LOCAL, mode="nearest"), np.median(odd)), LEAST_NOISE)
-    around = np.max([np.roll(odd, shift) for shift in (-2, -1, 1, 2)], axis=0)
-    rows: Int64[np.ndarray, " s"] = np.flatnonzero((odd > STEP * usual) & (odd >= 0.9 * around))
+    size = np.linalg.norm(_unexplained_difference(t_s, y), axis=1)
+    usual = np.maximum(np.maximum(median_filter(size, LOCAL, mode="nearest"), np.median(size)), LEAST_NOISE)
+    around = np.max([np.roll(size, shift) for shift in (-2, -1, 1, 2)], axis=0)
+    rows: Int64[np.ndarray, " s"] = np.flatnonzero((size > STEP * usual) & (size >= 0.9 * around))
     return rows
 
 

@@ -118,13 +118,13 @@ def curve(label: str, signal: Sensor, variable: str, x: Float64[np.ndarray, " k"
 
 def product(label: str, signal: Sensor, text: str, value: Sequence[float]) -> Effect | None:
     """Effect of a product of factors, so many times on each axis; None if a factor is not known."""
-    of = [factor(word) for word in factors(text)]
-    known = [one for one in of if one is not None]
-    if not of or len(known) < len(of):
+    parsed = [factor(word) for word in factors(text)]
+    functions = [function for function in parsed if function is not None]
+    if not parsed or len(functions) < len(parsed):
         return None
 
     def forward(samples: SensorSamples, _: Theta) -> SensorSamples:
-        size = np.prod([variable(samples) for variable in known], axis=0)
+        size = np.prod([variable(samples) for variable in functions], axis=0)
         return samples.with_added(signal, np.outer(size, value))
 
     return Effect(f"{UNKNOWN}[{label}]", Stage.SENSOR, (signal,), f"{signal} += c {text}", (), "it varies", forward)

@@ -11,8 +11,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from imutool.bias.model import COLUMNS, BiasModel, Segment
-from imutool.bias_start.bias_from_truth import bias_from_truth
-from imutool.bias_start.initial_bias import TRUTH_S, rest_spread
+from imutool.bias_start.bias_at_rest import rest_spread
+from imutool.bias_start.bias_from_truth import TRUTH_S, bias_from_truth
 from imutool.inertial.stationary import white_noise
 from imutool.training import closed_form
 from imutool.training.segments import Pool, corrected

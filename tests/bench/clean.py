@@ -7,9 +7,8 @@ FETCH.
 `python tests/bench/clean.py [--minutes 10 60]` measures the cost.
 
 For each length: CPU seconds of `imutool.cleaning.survey`, beside a pass that only reads and decodes the same IMU messages, and
-beside `imutool.log_info.inspect`, which holds the columns; each in a process of its own, with the memory it takes at most
-beyond
-what the imports take. The log is in the page cache. Poses stand beside the IMU at 20 Hz.
+beside `imutool.log_info.inspection.inspect`, which holds the columns; each in a process of its own, with the memory it takes
+at most beyond what the imports take. The log is in the page cache. Poses stand beside the IMU at 20 Hz.
 """
 
 from __future__ import annotations
@@ -28,7 +27,7 @@ import numpy as np
 from imutool.cleaning import survey
 from imutool.mcap_io.write import write
 from imutool.recording import Imu, Poses, Recording
-from imutool.sensor.flight import flight
+from imutool.sensor.made_up_flight import flight
 
 RATE_HZ = 200.0
 PIECE_S = 60.0  # of motion, again and again

@@ -32,9 +32,8 @@ from nees import consistency
 from imutool.bias.io import load
 from imutool.bias.model import BiasModel
 from imutool.bias_start.bias_covariance import BiasEstimator
-from imutool.bias_start.bias_from_truth import bias_from_truth
-from imutool.bias_start.initial_bias import TRUTH_S, find
-from imutool.bias_start.model_choice import smooth_in_memory
+from imutool.bias_start.bias_from_truth import TRUTH_S, bias_from_truth
+from imutool.bias_start.model_choice import find_initial_bias, smooth_in_memory
 from imutool.geometry import so3
 from imutool.inertial.strapdown import with_velocity
 from imutool.inertial.windows import running_product, step_means
@@ -115,7 +114,7 @@ def windows(
 ) -> tuple[Float64[np.ndarray, "m 3"], Float64[np.ndarray, "m 3 3"]]:
     """Differences of the gyro's rest bias to what the truth says, window by window, and what covariance they should have."""
     imu, seen = recording.imu, Seen.of(recording)
-    begun = smooth_in_memory(model, imu, recording.name) if start == "smooth" else find(start, model, recording)
+    begun = smooth_in_memory(model, imu, recording.name) if start == "smooth" else find_initial_bias(start, model, recording)
     bias, P, roots = BiasEstimator(model, begun).parts(seen.t_s, imu.gyro, imu.accel)
     S = roots.get("gyro", np.zeros((len(bias), 3, 0)))
     measured = np.diag(measured_variance(model, seen))

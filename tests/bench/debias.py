@@ -36,7 +36,7 @@ from imutool.bias_start.initial_bias import InitialBias, prior, tracked_from_pri
 from imutool.debiasing import debias
 from imutool.mcap_io.write import write
 from imutool.recording import Imu, seconds
-from imutool.sensor.flight import flight
+from imutool.sensor.made_up_flight import flight
 
 BLOCK = 2900  # Imu messages in a chunk of 1 MiB
 SAME = 1e-9  # rad/s, m/s²: rounding alone separates a block from its samples

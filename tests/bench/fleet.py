@@ -30,7 +30,7 @@ from mcap.writer import CompressionType, Writer
 from imutool.mcap_io.codec import schemas
 from imutool.mcap_io.codec.encode import encode_imu
 from imutool.mcap_io.log import Log
-from imutool.sensor.flight import flight
+from imutool.sensor.made_up_flight import flight
 
 IMAGE_BYTES, IMU_PER_IMAGE = 250_000, 20  # 10 images a second beside 200 Hz
 MODEL = "euroc-adis16448-hybrid"

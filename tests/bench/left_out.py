@@ -16,8 +16,7 @@ import numpy as np
 
 from imutool.bias.hybrid import Model
 from imutool.bias_start.correction import apply
-from imutool.bias_start.initial_bias import find
-from imutool.bias_start.model_choice import smooth_in_memory
+from imutool.bias_start.model_choice import find_initial_bias, smooth_in_memory
 from imutool.config import load
 from imutool.inertial import metrics
 from imutool.inertial.strapdown import along_truth
@@ -65,7 +64,11 @@ def learned(recordings: list[Recording], words: list[str]) -> Model:
 
 def aoe(model: Model, recording: Recording, start: str) -> float:
     """Orientation error of pure integration, in degrees."""
-    begun = smooth_in_memory(model, recording.imu, recording.name) if start == "smooth" else find(start, model, recording)
+    begun = (
+        smooth_in_memory(model, recording.imu, recording.name)
+        if start == "smooth"
+        else find_initial_bias(start, model, recording)
+    )
     debiased = apply(model, begun, recording.imu).imu
     return float(metrics.evaluate(*along_truth(debiased, recording.truth, recording.name))["aoe_deg"])
 

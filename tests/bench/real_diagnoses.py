@@ -23,6 +23,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -40,10 +41,17 @@ from sensor_tables import (
     values_table,
 )
 
-from imutool.conversion import convert
-from imutool.diagnosis.effect_sizes import EVERY_UNIT, effect_sizes, residual_to_truth
+from imutool.conversion.run import convert
+from imutool.diagnosis.diagnose import EVERY_UNIT, candidates_for, effect_sizes
+from imutool.diagnosis.estimation.jacobians import Chosen, expected
+from imutool.diagnosis.estimation.noise_estimate import whitened
+from imutool.diagnosis.held_out import gains, with_constant
+from imutool.diagnosis.reference import align, without_unusable
+from imutool.diagnosis.result import Closer
+from imutool.diagnosis.settings import DiagnoseSettings
 from imutool.errors import ImutoolError
 from imutool.evaluation import evaluate
+from imutool.mcap_io.read import read as read_log
 from imutool.sensor import physics_file
 from imutool.sensor.physics_file import Entry, PhysicsFile
 from imutool.sensor.physics_file import Value as Written
@@ -180,6 +188,28 @@ def as_file(values: Mapping[str, float]) -> PhysicsFile:
         effect, _, parameter = name.partition(".")
         entries.setdefault(effect, {})[parameter] = Written(value=value, unit="-")
     return PhysicsFile(effect=tuple(Entry(name=effect, parameters=row) for effect, row in entries.items()))
+
+
+def residual_to_truth(
+    real: Path, chosen: Chosen = (), *, imu: str | None = None, truth: str | None = None
+) -> dict[str, Closer]:
+    """Residual of a whole recording against its own true poses, by signal, without and with effects.
+
+    The best constant of its own is in both; compared is as far up in frequency as the poses are known.
+
+    Raises:
+        ConfigError, LogError, DataError: as `diagnose`.
+    """
+    settings = DiagnoseSettings()
+    aligned = align(read_log(real, imu=imu, truth=truth), None, truth, settings.reference)
+    pairs = [without_unusable(pair, settings.reference) for pair in aligned]
+    candidates = candidates_for(pairs)
+    logs = []
+    for log in (whitened(pair, candidates, settings.band) for pair in pairs):
+        unseen = replace(log.pair, fitted=np.zeros_like(log.pair.fitted), held_out=log.pair.fitted | log.pair.held_out)
+        logs.append(replace(log, pair=unseen))
+    before, after = ([with_constant(log.pair, expected(log.pair, effects)) for log in logs] for effects in ((), chosen))
+    return gains(logs, before, after)
 
 
 def gained(log: Log, physics: Path) -> dict[str, Any]:

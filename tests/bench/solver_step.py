@@ -16,8 +16,9 @@ import torch
 from imutool.bias.io import load
 from imutool.bias.model import Segment
 from imutool.bias.neural_ode import Model
+from imutool.bias_start.bias_from_truth import from_truth
 from imutool.bias_start.correction import apply
-from imutool.bias_start.initial_bias import InitialBias, from_truth
+from imutool.bias_start.initial_bias import InitialBias
 from imutool.inertial import metrics
 from imutool.inertial.strapdown import along_truth
 from imutool.mcap_io.read import read

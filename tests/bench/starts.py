@@ -24,7 +24,7 @@ import vqf
 
 from imutool.bias.io import load
 from imutool.bias.model import BiasModel, Vector6
-from imutool.bias_start import initial_bias
+from imutool.bias_start import bias_at_rest, bias_from_truth, initial_bias
 from imutool.bias_start.bias_tracking import BiasTrajectory, Samples, filter_blocks
 from imutool.bias_start.initial_bias import InitialBias
 from imutool.errors import DataError
@@ -71,13 +71,13 @@ def score(model: BiasModel, recording: Recording, own: Vector6) -> tuple[list[fl
     """AOE of each way, a word on time, and how far the filter's last gyro bias is from the log's own."""
     imu = recording.imu
     began = time.perf_counter()
-    auto = initial_bias.auto(model, imu)
+    auto = bias_at_rest.auto(model, imu)
     auto.stream(model)(*samples(imu))
     halfway = time.perf_counter()
     smooth = initial_bias.smoothed_start(model, [samples(imu)])
     ended = time.perf_counter()
     starts = {
-        "truth": initial_bias.from_truth(model, recording),
+        "truth": bias_from_truth.from_truth(model, recording),
         "prior": initial_bias.prior(model),
         "rest": at_rest_else_prior(model, imu),
         "VQF": by_vqf(model, imu, offline=False),
@@ -112,7 +112,7 @@ def own_bias(model: BiasModel, recordings: list[Recording]) -> np.ndarray:
 
 def at_rest_else_prior(model: BiasModel, imu: Imu) -> InitialBias:
     try:
-        return initial_bias.at_rest(model, imu)
+        return bias_at_rest.at_rest(model, imu)
     except DataError:
         return initial_bias.prior(model)
 

@@ -45,12 +45,12 @@ from torch import Tensor
 
 from imutool.bias.model import COLUMNS, BiasModel
 from imutool.bias.ode import HermitePath, Method, integrate
-from imutool.demo import write_asl
+from imutool.cli.demo import write_asl
 from imutool.geometry import so3
 from imutool.inertial.strapdown import GRAVITY_W
 from imutool.inertial.windows import end_attitude
 from imutool.recording import Recording
-from imutool.sensor.flight import flight
+from imutool.sensor.made_up_flight import flight
 from imutool.training.fit import Training, TrainSettings
 from imutool.training.objective import RobustLoss, error
 from imutool.training.segments import Windows

@@ -19,7 +19,7 @@ from jaxtyping import Float64
 
 from imutool.bias.io import load
 from imutool.bias_start.correction import apply
-from imutool.bias_start.initial_bias import find
+from imutool.bias_start.model_choice import find_initial_bias
 from imutool.inertial.strapdown import GRAVITY_W, StartPose, along_truth, dead_reckon, drift, with_velocity
 from imutool.mcap_io.read import read
 from imutool.recording import Imu, Poses, Recording, seconds
@@ -44,7 +44,7 @@ def main() -> None:
         recording = read(path)
         truths = list(recording.truths)
         recording = recording.with_truth(RECOMPUTED if RECOMPUTED in truths else truths[0])
-        debiased = [apply(model, find("truth", model, recording), recording.imu).imu for model in models]
+        debiased = [apply(model, find_initial_bias("truth", model, recording), recording.imu).imu for model in models]
         drifts = [drift(*along_truth(imu, recording.truth, recording.name), WINDOW_S) for imu in debiased]
         cells = [float(np.sqrt(np.mean(one.velocity_m_s**2))) for one in drifts]
         print(f"| {recording.name} | {' | '.join(f'{cell:.2f}' for cell in (*cells, floor(recording)))} |", flush=True)

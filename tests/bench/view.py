@@ -29,7 +29,7 @@ from typing import Any
 
 from imutool.mcap_io.read import read
 from imutool.mcap_io.write import write
-from imutool.sensor.flight import flight
+from imutool.sensor.made_up_flight import flight
 from imutool.viewing.model import runs
 from imutool.viewing.model.run_data import RunData
 from imutool.viewing.rerun import layout, scene

@@ -220,13 +220,13 @@ def test_a_file_cut_short_anywhere_is_refused(saved: Path) -> None:
     whole = saved.read_bytes()
     for length in (0, 4, 8, 100, len(whole) // 2, len(whole) - 1):
         saved.write_bytes(whole[:length])
-        with pytest.raises(ModelError, match="is no model file"):
+        with pytest.raises(ModelError, match="is not a model file"):
             load(saved)
 
 
 def test_a_file_with_something_after_its_end_is_refused(saved: Path) -> None:
     saved.write_bytes(saved.read_bytes() + b"\0")
-    with pytest.raises(ModelError, match="is no model file"):
+    with pytest.raises(ModelError, match="is not a model file"):
         load(saved)
 
 
@@ -287,13 +287,13 @@ def test_numbers_that_are_not_finite_are_refused(model: BiasModel, saved: Path, 
 )
 def test_a_header_that_makes_no_sense_is_refused(saved: Path, header: dict[str, str | None]) -> None:
     path = altered(saved, **header)
-    with pytest.raises(ModelError, match="has a header that cannot be used"):
+    with pytest.raises(ModelError, match="has an invalid header"):
         load(path)
 
 
 @pytest.mark.parametrize("header", [{"method": None}, {"rate_hz": "fast"}, {"card": "[1]"}, {"card": None}])
 def test_a_header_that_makes_no_sense_is_refused_when_only_listed(saved: Path, header: dict[str, str | None]) -> None:
-    with pytest.raises(ModelError, match="has a header that cannot be used"):
+    with pytest.raises(ModelError, match="has an invalid header"):
         header_of(altered(saved, **header))
 
 
@@ -302,7 +302,7 @@ def test_a_text_file_a_folder_and_nothing_are_refused(tmp_path: Path) -> None:
     text.write_text("a model, honestly\n" * 100)
     folder.mkdir()
     for path in (text, folder, tmp_path / "nothing.safetensors"):
-        with pytest.raises(ModelError, match="is no model file"):
+        with pytest.raises(ModelError, match="is not a model file"):
             load(path)
 
 
@@ -333,9 +333,9 @@ def test_a_pickle_is_refused_without_being_executed(tmp_path: Path) -> None:
     assert mark.exists(), "the bomb must be a live one for this test to mean anything"
     mark.unlink()
     for path in (plain, zipped):
-        with pytest.raises(ModelError, match="is no model file"):
+        with pytest.raises(ModelError, match="is not a model file"):
             load(path)
-        with pytest.raises(ModelError, match="is no model file"):
+        with pytest.raises(ModelError, match="is not a model file"):
             find_model(path)
     assert not mark.exists()
 

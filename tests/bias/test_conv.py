@@ -217,5 +217,5 @@ def test_sizes_can_be_chosen_and_must_fit_each_other(segment: MakeSegment) -> No
     small = Model(Config(channels=(4, 8), dilations=(1, 3), kernel=3)).double().eval()
     assert small.context == 2 * 4
     assert small(segment(14, 1, 20)).shape == (1, 20, 6)
-    with pytest.raises(ConfigError, match=r"model.channels: 3 channels and 4 dilations; expected one of each a layer"):
+    with pytest.raises(ConfigError, match=r"model.channels: 3 channels and 4 dilations; expected one of each per layer"):
         Model(Config(channels=(4, 8, 16)))

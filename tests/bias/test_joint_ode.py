@@ -14,7 +14,7 @@ from imutool.errors import ConfigError
 from imutool.geometry import so3
 from imutool.inertial.windows import end_attitude
 from imutool.recording import seconds
-from imutool.sensor.flight import flight
+from imutool.sensor.made_up_flight import flight
 
 RATE_HZ = 200.0
 STREAM = 1e-6  # rad/s and m/s²: of numpy against torch, as for every model

@@ -12,13 +12,13 @@ import torch
 from torch import Tensor, nn
 
 from imutool.bias.model import COLUMNS, BiasModel, Segment
-from imutool.bias.neural_ode import DRIFT_SEES_S, SLOW_S, Config, Curve, Drift, Model
+from imutool.bias.neural_ode import DRIFT_FILTER_S, SLOW_S, Config, Curve, Drift, Model
 from imutool.bias.neural_stream import Curves
 from imutool.bias.ode import HermitePath, integrate
 from imutool.geometry import so3
 from imutool.inertial.windows import attitudes
 from imutool.recording import seconds
-from imutool.sensor.flight import flight
+from imutool.sensor.made_up_flight import flight
 from imutool.units import Sensor
 
 RATE_HZ = 200.0
@@ -226,7 +226,7 @@ class Joint(nn.Module):
         assert isinstance(drift, Drift)
         self.curve, self.drift, self.samples = curve, drift, HermitePath(t, gyro)
         self.slow = HermitePath(t, model._filtered(gyro[None], SLOW_S)[0])
-        seen = model._filtered(gyro[None], DRIFT_SEES_S)[0, :: model.stride]
+        seen = model._filtered(gyro[None], DRIFT_FILTER_S)[0, :: model.stride]
         self.step_s = float(t[model.stride] - t[0])
         self.seen = HermitePath(torch.arange(len(seen)), seen)
 

@@ -21,7 +21,7 @@ from imutool.mcap_io.read import read
 from imutool.mcap_io.write import write
 from imutool.recording import Imu, Recording, seconds
 from imutool.sensor import catalogue, physics_file
-from imutool.sensor.flight import flight
+from imutool.sensor.made_up_flight import flight
 from imutool.sensor.physics_file import Bias, Curve, Entry, PhysicsFile, Term, Value
 from imutool.sensor.simulate import simulate
 
@@ -160,7 +160,7 @@ def test_what_cannot_be_taken_off_is_told(trajectory: Path, caplog: pytest.LogCa
 
 def test_nothing_to_take_off_is_refused(trajectory: Path) -> None:
     file = written(trajectory.with_name("none.toml"), entry("saturation", {"gyro_limit": 5.0}), bias=None)
-    with pytest.raises(ModelError, match=r"nothing in it can be corrected \(saturation\)"):
+    with pytest.raises(ModelError, match=r"no effect can be corrected \(saturation\)"):
         find_model(file, RATE_HZ)
 
 
@@ -170,7 +170,7 @@ def test_a_file_that_says_nothing_sensible_is_refused(tmp_path: Path) -> None:
     (tmp_path / "odd.toml").write_text('[[effect]]\nname = "gyro_scal"\n[effect.parameters]\nx = {value = 0.1, unit = "-"}\n')
     with pytest.raises(ConfigError, match="gyro_scale"):
         find_model(tmp_path / "odd.toml", RATE_HZ)
-    with pytest.raises(ModelError, match="says no rate"):
+    with pytest.raises(ModelError, match="has no sample rate"):
         find_model(tmp_path / "odd.toml")
 
 

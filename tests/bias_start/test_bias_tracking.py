@@ -23,7 +23,7 @@ from imutool.bias_start.bias_tracking import (
     smooth_blocks,
 )
 from imutool.recording import Imu, seconds
-from imutool.sensor.flight import FlightSettings, TriadSettings, flight
+from imutool.sensor.made_up_flight import FlightSettings, TriadSettings, flight
 
 RATE_HZ = 200.0
 PRIOR = np.array([3e-3] * 3 + [0.1] * 3)

@@ -13,30 +13,26 @@ from scipy.spatial.transform import Rotation
 
 from imutool.bias import linear, static
 from imutool.bias.model import BiasModel
-from imutool.bias_start import initial_bias
+from imutool.bias_start import bias_at_rest
+from imutool.bias_start.bias_at_rest import at_rest, auto, over_all_rest, rest_spread
+from imutool.bias_start.bias_from_truth import TRUTH_S, from_truth
 from imutool.bias_start.bias_tracking import Samples
 from imutool.bias_start.initial_bias import (
     AT_REST_STD,
-    TRUTH_S,
     InitialBias,
     NoRestError,
-    at_rest,
-    auto,
     bias_prior,
-    find,
     from_numbers,
-    from_truth,
-    over_all_rest,
     prior,
-    rest_spread,
     smoothed_start,
 )
+from imutool.bias_start.model_choice import find_initial_bias
 from imutool.errors import ConfigError, DataError
 from imutool.inertial.stationary import Blocks, block_statistics
 from imutool.inertial.strapdown import dead_reckon
 from imutool.recording import GRAVITY_M_S2, Imu, Poses, Recording, seconds
-from imutool.sensor.flight import FlightSettings as Flight
-from imutool.sensor.flight import TriadSettings, flight, trajectory
+from imutool.sensor.made_up_flight import FlightSettings as Flight
+from imutool.sensor.made_up_flight import TriadSettings, flight, trajectory
 
 RATE_HZ = 200.0
 NOISE = np.array([2.4e-3] * 3 + [0.03] * 3)  # of a sample: the ADIS16448 at 200 Hz
@@ -101,7 +97,7 @@ def test_it_is_the_kalman_update_of_the_prior() -> None:
     imu, _ = resting()
     made = model(mean=0.01, prior_std=0.02)
     start = at_rest(made, imu)
-    (stretch, *_) = initial_bias.rest_stretches(imu)
+    (stretch, *_) = bias_at_rest.rest_stretches(imu)
     still = imu.rows(slice(*stretch))
     x = np.full(6, 0.01)
     P = np.eye(6) * 0.02**2
@@ -153,7 +149,7 @@ def test_a_models_own_part_is_taken_off_first() -> None:
 @pytest.mark.parametrize("stops", [[], [(8.0, 12.0)], [(0.0, 0.9)]])
 def test_a_log_that_does_not_start_at_rest_is_refused(stops: list[tuple[float, float]]) -> None:
     imu, _ = resting(stops)
-    with pytest.raises(DataError, match=r"the log does not start at rest.*--init prior"):
+    with pytest.raises(DataError, match=r"the log does not start at rest.*`init=prior`"):
         at_rest(static.Model(), imu)
 
 
@@ -240,13 +236,13 @@ def test_a_truth_whose_world_leans_is_believed_beside_itself_and_not_beside_grav
 
 
 def test_a_shorter_truth_can_be_asked_for(biased: Recording) -> None:
-    start = find("truth:4", sees_everything(), biased)
+    start = find_initial_bias("truth:4", sees_everything(), biased)
     assert (np.abs(start.rest - np.concatenate([GYRO_BIAS, ACCEL_BIAS])) < TRUTH).all()
     assert start.how == "truth over 4.0 s, ±4e-06 rad/s"
     np.testing.assert_allclose(start.std, 1e-6 * TRUTH_S / 4.0, rtol=1e-6)
     for word in ("truth:0", "truth:nan", "truth:five"):
         with pytest.raises(ConfigError, match="truth:SECONDS"):
-            find(word, sees_everything(), biased)
+            find_initial_bias(word, sees_everything(), biased)
 
 
 def test_truth_and_prior_meet_by_their_variances(biased: Recording) -> None:
@@ -372,7 +368,7 @@ def test_what_differs_at_rest_is_told_from_the_logs_own_bias() -> None:
         logs.append(samples(imu))
         own.append(np.concatenate([GYRO_BIAS - away * (-1) ** seed, ACCEL_BIAS]))
     spread = rest_spread(static.Model(), logs, np.array(own))
-    np.testing.assert_allclose(spread[:2], initial_bias.MAD_TO_STD * np.abs(away[:2]), rtol=0.2)
+    np.testing.assert_allclose(spread[:2], bias_at_rest.MAD_TO_STD * np.abs(away[:2]), rtol=0.2)
     assert spread[2] < 2.5 * AT_REST_STD[2]
     assert (spread >= AT_REST_STD).all()
     moving = samples(resting([])[0])
@@ -389,7 +385,7 @@ def test_a_model_that_says_how_rest_differs_is_believed() -> None:
     np.testing.assert_allclose(after.rest[:3], before.rest[:3], atol=3e-4)  # at rest it is what it is
 
 
-# ── the words of --init ──────────────────────────────────────────────────────────────────────────────────────────────
+# ── methods of `init` ──────────────────────────────────────────────────────────────────────────────────────────────
 
 
 def test_the_prior_is_what_the_training_runs_had() -> None:
@@ -411,8 +407,8 @@ def test_six_numbers_are_taken_as_they_are() -> None:
 )
 def test_other_words_are_refused_with_what_there_is(text: str) -> None:
     imu, _ = resting()
-    with pytest.raises(ConfigError, match=r"--init: .*expected auto, stationary, prior, truth or gx,gy,gz,ax,ay,az"):
-        find(text, static.Model(), Recording("r", imu))
+    with pytest.raises(ConfigError, match=r"init: .*expected auto, stationary, prior, truth or gx,gy,gz,ax,ay,az"):
+        find_initial_bias(text, static.Model(), Recording("r", imu))
 
 
 def test_each_word_finds_its_way(biased: Recording) -> None:
@@ -420,16 +416,18 @@ def test_each_word_finds_its_way(biased: Recording) -> None:
     still, trained = Recording("still", imu), static.Model()
     trained.card = {"name": "trained"}
     moving = Recording("moving", resting([])[0])
-    how = {way: find(way, trained, still).how for way in ("auto", "stationary", "prior", "1,2,3,4,5,6")}
+    how = {way: find_initial_bias(way, trained, still).how for way in ("auto", "stationary", "prior", "1,2,3,4,5,6")}
     assert "at rest" in how["auto"]
     assert how["auto"].startswith("4.0 s at rest from 0.0 s on, prior of the training runs, ±")
     assert how["1,2,3,4,5,6"] == "given"
-    assert find("truth", trained, biased).how.startswith("truth over 12.0 s, weighed against the training runs, ±")
-    assert find("auto", trained, moving).how.startswith("prior of the training runs, ±0.05 rad/s, then gravity in motion")
+    assert find_initial_bias("truth", trained, biased).how.startswith("truth over 12.0 s, weighed against the training runs, ±")
+    assert find_initial_bias("auto", trained, moving).how.startswith(
+        "prior of the training runs, ±0.05 rad/s, then gravity in motion"
+    )
     with pytest.raises(DataError, match="does not start at rest"):
-        find("stationary", trained, moving)
+        find_initial_bias("stationary", trained, moving)
     with pytest.raises(DataError, match="does not start at rest"):
-        find("auto", static.Model(), moving)  # no training runs, no prior to fall back on
+        find_initial_bias("auto", static.Model(), moving)  # no training runs, no prior to fall back on
 
 
 def test_a_start_does_not_share_memory_with_the_model() -> None:

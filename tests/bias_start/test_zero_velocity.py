@@ -10,7 +10,7 @@ from imutool.bias_start.zero_velocity import zero_velocity_trajectory
 from imutool.errors import DataError
 from imutool.inertial.strapdown import StartPose, dead_reckon
 from imutool.recording import Imu, Poses
-from imutool.sensor.flight import FlightSettings, TriadSettings, flight, trajectory
+from imutool.sensor.made_up_flight import FlightSettings, TriadSettings, flight, trajectory
 
 NOISE = TriadSettings(
     noise_density=2e-4, walk_density=0.0, typical_bias=0.0, turn_on_bias=0.0, warm_up=0.0, scale=0.0, misalignment_rad=0.0

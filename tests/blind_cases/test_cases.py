@@ -18,6 +18,7 @@ import pytest
 from numpy.random import default_rng
 from scipy.interpolate import make_interp_spline
 from scipy.spatial.transform import Rotation
+from support.report_schema import assert_valid
 
 from imutool.blind_cases import draw, unnamed
 from imutool.blind_cases.cases import ENVELOPE, FINDINGS, KEY, OPENED, REAL, SIM, conceal, open_case
@@ -34,7 +35,7 @@ from imutool.mcap_io.log import Log
 from imutool.mcap_io.read import read
 from imutool.mcap_io.write import write
 from imutool.recording import GRAVITY_M_S2, Poses
-from imutool.sensor.flight import flight
+from imutool.sensor.made_up_flight import flight
 
 EXACT = 1e-12  # float64 arithmetic of a few products of numbers of order one
 SPLINE = 2e-4  # rad/s, m/s²: what a spline of degree 5 with knots 50 ms apart, smoothed at 8 Hz, leaves of a slow circle
@@ -570,7 +571,9 @@ def test_the_command_conceals_and_opens(
     done = imutool("conceal", "--open", "case", "--json", "score.json", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     assert "the names are right" in done.stdout
-    assert json.loads((tmp_path / "score.json").read_text())["schema"] == "imutool.score/1"
+    opened = json.loads((tmp_path / "score.json").read_text())
+    assert_valid(opened)
+    assert opened["schema"] == "imutool.score/1"
     done = imutool("conceal", "--open", "nowhere", cwd=tmp_path)
     assert done.returncode == 4
     assert "Traceback" not in done.stderr

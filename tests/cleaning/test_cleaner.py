@@ -15,7 +15,7 @@ from imutool.cleaning.settings import CleaningSettings, every
 from imutool.errors import LogError
 from imutool.mcap_io.topics import ImuBatch, StampCheck
 from imutool.report import json_values
-from imutool.sensor.flight import flight
+from imutool.sensor.made_up_flight import flight
 
 MADE = batch_of(flight(3, duration_s=30.0).imu)
 COUNT = len(MADE.stamp_ns)

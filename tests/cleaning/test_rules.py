@@ -15,7 +15,7 @@ from imutool.cleaning.settings import CleaningSettings
 from imutool.cleaning.truth import Truth
 from imutool.mcap_io.topics import ImuBatch
 from imutool.recording import GRAVITY_M_S2, Poses
-from imutool.sensor.flight import flight
+from imutool.sensor.made_up_flight import flight
 
 HOUR_NS = 3_600_000_000_000
 HALF_A_SECOND_NS = 500_000_000

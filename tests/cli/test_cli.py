@@ -14,9 +14,9 @@ import pytest
 
 from imutool import cli, errors, registry
 from imutool.cli import terminal
+from imutool.cli.demo import write_asl
 from imutool.cli.terminal import epoch_line
-from imutool.demo import write_asl
-from imutool.sensor.flight import flight
+from imutool.sensor.made_up_flight import flight
 from imutool.training.fit import Epoch
 
 Run = Callable[..., subprocess.CompletedProcess[str]]
@@ -61,7 +61,7 @@ def test_each_kind_of_error_has_its_code(
     def inspect(_: Path, *, check: bool) -> None:
         raise error
 
-    monkeypatch.setattr("imutool.log_info.inspect", inspect)
+    monkeypatch.setattr("imutool.log_info.inspection.inspect", inspect)
     assert code("info", "log.mcap") == expected
     printed = capsys.readouterr()
     assert printed.out == ""
@@ -72,7 +72,7 @@ def test_a_bug_is_a_traceback(monkeypatch: pytest.MonkeyPatch) -> None:
     def inspect(_: Path, *, check: bool) -> None:
         raise ZeroDivisionError
 
-    monkeypatch.setattr("imutool.log_info.inspect", inspect)
+    monkeypatch.setattr("imutool.log_info.inspection.inspect", inspect)
     monkeypatch.setattr(sys, "argv", ["imutool", "info", "log.mcap"])
     with pytest.raises(ZeroDivisionError):  # nobody catches it: Python prints the traceback and leaves with 1
         cli.main()

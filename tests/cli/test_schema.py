@@ -5,16 +5,15 @@ from __future__ import annotations
 import json
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
-import jsonschema
 import pytest
+from support.report_schema import assert_valid
 from typer.testing import CliRunner
 
 from imutool.cli import app
-from imutool.demo import write_asl
+from imutool.cli.demo import write_asl
 from imutool.report import REPORTS, json_schema
-from imutool.sensor.flight import flight
+from imutool.sensor.made_up_flight import flight
 
 COMMANDS = [command.name or command.callback.__name__ for command in app.registered_commands if command.callback]
 SILENT = {"schema"}  # commands without --json
@@ -41,18 +40,7 @@ LINES: dict[str, Sequence[str]] = {
     "fleet-info": ["fleet", "info", "{}/flight_1.mcap", "out"],
     "fleet-diagnose": ["fleet", "diagnose", "{}/flight_1.mcap", "out", "--no-search"],
 }
-ELSEWHERE = {"demo", "diagnose", "conceal"}  # slow: their own tests call `hold`
-
-
-def hold(report: dict[str, Any]) -> None:
-    """Validate a report against its schema.
-
-    Raises:
-        AssertionError: it has no schema, or violates it.
-    """
-    validator = jsonschema.Draft202012Validator(json_schema(report["schema"]))
-    problems = [f"{error.json_path}: {error.message}" for error in validator.iter_errors(report)]
-    assert not problems, problems[:5]
+ELSEWHERE = {"demo", "diagnose", "conceal"}  # slow: their own tests call `assert_valid`
 
 
 @pytest.fixture
@@ -69,10 +57,10 @@ def folder(tmp_path: Path, logs: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 def test_a_report_is_valid_against_its_schema(folder: Path, logs: Path, words: Sequence[str]) -> None:
     done = CliRunner().invoke(app, [*(word.format(logs) for word in words), "--json", "report.json"])
     assert done.exit_code in {0, 3}, done.output
-    hold(json.loads((folder / "report.json").read_text()))
+    assert_valid(json.loads((folder / "report.json").read_text()))
     if words[0] == "fleet":
         for path in (folder / "out").rglob("*.json"):
-            hold(json.loads(path.read_text()))
+            assert_valid(json.loads(path.read_text()))
 
 
 def test_every_command_is_covered() -> None:
@@ -80,7 +68,7 @@ def test_every_command_is_covered() -> None:
 
 
 def test_the_demo_is_valid_against_its_schema(demonstration: Path) -> None:
-    hold(json.loads((demonstration / "report.json").read_text()))
+    assert_valid(json.loads((demonstration / "report.json").read_text()))
 
 
 def test_schema_lists_the_reports_and_prints_the_schema_of_one() -> None:

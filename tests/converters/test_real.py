@@ -59,11 +59,12 @@ def test_every_sequence_reads_with_its_counts_and_exact_stamps(data, place):
 def test_each_sequence_is_recognised_by_exactly_one_converter(data):
     claims = {
         sequence.path: [module.DATASET for module in PLACES.values() if module.recognises(sequence)]
-        for sequence in euroc.sequences(data)
+        for place in PLACES
+        for sequence in euroc.sequences(data / place)
     }
     assert len(claims) == sum(map(len, EXPECTED.values()))
-    place = {"euroc": "euroc", "tumvi": "tum_vi"}
-    assert all(claim == [place.get(path.parent.name, "fetch")] for path, claim in claims.items())
+    converter = {"euroc": "euroc", "tumvi": "tum_vi"}
+    assert all(claim == [converter.get(path.parent.name, "fetch")] for path, claim in claims.items())
 
 
 def test_the_recomputed_truth_of_v1_01_is_a_second_one(data):

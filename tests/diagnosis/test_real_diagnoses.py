@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 from support import planted
 
-from imutool.diagnosis.effect_sizes import residual_to_truth
 from imutool.mcap_io.write import write
 
 BENCH = Path(__file__).parents[1] / "bench"
@@ -166,13 +165,13 @@ def test_a_lag_that_changes_is_told_window_by_window_whatever_the_scale(check: A
     np.testing.assert_allclose(lags, [0.003, 0.003, -0.002, -0.002], atol=LAG_S)
 
 
-def test_physics_of_one_recording_removes_its_misfit_of_another(tmp_path: Path) -> None:
+def test_physics_of_one_recording_removes_its_misfit_of_another(bench: Any, tmp_path: Path) -> None:
     path, felt = planted.moving(4), planted.rich(4)
     arm = planted.acting({"lever_arm": ARM_M})
     samples = planted.ideal(felt, arm) + planted.BIAS
     log = tmp_path / "flight.mcap"
     write(planted.recording("flight", felt.t_s, samples, poses=planted.poses(path, felt.t_s)), log)
-    without, with_ = residual_to_truth(log), residual_to_truth(log, arm)
+    without, with_ = bench.residual_to_truth(log), bench.residual_to_truth(log, arm)
     assert without["gyro"].rms_after == without["gyro"].rms_before
     assert with_["accel"].rms_before == without["accel"].rms_before
     assert with_["accel"].rms_after < POSE_NOISE * with_["accel"].rms_before

@@ -15,10 +15,10 @@ from support import diagnoses
 from support.diagnoses import replace
 
 import imutool.sensor.effects
+from imutool.diagnosis.quantity import grouped, percent, value, vector
 from imutool.diagnosis.result import Estimate, Finding, HeldOut, Located, Unexplained
 from imutool.diagnosis.wording.conclusion import NULL, chance_text, conclusion, lines, rms_text, table
 from imutool.diagnosis.wording.effect_sentences import SENTENCES, named_sentence, signals
-from imutool.diagnosis.wording.quantity import grouped, percent, value, vector
 
 CATALOGUE = [  # of physics: what an ideal simulation leaves out, and what any signal can have
     "gyro_bias", "accel_bias", "gyro_scale", "gyro_misalignment", "gyro_g_sensitivity", "gyro_quadratic", "gyro_bias_drift",

@@ -23,7 +23,7 @@ from rosbags.rosbag2 import Reader
 from rosbags.typesys import Stores, get_typestore
 from ruamel.yaml import YAML
 
-from imutool.conversion import convert
+from imutool.conversion.run import convert
 from imutool.converters import euroc
 from imutool.debiasing import debias
 from imutool.errors import ConfigError, ImutoolError, LogError
@@ -33,7 +33,7 @@ from imutool.mcap_io.read import read
 from imutool.mcap_io.write import write
 from imutool.noise import datasheet
 from imutool.recording import Frames, Imu, Poses, Recording, Scalars
-from imutool.sensor.flight import flight
+from imutool.sensor.made_up_flight import flight
 
 Run = Callable[..., subprocess.CompletedProcess[str]]
 

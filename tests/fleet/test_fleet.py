@@ -353,7 +353,7 @@ def test_the_command_says_what_came_of_it(fleet: Path, tmp_path: Path, ray_start
 @pytest.mark.parametrize(
     ("words", "code", "why"),
     [
-        (["--memory-per-task", "much"], 3, "'much' is no size"),
+        (["--memory-per-task", "much"], 3, "'much' is not a size"),
         (["--model", "none"], 6, "no model 'none'"),
         (["--smooth", "--init", "prior"], 3, "--smooth with --init prior"),
     ],

@@ -87,13 +87,13 @@ def test_half_of_the_robots_cannot_spoil_the_spread() -> None:
     assert robust(x)[1] < 10.0
 
 
-def test_of_twenty_robots_the_rotated_mount_and_the_wrong_scale_are_named(
+def test_of_a_dozen_robots_the_rotated_mount_and_the_wrong_scale_are_named(
     robot: Callable[[Path, int, Mapping[str, Sequence[float]]], None], tmp_path: Path
 ) -> None:
     rng = np.random.default_rng(7)
-    for k in range(ROBOTS):
+    for k in range(12):
         effects = {"mount_rotation": np.deg2rad(0.2) * rng.normal(size=3), "gyro_scale": 0.002 * rng.normal(size=3)}
-        effects["mount_rotation"][1] += np.deg2rad(2.1) * (k == 12)
+        effects["mount_rotation"][1] += np.deg2rad(2.1) * (k == 11)
         effects["gyro_scale"][2] += 0.03 * (k == 5)
         robot(tmp_path / "logs" / f"robot_{k:02d}" / "log.mcap", k + 1, effects)
     quick = Settings(command="diagnose", quick=True)
@@ -104,9 +104,9 @@ def test_of_twenty_robots_the_rotated_mount_and_the_wrong_scale_are_named(
     assert [one.error for one in results if one.status != "ok"] == []
     found = compare(results)
     assert {(one.robot, one.effect, one.parameter) for one in found.outliers} == {
-        ("robot_12", "mount_rotation", "phi_y"),
+        ("robot_11", "mount_rotation", "phi_y"),
         ("robot_05", "gyro_scale", "z"),
     }
-    turned = next(one for one in found.outliers if one.robot == "robot_12")
+    turned = next(one for one in found.outliers if one.robot == "robot_11")
     assert turned.value - turned.middle == pytest.approx(np.deg2rad(2.1), abs=4.0 * np.deg2rad(0.2))
-    assert "robot_12: mount rotation phi y 2" in turned.sentence
+    assert "robot_11: mount rotation phi y 2" in turned.sentence

@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from imutool.inertial.preintegration import exp, hat, integrate
 from imutool.recording import seconds
-from imutool.sensor.flight import FlightSettings, TriadSettings, flight, trajectory
+from imutool.sensor.made_up_flight import FlightSettings, TriadSettings, flight, trajectory
 
 SECOND_ORDER = 2e-4  # of the mean of two samples, over half a second at 200 Hz in a lively flight: rad, m/s, m
 DIFFERENCE = 1e-5  # rad/s and m/s²: the step of a central difference, whose error is its square

@@ -15,7 +15,7 @@ from imutool.inertial.stationary import (
     white_noise,
 )
 from imutool.recording import GRAVITY_M_S2, Imu
-from imutool.sensor.flight import flight
+from imutool.sensor.made_up_flight import flight
 
 RATE_HZ = 200.0
 GYRO_NOISE, ACCEL_NOISE = 2.4e-3, 0.03  # rad/s and m/s² a sample and axis: an ADIS16448 at 200 Hz

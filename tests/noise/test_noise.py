@@ -21,7 +21,7 @@ from imutool.noise.datasheet import SHEETS, UNITS, Noise
 from imutool.noise.residual import curves
 from imutool.noise_identification import identify, plain, rows
 from imutool.recording import GRAVITY_M_S2, Imu, Poses, Recording
-from imutool.sensor.flight import GYRO, flight
+from imutool.sensor.made_up_flight import GYRO, flight
 
 Run = Callable[..., subprocess.CompletedProcess[str]]
 
@@ -296,7 +296,7 @@ def test_a_truth_made_from_the_gyro_shows_nothing_of_it(tmp_path: Path) -> None:
     write(Recording("own", made.imu, truths={"/ground_truth/pose": own}), tmp_path / "own.mcap")
     found = identify(tmp_path / "own.mcap")
     assert found.noise.gyro_density == (None,) * 3
-    assert any("it was made from it" in remark and "gyro" in remark for remark in found.remarks)
+    assert any("it was computed from the same samples" in remark and "gyro" in remark for remark in found.remarks)
 
 
 def test_a_model_takes_the_place_of_the_fit(logs: Path) -> None:
@@ -343,7 +343,7 @@ def test_noise_options_without_noise_are_refused(imutool: Run, tmp_path: Path) -
     write(Recording("still", still(5.0)), tmp_path / "still.mcap")
     done = imutool("info", "still.mcap", "--noise-toml", "n.toml", cwd=tmp_path)
     assert done.returncode == 3
-    assert "--noise-toml says nothing without --noise" in done.stderr
+    assert "--noise-toml needs --noise" in done.stderr
     assert not (tmp_path / "n.toml").exists()
 
 

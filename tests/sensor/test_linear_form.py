@@ -12,8 +12,8 @@ from imutool.errors import ConfigError
 from imutool.sensor import catalogue
 from imutool.sensor.effects.gyro_bias_drift import TRAINING_TAU_S
 from imutool.sensor.effects.rate_curve import KNOTS_RAD_S, NONZERO, hats
-from imutool.sensor.flight import trajectory
 from imutool.sensor.linear_form import LinearForm, compiled, patterns
+from imutool.sensor.made_up_flight import trajectory
 from imutool.sensor.signals import ACCEL, ALPHA, COUNT, GYRO, GYRO_SLOW, SignalFilter, Signals
 from imutool.units import SENSORS, Sensor
 

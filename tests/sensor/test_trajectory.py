@@ -14,7 +14,7 @@ from imutool.converters import tum_vi
 from imutool.errors import ConfigError, DataError
 from imutool.inertial.kinematics import Trajectory
 from imutool.recording import Poses
-from imutool.sensor.flight import FlightSettings, trajectory
+from imutool.sensor.made_up_flight import FlightSettings, trajectory
 from imutool.sensor.trajectory import MAX_GAP_S, SmoothMotion, smooth_motion
 
 DURATION_S = 30.0

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from imutool.recording import Imu, Recording, Scalars
-from imutool.sensor.flight import ACCEL_BIAS, GYRO_BIAS, flight
+from imutool.sensor.made_up_flight import ACCEL_BIAS, GYRO_BIAS, flight
 from imutool.viewing.model.run_data import Run
 
 OFF = np.array([0.06, -0.12, 0.18, 1.2, -1.8, 2.4])  # rad/s, m/s²: what raw is off by, beside the flight's own bias

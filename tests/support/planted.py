@@ -15,7 +15,7 @@ from imutool.inertial.kinematics import Trajectory
 from imutool.recording import Imu, Poses, Recording
 from imutool.sensor import catalogue as _catalogue
 from imutool.sensor.effect import Effect, simulate_samples
-from imutool.sensor.flight import FlightSettings, trajectory
+from imutool.sensor.made_up_flight import FlightSettings, trajectory
 from imutool.sensor.samples import IdealMotion
 
 RATE_HZ, DURATION_S = 100.0, 24.0
@@ -106,7 +106,7 @@ def pair(
         real = real + added
     held_out, usable = split(stamp_s)
     names = {name: np.interp(stamp_s, felt.t_s, values) for name, values in felt.channels.items()}
-    return Pair(f"log_{seed}", stamp_s, real, usable & ~held_out, usable & held_out, felt=felt, channels=names)
+    return Pair(f"log_{seed}", stamp_s, real, usable & ~held_out, usable & held_out, ideal=felt, channels=names)
 
 
 def weighed(one: Pair) -> WhitenedImu:

@@ -11,8 +11,8 @@ import pytest
 import torch
 
 from imutool.recording import Imu, Poses, Recording
-from imutool.sensor.flight import FlightSettings as Flight
-from imutool.sensor.flight import TriadSettings, flight, trajectory
+from imutool.sensor.made_up_flight import FlightSettings as Flight
+from imutool.sensor.made_up_flight import TriadSettings, flight, trajectory
 
 PERFECT = TriadSettings(
     noise_density=0.0, walk_density=0.0, typical_bias=0.0, turn_on_bias=0.0, warm_up=0.0, scale=0.0, misalignment_rad=0.0

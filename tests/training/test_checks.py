@@ -11,7 +11,7 @@ import pytest
 from imutool.errors import DataError
 from imutool.mcap_io.read import read
 from imutool.recording import Imu, Recording
-from imutool.sensor.flight import flight
+from imutool.sensor.made_up_flight import flight
 from imutool.training.run import check_trainable
 from imutool.training.segments import Pool
 
@@ -75,7 +75,7 @@ def test_a_few_seconds_are_not_enough() -> None:
 
 def test_every_training_log_of_the_data_sets_is_accepted(data: Path, tmp_path: Path) -> None:
     """Among them one of whose truth a tenth is missing, and a robot that stands for a fifth of the time."""
-    from imutool.conversion import convert
+    from imutool.conversion.run import convert
 
     convert(data / "fetch", tmp_path / "fetch")
     convert(data / "tumvi" / "dataset-room1.tar.gz", tmp_path / "room1.mcap")

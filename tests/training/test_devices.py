@@ -20,7 +20,7 @@ from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 from imutool.bias import io, neural_ode
 from imutool.bias.model import Segment
 from imutool.mcap_io.write import write
-from imutool.sensor.flight import flight
+from imutool.sensor.made_up_flight import flight
 from imutool.training.fit import Epoch, Training
 from imutool.training.run import checkpoint_path, train
 from imutool.training.settings import TrainSettings, settings_of

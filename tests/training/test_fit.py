@@ -15,13 +15,13 @@ from safetensors.torch import save_file
 from imutool.bias import io
 from imutool.bias.io import load
 from imutool.bias_start import initial_bias
+from imutool.bias_start.bias_from_truth import from_truth
 from imutool.bias_start.correction import apply
-from imutool.bias_start.initial_bias import from_truth
 from imutool.errors import ConfigError, DataError, ModelError, NumericsError
 from imutool.inertial import metrics
 from imutool.inertial.strapdown import along_truth
 from imutool.recording import Imu, Recording
-from imutool.sensor.flight import flight
+from imutool.sensor.made_up_flight import flight
 from imutool.training import checkpoint
 from imutool.training.fit import Epoch, Training, TrainSettings
 

@@ -17,7 +17,7 @@ from imutool.bias.model import BiasModel, Segment
 from imutool.errors import ConfigError, DataError, NumericsError
 from imutool.geometry import so3
 from imutool.recording import Imu, Recording
-from imutool.sensor.flight import flight
+from imutool.sensor.made_up_flight import flight
 from imutool.training import checkpoint
 from imutool.training.fit import Training, TrainSettings
 from imutool.training.increments import IncrementObjective, products

@@ -22,7 +22,7 @@ from imutool.config import load as load_settings
 from imutool.errors import ConfigError, DataError, LogError, ModelError, NumericsError
 from imutool.mcap_io.write import write
 from imutool.recording import Imu, Recording
-from imutool.sensor.flight import flight
+from imutool.sensor.made_up_flight import flight
 from imutool.training.fit import Epoch, TrainSettings
 from imutool.training.objective import WindowEndObjective
 from imutool.training.physics_first import config_of, helps, settings_for
@@ -206,7 +206,7 @@ def test_refusals_come_before_the_work_and_leave_nothing(
 ) -> None:
     there = tmp_path / "there.safetensors"
     there.write_bytes(b"mine")
-    with pytest.raises(ConfigError, match=r"exists already.*--overwrite"):
+    with pytest.raises(ConfigError, match=r"exists already.*overwrite"):
         train(logs, there, method="neural_ode", settings=TINY)
     with pytest.raises(ConfigError, match="the folder does not exist"):
         train(logs, tmp_path / "no" / "m.safetensors", method="neural_ode", settings=TINY)

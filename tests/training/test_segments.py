@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from imutool.errors import DataError
 from imutool.geometry import so3
 from imutool.recording import Imu, Recording
-from imutool.sensor.flight import flight
+from imutool.sensor.made_up_flight import flight
 from imutool.training.segments import HELD_OUT, Pool
 
 RATE_HZ = 200.0

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from imutool.recording import Imu, Recording
-from imutool.sensor.flight import ACCEL_BIAS, GYRO_BIAS, flight
+from imutool.sensor.made_up_flight import ACCEL_BIAS, GYRO_BIAS, flight
 from imutool.viewing.model.run_data import Run, RunData
 from imutool.viewing.model.runs import build
 

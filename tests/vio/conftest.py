@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from imutool.recording import Recording
-from imutool.sensor.flight import FlightSettings, TriadSettings, flight
+from imutool.sensor.made_up_flight import FlightSettings, TriadSettings, flight
 
 PERFECT = TriadSettings(
     noise_density=0.0, walk_density=0.0, typical_bias=0.0, turn_on_bias=0.0, warm_up=0.0, scale=0.0, misalignment_rad=0.0

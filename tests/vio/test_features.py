@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from imutool.recording import Poses
-from imutool.sensor.flight import FlightSettings, flight
+from imutool.sensor.made_up_flight import FlightSettings, flight
 from imutool.vio.features import FAR_M, NEAR_M, Frame, blackouts, observe, room
 from imutool.vio.rig import EUROC, StereoRig
 

@@ -1,1 +1,1 @@
-"""The rules, one file each; the file's name is the rule's, and every file here is found (`imutool.registry`)."""
+"""Cleaning rules: one file each, named like the rule (`imutool.registry` finds them)."""

@@ -1,4 +1,4 @@
-"""Swapped or flipped axes: a signed permutation by which the sensors fit gravity or the true poses clearly better.
+"""Swapped or flipped axes: another signed permutation fits gravity or the poses better.
 
 Only said, never mended. That both sensors are turned alike against the poses is a mount, and no defect. Of two sensors that
 contradict one another gravity cannot say which has the wrong axes. And in level flight the specific force stays along the
@@ -26,28 +26,31 @@ FEWEST_POSES, MOST_POSES = 10, 20_000  # evenly taken from a longer log
 
 
 class Fit(NamedTuple):
-    """Misfit of each of the 48 readings of a sensor's axes, the present one first, and of a sensor that reads nothing."""
+    """Misfit of the 48 axis permutations, the identity first, and of a zero reading."""
 
     misfit: Float64[np.ndarray, "48"]
     nothing: float
 
     @property
     def explains(self) -> bool:
-        """Whether any reading fits better than none."""
+        """Whether any permutation fits better than a zero reading."""
         return float(self.misfit.min()) < CLEARLY * self.nothing
 
     @property
     def wrong(self) -> bool:
-        """Whether another reading fits clearly better than the present one, and better than none."""
+        """Whether another permutation fits clearly better than the identity and than zero."""
         return self.explains and float(self.misfit.min()) < CLEARLY * float(self.misfit[0])
 
     def within(self, times: float) -> Bool[np.ndarray, "48"]:
-        """The readings that fit nearly as well as the best."""
+        """Permutations that fit nearly as well as the best."""
         return np.asarray(self.misfit <= times * self.misfit.min())
 
 
 class Axes(Rule):
-    """Looked for after units. Against the poses where they settle it, else the one sensor against the other."""
+    """Rule for swapped or flipped axes; it runs after `units`.
+
+    The poses decide where they can, else the other sensor does.
+    """
 
     place = 130
 
@@ -74,7 +77,7 @@ class Axes(Rule):
 
 
 def _wrong(sensor: str, fit: Fit, readings: Float64[np.ndarray, "48 3 3"], against: str, *, alone: bool) -> Finding:
-    """Of the readings that fit alike, the one with most axes as they are."""
+    """Finding about wrong axes: of the equally good permutations the nearest to the identity."""
     alike = np.flatnonzero(fit.within(ALIKE))
     chosen = readings[alike[np.argmax(np.trace(readings[alike], axis1=1, axis2=2))]]
     names = axis_names(chosen)
@@ -91,7 +94,10 @@ def _wrong(sensor: str, fit: Fit, readings: Float64[np.ndarray, "48 3 3"], again
 
 
 def _against_poses(whole: TopicSummary, readings: Float64[np.ndarray, "48 3 3"]) -> tuple[Fit | None, Fit | None]:
-    """Rate against the turning of the poses; specific force against gravity and the poses' acceleration, in their body."""
+    """Fits of gyro and accel to the true poses, in their body frame.
+
+    The gyro is compared with the rate of the poses, the accel with gravity plus their acceleration.
+    """
     step, raw = whole.motion.table()
     if whole.truth is None or len(step) < 2 or whole.motion.start_ns is None:
         return None, None

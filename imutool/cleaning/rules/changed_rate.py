@@ -1,4 +1,4 @@
-"""Stretches in which the samples come at another rate than in most of the log."""
+"""Changed sample rate: stretches at another rate than most of the log."""
 
 from __future__ import annotations
 
@@ -18,7 +18,10 @@ DISTRUST = 0.02  # of the samples: a model knows one rate
 
 
 class ChangedRate(Rule):
-    """Only said; a log with much of it is not to be trusted, since a bias model is made for one rate."""
+    """Rule for a changed sample rate; it only reports.
+
+    A bias model has one rate, so a large share at another rate makes the log untrusted.
+    """
 
     place = 90
 
@@ -29,7 +32,7 @@ class ChangedRate(Rule):
         self._waiting = np.zeros(0, np.int64)
 
     def see(self, samples: Samples) -> None:
-        """One median a part."""
+        """Take one median period for each part."""
         stamp = np.concatenate([self._waiting, samples.stamp_ns])
         parts = max(len(stamp) - 1, 0) // PART
         if parts:
@@ -39,7 +42,7 @@ class ChangedRate(Rule):
         self._waiting = stamp[parts * PART :]
 
     def findings(self, whole: TopicSummary) -> Iterator[Finding]:
-        """One, with the rates; where it begins and ends is known to within a part."""
+        """Finding with the rates; its ends are known to within a part."""
         if not self._rows:
             return
         period, ends = np.concatenate(self._rows), np.concatenate(self._ends)

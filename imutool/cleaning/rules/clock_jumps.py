@@ -1,4 +1,4 @@
-"""Steps between the clock of the stamps and the clock of the recorder (log time)."""
+"""Clock jumps: steps between the stamps and the recorder's log time."""
 
 from __future__ import annotations
 
@@ -18,7 +18,10 @@ NOT_ITS_PERIOD = 0.5  # of a jump, by which the stamps' own step differs from wh
 
 
 class ClockJumps(Rule):
-    """Only said. Where the stamps jump forward, `dt` does too, and the bias starts anew there as after a gap."""
+    """Rule for clock jumps; it only reports.
+
+    Where stamps jump forward, `dt` jumps too: the bias starts anew, as after a gap.
+    """
 
     place = 80
 
@@ -29,7 +32,7 @@ class ClockJumps(Rule):
         self._waiting: list[np.ndarray] = []
 
     def see(self, samples: Samples) -> None:
-        """Of each part: median delay and its scatter, and where the delay changes most."""
+        """Record median delay, scatter and largest change of each part."""
         table = np.column_stack([samples.number, samples.stamp_ns, samples.log_ns])
         self._waiting.append(table)
         rows = np.concatenate(self._waiting)
@@ -53,7 +56,7 @@ class ClockJumps(Rule):
         self._last = int(delay[-1]), int(table[-1, 1]), int(table[-1, 0])
 
     def findings(self, whole: TopicSummary) -> Iterator[Finding]:
-        """One for the stamps' clock, one for the recorder's."""
+        """Findings about the stamps' clock and the recorder's clock."""
         if self._waiting and len(self._waiting[0]) > PART // 4:
             self._row(self._waiting[0])
         by_clock: dict[str, list[tuple[int, float, int, int]]] = {"stamp": [], "log time": []}
@@ -78,7 +81,7 @@ class ClockJumps(Rule):
                 )
 
     def _steps(self) -> Iterator[tuple[tuple[float, float, int, int, int, int, int], float]]:
-        """Where the level of the delay changes and stays: the row with its largest change, and the step (s)."""
+        """Lasting steps of the delay: row of the largest change, and step size (s)."""
         if len(self._rows) < 2:
             return
         level = np.array([row[0] for row in self._rows])
@@ -87,7 +90,7 @@ class ClockJumps(Rule):
         while k + 1 < len(level):
             before, after = np.median(level[max(0, k + 1 - AROUND) : k + 1]), np.median(level[k + 1 : k + 1 + AROUND])
             if abs(level[k + 1] - level[k]) > least and abs(after - before) > least:
-                row = max(self._rows[k], self._rows[k + 1], key=lambda one: one[2])
+                row = max(self._rows[k], self._rows[k + 1], key=lambda row: row[2])
                 yield row, float(after - before) * 1e-9
                 k += 1
             k += 1

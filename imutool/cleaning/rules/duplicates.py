@@ -1,4 +1,4 @@
-"""Messages that come again: a stamp that one of the last messages had already."""
+"""Duplicate messages: a stamp that one of the last messages has."""
 
 from __future__ import annotations
 
@@ -14,7 +14,10 @@ MEMORY = 1024  # messages: what a recorder sends again, it sends soon
 
 
 class Duplicates(Rule):
-    """The first of equal stamps stays; one sent again out of its place is a duplicate too, not time going back."""
+    """Rule for duplicates: it keeps the first of equal stamps.
+
+    A message sent again later is a duplicate too, not time that goes back.
+    """
 
     place = 10
 
@@ -23,7 +26,7 @@ class Duplicates(Rule):
         self._places, self._same = Intervals(), 0
 
     def __call__(self, stream: Iterable[Samples]) -> Iterator[Samples]:
-        """The samples without the repeated ones."""
+        """Yield the samples without duplicates."""
         before: Samples | None = None
         for samples in stream:
             both = samples if before is None else joined([before, samples])
@@ -41,7 +44,7 @@ class Duplicates(Rule):
             yield left
 
     def findings(self, whole: TopicSummary) -> Iterator[Finding]:
-        """One, with how many were the same to the last bit."""
+        """Finding with the number of bitwise equal samples."""
         if self._places.count:
             what = "samples with a stamp that an earlier one has"
             values = {"identical": self._same}

@@ -22,7 +22,7 @@ PAUSE_NS = nanoseconds(60.0)  # nobody recorded: nothing is missing
 
 
 class Gap(NamedTuple):
-    """Between two neighbours: the second one's number, their stamps, and how many samples are missing."""
+    """Gap between neighbours: number of the second, both stamps, number of missing samples."""
 
     number: int
     first_ns: int
@@ -31,7 +31,9 @@ class Gap(NamedTuple):
 
 
 class Gaps(Rule):
-    """Counts what is missing between neighbours that are left; what another rule dropped there is not missing.
+    """Rule for missing samples between the remaining neighbours.
+
+    Samples that another rule dropped are not missing.
 
     Nor are samples that came too late, nor anything where the clock of the stamps stepped or the rate is another.
     """
@@ -47,7 +49,7 @@ class Gaps(Rule):
         self._pauses: list[Gap] = []
 
     def see(self, samples: Samples) -> None:
-        """Steps within a block are measured against the median of the block."""
+        """Compare the steps within a block with their median."""
         if not len(samples.number):
             return
         number, stamp = samples.number, samples.stamp_ns
@@ -70,7 +72,7 @@ class Gaps(Rule):
             self._rows.append(Gap(int(number[row + 1]), int(stamp[row]), int(stamp[row + 1]), int(lost[row])))
 
     def findings(self, whole: TopicSummary) -> Iterator[Finding]:
-        """One for what is missing, with the longest gaps, and one for pauses."""
+        """Findings about missing samples, with the longest gaps, and about pauses."""
         pauses = [(row.first_ns, row.last_ns) for row in self._pauses if row.number not in whole.jumps]
         if pauses:
             what = f"pauses of more than {PAUSE_NS * 1e-9:g} s"
@@ -97,7 +99,7 @@ class Gaps(Rule):
         )
 
     def _left(self, gap: Gap, whole: TopicSummary) -> Gap:
-        """A gap less what is explained otherwise."""
+        """Gap without the samples that late stamps, clock jumps or another rate explain."""
         at_other_rate = any(first <= gap.first_ns and gap.last_ns <= last for first, last in whole.other_rate_ns)
         if gap.number in whole.jumps or at_other_rate:
             return gap._replace(missing=0)
@@ -106,6 +108,6 @@ class Gaps(Rule):
 
 
 def missing(steps_ns: Int64[np.ndarray, " n"], period_ns: float) -> Float64[np.ndarray, " n"]:
-    """How many samples would fill each step; none where it is shorter than 1.5 periods."""
+    """Number of samples that would fill each step; 0 for steps below 1.5 periods."""
     periods = steps_ns / period_ns
     return np.where(periods >= MISSING_STEP, np.round(periods - 1.0), 0.0)

@@ -1,4 +1,4 @@
-"""Values that are no measurement: no finite numbers, or beyond what any sensor reads in any unit."""
+"""Invalid values: NaN, infinity, or beyond the range of any sensor in any unit."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ AXES = tuple(f"{sensor}.{axis}" for sensor in ("gyro", "accel") for axis in "xyz
 
 
 class NotFinite(Rule):
-    """A sample with such a value among its six is left out."""
+    """Rule that drops a sample with an invalid value on any axis."""
 
     place = 30
 
@@ -24,7 +24,7 @@ class NotFinite(Rule):
         self._places, self._by_axis = Intervals(), np.zeros(6, np.int64)
 
     def __call__(self, stream: Iterable[Samples]) -> Iterator[Samples]:
-        """The samples that are all numbers."""
+        """Yield the samples with six valid values."""
         for samples in stream:
             finite = np.abs(samples.values) <= NO_SENSOR  # false of NaN
             good = finite.all(axis=1)
@@ -35,7 +35,7 @@ class NotFinite(Rule):
             yield samples.where(good)
 
     def findings(self, whole: TopicSummary) -> Iterator[Finding]:
-        """One, with the count by axis."""
+        """Finding with the count by axis."""
         if self._places.count:
             by_axis = {name: int(count) for name, count in zip(AXES, self._by_axis, strict=True) if count}
             what = "samples that are no measurement: not finite, or beyond any sensor"

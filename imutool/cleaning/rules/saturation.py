@@ -1,4 +1,4 @@
-"""Axes at the end of their range."""
+"""Saturation: axes at the end of their range."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ KEPT = 3  # values at either end: the last one, and the two it is compared with
 
 
 class Ends:
-    """The largest and smallest values of an axis and how often each came, over samples that come in parts."""
+    """Extreme values of an axis and their counts, over samples that come in parts."""
 
     def __init__(self) -> None:
         self._few = np.zeros(0)  # distinct values, until there are enough of them
@@ -33,7 +33,7 @@ class Ends:
         self._samples = 0
 
     def see(self, values: Float64[np.ndarray, " n"]) -> None:
-        """The next values; those that are no finite numbers are passed over."""
+        """Add values; those that are not finite are skipped."""
         levels, counts = np.unique(values[np.isfinite(values)], return_counts=True)
         self._samples += int(counts.sum())
         if len(self._few) < LEVELS:
@@ -45,7 +45,7 @@ class Ends:
             self._ends[side] = both[near], total[near]
 
     def limit(self, side: int) -> float | None:
-        """The value at which the axis is saturated (`RULE`), at its low (-1) or high (1) end."""
+        """Saturation limit (`RULE`) at the low (-1) or high (1) end; None without saturation."""
         if len(self._few) < LEVELS:
             return None
         levels, counts = self._ends[side]
@@ -55,13 +55,16 @@ class Ends:
         return float(levels[end]) if piled and not median else None
 
     def extreme(self, side: int) -> float:
-        """The last value at an end so far."""
+        """Extreme value so far at an end."""
         levels = self._ends[side][0]
         return float(levels[0 if side < 0 else -1]) if len(levels) else np.nan
 
 
 class Saturation(Rule):
-    """Saturated samples stay: that they are at least this large is worth knowing, and a bias model cannot mend them."""
+    """Rule for saturated samples; it keeps them.
+
+    The true value is at least this large, and a bias model cannot correct it.
+    """
 
     place = 110
 
@@ -71,7 +74,7 @@ class Saturation(Rule):
         self._places: dict[tuple[int, int], tuple[float, Intervals]] = {}
 
     def see(self, samples: Samples) -> None:
-        """Places are those of the extreme so far: a larger value makes those before it ordinary."""
+        """Note the samples at the extreme value so far; a larger value clears them."""
         for axis, ends in enumerate(self._ends):
             values = samples.values[:, axis]
             ends.see(values)
@@ -84,7 +87,7 @@ class Saturation(Rule):
                 known[1].add(samples.number[at], samples.stamp_ns[at])
 
     def findings(self, whole: TopicSummary) -> Iterator[Finding]:
-        """One for each axis and end."""
+        """Findings by axis and end."""
         for axis, side in product(range(6), (-1, 1)):
             limit = self._ends[axis].limit(side)
             if limit is not None:

@@ -1,4 +1,4 @@
-"""Single samples, or up to three in a row, that stand far out of what surrounds them.
+"""Spikes: one to three samples in a row far outside their neighbours.
 
 A spike of w samples leaves by one step and comes back by another of the opposite sign, and both are many times larger than
 every other step nearby. Real shocks ring: over the training recordings of EuRoC (motors), TUM-VI (hand-held) and FETCH
@@ -27,7 +27,7 @@ ORDINARY = 0.75  # quantile of the steps
 
 
 class Spikes(Rule):
-    """Leaves spikes out; the whole sample goes, whichever of its axes has it."""
+    """Rule that drops spikes; a spike on one axis drops the whole sample."""
 
     place = 50
 
@@ -36,7 +36,7 @@ class Spikes(Rule):
         self._places, self._by_axis, self._largest = Intervals(), np.zeros(6, np.int64), np.zeros(6)
 
     def __call__(self, stream: Iterable[Samples]) -> Iterator[Samples]:
-        """The samples without spikes."""
+        """Yield the samples without spikes."""
         for around, core in padded(stream, NEARBY + LONGEST + 1):
             spike, size = spikes(around.values)
             found = spike[core]
@@ -50,7 +50,7 @@ class Spikes(Rule):
             yield samples.where(~bad)
 
     def findings(self, whole: TopicSummary) -> Iterator[Finding]:
-        """One, with count and largest step by axis."""
+        """Finding with count and largest step by axis."""
         if self._places.count:
             axes = [i for i in range(6) if self._by_axis[i]]
             values = {
@@ -62,7 +62,7 @@ class Spikes(Rule):
 
 
 def spikes(values: Float64[np.ndarray, "n k"]) -> tuple[Bool[np.ndarray, "n k"], Float64[np.ndarray, "n k"]]:
-    """Which samples are spikes, by axis, and the smaller of the two steps of each (0 elsewhere).
+    """Spike mask by axis, and the smaller of the two steps of each spike (0 elsewhere).
 
     Where the samples nearby hardly change (at rest, at the end of the range), an ordinary step must not stand out: three
     quarters of the steps that are not zero, over the whole block, are the least that counts as a step nearby.
@@ -72,10 +72,10 @@ def spikes(values: Float64[np.ndarray, "n k"]) -> tuple[Bool[np.ndarray, "n k"],
     if n < NEARBY:
         return found, size
     step = np.diff(values, axis=0)
-    there = np.abs(step)
-    ordinary = np.array([np.quantile(column[column > 0], ORDINARY) if column.any() else 0.0 for column in there.T])
+    magnitude = np.abs(step)
+    ordinary = np.array([np.quantile(column[column > 0], ORDINARY) if column.any() else 0.0 for column in magnitude.T])
     edge = np.zeros((NEARBY, values.shape[1]))
-    largest = sliding_window_view(np.concatenate([edge, there, edge]), NEARBY, axis=0).max(axis=-1)  # of steps k-10..k-1
+    largest = sliding_window_view(np.concatenate([edge, magnitude, edge]), NEARBY, axis=0).max(axis=-1)  # of steps k-10..k-1
     for width in range(1, LONGEST + 1):
         first = np.arange(1, n - width)  # the step into it is first - 1, the step out of it first + width - 1
         into, out = step[first - 1], -step[first + width - 1]

@@ -1,4 +1,4 @@
-"""Values that stand still: a sensor that repeats its last sample, an axis that no longer moves.
+"""Stuck values: a sensor that repeats its last sample, an axis that does not change.
 
 A sensor with noise does not give six equal numbers twice; in 23 real recordings two samples in a row are the longest such
 run. In a noise-free simulation at rest it does, so repeats are only dropped where the samples that do change show noise:
@@ -24,7 +24,7 @@ AXIS_DISTRUST = 0.1  # of the time
 
 
 class Stuck(Rule):
-    """Of equal samples in a row the first stays. An axis that alone stands still is only said."""
+    """Rule for stuck values: it keeps the first of equal samples, and reports a stuck axis."""
 
     place = 40
 
@@ -36,7 +36,7 @@ class Stuck(Rule):
         self._axes = [_Axis() for _ in AXES]
 
     def __call__(self, stream: Iterable[Samples]) -> Iterator[Samples]:
-        """The samples without repeats."""
+        """Yield the samples without repeats."""
         for around, core in padded(stream, LEAST):
             same = np.concatenate([[False], (np.diff(around.values, axis=0) == 0).all(axis=1)])
             self._noisy = _noisy(around.values[~same], self._noisy)
@@ -57,7 +57,7 @@ class Stuck(Rule):
             yield samples
 
     def findings(self, whole: TopicSummary) -> Iterator[Finding]:
-        """Repeats, values held by a topic faster than its sensor, and axes that stand still."""
+        """Findings about repeats, a topic faster than its sensor, and stuck axes."""
         if self._places.count:
             what = f"samples that repeat the one before, in runs of {LEAST} and more: the sensor was stuck"
             yield Finding("stuck", "warning", what, **self._places.where(), action="dropped", confidence=0.95)
@@ -113,7 +113,7 @@ class _Axis:
         self._stamps = self._stamps[0], int(samples.stamp_ns[end - 1])
 
     def close(self) -> None:
-        """The run so far ends."""
+        """Close the current run."""
         lasted_s = (self._stamps[1] - self._stamps[0]) * 1e-9
         if self._count >= AXIS_LEAST and lasted_s >= AXIS_LEAST_S:
             self.places.add_run(self._numbers, self._stamps, self._count)
@@ -122,7 +122,7 @@ class _Axis:
 
 
 def _noisy(values: Float64[np.ndarray, "n 6"], before: bool) -> bool:
-    """Whether samples show noise; what was known before where there are too few."""
+    """Whether samples show noise; `before` for too few samples."""
     if len(values) < 4 * LEAST:
         return before
     second, third = np.diff(values, n=2, axis=0), np.diff(values, n=3, axis=0)

@@ -148,7 +148,7 @@ class NonMonotonic(Rule):
 
 
 def _ahead(stamp_ns: Int64[np.ndarray, " n"]) -> Bool[np.ndarray, " n"]:
-    """Samples that come, by their stamps, at or after most of the next 32 (or of those there are, two at least).
+    """Samples stamped at or after most of the next 32 samples (of two at least).
 
     Only where what follows them goes on after what came before them: else the clock was set back, and they are right.
     """
@@ -167,7 +167,7 @@ def _ahead(stamp_ns: Int64[np.ndarray, " n"]) -> Bool[np.ndarray, " n"]:
 
 
 def _before(stamp_ns: Int64[np.ndarray, " n"], ahead: Bool[np.ndarray, " n"]) -> Int64[np.ndarray, " n"]:
-    """The stamp of the last sample that is not ahead, for each: where in the log something far ahead of it stands."""
+    """Stamp of the last sample before each that is not ahead."""
     if not ahead.any() or ahead.all():
         return stamp_ns
     row = np.maximum.accumulate(np.where(ahead, 0, np.arange(len(ahead))))

@@ -40,7 +40,7 @@ CALM_SCATTER = 0.03  # of the reading
 
 
 class Units(Rule):
-    """Converts where the unit is settled; else says what it looks like, and does not trust the log."""
+    """Rule for units: it converts a settled unit, else reports it and distrusts the log."""
 
     place = 120
 
@@ -115,7 +115,7 @@ def accel_unit(level: float, tolerance: float) -> str:
 
 
 def gravity_level(motion: Motion) -> tuple[float | None, bool]:
-    """What the accelerometer reads of gravity, and whether in calm seconds; none without samples.
+    """Gravity as the accel reads it, and whether at rest; None without samples.
 
     Calm are the tenth of the seconds whose means over 0.1 s scatter least, if that is less than 3 % of what they read.
     Without any it is the median of all, means of a second, in which vibration is gone.
@@ -141,7 +141,7 @@ def spread(gyro: Float64[np.ndarray, "n 3"]) -> float:
 
 
 def rate_ratio(motion: Motion, truth: Truth) -> float | None:
-    """Measured over true rate; none where the truth hardly turns or shares no time with the samples."""
+    """Ratio of measured to true rate; None if the truth hardly turns or shares no time."""
     first, last, rate = turning(truth)
     step, mean = motion.table()
     start = motion.start_ns or 0

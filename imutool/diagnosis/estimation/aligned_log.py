@@ -1,4 +1,4 @@
-"""Aligned logs: samples in k columns on one clock with what was expected of them, and the rows that a fit sees."""
+"""Aligned logs: samples in k columns, their expectation on one clock, and rows of a fit."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ Blocks = tuple[tuple[int, Float64[np.ndarray, "n _"]], ...]
 
 @dataclass(frozen=True, eq=False)
 class AlignedLog(ABC):
-    """Recorded samples by their stamps (s from the log's start), and a forward model of what was expected.
+    """Recorded samples by stamp (s from the log's start), with their forward model.
 
     `fitted` and `held_out` are rows; rows in neither are borders, gaps and ends. `known` marks samples that measure their axis
     (none: all): those of a converter at its end and of an axis that is stuck do not. Above `band_hz` the expectation is wrong
@@ -62,7 +62,10 @@ class AlignedLog(ABC):
 
     @abstractmethod
     def blocks(self, samples: Any) -> Blocks:
-        """Sampled signals by sensor: first column and columns; effects leave arrays of other sensors as they are."""
+        """Sampled signals by sensor: first column, and the columns.
+
+        An effect leaves the arrays of other sensors as they are.
+        """
 
     @abstractmethod
     def recorded(self) -> tuple[Any, Any]:
@@ -102,13 +105,13 @@ class AlignedLog(ABC):
 
 @dataclass(frozen=True, eq=False)
 class Pair(AlignedLog):
-    """An IMU's samples (rad/s, m/s²) with the ideal motion `felt` on an even clock.
+    """Aligned IMU samples (rad/s, m/s²) with the `ideal` motion on an even clock.
 
     `sim_noise` was filtered out of a simulation's samples (zero where its poses replace them), `truth` are the true poses at
     the stamps.
     """
 
-    felt: IdealMotion = field(kw_only=True)
+    ideal: IdealMotion = field(kw_only=True)
     truth: Poses | None = field(default=None, kw_only=True)
     against: str = field(default="simulation", kw_only=True)
     sim_noise: Float64[np.ndarray, "6"] = field(default_factory=lambda: np.zeros(6), kw_only=True)
@@ -131,7 +134,7 @@ class Pair(AlignedLog):
 
     def state(self) -> SignalState:
         """The ideal motion, to be sampled at the stamps."""
-        return SignalState(self.felt, self.stamp_s, self.stamp_s)
+        return SignalState(self.ideal, self.stamp_s, self.stamp_s)
 
     def blocks(self, samples: SensorSamples) -> Blocks:
         """Gyro, then accelerometer."""
@@ -139,11 +142,14 @@ class Pair(AlignedLog):
 
     def recorded(self) -> tuple[IdealMotion, SensorSamples]:
         """The ideal motion and the recorded samples; angular acceleration is not recorded."""
-        return self.felt, SensorSamples(self.stamp_s, self.real[:, :3], self.real[:, 3:], np.zeros((len(self.real), 3)))
+        return self.ideal, SensorSamples(self.stamp_s, self.real[:, :3], self.real[:, 3:], np.zeros((len(self.real), 3)))
 
 
 def split(stamp_s: Float64[np.ndarray, " n"]) -> tuple[Bool[np.ndarray, " n"], Bool[np.ndarray, " n"]]:
-    """Rows that are held out, and rows that count at all: away from borders between the two and from gaps."""
+    """Held-out rows, and usable rows.
+
+    Usable rows are away from gaps and from borders between fitted and held-out blocks.
+    """
     since = stamp_s - stamp_s[0]
     block_s = min(BLOCK_S, since[-1] / (2 * HELD_OUT_EACH))
     block = np.floor(since / block_s).astype(int)

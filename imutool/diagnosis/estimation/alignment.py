@@ -1,4 +1,4 @@
-"""Alignment of a recording with a simulation, or with its own true poses: one clock, one row a sample.
+"""Alignment of a recording with a simulation or its true poses: one clock, a row a sample.
 
 A simulation's samples carry noise of their own, and a term that can shrink the simulation would shrink its noise as well and
 look like physics. Where the simulation's poses explain its samples but for white noise, they stand in for them, without noise
@@ -41,7 +41,7 @@ LEAST_NOISE = np.array([1e-4] * 3 + [1e-3] * 3)
 
 
 def with_simulation(real: Recording, sim: Recording) -> Pair:
-    """The recording beside a simulation of the same motion.
+    """Align a recording with a simulation of the same motion.
 
     Raises:
         DataError: the two share too little time, or are not of one motion.
@@ -57,9 +57,9 @@ def with_simulation(real: Recording, sim: Recording) -> Pair:
     start_ns = int(real.imu.t_ns[0])
     t_sim = seconds(sim.imu.t_ns, start_ns) - shift_s  # on the recording's clock
     stamp_s = seconds(real.imu.t_ns, start_ns)
-    felt, noise = _simulated(t_sim, sim, shift_s, start_ns, real)
-    inside = (stamp_s >= felt.t_s[0]) & (stamp_s <= felt.t_s[-1])
-    return _pair(real, felt, stamp_s, inside, "simulation", shift_s, noise)
+    ideal, noise = _simulated(t_sim, sim, shift_s, start_ns, real)
+    inside = (stamp_s >= ideal.t_s[0]) & (stamp_s <= ideal.t_s[-1])
+    return _pair(real, ideal, stamp_s, inside, "simulation", shift_s, noise)
 
 
 def same_motion(real: Imu, sim: Imu) -> bool:
@@ -67,21 +67,23 @@ def same_motion(real: Imu, sim: Imu) -> bool:
     return _shift(real, sim) is not None
 
 
-def with_truth(real: Recording, felt: IdealMotion, start_ns: int, band_hz: float) -> Pair:
-    """The recording beside what its own true poses say, `felt` being on seconds since `start_ns`, true up to `band_hz`.
+def with_truth(real: Recording, ideal: IdealMotion, start_ns: int, band_hz: float) -> Pair:
+    """Align a recording with the motion of its own true poses.
+
+    `ideal` counts seconds from `start_ns` and is true up to `band_hz`.
 
     Raises:
         DataError: too little shared time.
     """
     stamp_s = seconds(real.imu.t_ns, start_ns)
-    inside = (stamp_s >= felt.t_s[0]) & (stamp_s <= felt.t_s[-1])
-    felt = replace(felt, channels=_channels(real, start_ns + np.round(felt.t_s * 1e9).astype(np.int64)))
-    return replace(_pair(real, felt, stamp_s, inside, "true poses", 0.0, np.zeros(6)), band_hz=band_hz)
+    inside = (stamp_s >= ideal.t_s[0]) & (stamp_s <= ideal.t_s[-1])
+    ideal = replace(ideal, channels=_channels(real, start_ns + np.round(ideal.t_s * 1e9).astype(np.int64)))
+    return replace(_pair(real, ideal, stamp_s, inside, "true poses", 0.0, np.zeros(6)), band_hz=band_hz)
 
 
 def _pair(
     real: Recording,
-    felt: IdealMotion,
+    ideal: IdealMotion,
     stamp_s: Float64[np.ndarray, " n"],
     inside: Bool[np.ndarray, " n"],
     against: str,
@@ -112,7 +114,7 @@ def _pair(
         samples,
         usable & ~held_out,
         usable & held_out,
-        felt=felt,
+        ideal=ideal,
         truth=truth,
         aligned_s=aligned_s,
         against=against,
@@ -130,15 +132,15 @@ def _channels(recording: Recording, t_ns: np.ndarray) -> dict[str, Float64[np.nd
 def _simulated(
     t_sim: Float64[np.ndarray, " m"], sim: Recording, shift_s: float, start_ns: int, real: Recording
 ) -> tuple[IdealMotion, Float64[np.ndarray, "6"]]:
-    """The simulation without its noise on an even clock, and how noisy it was where that had to be filtered out."""
+    """Simulated motion without noise on an even clock, and the noise that was filtered out."""
     samples = np.concatenate([sim.imu.gyro, sim.imu.accel], axis=1)
     noise = white_noise(samples)
     period_s = float(np.median(np.diff(t_sim)))
-    felt = _by_poses(sim, samples, noise, 1.0 / period_s)
-    if felt is not None:
-        t_s = seconds(sim.truth.t_ns[:1], start_ns)[0] - shift_s + felt.t_s
+    ideal = _by_poses(sim, samples, noise, 1.0 / period_s)
+    if ideal is not None:
+        t_s = seconds(sim.truth.t_ns[:1], start_ns)[0] - shift_s + ideal.t_s
         t_ns = start_ns + np.round(t_s * 1e9).astype(np.int64)
-        return replace(felt, t_s=t_s, channels=_channels(real, t_ns)), np.zeros(6)
+        return replace(ideal, t_s=t_s, channels=_channels(real, t_ns)), np.zeros(6)
     t_s = t_sim[0] + period_s * np.arange(int((t_sim[-1] - t_sim[0]) / period_s) + 1)
     even = np.asarray(make_interp_spline(t_sim, samples, k=3)(t_s))
     clean = np.stack([wiener_filter(column) for column in even.T], axis=1)
@@ -153,7 +155,10 @@ def _simulated(
 def _by_poses(
     sim: Recording, samples: Float64[np.ndarray, "m 6"], noise: Float64[np.ndarray, "6"], rate_hz: float
 ) -> IdealMotion | None:
-    """What the simulation's own poses say its IMU feels, if that is what it reads but for white noise and a constant."""
+    """Ideal motion of the simulation's own poses.
+
+    None unless the simulated samples are that motion plus white noise and a constant.
+    """
     if not sim.truths:
         return None
     poses = sim.truth
@@ -164,19 +169,19 @@ def _by_poses(
     motion = trajectory.at(t_ns[t_ns <= poses.t_ns[-1]])
     R_wb = Rotation.from_quat(motion.q_wb_wxyz, scalar_first=True).as_matrix()
     t_s = np.arange(len(motion.p_wb)) * round(1e9 / rate_hz) * 1e-9
-    felt = IdealMotion(t_s, motion.omega_b, motion.specific_force(), motion.alpha_b, R_wb)
+    ideal = IdealMotion(t_s, motion.omega_b, motion.specific_force(), motion.alpha_b, R_wb)
     t_s = seconds(sim.imu.t_ns, int(poses.t_ns[0]))
-    rows = (t_s >= felt.t_s[0]) & (t_s <= felt.t_s[-1])
+    rows = (t_s >= ideal.t_s[0]) & (t_s <= ideal.t_s[-1])
     if rows.mean() < MOST_OF_IT:
         return None
-    read = felt.sample(t_s[rows], t_s[rows])
-    left = samples[rows] - np.concatenate([read.gyro, read.accel], axis=1)
-    left = left - left.mean(axis=0)
+    expected = ideal.sample(t_s[rows], t_s[rows])
+    residual = samples[rows] - np.concatenate([expected.gyro, expected.accel], axis=1)
+    residual = residual - residual.mean(axis=0)
     coarse = (
-        left[: len(left) // COARSE * COARSE].reshape(-1, COARSE, 6).mean(axis=1)
+        residual[: len(residual) // COARSE * COARSE].reshape(-1, COARSE, 6).mean(axis=1)
     )  # where a misfit of motion would stand out
     exact = (coarse.std(axis=0) < TOLERATED * np.maximum(noise, LEAST_NOISE) / np.sqrt(COARSE)).all()
-    return felt if exact else None
+    return ideal if exact else None
 
 
 def _attitude(recording: Recording, t_ns: np.ndarray) -> Float64[np.ndarray, "n 3 3"] | None:
@@ -192,7 +197,10 @@ def rotation_matrices(poses: Poses) -> Float64[np.ndarray, "n 3 3"]:
 
 
 def wiener_filter(x: Float64[np.ndarray, " n"]) -> Float64[np.ndarray, " n"]:
-    """A signal without the white noise that the top of its spectrum shows: each frequency by 1 - noise / power."""
+    """Wiener filter: multiply each frequency by 1 - noise / power.
+
+    The top of the spectrum shows the white noise.
+    """
     n = len(x)
     if nothing_but_noise(x):  # its ends would be taken for a ramp
         return np.full(n, x.mean())
@@ -207,7 +215,7 @@ def wiener_filter(x: Float64[np.ndarray, " n"]) -> Float64[np.ndarray, " n"]:
 
 
 def _shift(real: Imu, sim: Imu) -> float | None:
-    """What has to be added to the recording's times to get the simulation's (s): 0 where the two clocks share an epoch.
+    """Clock shift (s) to add to the recording's times; 0 on a shared epoch, None if unlike.
 
     None where the two are not of one motion.
     """
@@ -222,12 +230,12 @@ def _shift(real: Imu, sim: Imu) -> float | None:
 
 
 def _rests(imu: Imu) -> bool:
-    """Whether it turns by no more than its noise: then nothing can be aligned, and nothing has to be."""
+    """Whether a gyro shows noise only, so that nothing can be aligned, and nothing has to be."""
     return all(nothing_but_noise(column, least) for column, least in zip(imu.gyro.T, LEAST_NOISE, strict=False))
 
 
 def nothing_but_noise(x: Float64[np.ndarray, " n"], least: float = 0.0) -> bool:
-    """Whether means of a signal, over a few samples and over much of it, scatter no more than those of white noise."""
+    """Whether means of a signal scatter no more than means of white noise."""
     noise = max(float(white_noise(x[:, None])[0]), least)
     sizes = [size for size in (*MEANS, len(x) // LEAST_MEANS) if 0 < size <= len(x) // LEAST_MEANS]
     means = (x[: len(x) // size * size].reshape(-1, size).mean(axis=1) for size in sizes)
@@ -235,7 +243,7 @@ def nothing_but_noise(x: Float64[np.ndarray, " n"], least: float = 0.0) -> bool:
 
 
 def _lag(real: Imu, sim: Imu) -> tuple[float, float]:
-    """The shift at which the two turn alike, and their correlation there."""
+    """Lag (s) at which the angular rates correlate best, and that correlation."""
     rows = [np.linalg.norm(imu.gyro - np.median(imu.gyro, axis=0), axis=1) for imu in (real, sim)]
     start = [int(imu.t_ns[0]) for imu in (real, sim)]
     grids = [np.arange(0.0, imu.duration_s, 1.0 / ALIGN_HZ) for imu in (real, sim)]

@@ -1,4 +1,4 @@
-"""Score test of candidate effects: the gain of one linear step beside a fit, and candidates ranked by its p-value."""
+"""Score test of candidate effects: gain of one linear step, ranked by p-value."""
 
 from __future__ import annotations
 
@@ -54,7 +54,10 @@ class CandidateScore:
         self.left = self.total - float(self.g @ np.linalg.solve(self.N, self.g))
 
     def gain(self, effect: Effect, start: Theta) -> float:
-        """Gain in squares of one linear step from a start, no positive parameter changing by more than a factor of e."""
+        """Gain in squares of one linear step from a start.
+
+        No positive parameter changes by more than a factor of e.
+        """
         chosen, p = (*self.now.chosen, (effect, start)), len(start)
         moves = np.array([not parameter.begins for parameter in effect.parameters])  # onsets are searched, not stepped
         N_bb, N_ab, g_b = np.zeros((p, p)), np.zeros((len(self.N), p)), np.zeros(p)
@@ -75,22 +78,22 @@ class CandidateScore:
                     N_ab[np.ix_(axis.where, js)] += axis.A @ b.T
                     g_b[js] += b @ r
         _, std = priors(chosen[-1:])
-        beside = np.linalg.solve(self.N, np.concatenate([N_ab, g_a[:, None]], axis=1))
-        S, g = N_bb + np.diag(1.0 / std**2) - N_ab.T @ beside[:, :p], g_b - N_ab.T @ beside[:, p]
+        solved = np.linalg.solve(self.N, np.concatenate([N_ab, g_a[:, None]], axis=1))
+        S, g = N_bb + np.diag(1.0 / std**2) - N_ab.T @ solved[:, :p], g_b - N_ab.T @ solved[:, p]
         step = np.linalg.solve(S, g)
         far = float(np.abs(step[[parameter.positive for parameter in effect.parameters]]).max(initial=1.0))
-        return float(self.left - total + g_a @ beside[:, p] + (2.0 / far - 1.0 / far**2) * (g @ step))
+        return float(self.left - total + g_a @ solved[:, p] + (2.0 / far - 1.0 / far**2) * (g @ step))
 
 
 def _exclude(a: Effect, b: Effect) -> bool:
-    """Whether two effects never act together: variants of one effect of the catalogue on one sensor."""
+    """Whether two effects never act together: variants of one catalogue effect on one sensor."""
     one_sensor = a.sensors == b.sensors or bool(set(a.sensors) & set(b.sensors))
     variants = a.kind == b.kind == "catalogue" and a.name == b.name and one_sensor
     return a.key == b.key or variants
 
 
 class Scored(NamedTuple):
-    """A candidate with the log p-value of its score from its best start, and the gain in squares."""
+    """Candidate with the log p-value of its best start, and the gain in squares."""
 
     log_p: float
     effect: Effect
@@ -104,7 +107,7 @@ class Scored(NamedTuple):
 
 
 class Candidates:
-    """Candidate effects with the starts of their fits, and their scores beside the last fit that was asked for."""
+    """Candidate effects with the starts of their fits, and their scores beside a fit."""
 
     def __init__(self, logs: Sequence[WhitenedLog], effects: Sequence[Effect]) -> None:
         self.logs = logs
@@ -123,22 +126,25 @@ class Candidates:
         return sum(len(self.starts[effect.key]) for effect in effects)
 
     def log_p(self, effect: Effect, gain: float) -> float:
-        """Log p-value of a gain by an effect; starts that are the best of many choices make chance likelier."""
+        """Log p-value of a gain by an effect.
+
+        Starts that are the best of many choices make chance likelier.
+        """
         return log_p_value(gain, len(effect.parameters)) + self.log_choices[effect.key]
 
     def ranked(self, now: Fit, candidates: Sequence[Effect]) -> list[Scored]:
         """Candidates beside a fit by their score, each from its best start."""
         if self.scored_fit is not now:
             self.scored_fit, self.scores = now, {}
-        asked = [effect for effect in candidates if not any(_exclude(effect, other) for other, _ in now.chosen)]
+        allowed = [effect for effect in candidates if not any(_exclude(effect, other) for other, _ in now.chosen)]
         score = None
-        for effect in asked:
+        for effect in allowed:
             if effect.key not in self.scores:
                 score = score or CandidateScore(self.logs, now)
                 gains = [(score.gain(effect, start), start) for start in self.starts[effect.key]]
                 gain, start = max(gains, key=lambda pair: pair[0])
                 self.scores[effect.key] = Scored(self.log_p(effect, gain), effect, start, gain)
-        return sorted((self.scores[effect.key] for effect in asked), key=lambda entry: entry.log_p)
+        return sorted((self.scores[effect.key] for effect in allowed), key=lambda entry: entry.log_p)
 
 
 def unnamed_count(found: Fit) -> int:
@@ -147,6 +153,9 @@ def unnamed_count(found: Fit) -> int:
 
 
 def bic(found: Fit, unnamed_penalty: float) -> float:
-    """Squares left and the cost of the parameters (BIC); an effect outside the catalogue costs more."""
+    """Bayesian information criterion (BIC): squares left and the cost of the parameters.
+
+    An effect outside the catalogue costs more.
+    """
     count = len(parameters_of(found.chosen))
     return found.objective + count * float(np.log(found.numbers)) + unnamed_penalty * unnamed_count(found)

@@ -1,4 +1,4 @@
-"""Gauss-Newton fit of effects to whitened logs together, with a constant bias for each log and axis.
+"""Gauss-Newton fit of effects to whitened logs, with a bias for each log and axis.
 
 Between the steps all times are searched at which an effect may set in. A Jacobian costs an evaluation for each parameter, a
 step one: a Jacobian is kept as long as steps do what it predicts, and a fit may begin with that of another fit nearby.
@@ -49,7 +49,10 @@ def with_value(chosen: Chosen, k: int, j: int, value: float) -> Chosen:
 
 @dataclass(frozen=True, eq=False)
 class Fit:
-    """Effects with their parameters, each log's bias, and the sum of squares of white residuals and of the prior.
+    """Fitted effects with parameters and biases, and the objective of the fit.
+
+    The objective is the sum of squares of white residuals and of the prior. `numbers` is the count of the fitted white
+    values.
 
     `numbers` is the count of the white values that were fitted.
     """
@@ -88,11 +91,11 @@ class Fit:
 
     @cached_property
     def covariance(self) -> Float64[np.ndarray, "p p"]:
-        """Covariance of the free parameters in order (logarithms for positive ones), biases marginalised."""
+        """Covariance of the free parameters, biases marginalised; logarithms for positive ones."""
         return np.linalg.inv(self.information + np.diag(1.0 / self.prior**2)) if len(self.prior) else np.zeros((0, 0))
 
     def place(self, key: str) -> slice:
-        """Where an effect's parameters are among all."""
+        """Slice of an effect's parameters among all."""
         k = self.keys.index(key)
         first = sum(len(theta) for _, theta in self.chosen[:k])
         return slice(first, first + len(self.chosen[k][1]))
@@ -109,7 +112,10 @@ class Fit:
 
 
 def priors(begun: Chosen) -> tuple[Float64[np.ndarray, " p"], Float64[np.ndarray, " p"]]:
-    """Mean and standard deviation of the free parameters: about the null value, or the start where that is infinite."""
+    """Prior mean and standard deviation of the free parameters.
+
+    The mean is the null value, or the start where the null value is infinite or the parameter positive.
+    """
     mean, std = [], []
     for parameter, x in zip(parameters_of(begun), free_of(begun), strict=True):
         at_start = parameter.positive or not np.isfinite(parameter.null_value)
@@ -157,7 +163,7 @@ class _Problem:
         self.mean, self.std = priors(begun)
 
     def state(self, chosen: Chosen, like: _State | None) -> _State:
-        """Parameters with their residuals and objective; forward passes are continued from a state like it."""
+        """Residuals and objective of parameters; forward passes continue from a state like it."""
         passes = [ForwardPass(log.pair, chosen, None if like is None else like.passes[k]) for k, log in enumerate(self.logs)]
         residuals = [log.residual(forward.expected) for log, forward in zip(self.logs, passes, strict=True)]
         total = float((((free_of(chosen) - self.mean) / self.std) ** 2).sum()) if len(self.mean) else 0.0
@@ -169,7 +175,10 @@ class _Problem:
         return _State(chosen, passes, residuals, bias, total)
 
     def step(self, jacobians: Jacobians, now: _State) -> Theta:
-        """Gauss-Newton step of the free parameters; no positive one changes by more than a factor of e, onsets stay."""
+        """Gauss-Newton step of the free parameters.
+
+        No positive parameter changes by more than a factor of e; onsets stay.
+        """
         N, g = _normal(self, jacobians, now.residuals, now.bias)
         x, parameters = free_of(now.chosen), parameters_of(now.chosen)
         N[: len(x), : len(x)] += np.diag(1.0 / self.std**2)
@@ -183,7 +192,7 @@ class _Problem:
         return delta / max(1.0, float(np.abs(delta[positive]).max(initial=0.0)))
 
     def as_predicted(self, jacobians: Jacobians, before: _State, after: _State, step: Theta) -> bool:
-        """Whether a step changed the residuals as the Jacobians predict, so that they may be kept."""
+        """Whether a step changed the residuals as the Jacobians predict, so that they are kept."""
         missed = length = 0.0
         for k, (log, mask) in enumerate(zip(self.logs, self.masks, strict=True)):
             change, constant = (before.residuals[k] - after.residuals[k])[mask], log.constants[mask]
@@ -196,14 +205,14 @@ class _Problem:
 
 
 def _descended(problem: _Problem, now: _State, iterations: int, near: Fit | None, give_up_above: float) -> _State:
-    """The state after Gauss-Newton steps, each shortened until the objective falls."""
-    steps, known = 0, None if near is None or not len(problem.mean) else near.jacobians
+    """State after Gauss-Newton steps, each shortened until the objective falls."""
+    steps, kept = 0, None if near is None or not len(problem.mean) else near.jacobians
     whiteners = [log.whiten for log in problem.logs]
     while len(problem.mean) and steps < iterations:
         before = now.objective
         for moved in _onsets(problem, now):
             now = min(now, problem.state(moved, now), key=_objective)
-        jacobians = Jacobians(whiteners, now.passes, now.chosen, known)
+        jacobians = Jacobians(whiteners, now.passes, now.chosen, kept)
         x, whole = free_of(now.chosen), problem.step(jacobians, now)
         tries = (
             (step, problem.state(_bound(now.chosen, x + step), now)) for step in (whole * 0.5**k for k in range(BACKTRACKS))
@@ -212,19 +221,19 @@ def _descended(problem: _Problem, now: _State, iterations: int, near: Fit | None
         if better is now:
             if jacobians.fresh:
                 break
-            known = None
+            kept = None
             continue
         predicted = problem.as_predicted(jacobians, now, better, step)
         now, steps = better, steps + 1
         converged = before - now.objective < CONVERGED and (jacobians.fresh or predicted)
         if converged or (steps == PATIENCE and now.objective >= give_up_above):
             break
-        known = jacobians if predicted else jacobians.linear()
+        kept = jacobians if predicted else jacobians.linear()
     return now
 
 
 def _polished(problem: _Problem, now: _State) -> _State:
-    """The state after ever smaller steps of single parameters of what jumps, where derivatives lead only from afar."""
+    """State after ever smaller steps of jumping effects: derivatives lead only from afar."""
     moving = [(effect.jumps, step_of(parameter)) for effect, _ in now.chosen for parameter in effect.parameters]
     for halved in range(POLISHED):
         for j, (jumps, h) in enumerate(moving):
@@ -251,7 +260,7 @@ def direction(x: Float64[np.ndarray, " n"]) -> Float64[np.ndarray, " n"]:
 
 
 def _onsets(problem: _Problem, now: _State) -> Iterator[Chosen]:
-    """Effects with one onset at the time that minimises the cost: no effect before it, the effect after."""
+    """Onset times that minimise the cost: no effect before it, the effect after."""
     for k, (effect, _) in enumerate(now.chosen):
         for j, parameter in enumerate(effect.parameters):
             if not parameter.begins:
@@ -275,7 +284,7 @@ def _normal(
     residuals: Sequence[Float64[np.ndarray, "n k"]] | None,
     bias: Float64[np.ndarray, "logs k"],
 ) -> tuple[Float64[np.ndarray, "q q"], Float64[np.ndarray, " q"]]:
-    """Normal equations of all free parameters, then each log's bias; no right-hand side without residuals."""
+    """Normal equations of free parameters and biases; no right-hand side without residuals."""
     p = sum(len(theta) for _, theta in jacobians.chosen)
     N, g = np.zeros((p + bias.size,) * 2), np.zeros(p + bias.size)
     for k, (log, mask) in enumerate(zip(problem.logs, problem.masks, strict=True)):

@@ -1,4 +1,4 @@
-"""Cached forward passes through effects, and finite-difference Jacobians of whitened samples.
+"""Cached forward passes through effects, and finite-difference Jacobians.
 
 A forward pass keeps the signals before each effect, so that a change of one effect evaluates only the effects behind it.
 Derivatives are differences of the effects' own forward models: an effect is one function. They cost an evaluation for each
@@ -24,7 +24,7 @@ Chosen = tuple[tuple[Effect, Theta], ...]
 
 
 class ForwardPass:
-    """Ideal signals of a log through effects to its readings; states shared with another pass are taken from there."""
+    """Forward pass of a log's ideal signals through effects; shares states with another pass."""
 
     def __init__(self, pair: AlignedLog, chosen: Chosen, like: ForwardPass | None = None) -> None:
         self.pair, self.acting = pair, in_stage_order(chosen)
@@ -43,12 +43,14 @@ class ForwardPass:
 
     def added(self, to: ForwardPass) -> dict[int, Float64[np.ndarray, " n"]]:
         """Readings less those of another pass, by the axes on which they differ."""
-        both = ((first, here, there) for (first, here), (_, there) in zip(self.blocks, to.blocks, strict=True))
-        rows = {first + k: row for first, here, there in both if here is not there for k, row in enumerate((here - there).T)}
+        pairs = ((first, own, other) for (first, own), (_, other) in zip(self.blocks, to.blocks, strict=True))
+        rows = {first + k: row for first, own, other in pairs if own is not other for k, row in enumerate((own - other).T)}
         return {axis: row for axis, row in rows.items() if row.any()}
 
     def derivatives(self, effect: Effect) -> Iterator[tuple[int, int, Float64[np.ndarray, " n"]]]:
-        """d expected / d (free parameters) of an effect, by forward differences: axis, parameter, and a row that is not zero.
+        """Finite differences d expected / d (free parameters): axis, parameter, nonzero row.
+
+        They are forward differences.
 
         An effect outside this pass is inserted at its null value, for which it has to be linear.
         """
@@ -85,12 +87,12 @@ def _shared(a: list[tuple[Effect, Theta]], b: list[tuple[Effect, Theta]]) -> int
 
 
 def expected(pair: AlignedLog, chosen: Chosen) -> Float64[np.ndarray, "n k"]:
-    """Readings of a sensor with some effects, without bias."""
+    """Expected readings of a sensor with some effects, without bias."""
     return ForwardPass(pair, chosen).expected
 
 
 def free(effect: Effect, theta: Theta) -> Theta:
-    """Parameters as they are fitted: logarithms of the positive ones."""
+    """Free parameters of a fit: logarithms of the positive ones."""
     return np.array([np.log(t) if n.positive else t for t, n in zip(theta, effect.parameters, strict=True)])
 
 
@@ -107,7 +109,7 @@ def step_of(parameter: Parameter) -> float:
 
 
 class EffectJacobian(NamedTuple):
-    """White derivatives of one effect on one log, by axis and parameter; `on` marks those that are not zero."""
+    """Jacobian of one effect on one log, white, by axis and parameter; `on` marks nonzero rows."""
 
     white: Float64[np.ndarray, "k p n"]
     on: Bool[np.ndarray, "k p"]
@@ -117,15 +119,15 @@ def effect_jacobian(whiten: Whitener, forward: ForwardPass, effect: Effect) -> E
     """Jacobian of an effect in a forward pass, or of a linear one outside it."""
     shape = forward.pair.columns, len(effect.parameters)
     white, on = np.zeros((*shape, len(range(0, len(forward.pair.stamp_s), whiten.every)))), np.zeros(shape, bool)
-    found = list(forward.derivatives(effect))
-    if found:
-        axes, js = np.array([axis for axis, _, _ in found]), np.array([j for _, j, _ in found])
-        white[axes, js], on[axes, js] = whiten.rows(np.stack([row for _, _, row in found]), axes), True
+    entries = list(forward.derivatives(effect))
+    if entries:
+        axes, js = np.array([axis for axis, _, _ in entries]), np.array([j for _, j, _ in entries])
+        white[axes, js], on[axes, js] = whiten.rows(np.stack([row for _, _, row in entries]), axes), True
     return EffectJacobian(white, on)
 
 
 class Jacobians:
-    """Jacobians of effects that act together; those of the very same effect in `known` are taken from there."""
+    """Jacobians of effects that act together; those of equal effects in `known` are reused."""
 
     def __init__(
         self, whiteners: Sequence[Whitener], passes: Sequence[ForwardPass], chosen: Chosen, known: Jacobians | None = None
@@ -149,7 +151,7 @@ class Jacobians:
     def on_axis(
         self, log: int, axis: int, mask: Bool[np.ndarray, " n"]
     ) -> tuple[Int64[np.ndarray, " q"], Float64[np.ndarray, "q m"]]:
-        """Places of the parameters that act on an axis of a log, and their derivatives on some rows."""
+        """Indices of the parameters that act on an axis of a log, and their derivatives."""
         where, rows, first = [np.zeros(0, np.int64)], [], 0
         for jacobians in self._by_effect.values():
             jacobian = jacobians[log]

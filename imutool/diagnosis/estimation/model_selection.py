@@ -1,4 +1,4 @@
-"""Model selection: which effects separate logs from their expectation, by forward selection, exchange and elimination.
+"""Model selection of effects: forward selection, exchange and elimination.
 
 Forward: each candidate is scored beside the effects so far; those of the best score are fitted in full, and the best comes in.
 Then back: an effect that the others have made superfluous goes, and one for which another serves better is exchanged. What
@@ -45,13 +45,13 @@ from imutool.sensor.effect import Effect, Theta
 
 @dataclass(frozen=True, eq=False)
 class SelectedEffect:
-    """An effect that was found, with the cost of leaving it out.
+    """Selected effect with its parameters and the cost of leaving it out.
 
     `p_value` is by chi-square over all rows, `gain` the squares that leaving it out adds there, `unidentified` its parameters
     that no motion showed, `similar` other effects that explain about as much in its place.
     """
 
-    physics: Effect
+    effect: Effect
     theta: Theta
     std: Theta
     unidentified: tuple[str, ...]
@@ -63,7 +63,7 @@ class SelectedEffect:
 
 @dataclass(frozen=True, eq=False)
 class Selection:
-    """Effects that were found, strongest first, the fit on fitted rows and the one on all, and how many starts were tried."""
+    """Selected effects, strongest first, fits of fitted and of all rows, and count of trials."""
 
     selected: tuple[SelectedEffect, ...]
     fitted: Fit
@@ -80,7 +80,7 @@ def select_effects(
     always: Chosen = (),
     settings: SearchSettings | None = None,
 ) -> Selection:
-    """Effects that the logs show together.
+    """Select the effects that the logs show together.
 
     Groups of `later` are tried in turn, once the candidates before explain nothing more. Effects of `always` are in every fit
     and are no findings. `progress` is called with what is being tried.
@@ -89,8 +89,8 @@ def select_effects(
     settings = settings or SearchSettings()
     penalty = settings.unnamed_penalty
     start = fit(logs, always)
-    known, said = Candidates(logs, (*candidates, *unnamed)), progress or (lambda text: None)
-    first = _Search(logs, tuple(candidates), unnamed, always, start.objective, settings, said, known)
+    known, report = Candidates(logs, (*candidates, *unnamed)), progress or (lambda text: None)
+    first = _Search(logs, tuple(candidates), unnamed, always, start.objective, settings, report, known)
     best_named, best_unnamed = (max((s.aic_gain for s in known.ranked(start, c)), default=0.0) for c in (candidates, unnamed))
     unnamed_first = best_unnamed > best_named + settings.clearly_better
     search, now = _grown(first, start, unnamed, []) if unnamed_first else _grown(first, start, (), list(later))
@@ -104,7 +104,7 @@ def select_effects(
 
 
 def _grown(first: _Search, now: Fit, unnamed: tuple[Effect, ...], waiting: list[Sequence[Effect]]) -> tuple[_Search, Fit]:
-    """The fit after effects came in one by one, until no candidate explains more than chance."""
+    """Fit after effects came in one by one, until no candidate explains more than chance."""
     search, settings = replace(first, unnamed=unnamed), first.settings
     for _ in range(settings.rounds):
         count = len(now.chosen) - len(first.always)
@@ -145,7 +145,7 @@ class _Search:
         return float(np.log(self.settings.false_discovery_rate / self.tried))
 
     def removable(self, now: Fit) -> range:
-        """Places of effects but for those of every fit and the last, which has just come in."""
+        """Indices of effects but for those of every fit and the last, which has just come in."""
         return range(len(self.always), len(now.chosen) - 1)
 
     def added(self, now: Fit) -> Fit | None:
@@ -164,10 +164,10 @@ class _Search:
                 limit = now.objective - (0.0 if best is None else share * (now.objective - best[1].objective))
                 self.trials[effect.key] = self.tried_with(now.chosen, effect, start, now, limit)
             trial = self.trials[effect.key]
-            it, theta = trial.chosen[-1]
-            if not it.parameters or beyond_the_band(it, theta, self.logs, self.settings):
+            added_effect, theta = trial.chosen[-1]
+            if not added_effect.parameters or beyond_the_band(added_effect, theta, self.logs, self.settings):
                 continue
-            log_p = self.candidates.log_p(it, now.objective - trial.objective)
+            log_p = self.candidates.log_p(added_effect, now.objective - trial.objective)
             best = (log_p, trial) if best is None or log_p < best[0] else best
         if best is None or best[0] > self.threshold:
             return None
@@ -177,7 +177,7 @@ class _Search:
         return best[1]
 
     def tried_with(self, others: Chosen, effect: Effect, start: Theta, near: Fit, limit: float) -> Fit:
-        """The fit with one more effect, without those of its parameters that came out implausibly large."""
+        """Fit with one more effect, without its implausibly large parameters."""
         trial = fit(self.logs, (*others, (effect, start)), near=near, give_up_above=limit)
         theta = trial.chosen[-1][1]
         reduced = without_implausible(effect, theta, self.settings.implausible_factor)
@@ -198,23 +198,23 @@ class _Search:
         return trial if bic(trial, penalty) < bic(now, penalty) - self.settings.clearly_better else now
 
     def exchanged(self, now: Fit) -> Fit:
-        """The fit with an effect replaced by another of the catalogue that explains more, where there is one."""
+        """Fit with an effect replaced by another of the catalogue that explains more."""
         few = len(now.chosen) - len(self.always) <= self.settings.exchanged_effects
         for k in self.removable(now) if few else ():
             others, mine = (*now.chosen[:k], *now.chosen[k + 1 :]), now.chosen[k][0]
             without = fit(self.logs, others, iterations=2, near=now)
-            here = self.candidates.log_p(mine, without.objective - now.objective)
+            own_log_p = self.candidates.log_p(mine, without.objective - now.objective)
             unfitted = fit(self.logs, others, iterations=0)  # refitted, a nonlinear effect may diverge for good
             for log_p, effect, start, _ in self.candidates.ranked(unfitted, self.named)[:2]:
                 if effect.key == mine.key:
                     if effect.linear:  # its score is its gain
                         break
                     continue
-                if log_p > here and not mine.linear:
+                if log_p > own_log_p and not mine.linear:
                     continue
                 limit = without.objective - self.settings.rival_share * (without.objective - now.objective)
                 trial = self.tried_with(others, effect, start, without, limit)
-                if self.candidates.log_p(trial.chosen[-1][0], without.objective - trial.objective) < here - 1.0:
+                if self.candidates.log_p(trial.chosen[-1][0], without.objective - trial.objective) < own_log_p - 1.0:
                     return trial
         return now
 
@@ -230,7 +230,7 @@ class _Search:
         return now
 
     def tested(self, now: Fit) -> Selection:
-        """Effects that stay: tested on all rows, and on blocks that were not fitted."""
+        """Selection of the effects that pass on all rows and on held-out blocks."""
         first = len(self.always)
         while len(now.chosen) > first:
             self.progress(f"on unseen time: {', '.join(now.keys[first:])}")
@@ -245,9 +245,9 @@ class _Search:
             verdicts = self._beyond_model_error(tests)
             worst = max(range(len(verdicts)), key=lambda k: verdicts[k].false_discovery_rate)
             if verdicts[worst].false_discovery_rate <= self.settings.false_discovery_rate:
-                selected = [replace(one, similar=self._similar(first + k, now)) for k, one in enumerate(verdicts)]
+                selected = [replace(verdict, similar=self._similar(first + k, now)) for k, verdict in enumerate(verdicts)]
                 fitted = replace(now, chosen=with_onsets_of(now.chosen, whole.chosen))
-                return Selection(tuple(sorted(selected, key=lambda one: -one.gain)), fitted, whole, self.tried)
+                return Selection(tuple(sorted(selected, key=lambda verdict: -verdict.gain)), fitted, whole, self.tried)
             now = fit(self.logs, (*now.chosen[: first + worst], *now.chosen[first + worst + 1 :]), near=now)
         return Selection((), now, fit(self.logs, now.chosen, part="all"), self.tried)
 
@@ -258,35 +258,35 @@ class _Search:
         return scatter(self.logs, found, found.part, self.settings.robust_block_s)
 
     def _similar(self, k: int, now: Fit) -> tuple[str, ...]:
-        """Effects of the catalogue that in an effect's place leave about as little (Akaike's criterion)."""
+        """Similar effects of the catalogue: they leave about as little (Akaike's criterion)."""
         share = self.settings.rival_share
         others = (*now.chosen[:k], *now.chosen[k + 1 :])
         without = fit(self.logs, others, iterations=2, near=now)
-        gain, found = without.objective - now.objective, []
+        gain, names = without.objective - now.objective, []
         for _, effect, start, promised in self.candidates.ranked(without, self.named)[: self.settings.rivals]:
             if effect.key != now.chosen[k][0].key and promised > share * gain:
                 trial = fit(self.logs, (*others, (effect, start)), near=without, give_up_above=without.objective - share * gain)
                 aic = now.objective + 2 * len(now.chosen[k][1])
                 if trial.objective + 2 * len(start) < aic + self.settings.clearly_better:
-                    found.append(effect.name)
-        return tuple(dict.fromkeys(found))
+                    names.append(effect.name)
+        return tuple(dict.fromkeys(names))
 
     def _verdict(self, k: int, fitted: Fit, other: Fit, whole: Fit, scattered: Scatter | None) -> SelectedEffect:
         effect, theta = whole.chosen[k]
         without = fit(self.logs, (*whole.chosen[:k], *whole.chosen[k + 1 :]), part="all", near=whole)
         gain = without.objective - whole.objective
-        if any(rest.jumps for rest, _ in without.chosen):
+        if any(other_effect.jumps for other_effect, _ in without.chosen):
             gain /= BETWEEN_SAMPLES**2  # whatever moves the signal a little wins single samples at an edge
         log_p = self.candidates.log_p(effect, gain)
         if scattered is not None:
             log_p = max(log_p, scattered.log_p_value(effect.key, gain, len(theta)) + self.candidates.log_choices[effect.key])
         parts, block_s = ((fitted, "held_out"), (other, "fitted")), self.settings.held_out_block_s
         blocks = np.concatenate([held_out_gains(log, of, k, part, block_s) for of, part in parts for log in self.logs])
-        helping = min(
+        held_out_p = min(
             held_out_p_value(blocks[:, 0]), prediction_p_value(blocks) if all(log.pair.exact for log in self.logs) else 1.0
         )
         rate = min(1.0, float(np.exp(min(0.0, log_p + np.log(self.tried)))))
-        if helping > self.settings.held_out_p_value or beyond_the_band(effect, theta, self.logs, self.settings):
+        if held_out_p > self.settings.held_out_p_value or beyond_the_band(effect, theta, self.logs, self.settings):
             rate = 1.0
         std = (whole.stds() if scattered is None else scattered.std)[effect.key]
         std = np.array([self.onset_std.get((effect.key, j), float(s)) for j, s in enumerate(std)])
@@ -296,5 +296,5 @@ class _Search:
     def _beyond_model_error(self, verdicts: Sequence[SelectedEffect]) -> list[SelectedEffect]:
         """Verdicts, with no trust in what may be the model error of a far larger effect."""
         denoised = any(log.pair.denoised for log in self.logs)
-        hidden = below_model_error({one.physics.key: one.gain for one in verdicts}, denoised, self.settings)
-        return [replace(one, false_discovery_rate=1.0) if one.physics.key in hidden else one for one in verdicts]
+        hidden = below_model_error({verdict.effect.key: verdict.gain for verdict in verdicts}, denoised, self.settings)
+        return [replace(verdict, false_discovery_rate=1.0) if verdict.effect.key in hidden else verdict for verdict in verdicts]

@@ -1,4 +1,4 @@
-"""Noise model from the residuals of the full-catalogue fit, and the band up to which poses know the motion.
+"""Noise model from the residuals of the full-catalogue fit, and the band of the poses.
 
 Beside poses the noise is unknown: that of the poses, differentiated, has every colour, and that of the sensor lies under it.
 It is estimated from what a rich model leaves: every effect of the catalogue, the nonlinear ones by their derivatives where a
@@ -29,18 +29,18 @@ EDGES_HZ = (0.5, 0.8, 1.25, 2.0, 3.0, 4.5, 6.5, 9.0, 13.0, 18.0, 25.0)  # of the
 
 
 def whitened(pair: Pair, candidates: Sequence[Effect], settings: BandSettings) -> WhitenedImu:
-    """The log with its noise model; beside poses also with the band up to which they are seen to know the motion."""
+    """Whitened log with its noise model; beside poses also with the band that they know."""
     if pair.exact:
         return _counting(pair, level(_left(pair, candidates), pair.usable, 1.0 / pair.period_s, ORDER))
     assert pair.band_hz is not None
-    found, left = _in_band(pair, candidates, pair.band_hz)
-    assert found.band is not None
-    rate_hz = 1.0 / (pair.period_s * found.every)
-    band_hz = known_band_hz(found.band(pair.real), left, rate_hz, pair.band_hz, settings)
+    whiten, residual = _in_band(pair, candidates, pair.band_hz)
+    assert whiten.band is not None
+    rate_hz = 1.0 / (pair.period_s * whiten.every)
+    band_hz = known_band_hz(whiten.band(pair.real), residual, rate_hz, pair.band_hz, settings)
     if band_hz < pair.band_hz:
         pair = replace(pair, band_hz=band_hz)
-        found, _ = _in_band(pair, candidates, band_hz)
-    return _counting(pair, limited_to_quiet_axes(found, settings.noisy_axis))
+        whiten, _ = _in_band(pair, candidates, band_hz)
+    return _counting(pair, limited_to_quiet_axes(whiten, settings.noisy_axis))
 
 
 def _counting(pair: Pair, white: Whitener) -> WhitenedImu:
@@ -53,61 +53,61 @@ def _in_band(pair: Pair, candidates: Sequence[Effect], band_hz: float) -> tuple[
     band = Band.below(band_hz, 1.0 / pair.period_s)
     columns, misfit = _rich(pair, candidates, band), band(pair.real - expected(pair, ()))
     usable = pair.usable[:: band.every]
-    found = Whitener(np.ones((6, 1)), np.ones(6))
+    whiten = Whitener(np.ones((6, 1)), np.ones(6))
     for _ in range(ROUNDS):
-        left, spent = misfit.copy(), np.zeros(6)
+        residual, fitted = misfit.copy(), np.zeros(6)
         for axis in np.flatnonzero(usable.any(axis=0)).tolist():
-            rows = settled(usable[:, axis], found.order)
+            rows = settled(usable[:, axis], whiten.order)
             both = np.concatenate([columns[axis], misfit[:, axis][None]])
-            white = found.rows(both, np.full(len(both), axis))[:, rows]
-            x, spent[axis] = _solved(white[:-1], white[-1])
-            left[:, axis] -= x @ columns[axis]
-        found = whitener(left, usable, ORDER)
+            white = whiten.rows(both, np.full(len(both), axis))[:, rows]
+            x, fitted[axis] = _solved(white[:-1], white[-1])
+            residual[:, axis] -= x @ columns[axis]
+        whiten = whitener(residual, usable, ORDER)
         count = np.maximum(usable.sum(axis=0), 1.0)  # the noise before so many parameters were fitted to it
-        found = Whitener(found.filters, found.std * np.sqrt(count / np.maximum(count - spent, 0.5 * count)))
-    return Whitener(found.filters, found.std, band), left
+        whiten = Whitener(whiten.filters, whiten.std * np.sqrt(count / np.maximum(count - fitted, 0.5 * count)))
+    return Whitener(whiten.filters, whiten.std, band), residual
 
 
-def limited_to_quiet_axes(found: Whitener, most: float) -> Whitener:
-    """The whitener with no axis more than `most` times as noisy as the middle one of its sensor.
+def limited_to_quiet_axes(whiten: Whitener, most: float) -> Whitener:
+    """Whitener with no axis more than `most` times as noisy as the middle axis of its sensor.
 
     Poses err alike in all directions, and a sensor's axes are equally noisy; an axis with a much larger residual holds what
     the catalogue has no name for.
     """
-    filters, std = found.filters.copy(), found.std.copy()
-    total = noise_std(found)
+    filters, std = whiten.filters.copy(), whiten.std.copy()
+    total = noise_std(whiten)
     for part in (slice(0, 3), slice(3, 6)):
         middle = int(np.argsort(total[part])[1]) + part.start
         for axis in range(part.start, part.stop):
             if total[axis] > most * total[middle]:
-                filters[axis], std[axis] = found.filters[middle], most * found.std[middle]
-    return Whitener(filters, std, found.band)
+                filters[axis], std[axis] = whiten.filters[middle], most * whiten.std[middle]
+    return Whitener(filters, std, whiten.band)
 
 
-def noise_std(found: Whitener) -> Float64[np.ndarray, " k"]:
+def noise_std(whiten: Whitener) -> Float64[np.ndarray, " k"]:
     """Standard deviation of the noise of a row by axis, before whitening."""
-    response = np.array([np.abs(np.fft.rfft(a, 512)) ** 2 for a in found.filters])
-    return np.asarray(found.std * np.sqrt((1.0 / response).mean(axis=1)))
+    response = np.array([np.abs(np.fft.rfft(a, 512)) ** 2 for a in whiten.filters])
+    return np.asarray(whiten.std * np.sqrt((1.0 / response).mean(axis=1)))
 
 
 def _left(pair: Pair, candidates: Sequence[Effect]) -> Float64[np.ndarray, "n 6"]:
     """Residual of a simulation's misfit after a fit of every linear effect."""
     linear: Chosen = tuple((effect, effect.null_value.astype(float)) for effect in candidates if effect.linear)
     forward = ForwardPass(pair, linear)
-    left: Float64[np.ndarray, "n 6"] = pair.real - forward.expected
-    columns: list[list[np.ndarray]] = [[np.ones(len(left))] for _ in range(6)]
+    residual: Float64[np.ndarray, "n 6"] = pair.real - forward.expected
+    columns: list[list[np.ndarray]] = [[np.ones(len(residual))] for _ in range(6)]
     for effect, _ in linear:
         for axis, _, row in forward.derivatives(effect):
             columns[axis].append(row)
     for axis, rows in enumerate(pair.usable.T):
-        left[:, axis] -= ridge_fit(np.stack(columns[axis], axis=1), left[:, axis], rows)
-    return left
+        residual[:, axis] -= ridge_fit(np.stack(columns[axis], axis=1), residual[:, axis], rows)
+    return residual
 
 
 def ridge_fit(
     A: Float64[np.ndarray, "n q"], y: Float64[np.ndarray, " n"], rows: Bool[np.ndarray, " n"]
 ) -> Float64[np.ndarray, " n"]:
-    """Combination of columns that fits y best on some rows, on all rows."""
+    """Ridge fit of y by columns on some rows, evaluated on all rows."""
     size = np.linalg.norm(A[rows], axis=0)
     A = A[:, size > 0] / size[size > 0]
     N = A[rows].T @ A[rows] + RIDGE * np.eye(A.shape[1])
@@ -115,13 +115,13 @@ def ridge_fit(
 
 
 def _rich(pair: Pair, candidates: Sequence[Effect], band: Band) -> list[Float64[np.ndarray, "_ m"]]:
-    """For each axis a constant, and derivatives of the whole catalogue where fits begin, in a band."""
+    """Design columns by axis in a band: a constant, and derivatives where fits begin."""
     columns = [[np.ones(len(pair.real))] for _ in range(6)]
-    nothing = ForwardPass(pair, ())
+    ideal = ForwardPass(pair, ())
     for effect in candidates:
-        passes = [nothing]
+        passes = [ideal]
         if effect.starts is not None and not effect.linear:
-            passes = [ForwardPass(pair, ((effect, start),), nothing) for start in pair.starts(effect)] or passes
+            passes = [ForwardPass(pair, ((effect, start),), ideal) for start in pair.starts(effect)] or passes
         for forward in passes:
             for axis, j, row in forward.derivatives(effect):
                 if not effect.parameters[j].begins:
@@ -139,22 +139,26 @@ def _solved(A: Float64[np.ndarray, "q m"], y: Float64[np.ndarray, " m"]) -> tupl
 
 
 def known_band_hz(
-    real: Float64[np.ndarray, "m 6"], left: Float64[np.ndarray, "m 6"], rate_hz: float, most_hz: float, settings: BandSettings
+    real: Float64[np.ndarray, "m 6"],
+    residual: Float64[np.ndarray, "m 6"],
+    rate_hz: float,
+    most_hz: float,
+    settings: BandSettings,
 ) -> float:
-    """Frequency (Hz, up to `most_hz`) below which the expectation has hardly any error of the poses.
+    """Band edge (Hz, up to `most_hz`) below which poses have hardly any error.
 
     An error of the expectation does two things together: the recording shares less of it (coherence), and follows it with a
     gain that is too small by as much (regression dilution; Fuller, Measurement Error Models, 1987, eq. 1.1.7: gain = true gain
     x reliability), which passes for a scale. Noise of the sensor lowers the coherence alone, a slow sensor the gain alone.
     The standard deviation of the gain is Bendat and Piersol's (Random Data, 4th ed., eq. 9.89).
 
-    `left` is the residual of a rich model of the sensor; the rest of the recording `real` is the expectation.
+    `residual` is that of a rich model of the sensor; the rest of the recording `real` is the expectation.
     """
-    expectation, size = real - left, min(int(settings.segment_s * rate_hz), len(left))
+    expectation, size = real - residual, min(int(settings.segment_s * rate_hz), len(residual))
     f_hz, power = welch(expectation, rate_hz, nperseg=size, axis=0)
     _, recorded = welch(real, rate_hz, nperseg=size, axis=0)
     _, cross = csd(expectation, real, rate_hz, nperseg=size, axis=0)
-    duration_s = len(left) / rate_hz
+    duration_s = len(residual) / rate_hz
     for low, high in pairwise(EDGES_HZ):
         if low >= most_hz:
             break

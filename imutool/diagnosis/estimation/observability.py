@@ -1,4 +1,4 @@
-"""Observability: which parameters the motion can show, which are fixed at their null value, which drown in a model's error."""
+"""Observability: parameters that the motion can show, fixed ones, and model error."""
 
 from __future__ import annotations
 
@@ -24,7 +24,9 @@ FOLLOWING = frozenset({"clock_offset", "clock_skew", "clock_jump", "low_pass", "
 
 
 def unobservable(logs: Sequence[WhitenedLog], candidates: Sequence[Effect], settings: SearchSettings) -> tuple[str, ...]:
-    """`effect.parameter` of what would drown in the noise at its plausible size, and `effect` where that is all of it.
+    """Unobservable parameters `effect.parameter`, or `effect` where all of them are.
+
+    Such a parameter drowns in the noise at its plausible size.
 
     A parameter at its plausible size adds squares to the white residuals, less those that a constant bias takes. Fewer than
     `observable_squares` cannot be seen.
@@ -52,8 +54,8 @@ def _gains(logs: Sequence[WhitenedLog], effect: Effect) -> Float64[np.ndarray, "
     """Squares that each parameter adds at its plausible size, less those that a constant takes."""
     total = np.zeros(len(effect.parameters))
     for log in logs:
-        rows, nothing = log.rows("all"), expected(log.pair, ())
-        added = [expected(log.pair, ((effect, theta),)) - nothing for theta in np.diag(SMALL * effect.plausible)]
+        rows, ideal = log.rows("all"), expected(log.pair, ())
+        added = [expected(log.pair, ((effect, theta),)) - ideal for theta in np.diag(SMALL * effect.plausible)]
         B = log.whiten(np.stack(added, axis=2))[rows] / SMALL
         constant = log.constants[rows]
         cross = np.einsum("na,nap->ap", constant, B)
@@ -78,14 +80,14 @@ class FixedParameters:
 
 
 def with_free(effect: Effect, free: Sequence[int]) -> Effect:
-    """The effect with only these parameters, by place; itself where they are all."""
+    """Effect with only some free parameters, by index; itself if they are all."""
     if len(free) == len(effect.parameters):
         return effect
     return replace(effect, parameters=tuple(effect.parameters[k] for k in free), forward=FixedParameters(effect, free))
 
 
 def without_implausible(effect: Effect, theta: Theta, factor: float) -> Effect:
-    """The effect without parameters `factor` times larger than plausible, which are a fit to noise."""
+    """Effect without parameters `factor` times larger than plausible, which fit noise."""
     if not effect.linear or effect.kind != "catalogue":
         return effect
     return with_free(effect, [k for k, n in enumerate(effect.parameters) if abs(theta[k]) <= factor * n.plausible])
@@ -98,16 +100,19 @@ def values_of(effect: Effect, reduced: Effect, theta: Theta) -> Theta:
 
 
 def plausible_part(chosen: Chosen, factor: float) -> Chosen | None:
-    """The effects without implausible parameters; none if all are plausible."""
+    """Effects without implausible parameters; None if all are plausible."""
     reduced = [without_implausible(effect, theta, factor) for effect, theta in chosen]
     if all(new is effect for new, (effect, _) in zip(reduced, chosen, strict=True)):
         return None
-    left = [(new, values_of(effect, new, theta)) for new, (effect, theta) in zip(reduced, chosen, strict=True)]
-    return tuple(pair for pair in left if len(pair[1]))
+    kept = [(new, values_of(effect, new, theta)) for new, (effect, theta) in zip(reduced, chosen, strict=True)]
+    return tuple(pair for pair in kept if len(pair[1]))
 
 
 def unidentified(effect: Effect, std: Theta, log_prior: float, *, curve: bool) -> Iterator[str]:
-    """`effect.parameter` of what is no surer than its prior, and of what is fixed; a curve's coefficients are not named."""
+    """Unidentified parameters `effect.parameter`: as unsure as their prior, or fixed.
+
+    Coefficients of a curve are not named.
+    """
     for parameter, s in zip(effect.parameters, std, strict=True):
         if s > (log_prior if parameter.positive else parameter.plausible) and not curve:
             yield f"{effect.key}.{parameter.name}"
@@ -120,7 +125,7 @@ def unidentified(effect: Effect, std: Theta, log_prior: float, *, curve: bool) -
 
 
 def below_model_error(gains: Mapping[str, float], denoised: bool, settings: SearchSettings) -> frozenset[str]:
-    """Effects that follow the motion and explain no more than the model error of a far larger effect.
+    """Effects below the model error of a far larger effect that follow the same motion.
 
     A filter and a clock say how a sensor follows its motion, and so does the error of any other model: a mass on springs moves,
     and its lever arm with it; a simulator that holds its forces for a step reads accelerations half a step early; noise that
@@ -139,7 +144,10 @@ def below_model_error(gains: Mapping[str, float], denoised: bool, settings: Sear
 
 
 def beyond_the_band(effect: Effect, theta: Theta, logs: Sequence[WhitenedLog], settings: SearchSettings) -> bool:
-    """Whether a frequency is one at which smoothed poses, which lose and lag by themselves, look alike, or too slow."""
+    """Whether a fitted frequency lies beyond the poses' band, or is too slow.
+
+    Smoothed poses lose and delay motion there by themselves, which looks alike.
+    """
     factor = settings.beyond_band_low_pass if effect.name == "low_pass" else settings.beyond_band
     reach = [factor * log.pair.band_hz for log in logs if log.pair.band_hz is not None]
     hertz = [value for parameter, value in zip(effect.parameters, theta, strict=True) if parameter.unit == "Hz"]

@@ -1,4 +1,4 @@
-"""Significance of an effect: p-values of its gain, gain on held-out blocks, robust covariance, and its onset's posterior.
+"""Significance of an effect: p-values, robust covariance, posterior of its onset.
 
 A fit's information holds where its white residuals are white. Beside poses they seldom are: the poses' errors come with the
 motion and last. The sum of J^T r over a block of some seconds scatters by the real errors, and a covariance made of those
@@ -35,7 +35,7 @@ Matrix = Float64[np.ndarray, "p p"]
 
 
 def log_p_value(gain: float, parameters: int) -> float:
-    """Logarithm of the p-value of a gain in squares under H0, by chi-square (far out, the tail's leading term)."""
+    """Log p-value of a gain in squares under H0, by chi-square (leading term far out)."""
     half, k = 0.5 * max(gain, 0.0), 0.5 * parameters
     return float(np.log(gammaincc(k, half))) if half < TAIL else float((k - 1.0) * np.log(half) - half - gammaln(k))
 
@@ -46,7 +46,10 @@ def gain_for(log_p: float, parameters: int) -> float:
 
 
 def held_out_p_value(gained: Float64[np.ndarray, " b"]) -> float:
-    """p-value of the held-out improvement under H0, by Student's test or by ranks, which one outlying block does not decide."""
+    """p-value of the held-out improvement under H0, by Student's t or by ranks.
+
+    One outlying block does not decide the ranks.
+    """
     if len(gained) < 3 or not gained.std():
         return 1.0
     z = gained.mean() / (gained.std(ddof=1) / np.sqrt(len(gained)))
@@ -55,13 +58,16 @@ def held_out_p_value(gained: Float64[np.ndarray, " b"]) -> float:
 
 
 def prediction_p_value(blocks: Float64[np.ndarray, "b 2"]) -> float:
-    """p-value of held-out noise following a prediction u: 2 u.n - |u|² has mean -|u|² and variance 4 |u|² under H0."""
+    """p-value of held-out noise following a prediction u under H0.
+
+    Then 2 u.n - |u|² has mean -|u|² and variance 4 |u|².
+    """
     gain, size = blocks.sum(axis=0)
     return float(norm.sf((gain + size) / (2.0 * np.sqrt(size)))) if size > 0 else 1.0
 
 
 def held_out_gains(log: WhitenedLog, fitted: Fit, k: int, part: str, block_s: float) -> Float64[np.ndarray, "b 2"]:
-    """Gain in squares by an effect, and squares of what it predicts, on blocks of a part that was not fitted."""
+    """Gain in squares by an effect, and squares of its prediction, on held-out blocks."""
     chosen = fitted.chosen
     with_, without = (_white(log, effects, part) for effects in (chosen, (*chosen[:k], *chosen[k + 1 :])))
     rows = log.rows(part)
@@ -84,7 +90,9 @@ def _white(log: WhitenedLog, chosen: Chosen, part: str) -> Float64[np.ndarray, "
 
 @dataclass(frozen=True, eq=False)
 class Scatter:
-    """Robust standard deviations by effect, no less than by information, with their inflation and degrees of freedom.
+    """Robust standard deviations by effect, with their inflation and degrees of freedom.
+
+    They are no less than by information.
 
     `inflation` is the ratio of the blocks' variance to the information's by effect, at least 1; `blocks` the number of
     independent blocks less one that it rests on.
@@ -130,11 +138,11 @@ def _by_effect(found: Fit, by_blocks: Matrix, by_information: Matrix, shares: Se
     usual, stated = max(1.0, found.reduced_chi_square), found.stds()
     for key in found.keys:
         part = found.place(key)
-        own, seen = by_information[part, part], by_blocks[part, part]
+        own, robust = by_information[part, part], by_blocks[part, part]
         each = np.array([np.diag(share)[part] for share in shares]) / np.diag(own)
-        ratio, blocks = _moderated(np.diag(seen) / np.diag(own), _effective(each), usual)
+        ratio, blocks = _moderated(np.diag(robust) / np.diag(own), _effective(each), usual)
         std[key] = stated[key] * np.sqrt(np.maximum(1.0, np.where(_begins(found)[part], 1.0, ratio)))
-        mean = np.asarray(np.trace(np.linalg.solve(own, seen)) / len(own))
+        mean = np.asarray(np.trace(np.linalg.solve(own, robust)) / len(own))
         taken = np.array([np.trace(np.linalg.solve(own, share[part, part])) for share in shares])
         ratio, blocks = _moderated(mean, _effective(taken), usual)
         inflation[key], count[key] = max(1.0, float(ratio)), float(blocks)
@@ -162,9 +170,9 @@ def _seen_from(lower: Matrix, H: Matrix) -> Matrix:
 
 
 def _blocks(log: WhitenedLog, found: Fit, k: int, part: str, block_s: float) -> list[tuple[Matrix, Float64[np.ndarray, " p"]]]:
-    """Information on the effects and score J^T r of each block, a constant taken out of the whole log."""
+    """Information and score J^T r of each block, a constant taken out of the whole log."""
     rows, begins = log.rows(part), _begins(found)
-    left = log.residual(found.passes[k].expected)[rows] - log.constants[rows] * found.bias[k]
+    residual = log.residual(found.passes[k].expected)[rows] - log.constants[rows] * found.bias[k]
     J = np.zeros((log.pair.columns, len(begins), int(rows.sum())))
     for axis in range(log.pair.columns):
         where, J_axis = found.jacobians.on_axis(k, axis, rows)
@@ -175,10 +183,10 @@ def _blocks(log: WhitenedLog, found: Fit, k: int, part: str, block_s: float) -> 
     duration_s = float(t_s[-1] - t_s[0])
     block = np.floor((t_s - t_s[0]) / min(block_s, duration_s / LEAST_BLOCKS)).astype(int)
     out = []
-    for which in np.unique(block):
-        here = block == which
-        flat = J[:, :, here].transpose(1, 0, 2).reshape(len(begins), -1)
-        out.append((flat @ flat.T, flat @ left[here].T.reshape(-1)))
+    for number in np.unique(block):
+        inside = block == number
+        flat = J[:, :, inside].transpose(1, 0, 2).reshape(len(begins), -1)
+        out.append((flat @ flat.T, flat @ residual[inside].T.reshape(-1)))
     return out
 
 
@@ -188,7 +196,7 @@ def _blocks(log: WhitenedLog, found: Fit, k: int, part: str, block_s: float) -> 
 def estimate_onsets(
     logs: Sequence[WhitenedLog], found: Fit, part: str, inflation: float
 ) -> tuple[Fit, dict[tuple[str, int], float]]:
-    """The fit with each onset at its posterior mean, and the standard deviations (s) by effect and parameter.
+    """Fit with each onset at its posterior mean, and standard deviations (s).
 
     Nothing is smooth in an onset, so the times near it are searched. A time is as likely as exp(-squares / 2), the squares
     divided by `inflation` where they are more than noise.
@@ -212,9 +220,9 @@ def estimate_onsets(
 
 
 def with_onsets_of(fitted: Chosen, whole: Chosen) -> Chosen:
-    """Effects with the onsets that all rows show: fitted rows do not show one between them."""
+    """Fitted effects with the onsets of all rows: fitted rows do not show one between them."""
     out = []
-    for (effect, theta), (_, seen) in zip(fitted, whole, strict=True):
+    for (effect, theta), (_, onsets) in zip(fitted, whole, strict=True):
         begins = np.array([parameter.begins for parameter in effect.parameters])
-        out.append((effect, np.where(begins, seen, theta)))
+        out.append((effect, np.where(begins, onsets, theta)))
     return tuple(out)

@@ -1,4 +1,4 @@
-"""Timestamps and converter: missing samples, stamp jitter, quantization and saturation, from the samples themselves."""
+"""Timestamps and converter: missing samples, stamp jitter, quantization, saturation."""
 
 from __future__ import annotations
 
@@ -29,7 +29,6 @@ LEAST_VALUES = 3  # of a grid
 AROUND, DEGREE = 15, 3  # samples of a line, and what it may bend
 EVENLY = 5.0  # standard deviations by which samples must be nearer to even than to their stamps
 LEAST_ROWS = 100
-TINY = 1e-300
 
 
 def even(stamp_s: Float64[np.ndarray, " n"]) -> tuple[Float64[np.ndarray, " n"], int]:
@@ -53,7 +52,7 @@ def even(stamp_s: Float64[np.ndarray, " n"]) -> tuple[Float64[np.ndarray, " n"],
 
 
 def _by_level(stamp_s: Float64[np.ndarray, " n"], k: Float64[np.ndarray, " n"]) -> tuple[Float64[np.ndarray, " n"], int]:
-    """For stamps that jitter by much of a period: a missing sample lifts the level of all later ones."""
+    """Even stamps under large jitter: a missing sample lifts the level of all later ones."""
     period = float(np.median(stamp_s[LAG:] - stamp_s[:-LAG])) / LAG
     missing = np.zeros(len(stamp_s))
     for _ in range(4):
@@ -66,30 +65,30 @@ def _by_level(stamp_s: Float64[np.ndarray, " n"], k: Float64[np.ndarray, " n"]) 
 
 
 def _period(since_s: Float64[np.ndarray, " n"]) -> tuple[float, float, float]:
-    """The period near the median step in which the stamps agree best (s), where they lie in it, and how well they agree."""
+    """Period (s) in which the stamps agree best, its phase (s), and the agreement."""
     best = float(np.median(np.diff(since_s)))
     span = PERIOD_SPAN
     for count in (FEW, len(since_s)):
-        some = since_s[:count]
+        first_s = since_s[:count]
         tried = best * (1.0 + np.linspace(-span, span, PERIODS))
-        agree = np.array([abs(np.exp(2j * np.pi * some / one).sum()) for one in tried])
+        agree = np.array([abs(np.exp(2j * np.pi * first_s / period_s).sum()) for period_s in tried])
         best, span = float(tried[int(np.argmax(agree))]), 4.0 * span / PERIODS
     mean = np.exp(2j * np.pi * since_s / best).mean()
     return best, float(np.angle(mean)) / (2.0 * np.pi) * best, float(abs(mean))
 
 
 def jitter(pairs: Sequence[Pair]) -> tuple[Effect, ...]:
-    """Samples taken evenly whose stamps are not: a share of one is all of it. None where the stamps are even."""
-    late = [(pair.stamp_s, even(pair.stamp_s)[0] - pair.stamp_s) for pair in pairs]
-    if min(float(x.std()) for _, x in late) < LEAST_JITTER_S:
+    """Timestamp jitter of evenly taken samples as an effect; a share of one is all of it."""
+    corrections = [(pair.stamp_s, even(pair.stamp_s)[0] - pair.stamp_s) for pair in pairs]
+    if min(float(x.std()) for _, x in corrections) < LEAST_JITTER_S:
         return ()
 
     def forward(taken_s: Float64[np.ndarray, " n"], theta: Theta) -> Float64[np.ndarray, " n"]:
-        alike = (one for one in late if len(one[0]) == len(taken_s))
-        _, correction = min(alike, key=lambda one: abs(float(one[0][0] - taken_s[0])))
+        same_length = (entry for entry in corrections if len(entry[0]) == len(taken_s))
+        _, correction = min(same_length, key=lambda entry: abs(float(entry[0][0] - taken_s[0])))
         return np.asarray(taken_s + theta[0] * correction + theta[1] + theta[2] * np.linspace(-1.0, 1.0, len(taken_s)))
 
-    unsure = float(np.mean([x.std() / np.sqrt(len(x)) for _, x in late]))  # to which stamps show where the even clock begins
+    unsure = float(np.mean([x.std() / np.sqrt(len(x)) for _, x in corrections]))  # of the even clock's start
     share = (Parameter("share", "-", 1.0), Parameter("begins_off", "s", unsure), Parameter("ends_off", "s", 2.0 * unsure))
     return (
         Effect(
@@ -105,7 +104,7 @@ def jitter(pairs: Sequence[Pair]) -> tuple[Effect, ...]:
 
 
 def dropped(pairs: Sequence[Pair]) -> list[Finding]:
-    """Finding of samples that an even clock would have had."""
+    """Finding of dropped samples that an even clock would have had."""
     missing, total, length = 0, 0, 0.0
     for pair in pairs:
         missing, total = missing + even(pair.stamp_s)[1], total + len(pair.stamp_s)
@@ -117,8 +116,8 @@ def dropped(pairs: Sequence[Pair]) -> list[Finding]:
         "share": Estimate(share, float(np.sqrt(missing)) / (missing + total), "-"),
         "missing": Estimate(float(missing), 0.0, "samples"),
     }
-    nothing = HeldOut(0.0, 0.0, "-", round(length, 1))
-    return [Finding("dropped_samples", "both", 0.0, 0.0, 0.0, parameters, "samples are missing", nothing)]
+    held_out = HeldOut(0.0, 0.0, "-", round(length, 1))
+    return [Finding("dropped_samples", "both", 0.0, 0.0, 0.0, parameters, "samples are missing", held_out)]
 
 
 def rounded(pairs: Sequence[Pair], floor: Float64[np.ndarray, "6"]) -> list[Finding]:
@@ -135,12 +134,12 @@ def rounded(pairs: Sequence[Pair], floor: Float64[np.ndarray, "6"]) -> list[Find
     signal = next(iter(lsb)) if len(lsb) == 1 else "both"
     parameters = {f"{name}_lsb": Estimate(value, 1e-3 * value, UNITS[name]) for name, value in lsb.items()}
     length = sum(float(pair.stamp_s[-1] - pair.stamp_s[0]) for pair in pairs)
-    nothing = HeldOut(0.0, 0.0, "-", round(length, 1))
-    return [Finding("quantization", signal, 0.0, 0.0, 0.0, parameters, "values are multiples of an LSB", nothing)]
+    held_out = HeldOut(0.0, 0.0, "-", round(length, 1))
+    return [Finding("quantization", signal, 0.0, 0.0, 0.0, parameters, "values are multiples of an LSB", held_out)]
 
 
 def grid(x: Float64[np.ndarray, " n"]) -> float:
-    """The step of the grid that values lie on; 0 where they lie on none, or take fewer than three values."""
+    """Grid step of values; 0 where they lie on no grid or take fewer than three values."""
     values = np.unique(np.round(x, 12))
     if len(values) < LEAST_VALUES:
         return 0.0
@@ -155,7 +154,7 @@ def grid(x: Float64[np.ndarray, " n"]) -> float:
 
 
 def limits(real: Float64[np.ndarray, "n 6"]) -> dict[Sensor, float]:
-    """The largest readings of a sensor that come again and again, to the last digit: where its converter ends."""
+    """Limits of the converters: the largest readings that recur to the last digit."""
     found: dict[Sensor, float] = {}
     for k, signal in enumerate(SENSORS):
         values = np.abs(real[:, 3 * k : 3 * k + 3])
@@ -168,7 +167,7 @@ def limits(real: Float64[np.ndarray, "n 6"]) -> dict[Sensor, float]:
 
 
 def soft_limits(pairs: Sequence[Pair], biases: Sequence[Float64[np.ndarray, "6"]]) -> tuple[Effect, ...]:
-    """A limit whose readings still carry noise: one candidate a sensor, for a fit. What is clipped includes the bias."""
+    """Saturation whose readings still carry noise: one candidate a sensor, bias included."""
     found = []
     for k, signal in enumerate(("gyro", "accel")):
         if any(signal in limits(pair.real) for pair in pairs):
@@ -212,12 +211,12 @@ class _Starts:
     def __init__(self, most: float) -> None:
         self.most = most
 
-    def __call__(self, _felt: IdealMotion, _samples: SensorSamples) -> list[Theta]:
+    def __call__(self, _ideal: IdealMotion, _samples: SensorSamples) -> list[Theta]:
         return [np.array([share * self.most]) for share in SHARES]
 
 
 def clipped(real: Float64[np.ndarray, "n 6"]) -> Bool[np.ndarray, "n 6"]:
-    """Samples of an axis whose converter is at its limit, and their neighbours, which filters mix with them."""
+    """Clipped samples of an axis, and their neighbours, which filters mix with them."""
     at, most = np.zeros(real.shape, bool), limits(real)
     for k, signal in enumerate(("gyro", "accel")):
         if signal in most:
@@ -227,66 +226,68 @@ def clipped(real: Float64[np.ndarray, "n 6"]) -> Bool[np.ndarray, "n 6"]:
 
 
 def stuck(real: Float64[np.ndarray, "n 6"]) -> Bool[np.ndarray, "6"]:
-    """Axes that read the same in every sample."""
+    """Stuck axes, which read the same in every sample."""
     return np.asarray(np.ptp(real, axis=0) == 0.0)
 
 
 def saturated(pairs: Sequence[Pair], expected: Sequence[Float64[np.ndarray, "n 6"]], tried: int) -> list[Finding]:
-    """Clipping that the expectation, which knows no limit, exceeds: more than by chance (a sign test on clipped samples)."""
-    told: dict[str, Estimate] = {}
+    """Finding of saturation: the expectation exceeds clipped samples (sign test)."""
+    parameters: dict[str, Estimate] = {}
     powers, signal_of, p = [0.0, 0.0, 0.0], "", 1.0
-    real, there = (np.concatenate(parts) for parts in ([pair.real for pair in pairs], expected))
+    real, model = (np.concatenate(parts) for parts in ([pair.real for pair in pairs], expected))
     for k, signal in enumerate(SENSORS):
         most = limits(real).get(signal)
         if most is None:
             continue
         part = slice(3 * k, 3 * k + 3)
         at = np.abs(real[:, part]) >= most * (1.0 - 1e-9)
-        beyond = (there[:, part] * np.sign(real[:, part]))[at] > most
+        beyond = (model[:, part] * np.sign(real[:, part]))[at] > most
         chance = float(binom.sf(beyond.sum() - 1, len(beyond), 0.5)) * tried
         if chance > 1e-2 and beyond.mean() < 0.9:
             continue
-        told[f"{signal}_limit"] = Estimate(most, EXACT * most, UNITS[signal])
-        before = ((real - there)[:, part] ** 2)[at]
-        after = ((real[:, part] - np.clip(there[:, part], -most, most)) ** 2)[at]
+        parameters[f"{signal}_limit"] = Estimate(most, EXACT * most, UNITS[signal])
+        before = ((real - model)[:, part] ** 2)[at]
+        after = ((real[:, part] - np.clip(model[:, part], -most, most)) ** 2)[at]
         powers, signal_of, p = [float(before.sum()), float(after.sum()), float(at.size)], signal, min(p, chance)
-    if not told:
+    if not parameters:
         return []
-    seen_in = signal_of if len(told) == 1 else "both"
+    seen_in = signal_of if len(parameters) == 1 else "both"
     length = sum(float(pair.stamp_s[-1] - pair.stamp_s[0]) for pair in pairs)
-    held = HeldOut(
+    held_out = HeldOut(
         float(np.sqrt(powers[0] / powers[2])), float(np.sqrt(powers[1] / powers[2])), ASCII_UNITS[signal_of], round(length, 1)
     )
     share = float(np.clip(1.0 - powers[1] / max(powers[0], 1e-300), 0.0, 1.0))
-    return [Finding("saturation", seen_in, share, min(p, 1.0), min(p, 1.0), told, "readings are clipped at +-limit", held)]
+    return [
+        Finding("saturation", seen_in, share, min(p, 1.0), min(p, 1.0), parameters, "readings are clipped at +-limit", held_out)
+    ]
 
 
 def late_stamps(pairs: Sequence[Pair]) -> list[Finding]:
-    """`timestamp_jitter` with its standard deviation (s), where stamps are uneven and samples are seen not to be."""
-    off = [pair.stamp_s - even(pair.stamp_s)[0] for pair in pairs]
-    if min(float(x.std()) for x in off) < LEAST_JITTER_S:
+    """Finding of timestamp jitter, where stamps are uneven and the samples are even."""
+    lateness = [pair.stamp_s - even(pair.stamp_s)[0] for pair in pairs]
+    if min(float(x.std()) for x in lateness) < LEAST_JITTER_S:
         return []
-    followed, weight = 0.0, 0.0
-    for pair, late in zip(pairs, off, strict=True):
+    followed_sum, weight = 0.0, 0.0
+    for pair, late in zip(pairs, lateness, strict=True):
         for column in pair.real.T:
             share, size = _followed(column, late, pair.period_s)
-            followed, weight = followed + share * size, weight + size
+            followed_sum, weight = followed_sum + share * size, weight + size
     if weight <= 0.0:
         return []
-    share, sigma = followed / weight, 1.0 / np.sqrt(weight)
+    share, sigma = followed_sum / weight, 1.0 / np.sqrt(weight)
     if share > 0.5 or 1.0 - share < EVENLY * sigma:
         return []
-    every = np.concatenate(off)
-    std = float(every.std())
+    all_s = np.concatenate(lateness)
+    std = float(all_s.std())
     length = sum(float(pair.stamp_s[-1] - pair.stamp_s[0]) for pair in pairs)
     chance = float(norm.sf((1.0 - share) / sigma))
-    told = {"std": Estimate(std, std / np.sqrt(2.0 * len(every)), "s")}
-    nothing = HeldOut(0.0, 0.0, "-", round(length, 1))
-    return [Finding("timestamp_jitter", "both", 0.0, chance, chance, told, "stamps jitter, samples do not", nothing)]
+    parameters = {"std": Estimate(std, std / np.sqrt(2.0 * len(all_s)), "s")}
+    held_out = HeldOut(0.0, 0.0, "-", round(length, 1))
+    return [Finding("timestamp_jitter", "both", 0.0, chance, chance, parameters, "stamps jitter, samples do not", held_out)]
 
 
 def _followed(column: Float64[np.ndarray, " n"], late_s: Float64[np.ndarray, " n"], period_s: float) -> tuple[float, float]:
-    """How much of their stamps' lateness samples took part in, between 0 and 1, and one over the variance of that."""
+    """Share of the stamps' lateness that the samples follow, and its inverse variance."""
     if len(column) < LEAST_ROWS:
         return 0.0, 0.0
     slope = savgol_filter(column, AROUND, DEGREE, deriv=1, delta=period_s)
@@ -294,6 +295,6 @@ def _followed(column: Float64[np.ndarray, " n"], late_s: Float64[np.ndarray, " n
     moved = moved - savgol_filter(moved, AROUND, DEGREE)
     rest = column - savgol_filter(column, AROUND, DEGREE)
     size = float(moved @ moved)
-    share = float(moved @ rest) / max(size, TINY)
-    left = float(np.mean((rest - share * moved) ** 2))
-    return share, size / max(left, TINY)
+    share = float(moved @ rest) / max(size, 1e-300)
+    variance = float(np.mean((rest - share * moved) ** 2))
+    return share, size / max(variance, 1e-300)

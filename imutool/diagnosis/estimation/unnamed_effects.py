@@ -34,8 +34,11 @@ Variable = Callable[[SensorSamples], Float64[np.ndarray, " n"]]
 
 
 def driven(pairs: Sequence[Pair]) -> Iterator[Effect]:
-    """An effect for each other channel of the logs: + gain * channel, taken some time earlier, on one of the sensors."""
-    named = {need for physics in catalogue.diagnosed() for need in physics.needs}
+    """Effects driven by each other channel of the logs, on one of the sensors.
+
+    + gain * channel, taken some time earlier.
+    """
+    named = {need for effect in catalogue.diagnosed() for need in effect.needs}
     for name in sorted(set.intersection(*(set(pair.channels) for pair in pairs))):
         if any(need in name for need in named):
             continue  # the catalogue has a name for that
@@ -57,7 +60,7 @@ def driven(pairs: Sequence[Pair]) -> Iterator[Effect]:
                 f"{name} varies",
                 _Driven(name, center, k),
                 linear=False,
-                starts=lambda felt, real: [np.array([0.0, 0.0, 0.0, lag]) for lag in LAGS_S],
+                starts=lambda ideal, real: [np.array([0.0, 0.0, 0.0, lag]) for lag in LAGS_S],
                 kind="driven",
                 variable=name,
                 variant=f"{name}:{signal}",
@@ -90,9 +93,9 @@ def curves(like: SensorSamples) -> Iterator[Effect]:
             yield from (_curve(variable, k, axis, inner) for k in range(len(SIGNALS)) for axis in range(3))
 
 
-def finer(physics: Effect, like: SensorSamples) -> Effect | None:
-    """The same curve with more knots, for what has an edge; nothing for what is no curve, or varies too little."""
-    coarse = physics.forward
+def finer(effect: Effect, like: SensorSamples) -> Effect | None:
+    """Curve with more knots, for an edge; None where the variable has no room for them."""
+    coarse = effect.forward
     if not isinstance(coarse, Curve):
         return None
     inner = _knots(like, coarse.variable, FINE_KNOTS)
@@ -129,7 +132,9 @@ def _curve(variable: str, sensor: int, axis: int, inner: Float64[np.ndarray, " p
 
 
 class SplineCurve:
-    """A cubic spline of one variable, constant beyond its ends: coefficients of B-splines, or of sums of them.
+    """Spline curve (cubic) of one variable, constant beyond its ends.
+
+    Coefficients are those of B-splines, or of sums of them.
 
     Where samples are many, knots are close: at even distances, what the motion rarely does would bend all the rest.
     """
@@ -230,4 +235,4 @@ def like(pairs: Sequence[Pair]) -> SensorSamples:
     """Ideal signals at the samples of the first log that are fitted: what ranges there are."""
     pair = pairs[0]
     stamp_s = pair.stamp_s[pair.fitted]
-    return pair.felt.sample(stamp_s, stamp_s)
+    return pair.ideal.sample(stamp_s, stamp_s)

@@ -1,4 +1,4 @@
-"""Whitening of residuals: an autoregressive filter for each axis, from what a rich model leaves.
+"""Whitening of residuals: an autoregressive filter for each axis.
 
 Poses that were differentiated leave noise of every colour; least squares on such residuals is sure of the wrong things. An
 autoregressive filter makes it white (Box and Jenkins; here by Burg's recursion over stretches that count), and what is
@@ -28,14 +28,17 @@ SEGMENT, LINES = 512, 9  # samples of a spectrum; frequencies of the median that
 
 @dataclass(frozen=True, eq=False)
 class Band:
-    """What is slower than a frequency, on every so many-th sample: smoothed poses know nothing of what is faster."""
+    """Low-pass band of a signal, decimated.
+
+    Smoothed poses know nothing of what is faster.
+    """
 
     taps: Float64[np.ndarray, " k"]
     every: int
 
     @staticmethod
     def below(band_hz: float, rate_hz: float) -> Band:
-        """Up to `band_hz`, by a symmetric filter of `BAND_S`."""
+        """Band up to `band_hz`, by a symmetric filter of `BAND_S`."""
         count = 2 * round(0.5 * BAND_S * rate_hz) + 1
         every = max(1, int(rate_hz / (OVER * band_hz)))
         return Band(firwin(count, min(band_hz, 0.45 * rate_hz), fs=rate_hz), every)
@@ -58,7 +61,7 @@ class Band:
 
 @dataclass(frozen=True, eq=False)
 class Whitener:
-    """For each axis a filter and the size of what comes out of it, so that it has unit variance.
+    """Whitening filter for each axis, with the standard deviation of its output.
 
     `counts` are the values that come out and tell anything (none: all); the others come out as zero, whatever goes in.
     """
@@ -69,7 +72,7 @@ class Whitener:
     counts: Bool[np.ndarray, "m k"] | None = None
 
     def __call__(self, x: Float64[np.ndarray, "n k *p"]) -> Float64[np.ndarray, "m k *p"]:
-        """White rows from coloured ones (fewer, where only a band is looked at); columns of zeros stay zeros."""
+        """White rows from coloured ones (fewer in a band); columns of zeros stay zeros."""
         columns = x.reshape(len(x), x.shape[1], math.prod(x.shape[2:]))
         axes, ks = np.nonzero(columns.any(axis=0))
         out = np.zeros((len(range(0, len(x), self.every)), *columns.shape[1:]))
@@ -90,25 +93,25 @@ class Whitener:
         return out
 
     def counting(self, known: Bool[np.ndarray, "n k"]) -> Whitener:
-        """Where only some samples tell anything: neither do values that others have gone into."""
+        """Whitener that drops values which depend on unknown samples."""
         if self.band is not None:
             known = np.asarray(minimum_filter1d(known, len(self.band.taps), axis=0, mode="nearest"))[:: self.every]
         return replace(self, counts=np.stack([settled(column, self.order) for column in known.T], axis=1))
 
     @property
     def every(self) -> int:
-        """Samples for one row that comes out."""
+        """Decimation: samples for one row of the output."""
         return 1 if self.band is None else self.band.every
 
     @property
     def order(self) -> int:
-        """Samples it looks back."""
+        """Order of the filter."""
         return int(self.filters.shape[1] - 1)
 
 
 @dataclass(frozen=True, eq=False)
 class WhitenedLog:
-    """An aligned log with the filter that makes its noise white; rows are fitted, held out, or neither."""
+    """Whitened log: aligned samples with the filter that makes their noise white."""
 
     pair: AlignedLog
     whiten: Whitener
@@ -140,7 +143,7 @@ class WhitenedLog:
 
 @dataclass(frozen=True, eq=False)
 class WhitenedImu(WhitenedLog):
-    """An aligned IMU log with the filter that makes its noise white."""
+    """Whitened IMU log."""
 
     pair: Pair
 
@@ -148,7 +151,7 @@ class WhitenedImu(WhitenedLog):
 def whitener(
     residual: Float64[np.ndarray, "n k"], usable: Bool[np.ndarray, "n ..."], order: int, band: Band | None = None
 ) -> Whitener:
-    """From a residual and the rows of it that count, or the samples; an axis without any is left as it is.
+    """Whitening filters from a residual and its usable rows or samples.
 
     The size is robust (a few spikes are not the noise), but no less than half of what the plain one is.
     """
@@ -168,7 +171,9 @@ def whitener(
 
 
 def level(residual: Float64[np.ndarray, "n k"], usable: Bool[np.ndarray, "n ..."], rate_hz: float, order: int) -> Whitener:
-    """As `whitener`, for a sensor beside an exact simulation: below `MOTION_HZ` its noise is taken to be what it is above.
+    """Whitening filters of a sensor beside an exact simulation.
+
+    As `whitener`, but below `MOTION_HZ` the noise is taken to be what it is above.
 
     What is left down there may be physics that nobody thought of, and must not be taken for noise.
     """
@@ -186,7 +191,7 @@ def level(residual: Float64[np.ndarray, "n k"], usable: Bool[np.ndarray, "n ..."
 
 
 def autoregression(power: Float64[np.ndarray, " f"], rate_hz: float, order: int) -> tuple[Float64[np.ndarray, " _"], float]:
-    """Coefficients (1, a_1, ..., a_order) and standard deviation of the innovations, from a power density (Yule-Walker)."""
+    """Autoregression (1, a_1, ..., a_order) and innovation std from a density (Yule-Walker)."""
     from scipy.linalg import solve_toeplitz
 
     covariance = np.fft.irfft(power * rate_hz / 2.0)[: order + 1] + np.concatenate([[LEAST_STD**2], np.zeros(order)])
@@ -201,7 +206,10 @@ def _by_axis(usable: Bool[np.ndarray, "n ..."], columns: int) -> Bool[np.ndarray
 def spectrum(
     x: Float64[np.ndarray, " n"], usable: Bool[np.ndarray, " n"], rate_hz: float
 ) -> tuple[Float64[np.ndarray, " f"], Float64[np.ndarray, " f"]]:
-    """Frequencies and power density, the median (Welch) over segments that count wholly, or mostly where none does."""
+    """Frequencies and power density: the median (Welch) over usable segments.
+
+    A segment counts if all of it is usable, or most of it where none is.
+    """
     size = min(SEGMENT, max(len(x) // LEAST_SEGMENTS, LEAST_SEGMENT), len(x))
     starts = range(0, len(x) - size + 1, max(1, size // 2))
     whole = np.array([float(usable[s : s + size].mean()) for s in starts])
@@ -211,9 +219,9 @@ def spectrum(
 
 
 def median_bias(count: int) -> float:
-    """The median of so many exponential variables of mean one (Allen et al., FINDCHIRP, appendix B; an odd count)."""
-    odd = count - (count + 1) % 2
-    return float(sum((-1.0) ** (k + 1) / k for k in range(1, max(odd, 1) + 1)))
+    """Bias of the median of exponential variables (Allen et al., FINDCHIRP, app. B; odd count)."""
+    odd_count = count - (count + 1) % 2
+    return float(sum((-1.0) ** (k + 1) / k for k in range(1, max(odd_count, 1) + 1)))
 
 
 def settled(usable: Bool[np.ndarray, " n"], order: int) -> Bool[np.ndarray, " n"]:
@@ -225,7 +233,10 @@ def settled(usable: Bool[np.ndarray, " n"], order: int) -> Bool[np.ndarray, " n"
 
 
 def burg(x: Float64[np.ndarray, " n"], usable: Bool[np.ndarray, " n"], order: int) -> Float64[np.ndarray, " _"]:
-    """Burg's autoregression (1, a_1, ..., a_order), forward and backward errors counted where all their samples do."""
+    """Burg's autoregression (1, a_1, ..., a_order).
+
+    Forward and backward errors count where all their samples do.
+    """
     a = np.array([1.0])
     f, b, ok = np.where(usable, x, 0.0), np.where(usable, x, 0.0), usable.copy()
     for _ in range(order):

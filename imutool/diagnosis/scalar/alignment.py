@@ -1,4 +1,4 @@
-"""Alignment of a recorded number with its simulation: one clock, the simulation without its noise, rows that count."""
+"""Alignment of a scalar signal with its simulation: one clock, no simulation noise."""
 
 from __future__ import annotations
 
@@ -27,13 +27,13 @@ MOST_FINE = 20_000_000  # samples
 
 
 def aligned(real: Fields, sim: Fields, others: Mapping[str, Fields], name: str) -> AlignedSignal:
-    """Both on the recording's clock, in seconds from its first sample that the simulation covers.
+    """Align a signal with its simulation, in seconds from the first shared sample.
 
     Raises:
         DataError: constant, too short or too few, or nothing alike in the two.
     """
-    for one, what in ((real, "recording"), (sim, "simulation")):
-        _check(one, what, name)
+    for fields, what in ((real, "recording"), (sim, "simulation")):
+        _check(fields, what, name)
     start_ns = int(real.t_ns[0])
     t_real, t_sim = seconds(real.t_ns, start_ns), seconds(sim.t_ns, start_ns)
     lag_s, aligned_s = _lag(t_real, real.values, t_sim, sim.values, name)
@@ -51,7 +51,7 @@ def aligned(real: Fields, sim: Fields, others: Mapping[str, Fields], name: str) 
             fix="Give logs of the same time, or longer ones",
         )
     part = slice(int(rows[0]), int(rows[-1]) + 1)
-    channels = {other: (seconds(one.t_ns, start_ns), one.values) for other, one in others.items() if len(one) > 1}
+    channels = {other: (seconds(fields.t_ns, start_ns), fields.values) for other, fields in others.items() if len(fields) > 1}
     ideal, sim_density = _ideal(t_sim, sim.values, period_sim, period_real, channels)
     held_out, usable = split(t_real[part])
     step = np.diff(t_sim)
@@ -73,31 +73,31 @@ def aligned(real: Fields, sim: Fields, others: Mapping[str, Fields], name: str) 
     )
 
 
-def _check(one: Fields, what: str, name: str) -> None:
+def _check(fields: Fields, what: str, name: str) -> None:
     """Refuses what holds nothing to compare.
 
     Raises:
         DataError: too short, not finite, stamps that do not increase, constant.
     """
-    length = float(one.t_ns[-1] - one.t_ns[0]) * 1e-9 if len(one) else 0.0
-    if length < LEAST_S or len(one) < LEAST_SAMPLES:
+    length = float(fields.t_ns[-1] - fields.t_ns[0]) * 1e-9 if len(fields) else 0.0
+    if length < LEAST_S or len(fields) < LEAST_SAMPLES:
         raise DataError(
-            f"the {what} has {len(one)} samples of {name} in {length:.1f} s",
+            f"the {what} has {len(fields)} samples of {name} in {length:.1f} s",
             where=name,
             expected=f"at least {LEAST_S:g} s and {LEAST_SAMPLES} samples",
             fix="Give a longer log",
         )
-    if not np.isfinite(one.values).all() or (np.diff(one.t_ns) <= 0).any():
+    if not np.isfinite(fields.values).all() or (np.diff(fields.t_ns) <= 0).any():
         raise DataError(
             f"the {what} of {name} has values that are not finite, or stamps that do not increase",
             where=name,
             expected="finite values and increasing stamps",
             fix="Cut the log where it is sound",
         )
-    if np.ptp(one.values) <= MOVES * float(np.abs(one.values).max()):
+    if np.ptp(fields.values) <= MOVES * float(np.abs(fields.values).max()):
         why = "the sensor may be dead or not connected" if what == "recording" else "it may not be simulated at all"
         raise DataError(
-            f"{name} is {one.values[0]:g} throughout the {what}",
+            f"{name} is {fields.values[0]:g} throughout the {what}",
             where=name,
             expected="a signal that varies",
             fix=f"Choose another field: {why}",
@@ -120,28 +120,31 @@ def _ideal(
 
 
 def _jumps(values: Column) -> bool:
-    """Whether a signal stands still for most of its samples, as a command does: a spline would ring about its steps."""
+    """Whether a signal holds still for most samples, as a command does.
+
+    A spline would ring about its steps.
+    """
     return float((np.diff(values) == 0.0).mean()) > 0.5
 
 
 def _lag(t_real: Column, real: Column, t_sim: Column, sim: Column, name: str) -> tuple[float, float | None]:
-    """How much later the recording is at first sight, and what is between the clocks where they share no epoch (s).
+    """Lag (s) of the recording at first sight, and the clock shift (s) if no epoch is shared.
 
     Raises:
         DataError: nowhere are the two alike.
     """
     a, b = _smooth(t_real, real), _smooth(t_sim, sim)
-    both = correlate(a, b, mode="full") / max(float(np.linalg.norm(a) * np.linalg.norm(b)), 1e-300)
+    correlation = correlate(a, b, mode="full") / max(float(np.linalg.norm(a) * np.linalg.norm(b)), 1e-300)
     lags = correlation_lags(len(a), len(b)) / ALIGN_HZ + float(t_real[0] - t_sim[0])
     shared = min(t_real[-1], t_sim[-1]) - max(t_real[0], t_sim[0])
     length = min(t_real[-1] - t_real[0], t_sim[-1] - t_sim[0])
-    here = np.abs(lags) <= FARTHEST_S
-    if shared > max(LEAST_S, 0.5 * length) and here.any() and np.abs(both[here]).max() > ALIKE:
-        return float(lags[here][np.argmax(np.abs(both[here]))]), None
-    best = int(np.argmax(both))
-    if both[best] < ALIKE:
+    near = np.abs(lags) <= FARTHEST_S
+    if shared > max(LEAST_S, 0.5 * length) and near.any() and np.abs(correlation[near]).max() > ALIKE:
+        return float(lags[near][np.argmax(np.abs(correlation[near]))]), None
+    best = int(np.argmax(correlation))
+    if correlation[best] < ALIKE:
         raise DataError(
-            f"recording and simulation of {name} are not alike (correlation {both[best]:.2f} at best)",
+            f"recording and simulation of {name} are not alike (correlation {correlation[best]:.2f} at best)",
             where=name,
             expected="one motion",
             fix="Simulate what was recorded, or choose another field",
@@ -152,5 +155,5 @@ def _lag(t_real: Column, real: Column, t_sim: Column, sim: Column, name: str) ->
 def _smooth(t_s: Column, values: Column) -> Float64[np.ndarray, " _"]:
     """On an even clock, without its mean."""
     at = np.arange(t_s[0], t_s[-1], 1.0 / ALIGN_HZ)
-    there = np.interp(at, t_s, values)
-    return np.asarray(there - there.mean())
+    even = np.interp(at, t_s, values)
+    return np.asarray(even - even.mean())

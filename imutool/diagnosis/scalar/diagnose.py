@@ -1,4 +1,4 @@
-"""Diagnosis of one scalar signal of a log: aligned, whitened, searched by the engine with one column, reported."""
+"""Diagnosis of one scalar signal of a log: aligned, whitened, searched, reported."""
 
 from __future__ import annotations
 
@@ -16,20 +16,19 @@ from imutool.diagnosis.estimation.noise_estimate import ORDER, noise_std, ridge_
 from imutool.diagnosis.estimation.timestamps import LEAST_DIGITS, grid
 from imutool.diagnosis.estimation.unnamed_effects import SplineCurve
 from imutool.diagnosis.estimation.whitening import LINES, SEGMENT, WhitenedLog, Whitener, autoregression
-from imutool.diagnosis.localization import CLEAR, WINDOW_S, intervals, regime
+from imutool.diagnosis.localization import intervals, regime
 from imutool.diagnosis.result import Curve, Estimate, Finding, HeldOut, Located, SignalTraces, Unexplained
 from imutool.diagnosis.scalar import effects
 from imutool.diagnosis.scalar.alignment import TOP, aligned
 from imutool.diagnosis.scalar.effects import SignalCurve
 from imutool.diagnosis.scalar.signal import AlignedSignal, Column, Samples
-from imutool.diagnosis.settings import SearchSettings
+from imutool.diagnosis.settings import DiagnoseSettings, LocalizationSettings
 from imutool.mcap_io.fields import Fields
 
 BETTER_NOISE = 0.95  # of what the noise was first taken for, below which effects are searched once more
 IN_BAND, ABOVE = 0.999, 1.3  # of the signal's power lie below its edge, and noise is measured from a little above that
 LOWEST, HIGHEST = 0.05, 0.3  # of the sample rate: least and most for the edge
 SHOWN_KNOTS = 41
-WHITE = 1.15
 EXACT = 1e-3
 SAME_GRID = 0.01
 RICH_KNOTS = 12
@@ -53,9 +52,9 @@ class SignalDiagnosis:
 
 
 def diagnose_signal(
-    real: Fields, sim: Fields, others: Mapping[str, Fields], name: str, settings: SearchSettings | None = None
+    real: Fields, sim: Fields, others: Mapping[str, Fields], name: str, settings: DiagnoseSettings | None = None
 ) -> SignalDiagnosis:
-    """Diagnose what separates a recorded signal from its simulation, but for a constant and noise.
+    """Diagnose the misfit of a recorded signal to its simulation, but for constant and noise.
 
     `others` are further numbers of the recording, on its clock, which may drive the misfit; `name` is TOPIC.field, as findings
     have it.
@@ -63,6 +62,7 @@ def diagnose_signal(
     Raises:
         DataError: constant, too short, or not of one motion; the message says what to do.
     """
+    settings = settings or DiagnoseSettings()
     pair = aligned(real, sim, others, name)
     lsb = _lsb(real, sim)
     always: Chosen = ((effects.offset(float(np.ptp(pair.real)), pair.unit), np.zeros(1)),)
@@ -71,12 +71,12 @@ def diagnose_signal(
     candidates = [effect for effect in effects.named(pair) if effect.name != "delay" or pair.shares_epoch]
     later = [list(effects.driven(pair)), list(effects.unknown(pair))]
     log = _whitened(pair, _rich_residual(pair), lsb)
-    found = select_effects([log], candidates, later, always=always, settings=settings)
-    again = _whitened(pair, (pair.real - expected(pair, found.whole.chosen))[:, 0], lsb)
-    if _level(again) < BETTER_NOISE * _level(log):  # the effects' own high frequencies were taken for noise
-        log = again
-        found = select_effects([log], candidates, later, always=always, settings=settings)
-    return _summarized(pair, log, found, len(always), lsb)
+    selection = select_effects([log], candidates, later, always=always, settings=settings.search)
+    rewhitened = _whitened(pair, (pair.real - expected(pair, selection.whole.chosen))[:, 0], lsb)
+    if _level(rewhitened) < BETTER_NOISE * _level(log):  # the effects' own high frequencies were taken for noise
+        log = rewhitened
+        selection = select_effects([log], candidates, later, always=always, settings=settings.search)
+    return _summarized(pair, log, selection, len(always), lsb, settings)
 
 
 # ── noise ──
@@ -121,7 +121,7 @@ def _level(log: WhitenedLog) -> float:
 
 
 def _rich_residual(pair: AlignedSignal) -> Samples:
-    """What a smooth function of signal, derivatives and time leaves of the recording: noise, or what is sharp."""
+    """Residual of a smooth function of signal, derivatives and time: noise, or what is sharp."""
     ideal, k = pair.ideal, np.arange(len(pair.ideal.fine))
     at = (pair.stamp_s - pair.lag_s - ideal.start_s) * ideal.rate_hz
     derivatives = [ideal.fine]
@@ -130,13 +130,16 @@ def _rich_residual(pair: AlignedSignal) -> Samples:
     columns = [np.interp(at, k, column) for column in derivatives]
     x, dx = columns[0], columns[1]
     columns += [np.sign(x), np.sign(dx)]
-    for of in (x, dx, pair.stamp_s):
-        columns += [*SplineCurve("", np.linspace(of.min(), of.max(), RICH_KNOTS - 2)).basis(of).T]
+    for values in (x, dx, pair.stamp_s):
+        columns += [*SplineCurve("", np.linspace(values.min(), values.max(), RICH_KNOTS - 2)).basis(values).T]
     return np.asarray(pair.real[:, 0] - ridge_fit(np.stack(columns, axis=1), pair.real[:, 0], pair.usable[:, 0]))
 
 
 def _lsb(real: Fields, sim: Fields) -> float:
-    """Step that recorded values are multiples of, 0 where they are of none or the simulation's are of the same."""
+    """Quantization step of recorded values.
+
+    0 where they lie on no grid, or the simulation's lie on the same.
+    """
     step, simulated = grid(real.values), grid(sim.values)
     return 0.0 if simulated and abs(step / simulated - 1.0) < SAME_GRID else step
 
@@ -144,33 +147,35 @@ def _lsb(real: Fields, sim: Fields) -> float:
 # ── report ──
 
 
-def _summarized(pair: AlignedSignal, log: WhitenedLog, found: Selection, always: int, lsb: float) -> SignalDiagnosis:
+def _summarized(
+    pair: AlignedSignal, log: WhitenedLog, selection: Selection, always: int, lsb: float, settings: DiagnoseSettings
+) -> SignalDiagnosis:
     level, name, unit = _level(log), pair.name, pair.unit
-    real, chosen, held_out = pair.real[:, 0], found.whole.chosen, pair.held_out
+    real, chosen, held_out = pair.real[:, 0], selection.whole.chosen, pair.held_out
     before, after = _column(pair, ()), _column(pair, chosen)
     before = before + (real - before)[pair.usable[:, 0]].mean()
-    findings = [_finding(pair, found, one, always, level) for one in found.selected]
+    findings = [_finding(pair, selection, selected, always, level) for selected in selection.selected]
     rounded = lsb > LEAST_DIGITS * level
     if rounded:
         phase = float(np.median(np.mod(real + 0.5 * lsb, lsb))) - 0.5 * lsb
         digits = np.rint((after - phase) / lsb) * lsb + phase
-        held = _held_out(pair, after, digits)
-        share = float(np.clip(1.0 - (held.rms_after / max(held.rms_before, 1e-300)) ** 2, 0.0, 1.0))
+        held_out_gain = _held_out(pair, after, digits)
+        share = float(np.clip(1.0 - (held_out_gain.rms_after / max(held_out_gain.rms_before, 1e-300)) ** 2, 0.0, 1.0))
         parameters = {"lsb": Estimate(lsb, EXACT * lsb, unit)}  # no noise puts every value on a grid by chance
-        findings.append(Finding("quantization", name, share, 0.0, 0.0, parameters, "y = lsb round(x / lsb)", held))
-        after = digits if held.rms_after < held.rms_before else after
-    p_value = min((one.p_value for one in found.selected), default=1.0)
-    offset = found.whole.stds()["offset"]
+        findings.append(Finding("quantization", name, share, 0.0, 0.0, parameters, "y = lsb round(x / lsb)", held_out_gain))
+        after = digits if held_out_gain.rms_after < held_out_gain.rms_before else after
+    p_value = min((selected.p_value for selected in selection.selected), default=1.0)
+    offset = selection.whole.stds()["offset"]
     rms = float(np.sqrt(np.mean((real - after)[held_out] ** 2)))
     floor = float(np.hypot(level, lsb / np.sqrt(12.0))) if rounded else level
     return SignalDiagnosis(
         signal=name,
         unit=unit,
-        located=_located(pair, after - before, level, p_value) if found.selected else (),
+        located=_located(pair, after - before, level, p_value, settings.localization) if selection.selected else (),
         findings=tuple(findings),
         offset=Estimate(float({e.key: theta for e, theta in chosen}["offset"][0]), float(offset[0]), unit),
         not_identifiable=() if pair.shares_epoch else (f"{name}.delay",),
-        unexplained=Unexplained(rms, level, rms < WHITE * floor),
+        unexplained=Unexplained(rms, level, rms < settings.held_out.white_ratio * floor),
         closer=_held_out(pair, before, after),
         remarks=() if pair.shares_epoch else (NO_EPOCH.format(name, pair.aligned_s),),
         traces=SignalTraces(pair.stamp_s, real, before, after, held_out, unit),
@@ -186,52 +191,54 @@ def _held_out(pair: AlignedSignal, before: Samples, after: Samples) -> HeldOut:
     return HeldOut(rms[0], rms[1], pair.unit, round(float(pair.held_out.sum()) * pair.period_s, 1))
 
 
-def _finding(pair: AlignedSignal, found: Selection, one: SelectedEffect, always: int, level: float) -> Finding:
+def _finding(pair: AlignedSignal, selection: Selection, selected: SelectedEffect, always: int, level: float) -> Finding:
     """A finding, with what leaving it out costs on time that its parameters were not fitted to."""
-    effect, chosen = one.physics, found.fitted.chosen
+    effect, chosen = selected.effect, selection.fitted.chosen
     without = tuple(pair for pair in chosen if pair[0].key != effect.key)
-    with_, alone, nothing = (_column(pair, these) for these in (chosen, without, chosen[:always]))
-    alone, nothing = (model + (pair.real[:, 0] - model)[pair.fitted].mean() for model in (alone, nothing))
-    held, all_ = _held_out(pair, alone, with_), _held_out(pair, nothing, with_)
-    misfit = max(all_.rms_before**2 - level**2, 1e-300)
-    numbers = zip(effect.parameters, one.theta, one.std, strict=True)
+    complete, left_out, no_effects = (_column(pair, these) for these in (chosen, without, chosen[:always]))
+    left_out, no_effects = (model + (pair.real[:, 0] - model)[pair.fitted].mean() for model in (left_out, no_effects))
+    held_out, held_out_of_all = _held_out(pair, left_out, complete), _held_out(pair, no_effects, complete)
+    misfit = max(held_out_of_all.rms_before**2 - level**2, 1e-300)
+    numbers = zip(effect.parameters, selected.theta, selected.std, strict=True)
     curve = isinstance(effect.forward, SignalCurve)
     return Finding(
         effect=effect.name,
         signal=pair.name,
-        share=float(np.clip((held.rms_before**2 - held.rms_after**2) / misfit, 0.0, 1.0)),
-        p_value=one.p_value,
-        false_discovery_rate=one.false_discovery_rate,
+        share=float(np.clip((held_out.rms_before**2 - held_out.rms_after**2) / misfit, 0.0, 1.0)),
+        p_value=selected.p_value,
+        false_discovery_rate=selected.false_discovery_rate,
         parameters={} if curve else {n.name: Estimate(float(value), float(std), n.unit) for n, value, std in numbers},
         equation=effect.equation,
-        held_out=held,
+        held_out=held_out,
         driver=effect.variable if effect.kind == "driven" else "",
-        similar=one.similar,
-        curve=_curve(found, one),
+        similar=selected.similar,
+        curve=_curve(selection, selected),
         kind=effect.kind,
         variable=effect.variable,
     )
 
 
-def _curve(found: Selection, one: SelectedEffect) -> Curve | None:
+def _curve(selection: Selection, selected: SelectedEffect) -> Curve | None:
     """A curve by its values, with their standard deviations; its mean belongs to the offset."""
-    forward = one.physics.forward
+    forward = selected.effect.forward
     if not isinstance(forward, SignalCurve):
         return None
     x = forward.points(SHOWN_KNOTS)
     basis = forward.basis(x)
     centred = basis - basis.mean(axis=0)
-    place = found.whole.place(one.physics.key)
-    band = np.sqrt(np.einsum("nq,qp,np->n", centred, found.whole.covariance[place, place], centred))
-    return Curve.of_arrays(forward.variable, forward.unit, x, (centred @ one.theta)[:, None], band[:, None])
+    place = selection.whole.place(selected.effect.key)
+    band = np.sqrt(np.einsum("nq,qp,np->n", centred, selection.whole.covariance[place, place], centred))
+    return Curve.of_arrays(forward.variable, forward.unit, x, (centred @ selected.theta)[:, None], band[:, None])
 
 
-def _located(pair: AlignedSignal, misfit: Samples, level: float, p_value: float) -> tuple[Located, ...]:
-    """Seconds in which what the findings add stands out of the noise, and in which regime they are."""
+def _located(
+    pair: AlignedSignal, misfit: Samples, level: float, p_value: float, settings: LocalizationSettings
+) -> tuple[Located, ...]:
+    """Location of the findings' misfit: seconds that stand out of the noise, and regime."""
     t_s, sampled = pair.stamp_s, pair.sampled
-    window = np.floor((t_s - t_s[0]) / WINDOW_S).astype(int)
+    window = np.floor((t_s - t_s[0]) / settings.window_s).astype(int)
     power = np.bincount(window, weights=((misfit - np.median(misfit)) / level) ** 2)
-    inside = power > CLEAR
+    inside = power > settings.clear_squares
     if not inside.any():
         return ()
     variables: dict[str, tuple[str, Column]] = {
@@ -241,6 +248,6 @@ def _located(pair: AlignedSignal, misfit: Samples, level: float, p_value: float)
         "time": ("s", t_s),
     }
     variables |= {other: ("", np.interp(t_s, at, values)) for other, (at, values) in pair.ideal.channels.items()}
-    spans = intervals(float(t_s[0]) + WINDOW_S * np.flatnonzero(inside))
-    where = regime(inside, power, window, variables)
+    spans = intervals(float(t_s[0]) + settings.window_s * np.flatnonzero(inside), settings)
+    where = regime(inside, power, window, variables, settings)
     return (Located(pair.name, (), tuple(spans), where, float(power[inside].sum() / power.sum()), p_value),)

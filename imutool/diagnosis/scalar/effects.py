@@ -1,4 +1,4 @@
-"""Effects of any scalar signal: what can come between a simulated number and its recording, whatever it measures.
+"""Effects of any scalar signal between a simulated number and its recording.
 
 In the order in which they act: low_pass, delay, gain, dead_band, then what is added (offset, drift, friction, a driving
 channel, an unnamed curve), saturation; quantization is seen in the values alone. Dead zone, Coulomb friction and first-order
@@ -88,7 +88,10 @@ def named(signal: AlignedSignal) -> Iterator[Effect]:
 
 
 def _low_pass(ideal: IdealSignal, theta: Theta) -> IdealSignal:
-    """First-order lag, exact for straight lines between fine samples; as if what came first had always been."""
+    """First-order lag, exact for straight lines between fine samples.
+
+    The first value holds before the start.
+    """
     a = 2.0 * np.pi * min(float(theta[0]), 1e3 * ideal.rate_hz) / ideal.rate_hz  # rad a sample
     e = np.exp(-a)
     b = [1.0 - (1.0 - e) / a, (1.0 - e) / a - e]
@@ -158,7 +161,7 @@ def _drifts(signal: AlignedSignal, size: float, unit: str) -> Iterator[Effect]:
 
 
 class SignalCurve(SplineCurve):
-    """+ a cubic spline of one variable, by level, slope and bends (second differences) about the middle.
+    """Spline curve of one variable, by level, slope and bends about the middle.
 
     Bends are small, so that ends without data go straight on.
     """

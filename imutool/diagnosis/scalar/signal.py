@@ -1,4 +1,4 @@
-"""A scalar signal as the estimator takes it: ideal, sampled, and aligned with its recording in one column."""
+"""Scalar signal for the estimator: ideal, sampled, and aligned with its recording."""
 
 from __future__ import annotations
 
@@ -19,7 +19,10 @@ Samples = Float64[np.ndarray, " n"]
 
 @dataclass(frozen=True, eq=False)
 class SignalSamples:
-    """A signal on its way through the effects: its value now, and the ideal one with its derivative (per second) as sampled."""
+    """Signal samples between effects, with the ideal signal and its derivative.
+
+    `y` is the value now; `x` and `dx` (per second) are the ideal ones as sampled.
+    """
 
     stamp_s: Samples
     y: Samples
@@ -34,7 +37,7 @@ class SignalSamples:
 
 @dataclass(frozen=True, eq=False)
 class IdealSignal:
-    """A simulated signal without noise on a fine even clock, and other channels by name with their times (s)."""
+    """Ideal signal on a fine even clock, and other channels by name with their times (s)."""
 
     start_s: float
     rate_hz: float

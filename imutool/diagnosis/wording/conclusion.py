@@ -8,9 +8,9 @@ from itertools import groupby
 from pathlib import Path
 from textwrap import fill
 
-from imutool.diagnosis.result import Diagnosis, HeldOut, Located, Unexplained
+from imutool.diagnosis.quantity import grouped, percent, symbol
+from imutool.diagnosis.result import ALWAYS, Diagnosis, HeldOut, Located, Unexplained
 from imutool.diagnosis.wording.effect_sentences import has_gain, label, named_sentence, parameters_text, signals
-from imutool.diagnosis.wording.quantity import grouped, percent, symbol
 from imutool.units import UNITS
 
 QUIET = "nothing else stands above the noise"
@@ -30,7 +30,7 @@ COUNTS = ("No", "One thing was", "Two things were", "Three things were", "Four t
 
 
 def conclusion(d: Diagnosis) -> str:
-    """Conclusion in a few sentences: findings by signal, strongest first, the residual, unobservable effects."""
+    """Conclusion in a few sentences: findings by signal, residual, unobservable effects."""
     return " ".join([*headline(d), *notes(d)])
 
 
@@ -63,7 +63,7 @@ def notes(d: Diagnosis) -> list[str]:
 
 
 def unobservable(d: Diagnosis) -> list[str]:
-    """Unobservable parameters by effect: `gyro_scale (x, y)`, or `lever_arm` for all; of many their number."""
+    """Unobservable parameters by effect: `gyro_scale (x, y)`; `lever_arm` for all; or a count."""
     parts: dict[str, list[str]] = {}
     for entry in d.not_identifiable:
         effect, _, part = (entry, "", "") if entry.startswith("/") else entry.partition(".")
@@ -85,7 +85,7 @@ def lines(d: Diagnosis) -> list[str]:
 
 
 def table(d: Diagnosis) -> list[list[str]]:
-    """Rows of the findings table, the header first; with the p-value of a finding that is not certain."""
+    """Rows of the findings table with its header, and the p-value of an uncertain finding."""
     rows = [["What", "Removes", "Value"]]
     for finding in d.findings:
         what = label(finding) if finding.signal in label(finding) else f"{label(finding)} ({finding.signal})"
@@ -225,19 +225,34 @@ def _differs(signal: str) -> str:
 
 def _regime(located: Sequence[Located], signal: str) -> str:
     """Where the largest share of a signal's misfit lies, as it goes on after `differs`."""
-    here = [
+    places = [
         place for place in located if place.regime and not place.reason and set(signals(place.signal)) & set(signals(signal))
     ]
-    if not here:
+    if not places:
         return ""
-    regime = max(here, key=lambda place: place.share).regime
-    if regime.startswith("always"):
-        return regime.replace("always", " throughout", 1)
-    if regime.startswith("no regime"):
+    place = max(places, key=lambda place: place.share)
+    regime = place.regime
+    if place.everywhere:
+        return f" throughout{regime.removeprefix(ALWAYS)}"
+    if place.intermittent:
         return " off and on"
     word = regime.split()[0].lower()
-    goes_on = {"when", "while", "where", "at", "in", "on", "above", "below", "during", "all", "throughout", "after", "before"}
-    return f" {regime}" if word in goes_on else f" at {regime}"
+    starts = {
+        "when",
+        "while",
+        "where",
+        "at",
+        "in",
+        "on",
+        "above",
+        "below",
+        "during",
+        "all",
+        "throughout",
+        "after",
+        "before",
+    }
+    return f" {regime}" if word in starts else f" at {regime}"
 
 
 def _seconds(seconds: float) -> str:

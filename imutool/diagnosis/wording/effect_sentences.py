@@ -6,8 +6,8 @@ import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
+from imutool.diagnosis.quantity import Quantity, grouped
 from imutool.diagnosis.result import Diagnosis, Finding
-from imutool.diagnosis.wording.quantity import Quantity, grouped
 
 
 @dataclass(frozen=True)
@@ -25,8 +25,10 @@ class Words:
 
     def left_out(self, text: str) -> str:
         """Quantities that the sentence does not mention; a curve's coefficients are never listed."""
-        quiet = () if self.finding.curve is not None else tuple(one for one in self.rest if str(one) not in text)
-        return "".join(f", {one.labelled}" for one in quiet)
+        unmentioned = (
+            () if self.finding.curve is not None else tuple(quantity for quantity in self.rest if str(quantity) not in text)
+        )
+        return "".join(f", {quantity.labelled}" for quantity in unmentioned)
 
 
 def _clock_offset(w: Words) -> str:
@@ -39,7 +41,7 @@ def _delay(w: Words) -> str:
 
 
 def _clock_skew(w: Words) -> str:
-    """t (1 + eps): with eps > 0 the motion between two stamps is more than their difference says."""
+    """Skew t (1 + eps): eps > 0 puts more motion between two stamps than they say."""
     return f"the clock of the recording runs {'slow' if w.main.sign > 0 else 'fast'} by {w.main.size}"
 
 
@@ -105,7 +107,7 @@ SENTENCES: Mapping[str, str | Callable[[Words], str]] = {
 
 
 def named_sentence(d: Diagnosis, finding: Finding) -> str:
-    """Sentence of a finding with its name: `it lags the simulation by 12.4 ± 0.3 ms (clock_offset)`."""
+    """Sentence of a finding with its name: `it lags the simulation by 12 ms (clock_offset)`."""
     could = f"; could as well be {' or '.join(finding.similar)}" if finding.similar else ""
     return f"{effect_sentence(d, finding)} ({finding.effect}{could})"
 

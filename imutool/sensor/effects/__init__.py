@@ -1,1 +1,1 @@
-"""Effects that an ideal IMU leaves out, one file and one `EFFECT` each; the file's name is the key."""
+"""Effects that an ideal IMU lacks: one file, one `EFFECT`; the file's name is the key."""

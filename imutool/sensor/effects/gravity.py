@@ -13,7 +13,10 @@ from imutool.sensor.samples import IdealMotion
 
 
 def _forward(motion: IdealMotion, theta: Theta) -> IdealMotion:
-    """g_w = Exp(tilt_x, tilt_y, 0) (0, 0, -(g + dg)), so that the specific force changes by -R_wb^T times g_w's change."""
+    """Gravity g_w = Exp(tilt_x, tilt_y, 0) (0, 0, -(g + dg)).
+
+    The specific force changes by -R_wb^T times g_w's change.
+    """
     dg, tilt_x, tilt_y = theta.tolist()
     up = Rotation.from_rotvec([tilt_x, tilt_y, 0.0]).apply([0.0, 0.0, 1.0])
     more_w = (GRAVITY_M_S2 + dg) * up - np.array([0.0, 0.0, GRAVITY_M_S2])

@@ -1,4 +1,4 @@
-"""Resonance of a soft mount: force through a spring and a damper, each axis to its own share."""
+"""Resonance of a soft mount: a spring and a damper, each axis to its own share."""
 
 from __future__ import annotations
 

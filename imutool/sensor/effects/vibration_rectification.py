@@ -1,4 +1,4 @@
-"""Rectified vibration: + K v², v² the specific force's power above 1.6 Hz over half a second.
+"""Rectified vibration: + K v², v² the force's power above 1.6 Hz over half a second.
 
 Known of accelerometers as vibration rectification error and of gyros as g²-sensitivity (IEEE 1293, 952): a sensor that reads
 one bias on the ground and another with its motors running.

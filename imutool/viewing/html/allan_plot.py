@@ -10,8 +10,8 @@ import numpy as np
 
 from imutool.mcap_io.storage.target import Target
 from imutool.noise import allan
-from imutool.noise_identification import SENSORS, CurveSource, IdentifiedNoise, Sensor
-from imutool.units import AXES, UNITS
+from imutool.noise_identification import CurveSource, IdentifiedNoise
+from imutool.units import AXES, SENSORS, UNITS, Sensor
 from imutool.viewing.html.drawing import Panel, Picture, legend, plain_tick_labels
 from imutool.viewing.html.drawing import png as drawn
 from imutool.viewing.html.page import AXIS_COLORS, SOFT, TITLES

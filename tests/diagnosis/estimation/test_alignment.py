@@ -34,7 +34,7 @@ def rms(x: np.ndarray) -> float:
 
 def left(pair: Pair) -> np.ndarray:
     """Real minus expected, by column, without its mean."""
-    there = pair.felt.sample(pair.stamp_s, pair.stamp_s)
+    there = pair.ideal.sample(pair.stamp_s, pair.stamp_s)
     out = pair.real - np.concatenate([there.gyro, there.accel], axis=1)
     return np.asarray(out - out.mean(axis=0))
 
@@ -111,11 +111,11 @@ def test_poses_of_the_simulation_stand_in_for_its_samples_and_bring_the_attitude
     pair = with_simulation(*logs(with_poses=True))
     path = planted.moving()
     exact = path.imu(path.start_ns + np.round((pair.stamp_s + 1.0) * 1e9).astype(np.int64))
-    there = pair.felt.sample(pair.stamp_s, pair.stamp_s)
+    there = pair.ideal.sample(pair.stamp_s, pair.stamp_s)
     inner = slice(50, -50)  # splines through poses know less at their ends
     assert np.abs(there.gyro - exact.gyro)[inner].max() < planted.NOISE[0] / 10.0
     assert np.abs(there.accel - exact.accel)[inner].max() < planted.NOISE[3] / 3.0
-    assert pair.felt.R_wb is not None
+    assert pair.ideal.R_wb is not None
     assert not pair.sim_noise.any()  # nothing had to be filtered
 
 
@@ -129,7 +129,7 @@ def test_poses_that_disagree_with_the_simulations_samples_do_not_stand_in_for_th
 def test_clocks_of_one_epoch_are_left_alone_so_that_an_offset_between_them_shows() -> None:
     pair = with_simulation(*logs(late_s=0.02))
     assert pair.aligned_s == 0.0
-    there = pair.felt.sample(pair.stamp_s, pair.stamp_s)
+    there = pair.ideal.sample(pair.stamp_s, pair.stamp_s)
     rate = there.alpha[:, 0]
     assert float(rate @ left(pair)[:, 0] / (rate @ rate)) == pytest.approx(0.02, rel=0.1)  # first order of 20 ms
 
@@ -145,7 +145,7 @@ def test_clocks_without_a_common_epoch_are_aligned_by_the_motion(away_ns: int) -
 
 def test_clocks_aligned_by_the_motion_leave_the_same_misfit_but_for_the_step_of_the_search() -> None:
     pair = with_simulation(*logs(sim_start_ns=planted.START_NS + YEAR_NS, with_poses=True))
-    there = pair.felt.sample(pair.stamp_s, pair.stamp_s)
+    there = pair.ideal.sample(pair.stamp_s, pair.stamp_s)
     offset = float((there.alpha * left(pair)[:, :3]).sum() / (there.alpha**2).sum())
     assert abs(offset) < GRID_S / 2.0
 
@@ -197,7 +197,7 @@ def test_channels_come_along_at_the_samples_and_constant_ones_do_not() -> None:
     pair = with_simulation(replace(real, scalars=scalars), sim)
     assert set(pair.channels) == {"/motor/current", "/wheel.x", "/wheel.z"}
     np.testing.assert_allclose(pair.channels["/motor/current"], pair.stamp_s + 1.0, atol=1e-6)
-    np.testing.assert_allclose(pair.felt.channels["/wheel.z"], -(pair.felt.t_s + 1.0).clip(0.0, 24.0), atol=1e-6)
+    np.testing.assert_allclose(pair.ideal.channels["/wheel.z"], -(pair.ideal.t_s + 1.0).clip(0.0, 24.0), atol=1e-6)
 
 
 def test_without_a_simulation_the_motion_itself_is_expected() -> None:

@@ -29,7 +29,7 @@ SECONDS = 20.0
 def evaluated(pair: Pair, chosen: tuple[tuple[Effect, Theta], ...]) -> np.ndarray:
     """From the start, nothing remembered."""
     got = simulate_samples(
-        type(pair.felt)(*(getattr(pair.felt, n) for n in ("t_s", "gyro", "accel", "alpha", "R_wb"))), pair.stamp_s, chosen
+        type(pair.ideal)(*(getattr(pair.ideal, n) for n in ("t_s", "gyro", "accel", "alpha", "R_wb"))), pair.stamp_s, chosen
     )
     return np.concatenate([got.gyro, got.accel], axis=1)
 
@@ -38,8 +38,8 @@ def start(physics: Effect, pair: Pair) -> Theta:
     """Where a fit of it would begin, or a tenth of its plausible size."""
     if physics.starts is None:
         return 0.1 * physics.plausible
-    got = simulate_samples(pair.felt, pair.stamp_s, ())
-    return np.asarray(physics.starts(pair.felt, got.with_readings(pair.real[:, :3], pair.real[:, 3:]))[0], dtype=float)
+    got = simulate_samples(pair.ideal, pair.stamp_s, ())
+    return np.asarray(physics.starts(pair.ideal, got.with_readings(pair.real[:, :3], pair.real[:, 3:]))[0], dtype=float)
 
 
 @pytest.fixture(scope="module")

@@ -20,7 +20,7 @@ def stamped(late_s: np.ndarray, taken_late: bool) -> Pair:
     if taken_late:
         return pair
     even = planted.ideal(FELT)[INNER] + planted.noise(len(stamp_s), 3) + planted.BIAS
-    return Pair(pair.name, stamp_s, even, pair.fitted, pair.held_out, felt=FELT)
+    return Pair(pair.name, stamp_s, even, pair.fitted, pair.held_out, ideal=FELT)
 
 
 def jittering(std_s: float, seed: int) -> np.ndarray:
@@ -47,5 +47,5 @@ def test_even_stamps_are_no_finding() -> None:
 
 def test_a_body_at_rest_cannot_tell() -> None:
     still = stamped(jittering(1e-3, 0), taken_late=False)
-    at_rest = Pair("rest", still.stamp_s, planted.noise(len(still.stamp_s), 4), still.fitted, still.held_out, felt=FELT)
+    at_rest = Pair("rest", still.stamp_s, planted.noise(len(still.stamp_s), 4), still.fitted, still.held_out, ideal=FELT)
     assert late_stamps([at_rest]) == []

@@ -43,11 +43,11 @@ def asked(pair: Pair, beyond: bool = True) -> Selection:
 
 
 def names(found: Selection) -> list[str]:
-    return [one.physics.key for one in found.selected]
+    return [one.effect.key for one in found.selected]
 
 
 def sure(found: Selection, name: str, truth: list[float]) -> bool:
-    one = next(one for one in found.selected if one.physics.key == name)
+    one = next(one for one in found.selected if one.effect.key == name)
     return bool((np.abs(one.theta - truth) < SURE * one.std).all())
 
 
@@ -120,11 +120,11 @@ def test_a_single_effect_is_found_alone_and_by_its_name(name: str) -> None:
     "both", [("lever_arm", "clock_offset"), ("gyro_scale", "low_pass"), ("mount_rotation", "accel_misalignment")], ids="+".join
 )
 def test_a_pair_is_found_both_by_name(both: tuple[str, str]) -> None:
-    planted = {name: SINGLE[name] for name in both}
-    found = asked(planted.pair(planted.rich(3, DURATION_S), planted, 3), beyond=False)
+    effects = {name: SINGLE[name] for name in both}
+    found = asked(planted.pair(planted.rich(3, DURATION_S), effects, 3), beyond=False)
     assert sorted(names(found)) == sorted(both)
     assert found.selected[0].gain >= found.selected[1].gain  # strongest first
-    assert all(sure(found, name, planted[name]) for name in both)
+    assert all(sure(found, name, effects[name]) for name in both)
 
 
 def test_two_logs_show_together_what_each_shows_alone() -> None:
@@ -185,7 +185,7 @@ def test_a_misfit_without_a_name_gets_none_of_the_catalogues(column: int, seed: 
 
 def fit_cost(found: Selection) -> tuple[float, float]:
     """Squares above the noise that the effects took, with those that are left; and those that are left."""
-    left = max(found.whole.objective - 6.0 * found.whole.rows, 0.0)
+    left = max(found.whole.objective - found.whole.numbers, 0.0)
     return left + sum(one.gain for one in found.selected), left
 
 
@@ -200,12 +200,12 @@ def test_a_temperature_that_rises_as_the_bias_does_is_named_beside_the_drift() -
 
     def told(temperature: np.ndarray) -> dict[str, tuple[str, ...]]:
         pair = planted.pair(planted.shaken(2, DURATION_S), effects, 5)
-        pair = replace(pair, felt=replace(pair.felt, channels={"/temperature.data": temperature}))
+        pair = replace(pair, ideal=replace(pair.ideal, channels={"/temperature.data": temperature}))
         pair = replace(pair, channels={"/temperature.data": temperature})
         drift, temp = (
             planted.acting({name: size})[0][0] for name, size in (("gyro_bias_drift", [0] * 4), ("temperature", [0] * 6))
         )
-        return {one.physics.key: one.similar for one in select_effects([planted.weighed(pair)], (drift, temp)).selected}
+        return {one.effect.key: one.similar for one in select_effects([planted.weighed(pair)], (drift, temp)).selected}
 
     (name, rivals), *more = told(rising).items()
     assert {name, *rivals} == {"gyro_bias_drift", "temperature"}
@@ -218,7 +218,7 @@ def test_the_time_of_a_jump_is_found_also_beside_another_effect_and_between_fitt
     pair = planted.pair(planted.rich(3, DURATION_S), {"clock_jump": [t_jump, -0.02], "gyro_scale": [0.02, -0.03, 0.01]}, 3)
     found = asked(pair, beyond=False)
     assert sorted(names(found)) == ["clock_jump", "gyro_scale"]
-    jump = next(one for one in found.selected if one.physics.key == "clock_jump")
+    jump = next(one for one in found.selected if one.effect.key == "clock_jump")
     assert abs(jump.theta[0] - t_jump) < 0.05  # s: five samples, in which it may hardly move
     assert jump.theta[1] == pytest.approx(-0.02, abs=2e-4)
 

@@ -36,7 +36,7 @@ def test_only_channels_of_all_logs_may_drive() -> None:
 def test_what_a_channel_adds_is_gain_times_its_departure_some_time_earlier(sensor: str, lag_s: float) -> None:
     pair = planted.pair(planted.rich(channels={"/motor": CURRENT}))
     physics = named(f"driven:/motor:{sensor}", unnamed.driven([pair]))
-    before = pair.felt.sample(pair.stamp_s, pair.stamp_s)
+    before = pair.ideal.sample(pair.stamp_s, pair.stamp_s)
     after = physics.forward(before, np.array([0.1, -0.2, 0.3, lag_s]))
     t = T - lag_s
     then = np.sin(0.7 * t) + 0.5 * np.cos(1.9 * t) - CURRENT.mean()

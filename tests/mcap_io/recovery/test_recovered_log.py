@@ -26,7 +26,7 @@ from rosbags.highlevel import AnyReader
 from support import log_damage
 
 from imutool.errors import ConfigError, LogError
-from imutool.log_info import inspect
+from imutool.log_info.inspection import inspect
 from imutool.mcap_io import index
 from imutool.mcap_io.codec import records
 from imutool.mcap_io.codec.records import HEAD, MAGIC
@@ -35,6 +35,7 @@ from imutool.mcap_io.index import MessageBlock
 from imutool.mcap_io.log import Log
 from imutool.mcap_io.recovery.recovered_log import RecoveredLog
 from imutool.mcap_io.repair import RECORD, repair
+from imutool.report import json_values
 
 Message = tuple[str, int, int, int, bytes]  # topic, log time, publish time, sequence, payload
 Messages = list[tuple[str, str, int, int, int, bytes]]
@@ -519,10 +520,10 @@ def test_the_command_tells_whole_from_saved_from_hopeless(
 
 def test_info_describes_what_is_sound_and_says_what_is_lost(foreign: Foreign, flight: Messages) -> None:
     path = foreign(flight, chunk_size=20_000)
-    assert inspect(path)["losses"]["whole"]
+    assert json_values(inspect(path))["losses"]["whole"]
     block = blocks(path)[3]
     flip(path, block.offset + block.length - 30)
-    report = inspect(path)
+    report = json_values(inspect(path))
     counts = {topic["name"]: topic["count"] for topic in report["topics"]}
     assert sum(counts.values()) + report["losses"]["messages"] == len(flight)
     assert report["imu"][0]["samples"] == counts["/imu/data"] == 900 - report["losses"]["topics"]["/imu/data"]

@@ -19,7 +19,7 @@ from support import markup
 
 from imutool.errors import ConfigError
 from imutool.recording import Imu, Poses, Recording
-from imutool.sensor.flight import flight
+from imutool.sensor.made_up_flight import flight
 from imutool.viewing.html import drawing, report, report_errors, report_paths, report_signals, report_wording
 from imutool.viewing.html.page import DARK, LEVELS, LIGHT, PAPER, is_imutool_page
 from imutool.viewing.model.events import Event

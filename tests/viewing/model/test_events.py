@@ -15,7 +15,7 @@ from imutool.diagnosis_output import FINDINGS as WRITTEN
 from imutool.errors import ConfigError, DataError
 from imutool.mcap_io.topics import ImuBatch
 from imutool.recording import Imu, Recording
-from imutool.sensor.flight import flight
+from imutool.sensor.made_up_flight import flight
 from imutool.viewing.model import events
 from imutool.viewing.model.events import (
     FINDINGS,

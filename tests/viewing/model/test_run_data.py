@@ -12,7 +12,7 @@ from imutool.errors import ConfigError, DataError
 from imutool.inertial import metrics
 from imutool.inertial.strapdown import StartPose, dead_reckon
 from imutool.recording import Imu, Poses, Recording, seconds
-from imutool.sensor.flight import ACCEL, GYRO, flight
+from imutool.sensor.made_up_flight import ACCEL, GYRO, flight
 from imutool.viewing.model import runs as runs_module
 from imutool.viewing.model.events import Event
 from imutool.viewing.model.run_data import RAW, Run, RunData, level_start, split_at_gaps

@@ -24,7 +24,7 @@ from imutool.mcap_io.read import read
 from imutool.mcap_io.topics import DERIVED_KEY, ImuBatch
 from imutool.mcap_io.write import write
 from imutool.recording import Imu, Recording
-from imutool.sensor.flight import flight
+from imutool.sensor.made_up_flight import flight
 from imutool.viewing.model.events import FINDINGS
 from imutool.viewing.model.runs import MAX_ENTRIES, MAX_VALUE_LENGTH, load, provenance
 

@@ -20,7 +20,7 @@ from imutool.cleaning.cleaner import rows
 from imutool.debiasing import BlockCallback, DebiasedBlock, debias
 from imutool.errors import ConfigError
 from imutool.mcap_io.write import write
-from imutool.sensor.flight import flight
+from imutool.sensor.made_up_flight import flight
 from imutool.viewing.model.runs import load
 from imutool.viewing.rerun import live, scene, viewer
 

@@ -14,7 +14,7 @@ from imutool import config
 from imutool.errors import ConfigError
 from imutool.inertial.strapdown import StartPose, dead_reckon
 from imutool.recording import Recording, seconds
-from imutool.sensor.flight import ACCEL_BIAS, GYRO_BIAS, FlightSettings, TriadSettings, flight, trajectory
+from imutool.sensor.made_up_flight import ACCEL_BIAS, GYRO_BIAS, FlightSettings, TriadSettings, flight, trajectory
 
 PERFECT = TriadSettings(
     noise_density=0.0,

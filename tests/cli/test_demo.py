@@ -8,12 +8,12 @@ from typing import Any
 
 import pytest
 
-from imutool import demo
+from imutool.cli import demo
 from imutool.errors import ConfigError
 from imutool.evaluation import evaluate
 from imutool.mcap_io.log import Log
 from imutool.mcap_io.write import write
-from imutool.sensor.flight import flight
+from imutool.sensor.made_up_flight import flight
 
 FLIGHT_SAMPLES = 12_001  # 60 s at 200 Hz, both ends included
 SMALLEST_PICTURE = 20_000  # bytes; an empty figure of this size has under 10 kB
@@ -83,7 +83,7 @@ def test_the_numbers_are_those_of_the_files_and_change_with_the_flight(
 
 def test_an_earlier_demo_stays_without_overwrite(made: tuple[Path, dict[str, Any]]) -> None:
     before = sorted(made[0].rglob("*"))
-    with pytest.raises(ConfigError, match="--overwrite"):
+    with pytest.raises(ConfigError, match="overwrite"):
         demo.run(made[0] / "demo-out", lambda _: None)
     assert sorted(made[0].rglob("*")) == before
 

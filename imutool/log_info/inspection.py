@@ -1,4 +1,4 @@
-"""Contents and quality of a log: clock of every topic, defects and noise of its IMUs, coverage by the truth.
+"""Inspection of a log: clocks, IMU defects and noise, coverage by the truth.
 
 Images are never unpacked; an IMU's columns are held in memory. Defects are counted where reading the log would stop at the
 first: stamps that go back, repeated stamps, and values that are not finite.
@@ -27,7 +27,7 @@ from imutool.cleaning.rules.units import (
 from imutool.errors import LogError
 from imutool.inertial.stationary import rest_stretches
 from imutool.location import Location
-from imutool.log_report import ImuInfo, ImuNoise, Interval, LogInfo, TopicInfo, TruthInfo
+from imutool.log_info.report import Clock, ImuInfo, ImuNoise, Interval, LogInfo, TopicInfo, TruthInfo
 from imutool.mcap_io.codec import schemas
 from imutool.mcap_io.codec.decode import decode_imu
 from imutool.mcap_io.log import Log
@@ -38,14 +38,6 @@ from imutool.report import UNSET
 
 CALM_SHARE = 0.25  # of the resting windows, the calmest, that give the noise: motors may idle in the others
 NOISE_WINDOW_S = 1.0
-
-
-class _Clock(NamedTuple):
-    rate_hz: float | None
-    jitter_s: float | None
-    largest_gap_s: float | None
-    first_ns: int | None
-    last_ns: int | None
 
 
 def inspect(path: Location, *, check: bool = True) -> LogInfo:
@@ -96,13 +88,13 @@ def _topic(topic: Topic, log_times: Int64[np.ndarray, " n"]) -> TopicInfo:
     return TopicInfo(topic.name, topic.schema_name, topic.message_encoding, len(log_times), *_clock(log_times))
 
 
-def _clock(t_ns: Int64[np.ndarray, " n"]) -> _Clock:
+def _clock(t_ns: Int64[np.ndarray, " n"]) -> Clock:
     """Rate, jitter, largest gap and ends of the sorted times."""
     ordered = np.sort(t_ns)
     periods = np.diff(ordered)
     known = len(periods) > 0
     median = float(np.median(periods)) if known else 0.0
-    return _Clock(
+    return Clock(
         rate_hz=1e9 / median if median > 0 else None,
         jitter_s=float(np.std(periods)) * 1e-9 if known else None,
         largest_gap_s=float(periods.max()) * 1e-9 if known else None,
@@ -112,7 +104,7 @@ def _clock(t_ns: Int64[np.ndarray, " n"]) -> _Clock:
 
 
 def _imu(log: Log, topic: Topic) -> ImuInfo:
-    """Defects, rest and noise of one IMU; of one in an unknown encoding only a warning."""
+    """Defects, rest and noise of an IMU; only a warning if its encoding is unknown."""
     derived_from = topic.metadata.get(DERIVED_KEY, UNSET)
     if topic.message_encoding not in ENCODINGS:
         warnings = [f"encoding {topic.message_encoding!r} is not read"]
@@ -146,7 +138,7 @@ def _imu(log: Log, topic: Topic) -> ImuInfo:
 
 
 def _columns(log: Log, topic: Topic) -> tuple[Int64[np.ndarray, " n"], Float64[np.ndarray, "n 3"], Float64[np.ndarray, "n 3"]]:
-    """Header stamps, rates and specific forces in the order of the file, with no demand on them."""
+    """Unchecked header stamps, rates and specific forces, in the order of the file."""
     stamps, gyro, accel = [np.empty(0, np.int64)], [np.empty((0, 3))], [np.empty((0, 3))]
     for _, rows in log.rows([topic.name], None, None):
         for part, layout in schemas.runs(rows.payload, schemas.IMU, topic.message_encoding):
@@ -158,7 +150,7 @@ def _columns(log: Log, topic: Topic) -> tuple[Int64[np.ndarray, " n"], Float64[n
 
 
 def _missing(ordered_ns: Int64[np.ndarray, " n"]) -> int:
-    """How many samples would fill the steps of at least 1.5 median periods."""
+    """Number of samples that would fill the steps of at least 1.5 median periods."""
     steps = np.diff(ordered_ns)
     return int(missing(steps, float(np.median(steps))).sum()) if len(steps) else 0
 
@@ -248,13 +240,13 @@ def _accel_warnings(level: float, when: str) -> list[str]:
 
 
 def _coverage(name: str, truth_ns: Int64[np.ndarray, " n"], imu_ns: Int64[np.ndarray, " m"]) -> TruthInfo:
-    """Share of the IMU's time between two true poses that are not too far apart (4 median periods, 60 ms)."""
+    """Truth coverage: share of the IMU's time between neighbouring true poses."""
     knots = np.unique(truth_ns)
     if len(knots) < 2 or not len(imu_ns):
         return TruthInfo(name, len(truth_ns))
     start, end = int(imu_ns.min()), int(imu_ns.max())
     steps = np.diff(knots)
-    limit = max(GAP_FACTOR * float(np.median(steps)), nanoseconds(MIN_GAP_S))
+    limit = max(GAP_FACTOR * float(np.median(steps)), nanoseconds(MIN_GAP_S))  # 4 median periods, 60 ms
     gap = (steps > limit) & (knots[1:] > start) & (knots[:-1] < end)
     after = np.searchsorted(knots, imu_ns, side="left")
     inside = (imu_ns >= knots[0]) & (imu_ns <= knots[-1])
@@ -287,7 +279,7 @@ def _truth_warnings(log: Log, imus: list[ImuInfo], truths: list[TruthInfo]) -> l
 
 
 def _rate_warning(log: Log, imu_topic: str, truth_topic: str) -> list[str]:
-    """Compares the spread of the gyro with the rate of the true orientation: they differ by 57.3 if it is in degrees."""
+    """Warn if the gyro's spread is about 57.3 times the true rate: it reads deg/s."""
     batches = list(log.pose_batches(truth_topic))
     t_ns, first = np.unique(_joined(batch.stamp_ns for batch in batches), return_index=True)
     if len(t_ns) < 3:

@@ -13,9 +13,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from imutool import conversion as convert_module
 from imutool import registry
-from imutool.conversion import ConvertReport, convert
+from imutool.conversion.run import ConvertReport, convert
 from imutool.errors import ConfigError, DataError
 from imutool.mcap_io.log import Log
 from imutool.mcap_io.read import read
@@ -215,7 +214,7 @@ def test_an_interrupt_ends_all_processes_and_leaves_nothing_half_written(tmp_pat
 
 
 def test_a_process_that_dies_is_a_failure_of_its_sequence_not_of_the_tool(source, tmp_path, monkeypatch):
-    monkeypatch.setattr(convert_module, "_convert_in_process", _die)
+    monkeypatch.setattr("imutool.conversion.workers._convert_in_process", _die)
     report = convert(source, tmp_path / "out", workers=2)
     assert [failure.name for failure in report.failures] == ["a", "b", "c"]
     assert "its process died" in report.failures[0].message
@@ -257,6 +256,6 @@ def test_converting_needs_no_torch():
     import subprocess
 
     heavy = "('torch', 'rosbags', 'rerun', 'matplotlib')"
-    code = f"import imutool.conversion, imutool.log_info, sys; print([m for m in {heavy} if m in sys.modules])"
+    code = f"import imutool.conversion.run, imutool.log_info.inspection, sys; print([m for m in {heavy} if m in sys.modules])"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"

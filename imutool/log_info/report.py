@@ -2,13 +2,26 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 from imutool.report import UNSET, Report, Section, UnsetType
 
 
+class Clock(NamedTuple):
+    """Clock of a topic: rate, jitter, largest gap, first and last stamp.
+
+    Null with fewer than two messages.
+    """
+
+    rate_hz: float | None
+    jitter_s: float | None
+    largest_gap_s: float | None
+    first_ns: int | None
+    last_ns: int | None
+
+
 class TopicInfo(Section, frozen=True):
-    """A topic and its clock, from the log times. Null where it has too few messages.
+    """Topic with its clock, from the log times; null with too few messages.
 
     `rate_hz` is one over the median period, so that drop-outs do not lower it; `jitter_s` is the periods' standard deviation.
     """
@@ -25,14 +38,14 @@ class TopicInfo(Section, frozen=True):
 
 
 class Interval(Section, frozen=True):
-    """A stretch of time, by the stamps of its first and last sample."""
+    """Time interval, by the stamps of its first and last sample."""
 
     first_ns: int
     last_ns: int
 
 
 class ImuNoise(Section, frozen=True):
-    """White noise by axis at rest: standard deviation of a sample, and density = std * sqrt(period)."""
+    """White noise by axis at rest: std of a sample, and density = std * sqrt(period)."""
 
     gyro_std_rad_s: list[float]
     gyro_density: list[float]
@@ -43,7 +56,10 @@ class ImuNoise(Section, frozen=True):
 
 
 class ImuInfo(Section, frozen=True, kw_only=True):
-    """An IMU topic: clock from the header stamps, defects, rest and noise; only warnings where its encoding is unknown."""
+    """IMU topic: clock from the header stamps, defects, rest and noise.
+
+    Only warnings where its encoding is unknown.
+    """
 
     topic: str
     warnings: list[str]
@@ -67,7 +83,7 @@ class ImuInfo(Section, frozen=True, kw_only=True):
 
 
 class TruthInfo(Section, frozen=True):
-    """A topic of true poses: the share of the IMU's samples between two poses that are not too far apart."""
+    """Topic of true poses, and the share of the IMU's samples between two close poses."""
 
     topic: str
     poses: int
@@ -79,7 +95,7 @@ class TruthInfo(Section, frozen=True):
 
 
 class LogInfo(Report, frozen=True, kw_only=True, tag="imutool.info/1"):
-    """The report of `imutool info` about one log."""
+    """Report of `imutool info` about one log."""
 
     log: str
     path: str
@@ -100,6 +116,6 @@ class LogInfo(Report, frozen=True, kw_only=True, tag="imutool.info/1"):
 
 
 class LogInfos(Report, frozen=True, tag="imutool.infos/1"):
-    """The report of `imutool info` about several logs."""
+    """Report of `imutool info` about several logs."""
 
     logs: list[LogInfo]

@@ -1,4 +1,4 @@
-"""Quantities with their uncertainty as text: rounded to it, in a readable unit, vectors together."""
+"""Quantities with their uncertainty as text: rounded, in a readable unit."""
 
 from __future__ import annotations
 
@@ -62,7 +62,9 @@ class Quantity:
 
 
 def grouped(estimates: Mapping[str, Estimate]) -> list[Quantity]:
-    """Quantities of parameters: `x`, `y`, `z` (or `tilt_x`, `tilt_y`; `xy`, `yx`) of a unit are one quantity.
+    """Quantities of parameters, those of one vector or matrix together.
+
+    `x`, `y`, `z` (or `tilt_x`, `tilt_y`; `xy`, `yx`) of a unit are one quantity.
 
     What is infinite is left out: a limit or a cut-off that is never reached.
     """
@@ -83,7 +85,7 @@ def grouped(estimates: Mapping[str, Estimate]) -> list[Quantity]:
 
 
 def value(estimate: Estimate) -> str:
-    """`12.4 ± 0.3 ms`: in a readable unit, rounded to the uncertainty; four digits where that is zero."""
+    """Text of an estimate, `12.4 ± 0.3 ms`, rounded to the uncertainty; four digits if zero."""
     size, unit = _step([estimate])
     number, band, factor = _numbers([estimate], size)
     text = f"{number[0]} ± {band[0]}" if band[0] else number[0]
@@ -94,7 +96,7 @@ def value(estimate: Estimate) -> str:
 
 
 def vector(several: Sequence[Estimate], labels: Sequence[str] = ()) -> str:
-    """`(0.213, -0.051, 0.120) ± 0.004 m`: as `value`, in one unit for all; labels come before the numbers."""
+    """Text of a vector, `(0.213, -0.051, 0.120) ± 0.004 m`; labels come before the numbers."""
     size, unit = _step(several)
     numbers, bands, factor = _numbers(several, size)
     if labels:
@@ -151,7 +153,7 @@ def _step(several: Sequence[Estimate]) -> tuple[float, str]:
 
 
 def _numbers(several: Sequence[Estimate], size: float) -> tuple[list[str], list[str], str]:
-    """Values and bands as text, each rounded to its own uncertainty, and the power of ten taken out in front."""
+    """Values and uncertainties as text, rounded, and the power of ten taken out in front."""
     values = [estimate.value / size for estimate in several]
     bands = [estimate.std / size for estimate in several]
     largest = max((abs(v) for v in [*values, *bands] if math.isfinite(v)), default=0.0)
@@ -169,7 +171,7 @@ def _numbers(several: Sequence[Estimate], size: float) -> tuple[list[str], list[
 
 
 def _decimals(std: float) -> int:
-    """Decimals that an uncertainty is worth: its first digit, and the second too if the first is a one."""
+    """Decimals of an uncertainty: its first digit, and the second if the first is a one."""
     exponent = math.floor(math.log10(std))
     lead = std / 10.0**exponent
     if lead >= 9.5:

@@ -146,7 +146,7 @@ def trajectory(seed: int = 0, settings: FlightSettings | None = None) -> Traject
 
 
 def _points(settings: FlightSettings, knot_s: float) -> tuple[int, int]:
-    """Number of control points that repeat the first, for rest until `still_s`, and of free ones.
+    """Number of control points that repeat the first (rest until `still_s`), and of free ones.
 
     Point j acts from knot j on, and knot j lies at (j - DEGREE) knot_s - MARGIN_S.
     """
@@ -211,7 +211,7 @@ def _truth(path: Trajectory, settings: FlightSettings, seed: int) -> Poses:
 
 
 def _clock(start_ns: int, duration_s: float, rate_hz: float) -> Times:
-    """Stamps of a regular clock within the duration, each rounded by itself so that no error adds up."""
+    """Stamps of a regular clock within the duration, each rounded by itself."""
     count = int(np.floor(duration_s * rate_hz + 1e-6)) + 1
     return start_ns + np.round(np.arange(count) * (1e9 / rate_hz)).astype(np.int64)
 

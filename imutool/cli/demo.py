@@ -1,4 +1,4 @@
-"""The whole way on a made-up recording: raw files, logs, a model, a debiased log, its figures and its pictures."""
+"""Demo on a made-up recording: raw files, logs, a model, a debiased log and its figures."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from imutool.conversion import convert
+from imutool.conversion.run import convert
 from imutool.debiasing import debias
 from imutool.errors import ConfigError
 from imutool.evaluation import evaluate
 from imutool.recording import Recording
-from imutool.sensor.flight import ACCEL, GYRO, FlightSettings, flight
+from imutool.sensor.made_up_flight import ACCEL, GYRO, FlightSettings, flight
 from imutool.training.fit import Epoch, TrainSettings
 from imutool.training.run import train
 from imutool.viewing.html import report
@@ -45,7 +45,7 @@ TRUTH_HEADER = "#timestamp," + ",".join(
 
 @dataclass(frozen=True)
 class Demo:
-    """What the demo made, and the figures it found."""
+    """Files of the demo, and its scores."""
 
     log: Path
     debiased: Path
@@ -65,7 +65,9 @@ def run(
     seed: int = TEST_SEED,
     settings: TrainSettings | None = None,
 ) -> Demo:
-    """Runs every step in the folder `out`, saying each one; `seed` is that of the flight the model is tried on.
+    """Run every step in the folder `out`, and report each.
+
+    `seed` is the seed of the flight that tests the model.
 
     Raises:
         ConfigError: the folder holds an earlier demo, or the extras view and report are not installed.
@@ -97,12 +99,12 @@ def run(
 
 
 def made_up(seed: int) -> Recording:
-    """A minute's flight of the demo's sensor; motion, turn-on bias and drift change with the seed."""
+    """Made-up flight of one minute; `seed` sets motion, turn-on bias and drift."""
     return flight(seed, SENSOR)
 
 
 def _check(out: Path, overwrite: bool) -> None:
-    """What would stop the demo half-way stops it now."""
+    """Check everything that would stop the demo half-way."""
     for module, extra in (("rerun", "view"), ("matplotlib", "report")):
         if importlib.util.find_spec(module) is None:
             raise ConfigError(f"{module} is not installed", where="demo", fix=f"pip install 'imutool[{extra}]'")
@@ -113,7 +115,10 @@ def _check(out: Path, overwrite: bool) -> None:
 
 
 def write_asl(recording: Recording, folder: Path) -> None:
-    """A recording as an ASL sequence folder (mav0/imu0, mav0/state_groundtruth_estimate0), numbers exact to the last bit."""
+    """Write a recording as an ASL sequence folder, with numbers exact to the last bit.
+
+    The folder has mav0/imu0 and mav0/state_groundtruth_estimate0.
+    """
     imu, truth = recording.imu, recording.truth
     assert truth.v_w is not None
     _write_csv(folder / "mav0" / "imu0" / "data.csv", IMU_HEADER, imu.t_ns, imu.gyro, imu.accel)

@@ -14,7 +14,7 @@ import pytest
 from imutool.cli.info import imu_rows, topic_rows
 from imutool.converters import fetch, tum_vi
 from imutool.errors import LogError
-from imutool.log_info import inspect
+from imutool.log_info.inspection import inspect
 from imutool.mcap_io.codec.decode import decode_imu
 from imutool.mcap_io.write import write
 from imutool.recording import GRAVITY_M_S2, Frames, Imu, Poses, Recording
@@ -109,7 +109,7 @@ def test_disorder_repeats_and_values_that_are_no_numbers_are_counted_not_refused
         gyro[700, 1] = np.nan
         return columns._replace(stamp_ns=stamps, gyro=gyro)
 
-    monkeypatch.setattr("imutool.log_info.decode_imu", spoiled)
+    monkeypatch.setattr("imutool.log_info.inspection.decode_imu", spoiled)
     (found,) = described(path)["imu"]
     assert (found["out_of_order"], found["duplicated"], found["not_finite"]) == (1, 1, 1)
     assert found["samples"] == 1000

@@ -1,4 +1,4 @@
-"""Converts data sets to MCAP: finds the sequences, asks the converters whose they are, and writes one log for each.
+"""Conversion of data sets to MCAP: find the sequences, choose a converter, write the logs.
 
 Sequences convert in worker processes, one log a sequence; a sequence that fails is reported and the others go on.
 A script that calls `convert` with several workers needs the usual `if __name__ == "__main__":` (processes are spawned).
@@ -7,35 +7,27 @@ A script that calls `convert` with several workers needs the usual `if __name__ 
 from __future__ import annotations
 
 import difflib
-import multiprocessing
 import os
-import signal
-from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
-from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
-from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import chain, islice
-from multiprocessing.process import BaseProcess
 from pathlib import Path
-from types import FrameType, ModuleType
-from typing import Any
+from types import ModuleType
 
 from imutool import registry
+from imutool.conversion.workers import GROUP, Job, run_jobs
 from imutool.errors import ConfigError, DataError, ImutoolError
 from imutool.mcap_io.write import write
 from imutool.recording import Recording
 
-GROUP = "imutool.converters"
 AUTO = "auto"
 SUFFIX = ".mcap"
-INTERRUPT_EVERY_S = 0.1
 Progress = Callable[[int, int, str], None]  # sequences done, sequences in all, the name of the one that just ended
 
 
 @dataclass(frozen=True)
 class Failure:
-    """A sequence that was not written, and why."""
+    """Failed sequence, with the reason."""
 
     name: str
     message: str
@@ -43,29 +35,17 @@ class Failure:
 
 @dataclass(frozen=True)
 class ConvertReport:
-    """What was written, in the order of the source, and what was not."""
+    """Written logs, in the order of the source, and failures."""
 
     written: list[Path] = field(default_factory=list)
     failures: list[Failure] = field(default_factory=list)
 
 
-@dataclass(frozen=True)
-class _Job:
-    """All that a worker process needs to write one log."""
-
-    converter: str
-    sequence: Any  # the converter's own handle: has a `name`, and pickles
-    target: Path = Path()
-    compression: str = "zstd"
-    images: bool = True
-    overwrite: bool = False
-
-
 @dataclass
 class _Found:
-    """The sequences of a source: those a converter claims, and those none can read."""
+    """Recognised sequences of a source, and the others with their errors."""
 
-    jobs: list[_Job] = field(default_factory=list)
+    jobs: list[Job] = field(default_factory=list)
     errors: list[tuple[str, ImutoolError]] = field(default_factory=list)
 
     def names(self) -> list[str]:
@@ -84,12 +64,12 @@ def convert(
     workers: int | None = None,
     progress: Progress | None = None,
 ) -> ConvertReport:
-    """Writes the log of one sequence to the file `out`, or the logs of several to the folder `out`, and says which.
+    """Convert one sequence to the file `out`, or several sequences to the folder `out`.
 
     `workers` is the number of processes, by default one a processor; with 1, or for one sequence, all happens here.
 
     Raises:
-        DataError: the source holds nothing that is recognised.
+        DataError: no converter recognises anything in the source.
         ConfigError: unknown format or sequence, two sequences of one name, a target that exists, is a source, or cannot
             be made.
         ImutoolError: the only sequence there is (or was asked for) failed; of several, failures go to the report.
@@ -110,7 +90,7 @@ def convert(
     _check_targets(jobs)
     outcomes: dict[int, ImutoolError | None] = {}
     done = len(found.errors)
-    for number, error in _run(jobs, _worker_count(workers, len(jobs))):
+    for number, error in run_jobs(jobs, _worker_count(workers, len(jobs))):
         outcomes[number] = error
         done += 1
         if progress is not None:
@@ -125,13 +105,13 @@ def convert(
 
 
 def _find(source: Path, format: str) -> _Found:
-    """Every sequence of the source with the converter it belongs to.
+    """Find every sequence of the source, with its converter.
 
     Raises:
         DataError: there is none.
         ConfigError: a sequence is claimed twice.
     """
-    claims: dict[str, list[_Job]] = {}
+    claims: dict[str, list[Job]] = {}
     errors: dict[str, tuple[str, ImutoolError]] = {}
     for key in registry.names(GROUP) if format == AUTO else [format]:
         module = registry.load(GROUP, key)
@@ -141,7 +121,7 @@ def _find(source: Path, format: str) -> _Found:
             mine = claims.setdefault(str(sequence), [])
             try:
                 if format != AUTO or module.recognises(sequence):
-                    mine.append(_Job(key, sequence))
+                    mine.append(Job(key, sequence))
                 elif not mine:
                     reason = DataError("no converter recognises it", where=str(sequence), fix="Choose one with `format`")
                     errors.setdefault(str(sequence), (sequence.name, reason))
@@ -164,10 +144,10 @@ def _find(source: Path, format: str) -> _Found:
 
 
 def _only(found: _Found, wanted: Sequence[str]) -> _Found:
-    """The sequences asked for.
+    """Requested sequences.
 
     Raises:
-        ConfigError: there is no such sequence; the message names the nearest.
+        ConfigError: a sequence is not in the source; the message names the nearest.
     """
     known = found.names()
     for name in wanted:
@@ -186,7 +166,7 @@ def _only(found: _Found, wanted: Sequence[str]) -> _Found:
 
 
 def _targets(names: Sequence[str], out: Path, *, many: bool) -> list[Path]:
-    """Where each log goes; folders on the way are made.
+    """Target of each log; missing folders are made.
 
     Raises:
         ConfigError: several logs but `out` names a file, or a folder cannot be made.
@@ -202,9 +182,9 @@ def _targets(names: Sequence[str], out: Path, *, many: bool) -> list[Path]:
     return [out / f"{name}{SUFFIX}" if into_folder else out for name in names]
 
 
-def _check_targets(jobs: Sequence[_Job]) -> None:
-    """Refuses before anything is written what would overwrite a log, a source, or another log of the same run."""
-    seen: dict[Path, _Job] = {}
+def _check_targets(jobs: Sequence[Job]) -> None:
+    """Refuse to overwrite a log, a source, or another log of the same run."""
+    seen: dict[Path, Job] = {}
     for job in jobs:
         if (other := seen.setdefault(job.target, job)) is not job:
             raise ConfigError(
@@ -220,7 +200,10 @@ def _check_targets(jobs: Sequence[_Job]) -> None:
 
 
 def _is_part_of(target: Path, source: Path) -> bool:
-    """Whether a target is the source or one of its files; a log lying in the source's folder is not."""
+    """Whether a target is the source or one of its files.
+
+    A log in the source's folder is not one of its files.
+    """
     if not target.exists():
         return False
     inside = source.is_dir() and target.resolve().is_relative_to(source.resolve()) and target.suffix != SUFFIX
@@ -234,99 +217,6 @@ def _worker_count(workers: int | None, jobs: int) -> int:
     return min(jobs, processors if workers is None else workers)
 
 
-def _run(jobs: Sequence[_Job], workers: int) -> Iterator[tuple[int, ImutoolError | None]]:
-    """Each job's number and its failure, if it failed, as they end."""
-    if workers <= 1:
-        for number, job in enumerate(jobs):
-            yield number, _convert_one(job)
-    else:
-        yield from _run_in_processes(jobs, workers)
-
-
-def _convert_one(job: _Job) -> ImutoolError | None:
-    try:
-        module = registry.load(GROUP, job.converter)
-        recording = module.read_sequence(job.sequence, images=job.images)
-        write(recording, job.target, compression=job.compression, overwrite=job.overwrite)
-    except ImutoolError as error:
-        return error
-    return None
-
-
-def _run_in_processes(jobs: Sequence[_Job], workers: int) -> Iterator[tuple[int, ImutoolError | None]]:
-    """As `_run`, in processes; on an interrupt each removes what it was writing, and all end before this returns."""
-    others = set(multiprocessing.active_children())
-    waiting = iter(enumerate(jobs))
-    running: dict[Future[ImutoolError | None], int] = {}
-    pool = ProcessPoolExecutor(workers, mp_context=multiprocessing.get_context("spawn"))
-    try:
-        with _interrupts_held():  # inherited by the processes, which heed interrupts only inside a job
-            running.update({pool.submit(_convert_in_process, job): n for n, job in islice(waiting, workers)})
-        while running:
-            for future in wait(running, return_when=FIRST_COMPLETED).done:
-                number = running.pop(future)
-                yield number, _outcome(future, jobs[number])
-                for following, job in waiting:
-                    try:
-                        running[pool.submit(_convert_in_process, job)] = following
-                    except BrokenProcessPool:  # a process died and took the pool with it: none of the rest can run
-                        yield following, _died(job)
-                        continue
-                    break
-    except BaseException:
-        pool.shutdown(wait=False, cancel_futures=True)
-        _interrupt(set(multiprocessing.active_children()) - others)
-        raise
-    finally:
-        pool.shutdown(wait=True, cancel_futures=True)
-
-
-def _interrupt(processes: Collection[BaseProcess]) -> None:
-    """Interrupts processes until all have ended."""
-    while alive := [process for process in processes if process.is_alive()]:
-        for process in alive:
-            if process.pid is not None:
-                with suppress(ProcessLookupError):  # it has just ended by itself
-                    os.kill(process.pid, signal.SIGINT)
-        alive[0].join(INTERRUPT_EVERY_S)
-
-
-def _outcome(future: Future[ImutoolError | None], job: _Job) -> ImutoolError | None:
-    try:
-        return future.result()
-    except BrokenProcessPool:
-        return _died(job)
-
-
-def _died(job: _Job) -> ImutoolError:
-    return DataError("its process died, perhaps for want of memory", where=str(job.sequence), fix="Use fewer at once")
-
-
-def _convert_in_process(job: _Job) -> ImutoolError | None:
-    signal.signal(signal.SIGINT, _interrupt_once)
-    signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
-    try:
-        return _convert_one(job)
-    finally:
-        signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-
-
-def _interrupt_once(_number: int, _frame: FrameType | None) -> None:
-    """A second interrupt (one from the terminal, one from the parent) must not disturb the clearing up after the first."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    raise KeyboardInterrupt
-
-
-@contextmanager
-def _interrupts_held() -> Iterator[None]:
-    """Interrupts come after the block instead of within it; what is started within it holds them until it says so."""
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-    try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
-
-
 def _from_stream(
     module: ModuleType,
     source: Path,
@@ -337,7 +227,10 @@ def _from_stream(
     overwrite: bool,
     progress: Progress | None,
 ) -> ConvertReport:
-    """As `convert`, for a converter that has `read` alone: one after the other, and the first failure ends it."""
+    """Convert one after the other, with a converter that only has `read`.
+
+    The first failure ends the conversion.
+    """
     recordings: Iterable[Recording] = (r for r in module.read(source) if not wanted or r.name in wanted)
     recordings = iter(recordings)
     first = list(islice(recordings, 2))

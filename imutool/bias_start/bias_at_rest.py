@@ -1,0 +1,156 @@
+"""Initial bias measured at rest: true rate zero, specific force g along an unknown direction."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float64
+
+from imutool.bias.model import BiasModel, Vector6
+from imutool.bias_start.bias_tracking import FilteredBlock, Samples, filter_blocks
+from imutool.bias_start.initial_bias import (
+    AT_REST_STD,
+    TRACKED_BY,
+    InitialBias,
+    accuracy,
+    bias_over,
+    bias_prior,
+    prior,
+    relative_samples,
+    tracked_from_prior,
+    training_source,
+)
+from imutool.errors import DataError
+from imutool.inertial.stationary import Blocks, rest_stretches, resting_blocks, white_noise
+from imutool.recording import GRAVITY_M_S2, Imu, nanoseconds
+
+REST_BEGINS_WITHIN_S = 5.0  # a later stop would give a bias from the future
+MAD_TO_STD = 1.4826
+
+
+def auto(model: BiasModel, imu: Imu) -> InitialBias:
+    """Bias from the stop at the log's start and the training runs, tracked from there on.
+
+    Only the samples up to the end of that stop are used.
+
+    Raises:
+        DataError: an untrained model, and the log does not start at rest.
+    """
+    rest_blocks: list[FilteredBlock] = []
+    before = bias_prior(model)
+    for block in filter_blocks(model, [relative_samples(imu)], before, ahead=True):
+        if not block.resting:
+            break
+        rest_blocks.append(block)
+    if not rest_blocks:
+        if not model.card:
+            raise _no_rest()
+        return tracked_from_prior(model)
+    end_s, state = rest_blocks[-1].end_s, rest_blocks[-1].step.after
+    std = np.sqrt(np.diag(state.covariance(False)))  # in motion, where the bias is used
+    stop = imu.rows(slice(0, int(np.searchsorted(imu.t_ns, imu.t_ns[0] + nanoseconds(end_s)))))
+    noise = white_noise(np.concatenate([stop.gyro, stop.accel], axis=1))
+    source = f"{end_s - rest_blocks[0].start_s:.1f} s at rest from 0.0 s on"
+    if model.card:
+        source = f"{source}, {training_source(model)}"
+    how = f"{source}, {accuracy(std)}, then {TRACKED_BY}"
+    return InitialBias(state.rest_bias(True), std, how, noise, follows=before, hold_s=end_s)
+
+
+def at_rest(model: BiasModel, imu: Imu) -> InitialBias:
+    """Bias from the rest stretch at the log's start, combined with the prior.
+
+    Raises:
+        DataError: there is no such stretch.
+    """
+    latest = np.searchsorted(imu.t_ns, imu.t_ns[0] + nanoseconds(REST_BEGINS_WITHIN_S)) if len(imu) else 0
+    bounds = next((bounds for bounds in rest_stretches(imu) if bounds[0] <= latest), None)
+    if bounds is None:
+        raise _no_rest()
+    start, samples = prior(model), imu.rows(slice(*bounds))
+    residual = np.concatenate([samples.gyro, samples.accel], axis=1) - bias_over(model, samples, start.rest) + start.rest
+    mean = residual.mean(axis=0)
+    squares = ((residual - mean) ** 2).sum(axis=0)
+    stretch = _RestStretch(mean, squares, len(samples), int(samples.t_ns[0]), int(samples.t_ns[-1]))
+    return _combined(start, [stretch], int(imu.t_ns[0]))
+
+
+def over_all_rest(model: BiasModel, blocks: Blocks) -> InitialBias:
+    """Bias from all rest in a log, also after motion: for a model with a constant bias only.
+
+    It uses only the block statistics of `stationary.block_statistics`, not the samples.
+
+    Raises:
+        DataError: the log never rests.
+    """
+    ranges = resting_blocks(blocks)
+    if not ranges:
+        raise DataError("the log never rests", expected="1.5 s or more without motion")
+    stretches = []
+    for first, last in ranges:
+        part, mean = slice(first, last), blocks.mean[first:last].mean(axis=0)
+        squares = (blocks.k - 1) * blocks.var[part] + blocks.k * (blocks.mean[part] - mean) ** 2
+        ends_ns = int(blocks.first_ns[first]), int(blocks.last_ns[last - 1])
+        stretches.append(_RestStretch(mean, squares.sum(axis=0), (last - first) * blocks.k, *ends_ns))
+    return _combined(prior(model), stretches, int(blocks.first_ns[0]))
+
+
+def rest_spread(model: BiasModel, logs: Sequence[Samples], rest: Float64[np.ndarray, "logs 6"]) -> Vector6:
+    """Robust standard deviation about zero of the bias at rest minus the bias in motion.
+
+    `rest` is the rest bias in motion of each log, from its truth. The gyro's figure is by axis; rest shows the accelerometer's
+    bias along gravity only, so its three axes share one figure. Never below `AT_REST_STD`, which also holds if no log rests.
+    """
+    differences = []
+    for (t_s, gyro, accel), in_motion in zip(logs, rest, strict=True):
+        t_ns = np.round(t_s * 1e9).astype(np.int64)
+        residual = np.concatenate([gyro, accel], axis=1) - model.stream(in_motion)(t_s, gyro, accel)
+        for first, last in rest_stretches(Imu(t_ns, gyro, accel)):
+            mean = residual[first:last].mean(axis=0)
+            differences.append([*mean[:3], *[np.linalg.norm(mean[3:]) - GRAVITY_M_S2] * 3])
+    if not differences:
+        return AT_REST_STD.copy()
+    spread: Vector6 = np.maximum(MAD_TO_STD * np.median(np.abs(differences), axis=0), AT_REST_STD)
+    return spread
+
+
+class _RestStretch(NamedTuple):
+    """Rest stretch: mean of the samples, sum of squared deviations, count, and stamps of both ends."""
+
+    mean: Vector6
+    squares: Vector6
+    samples: int
+    start_ns: int
+    end_ns: int
+
+
+def _combined(start: InitialBias, stretches: Sequence[_RestStretch], first_ns: int) -> InitialBias:
+    """Bias from the prior and some rest stretches; gravity shows the accelerometer's along itself only."""
+    rest, var = start.rest.copy(), start.std**2
+    count = sum(stretch.samples for stretch in stretches)
+    noise = np.sqrt(np.sum([stretch.squares for stretch in stretches], axis=0) / count)
+    mean = np.sum([stretch.mean * stretch.samples for stretch in stretches], axis=0) / count
+
+    gain = var[:3] / (var[:3] + AT_REST_STD[:3] ** 2 + noise[:3] ** 2 / count)
+    rest[:3] += gain * (mean[:3] - start.rest[:3])
+    var[:3] *= 1 - gain
+    for stretch in stretches:  # attitude may differ from stop to stop: each shows another direction
+        force = stretch.mean[3:] - rest[3:]
+        size = float(np.linalg.norm(force))
+        up = force / size
+        gain = var[3:] * up / (up @ (var[3:] * up) + AT_REST_STD[3] ** 2)
+        rest[3:] += gain * (size - GRAVITY_M_S2)
+        var[3:] *= 1 - gain * up
+    total_s = 1e-9 * sum(stretch.end_ns - stretch.start_ns for stretch in stretches)
+    first_s = 1e-9 * (stretches[0].start_ns - first_ns)
+    return InitialBias(rest, np.sqrt(var), f"{total_s:.1f} s at rest from {first_s:.1f} s on", noise)
+
+
+def _no_rest() -> DataError:
+    return DataError(
+        "the log does not start at rest",
+        expected=f"1.5 s or more without motion in the first {REST_BEGINS_WITHIN_S:g} s",
+        fix="Give `init=prior` with a trained `model`, or six numbers",
+    )

@@ -1,0 +1,129 @@
+"""Worker processes of a conversion: one log a job, with clean interrupts."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import signal
+from collections.abc import Collection, Iterator, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from itertools import islice
+from multiprocessing.process import BaseProcess
+from pathlib import Path
+from types import FrameType
+from typing import Any
+
+from imutool import registry
+from imutool.errors import DataError, ImutoolError
+from imutool.mcap_io.write import write
+
+GROUP = "imutool.converters"
+INTERRUPT_EVERY_S = 0.1
+
+
+@dataclass(frozen=True)
+class Job:
+    """Job of a worker process: one log."""
+
+    converter: str
+    sequence: Any  # the converter's own handle: has a `name`, and pickles
+    target: Path = Path()
+    compression: str = "zstd"
+    images: bool = True
+    overwrite: bool = False
+
+
+def run_jobs(jobs: Sequence[Job], workers: int) -> Iterator[tuple[int, ImutoolError | None]]:
+    """Yield each job's number and its error, if it failed, as the jobs end."""
+    if workers <= 1:
+        for number, job in enumerate(jobs):
+            yield number, _convert_one(job)
+    else:
+        yield from _run_in_processes(jobs, workers)
+
+
+def _convert_one(job: Job) -> ImutoolError | None:
+    try:
+        module = registry.load(GROUP, job.converter)
+        recording = module.read_sequence(job.sequence, images=job.images)
+        write(recording, job.target, compression=job.compression, overwrite=job.overwrite)
+    except ImutoolError as error:
+        return error
+    return None
+
+
+def _run_in_processes(jobs: Sequence[Job], workers: int) -> Iterator[tuple[int, ImutoolError | None]]:
+    """Run jobs in processes; on an interrupt, wait until all have removed their partial files."""
+    others = set(multiprocessing.active_children())
+    waiting = iter(enumerate(jobs))
+    running: dict[Future[ImutoolError | None], int] = {}
+    pool = ProcessPoolExecutor(workers, mp_context=multiprocessing.get_context("spawn"))
+    try:
+        with _interrupts_held():  # inherited by the processes, which heed interrupts only inside a job
+            running.update({pool.submit(_convert_in_process, job): n for n, job in islice(waiting, workers)})
+        while running:
+            for future in wait(running, return_when=FIRST_COMPLETED).done:
+                number = running.pop(future)
+                yield number, _outcome(future, jobs[number])
+                for following, job in waiting:
+                    try:
+                        running[pool.submit(_convert_in_process, job)] = following
+                    except BrokenProcessPool:  # a process died and took the pool with it: none of the rest can run
+                        yield following, _died(job)
+                        continue
+                    break
+    except BaseException:
+        pool.shutdown(wait=False, cancel_futures=True)
+        _interrupt(set(multiprocessing.active_children()) - others)
+        raise
+    finally:
+        pool.shutdown(wait=True, cancel_futures=True)
+
+
+def _interrupt(processes: Collection[BaseProcess]) -> None:
+    """Interrupt processes until all have ended."""
+    while alive := [process for process in processes if process.is_alive()]:
+        for process in alive:
+            if process.pid is not None:
+                with suppress(ProcessLookupError):  # it has just ended by itself
+                    os.kill(process.pid, signal.SIGINT)
+        alive[0].join(INTERRUPT_EVERY_S)
+
+
+def _outcome(future: Future[ImutoolError | None], job: Job) -> ImutoolError | None:
+    try:
+        return future.result()
+    except BrokenProcessPool:
+        return _died(job)
+
+
+def _died(job: Job) -> ImutoolError:
+    return DataError("its process died, perhaps for want of memory", where=str(job.sequence), fix="Use fewer `workers`")
+
+
+def _convert_in_process(job: Job) -> ImutoolError | None:
+    signal.signal(signal.SIGINT, _interrupt_once)
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
+    try:
+        return _convert_one(job)
+    finally:
+        signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+
+
+def _interrupt_once(_number: int, _frame: FrameType | None) -> None:
+    """Raise KeyboardInterrupt once; ignore further interrupts during the clean-up."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    raise KeyboardInterrupt
+
+
+@contextmanager
+def _interrupts_held() -> Iterator[None]:
+    """Block interrupts until the end of the block; processes started within inherit this."""
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
