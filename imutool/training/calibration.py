@@ -1,7 +1,6 @@
 """Calibration: effects that the training logs support, fitted by linear least squares.
 
-Effects (`imutool.sensor.effects`) are shared by all logs; rest bias and tilt are each log's own
-(`imutool.training.linearised`).
+Effects (`imutool.sensor.effects`) are shared by all logs; rest bias and tilt are each log's own.
 Forward selection: an effect is chosen by how well the other logs predict each log's long windows
 (`imutool.training.normal_equations`), and refused where most logs do not agree or chance explains it. A parameter that the
 motion does not show stays at its prior, and is named.
@@ -22,8 +21,7 @@ from imutool.sensor import catalogue
 from imutool.sensor.linear_form import LinearForm
 from imutool.sensor.signals import SignalFilter, Signals
 from imutool.training.closed_form import CORRELATED
-from imutool.training.linearised import Seen, linearise
-from imutool.training.normal_equations import Problem
+from imutool.training.normal_equations import Problem, Seen, linearise
 from imutool.training.segments import Part, Pool
 from imutool.units import Sensor
 

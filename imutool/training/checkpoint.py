@@ -1,4 +1,4 @@
-"""A training set down between two steps, to be taken up again: tensors in safetensors, the rest in its JSON header."""
+"""Checkpoint of a training: tensors in safetensors, the rest in its JSON header."""
 
 from __future__ import annotations
 
@@ -87,7 +87,7 @@ def _part(tensors: dict[str, Tensor], prefix: str) -> dict[str, Tensor]:
 
 
 def _identity(training: Training) -> dict[str, Any]:
-    """What must be the same for a checkpoint to go on: logs (by their samples), method, settings."""
+    """Logs (by their samples), method and settings, which a checkpoint must match."""
     pool = training.pool
     return {
         "logs": [[name, int((pool.log == i).sum())] for i, name in enumerate(pool.names)],

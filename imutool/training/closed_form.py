@@ -1,4 +1,4 @@
-"""A calibration without a single step of gradient descent: robust Gauss-Newton over windows between true poses.
+"""Closed-form calibration: robust Gauss-Newton over windows between true poses.
 
 Unknown are one matrix W of the sensor and one rest bias a log. The residual of a window is what integration misses
 (`imutool.inertial.windows`), its derivative is exact, Huber's weights keep outliers of the truth from pulling, and
@@ -41,7 +41,7 @@ class Solution:
 def sensor_residual(
     model: BiasModel, sensor: Sensor, windows: Windows, W: Float[Tensor, "3 3"] | None = None
 ) -> tuple[Float[Tensor, "batch 3"], Float[Tensor, "batch n 3 3"]]:
-    """What the debiased samples of a window miss of the truth, and how each sample moves it (`imutool.inertial.windows`).
+    """Residual of each window's debiased samples, and its Jacobian by each sample.
 
     `W u` is taken off the sensor's samples on top of what the model takes off. The attitude under the accelerometer starts at
     the true one and follows the debiased gyro.
@@ -68,7 +68,7 @@ def solve(
     matrix: bool,
     part: Part = "train",
 ) -> Solution:
-    """The rest biases of all logs, and with `matrix` a calibration on top of the model's, by Gauss-Newton.
+    """Rest biases of all logs by Gauss-Newton; with `matrix` also W on top of the model's.
 
     Windows of all lengths count together, each length against its own noise: short ones show the matrix, long ones the bias.
 

@@ -1,4 +1,4 @@
-"""The training: a closed form to start from, then gradient descent, gyro first and the accelerometer on top of it.
+"""Gradient descent from a closed form: first the gyro, then the accelerometer.
 
 What a step descends on is the objective's to say (`imutool.training.objective`), and it mixes all logs. Beside the sensor's
 weights each log has a track of its own rest bias, free but slow, so that what belongs to a run cannot be mistaken for what
@@ -83,7 +83,7 @@ def check_device(device: str) -> None:
 
 
 class Training:
-    """Trains one model on the recordings of one sensor; once `epochs` has ended, `model` is what is kept.
+    """Training of one model on one sensor; `model` is final once `epochs` has ended.
 
     Raises:
         DataError: recordings without truth, of different rates, too short, or standing still.
@@ -108,7 +108,7 @@ class Training:
         self.stage: Stage | None = None
 
     def epochs(self) -> Iterator[Epoch]:
-        """Trains, yielding a line of progress now and then; may be left and entered again between two lines."""
+        """Train and yield progress; a caller may stop and resume between two yields."""
         for sensor in SENSORS:
             if sensor in self.done:
                 continue
@@ -173,7 +173,7 @@ class Training:
         self.tracks.set(sensor, solution.rest)
 
     def begin(self, sensor: Sensor) -> Stage:
-        """A fresh stage, from where model and tracks stand: it moves the sensor's weights and the tracks."""
+        """Fresh stage from the current model and tracks: it moves the sensor's weights and the tracks."""
         rate, decay = self._rate(sensor), self.settings.weight_decay
         weights = {name: w for name, w in self.model.named_parameters() if f".{sensor}" in f".{name}"}
         free = [w for name, w in weights.items() if name.startswith(self.model.undecayed)]

@@ -1,4 +1,4 @@
-"""The loss of Brossard, Bonnabel and Barrau: every short increment of a long stretch against the true one.
+"""Increment loss of Brossard, Bonnabel and Barrau: every short increment of a long stretch.
 
 "Denoising IMU Gyroscopes with Deep Learning for Open-Loop Attitude Estimation", RA-L 2020, arXiv:2002.10718, eq. 11 and 13:
 Huber's function of Log(dR_hat^T dR) over 16 and 32 samples. A network that looks seconds back is evaluated once for a stretch

@@ -1,4 +1,4 @@
-"""Objectives of the descent: window errors, their robust loss, and the free rest bias of each training log.
+"""Objectives of the descent: window errors, a robust loss, and each log's free rest bias.
 
 The paper's losses are mean squares (eq. 16, 17). Here the error of a window is divided by the median error of windows of its
 length and log, and goes through Huber's function: an outlier of the motion capture pulls no harder than an ordinary window, and
@@ -104,7 +104,7 @@ def motion_error(model: BiasModel, windows: Windows) -> Float[Tensor, " batch"]:
 
 
 def error(model: BiasModel, sensor: Sensor, windows: Windows) -> Float[Tensor, " batch"]:
-    """The error that trains a sensor: orientation for the gyro (rad), motion for the accelerometer (m/s)."""
+    """Training error of a sensor: orientation for the gyro (rad), motion for the accel (m/s)."""
     return orientation_error(model, windows) if sensor == "gyro" else motion_error(model, windows)
 
 

@@ -1,4 +1,4 @@
-"""Logs in, a model file out: reads the logs, trains, keeps a checkpoint on the way, and writes the model with its card."""
+"""Train on logs with checkpoints, and write the model file with its card."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def train(
     overwrite: bool = False,
     progress: Callable[[Epoch], None] | None = None,
 ) -> BiasModel:
-    """Trains a model on logs of one sensor and writes it; interrupted, it leaves a checkpoint that `resume` takes up.
+    """Train a model on logs of one sensor and write it; `resume` continues from a checkpoint.
 
     Raises:
         ConfigError: the target exists, unknown method or settings, or a checkpoint of another training.

@@ -1,4 +1,4 @@
-"""Windows of the training logs: truth on the clock of the IMU, gaps masked, the last part of each log held out.
+"""Windows of training logs: truth on the IMU's clock, gaps masked, the last part held out.
 
 All logs lie end to end in one set of tensors, and a window is the index of its first sample; a batch is one gather over
 as many logs as it happens to touch, so that every step of a training mixes all sequences.
@@ -32,7 +32,7 @@ Part = Literal["train", "held_out", "all"]
 
 @dataclass(frozen=True)
 class Windows:
-    """Some windows of n samples, the true poses at the first and the last, and the log each comes from."""
+    """Windows of n samples, the true poses at both ends, and the log of each."""
 
     segment: Segment
     dt: Float[Tensor, "batch steps"]

@@ -1,4 +1,4 @@
-"""What the training runs say beside the calibration: how rest biases differ from run to run, and how sure a start can be."""
+"""Spread of rest biases from run to run, and uncertainty of a start from truth."""
 
 from __future__ import annotations
 

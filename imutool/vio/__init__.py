@@ -1,1 +1,1 @@
-"""A visual-inertial estimate on real IMU samples and simulated feature tracks: what debiasing is worth downstream."""
+"""Visual-inertial odometry on real IMU samples and simulated feature tracks."""

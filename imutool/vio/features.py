@@ -1,4 +1,4 @@
-"""What a stereo camera's front end would hand over: feature tracks of made-up landmarks along a true trajectory.
+"""Feature tracks of made-up landmarks along a true trajectory, as a stereo front end gives.
 
 Landmarks lie on the walls, the floor and the ceiling of a room that encloses the trajectory. At each keyframe tracks go on
 while they can be seen and are not too old, and new ones begin until there are as many as asked for. A landmark that comes back

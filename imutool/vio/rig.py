@@ -1,4 +1,4 @@
-"""The stereo camera that is assumed to ride on the body: EuRoC's, rectified, without distortion."""
+"""Stereo camera on the body: EuRoC's, rectified, without distortion."""
 
 from __future__ import annotations
 

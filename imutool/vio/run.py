@@ -1,4 +1,4 @@
-"""From a log and models to a visual-inertial estimate's figures: the VIO columns of the paper's tables, on simulated tracks.
+"""VIO figures of a log and its models: the VIO columns of the paper's tables.
 
 The IMU is the log's own, raw or as a model corrects it; the camera is EuRoC's stereo rig on every data set, its tracks are
 simulated along the log's true poses (`imutool.vio.features`). All runs of a log see the same tracks and the same settings; only
@@ -51,7 +51,7 @@ class VioSettings(config.Settings, frozen=True, kw_only=True):
 
 
 class VioProblem(NamedTuple):
-    """What all runs of a log share: the samples that are keyframes, the truth there, and what the camera saw."""
+    """Keyframes of a log with the true poses and the camera's frames, shared by all runs."""
 
     rows: slice  # of the IMU, from the first keyframe to the last
     keyframes: Int64[np.ndarray, " k"]  # counted from the first

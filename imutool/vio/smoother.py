@@ -1,4 +1,4 @@
-"""A fixed-lag smoother on preintegrated IMU samples and stereo tracks, by GTSAM (the extra `vio`).
+"""Fixed-lag smoother on preintegrated IMU samples and stereo tracks (GTSAM, extra `vio`).
 
 States at each keyframe: pose, velocity and, where they are wanted, the biases of gyro and accelerometer. Between keyframes one
 preintegrated factor (Forster et al., TRO 2017); at each, one stereo factor a track. Landmarks are states too and leave the lag

@@ -15,7 +15,7 @@ from imutool.sensor import catalogue
 from imutool.sensor.linear_form import LinearForm, compiled
 from imutool.sensor.signals import SignalFilter
 from imutool.training.calibration import FOLDS, Calibration, calibrate, folded
-from imutool.training.linearised import prior_std
+from imutool.training.normal_equations import prior_std
 from imutool.training.segments import Pool
 from imutool.units import Sensor
 
