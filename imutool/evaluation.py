@@ -1,4 +1,7 @@
-"""Evaluate pure integration, raw and with each model: the paper's error metrics for a log with true poses."""
+"""Evaluate pure integration, raw and with each model.
+
+The paper's error metrics for a log with true poses.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Noise of an IMU from a log: Allan deviation at rest, and residuals against the truth in motion.
+"""Noise of an IMU: Allan deviation at rest, residuals against the truth in motion.
 
 Rest has priority: there the samples hold only noise and vibration. A value that the log does not show stays unknown.
 """
@@ -38,7 +38,7 @@ WINDOWS_S: Mapping[Sensor, tuple[float, float]] = {"gyro": (1.0, 4.0), "accel": 
 
 @dataclass(frozen=True)
 class CurveSource:
-    """Allan curves of both sensors from one source: its name in words, seconds, curves and their slopes."""
+    """Allan curves of both sensors from one source, and their slopes."""
 
     how: str
     seconds: float

@@ -38,7 +38,10 @@ def nanoseconds(duration_s: float) -> int:
 
 @dataclass(frozen=True, eq=False)
 class Imu(Columns):
-    """Angular rate (rad/s) and specific force (m/s², at rest it reads +g up) in the body frame b, as measured."""
+    """Angular rate (rad/s) and specific force (m/s²) in the body frame b, as measured.
+
+    At rest the specific force is +g up.
+    """
 
     t_ns: Times
     gyro: Float64[np.ndarray, "n 3"]
@@ -51,7 +54,10 @@ class Imu(Columns):
 
 @dataclass(frozen=True, eq=False)
 class Poses(Columns):
-    """Poses of the body in the world (m); `q_wb` takes body vectors to world; world velocity (m/s) if known."""
+    """Poses of the body in the world (m); `q_wb` takes body vectors to world.
+
+    World velocity (m/s) if known.
+    """
 
     t_ns: Times
     p_wb: Float64[np.ndarray, "n 3"]
@@ -95,7 +101,10 @@ class Poses(Columns):
 
 @dataclass(frozen=True, eq=False)
 class Scalars(Columns):
-    """Numeric channel on its own clock: one column (a temperature) or three (a vector), and its unit."""
+    """Numeric channel on its own clock.
+
+    One column (a temperature) or three (a vector), and its unit.
+    """
 
     t_ns: Times
     values: Float64[np.ndarray, "n k"]

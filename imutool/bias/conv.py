@@ -47,7 +47,10 @@ BLOCK = 2048  # samples that a stream convolves at once: bounds its memory
 
 
 class Config(Settings, frozen=True):
-    """Sizes and output units of the networks; one channel count and one dilation (samples) per layer."""
+    """Sizes and output units of the networks.
+
+    One channel count and one dilation (samples) per layer.
+    """
 
     channels: Channels = (16, 32, 64, 128)
     dilations: Dilations = (1, 4, 16, 64)
@@ -59,7 +62,10 @@ class Config(Settings, frozen=True):
 
 
 class FoldedLayer(NamedTuple):
-    """Layer with folded batch norm, for deviations from rest: y = GELU(weight * x + offset) - GELU(offset)."""
+    """Layer with folded batch norm, for deviations from rest.
+
+    y = GELU(weight * x + offset) - GELU(offset).
+    """
 
     weight: Float[Tensor, "after before kernel"]
     offset: Float[Tensor, " after"]

@@ -146,7 +146,9 @@ def library() -> Path:
 
 
 def find_model(name: str | Path, rate_hz: float | None = None) -> BiasModel:
-    """Model from a file (also a physics.toml, for samples at `rate_hz`), or a shipped model by name.
+    """Model from a file or a shipped model by name.
+
+    The file may be a physics.toml, for samples at `rate_hz`.
 
     Raises:
         ModelError: neither (the message names the nearest); a physics.toml without `rate_hz`, or with no effect to correct.
@@ -184,7 +186,9 @@ def shipped(name: str) -> Path:
 
 
 def shipped_for(sensor: str | None, dataset: str | None) -> str | None:
-    """Name of the shipped model for the sensor of a data set, by the best method; None if there is none.
+    """Name of the shipped model for the sensor of a data set, by the best method.
+
+    None if there is none.
 
     A calibration belongs to one unit of a sensor, not to its type: another ADIS16448 needs its own model.
     """

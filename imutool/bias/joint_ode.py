@@ -40,7 +40,10 @@ class JointField(nn.Module):
 
 
 class JointPath(nn.Module):
-    """Joint vector field over the samples of some windows; time is the index of a sample, for all windows alike."""
+    """Joint vector field over the samples of some windows.
+
+    Time is the index of a sample, for all windows alike.
+    """
 
     def __init__(self, field: nn.Module, segment: Segment) -> None:
         super().__init__()
@@ -100,7 +103,10 @@ def end_attitude(
 
 
 class JointStream:
-    """Bias stream of the joint scheme: gyro by Euler from sample to sample, accelerometer from its curve."""
+    """Bias stream of the joint scheme.
+
+    Gyro by Euler from sample to sample, accelerometer from its curve.
+    """
 
     def __init__(self, rate: DriftRate, W: Array, rest: Vector6, others: SampleStream) -> None:
         self._rate, self._W, self._rest, self._others = rate, W, rest[:3].astype(np.float64), others

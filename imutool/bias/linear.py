@@ -22,7 +22,9 @@ class Config(Settings, frozen=True):
 
 
 class Model(BiasModel):
-    """Linear model gyro_hat = (I - W_g) gyro - rest_g, likewise for accel: the paper's linear method with A = I - W.
+    """Linear model gyro_hat = (I - W_g) gyro - rest_g, likewise for accel.
+
+    The paper's linear method with A = I - W.
 
     Source: "Debiasing 6-DOF IMU via Hierarchical Learning of Continuous Bias Dynamics", sec. V-C (method "Linear");
     Rehder et al., ICRA 2016, eq. 5 and 10 for the calibration it stands for.

@@ -31,7 +31,10 @@ Covariances = Float64[np.ndarray, "n 6 6"]
 
 @dataclass(frozen=True)
 class Segment:
-    """Samples of a segment: `t` in seconds from its first sample, and the rest bias at its start."""
+    """Samples of a segment.
+
+    `t` in seconds from its first sample, and the rest bias at its start.
+    """
 
     t: Float[Tensor, "batch n"]
     gyro: Float[Tensor, "batch n 3"]
@@ -45,7 +48,10 @@ class Segment:
 
 @runtime_checkable
 class Stream(Protocol):
-    """Bias stream of a model: samples arrive in blocks of any size, and the stream keeps its state between them."""
+    """Bias stream of a model.
+
+    Samples arrive in blocks of any size, and the stream keeps its state between them.
+    """
 
     def __call__(
         self, t_s: Float64[np.ndarray, " n"], gyro: Float64[np.ndarray, "n 3"], accel: Float64[np.ndarray, "n 3"]
@@ -72,7 +78,10 @@ class RestBiasEstimator(Protocol):
 
 @runtime_checkable
 class SampleStream(Stream, Protocol):
-    """Bias stream with a fast path for one sample: a block call spends half its time on slicing arrays."""
+    """Bias stream with a fast path for one sample.
+
+    A block call spends half its time on slicing arrays.
+    """
 
     def one(self, t_s: float, u: Vector6) -> Vector6:
         """Bias at one sample (gyro, then accel), as a block of this sample gives; the caller owns the array."""
@@ -80,7 +89,9 @@ class SampleStream(Stream, Protocol):
 
 @runtime_checkable
 class CovarianceModel(Protocol):
-    """Roots S of the covariance S S^T of the motion-dependent bias, by sensor, for a stream of samples.
+    """Roots S of the covariance S S^T of the motion-dependent bias, by sensor.
+
+    For a stream of samples.
 
     The columns of S belong to the same unknowns at every sample: the covariance root of a mean is the mean of S.
     """

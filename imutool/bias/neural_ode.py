@@ -1,4 +1,4 @@
-"""Neural ODE of the bias dynamics, learned from poses: db/dt = f(b, u, du/dt), u the samples.
+"""Neural ODE of the bias dynamics, learned from poses: db/dt = f(b, u, du/dt).
 
 The paper writes db_g/dt = f_g(b_g, gyro, dgyro/dt; theta) with one network (eq. 10, 31), and likewise for accel. Trained that
 way the network forgets its state within two samples and is valid for one step size only. Here the field has two parts whose
@@ -46,7 +46,7 @@ Width = Annotated[int, msgspec.Meta(ge=1, le=4096)]
 
 
 class Config(Settings, frozen=True):
-    """Scheme, sizes, solver, and the sensors with a drift; scales are units of inputs and outputs, not limits.
+    """Scheme, sizes, solver, sensors with a drift; scales are units, not limits.
 
     By default the accelerometer's rest bias does not drift. Attitude errors limit its training windows to five seconds, and a
     drift of a hundredth in five seconds is far off after a minute (0.3 m/s² on FETCH).
@@ -67,7 +67,7 @@ class Config(Settings, frozen=True):
 
 
 class Curve(nn.Module):
-    """Curve C(u, s) = W u + curve (N(u, s) - N(0, 0)), zero without motion; N a perceptron that starts at zero.
+    """Curve C(u, s) = W u + curve (N(u, s) - N(0, 0)), zero without motion.
 
     Inputs of N: its arguments in units of the scale, and asinh(10 x) of them, which resolves small motion.
     """
@@ -96,7 +96,7 @@ class Curve(nn.Module):
 
 
 class Drift(nn.Module):
-    """Drift g: the slow rate of the rest bias, a perceptron with two residual blocks of the released sizes."""
+    """Drift g, the slow rate of the rest bias: a perceptron of two residual blocks."""
 
     def __init__(self, hidden: tuple[tuple[int, ...], tuple[int, ...]], scale: float, curve: float, rate: float) -> None:
         super().__init__()

@@ -136,7 +136,9 @@ class _Buffers:
 
 
 class NeuralStream:
-    """Bias stream: the curves, and the rest bias by one Euler step of the drift every `stride` samples.
+    """Bias stream of the curves and of the drift.
+
+    The rest bias takes one Euler step of the drift every `stride` samples.
 
     State: the rest bias, its rate, the filtered samples, and the count of samples since the last step of the drift.
     """

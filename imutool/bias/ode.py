@@ -31,7 +31,9 @@ REDUCE = "Reduce the step, or ask for output more often"
 
 
 class HermitePath:
-    """Causal cubic Hermite spline of sampled controls, with backward differences (paper; Morrill 2022).
+    """Causal cubic Hermite spline of sampled controls, with backward differences.
+
+    As in the paper; Morrill 2022.
 
     S(t_i) = u_i and dS/dt(t_i) = (u_i - u_{i-1}) / (t_i - t_{i-1}); the slope at the first knot, which has no
     predecessor, is 0. Causal: up to t_{i+1} the path depends on samples up to i+1 only, and its slope at t_i on samples

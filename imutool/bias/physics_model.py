@@ -52,7 +52,10 @@ Part = tuple[LinearForm, Theta, Theta]  # an effect, its parameters, their stand
 
 
 class Model(hybrid.Model):
-    """Bias b = rest + E(u - b_0), b_0 the file's bias: an error of the initial bias stays constant."""
+    """Bias b = rest + E(u - b_0), b_0 the file's bias.
+
+    An error of the initial bias stays constant.
+    """
 
     method: ClassVar[str] = "physics"
 

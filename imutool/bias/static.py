@@ -19,7 +19,10 @@ class Config(Settings, frozen=True):
 
 
 class Model(BiasModel):
-    """Bias b(t) = rest (Titterton and Weston, Strapdown Inertial Navigation Technology, 2004, sec. 12.5: turn-on bias)."""
+    """Bias b(t) = rest, the turn-on bias.
+
+    Titterton and Weston, Strapdown Inertial Navigation Technology, 2004, sec. 12.5.
+    """
 
     method: ClassVar[str] = "static"
     iterative: ClassVar[bool] = False

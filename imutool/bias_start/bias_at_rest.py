@@ -1,4 +1,7 @@
-"""Initial bias measured at rest: true rate zero, specific force g along an unknown direction."""
+"""Initial bias measured at rest.
+
+True rate zero, specific force g along an unknown direction.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""Bias covariance at each sample: of the rest bias through the learned dynamics, and of the calibration.
+"""Bias covariance at each sample.
+
+Of the rest bias through the learned dynamics, and of the calibration.
 
 For a rest bias that stays constant over the whole log::
 
@@ -30,7 +32,10 @@ Roots = Mapping[Sensor, Float64[np.ndarray, "n 3 p"]]
 
 
 class EstimateParts(NamedTuple):
-    """Bias, covariance of its rest bias, and roots of the calibration covariance (`bias.model.CovarianceModel`)."""
+    """Bias, covariance of its rest bias, and roots of the calibration covariance.
+
+    `bias.model.CovarianceModel`.
+    """
 
     bias: Float64[np.ndarray, "n 6"]
     rest: Covariances
@@ -38,7 +43,10 @@ class EstimateParts(NamedTuple):
 
 
 class BiasEstimator:
-    """Bias with its covariance, gyro (rad/s) then accel (m/s²), for samples as they arrive in blocks of any size."""
+    """Bias with its covariance, gyro (rad/s) then accel (m/s²).
+
+    For samples as they arrive in blocks of any size.
+    """
 
     def __init__(self, model: BiasModel, start: InitialBias) -> None:
         self._rest, self._calibration = start.estimator(model), model.calibration_covariance()

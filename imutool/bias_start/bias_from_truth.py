@@ -1,4 +1,7 @@
-"""Initial bias from true poses: the constant bias that explains the drift of the integrated samples."""
+"""Initial bias from true poses.
+
+The constant bias that explains the drift of the integrated samples.
+"""
 
 from __future__ import annotations
 

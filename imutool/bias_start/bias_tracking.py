@@ -1,4 +1,6 @@
-"""Rest bias tracked through a log: causally from earlier samples, or smoothed from the whole log.
+"""Rest bias tracked through a log.
+
+Causally from earlier samples, or smoothed from the whole log.
 
 Samples, minus the model's motion-dependent bias, go through `imutool.inertial.inertial_filter` in blocks of half a second.
 """
@@ -31,7 +33,9 @@ Samples = tuple[Float64[np.ndarray, " n"], Float64[np.ndarray, "n 3"], Float64[n
 
 @dataclass(frozen=True)
 class BiasPrior:
-    """Prior of a run's biases: bias b in motion, offset at rest (mean zero), and random walk of b.
+    """Prior of a run's biases.
+
+    Bias b in motion, offset at rest (mean zero), and random walk of b.
 
     `walk` is in rad/s and m/s² per second^1/2.
     """
@@ -152,7 +156,9 @@ class BiasFilter:
 
 
 class TrackedBiasStream:
-    """Bias stream with a causally tracked rest bias: row k depends on samples up to k, and on the start.
+    """Bias stream with a causally tracked rest bias.
+
+    Row k depends on samples up to k, and on the start.
 
     Until `hold_s` the rest bias is `rest`, measured on the whole stop at the log's start.
     """
@@ -210,7 +216,10 @@ class TrajectoryBiasStream:
 
 
 class ConstantBiasStream:
-    """Bias stream with a constant rest bias; its covariance grows by random walk and the model's drift."""
+    """Bias stream with a constant rest bias.
+
+    Its covariance grows by random walk and the model's drift.
+    """
 
     def __init__(self, model: BiasModel, rest: Vector6, std: Vector6) -> None:
         self._stream = model.stream(rest)
@@ -265,7 +274,9 @@ def smooth_blocks(blocks: Iterable[FilteredBlock]) -> Iterator[tuple[FilteredBlo
 
 
 def smooth_bias(model: BiasModel, batches: Iterable[Samples], prior: BiasPrior) -> tuple[BiasTrajectory, float]:
-    """Smoothed rest bias over a whole log, and the time at rest (s); memory: thirteen numbers per block.
+    """Smoothed rest bias over a whole log, and the time at rest (s); memory.
+
+    Thirteen numbers per block.
 
     The trajectory is empty for a log shorter than a block.
     """

@@ -88,7 +88,10 @@ def prior(model: BiasModel) -> InitialBias:
 
 
 def bias_prior(model: BiasModel) -> BiasPrior:
-    """Prior of the bias filter from the training runs; the axes of a sensor share one random walk."""
+    """Prior of the bias filter from the training runs.
+
+    The axes of a sensor share one random walk.
+    """
     ground = np.maximum(float64(model.rest_std), AT_REST_STD)
     walk = np.repeat(np.sqrt(np.mean(float64(model.walk_std).reshape(2, 3) ** 2, axis=1)), 3)
     walk = np.where(walk > 0, walk, USUAL_WALK)
@@ -103,7 +106,9 @@ def tracked_from_prior(model: BiasModel) -> InitialBias:
 
 
 def smoothed_start(model: BiasModel, batches: Iterable[Samples], where: str = "") -> InitialBias:
-    """Smoothed rest bias in time from a whole log: all stops, gravity in motion and the training runs.
+    """Smoothed rest bias in time from a whole log.
+
+    All stops, gravity in motion and the training runs.
 
     `batches` are seconds since the first sample, gyro and accel.
 

@@ -1,4 +1,6 @@
-"""Zero-velocity updates: dead reckoning of debiased samples through the inertial filter, from a known pose.
+"""Zero-velocity updates.
+
+Dead reckoning of debiased samples through the inertial filter, from a known pose.
 
 At every stop velocity and rate are zero, in between speed is bounded (`imutool.inertial.inertial_filter`). Each correction of
 the velocity also corrects the position for its drift. Without a stop, only the bound on the speed acts.
@@ -21,7 +23,9 @@ START_STD = np.array([1e-3] * 3 + [1e-2] * 3 + [1e-3] * 3)  # rad, m/s, m: of th
 
 
 def zero_velocity_trajectory(imu: Imu, start: StartPose, prior: BiasPrior, *, smooth: bool = False) -> Poses:
-    """Trajectory at the IMU's stamps from `start` at the first; with `smooth` each pose uses all samples.
+    """Trajectory at the IMU's stamps from `start` at the first.
+
+    With `smooth` each pose uses all samples.
 
     `imu` is debiased; `prior` is that of the residual bias. Between the filter's blocks of half a second, and in a recording
     shorter than a block, samples are integrated as in pure integration.

@@ -1,4 +1,6 @@
-"""Blind cases: a simulation and a recording of one real motion, with the truth in an envelope.
+"""Blind cases: a simulation and a recording of one real motion.
+
+With the truth in an envelope.
 
 The generator knows nothing of the effects that the estimator fits; the two share the file format alone. The logs themselves
 reveal nothing: names, topics, metadata, message counts, sizes and the start time are the same for every case.
@@ -48,7 +50,10 @@ class OpenedCase(Score, frozen=True, kw_only=True, tag=SCHEMA):
 
 
 class Plan(NamedTuple):
-    """Scene of a case, the effects that act in it, the random generators of the rest, and the grade of the noise."""
+    """Scene of a case, the effects that act in it, the random generators of the rest.
+
+    Also the grade of the noise.
+    """
 
     scene: Scene
     concealed: draw.Concealed
@@ -133,7 +138,9 @@ def case_log(imu: Imu, truth: Poses, channels: Mapping[str, Scalars]) -> Recordi
 
 
 def write_case(folder: Path, sim: Recording, real: Recording, truth: ConcealedTruth) -> None:
-    """Seals a case: writes all files beside the folder, then moves each into its place, the envelope last.
+    """Seals a case: writes all files beside the folder, then moves each into its place.
+
+    The envelope last.
 
     Logs are not compressed: how well numbers compress would tell which of them are rounded.
 

@@ -17,7 +17,10 @@ CLIPPED_PERCENT = 5.0
 
 
 def clipping(theta: Theta, size: float, signal: Six) -> Theta:
-    """Limits that clip the largest axis 5 % of the time at the plausible size, a quarter of that at a quarter of it."""
+    """Limits that clip the largest axis 5 % of the time at the plausible size.
+
+    A quarter of that at a quarter of it.
+    """
     share = 100.0 - CLIPPED_PERCENT * size
     at = np.array([np.percentile(np.abs(signal[:, part]).max(axis=1), share) for part in (GYRO, ACCEL)])
     return np.where(theta < NO_LIMIT, at, NO_LIMIT)

@@ -1,4 +1,6 @@
-"""Forward models of the effects that a blind case may conceal, from the catalogue's formulas.
+"""Forward models of the effects that a blind case may conceal.
+
+From the catalogue's formulas.
 
 A model acts at its stage, in the order in which a signal passes them; within a stage by name. Up to CONVERTER a signal is an
 array of six columns: gyro (rad/s), then accel (m/s²). The estimator has forward models of its own and uses none of these.
@@ -44,7 +46,10 @@ class Stage(IntEnum):
 
 @dataclass(frozen=True)
 class Parameter:
-    """Parameter of a model; an `amount` grows with the size of the effect, a time or a frequency does not."""
+    """Parameter of a model.
+
+    An `amount` grows with the size of the effect, a time or a frequency does not.
+    """
 
     name: str
     unit: str
@@ -54,7 +59,10 @@ class Parameter:
 
 @dataclass(frozen=True)
 class Reading:
-    """Input of a SENSOR model: seconds since the log's start, the signal, and the log's other channels."""
+    """Input of a SENSOR model.
+
+    Seconds since the log's start, the signal, and the log's other channels.
+    """
 
     t_s: Times
     signal: Six
@@ -131,7 +139,10 @@ def gravity(ideal: Kinematics, theta: Theta) -> Six:
 
 
 def earth_rotation(ideal: Kinematics, theta: Theta) -> Six:
-    """omega_e (cos lat cos heading, cos lat sin heading, sin lat) in the world, z up; north is at `heading` about z from x."""
+    """omega_e (cos lat cos heading, cos lat sin heading, sin lat) in the world, z up.
+
+    North is at `heading` about z from x.
+    """
     latitude, heading = theta
     level = np.cos(latitude)
     omega_w = EARTH_RAD_S * np.array([level * np.cos(heading), level * np.sin(heading), np.sin(latitude)])
@@ -189,7 +200,10 @@ def first_order(signal: Columns, rate_hz: float, cut_off_hz: float) -> Columns:
 
 
 def spring_mount(signal: Columns, rate_hz: float, f0_hz: float, zeta: float) -> Columns:
-    """Acceleration on a spring and damper: H = (2 zeta w s + w²) / (s² + 2 zeta w s + w²) of the base's."""
+    """Acceleration on a spring and damper.
+
+    H = (2 zeta w s + w²) / (s² + 2 zeta w s + w²) of the base's.
+    """
     w = 2.0 * np.pi * f0_hz
     return _filtered(signal, rate_hz, [2.0 * zeta * w, w * w], [1.0, 2.0 * zeta * w, w * w])
 

@@ -50,7 +50,10 @@ class Rms(Section, frozen=True):
 
 
 class TrueParameter(Section, frozen=True):
-    """True value of a parameter, its scale, and the smallest standard deviation of an estimate (None: no bound)."""
+    """True value of a parameter, its scale, and the smallest standard deviation of an estimate.
+
+    None: no bound.
+    """
 
     value: float
     unit: str

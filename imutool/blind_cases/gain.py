@@ -81,7 +81,9 @@ class Findings(Struct):
 def explained_gain(
     truth: ConcealedTruth, found: Sequence[tuple[ReportedFinding, Mapping[str, float]]], sim: Recording
 ) -> float | None:
-    """Share of the misfit's power over the noise that findings (with parameters by the catalogue's names) explain.
+    """Share of the misfit's power over the noise that findings explain.
+
+    Their parameters have the catalogue's names.
 
     At most 1; below 0 where they make it worse. None where an effect cannot be simulated, or there is none.
     """
@@ -137,7 +139,9 @@ def _scene(truth: ConcealedTruth, sim: Recording) -> Scene:
 
 
 def reported_gain(truth: ConcealedTruth, found: Findings, findings: Sequence[ReportedFinding]) -> float | None:
-    """Reported share of the achievable reduction of the residual's power, signals weighted by their misfit over the noise.
+    """Reported share of the achievable reduction of the residual's power.
+
+    Signals weighted by their misfit over the noise.
 
     Achievable is a reduction down to the recording's own noise: that of the simulation can be smoothed away.
     """

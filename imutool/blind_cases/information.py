@@ -1,4 +1,6 @@
-"""Detectability of a misfit: against noise, beside the bias and similar effects (Fisher's information).
+"""Detectability of a misfit.
+
+Against noise, beside the bias and similar effects (Fisher's information).
 
 For white Gaussian noise the information that samples hold on parameters is J^T J, J the signal's derivatives over the noise;
 nuisances (a constant bias, another effect) are projected out of J. A misfit m that the noise hides half of the time has
@@ -35,7 +37,7 @@ MARKS = ".?#"  # nothing, doubtful, clear
 
 
 def detectable_misfit(parameters: int) -> float:
-    """Squared misfit over the noise at which an optimal test of so many parameters has a power of one half."""
+    """Squared misfit over the noise at which an optimal test has a power of one half."""
     threshold = chi2.isf(FALSE_ALARM, parameters)
     return float(brentq(lambda nc: ncx2.sf(threshold, parameters, nc) - POWER, 1e-3, 10.0 * threshold))
 
@@ -130,7 +132,9 @@ def _orthonormal(columns: Float64[np.ndarray, "m p"]) -> Float64[np.ndarray, "m 
 
 
 def cramer_rao_bounds(scene: Scene, acting: Acting) -> list[Theta | None]:
-    """Smallest standard deviations of unbiased estimates of the parameters (Cramér and Rao), bias unknown.
+    """Smallest standard deviations of unbiased estimates of the parameters (Cramér and Rao).
+
+    Bias unknown.
 
     All effects are estimated together. None for effects without a derivative; infinite where nothing can be seen.
     """
@@ -192,7 +196,10 @@ def location(misfit: Six, sigma: Theta) -> Location:
 
 
 def achievable_rms(misfit: Six, sigma: Theta) -> dict[str, Rms]:
-    """Root mean square of real minus simulated samples by sensor, bias removed: with the misfit, and of the noise."""
+    """Root mean square of real minus simulated samples by sensor, bias removed.
+
+    With the misfit, and of the noise.
+    """
     misfit = misfit - misfit.mean(axis=0)
     found = {}
     for name, part in (("gyro", GYRO), ("accel", ACCEL)):

@@ -31,7 +31,10 @@ Knots = Float64[np.ndarray, " m"]
 
 @dataclass(frozen=True, eq=False)
 class Kinematics:
-    """Rate omega (rad/s), its derivative alpha, specific force f = R_wb^T (a_w - g_w) (m/s²), in the body."""
+    """Rate omega (rad/s), its derivative alpha, specific force f = R_wb^T (a_w - g_w) (m/s²).
+
+    In the body.
+    """
 
     t_s: Times
     omega: Vectors
@@ -42,7 +45,10 @@ class Kinematics:
 
 @dataclass(frozen=True, eq=False)
 class Motion:
-    """Splines of position (m) and of a multiple of q_wb (wxyz), valid from `first_s` to `last_s`."""
+    """Splines of position (m) and of a multiple of q_wb (wxyz).
+
+    Valid from `first_s` to `last_s`.
+    """
 
     position: BSpline
     quaternion: BSpline
@@ -93,7 +99,9 @@ class Smoother:
 
 
 def smoother(poses: Poses) -> Smoother:
-    """Smoother of true poses: continuous quaternions, penalty by their noise, no weight on outliers.
+    """Smoother of true poses.
+
+    Continuous quaternions, penalty by their noise, no weight on outliers.
 
     Raises:
         DataError: fewer poses than 20 s of any motion capture give, or shorter than that.

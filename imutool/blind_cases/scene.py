@@ -1,4 +1,7 @@
-"""Scene of a blind case: a motion with noise and channels, and the samples of a sensor along it."""
+"""Scene of a blind case.
+
+A motion with noise and channels, and the samples of a sensor along it.
+"""
 
 from __future__ import annotations
 

@@ -105,7 +105,9 @@ class Score(Report, frozen=True, kw_only=True, tag=SCHEMA):
 
 
 def score(truth: ConcealedTruth, report: Mapping[str, Any], where: Path, sim: Recording | None = None) -> Score:
-    """Score of a report of `diagnose`; the simulation `sim` lets the gain be computed, not only read.
+    """Score of a report of `diagnose`.
+
+    The simulation `sim` lets the gain be computed, not only read.
 
     Raises:
         DataError: findings of another schema, or with fields of another type.

@@ -1,4 +1,6 @@
-"""Unit quaternions as rows wxyz in numpy; for many rows ten times as fast as rotation objects.
+"""Unit quaternions as rows wxyz in numpy.
+
+For many rows ten times as fast as rotation objects.
 
 Hamilton's convention: `multiply(a, b)` turns first by b, then by a, and a row of `rotate(q, v)` is R(q) v. For torch: `so3`.
 """
@@ -61,7 +63,10 @@ def exp(xi: Vectors) -> Quaternions:
 
 
 def log(q: Quaternions) -> Vectors:
-    """Rotation vectors (rad) of at most half a turn: 2 atan2(|u|, |w|) along u, with the sign of w."""
+    """Rotation vectors (rad) of at most half a turn.
+
+    2 atan2(|u|, |w|) along u, with the sign of w.
+    """
     w, u = q[:, :1], q[:, 1:]
     sine = length(u)[:, None]
     angle = 2.0 * np.arctan2(sine, np.abs(w))
@@ -86,7 +91,9 @@ def slerp(a: Quaternions, b: Quaternions, share: Column) -> Quaternions:
 
 
 def roll_pitch_yaw(q: Quaternions) -> Vectors:
-    """Roll, pitch and yaw (rad) with R = R_z(yaw) R_y(pitch) R_x(roll); pitch within a quarter turn.
+    """Roll, pitch and yaw (rad) with R = R_z(yaw) R_y(pitch) R_x(roll).
+
+    Pitch within a quarter turn.
 
     Within 1e-7 rad of a pitch of a quarter turn, roll and yaw are arbitrary: only their sum or difference has a meaning.
     """

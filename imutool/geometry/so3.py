@@ -1,4 +1,6 @@
-"""Rotations (SO(3)) on tensors: exponential, logarithm, Jacobians, quaternions; float32 and float64.
+"""Rotations (SO(3)) on tensors: exponential, logarithm, Jacobians, quaternions.
+
+Float32 and float64.
 
 Right convention throughout: `R_wb` takes body vectors to world and dR/dt = R_wb [omega_b]x, hence
 d Exp(xi)/dt = Exp(xi) [J_r(xi) dxi/dt]x (Barfoot, State Estimation for Robotics, 2017, eq. 7.77a; Chirikjian 2012).
@@ -127,7 +129,9 @@ def chart_rate(xi: Vectors, omega_b: Vectors) -> Vectors:
 
 
 def quaternion_wxyz_from_matrix(R: Rotations) -> Quaternions:
-    """Unit quaternion of a rotation, with w >= 0 (the shorter arc, and continuous up to half a turn).
+    """Unit quaternion of a rotation, with w >= 0.
+
+    The shorter arc, and continuous up to half a turn.
 
     4 q q^T is linear in R; its row with the largest diagonal has length 2 or more, so it is normalised safely and smoothly
     (the idea of Shepperd 1978, without his square roots).

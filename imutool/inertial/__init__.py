@@ -1,1 +1,4 @@
-"""Inertial navigation: kinematics, strapdown integration, preintegration, rest detection, error metrics."""
+"""Inertial navigation: kinematics, strapdown integration, preintegration, rest detection.
+
+Error metrics.
+"""

@@ -1,4 +1,6 @@
-"""Invariant Kalman filter of attitude, velocity, position and biases from the samples of one IMU.
+"""Invariant Kalman filter of attitude, velocity.
+
+Position and biases from the samples of one IMU.
 
 Errors are right-invariant on SE_2(3), augmented by the biases (Barrau and Bonnabel, "The invariant extended Kalman filter
 as a stable observer", TAC 2017; the "imperfect" filter with biases: Hartley et al., IJRR 2020, section 5)::
@@ -66,7 +68,10 @@ class FilterSettings(Settings, frozen=True, kw_only=True):
 
 @dataclass(frozen=True)
 class State:
-    """Filter state: pose, bias b in motion (gyro rad/s, accel m/s²), offset d at rest, and covariance."""
+    """Filter state: pose, bias b in motion (gyro rad/s, accel m/s²), offset d at rest.
+
+    Also covariance.
+    """
 
     R_wb: Matrix3
     v_w: Vector3
@@ -107,7 +112,10 @@ class State:
 
 
 class Step(NamedTuple):
-    """Filter step over a block: state before, predicted state, transition, and state after the measurements."""
+    """Filter step over a block.
+
+    State before, predicted state, transition, and state after the measurements.
+    """
 
     before: State
     expected: State
@@ -116,7 +124,10 @@ class Step(NamedTuple):
 
 
 def level(accel: Vector3, bias: Vector6, ground: Vector6, P_bias: Float64[np.ndarray, "12 12"], s: FilterSettings) -> State:
-    """Levelled state from the direction of the mean specific force: heading 0, unknown velocity, at the origin."""
+    """Levelled state from the direction of the mean specific force.
+
+    Heading 0, unknown velocity, at the origin.
+    """
     up_b = (accel - bias[3:]) / np.linalg.norm(accel - bias[3:])
     axis = np.array([up_b[1], -up_b[0], 0.0])  # up_b x z
     sine = float(np.linalg.norm(axis))
@@ -130,7 +141,9 @@ def level(accel: Vector3, bias: Vector6, ground: Vector6, P_bias: Float64[np.nda
 
 
 def motion_step(x: State, motion: Increment, missing_s: float, walk: Vector6, s: FilterSettings) -> Step:
-    """Filter step over a block in motion: prediction with the bias of `x`, then the bounded velocity.
+    """Filter step over a block in motion.
+
+    Prediction with the bias of `x`, then the bounded velocity.
 
     `walk` is the random walk of b per second^1/2.
     """
@@ -147,7 +160,10 @@ def motion_step(x: State, motion: Increment, missing_s: float, walk: Vector6, s:
 
 
 def rest_step(x: State, mean: Vector6, variance: Float64[np.ndarray, "3"], T: float, walk: Vector6, s: FilterSettings) -> Step:
-    """Filter step over a block at rest, from the samples' mean and the variance of the gyro's mean."""
+    """Filter step over a block at rest.
+
+    From the samples' mean and the variance of the gyro's mean.
+    """
     dv = (mean[3:] - x.bias[3:] - x.ground[3:]) * T
     by_bias = np.zeros((9, 6))
     by_bias[3:6, 3:], by_bias[6:, 3:] = -T * np.eye(3), -0.5 * T**2 * np.eye(3)
@@ -193,7 +209,10 @@ def _predict(
 
 
 def update(x: State, H: Float64[np.ndarray, "k 21"], z: Float64[np.ndarray, " k"], noise: Float64[np.ndarray, " k"]) -> State:
-    """Kalman update by z = H e + n, with e the error of the estimate and `noise` the variances of n."""
+    """Kalman update by z = H e + n.
+
+    With e the error of the estimate and `noise` the variances of n.
+    """
     PH = x.P @ H.T
     K = np.linalg.solve(H @ PH + np.diag(noise), PH.T).T
     I_KH = np.eye(SIZE) - K @ H

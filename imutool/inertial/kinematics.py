@@ -1,4 +1,6 @@
-"""Kinematics of a trajectory: angular rate, angular acceleration and specific force, as of an ideal IMU.
+"""Kinematics of a trajectory.
+
+Angular rate, angular acceleration and specific force, as of an ideal IMU.
 
 The trajectory is a pair of splines, one for the position, one for the quaternion. The quaternion spline need not stay
 on the unit sphere: any positive multiple of a unit quaternion is the same rotation. So four free coordinates have no
@@ -27,7 +29,9 @@ Vectors = Float64[np.ndarray, "n 3"]
 
 
 def lever_acceleration(omega: Any, alpha: Any, arms: Any) -> tuple[Any, Any, Any]:
-    """Lever-arm acceleration alpha x r + omega x (omega x r) of a rigid body at r (m/s²), by axis.
+    """Lever-arm acceleration alpha x r + omega x (omega x r) of a rigid body at r (m/s²).
+
+    By axis.
 
     Component i is that of the point `arms[i]`, because the axes of an accelerometer may be at different points. omega and alpha
     are three floats or three columns each; written out, because for floats numpy costs several times the arithmetic.
@@ -76,7 +80,10 @@ class Motion:
 
 @dataclass(frozen=True, eq=False)
 class Trajectory:
-    """Smooth trajectory: splines of position (m) and of a multiple of `q_wb_wxyz` over seconds since `start_ns`."""
+    """Smooth trajectory: splines of position (m) and of a multiple of `q_wb_wxyz`.
+
+    Time is in seconds since `start_ns`.
+    """
 
     start_ns: int
     position: BSpline
@@ -171,7 +178,10 @@ def _conjugate_product(a: Float64[np.ndarray, "n 4"], b: Float64[np.ndarray, "n 
 
 
 def continuous(q_wxyz: Float64[np.ndarray, "n 4"]) -> Float64[np.ndarray, "n 4"]:
-    """Quaternions with signs such that neighbours are in one hemisphere (q and -q are one rotation)."""
+    """Quaternions with signs such that neighbours are in one hemisphere.
+
+    q and -q are one rotation.
+    """
     flips = np.where(np.sum(q_wxyz[1:] * q_wxyz[:-1], axis=1) < 0.0, -1.0, 1.0)
     signed: Float64[np.ndarray, "n 4"] = q_wxyz * np.concatenate([[1.0], np.cumprod(flips)])[:, None]
     return signed

@@ -1,4 +1,6 @@
-"""Error metrics of an estimated trajectory: plain dicts for JSON, with the unit in every key.
+"""Error metrics of an estimated trajectory.
+
+Plain dicts for JSON, with the unit in every key.
 
 Definitions are the paper's (section "Evaluation Metric"), which are those of evo; a test compares with evo's command line.
 Both trajectories have the same stamps, and a mask marks the rows with truth; other rows count nowhere. A figure that the
@@ -41,7 +43,9 @@ Points = Float64[np.ndarray, "n 3"]
 
 
 def evaluate(estimate: Poses, truth: Poses, valid: Mask, distances_m: Sequence[float] = DISTANCES_M) -> dict[str, Any]:
-    """Error metrics of the module's table, with `samples` (rows that count) and `duration_s` (first such row to last).
+    """Error metrics of the module's table, with `samples` (rows that count) and `duration_s`.
+
+    First such row to last.
 
     Raises:
         DataError: stamps differ, or no row is valid.
@@ -63,7 +67,9 @@ def orientation_errors(estimate: Poses, truth: Poses) -> Float64[np.ndarray, " n
 
 
 def absolute(estimate: Poses, truth: Poses, valid: Mask) -> dict[str, float | None]:
-    """Absolute errors: `aoe_deg`, `aoe_aligned_deg`, `ape_m`, `ape_aligned_m`, `velocity_rmse_m_s`.
+    """Absolute errors: `aoe_deg`, `aoe_aligned_deg`, `ape_m`, `ape_aligned_m`.
+
+    `velocity_rmse_m_s`.
 
     The aligned figures are None if positions (of either) do not span a plane, the velocity figure if a velocity is missing.
 
@@ -99,7 +105,9 @@ def absolute(estimate: Poses, truth: Poses, valid: Mask) -> dict[str, float | No
 def relative(
     estimate: Poses, truth: Poses, valid: Mask, distances_m: Sequence[float] = DISTANCES_M
 ) -> dict[str, dict[str, float | None]]:
-    """Relative errors `roe_deg` and `rpe_m`, keyed by the distance in metres ("5"); None if the true path is too short.
+    """Relative errors `roe_deg` and `rpe_m`, keyed by the distance in metres ("5").
+
+    None if the true path is too short.
 
     Raises:
         DataError: stamps differ, or no row is valid.
@@ -130,7 +138,9 @@ def relative(
 
 
 def align(p: Points, p_target: Points) -> tuple[Rotation, Float64[np.ndarray, "3"]] | None:
-    """Rotation and shift of the least-squares alignment of points (Umeyama 1991, eq. 40-42, scale 1).
+    """Rotation and shift of the least-squares alignment of points.
+
+    Umeyama 1991, eq. 40-42, scale 1.
 
     None if the points do not determine the rotation: fewer than two directions in their covariance.
 
@@ -152,7 +162,9 @@ def align(p: Points, p_target: Points) -> tuple[Rotation, Float64[np.ndarray, "3
 def pairs_by_distance(
     p: Points, distance_m: float, tolerance: float = PAIR_TOLERANCE
 ) -> tuple[Int64[np.ndarray, " m"], Int64[np.ndarray, " m"]]:
-    """Pairs (i, j): for each point i the later point j nearest to `distance_m` along the path, within tolerance.
+    """Pairs (i, j): for each point i the later point j nearest to `distance_m` along the path.
+
+    Within tolerance.
 
     The rule of evo's `--all_pairs`: of equally near points the first. Bisection applies because distance along a path only
     grows (evo searches every pair, minutes for 30 000 poses).
@@ -171,7 +183,9 @@ def pairs_by_distance(
 
 
 def write_tum(poses: Poses, path: Path, overwrite: bool = False) -> None:
-    """Write `t x y z qx qy qz qw` lines (TUM RGB-D format): stamps with nine decimals, exact numbers.
+    """Write `t x y z qx qy qz qw` lines (TUM RGB-D format).
+
+    Stamps with nine decimals, exact numbers.
 
     Raises:
         ConfigError: the target exists and `overwrite` is false, or cannot be written.

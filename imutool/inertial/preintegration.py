@@ -1,4 +1,6 @@
-"""Preintegration: increments of attitude, velocity and position, with their bias Jacobians; numpy, no torch.
+"""Preintegration: increments of attitude, velocity and position, with their bias Jacobians.
+
+Numpy, no torch.
 
 Forster, Carlone, Dellaert, Scaramuzza, "On-Manifold Preintegration", TRO 2017, eq. 33-36 and 44. Here a step uses the mean of
 its two samples (reason: `imutool.inertial.windows`), and sums replace the recursions: a block of a hundred samples costs a few

@@ -38,7 +38,10 @@ Positive = Annotated[float, Meta(gt=0)]
 
 
 class StationarySettings(Settings, frozen=True, kw_only=True):
-    """Settings of rest detection: lengths of blocks, windows and stretches, and caps of a resting sensor."""
+    """Settings of rest detection.
+
+    Lengths of blocks, windows and stretches, and caps of a resting sensor.
+    """
 
     block_s: Positive = 0.1
     window_s: Positive = 1.0
@@ -52,7 +55,10 @@ class StationarySettings(Settings, frozen=True, kw_only=True):
 
 
 class Blocks(NamedTuple):
-    """Block statistics of samples in blocks of `k`: 113 bytes per block, 4 MB per hour at any rate."""
+    """Block statistics of samples in blocks of `k`.
+
+    113 bytes per block, 4 MB per hour at any rate.
+    """
 
     k: int
     period_s: float
@@ -64,7 +70,10 @@ class Blocks(NamedTuple):
 
 
 def block_statistics(batches: Iterable[Batch], period_s: float, settings: StationarySettings | None = None) -> Blocks:
-    """Block statistics of batches of samples; memory holds one batch, an incomplete last block is ignored."""
+    """Block statistics of batches of samples.
+
+    Memory holds one batch, an incomplete last block is ignored.
+    """
     k = max(2, round((settings or StationarySettings()).block_s / period_s))
     parts = [_blocks_of(np.zeros(0, np.int64), np.zeros((0, 6)), k, 0, period_s)]
     t_left, u_left = np.zeros(0, np.int64), np.zeros((0, 6))
@@ -184,7 +193,9 @@ class OnlineRestDetector:
 
 
 def white_noise(values: Float64[np.ndarray, "n k"]) -> Float64[np.ndarray, " k"]:
-    """White noise of a sample (standard deviation) from calm second differences, at rest or in motion.
+    """White noise of a sample (standard deviation) from calm second differences.
+
+    At rest or in motion.
 
     The variance of second differences is 6 sigma², with little motion in it. The figure is the lower quartile over blocks of
     `NOISE_BLOCK` samples: five sixths of pure white noise. Zero for fewer samples than a block.

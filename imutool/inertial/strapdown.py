@@ -31,7 +31,10 @@ Quaternions = Float64[np.ndarray, "n 4"]
 
 
 class StartPose(NamedTuple):
-    """Start pose of an integration: orientation (body to world), position in m, world velocity in m/s."""
+    """Start pose of an integration.
+
+    Orientation (body to world), position in m, world velocity in m/s.
+    """
 
     q_wb_wxyz: Float64[np.ndarray, "4"]
     p_wb: Float64[np.ndarray, "3"]
@@ -87,7 +90,9 @@ def dead_reckon(
 
 
 def along_truth(imu: Imu, truth: Poses, where: str) -> tuple[Poses, Poses, Bool[np.ndarray, " n"]]:
-    """Dead-reckoned trajectory over the stretch with truth, the truth on the same stamps, and the mask of valid rows.
+    """Dead-reckoned trajectory over the stretch with truth, the truth on the same stamps.
+
+    Also the mask of valid rows.
 
     The stretch is from the first sample with truth to the last. The start is the truth there; its velocity is derived if it has
     none.
@@ -101,7 +106,9 @@ def along_truth(imu: Imu, truth: Poses, where: str) -> tuple[Poses, Poses, Bool[
 
 
 def stretch_with_truth(t_ns: Times, truth: Poses, where: str) -> tuple[slice, Poses, Bool[np.ndarray, " m"]]:
-    """Rows from the first stamp with truth to the last, the truth with velocity there, and the mask of valid rows.
+    """Rows from the first stamp with truth to the last, the truth with velocity there.
+
+    Also the mask of valid rows.
 
     Raises:
         DataError: fewer than two stamps with truth.
@@ -115,7 +122,10 @@ def stretch_with_truth(t_ns: Times, truth: Poses, where: str) -> tuple[slice, Po
 
 
 class Drift(NamedTuple):
-    """Drift of integrations that start from the truth: orientation (rad), velocity (m/s), position (m)."""
+    """Drift of integrations that start from the truth.
+
+    Orientation (rad), velocity (m/s), position (m).
+    """
 
     orientation_rad: Float64[np.ndarray, " m"]
     velocity_m_s: Float64[np.ndarray, " m"]
@@ -123,7 +133,9 @@ class Drift(NamedTuple):
 
 
 def window_drift(path: Poses, truth: Poses, first: Int64[np.ndarray, " m"], last: Int64[np.ndarray, " m"] | slice) -> Drift:
-    """Drift at rows `last` of integrations from the truth at rows `first`, from a single integration.
+    """Drift at rows `last` of integrations from the truth at rows `first`.
+
+    From a single integration.
 
     `path` is the integration of the same samples from any start, on the stamps of `truth`. An integration from the truth at row
     s equals `path` rotated by C = R_true,s R_s^T from there on, so nothing is integrated again::
@@ -190,7 +202,9 @@ def truth_velocity(
     order: int = VELOCITY_ORDER,
     max_gap_s: float | None = None,
 ) -> Vectors:
-    """World velocity (m/s) at every pose: a Savitzky-Golay derivative of positions on the poses' stamps.
+    """World velocity (m/s) at every pose.
+
+    a Savitzky-Golay derivative of positions on the poses' stamps.
 
     Around each pose, a polynomial of degree `order` in time is fitted to the poses of `window_s` (an odd number m, by the
     median period, over `order`) by least squares on the true stamps; the velocity is its slope. On an even clock this is

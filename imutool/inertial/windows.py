@@ -28,7 +28,10 @@ def step_means(u: Samples) -> Float[Tensor, "batch n-1 3"]:
 
 
 def running_product(increments: Float[Tensor, "batch n 3 3"]) -> Float[Tensor, "batch n 3 3"]:
-    """Products `increments[0] @ ... @ increments[k]` for every k, in log2(n) passes (Hillis and Steele's scan)."""
+    """Products `increments[0] @ ... @ increments[k]` for every k, in log2(n) passes.
+
+    Hillis and Steele's scan.
+    """
     shift = 1
     while shift < increments.shape[1]:
         increments = torch.cat([increments[:, :shift], increments[:, :-shift] @ increments[:, shift:]], dim=1)
@@ -74,7 +77,9 @@ def rotation_residual(
 def velocity_residual(
     accel: Samples, dt: Steps, R_wb: Float[Tensor, "batch n 3 3"], dv_true: Float[Tensor, "batch 3"], g_w: Float[Tensor, "3"]
 ) -> tuple[Float[Tensor, "batch 3"], Float[Tensor, "batch n 3 3"]]:
-    """Velocity residual of the integrated specific force (m/s), and its derivative by each sample.
+    """Velocity residual of the integrated specific force (m/s).
+
+    Also its derivative by each sample.
 
     Returns:
         e = dv_true - sum_k (R_k a_k + g) h_k, h the weights of the trapezoidal rule (s), and A_k = R_k h_k, so that
@@ -86,11 +91,17 @@ def velocity_residual(
 
 
 def huber_weight(size: Float[Tensor, " m"], delta: Float[Tensor, " m"]) -> Float[Tensor, " m"]:
-    """Weights of iteratively reweighted least squares for Huber's loss: 1 up to `delta`, then falling as 1/size."""
+    """Weights of iteratively reweighted least squares for Huber's loss.
+
+    1 up to `delta`, then falling as 1/size.
+    """
     return torch.where(size <= delta, torch.ones_like(size), delta / size.clamp_min(1e-300))
 
 
 def huber(size: Float[Tensor, " m"], delta: Float[Tensor, " m"]) -> Float[Tensor, " m"]:
-    """Huber's loss of normalised sizes: (size/delta)²/2 up to `delta`, then linear, which limits outliers."""
+    """Huber's loss of normalised sizes.
+
+    (size/delta)²/2 up to `delta`, then linear, which limits outliers.
+    """
     x = size / delta
     return torch.where(x <= 1, 0.5 * x * x, x - 0.5)

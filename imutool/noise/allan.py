@@ -1,4 +1,6 @@
-"""Allan deviation at rest and its slopes: density at -1/2, instability at 0, bias walk at +1/2.
+"""Allan deviation at rest and its slopes.
+
+Density at -1/2, instability at 0, bias walk at +1/2.
 
 A stretch of T seconds shows averaging times up to T/4. Over these the variance is a sum of powers (IEEE 952, annex C)::
 
@@ -48,7 +50,10 @@ Samples = Float64[np.ndarray, "_ 3"]
 
 @dataclass(frozen=True)
 class Curve:
-    """Allan deviation by averaging time (s) and axis, and how many independent differences each is worth."""
+    """Allan deviation by averaging time (s) and axis.
+
+    Also how many independent differences each is worth.
+    """
 
     tau_s: Float64[np.ndarray, " m"]
     deviation: Float64[np.ndarray, "m 3"]
@@ -57,7 +62,9 @@ class Curve:
 
 @dataclass(frozen=True)
 class Slopes:
-    """Slopes of one axis: values of the seen `POWERS`, their standard deviations, and the range of the fit.
+    """Slopes of one axis: values of the seen `POWERS`, their standard deviations.
+
+    Also the range of the fit.
 
     `powers` holds all fitted values, seen or not, for drawing. The fit holds from `from_s` on. `excess` is the worst ratio of
     variance to fit below `from_s` (less than 1: smaller, as with filters), 1 if no time was dropped.
@@ -87,7 +94,9 @@ def library() -> ModuleType:
 
 
 def curve(stretches: Iterable[Samples], period_s: float) -> Curve:
-    """Overlapping Allan deviation over stretches of one sensor, at averaging times an octave apart.
+    """Overlapping Allan deviation over stretches of one sensor.
+
+    At averaging times an octave apart.
 
     Squared differences of all stretches are averaged together; none reaches across from one stretch to the next. Empty
     where no stretch has 8 samples.
@@ -111,7 +120,10 @@ def curve(stretches: Iterable[Samples], period_s: float) -> Curve:
 
 
 def freedom(tools: ModuleType, count: int, m: int) -> float:
-    """Equivalent degrees of freedom (NIST SP 1065, table 5): the smaller of those for white noise and for a random walk."""
+    """Equivalent degrees of freedom (NIST SP 1065, table 5).
+
+    The smaller of those for white noise and for a random walk.
+    """
     return max(1.0, min(float(tools.edf_simple(count + 1, m, alpha)) for alpha in (0, -2)))
 
 

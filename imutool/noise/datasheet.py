@@ -1,4 +1,6 @@
-"""Noise of an IMU: densities, walks and instabilities by axis, with their sources; data sheets by name.
+"""Noise of an IMU: densities, walks and instabilities by axis, with their sources.
+
+Data sheets by name.
 
 The model is that of IEEE 952 and 1293, as Kalibr and the ASL `sensor.yaml` write it: a sample reads truth + b(t) + n(t), n
 white with a density, b a random walk with a walk density, plus a flicker floor (instability) that no averaging gets below.
@@ -112,7 +114,9 @@ bmi160: Bosch Sensortec, BST-BMI160-DS000, table 3. Walks: Schubert et al., The 
 
 
 def read(name: str | Path) -> Noise:
-    """Noise of a sensor in `SHEETS`, or from a TOML file of `write`; a single number holds for all three axes.
+    """Noise of a sensor in `SHEETS`, or from a TOML file of `write`.
+
+    A single number holds for all three axes.
 
     Raises:
         ConfigError: no such name or file (the nearest name is given), no TOML, unknown key, negative or infinite value.

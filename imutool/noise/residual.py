@@ -34,7 +34,9 @@ Rows = Float64[np.ndarray, "n 3"]
 
 
 def curves(imu: Imu, truth: Poses) -> tuple[Curve, Curve]:
-    """Allan deviations of the errors of gyro (rad/s) and accelerometer (m/s²), window lengths an octave apart.
+    """Allan deviations of the errors of gyro (rad/s) and accelerometer (m/s²).
+
+    Window lengths an octave apart.
 
     Outliers of the truth do no harm: the spread is the median's. Windows touch no gap in truth or samples. Lengths that fewer
     than 9 windows have are left out.

@@ -136,6 +136,9 @@ def _weight(e: Float[Tensor, "m 3"], log: Int[Tensor, " m"], logs: int) -> Float
 
 
 def median_per_log(size: Float[Tensor, " m"], log: Int[Tensor, " m"], logs: int) -> Float[Tensor, " logs"]:
-    """The median size of each log's windows: truths differ in quality by a factor of eight between rooms of one data set."""
+    """The median size of each log's windows.
+
+    Truths differ in quality by a factor of eight between rooms of one data set.
+    """
     medians = [size[log == i].median() if bool((log == i).any()) else size.median() for i in range(logs)]
     return torch.stack(medians).clamp_min(LEAST_RESIDUAL)

@@ -47,7 +47,10 @@ RIDGE = 1e-9  # of a diagonal, so that a log without information on its own unkn
 
 @dataclass(frozen=True)
 class Equations:
-    """Loss of each log to second order about a point: c + 2 g.d + d.H.d, unknowns theta then the log's own."""
+    """Loss of each log to second order about a point.
+
+    c + 2 g.d + d.H.d, unknowns theta then the log's own.
+    """
 
     H: Float[Tensor, "logs k k"]
     g: Float[Tensor, "logs k"]

@@ -86,7 +86,9 @@ def orientation_error(model: BiasModel, windows: Windows) -> Float[Tensor, " bat
 
 
 def motion_error(model: BiasModel, windows: Windows) -> Float[Tensor, " batch"]:
-    """|v_hat - v| and |p_hat - p| / window together, at the end of each window, in m/s (paper, eq. 17, in one unit).
+    """|v_hat - v| and |p_hat - p| / window together, at the end of each window, in m/s.
+
+    Paper, eq. 17, in one unit.
 
     The attitude follows the debiased gyro, whose weights this stage leaves alone.
     """
@@ -109,7 +111,9 @@ def error(model: BiasModel, sensor: Sensor, windows: Windows) -> Float[Tensor, "
 
 
 class RobustLoss:
-    """Huber's loss, its width 1.5 medians of the errors that windows of this length of this log had at the stage's start.
+    """Huber's loss, its width 1.5 medians of the errors at the stage's start.
+
+    Each length of windows of each log has its own median.
 
     Fixed during a stage, so that the loss can be followed; by log, because truths differ in quality by a factor of eight.
     """
@@ -162,7 +166,10 @@ class Objective(ABC):
 
 
 class WindowEndObjective(Objective):
-    """What integration misses at the end of windows of several lengths (`imutool.training.objective`)."""
+    """What integration misses at the end of windows of several lengths.
+
+    `imutool.training.objective`.
+    """
 
     def _choose(self) -> None:
         named = self.settings.gyro_window_s if self.sensor == "gyro" else self.settings.accel_window_s

@@ -214,5 +214,8 @@ def corrected(model: BiasModel, pool: Pool, part: Part = "all", sensors: Sequenc
 
 
 def sensors_up_to(sensor: Sensor) -> Sequence[Sensor]:
-    """A sensor and those trained before it: the accelerometer's errors depend on the gyro, not the other way round."""
+    """A sensor and those trained before it.
+
+    The accelerometer's errors depend on the gyro, not the other way round.
+    """
     return SENSORS[: SENSORS.index(sensor) + 1]

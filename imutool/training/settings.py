@@ -16,7 +16,9 @@ Count = Annotated[int, msgspec.Meta(ge=1)]
 
 
 class IncrementSettings(Settings, frozen=True):
-    """For methods that descend on increments (`imutool.training.increments`): their lengths, and the stretches that hold
+    """For methods that descend on increments (`imutool.training.increments`).
+
+    Their lengths, and the stretches that hold
     them.
     """
 
@@ -26,7 +28,9 @@ class IncrementSettings(Settings, frozen=True):
 
 
 class TrainSettings(Settings, frozen=True):
-    """How to train; `model` holds the settings of the method (`imutool/bias/METHOD.py`, class Config).
+    """How to train; `model` holds the settings of the method.
+
+    `imutool/bias/METHOD.py`, class Config.
 
     The defaults here are those of linear and neural_ode; `settings_of` has those of any method.
     """
@@ -47,7 +51,7 @@ class TrainSettings(Settings, frozen=True):
 
 @functools.cache
 def settings_of(method: str) -> type[TrainSettings]:
-    """`TrainSettings` with the defaults that a method prefers (`BiasModel.prefers`) in place of the general ones.
+    """`TrainSettings` with the defaults that a method prefers (`BiasModel.prefers`).
 
     Raises:
         ConfigError: unknown method.

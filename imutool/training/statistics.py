@@ -28,7 +28,10 @@ FLOOR_STD = {"gyro": 5e-5, "accel": 2e-3}
 def store_statistics(
     model: BiasModel, pool: Pool, rest: Float[Tensor, "logs 6"], window_s: Mapping[Sensor, Sequence[float]]
 ) -> None:
-    """Fills the model's prior, the spread of starts from truth, and the noise of a sample, from the training part."""
+    """Fills the model's prior, the spread of starts from truth, and the noise of a sample.
+
+    From the training part.
+    """
     scored, left = corrected(model, pool)
     for sensor in SENSORS:
         columns = COLUMNS[sensor]

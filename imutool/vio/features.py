@@ -35,7 +35,7 @@ class Frame:
 
 
 def room(p_wb: Points, rng: Generator, count: int = LANDMARKS, margin_m: float = MARGIN_M) -> Landmarks:
-    """Landmarks spread evenly over the six sides of the box that lies `margin_m` around a trajectory (m, world)."""
+    """Landmarks (m, world) on the six sides of the box `margin_m` around a trajectory."""
     low, high = p_wb.min(axis=0) - margin_m, p_wb.max(axis=0) + margin_m
     size = high - low
     area = np.array([size[1] * size[2], size[0] * size[2], size[0] * size[1]]).repeat(2)
@@ -86,7 +86,10 @@ def observe(
 
 
 def blackouts(t_s: Float64[np.ndarray, " n"], length_s: float, every_s: float) -> Bool[np.ndarray, " n"]:
-    """Where the camera sees nothing: the last `length_s` of every `every_s` seconds, so that the start is seen."""
+    """Where the camera sees nothing.
+
+    The last `length_s` of every `every_s` seconds, so that the start is seen.
+    """
     return np.asarray(t_s % every_s >= every_s - length_s) if length_s > 0.0 else np.zeros(len(t_s), bool)
 
 

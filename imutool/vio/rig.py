@@ -12,7 +12,9 @@ Points = Float64[np.ndarray, "n 3"]
 
 @dataclass(frozen=True, eq=False)
 class StereoRig:
-    """Two equal pinhole cameras side by side; camera frame: x right, y down, z forward, origin in the left one.
+    """Two equal pinhole cameras side by side; camera frame.
+
+    x right, y down, z forward, origin in the left one.
 
     `R_bc`, `p_bc` take points of the left camera's frame to the body's (the IMU's); the right camera sits `baseline_m` along
     the left one's x.

@@ -108,7 +108,9 @@ def vio(
 
 
 def plan(recording: Recording, settings: VioSettings) -> VioProblem:
-    """Keyframes over the stretch with truth, and what the camera sees there; where the truth has gaps it sees nothing.
+    """Keyframes over the stretch with truth, and what the camera sees there.
+
+    Where the truth has gaps it sees nothing.
 
     Raises:
         DataError: no truth, or too little of it for two keyframes.
@@ -147,8 +149,9 @@ def score(
     bias_states: bool,
     progress: Callable[[int, int], None] | None = None,
 ) -> dict[str, Any]:
-    """Figures of one run (`imutool.inertial.metrics`, aligned in heading and position at the first keyframe), or why it
-    failed.
+    """Figures of one run, or why it failed.
+
+    They are those of `imutool.inertial.metrics`, aligned in heading and position at the first keyframe.
     """
     began = time.process_time()
     start = StartPose.of(course.true)
@@ -171,7 +174,7 @@ def score(
 
 
 def from_first_pose(estimate: Poses, truth: Poses) -> Poses:
-    """The estimate turned about the vertical and shifted so that heading and position agree with the truth at the first row.
+    """Estimate with the heading and position of the truth at the first row.
 
     The heading is that of the turn between the two first attitudes (the twist about z of R_true R_est^T); tilt stays, for
     gravity makes it the estimate's own error.
@@ -203,7 +206,10 @@ def _within(progress: Tell | None, done: int, total: int, word: str) -> Callable
 
 
 def tabulate(results: Sequence[dict[str, Any]]) -> Iterator[list[tuple[str, ...]]]:
-    """Results as tables of text: absolute errors, then relative ones; of a failed run there is nothing to show."""
+    """Results as tables of text: absolute errors, then relative ones.
+
+    Of a failed run there is nothing to show.
+    """
     distances = next((list(one["roe_deg"]) for one in results if not one["failed"]), [])
     keys = ("log", "model", "bias\nstates")
     absolute: list[tuple[str, ...]] = [(*keys, "AOE\n°", "APE\nm", "aligned\n°", "aligned\nm", "velocity\nm/s", "CPU\ns")]

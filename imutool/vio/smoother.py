@@ -37,7 +37,9 @@ LEAST_DISPARITY_PX = 1.0  # a first place is no further away than this, whatever
 
 
 class SmootherSettings(config.Settings, frozen=True, kw_only=True):
-    """What the smoother believes of the sensor and the start: the same for every run, so that only the samples differ.
+    """What the smoother believes of the sensor and the start.
+
+    The same for every run, so that only the samples differ.
 
     The noise densities are ten times a data sheet's, for vibration, scale and misalignment, chosen on training sequences for
     the raw IMU with bias states. The accelerometer's walk is that of EuRoC's sensor.yaml, the gyro's five times that (figures
@@ -58,7 +60,10 @@ class SmootherSettings(config.Settings, frozen=True, kw_only=True):
 
 
 class Estimate(NamedTuple):
-    """The newest state at each keyframe, as it was known then, and the bias (gyro rad/s, accel m/s²) it went with."""
+    """The newest state at each keyframe, as it was known then.
+
+    Also the bias (gyro rad/s, accel m/s²) it went with.
+    """
 
     poses: Poses
     bias: Float64[np.ndarray, "n 6"]
@@ -91,7 +96,9 @@ def estimate(
     rig: StereoRig = EUROC,
     progress: Callable[[int, int], None] | None = None,
 ) -> Estimate:
-    """The trajectory at some samples of the IMU (`keyframes`, their rows), from the true start and the frames there.
+    """The trajectory at some samples of the IMU (`keyframes`, their rows).
+
+    From the true start and the frames there.
 
     `pixel_std` (px) is what the pixels' noise is taken for. With `bias_states` false the samples are taken as they are: biases
     are zero and stay there.

@@ -256,7 +256,7 @@ def test_trajectories_that_do_not_match_are_refused() -> None:
     truth = wander(10, seed=14)
     with pytest.raises(DataError, match="do not match"):
         absolute(truth.rows(slice(0, 9)), truth, everything(truth))
-    with pytest.raises(DataError, match="at none"):
+    with pytest.raises(DataError, match="no stamp of the estimate has truth"):
         absolute(truth, truth, ~everything(truth))
 
 
