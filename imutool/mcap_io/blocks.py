@@ -153,8 +153,8 @@ def read_message_indexes(source: Source, block: MessageBlock) -> tuple[ChunkHead
     return head, parse_message_indexes(source.at(start, block.end - start), block, head.size)
 
 
-def message_offsets(source: Source, block: MessageBlock, size: int) -> Int64[np.ndarray, " n"] | None:
-    """Message offsets in a chunk of `size` bytes from its message indexes; None if wrong.
+def message_offsets(source: Source, block: MessageBlock, unpacked: int) -> Int64[np.ndarray, " n"] | None:
+    """Message offsets in a chunk of `unpacked` bytes from its message indexes; None if wrong.
 
     Only a hint: the caller checks that messages lie there.
     """
@@ -167,7 +167,7 @@ def message_offsets(source: Source, block: MessageBlock, size: int) -> Int64[np.
         parts.append(np.frombuffer(raw, "<u8", size // 8, at + INDEX_HEAD.size)[1::2])
         at += HEAD.size + length
     offsets = np.sort(np.concatenate([np.zeros(0, np.uint64), *parts]))
-    return offsets.view(np.int64) if len(offsets) and offsets[-1] < size else None
+    return offsets.view(np.int64) if len(offsets) and offsets[-1] < unpacked else None
 
 
 def read_entries(source: Source, block: MessageBlock, channel: int) -> UInt64[np.ndarray, "n 2"]:

@@ -63,9 +63,7 @@ def repair(
     overwrite: bool = False,
     progress: Callable[[int, int], None] | None = None,
 ) -> RepairReport:
-    """Writes the intact part of `source` to `target`, in the order of the file.
-
-    With all indexes.
+    """Writes the intact part of `source` to `target`, in file order, with all indexes.
 
     With `damaged="keep"` the bytes of damaged stretches become attachments `imutool/damaged/OFFSET`, which no reader takes
     for messages. The metadata record `imutool_repair` lists what was lost; an intact log gets none. The result is

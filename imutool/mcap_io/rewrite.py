@@ -239,7 +239,7 @@ class _Rewrite:
         self.passing.skip(block.end)
 
     def _copy_unpacked(self, block: MessageBlock) -> None:
-        """Copies a chunk that must be unpacked, with its own message indexes if they list its messages, else new ones."""
+        """Copies a chunk that must be unpacked; wrong message indexes are replaced."""
         everything = memoryview(self.source.at(block.offset, block.end - block.offset))
         raw, behind = everything[: block.length], everything[block.length :]
         try:
@@ -273,7 +273,7 @@ class _Rewrite:
         self.out.contents.add(indexes.counts, indexes.start_ns, indexes.end_ns)
 
     def _define(self, opcode: int, body: bytes, offset: int) -> None:
-        """Takes in a definition that stands in a chunk alone; one under a new channel's id is refused."""
+        """Adds a definition that only a chunk contains; refuses one under a new channel's id."""
         index, contents = self.index, self.out.contents
         known_schemas, known_channels = set(index.schemas), set(index.channels)
         index.define(opcode, body, offset)

@@ -209,7 +209,7 @@ def _page(logs: Sequence[RunData], path: Path, overwrite: bool) -> Output:
 
 
 def _check_contradictions(asked: RequestedOutputs) -> None:
-    """Raises ConfigError where two outputs exclude each other, or a setting has no output to act on."""
+    """Refuses outputs that exclude each other, and settings without an output (ConfigError)."""
     if asked.connect is not None and asked.web:
         raise ConfigError("`connect` and `web` exclude each other", where="view", fix="Leave one of them out")
     if asked.port is not None and not asked.web:

@@ -209,6 +209,15 @@ def test_stamps_come_from_the_indexes_and_unpack_nothing(long_log: Path, monkeyp
     assert np.array_equal(stamps, START_NS + 1_000_000 * np.arange(120_000))
 
 
+def test_message_indexes_spare_following_the_records_one_by_one(long_log: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(*_: object) -> None:
+        raise AssertionError("the records of a chunk were followed one by one")
+
+    monkeypatch.setattr("imutool.mcap_io.codec.messages.parse", refuse)
+    with Log(long_log) as log:
+        assert sum(len(batch.stamp_ns) for batch in log.imu_batches("/imu0")) == 120_000
+
+
 def test_chunks_of_other_topics_are_not_unpacked(recording: Recording, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = tmp_path / "log.mcap"
     write(recording, path)

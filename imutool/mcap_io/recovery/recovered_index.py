@@ -184,7 +184,7 @@ class RecoveredIndex(LogIndex):
         del self._scan, self._failed
 
     def _drop_doubtful(self) -> None:
-        """Drops messages found behind a gap in a log with chunks: they are the unproven contents of a damaged chunk."""
+        """Drops messages after a gap in a chunked log: unproven contents of a damaged chunk."""
         dropped = {id(block) for block, _ in self._scan.doubtful}
         for block, gap in self._scan.doubtful:
             gap.length = max(gap.length, block.offset + block.length - gap.offset)
@@ -275,7 +275,7 @@ class RecoveredIndex(LogIndex):
 
 
 def _counts_by_size(block: MessageBlock) -> dict[int, int]:
-    """Messages per channel from the sizes of the message indexes: 15 bytes each and 16 for every message."""
+    """Messages per channel by index size: 15 bytes a message index, 16 a message."""
     if not block.indexes:
         return {}
     starts = sorted(block.indexes.items(), key=lambda item: item[1])

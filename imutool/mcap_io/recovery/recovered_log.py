@@ -71,7 +71,7 @@ class RecoveredLog(Log):
             self._explain(f"the data section has CRC {crc:08x}, expected {stated:08x}")
 
     def _explain(self, mismatch: str) -> None:
-        """Finds what changed: a chunk, an index that contradicts its chunk, or else what no other CRC covers."""
+        """Finds the damage: a chunk, an index against its chunk, or bytes that no other CRC covers."""
         index, losses = self.index, self.losses
         index.check()
         if losses:

@@ -209,7 +209,7 @@ class RecordFrames:
         return limit
 
     def _candidates(self, raw: bytes, at: int) -> list[int]:
-        """Offsets of a known opcode with a length that fits, and of the magic, in the first `WINDOW` bytes."""
+        """Offsets of possible records (opcode known, length fits) and magics in `WINDOW` bytes."""
         view = np.frombuffer(raw, np.uint8)
         found: list[int] = []
         if len(view) >= HEAD.size:

@@ -82,7 +82,7 @@ class Scan:
 
     @property
     def data_end(self) -> int:
-        """Where the DataEnd record begins; the end of the file, where there is none or more than one."""
+        """Offset of the DataEnd record; the file's end where it has none or several."""
         return self._data_ends[0] if len(self._data_ends) == 1 and len(self.sections.each) == 1 else self.source.size
 
     def _listed_block(self, position: int, limit: int) -> MessageBlock | None:
@@ -111,7 +111,7 @@ class Scan:
         self._last, self._open_gap = chunk, None
 
     def _step(self, position: int) -> int | None:
-        """Takes in the record at a position; returns where the next begins, or None where the framing is broken."""
+        """Handles the record at a position; returns the next offset, None if the framing is broken."""
         frames = self.frames
         if frames.is_magic(position):
             self._log_boundary(position)
@@ -124,7 +124,7 @@ class Scan:
         return None if not self.has_summary and self.frames.overlaps_next(position, *head) else self._record(position, *head)
 
     def _log_boundary(self, position: int) -> None:
-        """Handles the magic inside the file: another log begins here if a Header follows, else one has ended."""
+        """Handles a magic inside the file: a log begins if a Header follows, else one has ended."""
         head = self.frames.head(position + len(MAGIC))
         if position and head is not None and head[0] == Opcode.HEADER:
             if not self._ended:
@@ -162,7 +162,7 @@ class Scan:
         return end
 
     def _moved_summary(self, position: int) -> None:
-        """Finds where a log inside the file began, from the distance between its summary and the stated place."""
+        """Finds the start of an inner log: the offset of its summary minus the stated one."""
         if not self._ended or not self._data_ends:
             return
         footer = records.parse(Footer, self.source.at(position + HEAD.size, FOOTER_SIZE - HEAD.size), position)
@@ -195,7 +195,7 @@ class Scan:
             self.losses.add_harmless(conflict)
 
     def _message_index(self, position: int, length: int) -> None:
-        """Assigns a message index to the chunk right before it, or counts the messages of a lost one."""
+        """Assigns a message index to the chunk before it, or counts a lost chunk's messages."""
         last, self._open_gap = self._last, None
         if isinstance(last, Gap):
             body = self.source.at(position + HEAD.size, length)
@@ -239,7 +239,7 @@ class Scan:
         return position + whole
 
     def _messages(self, position: int, length: int) -> int | None:
-        """Takes in a run of messages outside chunks as one block; the last counts only if its end is certain."""
+        """Adds messages outside chunks as one block; the last one only if its end is certain."""
         limit = self.frames.limit
         raw = self.source.at(position, min(max(RUN_BYTES, HEAD.size + length), limit - position))
         offsets, _, end = messages.scan(raw, bare=True)

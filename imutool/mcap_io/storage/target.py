@@ -37,7 +37,7 @@ class _Medium(Protocol):
     def write(self, data: bytes | bytearray | memoryview) -> None: ...
 
     def copy(self, source: Source, start: int, end: int) -> int:
-        """Takes bytes over without their coming here, as far as that can be done; returns where it stopped."""
+        """Copies bytes without reading them here, as far as possible; returns where it stopped."""
 
     def complete(self) -> None:
         """Makes all of it readable under the temporary name."""
@@ -102,7 +102,7 @@ class Target:
             self.crc = crc32(data, self.crc)
 
     def copy(self, source: Source, start: int, end: int) -> None:
-        """Appends the bytes of another file from `start` to `end`, by the kernel if that is quicker and their CRC not wanted.
+        """Appends bytes `start` to `end` of another file; the kernel copies if no CRC is needed.
 
         Raises:
             ConfigError: the system refuses to write.
@@ -165,7 +165,7 @@ class _File:
         self.file.write(data)
 
     def copy(self, source: Source, start: int, end: int) -> int:
-        """By the kernel; where it began, if the kernel cannot do it, or not without cutting blocks in two."""
+        """Copies by the kernel; returns `start` if the kernel cannot, or would split blocks."""
         theirs, ours = descriptor(source.file), descriptor(self.file)
         if theirs is None or ours is None or (start - self.file.tell()) % PAGE_BYTES:
             return start
@@ -245,7 +245,7 @@ class PassThrough:
             out.write(raw)
 
     def skip(self, end: int) -> None:
-        """Leaves out the bytes of the source up to here, which are written in another form or not at all."""
+        """Skips the source's bytes up to `end`: another form of them is written, or none."""
         if self.target.summing:
             self.crc = crc_of(self.source, self.copied, end, self.crc)
         self.copied = self.pending_end = end

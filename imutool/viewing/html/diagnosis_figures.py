@@ -220,7 +220,7 @@ def _local_rms(trace: Traces, edges: Line) -> Float64[np.ndarray, "bins 6"]:
 
 
 def _density(traces: Sequence[Traces], part: slice, after: bool) -> tuple[Line, Line] | None:
-    """Frequencies and amplitude density over the unseen stretches of all logs, weighted by their length."""
+    """Amplitude density and frequencies over unseen stretches of all logs, weighted by length."""
     pieces = [(rate_hz(trace), piece) for trace in traces for piece in _stretches(trace, part, after)]
     longest_s = max((len(piece) / rate for rate, piece in pieces), default=0.0)
     window_s = min(WELCH_S, 2.0 ** np.floor(np.log2(max(longest_s, 1e-9))))
@@ -249,7 +249,7 @@ def _stretches(trace: Traces, part: slice, after: bool) -> Iterator[Float64[np.n
 
 
 def _binned(d: Diagnosis, variable: Callable[[Traces, str, int], Line], names: dict[str, str], name: str) -> str | None:
-    """Means in bins of a variable over all logs, before and after, one panel per signal and axis."""
+    """Binned means over all logs, before and after, one panel per signal and axis."""
     if not d.traces:
         return None
 

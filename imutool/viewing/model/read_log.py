@@ -163,7 +163,7 @@ def _model(metadata: Sequence[tuple[str, Mapping[str, str]]], topic: str) -> str
 def _run(
     name: str, model: str, raw: Imu, batches: Sequence[ImuBatch], biases_by_topic: Mapping[str, Sequence[TwistColumns]]
 ) -> Run | None:
-    """Debiased channel with the bias and its standard deviation from the log, else the bias by subtraction at equal stamps."""
+    """Debiased channel with bias and sigma from the log, else bias = raw - debiased per stamp."""
     try:
         imu, _ = _columns(batches)
     except DataError:

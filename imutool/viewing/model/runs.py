@@ -147,7 +147,7 @@ def _true_bias(recording: Recording) -> Mapping[str, Scalars]:
 
 
 def _scored(runs: Sequence[Run], truth: Poses, where: str, align: Alignment) -> tuple[tuple[Trace, ...], list[str]]:
-    """Runs from the first to the last sample with truth, with their errors and figures, and notes."""
+    """Scored runs over the span with truth: errors, figures and notes."""
     known: list[TruthSpan] = []
     for k, run in enumerate(runs):
         alike = k > 0 and np.array_equal(run.imu.t_ns, runs[k - 1].imu.t_ns)

@@ -151,7 +151,7 @@ def _encrypted(plain: socket.socket, parts: SplitResult) -> socket.socket:
 
 
 def _viewer_version(url: str) -> str | None:
-    """Version of a viewer; None for a server without a viewer and for a viewer too old or too busy to answer.
+    """Version of a viewer; None for a bare server or a viewer too old or too busy to answer.
 
     Raises:
         ConfigError: the listener is not a viewer.

@@ -147,7 +147,7 @@ def _runs_with_errors(logs: Sequence[RunData], scopes: Sequence[Scope]) -> list[
 
 
 def _comparison_colors(scored: Sequence[tuple[RunData, Trace, Scope]]) -> list[Color]:
-    """Colour of each run: colour-blind safe while they last for models, the log's colour towards grey for raw."""
+    """Colour of each run: colour-blind safe first for models; the log's colour, greyer, for raw."""
     models = [(scope, trace.name) for data, trace, scope in scored if not trace.is_raw or not data.models()]
     hues = MODEL_COLORS if len(models) <= len(MODEL_COLORS) else _color_wheel(len(models))
     by_model = dict(zip(models, hues, strict=False))

@@ -74,7 +74,7 @@ def _signals(data: RunData, scope: Scope) -> View:
 
 
 def _bias(data: RunData, scope: Scope) -> View | None:
-    """One tab per sensor, one plot per axis: axes in one plot would hide differences of a thousandth."""
+    """Bias tabs per sensor, a plot per axis: one plot would hide differences of a thousandth."""
     import rerun.blueprint as rrb
 
     sensors = [kind for kind in signals.KINDS if data.models() or kind in data.true_bias]
@@ -117,7 +117,7 @@ def _only(axis: int, count: int) -> list[bool]:
 
 
 def _bias_range(data: RunData, kind: str, axis: int) -> tuple[float, float] | None:
-    """Axis range for estimates, truth and most standard deviations, which may be many times larger at the start."""
+    """Axis range of estimates, truth and most sigmas, which may be far larger at the start."""
     lows, highs = [], []
     for trace in data.models():
         bias = (trace.run.gyro_bias if kind == "gyro" else trace.run.accel_bias)[:, axis]
@@ -244,7 +244,7 @@ def _cameras(data: RunData, scope: Scope) -> View | None:
 def _three(
     data: RunData, contents: list[str], title: str, height: tuple[float, float] | None = None, names: tuple[str, ...] = AXES
 ) -> rrb.TimeSeriesView:
-    """Plot of curves about or along x, y and z, with their colours in the title instead of a legend of six lines."""
+    """Plot of x, y and z curves; colours in the title instead of a legend of six lines."""
     key = ", ".join(f"{name} {color}" for name, color in zip(names, ("red", "green", "blue"), strict=True))
     models = [sdk.label(data, trace) for trace in data.models()]
     if len(models) == 1:

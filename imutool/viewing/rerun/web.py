@@ -210,7 +210,7 @@ def export(
 
 
 def _replace_folder(source: Path, target: Path) -> None:
-    """Move a folder to its place; an existing one is removed after the move, and restored if it fails."""
+    """Move a folder to its place; remove an existing one after, restore it on failure."""
     if not target.exists():
         source.rename(target)
         return

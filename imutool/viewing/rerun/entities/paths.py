@@ -108,7 +108,7 @@ def _log_path(
     role: str,
     color: Color,
 ) -> None:
-    """Rows of pieces, coloured by the largest error in each piece where `by_error` gives errors and scale."""
+    """Path in rows of pieces; `by_error` (errors, scale) colours each by its largest error."""
     import rerun as rr
 
     cut = path_pieces(poses)
@@ -170,7 +170,7 @@ def row_of_largest(t_ns: Times, values: Float64[np.ndarray, " n"]) -> int | None
 
 
 def _log_worst(to: rr.RecordingStream, data: RunData, trace: Trace, entity: str, size: float) -> None:
-    """Pole on the true path at a model's largest orientation error: the model's own path may be far off."""
+    """Pole on the true path (the model's may be far off) at a model's largest orientation error."""
     import rerun as rr
 
     if trace.is_raw or trace.errors is None or data.truth is None:
@@ -192,7 +192,7 @@ def _log_worst(to: rr.RecordingStream, data: RunData, trace: Trace, entity: str,
 
 
 def _log_legend(to: rr.RecordingStream, scope: Scope, top: float) -> None:
-    """Colour scale of a path, LEGEND_WIDTH wide, with tick labels below and its title on the left."""
+    """Colour scale of a path, LEGEND_WIDTH wide; tick labels below, title on the left."""
     import rerun as rr
 
     strips = [[[left, 0.0], [right, 0.0]] for left, right in pairwise(np.linspace(0.0, LEGEND_WIDTH, LEGEND_STEPS + 1))]
