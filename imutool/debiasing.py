@@ -68,13 +68,7 @@ BlockCallback = Callable[[DebiasedBlock], None]
 
 
 class Debiaser:
-<<<<<<< HEAD
-    """Debiased topics of one IMU, computed batch by batch as the log is copied.
-
-    `mcap_io.added_topics`.
-=======
     """Debiased topics of one IMU, computed by batches during the copy (`mcap_io.added_topics`).
->>>>>>> w5
 
     With a survey the samples are cleaned first. `watch` is called with every batch.
     """
