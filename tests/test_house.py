@@ -200,9 +200,9 @@ def test_no_file_is_longer_than_a_reader_likes() -> None:
 
 
 def test_functions_are_short() -> None:
-    sizes = {f"{name}.{node.name}": lines_of(node) for name, tree in EVERYTHING.items() for node in functions(tree)}
-    assert {name: size for name, size in sizes.items() if size > MOST_FUNCTION_LINES} == {}
-    assert statistics.median(sizes.values()) <= MEDIAN_FUNCTION_LINES
+    sizes = [(f"{name}.{node.name}", lines_of(node)) for name, tree in EVERYTHING.items() for node in functions(tree)]
+    assert [(name, size) for name, size in sizes if size > MOST_FUNCTION_LINES] == []
+    assert statistics.median(size for _, size in sizes) <= MEDIAN_FUNCTION_LINES
 
 
 # ── names and words ──

@@ -169,7 +169,7 @@ def test_where_ray_cannot_start_the_message_says_what_to_do(monkeypatch: pytest.
     monkeypatch.setattr(ray, "shutdown", lambda: None)  # the other tests' workers go on
     with pytest.raises(ConfigError, match=r"cannot be started on this machine \(bind: Operation not permitted\).*`address`"):
         Engine()
-    with pytest.raises(ConfigError, match=r"--address 127\.0\.0\.1:1: nobody answers"):
+    with pytest.raises(ConfigError, match=r"address=127\.0\.0\.1:1: no answer"):
         Engine("127.0.0.1:1")
 
 

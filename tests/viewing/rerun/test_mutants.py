@@ -110,6 +110,6 @@ def test_what_is_missing_is_missing_among_the_pixels(
     curves = test_pixels.curves_of(test_pixels.one_model, tmp_path)
     plant(monkeypatch)
     views, seen = test_pixels.drawn(test_pixels.one_model, 1)
-    faults = [fault for view in views for fault in test_pixels.curves.unseen(view, seen[view.id], curves)]
+    faults = [fault for view in views for fault in test_pixels.drawn_curves.unseen(view, seen[view.id], curves)]
     assert faults
     assert all(entity in fault for fault in faults)
