@@ -1,6 +1,6 @@
 """Bias covariance at each sample.
 
-Of the rest bias through the learned dynamics, and of the calibration.
+It is the covariance of the rest bias, propagated by the learned dynamics, plus that of the calibration.
 
 For a rest bias that stays constant over the whole log::
 

@@ -1,6 +1,4 @@
-"""Blind cases: a simulation and a recording of one real motion.
-
-With the truth in an envelope.
+"""Blind cases: a simulation and a recording of one motion, the truth in an envelope.
 
 The generator knows nothing of the effects that the estimator fits; the two share the file format alone. The logs themselves
 reveal nothing: names, topics, metadata, message counts, sizes and the start time are the same for every case.
@@ -50,10 +48,7 @@ class OpenedCase(Score, frozen=True, kw_only=True, tag=SCHEMA):
 
 
 class Plan(NamedTuple):
-    """Scene of a case, the effects that act in it, the random generators of the rest.
-
-    Also the grade of the noise.
-    """
+    """Scene of a case, its effects, its random generators, and the grade of the noise."""
 
     scene: Scene
     concealed: draw.Concealed

@@ -31,9 +31,9 @@ Knots = Float64[np.ndarray, " m"]
 
 @dataclass(frozen=True, eq=False)
 class Kinematics:
-    """Rate omega (rad/s), its derivative alpha, specific force f = R_wb^T (a_w - g_w) (m/s²).
+    """Rate omega (rad/s), its derivative alpha and specific force f (m/s²) in the body frame.
 
-    In the body.
+    f = R_wb^T (a_w - g_w).
     """
 
     t_s: Times

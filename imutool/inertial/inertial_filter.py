@@ -68,9 +68,9 @@ class FilterSettings(Settings, frozen=True, kw_only=True):
 
 @dataclass(frozen=True)
 class State:
-    """Filter state: pose, bias b in motion (gyro rad/s, accel m/s²), offset d at rest.
+    """Filter state: pose, bias b in motion, offset d at rest, and covariance.
 
-    Also covariance.
+    Biases are gyro (rad/s), then accel (m/s²).
     """
 
     R_wb: Matrix3

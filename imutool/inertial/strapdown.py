@@ -90,9 +90,7 @@ def dead_reckon(
 
 
 def along_truth(imu: Imu, truth: Poses, where: str) -> tuple[Poses, Poses, Bool[np.ndarray, " n"]]:
-    """Dead-reckoned trajectory over the stretch with truth, the truth on the same stamps.
-
-    Also the mask of valid rows.
+    """Dead-reckoned trajectory, the truth on the same stamps, and the mask of valid rows.
 
     The stretch is from the first sample with truth to the last. The start is the truth there; its velocity is derived if it has
     none.
@@ -106,9 +104,9 @@ def along_truth(imu: Imu, truth: Poses, where: str) -> tuple[Poses, Poses, Bool[
 
 
 def stretch_with_truth(t_ns: Times, truth: Poses, where: str) -> tuple[slice, Poses, Bool[np.ndarray, " m"]]:
-    """Rows from the first stamp with truth to the last, the truth with velocity there.
+    """Rows with truth, the truth with velocity there, and the mask of valid rows.
 
-    Also the mask of valid rows.
+    The rows go from the first stamp with truth to the last.
 
     Raises:
         DataError: fewer than two stamps with truth.

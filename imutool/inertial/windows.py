@@ -77,9 +77,7 @@ def rotation_residual(
 def velocity_residual(
     accel: Samples, dt: Steps, R_wb: Float[Tensor, "batch n 3 3"], dv_true: Float[Tensor, "batch 3"], g_w: Float[Tensor, "3"]
 ) -> tuple[Float[Tensor, "batch 3"], Float[Tensor, "batch n 3 3"]]:
-    """Velocity residual of the integrated specific force (m/s).
-
-    Also its derivative by each sample.
+    """Velocity residual of the integrated specific force (m/s), and its derivative.
 
     Returns:
         e = dv_true - sum_k (R_k a_k + g) h_k, h the weights of the trapezoidal rule (s), and A_k = R_k h_k, so that

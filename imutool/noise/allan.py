@@ -50,10 +50,7 @@ Samples = Float64[np.ndarray, "_ 3"]
 
 @dataclass(frozen=True)
 class Curve:
-    """Allan deviation by averaging time (s) and axis.
-
-    Also how many independent differences each is worth.
-    """
+    """Allan deviation by averaging time (s) and axis, with its degrees of freedom."""
 
     tau_s: Float64[np.ndarray, " m"]
     deviation: Float64[np.ndarray, "m 3"]
@@ -62,9 +59,7 @@ class Curve:
 
 @dataclass(frozen=True)
 class Slopes:
-    """Slopes of one axis: values of the seen `POWERS`, their standard deviations.
-
-    Also the range of the fit.
+    """Slopes of one axis: values, standard deviations, and the range of the fit.
 
     `powers` holds all fitted values, seen or not, for drawing. The fit holds from `from_s` on. `excess` is the worst ratio of
     variance to fit below `from_s` (less than 1: smaller, as with filters), 1 if no time was dropped.

@@ -104,10 +104,7 @@ def settings_for(physics: Path) -> tuple[list[str], tuple[str, ...]]:
 
 
 def helps(before: dict[Sensor, float], after: dict[Sensor, float]) -> bool:
-    """Whether a descent lowers one sensor's held-out error enough.
-
-    Also does not raise the other's.
-    """
+    """Whether a descent lowers one held-out error enough and does not raise the other."""
     gains = [1 - after[sensor] / before[sensor] for sensor in SENSORS]
     return max(gains) >= LEAST_GAIN and min(gains) > -LEAST_GAIN
 

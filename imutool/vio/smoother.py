@@ -60,9 +60,9 @@ class SmootherSettings(config.Settings, frozen=True, kw_only=True):
 
 
 class Estimate(NamedTuple):
-    """The newest state at each keyframe, as it was known then.
+    """Estimated state at each keyframe from the data up to it, and its bias.
 
-    Also the bias (gyro rad/s, accel m/s²) it went with.
+    The bias is gyro (rad/s), then accel (m/s²).
     """
 
     poses: Poses
