@@ -91,7 +91,7 @@ class SampleStream(Stream, Protocol):
 class CovarianceModel(Protocol):
     """Roots S of the covariance S S^T of the motion-dependent bias, by sensor.
 
-    For a stream of samples.
+    It takes a stream of samples.
 
     The columns of S belong to the same unknowns at every sample: the covariance root of a mean is the mean of S.
     """

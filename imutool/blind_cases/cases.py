@@ -135,7 +135,7 @@ def case_log(imu: Imu, truth: Poses, channels: Mapping[str, Scalars]) -> Recordi
 def write_case(folder: Path, sim: Recording, real: Recording, truth: ConcealedTruth) -> None:
     """Seals a case: writes all files beside the folder, then moves each into its place.
 
-    The envelope last.
+    The envelope is moved last.
 
     Logs are not compressed: how well numbers compress would tell which of them are rounded.
 

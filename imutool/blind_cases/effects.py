@@ -1,6 +1,6 @@
 """Forward models of the effects that a blind case may conceal.
 
-From the catalogue's formulas.
+They follow the catalogue's formulas.
 
 A model acts at its stage, in the order in which a signal passes them; within a stage by name. Up to CONVERTER a signal is an
 array of six columns: gyro (rad/s), then accel (m/s²). The estimator has forward models of its own and uses none of these.

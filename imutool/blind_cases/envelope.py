@@ -52,7 +52,7 @@ class Rms(Section, frozen=True):
 class TrueParameter(Section, frozen=True):
     """True value of a parameter, its scale, and the smallest standard deviation of an estimate.
 
-    None: no bound.
+    The smallest deviation is None where there is no bound.
     """
 
     value: float

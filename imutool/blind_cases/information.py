@@ -134,7 +134,7 @@ def _orthonormal(columns: Float64[np.ndarray, "m p"]) -> Float64[np.ndarray, "m 
 def cramer_rao_bounds(scene: Scene, acting: Acting) -> list[Theta | None]:
     """Smallest standard deviations of unbiased estimates of the parameters (Cramér and Rao).
 
-    Bias unknown.
+    The bias counts as unknown.
 
     All effects are estimated together. None for effects without a derivative; infinite where nothing can be seen.
     """
@@ -198,7 +198,7 @@ def location(misfit: Six, sigma: Theta) -> Location:
 def achievable_rms(misfit: Six, sigma: Theta) -> dict[str, Rms]:
     """Root mean square of real minus simulated samples by sensor, bias removed.
 
-    With the misfit, and of the noise.
+    It has two values: of misfit and noise together, and of the noise alone.
     """
     misfit = misfit - misfit.mean(axis=0)
     found = {}

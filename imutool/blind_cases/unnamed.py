@@ -1,6 +1,6 @@
 """Concealed effects without a name in the catalogue.
 
-Odd terms of the signals, and driven columns.
+They are odd terms of the signals, and columns that another channel drives.
 """
 
 from __future__ import annotations

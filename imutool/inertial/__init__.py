@@ -1,4 +1,1 @@
-"""Inertial navigation: kinematics, strapdown integration, preintegration, rest detection.
-
-Error metrics.
-"""
+"""Inertial navigation: kinematics, integration, rest detection, error metrics."""

@@ -1,6 +1,4 @@
-"""Invariant Kalman filter of attitude, velocity.
-
-Position and biases from the samples of one IMU.
+"""Invariant Kalman filter of pose, velocity and biases from the samples of one IMU.
 
 Errors are right-invariant on SE_2(3), augmented by the biases (Barrau and Bonnabel, "The invariant extended Kalman filter
 as a stable observer", TAC 2017; the "imperfect" filter with biases: Hartley et al., IJRR 2020, section 5)::

@@ -31,7 +31,7 @@ Vectors = Float64[np.ndarray, "n 3"]
 def lever_acceleration(omega: Any, alpha: Any, arms: Any) -> tuple[Any, Any, Any]:
     """Lever-arm acceleration alpha x r + omega x (omega x r) of a rigid body at r (m/s²).
 
-    By axis.
+    It comes back by axis.
 
     Component i is that of the point `arms[i]`, because the axes of an accelerometer may be at different points. omega and alpha
     are three floats or three columns each; written out, because for floats numpy costs several times the arithmetic.

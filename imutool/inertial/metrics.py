@@ -45,7 +45,7 @@ Points = Float64[np.ndarray, "n 3"]
 def evaluate(estimate: Poses, truth: Poses, valid: Mask, distances_m: Sequence[float] = DISTANCES_M) -> dict[str, Any]:
     """Error metrics of the module's table, with `samples` (rows that count) and `duration_s`.
 
-    First such row to last.
+    The duration is from the first such row to the last.
 
     Raises:
         DataError: stamps differ, or no row is valid.
@@ -67,9 +67,7 @@ def orientation_errors(estimate: Poses, truth: Poses) -> Float64[np.ndarray, " n
 
 
 def absolute(estimate: Poses, truth: Poses, valid: Mask) -> dict[str, float | None]:
-    """Absolute errors: `aoe_deg`, `aoe_aligned_deg`, `ape_m`, `ape_aligned_m`.
-
-    `velocity_rmse_m_s`.
+    """Absolute errors of orientation, position and velocity: AOE, APE, velocity RMSE.
 
     The aligned figures are None if positions (of either) do not span a plane, the velocity figure if a velocity is missing.
 
@@ -162,9 +160,9 @@ def align(p: Points, p_target: Points) -> tuple[Rotation, Float64[np.ndarray, "3
 def pairs_by_distance(
     p: Points, distance_m: float, tolerance: float = PAIR_TOLERANCE
 ) -> tuple[Int64[np.ndarray, " m"], Int64[np.ndarray, " m"]]:
-    """Pairs (i, j): for each point i the later point j nearest to `distance_m` along the path.
+    """Pairs (i, j): the later point j at `distance_m` from point i along the path.
 
-    Within tolerance.
+    The distance may differ by a tolerance.
 
     The rule of evo's `--all_pairs`: of equally near points the first. Bisection applies because distance along a path only
     grows (evo searches every pair, minutes for 30 000 poses).

@@ -133,7 +133,7 @@ class Drift(NamedTuple):
 def window_drift(path: Poses, truth: Poses, first: Int64[np.ndarray, " m"], last: Int64[np.ndarray, " m"] | slice) -> Drift:
     """Drift at rows `last` of integrations from the truth at rows `first`.
 
-    From a single integration.
+    All of them come from a single integration.
 
     `path` is the integration of the same samples from any start, on the stamps of `truth`. An integration from the truth at row
     s equals `path` rotated by C = R_true,s R_s^T from there on, so nothing is integrated again::
