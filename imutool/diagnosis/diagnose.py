@@ -24,19 +24,19 @@ from imutool.diagnosis.estimation.noise_estimate import whitened
 from imutool.diagnosis.estimation.observability import unobservable, with_free
 from imutool.diagnosis.estimation.significance import scatter
 from imutool.diagnosis.estimation.whitening import WhitenedImu
+from imutool.diagnosis.held_out import resimulate
 from imutool.diagnosis.reference import (
     align,
     align_all,
+    check_without_reference,
     is_another_motion,
     reference_errors,
     with_unique_names,
     without_unusable,
 )
-from imutool.diagnosis.reference_free_checks import check_without_reference
-from imutool.diagnosis.resimulation import resimulate
 from imutool.diagnosis.result import Closer, Diagnosis, Finding
-from imutool.diagnosis.scalar.diagnose import SignalDiagnosis, diagnose_signal
 from imutool.diagnosis.settings import DiagnoseSettings
+from imutool.diagnosis.signal_diagnosis import SignalDiagnosis, diagnose_signal
 from imutool.diagnosis.to_physics_file import NO_EFFECT
 from imutool.errors import ConfigError, ImutoolError
 from imutool.location import Location

@@ -1,4 +1,4 @@
-"""Reference of a recording: its alignment, unusable axes, and intervals where it is wrong.
+"""Reference of a recording: alignment, unusable axes, wrong intervals, checks without one.
 
 Poses that were lost and bridged give a simulation, or a truth, another motion there. No effect of a sensor lasts two seconds
 and leaves no trace, so where all the rest is noise, the reference is wrong.
@@ -10,7 +10,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Bool, Float64
 from scipy.stats import chi2
 
 from imutool.diagnosis.estimation import timestamps
@@ -18,13 +18,19 @@ from imutool.diagnosis.estimation.aligned_log import Pair
 from imutool.diagnosis.estimation.alignment import LEAST_S, same_motion, with_simulation, with_truth
 from imutool.diagnosis.estimation.jacobians import expected
 from imutool.diagnosis.estimation.whitening import WhitenedImu
-from imutool.diagnosis.reference_free_checks import unusable_axes
-from imutool.diagnosis.result import NO_REGIME, Estimate, Finding, HeldOut, Located
+from imutool.diagnosis.result import Diagnosis, Estimate, Finding, HeldOut, Located
 from imutool.diagnosis.settings import ReferenceSettings
+from imutool.diagnosis.wording.quantity import percent
 from imutool.errors import DataError, ImutoolError, NumericsError
-from imutool.recording import Recording
+from imutool.inertial.stationary import white_noise
+from imutool.recording import Recording, seconds
+from imutool.sensor import catalogue
+from imutool.sensor.samples import IdealMotion
 from imutool.sensor.trajectory import smooth_motion
-from imutool.units import ASCII_UNITS, AXES, SENSORS
+from imutool.units import ASCII_UNITS, AXES, SENSORS, UNITS
+
+SOME = 0.05  # of the samples of an axis at its limit, from which it is reported
+BY_THEMSELVES = frozenset({"saturation", "quantization"})  # of the catalogue
 
 
 def align_all(
@@ -194,7 +200,8 @@ def _where(
 ) -> Located:
     power = (white[inside] ** 2).mean(axis=0)
     axes = tuple(axis for axis, value in zip(AXES, power, strict=True) if value > 1.3)
-    return Located(signal, axes or AXES, tuple(runs), f"{NO_REGIME}: the reference's own moments", share, p_value)
+    regime = "no regime: the reference's own moments"
+    return Located(signal, axes or AXES, tuple(runs), regime, share, p_value, extent="intermittent")
 
 
 def _runs(loud: np.ndarray, start_s: float, settings: ReferenceSettings) -> list[tuple[float, float]]:
@@ -208,3 +215,51 @@ def _runs(loud: np.ndarray, start_s: float, settings: ReferenceSettings) -> list
         else:
             out.append((begin, end))
     return out
+
+
+# ── without a reference ──
+
+
+def check_without_reference(real: Recording, path: str, why: str) -> Diagnosis:
+    """Diagnosis without a reference, for the reason `why`: gaps, quantization, saturation.
+
+    The constant bias is not known either (NaN).
+    """
+    stamp_s = seconds(real.imu.t_ns, int(real.imu.t_ns[0]))
+    samples, no_rows = np.concatenate([real.imu.gyro, real.imu.accel], axis=1), np.zeros(len(stamp_s), bool)
+    pair = Pair(real.name, stamp_s, samples, no_rows, no_rows, ideal=IdealMotion(stamp_s, *np.zeros((3, len(stamp_s), 3))))
+    findings = [*timestamps.dropped([pair]), *timestamps.rounded([pair], white_noise(samples)), *_limits(pair)]
+    remark = f"{why.rstrip('.')}. Only what stamps and digits show by themselves could be asked"
+    hidden = tuple(effect.name for effect in catalogue.diagnosed() if effect.name not in BY_THEMSELVES)
+    return Diagnosis((path,), None, (), tuple(findings), np.full((1, 6), np.nan), hidden, {}, (remark,))
+
+
+def _limits(pair: Pair) -> list[Finding]:
+    """Saturation: samples that pile up at the largest value."""
+    limits = timestamps.limits(pair.real)
+    if not limits:
+        return []
+    parameters = {f"{signal}_limit": Estimate(value, 0.0, UNITS[signal]) for signal, value in limits.items()}
+    length = round(float(pair.stamp_s[-1] - pair.stamp_s[0]), 1)
+    signal = next(iter(limits)) if len(limits) == 1 else "both"
+    held_out = HeldOut(0.0, 0.0, "-", length)
+    return [Finding("saturation", signal, 0.0, 0.0, 0.0, parameters, "readings pile up at +-limit", held_out)]
+
+
+def unusable_axes(pair: Pair) -> list[str]:
+    """Unusable axes of a log, with the reason."""
+    stuck, clipped, saturated, out = timestamps.stuck(pair.real), timestamps.clipped(pair.real).mean(axis=0), at_limit(pair), []
+    for a in np.flatnonzero(stuck & ~saturated):
+        signal = SENSORS[a // 3]
+        out.append(f"{signal} {AXES[a % 3]} reads {pair.real[0, a]:.4g} {UNITS[signal]} in every sample")
+    for signal, most in timestamps.limits(pair.real).items():
+        k = 3 * SENSORS.index(signal)
+        share = ", ".join(f"{AXES[a - k]} in {percent(float(clipped[a]))}" for a in range(k, k + 3) if saturated[a])
+        if share:
+            out.append(f"{signal} is at its limit of {most:.4g} {UNITS[signal]}: {share} of the samples")
+    return out
+
+
+def at_limit(pair: Pair) -> Bool[np.ndarray, "6"]:
+    """Axes that are clipped in more than 5 % of the samples."""
+    return np.asarray(timestamps.clipped(pair.real).mean(axis=0) > SOME)

@@ -13,6 +13,7 @@ from jaxtyping import Bool, Float64
 from imutool.recording import Poses
 from imutool.sensor.effect import Effect, SignalState, Theta
 from imutool.sensor.samples import NOTHING, IdealMotion, SensorSamples
+from imutool.units import ASCII_UNITS, AXES
 
 BLOCK_S, HELD_OUT_EACH = 6.0, 3  # every third block of six seconds is never fitted
 MARGIN_S = 0.3  # around a border between blocks, counted for neither
@@ -20,6 +21,8 @@ GAP_PERIODS = 3.0  # a longer step between samples is a gap
 BIAS_STD = np.array([0.5] * 3 + [5.0] * 3)  # prior of a log's constant bias: rad/s, m/s²
 
 Blocks = tuple[tuple[int, Float64[np.ndarray, "n _"]], ...]
+Variables = Mapping[str, tuple[str, Float64[np.ndarray, " n"]]]
+IMU_SIGNALS: Mapping[str, slice] = {"gyro": slice(0, 3), "accel": slice(3, 6)}
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,6 +73,19 @@ class AlignedLog(ABC):
     @abstractmethod
     def recorded(self) -> tuple[Any, Any]:
         """Ideal signals, and the recorded samples in the form that effects take."""
+
+    @property
+    @abstractmethod
+    def signals(self) -> Mapping[str, slice]:
+        """Columns by the name of the signal."""
+
+    @abstractmethod
+    def unit_of(self, signal: str) -> str:
+        """Unit of a signal, as JSON holds it."""
+
+    @abstractmethod
+    def variables(self) -> Variables:
+        """Variables of a regime at the samples, with their units."""
 
     @property
     def usable(self) -> Bool[np.ndarray, "n k"]:
@@ -139,6 +155,32 @@ class Pair(AlignedLog):
     def blocks(self, samples: SensorSamples) -> Blocks:
         """Gyro, then accelerometer."""
         return (0, samples.gyro), (3, samples.accel)
+
+    @property
+    def signals(self) -> Mapping[str, slice]:
+        """Gyro and accelerometer."""
+        return IMU_SIGNALS
+
+    def unit_of(self, signal: str) -> str:
+        """rad/s or m/s^2."""
+        return ASCII_UNITS[signal]
+
+    def variables(self) -> Variables:
+        """Rates, forces, time, tilt and the channels of the log."""
+        read = self.ideal.sample(self.stamp_s, self.stamp_s)
+        rate, force = np.linalg.norm(read.gyro, axis=1), np.linalg.norm(read.accel, axis=1)
+        out = {
+            "angular rate": ("rad/s", rate),
+            "acceleration": ("m/s²", np.abs(force - 9.81)),
+            "angular acceleration": ("rad/s²", np.linalg.norm(read.alpha, axis=1)),
+            "time": ("s", self.stamp_s),
+        }
+        if read.R_wb is not None:
+            out["tilt"] = ("rad", np.arccos(np.clip(read.R_wb[:, 2, 2], -1.0, 1.0)))
+        for k, axis in enumerate(AXES):
+            out[f"rate about {axis}"] = ("rad/s", np.abs(read.gyro[:, k]))
+            out[f"force along {axis}"] = ("m/s²", np.abs(read.accel[:, k]))
+        return out | {name: ("", values) for name, values in self.channels.items()}
 
     def recorded(self) -> tuple[IdealMotion, SensorSamples]:
         """The ideal motion and the recorded samples; angular acceleration is not recorded."""

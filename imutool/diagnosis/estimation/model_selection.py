@@ -63,12 +63,16 @@ class SelectedEffect:
 
 @dataclass(frozen=True, eq=False)
 class Selection:
-    """Selected effects, strongest first, fits of fitted and of all rows, and count of trials."""
+    """Selected effects, strongest first, fits of fitted and of all rows, and count of trials.
+
+    The first `always` effects of the fits are in every fit, and no findings.
+    """
 
     selected: tuple[SelectedEffect, ...]
     fitted: Fit
     whole: Fit
     tried: int
+    always: int = 0
 
 
 def select_effects(
@@ -247,9 +251,9 @@ class _Search:
             if verdicts[worst].false_discovery_rate <= self.settings.false_discovery_rate:
                 selected = [replace(verdict, similar=self._similar(first + k, now)) for k, verdict in enumerate(verdicts)]
                 fitted = replace(now, chosen=with_onsets_of(now.chosen, whole.chosen))
-                return Selection(tuple(sorted(selected, key=lambda verdict: -verdict.gain)), fitted, whole, self.tried)
+                return Selection(tuple(sorted(selected, key=lambda verdict: -verdict.gain)), fitted, whole, self.tried, first)
             now = fit(self.logs, (*now.chosen[: first + worst], *now.chosen[first + worst + 1 :]), near=now)
-        return Selection((), now, fit(self.logs, now.chosen, part="all"), self.tried)
+        return Selection((), now, fit(self.logs, now.chosen, part="all"), self.tried, first)
 
     def _scattered(self, found: Fit) -> Scatter | None:
         """Robust covariance; none where the noise is known and the residuals are as white."""

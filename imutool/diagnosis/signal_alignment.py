@@ -1,21 +1,24 @@
-"""Alignment of a scalar signal with its simulation: one clock, no simulation noise."""
+"""Any other signal of a log, aligned with its simulation: one clock, no simulation noise."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from jaxtyping import Float64
 from scipy.interpolate import make_interp_spline
+from scipy.ndimage import map_coordinates, spline_filter
 from scipy.signal import correlate, correlation_lags, welch
 
-from imutool.diagnosis.estimation.aligned_log import GAP_PERIODS, MARGIN_S, split
+from imutool.diagnosis.estimation.aligned_log import GAP_PERIODS, MARGIN_S, AlignedLog, Blocks, Variables, split
 from imutool.diagnosis.estimation.alignment import FARTHEST_S, wiener_filter
 from imutool.diagnosis.estimation.whitening import SEGMENT
-from imutool.diagnosis.scalar.signal import AlignedSignal, Column, IdealSignal
 from imutool.errors import DataError
 from imutool.mcap_io.fields import Fields
 from imutool.recording import seconds
+from imutool.sensor.effect import SignalState
 
 LEAST_S, LEAST_SAMPLES = 15.0, 300  # two blocks to fit and one to test, and a spectrum
 OVERSAMPLED = 4.0  # so that a straight line between fine samples is the signal
@@ -24,6 +27,105 @@ ALIKE = 0.3  # correlation below which nothing says that the two are one motion
 MOVES = 1e-9  # of its largest value, below which a signal is constant
 TOP_BAND, TOP = 0.4, 0.45  # of the rate: between, a simulation's spectrum is its noise
 MOST_FINE = 20_000_000  # samples
+Column = Float64[np.ndarray, "_"]
+Samples = Float64[np.ndarray, " n"]
+
+
+@dataclass(frozen=True, eq=False)
+class SignalSamples:
+    """Signal samples between effects, with the ideal signal and its derivative.
+
+    `y` is the value now; `x` and `dx` (per second) are the ideal ones as sampled.
+    """
+
+    stamp_s: Samples
+    y: Samples
+    x: Samples
+    dx: Samples
+    channels: Mapping[str, tuple[Column, Column]]
+
+    def but(self, y: Samples) -> SignalSamples:
+        """The samples with another value."""
+        return replace(self, y=np.asarray(y))
+
+
+@dataclass(frozen=True, eq=False)
+class IdealSignal:
+    """Ideal signal on a fine even clock, and other channels by name with their times (s)."""
+
+    start_s: float
+    rate_hz: float
+    fine: Column
+    channels: Mapping[str, tuple[Column, Column]]
+
+    @cached_property
+    def _coefficients(self) -> tuple[Column, ...]:
+        return tuple(spline_filter(column) for column in (self.fine, np.gradient(self.fine) * self.rate_hz))
+
+    def sample(self, taken_s: Samples, stamp_s: Samples) -> SignalSamples:
+        """The signal sampled at some times (cubic splines)."""
+        at = ((taken_s - self.start_s) * self.rate_hz)[None]
+        x, dx = (map_coordinates(c, at, order=3, mode="nearest", prefilter=False) for c in self._coefficients)
+        return SignalSamples(stamp_s, x, x, dx, self.channels)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class AlignedSignal(AlignedLog):
+    """One recorded column with the ideal signal.
+
+    `lag_s` is how much later the recording follows at first sight, `sim_density` the density of the simulation's own noise.
+    """
+
+    ideal: IdealSignal
+    unit: str
+    lag_s: float
+    sim_density: float
+    shares_epoch: bool
+
+    exact, denoised = True, False
+
+    @property
+    def bias_std(self) -> Float64[np.ndarray, " k"]:
+        """The offset is an effect, which acts before saturation."""
+        return np.full(1, 1e-9)
+
+    def state(self) -> SignalState:
+        """The ideal signal, to be sampled at the stamps."""
+        return SignalState(self.ideal, self.stamp_s, self.stamp_s)
+
+    def blocks(self, samples: SignalSamples) -> Blocks:
+        """The one column."""
+        return ((0, samples.y[:, None]),)
+
+    @property
+    def signals(self) -> Mapping[str, slice]:
+        """The one signal."""
+        return {self.name: slice(0, 1)}
+
+    def unit_of(self, signal: str) -> str:
+        """Unit of the signal."""
+        return self.unit
+
+    def variables(self) -> Variables:
+        """Value, rate of change, time and the channels of the log."""
+        sampled = self.sampled
+        out = {
+            "its value": (self.unit, sampled.x),
+            "its size": (self.unit, np.abs(sampled.x - np.median(sampled.x))),
+            "its rate of change": (f"{self.unit}/s", np.abs(sampled.dx)),
+            "time": ("s", self.stamp_s),
+        }
+        channels = self.ideal.channels.items()
+        return out | {name: ("", np.interp(self.stamp_s, at_s, values)) for name, (at_s, values) in channels}
+
+    def recorded(self) -> tuple[IdealSignal, Samples]:
+        """The ideal signal and the recorded column."""
+        return self.ideal, self.real[:, 0]
+
+    @cached_property
+    def sampled(self) -> SignalSamples:
+        """The ideal signal at the stamps."""
+        return self.ideal.sample(self.stamp_s, self.stamp_s)
 
 
 def aligned(real: Fields, sim: Fields, others: Mapping[str, Fields], name: str) -> AlignedSignal:
