@@ -78,13 +78,18 @@ def diagnose(
     recordings = with_unique_names([read_log(real, imu=imu, truth=truth) for real in reals])
     simulated = None if sim is None else read_log(sim, imu=imu)
     sim_findings: tuple[Finding, ...] = ()
-    if sim is not None and simulated is not None and simulated.truths and is_another_motion(recordings, simulated, signals):
+    if (
+        sim is not None
+        and simulated is not None
+        and simulated.truths
+        and is_another_motion(recordings, simulated, signals, settings.alignment)
+    ):
         report(0, 4, "the simulation, of another motion")
         sim_findings, simulated = diagnose([sim], imu=imu, settings=settings).findings, None
     another_motion = sim is not None and simulated is None
-    pairs, left_out = align_all(recordings, simulated, truth, settings.reference)
+    pairs, left_out = align_all(recordings, simulated, truth, settings)
     if not pairs:
-        return check_without_reference(recordings[0], str(reals[0]), left_out[0])
+        return check_without_reference(recordings[0], str(reals[0]), left_out[0], settings)
     report(1, 4, "noise")
     candidates = candidates_for(pairs)
     logs = [whitened(pair, (*candidates, *unnamed.driven([pair])), settings.band) for pair in pairs]
@@ -92,9 +97,7 @@ def diagnose(
     report(2, 4, "searching")
     wrong, wrong_at = reference_errors(logs, settings.reference)
     named, unnamed_groups = ((), ()) if wrong else (candidates, unnamed_candidates(pairs))
-    selection = select_effects(
-        logs, named, unnamed_groups, lambda word: report(2, 4, f"trying {word}"), settings=settings.search
-    )
+    selection = select_effects(logs, named, unnamed_groups, lambda word: report(2, 4, f"trying {word}"))
     report(3, 4, "locating")
     paths = {recording.name: str(real) for recording, real in zip(recordings, reals, strict=True)}
     hidden = unobservable(logs, candidates, settings.search)
@@ -199,7 +202,7 @@ def effect_sizes(
     """
     simulated = None if sim is None else read_log(sim, imu=imu)
     settings = settings or DiagnoseSettings()
-    aligned = align(read_log(real, imu=imu, truth=truth), simulated, truth, settings.reference)
+    aligned = align(read_log(real, imu=imu, truth=truth), simulated, truth, settings)
     pairs = [without_unusable(pair, settings.reference) for pair in aligned]
     candidates = candidates_for(pairs)
     logs = [whitened(pair, candidates, settings.band) for pair in pairs]

@@ -15,11 +15,11 @@ from scipy.stats import chi2
 
 from imutool.diagnosis.estimation import timestamps
 from imutool.diagnosis.estimation.aligned_log import Pair
-from imutool.diagnosis.estimation.alignment import LEAST_S, same_motion, with_simulation, with_truth
+from imutool.diagnosis.estimation.alignment import same_motion, with_simulation, with_truth
 from imutool.diagnosis.estimation.jacobians import expected
 from imutool.diagnosis.estimation.whitening import WhitenedImu
 from imutool.diagnosis.result import Diagnosis, Estimate, Finding, HeldOut, Located
-from imutool.diagnosis.settings import ReferenceSettings
+from imutool.diagnosis.settings import AlignmentSettings, DiagnoseSettings, ReferenceSettings
 from imutool.diagnosis.wording.quantity import percent
 from imutool.errors import DataError, ImutoolError, NumericsError
 from imutool.inertial.stationary import white_noise
@@ -34,7 +34,7 @@ BY_THEMSELVES = frozenset({"saturation", "quantization"})  # of the catalogue
 
 
 def align_all(
-    recordings: Sequence[Recording], sim: Recording | None, truth: str | None, settings: ReferenceSettings
+    recordings: Sequence[Recording], sim: Recording | None, truth: str | None, settings: DiagnoseSettings
 ) -> tuple[list[Pair], list[str]]:
     """Recordings aligned with their references, and remarks on what is left out.
 
@@ -52,9 +52,9 @@ def align_all(
                 raise
             refused.append(error.at(recording.name))
             continue
-        pairs += [without_unusable(pair, settings) for pair in aligned]
+        pairs += [without_unusable(pair, settings.reference) for pair in aligned]
         covered = sum(float(pair.stamp_s[-1] - pair.stamp_s[0]) for pair in aligned)
-        if covered < settings.covered_share * recording.imu.duration_s:
+        if covered < settings.reference.covered_share * recording.imu.duration_s:
             what = "its true poses cover" if sim is None else "the simulation covers"
             remarks.append(
                 f"{recording.name}: {what} {covered:.0f} of {recording.imu.duration_s:.0f} s; the rest was not looked at"
@@ -75,13 +75,13 @@ def with_unique_names(recordings: Sequence[Recording]) -> list[Recording]:
     return out
 
 
-def is_another_motion(reals: Sequence[Recording], sim: Recording, signals: Sequence[str]) -> bool:
+def is_another_motion(reals: Sequence[Recording], sim: Recording, signals: Sequence[str], settings: AlignmentSettings) -> bool:
     """Whether the simulation is of another motion than every recording with true poses.
 
     Raises:
         DataError: it is of the motion of some only, or other signals are to be compared with it.
     """
-    alike = [same_motion(real.imu, sim.imu) for real in reals]
+    alike = [same_motion(real.imu, sim.imu, settings) for real in reals]
     if all(alike) or not all(real.truths for real in reals):
         return False
     if any(alike):
@@ -98,28 +98,29 @@ def is_another_motion(reals: Sequence[Recording], sim: Recording, signals: Seque
     return True
 
 
-def align(real: Recording, sim: Recording | None, truth: str | None, settings: ReferenceSettings) -> Iterator[Pair]:
+def align(real: Recording, sim: Recording | None, truth: str | None, settings: DiagnoseSettings) -> Iterator[Pair]:
     """The recording aligned with the simulation, or each interval of it with its own poses."""
     if sim is not None:
-        yield with_simulation(real, sim)
+        yield with_simulation(real, sim, settings)
         return
     if not real.truths:
         raise DataError("no simulation and no true poses", where=real.name, expected="`sim`, or poses in the log")
     chosen = real if truth is not None else real.with_truth(next(iter(real.truths)))
-    motion = smooth_motion(chosen.truth)
-    parts = [ideal for ideal in motion.ideal_motions(1.0 / real.imu.period_s) if ideal.t_s[-1] - ideal.t_s[0] >= LEAST_S]
+    motion, least_s = smooth_motion(chosen.truth), settings.alignment.least_s
+    parts = [ideal for ideal in motion.ideal_motions(1.0 / real.imu.period_s) if ideal.t_s[-1] - ideal.t_s[0] >= least_s]
     if not parts:
         raise DataError(
-            f"the true poses have no stretch of {LEAST_S:g} s that can be differentiated",
+            f"the true poses have no stretch of {least_s:g} s that can be differentiated",
             where=real.name,
             expected="poses at 40 Hz or more, without holes",
             fix="Give a simulation with `sim`",
         )
     for ideal in parts:
-        stretch = next(one for one in motion.stretches if one.start_s <= ideal.t_s[0] <= one.end_s)
+        stretch = next(part for part in motion.stretches if part.start_s <= ideal.t_s[0] <= part.end_s)
         started_ns = int(chosen.imu.t_ns[0])  # times are told from the log's start, also where its poses begin later
         since = replace(ideal, t_s=ideal.t_s + (motion.start_ns - started_ns) * 1e-9)
-        yield with_truth(chosen, since, started_ns, max(settings.band_share * min(stretch.cutoff_hz), settings.least_band_hz))
+        band_hz = max(settings.reference.band_share * min(stretch.cutoff_hz), settings.reference.least_band_hz)
+        yield with_truth(chosen, since, started_ns, band_hz, settings)
 
 
 def without_unusable(pair: Pair, settings: ReferenceSettings) -> Pair:
@@ -128,7 +129,7 @@ def without_unusable(pair: Pair, settings: ReferenceSettings) -> Pair:
     Raises:
         DataError: no axis is left.
     """
-    known = ~(timestamps.clipped(pair.real) | timestamps.stuck(pair.real))
+    known = ~(timestamps.clipped(pair.real, pair.settings.timestamps) | timestamps.stuck(pair.real))
     if known.all():
         return pair
     reduced = replace(pair, known=known)
@@ -220,14 +221,15 @@ def _runs(loud: np.ndarray, start_s: float, settings: ReferenceSettings) -> list
 # ── without a reference ──
 
 
-def check_without_reference(real: Recording, path: str, why: str) -> Diagnosis:
+def check_without_reference(real: Recording, path: str, why: str, settings: DiagnoseSettings) -> Diagnosis:
     """Diagnosis without a reference, for the reason `why`: gaps, quantization, saturation.
 
     The constant bias is not known either (NaN).
     """
     stamp_s = seconds(real.imu.t_ns, int(real.imu.t_ns[0]))
     samples, no_rows = np.concatenate([real.imu.gyro, real.imu.accel], axis=1), np.zeros(len(stamp_s), bool)
-    pair = Pair(real.name, stamp_s, samples, no_rows, no_rows, ideal=IdealMotion(stamp_s, *np.zeros((3, len(stamp_s), 3))))
+    no_motion = IdealMotion(stamp_s, *np.zeros((3, len(stamp_s), 3)))
+    pair = Pair(real.name, stamp_s, samples, no_rows, no_rows, ideal=no_motion, settings=settings)
     findings = [*timestamps.dropped([pair]), *timestamps.rounded([pair], white_noise(samples)), *_limits(pair)]
     remark = f"{why.rstrip('.')}. Only what stamps and digits show by themselves could be asked"
     hidden = tuple(effect.name for effect in catalogue.diagnosed() if effect.name not in BY_THEMSELVES)
@@ -236,7 +238,7 @@ def check_without_reference(real: Recording, path: str, why: str) -> Diagnosis:
 
 def _limits(pair: Pair) -> list[Finding]:
     """Saturation: samples that pile up at the largest value."""
-    limits = timestamps.limits(pair.real)
+    limits = timestamps.limits(pair.real, pair.settings.timestamps)
     if not limits:
         return []
     parameters = {f"{signal}_limit": Estimate(value, 0.0, UNITS[signal]) for signal, value in limits.items()}
@@ -248,11 +250,16 @@ def _limits(pair: Pair) -> list[Finding]:
 
 def unusable_axes(pair: Pair) -> list[str]:
     """Unusable axes of a log, with the reason."""
-    stuck, clipped, saturated, out = timestamps.stuck(pair.real), timestamps.clipped(pair.real).mean(axis=0), at_limit(pair), []
+    stuck, clipped, saturated, out = (
+        timestamps.stuck(pair.real),
+        timestamps.clipped(pair.real, pair.settings.timestamps).mean(axis=0),
+        at_limit(pair),
+        [],
+    )
     for a in np.flatnonzero(stuck & ~saturated):
         signal = SENSORS[a // 3]
         out.append(f"{signal} {AXES[a % 3]} reads {pair.real[0, a]:.4g} {UNITS[signal]} in every sample")
-    for signal, most in timestamps.limits(pair.real).items():
+    for signal, most in timestamps.limits(pair.real, pair.settings.timestamps).items():
         k = 3 * SENSORS.index(signal)
         share = ", ".join(f"{AXES[a - k]} in {percent(float(clipped[a]))}" for a in range(k, k + 3) if saturated[a])
         if share:
@@ -262,4 +269,4 @@ def unusable_axes(pair: Pair) -> list[str]:
 
 def at_limit(pair: Pair) -> Bool[np.ndarray, "6"]:
     """Axes that are clipped in more than 5 % of the samples."""
-    return np.asarray(timestamps.clipped(pair.real).mean(axis=0) > SOME)
+    return np.asarray(timestamps.clipped(pair.real, pair.settings.timestamps).mean(axis=0) > SOME)

@@ -12,20 +12,15 @@ from scipy.interpolate import make_interp_spline
 from scipy.ndimage import map_coordinates, spline_filter
 from scipy.signal import correlate, correlation_lags, welch
 
-from imutool.diagnosis.estimation.aligned_log import GAP_PERIODS, MARGIN_S, AlignedLog, Blocks, Variables, split
-from imutool.diagnosis.estimation.alignment import FARTHEST_S, wiener_filter
-from imutool.diagnosis.estimation.whitening import SEGMENT
+from imutool.diagnosis.estimation.aligned_log import AlignedLog, Blocks, Variables, split
+from imutool.diagnosis.estimation.alignment import wiener_filter
+from imutool.diagnosis.settings import DiagnoseSettings, SignalSettings
 from imutool.errors import DataError
 from imutool.mcap_io.fields import Fields
 from imutool.recording import seconds
 from imutool.sensor.effect import SignalState
 
-LEAST_S, LEAST_SAMPLES = 15.0, 300  # two blocks to fit and one to test, and a spectrum
-OVERSAMPLED = 4.0  # so that a straight line between fine samples is the signal
-ALIGN_HZ = 100.0
-ALIKE = 0.3  # correlation below which nothing says that the two are one motion
 MOVES = 1e-9  # of its largest value, below which a signal is constant
-TOP_BAND, TOP = 0.4, 0.45  # of the rate: between, a simulation's spectrum is its noise
 MOST_FINE = 20_000_000  # samples
 Column = Float64[np.ndarray, "_"]
 Samples = Float64[np.ndarray, " n"]
@@ -128,37 +123,39 @@ class AlignedSignal(AlignedLog):
         return self.ideal.sample(self.stamp_s, self.stamp_s)
 
 
-def aligned(real: Fields, sim: Fields, others: Mapping[str, Fields], name: str) -> AlignedSignal:
+def aligned(real: Fields, sim: Fields, others: Mapping[str, Fields], name: str, settings: DiagnoseSettings) -> AlignedSignal:
     """Align a signal with its simulation, in seconds from the first shared sample.
 
     Raises:
         DataError: constant, too short or too few, or nothing alike in the two.
     """
     for fields, what in ((real, "recording"), (sim, "simulation")):
-        _check(fields, what, name)
+        _check(fields, what, name, settings.signal)
     start_ns = int(real.t_ns[0])
     t_real, t_sim = seconds(real.t_ns, start_ns), seconds(sim.t_ns, start_ns)
-    lag_s, aligned_s = _lag(t_real, real.values, t_sim, sim.values, name)
+    lag_s, aligned_s = _lag(t_real, real.values, t_sim, sim.values, name, settings)
     if aligned_s is not None:
         t_sim, lag_s = t_sim - aligned_s, 0.0
     period_real, period_sim = float(np.median(np.diff(t_real))), float(np.median(np.diff(t_sim)))
     early, late = min(0.0, lag_s), max(0.0, lag_s)
     rows = np.flatnonzero((t_real - late >= t_sim[0]) & (t_real - early <= t_sim[-1]))
     shared_s = float(t_real[rows[-1]] - t_real[rows[0]]) if len(rows) > 1 else 0.0
-    if shared_s < LEAST_S or len(rows) < LEAST_SAMPLES:
+    if shared_s < settings.signal.least_s or len(rows) < settings.signal.least_samples:
         raise DataError(
             f"{shared_s:.1f} s and {len(rows)} samples of {name} are shared with the simulation",
             where=name,
-            expected=f"at least {LEAST_S:g} s and {LEAST_SAMPLES} samples",
+            expected=f"at least {settings.signal.least_s:g} s and {settings.signal.least_samples} samples",
             fix="Give logs of the same time, or longer ones",
         )
     part = slice(int(rows[0]), int(rows[-1]) + 1)
     channels = {other: (seconds(fields.t_ns, start_ns), fields.values) for other, fields in others.items() if len(fields) > 1}
-    ideal, sim_density = _ideal(t_sim, sim.values, period_sim, period_real, channels)
-    held_out, usable = split(t_real[part])
+    ideal, sim_density = _ideal(t_sim, sim.values, period_sim, period_real, channels, settings)
+    held_out, usable = split(t_real[part], settings.split)
     step = np.diff(t_sim)
-    for k in np.flatnonzero(step > max(GAP_PERIODS * period_sim, 0.1)):  # what was never simulated
-        usable &= (t_real[part] < t_sim[k] + early - MARGIN_S) | (t_real[part] > t_sim[k + 1] + late + MARGIN_S)
+    for k in np.flatnonzero(step > max(settings.split.gap_periods * period_sim, 0.1)):  # what was never simulated
+        usable &= (t_real[part] < t_sim[k] + early - settings.split.margin_s) | (
+            t_real[part] > t_sim[k + 1] + late + settings.split.margin_s
+        )
     return AlignedSignal(
         name,
         t_real[part],
@@ -172,21 +169,22 @@ def aligned(real: Fields, sim: Fields, others: Mapping[str, Fields], name: str) 
         lag_s=lag_s,
         sim_density=sim_density,
         shares_epoch=aligned_s is None,
+        settings=settings,
     )
 
 
-def _check(fields: Fields, what: str, name: str) -> None:
+def _check(fields: Fields, what: str, name: str, settings: SignalSettings) -> None:
     """Refuses what holds nothing to compare.
 
     Raises:
         DataError: too short, not finite, stamps that do not increase, constant.
     """
     length = float(fields.t_ns[-1] - fields.t_ns[0]) * 1e-9 if len(fields) else 0.0
-    if length < LEAST_S or len(fields) < LEAST_SAMPLES:
+    if length < settings.least_s or len(fields) < settings.least_samples:
         raise DataError(
             f"the {what} has {len(fields)} samples of {name} in {length:.1f} s",
             where=name,
-            expected=f"at least {LEAST_S:g} s and {LEAST_SAMPLES} samples",
+            expected=f"at least {settings.least_s:g} s and {settings.least_samples} samples",
             fix="Give a longer log",
         )
     if not np.isfinite(fields.values).all() or (np.diff(fields.t_ns) <= 0).any():
@@ -207,16 +205,21 @@ def _check(fields: Fields, what: str, name: str) -> None:
 
 
 def _ideal(
-    t_sim: Column, values: Column, period_sim: float, period_real: float, channels: Mapping[str, tuple[Column, Column]]
+    t_sim: Column,
+    values: Column,
+    period_sim: float,
+    period_real: float,
+    channels: Mapping[str, tuple[Column, Column]],
+    settings: DiagnoseSettings,
 ) -> tuple[IdealSignal, float]:
     """The simulation without white noise on a fine clock, and the density of that noise."""
     t_even = t_sim[0] + period_sim * np.arange(int((t_sim[-1] - t_sim[0]) / period_sim) + 1)
     even = np.interp(t_even, t_sim, values) if _jumps(values) else np.asarray(make_interp_spline(t_sim, values, k=3)(t_even))
-    f_hz, power = welch(even, 1.0 / period_sim, nperseg=min(SEGMENT, len(even)), average="median")
-    top = (f_hz >= TOP_BAND / period_sim) & (f_hz <= TOP / period_sim)
-    rate_hz = min(OVERSAMPLED / min(period_sim, period_real), MOST_FINE / (t_even[-1] - t_even[0]))
+    f_hz, power = welch(even, 1.0 / period_sim, nperseg=min(settings.noise.segment_samples, len(even)), average="median")
+    top = (f_hz >= settings.signal.noise_band / period_sim) & (f_hz <= settings.signal.noise_band_end / period_sim)
+    rate_hz = min(settings.signal.oversampling / min(period_sim, period_real), MOST_FINE / (t_even[-1] - t_even[0]))
     t_fine = t_even[0] + np.arange(int((t_even[-1] - t_even[0]) * rate_hz) + 1) / rate_hz
-    clean = wiener_filter(even)
+    clean = wiener_filter(even, settings.alignment)
     fine = np.interp(t_fine, t_even, clean) if _jumps(values) else np.asarray(make_interp_spline(t_even, clean, k=3)(t_fine))
     return IdealSignal(float(t_fine[0]), rate_hz, fine, channels), float(np.median(power[top]))
 
@@ -229,22 +232,25 @@ def _jumps(values: Column) -> bool:
     return float((np.diff(values) == 0.0).mean()) > 0.5
 
 
-def _lag(t_real: Column, real: Column, t_sim: Column, sim: Column, name: str) -> tuple[float, float | None]:
+def _lag(
+    t_real: Column, real: Column, t_sim: Column, sim: Column, name: str, settings: DiagnoseSettings
+) -> tuple[float, float | None]:
     """Lag (s) of the recording at first sight, and the clock shift (s) if no epoch is shared.
 
     Raises:
         DataError: nowhere are the two alike.
     """
-    a, b = _smooth(t_real, real), _smooth(t_sim, sim)
+    own = settings.signal
+    a, b = _smooth(t_real, real, own.align_hz), _smooth(t_sim, sim, own.align_hz)
     correlation = correlate(a, b, mode="full") / max(float(np.linalg.norm(a) * np.linalg.norm(b)), 1e-300)
-    lags = correlation_lags(len(a), len(b)) / ALIGN_HZ + float(t_real[0] - t_sim[0])
+    lags = correlation_lags(len(a), len(b)) / own.align_hz + float(t_real[0] - t_sim[0])
     shared = min(t_real[-1], t_sim[-1]) - max(t_real[0], t_sim[0])
     length = min(t_real[-1] - t_real[0], t_sim[-1] - t_sim[0])
-    near = np.abs(lags) <= FARTHEST_S
-    if shared > max(LEAST_S, 0.5 * length) and near.any() and np.abs(correlation[near]).max() > ALIKE:
+    near = np.abs(lags) <= settings.alignment.farthest_s
+    if shared > max(own.least_s, 0.5 * length) and near.any() and np.abs(correlation[near]).max() > own.least_correlation:
         return float(lags[near][np.argmax(np.abs(correlation[near]))]), None
     best = int(np.argmax(correlation))
-    if correlation[best] < ALIKE:
+    if correlation[best] < own.least_correlation:
         raise DataError(
             f"recording and simulation of {name} are not alike (correlation {correlation[best]:.2f} at best)",
             where=name,
@@ -254,8 +260,8 @@ def _lag(t_real: Column, real: Column, t_sim: Column, sim: Column, name: str) ->
     return 0.0, -float(lags[best])
 
 
-def _smooth(t_s: Column, values: Column) -> Float64[np.ndarray, " _"]:
+def _smooth(t_s: Column, values: Column, rate_hz: float) -> Float64[np.ndarray, " _"]:
     """On an even clock, without its mean."""
-    at = np.arange(t_s[0], t_s[-1], 1.0 / ALIGN_HZ)
+    at = np.arange(t_s[0], t_s[-1], 1.0 / rate_hz)
     even = np.interp(at, t_s, values)
     return np.asarray(even - even.mean())

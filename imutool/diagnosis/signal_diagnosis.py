@@ -14,23 +14,19 @@ from scipy.signal import welch
 from imutool.diagnosis import signal_effects as effects
 from imutool.diagnosis.estimation.jacobians import Chosen, expected
 from imutool.diagnosis.estimation.model_selection import Selection, select_effects
-from imutool.diagnosis.estimation.noise_estimate import ORDER, noise_std, ridge_fit
-from imutool.diagnosis.estimation.timestamps import LEAST_DIGITS, grid
+from imutool.diagnosis.estimation.noise_estimate import noise_std, ridge_fit
+from imutool.diagnosis.estimation.timestamps import grid
 from imutool.diagnosis.estimation.unnamed_effects import SplineBasis
-from imutool.diagnosis.estimation.whitening import LINES, SEGMENT, WhitenedLog, Whitener, autoregression
+from imutool.diagnosis.estimation.whitening import WhitenedLog, Whitener, autoregression
 from imutool.diagnosis.held_out import held_out_rms, noise_floor, unexplained_residuals, with_effects
 from imutool.diagnosis.localization import locate_findings
 from imutool.diagnosis.result import Estimate, Finding, HeldOut, Located, SignalTraces, Unexplained
-from imutool.diagnosis.settings import DiagnoseSettings
-from imutool.diagnosis.signal_alignment import TOP, AlignedSignal, Column, Samples, aligned
+from imutool.diagnosis.settings import DiagnoseSettings, NoiseSettings
+from imutool.diagnosis.signal_alignment import AlignedSignal, Column, Samples, aligned
 from imutool.diagnosis.summarize import finding_of
 from imutool.mcap_io.fields import Fields
 
-BETTER_NOISE = 0.95  # of what the noise was first taken for, below which effects are searched once more
-IN_BAND, ABOVE = 0.999, 1.3  # of the signal's power lie below its edge, and noise is measured from a little above that
-LOWEST, HIGHEST = 0.05, 0.3  # of the sample rate: least and most for the edge
 EXACT = 1e-3
-SAME_GRID = 0.01
 RICH_KNOTS = 12
 NO_EPOCH = "{}: the two clocks share no epoch; aligned by the signal ({:+.3f} s), so that a delay between them cannot be seen"
 
@@ -63,19 +59,21 @@ def diagnose_signal(
         DataError: constant, too short, or not of one motion; the message says what to do.
     """
     settings = settings or DiagnoseSettings()
-    pair = aligned(real, sim, others, name)
-    lsb = _lsb(real, sim)
+    pair = aligned(real, sim, others, name, settings)
+    lsb = _lsb(real, sim, settings)
     always: Chosen = ((effects.offset(float(np.ptp(pair.real)), pair.unit), np.zeros(1)),)
     if not pair.shares_epoch:
         always = ((effects.delay(0.0, effects.delay_step_s(pair)), np.zeros(1)), *always)
     candidates = [effect for effect in effects.named(pair) if effect.name != "delay" or pair.shares_epoch]
     later = [list(effects.driven(pair)), list(effects.unknown(pair))]
     log = _whitened(pair, _rich_residual(pair), lsb)
-    selection = select_effects([log], candidates, later, always=always, settings=settings.search)
+    selection = select_effects([log], candidates, later, always=always)
     rewhitened = _whitened(pair, (pair.real - expected(pair, selection.whole.chosen))[:, 0], lsb)
-    if _level(rewhitened) < BETTER_NOISE * _level(log):  # the effects' own high frequencies were taken for noise
+    if _level(rewhitened) < settings.signal.better_noise * _level(
+        log
+    ):  # the effects' own high frequencies were taken for noise
         log = rewhitened
-        selection = select_effects([log], candidates, later, always=always, settings=settings.search)
+        selection = select_effects([log], candidates, later, always=always)
     return _summarized(pair, log, selection, lsb, settings)
 
 
@@ -89,30 +87,32 @@ def _whitened(pair: AlignedSignal, residual: Samples, lsb: float) -> WhitenedLog
     modelled is not taken for noise; the simulation's own noise, which is in its band, comes on top. An error of rounding is no
     white noise where the signal is slow: the density is no less than that.
     """
-    usable, rate_hz = pair.usable[:, 0], 1.0 / pair.period_s
-    edge = _edge_hz(pair.sampled.x, rate_hz)
-    f_hz, power = _density(residual, usable, rate_hz)
-    near = (f_hz >= edge) & (f_hz <= min(2.0 * edge, TOP * rate_hz))
-    far = (f_hz >= edge) & (f_hz <= TOP * rate_hz)
+    usable, rate_hz, settings = pair.usable[:, 0], 1.0 / pair.period_s, pair.settings
+    edge, top_hz = _edge_hz(pair.sampled.x, rate_hz, settings), settings.signal.noise_band_end * rate_hz
+    f_hz, power = _density(residual, usable, rate_hz, settings.noise)
+    near = (f_hz >= edge) & (f_hz <= min(2.0 * edge, top_hz))
+    far = (f_hz >= edge) & (f_hz <= top_hz)
     power[f_hz < edge] = max(float(np.median(power[near])), float(np.median(power[far]))) + pair.sim_density
     if lsb:
         model = pair.real[:, 0] - residual
-        power = np.maximum(power, _density(np.rint(model / lsb) * lsb - model, usable, rate_hz)[1])
-    filter_, std = autoregression(power, rate_hz, ORDER)
+        power = np.maximum(power, _density(np.rint(model / lsb) * lsb - model, usable, rate_hz, settings.noise)[1])
+    filter_, std = autoregression(power, rate_hz, settings.noise.order)
     return WhitenedLog(pair, Whitener(filter_[None], np.array([std])))
 
 
-def _edge_hz(x: Samples, rate_hz: float) -> float:
+def _edge_hz(x: Samples, rate_hz: float, settings: DiagnoseSettings) -> float:
     """Frequency where a signal's power ends, within what a noise can be measured above."""
-    f_hz, power = welch(x, rate_hz, nperseg=min(SEGMENT, len(x)))
+    own = settings.signal
+    f_hz, power = welch(x, rate_hz, nperseg=min(settings.noise.segment_samples, len(x)))
     share = np.cumsum(power) / max(float(power.sum()), 1e-300)
-    return float(np.clip(ABOVE * f_hz[np.searchsorted(share, IN_BAND)], LOWEST * rate_hz, HIGHEST * rate_hz))
+    edge_hz = own.edge_factor * f_hz[np.searchsorted(share, own.power_share)]
+    return float(np.clip(edge_hz, own.least_edge * rate_hz, own.most_edge * rate_hz))
 
 
-def _density(x: Samples, usable: Bool[np.ndarray, " n"], rate_hz: float) -> tuple[Column, Column]:
+def _density(x: Samples, usable: Bool[np.ndarray, " n"], rate_hz: float, settings: NoiseSettings) -> tuple[Column, Column]:
     """Frequencies, and the one-sided density of the usable part of a signal, without lines."""
-    f_hz, power = welch(np.where(usable, x, 0.0), rate_hz, nperseg=min(SEGMENT, len(x)), average="median")
-    return f_hz, np.asarray(median_filter(power, LINES, mode="nearest")) / max(float(usable.mean()), 1e-3)
+    f_hz, power = welch(np.where(usable, x, 0.0), rate_hz, nperseg=min(settings.segment_samples, len(x)), average="median")
+    return f_hz, np.asarray(median_filter(power, settings.line_bins, mode="nearest")) / max(float(usable.mean()), 1e-3)
 
 
 def _level(log: WhitenedLog) -> float:
@@ -135,13 +135,13 @@ def _rich_residual(pair: AlignedSignal) -> Samples:
     return np.asarray(pair.real[:, 0] - ridge_fit(np.stack(columns, axis=1), pair.real[:, 0], pair.usable[:, 0]))
 
 
-def _lsb(real: Fields, sim: Fields) -> float:
+def _lsb(real: Fields, sim: Fields, settings: DiagnoseSettings) -> float:
     """Quantization step of recorded values.
 
     0 where they lie on no grid, or the simulation's lie on the same.
     """
-    step, simulated = grid(real.values), grid(sim.values)
-    return 0.0 if simulated and abs(step / simulated - 1.0) < SAME_GRID else step
+    step, simulated = (grid(fields.values, settings.timestamps) for fields in (real, sim))
+    return 0.0 if simulated and abs(step / simulated - 1.0) < settings.signal.same_grid else step
 
 
 # ── report ──
@@ -156,7 +156,7 @@ def _summarized(
     p_values = {name: min((finding.p_value for finding in findings), default=1.0)}
     located = locate_findings([pair], [before], [after], level, (), p_values, settings.localization) if findings else []
     floor = level
-    if lsb > LEAST_DIGITS * float(level[0]):
+    if lsb > settings.timestamps.least_digits * float(level[0]):
         finding, rounded = _quantization(log, after, lsb)
         after = rounded if finding.held_out.rms_after < finding.held_out.rms_before else after
         findings, floor = [*findings, finding], np.hypot(level, lsb / np.sqrt(12.0))

@@ -27,7 +27,6 @@ MOVED = 0.005  # of the signal's size, by which derivatives move it: more than a
 LOG_MOVED = 0.02  # of the logarithm of a positive parameter, likewise
 KNOTS, KNOTS_OF_TIME = 7, 15
 BEND = 0.3  # of the signal's size: a second difference between a curve's knots
-COPY = 0.98  # correlation above which another channel is a copy of the signal
 
 
 def _effect(
@@ -224,7 +223,10 @@ def driven(signal: AlignedSignal) -> Iterator[Effect]:
     for name, (t_s, values) in sorted(signal.ideal.channels.items()):
         channel = np.interp(signal.stamp_s, t_s, values)
         spread = float(channel.std())
-        if not spread > 1e-12 * max(1.0, float(np.abs(channel).max())) or abs(float(np.corrcoef(channel, real)[0, 1])) > COPY:
+        if (
+            not spread > 1e-12 * max(1.0, float(np.abs(channel).max()))
+            or abs(float(np.corrcoef(channel, real)[0, 1])) > signal.settings.signal.copy_correlation
+        ):
             continue
         numbers = (Parameter("gain", f"{signal.unit or '1'} per unit of {name}", size / spread), Parameter("lag", "s", 0.2))
         yield _effect(
