@@ -1,4 +1,4 @@
-"""Catalogue of the effects that a blind case may conceal, named and unnamed, with their sizes.
+"""Catalogue of the effects that a blind case may conceal: sizes, named and unnamed ones.
 
 Unnamed are odd terms of the signals, and columns that another channel drives.
 """

@@ -78,12 +78,7 @@ def diagnose(
     recordings = with_unique_names([read_log(real, imu=imu, truth=truth) for real in reals])
     simulated = None if sim is None else read_log(sim, imu=imu)
     sim_findings: tuple[Finding, ...] = ()
-    if (
-        sim is not None
-        and simulated is not None
-        and simulated.truths
-        and is_another_motion(recordings, simulated, signals, settings.alignment)
-    ):
+    if sim is not None and simulated is not None and is_another_motion(recordings, simulated, signals, settings.alignment):
         report(0, 4, "the simulation, of another motion")
         sim_findings, simulated = diagnose([sim], imu=imu, settings=settings).findings, None
     another_motion = sim is not None and simulated is None

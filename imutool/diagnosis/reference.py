@@ -82,7 +82,7 @@ def is_another_motion(reals: Sequence[Recording], sim: Recording, signals: Seque
         DataError: it is of the motion of some only, or other signals are to be compared with it.
     """
     alike = [same_motion(real.imu, sim.imu, settings) for real in reals]
-    if all(alike) or not all(real.truths for real in reals):
+    if all(alike) or not sim.truths or not all(real.truths for real in reals):
         return False
     if any(alike):
         raise DataError(
