@@ -16,7 +16,6 @@ from typer.testing import CliRunner
 
 from imutool.bias import hybrid
 from imutool.bias.io import load
-from imutool.cli.app import app
 from imutool.config import build
 from imutool.config import load as load_settings
 from imutool.errors import ConfigError, DataError, LogError, ModelError, NumericsError
@@ -389,6 +388,8 @@ def test_a_physics_file_of_which_hybrid_knows_nothing_is_refused(tmp_path: Path)
     file.write_text(entry("saturation", "gyro", "rad/s"))
     with pytest.raises(ConfigError, match="no effect that a bias model can correct"):
         settings_for(file)
-    said = CliRunner().invoke(app, ["train", "a.mcap", "-o", str(tmp_path / "m"), "--method", "linear", "--physics", str(file)])
+    said = CliRunner().invoke(
+        load(), ["train", "a.mcap", "-o", str(tmp_path / "m"), "--method", "linear", "--physics", str(file)]
+    )
     assert said.exit_code == 3
     assert "linear knows no effects" in said.output
