@@ -57,9 +57,8 @@ def score(folder: Path, kind: Switchings, methods: list[str], words: list[str]) 
         settings = load(settings_of(method), None, words if method == "hybrid" else [])
         card = train(training, Path(models[-1]), method=method, settings=settings).card
         print(method, {key: card[key] for key in ("physics", "compared") if key in card}, file=sys.stderr)
-    print(
-        f"| sensor {kind.sensor_seed} | raw | {' | '.join(Path(model).stem for model in models)} |\n|{'---|' * (len(models) + 2)}"
-    )
+    names = ["raw", *(Path(model).stem for model in models)]
+    print(f"| sensor {kind.sensor_seed} | {' | '.join(names)} |\n|{'---|' * (len(names) + 1)}")
     for start in STARTS:
         rows = [
             evaluate(test, models=models, init="auto" if start == "smooth" else start, smooth=start == "smooth")
