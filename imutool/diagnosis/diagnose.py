@@ -31,6 +31,7 @@ from imutool.diagnosis.reference import (
     align_all,
     check_without_reference,
     is_another_motion,
+    reference_caveat,
     reference_errors,
     with_unique_names,
     without_unusable,
@@ -103,8 +104,9 @@ def diagnose(
     if simulated is not None and any(finding.effect not in NO_EFFECT for finding in diagnosis.findings):
         report(3, 4, "simulating again")
         diagnosis = _resimulated(diagnosis, logs, selection, simulated)
+    caveat = reference_caveat(recordings) if simulated is None else ""
     tried = dict.fromkeys(log.remark for log in logs_read if log.remark)
-    diagnosis = replace(diagnosis, remarks=(*another, *left_out, *diagnosis.remarks, *tried))
+    diagnosis = replace(diagnosis, remarks=(*another, *left_out, *diagnosis.remarks, *tried), caveat=caveat)
     diagnosis = replace(diagnosis, findings=(*wrong, *diagnosis.findings), located=tuple(wrong_at) or diagnosis.located)
     for signal, real, simulated_field in signal_fields:
         report(3, 4, signal)

@@ -1,7 +1,7 @@
 """Channels of a log that may drive a sensor: numeric fields of all messages but the reference's.
 
-Left out are constants, enumerations, counters and clocks, covariances, stamps, copies of another channel, and what the
-reference or imutool itself brings: a ground truth's bias estimate explains a misfit without being its cause.
+Left out are poses and IMUs, constants, enumerations, counters and clocks, covariances, stamps, copies of another channel, and
+what the reference or imutool itself brings: a ground truth's bias estimate explains a misfit without being its cause.
 """
 
 from __future__ import annotations
@@ -13,12 +13,12 @@ import numpy as np
 from jaxtyping import Float64
 
 from imutool.location import Location
-from imutool.mcap_io.codec.schemas import IMU
+from imutool.mcap_io.codec.schemas import IMU, TF
 from imutool.mcap_io.fields import Fields, others
 from imutool.mcap_io.log import Log
 from imutool.recording import Recording, Scalars, seconds
 
-MOST_READ, MOST_TRIED = 200, 12  # fields of a log that are read, and those that become channels
+MOST_READ, MOST_TRIED = 200, 6  # fields of a log that are read, and those that become channels
 LEAST_MESSAGES = 5
 LEAST_COVERAGE = 0.5  # of the IMU's time
 MOST_STATES = 16  # distinct whole numbers of an enumeration; two are a switch, which may drive
@@ -57,9 +57,9 @@ def with_channels(recording: Recording, path: Location) -> Channels:
     """
     scalars = {topic: values for topic, values in recording.scalars.items() if not brought_by_reference(topic, recording)}
     with Log(path) as log:
-        imus = {topic.name for topic in log.with_schema((IMU,))}
+        moved = {topic.name for topic in log.with_schema((IMU, TF))} | set(log.pose_topics)
         brought = {name for name in log.topics if brought_by_reference(name, recording)}
-    fields = others(path, "", MOST_READ, skip={*imus, *brought, *recording.scalars, *recording.truths})
+    fields = others(path, "", MOST_READ, skip={*moved, *brought, *recording.scalars, *recording.truths})
     varying = {name: field for name, field in fields.items() if _may_drive(field, recording)}
     names = sorted(varying, key=lambda name: "temperature" not in name.lower())  # a sort keeps the log's order otherwise
     added, untried = _distinct(names, varying, scalars, recording)
