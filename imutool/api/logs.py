@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
+from imutool import conversion
 from imutool.api.paths import LogPath, local, location
-from imutool.conversion import run as conversion
-from imutool.conversion.run import ConvertReport
+from imutool.conversion import ConvertReport
 from imutool.exporting.export import export as export_log
 from imutool.exporting.folder import ExportReport
 from imutool.log_info import inspection

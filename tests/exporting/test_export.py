@@ -23,7 +23,7 @@ from rosbags.rosbag2 import Reader
 from rosbags.typesys import Stores, get_typestore
 from ruamel.yaml import YAML
 
-from imutool.conversion.run import convert
+from imutool.conversion import convert
 from imutool.converters import euroc
 from imutool.debiasing import debias
 from imutool.errors import ConfigError, ImutoolError, LogError

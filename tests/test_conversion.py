@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from imutool import registry
-from imutool.conversion.run import ConvertReport, convert
+from imutool.conversion import ConvertReport, convert
 from imutool.errors import ConfigError, DataError
 from imutool.mcap_io.log import Log
 from imutool.mcap_io.read import read
@@ -256,6 +256,6 @@ def test_converting_needs_no_torch():
     import subprocess
 
     heavy = "('torch', 'rosbags', 'rerun', 'matplotlib')"
-    code = f"import imutool.conversion.run, imutool.log_info.inspection, sys; print([m for m in {heavy} if m in sys.modules])"
+    code = f"import imutool.conversion, imutool.log_info.inspection, sys; print([m for m in {heavy} if m in sys.modules])"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"

@@ -1,25 +1,26 @@
 """Conversion of data sets to MCAP: find the sequences, choose a converter, write the logs.
 
 Sequences convert in worker processes, one log a sequence; a sequence that fails is reported and the others go on.
-A script that calls `convert` with several workers needs the usual `if __name__ == "__main__":` (processes are spawned).
 """
 
 from __future__ import annotations
 
 import difflib
 import os
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import chain, islice
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 from imutool import registry
-from imutool.conversion.workers import GROUP, Job, run_jobs
 from imutool.errors import ConfigError, DataError, ImutoolError
 from imutool.mcap_io.write import write
 from imutool.recording import Recording
+from imutool.worker_pool import WorkerBugError, WorkerPool
 
+GROUP = "imutool.converters"
 AUTO = "auto"
 SUFFIX = ".mcap"
 Progress = Callable[[int, int, str], None]  # sequences done, sequences in all, the name of the one that just ended
@@ -41,11 +42,23 @@ class ConvertReport:
     failures: list[Failure] = field(default_factory=list)
 
 
+@dataclass(frozen=True)
+class _Job:
+    """Conversion of one sequence to one log."""
+
+    converter: str
+    sequence: Any  # the converter's own handle: has a `name`, and pickles
+    target: Path = Path()
+    compression: str = "zstd"
+    images: bool = True
+    overwrite: bool = False
+
+
 @dataclass
 class _Sequences:
     """Recognised sequences of a source, and the others with their errors."""
 
-    jobs: list[Job] = field(default_factory=list)
+    jobs: list[_Job] = field(default_factory=list)
     errors: list[tuple[str, ImutoolError]] = field(default_factory=list)
 
     def names(self) -> list[str]:
@@ -90,7 +103,7 @@ def convert(
     _check_targets(jobs)
     outcomes: dict[int, ImutoolError | None] = {}
     done = len(source_sequences.errors)
-    for number, error in run_jobs(jobs, _worker_count(workers, len(jobs))):
+    for number, error in _run(jobs, _worker_count(workers, len(jobs))):
         outcomes[number] = error
         done += 1
         if progress is not None:
@@ -104,6 +117,38 @@ def convert(
     )
 
 
+def _run(jobs: Sequence[_Job], workers: int) -> Iterator[tuple[int, ImutoolError | None]]:
+    """Yield each job's number and its error, if it failed, as the jobs end.
+
+    After an interrupt the processes remove what they have half written.
+    """
+    if workers <= 1:
+        yield from ((number, _convert_one(job)) for number, job in enumerate(jobs))
+        return
+    with WorkerPool(_convert_numbered, workers) as pool:
+        for outcome in pool.run(enumerate(jobs)):
+            number, job = outcome.item
+            if isinstance(outcome.error, WorkerBugError):
+                outcome.error.add_note(outcome.error.trace)
+                raise outcome.error
+            why = f"its process died ({outcome.error}), perhaps for want of memory"
+            died = DataError(why, where=str(job.sequence), fix="Use fewer `workers`")
+            yield number, died if outcome.error is not None else outcome.value
+
+
+def _convert_numbered(item: tuple[int, _Job]) -> ImutoolError | None:
+    return _convert_one(item[1])
+
+
+def _convert_one(job: _Job) -> ImutoolError | None:
+    try:
+        recording = registry.load(GROUP, job.converter).read_sequence(job.sequence, images=job.images)
+        write(recording, job.target, compression=job.compression, overwrite=job.overwrite)
+    except ImutoolError as error:
+        return error
+    return None
+
+
 def _find(source: Path, format: str) -> _Sequences:
     """Find every sequence of the source, with its converter.
 
@@ -111,7 +156,7 @@ def _find(source: Path, format: str) -> _Sequences:
         DataError: there is none.
         ConfigError: a sequence is claimed twice.
     """
-    claims: dict[str, list[Job]] = {}
+    claims: dict[str, list[_Job]] = {}
     errors: dict[str, tuple[str, ImutoolError]] = {}
     for key in registry.names(GROUP) if format == AUTO else [format]:
         module = registry.load(GROUP, key)
@@ -121,7 +166,7 @@ def _find(source: Path, format: str) -> _Sequences:
             mine = claims.setdefault(str(sequence), [])
             try:
                 if format != AUTO or module.recognises(sequence):
-                    mine.append(Job(key, sequence))
+                    mine.append(_Job(key, sequence))
                 elif not mine:
                     reason = DataError("no converter recognises it", where=str(sequence), fix="Choose one with `format`")
                     errors.setdefault(str(sequence), (sequence.name, reason))
@@ -182,9 +227,9 @@ def _targets(names: Sequence[str], out: Path, *, many: bool) -> list[Path]:
     return [out / f"{name}{SUFFIX}" if into_folder else out for name in names]
 
 
-def _check_targets(jobs: Sequence[Job]) -> None:
+def _check_targets(jobs: Sequence[_Job]) -> None:
     """Refuse to overwrite a log, a source, or another log of the same run."""
-    jobs_by_target: dict[Path, Job] = {}
+    jobs_by_target: dict[Path, _Job] = {}
     for job in jobs:
         if (other := jobs_by_target.setdefault(job.target, job)) is not job:
             raise ConfigError(

@@ -1,1 +1,0 @@
-"""Conversion of data sets to MCAP logs, in worker processes."""
