@@ -27,7 +27,7 @@ from imutool.bias_start.initial_bias import InitialBias, from_numbers, prior, sm
 from imutool.bias_start.model_choice import estimate_at_rest
 from imutool.cleaning import CleaningSettings
 from imutool.cli.debias import assigned
-from imutool.conversion import convert
+from imutool.conversion.run import convert
 from imutool.debiasing import debias
 from imutool.errors import ConfigError, LogError, ModelError
 from imutool.mcap_io.codec import schemas

@@ -19,7 +19,7 @@ from scipy.spatial.transform import Rotation
 
 from imutool.bias import linear
 from imutool.bias.io import save
-from imutool.conversion import convert
+from imutool.conversion.run import convert
 from imutool.errors import ConfigError, DataError, LogError, ModelError, NumericsError
 from imutool.evaluation import evaluate, runs
 from imutool.inertial import metrics

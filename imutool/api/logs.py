@@ -6,8 +6,8 @@ import difflib
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from imutool import conversion
-from imutool.conversion import ConvertReport
+from imutool.conversion import run as conversion
+from imutool.conversion.run import ConvertReport
 from imutool.errors import ConfigError
 from imutool.exporting import ExportReport, euroc, rosbag2
 from imutool.location import LogPath, local, location

@@ -64,7 +64,7 @@ def convert(
     quiet: Quiet = False,
 ) -> None:
     """Convert a data set to MCAP: each sequence becomes a log."""
-    from imutool.conversion import convert as run
+    from imutool.conversion.run import convert as run
 
     with progress("Converting", verbose, quiet) as tell:
         report = run(

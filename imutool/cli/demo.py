@@ -11,7 +11,7 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from imutool.conversion import convert
+from imutool.conversion.run import convert
 from imutool.debiasing import debias
 from imutool.errors import ConfigError
 from imutool.evaluation import evaluate

@@ -21,11 +21,11 @@ from typing import Any, Protocol
 
 import msgspec
 
+from imutool.conversion.worker_pool import ONE_THREAD, WorkerBugError, WorkerPool
 from imutool.errors import ConfigError, LogError
 from imutool.fleet.task import Result, Task
 from imutool.fleet.work import work
 from imutool.location import redact
-from imutool.worker_pool import ONE_THREAD, WorkerBugError, WorkerPool
 
 AHEAD = 2  # tasks in flight for each that can be worked on: the next one is there when one ends
 POLL_S = 0.5
@@ -62,7 +62,7 @@ class ProcessEngine:
         memory = _memory_bytes()
         _refuse_too_much(memory_bytes, memory)
         cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-        self._workers = max(1, min(workers or cores, memory // max(memory_bytes, 1)))
+        self.workers = max(1, min(workers or cores, memory // max(memory_bytes, 1)))
         self._retries = retries
 
     def __enter__(self) -> ProcessEngine:
@@ -77,7 +77,7 @@ class ProcessEngine:
         Raises:
             ConfigError: the processes do not start.
         """
-        with WorkerPool(partial(_work_quietly, model=model), self._workers, retries=self._retries) as pool:
+        with WorkerPool(partial(_work_quietly, model=model), self.workers, retries=self._retries) as pool:
             for outcome in pool.run(tasks, tick):
                 if outcome.error is None:
                     yield outcome.value
@@ -103,7 +103,7 @@ def _memory_bytes() -> int:
     return min(limits)
 
 
-def _refuse_too_much(wanted: int, most: float) -> None:
+def _refuse_too_much(wanted: int, most: int) -> None:
     if wanted > most:
         raise ConfigError(
             f"{wanted / 2**30:.2f} GiB for each task",
@@ -155,7 +155,7 @@ class RayEngine:
         try:
             if not self._ray.is_initialized():
                 self._connect(address)
-            _refuse_too_much(memory_bytes, max((node.get("memory", 0.0) for node in self._nodes()), default=0.0))
+            _refuse_too_much(memory_bytes, int(max((node.get("memory", 0.0) for node in self._nodes()), default=0.0)))
         except BaseException:
             self.close()
             raise

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from imutool.bias.io import find_model, header_of, library, load, shipped_for
-from imutool.conversion import convert
+from imutool.conversion.run import convert
 from imutool.debiasing import debias
 from imutool.evaluation import evaluate
 from imutool.mcap_io.log import Log

@@ -24,7 +24,7 @@ from rosbags.typesys import Stores, get_typestore
 from ruamel.yaml import YAML
 
 from imutool.api.logs import export
-from imutool.conversion import convert
+from imutool.conversion.run import convert
 from imutool.converters import euroc
 from imutool.debiasing import debias
 from imutool.errors import ConfigError, ImutoolError, LogError

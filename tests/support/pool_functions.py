@@ -26,6 +26,12 @@ def follow(item: tuple[str, str]) -> str:
     return path
 
 
+def end_at_first(item: tuple[int, object]) -> None:
+    """Ends its process at the first item."""
+    if item[0] == 0:
+        os._exit(9)
+
+
 def no_worker(item: object) -> object:
     """Cannot be found by a worker: the test takes it away."""
     return item

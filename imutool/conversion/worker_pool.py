@@ -39,9 +39,12 @@ TERMINATED = 143
 READY = b"ready"
 KILLED = (-signal.SIGKILL, -signal.SIGTERM)
 ONE_THREAD = {"OMP_NUM_THREADS": "1", "OMP_WAIT_POLICY": "PASSIVE", "OPENBLAS_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
-START = (
-    "import sys, json; sys.path[:] = json.loads(sys.argv[2]); from imutool.worker_pool import serve; serve(int(sys.argv[1]))"
-)
+START = """
+import sys, json
+sys.path[:] = json.loads(sys.argv[2])
+from imutool.conversion.worker_pool import serve
+serve(int(sys.argv[1]))
+"""
 Tick = Callable[[int], None]
 
 
@@ -249,12 +252,13 @@ def serve(descriptor: int) -> None:
     with contextlib.suppress(OSError):  # when memory runs out a worker ends, not the process that keeps the results
         Path("/proc/self/oom_score_adj").write_text("500")
     connection, items = Connection(descriptor), queue.SimpleQueue[Any]()
-    with contextlib.suppress(EOFError, OSError):  # the other end has gone
+    with contextlib.suppress(EOFError, OSError, SystemExit):  # the other end has gone, or wants this one to end
         function = pickle.loads(connection.recv_bytes())  # noqa: S301  from the process that started this one
         connection.send_bytes(READY)
         threading.Thread(target=_listen, args=(connection, items), daemon=True).start()
         while True:
             connection.send_bytes(_applied(function, items.get()))
+    os._exit(TERMINATED)  # at once: a library's own clean-up at the interpreter's end can take seconds
 
 
 def _applied(function: Callable[[Any], Any], item: Any) -> bytes:

@@ -15,10 +15,10 @@ from types import ModuleType
 from typing import Any
 
 from imutool import registry
+from imutool.conversion.worker_pool import WorkerBugError, WorkerPool
 from imutool.errors import ConfigError, DataError, ImutoolError
 from imutool.mcap_io.write import write
 from imutool.recording import Recording
-from imutool.worker_pool import WorkerBugError, WorkerPool
 
 GROUP = "imutool.converters"
 AUTO = "auto"
