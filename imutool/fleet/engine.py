@@ -45,7 +45,7 @@ class Engine(Protocol):
     def __exit__(self, *_: object) -> None: ...
 
     def run(self, tasks: Iterable[Task], tick: Tick, model: bytes | None) -> Generator[Result]:
-        """Yield results as tasks end; `tick` gets the number of running tasks, and every worker gets `model`.
+        """Yield results as tasks end.
 
         The task of a worker that dies goes to another one.
         """
@@ -69,14 +69,10 @@ class ProcessEngine:
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Do nothing: `run` has ended its processes."""
+        pass  # `run` has ended its processes
 
     def run(self, tasks: Iterable[Task], tick: Tick = lambda running: None, model: bytes | None = None) -> Generator[Result]:
-        """Yield results as tasks end; `tick` gets the number of running tasks, and every worker gets `model`.
-
-        Raises:
-            ConfigError: the processes do not start.
-        """
+        """Yield results as tasks end; a ConfigError says that processes do not start."""
         with WorkerPool(partial(_work_quietly, model=model), self.workers, retries=self._retries) as pool:
             for outcome in pool.run(tasks, tick):
                 if outcome.error is None:
@@ -188,7 +184,7 @@ class RayEngine:
         return max(1, fits if self._workers is None else min(fits, self._workers))
 
     def run(self, tasks: Iterable[Task], tick: Tick = lambda running: None, model: bytes | None = None) -> Generator[Result]:
-        """Yield results as tasks end; `tick` gets the number of running tasks, and every worker gets `model`.
+        """Yield results as tasks end.
 
         The task of a worker that dies goes to another one, up to `retries` times, then once more to a machine of its own: what
         killed the worker may have been another log.
