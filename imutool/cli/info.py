@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, NoReturn
 import typer
 from msgspec.structs import replace
 
-from imutool.cli.app import LOST, Json, Overwrite, Quiet, Verbose, app
+from imutool.cli.app import LOST, PNG, TOML, Json, Overwrite, Quiet, Verbose, app
 from imutool.cli.terminal import log_to_stderr, out, plain, say, table, tell_losses, write_json
 from imutool.errors import ConfigError
 from imutool.location import to_location
@@ -28,8 +28,12 @@ def info(
     model: Annotated[str | None, typer.Option(help="For --noise: model that corrects the samples in motion.")] = None,
     imu: Annotated[str | None, typer.Option(help="For --noise: IMU topic, where a log has several.")] = None,
     truth: Annotated[str | None, typer.Option(help="For --noise: topic of the true poses, where a log has several.")] = None,
-    noise_plot: Annotated[Path | None, typer.Option(metavar="F.png", help="Draw the Allan deviations (with --noise).")] = None,
-    noise_toml: Annotated[Path | None, typer.Option(metavar="F.toml", help="Write the noise as TOML (with --noise).")] = None,
+    noise_plot: Annotated[
+        Path | None, typer.Option(metavar="F.png", help="Draw the Allan deviations (with --noise)."), PNG
+    ] = None,
+    noise_toml: Annotated[
+        Path | None, typer.Option(metavar="F.toml", help="Write the noise as TOML (with --noise)."), TOML
+    ] = None,
     quick: Annotated[
         bool, typer.Option("--quick", help="Read only the chunks with IMU messages; this may miss damage.")
     ] = False,
@@ -59,7 +63,7 @@ def info(
         noises = [noise_identification.plain(identified) for identified in identified_noises]
         reports = [replace(report, noise=noise) for report, noise in zip(reports, noises, strict=True)]
         _write_noise(identified_noises[0], noise_plot, noise_toml, overwrite)
-    if write_json(reports[0] if len(reports) == 1 else LogInfos(reports), json_to):
+    if write_json(reports[0] if len(reports) == 1 else LogInfos(reports), json_to, overwrite=overwrite):
         _leave(lost)
     for number, (log, report) in enumerate(zip(logs, reports, strict=True)):
         say(log)
