@@ -68,7 +68,7 @@ class ConfigError(ImutoolError):
 
 
 class UsageError(ConfigError):
-    """The command line or a call is wrong in itself, such as an output whose suffix does not fit."""
+    """The command line is wrong in itself, such as an output whose suffix does not fit."""
 
     exit_code = 2
 

@@ -59,7 +59,7 @@ def caught() -> Iterator[None]:
 
 @dataclass(frozen=True)
 class Written:
-    """Mark in the annotation of a parameter that names an output; the fields are those of `OutputFile`."""
+    """Mark of a parameter that names an output; the fields are those of `OutputFile`."""
 
     suffixes: tuple[str, ...] = ()
     files: tuple[str, ...] | None = None
@@ -77,7 +77,7 @@ def written(function: Callable[..., Any]) -> dict[str, Written]:
 
 
 class Command(TyperCommand):
-    """Command that refuses destructive outputs before its work, and whose errors name flags instead of parameters."""
+    """Command that refuses destructive outputs first, and whose errors name flags."""
 
     function: Callable[..., Any]  # what the command runs
 

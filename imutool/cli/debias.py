@@ -81,8 +81,7 @@ def debias(
         )
     shown = None if watch is None else watch.shown
     summary = _summary(report, str(target or source), shown, report_to, clean)
-    json_only = write_json(summary, json_to, overwrite=overwrite)
-    if not json_only:
+    if not (json_only := write_json(summary, json_to, overwrite=overwrite)):
         _say(report, summary, shown or ())
     if report_to is not None:  # last: should it fail, the log is there all the same, and that has been said
         with progress("Drawing", verbose, quiet):

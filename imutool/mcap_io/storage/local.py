@@ -1,4 +1,4 @@
-"""Local files, devices and pipes as they are written, and the temporary files of killed processes.
+"""Write local files, devices and pipes; remove temporary files of killed processes.
 
 A file is written as `.NAME.PID.HEX.partial` beside its place. HEX says the machine (and container), its boot, the start of
 the process, and a random number, so that a later run can tell whose file it is. It removes one if and only if
@@ -92,7 +92,7 @@ class LocalFile:
 
 
 class Stream(LocalFile):
-    """Device or pipe: bytes are gathered in a temporary file and then written to it; it is never replaced."""
+    """Device or pipe; it is written to from a temporary file, and never replaced."""
 
     def __init__(self, path: Path) -> None:
         super().__init__(path)
@@ -113,7 +113,7 @@ class Stream(LocalFile):
 
 
 def is_stream(path: Path) -> bool:
-    """Whether a path is a character device, a pipe, or a file that this process has open already."""
+    """Whether a path is a character device, a pipe, or a file that is open already."""
     if str(path) in STANDARD or _open_number(path) is not None:
         return True
     try:

@@ -1,4 +1,4 @@
-"""Outputs of a command or a public function: refused before any work where they would destroy something.
+"""Refuse outputs that would destroy something, before any work.
 
 An existing file is refused without `overwrite`. Always refused are an input, by whatever name or link, two outputs that are
 one file, and a suffix that does not fit. A device or a pipe is written to.
@@ -79,7 +79,7 @@ def check_outputs(outputs: Iterable[OutputFile], inputs: Iterable[object] = (), 
 
 
 def refuse_existing(path: Location, *, overwrite: bool) -> None:
-    """Refuse a target that is a folder, or that exists already without `overwrite`; a device may exist.
+    """Refuse a target that is a folder, or exists without `overwrite`; a device may exist.
 
     Raises:
         ConfigError: it is a folder, a disk or a socket, or it exists.

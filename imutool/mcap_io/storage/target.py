@@ -1,4 +1,4 @@
-"""Write a file or folder that appears whole or not at all: under a temporary name, then renamed.
+"""Write a file or folder whole or not at all: under a temporary name, then renamed.
 
 What another file holds is copied by the kernel where its blocks stay blocks: a file system that shares them between files
 copies nothing at all. Where they move by part of a block it could only cut each in two, and costs more than reading and
