@@ -1,4 +1,4 @@
-"""ROS message types: definitions of ROS 1 as definitions of ROS 2, and messages from ROS 1 encoding to CDR.
+"""ROS message types: ROS 1 definitions as ROS 2 definitions, ROS 1 messages as CDR.
 
 A type that ROS 2 has with the same fields gets the definition of ROS 2, so that ROS 2 programs know it. Any other keeps the
 definition of its bag, with names that ROS 2 allows: `wheel_speed` for `wheelSpeed`. Needs rosbags.

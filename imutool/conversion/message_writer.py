@@ -1,4 +1,4 @@
-"""Write a message log as MCAP: encoded messages stream through, arrays are encoded a chunk at a time.
+"""Write a message log as MCAP, its encoded messages as they come, its arrays by chunks.
 
 Sensors, images and other topics have chunks of their own, so that a reader of the IMU unpacks no image.
 """

@@ -1,4 +1,4 @@
-"""Tables of numbers as CDR messages: the type is made from the names of the columns."""
+"""Tables of numbers as CDR messages with a type made from the columns."""
 
 from __future__ import annotations
 

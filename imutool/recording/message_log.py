@@ -1,4 +1,4 @@
-"""Message log: topics of any type, some as arrays and some as encoded messages, on their way into an MCAP log.
+"""Message log: topics of any type, as arrays or as encoded messages.
 
 A `Recording` holds one IMU as arrays. A `MessageLog` holds what a robot recorded: every topic, in its own encoding, streamed
 in bounded memory. What a converter knows as numbers (`imus`, `poses`, `scalars`, `tables`) it gives as arrays.
