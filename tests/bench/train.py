@@ -43,8 +43,9 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from imutool.bias.model import COLUMNS, BiasModel
-from imutool.bias.ode import HermitePath, Method, integrate
+from imutool.bias.model import COLUMNS
+from imutool.bias.networks.network import BiasNetwork
+from imutool.bias.networks.ode import HermitePath, Method, integrate
 from imutool.cli.demo import write_asl
 from imutool.geometry import so3
 from imutool.inertial.strapdown import GRAVITY_W
@@ -141,7 +142,7 @@ def our_step(recording: Recording, sensor: Sensor, batches: list[Batch], measure
     return step
 
 
-def chart_solution(model: BiasModel, sensor: Sensor, windows: Windows, method: Method) -> tuple[Tensor, Tensor]:
+def chart_solution(model: BiasNetwork, sensor: Sensor, windows: Windows, method: Method) -> tuple[Tensor, Tensor]:
     """Attitudes and states of all samples, by the ODE in the chart (`imutool.bias.ode`): the segments share one clock."""
     segment = windows.segment
     t = segment.t[0]
@@ -168,7 +169,7 @@ def chart_solution(model: BiasModel, sensor: Sensor, windows: Windows, method: M
     return integrate(moving, start, t, windows.R_start, method=method)
 
 
-def chart_error(model: BiasModel, sensor: Sensor, windows: Windows, method: Method = "euler") -> Tensor:
+def chart_error(model: BiasNetwork, sensor: Sensor, windows: Windows, method: Method = "euler") -> Tensor:
     """The error of `imutool.training.objective` at the end of each window, of the chart's solution."""
     R_wb, state = chart_solution(model, sensor, windows, method)
     if sensor == "gyro":
