@@ -105,7 +105,7 @@ def _step_means(u: Array) -> Array:
     return means
 
 
-def _integrated(rate: Rows, dt: Float64[np.ndarray, "m 1"]) -> Quaternions:
+def _integrated(rate: Rows, dt: Float64[np.ndarray, "m 1"]) -> Float64[np.ndarray, "m 4"]:
     """Rotation from the first sample to each later one."""
     return quaternion.unit(quaternion.running_product(quaternion.exp(_step_means(rate) * dt)))
 

@@ -109,7 +109,7 @@ class Batch(NamedTuple):
     count: int
 
 
-Error = Callable[[BiasModel, Sensor, Windows], Tensor]
+Error = Callable[[BiasNetwork, Sensor, Windows], Tensor]
 
 
 def drawn(training: Training, batch: Batch) -> Windows:
