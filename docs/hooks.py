@@ -74,9 +74,9 @@ def commands() -> str:
         warnings.simplefilter("ignore")
         import typer
 
-        from imutool.cli import app
+        from imutool.cli import load
 
-        root = typer.main.get_command(app)
+        root = typer.main.get_command(load())
     return "\n".join([INTRODUCTION, *sections(root, "imutool")])
 
 

@@ -21,6 +21,8 @@ from __future__ import annotations
 
 from typing import ClassVar
 
+INTERRUPTED = 130  # exit code after Ctrl-C
+
 
 class ImutoolError(Exception):
     """Error with four parts: place, problem, expectation, fix.

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO, ForwardRef, NamedTuple, TypeAlias
 from urllib.parse import urlsplit
@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 else:
     Location = Path | ForwardRef("upath.UPath")  # beartype looks the name up, and imports upath, at the first URL it meets
 
+LogPath: TypeAlias = str | Location
 CLOUD = "pip install 'imutool[cloud]'"
 STORES = {
     "s3": CLOUD,
@@ -54,8 +55,8 @@ def to_location(text: str) -> Location:
     Raises:
         ConfigError: an unknown kind of store, one whose package is not installed, or a URL with a password or signature in it.
     """
-    scheme, found, rest = text.partition("://")
-    if not found:
+    scheme, colon, rest = text.partition("://")
+    if not colon:
         return Path(text)
     if scheme == "file":
         return Path(rest)
@@ -74,6 +75,37 @@ def to_location(text: str) -> Location:
     except Exception as error:  # any error of the store's set-up
         raise ConfigError(f"cannot be opened ({reason(error)})", where=text) from error
     return place
+
+
+def location(path: LogPath) -> Location:
+    """File or object of a path or URL.
+
+    Raises:
+        ConfigError: unknown store, missing package for it, or a password in the URL.
+    """
+    return to_location(path) if isinstance(path, str) else path
+
+
+def local(path: LogPath, parameter: str) -> Path:
+    """File on this machine.
+
+    Raises:
+        ConfigError: `path` is a URL.
+    """
+    place = location(path)
+    if not isinstance(place, Path):
+        raise ConfigError(f"{path} is in an object store", where=parameter, expected="a file on this machine")
+    return place
+
+
+def locals_of(paths: LogPath | Sequence[LogPath], parameter: str) -> list[Path]:
+    """Files on this machine, of one path or of several.
+
+    Raises:
+        ConfigError: one of them is a URL.
+    """
+    several = paths if isinstance(paths, Sequence) and not isinstance(paths, str) else [paths]
+    return [local(path, parameter) for path in several]
 
 
 def _refuse_secrets(scheme: str, text: str) -> None:

@@ -46,7 +46,7 @@ REPORTS = {
     "training": "imutool.cli.train:TrainingReport",
     "unit": "imutool.fleet.work:UnitReport",
     "view": "imutool.cli.view:View",
-    "vio": "imutool.cli.vio:VioReport",
+    "vio": "imutool.cli.evaluate:VioReport",
 }
 
 
@@ -84,10 +84,10 @@ def report_type(name: str) -> type[Report]:
             fix=f"Did you mean {near[0]}?" if near else "",
         )
     module, _, kind = REPORTS[short].partition(":")
-    found = getattr(importlib.import_module(module), kind)
-    assert isinstance(found, type)
-    assert issubclass(found, Report)
-    return found
+    report = getattr(importlib.import_module(module), kind)
+    assert isinstance(report, type)
+    assert issubclass(report, Report)
+    return report
 
 
 def json_schema(name: str) -> dict[str, Any]:

@@ -2,20 +2,22 @@
 
 from __future__ import annotations
 
+import difflib
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from imutool.api.paths import LogPath, local, location
 from imutool.conversion import run as conversion
 from imutool.conversion.run import ConvertReport
-from imutool.exporting.export import export as export_log
-from imutool.exporting.folder import ExportReport
+from imutool.errors import ConfigError
+from imutool.exporting import ExportReport, euroc, rosbag2
+from imutool.location import LogPath, local, location
 from imutool.log_info import inspection
 from imutool.log_info.report import LogInfo
 from imutool.mcap_io.read import read as read_log
 from imutool.mcap_io.write import write as write_log
 from imutool.recording import Recording
 
+FORMATS = ("euroc", "rosbag2")
 Progress = Callable[[int, int], None]  # bytes done, bytes in all
 NamedProgress = Callable[[int, int, str], None]  # steps done, steps in all, the current step
 
@@ -183,12 +185,14 @@ def export(
         >>> report.imu
         '/imu0'
     """
-    return export_log(
-        local(log, "log"),
-        local(out, "out"),
-        format=format,
-        imu=imu,
-        sensor_noise=noise,
-        overwrite=overwrite,
-        progress=progress,
-    )
+    if format not in FORMATS:
+        near = difflib.get_close_matches(format, FORMATS, n=1)
+        fix = f"Did you mean {near[0]}?" if near else ""
+        raise ConfigError(f"unknown format {format!r}", where="format", expected=" or ".join(FORMATS), fix=fix)
+    source, folder = local(log, "log"), local(out, "out")
+    tell: NamedProgress = progress or (lambda done, total, word: None)
+    if format == "euroc":
+        return euroc.write(source, folder, imu, noise, overwrite, tell)
+    if imu is not None or noise is not None:
+        raise ConfigError("a rosbag2 folder holds the whole log", where="imu, noise", fix="Leave them out")
+    return rosbag2.write(source, folder, overwrite, tell)

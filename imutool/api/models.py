@@ -13,7 +13,6 @@ from jaxtyping import Float64
 
 from imutool import debiasing, evaluation
 from imutool.api.logs import Progress
-from imutool.api.paths import LogPath, location
 from imutool.bias import static
 from imutool.bias.io import find_model, shipped_for
 from imutool.bias.model import BiasModel
@@ -23,6 +22,7 @@ from imutool.bias_start.initial_bias import InitialBias
 from imutool.bias_start.model_choice import check_smooth, find_initial_bias, smooth_in_memory
 from imutool.debiasing import DebiasReport
 from imutool.errors import ConfigError
+from imutool.location import LogPath, location
 from imutool.recording import Imu, Recording
 
 Model = str | Path | BiasModel

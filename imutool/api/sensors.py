@@ -10,9 +10,9 @@ import msgspec
 
 from imutool import diagnosis_output
 from imutool.api.logs import NamedProgress
-from imutool.api.paths import LogPath, local, location
 from imutool.diagnosis.diagnose import diagnose as diagnose_logs
 from imutool.diagnosis.result import Diagnosis
+from imutool.location import LogPath, local, location
 from imutool.recording import Recording
 from imutool.sensor.made_up_flight import FlightSettings, flight
 from imutool.sensor.simulate import Simulation

@@ -7,9 +7,9 @@ from pathlib import Path
 from typing import Any
 
 from imutool import evaluation
-from imutool.api.paths import LogPath, local, locals_of
 from imutool.bias.model import BiasModel
 from imutool.config import build
+from imutool.location import LogPath, local, locals_of
 from imutool.training import run
 from imutool.training.fit import Epoch
 from imutool.training.settings import settings_of

@@ -10,13 +10,12 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float64
 
-from imutool.api.paths import LogPath, local, location
 from imutool.debiasing import DebiasedBlock
 from imutool.errors import ConfigError
+from imutool.location import LogPath, local, location
 from imutool.mcap_io.topics import ImuBatch
 from imutool.recording import Imu
-from imutool.viewing import notebook
-from imutool.viewing.model.output import Output
+from imutool.viewing import Output, notebook
 from imutool.viewing.model.run_data import RunData
 from imutool.viewing.model.runs import load
 from imutool.viewing.model.trajectory_error import ALIGNMENTS, Alignment

@@ -1,4 +1,4 @@
-"""Command line: each command is a file that is imported here.
+"""Command line: each command stands in a file of this room; `load` imports them.
 
 Results go to stdout; log lines and progress go to stderr.
 """
@@ -8,44 +8,38 @@ from __future__ import annotations
 import os
 import signal
 import sys
+from importlib import import_module
+from typing import TYPE_CHECKING
 
-from imutool.cli import (
-    clean,
-    conceal,
-    convert,
-    debias,
-    diagnose,
-    evaluate,
-    fleet,
-    info,
-    repair,
-    shipped,
-    simulate,
-    train,
-    view,
-    vio,
+from imutool.errors import INTERRUPTED
+
+if TYPE_CHECKING:
+    from imutool.cli.app import App
+
+MODULES = (
+    "convert",
+    "info",
+    "repair",
+    "train",
+    "debias",
+    "clean",
+    "evaluate",
+    "view",
+    "simulate",
+    "diagnose",
+    "fleet",
+    "shipped",
 )
-from imutool.cli.app import app, caught
-
-COMMANDS = (
-    convert,
-    info,
-    repair,
-    train,
-    debias,
-    clean,
-    evaluate,
-    view,
-    vio,
-    simulate,
-    diagnose,
-    conceal,
-    fleet,
-    shipped,
-)
-
-
 TERMINATED = 143  # what a shell reports of a program that SIGTERM ended
+
+
+def load() -> App:
+    """Application with every command; the order is that of `--help`."""
+    for name in MODULES:
+        import_module(f"imutool.cli.{name}")
+    from imutool.cli.app import app
+
+    return app
 
 
 def main() -> None:
@@ -54,5 +48,11 @@ def main() -> None:
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     # A scheduler's SIGTERM would end the process where it stands, with its temporary files and parts of uploads left behind
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(TERMINATED))
+    try:
+        app = load()
+        from imutool.cli.app import caught
+    except KeyboardInterrupt:  # Ctrl-C before there is anybody who could catch it in style
+        print("error: interrupted. Nothing was begun.", file=sys.stderr)
+        sys.exit(INTERRUPTED)
     with caught():
         app()

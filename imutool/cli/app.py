@@ -16,9 +16,8 @@ from typer.models import CommandFunctionType
 from imutool import __version__, registry
 from imutool.cli.parameters import current, error_with_flags, flags, with_flags
 from imutool.cli.terminal import plain, say, tell_error
-from imutool.errors import ConfigError, ImutoolError
+from imutool.errors import INTERRUPTED, ConfigError, ImutoolError
 
-INTERRUPTED = 130
 LOST = 3  # the command did what it could, and something of the log is lost
 PIPE_CLOSED = 141  # what a shell reports of a program that SIGPIPE ended
 NOTHING_LEFT = "Nothing half-written is left"

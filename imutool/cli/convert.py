@@ -103,10 +103,10 @@ def export(
     quiet: Quiet = False,
 ) -> None:
     """Write a log as a EuRoC folder or a rosbag2 folder, for programs that read those."""
-    from imutool.exporting.export import export as run
+    from imutool.api.logs import export as run
 
     with progress("Exporting", verbose, quiet) as tell:
-        report = run(log, target, format=format, imu=imu, sensor_noise=noise, overwrite=overwrite, progress=tell)
+        report = run(log, target, format=format, imu=imu, noise=noise, overwrite=overwrite, progress=tell)
     summary = Export(str(report.output), report.format, report.imu, report.written, report.left_out)
     if write_json(summary, json_to):
         return

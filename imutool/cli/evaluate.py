@@ -1,4 +1,4 @@
-"""`imutool evaluate`."""
+"""Scores against the true poses: `imutool evaluate` and `imutool vio`."""
 
 from __future__ import annotations
 
@@ -10,12 +10,18 @@ from typing import Annotated, Any
 import typer
 
 from imutool.cli.app import Imu, Init, Json, Logs, Models, Overwrite, Quiet, ReportPage, Smooth, Truth, Verbose, app
-from imutool.cli.terminal import figures, progress, say, write_json
+from imutool.cli.terminal import figures, progress, say, table, write_json
 from imutool.report import Report
 
 
 class Evaluation(Report, frozen=True, tag="imutool.evaluation/1"):
     """Report of `imutool evaluate`: scores of each log, model and estimate."""
+
+    results: list[dict[str, Any]]
+
+
+class VioReport(Report, frozen=True, tag="imutool.vio/1"):
+    """Report of `imutool vio`: scores of each log, model and choice of bias states."""
 
     results: list[dict[str, Any]]
 
@@ -84,3 +90,56 @@ def _stops(results: Sequence[dict[str, Any]]) -> list[str]:
         for row in results
         if row["estimate"] == "zupt"
     ]
+
+
+@app.command(epilog="Example: [bold]imutool vio MH_04.mcap --model adis.safetensors --blackout 3[/]")
+def vio(
+    logs: Logs,
+    model: Models = None,
+    init: Init = "auto",
+    truth: Truth = None,
+    imu: Imu = None,
+    bias_states: Annotated[
+        bool | None, typer.Option("--bias-states/--no-bias-states", help="Estimate biases, or trust the IMU; by default both.")
+    ] = None,
+    lag: Annotated[float, typer.Option(metavar="S", help="Lag of the fixed-lag smoother.")] = 3.0,
+    keyframes: Annotated[float, typer.Option(metavar="HZ", help="Camera keyframes per second.")] = 4.0,
+    features: Annotated[int, typer.Option(help="Feature tracks in a frame.")] = 30,
+    pixel_noise: Annotated[float, typer.Option(metavar="PX", help="White noise of a pixel coordinate.")] = 1.0,
+    blackout: Annotated[float, typer.Option(metavar="S", help="Length of a camera blackout in every 15 s.")] = 0.0,
+    duration: Annotated[float | None, typer.Option(metavar="S", help="Use only this much of each log.")] = None,
+    seed: Annotated[int, typer.Option(help="Seed of landmarks, tracks and pixel noise.")] = 0,
+    set_: Annotated[
+        list[str] | None,
+        typer.Option("--set", metavar="key=value", help="Change a setting of imutool.vio.run.VioSettings. Repeatable."),
+    ] = None,
+    json_to: Json = None,
+    verbose: Verbose = False,
+    quiet: Quiet = False,
+) -> None:
+    """Score a visual-inertial estimate on the log's IMU, raw and with each model.
+
+    The camera is simulated: EuRoC's stereo pair along the log's true poses, on every data set.
+    """
+    from imutool.config import load
+    from imutool.vio.run import VioSettings, tabulate
+    from imutool.vio.run import vio as run
+
+    given = {"smoother.lag_s": lag, "keyframes_hz": keyframes, "features": features, "pixel_noise": pixel_noise}
+    given |= {"blackout_s": blackout, "seed": seed} | ({} if duration is None else {"duration_s": duration})
+    settings = load(VioSettings, None, [*(f"{key}={value}" for key, value in given.items()), *(set_ or ())])
+    states = (True, False) if bias_states is None else (bias_states,)
+    results = []
+    with progress("Estimating", verbose, quiet) as tell:
+        for log in logs:
+            results += run(
+                log, models=model or (), init=init, truth=truth, imu=imu, bias_states=states, settings=settings, progress=tell
+            )
+    if write_json(VioReport(results), json_to):
+        return
+    for rows in tabulate(results):
+        table(rows, keys=3)
+    say(f"Camera, simulated along the truth: {results[0]['camera']}; {results[0]['tracks']} tracks in a frame")
+    for row in results:
+        if row["failed"]:
+            say(f"{row['log']}, {row['model']}, bias states {'on' if row['bias_states'] else 'off'}: {row['failed']}")

@@ -25,7 +25,6 @@ ALIASES = {
     "real": ("reals",),
     "robots": ("robot_from",),
     "rules": ("rule",),
-    "sensor_noise": ("noise",),
     "sequences": ("sequence",),
     "settings": ("config",),
     "signals": ("signal",),

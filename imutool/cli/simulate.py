@@ -1,4 +1,4 @@
-"""`imutool simulate`."""
+"""Made-up logs: `imutool simulate` and the blind cases of `imutool conceal`."""
 
 from __future__ import annotations
 
@@ -8,7 +8,8 @@ from typing import Annotated, Any
 import typer
 
 from imutool.cli.app import Json, Overwrite, Quiet, Truth, Verbose, app
-from imutool.cli.terminal import logger, progress, say, write_json
+from imutool.cli.terminal import log_to_stderr, logger, progress, say, write_json
+from imutool.errors import ConfigError
 from imutool.report import Report, Section
 
 
@@ -89,3 +90,73 @@ def simulate(
     motion = report.motion
     std = f"{motion.gyro_std_rad_s:.2g} rad/s and {motion.accel_std_m_s2:.2g} m/s²"
     say(f"uncertainty of the motion {std}; {motion.glitches} glitches dropped, {motion.steps} steps levelled")
+
+
+@app.command(epilog="Example: [bold]imutool conceal MH_03.mcap case/ --seed 7[/], then [bold]imutool conceal --open case/[/]")
+def conceal(
+    places: Annotated[list[Path], typer.Argument(metavar="[TRAJECTORY] DIR", help="A log with true poses; the case's folder.")],
+    seed: Annotated[int | None, typer.Option(min=0, help="Seed of the case; by default random.")] = None,
+    kind: Annotated[str, typer.Option(help="single, pair, null, driven, unknown or any.")] = "any",
+    size: Annotated[str, typer.Option(help="large (plausible), middle (a quarter), small (just visible) or any.")] = "any",
+    noise: Annotated[str, typer.Option(help="any, adis16448, bmi160, navigation or a TOML file.")] = "any",
+    longest: Annotated[
+        float, typer.Option(min=20.0, metavar="SECONDS", help="Use at most this much of the trajectory.")
+    ] = 75.0,
+    truth: Annotated[str | None, typer.Option(help="Topic of the true poses, where a log has several.")] = None,
+    open_it: Annotated[bool, typer.Option("--open", help="Open the envelope in DIR and score DIR/findings.json.")] = False,
+    findings: Annotated[Path | None, typer.Option(help="Score this findings file (with --open).")] = None,
+    json_to: Json = None,
+    verbose: Verbose = False,
+    quiet: Quiet = False,
+) -> None:
+    """Make a sealed blind case, or open one and score the findings.
+
+    A case is a simulation, a recording, and an envelope with the effects that separate them.
+    """
+    log_to_stderr(verbose, quiet)
+    if len(places) != (1 if open_it else 2):
+        expected = "DIR alone" if open_it else "TRAJECTORY and DIR"
+        raise ConfigError(f"{len(places)} places are named", where="conceal", expected=expected)
+    if open_it:
+        _open(places[0], findings, json_to)
+        return
+    if findings is not None or json_to is not None:
+        raise ConfigError("--findings and --json need --open", where="conceal", fix="Add --open")
+    from imutool.blind_cases.cases import conceal as run
+
+    run(places[0], places[1], seed=seed, kind=kind, size=size, noise=noise, longest_s=longest, truth=truth)
+    say(f"{places[1]}: sim.mcap, real.mcap, envelope.json and its key")
+    say(f"next: imutool diagnose {places[1]}/real.mcap --sim {places[1]}/sim.mcap -o {places[1]}")
+    say(f"then: imutool conceal --open {places[1]}")
+
+
+def _open(folder: Path, findings: Path | None, json_to: str | None) -> None:
+    import msgspec
+
+    from imutool.blind_cases.cases import open_case
+
+    result: dict[str, Any] = msgspec.to_builtins(open_case(folder, findings))
+    if write_json(result, json_to):
+        return
+    hidden = "; ".join(_effect_text(effect) for effect in result["truth"]["effects"]) or "nothing but a bias and noise"
+    say(f"concealed ({result['kind']}, {result['size']}): {hidden}")
+    say(f"found: {', '.join(result['found']) or 'nothing'}; the names are {'right' if result['right'] else 'not right'}")
+    if result["place"]["f1"] is not None:
+        say(f"place: F1 {result['place']['f1']:.2f}")
+    for row in result["parameters"]:
+        sigmas = "" if row["sigmas"] is None else f", {row['sigmas']:+.1f} sigmas off"
+        name = f"{row['effect']}.{row['parameter']}"
+        say(f"{name}: {row['value']:.5g} ± {row['std']:.2g}, truly {row['true']:.5g} ({row['percent']:.2g} %{sigmas})")
+    if result["gain"] is not None:
+        say(f"gain: {100.0 * result['gain']:.0f} % of what perfect knowledge would remove")
+
+
+def _effect_text(effect: dict[str, Any]) -> str:
+    """Effect with its parameters; those without influence are left out."""
+    numbers = (
+        f"{name} {parameter['value']:.4g} {parameter['unit']}"
+        for name, parameter in effect["parameters"].items()
+        if parameter["value"] != 0.0 and abs(parameter["value"]) < 1e8 and not name.startswith("phase")
+    )
+    driver = f" by {effect['driver']}" if effect["driver"] else ""
+    return f"{effect['effect']}{driver} ({', '.join(numbers)})"

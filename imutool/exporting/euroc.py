@@ -11,10 +11,11 @@ import numpy as np
 from jaxtyping import Float64, Int64
 
 from imutool.errors import LogError
-from imutool.exporting.folder import SIGNATURE, ExportFolder, ExportReport, Progress, writing
+from imutool.exporting import ExportReport, Progress
 from imutool.mcap_io.codec import schemas
 from imutool.mcap_io.log import Log
 from imutool.mcap_io.read import VELOCITY_KEY, read
+from imutool.mcap_io.storage.folder import SIGNATURE, ExportFolder, writing
 from imutool.mcap_io.topics import DERIVED_KEY
 from imutool.noise import datasheet
 from imutool.noise.datasheet import Noise
@@ -57,7 +58,7 @@ IDENTITY = "  cols: 4\n  rows: 4\n  data: [1.0, 0.0, 0.0, 0.0,\n" + (
 def write(
     log: Path, out: Path, imu: str | None, sensor_noise: str | Path | None, overwrite: bool, tell: Progress
 ) -> ExportReport:
-    """Writes the folder `out`; the arguments are those of `imutool.exporting.export.export`."""
+    """Writes the folder `out`; the arguments are those of `imutool.export`."""
     given = datasheet.read(sensor_noise) if sensor_noise is not None else None
     with Log(log) as opened:
         topic = imu or _best_imu(opened)

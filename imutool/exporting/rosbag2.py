@@ -9,8 +9,9 @@ import re
 from pathlib import Path
 
 from imutool.errors import ConfigError, LogError
-from imutool.exporting.folder import SIGNATURE, ExportFolder, ExportReport, Progress, writing
+from imutool.exporting import ExportReport, Progress
 from imutool.mcap_io.log import Log
+from imutool.mcap_io.storage.folder import SIGNATURE, ExportFolder, writing
 
 COPY_BYTES = 1 << 20
 VERSION = 5  # of metadata.yaml: the oldest with a list of files, so that Humble plays it, and every later one too
@@ -23,7 +24,7 @@ QOS_NUMBERS = {  # as rmw numbers them; names came with version 9
 
 
 def write(log: Path, out: Path, overwrite: bool, tell: Progress) -> ExportReport:
-    """Writes the folder `out`; the arguments are those of `imutool.exporting.export.export`."""
+    """Writes the folder `out`; the arguments are those of `imutool.export`."""
     with Log(log) as opened:
         _check_readable(opened)
         name = f"{out.absolute().name}_0.mcap"

@@ -157,15 +157,15 @@ def _missing(ordered_ns: Int64[np.ndarray, " n"]) -> int:
 
 def _saturated(values: Float64[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
     """Samples with an axis at the end of its range, by `saturation.RULE`."""
-    found = np.zeros(len(values), bool)
+    at_limit = np.zeros(len(values), bool)
     for axis in values.T:
         ends = saturation.Ends()
         ends.see(axis)
         for side in (-1, 1):
             limit = ends.limit(side)
             if limit is not None:
-                found |= axis == limit
-    return found
+                at_limit |= axis == limit
+    return at_limit
 
 
 class _Rest(NamedTuple):
@@ -177,14 +177,14 @@ class _Rest(NamedTuple):
 
 def _rest(imu: Imu) -> _Rest:
     """Stationary stretches, the specific force there, and the noise."""
-    found = rest_stretches(imu)
-    samples = [slice(a, b) for a, b in found]
-    weights = [b - a for a, b in found]
+    stretches = rest_stretches(imu)
+    samples = [slice(a, b) for a, b in stretches]
+    weights = [b - a for a, b in stretches]
     norms = [float(np.linalg.norm(imu.accel[s].mean(axis=0))) for s in samples]
     return _Rest(
-        seconds=float(sum(imu.t_ns[b - 1] - imu.t_ns[a] for a, b in found)) * 1e-9,
-        stretches=[Interval(int(imu.t_ns[a]), int(imu.t_ns[b - 1])) for a, b in found],
-        accel_m_s2=float(np.average(norms, weights=weights)) if found else None,
+        seconds=float(sum(imu.t_ns[b - 1] - imu.t_ns[a] for a, b in stretches)) * 1e-9,
+        stretches=[Interval(int(imu.t_ns[a]), int(imu.t_ns[b - 1])) for a, b in stretches],
+        accel_m_s2=float(np.average(norms, weights=weights)) if stretches else None,
         noise=_noise(imu, samples),
     )
 

@@ -91,13 +91,13 @@ def diagnose(folder: Path, with_sim: bool) -> tuple[Path, float, str]:
     """The findings of the command, its seconds, and what it said if it failed."""
     import typer
 
-    from imutool.cli.app import app
+    from imutool.cli import load
 
     out = folder / (FOUND if with_sim else f"{FOUND}_alone")
     line = ["diagnose", str(folder / "real.mcap"), "-o", str(out)]
     line += ["--sim", str(folder / "sim.mcap")] if with_sim else []
     said, began = io.StringIO(), time.perf_counter()
-    command = typer.main.get_command(app)
+    command = typer.main.get_command(load())
     failed = ""
     with contextlib.redirect_stdout(said), contextlib.redirect_stderr(said):
         try:

@@ -4,7 +4,8 @@ All contestants take 1000 segments of 16 samples (the paper's batch), gyro stage
 
 (a) fast path: what `imutool train` does with such windows. The rest bias is integrated on the grid of the drift, the
     curve is one evaluation for all samples, rotations are a product taken as a tree (`imutool.training.objective`).
-(b) chart ODE: the paper's joint form through `imutool.bias.ode.integrate` with Euler, one step a sample, of the same field with
+(b) chart ODE: the paper's joint form through `imutool.bias.networks.ode.integrate` with Euler, one step a sample, of the
+same field with
     the same parts of the same model: state (xi, beta_g), in the accel stage (xi, beta_g, beta_a, v, p) with the gyro frozen.
 (c) with `--released DIR`, the paper's own code, run by its own training functions. DIR holds its BiasDy, SO3diffeq and
     Third_party; nothing in it is edited, and nothing of it is kept here:
@@ -143,7 +144,7 @@ def our_step(recording: Recording, sensor: Sensor, batches: list[Batch], measure
 
 
 def chart_solution(model: BiasNetwork, sensor: Sensor, windows: Windows, method: Method) -> tuple[Tensor, Tensor]:
-    """Attitudes and states of all samples, by the ODE in the chart (`imutool.bias.ode`): the segments share one clock."""
+    """Attitudes and states of all samples, by the ODE in the chart (`networks.ode`): the segments share one clock."""
     segment = windows.segment
     t = segment.t[0]
     gyro, accel = HermitePath(t, segment.gyro), HermitePath(t, segment.accel)

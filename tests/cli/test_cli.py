@@ -22,7 +22,7 @@ from imutool.training.fit import Epoch
 Run = Callable[..., subprocess.CompletedProcess[str]]
 Code = Callable[..., int]
 
-COMMANDS = [command.name or command.callback.__name__ for command in cli.app.registered_commands if command.callback]
+COMMANDS = [command.name or command.callback.__name__ for command in cli.load().registered_commands if command.callback]
 
 
 @pytest.fixture

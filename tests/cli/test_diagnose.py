@@ -16,7 +16,7 @@ from support.report_schema import assert_valid
 from typer.testing import CliRunner, Result
 
 from imutool import diagnosis_output
-from imutool.cli import app
+from imutool.cli import load
 from imutool.diagnosis.estimation import unnamed_effects as unnamed
 from imutool.diagnosis.result import Curve, Diagnosis, Estimate, Finding, HeldOut
 from imutool.diagnosis.to_physics_file import to_physics_file
@@ -46,7 +46,7 @@ HELD = HeldOut(0.02, 0.01, "rad/s", 9.0)
 
 
 def run(*words: str | Path) -> Result:
-    return CliRunner().invoke(app, [*map(str, words)])
+    return CliRunner().invoke(load(), [*map(str, words)])
 
 
 @pytest.fixture(scope="module")

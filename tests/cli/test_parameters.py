@@ -12,7 +12,7 @@ from imutool import cli
 from imutool.cli.parameters import error_with_flags, flags, with_flags
 from imutool.errors import ConfigError
 
-COMMANDS = typer.main.get_command(cli.app).commands  # type: ignore[attr-defined]
+COMMANDS = typer.main.get_command(cli.load()).commands  # type: ignore[attr-defined]
 
 
 def test_an_argument_goes_by_its_word_and_an_option_by_its_long_flag() -> None:

@@ -13,7 +13,7 @@ from support import diagnoses
 from typer.testing import CliRunner, Result
 
 from imutool import diagnosis_output
-from imutool.cli import app
+from imutool.cli import load
 from imutool.errors import DataError
 from imutool.fleet import page as fleet_page
 from imutool.fleet.task import Result as Done
@@ -26,7 +26,7 @@ HOSTILE = "a#b?<b>&'%41"
 
 
 def run(*words: str | Path) -> Result:
-    return CliRunner().invoke(app, [*map(str, words)])
+    return CliRunner().invoke(load(), [*map(str, words)])
 
 
 @pytest.fixture(autouse=True)

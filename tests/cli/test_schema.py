@@ -10,12 +10,12 @@ import pytest
 from support.report_schema import assert_valid
 from typer.testing import CliRunner
 
-from imutool.cli import app
+from imutool.cli import load
 from imutool.cli.demo import write_asl
 from imutool.report import REPORTS, json_schema
 from imutool.sensor.made_up_flight import flight
 
-COMMANDS = [command.name or command.callback.__name__ for command in app.registered_commands if command.callback]
+COMMANDS = [command.name or command.callback.__name__ for command in load().registered_commands if command.callback]
 SILENT = {"schema"}  # commands without --json
 
 # words of the command; {} is the folder of the logs, and a test runs in a folder of its own
@@ -55,7 +55,7 @@ def folder(tmp_path: Path, logs: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 @pytest.mark.parametrize("words", LINES.values(), ids=LINES)
 def test_a_report_is_valid_against_its_schema(folder: Path, logs: Path, words: Sequence[str]) -> None:
-    done = CliRunner().invoke(app, [*(word.format(logs) for word in words), "--json", "report.json"])
+    done = CliRunner().invoke(load(), [*(word.format(logs) for word in words), "--json", "report.json"])
     assert done.exit_code in {0, 3}, done.output
     assert_valid(json.loads((folder / "report.json").read_text()))
     if words[0] == "fleet":
@@ -72,8 +72,8 @@ def test_the_demo_is_valid_against_its_schema(demonstration: Path) -> None:
 
 
 def test_schema_lists_the_reports_and_prints_the_schema_of_one() -> None:
-    listed = CliRunner().invoke(app, ["schema"])
+    listed = CliRunner().invoke(load(), ["schema"])
     assert listed.stdout.split() == sorted(REPORTS)
-    printed = CliRunner().invoke(app, ["schema", "info"])
+    printed = CliRunner().invoke(load(), ["schema", "info"])
     assert json.loads(printed.stdout) == json_schema("info")
-    assert CliRunner().invoke(app, ["schema", "inof"]).exit_code == 3
+    assert CliRunner().invoke(load(), ["schema", "inof"]).exit_code == 3

@@ -23,11 +23,11 @@ from rosbags.rosbag2 import Reader
 from rosbags.typesys import Stores, get_typestore
 from ruamel.yaml import YAML
 
+from imutool.api.logs import export
 from imutool.conversion.run import convert
 from imutool.converters import euroc
 from imutool.debiasing import debias
 from imutool.errors import ConfigError, ImutoolError, LogError
-from imutool.exporting.export import export
 from imutool.mcap_io.log import Log
 from imutool.mcap_io.read import read
 from imutool.mcap_io.write import write
@@ -172,7 +172,7 @@ def test_sensor_yaml_says_where_its_noise_is_from(log: Path, tmp_path: Path) -> 
 
     measured = datasheet.Noise(gyro_density=(3e-4, None, 4e-4), sources={"gyro_density": "4.2 h at rest"})
     datasheet.write(measured, tmp_path / "imu.toml")
-    export(log, tmp_path / "measured", format="euroc", sensor_noise=tmp_path / "imu.toml")
+    export(log, tmp_path / "measured", format="euroc", noise=tmp_path / "imu.toml")
     held = yaml_of(tmp_path / "measured")
     assert held["gyroscope_noise_density"] == pytest.approx(np.sqrt((9 + 16) / 2) * 1e-4)
     assert "gyroscope_random_walk" not in held

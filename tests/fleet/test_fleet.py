@@ -20,7 +20,7 @@ import pytest
 from typer.testing import CliRunner
 
 from imutool.cleaning import CleaningSettings
-from imutool.cli import app
+from imutool.cli import load
 from imutool.debiasing import debias
 from imutool.errors import ConfigError
 from imutool.fleet.engine import Engine
@@ -339,12 +339,12 @@ def test_a_fleet_that_is_ended_goes_on_where_it_was(
 def test_the_command_says_what_came_of_it(fleet: Path, tmp_path: Path, ray_started: None) -> None:
     (fleet / "bad.mcap").write_bytes(b"no log")
     words = ["fleet", "info", str(fleet), str(tmp_path / "out"), "--report", str(tmp_path / "page.html"), "-q"]
-    done = CliRunner().invoke(app, words)
+    done = CliRunner().invoke(load(), words)
     assert done.exit_code == 5
     assert "failed" in done.stdout
     assert str(fleet / "bad.mcap") in done.stdout
     assert (tmp_path / "page.html").is_file()
-    done = CliRunner().invoke(app, [*words, "--resume", "--json", "-"])
+    done = CliRunner().invoke(load(), [*words, "--resume", "--json", "-"])
     report = json.loads(done.stdout)
     assert (report["schema"], report["statuses"]) == ("imutool.fleet/1", {"failed": 1, "skipped": 2})
     assert report["not_whole"][0]["source"] == str(fleet / "bad.mcap")
@@ -362,7 +362,7 @@ def test_the_command_says_what_came_of_it(fleet: Path, tmp_path: Path, ray_start
 def test_a_wrong_word_is_told_before_anything_is_begun(
     fleet: Path, tmp_path: Path, words: list[str], code: int, why: str
 ) -> None:
-    done = CliRunner().invoke(app, ["fleet", "debias", str(fleet), str(tmp_path / "out"), *words])
+    done = CliRunner().invoke(load(), ["fleet", "debias", str(fleet), str(tmp_path / "out"), *words])
     assert done.exit_code == code
     assert why in done.stderr
     assert not (tmp_path / "out").exists()

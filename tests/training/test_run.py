@@ -16,16 +16,15 @@ from typer.testing import CliRunner
 
 from imutool.bias import hybrid
 from imutool.bias.io import load
-from imutool.cli.app import app
 from imutool.config import build
 from imutool.config import load as load_settings
 from imutool.errors import ConfigError, DataError, LogError, ModelError, NumericsError
 from imutool.mcap_io.write import write
 from imutool.recording import Imu, Recording
 from imutool.sensor.made_up_flight import flight
+from imutool.training.calibration import config_of, helps, settings_for
 from imutool.training.fit import Epoch, TrainSettings
 from imutool.training.objective import WindowEndObjective
-from imutool.training.physics_first import config_of, helps, settings_for
 from imutool.training.run import checkpoint_path, train
 from imutool.training.settings import settings_of
 from imutool.units import Sensor
@@ -155,19 +154,19 @@ def test_ctrl_c_before_anything_is_done_leaves_nothing(logs: list[Path], tmp_pat
 def test_a_device_that_is_not_there_is_refused_before_any_log_is_read(method: str, tmp_path: Path) -> None:
     devices = ["tpu"] if torch.cuda.is_available() else ["tpu", "cuda"]
     for device in devices:
-        with pytest.raises(ConfigError, match="--device"):
+        with pytest.raises(ConfigError, match="device"):
             train([tmp_path / "absent.mcap"], tmp_path / "m.safetensors", method=method, device=device)
 
 
 def test_to_resume_what_was_never_begun_is_refused(logs: list[Path], tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match=r"m.safetensors.checkpoint: there is no checkpoint.*without --resume"):
+    with pytest.raises(ConfigError, match=r"m.safetensors.checkpoint: there is no checkpoint.*without `resume`"):
         train(logs, tmp_path / "m.safetensors", method="neural_ode", settings=TINY, resume=True)
 
 
 def test_a_checkpoint_is_not_trained_over_without_being_told(logs: list[Path], tmp_path: Path) -> None:
     out = tmp_path / "m.safetensors"
     checkpoint_path(out).write_bytes(b"hours of work")
-    with pytest.raises(ConfigError, match=r"interrupted training left its checkpoint.*--resume to go on"):
+    with pytest.raises(ConfigError, match=r"interrupted training left its checkpoint.*`resume` to go on"):
         train(logs, out, method="neural_ode", settings=TINY)
     assert checkpoint_path(out).read_bytes() == b"hours of work"
     train(logs, out, method="neural_ode", settings=TINY, overwrite=True)
@@ -389,6 +388,8 @@ def test_a_physics_file_of_which_hybrid_knows_nothing_is_refused(tmp_path: Path)
     file.write_text(entry("saturation", "gyro", "rad/s"))
     with pytest.raises(ConfigError, match="no effect that a bias model can correct"):
         settings_for(file)
-    said = CliRunner().invoke(app, ["train", "a.mcap", "-o", str(tmp_path / "m"), "--method", "linear", "--physics", str(file)])
+    said = CliRunner().invoke(
+        load(), ["train", "a.mcap", "-o", str(tmp_path / "m"), "--method", "linear", "--physics", str(file)]
+    )
     assert said.exit_code == 3
     assert "linear knows no effects" in said.output

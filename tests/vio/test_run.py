@@ -15,6 +15,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from imutool import cli
+from imutool.cli import evaluate as scores
 from imutool.config import plain
 from imutool.errors import DataError
 from imutool.inertial import metrics
@@ -152,7 +153,7 @@ def test_the_command_writes_json_and_a_table(code: Callable[..., int], capsys: p
 
 
 def test_the_commands_defaults_are_the_settings() -> None:
-    given = {name: one.default for name, one in inspect.signature(cli.vio.vio).parameters.items()}
+    given = {name: one.default for name, one in inspect.signature(scores.vio).parameters.items()}
     settings = VioSettings()
     assert given["lag"] == settings.smoother.lag_s
     assert given["keyframes"] == settings.keyframes_hz

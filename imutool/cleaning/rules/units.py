@@ -13,8 +13,8 @@ import numpy as np
 from jaxtyping import Float64
 
 from imutool.cleaning.finding import Finding, Severity
-from imutool.cleaning.frames import tilt_misfit
 from imutool.cleaning.rule import Rule, TopicSummary
+from imutool.cleaning.rules.axes import tilt_misfit
 from imutool.cleaning.samples import Motion
 from imutool.cleaning.truth import Truth, turning
 from imutool.recording import GRAVITY_M_S2, seconds

@@ -51,6 +51,7 @@ class Losses:
     unlisted: int = 0  # stretches beyond those listed
     bytes: int = 0
     unchecked_topics: list[str] = field(default_factory=list)  # topics whose definition no CRC covers
+    unproven: int = 0  # messages of which two definitions are possible
     unchecked_in: dict[int, int] = field(default_factory=dict)  # messages without CRC, by the offset of their stretch
 
     def __bool__(self) -> bool:

@@ -142,13 +142,13 @@ def _before_and_after(d: Diagnosis) -> Iterator[str]:
         return
     found = bool(d.findings)
     legend = BEFORE + AFTER if found else DIFFERENCE
-    over = "unseen time of all logs" if any(one.held_out.any() for one in d.traces) else "all time: none was held out"
+    over = "unseen time of all logs" if any(trace.held_out.any() for trace in d.traces) else "all time: none was held out"
     yield f"<h2>{'Before and after' if found else 'Difference'}</h2>"
     for k, trace in enumerate(d.traces[:MAX_LOGS]):
         drawn = figures.residual(trace, found=found)
         yield _figure(drawn, f"r{k}", f"{text(trace.log)}: over time{_band(trace)}. {legend}{HELD}")
     for k, (signal, traces) in enumerate(d.signals.items()):
-        drawn = figures.scalar_signal(traces, found=any(one.signal == signal for one in d.findings))
+        drawn = figures.scalar_signal(traces, found=any(finding.signal == signal for finding in d.findings))
         yield _figure(drawn, f"g{k}", f"{text(signal)}: over time. {legend}{HELD}")
     if len(d.traces) > MAX_LOGS:
         yield f'<p class="note">The first {MAX_LOGS} of {len(d.traces)} logs are drawn; all are in the .rrd.</p>'

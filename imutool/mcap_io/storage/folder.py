@@ -1,4 +1,4 @@
-"""Write a folder that appears whole or not at all, and report its contents."""
+"""Write a folder that appears whole or not at all."""
 
 from __future__ import annotations
 
@@ -8,8 +8,7 @@ import re
 import secrets
 import shutil
 import weakref
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from collections.abc import Iterator
 from pathlib import Path
 from types import TracebackType
 
@@ -97,17 +96,3 @@ def writing(path: Path) -> Iterator[None]:
         reason = error.strerror or type(error).__name__
         fix = "Choose a place that can be written and has room"
         raise ConfigError(f"cannot be written ({reason})", where=path, fix=fix) from error
-
-
-Progress = Callable[[int, int, str], None]  # done, in all, what is being written
-
-
-@dataclass(frozen=True)
-class ExportReport:
-    """Exported files with their rows, the IMU's topic (EuRoC), and the topics left out."""
-
-    output: Path
-    format: str
-    imu: str | None = None
-    written: dict[str, int] = field(default_factory=dict)
-    left_out: list[str] = field(default_factory=list)
