@@ -1,4 +1,4 @@
-"""Bias stream of the neural ODE: curves and drift in numpy, for whole logs and single samples."""
+"""Bias stream of the neural ODE in numpy, for whole logs and single samples."""
 
 from __future__ import annotations
 

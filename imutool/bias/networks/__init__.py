@@ -1,1 +1,1 @@
-"""Networks of the bias models in torch, for training; `Network.frozen` is the model for inference."""
+"""Networks of the bias models in torch, for training; `frozen` gives the model."""

@@ -1,4 +1,4 @@
-"""Convolutional network: four dilated causal convolutions for each sensor (`imutool.bias.conv`).
+"""Convolutional network: dilated causal convolutions (`imutool.bias.conv`).
 
 Training computes in float32 (three times as fast; the weights stay float64) with the batch norm as it stands, inference in
 float64 with the batch norm folded into the convolutions.

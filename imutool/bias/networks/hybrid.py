@@ -1,4 +1,4 @@
-"""Network of the hybrid: effects fitted in closed form, then the network of the neural ODE (`imutool.bias.hybrid`)."""
+"""Hybrid network: effects fitted in closed form, then a neural ODE (`imutool.bias.hybrid`)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Network of a bias model in torch: what training moves, and `frozen`, the model in numpy that infers with its weights."""
+"""Network of a bias model in torch, for training; `frozen` gives the model in numpy."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Network of the neural ODE: curve and drift, integrated by torchdiffeq (`imutool.bias.neural_ode`).
+"""Network of the neural ODE, integrated by torchdiffeq (`imutool.bias.neural_ode`).
 
 The drift is integrated along a causal Hermite path through the samples filtered over half a second, so the step of the solver
 changes the solution only by its own error.
