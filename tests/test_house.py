@@ -320,9 +320,9 @@ def test_training_shows_that_the_spy_sees(imported: Callable[..., set[str]], log
 INFERENCE = """
 import sys
 from typer.testing import CliRunner
-from imutool.cli import app
+from imutool.cli import load
 for line in sys.argv[1:]:
-    done = CliRunner().invoke(app, line.split())
+    done = CliRunner().invoke(load(), line.split())
     assert done.exit_code == 0, (line, done.output, done.exception)
     assert "torch" not in sys.modules, line
 """
