@@ -86,7 +86,7 @@ class Model(BiasModel):
         raise ConfigError(
             "hybrid does not start from a matrix",
             where="training hybrid",
-            fix="Train it with imutool.training.run.train, or its parts with imutool.training.physics_first",
+            fix="Train it with imutool.training.run.train, or its parts with imutool.training.calibration",
         )
 
     def error(self, sensor: Sensor, signals: Signals) -> Float64[np.ndarray, "n 3"]:

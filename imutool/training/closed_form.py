@@ -83,7 +83,7 @@ def solve(
         raise DataError(
             f"no stretch of {min(window_s):g} s of truth without a gap in {where}",
             expected="truth that covers at least one window",
-            fix="Shorten the windows with --set, or leave the log out",
+            fix="Shorten the windows (settings gyro_window_s, accel_window_s), or leave the log out",
         )
     rest, W, columns, known = rest.clone(), torch.zeros(3, 3).to(rest), COLUMNS[sensor], 9 if matrix else 0
     for _ in range(ITERATIONS if matrix else REST_ITERATIONS):

@@ -77,9 +77,9 @@ def check_device(device: str) -> None:
         ConfigError: neither cpu nor cuda, or cuda where there is none.
     """
     if device.partition(":")[0] not in ("cpu", "cuda"):
-        raise ConfigError(f"{device!r} is no device", where="--device", expected="cpu or cuda")
+        raise ConfigError(f"{device!r} is no device", where="device", expected="cpu or cuda")
     if device.startswith("cuda") and not torch.cuda.is_available():
-        raise ConfigError("no CUDA device here", where="--device", fix="Use --device cpu")
+        raise ConfigError("no CUDA device here", where="device", fix="Use `device=cpu`")
 
 
 class Training:
@@ -221,7 +221,7 @@ class Training:
             raise NumericsError(
                 f"the loss is {float(total.detach())} at step {stage.step} of the {stage.sensor} stage",
                 expected="a finite loss",
-                fix=f"Lower --set {stage.sensor}_rate",
+                fix=f"Lower the setting {stage.sensor}_rate",
             )
         stage.optimizer.step()
         stage.mean.update_parameters(self.model)

@@ -22,8 +22,8 @@ from imutool.inertial import metrics
 from imutool.inertial.strapdown import along_truth
 from imutool.mcap_io.read import read
 from imutool.recording import Recording
+from imutool.training.calibration import PhysicsFirst
 from imutool.training.fit import Training
-from imutool.training.physics_first import PhysicsFirst
 from imutool.training.settings import settings_of
 
 STARTS = ("prior", "truth:2", "truth:5", "truth:10", "truth:15", "auto", "smooth")

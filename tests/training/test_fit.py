@@ -196,7 +196,7 @@ def test_a_descent_that_only_harms_leaves_the_closed_form(recordings: list[Recor
 
 def test_a_loss_that_is_no_number_stops_the_training(recordings: list[Recording]) -> None:
     training = Training(recordings, "neural_ode", settings(gyro_rate=1e300))
-    with pytest.raises(NumericsError, match=r"the loss is (nan|inf) at step \d of the gyro stage.*Lower --set gyro_rate"):
+    with pytest.raises(NumericsError, match=r"the loss is (nan|inf) at step \d of the gyro stage.*Lower the setting gyro_rate"):
         finish(training)
 
 

@@ -126,7 +126,7 @@ def test_lengths_that_no_truth_holds_are_left_out_and_if_all_are_it_is_said(perf
     assert asked.lengths == [16, 120]
     assert set(asked.loss.medians) == {16, 120}
     far = TrainSettings(increments=IncrementSettings(gyro_samples=(4000,)))
-    with pytest.raises(DataError, match=r"for the gyro: no increment of 4000 samples.*--set increments.gyro_samples"):
+    with pytest.raises(DataError, match=r"for the gyro: no increment of 4000 samples.*setting increments.gyro_samples"):
         IncrementObjective(static.Model().double(), "gyro", pool, RestBiases(pool, 20.0), far)
 
 
