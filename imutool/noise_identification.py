@@ -17,7 +17,8 @@ from imutool.config import build
 from imutool.errors import DataError
 from imutool.inertial.stationary import rest_stretches, white_noise
 from imutool.location import Location
-from imutool.mcap_io.read import read
+from imutool.mcap_io.log import Log
+from imutool.mcap_io.read import read_recording
 from imutool.noise import allan
 from imutool.noise import datasheet as noise
 from imutool.noise.allan import Curve, Slopes
@@ -70,9 +71,9 @@ class IdentifiedNoise:
 
 
 def identify(
-    path: Location, *, imu: str | None = None, truth: str | None = None, model: str | Path | None = None
+    log: Location | Log, *, imu: str | None = None, truth: str | None = None, model: str | Path | None = None
 ) -> IdentifiedNoise:
-    """Noise of one IMU of a log: from rest, and with true poses from motion.
+    """Noise of one IMU of a log, which may be open: from rest, and with true poses from motion.
 
     In motion the samples are first corrected: by `model`, else by a matrix and a constant fitted to this log's own truth.
 
@@ -81,7 +82,10 @@ def identify(
         LogError, ConfigError, ModelError: the log or the model is not usable.
     """
     allan.library()
-    recording = read(path, imu=imu, truth=truth)
+    if not isinstance(log, Log):
+        with Log(log) as opened:
+            return identify(opened, imu=imu, truth=truth, model=model)
+    path, recording = log.path, read_recording(log, imu=imu, truth=truth)
     if truth is None and recording.truths:
         recording = recording.with_truth(next(iter(recording.truths)))
     remarks: list[str] = []

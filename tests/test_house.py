@@ -118,15 +118,14 @@ def test_the_order_is_really_looked_at() -> None:
     ]
 
 
-# Floors of imutool/diagnosis, lowest first: report and settings, estimator, one scalar signal, the diagnosis, sentences.
+# Floors of imutool/diagnosis, lowest first: report and settings, sentences, estimator, localization, the diagnosis.
 DIAGNOSIS = "imutool.diagnosis"
 DIAGNOSIS_FLOORS = (
     tuple(f"{DIAGNOSIS}.{module}" for module in ("result", "settings")),
-    (f"{DIAGNOSIS}.estimation",),
-    (f"{DIAGNOSIS}.localization",),  # of the IMU and of scalar signals
-    (f"{DIAGNOSIS}.scalar",),
-    (DIAGNOSIS,),
     (f"{DIAGNOSIS}.wording",),
+    (f"{DIAGNOSIS}.estimation",),
+    (f"{DIAGNOSIS}.localization",),
+    (DIAGNOSIS,),
 )
 
 
