@@ -15,8 +15,7 @@ from imutool.errors import ConfigError
 from imutool.location import LogPath, local, location
 from imutool.mcap_io.topics import ImuBatch
 from imutool.recording import Imu
-from imutool.viewing import notebook
-from imutool.viewing.model.output import Output
+from imutool.viewing import Output, notebook
 from imutool.viewing.model.run_data import RunData
 from imutool.viewing.model.runs import load
 from imutool.viewing.model.trajectory_error import ALIGNMENTS, Alignment

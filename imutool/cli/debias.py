@@ -17,7 +17,7 @@ from imutool.report import UNSET, Report, Section, UnsetType, json_values
 
 if TYPE_CHECKING:
     from imutool.debiasing import DebiasReport
-    from imutool.viewing.model.output import Output
+    from imutool.viewing import Output
     from imutool.viewing.rerun.live import Live
 
 MODEL_HELP = (

@@ -21,6 +21,7 @@ import numpy as np
 from jaxtyping import Bool, Float64, Int64
 from msgspec import Meta
 
+from imutool.columns import true_ranges
 from imutool.config import Settings
 from imutool.recording import Imu, nanoseconds
 
@@ -138,7 +139,7 @@ def resting_blocks(blocks: Blocks, settings: StationarySettings | None = None) -
     for shift in range(width):
         resting_blocks[shift : shift + len(rests)] |= rests
     least_ns = nanoseconds(settings.min_s - 2 * period_s)
-    return [(a, b) for a, b in _runs(resting_blocks) if blocks.last_ns[b - 1] - blocks.first_ns[a] >= least_ns]
+    return [(a, b) for a, b in true_ranges(resting_blocks) if blocks.last_ns[b - 1] - blocks.first_ns[a] >= least_ns]
 
 
 class OnlineRestDetector:
@@ -220,8 +221,3 @@ def _window_statistics(
         noise.append(np.sqrt(v.mean(axis=-1)))
         means.append(m.mean(axis=-1))
     return np.concatenate(scatter), np.concatenate(noise), np.concatenate(means)
-
-
-def _runs(mask: Bool[np.ndarray, " n"]) -> list[tuple[int, int]]:
-    edges = np.flatnonzero(np.diff(mask.astype(np.int8), prepend=0, append=0))
-    return [(int(a), int(b)) for a, b in edges.reshape(-1, 2)]

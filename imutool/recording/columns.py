@@ -120,3 +120,9 @@ def _is_immutable(array: np.ndarray) -> bool:
             return False
         owner = owner.base
     return owner is None or isinstance(owner, bytes)
+
+
+def true_ranges(mask: Bool[np.ndarray, " n"]) -> list[tuple[int, int]]:
+    """Index ranges `[first, end)` in which a mask holds."""
+    edges = np.flatnonzero(np.diff(mask.astype(np.int8), prepend=0, append=0))
+    return [(int(a), int(b)) for a, b in edges.reshape(-1, 2)]

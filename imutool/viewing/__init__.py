@@ -1,1 +1,19 @@
 """What a person looks at: the data behind every picture, and the viewer that shows it."""
+
+from __future__ import annotations
+
+from typing import Literal, NamedTuple
+
+How = Literal["viewer", "connect", "rrd", "web", "folder", "png", "html"]
+
+
+class Output(NamedTuple):
+    """Output of a view: `place` is a URL or a path, `said` a sentence on how to open it."""
+
+    how: How
+    place: str
+    said: str
+
+    def plain(self) -> dict[str, str]:
+        """The fields by name, for JSON."""
+        return self._asdict()

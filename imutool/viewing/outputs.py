@@ -15,8 +15,8 @@ import numpy as np
 
 from imutool import __version__
 from imutool.errors import ConfigError, DataError
+from imutool.viewing import Output
 from imutool.viewing.html import report
-from imutool.viewing.model.output import Output
 from imutool.viewing.model.run_data import RunData
 from imutool.viewing.rerun.sdk import recording_name
 

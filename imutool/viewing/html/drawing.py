@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float64
 
+from imutool.columns import true_ranges
 from imutool.errors import ConfigError
 from imutool.viewing.html.page import GRID, INK, LIGHT, printable, text
 
@@ -173,8 +174,7 @@ def decimate_extremes(t: Line, y: Line, buckets: int = BUCKETS) -> tuple[Decimat
 
 def true_intervals(t: Line, mask: Bool[np.ndarray, " n"]) -> list[tuple[float, float]]:
     """Intervals of time in which a mask is true."""
-    turns = np.flatnonzero(np.diff(np.concatenate([[False], mask, [False]]).astype(int)))
-    return [(float(t[first]), float(t[last - 1])) for first, last in zip(turns[::2], turns[1::2], strict=True)]
+    return [(float(t[first]), float(t[end - 1])) for first, end in true_ranges(mask)]
 
 
 def average_log_bins(

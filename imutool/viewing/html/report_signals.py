@@ -40,11 +40,11 @@ def signals(data: RunData) -> Picture:
 def zoom(data: RunData) -> Picture | None:
     """Samples around the largest orientation error of the best model."""
     chosen = best_run(data)
-    found = None if chosen is None or chosen.is_raw else worst_orientation_error(chosen, data)
-    if found is None or data.duration_s <= 2.0 * ZOOM_S:
+    worst = None if chosen is None or chosen.is_raw else worst_orientation_error(chosen, data)
+    if worst is None or data.duration_s <= 2.0 * ZOOM_S:
         return None
-    assert chosen is not None, "then nothing was found"
-    first = min(max(found[1] - ZOOM_S / 2.0, 0.0), data.duration_s - ZOOM_S)
+    assert chosen is not None, "a worst error belongs to a run"
+    first = min(max(worst[1] - ZOOM_S / 2.0, 0.0), data.duration_s - ZOOM_S)
     caption = f"Every sample of {ZOOM_S:g} s around the largest orientation error of {run_name(chosen)}."
     return _samples(data, "zoom", "Signals where the error is largest", caption, (first, first + ZOOM_S))
 
@@ -54,7 +54,10 @@ def biases(data: RunData) -> Picture | None:
     models = data.models()
     if not models:
         return None
-    panels = [Panel(partial(_draw_bias, data=data, sensor=one), HEIGHT_INCH, f"{TITLES[one]} bias by axis") for one in SENSORS]
+    panels = [
+        Panel(partial(_draw_bias, data=data, sensor=sensor), HEIGHT_INCH, f"{TITLES[sensor]} bias by axis")
+        for sensor in SENSORS
+    ]
     band = " Bands: three standard deviations, as the model states them." * any(t.run.bias_std is not None for t in models)
     true = " Dashed: the true bias." * bool(data.true_bias)
     return Picture("bias", "Biases", f"The bias that each model subtracts.{band}{true}", tuple(panels))
@@ -66,7 +69,9 @@ def spectrum(data: RunData) -> Picture | None:
         return None
     curves = {
         sensor: [
-            (trace, one.frequency_hz, one.density) for trace in data.traces if (one := trace.spectra.get(sensor)) is not None
+            (trace, spectrum.frequency_hz, spectrum.density)
+            for trace in data.traces
+            if (spectrum := trace.spectra.get(sensor)) is not None
         ]
         for sensor in SENSORS
     }
@@ -96,11 +101,15 @@ def allan_deviation(data: RunData) -> Picture | None:
     for trace in data.traces:
         still = [trace.run.imu.between(int(imu.t_ns[a]), int(imu.t_ns[b - 1])) for a, b in ranges]
         for sensor in SENSORS:
-            curve = allan.curve([_both(one)[sensor] for one in still], imu.period_s)
+            curve = allan.curve([_both(part)[sensor] for part in still], imu.period_s)
             curves[sensor].append((trace, curve.tau_s, curve.deviation))
     panels = [
-        Panel(partial(_draw_allan, data=data, sensor=one, curves=curves[one]), HEIGHT_INCH, f"{TITLES[one]} Allan deviation")
-        for one in SENSORS
+        Panel(
+            partial(_draw_allan, data=data, sensor=sensor, curves=curves[sensor]),
+            HEIGHT_INCH,
+            f"{TITLES[sensor]} Allan deviation",
+        )
+        for sensor in SENSORS
     ]
     caption = f"Over {format_number(rest_s)} s at rest in {len(ranges)} stretch{'es' * (len(ranges) > 1)}; overlapping."
     return Picture("allan", "Allan deviation at rest", caption, tuple(panels))

@@ -88,9 +88,9 @@ def conclusion(data: RunData) -> str:
         text = f"{run_name(chosen)} has errors of {_errors(chosen)} over {format_number(data.duration_s)} s, without alignment"
     else:
         text = f"{comparison(chosen, before)} over {format_number(chosen.figures['duration_s'])} s, without alignment"
-    found = worst_orientation_error(chosen, data)
-    at = "" if found is None else f"; at worst by {format_quantity(found[0], '°')}, {format_number(found[1])} s after the start"
-    at += f" ({alignment_text(data)})" * (found is not None and data.alignment != "none")
+    worst = worst_orientation_error(chosen, data)
+    at = "" if worst is None else f"; at worst by {format_quantity(worst[0], '°')}, {format_number(worst[1])} s after the start"
+    at += f" ({alignment_text(data)})" * (worst is not None and data.alignment != "none")
     return f"{data.name}: {text}{at}."
 
 

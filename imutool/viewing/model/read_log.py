@@ -66,11 +66,11 @@ def read_log(path: Location, *, imu: str | None = None, truth: str | None = None
     """
     notes: list[str] = []
     try:
-        found = _read(Log(path), imu, truth, notes)
+        contents = _read(Log(path), imu, truth, notes)
     except LogError:  # reading with recovery is slower; an error that is not damage comes again
         notes.clear()
-        found = _read(RecoveredLog(path), imu, truth, notes)
-    topic, derived, batches, biases_by_topic, rest, metadata = found
+        contents = _read(RecoveredLog(path), imu, truth, notes)
+    topic, derived, batches, biases_by_topic, rest, metadata = contents
     where = f"{path} {topic}"
     survey = examine(lambda: batches[topic], _true(rest), CleaningSettings(), where=str(path), topic=topic)
     samples, logged, why = _sound_samples(batches[topic], survey, where)
@@ -96,8 +96,8 @@ def _read(opened: Log, imu: str | None, truth: str | None, notes: list[str]) -> 
 
     with opened as log:
         topic = log.only_imu() if imu is None else log.topic(imu, (schemas.IMU,)).name
-        derived = [one.name for one in log.with_schema((schemas.IMU,)) if one.metadata.get(DERIVED_KEY) == topic]
-        biases = [one.name for one in log.with_schema((schemas.TWIST,)) if one.metadata.get(DERIVED_KEY) == topic]
+        derived = [channel.name for channel in log.with_schema((schemas.IMU,)) if channel.metadata.get(DERIVED_KEY) == topic]
+        biases = [channel.name for channel in log.with_schema((schemas.TWIST,)) if channel.metadata.get(DERIVED_KEY) == topic]
         batches, biases_by_topic = _messages(log, [topic, *derived], biases)
         rest = read_recording(
             log, imu=topic, truth=truth, samples=NO_SAMPLES, derived=False, refused=None if truth else refused

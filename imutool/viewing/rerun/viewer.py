@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from imutool.errors import ConfigError
-from imutool.viewing.model.output import Output
+from imutool.viewing import Output
 from imutool.viewing.model.run_data import RunData
 from imutool.viewing.rerun import connect, scene
 from imutool.viewing.rerun.connect import Listener

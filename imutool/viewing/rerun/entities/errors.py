@@ -78,8 +78,8 @@ def _log_worst(data: RunData, to: rr.RecordingStream, entity: str, errors: Error
 
 def event_kinds(data: RunData) -> list[str]:
     """Kinds of event in the log, in the order of `events.KINDS`."""
-    found = {event.kind for event in data.events}
-    return [kind for kind in events.KINDS if kind in found]
+    present = {event.kind for event in data.events}
+    return [kind for kind in events.KINDS if kind in present]
 
 
 def log_events(data: RunData, to: rr.RecordingStream, scope: Scope) -> None:

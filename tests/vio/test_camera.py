@@ -8,8 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from imutool.recording import Poses
 from imutool.sensor.made_up_flight import FlightSettings, flight
-from imutool.vio.features import FAR_M, NEAR_M, Frame, blackouts, observe, room
-from imutool.vio.rig import EUROC, StereoRig
+from imutool.vio.camera import EUROC, FAR_M, NEAR_M, Frame, StereoRig, blackouts, observe, room
 
 EXACT_PX = 1e-9  # rounding of a few products of numbers up to 1e3
 FEATURES, LONGEST = 25, 8
