@@ -69,7 +69,7 @@ class ProcessEngine:
         return self
 
     def __exit__(self, *_: object) -> None:
-        pass  # `run` has ended its processes
+        """Do nothing: `run` has ended its processes."""
 
     def run(self, tasks: Iterable[Task], tick: Tick = lambda running: None, model: bytes | None = None) -> Generator[Result]:
         """Yield results as tasks end; a ConfigError says that processes do not start."""

@@ -215,7 +215,7 @@ def test_an_interrupt_ends_all_processes_and_leaves_nothing_half_written(tmp_pat
 
 
 def test_a_process_that_dies_is_a_failure_of_its_sequence_not_of_the_tool(source, tmp_path, monkeypatch):
-    monkeypatch.setattr("imutool.conversion.run._convert_numbered", pool_functions.end_at_first)
+    monkeypatch.setattr("imutool.conversion.workers.convert_numbered", pool_functions.end_at_first)
     report = convert(source, tmp_path / "out", workers=2)
     assert [failure.name for failure in report.failures] == ["a"]
     assert "its process died (exit code 9)" in report.failures[0].message

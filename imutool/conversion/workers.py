@@ -1,0 +1,93 @@
+"""Worker processes of a conversion: one log a job, with clean interrupts."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from imutool import registry
+from imutool.conversion.labels import Labels
+from imutool.conversion.message_writer import write_log
+from imutool.conversion.worker_pool import WorkerBugError, WorkerPool
+from imutool.errors import DataError, ImutoolError
+from imutool.mcap_io.write import write
+from imutool.recording import Recording
+from imutool.recording.message_log import MessageLog
+
+GROUP = "imutool.converters"
+
+
+@dataclass(frozen=True)
+class Job:
+    """Job of a worker process: one log."""
+
+    converter: str
+    sequence: Any  # the converter's own handle: has a `name`, and pickles
+    target: Path = Path()
+    compression: str = "zstd"
+    images: bool = True
+    overwrite: bool = False
+    labels: Labels = field(default_factory=Labels)
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """Outcome of a job: its error, or remarks on what was written."""
+
+    error: ImutoolError | None = None
+    notes: tuple[str, ...] = ()
+    losses: tuple[str, ...] = ()
+
+
+def run_jobs(jobs: Sequence[Job], workers: int) -> Iterator[tuple[int, Outcome]]:
+    """Yield each job's number and outcome, as the jobs end."""
+    if workers <= 1:
+        for number, job in enumerate(jobs):
+            yield number, _convert_one(job)
+    else:
+        yield from _run_in_processes(jobs, workers)
+
+
+def _convert_one(job: Job) -> Outcome:
+    try:
+        module = registry.load(GROUP, job.converter)
+        content = module.read_sequence(job.sequence, images=job.images)
+        return write_content(content, job.target, job.labels, compression=job.compression, overwrite=job.overwrite)
+    except ImutoolError as error:
+        return Outcome(error)
+
+
+def write_content(
+    content: Recording | MessageLog, target: Path, labels: Labels, *, compression: str, overwrite: bool
+) -> Outcome:
+    """Write what a converter has read, with the user's labels.
+
+    Raises:
+        ImutoolError: it cannot be written.
+    """
+    labelled = labels.put_on(content)
+    if isinstance(labelled, Recording):
+        write(labelled, target, compression=compression, overwrite=overwrite)
+        return Outcome()
+    write_log(labelled, target, compression=compression, overwrite=overwrite)
+    return Outcome(None, tuple(labelled.remarks.notes), tuple(labelled.remarks.losses))
+
+
+def _run_in_processes(jobs: Sequence[Job], workers: int) -> Iterator[tuple[int, Outcome]]:
+    """Run jobs in processes; after an interrupt they remove what they have half written."""
+    with WorkerPool(convert_numbered, workers) as pool:
+        for done in pool.run(enumerate(jobs)):
+            number, job = done.item
+            if isinstance(done.error, WorkerBugError):
+                done.error.add_note(done.error.trace)
+                raise done.error
+            why = f"its process died ({done.error}), perhaps for want of memory"
+            died = DataError(why, where=str(job.sequence), fix="Use fewer `workers`")
+            yield number, done.value if done.error is None else Outcome(died)
+
+
+def convert_numbered(item: tuple[int, Job]) -> Outcome:
+    """Convert a job with its number, in a worker process."""
+    return _convert_one(item[1])
