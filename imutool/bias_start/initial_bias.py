@@ -101,7 +101,7 @@ class ConstantBiasStream:
     ) -> BiasEstimate:
         """Bias at each sample, and the covariance of the rest bias in steps of `STEP_S`."""
         covariance = np.empty((len(t_s), 6, 6))
-        ends = [*np.flatnonzero(np.diff(t_s, prepend=self._before_s) > GAP_S), len(t_s)]
+        ends = [*np.flatnonzero(np.diff(t_s, prepend=self._before_s) > GAP_S).tolist(), len(t_s)]
         first = self._within(t_s, 0, ends[0], covariance)
         for end in ends[1:]:
             self._after_gap(float(t_s[first]))
