@@ -14,6 +14,9 @@ from imutool.cli.terminal import figures, progress, say, table, write_json
 from imutool.report import Report
 
 
+ALIGNED_HELP = "Also print evo's orientation error after an alignment of the positions (SE(3)); it says little about attitude."
+
+
 class Evaluation(Report, frozen=True, tag="imutool.evaluation/1"):
     """Report of `imutool evaluate`: scores of each log, model and estimate."""
 
@@ -36,6 +39,7 @@ def evaluate(
     truth: Truth = None,
     imu: Imu = None,
     trajectories: Annotated[Path | None, typer.Option(metavar="DIR", help="Folder for trajectories in TUM format.")] = None,
+    aligned: Annotated[bool, typer.Option("--aligned", help=ALIGNED_HELP)] = False,
     report: ReportPage = None,
     overwrite: Overwrite = False,
     json_to: Json = None,
@@ -74,7 +78,8 @@ def evaluate(
             pages.write_page(loaded, report, overwrite=overwrite)
         tell(len(logs), len(logs), "")
     if not write_json(Evaluation(results), json_to):
-        figures([{**row, "model": f"{row['model']} zupt"} if row["estimate"] == "zupt" else row for row in results])
+        rows = [{**row, "model": f"{row['model']} zupt"} if row["estimate"] == "zupt" else row for row in results]
+        figures(rows, aligned=aligned)
         if report is not None:
             say(f"Report: {report}")
 
