@@ -22,6 +22,7 @@ TRUTHS = {
     "state_groundtruth_recomputed0": "/ground_truth_recomputed/pose",
     "vicon0": "/ground_truth_vicon/pose",
 }
+BAG_SIGNS = {"/vicon/firefly_sbx/firefly_sbx", "/leica/position"}
 BAG_TRUTHS = ("/vicon/firefly_sbx/firefly_sbx",)
 
 
@@ -33,11 +34,11 @@ def sequences(source: Path) -> list[Sequence]:
 def recognises(sequence: Sequence) -> bool:
     """Whether a sequence is EuRoC: whole-number stamps and no motion capture as in TUM-VI.
 
-    A bag needs /imu0 and no vrpn topic.
+    A bag needs /imu0 and the topic of the laser tracker or of the Vicon system.
     """
     if is_bag(sequence.path):
         topics = _bag.topics(sequence.path)
-        return _asl.IMU_TOPIC in topics and "/vrpn_client/raw_transform" not in topics
+        return _asl.IMU_TOPIC in topics and "/vrpn_client/raw_transform" not in topics and bool(BAG_SIGNS & topics.keys())
     tree = Tree(sequence)
     return "mocap0" not in tree.sensors() and not _asl.float_stamps(tree)
 

@@ -16,6 +16,7 @@ from . import Sequence, _asl, _bag
 from ._source import Tree, find, is_bag
 
 DATASET, SENSOR = "fetch", "fetch"
+BAG_IMU = "/base/imu"
 TRUTHS = {"mocap0": "/ground_truth/pose"}
 
 
@@ -27,12 +28,12 @@ def sequences(source: Path) -> list[Sequence]:
 def recognises(sequence: Sequence) -> bool:
     """Whether a sequence is FETCH: stamps in scientific notation.
 
-    A bag needs an IMU (not on /imu0) and PoseStamped truth.
+    A bag needs the base's IMU and a motion-capture pose.
     """
     if is_bag(sequence.path):
         topics = _bag.topics(sequence.path)
-        kinds = set(topics.values())
-        return _asl.IMU_TOPIC not in topics and {"sensor_msgs/msg/Imu", "geometry_msgs/msg/PoseStamped"} <= kinds
+        mocap = any("mocap" in topic and kind == "geometry_msgs/msg/PoseStamped" for topic, kind in topics.items())
+        return topics.get(BAG_IMU) == _bag.IMU and mocap
     return _asl.float_stamps(Tree(sequence))
 
 

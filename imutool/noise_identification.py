@@ -175,12 +175,12 @@ def _by_fit(recording: Recording) -> tuple[Imu, str]:
     """
     import torch
 
-    from imutool.bias import static
+    from imutool.bias.networks import static
     from imutool.training import closed_form
     from imutool.training.segments import Pool
 
     pool = Pool.of([recording])
-    model = static.Model(rate_hz=pool.rate_hz).double()
+    model = static.Network(rate_hz=pool.rate_hz).double()
     rest = torch.zeros(1, 6, dtype=torch.float64)
     corrected = []
     for column, sensor in enumerate(SENSORS):

@@ -92,24 +92,28 @@ def convert(
     compression: str = "zstd",
     images: bool = True,
     overwrite: bool = False,
+    sensor: str = "",
+    kinds: Sequence[str] = (),
     workers: int | None = None,
     progress: NamedProgress | None = None,
 ) -> ConvertReport:
-    """Convert a raw data set to MCAP logs, one log per sequence.
+    """Convert recordings of any format to MCAP logs, one log per sequence.
 
     Args:
-        source: Sequence folder, archive (.zip, .tar, .tar.gz), ROS 1 bag, or a folder of these.
+        source: Bag, log, sequence folder or archive (.zip, .tar, .tar.gz), or a folder of these.
         out: Log file for one sequence, folder for several.
         format: Converter (`euroc`, `tum_vi`, `fetch`, ...), or `auto` to recognise it.
         sequences: Names of the sequences to convert; by default all.
         compression: `zstd`, `lz4` or `none`.
         images: Copy camera frames as well.
         overwrite: Replace existing logs.
+        sensor: Name of the IMU, where the recording does not state it.
+        kinds: What poses are worth, as `TOPIC=truth|estimate|odometry|unknown`.
         workers: Processes; by default one per core. A script that uses several needs `if __name__ == "__main__":`.
         progress: Callback with sequences done, sequences in all, and the name of the last one.
 
     Returns:
-        `written`, the logs in the order of the source, and `failures`.
+        `written`, the logs in the order of the source, `failures`, `notes`, and `losses`: what a log lacks of its source.
 
     Raises:
         DataError: The source holds no known sequence.
@@ -129,6 +133,8 @@ def convert(
         compression=compression,
         images=images,
         overwrite=overwrite,
+        sensor=sensor,
+        kinds=kinds,
         workers=workers,
         progress=progress,
     )

@@ -58,6 +58,11 @@ def tell_error(message: str) -> None:
     err.print(f"[bold red]error:[/] {plain(message)}", highlight=False, soft_wrap=True)
 
 
+def tell_warning(message: str, word: str = "warning") -> None:
+    """Print a line that begins with "warning:" or another word on stderr."""
+    err.print(f"[yellow]{word}:[/] {plain(message)}", highlight=False, soft_wrap=True)
+
+
 def tell_losses(losses: Mapping[str, Any]) -> None:
     """Print a log's losses (`mcap_io.recovery.losses.Losses.plain`), one line a stretch."""
     for line in describe(losses):

@@ -9,7 +9,7 @@ from collections.abc import Collection, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import islice
 from multiprocessing.process import BaseProcess
 from pathlib import Path
@@ -17,8 +17,12 @@ from types import FrameType
 from typing import Any
 
 from imutool import registry
+from imutool.conversion.labels import Labels
+from imutool.conversion.message_writer import write_log
 from imutool.errors import DataError, ImutoolError
 from imutool.mcap_io.write import write
+from imutool.recording import Recording
+from imutool.recording.message_log import MessageLog
 
 GROUP = "imutool.converters"
 INTERRUPT_EVERY_S = 0.1
@@ -34,10 +38,20 @@ class Job:
     compression: str = "zstd"
     images: bool = True
     overwrite: bool = False
+    labels: Labels = field(default_factory=Labels)
 
 
-def run_jobs(jobs: Sequence[Job], workers: int) -> Iterator[tuple[int, ImutoolError | None]]:
-    """Yield each job's number and its error, if it failed, as the jobs end."""
+@dataclass(frozen=True)
+class Outcome:
+    """Outcome of a job: its error, or remarks on what was written."""
+
+    error: ImutoolError | None = None
+    notes: tuple[str, ...] = ()
+    losses: tuple[str, ...] = ()
+
+
+def run_jobs(jobs: Sequence[Job], workers: int) -> Iterator[tuple[int, Outcome]]:
+    """Yield each job's number and outcome, as the jobs end."""
     if workers <= 1:
         for number, job in enumerate(jobs):
             yield number, _convert_one(job)
@@ -45,21 +59,36 @@ def run_jobs(jobs: Sequence[Job], workers: int) -> Iterator[tuple[int, ImutoolEr
         yield from _run_in_processes(jobs, workers)
 
 
-def _convert_one(job: Job) -> ImutoolError | None:
+def _convert_one(job: Job) -> Outcome:
     try:
         module = registry.load(GROUP, job.converter)
-        recording = module.read_sequence(job.sequence, images=job.images)
-        write(recording, job.target, compression=job.compression, overwrite=job.overwrite)
+        content = module.read_sequence(job.sequence, images=job.images)
+        return write_content(content, job.target, job.labels, compression=job.compression, overwrite=job.overwrite)
     except ImutoolError as error:
-        return error
-    return None
+        return Outcome(error)
 
 
-def _run_in_processes(jobs: Sequence[Job], workers: int) -> Iterator[tuple[int, ImutoolError | None]]:
+def write_content(
+    content: Recording | MessageLog, target: Path, labels: Labels, *, compression: str, overwrite: bool
+) -> Outcome:
+    """Write what a converter has read, with the user's labels.
+
+    Raises:
+        ImutoolError: it cannot be written.
+    """
+    labelled = labels.put_on(content)
+    if isinstance(labelled, Recording):
+        write(labelled, target, compression=compression, overwrite=overwrite)
+        return Outcome()
+    write_log(labelled, target, compression=compression, overwrite=overwrite)
+    return Outcome(None, tuple(labelled.remarks.notes), tuple(labelled.remarks.losses))
+
+
+def _run_in_processes(jobs: Sequence[Job], workers: int) -> Iterator[tuple[int, Outcome]]:
     """Run jobs in processes; on an interrupt, wait until all have removed their partial files."""
     others = set(multiprocessing.active_children())
     waiting = iter(enumerate(jobs))
-    running: dict[Future[ImutoolError | None], int] = {}
+    running: dict[Future[Outcome], int] = {}
     pool = ProcessPoolExecutor(workers, mp_context=multiprocessing.get_context("spawn"))
     try:
         with _interrupts_held():  # inherited by the processes, which heed interrupts only inside a job
@@ -93,18 +122,20 @@ def _interrupt(processes: Collection[BaseProcess]) -> None:
         alive[0].join(INTERRUPT_EVERY_S)
 
 
-def _outcome(future: Future[ImutoolError | None], job: Job) -> ImutoolError | None:
+def _outcome(future: Future[Outcome], job: Job) -> Outcome:
     try:
         return future.result()
     except BrokenProcessPool:
         return _died(job)
 
 
-def _died(job: Job) -> ImutoolError:
-    return DataError("its process died, perhaps for want of memory", where=str(job.sequence), fix="Use fewer `workers`")
+def _died(job: Job) -> Outcome:
+    return Outcome(
+        DataError("its process died, perhaps for want of memory", where=str(job.sequence), fix="Use fewer `workers`")
+    )
 
 
-def _convert_in_process(job: Job) -> ImutoolError | None:
+def _convert_in_process(job: Job) -> Outcome:
     signal.signal(signal.SIGINT, _interrupt_once)
     signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
     try:

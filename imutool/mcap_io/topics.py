@@ -16,6 +16,7 @@ from imutool.mcap_io.codec.messages import Rows
 
 ENCODINGS = ("cdr", "ros1")
 DERIVED_KEY = "imutool_source_topic"  # channel metadata: computed by imutool from this topic
+KIND_KEY = "imutool_kind"  # channel metadata of poses: truth, estimate, odometry or unknown
 MESSAGE_POSES = (schemas.POSE, schemas.ODOMETRY, schemas.TRANSFORM)
 SCALARS = {schemas.FLOAT: 1, schemas.VECTOR3: 3}
 CLEAN_FIX = "See what is wrong with imutool clean LOG, and leave it out with imutool debias --clean"

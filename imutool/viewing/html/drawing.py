@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float64
 
-from imutool.columns import true_ranges
 from imutool.errors import ConfigError
+from imutool.recording.columns import true_ranges
 from imutool.viewing.html.page import GRID, INK, LIGHT, printable, text
 
 WIDTH_INCH = 11.5  # on a page of 1150 pixels, letters of 9 points are 12 pixels high

@@ -14,9 +14,9 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float64, Int64
 
-from imutool.columns import Columns
 from imutool.errors import DataError
 from imutool.geometry import quaternion
+from imutool.recording.columns import Columns
 
 GRAVITY_M_S2 = 9.81
 UNIT_QUATERNION_TOLERANCE = 1e-6  # six printed decimals, as in the normalised EuRoC truth
