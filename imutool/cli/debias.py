@@ -14,10 +14,10 @@ from imutool.cli.terminal import progress, say, tell_losses, write_json
 from imutool.errors import ConfigError
 from imutool.location import Location, to_location
 from imutool.report import UNSET, Report, Section, UnsetType, json_values
+from imutool.viewing import Output
 
 if TYPE_CHECKING:
     from imutool.debiasing import DebiasReport
-    from imutool.viewing import Output
     from imutool.viewing.rerun.live import Live
 
 MODEL_HELP = (
@@ -118,7 +118,7 @@ class DebiasSummary(Report, frozen=True, kw_only=True, tag="imutool.debias/1"):
     added: dict[str, int]
     verified: Verified
     losses: dict[str, Any]
-    shown: list[dict[str, str]] | UnsetType = UNSET
+    shown: list[Output] | UnsetType = UNSET
     report: str | UnsetType = UNSET
     clean: list[dict[str, Any]] | UnsetType = UNSET
 
@@ -139,7 +139,7 @@ def _summary(
         added=dict(report.rewrite.added),
         verified=Verified(*report.rewrite.verified),
         losses=report.losses.plain(),
-        shown=UNSET if shown is None else [output.plain() for output in shown],
+        shown=UNSET if shown is None else list(shown),
         report=UNSET if page is None else str(page),
         clean=[json_values(survey.report()) for survey in report.surveys.values()] if clean else UNSET,
     )
