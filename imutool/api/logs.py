@@ -14,6 +14,8 @@ from imutool.location import LogPath, local, location
 from imutool.log_info import inspection
 from imutool.log_info.report import LogInfo
 from imutool.mcap_io.read import read as read_log
+from imutool.mcap_io.storage import outputs
+from imutool.mcap_io.storage.outputs import OutputFile, check_outputs
 from imutool.mcap_io.write import write as write_log
 from imutool.recording import Recording
 
@@ -80,6 +82,7 @@ def write(path: LogPath, recording: Recording, *, compression: str = "zstd", ove
         >>> imutool.read("bench.mcap") == recording
         True
     """
+    check_outputs([OutputFile("path", path, outputs.LOG)], overwrite=overwrite)
     write_log(recording, location(path), compression=compression, overwrite=overwrite)
 
 
@@ -125,6 +128,7 @@ def convert(
         >>> [log.name for log in imutool.convert("raw", "logs", format="euroc").written]
         ['flight_1.mcap', 'flight_2.mcap']
     """
+    check_outputs([OutputFile("out", out, files=("*.mcap",), keeps=True)], [source], overwrite=overwrite)
     return conversion.convert(
         local(source, "source"),
         local(out, "out"),
@@ -196,6 +200,7 @@ def export(
         fix = f"Did you mean {near[0]}?" if near else ""
         raise ConfigError(f"unknown format {format!r}", where="format", expected=" or ".join(FORMATS), fix=fix)
     source, folder = local(log, "log"), local(out, "out")
+    check_outputs([OutputFile("out", folder, files=("*",), keeps=True)], [source, noise], overwrite=overwrite)
     tell: NamedProgress = progress or (lambda done, total, word: None)
     if format == "euroc":
         return euroc.write(source, folder, imu, noise, overwrite, tell)

@@ -8,11 +8,14 @@ from typing import Annotated
 
 import typer
 
-from imutool.cli.app import LOST, Json, Overwrite, Quiet, Verbose, app, listing
+from imutool.cli.app import LOST, Json, Overwrite, Quiet, Verbose, Written, app, listing
 from imutool.cli.parameters import with_flags
 from imutool.cli.terminal import progress, say, tell_error, tell_warning, write_json
 from imutool.errors import DataError
 from imutool.report import Report, Section
+
+LOGS = Written(files=("*.mcap",), keeps=True)  # a file, or a folder of files
+FOLDER = Written(files=("*",), keeps=True)
 
 
 class Compression(StrEnum):
@@ -54,7 +57,7 @@ class Export(Report, frozen=True, tag="imutool.export/1"):
 )
 def convert(
     source: Annotated[Path, typer.Argument(help="Bag, log, sequence folder or archive, or a folder of them.")],
-    target: Annotated[Path, typer.Argument(metavar="OUT", help="File for one sequence, folder for several.")],
+    target: Annotated[Path, typer.Argument(metavar="OUT", help="File for one sequence, folder for several."), LOGS],
     format: Annotated[str, typer.Option(help="auto, or a name from the list below.")] = "auto",
     sequence: Annotated[list[str] | None, typer.Option(help="Convert only this sequence. Repeatable.")] = None,
     compression: Annotated[Compression, typer.Option(help="Compression of the chunks.")] = Compression.zstd,
@@ -89,7 +92,7 @@ def convert(
         )
     failures = [Failure(failure.name, failure.message) for failure in report.failures]
     summary = Conversion([str(path) for path in report.written], failures, report.notes, report.losses)
-    if not write_json(summary, json_to):
+    if not write_json(summary, json_to, overwrite=overwrite):
         for path in report.written:
             say(str(path))
     if not quiet:
@@ -106,7 +109,7 @@ def convert(
 @app.command(epilog="Example: [bold]imutool export MH_04_debiased.mcap MH_04_debiased --format euroc[/]")
 def export(
     log: Annotated[Path, typer.Argument(metavar="LOG", help="An MCAP log.")],
-    target: Annotated[Path, typer.Argument(metavar="OUT", help="New folder.")],
+    target: Annotated[Path, typer.Argument(metavar="OUT", help="New folder."), FOLDER],
     format: Annotated[str, typer.Option(help="euroc: an ASL folder; rosbag2: a folder around a copy of the log.")],
     imu: Annotated[str | None, typer.Option(help="IMU topic of a EuRoC folder; by default the debiased one.")] = None,
     noise: Annotated[
@@ -123,7 +126,7 @@ def export(
     with progress("Exporting", verbose, quiet) as tell:
         report = run(log, target, format=format, imu=imu, noise=noise, overwrite=overwrite, progress=tell)
     summary = Export(str(report.output), report.format, report.imu, report.written, report.left_out)
-    if write_json(summary, json_to):
+    if write_json(summary, json_to, overwrite=overwrite):
         return
     counts = ", ".join(f"{count} on {name}" for name, count in report.written.items())
     say(f"{target}: {counts}" + (f"; IMU from {report.imu}" if report.imu else ""))

@@ -10,7 +10,7 @@ from typing import Annotated, Any
 
 import typer
 
-from imutool.cli.app import Imu, Init, Json, Logs, Models, Overwrite, Quiet, ReportPage, Smooth, Truth, Verbose, app
+from imutool.cli.app import Imu, Init, Json, Logs, Models, Overwrite, Quiet, ReportPage, Smooth, Truth, Verbose, Written, app
 from imutool.cli.terminal import figures, progress, say, table, write_json
 from imutool.errors import ImutoolError
 from imutool.report import Report
@@ -18,6 +18,7 @@ from imutool.report import Report
 logger = logging.getLogger(__name__)
 
 ALIGNED_HELP = "Also print evo's orientation error after an alignment of the positions (SE(3)); it says little about attitude."
+TRAJECTORIES = Written(files=("*.tum",), keeps=True)
 
 
 class Evaluation(Report, frozen=True, tag="imutool.evaluation/1"):
@@ -41,7 +42,9 @@ def evaluate(
     zupt: Annotated[bool, typer.Option("--zupt", help="Also score dead reckoning with zero-velocity updates.")] = False,
     truth: Truth = None,
     imu: Imu = None,
-    trajectories: Annotated[Path | None, typer.Option(metavar="DIR", help="Folder for trajectories in TUM format.")] = None,
+    trajectories: Annotated[
+        Path | None, typer.Option(metavar="DIR", help="Folder for trajectories in TUM format."), TRAJECTORIES
+    ] = None,
     aligned: Annotated[bool, typer.Option("--aligned", help=ALIGNED_HELP)] = False,
     report: ReportPage = None,
     overwrite: Overwrite = False,
@@ -55,10 +58,11 @@ def evaluate(
     """
     from imutool.evaluation import evaluate as run
     from imutool.viewing.html import report as pages
+    from imutool.viewing.html.drawing import require_matplotlib
     from imutool.viewing.model.runs import load
 
     if report is not None:
-        pages.check_target(report, overwrite=overwrite)
+        require_matplotlib()
     results: list[dict[str, Any]] = []
     loaded = []
     errors: list[ImutoolError] = []
@@ -88,7 +92,7 @@ def evaluate(
             tell(len(logs), len(logs), "drawing")
             pages.write_page(loaded, report, overwrite=overwrite)
         tell(len(logs), len(logs), "")
-    if not write_json(Evaluation(results), json_to):
+    if not write_json(Evaluation(results), json_to, overwrite=overwrite):
         rows = [{**row, "model": f"{row['model']} zupt"} if row["estimate"] == "zupt" else row for row in results]
         figures(rows, aligned=aligned)
         if report is not None:
@@ -140,6 +144,7 @@ def vio(
         list[str] | None,
         typer.Option("--set", metavar="key=value", help="Change a setting of imutool.vio.run.VioSettings. Repeatable."),
     ] = None,
+    overwrite: Overwrite = False,
     json_to: Json = None,
     verbose: Verbose = False,
     quiet: Quiet = False,
@@ -162,7 +167,7 @@ def vio(
             results += run(
                 log, models=model or (), init=init, truth=truth, imu=imu, bias_states=states, settings=settings, progress=tell
             )
-    if write_json(VioReport(results), json_to):
+    if write_json(VioReport(results), json_to, overwrite=overwrite):
         return
     for rows in tabulate(results):
         table(rows, keys=3)

@@ -2,27 +2,24 @@
 
 from __future__ import annotations
 
-import json
 import logging
 import math
-import os
 import re
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import msgspec
 from rich import box
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn
 from rich.table import Table
 
 from imutool.cli.parameters import with_flags
-from imutool.errors import ConfigError
+from imutool.location import to_location
 from imutool.mcap_io.recovery.losses import describe
-from imutool.report import json_values
+from imutool.mcap_io.storage.target import Target
+from imutool.report import Report, json_text
 
 if TYPE_CHECKING:
     from imutool.training.fit import Epoch
@@ -112,27 +109,20 @@ def _print(columns: Sequence[Sequence[str]], width: int) -> None:
     console.print()
 
 
-def write_json(report: Any, where: str | None) -> bool:
+def write_json(report: Report | Mapping[str, Any], where: str | None, *, overwrite: bool = False) -> bool:
     """Write the report where `--json` says; True if stdout holds it.
 
     Raises:
-        ConfigError: the file cannot be written.
+        ConfigError: the file exists (without `overwrite`), or cannot be written.
     """
     if where is None:
         return False
-    values = json_values(report) if isinstance(report, msgspec.Struct) else report
-    text = json.dumps(values, indent=2, allow_nan=False, ensure_ascii=False)
+    text = json_text(report)
     if where == "-":
-        sys.stdout.write(text + "\n")
+        sys.stdout.write(text)
         return True
-    beside = Path(where).with_name(f".{Path(where).name}.{os.getpid()}.part")
-    try:
-        beside.write_text(text + "\n", encoding="utf-8")
-        beside.replace(where)
-    except OSError as error:
-        raise ConfigError(f"cannot be written ({error.strerror})", where=where, fix="Choose another --json") from error
-    finally:
-        beside.unlink(missing_ok=True)
+    with Target(to_location(where), overwrite=overwrite) as target:
+        target.write(text.encode())
     return False
 
 
