@@ -28,7 +28,7 @@ ROOT = Path(__file__).parents[1]
 # docs/architecture.md, Rooms: lower never imports higher. A room is a module of imutool or a folder of them.
 TIERS = (
     ("errors",),
-    ("columns", "config", "location", "registry", "report", "units", "geometry", "recording"),
+    ("config", "location", "registry", "report", "units", "geometry", "recording"),
     ("inertial", "mcap_io", "bag"),
     ("noise", "cleaning"),
     ("sensor", "log_info", "exporting"),
