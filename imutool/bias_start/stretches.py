@@ -138,7 +138,8 @@ class Sieve:
         """Defects in words: samples that were left out, and jumps of the clock."""
         if self.left_out:
             total = sum(self.left_out.values())
-            yield f"{total} samples are no measurement and left out ({described(self.left_out)}), the first at {self.first_ns} ns"
+            kinds = described(self.left_out)
+            yield f"{total} samples are no measurement and left out ({kinds}), the first at {self.first_ns} ns"
         jumps = [stretch for stretch in self.clock.stretches if stretch.jump]
         for stretch in jumps[:MOST_WARNINGS]:
             yield f"the clock jumps by {stretch.step_s:+.6g} s to {stretch.start_ns} ns; a new stretch begins there"
