@@ -3,6 +3,8 @@
 The *rest bias* differs from run to run (the turn-on bias); the dynamics start from it. The part that the motion adds (scale,
 misalignment, curvature) belongs to the sensor. Models add the two, `bias = rest + ...`: an error of the rest bias is the same
 error at every sample, so `imutool.bias_start.initial_bias` can solve for it with any model.
+
+Inference is numpy. A trained method has a network in torch, `imutool.bias.networks.METHOD`, whose weights a model holds.
 """
 
 from __future__ import annotations
@@ -10,40 +12,23 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
-from dataclasses import dataclass
-from types import MappingProxyType
-from typing import Any, ClassVar, Literal, NamedTuple, Protocol, runtime_checkable
+from typing import Any, ClassVar, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
-import torch
-from jaxtyping import Float, Float64
-from torch import Tensor, nn
+from jaxtyping import Float64
 
 from imutool.config import Settings
-from imutool.inertial.windows import end_attitude
 from imutool.units import SENSORS, Sensor
 
 COLUMNS = {"gyro": slice(0, 3), "accel": slice(3, 6)}  # of a vector of six
+STATISTICS = ("prior_mean", "prior_std", "truth_std", "rest_std", "walk_std", "noise_std")
+
+GAP_S = 1.0  # a longer step of the stamps begins a new stretch: filters of the samples start anew, and no drift is integrated
 
 Vector6 = Float64[np.ndarray, "6"]  # gyro (rad/s) then accel (m/s²)
 Covariances = Float64[np.ndarray, "n 6 6"]
-
-
-@dataclass(frozen=True)
-class Segment:
-    """Samples of a segment.
-
-    `t` in seconds from its first sample, and the rest bias at its start.
-    """
-
-    t: Float[Tensor, "batch n"]
-    gyro: Float[Tensor, "batch n 3"]
-    accel: Float[Tensor, "batch n 3"]
-    rest: Float[Tensor, "batch 6"]
-
-    def of(self, sensor: Sensor) -> tuple[Float[Tensor, "batch n 3"], Float[Tensor, "batch 3"]]:
-        """Samples and rest bias of one sensor."""
-        return (self.gyro if sensor == "gyro" else self.accel), self.rest[:, COLUMNS[sensor]]
+Array = Float64[np.ndarray, "..."]
+Shapes = dict[str, tuple[int, ...]]
 
 
 @runtime_checkable
@@ -88,6 +73,15 @@ class SampleStream(Stream, Protocol):
 
 
 @runtime_checkable
+class DriftStream(SampleStream, Protocol):
+    """Bias stream whose rest bias may drift."""
+
+    @property
+    def rest(self) -> Vector6:
+        """Latest rest bias."""
+
+
+@runtime_checkable
 class CovarianceModel(Protocol):
     """Roots S of the covariance S S^T of the motion-dependent bias, by sensor.
 
@@ -102,63 +96,59 @@ class CovarianceModel(Protocol):
         """Roots at each sample, from it and earlier ones; no entry for a sensor without covariance."""
 
 
-class BiasModel(nn.Module, ABC):
+class BiasModel(ABC):
     """Bias model with the statistics of its sensor's training runs, from which every run starts.
 
-    It computes in float64 (`imutool.bias.io.load`, `imutool.training.fit`); files hold float32.
-
-    Attributes:
-        prior_mean, prior_std: rest bias over the training runs, and its spread from run to run.
-        truth_std: spread of a rest bias estimated from `imutool.bias_start.bias_from_truth.TRUTH_S` seconds of truth.
-        rest_std: spread of the bias at rest minus the bias in motion.
-        walk_std: random walk of the rest bias per second^1/2.
-        noise_std: white noise of a sample from the residuals, for the covariance of the debiased message.
+    It computes in float64; files hold float32. `tensors` are the weights and statistics by name, with the shapes of `shapes`;
+    those that are not given are zero.
     """
 
     method: ClassVar[str]
-    iterative: ClassVar[bool] = True  # false where the closed form is the whole solution
-    objective: ClassVar[Literal["window_ends", "increments"]] = "window_ends"  # loss of the training (imutool.training)
-    prefers: ClassVar[Mapping[str, Any]] = MappingProxyType({})  # TrainSettings that differ from the general defaults
-    undecayed: ClassVar[tuple[str, ...]] = ()  # name prefixes of parameters without weight decay
-    longest_window_s: float = math.inf  # upper limit for the training
-    context: int = 0  # samples before a segment that its bias depends on; such a bias is rest + f(samples)
-    prior_mean: Tensor
-    prior_std: Tensor
-    truth_std: Tensor
-    rest_std: Tensor
-    walk_std: Tensor
-    noise_std: Tensor
+    card: Mapping[str, Any]
 
-    def __init__(self, config: Settings, rate_hz: float) -> None:
-        super().__init__()
-        self.config, self.rate_hz = config, rate_hz
-        self.card: Mapping[str, Any] = {}
-        for name in ("prior_mean", "prior_std", "truth_std", "rest_std", "walk_std", "noise_std"):
-            self.register_buffer(name, torch.zeros(6))
+    def __init__(self, config: Settings, rate_hz: float, tensors: Mapping[str, np.ndarray] | None = None) -> None:
+        self.config, self.rate_hz, self.card = config, rate_hz, {}
+        blank = {name: np.zeros(shape) for name, shape in self.shapes(config).items() if name not in (tensors or {})}
+        self.tensors = blank | {name: np.array(value, dtype=np.float64) for name, value in (tensors or {}).items()}
 
-    def see(self, gyro: Float[Tensor, "n 3"], accel: Float[Tensor, "n 3"]) -> None:
-        """Set the scales of the inputs from all training samples, before the first step."""
+    @classmethod
+    def shapes(cls, config: Settings) -> Shapes:
+        """Shapes of the tensors by name; they cost no memory, whatever sizes the settings name.
 
-    def rest_at_work(self, sensor: Sensor, rest: Float[Tensor, "*logs 3"]) -> Float[Tensor, "*logs 3"]:
-        """Rest biases for inference from those of training mode; equal for most models."""
-        return rest
-
-    @abstractmethod
-    def sensor_bias(self, sensor: Sensor, segment: Segment) -> Float[Tensor, "batch n 3"]:
-        """Bias of one sensor at each sample; row k depends on samples up to k. Differentiable.
-
-        The sensors are separate because the training is: first the gyro, then the accelerometer with the trained gyro.
+        Raises:
+            ConfigError: settings that do not fit each other, or an unknown effect.
         """
+        return dict.fromkeys(STATISTICS, (6,))
 
-    def forward(self, segment: Segment) -> Float[Tensor, "batch n 6"]:
-        """Bias at each sample: gyro (rad/s), then accel (m/s²)."""
-        return torch.cat([self.sensor_bias(sensor, segment) for sensor in SENSORS], dim=-1)
+    @property
+    def prior_mean(self) -> Vector6:
+        """Mean of the rest bias over the training runs."""
+        return self.tensors["prior_mean"]
 
-    def end_attitude(
-        self, R_start: Float[Tensor, "batch 3 3"], segment: Segment, dt: Float[Tensor, "batch steps"]
-    ) -> Float[Tensor, "batch 3 3"]:
-        """Attitude (body to world) at the last sample, by integrating the debiased rate from `R_start`. Differentiable."""
-        return end_attitude(R_start, segment.gyro - self.sensor_bias("gyro", segment), dt)
+    @property
+    def prior_std(self) -> Vector6:
+        """Spread of the rest bias from run to run."""
+        return self.tensors["prior_std"]
+
+    @property
+    def truth_std(self) -> Vector6:
+        """Spread of a rest bias estimated from `imutool.bias_start.bias_from_truth.TRUTH_S` seconds of truth."""
+        return self.tensors["truth_std"]
+
+    @property
+    def rest_std(self) -> Vector6:
+        """Spread of the bias at rest minus the bias in motion."""
+        return self.tensors["rest_std"]
+
+    @property
+    def walk_std(self) -> Vector6:
+        """Random walk of the rest bias per second^1/2."""
+        return self.tensors["walk_std"]
+
+    @property
+    def noise_std(self) -> Vector6:
+        """White noise of a sample from the residuals, for the covariance of the debiased message."""
+        return self.tensors["noise_std"]
 
     def rest_dynamics(self) -> Float64[np.ndarray, "6 6"]:
         """Rest dynamics d(drift of the rest bias) / d(rest bias) per second; zero for most models."""
@@ -169,9 +159,62 @@ class BiasModel(nn.Module, ABC):
         return None
 
     @abstractmethod
-    def begin_at(self, sensor: Sensor, W: Float[Tensor, "3 3"]) -> None:
-        """Set the calibration matrix, solved in closed form, from which the training starts."""
+    def stretch(self, rest: Vector6, start_s: float = math.nan) -> Stream:
+        """Bias stream from a rest bias over samples without gaps; one that drifts has `rest`, its latest rest bias.
 
-    @abstractmethod
-    def stream(self, rest: Vector6) -> Stream:
-        """Bias stream in numpy from a rest bias, for long logs and live use; equals `forward` to 1e-6."""
+        `start_s` is the time of the log's first sample (by default of the stretch's).
+        """
+
+    def stream(self, rest: Vector6) -> SampleStream:
+        """Bias stream from a rest bias, for long logs and live use; after a gap a new stretch begins."""
+        return _Stretches(self, rest)
+
+
+class _Stretches:
+    """Bias stream over stretches with gaps between them; each begins at the rest bias that the one before has reached."""
+
+    def __init__(self, model: BiasModel, rest: Vector6) -> None:
+        self._model, self._rest, self._start_s, self._before_s = model, rest, math.nan, math.nan
+        self._stream = model.stretch(rest)
+        self._one = getattr(self._stream, "one", None)
+
+    def __call__(
+        self, t_s: Float64[np.ndarray, " n"], gyro: Float64[np.ndarray, "n 3"], accel: Float64[np.ndarray, "n 3"]
+    ) -> Float64[np.ndarray, "n 6"]:
+        """Bias at each sample."""
+        if not len(t_s):
+            return np.zeros((0, 6))
+        if math.isnan(self._start_s):
+            self._start_s = float(t_s[0])
+        step = np.diff(t_s, prepend=self._before_s)
+        self._before_s, cuts = float(t_s[-1]), np.flatnonzero((step > GAP_S) | (step < 0.0))
+        if not len(cuts):
+            return self._stream(t_s, gyro, accel)
+        parts = []
+        for first, last in zip([0, *cuts], [*cuts, len(t_s)], strict=True):
+            if first in cuts:
+                self._begin()
+            if last > first:
+                parts.append(self._stream(t_s[first:last], gyro[first:last], accel[first:last]))
+        return np.concatenate(parts)
+
+    def one(self, t_s: float, u: Vector6) -> Vector6:
+        """Bias at one sample."""
+        step = t_s - self._before_s
+        if step > GAP_S or step < 0.0:
+            self._begin()
+        self._before_s = t_s
+        if math.isnan(self._start_s):
+            self._start_s = t_s
+        bias: Vector6 = self._stream(np.array([t_s]), u[None, :3], u[None, 3:])[0] if self._one is None else self._one(t_s, u)
+        return bias
+
+    def _begin(self) -> None:
+        self._rest = getattr(self._stream, "rest", self._rest)
+        self._stream = self._model.stretch(self._rest, self._start_s)
+        self._one = getattr(self._stream, "one", None)
+
+
+def matrices(names: str) -> Shapes:
+    """Shapes of one matrix for each sensor: `names` with its name."""
+    return {f"{names}.{sensor}": (3, 3) for sensor in SENSORS}
