@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import ast
 import difflib
+import functools
 import importlib
 import importlib.util
 import pkgutil
-from importlib.metadata import EntryPoint, entry_points
+from importlib import metadata
+from importlib.metadata import EntryPoint, EntryPoints
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 from imutool.errors import ConfigError
 
@@ -24,6 +27,18 @@ NOT_PLUGINS = {
     "imutool.bias": frozenset({"io", "model", "networks", "neural_stream", "physics"}),
     "imutool.networks": frozenset({"joint_ode", "network", "ode"}),
 }
+
+
+@functools.cache
+def _all_entry_points() -> Any:  # EntryPoints, before Python 3.12 SelectableGroups
+    """Entry points of all installed packages: a search of their folders, once a process."""
+    return metadata.entry_points()
+
+
+def entry_points(group: str) -> EntryPoints:
+    """Entry points of a group."""
+    points: EntryPoints = _all_entry_points().select(group=group)
+    return points
 
 
 def names(group: str) -> list[str]:
