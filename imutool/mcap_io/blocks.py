@@ -49,6 +49,7 @@ class MessageBlock:
     counts: dict[int, int] | None = None  # messages per channel id, once known
     trusted: bool = True  # False: no summary lists the block, and only unpacking it proves what is in it
     edited: bool = False  # some of its messages are left out or have other channel ids than in its bytes
+    recording: int = 0  # of the logs in a damaged file, the one that wrote it
     lost: bool = False
 
     @staticmethod

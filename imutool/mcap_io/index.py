@@ -39,8 +39,11 @@ class LogIndex:
         LogError: empty, not an MCAP log, cut short, or damaged; the message says at which byte.
     """
 
-    def __init__(self, source: Source) -> None:
-        self.source = source
+    def __init__(self, source: Source, max_chunk: int = records.MAX_CHUNK) -> None:
+        self.source, self.max_chunk = source, max_chunk
+        self._read()
+
+    def _read(self) -> None:
         self.schemas: dict[int, Schema] = {}
         self.channels: dict[int, Channel] = {}
         self.items: list[MessageBlock | RecordSpan] = []
@@ -96,9 +99,11 @@ class LogIndex:
         Raises:
             LogError: too large for memory, or the disk does not give them.
         """
-        if block.length > records.CHUNK_LIMIT:
+        if block.length > self.max_chunk:
             raise LogError(
-                f"the chunk at byte {block.offset} has {block.length} bytes", expected=f"at most {records.CHUNK_LIMIT}"
+                f"the chunk at byte {block.offset} has {block.length} bytes",
+                expected=f"at most {self.max_chunk}",
+                fix="Give a larger `max_chunk`",
             )
         return self.source.at(block.offset, block.length)
 
@@ -133,7 +138,7 @@ class LogIndex:
         opcode, length = HEAD.unpack_from(raw)
         if opcode != Opcode.CHUNK or length != block.length - HEAD.size:
             raise LogError(f"the summary lists a chunk at byte {block.offset}, and none begins there")
-        data = records.unpack(raw, block.offset)
+        data = records.unpack(raw, block.offset, self.max_chunk)
         offsets = message_offsets(self.source, block, len(data))
         found = None if offsets is None else messages.parse_at(data, offsets)
         return found or messages.parse(data, block.offset)
@@ -229,6 +234,8 @@ class LogIndex:
                     expected=f"at most {max(0, limit - position - HEAD.size)}",
                 )
             if opcode in (Opcode.DATA_END, Opcode.FOOTER):
+                if opcode == Opcode.FOOTER or position + HEAD.size + length != limit:
+                    raise LogError(f"the data section ends at byte {position}, ahead of byte {limit} where the summary begins")
                 return position
             position = self._add(opcode, position, length, limit)
         raise LogError(f"the data section does not end before byte {limit}", expected="a DataEnd record")

@@ -61,13 +61,14 @@ def repair(
     *,
     damaged: str = "drop",
     overwrite: bool = False,
+    max_chunk: int | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> RepairReport:
-    """Writes the intact part of `source` to `target`, in file order, with all indexes.
+    """Writes the intact part of `source` to `target`, in order of log time, with all indexes.
 
     With `damaged="keep"` the bytes of damaged stretches become attachments `imutool/damaged/OFFSET`, which no reader takes
     for messages. The metadata record `imutool_repair` lists what was lost; an intact log gets none. The result is
-    read back as a whole before it takes its place.
+    read back as a whole before it takes its place. A chunk of more than `max_chunk` bytes, packed or unpacked, is left out.
 
     Raises:
         ConfigError: source or target cannot be opened, the target exists or is the source, or an unknown `damaged`.
@@ -78,26 +79,39 @@ def repair(
     if same_location(source, target):
         raise ConfigError("the target is the source", where=target, fix="Choose another name")
     tell = progress or (lambda done, total: None)
-    with RecoveredLog(source) as log:
-        index, losses, size = log.index, log.losses, log.index.source.size
-        compression = next((b.compression for b in index.blocks if b.compression), "zstd")
-        with LogWriter(target, compression=compression, overwrite=overwrite, header=index.header_bytes) as out:
-            with log.named():
-                kept = _save(log, out, damaged, lambda done: tell(done, 2 * size))
-            if not losses.intact:
-                out.metadata(RECORD, _loss_record(source, damaged, losses))
-            out.finish()
-            verify(
-                out.target.temporary,
-                out.contents.counts,
-                progress=lambda done, total: tell(size + size * done // total, 2 * size),
-            )
-            tell(2 * size, 2 * size)
-            saved: dict[str, int] = {}
-            for channel, count in sorted(out.contents.counts.items()):
-                topic = index.channels[channel].topic
-                saved[topic] = saved.get(topic, 0) + count
-            return RepairReport(losses, saved, len(out.contents.chunks), kept, size, out.target.position)
+    with RecoveredLog(source, max_chunk=max_chunk) as log:
+        try:
+            return _repair(log, target, damaged, overwrite, tell)
+        except _ContradictionError:
+            log.read_by_records()
+            return _repair(log, target, damaged, overwrite, tell)
+
+
+class _ContradictionError(Exception):
+    """The contents of a log are not as its index says."""
+
+
+def _repair(log: RecoveredLog, target: Location, damaged: str, overwrite: bool, tell: Callable[[int, int], None]) -> RepairReport:
+    index, losses, size = log.index, log.losses, log.index.source.size
+    compression = next((b.compression for b in index.blocks if b.compression), "zstd")
+    with LogWriter(target, compression=compression, overwrite=overwrite, header=index.header_bytes) as out:
+        with log.named():
+            kept = _save(log, out, damaged, lambda done: tell(done, 2 * size))
+        if not losses.intact:
+            out.metadata(RECORD, _loss_record(log.path, damaged, losses))
+        out.finish()
+        verify(
+            out.target.temporary,
+            out.contents.counts,
+            max_chunk=log.max_chunk,
+            progress=lambda done, total: tell(size + size * done // total, 2 * size),
+        )
+        tell(2 * size, 2 * size)
+        saved: dict[str, int] = {}
+        for channel, count in sorted(out.contents.counts.items()):
+            topic = index.channels[channel].topic
+            saved[topic] = saved.get(topic, 0) + count
+        return RepairReport(losses, saved, len(out.contents.chunks), kept, size, out.target.position)
 
 
 def _loss_record(source: Location, damaged: str, losses: Losses) -> dict[str, str]:
@@ -114,6 +128,8 @@ def _save(log: RecoveredLog, out: LogWriter, damaged: str, tell: Callable[[int],
         LogError: nothing is intact.
     """
     log.check_data_crc()
+    if log.losses and not log.index.by_records:
+        raise _ContradictionError
     saver = _Saver(log.index, out)
     for item in log.index.items:
         saver.copy(item)
@@ -145,6 +161,8 @@ class _Saver:
             elif not item.lost:
                 self._copy_block(item)
         except LogError as error:
+            if not self.index.by_records:
+                raise _ContradictionError from error
             self.index.lose(item, error)
 
     def _copy_block(self, block: MessageBlock) -> None:

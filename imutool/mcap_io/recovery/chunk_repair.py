@@ -26,7 +26,7 @@ MAX_UNPACKED = 4 << 20  # bytes in which definitions are sought: they come first
 STEP = 256
 
 
-def repair_head(raw: bytes, offset: int, known: ChunkIndex | None) -> bytes | None:
+def repair_head(raw: bytes, offset: int, known: ChunkIndex | None, max_chunk: int) -> bytes | None:
     """The Chunk record with a head that its contents prove; None if intact or unprovable.
 
     `known` is the chunk's entry in an intact summary. The CRC itself must stand in the record as it was written.
@@ -36,7 +36,7 @@ def repair_head(raw: bytes, offset: int, known: ChunkIndex | None) -> bytes | No
     for candidate in _candidates(raw, known):
         try:
             if records.ChunkHead.of(candidate[:128], len(candidate), offset).crc:
-                records.unpack(candidate, offset)
+                records.unpack(candidate, offset, max_chunk)
                 return candidate
         except LogError:
             continue

@@ -1,15 +1,14 @@
-"""Recover definitions of schemas and channels, and remap channel ids.
+"""Decide which recording each block of a damaged file belongs to, and what its channel ids mean.
 
-One file may hold several logs, mostly one: each is a section whose ids mean what its own records say, and callers see one
-numbering for the whole file. A definition that a CRC covers (in a chunk, in a summary) replaces one that none covers. Where two
-that are both covered disagree, they are of different logs.
+One file may hold parts of several logs: each is a recording whose ids mean what its own records say, and callers see one
+numbering for the whole file. A block's recording follows from the definitions in the block, from a summary that lists it, from the
+unbroken chain of records to its log's begin, and last from what its messages decode as. What stays open is on no topic.
 """
 
 from __future__ import annotations
 
-from bisect import bisect_right
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import chain, count
 from typing import Any
@@ -23,23 +22,27 @@ from imutool.errors import LogError
 from imutool.mcap_io.blocks import MessageBlock
 from imutool.mcap_io.codec import messages, records
 from imutool.mcap_io.codec.records import HEAD
-from imutool.mcap_io.recovery.chunk_repair import MAX_SEARCHED, find_definitions
 from imutool.mcap_io.recovery.losses import LATEST_NS, Losses, reason
-from imutool.mcap_io.storage.source import Source
+from imutool.mcap_io.recovery.resync import Gap
+from imutool.mcap_io.recovery.scan import ChunkKey, Definition, Event, LogEnd, LogStart, ScannedBlock, Summary
 
-MAX_AGREED = 1000  # definitions compared once: some writers repeat all of theirs in every chunk
-DEFINITIONS = (Opcode.SCHEMA, Opcode.CHANNEL)
+MAX_ID = 2**16 - 1  # of a channel or a schema
+Fits = Callable[[MessageBlock, int, "Recording"], bool]  # whether a block's messages of a channel decode by a recording's schema
 
 
-@dataclass
-class Section:
-    """One log in the file: from its first byte on, its own records define the ids."""
+@dataclass(eq=False)
+class Recording:
+    """One log in the file, whole or in part: its own records define the ids."""
 
     start: int
     schemas: dict[int, Schema] = field(default_factory=dict)
     channels: dict[int, Channel] = field(default_factory=dict)
     proven: set[tuple[int, int]] = field(default_factory=set)  # opcode and id of definitions that a CRC covers
+    lists: set[ChunkKey] | None = None  # the chunks in its summary, which are all it has
+    ended: bool = False  # its footer was met
+    anonymous: bool = False  # no record in the file defines its ids
     ids: dict[int, int] = field(default_factory=dict)  # channel ids of the whole file by its own
+    moved: bool = False  # its definitions cannot stay as they are in its chunks
     renamed: dict[str, str] = field(default_factory=dict)  # topics that carry another type elsewhere
 
     def known(self, opcode: int) -> dict[int, Any]:
@@ -50,97 +53,248 @@ class Section:
         """Channels that are defined together with their schema."""
         return {i for i, channel in self.channels.items() if not channel.schema_id or channel.schema_id in self.schemas}
 
+    def meaning(self, channel: int) -> object:
+        """What a channel id means here, to compare; None where it is not defined."""
+        known = self.channels.get(channel)
+        if known is None or (known.schema_id and known.schema_id not in self.schemas):
+            return None
+        schema = self.schemas.get(known.schema_id)
+        return known.topic, known.message_encoding, (schema.name, schema.encoding, schema.data) if schema else None
 
-class Sections:
-    """Sections of a file, in its order."""
-
-    def __init__(self) -> None:
-        self.each = [Section(0)]
-
-    def at(self, offset: int) -> Section:
-        """The section of a byte."""
-        return self.each[bisect_right([section.start for section in self.each], offset) - 1]
-
-    def begin(self, start: int) -> bool:
-        """Begins another section at a byte; false if one begins there already."""
-        if self.at(start).start == start:
-            return False
-        self.each.insert(bisect_right([section.start for section in self.each], start), Section(start))
+    def agrees(self, definitions: Iterable[Any]) -> bool:
+        """Whether none of these definitions contradicts its own."""
+        for record in definitions:
+            known = (self.schemas if isinstance(record, Schema) else self.channels).get(record.id)
+            if known is not None and not same_definition(known, record):
+                return False
         return True
 
-    def end(self, section: Section) -> int | None:
-        """Where the next section begins, if there is one."""
-        return next((other.start for other in self.each if other.start > section.start), None)
+    def define(self, record: Any, *, proven: bool) -> None:
+        """Adds a definition; a proven one replaces one that is not."""
+        opcode = int(Opcode.SCHEMA if isinstance(record, Schema) else Opcode.CHANNEL)
+        if proven or (opcode, record.id) not in self.proven:
+            self.known(opcode).setdefault(record.id, record)
+            if proven:
+                self.known(opcode)[record.id] = record
+                self.proven.add((opcode, record.id))
 
-    def channels(self) -> set[int]:
-        """Every channel id that is defined so far."""
-        return {channel for section in self.each for channel in section.channels}
 
-    def define(self, opcode: int, body: bytes, offset: int, *, proven: bool) -> str:
-        """Adds a Schema or Channel record; returns a conflict that could be resolved, or "".
+class Recordings:
+    """The recordings of a file, and which of them each block belongs to (`MessageBlock.recording`)."""
 
-        Raises:
-            LogError: damaged, or a CRC covers another definition of the same id as well.
-        """
-        section = self.at(offset)
-        known, record = section.known(opcode), _parse(opcode, body, offset)
-        before, key, conflict = known.get(record.id), (opcode, record.id), ""
-        if before is not None and not same_definition(before, record):
-            conflict = f"{records.name_of(opcode).lower()} {record.id} has two definitions, the second at byte {offset}"
-            if proven and key in section.proven:
-                raise LogError(conflict)
-            conflict += f"; the {'second' if proven else 'first'} holds"
-        if before is None or proven:
-            known[record.id] = record
-        if proven:
-            section.proven.add(key)
-        return conflict
+    def __init__(self, summaries: Sequence[Summary], losses: Losses, fits: Fits) -> None:
+        self.losses, self.fits = losses, fits
+        self.each: list[Recording] = []
+        self.unproven: dict[int, dict[int, str]] = {}  # by a block's offset: its channels of which several topics are possible
+        self._current: Recording | None = None
+        self._behind_gap: list[ScannedBlock] = []  # blocks whose recording no chain proves
+        self._verified: set[int] = set()  # channels whose messages behind the gap decode
+        self._certain = False  # an unbroken chain of records leads from the definitions of the current one to here
+        for summary in summaries:
+            recording = Recording(summary.base)
+            if summary.chunks:
+                recording.lists = {(e.message_start_time, e.message_end_time, e.uncompressed_size) for e in summary.chunks}
+            definitions = parsed(summary.definitions, summary.base, losses)
+            twice = {key for key, number in Counter((type(d), d.id) for d in _different(definitions)).items() if number > 1}
+            for record in definitions:
+                if (type(record), record.id) not in twice:
+                    recording.define(record, proven=True)
+            for kind, number in sorted(twice, key=str):
+                losses.add_harmless(f"a summary defines {kind.__name__.lower()} {number} twice; neither is used")
+            self.each.append(recording)
 
-    def contradicts(self, opcode: int, body: bytes, offset: int) -> bool:
-        """Whether the section at `offset` has another definition under the same id.
+    def of(self, block: MessageBlock) -> Recording:
+        """The recording of a block."""
+        return self.each[block.recording]
 
-        Raises:
-            LogError: damaged.
-        """
-        record = _parse(opcode, body, offset)
-        known = self.at(offset).known(opcode).get(record.id)
-        return known is not None and not same_definition(known, record)
+    def assign(self, events: Sequence[Event]) -> None:
+        """Finds the recording of every block, in file order."""
+        if not self.each:
+            self.each.append(Recording(0))
+        keys = {event.key for event in events if isinstance(event, ScannedBlock)}
+        for recording in self.each:
+            if recording.lists and not recording.lists & keys:  # one field of every entry is wrong; do the others agree?
+                pairs = {pair for key in recording.lists for pair in _pairs(key)}
+                recording.lists = {key for key in keys if not pairs.isdisjoint(_pairs(key))} or recording.lists
+        for event in events:
+            if isinstance(event, LogStart):
+                self._begin(event.offset)
+            elif isinstance(event, LogEnd):
+                if self._current is not None:
+                    self._current.ended = True
+                self._certain = False
+            elif isinstance(event, Gap):
+                event.recording = self.each.index(self._now)
+                self._certain, self._behind_gap, self._verified = False, [], set()
+            elif isinstance(event, Definition):
+                self._take_definition(event)
+            else:
+                self._assign(event)
+
+    def _assign(self, found: ScannedBlock) -> None:
+        recording = self._choose(found)
+        listed = found.key in (recording.lists or ())
+        known = {record.id for record in parsed(found.definitions, 0, self.losses) if isinstance(record, Channel)}
+        found.evidence = 3 if known >= set(found.block.counts or {}) else 2 if listed else int(self._certain)
+        found.block.recording = self.each.index(recording)
+        self._current = recording
+        self._certain = self._certain or found.evidence > 1 or bool(known)
+        if not self._certain:
+            self._verify(found, recording)
+
+    def _verify(self, found: ScannedBlock, recording: Recording) -> None:
+        """Checks behind a gap that messages decode; where not, all behind the gap is of a log that nothing defines."""
+        self._behind_gap.append(found)
+        ids = set(found.block.counts or {}) - self._verified
+        self._verified |= ids
+        if all(self.fits(found.block, i, recording) for i in ids & recording.readable()):
+            return
+        self.losses.add_harmless(f"behind byte {self._behind_gap[0].block.offset} messages do not fit the definitions before it")
+        self._current = Recording(self._behind_gap[0].block.offset, anonymous=True)
+        self.each.append(self._current)
+        for other in self._behind_gap:
+            other.block.recording = len(self.each) - 1
+            self.unproven.pop(other.block.offset, None)
+
+    @property
+    def _now(self) -> Recording:
+        return self._current or self.each[0]
+
+    def _begin(self, start: int) -> None:
+        """Begins the log whose Header stands at a byte."""
+        self._current = next((recording for recording in self.each if recording.start == start), None)
+        if self._current is None:
+            self._current = Recording(start)
+            self.each.append(self._current)
+        self._certain = True
+
+    def _take_definition(self, found: Definition) -> None:
+        """Takes in a definition outside chunks; behind a gap one that contradicts begins another recording."""
+        for record in parsed([(found.opcode, found.body)], found.offset, self.losses):
+            if not self._now.agrees([record]):
+                what = f"{type(record).__name__.lower()} {record.id} has two definitions, the second at byte {found.offset}"
+                key = int(found.opcode), record.id
+                self.losses.add_harmless(f"{what}; {'the one that a CRC covers' if key in self._now.proven else 'the first'} holds")
+            else:
+                self._now.define(record, proven=False)
+
+    def _choose(self, found: ScannedBlock) -> Recording:
+        """The recording of a block, which may be a new one."""
+        own = parsed(found.definitions, found.block.offset, self.losses) if found.definitions else []
+        rest = set(found.block.counts or {}) - {record.id for record in own if isinstance(record, Channel)}
+        agreeing = [r for r in (self._now, *self.each) if r.agrees(own)]
+        listed = [r for r in agreeing if r.lists and found.key in r.lists]
+        if not agreeing:
+            chosen = self._new(found.block.offset)
+        elif own and not rest:
+            chosen = (listed or agreeing)[0]
+        else:
+            chosen = self._among(found, rest, [r for r in listed if rest <= r.readable()] or agreeing)
+        for record in own:
+            chosen.define(record, proven=bool(found.crc))
+        return chosen
+
+    def _new(self, start: int) -> Recording:
+        self.losses.add_harmless(f"another log begins at byte {start}: the chunk there defines ids anew")
+        self.each.append(Recording(start))
+        return self.each[-1]
+
+    def _among(self, found: ScannedBlock, used: set[int], pool: Sequence[Recording]) -> Recording:
+        """The recording of a block that does not define all of its ids itself."""
+        pool = list({id(r): r for r in pool}.values())
+        unlisted = [r for r in pool if r.lists is None or found.key in r.lists]
+        if (self._certain or self._now.anonymous) and self._now in unlisted:
+            return self._now
+        for narrower in (
+            [r for r in pool if used <= r.readable()],
+            unlisted,
+            [r for r in pool if not r.ended],
+            [r for r in pool if r.start <= found.block.offset],
+        ):
+            pool = [r for r in pool if r in narrower] or pool
+        open_ids = {i for i in used if len({r.meaning(i) for r in pool} - {None}) > 1}
+        if not open_ids or (self._certain and self._now in pool):
+            return self._now if self._now in pool else pool[0]
+        fitting = [r for r in pool if all(self.fits(found.block, i, r) for i in open_ids)]
+        pool = fitting or pool
+        still = {i for i in open_ids if len({r.meaning(i) for r in pool} - {None}) > 1}
+        if still:
+            names = {i: {r.channels[i].topic for r in pool if i in r.channels} for i in still}
+            self.unproven[found.block.offset] = {i: " or ".join(sorted(topics)) for i, topics in names.items()}
+        return pool[0]
+
+    # ── one numbering for the whole file ─────────────────────────────────────────────────────────────────────────────
 
     def renumber(self) -> tuple[dict[int, Schema], dict[int, Channel]]:
-        """Schemas and channels of the whole file; the first section keeps its ids."""
+        """Schemas and channels of the whole file; the first recording keeps its ids.
+
+        Raises:
+            LogError: no id is left.
+        """
         schemas: dict[int, Schema] = {}
         channels: dict[int, Channel] = {}
-        for section in self.each:
-            first = section is self.each[0]
+        for recording in self.each:
+            first = recording is self.each[0]
             placed = {
                 local: _place(schemas, schema, _same_schema, reuse=not first)
-                for local, schema in sorted(section.schemas.items())
+                for local, schema in sorted(recording.schemas.items())
             }
-            for local in sorted(section.readable()):
-                channel = section.channels[local]
+            for local in sorted(recording.readable()):
+                channel = recording.channels[local]
                 moved = replace(channel, schema_id=placed.get(channel.schema_id, 0))
-                moved = replace(moved, topic=self._name(section, moved, schemas, channels))
-                section.ids[local] = _place(channels, moved, _same_channel, reuse=not first)
+                moved = replace(moved, topic=self._name(recording, moved, schemas, channels))
+                recording.ids[local] = _place(channels, moved, _same_channel, reuse=not first)
+            recording.moved = not first or bool(recording.renamed)
+            for old, new in recording.renamed.items():
+                self.losses.add_harmless(f"{old} carries messages of two types; those of the second are on {new}")
         return schemas, channels
 
-    def _name(self, section: Section, channel: Channel, schemas: dict[int, Schema], channels: dict[int, Channel]) -> str:
+    def _name(
+        self, recording: Recording, channel: Channel, schemas: dict[int, Schema], channels: dict[int, Channel]
+    ) -> str:
         """The topic's name in the whole file: one of another type gets another name."""
         taken = {other.topic: _type(other, schemas) for other in channels.values()}
         names = chain([channel.topic], (f"{channel.topic}_{number}" for number in count(2)))
         name = next(name for name in names if taken.get(name, _type(channel, schemas)) == _type(channel, schemas))
         if name != channel.topic:
-            section.renamed[channel.topic] = name
+            recording.renamed[channel.topic] = name
         return str(name)
 
     def unproven_topics(self) -> list[str]:
         """Topics whose channel or schema no CRC covers."""
         topics = set()
-        for section in self.each:
-            for channel in (section.channels[local] for local in section.ids):
+        for recording in self.each:
+            for channel in (recording.channels[local] for local in recording.ids):
                 keys = {(int(Opcode.CHANNEL), channel.id), (int(Opcode.SCHEMA), channel.schema_id)}
-                if not keys - {(int(Opcode.SCHEMA), 0)} <= section.proven:
+                if not keys - {(int(Opcode.SCHEMA), 0)} <= recording.proven:
                     topics.add(channel.topic)
         return sorted(topics)
+
+
+def parsed(definitions: Iterable[tuple[int, bytes]], offset: int, losses: Losses) -> list[Any]:
+    """Schema and Channel records; a damaged one is noted and left out."""
+    found = []
+    for opcode, body in definitions:
+        try:
+            found.append(records.parse(Schema if opcode == Opcode.SCHEMA else Channel, body, offset))
+        except LogError as error:
+            losses.add_harmless(reason(error))
+    return found
+
+
+def _pairs(key: ChunkKey) -> tuple[object, ...]:
+    """Any two fields of a key, by which it is known again when one is wrong."""
+    start_ns, end_ns, size = key
+    return (0, start_ns, end_ns), (1, start_ns, size), (2, end_ns, size)
+
+
+def _different(definitions: Iterable[Any]) -> Iterator[Any]:
+    """Definitions without repetitions."""
+    seen: list[Any] = []
+    for record in definitions:
+        if not any(type(other) is type(record) and other.id == record.id and same_definition(other, record) for other in seen):
+            seen.append(record)
+            yield record
 
 
 def same_definition(a: Any, b: Any) -> bool:
@@ -148,10 +302,6 @@ def same_definition(a: Any, b: Any) -> bool:
     if isinstance(a, Schema):
         return (a.name, a.data) == (b.name, b.data)
     return bool((a.topic, a.schema_id) == (b.topic, b.schema_id))
-
-
-def _parse(opcode: int, body: bytes, offset: int) -> Any:
-    return records.parse(Schema if opcode == Opcode.SCHEMA else Channel, body, offset)
 
 
 def _type(channel: Channel, schemas: dict[int, Schema]) -> tuple[str, str]:
@@ -173,86 +323,49 @@ def _place(known: dict[int, Any], record: Any, same: Callable[[Any, Any], bool],
         for found, other in known.items():
             if same(other, record):
                 return found
-    identity: int = record.id if record.id not in known else max(known) + 1
+    identity: int = record.id if record.id not in known else free_id(known)
     known[identity] = replace(record, id=identity)
     return identity
 
 
-def read_definitions(sections: Sections, losses: Losses, found: messages.Messages, block: MessageBlock) -> None:
-    """Takes in a chunk's definitions; contradictions to proven ones begin another section."""
-    found_definitions = [(opcode, found.data[first : first + length].tobytes()) for opcode, first, length in found.definitions]
-    proven = block.offset not in losses.unchecked_in
-    for second_try in (False, True):
-        try:
-            for opcode, body in found_definitions:
-                conflict = sections.define(opcode, body, block.offset, proven=proven)
-                if conflict:
-                    losses.add_harmless(conflict)
-            return
-        except LogError as error:
-            if second_try or not sections.begin(block.offset):
-                losses.add_harmless(reason(error))
-                return
-            losses.add_harmless(f"another log begins at byte {block.offset}: the chunk there defines ids anew")
+def free_id(taken: Mapping[int, object]) -> int:
+    """The largest id plus one, or the smallest free one.
+
+    Raises:
+        LogError: none is left.
+    """
+    largest = max(taken, default=0)
+    found = largest + 1 if largest < MAX_ID else next((i for i in range(1, MAX_ID) if i not in taken), 0)
+    if not found:
+        raise LogError("the log has 65535 channels or schemas", expected="an id that is free")
+    return found
 
 
-def search_damaged(
-    sections: Sections, source: Source, blocks: Sequence[MessageBlock], damaged: Sequence[tuple[int, int]]
-) -> None:
-    """Looks for missing definitions in the damaged stretches (first byte, bytes) of a log."""
-    for section in sections.each:
-        stop = sections.end(section) or source.size + 1
-        for offset, length in sorted(stretch for stretch in damaged if section.start <= stretch[0] < stop):
-            used = {c for block in blocks if section.start <= block.offset < stop for c in block.counts or block.indexes}
-            if used <= section.readable():
-                break
-            for opcode, body in find_definitions(source.at(offset, min(length, MAX_SEARCHED))):
-                sections.define(opcode, body, offset, proven=False)
-
-
-def renumber_counts(section: Section, counts: Mapping[int, int]) -> dict[int, int]:
+def renumber_counts(recording: Recording, counts: Mapping[int, int]) -> dict[int, int]:
     """Counts by the channel ids of the whole file, without undefined channels."""
-    ids, total = section.ids, Counter[int]()
+    ids, total = recording.ids, Counter[int]()
     for local, number in counts.items():
         if local in ids:
             total[ids[local]] += number
     return dict(total)
 
 
-def check_definitions(sections: Sections, found: messages.Messages, block: MessageBlock, agreed: set[bytes]) -> None:
-    """Refuses a CRC-proven chunk whose definitions show that another log wrote it.
-
-    `agreed` collects the bodies of definitions that need not be compared again.
-
-    Raises:
-        LogError: the chunk is another log's, or a definition in it is damaged.
-    """
-    for opcode, first, length in found.definitions:
-        body = found.data[first : first + length].tobytes()
-        if body in agreed:
-            continue
-        if sections.contradicts(opcode, body, block.offset):
-            raise LogError(f"the chunk at byte {block.offset} defines another {records.name_of(opcode)} under an id in use")
-        if len(agreed) < MAX_AGREED:
-            agreed.add(body)
-
-
-def map_channels(section: Section, found: messages.Messages) -> tuple[Int64[np.ndarray, " n"], Bool[np.ndarray, " n"]] | None:
+def map_channels(
+    recording: Recording, refused: Mapping[int, object], found: messages.Messages
+) -> tuple[Int64[np.ndarray, " n"], Bool[np.ndarray, " n"]] | None:
     """Channel ids in the whole file, -1 where undefined, and a mask of readable messages.
 
-    None where the messages can stay as they are.
+    None where the messages can stay as they are. `refused` are ids of which nobody knows what they mean.
     """
-    ids, heads = section.ids, found.heads
+    ids, heads = recording.ids, found.heads
     local = np.unique(heads["channel"]).tolist()
     late = heads["log_time"] >= LATEST_NS
-    if (
-        not late.any()
-        and all(ids.get(channel) == channel for channel in local)
-        and not ((section.start or section.renamed) and found.definitions)
-    ):
+    unchanged = all(ids.get(channel) == channel and channel not in refused for channel in local)
+    if not late.any() and unchanged and not (recording.moved and found.definitions):
         return None
     table = np.full(1 << 16, -1, np.int64)
-    table[list(ids)] = list(ids.values())
+    for own, number in ids.items():
+        table[own] = -1 if own in refused else number
     channels = table[heads["channel"]]
     return channels, ~late & (channels >= 0)
 

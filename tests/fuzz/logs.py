@@ -35,6 +35,7 @@ HEAD, CHUNK = struct.Struct("<BQ"), struct.Struct("<QQQII")
 MAGIC = b"\x89MCAP0\r\n"
 LARGEST = 1 << 26  # bytes of a chunk that the oracle unpacks
 ORIGINALS = 24  # pairs of whole logs, from which all cases are made
+SHORTEST_SUMMARY = 200  # bytes of one that lists the chunks; without one, nobody misses a chunk
 COMMAND_EVERY = 12  # cases are also given to the commands
 
 LAYOUTS: tuple[dict[str, Any], ...] = (
@@ -385,6 +386,7 @@ def judged(path: Path, target: Path, originals: tuple[Original, Original], damag
         return
     lines = describe(losses.plain())
     known = {m for o in originals for m in o.messages} | {m for c in chunks for m in _crafted(c, originals)}
+    known |= _undefined(chunks, raw, originals)
     wrong = [m for m in found if m not in known]
     if len(wrong) > losses.unchecked and not any(m[0] in losses.unchecked_topics for m in wrong):
         topics = Counter(m[0] for m in wrong)
@@ -395,22 +397,39 @@ def judged(path: Path, target: Path, originals: tuple[Original, Original], damag
     if not losses.unchecked and max(Counter(found).values(), default=1) > 1:
         yield f"messages come twice: {lines}"
     first = originals[0]
-    if set(damages) <= set(ALONE) and first.chunked and first.messages - Counter(found) and losses.intact:
+    if set(damages) <= set(ALONE) and first.chunked and len(first.summary) > SHORTEST_SUMMARY and first.messages - Counter(found) and losses.intact:
         yield f"{(first.messages - Counter(found)).total()} messages are missing, and nothing is told"
     yield from _repaired(path, target, found)
+
+
+def _defined(original: Original, chunks: Sequence[Chunk], raw: bytes) -> set[int]:
+    """Channels of an original that a proven record defines."""
+    defined = {n for c in chunks for n in original.own.get(c.record, ())}
+    if original.summary in raw and any(opcode == 4 for opcode, _ in _fields(original.summary)):
+        defined = set(original.channels)
+    return defined
 
 
 def _must(chunk: Chunk, chunks: Sequence[Chunk], raw: bytes, originals: tuple[Original, Original]) -> Iterator[Message]:
     """Messages of a chunk that must come back: some proven record defines their channels."""
     for original in originals:
         if chunk.record in original.chunks:
-            defined = {n for c in chunks for n in original.own.get(c.record, ())}
-            if original.summary in raw and 0x04 in {original.summary[13]} | {o for o, _ in _fields(original.summary)}:
-                defined = set(original.channels)
             ids = {struct.unpack_from("<H", body)[0] for opcode, body in _fields(chunk.contents) if opcode == 5}
-            if ids <= defined:
+            if ids <= _defined(original, chunks, raw):
                 yield from original.chunks[chunk.record]
             return
+
+
+def _undefined(chunks: Sequence[Chunk], raw: bytes, originals: tuple[Original, Original]) -> set[Message]:
+    """Messages whose own definition is gone, on the topics of the same type of the other log: nobody can tell."""
+    found: set[Message] = set()
+    for mine, other in (originals, originals[::-1]):
+        gone = set(mine.channels) - _defined(mine, chunks, raw)
+        alike = {i: c for i, c in other.channels.items() if i in gone and c[1] == mine.channels[i][1]}
+        for chunk in chunks:
+            if chunk.record in mine.chunks:
+                found.update(_messages(chunk.contents, alike))
+    return found
 
 
 def _crafted(chunk: Chunk, originals: tuple[Original, Original]) -> Iterator[Message]:
