@@ -204,6 +204,12 @@ def read_run(source: Source, position: int, first: int, limit: int) -> MessageBl
     return MessageBlock(position, end, position + end, int(times.min()), int(times.max()), None, counts=counts)
 
 
+def too_large(what: str, offset: int, size: int, max_chunk: int) -> LogError:
+    """Error about a record that is not to come into memory."""
+    where = f"the {what} at byte {offset}"
+    return LogError(f"{where} has {size} bytes", expected=f"at most {max_chunk}", fix="Give a larger `max_chunk`")
+
+
 def cut_short(source: Source) -> LogError:
     """Where a log without an end stops, found by following its records."""
     position, inside = len(MAGIC), "inside its first record"

@@ -24,6 +24,7 @@ from imutool.mcap_io.blocks import (
     message_offsets,
     read_entries,
     read_run,
+    too_large,
 )
 from imutool.mcap_io.codec import messages, records
 from imutool.mcap_io.codec.records import FOOTER_SIZE, HEAD, MAGIC, crc32
@@ -100,11 +101,7 @@ class LogIndex:
             LogError: too large for memory, or the disk does not give them.
         """
         if block.length > self.max_chunk:
-            raise LogError(
-                f"the chunk at byte {block.offset} has {block.length} bytes",
-                expected=f"at most {self.max_chunk}",
-                fix="Give a larger `max_chunk`",
-            )
+            raise too_large("chunk", block.offset, block.length, self.max_chunk)
         return self.source.at(block.offset, block.length)
 
     def unpack_or_lose(self, block: MessageBlock) -> messages.Messages | None:
@@ -162,8 +159,7 @@ class LogIndex:
         opcode, length = source.head(at)
         if opcode != Opcode.FOOTER or length != FOOTER_SIZE - HEAD.size:
             raise LogError(f"the footer at byte {at} is damaged", expected="a Footer record")
-        footer = records.parse(Footer, source.at(at + HEAD.size, length), at)
-        assert isinstance(footer, Footer), "parse returns the class it is given"
+        footer: Footer = records.parse(Footer, source.at(at + HEAD.size, length), at)
         return footer
 
     def _read_summary(self) -> dict[int, ChunkIndex]:
@@ -223,8 +219,7 @@ class LogIndex:
         self.header_end = position
         while position < limit:
             if (known := chunks.get(position)) is not None:
-                block = MessageBlock.of_summary(known, limit)
-                self.items.append(block)
+                self.items.append(block := MessageBlock.of_summary(known, limit))
                 position = block.end
                 continue
             opcode, length = source.head(position) if limit - position >= HEAD.size else (0, limit)
@@ -245,9 +240,10 @@ class LogIndex:
         whole = HEAD.size + length
         if opcode == Opcode.CHUNK:
             head = records.ChunkHead.of(self.source.at(position, min(HEAD_BYTES, whole)), whole, position)
-            block = MessageBlock(position, whole, position + whole, head.start_ns, head.end_ns, head.compression)
-            self.items.append(block)
+            self.items.append(MessageBlock(position, whole, position + whole, head.start_ns, head.end_ns, head.compression))
         elif opcode == Opcode.MESSAGE:
+            if whole > self.max_chunk:
+                raise too_large("message", position, whole, self.max_chunk)
             block = read_run(self.source, position, whole, limit)
             self.items.append(block)
             return block.end
@@ -298,10 +294,9 @@ class LogIndex:
             self.define(opcode, found.data[first : first + length].tobytes(), block.offset)
 
     def _counts_of(self, block: MessageBlock) -> dict[int, int]:
-        if block.counts is None:
-            if block.indexes:
-                block.counts = {channel: len(self.entries(block, channel)) for channel in block.indexes}
-            else:
-                self._read_definitions(block)
+        if block.counts is None and block.indexes:
+            block.counts = {channel: len(self.entries(block, channel)) for channel in block.indexes}
+        elif block.counts is None:
+            self._read_definitions(block)
         assert block.counts is not None, "reading the definitions of a block counts its messages"
         return block.counts

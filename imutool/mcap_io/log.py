@@ -30,9 +30,9 @@ class Log:
 
     It may have chunks, a summary and message indexes, or not.
 
-    Memory is bounded by its largest chunk; one of more than `max_chunk` bytes is refused. An open `Source` can be given in place of a path. Times given to a
-    method select by log time, both ends included. The first damage is an error; `recovery.recovered_log.RecoveredLog` reads
-    what is intact of a damaged log.
+    Memory is bounded by its largest chunk; one of more than `max_chunk` bytes is refused. An open `Source` can be given in
+    place of a path. Times given to a method select by log time, both ends included. The first damage is an error;
+    `recovery.recovered_log.RecoveredLog` reads what is intact of a damaged log.
 
     Raises:
         ConfigError: the file cannot be opened.

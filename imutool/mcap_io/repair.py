@@ -91,7 +91,9 @@ class _ContradictionError(Exception):
     """The contents of a log are not as its index says."""
 
 
-def _repair(log: RecoveredLog, target: Location, damaged: str, overwrite: bool, tell: Callable[[int, int], None]) -> RepairReport:
+def _repair(
+    log: RecoveredLog, target: Location, damaged: str, overwrite: bool, tell: Callable[[int, int], None]
+) -> RepairReport:
     index, losses, size = log.index, log.losses, log.index.source.size
     compression = next((b.compression for b in index.blocks if b.compression), "zstd")
     with LogWriter(target, compression=compression, overwrite=overwrite, header=index.header_bytes) as out:
@@ -168,11 +170,11 @@ class _Saver:
     def _copy_block(self, block: MessageBlock) -> None:
         raw = self.index.read(block)
         found = self.index.unpack_bytes(block, raw)
-        if block.compression is None or block.edited:
+        head = None if block.compression is None else ChunkHead.of(raw[:128], len(raw), block.offset)
+        if head is None or block.edited or not _frame_ends(raw[head.data_at :], head.compression):
             if len(found.heads):
                 self._new_chunk(block, found)
             return
-        head = ChunkHead.of(raw[:128], len(raw), block.offset)
         self._write_chunk(raw[: head.data_at], raw[head.data_at :], head, found)
 
     def _new_chunk(self, block: MessageBlock, found: messages.Messages) -> None:
@@ -210,6 +212,14 @@ class _Saver:
             attachment.check_crc(self.source)
             self.out.contents.attachments.append(attachment.index_at(at))
         self.out.target.copy(self.source, span.offset, span.offset + span.length)
+
+
+def _frame_ends(packed: bytes, compression: str) -> bool:
+    """Whether a packed chunk has its end mark, without which other readers refuse sound contents."""
+    if compression != "lz4":
+        return True
+    checksum = 4 if packed[4] & 4 else 0  # of the contents, behind the end mark
+    return packed[len(packed) - 4 - checksum : len(packed) - checksum] == bytes(4)
 
 
 def _attach_damaged(out: LogWriter, source: Source, loss: Loss) -> None:

@@ -1,36 +1,43 @@
 """Index of a log that may be damaged; keeps what a CRC proves, and lists the rest in `losses`.
 
-An intact log is read by its index. At the first thing that contradicts the index, it is read by its records instead (`Scan`): the
-index then only helps to put damaged chunk heads right, and tells which chunks are gone.
+An intact log is read by its index. At the first thing that contradicts the index, it is read by its records instead (`Scan`):
+the index then only helps to put damaged chunk heads right, and tells which chunks are gone.
 """
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Iterator
-from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import UInt64
 from mcap.opcode import Opcode
-from mcap.records import ChunkIndex, Footer, Header
+from mcap.records import ChunkIndex, Header
 
 from imutool.errors import LogError
 from imutool.mcap_io.blocks import HEAD_BYTES, Attachment, MessageBlock, RecordSpan
 from imutool.mcap_io.codec import messages, records
-from imutool.mcap_io.codec.records import CHUNK_HEAD, FOOTER_SIZE, HEAD, MAGIC, crc32
-from imutool.mcap_io.codec.ros2_definition import decodes
-from imutool.mcap_io.index import MAX_SUMMARY, LogIndex
+from imutool.mcap_io.codec.records import CHUNK_HEAD, HEAD, MAGIC
+from imutool.mcap_io.index import LogIndex
 from imutool.mcap_io.recovery.chunk_repair import find_definitions
-from imutool.mcap_io.recovery.definitions import Recording, Recordings, map_channels, parsed, remap, renumber_counts
+from imutool.mcap_io.recovery.definitions import (
+    map_channels,
+    parsed,
+    remap,
+    renumber,
+    renumber_counts,
+    unproven_topics,
+)
+from imutool.mcap_io.recovery.gaps import counts_by_size, really_lost
 from imutool.mcap_io.recovery.losses import LATEST_NS, Loss, Losses, reason
-from imutool.mcap_io.recovery.resync import Gap
-from imutool.mcap_io.recovery.scan import Scan, ScannedBlock, Summary, parse_summary
+from imutool.mcap_io.recovery.recordings import Recordings
+from imutool.mcap_io.recovery.scan import Scan
+from imutool.mcap_io.recovery.scan_events import Gap, ScannedBlock
+from imutool.mcap_io.recovery.summary import proven_summary
 from imutool.mcap_io.storage.source import Source
 
 MAX_SEARCHED = 1 << 20  # bytes of a damaged stretch in which definitions are sought
-SAMPLES = 4  # messages of a channel that must decode by a definition
 
 
 class RecoveredIndex(LogIndex):
@@ -44,29 +51,33 @@ class RecoveredIndex(LogIndex):
 
     def __init__(self, source: Source, max_chunk: int = records.MAX_CHUNK, *, by_records: bool = False) -> None:
         self.losses, self.by_records = Losses(), by_records
-        self.proven = False  # all of it, by the CRC of the data section
+        self.proven = self._ready = False  # by the CRC of the data section; with an index that nothing contradicts so far
         self._repaired: dict[int, bytes] = {}  # heads of chunks as their contents prove them
         self._lost_spans: set[int] = set()
         self._stated: dict[int, int] = {}  # counts of an intact log
-        self._ready = False
         super().__init__(source, max_chunk)
 
     def _read(self) -> None:
+        contradiction = ""
         if not self.by_records:
             try:
                 super()._read()
-                self._compare_heads()
-                self._stated = super().counts()
-                self._ready = True
-                return
+                if self.footer.summary_crc and self.footer.summary_start:
+                    self._compare_heads()
+                    self._stated = super().counts()
+                    self._ready = True
+                    return
             except LogError as error:
-                self.by_records, contradiction = True, reason(error)
-        else:
-            contradiction = ""
-        self.losses, self.statistics = Losses(), None
+                contradiction = reason(error)
+        self.by_records, self.losses, self.statistics = True, Losses(), None
         self._read_records()
         if self.losses.intact and contradiction:
             self.losses.add_harmless(contradiction)
+        self._sort()
+
+    def _read_summary(self) -> dict[int, ChunkIndex]:
+        self._listed = super()._read_summary()
+        return self._listed
 
     def _compare_heads(self) -> None:
         """Compares every chunk's head with the summary; not in a store, where that would fetch the whole log.
@@ -76,17 +87,18 @@ class RecoveredIndex(LogIndex):
         """
         if not isinstance(self.source.path, Path):
             return
-        size, seen = HEAD.size + CHUNK_HEAD.size, set[int]()
+        seen = set[int]()
         for block in self.blocks:
             if block.compression is not None:
-                raw = self.source.at(block.offset, size)
-                start_ns, end_ns, _, crc, _ = CHUNK_HEAD.unpack_from(raw, HEAD.size)
-                stated = (*HEAD.unpack_from(raw), start_ns, end_ns)
-                if stated != (Opcode.CHUNK, block.length - HEAD.size, block.start_ns, block.end_ns):
+                raw = self.source.at(block.offset, min(block.length, HEAD_BYTES))
+                head, entry = block.head(raw), self._listed.get(block.offset)
+                stated = (block.start_ns, block.end_ns, block.compression, entry.uncompressed_size if entry else head.size)
+                if (head.start_ns, head.end_ns, head.compression, head.size) != stated:
                     raise LogError(f"the summary lists the chunk at byte {block.offset} otherwise than it is")
-                if crc and hash(raw) in seen:
+                key = hash(raw[HEAD.size : HEAD.size + CHUNK_HEAD.size])
+                if head.crc and key in seen:
                     raise LogError(f"the chunk at byte {block.offset} may repeat another")
-                seen.add(hash(raw))
+                seen.add(key)
 
     @property
     def header_bytes(self) -> bytes:
@@ -109,18 +121,16 @@ class RecoveredIndex(LogIndex):
             LogError: too large, or the disk does not give them.
         """
         raw = super().read(block)
-        better = self._repaired.get(block.offset)
-        return raw if better is None else better + raw[len(better) :]
+        better = self._repaired.get(block.offset, b"")
+        return better + raw[len(better) :]
 
     def unpack_bytes(self, block: MessageBlock, raw: bytes) -> messages.Messages:
         """The messages of a block whose channel is defined and whose time is possible."""
         if not self.by_records:
             found = super().unpack_bytes(block, raw)
             found.times()
-        elif block.compression is None:
-            found = messages.parse(raw, block.offset)
         else:
-            found = messages.parse(records.unpack(raw, block.offset, self.max_chunk), block.offset)
+            found = self._parse(block, raw)
         crc = 0 if block.compression is None else records.ChunkHead.of(raw[:HEAD_BYTES], len(raw), block.offset).crc
         if not crc and len(found.heads) and not self.proven:
             self.losses.unchecked_in[block.offset] = len(found.heads)
@@ -165,60 +175,32 @@ class RecoveredIndex(LogIndex):
 
     def _read_records(self) -> None:
         """Builds the index from the records alone."""
-        self.footer, summary = self._proven_summary()
+        self.footer, summary = proven_summary(self.source, self.losses)
         listed = {} if summary is None else {entry.chunk_start_offset: entry for entry in summary.chunks}
         limit = self.source.size if summary is None else self.footer.summary_start
         scan = Scan(self.source, limit, listed, self.losses, self.max_chunk)
+        for opcode, body in [] if summary is None else summary.definitions:
+            scan.used_channels |= {int.from_bytes(body[:2], "little")} if opcode == Opcode.CHANNEL else set()
         scan.run()
         self._repaired, self.items = scan.repaired, scan.items
         self.data_end = scan.data_ends[0] if len(scan.data_ends) == 1 else self.source.size
         self._drop_doubtful(scan)
         summaries = ([] if summary is None else [summary]) + scan.summaries
-        self.recordings = Recordings(summaries, self.losses, self._fits)
+        self.recordings = Recordings(summaries, self.losses, self._found_in)
         kept = {id(item) for item in self.items}
         self.recordings.assign([e for e in scan.events if not isinstance(e, ScannedBlock) or id(e.block) in kept])
-        self._drop_copies(scan)
+        self.recordings.drop_copies([e for e in scan.events if isinstance(e, ScannedBlock)])
         self._search_definitions(scan)
-        self.schemas, self.channels = self.recordings.renumber()
-        self.losses.unchecked_topics = self.recordings.unproven_topics()
-        for gap in _really_lost(scan, self.blocks, summaries, self.losses):
+        self.schemas, self.channels = renumber(self.recordings.each, self.losses)
+        self.losses.unchecked_topics = unproven_topics(self.recordings.each)
+        for gap in really_lost(scan, self.blocks, summaries, self.losses):
             self._add_gap(gap)
         unchecked = {e.block.offset for e in scan.events if isinstance(e, ScannedBlock) and not e.crc}
         for block in self.blocks:
             self._edit(block)
             if block.offset in unchecked and block.counts:
                 self.losses.unchecked_in[block.offset] = sum(block.counts.values())
-        self._sort()
         self._set_header(scan)
-
-    def _proven_summary(self) -> tuple[Footer, Summary | None]:
-        """The footer, and the summary if its CRC proves it where the footer says it is."""
-        source, missing = self.source, Footer(summary_start=0, summary_offset_start=0, summary_crc=0)
-        if source.size == 0:
-            raise LogError("the file is empty", expected="an MCAP log")
-        at = source.size - len(MAGIC) - FOOTER_SIZE
-        if at < len(MAGIC) or source.at(source.size - len(MAGIC), len(MAGIC)) != MAGIC:
-            return missing, None
-        if source.head(at) != (Opcode.FOOTER, FOOTER_SIZE - HEAD.size):
-            return missing, None
-        footer: Footer = records.parse(Footer, source.at(at + HEAD.size, FOOTER_SIZE - HEAD.size), at)
-        start = footer.summary_start
-        if not footer.summary_crc or not len(MAGIC) <= start <= at:
-            if start:
-                self.losses.add_harmless(f"nothing proves the summary at byte {start}; a new one can be made")
-            return footer, None
-        try:
-            if at - start > MAX_SUMMARY:
-                raise LogError(f"the summary at byte {start} has {at - start} bytes", expected=f"at most {MAX_SUMMARY}")
-            raw = source.at(start, at - start + FOOTER_SIZE - 4)
-            if crc32(raw) != footer.summary_crc:
-                raise LogError(f"the summary at byte {start} is damaged: its CRC is {crc32(raw):08x}")
-            if (summary := parse_summary(raw[: at - start], 0)) is None:
-                raise LogError(f"other records than those of a summary follow byte {start}")
-            return footer, summary
-        except LogError as error:
-            self.losses.add_harmless(f"{reason(error)}; a new summary can be made")
-            return footer, None
 
     def _drop_doubtful(self, scan: Scan) -> None:
         """Drops messages after a gap in a chunked log: unproven contents of a damaged chunk."""
@@ -231,32 +213,13 @@ class RecoveredIndex(LogIndex):
                 gap.counts.update(block.counts or {})
         self.items = [item for item in self.items if id(item) not in dropped]
 
-    def _fits(self, block: MessageBlock, channel: int, recording: Recording) -> bool:
-        """Whether the messages of a channel decode by the recording's definition; True where nothing tells."""
-        known = recording.channels[channel]
-        schema = recording.schemas.get(known.schema_id)
-        if schema is None or (schema.encoding, known.message_encoding) != ("ros2msg", "cdr"):
-            return True
-        found = messages.parse(_contents(self.read(block), block, self.max_chunk), block.offset)
-        chosen = np.flatnonzero(found.heads["channel"] == channel)[:SAMPLES].tolist()
-        sizes = found.heads["length"].astype(np.int64) + HEAD.size
-        payloads = [found.data[found.offsets[i] + messages.MESSAGE.itemsize : found.offsets[i] + sizes[i]] for i in chosen]
-        return all(decodes(payload.tobytes(), schema.name, schema.data) for payload in payloads)
+    def _found_in(self, block: MessageBlock) -> messages.Messages:
+        """All messages in a block, by its own channel ids."""
+        return self._parse(block, self.read(block))
 
-    def _drop_copies(self, scan: Scan) -> None:
-        """Keeps of equal chunks the one whose recording is best known."""
-        kept: dict[object, ScannedBlock] = {}
-        for event in scan.events:
-            if not isinstance(event, ScannedBlock) or event.block.compression is None or not event.block.counts:
-                continue
-            before = kept.setdefault((event.key, event.crc), event)
-            if before is not event and self._same_contents(before.block, event.block):
-                better, worse = (event, before) if event.evidence > before.evidence else (before, event)
-                kept[event.key, event.crc], worse.block.lost = better, True
-                self.losses.add_harmless(f"the chunk at byte {worse.block.offset} repeats the one at byte {better.block.offset}")
-
-    def _same_contents(self, a: MessageBlock, b: MessageBlock) -> bool:
-        return bytes(_contents(self.read(a), a, self.max_chunk)) == bytes(_contents(self.read(b), b, self.max_chunk))
+    def _parse(self, block: MessageBlock, raw: bytes) -> messages.Messages:
+        contents = raw if block.compression is None else records.unpack(raw, block.offset, self.max_chunk)
+        return messages.parse(contents, block.offset)
 
     def _search_definitions(self, scan: Scan) -> None:
         """Looks for missing definitions in the damaged stretches of the log."""
@@ -315,12 +278,12 @@ class RecoveredIndex(LogIndex):
         return remap(found, keep, channels[keep])
 
     def _sort(self) -> None:
-        """Puts the chunks in order of log time; other records stay behind the chunk that they follow."""
+        """Puts chunks that were found in disorder in order of log time; other records stay behind the chunk they follow."""
         keys, last = [], -1
         for item in self.items:
             last = item.start_ns if isinstance(item, MessageBlock) and item.counts else last
             keys.append(last)
-        if any(a > b for a, b in zip(keys, keys[1:], strict=False)):
+        if not self.losses.intact and any(a > b for a, b in pairwise(keys)):
             self.losses.add_harmless("the chunks are not in order of log time; they are put in order")
             order = sorted(range(len(keys)), key=keys.__getitem__)
             self.items = [self.items[i] for i in order]
@@ -336,74 +299,3 @@ class RecoveredIndex(LogIndex):
             self.losses.add_harmless(f"the Header is lost; the profile is {profile!r} by the messages' encoding")
         self.header = header
         self.header_end = len(MAGIC) + len(self.header_bytes)
-
-
-def _contents(raw: bytes, block: MessageBlock, max_chunk: int) -> bytes | memoryview:
-    return raw if block.compression is None else records.unpack(raw, block.offset, max_chunk)
-
-
-def counts_by_size(indexes: dict[int, int], end: int) -> dict[int, int]:
-    """Messages per channel by index size: 15 bytes a message index, 16 a message; none where they do not fit."""
-    if not indexes:
-        return {}
-    starts = sorted(indexes.items(), key=lambda item: item[1])
-    ends = [offset for _, offset in starts[1:]] + [end]
-    sizes = {channel: stop - offset - 15 for (channel, offset), stop in zip(starts, ends, strict=True)}
-    good = all(size >= 0 and size % 16 == 0 for size in sizes.values())
-    return {channel: size // 16 for channel, size in sizes.items()} if good else {}
-
-
-def _really_lost(scan: Scan, blocks: list[MessageBlock], summaries: list[Summary], losses: Losses) -> Iterator[Gap]:
-    """The gaps in which something was lost, with what message indexes and summaries say of it."""
-    places = {block.offset + block.length: block for block in blocks if block.compression is not None}
-    sizes = {end: end + sum(15 + 16 * n for n in (block.counts or {}).values()) for end, block in places.items()}
-    starts = np.array(sorted(sizes), np.int64)
-    where = {(channel, n) for block in blocks for channel, n in (block.counts or {}).items()}
-    missing = [(n, entry) for n, summary in enumerate(summaries) for entry in _missing(summary, scan)]
-    for gap in scan.gaps:
-        before = int(np.searchsorted(starts, gap.offset, "right")) - 1
-        if gap.length and before >= 0 and gap.end <= sizes[int(starts[before])]:
-            losses.add_harmless(f"a message index at byte {gap.offset} is damaged; a new one can be made")
-            continue
-        if not gap.length and gap.indexes and all((channel, n) in where for channel, n, _, _ in gap.indexes):
-            losses.add_harmless(f"message indexes at byte {gap.offset} are not behind their chunk; new ones can be made")
-            continue
-        inside = [pair for pair in missing if gap.offset - 15 <= pair[1].chunk_start_offset < max(gap.end, gap.offset + 1)]
-        missing = [pair for pair in missing if pair not in inside]
-        gap.recording = inside[0][0] if inside else gap.recording
-        if inside and not gap.counted:
-            _count(gap, [entry for _, entry in inside])
-        yield gap
-    for number in sorted({number for number, _ in missing}):
-        entries = [entry for n, entry in missing if n == number]
-        start = min(entry.chunk_start_offset for entry in entries)
-        gap = Gap(start, 0, f"a summary lists {len(entries)} chunks that are not in the file", recording=number)
-        _count(gap, entries)
-        yield gap
-
-
-def _missing(summary: Summary, scan: Scan) -> Iterator[ChunkIndex]:
-    """Entries of a summary whose chunk was not met, by the bytes of the file."""
-    keys = {event.key for event in scan.events if isinstance(event, ScannedBlock)}
-    places = {event.block.offset for event in scan.events if isinstance(event, ScannedBlock)}
-    entries = [e for e in summary.chunks if (e.message_start_time, e.message_end_time, e.uncompressed_size) not in keys]
-    if len(entries) == len(summary.chunks):  # the times or sizes are wrong
-        entries = [e for e in entries if summary.base + e.chunk_start_offset not in places]
-    for entry in entries:
-        offsets = {channel: at + summary.base for channel, at in entry.message_index_offsets.items()}
-        start = entry.chunk_start_offset + summary.base
-        yield replace(entry, chunk_start_offset=start, message_index_offsets=offsets)
-
-
-def _count(gap: Gap, entries: Iterable[ChunkIndex]) -> None:
-    """Adds the messages and times of lost chunks to a gap, as their summary states them."""
-    complete = True
-    for entry in entries:
-        end = entry.chunk_start_offset + entry.chunk_length + entry.message_index_length
-        found = counts_by_size(entry.message_index_offsets, end)
-        complete = complete and bool(found)
-        gap.counts.update(found)
-        if entry.message_start_time <= entry.message_end_time < LATEST_NS:
-            starts, ends = [gap.start_ns, entry.message_start_time], [gap.end_ns, entry.message_end_time]
-            gap.start_ns, gap.end_ns = min(t for t in starts if t is not None), max(t for t in ends if t is not None)
-    gap.counted = complete

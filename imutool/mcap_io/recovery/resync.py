@@ -7,12 +7,10 @@ of a definition with the definition). A message has no such lengths: the records
 from __future__ import annotations
 
 import struct
-from collections import Counter
-from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from jaxtyping import Int64, UInt64
+from jaxtyping import Int64
 from mcap.opcode import Opcode
 from mcap.records import (
     AttachmentIndex,
@@ -33,7 +31,7 @@ from imutool.mcap_io.blocks import Attachment
 from imutool.mcap_io.codec import messages, records
 from imutool.mcap_io.codec.messages import FIXED
 from imutool.mcap_io.codec.records import CHUNK_HEAD, HEAD, MAGIC
-from imutool.mcap_io.recovery.losses import LATEST_NS
+from imutool.mcap_io.recovery.summary import PRIVATE
 from imutool.mcap_io.storage.source import Source
 
 WINDOW = 1 << 20
@@ -42,7 +40,6 @@ MAX_CANDIDATES = 1 << 17  # parsed in one file; more occur only in a file made t
 MIN_PROOF_BYTES = 1 << 30  # that may be unpacked while chunks are sought in damaged bytes
 CHAIN = 3  # records in a row that prove a message after a gap
 LOG_START = MAGIC + bytes([Opcode.HEADER])
-PRIVATE = 0x80  # opcodes from here on belong to whoever writes them
 
 SMALL: dict[int, Any] = {
     Opcode.HEADER: Header,
@@ -58,13 +55,6 @@ SMALL: dict[int, Any] = {
     Opcode.DATA_END: DataEnd,
 }
 IN_MEMORY = {Opcode.MESSAGE, Opcode.MESSAGE_INDEX}  # as a whole
-SUMMARY = {
-    Opcode.CHUNK_INDEX,
-    Opcode.ATTACHMENT_INDEX,
-    Opcode.STATISTICS,
-    Opcode.METADATA_INDEX,
-    Opcode.SUMMARY_OFFSET,
-}
 # The shortest body of each
 MIN_LENGTH = {
     Opcode.HEADER: 8,
@@ -87,37 +77,6 @@ _MIN_LENGTH = np.full(256, 2**63, np.uint64)
 _MIN_LENGTH[[int(o) for o in MIN_LENGTH]] = list(MIN_LENGTH.values())
 _KNOWN = _MIN_LENGTH < 2**63
 _CANDIDATE = np.dtype([("opcode", "u1"), ("length", "<u8")])
-
-
-@dataclass
-class Gap:
-    """A stretch without a valid record."""
-
-    offset: int
-    length: int
-    reason: str
-    start_ns: int | None = None
-    end_ns: int | None = None
-    counts: Counter[int] = field(default_factory=Counter)  # by the channel ids of its recording
-    counted: bool = False  # from message indexes that survived behind it, or from the summary
-    indexes: list[tuple[int, int, int, int]] = field(default_factory=list)  # channel, entries, first and last time of each
-    recording: int = 0
-
-    @property
-    def end(self) -> int:
-        """The first byte behind it."""
-        return self.offset + self.length
-
-    def count(self, channel: int, entries: UInt64[np.ndarray, "n 2"]) -> None:
-        """Counts the messages of a lost chunk from the entries of a message index behind it."""
-        if not self.counted:
-            self.counts, self.counted = Counter(), True
-        self.counts[channel] += len(entries)
-        if len(entries) and entries[:, 0].max() < LATEST_NS:
-            first, last = int(entries[:, 0].min()), int(entries[:, 0].max())
-            self.indexes.append((channel, len(entries), first, last))
-            self.start_ns = first if self.start_ns is None else min(first, self.start_ns)
-            self.end_ns = last if self.end_ns is None else max(last, self.end_ns)
 
 
 class RecordFrames:
