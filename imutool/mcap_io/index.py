@@ -79,8 +79,10 @@ class LogIndex:
 
     def counts(self) -> dict[int, int]:
         """Messages per channel id."""
-        if self.statistics is not None:
-            return dict(self.statistics.channel_message_counts)
+        return dict(self.statistics.channel_message_counts) if self.statistics else self.summed_counts()
+
+    def summed_counts(self) -> dict[int, int]:
+        """Messages per channel id, block by block."""
         total: Counter[int] = Counter()
         for block in self.blocks:
             total.update(self._counts_of(block))
@@ -120,10 +122,9 @@ class LogIndex:
         """
         for item in self.items:
             try:
-                if isinstance(item, MessageBlock):
-                    if not item.lost:
-                        self.unpack(item)
-                elif item.opcode == Opcode.ATTACHMENT:
+                if isinstance(item, MessageBlock) and not item.lost:
+                    self.unpack(item)
+                elif isinstance(item, RecordSpan) and item.opcode == Opcode.ATTACHMENT:
                     Attachment.of(self.source, item.offset, item.length - HEAD.size).check_crc(self.source)
             except LogError as error:
                 self.lose(item, error)
@@ -137,8 +138,7 @@ class LogIndex:
             raise LogError(f"the summary lists a chunk at byte {block.offset}, and none begins there")
         data = records.unpack(raw, block.offset, self.max_chunk)
         offsets = message_offsets(self.source, block, len(data))
-        found = None if offsets is None else messages.parse_at(data, offsets)
-        return found or messages.parse(data, block.offset)
+        return (None if offsets is None else messages.parse_at(data, offsets)) or messages.parse(data, block.offset)
 
     def entries(self, block: MessageBlock, channel: int) -> UInt64[np.ndarray, "n 2"]:
         """As `blocks.read_entries`."""
@@ -156,10 +156,9 @@ class LogIndex:
         at = source.size - len(MAGIC) - FOOTER_SIZE
         if at < len(MAGIC) or source.at(source.size - len(MAGIC), len(MAGIC)) != MAGIC:
             raise cut_short(source)
-        opcode, length = source.head(at)
-        if opcode != Opcode.FOOTER or length != FOOTER_SIZE - HEAD.size:
+        if source.head(at) != (Opcode.FOOTER, FOOTER_SIZE - HEAD.size):
             raise LogError(f"the footer at byte {at} is damaged", expected="a Footer record")
-        footer: Footer = records.parse(Footer, source.at(at + HEAD.size, length), at)
+        footer: Footer = records.parse(Footer, source.at(at + HEAD.size, FOOTER_SIZE - HEAD.size), at)
         return footer
 
     def _read_summary(self) -> dict[int, ChunkIndex]:

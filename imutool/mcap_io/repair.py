@@ -215,7 +215,7 @@ class _Saver:
 
 
 def _frame_ends(packed: bytes, compression: str) -> bool:
-    """Whether a packed chunk has its end mark, without which other readers refuse sound contents."""
+    """Whether packed data have their end mark, without which other readers refuse them."""
     if compression != "lz4":
         return True
     checksum = 4 if packed[4] & 4 else 0  # of the contents, behind the end mark

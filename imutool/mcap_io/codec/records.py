@@ -118,7 +118,7 @@ def _contradicting(offset: int) -> LogError:
 
 
 def unpack(record: bytes | memoryview, offset: int, max_chunk: int = MAX_CHUNK) -> bytes | memoryview:
-    """Unpacked, CRC-checked contents of a Chunk record of at most `max_chunk` bytes; a view if it is not compressed.
+    """Unpacked, CRC-checked contents of a Chunk record; a view if it is not compressed.
 
     Raises:
         LogError: unknown compression, data that do not unpack to the stated size, or a wrong CRC.

@@ -117,7 +117,7 @@ def _check(name: str, known: Definition, sound: dict[str, int], depth: int) -> i
 
 
 def decodes(payload: bytes, schema_name: str, text: bytes) -> bool:
-    """Whether a CDR payload can be a message of this definition: its fields fill it, but for padding."""
+    """Whether a CDR payload can be a message of this definition, whose fields fill it."""
     try:
         walk = Walk(payload, parse(schema_name, text))
         for _ in walk.leaves():

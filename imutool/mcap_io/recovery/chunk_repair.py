@@ -34,8 +34,9 @@ class UnreadableError(LogError):
 def prove(
     raw: bytes, offset: int, known: ChunkIndex | None, max_chunk: int, is_boundary: Callable[[int], bool]
 ) -> tuple[messages.Messages, records.ChunkHead, bytes]:
-    """Contents and head of a chunk that its CRC proves, or that states none and nothing contradicts; its bytes, repaired.
+    """Contents, head and repaired bytes of a chunk that its CRC proves.
 
+    A chunk that states no CRC is taken where nothing contradicts it.
     `known` is the chunk's entry in an intact summary. `is_boundary` says whether a record can end at a byte.
 
     Raises:

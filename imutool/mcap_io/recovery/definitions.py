@@ -1,4 +1,4 @@
-"""Definitions of a damaged file: what each recording in it says its ids mean, and one numbering for all of them."""
+"""Definitions of each recording in a damaged file, and one numbering for all of them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Account for the gaps of a damaged log: what message indexes and summaries say of the chunks that are gone."""
+"""Messages lost in the gaps of a damaged log, from message indexes and summaries."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from imutool.mcap_io.recovery.summary import Summary
 
 
 def counts_by_size(indexes: dict[int, int], end: int) -> dict[int, int]:
-    """Messages per channel by index size: 15 bytes a message index, 16 a message; none where they do not fit."""
+    """Messages per channel by index size: 15 bytes a message index, 16 a message."""
     if not indexes:
         return {}
     starts = sorted(indexes.items(), key=lambda item: item[1])

@@ -29,7 +29,7 @@ SAMPLES = 4  # messages of a channel that must decode by a definition
 
 
 class Recordings:
-    """The recordings of a file, and which of them each block belongs to (`MessageBlock.recording`)."""
+    """Recordings of a file, and which of them each block is of (`MessageBlock.recording`)."""
 
     def __init__(
         self, summaries: Sequence[Summary], losses: Losses, found_in: Callable[[MessageBlock], messages.Messages]
@@ -126,7 +126,7 @@ class Recordings:
             recording.samples.setdefault(channel, found.block)
 
     def _verify(self, found: ScannedBlock, recording: Recording) -> None:
-        """Checks that messages of unusual sizes decode; where not, they are of a log that nothing defines."""
+        """Checks that messages of unusual sizes decode; else they are of a log that nothing defines."""
         unusual = [
             channel
             for channel, (low, high) in found.sizes.items()
@@ -155,7 +155,7 @@ class Recordings:
         self.each.append(self._current)
 
     def _take_definition(self, found: Definition) -> None:
-        """Takes in a definition outside chunks; behind a gap one that contradicts begins another recording."""
+        """Takes in a definition outside chunks, unless it contradicts an earlier one."""
         for record in parsed([(found.opcode, found.body)], found.offset, self.losses):
             if not self._now.agrees([record]):
                 what = f"{type(record).__name__.lower()} {record.id} has two definitions, the second at byte {found.offset}"
@@ -183,7 +183,7 @@ class Recordings:
         return chosen
 
     def _fits(self, block: MessageBlock, channel: int, recording: Recording) -> bool:
-        """Whether the messages of a channel decode by the recording's definition; True where nothing tells."""
+        """Whether messages of a channel decode by the recording's definition; True if unknown."""
         known = recording.channels.get(channel)
         schema = recording.schemas.get(known.schema_id) if known else None
         if known is None or schema is None or (schema.encoding, known.message_encoding) != ("ros2msg", "cdr"):

@@ -1,4 +1,4 @@
-"""Index of a log that may be damaged; keeps what a CRC proves, and lists the rest in `losses`.
+"""Index of a log that may be damaged: what a CRC proves; `losses` lists the rest.
 
 An intact log is read by its index. At the first thing that contradicts the index, it is read by its records instead (`Scan`):
 the index then only helps to put damaged chunk heads right, and tells which chunks are gone.
@@ -80,7 +80,9 @@ class RecoveredIndex(LogIndex):
         return self._listed
 
     def _compare_heads(self) -> None:
-        """Compares every chunk's head with the summary; not in a store, where that would fetch the whole log.
+        """Compares every chunk's head with the summary.
+
+        Not in a store, where that would fetch the whole log.
 
         Raises:
             LogError: they contradict each other.
@@ -109,10 +111,7 @@ class RecoveredIndex(LogIndex):
         """Messages per channel id that are not lost so far."""
         if not self.losses and not self.by_records:
             return dict(self._stated)
-        total: Counter[int] = Counter()
-        for block in self.blocks:
-            total.update(self._counts_of(block))
-        return dict(total)
+        return self.summed_counts()
 
     def read(self, block: MessageBlock) -> bytes:
         """The bytes of a block, with a damaged chunk head repaired.
@@ -249,7 +248,7 @@ class RecoveredIndex(LogIndex):
         return dict(found)
 
     def _edit(self, block: MessageBlock) -> None:
-        """Counts by the channel ids of the whole file; messages that are on no topic are listed as lost."""
+        """Counts by the channel ids of the whole file; lists messages without a topic as lost."""
         local, recording = block.counts or {}, self.recordings.of(block)
         unproven = self.recordings.unproven.get(block.offset, {})
         if unproven and (lost := {f"({names})": local[i] for i, names in unproven.items() if i in local}):
@@ -278,7 +277,7 @@ class RecoveredIndex(LogIndex):
         return remap(found, keep, channels[keep])
 
     def _sort(self) -> None:
-        """Puts chunks that were found in disorder in order of log time; other records stay behind the chunk they follow."""
+        """Puts the chunks of a damaged log in order of log time, each with the records behind it."""
         keys, last = [], -1
         for item in self.items:
             last = item.start_ns if isinstance(item, MessageBlock) and item.counts else last

@@ -58,7 +58,7 @@ class RecoveredLog(Log):
             self.check_data_crc()
 
     def read_by_records(self) -> None:
-        """Reads the log again by its records, because its index and its contents contradict each other."""
+        """Reads the log again by its records, because its index contradicts them."""
         with self.named():
             self.index = RecoveredIndex(self._source, self.max_chunk, by_records=True)
             self.index.check()

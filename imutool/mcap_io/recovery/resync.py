@@ -180,7 +180,7 @@ class RecordFrames:
         return limit
 
     def _candidates(self, raw: bytes, at: int, *, chunks_only: bool = False) -> list[int]:
-        """Offsets of possible records (opcode known, length fits) and magics, or of chunks alone, in `WINDOW` bytes."""
+        """Offsets of possible records and magics, or of chunks alone, in `WINDOW` bytes."""
         view = np.frombuffer(raw, np.uint8)
         found: list[int] = []
         if len(view) >= HEAD.size:
@@ -219,7 +219,7 @@ class RecordFrames:
         return True
 
     def holds_log(self, position: int, opcode: int, length: int) -> bool:
-        """Whether another log begins inside a record, which was therefore cut off; an attachment may hold one."""
+        """Whether another log begins inside a record, which was cut off; an attachment may hold one."""
         if self.find(position, position + HEAD.size + length, LOG_START) < 0:
             return False
         try:
@@ -228,7 +228,7 @@ class RecordFrames:
             return True
 
     def find_proven(self, start: int, end: int) -> int:
-        """Offset of the first chunk in a stretch that its CRC proves, or -1; it may go on beyond the stretch."""
+        """Offset of the first chunk in a stretch that its CRC proves, or -1."""
         for at in range(start, end, WINDOW):
             raw = self.source.at(at, min(WINDOW + len(MAGIC), self.limit - at))
             for offset in self._candidates(raw, at, chunks_only=True):

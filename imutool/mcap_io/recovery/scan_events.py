@@ -1,4 +1,4 @@
-"""Results of the scan of a damaged log, in file order: blocks, gaps, definitions, and where logs begin and end."""
+"""Results of scanning a damaged log, in file order: blocks, gaps, definitions, logs."""
 
 from __future__ import annotations
 
@@ -85,7 +85,7 @@ Event = LogStart | LogEnd | Definition | ScannedBlock | Gap  # what decides whos
 
 
 class ScanResult:
-    """Blocks, other records and gaps of a file as a scan meets them, and what follows for the records before them."""
+    """Blocks, other records and gaps of a file as a scan meets them."""
 
     def __init__(self) -> None:
         self.items: list[MessageBlock | RecordSpan] = []
@@ -116,7 +116,7 @@ class ScanResult:
         self.used_channels.update(block.counts)
 
     def add_message_index(self, position: int, body: bytes) -> None:
-        """Assigns a message index to the chunk before it, or counts the messages of a chunk that is gone."""
+        """Assigns a message index to the chunk before it, or counts a lost chunk's messages."""
         last = self.last
         channel, entries = int.from_bytes(body[:2], "little"), np.frombuffer(body, "<u8", offset=6).reshape(-1, 2)
         end = position + HEAD.size + len(body)

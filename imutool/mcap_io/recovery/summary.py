@@ -69,7 +69,7 @@ def proven_summary(source: Source, losses: Losses) -> tuple[Footer, Summary | No
 
 
 def moved_summary(source: Source, data_end: int, position: int) -> Summary | None:
-    """The summary between a DataEnd and a Footer record, if its CRC proves it although it lies elsewhere than stated."""
+    """Summary between DataEnd and Footer that its CRC proves, although it was moved."""
     footer = records.parse(Footer, source.at(position + HEAD.size, FOOTER_SIZE - HEAD.size), position)
     start, stop = data_end + HEAD.size + 4, position + FOOTER_SIZE - 4
     if not footer.summary_crc or not footer.summary_start or stop - start > MAX_SUMMARY:
