@@ -225,7 +225,7 @@ class ConstantBiasStream:
         self._stream = model.stream(rest)
         self._P, self._t_s = np.diag(std**2), 0.0
         self._transition = expm(model.rest_dynamics() * STEP_S)
-        self._walk = np.diag(model.walk_std.detach().cpu().double().numpy() ** 2) * STEP_S
+        self._walk = np.diag(model.walk_std**2) * STEP_S
 
     def estimate(
         self, t_s: Float64[np.ndarray, " n"], gyro: Float64[np.ndarray, "n 3"], accel: Float64[np.ndarray, "n 3"]

@@ -17,7 +17,6 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from jaxtyping import Float64
-from torch import Tensor
 
 from imutool.bias.model import BiasModel, RestBiasEstimator, Stream, Vector6
 from imutool.bias_start.bias_tracking import (
@@ -84,7 +83,7 @@ class InitialBias:
 
 def prior(model: BiasModel) -> InitialBias:
     """Prior bias: mean and spread over the training runs."""
-    return InitialBias(float64(model.prior_mean), float64(model.prior_std), "prior of the training runs")
+    return InitialBias(model.prior_mean.copy(), model.prior_std.copy(), "prior of the training runs")
 
 
 def bias_prior(model: BiasModel) -> BiasPrior:
@@ -92,10 +91,10 @@ def bias_prior(model: BiasModel) -> BiasPrior:
 
     The axes of a sensor share one random walk.
     """
-    ground = np.maximum(float64(model.rest_std), AT_REST_STD)
-    walk = np.repeat(np.sqrt(np.mean(float64(model.walk_std).reshape(2, 3) ** 2, axis=1)), 3)
+    ground = np.maximum(model.rest_std, AT_REST_STD)
+    walk = np.repeat(np.sqrt(np.mean(model.walk_std.reshape(2, 3) ** 2, axis=1)), 3)
     walk = np.where(walk > 0, walk, USUAL_WALK)
-    return BiasPrior(float64(model.prior_mean), np.maximum(float64(model.prior_std), LEAST_STD), ground, walk)
+    return BiasPrior(model.prior_mean.copy(), np.maximum(model.prior_std, LEAST_STD), ground, walk)
 
 
 def tracked_from_prior(model: BiasModel) -> InitialBias:
@@ -163,9 +162,3 @@ def relative_samples(imu: Imu) -> Samples:
 def bias_over(model: BiasModel, imu: Imu, rest: Vector6) -> Float64[np.ndarray, "n 6"]:
     """Bias of a model over some samples, from a rest bias."""
     return model.stream(rest)(*relative_samples(imu))
-
-
-def float64(buffer: Tensor) -> Vector6:
-    """Values of a model's buffer as a numpy copy."""
-    value: Vector6 = buffer.detach().cpu().double().numpy().copy()
-    return value

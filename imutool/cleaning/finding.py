@@ -8,7 +8,7 @@ from itertools import pairwise
 from typing import Any, Literal
 
 import numpy as np
-from jaxtyping import Bool, Int64
+from jaxtyping import Int64
 
 from imutool.cleaning.samples import Numbers
 from imutool.report import Section
@@ -116,12 +116,6 @@ class Intervals:
     def where(self) -> dict[str, Any]:
         """Count and intervals, by the names of `Finding`."""
         return {"count": self.count, "intervals_ns": tuple(self.intervals), "intervals_left_out": self.left_out}
-
-
-def runs(mask: Bool[np.ndarray, " n"]) -> list[tuple[int, int]]:
-    """Index ranges `[first, end)` in which a mask holds."""
-    edges = np.flatnonzero(np.diff(mask.astype(np.int8), prepend=0, append=0))
-    return [(int(a), int(b)) for a, b in edges.reshape(-1, 2)]
 
 
 def score(messages: int, valid: int, missing: int, findings: Sequence[Finding]) -> float:

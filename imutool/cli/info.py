@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, NoReturn
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 from msgspec.structs import replace
 
-from imutool.cli.app import LOST, Json, Overwrite, Quiet, Verbose, app
+from imutool.cli.app import LOST, PNG, TOML, Json, Overwrite, Quiet, Verbose, app
 from imutool.cli.terminal import log_to_stderr, out, plain, say, table, tell_losses, write_json
 from imutool.errors import ConfigError
 from imutool.location import to_location
@@ -28,8 +29,12 @@ def info(
     model: Annotated[str | None, typer.Option(help="For --noise: model that corrects the samples in motion.")] = None,
     imu: Annotated[str | None, typer.Option(help="For --noise: IMU topic, where a log has several.")] = None,
     truth: Annotated[str | None, typer.Option(help="For --noise: topic of the true poses, where a log has several.")] = None,
-    noise_plot: Annotated[Path | None, typer.Option(metavar="F.png", help="Draw the Allan deviations (with --noise).")] = None,
-    noise_toml: Annotated[Path | None, typer.Option(metavar="F.toml", help="Write the noise as TOML (with --noise).")] = None,
+    noise_plot: Annotated[
+        Path | None, typer.Option(metavar="F.png", help="Draw the Allan deviations (with --noise)."), PNG
+    ] = None,
+    noise_toml: Annotated[
+        Path | None, typer.Option(metavar="F.toml", help="Write the noise as TOML (with --noise)."), TOML
+    ] = None,
     quick: Annotated[
         bool, typer.Option("--quick", help="Read only the chunks with IMU messages; this may miss damage.")
     ] = False,
@@ -39,7 +44,6 @@ def info(
     quiet: Quiet = False,
 ) -> None:
     """Report the topics, quality and damage of a log; with --noise, also its IMU noise."""
-    from imutool.log_info.inspection import inspect
     from imutool.log_info.report import LogInfos
 
     log_to_stderr(verbose, quiet)
@@ -48,35 +52,48 @@ def info(
         raise ConfigError(f"{idle[0]} needs --noise", where="info", fix="Add --noise")
     if len(logs) > 1 and (noise_plot or noise_toml):
         raise ConfigError(f"{len(logs)} logs do not fit one file", where="--noise-plot, --noise-toml", expected="one log")
-    places = [to_location(log) for log in logs]
-    reports = [inspect(log, check=not quick) for log in places]
-    lost = any(report.losses["stretches"] for report in reports)
-    identified_noises = []
-    if noise:
+    described = [_described(log, quick, noise, {"imu": imu, "truth": truth, "model": model}) for log in logs]
+    reports = [report for report, _ in described]
+    if (identified := described[0][1]) is not None:
+        _write_noise(identified, noise_plot, noise_toml, overwrite)
+    if not write_json(reports[0] if len(reports) == 1 else LogInfos(reports), json_to, overwrite=overwrite):
+        for log, (report, identified) in zip(logs, described, strict=True):
+            say(log)
+            _print(report, identified)
+    if any(report.losses["stretches"] for report in reports):
+        raise typer.Exit(LOST)
+
+
+def _described(
+    log: str, quick: bool, noise: bool, settings: Mapping[str, str | None]
+) -> tuple[LogInfo, IdentifiedNoise | None]:
+    """Report on a log, and its noise if requested; the log is opened once."""
+    from imutool.log_info.inspection import describe
+    from imutool.mcap_io.recovery.recovered_log import RecoveredLog
+
+    with RecoveredLog(to_location(log)) as opened:
+        report = describe(opened, check=not quick)
+        if not noise:
+            return report, None
         from imutool import noise_identification
 
-        identified_noises = [noise_identification.identify(log, imu=imu, truth=truth, model=model) for log in places]
-        noises = [noise_identification.plain(identified) for identified in identified_noises]
-        reports = [replace(report, noise=noise) for report, noise in zip(reports, noises, strict=True)]
-        _write_noise(identified_noises[0], noise_plot, noise_toml, overwrite)
-    if write_json(reports[0] if len(reports) == 1 else LogInfos(reports), json_to):
-        _leave(lost)
-    for number, (log, report) in enumerate(zip(logs, reports, strict=True)):
-        say(log)
-        table(topic_rows(report), keys=1)
-        table(imu_rows(report), keys=2)
-        if identified_noises:
-            table(noise_identification.rows(identified_noises[number]), keys=1)
-            for remark in identified_noises[number].remarks:
-                out.print(f"[cyan]noise:[/] {plain(remark)}", highlight=False, soft_wrap=True)
-        for warning in report.warnings:
-            out.print(f"[yellow]warning:[/] {plain(warning)}", highlight=False, soft_wrap=True)
-        tell_losses(report.losses)
-    _leave(lost)
+        identified = noise_identification.identify(opened, **settings)
+        return replace(report, noise=noise_identification.plain(identified)), identified
 
 
-def _leave(lost: bool) -> NoReturn:
-    raise typer.Exit(LOST if lost else 0)
+def _print(report: LogInfo, identified: IdentifiedNoise | None) -> None:
+    """Print tables, remarks, warnings and losses of one log."""
+    table(topic_rows(report), keys=1)
+    table(imu_rows(report), keys=2)
+    if identified is not None:
+        from imutool import noise_identification
+
+        table(noise_identification.rows(identified), keys=1)
+        for remark in identified.remarks:
+            out.print(f"[cyan]noise:[/] {plain(remark)}", highlight=False, soft_wrap=True)
+    for warning in report.warnings:
+        out.print(f"[yellow]warning:[/] {plain(warning)}", highlight=False, soft_wrap=True)
+    tell_losses(report.losses)
 
 
 def _write_noise(identified: IdentifiedNoise, plot: Path | None, toml: Path | None, overwrite: bool) -> None:
@@ -128,7 +145,7 @@ def imu_rows(report: LogInfo) -> list[tuple[str, ...]]:
                 rows.append((imu["topic"], f"{name} noise", ", ".join(f"{d:.2e}" for d in density) + f" {unit}/√Hz"))
     for truth in report.truth:
         value = f"{100 * truth.coverage:.1f} % of the IMU, {truth.gaps} gaps, longest {truth.longest_gap_s:.2f} s"
-        rows.append((truth.topic, "covers", value))
+        rows += [(truth.topic, "kind of poses", truth.kind), (truth.topic, "covers", value)]
     return rows
 
 

@@ -23,6 +23,7 @@ from msgspec import Meta
 
 from imutool.config import Settings
 from imutool.recording import Imu, nanoseconds
+from imutool.recording.columns import true_ranges
 
 WHITE_MARGIN = 1.3  # ratio of block means to white noise; with 10 blocks of 3 axes it scatters by 0.14
 FLOOR_MARGIN = 2.5  # ratio to the calmest windows of the log
@@ -138,7 +139,7 @@ def resting_blocks(blocks: Blocks, settings: StationarySettings | None = None) -
     for shift in range(width):
         resting_blocks[shift : shift + len(rests)] |= rests
     least_ns = nanoseconds(settings.min_s - 2 * period_s)
-    return [(a, b) for a, b in _runs(resting_blocks) if blocks.last_ns[b - 1] - blocks.first_ns[a] >= least_ns]
+    return [(a, b) for a, b in true_ranges(resting_blocks) if blocks.last_ns[b - 1] - blocks.first_ns[a] >= least_ns]
 
 
 class OnlineRestDetector:
@@ -220,8 +221,3 @@ def _window_statistics(
         noise.append(np.sqrt(v.mean(axis=-1)))
         means.append(m.mean(axis=-1))
     return np.concatenate(scatter), np.concatenate(noise), np.concatenate(means)
-
-
-def _runs(mask: Bool[np.ndarray, " n"]) -> list[tuple[int, int]]:
-    edges = np.flatnonzero(np.diff(mask.astype(np.int8), prepend=0, append=0))
-    return [(int(a), int(b)) for a, b in edges.reshape(-1, 2)]

@@ -15,7 +15,8 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from imutool.bias.model import COLUMNS, BiasModel
+from imutool.bias.model import COLUMNS
+from imutool.bias.networks.network import BiasNetwork
 from imutool.errors import DataError
 from imutool.inertial.strapdown import GRAVITY_W
 from imutool.inertial.windows import HUBER_MEDIANS, attitudes, huber_weight, rotation_residual, step_means, velocity_residual
@@ -39,7 +40,7 @@ class Solution:
 
 
 def sensor_residual(
-    model: BiasModel, sensor: Sensor, windows: Windows, W: Float[Tensor, "3 3"] | None = None
+    model: BiasNetwork, sensor: Sensor, windows: Windows, W: Float[Tensor, "3 3"] | None = None
 ) -> tuple[Float[Tensor, "batch 3"], Float[Tensor, "batch n 3 3"]]:
     """Residual of each window's debiased samples, and its Jacobian by each sample.
 
@@ -59,7 +60,7 @@ def sensor_residual(
 
 @torch.no_grad()
 def solve(
-    model: BiasModel,
+    model: BiasNetwork,
     sensor: Sensor,
     pool: Pool,
     rest: Float[Tensor, "logs 6"],
@@ -83,7 +84,7 @@ def solve(
         raise DataError(
             f"no stretch of {min(window_s):g} s of truth without a gap in {where}",
             expected="truth that covers at least one window",
-            fix="Shorten the windows with --set, or leave the log out",
+            fix="Shorten the windows (settings gyro_window_s, accel_window_s), or leave the log out",
         )
     rest, W, columns, known = rest.clone(), torch.zeros(3, 3).to(rest), COLUMNS[sensor], 9 if matrix else 0
     for _ in range(ITERATIONS if matrix else REST_ITERATIONS):

@@ -17,7 +17,8 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from imutool.bias.model import COLUMNS, Segment
+from imutool.bias.model import COLUMNS
+from imutool.bias.networks.network import Segment
 from imutool.errors import DataError
 from imutool.geometry import so3
 from imutool.inertial.strapdown import GRAVITY_W
@@ -54,8 +55,8 @@ class IncrementObjective(Objective):
             raise DataError(
                 f"no increment of {', '.join(map(str, asked))} samples of truth without a gap",
                 where=f"the training parts, for the {self.sensor}",
-                expected="truth that covers one at least",
-                fix=f"Shorten them with --set increments.{self.sensor}_samples=[16,32], or give logs with more truth",
+                expected="truth that covers at least one increment",
+                fix=f"Lower the setting increments.{self.sensor}_samples to [16,32], or give logs with more truth",
             )
         # a stretch holds the longest increment at least; one that is longer than its log repeats the last sample, unscored
         self.stretch = max(self.pool.samples(chosen.stretch_s), self.lengths[-1])
@@ -78,11 +79,11 @@ class IncrementObjective(Objective):
         true_u = (measured - self.model.sensor_bias(self.sensor, segment))[:, before:]
         dt = torch.diff(t[:, before:], dim=1)
         missed = _rotation if self.sensor == "gyro" else _velocity
-        found = {}
+        errors = {}
         for n, size in missed(true_u, dt, pool.R_wb[seen], pool.v_w[seen], self.lengths).items():
             counts = self.whole[n][seen[:, :-n]]
-            found[n] = IncrementErrors(size[counts], log[:, None].expand_as(counts)[counts])
-        return found
+            errors[n] = IncrementErrors(size[counts], log[:, None].expand_as(counts)[counts])
+        return errors
 
     def _usual(self) -> dict[int, Float[Tensor, " logs"]]:
         first = self.first[:: self.stretch]

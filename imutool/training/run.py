@@ -13,6 +13,7 @@ import torch
 from imutool import __version__, registry
 from imutool.bias import hybrid, io, neural_ode, static
 from imutool.bias.model import BiasModel
+from imutool.bias.networks.network import BiasNetwork
 from imutool.config import plain
 from imutool.errors import ConfigError, DataError
 from imutool.geometry import so3
@@ -21,8 +22,8 @@ from imutool.mcap_io.read import read
 from imutool.mcap_io.storage.source import sha256
 from imutool.recording import Recording
 from imutool.training import checkpoint
+from imutool.training.calibration import PhysicsFirst, config_of, described, helps
 from imutool.training.fit import Epoch, Training, check_device
-from imutool.training.physics_first import PhysicsFirst, config_of, described, helps
 from imutool.training.segments import Pool
 from imutool.training.settings import TrainSettings, settings_for
 from imutool.units import SENSORS
@@ -62,23 +63,23 @@ def train(
         NumericsError: the loss diverged.
     """
     if out.exists() and not overwrite:
-        raise ConfigError("exists already", where=out, fix="Choose another name or give --overwrite")
+        raise ConfigError("exists already", where=out, fix="Choose another name or give `overwrite`")
     if not out.parent.is_dir():
         raise ConfigError("the folder does not exist", where=out.parent, fix="Create it first")
     kept = checkpoint_path(out)
     if resume and not kept.exists():
-        raise ConfigError("there is no checkpoint", where=kept, fix="Train without --resume")
+        raise ConfigError("there is no checkpoint", where=kept, fix="Train without `resume`")
     if kept.exists() and not (resume or overwrite):
-        said = "an interrupted training left its checkpoint"
-        raise ConfigError(said, where=kept, fix="Give --resume to go on, or --overwrite to start afresh")
+        message = "an interrupted training left its checkpoint"
+        raise ConfigError(message, where=kept, fix="Give `resume` to go on, or `overwrite` to start afresh")
     if method == static.Model.method:
-        raise ConfigError("static is not trained", where="--method", fix="Choose hybrid, neural_ode, conv or linear")
+        raise ConfigError("static is not trained", where="method", fix="Choose hybrid, neural_ode, conv or linear")
     check_device(device)
     chosen = settings_for(method, settings)
-    if resume and not registry.load("imutool.bias", method).Model.iterative:
-        raise ConfigError(f"{method} has no steps to go on with", where="--resume", fix="Train it without --resume")
+    if resume and not registry.load("imutool.networks", method).Network.iterative:
+        raise ConfigError(f"{method} has no steps to go on with", where="resume", fix="Train it without `resume`")
     if method == hybrid.Model.method:
-        config_of(chosen)  # a slip of the pen is told before any log is read
+        config_of(chosen)  # a misspelt setting is an error before any log is read
     recordings = [read(log, imu=imu, truth=truth) for log in logs]
     check_trainable(recordings, Pool.of(recordings))
     say = progress or (lambda epoch: None)
@@ -93,7 +94,7 @@ def train(
         **about,
         **{key: _shared(recordings, key) for key in ("sensor", "dataset")},
     }
-    io.save(model, out, overwrite=overwrite)
+    io.save(model.frozen(), out, overwrite=overwrite)
     kept.unlink(missing_ok=True)
     return io.load(out)
 
@@ -122,7 +123,7 @@ class _Descent:
         except KeyboardInterrupt as interrupt:  # it may have struck in the middle of a step: what is kept is from before
             if self.kept.exists():
                 raise KeyboardInterrupt(
-                    f"{self.kept} holds what is done; the same command with --resume goes on from there"
+                    f"{self.kept} holds what is done; the same command with `resume` goes on from there"
                 ) from interrupt
             raise
         return training
@@ -130,7 +131,7 @@ class _Descent:
 
 def _physics_first(
     recordings: Sequence[Recording], settings: TrainSettings, descent: _Descent
-) -> tuple[BiasModel, dict[str, Any]]:
+) -> tuple[BiasNetwork, dict[str, Any]]:
     """Effects, then the neural ODE where it helps; what the card says of both."""
     physics = PhysicsFirst.of(recordings, settings, descent.device, descent.say)
     alone = msgspec.structs.replace(settings, model={})
@@ -142,7 +143,7 @@ def _physics_first(
         held_out["effects and neural_ode"] = _held_out(ode)
         kept = ode if helps(without.done, ode.done) else without
     model = physics.finish(kept.model)
-    return model, {"held_out": _held_out(kept), "compared": held_out, "physics": dict(described(physics.found))}
+    return model, {"held_out": _held_out(kept), "compared": held_out, "physics": dict(described(physics.fits))}
 
 
 def _shared(recordings: Sequence[Recording], key: str) -> str | None:

@@ -15,8 +15,8 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from imutool.bias import static
-from imutool.bias.model import BiasModel, Segment
+from imutool.bias.networks import static
+from imutool.bias.networks.network import BiasNetwork, Segment
 from imutool.errors import DataError
 from imutool.geometry import so3
 from imutool.inertial.stationary import GAP_PERIODS
@@ -28,6 +28,8 @@ HELD_OUT = 0.2  # the last fifth of every training log validates, as in the pape
 MAX_RATE_SPREAD = 0.05
 
 Part = Literal["train", "held_out", "all"]
+SAMPLED = ("gyro", "accel", "R_wb", "v_w", "p_wb")  # columns of a pool
+FLAGS = ("trusted", "held_out", "late")
 
 
 @dataclass(frozen=True)
@@ -69,27 +71,35 @@ class Pool:
         Raises:
             DataError: no truth, logs sampled at different rates, or no log long enough to hold anything.
         """
-        tracks = [_Track.of(recording) for recording in recordings]
-        rates = [track.rate_hz for track in tracks]
+        pools = [cls._of_log(recording, dtype, device) for recording in recordings]
+        rates = [pool.rate_hz for pool in pools]
         if max(rates) / min(rates) - 1 > MAX_RATE_SPREAD:
-            listed = ", ".join(f"{r.name} {rate:.1f}" for r, rate in zip(recordings, rates, strict=True))
+            listed = ", ".join(f"{pool.names[0]} {pool.rate_hz:.1f}" for pool in pools)
             raise DataError(f"training logs at different rates ({listed} Hz)", expected="logs of one sensor")
+        columns = {name: torch.cat([getattr(pool, name) for pool in pools]) for name in ("t", *SAMPLED, *FLAGS)}
+        log = torch.cat([pool.log + i for i, pool in enumerate(pools)])
+        return cls(names=tuple(pool.names[0] for pool in pools), rate_hz=float(np.median(rates)), log=log, **columns)
 
-        def put(column: str) -> Tensor:
-            return torch.as_tensor(np.concatenate([getattr(track, column) for track in tracks]), dtype=dtype, device=device)
-
-        def flags(column: str) -> Tensor:
-            return torch.as_tensor(np.concatenate([getattr(track, column) for track in tracks]), device=device)
-
-        log = np.repeat(np.arange(len(tracks)), [len(track.t) for track in tracks])
+    @classmethod
+    def _of_log(cls, recording: Recording, dtype: torch.dtype, device: str) -> Pool:
+        """One recording, on its IMU's clock."""
+        try:
+            both = recording.overlap()
+        except DataError as error:
+            raise error.at(recording.name) from error
+        imu = both.imu
+        poses, trusted = with_velocity(both.truth).at(imu.t_ns)
+        t = seconds(imu.t_ns, int(imu.t_ns[0]))
+        R_wb = so3.matrix_from_quaternion_wxyz(torch.from_numpy(np.array(poses.q_wb_wxyz)))
+        flags = (trusted, t > (1 - HELD_OUT) * t[-1], np.diff(t, prepend=t[0]) > GAP_PERIODS * imu.period_s)
+        sampled = (imu.gyro, imu.accel, R_wb, poses.v_w, poses.p_wb)
         return cls(
-            names=tuple(recording.name for recording in recordings),
-            rate_hz=float(np.median(rates)),
-            **{column: put(column) for column in ("t", "gyro", "accel", "R_wb", "v_w", "p_wb")},
-            log=torch.as_tensor(log, device=device),
-            trusted=flags("trusted"),
-            held_out=flags("held_out"),
-            late=flags("late"),
+            names=(recording.name,),
+            rate_hz=1.0 / imu.period_s,
+            t=torch.tensor(t, dtype=dtype, device=device),
+            log=torch.zeros(len(t), dtype=torch.long, device=device),
+            **{name: torch.tensor(np.asarray(x), dtype=dtype, device=device) for name, x in zip(SAMPLED, sampled, strict=True)},
+            **{name: torch.tensor(x, device=device) for name, x in zip(FLAGS, flags, strict=True)},
         )
 
     def samples(self, window_s: float) -> int:
@@ -144,58 +154,19 @@ class Pool:
         )
 
 
-@dataclass(frozen=True)
-class _Track:
-    """One recording on its IMU's clock."""
-
-    rate_hz: float
-    t: np.ndarray
-    gyro: np.ndarray
-    accel: np.ndarray
-    R_wb: np.ndarray
-    v_w: np.ndarray
-    p_wb: np.ndarray
-    trusted: np.ndarray
-    held_out: np.ndarray
-    late: np.ndarray
-
-    @classmethod
-    def of(cls, recording: Recording) -> _Track:
-        try:
-            both = recording.overlap()
-        except DataError as error:
-            raise error.at(recording.name) from error
-        imu, truth = both.imu, both.truth
-        poses, trusted = with_velocity(truth).at(imu.t_ns)
-        assert poses.v_w is not None
-        t = seconds(imu.t_ns, int(imu.t_ns[0]))
-        R_wb = so3.matrix_from_quaternion_wxyz(torch.from_numpy(np.array(poses.q_wb_wxyz))).numpy()
-        held_out = t > (1 - HELD_OUT) * t[-1]
-        return cls(
-            1.0 / imu.period_s,
-            t,
-            imu.gyro,
-            imu.accel,
-            R_wb,
-            poses.v_w,
-            poses.p_wb,
-            trusted,
-            held_out,
-            np.diff(t, prepend=t[0]) > GAP_PERIODS * imu.period_s,
-        )
-
-
 CHUNK = 8192  # samples at a time: what is in memory does not depend on how long a log is
 
 
 @torch.no_grad()
-def corrected(model: BiasModel, pool: Pool, part: Part = "all", sensors: Sequence[Sensor] = SENSORS) -> tuple[BiasModel, Pool]:
+def corrected(
+    model: BiasNetwork, pool: Pool, part: Part = "all", sensors: Sequence[Sensor] = SENSORS
+) -> tuple[BiasNetwork, Pool]:
     """A model and a pool that are scored over windows as the given ones at work over whole logs.
 
-    A model that looks back (`BiasModel.context`) would be shown a window without the samples before it, and would be computed
-    anew for every window that overlaps another. What it adds to the rest bias depends on the samples alone: here it is taken
-    off them, with their real history, and a constant remains. Only the samples of `part` and the columns of `sensors` are
-    corrected. Models that do not look back, and their pool, come back as they are.
+    A model that looks back (`BiasNetwork.context`) would be shown a window without the samples before it, and would be
+    computed anew for every window that overlaps another. What it adds to the rest bias depends on the samples alone: here it
+    is taken off them, with their real history, and a constant remains. Only the samples of `part` and the columns of
+    `sensors` are corrected. Models that do not look back, and their pool, come back as they are.
     """
     if not model.context:
         return model, pool
@@ -210,7 +181,7 @@ def corrected(model: BiasModel, pool: Pool, part: Part = "all", sensors: Sequenc
             segment = Segment((t - t[0])[None], pool.gyro[index][None], pool.accel[index][None], nothing)
             for sensor in sensors:
                 columns[sensor][some] -= model.sensor_bias(sensor, segment)[0, model.context :]
-    return static.Model().to(pool.t), replace(pool, gyro=columns["gyro"], accel=columns["accel"])
+    return static.Network().to(pool.t), replace(pool, gyro=columns["gyro"], accel=columns["accel"])
 
 
 def sensors_up_to(sensor: Sensor) -> Sequence[Sensor]:

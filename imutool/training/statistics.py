@@ -10,9 +10,11 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from imutool.bias.model import COLUMNS, BiasModel, Segment
+from imutool.bias.model import COLUMNS
+from imutool.bias.networks.network import BiasNetwork, Segment
 from imutool.bias_start.bias_at_rest import rest_spread
 from imutool.bias_start.bias_from_truth import TRUTH_S, bias_from_truth
+from imutool.geometry import so3
 from imutool.inertial.stationary import white_noise
 from imutool.training import closed_form
 from imutool.training.segments import Pool, corrected
@@ -26,7 +28,7 @@ FLOOR_STD = {"gyro": 5e-5, "accel": 2e-3}
 
 
 def store_statistics(
-    model: BiasModel, pool: Pool, rest: Float[Tensor, "logs 6"], window_s: Mapping[Sensor, Sequence[float]]
+    model: BiasNetwork, pool: Pool, rest: Float[Tensor, "logs 6"], window_s: Mapping[Sensor, Sequence[float]]
 ) -> None:
     """Fills the model's prior, the spread of starts from truth, and the noise of a sample.
 
@@ -44,7 +46,7 @@ def store_statistics(
         model.noise_std[columns] = torch.from_numpy(white_noise(u.cpu().numpy())).to(rest)
     model.truth_std.copy_(_start_spread(scored, left, rest))
     model.walk_std.copy_(_walk(scored, left, rest, window_s))
-    model.rest_std.copy_(torch.from_numpy(rest_spread(scored, _samples(left), rest.cpu().double().numpy())))
+    model.rest_std.copy_(torch.from_numpy(rest_spread(scored.frozen(), _samples(left), rest.cpu().double().numpy())))
 
 
 def _run_to_run(sensor: Sensor, rest: Float[Tensor, "logs 3"]) -> Float[Tensor, "3"]:
@@ -60,7 +62,7 @@ def _run_to_run(sensor: Sensor, rest: Float[Tensor, "logs 3"]) -> Float[Tensor, 
 
 
 def _walk(
-    model: BiasModel, pool: Pool, rest: Float[Tensor, "logs 6"], window_s: Mapping[Sensor, Sequence[float]]
+    model: BiasNetwork, pool: Pool, rest: Float[Tensor, "logs 6"], window_s: Mapping[Sensor, Sequence[float]]
 ) -> Float[Tensor, "6"]:
     """How far rest biases walk in a second^1/2: the means over a log's two halves differ by walk sqrt(T / 3)."""
     begins = torch.searchsorted(pool.log, torch.arange(len(pool.names), device=pool.log.device))
@@ -78,7 +80,7 @@ def _walk(
 
 
 @torch.no_grad()
-def _start_spread(model: BiasModel, pool: Pool, rest: Float[Tensor, "logs 6"]) -> Float[Tensor, "6"]:
+def _start_spread(model: BiasNetwork, pool: Pool, rest: Float[Tensor, "logs 6"]) -> Float[Tensor, "6"]:
     """How far a rest bias from `TRUTH_S` of truth lies from its log's, as a robust standard deviation."""
     n, off = pool.samples(TRUTH_S), []
     for log in range(len(pool.names)):
@@ -92,8 +94,9 @@ def _start_spread(model: BiasModel, pool: Pool, rest: Float[Tensor, "logs 6"]) -
             t = pool.t[some] - pool.t[some[0]]
             segment = Segment(t[None], u[None, :, :3], u[None, :, 3:], rest[log][None])
             left = (u - model(segment)[0]).cpu().double().numpy()
-            R_wb, v_w = (x[some].cpu().double() for x in (pool.R_wb, pool.v_w))
-            off.append(bias_from_truth(t.cpu().double().numpy(), left, R_wb, v_w, trusted.cpu().numpy()))
+            q_wb_wxyz = so3.quaternion_wxyz_from_matrix(pool.R_wb[some].double())
+            seconds, q, v_w = (x.cpu().double().numpy() for x in (t, q_wb_wxyz, pool.v_w[some]))
+            off.append(bias_from_truth(seconds, left, q, v_w, trusted.cpu().numpy()))
     if len(off) < FEWEST_STARTS:
         return torch.tensor([ONE_RUN_STD["gyro"]] * 3 + [ONE_RUN_STD["accel"]] * 3).to(rest)
     floor = torch.tensor([FLOOR_STD["gyro"]] * 3 + [FLOOR_STD["accel"]] * 3)

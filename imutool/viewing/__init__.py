@@ -1,1 +1,17 @@
 """What a person looks at: the data behind every picture, and the viewer that shows it."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from imutool.report import Section
+
+How = Literal["viewer", "connect", "rrd", "web", "folder", "png", "html"]
+
+
+class Output(Section, frozen=True):
+    """Output of a view: `place` is a URL or a path, `said` a sentence on how to open it."""
+
+    how: How
+    place: str
+    said: str

@@ -1,7 +1,7 @@
 """VIO figures of a log and its models: the VIO columns of the paper's tables.
 
 The IMU is the log's own, raw or as a model corrects it; the camera is EuRoC's stereo rig on every data set, its tracks are
-simulated along the log's true poses (`imutool.vio.features`). All runs of a log see the same tracks and the same settings; only
+simulated along the log's true poses (`imutool.vio.camera`). All runs of a log see the same tracks and the same settings; only
 the samples differ. The estimate starts in the true state and is scored where the truth is known, at the keyframes.
 """
 
@@ -25,8 +25,8 @@ from imutool.inertial import metrics
 from imutool.inertial.strapdown import StartPose, with_velocity
 from imutool.mcap_io.read import read
 from imutool.recording import Imu, Poses, Recording, nanoseconds, seconds
-from imutool.vio import features, rig, smoother
-from imutool.vio.features import Frame
+from imutool.vio import camera, smoother
+from imutool.vio.camera import Frame
 from imutool.vio.smoother import Positive, SmootherSettings
 
 SCHEMA = "imutool.vio/1"
@@ -99,8 +99,8 @@ def vio(
                     "init_how": start.how if start else None,
                     "bias_states": states,
                     **score(debiased.imu, course, chosen, bias_states=states, progress=tell),
-                    "camera": rig.EUROC.name,
-                    "tracks": round(features.seen(course.frames), 1),
+                    "camera": camera.EUROC.name,
+                    "tracks": round(camera.seen(course.frames), 1),
                     "settings": msgspec.to_builtins(chosen),
                 }
             )
@@ -134,10 +134,10 @@ def plan(recording: Recording, settings: VioSettings) -> VioProblem:
         )
     true, valid = truth.at(imu.t_ns[rows][keyframes])
     t_s = seconds(true.t_ns, int(true.t_ns[0]))
-    sighted = valid & ~features.blackouts(t_s, settings.blackout_s, settings.blackout_every_s)
+    sighted = valid & ~camera.blackouts(t_s, settings.blackout_s, settings.blackout_every_s)
     rng = np.random.default_rng(settings.seed)
-    landmarks_w = features.room(true.p_wb[valid], rng)
-    frames, _ = features.observe(true, sighted, landmarks_w, rng, features=settings.features, pixel_noise=settings.pixel_noise)
+    landmarks_w = camera.room(true.p_wb[valid], rng)
+    frames, _ = camera.observe(true, sighted, landmarks_w, rng, features=settings.features, pixel_noise=settings.pixel_noise)
     return VioProblem(rows, keyframes, true, valid, frames)
 
 
@@ -156,7 +156,7 @@ def score(
     began = time.process_time()
     start = StartPose.of(course.true)
     try:
-        found = smoother.estimate(
+        estimate = smoother.estimate(
             imu.rows(course.rows),
             course.keyframes,
             course.frames,
@@ -166,10 +166,10 @@ def score(
             bias_states=bias_states,
             progress=progress,
         )
-        figures = metrics.evaluate(from_first_pose(found.poses, course.true), course.true, course.valid)
+        figures = metrics.evaluate(from_first_pose(estimate.poses, course.true), course.true, course.valid)
     except NumericsError as error:
         return {"failed": str(error), **dict.fromkeys(FIGURES), "cpu_s": time.process_time() - began}
-    bias = {"gyro_bias_end": found.bias[-1, :3].tolist(), "accel_bias_end": found.bias[-1, 3:].tolist()}
+    bias = {"gyro_bias_end": estimate.bias[-1, :3].tolist(), "accel_bias_end": estimate.bias[-1, 3:].tolist()}
     return {"failed": None, **figures, **bias, "cpu_s": time.process_time() - began}
 
 
@@ -210,17 +210,17 @@ def tabulate(results: Sequence[dict[str, Any]]) -> Iterator[list[tuple[str, ...]
 
     Of a failed run there is nothing to show.
     """
-    distances = next((list(one["roe_deg"]) for one in results if not one["failed"]), [])
+    distances = next((list(result["roe_deg"]) for result in results if not result["failed"]), [])
     keys = ("log", "model", "bias\nstates")
     absolute: list[tuple[str, ...]] = [(*keys, "AOE\n°", "APE\nm", "aligned\n°", "aligned\nm", "velocity\nm/s", "CPU\ns")]
     relative: list[tuple[str, ...]] = [(*keys, *(f"ROE °\n{d} m" for d in distances), *(f"RPE m\n{d} m" for d in distances))]
-    for one in results:
-        row = (one["log"], one["model"], ON if one["bias_states"] else OFF)
-        if one["failed"]:
-            absolute.append((*row, *["–"] * 5, f"{one['cpu_s']:.1f}"))
+    for result in results:
+        row = (result["log"], result["model"], ON if result["bias_states"] else OFF)
+        if result["failed"]:
+            absolute.append((*row, *["–"] * 5, f"{result['cpu_s']:.1f}"))
             continue
-        absolute.append((*row, *(_number(one[name]) for name in ABSOLUTE), f"{one['cpu_s']:.1f}"))
-        relative.append((*row, *(_number(one[name][d]) for name in RELATIVE for d in distances)))
+        absolute.append((*row, *(_number(result[name]) for name in ABSOLUTE), f"{result['cpu_s']:.1f}"))
+        relative.append((*row, *(_number(result[name][d]) for name in RELATIVE for d in distances)))
     yield absolute
     if len(relative) > 1:
         yield relative

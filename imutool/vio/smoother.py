@@ -24,8 +24,7 @@ from imutool import config
 from imutool.errors import ConfigError, NumericsError
 from imutool.inertial.strapdown import StartPose
 from imutool.recording import GRAVITY_M_S2, Imu, Poses, seconds
-from imutool.vio.features import Frame
-from imutool.vio.rig import EUROC, StereoRig
+from imutool.vio.camera import EUROC, Frame, StereoRig
 
 Vectors = Float64[np.ndarray, "n 3"]
 Positive = Annotated[float, Meta(gt=0.0)]

@@ -65,7 +65,7 @@ def samples(imu: Imu) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def model() -> BiasModel:
-    return static.Model().double()
+    return static.Model()
 
 
 def forward(imu: Imu, known: BiasPrior = KNOWN) -> list[FilteredBlock]:

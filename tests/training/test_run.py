@@ -22,9 +22,9 @@ from imutool.errors import ConfigError, DataError, LogError, ModelError, Numeric
 from imutool.mcap_io.write import write
 from imutool.recording import Imu, Recording
 from imutool.sensor.made_up_flight import flight
+from imutool.training.calibration import config_of, helps, settings_for
 from imutool.training.fit import Epoch, TrainSettings
 from imutool.training.objective import WindowEndObjective
-from imutool.training.physics_first import config_of, helps, settings_for
 from imutool.training.run import checkpoint_path, train
 from imutool.training.settings import settings_of
 from imutool.units import Sensor
@@ -154,19 +154,19 @@ def test_ctrl_c_before_anything_is_done_leaves_nothing(logs: list[Path], tmp_pat
 def test_a_device_that_is_not_there_is_refused_before_any_log_is_read(method: str, tmp_path: Path) -> None:
     devices = ["tpu"] if torch.cuda.is_available() else ["tpu", "cuda"]
     for device in devices:
-        with pytest.raises(ConfigError, match="--device"):
+        with pytest.raises(ConfigError, match="device"):
             train([tmp_path / "absent.mcap"], tmp_path / "m.safetensors", method=method, device=device)
 
 
 def test_to_resume_what_was_never_begun_is_refused(logs: list[Path], tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match=r"m.safetensors.checkpoint: there is no checkpoint.*without --resume"):
+    with pytest.raises(ConfigError, match=r"m.safetensors.checkpoint: there is no checkpoint.*without `resume`"):
         train(logs, tmp_path / "m.safetensors", method="neural_ode", settings=TINY, resume=True)
 
 
 def test_a_checkpoint_is_not_trained_over_without_being_told(logs: list[Path], tmp_path: Path) -> None:
     out = tmp_path / "m.safetensors"
     checkpoint_path(out).write_bytes(b"hours of work")
-    with pytest.raises(ConfigError, match=r"interrupted training left its checkpoint.*--resume to go on"):
+    with pytest.raises(ConfigError, match=r"interrupted training left its checkpoint.*`resume` to go on"):
         train(logs, out, method="neural_ode", settings=TINY)
     assert checkpoint_path(out).read_bytes() == b"hours of work"
     train(logs, out, method="neural_ode", settings=TINY, overwrite=True)
@@ -281,7 +281,7 @@ def test_a_hybrids_card_says_what_was_found_and_compared(expected_hybrid: bytes,
     assert card["physics"]["accel"]["effects"] == ["accel_scale"]
     assert set(card["compared"]) == {"effects", "effects and neural_ode"}
     assert card["held_out"] == card["compared"]["effects and neural_ode"]
-    assert model.named("gyro") == ("gyro_scale", "gyro_misalignment")
+    assert model.config.effects("gyro") == ("gyro_scale", "gyro_misalignment")
     assert model.ode is not None
     for name in ("prior_std", "truth_std", "noise_std"):
         assert (getattr(model, name) > 0).all(), name

@@ -14,7 +14,7 @@ from imutool.errors import ConfigError, NumericsError
 from imutool.inertial.strapdown import StartPose
 from imutool.recording import Imu, Recording
 from imutool.vio import smoother
-from imutool.vio.features import Frame
+from imutool.vio.camera import Frame
 from imutool.vio.run import VioProblem, VioSettings, plan, score
 from imutool.vio.smoother import Estimate, SmootherSettings
 

@@ -7,9 +7,10 @@ from collections.abc import Iterator
 import numpy as np
 from jaxtyping import Float64, Int64
 
-from imutool.cleaning.finding import MAX_INTERVALS, Finding, runs
+from imutool.cleaning.finding import MAX_INTERVALS, Finding
 from imutool.cleaning.rule import Rule, TopicSummary
 from imutool.cleaning.samples import Samples
+from imutool.recording.columns import true_ranges
 
 PART = 64  # samples whose median period is one row
 CHANGE = 1.2  # times the usual period, or the usual period so many times this one
@@ -48,7 +49,7 @@ class ChangedRate(Rule):
         period, ends = np.concatenate(self._rows), np.concatenate(self._ends)
         usual = float(np.median(period))
         other = (period > CHANGE * usual) | (period * CHANGE < usual)
-        stretches = [(a, b) for a, b in runs(other) if b - a >= LEAST_PARTS]
+        stretches = [(a, b) for a, b in true_ranges(other) if b - a >= LEAST_PARTS]
         if not stretches:
             return
         intervals = tuple((int(ends[a, 0]), int(ends[b - 1, 1])) for a, b in stretches)

@@ -39,12 +39,12 @@ class Spikes(Rule):
         """Yield the samples without spikes."""
         for around, core in padded(stream, NEARBY + LONGEST + 1):
             spike, size = spikes(around.values)
-            found = spike[core]
+            spiked = spike[core]
             samples = around.where(core)
-            bad = np.asarray(found.any(axis=1))
+            bad = np.asarray(spiked.any(axis=1))
             if bad.any():
-                self._by_axis += found.sum(axis=0)
-                self._largest = np.maximum(self._largest, np.where(found, size[core], 0.0).max(axis=0))
+                self._by_axis += spiked.sum(axis=0)
+                self._largest = np.maximum(self._largest, np.where(spiked, size[core], 0.0).max(axis=0))
                 self._places.add(samples.number[bad], samples.stamp_ns[bad])
                 self.dropped.append(samples.number[bad])
             yield samples.where(~bad)
@@ -68,9 +68,9 @@ def spikes(values: Float64[np.ndarray, "n k"]) -> tuple[Bool[np.ndarray, "n k"],
     quarters of the steps that are not zero, over the whole block, are the least that counts as a step nearby.
     """
     n = len(values)
-    found, size = np.zeros(values.shape, bool), np.zeros(values.shape)
+    mask, size = np.zeros(values.shape, bool), np.zeros(values.shape)
     if n < NEARBY:
-        return found, size
+        return mask, size
     step = np.diff(values, axis=0)
     magnitude = np.abs(step)
     ordinary = np.array([np.quantile(column[column > 0], ORDINARY) if column.any() else 0.0 for column in magnitude.T])
@@ -83,6 +83,6 @@ def spikes(values: Float64[np.ndarray, "n k"]) -> tuple[Bool[np.ndarray, "n k"],
         other = np.maximum(np.maximum(largest[first - 1], largest[first + width + NEARBY]), ordinary)
         rows, axes = np.nonzero(peak > TIMES * other)
         for shift in range(width):
-            found[first[rows] + shift, axes] = True
+            mask[first[rows] + shift, axes] = True
             size[first[rows] + shift, axes] = np.maximum(size[first[rows] + shift, axes], peak[rows, axes])
-    return found, size
+    return mask, size

@@ -12,10 +12,11 @@ from collections.abc import Iterable, Iterator
 import numpy as np
 from jaxtyping import Bool, Float64
 
-from imutool.cleaning.finding import Finding, Intervals, runs
+from imutool.cleaning.finding import Finding, Intervals
 from imutool.cleaning.rule import Rule, TopicSummary
 from imutool.cleaning.rules.not_finite import AXES
 from imutool.cleaning.samples import Samples, padded
+from imutool.recording.columns import true_ranges
 
 LEAST = 10  # equal samples in a row
 AXIS_LEAST, AXIS_LEAST_S = 100, 1.0  # of one axis alone; the longest in real recordings is 17, or 0.17 s
@@ -41,7 +42,7 @@ class Stuck(Rule):
             same = np.concatenate([[False], (np.diff(around.values, axis=0) == 0).all(axis=1)])
             self._noisy = _noisy(around.values[~same], self._noisy)
             again = np.zeros(len(same), bool)
-            for first, end in runs(same):
+            for first, end in true_ranges(same):
                 again[first:end] = end - first >= LEAST - 1
             samples, repeated = around.where(core), again[core]
             self._equal += int(same[core].sum())

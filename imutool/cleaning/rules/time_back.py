@@ -16,10 +16,11 @@ import numpy as np
 from jaxtyping import Bool, Int64
 from numpy.lib.stride_tricks import sliding_window_view
 
-from imutool.cleaning.finding import Finding, Intervals, runs
+from imutool.cleaning.finding import Finding, Intervals
 from imutool.cleaning.rule import Rule, TopicSummary
 from imutool.cleaning.samples import Samples, padded
 from imutool.recording import nanoseconds
+from imutool.recording.columns import true_ranges
 
 AHEAD = 32  # samples asked whether one is ahead of them
 SET_BACK_NS = nanoseconds(1.0)
@@ -158,9 +159,9 @@ def _ahead(stamp_ns: Int64[np.ndarray, " n"]) -> Bool[np.ndarray, " n"]:
     filled = np.concatenate([stamp_ns, np.full(AHEAD, 2**63 - 1)])
     later = sliding_window_view(filled, AHEAD + 1)[:n, 1:]
     behind: Int64[np.ndarray, " n"] = (later <= stamp_ns[:, None]).sum(axis=1)
-    there = np.minimum(AHEAD, n - 1 - np.arange(n))
-    ahead: Bool[np.ndarray, " n"] = (behind >= 2) & (2 * behind > there)
-    for first, end in runs(ahead):
+    following = np.minimum(AHEAD, n - 1 - np.arange(n))
+    ahead: Bool[np.ndarray, " n"] = (behind >= 2) & (2 * behind > following)
+    for first, end in true_ranges(ahead):
         if first and end < n and stamp_ns[end] <= stamp_ns[first - 1]:
             ahead[first:end] = False
     return ahead

@@ -26,7 +26,7 @@ LINES = {
 HEIGHT_INCH = 3.8
 
 
-def write_png(found: IdentifiedNoise, path: Path, *, overwrite: bool = False) -> None:
+def write_png(identified: IdentifiedNoise, path: Path, *, overwrite: bool = False) -> None:
     """Write a PNG of the Allan deviation of each axis, the fitted sum and each noise term.
 
     Above from rest, below from the residual in motion, where the log has them.
@@ -35,28 +35,28 @@ def write_png(found: IdentifiedNoise, path: Path, *, overwrite: bool = False) ->
         ConfigError: matplotlib is not installed, or the file exists or cannot be written.
     """
     with Target(path, overwrite=overwrite) as target:  # refuses before the work is done, leaves nothing after a failure
-        target.write(png(found))
+        target.write(png(identified))
 
 
-def png(found: IdentifiedNoise) -> bytes:
+def png(identified: IdentifiedNoise) -> bytes:
     """Content of the PNG file of `write_png`.
 
     Raises:
         ConfigError: matplotlib is not installed.
     """
-    sights = [sight for sight in (found.at_rest, found.in_motion) if sight is not None]
+    sources = [source for source in (identified.at_rest, identified.in_motion) if source is not None]
     panels = [
-        Panel(partial(_draw, sight=sight, sensor=sensor), HEIGHT_INCH, f"{TITLES[sensor]}: {sight.how}")
-        for sight in sights
+        Panel(partial(_draw, source=source, sensor=sensor), HEIGHT_INCH, f"{TITLES[sensor]}: {source.how}")
+        for source in sources
         for sensor in SENSORS
     ]
-    return drawn(Picture("allan", "Allan deviation", "", tuple(panels)), f"{found.log} {found.topic}")
+    return drawn(Picture("allan", "Allan deviation", "", tuple(panels)), f"{identified.log} {identified.topic}")
 
 
-def _draw(figure: Any, *, sight: CurveSource, sensor: Sensor) -> None:
+def _draw(figure: Any, *, source: CurveSource, sensor: Sensor) -> None:
     axes = figure.subplots()
-    curve = sight.curves[sensor]
-    for axis, (slopes, color) in enumerate(zip(sight.slopes[sensor], AXIS_COLORS, strict=True)):
+    curve = source.curves[sensor]
+    for axis, (slopes, color) in enumerate(zip(source.slopes[sensor], AXIS_COLORS, strict=True)):
         error = curve.deviation[:, axis] / np.sqrt(2.0 * curve.freedom)
         axes.errorbar(curve.tau_s, curve.deviation[:, axis], error, fmt="o", ms=4, color=color, lw=0.8, label=AXES[axis])
         if not slopes.powers:
@@ -70,11 +70,11 @@ def _draw(figure: Any, *, sight: CurveSource, sensor: Sensor) -> None:
     axes.set_yscale("log")
     if len(curve.tau_s):
         axes.set_ylim(curve.deviation.min() / 3.0, curve.deviation.max() * 2.0)
-    axes.set_title(f"{TITLES[sensor]}: {sight.how}".replace(", ", ",\n"), fontsize=9)
+    axes.set_title(f"{TITLES[sensor]}: {source.how}".replace(", ", ",\n"), fontsize=9)
     axes.set_xlabel("averaging time (s)")
     axes.set_ylabel(f"Allan deviation ({UNITS[sensor]})")
     plain_tick_labels(axes.xaxis, axes.yaxis)
-    named = sorted({name for slopes in sight.slopes[sensor] for name in slopes.seen}, key=list(LINES).index)
+    named = sorted({name for slopes in source.slopes[sensor] for name in slopes.seen}, key=list(LINES).index)
     for name in named:
         axes.plot([], [], color=SOFT, lw=0.9, ls=LINES[name], label=name)
     legend(figure, axes.get_legend_handles_labels()[0])

@@ -153,9 +153,9 @@ def residual_against_attitude(d: Diagnosis) -> str | None:
     return _binned(d, variable, dict.fromkeys(SIGNALS, "{} above the horizon (°)"), "attitude")
 
 
-def curve(found: Curve, signal: str) -> str:
+def curve(smooth: Curve, signal: str) -> str:
     """Curve of a finding without a name over its variable, one panel per axis, with its band."""
-    all_y, all_bands = np.array(found.y), np.array(found.band)
+    all_y, all_bands = np.array(smooth.y), np.array(smooth.band)
 
     def draw(figure: Any) -> None:
         count = all_y.shape[1]
@@ -163,11 +163,11 @@ def curve(found: Curve, signal: str) -> str:
         panels = figure.subplots(1, max(len(drawn), 1), squeeze=False, sharey=True)[0]
         for k, axes in zip(drawn, panels, strict=False):
             y, band = all_y[:, k], all_bands[:, k]
-            axes.fill_between(found.x, y - band, y + band, color=AFTER, alpha=0.3, lw=0)
-            axes.plot(found.x, y, color=AFTER, lw=1.4)
+            axes.fill_between(smooth.x, y - band, y + band, color=AFTER, alpha=0.3, lw=0)
+            axes.plot(smooth.x, y, color=AFTER, lw=1.4)
             axes.axhline(0.0, color=INK, lw=0.6)
             axes.set_title(f"{signal} {AXES[k]}" if count == 3 else signal)
-            axes.set_xlabel(f"{found.variable} ({found.unit})")
+            axes.set_xlabel(f"{smooth.variable} ({smooth.unit})")
             axes.locator_params(axis="x", nbins=6)
         panels[0].set_ylabel(f"misfit ({UNITS[signal]})" if signal in UNITS else "misfit")
 

@@ -7,7 +7,6 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from imutool import __version__
-from imutool.diagnosis.quantity import SHOWN, each, grouped, percent, symbol
 from imutool.diagnosis.result import SCHEMA, Diagnosis, Finding, Traces
 from imutool.diagnosis.wording.conclusion import (
     chance_text,
@@ -22,6 +21,7 @@ from imutool.diagnosis.wording.conclusion import (
     unobservable,
 )
 from imutool.diagnosis.wording.effect_sentences import effect_sentence, has_gain, label
+from imutool.diagnosis.wording.quantity import SHOWN, each, grouped, percent, symbol
 from imutool.mcap_io.storage.target import Target
 from imutool.units import ASCII_UNITS
 from imutool.viewing.html import diagnosis_figures as figures
@@ -142,13 +142,13 @@ def _before_and_after(d: Diagnosis) -> Iterator[str]:
         return
     found = bool(d.findings)
     legend = BEFORE + AFTER if found else DIFFERENCE
-    over = "unseen time of all logs" if any(one.held_out.any() for one in d.traces) else "all time: none was held out"
+    over = "unseen time of all logs" if any(trace.held_out.any() for trace in d.traces) else "all time: none was held out"
     yield f"<h2>{'Before and after' if found else 'Difference'}</h2>"
     for k, trace in enumerate(d.traces[:MAX_LOGS]):
         drawn = figures.residual(trace, found=found)
         yield _figure(drawn, f"r{k}", f"{text(trace.log)}: over time{_band(trace)}. {legend}{HELD}")
     for k, (signal, traces) in enumerate(d.signals.items()):
-        drawn = figures.scalar_signal(traces, found=any(one.signal == signal for one in d.findings))
+        drawn = figures.scalar_signal(traces, found=any(finding.signal == signal for finding in d.findings))
         yield _figure(drawn, f"g{k}", f"{text(signal)}: over time. {legend}{HELD}")
     if len(d.traces) > MAX_LOGS:
         yield f'<p class="note">The first {MAX_LOGS} of {len(d.traces)} logs are drawn; all are in the .rrd.</p>'

@@ -72,15 +72,15 @@ def paths(d: Diagnosis) -> str | None:
     return svg(draw, 3.0, "paths")
 
 
-def rms_drift(found: Sequence[Stretch], side: int) -> tuple[Float64[np.ndarray, " k"], Float64[np.ndarray, "k 2"]]:
+def rms_drift(stretches: Sequence[Stretch], side: int) -> tuple[Float64[np.ndarray, " k"], Float64[np.ndarray, "k 2"]]:
     """Root mean square orientation (deg) and position error (m) by time since the start.
 
     `side` is 1 for before, 2 for after. As far as half of the stretches reach.
     """
-    lasting = float(np.median([stretch.truth.duration_s for stretch in found]))
+    lasting = float(np.median([stretch.truth.duration_s for stretch in stretches]))
     t_s = np.arange(0.0, lasting + 1e-9, GRID_S)
-    squares = np.full((len(found), len(t_s), 2), np.nan)
-    for k, stretch in enumerate(found):
+    squares = np.full((len(stretches), len(t_s), 2), np.nan)
+    for k, stretch in enumerate(stretches):
         own_s = (stretch.truth.t_ns - stretch.truth.t_ns[0]) * 1e-9
         reach = t_s <= own_s[-1]
         for column, error in enumerate(_errors(stretch.truth, stretch[side])):
@@ -100,8 +100,8 @@ def _stretch(trace: Traces, rows: slice) -> Stretch:
     return Stretch(truth, *sides)
 
 
-def _errors(truth: Poses, found: Poses) -> tuple[Float64[np.ndarray, " n"], Float64[np.ndarray, " n"]]:
-    turn, true = (Rotation.from_quat(poses.q_wb_wxyz, scalar_first=True) for poses in (found, truth))
+def _errors(truth: Poses, path: Poses) -> tuple[Float64[np.ndarray, " n"], Float64[np.ndarray, " n"]]:
+    turn, true = (Rotation.from_quat(poses.q_wb_wxyz, scalar_first=True) for poses in (path, truth))
     angle: Float64[np.ndarray, " n"] = np.degrees((true.inv() * turn).magnitude())
-    apart: Float64[np.ndarray, " n"] = np.linalg.norm(found.p_wb - truth.p_wb, axis=1)
+    apart: Float64[np.ndarray, " n"] = np.linalg.norm(path.p_wb - truth.p_wb, axis=1)
     return angle, apart

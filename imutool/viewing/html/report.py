@@ -192,7 +192,7 @@ def _figures(data: RunData, key: str) -> Iterator[str]:
     for name, values in rows:
         yield f"<tr><td>{text(figure_label(name))}</td>{_cells(values, index_of_best(values, name))}</tr>"
     counted = {trace.name: trace.figures for trace in data.traces if trace.figures}
-    samples, seconds = next(((one["samples"], one["duration_s"]) for one in counted.values()), (0, 0.0))
+    samples, seconds = next(((figures["samples"], figures["duration_s"]) for figures in counted.values()), (0, 0.0))
     yield f'</tbody></table></div><p class="note">Root mean squares over {samples:,} samples in {format_number(seconds)} s '
     yield "from the true start, and means over stretches of the true path; the best in bold.</p></section>"
 
@@ -219,8 +219,8 @@ def _windows(data: RunData) -> Iterator[str]:
     yield f'<div class="scroll"><table class="numeric"><thead><tr>{head}</tr></thead><tbody>'
     for name, unit in quantities:
         for length in lengths:
-            found = [next((w for w in trace.windows if w.length_s == length), None) for trace in runs]
-            values = [None if one is None else float(getattr(one, name)) for one in found]
+            windows = [next((w for w in trace.windows if w.length_s == length), None) for trace in runs]
+            values = [None if window is None else float(getattr(window, name)) for window in windows]
             values = [value if value is not None and np.isfinite(value) else None for value in values]
             words = f"{name.split('_')[0].capitalize()} after {length:g} s ({unit})"
             yield f"<tr><td>{words}</td>{_cells(values, index_of_best(values, name))}</tr>"
@@ -232,13 +232,13 @@ def _compared(logs: Sequence[RunData]) -> Iterator[str]:
     """Table with one row for every run of every log."""
     head = ("Log", "Run", "Seconds", "Orientation error (°)", "Position error (m)", "Velocity error (m/s)", "Largest (°)")
     yield '<div class="scroll"><table class="numeric"><thead><tr>'
-    yield "".join(f"<th{' class=word' * (one == 'Run')}>{one}</th>" for one in head) + "</tr></thead><tbody>"
+    yield "".join(f"<th{' class=word' * (title == 'Run')}>{title}</th>" for title in head) + "</tr></thead><tbody>"
     for k, data in enumerate(logs, start=1):
         chosen = best_run(data)
         for trace in data.traces:
-            found = worst_orientation_error(trace, data)
+            worst = worst_orientation_error(trace, data)
             values = [trace.figures.get(name) for name in ("aoe_deg", "ape_m", "velocity_rmse_m_s")]
-            cells = _cells([*values, None if found is None else found[0]], 0 if trace is chosen else None)
+            cells = _cells([*values, None if worst is None else worst[0]], 0 if trace is chosen else None)
             name = f'<td><a href="#log{k}">{text(data.name)}</a></td><td class=word>{text(trace.name)}</td>'
             yield f"<tr>{name}<td class=number>{format_number(data.duration_s)}</td>{cells}</tr>"
     yield "</tbody></table></div>"

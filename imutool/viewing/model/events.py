@@ -49,21 +49,19 @@ class Event:
 
 
 def survey_events(survey: Survey) -> tuple[list[Event], list[str]]:
-    """Events from a cleaning survey, and notes on findings without times or with too many.
-    kept.
-    """
-    found, notes = [], []
+    """Events from a cleaning survey, and notes on findings without times or with too many."""
+    events, notes = [], []
     for finding in survey.findings:
         kind = KIND_OF_RULE.get(finding.rule)
         if kind is None or not finding.intervals_ns:
-            notes.append(f"{finding.what}.")
+            notes.append(f"{finding.what[0].upper()}{finding.what[1:]}.")
             continue
         for start_ns, end_ns in finding.intervals_ns:
             length = f" for {(end_ns - start_ns) * 1e-9:.3g} s" if end_ns > start_ns else ""
-            found.append(Event(kind, start_ns, end_ns, f"{finding.what}{length} ({finding.count} in the log)"))
+            events.append(Event(kind, start_ns, end_ns, f"{finding.what}{length} ({finding.count} in the log)"))
         if finding.intervals_left_out:
-            notes.append(f"{finding.what}: {finding.intervals_left_out} more intervals are not listed as events.")
-    return found, notes
+            notes.append(f"{finding.intervals_left_out} more intervals of {finding.what} are not listed as events.")
+    return events, notes
 
 
 def stop_events(imu: Imu) -> list[Event]:
@@ -101,7 +99,8 @@ def events_within(events: Iterable[Event], start_ns: int, end_ns: int) -> tuple[
         if len(inside) > len(longest):
             notes.append(f"Events of kind {named}: the {len(longest)} longest are shown, {len(inside) - len(longest)} are not.")
         kept += (
-            Event(kind, max(one.start_ns, start_ns), min(one.end_ns, end_ns), one.text[:MAX_TEXT_LENGTH]) for one in longest
+            Event(kind, max(event.start_ns, start_ns), min(event.end_ns, end_ns), event.text[:MAX_TEXT_LENGTH])
+            for event in longest
         )
     return tuple(sorted(kept, key=lambda event: (event.start_ns, event.end_ns))), tuple(notes)
 
@@ -146,22 +145,24 @@ def finding_events(folder: Path, log: str, start_ns: int, end_ns: int) -> tuple[
         ConfigError: the folder holds no diagnosis, or it cannot be read.
         DataError: its findings.json is not one.
     """
-    found = _read(folder / FINDINGS)
-    first = found.real[0] if found.real else "no log"
-    here = [place for place in found.located if Path(place.log or first).name == log]
+    diagnosis = _read(folder / FINDINGS)
+    first = diagnosis.real[0] if diagnosis.real else "no log"
+    here = [place for place in diagnosis.located if Path(place.log or first).name == log]
     if Path(first).name != log and not here:
         return [], [f"The findings of {folder.name} are on the clock of {Path(first).name} and are not marked in {log}."]
     events, notes = [], []
     for place in here:
-        text = _words(place, found.findings)
-        longest = sorted(place.intervals_s, key=lambda one: one[0] - one[1])
+        text = _words(place, diagnosis.findings)
+        longest = sorted(place.intervals_s, key=lambda interval: interval[0] - interval[1])
         if len(longest) > MAX_EVENTS_PER_KIND:
             notes.append(f"{text}: {len(longest) - MAX_EVENTS_PER_KIND} shorter stretches are not marked.")
         for first_s, last_s in longest[:MAX_EVENTS_PER_KIND] or [(0.0, (end_ns - start_ns) * 1e-9)]:
             low, high = sorted((start_ns + nanoseconds(first_s), start_ns + nanoseconds(last_s)))
             events.append(Event("finding", low, high, text))
-    unplaced = found.findings if not found.located else []
-    notes += [f"Diagnosis: {one.effect} on {one.signal}, at no time of its own." for one in unplaced[:MAX_EVENTS_PER_KIND]]
+    unplaced = diagnosis.findings if not diagnosis.located else []
+    notes += [
+        f"Diagnosis: {finding.effect} on {finding.signal}, at no time of its own." for finding in unplaced[:MAX_EVENTS_PER_KIND]
+    ]
     return events, notes
 
 
@@ -169,8 +170,11 @@ def _words(place: _Located, findings: list[_Finding]) -> str:
     """Signal, axes, regime and share, and the strongest effects found on that signal."""
     what = f"{place.signal} {', '.join(place.axes)}".strip()
     share = "" if place.share is None else f", {100.0 * place.share:.0f} % of its misfit"
-    of_signal = [one for one in findings if place.signal in one.signal or one.signal in ("both", "imu")]
-    effects = [f"{one.effect} ({one.driver})" if one.driver else one.effect for one in of_signal[:MAX_NAMED_EFFECTS]]
+    of_signal = [finding for finding in findings if place.signal in finding.signal or finding.signal in ("both", "imu")]
+    effects = [
+        f"{finding.effect} ({finding.driver})" if finding.driver else finding.effect
+        for finding in of_signal[:MAX_NAMED_EFFECTS]
+    ]
     because = f": {', '.join(effects)}" if effects else ""
     return f"{what}{f', {place.regime}' if place.regime else ''}{share}{because}"
 

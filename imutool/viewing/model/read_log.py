@@ -66,11 +66,11 @@ def read_log(path: Location, *, imu: str | None = None, truth: str | None = None
     """
     notes: list[str] = []
     try:
-        found = _read(Log(path), imu, truth, notes)
+        contents = _read(Log(path), imu, truth, notes)
     except LogError:  # reading with recovery is slower; an error that is not damage comes again
         notes.clear()
-        found = _read(RecoveredLog(path), imu, truth, notes)
-    topic, derived, batches, biases_by_topic, rest, metadata = found
+        contents = _read(RecoveredLog(path), imu, truth, notes)
+    topic, derived, batches, biases_by_topic, rest, metadata = contents
     where = f"{path} {topic}"
     survey = examine(lambda: batches[topic], _true(rest), CleaningSettings(), where=str(path), topic=topic)
     samples, logged, why = _sound_samples(batches[topic], survey, where)
@@ -79,14 +79,14 @@ def read_log(path: Location, *, imu: str | None = None, truth: str | None = None
         notes.append(f"{topic} cannot be shown as it was recorded ({why}); as by debias --clean, {left}.")
     if survey.reasons:
         notes.append(f"{topic} cannot be trusted: {'; '.join(survey.reasons)}.")
-    model = _model(metadata, topic)
+    model, start = _model_and_start(metadata, topic)
     debiased = []
     for name in derived:
         run = _run(name, model, samples, batches[name], biases_by_topic)
         if run is None:
             notes.append(f"{name} is left out: its samples are not those of {topic}.")
         else:
-            debiased.append(run)
+            debiased.append(replace(run, start=start))
     return LogContents(replace(rest, imu=samples), logged, tuple(debiased), survey, metadata, tuple(notes))
 
 
@@ -96,8 +96,8 @@ def _read(opened: Log, imu: str | None, truth: str | None, notes: list[str]) -> 
 
     with opened as log:
         topic = log.only_imu() if imu is None else log.topic(imu, (schemas.IMU,)).name
-        derived = [one.name for one in log.with_schema((schemas.IMU,)) if one.metadata.get(DERIVED_KEY) == topic]
-        biases = [one.name for one in log.with_schema((schemas.TWIST,)) if one.metadata.get(DERIVED_KEY) == topic]
+        derived = [channel.name for channel in log.with_schema((schemas.IMU,)) if channel.metadata.get(DERIVED_KEY) == topic]
+        biases = [channel.name for channel in log.with_schema((schemas.TWIST,)) if channel.metadata.get(DERIVED_KEY) == topic]
         batches, biases_by_topic = _messages(log, [topic, *derived], biases)
         rest = read_recording(
             log, imu=topic, truth=truth, samples=NO_SAMPLES, derived=False, refused=None if truth else refused
@@ -153,11 +153,11 @@ def _columns(batches: Sequence[ImuBatch]) -> tuple[Imu, LogTimes]:
     return Imu(stamp_ns, gyro, accel), LogTimes(stamp_ns, log_ns)
 
 
-def _model(metadata: Sequence[tuple[str, Mapping[str, str]]], topic: str) -> str:
-    """Model that `debias` recorded last for this IMU; empty where it recorded none."""
+def _model_and_start(metadata: Sequence[tuple[str, Mapping[str, str]]], topic: str) -> tuple[str, str]:
+    """Model and `init` that `debias` recorded last for this IMU; empty where it recorded none."""
     ours = [values for name, values in metadata if name.startswith("imutool") and values.get("model")]
-    named = [values["model"] for values in ours if values.get("source_topic", topic) == topic]
-    return named[-1] if named else ""
+    named = [values for values in ours if values.get("source_topic", topic) == topic]
+    return (named[-1]["model"], named[-1].get("init", "")) if named else ("", "")
 
 
 def _run(

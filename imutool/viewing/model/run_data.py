@@ -1,4 +1,4 @@
-"""Data of a view: runs, traces with errors and spectra, events and notes."""
+"""Data of a view: runs, traces with errors and spectra, events; decimated for drawing."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from types import MappingProxyType
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Float64, Int64
 from scipy.signal import welch
 from scipy.spatial.transform import Rotation
 
@@ -23,6 +23,7 @@ from imutool.viewing.model.trajectory_error import Alignment, Drift, Errors, Win
 RAW = "raw"
 TRUTH = "truth"  # label of the truth; no run may have this name
 LEVELLING_S = 0.5  # without truth, the mean specific force of this time gives the vertical
+HIDDEN_FIGURES = ("aoe_aligned_deg",)  # aligned positions say nothing about the attitude of a path that drifts by metres
 TRUE_BIAS = {"gyro": "/ground_truth/bias/gyro", "accel": "/ground_truth/bias/accel"}
 
 
@@ -30,7 +31,8 @@ TRUE_BIAS = {"gyro": "/ground_truth/bias/gyro", "accel": "/ground_truth/bias/acc
 class Run:
     """IMU samples, raw or corrected by a model, with the subtracted bias (zeros for raw).
 
-    `bias_std` is one standard deviation of the bias, gyro (rad/s) then accel (m/s²), where the model states it.
+    `bias_std` is one standard deviation of the bias, gyro (rad/s) then accel (m/s²), where the model states it. `start` is the
+    method of the initial bias (`init`), where it is known.
     """
 
     name: str
@@ -38,6 +40,7 @@ class Run:
     gyro_bias: Float64[np.ndarray, "n 3"]
     accel_bias: Float64[np.ndarray, "n 3"]
     bias_std: Float64[np.ndarray, "n 6"] | None = None
+    start: str = ""
 
     def __post_init__(self) -> None:
         for name in ("gyro_bias", "accel_bias", "bias_std"):
@@ -132,7 +135,7 @@ class RunData:
     def table(self) -> list[tuple[str, list[float | None]]]:
         """Figures as rows: a label (`aoe_deg`, `roe_deg 5`) and one value or None per trace."""
         columns = [dict(_numbers(trace.figures)) for trace in self.traces]
-        labels = list(dict.fromkeys(label for column in columns for label in column))
+        labels = dict.fromkeys(label for column in columns for label in column if label not in HIDDEN_FIGURES)
         return [(label, [column.get(label) for column in columns]) for label in labels]
 
     def models(self) -> tuple[Trace, ...]:
@@ -191,9 +194,63 @@ def spectra(imu: Imu) -> Mapping[str, Spectrum]:
         return MappingProxyType({})
     rate_hz = 1.0 / imu.period_s
     length = min(len(imu), max(MIN_SAMPLES, round(WINDOW_S * rate_hz)))
-    found = {}
+    densities = {}
     for kind, values in (("gyro", imu.gyro), ("accel", imu.accel)):
         along = np.ascontiguousarray(values.T)  # twice as fast
         frequency_hz, density = welch(along, rate_hz, nperseg=length, detrend="constant")
-        found[kind] = Spectrum(frequency_hz[1:], density.T[1:])  # without the constant part
-    return MappingProxyType(found)
+        densities[kind] = Spectrum(frequency_hz[1:], density.T[1:])  # without the constant part
+    return MappingProxyType(densities)
+
+
+MAX_CURVE_ROWS = 300_000  # of a curve that is drawn whole (25 minutes at 200 Hz); an hour would take a viewer over 1 GB
+MAX_PATH_ROWS = 20_000  # of a path: a screen has no more pixels along it
+
+Rows = Int64[np.ndarray, " m"]
+
+
+def curve_rows(values: Float64[np.ndarray, "n k"], most: int = MAX_CURVE_ROWS) -> Rows:
+    """Decimate a curve to `most` rows: per bucket the lowest and highest of every column.
+
+    The first and the last row are always drawn, and of a bucket with NaN rows one such row, so that a hole stays a hole.
+    `most` is at least 2 k + 3.
+    """
+    n, columns = values.shape
+    if n <= most:
+        return np.arange(n)
+    buckets = max(1, (most - 2) // (2 * columns + 1))
+    size = -(-n // buckets)
+    starts = np.arange(0, n, size)
+    padded = np.full((columns, len(starts) * size), np.nan)  # by column: contiguous values are searched many times faster
+    padded[:, :n] = values.T
+    cut = padded.reshape(columns, len(starts), size)
+    hole = np.isnan(cut)
+    drawn = np.zeros(padded.shape[1], dtype=bool)
+    drawn[[0, n - 1]] = True
+    for least in (np.where(hole, np.inf, cut).argmin(axis=2), np.where(hole, -np.inf, cut).argmax(axis=2)):
+        drawn[starts + least] = True
+    holes = np.any(hole, axis=0)
+    drawn[(starts + holes.argmax(axis=1))[np.any(holes, axis=1)]] = True
+    rows: Rows = np.flatnonzero(drawn[:n])
+    return rows
+
+
+def path_rows(p_wb: Float64[np.ndarray, "n 3"], most: int = MAX_PATH_ROWS) -> Rows:
+    """Decimate a path to at most `most` rows: half even in time, half even along the path.
+
+    A row left out follows a drawn one by less than 2 / (most - 2) of the path's length and of its rows: a fast part keeps its
+    shape, and so does a small part of a path that left for kilometres. The first and the last row are always drawn.
+    """
+    n = len(p_wb)
+    if n <= most:
+        return np.arange(n)
+    travelled = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(p_wb, axis=0), axis=1))])
+    half = most // 2
+    along = np.searchsorted(travelled, np.linspace(0.0, travelled[-1], half))
+    rows: Rows = np.unique(np.concatenate([np.linspace(0, n - 1, most - half).round().astype(np.int64), along]))
+    return rows
+
+
+def round_up_125(highest: float) -> float:
+    """Next number of the form 1, 2 or 5 times a power of ten, as the end of a scale."""
+    decade = 10.0 ** np.floor(np.log10(highest)) if highest > 0.0 else 1.0
+    return float(next(step for step in (1.0, 2.0, 5.0, 10.0) if step * decade >= highest * (1.0 - 1e-9)) * decade)

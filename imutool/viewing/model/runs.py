@@ -20,10 +20,19 @@ from imutool.inertial.metrics import evaluate
 from imutool.inertial.strapdown import StartPose, dead_reckon, stretch_with_truth, with_velocity
 from imutool.location import Location
 from imutool.recording import Imu, Poses, Recording, Scalars, seconds
-from imutool.viewing.model.decimate import MAX_CURVE_ROWS
 from imutool.viewing.model.events import Event, events_within, finding_events, stop_events, survey_events, worst_error_events
 from imutool.viewing.model.read_log import read_log
-from imutool.viewing.model.run_data import LEVELLING_S, TRUE_BIAS, TRUTH, Run, RunData, Trace, level_start, spectra
+from imutool.viewing.model.run_data import (
+    LEVELLING_S,
+    MAX_CURVE_ROWS,
+    TRUE_BIAS,
+    TRUTH,
+    Run,
+    RunData,
+    Trace,
+    level_start,
+    spectra,
+)
 from imutool.viewing.model.trajectory_error import Alignment, aligned, drift_since_reset, errors, windows
 
 
@@ -75,13 +84,15 @@ def _with_models(
     recording: Recording, models: Sequence[str | Path], init: str, log: str, smooth: bool
 ) -> tuple[list[Run], dict[str, str]]:
     """Run of each model, and by its name its file digest, method and start bias."""
+    from imutool.bias_start.bias_from_truth import TRUTH_S
     from imutool.bias_start.correction import apply_with_std
     from imutool.evaluation import started
 
+    method = "smooth" if smooth else f"truth:{TRUTH_S:g}" if init == "truth" else init
     runs, origins = [], {}
     for name, model, start in started(recording, models, init, log, smooth=smooth):
         debiased, std = apply_with_std(model, start, recording.imu)
-        runs.append(Run(name, debiased.imu, debiased.bias[:, :3], debiased.bias[:, 3:], std))
+        runs.append(Run(name, debiased.imu, debiased.bias[:, :3], debiased.bias[:, 3:], std, method))
         digest = model.card.get("sha256")
         origins[name] = f"{f'sha256 {digest}, ' if digest else ''}{model.method}, start: {start.how}"
     return runs, origins
@@ -124,7 +135,9 @@ def build(
             f"heading 0, levelled by the first {LEVELLING_S:g} s of specific force."
         ]
     with_worst = [trace for trace in traces if not trace.is_raw] or traces
-    worst = [one for trace in with_worst if trace.errors is not None for one in worst_error_events(trace.name, trace.errors)]
+    worst = [
+        event for trace in with_worst if trace.errors is not None for event in worst_error_events(trace.name, trace.errors)
+    ]
     shown, of_events = events_within([*events, *stop_events(imu), *worst], start_ns, end_ns)
     return RunData(
         name=recording.name,

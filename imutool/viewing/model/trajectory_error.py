@@ -116,8 +116,8 @@ def aligned(estimate: Poses, truth: Poses, valid: Bool[np.ndarray, " n"], alignm
 def _motion(estimate: Poses, truth: Poses, valid: Bool[np.ndarray, " n"], alignment: Alignment) -> RigidMotion:
     if alignment == "origin":
         row = int(np.argmax(valid))
-        found, true = (Rotation.from_quat(poses.q_wb_wxyz[row], scalar_first=True) for poses in (estimate, truth))
-        return _about(true * found.inv(), estimate.p_wb[row], truth.p_wb[row])
+        start, true = (Rotation.from_quat(poses.q_wb_wxyz[row], scalar_first=True) for poses in (estimate, truth))
+        return _about(true * start.inv(), estimate.p_wb[row], truth.p_wb[row])
     p, p_true = estimate.p_wb[valid], truth.p_wb[valid]
     centre, centre_true = p.mean(axis=0), p_true.mean(axis=0)
     if alignment == "yaw":
@@ -146,23 +146,23 @@ def drift_since_reset(path: Poses, truth: Poses, valid: Bool[np.ndarray, " n"], 
     turn_of = (path.t_ns[known] - path.t_ns[0]) // nanoseconds(reset_s)
     resets = np.diff(turn_of, prepend=-1) > 0
     last_reset = known[resets][np.cumsum(resets) - 1]
-    found = window_drift(path, truth, last_reset, slice(None) if valid.all() else known)
+    drifted = window_drift(path, truth, last_reset, slice(None) if valid.all() else known)
     since_s, *errors = (np.full(len(path), np.nan) for _ in range(4))
     since_s[known] = (path.t_ns[known] - path.t_ns[last_reset]) * 1e-9
-    for column, values in zip(errors, found._replace(orientation_rad=np.rad2deg(found.orientation_rad)), strict=True):
+    for column, values in zip(errors, drifted._replace(orientation_rad=np.rad2deg(drifted.orientation_rad)), strict=True):
         column[known] = values
     return Drift(reset_s, path.t_ns, since_s, *errors)
 
 
 def windows(path: Poses, truth: Poses, valid: Bool[np.ndarray, " n"]) -> tuple[Window, ...]:
     """Drift over windows of each length in `WINDOWS_S` that fits (`strapdown.drift`)."""
-    found = []
+    rows = []
     for length_s in WINDOWS_S:
         ends = drift(path, truth, valid, length_s)
         if count := len(ends.position_m):
             turned_deg = float(np.rad2deg(_rms(ends.orientation_rad)))
-            found.append(Window(length_s, count, turned_deg, _rms(ends.velocity_m_s), _rms(ends.position_m)))
-    return tuple(found)
+            rows.append(Window(length_s, count, turned_deg, _rms(ends.velocity_m_s), _rms(ends.position_m)))
+    return tuple(rows)
 
 
 def _rms(values: Float64[np.ndarray, " n"]) -> float:

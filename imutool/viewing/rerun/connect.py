@@ -12,7 +12,7 @@ from typing import NamedTuple
 from urllib.parse import SplitResult, urlsplit
 
 from imutool.errors import ConfigError
-from imutool.viewing.model.output import Output
+from imutool.viewing import Output
 from imutool.viewing.model.run_data import RunData
 from imutool.viewing.rerun import scene, sdk
 from imutool.viewing.rerun.sdk import FLUSH_S, require_rerun, rerun_version, stream_of_logs

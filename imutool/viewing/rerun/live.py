@@ -20,7 +20,7 @@ from imutool.errors import ConfigError, ImutoolError
 from imutool.inertial.strapdown import StartPose, dead_reckon
 from imutool.mcap_io.storage.target import Target
 from imutool.recording import Imu, Poses
-from imutool.viewing.model.output import Output
+from imutool.viewing import Output
 from imutool.viewing.model.run_data import level_start
 from imutool.viewing.rerun import connect, layout, sdk, viewer
 from imutool.viewing.rerun.connect import Listener

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from imutool.mcap_io.storage.target import Target
-from imutool.viewing.model.output import Output
+from imutool.viewing import Output
 from imutool.viewing.model.run_data import RunData
 from imutool.viewing.rerun import layout
 from imutool.viewing.rerun import source as other_topics

@@ -32,13 +32,13 @@ View = Any  # a view or a container of views
 
 def tabs(data: RunData, scope: Scope, with_source: bool) -> list[View]:
     """Tabs with content, in their order."""
-    found = [_signals(data, scope), _bias(data, scope), _spectrum(data, scope), _errors(data, scope), _events(data, scope)]
-    return [view for view in (*found, _report(scope), _cameras(data, scope) if with_source else None) if view is not None]
+    views = [_signals(data, scope), _bias(data, scope), _spectrum(data, scope), _errors(data, scope), _events(data, scope)]
+    return [view for view in (*views, _report(scope), _cameras(data, scope) if with_source else None) if view is not None]
 
 
 def total_errors(data: RunData, scope: Scope) -> list[View]:
     """Plots of the total errors of every run, with the worst moment of each model."""
-    found = []
+    views = []
     for kind in errors.KINDS:
         scored = [trace for trace in data.traces if trace.errors is not None]
         contents = [sdk.trace_path(data, trace, scope, "error", kind, sdk.role(trace)) for trace in scored]
@@ -48,8 +48,8 @@ def total_errors(data: RunData, scope: Scope) -> list[View]:
             top = "" if limit is None else f", top {limit:.3g}"  # a low plot may have no room for tick labels
             title, key = f"{kind.capitalize()} error ({errors.UNITS[kind]}){top}", _colors(data, _models_first(data))
             key += ", worst pink" if any(not trace.is_raw for trace in scored) else ""
-            found.append(plot(contents, title, key, height=unsigned_range(limit)))
-    return found
+            views.append(plot(contents, title, key, height=unsigned_range(limit)))
+    return views
 
 
 def _colors(data: RunData, of: Sequence[Trace]) -> str:
@@ -63,7 +63,7 @@ def _models_first(data: RunData) -> list[Trace]:
 
 def error_limit(data: RunData, kind: str) -> float | None:
     """Upper limit of the plot of total errors of one kind."""
-    return error_axis_limit(data, _by_run(data, lambda found: errors.total_error(found, kind)))
+    return error_axis_limit(data, _by_run(data, lambda errors_of_run: errors.total_error(errors_of_run, kind)))
 
 
 def _signals(data: RunData, scope: Scope) -> View:
@@ -80,10 +80,10 @@ def _bias(data: RunData, scope: Scope) -> View | None:
     sensors = [kind for kind in signals.KINDS if data.models() or kind in data.true_bias]
     if not sensors:
         return None
-    found = [
+    views = [
         rrb.Vertical(*(_bias_of(data, scope, kind, axis) for axis in range(3)), name=BIAS_TITLES[kind]) for kind in sensors
     ]
-    return rrb.Tabs(*found, active_tab=0, name="Bias")
+    return rrb.Tabs(*views, active_tab=0, name="Bias")
 
 
 def _bias_of(data: RunData, scope: Scope, kind: str, axis: int) -> rrb.TimeSeriesView:

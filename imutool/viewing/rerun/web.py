@@ -16,7 +16,7 @@ from typing import Any
 
 from imutool.errors import ConfigError
 from imutool.recording import nanoseconds
-from imutool.viewing.model.output import Output
+from imutool.viewing import Output
 from imutool.viewing.model.run_data import RunData
 from imutool.viewing.rerun import viewer
 from imutool.viewing.rerun.scene import rrd

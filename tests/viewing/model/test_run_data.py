@@ -6,6 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from imutool.errors import ConfigError, DataError
@@ -15,7 +17,17 @@ from imutool.recording import Imu, Poses, Recording, seconds
 from imutool.sensor.made_up_flight import ACCEL, GYRO, flight
 from imutool.viewing.model import runs as runs_module
 from imutool.viewing.model.events import Event
-from imutool.viewing.model.run_data import RAW, Run, RunData, level_start, split_at_gaps
+from imutool.viewing.model.run_data import (
+    MIN_SAMPLES,
+    RAW,
+    Run,
+    RunData,
+    curve_rows,
+    level_start,
+    path_rows,
+    spectra,
+    split_at_gaps,
+)
 from imutool.viewing.model.runs import build
 from imutool.viewing.model.trajectory_error import Alignment, errors
 
@@ -235,3 +247,113 @@ def test_truth_and_imu_that_never_meet_are_refused(recording: Recording, runs: l
 
 def test_the_settings_of_a_triad_are_all_switched_off_here() -> None:
     assert set(NO_ERROR) == set(ACCEL.__struct_fields__)
+
+
+@settings(max_examples=60, deadline=None)
+@given(n=st.integers(1, 3000), k=st.integers(1, 6), more=st.integers(0, 500), seed=st.integers(0, 2**32 - 1))
+def test_a_thinned_curve_has_every_column_s_extremes_and_its_ends(n: int, k: int, more: int, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    most = 2 * k + 3 + more
+    values = rng.normal(size=(n, k))
+    values[rng.integers(0, n)] = 100.0
+    rows = curve_rows(values, most)
+    assert len(rows) <= max(most, 0)
+    assert (np.diff(rows) > 0).all()
+    assert rows[0] == 0
+    assert rows[-1] == n - 1
+    assert np.array_equal(values[rows].max(axis=0), values.max(axis=0))
+    assert np.array_equal(values[rows].min(axis=0), values.min(axis=0))
+
+
+def test_every_bucket_keeps_its_own_extremes() -> None:
+    n, most = 100_000, 2000
+    values = np.random.default_rng(0).normal(size=(n, 3))
+    rows = curve_rows(values, most)
+    size = -(-n // ((most - 2) // 7))
+    for first in range(0, n, size):
+        inside = rows[(rows >= first) & (rows < first + size)]
+        assert np.array_equal(values[inside].max(axis=0), values[first : first + size].max(axis=0))
+        assert np.array_equal(values[inside].min(axis=0), values[first : first + size].min(axis=0))
+
+
+def test_a_hole_stays_a_hole_and_hides_no_extreme() -> None:
+    values = np.sin(np.linspace(0.0, 50.0, 10_000))[:, None].repeat(2, axis=1)
+    values[5_000:5_003] = np.nan
+    values[7_000:9_000, 1] = np.nan  # one column alone
+    values[4_999] = 9.0
+    rows = curve_rows(values, 500)
+    assert np.isnan(values[rows]).any(axis=1).any()
+    between = rows[(rows >= 5_000) & (rows < 5_003)]
+    assert len(between) == 1
+    assert 4_999 in rows
+    assert np.isnan(values[rows[(rows > 7_100) & (rows < 8_900)], 1]).any()
+    everything = np.full((1000, 1), np.nan)
+    assert np.isnan(everything[curve_rows(everything, 50)]).all()
+
+
+def test_a_short_curve_is_whole() -> None:
+    assert np.array_equal(curve_rows(np.zeros((1000, 3)), 1000), np.arange(1000))
+    assert np.array_equal(path_rows(np.zeros((1000, 3)), 1000), np.arange(1000))
+    assert len(curve_rows(np.zeros((0, 3)))) == 0
+
+
+@pytest.mark.parametrize("most", [10, 101, 1000])
+def test_what_is_left_out_of_a_path_is_near_what_is_drawn_in_time_and_along_it(most: int) -> None:
+    n = 20_000
+    steps = np.random.default_rng(1).normal(size=(n, 3))
+    steps[5_000:9_000] = 0.0  # at rest
+    steps[15_000:15_100] *= 500.0  # and suddenly away
+    p_wb = np.cumsum(steps, axis=0)
+    rows = path_rows(p_wb, most)
+    assert rows[0] == 0
+    assert rows[-1] == n - 1
+    assert len(rows) <= most
+    assert (np.diff(rows) > 0).all()
+    travelled = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(p_wb, axis=0), axis=1))])
+    before = rows[np.searchsorted(rows, np.arange(n), side="right") - 1]
+    share = 2.0 / (most - 2)
+    assert (travelled - travelled[before]).max() <= share * travelled[-1]
+    assert (np.arange(n) - before).max() <= share * n + 1
+
+
+def test_a_path_that_never_moves_is_thinned_too() -> None:
+    rows = path_rows(np.ones((5000, 3)), 100)
+    assert len(rows) <= 100
+    assert {0, 4999} <= set(rows.tolist())
+
+
+RATE_HZ, COUNT = 200.0, 40_000
+SCATTER = 0.1  # of a mean over 800 frequencies of 49 half-overlapping windows: a hundredth, with margin
+
+
+def sampled(gyro: np.ndarray) -> Imu:
+    t_ns = np.arange(len(gyro), dtype=np.int64) * 5_000_000 + 1_700_000_000_000_000_000
+    return Imu(t_ns, gyro, np.tile([0.0, 0.0, 9.81], (len(gyro), 1)))
+
+
+def test_white_noise_has_its_density_at_all_frequencies() -> None:
+    density = 1e-3  # rad/s/sqrt(Hz)
+    noise = np.random.default_rng(1).normal(size=(COUNT, 3)) * density * np.sqrt(RATE_HZ / 2)
+    found = spectra(sampled(noise))["gyro"]
+    assert found.frequency_hz[0] == pytest.approx(0.125)
+    assert found.frequency_hz[-1] == pytest.approx(RATE_HZ / 2)
+    assert found.density.shape == (len(found.frequency_hz), 3)
+    np.testing.assert_allclose(np.sqrt(found.density.mean(axis=0)), density, rtol=SCATTER)
+
+
+def test_a_vibration_is_found_on_its_axis_with_its_power_and_a_constant_nowhere() -> None:
+    t = np.arange(COUNT) / RATE_HZ
+    gyro = np.zeros((COUNT, 3))
+    gyro[:, 1] = 0.3 * np.sin(2 * np.pi * 37.0 * t) + 5.0
+    found = spectra(sampled(gyro))
+    line = found["gyro"]
+    assert line.frequency_hz[line.density[:, 1].argmax()] == pytest.approx(37.0, abs=0.125)
+    power = line.density[:, 1].sum() * np.diff(line.frequency_hz).mean()
+    assert power == pytest.approx(0.3**2 / 2, rel=1e-3)
+    assert line.density[:, [0, 2]].max() < 1e-20
+    assert found["accel"].density.max() < 1e-20
+
+
+def test_a_log_too_short_has_no_spectrum() -> None:
+    assert not spectra(sampled(np.zeros((MIN_SAMPLES - 1, 3))))
+    assert set(spectra(sampled(np.zeros((MIN_SAMPLES, 3))))) == {"gyro", "accel"}

@@ -10,12 +10,11 @@ import numpy as np
 from jaxtyping import Float64, Int64
 
 from imutool.recording import Poses, Times, nanoseconds
-from imutool.viewing.model.decimate import Rows, path_rows
-from imutool.viewing.model.run_data import TRUTH, RunData, Trace, split_at_gaps
+from imutool.viewing.model.run_data import TRUTH, Rows, RunData, Trace, path_rows, round_up_125, split_at_gaps
 from imutool.viewing.model.trajectory_error import Errors
 from imutool.viewing.rerun import sdk
 from imutool.viewing.rerun.entities import styles
-from imutool.viewing.rerun.entities.styles import INK, TRUTH_COLOR, WORST_COLOR, Color, color_of, heat_colors, round_up_125
+from imutool.viewing.rerun.entities.styles import INK, TRUTH_COLOR, WORST_COLOR, Color, color_of, heat_colors
 from imutool.viewing.rerun.sdk import Scope
 
 if TYPE_CHECKING:
@@ -156,8 +155,8 @@ def _log_error_vectors(to: rr.RecordingStream, data: RunData, trace: Trace, erro
     rows = error_rows(trace, errors)
     if not len(rows):
         return
-    found = trace.path.p_wb[rows]
-    strips = np.stack([found - errors.position_m[rows], found], axis=1)
+    estimated = trace.path.p_wb[rows]
+    strips = np.stack([estimated - errors.position_m[rows], estimated], axis=1)
     style = rr.LineStrips3D.from_fields(radii=rr.Radius.ui_points([ERROR_RADIUS]), colors=[WORST_COLOR])
     to.log(entity, style, static=True, strict=True)
     columns = rr.LineStrips3D.columns(strips=strips)

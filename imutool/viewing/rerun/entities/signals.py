@@ -11,8 +11,7 @@ from jaxtyping import Float64
 
 from imutool.recording import Times
 from imutool.units import AXES
-from imutool.viewing.model.decimate import MAX_CURVE_ROWS, curve_rows
-from imutool.viewing.model.run_data import RunData, Trace
+from imutool.viewing.model.run_data import MAX_CURVE_ROWS, RunData, Trace, curve_rows
 from imutool.viewing.rerun import sdk
 from imutool.viewing.rerun.entities import styles
 from imutool.viewing.rerun.entities.styles import BOLD_WIDTH, GRID, INK, RAW_FADE, XYZ, axis_colors, blend_to_grey
@@ -142,9 +141,9 @@ def sensors_with_spectrum(data: RunData) -> list[str]:
 
 def decade_frame(data: RunData, kind: str) -> DecadeFrame:
     """Decades that hold every curve, at most five below the highest: rounding fills the rest."""
-    found = [trace.spectra[kind] for trace in data.traces if kind in trace.spectra]
-    hz = np.concatenate([spectrum.frequency_hz for spectrum in found])
-    root = np.sqrt(np.concatenate([spectrum.density.ravel() for spectrum in found]))
+    spectra = [trace.spectra[kind] for trace in data.traces if kind in trace.spectra]
+    hz = np.concatenate([spectrum.frequency_hz for spectrum in spectra])
+    root = np.sqrt(np.concatenate([spectrum.density.ravel() for spectrum in spectra]))
     root = root[root > 0.0]
     high = int(np.ceil(np.log10(root.max()))) if len(root) else 0
     low = max(int(np.floor(np.log10(root.min()))), high - 5) if len(root) else -1

@@ -1,0 +1,242 @@
+"""Effects of any scalar signal between a simulated number and its recording.
+
+In the order in which they act: low_pass, delay, gain, dead_band, then what is added (offset, drift, friction, a driving
+channel, an unnamed curve), saturation; quantization is seen in the values alone. Dead zone, Coulomb friction and first-order
+lag are those of control textbooks (e.g. Slotine and Li, Applied Nonlinear Control, chapter 5).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float64
+from scipy.signal import lfilter
+
+from imutool.diagnosis.estimation.unnamed_effects import LAGS_S, SplineCurve
+from imutool.diagnosis.signal_alignment import AlignedSignal, IdealSignal, Samples, SignalSamples
+from imutool.sensor.effect import Effect, Kind, Parameter, Stage, Theta
+
+CUTOFFS = (100.0, 30.0, 10.0, 3.0, 1.0, 0.3)  # to start from, over the signal's own mean frequency
+WIDTHS = (0.05, 0.15, 0.4, 0.8)  # of a dead band, over the signal's standard deviation
+REACHED = (0.001, 0.02, 0.1)  # of the samples beyond a limit to start from
+STEEP = 0.002  # of the signal's size, over which a jump is smeared
+MOVED = 0.005  # of the signal's size, by which derivatives move it: more than a jump's width, or they see none or all of it
+LOG_MOVED = 0.02  # of the logarithm of a positive parameter, likewise
+KNOTS, KNOTS_OF_TIME = 7, 15
+BEND = 0.3  # of the signal's size: a second difference between a curve's knots
+
+
+def _effect(
+    name: str,
+    stage: Stage,
+    equation: str,
+    parameters: tuple[Parameter, ...],
+    forward: Callable[..., Any],
+    starts: Sequence[Theta] | None = None,
+    **more: Any,
+) -> Effect:
+    """An effect on the one column; nonlinear, unless it has no starts."""
+    given = None if starts is None else lambda ideal, real: starts
+    return Effect(name, stage, (), equation, parameters, "it varies", forward, starts is None, given, **more)
+
+
+# ── the effects ──
+
+
+def offset(size: float, unit: str) -> Effect:
+    """A constant: part of every fit, and no finding on its own."""
+    numbers = (Parameter("offset", unit, 10.0 * size),)
+    return _effect("offset", Stage.SENSOR, "y += offset", numbers, lambda s, theta: s.but(s.y + theta[0]), [np.zeros(1)])
+
+
+def delay(lag_s: float, step_s: float) -> Effect:
+    """A delay, positive where the recording comes late; `step_s` is the step of its derivative."""
+    starts = [np.zeros(1)] if abs(lag_s) < 1e-9 else [np.zeros(1), np.array([lag_s])]
+    numbers = (Parameter("delay", "s", max(0.2, abs(lag_s)), step=step_s),)
+    return _effect("delay", Stage.CLOCK, "y(t) = x(t - delay)", numbers, lambda taken_s, theta: taken_s - theta[0], starts)
+
+
+def delay_step_s(signal: AlignedSignal) -> float:
+    """A delay that moves the signal by `MOVED` of its size."""
+    return MOVED * float(signal.sampled.x.std()) / float(signal.sampled.dx.std())
+
+
+def named(signal: AlignedSignal) -> Iterator[Effect]:
+    """The catalogue of effects that any signal can have."""
+    unit, size, slope = signal.unit, float(signal.sampled.x.std()), float(signal.sampled.dx.std())
+    yield delay(signal.lag_s, delay_step_s(signal))
+    yield _effect(
+        "low_pass",
+        Stage.BANDWIDTH,
+        "dy/dt = 2 pi f_c (x - y)",
+        (Parameter("f_c", "Hz", 10.0, positive=True, null_value=np.inf, step=LOG_MOVED),),
+        _low_pass,
+        [np.array([times * slope / size / (2.0 * np.pi)]) for times in CUTOFFS],
+    )
+    gain = (Parameter("gain", "-", 0.5, null_value=1.0),)
+    yield _effect("gain", Stage.SENSOR, "y = gain x", gain, lambda s, theta: s.but(theta[0] * s.y), [np.ones(1)])
+    yield from _dead_bands(size, unit)
+    yield from _drifts(signal, size, unit)
+    for variable, of, steep in (("x", "x", STEEP * size), ("dx", "dx/dt", STEEP * slope)):
+        level, text = (Parameter("level", unit, size),), f"y += level sign({of})"
+        yield _effect("friction", Stage.SENSOR, text, level, _Sign(variable, steep), variant=f"of {variable}")
+    yield from _limits(signal.real[:, 0], size, unit)
+
+
+def _low_pass(ideal: IdealSignal, theta: Theta) -> IdealSignal:
+    """First-order lag, exact for straight lines between fine samples.
+
+    The first value holds before the start.
+    """
+    a = 2.0 * np.pi * min(float(theta[0]), 1e3 * ideal.rate_hz) / ideal.rate_hz  # rad a sample
+    e = np.exp(-a)
+    b = [1.0 - (1.0 - e) / a, (1.0 - e) / a - e]
+    first = ideal.fine[0]
+    return replace(ideal, fine=np.asarray(lfilter(b, [1.0, -e], ideal.fine - first) + first))
+
+
+def _dead_bands(size: float, unit: str) -> Iterator[Effect]:
+    width = Parameter("width", unit, size, positive=True, step=LOG_MOVED)
+    numbers = (width, Parameter("center", unit, 0.3 * size, step=MOVED * size))
+    starts = [np.array([width * size, 0.0]) for width in WIDTHS]
+
+    def zone(s: SignalSamples, theta: Theta) -> SignalSamples:
+        from_center = s.y - theta[1]
+        return s.but(np.sign(from_center) * np.maximum(np.abs(from_center) - theta[0], 0.0) + theta[1])
+
+    def jump(s: SignalSamples, theta: Theta) -> SignalSamples:
+        from_center = s.y - theta[1]
+        past = np.clip((np.abs(from_center) - theta[0]) / (STEEP * size) + 0.5, 0.0, 1.0)  # a steep line across the edge
+        return s.but(from_center * past + theta[1])
+
+    text = "y = x - width sign(x) where |x| > width, else 0 (about center)"
+    yield _effect("dead_band", Stage.SENSOR, text, numbers, zone, starts, variant="zone")
+    text = "y = x where |x| > width, else 0 (about center)"
+    yield _effect("dead_band", Stage.SENSOR, text, numbers, jump, starts, variant="jump", jumps=True)
+
+
+def _limits(real: Samples, size: float, unit: str) -> Iterator[Effect]:
+    """Limits above, below, or both: a side that is never reached is no limit."""
+    upper = Parameter("upper", unit, size, null_value=np.inf, step=MOVED * size)
+    lower = Parameter("lower", unit, size, null_value=-np.inf, step=MOVED * size)
+    high, low = ([float(np.quantile(real, out)) for out in outs] for outs in ([1.0 - r for r in REACHED], REACHED))
+
+    def effect(variant: str, text: str, numbers: tuple[Parameter, ...], starts: list[Theta]) -> Effect:
+        def clip(s: SignalSamples, theta: Theta) -> SignalSamples:
+            least, most = theta[-1] if lower in numbers else -np.inf, theta[0] if upper in numbers else np.inf
+            return s.but(np.clip(s.y, least, most))
+
+        return _effect("saturation", Stage.CONVERTER, text, numbers, clip, starts, variant=variant)
+
+    yield effect("upper", "y = min(x, upper)", (upper,), [np.array([x]) for x in high])
+    yield effect("lower", "y = max(x, lower)", (lower,), [np.array([x]) for x in low])
+    both = [np.array(pair) for pair in zip(high, low, strict=True)]
+    yield effect("both", "y = min(max(x, lower), upper)", (upper, lower), both)
+
+
+class _Sign:
+    """+ level, with the sign of the ideal signal or of its derivative."""
+
+    def __init__(self, variable: str, steep: float) -> None:
+        self.variable, self.steep = variable, steep
+
+    def __call__(self, s: SignalSamples, theta: Theta) -> SignalSamples:
+        of = s.dx if self.variable == "dx" else s.x
+        return s.but(s.y + theta[0] * np.clip(of / self.steep, -1.0, 1.0))
+
+
+def _drifts(signal: AlignedSignal, size: float, unit: str) -> Iterator[Effect]:
+    first, last = float(signal.stamp_s[0]), float(signal.stamp_s[-1])
+    middle, length = 0.5 * (first + last), last - first
+    rate = (Parameter("rate", f"{unit}/s" if unit else "1/s", size / length),)
+    yield _effect("drift", Stage.SENSOR, "y += rate t", rate, lambda s, theta: s.but(s.y + theta[0] * (s.stamp_s - middle)))
+    yield _curve("drift", "catalogue", "t", "s", signal.stamp_s, KNOTS, size, unit)
+
+
+# ── unnamed effects ──
+
+
+class SignalCurve(SplineCurve):
+    """Spline curve of one variable, by level, slope and bends about the middle.
+
+    Bends are small, so that ends without data go straight on.
+    """
+
+    def __init__(self, variable: str, unit: str, inner: Float64[np.ndarray, " p"]) -> None:
+        super().__init__(variable, unit, inner)
+        self.count = len(inner) + 2
+
+    @property
+    def plausible(self) -> tuple[float, ...]:
+        """Plausible sizes of level, slope and bends, over the size of the signal."""
+        return (1.0, 2.0 / self.count, *(BEND for _ in range(self.count - 2)))
+
+    def _combined(self, splines: Float64[np.ndarray, "n q"]) -> Float64[np.ndarray, "n q"]:
+        at = np.arange(self.count, dtype=np.float64) - 0.5 * (self.count - 1)
+        bends = [np.maximum(at - at[j], 0.0) if at[j] >= 0 else np.maximum(at[j] - at, 0.0) for j in range(1, self.count - 1)]
+        return np.asarray(splines @ np.stack([np.ones(self.count), at, *bends], axis=1))
+
+    def __call__(self, samples: SignalSamples, theta: Theta) -> SignalSamples:
+        """The signal with the curve on it."""
+        of = {"x": samples.x, "dx/dt": samples.dx, "t": samples.stamp_s}[self.variable]
+        return samples.but(samples.y + self.basis(of) @ theta)
+
+
+def _curve(name: str, kind: Kind, variable: str, of: str, values: Samples, knots: int, size: float, unit: str) -> Effect:
+    curve = SignalCurve(variable, of, np.linspace(values.min(), values.max(), knots - 2))
+    numbers = tuple(Parameter(f"c{j}", unit, share * size) for j, share in enumerate(curve.plausible))
+    text, starts = f"y += curve({variable})", [np.zeros(knots)] if kind == "catalogue" else None
+    return _effect(name, Stage.SENSOR, text, numbers, curve, starts, kind=kind, variable=variable, variant=f"curve({variable})")
+
+
+def unknown(signal: AlignedSignal) -> Iterator[Effect]:
+    """A smooth curve of the simulated signal, of its derivative, of time."""
+    sampled, unit = signal.sampled, signal.unit
+    size = float(sampled.x.std())
+    variables = (
+        ("x", unit, sampled.x, KNOTS),
+        ("dx/dt", f"{unit}/s", sampled.dx, KNOTS),
+        ("t", "s", signal.stamp_s, KNOTS_OF_TIME),
+    )
+    for variable, of, values, knots in variables:
+        if np.ptp(values) > 0:
+            yield _curve("unknown", "unknown", variable, of, values, knots, size, unit)
+
+
+class _Driven:
+    """+ gain times a channel, some time earlier."""
+
+    def __init__(self, channel: str, mean: float) -> None:
+        self.channel, self.mean = channel, mean
+
+    def __call__(self, s: SignalSamples, theta: Theta) -> SignalSamples:
+        t_s, values = s.channels[self.channel]
+        return s.but(s.y + theta[0] * (np.interp(s.stamp_s - theta[1], t_s, values) - self.mean))
+
+
+def driven(signal: AlignedSignal) -> Iterator[Effect]:
+    """Effects driven by each other channel, but for copies of the signal."""
+    size, real = float(signal.sampled.x.std()), signal.real[:, 0]
+    for name, (t_s, values) in sorted(signal.ideal.channels.items()):
+        channel = np.interp(signal.stamp_s, t_s, values)
+        spread = float(channel.std())
+        if (
+            not spread > 1e-12 * max(1.0, float(np.abs(channel).max()))
+            or abs(float(np.corrcoef(channel, real)[0, 1])) > signal.settings.signal.copy_correlation
+        ):
+            continue
+        numbers = (Parameter("gain", f"{signal.unit or '1'} per unit of {name}", size / spread), Parameter("lag", "s", 0.2))
+        yield _effect(
+            "driven",
+            Stage.SENSOR,
+            f"y += gain ({name}(t - lag) - mean)",
+            numbers,
+            _Driven(name, float(channel.mean())),
+            [np.array([0.0, lag]) for lag in LAGS_S],
+            kind="driven",
+            variable=name,
+            variant=name,
+        )

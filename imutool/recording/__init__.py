@@ -1,0 +1,249 @@
+"""Recording of a log in memory: immutable, validated arrays on integer-nanosecond clocks.
+
+All data pass through a `Recording`; files are MCAP, and `read(write(r)) == r` bit for bit. Time is int64 nanoseconds. Only
+`seconds` converts it to float seconds, always relative to a start (float64 seconds at an epoch of 2014 resolve 384 ns only).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field, fields, replace
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float64, Int64
+
+from imutool.errors import DataError
+from imutool.geometry import quaternion
+from imutool.recording.columns import Columns
+
+GRAVITY_M_S2 = 9.81
+UNIT_QUATERNION_TOLERANCE = 1e-6  # six printed decimals, as in the normalised EuRoC truth
+GAP_FACTOR = 4.0  # length of a gap in the truth, in median periods
+MIN_GAP_S = 0.08  # least length of a gap: a 20 Hz truth, and the 70 ms jitter of FETCH, have no gap
+
+Times = Int64[np.ndarray, " n"]
+
+
+def seconds(t_ns: Int64[np.ndarray, "*n"], start_ns: int) -> Float64[np.ndarray, "*n"]:
+    """Seconds since `start_ns`; the subtraction is exact because it uses integers."""
+    return (t_ns - np.int64(start_ns)).astype(np.float64) * 1e-9
+
+
+def nanoseconds(duration_s: float) -> int:
+    """Nanoseconds of a duration, rounded to an integer."""
+    return round(duration_s * 1e9)
+
+
+@dataclass(frozen=True, eq=False)
+class Imu(Columns):
+    """Angular rate (rad/s) and specific force (m/s²) in the body frame b, as measured.
+
+    At rest the specific force is +g up.
+    """
+
+    t_ns: Times
+    gyro: Float64[np.ndarray, "n 3"]
+    accel: Float64[np.ndarray, "n 3"]
+
+    def __post_init__(self) -> None:
+        self.freeze()
+        self.check(gyro=(3,), accel=(3,))
+
+
+@dataclass(frozen=True, eq=False)
+class Poses(Columns):
+    """Poses of the body in the world (m); `q_wb` takes body vectors to world.
+
+    World velocity (m/s) if known.
+    """
+
+    t_ns: Times
+    p_wb: Float64[np.ndarray, "n 3"]
+    q_wb_wxyz: Float64[np.ndarray, "n 4"]
+    v_w: Float64[np.ndarray, "n 3"] | None = None
+
+    def __post_init__(self) -> None:
+        self.freeze()
+        self.check(p_wb=(3,), q_wb_wxyz=(4,), v_w=(3,))
+        error = np.abs(quaternion.length(self.q_wb_wxyz) - 1.0)
+        if len(error) and error.max() > UNIT_QUATERNION_TOLERANCE:
+            row = int(np.argmax(error))
+            raise DataError(f"Poses.q_wb_wxyz row {row} is {self.q_wb_wxyz[row].tolist()}", expected="norm 1")
+
+    def at(self, t_ns: Times, max_gap_s: float | None = None) -> tuple[Poses, Bool[np.ndarray, " n"]]:
+        """Poses interpolated at other times, and a mask of the valid ones.
+
+        Position (and velocity) linearly, orientation by slerp along the shorter arc. The mask is false before the first
+        pose, after the last, and inside a gap longer than `max_gap_s` (by default four median periods, at least
+        80 ms). Masked rows hold the pose of the end or the interpolation across the gap.
+
+        Raises:
+            DataError: fewer than two poses.
+        """
+        gap_s = max(GAP_FACTOR * self.period_s, MIN_GAP_S) if max_gap_s is None else max_gap_s
+        clipped = np.clip(t_ns, self.t_ns[0], self.t_ns[-1])
+        after = np.clip(np.searchsorted(self.t_ns, clipped, side="left"), 1, len(self.t_ns) - 1)
+        exact = self.t_ns[after] == clipped
+        exact_first = self.t_ns[after - 1] == clipped
+        span_ns = self.t_ns[after] - self.t_ns[after - 1]
+        valid = (clipped == t_ns) & ((span_ns <= nanoseconds(gap_s)) | exact | exact_first)
+
+        start = int(self.t_ns[0])
+        knots, wanted = seconds(self.t_ns, start), seconds(clipped, start)
+        share = (clipped - self.t_ns[after - 1]) / span_ns
+        q_wb_wxyz = quaternion.unit(quaternion.slerp(self.q_wb_wxyz[after - 1], self.q_wb_wxyz[after], share))
+        p_wb = _interpolate(wanted, knots, self.p_wb)
+        v_w = None if self.v_w is None else _interpolate(wanted, knots, self.v_w)
+        return Poses(t_ns, p_wb, q_wb_wxyz, v_w), valid
+
+
+@dataclass(frozen=True, eq=False)
+class Scalars(Columns):
+    """Numeric channel on its own clock.
+
+    One column (a temperature) or three (a vector), and its unit.
+    """
+
+    t_ns: Times
+    values: Float64[np.ndarray, "n k"]
+    unit: str = ""
+
+    def __post_init__(self) -> None:
+        self.freeze()
+        self.check(values=self.values.shape[1:])
+        if self.values.ndim != 2 or self.values.shape[1] not in (1, 3):
+            raise DataError(f"Scalars.values is {list(self.values.shape)}", expected="[n, 1] or [n, 3]")
+
+
+@dataclass(frozen=True)
+class Frames:
+    """Camera frames that stay in their source; a writer copies them in the order of the source."""
+
+    format: str
+    count: int
+    each: Callable[[], Iterator[tuple[int, bytes]]]  # (t_ns, bytes of the encoded image)
+
+
+def _mapping(value: Mapping[str, Any]) -> Mapping[str, Any]:
+    """Read-only copy of a mapping and the mappings in it."""
+    return MappingProxyType({k: _mapping(v) if isinstance(v, Mapping) else v for k, v in value.items()})
+
+
+def _dict(value: Any) -> Any:
+    return {k: _dict(v) for k, v in value.items()} if isinstance(value, MappingProxyType) else value
+
+
+@dataclass(frozen=True, eq=False)
+class Recording:
+    """Recording of one IMU with its true poses, scalar channels, camera frames and metadata.
+
+    `truths`, `scalars` and `frames` are keyed by topic (`/ground_truth/pose`), `metadata` by record name. Equality ignores
+    frames: the writer copies them byte for byte, which its tests check.
+    """
+
+    name: str
+    imu: Imu
+    truths: Mapping[str, Poses] = field(default_factory=dict)
+    scalars: Mapping[str, Scalars] = field(default_factory=dict)
+    frames: Mapping[str, Frames] = field(default_factory=dict)
+    metadata: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
+    imu_topic: str = "/imu0"
+    source: str = ""
+    other_poses: Mapping[str, str] = field(default_factory=dict)  # kinds of pose topics that are no truth: not read
+
+    def __post_init__(self) -> None:
+        for name in ("other_poses", "truths", "scalars", "frames", "metadata"):
+            object.__setattr__(self, name, _mapping(getattr(self, name)))
+
+    def __eq__(self, other: object) -> bool:
+        if not isinstance(other, Recording):
+            return NotImplemented
+        names = ("name", "imu", "truths", "scalars", "metadata", "imu_topic", "source")
+        return all(getattr(self, n) == getattr(other, n) for n in names)
+
+    __hash__ = None  # type: ignore[assignment]
+
+    def __reduce__(self) -> tuple[object, ...]:
+        """Pickle with plain dicts, because mapping proxies do not pickle (recordings go to worker processes)."""
+        return type(self), tuple(_dict(getattr(self, f.name)) for f in fields(self))
+
+    @property
+    def truth(self) -> Poses:
+        """First true trajectory.
+
+        Raises:
+            DataError: the recording has none.
+        """
+        if not self.truths:
+            raise self.no_truth("no true poses")
+        return next(iter(self.truths.values()))
+
+    def no_truth(self, what: str, expected: str = "a pose topic in the log") -> DataError:
+        """Error of a recording without truth; it names the poses that are an estimate or odometry."""
+        if not self.other_poses:
+            return DataError(what, where=self.name, expected=expected)
+        listed = ", ".join(f"{topic} ({kind})" for topic, kind in self.other_poses.items())
+        return DataError(
+            f"{what}: the poses are {listed}",
+            where=self.name,
+            expected=expected,
+            fix="Take one of them all the same with `truth`",
+        )
+
+    def with_truth(self, topic: str) -> Recording:
+        """Recording with only one of its true trajectories.
+
+        Raises:
+            DataError: no such topic; the message lists the available ones.
+        """
+        if topic not in self.truths:
+            raise DataError(
+                f"no true poses on {topic}", where=self.name, expected=f"one of {', '.join(self.truths) or '(none)'}"
+            )
+        return replace(self, truths={topic: self.truths[topic]})
+
+    def between(self, start_ns: int, end_ns: int) -> Recording:
+        """Recording without frames, cut to `start_ns <= t_ns <= end_ns`."""
+        return replace(
+            self,
+            imu=self.imu.between(start_ns, end_ns),
+            truths={k: v.between(start_ns, end_ns) for k, v in self.truths.items()},
+            scalars={k: v.between(start_ns, end_ns) for k, v in self.scalars.items()},
+            frames={},
+        )
+
+    def overlap(self) -> Recording:
+        """Recording cut to the time that IMU and (first) truth share.
+
+        Raises:
+            DataError: no truth, or the two share less than two samples.
+        """
+        truth, t_ns = self.truth.t_ns, self.imu.t_ns
+        if not len(truth) or not len(t_ns) or truth[0] >= t_ns[-1] or truth[-1] <= t_ns[0]:
+            raise DataError("IMU and true poses share no time", where=self.name, expected="an overlap")
+        cut = self.between(int(max(truth[0], t_ns[0])), int(min(truth[-1], t_ns[-1])))
+        if len(cut.imu) < 2 or len(cut.truth) < 2:
+            raise DataError("IMU and true poses share fewer than two samples", where=self.name, expected="an overlap")
+        return cut
+
+
+def unit_quaternions(q_wxyz: Float64[np.ndarray, "n 4"], tolerance: float = 1e-2) -> Float64[np.ndarray, "n 4"]:
+    """Unit quaternions; rows that already are unit (to 1e-9) keep every bit.
+
+    Raises:
+        DataError: a norm differs from one by more than `tolerance`; the message names the row.
+    """
+    norm = np.linalg.norm(q_wxyz, axis=1)
+    bad = ~(np.abs(norm - 1.0) <= tolerance)
+    if bad.any():
+        row = int(np.argmax(bad))
+        raise DataError(f"quaternion {q_wxyz[row].tolist()} in row {row} has norm {norm[row]:.6g}", expected="norm 1")
+    return np.where(np.abs(norm - 1.0)[:, None] <= 1e-9, q_wxyz, q_wxyz / norm[:, None])
+
+
+def _interpolate(
+    t: Float64[np.ndarray, " n"], knots: Float64[np.ndarray, " m"], values: Float64[np.ndarray, "m k"]
+) -> Float64[np.ndarray, "n k"]:
+    return np.stack([np.interp(t, knots, column) for column in values.T], axis=1)

@@ -1,0 +1,128 @@
+"""Columns of numpy arrays on one clock: immutable, validated, compared bit for bit.
+
+Base class of the array types of `imutool.recording`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import fields, replace
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Int64
+
+from imutool.errors import DataError
+
+
+class Columns:
+    """Base of frozen dataclasses of arrays with one row per stamp; slices by row or by time."""
+
+    t_ns: Int64[np.ndarray, " n"]
+
+    def freeze(self) -> None:
+        """Make every array contiguous and read-only; a copy only where it is not already."""
+        for column in fields(self):  # type: ignore[arg-type]
+            value = getattr(self, column.name)
+            if isinstance(value, np.ndarray):
+                if not (value.flags.c_contiguous and _is_immutable(value)):
+                    value = np.array(value, order="C")
+                    value.flags.writeable = False
+                object.__setattr__(self, column.name, value)
+
+    def check(self, **shapes: tuple[int, ...]) -> None:
+        """Check types, lengths, finite values and strictly increasing time.
+
+        Raises:
+            DataError: a check fails; the message names the row.
+        """
+        kind = type(self).__name__
+        if self.t_ns.dtype != np.int64 or self.t_ns.ndim != 1:
+            raise DataError(f"{kind}.t_ns is {self.t_ns.dtype}{list(self.t_ns.shape)}", expected="int64[n]")
+        for name, tail in shapes.items():
+            value = getattr(self, name)
+            if value is None:
+                continue
+            if value.dtype != np.float64 or value.shape != (len(self.t_ns), *tail):
+                raise DataError(
+                    f"{kind}.{name} is {value.dtype}{list(value.shape)}",
+                    expected=f"float64{[len(self.t_ns), *tail]}",
+                )
+            if not np.isfinite(value).all():
+                row = int(np.argmin(np.isfinite(value).reshape(len(value), -1).all(axis=1)))
+                raise DataError(f"{kind}.{name} row {row} is {value[row].tolist()}", expected="finite numbers")
+        backward = np.flatnonzero(np.diff(self.t_ns) <= 0)
+        if len(backward):
+            row = int(backward[0]) + 1
+            raise DataError(
+                f"{kind} time goes from {self.t_ns[row - 1]} to {self.t_ns[row]} ns at row {row}",
+                expected="strictly increasing stamps",
+            )
+
+    def __len__(self) -> int:
+        return len(self.t_ns)
+
+    def __eq__(self, other: object) -> bool:
+        if type(other) is not type(self):
+            return NotImplemented
+        return all(_same(getattr(self, c.name), getattr(other, c.name)) for c in fields(self))  # type: ignore[arg-type]
+
+    __hash__ = None  # type: ignore[assignment]
+
+    def __reduce__(self) -> tuple[object, ...]:
+        """Pickle through the constructor: it makes the unpickled arrays read-only again."""
+        return type(self), tuple(getattr(self, c.name) for c in fields(self))  # type: ignore[arg-type]
+
+    def rows(self, index: slice | Bool[np.ndarray, " n"]) -> Any:
+        """Columns at some rows."""
+        cut = {
+            c.name: value[index]
+            for c in fields(self)  # type: ignore[arg-type]
+            if isinstance(value := getattr(self, c.name), np.ndarray)
+        }
+        return replace(self, **cut)  # type: ignore[type-var]
+
+    def between(self, start_ns: int, end_ns: int) -> Any:
+        """Rows with `start_ns <= t_ns <= end_ns`."""
+        first, last = np.searchsorted(self.t_ns, start_ns), np.searchsorted(self.t_ns, end_ns, side="right")
+        return self.rows(slice(int(first), int(last)))
+
+    @property
+    def period_s(self) -> float:
+        """Median time between rows.
+
+        Raises:
+            DataError: fewer than two rows.
+        """
+        if len(self.t_ns) < 2:
+            raise DataError(f"{type(self).__name__} has {len(self.t_ns)} rows", expected="at least 2")
+        return float(np.median(np.diff(self.t_ns))) * 1e-9
+
+    @property
+    def duration_s(self) -> float:
+        """Time from the first row to the last."""
+        return float(self.t_ns[-1] - self.t_ns[0]) * 1e-9 if len(self.t_ns) else 0.0
+
+
+def _same(a: object, b: object) -> bool:
+    """Whether two values are equal bit for bit (-0.0 and 0.0 differ, as they do in a file)."""
+    if isinstance(a, np.ndarray) or isinstance(b, np.ndarray):
+        if not (isinstance(a, np.ndarray) and isinstance(b, np.ndarray)):
+            return False
+        return a.dtype == b.dtype and a.shape == b.shape and a.tobytes() == b.tobytes()
+    return bool(a == b)
+
+
+def _is_immutable(array: np.ndarray) -> bool:
+    """Whether an array and the arrays it is a view of are read-only."""
+    owner: object = array
+    while isinstance(owner, np.ndarray):
+        if owner.flags.writeable:
+            return False
+        owner = owner.base
+    return owner is None or isinstance(owner, bytes)
+
+
+def true_ranges(mask: Bool[np.ndarray, " n"]) -> list[tuple[int, int]]:
+    """Index ranges `[first, end)` in which a mask holds."""
+    edges = np.flatnonzero(np.diff(mask.astype(np.int8), prepend=0, append=0))
+    return [(int(a), int(b)) for a, b in edges.reshape(-1, 2)]

@@ -1,0 +1,295 @@
+"""Any number of a log against its simulation: each effect planted is found by name and size, none where none is."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+
+import numpy as np
+import pytest
+
+from imutool.diagnosis.signal_diagnosis import SignalDiagnosis, diagnose_signal
+from imutool.errors import DataError
+from imutool.mcap_io.fields import Fields
+
+START_NS = 1_700_000_000_000_000_000
+RATE_HZ, SIM_HZ, DURATION_S, NOISE = 80.0, 100.0, 60.0, 0.02
+OFFSET = 0.3
+SURE = 4.0  # standard deviations within which the planted value lies: 1 in 16 000 outside, in some thirty checks
+CENTER = 5.0  # of the channel that drives
+
+
+class Motion:
+    """Forty cosines up to 2.5 Hz, of unit size: band-limited, with every derivative and filter known in closed form."""
+
+    def __init__(self, seed: int) -> None:
+        rng = np.random.default_rng(seed)
+        self.f = rng.uniform(0.05, 2.5, 40)
+        a = rng.normal(size=40) / np.sqrt(1.0 + (self.f / 0.7) ** 2)
+        self.a = a / np.sqrt((a**2).sum() / 2.0)
+        self.p = rng.uniform(0.0, 2.0 * np.pi, 40)
+
+    def through(self, t: np.ndarray, response: np.ndarray) -> np.ndarray:
+        """What a linear filter of this complex response at the frequencies makes of it."""
+        phase = 2.0 * np.pi * np.outer(t, self.f) + self.p + np.angle(response)
+        return (self.a * np.abs(response) * np.cos(phase)).sum(1)
+
+    def __call__(self, t: np.ndarray) -> np.ndarray:
+        return self.through(t, np.ones(40, complex))
+
+    def rate(self, t: np.ndarray) -> np.ndarray:
+        return self.through(t, 2j * np.pi * self.f)
+
+    def low(self, t: np.ndarray, f_c: float) -> np.ndarray:
+        return self.through(t, 1.0 / (1.0 + 1j * self.f / f_c))
+
+
+Plant = Callable[[Motion, np.ndarray, np.ndarray], np.ndarray]  # motion, times, a channel of its own
+
+
+def zone(y: np.ndarray, width: float) -> np.ndarray:
+    return np.sign(y) * np.maximum(np.abs(y) - width, 0.0)
+
+
+def fields(t: np.ndarray, values: np.ndarray, shift_s: float = 0.0) -> Fields:
+    return Fields(START_NS + np.round((t + shift_s) * 1e9).astype(np.int64), values)
+
+
+def pair(
+    plant: Plant,
+    seed: int = 0,
+    *,
+    after: Callable[[np.ndarray], np.ndarray] = lambda y: y,
+    rate_hz: float = RATE_HZ,
+    sim_hz: float = SIM_HZ,
+    sim_noise: float = 0.0,
+    clock_s: float = 0.0,
+) -> tuple[Fields, Fields, dict[str, Fields]]:
+    """Recording, simulation, and other channels, of which only `/motor.current` ever drives; `after` acts on the noise too."""
+    x, rng = Motion(seed), np.random.default_rng(1000 + seed)
+    t, t_sim = 3.0 + np.arange(int(DURATION_S * rate_hz)) / rate_hz, np.arange(int((DURATION_S + 6.0) * sim_hz)) / sim_hz
+    current, decoy = Motion(seed + 500)(t), Motion(seed + 700)(t)
+    real = after(plant(x, t, current) + OFFSET + NOISE * rng.normal(size=len(t)))
+    sim = x(t_sim) + sim_noise * rng.normal(size=len(t_sim))
+    others = {"/motor.current": fields(t, CENTER + 2.0 * current), "/decoy.x": fields(t, decoy), "/decoy.ramp": fields(t, t)}
+    return fields(t, real), fields(t_sim, sim, clock_s), others
+
+
+def diagnosed(plant: Plant, seed: int = 0, **options: object) -> SignalDiagnosis:
+    return diagnose_signal(*pair(plant, seed, **options), "/odom.v")  # type: ignore[arg-type]  # the options are pair's own
+
+
+def nothing(x: Motion, t: np.ndarray, current: np.ndarray) -> np.ndarray:
+    return x(t)
+
+
+def jump(y: np.ndarray) -> np.ndarray:
+    return np.where(np.abs(y) > 0.2, y, 0.0)
+
+
+SINGLE: Mapping[str, tuple[Plant, str, dict[str, float]]] = {
+    "gain": (lambda x, t, c: 1.05 * x(t), "gain", {"gain": 1.05}),
+    "reversed": (lambda x, t, c: -x(t), "gain", {"gain": -1.0}),
+    "delay": (lambda x, t, c: x(t - 0.013), "delay", {"delay": 0.013}),
+    "long delay": (lambda x, t, c: x(t - 0.8), "delay", {"delay": 0.8}),
+    "low_pass": (lambda x, t, c: x.low(t, 8.0), "low_pass", {"f_c": 8.0}),
+    "dead zone": (lambda x, t, c: zone(x(t), 0.1), "dead_band", {"width": 0.1, "center": 0.0}),
+    "dead band": (lambda x, t, c: jump(x(t)), "dead_band", {"width": 0.2, "center": 0.0}),
+    "drift": (lambda x, t, c: x(t) + 0.003 * t, "drift", {"rate": 0.003}),
+    "friction": (lambda x, t, c: x(t) + 0.05 * np.sign(x(t)), "friction", {"level": 0.05}),
+    "friction by rate": (lambda x, t, c: x(t) - 0.05 * np.sign(x.rate(t)), "friction", {"level": -0.05}),
+}
+
+
+def within(d: SignalDiagnosis, effect: str, expected: Mapping[str, float]) -> None:
+    """An effect is there, with the planted values within its stated uncertainty, and that is worth something."""
+    (one,) = [f for f in d.findings if f.effect == effect]
+    assert one.signal == "/odom.v"
+    assert one.false_discovery_rate <= 5e-3
+    for name, value in expected.items():
+        estimate = one.parameters[name]
+        assert abs(estimate.value - value) < SURE * estimate.std, (name, estimate)
+        assert estimate.std < 0.1 * max(abs(value), 0.1), (name, estimate)
+
+
+def names(d: SignalDiagnosis) -> set[str]:
+    return {one.effect for one in d.findings}
+
+
+@pytest.mark.parametrize("which", SINGLE)
+def test_a_single_effect_is_found_by_name_and_size(which: str) -> None:
+    plant, effect, expected = SINGLE[which]
+    d = diagnosed(plant)
+    assert names(d) == {effect}
+    within(d, effect, expected)
+    assert d.findings[0].share > 0.9
+    assert d.unexplained.white
+    assert d.closer.rms_after < 1.1 * NOISE
+    assert d.closer.rms_before > 1.2 * NOISE
+    assert [place.signal for place in d.located] == ["/odom.v"]
+
+
+@pytest.mark.parametrize(("rate_hz", "sim_hz"), [(50.0, 200.0), (100.0, 40.0)])
+@pytest.mark.parametrize("which", ["gain", "delay", "dead zone"])
+def test_rates_need_not_be_the_same(which: str, rate_hz: float, sim_hz: float) -> None:
+    plant, effect, expected = SINGLE[which]
+    d = diagnosed(plant, 3, rate_hz=rate_hz, sim_hz=sim_hz)
+    assert names(d) == {effect}
+    within(d, effect, expected)
+
+
+def test_limits_are_found_where_they_are_reached() -> None:
+    both = diagnosed(nothing, after=lambda y: np.clip(y, -1.2, 1.8))
+    assert names(both) == {"saturation"}
+    within(both, "saturation", {"upper": 1.8, "lower": -1.2})
+    one = diagnosed(nothing, after=lambda y: np.minimum(y, 1.5))
+    assert names(one) == {"saturation"}
+    within(one, "saturation", {"upper": 1.5})
+    assert "lower" not in one.findings[0].parameters
+
+
+def test_steps_of_the_values_are_found_unless_the_simulation_has_them_too() -> None:
+    d = diagnosed(nothing, after=lambda y: np.round(y / 0.05) * 0.05)
+    assert names(d) == {"quantization"}
+    within(d, "quantization", {"lsb": 0.05})
+    real, sim, others = pair(nothing, after=lambda y: np.round(y / 0.05) * 0.05)
+    same = diagnose_signal(real, Fields(sim.t_ns, np.round(sim.values / 0.05) * 0.05), others, "/odom.v")
+    assert "quantization" not in names(same)
+
+
+PAIRS: Mapping[str, tuple[Plant, dict[str, dict[str, float]]]] = {
+    "gain and delay": (lambda x, t, c: 1.05 * x(t - 0.013), {"gain": {"gain": 1.05}, "delay": {"delay": 0.013}}),
+    "delay and dead zone": (
+        lambda x, t, c: zone(x(t - 0.013), 0.1),
+        {"delay": {"delay": 0.013}, "dead_band": {"width": 0.1, "center": 0.0}},
+    ),
+    "low pass and drift": (
+        lambda x, t, c: x.low(t, 8.0) + 0.003 * t,
+        {"low_pass": {"f_c": 8.0}, "drift": {"rate": 0.003}},
+    ),
+}
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+@pytest.mark.parametrize("which", PAIRS)
+def test_two_effects_are_told_apart(which: str, seed: int) -> None:
+    plant, planted = PAIRS[which]
+    d = diagnosed(plant, seed)
+    assert names(d) == set(planted)
+    for effect, expected in planted.items():
+        within(d, effect, expected)
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_what_drives_is_named_and_decoys_are_not(seed: int) -> None:
+    d = diagnosed(lambda x, t, c: x(t) + 0.08 * np.interp(t - 0.05, t, c), seed)
+    assert names(d) == {"driven"}
+    assert d.findings[0].driver == "/motor.current"
+    within(d, "driven", {"gain": 0.04, "lag": 0.05})
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("variable", ["x", "dx/dt"])
+def test_what_has_no_name_is_given_none_but_a_curve(variable: str, seed: int) -> None:
+    cubic = variable == "x"
+    d = diagnosed(lambda x, t, c: x(t) + (0.03 * x(t) ** 3 if cubic else 0.002 * x.rate(t) ** 2), seed)
+    assert names(d) == {"unknown"}
+    (one,) = d.findings
+    assert one.curve is not None
+    assert one.curve.variable == variable
+    assert one.share > 0.9
+    x, y = np.array(one.curve.x), np.array(one.curve.y)[:, 0]
+    planted = 0.03 * x**3 if cubic else 0.002 * x**2
+    middle = np.abs(x) < 0.5 * np.abs(x).max()
+    off = (y - planted)[middle]
+    if cubic:
+        assert np.ptp(off) < 0.2 * np.ptp(planted)  # a straight line apart, which is the gain's
+    else:
+        assert off.std() < 0.05 * np.ptp(planted[middle])
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_nothing_is_found_where_only_noise_and_a_constant_differ(seed: int) -> None:
+    d = diagnosed(nothing, seed, sim_noise=NOISE * (seed % 3) / 2.0, sim_hz=(60.0, 100.0, 150.0)[seed % 3])
+    assert d.findings == ()
+    assert d.located == ()
+    assert d.unexplained.white
+    assert abs(d.offset.value - OFFSET) < 0.005
+    assert d.unexplained.rms == pytest.approx(NOISE, rel=0.25)
+
+
+def test_an_offset_alone_is_no_news_but_told() -> None:
+    d = diagnosed(lambda x, t, c: x(t) + 4.0)
+    assert d.findings == ()
+    assert abs(d.offset.value - 4.0 - OFFSET) < SURE * d.offset.std
+
+
+@pytest.mark.parametrize("clock_s", [1234.567, -98_765.4])
+def test_clocks_without_a_common_epoch_are_aligned_and_say_that_a_delay_cannot_be_seen(clock_s: float) -> None:
+    d = diagnosed(lambda x, t, c: 1.05 * x(t - 0.013), clock_s=clock_s)
+    assert names(d) == {"gain"}
+    within(d, "gain", {"gain": 1.05})
+    assert d.not_identifiable == ("/odom.v.delay",)
+    assert "share no epoch" in d.remarks[0]
+
+
+def test_what_serves_as_well_is_listed() -> None:
+    d = diagnosed(lambda x, t, c: x.low(t, 400.0))  # 0.4 ms behind, and nothing else that could be seen
+    (one,) = d.findings
+    assert {one.effect, *one.similar} >= {"delay", "low_pass"}
+
+
+LIMIT = 1.8  # reached in one sample of twenty
+
+
+def test_a_misfit_is_placed_where_it_is() -> None:
+    d = diagnosed(nothing, after=lambda y: np.minimum(y, LIMIT))
+    (place,) = d.located
+    assert "its value above" in place.regime
+    inside = np.zeros(len(d.traces.t_s), bool)
+    for begin, end in place.intervals_s:
+        inside |= (d.traces.t_s >= begin) & (d.traces.t_s < end)
+    clipped = d.traces.real >= LIMIT
+    assert clipped[inside].mean() > 2.0 * clipped.mean()
+    assert (clipped & inside).sum() > 0.9 * clipped.sum()
+
+
+def test_a_copy_of_the_signal_drives_nothing() -> None:
+    real, sim, _ = pair(lambda x, t, c: x(t) + 0.02 * c)
+    copies = {"/odom/filtered.v": Fields(real.t_ns, 0.5 * real.values)}
+    assert "driven" not in names(diagnose_signal(real, sim, copies, "/odom.v"))
+
+
+@pytest.mark.parametrize("which", ["short", "few", "constant recording", "constant simulation", "nan", "apart", "unlike"])
+def test_what_cannot_be_compared_is_refused_with_what_to_do(which: str) -> None:
+    real, sim, others = pair(nothing)
+    if which == "short":
+        real = Fields(real.t_ns[:800], real.values[:800])
+    elif which == "few":
+        real = Fields(real.t_ns[::40], real.values[::40])
+    elif which == "constant recording":
+        real = Fields(real.t_ns, np.full(len(real), 2.5))
+    elif which == "constant simulation":
+        sim = Fields(sim.t_ns, np.zeros(len(sim)))
+    elif which == "nan":
+        real = Fields(real.t_ns, np.where(np.arange(len(real)) == 7, np.nan, real.values))
+    elif which == "apart":  # the last seconds of the one are the first of the other
+        keep = sim.t_ns < real.t_ns[600]
+        sim = Fields(sim.t_ns[keep], sim.values[keep])
+    else:
+        sim = Fields(sim.t_ns, np.random.default_rng(1).normal(size=len(sim)))
+    with pytest.raises(DataError) as raised:
+        diagnose_signal(real, sim, others, "/odom.v")
+    assert raised.value.where == "/odom.v"
+    assert raised.value.fix
+    assert raised.value.expected
+
+
+def test_gaps_of_either_are_left_out() -> None:
+    real, sim, others = pair(SINGLE["gain"][0])
+    t, t_sim = (one.t_ns - real.t_ns[0] for one in (real, sim))
+    keep, there = (t < 20e9) | (t > 23e9), (t_sim < 40e9) | (t_sim > 42e9)
+    d = diagnose_signal(
+        Fields(real.t_ns[keep], real.values[keep]), Fields(sim.t_ns[there], sim.values[there]), others, "/odom.v"
+    )
+    assert names(d) == {"gain"}
+    within(d, "gain", {"gain": 1.05})
