@@ -279,8 +279,7 @@ class LogIndex:
                 break
             if block.counts is None:
                 self._read_definitions(block)
-        missing = used - self.channels.keys()
-        if missing:
+        if missing := used - self.channels.keys():
             raise LogError(f"channel {min(missing)} has messages and no Channel record", expected="a definition")
         for channel in self.channels.values():
             if channel.schema_id and channel.schema_id not in self.schemas:
