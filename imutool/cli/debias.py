@@ -88,7 +88,14 @@ def debias(
             _draw(to_location(target or source), list(report.starts), report_to, overwrite)
         if not json_only:
             say(f"Report: {report_to}")
-    raise typer.Exit(LOST if report.losses else 0)
+    raise typer.Exit(LOST if report.lossy else 0)
+
+
+class StretchEntry(Section, frozen=True):
+    """Beginning of a stretch of samples after a gap or a jump of the clock."""
+
+    start_ns: int
+    step_s: float
 
 
 class DebiasedImu(Section, frozen=True):
@@ -99,6 +106,8 @@ class DebiasedImu(Section, frozen=True):
     gyro_bias: list[float]
     accel_bias: list[float]
     std: list[float]
+    left_out: dict[str, int] | UnsetType = UNSET  # samples that are no measurement, by reason
+    stretches: list[StretchEntry] | UnsetType = UNSET  # each but the first: gaps and jumps of the clock
 
 
 class Verified(Section, frozen=True):
@@ -128,7 +137,13 @@ def _summary(
 ) -> DebiasSummary:
     imus = {
         topic: DebiasedImu(
-            report.models[topic], start.how, start.rest[:3].tolist(), start.rest[3:].tolist(), start.std.tolist()
+            report.models[topic],
+            start.how,
+            start.rest[:3].tolist(),
+            start.rest[3:].tolist(),
+            start.std.tolist(),
+            report.sieves[topic].left_out or UNSET,
+            [StretchEntry(*stretch) for stretch in report.sieves[topic].clock.stretches] or UNSET,
         )
         for topic, start in report.starts.items()
     }

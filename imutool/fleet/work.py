@@ -174,6 +174,9 @@ def _debias(job: _Job) -> dict[str, Any]:
             if finding.severity != "note"
         )
         entries["warnings"] = (*entries.get("warnings", ()), *found)
+    unmeasured = tuple(f"{topic}: {text}" for topic, sieve in report.sieves.items() for text in sieve.warnings())
+    if unmeasured:
+        entries["warnings"] = (*entries.get("warnings", ()), *unmeasured)
     if s.pages:
         entries |= _page(job, list(report.starts), entries.get("warnings", ()))
     return entries
