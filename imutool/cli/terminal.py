@@ -63,7 +63,7 @@ def tell_warning(message: str, word: str = "warning") -> None:
 def tell_losses(losses: Mapping[str, Any]) -> None:
     """Print a log's losses (`mcap_io.recovery.losses.Losses.plain`), one line a stretch."""
     for line in describe(losses):
-        kind, _, rest = line.partition(": ")
+        kind, _, rest = with_flags(line).partition(": ")
         out.print(f"[yellow]{kind}:[/] {plain(rest)}", highlight=False, soft_wrap=True)
 
 

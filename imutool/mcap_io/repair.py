@@ -241,14 +241,14 @@ def _attach_damaged(out: LogWriter, source: Source, loss: Loss) -> None:
 
 
 @contextmanager
-def repaired(source: Location, beside: Location) -> Iterator[tuple[Location, Losses] | None]:
+def repaired(source: Location, beside: Location, max_chunk: int | None = None) -> Iterator[tuple[Location, Losses] | None]:
     """Temporary repaired copy of a damaged log beside another file; None if the log is intact.
 
     Raises:
         ConfigError: the copy cannot be written.
         LogError: nothing in the log can be saved.
     """
-    with RecoveredLog(source) as log:
+    with RecoveredLog(source, max_chunk=max_chunk) as log:
         log.check()
         intact = log.losses.intact
     if intact:
@@ -256,7 +256,7 @@ def repaired(source: Location, beside: Location) -> Iterator[tuple[Location, Los
         return
     copy = beside.with_name(f".{source.name}.{os.getpid()}.{secrets.token_hex(4)}.partial")
     try:
-        yield copy, repair(source, copy).losses
+        yield copy, repair(source, copy, max_chunk=max_chunk).losses
     except ImutoolError as error:  # the user does not know the copy
         where = None if error.where is None else str(error.where).replace(str(copy), str(source))
         raise type(error)(error.what, where=where, expected=error.expected, fix=error.fix) from error

@@ -24,7 +24,7 @@ Messages = list[tuple[str, str, int, int, int, bytes]]
 Foreign = Callable[..., Path]
 by_mcap, stretches = log_damage.by_mcap, log_damage.stretches
 
-# Messages that the CRCs of each file's chunks prove (an exhaustive search for such chunks finds no more), and words of the report
+# Messages that the CRCs of each file's chunks prove: an exhaustive search finds no more; and words of the report
 PROVEN = {
     "new_log_over_older": (173, "a summary lists 5 chunks that are not in the file"),
     "index_lengths_wrong": (340, ""),
@@ -84,7 +84,9 @@ def test_an_old_index_never_wins_over_the_records(foreign: Foreign, log: Path, f
     stop = whole[3][1]  # the new recording's last whole chunk
     log.write_bytes(newer[:stop] + raw[stop:])
     found, report = saved(log)
-    theory = [m for _, end, each in whole if end <= stop for m in each] + [m for at, _, each in mine if at >= stop for m in each]
+    theory = [m for _, end, each in whole if end <= stop for m in each] + [
+        m for at, _, each in mine if at >= stop for m in each
+    ]
     assert found == Counter(theory)
     assert report.losses
 
