@@ -206,8 +206,7 @@ def read_run(source: Source, position: int, first: int, limit: int) -> MessageBl
 
 def too_large(what: str, offset: int, size: int, max_chunk: int) -> LogError:
     """Error about a record that is not to come into memory."""
-    where = f"the {what} at byte {offset}"
-    return LogError(f"{where} has {size} bytes", expected=f"at most {max_chunk}", fix="Give a larger `max_chunk`")
+    return LogError(f"the {what} at byte {offset} has {size} bytes", expected=f"at most {max_chunk} (`max_chunk`)")
 
 
 def cut_short(source: Source) -> LogError:

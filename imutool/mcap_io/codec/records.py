@@ -127,9 +127,7 @@ def unpack(record: bytes | memoryview, offset: int, max_chunk: int = MAX_CHUNK) 
     packed = memoryview(record)[head.data_at :]
     where = f"the chunk at byte {offset}"
     if head.size > max_chunk:
-        raise LogError(
-            f"{where} says it unpacks to {head.size} bytes", expected=f"at most {max_chunk}", fix="Give a larger `max_chunk`"
-        )
+        raise LogError(f"{where} says it unpacks to {head.size} bytes", expected=f"at most {max_chunk} (`max_chunk`)")
     if head.compression not in COMPRESSIONS.values():
         raise LogError(f"{where} is compressed with {head.compression!r}", expected="zstd, lz4 or none")
     try:
