@@ -6,6 +6,7 @@ import os
 import signal
 import time
 from pathlib import Path
+from typing import Any
 
 
 def follow(item: tuple[str, str]) -> str:
@@ -26,10 +27,13 @@ def follow(item: tuple[str, str]) -> str:
     return path
 
 
-def end_at_first(item: tuple[int, object]) -> None:
-    """Ends its process at the first item."""
+def end_at_first(item: tuple[int, Any]) -> Any:
+    """Ends its process at the first sequence, and converts the others."""
     if item[0] == 0:
         os._exit(9)
+    from imutool.conversion.workers import convert_numbered
+
+    return convert_numbered(item)
 
 
 def no_worker(item: object) -> object:
