@@ -97,6 +97,7 @@ def convert(
     overwrite: bool = False,
     sensor: str = "",
     kinds: Sequence[str] = (),
+    mapping: str | Path | None = None,
     workers: int | None = None,
     progress: NamedProgress | None = None,
 ) -> ConvertReport:
@@ -112,6 +113,7 @@ def convert(
         overwrite: Replace existing logs.
         sensor: Name of the IMU, where the recording does not state it.
         kinds: What poses are worth, as `TOPIC=truth|estimate|odometry|unknown`.
+        mapping: TOML file that states what the columns of a table mean.
         workers: Processes; by default one per core. A script that uses several needs `if __name__ == "__main__":`.
         progress: Callback with sequences done, sequences in all, and the name of the last one.
 
@@ -139,6 +141,7 @@ def convert(
         overwrite=overwrite,
         sensor=sensor,
         kinds=kinds,
+        mapping=None if mapping is None else local(mapping, "mapping"),
         workers=workers,
         progress=progress,
     )
