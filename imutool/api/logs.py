@@ -147,12 +147,13 @@ def convert(
     )
 
 
-def info(path: LogPath, *, check: bool = True) -> LogInfo:
+def info(path: LogPath, *, check: bool = True, max_chunk: int | None = None) -> LogInfo:
     """Report on a log: topics, rates, gaps, saturation, time at rest, truth coverage, damage.
 
     Args:
         path: MCAP log: a file or a URL.
         check: Compare the CRC of every chunk; otherwise only of chunks with IMU messages.
+        max_chunk: Largest chunk in bytes, packed or unpacked, to read into memory (256 MiB).
 
     Raises:
         ConfigError: The file cannot be opened.
@@ -164,7 +165,7 @@ def info(path: LogPath, *, check: bool = True) -> LogInfo:
         >>> report.imu[0].topic, round(report.imu[0].rate_hz)
         ('/imu0', 200)
     """
-    return inspection.inspect(location(path), check=check)
+    return inspection.inspect(location(path), check=check, max_chunk=max_chunk)
 
 
 def export(
