@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO, ForwardRef, NamedTuple, TypeAlias
 from urllib.parse import urlsplit
 
-from imutool.errors import ConfigError
+from imutool.errors import ConfigError, redact
 
 if TYPE_CHECKING:
     from upath import UPath
@@ -35,6 +35,7 @@ STORES = {
     "memory": CLOUD,
 }
 ACCOUNTS = ("az", "abfs")  # their URLs say CONTAINER@ACCOUNT, which is not secret
+ASSIGNMENT = re.compile(r"[?&#][\w.-]+=")
 BLOCK_BYTES = 4 << 20
 # A scan, the message indexes behind its chunk and the summary each have their block: 7 requests where 6 are the fewest, and
 # the library's own reading ahead made 13 (tests/bench/store.py)
@@ -117,18 +118,14 @@ def _refuse_secrets(scheme: str, text: str) -> None:
             expected="none: URLs are written into reports and logs",
             fix="Give it by the store's environment variables or profile",
         )
-    if scheme.startswith("http") and urlsplit(text).query:
+    parts = urlsplit(text)
+    if (parts.query or parts.fragment) and (scheme.startswith("http") or ASSIGNMENT.search(f"?{parts.query}&{parts.fragment}")):
         raise ConfigError(
-            "a query stands in the URL, which may be a signature",
-            where=text.partition("?")[0],
+            "a query or fragment stands in the URL, which may be a signature",
+            where=redact(text),
             expected="none: URLs are written into reports and logs",
             fix="Give the object by its store's own URL, such as s3://, or fetch it first",
         )
-
-
-def redact(text: str) -> str:
-    """Text without the users, passwords and signatures of the URLs in it."""
-    return re.sub(r"(?i)((?:signature|sig|token|credential)=)[^&\s\"']+", r"\1***", re.sub(r"//[^/\s]*@", "//***@", text))
 
 
 def io_errors(where: Location) -> type[Exception]:

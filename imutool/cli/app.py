@@ -18,7 +18,7 @@ from typer.models import CommandFunctionType
 from imutool import __version__, registry
 from imutool.cli.parameters import current, error_with_flags, flags, with_flags
 from imutool.cli.terminal import plain, say, tell_error
-from imutool.errors import INTERRUPTED, ConfigError, ImutoolError
+from imutool.errors import INTERRUPTED, ConfigError, ImutoolError, redact
 from imutool.mcap_io.storage import outputs
 from imutool.mcap_io.storage.outputs import OutputFile, check_outputs
 
@@ -33,7 +33,12 @@ class _Commands(TyperGroup):
 
     def invoke(self, ctx: Any) -> Any:
         with caught():
-            result = super().invoke(ctx)
+            try:
+                result = super().invoke(ctx)
+            except Exception as error:  # a wrong command line repeats its words
+                if hasattr(error, "format_message"):
+                    error.message = redact(error.message)  # type: ignore[attr-defined]
+                raise
             sys.stdout.flush()  # at the interpreter's end it would be too late to say anything
         return result
 

@@ -219,8 +219,9 @@ class LogWriter:
             self.target.write(records.build(record))
 
     def metadata(self, name: str, values: Mapping[str, str]) -> None:
-        """Writes a metadata record."""
-        raw = records.build(Metadata(name=name, metadata=dict(values)))
+        """Writes a metadata record; bytes of a file name that are no UTF-8 are written as escapes."""
+        texts = {key: value.encode("utf-8", "backslashreplace").decode() for key, value in values.items()}
+        raw = records.build(Metadata(name=name, metadata=texts))
         self.contents.metadata.append(MetadataIndex(offset=self.target.position, length=len(raw), name=name))
         self.target.write(raw)
 

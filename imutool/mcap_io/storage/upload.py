@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from typing import TYPE_CHECKING, Any
@@ -17,6 +18,7 @@ if TYPE_CHECKING:
 logger = logging.getLogger(__name__)
 
 PART_BYTES = 8 << 20  # one part and its copies are what is in memory
+DELETE_AGAIN_S = (0.1, 0.4)  # waits before a DELETE that failed is sent again
 LARGE_AFTER, LARGE_PART_BYTES = 32 << 30, 64 << 20  # S3 takes 10 000 parts: so they are enough for 400 GiB
 
 
@@ -61,9 +63,23 @@ class Upload:
             self.path.fs.cp_file(self.temporary.path, self.path.path)
         self._check_size(self.path)
         try:
-            self.path.fs.rm_file(self.temporary.path)
+            self._remove()
         except Exception as error:  # the object is in its place, and whole: that is what was asked for  # noqa: BLE001
             logger.warning("%s could not be removed: %s", self.temporary, reason(error))
+
+    def _remove(self) -> None:
+        """Remove the temporary object; try again where the store refuses."""
+        for wait_s in DELETE_AGAIN_S:
+            try:
+                self.temporary.fs.rm_file(self.temporary.path)
+            except FileNotFoundError:
+                return
+            except Exception as error:  # noqa: BLE001  any error of the store
+                logger.info("%s is not removed yet: %s", self.temporary, reason(error))
+                time.sleep(wait_s)
+            else:
+                return
+        self.temporary.fs.rm_file(self.temporary.path)
 
     @contextmanager
     def _no_parts_left(self) -> Iterator[None]:
@@ -101,4 +117,4 @@ class Upload:
         with suppress(Exception):
             self.file.discard()
         with suppress(Exception):  # it is there if the upload was complete, or an answer was lost on its way
-            self.temporary.fs.rm_file(self.temporary.path)
+            self._remove()
