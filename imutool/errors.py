@@ -113,3 +113,10 @@ def redact(text: str) -> str:
     if "://" in text or ":/" in text:
         text = URL_TAIL.sub(r"\1***", URL_LOGIN.sub(r"\1***@", text))
     return SECRET.sub(r"\1***", text) if "=" in text else text
+
+
+def was_interrupted(error: BaseException | None) -> bool:
+    """Whether an error came of Ctrl-C; an interrupted import may raise an ImportError."""
+    while error is not None and not isinstance(error, KeyboardInterrupt):
+        error = error.__cause__ or error.__context__
+    return error is not None

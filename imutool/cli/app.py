@@ -18,7 +18,7 @@ from typer.models import CommandFunctionType
 from imutool import __version__, registry
 from imutool.cli.parameters import current, error_with_flags, flags, with_flags
 from imutool.cli.terminal import plain, say, tell_error
-from imutool.errors import INTERRUPTED, ConfigError, ImutoolError, redact
+from imutool.errors import INTERRUPTED, ConfigError, ImutoolError, redact, was_interrupted
 from imutool.mcap_io.storage import outputs
 from imutool.mcap_io.storage.outputs import OutputFile, check_outputs
 
@@ -60,6 +60,10 @@ def caught() -> Iterator[None]:
             _forget_stdout()
         place = f"{error.filename}: " if error.filename else ""
         _fail(f"{place}{error.strerror or error}. Choose another place or make room.", ConfigError.exit_code)
+    except Exception as error:
+        if was_interrupted(error):
+            _fail(f"interrupted. {NOTHING_LEFT}.", INTERRUPTED)
+        raise
 
 
 @dataclass(frozen=True)

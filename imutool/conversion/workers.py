@@ -5,6 +5,7 @@ from __future__ import annotations
 import multiprocessing
 import os
 import signal
+import time
 from collections.abc import Collection, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
@@ -20,12 +21,14 @@ from imutool import registry
 from imutool.conversion.labels import Labels
 from imutool.conversion.message_writer import write_log
 from imutool.errors import DataError, ImutoolError
+from imutool.mcap_io.storage.local import remove_abandoned
 from imutool.mcap_io.write import write
 from imutool.recording import Recording
 from imutool.recording.message_log import MessageLog
 
 GROUP = "imutool.converters"
 INTERRUPT_EVERY_S = 0.1
+GRACE_S = 1.0  # for a process to remove its partial file
 
 
 @dataclass(frozen=True)
@@ -107,18 +110,21 @@ def _run_in_processes(jobs: Sequence[Job], workers: int) -> Iterator[tuple[int, 
     except BaseException:
         pool.shutdown(wait=False, cancel_futures=True)
         _interrupt(set(multiprocessing.active_children()) - others)
+        for job in jobs:
+            remove_abandoned(job.target)
         raise
     finally:
         pool.shutdown(wait=True, cancel_futures=True)
 
 
 def _interrupt(processes: Collection[BaseProcess]) -> None:
-    """Interrupt processes until all have ended."""
+    """Interrupt processes until all have ended; after a second, kill those that are stuck."""
+    patience = time.monotonic() + GRACE_S
     while alive := [process for process in processes if process.is_alive()]:
         for process in alive:
             if process.pid is not None:
                 with suppress(ProcessLookupError):  # it has just ended by itself
-                    os.kill(process.pid, signal.SIGINT)
+                    os.kill(process.pid, signal.SIGINT if time.monotonic() < patience else signal.SIGKILL)
         alive[0].join(INTERRUPT_EVERY_S)
 
 

@@ -51,7 +51,7 @@ class Upload:
             self.file.close()
             self.etag = self._check_size(self.temporary)
 
-    def publish(self) -> None:
+    def publish(self, *, replace: bool) -> None:
         """Copies the object to its own key, within the store, and removes the temporary one.
 
         Raises:
