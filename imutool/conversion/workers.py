@@ -5,6 +5,7 @@ from __future__ import annotations
 import multiprocessing
 import os
 import signal
+import threading
 import time
 from collections.abc import Collection, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
@@ -158,9 +159,19 @@ def _interrupt_once(_number: int, _frame: FrameType | None) -> None:
 
 @contextmanager
 def _interrupts_held() -> Iterator[None]:
-    """Block interrupts until the end of the block; processes started within inherit this."""
+    """Block interrupts, which processes started within inherit, and put SIGTERM off.
+
+    A process whose parent leaves while it starts would end with a traceback.
+    """
+    put_off: list[int] = []
+    here = threading.current_thread() is threading.main_thread()
+    terminate = signal.signal(signal.SIGTERM, lambda number, _: put_off.append(number)) if here else None
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         yield
     finally:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
+        if here:
+            signal.signal(signal.SIGTERM, terminate)
+        if put_off:
+            signal.raise_signal(signal.SIGTERM)

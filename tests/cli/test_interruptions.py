@@ -165,16 +165,16 @@ IMPORTED_FIRST = ("imutool.cli.parameters", "typer.core", "rich.console", "imuto
 def test_ctrl_c_while_modules_are_imported_is_an_interrupt(tmp_path: Path, command: str, module: str) -> None:
     """Python says on stderr what it has imported."""
     line = [sys.executable, "-X", "importtime", command, "info", "nowhere.mcap"]
-    process = subprocess.Popen(line, cwd=tmp_path, stderr=subprocess.PIPE, text=True)
-    assert process.stderr is not None
     said = ""
-    for text in process.stderr:
-        said += text
-        if text.endswith(f" {module}\n"):
-            process.send_signal(signal.SIGINT)
-            break
-    said += process.stderr.read()
-    assert process.wait(WAIT_S) == INTERRUPTED, said[-500:]
+    with subprocess.Popen(line, cwd=tmp_path, stderr=subprocess.PIPE, text=True) as process:
+        assert process.stderr is not None
+        for text in process.stderr:
+            said += text
+            if text.endswith(f" {module}\n"):
+                process.send_signal(signal.SIGINT)
+                break
+        said += process.stderr.read()
+    assert process.returncode == INTERRUPTED, said[-500:]
     words = [text for text in said.splitlines() if not text.startswith("import time:")]
     assert words[-1].startswith("error: interrupted.")
     assert "Traceback" not in said
