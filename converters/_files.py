@@ -26,6 +26,22 @@ def find_files(source: Path, suffixes: Collection[str], is_mine: Callable[[bytes
     return [Sequence(name(source), source)] if is_mine(head(source)) else []
 
 
+def find_folders(source: Path, is_mine: Callable[[Path], bool]) -> list[Sequence]:
+    """Find folders of one kind: the source itself, or those in it."""
+    if not source.is_dir():
+        return []
+    folder = source.absolute() if ".." not in source.parts else source.resolve()
+    return [Sequence(path.name, path) for path in _folders(folder, DEPTH, is_mine)]
+
+
+def _folders(folder: Path, depth: int, is_mine: Callable[[Path], bool]) -> Iterator[Path]:
+    if is_mine(folder):
+        yield folder
+    elif depth > 0 and not ((folder / ROOT).is_dir() or folder.name == ROOT):
+        for child in sorted(path for path in folder.iterdir() if path.is_dir() and not path.name.startswith(".")):
+            yield from _folders(child, depth - 1, is_mine)
+
+
 def name(path: Path) -> str:
     """Name of a recording: that of its file without the ending."""
     without = stem(path)

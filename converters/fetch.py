@@ -37,6 +37,11 @@ def recognises(sequence: Sequence) -> bool:
     return _asl.float_stamps(Tree(sequence))
 
 
+def is_known(sequence: Sequence) -> bool:
+    """Whether a sequence shows its origin: only FETCH prints its stamps so, and its bags have these topics."""
+    return recognises(sequence)
+
+
 def read_sequence(sequence: Sequence, *, images: bool = True) -> Recording:
     """Recording of one sequence.
 
@@ -44,9 +49,10 @@ def read_sequence(sequence: Sequence, *, images: bool = True) -> Recording:
         DataError: the sequence contradicts its format, with file and line.
         ConfigError: it is a bag and rosbags is not installed.
     """
+    known = is_known(sequence)
     if is_bag(sequence.path):
-        return _bag.recording(sequence, dataset=DATASET, sensor=SENSOR, truths=(), images=images)
-    return _asl.recording(sequence, dataset=DATASET, sensor=SENSOR, truths=TRUTHS, images=images)
+        return _bag.recording(sequence, dataset=DATASET, sensor=SENSOR if known else "", known=known, truths=(), images=images)
+    return _asl.recording(sequence, dataset=DATASET, sensor=SENSOR if known else "", known=known, truths=TRUTHS, images=images)
 
 
 def read(source: Path) -> Iterator[Recording]:

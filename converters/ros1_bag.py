@@ -11,6 +11,7 @@ import heapq
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import NamedTuple
@@ -107,24 +108,27 @@ def _routes(bag: Bag, types: Ros1Types, remarks: Remarks, images: bool) -> dict[
             remarks.notes.append(
                 f"{connection.topic} keeps the encoding of ROS 1: its {connection.kind} is not understood ({reason})"
             )
+        if _inner(connection.record).get(b"latching") == b"1":
+            topic = replace(topic, metadata=(*topic.metadata, ("latching", "1")))
         if by_name.setdefault(topic.name, topic) != topic:
             other = f"{topic.name}/{connection.kind.replace('/', '_')}_{number}"
             remarks.notes.append(f"{topic.name} carries two message types; {connection.kind} is on {other}")
-            topic = MessageTopic(other, *_rest(topic))
+            topic = replace(topic, name=other)
             by_name[other] = topic
         routes[number] = _Route(topic, to_cdr, definition, connection.kind)
     return routes
 
 
-def _rest(topic: MessageTopic) -> tuple[str, str, bytes, str, tuple[tuple[str, str], ...]]:
-    return topic.schema_name, topic.schema_encoding, topic.schema, topic.message_encoding, topic.metadata
-
-
 def _definition(record: bytes) -> str:
     """Text of the message definition in a connection record."""
+    return _inner(record)[b"message_definition"].decode()
+
+
+def _inner(record: bytes) -> dict[bytes, bytes]:
+    """Fields in the data of a connection record."""
     head = records.head(record, 0)
     assert head is not None  # or the scan had refused it
-    return (records.fields(record, head.data_at, len(record)) or {})[b"message_definition"].decode()
+    return records.fields(record, head.data_at, len(record)) or {}
 
 
 def _messages(path: Path, routes: dict[int, _Route], remarks: Remarks) -> Iterator[Message]:

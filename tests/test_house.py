@@ -44,7 +44,7 @@ TIERS = (
     ("cli",),
 )
 LEVEL = {room: level for level, rooms in enumerate(TIERS) for room in rooms}
-FOR_CONVERTERS = {"converters", "errors", "recording", "bag"}
+FOR_CONVERTERS = {"converters", "errors", "geometry", "recording", "bag"}
 
 HEAVY = {"torch", "torchdiffeq", "safetensors", "rerun", "ray", "matplotlib", "rosbags", "fsspec", "upath"}
 HELP_SHARE = 0.4  # of the time `import torch` takes; the command itself takes about a tenth of it

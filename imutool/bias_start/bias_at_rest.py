@@ -26,6 +26,7 @@ from imutool.bias_start.initial_bias import (
     training_source,
 )
 from imutool.errors import DataError
+from imutool.inertial.inertial_filter import LEAST_FORCE_M_S2
 from imutool.inertial.stationary import Blocks, rest_stretches, resting_blocks, white_noise
 from imutool.recording import GRAVITY_M_S2, Imu, nanoseconds
 
@@ -142,6 +143,8 @@ def _combined(start: InitialBias, stretches: Sequence[_RestStretch], first_ns: i
     for stretch in stretches:  # attitude may differ from stop to stop: each shows another direction
         force = stretch.mean[3:] - rest[3:]
         size = float(np.linalg.norm(force))
+        if size < LEAST_FORCE_M_S2:  # no direction, hence nothing along it
+            continue
         up = force / size
         gain = var[3:] * up / (up @ (var[3:] * up) + AT_REST_STD[3] ** 2)
         rest[3:] += gain * (size - GRAVITY_M_S2)

@@ -14,10 +14,10 @@ from imutool.cli.terminal import progress, say, tell_losses, write_json
 from imutool.errors import ConfigError
 from imutool.location import Location, to_location
 from imutool.report import UNSET, Report, Section, UnsetType, json_values
+from imutool.viewing import Output
 
 if TYPE_CHECKING:
     from imutool.debiasing import DebiasReport
-    from imutool.viewing import Output
     from imutool.viewing.rerun.live import Live
 
 MODEL_HELP = (
@@ -88,7 +88,14 @@ def debias(
             _draw(to_location(target or source), list(report.starts), report_to, overwrite)
         if not json_only:
             say(f"Report: {report_to}")
-    raise typer.Exit(LOST if report.losses else 0)
+    raise typer.Exit(LOST if report.lossy else 0)
+
+
+class StretchEntry(Section, frozen=True):
+    """Beginning of a stretch of samples after a gap or a jump of the clock."""
+
+    start_ns: int
+    step_s: float
 
 
 class DebiasedImu(Section, frozen=True):
@@ -99,6 +106,8 @@ class DebiasedImu(Section, frozen=True):
     gyro_bias: list[float]
     accel_bias: list[float]
     std: list[float]
+    left_out: dict[str, int] | UnsetType = UNSET  # samples that are no measurement, by reason
+    stretches: list[StretchEntry] | UnsetType = UNSET  # each but the first: gaps and jumps of the clock
 
 
 class Verified(Section, frozen=True):
@@ -118,7 +127,7 @@ class DebiasSummary(Report, frozen=True, kw_only=True, tag="imutool.debias/1"):
     added: dict[str, int]
     verified: Verified
     losses: dict[str, Any]
-    shown: list[dict[str, str]] | UnsetType = UNSET
+    shown: list[Output] | UnsetType = UNSET
     report: str | UnsetType = UNSET
     clean: list[dict[str, Any]] | UnsetType = UNSET
 
@@ -128,7 +137,13 @@ def _summary(
 ) -> DebiasSummary:
     imus = {
         topic: DebiasedImu(
-            report.models[topic], start.how, start.rest[:3].tolist(), start.rest[3:].tolist(), start.std.tolist()
+            report.models[topic],
+            start.how,
+            start.rest[:3].tolist(),
+            start.rest[3:].tolist(),
+            start.std.tolist(),
+            report.sieves[topic].left_out or UNSET,
+            [StretchEntry(*stretch) for stretch in report.sieves[topic].clock.stretches] or UNSET,
         )
         for topic, start in report.starts.items()
     }
@@ -139,7 +154,7 @@ def _summary(
         added=dict(report.rewrite.added),
         verified=Verified(*report.rewrite.verified),
         losses=report.losses.plain(),
-        shown=UNSET if shown is None else [output.plain() for output in shown],
+        shown=UNSET if shown is None else list(shown),
         report=UNSET if page is None else str(page),
         clean=[json_values(survey.report()) for survey in report.surveys.values()] if clean else UNSET,
     )

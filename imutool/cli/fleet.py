@@ -40,14 +40,15 @@ def _common(
     source: Annotated[str, typer.Argument(metavar="SRC", help="A folder, pattern, log or URL.")],
     target: Annotated[str, typer.Argument(metavar="OUT", help="Folder or URL; every log keeps its path below SRC."), FOLDER],
     *,
-    address: Annotated[str | None, typer.Option(help="Address of a Ray cluster, or auto; by default this machine.")] = None,
+    address: Annotated[
+        str | None, typer.Option(help="Address of a Ray cluster, or auto; by default processes of this machine.")
+    ] = None,
     resume: Annotated[bool, typer.Option("--resume", help=RESUME)] = False,
     recheck: Annotated[bool, typer.Option("--recheck", help="With --resume: read all finished results again.")] = False,
     report: Annotated[str | None, typer.Option(metavar="F.html", help="Write an HTML page about the fleet."), PAGE] = None,
     workers: Annotated[int | None, typer.Option(min=1, help="Number of logs at once; by default one per core.")] = None,
     memory: Annotated[str, typer.Option("--memory-per-task", metavar="SIZE", help="Memory for each log: 800M, 2G.")] = "1G",
     retries: Annotated[int, typer.Option(min=0, help="Number of retries after a worker died.")] = 3,
-    dashboard: Annotated[bool, typer.Option("--dashboard", help="Start the Ray dashboard on 127.0.0.1.")] = False,
     overwrite: Overwrite = False,
     json_to: Json = None,
     verbose: Verbose = False,
@@ -168,24 +169,23 @@ def _run(
     workers: int | None,
     memory: str,
     retries: int,
-    dashboard: bool,
     overwrite: bool,
     json_to: str | None,
     verbose: bool,
     quiet: bool,
 ) -> None:
-    from imutool.fleet.engine import Engine
+    from imutool.fleet.engine import ProcessEngine, RayEngine
     from imutool.fleet.run import run
     from imutool.location import to_location
 
-    size = memory_bytes(memory)
+    limits: dict[str, Any] = {"workers": workers, "memory_bytes": memory_bytes(memory), "retries": retries}
     page = None if report is None else to_location(report)
     with progress(f"Fleet {settings.command}", verbose, quiet) as tell:
         done = run(
             source,
             target,
             settings,
-            lambda: Engine(address, workers=workers, memory_bytes=size, retries=retries, dashboard=dashboard),
+            lambda: ProcessEngine(**limits) if address is None else RayEngine(address, **limits),
             resume=resume,
             overwrite=overwrite,
             recheck=recheck,

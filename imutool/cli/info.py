@@ -145,7 +145,7 @@ def imu_rows(report: LogInfo) -> list[tuple[str, ...]]:
                 rows.append((imu["topic"], f"{name} noise", ", ".join(f"{d:.2e}" for d in density) + f" {unit}/√Hz"))
     for truth in report.truth:
         value = f"{100 * truth.coverage:.1f} % of the IMU, {truth.gaps} gaps, longest {truth.longest_gap_s:.2f} s"
-        rows.append((truth.topic, "covers", value))
+        rows += [(truth.topic, "kind of poses", truth.kind), (truth.topic, "covers", value)]
     return rows
 
 

@@ -170,15 +170,20 @@ def epoch_line(epoch: Epoch) -> tuple[int, int, str]:
     return epoch.step, max(epoch.steps, 1), f"{text}, {minutes}:{seconds:02d} left" if epoch.step else text
 
 
-def figures(results: Sequence[dict[str, Any]]) -> None:
-    """Print evaluation results as tables: over the whole path, and by distance."""
+def figures(results: Sequence[dict[str, Any]], *, aligned: bool = False) -> None:
+    """Print evaluation results as tables: over the whole path, and by distance.
+
+    With `aligned` also the attitude after an alignment of the positions.
+    """
 
     def number(value: float | None) -> str:
         return "–" if value is None else format(value, ".2f")
 
     distances = list(results[0]["roe_deg"])
-    names = ("aoe_deg", "aoe_aligned_deg", "ape_m", "ape_aligned_m", "velocity_rmse_m_s")
-    whole = [("log", "model", "AOE\n°", "aligned\n°", "APE\nm", "aligned\nm", "velocity\nm/s")]
+    columns = {"aoe_deg": "AOE\n°", "aoe_aligned_deg": "aligned\n°", "ape_m": "APE\nm", "ape_aligned_m": "aligned\nm"}
+    columns["velocity_rmse_m_s"] = "velocity\nm/s"
+    names = [name for name in columns if aligned or name != "aoe_aligned_deg"]
+    whole = [("log", "model", *(columns[name] for name in names))]
     roe = [("log", "model", *(f"ROE °\n{d} m" for d in distances))]
     rpe = [("log", "model", *(f"RPE m\n{d} m" for d in distances))]
     for result in results:

@@ -14,6 +14,7 @@ from imutool.cli.terminal import progress, say, write_json
 from imutool.errors import ConfigError
 from imutool.mcap_io.storage import outputs
 from imutool.report import Report
+from imutool.viewing import Output
 
 if TYPE_CHECKING:
     from imutool.viewing.model.trajectory_error import Alignment
@@ -31,7 +32,7 @@ class View(Report, frozen=True, tag="imutool.view/1"):
     """Report of `imutool view`: outputs, and the versions of imutool, Rerun and the viewer."""
 
     logs: list[str]
-    shown: list[dict[str, str]]
+    shown: list[Output]
     imutool: str | None
     rerun: str | None
     viewer: str | None
@@ -83,7 +84,7 @@ def view(
                 tell(done, len(logs), log.name)
                 data.append(read(log))
         shown = outputs.show(data)
-        report = View([str(log) for log in logs], [output.plain() for output in shown], **outputs.versions())
+        report = View([str(log) for log in logs], shown, **outputs.versions())
         if not write_json(report, json_to, overwrite=overwrite):
             for output in shown:
                 say(output.said)

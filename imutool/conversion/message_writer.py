@@ -8,7 +8,7 @@ from __future__ import annotations
 import heapq
 from collections import Counter
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import NamedTuple
 
@@ -99,7 +99,7 @@ class _Stream:
 
     def _define(self, topic: MessageTopic) -> int:
         kind = self._source.kinds.get(topic.name)
-        marked = topic if kind is None else MessageTopic(*_fields(topic), (*topic.metadata, (KIND_KEY, kind)))
+        marked = topic if kind is None else replace(topic, metadata=(*topic.metadata, (KIND_KEY, kind)))
         number = self._channels[topic] = self._log.define(marked)
         name = schemas.canonical(topic.schema_name)
         if name in BULKY:
@@ -130,10 +130,6 @@ class _Stream:
                 yield buffer.pop()
         for topic, number in self._channels.items():
             self.counts[topic.name] += self._sequence[number]
-
-
-def _fields(topic: MessageTopic) -> tuple[str, str, str, bytes, str]:
-    return topic.name, topic.schema_name, topic.schema_encoding, topic.schema, topic.message_encoding
 
 
 def _write_metadata(log: LogWriter, source: MessageLog) -> None:

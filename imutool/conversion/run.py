@@ -1,7 +1,6 @@
 """Conversion of data sets to MCAP: find the sequences, choose a converter, write the logs.
 
 Sequences convert in worker processes, one log a sequence; a sequence that fails is reported and the others go on.
-A script that calls `convert` with several workers needs the usual `if __name__ == "__main__":` (processes are spawned).
 """
 
 from __future__ import annotations

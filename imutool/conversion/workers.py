@@ -2,34 +2,21 @@
 
 from __future__ import annotations
 
-import multiprocessing
-import os
-import signal
-import threading
-import time
-from collections.abc import Collection, Iterator, Sequence
-from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
-from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager, suppress
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
-from itertools import islice
-from multiprocessing.process import BaseProcess
 from pathlib import Path
-from types import FrameType
 from typing import Any
 
 from imutool import registry
 from imutool.conversion.labels import Labels
 from imutool.conversion.message_writer import write_log
+from imutool.conversion.worker_pool import WorkerBugError, WorkerPool
 from imutool.errors import DataError, ImutoolError
-from imutool.mcap_io.storage.local import remove_abandoned
 from imutool.mcap_io.write import write
 from imutool.recording import Recording
 from imutool.recording.message_log import MessageLog
 
 GROUP = "imutool.converters"
-INTERRUPT_EVERY_S = 0.1
-GRACE_S = 1.0  # for a process to remove its partial file
 
 
 @dataclass(frozen=True)
@@ -89,89 +76,18 @@ def write_content(
 
 
 def _run_in_processes(jobs: Sequence[Job], workers: int) -> Iterator[tuple[int, Outcome]]:
-    """Run jobs in processes; on an interrupt, wait until all have removed their partial files."""
-    others = set(multiprocessing.active_children())
-    waiting = iter(enumerate(jobs))
-    running: dict[Future[Outcome], int] = {}
-    pool = ProcessPoolExecutor(workers, mp_context=multiprocessing.get_context("spawn"))
-    try:
-        with _interrupts_held():  # inherited by the processes, which heed interrupts only inside a job
-            running.update({pool.submit(_convert_in_process, job): n for n, job in islice(waiting, workers)})
-        while running:
-            for future in wait(running, return_when=FIRST_COMPLETED).done:
-                number = running.pop(future)
-                yield number, _outcome(future, jobs[number])
-                for following, job in waiting:
-                    try:
-                        running[pool.submit(_convert_in_process, job)] = following
-                    except BrokenProcessPool:  # a process died and took the pool with it: none of the rest can run
-                        yield following, _died(job)
-                        continue
-                    break
-    except BaseException:
-        pool.shutdown(wait=False, cancel_futures=True)
-        _interrupt(set(multiprocessing.active_children()) - others)
-        for job in jobs:
-            remove_abandoned(job.target)
-        raise
-    finally:
-        pool.shutdown(wait=True, cancel_futures=True)
+    """Run jobs in processes; after an interrupt they remove what they have half written."""
+    with WorkerPool(convert_numbered, workers) as pool:
+        for done in pool.run(enumerate(jobs)):
+            number, job = done.item
+            if isinstance(done.error, WorkerBugError):
+                done.error.add_note(done.error.trace)
+                raise done.error
+            why = f"its process died ({done.error}), perhaps for want of memory"
+            died = DataError(why, where=str(job.sequence), fix="Use fewer `workers`")
+            yield number, done.value if done.error is None else Outcome(died)
 
 
-def _interrupt(processes: Collection[BaseProcess]) -> None:
-    """Interrupt processes until all have ended; after a second, kill those that are stuck."""
-    patience = time.monotonic() + GRACE_S
-    while alive := [process for process in processes if process.is_alive()]:
-        for process in alive:
-            if process.pid is not None:
-                with suppress(ProcessLookupError):  # it has just ended by itself
-                    os.kill(process.pid, signal.SIGINT if time.monotonic() < patience else signal.SIGKILL)
-        alive[0].join(INTERRUPT_EVERY_S)
-
-
-def _outcome(future: Future[Outcome], job: Job) -> Outcome:
-    try:
-        return future.result()
-    except BrokenProcessPool:
-        return _died(job)
-
-
-def _died(job: Job) -> Outcome:
-    return Outcome(
-        DataError("its process died, perhaps for want of memory", where=str(job.sequence), fix="Use fewer `workers`")
-    )
-
-
-def _convert_in_process(job: Job) -> Outcome:
-    signal.signal(signal.SIGINT, _interrupt_once)
-    signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
-    try:
-        return _convert_one(job)
-    finally:
-        signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-
-
-def _interrupt_once(_number: int, _frame: FrameType | None) -> None:
-    """Raise KeyboardInterrupt once; ignore further interrupts during the clean-up."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    raise KeyboardInterrupt
-
-
-@contextmanager
-def _interrupts_held() -> Iterator[None]:
-    """Block interrupts, which processes started within inherit, and put SIGTERM off.
-
-    A process whose parent leaves while it starts would end with a traceback.
-    """
-    put_off: list[int] = []
-    here = threading.current_thread() is threading.main_thread()
-    terminate = signal.signal(signal.SIGTERM, lambda number, _: put_off.append(number)) if here else None
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-    try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
-        if here:
-            signal.signal(signal.SIGTERM, terminate)
-        if put_off:
-            signal.raise_signal(signal.SIGTERM)
+def convert_numbered(item: tuple[int, Job]) -> Outcome:
+    """Convert a job with its number, in a worker process."""
+    return _convert_one(item[1])

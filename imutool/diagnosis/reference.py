@@ -104,7 +104,7 @@ def align(real: Recording, sim: Recording | None, truth: str | None, settings: D
         yield with_simulation(real, sim, settings)
         return
     if not real.truths:
-        raise DataError("no simulation and no true poses", where=real.name, expected="`sim`, or poses in the log")
+        raise real.no_truth("no simulation and no true poses", "`sim`, or poses in the log")
     chosen = real if truth is not None else real.with_truth(next(iter(real.truths)))
     motion, least_s = smooth_motion(chosen.truth), settings.alignment.least_s
     parts = [ideal for ideal in motion.ideal_motions(1.0 / real.imu.period_s) if ideal.t_s[-1] - ideal.t_s[0] >= least_s]
@@ -216,6 +216,14 @@ def _runs(loud: np.ndarray, start_s: float, settings: ReferenceSettings) -> list
         else:
             out.append((begin, end))
     return out
+
+
+def reference_caveat(recordings: Sequence[Recording]) -> str:
+    """Caveat on true poses that were estimated with the IMU itself, as their own description says; else empty."""
+    texts = (str(text) for recording in recordings for record in recording.metadata.values() for text in record.values())
+    if any("and IMU measurements" in text for text in texts):
+        return "its poses were estimated with this very IMU, and hide errors of the gyro"
+    return ""
 
 
 # ── without a reference ──

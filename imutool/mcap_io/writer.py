@@ -181,7 +181,7 @@ class LogWriter:
             id=_next(self.contents.channels, "channel"),
             topic=topic.name,
             message_encoding=topic.message_encoding,
-            metadata=({"offered_qos_profiles": QOS} if topic.message_encoding == "cdr" else {}) | dict(topic.metadata),
+            metadata=_described(topic),
             schema_id=self._schema_of(topic),
         )
         self.contents.channels[record.id] = record
@@ -275,6 +275,15 @@ class LogWriter:
         footer.summary_crc = self.target.crc
         self.target.write(records.build(footer)[-4:] + MAGIC)
         self.target.flush()
+
+
+def _described(topic: MessageTopic) -> dict[str, str]:
+    """Channel metadata of a topic, with the quality of service that ROS 2 asks for."""
+    metadata = dict(topic.metadata)
+    if topic.message_encoding != "cdr":
+        return metadata
+    latched = metadata.get("latching") == "1"
+    return {"offered_qos_profiles": QOS.replace("volatile", "transient_local") if latched else QOS} | metadata
 
 
 def _next(taken: Mapping[int, object], what: str) -> int:

@@ -48,7 +48,7 @@ def test_every_form_of_a_sequence_reads_as_the_same_recording(converter, make, f
     assert recording.name == "one"
     assert recording.source == source.name
     assert recording.imu_topic == "/imu0"
-    assert recording.metadata["imutool"]["dataset"] == converter.KEY
+    assert recording.metadata["imutool"]["format"] == converter.KEY
     assert recording.metadata["imutool"]["sequence"] == "one"
     assert recording.imu.t_ns[0] == FIRST_NS
     assert recording.imu.gyro[3].tolist() == [0.1, -0.2, 0.003]
@@ -93,3 +93,11 @@ def test_a_place_without_sequences_has_none(converter, make):
     assert converter.sequences(make.tmp) == []
     assert converter.sequences(make.tmp / "notes.txt") == []
     assert list(converter.read(make.tmp)) == []
+
+
+def test_data_set_and_sensor_are_stated_only_where_the_sequence_shows_them(converter, make):
+    own, fetch = {"euroc": "MH_01_easy", "tum_vi": "dataset-room1"}.get(converter.KEY, "one"), converter.KEY == "fetch"
+    for name, known in ((own, True), ("my_robot", fetch)):
+        (recording,) = converter.read(make.folder(name, make.files(converter.KEY)))
+        stated = recording.metadata["imutool"]
+        assert ("sensor" in stated, stated.get("dataset")) == (known, converter.KEY if known else None)

@@ -100,13 +100,13 @@ def refuse_existing(path: Location, *, overwrite: bool) -> None:
 
 def _check_suffix(output: OutputFile) -> None:
     place = output.where
-    if not output.suffixes or place.suffix.lower() in output.suffixes:
+    if not output.suffixes or place.suffix.lower() in (*output.suffixes, ""):  # a name without a suffix claims nothing
         return
     if isinstance(place, Path) and (is_stream(place) or (output.may_be_folder and place.is_dir())):
         return
     expected = " or ".join(output.suffixes)
     raise UsageError(
-        f"the suffix {place.suffix!r} does not fit what is written" if place.suffix else "the name has no suffix",
+        f"the suffix {place.suffix!r} does not fit what is written",
         where=place,
         expected=expected,
         fix=f"Choose a name for `{output.parameter}` that ends in {output.suffixes[0]}",
