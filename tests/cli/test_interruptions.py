@@ -130,13 +130,13 @@ def test_a_signal_in_the_middle(here: Path, command: str, imutool: Run, name: st
     assert {name: digest for name, digest in digests(here).items() if name in before} == before
 
 
-def group(pid: int) -> list[int]:
-    """Living processes of a group."""
+def session(pid: int) -> list[int]:
+    """Living processes of a session."""
     members = []
     for entry in Path("/proc").iterdir():
         with contextlib.suppress(OSError, ValueError):
             status = (entry / "stat").read_text().rpartition(")")[2].split()
-            if int(status[2]) == pid and status[0] not in "ZX":
+            if int(status[3]) == pid and status[0] not in "ZX":
                 members.append(int(entry.name))
     return members
 
@@ -146,11 +146,11 @@ def test_no_child_is_left_soon_after_sigterm(tmp_path: Path, command: str) -> No
         write_asl(flight(seed, duration_s=30.0), tmp_path / "src" / f"s{seed}")
     process = started(command, ["convert", "src", "out", "--workers", "2"], tmp_path)
     deadline = time.monotonic() + WAIT_S
-    while len(group(process.pid)) < 3 and time.monotonic() < deadline:
+    while len(session(process.pid)) < 3 and time.monotonic() < deadline:
         time.sleep(POLL_S)
     process.terminate()
     began = time.monotonic()
-    while group(process.pid) and time.monotonic() - began < WAIT_S:
+    while session(process.pid) and time.monotonic() - began < WAIT_S:
         time.sleep(POLL_S)
     assert time.monotonic() - began < SOON_S + SLACK_S
     assert "Traceback" not in process.communicate(timeout=WAIT_S)[1]
