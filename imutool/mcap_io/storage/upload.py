@@ -17,8 +17,8 @@ if TYPE_CHECKING:
 
 logger = logging.getLogger(__name__)
 
+DELETE_PAUSES_S = (0.1, 1.0)
 PART_BYTES = 8 << 20  # one part and its copies are what is in memory
-DELETE_AGAIN_S = (0.1, 0.4)  # waits before a DELETE that failed is sent again
 LARGE_AFTER, LARGE_PART_BYTES = 32 << 30, 64 << 20  # S3 takes 10 000 parts: so they are enough for 400 GiB
 
 
@@ -62,24 +62,21 @@ class Upload:
         with self._no_parts_left():
             self.path.fs.cp_file(self.temporary.path, self.path.path)
         self._check_size(self.path)
-        try:
-            self._remove()
-        except Exception as error:  # the object is in its place, and whole: that is what was asked for  # noqa: BLE001
-            logger.warning("%s could not be removed: %s", self.temporary, reason(error))
+        self._remove_temporary()
 
-    def _remove(self) -> None:
-        """Remove the temporary object; try again where the store refuses."""
-        for wait_s in DELETE_AGAIN_S:
+    def _remove_temporary(self) -> None:
+        """Remove the temporary object; a store that fails is asked again."""
+        for pause_s in (*DELETE_PAUSES_S, None):
             try:
-                self.temporary.fs.rm_file(self.temporary.path)
+                return self.temporary.fs.rm_file(self.temporary.path)  # type: ignore[no-any-return]  # None
             except FileNotFoundError:
-                return
-            except Exception as error:  # noqa: BLE001  any error of the store
-                logger.info("%s is not removed yet: %s", self.temporary, reason(error))
-                time.sleep(wait_s)
-            else:
-                return
-        self.temporary.fs.rm_file(self.temporary.path)
+                return None
+            except Exception as error:  # the object is in its place, and whole: that is what was asked for  # noqa: BLE001
+                if pause_s is None:
+                    logger.warning("%s could not be removed: %s", self.temporary, reason(error))
+                else:
+                    time.sleep(pause_s)
+        return None
 
     @contextmanager
     def _no_parts_left(self) -> Iterator[None]:
@@ -117,4 +114,4 @@ class Upload:
         with suppress(Exception):
             self.file.discard()
         with suppress(Exception):  # it is there if the upload was complete, or an answer was lost on its way
-            self._remove()
+            self._remove_temporary()
