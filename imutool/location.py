@@ -15,7 +15,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO, ForwardRef, NamedTuple, TypeAlias
 from urllib.parse import urlsplit
 
-from imutool.errors import ConfigError, redact
+from imutool.errors import ConfigError
+from imutool.errors import redact as redact
 
 if TYPE_CHECKING:
     from upath import UPath
