@@ -15,8 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO, ForwardRef, NamedTuple, TypeAlias
 from urllib.parse import urlsplit
 
-from imutool.errors import ConfigError
-from imutool.errors import redact as redact
+from imutool.errors import ConfigError, redact
 
 if TYPE_CHECKING:
     from upath import UPath
