@@ -192,7 +192,7 @@ class LogWriter:
         """Id of a topic's schema; 0 where the source has none. A type known here may come without its definition."""
         if not topic.schema_name:
             return 0
-        if topic.schema_encoding == "ros2msg" and not topic.schema:
+        if topic.schema_name in schema.TYPE_HASHES and not topic.schema:
             return self._schema(topic.schema_name)
         for known in self.contents.schemas.values():
             if (known.name, known.encoding, known.data) == (topic.schema_name, topic.schema_encoding, topic.schema):
