@@ -185,6 +185,12 @@ def test_a_setting_reaches_the_search(folder: Path, tmp_path: Path) -> None:
     assert json.loads(done.stdout)["findings"] == []
 
 
+def test_a_setting_reaches_the_alignment(folder: Path) -> None:
+    done = run("diagnose", folder / "arm.mcap", "--set", "alignment.least_s=1000", "--quiet")
+    assert done.exit_code == 0, done.output
+    assert "no stretch of 1000 s" in done.stdout
+
+
 @pytest.mark.parametrize("word", ["search.false_discovery=1e-3", "search.false_discovery_rate=2", "band.sigma=none"])
 def test_a_wrong_setting_is_refused(folder: Path, word: str) -> None:
     done = run("diagnose", folder / "arm.mcap", "--set", word)
