@@ -150,9 +150,7 @@ def test_every_parameter_with_a_name_of_a_file_is_an_output_an_input_or_a_word(c
         if not {bool, int, float} & {get_args(parameter.annotation)[0], *get_args(get_args(parameter.annotation)[0])}
     }
     new = {"folder"} if command == "new-converter" else set()
-    assert texts - set(MARKS[command]) - READ - WORDS - new == set(), (
-        "mark an output with `Written`, or list the parameter here"
-    )
+    assert texts - set(MARKS[command]) - READ - WORDS - new == set(), "mark an output with `Written`, or list it here"
 
 
 @pytest.mark.parametrize("command", sorted({name for name, _ in OUTPUTS}))
