@@ -67,6 +67,7 @@ def convert(
         list[str] | None,
         typer.Option(metavar="TOPIC=KIND", help="What poses are worth: truth, estimate, odometry or unknown. Repeatable."),
     ] = None,
+    imu: Annotated[str, typer.Option(metavar="gyro=T,accel=T", help="Two topics that become one IMU.")] = "",
     map_: Annotated[
         Path | None, typer.Option("--map", metavar="F.toml", help="Meaning and units of a table's columns.")
     ] = None,
@@ -91,6 +92,7 @@ def convert(
             sensor=sensor,
             kinds=kind or (),
             mapping=map_,
+            imu=imu,
             workers=workers,
             progress=tell,
         )

@@ -143,7 +143,7 @@ def test_a_diagnosis_stays_where_one_is(diagnosed: tuple[Path, Done]) -> None:
     before = {path.name: path.read_bytes() for path in place.iterdir()}
     said = run("diagnose", place.parent / "arm.mcap", "-o", place)
     assert said.exit_code == ConfigError.exit_code
-    assert "holds a diagnosis already" in said.stderr
+    assert "the target exists" in said.stderr
     assert {path.name: path.read_bytes() for path in place.iterdir()} == before
 
 
