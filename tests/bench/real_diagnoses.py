@@ -315,7 +315,7 @@ class Sensor:
         yield from (f"{name}: no answer ({why})" for name, why in failed.items())
         for effects in self.effects:
             kind = "measured" if effects == EVERY_UNIT else "matrices"
-            if rows := self.measured(kind):
+            if rows := self.effect_sizes(kind):
                 yield consistency_table(rows, published().get(self.data_set) if kind == "matrices" else None)
         gains = {
             f"{log.name}, {told_by}": self._told(f"gain/{name}", log)
@@ -329,12 +329,12 @@ class Sensor:
         """Every value of every sequence."""
         yield f"## {self.data_set}"
         for effects in self.effects:
-            yield values_table(self.measured("measured" if effects == EVERY_UNIT else "matrices"))
+            yield values_table(self.effect_sizes("measured" if effects == EVERY_UNIT else "matrices"))
         for log in self.logs:
             if log.name in OTHER_TRUTH and (self._fixed(log, EVERY_UNIT, "_other")).exists():
                 one = json.loads(self._fixed(log, EVERY_UNIT, "_other").read_text(encoding="utf-8"))
                 yield f"{log.name} beside {OTHER_TRUTH[log.name]}:"
-                yield values_table({"distributed": self.measured()[log.name], "recomputed": as_values(one)})
+                yield values_table({"distributed": self.effect_sizes()[log.name], "recomputed": as_values(one)})
         for log in self.logs:
             told = self._told("diagnoses", log)
             yield f"**{log.name}** ({told.get('cpu_s', '–')} CPU s): {_said(told)}"
@@ -388,7 +388,7 @@ def main() -> None:
     fragment = "\n\n".join(text for sensor in sensors for text in sensor.fragment())
     (options.out / "fragment.md").write_text(f"<!-- real -->\n{fragment}\n<!-- end -->\n", encoding="utf-8")
     (options.out / "real.md").write_text("\n\n".join(text for one in sensors for text in one.values()) + "\n", encoding="utf-8")
-    seen = {one.data_set: one.measured() for one in sensors}
+    seen = {one.data_set: one.effect_sizes() for one in sensors}
     picture(
         {name: rows for name, rows in seen.items() if rows},
         [log.name for one in sensors for log in one.tests],
