@@ -54,7 +54,7 @@ def toml(path: Path, what: str) -> dict[str, Any]:
                 fix="See whether this is the file that was meant",
             )
         return tomllib.loads(raw.decode())
-    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+    except (OSError, ValueError) as error:  # also an integer of thousands of digits
         raise ConfigError(f"{what} cannot be read ({error})", where=path, expected="a TOML file") from error
     except RecursionError as error:
         raise ConfigError(f"{what} cannot be read (nested too deeply)", where=path, expected="a TOML file") from error
