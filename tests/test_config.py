@@ -132,7 +132,7 @@ def test_a_file_too_large_or_nested_without_end_is_refused_before_it_costs_anyth
     with pytest.raises(ConfigError, match="nested too deeply"):
         read(path)
     path.write_text("a = " + "9" * 5000)
-    with pytest.raises(ConfigError, match=r"huge.toml: .* cannot be read .*4300 digits"):
+    with pytest.raises(ConfigError, match=r"huge.toml: .* cannot be read .*thousands of digits"):
         read(path)
 
 

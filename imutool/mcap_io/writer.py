@@ -189,9 +189,11 @@ class LogWriter:
         return record.id
 
     def _schema_of(self, topic: MessageTopic) -> int:
-        """Id of a topic's schema, equal byte for byte; 0 where the source has none."""
+        """Id of a topic's schema; 0 where the source has none. A type known here may come without its definition."""
         if not topic.schema_name:
             return 0
+        if topic.schema_name in schema.TYPE_HASHES and not topic.schema:
+            return self._schema(topic.schema_name)
         for known in self.contents.schemas.values():
             if (known.name, known.encoding, known.data) == (topic.schema_name, topic.schema_encoding, topic.schema):
                 return int(known.id)
@@ -219,8 +221,9 @@ class LogWriter:
             self.target.write(records.build(record))
 
     def metadata(self, name: str, values: Mapping[str, str]) -> None:
-        """Writes a metadata record."""
-        raw = records.build(Metadata(name=name, metadata=dict(values)))
+        """Writes a metadata record; bytes of a file name that are no UTF-8 are written as escapes."""
+        texts = {key: value.encode("utf-8", "backslashreplace").decode() for key, value in values.items()}
+        raw = records.build(Metadata(name=name, metadata=texts))
         self.contents.metadata.append(MetadataIndex(offset=self.target.position, length=len(raw), name=name))
         self.target.write(raw)
 
@@ -279,10 +282,8 @@ class LogWriter:
 def _described(topic: MessageTopic) -> dict[str, str]:
     """Channel metadata of a topic, with the quality of service that ROS 2 asks for."""
     metadata = dict(topic.metadata)
-    if topic.message_encoding != "cdr":
-        return metadata
-    latched = metadata.get("latching") == "1"
-    return {"offered_qos_profiles": QOS.replace("volatile", "transient_local") if latched else QOS} | metadata
+    qos = QOS.replace("volatile", "transient_local") if metadata.get("latching") == "1" else QOS
+    return {"offered_qos_profiles": qos} | metadata if topic.message_encoding == "cdr" else metadata
 
 
 def _next(taken: Mapping[int, object], what: str) -> int:

@@ -14,6 +14,7 @@ import pytest
 import torch
 from typer.testing import CliRunner
 
+from imutool import cli
 from imutool.bias import hybrid
 from imutool.bias.io import load
 from imutool.config import build
@@ -388,8 +389,7 @@ def test_a_physics_file_of_which_hybrid_knows_nothing_is_refused(tmp_path: Path)
     file.write_text(entry("saturation", "gyro", "rad/s"))
     with pytest.raises(ConfigError, match="no effect that a bias model can correct"):
         settings_for(file)
-    said = CliRunner().invoke(
-        load(), ["train", "a.mcap", "-o", str(tmp_path / "m"), "--method", "linear", "--physics", str(file)]
-    )
+    words = ["train", "a.mcap", "-o", str(tmp_path / "m.safetensors"), "--method", "linear", "--physics", str(file)]
+    said = CliRunner().invoke(cli.load(), words)
     assert said.exit_code == 3
     assert "linear knows no effects" in said.output
