@@ -14,10 +14,11 @@ import numpy as np
 
 from imutool.bias.model import Vector6
 from imutool.bias_start.bias_tracking import BiasFilter, BiasPrior, FilteredBlock, smooth_blocks
+from imutool.bias_start.initial_bias import relative_samples
 from imutool.geometry import quaternion
 from imutool.inertial.inertial_filter import SIZE, State
 from imutool.inertial.strapdown import StartPose, dead_reckon
-from imutool.recording import Imu, Poses, seconds
+from imutool.recording import Imu, Poses
 
 START_STD = np.array([1e-3] * 3 + [1e-2] * 3 + [1e-3] * 3)  # rad, m/s, m: of the start pose
 
@@ -36,7 +37,7 @@ def zero_velocity_trajectory(imu: Imu, start: StartPose, prior: BiasPrior, *, sm
     """
     filter_ = BiasFilter(prior, ahead=smooth)
     filter_.state = _state(start, prior)
-    t_s = seconds(imu.t_ns, int(imu.t_ns[0]) if len(imu) else 0)
+    t_s = relative_samples(imu)[0]
     estimates = _estimates(filter_, imu, t_s, smooth)
     pieces, first, state = [], 0, filter_.state
     for end_s, resting, over, after in estimates:
