@@ -55,8 +55,7 @@ class OnlineDebiaser:
     """
 
     def __init__(self, model: BiasModel, start: InitialBias | None = None) -> None:
-        stream = (start or tracked_from_prior(model)).stream(model)
-        self._correct, self._start_ns = stream.one if isinstance(stream, SampleStream) else _by_blocks(stream), -1
+        self._model, self._start, self._start_ns = model, start, -1
 
     def __call__(
         self, stamp_ns: int, gyro: Float64[np.ndarray, "3"], accel: Float64[np.ndarray, "3"]
@@ -64,6 +63,8 @@ class OnlineDebiaser:
         """Corrected angular rate (rad/s), specific force (m/s²), and the subtracted bias."""
         if self._start_ns < 0:
             self._start_ns = stamp_ns
+            stream = (self._start or tracked_from_prior(self._model, stamp_ns)).stream(self._model)
+            self._correct = stream.one if isinstance(stream, SampleStream) else _by_blocks(stream)
         u = np.concatenate((gyro, accel))
         bias = self._correct((stamp_ns - self._start_ns) * 1e-9, u)
         clean = u - bias

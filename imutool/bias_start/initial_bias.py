@@ -1,7 +1,9 @@
 """Initial bias of a run: the rest bias at its start, with standard deviation and source.
 
 A measurement (at rest: `bias_at_rest`; from true poses: `bias_from_truth`) and the prior of the training runs are combined by
-their variances, axis by axis; a measurement along one direction is a Kalman update. A model may add a motion-dependent part
+their variances, axis by axis; a measurement along one direction is a Kalman update. The prior is that of the training session
+within hours of the log, else that of a new session. It is held against the log first: where the log shows a bias that the
+prior all but rules out, the prior becomes as wide as that difference (`widened`). A model may add a motion-dependent part
 C(u): the measurement then uses the samples without that part.
 
 With `auto` and `truth` the rest bias is tracked after the start, by every stop and by gravity in motion
@@ -13,13 +15,13 @@ the measured stretch (the stop at the start of the log, or the first seconds of 
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from jaxtyping import Float64
 from torch import Tensor
 
-from imutool.bias.model import BiasModel, RestBiasEstimator, Stream, Vector6
+from imutool.bias.model import COLUMNS, BiasModel, RestBiasEstimator, Stream, Vector6
 from imutool.bias_start.bias_tracking import (
     USUAL_WALK,
     BiasPrior,
@@ -35,6 +37,8 @@ from imutool.recording import Imu, seconds
 
 AT_REST_STD = np.array([1e-4] * 3 + [0.03] * 3)  # earth's rotation; local gravity and a tilt of the sensor
 LEAST_STD = np.array([1e-6] * 3 + [1e-4] * 3)  # with a prior of zero variance nothing could be estimated
+SESSION_GAP_S = 6 * 3600.0  # a longer pause is another switching-on
+CONTRADICTED = (10.8, 13.8, 16.3)  # chi-square of one, two, three differences that a true prior exceeds once in a thousand logs
 TRACKED_BY = "gravity in motion and every stop"
 
 METHODS = ("auto", "stationary", "prior", "truth")
@@ -82,45 +86,72 @@ class InitialBias:
         return self.track is not None or self.follows is not None
 
 
-def prior(model: BiasModel) -> InitialBias:
-    """Prior bias: mean and spread over the training runs."""
-    return InitialBias(float64(model.prior_mean), float64(model.prior_std), "prior of the training runs")
+def prior(model: BiasModel, first_ns: int | None = None) -> InitialBias:
+    """Prior bias of a log that begins at a stamp: of its session if training saw it, else of a new one."""
+    mean, std = float64(model.prior_mean), float64(model.prior_std)
+    sessions = [] if first_ns is None else model.card.get("sessions", [])
+    apart = [max(0, session["start_ns"] - first_ns, first_ns - session["end_ns"]) for session in sessions]
+    if apart and min(apart) <= SESSION_GAP_S * 1e9:
+        session = sessions[apart.index(min(apart))]
+        mean, std = np.array(session["mean"]), np.array(session["std"])
+    return InitialBias(mean, std, "prior of the training runs")
 
 
-def bias_prior(model: BiasModel) -> BiasPrior:
+def bias_prior(model: BiasModel, first_ns: int | None = None) -> BiasPrior:
     """Prior of the bias filter from the training runs.
 
     The axes of a sensor share one random walk.
     """
+    start = prior(model, first_ns)
     ground = np.maximum(float64(model.rest_std), AT_REST_STD)
     walk = np.repeat(np.sqrt(np.mean(float64(model.walk_std).reshape(2, 3) ** 2, axis=1)), 3)
     walk = np.where(walk > 0, walk, USUAL_WALK)
-    return BiasPrior(float64(model.prior_mean), np.maximum(float64(model.prior_std), LEAST_STD), ground, walk)
+    return BiasPrior(start.rest, np.maximum(start.std, LEAST_STD), ground, walk)
 
 
-def tracked_from_prior(model: BiasModel) -> InitialBias:
+def widened(std: Vector6, difference: Vector6, variance: Vector6) -> Vector6:
+    """Standard deviation of a prior after comparison with what a log shows.
+
+    `difference` is the bias that the log shows minus the prior's mean, `variance` that of the measurement (infinite where it
+    shows nothing). A sensor whose chi-square exceeds `CONTRADICTED` gets the root mean square of its difference.
+    """
+    out = std.copy()
+    for columns in COLUMNS.values():
+        shown = np.isfinite(variance[columns])
+        square = difference[columns][shown] ** 2
+        chi_square = (square / (std[columns][shown] ** 2 + variance[columns][shown])).sum()
+        if shown.any() and chi_square > CONTRADICTED[shown.sum() - 1]:
+            out[columns] = np.maximum(std[columns], np.sqrt(square.mean()))
+    return out
+
+
+def tracked_from_prior(model: BiasModel, first_ns: int | None = None) -> InitialBias:
     """Prior bias, tracked from the first sample on: for a live node, which cannot look ahead."""
-    start = prior(model)
+    start = prior(model, first_ns)
     how = f"{training_source(model)}, {accuracy(start.std)}, then {TRACKED_BY}"
-    return InitialBias(start.rest, start.std, how, follows=bias_prior(model))
+    return InitialBias(start.rest, start.std, how, follows=bias_prior(model, first_ns))
 
 
-def smoothed_start(model: BiasModel, batches: Iterable[Samples], where: str = "") -> InitialBias:
+def smoothed_start(model: BiasModel, batches: Iterable[Samples], where: str = "", first_ns: int | None = None) -> InitialBias:
     """Smoothed rest bias in time from a whole log.
 
     All stops, gravity in motion and the training runs.
 
-    `batches` are seconds since the first sample, gyro and accel.
+    `batches` are seconds since the first sample, gyro and accel; they are iterated again if the log contradicts the prior.
 
     Raises:
         DataError: less than half a second of samples.
         NoRestError: an untrained model, and a log that never rests.
     """
-    track, rested_s = smooth_bias(model, batches, bias_prior(model))
+    before = bias_prior(model, first_ns)
+    track, rested_s, difference, variance = smooth_bias(model, batches, before)
     if not len(track.t_s):
         raise DataError("too short to be smoothed", where=where, expected="at least half a second of samples")
     if not model.card and not rested_s:
         raise NoRestError("the log never rests", where=where, expected="1.5 s or more without motion")
+    std = widened(before.std, difference, variance)
+    if (std > before.std).any():
+        track, *_ = smooth_bias(model, batches, replace(before, std=std))
     std = np.median(track.std, axis=0)
     parts = [f"{rested_s:.1f} s at rest in all"] * (rested_s > 0) + ["gravity in motion"]
     parts += [training_source(model)] * bool(model.card)

@@ -92,6 +92,7 @@ class TrainingReport(Report, frozen=True, kw_only=True, tag="imutool.training/1"
     training: dict[str, Any]
     logs: list[TrainingLog]
     held_out: dict[str, Any]
+    sessions: list[dict[str, Any]]
     compared: dict[str, Any] | UnsetType = UNSET
     physics: dict[str, Any] | UnsetType = UNSET
     sensor: str | None

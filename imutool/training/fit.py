@@ -106,6 +106,7 @@ class Training:
         self.generator = torch.Generator().manual_seed(self.settings.seed)
         self.done: dict[Sensor, float] = {}  # held-out error of each finished stage
         self.stage: Stage | None = None
+        self.sessions: list[statistics.Session] = []
 
     def epochs(self) -> Iterator[Epoch]:
         """Train and yield progress; a caller may stop and resume between two yields."""
@@ -122,7 +123,7 @@ class Training:
             self.done[sensor], self.stage = min(last, self.stage.before), None
         lengths: dict[Sensor, tuple[float, ...]] = {sensor: self._window_s(sensor) for sensor in SENSORS}
         self.model.eval()
-        statistics.store_statistics(self.model, self.pool, self.tracks.per_log().detach(), lengths)
+        self.sessions = statistics.store_statistics(self.model, self.pool, self.tracks.per_log().detach(), lengths)
         self.model.requires_grad_(False)
 
     def held_out(self, sensor: Sensor, model: BiasModel) -> float:
@@ -135,7 +136,7 @@ class Training:
         columns = COLUMNS[sensor]
         rest[:, columns] = model.rest_at_work(sensor, rest[:, columns])
         scored, pool = corrected(model, self.pool, "held_out", sensors_up_to(sensor))
-        solved = closed_form.solve(scored, sensor, pool, rest, lengths, matrix=False, part="held_out")
+        solved = closed_form.solve(scored, sensor, pool, rest, lengths, matrix=False, part="held_out", nuisances=False)
         rest[:, columns] = solved.rest
         with torch.no_grad():
             parts = torch.split(first, 64)
@@ -163,14 +164,15 @@ class Training:
         """Calibration and rest biases, as far as windows and a matrix show them."""
         rest = self.tracks.per_log().detach()
         scored, pool = corrected(self.model.eval(), self.pool, "train", sensors_up_to(sensor))
-        self._take(sensor, closed_form.solve(scored, sensor, pool, rest, self._window_s(sensor), matrix=True))
+        self.model.begin_at(sensor, closed_form.solve(scored, sensor, pool, rest, self._window_s(sensor), matrix=True).W)
+        # constants that take the nuisances of their logs: the descent knows none
+        scored, pool = corrected(self.model.eval(), self.pool, "train", sensors_up_to(sensor))
+        lengths = self._window_s(sensor)
+        constants = closed_form.solve(scored, sensor, pool, rest, lengths, matrix=False, nuisances=False)
+        self.tracks.set(sensor, constants.rest)
 
     def _window_s(self, sensor: Sensor) -> tuple[float, ...]:
         return self.settings.gyro_window_s if sensor == "gyro" else self.settings.accel_window_s
-
-    def _take(self, sensor: Sensor, solution: closed_form.Solution) -> None:
-        self.model.begin_at(sensor, solution.W)
-        self.tracks.set(sensor, solution.rest)
 
     def begin(self, sensor: Sensor) -> Stage:
         """Fresh stage from the current model and tracks: it moves the sensor's weights and the tracks."""

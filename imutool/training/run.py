@@ -87,7 +87,7 @@ def train(
         model, about = _physics_first(recordings, chosen, descent)
     else:
         training = descent(recordings, method, chosen)
-        model, about = training.model, {"held_out": _held_out(training)}
+        model, about = training.model, {"held_out": _held_out(training), "sessions": _sessions(training)}
     model.card = {
         **_card(method, chosen, recordings, logs),
         **about,
@@ -142,7 +142,8 @@ def _physics_first(
         held_out["effects and neural_ode"] = _held_out(ode)
         kept = ode if helps(without.done, ode.done) else without
     model = physics.finish(kept.model)
-    return model, {"held_out": _held_out(kept), "compared": held_out, "physics": dict(described(physics.fits))}
+    about = {"held_out": _held_out(kept), "sessions": _sessions(kept)}
+    return model, about | {"compared": held_out, "physics": dict(described(physics.fits))}
 
 
 def _shared(recordings: Sequence[Recording], key: str) -> str | None:
@@ -153,6 +154,10 @@ def _shared(recordings: Sequence[Recording], key: str) -> str | None:
 
 def _held_out(training: Training) -> dict[str, Any]:
     return {sensor: {"error": training.done[sensor], "unit": UNITS[sensor]} for sensor in SENSORS}
+
+
+def _sessions(training: Training) -> list[dict[str, Any]]:
+    return [session.card() for session in training.sessions]
 
 
 def _card(method: str, settings: TrainSettings, recordings: Sequence[Recording], logs: Sequence[Path]) -> dict[str, Any]:
