@@ -91,8 +91,7 @@ class Debiaser:
         )
         self._estimator, self._start_ns = BiasEstimator(model, start), -1
         self._clock = StampCheck()
-        noise = model.noise_std.detach().cpu().double().numpy()
-        self._white = np.diag(np.where(noise > 0, noise, start.noise) ** 2)
+        self._white = np.diag(np.where(model.noise_std > 0, model.noise_std, start.noise) ** 2)
 
     def __call__(self, batch: ImuBatch) -> DerivedBatch:
         """Payloads of the corrected messages, of the two biases, and of both with their covariance.

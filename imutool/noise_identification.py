@@ -17,7 +17,8 @@ from imutool.config import build
 from imutool.errors import DataError
 from imutool.inertial.stationary import rest_stretches, white_noise
 from imutool.location import Location
-from imutool.mcap_io.read import read
+from imutool.mcap_io.log import Log
+from imutool.mcap_io.read import read_recording
 from imutool.noise import allan
 from imutool.noise import datasheet as noise
 from imutool.noise.allan import Curve, Slopes
@@ -70,9 +71,9 @@ class IdentifiedNoise:
 
 
 def identify(
-    path: Location, *, imu: str | None = None, truth: str | None = None, model: str | Path | None = None
+    log: Location | Log, *, imu: str | None = None, truth: str | None = None, model: str | Path | None = None
 ) -> IdentifiedNoise:
-    """Noise of one IMU of a log: from rest, and with true poses from motion.
+    """Noise of one IMU of a log, which may be open: from rest, and with true poses from motion.
 
     In motion the samples are first corrected: by `model`, else by a matrix and a constant fitted to this log's own truth.
 
@@ -81,7 +82,10 @@ def identify(
         LogError, ConfigError, ModelError: the log or the model is not usable.
     """
     allan.library()
-    recording = read(path, imu=imu, truth=truth)
+    if not isinstance(log, Log):
+        with Log(log) as opened:
+            return identify(opened, imu=imu, truth=truth, model=model)
+    path, recording = log.path, read_recording(log, imu=imu, truth=truth)
     if truth is None and recording.truths:
         recording = recording.with_truth(next(iter(recording.truths)))
     remarks: list[str] = []
@@ -164,12 +168,12 @@ def _by_fit(recording: Recording) -> tuple[Imu, str]:
     """
     import torch
 
-    from imutool.bias import static
+    from imutool.bias.networks import static
     from imutool.training import closed_form
     from imutool.training.segments import Pool
 
     pool = Pool.of([recording])
-    model = static.Model(rate_hz=pool.rate_hz).double()
+    model = static.Network(rate_hz=pool.rate_hz).double()
     rest = torch.zeros(1, 6, dtype=torch.float64)
     corrected = []
     for column, sensor in enumerate(SENSORS):

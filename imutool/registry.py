@@ -16,10 +16,14 @@ from imutool.errors import ConfigError
 GROUPS = {
     "imutool.converters": "imutool.converters",
     "imutool.bias": "imutool.bias",
+    "imutool.networks": "imutool.bias.networks",
     "imutool.effects": "imutool.sensor.effects",
     "imutool.clean": "imutool.cleaning.rules",
 }
-NOT_PLUGINS = {"imutool.bias": frozenset({"io", "joint_ode", "model", "neural_stream", "ode", "physics_model"})}
+NOT_PLUGINS = {
+    "imutool.bias": frozenset({"io", "model", "networks", "neural_stream", "physics"}),
+    "imutool.networks": frozenset({"joint_ode", "network", "ode"}),
+}
 
 
 def names(group: str) -> list[str]:

@@ -17,7 +17,6 @@ from typing import Any
 import pytest
 from filelock import FileLock
 from hypothesis import settings
-from jaxtyping import install_import_hook
 
 os.environ["COLUMNS"] = "80"  # the width of the commands' tables, which are made at import
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # as the command does: idle threads must not spin while others test
@@ -31,7 +30,9 @@ if not os.environ.get("CI"):  # there hypothesis has a profile of its own, which
 
 sys.path.insert(0, str(Path(__file__).parent))  # for tests/support
 
-install_import_hook(["imutool"], "beartype.beartype").__enter__()
+from support.shapes import check_shapes  # noqa: E402  (before anything imports the package)
+
+check_shapes("imutool")
 
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 

@@ -17,9 +17,11 @@ from mcap.reader import make_reader
 from mcap.writer import CompressionType, Writer
 from rosbags.highlevel import AnyReader
 
-from imutool.bias import linear, neural_ode, static
 from imutool.bias.io import load, save
-from imutool.bias.model import BiasModel, Segment
+from imutool.bias.model import BiasModel
+from imutool.bias.networks import linear, neural_ode, static
+from imutool.bias.networks.network import BiasNetwork, Segment
+from imutool.bias.neural_ode import Config
 from imutool.bias_start.bias_at_rest import at_rest, auto
 from imutool.bias_start.bias_from_truth import from_truth
 from imutool.bias_start.correction import OnlineDebiaser, apply
@@ -46,13 +48,13 @@ NEW = ("/imu0/debiased", "/imu0/bias/gyro", "/imu0/bias/accel", "/imu0/bias")
 IMAGES = [(1_700_003_600_100_000_000 + 100_000_000 * i, bytes([i]) * 5000) for i in range(20)]
 
 
-def make_model(method: str, rate_hz: float = RATE_HZ) -> BiasModel:
-    """A model that does something to every sample."""
+def make_network(method: str, rate_hz: float = RATE_HZ) -> BiasNetwork:
+    """A network that does something to every sample."""
     torch.manual_seed(1)
-    kinds: dict[str, BiasModel] = {
-        "static": static.Model(rate_hz=0.0),
-        "linear": linear.Model(rate_hz=rate_hz),
-        "neural_ode": neural_ode.Model(neural_ode.Config(curve_width=8, drift_step_s=0.1), rate_hz),
+    kinds: dict[str, BiasNetwork] = {
+        "static": static.Network(rate_hz=0.0),
+        "linear": linear.Network(rate_hz=rate_hz),
+        "neural_ode": neural_ode.Network(Config(curve_width=8, drift_step_s=0.1), rate_hz),
     }
     model = kinds[method].double()
     with torch.no_grad():
@@ -62,6 +64,10 @@ def make_model(method: str, rate_hz: float = RATE_HZ) -> BiasModel:
         model.truth_std.copy_(torch.tensor([1e-3] * 3 + [0.05] * 3))
         model.noise_std.copy_(torch.tensor([2e-3] * 3 + [0.03] * 3))
     return model.requires_grad_(False).eval()
+
+
+def make_model(method: str, rate_hz: float = RATE_HZ) -> BiasModel:
+    return make_network(method, rate_hz).frozen()
 
 
 @pytest.fixture(scope="module")
@@ -352,7 +358,7 @@ def test_every_start_is_the_one_turn_on_finds(
 @pytest.mark.parametrize("method", ["static", "linear", "neural_ode"])
 def test_smoothing_takes_the_whole_log_and_says_so(source: Path, recording: Recording, tmp_path: Path, method: str) -> None:
     path: str | Path = method
-    model = static.Model() if method == "static" else make_model(method)
+    model = static.Network().frozen() if method == "static" else make_model(method)
     if method != "static":
         path = tmp_path / "m.safetensors"
         save(model, path)
@@ -651,7 +657,7 @@ def test_the_batch_path_is_the_models_forward_pass(recording: Recording) -> None
     model, imu = make_model("neural_ode"), recording.imu
     t = torch.from_numpy(seconds(imu.t_ns, int(imu.t_ns[0])))[None]
     gyro, accel = (torch.from_numpy(u.copy())[None] for u in (imu.gyro, imu.accel))
-    expected = model(Segment(t, gyro, accel, torch.zeros(1, 6, dtype=torch.float64)))[0]
+    expected = make_network("neural_ode")(Segment(t, gyro, accel, torch.zeros(1, 6, dtype=torch.float64)))[0]
     start = InitialBias(np.zeros(6), np.zeros(6), "zero")
     np.testing.assert_allclose(apply(model, start, imu).bias, expected, rtol=0, atol=ONLINE)
 

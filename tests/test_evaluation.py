@@ -144,10 +144,7 @@ def log(recording: Recording, tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def model(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("model") / "linear_1.safetensors"
-    made = linear.Model(rate_hz=200.0).double()
-    made.prior_std.fill_(1.0)
-    made.truth_std.fill_(1e-3)
-    save(made, path)
+    save(linear.Model(rate_hz=200.0, tensors={"prior_std": np.ones(6), "truth_std": np.full(6, 1e-3)}), path)
     return path
 
 

@@ -118,15 +118,14 @@ def test_the_order_is_really_looked_at() -> None:
     ]
 
 
-# Floors of imutool/diagnosis, lowest first: report and settings, estimator, one scalar signal, the diagnosis, sentences.
+# Floors of imutool/diagnosis, lowest first: report and settings, sentences, estimator, localization, the diagnosis.
 DIAGNOSIS = "imutool.diagnosis"
 DIAGNOSIS_FLOORS = (
     tuple(f"{DIAGNOSIS}.{module}" for module in ("result", "settings")),
-    (f"{DIAGNOSIS}.estimation",),
-    (f"{DIAGNOSIS}.localization",),  # of the IMU and of scalar signals
-    (f"{DIAGNOSIS}.scalar",),
-    (DIAGNOSIS,),
     (f"{DIAGNOSIS}.wording",),
+    (f"{DIAGNOSIS}.estimation",),
+    (f"{DIAGNOSIS}.localization",),
+    (DIAGNOSIS,),
 )
 
 
@@ -313,8 +312,41 @@ def test_view_without_a_model_imports_the_viewer_alone(imported: Callable[..., s
     assert (tmp_path / "out.rrd").is_file()
 
 
-def test_evaluate_shows_that_the_spy_sees(imported: Callable[..., set[str]], logs: Path) -> None:
-    assert "torch" in imported("evaluate", logs / "flight_1.mcap")
+def test_training_shows_that_the_spy_sees(imported: Callable[..., set[str]], logs: Path) -> None:
+    assert "torch" in imported("train", logs / "flight_1.mcap", "-o", "m.safetensors", "--method", "linear")
+
+
+INFERENCE = """
+import sys
+from typer.testing import CliRunner
+from imutool.cli import load
+for line in sys.argv[1:]:
+    done = CliRunner().invoke(load(), line.split())
+    assert done.exit_code == 0, (line, done.output, done.exception)
+    assert "torch" not in sys.modules, line
+"""
+
+
+def test_commands_that_infer_need_no_torch(tmp_path: Path, logs: Path) -> None:
+    """Every command but those that train, one after another in one process, with every method that ships a network."""
+    log, cut = logs / "flight_2.mcap", tmp_path / "cut.mcap"
+    cut.write_bytes(log.read_bytes()[:-1000])
+    lines = [
+        f"debias {log} linear.mcap --model {logs / 'linear.safetensors'}",
+        f"debias {log} smooth.mcap --smooth",
+        f"debias {log} hybrid.mcap --model euroc-adis16448-hybrid --init truth",
+        f"debias {log} ode.mcap --model euroc-adis16448-neural_ode",
+        f"debias {log} conv.mcap --model euroc-adis16448-conv",
+        f"evaluate {log} --model {logs / 'linear.safetensors'} --zupt",
+        f"view {log} --model static --html view.html",
+        f"repair {cut} repaired.mcap",
+        f"info {log} linear.mcap",
+        f"clean {log} cleaned.mcap",
+        "models",
+    ]
+    line = [sys.executable, "-c", INFERENCE, *lines]
+    done = subprocess.run(line, cwd=tmp_path, capture_output=True, text=True, timeout=180, check=False)
+    assert done.returncode == 0, done.stderr
 
 
 def test_help_is_quick(command: str) -> None:

@@ -9,25 +9,19 @@ part: then debiasing is a few products a sample.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping
 from typing import ClassVar
 
-import msgspec
 import numpy as np
-import torch
-from jaxtyping import Float, Float64
-from torch import Tensor
+from jaxtyping import Float64
 
 from imutool.bias import neural_ode
-from imutool.bias.model import COLUMNS, BiasModel, CovarianceModel, SampleStream, Segment, Stream, Vector6
+from imutool.bias.model import COLUMNS, BiasModel, CovarianceModel, SampleStream, Shapes, Stream, Vector6
 from imutool.config import Settings
-from imutool.errors import ConfigError
 from imutool.sensor import catalogue
 from imutool.sensor.linear_form import CompiledEffects, LinearForm, compiled, patterns
-from imutool.sensor.signals import POWER_S, SignalFilter, Signals
+from imutool.sensor.signals import SignalFilter, Signals
 from imutool.units import SENSORS, Sensor
-
-SETTLING = 10.0  # time constants after which the start of a filter no longer matters
 
 
 class Config(Settings, frozen=True):
@@ -38,72 +32,56 @@ class Config(Settings, frozen=True):
     remainder: bool = True
     ode: neural_ode.Config = neural_ode.Config()
 
+    def effects(self, sensor: Sensor) -> tuple[str, ...] | None:
+        """Effects that the settings name for a sensor; None if the training chooses."""
+        return self.gyro_effects if sensor == "gyro" else self.accel_effects
+
 
 class Model(BiasModel):
     """Bias b = rest + E_theta(signals) + C(u - E) + drift.
 
     Sources: the effects' files; Rehder et al., ICRA 2016, for the joint fit; `imutool.bias.neural_ode`.
-
-    Raises:
-        ConfigError: an unknown effect, or an effect that does not act on its sensor.
     """
 
     method: ClassVar[str] = "hybrid"
     config: Config
 
-    def __init__(self, config: Settings | None = None, rate_hz: float = 200.0) -> None:
-        chosen = config or Config()
-        assert isinstance(chosen, Config)
-        super().__init__(chosen, rate_hz)
-        self.effects: dict[Sensor, tuple[LinearForm, ...]] = {"gyro": (), "accel": ()}
-        for sensor in SENSORS:
-            self._set_effects(sensor, self.named(sensor) or ())
-        self.ode = neural_ode.Model(chosen.ode, rate_hz) if chosen.remainder else None
+    def __init__(
+        self,
+        config: Settings,
+        rate_hz: float,
+        tensors: Mapping[str, np.ndarray] | None = None,
+        effects: Mapping[Sensor, tuple[LinearForm, ...]] | None = None,
+    ) -> None:
+        super().__init__(config, rate_hz, tensors)
+        self.effects = effects or {sensor: catalogue.trained(sensor, self.config.effects(sensor) or ()) for sensor in SENSORS}
+        self.ode: neural_ode.Model | None = None
+        if self.config.remainder:
+            held = {name.removeprefix("ode."): value for name, value in self.tensors.items() if name.startswith("ode.")}
+            self.ode = neural_ode.Model(self.config.ode, rate_hz, held)
 
-    def named(self, sensor: Sensor) -> tuple[str, ...] | None:
-        """Effects that the settings name for a sensor; None if the training chooses."""
-        return self.config.gyro_effects if sensor == "gyro" else self.config.accel_effects
-
-    def take(self, sensor: Sensor, names: Sequence[str], theta: Float[Tensor, " p"], covariance: Float[Tensor, "p p"]) -> None:
-        """Take over effects and their fitted parameters, in the order of `names`."""
-        key = f"{sensor}_effects"
-        self.config = msgspec.structs.replace(self.config, **{key: tuple(names)})
-        self._set_effects(sensor, tuple(names))
-        with torch.no_grad():
-            getattr(self, f"theta_{sensor}").copy_(theta)
-            getattr(self, f"covariance_{sensor}").copy_(covariance)
-
-    def drop_remainder(self) -> None:
-        """Drop the neural ODE and keep only the effects."""
-        self.config, self.ode = msgspec.structs.replace(self.config, remainder=False), None
-
-    def begin_at(self, sensor: Sensor, W: Float[Tensor, "3 3"]) -> None:
-        """Refuse a start from a matrix, because all effects are fitted together.
+    @classmethod
+    def shapes(cls, config: Settings) -> Shapes:
+        """Shapes of the statistics, of the effects' parameters with their covariance, and of the neural ODE.
 
         Raises:
-            ConfigError: always; `imutool.training.run.train` knows how a hybrid is trained.
+            ConfigError: an unknown effect, or an effect that does not act on its sensor.
         """
-        raise ConfigError(
-            "hybrid does not start from a matrix",
-            where="training hybrid",
-            fix="Train it with imutool.training.run.train, or its parts with imutool.training.calibration",
-        )
+        assert isinstance(config, Config)
+        shapes = super().shapes(config)
+        for sensor in SENSORS:
+            effects = catalogue.trained(sensor, config.effects(sensor) or ())
+            size = sum(len(effect.parameters) for effect in effects)
+            shapes |= {f"theta_{sensor}": (size,), f"covariance_{sensor}": (size, size)}
+        ode = neural_ode.Model.shapes(config.ode) if config.remainder else {}
+        return shapes | {f"ode.{name}": shape for name, shape in ode.items()}
 
     def error(self, sensor: Sensor, signals: Signals) -> Float64[np.ndarray, "n 3"]:
         """Error of the effects at some signals (rad/s or m/s²)."""
         return self._compiled(sensor)(signals)
 
-    def sensor_bias(self, sensor: Sensor, segment: Segment) -> Float[Tensor, "batch n 3"]:
-        """Bias of the effects plus the neural ODE; filters start at the first sample."""
-        error = self._on(sensor, segment)
-        if self.ode is None:
-            return segment.rest[:, None, COLUMNS[sensor]] + error
-        corrected = {"gyro": segment.gyro, "accel": segment.accel}
-        corrected[sensor] = corrected[sensor] - error
-        return error + self.ode.sensor_bias(sensor, Segment(segment.t, corrected["gyro"], corrected["accel"], segment.rest))
-
     def stream(self, rest: Vector6) -> Stream:
-        """Bias stream in numpy, from the log's first sample on."""
+        """Bias stream, from the log's first sample on."""
         ode = None if self.ode is None else self.ode.stream(rest)
         gyro, accel = (self._compiled(sensor) for sensor in SENSORS)
         return _Stream(self.rate_hz, gyro, accel, ode, rest.astype(np.float64))
@@ -116,8 +94,7 @@ class Model(BiasModel):
         """Root T Sigma^1/2 of the covariance of the effects' error, T Sigma T^T."""
         roots: dict[Sensor, Float64[np.ndarray, "3 q p"]] = {}
         for sensor in SENSORS:
-            covariance: Tensor = getattr(self, f"covariance_{sensor}")
-            values, vectors = np.linalg.eigh(covariance.detach().cpu().double().numpy())
+            values, vectors = np.linalg.eigh(self.tensors[f"covariance_{sensor}"])
             root = vectors * np.sqrt(np.maximum(values, 0.0))
             roots[sensor] = patterns(self.effects[sensor]) @ root
         filter_ = SignalFilter(self.rate_hz)
@@ -134,25 +111,8 @@ class Model(BiasModel):
 
         return root_at
 
-    def _on(self, sensor: Sensor, segment: Segment) -> Float[Tensor, "batch n 3"]:
-        rows = []
-        for t, gyro, accel in zip(segment.t, segment.gyro, segment.accel, strict=True):
-            arrays = (x.detach().cpu().double().numpy() for x in (t - t[0], gyro, accel))
-            rows.append(torch.from_numpy(self.error(sensor, SignalFilter(self.rate_hz)(*arrays))))
-        return torch.stack(rows).to(segment.t)
-
-    def _set_effects(self, sensor: Sensor, names: tuple[str, ...]) -> None:
-        self.effects[sensor] = catalogue.trained(sensor, names)
-        size = sum(len(effect.parameters) for effect in self.effects[sensor])
-        like = self.prior_mean
-        self.register_buffer(f"theta_{sensor}", like.new_zeros(size))
-        self.register_buffer(f"covariance_{sensor}", like.new_zeros(size, size))
-        looks_back = any(self.effects.values())
-        self.context = math.ceil(SETTLING * POWER_S * self.rate_hz) if looks_back else 0
-
     def _compiled(self, sensor: Sensor) -> CompiledEffects:
-        theta: Tensor = getattr(self, f"theta_{sensor}")
-        return compiled(self.effects[sensor], theta.detach().cpu().double().numpy())
+        return compiled(self.effects[sensor], self.tensors[f"theta_{sensor}"])
 
 
 class _Stream:

@@ -11,9 +11,9 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import torch
+import numpy as np
 from safetensors import SafetensorError, safe_open
-from safetensors.torch import save as save_bytes
+from safetensors.numpy import save as save_bytes
 
 from imutool import registry
 from imutool.bias.model import BiasModel
@@ -42,11 +42,11 @@ def save(model: BiasModel, path: Path, *, overwrite: bool = False) -> None:
         "settings": json.dumps(plain(model.config)),
         "card": json.dumps(dict(model.card)),
     }
-    weights = {name: value.detach().cpu().float().contiguous() for name, value in model.state_dict().items()}
+    weights = {name: np.ascontiguousarray(value, dtype=np.float32) for name, value in model.tensors.items()}
     write_tensors(weights, header, path, overwrite)
 
 
-def write_tensors(tensors: Mapping[str, torch.Tensor], header: Mapping[str, str], path: Path, overwrite: bool) -> None:
+def write_tensors(tensors: Mapping[str, np.ndarray], header: Mapping[str, str], path: Path, overwrite: bool) -> None:
     """Write tensors and a header of strings to a temporary file, then rename it.
 
     Raises:
@@ -72,7 +72,7 @@ def _in_order(raw: bytes) -> bytes:
     return len(header).to_bytes(8, "little") + header + raw[8 + size :]
 
 
-def read_tensors(path: Path, kind: str) -> tuple[dict[str, torch.Tensor], dict[str, str]]:
+def read_tensors(path: Path, kind: str) -> tuple[dict[str, np.ndarray], dict[str, str]]:
     """Tensors and header of a file of format `kind`.
 
     Raises:
@@ -80,7 +80,7 @@ def read_tensors(path: Path, kind: str) -> tuple[dict[str, torch.Tensor], dict[s
     """
     try:
         _refuse_size(path, MAX_BYTES)
-        with safe_open(path, framework="pt") as file:
+        with safe_open(path, framework="np") as file:
             header = file.metadata() or {}
             if header.get("format") != kind:
                 raise ModelError(
@@ -90,7 +90,7 @@ def read_tensors(path: Path, kind: str) -> tuple[dict[str, torch.Tensor], dict[s
                     fix="Train it again with this version of imutool",
                 )
             return {name: file.get_tensor(name) for name in file.keys()}, header  # noqa: SIM118  not a dict
-    except (OSError, SafetensorError) as error:
+    except (OSError, SafetensorError, TypeError, AttributeError) as error:  # numpy knows fewer kinds of numbers than the format
         raise ModelError(f"is not a model file ({error})", where=path, expected="safetensors by imutool train") from error
 
 
@@ -119,24 +119,20 @@ def load(path: Path) -> BiasModel:
     tensors, raw = read_tensors(path, FORMAT)
     header = _header(raw, path)
     try:
-        module = registry.load("imutool.bias", header.method)
-        settings = build(module.Config, header.settings)
-        with torch.device("meta"):  # shapes without memory: the settings may ask for any
-            shapes: BiasModel = module.Model(settings, header.rate_hz)
-    except (ValueError, OverflowError, RuntimeError, ImutoolError) as error:
+        kind: type[BiasModel] = registry.load("imutool.bias", header.method).Model
+        settings = build(registry.load("imutool.bias", header.method).Config, header.settings)
+        expected = {name: (shape, np.dtype(np.float32)) for name, shape in kind.shapes(settings).items()}
+    except (ValueError, OverflowError, ImutoolError) as error:
         raise ModelError(f"has an invalid header ({error})", where=path) from error
-    expected = {k: (tuple(v.shape), torch.float32) for k, v in shapes.state_dict().items()}
-    found = {k: (tuple(v.shape), v.dtype) for k, v in tensors.items()}
-    if found != expected:
-        wrong = sorted(k for k in expected.keys() | found.keys() if expected.get(k) != found.get(k))
+    held = {name: (value.shape, value.dtype) for name, value in tensors.items()}
+    if held != expected:
+        wrong = sorted(name for name in expected.keys() | held.keys() if expected.get(name) != held.get(name))
         raise ModelError(f"tensors {', '.join(wrong[:5])} do not fit", where=path, expected=f"those of {header.method}")
-    if any(not bool(torch.isfinite(v).all()) for v in tensors.values()):
+    if any(not np.isfinite(value).all() for value in tensors.values()):
         raise ModelError("holds numbers that are not finite", where=path)
-    model: BiasModel = module.Model(settings, header.rate_hz)
-    model.load_state_dict(tensors)
+    model = kind(settings, header.rate_hz, tensors)
     model.card = {**header.card, "name": path.stem, "sha256": digest(path)}
-    model.requires_grad_(False)
-    return model.double().eval()
+    return model
 
 
 def library() -> Path:
@@ -158,11 +154,11 @@ def find_model(name: str | Path, rate_hz: float | None = None) -> BiasModel:
     if path.suffix == ".toml":
         if rate_hz is None:
             raise ModelError("a physics.toml has no sample rate", where=path, expected="`rate_hz`")
-        from imutool.bias import physics_model
+        from imutool.bias import physics
 
         with suppress(OSError):  # the reader reports it
             _refuse_size(path, MAX_TOML)
-        return physics_model.load(path, rate_hz)
+        return physics.load(path, rate_hz)
     if path.suffix == ".safetensors" or path.exists():
         return load(path)
     return load(shipped(str(name)))

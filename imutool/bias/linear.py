@@ -5,16 +5,15 @@ W is solved in closed form; a direction that the motion does not excite keeps th
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import ClassVar
 
 import numpy as np
-import torch
-from jaxtyping import Float, Float64
-from torch import Tensor, nn
+from jaxtyping import Float64
 
-from imutool.bias.model import BiasModel, Segment, Stream, Vector6
+from imutool.bias.model import BiasModel, Shapes, Stream, Vector6, matrices
 from imutool.config import Settings
-from imutool.units import SENSORS, Sensor
+from imutool.units import SENSORS
 
 
 class Config(Settings, frozen=True):
@@ -31,26 +30,20 @@ class Model(BiasModel):
     """
 
     method: ClassVar[str] = "linear"
-    iterative: ClassVar[bool] = False
 
-    def __init__(self, config: Settings | None = None, rate_hz: float = 0.0) -> None:
-        super().__init__(config or Config(), rate_hz)
-        self.W = nn.ParameterDict({sensor: nn.Parameter(torch.zeros(3, 3)) for sensor in SENSORS})
+    def __init__(
+        self, config: Settings | None = None, rate_hz: float = 0.0, tensors: Mapping[str, np.ndarray] | None = None
+    ) -> None:
+        super().__init__(config or Config(), rate_hz, tensors)
 
-    def sensor_bias(self, sensor: Sensor, segment: Segment) -> Float[Tensor, "batch n 3"]:
-        """Bias rest + W u at every sample."""
-        u, rest = segment.of(sensor)
-        W: Tensor = self.W[sensor]
-        return rest[:, None] + u @ W.mT
-
-    def begin_at(self, sensor: Sensor, W: Float[Tensor, "3 3"]) -> None:
-        """Set the matrix W: the closed form is the whole model."""
-        with torch.no_grad():
-            self.W[sensor].copy_(W)
+    @classmethod
+    def shapes(cls, config: Settings) -> Shapes:
+        """Shapes of the statistics and of W for each sensor."""
+        return super().shapes(config) | matrices("W")
 
     def stream(self, rest: Vector6) -> Stream:
         """Bias rest + W u at every sample."""
-        W_gyro, W_accel = (self.W[sensor].detach().cpu().double().numpy() for sensor in SENSORS)
+        W_gyro, W_accel = (self.tensors[f"W.{sensor}"] for sensor in SENSORS)
 
         def affine(
             t_s: Float64[np.ndarray, " n"], gyro: Float64[np.ndarray, "n 3"], accel: Float64[np.ndarray, "n 3"]

@@ -10,36 +10,33 @@ time scales differ by four orders of magnitude::
 linear sensor, (I - A^{-1}) du/dt (after eq. 31), to any smooth sensor. As a total derivative it integrates to C exactly, with
 every solver and step. C also depends on the samples filtered over 0.1 s (ds/dt = (u - s) / tau, solved exactly), for sensors
 whose error lags their motion. *g*, the drift, moves the rest bias beta = b - C, the turn-on bias of a run; its scale makes it
-slow. It is a residual perceptron of the paper's size. torchdiffeq integrates it along a causal Hermite path through the
-samples filtered over half a second, so the step of the solver changes the solution only by its own error. So
-b(t) = beta(t) + C(t).
+slow. It is a residual perceptron of the paper's size, integrated along the samples filtered over half a second, so the step of
+the solver changes the solution only by its own error. So b(t) = beta(t) + C(t).
+
+Inference takes Euler steps of `drift_step_s`; `imutool.bias.networks.neural_ode` trains with any solver of torchdiffeq.
 """
 
 from __future__ import annotations
 
-import math
-from typing import Annotated, ClassVar, Literal, TypeVar
+from collections.abc import Callable, Mapping
+from typing import Annotated, ClassVar, Literal
 
 import msgspec
 import numpy as np
-import torch
-from jaxtyping import Float, Float64
-from torch import Tensor, nn
-from torchdiffeq import odeint, odeint_adjoint
+from jaxtyping import Float64
+from scipy.special import erf
 
-from imutool.bias import joint_ode
-from imutool.bias.joint_ode import JointField
-from imutool.bias.model import COLUMNS, BiasModel, SampleStream, Segment, Vector6
-from imutool.bias.neural_stream import Array, Curves, CurveWeights, DriftRate, NeuralStream, perceptron
-from imutool.bias.ode import HermitePath
+from imutool.bias.model import COLUMNS, Array, BiasModel, SampleStream, Shapes, Vector6
+from imutool.bias.neural_stream import HALF_ROOT, Curves, CurveWeights, NeuralStream, gelu
 from imutool.config import Settings
 from imutool.errors import ConfigError
 from imutool.units import SENSORS, Sensor
 
 SLOW_S, DRIFT_FILTER_S = 0.1, 0.5  # filter time constants of the inputs of curve and drift
 NEAR_ZERO = 10.0
-GYRO_HIDDEN = (128, 128), (512,)  # of both residual blocks, as in the released networks
-NEGLIGIBLE = 1e-15
+HIDDEN = {"gyro": ((128, 128), (512,)), "accel": ((256, 512), (256, 256))}  # both residual blocks of the released networks
+INPUTS = 9
+NORMAL_PEAK = (2.0 * np.pi) ** -0.5
 
 Positive = Annotated[float, msgspec.Meta(gt=0)]
 Width = Annotated[int, msgspec.Meta(ge=1, le=4096)]
@@ -52,7 +49,7 @@ class Config(Settings, frozen=True):
     drift of a hundredth in five seconds is far off after a minute (0.3 m/s² on FETCH).
     """
 
-    scheme: Literal["split", "joint"] | msgspec.UnsetType = msgspec.UNSET  # joint: the paper's (`joint_ode`)
+    scheme: Literal["split", "joint"] | msgspec.UnsetType = msgspec.UNSET  # joint: the paper's (`networks.joint_ode`)
     curve_width: Width = 64
     drift: tuple[Sensor, ...] = ("gyro",)
     drift_step_s: Positive = 0.25
@@ -65,71 +62,20 @@ class Config(Settings, frozen=True):
     accel_curve_m_s2: Positive = 0.2
     accel_drift_m_s3: Positive = 1e-3
 
+    @property
+    def joint(self) -> bool:
+        """Whether attitude and gyro bias are integrated together; the accelerometer keeps the split scheme."""
+        return self.scheme == "joint"
 
-class Curve(nn.Module):
-    """Curve C(u, s) = W u + curve (N(u, s) - N(0, 0)), zero without motion.
+    def units(self, sensor: Sensor) -> tuple[float, float, float]:
+        """Units of a sensor's samples, of its curve and of its drift."""
+        if sensor == "gyro":
+            return self.gyro_scale_rad_s, self.gyro_curve_rad_s, self.gyro_drift_rad_s2
+        return self.accel_scale_m_s2, self.accel_curve_m_s2, self.accel_drift_m_s3
 
-    Inputs of N: its arguments in units of the scale, and asinh(10 x) of them, which resolves small motion.
-    """
-
-    def __init__(self, width: int, scale: float, curve: float) -> None:
-        super().__init__()
-        self.scale, self.curve = scale, curve
-        self.W = nn.Parameter(torch.zeros(3, 3))
-        layers = nn.Linear(9, width), nn.Linear(width, width), nn.Linear(width, 3, bias=False)
-        for layer in layers:
-            nn.init.normal_(layer.weight, 0.0, layer.in_features**-0.5)
-        nn.init.zeros_(layers[2].weight)
-        self.net = nn.Sequential(layers[0], nn.GELU(), layers[1], nn.Tanh(), layers[2])
-
-    def forward(self, u: Float[Tensor, "*batch 3"], slow: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
-        """Motion-dependent bias: `u` the samples, `slow` the filtered ones."""
-        x, s = u / self.scale, slow / self.scale
-        inputs = torch.cat([x, torch.asinh(NEAR_ZERO * x), torch.asinh(NEAR_ZERO * s)], dim=-1)
-        bend: Tensor = self.net(inputs) - self.net(u.new_zeros(9))
-        return u @ self.W.mT + self.curve * bend
-
-    def weights(self) -> CurveWeights:
-        """Curve weights for numpy."""
-        first, second, last = (layer for layer in self.net if isinstance(layer, nn.Linear))
-        return CurveWeights(self.W.detach().cpu().double().numpy(), (first, second, last), self.scale, NEAR_ZERO, self.curve)
-
-
-class Drift(nn.Module):
-    """Drift g, the slow rate of the rest bias: a perceptron of two residual blocks."""
-
-    def __init__(self, hidden: tuple[tuple[int, ...], tuple[int, ...]], scale: float, curve: float, rate: float) -> None:
-        super().__init__()
-        self.rate = rate
-        self.block1, self.block2 = _perceptron(hidden[0]), _perceptron(hidden[1])
-        self.out = nn.Linear(9, 3)
-        nn.init.zeros_(self.out.weight)
-        nn.init.zeros_(self.out.bias)
-        # inputs: the state relative to the prior's mean in units of the curve; the motion in its own
-        self.centre: Tensor
-        self.units: Tensor
-        self.register_buffer("centre", torch.zeros(3))
-        self.register_buffer("units", torch.tensor([curve] * 3 + [scale] * 6))
-
-    def forward(self, beta: Float[Tensor, "b 3"], u: Float[Tensor, "b 3"], du: Float[Tensor, "b 3"]) -> Float[Tensor, "b 3"]:
-        """Drift dbeta/dt per second."""
-        x = torch.cat([beta - self.centre, u, du], dim=-1) / self.units
-        x = x + self.block1(x)
-        x = x + self.block2(x)
-        y: Tensor = self.rate * self.out(x)
-        return y
-
-    def numpy(self) -> DriftRate:
-        """Drift in float64 numpy."""
-        block1, block2, out = perceptron(self.block1), perceptron(self.block2), perceptron(self.out)
-        centre, units = (x.detach().cpu().double().numpy() for x in (self.centre, self.units))
-
-        def rate(beta: Array, u: Array, du: Array) -> Array:
-            x = np.concatenate([beta - centre, u, du]) / units
-            x = x + block1(x)
-            return self.rate * out(x + block2(x))
-
-        return rate
+    def stride(self, rate_hz: float) -> int:
+        """Samples from one step of the drift to the next."""
+        return max(1, round(self.drift_step_s * rate_hz))
 
 
 class Model(BiasModel):
@@ -141,159 +87,170 @@ class Model(BiasModel):
     method: ClassVar[str] = "neural_ode"
     config: Config
 
-    def __init__(self, config: Settings | None = None, rate_hz: float = 200.0) -> None:
-        chosen = config or Config()
-        assert isinstance(chosen, Config)
-        if chosen.adjoint and chosen.solver == "euler":
+    @classmethod
+    def shapes(cls, config: Settings) -> Shapes:
+        """Shapes of the statistics, curves and drifts.
+
+        Raises:
+            ConfigError: the adjoint with Euler's steps, or the joint scheme without a drift of the gyro.
+        """
+        assert isinstance(config, Config)
+        if config.adjoint and config.solver == "euler":
             raise ConfigError(
                 "the adjoint of Euler's coarse steps has an error of Euler's order",
                 where="model.adjoint",
                 fix="Use model.solver=rk4 or dopri5 with it, or backpropagation",
             )
-        if chosen.scheme == "joint" and "gyro" not in chosen.drift:
+        if config.joint and "gyro" not in config.drift:
             raise ConfigError("the joint scheme without a drift of the gyro", where="model.drift", expected="gyro among them")
-        super().__init__(chosen, rate_hz)
-        c = chosen
-        self.stride = max(1, round(c.drift_step_s * rate_hz))
-        gyro = Curve(c.curve_width, c.gyro_scale_rad_s, c.gyro_curve_rad_s)
-        accel = Curve(c.curve_width, c.accel_scale_m_s2, c.accel_curve_m_s2)
-        self.curve = nn.ModuleDict({"gyro": gyro, "accel": accel})
-        drifts: dict[str, nn.Module] = {
-            "gyro": Drift(GYRO_HIDDEN, c.gyro_scale_rad_s, c.gyro_curve_rad_s, c.gyro_drift_rad_s2),
-            "accel": Drift(((256, 512), (256, 256)), c.accel_scale_m_s2, c.accel_curve_m_s2, c.accel_drift_m_s3),
-        }
-        if self.joint:
-            del self.curve["gyro"]
-            drifts["gyro"] = JointField(drifts["gyro"])
-            self.longest_window_s = joint_ode.WINDOW_S
-        self.drift = nn.ModuleDict({sensor: drift for sensor, drift in drifts.items() if sensor in c.drift})
-
-    @property
-    def joint(self) -> bool:
-        """Whether attitude and gyro bias are integrated together; the accelerometer keeps the split scheme."""
-        return self.config.scheme == "joint"
-
-    def _joint_start(self, segment: Segment) -> tuple[JointField, Float[Tensor, "b 3"]]:
-        """Joint field, and bias at the first sample."""
-        field = _part(self.drift, "gyro", JointField)
-        return field, segment.rest[:, :3] + segment.gyro[:, 0] @ field.W.mT
-
-    def end_attitude(
-        self, R_start: Float[Tensor, "b 3 3"], segment: Segment, dt: Float[Tensor, "b steps"]
-    ) -> Float[Tensor, "b 3 3"]:
-        """Attitude at the last sample; in the joint scheme by the joint ODE on SO(3)."""
-        if not self.joint:
-            return super().end_attitude(R_start, segment, dt)
-        field, start = self._joint_start(segment)
-        return joint_ode.end_attitude(field, segment, start, R_start, self.config.solver, adjoint=self.config.adjoint)
-
-    def sensor_bias(self, sensor: Sensor, segment: Segment) -> Float[Tensor, "batch n 3"]:
-        """Bias beta + C(u) at each sample; beta is linear between the steps of the drift."""
-        if self.joint and sensor == "gyro":
-            field, start = self._joint_start(segment)
-            return joint_ode.bias_path(field, segment, start, self.config.solver, adjoint=self.config.adjoint)
-        u, rest = segment.of(sensor)
-        motion: Float[Tensor, "batch n 3"] = self.curve[sensor](u, self._filtered(u, SLOW_S))
-        if sensor not in self.config.drift:
-            return rest[:, None] + motion
-        return self._rest_path(segment.t, u, rest, self.drift[sensor]) + motion
-
-    def begin_at(self, sensor: Sensor, W: Float[Tensor, "3 3"]) -> None:
-        """Set the linear part of the curve, or of the joint field."""
-        joint = self.joint and sensor == "gyro"
-        with torch.no_grad():
-            (_part(self.drift, sensor, JointField) if joint else _part(self.curve, sensor, Curve)).W.copy_(W)
-
-    def _rest_path(
-        self, t: Float[Tensor, "b n"], u: Float[Tensor, "b n 3"], rest: Float[Tensor, "b 3"], drift: nn.Module
-    ) -> Float[Tensor, "b n 3"]:
-        """beta at each sample; the ODE's time is the index on a grid of `stride` samples."""
-        n, stride = u.shape[1], self.stride
-        if n == 1:
-            return rest[:, None]
-        steps = math.ceil((n - 1) / stride)
-        whole = (n - 1) // stride
-        knots = self._filtered(u, DRIFT_FILTER_S)[:, : whole * stride + 1 : stride][:, :steps]
-        path = HermitePath(torch.arange(steps + 1, device=u.device), torch.cat([knots, knots[:, -1:]], dim=1))
-        step_s = ((t[:, -1] - t[:, 0]) / (n - 1) * stride)[:, None]
-
-        beta = _solve(_OnGrid(drift, path, step_s), rest, steps, self.config.solver, self.config.adjoint)
-        index = torch.arange(n, device=u.device) / stride
-        j = index.long().clamp(max=steps - 1)
-        return torch.lerp(beta[j], beta[j + 1], (index - j)[:, None, None].to(u)).transpose(0, 1)
+        shapes, width = super().shapes(config), config.curve_width
+        for sensor in SENSORS[1:] if config.joint else SENSORS:
+            shapes |= {f"curve.{sensor}.W": (3, 3), f"curve.{sensor}.net.4.weight": (3, width)}
+            shapes |= {f"curve.{sensor}.net.0.weight": (width, INPUTS), f"curve.{sensor}.net.0.bias": (width,)}
+            shapes |= {f"curve.{sensor}.net.2.weight": (width, width), f"curve.{sensor}.net.2.bias": (width,)}
+        for sensor in dict.fromkeys(config.drift):
+            shapes |= Drift.shapes(_drift_name(config, sensor), HIDDEN[sensor])
+        return shapes | ({"drift.gyro.W": (3, 3)} if config.joint else {})
 
     def rest_dynamics(self) -> Float64[np.ndarray, "6 6"]:
         """Rest dynamics d g / d beta per second, without motion, at the prior."""
-        F = np.zeros((6, 6))
-        still = self.prior_mean.new_zeros(1, 3)
+        F, still = np.zeros((6, 6)), np.zeros(3)
         for sensor in self.config.drift:
-            columns, drift = COLUMNS[sensor], self.drift[sensor]
-            by_rest = torch.autograd.functional.jacobian(  # type: ignore[no-untyped-call]  # torch gives it no type
-                lambda beta, g=drift: g(beta, still, still)[0], self.prior_mean[None, columns]
-            )
-            F[columns, columns] = by_rest[:, 0].detach().cpu().double().numpy()
+            columns = COLUMNS[sensor]
+            F[columns, columns] = self.drift(sensor).by_rest(self.prior_mean[columns], still, still)
         return F
 
-    def _filtered(self, u: Float[Tensor, "b n 3"], tau_s: float) -> Float[Tensor, "b n 3"]:
-        """Samples filtered by dy/dt = (u - y) / tau, in log2(n) passes (a scan of the recurrence)."""
-        keep = math.exp(-1.0 / (self.rate_hz * tau_s))
-        y = torch.cat([u[:, :1], (1.0 - keep) * u[:, 1:]], dim=1)
-        shift = 1
-        while shift < u.shape[1] and keep > NEGLIGIBLE:
-            y = torch.cat([y[:, :shift], y[:, shift:] + keep * y[:, :-shift]], dim=1)
-            shift, keep = 2 * shift, keep * keep
-        return y
-
     def stream(self, rest: Vector6) -> SampleStream:
-        """Bias stream in numpy by Euler: a step every `stride` samples, or every sample in the joint scheme."""
-        if self.joint:
-            return self._joint_stream(rest)
-        gyro, accel = (_part(self.curve, sensor, Curve).weights() for sensor in SENSORS)
-        drifts = {sensor: _part(self.drift, sensor, Drift).numpy() for sensor in self.config.drift}
-        return NeuralStream(Curves(gyro, accel), drifts, self.stride, self.rate_hz, (SLOW_S, DRIFT_FILTER_S), rest)
+        """Bias stream by Euler: a step every stride of samples, or every sample in the joint scheme."""
+        config = self.config
+        gyro = _no_curve(config.curve_width) if config.joint else self._curve("gyro")
+        drifts = {sensor: self.drift(sensor) for sensor in config.drift if not (config.joint and sensor == "gyro")}
+        curves, stride = Curves(gyro, self._curve("accel")), config.stride(self.rate_hz)
+        split = NeuralStream(curves, drifts, stride, self.rate_hz, (SLOW_S, DRIFT_FILTER_S), rest)
+        return JointStream(self.drift("gyro"), self.tensors["drift.gyro.W"], rest, split) if config.joint else split
 
-    def _joint_stream(self, rest: Vector6) -> SampleStream:
-        field, accel = _part(self.drift, "gyro", JointField), _part(self.curve, "accel", Curve)
-        without_motion = Curve(self.config.curve_width, 1.0, 0.0)  # of the gyro, whose calibration the joint field holds
-        curves = Curves(without_motion.double().weights(), accel.weights())
-        others: tuple[Sensor, ...] = tuple(sensor for sensor in self.config.drift if sensor != "gyro")
-        drifts = {sensor: _part(self.drift, sensor, Drift).numpy() for sensor in others}
-        own = NeuralStream(curves, drifts, self.stride, self.rate_hz, (SLOW_S, DRIFT_FILTER_S), rest)
-        rate = _part(field, "drift", Drift).numpy()
-        return joint_ode.JointStream(rate, field.W.detach().cpu().double().numpy(), rest, own)
+    def drift(self, sensor: Sensor) -> Drift:
+        """Drift of one sensor's rest bias."""
+        return Drift(self.tensors, _drift_name(self.config, sensor), HIDDEN[sensor], self.config.units(sensor)[2])
 
-
-class _OnGrid(nn.Module):
-    """Drift as a field for torchdiffeq: time is the grid's index, the path gives the controls."""
-
-    def __init__(self, drift: nn.Module, path: HermitePath, step_s: Float[Tensor, "b 1"]) -> None:
-        super().__init__()
-        self.drift, self.path, self.step_s = drift, path, step_s
-
-    def forward(self, index: Float[Tensor, ""], beta: Float[Tensor, "b 3"]) -> Float[Tensor, "b 3"]:
-        u, du = self.path.value(index), self.path.derivative(index) / self.step_s
-        rate: Tensor = self.drift(beta, u, du)
-        return self.step_s * rate
+    def _curve(self, sensor: Sensor) -> CurveWeights:
+        scale, curve, _ = self.config.units(sensor)
+        W, *layers = (
+            self.tensors[f"curve.{sensor}.{name}"]
+            for name in ("W", "net.0.weight", "net.0.bias", "net.2.weight", "net.2.bias", "net.4.weight")
+        )
+        return CurveWeights(W, ((layers[0], layers[1]), (layers[2], layers[3]), layers[4]), scale, NEAR_ZERO, curve)
 
 
-def _solve(field: nn.Module, rest: Float[Tensor, "b 3"], steps: int, solver: str, adjoint: bool) -> Float[Tensor, "m b 3"]:
-    grid = torch.arange(steps + 1, device=rest.device, dtype=rest.dtype)
-    solved: Tensor = (odeint_adjoint if adjoint else odeint)(field, rest, grid, method=solver, rtol=1e-6, atol=1e-9)
-    return solved
+def _drift_name(config: Config, sensor: Sensor) -> str:
+    """Prefix of a drift's tensors."""
+    return "drift.gyro.drift" if config.joint and sensor == "gyro" else f"drift.{sensor}"
 
 
-P = TypeVar("P", bound=nn.Module)
+def _no_curve(width: int) -> CurveWeights:
+    """Curve of the joint scheme's gyro, whose calibration the joint field holds."""
+    layers = (np.zeros((width, INPUTS)), np.zeros(width)), (np.zeros((width, width)), np.zeros(width)), np.zeros((3, width))
+    return CurveWeights(np.zeros((3, 3)), layers, 1.0, NEAR_ZERO, 0.0)
 
 
-def _part(parts: nn.Module, name: str, kind: type[P]) -> P:
-    part = parts.get_submodule(name)
-    assert isinstance(part, kind)
-    return part
+class Drift:
+    """Drift g, the slow rate of the rest bias: a perceptron of two residual blocks."""
+
+    def __init__(self, tensors: Mapping[str, Array], name: str, hidden: tuple[tuple[int, ...], ...], rate: float) -> None:
+        self._rate, self._centre, self._units = rate, tensors[f"{name}.centre"], tensors[f"{name}.units"]
+        layers = {key: (tensors[f"{name}.{key}.weight"].T.copy(), tensors[f"{name}.{key}.bias"]) for key in _layers(hidden)}
+        self._out = layers.pop("out")
+        self._blocks = [[layer for key, layer in layers.items() if key.startswith(block)] for block in ("block1", "block2")]
+
+    @staticmethod
+    def shapes(name: str, hidden: tuple[tuple[int, ...], ...]) -> Shapes:
+        """Shapes of the tensors under a name."""
+        shapes: Shapes = {f"{name}.centre": (3,), f"{name}.units": (INPUTS,)}
+        for key, (before, after) in _layers(hidden).items():
+            shapes |= {f"{name}.{key}.weight": (after, before), f"{name}.{key}.bias": (after,)}
+        return shapes
+
+    def __call__(self, beta: Array, u: Array, du: Array) -> Array:
+        """Drift dbeta/dt per second."""
+        x = np.concatenate([beta - self._centre, u, du]) / self._units
+        for block in self._blocks:
+            x = x + _perceptron(block, x)
+        W, b = self._out
+        rate: Array = self._rate * (np.dot(x, W) + b)
+        return rate
+
+    def by_rest(self, beta: Array, u: Array, du: Array) -> Float64[np.ndarray, "3 3"]:
+        """Derivative of the drift with respect to the rest bias."""
+        x = np.concatenate([beta - self._centre, u, du]) / self._units
+        by_rest = np.eye(INPUTS)[:, :3] / self._units[:, None]
+        for block in self._blocks:
+            slope = _perceptron_slope(block, x, by_rest)
+            x, by_rest = x + _perceptron(block, x), by_rest + slope
+        return np.asarray(self._rate * self._out[0].T @ by_rest)
 
 
-def _perceptron(hidden: tuple[int, ...]) -> nn.Sequential:
-    """Perceptron 9 -> hidden -> 9: GELU between hidden layers, tanh before the last."""
-    layers: list[nn.Module] = []
-    for i, (before, width) in enumerate(zip((9, *hidden), hidden, strict=False)):
-        layers += [nn.Linear(before, width), nn.Tanh() if i == len(hidden) - 1 else nn.GELU()]
-    return nn.Sequential(*layers, nn.Linear(hidden[-1], 9))
+def _layers(hidden: tuple[tuple[int, ...], ...]) -> dict[str, tuple[int, int]]:
+    """Inputs and outputs of a drift's linear layers; activations stand between them, hence every second index."""
+    layers: dict[str, tuple[int, int]] = {}
+    for block, widths in enumerate(hidden, 1):
+        sizes = (INPUTS, *widths, INPUTS)
+        layers |= {f"block{block}.{2 * k}": (sizes[k], sizes[k + 1]) for k in range(len(sizes) - 1)}
+    return {**layers, "out": (INPUTS, 3)}
+
+
+def _perceptron(layers: list[tuple[Array, Array]], x: Array) -> Array:
+    """Output of a perceptron: GELU between hidden layers, tanh before the last."""
+    *hidden, before, last = layers
+    for W, b in hidden:
+        x = gelu(np.dot(x, W) + b)
+    x = np.tanh(np.dot(x, before[0]) + before[1])
+    return np.asarray(np.dot(x, last[0]) + last[1])
+
+
+def _perceptron_slope(layers: list[tuple[Array, Array]], x: Array, J: Array) -> Array:
+    """Derivative of a perceptron's output, if J is that of its input."""
+    *hidden, before, last = layers
+    for W, b in hidden:
+        h = np.dot(x, W) + b
+        slope = 0.5 * (1.0 + erf(h * HALF_ROOT)) + h * NORMAL_PEAK * np.exp(-0.5 * h**2)
+        x, J = gelu(h), slope[:, None] * (W.T @ J)
+    x = np.tanh(np.dot(x, before[0]) + before[1])
+    return np.asarray(last[0].T @ ((1.0 - x**2)[:, None] * (before[0].T @ J)))
+
+
+class JointStream:
+    """Bias stream of the joint scheme.
+
+    Gyro by Euler from sample to sample, accelerometer from its curve.
+    """
+
+    def __init__(self, rate: Callable[[Array, Array, Array], Array], W: Array, rest: Vector6, others: SampleStream) -> None:
+        self._rate, self._W, self._rest, self._others = rate, W, rest[:3].astype(np.float64), others
+        self._bias, self._u, self._slope, self._t_s = np.zeros(3), np.zeros(3), np.zeros(3), np.nan
+
+    def __call__(
+        self, t_s: Float64[np.ndarray, " n"], gyro: Float64[np.ndarray, "n 3"], accel: Float64[np.ndarray, "n 3"]
+    ) -> Float64[np.ndarray, "n 6"]:
+        """Bias at each sample."""
+        bias = self._others(t_s, gyro, accel)
+        for k, (t, u) in enumerate(zip(t_s.tolist(), gyro, strict=True)):
+            bias[k, :3] = self._next(t, u)
+        return bias
+
+    def one(self, t_s: float, u: Vector6) -> Vector6:
+        """Bias at one sample."""
+        bias = self._others.one(t_s, u)
+        bias[:3] = self._next(t_s, u[:3])
+        return bias
+
+    def _next(self, t_s: float, u: Array) -> Array:
+        """Gyro bias at the next sample, from the field at the previous one."""
+        if np.isnan(self._t_s):
+            self._bias, self._slope = self._rest + self._W @ u, np.zeros(3)
+        else:
+            step_s = t_s - self._t_s
+            drift = self._rate(self._bias, self._u, self._slope)
+            self._bias = self._bias + step_s * (self._W @ self._slope + drift)
+            self._slope = (u - self._u) / max(step_s, 1e-9)
+        self._t_s, self._u = t_s, u.copy()
+        return self._bias

@@ -1,4 +1,4 @@
-"""Neural ODE in numpy for live use; torch takes twenty times as long for one sample."""
+"""Bias stream of the neural ODE in numpy, for whole logs and single samples."""
 
 from __future__ import annotations
 
@@ -7,12 +7,10 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
-import torch
 from jaxtyping import Float64
 from scipy.special import erf
-from torch import Tensor, nn
 
-from imutool.bias.model import COLUMNS, Vector6
+from imutool.bias.model import COLUMNS, Array, Vector6
 from imutool.sensor.signals import low_pass
 from imutool.units import Sensor
 
@@ -20,7 +18,6 @@ ROWS = 64  # per product: they fit in the cache, and BLAS starts no threads for 
 HALF_ROOT = math.sqrt(0.5)
 CONSTANT = 8.0  # its erf is exactly one: GELU maps a constant to a constant
 
-Array = Float64[np.ndarray, "..."]
 DriftRate = Callable[[Array, Array, Array], Array]
 
 
@@ -32,7 +29,7 @@ class CurveWeights:
     """
 
     W: Float64[np.ndarray, "3 3"]
-    layers: tuple[nn.Linear, nn.Linear, nn.Linear]
+    layers: tuple[tuple[Array, Array], tuple[Array, Array], Array]  # weight and bias; the last layer has no bias
     scale: float
     near_zero: float
     size: float
@@ -49,21 +46,21 @@ class Curves:
 
     def __init__(self, gyro: CurveWeights, accel: CurveWeights) -> None:
         both = (gyro, accel)
-        self._width = width = gyro.layers[0].out_features
+        self._width = width = len(gyro.layers[2].T)
         self._units = np.repeat([curve.near_zero / curve.scale for curve in both], 3)
-        self._bent = any(bool(curve.layers[2].weight.any()) for curve in both)
+        self._bent = any(bool(curve.layers[2].any()) for curve in both)
         self._first = np.zeros((2 * width + 1, 19))
         self._first[width, 6] = CONSTANT
         self._second = np.empty((2, width, width + 1))
         self._last = np.zeros((6, 2 * width + 8))
         for k, curve in enumerate(both):
             unit, own = k * (width + 1), slice(3 * k, 3 * k + 3)
-            first, second, last = (_array(layer.weight) for layer in curve.layers)
+            (first, first_bias), (second, second_bias), last = curve.layers
             for part, start in enumerate((0, 7, 13)):  # u, asinh of u, asinh of s
                 columns = first[:, 3 * part : 3 * part + 3] / (1.0 if part else curve.scale)
                 self._first[unit : unit + width, start + 3 * k : start + 3 * k + 3] = HALF_ROOT * columns
-            self._first[unit : unit + width, 6] = HALF_ROOT * _array(curve.layers[0].bias)
-            constant = _array(curve.layers[1].bias)[:, None] / (2.0 * CONSTANT)
+            self._first[unit : unit + width, 6] = HALF_ROOT * first_bias
+            constant = second_bias[:, None] / (2.0 * CONSTANT)
             self._second[k] = np.concatenate([HALF_ROOT * second, constant][:: 1 - 2 * k], axis=1)
             self._last[own, k * width : (k + 1) * width] = curve.size * last
             self._last[own, 2 * width + 1 :][:, own] = curve.W
@@ -225,35 +222,7 @@ class NeuralStream:
         self._curves.add_line(self._rest, self._slope)
 
 
-def perceptron(module: nn.Module) -> Callable[[Array], Array]:
-    """Perceptron (linear layers with tanh and GELU between them) as a numpy function."""
-    steps: list[Callable[[Array], Array]] = []
-    for layer in module if isinstance(module, nn.Sequential) else [module]:
-        if isinstance(layer, nn.Linear):
-            steps.append(_affine(_array(layer.weight).T.copy(), _array(layer.bias)))
-        elif isinstance(layer, nn.Tanh):
-            steps.append(np.tanh)
-        else:
-            assert isinstance(layer, nn.GELU)
-            steps.append(_gelu)
-
-    def run(x: Array) -> Array:
-        for step in steps:
-            x = step(x)
-        return x
-
-    return run
-
-
-def _affine(W: Array, b: Array) -> Callable[[Array], Array]:
-    return lambda x: np.asarray(np.dot(x, W) + b)
-
-
-def _gelu(x: Array) -> Array:
+def gelu(x: Array) -> Array:
+    """GELU x (1 + erf(x / sqrt 2)) / 2."""
     y: Array = 0.5 * x * (1.0 + erf(x * HALF_ROOT))
     return y
-
-
-def _array(tensor: Tensor) -> Array:
-    out: Array = tensor.detach().to("cpu", torch.float64).numpy()
-    return out

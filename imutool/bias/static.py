@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import ClassVar
 
 import numpy as np
-import torch
-from jaxtyping import Float, Float64
-from torch import Tensor
+from jaxtyping import Float64
 
-from imutool.bias.model import BiasModel, Segment, Stream, Vector6
+from imutool.bias.model import BiasModel, Stream, Vector6
 from imutool.config import Settings
-from imutool.units import Sensor
+
+# Without training runs a measurement outweighs the prior: spreads of a consumer sensor (Bosch BMI160 data sheet: zero-rate
+# offset 3 deg/s, zero-g offset 40 mg).
+UNTRAINED: Mapping[str, np.ndarray] = {
+    "prior_std": np.array([0.05] * 3 + [0.4] * 3, np.float32),  # single precision, as in a file
+    "truth_std": np.array([2e-3] * 3 + [0.1] * 3, np.float32),
+}
 
 
 class Config(Settings, frozen=True):
@@ -25,22 +30,11 @@ class Model(BiasModel):
     """
 
     method: ClassVar[str] = "static"
-    iterative: ClassVar[bool] = False
 
-    def __init__(self, config: Settings | None = None, rate_hz: float = 0.0) -> None:
-        super().__init__(config or Config(), rate_hz)
-        # Without training runs a measurement outweighs the prior: spreads of a consumer sensor (Bosch BMI160 data sheet:
-        # zero-rate offset 3 deg/s, zero-g offset 40 mg).
-        self.prior_std.copy_(torch.tensor([0.05] * 3 + [0.4] * 3))
-        self.truth_std.copy_(torch.tensor([2e-3] * 3 + [0.1] * 3))
-
-    def sensor_bias(self, sensor: Sensor, segment: Segment) -> Float[Tensor, "batch n 3"]:
-        """Rest bias at every sample."""
-        u, rest = segment.of(sensor)
-        return rest[:, None].expand_as(u)
-
-    def begin_at(self, sensor: Sensor, W: Float[Tensor, "3 3"]) -> None:
-        """Ignore the calibration: this model has no matrix."""
+    def __init__(
+        self, config: Settings | None = None, rate_hz: float = 0.0, tensors: Mapping[str, np.ndarray] | None = None
+    ) -> None:
+        super().__init__(config or Config(), rate_hz, UNTRAINED if tensors is None else tensors)
 
     def stream(self, rest: Vector6) -> Stream:
         """Rest bias at every sample."""

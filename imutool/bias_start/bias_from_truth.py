@@ -8,11 +8,9 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-import torch
-from jaxtyping import Bool, Float, Float64
-from torch import Tensor
+from jaxtyping import Bool, Float64
 
-from imutool.bias.model import BiasModel, Vector6
+from imutool.bias.model import Array, BiasModel, Vector6
 from imutool.bias_start.initial_bias import (
     LEAST_STD,
     TRACKED_BY,
@@ -20,20 +18,22 @@ from imutool.bias_start.initial_bias import (
     accuracy,
     bias_over,
     bias_prior,
-    float64,
     prior,
     widened,
 )
 from imutool.errors import DataError
-from imutool.geometry import so3
+from imutool.geometry import quaternion
 from imutool.inertial.strapdown import GRAVITY_W, with_velocity
-from imutool.inertial.windows import HUBER_MEDIANS, attitudes, huber_weight, running_product, step_means
 from imutool.recording import Recording, seconds
 
 TRUTH_S = 15.0  # length of truth for a start: of 3, 5, 8, 10 and 15 s the best on training logs left out in turn
 LEAST_TRUTH_S = 1.0
 WORLD_TILT_STD = np.array([0.0] * 3 + [0.1] * 3)  # m/s²: half a degree, as of EuRoC's second Vicon room (docs/diagnosis.md)
 ITERATIONS = 4
+HUBER_MEDIANS = 1.5  # threshold of an outlier, in medians of the residuals
+
+Rows = Float64[np.ndarray, "n 3"]
+Quaternions = Float64[np.ndarray, "n 4"]
 
 
 def from_truth(model: BiasModel, recording: Recording, truth_s: float = TRUTH_S) -> InitialBias:
@@ -60,9 +60,8 @@ def from_truth(model: BiasModel, recording: Recording, truth_s: float = TRUTH_S)
     assert poses.v_w is not None
     start = prior(model, int(imu.t_ns[0]))
     residual = np.concatenate([piece.gyro, piece.accel], axis=1) - bias_over(model, piece, start.rest)
-    R_wb = so3.matrix_from_quaternion_wxyz(torch.from_numpy(np.array(poses.q_wb_wxyz)))
-    offset = bias_from_truth(t[rows], residual, R_wb, torch.from_numpy(np.array(poses.v_w)), trusted[rows])
-    variance = float64(model.truth_std) ** 2 * (TRUTH_S / length_s) ** 2
+    offset = bias_from_truth(t[rows], residual, quaternion.unit(poses.q_wb_wxyz), poses.v_w, trusted[rows])
+    variance = model.truth_std**2 * (TRUTH_S / length_s) ** 2
     start = replace(start, std=widened(start.std, offset, variance + WORLD_TILT_STD**2))
     rest, std = _updated(start, offset, variance)
     how = f"truth over {length_s:.1f} s{', weighed against the training runs' if model.card else ''}, {accuracy(std)}"
@@ -84,8 +83,8 @@ def _updated(start: InitialBias, offset: Vector6, variance: Vector6) -> tuple[Ve
 def bias_from_truth(
     t_s: Float64[np.ndarray, " n"],
     samples: Float64[np.ndarray, "n 6"],
-    R_wb: Float[Tensor, "n 3 3"],
-    v_w: Float[Tensor, "n 3"],
+    q_wb_wxyz: Quaternions,
+    v_w: Rows,
     trusted: Bool[np.ndarray, " n"],
 ) -> Vector6:
     """Constant bias of samples with true poses: the slope in time of the integration error.
@@ -94,39 +93,54 @@ def bias_from_truth(
     trusted poses with Huber's weights, e_0 being the error of the first pose itself. The accelerometer is rotated with the true
     attitude (half a degree of drift would be a tenth of m/s²), carried through gaps by the gyro.
     """
-    dt, valid = torch.from_numpy(np.diff(t_s))[None], torch.from_numpy(trusted)
-    rate, force = torch.from_numpy(samples[:, :3])[None], torch.from_numpy(samples[:, 3:])[None]
-    offset = torch.zeros(2, 3, dtype=torch.float64)
+    dt = np.diff(t_s)[:, None]
+    rate, force, offset = samples[:, :3], samples[:, 3:], np.zeros(6)
+    turned = quaternion.multiply(quaternion.inverse(q_wb_wxyz[:1]), q_wb_wxyz[1:])
     for _ in range(ITERATIONS):
-        running = running_product(so3.exp(step_means(rate - offset[0]) * dt[..., None]))[0]
-        error = (running @ so3.log(running.mT @ (R_wb[0].mT @ R_wb[1:]))[..., None])[..., 0]
-        by_rate = torch.cumsum(running * dt[0, :, None, None], dim=0)
-        offset[0] -= _slope(error, by_rate, valid[1:])
-    R_wb = _attitudes(t_s, rate - offset[0], R_wb, trusted)
-    a_w = (R_wb @ force[0, ..., None])[..., 0] + torch.tensor(GRAVITY_W, dtype=torch.float64)
-    dv = torch.cumsum(step_means(a_w[None])[0] * dt[0, :, None], dim=0)
-    by_force = torch.cumsum(0.5 * (R_wb[:-1] + R_wb[1:]) * dt[0, :, None, None], dim=0)
-    offset[1] = -_slope(v_w[1:] - v_w[0] - dv, by_force, valid[1:])
-    return offset.flatten().numpy()
+        running = _integrated(rate - offset[:3], dt)
+        R = quaternion.matrix(running)
+        error = quaternion.rotate(running, quaternion.log(quaternion.multiply(quaternion.inverse(running), turned)))
+        offset[:3] -= _slope(error, np.cumsum(R * dt[..., None], axis=0), trusted[1:])
+    R_wb = quaternion.matrix(_attitudes(t_s, rate - offset[:3], q_wb_wxyz, trusted))
+    a_w = (R_wb @ force[..., None])[..., 0] + np.array(GRAVITY_W)
+    dv = np.cumsum(_step_means(a_w) * dt, axis=0)
+    by_force = np.cumsum(_step_means(R_wb) * dt[..., None], axis=0)
+    offset[3:] = -_slope(v_w[1:] - v_w[0] - dv, by_force, trusted[1:])
+    return offset
+
+
+def _step_means(u: Array) -> Array:
+    """Means of each sample and the next: the value over the step between them (reason: `imutool.inertial.windows`)."""
+    means: Array = 0.5 * (u[:-1] + u[1:])
+    return means
+
+
+def _integrated(rate: Rows, dt: Float64[np.ndarray, "m 1"]) -> Float64[np.ndarray, "m 4"]:
+    """Rotation from the first sample to each later one."""
+    return quaternion.unit(quaternion.running_product(quaternion.exp(_step_means(rate) * dt)))
 
 
 def _attitudes(
-    t_s: Float64[np.ndarray, " n"], rate: Float[Tensor, "1 n 3"], R_wb: Float[Tensor, "n 3 3"], trusted: Bool[np.ndarray, " n"]
-) -> Float[Tensor, "n 3 3"]:
+    t_s: Float64[np.ndarray, " n"], rate: Rows, q_wb_wxyz: Quaternions, trusted: Bool[np.ndarray, " n"]
+) -> Quaternions:
     """Integrated attitude, corrected by its error at trusted poses, interpolated in gaps."""
-    R_hat = attitudes(R_wb[:1], rate, torch.from_numpy(np.diff(t_s))[None])[0]
-    error = so3.log(R_hat.mT @ R_wb).numpy()
+    q_hat = np.concatenate([q_wb_wxyz[:1], quaternion.multiply(q_wb_wxyz[:1], _integrated(rate, np.diff(t_s)[:, None]))])
+    error = quaternion.log(quaternion.multiply(quaternion.inverse(q_hat), q_wb_wxyz))
     filled = [np.interp(t_s, t_s[trusted], error[trusted, axis]) for axis in range(3)]
-    return torch.as_tensor(R_hat @ so3.exp(torch.from_numpy(np.stack(filled, axis=1))))
+    return quaternion.unit(quaternion.multiply(q_hat, quaternion.exp(np.stack(filled, axis=1))))
 
 
-def _slope(error: Float[Tensor, "n 3"], by: Float[Tensor, "n 3 3"], valid: Bool[Tensor, " n"]) -> Float[Tensor, "3"]:
+def _slope(error: Rows, by: Float64[np.ndarray, "n 3 3"], valid: Bool[np.ndarray, " n"]) -> Float64[np.ndarray, "3"]:
     """b of error = e_0 + by b, by least squares with Huber's weights."""
-    y, X = error[valid], torch.cat([by[valid], torch.eye(3, dtype=by.dtype).expand(int(valid.sum()), 3, 3)], dim=2)
-    root = torch.ones(len(y), dtype=y.dtype)
+    y = error[valid]
+    X = np.concatenate([by[valid], np.broadcast_to(np.eye(3), (len(y), 3, 3))], axis=2)
+    weight = np.ones(len(y))
     for _ in range(ITERATIONS):
-        weighted = (X * root[:, None, None]).flatten(0, 1), (y * root[:, None]).reshape(-1, 1)
-        solution = torch.linalg.lstsq(*weighted).solution[:, 0]
-        size = (y - X @ solution).norm(dim=1)
-        root = huber_weight(size, (HUBER_MEDIANS * size.median()).clamp_min(1e-9).expand(len(size))).sqrt()
-    return torch.as_tensor(solution[:3])
+        root = np.sqrt(weight)
+        solution = np.linalg.lstsq((X * root[:, None, None]).reshape(-1, 6), (y * root[:, None]).ravel(), rcond=None)[0]
+        size = quaternion.length(y - X @ solution)
+        middle = (len(size) - 1) // 2
+        limit = max(HUBER_MEDIANS * float(np.partition(size, middle)[middle]), 1e-9)
+        weight = limit / np.maximum(size, limit)
+    slope: Float64[np.ndarray, "3"] = solution[:3]
+    return slope

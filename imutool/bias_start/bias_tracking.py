@@ -26,7 +26,6 @@ BLOCK_S = 0.5
 STEP_S = 1.0  # of the covariance of a constant rest bias, whose dynamics take minutes
 USUAL_WALK = np.array([1e-4] * 3 + [2e-3] * 3)  # of a sensor without a trained model
 LOST_S = 1.0  # after a longer gap, attitude and velocity are unknown
-LEAST_SHOWN = 0.2  # precision from the log, of that of the prior, below which the log says nothing about the prior
 CHUNK_S, LOOK_AHEAD_S = 600.0, 600.0  # of smoothing: a bias ten minutes later says nothing about the present one
 
 Samples = tuple[Float64[np.ndarray, " n"], Float64[np.ndarray, "n 3"], Float64[np.ndarray, "n 3"]]
@@ -226,7 +225,7 @@ class ConstantBiasStream:
         self._stream = model.stream(rest)
         self._P, self._t_s = np.diag(std**2), 0.0
         self._transition = expm(model.rest_dynamics() * STEP_S)
-        self._walk = np.diag(model.walk_std.detach().cpu().double().numpy() ** 2) * STEP_S
+        self._walk = np.diag(model.walk_std**2) * STEP_S
 
     def estimate(
         self, t_s: Float64[np.ndarray, " n"], gyro: Float64[np.ndarray, "n 3"], accel: Float64[np.ndarray, "n 3"]
@@ -272,40 +271,3 @@ def smooth_blocks(blocks: Iterable[FilteredBlock]) -> Iterator[tuple[FilteredBlo
     if kept:
         states = inertial_filter.smooth([block.step for block in kept])
         yield from zip(kept, states, strict=False)  # the last state is that of the end
-
-
-class SmoothedBias(NamedTuple):
-    """Smoothed rest bias, time at rest, and what the log alone shows of the bias at its start.
-
-    `difference` is that bias minus the prior's mean, `variance` its variance: infinite where the log shows little.
-    """
-
-    track: BiasTrajectory
-    rested_s: float
-    difference: Vector6
-    variance: Vector6
-
-
-def smooth_bias(model: BiasModel, batches: Iterable[Samples], prior: BiasPrior) -> SmoothedBias:
-    """Smoothed rest bias over a whole log; memory: thirteen numbers per block.
-
-    The trajectory is empty for a log shorter than a block.
-    """
-    rows, rested_s, first = [], 0.0, None
-    for block, state in smooth_blocks(filter_blocks(model, batches, prior, ahead=True)):
-        first = state if first is None else first
-        std = np.sqrt(np.diag(state.covariance(block.resting)))
-        rows.append(np.concatenate([[block.start_s], state.rest_bias(block.resting), std]))
-        rested_s += (block.end_s - block.start_s) * block.resting
-    table = np.array(rows).reshape(-1, 13)
-    shown = (np.zeros(6), np.full(6, np.inf)) if first is None else _shown(first, prior)
-    return SmoothedBias(BiasTrajectory(table[:, 0], table[:, 1:7], table[:, 7:]), rested_s, *shown)
-
-
-def _shown(first: State, prior: BiasPrior) -> tuple[Vector6, Vector6]:
-    """Bias that a log shows without the prior: precision of the smoothed bias minus that of the prior, axis by axis."""
-    after, before = np.diag(first.covariance(False)), prior.std**2
-    precision = 1.0 / after - 1.0 / before
-    measured = precision > LEAST_SHOWN / before
-    gain = np.where(measured, 1.0 - after / before, 1.0)
-    return (first.bias - prior.mean) / gain, np.where(measured, 1.0 / np.where(measured, precision, 1.0), np.inf)

@@ -19,7 +19,6 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 from jaxtyping import Float64
-from torch import Tensor
 
 from imutool.bias.model import COLUMNS, BiasModel, RestBiasEstimator, Stream, Vector6
 from imutool.bias_start.bias_tracking import (
@@ -30,14 +29,17 @@ from imutool.bias_start.bias_tracking import (
     Samples,
     TrackedBiasStream,
     TrajectoryBiasStream,
-    smooth_bias,
+    filter_blocks,
+    smooth_blocks,
 )
 from imutool.errors import ConfigError, DataError
+from imutool.inertial.inertial_filter import State
 from imutool.recording import Imu, seconds
 
 AT_REST_STD = np.array([1e-4] * 3 + [0.03] * 3)  # earth's rotation; local gravity and a tilt of the sensor
 LEAST_STD = np.array([1e-6] * 3 + [1e-4] * 3)  # with a prior of zero variance nothing could be estimated
 SESSION_GAP_S = 6 * 3600.0  # a longer pause is another switching-on
+LEAST_SHOWN = 0.2  # precision from the log, of that of the prior, below which the log says nothing about the prior
 CONTRADICTED = (10.8, 13.8, 16.3)  # chi-square of one, two, three differences that a true prior exceeds once in a thousand logs
 TRACKED_BY = "gravity in motion and every stop"
 
@@ -88,7 +90,7 @@ class InitialBias:
 
 def prior(model: BiasModel, first_ns: int | None = None) -> InitialBias:
     """Prior bias of a log that begins at a stamp: of its session if training saw it, else of a new one."""
-    mean, std = float64(model.prior_mean), float64(model.prior_std)
+    mean, std = model.prior_mean.copy(), model.prior_std.copy()
     sessions = [] if first_ns is None else model.card.get("sessions", [])
     apart = [max(0, session["start_ns"] - first_ns, first_ns - session["end_ns"]) for session in sessions]
     if apart and min(apart) <= SESSION_GAP_S * 1e9:
@@ -103,8 +105,8 @@ def bias_prior(model: BiasModel, first_ns: int | None = None) -> BiasPrior:
     The axes of a sensor share one random walk.
     """
     start = prior(model, first_ns)
-    ground = np.maximum(float64(model.rest_std), AT_REST_STD)
-    walk = np.repeat(np.sqrt(np.mean(float64(model.walk_std).reshape(2, 3) ** 2, axis=1)), 3)
+    ground = np.maximum(model.rest_std, AT_REST_STD)
+    walk = np.repeat(np.sqrt(np.mean(model.walk_std.reshape(2, 3) ** 2, axis=1)), 3)
     walk = np.where(walk > 0, walk, USUAL_WALK)
     return BiasPrior(start.rest, np.maximum(start.std, LEAST_STD), ground, walk)
 
@@ -196,7 +198,38 @@ def bias_over(model: BiasModel, imu: Imu, rest: Vector6) -> Float64[np.ndarray, 
     return model.stream(rest)(*relative_samples(imu))
 
 
-def float64(buffer: Tensor) -> Vector6:
-    """Values of a model's buffer as a numpy copy."""
-    value: Vector6 = buffer.detach().cpu().double().numpy().copy()
-    return value
+class SmoothedBias(NamedTuple):
+    """Smoothed rest bias, time at rest, and what the log alone shows of the bias at its start.
+
+    `difference` is that bias minus the prior's mean, `variance` its variance: infinite where the log shows little.
+    """
+
+    track: BiasTrajectory
+    rested_s: float
+    difference: Vector6
+    variance: Vector6
+
+
+def smooth_bias(model: BiasModel, batches: Iterable[Samples], prior: BiasPrior) -> SmoothedBias:
+    """Smoothed rest bias over a whole log; memory: thirteen numbers per block.
+
+    The trajectory is empty for a log shorter than a block.
+    """
+    rows, rested_s, first = [], 0.0, None
+    for block, state in smooth_blocks(filter_blocks(model, batches, prior, ahead=True)):
+        first = state if first is None else first
+        std = np.sqrt(np.diag(state.covariance(block.resting)))
+        rows.append(np.concatenate([[block.start_s], state.rest_bias(block.resting), std]))
+        rested_s += (block.end_s - block.start_s) * block.resting
+    table = np.array(rows).reshape(-1, 13)
+    shown = (np.zeros(6), np.full(6, np.inf)) if first is None else _shown(first, prior)
+    return SmoothedBias(BiasTrajectory(table[:, 0], table[:, 1:7], table[:, 7:]), rested_s, *shown)
+
+
+def _shown(first: State, prior: BiasPrior) -> tuple[Vector6, Vector6]:
+    """Bias that a log shows without the prior: precision of the smoothed bias minus that of the prior, axis by axis."""
+    after, before = np.diag(first.covariance(False)), prior.std**2
+    precision = 1.0 / after - 1.0 / before
+    measured = precision > LEAST_SHOWN / before
+    gain = np.where(measured, 1.0 - after / before, 1.0)
+    return (first.bias - prior.mean) / gain, np.where(measured, 1.0 / np.where(measured, precision, 1.0), np.inf)

@@ -18,7 +18,7 @@ import msgspec
 import numpy as np
 from numpy.random import Generator, SeedSequence, default_rng
 
-from imutool.blind_cases import draw, unnamed
+from imutool.blind_cases import catalogue, draw
 from imutool.blind_cases.catalogue import NO_LIMIT
 from imutool.blind_cases.effects import TEMPERATURE, Model, Theta
 from imutool.blind_cases.envelope import ConcealedEffect, ConcealedTruth, TrueParameter, digest, read_json, seal, unseal
@@ -120,7 +120,7 @@ def _write(folder: Path, planned: Plan, pose_noise: tuple[float, float], seed: i
     sim = scene.simulated(concealed.acting, rngs[2])
     channels = {
         topic: Scalars(stamps_ns(scene.channel_t_s), np.ascontiguousarray(scene.channels[topic][:, None]), unit)
-        for topic, unit in unnamed.TOPICS.items()
+        for topic, unit in catalogue.TOPICS.items()
     }
     poses = [scene.poses(concealed.acting, noise, rngs[3]) for noise in ((0.0, 0.0), pose_noise)]
     truth = _truth(planned, bias, came_to, seed, trajectory, grade)
@@ -245,4 +245,4 @@ def _check(name: str, value: str, known: Sequence[str]) -> None:
         raise ConfigError(f"`{name}` is {value!r}", where=name, expected=f"one of {', '.join(known)}")
 
 
-assert {TEMPERATURE, *unnamed.DRIVERS} == set(unnamed.TOPICS)
+assert {TEMPERATURE, *catalogue.DRIVERS} == set(catalogue.TOPICS)

@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Float64
 from numpy.random import Generator
 
-from imutool.blind_cases import unnamed
+from imutool.blind_cases import catalogue
 from imutool.blind_cases.catalogue import CATALOGUE, NO_LIMIT, clipping
 from imutool.blind_cases.effects import ACCEL, GYRO, Model, Six, Stage, Theta
 from imutool.blind_cases.information import Detectability, detectable_misfit
@@ -75,7 +75,7 @@ def draw_effects(seen: Detectability, rng: Generator, kind: Kind, size: Size, ef
         DataError: the motion shows nothing of that kind and size.
     """
     for name in effects:
-        if name not in CATALOGUE and not (kind == "unknown" and name in unnamed.FORMS):
+        if name not in CATALOGUE and not (kind == "unknown" and name in catalogue.FORMS):
             raise ConfigError(f"no effect is called {name!r}", where="conceal", expected=f"one of {', '.join(CATALOGUE)}")
     if kind == "null":
         return Concealed(kind, size)
@@ -110,9 +110,9 @@ def _candidates(seen: Detectability, rng: Generator, kind: str, effects: Sequenc
     """Effects in the order in which they are tried, at the plausible size."""
     scene = seen.scene
     if kind == "driven":
-        return [unnamed.driven(rng, {topic: float(values.std()) for topic, values in scene.channels.items()})]
+        return [catalogue.driven(rng, {topic: float(values.std()) for topic, values in scene.channels.items()})]
     if kind == "unknown":
-        return [unnamed.unknown(rng, effects[0] if effects else None)]
+        return [catalogue.unknown(rng, effects[0] if effects else None)]
     ideal = scene.ideal(seen.t_s)
     names = list(effects) or [str(name) for name in rng.permutation(sorted(CATALOGUE))]
     return [(CATALOGUE[name], draw_parameters(CATALOGUE[name], rng, ideal, scene.noise, scene.duration_s)) for name in names]

@@ -13,7 +13,7 @@ import numpy as np
 from msgspec import Struct
 from scipy.interpolate import make_interp_spline
 
-from imutool.blind_cases import unnamed
+from imutool.blind_cases import catalogue
 from imutool.blind_cases.catalogue import AXES, CATALOGUE
 from imutool.blind_cases.effects import Model, Stage, Theta
 from imutool.blind_cases.envelope import ConcealedTruth, Rms
@@ -107,10 +107,10 @@ def _model(name: str, driver: str, equation: str, values: Mapping[str, float]) -
     """Forward model with its parameters; a missing amount is zero, any other missing parameter gives None."""
     if name == "driven":
         sensor, _, axis = equation.partition(" ")[0].partition(".")
-        topic = next((topic for topic in unnamed.TOPICS if driver == topic or driver.startswith(f"{topic}.")), None)
+        topic = next((topic for topic in catalogue.TOPICS if driver == topic or driver.startswith(f"{topic}.")), None)
         if topic is None or sensor not in SIGNALS or axis not in AXES or not {"gain", "lag"} <= set(values):
             return None
-        return unnamed.follower(topic, AXES.index(axis) + 3 * (sensor == "accel")), np.array([values["gain"], values["lag"]])
+        return catalogue.follower(topic, AXES.index(axis) + 3 * (sensor == "accel")), np.array([values["gain"], values["lag"]])
     if name in NOT_SIMULATED or name not in CATALOGUE or (name == "low_pass" and "f_c" not in values):
         return None
     model = CATALOGUE[name]

@@ -13,7 +13,7 @@ from jaxtyping import Float64, Int64
 from numpy.random import Generator
 from scipy.interpolate import make_interp_spline
 
-from imutool.blind_cases import unnamed
+from imutool.blind_cases import catalogue
 from imutool.blind_cases.effects import Model, Reading, Six, Stage, Theta, Times
 from imutool.blind_cases.motion import Kinematics, Motion, Smoother
 from imutool.errors import ConfigError
@@ -180,9 +180,9 @@ def place_scene(smoother: Smoother, noise: Noise, rng: Generator, longest_s: flo
     room = motion.last_s - motion.first_s - 2.0 * MARGIN_S
     duration = np.floor(min(longest_s, room))
     start = motion.first_s + MARGIN_S + rng.uniform(0.0, max(room - duration, 0.0))
-    channel_t = np.arange(int(duration * unnamed.RATE_HZ) + 1) / unnamed.RATE_HZ
+    channel_t = np.arange(int(duration * catalogue.RATE_HZ) + 1) / catalogue.RATE_HZ
     scene = Scene(smoother, motion, float(start), float(duration), density * np.sqrt(RATE_HZ), channel_t)
-    return replace(scene, channels=unnamed.channels(rng, channel_t, scene.ideal(channel_t)))
+    return replace(scene, channels=catalogue.channels(rng, channel_t, scene.ideal(channel_t)))
 
 
 def _imu(t_s: Times, signal: Six) -> Imu:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -22,8 +23,11 @@ class Truth(NamedTuple):
     q_wb_wxyz: Float64[np.ndarray, "n 4"]
 
 
-def read_truth(log: Log) -> Truth | None:
-    """Poses of the log's first readable pose topic; None with fewer than three poses."""
+def read_truth(log: Log, refused: Callable[[str, LogError], None] | None = None) -> Truth | None:
+    """Poses of the log's first readable pose topic; None with fewer than three poses.
+
+    `refused` is called with each topic before it that cannot be read, and with the error.
+    """
     for topic in log.pose_topics:
         times, places, turns = [], [], []
         last = -(2**62)
@@ -35,7 +39,9 @@ def read_truth(log: Log) -> Truth | None:
                     times.append(batch.stamp_ns[keep])
                     places.append(batch.p_wb[keep])
                     turns.append(batch.q_wb_wxyz[keep])
-        except LogError:  # poses are a help here, not what is cleaned: `imutool info` says what is wrong with them
+        except LogError as error:  # poses are a help here, not what is cleaned
+            if refused is not None:
+                refused(topic, error)
             continue
         if sum(map(len, times)) >= 3:
             q_wxyz = np.concatenate(turns)

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, NoReturn
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 from msgspec.structs import replace
@@ -39,7 +40,6 @@ def info(
     quiet: Quiet = False,
 ) -> None:
     """Report the topics, quality and damage of a log; with --noise, also its IMU noise."""
-    from imutool.log_info.inspection import inspect
     from imutool.log_info.report import LogInfos
 
     log_to_stderr(verbose, quiet)
@@ -48,35 +48,48 @@ def info(
         raise ConfigError(f"{idle[0]} needs --noise", where="info", fix="Add --noise")
     if len(logs) > 1 and (noise_plot or noise_toml):
         raise ConfigError(f"{len(logs)} logs do not fit one file", where="--noise-plot, --noise-toml", expected="one log")
-    places = [to_location(log) for log in logs]
-    reports = [inspect(log, check=not quick) for log in places]
-    lost = any(report.losses["stretches"] for report in reports)
-    identified_noises = []
-    if noise:
+    described = [_described(log, quick, noise, {"imu": imu, "truth": truth, "model": model}) for log in logs]
+    reports = [report for report, _ in described]
+    if (identified := described[0][1]) is not None:
+        _write_noise(identified, noise_plot, noise_toml, overwrite)
+    if not write_json(reports[0] if len(reports) == 1 else LogInfos(reports), json_to):
+        for log, (report, identified) in zip(logs, described, strict=True):
+            say(log)
+            _print(report, identified)
+    if any(report.losses["stretches"] for report in reports):
+        raise typer.Exit(LOST)
+
+
+def _described(
+    log: str, quick: bool, noise: bool, settings: Mapping[str, str | None]
+) -> tuple[LogInfo, IdentifiedNoise | None]:
+    """Report on a log, and its noise if requested; the log is opened once."""
+    from imutool.log_info.inspection import describe
+    from imutool.mcap_io.recovery.recovered_log import RecoveredLog
+
+    with RecoveredLog(to_location(log)) as opened:
+        report = describe(opened, check=not quick)
+        if not noise:
+            return report, None
         from imutool import noise_identification
 
-        identified_noises = [noise_identification.identify(log, imu=imu, truth=truth, model=model) for log in places]
-        noises = [noise_identification.plain(identified) for identified in identified_noises]
-        reports = [replace(report, noise=noise) for report, noise in zip(reports, noises, strict=True)]
-        _write_noise(identified_noises[0], noise_plot, noise_toml, overwrite)
-    if write_json(reports[0] if len(reports) == 1 else LogInfos(reports), json_to):
-        _leave(lost)
-    for number, (log, report) in enumerate(zip(logs, reports, strict=True)):
-        say(log)
-        table(topic_rows(report), keys=1)
-        table(imu_rows(report), keys=2)
-        if identified_noises:
-            table(noise_identification.rows(identified_noises[number]), keys=1)
-            for remark in identified_noises[number].remarks:
-                out.print(f"[cyan]noise:[/] {plain(remark)}", highlight=False, soft_wrap=True)
-        for warning in report.warnings:
-            out.print(f"[yellow]warning:[/] {plain(warning)}", highlight=False, soft_wrap=True)
-        tell_losses(report.losses)
-    _leave(lost)
+        identified = noise_identification.identify(opened, **settings)
+        return replace(report, noise=noise_identification.plain(identified)), identified
 
 
-def _leave(lost: bool) -> NoReturn:
-    raise typer.Exit(LOST if lost else 0)
+def _print(report: LogInfo, identified: IdentifiedNoise | None) -> None:
+    """Print tables, remarks, warnings and losses of one log."""
+    table(topic_rows(report), keys=1)
+    table(imu_rows(report), keys=2)
+    if identified is not None:
+        from imutool import noise_identification
+
+        table(noise_identification.rows(identified), keys=1)
+        for remark in identified.remarks:
+            out.print(f"[cyan]noise:[/] {plain(remark)}", highlight=False, soft_wrap=True)
+    for warning in report.warnings:
+        out.print(f"[yellow]warning:[/] {plain(warning)}", highlight=False, soft_wrap=True)
+    tell_losses(report.losses)
 
 
 def _write_noise(identified: IdentifiedNoise, plot: Path | None, toml: Path | None, overwrite: bool) -> None:

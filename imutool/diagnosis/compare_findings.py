@@ -12,8 +12,8 @@ from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 
-from imutool.diagnosis.quantity import grouped
 from imutool.diagnosis.result import Curve, Estimate, Finding
+from imutool.diagnosis.wording.quantity import grouped
 
 ALIKE_STD = 3.0  # parameters this many joint standard deviations apart are two values,
 ALIKE_SHARE = 0.03  # unless they are within this of the largest: smoothed poses lack a per cent of either motion

@@ -24,19 +24,19 @@ from imutool.diagnosis.estimation.noise_estimate import whitened
 from imutool.diagnosis.estimation.observability import unobservable, with_free
 from imutool.diagnosis.estimation.significance import scatter
 from imutool.diagnosis.estimation.whitening import WhitenedImu
+from imutool.diagnosis.held_out import resimulate
 from imutool.diagnosis.reference import (
     align,
     align_all,
+    check_without_reference,
     is_another_motion,
     reference_errors,
     with_unique_names,
     without_unusable,
 )
-from imutool.diagnosis.reference_free_checks import check_without_reference
-from imutool.diagnosis.resimulation import resimulate
 from imutool.diagnosis.result import Closer, Diagnosis, Finding
-from imutool.diagnosis.scalar.diagnose import SignalDiagnosis, diagnose_signal
 from imutool.diagnosis.settings import DiagnoseSettings
+from imutool.diagnosis.signal_diagnosis import SignalDiagnosis, diagnose_signal
 from imutool.diagnosis.to_physics_file import NO_EFFECT
 from imutool.errors import ConfigError, ImutoolError
 from imutool.location import Location
@@ -78,13 +78,13 @@ def diagnose(
     recordings = with_unique_names([read_log(real, imu=imu, truth=truth) for real in reals])
     simulated = None if sim is None else read_log(sim, imu=imu)
     sim_findings: tuple[Finding, ...] = ()
-    if sim is not None and simulated is not None and simulated.truths and is_another_motion(recordings, simulated, signals):
+    if sim is not None and simulated is not None and is_another_motion(recordings, simulated, signals, settings.alignment):
         report(0, 4, "the simulation, of another motion")
         sim_findings, simulated = diagnose([sim], imu=imu, settings=settings).findings, None
     another_motion = sim is not None and simulated is None
-    pairs, left_out = align_all(recordings, simulated, truth, settings.reference)
+    pairs, left_out = align_all(recordings, simulated, truth, settings)
     if not pairs:
-        return check_without_reference(recordings[0], str(reals[0]), left_out[0])
+        return check_without_reference(recordings[0], str(reals[0]), left_out[0], settings)
     report(1, 4, "noise")
     candidates = candidates_for(pairs)
     logs = [whitened(pair, (*candidates, *unnamed.driven([pair])), settings.band) for pair in pairs]
@@ -92,9 +92,7 @@ def diagnose(
     report(2, 4, "searching")
     wrong, wrong_at = reference_errors(logs, settings.reference)
     named, unnamed_groups = ((), ()) if wrong else (candidates, unnamed_candidates(pairs))
-    selection = select_effects(
-        logs, named, unnamed_groups, lambda word: report(2, 4, f"trying {word}"), settings=settings.search
-    )
+    selection = select_effects(logs, named, unnamed_groups, lambda word: report(2, 4, f"trying {word}"))
     report(3, 4, "locating")
     paths = {recording.name: str(real) for recording, real in zip(recordings, reals, strict=True)}
     hidden = unobservable(logs, candidates, settings.search)
@@ -199,7 +197,7 @@ def effect_sizes(
     """
     simulated = None if sim is None else read_log(sim, imu=imu)
     settings = settings or DiagnoseSettings()
-    aligned = align(read_log(real, imu=imu, truth=truth), simulated, truth, settings.reference)
+    aligned = align(read_log(real, imu=imu, truth=truth), simulated, truth, settings)
     pairs = [without_unusable(pair, settings.reference) for pair in aligned]
     candidates = candidates_for(pairs)
     logs = [whitened(pair, candidates, settings.band) for pair in pairs]

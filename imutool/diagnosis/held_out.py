@@ -1,50 +1,59 @@
-"""Held-out residuals: root mean squares, gain of the findings, whiteness."""
+"""Held-out residuals: root mean squares, gain of the findings, whiteness, resimulation."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
+import msgspec
 import numpy as np
 from jaxtyping import Float64
 from scipy.stats import f as fisher
 from scipy.stats import ttest_1samp
 
-from imutool.diagnosis.estimation.aligned_log import Pair
-from imutool.diagnosis.estimation.alignment import LEAST_NOISE
+from imutool.diagnosis.estimation.aligned_log import AlignedLog, Pair
 from imutool.diagnosis.estimation.jacobians import Chosen, expected
 from imutool.diagnosis.estimation.noise_estimate import noise_std
-from imutool.diagnosis.estimation.whitening import WhitenedImu
+from imutool.diagnosis.estimation.whitening import WhitenedImu, WhitenedLog
 from imutool.diagnosis.result import Closer, HeldOut, Unexplained
 from imutool.diagnosis.settings import HeldOutSettings
-from imutool.units import ASCII_UNITS, SENSORS
+from imutool.errors import DataError
+from imutool.recording import Recording
+from imutool.sensor.effect import Acting, simulate_stretches
+from imutool.sensor.physics_file import PhysicsFile
+from imutool.sensor.samples import IdealMotion
+from imutool.sensor.simulate import MOTION_HZ
+from imutool.sensor.trajectory import smooth_motion
+
+LEAST_NOISE = {"gyro": 1e-4, "accel": 1e-3}  # rad/s, m/s²: of a sensor without a usable axis
+AS_GOOD = 0.3  # of the noise: how far a simulation along the poses may be from the one that was given, and still stand for it
+MOST_OF_IT = 0.8  # of the held-out samples that the poses have to cover
 
 
-def with_effects(pair: Pair, chosen: Chosen) -> Float64[np.ndarray, "n 6"]:
+def with_effects(pair: AlignedLog, chosen: Chosen) -> Float64[np.ndarray, "n k"]:
     """Expected samples with some effects and the best constant."""
     return with_constant(pair, expected(pair, chosen))
 
 
-def with_constant(pair: Pair, model: Float64[np.ndarray, "n 6"]) -> Float64[np.ndarray, "n 6"]:
+def with_constant(pair: AlignedLog, model: Float64[np.ndarray, "n k"]) -> Float64[np.ndarray, "n k"]:
     """Expected samples with the best constant; none for an unusable axis."""
     usable = pair.usable
     constant = np.where(usable, pair.real - model, 0.0).sum(axis=0) / np.maximum(usable.sum(axis=0), 1)
     return np.asarray(model + constant)
 
 
-def noise_floor(logs: Sequence[WhitenedImu]) -> Float64[np.ndarray, "6"]:
+def noise_floor(logs: Sequence[WhitenedLog]) -> Float64[np.ndarray, " k"]:
     """Noise standard deviation of a sample by axis; neighbours stand in for an unusable one."""
-    total, count = np.zeros(6), np.zeros(6)
-    for log in logs:
-        total += log.pair.axes * noise_std(log.whiten) ** 2
-        count += log.pair.axes
+    count = np.sum([log.pair.axes for log in logs], axis=0)
+    total = np.sum([log.pair.axes * noise_std(log.whiten) ** 2 for log in logs], axis=0)
     variance = total / np.maximum(count, 1.0)
-    for part in (slice(0, 3), slice(3, 6)):
+    for signal, part in logs[0].pair.signals.items():
         known = count[part] > 0
-        variance[part][~known] = variance[part][known].mean() if known.any() else LEAST_NOISE[part][0] ** 2
+        variance[part][~known] = variance[part][known].mean() if known.any() else LEAST_NOISE[signal] ** 2
     return np.asarray(np.sqrt(variance))
 
 
-def _residual(log: WhitenedImu, model: Float64[np.ndarray, "n 6"], part: slice) -> Float64[np.ndarray, " m"]:
+def _residual(log: WhitenedLog, model: Float64[np.ndarray, "n k"], part: slice) -> Float64[np.ndarray, " m"]:
     """Residual of usable held-out samples, within the band in which the reference is known."""
     pair, counts = log.pair, log.whiten.counts
     residual, rows = pair.real - model, pair.held_out[:: log.whiten.every]
@@ -53,67 +62,71 @@ def _residual(log: WhitenedImu, model: Float64[np.ndarray, "n 6"], part: slice) 
     return np.asarray(residual[rows, part].ravel() if counts is None else residual[rows, part][counts[rows, part]])
 
 
-def gains(logs: Sequence[WhitenedImu], before: Sequence[np.ndarray], after: Sequence[np.ndarray]) -> dict[str, Closer]:
-    """Gain of all findings together by sensor, on held-out time."""
-    noise, out = noise_floor(logs), {}
-    for signal, k in known_sensors([log.pair for log in logs]).items():
-        out[signal] = Closer.computed(held_out_rms(logs, before, after, k, ASCII_UNITS[signal]), sensor_noise(logs, noise, k))
-    return out
+def gains(logs: Sequence[WhitenedLog], before: Sequence[np.ndarray], after: Sequence[np.ndarray]) -> dict[str, Closer]:
+    """Gain of all findings together by signal, on held-out time."""
+    noise = noise_floor(logs)
+    return {
+        signal: Closer.computed(held_out_rms(logs, before, after, signal), signal_noise(logs, noise, signal))
+        for signal in known_signals(logs)
+    }
 
 
-def sensor_noise(logs: Sequence[WhitenedImu], floor: Float64[np.ndarray, "6"], k: int) -> float:
-    """Root mean square noise of a sensor over its usable axes."""
-    part, axes = slice(3 * k, 3 * k + 3), np.any([log.pair.axes for log in logs], axis=0)
+def signal_noise(logs: Sequence[WhitenedLog], floor: Float64[np.ndarray, " k"], signal: str) -> float:
+    """Root mean square noise of a signal over its usable axes."""
+    part, axes = logs[0].pair.signals[signal], np.any([log.pair.axes for log in logs], axis=0)
     return float(np.sqrt(np.mean(floor[part][axes[part]] ** 2)))
 
 
 def held_out_rms(
-    logs: Sequence[WhitenedImu], before: Sequence[np.ndarray], after: Sequence[np.ndarray], k: int, unit: str
+    logs: Sequence[WhitenedLog], before: Sequence[np.ndarray], after: Sequence[np.ndarray], signal: str
 ) -> HeldOut:
-    """Root mean square residuals over held-out samples of a sensor; NaN where none are usable."""
-    part = slice(3 * k, 3 * k + 3)
-    rms = []
+    """Root mean square residuals over held-out samples of a signal; NaN where none are usable."""
+    part, rms = logs[0].pair.signals[signal], []
     for models in (before, after):
         residual = np.concatenate([_residual(log, model, part) for log, model in zip(logs, models, strict=True)])
         rms.append(float(np.sqrt((residual**2).mean())) if len(residual) else float("nan"))
     length = sum(float(log.pair.held_out.sum()) * log.pair.period_s for log in logs)
-    return HeldOut(rms[0], rms[1], unit, round(length, 1))
+    return HeldOut(rms[0], rms[1], logs[0].pair.unit_of(signal), round(length, 1))
 
 
 def unexplained_residuals(
-    logs: Sequence[WhitenedImu],
-    after: Sequence[Float64[np.ndarray, "n 6"]],
-    noises: Float64[np.ndarray, "6"],
+    logs: Sequence[WhitenedLog],
+    after: Sequence[Float64[np.ndarray, "n k"]],
+    noises: Float64[np.ndarray, " k"],
     settings: HeldOutSettings,
 ) -> dict[str, Unexplained]:
-    """Residuals by sensor with their noise; beside poses, blocks decide on whiteness."""
-    out, beside_poses = {}, any(log.whiten.band is not None for log in logs)
-    for signal, k in known_sensors([log.pair for log in logs]).items():
-        held_out, noise = held_out_rms(logs, after, after, k, ASCII_UNITS[signal]), sensor_noise(logs, noises, k)
-        part = slice(3 * k, 3 * k + 3)
+    """Residuals by signal with their noise; beside poses, blocks decide on whiteness."""
+    out, beside_poses, signals = {}, any(log.whiten.band is not None for log in logs), logs[0].pair.signals
+    for signal in known_signals(logs):
+        held_out, noise = held_out_rms(logs, after, after, signal), signal_noise(logs, noises, signal)
+        part = signals[signal]
         held_out_count = sum(len(_residual(log, model, part)) for log, model in zip(logs, after, strict=True))
-        fitted_count = sum(log.count("fitted") for log in logs) / 2.0  # of both sensors
+        fitted_count = sum(log.count("fitted") for log in logs) / len(signals)
         most = settings.white_ratio
         if held_out_count:
             most = max(most, float(np.sqrt(fisher.isf(settings.few_samples_p_value, held_out_count, max(fitted_count, 1.0)))))
         white = held_out.rms_after < most * noise
         if not white and beside_poses:
-            white = _p_value(logs, after, k, noise, settings) > settings.white_p_value
+            white = _p_value(logs, after, part, noise, settings) > settings.white_p_value
         out[signal] = Unexplained(held_out.rms_after, noise, white)
     return out
 
 
 def _p_value(
-    logs: Sequence[WhitenedImu], after: Sequence[Float64[np.ndarray, "n 6"]], k: int, noise: float, settings: HeldOutSettings
+    logs: Sequence[WhitenedLog],
+    after: Sequence[Float64[np.ndarray, "n k"]],
+    part: slice,
+    noise: float,
+    settings: HeldOutSettings,
 ) -> float:
     """p-value of the power of held-out blocks under white noise (Student's t over blocks)."""
     powers: list[float] = []
     for log, model in zip(logs, after, strict=True):
-        if not log.pair.axes[3 * k : 3 * k + 3].any():
+        if not log.pair.axes[part].any():
             continue
         rows = log.pair.held_out[:: log.whiten.every]
         residual = log.pair.real - model if log.whiten.band is None else log.whiten.band(log.pair.real - model)
-        power = (residual[rows, 3 * k : 3 * k + 3][:, log.pair.axes[3 * k : 3 * k + 3]] ** 2).mean(axis=1)
+        power = (residual[rows, part][:, log.pair.axes[part]] ** 2).mean(axis=1)
         block = np.floor(log.pair.stamp_s[:: log.whiten.every][rows] / settings.block_s).astype(int)
         powers += [float(power[block == number].mean()) for number in np.unique(block)]
     if len(powers) < 2:
@@ -121,7 +134,71 @@ def _p_value(
     return float(ttest_1samp(powers, (settings.white_ratio * noise) ** 2, alternative="greater").pvalue)
 
 
-def known_sensors(pairs: Sequence[Pair]) -> dict[str, int]:
-    """Sensors with a usable axis, and their index."""
-    axes = np.any([pair.axes for pair in pairs], axis=0)
-    return {signal: k for k, signal in enumerate(SENSORS) if axes[3 * k : 3 * k + 3].any()}
+def known_signals(logs: Sequence[WhitenedLog]) -> list[str]:
+    """Signals with a usable axis."""
+    axes = np.any([log.pair.axes for log in logs], axis=0)
+    return [signal for signal, part in logs[0].pair.signals.items() if axes[part].any()]
+
+
+# ── a second simulation ──
+
+
+def resimulate(logs: Sequence[WhitenedImu], sim: Recording, physics: PhysicsFile) -> Mapping[str, Closer]:
+    """Gain of a second simulation with some physics by signal, on held-out time.
+
+    Raises:
+        DataError: the simulation has no poses that stand for its samples, or they cover too little of a log.
+        ImutoolError: its poses are no motion, or the physics cannot act on it.
+    """
+    if not sim.truths:
+        raise DataError("it has no poses", where=sim.name, expected="poses to simulate along")
+    motion = smooth_motion(sim.truth)
+    rate_hz = 1.0 / sim.imu.period_s
+    ideals = motion.ideal_motions(rate_hz * max(1, int(np.ceil(MOTION_HZ / rate_hz))))
+    acting = physics.acting()
+    covered, before, after = [], [], []
+    for log in logs:
+        on_its_clock = [_on_clock_of(one, motion.start_ns, log.pair) for one in ideals]
+        plain, simulated = (_read(log.pair, on_its_clock, effects) for effects in ((), acting))
+        finite = np.isfinite(plain).all(axis=1) & np.isfinite(simulated).all(axis=1)
+        pair = replace(log.pair, fitted=log.pair.fitted & finite, held_out=log.pair.held_out & finite)
+        if pair.held_out.sum() < MOST_OF_IT * log.pair.held_out.sum():
+            raise DataError("its poses cover too little of the recording", where=sim.name)
+        covered.append(WhitenedImu(pair, log.whiten))
+        before.append(with_constant(pair, expected(pair, ())))
+        after.append(with_constant(pair, simulated))
+        _refuse_unlike(covered[-1], before[-1], with_constant(pair, plain), sim)
+    return {
+        signal: msgspec.structs.replace(one, by="second simulation") for signal, one in gains(covered, before, after).items()
+    }
+
+
+def _on_clock_of(ideal: IdealMotion, start_ns: int, pair: Pair) -> IdealMotion:
+    """On the recording's clock, with its channels."""
+    first_ns = pair.start_ns - round(float(pair.stamp_s[0]) * 1e9)
+    t_s = ideal.t_s + (start_ns - first_ns) * 1e-9 - pair.aligned_s
+    channels = {name: np.interp(t_s, pair.ideal.t_s, values) for name, values in pair.ideal.channels.items()}
+    return replace(ideal, t_s=t_s, channels=channels)
+
+
+def _read(pair: Pair, ideals: Sequence[IdealMotion], acting: Acting) -> Float64[np.ndarray, "n 6"]:
+    """What the second simulation reads at the recording's stamps; NaN where it has no motion."""
+    stamps = [pair.stamp_s[(pair.stamp_s >= one.t_s[0]) & (pair.stamp_s <= one.t_s[-1])] for one in ideals]
+    samples = simulate_stretches(ideals, stamps, acting)
+    out = np.full(pair.real.shape, np.nan)
+    out[np.searchsorted(pair.stamp_s, samples.stamp_s)] = np.concatenate([samples.gyro, samples.accel], axis=1)
+    return out
+
+
+def _refuse_unlike(
+    log: WhitenedImu, given: Float64[np.ndarray, "n 6"], plain: Float64[np.ndarray, "n 6"], sim: Recording
+) -> None:
+    """Refuse poses so coarse or noisy that they give another simulation than the given one.
+
+    Raises:
+        DataError: so it is here.
+    """
+    rows = log.pair.held_out
+    off = np.sqrt(((given - plain)[rows] ** 2).mean(axis=0))
+    if (off > AS_GOOD * noise_floor([log])).any():
+        raise DataError("a simulation along its poses is not the simulation that was given", where=sim.name)

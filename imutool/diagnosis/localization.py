@@ -16,20 +16,19 @@ from jaxtyping import Bool, Float64
 from scipy.ndimage import uniform_filter1d
 from scipy.stats import chi2, mannwhitneyu
 
-from imutool.diagnosis.estimation.aligned_log import Pair
-from imutool.diagnosis.result import ALWAYS, NO_REGIME, Finding, Located
+from imutool.diagnosis.estimation.aligned_log import IMU_SIGNALS, AlignedLog, Pair, Variables
+from imutool.diagnosis.result import Extent, Finding, Located
 from imutool.diagnosis.settings import LocalizationSettings
 from imutool.units import AXES, SENSORS
 
-Samples = Float64[np.ndarray, "_ 6"]
-Variables = Mapping[str, tuple[str, Float64[np.ndarray, " n"]]]
+Samples = Float64[np.ndarray, "_ k"]
 
 
 def locate_findings(
-    pairs: Sequence[Pair],
+    pairs: Sequence[AlignedLog],
     before: Sequence[Samples],
     after: Sequence[Samples],
-    floor: Float64[np.ndarray, "6"],
+    floor: Float64[np.ndarray, " k"],
     findings: Sequence[Finding],
     p_values: Mapping[str, float],
     settings: LocalizationSettings,
@@ -49,9 +48,9 @@ def locate_residual(
 
 
 def _locate_logs(
-    pairs: Sequence[Pair],
+    pairs: Sequence[AlignedLog],
     misfits: Sequence[Samples],
-    floor: Float64[np.ndarray, "6"],
+    floor: Float64[np.ndarray, " k"],
     p_values: Mapping[str, float],
     settings: LocalizationSettings,
 ) -> list[Located]:
@@ -66,20 +65,20 @@ def _locate_logs(
 
 
 def _locate_log(
-    segments: Sequence[tuple[Pair, Samples]],
-    floor: Float64[np.ndarray, "6"],
+    segments: Sequence[tuple[AlignedLog, Samples]],
+    floor: Float64[np.ndarray, " k"],
     p_values: Mapping[str, float],
     settings: LocalizationSettings,
 ) -> list[Located]:
     """Segments of one log share its clock; each has its own constant."""
     t_s = np.concatenate([pair.stamp_s for pair, _ in segments])
     misfit = np.concatenate([misfit - np.median(misfit, axis=0) for _, misfit in segments])
-    each = [_variables(pair) for pair, _ in segments]
+    each = [pair.variables() for pair, _ in segments]
     variables = {name: (unit, np.concatenate([own[name][1] for own in each])) for name, (unit, _) in each[0].items()}
-    return locate(t_s, misfit, floor, variables, p_values, settings)
+    return locate(t_s, misfit, floor, variables, p_values, settings, segments[0][0].signals)
 
 
-def _converter_output(samples: Float64[np.ndarray, "n 6"], findings: Sequence[Finding]) -> Float64[np.ndarray, "n 6"]:
+def _converter_output(samples: Float64[np.ndarray, "n k"], findings: Sequence[Finding]) -> Float64[np.ndarray, "n k"]:
     """Clipped and rounded as the findings say."""
     out = samples.copy()
     values = {name: estimate.value for finding in findings for name, estimate in finding.parameters.items()}
@@ -92,67 +91,54 @@ def _converter_output(samples: Float64[np.ndarray, "n 6"], findings: Sequence[Fi
     return out
 
 
-def _variables(pair: Pair) -> Variables:
-    """Variables of a regime at the samples, with their units."""
-    read = pair.ideal.sample(pair.stamp_s, pair.stamp_s)
-    rate, force = np.linalg.norm(read.gyro, axis=1), np.linalg.norm(read.accel, axis=1)
-    out = {
-        "angular rate": ("rad/s", rate),
-        "acceleration": ("m/s²", np.abs(force - 9.81)),
-        "angular acceleration": ("rad/s²", np.linalg.norm(read.alpha, axis=1)),
-        "time": ("s", pair.stamp_s),
-    }
-    if read.R_wb is not None:
-        out["tilt"] = ("rad", np.arccos(np.clip(read.R_wb[:, 2, 2], -1.0, 1.0)))
-    for k, axis in enumerate(AXES):
-        out[f"rate about {axis}"] = ("rad/s", np.abs(read.gyro[:, k]))
-        out[f"force along {axis}"] = ("m/s²", np.abs(read.accel[:, k]))
-    return out | {name: ("", values) for name, values in pair.channels.items()}
-
-
 def locate(
     t_s: Float64[np.ndarray, " n"],
-    misfit: Float64[np.ndarray, "n 6"],
-    noise: Float64[np.ndarray, "6"],
+    misfit: Float64[np.ndarray, "n k"],
+    noise: Float64[np.ndarray, " k"],
     variables: Variables,
     p_values: Mapping[str, float],
     settings: LocalizationSettings | None = None,
+    signals: Mapping[str, slice] = IMU_SIGNALS,
 ) -> list[Located]:
-    """Locations of a misfit by sensor, strongest first; samples may span several segments.
+    """Locations of a misfit by signal, strongest first; samples may span several segments.
 
     Args:
         t_s: stamps of the samples.
         misfit: real minus expected samples, without noise.
         noise: standard deviation of a sample, by column.
         variables: what a regime can be of, by name, with unit and values at the samples.
-        p_values: of the findings by sensor; one that is too small for any single second to show it lies everywhere.
+        p_values: of the findings by signal; one that is too small for any single second to show it lies everywhere.
         settings: those of a diagnosis by default.
+        signals: columns by signal; the axes of a signal of three are named.
     """
     settings = settings or LocalizationSettings()
-    found = []
+    located = []
     scaled = (misfit - np.median(misfit, axis=0)) / noise
     seconds, window = np.unique(np.floor((t_s - t_s[0]) / settings.window_s), return_inverse=True)
-    for k, sensor in enumerate(SENSORS):
-        part = scaled[:, 3 * k : 3 * k + 3] ** 2
+    for signal, columns in signals.items():
+        part = scaled[:, columns] ** 2
         axes_power = part.sum(axis=0)
-        axes = [a for a in range(3) if axes_power[a] > max(settings.clear_squares, settings.axis_share * axes_power.max())]
+        least = max(settings.clear_squares, settings.axis_share * axes_power.max())
+        axes = np.flatnonzero(axes_power > least).tolist()
         power = np.bincount(window, weights=part.sum(axis=1))
         inside = power > settings.clear_squares
-        if axes and not inside.any() and p_values.get(sensor, 1.0) < settings.p_value:
+        if axes and not inside.any() and p_values.get(signal, 1.0) < settings.p_value:
             inside = np.ones(len(power), bool)
         if not axes or not inside.any():
             continue
-        found.append(
+        extent, text = regime(inside, power, window, variables, settings)
+        located.append(
             Located(
-                sensor,
-                tuple(AXES[a] for a in axes),
+                signal,
+                tuple(AXES[a] for a in axes) if len(axes_power) == len(AXES) else (),
                 tuple(intervals(float(t_s[0]) + settings.window_s * seconds[inside], settings)),
-                regime(inside, power, window, variables, settings),
+                text,
                 float(power[inside].sum() / max(power.sum(), 1e-300)),
-                p_values.get(sensor, float(chi2.sf(axes_power.sum(), 3))),
+                p_values.get(signal, float(chi2.sf(axes_power.sum(), len(axes_power)))),
+                extent=extent,
             )
         )
-    return sorted(found, key=lambda place: place.p_value)
+    return sorted(located, key=lambda place: place.p_value)
 
 
 def intervals(begins_s: Float64[np.ndarray, " w"], settings: LocalizationSettings) -> list[tuple[float, float]]:
@@ -172,11 +158,11 @@ def regime(
     window: np.ndarray,
     variables: Variables,
     settings: LocalizationSettings,
-) -> str:
-    """Regime in words: "angular rate above 0.4 rad/s", or "always"."""
+) -> tuple[Extent, str]:
+    """Extent of a misfit, and its regime in words: "angular rate above 0.4 rad/s"."""
     high = inside if not inside.all() else power > np.median(power)
     if high.all() or not high.any():
-        return ALWAYS
+        return "everywhere", "always"
     counts = np.maximum(np.bincount(window), 1)
     best: tuple[float, str] | None = None
     for name, (unit, values) in variables.items():
@@ -187,8 +173,8 @@ def regime(
             if p < settings.p_value and index > settings.least_youden and (best is None or index > best[0]):
                 best = index, f"{name} {word} {sign * threshold:.2g} {unit}".strip()
     if best is None:
-        return f"{NO_REGIME}: it comes and goes" if not inside.all() else ALWAYS
-    return best[1] if not inside.all() else f"{ALWAYS}, most with {best[1]}"
+        return ("everywhere", "always") if inside.all() else ("intermittent", "no regime: it comes and goes")
+    return ("everywhere", f"always, most with {best[1]}") if inside.all() else ("regime", best[1])
 
 
 def _youden(level: Float64[np.ndarray, " w"], high: Sequence[bool] | Bool[np.ndarray, " w"]) -> tuple[float, float]:

@@ -1,4 +1,4 @@
-"""Reference of a recording: its alignment, unusable axes, and intervals where it is wrong.
+"""Reference of a recording: alignment, unusable axes, wrong intervals, checks without one.
 
 Poses that were lost and bridged give a simulation, or a truth, another motion there. No effect of a sensor lasts two seconds
 and leaves no trace, so where all the rest is noise, the reference is wrong.
@@ -10,25 +10,31 @@ from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Bool, Float64
 from scipy.stats import chi2
 
 from imutool.diagnosis.estimation import timestamps
 from imutool.diagnosis.estimation.aligned_log import Pair
-from imutool.diagnosis.estimation.alignment import LEAST_S, same_motion, with_simulation, with_truth
+from imutool.diagnosis.estimation.alignment import same_motion, with_simulation, with_truth
 from imutool.diagnosis.estimation.jacobians import expected
 from imutool.diagnosis.estimation.whitening import WhitenedImu
-from imutool.diagnosis.reference_free_checks import unusable_axes
-from imutool.diagnosis.result import NO_REGIME, Estimate, Finding, HeldOut, Located
-from imutool.diagnosis.settings import ReferenceSettings
+from imutool.diagnosis.result import Diagnosis, Estimate, Finding, HeldOut, Located
+from imutool.diagnosis.settings import AlignmentSettings, DiagnoseSettings, ReferenceSettings
+from imutool.diagnosis.wording.quantity import percent
 from imutool.errors import DataError, ImutoolError, NumericsError
-from imutool.recording import Recording
+from imutool.inertial.stationary import white_noise
+from imutool.recording import Recording, seconds
+from imutool.sensor import catalogue
+from imutool.sensor.samples import IdealMotion
 from imutool.sensor.trajectory import smooth_motion
-from imutool.units import ASCII_UNITS, AXES, SENSORS
+from imutool.units import ASCII_UNITS, AXES, SENSORS, UNITS
+
+SOME = 0.05  # of the samples of an axis at its limit, from which it is reported
+BY_THEMSELVES = frozenset({"saturation", "quantization"})  # of the catalogue
 
 
 def align_all(
-    recordings: Sequence[Recording], sim: Recording | None, truth: str | None, settings: ReferenceSettings
+    recordings: Sequence[Recording], sim: Recording | None, truth: str | None, settings: DiagnoseSettings
 ) -> tuple[list[Pair], list[str]]:
     """Recordings aligned with their references, and remarks on what is left out.
 
@@ -46,9 +52,9 @@ def align_all(
                 raise
             refused.append(error.at(recording.name))
             continue
-        pairs += [without_unusable(pair, settings) for pair in aligned]
+        pairs += [without_unusable(pair, settings.reference) for pair in aligned]
         covered = sum(float(pair.stamp_s[-1] - pair.stamp_s[0]) for pair in aligned)
-        if covered < settings.covered_share * recording.imu.duration_s:
+        if covered < settings.reference.covered_share * recording.imu.duration_s:
             what = "its true poses cover" if sim is None else "the simulation covers"
             remarks.append(
                 f"{recording.name}: {what} {covered:.0f} of {recording.imu.duration_s:.0f} s; the rest was not looked at"
@@ -69,14 +75,14 @@ def with_unique_names(recordings: Sequence[Recording]) -> list[Recording]:
     return out
 
 
-def is_another_motion(reals: Sequence[Recording], sim: Recording, signals: Sequence[str]) -> bool:
+def is_another_motion(reals: Sequence[Recording], sim: Recording, signals: Sequence[str], settings: AlignmentSettings) -> bool:
     """Whether the simulation is of another motion than every recording with true poses.
 
     Raises:
         DataError: it is of the motion of some only, or other signals are to be compared with it.
     """
-    alike = [same_motion(real.imu, sim.imu) for real in reals]
-    if all(alike) or not all(real.truths for real in reals):
+    alike = [same_motion(real.imu, sim.imu, settings) for real in reals]
+    if all(alike) or not sim.truths or not all(real.truths for real in reals):
         return False
     if any(alike):
         raise DataError(
@@ -92,28 +98,29 @@ def is_another_motion(reals: Sequence[Recording], sim: Recording, signals: Seque
     return True
 
 
-def align(real: Recording, sim: Recording | None, truth: str | None, settings: ReferenceSettings) -> Iterator[Pair]:
+def align(real: Recording, sim: Recording | None, truth: str | None, settings: DiagnoseSettings) -> Iterator[Pair]:
     """The recording aligned with the simulation, or each interval of it with its own poses."""
     if sim is not None:
-        yield with_simulation(real, sim)
+        yield with_simulation(real, sim, settings)
         return
     if not real.truths:
         raise DataError("no simulation and no true poses", where=real.name, expected="`sim`, or poses in the log")
     chosen = real if truth is not None else real.with_truth(next(iter(real.truths)))
-    motion = smooth_motion(chosen.truth)
-    parts = [ideal for ideal in motion.ideal_motions(1.0 / real.imu.period_s) if ideal.t_s[-1] - ideal.t_s[0] >= LEAST_S]
+    motion, least_s = smooth_motion(chosen.truth), settings.alignment.least_s
+    parts = [ideal for ideal in motion.ideal_motions(1.0 / real.imu.period_s) if ideal.t_s[-1] - ideal.t_s[0] >= least_s]
     if not parts:
         raise DataError(
-            f"the true poses have no stretch of {LEAST_S:g} s that can be differentiated",
+            f"the true poses have no stretch of {least_s:g} s that can be differentiated",
             where=real.name,
             expected="poses at 40 Hz or more, without holes",
             fix="Give a simulation with `sim`",
         )
     for ideal in parts:
-        stretch = next(one for one in motion.stretches if one.start_s <= ideal.t_s[0] <= one.end_s)
+        stretch = next(part for part in motion.stretches if part.start_s <= ideal.t_s[0] <= part.end_s)
         started_ns = int(chosen.imu.t_ns[0])  # times are told from the log's start, also where its poses begin later
         since = replace(ideal, t_s=ideal.t_s + (motion.start_ns - started_ns) * 1e-9)
-        yield with_truth(chosen, since, started_ns, max(settings.band_share * min(stretch.cutoff_hz), settings.least_band_hz))
+        band_hz = max(settings.reference.band_share * min(stretch.cutoff_hz), settings.reference.least_band_hz)
+        yield with_truth(chosen, since, started_ns, band_hz, settings)
 
 
 def without_unusable(pair: Pair, settings: ReferenceSettings) -> Pair:
@@ -122,7 +129,7 @@ def without_unusable(pair: Pair, settings: ReferenceSettings) -> Pair:
     Raises:
         DataError: no axis is left.
     """
-    known = ~(timestamps.clipped(pair.real) | timestamps.stuck(pair.real))
+    known = ~(timestamps.clipped(pair.real, pair.settings.timestamps) | timestamps.stuck(pair.real))
     if known.all():
         return pair
     reduced = replace(pair, known=known)
@@ -194,7 +201,8 @@ def _where(
 ) -> Located:
     power = (white[inside] ** 2).mean(axis=0)
     axes = tuple(axis for axis, value in zip(AXES, power, strict=True) if value > 1.3)
-    return Located(signal, axes or AXES, tuple(runs), f"{NO_REGIME}: the reference's own moments", share, p_value)
+    regime = "no regime: the reference's own moments"
+    return Located(signal, axes or AXES, tuple(runs), regime, share, p_value, extent="intermittent")
 
 
 def _runs(loud: np.ndarray, start_s: float, settings: ReferenceSettings) -> list[tuple[float, float]]:
@@ -208,3 +216,57 @@ def _runs(loud: np.ndarray, start_s: float, settings: ReferenceSettings) -> list
         else:
             out.append((begin, end))
     return out
+
+
+# ── without a reference ──
+
+
+def check_without_reference(real: Recording, path: str, why: str, settings: DiagnoseSettings) -> Diagnosis:
+    """Diagnosis without a reference, for the reason `why`: gaps, quantization, saturation.
+
+    The constant bias is not known either (NaN).
+    """
+    stamp_s = seconds(real.imu.t_ns, int(real.imu.t_ns[0]))
+    samples, no_rows = np.concatenate([real.imu.gyro, real.imu.accel], axis=1), np.zeros(len(stamp_s), bool)
+    no_motion = IdealMotion(stamp_s, *np.zeros((3, len(stamp_s), 3)))
+    pair = Pair(real.name, stamp_s, samples, no_rows, no_rows, ideal=no_motion, settings=settings)
+    findings = [*timestamps.dropped([pair]), *timestamps.rounded([pair], white_noise(samples)), *_limits(pair)]
+    remark = f"{why.rstrip('.')}. Only what stamps and digits show by themselves could be asked"
+    hidden = tuple(effect.name for effect in catalogue.diagnosed() if effect.name not in BY_THEMSELVES)
+    return Diagnosis((path,), None, (), tuple(findings), np.full((1, 6), np.nan), hidden, {}, (remark,))
+
+
+def _limits(pair: Pair) -> list[Finding]:
+    """Saturation: samples that pile up at the largest value."""
+    limits = timestamps.limits(pair.real, pair.settings.timestamps)
+    if not limits:
+        return []
+    parameters = {f"{signal}_limit": Estimate(value, 0.0, UNITS[signal]) for signal, value in limits.items()}
+    length = round(float(pair.stamp_s[-1] - pair.stamp_s[0]), 1)
+    signal = next(iter(limits)) if len(limits) == 1 else "both"
+    held_out = HeldOut(0.0, 0.0, "-", length)
+    return [Finding("saturation", signal, 0.0, 0.0, 0.0, parameters, "readings pile up at +-limit", held_out)]
+
+
+def unusable_axes(pair: Pair) -> list[str]:
+    """Unusable axes of a log, with the reason."""
+    stuck, clipped, saturated, out = (
+        timestamps.stuck(pair.real),
+        timestamps.clipped(pair.real, pair.settings.timestamps).mean(axis=0),
+        at_limit(pair),
+        [],
+    )
+    for a in np.flatnonzero(stuck & ~saturated):
+        signal = SENSORS[a // 3]
+        out.append(f"{signal} {AXES[a % 3]} reads {pair.real[0, a]:.4g} {UNITS[signal]} in every sample")
+    for signal, most in timestamps.limits(pair.real, pair.settings.timestamps).items():
+        k = 3 * SENSORS.index(signal)
+        share = ", ".join(f"{AXES[a - k]} in {percent(float(clipped[a]))}" for a in range(k, k + 3) if saturated[a])
+        if share:
+            out.append(f"{signal} is at its limit of {most:.4g} {UNITS[signal]}: {share} of the samples")
+    return out
+
+
+def at_limit(pair: Pair) -> Bool[np.ndarray, "6"]:
+    """Axes that are clipped in more than 5 % of the samples."""
+    return np.asarray(timestamps.clipped(pair.real, pair.settings.timestamps).mean(axis=0) > SOME)

@@ -17,10 +17,10 @@ from imutool.report import Report, Section
 from imutool.units import ASCII_UNITS
 
 SCHEMA = "imutool.diagnosis/1"
-ALWAYS, NO_REGIME = "always", "no regime"  # how `Located.regime` begins where no regime bounds the misfit
 LEAST_MISFIT = 0.1  # of the noise's power: with less misfit than that, a share of it means nothing
 
 Kind = Literal["catalogue", "driven", "unknown"]
+Extent = Literal["regime", "everywhere", "intermittent"]
 if TYPE_CHECKING:
     Number = float
 else:
@@ -31,7 +31,8 @@ class Located(Section, frozen=True, omit_defaults=True):
     """Location of a misfit: axes of a signal, intervals (s from the log's start) and regime.
 
     `share` is the part of the signal's misfit above the noise that lies there; `p_value` is that of noise alone.
-    `log` is the path of the log where there are several; `reason` says why an unusable axis is no measurement.
+    `log` is the path of the log where there are several; `reason` says why an unusable axis is no measurement. `extent`: the
+    misfit lies in the `regime`, `everywhere` (perhaps most of it in one regime), or comes and goes without one.
     """
 
     signal: str
@@ -42,16 +43,7 @@ class Located(Section, frozen=True, omit_defaults=True):
     p_value: Number
     log: str = ""
     reason: str = ""
-
-    @property
-    def everywhere(self) -> bool:
-        """Whether the misfit lies in all of the log, perhaps most in one regime."""
-        return self.regime.startswith(ALWAYS)
-
-    @property
-    def intermittent(self) -> bool:
-        """Whether the misfit comes and goes without a regime."""
-        return self.regime.startswith(NO_REGIME)
+    extent: Extent = "regime"
 
 
 class Estimate(Section, frozen=True):

@@ -17,6 +17,116 @@ Share = Annotated[float, msgspec.Meta(gt=0, le=1)]
 Count = Annotated[int, msgspec.Meta(ge=1)]
 
 
+class FitSettings(Settings, frozen=True):
+    """Gauss-Newton fit: by experience on planted effects and blind cases.
+
+    Squares are of white residuals, steps those of the fit.
+    """
+
+    prior_std: Positive = 3.0  # of a parameter, over its plausible size: what no motion shows stays at its null value
+    log_prior_std: Positive = 1.5  # of the logarithm of a positive parameter, about the start of the fit
+    iterations: Count = 8  # Gauss-Newton steps at most
+    backtracks: Count = 4  # lengths tried of one step, each half of the one before
+    converged_squares: Positive = 1e-2  # a smaller gain ends the fit
+    patience_steps: Count = 3  # after which a fit that is not below its limit is given up
+    jacobian_error: Positive = 0.05  # of a step's length in white samples, up to which its Jacobian is kept
+    polish_rounds: Count = 8  # halvings of the step of a parameter that jumps
+    between_samples: Positive = 2.0  # inflation of the deviation at an edge, which lies between two samples (20 cases: 1.7)
+
+
+class SplitSettings(Settings, frozen=True):
+    """Fitted and held-out blocks of a log, and its constant bias: by experience on blind cases."""
+
+    block_s: Positive = 6.0  # of one block
+    held_out_each: Annotated[int, msgspec.Meta(ge=2)] = 3  # of so many blocks the last is never fitted
+    margin_s: Positive = 0.3  # around a border between blocks and around a gap: part of neither
+    gap_periods: Positive = 3.0  # a longer step between samples is a gap
+    gyro_bias_std: Positive = 0.5  # rad/s, prior of the constant bias
+    accel_bias_std: Positive = 5.0  # m/s², likewise
+
+
+class NoiseSettings(Settings, frozen=True):
+    """Whitening filters: by experience on blind cases; the order also on real logs."""
+
+    order: Count = 6  # of the autoregression: the noise of a sensor; of poses, on rows that just hold their band
+    motion_hz: Positive = 15.0  # below, a body moves, so that beside a simulation the noise is measured above
+    reference_hz: Positive = 60.0  # up to which it is measured
+    band_filter_s: Positive = 0.6  # length of the low-pass of a band
+    band_oversampling: Positive = 2.5  # samples a period of the band's edge
+    segment_samples: Count = 512  # of a spectrum
+    least_segment_samples: Count = 64  # of a short log
+    least_segments: Count = 8  # the median of one or two says too little
+    line_bins: Count = 9  # of the running median that takes lines out of a spectrum
+    rounds: Count = 2  # alternations of noise and model beside poses
+
+
+class SignificanceSettings(Settings, frozen=True):
+    """Robust covariance and onsets: by experience on poses with coloured errors."""
+
+    least_blocks: Count = 6  # of the robust covariance
+    prior_blocks: Positive = 6.0  # weight, in blocks, of the variance ratio of all rows together
+    most_leverage: Annotated[float, msgspec.Meta(gt=0, lt=1)] = 0.95  # of one block on a parameter, above which it says nothing
+    onset_near_s: Positive = 0.4  # searched on both sides of an onset: as far as the filter of a band smears it
+    onset_times: Annotated[int, msgspec.Meta(ge=3)] = 41  # times tried there
+
+
+class TimestampSettings(Settings, frozen=True):
+    """Missing samples, jitter, digits and limits: by experience on blind cases and on the real logs."""
+
+    median_samples: Count = 15  # of the running median that counts missing samples
+    period_samples: Count = 500  # from which the period is found first
+    period_span: Share = 0.02  # relative to the median step: periods tried on both sides
+    periods: Count = 201  # tried there
+    clear_share: Share = 0.25  # of a period: a stamp so near to its own place is taken at its word
+    least_agreement: Share = 0.3  # of the stamps with one period, below which jitter is large
+    lag_samples: Count = 10  # of a difference that is many periods long, under large jitter
+    least_missing: Count = 3  # samples, from which a loss is reported
+    least_at_limit: Count = 4  # samples at the largest reading, from which it may be a limit
+    piled_factor: Positive = 2.0  # over the count of the next reading: digits come again everywhere
+    clipped_share: Share = 0.995  # of the limit, from which a sample is clipped
+    limit_error: Positive = 1e-3  # relative deviation that a limit is stated with
+    least_jitter_s: Positive = 2e-5  # standard deviation of the stamps
+    least_digits: Positive = 0.3  # of the noise: finer steps leave no trace in it
+    grid_share: Share = 0.98  # of the samples that have to lie on a grid
+    line_samples: Count = 15  # of the local polynomial that the samples follow
+    line_degree: Count = 3  # of that polynomial
+    even_sigma: Positive = 5.0  # deviations by which samples must be nearer to even than to their stamps
+
+
+class AlignmentSettings(Settings, frozen=True):
+    """Alignment of two IMUs in time: by experience on blind cases and on logs without a common epoch."""
+
+    least_s: Positive = 8.0  # of shared time: below, nothing can be fitted and tested
+    align_hz: Positive = 100.0  # of the clock on which angular rates are correlated
+    farthest_s: Positive = 5.0  # by which clocks of one epoch may differ
+    least_correlation: Share = 0.6  # of the angular rates, below which two motions differ
+    noise_band: Share = 0.8  # of Nyquist: above, a simulated motion has nothing but noise
+    smoothed_bins: Count = 15  # of the spectrum of the Wiener filter
+    poses_share: Share = 0.9  # of the simulation that its poses must cover to stand for it
+    poses_hz: Positive = 40.0  # slower poses cannot be differentiated twice
+    coarse_samples: Count = 5  # of the means in which a misfit between poses and samples stands out
+    coarse_factor: Positive = 1.3  # over their noise, up to which poses stand for the samples
+
+
+class SignalSettings(Settings, frozen=True):
+    """Any other signal of a log: by experience on planted effects."""
+
+    least_s: Positive = 15.0  # two blocks to fit and one to test
+    least_samples: Count = 300  # of a spectrum
+    oversampling: Positive = 4.0  # so that a straight line between fine samples is the signal
+    align_hz: Positive = 100.0  # of the clock on which recording and simulation are correlated
+    least_correlation: Share = 0.3  # below which nothing says that the two are one motion
+    noise_band: Share = 0.4  # of the rate: from here to `noise_band_end` a simulation's spectrum is its noise
+    noise_band_end: Share = 0.45
+    better_noise: Share = 0.95  # of the first noise level, below which effects are searched once more
+    power_share: Share = 0.999  # of the signal's power that lies below its edge
+    edge_factor: Positive = 1.3  # over the edge, from where noise is measured
+    least_edge: Share = 0.05  # of the sample rate
+    most_edge: Share = 0.3  # of the sample rate
+    same_grid: Share = 0.01  # relative difference of two LSBs that are one
+    copy_correlation: Share = 0.98  # of another channel, above which it is a copy of the signal
+
+
 class SearchSettings(Settings, frozen=True):
     """Search for effects.
 
@@ -109,6 +219,13 @@ class DiagnoseSettings(Settings, frozen=True):
     """All settings of `imutool diagnose`."""
 
     search: SearchSettings = SearchSettings()
+    fit: FitSettings = FitSettings()
+    split: SplitSettings = SplitSettings()
+    noise: NoiseSettings = NoiseSettings()
+    significance: SignificanceSettings = SignificanceSettings()
+    timestamps: TimestampSettings = TimestampSettings()
+    alignment: AlignmentSettings = AlignmentSettings()
+    signal: SignalSettings = SignalSettings()
     band: BandSettings = BandSettings()
     reference: ReferenceSettings = ReferenceSettings()
     localization: LocalizationSettings = LocalizationSettings()

@@ -11,23 +11,22 @@ from jaxtyping import Float64
 
 from imutool.diagnosis.compare_findings import remarks, shared
 from imutool.diagnosis.estimation import timestamps
-from imutool.diagnosis.estimation import unnamed_effects as unnamed
-from imutool.diagnosis.estimation.aligned_log import Pair
+from imutool.diagnosis.estimation.aligned_log import AlignedLog, Pair
 from imutool.diagnosis.estimation.gauss_newton import Fit, fit
 from imutool.diagnosis.estimation.jacobians import Chosen, expected
 from imutool.diagnosis.estimation.model_selection import SelectedEffect, Selection
 from imutool.diagnosis.estimation.timestamps import late_stamps
-from imutool.diagnosis.estimation.unnamed_effects import unit
-from imutool.diagnosis.estimation.whitening import WhitenedImu
-from imutool.diagnosis.held_out import gains, held_out_rms, known_sensors, noise_floor, unexplained_residuals, with_effects
+from imutool.diagnosis.estimation.unnamed_effects import SplineCurve
+from imutool.diagnosis.estimation.whitening import WhitenedImu, WhitenedLog
+from imutool.diagnosis.held_out import gains, held_out_rms, known_signals, noise_floor, unexplained_residuals, with_effects
 from imutool.diagnosis.localization import locate_findings, locate_residual
-from imutool.diagnosis.reference_free_checks import at_limit, unusable_axes
-from imutool.diagnosis.result import ALWAYS, Curve, Diagnosis, Estimate, Finding, Located, Traces
+from imutool.diagnosis.reference import at_limit, unusable_axes
+from imutool.diagnosis.result import Curve, Diagnosis, Estimate, Finding, Located, Traces
 from imutool.diagnosis.settings import DiagnoseSettings
 from imutool.diagnosis.to_physics_file import to_physics_file
 from imutool.inertial.stationary import white_noise
 from imutool.sensor.physics_file import PhysicsFile
-from imutool.units import ASCII_UNITS, AXES, SENSORS, UNITS
+from imutool.units import AXES, SENSORS, UNITS
 
 JITTER, QUANTIZATION = "timestamp_jitter", "quantization"
 SHOWN_KNOTS = 41  # of a curve without a name in the report
@@ -110,7 +109,7 @@ def physics_of_fitted_time(logs: Sequence[WhitenedImu], selection: Selection, d:
         selected = by_equation.get((finding.effect, finding.equation))
         if selected is None:
             return finding
-        curve = _curve(pairs[0], selected, selection.fitted)
+        curve = _curve(selected, selection.fitted)
         return msgspec.structs.replace(finding, parameters=_parameters(pairs, selected), curve=curve)
 
     return to_physics_file(
@@ -122,29 +121,29 @@ def _worthwhile(
     logs: Sequence[WhitenedImu], selection: Selection, noise: Float64[np.ndarray, "6"]
 ) -> tuple[Selection, list[Finding], list[str]]:
     """Selection without effects of no held-out gain, its findings, and those effects."""
-    named, idle = [_finding(logs, selection, one, noise) for one in selection.selected], []
-    while any(one.share <= 0.0 for one in named):
+    named, idle = [finding_of(logs, selection, selected, noise) for selected in selection.selected], []
+    while any(finding.share <= 0.0 for finding in named):
         least = min(range(len(named)), key=lambda k: named[k].share)
         idle.append(named[least].effect)
         name = selection.selected[least].effect.key
         fitted, whole = (
-            fit(logs, tuple(one for one in those.chosen if one[0].key != name), part=those.part, near=those)
-            for those in (selection.fitted, selection.whole)
+            fit(logs, tuple(entry for entry in before.chosen if entry[0].key != name), part=before.part, near=before)
+            for before in (selection.fitted, selection.whole)
         )
         theta = {effect.key: value for effect, value in whole.chosen}
-        rest = (one for one in selection.selected if one.effect.key != name)
-        selected = tuple(replace(one, theta=theta[one.effect.key]) for one in rest)
-        selection = replace(selection, selected=selected, fitted=fitted, whole=whole)
-        named = [_finding(logs, selection, one, noise) for one in selection.selected]
+        rest = (selected for selected in selection.selected if selected.effect.key != name)
+        kept = tuple(replace(selected, theta=theta[selected.effect.key]) for selected in rest)
+        selection = replace(selection, selected=kept, fitted=fitted, whole=whole)
+        named = [finding_of(logs, selection, selected, noise) for selected in selection.selected]
     return selection, named, idle
 
 
 def _not_identifiable(selection: Selection, idle: Sequence[str], hidden: Sequence[str]) -> tuple[str, ...]:
     """Unidentified parameters of the findings, and unobservable ones of the other effects."""
-    names = [name for one in selection.selected for name in one.unidentified if one.effect.name != JITTER]
+    names = [name for selected in selection.selected for name in selected.unidentified if selected.effect.name != JITTER]
     names += idle
-    selected = {one.effect.name for one in selection.selected}
-    return tuple(dict.fromkeys([*names, *(name for name in hidden if name.partition(".")[0] not in selected)]))
+    reported = {selected.effect.name for selected in selection.selected}
+    return tuple(dict.fromkeys([*names, *(name for name in hidden if name.partition(".")[0] not in reported)]))
 
 
 def _stuck(pair: Pair, floor: Float64[np.ndarray, "6"], *, several: bool) -> Iterator[Located]:
@@ -154,27 +153,25 @@ def _stuck(pair: Pair, floor: Float64[np.ndarray, "6"], *, several: bool) -> Ite
         signal = SENSORS[a // 3]
         reason = f"it reads {pair.real[0, a]:.4g} {UNITS[signal]} in every sample"
         span = ((float(pair.stamp_s[0]), float(pair.stamp_s[-1])),)
-        yield Located(signal, (AXES[a % 3],), span, f"{ALWAYS}: {reason}", 1.0, 0.0, pair.name if several else "", reason)
+        name = pair.name if several else ""
+        yield Located(signal, (AXES[a % 3],), span, f"always: {reason}", 1.0, 0.0, name, reason, extent="everywhere")
 
 
-def _finding(
-    logs: Sequence[WhitenedImu], selection: Selection, selected: SelectedEffect, floor: Float64[np.ndarray, "6"]
+def finding_of(
+    logs: Sequence[WhitenedLog], selection: Selection, selected: SelectedEffect, floor: Float64[np.ndarray, " k"]
 ) -> Finding:
     """Finding of an effect, with its gain on held-out time over the fit without it."""
-    pairs = [log.pair for log in logs]
-    fitted = selection.fitted
-    names = [effect.key for effect, _ in fitted.chosen]
-    k = names.index(selected.effect.key)
-    without: Chosen = (*fitted.chosen[:k], *fitted.chosen[k + 1 :])
-    with_ = [with_effects(pair, fitted.chosen) for pair in pairs]
-    left_out = [with_effects(pair, without) for pair in pairs]
-    no_effects = [with_effects(pair, ()) for pair in pairs]
-    shares, sensors = [], known_sensors(pairs)
-    for j, signal in enumerate(("gyro", "accel")):
-        if signal in selected.effect.sensors and signal in sensors:
-            held_out = held_out_rms(logs, left_out, with_, j, ASCII_UNITS[signal])
-            held_out_of_all = held_out_rms(logs, no_effects, with_, j, ASCII_UNITS[signal])
-            noise = float(np.mean(floor[3 * j : 3 * j + 3] ** 2))
+    pairs, effect, chosen = [log.pair for log in logs], selected.effect, selection.fitted.chosen
+    without: Chosen = tuple(entry for entry in chosen if entry[0].key != effect.key)
+    complete, left_out, no_effects = (
+        [with_effects(pair, these) for pair in pairs] for these in (chosen, without, chosen[: selection.always])
+    )
+    shares, named = [], list[str](effect.sensors) or list(pairs[0].signals)
+    for signal in known_signals(logs):
+        if signal in named:
+            held_out = held_out_rms(logs, left_out, complete, signal)
+            held_out_of_all = held_out_rms(logs, no_effects, complete, signal)
+            noise = float(np.mean(floor[pairs[0].signals[signal]] ** 2))
             most = max(held_out_of_all.rms_before, held_out.rms_before)  # effects may make up for one another
             misfit = max(most**2 - noise, 1e-300)
             excess = held_out.rms_before**2 - held_out.rms_after**2
@@ -182,22 +179,21 @@ def _finding(
     _, share, signal, held_out = max(shares, key=lambda entry: entry[0])
     if sum(brought for brought, *_ in shares) <= 0.0:  # what it takes from one sensor it adds to the other
         share = 0.0
-    named_signal = signal if len(selected.effect.sensors) == 1 else "both"
     return Finding(
-        effect=selected.effect.name,
-        signal=named_signal,
+        effect=effect.name,
+        signal=signal if len(named) == 1 else "both",
         share=share,
         p_value=selected.p_value,
         false_discovery_rate=selected.false_discovery_rate,
         parameters=_parameters(pairs, selected),
-        equation=selected.effect.equation,
+        equation=effect.equation,
         held_out=held_out,
-        driver=selected.effect.variable if selected.effect.kind == "driven" else "",
-        curve=_curve(logs[0].pair, selected, selection.whole),
+        driver=effect.variable if effect.kind == "driven" else "",
+        curve=_curve(selected, selection.whole),
         similar=selected.similar,
-        kind=selected.effect.kind,
-        axis=None if selected.effect.axis is None else AXES[selected.effect.axis],
-        variable=selected.effect.variable,
+        kind=effect.kind,
+        axis=None if effect.axis is None else AXES[effect.axis],
+        variable=effect.variable,
         onset_s=_onset_s(selected),
     )
 
@@ -207,9 +203,9 @@ def _onset_s(selected: SelectedEffect) -> float | None:
     return times[0] if times and np.isfinite(times[0]) else None
 
 
-def _parameters(pairs: Sequence[Pair], selected: SelectedEffect) -> dict[str, Estimate]:
+def _parameters(pairs: Sequence[AlignedLog], selected: SelectedEffect) -> dict[str, Estimate]:
     """Fitted parameters; jitter from the stamps themselves, none for a curve."""
-    if isinstance(selected.effect.forward, unnamed.Curve):
+    if isinstance(selected.effect.forward, SplineCurve):
         return {}
     if selected.effect.name == JITTER:
         jitter_s = np.concatenate([pair.stamp_s - timestamps.even(pair.stamp_s)[0] for pair in pairs])
@@ -221,25 +217,18 @@ def _parameters(pairs: Sequence[Pair], selected: SelectedEffect) -> dict[str, Es
     }
 
 
-def _curve(pair: Pair, selected: SelectedEffect, whole: Fit) -> Curve | None:
-    """Curve of an unknown effect with one standard deviation."""
+def _curve(selected: SelectedEffect, fitted: Fit) -> Curve | None:
+    """Curve of an effect with one standard deviation; its mean belongs to the bias."""
     forward = selected.effect.forward
-    if not isinstance(forward, unnamed.Curve):
+    if not isinstance(forward, SplineCurve):
         return None
     x = forward.points(SHOWN_KNOTS)
     basis = forward.basis(x)
-    first = 0
-    for effect, theta in whole.chosen:
-        if effect.key == selected.effect.key:
-            break
-        first += len(theta)
-    covariance = whole.covariance[first : first + len(selected.theta), first : first + len(selected.theta)]
-    middle = float((basis @ selected.theta).mean())  # a constant belongs to the bias
-    y, band = np.zeros((len(x), 3)), np.zeros((len(x), 3))
-    y[:, forward.axis] = basis @ selected.theta - middle
-    centred = basis - basis.mean(axis=0)
-    band[:, forward.axis] = np.sqrt(np.einsum("nq,qp,np->n", centred, covariance, centred))
-    return Curve.of_arrays(forward.variable, unit(forward.variable), x, y, band, middle)
+    centred, place = basis - basis.mean(axis=0), fitted.place(selected.effect.key)
+    y, band = np.zeros((len(x), forward.columns)), np.zeros((len(x), forward.columns))
+    y[:, forward.axis] = centred @ selected.theta
+    band[:, forward.axis] = np.sqrt(np.einsum("nq,qp,np->n", centred, fitted.covariance[place, place], centred))
+    return Curve.of_arrays(forward.variable, forward.unit, x, y, band, float((basis @ selected.theta).mean()))
 
 
 def _resting(pairs: Sequence[Pair], hidden: Sequence[str]) -> Iterator[str]:

@@ -22,8 +22,8 @@ import numpy as np
 from jaxtyping import Float64
 from scipy.stats import t as student
 
-from imutool.diagnosis.quantity import value as value_text
 from imutool.diagnosis.result import Estimate
+from imutool.diagnosis.wording.quantity import value as value_text
 from imutool.errors import ConfigError
 from imutool.fleet.task import Parameter, Result
 from imutool.location import Location

@@ -75,6 +75,22 @@ def log(q: Quaternions) -> Vectors:
     return u * np.where(w < 0.0, -factor, factor)
 
 
+def matrix(q: Quaternions) -> Float64[np.ndarray, "n 3 3"]:
+    """Rotation matrices of unit quaternions."""
+    return np.stack([rotate(q, np.broadcast_to(axis, (len(q), 3))) for axis in np.eye(3)], axis=2)
+
+
+def running_product(q: Quaternions) -> Quaternions:
+    """Products q_0, q_0 q_1, q_0 q_1 q_2, ...: recursively of pairs, then the even ones filled in."""
+    if len(q) <= 1:
+        return q
+    pairs = running_product(multiply(q[: len(q) // 2 * 2 : 2], q[1::2]))
+    out = np.empty_like(q)
+    out[0], out[1::2] = q[0], pairs
+    out[2::2] = multiply(pairs[: (len(q) - 1) // 2], q[2::2])
+    return out
+
+
 def angle_between(a: Quaternions, b: Quaternions) -> Column:
     """Angles (rad, 0 to pi) between rows, exact also for small ones: 4 atan2(|a - b|, |a + b|)."""
     difference, total = length(a - b), length(a + b)  # q and -q are one rotation

@@ -27,7 +27,6 @@ VELOCITY_ORDER = 3
 SAMPLES_PER_COEFFICIENT = 3  # a stretch shorter than the window gets a lower order, against noise
 
 Vectors = Float64[np.ndarray, "n 3"]
-Quaternions = Float64[np.ndarray, "n 4"]
 
 
 class StartPose(NamedTuple):
@@ -75,7 +74,7 @@ def dead_reckon(
     dt = np.diff(t)[:, None]
     with np.errstate(over="ignore", invalid="ignore"):  # overflow is reported below with its row
         steps = quaternion.exp(imu.gyro[:-1] * dt)
-        q_wb = quaternion.unit(_prefix_product(np.concatenate([quaternion.unit(q_0[None]), steps])))
+        q_wb = quaternion.unit(quaternion.running_product(np.concatenate([quaternion.unit(q_0[None]), steps])))
         a_w = quaternion.rotate(q_wb[:-1], imu.accel[:-1]) + np.asarray(g_w, dtype=np.float64)
         v_w = np.cumsum(np.concatenate([v_0[None], a_w * dt]), axis=0)
         p_wb = np.cumsum(np.concatenate([p_0[None], v_w[:-1] * dt]), axis=0)
@@ -246,14 +245,3 @@ def _slopes(t: Float64[np.ndarray, " n"], p: Vectors, window: int, order: int) -
     weights = np.linalg.pinv(basis)[:, 1, :] / span[:, None]
     slopes: Vectors = np.einsum("nm,nmk->nk", weights, p[rows])
     return slopes
-
-
-def _prefix_product(q: Quaternions) -> Quaternions:
-    """Products q_0, q_0 q_1, q_0 q_1 q_2, ...: recursively of pairs, then the even ones filled in."""
-    if len(q) == 1:
-        return q
-    pairs = _prefix_product(quaternion.multiply(q[: len(q) // 2 * 2 : 2], q[1::2]))
-    out = np.empty_like(q)
-    out[0], out[1::2] = q[0], pairs
-    out[2::2] = quaternion.multiply(pairs[: (len(q) - 1) // 2], q[2::2])
-    return out

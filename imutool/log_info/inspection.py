@@ -12,29 +12,21 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float64, Int64
 
-from imutool.cleaning.rules import saturation
+from imutool.cleaning import raw_batches
+from imutool.cleaning.rules import not_finite, saturation
 from imutool.cleaning.rules.gaps import missing
-from imutool.cleaning.rules.units import (
-    DEGREES,
-    DEGREES_BAND,
-    FULL_SCALE_RAD_S,
-    MIN_TURN_RAD_S,
-    MOVING_TOLERANCE,
-    REST_TOLERANCE,
-    accel_unit,
-    spread,
-)
-from imutool.errors import LogError
+from imutool.cleaning.rules.units import unit_findings
+from imutool.cleaning.truth import Truth, read_truth
 from imutool.inertial.stationary import rest_stretches
 from imutool.location import Location
 from imutool.log_info.report import Clock, ImuInfo, ImuNoise, Interval, LogInfo, TopicInfo, TruthInfo
 from imutool.mcap_io.codec import schemas
-from imutool.mcap_io.codec.decode import decode_imu
 from imutool.mcap_io.log import Log
 from imutool.mcap_io.recovery.recovered_log import RecoveredLog
 from imutool.mcap_io.topics import DERIVED_KEY, ENCODINGS, Topic
-from imutool.recording import GAP_FACTOR, GRAVITY_M_S2, MIN_GAP_S, Imu, nanoseconds, seconds
+from imutool.recording import GAP_FACTOR, MIN_GAP_S, Imu, nanoseconds
 from imutool.report import UNSET
+from imutool.units import SENSORS
 
 CALM_SHARE = 0.25  # of the resting windows, the calmest, that give the noise: motors may idle in the others
 NOISE_WINDOW_S = 1.0
@@ -51,33 +43,44 @@ def inspect(path: Location, *, check: bool = True) -> LogInfo:
         LogError: the file is not an MCAP log, or nothing in it is sound.
     """
     with RecoveredLog(path) as log:
-        if check:
-            log.check()
-        clocks = {name: _joined(log.stamps(name)) for name in log.topics}
-        imus = [_imu(log, topic) for topic in log.topics.values() if topic.schema_name == schemas.IMU]
-        own = [imu for imu in imus if imu.derived_from is UNSET]
-        truths = [_coverage(name, clocks[name], clocks[own[0].topic]) for name in log.pose_topics if own]
-        warnings = [f"{imu.topic}: {warning}" for imu in imus for warning in imu.warnings]
-        warnings += _truth_warnings(log, own, truths)
-        stamps = [clock for clock in clocks.values() if len(clock)]
-        first, last = min((int(c.min()) for c in stamps), default=None), max((int(c.max()) for c in stamps), default=None)
-        return LogInfo(
-            log=path.stem,
-            path=str(path),
-            bytes=path.stat().st_size,
-            profile=log.profile,
-            messages=sum(len(clock) for clock in clocks.values()),
-            first_ns=first,
-            last_ns=last,
-            duration_s=None if first is None or last is None else (last - first) * 1e-9,
-            topics=[_topic(topic, clocks[name]) for name, topic in log.topics.items()],
-            imu=imus,
-            truth=truths,
-            metadata=sorted(log.metadata()),
-            warnings=warnings,
-            checked=check,
-            losses=log.losses.plain(),
-        )
+        return describe(log, check=check)
+
+
+def describe(log: RecoveredLog, *, check: bool = True) -> LogInfo:
+    """As `inspect`, of a log that is open.
+
+    Raises:
+        LogError: nothing in it is sound.
+    """
+    if check:
+        log.check()
+    clocks = {name: _joined(log.stamps(name)) for name in log.topics}
+    refused: list[str] = []
+    true_poses = read_truth(log, lambda topic, error: refused.append(f"{topic}: {error.what}"))
+    imus = [_imu(log, topic, true_poses) for topic in log.topics.values() if topic.schema_name == schemas.IMU]
+    own = [imu for imu in imus if imu.derived_from is UNSET]
+    truths = [_coverage(name, clocks[name], clocks[own[0].topic]) for name in log.pose_topics if own]
+    warnings = [f"{imu.topic}: {warning}" for imu in imus for warning in imu.warnings]
+    warnings += [*_truth_warnings(own, truths), *refused]
+    stamps = [clock for clock in clocks.values() if len(clock)]
+    first, last = min((int(c.min()) for c in stamps), default=None), max((int(c.max()) for c in stamps), default=None)
+    return LogInfo(
+        log=log.path.stem,
+        path=str(log.path),
+        bytes=log.path.stat().st_size,
+        profile=log.profile,
+        messages=sum(len(clock) for clock in clocks.values()),
+        first_ns=first,
+        last_ns=last,
+        duration_s=None if first is None or last is None else (last - first) * 1e-9,
+        topics=[_topic(topic, clocks[name]) for name, topic in log.topics.items()],
+        imu=imus,
+        truth=truths,
+        metadata=sorted(log.metadata()),
+        warnings=warnings,
+        checked=check,
+        losses=log.losses.plain(),
+    )
 
 
 def _joined(parts: Iterable[Int64[np.ndarray, " n"]]) -> Int64[np.ndarray, " m"]:
@@ -103,14 +106,16 @@ def _clock(t_ns: Int64[np.ndarray, " n"]) -> Clock:
     )
 
 
-def _imu(log: Log, topic: Topic) -> ImuInfo:
+def _imu(log: Log, topic: Topic, truth: Truth | None) -> ImuInfo:
     """Defects, rest and noise of an IMU; only a warning if its encoding is unknown."""
     derived_from = topic.metadata.get(DERIVED_KEY, UNSET)
     if topic.message_encoding not in ENCODINGS:
         warnings = [f"encoding {topic.message_encoding!r} is not read"]
         return ImuInfo(topic=topic.name, warnings=warnings, derived_from=derived_from)
-    t_ns, gyro, accel = _columns(log, topic)
-    finite = np.isfinite(gyro).all(axis=1) & np.isfinite(accel).all(axis=1)
+    batches = list(raw_batches(log, topic.name))
+    t_ns = _joined(batch.stamp_ns for batch in batches)
+    gyro, accel = (np.concatenate([np.empty((0, 3)), *(getattr(batch, name) for batch in batches)]) for name in SENSORS)
+    finite = not_finite.measured(gyro) & not_finite.measured(accel)
     ordered, first = np.unique(t_ns[finite], return_index=True)
     imu = Imu(ordered, gyro[finite][first], accel[finite][first])
     later = np.maximum.accumulate(t_ns) if len(t_ns) else t_ns
@@ -124,7 +129,7 @@ def _imu(log: Log, topic: Topic) -> ImuInfo:
     rest = _rest(imu)
     return ImuInfo(
         topic=topic.name,
-        warnings=_imu_warnings(counts, imu, rest.accel_m_s2),
+        warnings=_imu_warnings(counts, imu, truth),
         derived_from=derived_from,
         samples=len(t_ns),
         **_clock(t_ns)._asdict(),
@@ -135,18 +140,6 @@ def _imu(log: Log, topic: Topic) -> ImuInfo:
         accel_at_rest_m_s2=rest.accel_m_s2,
         noise=rest.noise,
     )
-
-
-def _columns(log: Log, topic: Topic) -> tuple[Int64[np.ndarray, " n"], Float64[np.ndarray, "n 3"], Float64[np.ndarray, "n 3"]]:
-    """Unchecked header stamps, rates and specific forces, in the order of the file."""
-    stamps, gyro, accel = [np.empty(0, np.int64)], [np.empty((0, 3))], [np.empty((0, 3))]
-    for _, rows in log.rows([topic.name], None, None):
-        for part, layout in schemas.runs(rows.payload, schemas.IMU, topic.message_encoding):
-            columns = decode_imu(rows.payload[part], topic.message_encoding, layout)
-            stamps.append(columns.stamp_ns)
-            gyro.append(columns.gyro)
-            accel.append(columns.accel)
-    return np.concatenate(stamps), np.concatenate(gyro), np.concatenate(accel)
 
 
 def _missing(ordered_ns: Int64[np.ndarray, " n"]) -> int:
@@ -208,7 +201,7 @@ def _noise(imu: Imu, samples: list[slice]) -> ImuNoise | None:
     return ImuNoise(gyro.tolist(), (gyro * root_s).tolist(), accel.tolist(), (accel * root_s).tolist())
 
 
-def _imu_warnings(counts: Mapping[str, int], imu: Imu, rest_accel: float | None) -> list[str]:
+def _imu_warnings(counts: Mapping[str, int], imu: Imu, truth: Truth | None) -> list[str]:
     words = {
         "out_of_order": "samples out of order",
         "duplicated": "samples with a repeated stamp",
@@ -217,26 +210,12 @@ def _imu_warnings(counts: Mapping[str, int], imu: Imu, rest_accel: float | None)
         "saturated": "samples saturated",
     }
     warnings = [f"{counts[key]} {text}" for key, text in words.items() if counts[key]]
-    if not len(imu):
-        return [*warnings, "no samples"]
-    if rest_accel is not None:
-        warnings += _accel_warnings(rest_accel, "at rest")
-    elif abs((level := float(np.median(np.linalg.norm(imu.accel, axis=1)))) / GRAVITY_M_S2 - 1.0) > 0.5:
-        warnings += _accel_warnings(level, "in the median")
-    largest = float(np.abs(imu.gyro).max())
-    if largest > FULL_SCALE_RAD_S:
-        warnings.append(f"gyro reaches {largest:.4g}: the unit looks like deg/s, not rad/s")
-    return warnings
+    return [*warnings, *_unit_warnings(imu, truth)] if len(imu) else [*warnings, "no samples"]
 
 
-def _accel_warnings(level: float, when: str) -> list[str]:
-    """Warnings about the unit of a reading."""
-    unit = accel_unit(level, REST_TOLERANCE if when == "at rest" else MOVING_TOLERANCE)
-    if unit == "m/s^2":
-        return []
-    if unit:
-        return [f"accel magnitude {when} is {level:.4g}: the unit looks like {unit}, not m/s^2"]
-    return [f"accel magnitude {when} is {level:.4g} m/s^2, gravity is {GRAVITY_M_S2}"]
+def _unit_warnings(imu: Imu, truth: Truth | None) -> list[str]:
+    """Warnings about units, by the same rule as `clean`; its notes are no warnings."""
+    return [finding.what for finding in unit_findings(imu, truth) if finding.severity != "note"]
 
 
 def _coverage(name: str, truth_ns: Int64[np.ndarray, " n"], imu_ns: Int64[np.ndarray, " m"]) -> TruthInfo:
@@ -264,36 +243,9 @@ def _coverage(name: str, truth_ns: Int64[np.ndarray, " n"], imu_ns: Int64[np.nda
     )
 
 
-def _truth_warnings(log: Log, imus: list[ImuInfo], truths: list[TruthInfo]) -> list[str]:
-    if not imus:
+def _truth_warnings(own: list[ImuInfo], truths: list[TruthInfo]) -> list[str]:
+    if not own:
         return ["no IMU topic"]
     if not truths:
         return ["no true poses"]
-    warnings = [f"{truth.topic}: shares no time with the IMU" for truth in truths if truth.coverage == 0.0]
-    if imus[0].samples is not UNSET and not any("deg/s" in warning for warning in imus[0].warnings):
-        try:
-            warnings += _rate_warning(log, imus[0].topic, truths[0].topic)
-        except LogError as error:
-            warnings.append(f"{truths[0].topic}: {error.what}")
-    return warnings
-
-
-def _rate_warning(log: Log, imu_topic: str, truth_topic: str) -> list[str]:
-    """Warn if the gyro's spread is about 57.3 times the true rate: it reads deg/s."""
-    batches = list(log.pose_batches(truth_topic))
-    t_ns, first = np.unique(_joined(batch.stamp_ns for batch in batches), return_index=True)
-    if len(t_ns) < 3:
-        return []
-    q_wxyz = np.concatenate([batch.q_wb_wxyz for batch in batches])[first]
-    t_imu, gyro, _ = _columns(log, log.topics[imu_topic])
-    gyro = gyro[(t_imu >= t_ns[0]) & (t_imu <= t_ns[-1]) & np.isfinite(gyro).all(axis=1)]
-    step = max(1, round(0.1 / max(float(np.median(np.diff(t_ns))) * 1e-9, 1e-9)))  # 0.1 s: beyond the noise of a pose
-    if len(t_ns) <= step or not len(gyro):
-        return []
-    cosine = np.abs(np.einsum("ij,ij->i", q_wxyz[step:], q_wxyz[:-step])).clip(0.0, 1.0)
-    rate = 2.0 * np.arccos(cosine) / (seconds(t_ns[step:], int(t_ns[0])) - seconds(t_ns[:-step], int(t_ns[0])))
-    true_rms = float(np.sqrt(np.median(rate**2)))
-    ratio = spread(gyro) / max(true_rms, 1e-12)
-    if true_rms < MIN_TURN_RAD_S or not DEGREES_BAND[0] <= ratio / DEGREES <= DEGREES_BAND[1]:
-        return []
-    return [f"{imu_topic}: gyro is {ratio:.3g} times the true rate: the unit looks like deg/s, not rad/s"]
+    return [f"{truth.topic}: shares no time with the IMU" for truth in truths if truth.coverage == 0.0]

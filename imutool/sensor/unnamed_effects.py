@@ -81,6 +81,15 @@ CHANGES: tuple[tuple[str, Callable[[Any], Any]], ...] = (
 )
 
 
+def product_of(text: str) -> Variable | None:
+    """Product of factors as a function of the samples; None if a factor is not known."""
+    parsed = [factor(word) for word in factors(text)]
+    functions = [function for function in parsed if function is not None]
+    if not parsed or len(functions) < len(parsed):
+        return None
+    return lambda samples: np.asarray(np.prod([function(samples) for function in functions], axis=0))
+
+
 def constant_bias(gyro: Sequence[float], accel: Sequence[float]) -> Effect:
     """Effect of a constant bias (rad/s, m/s²)."""
 
@@ -118,14 +127,12 @@ def curve(label: str, signal: Sensor, variable: str, x: Float64[np.ndarray, " k"
 
 def product(label: str, signal: Sensor, text: str, value: Sequence[float]) -> Effect | None:
     """Effect of a product of factors, so many times on each axis; None if a factor is not known."""
-    parsed = [factor(word) for word in factors(text)]
-    functions = [function for function in parsed if function is not None]
-    if not parsed or len(functions) < len(parsed):
+    function = product_of(text)
+    if function is None:
         return None
 
     def forward(samples: SensorSamples, _: Theta) -> SensorSamples:
-        size = np.prod([variable(samples) for variable in functions], axis=0)
-        return samples.with_added(signal, np.outer(size, value))
+        return samples.with_added(signal, np.outer(function(samples), value))
 
     return Effect(f"{UNKNOWN}[{label}]", Stage.SENSOR, (signal,), f"{signal} += c {text}", (), "it varies", forward)
 

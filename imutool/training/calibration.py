@@ -25,8 +25,11 @@ from jaxtyping import Float
 from scipy.stats import chi2
 from torch import Tensor
 
-from imutool.bias import hybrid, neural_ode
-from imutool.bias.model import BiasModel
+from imutool.bias import neural_ode
+from imutool.bias.hybrid import Config
+from imutool.bias.networks import hybrid
+from imutool.bias.networks import neural_ode as ode_network
+from imutool.bias.networks.network import BiasNetwork
 from imutool.config import build, plain
 from imutool.errors import ConfigError
 from imutool.recording import Imu, Recording, seconds
@@ -170,7 +173,7 @@ def _unseen(effects: Sequence[LinearForm], problem: Problem, covariance: Float[T
 class PhysicsFirst:
     """Hybrid model with fitted effects, and the recordings corrected for them."""
 
-    model: hybrid.Model
+    model: hybrid.Network
     fits: dict[Sensor, Calibration]
     recordings: list[Recording]
 
@@ -186,12 +189,12 @@ class PhysicsFirst:
         """
         pool = Pool.of(recordings, device=device)
         torch.manual_seed(settings.seed)
-        model = hybrid.Model(config_of(settings), pool.rate_hz).double()
+        model = hybrid.Network(config_of(settings), pool.rate_hz).double()
         signals, fits = _online_signals(recordings, pool), {}
         gyro = pool.gyro
         for sensor in SENSORS:
             report(Epoch(sensor, 0, 0, math.nan, math.nan, math.nan, 0.0, f"looking for effects on the {sensor}"))
-            chosen = calibrate(pool, sensor, gyro, model.named(sensor), "train", signals)
+            chosen = calibrate(pool, sensor, gyro, model.config.effects(sensor), "train", signals)
             whole = calibrate(pool, sensor, gyro, chosen.effects, "all", signals)  # nothing is left to be chosen
             fits[sensor] = replace(whole, gains=chosen.gains)
             model.take(sensor, fits[sensor].effects, fits[sensor].theta, fits[sensor].covariance)
@@ -205,10 +208,10 @@ class PhysicsFirst:
         ode: neural_ode.Config = self.model.config.ode
         return msgspec.structs.replace(settings, model=plain(ode))
 
-    def finish(self, learnt: BiasModel) -> hybrid.Model:
+    def finish(self, learnt: BiasNetwork) -> hybrid.Network:
         """Complete model with the trained ODE, or without one where a constant was enough."""
         model = self.model
-        if isinstance(learnt, neural_ode.Model):
+        if isinstance(learnt, ode_network.Network):
             assert model.ode is not None
             model.ode.load_state_dict(learnt.state_dict())
         else:
@@ -241,13 +244,13 @@ def helps(before: dict[Sensor, float], after: dict[Sensor, float]) -> bool:
     return max(gains) >= LEAST_ODE_GAIN and min(gains) > -LEAST_ODE_GAIN
 
 
-def config_of(settings: TrainSettings) -> hybrid.Config:
+def config_of(settings: TrainSettings) -> Config:
     """Model settings, their effects checked.
 
     Raises:
         ConfigError: an unknown setting or effect (the nearest is named), or an effect on the wrong sensor.
     """
-    config = build(hybrid.Config, settings.model, where="model settings of hybrid")
+    config = build(Config, settings.model, where="model settings of hybrid")
     catalogue.trained("gyro", config.gyro_effects or ())
     catalogue.trained("accel", config.accel_effects or ())
     return config
@@ -266,12 +269,12 @@ def _signals(imu: Imu, rate_hz: float) -> Signals:
     return SignalFilter(rate_hz)(seconds(imu.t_ns, int(imu.t_ns[0])), imu.gyro, imu.accel)
 
 
-def _without(model: hybrid.Model, recordings: Sequence[Recording]) -> list[Recording]:
+def _without(model: hybrid.Network, recordings: Sequence[Recording]) -> list[Recording]:
     """Recordings corrected for the model's effects."""
     return [replace(recording, imu=_corrected(model, recording.imu)) for recording in recordings]
 
 
-def _corrected(model: hybrid.Model, imu: Imu) -> Imu:
+def _corrected(model: hybrid.Network, imu: Imu) -> Imu:
     signals = _signals(imu, model.rate_hz)
     return Imu(imu.t_ns, imu.gyro - model.error("gyro", signals), imu.accel - model.error("accel", signals))
 

@@ -35,9 +35,8 @@ def save(training: Training, path: Path) -> None:
         tensors |= {f"usual.{n}": value for n, value in stage.objective.loss.medians.items()}
         for index, state in stage.optimizer.state_dict()["state"].items():
             tensors |= {f"optimizer.{index}.{name}": value for name, value in state.items()}
-    # clones: safetensors refuses tensors that share memory, as a model and its best state may
-    copies = {name: value.detach().cpu().clone().contiguous() for name, value in tensors.items()}
-    write_tensors(copies, {"format": FORMAT, "about": json.dumps(about)}, path, overwrite=True)
+    arrays = {name: value.detach().cpu().contiguous().numpy() for name, value in tensors.items()}
+    write_tensors(arrays, {"format": FORMAT, "about": json.dumps(about)}, path, overwrite=True)
 
 
 def restore(training: Training, path: Path) -> None:
@@ -47,7 +46,8 @@ def restore(training: Training, path: Path) -> None:
         ConfigError: the checkpoint is of other logs, another method or other settings.
         ModelError: it is damaged.
     """
-    tensors, header = read_tensors(path, FORMAT)
+    arrays, header = read_tensors(path, FORMAT)
+    tensors = {name: torch.from_numpy(value) for name, value in arrays.items()}
     try:
         about = json.loads(header["about"])
         if about["identity"] != _identity(training):

@@ -15,7 +15,8 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from imutool.bias.model import COLUMNS, BiasModel
+from imutool.bias.model import COLUMNS
+from imutool.bias.networks.network import BiasNetwork
 from imutool.errors import DataError
 from imutool.geometry import so3
 from imutool.inertial.strapdown import GRAVITY_W
@@ -48,7 +49,7 @@ class Solution:
 
 
 def sensor_residual(
-    model: BiasModel, sensor: Sensor, windows: Windows, W: Float[Tensor, "3 3"] | None = None
+    model: BiasNetwork, sensor: Sensor, windows: Windows, W: Float[Tensor, "3 3"] | None = None
 ) -> tuple[Float[Tensor, "batch 3"], Float[Tensor, "batch n 3 3"]]:
     """Residual of each window's debiased samples, and its Jacobian by each sample.
 
@@ -68,7 +69,7 @@ def sensor_residual(
 
 @torch.no_grad()
 def solve(
-    model: BiasModel,
+    model: BiasNetwork,
     sensor: Sensor,
     pool: Pool,
     rest: Float[Tensor, "logs 6"],

@@ -21,7 +21,8 @@ from torch import Tensor
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
 from imutool import registry
-from imutool.bias.model import COLUMNS, BiasModel
+from imutool.bias.model import COLUMNS
+from imutool.bias.networks.network import BiasNetwork
 from imutool.config import build
 from imutool.errors import ConfigError, DataError, NumericsError
 from imutool.recording import Recording
@@ -95,11 +96,12 @@ class Training:
     ) -> None:
         self.settings = settings_for(method, settings)
         check_device(device)
-        module = registry.load("imutool.bias", method)
         self.pool = Pool.of(recordings, device=device)
         torch.manual_seed(self.settings.seed)
-        config = build(module.Config, self.settings.model, where=f"model settings of {method}")
-        self.model: BiasModel = module.Model(config, self.pool.rate_hz).double().to(device)
+        config = build(registry.load("imutool.bias", method).Config, self.settings.model, where=f"model settings of {method}")
+        self.model: BiasNetwork = (
+            registry.load("imutool.networks", method).Network(config, self.pool.rate_hz).double().to(device)
+        )
         learnt = ~self.pool.held_out
         self.model.see(self.pool.gyro[learnt], self.pool.accel[learnt])
         self.tracks = RestBiases(self.pool, self.settings.track_knot_s)
@@ -126,7 +128,7 @@ class Training:
         self.sessions = statistics.store_statistics(self.model, self.pool, self.tracks.per_log().detach(), lengths)
         self.model.requires_grad_(False)
 
-    def held_out(self, sensor: Sensor, model: BiasModel) -> float:
+    def held_out(self, sensor: Sensor, model: BiasNetwork) -> float:
         """Error over the longest windows that fit the held-out parts: the mean without the worst tenth (rad or m/s).
 
         Each log's constant is solved for on that part first: it belongs to the run, and what is judged here is the sensor.
@@ -242,7 +244,7 @@ class Training:
 
     def _validate(self, stage: Stage) -> float:
         model = stage.mean.module
-        assert isinstance(model, BiasModel)
+        assert isinstance(model, BiasNetwork)
         model.eval()
         score = self.held_out(stage.sensor, model)
         if stage.closed_form:

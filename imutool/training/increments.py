@@ -17,7 +17,8 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from imutool.bias.model import COLUMNS, Segment
+from imutool.bias.model import COLUMNS
+from imutool.bias.networks.network import Segment
 from imutool.errors import DataError
 from imutool.geometry import so3
 from imutool.inertial.strapdown import GRAVITY_W

@@ -3,7 +3,7 @@
 The paper's losses are mean squares (eq. 16, 17). Here the error of a window is divided by the median error of windows of its
 length and log, and goes through Huber's function: an outlier of the motion capture pulls no harder than an ordinary window, and
 windows of every length and every log count alike. An objective draws its own batches from the training part. A model names the
-objective it wants (`BiasModel.objective`).
+objective it wants (`BiasNetwork.objective`).
 
 The rest bias of each log belongs to the run, not to the sensor. It is fitted together with the weights, free but slow, so that
 a turn-on bias or its drift is not attributed to the motion.
@@ -18,7 +18,8 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
-from imutool.bias.model import COLUMNS, BiasModel
+from imutool.bias.model import COLUMNS
+from imutool.bias.networks.network import BiasNetwork
 from imutool.geometry import so3
 from imutool.inertial.strapdown import GRAVITY_W
 from imutool.inertial.windows import HUBER_MEDIANS, attitudes, huber, step_means
@@ -79,13 +80,13 @@ class RestBiases(nn.Module):
         return cost
 
 
-def orientation_error(model: BiasModel, windows: Windows) -> Float[Tensor, " batch"]:
+def orientation_error(model: BiasNetwork, windows: Windows) -> Float[Tensor, " batch"]:
     """|Log(R_hat^T R)| at the end of each window, in rad (paper, eq. 16, at the last sample)."""
     R_hat = model.end_attitude(windows.R_start, windows.segment, windows.dt)
     return length(so3.log(R_hat.mT @ windows.R_end))
 
 
-def motion_error(model: BiasModel, windows: Windows) -> Float[Tensor, " batch"]:
+def motion_error(model: BiasNetwork, windows: Windows) -> Float[Tensor, " batch"]:
     """|v_hat - v| and |p_hat - p| / window together, at the end of each window, in m/s.
 
     Paper, eq. 17, in one unit.
@@ -105,7 +106,7 @@ def motion_error(model: BiasModel, windows: Windows) -> Float[Tensor, " batch"]:
     return length(torch.cat([velocity, position], dim=1))
 
 
-def error(model: BiasModel, sensor: Sensor, windows: Windows) -> Float[Tensor, " batch"]:
+def error(model: BiasNetwork, sensor: Sensor, windows: Windows) -> Float[Tensor, " batch"]:
     """Training error of a sensor: orientation for the gyro (rad), motion for the accel (m/s)."""
     return orientation_error(model, windows) if sensor == "gyro" else motion_error(model, windows)
 
@@ -142,7 +143,7 @@ class Objective(ABC):
         loss: its widths are fixed from the model as it stands when the objective is made; a checkpoint keeps them.
     """
 
-    def __init__(self, model: BiasModel, sensor: Sensor, pool: Pool, tracks: RestBiases, settings: TrainSettings) -> None:
+    def __init__(self, model: BiasNetwork, sensor: Sensor, pool: Pool, tracks: RestBiases, settings: TrainSettings) -> None:
         self.model, self.sensor, self.pool, self.tracks, self.settings = model, sensor, pool, tracks, settings
         self._choose()
         with torch.no_grad():

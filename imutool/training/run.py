@@ -13,6 +13,7 @@ import torch
 from imutool import __version__, registry
 from imutool.bias import hybrid, io, neural_ode, static
 from imutool.bias.model import BiasModel
+from imutool.bias.networks.network import BiasNetwork
 from imutool.config import plain
 from imutool.errors import ConfigError, DataError
 from imutool.geometry import so3
@@ -75,7 +76,7 @@ def train(
         raise ConfigError("static is not trained", where="method", fix="Choose hybrid, neural_ode, conv or linear")
     check_device(device)
     chosen = settings_for(method, settings)
-    if resume and not registry.load("imutool.bias", method).Model.iterative:
+    if resume and not registry.load("imutool.networks", method).Network.iterative:
         raise ConfigError(f"{method} has no steps to go on with", where="resume", fix="Train it without `resume`")
     if method == hybrid.Model.method:
         config_of(chosen)  # a misspelt setting is an error before any log is read
@@ -93,7 +94,7 @@ def train(
         **about,
         **{key: _shared(recordings, key) for key in ("sensor", "dataset")},
     }
-    io.save(model, out, overwrite=overwrite)
+    io.save(model.frozen(), out, overwrite=overwrite)
     kept.unlink(missing_ok=True)
     return io.load(out)
 
@@ -130,7 +131,7 @@ class _Descent:
 
 def _physics_first(
     recordings: Sequence[Recording], settings: TrainSettings, descent: _Descent
-) -> tuple[BiasModel, dict[str, Any]]:
+) -> tuple[BiasNetwork, dict[str, Any]]:
     """Effects, then the neural ODE where it helps; what the card says of both."""
     physics = PhysicsFirst.of(recordings, settings, descent.device, descent.say)
     alone = msgspec.structs.replace(settings, model={})

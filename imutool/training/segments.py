@@ -15,8 +15,8 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from imutool.bias import static
-from imutool.bias.model import BiasModel, Segment
+from imutool.bias.networks import static
+from imutool.bias.networks.network import BiasNetwork, Segment
 from imutool.errors import DataError
 from imutool.geometry import so3
 from imutool.inertial.stationary import GAP_PERIODS
@@ -166,13 +166,15 @@ CHUNK = 8192  # samples at a time: what is in memory does not depend on how long
 
 
 @torch.no_grad()
-def corrected(model: BiasModel, pool: Pool, part: Part = "all", sensors: Sequence[Sensor] = SENSORS) -> tuple[BiasModel, Pool]:
+def corrected(
+    model: BiasNetwork, pool: Pool, part: Part = "all", sensors: Sequence[Sensor] = SENSORS
+) -> tuple[BiasNetwork, Pool]:
     """A model and a pool that are scored over windows as the given ones at work over whole logs.
 
-    A model that looks back (`BiasModel.context`) would be shown a window without the samples before it, and would be computed
-    anew for every window that overlaps another. What it adds to the rest bias depends on the samples alone: here it is taken
-    off them, with their real history, and a constant remains. Only the samples of `part` and the columns of `sensors` are
-    corrected. Models that do not look back, and their pool, come back as they are.
+    A model that looks back (`BiasNetwork.context`) would be shown a window without the samples before it, and would be
+    computed anew for every window that overlaps another. What it adds to the rest bias depends on the samples alone: here it
+    is taken off them, with their real history, and a constant remains. Only the samples of `part` and the columns of
+    `sensors` are corrected. Models that do not look back, and their pool, come back as they are.
     """
     if not model.context:
         return model, pool
@@ -187,7 +189,7 @@ def corrected(model: BiasModel, pool: Pool, part: Part = "all", sensors: Sequenc
             segment = Segment((t - t[0])[None], pool.gyro[index][None], pool.accel[index][None], nothing)
             for sensor in sensors:
                 columns[sensor][some] -= model.sensor_bias(sensor, segment)[0, model.context :]
-    return static.Model().to(pool.t), replace(pool, gyro=columns["gyro"], accel=columns["accel"])
+    return static.Network().to(pool.t), replace(pool, gyro=columns["gyro"], accel=columns["accel"])
 
 
 def sensors_up_to(sensor: Sensor) -> Sequence[Sensor]:

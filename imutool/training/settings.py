@@ -51,12 +51,12 @@ class TrainSettings(Settings, frozen=True):
 
 @functools.cache
 def settings_of(method: str) -> type[TrainSettings]:
-    """`TrainSettings` with the defaults that a method prefers (`BiasModel.prefers`).
+    """`TrainSettings` with the defaults that a method prefers (`BiasNetwork.prefers`).
 
     Raises:
         ConfigError: unknown method.
     """
-    prefers = registry.load("imutool.bias", method).Model.prefers
+    prefers = registry.load("imutool.networks", method).Network.prefers
     if not prefers:
         return TrainSettings
     kinds = {field.name: field.type for field in msgspec.structs.fields(TrainSettings)}

@@ -12,10 +12,12 @@ from jaxtyping import Float, Float64
 from scipy.stats import chi2
 from torch import Tensor
 
-from imutool.bias.model import COLUMNS, BiasModel, Segment, Vector6
+from imutool.bias.model import COLUMNS, Vector6
+from imutool.bias.networks.network import BiasNetwork, Segment
 from imutool.bias_start.bias_at_rest import rest_differences
 from imutool.bias_start.bias_from_truth import TRUTH_S, bias_from_truth
 from imutool.bias_start.initial_bias import AT_REST_STD, SESSION_GAP_S
+from imutool.geometry import so3
 from imutool.inertial.stationary import white_noise
 from imutool.recording import nanoseconds
 from imutool.training import closed_form
@@ -46,7 +48,7 @@ class Session:
 
 
 def store_statistics(
-    model: BiasModel, pool: Pool, rest: Float[Tensor, "logs 6"], window_s: Mapping[Sensor, Sequence[float]]
+    model: BiasNetwork, pool: Pool, rest: Float[Tensor, "logs 6"], window_s: Mapping[Sensor, Sequence[float]]
 ) -> list[Session]:
     """Fills the model's prior, the spread of starts from truth, and the noise of a sample; the sessions of the logs.
 
@@ -66,7 +68,7 @@ def store_statistics(
     model.prior_std.copy_(torch.from_numpy(spread))
     model.truth_std.copy_(_start_spread(scored, left, rest))
     model.walk_std.copy_(_walk(scored, left, rest, window_s))
-    at_rest = rest_differences(scored, _samples(left), biases)
+    at_rest = rest_differences(scored.frozen(), _samples(left), biases)
     model.rest_std.copy_(torch.from_numpy(shift_at_rest(at_rest, std.cpu().double().numpy())))
     return sessions
 
@@ -128,7 +130,7 @@ def shift_at_rest(differences: Sequence[Float64[np.ndarray, "stops 6"]], std: Fl
 
 
 def _walk(
-    model: BiasModel, pool: Pool, rest: Float[Tensor, "logs 6"], window_s: Mapping[Sensor, Sequence[float]]
+    model: BiasNetwork, pool: Pool, rest: Float[Tensor, "logs 6"], window_s: Mapping[Sensor, Sequence[float]]
 ) -> Float[Tensor, "6"]:
     """How far rest biases walk in a second^1/2: the means over a log's two halves differ by walk sqrt(T / 3)."""
     begins = torch.searchsorted(pool.log, torch.arange(len(pool.names), device=pool.log.device))
@@ -146,7 +148,7 @@ def _walk(
 
 
 @torch.no_grad()
-def _start_spread(model: BiasModel, pool: Pool, rest: Float[Tensor, "logs 6"]) -> Float[Tensor, "6"]:
+def _start_spread(model: BiasNetwork, pool: Pool, rest: Float[Tensor, "logs 6"]) -> Float[Tensor, "6"]:
     """How far a rest bias from `TRUTH_S` of truth lies from its log's, as a robust standard deviation."""
     n, off = pool.samples(TRUTH_S), []
     for log in range(len(pool.names)):
@@ -160,8 +162,9 @@ def _start_spread(model: BiasModel, pool: Pool, rest: Float[Tensor, "logs 6"]) -
             t = pool.t[some] - pool.t[some[0]]
             segment = Segment(t[None], u[None, :, :3], u[None, :, 3:], rest[log][None])
             left = (u - model(segment)[0]).cpu().double().numpy()
-            R_wb, v_w = (x[some].cpu().double() for x in (pool.R_wb, pool.v_w))
-            off.append(bias_from_truth(t.cpu().double().numpy(), left, R_wb, v_w, trusted.cpu().numpy()))
+            q_wb_wxyz = so3.quaternion_wxyz_from_matrix(pool.R_wb[some].double())
+            seconds, q, v_w = (x.cpu().double().numpy() for x in (t, q_wb_wxyz, pool.v_w[some]))
+            off.append(bias_from_truth(seconds, left, q, v_w, trusted.cpu().numpy()))
     if len(off) < FEWEST_STARTS:
         return torch.tensor([TURN_ON_STD["gyro"]] * 3 + [TURN_ON_STD["accel"]] * 3).to(rest)
     floor = torch.tensor([FLOOR_STD["gyro"]] * 3 + [FLOOR_STD["accel"]] * 3)

@@ -35,6 +35,7 @@ from imutool.bias_start.bias_covariance import BiasEstimator
 from imutool.bias_start.bias_from_truth import TRUTH_S, bias_from_truth
 from imutool.bias_start.model_choice import find_initial_bias, smooth_in_memory
 from imutool.geometry import so3
+from imutool.geometry.quaternion import unit
 from imutool.inertial.strapdown import with_velocity
 from imutool.inertial.windows import running_product, step_means
 from imutool.mcap_io.read import read
@@ -49,8 +50,8 @@ class Seen(NamedTuple):
 
     t_s: Float64[np.ndarray, " n"]
     samples: Float64[np.ndarray, "n 6"]
-    R_wb: torch.Tensor
-    v_w: torch.Tensor
+    q_wb_wxyz: np.ndarray
+    v_w: np.ndarray
     trusted: np.ndarray
 
     @classmethod
@@ -59,10 +60,8 @@ class Seen(NamedTuple):
         imu = recording.imu
         poses, trusted = with_velocity(recording.truth).at(imu.t_ns)
         assert poses.v_w is not None
-        R_wb = so3.matrix_from_quaternion_wxyz(torch.from_numpy(np.array(poses.q_wb_wxyz)))
         samples = np.concatenate([imu.gyro, imu.accel], axis=1)
-        v_w = torch.from_numpy(np.array(poses.v_w))
-        return cls(seconds(imu.t_ns, int(imu.t_ns[0])), samples, R_wb, v_w, trusted)
+        return cls(seconds(imu.t_ns, int(imu.t_ns[0])), samples, unit(poses.q_wb_wxyz), poses.v_w, trusted)
 
     def window(self, from_s: float, length_s: float) -> slice | None:
         """The samples from a time on, if the truth can be trusted there."""
@@ -74,7 +73,7 @@ class Seen(NamedTuple):
     def gyro_offset(self, rows: slice, bias: Float64[np.ndarray, "n 6"]) -> Float64[np.ndarray, "3"]:
         """What a bias leaves of the rest bias over a window."""
         left = self.samples[rows] - bias[rows]
-        return bias_from_truth(self.t_s[rows], left, self.R_wb[rows], self.v_w[rows], self.trusted[rows])[:3]
+        return bias_from_truth(self.t_s[rows], left, self.q_wb_wxyz[rows], self.v_w[rows], self.trusted[rows])[:3]
 
     def slope_of(
         self, rows: slice, gyro: Float64[np.ndarray, "n 3"], S: Float64[np.ndarray, "n 3 p"]
@@ -133,13 +132,13 @@ def windows(
 
 def measured_variance(model: BiasModel, seen: Seen) -> Float64[np.ndarray, "3"]:
     """Of an offset from a window, by axis; the training logs' where a log is too short to show it."""
-    bias = model.stream(model.prior_mean.double().numpy())(seen.t_s, seen.samples[:, :3], seen.samples[:, 3:])
+    bias = model.stream(model.prior_mean)(seen.t_s, seen.samples[:, :3], seen.samples[:, 3:])
     starts_s = np.arange(seen.t_s[np.argmax(seen.trusted)], seen.t_s[-1] - TRUTH_S / 2, TRUTH_S / 4)  # half overlapping
     half = [seen.gyro_offset(rows, bias) if (rows := seen.window(t, TRUTH_S / 2)) else np.full(3, np.nan) for t in starts_s]
     change = np.reshape(half[2:], (-1, 3)) - np.reshape(half[:-2], (-1, 3))
     change = change[np.isfinite(change).all(axis=1)]
     if not len(change):
-        return np.asarray(model.truth_std.double().numpy()[:3] ** 2)
+        return np.asarray(model.truth_std[:3] ** 2)
     return np.asarray(0.5 * (change**2).mean(axis=0) / 2.0**3)
 
 

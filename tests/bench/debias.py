@@ -29,8 +29,9 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
-from imutool.bias import io, neural_ode
+from imutool.bias import io
 from imutool.bias.model import BiasModel
+from imutool.bias.networks import neural_ode
 from imutool.bias_start.correction import OnlineDebiaser
 from imutool.bias_start.initial_bias import InitialBias, prior, tracked_from_prior
 from imutool.debiasing import debias
@@ -45,12 +46,12 @@ SAME = 1e-9  # rad/s, m/s²: rounding alone separates a block from its samples
 def write_random_model(path: Path, rate_hz: float) -> None:
     """A file with a neural_ode of the default size, its drift set in motion."""
     torch.manual_seed(0)
-    model = neural_ode.Model(rate_hz=rate_hz)
+    network = neural_ode.Network(rate_hz=rate_hz)
     with torch.no_grad():
-        for weight in model.parameters():
+        for weight in network.parameters():
             weight.add_(0.01 * torch.randn_like(weight))
-        model.prior_std += 0.1
-    io.save(model, path)
+        network.prior_std += 0.1
+    io.save(network.frozen(), path)
 
 
 def in_blocks(model: BiasModel, start: InitialBias, imu: Imu) -> np.ndarray:

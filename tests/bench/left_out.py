@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from imutool.bias.hybrid import Model
+from imutool.bias.model import BiasModel
 from imutool.bias_start.correction import apply
 from imutool.bias_start.model_choice import find_initial_bias, smooth_in_memory
 from imutool.config import load
@@ -49,7 +49,7 @@ def main() -> None:
     print(f"| mean | {' | '.join(f'{a:.2f}' for a in np.mean(table, axis=0))} | |")
 
 
-def learned(recordings: list[Recording], words: list[str]) -> Model:
+def learned(recordings: list[Recording], words: list[str]) -> BiasModel:
     """The effects of some logs, with their statistics."""
     settings = load(settings_of("hybrid"), None, ["model.remainder=false", *words])
     physics = PhysicsFirst.of(recordings, settings, "cpu", lambda epoch: None)
@@ -58,11 +58,10 @@ def learned(recordings: list[Recording], words: list[str]) -> Model:
         pass
     model = physics.finish(training.model)
     model.card = {"logs": [r.name for r in recordings], "sessions": [session.card() for session in training.sessions]}
-    model.requires_grad_(False).eval()
-    return model
+    return model.frozen()
 
 
-def aoe(model: Model, recording: Recording, start: str) -> float:
+def aoe(model: BiasModel, recording: Recording, start: str) -> float:
     """Orientation error of pure integration, in degrees."""
     begun = (
         smooth_in_memory(model, recording.imu, recording.name)

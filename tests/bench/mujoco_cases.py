@@ -21,7 +21,7 @@ from jaxtyping import Float64
 from numpy.random import Generator, default_rng
 from scipy.interpolate import make_interp_spline
 
-from imutool.blind_cases import unnamed
+from imutool.blind_cases import catalogue
 from imutool.blind_cases.cases import case_log, write_case
 from imutool.blind_cases.envelope import ConcealedEffect, ConcealedTruth, TrueParameter
 from imutool.blind_cases.information import achievable_rms, location
@@ -74,10 +74,10 @@ def conceal_mujoco(folder: Path, *, seed: int, kind: str | None = None, duration
     poses_every = round(1.0 / POSE_RATE_HZ / STEP_S)
     p, q = flown.p_wb[first::poses_every], flown.q_wb_wxyz[first::poses_every]
     truth = Poses(stamps_ns(np.arange(len(p)) / POSE_RATE_HZ), np.ascontiguousarray(p), np.ascontiguousarray(q))
-    channel_t = np.arange(int(duration_s * unnamed.RATE_HZ) + 1) / unnamed.RATE_HZ
+    channel_t = np.arange(int(duration_s * catalogue.RATE_HZ) + 1) / catalogue.RATE_HZ
     motion = ideal[np.minimum((channel_t * RATE_HZ).astype(int), len(ideal) - 1)]
-    values = unnamed.channels(rng, channel_t, motion)
-    scalars = {t: Scalars(stamps_ns(channel_t), values[t][:, None].copy(), unit) for t, unit in unnamed.TOPICS.items()}
+    values = catalogue.channels(rng, channel_t, motion)
+    scalars = {t: Scalars(stamps_ns(channel_t), values[t][:, None].copy(), unit) for t, unit in catalogue.TOPICS.items()}
     sim = _imu(ideal + SIM_SHARE * NOISE * rng.standard_normal(ideal.shape))
     noisy = _imu(real + bias + NOISE * rng.standard_normal(real.shape))
     sigma = NOISE * np.hypot(1.0, SIM_SHARE)

@@ -12,9 +12,10 @@ from pathlib import Path
 
 import msgspec
 import torch
+from thawed import thawed
 
 from imutool.bias.io import load
-from imutool.bias.model import Segment
+from imutool.bias.networks.network import BiasNetwork, Segment
 from imutool.bias.neural_ode import Model
 from imutool.bias_start.bias_from_truth import from_truth
 from imutool.bias_start.correction import apply
@@ -34,9 +35,9 @@ def main() -> None:
             model = load(path)
             assert isinstance(model, Model)
             start = replace(from_truth(model, recording), follows=None)  # gravity would pull all answers to one
-            model.stride = max(1, round(part * model.stride))
+            model.config = msgspec.structs.replace(model.config, drift_step_s=part * model.config.drift_step_s)
             figures.append(aoe(recording, apply(model, start, recording.imu).imu))
-        figures.append(aoe(recording, by_rk4(load(path), start, recording.imu)))
+        figures.append(aoe(recording, by_rk4(thawed(load(path)), start, recording.imu)))
         print(
             f"{recording.name:20} step 1: {figures[0]:.3f}  1/2: {figures[1]:.3f}  1/4: {figures[2]:.3f}  rk4: {figures[3]:.3f}"
         )
@@ -48,12 +49,12 @@ def aoe(recording: Recording, imu: Imu) -> float:
 
 
 @torch.no_grad()
-def by_rk4(model: Model, start: InitialBias, imu: Imu) -> Imu:
+def by_rk4(network: BiasNetwork, start: InitialBias, imu: Imu) -> Imu:
     """The debiased samples with the drift solved by rk4 over the whole log."""
-    model.config = msgspec.structs.replace(model.config, solver="rk4")
+    network.config = msgspec.structs.replace(network.config, solver="rk4")
     t = torch.from_numpy(seconds(imu.t_ns, int(imu.t_ns[0])))[None]
     gyro, accel = (torch.from_numpy(u.copy())[None] for u in (imu.gyro, imu.accel))
-    bias = model(Segment(t, gyro, accel, torch.from_numpy(start.rest)[None]))[0].numpy()
+    bias = network(Segment(t, gyro, accel, torch.from_numpy(start.rest)[None]))[0].numpy()
     return Imu(imu.t_ns, imu.gyro - bias[:, :3], imu.accel - bias[:, 3:])
 
 

@@ -20,7 +20,9 @@ import time
 from pathlib import Path
 
 import numpy as np
+import torch
 import vqf
+from thawed import thawed
 
 from imutool.bias.io import load
 from imutool.bias.model import BiasModel, Vector6
@@ -102,8 +104,8 @@ def aoe(model: BiasModel, start: InitialBias, recording: Recording) -> float:
 def own_bias(model: BiasModel, recordings: list[Recording]) -> np.ndarray:
     """Each log's own constant, in closed form from all its truth."""
     pool = Pool.of(recordings)
-    rest = model.prior_mean.double().expand(len(recordings), 6).clone()
-    scored, pool = corrected(model, pool)
+    rest = torch.from_numpy(model.prior_mean).expand(len(recordings), 6).clone()
+    scored, pool = corrected(thawed(model), pool)
     for sensor, columns in (("gyro", slice(0, 3)), ("accel", slice(3, 6))):
         solved = closed_form.solve(scored, sensor, pool, rest, WINDOW_S[sensor], matrix=False, part="all", nuisances=False)  # type: ignore[arg-type]
         rest[:, columns] = solved.rest

@@ -4,7 +4,8 @@ All contestants take 1000 segments of 16 samples (the paper's batch), gyro stage
 
 (a) fast path: what `imutool train` does with such windows. The rest bias is integrated on the grid of the drift, the
     curve is one evaluation for all samples, rotations are a product taken as a tree (`imutool.training.objective`).
-(b) chart ODE: the paper's joint form through `imutool.bias.ode.integrate` with Euler, one step a sample, of the same field with
+(b) chart ODE: the paper's joint form through `imutool.bias.networks.ode.integrate` with Euler, one step a sample, of the
+same field with
     the same parts of the same model: state (xi, beta_g), in the accel stage (xi, beta_g, beta_a, v, p) with the gyro frozen.
 (c) with `--released DIR`, the paper's own code, run by its own training functions. DIR holds its BiasDy, SO3diffeq and
     Third_party; nothing in it is edited, and nothing of it is kept here:
@@ -43,8 +44,9 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from imutool.bias.model import COLUMNS, BiasModel
-from imutool.bias.ode import HermitePath, Method, integrate
+from imutool.bias.model import COLUMNS
+from imutool.bias.networks.network import BiasNetwork
+from imutool.bias.networks.ode import HermitePath, Method, integrate
 from imutool.cli.demo import write_asl
 from imutool.geometry import so3
 from imutool.inertial.strapdown import GRAVITY_W
@@ -108,7 +110,7 @@ class Batch(NamedTuple):
     count: int
 
 
-Error = Callable[[BiasModel, Sensor, Windows], Tensor]
+Error = Callable[[BiasNetwork, Sensor, Windows], Tensor]
 
 
 def drawn(training: Training, batch: Batch) -> Windows:
@@ -141,8 +143,8 @@ def our_step(recording: Recording, sensor: Sensor, batches: list[Batch], measure
     return step
 
 
-def chart_solution(model: BiasModel, sensor: Sensor, windows: Windows, method: Method) -> tuple[Tensor, Tensor]:
-    """Attitudes and states of all samples, by the ODE in the chart (`imutool.bias.ode`): the segments share one clock."""
+def chart_solution(model: BiasNetwork, sensor: Sensor, windows: Windows, method: Method) -> tuple[Tensor, Tensor]:
+    """Attitudes and states of all samples, by the ODE in the chart (`networks.ode`): the segments share one clock."""
     segment = windows.segment
     t = segment.t[0]
     gyro, accel = HermitePath(t, segment.gyro), HermitePath(t, segment.accel)
@@ -168,7 +170,7 @@ def chart_solution(model: BiasModel, sensor: Sensor, windows: Windows, method: M
     return integrate(moving, start, t, windows.R_start, method=method)
 
 
-def chart_error(model: BiasModel, sensor: Sensor, windows: Windows, method: Method = "euler") -> Tensor:
+def chart_error(model: BiasNetwork, sensor: Sensor, windows: Windows, method: Method = "euler") -> Tensor:
     """The error of `imutool.training.objective` at the end of each window, of the chart's solution."""
     R_wb, state = chart_solution(model, sensor, windows, method)
     if sensor == "gyro":

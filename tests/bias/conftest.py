@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from imutool import registry
-from imutool.bias.model import BiasModel, Segment
+from imutool.bias.networks.network import BiasNetwork, Segment
 
 RATE_HZ = 200.0
 
@@ -22,12 +22,12 @@ def one_thread() -> Iterator[None]:
     torch.set_num_threads(before)
 
 
-def _build(method: str, seed: int = 0, **settings: object) -> BiasModel:
-    """A model whose every number is moved from where it starts, so that no part of it is silent."""
-    module = registry.load("imutool.bias", method)
+def _build(method: str, seed: int = 0, **settings: object) -> BiasNetwork:
+    """A network whose every number is moved from where it starts, so that no part of it is silent."""
+    config = registry.load("imutool.bias", method).Config(**settings)
     generator = torch.Generator().manual_seed(seed)
     torch.manual_seed(seed)
-    model: BiasModel = module.Model(module.Config(**settings), RATE_HZ).double()
+    model: BiasNetwork = registry.load("imutool.networks", method).Network(config, RATE_HZ).double()
     with torch.no_grad():
         for value in model.parameters():
             value.add_(0.05 * torch.randn(value.shape, generator=generator, dtype=value.dtype))
@@ -49,7 +49,7 @@ def _segment(seed: int, batch: int, n: int, rate_hz: float = RATE_HZ) -> Segment
 
 
 @pytest.fixture(scope="session")
-def build() -> Callable[..., BiasModel]:
+def build() -> Callable[..., BiasNetwork]:
     """`build(method, seed=0, **settings)`."""
     return _build
 

@@ -21,7 +21,8 @@ from safetensors.torch import save_file
 from imutool import registry
 from imutool.bias import io
 from imutool.bias.io import MAX_BYTES, check_rate, find_model, header_of, load, save
-from imutool.bias.model import BiasModel, Segment
+from imutool.bias.model import BiasModel
+from imutool.bias.networks.network import BiasNetwork, Segment
 from imutool.errors import ConfigError, ModelError
 from imutool.units import SENSORS
 
@@ -35,8 +36,13 @@ ADDITIVE = 0.05  # of a change of the rest bias may have been forgotten or ampli
 
 
 @pytest.fixture(params=METHODS, scope="module")
-def model(request: pytest.FixtureRequest, build: Callable[..., BiasModel]) -> BiasModel:
+def network(request: pytest.FixtureRequest, build: Callable[..., BiasNetwork]) -> BiasNetwork:
     return build(request.param)
+
+
+@pytest.fixture(scope="module")
+def model(network: BiasNetwork) -> BiasModel:
+    return network.frozen()
 
 
 def streamed(model: BiasModel, seen: Segment, cuts: list[int]) -> np.ndarray:
@@ -47,8 +53,11 @@ def streamed(model: BiasModel, seen: Segment, cuts: list[int]) -> np.ndarray:
     return np.concatenate([stream(t[a:b], gyro[a:b], accel[a:b]) for a, b in pairwise(edges)])
 
 
-def test_its_name_is_its_files_and_its_docstring_names_a_source(model: BiasModel) -> None:
+def test_its_name_is_its_files_and_its_docstring_names_a_source(network: BiasNetwork, model: BiasModel) -> None:
     module = registry.load("imutool.bias", model.method)
+    assert registry.names("imutool.networks") == METHODS
+    assert type(network) is registry.load("imutool.networks", model.method).Network
+    assert model.method == network.method
     assert model.method in METHODS
     assert type(model) is module.Model
     assert isinstance(model.config, module.Config)
@@ -56,38 +65,38 @@ def test_its_name_is_its_files_and_its_docstring_names_a_source(model: BiasModel
 
 
 @pytest.mark.parametrize(("batch", "n"), [(1, 1), (3, 2), (2, 137)])
-def test_one_bias_of_six_for_every_sample(model: BiasModel, batch: int, n: int, segment: MakeSegment) -> None:
+def test_one_bias_of_six_for_every_sample(network: BiasNetwork, batch: int, n: int, segment: MakeSegment) -> None:
     seen = segment(1, batch, n)
-    bias = model(seen)
+    bias = network(seen)
     assert bias.shape == (batch, n, 6)
     assert bias.dtype == torch.float64
     assert torch.isfinite(bias).all()
     for sensor, part in zip(SENSORS, (bias[..., :3], bias[..., 3:]), strict=True):
-        assert torch.equal(model.sensor_bias(sensor, seen), part)
+        assert torch.equal(network.sensor_bias(sensor, seen), part)
 
 
-def test_elements_of_a_batch_do_not_see_one_another(model: BiasModel, segment: MakeSegment) -> None:
+def test_elements_of_a_batch_do_not_see_one_another(network: BiasNetwork, segment: MakeSegment) -> None:
     seen = segment(2, 3, 120)
     alone = Segment(seen.t[1:2], seen.gyro[1:2], seen.accel[1:2], seen.rest[1:2])
-    torch.testing.assert_close(model(seen)[1:2], model(alone), rtol=0, atol=1e-12)  # batched sums round differently
+    torch.testing.assert_close(network(seen)[1:2], network(alone), rtol=0, atol=1e-12)  # batched sums round differently
 
 
 @pytest.mark.parametrize("k", [0, 1, 49, 50, 51, 130, 198])
-def test_it_is_causal(model: BiasModel, k: int, segment: MakeSegment) -> None:
+def test_it_is_causal(network: BiasNetwork, k: int, segment: MakeSegment) -> None:
     """Sample k + 1 and all after it change; the bias at samples up to k does not."""
     seen = segment(3, 2, 200)
     later = torch.randn(2, 199 - k, 3, generator=torch.Generator().manual_seed(k), dtype=torch.float64)
     gyro, accel = seen.gyro.clone(), seen.accel.clone()
     gyro[:, k + 1 :] += later
     accel[:, k + 1 :] += later
-    moved = model(replace(seen, gyro=gyro, accel=accel))
-    torch.testing.assert_close(moved[:, : k + 1], model(seen)[:, : k + 1], rtol=0, atol=1e-13)
+    moved = network(replace(seen, gyro=gyro, accel=accel))
+    torch.testing.assert_close(moved[:, : k + 1], network(seen)[:, : k + 1], rtol=0, atol=1e-13)
 
 
-def test_its_derivative_is_causal_too(model: BiasModel, segment: MakeSegment) -> None:
+def test_its_derivative_is_causal_too(network: BiasNetwork, segment: MakeSegment) -> None:
     seen = segment(4, 1, 180)
     gyro = seen.gyro.clone().requires_grad_(True)
-    bias = model(replace(seen, gyro=gyro))
+    bias = network(replace(seen, gyro=gyro))
     if not bias.requires_grad:
         return  # a bias that does not look at the samples
     for k in (0, 60, 120):
@@ -95,24 +104,24 @@ def test_its_derivative_is_causal_too(model: BiasModel, segment: MakeSegment) ->
         assert slope is None or not slope[0, k + 1 :].any()
 
 
-def test_a_change_of_the_rest_bias_is_a_change_of_the_bias(model: BiasModel, segment: MakeSegment) -> None:
+def test_a_change_of_the_rest_bias_is_a_change_of_the_bias(network: BiasNetwork, segment: MakeSegment) -> None:
     seen = segment(5, 4, 1000)
     change = torch.tensor([0.01, -0.02, 0.005, 0.1, -0.05, 0.02], dtype=torch.float64)
-    moved = model(replace(seen, rest=seen.rest + change)) - model(seen)
+    moved = network(replace(seen, rest=seen.rest + change)) - network(seen)
     torch.testing.assert_close(moved[:, 0], change.expand(4, 6), rtol=0, atol=1e-15)
     assert ((moved - change).abs() <= ADDITIVE * change.abs()).all()
 
 
-def test_the_first_bias_is_the_rest_bias_and_what_the_motion_adds(model: BiasModel, segment: MakeSegment) -> None:
+def test_the_first_bias_is_the_rest_bias_and_what_the_motion_adds(network: BiasNetwork, segment: MakeSegment) -> None:
     """With no motion at all (no rate, no force) nothing is added."""
     seen = segment(6, 2, 1)
     still = Segment(seen.t, torch.zeros_like(seen.gyro), torch.zeros_like(seen.accel), seen.rest)
-    torch.testing.assert_close(model(still)[:, 0], seen.rest, rtol=0, atol=BLOCKS)
+    torch.testing.assert_close(network(still)[:, 0], seen.rest, rtol=0, atol=BLOCKS)
 
 
-def test_the_stream_is_the_forward_pass(model: BiasModel, segment: MakeSegment) -> None:
+def test_the_stream_is_the_forward_pass(network: BiasNetwork, model: BiasModel, segment: MakeSegment) -> None:
     seen = segment(7, 1, 1000)
-    np.testing.assert_allclose(streamed(model, seen, []), model(seen)[0].numpy(), rtol=0, atol=STREAM)
+    np.testing.assert_allclose(streamed(model, seen, []), network(seen)[0].numpy(), rtol=0, atol=STREAM)
 
 
 @given(cuts=st.lists(st.integers(0, 400), max_size=12).map(sorted))
@@ -172,15 +181,14 @@ def test_it_comes_back_from_its_file_in_single_precision(model: BiasModel, saved
     back = load(saved)
     assert type(back) is type(model)
     assert (back.rate_hz, back.config) == (model.rate_hz, model.config)
-    for name, value in model.state_dict().items():
-        kept = back.state_dict()[name]
-        assert kept.dtype == torch.float64
-        assert torch.equal(kept, value.float().double()), name
-    assert not any(weight.requires_grad for weight in back.parameters())
-    assert not back.training
+    assert back.tensors.keys() == model.tensors.keys() == model.shapes(model.config).keys()
+    for name, value in model.tensors.items():
+        kept = back.tensors[name]
+        assert kept.dtype == np.float64
+        assert np.array_equal(kept, value.astype(np.float32).astype(np.float64)), name
     assert (back.card["name"], back.card["sha256"]) == (model.method, io.digest(saved))
     seen = segment(11, 2, 300)
-    torch.testing.assert_close(back(seen), model(seen), rtol=1e-5, atol=1e-6)  # float32 keeps seven digits
+    np.testing.assert_allclose(streamed(back, seen, []), streamed(model, seen, []), rtol=1e-5, atol=1e-6)  # seven digits
 
 
 def test_the_file_is_single_precision_and_says_what_it_is(model: BiasModel, saved: Path) -> None:
@@ -249,7 +257,7 @@ def test_tensors_that_do_not_fit_are_named(model: BiasModel, saved: Path) -> Non
         "stowaway": lambda held: held.update(stowaway=torch.zeros(1)),
         "noise_std": lambda held: held.update(noise_std=torch.zeros(6, dtype=torch.float64)),
     }
-    for name, value in model.named_parameters():
+    for name, value in model.tensors.items():
         changes[name] = lambda held, name=name, shape=value.shape: held.update({name: torch.zeros(*shape, 2)})  # type: ignore[misc]
     for name, change in changes.items():
         with pytest.raises(ModelError, match=f"tensors {name} do not fit"):
@@ -258,7 +266,7 @@ def test_tensors_that_do_not_fit_are_named(model: BiasModel, saved: Path) -> Non
 
 @pytest.mark.parametrize("value", [float("nan"), float("inf")])
 def test_numbers_that_are_not_finite_are_refused(model: BiasModel, saved: Path, value: float) -> None:
-    for name in [*(name for name, _ in model.named_parameters()), "prior_mean"]:
+    for name in (name for name, held in model.tensors.items() if held.size):
         with pytest.raises(ModelError, match="not finite"):
             load(altered(saved, lambda held, name=name: held[name].view(-1)[-1:].fill_(value)))  # type: ignore[misc]
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-import torch
 
 from imutool.bias import hybrid
 from imutool.bias_start.bias_covariance import BiasEstimator
@@ -29,12 +28,11 @@ Samples = tuple[np.ndarray, np.ndarray, np.ndarray]
 
 def model_of(*names: str) -> hybrid.Model:
     """Gyro effects of whose parameters nothing is known but a standard deviation."""
-    model = hybrid.Model(hybrid.Config(remainder=False), RATE_HZ).double()
     std = {"gyro_scale": SCALE_STD, "gyro_g_sensitivity": G_STD}
     size = {"gyro_scale": 3, "gyro_g_sensitivity": 9}
-    each = torch.cat([torch.full((size[name],), std[name], dtype=torch.float64) for name in names])
-    model.take("gyro", names, torch.zeros_like(each), torch.diag(each**2))
-    return model
+    each = np.concatenate([np.full(size[name], std[name]) for name in names])
+    tensors = {"theta_gyro": np.zeros(len(each)), "covariance_gyro": np.diag(each**2)}
+    return hybrid.Model(hybrid.Config(gyro_effects=names, remainder=False), RATE_HZ, tensors)
 
 
 @pytest.fixture

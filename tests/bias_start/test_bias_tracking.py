@@ -19,9 +19,9 @@ from imutool.bias_start.bias_tracking import (
     FilteredBlock,
     TrackedBiasStream,
     filter_blocks,
-    smooth_bias,
     smooth_blocks,
 )
+from imutool.bias_start.initial_bias import smooth_bias
 from imutool.recording import Imu, seconds
 from imutool.sensor.made_up_flight import FlightSettings, TriadSettings, flight
 
@@ -65,7 +65,7 @@ def samples(imu: Imu) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def model() -> BiasModel:
-    return static.Model().double()
+    return static.Model()
 
 
 def forward(imu: Imu, known: BiasPrior = KNOWN) -> list[FilteredBlock]:

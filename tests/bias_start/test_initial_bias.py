@@ -8,7 +8,6 @@ from dataclasses import replace
 import msgspec
 import numpy as np
 import pytest
-import torch
 from scipy.spatial.transform import Rotation
 
 from imutool.bias import linear, static
@@ -68,10 +67,10 @@ def blocks_of(imu: Imu) -> Blocks:
 
 def model(mean: float = 0.0, **std: float) -> BiasModel:
     """A static model with a prior of its own."""
-    made = static.Model().double()
-    made.prior_mean.fill_(mean)
+    made = static.Model()
+    made.prior_mean[:] = mean
     for name, value in std.items():
-        getattr(made, name).fill_(value)
+        made.tensors[name][:] = value
     return made
 
 
@@ -137,13 +136,11 @@ def test_stops_in_several_attitudes_show_the_accelerometer_from_all_sides() -> N
 def test_a_models_own_part_is_taken_off_first() -> None:
     """At rest the accelerometer's matrix sees gravity: W f is no turn-on bias."""
     imu, _ = resting()
-    W = torch.diag(torch.tensor([0.02, -0.01, 0.03], dtype=torch.float64))
-    made = linear.Model().double()
-    made.begin_at("accel", W)
-    made.prior_std.fill_(1.0)
-    plain = static.Model().double()
-    plain.prior_std.fill_(1.0)
-    corrected = Imu(imu.t_ns, imu.gyro, imu.accel @ (np.eye(3) - W.numpy()).T)
+    W = np.diag([0.02, -0.01, 0.03])
+    made = linear.Model(tensors={"W.accel": W, "prior_std": np.ones(6)})
+    plain = static.Model()
+    plain.prior_std[:] = 1.0
+    corrected = Imu(imu.t_ns, imu.gyro, imu.accel @ (np.eye(3) - W).T)
     np.testing.assert_allclose(at_rest(made, imu).rest, at_rest(plain, corrected).rest, atol=1e-12)
 
 
@@ -225,7 +222,7 @@ def test_a_truth_whose_world_leans_is_believed_beside_itself_and_not_beside_grav
     q = (lean * Rotation.from_quat(np.array(truth.q_wb_wxyz), scalar_first=True)).as_quat(scalar_first=True)
     askew = replace(truth, q_wb_wxyz=q, p_wb=lean.apply(np.array(truth.p_wb)), v_w=lean.apply(np.array(truth.v_w)))
     made = trained(mean=0.0, prior_std=0.02, truth_std=1e-3)
-    made.prior_mean.copy_(torch.from_numpy(np.concatenate([GYRO_BIAS, ACCEL_BIAS])))
+    made.prior_mean[:] = np.concatenate([GYRO_BIAS, ACCEL_BIAS])
     upright, leaning = (from_truth(made, replace(biased, truths={"/truth": one})) for one in (truth, askew))
     assert upright.follows is not None
     assert leaning.follows is not None
@@ -259,12 +256,9 @@ def test_truth_and_prior_meet_by_their_variances(biased: Recording) -> None:
 
 
 def test_the_models_own_part_is_taken_off_the_samples_first(biased: Recording) -> None:
-    made = linear.Model().double()
-    W = torch.tensor([[0.02, 0.01, 0.0], [0.0, -0.02, 0.005], [0.01, 0.0, 0.01]], dtype=torch.float64)
-    made.begin_at("gyro", W)
-    made.prior_std.fill_(10.0)
-    made.truth_std.fill_(1e-6)
-    measured = np.linalg.solve(np.eye(3) - W.numpy(), biased.imu.gyro.T).T  # then (I - W) u - rest is true again
+    W = np.array([[0.02, 0.01, 0.0], [0.0, -0.02, 0.005], [0.01, 0.0, 0.01]])
+    made = linear.Model(tensors={"W.gyro": W, "prior_std": np.full(6, 10.0), "truth_std": np.full(6, 1e-6)})
+    measured = np.linalg.solve(np.eye(3) - W, biased.imu.gyro.T).T  # then (I - W) u - rest is true again
     start = from_truth(made, replace(biased, imu=Imu(biased.imu.t_ns, measured, biased.imu.accel)))
     assert (np.abs(start.rest - np.concatenate([GYRO_BIAS, ACCEL_BIAS])) < TRUTH).all()
 
@@ -408,7 +402,7 @@ def test_a_log_of_a_session_that_training_saw_starts_from_its_prior() -> None:
 def test_a_model_that_says_how_rest_differs_is_believed() -> None:
     made = trained(prior_std=3e-3)
     before = auto(made, resting()[0])
-    made.register_buffer("rest_std", torch.tensor([2e-3] * 3 + [0.03] * 3))
+    made.rest_std[:] = [2e-3] * 3 + [0.03] * 3
     np.testing.assert_allclose(bias_prior(made).ground_std[:3], 2e-3)
     after = auto(made, resting()[0])
     assert (after.std[:3] > 5 * before.std[:3]).all(), "in motion it is less sure"

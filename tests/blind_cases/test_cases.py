@@ -20,7 +20,7 @@ from scipy.interpolate import make_interp_spline
 from scipy.spatial.transform import Rotation
 from support.report_schema import assert_valid
 
-from imutool.blind_cases import draw, unnamed
+from imutool.blind_cases import catalogue, draw
 from imutool.blind_cases.cases import ENVELOPE, FINDINGS, KEY, OPENED, REAL, SIM, conceal, open_case
 from imutool.blind_cases.catalogue import CATALOGUE, NO_LIMIT
 from imutool.blind_cases.draw import draw_parameters
@@ -270,7 +270,7 @@ def test_filters_on_the_way_agree_with_the_slow_limit(scene: Scene) -> None:
 
 
 def test_a_driven_column_follows_its_channel_late(scene: Scene) -> None:
-    model, theta = unnamed.driven(default_rng(5), {topic: float(v.std()) for topic, v in scene.channels.items()})
+    model, theta = catalogue.driven(default_rng(5), {topic: float(v.std()) for topic, v in scene.channels.items()})
     t = scene.t_s[200:]
     added = (scene.converter_input([(model, theta)], scene.t_s) - scene.ideal(scene.t_s))[200:]
     column = int(np.argmax(np.abs(added).max(axis=0)))
@@ -279,9 +279,9 @@ def test_a_driven_column_follows_its_channel_late(scene: Scene) -> None:
     assert np.abs(np.delete(added, column, axis=1)).max() == 0.0
 
 
-@pytest.mark.parametrize("form", sorted(unnamed.FORMS))
+@pytest.mark.parametrize("form", sorted(catalogue.FORMS))
 def test_an_unknown_term_is_on_one_column_and_says_its_equation(scene: Scene, form: str) -> None:
-    model, theta = unnamed.unknown(default_rng(1), form)
+    model, theta = catalogue.unknown(default_rng(1), form)
     added = scene.converter_input([(model, theta)], scene.t_s) - scene.ideal(scene.t_s)
     assert np.count_nonzero(np.abs(added).max(axis=0)) == 1
     assert model.equation.startswith(f"{model.signal}.")
@@ -452,7 +452,7 @@ def test_logs_tell_nothing_of_themselves(cases: list[Path]) -> None:
 
 def test_no_name_and_no_seed_is_in_the_bytes(cases: list[Path]) -> None:
     named = set(CATALOGUE) - {"temperature"}  # a channel of that name is in every log
-    words = [name.encode() for name in (*named, *unnamed.FORMS, "driven", "seed", "single", "flight", "bmi160")]
+    words = [name.encode() for name in (*named, *catalogue.FORMS, "driven", "seed", "single", "flight", "bmi160")]
     for k, case in enumerate(cases):
         seed = SEED + k
         secrets = [*words, str(seed).encode(), seed.to_bytes(8, "little"), seed.to_bytes(8, "big")]
@@ -585,7 +585,7 @@ def test_the_command_conceals_and_opens(
 def test_cases_are_dealt_in_proportion_whatever_their_number() -> None:
     bench = _bench("diagnose")
     deck = bench.deck()
-    assert {effect for task in deck for effect in task.effects} == {*CATALOGUE, *unnamed.FORMS}
+    assert {effect for task in deck for effect in task.effects} == {*CATALOGUE, *catalogue.FORMS}
     for count in (40, len(deck), 200):
         tasks = bench.dealt(count, 1)
         assert len(tasks) == count

@@ -58,10 +58,10 @@ def code(monkeypatch: pytest.MonkeyPatch) -> Code:
 def test_each_kind_of_error_has_its_code(
     code: Code, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], error: BaseException, expected: int
 ) -> None:
-    def inspect(_: Path, *, check: bool) -> None:
+    def opened(_: Path) -> None:
         raise error
 
-    monkeypatch.setattr("imutool.log_info.inspection.inspect", inspect)
+    monkeypatch.setattr("imutool.mcap_io.recovery.recovered_log.RecoveredLog", opened)
     assert code("info", "log.mcap") == expected
     printed = capsys.readouterr()
     assert printed.out == ""
@@ -69,10 +69,10 @@ def test_each_kind_of_error_has_its_code(
 
 
 def test_a_bug_is_a_traceback(monkeypatch: pytest.MonkeyPatch) -> None:
-    def inspect(_: Path, *, check: bool) -> None:
+    def opened(_: Path) -> None:
         raise ZeroDivisionError
 
-    monkeypatch.setattr("imutool.log_info.inspection.inspect", inspect)
+    monkeypatch.setattr("imutool.mcap_io.recovery.recovered_log.RecoveredLog", opened)
     monkeypatch.setattr(sys, "argv", ["imutool", "info", "log.mcap"])
     with pytest.raises(ZeroDivisionError):  # nobody catches it: Python prints the traceback and leaves with 1
         cli.main()

@@ -15,10 +15,10 @@ from support import diagnoses
 from support.diagnoses import replace
 
 import imutool.sensor.effects
-from imutool.diagnosis.quantity import grouped, percent, value, vector
-from imutool.diagnosis.result import Estimate, Finding, HeldOut, Located, Unexplained
+from imutool.diagnosis.result import Estimate, Extent, Finding, HeldOut, Located, Unexplained
 from imutool.diagnosis.wording.conclusion import NULL, chance_text, conclusion, lines, rms_text, table
 from imutool.diagnosis.wording.effect_sentences import SENTENCES, named_sentence, signals
+from imutool.diagnosis.wording.quantity import grouped, percent, value, vector
 
 CATALOGUE = [  # of physics: what an ideal simulation leaves out, and what any signal can have
     "gyro_bias", "accel_bias", "gyro_scale", "gyro_misalignment", "gyro_g_sensitivity", "gyro_quadratic", "gyro_bias_drift",
@@ -132,21 +132,24 @@ def test_a_null_case_with_coloured_noise_says_so() -> None:
 
 
 @pytest.mark.parametrize(
-    ("regime", "words"),
+    ("extent", "regime", "words"),
     [
-        ("always", "The gyro differs throughout: it"),
+        ("everywhere", "always", "The gyro differs throughout: it"),
         (
+            "everywhere",
             "always, most with angular rate above 0.4 rad/s",
             "The gyro differs throughout, most with angular rate above 0.4 rad/s: it",
         ),
-        ("no regime: it comes and goes", "The gyro differs off and on: it"),
-        ("when turning", "The gyro differs when turning: it"),
-        ("time above 30 s", "The gyro differs at time above 30 s: it"),
-        ("", "The gyro differs: it"),
+        ("intermittent", "no regime: it comes and goes", "The gyro differs off and on: it"),
+        ("regime", "when turning", "The gyro differs when turning: it"),
+        ("regime", "time above 30 s", "The gyro differs at time above 30 s: it"),
+        ("regime", "", "The gyro differs: it"),
     ],
 )
-def test_a_regime_goes_on_after_differs(regime: str, words: str) -> None:
-    assert conclusion(replace(diagnoses.LATE, located=(replace(diagnoses.TURNING, regime=regime),))).startswith(words)
+def test_a_regime_goes_on_after_differs(extent: Extent, regime: str, words: str) -> None:
+    assert conclusion(replace(diagnoses.LATE, located=(replace(diagnoses.TURNING, regime=regime, extent=extent),))).startswith(
+        words
+    )
 
 
 def test_the_regime_is_that_of_the_largest_share_of_the_same_signal() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import time
 import tracemalloc
 from dataclasses import replace
 from pathlib import Path
@@ -11,6 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from imutool.cleaning import survey
 from imutool.cli.info import imu_rows, topic_rows
 from imutool.converters import fetch, tum_vi
 from imutool.errors import LogError
@@ -19,12 +21,14 @@ from imutool.mcap_io.codec.decode import decode_imu
 from imutool.mcap_io.write import write
 from imutool.recording import GRAVITY_M_S2, Frames, Imu, Poses, Recording
 from imutool.report import json_values
+from imutool.sensor.made_up_flight import flight
 
 PERIOD_NS = 5_000_000
 START_NS = 1_700_000_000_000_000_000
 GYRO_STD, ACCEL_STD = 2.4e-3, 0.03
 NOISE_TOLERANCE = 0.15  # the calmest quarter of 1 s windows is a few per cent below the true value; the rest is chance
 IMAGE_BYTES = 1_000_000
+HOSTILE_S = 4.0  # CPU seconds for 2000 samples, ten times what they take
 
 
 def resting(count: int = 4000, seed: int = 3) -> Imu:
@@ -109,7 +113,7 @@ def test_disorder_repeats_and_values_that_are_no_numbers_are_counted_not_refused
         gyro[700, 1] = np.nan
         return columns._replace(stamp_ns=stamps, gyro=gyro)
 
-    monkeypatch.setattr("imutool.log_info.inspection.decode_imu", spoiled)
+    monkeypatch.setattr("imutool.mcap_io.topics.decode_imu", spoiled)
     (found,) = described(path)["imu"]
     assert (found["out_of_order"], found["duplicated"], found["not_finite"]) == (1, 1, 1)
     assert found["samples"] == 1000
@@ -153,15 +157,60 @@ def test_without_rest_there_is_no_noise_estimate(tmp_path):
 def test_specific_force_in_another_unit_is_said(tmp_path, factor, unit, make):
     imu = make()
     (found,) = logged(tmp_path, replace(imu, accel=imu.accel * factor))["imu"]
-    assert any(f"the unit looks like {unit}, not m/s^2" in warning for warning in found["warnings"])
+    assert any(f"accel looks like {unit}, not m/s^2" in warning for warning in found["warnings"])
 
 
 def test_a_rate_in_degrees_is_said(tmp_path):
     imu = swinging()
     (found,) = logged(tmp_path, replace(imu, gyro=np.degrees(imu.gyro)))["imu"]
-    assert any("the unit looks like deg/s, not rad/s" in warning for warning in found["warnings"])
+    assert any("gyro looks like deg/s, not rad/s" in warning for warning in found["warnings"])
     (found,) = logged(tmp_path, imu)["imu"]
     assert found["warnings"] == []
+
+
+def test_a_saturated_gyro_in_rad_s_is_no_gyro_in_degrees(tmp_path):
+    """The shocks of a hand-held sensor with a full scale of 2280 degrees a second; `clean` finds the same."""
+    imu = flight(4, duration_s=20.0).imu
+    gyro = imu.gyro.copy()
+    gyro[1000:1100, 1] += 60.0 * np.sin(np.linspace(0.0, 6.0 * np.pi, 100))
+    gyro = gyro.clip(-39.78, 39.78)
+    (found,) = logged(tmp_path, replace(imu, gyro=gyro))["imu"]
+    at_limit = int((np.abs(gyro) == 39.78).any(axis=1).sum())
+    assert found["warnings"] == [f"{at_limit} samples saturated"]
+    findings = survey(tmp_path / "log.mcap").findings
+    assert {(finding.rule, finding.values.get("axis")) for finding in findings} == {("saturation", "gyro.y")}
+    assert sum(finding.count for finding in findings) == at_limit
+
+
+@pytest.mark.parametrize("hostile", ["zero", "huge", "nan", "a clock that jumps by fifty years", "constant"])
+def test_hostile_values_cost_no_more_than_others_and_give_no_nan(tmp_path, monkeypatch, hostile):
+    imu = resting(2000)
+    write(Recording("log", imu), tmp_path / "log.mcap")
+
+    def spoiled(rows, encoding="cdr", layout=None):
+        columns = decode_imu(rows, encoding, layout)
+        stamps, gyro, accel = columns.stamp_ns.copy(), columns.gyro.copy(), columns.accel.copy()
+        half = slice(len(gyro) // 2, None)
+        if hostile == "zero":
+            gyro[:] = accel[:] = 0.0
+        elif hostile == "huge":
+            gyro[half] = accel[::3] = 1e30
+        elif hostile == "nan":
+            gyro[half] = accel[::3] = np.nan
+        elif hostile == "constant":
+            gyro[:], accel[:] = 0.1, 9.81
+        else:
+            stamps[half] += 50 * 365 * 86_400 * 10**9
+        return columns._replace(stamp_ns=stamps, gyro=gyro, accel=accel)
+
+    monkeypatch.setattr("imutool.mcap_io.topics.decode_imu", spoiled)
+    began = time.process_time()
+    (found,) = described(tmp_path / "log.mcap")["imu"]
+    cleaned = json_values(survey(tmp_path / "log.mcap").report())
+    assert time.process_time() - began < HOSTILE_S
+    json.dumps(cleaned, allow_nan=False)
+    assert found["missing"] == cleaned["missing"] == 0
+    assert found["warnings"] != [] or hostile == "a clock that jumps by fifty years"
 
 
 def test_slow_rates_in_degrees_show_against_the_truth(data, tmp_path):

@@ -16,7 +16,7 @@ from mcap.writer import CompressionType, Writer
 from mcap_ros2.writer import Writer as Ros2Writer
 from rosbags.typesys import Stores, get_typestore
 
-from imutool.diagnosis.scalar.diagnose import diagnose_signal
+from imutool.diagnosis.signal_diagnosis import diagnose_signal
 from imutool.errors import LogError
 from imutool.mcap_io.codec import ros2_definition
 from imutool.mcap_io.fields import numeric_fields, others, read_field

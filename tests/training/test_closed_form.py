@@ -10,7 +10,7 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from imutool.bias import linear
+from imutool.bias.networks import linear
 from imutool.errors import DataError
 from imutool.recording import Imu, Poses, Recording
 from imutool.training import closed_form
@@ -45,7 +45,7 @@ def flights(perfect: Make) -> list[Recording]:
 def calibrate(recordings: Sequence[Recording], windows: dict[str, tuple[float, ...]] | None = None) -> dict[str, Solution]:
     """Both sensors, the gyro first, as the training does it."""
     pool = Pool.of(recordings)
-    model = linear.Model(rate_hz=pool.rate_hz).double()
+    model = linear.Network(rate_hz=pool.rate_hz).double()
     rest = torch.zeros(len(recordings), 6, dtype=torch.float64)
     found = {}
     sensors: tuple[Sensor, Sensor] = ("gyro", "accel")
@@ -91,7 +91,7 @@ def test_without_matrix_only_the_rest_biases_move(flights: list[Recording], plan
     made = [planted(flight, {k: np.zeros((3, 3)) for k in W}, rest) for flight, rest in zip(flights, RESTS, strict=True)]
     pool = Pool.of(made)
     begin = torch.zeros(2, 6, dtype=torch.float64)
-    solution = solve(linear.Model().double(), "gyro", pool, begin, WINDOWS["gyro"], matrix=False)
+    solution = solve(linear.Network().double(), "gyro", pool, begin, WINDOWS["gyro"], matrix=False)
     assert torch.equal(solution.W, torch.zeros(3, 3, dtype=torch.float64))
     np.testing.assert_allclose(solution.rest, [rest["gyro"] for rest in RESTS], atol=EXACT["gyro"][1])
     assert not begin.any(), "what is passed in stays as it is"
@@ -149,7 +149,7 @@ def test_outliers_of_the_truth_do_not_pull(flights: list[Recording], planted: Ma
         spoiled.append(replace(recording, truths={"/t": replace(truth, q_wb_wxyz=q)}))
     pool = Pool.of(spoiled)
     rest = torch.zeros(2, 6, dtype=torch.float64)
-    solution = solve(linear.Model().double(), "gyro", pool, rest, WINDOWS["gyro"], matrix=True)
+    solution = solve(linear.Network().double(), "gyro", pool, rest, WINDOWS["gyro"], matrix=True)
     of_W, of_rest = NOISY["gyro"]
     np.testing.assert_allclose(solution.W, W["gyro"], atol=of_W)
     np.testing.assert_allclose(solution.rest, [rest["gyro"] for rest in RESTS], atol=of_rest)
@@ -158,7 +158,7 @@ def test_outliers_of_the_truth_do_not_pull(flights: list[Recording], planted: Ma
 def test_what_is_left_of_the_windows_is_next_to_nothing(flights: list[Recording], planted: Make) -> None:
     made = [planted(flight, W, rest) for flight, rest in zip(flights, RESTS, strict=True)]
     found, pool = calibrate(made), Pool.of(made)
-    model = linear.Model().double().requires_grad_(False)
+    model = linear.Network().double().requires_grad_(False)
     rest = torch.cat([found["gyro"].rest, found["accel"].rest], dim=1)
     for sensor, most in (("gyro", 1e-4), ("accel", 5e-3)):  # rad and m/s; the biases alone had moved it by 0.05 and 0.5
         model.begin_at(sensor, found[sensor].W)  # type: ignore[arg-type]
@@ -173,7 +173,7 @@ def test_the_derivative_of_a_window_is_that_of_finite_differences(flights: list[
     pool = Pool.of(made)
     first = pool.starts(60, "train", hop=601)
     rest = torch.tensor([[*r["gyro"], *r["accel"]] for r in RESTS], dtype=torch.float64)
-    model = linear.Model().double()
+    model = linear.Network().double()
     model.begin_at("gyro", torch.from_numpy(W["gyro"]))
     model.requires_grad_(False)
     for sensor, tolerance in (("gyro", 5e-3), ("accel", 1e-9)):  # the gyro's is exact in the limit of small steps

@@ -17,8 +17,10 @@ from support.fake_gpu import OnGpu, simulated_gpu
 from torch import Tensor, nn
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
-from imutool.bias import io, neural_ode
-from imutool.bias.model import Segment
+from imutool.bias import io
+from imutool.bias.networks import neural_ode
+from imutool.bias.networks.network import Segment
+from imutool.bias.neural_ode import Config
 from imutool.mcap_io.write import write
 from imutool.sensor.made_up_flight import flight
 from imutool.training.fit import Epoch, Training
@@ -246,7 +248,7 @@ def test_every_way_to_solve_the_drift_stays_on_the_gpu(solver: str, adjoint: boo
         with simulated_gpu():
             torch.manual_seed(0)
             given = {**SMALL_ODE, "drift": ["gyro", "accel"], "solver": solver, "adjoint": adjoint}
-            model = neural_ode.Model(msgspec.convert(given, neural_ode.Config), rate_hz=50.0).double()
+            model = neural_ode.Network(msgspec.convert(given, Config), rate_hz=50.0).double()
             for drift in model.drift.values():
                 nn.init.normal_(drift.out.weight, 0.0, 1e-3)
             model.to(device)

@@ -10,10 +10,10 @@ import pytest
 import torch
 from torch import Tensor
 
-from imutool.bias import linear, static
 from imutool.bias.conv import Config as ConvConfig
-from imutool.bias.conv import Model
-from imutool.bias.model import BiasModel, Segment
+from imutool.bias.networks import linear, static
+from imutool.bias.networks.conv import Network
+from imutool.bias.networks.network import BiasNetwork, Segment
 from imutool.errors import ConfigError, DataError, NumericsError
 from imutool.geometry import so3
 from imutool.recording import Imu, Recording
@@ -36,13 +36,13 @@ SMALL = {"channels": [8, 16], "dilations": [1, 4], "kernel": 5}
 
 
 def objective(
-    recordings: list[Recording], sensor: str, rest: list[float] | None = None, model: BiasModel | None = None
+    recordings: list[Recording], sensor: str, rest: list[float] | None = None, model: BiasNetwork | None = None
 ) -> IncrementObjective:
     pool = Pool.of(recordings)
     tracks = RestBiases(pool, 20.0)
     for name, columns in (("gyro", slice(0, 3)), ("accel", slice(3, 6))):
         tracks.set(name, torch.tensor(rest or [0.0] * 6, dtype=torch.float64)[columns].expand(len(recordings), 3))  # type: ignore[arg-type]
-    return IncrementObjective(model or static.Model().double(), sensor, pool, tracks, CHOSEN)  # type: ignore[arg-type]
+    return IncrementObjective(model or static.Network().double(), sensor, pool, tracks, CHOSEN)  # type: ignore[arg-type]
 
 
 # ── the errors ───────────────────────────────────────────────────────────────────────────────────────────────────────
@@ -87,7 +87,7 @@ def test_the_rotation_error_is_that_of_the_window_it_is(perfect: Make) -> None:
     rest = torch.tensor([[0.3, -0.2, 0.5, 0.0, 0.0, 0.0]], dtype=torch.float64)
     size = asked.errors(first)[n].size
     starts = first + torch.arange(len(size))
-    expected = orientation_error(static.Model().double(), asked.pool.windows(starts, n, rest.expand(len(size), 6)))
+    expected = orientation_error(static.Network().double(), asked.pool.windows(starts, n, rest.expand(len(size), 6)))
     torch.testing.assert_close(size, expected, rtol=0, atol=1e-9)
 
 
@@ -122,12 +122,12 @@ def test_lengths_that_no_truth_holds_are_left_out_and_if_all_are_it_is_said(perf
             recording = without_truth(recording, k + 0.4, k + 0.55)
     pool = Pool.of([recording])
     chosen = TrainSettings(increments=IncrementSettings(gyro_samples=(16, 120, 4000), stretch_s=0.7))
-    asked = IncrementObjective(static.Model().double(), "gyro", pool, RestBiases(pool, 20.0), chosen)
+    asked = IncrementObjective(static.Network().double(), "gyro", pool, RestBiases(pool, 20.0), chosen)
     assert asked.lengths == [16, 120]
     assert set(asked.loss.medians) == {16, 120}
     far = TrainSettings(increments=IncrementSettings(gyro_samples=(4000,)))
     with pytest.raises(DataError, match=r"for the gyro: no increment of 4000 samples.*setting increments.gyro_samples"):
-        IncrementObjective(static.Model().double(), "gyro", pool, RestBiases(pool, 20.0), far)
+        IncrementObjective(static.Network().double(), "gyro", pool, RestBiases(pool, 20.0), far)
 
 
 def test_no_index_leaves_its_log(perfect: Make) -> None:
@@ -145,16 +145,16 @@ def test_no_index_leaves_its_log(perfect: Make) -> None:
 # ── models that look back ────────────────────────────────────────────────────────────────────────────────────────────
 
 
-def looking_back() -> Model:
+def looking_back() -> Network:
     torch.manual_seed(3)
-    model = Model(ConvConfig(channels=(8, 16), dilations=(1, 40), kernel=5)).double().eval()
+    model = Network(ConvConfig(channels=(8, 16), dilations=(1, 40), kernel=5)).double().eval()
     with torch.no_grad():
         for value in model.parameters():
             value.add_(0.1 * torch.randn_like(value))
     return model.requires_grad_(False)
 
 
-def whole_log(model: BiasModel, pool: Pool, log: int) -> Tensor:
+def whole_log(model: BiasNetwork, pool: Pool, log: int) -> Tensor:
     """The model's answer over a log from its first sample on."""
     rows = pool.log == log
     return model(Segment(pool.t[rows][None], pool.gyro[rows][None], pool.accel[rows][None], torch.zeros(1, 6).double()))[0]
@@ -175,7 +175,7 @@ def test_a_corrected_pool_is_the_model_over_whole_logs(perfect: Make) -> None:
 
 
 def test_a_model_that_does_not_look_back_is_left_as_it_is(perfect: Make) -> None:
-    model, pool = linear.Model().double(), Pool.of([perfect(1, duration_s=2.0)])
+    model, pool = linear.Network().double(), Pool.of([perfect(1, duration_s=2.0)])
     assert corrected(model, pool) == (model, pool)
 
 
@@ -197,7 +197,7 @@ def test_a_stretch_is_shown_with_the_samples_before_it(perfect: Make) -> None:
 
 def test_a_method_has_its_own_defaults_and_what_is_given_wins() -> None:
     kind = settings_of("conv")
-    for name, value in Model.prefers.items():
+    for name, value in Network.prefers.items():
         assert getattr(kind(), name) == value
         assert getattr(kind(), name) != getattr(TrainSettings(), name) or name == "gyro_rate"
     assert kind(steps=7).steps == 7
@@ -242,10 +242,10 @@ def trained(perfect: Make) -> dict[str, Training]:
     return done
 
 
-def rate_error(model: BiasModel, exact: Recording, measured: Recording) -> float:
+def rate_error(model: BiasNetwork, exact: Recording, measured: Recording) -> float:
     """Root mean square of the corrected rate less the true one, its own mean taken off: what no constant mends."""
     t_s = (measured.imu.t_ns - measured.imu.t_ns[0]) * 1e-9
-    bias = model.stream(np.zeros(6))(t_s, measured.imu.gyro, measured.imu.accel)[:, :3]
+    bias = model.frozen().stream(np.zeros(6))(t_s, measured.imu.gyro, measured.imu.accel)[:, :3]
     left = measured.imu.gyro - bias - exact.imu.gyro
     return float(np.sqrt(((left - left.mean(axis=0)) ** 2).mean()))
 
@@ -255,7 +255,7 @@ def test_it_learns_to_take_back_a_lag_which_no_matrix_can(trained: dict[str, Tra
     where both were judged. Four seeds gave 0.26 to 0.38, 0.35 to 0.50 and 0.41 to 0.49."""
     exact = perfect(9, duration_s=20.0)
     measured = lagging(exact, 0.02, 0.05, 9)
-    raw = rate_error(static.Model().double(), exact, measured)
+    raw = rate_error(static.Network().double(), exact, measured)
     conv, matrix = (rate_error(trained[name].model, exact, measured) for name in ("conv", "linear"))
     assert conv < raw / 2
     assert conv < 0.7 * matrix

@@ -8,8 +8,8 @@ from dataclasses import replace
 import pytest
 import torch
 
-from imutool.bias import static
-from imutool.bias.model import Segment
+from imutool.bias.networks import static
+from imutool.bias.networks.network import Segment
 from imutool.recording import Recording
 from imutool.training.objective import error, motion_error, orientation_error
 from imutool.training.segments import Pool, Windows
@@ -26,7 +26,7 @@ def windows(perfect: Callable[..., Recording], rest: list[float]) -> Windows:
 
 
 def test_an_exact_sensor_has_no_error(perfect: Callable[..., Recording]) -> None:
-    model, seen = static.Model().double(), windows(perfect, [0.0] * 6)
+    model, seen = static.Network().double(), windows(perfect, [0.0] * 6)
     assert error(model, "gyro", seen).max() < RULE["gyro"]
     assert error(model, "accel", seen).max() < RULE["accel"]
 
@@ -34,7 +34,7 @@ def test_an_exact_sensor_has_no_error(perfect: Callable[..., Recording]) -> None
 def test_a_bias_turns_by_itself_times_the_window(perfect: Callable[..., Recording]) -> None:
     """|b| T, less what turning about other axes takes back; seen from the body it is exact for a body that hardly turns."""
     bias = [0.01, -0.02, 0.02]
-    found = orientation_error(static.Model().double(), windows(perfect, [*bias, 0.0, 0.0, 0.0]))
+    found = orientation_error(static.Network().double(), windows(perfect, [*bias, 0.0, 0.0, 0.0]))
     assert found.max() == pytest.approx(0.03 * N * PERIOD_S, rel=0.02)
     assert (found <= 0.03 * N * PERIOD_S + RULE["gyro"]).all()
     assert found.min() > 0.7 * 0.03 * N * PERIOD_S
@@ -42,14 +42,14 @@ def test_a_bias_turns_by_itself_times_the_window(perfect: Callable[..., Recordin
 
 def test_a_force_bias_is_an_error_of_velocity_and_of_position_over_the_window(perfect: Callable[..., Recording]) -> None:
     """|b| T of velocity and |b| T / 2 of position over T; a body that turns spreads it, never adds to it."""
-    found = motion_error(static.Model().double(), windows(perfect, [0.0, 0.0, 0.0, 0.1, -0.2, 0.2]))
+    found = motion_error(static.Network().double(), windows(perfect, [0.0, 0.0, 0.0, 0.1, -0.2, 0.2]))
     expected = 0.3 * N * PERIOD_S * 1.25**0.5
     assert found.max() == pytest.approx(expected, rel=0.02)
     assert (found <= expected + RULE["accel"]).all()
 
 
 def test_the_accelerometers_error_teaches_the_gyro_nothing(perfect: Callable[..., Recording]) -> None:
-    model, seen = static.Model().double(), windows(perfect, [0.0] * 6)
+    model, seen = static.Network().double(), windows(perfect, [0.0] * 6)
     rest = seen.segment.rest.clone().requires_grad_(True)
     motion_error(model, replace(seen, segment=replace(seen.segment, rest=rest))).sum().backward()
     assert rest.grad is not None
@@ -65,7 +65,7 @@ def test_its_gradient_is_finite_where_there_is_no_error() -> None:
     segment = Segment(t, torch.zeros(1, 5, 3, dtype=torch.float64), up.expand(1, 5, 3), rest)
     eye, nothing = torch.eye(3, dtype=torch.float64)[None], torch.zeros(1, 3, dtype=torch.float64)
     still = Windows(segment, torch.diff(t), eye, eye, nothing, nothing, nothing, nothing, torch.zeros(1, dtype=torch.int64))
-    for found in (orientation_error(static.Model().double(), still), motion_error(static.Model().double(), still)):
+    for found in (orientation_error(static.Network().double(), still), motion_error(static.Network().double(), still)):
         assert found.item() < 1e-11
         (slope,) = torch.autograd.grad(found.sum(), rest)
         assert torch.isfinite(slope).all()

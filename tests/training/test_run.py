@@ -281,7 +281,7 @@ def test_a_hybrids_card_says_what_was_found_and_compared(expected_hybrid: bytes,
     assert card["physics"]["accel"]["effects"] == ["accel_scale"]
     assert set(card["compared"]) == {"effects", "effects and neural_ode"}
     assert card["held_out"] == card["compared"]["effects and neural_ode"]
-    assert model.named("gyro") == ("gyro_scale", "gyro_misalignment")
+    assert model.config.effects("gyro") == ("gyro_scale", "gyro_misalignment")
     assert model.ode is not None
     for name in ("prior_std", "truth_std", "noise_std"):
         assert (getattr(model, name) > 0).all(), name

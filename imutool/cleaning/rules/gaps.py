@@ -63,10 +63,8 @@ class Gaps(Rule):
             return
         lost = missing(steps, self._period_ns)
         lost = np.where(lost > 0, np.maximum(lost - (np.diff(number) - 1), 0), 0)
-        paused = steps > PAUSE_NS
-        for row in np.flatnonzero(paused)[: MOST - len(self._pauses)]:
+        for row in np.flatnonzero(steps > PAUSE_NS)[: MOST - len(self._pauses)]:
             self._pauses.append(Gap(int(number[row + 1]), int(stamp[row]), int(stamp[row + 1]), 0))
-        lost[paused] = 0
         self.missing += int(lost.sum())
         for row in np.flatnonzero(lost)[: MOST - len(self._rows)]:
             self._rows.append(Gap(int(number[row + 1]), int(stamp[row]), int(stamp[row + 1]), int(lost[row])))
@@ -108,6 +106,6 @@ class Gaps(Rule):
 
 
 def missing(steps_ns: Int64[np.ndarray, " n"], period_ns: float) -> Float64[np.ndarray, " n"]:
-    """Number of samples that would fill each step; 0 for steps below 1.5 periods."""
+    """Number of samples that would fill each step; 0 for steps below 1.5 periods and for pauses."""
     periods = steps_ns / period_ns
-    return np.where(periods >= MISSING_STEP, np.round(periods - 1.0), 0.0)
+    return np.where((periods >= MISSING_STEP) & (steps_ns <= PAUSE_NS), np.round(periods - 1.0), 0.0)

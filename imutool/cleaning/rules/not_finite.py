@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 
 import numpy as np
+from jaxtyping import Bool, Float64
 
 from imutool.cleaning.finding import Finding, Intervals
 from imutool.cleaning.rule import Rule, TopicSummary
@@ -26,10 +27,9 @@ class NotFinite(Rule):
     def __call__(self, stream: Iterable[Samples]) -> Iterator[Samples]:
         """Yield the samples with six valid values."""
         for samples in stream:
-            finite = np.abs(samples.values) <= NO_SENSOR  # false of NaN
-            good = finite.all(axis=1)
+            good = measured(samples.values)
             if not good.all():
-                self._by_axis += (~finite).sum(axis=0)
+                self._by_axis += (~(np.abs(samples.values) <= NO_SENSOR)).sum(axis=0)
                 self._places.add(samples.number[~good], samples.stamp_ns[~good])
                 self.dropped.append(samples.number[~good])
             yield samples.where(good)
@@ -40,3 +40,8 @@ class NotFinite(Rule):
             by_axis = {name: int(count) for name, count in zip(AXES, self._by_axis, strict=True) if count}
             what = "samples that are no measurement: not finite, or beyond any sensor"
             yield Finding("not_finite", "warning", what, **self._places.where(), values=by_axis, action="dropped")
+
+
+def measured(values: Float64[np.ndarray, "n k"]) -> Bool[np.ndarray, " n"]:
+    """Samples with valid values on every axis: finite, and within the range of some sensor."""
+    return np.asarray((np.abs(values) <= NO_SENSOR).all(axis=1))  # false of NaN

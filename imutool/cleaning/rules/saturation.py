@@ -12,14 +12,17 @@ from imutool.cleaning.finding import Finding, Intervals
 from imutool.cleaning.rule import Rule, TopicSummary
 from imutool.cleaning.rules.not_finite import AXES
 from imutool.cleaning.samples import Samples
+from imutool.units import ASCII_UNITS, SENSORS
 
 SAMPLES = 5
 PILE = 2.0
 LEVELS = 10
+FEW_SAMPLES, FAR, FINE_LEVELS = 3, 0.05, 64  # 64 levels: one step of the sensor is then at most 3 % of its range
 RULE = (
     f"an axis is saturated at its own largest or smallest value where at least {SAMPLES} samples hold exactly "
     f"that value, more than {PILE:g} times as many as either of the next two values, among at least "
-    f"{LEVELS} values, and it is not the median"
+    f"{LEVELS} values, and it is not the median; {FEW_SAMPLES} samples are enough among at least {FINE_LEVELS} values, "
+    f"where the next value is {100 * FAR:g} % nearer to zero"
 )
 KEPT = 3  # values at either end: the last one, and the two it is compared with
 
@@ -36,8 +39,8 @@ class Ends:
         """Add values; those that are not finite are skipped."""
         levels, counts = np.unique(values[np.isfinite(values)], return_counts=True)
         self._samples += int(counts.sum())
-        if len(self._few) < LEVELS:
-            self._few = np.union1d(self._few, levels)[:LEVELS]
+        if len(self._few) < FINE_LEVELS:
+            self._few = np.union1d(self._few, levels)[:FINE_LEVELS]
         for side, (known, times) in self._ends.items():
             near = slice(None, KEPT) if side < 0 else slice(-KEPT, None)
             both, which = np.unique(np.concatenate([known, levels[near]]), return_inverse=True)
@@ -49,8 +52,9 @@ class Ends:
         if len(self._few) < LEVELS:
             return None
         levels, counts = self._ends[side]
-        end, near = (0, counts[1:]) if side < 0 else (-1, counts[:-1])
-        piled = counts[end] >= SAMPLES and counts[end] > PILE * near.max()
+        end, near, before = (0, counts[1:], levels[1]) if side < 0 else (-1, counts[:-1], levels[-2])
+        far = len(self._few) >= FINE_LEVELS and side * before < (1.0 - FAR) * side * levels[end]
+        piled = counts[end] >= (FEW_SAMPLES if far else SAMPLES) and counts[end] > PILE * near.max()
         median = 2 * counts[end] > self._samples
         return float(levels[end]) if piled and not median else None
 
@@ -92,6 +96,7 @@ class Saturation(Rule):
             limit = self._ends[axis].limit(side)
             if limit is not None:
                 places = self._places[axis, side][1]
-                what = f"samples with {AXES[axis]} at the end of its range"
-                values = {"axis": AXES[axis], "limit": limit * float(whole.scale[axis])}
+                limit *= float(whole.scale[axis])
+                what = f"samples with {AXES[axis]} at the end of its range, {limit:.4g} {ASCII_UNITS[SENSORS[axis // 3]]}"
+                values = {"axis": AXES[axis], "limit": limit}
                 yield Finding("saturation", "warning", what, **places.where(), values=values, confidence=0.9)

@@ -10,14 +10,14 @@ from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float64
 
 from imutool.cleaning.finding import Finding, Severity
 from imutool.cleaning.rule import Rule, TopicSummary
 from imutool.cleaning.rules.axes import tilt_misfit
-from imutool.cleaning.samples import Motion
+from imutool.cleaning.samples import Motion, Samples
+from imutool.cleaning.settings import CleaningSettings
 from imutool.cleaning.truth import Truth, turning
-from imutool.recording import GRAVITY_M_S2, seconds
+from imutool.recording import GRAVITY_M_S2, Imu, seconds
 
 UNITS = {1.0: "g", 1000.0: "mg", GRAVITY_M_S2 * 1000.0: "mm/s^2", GRAVITY_M_S2 / 0.3048: "ft/s^2"}  # by reading at rest
 FACTORS = {"g": 9.80665, "mg": 9.80665e-3, "mm/s^2": 1e-3, "ft/s^2": 0.3048}
@@ -27,9 +27,10 @@ UNIT_TOLERANCE = 0.1  # the units are a factor of 3.3 apart and more
 FREE_OF_GRAVITY_M_S2 = 0.5
 
 DEGREES = 180.0 / np.pi
-DEGREES_BAND = (0.7, 1.4)  # of 180/pi, for the ratio of the measured to the true rate
+DEGREES_BAND = (0.45, 2.2)  # of 180/pi, for the ratio of the measured to the true rate; 0.97 to 1.05 on real recordings
 SURE_BAND = (0.9, 1.1)
-MIN_TURN_RAD_S = 0.05  # root mean square of the true rate below which that ratio means nothing
+MIN_TURN_RAD_S, FEWEST_TURNS = 0.1, 10  # of the true rate, and times at which it turns so fast
+POSES_APART_NS = 300_000_000
 FULL_SCALE_RAD_S = 35.0  # 2000 degrees a second, the widest range of common MEMS gyros
 ASTRAY_RAD = 0.6  # what gravity misses by after two seconds of a rate 57 times too high; 0.19 at most on real recordings
 CLEARLY = 0.5  # of the misfit as rad/s, that of deg/s at most
@@ -88,7 +89,8 @@ class Units(Rule):
             fastest = float(np.abs(mean[:, :3]).max(initial=0.0))
             fits = tilt_misfit(step, mean * whole.scale, np.stack([np.eye(3), np.eye(3) / DEGREES]))
             turns = fits is not None and bool(fits[1] < CLEARLY * fits[0]) and bool(fits[0] > ASTRAY_RAD)
-            if not turns and fastest <= FULL_SCALE_RAD_S:
+            turns_as_rad_s = fits is not None and bool(fits[0] < CLEARLY * fits[1]) and bool(fits[0] < ASTRAY_RAD)
+            if not turns and (fastest <= FULL_SCALE_RAD_S or turns_as_rad_s):
                 return
             sure = turns and fastest > FULL_SCALE_RAD_S
             how = " and ".join(
@@ -104,6 +106,14 @@ class Units(Rule):
         else:
             what = f"gyro looks like deg/s, not rad/s: {how}"
             yield Finding("units", "error", what, 3, values=values, confidence=0.7, distrust="gyro may be in deg/s")
+
+
+def unit_findings(imu: Imu, truth: Truth | None) -> list[Finding]:
+    """Findings of the rule in samples that are in order; no unit is converted."""
+    motion = Motion()
+    motion.see(Samples(np.arange(len(imu)), imu.t_ns, imu.t_ns, np.concatenate([imu.gyro, imu.accel], axis=1)))
+    whole = TopicSummary(CleaningSettings(convert_units=False), len(imu), motion, truth)
+    return list(Units().findings(whole))
 
 
 def accel_unit(level: float, tolerance: float) -> str:
@@ -135,21 +145,18 @@ def gravity_level(motion: Motion) -> tuple[float | None, bool]:
     return float(np.median(level[whole] if whole.any() else np.linalg.norm(mean[:, 3:], axis=1))), False
 
 
-def spread(gyro: Float64[np.ndarray, "n 3"]) -> float:
-    """Root median square of the rate about its median, which a bias does not change."""
-    return float(np.sqrt(np.median(((gyro - np.median(gyro, axis=0)) ** 2).sum(axis=1))))
-
-
 def rate_ratio(motion: Motion, truth: Truth) -> float | None:
-    """Ratio of measured to true rate; None if the truth hardly turns or shares no time."""
+    """Ratio of measured to true rate while the truth turns; None if it hardly does or shares no time.
+
+    Both are lengths about their medians, which a bias does not change.
+    """
     first, last, rate = turning(truth)
     step, mean = motion.table()
-    start = motion.start_ns or 0
-    time = seconds(first, start) + 0.5 * seconds(last - first, 0)
-    steps_s = 0.1 * step + 0.05
-    both = mean[(steps_s >= time[0]) & (steps_s <= time[-1]), :3]
-    known = (time >= steps_s[0]) & (time <= steps_s[-1]) & (last - first < 3 * 10**8) if len(step) else np.zeros(0, bool)
-    if not len(both) or not known.any():
+    t_s, steps_s = seconds(first, motion.start_ns or 0) + 0.5 * seconds(last - first, 0), 0.1 * step + 0.05
+    true, measured = (np.linalg.norm(values - np.median(values, axis=0), axis=1) for values in (rate, mean[:, :3]))
+    turns = (true > MIN_TURN_RAD_S) & (last - first < POSES_APART_NS)
+    if len(step):
+        turns &= (t_s >= steps_s[0]) & (t_s <= steps_s[-1])
+    if not len(step) or turns.sum() < FEWEST_TURNS:
         return None
-    true = float(np.sqrt(np.median((rate[known] ** 2).sum(axis=1))))
-    return spread(both) / true if true >= MIN_TURN_RAD_S else None
+    return float(np.median(np.interp(t_s[turns], steps_s, measured)) / np.median(true[turns]))

@@ -10,16 +10,16 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float64
 
+from imutool.diagnosis.settings import DiagnoseSettings, SplitSettings
 from imutool.recording import Poses
 from imutool.sensor.effect import Effect, SignalState, Theta
 from imutool.sensor.samples import NOTHING, IdealMotion, SensorSamples
+from imutool.units import ASCII_UNITS, AXES
 
-BLOCK_S, HELD_OUT_EACH = 6.0, 3  # every third block of six seconds is never fitted
-MARGIN_S = 0.3  # around a border between blocks, counted for neither
-GAP_PERIODS = 3.0  # a longer step between samples is a gap
-BIAS_STD = np.array([0.5] * 3 + [5.0] * 3)  # prior of a log's constant bias: rad/s, m/s²
-
+DEFAULT = DiagnoseSettings()
 Blocks = tuple[tuple[int, Float64[np.ndarray, "n _"]], ...]
+Variables = Mapping[str, tuple[str, Float64[np.ndarray, " n"]]]
+IMU_SIGNALS: Mapping[str, slice] = {"gyro": slice(0, 3), "accel": slice(3, 6)}
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,6 +40,7 @@ class AlignedLog(ABC):
     band_hz: float | None = field(default=None, kw_only=True)
     aligned_s: float = field(default=0.0, kw_only=True)
     start_ns: int = field(default=0, kw_only=True)
+    settings: DiagnoseSettings = field(default=DEFAULT, kw_only=True, repr=False)
 
     @property
     @abstractmethod
@@ -70,6 +71,19 @@ class AlignedLog(ABC):
     @abstractmethod
     def recorded(self) -> tuple[Any, Any]:
         """Ideal signals, and the recorded samples in the form that effects take."""
+
+    @property
+    @abstractmethod
+    def signals(self) -> Mapping[str, slice]:
+        """Columns by the name of the signal."""
+
+    @abstractmethod
+    def unit_of(self, signal: str) -> str:
+        """Unit of a signal, as JSON holds it."""
+
+    @abstractmethod
+    def variables(self) -> Variables:
+        """Variables of a regime at the samples, with their units."""
 
     @property
     def usable(self) -> Bool[np.ndarray, "n k"]:
@@ -120,7 +134,8 @@ class Pair(AlignedLog):
     @property
     def bias_std(self) -> Float64[np.ndarray, " k"]:
         """Prior of a turn-on bias, by axis (rad/s, m/s²)."""
-        return BIAS_STD
+        own = self.settings.split
+        return np.array([own.gyro_bias_std] * 3 + [own.accel_bias_std] * 3)
 
     @property
     def exact(self) -> bool:
@@ -140,26 +155,55 @@ class Pair(AlignedLog):
         """Gyro, then accelerometer."""
         return (0, samples.gyro), (3, samples.accel)
 
+    @property
+    def signals(self) -> Mapping[str, slice]:
+        """Gyro and accelerometer."""
+        return IMU_SIGNALS
+
+    def unit_of(self, signal: str) -> str:
+        """rad/s or m/s^2."""
+        return ASCII_UNITS[signal]
+
+    def variables(self) -> Variables:
+        """Rates, forces, time, tilt and the channels of the log."""
+        read = self.ideal.sample(self.stamp_s, self.stamp_s)
+        rate, force = np.linalg.norm(read.gyro, axis=1), np.linalg.norm(read.accel, axis=1)
+        out = {
+            "angular rate": ("rad/s", rate),
+            "acceleration": ("m/s²", np.abs(force - 9.81)),
+            "angular acceleration": ("rad/s²", np.linalg.norm(read.alpha, axis=1)),
+            "time": ("s", self.stamp_s),
+        }
+        if read.R_wb is not None:
+            out["tilt"] = ("rad", np.arccos(np.clip(read.R_wb[:, 2, 2], -1.0, 1.0)))
+        for k, axis in enumerate(AXES):
+            out[f"rate about {axis}"] = ("rad/s", np.abs(read.gyro[:, k]))
+            out[f"force along {axis}"] = ("m/s²", np.abs(read.accel[:, k]))
+        return out | {name: ("", values) for name, values in self.channels.items()}
+
     def recorded(self) -> tuple[IdealMotion, SensorSamples]:
         """The ideal motion and the recorded samples; angular acceleration is not recorded."""
         return self.ideal, SensorSamples(self.stamp_s, self.real[:, :3], self.real[:, 3:], np.zeros((len(self.real), 3)))
 
 
-def split(stamp_s: Float64[np.ndarray, " n"]) -> tuple[Bool[np.ndarray, " n"], Bool[np.ndarray, " n"]]:
+def split(
+    stamp_s: Float64[np.ndarray, " n"], settings: SplitSettings = DEFAULT.split
+) -> tuple[Bool[np.ndarray, " n"], Bool[np.ndarray, " n"]]:
     """Held-out rows, and usable rows.
 
     Usable rows are away from gaps and from borders between fitted and held-out blocks.
     """
+    each, margin_s = settings.held_out_each, settings.margin_s
     since = stamp_s - stamp_s[0]
-    block_s = min(BLOCK_S, since[-1] / (2 * HELD_OUT_EACH))
+    block_s = min(settings.block_s, since[-1] / (2 * each))
     block = np.floor(since / block_s).astype(int)
-    held_out = block % HELD_OUT_EACH == HELD_OUT_EACH - 1
+    held_out = block % each == each - 1
     inside = since - block * block_s
-    changed_before = held_out != ((block - 1) % HELD_OUT_EACH == 2)
-    changes_after = held_out != ((block + 1) % HELD_OUT_EACH == 2)
-    usable = ~(((inside < MARGIN_S) & changed_before & (block > 0)) | ((inside > block_s - MARGIN_S) & changes_after))
-    usable &= (since > MARGIN_S) & (since < since[-1] - MARGIN_S)
+    changed_before = held_out != ((block - 1) % each == each - 1)
+    changes_after = held_out != ((block + 1) % each == each - 1)
+    usable = ~(((inside < margin_s) & changed_before & (block > 0)) | ((inside > block_s - margin_s) & changes_after))
+    usable &= (since > margin_s) & (since < since[-1] - margin_s)
     step = np.diff(stamp_s)
-    for k in np.flatnonzero(step > GAP_PERIODS * np.median(step)):
-        usable &= (stamp_s < stamp_s[k] - MARGIN_S) | (stamp_s > stamp_s[k + 1] + MARGIN_S)
+    for k in np.flatnonzero(step > settings.gap_periods * np.median(step)):
+        usable &= (stamp_s < stamp_s[k] - margin_s) | (stamp_s > stamp_s[k + 1] + margin_s)
     return held_out, usable

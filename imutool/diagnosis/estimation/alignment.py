@@ -17,7 +17,8 @@ from scipy.ndimage import uniform_filter1d
 from scipy.signal import correlate, correlation_lags
 from scipy.spatial.transform import Rotation
 
-from imutool.diagnosis.estimation.aligned_log import GAP_PERIODS, Pair, split
+from imutool.diagnosis.estimation.aligned_log import DEFAULT, Pair, split
+from imutool.diagnosis.settings import AlignmentSettings, DiagnoseSettings
 from imutool.errors import DataError
 from imutool.inertial.kinematics import fit_trajectory
 from imutool.inertial.stationary import white_noise
@@ -25,28 +26,19 @@ from imutool.inertial.strapdown import with_velocity
 from imutool.recording import Imu, Poses, Recording, seconds
 from imutool.sensor.samples import IdealMotion, channels_at
 
-LEAST_S = 8.0  # below, nothing can be learned and tested
-ALIGN_HZ = 100.0
-FARTHEST_S = 5.0  # by which clocks of one epoch may differ
-ALIKE = 0.6  # correlation of the turning below which two logs are of different motions
-NOISE_BAND = 0.8  # of Nyquist: above, a simulated motion has nothing
-SMOOTHED_BINS = 15
 KNOWN_SHARE = 0.5  # of the samples that have a true pose, from which on the poses are worth drawing
-MOST_OF_IT = 0.9  # of the simulation that its poses must cover to stand for it
-POSES_HZ = 40.0  # slower poses cannot be differentiated twice
 MEANS, LEAST_MEANS = (20, 200), 8  # samples of a mean, and how many means there are at least
 TOLERATED_MEAN = 1.8  # by which they may scatter more than noise is measured, which finds five sixths of it
-COARSE, TOLERATED = 5, 1.3
 LEAST_NOISE = np.array([1e-4] * 3 + [1e-3] * 3)
 
 
-def with_simulation(real: Recording, sim: Recording) -> Pair:
+def with_simulation(real: Recording, sim: Recording, settings: DiagnoseSettings = DEFAULT) -> Pair:
     """Align a recording with a simulation of the same motion.
 
     Raises:
         DataError: the two share too little time, or are not of one motion.
     """
-    shift_s = _shift(real.imu, sim.imu)
+    shift_s = _shift(real.imu, sim.imu, settings.alignment)
     if shift_s is None:
         raise DataError(
             "the simulation turns otherwise than the recording",
@@ -57,17 +49,19 @@ def with_simulation(real: Recording, sim: Recording) -> Pair:
     start_ns = int(real.imu.t_ns[0])
     t_sim = seconds(sim.imu.t_ns, start_ns) - shift_s  # on the recording's clock
     stamp_s = seconds(real.imu.t_ns, start_ns)
-    ideal, noise = _simulated(t_sim, sim, shift_s, start_ns, real)
+    ideal, noise = _simulated(t_sim, sim, shift_s, start_ns, real, settings)
     inside = (stamp_s >= ideal.t_s[0]) & (stamp_s <= ideal.t_s[-1])
-    return _pair(real, ideal, stamp_s, inside, "simulation", shift_s, noise)
+    return _pair(real, ideal, stamp_s, inside, "simulation", shift_s, noise, settings)
 
 
-def same_motion(real: Imu, sim: Imu) -> bool:
+def same_motion(real: Imu, sim: Imu, settings: AlignmentSettings = DEFAULT.alignment) -> bool:
     """Whether a recording and a simulation turn alike, whatever their clocks say."""
-    return _shift(real, sim) is not None
+    return _shift(real, sim, settings) is not None
 
 
-def with_truth(real: Recording, ideal: IdealMotion, start_ns: int, band_hz: float) -> Pair:
+def with_truth(
+    real: Recording, ideal: IdealMotion, start_ns: int, band_hz: float, settings: DiagnoseSettings = DEFAULT
+) -> Pair:
     """Align a recording with the motion of its own true poses.
 
     `ideal` counts seconds from `start_ns` and is true up to `band_hz`.
@@ -78,7 +72,8 @@ def with_truth(real: Recording, ideal: IdealMotion, start_ns: int, band_hz: floa
     stamp_s = seconds(real.imu.t_ns, start_ns)
     inside = (stamp_s >= ideal.t_s[0]) & (stamp_s <= ideal.t_s[-1])
     ideal = replace(ideal, channels=_channels(real, start_ns + np.round(ideal.t_s * 1e9).astype(np.int64)))
-    return replace(_pair(real, ideal, stamp_s, inside, "true poses", 0.0, np.zeros(6)), band_hz=band_hz)
+    pair = _pair(real, ideal, stamp_s, inside, "true poses", 0.0, np.zeros(6), settings)
+    return replace(pair, band_hz=band_hz)
 
 
 def _pair(
@@ -89,20 +84,22 @@ def _pair(
     against: str,
     aligned_s: float,
     sim_noise: Float64[np.ndarray, "6"],
+    settings: DiagnoseSettings,
 ) -> Pair:
     rows = np.flatnonzero(inside)
     shared_s = float(stamp_s[rows[-1]] - stamp_s[rows[0]]) if len(rows) > 1 else 0.0
-    if shared_s < LEAST_S:
+    least_s = settings.alignment.least_s
+    if shared_s < least_s:
         raise DataError(
             f"{shared_s:.1f} s shared with the {against}",
             where=real.name,
-            expected=f"at least {LEAST_S:g} s",
+            expected=f"at least {least_s:g} s",
             fix="Give logs of the same time, or a longer one",
         )
     part = slice(int(rows[0]), int(rows[-1]) + 1)
     stamp_s = stamp_s[part]
     samples = np.concatenate([real.imu.gyro, real.imu.accel], axis=1)[part]
-    held_out, usable = split(stamp_s)
+    held_out, usable = split(stamp_s, settings.split)
     t_ns = real.imu.t_ns[part]
     truth = None
     if real.truths:
@@ -120,6 +117,7 @@ def _pair(
         against=against,
         start_ns=int(t_ns[0]),
         sim_noise=sim_noise,
+        settings=settings,
         channels={name: values for name, values in _channels(real, t_ns).items() if np.ptp(values) > 0},
     )
 
@@ -130,20 +128,20 @@ def _channels(recording: Recording, t_ns: np.ndarray) -> dict[str, Float64[np.nd
 
 
 def _simulated(
-    t_sim: Float64[np.ndarray, " m"], sim: Recording, shift_s: float, start_ns: int, real: Recording
+    t_sim: Float64[np.ndarray, " m"], sim: Recording, shift_s: float, start_ns: int, real: Recording, settings: DiagnoseSettings
 ) -> tuple[IdealMotion, Float64[np.ndarray, "6"]]:
     """Simulated motion without noise on an even clock, and the noise that was filtered out."""
     samples = np.concatenate([sim.imu.gyro, sim.imu.accel], axis=1)
     noise = white_noise(samples)
     period_s = float(np.median(np.diff(t_sim)))
-    ideal = _by_poses(sim, samples, noise, 1.0 / period_s)
+    ideal = _by_poses(sim, samples, noise, 1.0 / period_s, settings)
     if ideal is not None:
         t_s = seconds(sim.truth.t_ns[:1], start_ns)[0] - shift_s + ideal.t_s
         t_ns = start_ns + np.round(t_s * 1e9).astype(np.int64)
         return replace(ideal, t_s=t_s, channels=_channels(real, t_ns)), np.zeros(6)
     t_s = t_sim[0] + period_s * np.arange(int((t_sim[-1] - t_sim[0]) / period_s) + 1)
     even = np.asarray(make_interp_spline(t_sim, samples, k=3)(t_s))
-    clean = np.stack([wiener_filter(column) for column in even.T], axis=1)
+    clean = np.stack([wiener_filter(column, settings.alignment) for column in even.T], axis=1)
     alpha = np.asarray(make_interp_spline(t_s, clean[:, :3], k=5)(t_s, 1))
     t_ns = start_ns + np.round(t_s * 1e9).astype(np.int64)
     R_wb = _attitude(sim, t_ns + round(shift_s * 1e9))
@@ -153,7 +151,11 @@ def _simulated(
 
 
 def _by_poses(
-    sim: Recording, samples: Float64[np.ndarray, "m 6"], noise: Float64[np.ndarray, "6"], rate_hz: float
+    sim: Recording,
+    samples: Float64[np.ndarray, "m 6"],
+    noise: Float64[np.ndarray, "6"],
+    rate_hz: float,
+    settings: DiagnoseSettings,
 ) -> IdealMotion | None:
     """Ideal motion of the simulation's own poses.
 
@@ -161,8 +163,9 @@ def _by_poses(
     """
     if not sim.truths:
         return None
-    poses = sim.truth
-    if poses.period_s * POSES_HZ > 1.0 or np.diff(poses.t_ns).max() > 1e9 * GAP_PERIODS * poses.period_s:
+    poses, own = sim.truth, settings.alignment
+    holes = np.diff(poses.t_ns).max() > 1e9 * settings.split.gap_periods * poses.period_s
+    if holes or poses.period_s * own.poses_hz > 1.0:
         return None
     trajectory = fit_trajectory(poses)  # a simulation's poses are exact, or the test below fails
     t_ns = poses.t_ns[0] + np.arange(int(poses.duration_s * rate_hz) + 1) * round(1e9 / rate_hz)
@@ -172,15 +175,15 @@ def _by_poses(
     ideal = IdealMotion(t_s, motion.omega_b, motion.specific_force(), motion.alpha_b, R_wb)
     t_s = seconds(sim.imu.t_ns, int(poses.t_ns[0]))
     rows = (t_s >= ideal.t_s[0]) & (t_s <= ideal.t_s[-1])
-    if rows.mean() < MOST_OF_IT:
+    if rows.mean() < own.poses_share:
         return None
     expected = ideal.sample(t_s[rows], t_s[rows])
     residual = samples[rows] - np.concatenate([expected.gyro, expected.accel], axis=1)
     residual = residual - residual.mean(axis=0)
     coarse = (
-        residual[: len(residual) // COARSE * COARSE].reshape(-1, COARSE, 6).mean(axis=1)
+        residual[: len(residual) // own.coarse_samples * own.coarse_samples].reshape(-1, own.coarse_samples, 6).mean(axis=1)
     )  # where a misfit of motion would stand out
-    exact = (coarse.std(axis=0) < TOLERATED * np.maximum(noise, LEAST_NOISE) / np.sqrt(COARSE)).all()
+    exact = (coarse.std(axis=0) < own.coarse_factor * np.maximum(noise, LEAST_NOISE) / np.sqrt(own.coarse_samples)).all()
     return ideal if exact else None
 
 
@@ -196,7 +199,7 @@ def rotation_matrices(poses: Poses) -> Float64[np.ndarray, "n 3 3"]:
     return np.asarray(Rotation.from_quat(poses.q_wb_wxyz, scalar_first=True).as_matrix())
 
 
-def wiener_filter(x: Float64[np.ndarray, " n"]) -> Float64[np.ndarray, " n"]:
+def wiener_filter(x: Float64[np.ndarray, " n"], settings: AlignmentSettings = DEFAULT.alignment) -> Float64[np.ndarray, " n"]:
     """Wiener filter: multiply each frequency by 1 - noise / power.
 
     The top of the spectrum shows the white noise.
@@ -207,26 +210,26 @@ def wiener_filter(x: Float64[np.ndarray, " n"]) -> Float64[np.ndarray, " n"]:
     line = np.linspace(x[0], x[-1], n)  # its ends meet, so that the spectrum of a ramp is not in the noise's band
     mirrored = np.concatenate([x - line, -(x - line)[-2:0:-1]])
     spectrum = np.fft.rfft(mirrored)
-    power = uniform_filter1d(np.abs(spectrum) ** 2, SMOOTHED_BINS, mode="nearest")
-    floor = float(np.median(power[int(NOISE_BAND * len(power)) :]))
+    power = uniform_filter1d(np.abs(spectrum) ** 2, settings.smoothed_bins, mode="nearest")
+    floor = float(np.median(power[int(settings.noise_band * len(power)) :]))
     gain = np.clip(1.0 - floor / np.maximum(power, 1e-300), 0.0, 1.0)
     gain[power < 2.0 * floor] = 0.0  # what is noise for the most part goes altogether
     return line + np.fft.irfft(gain * spectrum, n=len(mirrored))[:n]
 
 
-def _shift(real: Imu, sim: Imu) -> float | None:
+def _shift(real: Imu, sim: Imu, settings: AlignmentSettings) -> float | None:
     """Clock shift (s) to add to the recording's times; 0 on a shared epoch, None if unlike.
 
     None where the two are not of one motion.
     """
     overlap = (min(real.t_ns[-1], sim.t_ns[-1]) - max(real.t_ns[0], sim.t_ns[0])) * 1e-9
-    shared = overlap > min(LEAST_S, 0.5 * min(real.duration_s, sim.duration_s))
+    shared = overlap > min(settings.least_s, 0.5 * min(real.duration_s, sim.duration_s))
     if _rests(real) and _rests(sim):
         return 0.0 if shared else None
-    lag_s, alike = _lag(real, sim)
-    if shared and abs(lag_s) < FARTHEST_S:
+    lag_s, alike = _lag(real, sim, settings)
+    if shared and abs(lag_s) < settings.farthest_s:
         return 0.0
-    return lag_s if alike >= ALIKE else None
+    return lag_s if alike >= settings.least_correlation else None
 
 
 def _rests(imu: Imu) -> bool:
@@ -242,11 +245,11 @@ def nothing_but_noise(x: Float64[np.ndarray, " n"], least: float = 0.0) -> bool:
     return all(float(mean.std()) <= TOLERATED_MEAN * noise / np.sqrt(size) for mean, size in zip(means, sizes, strict=True))
 
 
-def _lag(real: Imu, sim: Imu) -> tuple[float, float]:
+def _lag(real: Imu, sim: Imu, settings: AlignmentSettings) -> tuple[float, float]:
     """Lag (s) at which the angular rates correlate best, and that correlation."""
     rows = [np.linalg.norm(imu.gyro - np.median(imu.gyro, axis=0), axis=1) for imu in (real, sim)]
     start = [int(imu.t_ns[0]) for imu in (real, sim)]
-    grids = [np.arange(0.0, imu.duration_s, 1.0 / ALIGN_HZ) for imu in (real, sim)]
+    grids = [np.arange(0.0, imu.duration_s, 1.0 / settings.align_hz) for imu in (real, sim)]
     a, b = (
         np.interp(grid, seconds(imu.t_ns, first), row)
         for grid, imu, first, row in zip(grids, (real, sim), start, rows, strict=True)
@@ -257,7 +260,7 @@ def _lag(real: Imu, sim: Imu) -> tuple[float, float]:
     first, last = np.maximum(0, -lags), np.minimum(len(a), len(b) - lags)
     energy_a, energy_b = (np.concatenate([[0.0], np.cumsum(x * x)]) for x in (a, b))
     shared = np.sqrt((energy_a[last] - energy_a[first]) * (energy_b[last + lags] - energy_b[first + lags]))
-    enough = last - first >= min(LEAST_S * ALIGN_HZ, 0.8 * min(len(a), len(b)))
+    enough = last - first >= min(settings.least_s * settings.align_hz, 0.8 * min(len(a), len(b)))
     both = np.where(enough, correlate(b, a, mode="full") / np.maximum(shared, 1e-12), -1.0)
     best = int(np.argmax(both))
-    return (start[1] - start[0]) * 1e-9 + float(lags[best]) / ALIGN_HZ, float(both[best])
+    return (start[1] - start[0]) * 1e-9 + float(lags[best]) / settings.align_hz, float(both[best])

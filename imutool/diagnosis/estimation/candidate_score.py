@@ -77,7 +77,7 @@ class CandidateScore:
                     N_bb[np.ix_(js, js)] += b @ b.T
                     N_ab[np.ix_(axis.where, js)] += axis.A @ b.T
                     g_b[js] += b @ r
-        _, std = priors(chosen[-1:])
+        _, std = priors(chosen[-1:], self.now.settings)
         solved = np.linalg.solve(self.N, np.concatenate([N_ab, g_a[:, None]], axis=1))
         S, g = N_bb + np.diag(1.0 / std**2) - N_ab.T @ solved[:, :p], g_b - N_ab.T @ solved[:, p]
         step = np.linalg.solve(S, g)

@@ -2,7 +2,7 @@
 
 Between the steps all times are searched at which an effect may set in. A Jacobian costs an evaluation for each parameter, a
 step one: a Jacobian is kept as long as steps do what it predicts, and a fit may begin with that of another fit nearby.
-Every parameter has a weak prior, `PRIOR` times its plausible size: what the motion does not show stays at its null value
+Every parameter has a weak prior, a few times its plausible size: what the motion does not show stays at its null value
 instead of becoming a large number, and its standard deviation says so. Positive parameters are fitted by their logarithm.
 """
 
@@ -18,16 +18,8 @@ from jaxtyping import Float64
 
 from imutool.diagnosis.estimation.jacobians import Chosen, ForwardPass, Jacobians, bound, free, step_of
 from imutool.diagnosis.estimation.whitening import WhitenedLog
+from imutool.diagnosis.settings import FitSettings
 from imutool.sensor.effect import Parameter, Theta
-
-PRIOR = 3.0  # standard deviation of a parameter's prior, over its plausible size
-LOG_PRIOR = 1.5  # of a positive parameter about where its fit began, in powers of e
-ITERATIONS, BACKTRACKS = 8, 4
-CONVERGED = 1e-2  # squares: a smaller gain ends the fit
-PATIENCE = 3  # steps, after which a fit has to be below `give_up_above`
-PREDICTED = 0.05  # of a step's length in white samples: the error up to which its Jacobian is kept
-POLISHED = 8  # times that steps of a parameter that jumps are halved
-BETWEEN_SAMPLES = 2.0  # an edge lies somewhere between two samples, which least squares ignore (20 cases: 1.7)
 
 
 def parameters_of(chosen: Chosen) -> list[Parameter]:
@@ -51,10 +43,7 @@ def with_value(chosen: Chosen, k: int, j: int, value: float) -> Chosen:
 class Fit:
     """Fitted effects with parameters and biases, and the objective of the fit.
 
-    The objective is the sum of squares of white residuals and of the prior. `numbers` is the count of the fitted white
-    values.
-
-    `numbers` is the count of the white values that were fitted.
+    The objective is the sum of squares of white residuals and of the prior, `numbers` the count of fitted white values.
     """
 
     chosen: Chosen
@@ -65,6 +54,11 @@ class Fit:
     part: str
     passes: tuple[ForwardPass, ...]
     prior: Float64[np.ndarray, " p"]
+
+    @property
+    def settings(self) -> FitSettings:
+        """Settings of the fit."""
+        return self.logs[0].pair.settings.fit
 
     @property
     def keys(self) -> tuple[str, ...]:
@@ -104,14 +98,14 @@ class Fit:
         """Standard deviations by effect, in the parameters' units."""
         out, all_ = {}, np.sqrt(np.diag(self.covariance))
         for effect, theta in self.chosen:
-            std = all_[self.place(effect.key)] * (BETWEEN_SAMPLES if effect.jumps else 1.0)
+            std = all_[self.place(effect.key)] * (self.settings.between_samples if effect.jumps else 1.0)
             out[effect.key] = np.array(
                 [s * t if n.positive else s for s, t, n in zip(std, theta, effect.parameters, strict=True)]
             )
         return out
 
 
-def priors(begun: Chosen) -> tuple[Float64[np.ndarray, " p"], Float64[np.ndarray, " p"]]:
+def priors(begun: Chosen, settings: FitSettings) -> tuple[Float64[np.ndarray, " p"], Float64[np.ndarray, " p"]]:
     """Prior mean and standard deviation of the free parameters.
 
     The mean is the null value, or the start where the null value is infinite or the parameter positive.
@@ -120,7 +114,8 @@ def priors(begun: Chosen) -> tuple[Float64[np.ndarray, " p"], Float64[np.ndarray
     for parameter, x in zip(parameters_of(begun), free_of(begun), strict=True):
         at_start = parameter.positive or not np.isfinite(parameter.null_value)
         mean.append(x if at_start else parameter.null_value)
-        std.append(LOG_PRIOR if parameter.positive else PRIOR * parameter.plausible)
+        free_std = settings.prior_std * parameter.plausible
+        std.append(settings.log_prior_std if parameter.positive else free_std)
     return np.array(mean), np.array(std)
 
 
@@ -128,7 +123,7 @@ def fit(
     logs: Sequence[WhitenedLog],
     begun: Chosen,
     part: str = "fitted",
-    iterations: int = ITERATIONS,
+    iterations: int | None = None,
     near: Fit | None = None,
     give_up_above: float = np.inf,
 ) -> Fit:
@@ -138,6 +133,7 @@ def fit(
     objective is not below `give_up_above` after a few steps goes no further.
     """
     problem = _Problem(logs, begun, part)
+    iterations = problem.settings.iterations if iterations is None else iterations
     now = _descended(problem, problem.state(begun, None), iterations, near, give_up_above)
     if iterations and any(effect.jumps for effect, _ in begun):
         now = _descended(problem, _polished(problem, now), iterations, None, np.inf)
@@ -160,7 +156,8 @@ class _Problem:
 
     def __init__(self, logs: Sequence[WhitenedLog], begun: Chosen, part: str) -> None:
         self.logs, self.masks = logs, [log.rows(part) for log in logs]
-        self.mean, self.std = priors(begun)
+        self.settings = logs[0].pair.settings.fit
+        self.mean, self.std = priors(begun, self.settings)
 
     def state(self, chosen: Chosen, like: _State | None) -> _State:
         """Residuals and objective of parameters; forward passes continue from a state like it."""
@@ -201,11 +198,12 @@ class _Problem:
                 off = change[:, axis] - predicted
                 missed += float(off @ off - (off @ bias) ** 2)
                 length += float(predicted @ predicted - (predicted @ bias) ** 2)
-        return missed <= PREDICTED**2 * max(length, 1.0)
+        return missed <= self.settings.jacobian_error**2 * max(length, 1.0)
 
 
 def _descended(problem: _Problem, now: _State, iterations: int, near: Fit | None, give_up_above: float) -> _State:
     """State after Gauss-Newton steps, each shortened until the objective falls."""
+    settings = problem.settings
     steps, kept = 0, None if near is None or not len(problem.mean) else near.jacobians
     whiteners = [log.whiten for log in problem.logs]
     while len(problem.mean) and steps < iterations:
@@ -215,7 +213,8 @@ def _descended(problem: _Problem, now: _State, iterations: int, near: Fit | None
         jacobians = Jacobians(whiteners, now.passes, now.chosen, kept)
         x, whole = free_of(now.chosen), problem.step(jacobians, now)
         tries = (
-            (step, problem.state(_bound(now.chosen, x + step), now)) for step in (whole * 0.5**k for k in range(BACKTRACKS))
+            (step, problem.state(_bound(now.chosen, x + step), now))
+            for step in (whole * 0.5**k for k in range(settings.backtracks))
         )
         step, better = next((taken for taken in tries if taken[1].objective < now.objective), (x, now))
         if better is now:
@@ -225,8 +224,8 @@ def _descended(problem: _Problem, now: _State, iterations: int, near: Fit | None
             continue
         predicted = problem.as_predicted(jacobians, now, better, step)
         now, steps = better, steps + 1
-        converged = before - now.objective < CONVERGED and (jacobians.fresh or predicted)
-        if converged or (steps == PATIENCE and now.objective >= give_up_above):
+        converged = before - now.objective < settings.converged_squares and (jacobians.fresh or predicted)
+        if converged or (steps == settings.patience_steps and now.objective >= give_up_above):
             break
         kept = jacobians if predicted else jacobians.linear()
     return now
@@ -235,7 +234,7 @@ def _descended(problem: _Problem, now: _State, iterations: int, near: Fit | None
 def _polished(problem: _Problem, now: _State) -> _State:
     """State after ever smaller steps of jumping effects: derivatives lead only from afar."""
     moving = [(effect.jumps, step_of(parameter)) for effect, _ in now.chosen for parameter in effect.parameters]
-    for halved in range(POLISHED):
+    for halved in range(problem.settings.polish_rounds):
         for j, (jumps, h) in enumerate(moving):
             for sign in (1.0, -1.0) if jumps else ():
                 x = free_of(now.chosen)

@@ -17,7 +17,7 @@ import numpy as np
 
 from imutool.diagnosis.estimation.aligned_log import Pair
 from imutool.diagnosis.estimation.candidate_score import Candidates, bic, unnamed_count
-from imutool.diagnosis.estimation.gauss_newton import BETWEEN_SAMPLES, LOG_PRIOR, Fit, fit
+from imutool.diagnosis.estimation.gauss_newton import Fit, fit
 from imutool.diagnosis.estimation.jacobians import Chosen
 from imutool.diagnosis.estimation.observability import (
     below_model_error,
@@ -63,12 +63,13 @@ class SelectedEffect:
 
 @dataclass(frozen=True, eq=False)
 class Selection:
-    """Selected effects, strongest first, fits of fitted and of all rows, and count of trials."""
+    """Selected effects, strongest first; fits; number of trials, and of effects in every fit."""
 
     selected: tuple[SelectedEffect, ...]
     fitted: Fit
     whole: Fit
     tried: int
+    always: int = 0
 
 
 def select_effects(
@@ -78,7 +79,6 @@ def select_effects(
     progress: Callable[[str], None] | None = None,
     *,
     always: Chosen = (),
-    settings: SearchSettings | None = None,
 ) -> Selection:
     """Select the effects that the logs show together.
 
@@ -86,7 +86,7 @@ def select_effects(
     and are no findings. `progress` is called with what is being tried.
     """
     unnamed = tuple(effect for group in later for effect in group)
-    settings = settings or SearchSettings()
+    settings = logs[0].pair.settings.search
     penalty = settings.unnamed_penalty
     start = fit(logs, always)
     known, report = Candidates(logs, (*candidates, *unnamed)), progress or (lambda text: None)
@@ -247,9 +247,9 @@ class _Search:
             if verdicts[worst].false_discovery_rate <= self.settings.false_discovery_rate:
                 selected = [replace(verdict, similar=self._similar(first + k, now)) for k, verdict in enumerate(verdicts)]
                 fitted = replace(now, chosen=with_onsets_of(now.chosen, whole.chosen))
-                return Selection(tuple(sorted(selected, key=lambda verdict: -verdict.gain)), fitted, whole, self.tried)
+                return Selection(tuple(sorted(selected, key=lambda verdict: -verdict.gain)), fitted, whole, self.tried, first)
             now = fit(self.logs, (*now.chosen[: first + worst], *now.chosen[first + worst + 1 :]), near=now)
-        return Selection((), now, fit(self.logs, now.chosen, part="all"), self.tried)
+        return Selection((), now, fit(self.logs, now.chosen, part="all"), self.tried, first)
 
     def _scattered(self, found: Fit) -> Scatter | None:
         """Robust covariance; none where the noise is known and the residuals are as white."""
@@ -276,7 +276,7 @@ class _Search:
         without = fit(self.logs, (*whole.chosen[:k], *whole.chosen[k + 1 :]), part="all", near=whole)
         gain = without.objective - whole.objective
         if any(other_effect.jumps for other_effect, _ in without.chosen):
-            gain /= BETWEEN_SAMPLES**2  # whatever moves the signal a little wins single samples at an edge
+            gain /= whole.settings.between_samples**2  # whatever moves the signal a little wins single samples at an edge
         log_p = self.candidates.log_p(effect, gain)
         if scattered is not None:
             log_p = max(log_p, scattered.log_p_value(effect.key, gain, len(theta)) + self.candidates.log_choices[effect.key])
@@ -290,7 +290,7 @@ class _Search:
             rate = 1.0
         std = (whole.stds() if scattered is None else scattered.std)[effect.key]
         std = np.array([self.onset_std.get((effect.key, j), float(s)) for j, s in enumerate(std)])
-        unseen = tuple(unidentified(effect, std, LOG_PRIOR, curve=isinstance(effect.forward, SplineCurve)))
+        unseen = tuple(unidentified(effect, std, whole.settings.log_prior_std, curve=isinstance(effect.forward, SplineCurve)))
         return SelectedEffect(effect, theta, std, unseen, float(np.exp(max(log_p, -700.0))), rate, gain)
 
     def _beyond_model_error(self, verdicts: Sequence[SelectedEffect]) -> list[SelectedEffect]:

@@ -21,9 +21,7 @@ from imutool.diagnosis.estimation.whitening import Band, WhitenedImu, Whitener, 
 from imutool.diagnosis.settings import BandSettings
 from imutool.sensor.effect import Effect
 
-ORDER = 6  # of the autoregression: the noise of a sensor; of poses, on rows that just hold their band
 RIDGE = 1e-8
-ROUNDS = 2  # alternations of noise and model beside poses
 INDEPENDENT = 1e-3  # of the largest singular value, below which a column is a combination of others
 EDGES_HZ = (0.5, 0.8, 1.25, 2.0, 3.0, 4.5, 6.5, 9.0, 13.0, 18.0, 25.0)  # of the bands in which the poses are checked
 
@@ -31,7 +29,7 @@ EDGES_HZ = (0.5, 0.8, 1.25, 2.0, 3.0, 4.5, 6.5, 9.0, 13.0, 18.0, 25.0)  # of the
 def whitened(pair: Pair, candidates: Sequence[Effect], settings: BandSettings) -> WhitenedImu:
     """Whitened log with its noise model; beside poses also with the band that they know."""
     if pair.exact:
-        return _counting(pair, level(_left(pair, candidates), pair.usable, 1.0 / pair.period_s, ORDER))
+        return _counting(pair, level(_left(pair, candidates), pair.usable, 1.0 / pair.period_s, pair.settings.noise))
     assert pair.band_hz is not None
     whiten, residual = _in_band(pair, candidates, pair.band_hz)
     assert whiten.band is not None
@@ -50,11 +48,11 @@ def _counting(pair: Pair, white: Whitener) -> WhitenedImu:
 
 def _in_band(pair: Pair, candidates: Sequence[Effect], band_hz: float) -> tuple[Whitener, Float64[np.ndarray, "m 6"]]:
     """The noise of rows up to a frequency, and the residual of a rich model there."""
-    band = Band.below(band_hz, 1.0 / pair.period_s)
+    band = Band.below(band_hz, 1.0 / pair.period_s, pair.settings.noise)
     columns, misfit = _rich(pair, candidates, band), band(pair.real - expected(pair, ()))
     usable = pair.usable[:: band.every]
     whiten = Whitener(np.ones((6, 1)), np.ones(6))
-    for _ in range(ROUNDS):
+    for _ in range(pair.settings.noise.rounds):
         residual, fitted = misfit.copy(), np.zeros(6)
         for axis in np.flatnonzero(usable.any(axis=0)).tolist():
             rows = settled(usable[:, axis], whiten.order)
@@ -62,7 +60,7 @@ def _in_band(pair: Pair, candidates: Sequence[Effect], band_hz: float) -> tuple[
             white = whiten.rows(both, np.full(len(both), axis))[:, rows]
             x, fitted[axis] = _solved(white[:-1], white[-1])
             residual[:, axis] -= x @ columns[axis]
-        whiten = whitener(residual, usable, ORDER)
+        whiten = whitener(residual, usable, pair.settings.noise.order)
         count = np.maximum(usable.sum(axis=0), 1.0)  # the noise before so many parameters were fitted to it
         whiten = Whitener(whiten.filters, whiten.std * np.sqrt(count / np.maximum(count - fitted, 0.5 * count)))
     return Whitener(whiten.filters, whiten.std, band), residual

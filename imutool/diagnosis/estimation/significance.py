@@ -26,11 +26,7 @@ from imutool.diagnosis.estimation.jacobians import Chosen, expected
 from imutool.diagnosis.estimation.whitening import WhitenedLog
 
 TAIL = 300.0  # half the gain, above which the tail itself underflows
-LEAST_BLOCKS = 6
-PRIOR_BLOCKS = 6.0  # weight, in blocks, of the variance ratio of all rows together
 FIXED_STD = 1e-6  # deviation of a parameter that is taken as it is
-LEVERAGE = 0.95  # of one block on a parameter, above which its residuals carry no information on it
-ONSET_NEAR_S, ONSET_TIMES = 0.4, 41  # searched around an onset: as far as the filter of a band smears it
 Matrix = Float64[np.ndarray, "p p"]
 
 
@@ -110,8 +106,9 @@ class Scatter:
 
 def scatter(logs: Sequence[WhitenedLog], found: Fit, part: str, block_s: float) -> Scatter:
     """Robust covariance of a fit's free parameters, from blocks of the rows that were fitted."""
+    settings = logs[0].pair.settings.significance
     blocks = [block for k, log in enumerate(logs) for block in _blocks(log, found, k, part, block_s)]
-    _, prior_std = priors(found.chosen)
+    _, prior_std = priors(found.chosen, found.settings)
     prior = np.diag(1.0 / np.where(_begins(found), FIXED_STD, prior_std) ** 2)
     lower = np.linalg.cholesky(sum((H for H, _ in blocks), start=prior))
     middle = _seen_from(lower, prior)
@@ -120,12 +117,12 @@ def scatter(logs: Sequence[WhitenedLog], found: Fit, part: str, block_s: float) 
         share = _seen_from(lower, H)
         leverage, axes = np.linalg.eigh(share)
         turned = axes.T @ solve_triangular(lower, score, lower=True)
-        even = axes @ (turned / np.sqrt(1.0 - np.clip(leverage, 0.0, LEVERAGE)))
+        even = axes @ (turned / np.sqrt(1.0 - np.clip(leverage, 0.0, settings.most_leverage)))
         middle += np.outer(even, even)
         shares.append(share)
     outer = solve_triangular(lower, np.eye(len(lower)), lower=True)  # covariance by information: outer.T @ outer
     by_blocks, by_information = outer.T @ middle @ outer, outer.T @ outer
-    return _by_effect(found, by_blocks, by_information, [outer.T @ share @ outer for share in shares])
+    return _by_effect(found, by_blocks, by_information, [outer.T @ share @ outer for share in shares], settings.prior_blocks)
 
 
 def _begins(found: Fit) -> Bool[np.ndarray, " p"]:
@@ -133,18 +130,18 @@ def _begins(found: Fit) -> Bool[np.ndarray, " p"]:
     return np.array([parameter.begins for parameter in parameters_of(found.chosen)], dtype=bool)
 
 
-def _by_effect(found: Fit, by_blocks: Matrix, by_information: Matrix, shares: Sequence[Matrix]) -> Scatter:
+def _by_effect(found: Fit, by_blocks: Matrix, by_information: Matrix, shares: Sequence[Matrix], prior_blocks: float) -> Scatter:
     std, inflation, count = {}, {}, {}
     usual, stated = max(1.0, found.reduced_chi_square), found.stds()
     for key in found.keys:
         part = found.place(key)
         own, robust = by_information[part, part], by_blocks[part, part]
         each = np.array([np.diag(share)[part] for share in shares]) / np.diag(own)
-        ratio, blocks = _moderated(np.diag(robust) / np.diag(own), _effective(each), usual)
+        ratio, blocks = _moderated(np.diag(robust) / np.diag(own), _effective(each), usual, prior_blocks)
         std[key] = stated[key] * np.sqrt(np.maximum(1.0, np.where(_begins(found)[part], 1.0, ratio)))
         mean = np.asarray(np.trace(np.linalg.solve(own, robust)) / len(own))
         taken = np.array([np.trace(np.linalg.solve(own, share[part, part])) for share in shares])
-        ratio, blocks = _moderated(mean, _effective(taken), usual)
+        ratio, blocks = _moderated(mean, _effective(taken), usual, prior_blocks)
         inflation[key], count[key] = max(1.0, float(ratio)), float(blocks)
     return Scatter(std, inflation, count)
 
@@ -155,11 +152,11 @@ def _effective(shares: Float64[np.ndarray, "b ..."]) -> Float64[np.ndarray, "...
 
 
 def _moderated(
-    ratio: Float64[np.ndarray, "..."], blocks: Float64[np.ndarray, "..."], usual: float
+    ratio: Float64[np.ndarray, "..."], blocks: Float64[np.ndarray, "..."], usual: float, prior_blocks: float
 ) -> tuple[Float64[np.ndarray, "..."], Float64[np.ndarray, "..."]]:
     """A variance ratio shrunk to that of all rows, and its degrees of freedom (Smyth 2004)."""
     own = np.maximum(blocks - 1.0, 0.0)
-    return np.asarray((own * ratio + PRIOR_BLOCKS * usual) / (own + PRIOR_BLOCKS)), np.asarray(own + PRIOR_BLOCKS)
+    return np.asarray((own * ratio + prior_blocks * usual) / (own + prior_blocks)), np.asarray(own + prior_blocks)
 
 
 def _seen_from(lower: Matrix, H: Matrix) -> Matrix:
@@ -181,7 +178,7 @@ def _blocks(log: WhitenedLog, found: Fit, k: int, part: str, block_s: float) -> 
     J[:, begins] = 0.0
     t_s = log.pair.stamp_s[:: log.whiten.every][rows]
     duration_s = float(t_s[-1] - t_s[0])
-    block = np.floor((t_s - t_s[0]) / min(block_s, duration_s / LEAST_BLOCKS)).astype(int)
+    block = np.floor((t_s - t_s[0]) / min(block_s, duration_s / log.pair.settings.significance.least_blocks)).astype(int)
     out = []
     for number in np.unique(block):
         inside = block == number
@@ -201,14 +198,14 @@ def estimate_onsets(
     Nothing is smooth in an onset, so the times near it are searched. A time is as likely as exp(-squares / 2), the squares
     divided by `inflation` where they are more than noise.
     """
-    period_s = max(log.pair.period_s for log in logs)
+    settings, period_s = logs[0].pair.settings.significance, max(log.pair.period_s for log in logs)
     spread: dict[tuple[str, int], float] = {}
     for k, (effect, theta) in enumerate(found.chosen):
         for j, parameter in enumerate(effect.parameters):
             if not parameter.begins or not np.isfinite(theta[j]):
                 continue
-            step_s = max(period_s, 2.0 * ONSET_NEAR_S / (ONSET_TIMES - 1))
-            t_s = theta[j] + step_s * np.arange(-(ONSET_TIMES // 2), ONSET_TIMES // 2 + 1)
+            step_s = max(period_s, 2.0 * settings.onset_near_s / (settings.onset_times - 1))
+            t_s = theta[j] + step_s * np.arange(-(settings.onset_times // 2), settings.onset_times // 2 + 1)
             moved = (with_value(found.chosen, k, j, float(t)) for t in t_s)  # all else as it is but for the constants
             squares = np.array([fit(logs, chosen, part=part, iterations=0).objective for chosen in moved])
             likely = np.exp(-(squares - squares.min()) / (2.0 * inflation))

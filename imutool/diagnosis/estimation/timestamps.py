@@ -10,28 +10,21 @@ from scipy.ndimage import binary_dilation, median_filter
 from scipy.signal import savgol_filter
 from scipy.stats import binom, norm
 
-from imutool.diagnosis.estimation.aligned_log import Pair
+from imutool.diagnosis.estimation.aligned_log import DEFAULT, Pair
 from imutool.diagnosis.result import Estimate, Finding, HeldOut
-from imutool.sensor.effect import Effect, Parameter, Stage, Theta
-from imutool.sensor.samples import IdealMotion, SensorSamples
+from imutool.diagnosis.settings import TimestampSettings
+from imutool.sensor.effect import Effect, Parameter, Stage, Theta, starts_at
+from imutool.sensor.samples import SensorSamples
 from imutool.units import ASCII_UNITS, SENSORS, UNITS, Sensor
 
-MEDIAN, FEW = 15, 500  # samples: of a running median, and to find a period by first
-PERIOD_SPAN, PERIODS = 0.02, 201  # periods tried about the median step
-CLEAR, AGREE, LAG = 0.25, 0.3, 10  # of a period; of stamps that all agree; samples
-LEAST_MISSING, LEAST_AT_LIMIT, PILED = 3, 4, 2.0
-NEARLY, EXACT = 0.995, 1e-3
 SHARES = (0.999, 0.99, 0.97, 0.9, 0.8)  # of the largest reading, where a soft limit is looked for
-LEAST_JITTER_S = 2e-5
-LEAST_DIGITS = 0.3  # of the noise: finer steps leave no trace in it
-ON_GRID = 0.98  # of the samples
 LEAST_VALUES = 3  # of a grid
-AROUND, DEGREE = 15, 3  # samples of a line, and what it may bend
-EVENLY = 5.0  # standard deviations by which samples must be nearer to even than to their stamps
 LEAST_ROWS = 100
 
 
-def even(stamp_s: Float64[np.ndarray, " n"]) -> tuple[Float64[np.ndarray, " n"], int]:
+def even(
+    stamp_s: Float64[np.ndarray, " n"], settings: TimestampSettings = DEFAULT.timestamps
+) -> tuple[Float64[np.ndarray, " n"], int]:
     """Stamps of an even clock fitted to the stamps, and the number of missing samples.
 
     The period is the one in which the stamps agree best, which samples that are missing do not change; a running median of what
@@ -39,48 +32,54 @@ def even(stamp_s: Float64[np.ndarray, " n"]) -> tuple[Float64[np.ndarray, " n"],
     """
     k = np.arange(len(stamp_s), dtype=np.float64)
     since = stamp_s - stamp_s[0]
-    period, phase, agree = _period(since)
-    if agree < AGREE:
-        return _by_level(stamp_s, k)
+    period, phase, agree = _period(since, settings)
+    if agree < settings.least_agreement:
+        return _by_level(stamp_s, k, settings)
     counted = np.rint((since - phase) / period) - k
-    steady = median_filter(counted, MEDIAN, mode="nearest")
-    clear = np.abs((since - phase) / period - k - counted) < CLEAR  # a stamp well within its own period is taken at its word
+    steady = median_filter(counted, settings.median_samples, mode="nearest")
+    clear = (
+        np.abs((since - phase) / period - k - counted) < settings.clear_share
+    )  # a stamp well within its own period is taken at its word
     missing = np.where(clear, counted, steady)
     missing = np.where(np.abs(missing - steady) > 0.5, steady, missing) if not clear.all() else counted
     slope, start = np.polyfit(k + missing, stamp_s, 1)
     return start + slope * (k + missing), int(missing[-1] - missing[0])
 
 
-def _by_level(stamp_s: Float64[np.ndarray, " n"], k: Float64[np.ndarray, " n"]) -> tuple[Float64[np.ndarray, " n"], int]:
+def _by_level(
+    stamp_s: Float64[np.ndarray, " n"], k: Float64[np.ndarray, " n"], settings: TimestampSettings
+) -> tuple[Float64[np.ndarray, " n"], int]:
     """Even stamps under large jitter: a missing sample lifts the level of all later ones."""
-    period = float(np.median(stamp_s[LAG:] - stamp_s[:-LAG])) / LAG
+    lag = settings.lag_samples
+    period = float(np.median(stamp_s[lag:] - stamp_s[:-lag])) / lag
     missing = np.zeros(len(stamp_s))
     for _ in range(4):
         slope, start = np.polyfit(k + missing, stamp_s, 1)
         period = slope if missing.any() or abs(slope / period - 1.0) < 0.1 / len(k) else period
-        level = median_filter((stamp_s - start) / period - k, MEDIAN, mode="nearest")
+        level = median_filter((stamp_s - start) / period - k, settings.median_samples, mode="nearest")
         missing = np.maximum.accumulate(np.rint(level - level[0]))
     slope, start = np.polyfit(k + missing, stamp_s, 1)
     return start + slope * (k + missing), int(missing[-1] - missing[0])
 
 
-def _period(since_s: Float64[np.ndarray, " n"]) -> tuple[float, float, float]:
+def _period(since_s: Float64[np.ndarray, " n"], settings: TimestampSettings) -> tuple[float, float, float]:
     """Period (s) in which the stamps agree best, its phase (s), and the agreement."""
     best = float(np.median(np.diff(since_s)))
-    span = PERIOD_SPAN
-    for count in (FEW, len(since_s)):
+    span = settings.period_span
+    for count in (settings.period_samples, len(since_s)):
         first_s = since_s[:count]
-        tried = best * (1.0 + np.linspace(-span, span, PERIODS))
+        tried = best * (1.0 + np.linspace(-span, span, settings.periods))
         agree = np.array([abs(np.exp(2j * np.pi * first_s / period_s).sum()) for period_s in tried])
-        best, span = float(tried[int(np.argmax(agree))]), 4.0 * span / PERIODS
+        best, span = float(tried[int(np.argmax(agree))]), 4.0 * span / settings.periods
     mean = np.exp(2j * np.pi * since_s / best).mean()
     return best, float(np.angle(mean)) / (2.0 * np.pi) * best, float(abs(mean))
 
 
 def jitter(pairs: Sequence[Pair]) -> tuple[Effect, ...]:
     """Timestamp jitter of evenly taken samples as an effect; a share of one is all of it."""
-    corrections = [(pair.stamp_s, even(pair.stamp_s)[0] - pair.stamp_s) for pair in pairs]
-    if min(float(x.std()) for _, x in corrections) < LEAST_JITTER_S:
+    settings = pairs[0].settings.timestamps
+    corrections = [(pair.stamp_s, even(pair.stamp_s, settings)[0] - pair.stamp_s) for pair in pairs]
+    if min(float(x.std()) for _, x in corrections) < settings.least_jitter_s:
         return ()
 
     def forward(taken_s: Float64[np.ndarray, " n"], theta: Theta) -> Float64[np.ndarray, " n"]:
@@ -105,11 +104,11 @@ def jitter(pairs: Sequence[Pair]) -> tuple[Effect, ...]:
 
 def dropped(pairs: Sequence[Pair]) -> list[Finding]:
     """Finding of dropped samples that an even clock would have had."""
-    missing, total, length = 0, 0, 0.0
+    settings, missing, total, length = pairs[0].settings.timestamps, 0, 0, 0.0
     for pair in pairs:
-        missing, total = missing + even(pair.stamp_s)[1], total + len(pair.stamp_s)
+        missing, total = missing + even(pair.stamp_s, settings)[1], total + len(pair.stamp_s)
         length += float(pair.stamp_s[-1] - pair.stamp_s[0])
-    if missing < LEAST_MISSING:
+    if missing < settings.least_missing:
         return []
     share = missing / (missing + total)
     parameters = {
@@ -122,12 +121,12 @@ def dropped(pairs: Sequence[Pair]) -> list[Finding]:
 
 def rounded(pairs: Sequence[Pair], floor: Float64[np.ndarray, "6"]) -> list[Finding]:
     """Finding of quantization: values on a grid as coarse as the noise."""
-    lsb = {}
+    settings, lsb = pairs[0].settings.timestamps, {}
     for k, signal in enumerate(("gyro", "accel")):
         axes = [pair.real[:, a] for pair in pairs for a in range(3 * k, 3 * k + 3)]
-        grids = [grid(x) for x in axes if len(np.unique(x)) >= LEAST_VALUES] or [0.0]  # fewer lie on any grid
+        grids = [grid(x, settings) for x in axes if len(np.unique(x)) >= LEAST_VALUES] or [0.0]  # fewer lie on any grid
         noise = float(np.sqrt(np.mean(floor[3 * k : 3 * k + 3] ** 2)))
-        if min(grids) > LEAST_DIGITS * noise and max(grids) < 1.5 * min(grids):
+        if min(grids) > settings.least_digits * noise and max(grids) < 1.5 * min(grids):
             lsb[signal] = float(np.median(grids))
     if not lsb:
         return []
@@ -138,7 +137,7 @@ def rounded(pairs: Sequence[Pair], floor: Float64[np.ndarray, "6"]) -> list[Find
     return [Finding("quantization", signal, 0.0, 0.0, 0.0, parameters, "values are multiples of an LSB", held_out)]
 
 
-def grid(x: Float64[np.ndarray, " n"]) -> float:
+def grid(x: Float64[np.ndarray, " n"], settings: TimestampSettings = DEFAULT.timestamps) -> float:
     """Grid step of values; 0 where they lie on no grid or take fewer than three values."""
     values = np.unique(np.round(x, 12))
     if len(values) < LEAST_VALUES:
@@ -150,33 +149,35 @@ def grid(x: Float64[np.ndarray, " n"]) -> float:
         k = np.rint((values - values[0]) / step)
         step = float((k @ (values - values[0])) / (k @ k))
     off = np.abs((x - values[0]) / step - np.rint((x - values[0]) / step))
-    return step if float((off < 0.05).mean()) > ON_GRID else 0.0
+    return step if float((off < 0.05).mean()) > settings.grid_share else 0.0
 
 
-def limits(real: Float64[np.ndarray, "n 6"]) -> dict[Sensor, float]:
+def limits(real: Float64[np.ndarray, "n 6"], settings: TimestampSettings = DEFAULT.timestamps) -> dict[Sensor, float]:
     """Limits of the converters: the largest readings that recur to the last digit."""
-    found: dict[Sensor, float] = {}
+    highest: dict[Sensor, float] = {}
     for k, signal in enumerate(SENSORS):
         values = np.abs(real[:, 3 * k : 3 * k + 3])
         most = float(values.max())
         below = values[values < most * (1.0 - 1e-9)]
         at, next_to = values.size - below.size, int((below >= below.max(initial=0.0) * (1.0 - 1e-9)).sum())
-        if at >= LEAST_AT_LIMIT and at > PILED * next_to:  # values on a grid come again everywhere, and less at their ends
-            found[signal] = most
-    return found
+        if (
+            at >= settings.least_at_limit and at > settings.piled_factor * next_to
+        ):  # values on a grid come again everywhere, and less at their ends
+            highest[signal] = most
+    return highest
 
 
 def soft_limits(pairs: Sequence[Pair], biases: Sequence[Float64[np.ndarray, "6"]]) -> tuple[Effect, ...]:
     """Saturation whose readings still carry noise: one candidate a sensor, bias included."""
-    found = []
+    candidates = []
     for k, signal in enumerate(("gyro", "accel")):
-        if any(signal in limits(pair.real) for pair in pairs):
+        if any(signal in limits(pair.real, pair.settings.timestamps) for pair in pairs):
             continue
         part = slice(3 * k, 3 * k + 3)
         bias = np.mean([b[part] for b in biases], axis=0)
         most = float(max(np.abs(pair.real[:, part]).max() for pair in pairs))
         unit = UNITS[signal]
-        found.append(
+        candidates.append(
             Effect(
                 "saturation",
                 Stage.CONVERTER,
@@ -186,11 +187,11 @@ def soft_limits(pairs: Sequence[Pair], biases: Sequence[Float64[np.ndarray, "6"]
                 "the limit is reached",
                 _Clip(k, bias),
                 linear=False,
-                starts=_Starts(most),
+                starts=starts_at(*([share * most] for share in SHARES)),
                 variant="" if k == 0 else "accel",
             )
         )
-    return tuple(found)
+    return tuple(candidates)
 
 
 class _Clip:
@@ -205,23 +206,13 @@ class _Clip:
         return read.with_readings(gyro=out) if self.sensor == 0 else read.with_readings(accel=out)
 
 
-class _Starts:
-    """A little below the largest reading, which noise has raised."""
-
-    def __init__(self, most: float) -> None:
-        self.most = most
-
-    def __call__(self, _ideal: IdealMotion, _samples: SensorSamples) -> list[Theta]:
-        return [np.array([share * self.most]) for share in SHARES]
-
-
-def clipped(real: Float64[np.ndarray, "n 6"]) -> Bool[np.ndarray, "n 6"]:
+def clipped(real: Float64[np.ndarray, "n 6"], settings: TimestampSettings = DEFAULT.timestamps) -> Bool[np.ndarray, "n 6"]:
     """Clipped samples of an axis, and their neighbours, which filters mix with them."""
-    at, most = np.zeros(real.shape, bool), limits(real)
+    at, most = np.zeros(real.shape, bool), limits(real, settings)
     for k, signal in enumerate(("gyro", "accel")):
         if signal in most:
             part = slice(3 * k, 3 * k + 3)
-            at[:, part] = np.abs(real[:, part]) >= NEARLY * most[signal]
+            at[:, part] = np.abs(real[:, part]) >= settings.clipped_share * most[signal]
     return np.asarray(binary_dilation(at, np.ones((5, 1), bool))) if at.any() else at
 
 
@@ -232,11 +223,11 @@ def stuck(real: Float64[np.ndarray, "n 6"]) -> Bool[np.ndarray, "6"]:
 
 def saturated(pairs: Sequence[Pair], expected: Sequence[Float64[np.ndarray, "n 6"]], tried: int) -> list[Finding]:
     """Finding of saturation: the expectation exceeds clipped samples (sign test)."""
-    parameters: dict[str, Estimate] = {}
+    settings, parameters = pairs[0].settings.timestamps, dict[str, Estimate]()
     powers, signal_of, p = [0.0, 0.0, 0.0], "", 1.0
     real, model = (np.concatenate(parts) for parts in ([pair.real for pair in pairs], expected))
     for k, signal in enumerate(SENSORS):
-        most = limits(real).get(signal)
+        most = limits(real, settings).get(signal)
         if most is None:
             continue
         part = slice(3 * k, 3 * k + 3)
@@ -245,7 +236,7 @@ def saturated(pairs: Sequence[Pair], expected: Sequence[Float64[np.ndarray, "n 6
         chance = float(binom.sf(beyond.sum() - 1, len(beyond), 0.5)) * tried
         if chance > 1e-2 and beyond.mean() < 0.9:
             continue
-        parameters[f"{signal}_limit"] = Estimate(most, EXACT * most, UNITS[signal])
+        parameters[f"{signal}_limit"] = Estimate(most, settings.limit_error * most, UNITS[signal])
         before = ((real - model)[:, part] ** 2)[at]
         after = ((real[:, part] - np.clip(model[:, part], -most, most)) ** 2)[at]
         powers, signal_of, p = [float(before.sum()), float(after.sum()), float(at.size)], signal, min(p, chance)
@@ -264,18 +255,19 @@ def saturated(pairs: Sequence[Pair], expected: Sequence[Float64[np.ndarray, "n 6
 
 def late_stamps(pairs: Sequence[Pair]) -> list[Finding]:
     """Finding of timestamp jitter, where stamps are uneven and the samples are even."""
-    lateness = [pair.stamp_s - even(pair.stamp_s)[0] for pair in pairs]
-    if min(float(x.std()) for x in lateness) < LEAST_JITTER_S:
+    settings = pairs[0].settings.timestamps
+    lateness = [pair.stamp_s - even(pair.stamp_s, settings)[0] for pair in pairs]
+    if min(float(x.std()) for x in lateness) < settings.least_jitter_s:
         return []
     followed_sum, weight = 0.0, 0.0
     for pair, late in zip(pairs, lateness, strict=True):
         for column in pair.real.T:
-            share, size = _followed(column, late, pair.period_s)
+            share, size = _followed(column, late, pair.period_s, settings)
             followed_sum, weight = followed_sum + share * size, weight + size
     if weight <= 0.0:
         return []
     share, sigma = followed_sum / weight, 1.0 / np.sqrt(weight)
-    if share > 0.5 or 1.0 - share < EVENLY * sigma:
+    if share > 0.5 or 1.0 - share < settings.even_sigma * sigma:
         return []
     all_s = np.concatenate(lateness)
     std = float(all_s.std())
@@ -286,14 +278,17 @@ def late_stamps(pairs: Sequence[Pair]) -> list[Finding]:
     return [Finding("timestamp_jitter", "both", 0.0, chance, chance, parameters, "stamps jitter, samples do not", held_out)]
 
 
-def _followed(column: Float64[np.ndarray, " n"], late_s: Float64[np.ndarray, " n"], period_s: float) -> tuple[float, float]:
+def _followed(
+    column: Float64[np.ndarray, " n"], late_s: Float64[np.ndarray, " n"], period_s: float, settings: TimestampSettings
+) -> tuple[float, float]:
     """Share of the stamps' lateness that the samples follow, and its inverse variance."""
     if len(column) < LEAST_ROWS:
         return 0.0, 0.0
-    slope = savgol_filter(column, AROUND, DEGREE, deriv=1, delta=period_s)
+    line = settings.line_samples, settings.line_degree
+    slope = savgol_filter(column, *line, deriv=1, delta=period_s)
     moved = slope * late_s
-    moved = moved - savgol_filter(moved, AROUND, DEGREE)
-    rest = column - savgol_filter(column, AROUND, DEGREE)
+    moved = moved - savgol_filter(moved, *line)
+    rest = column - savgol_filter(column, *line)
     size = float(moved @ moved)
     share = float(moved @ rest) / max(size, 1e-300)
     variance = float(np.mean((rest - share * moved) ** 2))

@@ -8,8 +8,10 @@ to it.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from functools import partial
+from abc import ABC, abstractmethod
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float64
@@ -19,18 +21,16 @@ from imutool.diagnosis.estimation.aligned_log import Pair
 from imutool.sensor import catalogue
 from imutool.sensor.effect import Effect, Parameter, Stage, Theta
 from imutool.sensor.samples import SensorSamples, Vectors
-from imutool.sensor.unnamed_effects import VARIABLES
-from imutool.units import AXES, Sensor
+from imutool.sensor.unnamed_effects import VARIABLES, Variable, product_of
+from imutool.sensor.unnamed_effects import driven as channel_effect
+from imutool.units import AXES, SENSORS, UNITS
 
 LAGS_S = (-0.5, -0.2, -0.1, -0.05, 0.0, 0.05, 0.1, 0.2, 0.5)
 KNOTS, FINE_KNOTS = 9, 33
-SIGNALS: tuple[tuple[Sensor, str], ...] = (("gyro", "rad/s"), ("accel", "m/s²"))
-PLAUSIBLE = {"gyro": 0.1, "accel": 1.0}
+PLAUSIBLE, PLAUSIBLE_LAG_S = {"gyro": 0.1, "accel": 1.0}, 0.2
 INSIDE = 0.005  # of the values of a variable lie beyond its first knot, and as many beyond its last
 QUANTILES, BY_RANGE = 1001, 0.35  # places between which knots are found, and how many of them by the range alone
 SPREAD = 1e-9  # relative: knots that lie closer are one
-
-Variable = Callable[[SensorSamples], Float64[np.ndarray, " n"]]
 
 
 def driven(pairs: Sequence[Pair]) -> Iterator[Effect]:
@@ -40,41 +40,23 @@ def driven(pairs: Sequence[Pair]) -> Iterator[Effect]:
     """
     named = {need for effect in catalogue.diagnosed() for need in effect.needs}
     for name in sorted(set.intersection(*(set(pair.channels) for pair in pairs))):
-        if any(need in name for need in named):
-            continue  # the catalogue has a name for that
-        values = np.concatenate([pair.channels[name] for pair in pairs])
-        center, size = float(np.mean(values)), float(np.std(values))
-        if size <= 0:
-            continue
-        for k, (signal, measured_in) in enumerate(SIGNALS):
-            numbers = (
-                *(Parameter(axis, f"{measured_in} per unit of {name}", PLAUSIBLE[signal] / size) for axis in AXES),
-                Parameter("lag", "s", 0.2),
-            )
-            yield Effect(
-                "driven",
-                Stage.SENSOR,
-                (signal,),
-                f"{signal} += gain ({name}(t - lag) - mean)",
-                numbers,
-                f"{name} varies",
-                _Driven(name, center, k),
+        size = float(np.std(np.concatenate([pair.channels[name] for pair in pairs])))
+        if size <= 0 or any(need in name for need in named):
+            continue  # constant, or the catalogue has a name for that
+        for signal in SENSORS:
+            effect = channel_effect(signal, name)
+            plausible = (PLAUSIBLE[signal] / size,) * 3 + (PLAUSIBLE_LAG_S,)
+            yield replace(
+                effect,
+                parameters=tuple(replace(n, plausible=p) for n, p in zip(effect.parameters, plausible, strict=True)),
+                equation=f"{signal} += gain ({name}(t - lag) - mean)",
+                observable_if=f"{name} varies",
                 linear=False,
                 starts=lambda ideal, real: [np.array([0.0, 0.0, 0.0, lag]) for lag in LAGS_S],
                 kind="driven",
                 variable=name,
                 variant=f"{name}:{signal}",
             )
-
-
-class _Driven:
-    def __init__(self, channel: str, center: float, sensor: int) -> None:
-        self.channel, self.center, self.sensor = channel, center, sensor
-
-    def __call__(self, read: SensorSamples, theta: Theta) -> SensorSamples:
-        x = np.interp(read.stamp_s - theta[3], read.stamp_s, read.channels[self.channel]) - self.center
-        added = x[:, None] * theta[:3]
-        return read.with_readings(gyro=read.gyro + added) if self.sensor == 0 else read.with_readings(accel=read.accel + added)
 
 
 UNIT_OF = {"omega": "rad/s", "f": "m/s²", "alpha": "rad/s²", "t": "s"}
@@ -90,7 +72,7 @@ def curves(like: SensorSamples) -> Iterator[Effect]:
     for variable in VARIABLES:
         inner = _knots(like, variable, KNOTS)
         if inner is not None:
-            yield from (_curve(variable, k, axis, inner) for k in range(len(SIGNALS)) for axis in range(3))
+            yield from (_curve(variable, k, axis, inner) for k in range(len(SENSORS)) for axis in range(3))
 
 
 def finer(effect: Effect, like: SensorSamples) -> Effect | None:
@@ -115,13 +97,13 @@ def _knots(like: SensorSamples, variable: str, count: int) -> Float64[np.ndarray
 
 
 def _curve(variable: str, sensor: int, axis: int, inner: Float64[np.ndarray, " p"]) -> Effect:
-    signal, measured_in = SIGNALS[sensor]
+    signal = SENSORS[sensor]
     return Effect(
         "unknown",
         Stage.SENSOR,
         (signal,),
         f"{signal}.{AXES[axis]} += curve({variable})",
-        tuple(Parameter(f"c{j}", measured_in, PLAUSIBLE[signal]) for j in range(len(inner) + 2)),
+        tuple(Parameter(f"c{j}", UNITS[signal], PLAUSIBLE[signal]) for j in range(len(inner) + 2)),
         f"{variable} varies",
         Curve(variable, sensor, axis, inner),
         kind="unknown",
@@ -131,18 +113,15 @@ def _curve(variable: str, sensor: int, axis: int, inner: Float64[np.ndarray, " p
     )
 
 
-class SplineCurve:
-    """Spline curve (cubic) of one variable, constant beyond its ends.
-
-    Coefficients are those of B-splines, or of sums of them.
+class SplineBasis:
+    """Cubic B-splines, or sums of them, of one variable, constant beyond their ends.
 
     Where samples are many, knots are close: at even distances, what the motion rarely does would bend all the rest.
     """
 
-    def __init__(self, variable: str, inner: Float64[np.ndarray, " p"]) -> None:
-        self.variable, self.inner = variable, inner
+    def __init__(self, inner: Float64[np.ndarray, " p"]) -> None:
+        self.inner, self.knots = inner, np.concatenate([[inner[0]] * 3, inner, [inner[-1]] * 3])
         self._last: tuple[np.ndarray, np.ndarray] | None = None
-        self.knots = np.concatenate([[inner[0]] * 3, inner, [inner[-1]] * 3])
 
     def points(self, count: int) -> Float64[np.ndarray, " k"]:
         """Values to show the curve at: more where it can bend more."""
@@ -160,60 +139,58 @@ class SplineCurve:
         return splines
 
 
+class SplineCurve(SplineBasis, ABC):
+    """Forward model of a spline curve of one variable, on one of the columns of a signal."""
+
+    def __init__(self, variable: str, unit: str, inner: Float64[np.ndarray, " p"], columns: int = 1, axis: int = 0) -> None:
+        super().__init__(inner)
+        self.variable, self.unit, self.columns, self.axis = variable, unit, columns, axis
+
+    @abstractmethod
+    def __call__(self, samples: Any, theta: Theta) -> Any:
+        """The samples with the curve on them."""
+
+
 class Curve(SplineCurve):
     """+ a spline of one variable on one axis of an IMU."""
 
     def __init__(self, variable: str, sensor: int, axis: int, inner: Float64[np.ndarray, " p"]) -> None:
-        super().__init__(variable, inner)
-        self.sensor, self.axis = sensor, axis
+        super().__init__(variable, unit(variable), inner, columns=len(AXES), axis=axis)
+        self.sensor = sensor
 
-    def __call__(self, read: SensorSamples, theta: Theta) -> SensorSamples:
+    def __call__(self, samples: SensorSamples, theta: Theta) -> SensorSamples:
         """The reading with the curve on it."""
-        return _on_axis(read, self.sensor, self.axis, self.basis(VARIABLES[self.variable](read)) @ theta)
+        return _on_axis(samples, self.sensor, self.axis, self.basis(VARIABLES[self.variable](samples)) @ theta)
 
 
-def library() -> Iterator[tuple[str, Variable]]:
+def library() -> Iterator[str]:
     """Terms of equations, as physics.toml writes them."""
     names = [f"{kind}_{axis}" for kind in ("omega", "f", "alpha") for axis in AXES]
     for k, name in enumerate(names):
-        x = VARIABLES[name]
-        yield name, x
-        yield f"|{name}|", partial(_of, x, np.abs)
-        yield f"{name} |{name}|", partial(_of, x, lambda v: v * np.abs(v))
-        yield f"{name}^3", partial(_of, x, lambda v: v * v * v)
-        yield f"sign({name})", partial(_of, x, np.sign)
-        for other in names[: k + 1]:
-            yield f"{other} {name}", partial(_product, VARIABLES[other], x)
-
-
-def _of(x: Variable, function: Callable[[np.ndarray], np.ndarray], read: SensorSamples) -> Float64[np.ndarray, " n"]:
-    return np.asarray(function(x(read)))
-
-
-def _product(x: Variable, y: Variable, read: SensorSamples) -> Float64[np.ndarray, " n"]:
-    return x(read) * y(read)
+        yield from (name, f"|{name}|", f"{name} |{name}|", f"{name}^3", f"sign({name})")
+        yield from (f"{other} {name}" for other in names[: k + 1])
 
 
 def terms(like: SensorSamples) -> Iterator[Effect]:
     """Each term of the library on each axis of each sensor."""
-    for text, term in library():
+    for text in library():
+        term = product_of(text)
+        assert term is not None, f"{text} is a product of known factors"
         size = float(np.std(term(like)))
-        if not size > 0:
-            continue
-        for k, (signal, measured_in) in enumerate(SIGNALS):
-            for axis in range(3):
+        for sensor, signal in enumerate(SENSORS) if size > 0 else ():
+            for axis, letter in enumerate(AXES):
                 yield Effect(
                     "unknown",
                     Stage.SENSOR,
                     (signal,),
-                    f"{signal}.{AXES[axis]} += c {text}",
-                    (Parameter("c", f"{measured_in} per unit of {text}", PLAUSIBLE[signal] / size),),
+                    f"{signal}.{letter} += c {text}",
+                    (Parameter("c", f"{UNITS[signal]} per unit of {text}", PLAUSIBLE[signal] / size),),
                     f"{text} varies",
-                    _Term(term, k, axis),
+                    _Term(term, sensor, axis),
                     kind="unknown",
                     variable=text,
                     axis=axis,
-                    variant=f"{signal}.{AXES[axis]}:{text}",
+                    variant=f"{signal}.{letter}:{text}",
                 )
 
 

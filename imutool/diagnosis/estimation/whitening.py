@@ -16,14 +16,11 @@ from jaxtyping import Bool, Float64, Int64
 from scipy.ndimage import median_filter, minimum_filter1d
 from scipy.signal import firwin, lfilter, periodogram, upfirdn
 
-from imutool.diagnosis.estimation.aligned_log import AlignedLog, Pair
+from imutool.diagnosis.estimation.aligned_log import DEFAULT, AlignedLog, Pair
+from imutool.diagnosis.settings import NoiseSettings
 
 MAD_TO_STD = 1.4826
 LEAST_STD = 1e-12
-MOTION_HZ, REFERENCE_HZ = 15.0, 60.0  # where a body's motion has its power, and where noise is measured in its place
-BAND_S, OVER = 0.6, 2.5  # length of the filter of a band, and samples a period of its edge: whitening undoes what it can
-LEAST_SEGMENT, LEAST_SEGMENTS = 64, 8  # of a short log: the median of one or two says too little
-SEGMENT, LINES = 512, 9  # samples of a spectrum; frequencies of the median that takes lines out of it
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,10 +34,10 @@ class Band:
     every: int
 
     @staticmethod
-    def below(band_hz: float, rate_hz: float) -> Band:
-        """Band up to `band_hz`, by a symmetric filter of `BAND_S`."""
-        count = 2 * round(0.5 * BAND_S * rate_hz) + 1
-        every = max(1, int(rate_hz / (OVER * band_hz)))
+    def below(band_hz: float, rate_hz: float, settings: NoiseSettings = DEFAULT.noise) -> Band:
+        """Band up to `band_hz`, by a symmetric filter."""
+        count = 2 * round(0.5 * settings.band_filter_s * rate_hz) + 1
+        every = max(1, int(rate_hz / (settings.band_oversampling * band_hz)))
         return Band(firwin(count, min(band_hz, 0.45 * rate_hz), fs=rate_hz), every)
 
     def __call__(self, x: Float64[np.ndarray, "n k *p"]) -> Float64[np.ndarray, "m k *p"]:
@@ -170,23 +167,25 @@ def whitener(
     return Whitener(filters, std, band)
 
 
-def level(residual: Float64[np.ndarray, "n k"], usable: Bool[np.ndarray, "n ..."], rate_hz: float, order: int) -> Whitener:
+def level(
+    residual: Float64[np.ndarray, "n k"], usable: Bool[np.ndarray, "n ..."], rate_hz: float, settings: NoiseSettings
+) -> Whitener:
     """Whitening filters of a sensor beside an exact simulation.
 
-    As `whitener`, but below `MOTION_HZ` the noise is taken to be what it is above.
+    As `whitener`, but below `motion_hz` the noise is taken to be what it is above.
 
     What is left down there may be physics that nobody thought of, and must not be taken for noise.
     """
-    filters, std = np.zeros((residual.shape[1], order + 1)), np.ones(residual.shape[1])
+    filters, std = np.zeros((residual.shape[1], settings.order + 1)), np.ones(residual.shape[1])
     filters[:, 0] = 1.0
     for axis, counts in enumerate(_by_axis(usable, residual.shape[1])):
         if not counts.any():
             continue
-        f_hz, power = spectrum(residual[:, axis], counts, rate_hz)
-        power = median_filter(power, LINES, mode="nearest")  # a line is no noise
-        low, high = min(MOTION_HZ, 0.3 * rate_hz), min(REFERENCE_HZ, 0.45 * rate_hz)
+        f_hz, power = spectrum(residual[:, axis], counts, rate_hz, settings)
+        power = median_filter(power, settings.line_bins, mode="nearest")  # a line is no noise
+        low, high = min(settings.motion_hz, 0.3 * rate_hz), min(settings.reference_hz, 0.45 * rate_hz)
         power[f_hz < low] = np.median(power[(f_hz >= low) & (f_hz <= high)])
-        filters[axis], std[axis] = autoregression(power, rate_hz, order)
+        filters[axis], std[axis] = autoregression(power, rate_hz, settings.order)
     return Whitener(filters, std)
 
 
@@ -204,13 +203,14 @@ def _by_axis(usable: Bool[np.ndarray, "n ..."], columns: int) -> Bool[np.ndarray
 
 
 def spectrum(
-    x: Float64[np.ndarray, " n"], usable: Bool[np.ndarray, " n"], rate_hz: float
+    x: Float64[np.ndarray, " n"], usable: Bool[np.ndarray, " n"], rate_hz: float, settings: NoiseSettings
 ) -> tuple[Float64[np.ndarray, " f"], Float64[np.ndarray, " f"]]:
     """Frequencies and power density: the median (Welch) over usable segments.
 
     A segment counts if all of it is usable, or most of it where none is.
     """
-    size = min(SEGMENT, max(len(x) // LEAST_SEGMENTS, LEAST_SEGMENT), len(x))
+    least = max(len(x) // settings.least_segments, settings.least_segment_samples)
+    size = min(settings.segment_samples, least, len(x))
     starts = range(0, len(x) - size + 1, max(1, size // 2))
     whole = np.array([float(usable[s : s + size].mean()) for s in starts])
     taken = [s for s, share in zip(starts, whole, strict=True) if share >= min(1.0, float(whole.max()))]

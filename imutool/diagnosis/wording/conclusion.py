@@ -8,9 +8,9 @@ from itertools import groupby
 from pathlib import Path
 from textwrap import fill
 
-from imutool.diagnosis.quantity import grouped, percent, symbol
-from imutool.diagnosis.result import ALWAYS, Diagnosis, HeldOut, Located, Unexplained
+from imutool.diagnosis.result import Diagnosis, HeldOut, Located, Unexplained
 from imutool.diagnosis.wording.effect_sentences import has_gain, label, named_sentence, parameters_text, signals
+from imutool.diagnosis.wording.quantity import grouped, percent, symbol
 from imutool.units import UNITS
 
 QUIET = "nothing else stands above the noise"
@@ -232,9 +232,9 @@ def _regime(located: Sequence[Located], signal: str) -> str:
         return ""
     place = max(places, key=lambda place: place.share)
     regime = place.regime
-    if place.everywhere:
-        return f" throughout{regime.removeprefix(ALWAYS)}"
-    if place.intermittent:
+    if place.extent == "everywhere":
+        return f" throughout{regime.removeprefix('always')}"
+    if place.extent == "intermittent":
         return " off and on"
     word = regime.split()[0].lower()
     starts = {

@@ -6,8 +6,8 @@ import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
-from imutool.diagnosis.quantity import Quantity, grouped
 from imutool.diagnosis.result import Diagnosis, Finding
+from imutool.diagnosis.wording.quantity import Quantity, grouped
 
 
 @dataclass(frozen=True)

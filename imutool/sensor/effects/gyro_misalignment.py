@@ -7,19 +7,18 @@ from __future__ import annotations
 
 from imutool.sensor.effect import Effect, Stage, Theta, each_pair, matrix
 from imutool.sensor.samples import SensorSamples
+from imutool.units import Sensor
 
 
-def _forward(samples: SensorSamples, m: Theta) -> SensorSamples:
-    return samples.with_readings(gyro=samples.gyro + samples.gyro @ matrix(m).T)
+def misalignment(sensor: Sensor, symbol: str, observable_if: str) -> Effect:
+    """Misalignment of either sensor."""
+
+    def forward(samples: SensorSamples, m: Theta) -> SensorSamples:
+        return samples.with_added(sensor, getattr(samples, sensor) @ matrix(m).T)
+
+    parameters = each_pair("-", 0.05, diagonal=False)
+    equation = f"{sensor} += M {symbol}, diag M = 0"
+    return Effect(f"{sensor}_misalignment", Stage.SENSOR, (sensor,), equation, parameters, observable_if, forward, trained=True)
 
 
-EFFECT = Effect(
-    "gyro_misalignment",
-    Stage.SENSOR,
-    ("gyro",),
-    "gyro += M omega, diag M = 0",
-    each_pair("-", 0.05, diagonal=False),
-    "two axes turn",
-    _forward,
-    trained=True,
-)
+EFFECT = misalignment("gyro", "omega", "two axes turn")

@@ -7,7 +7,6 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from imutool import __version__
-from imutool.diagnosis.quantity import SHOWN, each, grouped, percent, symbol
 from imutool.diagnosis.result import SCHEMA, Diagnosis, Finding, Traces
 from imutool.diagnosis.wording.conclusion import (
     chance_text,
@@ -22,6 +21,7 @@ from imutool.diagnosis.wording.conclusion import (
     unobservable,
 )
 from imutool.diagnosis.wording.effect_sentences import effect_sentence, has_gain, label
+from imutool.diagnosis.wording.quantity import SHOWN, each, grouped, percent, symbol
 from imutool.mcap_io.storage.target import Target
 from imutool.units import ASCII_UNITS
 from imutool.viewing.html import diagnosis_figures as figures

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from support import planted
 
-from imutool.diagnosis.estimation.gauss_newton import PATIENCE, PRIOR, Fit, fit
+from imutool.diagnosis.estimation.gauss_newton import Fit, fit
 from imutool.diagnosis.estimation.jacobians import Jacobians, bound, expected, free
+from imutool.diagnosis.settings import DiagnoseSettings, FitSettings
 from imutool.sensor import catalogue
 
 SURE = 4.0  # standard deviations: 1 in 16 000 outside
@@ -29,6 +32,8 @@ EFFECTS: dict[str, dict[str, tuple[list[float], list[float]]]] = {  # what is pl
     "gyro drift": {"gyro_bias_drift": ([0.02, -0.03, 0.01, 8.0], [0.01, -0.01, 0.01, 10.0])},
     "arm and clock": {"lever_arm": ([0.2, -0.05, 0.1], [0.0] * 3), "clock_offset": ([-0.02], [0.0])},
 }
+
+SETTINGS = FitSettings()
 
 
 def fit_of_planted(effects: dict[str, tuple[list[float], list[float]]], seed: int) -> tuple[Fit, dict[str, np.ndarray]]:
@@ -88,7 +93,7 @@ def test_what_a_planar_motion_does_not_excite_stays_at_nothing_and_says_so() -> 
     stds = got.stds()
     names = [number.name for number in misalignment[0].parameters]
     for name, value, std in zip(names, got.chosen[0][1], stds["gyro_misalignment"], strict=True):
-        prior = PRIOR * misalignment[0].parameters[names.index(name)].plausible
+        prior = SETTINGS.prior_std * misalignment[0].parameters[names.index(name)].plausible
         if name in ("xz", "yz"):  # what the turn about z adds to the others
             assert std < 0.01 * prior
             assert abs(value - {"xz": 0.02, "yz": -0.03}[name]) < SURE * std
@@ -96,7 +101,7 @@ def test_what_a_planar_motion_does_not_excite_stays_at_nothing_and_says_so() -> 
             assert std == pytest.approx(prior, rel=0.01)
             assert abs(value) < 0.01 * prior
     assert abs(got.chosen[1][1][2]) < 1e-3
-    assert stds["lever_arm"][2] == pytest.approx(PRIOR * 0.3, rel=0.01)
+    assert stds["lever_arm"][2] == pytest.approx(SETTINGS.prior_std * 0.3, rel=0.01)
     assert np.abs((got.chosen[1][1][:2] - [0.3, 0.1]) / stds["lever_arm"][:2]).max() < SURE
 
 
@@ -184,9 +189,9 @@ def test_derivatives_that_were_kept_end_where_new_ones_end(monkeypatch: pytest.M
     pair = planted.pair(planted.rich(), {"low_pass": [6.0], "lever_arm": [0.3, -0.2, 0.1]}, 13)
     log, begun = planted.weighed(pair), planted.acting({"low_pass": [15.0], "lever_arm": [0.0] * 3})
     kept = fit([log], begun)
-    monkeypatch.setattr("imutool.diagnosis.estimation.gauss_newton.PREDICTED", 0.0)  # so that every step asks for new ones
+    never = DiagnoseSettings(fit=FitSettings(jacobian_error=1e-300))  # so that every step asks for new ones
     monkeypatch.setattr(Jacobians, "linear", lambda self: None)
-    anew = fit([log], begun)
+    anew = fit([replace(log, pair=replace(pair, settings=never))], begun)
     for (_, one), (physics, other) in zip(kept.chosen, anew.chosen, strict=True):
         assert (np.abs(one - other) < SAME * anew.stds()[physics.key]).all()
 
@@ -195,7 +200,7 @@ def test_a_fit_that_falls_short_of_what_was_hoped_for_goes_no_further() -> None:
     pair = planted.pair(planted.rich(), {"low_pass": [3.0]}, 14)
     log, begun = planted.weighed(pair), planted.acting({"low_pass": [80.0]})
     whole = fit([log], begun)
-    short = fit([log], begun, iterations=PATIENCE)
+    short = fit([log], begun, iterations=SETTINGS.patience_steps)
     assert whole.objective < short.objective - 1.0
     np.testing.assert_array_equal(fit([log], begun, give_up_above=0.0).chosen[0][1], short.chosen[0][1])
     np.testing.assert_array_equal(fit([log], begun, give_up_above=np.inf).chosen[0][1], whole.chosen[0][1])

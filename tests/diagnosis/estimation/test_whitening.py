@@ -7,6 +7,7 @@ import pytest
 from scipy.signal import lfilter
 
 from imutool.diagnosis.estimation.whitening import Band, Whitener, burg, level, settled, whitener
+from imutool.diagnosis.settings import NoiseSettings
 
 N, RATE_HZ, STD = 12_000, 100.0, 0.01
 SIGMAS = 4.5  # of a sample autocorrelation, one over the root of the count; some 60 are looked at
@@ -95,7 +96,7 @@ def test_rows_are_filtered_as_the_books_filters_do(banded: bool) -> None:
 @pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize("count", [2000, N])
 def test_level_of_white_noise_is_its_size(seed: int, count: int) -> None:
-    w = level(STD * white(seed, count), np.ones(count, bool), RATE_HZ, 6)
+    w = level(STD * white(seed, count), np.ones(count, bool), RATE_HZ, NoiseSettings())
     np.testing.assert_allclose(w(STD * white(seed, count))[6:].std(axis=0), 1.0, atol=LEVEL)
 
 
@@ -103,7 +104,7 @@ def test_level_does_not_take_a_slow_misfit_for_noise() -> None:
     t = np.arange(N) / RATE_HZ
     misfit = np.repeat((0.1 * np.sin(2.0 * np.pi * 0.4 * t) + 0.05 * np.sin(2.0 * np.pi * 3.0 * t))[:, None], 6, axis=1)
     x = STD * white(5) + misfit
-    w = level(x, np.ones(N, bool), RATE_HZ, 6)
+    w = level(x, np.ones(N, bool), RATE_HZ, NoiseSettings())
     kept = w(misfit)[100:].std(axis=0) / (misfit.std() / STD)
     assert (np.abs(kept - 1.0) < 2 * LEVEL).all()
     learned = whitener(x, np.ones(N, bool), 6)
@@ -113,13 +114,13 @@ def test_level_does_not_take_a_slow_misfit_for_noise() -> None:
 def test_level_does_not_take_a_line_for_noise() -> None:
     t = np.arange(N) / RATE_HZ
     line = np.repeat((0.05 * np.sin(2.0 * np.pi * 23.0 * t))[:, None], 6, axis=1)
-    w = level(STD * white(6) + line, np.ones(N, bool), RATE_HZ, 6)
+    w = level(STD * white(6) + line, np.ones(N, bool), RATE_HZ, NoiseSettings())
     assert (w(line)[100:].std(axis=0) > 0.7 * line.std() / STD).all()
 
 
 def test_level_knows_the_colour_above_the_motion() -> None:
     x = STD * lfilter([1.0, 0.9], [1.0], white(7), axis=0)  # less and less towards Nyquist
-    w = level(x, np.ones(N, bool), RATE_HZ, 6)
+    w = level(x, np.ones(N, bool), RATE_HZ, NoiseSettings())
     spectrum = np.abs(np.fft.rfft(w(x)[100:], axis=0)) ** 2 / (N - 100)
     f_hz = np.fft.rfftfreq(N - 100, 1.0 / RATE_HZ)
     high = (f_hz > 18.0) & (f_hz < 40.0)
@@ -129,7 +130,7 @@ def test_level_knows_the_colour_above_the_motion() -> None:
 def test_level_is_the_same_with_a_third_of_the_rows_left_out() -> None:
     x = STD * white(8)
     usable = (np.arange(N) // 600) % 3 != 2
-    w = level(np.where(usable[:, None], x, 0.0), usable, RATE_HZ, 6)
+    w = level(np.where(usable[:, None], x, 0.0), usable, RATE_HZ, NoiseSettings())
     np.testing.assert_allclose(w(x)[6:].std(axis=0), 1.0, atol=LEVEL)
 
 

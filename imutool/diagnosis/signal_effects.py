@@ -16,7 +16,7 @@ from jaxtyping import Float64
 from scipy.signal import lfilter
 
 from imutool.diagnosis.estimation.unnamed_effects import LAGS_S, SplineCurve
-from imutool.diagnosis.scalar.signal import AlignedSignal, IdealSignal, Samples, SignalSamples
+from imutool.diagnosis.signal_alignment import AlignedSignal, IdealSignal, Samples, SignalSamples
 from imutool.sensor.effect import Effect, Kind, Parameter, Stage, Theta
 
 CUTOFFS = (100.0, 30.0, 10.0, 3.0, 1.0, 0.3)  # to start from, over the signal's own mean frequency
@@ -27,7 +27,6 @@ MOVED = 0.005  # of the signal's size, by which derivatives move it: more than a
 LOG_MOVED = 0.02  # of the logarithm of a positive parameter, likewise
 KNOTS, KNOTS_OF_TIME = 7, 15
 BEND = 0.3  # of the signal's size: a second difference between a curve's knots
-COPY = 0.98  # correlation above which another channel is a copy of the signal
 
 
 def _effect(
@@ -167,8 +166,8 @@ class SignalCurve(SplineCurve):
     """
 
     def __init__(self, variable: str, unit: str, inner: Float64[np.ndarray, " p"]) -> None:
-        super().__init__(variable, inner)
-        self.unit, self.count = unit, len(inner) + 2
+        super().__init__(variable, unit, inner)
+        self.count = len(inner) + 2
 
     @property
     def plausible(self) -> tuple[float, ...]:
@@ -180,10 +179,10 @@ class SignalCurve(SplineCurve):
         bends = [np.maximum(at - at[j], 0.0) if at[j] >= 0 else np.maximum(at[j] - at, 0.0) for j in range(1, self.count - 1)]
         return np.asarray(splines @ np.stack([np.ones(self.count), at, *bends], axis=1))
 
-    def __call__(self, s: SignalSamples, theta: Theta) -> SignalSamples:
+    def __call__(self, samples: SignalSamples, theta: Theta) -> SignalSamples:
         """The signal with the curve on it."""
-        of = {"x": s.x, "dx/dt": s.dx, "t": s.stamp_s}[self.variable]
-        return s.but(s.y + self.basis(of) @ theta)
+        of = {"x": samples.x, "dx/dt": samples.dx, "t": samples.stamp_s}[self.variable]
+        return samples.but(samples.y + self.basis(of) @ theta)
 
 
 def _curve(name: str, kind: Kind, variable: str, of: str, values: Samples, knots: int, size: float, unit: str) -> Effect:
@@ -224,7 +223,10 @@ def driven(signal: AlignedSignal) -> Iterator[Effect]:
     for name, (t_s, values) in sorted(signal.ideal.channels.items()):
         channel = np.interp(signal.stamp_s, t_s, values)
         spread = float(channel.std())
-        if not spread > 1e-12 * max(1.0, float(np.abs(channel).max())) or abs(float(np.corrcoef(channel, real)[0, 1])) > COPY:
+        if (
+            not spread > 1e-12 * max(1.0, float(np.abs(channel).max()))
+            or abs(float(np.corrcoef(channel, real)[0, 1])) > signal.settings.signal.copy_correlation
+        ):
             continue
         numbers = (Parameter("gain", f"{signal.unit or '1'} per unit of {name}", size / spread), Parameter("lag", "s", 0.2))
         yield _effect(

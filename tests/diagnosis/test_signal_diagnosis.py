@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping
 import numpy as np
 import pytest
 
-from imutool.diagnosis.scalar.diagnose import SignalDiagnosis, diagnose_signal
+from imutool.diagnosis.signal_diagnosis import SignalDiagnosis, diagnose_signal
 from imutool.errors import DataError
 from imutool.mcap_io.fields import Fields
 

@@ -7,9 +7,10 @@ import pytest
 import torch
 
 from imutool.bias import io
-from imutool.bias.joint_ode import JointField
-from imutool.bias.model import Segment
-from imutool.bias.neural_ode import Config, Model
+from imutool.bias.networks.joint_ode import JointField
+from imutool.bias.networks.network import Segment
+from imutool.bias.networks.neural_ode import Network
+from imutool.bias.neural_ode import Config
 from imutool.errors import ConfigError
 from imutool.geometry import so3
 from imutool.inertial.windows import end_attitude
@@ -22,10 +23,10 @@ SAME_TURN = {"euler": 1e-2, "rk4": 1e-3}  # rad over half a second: Euler is lat
 WEIGHTS = 0.3  # of the field's last layer: drifts of some 1e-4 rad/s²
 
 
-def lively() -> Model:
+def lively() -> Network:
     """A joint model whose field and calibration are not zero."""
     torch.manual_seed(0)
-    model = Model(Config(scheme="joint"), RATE_HZ).double()
+    model = Network(Config(scheme="joint"), RATE_HZ).double()
     field = model.drift["gyro"]
     assert isinstance(field, JointField)
     with torch.no_grad():
@@ -48,10 +49,10 @@ def test_the_stream_equals_forward_in_blocks_and_one_by_one(seen: Segment) -> No
     model = lively()
     expected = model(seen)[0].numpy()
     t, gyro, accel = (x[0].numpy() for x in (seen.t, seen.gyro, seen.accel))
-    stream = model.stream(seen.rest[0].numpy())
+    stream = model.frozen().stream(seen.rest[0].numpy())
     blocks = np.concatenate([stream(t[a:b], gyro[a:b], accel[a:b]) for a, b in ((0, 1), (1, 40), (40, 101))])
     np.testing.assert_allclose(blocks, expected, rtol=0, atol=STREAM)
-    single = model.stream(seen.rest[0].numpy())
+    single = model.frozen().stream(seen.rest[0].numpy())
     each = [single.one(float(t[k]), np.concatenate([gyro[k], accel[k]])) for k in range(len(t))]
     np.testing.assert_allclose(each, expected, rtol=0, atol=STREAM)
 
@@ -74,4 +75,4 @@ def test_the_default_scheme_stands_in_no_file() -> None:
 
 def test_it_needs_a_drift_of_the_gyro() -> None:
     with pytest.raises(ConfigError, match="drift of the gyro"):
-        Model(Config(scheme="joint", drift=()), RATE_HZ)
+        Network(Config(scheme="joint", drift=()), RATE_HZ)

@@ -8,11 +8,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 
 from imutool.bias.io import find_model
-from imutool.bias.model import Segment
-from imutool.bias.physics_model import MOST_TAU_S, Model
+from imutool.bias.physics import MOST_TAU_S, Model
 from imutool.bias_start.correction import apply
 from imutool.bias_start.initial_bias import prior
 from imutool.debiasing import debias
@@ -28,7 +26,7 @@ from imutool.sensor.simulate import simulate
 RATE_HZ = 200.0
 BIAS = Bias(gyro=(0.05, -0.03, 0.02), accel=(0.2, -0.1, 0.3))
 EXACT = 1e-9  # of a matrix and its inverse
-STREAMED = 1e-6  # the contract of every model: in torch, in blocks and one by one the same
+STREAMED = 1e-6  # the contract of every model: in blocks and one by one the same
 # What is left of the error, as a share of its own root mean square: an effect of the true motion is computed from the measured
 # one (first order: as much of itself as it is of the signal), a derivative lags by its filter of 0.02 s.
 FIRST_ORDER, BY_DERIVATIVE = 0.2, 0.5
@@ -122,17 +120,15 @@ def test_terms_and_curves_without_a_name_are_taken_off(trajectory: Path, ideal: 
     assert after < FIRST_ORDER * before
 
 
-def test_blocks_and_single_samples_and_torch_agree(trajectory: Path) -> None:
+def test_blocks_and_single_samples_agree(trajectory: Path) -> None:
     file = written(trajectory.with_name("all.toml"), *(entry(name, values) for name, (values, _) in EFFECTS.items()))
     imu = along(trajectory, file, "all").imu.rows(slice(0, 900))
     model = find_model(file, RATE_HZ)
-    rest, t_s = model.prior_mean.numpy().copy() + 0.01, seconds(imu.t_ns, int(imu.t_ns[0]))
+    rest, t_s = model.prior_mean + 0.01, seconds(imu.t_ns, int(imu.t_ns[0]))
     whole = model.stream(rest)(t_s, imu.gyro, imu.accel)
     stream = model.stream(rest)
     cuts = [stream(t_s[a:b], imu.gyro[a:b], imu.accel[a:b]) for a, b in ((0, 1), (1, 400), (400, 401), (401, 900))]
     assert np.allclose(np.concatenate(cuts), whole, rtol=0, atol=STREAMED)
-    batch = (torch.from_numpy(np.array(values))[None] for values in (t_s, imu.gyro, imu.accel, rest))
-    assert np.allclose(model(Segment(*batch))[0].numpy(), whole, rtol=0, atol=STREAMED)
 
 
 def test_the_bias_is_the_prior_and_the_deviations_its_calibration(trajectory: Path) -> None:

@@ -7,21 +7,19 @@ One vector field drives attitude and bias together (paper, eq. 3, 10, 15 and 31)
 with u(t) the causal Hermite path through the gyro samples and f the residual perceptron of the paper's size. W du/dt is the
 term that the paper derives for a linear sensor (after eq. 31); it carries the calibration that was solved in closed form.
 Training integrates both states from sample to sample with the chosen solver in charts of SO(3)
-(`imutool.bias.ode.integrate`), and its loss is the attitude error at the end of a window (eq. 16). f does not depend on R:
-inference integrates only the bias, by Euler, which is the solver of the paper.
+(`imutool.bias.networks.ode.integrate`), and its loss is the attitude error at the end of a window (eq. 16). f does not
+depend on R: inference integrates only the bias, by Euler, which is the solver of the paper.
 """
 
 from __future__ import annotations
 
-import numpy as np
 import torch
-from jaxtyping import Float, Float64
+from jaxtyping import Float
 from torch import Tensor, nn
 from torchdiffeq import odeint, odeint_adjoint
 
-from imutool.bias.model import SampleStream, Segment, Vector6
-from imutool.bias.neural_stream import Array, DriftRate
-from imutool.bias.ode import HermitePath, Method, integrate
+from imutool.bias.networks.network import Segment
+from imutool.bias.networks.ode import HermitePath, Method, integrate
 
 WINDOW_S = 1.0  # longest training window: with a solver step at every sample, a longer one costs minutes
 
@@ -100,41 +98,3 @@ def end_attitude(
     joint = JointPath(field, segment)
     rotations, _ = integrate(_JointField(joint), start, joint.grid, R_start, method=solver, adjoint=adjoint)
     return rotations[-1]
-
-
-class JointStream:
-    """Bias stream of the joint scheme.
-
-    Gyro by Euler from sample to sample, accelerometer from its curve.
-    """
-
-    def __init__(self, rate: DriftRate, W: Array, rest: Vector6, others: SampleStream) -> None:
-        self._rate, self._W, self._rest, self._others = rate, W, rest[:3].astype(np.float64), others
-        self._bias, self._u, self._slope, self._t_s = np.zeros(3), np.zeros(3), np.zeros(3), np.nan
-
-    def __call__(
-        self, t_s: Float64[np.ndarray, " n"], gyro: Float64[np.ndarray, "n 3"], accel: Float64[np.ndarray, "n 3"]
-    ) -> Float64[np.ndarray, "n 6"]:
-        """Bias at each sample."""
-        bias = self._others(t_s, gyro, accel)
-        for k, (t, u) in enumerate(zip(t_s.tolist(), gyro, strict=True)):
-            bias[k, :3] = self._next(t, u)
-        return bias
-
-    def one(self, t_s: float, u: Vector6) -> Vector6:
-        """Bias at one sample."""
-        bias = self._others.one(t_s, u)
-        bias[:3] = self._next(t_s, u[:3])
-        return bias
-
-    def _next(self, t_s: float, u: Array) -> Array:
-        """Gyro bias at the next sample, from the field at the previous one."""
-        if np.isnan(self._t_s):
-            self._bias, self._slope = self._rest + self._W @ u, np.zeros(3)
-        else:
-            step_s = t_s - self._t_s
-            drift = self._rate(self._bias, self._u, self._slope)
-            self._bias = self._bias + step_s * (self._W @ self._slope + drift)
-            self._slope = (u - self._u) / max(step_s, 1e-9)
-        self._t_s, self._u = t_s, u.copy()
-        return self._bias

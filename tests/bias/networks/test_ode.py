@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from scipy.interpolate import CubicHermiteSpline
 from torch import Tensor, nn
 
-from imutool.bias.ode import HermitePath, integrate
+from imutool.bias.networks.ode import HermitePath, integrate
 from imutool.errors import DataError, NumericsError
 from imutool.geometry import so3
 

@@ -15,22 +15,19 @@ from dataclasses import replace
 from pathlib import Path
 from typing import ClassVar
 
-import msgspec
 import numpy as np
-import torch
-from jaxtyping import Float, Float64
-from scipy.spatial.transform import Rotation
-from torch import Tensor
+from jaxtyping import Float64
 
-from imutool.bias import hybrid
-from imutool.bias.model import CovarianceModel, SampleStream, Segment, Stream, Vector6
+from imutool.bias import hybrid, static
+from imutool.bias.model import BiasModel, CovarianceModel, SampleStream, Shapes, Stream, Vector6
+from imutool.config import Settings
 from imutool.errors import ModelError
+from imutool.inertial.preintegration import exp
 from imutool.sensor import catalogue, physics_file
 from imutool.sensor.effect import Effect, Parameter, Stage, Theta, each_pair
 from imutool.sensor.linear_form import LinearForm, linear_form
 from imutool.sensor.physics_file import Bias, Entry, PhysicsFile
 from imutool.sensor.samples import SensorSamples
-from imutool.sensor.signals import POWER_S
 from imutool.sensor.unnamed_effects import DRIVEN
 from imutool.units import AXES, SENSORS, Sensor
 
@@ -60,35 +57,24 @@ class Model(hybrid.Model):
     method: ClassVar[str] = "physics"
 
     def __init__(self, parts: Mapping[Sensor, Sequence[Part]], bias: Bias | None, rate_hz: float) -> None:
-        super().__init__(hybrid.Config(gyro_effects=(), accel_effects=(), remainder=False), rate_hz)
-        self.double()
-        for sensor in SENSORS:
-            sensor_parts = parts[sensor]
-            self._set_effects(sensor, ())
-            self.effects[sensor] = tuple(effect for effect, _, _ in sensor_parts)
-            theta, std = (np.concatenate([np.zeros(0), *(part[k] for part in sensor_parts)]) for k in (1, 2))
-            self.register_buffer(f"theta_{sensor}", torch.from_numpy(theta))
-            self.register_buffer(f"covariance_{sensor}", torch.from_numpy(np.diag(std**2)))
-        self.config = msgspec.structs.replace(
-            self.config,
-            gyro_effects=tuple(effect.name for effect in self.effects["gyro"]),
-            accel_effects=tuple(effect.name for effect in self.effects["accel"]),
-        )
-        looks_back = any(effect.columns is None for effects in self.effects.values() for effect in effects)
-        self.context = int(np.ceil(hybrid.SETTLING * POWER_S * rate_hz)) if looks_back else 0
+        forms = {sensor: tuple(effect for effect, _, _ in parts[sensor]) for sensor in SENSORS}
         self._b = np.zeros(6) if bias is None else np.array([*bias.gyro, *bias.accel])
-        self.prior_mean.copy_(torch.from_numpy(self._b))
-        self.prior_std.copy_(torch.tensor(np.repeat(UNKNOWN_STD if bias is None else TURN_ON_STD, 3)))
-        self.truth_std.copy_(torch.tensor([2e-3] * 3 + [0.1] * 3))  # as `imutool.bias.static`
+        spread = np.repeat(UNKNOWN_STD if bias is None else TURN_ON_STD, 3)
+        tensors = {**static.UNTRAINED, "prior_mean": self._b, "prior_std": spread}
+        for sensor in SENSORS:
+            theta, std = (np.concatenate([np.zeros(0), *(part[k] for part in parts[sensor])]) for k in (1, 2))
+            tensors |= {f"theta_{sensor}": theta, f"covariance_{sensor}": np.diag(std**2)}
+        gyro, accel = (tuple(form.name for form in forms[sensor]) for sensor in SENSORS)
+        config = hybrid.Config(gyro_effects=gyro, accel_effects=accel, remainder=False)
+        super().__init__(config, rate_hz, tensors, forms)
 
-    def sensor_bias(self, sensor: Sensor, segment: Segment) -> Float[Tensor, "batch n 3"]:
-        """Rest bias plus the error of the effects at the samples without the file's bias."""
-        b = torch.from_numpy(self._b).to(segment.gyro)
-        shifted = Segment(segment.t, segment.gyro - b[:3], segment.accel - b[3:], segment.rest)
-        return super().sensor_bias(sensor, shifted)
+    @classmethod
+    def shapes(cls, config: Settings) -> Shapes:
+        """Shapes of the statistics; those of the effects are their own."""
+        return BiasModel.shapes(config)
 
     def stream(self, rest: Vector6) -> Stream:
-        """Bias stream in numpy."""
+        """Bias stream of the samples without the file's bias."""
         inner = super().stream(rest)
         assert isinstance(inner, SampleStream)
         return _ShiftedStream(inner, self._b)
@@ -153,8 +139,7 @@ def load(path: Path, rate_hz: float) -> Model:
     model = Model(parts, file.bias, rate_hz)
     sha256 = hashlib.sha256(path.read_bytes()).hexdigest()
     model.card = {"name": path.stem, "sha256": sha256, "prior": f"bias of {path.name}", "not_taken": kept}
-    model.requires_grad_(False)
-    return model.eval()
+    return model
 
 
 def _is_corrected(entry: Entry, parts: Mapping[Sensor, list[Part]]) -> bool:
@@ -230,7 +215,7 @@ def _matrix(file: PhysicsFile, sensor: Sensor) -> Part | None:
             variance += std**2
     if MOUNT in entries:
         phi, std = (np.array([value(entries[MOUNT], f"phi_{axis}") for axis in AXES]) for value in (_value, _std))
-        factors.append(Rotation.from_rotvec(phi).as_matrix().T)
+        factors.append(exp(phi).T)
         variance += np.array([[0.0, std[2], std[1]], [std[2], 0.0, std[0]], [std[1], std[0], 0.0]]) ** 2
     T = np.linalg.multi_dot([np.eye(3), np.eye(3), *factors])
     return _full(sensor), (np.eye(3) - np.linalg.inv(T)).ravel(), np.sqrt(variance).ravel()

@@ -1,0 +1,1 @@
+"""Networks of the bias models in torch, for training; `frozen` gives the model."""

@@ -1,0 +1,36 @@
+"""Linear network: bias = rest + W u, with W solved in closed form."""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from imutool.bias.linear import Config, Model
+from imutool.bias.networks.network import BiasNetwork, Segment
+from imutool.config import Settings
+from imutool.units import SENSORS, Sensor
+
+
+class Network(BiasNetwork):
+    """Network of `imutool.bias.linear`."""
+
+    method: ClassVar[str] = Model.method
+    iterative: ClassVar[bool] = False
+
+    def __init__(self, config: Settings | None = None, rate_hz: float = 0.0) -> None:
+        super().__init__(config or Config(), rate_hz)
+        self.W = nn.ParameterDict({sensor: nn.Parameter(torch.zeros(3, 3)) for sensor in SENSORS})
+
+    def sensor_bias(self, sensor: Sensor, segment: Segment) -> Float[Tensor, "batch n 3"]:
+        """Bias rest + W u at every sample."""
+        u, rest = segment.of(sensor)
+        W: Tensor = self.W[sensor]
+        return rest[:, None] + u @ W.mT
+
+    def begin_at(self, sensor: Sensor, W: Float[Tensor, "3 3"]) -> None:
+        """Set the matrix W: the closed form is the whole model."""
+        with torch.no_grad():
+            self.W[sensor].copy_(W)

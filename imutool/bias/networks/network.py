@@ -1,0 +1,101 @@
+"""Network of a bias model in torch, for training; `frozen` gives the model in numpy."""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from dataclasses import dataclass
+from types import MappingProxyType
+from typing import Any, ClassVar, Literal
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from imutool import registry
+from imutool.bias.model import COLUMNS, STATISTICS, BiasModel
+from imutool.config import Settings
+from imutool.inertial.windows import end_attitude
+from imutool.units import SENSORS, Sensor
+
+
+@dataclass(frozen=True)
+class Segment:
+    """Samples of a segment.
+
+    `t` in seconds from its first sample, and the rest bias at its start.
+    """
+
+    t: Float[Tensor, "batch n"]
+    gyro: Float[Tensor, "batch n 3"]
+    accel: Float[Tensor, "batch n 3"]
+    rest: Float[Tensor, "batch 6"]
+
+    def of(self, sensor: Sensor) -> tuple[Float[Tensor, "batch n 3"], Float[Tensor, "batch 3"]]:
+        """Samples and rest bias of one sensor."""
+        return (self.gyro if sensor == "gyro" else self.accel), self.rest[:, COLUMNS[sensor]]
+
+
+class BiasNetwork(nn.Module, ABC):
+    """Bias network with the statistics of its sensor's training runs (`imutool.bias.model.BiasModel`).
+
+    It computes in float64 (`imutool.training.fit`). Names and shapes of its state are those of the model.
+    """
+
+    method: ClassVar[str]
+    iterative: ClassVar[bool] = True  # false where the closed form is the whole solution
+    objective: ClassVar[Literal["window_ends", "increments"]] = "window_ends"  # loss of the training (imutool.training)
+    prefers: ClassVar[Mapping[str, Any]] = MappingProxyType({})  # TrainSettings that differ from the general defaults
+    undecayed: ClassVar[tuple[str, ...]] = ()  # name prefixes of parameters without weight decay
+    longest_window_s: float = math.inf  # upper limit for the training
+    context: int = 0  # samples before a segment that its bias depends on; such a bias is rest + f(samples)
+    prior_mean: Tensor
+    prior_std: Tensor
+    truth_std: Tensor
+    rest_std: Tensor
+    walk_std: Tensor
+    noise_std: Tensor
+
+    def __init__(self, config: Settings, rate_hz: float) -> None:
+        super().__init__()
+        self.config, self.rate_hz = config, rate_hz
+        self.card: Mapping[str, Any] = {}
+        for name in STATISTICS:
+            self.register_buffer(name, torch.zeros(6))
+
+    def see(self, gyro: Float[Tensor, "n 3"], accel: Float[Tensor, "n 3"]) -> None:
+        """Set the scales of the inputs from all training samples, before the first step."""
+
+    def rest_at_work(self, sensor: Sensor, rest: Float[Tensor, "*logs 3"]) -> Float[Tensor, "*logs 3"]:
+        """Rest biases for inference from those of training mode; equal for most models."""
+        return rest
+
+    @abstractmethod
+    def sensor_bias(self, sensor: Sensor, segment: Segment) -> Float[Tensor, "batch n 3"]:
+        """Bias of one sensor at each sample; row k depends on samples up to k. Differentiable.
+
+        The sensors are separate because the training is: first the gyro, then the accelerometer with the trained gyro.
+        """
+
+    def forward(self, segment: Segment) -> Float[Tensor, "batch n 6"]:
+        """Bias at each sample: gyro (rad/s), then accel (m/s²)."""
+        return torch.cat([self.sensor_bias(sensor, segment) for sensor in SENSORS], dim=-1)
+
+    def end_attitude(
+        self, R_start: Float[Tensor, "batch 3 3"], segment: Segment, dt: Float[Tensor, "batch steps"]
+    ) -> Float[Tensor, "batch 3 3"]:
+        """Attitude (body to world) at the last sample, by integrating the debiased rate from `R_start`. Differentiable."""
+        return end_attitude(R_start, segment.gyro - self.sensor_bias("gyro", segment), dt)
+
+    @abstractmethod
+    def begin_at(self, sensor: Sensor, W: Float[Tensor, "3 3"]) -> None:
+        """Set the calibration matrix, solved in closed form, from which the training starts."""
+
+    def frozen(self) -> BiasModel:
+        """Model that infers with copies of the present weights, in numpy."""
+        kind = registry.load("imutool.bias", self.method).Model
+        tensors = {name: value.detach().cpu().double().numpy().copy() for name, value in self.state_dict().items()}
+        model: BiasModel = kind(self.config, self.rate_hz, tensors)
+        model.card = self.card
+        return model

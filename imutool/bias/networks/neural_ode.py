@@ -1,0 +1,194 @@
+"""Network of the neural ODE, integrated by torchdiffeq (`imutool.bias.neural_ode`).
+
+The drift is integrated along a causal Hermite path through the samples filtered over half a second, so the step of the solver
+changes the solution only by its own error.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import ClassVar, TypeVar
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+from torchdiffeq import odeint, odeint_adjoint
+
+from imutool.bias.networks import joint_ode
+from imutool.bias.networks.joint_ode import JointField
+from imutool.bias.networks.network import BiasNetwork, Segment
+from imutool.bias.networks.ode import HermitePath
+from imutool.bias.neural_ode import DRIFT_FILTER_S, HIDDEN, NEAR_ZERO, SLOW_S, Config, Model
+from imutool.config import Settings
+from imutool.units import SENSORS, Sensor
+
+NEGLIGIBLE = 1e-15
+
+
+class Curve(nn.Module):
+    """Curve C(u, s) = W u + curve (N(u, s) - N(0, 0)), zero without motion.
+
+    Inputs of N: its arguments in units of the scale, and asinh(10 x) of them, which resolves small motion.
+    """
+
+    def __init__(self, width: int, scale: float, curve: float) -> None:
+        super().__init__()
+        self.scale, self.curve = scale, curve
+        self.W = nn.Parameter(torch.zeros(3, 3))
+        layers = nn.Linear(9, width), nn.Linear(width, width), nn.Linear(width, 3, bias=False)
+        for layer in layers:
+            nn.init.normal_(layer.weight, 0.0, layer.in_features**-0.5)
+        nn.init.zeros_(layers[2].weight)
+        self.net = nn.Sequential(layers[0], nn.GELU(), layers[1], nn.Tanh(), layers[2])
+
+    def forward(self, u: Float[Tensor, "*batch 3"], slow: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
+        """Motion-dependent bias: `u` the samples, `slow` the filtered ones."""
+        x, s = u / self.scale, slow / self.scale
+        inputs = torch.cat([x, torch.asinh(NEAR_ZERO * x), torch.asinh(NEAR_ZERO * s)], dim=-1)
+        bend: Tensor = self.net(inputs) - self.net(u.new_zeros(9))
+        return u @ self.W.mT + self.curve * bend
+
+
+class Drift(nn.Module):
+    """Drift g, the slow rate of the rest bias: a perceptron of two residual blocks."""
+
+    def __init__(self, hidden: tuple[tuple[int, ...], tuple[int, ...]], scale: float, curve: float, rate: float) -> None:
+        super().__init__()
+        self.rate = rate
+        self.block1, self.block2 = _perceptron(hidden[0]), _perceptron(hidden[1])
+        self.out = nn.Linear(9, 3)
+        nn.init.zeros_(self.out.weight)
+        nn.init.zeros_(self.out.bias)
+        # inputs: the state relative to the prior's mean in units of the curve; the motion in its own
+        self.centre: Tensor
+        self.units: Tensor
+        self.register_buffer("centre", torch.zeros(3))
+        self.register_buffer("units", torch.tensor([curve] * 3 + [scale] * 6))
+
+    def forward(self, beta: Float[Tensor, "b 3"], u: Float[Tensor, "b 3"], du: Float[Tensor, "b 3"]) -> Float[Tensor, "b 3"]:
+        """Drift dbeta/dt per second."""
+        x = torch.cat([beta - self.centre, u, du], dim=-1) / self.units
+        x = x + self.block1(x)
+        x = x + self.block2(x)
+        y: Tensor = self.rate * self.out(x)
+        return y
+
+
+class Network(BiasNetwork):
+    """Network of `imutool.bias.neural_ode`."""
+
+    method: ClassVar[str] = Model.method
+    config: Config
+
+    def __init__(self, config: Settings | None = None, rate_hz: float = 200.0) -> None:
+        chosen = config or Config()
+        assert isinstance(chosen, Config)
+        Model.shapes(chosen)  # refuses settings that do not fit each other
+        super().__init__(chosen, rate_hz)
+        self.stride = chosen.stride(rate_hz)
+        scales = {sensor: chosen.units(sensor) for sensor in SENSORS}
+        curves: dict[str, nn.Module] = {
+            sensor: Curve(chosen.curve_width, scale, curve) for sensor, (scale, curve, _) in scales.items()
+        }
+        drifts: dict[str, nn.Module] = {sensor: Drift(HIDDEN[sensor], *scales[sensor]) for sensor in SENSORS}
+        self.curve = nn.ModuleDict(curves)
+        if chosen.joint:
+            del self.curve["gyro"]
+            drifts["gyro"] = JointField(drifts["gyro"])
+            self.longest_window_s = joint_ode.WINDOW_S
+        self.drift = nn.ModuleDict({sensor: drift for sensor, drift in drifts.items() if sensor in chosen.drift})
+
+    def _joint_start(self, segment: Segment) -> tuple[JointField, Float[Tensor, "b 3"]]:
+        """Joint field, and bias at the first sample."""
+        field = _part(self.drift, "gyro", JointField)
+        return field, segment.rest[:, :3] + segment.gyro[:, 0] @ field.W.mT
+
+    def end_attitude(
+        self, R_start: Float[Tensor, "b 3 3"], segment: Segment, dt: Float[Tensor, "b steps"]
+    ) -> Float[Tensor, "b 3 3"]:
+        """Attitude at the last sample; in the joint scheme by the joint ODE on SO(3)."""
+        if not self.config.joint:
+            return super().end_attitude(R_start, segment, dt)
+        field, start = self._joint_start(segment)
+        return joint_ode.end_attitude(field, segment, start, R_start, self.config.solver, adjoint=self.config.adjoint)
+
+    def sensor_bias(self, sensor: Sensor, segment: Segment) -> Float[Tensor, "batch n 3"]:
+        """Bias beta + C(u) at each sample; beta is linear between the steps of the drift."""
+        if self.config.joint and sensor == "gyro":
+            field, start = self._joint_start(segment)
+            return joint_ode.bias_path(field, segment, start, self.config.solver, adjoint=self.config.adjoint)
+        u, rest = segment.of(sensor)
+        motion: Float[Tensor, "batch n 3"] = self.curve[sensor](u, self._filtered(u, SLOW_S))
+        if sensor not in self.config.drift:
+            return rest[:, None] + motion
+        return self._rest_path(segment.t, u, rest, self.drift[sensor]) + motion
+
+    def begin_at(self, sensor: Sensor, W: Float[Tensor, "3 3"]) -> None:
+        """Set the linear part of the curve, or of the joint field."""
+        joint = self.config.joint and sensor == "gyro"
+        with torch.no_grad():
+            (_part(self.drift, sensor, JointField) if joint else _part(self.curve, sensor, Curve)).W.copy_(W)
+
+    def _rest_path(
+        self, t: Float[Tensor, "b n"], u: Float[Tensor, "b n 3"], rest: Float[Tensor, "b 3"], drift: nn.Module
+    ) -> Float[Tensor, "b n 3"]:
+        """beta at each sample; the ODE's time is the index on a grid of `stride` samples."""
+        n, stride = u.shape[1], self.stride
+        if n == 1:
+            return rest[:, None]
+        steps = math.ceil((n - 1) / stride)
+        whole = (n - 1) // stride
+        knots = self._filtered(u, DRIFT_FILTER_S)[:, : whole * stride + 1 : stride][:, :steps]
+        path = HermitePath(torch.arange(steps + 1, device=u.device), torch.cat([knots, knots[:, -1:]], dim=1))
+        step_s = ((t[:, -1] - t[:, 0]) / (n - 1) * stride)[:, None]
+
+        beta = _solve(_OnGrid(drift, path, step_s), rest, steps, self.config.solver, self.config.adjoint)
+        index = torch.arange(n, device=u.device) / stride
+        j = index.long().clamp(max=steps - 1)
+        return torch.lerp(beta[j], beta[j + 1], (index - j)[:, None, None].to(u)).transpose(0, 1)
+
+    def _filtered(self, u: Float[Tensor, "b n 3"], tau_s: float) -> Float[Tensor, "b n 3"]:
+        """Samples filtered by dy/dt = (u - y) / tau, in log2(n) passes (a scan of the recurrence)."""
+        keep = math.exp(-1.0 / (self.rate_hz * tau_s))
+        y = torch.cat([u[:, :1], (1.0 - keep) * u[:, 1:]], dim=1)
+        shift = 1
+        while shift < u.shape[1] and keep > NEGLIGIBLE:
+            y = torch.cat([y[:, :shift], y[:, shift:] + keep * y[:, :-shift]], dim=1)
+            shift, keep = 2 * shift, keep * keep
+        return y
+
+
+class _OnGrid(nn.Module):
+    """Drift as a field for torchdiffeq: time is the grid's index, the path gives the controls."""
+
+    def __init__(self, drift: nn.Module, path: HermitePath, step_s: Float[Tensor, "b 1"]) -> None:
+        super().__init__()
+        self.drift, self.path, self.step_s = drift, path, step_s
+
+    def forward(self, index: Float[Tensor, ""], beta: Float[Tensor, "b 3"]) -> Float[Tensor, "b 3"]:
+        u, du = self.path.value(index), self.path.derivative(index) / self.step_s
+        rate: Tensor = self.drift(beta, u, du)
+        return self.step_s * rate
+
+
+def _solve(field: nn.Module, rest: Float[Tensor, "b 3"], steps: int, solver: str, adjoint: bool) -> Float[Tensor, "m b 3"]:
+    grid = torch.arange(steps + 1, device=rest.device, dtype=rest.dtype)
+    solved: Tensor = (odeint_adjoint if adjoint else odeint)(field, rest, grid, method=solver, rtol=1e-6, atol=1e-9)
+    return solved
+
+
+P = TypeVar("P", bound=nn.Module)
+
+
+def _part(parts: nn.Module, name: str, kind: type[P]) -> P:
+    part = parts.get_submodule(name)
+    assert isinstance(part, kind)
+    return part
+
+
+def _perceptron(hidden: tuple[int, ...]) -> nn.Sequential:
+    """Perceptron 9 -> hidden -> 9: GELU between hidden layers, tanh before the last."""
+    layers: list[nn.Module] = []
+    for i, (before, width) in enumerate(zip((9, *hidden), hidden, strict=False)):
+        layers += [nn.Linear(before, width), nn.Tanh() if i == len(hidden) - 1 else nn.GELU()]
+    return nn.Sequential(*layers, nn.Linear(hidden[-1], 9))

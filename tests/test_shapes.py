@@ -1,0 +1,74 @@
+"""The tests check annotations: a wrong shape, type or result is refused, also after right ones have passed."""
+
+from __future__ import annotations
+
+import importlib
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from types import ModuleType
+
+import numpy as np
+import pytest
+from jaxtyping import TypeCheckError
+from support.shapes import check_shapes
+
+SOURCE = """
+from __future__ import annotations
+from dataclasses import dataclass
+from typing import Literal
+import numpy as np
+from jaxtyping import Float64
+
+def scaled(t: Float64[np.ndarray, " n"], x: Float64[np.ndarray, "n 3"], wrong: bool = False) -> Float64[np.ndarray, "n 3"]:
+    return x[1:] if wrong and x[0, 0] < 0 else x * t[:, None]
+
+def named(start: Literal["rest", "truth"]) -> str:
+    return start
+
+def outer(width: int) -> object:
+    def inner(x: Float64[np.ndarray, "n 3"]) -> int:
+        return len(x)
+    return inner(np.zeros((4, width)))
+
+@dataclass(frozen=True)
+class Samples:
+    t: Float64[np.ndarray, " n"]
+    x: Float64[np.ndarray, "n 3"]
+"""
+
+
+@pytest.fixture
+def package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[ModuleType]:
+    (tmp_path / "checked_shapes.py").write_text(SOURCE)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    check_shapes("checked_shapes")
+    yield importlib.import_module("checked_shapes")
+    del sys.modules["checked_shapes"]
+
+
+def test_a_wrong_shape_is_refused_after_right_ones(package: ModuleType) -> None:
+    t, x = np.ones(5), np.ones((5, 3))
+    for _ in range(3):
+        package.scaled(t, x)
+    for wrong in ((t, x[:4]), (t, x[:, :2]), (t.astype(np.float32), x), (t, list(x))):
+        with pytest.raises(TypeCheckError):
+            package.scaled(*wrong)
+
+
+def test_a_wrong_result_is_refused_after_right_ones(package: ModuleType) -> None:
+    t, x = np.ones(5), np.ones((5, 3))
+    package.scaled(t, x, wrong=True)
+    with pytest.raises(TypeCheckError, match="return value"):
+        package.scaled(t, -x, wrong=True)
+
+
+def test_a_word_a_field_and_an_inner_function_are_checked_after_right_ones(package: ModuleType) -> None:
+    package.named("rest"), package.outer(3), package.Samples(np.ones(5), np.ones((5, 3)))
+    for wrong in (
+        lambda: package.named("best"),
+        lambda: package.outer(2),
+        lambda: package.Samples(np.ones(4), np.ones((5, 3))),
+    ):
+        with pytest.raises(TypeCheckError):
+            wrong()
