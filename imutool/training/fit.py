@@ -12,7 +12,7 @@ from __future__ import annotations
 import copy
 import math
 import time
-from collections.abc import Generator, Iterator, Sequence
+from collections.abc import Collection, Generator, Iterator, Sequence
 from dataclasses import dataclass, field
 
 import torch
@@ -58,6 +58,11 @@ class Epoch:
     note: str = ""  # what is being done instead, where there are no steps to count
 
 
+def note(text: str) -> Epoch:
+    """Line of progress where there are no steps to count."""
+    return Epoch("gyro", 0, 0, math.nan, math.nan, math.nan, 0.0, text)
+
+
 @dataclass
 class Stage:
     """What one sensor's descent must remember to go on: also what a checkpoint holds."""
@@ -86,15 +91,22 @@ def check_device(device: str) -> None:
 class Training:
     """Training of one model on one sensor; `model` is final once `epochs` has ended.
 
+    The `constant` sensors get no matrix in closed form.
+
     Raises:
         DataError: recordings without truth, of different rates, too short, or standing still.
         ConfigError: a method that is not trained, settings it does not know, or settings with another method's defaults.
     """
 
     def __init__(
-        self, recordings: Sequence[Recording], method: str, settings: TrainSettings | None = None, device: str = "cpu"
+        self,
+        recordings: Sequence[Recording],
+        method: str,
+        settings: TrainSettings | None = None,
+        device: str = "cpu",
+        constant: Collection[Sensor] = (),
     ) -> None:
-        self.settings = settings_for(method, settings)
+        self.settings, self._constant = settings_for(method, settings), constant
         check_device(device)
         self.pool = Pool.of(recordings, device=device)
         torch.manual_seed(self.settings.seed)
@@ -166,7 +178,8 @@ class Training:
         """Calibration and rest biases, as far as windows and a matrix show them."""
         rest = self.tracks.per_log().detach()
         scored, pool = corrected(self.model.eval(), self.pool, "train", sensors_up_to(sensor))
-        self.model.begin_at(sensor, closed_form.solve(scored, sensor, pool, rest, self._window_s(sensor), matrix=True).W)
+        if sensor not in self._constant:
+            self.model.begin_at(sensor, closed_form.solve(scored, sensor, pool, rest, self._window_s(sensor), matrix=True).W)
         # constants that take the nuisances of their logs: the descent knows none
         scored, pool = corrected(self.model.eval(), self.pool, "train", sensors_up_to(sensor))
         lengths = self._window_s(sensor)

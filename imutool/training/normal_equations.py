@@ -11,7 +11,7 @@ product of matrices.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -107,6 +107,12 @@ class Problem:
         covariance = torch.linalg.inv(S) if columns else S
         at[columns] -= covariance @ v
         return Solution(at, covariance)
+
+    def without(self, index: int) -> Problem:
+        """The problem of all logs but one."""
+        kept = [i for i in range(len(self.own)) if i != index]
+        fit, judged = (Equations(e.H[kept], e.g[kept], e.c[kept]) for e in (self.fit, self.judged))
+        return replace(self, own=self.own[kept], fit=fit, judged=judged)
 
     def own_at(self, theta: Float[Tensor, " p"]) -> Float[Tensor, "logs o"]:
         """Unknowns of each log, for given parameters."""
