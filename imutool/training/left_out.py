@@ -1,7 +1,7 @@
 """Candidate models on left-out logs: each log corrected by models that the other logs gave.
 
-Candidates, from the simplest: `constant` (the prior of the rest bias alone), `linear` (scale and misalignment), `effects` (those
-supported by the other logs). Each log is integrated from its first true pose with every start that users have, beside the raw
+Candidates, from the simplest: `constant` (the prior of the rest bias alone), `linear` (scale and misalignment), and `effects`
+(those that the other logs support). Each log is integrated from its first true pose with every start that users have, beside the raw
 samples and `static`, the log's own rest bias without any training. The poses are first turned and shifted by the rotation and
 the clock that are fitted between them and the sensor for this log alone. The simplest candidate that is not beaten is kept, for
 the gyro by the orientation error (AOE), for the accelerometer by the velocity after 5 s from the truth.
@@ -89,10 +89,12 @@ def keep(scores: Sequence[Score], sensor: Sensor) -> str:
 
     def errors(model: str) -> Float64[np.ndarray, " logs"]:
         """Mean over the starts of the logarithm of each log's error; NaN where there is none."""
-        of_log = [[_error(s, sensor) for s in scores if s.model == model and s.log == log] for log in logs]
-        return np.array(
-            [np.mean(np.log(np.maximum(values, LEAST_ERROR))) if values and None not in values else np.nan for values in of_log]
-        )
+        out = []
+        for log in logs:
+            values = [_error(score, sensor) for score in scores if score.model == model and score.log == log]
+            known = [max(value, LEAST_ERROR) for value in values if value is not None]
+            out.append(float(np.mean(np.log(known))) if known else np.nan)
+        return np.array(out)
 
     present = [candidate for candidate in CANDIDATES if any(score.model == candidate for score in scores)]
     table = {model: errors(model) for model in (*present, "static")}
