@@ -82,15 +82,15 @@ def left_out_table(left_out: Mapping[str, Any]) -> None:
     models = list(dict.fromkeys(score["model"] for score in scores))
     aoe = {(score["log"], score["start"], score["model"]): score["aoe_deg"] for score in scores}
     raw = {score["log"]: score["aoe_deg"] for score in scores if score["model"] == "raw"}
-    starts = list(dict.fromkeys(score["start"] for score in scores if score["start"]))
+    starts = sorted({score["start"] for score in scores if score["start"]})
     rows = [
         (log, start, [aoe.get((log, start, model), raw[log] if model == "raw" else None) for model in models])
         for start in starts
         for log in raw
     ]
     for start in starts:
-        columns = zip(*(values for _, of, values in rows if of == start and None not in values), strict=True)
-        rows.append(("mean", start, [sum(column) / len(column) for column in columns] or [None] * len(models)))
+        columns = zip(*(values for _, of, values in rows if of == start), strict=True)
+        rows.append(("mean", start, [None if None in column else sum(column) / len(column) for column in columns]))
     cells = [(log, start, *("–" if value is None else f"{value:.2f}" for value in values)) for log, start, values in rows]
     table([("left-out log", "start", *(f"{model}\nAOE °" for model in models)), *cells], keys=2)
     say(", ".join(f"{sensor}: {kept}" for sensor, kept in left_out["kept"].items()) + " kept, the simplest that is not beaten")

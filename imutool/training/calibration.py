@@ -43,7 +43,7 @@ from imutool.training.settings import TrainSettings
 from imutool.units import SENSORS, Sensor
 
 BY_CHANCE = 0.01  # probability of finding any effect where there is none
-LEAST_GAIN = 0.03  # of the judged loss, for an effect to be worth its parameters
+LEAST_GAIN = 0.05  # of the judged loss, for an effect to be worth its parameters
 FOLDS = 3  # parts of a log where there are fewer logs than this
 LEAST_ODE_GAIN = 0.03  # of the held-out error, for an ODE to be worth its weights
 UNSEEN = 0.9  # of its prior's width: a parameter no narrower was not seen
@@ -144,7 +144,8 @@ def effects_beyond_chance(problem: Problem, effects: Sequence[LinearForm]) -> di
         left = [effect.name for effect in effects if effect.name not in gains]
         tried = {name: problem.predicted(parameter_columns(effects, [*gains, name])) for name in left}
         helped = {name: new for name, new in tried.items() if bool((new < loss).sum() > 0.5 * len(loss))}
-        agreed = {name: new for name, new in helped.items() if _beyond_chance(problem, effects, [*gains, name])}
+        fitted = {name: new for name, new in helped.items() if _beyond_chance(problem, effects, [*gains, name])}
+        agreed = {name: new for name, new in fitted.items() if float((loss - new).sum()) > _chance_gain(effects, name)}
         if not agreed:
             return gains
         best = min(agreed, key=lambda name: float(agreed[name].sum()))
@@ -166,6 +167,12 @@ def _beyond_chance(problem: Problem, effects: Sequence[LinearForm], names: Seque
     last = theta[columns][own]
     wald = CORRELATED * float(last @ torch.linalg.solve(covariance[own][:, own], last))
     return wald > float(chi2.isf(BY_CHANCE / len(effects), len(own)))
+
+
+def _chance_gain(effects: Sequence[LinearForm], name: str) -> float:
+    """Gain on other logs that the parameters of one effect do not have by chance, in units of the loss."""
+    count = next(len(effect.parameters) for effect in effects if effect.name == name)
+    return float(chi2.isf(BY_CHANCE / len(effects), count)) / CORRELATED
 
 
 def _unseen(effects: Sequence[LinearForm], problem: Problem, covariance: Float[Tensor, "p p"]) -> tuple[str, ...]:

@@ -36,6 +36,7 @@ NUISANCE_STD = {  # how far they differ from log to log
     "gyro": (0.01,) * 3 + (5e-3,),  # rotation (rad), clock (s)
     "accel": (0.1,) * 2 + (0.01,) * 3 + (5e-3,) + (0.02,) * 3,  # tilt (m/s² of gravity), rotation, clock, lever arm (m)
 }
+ROTATION = {"gyro": slice(3, 6), "accel": slice(5, 8)}  # of a log's unknowns, of which the rest bias comes first
 END_SAMPLES = 3  # whose mean is the rate at an end of a window
 
 
@@ -101,6 +102,7 @@ def solve(
     rest, W, columns, known = rest.clone(), torch.zeros(3, 3).to(rest), COLUMNS[sensor], 9 if matrix else 0
     nuisance_prior = torch.tensor(NUISANCE_STD[sensor] if nuisances else ()).to(rest) ** -2.0
     own = torch.zeros(len(pool.names), 3 + len(nuisance_prior)).to(rest)  # rest bias, then nuisances
+    turns = ROTATION[sensor] if nuisances else slice(0, 0)
     own_prior = torch.cat([torch.full((3,), REST_PRIOR[sensor] ** -2.0).to(rest), nuisance_prior]).repeat(len(own))
     prior = torch.cat([torch.full((known,), W_PRIOR**-2.0).to(rest), own_prior])
     for _ in range(ITERATIONS if matrix else REST_ITERATIONS):
@@ -114,8 +116,10 @@ def solve(
             e, A = sensor_residual(model, sensor, windows, W if matrix else None)
             rates, forces = (u - b[:, None] for u, b in map(windows.segment.of, SENSORS))
             by_nuisance = nuisance_jacobian(sensor, windows, rates, forces)[..., : len(nuisance_prior)]
-            e = e + (by_nuisance @ own[windows.log, 3:, None])[..., 0]
-            J = _by_log(torch.cat([A.sum(1), by_nuisance], dim=2), windows.log, len(own))
+            apart = own.clone()
+            apart[:, turns] -= own[:, turns].mean(0)  # what the rotations of all logs share is the matrix's
+            e = e + (by_nuisance @ apart[windows.log, 3:, None])[..., 0]
+            J = _by_log(torch.cat([A.sum(1), by_nuisance], dim=2), windows.log, len(own), turns)
             if matrix:
                 u, _ = windows.segment.of(sensor)
                 J = torch.cat([_by_matrix(A, step_means(u) if sensor == "gyro" else u), J], dim=2)
@@ -164,10 +168,11 @@ def _by_matrix(A: Float[Tensor, "m n 3 3"], u: Float[Tensor, "m n 3"]) -> Float[
     return torch.einsum("mkij,mkl->mijl", A, u).flatten(2)
 
 
-def _by_log(J: Float[Tensor, "m 3 k"], log: Int[Tensor, " m"], logs: int) -> Float[Tensor, "m 3 all"]:
-    """Derivative by the unknowns of every log: zero but for a window's own."""
+def _by_log(J: Float[Tensor, "m 3 k"], log: Int[Tensor, " m"], logs: int, turns: slice) -> Float[Tensor, "m 3 all"]:
+    """Derivative by the unknowns of every log: zero but for a window's own, and rotations about their mean."""
     out = J.new_zeros(len(J), 3, logs, J.shape[2])
     out[torch.arange(len(J), device=J.device), :, log] = J
+    out[..., turns] -= out[..., turns].mean(2, keepdim=True)
     return out.flatten(2)
 
 

@@ -1,10 +1,10 @@
 """Candidate models on left-out logs: each log corrected by models that the other logs gave.
 
 Candidates, from the simplest: `constant` (the prior of the rest bias alone), `linear` (scale and misalignment), and `effects`
-(those that the other logs support). Each log is integrated from its first true pose with every start that users have, beside the raw
-samples and `static`, the log's own rest bias without any training. The poses are first turned and shifted by the rotation and
-the clock that are fitted between them and the sensor for this log alone. The simplest candidate that is not beaten is kept, for
-the gyro by the orientation error (AOE), for the accelerometer by the velocity after 5 s from the truth.
+(those that the other logs support). Each log is integrated from its first true pose with every start that users have; raw
+samples and `static`, the log's own rest bias without any training, are scored alike. The poses are first turned and shifted by
+the rotation and the clock that are fitted between them and the sensor for this log alone. The simplest candidate that is not
+beaten is kept, for the gyro by the orientation error (AOE), for the accelerometer by the velocity after 5 s from the truth.
 """
 
 from __future__ import annotations
@@ -196,7 +196,7 @@ def _logs(recordings: Sequence[Recording], pool: Pool, fit: Calibration) -> Iter
 
 
 def _corrected(log: Recording, model: BiasModel | None, start: str) -> list[Imu]:
-    """Samples corrected by a model, or by the log's own rest bias; none if the log shows no start of this kind."""
+    """Samples corrected by a model, or by the log's own rest bias; empty if the log has no start of this kind."""
     try:
         if model is None and start == "auto":
             static_model, initial = estimate_at_rest(log.imu, log.name)
