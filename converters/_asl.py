@@ -6,7 +6,7 @@ metadata record `imutool/repairs`. Nothing of the IMU is ever repaired: a defect
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from functools import partial
 from pathlib import PurePosixPath
 
@@ -30,8 +30,18 @@ def float_stamps(tree: Tree) -> bool:
     return b"e" in _table.first_row(tree.head(f"{IMU}/data.csv")).partition(b",")[0].lower()
 
 
-def recording(sequence: Sequence, *, dataset: str, sensor: str, truths: Mapping[str, str], images: bool = True) -> Recording:
+def identity(format: str, sequence: Sequence, sensor: str, known: bool) -> dict[str, str]:
+    """Metadata on a sequence's origin: the data set and the sensor only where the sequence shows them."""
+    origin = {"dataset": format} if known else {}
+    return {"format": format, "sequence": sequence.name, **origin, **({"sensor": sensor} if sensor else {})}
+
+
+def recording(
+    sequence: Sequence, *, dataset: str, sensor: str, known: bool, truths: dict[str, str], images: bool = True
+) -> Recording:
     """Recording of a sequence; `truths` maps sensor folders to pose topics, truth first.
+
+    `known` states whether the sequence is really of the data set, and not only in its format; `sensor` may be empty.
 
     Velocity and biases are kept where the table has them; rows of unknown bias (nan) are left out of the bias channels.
 
@@ -41,7 +51,8 @@ def recording(sequence: Sequence, *, dataset: str, sensor: str, truths: Mapping[
     tree = Tree(sequence)
     if f"{IMU}/data.csv" not in tree:
         raise DataError("is missing", where=tree.where(f"{IMU}/data.csv"), expected="the IMU's table")
-    folders = [folder for folder in truths if f"{folder}/data.csv" in tree]
+    by_topic = {truths[folder]: folder for folder in reversed(truths) if f"{folder}/data.csv" in tree}
+    folders = [folder for folder in truths if folder in by_topic.values()]
     tables = {folder: f"{folder}/data.csv" for folder in (IMU, *folders)}
     cameras = [name for name in tree.sensors() if name.startswith("cam")] if images else []
     lists = {camera: f"{camera}/data.csv" for camera in cameras}
@@ -49,7 +60,7 @@ def recording(sequence: Sequence, *, dataset: str, sensor: str, truths: Mapping[
     content = tree.load([*tables.values(), *lists.values(), *texts])
 
     metadata: dict[str, dict[str, str]] = {
-        "imutool": {"dataset": dataset, "sequence": sequence.name, "sensor": sensor},
+        "imutool": identity(dataset, sequence, sensor, known),
     }
     metadata.update({name: {"text": content[name].decode("utf-8", "backslashreplace")} for name in texts})
     notes: dict[str, dict[str, str]] = {"imutool/repairs": {}, "imutool/skipped": {}}

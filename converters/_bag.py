@@ -74,8 +74,12 @@ def _ros2(kind: str) -> str:
     return f"{package}/msg/{name}" if "/" not in name else kind
 
 
-def recording(sequence: Sequence, *, dataset: str, sensor: str, truths: tuple[str, ...], images: bool = True) -> Recording:
+def recording(
+    sequence: Sequence, *, dataset: str, sensor: str, known: bool, truths: tuple[str, ...], images: bool = True
+) -> Recording:
     """Recording of a bag; the first topic of `truths` is the truth, then alphabetically.
+
+    Of a bag that is not `known` to be of the data set, only the topics in `truths` are truth.
 
     Raises:
         ConfigError: rosbags is not installed.
@@ -83,7 +87,8 @@ def recording(sequence: Sequence, *, dataset: str, sensor: str, truths: tuple[st
     """
     kinds, wrong = _known(sequence.path)
     imu_topic = _imu_topic(sequence.path, [topic for topic, kind in kinds.items() if kind == IMU])
-    pose_topics = sorted((t for t, kind in kinds.items() if kind in POSES), key=lambda t: (t not in truths, t))
+    wanted = (t for t, kind in kinds.items() if kind in POSES and (known or t in truths))
+    pose_topics = sorted(wanted, key=lambda t: (t not in truths, t))
     skipped = {topic: SKIPPED[kind] for topic, kind in kinds.items() if kind in SKIPPED}
     named = {_asl.IMU_TOPIC: imu_topic}
     repairs: dict[str, str] = {}
@@ -99,7 +104,7 @@ def recording(sequence: Sequence, *, dataset: str, sensor: str, truths: tuple[st
         logger.warning("%s: %s", sequence.path, wrong)
         repairs["bag"] = wrong
     metadata = {
-        "imutool": {"dataset": dataset, "sequence": sequence.name, "sensor": sensor},
+        "imutool": _asl.identity(dataset, sequence, sensor, known),
         "imutool/topics": named,
         **({"imutool/repairs": repairs} if repairs else {}),
         **({"imutool/skipped": skipped} if skipped else {}),

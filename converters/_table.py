@@ -86,6 +86,8 @@ def parse(content: bytes, where: str, kind: str) -> Table:
     if not numbers:
         raise DataError("is empty" if not content.strip() else "holds no rows", where=where, expected="rows of numbers")
     width = len(header) or lines[numbers[0]].count(b",") + 1
+    if lines[numbers[0]].count(b",") == width:  # a comma ends each row, as some programs write them
+        lines = [line.rstrip().removesuffix(b",") for line in lines]
     blocks = [
         _block([lines[n] for n in numbers[start : start + BLOCK_ROWS]], width, where, numbers[start : start + BLOCK_ROWS])
         for start in range(0, len(numbers), BLOCK_ROWS)

@@ -8,6 +8,7 @@ Frames: the IMU frame is the body frame, `state_groundtruth_estimate0` holds R_w
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -20,8 +21,11 @@ DATASET, SENSOR = "euroc", "adis16448"
 TRUTHS = {
     "state_groundtruth_estimate0": "/ground_truth/pose",
     "state_groundtruth_recomputed0": "/ground_truth_recomputed/pose",
+    "gt0": "/ground_truth/pose",  # as Kimera writes the format
     "vicon0": "/ground_truth_vicon/pose",
 }
+SEQUENCES = re.compile(r"(MH_0[1-5]|V[12]_0[1-3])(_(easy|medium|difficult))?")
+BAG_SIGNS = {"/vicon/firefly_sbx/firefly_sbx", "/leica/position"}
 BAG_TRUTHS = ("/vicon/firefly_sbx/firefly_sbx",)
 
 
@@ -33,13 +37,24 @@ def sequences(source: Path) -> list[Sequence]:
 def recognises(sequence: Sequence) -> bool:
     """Whether a sequence is EuRoC: whole-number stamps and no motion capture as in TUM-VI.
 
-    A bag needs /imu0 and no vrpn topic.
+    A bag needs /imu0 and the topic of the laser tracker or of the Vicon system.
     """
     if is_bag(sequence.path):
         topics = _bag.topics(sequence.path)
-        return _asl.IMU_TOPIC in topics and "/vrpn_client/raw_transform" not in topics
+        return _asl.IMU_TOPIC in topics and "/vrpn_client/raw_transform" not in topics and bool(BAG_SIGNS & topics.keys())
     tree = Tree(sequence)
     return "mocap0" not in tree.sensors() and not _asl.float_stamps(tree)
+
+
+def is_known(sequence: Sequence) -> bool:
+    """Whether a sequence shows its origin: by its name, or by its bag's topics."""
+    return bool(SEQUENCES.fullmatch(sequence.name)) or (is_bag(sequence.path) and recognises(sequence))
+
+
+def _names_sensor(sequence: Sequence) -> bool:
+    """Whether the IMU's own description names the sensor."""
+    tree, name = Tree(sequence), f"{_asl.IMU}/sensor.yaml"
+    return name in tree and SENSOR.upper().encode() in tree.load([name])[name].upper()
 
 
 def read_sequence(sequence: Sequence, *, images: bool = True) -> Recording:
@@ -49,9 +64,19 @@ def read_sequence(sequence: Sequence, *, images: bool = True) -> Recording:
         DataError: the sequence contradicts its format, with file and line.
         ConfigError: it is a bag and rosbags is not installed.
     """
+    known = is_known(sequence)
     if is_bag(sequence.path):
-        return _bag.recording(sequence, dataset=DATASET, sensor=SENSOR, truths=BAG_TRUTHS, images=images)
-    return _asl.recording(sequence, dataset=DATASET, sensor=SENSOR, truths=TRUTHS, images=images)
+        return _bag.recording(
+            sequence, dataset=DATASET, sensor=SENSOR if known else "", known=known, truths=BAG_TRUTHS, images=images
+        )
+    return _asl.recording(
+        sequence,
+        dataset=DATASET,
+        sensor=SENSOR if known or _names_sensor(sequence) else "",
+        known=known,
+        truths=TRUTHS,
+        images=images,
+    )
 
 
 def read(source: Path) -> Iterator[Recording]:

@@ -16,6 +16,7 @@ from . import Sequence, _asl, _bag
 from ._source import Tree, find, is_bag
 
 DATASET, SENSOR = "fetch", "fetch"
+BAG_IMU = "/base/imu"
 TRUTHS = {"mocap0": "/ground_truth/pose"}
 
 
@@ -27,13 +28,18 @@ def sequences(source: Path) -> list[Sequence]:
 def recognises(sequence: Sequence) -> bool:
     """Whether a sequence is FETCH: stamps in scientific notation.
 
-    A bag needs an IMU (not on /imu0) and PoseStamped truth.
+    A bag needs the base's IMU and a motion-capture pose.
     """
     if is_bag(sequence.path):
         topics = _bag.topics(sequence.path)
-        kinds = set(topics.values())
-        return _asl.IMU_TOPIC not in topics and {"sensor_msgs/msg/Imu", "geometry_msgs/msg/PoseStamped"} <= kinds
+        mocap = any("mocap" in topic and kind == "geometry_msgs/msg/PoseStamped" for topic, kind in topics.items())
+        return topics.get(BAG_IMU) == _bag.IMU and mocap
     return _asl.float_stamps(Tree(sequence))
+
+
+def is_known(sequence: Sequence) -> bool:
+    """Whether a sequence shows its origin: only FETCH prints its stamps so, and its bags have these topics."""
+    return recognises(sequence)
 
 
 def read_sequence(sequence: Sequence, *, images: bool = True) -> Recording:
@@ -43,9 +49,10 @@ def read_sequence(sequence: Sequence, *, images: bool = True) -> Recording:
         DataError: the sequence contradicts its format, with file and line.
         ConfigError: it is a bag and rosbags is not installed.
     """
+    known = is_known(sequence)
     if is_bag(sequence.path):
-        return _bag.recording(sequence, dataset=DATASET, sensor=SENSOR, truths=(), images=images)
-    return _asl.recording(sequence, dataset=DATASET, sensor=SENSOR, truths=TRUTHS, images=images)
+        return _bag.recording(sequence, dataset=DATASET, sensor=SENSOR if known else "", known=known, truths=(), images=images)
+    return _asl.recording(sequence, dataset=DATASET, sensor=SENSOR if known else "", known=known, truths=TRUTHS, images=images)
 
 
 def read(source: Path) -> Iterator[Recording]:

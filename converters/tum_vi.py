@@ -19,6 +19,7 @@ from ._source import Tree, find, is_bag
 
 DATASET, SENSOR = "tum_vi", "bmi160"
 TRUTHS = {"mocap0": "/ground_truth/pose"}
+SEQUENCES = re.compile(r"(room|corridor|magistrale|outdoors|slides|calib-cam|calib-imu)[1-9]?")
 BAG_TRUTHS = ("/vrpn_client/raw_transform",)
 
 
@@ -43,6 +44,11 @@ def recognises(sequence: Sequence) -> bool:
     return "mocap0" in tree.sensors() and not _asl.float_stamps(tree)
 
 
+def is_known(sequence: Sequence) -> bool:
+    """Whether a sequence shows its origin: its name, or its bag's topics."""
+    return bool(SEQUENCES.fullmatch(sequence.name)) or (is_bag(sequence.path) and recognises(sequence))
+
+
 def read_sequence(sequence: Sequence, *, images: bool = True) -> Recording:
     """Recording of one sequence.
 
@@ -50,9 +56,12 @@ def read_sequence(sequence: Sequence, *, images: bool = True) -> Recording:
         DataError: the sequence contradicts its format, with file and line.
         ConfigError: it is a bag and rosbags is not installed.
     """
+    known = is_known(sequence)
     if is_bag(sequence.path):
-        return _bag.recording(sequence, dataset=DATASET, sensor=SENSOR, truths=BAG_TRUTHS, images=images)
-    return _asl.recording(sequence, dataset=DATASET, sensor=SENSOR, truths=TRUTHS, images=images)
+        return _bag.recording(
+            sequence, dataset=DATASET, sensor=SENSOR if known else "", known=known, truths=BAG_TRUTHS, images=images
+        )
+    return _asl.recording(sequence, dataset=DATASET, sensor=SENSOR if known else "", known=known, truths=TRUTHS, images=images)
 
 
 def read(source: Path) -> Iterator[Recording]:

@@ -8,6 +8,7 @@ each half second.
 from __future__ import annotations
 
 import json
+import logging
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,10 +23,11 @@ from imutool.bias.io import shipped, shipped_for
 from imutool.bias.model import BiasModel
 from imutool.bias_start.bias_covariance import BiasEstimator
 from imutool.bias_start.initial_bias import InitialBias
-from imutool.bias_start.model_choice import check_smooth, choose_model_and_start
+from imutool.bias_start.model_choice import check_smooth, choose_imus, choose_model_and_start
+from imutool.bias_start.stretches import Sieve
 from imutool.cleaning import Cleaner, CleaningSettings, Survey, look
 from imutool.config import plain
-from imutool.errors import ConfigError, LogError
+from imutool.errors import LogError
 from imutool.location import Location
 from imutool.mcap_io.added_topics import DerivedBatch, NewTopic
 from imutool.mcap_io.codec import schemas
@@ -36,12 +38,14 @@ from imutool.mcap_io.recovery.recovered_log import RecoveredLog
 from imutool.mcap_io.repair import repaired
 from imutool.mcap_io.rewrite import RewriteReport, Values, rewrite
 from imutool.mcap_io.storage.source import Digest
-from imutool.mcap_io.topics import ImuBatch, StampCheck
+from imutool.mcap_io.topics import ImuBatch
 from imutool.mcap_io.verify import Verified, check_mode
 from imutool.recording import seconds
 
 SUFFIX = "/debiased"
 CLEAN_RECORD = "imutool_clean"
+
+logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -53,6 +57,12 @@ class DebiasReport:
     rewrite: RewriteReport
     losses: Losses  # of a damaged source; empty as far as it was looked at (`check`)
     surveys: Mapping[str, Survey]  # of what was cleaned
+    sieves: Mapping[str, Sieve]  # samples that are no measurement, and jumps of the clock
+
+    @property
+    def lossy(self) -> bool:
+        """Whether messages are missing: of a damaged source, or samples that are no measurement."""
+        return bool(self.losses) or any(sieve.left_out for sieve in self.sieves.values())
 
 
 class DebiasedBlock(NamedTuple):
@@ -90,7 +100,7 @@ class Debiaser:
             NewTopic(f"{source_topic}/bias", schemas.TWIST),
         )
         self._estimator, self._start_ns = BiasEstimator(model, start), -1
-        self._clock = StampCheck()
+        self.sieve = Sieve(source_topic)
         self._white = np.diag(np.where(model.noise_std > 0, model.noise_std, start.noise) ** 2)
 
     def __call__(self, batch: ImuBatch) -> DerivedBatch:
@@ -99,14 +109,14 @@ class Debiaser:
         A corrected sample's covariance is that of its bias and the sensor's white noise.
 
         Raises:
-            LogError: samples no model can take: NaN, or stamps that do not increase.
+            LogError: stamps that repeat or go back a little.
         """
         if self._clean is not None:
             batch = self._clean(batch)
-        self._clock.check_imu(batch)
-        if self._start_ns < 0 and len(batch.stamp_ns):
-            self._start_ns = int(batch.stamp_ns[0])
-        t_s = seconds(batch.stamp_ns, self._start_ns)
+        batch, t_ns = self.sieve(batch)
+        if self._start_ns < 0 and len(t_ns):
+            self._start_ns = int(t_ns[0])
+        t_s = seconds(t_ns, self._start_ns)
         bias, covariance = self._estimator(t_s, batch.gyro, batch.accel)
         total = covariance + self._white
         corrected = encode_imu(
@@ -213,7 +223,7 @@ def _debias(
     """Debiases an open log: the source itself, or the repaired copy of a damaged one."""
     model = options.model
     given = dict(model) if isinstance(model, Mapping) else {} if model is None else {"": model}
-    topics = _choose_imus(log, options.imus, given)
+    topics = choose_imus(log, options.imus, given)
     about = log.metadata().get("imutool", {})
     surveys = {} if options.clean is None else {topic: look(log, topic, options.clean).trusted() for topic in topics}
     default = given.get("") or (None if all(topic in given for topic in topics) else _model_of_log(about))
@@ -226,16 +236,24 @@ def _debias(
             starts[topic], models[topic] = start, str(chosen.card.get("name", chosen.method))
             records[topic] = _provenance(topic, chosen, start, options.init, options.smooth)
 
+        sieves = {debiaser.source_topic: debiaser.sieve for debiaser in derived}
+
         def metadata(verified: Verified) -> Values:
             origin = {"source_file": source.name, "source_sha256": digest.result(), "source_size": str(source.stat().st_size)}
             checked = {"verified": json.dumps(verified._asdict())}
-            entries = {_record_name("imutool", topic, records): v | origin | checked for topic, v in records.items()}
+            entries = {
+                _record_name("imutool", topic, records): v | origin | checked | sieves[topic].record()
+                for topic, v in records.items()
+            }
             return entries | {_record_name(CLEAN_RECORD, topic, records): found.record() for topic, found in surveys.items()}
 
         report = rewrite(
             log, target, derived, metadata=metadata, overwrite=options.overwrite, check=options.check, progress=progress
         )
-    return DebiasReport(models, starts, report, losses, surveys)
+    for topic, sieve in sieves.items():
+        for text in sieve.warnings():
+            logger.warning("%s %s: %s", source, topic, text)
+    return DebiasReport(models, starts, report, losses, surveys, sieves)
 
 
 def _record_name(name: str, topic: str, records: Mapping[str, object]) -> str:
@@ -246,32 +264,6 @@ def _record_name(name: str, topic: str, records: Mapping[str, object]) -> str:
 def _model_of_log(about: Mapping[str, str]) -> str | Path | None:
     """The shipped model that a log's metadata name: a log may come from anybody."""
     return shipped(about["model"]) if about.get("model") else shipped_for(about.get("sensor"), about.get("dataset"))
-
-
-def _choose_imus(log: Log, imus: Sequence[str], given: Mapping[str, str | Path]) -> list[str]:
-    """The IMUs to debias, each once.
-
-    Raises:
-        ConfigError: a model that none of them would use.
-        LogError: none is named, and the log has not exactly one.
-    """
-    own = [topic for topic in given if topic]
-    topics = list(dict.fromkeys(imus or own or [log.only_imu()]))
-    for topic in own:
-        if topic not in topics:
-            raise ConfigError(
-                f"a model for {topic}, which is not to be debiased",
-                where="model",
-                expected=", ".join(topics),
-                fix=f"Add {topic} to `imus`, or leave the model out",
-            )
-    if "" in given and all(topic in given for topic in topics):
-        raise ConfigError(
-            f"{given['']} is for all IMUs without a model of their own, and each has one",
-            where="model",
-            fix="Leave it out, or name the other IMUs in `imus`",
-        )
-    return topics
 
 
 def _provenance(topic: str, model: BiasModel, start: InitialBias, init: str, smooth: bool) -> dict[str, str]:

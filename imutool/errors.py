@@ -4,12 +4,13 @@
 
     ImutoolError
     ├── ConfigError    3   edit the command line or the settings file
+    │   └── UsageError 2   correct the command line
     ├── DataError      4   look at the data
     ├── LogError       5   look at the log
     ├── ModelError     6   choose another model
     └── NumericsError  7   change the step, the window or the rate
 
-Wrong usage exits with 2, an interrupt with 130; anything else is a bug and shows its traceback with 1.
+An interrupt exits with 130; anything else is a bug and shows its traceback with 1.
 `imutool.cli.main` is the one place that catches.
 
 The library names its parameters as Python does: plain in `where` (``where="init"``, ``where="imu, noise"``), in backquotes in
@@ -64,6 +65,12 @@ class ConfigError(ImutoolError):
     """A parameter or a settings file asks for something impossible."""
 
     exit_code = 3
+
+
+class UsageError(ConfigError):
+    """The command line is wrong in itself, such as an output whose suffix does not fit."""
+
+    exit_code = 2
 
 
 class DataError(ImutoolError):

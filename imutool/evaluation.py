@@ -6,7 +6,7 @@ The paper's error metrics for a log with true poses.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +21,7 @@ from imutool.bias_start.correction import DebiasedImu, apply
 from imutool.bias_start.initial_bias import AT_REST_STD, LEAST_STD, InitialBias
 from imutool.bias_start.model_choice import check_smooth, estimate_at_rest, find_initial_bias, smooth_in_memory
 from imutool.bias_start.zero_velocity import zero_velocity_trajectory
-from imutool.errors import ConfigError
+from imutool.errors import ConfigError, DataError, ImutoolError, ModelError
 from imutool.inertial import metrics
 from imutool.inertial.strapdown import StartPose, along_truth, drift
 from imutool.mcap_io.read import read
@@ -32,6 +32,7 @@ DRIFT_S = 5.0
 PURE, ZUPT = "integration", "zupt"
 RAW_STD = (0.1, 0.1, 0.1, 0.5, 0.5, 0.5)  # rad/s and m/s²: biases of a consumer sensor nobody calibrated
 SCHEMA = "imutool.evaluation/1"
+Refused = Callable[[str, ImutoolError], None]
 
 
 def evaluate(
@@ -45,6 +46,7 @@ def evaluate(
     imu: str | None = None,
     trajectories: Path | None = None,
     overwrite: bool = False,
+    refused: Refused | None = None,
 ) -> list[dict[str, Any]]:
     """One result for the raw samples and one for each model.
 
@@ -63,7 +65,7 @@ def evaluate(
     if truth is None and recording.truths:
         recording = recording.with_truth(next(iter(recording.truths)))
     results = []
-    for name, found, start in runs(recording, models, init, log, smooth=smooth):
+    for name, found, start in runs(recording, models, init, log, smooth=smooth, refused=refused):
         integrated, true, valid = along_truth(found.imu, recording.truth, recording.name)
         drifted = _drift(integrated, true, valid)
         estimates = {PURE: integrated}
@@ -112,22 +114,43 @@ def _left(start: InitialBias | None) -> BiasPrior:
 
 
 def runs(
-    recording: Recording, models: Sequence[str | Path], init: str, where: str | Path, *, smooth: bool = False
+    recording: Recording,
+    models: Sequence[str | Path],
+    init: str,
+    where: str | Path,
+    *,
+    smooth: bool = False,
+    refused: Refused | None = None,
 ) -> Iterator[tuple[str, DebiasedImu, InitialBias | None]]:
     """Samples as recorded, then corrected by each model: name, samples and bias, initial bias."""
     check_smooth(init, smooth)
     yield RAW, DebiasedImu(recording.imu, np.zeros((len(recording.imu), 6))), None
-    for name, model, start in started(recording, models, init, where, smooth=smooth):
+    for name, model, start in started(recording, models, init, where, smooth=smooth, refused=refused):
         yield name, apply(model, start, recording.imu), start
 
 
 def started(
-    recording: Recording, models: Sequence[str | Path], init: str, where: str | Path, *, smooth: bool = False
+    recording: Recording,
+    models: Sequence[str | Path],
+    init: str,
+    where: str | Path,
+    *,
+    smooth: bool = False,
+    refused: Refused | None = None,
 ) -> Iterator[tuple[str, BiasModel, InitialBias]]:
-    """Model name, model and initial bias in this recording, for each requested model."""
+    """Model name, model and initial bias in this recording, for each requested model.
+
+    With `refused` a model that does not apply to the recording is left out, and `refused` is called with it and the error.
+    """
     check_smooth(init, smooth)
     for given in models:
-        model, start = _model_and_start(given, recording, init, where, smooth)
+        try:
+            model, start = _model_and_start(given, recording, init, where, smooth)
+        except (DataError, ModelError) as error:
+            if refused is None:
+                raise
+            refused(str(given), error)
+            continue
         yield str(model.card.get("name", model.method)), model, start
 
 

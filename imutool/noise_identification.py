@@ -5,7 +5,7 @@ Rest has priority: there the samples hold only noise and vibration. A value that
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -122,16 +122,23 @@ def _at_rest(imu: Imu, remarks: list[str]) -> CurveSource | None:
     curves = {sensor: allan.curve([getattr(part, sensor) for part in parts], imu.period_s) for sensor in SENSORS}
     source = CurveSource.of(f"{_duration(total_s)} at rest", total_s, curves)
     for sensor in SENSORS:
-        vibrating = ["xyz"[axis] for axis, slopes in enumerate(source.slopes[sensor]) if _vibrates(slopes)]
-        if vibrating:
-            remarks.append(
-                f"at rest: the {sensor}'s deviation on {', '.join(vibrating)} does not fall as tau^-1/2 from the shortest on: "
-                "something vibrates (idling motors?), so its noise is above the data sheet's"
-            )
+        if remark := vibration(sensor, source.slopes[sensor]):
+            remarks.append(f"at rest: {remark}")
         if all(walk is None for walk in source.axes(sensor, "walk")) and len(curves[sensor].tau_s):
             longest = float(curves[sensor].tau_s[-1])
             remarks.append(f"at rest: no bias walk of the {sensor} shows up to averages of {_duration(longest)}")
     return source
+
+
+def vibration(sensor: Sensor, slopes: Sequence[Slopes]) -> str:
+    """Remark where a deviation at rest is that of a vibration; empty where it is the sensor's noise."""
+    vibrating = ["xyz"[axis] for axis, of_axis in enumerate(slopes) if _vibrates(of_axis)]
+    if not vibrating:
+        return ""
+    return (
+        f"the {sensor}'s deviation on {', '.join(vibrating)} does not fall as tau^-1/2 from the shortest on: "
+        "something vibrates (idling motors?), so its noise is above the data sheet's"
+    )
 
 
 def _vibrates(slopes: Slopes) -> bool:

@@ -7,6 +7,9 @@ import difflib
 import importlib
 import importlib.util
 import pkgutil
+import sys
+from collections.abc import Callable, Iterable, Mapping
+from functools import cache
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 from types import ModuleType
@@ -28,7 +31,18 @@ NOT_PLUGINS = {
 
 def names(group: str) -> list[str]:
     """Sorted keys of a group, without an import: a list of bias models needs no torch."""
-    return sorted(_own(group) | {point.name for point in entry_points(group=group)})
+    return sorted(_own(group) | _outside(group).keys())
+
+
+def _outside(group: str) -> Mapping[str, EntryPoint]:
+    """Entry points of other packages by key."""
+    return _listed(entry_points, group, tuple(sys.path))
+
+
+@cache
+def _listed(list_points: Callable[..., Iterable[EntryPoint]], group: str, path: tuple[str, ...]) -> Mapping[str, EntryPoint]:
+    """Entry points of a group: once a process, since each listing reads a file of every installed package."""
+    return {point.name: point for point in list_points(group=group)}
 
 
 def _own(group: str) -> set[str]:
@@ -54,19 +68,16 @@ def load(group: str, name: str) -> ModuleType:
             expected=f"one of {', '.join(known)}",
             fix=f"Did you mean {near[0]!r}?" if near else "",
         )
-    return _loaded(group, name, {point.name: point for point in entry_points(group=group)})
+    return _loaded(group, name, _outside(group))
 
 
 def every(group: str) -> dict[str, ModuleType]:
-    """Modules of a group by key, sorted.
-
-    The entry points are listed once, not for each key.
-    """
-    points = {point.name: point for point in entry_points(group=group)}
+    """Modules of a group by key, sorted."""
+    points = _outside(group)
     return {name: _loaded(group, name, points) for name in sorted(_own(group) | set(points))}
 
 
-def _loaded(group: str, name: str, points: dict[str, EntryPoint]) -> ModuleType:
+def _loaded(group: str, name: str, points: Mapping[str, EntryPoint]) -> ModuleType:
     if name not in points:
         return importlib.import_module(f"{GROUPS[group]}.{name}")
     module = points[name].load()
@@ -76,9 +87,9 @@ def _loaded(group: str, name: str, points: dict[str, EntryPoint]) -> ModuleType:
 
 def summary(group: str, name: str) -> str:
     """First line of a module's docstring, without an import; empty if there is none."""
-    outside = {point.name: point.module for point in entry_points(group=group)}
+    points = _outside(group)
     try:
-        spec = importlib.util.find_spec(outside.get(name, f"{GROUPS[group]}.{name}"))
+        spec = importlib.util.find_spec(points[name].module if name in points else f"{GROUPS[group]}.{name}")
     except ModuleNotFoundError:
         return ""
     if spec is None or spec.origin is None or not spec.origin.endswith(".py"):

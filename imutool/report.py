@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import difflib
 import importlib
+import json
 import math
 from collections.abc import Mapping
 from typing import Any
@@ -24,7 +25,7 @@ from msgspec import UNSET, UnsetType
 
 from imutool.errors import ConfigError
 
-__all__ = ["REPORTS", "UNSET", "Report", "Section", "UnsetType", "json_schema", "json_values", "report_type"]
+__all__ = ["REPORTS", "UNSET", "Report", "Section", "UnsetType", "json_schema", "json_text", "json_values", "report_type"]
 
 # by name, the module and the type: imported when its schema is asked for, so that --help stays light
 REPORTS = {
@@ -66,6 +67,19 @@ def json_values(report: msgspec.Struct | Mapping[str, Any]) -> dict[str, Any]:
     values = _finite(msgspec.to_builtins(report, enc_hook=_plain))
     assert isinstance(values, dict)
     return values
+
+
+def json_text(report: msgspec.Struct | Mapping[str, Any]) -> str:
+    """JSON of a report, indented, with a newline at its end.
+
+    Characters that a terminal would act on (control, bidirectional, lone surrogates) are escaped; the values are the same.
+    """
+    text = json.dumps(json_values(report), indent=2, allow_nan=False, ensure_ascii=False)
+    return "".join(c if c.isprintable() or c == "\n" else _escaped(c) for c in text) + "\n"
+
+
+def _escaped(character: str) -> str:
+    return json.dumps(character)[1:-1] if ord(character) > 0x7F else f"\\u{ord(character):04x}"
 
 
 def report_type(name: str) -> type[Report]:

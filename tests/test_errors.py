@@ -11,16 +11,17 @@ from pathlib import Path
 import pytest
 
 from imutool import errors
-from imutool.errors import ConfigError, DataError, ImutoolError, LogError, ModelError, NumericsError
+from imutool.errors import ConfigError, DataError, ImutoolError, LogError, ModelError, NumericsError, UsageError
 
-CODES = {ConfigError: 3, DataError: 4, LogError: 5, ModelError: 6, NumericsError: 7}
+CODES = {ConfigError: 3, UsageError: 2, DataError: 4, LogError: 5, ModelError: 6, NumericsError: 7}
 
 
 def test_the_tree_is_as_drawn_and_every_code_its_own() -> None:
     found = {kind for _, kind in inspect.getmembers(errors, inspect.isclass) if issubclass(kind, ImutoolError)}
     assert found == {ImutoolError, *CODES}
     assert {kind: kind.exit_code for kind in CODES} == CODES
-    assert all(kind.__bases__ == (ImutoolError,) for kind in CODES)
+    assert all(kind.__bases__ == (ImutoolError,) for kind in CODES if kind is not UsageError)
+    assert UsageError.__bases__ == (ConfigError,)
     drawing = errors.__doc__ or ""
     for kind, code in CODES.items():
         assert f"{kind.__name__:<13}".rstrip() in drawing

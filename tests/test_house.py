@@ -28,7 +28,7 @@ ROOT = Path(__file__).parents[1]
 # docs/architecture.md, Rooms: lower never imports higher. A room is a module of imutool or a folder of them.
 TIERS = (
     ("errors",),
-    ("columns", "config", "location", "registry", "report", "units", "geometry", "recording"),
+    ("config", "location", "registry", "report", "units", "geometry", "recording"),
     ("inertial", "mcap_io", "bag"),
     ("noise", "cleaning"),
     ("sensor", "log_info", "exporting"),
@@ -44,7 +44,7 @@ TIERS = (
     ("cli",),
 )
 LEVEL = {room: level for level, rooms in enumerate(TIERS) for room in rooms}
-FOR_CONVERTERS = {"converters", "errors", "recording", "bag"}
+FOR_CONVERTERS = {"converters", "errors", "geometry", "recording", "bag"}
 
 HEAVY = {"torch", "torchdiffeq", "safetensors", "rerun", "ray", "matplotlib", "rosbags", "fsspec", "upath"}
 HELP_SHARE = 0.4  # of the time `import torch` takes; the command itself takes about a tenth of it

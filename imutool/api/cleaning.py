@@ -16,6 +16,8 @@ from imutool.mcap_io.recovery.losses import Losses
 from imutool.mcap_io.recovery.recovered_log import RecoveredLog
 from imutool.mcap_io.repair import RepairReport
 from imutool.mcap_io.repair import repair as repair_log
+from imutool.mcap_io.storage import outputs
+from imutool.mcap_io.storage.outputs import OutputFile, check_outputs
 
 
 @dataclass(frozen=True)
@@ -73,6 +75,7 @@ def clean(
         'good'
     """
     wanted = chosen(rules, skip_rules, force)
+    check_outputs([OutputFile("target", target, outputs.LOG)], [source, model], overwrite=overwrite)
     if target is None:
         return _survey(source, imus, wanted)
     from imutool.debiasing import debias
@@ -130,6 +133,7 @@ def repair(
         >>> report.whole, report.messages["/imu0"] > 0
         (False, True)
     """
+    check_outputs([OutputFile("target", target, (*outputs.LOG, ".bag"))], [source], overwrite=overwrite)
     here, there = location(source), location(target)
     if not is_bag(here):
         return repair_log(here, there, damaged=damaged, overwrite=overwrite, progress=progress)

@@ -14,6 +14,8 @@ from imutool.location import LogPath, local, location
 from imutool.log_info import inspection
 from imutool.log_info.report import LogInfo
 from imutool.mcap_io.read import read as read_log
+from imutool.mcap_io.storage import outputs
+from imutool.mcap_io.storage.outputs import OutputFile, check_outputs
 from imutool.mcap_io.write import write as write_log
 from imutool.recording import Recording
 
@@ -80,6 +82,7 @@ def write(path: LogPath, recording: Recording, *, compression: str = "zstd", ove
         >>> imutool.read("bench.mcap") == recording
         True
     """
+    check_outputs([OutputFile("path", path, outputs.LOG)], overwrite=overwrite)
     write_log(recording, location(path), compression=compression, overwrite=overwrite)
 
 
@@ -92,24 +95,28 @@ def convert(
     compression: str = "zstd",
     images: bool = True,
     overwrite: bool = False,
+    sensor: str = "",
+    kinds: Sequence[str] = (),
     workers: int | None = None,
     progress: NamedProgress | None = None,
 ) -> ConvertReport:
-    """Convert a raw data set to MCAP logs, one log per sequence.
+    """Convert recordings of any format to MCAP logs, one log per sequence.
 
     Args:
-        source: Sequence folder, archive (.zip, .tar, .tar.gz), ROS 1 bag, or a folder of these.
+        source: Bag, log, sequence folder or archive (.zip, .tar, .tar.gz), or a folder of these.
         out: Log file for one sequence, folder for several.
         format: Converter (`euroc`, `tum_vi`, `fetch`, ...), or `auto` to recognise it.
         sequences: Names of the sequences to convert; by default all.
         compression: `zstd`, `lz4` or `none`.
         images: Copy camera frames as well.
         overwrite: Replace existing logs.
+        sensor: Name of the IMU, where the recording does not state it.
+        kinds: What poses are worth, as `TOPIC=truth|estimate|odometry|unknown`.
         workers: Processes; by default one per core. A script that uses several needs `if __name__ == "__main__":`.
         progress: Callback with sequences done, sequences in all, and the name of the last one.
 
     Returns:
-        `written`, the logs in the order of the source, and `failures`.
+        `written`, the logs in the order of the source, `failures`, `notes`, and `losses`: what a log lacks of its source.
 
     Raises:
         DataError: The source holds no known sequence.
@@ -121,6 +128,7 @@ def convert(
         >>> [log.name for log in imutool.convert("raw", "logs", format="euroc").written]
         ['flight_1.mcap', 'flight_2.mcap']
     """
+    check_outputs([OutputFile("out", out, files=("*.mcap",), keeps=True)], [source], overwrite=overwrite)
     return conversion.convert(
         local(source, "source"),
         local(out, "out"),
@@ -129,6 +137,8 @@ def convert(
         compression=compression,
         images=images,
         overwrite=overwrite,
+        sensor=sensor,
+        kinds=kinds,
         workers=workers,
         progress=progress,
     )
@@ -190,6 +200,7 @@ def export(
         fix = f"Did you mean {near[0]}?" if near else ""
         raise ConfigError(f"unknown format {format!r}", where="format", expected=" or ".join(FORMATS), fix=fix)
     source, folder = local(log, "log"), local(out, "out")
+    check_outputs([OutputFile("out", folder, files=("*",), keeps=True)], [source, noise], overwrite=overwrite)
     tell: NamedProgress = progress or (lambda done, total, word: None)
     if format == "euroc":
         return euroc.write(source, folder, imu, noise, overwrite, tell)

@@ -23,6 +23,8 @@ from imutool.bias_start.model_choice import check_smooth, find_initial_bias, smo
 from imutool.debiasing import DebiasReport
 from imutool.errors import ConfigError
 from imutool.location import LogPath, location
+from imutool.mcap_io.storage import outputs
+from imutool.mcap_io.storage.outputs import OutputFile, check_outputs
 from imutool.recording import Imu, Recording
 
 Model = str | Path | BiasModel
@@ -176,6 +178,8 @@ def debias(
     if in_place == (target is not None):
         raise ConfigError("`target` and `in_place`", where="debias", expected="one of the two")
     out = None if target is None else location(target)
+    given = list(model.values()) if isinstance(model, Mapping) else model
+    check_outputs([OutputFile("target", out, outputs.LOG)], [source, given], overwrite=overwrite)
     run = partial(debiasing.debias, location(source), out, model=model, imus=imus, init=init, smooth=smooth)
     return run(check=check, overwrite=overwrite, progress=progress)
 

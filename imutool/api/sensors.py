@@ -13,6 +13,8 @@ from imutool.api.logs import NamedProgress
 from imutool.diagnosis.diagnose import diagnose as diagnose_logs
 from imutool.diagnosis.result import Diagnosis
 from imutool.location import LogPath, local, location
+from imutool.mcap_io.storage import outputs
+from imutool.mcap_io.storage.outputs import OutputFile, check_outputs
 from imutool.recording import Recording
 from imutool.sensor.made_up_flight import FlightSettings, flight
 from imutool.sensor.simulate import Simulation
@@ -82,6 +84,7 @@ def simulate(
         >>> len(simulation.recording.imu) > 3900
         True
     """
+    check_outputs([OutputFile("out", out, outputs.LOG)], [trajectory, physics, noise], overwrite=overwrite)
     return simulate_log(
         local(trajectory, "trajectory"),
         local(out, "out"),
@@ -135,9 +138,10 @@ def diagnose(
     several = reals if isinstance(reals, Sequence) and not isinstance(reals, str) else [reals]
     logs = [location(real) for real in several]
     folder = None if output is None else local(output, "output")
-    if folder is not None:
-        diagnosis_output.refuse(folder, overwrite=overwrite)
-    found = diagnose_logs(logs, None if sim is None else location(sim), imu=imu, truth=truth, signals=signals, tell=progress)
+    check_outputs([OutputFile("output", folder, files=diagnosis_output.FILES)], [several, sim], overwrite=overwrite)
+    diagnosis = diagnose_logs(
+        logs, None if sim is None else location(sim), imu=imu, truth=truth, signals=signals, tell=progress
+    )
     if folder is not None:
 
         def runs(findings: Path) -> list[RunData]:
@@ -145,5 +149,5 @@ def diagnose(
 
             return [load(real, imu=imu, truth=truth, findings=findings) for real in logs]
 
-        diagnosis_output.write(found, folder, logs=runs, overwrite=overwrite)
-    return found
+        diagnosis_output.write(diagnosis, folder, logs=runs, overwrite=overwrite)
+    return diagnosis

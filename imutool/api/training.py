@@ -10,6 +10,8 @@ from imutool import evaluation
 from imutool.bias.model import BiasModel
 from imutool.config import build
 from imutool.location import LogPath, local, locals_of
+from imutool.mcap_io.storage import outputs
+from imutool.mcap_io.storage.outputs import OutputFile, check_outputs
 from imutool.training import run
 from imutool.training.fit import Epoch
 from imutool.training.settings import settings_of
@@ -55,6 +57,7 @@ def train(
         ['accel', 'gyro']
     """
     chosen = None if settings is None else build(settings_of(method), dict(settings), where="settings")
+    check_outputs([OutputFile("out", out, outputs.MODEL)], [logs], overwrite=overwrite)
     return run.train(
         locals_of(logs, "logs"),
         local(out, "out"),
@@ -109,6 +112,8 @@ def evaluate(
         >>> linear["aoe_deg"] < raw["aoe_deg"]
         True
     """
+    tum = OutputFile("trajectories", trajectories, files=("*.tum",), keeps=True)
+    check_outputs([tum], [log, list(models)], overwrite=overwrite)
     return evaluation.evaluate(
         local(log, "log"),
         models=models,

@@ -13,6 +13,8 @@ from jaxtyping import Float64
 from imutool.debiasing import DebiasedBlock
 from imutool.errors import ConfigError
 from imutool.location import LogPath, local, location
+from imutool.mcap_io.storage import outputs
+from imutool.mcap_io.storage.outputs import OutputFile, check_outputs
 from imutool.mcap_io.topics import ImuBatch
 from imutool.recording import Imu
 from imutool.viewing import Output, notebook
@@ -131,13 +133,23 @@ def view(
     several = logs if isinstance(logs, Sequence) and not isinstance(logs, str) else [logs]
     paths = [None if path is None else Path(path) for path in (save, export_web, png, html)]
     cursor = None if at is None else str(at)
+    check_outputs(_outputs(*paths), [path for path in several if not isinstance(path, RunData)], overwrite=overwrite)
     asked = RequestedOutputs(paths[0], connect, web, port, paths[1], paths[2], paths[3], cursor, source, overwrite)
-    with Outputs(asked) as outputs:
-        shown = outputs.show([one if isinstance(one, RunData) else load_run(one, **options) for one in several])
-        if outputs.refused is not None:
-            raise outputs.refused
-        outputs.serve()
+    with Outputs(asked) as views:
+        shown = views.show([log if isinstance(log, RunData) else load_run(log, **options) for log in several])
+        if views.refused is not None:
+            raise views.refused
+        views.serve()
     return shown
+
+
+def _outputs(save: Path | None, export_web: Path | None, png: Path | None, html: Path | None) -> list[OutputFile]:
+    return [
+        OutputFile("save", save, outputs.RRD, may_be_folder=True),
+        OutputFile("export_web", export_web, files=("*",), keeps=True),
+        OutputFile("png", png, files=("*.png",), keeps=True),
+        OutputFile("html", html, outputs.HTML),
+    ]
 
 
 def notebook_viewer(runs: RunData | Sequence[RunData]) -> Any:
@@ -231,5 +243,6 @@ def watch(
         1
     """
     file, instead = None if save is None else Path(save), Path(f"{name}.rrd")
+    check_outputs([OutputFile("save", file, outputs.RRD)], overwrite=overwrite)
     with live.live_view(name, connect_to=connect, save=file, instead=instead, overwrite=overwrite) as show:
         yield LiveView(topic, show)

@@ -104,6 +104,14 @@ class Message(NamedTuple):
     end: int
 
 
+class ChunkInfo(NamedTuple):
+    """Offset of a chunk, its first time, and how many messages of each connection it holds."""
+
+    offset: int
+    first_ns: int
+    counts: Mapping[int, int]
+
+
 class Chunk(NamedTuple):
     """One chunk's bytes, unpacked, and its messages; `whole` when nothing in it was lost."""
 
@@ -178,6 +186,13 @@ def connection(found: Head, data: bytes, record: bytes) -> Connection:
     if not (topic.isprintable() and topic and KIND.fullmatch(kind) and inner.get(b"latching", b"") in (b"", b"0", b"1")):
         raise LogError(f"a connection record is damaged: topic {topic!r} of type {kind!r}")
     return Connection(found.number(b"conn"), topic, kind, record)
+
+
+def chunk_info_of(found: Head, data: bytes) -> ChunkInfo:
+    """Start time of a chunk and its messages by connection, as the bag's index states them."""
+    start = found.fields.get(b"start_time", bytes(8))
+    first_ns = int.from_bytes(start[:4], "little") * 10**9 + int.from_bytes(start[4:8], "little")
+    return ChunkInfo(found.number(b"chunk_pos"), first_ns, dict(struct.iter_unpack("<II", data[: len(data) // 8 * 8])))
 
 
 def unpack(compression: str, packed: bytes, size: int, *, cut: bool = False) -> bytes:

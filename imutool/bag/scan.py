@@ -10,7 +10,7 @@ from collections import Counter
 from collections.abc import Iterator
 
 from imutool.bag import records
-from imutool.bag.records import HEAD_LIMIT, MAGIC, Chunk, Connection, Head, Loss, Message, Op
+from imutool.bag.records import HEAD_LIMIT, MAGIC, Chunk, ChunkInfo, Connection, Head, Loss, Message, Op
 from imutool.errors import LogError
 from imutool.location import Location
 from imutool.mcap_io.storage.source import Source
@@ -35,6 +35,7 @@ class Bag:
         self.path, self.recover = path, recover
         self.connections: dict[int, Connection] = {}
         self.doubtful: set[int] = set()  # numbers that two connections may share
+        self.infos: list[ChunkInfo] = []  # of an indexed bag
         self.losses: list[Loss] = []
         self.lost = 0  # number of losses, also beyond those in `losses`
         self.source = Source(path, expected="a ROS 1 bag")
@@ -83,6 +84,7 @@ class Bag:
             found = self._head(position)
             if found is None or found.op != Op.INFO or found.end > self.source.size:
                 return False
+            self.infos.append(records.chunk_info_of(found, self.source.at(found.data_at, found.size)))
             position = found.end
         return position <= self.source.size
 

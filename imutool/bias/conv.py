@@ -17,6 +17,7 @@ form, unless `start` says `identity`.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from typing import Annotated, ClassVar, Literal, NamedTuple
 
@@ -115,7 +116,7 @@ class Model(BiasModel):
             x = gelu(layers[-1].offset)
         return layers
 
-    def stream(self, rest: Vector6) -> Stream:
+    def stretch(self, rest: Vector6, start_s: float = math.nan) -> Stream:
         """Bias stream; each layer keeps the inputs that its convolution reaches."""
         return _Stream(self, rest)
 

@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from imutool.bias import neural_ode
-from imutool.bias.model import COLUMNS, BiasModel, CovarianceModel, SampleStream, Shapes, Stream, Vector6
+from imutool.bias.model import COLUMNS, BiasModel, CovarianceModel, DriftStream, Shapes, Stream, Vector6
 from imutool.config import Settings
 from imutool.sensor import catalogue
 from imutool.sensor.linear_form import CompiledEffects, LinearForm, compiled, patterns
@@ -80,11 +80,11 @@ class Model(BiasModel):
         """Error of the effects at some signals (rad/s or m/s²)."""
         return self._compiled(sensor)(signals)
 
-    def stream(self, rest: Vector6) -> Stream:
-        """Bias stream, from the log's first sample on."""
-        ode = None if self.ode is None else self.ode.stream(rest)
+    def stretch(self, rest: Vector6, start_s: float = math.nan) -> Stream:
+        """Bias stream, with filters that start at its first sample."""
+        ode = None if self.ode is None else self.ode.stretch(rest)
         gyro, accel = (self._compiled(sensor) for sensor in SENSORS)
-        return _Stream(self.rate_hz, gyro, accel, ode, rest.astype(np.float64))
+        return _Stream(self.rate_hz, gyro, accel, ode, rest.astype(np.float64), start_s)
 
     def rest_dynamics(self) -> Float64[np.ndarray, "6 6"]:
         """Rest dynamics of the neural ODE."""
@@ -119,12 +119,23 @@ class _Stream:
     """Bias stream: effects, then the neural ODE on the corrected samples."""
 
     def __init__(
-        self, rate_hz: float, gyro: CompiledEffects, accel: CompiledEffects, ode: SampleStream | None, rest: Vector6
+        self,
+        rate_hz: float,
+        gyro: CompiledEffects,
+        accel: CompiledEffects,
+        ode: DriftStream | None,
+        rest: Vector6,
+        start_s: float,
     ) -> None:
         self._signals = SignalFilter(rate_hz, max(gyro.wanted, accel.wanted))
         self._matrix = np.concatenate([gyro.matrix, accel.matrix], axis=1)
         self._gyro, self._accel, self._only_product = gyro, accel, not (gyro.others or accel.others)
-        self._ode, self._rest, self._start_s = ode, rest, math.nan
+        self._ode, self._rest, self._start_s = ode, rest, start_s
+
+    @property
+    def rest(self) -> Vector6:
+        """Latest rest bias."""
+        return self._rest if self._ode is None else self._ode.rest
 
     def __call__(
         self, t_s: Float64[np.ndarray, " n"], gyro: Float64[np.ndarray, "n 3"], accel: Float64[np.ndarray, "n 3"]

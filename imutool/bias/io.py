@@ -5,7 +5,6 @@ from __future__ import annotations
 import difflib
 import hashlib
 import json
-import os
 from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path
@@ -18,7 +17,8 @@ from safetensors.numpy import save as save_bytes
 from imutool import registry
 from imutool.bias.model import BiasModel
 from imutool.config import build, plain
-from imutool.errors import ConfigError, ImutoolError, ModelError
+from imutool.errors import ImutoolError, ModelError
+from imutool.mcap_io.storage.target import Target
 
 FORMAT = "imutool.model/1"
 MAX_BYTES = 64 << 20  # the shipped models are under 2 MB
@@ -52,16 +52,8 @@ def write_tensors(tensors: Mapping[str, np.ndarray], header: Mapping[str, str], 
     Raises:
         ConfigError: the target exists, or cannot be written.
     """
-    if path.exists() and not overwrite:
-        raise ConfigError("exists already", where=path, fix="Choose another name or give `overwrite`")
-    part = path.with_name(f".{path.name}.{os.getpid()}.part")
-    try:
-        part.write_bytes(_in_order(save_bytes(dict(tensors), metadata=dict(header))))
-        part.replace(path)
-    except (OSError, SafetensorError) as error:
-        raise ConfigError(f"cannot be written ({error})", where=path, fix="Choose another place") from error
-    finally:
-        part.unlink(missing_ok=True)
+    with Target(path, overwrite=overwrite) as target:
+        target.write(_in_order(save_bytes(dict(tensors), metadata=dict(header))))
 
 
 def _in_order(raw: bytes) -> bytes:

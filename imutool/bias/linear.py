@@ -5,6 +5,7 @@ W is solved in closed form; a direction that the motion does not excite keeps th
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from typing import ClassVar
 
@@ -41,7 +42,7 @@ class Model(BiasModel):
         """Shapes of the statistics and of W for each sensor."""
         return super().shapes(config) | matrices("W")
 
-    def stream(self, rest: Vector6) -> Stream:
+    def stretch(self, rest: Vector6, start_s: float = math.nan) -> Stream:
         """Bias rest + W u at every sample."""
         W_gyro, W_accel = (self.tensors[f"W.{sensor}"] for sensor in SENSORS)
 

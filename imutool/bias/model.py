@@ -9,6 +9,7 @@ Inference is numpy. A trained method has a network in torch, `imutool.bias.netwo
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from typing import Any, ClassVar, NamedTuple, Protocol, runtime_checkable
@@ -21,6 +22,8 @@ from imutool.units import SENSORS, Sensor
 
 COLUMNS = {"gyro": slice(0, 3), "accel": slice(3, 6)}  # of a vector of six
 STATISTICS = ("prior_mean", "prior_std", "truth_std", "rest_std", "walk_std", "noise_std")
+
+GAP_S = 1.0  # a longer step of the stamps begins a new stretch: filters of the samples start anew, and no drift is integrated
 
 Vector6 = Float64[np.ndarray, "6"]  # gyro (rad/s) then accel (m/s²)
 Covariances = Float64[np.ndarray, "n 6 6"]
@@ -67,6 +70,15 @@ class SampleStream(Stream, Protocol):
 
     def one(self, t_s: float, u: Vector6) -> Vector6:
         """Bias at one sample (gyro, then accel), as a block of this sample gives; the caller owns the array."""
+
+
+@runtime_checkable
+class DriftStream(SampleStream, Protocol):
+    """Bias stream whose rest bias may drift."""
+
+    @property
+    def rest(self) -> Vector6:
+        """Latest rest bias."""
 
 
 @runtime_checkable
@@ -147,8 +159,60 @@ class BiasModel(ABC):
         return None
 
     @abstractmethod
-    def stream(self, rest: Vector6) -> Stream:
-        """Bias stream from a rest bias, for long logs and live use."""
+    def stretch(self, rest: Vector6, start_s: float = math.nan) -> Stream:
+        """Bias stream from a rest bias over samples without gaps; one that drifts has `rest`, its latest rest bias.
+
+        `start_s` is the time of the log's first sample (by default of the stretch's).
+        """
+
+    def stream(self, rest: Vector6) -> SampleStream:
+        """Bias stream from a rest bias, for long logs and live use; after a gap a new stretch begins."""
+        return _Stretches(self, rest)
+
+
+class _Stretches:
+    """Bias stream over stretches with gaps between them; each begins at the rest bias that the one before has reached."""
+
+    def __init__(self, model: BiasModel, rest: Vector6) -> None:
+        self._model, self._rest, self._start_s, self._before_s = model, rest, math.nan, math.nan
+        self._stream = model.stretch(rest)
+        self._one = getattr(self._stream, "one", None)
+
+    def __call__(
+        self, t_s: Float64[np.ndarray, " n"], gyro: Float64[np.ndarray, "n 3"], accel: Float64[np.ndarray, "n 3"]
+    ) -> Float64[np.ndarray, "n 6"]:
+        """Bias at each sample."""
+        if not len(t_s):
+            return np.zeros((0, 6))
+        if math.isnan(self._start_s):
+            self._start_s = float(t_s[0])
+        step = np.diff(t_s, prepend=self._before_s)
+        self._before_s, cuts = float(t_s[-1]), np.flatnonzero((step > GAP_S) | (step < 0.0))
+        if not len(cuts):
+            return self._stream(t_s, gyro, accel)
+        parts = []
+        for first, last in zip([0, *cuts], [*cuts, len(t_s)], strict=True):
+            if first in cuts:
+                self._begin()
+            if last > first:
+                parts.append(self._stream(t_s[first:last], gyro[first:last], accel[first:last]))
+        return np.concatenate(parts)
+
+    def one(self, t_s: float, u: Vector6) -> Vector6:
+        """Bias at one sample."""
+        step = t_s - self._before_s
+        if step > GAP_S or step < 0.0:
+            self._begin()
+        self._before_s = t_s
+        if math.isnan(self._start_s):
+            self._start_s = t_s
+        bias: Vector6 = self._stream(np.array([t_s]), u[None, :3], u[None, 3:])[0] if self._one is None else self._one(t_s, u)
+        return bias
+
+    def _begin(self) -> None:
+        self._rest = getattr(self._stream, "rest", self._rest)
+        self._stream = self._model.stretch(self._rest, self._start_s)
+        self._one = getattr(self._stream, "one", None)
 
 
 def matrices(names: str) -> Shapes:

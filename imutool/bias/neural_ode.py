@@ -18,6 +18,7 @@ Inference takes Euler steps of `drift_step_s`; `imutool.bias.networks.neural_ode
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from typing import Annotated, ClassVar, Literal
 
@@ -26,7 +27,7 @@ import numpy as np
 from jaxtyping import Float64
 from scipy.special import erf
 
-from imutool.bias.model import COLUMNS, Array, BiasModel, SampleStream, Shapes, Vector6
+from imutool.bias.model import COLUMNS, Array, BiasModel, DriftStream, Shapes, Vector6
 from imutool.bias.neural_stream import HALF_ROOT, Curves, CurveWeights, NeuralStream, gelu
 from imutool.config import Settings
 from imutool.errors import ConfigError
@@ -120,7 +121,7 @@ class Model(BiasModel):
             F[columns, columns] = self.drift(sensor).by_rest(self.prior_mean[columns], still, still)
         return F
 
-    def stream(self, rest: Vector6) -> SampleStream:
+    def stretch(self, rest: Vector6, start_s: float = math.nan) -> DriftStream:
         """Bias stream by Euler: a step every stride of samples, or every sample in the joint scheme."""
         config = self.config
         gyro = _no_curve(config.curve_width) if config.joint else self._curve("gyro")
@@ -224,7 +225,7 @@ class JointStream:
     Gyro by Euler from sample to sample, accelerometer from its curve.
     """
 
-    def __init__(self, rate: Callable[[Array, Array, Array], Array], W: Array, rest: Vector6, others: SampleStream) -> None:
+    def __init__(self, rate: Callable[[Array, Array, Array], Array], W: Array, rest: Vector6, others: DriftStream) -> None:
         self._rate, self._W, self._rest, self._others = rate, W, rest[:3].astype(np.float64), others
         self._bias, self._u, self._slope, self._t_s = np.zeros(3), np.zeros(3), np.zeros(3), np.nan
 
@@ -236,6 +237,11 @@ class JointStream:
         for k, (t, u) in enumerate(zip(t_s.tolist(), gyro, strict=True)):
             bias[k, :3] = self._next(t, u)
         return bias
+
+    @property
+    def rest(self) -> Vector6:
+        """Latest rest bias: the gyro's without its calibration."""
+        return np.concatenate([self._bias - self._W @ self._u, self._others.rest[3:]])
 
     def one(self, t_s: float, u: Vector6) -> Vector6:
         """Bias at one sample."""

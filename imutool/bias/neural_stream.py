@@ -159,6 +159,11 @@ class NeuralStream:
         self._slow, self._drift_input = self._state
         self._before, self._t_step, self._count, self._began = np.zeros(6), 0.0, -1, False
 
+    @property
+    def rest(self) -> Vector6:
+        """Latest rest bias: that of the last step of the drift."""
+        return self._rest
+
     def __call__(
         self, t_s: Float64[np.ndarray, " n"], gyro: Float64[np.ndarray, "n 3"], accel: Float64[np.ndarray, "n 3"]
     ) -> Float64[np.ndarray, "n 6"]:

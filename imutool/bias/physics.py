@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import hashlib
 import logging
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -19,7 +20,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from imutool.bias import hybrid, static
-from imutool.bias.model import BiasModel, CovarianceModel, SampleStream, Shapes, Stream, Vector6
+from imutool.bias.model import BiasModel, CovarianceModel, DriftStream, Shapes, Stream, Vector6
 from imutool.config import Settings
 from imutool.errors import ModelError
 from imutool.inertial.preintegration import exp
@@ -73,10 +74,10 @@ class Model(hybrid.Model):
         """Shapes of the statistics; those of the effects are their own."""
         return BiasModel.shapes(config)
 
-    def stream(self, rest: Vector6) -> Stream:
+    def stretch(self, rest: Vector6, start_s: float = math.nan) -> Stream:
         """Bias stream of the samples without the file's bias."""
-        inner = super().stream(rest)
-        assert isinstance(inner, SampleStream)
+        inner = super().stretch(rest, start_s)
+        assert isinstance(inner, DriftStream)
         return _ShiftedStream(inner, self._b)
 
     def calibration_covariance(self) -> CovarianceModel | None:
@@ -95,13 +96,17 @@ class Model(hybrid.Model):
 class _ShiftedStream:
     """Stream that gets the samples minus a constant."""
 
-    def __init__(self, inner: SampleStream, b: Vector6) -> None:
+    def __init__(self, inner: DriftStream, b: Vector6) -> None:
         self._inner, self._b = inner, b
 
     def __call__(
         self, t_s: Float64[np.ndarray, " n"], gyro: Float64[np.ndarray, "n 3"], accel: Float64[np.ndarray, "n 3"]
     ) -> Float64[np.ndarray, "n 6"]:
         return self._inner(t_s, gyro - self._b[:3], accel - self._b[3:])
+
+    @property
+    def rest(self) -> Vector6:
+        return self._inner.rest
 
     def one(self, t_s: float, u: Vector6) -> Vector6:
         return self._inner.one(t_s, u - self._b)

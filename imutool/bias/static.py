@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from typing import ClassVar
 
@@ -36,7 +37,7 @@ class Model(BiasModel):
     ) -> None:
         super().__init__(config or Config(), rate_hz, UNTRAINED if tensors is None else tensors)
 
-    def stream(self, rest: Vector6) -> Stream:
+    def stretch(self, rest: Vector6, start_s: float = math.nan) -> Stream:
         """Rest bias at every sample."""
 
         def constant(

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from imutool.bias.model import BiasModel, Vector6
-from imutool.bias_start.bias_tracking import BiasPrior, FilteredBlock, Samples, filter_blocks
+from imutool.bias_start.bias_tracking import BiasPrior, FilteredBlock, Samples, filter_blocks, widened
 from imutool.bias_start.initial_bias import (
     AT_REST_STD,
     TRACKED_BY,
@@ -26,9 +26,9 @@ from imutool.bias_start.initial_bias import (
     relative_samples,
     tracked_from_prior,
     training_source,
-    widened,
 )
 from imutool.errors import DataError
+from imutool.inertial.inertial_filter import LEAST_FORCE_M_S2
 from imutool.inertial.stationary import Blocks, rest_stretches, resting_blocks, white_noise
 from imutool.recording import GRAVITY_M_S2, Imu, nanoseconds
 
@@ -51,8 +51,9 @@ def auto(model: BiasModel, imu: Imu) -> InitialBias:
         return tracked_from_prior(model, int(imu.t_ns[0]))
     end_s = rest_blocks[-1].end_s
     stop = imu.rows(slice(0, int(np.searchsorted(imu.t_ns, imu.t_ns[0] + nanoseconds(end_s)))))
-    u = np.concatenate([stop.gyro, stop.accel], axis=1)
-    difference = (u - bias_over(model, stop, before.mean)).mean(axis=0)
+    t_s, gyro, accel = relative_samples(stop)
+    u = np.concatenate([gyro, accel], axis=1)
+    difference = (u - model.stream(before.mean)(t_s, gyro, accel)).mean(axis=0)
     wide = widened(before.std, difference, _at_rest_variance(model, u))
     if (wide > before.std).any():
         before = replace(before, std=wide)
@@ -157,6 +158,8 @@ def _combined(start: InitialBias, stretches: Sequence[_RestStretch], first_ns: i
     for stretch in stretches:  # attitude may differ from stop to stop: each shows another direction
         force = stretch.mean[3:] - rest[3:]
         size = float(np.linalg.norm(force))
+        if size < LEAST_FORCE_M_S2:  # no direction, hence nothing along it
+            continue
         up = force / size
         gain = var[3:] * up / (up @ (var[3:] * up) + AT_REST_STD[3] ** 2)
         rest[3:] += gain * (size - GRAVITY_M_S2)

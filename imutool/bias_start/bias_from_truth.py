@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Bool, Float64
 
 from imutool.bias.model import Array, BiasModel, Vector6
+from imutool.bias_start.bias_tracking import widened
 from imutool.bias_start.initial_bias import (
     LEAST_STD,
     TRACKED_BY,
@@ -19,7 +20,6 @@ from imutool.bias_start.initial_bias import (
     bias_over,
     bias_prior,
     prior,
-    widened,
 )
 from imutool.errors import DataError
 from imutool.geometry import quaternion

@@ -14,19 +14,18 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float64, Int64
-from scipy.linalg import expm
 
-from imutool.bias.model import BiasEstimate, BiasModel, Vector6
+from imutool.bias.model import COLUMNS, GAP_S, BiasEstimate, BiasModel, Vector6
 from imutool.inertial import inertial_filter
 from imutool.inertial.inertial_filter import FilterSettings, State, Step
 from imutool.inertial.preintegration import integrate
 from imutool.inertial.stationary import GAP_PERIODS, OnlineRestDetector
 
 BLOCK_S = 0.5
-STEP_S = 1.0  # of the covariance of a constant rest bias, whose dynamics take minutes
 USUAL_WALK = np.array([1e-4] * 3 + [2e-3] * 3)  # of a sensor without a trained model
-LOST_S = 1.0  # after a longer gap, attitude and velocity are unknown
 CHUNK_S, LOOK_AHEAD_S = 600.0, 600.0  # of smoothing: a bias ten minutes later says nothing about the present one
+
+CONTRADICTED = (10.8, 13.8, 16.3)  # chi-square of one, two, three differences that a true prior exceeds once in a thousand logs
 
 Samples = tuple[Float64[np.ndarray, " n"], Float64[np.ndarray, "n 3"], Float64[np.ndarray, "n 3"]]
 
@@ -44,6 +43,22 @@ class BiasPrior:
     std: Vector6
     ground_std: Vector6
     walk: Vector6 = field(default_factory=USUAL_WALK.copy)
+
+
+def widened(std: Vector6, difference: Vector6, variance: Vector6) -> Vector6:
+    """Standard deviation of a prior after comparison with what a log shows.
+
+    `difference` is the bias that the log shows minus the prior's mean, `variance` that of the measurement (infinite where it
+    shows nothing). A sensor whose chi-square exceeds `CONTRADICTED` gets the root mean square of its difference.
+    """
+    out = std.copy()
+    for columns in COLUMNS.values():
+        shown = np.isfinite(variance[columns])
+        square = difference[columns][shown] ** 2
+        chi_square = (square / (std[columns][shown] ** 2 + variance[columns][shown])).sum()
+        if shown.any() and chi_square > CONTRADICTED[shown.sum() - 1]:
+            out[columns] = np.maximum(std[columns], np.sqrt(square.mean()))
+    return out
 
 
 class BiasTrajectory(NamedTuple):
@@ -142,8 +157,9 @@ class BiasFilter:
             P = np.diag(np.concatenate([prior.std, prior.ground_std]) ** 2)
             self.state = inertial_filter.level(u[:, 3:].mean(axis=0), prior.mean, np.zeros(6), P, s)
         x = self.state
-        if block.longest_s > LOST_S:
-            step = inertial_filter.reset_pose(x, u[-1, 3:], s)
+        if block.longest_s > GAP_S:
+            most = np.maximum(self._prior.std**2, np.diag(x.covariance(False)))
+            step = inertial_filter.reset_pose(x, u[-1, 3:], float(t[-1] - t[0]), self._prior.walk, most, s)
         elif rests:
             resting = u[:-1]
             variance = resting[:, :3].var(axis=0) / len(resting)
@@ -215,35 +231,6 @@ class TrajectoryBiasStream:
         return BiasEstimate(self(t_s, gyro, accel), covariance)
 
 
-class ConstantBiasStream:
-    """Bias stream with a constant rest bias.
-
-    Its covariance grows by random walk and the model's drift.
-    """
-
-    def __init__(self, model: BiasModel, rest: Vector6, std: Vector6) -> None:
-        self._stream = model.stream(rest)
-        self._P, self._t_s = np.diag(std**2), 0.0
-        self._transition = expm(model.rest_dynamics() * STEP_S)
-        self._walk = np.diag(model.walk_std**2) * STEP_S
-
-    def estimate(
-        self, t_s: Float64[np.ndarray, " n"], gyro: Float64[np.ndarray, "n 3"], accel: Float64[np.ndarray, "n 3"]
-    ) -> BiasEstimate:
-        """Bias at each sample, and the covariance of the rest bias in steps of `STEP_S`."""
-        covariance = np.empty((len(t_s), 6, 6))
-        first = 0
-        while first < len(t_s):
-            last = int(np.searchsorted(t_s, self._t_s + STEP_S))
-            if last > first:
-                covariance[first:last] = self._P
-                first = last
-            if first < len(t_s):
-                self._P = self._transition @ self._P @ self._transition.T + self._walk
-                self._t_s += STEP_S
-        return BiasEstimate(self._stream(t_s, gyro, accel), covariance)
-
-
 def filter_blocks(
     model: BiasModel, batches: Iterable[Samples], prior: BiasPrior, *, ahead: bool = False
 ) -> Iterator[FilteredBlock]:
@@ -264,7 +251,7 @@ def smooth_blocks(blocks: Iterable[FilteredBlock]) -> Iterator[tuple[FilteredBlo
         if kept[-1].end_s - kept[0].start_s >= CHUNK_S + LOOK_AHEAD_S:
             states = inertial_filter.smooth([block.step for block in kept])
             until_s = kept[0].start_s + CHUNK_S
-            for state in states:
+            for state in states[:-1]:  # the last state is that of the end
                 if kept[0].start_s >= until_s:
                     break
                 yield kept.popleft(), state

@@ -9,13 +9,15 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Bool, Float64
 
-from imutool.bias.model import BiasModel, SampleStream, Stream, Vector6
+from imutool.bias.model import GAP_S, BiasModel, SampleStream, Stream, Vector6
 from imutool.bias_start.bias_covariance import BiasEstimator
-from imutool.bias_start.initial_bias import InitialBias, tracked_from_prior
-from imutool.recording import Imu, seconds
+from imutool.bias_start.initial_bias import InitialBias, relative_samples, tracked_from_prior
+from imutool.bias_start.stretches import LEAST_FORCE_M_S2, MOST, MOST_GAP_S, measured
+from imutool.recording import Imu, nanoseconds
 
+GAP_NS, MOST_GAP_NS = nanoseconds(GAP_S), nanoseconds(MOST_GAP_S)
 BLOCK_SAMPLES = 1 << 14  # corrected at once: a covariance has 288 bytes
 
 
@@ -28,7 +30,8 @@ class DebiasedImu(NamedTuple):
 
 def apply(model: BiasModel, start: InitialBias, imu: Imu) -> DebiasedImu:
     """Corrected samples and bias of a model."""
-    bias = start.stream(model)(seconds(imu.t_ns, int(imu.t_ns[0])), imu.gyro, imu.accel)
+    good = measured(imu.gyro, imu.accel)
+    bias = _to_all(good, start.stream(model)(*relative_samples(imu)))
     return DebiasedImu(Imu(imu.t_ns, imu.gyro - bias[:, :3], imu.accel - bias[:, 3:]), bias)
 
 
@@ -38,13 +41,23 @@ def apply_with_std(model: BiasModel, start: InitialBias, imu: Imu) -> tuple[Debi
     Gyro (rad/s), then accel (m/s²); see `imutool.bias_start.bias_covariance`. Computed in blocks, as for a log.
     """
     estimator = BiasEstimator(model, start)
-    t_s = seconds(imu.t_ns, int(imu.t_ns[0]))
-    bias, std = np.empty((len(imu), 6)), np.empty((len(imu), 6))
-    for first in range(0, len(imu), BLOCK_SAMPLES):
+    good, (t_s, gyro, accel) = measured(imu.gyro, imu.accel), relative_samples(imu)
+    bias, std = np.empty((len(t_s), 6)), np.empty((len(t_s), 6))
+    for first in range(0, len(t_s), BLOCK_SAMPLES):
         rows = slice(first, first + BLOCK_SAMPLES)
-        bias[rows], covariance = estimator(t_s[rows], imu.gyro[rows], imu.accel[rows])
+        bias[rows], covariance = estimator(t_s[rows], gyro[rows], accel[rows])
         std[rows] = np.sqrt(covariance.diagonal(axis1=1, axis2=2))
+    bias, std = _to_all(good, bias), _to_all(good, std)
     return DebiasedImu(Imu(imu.t_ns, imu.gyro - bias[:, :3], imu.accel - bias[:, 3:]), bias), std
+
+
+def _to_all(good: Bool[np.ndarray, " n"], values: Float64[np.ndarray, "m 6"]) -> Float64[np.ndarray, "n 6"]:
+    """Values of the measured samples for all samples: one that is no measurement has the value before it."""
+    if good.all():
+        return values
+    if not len(values):
+        return np.zeros((len(good), 6))
+    return np.asarray(values[np.maximum(np.cumsum(good) - 1, 0)])
 
 
 class OnlineDebiaser:
@@ -55,20 +68,35 @@ class OnlineDebiaser:
     """
 
     def __init__(self, model: BiasModel, start: InitialBias | None = None) -> None:
-        self._model, self._start, self._start_ns = model, start, -1
+        self._model, self._start = model, start
+        self._start_ns, self._before_ns, self._bias = -1, -1, np.zeros(6)
 
     def __call__(
         self, stamp_ns: int, gyro: Float64[np.ndarray, "3"], accel: Float64[np.ndarray, "3"]
     ) -> tuple[Float64[np.ndarray, "3"], Float64[np.ndarray, "3"], Float64[np.ndarray, "6"]]:
         """Corrected angular rate (rad/s), specific force (m/s²), and the subtracted bias."""
-        if self._start_ns < 0:
-            self._start_ns = stamp_ns
-            stream = (self._start or tracked_from_prior(self._model, stamp_ns)).stream(self._model)
-            self._correct = stream.one if isinstance(stream, SampleStream) else _by_blocks(stream)
         u = np.concatenate((gyro, accel))
-        bias = self._correct((stamp_ns - self._start_ns) * 1e-9, u)
+        size = np.abs(u)
+        if (size <= MOST).all() and size[3:].max() >= LEAST_FORCE_M_S2:  # false for NaN
+            t_s = self._seconds(stamp_ns)
+            self._bias = self._correct(t_s, u)
+        bias = self._bias.copy()
         clean = u - bias
         return clean[:3], clean[3:], bias
+
+    def _seconds(self, stamp_ns: int) -> float:
+        """Seconds since the first sample; a jump of the clock counts as at most `stretches.MOST_GAP_S`."""
+        if self._start_ns < 0:
+            self._start_ns = self._before_ns = stamp_ns
+            stream = (self._start or tracked_from_prior(self._model, stamp_ns)).stream(self._model)
+            self._correct = stream.one if isinstance(stream, SampleStream) else _by_blocks(stream)
+        step_ns = stamp_ns - self._before_ns
+        if -GAP_NS < step_ns < 0:  # out of order: no time passes
+            self._start_ns += step_ns
+        elif not 0 <= step_ns <= MOST_GAP_NS:
+            self._start_ns += step_ns - MOST_GAP_NS
+        self._before_ns = stamp_ns
+        return (stamp_ns - self._start_ns) * 1e-9
 
 
 def _by_blocks(stream: Stream) -> Callable[[float, Vector6], Vector6]:

@@ -21,18 +21,27 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float64
 
-from imutool.bias.model import COLUMNS, BiasModel, RestBiasEstimator, Stream, Vector6
+from imutool.bias.model import (
+    GAP_S,
+    BiasEstimate,
+    BiasModel,
+    Covariances,
+    RestBiasEstimator,
+    Stream,
+    Vector6,
+)
 from imutool.bias_start.bias_tracking import (
     USUAL_WALK,
     BiasPrior,
     BiasTrajectory,
-    ConstantBiasStream,
     Samples,
     TrackedBiasStream,
     TrajectoryBiasStream,
     filter_blocks,
     smooth_blocks,
+    widened,
 )
+from imutool.bias_start.stretches import MOST, StretchClock, measured
 from imutool.errors import ConfigError, DataError
 from imutool.inertial.inertial_filter import State
 from imutool.recording import Imu, seconds
@@ -41,8 +50,9 @@ AT_REST_STD = np.array([1e-4] * 3 + [0.03] * 3)  # earth's rotation; local gravi
 LEAST_STD = np.array([1e-6] * 3 + [1e-4] * 3)  # with a prior of zero variance nothing could be estimated
 SESSION_GAP_S = 6 * 3600.0  # a longer pause is another switching-on
 LEAST_SHOWN = 0.2  # precision from the log, of that of the prior, below which the log says nothing about the prior
-CONTRADICTED = (10.8, 13.8, 16.3)  # chi-square of one, two, three differences that a true prior exceeds once in a thousand logs
 TRACKED_BY = "gravity in motion and every stop"
+
+STEP_S = 1.0  # of the covariance of a constant rest bias, whose dynamics take minutes
 
 METHODS = ("auto", "stationary", "prior", "truth")
 
@@ -89,6 +99,61 @@ class InitialBias:
         return self.track is not None or self.follows is not None
 
 
+class ConstantBiasStream:
+    """Bias stream with a constant rest bias.
+
+    Its covariance grows by random walk and the model's drift.
+    """
+
+    def __init__(self, model: BiasModel, rest: Vector6, std: Vector6) -> None:
+        self._stream = model.stream(rest)
+        self._P, self._t_s, self._before_s = np.diag(std**2), 0.0, 0.0
+        self._most = np.maximum(std, model.prior_std) ** 2
+        self._transition = _transition(model.rest_dynamics() * STEP_S)
+        self._walk = np.diag(model.walk_std**2) * STEP_S
+
+    def estimate(
+        self, t_s: Float64[np.ndarray, " n"], gyro: Float64[np.ndarray, "n 3"], accel: Float64[np.ndarray, "n 3"]
+    ) -> BiasEstimate:
+        """Bias at each sample, and the covariance of the rest bias in steps of `STEP_S`."""
+        covariance = np.empty((len(t_s), 6, 6))
+        ends = [*np.flatnonzero(np.diff(t_s, prepend=self._before_s) > GAP_S).tolist(), len(t_s)]
+        first = self._within(t_s, 0, ends[0], covariance)
+        for end in ends[1:]:
+            self._after_gap(float(t_s[first]))
+            first = self._within(t_s, first, end, covariance)
+        self._before_s = float(t_s[-1]) if len(t_s) else self._before_s
+        return BiasEstimate(self._stream(t_s, gyro, accel), covariance)
+
+    def _within(self, t_s: Float64[np.ndarray, " n"], first: int, end: int, covariance: Covariances) -> int:
+        """Covariances from row `first` to `end`, which no gap interrupts."""
+        while first < end:
+            last = min(end, int(np.searchsorted(t_s, self._t_s + STEP_S)))
+            if last > first:
+                covariance[first:last] = self._P
+                first = last
+            if first < end:
+                self._P = self._transition @ self._P @ self._transition.T + self._walk
+                self._t_s += STEP_S
+        return end
+
+    def _after_gap(self, t_s: float) -> None:
+        """Add the random walk of whole steps up to a time, no more than the variance of a run's bias; nothing drifts."""
+        steps = max(0.0, (t_s - self._t_s) // STEP_S)
+        variance = np.diag(self._P)
+        self._P = self._P + np.diag(np.minimum(steps * np.diag(self._walk), np.maximum(self._most - variance, 0.0)))
+        self._t_s += steps * STEP_S
+
+
+def _transition(F: Float64[np.ndarray, "6 6"]) -> Float64[np.ndarray, "6 6"]:
+    """Matrix exponential."""
+    if not F.any():
+        return np.eye(6)
+    from scipy.linalg import expm
+
+    return np.asarray(expm(F))
+
+
 def prior(model: BiasModel, first_ns: int | None = None) -> InitialBias:
     """Prior bias of a log that begins at a stamp: of its session if training saw it, else of a new one."""
     mean, std = model.prior_mean.copy(), model.prior_std.copy()
@@ -110,22 +175,6 @@ def bias_prior(model: BiasModel, first_ns: int | None = None) -> BiasPrior:
     walk = np.repeat(np.sqrt(np.mean(model.walk_std.reshape(2, 3) ** 2, axis=1)), 3)
     walk = np.where(walk > 0, walk, USUAL_WALK)
     return BiasPrior(start.rest, np.maximum(start.std, LEAST_STD), ground, walk)
-
-
-def widened(std: Vector6, difference: Vector6, variance: Vector6) -> Vector6:
-    """Standard deviation of a prior after comparison with what a log shows.
-
-    `difference` is the bias that the log shows minus the prior's mean, `variance` that of the measurement (infinite where it
-    shows nothing). A sensor whose chi-square exceeds `CONTRADICTED` gets the root mean square of its difference.
-    """
-    out = std.copy()
-    for columns in COLUMNS.values():
-        shown = np.isfinite(variance[columns])
-        square = difference[columns][shown] ** 2
-        chi_square = (square / (std[columns][shown] ** 2 + variance[columns][shown])).sum()
-        if shown.any() and chi_square > CONTRADICTED[shown.sum() - 1]:
-            out[columns] = np.maximum(std[columns], np.sqrt(square.mean()))
-    return out
 
 
 def tracked_from_prior(model: BiasModel, first_ns: int | None = None) -> InitialBias:
@@ -165,13 +214,13 @@ def from_numbers(text: str) -> InitialBias:
     """Initial bias from six numbers in text: gx,gy,gz in rad/s, ax,ay,az in m/s².
 
     Raises:
-        ConfigError: neither six finite numbers nor a name of `METHODS`.
+        ConfigError: neither six numbers that a sensor can read nor a name of `METHODS`.
     """
     try:
         rest = np.array([float(word) for word in text.split(",")])
     except ValueError:
         rest = np.zeros(0)
-    if rest.shape != (6,) or not np.isfinite(rest).all():
+    if rest.shape != (6,) or not (np.abs(rest) <= MOST).all():
         raise ConfigError(f"{text!r}", where="init", expected=f"{', '.join(METHODS)} or gx,gy,gz,ax,ay,az")
     return InitialBias(rest, np.zeros(6), "given")
 
@@ -190,8 +239,10 @@ def accuracy(std: Vector6) -> str:
 
 
 def relative_samples(imu: Imu) -> Samples:
-    """Samples with float seconds since the first."""
-    return seconds(imu.t_ns, int(imu.t_ns[0]) if len(imu) else 0), imu.gyro, imu.accel
+    """Measured samples with float seconds since the first; a long gap counts as `stretches.MOST_GAP_S`."""
+    good = measured(imu.gyro, imu.accel)
+    imu = imu if good.all() else imu.rows(good)
+    return seconds(StretchClock()(imu.t_ns), int(imu.t_ns[0]) if len(imu) else 0), imu.gyro, imu.accel
 
 
 def bias_over(model: BiasModel, imu: Imu, rest: Vector6) -> Float64[np.ndarray, "n 6"]:

@@ -6,12 +6,12 @@ With a survey the samples are cleaned (`imutool.cleaning`). Memory does not grow
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Float64, Int64
 
 from imutool.bias import static
 from imutool.bias.io import check_rate, find_model
@@ -27,7 +27,9 @@ from imutool.bias_start.initial_bias import (
     relative_samples,
     smoothed_start,
 )
+from imutool.bias_start.stretches import Sieve, measured
 from imutool.cleaning import Survey, cleaned
+from imutool.cleaning.first_pass import raw_batches
 from imutool.errors import ConfigError, DataError, LogError, ModelError
 from imutool.inertial.stationary import Blocks, block_statistics, white_noise
 from imutool.location import Location
@@ -84,6 +86,32 @@ def _truth_s(init: str) -> float:
     return value
 
 
+def choose_imus(log: Log, imus: Sequence[str], given: Mapping[str, str | Path]) -> list[str]:
+    """The IMUs to debias, each once.
+
+    Raises:
+        ConfigError: a model that none of them would use.
+        LogError: none is named, and the log has not exactly one.
+    """
+    own = [topic for topic in given if topic]
+    topics = list(dict.fromkeys(imus or own or [log.only_imu()]))
+    for topic in own:
+        if topic not in topics:
+            raise ConfigError(
+                f"a model for {topic}, which is not to be debiased",
+                where="model",
+                expected=", ".join(topics),
+                fix=f"Add {topic} to `imus`, or leave the model out",
+            )
+    if "" in given and all(topic in given for topic in topics):
+        raise ConfigError(
+            f"{given['']} is for all IMUs without a model of their own, and each has one",
+            where="model",
+            fix="Leave it out, or name the other IMUs in `imus`",
+        )
+    return topics
+
+
 def choose_model_and_start(
     log: Log, topic: str, name: str | Path | None, init: str, smooth: bool, survey: Survey | None
 ) -> tuple[BiasModel, InitialBias]:
@@ -92,7 +120,7 @@ def choose_model_and_start(
     first_minute = _first_minute(log, topic, init, survey)
     period_s = first_minute.imu.period_s
     if untrained and init == "auto" and not smooth:
-        batches = ((batch.stamp_ns, batch.gyro, batch.accel) for batch in _imu_batches(log, topic, survey))
+        batches = ((t_ns, batch.gyro, batch.accel) for batch, t_ns in _imu_batches(log, topic, survey))
         return _estimate(block_statistics(batches, period_s), log.path)
     model: BiasModel = static.Model() if name is None or untrained else find_model(name, 1.0 / period_s)
     if not untrained:
@@ -121,9 +149,16 @@ def _smoothed(model: BiasModel, batches: Iterable[Samples], where: str | Locatio
         raise _no_start(where) from error
 
 
-def _imu_batches(log: Log, topic: str, survey: Survey | None, end_ns: int | None = None) -> Iterator[ImuBatch]:
-    """IMU messages, cleaned where there is a survey."""
-    return log.imu_batches(topic, end_ns=end_ns) if survey is None else cleaned(log, survey, end_ns)
+def _imu_batches(
+    log: Log, topic: str, survey: Survey | None, end_ns: int | None = None
+) -> Iterator[tuple[ImuBatch, Int64[np.ndarray, " n"]]]:
+    """Measured samples and their times (ns) on a `StretchClock`, cleaned where there is a survey."""
+    sieve = Sieve(f"{log.path} {topic}")
+    for batch in raw_batches(log, topic, end_ns=end_ns) if survey is None else cleaned(log, survey, end_ns):
+        with log.named(topic):
+            found = sieve(batch)
+        yield found
+    sieve.refuse_nothing()
 
 
 @dataclass(frozen=True)
@@ -136,18 +171,16 @@ class _Batches:
 
     def __iter__(self) -> Iterator[Samples]:
         start_ns = None
-        for batch in _imu_batches(self.log, self.topic, self.survey):
-            if len(batch.stamp_ns):
-                start_ns = int(batch.stamp_ns[0]) if start_ns is None else start_ns
-                yield seconds(batch.stamp_ns, start_ns), batch.gyro, batch.accel
+        for batch, t_ns in _imu_batches(self.log, self.topic, self.survey):
+            if len(t_ns):
+                start_ns = int(t_ns[0]) if start_ns is None else start_ns
+                yield seconds(t_ns, start_ns), batch.gyro, batch.accel
 
 
 def _first_minute(log: Log, topic: str, init: str, survey: Survey | None) -> Recording:
     """First minute of a log, with truth only where `init` asks for it."""
     first = next((int(times.min()) for times in log.stamps(topic) if len(times)), None)
     end_ns = None if first is None else first + nanoseconds(HEAD_S)
-    if init.partition(":")[0] == "truth" and survey is None:
-        return read_recording(log, imu=topic, end_ns=end_ns)
     samples = _samples(log, topic, survey, end_ns if survey is None else survey.start_ns + nanoseconds(HEAD_S))
     if init.partition(":")[0] == "truth":
         return read_recording(log, imu=topic, end_ns=end_ns, samples=samples)
@@ -161,11 +194,12 @@ def _samples(log: Log, topic: str, survey: Survey | None, end_ns: int | None = N
         LogError: fewer than two samples, or none that a recording accepts.
     """
     batches = list(_imu_batches(log, topic, survey, end_ns))
-    count = sum(len(batch.stamp_ns) for batch in batches)
+    count = sum(len(t_ns) for _, t_ns in batches)
     if count < 2:
         raise LogError(f"{topic} holds {count} messages", where=log.path, expected="at least 2")
+    gyro, accel = (np.concatenate([getattr(batch, column) for batch, _ in batches]) for column in ("gyro", "accel"))
     with log.named(topic):
-        return Imu(*(np.concatenate([getattr(batch, c) for batch in batches]) for c in ("stamp_ns", "gyro", "accel")))
+        return Imu(np.concatenate([t_ns for _, t_ns in batches]), gyro, accel)
 
 
 def _noise(imu: Imu) -> Float64[np.ndarray, "6"]:
@@ -180,6 +214,8 @@ def estimate_at_rest(imu: Imu, where: str | Location) -> tuple[BiasModel, Initia
         DataError: fewer than two samples.
         ModelError: the log never rests.
     """
+    good = measured(imu.gyro, imu.accel)
+    imu = imu if good.all() else imu.rows(good)
     return _estimate(block_statistics([(imu.t_ns, imu.gyro, imu.accel)], imu.period_s), where)
 
 

@@ -28,7 +28,7 @@ def read_truth(log: Log, refused: Callable[[str, LogError], None] | None = None)
 
     `refused` is called with each topic before it that cannot be read, and with the error.
     """
-    for topic in log.pose_topics:
+    for topic in log.truth_topics:
         times, places, turns = [], [], []
         last = -(2**62)
         try:

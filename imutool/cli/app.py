@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import inspect
 import os
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, NoReturn
+from typing import Annotated, Any, NoReturn, get_args
 
 import typer
 from typer.core import TyperCommand, TyperGroup
@@ -17,8 +19,11 @@ from imutool import __version__, registry
 from imutool.cli.parameters import current, error_with_flags, flags, with_flags
 from imutool.cli.terminal import plain, say, tell_error
 from imutool.errors import INTERRUPTED, ConfigError, ImutoolError
+from imutool.mcap_io.storage import outputs
+from imutool.mcap_io.storage.outputs import OutputFile, check_outputs
 
 LOST = 3  # the command did what it could, and something of the log is lost
+REPORT_HEAD = 200  # bytes of a JSON report that hold its schema
 PIPE_CLOSED = 141  # what a shell reports of a program that SIGPIPE ended
 NOTHING_LEFT = "Nothing half-written is left"
 
@@ -52,8 +57,29 @@ def caught() -> Iterator[None]:
         _fail(f"{place}{error.strerror or error}. Choose another place or make room.", ConfigError.exit_code)
 
 
+@dataclass(frozen=True)
+class Written:
+    """Mark of a parameter that names an output; the fields are those of `OutputFile`."""
+
+    suffixes: tuple[str, ...] = ()
+    files: tuple[str, ...] | None = None
+    keeps: bool = False
+    may_be_folder: bool = False
+
+
+def written(function: Callable[..., Any]) -> dict[str, Written]:
+    """Outputs among the parameters of a command's function."""
+    marks = {
+        name: [mark for mark in get_args(parameter.annotation) if isinstance(mark, Written)]
+        for name, parameter in inspect.signature(function, eval_str=True).parameters.items()
+    }
+    return {name: found[0] for name, found in marks.items() if found}
+
+
 class Command(TyperCommand):
-    """Command whose errors name flags where the library names parameters."""
+    """Command that refuses destructive outputs first, and whose errors name flags."""
+
+    function: Callable[..., Any]  # what the command runs
 
     def invoke(self, ctx: Any) -> Any:
         """Run the command.
@@ -64,11 +90,33 @@ class Command(TyperCommand):
         flag_of = flags(self)
         current.set(flag_of)
         try:
+            self._check(ctx.params)
             return super().invoke(ctx)
         except ImutoolError as error:
             raise error_with_flags(error, flag_of) from error
         except KeyboardInterrupt as interrupt:
             raise KeyboardInterrupt(with_flags(str(interrupt), flag_of)) from interrupt
+
+    def _check(self, values: Mapping[str, Any]) -> None:
+        """Refuse outputs that would destroy something; on --resume a report of the run before may be replaced."""
+        marks = written(type(self).function)
+        places, resume = {name: values[name] for name in marks if values[name] != "-"}, bool(values.get("resume"))
+        wanted = [
+            OutputFile(name, place, mark.suffixes, mark.files, mark.keeps or (resume and _is_report(place)), mark.may_be_folder)
+            for name, place in places.items()
+            for mark in (marks[name],)
+        ]
+        inputs = [value for name, value in values.items() if name not in marks]
+        check_outputs(wanted, inputs, overwrite=bool(values.get("overwrite")))
+
+
+def _is_report(place: str | Path | None) -> bool:
+    """Whether a file is a JSON report of imutool."""
+    try:
+        with Path(place or "").open("rb") as file:
+            return b'"schema": "imutool.' in file.read(REPORT_HEAD)
+    except OSError:
+        return False
 
 
 class App(typer.Typer):
@@ -78,7 +126,12 @@ class App(typer.Typer):
         self, name: str | None = None, *, cls: type[TyperCommand] | None = None, **settings: Any
     ) -> Callable[[CommandFunctionType], CommandFunctionType]:
         """Register a function as a command."""
-        return super().command(name, cls=cls or Command, **settings)
+
+        def register(function: CommandFunctionType) -> CommandFunctionType:
+            kind = type("Command", (cls or Command,), {"function": staticmethod(function)})
+            return typer.Typer.command(self, name, cls=kind, **settings)(function)
+
+        return register
 
 
 def listing(group: str, option: str) -> type[TyperCommand]:
@@ -111,9 +164,11 @@ Init = Annotated[str, typer.Option(help="Start bias: auto, stationary, prior, tr
 Smooth = Annotated[bool, typer.Option("--smooth", help="Use the whole log for each sample's bias: more accurate, not causal.")]
 Imu = Annotated[str | None, typer.Option(help="IMU topic, where a log has several.")]
 Truth = Annotated[str | None, typer.Option(help="Topic of the true poses, where a log has several.")]
-Json = Annotated[str | None, typer.Option("--json", metavar="FILE|-", help="Write the report as JSON; - is stdout.")]
+JSON, HTML, PNG, TOML = (Written(suffixes) for suffixes in (outputs.JSON, outputs.HTML, outputs.PNG, outputs.TOML))
+RRD, MODEL, LOG = (Written(suffixes) for suffixes in (outputs.RRD, outputs.MODEL, outputs.LOG))
+Json = Annotated[str | None, typer.Option("--json", metavar="FILE|-", help="Write the report as JSON; - is stdout."), JSON]
 ReportPage = Annotated[
-    Path | None, typer.Option(metavar="F.html", help="Write an HTML page with figures, paths, errors and spectra.")
+    Path | None, typer.Option(metavar="F.html", help="Write an HTML page with figures, paths, errors and spectra."), HTML
 ]
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace existing files.")]
 Verbose = Annotated[bool, typer.Option("-v", "--verbose", help="Print more.")]

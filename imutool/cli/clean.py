@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from imutool.cli.app import LOST, Init, Json, Overwrite, Quiet, Smooth, Verbose, app, listing
+from imutool.cli.app import HTML, LOG, LOST, Init, Json, Overwrite, Quiet, Smooth, Verbose, app, listing
 from imutool.cli.terminal import out, plain, progress, say, table, tell_losses, write_json
 from imutool.errors import ConfigError, LogError
 from imutool.location import to_location
@@ -25,14 +25,14 @@ SHOWN = 3  # intervals of a finding in the table; all of them are in the JSON
 @app.command(cls=listing("imutool.clean", "--rule"), epilog="Example: [bold]imutool clean robot.mcap robot_clean.mcap[/]")
 def clean(
     source: Annotated[str, typer.Argument(metavar="LOG", help="An MCAP log: a file, or a URL such as s3://bucket/log.mcap.")],
-    target: Annotated[str | None, typer.Argument(metavar="OUT", help="New log with a clean, debiased IMU topic.")] = None,
+    target: Annotated[str | None, typer.Argument(metavar="OUT", help="New log with a clean, debiased IMU topic."), LOG] = None,
     model: Annotated[str | None, typer.Option(help="For OUT: model file, physics.toml or a name that ships.")] = None,
     imu: Annotated[list[str] | None, typer.Option(help="IMU topic, where a log has several. Repeatable.")] = None,
     rule: Annotated[list[str] | None, typer.Option("--rule", metavar="NAME", help="Run only this rule. Repeatable.")] = None,
     no_rule: Annotated[list[str] | None, typer.Option("--no-rule", metavar="NAME", help="Skip this rule. Repeatable.")] = None,
     force: Annotated[bool, typer.Option("--force", help="Write OUT even if the log cannot be trusted.")] = False,
     report_to: Annotated[
-        Path | None, typer.Option("--report", metavar="F.html", help="Write the findings as an HTML page.")
+        Path | None, typer.Option("--report", metavar="F.html", help="Write the findings as an HTML page."), HTML
     ] = None,
     init: Init = "auto",
     smooth: Smooth = False,
@@ -46,14 +46,16 @@ def clean(
     With OUT, write the log with a clean IMU beside the raw one.
     """
     from imutool.cleaning.settings import chosen
-    from imutool.mcap_io.storage.target import Target
 
     rules = chosen(rule or (), no_rule or (), force)
-    given = {"--model": model, "--smooth": smooth, "--force": force, "--overwrite": overwrite and report_to is None}
+    given = {
+        "--model": model,
+        "--smooth": smooth,
+        "--force": force,
+        "--overwrite": overwrite and report_to is None and json_to is None,
+    }
     if target is None and (idle := [name for name, value in given.items() if value]):
         raise ConfigError(f"{idle[0]} needs OUT", where="clean", fix="Name the log to be written")
-    if report_to is not None:
-        Target(report_to, overwrite=overwrite).abandon()  # a page that cannot be written is refused before the work is done
     added: dict[str, int] = {}
     if target is None:
         with progress("Looking through", verbose, quiet) as tell:
@@ -78,11 +80,17 @@ def clean(
         from imutool.viewing.html import cleaning_page
 
         cleaning_page.write(surveys, report_to, overwrite=overwrite)
-    _tell(source, surveys, losses, target, added, json_to)
+    _tell(source, surveys, losses, target, added, json_to, overwrite)
 
 
 def _tell(
-    source: str, surveys: Sequence[Survey], losses: Losses, target: str | None, added: Mapping[str, int], json_to: str | None
+    source: str,
+    surveys: Sequence[Survey],
+    losses: Losses,
+    target: str | None,
+    added: Mapping[str, int],
+    json_to: str | None,
+    overwrite: bool,
 ) -> None:
     """Report findings and output as JSON or text; with losses the exit code is 3."""
     from imutool.cleaning.first_pass import CleaningReport
@@ -94,7 +102,7 @@ def _tell(
         output=UNSET if target is None else target,
         added=UNSET if target is None else dict(added),
     )
-    if not write_json(report, json_to):
+    if not write_json(report, json_to, overwrite=overwrite):
         for survey in surveys:
             show(survey)
         if target is not None:

@@ -8,11 +8,14 @@ from typing import Annotated
 
 import typer
 
-from imutool.cli.app import Json, Overwrite, Quiet, Verbose, app, listing
+from imutool.cli.app import LOST, Json, Overwrite, Quiet, Verbose, Written, app, listing
 from imutool.cli.parameters import with_flags
-from imutool.cli.terminal import progress, say, tell_error, write_json
+from imutool.cli.terminal import progress, say, tell_error, tell_warning, write_json
 from imutool.errors import DataError
 from imutool.report import Report, Section
+
+LOGS = Written(files=("*.mcap",), keeps=True)  # a file, or a folder of files
+FOLDER = Written(files=("*",), keeps=True)
 
 
 class Compression(StrEnum):
@@ -35,6 +38,8 @@ class Conversion(Report, frozen=True, tag="imutool.conversion/1"):
 
     written: list[str]
     failures: list[Failure]
+    notes: list[str]
+    losses: list[str]
 
 
 class Export(Report, frozen=True, tag="imutool.export/1"):
@@ -51,19 +56,24 @@ class Export(Report, frozen=True, tag="imutool.export/1"):
     cls=listing("imutool.converters", "--format"), epilog="Example: [bold]imutool convert MH_04_difficult.zip MH_04.mcap[/]"
 )
 def convert(
-    source: Annotated[Path, typer.Argument(help="Sequence folder, .zip, .tar, .tar.gz, .bag, or a folder of them.")],
-    target: Annotated[Path, typer.Argument(metavar="OUT", help="File for one sequence, folder for several.")],
+    source: Annotated[Path, typer.Argument(help="Bag, log, sequence folder or archive, or a folder of them.")],
+    target: Annotated[Path, typer.Argument(metavar="OUT", help="File for one sequence, folder for several."), LOGS],
     format: Annotated[str, typer.Option(help="auto, or a name from the list below.")] = "auto",
     sequence: Annotated[list[str] | None, typer.Option(help="Convert only this sequence. Repeatable.")] = None,
     compression: Annotated[Compression, typer.Option(help="Compression of the chunks.")] = Compression.zstd,
     no_images: Annotated[bool, typer.Option("--no-images", help="Leave camera frames out.")] = False,
+    sensor: Annotated[str, typer.Option(metavar="NAME", help="The IMU's name, such as bmi160.")] = "",
+    kind: Annotated[
+        list[str] | None,
+        typer.Option(metavar="TOPIC=KIND", help="What poses are worth: truth, estimate, odometry or unknown. Repeatable."),
+    ] = None,
     workers: Annotated[int | None, typer.Option(min=1, help="Number of processes; by default one per processor.")] = None,
     overwrite: Overwrite = False,
     json_to: Json = None,
     verbose: Verbose = False,
     quiet: Quiet = False,
 ) -> None:
-    """Convert a data set to MCAP: each sequence becomes a log."""
+    """Convert any recording with an IMU to MCAP; its content tells the format."""
     from imutool.conversion.run import convert as run
 
     with progress("Converting", verbose, quiet) as tell:
@@ -75,23 +85,31 @@ def convert(
             compression=compression.value,
             images=not no_images,
             overwrite=overwrite,
+            sensor=sensor,
+            kinds=kind or (),
             workers=workers,
             progress=tell,
         )
     failures = [Failure(failure.name, failure.message) for failure in report.failures]
-    if not write_json(Conversion([str(path) for path in report.written], failures), json_to):
+    summary = Conversion([str(path) for path in report.written], failures, report.notes, report.losses)
+    if not write_json(summary, json_to, overwrite=overwrite):
         for path in report.written:
             say(str(path))
+    if not quiet:
+        for note in report.notes:
+            tell_warning(note, "note")
+    for loss in report.losses:
+        tell_warning(loss)
     for failure in report.failures:
         tell_error(with_flags(failure.message))
-    if report.failures:
-        raise typer.Exit(DataError.exit_code)
+    if report.failures or report.losses:
+        raise typer.Exit(DataError.exit_code if report.failures else LOST)
 
 
 @app.command(epilog="Example: [bold]imutool export MH_04_debiased.mcap MH_04_debiased --format euroc[/]")
 def export(
     log: Annotated[Path, typer.Argument(metavar="LOG", help="An MCAP log.")],
-    target: Annotated[Path, typer.Argument(metavar="OUT", help="New folder.")],
+    target: Annotated[Path, typer.Argument(metavar="OUT", help="New folder."), FOLDER],
     format: Annotated[str, typer.Option(help="euroc: an ASL folder; rosbag2: a folder around a copy of the log.")],
     imu: Annotated[str | None, typer.Option(help="IMU topic of a EuRoC folder; by default the debiased one.")] = None,
     noise: Annotated[
@@ -108,7 +126,7 @@ def export(
     with progress("Exporting", verbose, quiet) as tell:
         report = run(log, target, format=format, imu=imu, noise=noise, overwrite=overwrite, progress=tell)
     summary = Export(str(report.output), report.format, report.imu, report.written, report.left_out)
-    if write_json(summary, json_to):
+    if write_json(summary, json_to, overwrite=overwrite):
         return
     counts = ", ".join(f"{count} on {name}" for name, count in report.written.items())
     say(f"{target}: {counts}" + (f"; IMU from {report.imu}" if report.imu else ""))

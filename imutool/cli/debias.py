@@ -9,15 +9,15 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from imutool.cli.app import LOST, Init, Json, Overwrite, Quiet, Smooth, Verbose, app
+from imutool.cli.app import HTML, LOG, LOST, RRD, Init, Json, Overwrite, Quiet, Smooth, Verbose, app
 from imutool.cli.terminal import progress, say, tell_losses, write_json
 from imutool.errors import ConfigError
 from imutool.location import Location, to_location
 from imutool.report import UNSET, Report, Section, UnsetType, json_values
+from imutool.viewing import Output
 
 if TYPE_CHECKING:
     from imutool.debiasing import DebiasReport
-    from imutool.viewing import Output
     from imutool.viewing.rerun.live import Live
 
 MODEL_HELP = (
@@ -34,6 +34,7 @@ def debias(
     target: Annotated[
         str | None,
         typer.Argument(metavar="OUT", help="New log with the debiased IMU beside the raw one.", show_default=False),
+        LOG,
     ] = None,
     model: Annotated[list[str] | None, typer.Option(help=MODEL_HELP)] = None,
     imu: Annotated[list[str] | None, typer.Option(help="IMU topic, where a log has several. Repeatable.")] = None,
@@ -46,20 +47,20 @@ def debias(
     connect: Annotated[
         str | None, typer.Option(metavar="URL", help="Show the progress in a running viewer: HOST:PORT.")
     ] = None,
-    save_view: Annotated[Path | None, typer.Option(metavar="F.rrd", help="Save the viewer's data to a file.")] = None,
-    report_to: Annotated[Path | None, typer.Option("--report", metavar="F.html", help=REPORT_HELP)] = None,
+    save_view: Annotated[Path | None, typer.Option(metavar="F.rrd", help="Save the viewer's data to a file."), RRD] = None,
+    report_to: Annotated[Path | None, typer.Option("--report", metavar="F.html", help=REPORT_HELP), HTML] = None,
     overwrite: Overwrite = False,
     json_to: Json = None,
     verbose: Verbose = False,
     quiet: Quiet = False,
 ) -> None:
     """Write a log with a debiased IMU topic; all other messages stay unchanged."""
-    _refuse_contradictions(target, in_place, overwrite)
+    _refuse_contradictions(target, in_place, overwrite and save_view is None and report_to is None and json_to is None)
     models = assigned(model or ())
     if report_to is not None:
-        from imutool.viewing.html import report as pages
+        from imutool.viewing.html.drawing import require_matplotlib
 
-        pages.check_target(report_to, overwrite=overwrite)
+        require_matplotlib()
     from imutool.cleaning import CleaningSettings
     from imutool.debiasing import debias as run
 
@@ -74,21 +75,27 @@ def debias(
             smooth=smooth,
             check=verify,
             clean=CleaningSettings() if clean else None,
-            overwrite=overwrite,
+            overwrite=overwrite and not in_place,
             progress=lambda done, total: tell(done, total, ""),
             watch=watch,
         )
     shown = None if watch is None else watch.shown
     summary = _summary(report, str(target or source), shown, report_to, clean)
-    json_only = write_json(summary, json_to)
-    if not json_only:
+    if not (json_only := write_json(summary, json_to, overwrite=overwrite)):
         _say(report, summary, shown or ())
     if report_to is not None:  # last: should it fail, the log is there all the same, and that has been said
         with progress("Drawing", verbose, quiet):
             _draw(to_location(target or source), list(report.starts), report_to, overwrite)
         if not json_only:
             say(f"Report: {report_to}")
-    raise typer.Exit(LOST if report.losses else 0)
+    raise typer.Exit(LOST if report.lossy else 0)
+
+
+class StretchEntry(Section, frozen=True):
+    """Beginning of a stretch of samples after a gap or a jump of the clock."""
+
+    start_ns: int
+    step_s: float
 
 
 class DebiasedImu(Section, frozen=True):
@@ -99,6 +106,8 @@ class DebiasedImu(Section, frozen=True):
     gyro_bias: list[float]
     accel_bias: list[float]
     std: list[float]
+    left_out: dict[str, int] | UnsetType = UNSET  # samples that are no measurement, by reason
+    stretches: list[StretchEntry] | UnsetType = UNSET  # each but the first: gaps and jumps of the clock
 
 
 class Verified(Section, frozen=True):
@@ -118,7 +127,7 @@ class DebiasSummary(Report, frozen=True, kw_only=True, tag="imutool.debias/1"):
     added: dict[str, int]
     verified: Verified
     losses: dict[str, Any]
-    shown: list[dict[str, str]] | UnsetType = UNSET
+    shown: list[Output] | UnsetType = UNSET
     report: str | UnsetType = UNSET
     clean: list[dict[str, Any]] | UnsetType = UNSET
 
@@ -128,7 +137,13 @@ def _summary(
 ) -> DebiasSummary:
     imus = {
         topic: DebiasedImu(
-            report.models[topic], start.how, start.rest[:3].tolist(), start.rest[3:].tolist(), start.std.tolist()
+            report.models[topic],
+            start.how,
+            start.rest[:3].tolist(),
+            start.rest[3:].tolist(),
+            start.std.tolist(),
+            report.sieves[topic].left_out or UNSET,
+            [StretchEntry(*stretch) for stretch in report.sieves[topic].clock.stretches] or UNSET,
         )
         for topic, start in report.starts.items()
     }
@@ -139,7 +154,7 @@ def _summary(
         added=dict(report.rewrite.added),
         verified=Verified(*report.rewrite.verified),
         losses=report.losses.plain(),
-        shown=UNSET if shown is None else [output.plain() for output in shown],
+        shown=UNSET if shown is None else list(shown),
         report=UNSET if page is None else str(page),
         clean=[json_values(survey.report()) for survey in report.surveys.values()] if clean else UNSET,
     )

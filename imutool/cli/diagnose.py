@@ -7,12 +7,14 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from imutool.cli.app import Imu, Json, Overwrite, Quiet, Truth, Verbose, app
+from imutool.cli.app import Imu, Json, Overwrite, Quiet, Truth, Verbose, Written, app
 from imutool.cli.terminal import logger, progress, say, table, write_json
 
 if TYPE_CHECKING:
     from imutool.diagnosis.result import Diagnosis
     from imutool.viewing.model.run_data import RunData
+
+FOLDER = Written(files=("findings.json", "physics.toml", "report.html", "log.html", "view.rrd"))
 
 
 @app.command(epilog="Example: [bold]imutool diagnose real.mcap --sim sim.mcap -o diagnosis[/]")
@@ -34,6 +36,7 @@ def diagnose(
         typer.Option(
             "-o", "--output", metavar="DIR", help="Folder for findings.json, physics.toml, report.html, log.html and view.rrd."
         ),
+        FOLDER,
     ] = None,
     config: Annotated[
         Path | None,
@@ -71,7 +74,7 @@ def diagnose(
             tell(0, 1, "writing")
             for remark in diagnosis_output.write(diagnosis, folder, logs=look, overwrite=overwrite):
                 logger.warning("%s", remark)
-    if write_json(diagnosis.report, json_to):
+    if write_json(diagnosis.report, json_to, overwrite=overwrite):
         return
     _say(diagnosis, folder)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -9,9 +10,15 @@ from typing import Annotated, Any
 
 import typer
 
-from imutool.cli.app import Imu, Init, Json, Logs, Models, Overwrite, Quiet, ReportPage, Smooth, Truth, Verbose, app
+from imutool.cli.app import Imu, Init, Json, Logs, Models, Overwrite, Quiet, ReportPage, Smooth, Truth, Verbose, Written, app
 from imutool.cli.terminal import figures, progress, say, table, write_json
+from imutool.errors import ImutoolError
 from imutool.report import Report
+
+logger = logging.getLogger(__name__)
+
+ALIGNED_HELP = "Also print evo's orientation error after an alignment of the positions (SE(3)); it says little about attitude."
+TRAJECTORIES = Written(files=("*.tum",), keeps=True)
 
 
 class Evaluation(Report, frozen=True, tag="imutool.evaluation/1"):
@@ -35,26 +42,35 @@ def evaluate(
     zupt: Annotated[bool, typer.Option("--zupt", help="Also score dead reckoning with zero-velocity updates.")] = False,
     truth: Truth = None,
     imu: Imu = None,
-    trajectories: Annotated[Path | None, typer.Option(metavar="DIR", help="Folder for trajectories in TUM format.")] = None,
+    trajectories: Annotated[
+        Path | None, typer.Option(metavar="DIR", help="Folder for trajectories in TUM format."), TRAJECTORIES
+    ] = None,
+    aligned: Annotated[bool, typer.Option("--aligned", help=ALIGNED_HELP)] = False,
     report: ReportPage = None,
     overwrite: Overwrite = False,
     json_to: Json = None,
     verbose: Verbose = False,
     quiet: Quiet = False,
 ) -> None:
-    """Integrate the IMU from the true start, raw and debiased, and score it on the truth."""
+    """Integrate the IMU from the true start, raw and debiased, and score it on the truth.
+
+    A model that does not apply to a log is named at the end, after the scores of the others.
+    """
     from imutool.evaluation import evaluate as run
     from imutool.viewing.html import report as pages
+    from imutool.viewing.html.drawing import require_matplotlib
     from imutool.viewing.model.runs import load
 
     if report is not None:
-        pages.check_target(report, overwrite=overwrite)
+        require_matplotlib()
     results: list[dict[str, Any]] = []
     loaded = []
+    errors: list[ImutoolError] = []
     with progress("Evaluating", verbose, quiet) as tell:
         for done, log in enumerate(logs):
             tell(done, len(logs), log.name)
             first = len(results)
+            refused: dict[str, ImutoolError] = {}
             results += run(
                 log,
                 models=model or (),
@@ -65,18 +81,33 @@ def evaluate(
                 imu=imu,
                 trajectories=trajectories,
                 overwrite=overwrite,
+                refused=refused.__setitem__,
             )
+            errors += [_of_model(name, error) for name, error in refused.items()]
             if report is not None:
-                run_data = load(log, models=model or (), init=init, smooth=smooth, truth=truth, imu=imu)
+                scored = [name for name in model or () if name not in refused]
+                run_data = load(log, models=scored, init=init, smooth=smooth, truth=truth, imu=imu)
                 loaded.append(replace(run_data, notes=(*run_data.notes, *_stops(results[first:]))))
         if report is not None:
             tell(len(logs), len(logs), "drawing")
             pages.write_page(loaded, report, overwrite=overwrite)
         tell(len(logs), len(logs), "")
-    if not write_json(Evaluation(results), json_to):
-        figures([{**row, "model": f"{row['model']} zupt"} if row["estimate"] == "zupt" else row for row in results])
+    if not write_json(Evaluation(results), json_to, overwrite=overwrite):
+        rows = [{**row, "model": f"{row['model']} zupt"} if row["estimate"] == "zupt" else row for row in results]
+        figures(rows, aligned=aligned)
         if report is not None:
             say(f"Report: {report}")
+    for error in errors[1:]:
+        logger.warning("%s", error)
+    if errors:
+        raise errors[0]
+
+
+def _of_model(name: str, error: ImutoolError) -> ImutoolError:
+    """The error of a model that does not apply, with the model's name."""
+    return type(error)(
+        f"the model {name} is not scored: {error.what}", where=error.where, expected=error.expected, fix=error.fix
+    )
 
 
 def _stops(results: Sequence[dict[str, Any]]) -> list[str]:
@@ -113,6 +144,7 @@ def vio(
         list[str] | None,
         typer.Option("--set", metavar="key=value", help="Change a setting of imutool.vio.run.VioSettings. Repeatable."),
     ] = None,
+    overwrite: Overwrite = False,
     json_to: Json = None,
     verbose: Verbose = False,
     quiet: Quiet = False,
@@ -135,7 +167,7 @@ def vio(
             results += run(
                 log, models=model or (), init=init, truth=truth, imu=imu, bias_states=states, settings=settings, progress=tell
             )
-    if write_json(VioReport(results), json_to):
+    if write_json(VioReport(results), json_to, overwrite=overwrite):
         return
     for rows in tabulate(results):
         table(rows, keys=3)

@@ -9,12 +9,13 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from imutool.cli.app import App, Imu, Init, Json, Overwrite, Quiet, Smooth, Truth, Verbose, app
+from imutool.cli.app import App, Imu, Init, Json, Overwrite, Quiet, Smooth, Truth, Verbose, Written, app
 from imutool.cli.debias import VERIFY_HELP
 from imutool.cli.parameters import with_flags
 from imutool.cli.terminal import out, plain, progress, say, write_json
 from imutool.errors import ConfigError
 from imutool.fleet.task import Settings
+from imutool.mcap_io.storage import outputs
 
 if TYPE_CHECKING:
     from imutool.fleet.run import FleetReport
@@ -27,6 +28,7 @@ fleet = App(
 )
 app.add_typer(fleet)
 
+FOLDER, PAGE = Written(files=(), keeps=True), Written(outputs.HTML, keeps=True)  # the journal says whose the files are
 UNITS = {"": 1, "K": 1 << 10, "M": 1 << 20, "G": 1 << 30, "T": 1 << 40}
 SHOWN = 10  # logs that are not whole; all are in fleet.parquet
 PAGES_HELP = "Also write a page beside each log, with a link from --report; 5 to 10 s for a log of minutes."
@@ -36,16 +38,17 @@ CODES = "\n\nExit code: 0 all logs are intact; 3 data were lost or quarantined; 
 
 def _common(
     source: Annotated[str, typer.Argument(metavar="SRC", help="A folder, pattern, log or URL.")],
-    target: Annotated[str, typer.Argument(metavar="OUT", help="Folder or URL; every log keeps its path below SRC.")],
+    target: Annotated[str, typer.Argument(metavar="OUT", help="Folder or URL; every log keeps its path below SRC."), FOLDER],
     *,
-    address: Annotated[str | None, typer.Option(help="Address of a Ray cluster, or auto; by default this machine.")] = None,
+    address: Annotated[
+        str | None, typer.Option(help="Address of a Ray cluster, or auto; by default processes of this machine.")
+    ] = None,
     resume: Annotated[bool, typer.Option("--resume", help=RESUME)] = False,
     recheck: Annotated[bool, typer.Option("--recheck", help="With --resume: read all finished results again.")] = False,
-    report: Annotated[str | None, typer.Option(metavar="F.html", help="Write an HTML page about the fleet.")] = None,
+    report: Annotated[str | None, typer.Option(metavar="F.html", help="Write an HTML page about the fleet."), PAGE] = None,
     workers: Annotated[int | None, typer.Option(min=1, help="Number of logs at once; by default one per core.")] = None,
     memory: Annotated[str, typer.Option("--memory-per-task", metavar="SIZE", help="Memory for each log: 800M, 2G.")] = "1G",
     retries: Annotated[int, typer.Option(min=0, help="Number of retries after a worker died.")] = 3,
-    dashboard: Annotated[bool, typer.Option("--dashboard", help="Start the Ray dashboard on 127.0.0.1.")] = False,
     overwrite: Overwrite = False,
     json_to: Json = None,
     verbose: Verbose = False,
@@ -166,31 +169,30 @@ def _run(
     workers: int | None,
     memory: str,
     retries: int,
-    dashboard: bool,
     overwrite: bool,
     json_to: str | None,
     verbose: bool,
     quiet: bool,
 ) -> None:
-    from imutool.fleet.engine import Engine
+    from imutool.fleet.engine import ProcessEngine, RayEngine
     from imutool.fleet.run import run
     from imutool.location import to_location
 
-    size = memory_bytes(memory)
+    limits: dict[str, Any] = {"workers": workers, "memory_bytes": memory_bytes(memory), "retries": retries}
     page = None if report is None else to_location(report)
     with progress(f"Fleet {settings.command}", verbose, quiet) as tell:
         done = run(
             source,
             target,
             settings,
-            lambda: Engine(address, workers=workers, memory_bytes=size, retries=retries, dashboard=dashboard),
+            lambda: ProcessEngine(**limits) if address is None else RayEngine(address, **limits),
             resume=resume,
             overwrite=overwrite,
             recheck=recheck,
             page=page,
             tell=tell,
         )
-    if not write_json(done.summary(), json_to):
+    if not write_json(done.summary(), json_to, overwrite=overwrite or resume):
         _show(done, report)
     raise typer.Exit(done.progress.exit_code)
 

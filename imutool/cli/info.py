@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from msgspec.structs import replace
 
-from imutool.cli.app import LOST, Json, Overwrite, Quiet, Verbose, app
+from imutool.cli.app import LOST, PNG, TOML, Json, Overwrite, Quiet, Verbose, app
 from imutool.cli.terminal import log_to_stderr, out, plain, say, table, tell_losses, write_json
 from imutool.errors import ConfigError
 from imutool.location import to_location
@@ -29,8 +29,12 @@ def info(
     model: Annotated[str | None, typer.Option(help="For --noise: model that corrects the samples in motion.")] = None,
     imu: Annotated[str | None, typer.Option(help="For --noise: IMU topic, where a log has several.")] = None,
     truth: Annotated[str | None, typer.Option(help="For --noise: topic of the true poses, where a log has several.")] = None,
-    noise_plot: Annotated[Path | None, typer.Option(metavar="F.png", help="Draw the Allan deviations (with --noise).")] = None,
-    noise_toml: Annotated[Path | None, typer.Option(metavar="F.toml", help="Write the noise as TOML (with --noise).")] = None,
+    noise_plot: Annotated[
+        Path | None, typer.Option(metavar="F.png", help="Draw the Allan deviations (with --noise)."), PNG
+    ] = None,
+    noise_toml: Annotated[
+        Path | None, typer.Option(metavar="F.toml", help="Write the noise as TOML (with --noise)."), TOML
+    ] = None,
     quick: Annotated[
         bool, typer.Option("--quick", help="Read only the chunks with IMU messages; this may miss damage.")
     ] = False,
@@ -52,7 +56,7 @@ def info(
     reports = [report for report, _ in described]
     if (identified := described[0][1]) is not None:
         _write_noise(identified, noise_plot, noise_toml, overwrite)
-    if not write_json(reports[0] if len(reports) == 1 else LogInfos(reports), json_to):
+    if not write_json(reports[0] if len(reports) == 1 else LogInfos(reports), json_to, overwrite=overwrite):
         for log, (report, identified) in zip(logs, described, strict=True):
             say(log)
             _print(report, identified)
@@ -141,7 +145,7 @@ def imu_rows(report: LogInfo) -> list[tuple[str, ...]]:
                 rows.append((imu["topic"], f"{name} noise", ", ".join(f"{d:.2e}" for d in density) + f" {unit}/√Hz"))
     for truth in report.truth:
         value = f"{100 * truth.coverage:.1f} % of the IMU, {truth.gaps} gaps, longest {truth.longest_gap_s:.2f} s"
-        rows.append((truth.topic, "covers", value))
+        rows += [(truth.topic, "kind of poses", truth.kind), (truth.topic, "covers", value)]
     return rows
 
 

@@ -15,6 +15,7 @@ ALIASES = {
     "damage": ("damaged",),
     "folder": ("folder", "target"),
     "imus": ("imu",),
+    "kinds": ("kind",),
     "memory_bytes": ("memory",),
     "models": ("model",),
     "out": ("target", "folder", "model"),

@@ -7,11 +7,13 @@ from typing import Annotated, Any
 
 import typer
 
-from imutool.cli.app import LOST, Json, Overwrite, Quiet, Verbose, app
+from imutool.cli.app import LOST, Json, Overwrite, Quiet, Verbose, Written, app
 from imutool.cli.terminal import progress, say, tell_losses, write_json
 from imutool.errors import ConfigError
 from imutool.location import to_location
 from imutool.report import UNSET, Report, UnsetType
+
+REPAIRED = Written((".mcap", ".bag"))
 
 
 class Damaged(StrEnum):
@@ -37,7 +39,7 @@ class Repair(Report, frozen=True, kw_only=True, tag="imutool.repair/1"):
 )
 def repair(
     source: Annotated[str, typer.Argument(metavar="IN", help="A damaged MCAP log or ROS 1 bag: a file or a URL.")],
-    target: Annotated[str, typer.Argument(metavar="OUT", help="New log with all intact messages.")],
+    target: Annotated[str, typer.Argument(metavar="OUT", help="New log with all intact messages."), REPAIRED],
     damaged: Annotated[
         Damaged, typer.Option(help="Damaged stretches: drop them, or keep their bytes as attachments (MCAP).")
     ] = Damaged.drop,
@@ -72,7 +74,7 @@ def repair(
                 kept=log.kept,
                 losses=log.losses.plain(),
             )
-    if not write_json(report, json_to):
+    if not write_json(report, json_to, overwrite=overwrite):
         tell_losses(report.losses)
         counts = ", ".join(f"{count} on {topic}" for topic, count in report.messages.items()) or "no message"
         state = "the log was whole" if report.whole else "saved"

@@ -8,9 +8,11 @@ from typing import Annotated, Any
 import typer
 from msgspec.structs import astuple
 
-from imutool.cli.app import Json, Overwrite, Quiet, Verbose, app
+from imutool.cli.app import Json, Overwrite, Quiet, Verbose, Written, app
 from imutool.cli.terminal import epoch_line, err, figures, log_to_stderr, plain, progress, say, table, write_json
 from imutool.report import REPORTS, Report, Section, json_schema
+
+FOLDER = Written(files=("*",), keeps=True)
 
 
 class DemoReport(Report, frozen=True, tag="imutool.demo/1"):
@@ -42,7 +44,7 @@ class Models(Report, frozen=True, tag="imutool.models/1"):
 
 
 @app.command(epilog="Example: [bold]imutool models --json -[/]")
-def models(json_to: Json = None, verbose: Verbose = False, quiet: Quiet = False) -> None:
+def models(overwrite: Overwrite = False, json_to: Json = None, verbose: Verbose = False, quiet: Quiet = False) -> None:
     """List the models that ship, their sensor and their card."""
     from imutool.bias.io import header_of, library
 
@@ -52,7 +54,7 @@ def models(json_to: Json = None, verbose: Verbose = False, quiet: Quiet = False)
         about = header_of(path)
         rate_hz = round(float(about["rate_hz"]), 1)
         entries.append(ModelEntry(path.stem, about["method"], about.get("sensor"), about.get("dataset"), rate_hz))
-    if write_json(Models(entries), json_to):
+    if write_json(Models(entries), json_to, overwrite=overwrite):
         return
     if entries:
         table([ModelEntry.__struct_fields__, *(tuple(map(str, astuple(model))) for model in entries)], keys=1)
@@ -77,7 +79,7 @@ def schema(
 
 @app.command(epilog="Example: [bold]imutool demo -o demo-out[/]")
 def demo(
-    folder: Annotated[Path, typer.Option("-o", "--output", metavar="DIR", help="Output folder.")] = Path("demo-out"),
+    folder: Annotated[Path, typer.Option("-o", "--output", metavar="DIR", help="Output folder."), FOLDER] = Path("demo-out"),
     overwrite: Overwrite = False,
     json_to: Json = None,
     verbose: Verbose = False,
@@ -96,7 +98,7 @@ def demo(
     with progress("Training", verbose, quiet) as tell:
         done = run(folder, announce, overwrite=overwrite, progress=lambda epoch: tell(*epoch_line(epoch)))
     files = {name: str(getattr(done, name)) for name in ("log", "debiased", "model", "rrd", "png", "report")}
-    if not write_json(DemoReport(results=done.results, **files), json_to):
+    if not write_json(DemoReport(results=done.results, **files), json_to, overwrite=overwrite):
         say("Pure integration of a flight the model has not seen, from its true start:")
         figures(done.results)
         say(f"Report: {done.report}. Error curves: {done.png}. In the viewer: rerun {done.rrd}")

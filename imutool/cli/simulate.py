@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
-from imutool.cli.app import Json, Overwrite, Quiet, Truth, Verbose, app
+from imutool.cli.app import LOG, Json, Overwrite, Quiet, Truth, Verbose, app
 from imutool.cli.terminal import log_to_stderr, logger, progress, say, write_json
 from imutool.errors import ConfigError
 from imutool.report import Report, Section
@@ -46,7 +46,7 @@ class SimulationReport(Report, frozen=True, kw_only=True, tag="imutool.simulatio
 @app.command(epilog="Example: [bold]imutool simulate V1_02.mcap sim.mcap --physics physics.toml --noise adis16448 --seed 1[/]")
 def simulate(
     trajectory: Annotated[Path, typer.Argument(metavar="TRAJECTORY", help="An MCAP log with poses.")],
-    target: Annotated[Path, typer.Argument(metavar="OUT", help="New log with the simulated IMU and the poses.")],
+    target: Annotated[Path, typer.Argument(metavar="OUT", help="New log with the simulated IMU and the poses."), LOG],
     physics: Annotated[Path | None, typer.Option(metavar="FILE.toml", help="Physics of the sensor; by default ideal.")] = None,
     noise: Annotated[str, typer.Option(metavar="NAME|FILE.toml", help="none, adis16448, bmi160, or a TOML file.")] = "none",
     rate: Annotated[
@@ -78,7 +78,7 @@ def simulate(
             logger.warning("%s", remark)
     values = {key: value for key, value in simulation.plain().items() if key != "schema"}
     report = SimulationReport(**values | {"motion": MotionQuality(**values["motion"])})
-    if write_json(report, json_to):
+    if write_json(report, json_to, overwrite=overwrite):
         return
     acting = [effect["name"] for effect in report.physics["effect"]]
     acting += [f"a curve of {curve['variable']}" for curve in report.physics["unknown"]]
@@ -105,6 +105,9 @@ def conceal(
     truth: Annotated[str | None, typer.Option(help="Topic of the true poses, where a log has several.")] = None,
     open_it: Annotated[bool, typer.Option("--open", help="Open the envelope in DIR and score DIR/findings.json.")] = False,
     findings: Annotated[Path | None, typer.Option(help="Score this findings file (with --open).")] = None,
+    overwrite: Annotated[
+        bool, typer.Option("--overwrite", help="Replace an existing --json; a case is never replaced.")
+    ] = False,
     json_to: Json = None,
     verbose: Verbose = False,
     quiet: Quiet = False,
@@ -118,7 +121,7 @@ def conceal(
         expected = "DIR alone" if open_it else "TRAJECTORY and DIR"
         raise ConfigError(f"{len(places)} places are named", where="conceal", expected=expected)
     if open_it:
-        _open(places[0], findings, json_to)
+        _open(places[0], findings, json_to, overwrite)
         return
     if findings is not None or json_to is not None:
         raise ConfigError("--findings and --json need --open", where="conceal", fix="Add --open")
@@ -130,13 +133,13 @@ def conceal(
     say(f"then: imutool conceal --open {places[1]}")
 
 
-def _open(folder: Path, findings: Path | None, json_to: str | None) -> None:
+def _open(folder: Path, findings: Path | None, json_to: str | None, overwrite: bool) -> None:
     import msgspec
 
     from imutool.blind_cases.cases import open_case
 
     result: dict[str, Any] = msgspec.to_builtins(open_case(folder, findings))
-    if write_json(result, json_to):
+    if write_json(result, json_to, overwrite=overwrite):
         return
     hidden = "; ".join(_effect_text(effect) for effect in result["truth"]["effects"]) or "nothing but a bias and noise"
     say(f"concealed ({result['kind']}, {result['size']}): {hidden}")

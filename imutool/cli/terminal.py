@@ -2,27 +2,24 @@
 
 from __future__ import annotations
 
-import json
 import logging
 import math
-import os
 import re
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import msgspec
 from rich import box
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn
 from rich.table import Table
 
 from imutool.cli.parameters import with_flags
-from imutool.errors import ConfigError
+from imutool.location import to_location
 from imutool.mcap_io.recovery.losses import describe
-from imutool.report import json_values
+from imutool.mcap_io.storage.target import Target
+from imutool.report import Report, json_text
 
 if TYPE_CHECKING:
     from imutool.training.fit import Epoch
@@ -56,6 +53,11 @@ def say(line: str) -> None:
 def tell_error(message: str) -> None:
     """Print a line that begins with "error:" on stderr."""
     err.print(f"[bold red]error:[/] {plain(message)}", highlight=False, soft_wrap=True)
+
+
+def tell_warning(message: str, word: str = "warning") -> None:
+    """Print a line that begins with "warning:" or another word on stderr."""
+    err.print(f"[yellow]{word}:[/] {plain(message)}", highlight=False, soft_wrap=True)
 
 
 def tell_losses(losses: Mapping[str, Any]) -> None:
@@ -107,27 +109,20 @@ def _print(columns: Sequence[Sequence[str]], width: int) -> None:
     console.print()
 
 
-def write_json(report: Any, where: str | None) -> bool:
+def write_json(report: Report | Mapping[str, Any], where: str | None, *, overwrite: bool = False) -> bool:
     """Write the report where `--json` says; True if stdout holds it.
 
     Raises:
-        ConfigError: the file cannot be written.
+        ConfigError: the file exists (without `overwrite`), or cannot be written.
     """
     if where is None:
         return False
-    values = json_values(report) if isinstance(report, msgspec.Struct) else report
-    text = json.dumps(values, indent=2, allow_nan=False, ensure_ascii=False)
+    text = json_text(report)
     if where == "-":
-        sys.stdout.write(text + "\n")
+        sys.stdout.write(text)
         return True
-    beside = Path(where).with_name(f".{Path(where).name}.{os.getpid()}.part")
-    try:
-        beside.write_text(text + "\n", encoding="utf-8")
-        beside.replace(where)
-    except OSError as error:
-        raise ConfigError(f"cannot be written ({error.strerror})", where=where, fix="Choose another --json") from error
-    finally:
-        beside.unlink(missing_ok=True)
+    with Target(to_location(where), overwrite=overwrite) as target:
+        target.write(text.encode())
     return False
 
 
@@ -175,15 +170,20 @@ def epoch_line(epoch: Epoch) -> tuple[int, int, str]:
     return epoch.step, max(epoch.steps, 1), f"{text}, {minutes}:{seconds:02d} left" if epoch.step else text
 
 
-def figures(results: Sequence[dict[str, Any]]) -> None:
-    """Print evaluation results as tables: over the whole path, and by distance."""
+def figures(results: Sequence[dict[str, Any]], *, aligned: bool = False) -> None:
+    """Print evaluation results as tables: over the whole path, and by distance.
+
+    With `aligned` also the attitude after an alignment of the positions.
+    """
 
     def number(value: float | None) -> str:
         return "–" if value is None else format(value, ".2f")
 
     distances = list(results[0]["roe_deg"])
-    names = ("aoe_deg", "aoe_aligned_deg", "ape_m", "ape_aligned_m", "velocity_rmse_m_s")
-    whole = [("log", "model", "AOE\n°", "aligned\n°", "APE\nm", "aligned\nm", "velocity\nm/s")]
+    columns = {"aoe_deg": "AOE\n°", "aoe_aligned_deg": "aligned\n°", "ape_m": "APE\nm", "ape_aligned_m": "aligned\nm"}
+    columns["velocity_rmse_m_s"] = "velocity\nm/s"
+    names = [name for name in columns if aligned or name != "aoe_aligned_deg"]
+    whole = [("log", "model", *(columns[name] for name in names))]
     roe = [("log", "model", *(f"ROE °\n{d} m" for d in distances))]
     rpe = [("log", "model", *(f"RPE m\n{d} m" for d in distances))]
     for result in results:

@@ -10,7 +10,7 @@ from typing import Annotated, Any
 import typer
 
 from imutool import registry
-from imutool.cli.app import Imu, Json, Logs, Overwrite, Quiet, Truth, Verbose, app, listing
+from imutool.cli.app import MODEL, Imu, Json, Logs, Overwrite, Quiet, Truth, Verbose, app, listing
 from imutool.cli.terminal import epoch_line, progress, say, table, write_json
 from imutool.errors import ConfigError
 from imutool.report import UNSET, Report, Section, UnsetType
@@ -22,7 +22,7 @@ from imutool.report import UNSET, Report, Section, UnsetType
 )
 def train(
     logs: Logs,
-    model: Annotated[Path, typer.Option("-o", "--output", metavar="MODEL.safetensors", help="File of the new model.")],
+    model: Annotated[Path, typer.Option("-o", "--output", metavar="MODEL.safetensors", help="File of the new model."), MODEL],
     method: Annotated[str, typer.Option(help="Bias model from the list below.")] = "hybrid",
     config: Annotated[
         Path | None, typer.Option(metavar="FILE.toml", help="Settings; imutool.training.fit.TrainSettings lists them.")
@@ -70,7 +70,7 @@ def train(
             overwrite=overwrite,
             progress=lambda epoch: tell(*epoch_line(epoch)),
         )
-    if not write_json(training_report(model, trained.card), json_to):
+    if not write_json(training_report(model, trained.card), json_to, overwrite=overwrite or resume):
         if "left_out" in trained.card:
             left_out_table(trained.card["left_out"])
         say(str(model))

@@ -9,10 +9,12 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from imutool.cli.app import Imu, Init, Json, Logs, Models, Overwrite, Quiet, Smooth, Truth, Verbose, app
+from imutool.cli.app import HTML, Imu, Init, Json, Logs, Models, Overwrite, Quiet, Smooth, Truth, Verbose, Written, app
 from imutool.cli.terminal import progress, say, write_json
 from imutool.errors import ConfigError
+from imutool.mcap_io.storage import outputs
 from imutool.report import Report
+from imutool.viewing import Output
 
 if TYPE_CHECKING:
     from imutool.viewing.model.trajectory_error import Alignment
@@ -22,11 +24,15 @@ ALIGN_HELP = "Align each path with the truth before taking errors: by its start,
 SOURCE_HELP = "Also show other topics of the log, such as cameras."
 
 
+SAVED = Written(outputs.RRD, may_be_folder=True)
+PICTURES, SITE = Written(files=("*.png",), keeps=True), Written(files=("*",), keeps=True)
+
+
 class View(Report, frozen=True, tag="imutool.view/1"):
     """Report of `imutool view`: outputs, and the versions of imutool, Rerun and the viewer."""
 
     logs: list[str]
-    shown: list[dict[str, str]]
+    shown: list[Output]
     imutool: str | None
     rerun: str | None
     viewer: str | None
@@ -44,17 +50,17 @@ def view(
     findings: Annotated[Path | None, typer.Option(metavar="DIR", help="Mark the findings of this diagnosis folder.")] = None,
     source: Annotated[bool, typer.Option("--source/--no-source", help=SOURCE_HELP)] = True,
     at: Annotated[str | None, typer.Option(metavar="SECONDS|worst", help=AT_HELP)] = None,
-    save: Annotated[Path | None, typer.Option(metavar="F.rrd", help="Save a file for the viewer.")] = None,
+    save: Annotated[Path | None, typer.Option(metavar="F.rrd", help="Save a file for the viewer."), SAVED] = None,
     connect: Annotated[str | None, typer.Option(metavar="URL", help="Send to a running viewer: HOST:PORT.")] = None,
     web: Annotated[bool, typer.Option("--web", help="Serve to a browser on this machine, until Ctrl-C.")] = False,
     port: Annotated[int | None, typer.Option(min=1, max=65535, help="Port of --web; else a free one.")] = None,
     export_web: Annotated[
-        Path | None, typer.Option(metavar="DIR", help="Write a folder that any web server can serve.")
+        Path | None, typer.Option(metavar="DIR", help="Write a folder that any web server can serve."), SITE
     ] = None,
     png: Annotated[
-        Path | None, typer.Option(metavar="DIR", help="Draw pictures, LOG-errors.png and so on; without Rerun.")
+        Path | None, typer.Option(metavar="DIR", help="Draw pictures, LOG-errors.png and so on; without Rerun."), PICTURES
     ] = None,
-    html: Annotated[Path | None, typer.Option(metavar="F.html", help="Write an HTML page, without Rerun.")] = None,
+    html: Annotated[Path | None, typer.Option(metavar="F.html", help="Write an HTML page, without Rerun."), HTML] = None,
     overwrite: Overwrite = False,
     json_to: Json = None,
     verbose: Verbose = False,
@@ -78,8 +84,8 @@ def view(
                 tell(done, len(logs), log.name)
                 data.append(read(log))
         shown = outputs.show(data)
-        report = View([str(log) for log in logs], [output.plain() for output in shown], **outputs.versions())
-        if not write_json(report, json_to):
+        report = View([str(log) for log in logs], shown, **outputs.versions())
+        if not write_json(report, json_to, overwrite=overwrite):
             for output in shown:
                 say(output.said)
         sys.stdout.flush()  # whoever reads it through a pipe wants the address now

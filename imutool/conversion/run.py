@@ -1,7 +1,6 @@
 """Conversion of data sets to MCAP: find the sequences, choose a converter, write the logs.
 
 Sequences convert in worker processes, one log a sequence; a sequence that fails is reported and the others go on.
-A script that calls `convert` with several workers needs the usual `if __name__ == "__main__":` (processes are spawned).
 """
 
 from __future__ import annotations
@@ -15,10 +14,11 @@ from pathlib import Path
 from types import ModuleType
 
 from imutool import registry
-from imutool.conversion.workers import GROUP, Job, run_jobs
+from imutool.conversion.labels import Labels, parse_kinds
+from imutool.conversion.workers import GROUP, Job, Outcome, run_jobs, write_content
 from imutool.errors import ConfigError, DataError, ImutoolError
-from imutool.mcap_io.write import write
 from imutool.recording import Recording
+from imutool.recording.message_log import MessageLog
 
 AUTO = "auto"
 SUFFIX = ".mcap"
@@ -39,6 +39,14 @@ class ConvertReport:
 
     written: list[Path] = field(default_factory=list)
     failures: list[Failure] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)  # what is worth knowing about a log
+    losses: list[str] = field(default_factory=list)  # what of a source is not in its log
+
+    def add(self, target: Path, outcome: Outcome) -> None:
+        """Enter a written log and the remarks on it."""
+        self.written.append(target)
+        self.notes.extend(f"{target.name}: {note}" for note in outcome.notes)
+        self.losses.extend(f"{target.name}: {loss}" for loss in outcome.losses)
 
 
 @dataclass
@@ -61,12 +69,15 @@ def convert(
     compression: str = "zstd",
     images: bool = True,
     overwrite: bool = False,
+    sensor: str = "",
+    kinds: Sequence[str] = (),
     workers: int | None = None,
     progress: Progress | None = None,
 ) -> ConvertReport:
     """Convert one sequence to the file `out`, or several sequences to the folder `out`.
 
-    `workers` is the number of processes, by default one a processor; with 1, or for one sequence, all happens here.
+    `sensor` names the IMU where the data set does not, and `kinds` (`TOPIC=truth|estimate|odometry|unknown`) says what poses
+    are worth. `workers` is the number of processes, by default one a processor; with 1, or for one sequence, all happens here.
 
     Raises:
         DataError: no converter recognises anything in the source.
@@ -74,34 +85,36 @@ def convert(
             be made.
         ImutoolError: the only sequence there is (or was asked for) failed; of several, failures go to the report.
     """
+    labels = Labels(sensor, parse_kinds(kinds))
     if format != AUTO and not hasattr(module := registry.load(GROUP, format), "sequences"):
-        return _from_stream(module, source, out, sequences, compression, images, overwrite, progress)
+        return _from_stream(module, source, out, sequences, labels, compression, images, overwrite, progress)
     source_sequences = _find(source, format)
     if sequences:
         source_sequences = _only(source_sequences, sequences)
     names = source_sequences.names()
     targets = _targets([job.sequence.name for job in source_sequences.jobs], out, many=len(names) > 1)
     jobs = [
-        replace(job, target=target, compression=compression, images=images, overwrite=overwrite)
+        replace(job, target=target, compression=compression, images=images, overwrite=overwrite, labels=labels)
         for job, target in zip(source_sequences.jobs, targets, strict=True)
     ]
     if len(names) == 1 and source_sequences.errors:
         raise source_sequences.errors[0][1]
     _check_targets(jobs)
-    outcomes: dict[int, ImutoolError | None] = {}
+    outcomes: dict[int, Outcome] = {}
     done = len(source_sequences.errors)
-    for number, error in run_jobs(jobs, _worker_count(workers, len(jobs))):
-        outcomes[number] = error
+    for number, outcome in run_jobs(jobs, _worker_count(workers, len(jobs))):
+        outcomes[number] = outcome
         done += 1
         if progress is not None:
             progress(done, len(names), jobs[number].sequence.name)
-    failed = [(jobs[n].sequence.name, error) for n, error in sorted(outcomes.items()) if error is not None]
+    failed = [(jobs[n].sequence.name, outcome.error) for n, outcome in sorted(outcomes.items()) if outcome.error is not None]
     if len(names) == 1 and failed:
         raise failed[0][1]
-    return ConvertReport(
-        written=[jobs[n].target for n, error in sorted(outcomes.items()) if error is None],
-        failures=[Failure(name, str(error)) for name, error in [*source_sequences.errors, *failed]],
-    )
+    report = ConvertReport(failures=[Failure(name, str(error)) for name, error in [*source_sequences.errors, *failed]])
+    for number, outcome in sorted(outcomes.items()):
+        if outcome.error is None:
+            report.add(jobs[number].target, outcome)
+    return report
 
 
 def _find(source: Path, format: str) -> _Sequences:
@@ -113,12 +126,11 @@ def _find(source: Path, format: str) -> _Sequences:
     """
     claims: dict[str, list[Job]] = {}
     errors: dict[str, tuple[str, ImutoolError]] = {}
-    for key in registry.names(GROUP) if format == AUTO else [format]:
-        module = registry.load(GROUP, key)
-        if not hasattr(module, "sequences"):
-            continue  # reads, but recognises nothing: only on request
+    for key, module in _converters(format):
         for sequence in module.sequences(source):
             mine = claims.setdefault(str(sequence), [])
+            if mine and is_general(module):
+                continue  # a data set's own converter knows more
             try:
                 if format != AUTO or module.recognises(sequence):
                     mine.append(Job(key, sequence))
@@ -141,6 +153,18 @@ def _find(source: Path, format: str) -> _Sequences:
         [job for jobs in claims.values() for job in jobs],
         [error for place, error in errors.items() if not claims[place]],
     )
+
+
+def _converters(format: str) -> list[tuple[str, ModuleType]]:
+    """Converters that find sequences by themselves, those of data sets first."""
+    keys = registry.names(GROUP) if format == AUTO else [format]
+    modules = [(key, registry.load(GROUP, key)) for key in keys]
+    return sorted(((key, m) for key, m in modules if hasattr(m, "sequences")), key=lambda item: is_general(item[1]))
+
+
+def is_general(module: ModuleType) -> bool:
+    """Whether a converter reads a file format, whatever data set it is from."""
+    return bool(getattr(module, "GENERAL", False))
 
 
 def _only(source_sequences: _Sequences, wanted: Sequence[str]) -> _Sequences:
@@ -222,6 +246,7 @@ def _from_stream(
     source: Path,
     out: Path,
     wanted: Sequence[str],
+    labels: Labels,
     compression: str,
     images: bool,
     overwrite: bool,
@@ -231,7 +256,7 @@ def _from_stream(
 
     The first failure ends the conversion.
     """
-    recordings: Iterable[Recording] = (r for r in module.read(source) if not wanted or r.name in wanted)
+    recordings: Iterable[Recording | MessageLog] = (r for r in module.read(source) if not wanted or r.name in wanted)
     recordings = iter(recordings)
     first = list(islice(recordings, 2))
     if not first:
@@ -239,9 +264,8 @@ def _from_stream(
     report = ConvertReport()
     for recording in chain(first, recordings):
         (target,) = _targets([recording.name], out, many=len(first) > 1)
-        kept = recording if images else replace(recording, frames={})
-        write(kept, target, compression=compression, overwrite=overwrite)
-        report.written.append(target)
+        kept = replace(recording, frames={}) if isinstance(recording, Recording) and not images else recording
+        report.add(target, write_content(kept, target, labels, compression=compression, overwrite=overwrite))
         if progress is not None:
             progress(len(report.written), len(report.written), recording.name)
     missing = set(wanted) - {path.stem for path in report.written} if len(first) > 1 else set(wanted) - {first[0].name}

@@ -2,26 +2,21 @@
 
 from __future__ import annotations
 
-import multiprocessing
-import os
-import signal
-from collections.abc import Collection, Iterator, Sequence
-from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
-from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager, suppress
-from dataclasses import dataclass
-from itertools import islice
-from multiprocessing.process import BaseProcess
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
-from types import FrameType
 from typing import Any
 
 from imutool import registry
+from imutool.conversion.labels import Labels
+from imutool.conversion.message_writer import write_log
+from imutool.conversion.worker_pool import WorkerBugError, WorkerPool
 from imutool.errors import DataError, ImutoolError
 from imutool.mcap_io.write import write
+from imutool.recording import Recording
+from imutool.recording.message_log import MessageLog
 
 GROUP = "imutool.converters"
-INTERRUPT_EVERY_S = 0.1
 
 
 @dataclass(frozen=True)
@@ -34,10 +29,20 @@ class Job:
     compression: str = "zstd"
     images: bool = True
     overwrite: bool = False
+    labels: Labels = field(default_factory=Labels)
 
 
-def run_jobs(jobs: Sequence[Job], workers: int) -> Iterator[tuple[int, ImutoolError | None]]:
-    """Yield each job's number and its error, if it failed, as the jobs end."""
+@dataclass(frozen=True)
+class Outcome:
+    """Outcome of a job: its error, or remarks on what was written."""
+
+    error: ImutoolError | None = None
+    notes: tuple[str, ...] = ()
+    losses: tuple[str, ...] = ()
+
+
+def run_jobs(jobs: Sequence[Job], workers: int) -> Iterator[tuple[int, Outcome]]:
+    """Yield each job's number and outcome, as the jobs end."""
     if workers <= 1:
         for number, job in enumerate(jobs):
             yield number, _convert_one(job)
@@ -45,85 +50,44 @@ def run_jobs(jobs: Sequence[Job], workers: int) -> Iterator[tuple[int, ImutoolEr
         yield from _run_in_processes(jobs, workers)
 
 
-def _convert_one(job: Job) -> ImutoolError | None:
+def _convert_one(job: Job) -> Outcome:
     try:
         module = registry.load(GROUP, job.converter)
-        recording = module.read_sequence(job.sequence, images=job.images)
-        write(recording, job.target, compression=job.compression, overwrite=job.overwrite)
+        content = module.read_sequence(job.sequence, images=job.images)
+        return write_content(content, job.target, job.labels, compression=job.compression, overwrite=job.overwrite)
     except ImutoolError as error:
-        return error
-    return None
+        return Outcome(error)
 
 
-def _run_in_processes(jobs: Sequence[Job], workers: int) -> Iterator[tuple[int, ImutoolError | None]]:
-    """Run jobs in processes; on an interrupt, wait until all have removed their partial files."""
-    others = set(multiprocessing.active_children())
-    waiting = iter(enumerate(jobs))
-    running: dict[Future[ImutoolError | None], int] = {}
-    pool = ProcessPoolExecutor(workers, mp_context=multiprocessing.get_context("spawn"))
-    try:
-        with _interrupts_held():  # inherited by the processes, which heed interrupts only inside a job
-            running.update({pool.submit(_convert_in_process, job): n for n, job in islice(waiting, workers)})
-        while running:
-            for future in wait(running, return_when=FIRST_COMPLETED).done:
-                number = running.pop(future)
-                yield number, _outcome(future, jobs[number])
-                for following, job in waiting:
-                    try:
-                        running[pool.submit(_convert_in_process, job)] = following
-                    except BrokenProcessPool:  # a process died and took the pool with it: none of the rest can run
-                        yield following, _died(job)
-                        continue
-                    break
-    except BaseException:
-        pool.shutdown(wait=False, cancel_futures=True)
-        _interrupt(set(multiprocessing.active_children()) - others)
-        raise
-    finally:
-        pool.shutdown(wait=True, cancel_futures=True)
+def write_content(
+    content: Recording | MessageLog, target: Path, labels: Labels, *, compression: str, overwrite: bool
+) -> Outcome:
+    """Write what a converter has read, with the user's labels.
+
+    Raises:
+        ImutoolError: it cannot be written.
+    """
+    labelled = labels.put_on(content)
+    if isinstance(labelled, Recording):
+        write(labelled, target, compression=compression, overwrite=overwrite)
+        return Outcome()
+    write_log(labelled, target, compression=compression, overwrite=overwrite)
+    return Outcome(None, tuple(labelled.remarks.notes), tuple(labelled.remarks.losses))
 
 
-def _interrupt(processes: Collection[BaseProcess]) -> None:
-    """Interrupt processes until all have ended."""
-    while alive := [process for process in processes if process.is_alive()]:
-        for process in alive:
-            if process.pid is not None:
-                with suppress(ProcessLookupError):  # it has just ended by itself
-                    os.kill(process.pid, signal.SIGINT)
-        alive[0].join(INTERRUPT_EVERY_S)
+def _run_in_processes(jobs: Sequence[Job], workers: int) -> Iterator[tuple[int, Outcome]]:
+    """Run jobs in processes; after an interrupt they remove what they have half written."""
+    with WorkerPool(convert_numbered, workers) as pool:
+        for done in pool.run(enumerate(jobs)):
+            number, job = done.item
+            if isinstance(done.error, WorkerBugError):
+                done.error.add_note(done.error.trace)
+                raise done.error
+            why = f"its process died ({done.error}), perhaps for want of memory"
+            died = DataError(why, where=str(job.sequence), fix="Use fewer `workers`")
+            yield number, done.value if done.error is None else Outcome(died)
 
 
-def _outcome(future: Future[ImutoolError | None], job: Job) -> ImutoolError | None:
-    try:
-        return future.result()
-    except BrokenProcessPool:
-        return _died(job)
-
-
-def _died(job: Job) -> ImutoolError:
-    return DataError("its process died, perhaps for want of memory", where=str(job.sequence), fix="Use fewer `workers`")
-
-
-def _convert_in_process(job: Job) -> ImutoolError | None:
-    signal.signal(signal.SIGINT, _interrupt_once)
-    signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
-    try:
-        return _convert_one(job)
-    finally:
-        signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-
-
-def _interrupt_once(_number: int, _frame: FrameType | None) -> None:
-    """Raise KeyboardInterrupt once; ignore further interrupts during the clean-up."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    raise KeyboardInterrupt
-
-
-@contextmanager
-def _interrupts_held() -> Iterator[None]:
-    """Block interrupts until the end of the block; processes started within inherit this."""
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-    try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+def convert_numbered(item: tuple[int, Job]) -> Outcome:
+    """Convert a job with its number, in a worker process."""
+    return _convert_one(item[1])

@@ -104,7 +104,7 @@ def align(real: Recording, sim: Recording | None, truth: str | None, settings: D
         yield with_simulation(real, sim, settings)
         return
     if not real.truths:
-        raise DataError("no simulation and no true poses", where=real.name, expected="`sim`, or poses in the log")
+        raise real.no_truth("no simulation and no true poses", "`sim`, or poses in the log")
     chosen = real if truth is not None else real.with_truth(next(iter(real.truths)))
     motion, least_s = smooth_motion(chosen.truth), settings.alignment.least_s
     parts = [ideal for ideal in motion.ideal_motions(1.0 / real.imu.period_s) if ideal.t_s[-1] - ideal.t_s[0] >= least_s]

@@ -1,4 +1,4 @@
-"""Export a log as a folder for programs that read EuRoC (ASL) or rosbag2; the log stays as it is."""
+"""Export a log as a EuRoC (ASL) or rosbag2 folder; the log stays as it is."""
 
 from __future__ import annotations
 

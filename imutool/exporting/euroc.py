@@ -15,7 +15,7 @@ from imutool.exporting import ExportReport, Progress
 from imutool.mcap_io.codec import schemas
 from imutool.mcap_io.log import Log
 from imutool.mcap_io.read import VELOCITY_KEY, read
-from imutool.mcap_io.storage.folder import SIGNATURE, ExportFolder, writing
+from imutool.mcap_io.storage.target import SIGNATURE, FolderTarget, writing
 from imutool.mcap_io.topics import DERIVED_KEY
 from imutool.noise import datasheet
 from imutool.noise.datasheet import Noise
@@ -64,7 +64,7 @@ def write(
         topic = imu or _best_imu(opened)
         topics = list(opened.topics)
         velocities = {name: t.metadata[VELOCITY_KEY] for name, t in opened.topics.items() if VELOCITY_KEY in t.metadata}
-    with ExportFolder(out, log, signed="mav0/imu0/sensor.yaml", holds="mav0", overwrite=overwrite) as folder:
+    with FolderTarget(out, log, signed="mav0/imu0/sensor.yaml", holds="mav0", overwrite=overwrite) as folder:
         recording = read(log, imu=topic)
         with writing(out):
             writer = _Asl(folder / "mav0", recording, tell)

@@ -11,7 +11,7 @@ from pathlib import Path
 from imutool.errors import ConfigError, LogError
 from imutool.exporting import ExportReport, Progress
 from imutool.mcap_io.log import Log
-from imutool.mcap_io.storage.folder import SIGNATURE, ExportFolder, writing
+from imutool.mcap_io.storage.target import SIGNATURE, FolderTarget, writing
 
 COPY_BYTES = 1 << 20
 VERSION = 5  # of metadata.yaml: the oldest with a list of files, so that Humble plays it, and every later one too
@@ -31,7 +31,7 @@ def write(log: Path, out: Path, overwrite: bool, tell: Progress) -> ExportReport
         text = _metadata_yaml(opened, name)
         counts = {topic.name: topic.count for topic in opened.topics.values()}
     holds = r"metadata\.yaml|.*_\d+\.mcap"
-    with ExportFolder(out, log, signed="metadata.yaml", holds=holds, overwrite=overwrite) as folder, writing(out):
+    with FolderTarget(out, log, signed="metadata.yaml", holds=holds, overwrite=overwrite) as folder, writing(out):
         _copy(log, folder / name, tell)
         (folder / "metadata.yaml").write_text(text, encoding="utf-8", newline="\n")
     return ExportReport(out, "rosbag2", None, counts)

@@ -16,7 +16,7 @@ from imutool.location import Location, identity, io_errors, reason, size_and_eta
 LOG, BAG = ".mcap", ".bag"
 PATTERN = re.compile(r"[*?\[]")
 LONGEST = 200  # bytes of one part of a name: room for what is written beside it under another, within the usual 255
-PARTIAL = re.compile(r"\.(?P<name>.+)\.\d+\.[0-9a-f]{8}\.partial", re.DOTALL)
+PARTIAL = re.compile(r"\.(?P<name>.+)\.\d+\.[0-9a-f]{8,24}\.partial", re.DOTALL)
 OWN = "fleet."  # how the names of what the fleet itself writes at the top of OUT begin
 
 

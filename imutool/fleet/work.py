@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import json
 import os
@@ -80,9 +81,16 @@ def work(task: Task, model: bytes | None = None) -> Result:
         result = msgspec.structs.replace(result, status="failed", error=reason, exit_code=ConfigError.exit_code)
     except MemoryError:
         result = msgspec.structs.replace(result, status="failed", error="out of memory", exit_code=LogError.exit_code)
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * MAXRSS
     spent = {"seconds": time.perf_counter() - began, "cpu_seconds": time.process_time() - cpu_began}
-    return msgspec.structs.replace(result, **spent, peak_bytes=peak)
+    return msgspec.structs.replace(result, **spent, peak_bytes=peak_bytes())
+
+
+def peak_bytes() -> int:
+    """Most memory that this process has held; ru_maxrss of a new process begins with what its parent held."""
+    with contextlib.suppress(OSError, StopIteration):
+        lines = Path("/proc/self/status").read_text().splitlines()
+        return 1024 * next(int(line.split()[1]) for line in lines if line.startswith("VmHWM:"))
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * MAXRSS
 
 
 def page_name(log: str) -> str:
@@ -166,6 +174,9 @@ def _debias(job: _Job) -> dict[str, Any]:
             if finding.severity != "note"
         )
         entries["warnings"] = (*entries.get("warnings", ()), *found)
+    unmeasured = tuple(f"{topic}: {text}" for topic, sieve in report.sieves.items() for text in sieve.warnings())
+    if unmeasured:
+        entries["warnings"] = (*entries.get("warnings", ()), *unmeasured)
     if s.pages:
         entries |= _page(job, list(report.starts), entries.get("warnings", ()))
     return entries

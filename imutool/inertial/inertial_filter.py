@@ -42,6 +42,7 @@ STOPPED[:, VELOCITY] = np.eye(3)
 STILL = np.zeros((3, SIZE))  # rows of d(gyro bias at rest)/d(error)
 STILL[:, 9:12] = STILL[:, 15:18] = np.eye(3)
 HUBER = 2.0  # standard deviations of a speed, above which it gets less weight
+LEAST_FORCE_M_S2 = 1e-6  # below, a mean specific force has no direction
 LEAST_VARIANCE = 1e-14  # that a step adds to every error: keeps the covariance invertible
 MISSING_RAD_S, MISSING_M_S2 = 2.0, 10.0  # standard deviation of the motion during missing samples
 
@@ -126,7 +127,11 @@ def level(accel: Vector3, bias: Vector6, ground: Vector6, P_bias: Float64[np.nda
 
     Heading 0, unknown velocity, at the origin.
     """
-    up_b = (accel - bias[3:]) / np.linalg.norm(accel - bias[3:])
+    force = accel - bias[3:]
+    size = float(np.linalg.norm(force))
+    if size < LEAST_FORCE_M_S2:  # no direction at all
+        force, size = np.array([0.0, 0.0, 1.0]), 1.0
+    up_b = force / size
     axis = np.array([up_b[1], -up_b[0], 0.0])  # up_b x z
     sine = float(np.linalg.norm(axis))
     turn = axis / sine * np.arctan2(sine, up_b[2]) if sine > SMALL_RAD2 else np.array([0.0 if up_b[2] > 0 else np.pi, 0.0, 0.0])
@@ -232,10 +237,15 @@ def smooth(steps: Sequence[Step]) -> list[State]:
     return states[::-1]
 
 
-def reset_pose(x: State, accel: Vector3, s: FilterSettings) -> Step:
-    """Reset of the pose after a gap in the samples; the biases stay."""
+def reset_pose(x: State, accel: Vector3, T: float, walk: Vector6, most: Vector6, s: FilterSettings) -> Step:
+    """Reset of the pose after a gap of T seconds in the samples; the biases stay.
+
+    The variance of b grows by walk² T, up to `most`, the variance of a run's bias before its first sample.
+    """
     fresh = level(accel, x.bias, x.ground, x.P[9:, 9:], s)
     P = fresh.P + LEAST_VARIANCE * np.eye(SIZE)
+    grown = np.arange(9, 15)
+    P[grown, grown] += np.minimum(walk**2 * T, np.maximum(most - P[grown, grown], 0.0))
     F = np.zeros((SIZE, SIZE))
     F[9:, 9:] = np.eye(12)
     fresh = replace(fresh, P=P)

@@ -19,7 +19,6 @@ roe_deg, rpe_m      mean rotation angle and mean length of the difference of mot
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -28,8 +27,9 @@ import numpy as np
 from jaxtyping import Bool, Float64, Int64
 from scipy.spatial.transform import Rotation
 
-from imutool.errors import ConfigError, DataError, NumericsError
+from imutool.errors import DataError, NumericsError
 from imutool.geometry import quaternion
+from imutool.mcap_io.storage.target import Target
 from imutool.recording import Poses
 
 DISTANCES_M = (5.0, 10.0, 15.0, 20.0)
@@ -188,19 +188,11 @@ def write_tum(poses: Poses, path: Path, overwrite: bool = False) -> None:
     Raises:
         ConfigError: the target exists and `overwrite` is false, or cannot be written.
     """
-    if path.exists() and not overwrite:
-        raise ConfigError("the file exists", where=path, expected="a new file", fix="Give `overwrite` to replace it")
     columns = np.concatenate([poses.p_wb, poses.q_wb_wxyz[:, [1, 2, 3, 0]]], axis=1).tolist()
     stamps = (f"{'-' * (t < 0)}{abs(t) // 10**9}.{abs(t) % 10**9:09d}" for t in poses.t_ns.tolist())
     text = "".join(f"{stamp} {' '.join(map(repr, row))}\n" for stamp, row in zip(stamps, columns, strict=True))
-    part = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    try:
-        part.write_text(text, encoding="ascii")
-        part.replace(path)
-    except OSError as error:
-        raise ConfigError(f"cannot be written ({error.strerror})", where=path, expected="a writable folder") from error
-    finally:
-        part.unlink(missing_ok=True)
+    with Target(path, overwrite=overwrite) as target:
+        target.write(text.encode("ascii"))
 
 
 def _scored(estimate: Poses, truth: Poses, valid: Mask) -> tuple[Poses, Poses]:

@@ -21,9 +21,9 @@ import numpy as np
 from jaxtyping import Bool, Float64, Int64
 from msgspec import Meta
 
-from imutool.columns import true_ranges
 from imutool.config import Settings
 from imutool.recording import Imu, nanoseconds
+from imutool.recording.columns import true_ranges
 
 WHITE_MARGIN = 1.3  # ratio of block means to white noise; with 10 blocks of 3 axes it scatters by 0.14
 FLOOR_MARGIN = 2.5  # ratio to the calmest windows of the log

@@ -59,7 +59,8 @@ def describe(log: RecoveredLog, *, check: bool = True) -> LogInfo:
     true_poses = read_truth(log, lambda topic, error: refused.append(f"{topic}: {error.what}"))
     imus = [_imu(log, topic, true_poses) for topic in log.topics.values() if topic.schema_name == schemas.IMU]
     own = [imu for imu in imus if imu.derived_from is UNSET]
-    truths = [_coverage(name, clocks[name], clocks[own[0].topic]) for name in log.pose_topics if own]
+    imu_ns = clocks[own[0].topic] if own else np.empty(0, np.int64)
+    truths = [_coverage(log.topics[name], clocks[name], imu_ns) for name in log.pose_topics]
     warnings = [f"{imu.topic}: {warning}" for imu in imus for warning in imu.warnings]
     warnings += [*_truth_warnings(own, truths), *refused]
     stamps = [clock for clock in clocks.values() if len(clock)]
@@ -218,11 +219,11 @@ def _unit_warnings(imu: Imu, truth: Truth | None) -> list[str]:
     return [finding.what for finding in unit_findings(imu, truth) if finding.severity != "note"]
 
 
-def _coverage(name: str, truth_ns: Int64[np.ndarray, " n"], imu_ns: Int64[np.ndarray, " m"]) -> TruthInfo:
+def _coverage(topic: Topic, truth_ns: Int64[np.ndarray, " n"], imu_ns: Int64[np.ndarray, " m"]) -> TruthInfo:
     """Truth coverage: share of the IMU's time between neighbouring true poses."""
     knots = np.unique(truth_ns)
     if len(knots) < 2 or not len(imu_ns):
-        return TruthInfo(name, len(truth_ns))
+        return TruthInfo(topic.name, len(truth_ns), topic.pose_kind)
     start, end = int(imu_ns.min()), int(imu_ns.max())
     steps = np.diff(knots)
     limit = max(GAP_FACTOR * float(np.median(steps)), nanoseconds(MIN_GAP_S))  # 4 median periods, 60 ms
@@ -233,8 +234,9 @@ def _coverage(name: str, truth_ns: Int64[np.ndarray, " n"], imu_ns: Int64[np.nda
         (steps <= limit)[np.clip(after - 1, 0, len(steps) - 1)] | (knots[np.clip(after, 0, len(steps))] == imu_ns)
     )
     return TruthInfo(
-        name,
+        topic.name,
         len(truth_ns),
+        topic.pose_kind,
         coverage=float(known.mean()),
         gaps=int(gap.sum()),
         longest_gap_s=float(steps[gap].max()) * 1e-9 if gap.any() else 0.0,
@@ -246,6 +248,8 @@ def _coverage(name: str, truth_ns: Int64[np.ndarray, " n"], imu_ns: Int64[np.nda
 def _truth_warnings(own: list[ImuInfo], truths: list[TruthInfo]) -> list[str]:
     if not own:
         return ["no IMU topic"]
-    if not truths:
-        return ["no true poses"]
-    return [f"{truth.topic}: shares no time with the IMU" for truth in truths if truth.coverage == 0.0]
+    usable = [truth for truth in truths if truth.kind in ("truth", "unknown")]
+    if not usable:
+        others = ", ".join(f"{truth.topic} is {truth.kind}" for truth in truths)
+        return [f"no true poses: {others}" if others else "no true poses"]
+    return [f"{truth.topic}: shares no time with the IMU" for truth in usable if truth.coverage == 0.0]

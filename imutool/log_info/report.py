@@ -83,10 +83,14 @@ class ImuInfo(Section, frozen=True, kw_only=True):
 
 
 class TruthInfo(Section, frozen=True):
-    """Topic of true poses, and the share of the IMU's samples between two close poses."""
+    """Topic of poses: what they are worth, and the share of the IMU's samples between two close ones.
+
+    `kind` is `truth`, `estimate`, `odometry` or `unknown`.
+    """
 
     topic: str
     poses: int
+    kind: str
     coverage: float = 0.0
     gaps: int = 0
     longest_gap_s: float = 0.0

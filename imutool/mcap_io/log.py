@@ -118,6 +118,12 @@ class Log:
         dedicated = [t.name for t in self.with_schema(MESSAGE_POSES)]
         return dedicated or [t.name for t in self.with_schema((schemas.TF,)) if not t.name.endswith("tf_static")]
 
+    @property
+    def truth_topics(self) -> list[str]:
+        """Pose topics that may serve as truth: true ones first, then those of unknown kind; no estimate and no odometry."""
+        kinds = {name: self.topics[name].pose_kind for name in self.pose_topics}
+        return [name for wanted in ("truth", "unknown") for name, kind in kinds.items() if kind == wanted]
+
     def with_schema(self, schema_names: Collection[str]) -> list[Topic]:
         """The topics that carry one of these messages, in order of their channel ids."""
         return [t for t in self.topics.values() if t.schema_name in schema_names]

@@ -38,10 +38,11 @@ def read(
 ) -> Recording:
     """The recording in a log: `read(write(r)) == r`, bit for bit.
 
-    Of a log that imutool did not write, the name is that of the file, poses of every pose topic are truths (/tf, by child
-    frame, where there are no others), and Float64 and Vector3Stamped topics are scalars; one of these that a recording
-    cannot hold (time going back, NaN) is left out and logged as a warning. `start_ns` and `end_ns` select by log time.
-    With `samples` those are the IMU's, and its messages are not read.
+    Poses of every pose topic are truths (/tf, by child frame, where there are no others), but not those that are an estimate or
+    odometry, unless `truth` names them. Of a log that imutool did not write, the name is that of the file, and Float64 and
+    Vector3Stamped topics are scalars; one of these that a recording cannot hold (time going back, NaN) is left out and
+    logged as a warning. `start_ns` and `end_ns` select by log time. With `samples` those are the IMU's, and its messages are
+    not read.
 
     Raises:
         ConfigError: the file cannot be opened.
@@ -93,6 +94,7 @@ def read_recording(
         metadata=metadata,
         imu_topic=imu_topic,
         source=own.get("source", ""),
+        other_poses={name: log.topics[name].pose_kind for name in log.pose_topics if name not in truths},
     )
 
 
@@ -100,7 +102,7 @@ def _choose_truths(log: Log, truth: str | None) -> list[str]:
     """The topics to read poses from; a transform of /tf is chosen as TOPIC/CHILD_FRAME."""
     kinds = (*MESSAGE_POSES, schemas.TF)
     if truth is None:
-        return [log.topic(name, kinds).name for name in log.pose_topics]
+        return [log.topic(name, kinds).name for name in log.truth_topics]
     if truth in log.topics:
         return [log.topic(truth, kinds).name]
     trees = [t.name for t in log.with_schema((schemas.TF,)) if truth.startswith(f"{t.name}/")]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -16,6 +17,12 @@ from imutool.mcap_io.codec.messages import Rows
 
 ENCODINGS = ("cdr", "ros1")
 DERIVED_KEY = "imutool_source_topic"  # channel metadata: computed by imutool from this topic
+KIND_KEY = "imutool_kind"  # channel metadata of poses: truth, estimate, odometry or unknown
+KIND_WORDS = {  # in the names of topics
+    "truth": "ground_truth|groundtruth|gt|truth|mocap|vicon|vrpn|optitrack|qualisys|natnet",
+    "estimate": "filtered|fused|estimate|estimated|ekf|ukf|kalman|slam|vio|vins|msckf|okvis|orb|lio|amcl|local_position|vision",
+    "odometry": "odom|odometry|wheel|wheels|encoder|encoders",
+}
 MESSAGE_POSES = (schemas.POSE, schemas.ODOMETRY, schemas.TRANSFORM)
 SCALARS = {schemas.FLOAT: 1, schemas.VECTOR3: 3}
 CLEAN_FIX = "See what is wrong with imutool clean LOG, and leave it out with imutool debias --clean"
@@ -75,6 +82,20 @@ class Topic:
     def is_derived(self) -> bool:
         """Whether imutool computed the topic from another one."""
         return DERIVED_KEY in self.metadata
+
+    @property
+    def pose_kind(self) -> str:
+        """What the topic's poses are worth: `truth`, `estimate`, `odometry` or `unknown`.
+
+        The channel's metadata state it (`convert --kind`); else the words of the topic's name, then the message type.
+        """
+        if (stated := self.metadata.get(KIND_KEY)) is not None:
+            return stated
+        words = "_".join(filter(None, re.split(r"[^a-z0-9]+", self.name.lower())))
+        for kind, pattern in KIND_WORDS.items():
+            if re.search(rf"(^|_)({pattern})(_|$)", words):
+                return kind
+        return "odometry" if self.schema_name == schemas.ODOMETRY else "unknown"
 
     def decode_imu(self, rows: Rows) -> Iterator[ImuBatch]:
         """IMU messages from their bytes, one batch per stretch with one frame, unchecked.

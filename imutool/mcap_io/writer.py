@@ -33,6 +33,7 @@ from imutool.mcap_io.codec import messages, records
 from imutool.mcap_io.codec import schemas as schema
 from imutool.mcap_io.codec.records import FOOTER_SIZE, MAGIC
 from imutool.mcap_io.storage.target import Target
+from imutool.recording.message_log import MessageTopic
 
 LARGEST_ID = 2**16 - 1  # of a channel or a schema
 
@@ -170,6 +171,36 @@ class LogWriter:
         self.target.write(records.build(record))
         return record.id
 
+    def define(self, topic: MessageTopic) -> int:
+        """Defines a topic with the schema and encoding of its source; returns its channel id.
+
+        Raises:
+            DataError: no id is left.
+        """
+        record = Channel(
+            id=_next(self.contents.channels, "channel"),
+            topic=topic.name,
+            message_encoding=topic.message_encoding,
+            metadata=_described(topic),
+            schema_id=self._schema_of(topic),
+        )
+        self.contents.channels[record.id] = record
+        self.target.write(records.build(record))
+        return record.id
+
+    def _schema_of(self, topic: MessageTopic) -> int:
+        """Id of a topic's schema, equal byte for byte; 0 where the source has none."""
+        if not topic.schema_name:
+            return 0
+        for known in self.contents.schemas.values():
+            if (known.name, known.encoding, known.data) == (topic.schema_name, topic.schema_encoding, topic.schema):
+                return int(known.id)
+        number = _next(self.contents.schemas, "schema")
+        record = Schema(id=number, name=topic.schema_name, encoding=topic.schema_encoding, data=topic.schema)
+        self.contents.schemas[number] = record
+        self._write_schema(record)
+        return number
+
     def _schema(self, schema_name: str) -> int:
         """Id of a schema with the same definition (comments aside), or of a new one."""
         text = schema.definition(schema_name)
@@ -243,6 +274,15 @@ class LogWriter:
         footer.summary_crc = self.target.crc
         self.target.write(records.build(footer)[-4:] + MAGIC)
         self.target.flush()
+
+
+def _described(topic: MessageTopic) -> dict[str, str]:
+    """Channel metadata of a topic, with the quality of service that ROS 2 asks for."""
+    metadata = dict(topic.metadata)
+    if topic.message_encoding != "cdr":
+        return metadata
+    latched = metadata.get("latching") == "1"
+    return {"offered_qos_profiles": QOS.replace("volatile", "transient_local") if latched else QOS} | metadata
 
 
 def _next(taken: Mapping[int, object], what: str) -> int:

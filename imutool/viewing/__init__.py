@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-from typing import Literal, NamedTuple
+from typing import Literal
+
+from imutool.report import Section
 
 How = Literal["viewer", "connect", "rrd", "web", "folder", "png", "html"]
 
 
-class Output(NamedTuple):
+class Output(Section, frozen=True):
     """Output of a view: `place` is a URL or a path, `said` a sentence on how to open it."""
 
     how: How
     place: str
     said: str
-
-    def plain(self) -> dict[str, str]:
-        """The fields by name, for JSON."""
-        return self._asdict()

@@ -12,11 +12,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
+from msgspec.structs import replace
 
 from imutool import __version__
 from imutool.errors import ConfigError, DataError
 from imutool.viewing import Output
 from imutool.viewing.html import report
+from imutool.viewing.html.drawing import require_matplotlib
 from imutool.viewing.model.run_data import RunData
 from imutool.viewing.rerun.sdk import recording_name
 
@@ -27,6 +29,7 @@ if TYPE_CHECKING:
 logger = logging.getLogger(__name__)
 
 WORST = "worst"
+NO_VIEWER = "The viewer is not installed (pip install 'imutool[view]')"
 
 
 @dataclass(frozen=True)
@@ -82,6 +85,7 @@ class Outputs:
         self._server: Server | None = None
         self._stack = ExitStack()
         _check_contradictions(asked)
+        _check_extras(asked)
         if not asked.needs_rerun:
             return
         from imutool.viewing.rerun import connect, sdk, web
@@ -188,16 +192,8 @@ def cursor_s(logs: Sequence[RunData], at: str) -> float:
 def _open(logs: Sequence[RunData], asked: RequestedOutputs, at_s: float | None) -> Output:
     """Open a viewer, or write a page without Rerun."""
     if find_spec("rerun") is None:
-        no_rerun = "The viewer is not installed (pip install 'imutool[view]')"
-        if find_spec("matplotlib") is None:
-            raise ConfigError(
-                no_rerun,
-                where="view",
-                expected="the viewer, or matplotlib for a page",
-                fix="pip install 'imutool[view,report]'",
-            )
         page = _page(logs, Path(f"{recording_name(logs)}.html"), asked.overwrite)
-        return page._replace(said=f"{no_rerun}. {page.said}")
+        return replace(page, said=f"{NO_VIEWER}. {page.said}")
     from imutool.viewing.rerun import viewer
 
     return viewer.show(logs, source=asked.source, at_s=at_s, overwrite=asked.overwrite)
@@ -206,6 +202,17 @@ def _open(logs: Sequence[RunData], asked: RequestedOutputs, at_s: float | None) 
 def _page(logs: Sequence[RunData], path: Path, overwrite: bool) -> Output:
     report.write_page(logs, path, overwrite=overwrite)
     return Output("html", str(path), f"Wrote {path}. Open it in a browser")
+
+
+def _check_extras(asked: RequestedOutputs) -> None:
+    """Refuses before the logs are read what a missing package or an existing page would refuse after (ConfigError)."""
+    if asked.html is not None:
+        report.check_target(asked.html, overwrite=asked.overwrite)
+    if asked.png is not None:
+        require_matplotlib()
+    if asked.opens_viewer and find_spec("rerun") is None and find_spec("matplotlib") is None:
+        expected = "the viewer, or matplotlib for a page"
+        raise ConfigError(NO_VIEWER, where="view", expected=expected, fix="pip install 'imutool[view,report]'")
 
 
 def _check_contradictions(asked: RequestedOutputs) -> None:

@@ -15,7 +15,7 @@ from imutool.bias.model import BiasModel
 from imutool.bias_start import bias_at_rest
 from imutool.bias_start.bias_at_rest import at_rest, auto, over_all_rest, rest_differences
 from imutool.bias_start.bias_from_truth import TRUTH_S, from_truth
-from imutool.bias_start.bias_tracking import Samples
+from imutool.bias_start.bias_tracking import Samples, widened
 from imutool.bias_start.initial_bias import (
     AT_REST_STD,
     InitialBias,
@@ -24,7 +24,6 @@ from imutool.bias_start.initial_bias import (
     from_numbers,
     prior,
     smoothed_start,
-    widened,
 )
 from imutool.bias_start.model_choice import find_initial_bias
 from imutool.errors import ConfigError, DataError

@@ -202,7 +202,7 @@ def test_names_of_files_are_shown_as_they_are(tmp_path: Path, logs: Path, imutoo
 def test_tables_hold_every_figure_and_no_line_is_wider_than_the_terminal(
     tmp_path: Path, logs: Path, imutool: Run, columns: int
 ) -> None:
-    words = ["evaluate", logs / "flight_2.mcap", "--model", "static", "--model", logs / "linear.safetensors"]
+    words = ["evaluate", logs / "flight_2.mcap", "--model", "static", "--model", logs / "linear.safetensors", "--aligned"]
     env = {"COLUMNS": str(columns), "TTY_COMPATIBLE": "1", "NO_COLOR": "1", "TERM": "xterm"}
     done = imutool(*words, "--json", "out.json", "-q", cwd=tmp_path, env=env)
     shown = re.sub(r"\x1b\[[0-9;]*m", "", done.stdout)

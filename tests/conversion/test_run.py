@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import multiprocessing
 import os
 import signal
 import sys
@@ -12,6 +11,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from support import pool_functions
+from support.processes import below
 
 from imutool import registry
 from imutool.conversion.run import ConvertReport, convert
@@ -199,14 +200,14 @@ def test_an_interrupt_ends_all_processes_and_leaves_nothing_half_written(tmp_pat
     for name in ("b", "c"):
         sequence(tmp_path / "source" / name, rows=1500, images=1500)
     before = content(tmp_path / "source")
-    children = set(multiprocessing.active_children())
+    children = set(below(os.getpid()))
 
     def interrupt(done, total, name):
         os.kill(os.getpid(), signal.SIGINT)
 
     with pytest.raises(KeyboardInterrupt):
         convert(tmp_path / "source", tmp_path / "out", workers=2, progress=interrupt)
-    assert set(multiprocessing.active_children()) == children
+    assert set(below(os.getpid())) == children
     left = {name: (tmp_path / "out" / name) for name in content(tmp_path / "out")}
     assert set(left) <= {"a.mcap", "b.mcap", "c.mcap"}
     assert all(read(path).name == path.stem for path in left.values())
@@ -214,14 +215,11 @@ def test_an_interrupt_ends_all_processes_and_leaves_nothing_half_written(tmp_pat
 
 
 def test_a_process_that_dies_is_a_failure_of_its_sequence_not_of_the_tool(source, tmp_path, monkeypatch):
-    monkeypatch.setattr("imutool.conversion.workers._convert_in_process", _die)
+    monkeypatch.setattr("imutool.conversion.workers.convert_numbered", pool_functions.end_at_first)
     report = convert(source, tmp_path / "out", workers=2)
-    assert [failure.name for failure in report.failures] == ["a", "b", "c"]
-    assert "its process died" in report.failures[0].message
-
-
-def _die(job: object) -> None:
-    os._exit(9)
+    assert [failure.name for failure in report.failures] == ["a"]
+    assert "its process died (exit code 9)" in report.failures[0].message
+    assert [path.name for path in report.written] == ["b.mcap", "c.mcap"]
 
 
 @pytest.fixture

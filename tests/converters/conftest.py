@@ -7,6 +7,7 @@ import tarfile
 import zipfile
 from collections.abc import Callable, Mapping
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -115,3 +116,9 @@ def make(tmp_path: Path) -> Maker:
     folder = tmp_path / "source"
     folder.mkdir()
     return Maker(folder)
+
+
+@pytest.fixture
+def convert(imutool, tmp_path: Path) -> Callable[..., Any]:
+    """Runs `imutool convert` with some arguments."""
+    return lambda *words: imutool("convert", *words, cwd=tmp_path)

@@ -217,7 +217,7 @@ def test_settings_of_the_sensors_and_what_was_not_read_are_kept_as_metadata(make
     (recording,) = euroc.read(make.zip("one.zip", files))
     assert recording.metadata["imu0/sensor.yaml"]["text"].encode() == files["mav0/imu0/sensor.yaml"]
     assert recording.metadata["body.yaml"]["text"] == "comment: made up\n"
-    assert recording.metadata["imutool"] == {"dataset": "euroc", "sequence": "one", "sensor": "adis16448"}
+    assert recording.metadata["imutool"] == {"format": "euroc", "sequence": "one"}
     assert list(recording.metadata["imutool/skipped"]) == ["leica0"]
 
 
@@ -278,3 +278,17 @@ def test_fetch_stamps_do_not_pass_through_a_float(make):
     assert recording.imu.t_ns[1] - recording.imu.t_ns[0] == 5_000_000
     assert recording.imu.t_ns[1] == 1403636579763560000
     assert int(float(1403636579763560000)) != 1403636579763560000
+
+
+def test_a_folder_in_the_form_of_euroc_keeps_its_own_truth_and_claims_no_sensor(make):
+    files = make.files("euroc")
+    truth = files.pop("mav0/state_groundtruth_estimate0/data.csv")
+    files["mav0/gt0/data.csv"] = b"\n".join([truth.splitlines()[0], *(row + b"," for row in truth.splitlines()[1:])])
+    (recording,) = euroc.read(make.folder("simulated", files))
+    (original,) = euroc.read(make.folder("original", {**files, "mav0/state_groundtruth_estimate0/data.csv": truth}))
+    assert list(recording.truths) == ["/ground_truth/pose"]
+    assert recording.truth == original.truth
+    assert "sensor" not in recording.metadata["imutool"]
+    described = {**files, "mav0/imu0/sensor.yaml": b"comment: VI-Sensor IMU (ADIS16448)"}
+    (recording,) = euroc.read(make.folder("renamed", described))
+    assert recording.metadata["imutool"]["sensor"] == "adis16448"

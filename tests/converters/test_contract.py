@@ -9,23 +9,28 @@ import numpy as np
 import pytest
 
 from imutool import registry
+from imutool.conversion.run import is_general
 from imutool.recording import Recording
 
 GROUP = "imutool.converters"
 FIRST_NS = 1403636579758560000
 
 
-@pytest.fixture(params=registry.names(GROUP))
+DATA_SETS = [key for key in registry.names(GROUP) if not is_general(registry.load(GROUP, key))]
+
+
+@pytest.mark.parametrize("key", registry.names(GROUP))
+def test_the_docstring_begins_with_one_line_of_help(key):
+    summary = registry.summary(GROUP, key)
+    assert 20 < len(summary) <= 120
+    assert summary.endswith(".")
+
+
+@pytest.fixture(params=DATA_SETS)
 def converter(request: pytest.FixtureRequest) -> ModuleType:
     module = registry.load(GROUP, request.param)
     module.KEY = request.param
     return module
-
-
-def test_the_docstring_begins_with_one_line_of_help(converter):
-    summary = registry.summary(GROUP, converter.KEY)
-    assert 20 < len(summary) <= 120
-    assert summary.endswith(".")
 
 
 @pytest.mark.parametrize("form", ["folder", "zip", "tar", "tar.gz", "archive of one folder"])
@@ -43,7 +48,7 @@ def test_every_form_of_a_sequence_reads_as_the_same_recording(converter, make, f
     assert recording.name == "one"
     assert recording.source == source.name
     assert recording.imu_topic == "/imu0"
-    assert recording.metadata["imutool"]["dataset"] == converter.KEY
+    assert recording.metadata["imutool"]["format"] == converter.KEY
     assert recording.metadata["imutool"]["sequence"] == "one"
     assert recording.imu.t_ns[0] == FIRST_NS
     assert recording.imu.gyro[3].tolist() == [0.1, -0.2, 0.003]
@@ -77,7 +82,7 @@ def test_exactly_the_data_sets_own_converter_recognises_a_sequence(converter, ma
         key
         for key in registry.names(GROUP)
         for module in [registry.load(GROUP, key)]
-        if all(module.recognises(sequence) for sequence in module.sequences(source))
+        if any(module.recognises(sequence) for sequence in module.sequences(source))
     ]
     assert recognising == [converter.KEY]
 
@@ -88,3 +93,11 @@ def test_a_place_without_sequences_has_none(converter, make):
     assert converter.sequences(make.tmp) == []
     assert converter.sequences(make.tmp / "notes.txt") == []
     assert list(converter.read(make.tmp)) == []
+
+
+def test_data_set_and_sensor_are_stated_only_where_the_sequence_shows_them(converter, make):
+    own, fetch = {"euroc": "MH_01_easy", "tum_vi": "dataset-room1"}.get(converter.KEY, "one"), converter.KEY == "fetch"
+    for name, known in ((own, True), ("my_robot", fetch)):
+        (recording,) = converter.read(make.folder(name, make.files(converter.KEY)))
+        stated = recording.metadata["imutool"]
+        assert ("sensor" in stated, stated.get("dataset")) == (known, converter.KEY if known else None)

@@ -1,4 +1,4 @@
-"""Workers for all tests of a fleet, started once; logs that robots of one kind would record."""
+"""Workers for the tests of a fleet; logs that robots of one kind would record."""
 
 from __future__ import annotations
 
@@ -10,7 +10,8 @@ from pathlib import Path
 import pytest
 from support import planted
 
-from imutool.fleet.engine import Engine
+from imutool.conversion.worker_pool import ONE_THREAD
+from imutool.fleet.engine import ProcessEngine
 from imutool.mcap_io.write import write
 
 LOG_S = 10.0  # below eight nothing is told
@@ -19,15 +20,16 @@ Robot = Callable[[Path, int, Mapping[str, Sequence[float]]], None]
 
 @pytest.fixture(scope="session")
 def ray_started() -> Iterator[None]:
-    """Ray on two cores of this machine; every Engine of this process uses it."""
+    """A cluster of this machine alone, on loopback: two cores. Every RayEngine of this process uses it."""
     before = dict(os.environ)
-    engine = Engine(workers=2, memory_bytes=1 << 28)
-    yield
-    import ray  # not before Engine has told it how to start
+    os.environ |= {"RAY_USAGE_STATS_ENABLED": "0", "RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER": "0", **ONE_THREAD}
+    import ray  # not before it is said how
 
+    ray.init(address="local", num_cpus=2, include_dashboard=False, log_to_driver=False, object_store_memory=80 << 20)
+    yield
     node = ray._private.worker._global_node
-    started = [one.process for several in node.all_processes.values() for one in several]
-    engine.close()
+    started = [info.process for several in node.all_processes.values() for info in several]
+    ray.shutdown()
     for process in started:
         process.wait(timeout=10)  # Ray itself does not, and a Popen that nobody waited for warns when it goes
     os.environ.clear()
@@ -35,9 +37,9 @@ def ray_started() -> Iterator[None]:
 
 
 @pytest.fixture
-def engine(ray_started: None) -> Callable[[], Engine]:
+def engine() -> Callable[[], ProcessEngine]:
     """Two workers."""
-    return lambda: Engine(workers=2, memory_bytes=1 << 28, retries=3)
+    return lambda: ProcessEngine(workers=2, memory_bytes=1 << 28)
 
 
 @pytest.fixture

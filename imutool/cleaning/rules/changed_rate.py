@@ -10,7 +10,7 @@ from jaxtyping import Float64, Int64
 from imutool.cleaning.finding import MAX_INTERVALS, Finding
 from imutool.cleaning.rule import Rule, TopicSummary
 from imutool.cleaning.samples import Samples
-from imutool.columns import true_ranges
+from imutool.recording.columns import true_ranges
 
 PART = 64  # samples whose median period is one row
 CHANGE = 1.2  # times the usual period, or the usual period so many times this one

@@ -16,7 +16,7 @@ from imutool.cleaning.finding import Finding, Intervals
 from imutool.cleaning.rule import Rule, TopicSummary
 from imutool.cleaning.rules.not_finite import AXES
 from imutool.cleaning.samples import Samples, padded
-from imutool.columns import true_ranges
+from imutool.recording.columns import true_ranges
 
 LEAST = 10  # equal samples in a row
 AXIS_LEAST, AXIS_LEAST_S = 100, 1.0  # of one axis alone; the longest in real recordings is 17, or 0.17 s

@@ -19,8 +19,8 @@ from numpy.lib.stride_tricks import sliding_window_view
 from imutool.cleaning.finding import Finding, Intervals
 from imutool.cleaning.rule import Rule, TopicSummary
 from imutool.cleaning.samples import Samples, padded
-from imutool.columns import true_ranges
 from imutool.recording import nanoseconds
+from imutool.recording.columns import true_ranges
 
 AHEAD = 32  # samples asked whether one is ahead of them
 SET_BACK_NS = nanoseconds(1.0)

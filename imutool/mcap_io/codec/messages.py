@@ -216,10 +216,17 @@ def message_rows(
     return records
 
 
+_MESSAGE_HEAD = struct.Struct("<BQHIQQ")
+
+
+def message_head(channel: int, sequence: int, log_time: int, publish_time: int, size: int) -> bytes:
+    """The bytes of a Message record ahead of a payload of `size` bytes."""
+    return _MESSAGE_HEAD.pack(Opcode.MESSAGE, FIXED + size, channel, sequence, log_time, publish_time)
+
+
 def message_record(channel: int, sequence: int, time_ns: int, payload: bytes) -> bytes:
     """One Message record with one time, for the few large ones."""
-    fixed = struct.pack("<HIQQ", channel, sequence, time_ns, time_ns)
-    return HEAD.pack(Opcode.MESSAGE, FIXED + len(payload)) + fixed + payload
+    return message_head(channel, sequence, time_ns, time_ns, len(payload)) + payload
 
 
 def scatter(data: UInt8[np.ndarray, " b"], offsets: Int64[np.ndarray, " n"], rows: UInt8[np.ndarray, "n M"]) -> None:

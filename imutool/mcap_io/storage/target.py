@@ -1,4 +1,4 @@
-"""Write a file that appears whole or not at all: under a temporary name, then renamed.
+"""Write a file or folder whole or not at all: under a temporary name, then renamed.
 
 What another file holds is copied by the kernel where its blocks stay blocks: a file system that shares them between files
 copies nothing at all. Where they move by part of a block it could only cut each in two, and costs more than reading and
@@ -7,54 +7,34 @@ writing do: 1.05 times in memory, 1.5 times on ext4.
 
 from __future__ import annotations
 
-import contextlib
 import os
+import re
 import secrets
+import shutil
 import weakref
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from types import TracebackType
-from typing import BinaryIO, Protocol
 
 from imutool.errors import ConfigError
 from imutool.location import Location, io_errors, reason
 from imutool.mcap_io.codec.records import crc32
-from imutool.mcap_io.storage.source import BLOCK_BYTES, Source, crc_of, descriptor
+from imutool.mcap_io.storage.local import LocalFile, Stream, is_stream, remove_abandoned, temporary_path
+from imutool.mcap_io.storage.outputs import refuse_existing
+from imutool.mcap_io.storage.source import BLOCK_BYTES, Source, crc_of
 from imutool.mcap_io.storage.upload import Upload
 
-PAGE_BYTES = 1 << 12  # of a file system
-
-
-class _Medium(Protocol):
-    """A file or object written under its temporary name."""
-
-    @property
-    def temporary(self) -> Location: ...
-
-    def open(self) -> None: ...
-
-    def write(self, data: bytes | bytearray | memoryview) -> None: ...
-
-    def copy(self, source: Source, start: int, end: int) -> int:
-        """Copies bytes without reading them here, as far as possible; returns where it stopped."""
-
-    def complete(self) -> None:
-        """Makes all of it readable under the temporary name."""
-
-    def publish(self) -> None:
-        """Puts it in its place."""
-
-    def discard(self) -> None:
-        """Removes the temporary file, silently if that fails."""
+SIGNATURE = "# Exported by imutool"  # in the first lines of a file of every exported folder
 
 
 class Target:
     """The file being written; leaving the context without an error puts it in its place.
 
-    Any error, Ctrl-C included, removes what was written. `crc` is the CRC-32 of everything written while `summing`. In a store
-    it is an object under another key, copied to its own by the store when it is complete; between the last look whether the
-    target exists and that copy lies a moment in which another writer's object would be replaced, as with a file.
+    A device or a pipe gets the complete bytes and is never replaced. Any error, Ctrl-C included, removes what was written.
+    `crc` is the CRC-32 of everything written while `summing`. In a store it is an object under another key, copied to its own
+    by the store when it is complete; between the last look whether the target exists and that copy lies a moment in which
+    another writer's object would be replaced, as with a file.
 
     Raises:
         ConfigError: the target exists (without `overwrite`), is a folder, or the system refuses to write.
@@ -63,20 +43,13 @@ class Target:
     def __init__(self, path: Location, *, overwrite: bool = False, summing: bool = True) -> None:
         self.path, self.overwrite = path, overwrite
         self.position, self.crc, self.summing = 0, 0, summing
-        name = f".{path.name}.{os.getpid()}.{secrets.token_hex(4)}.partial"
-        self._medium: _Medium = _File(path, name) if isinstance(path, Path) else Upload(path, name)
+        self._medium = _medium(path)
         self.temporary = self._medium.temporary
         # Ctrl-C may come between two lines, before `abandon` can be called: then the file goes with this object
         self._remove = weakref.finalize(self, self._medium.discard)
         with self._system_errors():
-            self._refuse_existing()
+            refuse_existing(path, overwrite=overwrite)
             self._medium.open()
-
-    def _refuse_existing(self) -> None:
-        if self.path.is_dir():
-            raise ConfigError("the target is a folder", where=self.path, expected="the name of a file")
-        if self.path.exists() and not self.overwrite:
-            raise ConfigError("the target exists", where=self.path, fix="Choose another name, or add `overwrite=True`")
 
     @contextmanager
     def _system_errors(self) -> Iterator[None]:
@@ -138,7 +111,7 @@ class Target:
         try:
             with self._system_errors():
                 self._medium.complete()
-                self._refuse_existing()
+                refuse_existing(self.path, overwrite=self.overwrite)
                 self._medium.publish()
             self._remove.detach()
         except BaseException:
@@ -150,68 +123,10 @@ class Target:
         self._remove()
 
 
-class _File:
-    """A file beside its place."""
-
-    file: BinaryIO
-
-    def __init__(self, path: Path, name: str) -> None:
-        self.path, self.temporary = path, path.with_name(name)
-
-    def open(self) -> None:
-        self.file = self.temporary.open("xb")
-
-    def write(self, data: bytes | bytearray | memoryview) -> None:
-        self.file.write(data)
-
-    def copy(self, source: Source, start: int, end: int) -> int:
-        """Copies by the kernel; returns `start` if the kernel cannot, or would split blocks."""
-        theirs, ours = descriptor(source.file), descriptor(self.file)
-        if theirs is None or ours is None or (start - self.file.tell()) % PAGE_BYTES:
-            return start
-        calls: tuple[Callable[[int], int], ...] = (
-            lambda at: os.copy_file_range(theirs, ours, end - at, offset_src=at),
-            lambda at: os.sendfile(ours, theirs, at, end - at),
-        )
-        self.file.flush()
-        for call in calls:
-            while start < end and (count := _tried(call, start)):
-                start += count
-        self.file.seek(0, os.SEEK_END)
-        return start
-
-    def complete(self) -> None:
-        self.file.flush()
-
-    def publish(self) -> None:
-        os.fsync(self.file.fileno())
-        self.file.close()
-        self.temporary.replace(self.path)
-        _settle(self.path.parent)
-
-    def discard(self) -> None:
-        with contextlib.suppress(OSError, AttributeError):  # a full disk refuses the last flush; or it was never opened
-            self.file.close()
-        with contextlib.suppress(OSError):
-            self.temporary.unlink(missing_ok=True)
-
-
-def _settle(folder: Path) -> None:
-    """Writes the new name to disk, so that a power cut does not restore the old file."""
-    with contextlib.suppress(OSError):
-        handle = os.open(folder, os.O_RDONLY)
-        try:
-            os.fsync(handle)
-        finally:
-            os.close(handle)
-
-
-def _tried(call: Callable[[int], int], at: int) -> int:
-    """Bytes copied by the call; 0 if the call fails, then reading and writing show why."""
-    try:
-        return call(at)
-    except OSError:
-        return 0
+def _medium(path: Location) -> LocalFile | Upload:
+    if not isinstance(path, Path):
+        return Upload(path, f".{path.name}.{os.getpid()}.{secrets.token_hex(4)}.partial")
+    return Stream(path) if is_stream(path) else LocalFile(path)
 
 
 class PassThrough:
@@ -259,3 +174,82 @@ class PassThrough:
         self.target.write(raw)
         self.copied = self.pending_end = self.copied + len(raw)
         return at
+
+
+class FolderTarget:
+    """The folder being written; leaving the context without an error puts it in its place.
+
+    Any error, Ctrl-C included, removes what was written. An older folder is replaced only if its file `signed` says that it
+    was made here and its top holds nothing but what `holds` matches: a data set that merely looks alike is never removed.
+
+    Raises:
+        ConfigError: the target exists (without `overwrite`), is not an export, holds the log, or cannot be written.
+    """
+
+    def __init__(self, path: Path, log: Path, *, signed: str, holds: str, overwrite: bool) -> None:
+        self.path, self.log, self.overwrite = path.absolute(), log, overwrite
+        self.signed, self.holds = signed, holds
+        self._refuse_existing()
+        remove_abandoned(self.path)
+        self.temporary = temporary_path(self.path)
+        self._remove = weakref.finalize(self, shutil.rmtree, self.temporary, True)
+        with writing(path):
+            self.temporary.mkdir()
+
+    def _refuse_existing(self) -> None:
+        if not self.path.exists() and not self.path.is_symlink():
+            return
+        if not self.overwrite:
+            raise ConfigError("the target exists", where=self.path, fix="Choose another name, or add `overwrite=True`")
+        if self.path.is_symlink() or not self.path.is_dir():
+            raise ConfigError("the target is not a folder", where=self.path, expected="the name of a new folder")
+        if self.log.resolve().is_relative_to(self.path.resolve()):
+            raise ConfigError("the target holds the log itself", where=self.path, expected="another folder")
+        foreign = sorted(entry.name for entry in self.path.iterdir() if not re.fullmatch(self.holds, entry.name))
+        if foreign or not self._was_made_here():
+            what = f"the target holds {foreign[0]}, which no export makes" if foreign else "the target was not made by imutool"
+            raise ConfigError(what, where=self.path, fix="Choose another folder, or remove this one yourself")
+
+    def _was_made_here(self) -> bool:
+        try:
+            with (self.path / self.signed).open("rb") as file:
+                return SIGNATURE.encode() in file.read(len(SIGNATURE) + 80)
+        except OSError:
+            return False
+
+    def __enter__(self) -> Path:
+        return self.temporary
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+        try:
+            if kind is None:
+                self._commit()
+        finally:
+            self._remove()
+
+    def _commit(self) -> None:
+        """Puts the folder in its place, and an older one out of it once nothing can fail."""
+        self._refuse_existing()
+        with writing(self.path):
+            if not self.path.exists():
+                self.temporary.rename(self.path)
+                return
+            before = temporary_path(self.path).with_suffix(".replaced")  # never removed by a later run
+            self.path.rename(before)
+            try:
+                self.temporary.rename(self.path)
+            except BaseException:
+                before.rename(self.path)
+                raise
+            shutil.rmtree(before)
+
+
+@contextmanager
+def writing(path: Path) -> Iterator[None]:
+    """Turns errors of the system into a ConfigError while a folder is written."""
+    try:
+        yield
+    except OSError as error:
+        reason = error.strerror or type(error).__name__
+        fix = "Choose a place that can be written and has room"
+        raise ConfigError(f"cannot be written ({reason})", where=path, fix=fix) from error

@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float64
 
-from imutool.columns import true_ranges
 from imutool.errors import ConfigError
+from imutool.recording.columns import true_ranges
 from imutool.viewing.html.page import GRID, INK, LIGHT, printable, text
 
 WIDTH_INCH = 11.5  # on a page of 1150 pixels, letters of 9 points are 12 pixels high
@@ -26,6 +26,7 @@ HEADING_INCH = 0.45
 PER_DECADE = 40  # points of a spectrum
 LEGEND_LETTERS, HANDLE_LETTERS = 76, 8  # in a row of a legend at half width
 MAX_LETTERS = 48  # of a name in a legend
+MAX_DECADES = 5  # labels of a logarithmic axis
 BUCKETS = 400  # of a line at half width; each draws its lowest and its highest sample
 
 # placeholder colour for each of the page's colours in an SVG; none is one of matplotlib's own
@@ -189,6 +190,25 @@ def average_log_bins(
     count = np.diff(np.append(starts, len(decade)))
     sums = np.add.reduceat(power, starts, axis=0)
     return np.add.reduceat(frequency_hz, starts) / count, sums / count.reshape(-1, *[1] * (power.ndim - 1))
+
+
+def at_least_three_ticks(axes: Any) -> None:
+    """Choose the ticks of a linear vertical axis so that a low panel has three or more."""
+    from matplotlib.ticker import MaxNLocator
+
+    axes.yaxis.set_major_locator(MaxNLocator(nbins=4, min_n_ticks=3, steps=[1, 2, 2.5, 5, 10]))
+
+
+def decades(axes: Any) -> None:
+    """Logarithmic vertical axis with limits at whole decades, and labels at three or more of its ticks."""
+    from matplotlib.ticker import LogLocator
+
+    low, high = axes.get_ylim()
+    first, last = np.floor(np.log10(low)), np.ceil(np.log10(high))
+    axes.set_ylim(10.0**first, 10.0**last)
+    axes.yaxis.set_major_locator(LogLocator(numticks=MAX_DECADES))
+    if last - first < 2:
+        axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0), numticks=MAX_DECADES))
 
 
 def plain_tick_labels(*rulers: Any) -> None:

@@ -9,7 +9,15 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float64, Int64
 
-from imutool.viewing.html.drawing import DecimatedLine, Panel, Picture, decimate_extremes, legend, plain_tick_labels
+from imutool.viewing.html.drawing import (
+    DecimatedLine,
+    Panel,
+    Picture,
+    at_least_three_ticks,
+    decimate_extremes,
+    legend,
+    plain_tick_labels,
+)
 from imutool.viewing.html.page import AFTER, BEFORE, HELD, INK, MARK, text
 from imutool.viewing.html.report_paths import color_of
 from imutool.viewing.html.report_wording import alignment_text, format_number
@@ -45,8 +53,8 @@ def error_curves(data: RunData) -> Picture | None:
         _panel(data, scored, times, moved, "Position error", "m"),
     )
     signed = [values for rows in (turned, moved) for name, values in rows.items() if name not in ("total", "horizontal")]
-    out = any(_leaves_panel(values) for values in signed)
-    note = " A signed error far above the others leaves its panel; the total shows it whole." * out
+    out = any(_leaves(error, values) for values in signed for error in values)
+    note = " A signed error far above the others is left out of its panel; the total shows it." * out
     return Picture("errors", "Errors over time", f"Integrated from the true start, {alignment_text(data)}.{note}", panels)
 
 
@@ -108,6 +116,8 @@ def _draw(
         signed = name not in {"total", "horizontal"}
         log = not signed and _needs_log_scale(values)
         for trace, t, error in zip(scored, times, values, strict=True):
+            if signed and axes is not panels[0] and _leaves(error, values):
+                continue
             shown = np.where(error > 0.0, error, np.nan) if log else error  # the start is exact: log(0)
             label = f"{trace.name}: {title.lower()}, {name}" if axes is not panels[0] else trace.name
             line = axes.plot(
@@ -131,11 +141,12 @@ def _limits(axes: Any, values: Sequence[Line], *, signed: bool, log: bool) -> No
         axes.set_ylim(min(tops) * 10.0**-DECADES, max(tops) * 2.0)
     elif signed:
         axes.axhline(0.0, color=INK, lw=0.6)
-        near = [top for top in tops if top <= LINEAR_RATIO * min(tops)]
-        most = max(near, default=0.0)
+        most = max((top for top in tops if top <= LINEAR_RATIO * min(tops)), default=0.0)
         axes.set_ylim(-1.15 * most, 1.15 * most) if most > 0.0 else None
+        at_least_three_ticks(axes)
     else:
         axes.set_ylim(0.0, 1.1 * max(tops, default=1.0) or 1.0)
+        at_least_three_ticks(axes)
 
 
 def _needs_log_scale(values: Sequence[Line]) -> bool:
@@ -144,12 +155,15 @@ def _needs_log_scale(values: Sequence[Line]) -> bool:
     return len(tops) > 1 and min(tops) > 0.0 and max(tops) > LINEAR_RATIO * min(tops)
 
 
-def _leaves_panel(values: Sequence[Line]) -> bool:
-    return _needs_log_scale([np.abs(errors) for errors in values])
+def _leaves(error: Line, values: Sequence[Line]) -> bool:
+    """Whether a signed error is too large for the panel of the others, where it would be a stray sliver."""
+    tops = [float(np.nanmax(np.abs(other))) for other in values if np.isfinite(other).any()]
+    return bool(np.isfinite(error).any()) and float(np.nanmax(np.abs(error))) > LINEAR_RATIO * min(tops) > 0.0
 
 
 MAX_ROWS = 40
-MIN_EVENT_SHARE = 0.002  # of the duration, so that one sample in an hour is visible
+MIN_EVENT_SHARE = 0.002  # of the duration; a shorter event is a mark, so that one sample in an hour is visible
+MOMENT_POINTS = 0.5
 LANE_INCH, EDGES_INCH = 0.24, 0.75
 EVENT_COLORS = {"stop": HELD, "finding": AFTER, "worst": BEFORE}
 
@@ -166,7 +180,7 @@ def event_lanes(data: RunData) -> Picture | None:
         f"Events over time: {', '.join(map(event_label, kinds))}",
         wide=True,
     )
-    return Picture("events", "Events", "", (panel,))
+    return Picture("events", "Events", "Bars are to scale; low marks are events too short for that.", (panel,))
 
 
 def event_table(data: RunData) -> Iterator[str]:
@@ -199,16 +213,15 @@ def _first(events: Sequence[Event]) -> list[Event]:
 
 def _draw_lanes(figure: Any, *, data: RunData, kinds: Sequence[str]) -> None:
     axes = figure.subplots()
-    least = MIN_EVENT_SHARE * data.duration_s
+    least_s = MIN_EVENT_SHARE * data.duration_s
     for lane, kind in enumerate(kinds):
-        bars = []
-        for event in data.events:
-            if event.kind == kind:
-                first, length = (event.start_ns - data.start_ns) * 1e-9, (event.end_ns - event.start_ns) * 1e-9
-                bars.append((min(first, data.duration_s - least), max(length, least)))
-        axes.broken_barh(
-            bars, (-lane - 0.4, 0.8), color=EVENT_COLORS.get(kind, MARK), lw=0, label=f"{event_label(kind)}: {len(bars)}"
-        )
+        spans = [data.elapsed_s(np.array([e.start_ns, e.end_ns])) for e in data.events if e.kind == kind]
+        color, label = EVENT_COLORS.get(kind, MARK), f"{event_label(kind)}: {len(spans)}"
+        bars = [(first, last - first) for first, last in spans if last - first >= least_s]
+        axes.broken_barh(bars, (-lane - 0.4, 0.8), color=color, lw=0, label=label)
+        # a thin low mark: wide ones, many in a row, would look like one long event
+        moments = [first for first, last in spans if last - first < least_s]
+        axes.vlines(moments, -lane - 0.4, -lane + 0.1, color=color, lw=MOMENT_POINTS, label=label)
     axes.set_yticks([-lane for lane in range(len(kinds))], [event_label(kind) for kind in kinds])
     axes.tick_params(axis="y", length=0)
     axes.set(xlim=(0.0, data.duration_s), ylim=(-len(kinds) + 0.4, 0.6), xlabel="time (s)")

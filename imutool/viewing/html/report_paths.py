@@ -38,7 +38,8 @@ def paths(data: RunData) -> Picture:
     views = [((0, 1), "From above", shown), ((_long_side(_box(data, shown)), 2), "From the side", shown)]
     if models := [trace for trace in far if not trace.is_raw]:
         side = _long_side(_box(data, models))
-        views += [((0, 1), "Complete, from above", models), ((side, 2), "Complete, from the side", models)]
+        whole = f"Whole path{'s' * (len(models) > 1)} of {run_name(models[0]) if len(models) == 1 else 'the models'}"
+        views += [((0, 1), f"{whole}, from above", models), ((side, 2), f"{whole}, from the side", models)]
     panels = tuple(
         Panel(
             partial(_draw_paths, data=data, shown=traces, axes_of=axes_of, title=title), HEIGHT_INCH, f"Paths: {title.lower()}"

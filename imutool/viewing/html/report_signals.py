@@ -12,16 +12,28 @@ from jaxtyping import Float64
 
 from imutool.inertial import stationary
 from imutool.noise import allan
+from imutool.noise.allan import Curve
+from imutool.noise_identification import vibration
 from imutool.recording import Imu
-from imutool.units import AXES, UNITS
-from imutool.viewing.html.drawing import Panel, Picture, average_log_bins, decimate_extremes, legend, plain_tick_labels
-from imutool.viewing.html.page import AXIS_COLORS, INK, TITLES
+from imutool.units import AXES, SENSORS, UNITS, Sensor
+from imutool.viewing.html.drawing import (
+    Panel,
+    Picture,
+    at_least_three_ticks,
+    average_log_bins,
+    decades,
+    decimate_extremes,
+    legend,
+    plain_tick_labels,
+)
+from imutool.viewing.html.page import AXIS_COLORS, INK, SOFT, TITLES
 from imutool.viewing.html.report_paths import color_of
 from imutool.viewing.html.report_wording import best_run, format_number, run_name, worst_orientation_error
-from imutool.viewing.model.run_data import RunData, Trace
+from imutool.viewing.model.run_data import Run, RunData, Spectrum, Trace, round_up_125, spectra
 
-SENSORS = ("gyro", "accel")
-HEIGHT_INCH = 4.2
+HEIGHT_INCH, SAMPLES_INCH = 4.2, 5.2
+TAIL = 0.005  # of the samples: spikes may cross into the next run
+SHIFTED = "Each run is drawn below the one before by the step at the right, so that it does not cover it."
 ZOOM_S = 4.0
 SIGMAS = 3.0
 BAND_POINTS = 300
@@ -34,7 +46,7 @@ Values = Float64[np.ndarray, " _"]
 
 def signals(data: RunData) -> Picture:
     """Raw and corrected samples by axis, decimated with their extremes."""
-    return _samples(data, "signals", "Signals", "Decimated without losing a peak.", (0.0, data.duration_s))
+    return _samples(data, "signals", "Signals", "The decimation keeps every peak.", (0.0, data.duration_s))
 
 
 def zoom(data: RunData) -> Picture | None:
@@ -75,14 +87,24 @@ def spectrum(data: RunData) -> Picture | None:
         ]
         for sensor in SENSORS
     }
+    subtracted = [(trace, _subtracted(trace.run)) for trace in data.models()]
     panels = [
         Panel(
-            partial(_draw_spectrum, data=data, sensor=sensor, curves=curves[sensor]), HEIGHT_INCH, f"{TITLES[sensor]} spectrum"
+            partial(_draw_spectrum, data=data, sensor=sensor, curves=curves[sensor], subtracted=subtracted),
+            HEIGHT_INCH,
+            f"{TITLES[sensor]} spectrum",
         )
         for sensor in SENSORS
         if curves[sensor]
     ]
-    return Picture("spectrum", "Spectra", "Amplitude density of the samples (Welch), up to half their rate.", tuple(panels))
+    caption = "Amplitude density of the samples (Welch), up to half their rate."
+    caption += " Dashed: the difference, raw minus debiased; it is small where the curves coincide." * bool(subtracted)
+    return Picture("spectrum", "Spectra", caption, tuple(panels))
+
+
+def _subtracted(run: Run) -> Mapping[str, Spectrum]:
+    """Spectra of raw minus debiased."""
+    return spectra(Imu(run.imu.t_ns, run.gyro_bias, run.accel_bias))
 
 
 def allan_deviation(data: RunData) -> Picture | None:
@@ -98,11 +120,13 @@ def allan_deviation(data: RunData) -> Picture | None:
         return None
     rest_s = sum(b - a for a, b in ranges) * imu.period_s
     curves: dict[str, list[Any]] = {sensor: [] for sensor in SENSORS}
+    recorded: dict[Sensor, Curve] = {}
     for trace in data.traces:
         still = [trace.run.imu.between(int(imu.t_ns[a]), int(imu.t_ns[b - 1])) for a, b in ranges]
         for sensor in SENSORS:
             curve = allan.curve([_both(part)[sensor] for part in still], imu.period_s)
             curves[sensor].append((trace, curve.tau_s, curve.deviation))
+            recorded.setdefault(sensor, curve)
     panels = [
         Panel(
             partial(_draw_allan, data=data, sensor=sensor, curves=curves[sensor]),
@@ -112,6 +136,8 @@ def allan_deviation(data: RunData) -> Picture | None:
         for sensor in SENSORS
     ]
     caption = f"Over {format_number(rest_s)} s at rest in {len(ranges)} stretch{'es' * (len(ranges) > 1)}; overlapping."
+    remarks = [vibration(sensor, allan.slopes(first)) for sensor, first in recorded.items()]
+    caption = " ".join([caption, *(f"{remark[0].upper()}{remark[1:]}." for remark in remarks if remark)])
     return Picture("allan", "Allan deviation at rest", caption, tuple(panels))
 
 
@@ -124,10 +150,11 @@ def missing_pictures() -> list[str]:
 
 def _samples(data: RunData, name: str, title: str, caption: str, span_s: tuple[float, float]) -> Picture:
     panels = [
-        Panel(partial(_draw_samples, data=data, sensor=sensor, span_s=span_s), HEIGHT_INCH, f"{NOUNS[sensor]} by axis")
+        Panel(partial(_draw_samples, data=data, sensor=sensor, span_s=span_s), SAMPLES_INCH, f"{NOUNS[sensor]} by axis")
         for sensor in SENSORS
     ]
-    return Picture(name, title, caption, tuple(panels))
+    lower = f" {SHIFTED}" * (len(data.traces) > 1)
+    return Picture(name, title, f"{caption}{lower}", tuple(panels))
 
 
 def _by_axis(figure: Any, sensor: str, title: str, unit: str) -> list[Any]:
@@ -142,17 +169,28 @@ def _by_axis(figure: Any, sensor: str, title: str, unit: str) -> list[Any]:
 
 def _draw_samples(figure: Any, *, data: RunData, sensor: str, span_s: tuple[float, float]) -> None:
     panels = _by_axis(figure, sensor, NOUNS[sensor], UNITS[sensor])
-    lines = []
-    for trace in data.traces:
+    lines, steps = [], np.zeros(3)
+    for rank, trace in enumerate(data.traces):
         t = data.elapsed_s(trace.run.imu.t_ns)
         part = slice(*np.searchsorted(t, span_s, side="left") + np.array([0, 1]))
         values = _both(trace.run.imu)[sensor][part]
-        under = trace.is_raw and bool(data.models())
-        style: dict[str, Any] = {"color": color_of(data, trace), "lw": 1.8 if under else 0.8, "alpha": 0.55 if under else 1.0}
-        drawn = [_line(axes, t[part], values[:, k], trace.name, k, style) for k, axes in enumerate(panels)]
+        if rank == 0 and len(data.traces) > 1:
+            steps = _steps(values)
+        style: dict[str, Any] = {"color": color_of(data, trace), "lw": 0.8}
+        drawn = [_line(axes, t[part], values[:, k] - rank * steps[k], trace.name, k, style) for k, axes in enumerate(panels)]
         lines.append(drawn[0])
+    for axes, step in zip(panels, steps, strict=True):
+        at_least_three_ticks(axes)
+        if step > 0.0:
+            axes.text(1.0, 1.0, f"step {step:g}", transform=axes.transAxes, ha="right", va="bottom", fontsize=8, color=SOFT)
     panels[-1].set(xlabel="time (s)", xlim=span_s)
     legend(figure, lines)
+
+
+def _steps(values: Vectors) -> Values:
+    """Distance between two runs that do not cover each other, by axis: rounded up to 1, 2 or 5 times a power of ten."""
+    low, high = np.quantile(values, [TAIL, 1.0 - TAIL], axis=0) if len(values) else np.zeros((2, 3))
+    return np.array([round_up_125(extent) if extent > 0.0 else 0.0 for extent in high - low])
 
 
 def _draw_bias(figure: Any, *, data: RunData, sensor: str) -> None:
@@ -173,6 +211,7 @@ def _draw_bias(figure: Any, *, data: RunData, sensor: str) -> None:
         lines.append(drawn[0])
     for axes in panels:
         axes.margins(y=0.15)
+        at_least_three_ticks(axes)
     panels[-1].set(xlabel="time (s)", xlim=(0.0, data.duration_s))
     legend(figure, lines)
 
@@ -185,13 +224,26 @@ def _bands(panels: Sequence[Any], t: Values, bias: Vectors, half: Vectors, color
         axes.fill_between(t[starts], low[:, k], high[:, k], color=color, alpha=0.22, lw=0, label=f"±3 σ, {AXES[k]}")
 
 
-def _draw_spectrum(figure: Any, *, data: RunData, sensor: str, curves: Sequence[Any]) -> None:
+def _draw_spectrum(
+    figure: Any,
+    *,
+    data: RunData,
+    sensor: str,
+    curves: Sequence[Any],
+    subtracted: Sequence[tuple[Trace, Mapping[str, Spectrum]]],
+) -> None:
     panels = _by_axis(figure, sensor, f"{NOUNS[sensor]} ({UNITS[sensor]}/√Hz)", "")
     lines = []
     for trace, frequency_hz, density in curves:
         at, power = average_log_bins(frequency_hz, density, frequency_hz[0])
         drawn = [_log_line(axes, at, np.sqrt(power[:, k]), data, trace, k) for k, axes in enumerate(panels)]
         lines.append(drawn[0])
+    for trace, densities in subtracted:
+        density, style = densities[sensor].density, {"color": color_of(data, trace), "lw": 1.0, "ls": (0, (4, 2))}
+        at, power = average_log_bins(densities[sensor].frequency_hz, density, densities[sensor].frequency_hz[0])
+        for k, axes in enumerate(panels):
+            label = f"{run_name(trace)}: raw minus debiased, {AXES[k]}"
+            axes.plot(at, np.sqrt(np.where(power[:, k] > 0.0, power[:, k], np.nan)), label=label, **style)
     _decades(panels)
     panels[-1].set_xlabel("frequency (Hz)")
     legend(figure, lines)
@@ -225,8 +277,7 @@ def _decades(panels: Sequence[Any]) -> None:
     for axes in panels:
         axes.set_xscale("log")
         axes.set_yscale("log")
-        low, high = axes.get_ylim()
-        axes.set_ylim(10.0 ** np.floor(np.log10(low)), 10.0 ** np.ceil(np.log10(high)))
+        decades(axes)
         plain_tick_labels(axes.xaxis, axes.yaxis)
 
 

@@ -11,7 +11,6 @@ from imutool.viewing.model.run_data import RunData, Trace
 
 FIGURE_LABELS = {
     "aoe_deg": "Orientation error (AOE, °)",
-    "aoe_aligned_deg": "Orientation error, aligned (°)",
     "ape_m": "Position error (APE, m)",
     "ape_aligned_m": "Position error, aligned (m)",
     "velocity_rmse_m_s": "Velocity error (m/s)",
@@ -80,18 +79,36 @@ def worst_orientation_error(trace: Trace, data: RunData) -> tuple[float, float] 
 
 
 def conclusion(data: RunData) -> str:
-    """Conclusion in one or two sentences, from figures without alignment."""
+    """Conclusion in one or two sentences, with the start, from figures without alignment."""
     chosen, before = best_run(data), raw_run(data)
     if chosen is None:
         return _without_truth(data)
     if chosen.is_raw or before is None:
-        text = f"{run_name(chosen)} has errors of {_errors(chosen)} over {format_number(data.duration_s)} s, without alignment"
+        seconds = format_number(data.duration_s)
+        text = f"{run_name(chosen)} has errors of {_errors(chosen)} over {seconds} s{start_text(chosen)}, without alignment"
     else:
-        text = f"{comparison(chosen, before)} over {format_number(chosen.figures['duration_s'])} s, without alignment"
-    worst = worst_orientation_error(chosen, data)
-    at = "" if worst is None else f"; at worst by {format_quantity(worst[0], '°')}, {format_number(worst[1])} s after the start"
-    at += f" ({alignment_text(data)})" * (worst is not None and data.alignment != "none")
-    return f"{data.name}: {text}{at}."
+        seconds = format_number(chosen.figures["duration_s"])
+        text = f"{comparison(chosen, before)} over {seconds} s{start_text(chosen)}, without alignment"
+    largest = worst_orientation_error(chosen, data)
+    if largest is None:
+        return f"{data.name}: {text}."
+    how = f" ({alignment_text(data)})" * (data.alignment != "none")
+    at_s = f"{format_quantity(largest[0], '°')}{how} at {format_number(largest[1])} s"
+    return f"{data.name}: {text}. The largest orientation error is {at_s}."
+
+
+def start_text(trace: Trace) -> str:
+    """Start of a model's bias as part of a sentence: ` after a start from 15 s of truth`; empty if unknown."""
+    method, _, length = trace.run.start.partition(":")
+    if method == "truth":
+        return f" after a start from {length} s of truth" if length else " after a start from truth"
+    known = {
+        "auto": " from a start without truth",
+        "stationary": " from a start at rest",
+        "prior": " from the mean bias of the training runs",
+        "smooth": " with the bias smoothed over the whole log",
+    }
+    return known.get(method, " from a given bias" if method else "")
 
 
 def comparison(chosen: Trace, before: Trace) -> str:

@@ -54,13 +54,13 @@ def survey_events(survey: Survey) -> tuple[list[Event], list[str]]:
     for finding in survey.findings:
         kind = KIND_OF_RULE.get(finding.rule)
         if kind is None or not finding.intervals_ns:
-            notes.append(f"{finding.what}.")
+            notes.append(f"{finding.what[0].upper()}{finding.what[1:]}.")
             continue
         for start_ns, end_ns in finding.intervals_ns:
             length = f" for {(end_ns - start_ns) * 1e-9:.3g} s" if end_ns > start_ns else ""
             events.append(Event(kind, start_ns, end_ns, f"{finding.what}{length} ({finding.count} in the log)"))
         if finding.intervals_left_out:
-            notes.append(f"{finding.what}: {finding.intervals_left_out} more intervals are not listed as events.")
+            notes.append(f"{finding.intervals_left_out} more intervals of {finding.what} are not listed as events.")
     return events, notes
 
 

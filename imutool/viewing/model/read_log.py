@@ -79,14 +79,14 @@ def read_log(path: Location, *, imu: str | None = None, truth: str | None = None
         notes.append(f"{topic} cannot be shown as it was recorded ({why}); as by debias --clean, {left}.")
     if survey.reasons:
         notes.append(f"{topic} cannot be trusted: {'; '.join(survey.reasons)}.")
-    model = _model(metadata, topic)
+    model, start = _model_and_start(metadata, topic)
     debiased = []
     for name in derived:
         run = _run(name, model, samples, batches[name], biases_by_topic)
         if run is None:
             notes.append(f"{name} is left out: its samples are not those of {topic}.")
         else:
-            debiased.append(run)
+            debiased.append(replace(run, start=start))
     return LogContents(replace(rest, imu=samples), logged, tuple(debiased), survey, metadata, tuple(notes))
 
 
@@ -153,11 +153,11 @@ def _columns(batches: Sequence[ImuBatch]) -> tuple[Imu, LogTimes]:
     return Imu(stamp_ns, gyro, accel), LogTimes(stamp_ns, log_ns)
 
 
-def _model(metadata: Sequence[tuple[str, Mapping[str, str]]], topic: str) -> str:
-    """Model that `debias` recorded last for this IMU; empty where it recorded none."""
+def _model_and_start(metadata: Sequence[tuple[str, Mapping[str, str]]], topic: str) -> tuple[str, str]:
+    """Model and `init` that `debias` recorded last for this IMU; empty where it recorded none."""
     ours = [values for name, values in metadata if name.startswith("imutool") and values.get("model")]
-    named = [values["model"] for values in ours if values.get("source_topic", topic) == topic]
-    return named[-1] if named else ""
+    named = [values for values in ours if values.get("source_topic", topic) == topic]
+    return (named[-1]["model"], named[-1].get("init", "")) if named else ("", "")
 
 
 def _run(

@@ -23,6 +23,7 @@ from imutool.viewing.model.trajectory_error import Alignment, Drift, Errors, Win
 RAW = "raw"
 TRUTH = "truth"  # label of the truth; no run may have this name
 LEVELLING_S = 0.5  # without truth, the mean specific force of this time gives the vertical
+HIDDEN_FIGURES = ("aoe_aligned_deg",)  # aligned positions say nothing about the attitude of a path that drifts by metres
 TRUE_BIAS = {"gyro": "/ground_truth/bias/gyro", "accel": "/ground_truth/bias/accel"}
 
 
@@ -30,7 +31,8 @@ TRUE_BIAS = {"gyro": "/ground_truth/bias/gyro", "accel": "/ground_truth/bias/acc
 class Run:
     """IMU samples, raw or corrected by a model, with the subtracted bias (zeros for raw).
 
-    `bias_std` is one standard deviation of the bias, gyro (rad/s) then accel (m/s²), where the model states it.
+    `bias_std` is one standard deviation of the bias, gyro (rad/s) then accel (m/s²), where the model states it. `start` is the
+    method of the initial bias (`init`), where it is known.
     """
 
     name: str
@@ -38,6 +40,7 @@ class Run:
     gyro_bias: Float64[np.ndarray, "n 3"]
     accel_bias: Float64[np.ndarray, "n 3"]
     bias_std: Float64[np.ndarray, "n 6"] | None = None
+    start: str = ""
 
     def __post_init__(self) -> None:
         for name in ("gyro_bias", "accel_bias", "bias_std"):
@@ -132,7 +135,7 @@ class RunData:
     def table(self) -> list[tuple[str, list[float | None]]]:
         """Figures as rows: a label (`aoe_deg`, `roe_deg 5`) and one value or None per trace."""
         columns = [dict(_numbers(trace.figures)) for trace in self.traces]
-        labels = list(dict.fromkeys(label for column in columns for label in column))
+        labels = dict.fromkeys(label for column in columns for label in column if label not in HIDDEN_FIGURES)
         return [(label, [column.get(label) for column in columns]) for label in labels]
 
     def models(self) -> tuple[Trace, ...]:
@@ -245,3 +248,9 @@ def path_rows(p_wb: Float64[np.ndarray, "n 3"], most: int = MAX_PATH_ROWS) -> Ro
     along = np.searchsorted(travelled, np.linspace(0.0, travelled[-1], half))
     rows: Rows = np.unique(np.concatenate([np.linspace(0, n - 1, most - half).round().astype(np.int64), along]))
     return rows
+
+
+def round_up_125(highest: float) -> float:
+    """Next number of the form 1, 2 or 5 times a power of ten, as the end of a scale."""
+    decade = 10.0 ** np.floor(np.log10(highest)) if highest > 0.0 else 1.0
+    return float(next(step for step in (1.0, 2.0, 5.0, 10.0) if step * decade >= highest * (1.0 - 1e-9)) * decade)

@@ -84,13 +84,15 @@ def _with_models(
     recording: Recording, models: Sequence[str | Path], init: str, log: str, smooth: bool
 ) -> tuple[list[Run], dict[str, str]]:
     """Run of each model, and by its name its file digest, method and start bias."""
+    from imutool.bias_start.bias_from_truth import TRUTH_S
     from imutool.bias_start.correction import apply_with_std
     from imutool.evaluation import started
 
+    method = "smooth" if smooth else f"truth:{TRUTH_S:g}" if init == "truth" else init
     runs, origins = [], {}
     for name, model, start in started(recording, models, init, log, smooth=smooth):
         debiased, std = apply_with_std(model, start, recording.imu)
-        runs.append(Run(name, debiased.imu, debiased.bias[:, :3], debiased.bias[:, 3:], std))
+        runs.append(Run(name, debiased.imu, debiased.bias[:, :3], debiased.bias[:, 3:], std, method))
         digest = model.card.get("sha256")
         origins[name] = f"{f'sha256 {digest}, ' if digest else ''}{model.method}, start: {start.how}"
     return runs, origins

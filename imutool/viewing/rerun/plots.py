@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from jaxtyping import Float64
 
-from imutool.viewing.model.run_data import RunData
-from imutool.viewing.rerun.entities.styles import round_up_125
+from imutool.viewing.model.run_data import RunData, round_up_125
 from imutool.viewing.rerun.sdk import ELAPSED, TIMELINES
 
 if TYPE_CHECKING:

@@ -13,6 +13,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from msgspec.structs import replace
+
 from imutool.errors import ConfigError
 from imutool.viewing import Output
 from imutool.viewing.model.run_data import RunData
@@ -40,7 +42,7 @@ def show(logs: Sequence[RunData], *, source: bool = True, at_s: float | None = N
     except ConfigError as error:
         trouble = as_sentence(error)
     saved = scene.save(logs, source=source, overwrite=overwrite)
-    return saved._replace(said=f"{trouble}{saved.said}, or use a browser: imutool view --web")
+    return replace(saved, said=f"{trouble}{saved.said}, or use a browser: imutool view --web")
 
 
 def open_viewer(logs: Sequence[RunData], *, source: bool = True, at_s: float | None = None) -> Output:

@@ -14,7 +14,7 @@ from support import saved_rrd
 
 from imutool.recording import Recording
 from imutool.viewing.model.events import Event
-from imutool.viewing.model.run_data import LogTimes, Run, RunData
+from imutool.viewing.model.run_data import LogTimes, Run, RunData, round_up_125
 from imutool.viewing.model.runs import build
 from imutool.viewing.model.trajectory_error import Drift, Errors, Window
 from imutool.viewing.rerun import scene, sdk
@@ -242,7 +242,7 @@ def test_the_debiased_path_has_the_colour_of_its_error_and_the_legend_its_scale(
     errors = one.models()[0].errors
     assert errors is not None
     total = errors.orientation_total_deg
-    top = styles.round_up_125(total.max())
+    top = round_up_125(total.max())
     assert total.max() <= top < 2.6 * total.max()
     packed = entities.all["/world/debiased/path"].rows("LineStrips3D:colors").flatten().to_numpy()
     found = np.stack([packed >> 24, packed >> 16 & 255, packed >> 8 & 255], axis=1)
@@ -263,7 +263,7 @@ def test_an_error_vector_goes_from_the_true_place_to_the_estimated_one(one: RunD
 
 @pytest.mark.parametrize(("highest", "top"), [(0.3, 0.5), (1.0, 1.0), (1.1, 2.0), (5.0, 5.0), (130.0, 200.0), (0.0, 1.0)])
 def test_a_scale_ends_with_a_number_that_can_be_read(highest: float, top: float) -> None:
-    assert styles.round_up_125(highest) == pytest.approx(top)
+    assert round_up_125(highest) == pytest.approx(top)
 
 
 def test_heat_runs_from_its_first_colour_to_its_last_and_is_grey_where_nothing_is_known() -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from itertools import zip_longest
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -92,7 +94,7 @@ def log_events(data: RunData, to: rr.RecordingStream, scope: Scope) -> None:
         to.log(
             entity, styles.state_style(kind.replace("_", " "), EVENT_COLORS.get(kind, EVENT_COLOR)), static=True, strict=True
         )
-        times, states = styles.state_changes([_visible_interval(event, data) for event in of_kind], data.start_ns)
+        times, states = styles.state_changes(_visible_intervals(of_kind, data), data.start_ns)
         changes = rr.StateChange.columns(state=states)
         to.send_columns(entity, sdk.data_times(data, np.array(times, dtype=np.int64)), changes, strict=True)
         level = "INFO" if kind == "stop" else "WARN"
@@ -101,10 +103,18 @@ def log_events(data: RunData, to: rr.RecordingStream, scope: Scope) -> None:
         to.send_columns(entity, sdk.data_times(data, stamps), texts, strict=True)
 
 
-def _visible_interval(event: events.Event, data: RunData) -> tuple[int, int]:
-    """Interval of an event, widened to a visible width; backwards where the log ends before."""
+def _visible_intervals(of_kind: Sequence[events.Event], data: RunData) -> list[tuple[int, int]]:
+    """Intervals of sorted events, widened to a visible width; backwards where the log ends before.
+
+    A widened interval ends half-way to the next event: many moments in a row are not one long event.
+    """
     least_ns = round(MIN_EVENT_SHARE * (data.end_ns - data.start_ns))
-    if event.end_ns - event.start_ns >= least_ns:
-        return event.start_ns, event.end_ns
-    start_ns = min(event.start_ns, data.end_ns - least_ns)
-    return start_ns, start_ns + least_ns
+    intervals = []
+    for event, following in zip_longest(of_kind, of_kind[1:]):
+        start_ns, end_ns = event.start_ns, event.end_ns
+        if end_ns - start_ns < least_ns:
+            start_ns = min(start_ns, data.end_ns - least_ns)
+            half_way = data.end_ns if following is None else (event.end_ns + following.start_ns) // 2
+            end_ns = max(event.end_ns, min(start_ns + least_ns, half_way))
+        intervals.append((start_ns, end_ns))
+    return intervals

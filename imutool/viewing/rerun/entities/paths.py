@@ -10,11 +10,11 @@ import numpy as np
 from jaxtyping import Float64, Int64
 
 from imutool.recording import Poses, Times, nanoseconds
-from imutool.viewing.model.run_data import TRUTH, Rows, RunData, Trace, path_rows, split_at_gaps
+from imutool.viewing.model.run_data import TRUTH, Rows, RunData, Trace, path_rows, round_up_125, split_at_gaps
 from imutool.viewing.model.trajectory_error import Errors
 from imutool.viewing.rerun import sdk
 from imutool.viewing.rerun.entities import styles
-from imutool.viewing.rerun.entities.styles import INK, TRUTH_COLOR, WORST_COLOR, Color, color_of, heat_colors, round_up_125
+from imutool.viewing.rerun.entities.styles import INK, TRUTH_COLOR, WORST_COLOR, Color, color_of, heat_colors
 from imutool.viewing.rerun.sdk import Scope
 
 if TYPE_CHECKING:

@@ -71,12 +71,6 @@ def heat_colors(values: Float64[np.ndarray, " n"], top: float) -> UInt8[np.ndarr
     return np.where(finite[:, None], np.rint(colors), GREY).astype(np.uint8)
 
 
-def round_up_125(highest: float) -> float:
-    """Next number of the form 1, 2 or 5 times a power of ten, as the end of a scale."""
-    decade = 10.0 ** np.floor(np.log10(highest)) if highest > 0.0 else 1.0
-    return float(next(step for step in (1.0, 2.0, 5.0, 10.0) if step * decade >= highest * (1.0 - 1e-9)) * decade)
-
-
 def curves(names: Sequence[str], colors: Sequence[Color], width: float) -> rr.SeriesLines:
     """Style of one curve per name; draws the extremes per pixel instead of the mean."""
     return line_style(names, colors, [width] * len(names))

@@ -14,9 +14,9 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float64, Int64
 
-from imutool.columns import Columns
 from imutool.errors import DataError
 from imutool.geometry import quaternion
+from imutool.recording.columns import Columns
 
 GRAVITY_M_S2 = 9.81
 UNIT_QUATERNION_TOLERANCE = 1e-6  # six printed decimals, as in the normalised EuRoC truth
@@ -151,9 +151,10 @@ class Recording:
     metadata: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
     imu_topic: str = "/imu0"
     source: str = ""
+    other_poses: Mapping[str, str] = field(default_factory=dict)  # kinds of pose topics that are no truth: not read
 
     def __post_init__(self) -> None:
-        for name in ("truths", "scalars", "frames", "metadata"):
+        for name in ("other_poses", "truths", "scalars", "frames", "metadata"):
             object.__setattr__(self, name, _mapping(getattr(self, name)))
 
     def __eq__(self, other: object) -> bool:
@@ -176,8 +177,20 @@ class Recording:
             DataError: the recording has none.
         """
         if not self.truths:
-            raise DataError("no true poses", where=self.name, expected="a pose topic in the log")
+            raise self.no_truth("no true poses")
         return next(iter(self.truths.values()))
+
+    def no_truth(self, what: str, expected: str = "a pose topic in the log") -> DataError:
+        """Error of a recording without truth; it names the poses that are an estimate or odometry."""
+        if not self.other_poses:
+            return DataError(what, where=self.name, expected=expected)
+        listed = ", ".join(f"{topic} ({kind})" for topic, kind in self.other_poses.items())
+        return DataError(
+            f"{what}: the poses are {listed}",
+            where=self.name,
+            expected=expected,
+            fix="Take one of them all the same with `truth`",
+        )
 
     def with_truth(self, topic: str) -> Recording:
         """Recording with only one of its true trajectories.

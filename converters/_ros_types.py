@@ -1,0 +1,171 @@
+"""ROS message types: ROS 1 definitions as ROS 2 definitions, ROS 1 messages as CDR.
+
+A type that ROS 2 has with the same fields gets the definition of ROS 2, so that ROS 2 programs know it. Any other keeps the
+definition of its bag, with names that ROS 2 allows: `wheel_speed` for `wheelSpeed`. Needs rosbags.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Mapping
+from functools import cache, lru_cache, partial
+from pathlib import Path
+from typing import Any
+
+from imutool.errors import ConfigError
+from imutool.recording.message_log import MessageTopic
+
+HEADER, TIME, DURATION = "std_msgs/msg/Header", "builtin_interfaces/msg/Time", "builtin_interfaces/msg/Duration"
+RENAMED = {"tf/msg/tfMessage": "tf2_msgs/msg/TFMessage"}
+EMPTY_CDR = b"\0\1\0\0\0"  # ROS 2 gives a message without fields one byte
+NAME = 2  # rosbags' kind of field: another message
+FIELD = re.compile(r"(?!.*__)(?!.*_$)[a-z][a-z0-9_]*")
+TYPE = re.compile(r"[A-Z][A-Za-z0-9]*")
+CONSTANT_NAME = re.compile(r"[A-Z]([A-Z0-9_]?[A-Z0-9]+)*")
+CONSTANT = re.compile(r"^[ \t]*[a-z0-9]+[ \t]+\w+[ \t]*=.*$", re.MULTILINE)  # a line of a definition
+ToCdr = Callable[[bytes], "bytes | memoryview"]
+
+
+def need_rosbags(where: Path) -> None:
+    """Check that rosbags is installed.
+
+    Raises:
+        ConfigError: it is not.
+    """
+    try:
+        import rosbags.typesys  # noqa: F401
+    except ImportError as error:
+        raise ConfigError(
+            "reading ROS bags needs rosbags", where=where, fix="Install it with: pip install 'imutool[bags]'"
+        ) from error
+
+
+def ros2_name(kind: str) -> str:
+    """Message type in ROS 2 spelling."""
+    package, _, name = kind.partition("/")
+    return f"{package}/msg/{name}" if "/" not in name else kind
+
+
+@cache
+def ros2_store() -> Any:
+    """The message types of ROS 2 Jazzy."""
+    from rosbags.typesys import Stores, get_typestore
+
+    return get_typestore(Stores.ROS2_JAZZY)
+
+
+@lru_cache(maxsize=256)
+def ros2_definition(kind: str) -> tuple[bytes, str] | None:
+    """Text and REP-2011 hash of a type that ROS 2 has; None of any other."""
+    store = ros2_store()
+    if kind not in store.fielddefs:
+        return None
+    return store.generate_msgdef(kind, ros_version=2)[0].encode(), store.hash_rihs01(kind)
+
+
+class Ros1Types:
+    """Message types of one ROS 1 bag, from the definitions in its connections."""
+
+    def __init__(self) -> None:
+        self._stores: list[Any] = []  # two publishers may define a type in two ways
+
+    def topic(self, name: str, kind: str, definition: str) -> tuple[MessageTopic, ToCdr]:
+        """Topic in CDR, and the translation of its messages.
+
+        Raises:
+            Exception: rosbags cannot parse the definition; what it raises is its own affair.
+        """
+        store = self._store_of(definition, ros2_name(kind))
+        ros1_kind = _type_name(ros2_name(kind))
+        kind = RENAMED.get(ros2_name(kind), ros1_kind)
+        theirs = ros2_store()
+        fields = store.fielddefs[ros1_kind][1]
+        if kind in theirs.fielddefs and same_layout(store.fielddefs, ros1_kind, theirs.fielddefs, kind):
+            text, digest = ros2_definition(kind) or (b"", "")
+        else:
+            kind = ros1_kind
+            text, digest = store.generate_msgdef(kind, ros_version=2)[0].encode(), store.hash_rihs01(kind)
+        topic = MessageTopic(name, kind, "ros2msg", text, "cdr", (("topic_type_hash", digest),))
+        return topic, partial(store.ros1_to_cdr, typename=ros1_kind) if fields else (lambda _: EMPTY_CDR)
+
+    def _store_of(self, definition: str, kind: str) -> Any:
+        from rosbags.typesys import Stores, TypesysError, get_types_from_msg, get_typestore
+
+        known = ros2_store().fielddefs
+        try:
+            found = get_types_from_msg(definition, kind)
+        except TypesysError:  # most often a constant: they are no part of a message
+            found = get_types_from_msg(CONSTANT.sub("", definition), kind)
+        parsed = {_type_name(name): _renamed(*parts) for name, parts in found.items()}
+        parsed |= {name: known[name] for name in (HEADER, TIME, DURATION)}
+        for store in self._stores:
+            try:
+                store.register(parsed)
+            except TypesysError:
+                continue
+            return store
+        store = get_typestore(Stores.EMPTY)
+        store.register(parsed)
+        self._stores.append(store)
+        return store
+
+
+def _type_name(kind: str) -> str:
+    """Type name that ROS 2 allows: `my_robot/msg/WheelState` for `My_robot/msg/wheel_state`."""
+    package, _, message = kind.rpartition("/msg/")
+    if not TYPE.fullmatch(message):
+        message = "".join(part[:1].upper() + part[1:] for part in message.split("_"))
+    return f"{_field_name(package)}/msg/{message}"
+
+
+def _field_name(name: str) -> str:
+    """Field name that ROS 2 allows: `wheel_speed` for `wheelSpeed`."""
+    if FIELD.fullmatch(name):
+        return name
+    snake = re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", name).lower()
+    return re.sub(r"__+", "_", snake).strip("_") or "field"
+
+
+def _renamed(constants: list[Any], fields: list[Any]) -> tuple[list[Any], list[Any]]:
+    """Constants and fields of a type with names that ROS 2 allows; no two alike."""
+    names: list[str] = []
+    for name, _ in fields:
+        new = _field_name(name)
+        names.append(new if new not in names else f"{new}_{len(names)}")
+    kept = [(name.upper(), *rest) for name, *rest in constants if CONSTANT_NAME.fullmatch(name.upper())]
+    return kept, [(name, _renamed_field(field)) for name, (_, field) in zip(names, fields, strict=True)]
+
+
+def _renamed_field(field: Any) -> Any:
+    """Description of a field, its message type renamed."""
+    if field[0] == NAME:
+        return field[0], _type_name(field[1])
+    if isinstance(field[1][0], tuple):
+        return field[0], (_renamed_field(field[1][0]), field[1][1])
+    return field
+
+
+def ros1_topic(name: str, kind: str, definition: str) -> MessageTopic:
+    """Topic that keeps the encoding of ROS 1."""
+    spelled = kind.replace("/msg/", "/")
+    return MessageTopic(name, spelled, "ros1msg", definition.encode(), "ros1")
+
+
+def same_layout(ours: Mapping[str, Any], our_kind: str, theirs: Mapping[str, Any], their_kind: str) -> bool:
+    """Whether two definitions lay out a message in the same bytes."""
+    if our_kind == HEADER == their_kind:
+        return True
+    if our_kind not in ours or their_kind not in theirs:
+        return False
+    mine, other = ours[our_kind][1], theirs[their_kind][1]
+    return len(mine) == len(other) and all(_same_field(ours, a, theirs, b) for (_, a), (_, b) in zip(mine, other, strict=True))
+
+
+def _same_field(ours: Mapping[str, Any], mine: Any, theirs: Mapping[str, Any], other: Any) -> bool:
+    if mine[0] != other[0]:
+        return False
+    if mine[0] == NAME:
+        return same_layout(ours, mine[1], theirs, other[1])
+    if isinstance(mine[1][0], tuple):  # an array or a sequence: of what, and how many
+        return bool(mine[1][1] == other[1][1]) and _same_field(ours, mine[1][0], theirs, other[1][0])
+    return bool(mine == other)

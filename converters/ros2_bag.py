@@ -1,0 +1,150 @@
+"""ROS 2 bag, sqlite3 or MCAP, split or compressed: every topic under its own name.
+
+A bag is the folder with its metadata.yaml, a folder of storage files that its recorder did not finish, or a single .db3 file.
+Bags of old ROS 2 versions hold no definitions: those of ROS 2 Jazzy stand in. A type that Jazzy lacks keeps its bytes without
+a definition, and is named.
+"""
+
+from __future__ import annotations
+
+import sqlite3
+import zlib
+from collections import Counter
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from imutool.errors import DataError
+from imutool.recording.message_log import Message, MessageLog, MessageTopic, Remarks
+
+from . import Sequence
+from ._files import find_files, find_folders, head
+from ._ros_types import need_rosbags, ros2_definition
+
+GENERAL = True
+METADATA = "metadata.yaml"
+SQLITE = b"SQLite format 3\0"
+IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
+ENCODINGS = {"MSG": "ros2msg", "IDL": "ros2idl"}
+
+
+def sequences(source: Path) -> list[Sequence]:
+    """Bag folders and storage files of sqlite3 in the source."""
+    folders = find_folders(source, _is_bag)
+    taken = [sequence.path for sequence in folders]
+    files = [] if source in taken else find_files(source, (".db3",), lambda start: start.startswith(SQLITE))
+    return folders + [file for file in files if file.path.parent not in taken and _has_messages(file.path)]
+
+
+def recognises(sequence: Sequence) -> bool:
+    """Whether a sequence is a bag: always, as only bags are listed."""
+    return True
+
+
+def read_sequence(sequence: Sequence, *, images: bool = True) -> MessageLog:
+    """Message log of a bag.
+
+    Raises:
+        ConfigError: rosbags is not installed.
+        DataError: the bag cannot be read.
+    """
+    need_rosbags(sequence.path)
+    remarks = Remarks()
+    with _open(sequence.path, remarks) as readers:
+        topics: dict[str, MessageTopic] = {}
+        counts = Counter[str]()
+        for connection in (c for reader in readers for c in reader.connections):
+            if images or connection.msgtype not in IMAGES:
+                topics.setdefault(connection.topic, _topic(connection, remarks))
+                counts[connection.topic] += connection.msgcount
+    return MessageLog(
+        sequence.name,
+        sequence.path.name,
+        topics=tuple(topics.values()),
+        messages=partial(_messages, sequence.path, topics),
+        counts=dict(counts),
+        metadata={"imutool": {"format": "ros2_bag", "sequence": sequence.name}},
+        remarks=remarks,
+    )
+
+
+def read(source: Path) -> Iterator[MessageLog]:
+    """Message logs of all bags of the source, one after the other."""
+    return map(read_sequence, sequences(source))
+
+
+def _is_bag(folder: Path) -> bool:
+    metadata = folder / METADATA
+    if metadata.is_file():
+        return b"rosbag2_bagfile_information" in head(metadata)
+    return any(_has_messages(path) for path in folder.glob("*.db3"))
+
+
+def _has_messages(path: Path) -> bool:
+    """Whether a database has the tables of a bag."""
+    if head(path, len(SQLITE)) != SQLITE:
+        return False
+    try:
+        with sqlite3.connect(f"file:{path}?immutable=1", uri=True) as database:
+            names = {name for (name,) in database.execute("SELECT name FROM sqlite_master WHERE type = 'table'")}
+    except sqlite3.Error:
+        return False
+    return {"topics", "messages"} <= names
+
+
+def _topic(connection: Any, remarks: Remarks) -> MessageTopic:
+    """Topic with the definition in the bag, or that of ROS 2 Jazzy."""
+    kind, form = connection.msgtype, connection.msgdef.format.name
+    metadata: tuple[tuple[str, str], ...] = (("topic_type_hash", connection.digest),) if connection.digest else ()
+    if connection.ext.offered_qos_profiles:
+        from rosbags.rosbag2.metadata import dump_qos_v8
+
+        metadata += (("offered_qos_profiles", dump_qos_v8(connection.ext.offered_qos_profiles)),)
+    if form in ENCODINGS:
+        return MessageTopic(connection.topic, kind, ENCODINGS[form], connection.msgdef.data.encode(), "cdr", metadata)
+    known = ros2_definition(kind)
+    if known is None:
+        remarks.notes.append(f"{connection.topic} has no definition of its {kind}: its messages are kept as they are")
+        return MessageTopic(connection.topic, kind, "", b"", "cdr", metadata)
+    return MessageTopic(connection.topic, kind, "ros2msg", known[0], "cdr", metadata)
+
+
+def _messages(path: Path, topics: dict[str, MessageTopic]) -> Iterator[Message]:
+    with _open(path, Remarks()) as readers:
+        for reader in readers:
+            wanted = [connection for connection in reader.connections if connection.topic in topics]
+            for connection, time_ns, payload in reader.messages(wanted):
+                yield Message(topics[connection.topic], time_ns, time_ns, payload)
+
+
+@contextmanager
+def _open(path: Path, remarks: Remarks) -> Iterator[list[Any]]:
+    """Open a bag folder, or storage files one by one.
+
+    Raises:
+        DataError: rosbags or SQLite cannot read it.
+    """
+    import apsw
+    from rosbags.rosbag2 import ReaderError
+    from rosbags.rosbag2.reader import DirectoryReader
+    from rosbags.rosbag2.storage_sqlite3 import Sqlite3Reader
+
+    readers: list[Any]
+    if path.is_file():
+        readers = [Sqlite3Reader(path)]
+    elif (path / METADATA).is_file():
+        readers = [DirectoryReader(path)]
+    else:
+        readers = [Sqlite3Reader(file) for file in sorted(path.glob("*.db3")) if _has_messages(file)]
+        remarks.notes.append(f"the bag has no {METADATA}; its storage files were read in order of their names")
+    try:
+        with ExitStack() as stack:
+            for reader in readers:
+                reader.open()
+                stack.callback(reader.close)
+            yield readers
+    except (ReaderError, apsw.Error, OSError, EOFError, zlib.error, ValueError, KeyError, AssertionError) as error:
+        reason = str(error).partition("\n")[0] or type(error).__name__
+        raise DataError(f"cannot be read as a ROS 2 bag ({reason})", where=path) from error

@@ -1,0 +1,260 @@
+"""PX4 ULog (.ulg): IMUs in FLU, the EKF's poses as an estimate, simulated truth as truth, every topic.
+
+Frames: PX4 measures in FRD (x forward, y right, z down) and its world is NED. The IMU and pose topics are written in FLU (x
+forward, y left, z up) and ENU, as ROS has them: y and z of the body change sign. The topics of PX4 keep its own frames, as
+messages of the types px4_msgs. Stamps are PX4's own clock, in most logs the time since boot.
+"""
+
+from __future__ import annotations
+
+import logging
+import re
+import struct
+from collections.abc import Iterator
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float64, Int64
+
+from imutool.errors import ConfigError, DataError
+from imutool.geometry import quaternion
+from imutool.recording import Imu, Poses
+from imutool.recording.message_log import Message, MessageLog, MessageTopic, Remarks, Table
+
+from . import Sequence
+from ._files import find_files, head
+from ._imu_columns import in_order, joined
+
+GENERAL = True
+MAGIC, ENCRYPTED = b"ULog\x01\x12\x35", b"ULogEnc"
+LEAST_IMU_HZ = 10.0  # slower logs of a sensor are samples for its temperature, not for its motion
+FLU_FROM_FRD = np.array([1.0, -1.0, -1.0])
+Q_ENU_FROM_NED_WXYZ = np.array([[0.0, np.sqrt(0.5), np.sqrt(0.5), 0.0]])
+Q_FRD_FROM_FLU_WXYZ = np.array([[0.0, 1.0, 0.0, 0.0]])
+NO_ACCEL = 0x7FFFFFFF  # accelerometer_timestamp_relative without an accelerometer
+LOG_DEFINITION = (
+    "builtin_interfaces/Time stamp\nuint8 level\nstring name\nstring msg\nstring file\nstring function\nuint32 line\n"
+    f"{'=' * 80}\nMSG: builtin_interfaces/Time\nint32 sec\nuint32 nanosec\n"
+)
+LOG_LEVELS = {"DEBUG": 10, "INFO": 20, "NOTICE": 20, "WARNING": 30, "ERROR": 40}  # of rcl_interfaces/Log; others are fatal
+Columns = dict[str, np.ndarray]
+
+
+def sequences(source: Path) -> list[Sequence]:
+    """ULog files in the source, by their first bytes."""
+    return find_files(source, (".ulg", ".ulge"), lambda start: start.startswith((MAGIC, ENCRYPTED)))
+
+
+def recognises(sequence: Sequence) -> bool:
+    """Whether a sequence is a ULog: always, as only ULogs are listed."""
+    return True
+
+
+def read_sequence(sequence: Sequence, *, images: bool = True) -> MessageLog:
+    """Message log of a ULog.
+
+    Raises:
+        ConfigError: pyulog is not installed.
+        DataError: the file is encrypted, damaged beyond reading, or holds no data.
+    """
+    ulog = _open(sequence.path)
+    remarks = Remarks()
+    topics: dict[str, Columns] = {}
+    several = {data.name for data in ulog.data_list if data.multi_id > 0}
+    for data in ulog.data_list:
+        name = f"{data.name}/{data.multi_id}" if data.name in several else data.name
+        if len(data.data["timestamp"]):
+            topics[name] = data.data
+    if not topics:
+        raise DataError("holds no data", where=sequence.path, expected="a log with messages")
+    if ulog.file_corruption:
+        remarks.losses.append("the file is damaged: some of its messages could not be read")
+    if ulog.dropouts:
+        lost_s = sum(dropout.duration for dropout in ulog.dropouts) * 1e-3
+        remarks.notes.append(f"PX4 reports {len(ulog.dropouts)} dropouts, {lost_s:.3f} s: the topics have gaps there")
+    poses = {topic: p for topic, p in _all_poses(topics, remarks).items() if p is not None}
+    return MessageLog(
+        sequence.name,
+        sequence.path.name,
+        topics=(_log_topic(),) if ulog.logged_messages else (),
+        messages=partial(_logged, [(m.timestamp, m.log_level_str(), m.message) for m in ulog.logged_messages]),
+        imus=_imus(topics, remarks),
+        poses=poses,
+        tables={f"/{name}": _table(name, columns) for name, columns in topics.items()},
+        kinds={topic: "truth" if topic.startswith("/ground_truth") else "estimate" for topic in poses},
+        metadata=_metadata(sequence, ulog),
+        remarks=remarks,
+    )
+
+
+def read(source: Path) -> Iterator[MessageLog]:
+    """Message logs of all ULogs of the source, one after the other."""
+    return map(read_sequence, sequences(source))
+
+
+def _open(path: Path) -> Any:
+    try:
+        from pyulog import ULog
+    except ImportError as error:
+        raise ConfigError(
+            "reading ULogs needs pyulog", where=path, fix="Install it with: pip install 'imutool[ulog]'"
+        ) from error
+    if head(path, len(ENCRYPTED)) == ENCRYPTED:
+        raise DataError("is encrypted", where=path, fix="Decrypt it with PX4's Tools/decrypt_ulog.py first")
+    printing = logging.getLogger("pyulog")
+    printing.setLevel(logging.ERROR)
+    try:
+        with path.open("rb") as file:  # pyulog leaves a file that it refuses open
+            return ULog(file, None, True)
+    except Exception as error:  # pyulog raises TypeError, struct.error, KeyError, IndexError: whatever the bytes lead to
+        raise DataError(f"cannot be read as a ULog ({error or type(error).__name__})", where=path) from error
+
+
+def _metadata(sequence: Sequence, ulog: Any) -> dict[str, dict[str, str]]:
+    own = {"format": "ulog", "sequence": sequence.name, "frames": "IMU and poses: FLU body in ENU; px4_msgs topics: FRD in NED"}
+    return {
+        "imutool": own,
+        "px4/info": {name: str(value) for name, value in ulog.msg_info_dict.items()},
+        "px4/parameters": {name: str(value) for name, value in ulog.initial_parameters.items()},
+        "px4/changed_parameters": {f"{t} us {name}": str(value) for t, name, value in ulog.changed_parameters},
+        "px4/dropouts": {f"{dropout.timestamp} us": f"{dropout.duration} ms" for dropout in ulog.dropouts},
+    }
+
+
+def _ns(columns: Columns, name: str = "timestamp") -> Int64[np.ndarray, " n"]:
+    return columns[name].astype(np.int64) * 1000
+
+
+def _sample_ns(columns: Columns) -> Int64[np.ndarray, " n"]:
+    """Time of a sample where PX4 logs it, else of its message."""
+    return _ns(columns, "timestamp_sample" if "timestamp_sample" in columns else "timestamp")
+
+
+def _vectors(columns: Columns, names: str) -> Float64[np.ndarray, "n k"]:
+    return np.stack([columns[name].astype(np.float64) for name in names.split()], axis=1)
+
+
+def _imus(topics: dict[str, Columns], remarks: Remarks) -> dict[str, Imu]:
+    """IMU of the estimator, and those of each sensor that is logged fast enough."""
+    imus: dict[str, Imu] = {}
+    if (combined := topics.get("sensor_combined")) is not None:
+        gyro_ns = _ns(combined)
+        relative = combined["accelerometer_timestamp_relative"].astype(np.int64)
+        known = relative != NO_ACCEL
+        gyro = _vectors(combined, "gyro_rad[0] gyro_rad[1] gyro_rad[2]") * FLU_FROM_FRD
+        names = "accelerometer_m_s2[0] accelerometer_m_s2[1] accelerometer_m_s2[2]"
+        accel = _vectors(combined, names)[known] * FLU_FROM_FRD
+        _put(imus, "/imu", (gyro_ns, gyro, (gyro_ns + relative * 1000)[known], accel), remarks)
+    for name in sorted(topics):
+        gyro_name, number = re.fullmatch(r"sensor_gyro(?:_fifo)?(?:/(\d+))?", name), 0
+        accel_columns = topics.get(name.replace("gyro", "accel"))
+        if gyro_name is None or accel_columns is None:
+            continue
+        number = int(gyro_name[1] or 0)
+        gyro_ns, gyro = _samples(topics[name])
+        accel_ns, accel = _samples(accel_columns)
+        if len(gyro_ns) > 1 and (len(gyro_ns) - 1) * 1e9 >= LEAST_IMU_HZ * float(gyro_ns[-1] - gyro_ns[0]):
+            topic = f"/imu/{'fifo' if 'fifo' in name else 'sensor'}{number}"
+            _put(imus, topic, (gyro_ns, gyro, accel_ns, accel), remarks)
+    if not imus:
+        remarks.losses.append("the log has no IMU: neither sensor_combined, nor sensor_gyro and sensor_accel at 10 Hz or more")
+    return imus
+
+
+def _put(imus: dict[str, Imu], topic: str, columns: tuple[Any, Any, Any, Any], remarks: Remarks) -> None:
+    try:
+        imus[topic], notes = joined(*columns, name=topic)
+        remarks.notes.extend(notes)
+    except DataError as error:
+        remarks.losses.append(f"{topic} is left out: {error.what}")
+
+
+def _samples(columns: Columns) -> tuple[Int64[np.ndarray, " n"], Float64[np.ndarray, "n 3"]]:
+    """Stamps and values of a sensor in FLU; the samples of a FIFO are spread over its time."""
+    if "samples" not in columns or "dt" not in columns:
+        return _sample_ns(columns), _vectors(columns, "x y z") * FLU_FROM_FRD
+    counts = columns["samples"].astype(np.int64)
+    size = sum(1 for name in columns if re.fullmatch(r"x\[\d+\]", name))
+    taken = np.arange(size)[None, :] < counts[:, None]
+    back = (counts[:, None] - 1 - np.arange(size)[None, :]) * columns["dt"].astype(np.float64)[:, None] * 1000.0
+    t_ns = _sample_ns(columns)[:, None] - np.rint(back).astype(np.int64)
+    axes = [np.stack([columns[f"{axis}[{n}]"] for n in range(size)], axis=1) for axis in "xyz"]
+    values = np.stack(axes, axis=2).astype(np.float64) * columns["scale"].astype(np.float64)[:, None, None]
+    return t_ns[taken], values[taken] * FLU_FROM_FRD
+
+
+def _all_poses(topics: dict[str, Columns], remarks: Remarks) -> dict[str, Poses | None]:
+    truth, ekf = "_groundtruth", ""
+    return {
+        "/ground_truth/pose": _poses(topics, truth, remarks),
+        "/ekf/pose": _poses(topics, ekf, remarks),
+    }
+
+
+def _poses(topics: dict[str, Columns], ending: str, remarks: Remarks) -> Poses | None:
+    """Poses in ENU at the stamps of the attitude; position and velocity are interpolated between PX4's."""
+    attitude, position = topics.get(f"vehicle_attitude{ending}"), topics.get(f"vehicle_local_position{ending}")
+    if attitude is None:
+        return None
+    q = in_order(_sample_ns(attitude), _vectors(attitude, "q[0] q[1] q[2] q[3]"), f"vehicle_attitude{ending}")
+    remarks.notes.extend(q.notes)
+    if not len(q.t_ns):
+        return None
+    t_ns, q_ned_frd = q.t_ns, quaternion.unit(q.values)
+    p_wb, v_w = np.zeros((len(t_ns), 3)), None
+    if position is not None:
+        moves = in_order(_sample_ns(position), _vectors(position, "y x z vy vx vz"), f"vehicle_local_position{ending}")
+        if len(moves.t_ns) > 1:
+            inside = (t_ns >= moves.t_ns[0]) & (t_ns <= moves.t_ns[-1])
+            t_ns, q_ned_frd, start = t_ns[inside], q_ned_frd[inside], moves.t_ns[0]
+            knots, t = (moves.t_ns - start).astype(float), (t_ns - start).astype(float)
+            both = np.stack([np.interp(t, knots, column) for column in moves.values.T], axis=1)
+            p_wb, v_w = both[:, :3] * [1.0, 1.0, -1.0], both[:, 3:] * [1.0, 1.0, -1.0]
+    if v_w is None:
+        remarks.notes.append(f"vehicle_attitude{ending} has no positions with it: those of its poses are zero")
+    q_wb = quaternion.multiply(quaternion.multiply(Q_ENU_FROM_NED_WXYZ, q_ned_frd), Q_FRD_FROM_FLU_WXYZ)
+    return Poses(t_ns, p_wb, quaternion.unit(q_wb), v_w)
+
+
+def _table(name: str, columns: Columns) -> Table:
+    """Columns of a PX4 topic as a message; `q[0]`, `q[1]`, ... are one field."""
+    groups: dict[str, list[str]] = {}
+    for column in columns:
+        groups.setdefault(re.sub(r"\[\d+\]$", "", column), []).append(column)
+    fields, values = [], {}
+    for group, members in groups.items():
+        field = re.sub(r"[^a-z0-9]+", "_", group.lower()).strip("_")
+        kind = np.result_type(*(columns[member].dtype for member in members))
+        shape = (len(members),) if members != [group] else ()
+        fields.append((field, kind, shape))
+        values[field] = np.stack([columns[m] for m in members], axis=1) if shape else columns[group]
+    rows = np.zeros(len(columns["timestamp"]), np.dtype(fields))
+    for field, value in values.items():
+        rows[field] = value
+    t_ns = _ns(columns)
+    order = np.argsort(t_ns, kind="stable")
+    message = "".join(part.capitalize() for part in name.partition("/")[0].split("_"))
+    return Table(t_ns[order], rows[order], f"px4_msgs/msg/{message}")
+
+
+def _log_topic() -> MessageTopic:
+    return MessageTopic("/logged_messages", "rcl_interfaces/msg/Log", "ros2msg", LOG_DEFINITION.encode(), "cdr")
+
+
+def _logged(lines: list[tuple[int, str, str]]) -> Iterator[Message]:
+    """Text messages of PX4, as ROS 2 logs them."""
+    topic = _log_topic()
+    for timestamp, level, text in sorted(lines, key=lambda line: line[0]):
+        t_ns = int(timestamp) * 1000
+        payload = bytearray(b"\0\1\0\0") + struct.pack("<iIB", *divmod(t_ns, 10**9), LOG_LEVELS.get(level, 50))
+        for part in ("px4", text, "", ""):
+            _put_text(payload, part)
+        payload += bytes(-(len(payload) - 4) % 4) + struct.pack("<I", 0)
+        yield Message(topic, t_ns, t_ns, bytes(payload))
+
+
+def _put_text(payload: bytearray, text: str) -> None:
+    raw = text.encode("utf-8", "replace") + b"\0"
+    payload += bytes(-(len(payload) - 4) % 4) + struct.pack("<I", len(raw)) + raw

@@ -1,0 +1,166 @@
+"""Stretches of samples: what is no measurement left out, and a clock that no jump of the stamps can carry away.
+
+Filters cost by samples and their times stay small: a step of the stamps of more than `GAP_S`, or back by as much, begins a new
+stretch, and counts as at most `MOST_GAP_S`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float64, Int64
+
+from imutool.bias.model import GAP_S
+from imutool.cleaning.cleaner import rows
+from imutool.errors import ConfigError, LogError
+from imutool.mcap_io.topics import CLEAN_FIX, ImuBatch
+from imutool.recording import nanoseconds
+
+MOST_GAP_S = 3600.0  # of a gap on the filters' clock: beyond, the time says nothing about the bias
+MOST = np.array([1e4] * 3 + [1e6] * 3)  # rad/s and m/s²: no gyro or accelerometer measures more
+LEAST_FORCE_M_S2 = 1e-9  # on some axis: even in free fall a sensor's noise exceeds it
+MOST_STRETCHES, MOST_WARNINGS = 1000, 5  # that a report lists, and that the terminal shows
+NOT_FINITE, OUT_OF_RANGE, ZERO_FORCE = "not_finite", "out_of_range", "zero_force"
+
+Rows3 = Float64[np.ndarray, "n 3"]
+
+
+class Stretch(NamedTuple):
+    """Beginning of a stretch: its first stamp, and the step of the stamps to it (negative: the clock was set back)."""
+
+    start_ns: int
+    step_s: float
+
+    @property
+    def jump(self) -> bool:
+        """Whether the clock jumped, rather than paused."""
+        return not 0.0 < self.step_s <= MOST_GAP_S
+
+
+def unmeasured(gyro: Rows3, accel: Rows3) -> Mapping[str, Bool[np.ndarray, " n"]]:
+    """Samples that are no measurement, by reason: not finite, beyond any sensor, or no specific force at all."""
+    u = np.concatenate([gyro, accel], axis=1)
+    size = np.abs(u)
+    not_finite = ~np.isfinite(u).all(axis=1)
+    out_of_range = ~not_finite & (size > MOST).any(axis=1)
+    zero = ~not_finite & ~out_of_range & (size[:, 3:].max(axis=1, initial=0.0) < LEAST_FORCE_M_S2)
+    return {NOT_FINITE: not_finite, OUT_OF_RANGE: out_of_range, ZERO_FORCE: zero}
+
+
+def measured(gyro: Rows3, accel: Rows3) -> Bool[np.ndarray, " n"]:
+    """Samples that are a measurement."""
+    good: Bool[np.ndarray, " n"] = ~np.logical_or.reduce(list(unmeasured(gyro, accel).values()))
+    return good
+
+
+class StretchClock:
+    """Monotone time of samples, equal to their stamps up to the first jump."""
+
+    def __init__(self) -> None:
+        self.stretches: list[Stretch] = []
+        self.count = 0
+        self._last_ns: int | None = None
+        self._removed_ns = 0
+
+    def __call__(self, stamp_ns: Int64[np.ndarray, " n"]) -> Int64[np.ndarray, " n"]:
+        """Times (ns) of the next samples.
+
+        Raises:
+            LogError: a stamp that repeats, or goes back by less than `GAP_S`.
+        """
+        if not len(stamp_ns):
+            return stamp_ns
+        before = np.int64(stamp_ns[0] - 1 if self._last_ns is None else self._last_ns)
+        step = np.diff(stamp_ns, prepend=before)
+        gap_ns, most_ns = nanoseconds(GAP_S), nanoseconds(MOST_GAP_S)
+        wrong = (step <= 0) & (step > -gap_ns)
+        if wrong.any():
+            row = int(np.argmax(wrong))
+            how = "repeats" if step[row] == 0 else "goes back"
+            raise LogError(
+                f"message {self.count + row} has the stamp {stamp_ns[row]} ns, which {how}: "
+                f"the message before has {stamp_ns[row] - step[row]} ns",
+                expected="stamps that increase",
+                fix=CLEAN_FIX,
+            )
+        begins = np.flatnonzero((step > gap_ns) | (step < 0))
+        self.stretches += [Stretch(int(stamp_ns[k]), float(step[k]) * 1e-9) for k in begins[:MOST_STRETCHES]]
+        del self.stretches[MOST_STRETCHES:]
+        kept = np.where((step > most_ns) | (step < 0), most_ns, step)
+        removed = self._removed_ns + np.cumsum(step - kept)
+        self.count, self._last_ns, self._removed_ns = self.count + len(step), int(stamp_ns[-1]), int(removed[-1])
+        return np.asarray(stamp_ns - removed)
+
+
+@dataclass
+class Sieve:
+    """Samples of one IMU without those that are no measurement, with times of a `StretchClock`."""
+
+    where: str = ""
+    clock: StretchClock = field(default_factory=StretchClock)
+    left_out: dict[str, int] = field(default_factory=dict)
+    first_ns: int = 0  # stamp of the first sample that was left out
+
+    def __call__(self, batch: ImuBatch) -> tuple[ImuBatch, Int64[np.ndarray, " n"]]:
+        """Measured samples and their times (ns).
+
+        Raises:
+            LogError: a stamp that repeats, or goes back by less than `GAP_S`.
+        """
+        reasons = unmeasured(batch.gyro, batch.accel)
+        bad = np.logical_or.reduce(list(reasons.values()))
+        if bad.any():
+            self.first_ns = self.first_ns if self.left_out else int(batch.stamp_ns[np.argmax(bad)])
+            for reason, mask in reasons.items():
+                if mask.any():
+                    self.left_out[reason] = self.left_out.get(reason, 0) + int(mask.sum())
+            batch = rows(batch, ~bad)
+        return batch, self.clock(batch.stamp_ns)
+
+    def refuse_nothing(self) -> None:
+        """Refuse an IMU of which next to nothing is left.
+
+        Raises:
+            ConfigError: fewer than two measured samples, others were left out.
+        """
+        if self.left_out and self.clock.count < 2:
+            raise ConfigError(
+                f"no sample is a measurement ({described(self.left_out)})",
+                where=self.where,
+                expected="finite samples with a specific force",
+                fix="Look at the sensor with imutool info, or name another IMU in `imus`",
+            )
+
+    def warnings(self) -> Iterator[str]:
+        """Defects in words: samples that were left out, and jumps of the clock."""
+        if self.left_out:
+            total = sum(self.left_out.values())
+            kinds = described(self.left_out)
+            yield f"{total} samples are no measurement and left out ({kinds}), the first at {self.first_ns} ns"
+        jumps = [stretch for stretch in self.clock.stretches if stretch.jump]
+        for stretch in jumps[:MOST_WARNINGS]:
+            yield f"the clock jumps by {stretch.step_s:+.6g} s to {stretch.start_ns} ns; a new stretch begins there"
+        if len(jumps) > MOST_WARNINGS:
+            yield f"the clock jumps {len(jumps) - MOST_WARNINGS} times more"
+
+    def record(self) -> dict[str, str]:
+        """Entries of the log's metadata; none for a log without defects."""
+        out = {"left_out": ", ".join(f"{reason}: {count}" for reason, count in self.left_out.items())} if self.left_out else {}
+        if self.clock.stretches:
+            out["stretches"] = ", ".join(f"{start_ns}: {step_s:.9g} s" for start_ns, step_s in self.clock.stretches)
+        return out
+
+
+WORDS = {
+    NOT_FINITE: "not finite",
+    OUT_OF_RANGE: "beyond any sensor",
+    ZERO_FORCE: "without any specific force",
+}
+
+
+def described(left_out: Mapping[str, int]) -> str:
+    """Left-out samples in words."""
+    return ", ".join(f"{count} {WORDS[reason]}" for reason, count in left_out.items())

@@ -1,0 +1,63 @@
+"""Labels that the user puts on a log: the sensor's name, and what its poses are worth."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, replace
+
+from imutool.errors import ConfigError
+from imutool.mcap_io.codec import schemas
+from imutool.mcap_io.read import RECORD
+from imutool.mcap_io.topics import MESSAGE_POSES
+from imutool.recording import Recording
+from imutool.recording.message_log import KINDS, MessageLog
+
+POSES = (*MESSAGE_POSES, schemas.TF, "geometry_msgs/msg/PoseWithCovarianceStamped")
+
+
+@dataclass(frozen=True)
+class Labels:
+    """Labels of a log: `sensor` names the IMU, `kinds` says what the poses of a topic are worth."""
+
+    sensor: str = ""
+    kinds: tuple[tuple[str, str], ...] = ()
+
+    def put_on(self, content: Recording | MessageLog) -> Recording | MessageLog:
+        """Content with the labels.
+
+        Raises:
+            ConfigError: a kind is stated for a topic without poses.
+        """
+        if self.sensor:
+            own = {**content.metadata.get(RECORD, {}), "sensor": self.sensor}
+            content = replace(content, metadata={**content.metadata, RECORD: own})
+        if not self.kinds:
+            return content
+        if isinstance(content, Recording):
+            self._check(list(content.truths), content.name)
+            if wrong := [f"{topic}={kind}" for topic, kind in self.kinds if kind != "truth"]:
+                raise ConfigError(f"{wrong[0]}: the data set states that these poses are its truth", where="kinds")
+            return content
+        topics = [topic.name for topic in content.topics if schemas.canonical(topic.schema_name) in POSES]
+        self._check([*content.poses, *topics], content.name)
+        return replace(content, kinds={**content.kinds, **dict(self.kinds)})
+
+    def _check(self, topics: Collection[str], name: str) -> None:
+        for topic, _ in self.kinds:
+            if topic not in topics:
+                raise ConfigError(f"{topic!r} holds no poses in {name}", where="kinds", expected=", ".join(topics) or "(none)")
+
+
+def parse_kinds(texts: Sequence[str]) -> tuple[tuple[str, str], ...]:
+    """Topics and kinds of `TOPIC=KIND` texts.
+
+    Raises:
+        ConfigError: no such text, or no such kind.
+    """
+    kinds = []
+    for text in texts:
+        topic, equals, kind = text.rpartition("=")
+        if not (equals and topic and kind in KINDS):
+            raise ConfigError(f"{text!r}", where="kinds", expected=f"TOPIC=KIND with one of {', '.join(KINDS)}")
+        kinds.append((topic, kind))
+    return tuple(kinds)

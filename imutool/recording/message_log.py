@@ -1,0 +1,91 @@
+"""Message log: topics of any type, as arrays or as encoded messages.
+
+A `Recording` holds one IMU as arrays. A `MessageLog` holds what a robot recorded: every topic, in its own encoding, streamed
+in bounded memory. What a converter knows as numbers (`imus`, `poses`, `scalars`, `tables`) it gives as arrays.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Shaped
+
+from imutool.recording import Imu, Poses, Scalars, Times
+
+KINDS = ("truth", "estimate", "odometry", "unknown")  # what poses are worth
+
+
+@dataclass(frozen=True)
+class MessageTopic:
+    """Topic whose messages pass as bytes: its schema, encoding and channel metadata."""
+
+    name: str
+    schema_name: str
+    schema_encoding: str
+    schema: bytes
+    message_encoding: str
+    metadata: tuple[tuple[str, str], ...] = ()
+
+
+class Message(NamedTuple):
+    """Encoded message of a topic with its log and publish times (ns)."""
+
+    topic: MessageTopic
+    log_time: int
+    publish_time: int
+    payload: bytes | memoryview
+
+
+@dataclass(frozen=True)
+class Table:
+    """Columns of numbers on one clock, written as messages of a type made from the columns' names.
+
+    `columns` is a structured array. A field may have a subarray shape: `gyro_rad` of three numbers.
+    """
+
+    t_ns: Times
+    columns: Shaped[np.ndarray, " n"]
+    schema_name: str
+
+    def __post_init__(self) -> None:
+        if len(self.t_ns) != len(self.columns):
+            raise ValueError(f"{len(self.t_ns)} times for {len(self.columns)} rows")
+
+
+@dataclass
+class Remarks:
+    """Sentences about a conversion; `losses` say what of the source is not in the log."""
+
+    notes: list[str] = field(default_factory=list)
+    losses: list[str] = field(default_factory=list)
+
+
+def no_messages() -> Iterator[Message]:
+    """Yield nothing: the messages of a log that is all arrays."""
+    yield from ()
+
+
+@dataclass(frozen=True)
+class MessageLog:
+    """Log of several topics: arrays by topic, and a stream of encoded messages in log-time order.
+
+    `topics` are defined ahead of the messages; `messages` may use further ones. `counts` states how many messages of a
+    topic the source says it has; the writer compares. `kinds` says what the poses of a topic are worth, where the source
+    knows. `remarks` grows while the messages are read.
+    """
+
+    name: str
+    source: str
+    topics: tuple[MessageTopic, ...] = ()
+    messages: Callable[[], Iterator[Message]] = no_messages
+    counts: Mapping[str, int] = field(default_factory=dict)
+    imus: Mapping[str, Imu] = field(default_factory=dict)
+    poses: Mapping[str, Poses] = field(default_factory=dict)
+    scalars: Mapping[str, Scalars] = field(default_factory=dict)
+    tables: Mapping[str, Table] = field(default_factory=dict)
+    kinds: Mapping[str, str] = field(default_factory=dict)
+    metadata: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
+    remarks: Remarks = field(default_factory=Remarks)

@@ -1,0 +1,194 @@
+"""PX4 ULogs, made up byte by byte and the public samples: frames, kinds, instances, every topic."""
+
+from __future__ import annotations
+
+import struct
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from mcap.reader import make_reader
+from mcap_ros2.decoder import DecoderFactory
+
+from imutool.converters import ulog
+from imutool.mcap_io.log import Log
+from imutool.mcap_io.read import read
+
+START_US = 5_000_000
+CODES = {"uint64_t": "Q", "int32_t": "i", "float": "f", "uint32_t": "I", "uint8_t": "B"}
+
+
+class Writer:
+    """A ULog: formats, then messages."""
+
+    def __init__(self) -> None:
+        self.raw = b"ULog\x01\x12\x35\x01" + struct.pack("<Q", START_US) + self._record(b"B", bytes(40))
+        self.data = b""
+        self.formats: dict[str, str] = {}
+        self.ids = 0
+
+    @staticmethod
+    def _record(kind: bytes, content: bytes) -> bytes:
+        return struct.pack("<H", len(content)) + kind + content
+
+    def text(self, key: str, value: str) -> None:
+        name = f"char[{len(value)}] {key}".encode()
+        self.raw += self._record(b"I", bytes([len(name)]) + name + value.encode())
+
+    def parameter(self, key: str, value: float) -> None:
+        name = f"float {key}".encode()
+        self.raw += self._record(b"P", bytes([len(name)]) + name + struct.pack("<f", value))
+
+    def topic(self, name: str, fields: str, rows: list[tuple[Any, ...]], instance: int = 0) -> None:
+        code = "<"
+        for part in fields.split(";"):
+            kind, _, size = part.split()[0].partition("[")
+            code += f"{size.rstrip(']')}{CODES[kind]}"
+        if name not in self.formats:
+            self.raw += self._record(b"F", f"{name}:{fields};".encode())
+            self.formats[name] = fields
+        number, self.ids = self.ids, self.ids + 1
+        self.data += self._record(b"A", struct.pack("<BH", instance, number) + name.encode())
+        for row in rows:
+            self.data += self._record(b"D", struct.pack("<H", number) + struct.pack(code, *row))
+
+    def log(self, text: str, t_us: int) -> None:
+        self.data += self._record(b"L", b"4" + struct.pack("<Q", t_us) + text.encode())
+
+    def dropout(self, duration_ms: int) -> None:
+        self.data += self._record(b"O", struct.pack("<H", duration_ms))
+
+    def write(self, path: Path) -> Path:
+        path.write_bytes(self.raw + self.data)
+        return path
+
+
+COMBINED = (
+    "uint64_t timestamp;float[3] gyro_rad;uint32_t gyro_integral_dt;int32_t accelerometer_timestamp_relative;"
+    "float[3] accelerometer_m_s2;uint32_t accelerometer_integral_dt"
+)
+ATTITUDE = "uint64_t timestamp;float[4] q"
+POSITION = "uint64_t timestamp;float x;float y;float z;float vx;float vy;float vz"
+SENSOR = "uint64_t timestamp;uint64_t timestamp_sample;float x;float y;float z;float temperature"
+
+
+def flight() -> Writer:
+    """One second at rest, nose to the north-east, with simulated truth."""
+    writer = Writer()
+    writer.text("sys_name", "PX4")
+    writer.parameter("IMU_GYRO_CUTOFF", 40.0)
+    times = [START_US + 4000 * n for n in range(250)]
+    yaw = (float(np.cos(np.pi / 8)), 0.0, 0.0, float(np.sin(np.pi / 8)))
+    writer.topic("sensor_combined", COMBINED, [(t, 0.1, 0.2, 0.3, 4000, 0, 1.0, 2.0, -9.75, 4000) for t in times])
+    writer.topic("vehicle_attitude", ATTITUDE, [(t, *yaw) for t in times[::4]])
+    writer.topic("vehicle_attitude_groundtruth", ATTITUDE, [(t, *yaw) for t in times[::4]])
+    moves = [(t, 1.0, 2.0, -3.0, 0.5, 0.25, -0.125) for t in times[::10]]
+    writer.topic("vehicle_local_position_groundtruth", POSITION, moves)
+    for instance in (0, 1):
+        for sensor, shift in (("sensor_gyro", 0), ("sensor_accel", 700)):
+            rows = [(t + shift, t + shift, float(instance), 1.0, 2.0, 25.0 + instance) for t in times]
+            writer.topic(sensor, SENSOR, rows, instance)
+    writer.log("Takeoff detected", times[50])
+    writer.dropout(12)
+    return writer
+
+
+@pytest.fixture
+def log(convert, tmp_path):
+    done = convert(flight().write(tmp_path / "flight.ulg"), tmp_path / "out.mcap")
+    assert done.returncode == 0, done.stderr
+    return tmp_path / "out.mcap"
+
+
+def test_imu_and_truth_are_written_in_flu_and_enu(log):
+    recording = read(log, imu="/imu")
+    assert recording.imu.t_ns[0] == START_US * 1000
+    np.testing.assert_allclose(recording.imu.gyro[7], [0.1, -0.2, -0.3], rtol=1e-6)
+    np.testing.assert_allclose(recording.imu.accel[7], [1.0, -2.0, 9.75], rtol=1e-6)
+    assert list(recording.truths) == ["/ground_truth/pose"]
+    assert recording.other_poses == {"/ekf/pose": "estimate"}
+    np.testing.assert_allclose(recording.truth.p_wb[3], [2.0, 1.0, 3.0])
+    np.testing.assert_allclose(recording.truth.v_w[3], [0.25, 0.5, 0.125])
+    half = np.pi / 8  # the nose, to the north-east, is 45 degrees from east
+    np.testing.assert_allclose(np.abs(recording.truth.q_wb_wxyz[3]), [np.cos(half), 0, 0, np.sin(half)], atol=1e-7)
+
+
+def test_every_instance_is_an_imu_on_the_gyros_stamps(log):
+    with Log(log) as opened:
+        assert opened.imu_topics == ["/imu", "/imu/sensor0", "/imu/sensor1"]
+    second = read(log, imu="/imu/sensor1").imu
+    np.testing.assert_allclose(second.gyro[5], [1.0, -1.0, -2.0])
+    assert second.t_ns[0] == (START_US + 4000) * 1000  # the first gyro sample has no accelerometer sample ahead of it
+
+
+def test_every_topic_parameter_and_text_arrives(log):
+    with log.open("rb") as file:
+        reader = make_reader(file, validate_crcs=True, decoder_factories=[DecoderFactory()])
+        found: dict[str, list[Any]] = {}
+        for _, channel, _, content in reader.iter_decoded_messages():
+            found.setdefault(channel.topic, []).append(content)
+        metadata = {record.name: record.metadata for record in reader.iter_metadata()}
+    assert found["/sensor_combined"][9].accelerometer_m_s2 == [1.0, 2.0, -9.75]  # PX4's own frame
+    assert [len(found[f"/sensor_gyro/{n}"]) for n in (0, 1)] == [250, 250]
+    assert found["/sensor_accel/1"][0].temperature == 26.0
+    (line,) = found["/logged_messages"]
+    assert (line.msg, line.level, line.stamp.sec) == ("Takeoff detected", 30, 5)
+    assert metadata["px4/parameters"] == {"IMU_GYRO_CUTOFF": "40.0"}
+    assert list(metadata["px4/dropouts"].values()) == ["12 ms"]
+    assert "sensor" not in metadata["imutool"]
+
+
+def test_the_samples_of_a_fifo_are_spread_over_its_time(convert, tmp_path):
+    fifo = "uint64_t timestamp;uint64_t timestamp_sample;float dt;float scale;uint8_t samples;float[4] x;float[4] y;float[4] z"
+    writer = Writer()
+    for sensor in ("sensor_gyro_fifo", "sensor_accel_fifo"):
+        rows = [
+            (t, t, 1000.0, 0.5, 3, *(4.0 * n + i for i in range(4)), *[1.0] * 8)
+            for n in range(100)
+            for t in (5_000_000 + 3000 * n,)
+        ]
+        writer.topic(sensor, fifo, rows)
+    assert convert(writer.write(tmp_path / "a.ulg"), tmp_path / "a.mcap").returncode == 0
+    imu = read(tmp_path / "a.mcap").imu
+    assert len(imu) == 300
+    assert set(np.diff(imu.t_ns).tolist()) == {1_000_000}
+    assert imu.gyro[:4, 0].tolist() == [0.0, 0.5, 1.0, 2.0]
+
+
+@pytest.mark.parametrize(
+    ("raw", "said"), [(b"ULogEnc" + bytes(90), "is encrypted"), (b"ULog\x01\x12\x35\x01", "cannot be read")]
+)
+def test_what_cannot_be_read_is_refused_in_one_sentence(convert, tmp_path, raw, said):
+    (tmp_path / "a.ulg").write_bytes(raw)
+    done = convert(tmp_path / "a.ulg", tmp_path / "a.mcap")
+    assert done.returncode == 4
+    assert said in done.stderr
+    assert "Traceback" not in done.stderr
+
+
+@pytest.mark.parametrize("sample", ["sample_log_small", "sample_px4_events"])
+def test_the_public_samples_hold_the_values_that_pyulog_reads(tmp_path, data, sample, convert):
+    from pyulog import ULog
+
+    path = data / "outside" / "ulog" / f"{sample}.ulg"
+    done = convert(path, tmp_path / "a.mcap")
+    assert done.returncode == 0, done.stderr
+    theirs = ULog(str(path))
+    combined = theirs.get_dataset("sensor_combined").data
+    imu = read(tmp_path / "a.mcap").imu
+    assert np.array_equal(imu.t_ns, combined["timestamp"].astype(np.int64) * 1000)
+    for axis, sign in enumerate((1, -1, -1)):
+        assert np.array_equal(imu.gyro[:, axis], sign * combined[f"gyro_rad[{axis}]"].astype(float))
+    with Log(tmp_path / "a.mcap") as log:
+        counts = {topic.name.split("/")[1]: 0 for topic in log.topics.values()}
+        for topic in log.topics.values():
+            counts[topic.name.split("/")[1]] += topic.count
+    for dataset in theirs.data_list:
+        same = sum(len(d.data["timestamp"]) for d in theirs.data_list if d.name == dataset.name)
+        assert counts[dataset.name] == same, dataset.name
+
+
+def test_a_ulog_is_known_by_its_content(tmp_path):
+    (sequence,) = ulog.sequences(flight().write(tmp_path / "download"))
+    assert ulog.read_sequence(sequence).name == "download"

@@ -1,0 +1,41 @@
+"""What workers are made to do in tests: a module of its own, which their processes import."""
+
+from __future__ import annotations
+
+import os
+import signal
+import time
+from pathlib import Path
+from typing import Any
+
+
+def follow(item: tuple[str, str]) -> str:
+    """Does what the first word says; the second is a file that a line is added to first. Returns it."""
+    what, path = item
+    with Path(path).open("a") as file:
+        file.write(f"{os.getpid()}\n")
+    tries = len(Path(path).read_text().splitlines())
+    if what == "bug":
+        raise ValueError("two and two is five")
+    if what == "crash" or (what == "crash once" and tries == 1):
+        os.kill(os.getpid(), signal.SIGSEGV)
+    if what == "killed" or (what == "killed once" and tries == 1):
+        time.sleep(0.3)  # so that another one has begun
+        os.kill(os.getpid(), signal.SIGKILL)
+    if what.startswith("last "):
+        time.sleep(float(what.removeprefix("last ")))
+    return path
+
+
+def end_at_first(item: tuple[int, Any]) -> Any:
+    """Ends its process at the first sequence, and converts the others."""
+    if item[0] == 0:
+        os._exit(9)
+    from imutool.conversion.workers import convert_numbered
+
+    return convert_numbered(item)
+
+
+def no_worker(item: object) -> object:
+    """Cannot be found by a worker: the test takes it away."""
+    return item
