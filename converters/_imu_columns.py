@@ -11,20 +11,18 @@ from imutool.errors import DataError
 from imutool.recording import Imu
 
 MAX_GAP_PERIODS = 4.0  # of the accelerometer, across which nothing is interpolated
-Stamps = Int64[np.ndarray, " n"]
-Vectors = Float64[np.ndarray, "n 3"]
 
 
 @dataclass
 class Cleaned:
     """Samples in time order without repeated stamps and without values that are not finite."""
 
-    t_ns: Stamps
+    t_ns: Int64[np.ndarray, " n"]
     values: Float64[np.ndarray, "n k"]
     notes: list[str] = field(default_factory=list)
 
 
-def in_order(t_ns: Stamps, values: Float64[np.ndarray, "n k"], name: str) -> Cleaned:
+def in_order(t_ns: Int64[np.ndarray, " n"], values: Float64[np.ndarray, "n k"], name: str) -> Cleaned:
     """Samples whose stamps increase; notes say how many were left out, and why."""
     finite = np.isfinite(values).all(axis=1)
     later = np.maximum.accumulate(t_ns) if len(t_ns) else t_ns
@@ -38,7 +36,13 @@ def in_order(t_ns: Stamps, values: Float64[np.ndarray, "n k"], name: str) -> Cle
     return Cleaned(t_ns[keep], values[keep], notes)
 
 
-def joined(gyro_ns: Stamps, gyro: Vectors, accel_ns: Stamps, accel: Vectors, name: str) -> tuple[Imu, list[str]]:
+def joined(
+    gyro_ns: Int64[np.ndarray, " n"],
+    gyro: Float64[np.ndarray, "n 3"],
+    accel_ns: Int64[np.ndarray, " m"],
+    accel: Float64[np.ndarray, "m 3"],
+    name: str,
+) -> tuple[Imu, list[str]]:
     """IMU on the gyro's stamps, with notes on what was interpolated and left out.
 
     Raises:

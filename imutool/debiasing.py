@@ -148,6 +148,7 @@ def debias(
     init: str = "auto",
     smooth: bool = False,
     check: str = "imu",
+    max_chunk: int | None = None,
     clean: CleaningSettings | None = None,
     overwrite: bool = False,
     progress: Callable[[int, int], None] | None = None,
@@ -162,6 +163,7 @@ def debias(
     Without a target the log itself is replaced; `check` is that of `mcap_io.rewrite`. The intact part of a damaged log is
     debiased from a repaired copy beside the target (`mcap_io.repair`), and `losses` lists the rest; it is not replaced. With
     `clean` a first pass finds samples to leave out or convert (`imutool.cleaning`); the record `imutool_clean` lists them.
+    A chunk of more than `max_chunk` bytes is not read into memory.
     `watch` is called with every batch of debiased samples, those of a damaged log again when its repaired copy is debiased.
 
     Raises:
@@ -176,25 +178,25 @@ def debias(
     options = _Options(model, imus, init, smooth, clean, check, overwrite, watch)
     refusal: LogError | None = None
     try:
-        if (log := _open_intact(source)) is not None:
+        if (log := _open_intact(source, max_chunk)) is not None:
             with log:
                 return _debias(log, source, Losses(), target, options, progress)
     except LogError as error:  # damage inside a chunk shows only here
         refusal = error
-    with repaired(source, target or source) as saved:
+    with repaired(source, target or source, max_chunk) as saved:
         if saved is None:
             assert refusal is not None, "an intact log was debiased, or refused"
             raise refusal
         if target is None:
             raise LogError("the log is damaged", where=source, fix="Give a target: in place, the damaged part would be gone")
         copy, losses = saved
-        with Log(copy) as log:
+        with Log(copy, max_chunk=max_chunk) as log:
             return _debias(log, source, losses, target, options, progress)
 
 
-def _open_intact(source: Location) -> Log | None:
+def _open_intact(source: Location, max_chunk: int | None) -> Log | None:
     """The log, opened; None where opening it shows damage."""
-    with RecoveredLog(source) as log:
+    with RecoveredLog(source, max_chunk=max_chunk) as log:
         return log.strict() if log.losses.intact else None
 
 
@@ -253,6 +255,8 @@ def _debias(
     for topic, sieve in sieves.items():
         for text in sieve.warnings():
             logger.warning("%s %s: %s", source, topic, text)
+    losses.unchecked_in = losses.unchecked_in or {0: report.unchecked}
+    losses.unchecked_in = losses.unchecked_in or {0: report.unchecked}
     return DebiasReport(models, starts, report, losses, surveys, sieves)
 
 

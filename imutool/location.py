@@ -7,6 +7,7 @@ URL is written into reports, metadata and journals.
 
 from __future__ import annotations
 
+import errno
 import os
 import re
 from collections.abc import Mapping, Sequence
@@ -24,6 +25,7 @@ else:
     Location = Path | ForwardRef("upath.UPath")  # beartype looks the name up, and imports upath, at the first URL it meets
 
 LogPath: TypeAlias = str | Location
+QUERY = re.compile(r"[?#][\w.-]+=[^/]*$")  # in other places ? is a wildcard, and # a letter of a key
 CLOUD = "pip install 'imutool[cloud]'"
 STORES = {
     "s3": CLOUD,
@@ -117,18 +119,21 @@ def _refuse_secrets(scheme: str, text: str) -> None:
             expected="none: URLs are written into reports and logs",
             fix="Give it by the store's environment variables or profile",
         )
-    if scheme.startswith("http") and urlsplit(text).query:
+    if QUERY.search(text) or (scheme.startswith("http") and (urlsplit(text).query or urlsplit(text).fragment)):
         raise ConfigError(
             "a query stands in the URL, which may be a signature",
-            where=text.partition("?")[0],
+            where=re.split("[?#]", text)[0],
             expected="none: URLs are written into reports and logs",
             fix="Give the object by its store's own URL, such as s3://, or fetch it first",
         )
 
 
 def redact(text: str) -> str:
-    """Text without the users, passwords and signatures of the URLs in it."""
-    return re.sub(r"(?i)((?:signature|sig|token|credential)=)[^&\s\"']+", r"\1***", re.sub(r"//[^/\s]*@", "//***@", text))
+    """Text without the users, passwords, queries and fragments of the URLs in it."""
+    text = re.sub(r"//[^/\s]*@", "//***@", text)
+    text = re.sub(r"(?i)(https?://[^\s\"'?#]*[?#])[^\s\"']+", r"\1***", text)
+    text = re.sub(r"(://[^\s\"'?#]*[?#])[\w.-]+=[^\s\"'/]*", r"\1***", text)
+    return re.sub(r"(?i)((?:signature|sig|token|credential)=)[^&\s\"']+", r"\1***", text)
 
 
 def io_errors(where: Location) -> type[Exception]:
@@ -154,6 +159,8 @@ def open_location(where: Location) -> OpenFile:
         The classes that `io_errors` names.
     """
     if isinstance(where, Path):
+        if where.exists() and not where.is_file() and not where.is_dir():
+            raise OSError(errno.EINVAL, "it is a pipe, a socket or a device, not a file", str(where))  # opening it might wait
         file = where.open("rb", buffering=0)
         status = os.fstat(file.fileno())
         return OpenFile(file, status.st_size, (status.st_size, str(status.st_mtime_ns)))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import subprocess
 import sys
@@ -17,7 +18,7 @@ import pytest
 
 from imutool.debiasing import debias
 from imutool.errors import ConfigError, LogError
-from imutool.location import BLOCK_BYTES, reason, same_location, to_location
+from imutool.location import BLOCK_BYTES, reason, redact, same_location, to_location
 from imutool.log_info.inspection import inspect
 from imutool.mcap_io.log import Log
 from imutool.mcap_io.rewrite import rewrite
@@ -398,3 +399,81 @@ def test_what_a_store_says_is_repeated_without_its_secrets(text: str) -> None:
     for error in (ValueError(text), PermissionError(text), OSError(5, text)):
         assert "hush" not in reason(error)
         assert "host" in reason(error) or "account" in reason(error)
+
+
+SIGNED = [
+    "https://host/log.mcap?X-Amz-Signature=hush",
+    "https://host/log.mcap#token=hush",
+    "https://host/log.mcap?hush",
+    "s3://fleet/log.mcap?X-Amz-Signature=hush&more=hush",
+    "s3://fleet/log.mcap#access_token=hush",
+    "ftp://host/log.mcap?sig=hush",
+]
+
+
+@pytest.mark.parametrize("url", SIGNED)
+def test_a_secret_in_a_query_or_fragment_is_not_echoed(
+    url: str, imutool: Callable[..., subprocess.CompletedProcess[str]], tmp_path: Path, logs: Path
+) -> None:
+    log = str(logs / "flight_1.mcap")
+    commands = [
+        ["info", url],
+        ["debias", url, "out.mcap"],
+        ["debias", log, "out.mcap", "--model", url],
+        ["repair", log, url],
+    ]
+    fleets = [
+        ["info", url, "out"],
+        ["info", log, url],
+        ["info", log, "out", "--report", url],
+        ["info", log, "out", "--address", url],
+    ]
+    if url in SIGNED[:2]:  # fleets are processes of their own
+        commands += [["fleet", *words] for words in fleets]
+    for words in commands:
+        done = imutool(*words, cwd=tmp_path)
+        assert done.returncode in (2, 3, 5, 6), (words, done.stderr)
+        assert "hush" not in done.stdout + done.stderr, words
+        assert "error" in done.stderr.lower(), done.stderr
+    assert not [path for path in tmp_path.rglob("*") if path.is_file() and b"hush" in path.read_bytes()]
+
+
+def test_wildcards_and_keys_are_no_queries() -> None:
+    for url in ("s3://fleet/log_?.mcap", "s3://fleet/day=2024-0?/log.mcap", "s3://fleet/a#1.mcap"):
+        assert str(to_location(url)) == url
+        assert redact(url) == url
+
+
+@pytest.mark.parametrize("kind", ["pipe", "device"])
+def test_a_pipe_or_device_is_refused_before_it_is_opened(
+    kind: str, imutool: Callable[..., subprocess.CompletedProcess[str]], tmp_path: Path
+) -> None:
+    odd = tmp_path / "odd.mcap"
+    os.mkfifo(odd) if kind == "pipe" else odd.symlink_to("/dev/zero")
+    for words in (
+        ["info", odd],
+        ["clean", odd],
+        ["repair", odd, "out.mcap"],
+        ["debias", odd, "out.mcap"],
+        ["convert", tmp_path, "out"],
+    ):
+        done = imutool(*words, cwd=tmp_path)
+        assert done.returncode in (3, 4, 5), (words, done.stderr)
+        assert "error:" in done.stderr
+
+
+def test_a_delete_that_fails_is_tried_again(store: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("imutool.mcap_io.storage.upload.DELETE_PAUSES_S", (0.0, 0.0))
+    refused: list[Any] = []
+
+    def fault(request: Any) -> str | None:
+        if request.method == "DELETE" and len(refused) < 2:
+            refused.append(request)
+            return "403"
+        return None
+
+    store.fault = fault
+    with Target(to_location("s3://fleet/a.json")) as out:
+        out.write(b"{}")
+    assert len(refused) == 2
+    assert store.keys() == ["a.json"]

@@ -108,6 +108,7 @@ def repair(
     target: LogPath,
     *,
     damaged: str = "drop",
+    max_chunk: int | None = None,
     overwrite: bool = False,
     progress: Progress | None = None,
 ) -> RepairReport | BagReport:
@@ -117,6 +118,7 @@ def repair(
         source: Damaged log or bag: a file or a URL.
         target: File or URL to write.
         damaged: `drop` damaged bytes, or `keep` them as attachments (MCAP only).
+        max_chunk: Largest chunk in bytes, packed or unpacked, to read into memory (256 MiB).
         overwrite: Replace an existing `target`.
         progress: Callback with bytes done and bytes in all.
 
@@ -136,7 +138,7 @@ def repair(
     check_outputs([OutputFile("target", target, (*outputs.LOG, ".bag"))], [source], overwrite=overwrite)
     here, there = location(source), location(target)
     if not is_bag(here):
-        return repair_log(here, there, damaged=damaged, overwrite=overwrite, progress=progress)
+        return repair_log(here, there, damaged=damaged, max_chunk=max_chunk, overwrite=overwrite, progress=progress)
     if damaged != "drop":
         raise ConfigError(NO_ATTACHMENTS, where="damaged", fix="Leave `damaged` out")
     return repair_bag(here, there, overwrite=overwrite, progress=progress)

@@ -97,6 +97,7 @@ def convert(
     overwrite: bool = False,
     sensor: str = "",
     kinds: Sequence[str] = (),
+    mapping: str | Path | None = None,
     workers: int | None = None,
     progress: NamedProgress | None = None,
 ) -> ConvertReport:
@@ -112,6 +113,7 @@ def convert(
         overwrite: Replace existing logs.
         sensor: Name of the IMU, where the recording does not state it.
         kinds: What poses are worth, as `TOPIC=truth|estimate|odometry|unknown`.
+        mapping: TOML file that states what the columns of a table mean.
         workers: Processes; by default one per core. A script that uses several needs `if __name__ == "__main__":`.
         progress: Callback with sequences done, sequences in all, and the name of the last one.
 
@@ -139,17 +141,19 @@ def convert(
         overwrite=overwrite,
         sensor=sensor,
         kinds=kinds,
+        mapping=None if mapping is None else local(mapping, "mapping"),
         workers=workers,
         progress=progress,
     )
 
 
-def info(path: LogPath, *, check: bool = True) -> LogInfo:
+def info(path: LogPath, *, check: bool = True, max_chunk: int | None = None) -> LogInfo:
     """Report on a log: topics, rates, gaps, saturation, time at rest, truth coverage, damage.
 
     Args:
         path: MCAP log: a file or a URL.
         check: Compare the CRC of every chunk; otherwise only of chunks with IMU messages.
+        max_chunk: Largest chunk in bytes, packed or unpacked, to read into memory (256 MiB).
 
     Raises:
         ConfigError: The file cannot be opened.
@@ -161,7 +165,7 @@ def info(path: LogPath, *, check: bool = True) -> LogInfo:
         >>> report.imu[0].topic, round(report.imu[0].rate_hz)
         ('/imu0', 200)
     """
-    return inspection.inspect(location(path), check=check)
+    return inspection.inspect(location(path), check=check, max_chunk=max_chunk)
 
 
 def export(

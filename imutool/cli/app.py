@@ -171,6 +171,9 @@ ReportPage = Annotated[
     Path | None, typer.Option(metavar="F.html", help="Write an HTML page with figures, paths, errors and spectra."), HTML
 ]
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace existing files.")]
+MaxChunk = Annotated[
+    int | None, typer.Option(min=1, metavar="BYTES", help="Largest chunk to unpack into memory (default: 268435456).")
+]
 Verbose = Annotated[bool, typer.Option("-v", "--verbose", help="Print more.")]
 Quiet = Annotated[bool, typer.Option("-q", "--quiet", help="Print only results and errors.")]
 

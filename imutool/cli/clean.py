@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from imutool.cli.app import HTML, LOG, LOST, Init, Json, Overwrite, Quiet, Smooth, Verbose, app, listing
+from imutool.cli.app import HTML, LOG, LOST, Init, Json, MaxChunk, Overwrite, Quiet, Smooth, Verbose, app, listing
 from imutool.cli.terminal import out, plain, progress, say, table, tell_losses, write_json
 from imutool.errors import ConfigError, LogError
 from imutool.location import to_location
@@ -36,6 +36,7 @@ def clean(
     ] = None,
     init: Init = "auto",
     smooth: Smooth = False,
+    max_chunk: MaxChunk = None,
     overwrite: Overwrite = False,
     json_to: Json = None,
     verbose: Verbose = False,
@@ -59,7 +60,7 @@ def clean(
     added: dict[str, int] = {}
     if target is None:
         with progress("Looking through", verbose, quiet) as tell:
-            surveys, losses = _looked(source, imu or (), rules, tell)
+            surveys, losses = _looked(source, imu or (), rules, max_chunk, tell)
     else:
         from imutool.debiasing import debias
 
@@ -73,6 +74,7 @@ def clean(
                 smooth=smooth,
                 overwrite=overwrite,
                 clean=rules,
+                max_chunk=max_chunk,
                 progress=lambda done, total: tell(done, total, ""),
             )
         surveys, added, losses = list(report.surveys.values()), dict(report.rewrite.added), report.losses
@@ -113,13 +115,13 @@ def _tell(
 
 
 def _looked(
-    source: str, imus: Sequence[str], rules: CleaningSettings, tell: Callable[[int, int, str], None]
+    source: str, imus: Sequence[str], rules: CleaningSettings, max_chunk: int | None, tell: Callable[[int, int, str], None]
 ) -> tuple[list[Survey], Losses]:
     """Survey of each IMU of a log, and the losses of a damaged log."""
     from imutool.cleaning import look
     from imutool.mcap_io.recovery.recovered_log import RecoveredLog
 
-    with RecoveredLog(to_location(source)) as log:
+    with RecoveredLog(to_location(source), max_chunk=max_chunk) as log:
         topics = list(imus) or log.imu_topics
         if not topics:
             raise LogError("no IMU topic", where=source, expected=log.listing())

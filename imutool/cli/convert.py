@@ -67,6 +67,9 @@ def convert(
         list[str] | None,
         typer.Option(metavar="TOPIC=KIND", help="What poses are worth: truth, estimate, odometry or unknown. Repeatable."),
     ] = None,
+    map_: Annotated[
+        Path | None, typer.Option("--map", metavar="F.toml", help="Meaning and units of a table's columns.")
+    ] = None,
     workers: Annotated[int | None, typer.Option(min=1, help="Number of processes; by default one per processor.")] = None,
     overwrite: Overwrite = False,
     json_to: Json = None,
@@ -87,6 +90,7 @@ def convert(
             overwrite=overwrite,
             sensor=sensor,
             kinds=kind or (),
+            mapping=map_,
             workers=workers,
             progress=tell,
         )

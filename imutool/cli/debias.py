@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from imutool.cli.app import HTML, LOG, LOST, RRD, Init, Json, Overwrite, Quiet, Smooth, Verbose, app
+from imutool.cli.app import HTML, LOG, LOST, RRD, Init, Json, MaxChunk, Overwrite, Quiet, Smooth, Verbose, app
 from imutool.cli.terminal import progress, say, tell_losses, write_json
 from imutool.errors import ConfigError
 from imutool.location import Location, to_location
@@ -49,6 +49,7 @@ def debias(
     ] = None,
     save_view: Annotated[Path | None, typer.Option(metavar="F.rrd", help="Save the viewer's data to a file."), RRD] = None,
     report_to: Annotated[Path | None, typer.Option("--report", metavar="F.html", help=REPORT_HELP), HTML] = None,
+    max_chunk: MaxChunk = None,
     overwrite: Overwrite = False,
     json_to: Json = None,
     verbose: Verbose = False,
@@ -74,6 +75,7 @@ def debias(
             init=init,
             smooth=smooth,
             check=verify,
+            max_chunk=max_chunk,
             clean=CleaningSettings() if clean else None,
             overwrite=overwrite and not in_place,
             progress=lambda done, total: tell(done, total, ""),

@@ -81,14 +81,14 @@ def diagnose(
 
 def _say(diagnosis: Diagnosis, folder: Path | None) -> None:
     from imutool import diagnosis_output
-    from imutool.diagnosis.wording.conclusion import below, conclusion
+    from imutool.diagnosis.wording.conclusion import below, headline, notes
     from imutool.diagnosis.wording.conclusion import table as findings_table
 
-    say(conclusion(diagnosis))
+    say(headline(diagnosis))
     if diagnosis.findings:
         say("")
         table(findings_table(diagnosis), keys=1)
-    for line in below(diagnosis):
+    for line in [*below(diagnosis), *notes(diagnosis)]:
         say(line)
     if folder is not None:
         say(f"{folder}: {', '.join(name for name in diagnosis_output.FILES if (folder / name).exists())}")

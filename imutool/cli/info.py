@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from msgspec.structs import replace
 
-from imutool.cli.app import LOST, PNG, TOML, Json, Overwrite, Quiet, Verbose, app
+from imutool.cli.app import LOST, PNG, TOML, Json, MaxChunk, Overwrite, Quiet, Verbose, app
 from imutool.cli.terminal import log_to_stderr, out, plain, say, table, tell_losses, write_json
 from imutool.errors import ConfigError
 from imutool.location import to_location
@@ -38,6 +38,7 @@ def info(
     quick: Annotated[
         bool, typer.Option("--quick", help="Read only the chunks with IMU messages; this may miss damage.")
     ] = False,
+    max_chunk: MaxChunk = None,
     overwrite: Overwrite = False,
     json_to: Json = None,
     verbose: Verbose = False,
@@ -52,7 +53,7 @@ def info(
         raise ConfigError(f"{idle[0]} needs --noise", where="info", fix="Add --noise")
     if len(logs) > 1 and (noise_plot or noise_toml):
         raise ConfigError(f"{len(logs)} logs do not fit one file", where="--noise-plot, --noise-toml", expected="one log")
-    described = [_described(log, quick, noise, {"imu": imu, "truth": truth, "model": model}) for log in logs]
+    described = [_described(log, quick, max_chunk, noise, {"imu": imu, "truth": truth, "model": model}) for log in logs]
     reports = [report for report, _ in described]
     if (identified := described[0][1]) is not None:
         _write_noise(identified, noise_plot, noise_toml, overwrite)
@@ -65,13 +66,13 @@ def info(
 
 
 def _described(
-    log: str, quick: bool, noise: bool, settings: Mapping[str, str | None]
+    log: str, quick: bool, max_chunk: int | None, noise: bool, settings: Mapping[str, str | None]
 ) -> tuple[LogInfo, IdentifiedNoise | None]:
     """Report on a log, and its noise if requested; the log is opened once."""
     from imutool.log_info.inspection import describe
     from imutool.mcap_io.recovery.recovered_log import RecoveredLog
 
-    with RecoveredLog(to_location(log)) as opened:
+    with RecoveredLog(to_location(log), max_chunk=max_chunk) as opened:
         report = describe(opened, check=not quick)
         if not noise:
             return report, None

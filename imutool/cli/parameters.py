@@ -16,6 +16,7 @@ ALIASES = {
     "folder": ("folder", "target"),
     "imus": ("imu",),
     "kinds": ("kind",),
+    "mapping": ("map_",),
     "memory_bytes": ("memory",),
     "models": ("model",),
     "out": ("target", "folder", "model"),

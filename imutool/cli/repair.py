@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
-from imutool.cli.app import LOST, Json, Overwrite, Quiet, Verbose, Written, app
+from imutool.cli.app import LOST, Json, MaxChunk, Overwrite, Quiet, Verbose, Written, app
 from imutool.cli.terminal import progress, say, tell_losses, write_json
 from imutool.errors import ConfigError
 from imutool.location import to_location
@@ -43,6 +43,7 @@ def repair(
     damaged: Annotated[
         Damaged, typer.Option(help="Damaged stretches: drop them, or keep their bytes as attachments (MCAP).")
     ] = Damaged.drop,
+    max_chunk: MaxChunk = None,
     overwrite: Overwrite = False,
     json_to: Json = None,
     verbose: Verbose = False,
@@ -64,7 +65,12 @@ def repair(
             report = Repair(output=target, whole=bag.whole, messages=dict(bag.messages), chunks=bag.chunks, losses=bag.plain())
         else:
             log = repair_log(
-                log_in, log_out, damaged=damaged.value, overwrite=overwrite, progress=lambda done, total: tell(done, total, "")
+                log_in,
+                log_out,
+                damaged=damaged.value,
+                max_chunk=max_chunk,
+                overwrite=overwrite,
+                progress=lambda done, total: tell(done, total, ""),
             )
             report = Repair(
                 output=target,

@@ -16,7 +16,7 @@ from rich.progress import BarColumn, Progress, TextColumn
 from rich.table import Table
 
 from imutool.cli.parameters import with_flags
-from imutool.location import to_location
+from imutool.location import redact, to_location
 from imutool.mcap_io.recovery.losses import describe
 from imutool.mcap_io.storage.target import Target
 from imutool.report import Report, json_text
@@ -52,7 +52,7 @@ def say(line: str) -> None:
 
 def tell_error(message: str) -> None:
     """Print a line that begins with "error:" on stderr."""
-    err.print(f"[bold red]error:[/] {plain(message)}", highlight=False, soft_wrap=True)
+    err.print(f"[bold red]error:[/] {plain(redact(message))}", highlight=False, soft_wrap=True)
 
 
 def tell_warning(message: str, word: str = "warning") -> None:
@@ -63,7 +63,7 @@ def tell_warning(message: str, word: str = "warning") -> None:
 def tell_losses(losses: Mapping[str, Any]) -> None:
     """Print a log's losses (`mcap_io.recovery.losses.Losses.plain`), one line a stretch."""
     for line in describe(losses):
-        kind, _, rest = line.partition(": ")
+        kind, _, rest = with_flags(line).partition(": ")
         out.print(f"[yellow]{kind}:[/] {plain(rest)}", highlight=False, soft_wrap=True)
 
 

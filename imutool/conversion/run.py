@@ -71,13 +71,15 @@ def convert(
     overwrite: bool = False,
     sensor: str = "",
     kinds: Sequence[str] = (),
+    mapping: Path | None = None,
     workers: int | None = None,
     progress: Progress | None = None,
 ) -> ConvertReport:
     """Convert one sequence to the file `out`, or several sequences to the folder `out`.
 
     `sensor` names the IMU where the data set does not, and `kinds` (`TOPIC=truth|estimate|odometry|unknown`) says what poses
-    are worth. `workers` is the number of processes, by default one a processor; with 1, or for one sequence, all happens here.
+    are worth. `mapping` is a file that states what the columns of a table mean. `workers` is the number of processes, by
+    default one a processor; with 1, or for one sequence, all happens here.
 
     Raises:
         DataError: no converter recognises anything in the source.
@@ -94,7 +96,7 @@ def convert(
     names = source_sequences.names()
     targets = _targets([job.sequence.name for job in source_sequences.jobs], out, many=len(names) > 1)
     jobs = [
-        replace(job, target=target, compression=compression, images=images, overwrite=overwrite, labels=labels)
+        replace(job, target=target, compression=compression, images=images, overwrite=overwrite, labels=labels, mapping=mapping)
         for job, target in zip(source_sequences.jobs, targets, strict=True)
     ]
     if len(names) == 1 and source_sequences.errors:

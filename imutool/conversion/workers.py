@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -11,7 +12,7 @@ from imutool import registry
 from imutool.conversion.labels import Labels
 from imutool.conversion.message_writer import write_log
 from imutool.conversion.worker_pool import WorkerBugError, WorkerPool
-from imutool.errors import DataError, ImutoolError
+from imutool.errors import ConfigError, DataError, ImutoolError
 from imutool.mcap_io.write import write
 from imutool.recording import Recording
 from imutool.recording.message_log import MessageLog
@@ -30,6 +31,7 @@ class Job:
     images: bool = True
     overwrite: bool = False
     labels: Labels = field(default_factory=Labels)
+    mapping: Path | None = None  # what the columns of a table mean
 
 
 @dataclass(frozen=True)
@@ -53,7 +55,10 @@ def run_jobs(jobs: Sequence[Job], workers: int) -> Iterator[tuple[int, Outcome]]
 def _convert_one(job: Job) -> Outcome:
     try:
         module = registry.load(GROUP, job.converter)
-        content = module.read_sequence(job.sequence, images=job.images)
+        given = {} if job.mapping is None else {"mapping": job.mapping}
+        if given and "mapping" not in inspect.signature(module.read_sequence).parameters:
+            raise ConfigError(f"{job.converter} reads no tables", where="mapping", expected="a table")
+        content = module.read_sequence(job.sequence, images=job.images, **given)
         return write_content(content, job.target, job.labels, compression=job.compression, overwrite=job.overwrite)
     except ImutoolError as error:
         return Outcome(error)

@@ -17,9 +17,10 @@ from imutool.diagnosis.compare_findings import ANOTHER_MOTION
 from imutool.diagnosis.estimation import timestamps
 from imutool.diagnosis.estimation import unnamed_effects as unnamed
 from imutool.diagnosis.estimation.aligned_log import Pair
+from imutool.diagnosis.estimation.candidate_score import Selection
 from imutool.diagnosis.estimation.gauss_newton import fit
 from imutool.diagnosis.estimation.jacobians import Chosen, expected
-from imutool.diagnosis.estimation.model_selection import Selection, select_effects
+from imutool.diagnosis.estimation.model_selection import select_effects
 from imutool.diagnosis.estimation.noise_estimate import whitened
 from imutool.diagnosis.estimation.observability import unobservable, with_free
 from imutool.diagnosis.estimation.significance import scatter
@@ -30,6 +31,7 @@ from imutool.diagnosis.reference import (
     align_all,
     check_without_reference,
     is_another_motion,
+    reference_caveat,
     reference_errors,
     with_unique_names,
     without_unusable,
@@ -44,6 +46,7 @@ from imutool.mcap_io.fields import others, read_field
 from imutool.mcap_io.read import read as read_log
 from imutool.recording import Recording
 from imutool.sensor import catalogue
+from imutool.sensor.channels import with_channels
 from imutool.sensor.effect import Effect
 
 SHOWN_BY_SAMPLES = {"saturation", "quantization"}  # without any fit: `stamps`
@@ -75,13 +78,14 @@ def diagnose(
         raise ConfigError("`signals` compare one recording with its simulation", where="signals", fix="Give one log and `sim`")
     report(0, 4, "reading")
     signal_fields = [] if sim is None else [(name, read_field(reals[0], name), read_field(sim, name)) for name in signals]
-    recordings = with_unique_names([read_log(real, imu=imu, truth=truth) for real in reals])
+    logs_read = [with_channels(read_log(real, imu=imu, truth=truth), real) for real in reals]
+    recordings = with_unique_names([log.recording for log in logs_read])
     simulated = None if sim is None else read_log(sim, imu=imu)
     sim_findings: tuple[Finding, ...] = ()
     if sim is not None and simulated is not None and is_another_motion(recordings, simulated, signals, settings.alignment):
         report(0, 4, "the simulation, of another motion")
         sim_findings, simulated = diagnose([sim], imu=imu, settings=settings).findings, None
-    another_motion = sim is not None and simulated is None
+    another = [ANOTHER_MOTION] if sim is not None and simulated is None else []
     pairs, left_out = align_all(recordings, simulated, truth, settings)
     if not pairs:
         return check_without_reference(recordings[0], str(reals[0]), left_out[0], settings)
@@ -100,7 +104,9 @@ def diagnose(
     if simulated is not None and any(finding.effect not in NO_EFFECT for finding in diagnosis.findings):
         report(3, 4, "simulating again")
         diagnosis = _resimulated(diagnosis, logs, selection, simulated)
-    diagnosis = replace(diagnosis, remarks=(*([ANOTHER_MOTION] if another_motion else []), *left_out, *diagnosis.remarks))
+    caveat = reference_caveat(recordings) if simulated is None else ""
+    tried = dict.fromkeys(log.remark for log in logs_read if log.remark)
+    diagnosis = replace(diagnosis, remarks=(*another, *left_out, *diagnosis.remarks, *tried), caveat=caveat)
     diagnosis = replace(diagnosis, findings=(*wrong, *diagnosis.findings), located=tuple(wrong_at) or diagnosis.located)
     for signal, real, simulated_field in signal_fields:
         report(3, 4, signal)
@@ -197,7 +203,7 @@ def effect_sizes(
     """
     simulated = None if sim is None else read_log(sim, imu=imu)
     settings = settings or DiagnoseSettings()
-    aligned = align(read_log(real, imu=imu, truth=truth), simulated, truth, settings)
+    aligned = align(with_channels(read_log(real, imu=imu, truth=truth), real).recording, simulated, truth, settings)
     pairs = [without_unusable(pair, settings.reference) for pair in aligned]
     candidates = candidates_for(pairs)
     logs = [whitened(pair, candidates, settings.band) for pair in pairs]

@@ -206,7 +206,8 @@ class SignalTraces:
 class Diagnosis:
     """Result of `diagnose`: findings, strongest first, located misfits, biases and traces.
 
-    `bias` has a row for each log; the JSON shows the first as `bias` and all as `biases`.
+    `bias` has a row for each log; the JSON shows the first as `bias` and all as `biases`. `caveat` says what the reference
+    cannot show by its origin, as it goes on after a semicolon.
     """
 
     real: tuple[str, ...]
@@ -220,6 +221,7 @@ class Diagnosis:
     closer: Mapping[str, Closer] = field(default_factory=dict)  # by signal
     traces: tuple[Traces, ...] = ()
     signals: Mapping[str, SignalTraces] = field(default_factory=dict)  # by TOPIC.field
+    caveat: str = ""
 
     @property
     def mismatch(self) -> bool:

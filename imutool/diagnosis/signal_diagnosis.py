@@ -12,8 +12,9 @@ from scipy.ndimage import median_filter
 from scipy.signal import welch
 
 from imutool.diagnosis import signal_effects as effects
+from imutool.diagnosis.estimation.candidate_score import Selection
 from imutool.diagnosis.estimation.jacobians import Chosen, expected
-from imutool.diagnosis.estimation.model_selection import Selection, select_effects
+from imutool.diagnosis.estimation.model_selection import select_effects
 from imutool.diagnosis.estimation.noise_estimate import noise_std, ridge_fit
 from imutool.diagnosis.estimation.timestamps import grid
 from imutool.diagnosis.estimation.unnamed_effects import SplineBasis

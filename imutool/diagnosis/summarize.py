@@ -12,9 +12,9 @@ from jaxtyping import Float64
 from imutool.diagnosis.compare_findings import remarks, shared
 from imutool.diagnosis.estimation import timestamps
 from imutool.diagnosis.estimation.aligned_log import AlignedLog, Pair
+from imutool.diagnosis.estimation.candidate_score import SelectedEffect, Selection
 from imutool.diagnosis.estimation.gauss_newton import Fit, fit
 from imutool.diagnosis.estimation.jacobians import Chosen, expected
-from imutool.diagnosis.estimation.model_selection import SelectedEffect, Selection
 from imutool.diagnosis.estimation.timestamps import late_stamps
 from imutool.diagnosis.estimation.unnamed_effects import SplineCurve
 from imutool.diagnosis.estimation.whitening import WhitenedImu, WhitenedLog

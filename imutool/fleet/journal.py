@@ -1,7 +1,8 @@
 """Journal of a fleet, OUT/fleet.journal: appended JSON lines, each flushed to the disk.
 
 A line notes that a target was begun (a later run then knows it as the fleet's own), or the result of a log. One process writes,
-and holds a lock. A line that a dying process left incomplete is cut off; an unreadable line is skipped, and its log done again.
+and holds a lock. Every line ends with its CRC-32: a line that is incomplete or was hit by something else is skipped, the log of
+its result is done again, and the lines around it count. Targets are noted a second time, some lines later.
 
 In an object store, where nothing can be appended to, OUT/fleet.journal/ holds pieces of it: each is written over with one line
 more until it is large enough for the next to begin, and what is read is a copy. Nobody there can hold a lock.
@@ -12,11 +13,14 @@ from __future__ import annotations
 import contextlib
 import fcntl
 import os
+import platform
+import re
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 from types import TracebackType
 from typing import IO
+from zlib import crc32
 
 import msgspec
 
@@ -26,6 +30,10 @@ from imutool.fleet.task import Result, Settings
 from imutool.location import Location, io_errors, reason
 
 NAME = "fleet.journal"
+NOTED_AGAIN = 32  # targets in a second note
+CRC = re.compile(rb',"crc":"([0-9a-f]{8})"\}\n?\Z')
+CRC_WITHIN = re.compile(rb',"crc":"[0-9a-f]{8}"\}')
+BEGIN = re.compile(rb'\{"line":"')
 PIECE_BYTES = 256 << 10  # of a journal in a store
 
 
@@ -36,6 +44,7 @@ class Run(msgspec.Struct, frozen=True, tag_field="line", tag="run"):
     digest: str
     anew: bool = False
     version: str = __version__
+    process: str = ""  # that writes from here on
 
 
 class TargetBegun(msgspec.Struct, frozen=True, tag_field="line", tag="began"):
@@ -45,7 +54,15 @@ class TargetBegun(msgspec.Struct, frozen=True, tag_field="line", tag="began"):
     target: str
 
 
-_line = msgspec.json.Decoder(Run | TargetBegun | Result)
+class TargetsBegun(msgspec.Struct, frozen=True, tag_field="line", tag="targets"):
+    """Second note of targets, with the settings under which they were begun."""
+
+    targets: tuple[str, ...]
+    digest: str
+
+
+_Line = Run | TargetBegun | TargetsBegun | Result
+_line = msgspec.json.Decoder(_Line)
 
 
 class Journal:
@@ -61,7 +78,9 @@ class Journal:
     def __init__(self, out: Location, settings: Settings, *, resume: bool = False, overwrite: bool = False) -> None:
         self.path = out / NAME
         self._begun: set[str] = set()
-        self._done: dict[str, int] = {}
+        self._noted_once: list[str] = []
+        self._done: dict[str, tuple[int, int]] = {}  # offset and length of a result's line
+        self._digest = settings.digest
         self._pieces: _Pieces | None = None
         try:
             if isinstance(out, Path):
@@ -79,7 +98,8 @@ class Journal:
                 self._refuse(known, settings, resume, overwrite)
             if not resume:
                 self._done.clear()  # but what was begun stays the fleet's own
-            self._append(Run(settings, settings.digest, anew=not resume))
+            process = f"process {os.getpid()} of {platform.node()}"
+            self._append(Run(settings, settings.digest, anew=not resume, process=process))
         except BaseException:
             self._file.close()
             raise
@@ -88,6 +108,8 @@ class Journal:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+        with contextlib.suppress(ConfigError):  # a full disk: each target stands there once
+            self._note_again(len(self._noted_once))
         self._file.close()
 
     def ours(self, target: str) -> bool:
@@ -96,26 +118,35 @@ class Journal:
 
     def done(self, key: str) -> Result | None:
         """Result of a log, if the journal has one."""
-        at = self._done.get(key)
-        if at is None:
+        place = self._done.get(key)
+        if place is None:
             return None
-        self._file.seek(at)
-        found = _line.decode(self._file.readline())
-        assert isinstance(found, Result), "the offset is that of a result"
-        return found
+        self._file.seek(place[0])
+        result = _decoded(self._file.read(place[1]))
+        assert isinstance(result, Result), "the offset is that of a result"
+        return result
 
     def begin(self, key: str, target: str) -> None:
         """Note, before anything is written, that a target is the fleet's own."""
         if target not in self._begun:
             self._append(TargetBegun(key, target))
             self._begun.add(target)
+            self._noted_once.append(target)
+            if len(self._noted_once) >= 2 * NOTED_AGAIN:
+                self._note_again(NOTED_AGAIN)
+
+    def _note_again(self, count: int) -> None:
+        """Note the oldest targets a second time, far from the first: what hits one line spares the other."""
+        if count:
+            targets, self._noted_once = self._noted_once[:count], self._noted_once[count:]
+            self._append(TargetsBegun(tuple(targets), self._digest))
 
     def finish(self, result: Result) -> None:
         """Note the result of a log."""
         self._done[result.key] = self._append(result)
 
-    def _append(self, line: Run | TargetBegun | Result) -> int:
-        raw = msgspec.json.encode(line) + b"\n"
+    def _append(self, line: _Line) -> tuple[int, int]:
+        raw = _encoded(line)
         at = self._file.seek(0, os.SEEK_END)
         try:
             self._file.write(raw)
@@ -130,43 +161,59 @@ class Journal:
             raise ConfigError(
                 f"cannot be written ({reason(error)})", where=self.path, fix="Make room, and go on with `resume`"
             ) from error
-        return at
+        return at, len(raw)
 
     def _lock(self) -> None:
         try:
             fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError as error:
+            runs = [line for _, _, line in self._lines() if isinstance(line, Run)]
+            who = f" ({runs[-1].process})" if runs and runs[-1].process else ""
             raise ConfigError(
-                "another run is at work here", where=self.path, fix="Wait for it, or choose another OUT"
+                f"another run is at work here{who}", where=self.path, fix="Wait for it, or choose another `out`"
             ) from error
 
     def _read(self) -> Run | None:
-        """Read the journal, cut off an incomplete last line, and return the last run's line."""
-        run, end = None, 0
-        for at, raw in self._lines():
-            if not raw.endswith(b"\n"):
-                self._file.truncate(at)
-                break
-            end = at + len(raw)
-            with contextlib.suppress(msgspec.DecodeError, UnicodeDecodeError):
-                line = _line.decode(raw)
-                match line:
-                    case Run():
-                        run = line
-                        if line.anew:
-                            self._done.clear()
-                    case TargetBegun():
-                        self._begun.add(line.target)
-                    case Result():
-                        self._begun.add(line.target)
-                        self._done[line.key] = at
-        return run if run is not None or end == 0 else Run(Settings(command="info"), "")
+        """Read the journal, and return the last run's line."""
+        run, digest = None, ""
+        for at, length, line in self._lines():
+            match line:
+                case Run():
+                    run = line
+                    if line.anew:
+                        self._done.clear()
+                case TargetBegun():
+                    self._begun.add(line.target)
+                case TargetsBegun():
+                    self._begun.update(line.targets)
+                    digest = line.digest
+                case Result():
+                    self._begun.add(line.target)
+                    self._done[line.key] = at, length
+        end = self._file.seek(0, os.SEEK_END)
+        if end and self._read_at(end - 1, 1) != b"\n":
+            self._file.write(b"\n")  # what comes now stands in a line of its own
+        if run is None and end:  # hit: the keys of the results say whether the settings fit
+            return Run(Settings(command="info"), digest or self._digest)
+        return run
 
-    def _lines(self) -> Iterator[tuple[int, bytes]]:
+    def _read_at(self, at: int, length: int) -> bytes:
+        self._file.seek(at)
+        return self._file.read(length)
+
+    def _lines(self) -> Iterator[tuple[int, int, _Line]]:
+        """Offset, length and content of every sound line; two that have lost the end between them count both."""
         self._file.seek(0)
         at = 0
         for raw in self._file:
-            yield at, raw
+            line = _decoded(raw)
+            if line is not None:
+                yield at, len(raw), line
+            else:
+                for start, piece in _pieces(raw):
+                    line = _decoded(piece)
+                    if line is not None:
+                        yield at + start, len(piece), line
             at += len(raw)
 
     def _refuse(self, known: Run, settings: Settings, resume: bool, overwrite: bool) -> None:
@@ -184,6 +231,31 @@ class Journal:
                 where=self.path.parent,
                 fix="Give the same ones, choose another `out`, or add `overwrite` to do all logs again",
             )
+
+
+def _encoded(line: _Line) -> bytes:
+    """Line as JSON whose last entry is the CRC-32 of the rest."""
+    raw = msgspec.json.encode(line)
+    return raw[:-1] + b',"crc":"%08x"}\n' % crc32(raw)
+
+
+def _decoded(raw: bytes) -> _Line | None:
+    """Content of a line; None for one that is not sound. Lines of earlier versions have no CRC."""
+    match = CRC.search(raw)
+    if match is not None and crc32(raw[: match.start()] + b"}") != int(match[1], 16):
+        return None
+    with contextlib.suppress(msgspec.DecodeError, UnicodeDecodeError):
+        line: _Line = _line.decode(raw)
+        return line
+    return None
+
+
+def _pieces(raw: bytes) -> Iterator[tuple[int, bytes]]:
+    """Everything in a line that may be a whole one: from where one begins to the next CRC."""
+    for start in BEGIN.finditer(raw):
+        end = CRC_WITHIN.search(raw, start.start())
+        if end is not None:
+            yield start.start(), raw[start.start() : end.end()]
 
 
 class _Pieces:

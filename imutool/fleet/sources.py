@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 from imutool.errors import ConfigError
 from imutool.fleet.task import Source
-from imutool.location import Location, identity, io_errors, reason, size_and_etag, to_location
+from imutool.location import Location, identity, io_errors, reason, redact, size_and_etag, to_location
 
 LOG, BAG = ".mcap", ".bag"
 PATTERN = re.compile(r"[*?\[]")
@@ -56,6 +56,8 @@ def find(text: str, out: Location, *, bags: bool = False) -> Found:
             before = taken.setdefault(name.casefold(), where)  # one file on some systems, two on others
             if before != where:
                 raise ConfigError(f"would be called {name}, and so would {before}", fix="Rename one of the two")
+            if about is None and Path(where).exists() and not Path(where).is_file():
+                raise ConfigError("is a pipe, a socket or a device", expected="a file", fix="Remove it")
             logs.append(Source(where, name, *(identity(Path(where)) if about is None else size_and_etag(about))))
         except ConfigError as error:
             refused.append((_shown(where), str(error)))
@@ -101,10 +103,10 @@ def _files(text: str, endings: tuple[str, ...]) -> tuple[str, Iterator[_File]]:
     if where.is_dir():
         root = where.absolute()
         return str(root), _walk(root, endings, frozenset())
-    if where.is_file():
+    if where.exists():
         return str(where.absolute().parent), iter([_File(str(where.absolute()))])
     if not PATTERN.search(str(where)):
-        raise ConfigError("is not there", where=text, expected="a log, a folder with logs, or a pattern")
+        raise ConfigError("is not there", where=redact(text), expected="a log, a folder with logs, or a pattern")
     root = Path.cwd()
     for part in where.parts:
         if PATTERN.search(part):

@@ -32,17 +32,18 @@ CALM_SHARE = 0.25  # of the resting windows, the calmest, that give the noise: m
 NOISE_WINDOW_S = 1.0
 
 
-def inspect(path: Location, *, check: bool = True) -> LogInfo:
+def inspect(path: Location, *, check: bool = True, max_chunk: int | None = None) -> LogInfo:
     """Describe a log: topics, clocks, IMU defects and noise, coverage by the truth, warnings.
 
     Of a damaged log the sound part is described, and `losses` lists the rest. For that every chunk is read once; without
     `check` only chunks with IMU messages are read, and damage elsewhere may go unnoticed.
+    A chunk of more than `max_chunk` bytes counts as lost.
 
     Raises:
         ConfigError: the file cannot be opened.
         LogError: the file is not an MCAP log, or nothing in it is sound.
     """
-    with RecoveredLog(path) as log:
+    with RecoveredLog(path, max_chunk=max_chunk) as log:
         return describe(log, check=check)
 
 

@@ -9,7 +9,8 @@ from typing import NamedTuple, Protocol, runtime_checkable
 import numpy as np
 from jaxtyping import Int64, Shaped, UInt8, UInt16
 
-from imutool.mcap_io.codec import messages
+from imutool.errors import LogError
+from imutool.mcap_io.codec import messages, schemas
 from imutool.mcap_io.log import Log
 from imutool.mcap_io.topics import ImuBatch
 from imutool.mcap_io.writer import Chunk
@@ -51,6 +52,24 @@ class DerivedTopics(Protocol):
 
     def __call__(self, batch: ImuBatch) -> DerivedBatch:
         """Messages for a batch: the source messages that stay, and CDR payloads per new topic."""
+
+
+def check_new_topics(log: Log, derived: Sequence[DerivedTopics]) -> None:
+    """Refuses a new topic that the log has already.
+
+    Raises:
+        LogError: it has, or lacks a source topic.
+    """
+    for topics in derived:
+        log.topic(topics.source_topic, (schemas.IMU,))
+        for new in topics.topics:
+            if new.name in log.topics:
+                raise LogError(
+                    f"{new.name} is in this log already",
+                    where=log.path,
+                    expected="a log without it",
+                    fix="Choose another IMU with `imu`, or start from the original log",
+                )
 
 
 @dataclass

@@ -49,6 +49,7 @@ class MessageBlock:
     counts: dict[int, int] | None = None  # messages per channel id, once known
     trusted: bool = True  # False: no summary lists the block, and only unpacking it proves what is in it
     edited: bool = False  # some of its messages are left out or have other channel ids than in its bytes
+    recording: int = 0  # of the logs in a damaged file, the one that wrote it
     lost: bool = False
 
     @staticmethod
@@ -201,6 +202,11 @@ def read_run(source: Source, position: int, first: int, limit: int) -> MessageBl
     times = found.times()
     counts = dict(Counter(found.heads["channel"].tolist()))
     return MessageBlock(position, end, position + end, int(times.min()), int(times.max()), None, counts=counts)
+
+
+def too_large(what: str, offset: int, size: int, max_chunk: int) -> LogError:
+    """Error about a record that is not to come into memory."""
+    return LogError(f"the {what} at byte {offset} has {size} bytes", expected=f"at most {max_chunk} (`max_chunk`)")
 
 
 def cut_short(source: Source) -> LogError:

@@ -29,7 +29,7 @@ MAX_ROW = 64  # numbers of an array that become channels
 MAX_OTHERS, READ_FACTOR = 48, 4  # channels, and how many times as many fields are read to find varying ones
 _PATH = re.compile(r"[A-Za-z]\w*(\[\d{1,9}\])?(\.[A-Za-z]\w*(\[\d{1,9}\])?)*")
 _LAST = re.compile(r"(.*?)(?:\[(\d+)\])?")
-_NO_CHANNEL = re.compile(r"(^|\.)(\w*stamp|covariance|\w+_covariance)\b")
+_NO_CHANNEL = re.compile(r"(^|\.)(\w*stamp|covariance|\w+_covariance|variance)\b")
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,11 +96,11 @@ def numeric_fields(log: Log, topic: str, *, long: bool = True) -> list[str]:
     return []
 
 
-def others(path: Location, signal: str, most: int = MAX_OTHERS) -> dict[str, Fields]:
+def others(path: Location, signal: str, most: int = MAX_OTHERS, skip: Collection[str] = ()) -> dict[str, Fields]:
     """Every other varying number of a log by TOPIC.field: candidates to drive a signal.
 
     Left out are stamps, covariances, constants, NaN, stamps that go back, long arrays (images), topics without a definition or
-    computed by imutool, and all fields behind the first `most` that vary, in the order of the log.
+    computed by imutool, those in `skip`, and all fields behind the first `most` that vary, in the order of the log.
 
     Raises:
         ConfigError, LogError: the log cannot be opened, or is damaged.
@@ -109,7 +109,7 @@ def others(path: Location, signal: str, most: int = MAX_OTHERS) -> dict[str, Fie
         readers = {}
         left = READ_FACTOR * most
         for name, topic in log.topics.items():
-            paths = [] if DERIVED_KEY in topic.metadata else _offered(log, name)
+            paths = [] if name in skip or DERIVED_KEY in topic.metadata else _offered(log, name)
             paths = [inside for inside in paths if f"{name}.{inside}" != signal and not _NO_CHANNEL.search(inside)][:left]
             if paths:
                 readers[name], left = _Reader(log, topic, tuple(paths), strict=False), left - len(paths)

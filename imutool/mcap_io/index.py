@@ -24,6 +24,7 @@ from imutool.mcap_io.blocks import (
     message_offsets,
     read_entries,
     read_run,
+    too_large,
 )
 from imutool.mcap_io.codec import messages, records
 from imutool.mcap_io.codec.records import FOOTER_SIZE, HEAD, MAGIC, crc32
@@ -39,8 +40,11 @@ class LogIndex:
         LogError: empty, not an MCAP log, cut short, or damaged; the message says at which byte.
     """
 
-    def __init__(self, source: Source) -> None:
-        self.source = source
+    def __init__(self, source: Source, max_chunk: int = records.MAX_CHUNK) -> None:
+        self.source, self.max_chunk = source, max_chunk
+        self._read()
+
+    def _read(self) -> None:
         self.schemas: dict[int, Schema] = {}
         self.channels: dict[int, Channel] = {}
         self.items: list[MessageBlock | RecordSpan] = []
@@ -75,8 +79,10 @@ class LogIndex:
 
     def counts(self) -> dict[int, int]:
         """Messages per channel id."""
-        if self.statistics is not None:
-            return dict(self.statistics.channel_message_counts)
+        return dict(self.statistics.channel_message_counts) if self.statistics else self.summed_counts()
+
+    def summed_counts(self) -> dict[int, int]:
+        """Messages per channel id, block by block."""
         total: Counter[int] = Counter()
         for block in self.blocks:
             total.update(self._counts_of(block))
@@ -96,10 +102,8 @@ class LogIndex:
         Raises:
             LogError: too large for memory, or the disk does not give them.
         """
-        if block.length > records.CHUNK_LIMIT:
-            raise LogError(
-                f"the chunk at byte {block.offset} has {block.length} bytes", expected=f"at most {records.CHUNK_LIMIT}"
-            )
+        if block.length > self.max_chunk:
+            raise too_large("chunk", block.offset, block.length, self.max_chunk)
         return self.source.at(block.offset, block.length)
 
     def unpack_or_lose(self, block: MessageBlock) -> messages.Messages | None:
@@ -118,10 +122,9 @@ class LogIndex:
         """
         for item in self.items:
             try:
-                if isinstance(item, MessageBlock):
-                    if not item.lost:
-                        self.unpack(item)
-                elif item.opcode == Opcode.ATTACHMENT:
+                if isinstance(item, MessageBlock) and not item.lost:
+                    self.unpack(item)
+                elif isinstance(item, RecordSpan) and item.opcode == Opcode.ATTACHMENT:
                     Attachment.of(self.source, item.offset, item.length - HEAD.size).check_crc(self.source)
             except LogError as error:
                 self.lose(item, error)
@@ -133,10 +136,9 @@ class LogIndex:
         opcode, length = HEAD.unpack_from(raw)
         if opcode != Opcode.CHUNK or length != block.length - HEAD.size:
             raise LogError(f"the summary lists a chunk at byte {block.offset}, and none begins there")
-        data = records.unpack(raw, block.offset)
+        data = records.unpack(raw, block.offset, self.max_chunk)
         offsets = message_offsets(self.source, block, len(data))
-        found = None if offsets is None else messages.parse_at(data, offsets)
-        return found or messages.parse(data, block.offset)
+        return (None if offsets is None else messages.parse_at(data, offsets)) or messages.parse(data, block.offset)
 
     def entries(self, block: MessageBlock, channel: int) -> UInt64[np.ndarray, "n 2"]:
         """As `blocks.read_entries`."""
@@ -154,11 +156,9 @@ class LogIndex:
         at = source.size - len(MAGIC) - FOOTER_SIZE
         if at < len(MAGIC) or source.at(source.size - len(MAGIC), len(MAGIC)) != MAGIC:
             raise cut_short(source)
-        opcode, length = source.head(at)
-        if opcode != Opcode.FOOTER or length != FOOTER_SIZE - HEAD.size:
+        if source.head(at) != (Opcode.FOOTER, FOOTER_SIZE - HEAD.size):
             raise LogError(f"the footer at byte {at} is damaged", expected="a Footer record")
-        footer = records.parse(Footer, source.at(at + HEAD.size, length), at)
-        assert isinstance(footer, Footer), "parse returns the class it is given"
+        footer: Footer = records.parse(Footer, source.at(at + HEAD.size, FOOTER_SIZE - HEAD.size), at)
         return footer
 
     def _read_summary(self) -> dict[int, ChunkIndex]:
@@ -218,8 +218,7 @@ class LogIndex:
         self.header_end = position
         while position < limit:
             if (known := chunks.get(position)) is not None:
-                block = MessageBlock.of_summary(known, limit)
-                self.items.append(block)
+                self.items.append(block := MessageBlock.of_summary(known, limit))
                 position = block.end
                 continue
             opcode, length = source.head(position) if limit - position >= HEAD.size else (0, limit)
@@ -229,6 +228,8 @@ class LogIndex:
                     expected=f"at most {max(0, limit - position - HEAD.size)}",
                 )
             if opcode in (Opcode.DATA_END, Opcode.FOOTER):
+                if opcode == Opcode.FOOTER or position + HEAD.size + length != limit:
+                    raise LogError(f"the data section ends at byte {position}, ahead of byte {limit} where the summary begins")
                 return position
             position = self._add(opcode, position, length, limit)
         raise LogError(f"the data section does not end before byte {limit}", expected="a DataEnd record")
@@ -238,9 +239,10 @@ class LogIndex:
         whole = HEAD.size + length
         if opcode == Opcode.CHUNK:
             head = records.ChunkHead.of(self.source.at(position, min(HEAD_BYTES, whole)), whole, position)
-            block = MessageBlock(position, whole, position + whole, head.start_ns, head.end_ns, head.compression)
-            self.items.append(block)
+            self.items.append(MessageBlock(position, whole, position + whole, head.start_ns, head.end_ns, head.compression))
         elif opcode == Opcode.MESSAGE:
+            if whole > self.max_chunk:
+                raise too_large("message", position, whole, self.max_chunk)
             block = read_run(self.source, position, whole, limit)
             self.items.append(block)
             return block.end
@@ -277,8 +279,7 @@ class LogIndex:
                 break
             if block.counts is None:
                 self._read_definitions(block)
-        missing = used - self.channels.keys()
-        if missing:
+        if missing := used - self.channels.keys():
             raise LogError(f"channel {min(missing)} has messages and no Channel record", expected="a definition")
         for channel in self.channels.values():
             if channel.schema_id and channel.schema_id not in self.schemas:
@@ -291,10 +292,9 @@ class LogIndex:
             self.define(opcode, found.data[first : first + length].tobytes(), block.offset)
 
     def _counts_of(self, block: MessageBlock) -> dict[int, int]:
-        if block.counts is None:
-            if block.indexes:
-                block.counts = {channel: len(self.entries(block, channel)) for channel in block.indexes}
-            else:
-                self._read_definitions(block)
+        if block.counts is None and block.indexes:
+            block.counts = {channel: len(self.entries(block, channel)) for channel in block.indexes}
+        elif block.counts is None:
+            self._read_definitions(block)
         assert block.counts is not None, "reading the definitions of a block counts its messages"
         return block.counts

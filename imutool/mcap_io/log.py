@@ -30,9 +30,9 @@ class Log:
 
     It may have chunks, a summary and message indexes, or not.
 
-    Memory is bounded by its largest chunk. An open `Source` can be given in place of a path. Times given to a
-    method select by log time, both ends included. The first damage is an error; `recovery.recovered_log.RecoveredLog` reads
-    what is intact of a damaged log.
+    Memory is bounded by its largest chunk; one of more than `max_chunk` bytes is refused. An open `Source` can be given in
+    place of a path. Times given to a method select by log time, both ends included. The first damage is an error;
+    `recovery.recovered_log.RecoveredLog` reads what is intact of a damaged log.
 
     Raises:
         ConfigError: the file cannot be opened.
@@ -41,21 +41,22 @@ class Log:
 
     index: LogIndex
 
-    def __init__(self, path: str | Location | Source) -> None:
+    def __init__(self, path: str | Location | Source, *, max_chunk: int | None = None) -> None:
         keep_buffers()
+        self.max_chunk = records.MAX_CHUNK if max_chunk is None else max_chunk
         place = to_location(path) if isinstance(path, str) else path
         self._source = place if isinstance(place, Source) else Source(place)
         self._owns_source, self.path = True, self._source.path
         try:
             with self.named():
                 self.index = self._read_index(self._source)
-                self.topics = MappingProxyType(_topics_of(self.index))
+                self.topics = MappingProxyType(topics_of(self.index))
         except BaseException:
             self.close()
             raise
 
     def _read_index(self, source: Source) -> LogIndex:
-        return LogIndex(source)
+        return LogIndex(source, self.max_chunk)
 
     def __enter__(self) -> Log:
         return self
@@ -273,7 +274,7 @@ class Log:
                 yield topic, rows
 
 
-def _topics_of(index: LogIndex) -> dict[str, Topic]:
+def topics_of(index: LogIndex) -> dict[str, Topic]:
     """The topics of a log by their names, in order of their channel ids.
 
     Raises:

@@ -61,13 +61,14 @@ def repair(
     *,
     damaged: str = "drop",
     overwrite: bool = False,
+    max_chunk: int | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> RepairReport:
-    """Writes the intact part of `source` to `target`, in file order, with all indexes.
+    """Writes the intact part of `source` to `target`, in order of log time, with all indexes.
 
     With `damaged="keep"` the bytes of damaged stretches become attachments `imutool/damaged/OFFSET`, which no reader takes
     for messages. The metadata record `imutool_repair` lists what was lost; an intact log gets none. The result is
-    read back as a whole before it takes its place.
+    read back as a whole before it takes its place. A chunk of more than `max_chunk` bytes, packed or unpacked, is left out.
 
     Raises:
         ConfigError: source or target cannot be opened, the target exists or is the source, or an unknown `damaged`.
@@ -78,26 +79,41 @@ def repair(
     if same_location(source, target):
         raise ConfigError("the target is the source", where=target, fix="Choose another name")
     tell = progress or (lambda done, total: None)
-    with RecoveredLog(source) as log:
-        index, losses, size = log.index, log.losses, log.index.source.size
-        compression = next((b.compression for b in index.blocks if b.compression), "zstd")
-        with LogWriter(target, compression=compression, overwrite=overwrite, header=index.header_bytes) as out:
-            with log.named():
-                kept = _save(log, out, damaged, lambda done: tell(done, 2 * size))
-            if not losses.intact:
-                out.metadata(RECORD, _loss_record(source, damaged, losses))
-            out.finish()
-            verify(
-                out.target.temporary,
-                out.contents.counts,
-                progress=lambda done, total: tell(size + size * done // total, 2 * size),
-            )
-            tell(2 * size, 2 * size)
-            saved: dict[str, int] = {}
-            for channel, count in sorted(out.contents.counts.items()):
-                topic = index.channels[channel].topic
-                saved[topic] = saved.get(topic, 0) + count
-            return RepairReport(losses, saved, len(out.contents.chunks), kept, size, out.target.position)
+    with RecoveredLog(source, max_chunk=max_chunk) as log:
+        try:
+            return _repair(log, target, damaged, overwrite, tell)
+        except _ContradictionError:
+            log.read_by_records()
+            return _repair(log, target, damaged, overwrite, tell)
+
+
+class _ContradictionError(Exception):
+    """The contents of a log are not as its index says."""
+
+
+def _repair(
+    log: RecoveredLog, target: Location, damaged: str, overwrite: bool, tell: Callable[[int, int], None]
+) -> RepairReport:
+    index, losses, size = log.index, log.losses, log.index.source.size
+    compression = next((b.compression for b in index.blocks if b.compression), "zstd")
+    with LogWriter(target, compression=compression, overwrite=overwrite, header=index.header_bytes) as out:
+        with log.named():
+            kept = _save(log, out, damaged, lambda done: tell(done, 2 * size))
+        if not losses.intact:
+            out.metadata(RECORD, _loss_record(log.path, damaged, losses))
+        out.finish()
+        verify(
+            out.target.temporary,
+            out.contents.counts,
+            max_chunk=log.max_chunk,
+            progress=lambda done, total: tell(size + size * done // total, 2 * size),
+        )
+        tell(2 * size, 2 * size)
+        saved: dict[str, int] = {}
+        for channel, count in sorted(out.contents.counts.items()):
+            topic = index.channels[channel].topic
+            saved[topic] = saved.get(topic, 0) + count
+        return RepairReport(losses, saved, len(out.contents.chunks), kept, size, out.target.position)
 
 
 def _loss_record(source: Location, damaged: str, losses: Losses) -> dict[str, str]:
@@ -114,6 +130,8 @@ def _save(log: RecoveredLog, out: LogWriter, damaged: str, tell: Callable[[int],
         LogError: nothing is intact.
     """
     log.check_data_crc()
+    if log.losses and not log.index.by_records:
+        raise _ContradictionError
     saver = _Saver(log.index, out)
     for item in log.index.items:
         saver.copy(item)
@@ -145,16 +163,18 @@ class _Saver:
             elif not item.lost:
                 self._copy_block(item)
         except LogError as error:
+            if not self.index.by_records:
+                raise _ContradictionError from error
             self.index.lose(item, error)
 
     def _copy_block(self, block: MessageBlock) -> None:
         raw = self.index.read(block)
         found = self.index.unpack_bytes(block, raw)
-        if block.compression is None or block.edited:
+        head = None if block.compression is None else ChunkHead.of(raw[:128], len(raw), block.offset)
+        if head is None or block.edited or not _frame_ends(raw[head.data_at :], head.compression):
             if len(found.heads):
                 self._new_chunk(block, found)
             return
-        head = ChunkHead.of(raw[:128], len(raw), block.offset)
         self._write_chunk(raw[: head.data_at], raw[head.data_at :], head, found)
 
     def _new_chunk(self, block: MessageBlock, found: messages.Messages) -> None:
@@ -194,6 +214,14 @@ class _Saver:
         self.out.target.copy(self.source, span.offset, span.offset + span.length)
 
 
+def _frame_ends(packed: bytes, compression: str) -> bool:
+    """Whether packed data have their end mark, without which other readers refuse them."""
+    if compression != "lz4":
+        return True
+    checksum = 4 if packed[4] & 4 else 0  # of the contents, behind the end mark
+    return packed[len(packed) - 4 - checksum : len(packed) - checksum] == bytes(4)
+
+
 def _attach_damaged(out: LogWriter, source: Source, loss: Loss) -> None:
     """Writes damaged bytes as attachments, in parts that a reader can hold."""
     for start in range(loss.offset, loss.offset + loss.length, PART_BYTES):
@@ -213,14 +241,14 @@ def _attach_damaged(out: LogWriter, source: Source, loss: Loss) -> None:
 
 
 @contextmanager
-def repaired(source: Location, beside: Location) -> Iterator[tuple[Location, Losses] | None]:
+def repaired(source: Location, beside: Location, max_chunk: int | None = None) -> Iterator[tuple[Location, Losses] | None]:
     """Temporary repaired copy of a damaged log beside another file; None if the log is intact.
 
     Raises:
         ConfigError: the copy cannot be written.
         LogError: nothing in the log can be saved.
     """
-    with RecoveredLog(source) as log:
+    with RecoveredLog(source, max_chunk=max_chunk) as log:
         log.check()
         intact = log.losses.intact
     if intact:
@@ -228,7 +256,7 @@ def repaired(source: Location, beside: Location) -> Iterator[tuple[Location, Los
         return
     copy = beside.with_name(f".{source.name}.{os.getpid()}.{secrets.token_hex(4)}.partial")
     try:
-        yield copy, repair(source, copy).losses
+        yield copy, repair(source, copy, max_chunk=max_chunk).losses
     except ImutoolError as error:  # the user does not know the copy
         where = None if error.where is None else str(error.where).replace(str(copy), str(source))
         raise type(error)(error.what, where=where, expected=error.expected, fix=error.fix) from error

@@ -24,7 +24,7 @@ from mcap.records import Metadata, MetadataIndex
 
 from imutool.errors import ConfigError, LogError
 from imutool.location import Location, identity, same_location
-from imutool.mcap_io.added_topics import DerivedStream, DerivedTopics
+from imutool.mcap_io.added_topics import DerivedStream, DerivedTopics, check_new_topics
 from imutool.mcap_io.blocks import (
     Attachment,
     MessageBlock,
@@ -33,7 +33,7 @@ from imutool.mcap_io.blocks import (
     parse_message_indexes,
     read_message_indexes,
 )
-from imutool.mcap_io.codec import messages, records, schemas
+from imutool.mcap_io.codec import messages, records
 from imutool.mcap_io.codec.records import HEAD, ChunkHead
 from imutool.mcap_io.index import LogIndex
 from imutool.mcap_io.log import Log
@@ -54,6 +54,7 @@ class RewriteReport:
     copied: int  # messages of the source
     added: Mapping[str, int]  # messages per new topic
     chunks: int
+    unchecked: int  # messages of the source that no CRC covers
     source_bytes: int
     target_bytes: int
     verified: Verified
@@ -97,7 +98,7 @@ def rewrite(
         raise ConfigError("the target is the source", where=target, fix="Choose another name")
     place = (path.resolve() if isinstance(path, Path) else path) if target is None else target
     with nullcontext(source) if isinstance(source, Log) else Log(source) as log:
-        _check_new_topics(log, derived)
+        check_new_topics(log, derived)
         crc, packing = bool(stated_crc(log.index)), _compression(log.index)
         header, replace = log.index.header_bytes, overwrite or target is None
         with LogWriter(place, compression=packing, overwrite=replace, header=header, data_crc=crc) as out:
@@ -115,19 +116,6 @@ def _copy_permissions(source: Path, target: Path) -> None:
     with suppress(PermissionError):
         os.chown(target, status.st_uid, status.st_gid)
     target.chmod(status.st_mode & 0o7777)
-
-
-def _check_new_topics(log: Log, derived: Sequence[DerivedTopics]) -> None:
-    for topics in derived:
-        log.topic(topics.source_topic, (schemas.IMU,))
-        for new in topics.topics:
-            if new.name in log.topics:
-                raise LogError(
-                    f"{new.name} is in this log already",
-                    where=log.path,
-                    expected="a log without it",
-                    fix="Choose another IMU with `imu`, or start from the original log",
-                )
 
 
 def _compression(index: LogIndex) -> str:
@@ -156,7 +144,11 @@ class _Rewrite:
         ]
         self.imu_channels = set().union(*(stream.sources for stream in self.streams)) if self.streams else set()
         self.passing = PassThrough(self.source, out.target)
-        self.checked, self.new_chunks = 0, set[int]()  # chunks unpacked while copying; offsets of the new ones
+        self.checked, self.unchecked, self.new_chunks = (
+            0,
+            0,
+            set[int](),
+        )  # chunks unpacked while copying; offsets of the new ones
 
     def run(self, metadata: Values | Callable[[Verified], Values]) -> RewriteReport:
         """Copies the log item by item with the new chunks between them, ends it, and verifies it.
@@ -177,12 +169,14 @@ class _Rewrite:
             self.out.target.temporary,
             contents.counts,
             unpacked={"all": None, "imu": self.new_chunks, "none": ()}[self.check],
+            max_chunk=self.index.max_chunk,
             progress=lambda done, total: self.tell(size + size * done // total, 2 * size),
         )
         self.tell(2 * size, 2 * size)
         added = {t.name: contents.counts[i] for s in self.streams for t, i in zip(s.derived.topics, s.ids, strict=True)}
         copied = contents.counts.total() - sum(added.values())
-        return RewriteReport(copied, added, len(contents.chunks), size, self.out.target.position, verified)
+        unchecked = 0 if stated_crc(self.index) else self.unchecked  # else the CRC of the data section covers them
+        return RewriteReport(copied, added, len(contents.chunks), unchecked, size, self.out.target.position, verified)
 
     def _copy_all(self, size: int) -> None:
         self.passing.skip(self.index.header_end)
@@ -235,6 +229,7 @@ class _Rewrite:
             stream.add(found)
         self.passing.flush()
         self.checked += 1
+        self.unchecked += len(found.heads)
         self.out.chunk(Chunk(raw, found.heads["channel"], found.times(), found.offsets), "none")
         self.passing.skip(block.end)
 
@@ -244,7 +239,10 @@ class _Rewrite:
         raw, behind = everything[: block.length], everything[block.length :]
         try:
             head = block.head(raw)
-            indexes, data = parse_message_indexes(behind, block, head.size), records.unpack(raw, block.offset)
+            indexes, data = (
+                parse_message_indexes(behind, block, head.size),
+                records.unpack(raw, block.offset, self.index.max_chunk),
+            )
             found, right = indexes.messages(data, block.offset) if indexes else (messages.parse(data, block.offset), False)
         except LogError as error:
             self.index.lose(block, error)
@@ -259,12 +257,14 @@ class _Rewrite:
         if indexes is not None and right:
             self._list_chunk(block, head, indexes, self.passing.write(everything) - block.offset)
         else:
+            self.unchecked += 0 if head.crc else len(found.heads)
             entry = head.index_at(self.passing.write(raw), block.length)
             self.out.write_indexes(entry, found.heads["channel"].copy(), found.times(), found.offsets)
             self.passing.skip(block.end)
 
     def _list_chunk(self, block: MessageBlock, head: ChunkHead, indexes: MessageIndexes, moved: int) -> None:
         """Enters a chunk with its own message indexes in the summary."""
+        self.unchecked += 0 if head.crc else sum(indexes.counts.values())
         entry = head.index_at(block.offset + moved, block.length)
         entry.message_start_time, entry.message_end_time = indexes.start_ns, indexes.end_ns
         entry.message_index_offsets = {c: at + moved for c, at in block.indexes.items()}

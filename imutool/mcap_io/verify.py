@@ -48,6 +48,7 @@ def verify(
     counts: Mapping[int, int],
     *,
     unpacked: Collection[int] | None = None,
+    max_chunk: int | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> int:
     """Checks a log that should hold `counts` messages per channel id.
@@ -60,7 +61,7 @@ def verify(
     Raises:
         LogError: the log contradicts its own indexes, statistics or CRCs.
     """
-    with Log(path) as log, log.named():
+    with Log(path, max_chunk=max_chunk) as log, log.named():
         index, done = log.index, 0
         sums = _Sums()
         for block in index.blocks:
@@ -96,7 +97,7 @@ class _Sums:
                 raise LogError(f"the message indexes behind the chunk at byte {block.offset} are damaged")
             return
         raw = index.source.at(block.offset, block.length) if whole else b""
-        if whole and not listed.messages(records.unpack(raw, block.offset), block.offset)[1]:
+        if whole and not listed.messages(records.unpack(raw, block.offset, index.max_chunk), block.offset)[1]:
             raise LogError(f"the message indexes behind the chunk at byte {block.offset} list other messages than are in it")
         if (block.start_ns, block.end_ns) != (listed.start_ns, listed.end_ns):
             raise LogError(

@@ -54,6 +54,7 @@ class Parameter:
         matters only together with an amplitude (a time constant, a frequency) has its plausible size there.
     step: the largest step whose difference is still a derivative, of the logarithm if `positive`.
     begins: it is the time (s from the log's start) at which the effect sets in, never if infinite; a fit tries all times.
+    least: the smallest value that is an answer; a fit below it is none.
     fixed_in_training: the value that training gives a parameter in which the effect is not linear.
     """
 
@@ -64,6 +65,7 @@ class Parameter:
     null_value: float = 0.0
     step: float | None = None
     begins: bool = False
+    least: float | None = None
     fixed_in_training: float | None = None
 
 

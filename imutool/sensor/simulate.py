@@ -25,6 +25,7 @@ from imutool.mcap_io.write import write
 from imutool.noise import datasheet as noises
 from imutool.recording import Imu, Poses, Recording, unit_quaternions
 from imutool.sensor import physics_file
+from imutool.sensor.channels import with_channels
 from imutool.sensor.effect import Acting, Effect, Stage, Theta, simulate_stretches
 from imutool.sensor.physics_file import PhysicsFile
 from imutool.sensor.samples import IdealMotion, SensorSamples, channels_at
@@ -103,7 +104,7 @@ def simulate(
     if out.exists() and out.samefile(trajectory):
         raise ConfigError("is the trajectory itself", where=out, expected="another OUT")
     report(0, 4, "reading")
-    source = _source(trajectory, truth)
+    source = _source(trajectory, truth, channels=_needs_channels(acting))
     own_rate = 1.0 / source.imu.period_s if len(source.imu) > 1 else RATE_HZ
     report(1, 4, "smoothing")
     try:
@@ -150,7 +151,7 @@ def simulated(source: Recording, acting: Acting, noise: noises.Noise, rate_hz: f
         )
     remarks = _remarks(motion, source.truth, noise)
     ideals = motion.ideal_motions(rate_hz * max(1, int(np.ceil(MOTION_HZ / rate_hz))))
-    needed = any(effect.needs or effect.name == DRIVEN for effect, _ in acting)
+    needed = _needs_channels(acting)
     if needed:
         ideals = [replace(ideal, channels=channels_at(source, ideal.t_s, motion.start_ns)) for ideal in ideals]
     stamps = [_stamps(ideal, rate_hz) for ideal in ideals]
@@ -173,6 +174,10 @@ def simulated(source: Recording, acting: Acting, noise: noises.Noise, rate_hz: f
         {"rate_hz": rate_hz, "seed": seed},
         remarks,
     )
+
+
+def _needs_channels(acting: Acting) -> bool:
+    return any(effect.needs or effect.name == DRIVEN for effect, _ in acting)
 
 
 def _stamps(ideal: IdealMotion, rate_hz: float) -> Float64[np.ndarray, " m"]:
@@ -238,13 +243,14 @@ def _rounded(rate_hz: float) -> float:
     return float(whole) if whole and abs(rate_hz / whole - 1.0) < 1e-3 else rate_hz
 
 
-def _source(path: Path, truth: str | None) -> Recording:
+def _source(path: Path, truth: str | None, *, channels: bool) -> Recording:
     """Recording of a log with poses; without an IMU, an empty one stands in."""
     with Log(path) as log:
         imus = log.imu_topics
         if not imus:
             return _without_imu(log, truth)
     found = read_log(path, imu=imus[0], truth=truth)
+    found = with_channels(found, path).recording if channels else found
     if not found.truths:
         raise LogError("the log has no poses", where=path, expected="a topic of PoseStamped, Odometry or TF")
     return found if truth is None else found.with_truth(next(iter(found.truths)))

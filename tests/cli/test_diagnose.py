@@ -110,7 +110,7 @@ def test_the_conclusion_comes_first(diagnosed: tuple[Path, Done]) -> None:
     assert lines[-1] == f"{place}: findings.json, physics.toml, report.html, log.html, view.rrd"
     (closer,) = [line for line in lines if line.startswith("With everything that was found")]
     assert "accel rms" in closer
-    assert "% closer" in closer
+    assert "% of the misfit removed" in closer
 
 
 def test_simulated_with_the_physics_found_it_comes_closer(diagnosed: tuple[Path, Done]) -> None:

@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import os
+import platform
+import random
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -46,12 +50,13 @@ def test_cut_off_anywhere_the_journal_knows_all_whole_lines(tmp_path: Path) -> N
     fill(tmp_path, "a", "b")
     whole = (tmp_path / NAME).read_bytes()
     first, last = whole.index(b'"messages":7') + 1, len(whole)
+    second = whole.index(b"\n", whole.index(b'"messages":7', first))  # the end of the line, without which it is whole
     ends = [at + k for at, byte in enumerate(whole, 1) if byte == 10 for k in (-1, 0, 1)]
     for cut in sorted({*range(whole.index(b"\n") + 1, last, 23), *(at for at in ends if at <= last)} - {*range(ends[1])}):
         (tmp_path / NAME).write_bytes(whole[:cut])
         with Journal(tmp_path, SETTINGS, resume=True) as journal:
             known = [key for key in "ab" if journal.done(key)]
-            assert known == (["a", "b"] if cut == last else ["a"] if cut > whole.index(b"\n", first) else [])
+            assert known == (["a", "b"] if cut >= second else ["a"] if cut >= whole.index(b"\n", first) else [])
             journal.finish(result("c"))
         with Journal(tmp_path, SETTINGS, resume=True) as journal:
             assert journal.done("c") == result("c")
@@ -65,6 +70,47 @@ def test_a_line_that_cannot_be_read_costs_that_log_alone(tmp_path: Path) -> None
     with Journal(tmp_path, SETTINGS, resume=True) as journal:
         assert (journal.done("a"), journal.done("b")) == (None, result("b", messages=7))
         assert journal.ours("a.mcap")
+
+
+def test_after_random_bytes_only_what_they_hit_is_done_again(tmp_path: Path) -> None:
+    """Anywhere, of any length, also over the ends of lines and over the line that says with which settings it was begun."""
+    keys = [f"log_{k:02d}" for k in range(80)]
+    fill(tmp_path, *keys)
+    whole, rng = (tmp_path / NAME).read_bytes(), random.Random(0)
+    ends = [at for at, byte in enumerate(whole) if byte == 10]
+    for n in range(60):
+        raw, at, size = (
+            bytearray(whole),
+            rng.choice([0, rng.choice(ends), rng.randrange(len(whole))]),
+            rng.choice([1, 1, 40, 900]),
+        )
+        raw[at : at + size] = rng.choice([rng.randbytes(size), bytes(size), b"\n" * size])[: len(raw) - at]
+        (tmp_path / NAME).write_bytes(raw)
+        changed = [k for k in range(at, min(at + size, len(whole))) if raw[k] != whole[k]]
+        spared = set()
+        with Journal(tmp_path, SETTINGS, resume=True) as journal:
+            for key in keys:
+                line = whole.index(b'{"line":"done","key":"%s"' % key.encode())
+                if not any(line <= k < whole.index(b"\n", line) for k in changed):
+                    spared.add(key)
+            assert {key for key in keys if journal.done(key) == result(key, messages=7)} == spared, (n, at, size)
+            assert {key for key in keys if journal.done(key)} == spared
+            if at + size < ends[-2]:  # else the last note that a target is ours goes as well
+                assert all(journal.ours(f"{key}.mcap") for key in keys)
+
+
+def test_a_changed_digit_in_a_line_is_seen(tmp_path: Path) -> None:
+    fill(tmp_path, "a", "b")
+    (tmp_path / NAME).write_bytes((tmp_path / NAME).read_bytes().replace(b'"messages":7', b'"messages":8', 1))
+    with Journal(tmp_path, SETTINGS, resume=True) as journal:
+        assert (journal.done("a"), journal.done("b")) == (None, result("b", messages=7))
+
+
+def test_lines_of_an_earlier_version_count(tmp_path: Path) -> None:
+    fill(tmp_path, "a")
+    (tmp_path / NAME).write_bytes(re.sub(rb',"crc":"[0-9a-f]{8}"', b"", (tmp_path / NAME).read_bytes()))
+    with Journal(tmp_path, SETTINGS, resume=True) as journal:
+        assert journal.done("a") == result("a", messages=7)
 
 
 def test_results_that_are_there_are_not_begun_anew_without_a_word(tmp_path: Path) -> None:
@@ -91,7 +137,7 @@ def test_two_at_once_are_refused(tmp_path: Path) -> None:
     line = f"from imutool.fleet.journal import *; Journal(Path({str(tmp_path)!r}), Settings(command='info'), resume=True)"
     with Journal(tmp_path, SETTINGS):
         done = subprocess.run([sys.executable, "-c", line], capture_output=True, text=True, timeout=60, check=False)
-    assert "another run is at work here" in done.stderr
+    assert f"another run is at work here (process {os.getpid()} of {platform.node()})" in done.stderr
 
 
 def test_a_key_is_of_the_content_the_model_and_the_settings() -> None:

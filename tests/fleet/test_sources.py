@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import socket
 from pathlib import Path
 from typing import Any
 
@@ -137,6 +138,19 @@ def test_only_what_was_half_written_beside_these_targets_goes(tmp_path: Path) ->
     tree(tmp_path, *ours, *others)
     remove_files(partial_files(tmp_path, ["a.mcap", "b/c.mcap", "gone/d.mcap"]))
     assert sorted(str(one.relative_to(tmp_path)) for one in tmp_path.rglob("*") if one.is_file()) == sorted(others)
+
+
+def test_a_pipe_a_socket_and_a_device_are_told_and_not_opened(tmp_path: Path) -> None:
+    tree(tmp_path, "good.mcap")
+    os.mkfifo(tmp_path / "pipe.mcap")
+    (tmp_path / "device.mcap").symlink_to("/dev/zero")
+    with socket.socket(socket.AF_UNIX) as listener:
+        listener.bind(str(tmp_path / "socket.mcap"))
+        found = find(str(tmp_path), NOWHERE)
+    assert [log.name for log in found.logs] == ["good.mcap"]
+    assert [Path(where).name for where, _ in found.refused] == ["device.mcap", "pipe.mcap", "socket.mcap"]
+    assert all("is a pipe, a socket or a device" in why for _, why in found.refused)
+    assert "is a pipe" in find(str(tmp_path / "pipe.mcap"), NOWHERE).refused[0][1]
 
 
 def test_a_store_is_listed_in_one_request(store: Any) -> None:

@@ -182,8 +182,12 @@ def pixels(png: bytes) -> Picture:
 
 
 @contextmanager
-def native(window: tuple[int, int] = WINDOW, memory: str = "2GiB") -> Iterator[Native]:
+def native(
+    window: tuple[int, int] = WINDOW, memory: str = "2GiB", *, files: Sequence[Path] = (), path: str | None = None
+) -> Iterator[Native]:
     """Rerun's viewer without a window, on a port of its own on loopback, in a software Vulkan driver.
+
+    It opens `files`; with `path` it looks for importers there.
 
     Raises:
         DiedError: it did not start.
@@ -193,8 +197,9 @@ def native(window: tuple[int, int] = WINDOW, memory: str = "2GiB") -> Iterator[N
     found = driver() or absent("driver")
     port = free_port()
     options = ["--headless", "--bind", "127.0.0.1", "--port", str(port), "--memory-limit", memory, "--hide-welcome-screen"]
-    line = [str(binary()), *options, "--window-size", f"{window[0]}x{window[1]}"]
+    line = [str(binary()), *map(str, files), *options, "--window-size", f"{window[0]}x{window[1]}"]
     environment = {**os.environ, "RERUN_APP_ONLY": "true", **dict.fromkeys(CHOSEN, str(found))}
+    environment |= {} if path is None else {"PATH": path}
     with tempfile.TemporaryFile() as said:
         process = subprocess.Popen(line, env=environment, stdin=subprocess.DEVNULL, stdout=said, stderr=subprocess.STDOUT)
         try:

@@ -1,8 +1,9 @@
-"""Score test of candidate effects: gain of one linear step, ranked by p-value."""
+"""Candidate effects: their score, by the gain of one linear step, and those that are selected."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -15,6 +16,35 @@ from imutool.diagnosis.estimation.whitening import WhitenedLog
 from imutool.sensor.effect import Effect, Theta
 
 RIDGE = 1e-9
+
+
+@dataclass(frozen=True, eq=False)
+class SelectedEffect:
+    """Selected effect with its parameters and the cost of leaving it out.
+
+    `p_value` is by chi-square over all rows, `gain` the squares that leaving it out adds there, `unidentified` its parameters
+    that no motion showed, `similar` other effects that explain about as much in its place.
+    """
+
+    effect: Effect
+    theta: Theta
+    std: Theta
+    unidentified: tuple[str, ...]
+    p_value: float
+    false_discovery_rate: float
+    gain: float
+    similar: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class Selection:
+    """Selected effects, strongest first; fits; number of trials, and of effects in every fit."""
+
+    selected: tuple[SelectedEffect, ...]
+    fitted: Fit
+    whole: Fit
+    tried: int
+    always: int = 0
 
 
 class _Axis(NamedTuple):

@@ -16,12 +16,13 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from imutool.diagnosis.estimation.aligned_log import Pair
-from imutool.diagnosis.estimation.candidate_score import Candidates, bic, unnamed_count
+from imutool.diagnosis.estimation.candidate_score import Candidates, SelectedEffect, Selection, bic, unnamed_count
 from imutool.diagnosis.estimation.gauss_newton import Fit, fit
 from imutool.diagnosis.estimation.jacobians import Chosen
 from imutool.diagnosis.estimation.observability import (
     below_model_error,
     beyond_the_band,
+    has_no_size,
     plausible_part,
     unidentified,
     values_of,
@@ -41,35 +42,6 @@ from imutool.diagnosis.estimation.unnamed_effects import Curve, SplineCurve, fin
 from imutool.diagnosis.estimation.whitening import WhitenedLog
 from imutool.diagnosis.settings import SearchSettings
 from imutool.sensor.effect import Effect, Theta
-
-
-@dataclass(frozen=True, eq=False)
-class SelectedEffect:
-    """Selected effect with its parameters and the cost of leaving it out.
-
-    `p_value` is by chi-square over all rows, `gain` the squares that leaving it out adds there, `unidentified` its parameters
-    that no motion showed, `similar` other effects that explain about as much in its place.
-    """
-
-    effect: Effect
-    theta: Theta
-    std: Theta
-    unidentified: tuple[str, ...]
-    p_value: float
-    false_discovery_rate: float
-    gain: float
-    similar: tuple[str, ...] = ()
-
-
-@dataclass(frozen=True, eq=False)
-class Selection:
-    """Selected effects, strongest first; fits; number of trials, and of effects in every fit."""
-
-    selected: tuple[SelectedEffect, ...]
-    fitted: Fit
-    whole: Fit
-    tried: int
-    always: int = 0
 
 
 def select_effects(
@@ -100,7 +72,7 @@ def select_effects(
         other = _grown(first, start, (), list(later)) if unnamed_first else _grown(first, start, unnamed, [])
         if bic(other[1], penalty) < bic(now, penalty) - settings.clearly_better:
             search, now = other
-    return search.tested(now)
+    return search.tested(search.simplified(now))
 
 
 def _grown(first: _Search, now: Fit, unnamed: tuple[Effect, ...], waiting: list[Sequence[Effect]]) -> tuple[_Search, Fit]:
@@ -218,6 +190,21 @@ class _Search:
                     return trial
         return now
 
+    def simplified(self, now: Fit) -> Fit:
+        """Fit with a lever arm instead of a size effect of three equal arms, and the rest if it is significant."""
+        arms = [k for k, (effect, _) in enumerate(now.chosen) if effect.name == "size_effect"]
+        lever = [effect for effect in self.named if effect.name == "lever_arm" and effect.key not in now.keys]
+        if not arms or not lever:
+            return now
+        others, (size_effect, _) = (*now.chosen[: arms[0]], *now.chosen[arms[0] + 1 :]), now.chosen[arms[0]]
+        without = fit(self.logs, others, near=now)
+        simple = fit(self.logs, (*others, (lever[0], lever[0].null_value.astype(float))), near=now)
+        share = self.settings.common_arm_share
+        if without.objective - simple.objective < share * (without.objective - now.objective):
+            return now
+        both = fit(self.logs, (*simple.chosen, (size_effect, size_effect.null_value.astype(float))), near=now)
+        return both if self.candidates.log_p(size_effect, simple.objective - both.objective) < self.threshold else simple
+
     def pruned(self, now: Fit) -> Fit:
         """The fit without effects that the others have made superfluous."""
         for k in self.removable(now):
@@ -282,14 +269,14 @@ class _Search:
             log_p = max(log_p, scattered.log_p_value(effect.key, gain, len(theta)) + self.candidates.log_choices[effect.key])
         parts, block_s = ((fitted, "held_out"), (other, "fitted")), self.settings.held_out_block_s
         blocks = np.concatenate([held_out_gains(log, of, k, part, block_s) for of, part in parts for log in self.logs])
-        held_out_p = min(
-            held_out_p_value(blocks[:, 0]), prediction_p_value(blocks) if all(log.pair.exact for log in self.logs) else 1.0
-        )
+        exact_p = prediction_p_value(blocks) if all(log.pair.exact for log in self.logs) else 1.0
+        held_out_p = min(held_out_p_value(blocks[:, 0]), exact_p)
         rate = min(1.0, float(np.exp(min(0.0, log_p + np.log(self.tried)))))
-        if held_out_p > self.settings.held_out_p_value or beyond_the_band(effect, theta, self.logs, self.settings):
-            rate = 1.0
         std = (whole.stds() if scattered is None else scattered.std)[effect.key]
         std = np.array([self.onset_std.get((effect.key, j), float(s)) for j, s in enumerate(std)])
+        beyond = beyond_the_band(effect, theta, self.logs, self.settings) or has_no_size(effect, theta, std)
+        if held_out_p > self.settings.held_out_p_value or beyond:
+            rate = 1.0
         unseen = tuple(unidentified(effect, std, whole.settings.log_prior_std, curve=isinstance(effect.forward, SplineCurve)))
         return SelectedEffect(effect, theta, std, unseen, float(np.exp(max(log_p, -700.0))), rate, gain)
 

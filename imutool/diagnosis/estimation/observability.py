@@ -143,11 +143,22 @@ def below_model_error(gains: Mapping[str, float], denoised: bool, settings: Sear
     )
 
 
+def has_no_size(effect: Effect, theta: Theta, std: Theta) -> bool:
+    """Whether a fitted frequency is no larger than its deviation, or no amplitude than its own."""
+    vague = any(
+        parameter.unit == "Hz" and s >= value for parameter, value, s in zip(effect.parameters, theta, std, strict=True)
+    )
+    amounts = [k for k, parameter in enumerate(effect.parameters) if not parameter.positive and not parameter.begins]
+    return vague or (bool(amounts) and bool((np.abs(theta[amounts]) < std[amounts]).all()))
+
+
 def beyond_the_band(effect: Effect, theta: Theta, logs: Sequence[WhitenedLog], settings: SearchSettings) -> bool:
     """Whether a fitted frequency lies beyond the poses' band, or is too slow.
 
     Smoothed poses lose and delay motion there by themselves, which looks alike.
     """
+    if any(n.least is not None and value < n.least for n, value in zip(effect.parameters, theta, strict=True)):
+        return True
     factor = settings.beyond_band_low_pass if effect.name == "low_pass" else settings.beyond_band
     reach = [factor * log.pair.band_hz for log in logs if log.pair.band_hz is not None]
     hertz = [value for parameter, value in zip(effect.parameters, theta, strict=True) if parameter.unit == "Hz"]

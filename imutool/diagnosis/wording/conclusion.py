@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from itertools import groupby
 from pathlib import Path
 from textwrap import fill
 
-from imutool.diagnosis.result import Diagnosis, HeldOut, Located, Unexplained
-from imutool.diagnosis.wording.effect_sentences import has_gain, label, named_sentence, parameters_text, signals
-from imutool.diagnosis.wording.quantity import grouped, percent, symbol
+from imutool.diagnosis.result import Closer, Diagnosis, HeldOut, Located, Unexplained
+from imutool.diagnosis.wording.effect_sentences import has_gain, label, named_sentence, parameters_text, reference, signals
+from imutool.diagnosis.wording.quantity import percent, symbol
 from imutool.units import UNITS
 
 QUIET = "nothing else stands above the noise"
@@ -26,36 +25,38 @@ ENTRIES = 6  # of an effect that are listed one by one
 WIDE = 40  # letters of a value in a table
 AS_BEFORE = 2e-3  # relative change of a root mean square below which it is `as before`
 CERTAIN = 1e-9  # p-value below which no number is given
-COUNTS = ("No", "One thing was", "Two things were", "Three things were", "Four things were", "Five things were")
+COUNTS = ("No effect", "One effect", "Two effects", "Three effects", "Four effects", "Five effects")
+MEASURE = "Removes: share of the squared misfit above the noise, on time that no fit has seen."
 
 
 def conclusion(d: Diagnosis) -> str:
-    """Conclusion in a few sentences: findings by signal, residual, unobservable effects."""
-    return " ".join([*headline(d), *notes(d)])
+    """Headline and notes as one text."""
+    return " ".join([headline(d), *notes(d)])
 
 
-def headline(d: Diagnosis) -> list[str]:
-    """Most important sentences: the findings and the residual."""
-    sentences = _findings(d) if d.mismatch else [NULL if d.unexplained else UNKNOWN]
-    residuals = _residuals(d)
-    if 0 < len(d.findings) <= FULL and len({finding.signal for finding in d.findings}) == 1 and len(residuals) == 1:
-        sentences[-1] = f"{sentences[-1][:-1]}; {residuals[0][0].lower()}{residuals[0][1:]}"  # one thought, one sentence
-    elif d.mismatch or not all(residual.white for residual in d.unexplained.values()):
-        sentences += residuals
-    return sentences
+def headline(d: Diagnosis) -> str:
+    """The answer in one sentence: what differs, how much of it the findings remove, what is left."""
+    if not d.mismatch:
+        return NULL if d.unexplained else UNKNOWN
+    unnamed = _unnamed_place(d)
+    parts = [_only_finding(d) if len(d.findings) == 1 else _all_findings(d)] if d.findings else []
+    if unnamed:
+        parts.append(unnamed)
+    elif all(_residual(d, signal) == QUIET for signal in d.unexplained):
+        parts.append(QUIET)
+    elif d.findings:
+        left = [signal for signal in d.unexplained if _residual(d, signal) != QUIET]
+        parts.append(f"{_the(' and '.join(left))} {'keep' if len(left) > 1 else 'keeps'} a misfit that has no name")
+    if d.caveat and d.sim is None:
+        parts.append(d.caveat)
+    return f"{_upper('; '.join(parts))}." if parts else NULL
 
 
 def notes(d: Diagnosis) -> list[str]:
-    """Further sentences: gain of a second simulation, and unobservable effects."""
-    sentences = []
-    touched = {part for finding in d.findings for part in signals(finding.signal)}
-    shares = {
-        signal: closer.share for signal, closer in d.closer.items() if signal in touched and closer.by == "second simulation"
-    }
-    parts = [f"{percent(share)} of the misfit of {_the(signal)}" for signal, share in shares.items() if share is not None]
-    if parts:
-        seconds = max(closer.seconds for closer in d.closer.values())
-        sentences.append(f"Simulated again with this, {' and '.join(parts)} is gone on {_seconds(seconds)} of unseen time.")
+    """Further sentences: unusable axes, residuals that remain, unobservable effects."""
+    sentences = [_unusable(place) for place in d.located if place.reason]
+    residuals = (_residual(d, signal) for signal in d.unexplained)
+    sentences += [f"{_upper(text)}." for text in residuals if text != QUIET]
     if hidden := unobservable(d):
         more = [f"{len(hidden) - LISTED} more effects in whole or part"] if len(hidden) > LISTED + 1 else hidden[LISTED:]
         sentences.append(f"These logs cannot show: {', '.join([*hidden[:LISTED], *more])}.")
@@ -76,7 +77,7 @@ def unobservable(d: Diagnosis) -> list[str]:
 
 def lines(d: Diagnosis) -> list[str]:
     """Lines of a text report: conclusion, findings with their numbers, locations, gain, remarks."""
-    out = [conclusion(d)]
+    out = [headline(d), *notes(d)]
     for rank, finding in enumerate(d.findings, start=1):
         gain = f"; {gain_text(finding.held_out)}" if has_gain(finding) else ""
         chance = chance_text(finding.false_discovery_rate)
@@ -90,7 +91,7 @@ def table(d: Diagnosis) -> list[list[str]]:
     for finding in d.findings:
         what = label(finding) if finding.signal in label(finding) else f"{label(finding)} ({finding.signal})"
         removes = percent(finding.share).replace("less than", "<").replace("more than", ">") if has_gain(finding) else "–"
-        values = [q.labelled for q in grouped(finding.parameters)] if finding.curve is None else [parameters_text(finding)]
+        values = parameters_text(finding).split("; ") if finding.curve is None else [parameters_text(finding)]
         if finding.false_discovery_rate >= CERTAIN:
             values.append(chance_text(finding.false_discovery_rate))
         rows.append([what, removes, "\n".join(fill(text, WIDE) for text in values or [finding.equation])])
@@ -99,7 +100,8 @@ def table(d: Diagnosis) -> list[list[str]]:
 
 def below(d: Diagnosis) -> list[str]:
     """Lines below the findings: locations, gain, remarks."""
-    out = [f"Where: {location_text(place)}; {percent(place.share)} of the misfit" for place in d.located]
+    out = [MEASURE] if any(has_gain(finding) for finding in d.findings) else []
+    out += [f"Where: {location_text(place)}; {percent(place.share)} of the misfit" for place in d.located]
     if d.findings and d.closer:
         closer = "; ".join(f"{signal} {improvement(gain)}" for signal, gain in d.closer.items())
         out.append(f"{gain_source(d)}{held_out_time(d)}: {closer}")
@@ -126,12 +128,13 @@ def rms_text(held_out: HeldOut) -> str:
     return f"rms {before} to {after} {symbol(held_out.unit)}".strip()
 
 
-def improvement(held_out: HeldOut) -> str:
-    """`rms 0.52 to 0.19 m/s², 63 % closer`, or `as before` where nothing was found."""
-    if not held_out.rms_before > 0.0 or abs(held_out.rms_after / held_out.rms_before - 1.0) < AS_BEFORE:
-        return f"rms {held_out.rms_before:.3g} {symbol(held_out.unit)}, as before".replace(" ,", ",")
-    gain = 1.0 - held_out.rms_after / held_out.rms_before
-    return f"{rms_text(held_out)}, {percent(abs(gain))} {'closer' if gain > 0.0 else 'farther'}"
+def improvement(closer: Closer) -> str:
+    """`rms 0.52 to 0.19 m/s², 87 % of the misfit removed`, or `as before` where nothing was found."""
+    if not closer.rms_before > 0.0 or abs(closer.rms_after / closer.rms_before - 1.0) < AS_BEFORE:
+        return f"rms {closer.rms_before:.3g} {symbol(closer.unit)}, as before".replace(" ,", ",")
+    if closer.share is None or closer.share <= 0.0:
+        return f"{rms_text(closer)}{', farther than before' if closer.rms_after > closer.rms_before else ''}"
+    return f"{rms_text(closer)}, {percent(closer.share)} of the misfit removed"
 
 
 def location_text(place: Located) -> str:
@@ -167,48 +170,50 @@ def residual_text(residual: Unexplained, unit: str, of: str = "") -> str:
     return QUIET if residual.white else f"{what} is as small as the noise, but not white"
 
 
-def _findings(d: Diagnosis) -> list[str]:
-    """A sentence per signal that differs; unexplained locations come last."""
-    count = len(d.findings)
-    sentences = []
-    if count > 1:
-        sentences.append(f"{COUNTS[count] if count < len(COUNTS) else f'{count} things were'} left out.")
-    full = d.findings[:FULL]
-    order = list(dict.fromkeys(finding.signal for finding in full))
-    mentioned: set[float] = set()
-    for signal, group in groupby(
-        sorted(full, key=lambda finding: order.index(finding.signal)), key=lambda finding: finding.signal
-    ):
-        parts = []
-        for finding in group:
-            parts.append(named_sentence(d, finding))
-            if has_gain(finding):
-                seconds = finding.held_out.seconds
-                held_out = f" on {_seconds(seconds)} of unseen data" if seconds > 0.0 and seconds not in mentioned else ""
-                mentioned.add(seconds)
-                parts[-1] += f"; modelling it removes {percent(finding.share)} of the misfit{held_out}"
-        sentences.append(f"{_differs(signal)}{_regime(d.located, signal)}: {'; '.join(parts)}.")
-    if count > FULL:
-        sentences.append(f"Smaller: {', '.join(f'{label(finding)} ({finding.signal})' for finding in d.findings[FULL:])}.")
+def _only_finding(d: Diagnosis) -> str:
+    (finding,) = d.findings
+    text = f"{_differs(finding.signal)}{_regime(d.located, finding.signal)}: {named_sentence(d, finding)}"
+    if has_gain(finding):
+        text += f"; modelling it removes {percent(finding.share)} of the misfit"
+        text += f" on {_seconds(finding.held_out.seconds)} of unseen data" if finding.held_out.seconds > 0.0 else ""
+    return text
+
+
+def _all_findings(d: Diagnosis) -> str:
+    """Names of several findings, strongest first, and the gain of all of them."""
+    count, labels = len(d.findings), [f"{label(finding)} ({finding.signal})" for finding in d.findings]
+    shown = labels if count <= FULL + 1 else [*labels[:FULL], f"{count - FULL} smaller ones"]
+    number = COUNTS[count] if count < len(COUNTS) else f"{count} effects"
+    other = reference(d) if d.sim is not None or len(d.real) == 1 else "their true poses"
+    text = f"{number} separate the recording{'s' if len(d.real) > 1 else ''} from {other}: "
+    text += f"{', '.join(shown[:-1])} and {shown[-1]}"
+    touched = {part for finding in d.findings for part in signals(finding.signal) if has_gain(finding)}
+    gains = [
+        f"{percent(closer.share)} of the misfit of {_the(signal)}"
+        for signal, closer in d.closer.items()
+        if signal in touched and closer.share is not None and closer.share > 0.0
+    ]
+    return f"{text}; together they remove {' and '.join(gains)}" if gains else text
+
+
+def _unnamed_place(d: Diagnosis) -> str:
+    """Clause on signals that differ without a finding, empty where there is none."""
     named = {part for finding in d.findings for part in signals(finding.signal)}
-    for place in d.located:
-        if not place.reason and place.signal not in named and not set(signals(place.signal)) & named:
-            text = f"{_differs(place.signal)}{_regime([place], place.signal)}"
-            sentences.append(f"{text}, and what was left out could not be named.")
-    return [*(_unusable(place) for place in d.located if place.reason), *sentences]
+    places = [place for place in d.located if not place.reason and not set(signals(place.signal)) & named]
+    if not places:
+        return ""
+    differing = list(dict.fromkeys(place.signal for place in places))
+    return f"{_differs(' and '.join(differing))}{_regime(places, differing[0])}, and what was left out could not be named"
 
 
 def _unusable(place: Located) -> str:
     return f"{_upper(_the(place.signal))}'s {', '.join(place.axes)} is no measurement: {place.reason}."
 
 
-def _residuals(d: Diagnosis) -> list[str]:
-    """Residual of each signal; one sentence where there is none."""
+def _residual(d: Diagnosis, signal: str) -> str:
+    """Residual of a signal as text."""
     units = {finding.signal: finding.held_out.unit for finding in d.findings} | UNITS
-    texts = [residual_text(residual, units.get(signal, ""), _the(signal)) for signal, residual in d.unexplained.items()]
-    if texts and set(texts) == {QUIET}:
-        return [f"{_upper(QUIET)}."]
-    return [f"{_upper(text)}." for text in texts if text != QUIET]
+    return residual_text(d.unexplained[signal], units.get(signal, ""), _the(signal))
 
 
 def _the(signal: str) -> str:

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 from imutool.diagnosis.result import Diagnosis, Finding
-from imutool.diagnosis.wording.quantity import Quantity, grouped
+from imutool.diagnosis.wording.quantity import SHOWN, Quantity, distinguished, grouped
 
 
 @dataclass(frozen=True)
@@ -114,16 +114,25 @@ def named_sentence(d: Diagnosis, finding: Finding) -> str:
 
 def effect_sentence(d: Diagnosis, finding: Finding) -> str:
     """What a finding does to the reading, with its numbers."""
-    quantities = grouped(finding.parameters)
+    parameters, small = distinguished(finding.parameters)
+    quantities = grouped(parameters)
     main = quantities[0] if quantities else Quantity("", (), ())
-    words = Words(_pronoun(finding.signal), _reference(d), main, tuple(quantities[1:]), finding)
+    words = Words(_pronoun(finding.signal), reference(d), main, tuple(quantities[1:]), finding)
     template = SENTENCES.get(finding.effect)
     if template is None or not (quantities or finding.curve):
         text = f"{words.it} shows {finding.effect}, {finding.equation}"
         text += f", {main.labelled}" if quantities else ""
     else:
         text = template(words) if callable(template) else template.format(w=words)
-    return f"{text}{words.left_out(text)}"
+    return f"{text}{words.left_out(text)}{indistinct(small)}"
+
+
+def indistinct(names: Sequence[str]) -> str:
+    """Clause on parameters that are smaller than their deviation, empty without any."""
+    if not names:
+        return ""
+    shown = ", ".join(names) if len(names) <= SHOWN else f"{len(names)} parameters"
+    return f"; {shown} not distinguished from zero"
 
 
 def label(finding: Finding) -> str:
@@ -132,15 +141,16 @@ def label(finding: Finding) -> str:
 
 
 def has_gain(finding: Finding) -> bool:
-    """Whether its gain was measured: missing samples and quantization are seen without a fit."""
-    return finding.held_out.rms_before > 0.0
+    """Whether it removes misfit: missing samples and digits do not, nor does a wrong reference."""
+    return finding.held_out.rms_before > 0.0 and finding.effect != "reference_error"
 
 
 def parameters_text(finding: Finding) -> str:
     """Quantities of a finding: `r (0.213, -0.051, 0.120) ± 0.004 m`; of a curve its variable."""
     if finding.curve is not None:
         return f"a curve of {finding.curve.variable}"
-    return ", ".join(q.labelled for q in grouped(finding.parameters)) or finding.equation
+    parameters, small = distinguished(finding.parameters)
+    return (", ".join(q.labelled for q in grouped(parameters)) or finding.equation) + indistinct(small)
 
 
 def signals(signal: str) -> tuple[str, ...]:
@@ -154,5 +164,6 @@ def _pronoun(signal: str) -> str:
     return "it" if len(signals(signal)) == 1 else "the sensor"
 
 
-def _reference(d: Diagnosis) -> str:
+def reference(d: Diagnosis) -> str:
+    """The simulation, or the true poses."""
     return "the simulation" if d.sim is not None else "the true poses"

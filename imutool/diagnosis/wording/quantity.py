@@ -84,6 +84,12 @@ def grouped(estimates: Mapping[str, Estimate]) -> list[Quantity]:
     return out
 
 
+def distinguished(estimates: Mapping[str, Estimate]) -> tuple[dict[str, Estimate], list[str]]:
+    """Estimates larger than their standard deviation, and the names of the others."""
+    small = [name for name, e in estimates.items() if math.isfinite(e.std) and abs(e.value) < e.std]
+    return {name: estimate for name, estimate in estimates.items() if name not in small}, small
+
+
 def value(estimate: Estimate) -> str:
     """Text of an estimate, `12.4 ± 0.3 ms`, rounded to the uncertainty; four digits if zero."""
     size, unit = _step([estimate])

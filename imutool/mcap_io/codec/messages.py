@@ -109,6 +109,8 @@ def scan(data: bytes | memoryview, *, bare: bool = False) -> tuple[Int64[np.ndar
             singles.append(position)
         elif bare:
             break
+        elif not opcode:  # the format has no such record; zeros would make 28 million a chunk
+            raise LogError(f"a record has the opcode 0, at byte {position}")
         elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
             definitions.append((opcode, position + HEAD.size, length))
         position += HEAD.size + length

@@ -23,6 +23,7 @@ NUMBERS = {
 TEXT = "string"
 TIMES = ("builtin_interfaces/Time", "builtin_interfaces/Duration")
 DEEPEST = 24  # messages within messages; those of ROS are at most six deep
+PADDING = 4  # bytes to which some writers fill up a payload
 MOST_TEXT = 1 << 20  # bytes of a definition
 MOST_COUNTED = 4096  # counts and texts before a number in one message
 
@@ -113,6 +114,17 @@ def _check(name: str, known: Definition, sound: dict[str, int], depth: int) -> i
     if depth + sound[name] > DEEPEST + 1:
         raise LogError(f"{name} nests more than {DEEPEST} messages deep", expected="a definition that ends")
     return sound[name]
+
+
+def decodes(payload: bytes, schema_name: str, text: bytes) -> bool:
+    """Whether a CDR payload can be a message of this definition, whose fields fill it."""
+    try:
+        walk = Walk(payload, parse(schema_name, text))
+        for _ in walk.leaves():
+            pass
+    except LogError:
+        return False
+    return 0 <= len(payload) - walk.position < PADDING
 
 
 class Walk:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import contextlib
 import struct
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 
 import lz4.frame
 import zstandard
@@ -15,7 +15,8 @@ from mcap.opcode import Opcode
 from mcap.records import Channel, ChunkIndex, Schema
 
 from imutool.errors import LogError
-from imutool.mcap_io.codec import records
+from imutool.mcap_io.blocks import HEAD_BYTES
+from imutool.mcap_io.codec import messages, records
 from imutool.mcap_io.codec.records import CHUNK_HEAD, HEAD
 
 FRAME_MAGICS = (b"\x28\xb5\x2f\xfd", b"\x04\x22\x4d\x18")  # of zstd and lz4
@@ -26,7 +27,51 @@ MAX_UNPACKED = 4 << 20  # bytes in which definitions are sought: they come first
 STEP = 256
 
 
-def repair_head(raw: bytes, offset: int, known: ChunkIndex | None) -> bytes | None:
+class UnreadableError(LogError):
+    """The contents of a chunk are as its CRC says, and no records."""
+
+
+def prove(
+    raw: bytes, offset: int, known: ChunkIndex | None, max_chunk: int, is_boundary: Callable[[int], bool]
+) -> tuple[messages.Messages, records.ChunkHead, bytes]:
+    """Contents, head and repaired bytes of a chunk that its CRC proves.
+
+    A chunk that states no CRC is taken where nothing contradicts it.
+    `known` is the chunk's entry in an intact summary. `is_boundary` says whether a record can end at a byte.
+
+    Raises:
+        LogError: damaged.
+    """
+    try:
+        return *_contents(raw, offset, known, max_chunk, is_boundary), raw
+    except UnreadableError:
+        raise
+    except LogError:
+        better = repair_head(raw, offset, known, max_chunk)
+        if better is None:
+            raise
+        return *_contents(better, offset, None, max_chunk, is_boundary), better
+
+
+def _contents(
+    raw: bytes, offset: int, known: ChunkIndex | None, max_chunk: int, is_boundary: Callable[[int], bool]
+) -> tuple[messages.Messages, records.ChunkHead]:
+    if HEAD.unpack_from(raw) != (Opcode.CHUNK, len(raw) - HEAD.size):
+        raise LogError(f"the head of the chunk at byte {offset} is damaged")
+    head = records.ChunkHead.of(raw[:HEAD_BYTES], len(raw), offset)
+    contents = records.unpack(raw, offset, max_chunk)
+    try:
+        found = messages.parse(contents, offset)
+    except LogError as error:
+        raise UnreadableError(error.what) if head.crc else error from error
+    if not head.crc and not is_consistent(raw, offset, known):
+        raise LogError(f"the head of the chunk at byte {offset} is damaged, and it has no CRC to tell by")
+    if not head.crc and not is_boundary(offset + len(raw)):
+        raise LogError(f"the chunk at byte {offset} has no CRC, and no record follows it")
+    return found, head
+
+
+def repair_head(raw: bytes, offset: int, known: ChunkIndex | None, max_chunk: int) -> bytes | None:
     """The Chunk record with a head that its contents prove; None if intact or unprovable.
 
     `known` is the chunk's entry in an intact summary. The CRC itself must stand in the record as it was written.
@@ -36,7 +81,7 @@ def repair_head(raw: bytes, offset: int, known: ChunkIndex | None) -> bytes | No
     for candidate in _candidates(raw, known):
         try:
             if records.ChunkHead.of(candidate[:128], len(candidate), offset).crc:
-                records.unpack(candidate, offset)
+                records.unpack(candidate, offset, max_chunk)
                 return candidate
         except LogError:
             continue

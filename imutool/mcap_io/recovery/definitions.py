@@ -1,15 +1,9 @@
-"""Recover definitions of schemas and channels, and remap channel ids.
-
-One file may hold several logs, mostly one: each is a section whose ids mean what its own records say, and callers see one
-numbering for the whole file. A definition that a CRC covers (in a chunk, in a summary) replaces one that none covers. Where two
-that are both covered disagree, they are of different logs.
-"""
+"""Definitions of each recording in a damaged file, and one numbering for all of them."""
 
 from __future__ import annotations
 
-from bisect import bisect_right
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import chain, count
 from typing import Any
@@ -23,23 +17,28 @@ from imutool.errors import LogError
 from imutool.mcap_io.blocks import MessageBlock
 from imutool.mcap_io.codec import messages, records
 from imutool.mcap_io.codec.records import HEAD
-from imutool.mcap_io.recovery.chunk_repair import MAX_SEARCHED, find_definitions
 from imutool.mcap_io.recovery.losses import LATEST_NS, Losses, reason
-from imutool.mcap_io.storage.source import Source
 
-MAX_AGREED = 1000  # definitions compared once: some writers repeat all of theirs in every chunk
-DEFINITIONS = (Opcode.SCHEMA, Opcode.CHANNEL)
+MAX_ID = 2**16 - 1  # of a channel or a schema
+
+ChunkKey = tuple[int, int, int]  # start and end in ns, unpacked bytes: what a summary says of a chunk wherever it lies
 
 
-@dataclass
-class Section:
-    """One log in the file: from its first byte on, its own records define the ids."""
+@dataclass(eq=False)
+class Recording:
+    """One log in the file, whole or in part: its own records define the ids."""
 
     start: int
     schemas: dict[int, Schema] = field(default_factory=dict)
     channels: dict[int, Channel] = field(default_factory=dict)
     proven: set[tuple[int, int]] = field(default_factory=set)  # opcode and id of definitions that a CRC covers
+    lists: set[ChunkKey] | None = None  # the chunks in its summary, which are all it has
+    ended: bool = False  # its footer was met
+    anonymous: bool = False  # no record in the file defines its ids
     ids: dict[int, int] = field(default_factory=dict)  # channel ids of the whole file by its own
+    moved: bool = False  # its definitions cannot stay as they are in its chunks
+    sizes: dict[int, tuple[int, int]] = field(default_factory=dict)  # the shortest and the longest message of a channel
+    samples: dict[int, MessageBlock] = field(default_factory=dict)  # a block with messages of a channel
     renamed: dict[str, str] = field(default_factory=dict)  # topics that carry another type elsewhere
 
     def known(self, opcode: int) -> dict[int, Any]:
@@ -50,97 +49,41 @@ class Section:
         """Channels that are defined together with their schema."""
         return {i for i, channel in self.channels.items() if not channel.schema_id or channel.schema_id in self.schemas}
 
+    def meaning(self, channel: int) -> object:
+        """What a channel id means here, to compare; None where it is not defined."""
+        known = self.channels.get(channel)
+        if known is None or (known.schema_id and known.schema_id not in self.schemas):
+            return None
+        schema = self.schemas.get(known.schema_id)
+        return known.topic, known.message_encoding, (schema.name, schema.encoding, schema.data) if schema else None
 
-class Sections:
-    """Sections of a file, in its order."""
-
-    def __init__(self) -> None:
-        self.each = [Section(0)]
-
-    def at(self, offset: int) -> Section:
-        """The section of a byte."""
-        return self.each[bisect_right([section.start for section in self.each], offset) - 1]
-
-    def begin(self, start: int) -> bool:
-        """Begins another section at a byte; false if one begins there already."""
-        if self.at(start).start == start:
-            return False
-        self.each.insert(bisect_right([section.start for section in self.each], start), Section(start))
+    def agrees(self, definitions: Iterable[Any]) -> bool:
+        """Whether none of these definitions contradicts its own."""
+        for record in definitions:
+            known = (self.schemas if isinstance(record, Schema) else self.channels).get(record.id)
+            if known is not None and not same_definition(known, record):
+                return False
         return True
 
-    def end(self, section: Section) -> int | None:
-        """Where the next section begins, if there is one."""
-        return next((other.start for other in self.each if other.start > section.start), None)
+    def define(self, record: Any, *, proven: bool) -> None:
+        """Adds a definition; a proven one replaces one that is not."""
+        opcode = int(Opcode.SCHEMA if isinstance(record, Schema) else Opcode.CHANNEL)
+        if proven or (opcode, record.id) not in self.proven:
+            self.known(opcode).setdefault(record.id, record)
+            if proven:
+                self.known(opcode)[record.id] = record
+                self.proven.add((opcode, record.id))
 
-    def channels(self) -> set[int]:
-        """Every channel id that is defined so far."""
-        return {channel for section in self.each for channel in section.channels}
 
-    def define(self, opcode: int, body: bytes, offset: int, *, proven: bool) -> str:
-        """Adds a Schema or Channel record; returns a conflict that could be resolved, or "".
-
-        Raises:
-            LogError: damaged, or a CRC covers another definition of the same id as well.
-        """
-        section = self.at(offset)
-        known, record = section.known(opcode), _parse(opcode, body, offset)
-        before, key, conflict = known.get(record.id), (opcode, record.id), ""
-        if before is not None and not same_definition(before, record):
-            conflict = f"{records.name_of(opcode).lower()} {record.id} has two definitions, the second at byte {offset}"
-            if proven and key in section.proven:
-                raise LogError(conflict)
-            conflict += f"; the {'second' if proven else 'first'} holds"
-        if before is None or proven:
-            known[record.id] = record
-        if proven:
-            section.proven.add(key)
-        return conflict
-
-    def contradicts(self, opcode: int, body: bytes, offset: int) -> bool:
-        """Whether the section at `offset` has another definition under the same id.
-
-        Raises:
-            LogError: damaged.
-        """
-        record = _parse(opcode, body, offset)
-        known = self.at(offset).known(opcode).get(record.id)
-        return known is not None and not same_definition(known, record)
-
-    def renumber(self) -> tuple[dict[int, Schema], dict[int, Channel]]:
-        """Schemas and channels of the whole file; the first section keeps its ids."""
-        schemas: dict[int, Schema] = {}
-        channels: dict[int, Channel] = {}
-        for section in self.each:
-            first = section is self.each[0]
-            placed = {
-                local: _place(schemas, schema, _same_schema, reuse=not first)
-                for local, schema in sorted(section.schemas.items())
-            }
-            for local in sorted(section.readable()):
-                channel = section.channels[local]
-                moved = replace(channel, schema_id=placed.get(channel.schema_id, 0))
-                moved = replace(moved, topic=self._name(section, moved, schemas, channels))
-                section.ids[local] = _place(channels, moved, _same_channel, reuse=not first)
-        return schemas, channels
-
-    def _name(self, section: Section, channel: Channel, schemas: dict[int, Schema], channels: dict[int, Channel]) -> str:
-        """The topic's name in the whole file: one of another type gets another name."""
-        taken = {other.topic: _type(other, schemas) for other in channels.values()}
-        names = chain([channel.topic], (f"{channel.topic}_{number}" for number in count(2)))
-        name = next(name for name in names if taken.get(name, _type(channel, schemas)) == _type(channel, schemas))
-        if name != channel.topic:
-            section.renamed[channel.topic] = name
-        return str(name)
-
-    def unproven_topics(self) -> list[str]:
-        """Topics whose channel or schema no CRC covers."""
-        topics = set()
-        for section in self.each:
-            for channel in (section.channels[local] for local in section.ids):
-                keys = {(int(Opcode.CHANNEL), channel.id), (int(Opcode.SCHEMA), channel.schema_id)}
-                if not keys - {(int(Opcode.SCHEMA), 0)} <= section.proven:
-                    topics.add(channel.topic)
-        return sorted(topics)
+def parsed(definitions: Iterable[tuple[int, bytes]], offset: int, losses: Losses) -> list[Any]:
+    """Schema and Channel records; a damaged one is noted and left out."""
+    found = []
+    for opcode, body in definitions:
+        try:
+            found.append(records.parse(Schema if opcode == Opcode.SCHEMA else Channel, body, offset))
+        except LogError as error:
+            losses.add_harmless(reason(error))
+    return found
 
 
 def same_definition(a: Any, b: Any) -> bool:
@@ -150,8 +93,49 @@ def same_definition(a: Any, b: Any) -> bool:
     return bool((a.topic, a.schema_id) == (b.topic, b.schema_id))
 
 
-def _parse(opcode: int, body: bytes, offset: int) -> Any:
-    return records.parse(Schema if opcode == Opcode.SCHEMA else Channel, body, offset)
+def renumber(recordings: Sequence[Recording], losses: Losses) -> tuple[dict[int, Schema], dict[int, Channel]]:
+    """Schemas and channels of the whole file; the first recording keeps its ids.
+
+    Raises:
+        LogError: no id is left.
+    """
+    schemas: dict[int, Schema] = {}
+    channels: dict[int, Channel] = {}
+    for recording in recordings:
+        first = recording is recordings[0]
+        placed = {
+            local: _place(schemas, schema, _same_schema, reuse=not first) for local, schema in sorted(recording.schemas.items())
+        }
+        for local in sorted(recording.readable()):
+            channel = recording.channels[local]
+            moved = replace(channel, schema_id=placed.get(channel.schema_id, 0))
+            moved = replace(moved, topic=_name(recording, moved, schemas, channels))
+            recording.ids[local] = _place(channels, moved, _same_channel, reuse=not first)
+        recording.moved = not first or bool(recording.renamed)
+        for old, new in recording.renamed.items():
+            losses.add_harmless(f"{old} carries messages of two types; those of the second are on {new}")
+    return schemas, channels
+
+
+def _name(recording: Recording, channel: Channel, schemas: dict[int, Schema], channels: dict[int, Channel]) -> str:
+    """The topic's name in the whole file: one of another type gets another name."""
+    taken = {other.topic: _type(other, schemas) for other in channels.values()}
+    names = chain([channel.topic], (f"{channel.topic}_{number}" for number in count(2)))
+    name = next(name for name in names if taken.get(name, _type(channel, schemas)) == _type(channel, schemas))
+    if name != channel.topic:
+        recording.renamed[channel.topic] = name
+    return str(name)
+
+
+def unproven_topics(recordings: Sequence[Recording]) -> list[str]:
+    """Topics whose channel or schema no CRC covers."""
+    topics = set()
+    for recording in recordings:
+        for channel in (recording.channels[local] for local in recording.ids):
+            keys = {(int(Opcode.CHANNEL), channel.id), (int(Opcode.SCHEMA), channel.schema_id)}
+            if not keys - {(int(Opcode.SCHEMA), 0)} <= recording.proven:
+                topics.add(channel.topic)
+    return sorted(topics)
 
 
 def _type(channel: Channel, schemas: dict[int, Schema]) -> tuple[str, str]:
@@ -173,86 +157,49 @@ def _place(known: dict[int, Any], record: Any, same: Callable[[Any, Any], bool],
         for found, other in known.items():
             if same(other, record):
                 return found
-    identity: int = record.id if record.id not in known else max(known) + 1
+    identity: int = record.id if record.id not in known else free_id(known)
     known[identity] = replace(record, id=identity)
     return identity
 
 
-def read_definitions(sections: Sections, losses: Losses, found: messages.Messages, block: MessageBlock) -> None:
-    """Takes in a chunk's definitions; contradictions to proven ones begin another section."""
-    found_definitions = [(opcode, found.data[first : first + length].tobytes()) for opcode, first, length in found.definitions]
-    proven = block.offset not in losses.unchecked_in
-    for second_try in (False, True):
-        try:
-            for opcode, body in found_definitions:
-                conflict = sections.define(opcode, body, block.offset, proven=proven)
-                if conflict:
-                    losses.add_harmless(conflict)
-            return
-        except LogError as error:
-            if second_try or not sections.begin(block.offset):
-                losses.add_harmless(reason(error))
-                return
-            losses.add_harmless(f"another log begins at byte {block.offset}: the chunk there defines ids anew")
+def free_id(taken: Mapping[int, object]) -> int:
+    """The largest id plus one, or the smallest free one.
+
+    Raises:
+        LogError: none is left.
+    """
+    largest = max(taken, default=0)
+    found = largest + 1 if largest < MAX_ID else next((i for i in range(1, MAX_ID) if i not in taken), 0)
+    if not found:
+        raise LogError("the log has 65535 channels or schemas", expected="an id that is free")
+    return found
 
 
-def search_damaged(
-    sections: Sections, source: Source, blocks: Sequence[MessageBlock], damaged: Sequence[tuple[int, int]]
-) -> None:
-    """Looks for missing definitions in the damaged stretches (first byte, bytes) of a log."""
-    for section in sections.each:
-        stop = sections.end(section) or source.size + 1
-        for offset, length in sorted(stretch for stretch in damaged if section.start <= stretch[0] < stop):
-            used = {c for block in blocks if section.start <= block.offset < stop for c in block.counts or block.indexes}
-            if used <= section.readable():
-                break
-            for opcode, body in find_definitions(source.at(offset, min(length, MAX_SEARCHED))):
-                sections.define(opcode, body, offset, proven=False)
-
-
-def renumber_counts(section: Section, counts: Mapping[int, int]) -> dict[int, int]:
+def renumber_counts(recording: Recording, counts: Mapping[int, int]) -> dict[int, int]:
     """Counts by the channel ids of the whole file, without undefined channels."""
-    ids, total = section.ids, Counter[int]()
+    ids, total = recording.ids, Counter[int]()
     for local, number in counts.items():
         if local in ids:
             total[ids[local]] += number
     return dict(total)
 
 
-def check_definitions(sections: Sections, found: messages.Messages, block: MessageBlock, agreed: set[bytes]) -> None:
-    """Refuses a CRC-proven chunk whose definitions show that another log wrote it.
-
-    `agreed` collects the bodies of definitions that need not be compared again.
-
-    Raises:
-        LogError: the chunk is another log's, or a definition in it is damaged.
-    """
-    for opcode, first, length in found.definitions:
-        body = found.data[first : first + length].tobytes()
-        if body in agreed:
-            continue
-        if sections.contradicts(opcode, body, block.offset):
-            raise LogError(f"the chunk at byte {block.offset} defines another {records.name_of(opcode)} under an id in use")
-        if len(agreed) < MAX_AGREED:
-            agreed.add(body)
-
-
-def map_channels(section: Section, found: messages.Messages) -> tuple[Int64[np.ndarray, " n"], Bool[np.ndarray, " n"]] | None:
+def map_channels(
+    recording: Recording, refused: Mapping[int, object], found: messages.Messages
+) -> tuple[Int64[np.ndarray, " n"], Bool[np.ndarray, " n"]] | None:
     """Channel ids in the whole file, -1 where undefined, and a mask of readable messages.
 
-    None where the messages can stay as they are.
+    None where the messages can stay as they are. `refused` are ids of which nobody knows what they mean.
     """
-    ids, heads = section.ids, found.heads
+    ids, heads = recording.ids, found.heads
     local = np.unique(heads["channel"]).tolist()
     late = heads["log_time"] >= LATEST_NS
-    if (
-        not late.any()
-        and all(ids.get(channel) == channel for channel in local)
-        and not ((section.start or section.renamed) and found.definitions)
-    ):
+    unchanged = all(ids.get(channel) == channel and channel not in refused for channel in local)
+    if not late.any() and unchanged and not (recording.moved and found.definitions):
         return None
     table = np.full(1 << 16, -1, np.int64)
-    table[list(ids)] = list(ids.values())
+    for own, number in ids.items():
+        table[own] = -1 if own in refused else number
     channels = table[heads["channel"]]
     return channels, ~late & (channels >= 0)
 

@@ -105,6 +105,7 @@ class Losses:
             "stretches": [entry.plain() for entry in self.entries],
             "stretches_not_listed": self.unlisted,
             "mended": list(self.harmless),
+            "unproven_messages": self.unproven,
             "unchecked_messages": self.unchecked,
             "unchecked_definitions": list(self.unchecked_topics),
         }
@@ -119,6 +120,10 @@ def describe(losses: Mapping[str, Any]) -> list[str]:
     lines += [f"mended: {what}" for what in mended[:MAX_LINES]]
     if len(mended) > MAX_LINES:
         lines.append(f"mended: {len(mended) - MAX_LINES} more places")
+    if losses.get("unproven_messages"):
+        lines.append(
+            f"unproven: {losses['unproven_messages']} messages may be of either of two recordings, and are on no topic"
+        )
     if losses["unchecked_messages"]:
         lines.append(f"unchecked: {losses['unchecked_messages']} messages lie where no CRC covers them")
     if losses["unchecked_definitions"]:

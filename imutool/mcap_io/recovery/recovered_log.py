@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+from types import MappingProxyType
+
 import numpy as np
 from mcap.opcode import Opcode
 
 from imutool.mcap_io.blocks import MessageBlock, RecordSpan
-from imutool.mcap_io.log import Log
+from imutool.mcap_io.log import Log, topics_of
 from imutool.mcap_io.recovery.losses import Loss, Losses
 from imutool.mcap_io.recovery.recovered_index import RecoveredIndex
-from imutool.mcap_io.recovery.resync import PRIVATE
+from imutool.mcap_io.recovery.summary import PRIVATE
 from imutool.mcap_io.storage.source import Source, crc_of
 from imutool.mcap_io.verify import stated_crc
 
@@ -27,7 +29,7 @@ class RecoveredLog(Log):
     index: RecoveredIndex
 
     def _read_index(self, source: Source) -> RecoveredIndex:
-        return RecoveredIndex(source)
+        return RecoveredIndex(source, self.max_chunk)
 
     def __enter__(self) -> RecoveredLog:
         return self
@@ -43,7 +45,7 @@ class RecoveredLog(Log):
         Raises:
             LogError: the log is damaged.
         """
-        log = Log(self._source)
+        log = Log(self._source, max_chunk=self.max_chunk)
         self._owns_source = False
         return log
 
@@ -51,7 +53,16 @@ class RecoveredLog(Log):
         """Compares the CRC of every chunk, attachment and of the data section; completes `losses`."""
         with self.named():
             self.index.check()
+            if self.losses and not self.index.by_records:
+                self.read_by_records()
             self.check_data_crc()
+
+    def read_by_records(self) -> None:
+        """Reads the log again by its records, because its index contradicts them."""
+        with self.named():
+            self.index = RecoveredIndex(self._source, self.max_chunk, by_records=True)
+            self.index.check()
+            self.topics = MappingProxyType(topics_of(self.index))
 
     def check_data_crc(self) -> None:
         """Compares the CRC of the data section, where one is stated and no damage is known yet.

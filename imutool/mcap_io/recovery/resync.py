@@ -7,12 +7,10 @@ of a definition with the definition). A message has no such lengths: the records
 from __future__ import annotations
 
 import struct
-from collections import Counter
-from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from jaxtyping import Int64, UInt64
+from jaxtyping import Int64
 from mcap.opcode import Opcode
 from mcap.records import (
     AttachmentIndex,
@@ -30,18 +28,18 @@ from mcap.records import (
 
 from imutool.errors import LogError
 from imutool.mcap_io.blocks import Attachment
-from imutool.mcap_io.codec import records
+from imutool.mcap_io.codec import messages, records
 from imutool.mcap_io.codec.messages import FIXED
 from imutool.mcap_io.codec.records import CHUNK_HEAD, HEAD, MAGIC
-from imutool.mcap_io.recovery.losses import LATEST_NS
+from imutool.mcap_io.recovery.summary import PRIVATE
 from imutool.mcap_io.storage.source import Source
 
 WINDOW = 1 << 20
 MAX_SMALL = 1 << 24  # bytes of a record that is parsed whole: a definition, metadata, an entry of the summary
 MAX_CANDIDATES = 1 << 17  # parsed in one file; more occur only in a file made to be searched forever
+MIN_PROOF_BYTES = 1 << 30  # that may be unpacked while chunks are sought in damaged bytes
 CHAIN = 3  # records in a row that prove a message after a gap
 LOG_START = MAGIC + bytes([Opcode.HEADER])
-PRIVATE = 0x80  # opcodes from here on belong to whoever writes them
 
 SMALL: dict[int, Any] = {
     Opcode.HEADER: Header,
@@ -56,14 +54,7 @@ SMALL: dict[int, Any] = {
     Opcode.SUMMARY_OFFSET: SummaryOffset,
     Opcode.DATA_END: DataEnd,
 }
-IN_MEMORY = {Opcode.MESSAGE, Opcode.CHUNK, Opcode.MESSAGE_INDEX}  # as a whole
-SUMMARY = {
-    Opcode.CHUNK_INDEX,
-    Opcode.ATTACHMENT_INDEX,
-    Opcode.STATISTICS,
-    Opcode.METADATA_INDEX,
-    Opcode.SUMMARY_OFFSET,
-}
+IN_MEMORY = {Opcode.MESSAGE, Opcode.MESSAGE_INDEX}  # as a whole
 # The shortest body of each
 MIN_LENGTH = {
     Opcode.HEADER: 8,
@@ -88,29 +79,6 @@ _KNOWN = _MIN_LENGTH < 2**63
 _CANDIDATE = np.dtype([("opcode", "u1"), ("length", "<u8")])
 
 
-@dataclass
-class Gap:
-    """A stretch without a valid record."""
-
-    offset: int
-    length: int
-    reason: str
-    counts: Counter[int] = field(default_factory=Counter)  # by the channel ids of its section
-    counted: bool = False  # from message indexes that survived behind it
-    start_ns: int | None = None
-    end_ns: int | None = None
-
-    def count(self, channel: int, entries: UInt64[np.ndarray, "n 2"]) -> None:
-        """Counts the messages of a lost chunk from the entries of a message index behind it."""
-        if not self.counted:
-            self.counts, self.counted = Counter(), True
-        self.counts[channel] += len(entries)
-        if len(entries) and entries[:, 0].max() < LATEST_NS:
-            first, last = int(entries[:, 0].min()), int(entries[:, 0].max())
-            self.start_ns = first if self.start_ns is None else min(first, self.start_ns)
-            self.end_ns = last if self.end_ns is None else max(last, self.end_ns)
-
-
 class RecordFrames:
     """Checks of record framing in one file, up to a byte.
 
@@ -118,8 +86,9 @@ class RecordFrames:
         LogError: the disk does not give the bytes.
     """
 
-    def __init__(self, source: Source, limit: int) -> None:
-        self.source, self.limit, self.candidates = source, limit, 0
+    def __init__(self, source: Source, limit: int, max_chunk: int) -> None:
+        self.source, self.limit, self.max_chunk, self.candidates = source, limit, max_chunk, 0
+        self._proof_bytes = max(MIN_PROOF_BYTES, 4 * source.size)  # left to be unpacked in vain
 
     def head(self, position: int) -> tuple[int, int] | None:
         """Opcode and length of a record that fits into the file, or None."""
@@ -128,7 +97,7 @@ class RecordFrames:
         opcode, length = self.source.head(position)
         if length > self.limit - position - HEAD.size or (opcode < PRIVATE and length < int(_MIN_LENGTH[opcode])):
             return None
-        if opcode in IN_MEMORY and length > records.CHUNK_LIMIT:
+        if opcode in IN_MEMORY and length > self.max_chunk:
             return None
         return opcode, length
 
@@ -174,8 +143,10 @@ class RecordFrames:
     def chunk(self, position: int, length: int) -> records.ChunkHead | None:
         """The head of a chunk whose record has this length, or None; its compression must be known."""
         whole = HEAD.size + length
+        if whole > self.limit - position:
+            return None
         try:
-            head = records.ChunkHead.of(self.source.at(position, min(128, whole, self.limit - position)), whole, position)
+            head = records.ChunkHead.of(self.source.at(position, min(128, whole)), whole, position)
         except LogError:
             return None
         return head if head.compression in records.COMPRESSIONS.values() else None
@@ -208,19 +179,20 @@ class RecordFrames:
                     return position
         return limit
 
-    def _candidates(self, raw: bytes, at: int) -> list[int]:
-        """Offsets of possible records (opcode known, length fits) and magics in `WINDOW` bytes."""
+    def _candidates(self, raw: bytes, at: int, *, chunks_only: bool = False) -> list[int]:
+        """Offsets of possible records and magics, or of chunks alone, in `WINDOW` bytes."""
         view = np.frombuffer(raw, np.uint8)
         found: list[int] = []
         if len(view) >= HEAD.size:
             count = len(view) - HEAD.size + 1
-            small = (view[8:] == 0) & (view[7 : 7 + count] == 0) & (view[6 : 6 + count] == 0) & _KNOWN[view[:count]]
+            small = (view[8:] == 0) & (view[7 : 7 + count] == 0) & (view[6 : 6 + count] == 0)
+            small &= (view[:count] == Opcode.CHUNK.value) if chunks_only else _KNOWN[view[:count]]
             offsets = np.flatnonzero(small[:WINDOW])
             heads = np.lib.stride_tricks.sliding_window_view(view, HEAD.size)[offsets].view(_CANDIDATE)[:, 0]
             room = self.limit - at - HEAD.size - offsets
             fits = (heads["length"] >= _MIN_LENGTH[heads["opcode"]]) & (heads["length"].astype(np.int64) <= room)
             found = offsets[fits].tolist()
-        magic = raw.find(MAGIC)
+        magic = -1 if chunks_only else raw.find(MAGIC)
         while 0 <= magic < WINDOW:
             found.append(magic)
             magic = raw.find(MAGIC, magic + 1)
@@ -246,23 +218,38 @@ class RecordFrames:
                 return self.is_valid(position, opcode, length)
         return True
 
-    def overlaps_next(self, position: int, opcode: int, length: int) -> bool:
-        """Whether a record was cut off and the next one overwrites its end.
-
-        Then another log begins inside it, or no record follows a chunk; and its CRC does not prove it whole.
-        """
-        end = position + HEAD.size + length
-        unframed = opcode == Opcode.CHUNK and not self.is_boundary(end)
-        if not (unframed or self.find(position, end, LOG_START) >= 0):
+    def holds_log(self, position: int, opcode: int, length: int) -> bool:
+        """Whether another log begins inside a record, which was cut off; an attachment may hold one."""
+        if self.find(position, position + HEAD.size + length, LOG_START) < 0:
             return False
         try:
-            if opcode == Opcode.CHUNK:
-                records.unpack(self.source.at(position, end - position), position)
-            elif opcode == Opcode.ATTACHMENT:
-                return not Attachment.of(self.source, position, length).check_crc(self.source)
+            return opcode != Opcode.ATTACHMENT or not Attachment.of(self.source, position, length).check_crc(self.source)
         except LogError:
             return True
-        return opcode != Opcode.CHUNK
+
+    def find_proven(self, start: int, end: int) -> int:
+        """Offset of the first chunk in a stretch that its CRC proves, or -1."""
+        for at in range(start, end, WINDOW):
+            raw = self.source.at(at, min(WINDOW + len(MAGIC), self.limit - at))
+            for offset in self._candidates(raw, at, chunks_only=True):
+                if at + offset >= end or self._proof_bytes < 0:
+                    return -1
+                if self.proves(at + offset):
+                    return at + offset
+        return -1
+
+    def proves(self, position: int) -> bool:
+        """Whether a chunk begins there that its CRC proves."""
+        opcode, length = self.source.head(position)
+        head = self.chunk(position, length) if opcode == Opcode.CHUNK and HEAD.size + length <= self.max_chunk else None
+        if head is None or not head.crc or head.size > self.max_chunk:
+            return False
+        self._proof_bytes -= head.size + length
+        try:
+            messages.parse(records.unpack(self.source.at(position, HEAD.size + length), position, self.max_chunk), position)
+        except LogError:
+            return False
+        return True
 
     def ends_run(self, end: int, raw: bytes, offsets: Int64[np.ndarray, " n"], channels: set[int]) -> bool:
         """Whether the last message of a run ends at `end`: a record follows, perhaps a damaged one."""

@@ -1,210 +1,221 @@
 """Scan a damaged log from its first byte to its last, record by record.
 
-Where framing breaks, the search goes on to the next valid record (`resync`), or to the next chunk that the summary lists; the
-bytes between are a gap. A chunk is unpacked only to tell a whole one from one that was cut off.
+Every chunk is unpacked where it is met, because only its CRC proves it. Where framing breaks, the search goes on to the next
+valid record (`resync`); the bytes between are a gap. A record without a CRC never hides a chunk that a CRC proves: a chunk that
+begins inside one shows that the record was cut off there.
 """
 
 from __future__ import annotations
 
 import struct
-from bisect import bisect_right
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 
-import numpy as np
 from mcap.opcode import Opcode
-from mcap.records import ChunkIndex, Footer, Header
+from mcap.records import ChunkIndex, Header
 
 from imutool.errors import LogError
-from imutool.mcap_io.blocks import RUN_BYTES, MessageBlock, RecordSpan
+from imutool.mcap_io.blocks import HEAD_BYTES, RUN_BYTES, Attachment, MessageBlock, RecordSpan, too_large
 from imutool.mcap_io.codec import messages, records
-from imutool.mcap_io.codec.records import FOOTER_SIZE, HEAD, MAGIC, crc32
-from imutool.mcap_io.index import MAX_SUMMARY
-from imutool.mcap_io.recovery.definitions import DEFINITIONS, Sections
+from imutool.mcap_io.codec.records import HEAD, MAGIC
+from imutool.mcap_io.recovery.chunk_repair import UnreadableError, prove
 from imutool.mcap_io.recovery.losses import LATEST_NS, Losses, reason
-from imutool.mcap_io.recovery.resync import LOG_START, MAX_CANDIDATES, PRIVATE, SUMMARY, Gap, RecordFrames
+from imutool.mcap_io.recovery.resync import LOG_START, MAX_CANDIDATES, RecordFrames
+from imutool.mcap_io.recovery.scan_events import (
+    Definition,
+    Gap,
+    LogEnd,
+    LogStart,
+    ScanResult,
+)
+from imutool.mcap_io.recovery.summary import DEFINITIONS, PRIVATE, SUMMARY, moved_summary
 from imutool.mcap_io.storage.source import Source
 
 MAX_ITEMS = 5_000_000  # a 100 GB log has some 100 000 chunks; a file of nothing but empty ones would fill the memory
 
 
-class Scan:
+class Scan(ScanResult):
     """One pass over the records of a file.
 
-    `chunks` are the entries of an intact summary, if there is one.
+    `listed` are the entries of an intact summary, by the offset of their chunk; they help to put damaged heads right.
 
     Raises:
         LogError: more records than any recorder writes.
     """
 
-    def __init__(
-        self, source: Source, limit: int, chunks: Mapping[int, ChunkIndex], sections: Sections, losses: Losses
-    ) -> None:
-        self.source, self.limit, self.chunks, self.sections, self.losses = source, limit, chunks, sections, losses
+    def __init__(self, source: Source, limit: int, listed: Mapping[int, ChunkIndex], losses: Losses, max_chunk: int) -> None:
+        super().__init__()
+        self.source, self.limit, self.listed, self.losses, self.max_chunk = source, limit, listed, losses, max_chunk
         self.has_summary = limit < source.size  # an intact one, which begins at the limit
-        self.frames = RecordFrames(source, limit)
-        self.items: list[MessageBlock | RecordSpan] = []
-        self.gaps: list[Gap] = []
-        self.doubtful: list[tuple[MessageBlock, Gap]] = []  # messages that may be the contents of a damaged chunk
-        self.header: Header | None = None
-        self._data_ends: list[int] = []
-        self._used_channels: set[int] = set()  # channels of messages, whose definition may be lost
+        self.frames = RecordFrames(source, limit, max_chunk)
         self._closed = False  # past a footer
         self._ended = False  # past the data section of a log
-        self._last: MessageBlock | Gap | None = None  # what message indexes would belong to
         self._open_gap: Gap | None = None  # messages behind it may lie inside a damaged chunk
+        self._unproven = -1  # where the last record began, if no CRC proves it
 
     def run(self) -> None:
         """Scans from the first byte to the limit."""
-        limit, chunks = self.limit, sorted(self.chunks)
         position = self._start()
-        while position < limit:
+        while position < self.limit:
             if len(self.items) + len(self.gaps) > MAX_ITEMS:
                 raise LogError(
                     f"the log has more than {MAX_ITEMS} chunks and other records", expected="one that a recorder made"
                 )
-            if (block := self._listed_block(position, limit)) is not None:
-                self._add_block(block)
-                position = block.end
-                continue
             after = self._step(position)
-            if after is None:
-                following = bisect_right(chunks, position)
-                after = self._gap(position, min(limit, chunks[following]) if following < len(chunks) else limit)
-            position = after
+            position = self._gap(position) if after is None else after
+        self._close()
+
+    def _close(self) -> None:
+        """Says how the file ends."""
+        limit = self.limit
         if self.has_summary and not self._ended:
             self.losses.add_harmless(f"the DataEnd record before byte {limit} is damaged; a new one can be made")
         elif self._ended and not self._closed and not self.has_summary:
             self.losses.add_harmless("the log ends inside its summary; a new one can be made")
-        elif not self._ended and not (self.gaps and self.gaps[-1].offset + self.gaps[-1].length == limit):
-            self.gaps.append(
-                Gap(limit, 0, "the log stops here without an end: the recorder did not finish it, or it was cut off")
-            )
-
-    @property
-    def data_end(self) -> int:
-        """Offset of the DataEnd record; the file's end where it has none or several."""
-        return self._data_ends[0] if len(self._data_ends) == 1 and len(self.sections.each) == 1 else self.source.size
-
-    def _listed_block(self, position: int, limit: int) -> MessageBlock | None:
-        entry = self.chunks.get(position)
-        if entry is None:
-            return None
-        try:
-            return MessageBlock.of_summary(entry, limit)
-        except LogError as error:
-            self.losses.add_harmless(reason(error))
-            return None
+        elif not self._ended and not (self.gaps and self.gaps[-1].end == limit):
+            why = "the log stops here without an end: the recorder did not finish it, or it was cut off"
+            self.add_gap(Gap(limit, 0, why))
 
     def _start(self) -> int:
         """Checks the magic and the Header; returns where records begin."""
         at = len(MAGIC)
-        found = self.frames.head(at)
-        sound = found is not None and found[0] == Opcode.HEADER and self.frames.is_valid(at, *found)
+        self.events.append(LogStart(0))
         if not self.frames.is_magic(0):
             self.losses.add_harmless("the file does not begin as an MCAP log does")
-            if not sound:
+            head = self.frames.head(at)
+            if head is None or head[0] != Opcode.HEADER or not self.frames.is_valid(at, *head):
                 return 0
         return at
 
-    def _add_block(self, chunk: MessageBlock) -> None:
-        self.items.append(chunk)
-        self._last, self._open_gap = chunk, None
-
     def _step(self, position: int) -> int | None:
         """Handles the record at a position; returns the next offset, None if the framing is broken."""
-        frames = self.frames
-        if frames.is_magic(position):
+        frames, head = self.frames, self.frames.head(position)
+        if head is None and frames.is_magic(position):
             self._log_boundary(position)
             return position + len(MAGIC)
-        head = frames.head(position)
-        if head is not None and head[0] == Opcode.MESSAGE:
-            return self._messages(position, head[1])
+        opcode, length = head or (0, 0)
+        if opcode == Opcode.MESSAGE:
+            return self._messages(position, length)
+        if opcode == Opcode.CHUNK:
+            return self._chunk(position, length)
         if head is None or not frames.is_valid(position, *head):
             return self._damaged(position)
-        return None if not self.has_summary and self.frames.overlaps_next(position, *head) else self._record(position, *head)
+        cut_off = opcode == Opcode.ATTACHMENT and not self._is_whole(position, length)
+        if cut_off or (not self.has_summary and frames.holds_log(position, *head)):
+            return None
+        return self._record(position, *head)
+
+    def _is_whole(self, position: int, length: int) -> bool:
+        """Whether an attachment ends where it says: its CRC proves it, or a record follows."""
+        if self.frames.is_boundary(position + HEAD.size + length):
+            return True
+        try:
+            return Attachment.of(self.source, position, length).check_crc(self.source)
+        except LogError:
+            return False
 
     def _log_boundary(self, position: int) -> None:
         """Handles a magic inside the file: a log begins if a Header follows, else one has ended."""
         head = self.frames.head(position + len(MAGIC))
         if position and head is not None and head[0] == Opcode.HEADER:
             if not self._ended:
-                self.gaps.append(Gap(position, 0, "a log stops here without an end, and another begins"))
+                self.add_gap(Gap(position, 0, "a log stops here without an end, and another begins"))
             self.losses.add_harmless(f"another log begins at byte {position}")
-            self.sections.begin(position)
-            self._ended, self._closed, self._last, self._open_gap = False, False, None, None
+            self.events.append(LogStart(position))
+            self._ended, self._closed, self.last, self._open_gap = False, False, None, None
+        self._unproven = -1
+
+    # ── chunks ───────────────────────────────────────────────────────────────────────────────────────────────────────
+
+    def _chunk(self, position: int, length: int) -> int | None:
+        """Handles a Chunk record: proven, without CRC, or damaged."""
+        end = position + HEAD.size + length
+        why = f"the chunk at byte {position} is damaged: its lengths contradict one another"
+        for stated in dict.fromkeys((length, *self._other_lengths(position))):
+            if not 0 <= stated <= self.frames.limit - position - HEAD.size:
+                continue
+            try:
+                return self._take_chunk(position, HEAD.size + stated)
+            except UnreadableError as error:  # its contents are proven and make no sense; what lies in them is theirs
+                return self._lose_chunk(position, HEAD.size + stated, reason(error))
+            except LogError as error:
+                why = reason(error) if stated == length else why
+        if (proven := self.frames.find_proven(position + 1, min(end, self.limit))) >= 0:
+            return self.add_gap(
+                Gap(position, proven - position, f"{why}; another chunk begins inside it", *self._times(position))
+            )
+        return self._lose_chunk(position, end - position, why) if self.frames.is_boundary(end) else None
+
+    def _lose_chunk(self, position: int, length: int, why: str) -> int:
+        self.last = self._open_gap = gap = Gap(position, length, why, *self._times(position))
+        return self.add_gap(gap)
+
+    def _other_lengths(self, position: int) -> Iterator[int]:
+        """Lengths that a Chunk record may have whose own length is damaged."""
+        if (inner := self.frames.chunk_length(position)) is not None:
+            yield inner
+        if (entry := self.listed.get(position)) is not None:
+            yield entry.chunk_length - HEAD.size
+
+    def _take_chunk(self, position: int, whole: int) -> int:
+        """Adds a chunk of `whole` bytes; returns where it ends.
+
+        Raises:
+            LogError: nothing proves it.
+        """
+        if whole > self.max_chunk:
+            raise too_large("chunk", position, whole, self.max_chunk)
+        found, head, raw = prove(
+            self.source.at(position, whole), position, self.listed.get(position), self.max_chunk, self.frames.is_boundary
+        )
+        block = MessageBlock(position, whole, position + whole, 0, 0, head.compression, trusted=False)
+        self.add_block(block, found, head)
+        start = raw[:HEAD_BYTES]
+        if head.crc and block.counts:
+            start = start[: HEAD.size] + struct.pack("<QQ", block.start_ns, block.end_ns) + start[HEAD.size + 16 :]
+        if start != self.source.at(position, min(whole, HEAD_BYTES)):
+            self.repaired[position] = start
+            self.losses.add_harmless(f"the head of the chunk at byte {position} was damaged, and is repaired")
+        self.last, self._open_gap, self._unproven = block, None, -1 if head.crc else position
+        return block.end
+
+    def _times(self, position: int) -> tuple[int | None, int | None]:
+        """Start and end that the head of a damaged chunk states, if they can be."""
+        first = self.source.at(position, min(HEAD.size + 16, self.frames.limit - position))
+        if len(first) == HEAD.size + 16 and first[0] == Opcode.CHUNK:
+            start_ns, end_ns = struct.unpack_from("<QQ", first, HEAD.size)
+            if 0 < start_ns <= end_ns < LATEST_NS:
+                return start_ns, end_ns
+        return None, None
+
+    # ── other records ────────────────────────────────────────────────────────────────────────────────────────────────
 
     def _record(self, position: int, opcode: int, length: int) -> int:
         """Takes in a valid record; returns where it ends."""
         end = position + HEAD.size + length
-        if opcode == Opcode.CHUNK:
-            head = self.frames.chunk(position, length)
-            assert head is not None, "a chunk that agrees has a head"
-            self._add_block(
-                MessageBlock(position, end - position, end, head.start_ns, head.end_ns, head.compression, trusted=False)
-            )
-        elif opcode == Opcode.MESSAGE_INDEX:
-            self._message_index(position, length)
+        self._unproven = position
+        if opcode == Opcode.MESSAGE_INDEX:
+            self._open_gap = None
+            self.add_message_index(position, self.source.at(position + HEAD.size, length))
         elif opcode == Opcode.HEADER:
             if self.header is None:
                 self.header = records.parse(Header, self.source.at(position + HEAD.size, length), position)
-        elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
-            self._define(opcode, self.source.at(position + HEAD.size, length), position, proven=False)
+        elif opcode in DEFINITIONS:
+            body = self.source.at(position + HEAD.size, length)
+            self.events.append(Definition(position, opcode, body))
+            self.used_channels |= {int.from_bytes(body[:2], "little")} if opcode == Opcode.CHANNEL else set()
             if not self._ended:
                 self.items.append(RecordSpan(opcode, position, end - position))
         elif opcode == Opcode.FOOTER:
-            self._moved_summary(position)
+            if self._ended and not self.has_summary and (found := moved_summary(self.source, self.data_ends[-1], position)):
+                self.summaries.append(found)
             self._closed = self.frames.is_magic(end)
+            self.events.append(LogEnd(end))
         elif opcode == Opcode.DATA_END:
-            self._data_ends.append(position)
-            self._ended, self._last, self._open_gap = True, None, None
+            self.data_ends.append(position)
+            self._ended, self.last, self._open_gap = True, None, None
         elif opcode in (Opcode.ATTACHMENT, Opcode.METADATA):
             self.items.append(RecordSpan(opcode, position, end - position))
         return end
-
-    def _moved_summary(self, position: int) -> None:
-        """Finds the start of an inner log: the offset of its summary minus the stated one."""
-        if not self._ended or not self._data_ends:
-            return
-        footer = records.parse(Footer, self.source.at(position + HEAD.size, FOOTER_SIZE - HEAD.size), position)
-        start, stop = self._data_ends[-1] + HEAD.size + 4, position + FOOTER_SIZE - 4
-        base = start - footer.summary_start
-        if self.has_summary or not footer.summary_crc or not footer.summary_start or base < 0:
-            return
-        if stop - start > MAX_SUMMARY:
-            return
-        raw = self.source.at(start, stop - start)
-        if crc32(raw) != footer.summary_crc:
-            return
-        if self.sections.begin(base):
-            self.losses.add_harmless(f"another log begins at byte {base}, as its summary says")
-        at = 0
-        while len(raw) - at >= HEAD.size:
-            opcode, length = HEAD.unpack_from(raw, at)
-            self._define(opcode, raw[at + HEAD.size : at + HEAD.size + length], base, proven=True)
-            at += HEAD.size + length
-
-    def _define(self, opcode: int, body: bytes, offset: int, *, proven: bool) -> None:
-        """Takes in a definition; one that contradicts a proven one is left out."""
-        if opcode not in DEFINITIONS:
-            return
-        try:
-            conflict = self.sections.define(opcode, body, offset, proven=proven)
-        except LogError as error:
-            conflict = reason(error)
-        if conflict:
-            self.losses.add_harmless(conflict)
-
-    def _message_index(self, position: int, length: int) -> None:
-        """Assigns a message index to the chunk before it, or counts a lost chunk's messages."""
-        last, self._open_gap = self._last, None
-        if isinstance(last, Gap):
-            body = self.source.at(position + HEAD.size, length)
-            last.count(int.from_bytes(body[:2], "little"), np.frombuffer(body, "<u8", offset=6).reshape(-1, 2))
-        elif last is not None and last.end == position:
-            channel, size = struct.unpack("<HI", self.source.at(position + HEAD.size, 6))
-            last.end = position + HEAD.size + length
-            if size:
-                last.indexes[channel] = position
 
     def _damaged(self, position: int) -> int | None:
         """Handles an invalid or unknown record; returns its end, or None where that is unknown."""
@@ -212,38 +223,35 @@ class Scan:
         if frames.limit - position < HEAD.size:
             return None
         opcode, length = self.source.head(position)
-        fits = length <= frames.limit - position - HEAD.size and frames.is_boundary(position + HEAD.size + length)
-        for own in (
-            length if fits else None,
-            frames.chunk_length(position),
-        ):  # a chunk whose opcode or length is what is damaged
-            if own is not None and (opcode == Opcode.CHUNK or frames.chunk(position, own) is not None):
-                end = position + HEAD.size + own
-                if frames.is_boundary(end):
-                    start_ns, end_ns = struct.unpack("<QQ", self.source.at(position + HEAD.size, 16))
-                    self._add_block(MessageBlock(position, end - position, end, start_ns, end_ns, "", trusted=False))
-                    return end
-        if not fits:
+        for own in self._other_lengths(position):
+            if 0 <= own <= frames.limit - position - HEAD.size:  # opcode or length of a chunk is damaged
+                try:
+                    return self._take_chunk(position, HEAD.size + own)
+                except LogError:
+                    continue
+        end = position + HEAD.size + length
+        if not (length <= frames.limit - position - HEAD.size and frames.is_boundary(end)):
             return None
-        whole = HEAD.size + length
+        if frames.find_proven(position + 1, end) >= 0:
+            return None
         if opcode >= PRIVATE:
-            self.items.append(RecordSpan(opcode, position, whole))
-        elif (opcode in SUMMARY and self._ended) or (opcode == Opcode.MESSAGE_INDEX and self._last is not None):
-            self.losses.add_harmless(
-                f"the {records.name_of(opcode)} record at byte {position} is damaged; a new one can be made"
-            )
-            if isinstance(self._last, MessageBlock) and self._last.end == position:
-                self._last.end += whole
+            self.items.append(RecordSpan(opcode, position, HEAD.size + length))
+        elif (opcode in SUMMARY and self._ended) or (opcode == Opcode.MESSAGE_INDEX and self.last is not None):
+            name = records.name_of(opcode)
+            self.losses.add_harmless(f"the {name} record at byte {position} is damaged; a new one can be made")
+            if isinstance(self.last, MessageBlock) and self.last.end == position:
+                self.last.end = end
         else:
-            self.gaps.append(Gap(position, whole, f"the {records.name_of(opcode)} record here is damaged"))
-        return position + whole
+            self.add_gap(Gap(position, HEAD.size + length, f"the {records.name_of(opcode)} record here is damaged"))
+        self._unproven = position
+        return end
 
     def _messages(self, position: int, length: int) -> int | None:
         """Adds messages outside chunks as one block; the last one only if its end is certain."""
         limit = self.frames.limit
         raw = self.source.at(position, min(max(RUN_BYTES, HEAD.size + length), limit - position))
         offsets, _, end = messages.scan(raw, bare=True)
-        if not self.frames.ends_run(position + end, raw, offsets, self.sections.channels() | self._used_channels):
+        if not self.frames.ends_run(position + end, raw, offsets, self.used_channels):
             end = int(offsets[-1])
         next_log = -1 if self.has_summary else self.frames.find(position, position + end, LOG_START)
         if next_log >= 0:
@@ -251,36 +259,34 @@ class Scan:
         if not end:
             return None
         found = messages.parse(raw[:end], position)
-        times = found.heads["log_time"]
-        self._used_channels.update(np.unique(found.heads["channel"]).tolist())
-        block = MessageBlock(position, end, position + end, int(times.min()), int(times.max()), None, trusted=False)
-        self.items.append(block)
-        self._last = self._open_gap
+        block = MessageBlock(position, end, position + end, 0, 0, None, trusted=False)
+        self.add_block(block, found, None)
+        self.last, self._unproven = self._open_gap, position + int(found.offsets[-1])
         if self._open_gap is not None:
             self.doubtful.append((block, self._open_gap))
         return position + end
 
-    def _gap(self, position: int, limit: int) -> int:
+    # ── gaps ─────────────────────────────────────────────────────────────────────────────────────────────────────────
+
+    def _gap(self, position: int) -> int:
         """Goes on to the next valid record; the bytes between are lost."""
         frames = self.frames
-        after = frames.find_next(position + 1, limit, self.sections.channels() | self._used_channels)
-        gap = Gap(position, after - position, frames.broken_framing(position))
+        if self._unproven >= 0 and (proven := frames.find_proven(self._unproven + 1, position)) >= 0:
+            self.cut_back(self._unproven, position)
+            position, after = self._unproven, proven
+        else:
+            after = frames.find_next(position + 1, self.limit, self.used_channels)
+        self._unproven = -1
+        gap = Gap(position, after - position, frames.broken_framing(position), *self._times(position))
         if frames.candidates > MAX_CANDIDATES:
             gap.reason += "; the search for what follows was given up after too many false starts"
-        first = self.source.at(position, min(64, frames.limit - position))
-        if len(first) >= HEAD.size + 16 and first[0] == Opcode.CHUNK:
-            start_ns, end_ns = struct.unpack_from("<QQ", first, HEAD.size)
-            if start_ns <= end_ns < LATEST_NS:
-                gap.start_ns, gap.end_ns = start_ns, end_ns
         following = frames.head(after)
         if self._ended and not self._closed and (following is None or following[0] in SUMMARY | {Opcode.FOOTER, *DEFINITIONS}):
-            self.losses.add_harmless(
-                f"{after - position} bytes of the summary at byte {position} are damaged; a new one can be made"
-            )
+            self.losses.add_harmless(f"{gap.length} bytes of the summary at byte {position} are damaged; a new one can be made")
             return after
         if self._ended and frames.is_zero(position, after):
-            self.losses.add_harmless(f"{after - position} zero bytes follow the end of the log, at byte {position}")
+            self.losses.add_harmless(f"{gap.length} zero bytes follow the end of the log, at byte {position}")
             return after
-        self.gaps.append(gap)
-        self._last = self._open_gap = gap
+        self.add_gap(gap)
+        self.last = self._open_gap = gap
         return after

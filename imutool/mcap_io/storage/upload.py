@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from typing import TYPE_CHECKING, Any
@@ -16,6 +17,7 @@ if TYPE_CHECKING:
 
 logger = logging.getLogger(__name__)
 
+DELETE_PAUSES_S = (0.1, 1.0)
 PART_BYTES = 8 << 20  # one part and its copies are what is in memory
 LARGE_AFTER, LARGE_PART_BYTES = 32 << 30, 64 << 20  # S3 takes 10 000 parts: so they are enough for 400 GiB
 
@@ -60,10 +62,21 @@ class Upload:
         with self._no_parts_left():
             self.path.fs.cp_file(self.temporary.path, self.path.path)
         self._check_size(self.path)
-        try:
-            self.path.fs.rm_file(self.temporary.path)
-        except Exception as error:  # the object is in its place, and whole: that is what was asked for  # noqa: BLE001
-            logger.warning("%s could not be removed: %s", self.temporary, reason(error))
+        self._remove_temporary()
+
+    def _remove_temporary(self) -> None:
+        """Remove the temporary object; a store that fails is asked again."""
+        for pause_s in (*DELETE_PAUSES_S, None):
+            try:
+                return self.temporary.fs.rm_file(self.temporary.path)  # type: ignore[no-any-return]  # None
+            except FileNotFoundError:
+                return None
+            except Exception as error:  # the object is in its place, and whole: that is what was asked for  # noqa: BLE001
+                if pause_s is None:
+                    logger.warning("%s could not be removed: %s", self.temporary, reason(error))
+                else:
+                    time.sleep(pause_s)
+        return None
 
     @contextmanager
     def _no_parts_left(self) -> Iterator[None]:

@@ -21,7 +21,7 @@ from imutool.diagnosis.wording.conclusion import (
     unobservable,
 )
 from imutool.diagnosis.wording.effect_sentences import effect_sentence, has_gain, label
-from imutool.diagnosis.wording.quantity import SHOWN, each, grouped, percent, symbol
+from imutool.diagnosis.wording.quantity import SHOWN, distinguished, each, grouped, percent, symbol
 from imutool.mcap_io.storage.target import Target
 from imutool.units import ASCII_UNITS
 from imutool.viewing.html import diagnosis_figures as figures
@@ -61,7 +61,7 @@ def html(d: Diagnosis, *, logs: str | None = None) -> str:
     )
     body = [
         f"<h1>{text(names)} {text(against)}</h1>",
-        f'<p class="conclusion">{text(" ".join(headline(d)))}</p>',
+        f'<p class="conclusion">{text(headline(d))}</p>',
         *(f'<p class="note">{text(line)}</p>' for line in notes(d)),
         *(f'<p class="note">{text(line)}</p>' for line in d.remarks),
         *([f'<p><a href="{text(logs)}">The recordings themselves</a>: signals, spectra, events.</p>'] if logs else []),
@@ -111,7 +111,7 @@ def _entries(finding: Finding) -> str:
     if finding.curve is not None:
         return f"<br>a curve of {text(finding.curve.variable)}, drawn below"
     out = []
-    for quantity in grouped(finding.parameters):
+    for quantity in grouped(distinguished(finding.parameters)[0]):
         if len(quantity.estimates) > SHOWN:
             entries, unit = each(quantity.estimates, quantity.axes)
             listed = "; ".join(f"<span class=entry>{text(entry)}</span>" for entry in entries)

@@ -24,8 +24,8 @@ ROW_SHARES = {"paths": 6.0, "legend": 0.9, "error": 2.6}
 LIVE_WINDOW_S = 20.0  # of the plots in a live view
 
 
-def blueprint(logs: Sequence[RunData], *, source: bool = True) -> rrb.Blueprint:
-    """Layout of what `scene.log` logs for the same logs and `source`; every view has content.
+def blueprint(logs: Sequence[RunData], *, source: bool = True, root: Scope = ()) -> rrb.Blueprint:
+    """Layout of what `scene.log` logs for the same logs, `source` and `root`; every view has content.
 
     The cursor starts at the end of the log on `elapsed`, where whole paths are visible.
 
@@ -35,7 +35,7 @@ def blueprint(logs: Sequence[RunData], *, source: bool = True) -> rrb.Blueprint:
     require_rerun()
     import rerun.blueprint as rrb
 
-    of_logs = scopes(logs)
+    of_logs = scopes(logs, root)
     views = [_log_view(data, scope, source) for data, scope in zip(logs, of_logs, strict=True)]
     return plots.frame(views[0] if len(logs) == 1 else rrb.Tabs(_comparison(logs, of_logs), *views, active_tab=0))
 

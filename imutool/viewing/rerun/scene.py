@@ -19,10 +19,10 @@ if TYPE_CHECKING:
     import rerun as rr
 
 
-def log(logs: Sequence[RunData], to: rr.RecordingStream, *, source: bool = True) -> None:
+def log(logs: Sequence[RunData], to: rr.RecordingStream, *, source: bool = True, root: Scope = ()) -> None:
     """Log all entities as whole columns on `elapsed`, `ros2_timestamp` and `message_log_time`.
 
-    One log lies at the root, several each under `run/NAME`; each of several models lies under its own name.
+    One log lies at the root of its entities, several each under `run/NAME`; each of several models lies under its own name.
     `world/{gt,raw,debiased}/{path,body}`, `imu/{gyro,accel}/{raw,debiased}`, `bias/{gyro,accel}/{estimated,true,sigma}`,
     `error/{orientation,position}/{raw,debiased}` (degrees and metres; parts below), `error/drift/…`,
     `spectrum/{gyro,accel}/…`, `events/KIND`, `report`; with `source` the log's other topics under their own names.
@@ -35,7 +35,7 @@ def log(logs: Sequence[RunData], to: rr.RecordingStream, *, source: bool = True)
     to.set_log_tick_enabled(False)
     if len(logs) > 1:  # first: the user sees it first, and a page receives slowly
         report.log_comparison(logs, to)
-    for data, scope in zip(logs, scopes(logs), strict=True):
+    for data, scope in zip(logs, scopes(logs, root), strict=True):
         _log_one(data, to, scope, source)
 
 

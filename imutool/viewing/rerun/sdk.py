@@ -50,8 +50,10 @@ def stream_of_logs(logs: Sequence[RunData]) -> rr.RecordingStream:
     return new_stream(recording_name(logs))
 
 
-def new_stream(name: str) -> rr.RecordingStream:
+def new_stream(name: str, *, application: str | None = None, recording: str | None = None) -> rr.RecordingStream:
     """Create a recording stream in an application of its own: Rerun keeps a layout for each.
+
+    `application` and `recording` are the ids of a recording that a viewer shows already.
 
     The stream has no `log_time` and no `log_tick`: the time of drawing tells the user nothing.
 
@@ -62,10 +64,10 @@ def new_stream(name: str) -> rr.RecordingStream:
     import rerun as rr
 
     short = safe_name(name)
-    recording = rr.RecordingStream(f"imutool {short}", recording_id=f"{short}-{uuid.uuid4().hex[:8]}")
-    recording.set_log_time_enabled(False)
-    recording.set_log_tick_enabled(False)
-    return recording
+    stream = rr.RecordingStream(application or f"imutool {short}", recording_id=recording or f"{short}-{uuid.uuid4().hex[:8]}")
+    stream.set_log_time_enabled(False)
+    stream.set_log_tick_enabled(False)
+    return stream
 
 
 def recording_name(logs: Sequence[RunData]) -> str:
@@ -92,11 +94,11 @@ def rerun_version() -> str:
     return str(rr.__version__)
 
 
-def scopes(logs: Sequence[RunData]) -> list[Scope]:
-    """Scope of each log: the root for one log, `run/NAME` for several."""
+def scopes(logs: Sequence[RunData], root: Scope = ()) -> list[Scope]:
+    """Scope of each log: the root for one log, `run/NAME` below it for several."""
     if len(logs) == 1:
-        return [()]
-    return [("run", name) for name in unique_names([data.name or "log" for data in logs])]
+        return [root]
+    return [(*root, "run", name) for name in unique_names([data.name or "log" for data in logs])]
 
 
 def unique_names(names: Sequence[str], taken: Sequence[str] = ()) -> list[str]:

@@ -12,7 +12,8 @@ from support import planted
 
 from imutool.diagnosis.estimation import unnamed_effects as unnamed
 from imutool.diagnosis.estimation.aligned_log import Pair
-from imutool.diagnosis.estimation.model_selection import Selection, select_effects
+from imutool.diagnosis.estimation.candidate_score import Selection
+from imutool.diagnosis.estimation.model_selection import select_effects
 from imutool.diagnosis.estimation.significance import log_p_value
 from imutool.diagnosis.settings import SearchSettings
 

@@ -33,6 +33,7 @@ from imutool.mcap_io.codec.records import HEAD, MAGIC
 from imutool.mcap_io.codec.ros2_definition import DEEPEST, parse
 from imutool.mcap_io.index import MessageBlock
 from imutool.mcap_io.log import Log
+from imutool.mcap_io.recovery import summary
 from imutool.mcap_io.recovery.recovered_log import RecoveredLog
 from imutool.mcap_io.repair import RECORD, repair
 from imutool.report import json_values
@@ -458,13 +459,13 @@ def test_huge_claims_of_metadata_and_attachments_cost_nothing(tmp_path: Path) ->
 
 
 def test_nothing_longer_than_a_chunk_may_be_comes_into_memory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(records, "CHUNK_LIMIT", 1 << 20)
     monkeypatch.setattr(index, "MAX_SUMMARY", 1 << 20)
+    monkeypatch.setattr(summary, "MAX_SUMMARY", 1 << 20)
     size = 50 << 20
     path, message = tmp_path / "log.mcap", struct.pack("<HIQQ", 1, 0, 0, 0)
     for start in (HEAD.pack(5, size) + message, HEAD.pack(6, size + 49) + struct.pack("<QQQIIQ", 0, 1, size, 7, 0, size)):
         hostile(path, start, bytes(size))
-        with in_time(), in_room(), RecoveredLog(path) as log:
+        with in_time(), in_room(), RecoveredLog(path, max_chunk=1 << 20) as log:
             assert log.losses.bytes > size
     footer = HEAD.pack(2, 20) + struct.pack("<QQI", 8, 0, 1) + MAGIC
     path.write_bytes(MAGIC + HEAD.pack(1, 8) + bytes(8) + bytes(size) + footer)

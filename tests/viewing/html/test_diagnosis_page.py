@@ -17,7 +17,7 @@ from support import diagnoses, markup
 from support.diagnoses import replace
 
 from imutool.diagnosis.result import Closer, SignalTraces
-from imutool.diagnosis.wording.conclusion import conclusion
+from imutool.diagnosis.wording.conclusion import headline
 from imutool.errors import ConfigError
 from imutool.viewing.html import diagnosis_figures as figures
 from imutool.viewing.html import diagnosis_paths, drawing
@@ -47,7 +47,7 @@ def nothing() -> str:
 def test_the_conclusion_comes_first_and_what_remains_and_the_provenance_after(name: str) -> None:
     d = replace(getattr(diagnoses, name), traces=())  # its words alone: figures are looked at below
     said = Page(html(d)).text
-    places = [said.index(words) for words in (conclusion(d), "Remaining misfit", "Provenance", "imutool.diagnosis/1")]
+    places = [said.index(words) for words in (headline(d), "Remaining misfit", "Provenance", "imutool.diagnosis/1")]
     assert places == sorted(places)
     assert ("Unmodelled effects" in said) == bool(d.findings)
     assert ("Location of the misfit" in said) == bool(d.located)
@@ -77,7 +77,7 @@ def test_every_log_has_its_bias_its_samples_and_its_unseen_time(three: str) -> N
     assert "constant bias gyro (-0.01, +0.02, -0.003) rad/s, accel (-0.1, +0.2, -0.05) m/s²" in said
     assert "one: 18000 at 200 Hz, 0.0 to 90.0 s, 30 s of it unseen by any fit" in said
     assert "two: 14000 at 200 Hz, 100.0 to 170.0 s, 23 s of it unseen by any fit" in said
-    assert "gyro rms 0.02 to 0.0074 rad/s, 63 % closer" in said
+    assert "gyro rms 0.02 to 0.0074 rad/s, 90 % of the misfit removed" in said
     assert diagnoses.THREE.remarks[0] in said
 
 

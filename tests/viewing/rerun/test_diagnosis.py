@@ -17,7 +17,7 @@ from rerun.chunk import RrdReader
 from support import diagnoses
 from support.diagnoses import replace
 
-from imutool.diagnosis.wording.conclusion import conclusion
+from imutool.diagnosis.wording.conclusion import headline
 from imutool.errors import ConfigError
 from imutool.viewing.rerun import diagnosis as view
 from imutool.viewing.rerun.viewer import binary
@@ -154,7 +154,7 @@ def test_located_time_goes_to_the_log_it_lies_in(folder: Path) -> None:
 
 def test_the_report_says_the_conclusion_and_what_a_log_is_called_is_no_markup(folder: Path) -> None:
     (words,) = read(folder / "BOTH.rrd")["/report"].static["TextDocument:text"]
-    assert conclusion(diagnoses.BOTH).replace("_", "\\_") in words
+    assert headline(diagnoses.BOTH).replace("_", "\\_") in words
     assert diagnoses.BOTH.remarks[0] in words
     hostile = replace(diagnoses.BY_CURRENT, findings=(replace(diagnoses.DRIVEN, driver="[a](http://b) <i>"),), traces=())
     view.save(hostile, folder / "hostile.rrd")

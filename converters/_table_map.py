@@ -1,0 +1,202 @@
+"""Map of a table: which columns hold time, rates and accelerations, and in which units.
+
+A map is proposed from the names of the columns, the units in them and the magnitude of the values. What these leave open is
+for the user to state in a map file.
+"""
+
+from __future__ import annotations
+
+import re
+import tomllib
+from pathlib import Path
+
+import msgspec
+import numpy as np
+
+from imutool.errors import ConfigError
+
+from ._table_files import Columns
+
+TIME_NS = {"s": 1e9, "ms": 1e6, "us": 1e3, "ns": 1.0}
+GYRO_SI = {"rad/s": 1.0, "deg/s": np.pi / 180.0}
+STANDARD_GRAVITY = 9.80665
+ACCEL_SI = {"m/s^2": 1.0, "g": STANDARD_GRAVITY, "mg": STANDARD_GRAVITY / 1000.0}
+PLAUSIBLE_HZ = 5.0, 10_000.0
+GRAVITY_BAND = 0.15  # share by which the median acceleration may differ from gravity
+
+WORDS = {
+    "gyro": r"gyro(scope)?|gyr|gyros|omega|w|g|angular_?velocity|ang_?vel|rotation_?rate|rate|w_rs_s",
+    "accel": r"accel(eration|erometer)?|acce?|a|linear_?acceleration|specific_?force|a_rs_s",
+}
+ROS_WORDS = r"angular_?velocity|linear_?acceleration"  # fields of ROS messages, which are in SI units
+TIME_WORDS = (
+    r"(time|timestamp|time_?stamp|t|ts|stamp|seconds|seconds_?elapsed|sec|epoch|rosbagtimestamp|time_?(s|ms|us|ns|sec))"
+)
+UNITS = {
+    "rad/s": r"rad ?/ ?s|rads|rad s\^?-1|rad/sec|rps",
+    "deg/s": r"deg ?/ ?s|dps|degs|°/s|deg/sec|deg s\^?-1",
+    "m/s^2": r"m/s(\^|\*\*)?2|m/s²|mps2|ms2|m s\^?-2",
+    "mg": r"mg",
+    "g": r"g",
+    "ns": r"ns|nanoseconds?|nsec",
+    "us": r"us|µs|microseconds?|usec",
+    "ms": r"ms|milliseconds?|msec",
+    "s": r"s|sec|seconds?",
+}
+
+
+class TableMap(msgspec.Struct, forbid_unknown_fields=True, kw_only=True):
+    """Map of a table's columns; a column named `-ax` counts with the opposite sign."""
+
+    time: str
+    time_unit: str
+    gyro: list[str]
+    gyro_unit: str
+    accel: list[str]
+    accel_unit: str
+    accel_time: str = ""
+    gyro_scale: float | list[float] = 1.0
+    gyro_offset: float | list[float] = 0.0
+    accel_scale: float | list[float] = 1.0
+    accel_offset: float | list[float] = 0.0
+    topic: str = "/imu0"
+    truth_file: str = ""
+    truth_time: str = ""
+    position: list[str] = []
+    quaternion_wxyz: list[str] = []
+    rotation_matrix: str = ""
+
+
+def read_map(path: Path) -> TableMap:
+    """Map in a TOML file.
+
+    Raises:
+        ConfigError: unreadable, no TOML, a missing or unknown entry, or an unknown unit.
+    """
+    try:
+        table = msgspec.convert(tomllib.loads(path.read_text(encoding="utf-8")), TableMap)
+    except OSError as error:
+        raise ConfigError(f"cannot be read ({error.strerror})", where=path) from error
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError, msgspec.ValidationError) as error:
+        raise ConfigError(f"is no map of a table ({error})", where=path) from error
+    for name, units in (("time", TIME_NS), ("gyro", GYRO_SI), ("accel", ACCEL_SI)):
+        if (unit := getattr(table, f"{name}_unit")) not in units:
+            raise ConfigError(f"{name}_unit is {unit!r}", where=path, expected=f"one of {', '.join(units)}")
+    for name in ("gyro", "accel"):
+        if len(getattr(table, name)) != 3:
+            raise ConfigError(f"{name} names {len(getattr(table, name))} columns", where=path, expected="three: x, y, z")
+    return table
+
+
+class Proposal(msgspec.Struct):
+    """Map as far as a table shows it, what is open, and why."""
+
+    entries: dict[str, str | list[str]]
+    open: list[str]
+    reasons: list[str]
+
+    def toml(self) -> str:
+        """The proposal as a map file, with a question behind what is open."""
+        lines = []
+        for name in ("time", "time_unit", "gyro", "gyro_unit", "accel", "accel_unit"):
+            value = self.entries.get(name, ["?", "?", "?"] if name in ("gyro", "accel") else "?")
+            text = f'"{value}"' if isinstance(value, str) else "[" + ", ".join(f'"{part}"' for part in value) + "]"
+            choice = {"time_unit": TIME_NS, "gyro_unit": GYRO_SI, "accel_unit": ACCEL_SI}.get(name, {})
+            asked = f"  # please state: {' or '.join(choice) or 'the columns'}" if name in self.open else ""
+            lines.append(f"{name} = {text}{asked}")
+        lines.append(
+            "# raw counts: gyro_offset, gyro_scale, accel_offset, accel_scale give (count - offset) * scale in the unit"
+        )
+        return "\n".join(lines)
+
+
+def propose(columns: Columns) -> Proposal:
+    """Map that names, units and magnitudes of the columns suggest."""
+    proposal = Proposal({}, [], [])
+    names = {column: _split(column) for column in columns.values}
+    for sensor, units in (("gyro", GYRO_SI), ("accel", ACCEL_SI)):
+        _propose_sensor(proposal, sensor, units, names, columns)
+    _propose_time(proposal, names, columns)
+    return proposal
+
+
+def _split(column: str) -> tuple[str, str]:
+    """Name in lower case with underscores, and the unit in brackets or at the end."""
+    text = column.strip().lower()
+    bracket = re.search(r"[\[(]([^\])]*[a-zµ°][^\])]*)[\])]\s*$", text)
+    unit = next((u for u, p in UNITS.items() if bracket and re.fullmatch(p, bracket[1].strip())), "")
+    if bracket:
+        text = text[: bracket.start()]
+    name = re.sub(r"[^a-z0-9]+", "_", text).strip("_")
+    if not unit and (end := re.search(r"_(dps|rads|degs|mps2|ms2|mg|g|ns|us|ms|s|sec)$", name)):
+        unit = next(u for u, p in UNITS.items() if re.fullmatch(p, end[1]))
+        name = name[: end.start()]
+    return name, unit
+
+
+def _propose_sensor(
+    proposal: Proposal, sensor: str, units: dict[str, float], names: dict[str, tuple[str, str]], columns: Columns
+) -> None:
+    """Columns of the three axes, and their unit."""
+    groups: dict[str, dict[str, str]] = {}
+    for column, (name, _) in names.items():
+        axis = re.fullmatch(rf"((?:.*_)?({WORDS[sensor]}))_?([xyz012])", name)
+        if axis:
+            groups.setdefault(axis[1], {})[axis[axis.lastindex or 0].translate(str.maketrans("012", "xyz"))] = column
+    whole = [group for group in groups.values() if set(group) == set("xyz")]
+    if len(whole) != 1:
+        proposal.open += [sensor, f"{sensor}_unit"]
+        proposal.reasons.append(f"{len(whole)} triples of columns look like the {sensor}")
+        return
+    chosen = [whole[0][axis] for axis in "xyz"]
+    proposal.entries[sensor] = chosen
+    stated = {names[column][1] for column in chosen} - {""}
+    if len(stated) == 1 and stated <= units.keys():
+        proposal.entries[f"{sensor}_unit"] = stated.pop()
+    elif re.search(ROS_WORDS, names[chosen[0]][0]):
+        proposal.entries[f"{sensor}_unit"] = next(iter(units))
+    else:
+        _propose_unit(proposal, sensor, np.stack([columns.values[c].astype(float) for c in chosen], axis=1))
+
+
+def _propose_unit(proposal: Proposal, sensor: str, values: np.ndarray) -> None:
+    """Unit from the magnitude: gravity shows that of an accelerometer; nothing shows that of a gyro."""
+    if sensor == "accel":
+        level = float(np.nanmedian(np.linalg.norm(values, axis=1)))
+        for unit, size in ACCEL_SI.items():
+            if abs(level * size / STANDARD_GRAVITY - 1.0) < GRAVITY_BAND:
+                proposal.entries["accel_unit"] = unit
+                proposal.reasons.append(f"the median acceleration is {level:.4g}: gravity in {unit}")
+                return
+    proposal.open.append(f"{sensor}_unit")
+    proposal.reasons.append(f"the names of the columns state no unit of the {sensor}, and its values show none")
+
+
+def _propose_time(proposal: Proposal, names: dict[str, tuple[str, str]], columns: Columns) -> None:
+    """Column of the time and its unit, from its name or from a plausible rate."""
+    length = len(columns.values[proposal.entries["gyro"][0]]) if "gyro" in proposal.entries else None
+    found = [c for c, (name, _) in names.items() if re.fullmatch(rf"(.*_)?{TIME_WORDS}", name or names[c][1])]
+    found = [c for c in found if length in (None, len(columns.values[c])) and _rises(columns.values[c])]
+    if not found:
+        proposal.open += ["time", "time_unit"]
+        proposal.reasons.append("no column that rises looks like a time")
+        return
+    column = proposal.entries["time"] = found[0]
+    if (unit := names[column][1]) in TIME_NS:
+        proposal.entries["time_unit"] = unit
+        return
+    values = columns.values[column].astype(float)
+    step = float(np.median(np.diff(values)))
+    plausible = [u for u, size in TIME_NS.items() if PLAUSIBLE_HZ[0] <= 1e9 / (step * size) <= PLAUSIBLE_HZ[1]]
+    epochs = [u for u in plausible if 1e18 < values[0] * TIME_NS[u] < 4e18]  # 2001 to 2096
+    certain = epochs or plausible
+    if len(certain) == 1:
+        proposal.entries["time_unit"] = certain[0]
+        proposal.reasons.append(f"{column!r} counts {certain[0]}: {1e9 / (step * TIME_NS[certain[0]]):.1f} samples a second")
+    else:
+        proposal.open.append("time_unit")
+        proposal.reasons.append(f"{column!r} states no unit, and a step of {step:.4g} fits {' and '.join(certain) or 'none'}")
+
+
+def _rises(values: np.ndarray) -> bool:
+    return len(values) > 1 and float(np.mean(np.diff(values.astype(float)) > 0)) > 0.9

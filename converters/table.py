@@ -1,0 +1,200 @@
+"""Table of any origin: CSV, TSV, Parquet, .npz, MATLAB .mat or HDF5, with a map of its columns.
+
+Columns and units are recognised from their names. What stays open is asked for: the refusal holds a map file to complete.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from decimal import Decimal, InvalidOperation
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float64, Int64
+
+from imutool.errors import ConfigError, DataError
+from imutool.geometry import quaternion
+from imutool.recording import Poses, Scalars, unit_quaternions
+from imutool.recording.message_log import MessageLog, Remarks
+
+from . import Sequence
+from ._files import head, name
+from ._imu_columns import in_order, joined
+from ._table_files import Columns, kind_of, load
+from ._table_map import ACCEL_SI, GYRO_SI, TIME_NS, TableMap, propose, read_map
+
+GENERAL = True
+MOST_SCALARS = 200  # further columns that become topics
+LARGEST_NS = 2**63 - 1
+
+
+def sequences(source: Path) -> list[Sequence]:
+    """The source itself, if it is a table file; tables in folders are not looked for."""
+    if source.is_dir():
+        return []
+    if not source.exists():
+        raise DataError("does not exist", where=source, expected="a file or a folder")
+    return [Sequence(name(source), source)] if kind_of(head(source), source) else []
+
+
+def recognises(sequence: Sequence) -> bool:
+    """Whether a sequence is a table: always, as only tables are listed."""
+    return True
+
+
+def read_sequence(sequence: Sequence, *, images: bool = True, mapping: Path | None = None) -> MessageLog:
+    """Message log of a table, by the map file or by the names of its columns.
+
+    Raises:
+        ConfigError: the columns leave something open, a map names columns that do not exist, or a library is missing.
+        DataError: the file cannot be read.
+    """
+    path = sequence.path
+    columns = load(path, kind_of(head(path), path))
+    remarks = Remarks(notes=list(columns.notes))
+    table = _proposed(columns, path, remarks) if mapping is None else read_map(mapping)
+    place = path if mapping is None else mapping
+    gyro_ns = _times(columns, table.time, table.time_unit, place)
+    accel_ns = _times(columns, table.accel_time, table.time_unit, place) if table.accel_time else gyro_ns
+    gyro = _vectors(columns, table.gyro, table.gyro_scale, table.gyro_offset, place) * GYRO_SI[table.gyro_unit]
+    accel = _vectors(columns, table.accel, table.accel_scale, table.accel_offset, place) * ACCEL_SI[table.accel_unit]
+    for label, t_ns, values in (("gyro", gyro_ns, gyro), ("accel", accel_ns, accel)):
+        if len(t_ns) != len(values):
+            raise ConfigError(f"the {label} has {len(values)} rows and its time {len(t_ns)}", where=place, expected="as many")
+    imu, notes = joined(gyro_ns, gyro, accel_ns, accel, table.topic)
+    remarks.notes.extend(notes)
+    used = {table.time, table.accel_time, *(c.removeprefix("-") for c in (*table.gyro, *table.accel))}
+    poses = _truth(columns, table, path, place, remarks)
+    return MessageLog(
+        sequence.name,
+        path.name,
+        imus={table.topic: imu},
+        poses=poses,
+        kinds=dict.fromkeys(poses, "truth"),
+        scalars=_scalars(columns, used, gyro_ns, remarks),
+        metadata={"imutool": {"format": "table", "sequence": sequence.name}, "imutool/map": _described(table)},
+        remarks=remarks,
+    )
+
+
+def read(source: Path) -> Iterator[MessageLog]:
+    """Message log of the source."""
+    return map(read_sequence, sequences(source))
+
+
+def _proposed(columns: Columns, path: Path, remarks: Remarks) -> TableMap:
+    """Map from the columns' names.
+
+    Raises:
+        ConfigError: something is open; the message holds a map file to complete.
+    """
+    proposal = propose(columns)
+    if proposal.open:
+        shown = ", ".join(list(columns.values)[:40])
+        raise ConfigError(
+            f"the meaning of its columns is not certain: {'; '.join(proposal.reasons)}. Its columns are {shown}",
+            where=path,
+            fix=f"Complete this file and give it as `mapping`:\n\n{proposal.toml()}",
+        )
+    entries = dict(proposal.entries)
+    remarks.notes.append(
+        "columns: "
+        + ", ".join(f"{key} = {value if isinstance(value, str) else '/'.join(value)}" for key, value in entries.items())
+    )
+    remarks.notes.extend(proposal.reasons)
+    import msgspec
+
+    return msgspec.convert(entries, TableMap)
+
+
+def _described(table: TableMap) -> dict[str, str]:
+    return {key: str(getattr(table, key)) for key in table.__struct_fields__}
+
+
+def _column(columns: Columns, wanted: str, where: Path) -> np.ndarray:
+    if wanted not in columns.values:
+        raise ConfigError(f"no column {wanted!r}", where=where, expected=f"one of {', '.join(columns.values)}")
+    return columns.values[wanted]
+
+
+def _times(columns: Columns, wanted: str, unit: str, where: Path) -> Int64[np.ndarray, " n"]:
+    """Stamps in nanoseconds; decimals of a text file are exact."""
+    values = _column(columns, wanted, where)
+    size = TIME_NS[unit]
+    if values.dtype.kind in "iu":
+        if len(values) and int(values.max()) > LARGEST_NS // int(size):
+            raise DataError(f"{wanted} reaches {values.max()} {unit}", where=where, expected="a time before the year 2262")
+        return values.astype(np.int64) * int(size)
+    if (texts := columns.texts.get(wanted)) is not None:
+        try:
+            return np.array([int((Decimal(text) * int(size)).to_integral_value()) for text in texts], np.int64)
+        except (InvalidOperation, OverflowError, ValueError):
+            pass
+    if not np.isfinite(values).all() or np.abs(values).max() * size > LARGEST_NS:
+        raise DataError(f"{wanted} holds times that are no numbers, or beyond the year 2262", where=where)
+    return np.rint(values.astype(np.float64) * size).astype(np.int64)
+
+
+def _vectors(
+    columns: Columns, wanted: list[str], scale: float | list[float], offset: float | list[float], where: Path
+) -> Float64[np.ndarray, "n k"]:
+    """Columns side by side, (value - offset) * scale; a name with a minus counts with the opposite sign."""
+    signs = np.array([-1.0 if name.startswith("-") and name not in columns.values else 1.0 for name in wanted])
+    parts = [_column(columns, n if n in columns.values else n.removeprefix("-"), where).astype(np.float64) for n in wanted]
+    if len({len(part) for part in parts}) > 1:
+        raise ConfigError(f"{', '.join(wanted)} have different numbers of rows", where=where)
+    values: Float64[np.ndarray, "n k"] = (np.stack(parts, axis=1) - np.asarray(offset)) * np.asarray(scale) * signs
+    return values
+
+
+def _truth(columns: Columns, table: TableMap, path: Path, where: Path, remarks: Remarks) -> dict[str, Poses]:
+    """True poses, where the map names them: in the table, or in a file beside it."""
+    if not (table.quaternion_wxyz or table.rotation_matrix):
+        return {}
+    if table.truth_file:
+        other = path.parent / table.truth_file
+        if not other.is_file():
+            raise ConfigError(f"truth_file {table.truth_file!r} does not exist", where=where)
+        columns = load(other, kind_of(head(other), other))
+    t_ns = _times(columns, table.truth_time or table.time, table.time_unit, where)
+    if table.quaternion_wxyz:
+        q_wxyz = _vectors(columns, table.quaternion_wxyz, 1.0, 0.0, where)
+    elif table.rotation_matrix in columns.matrices:
+        q_wxyz = _quaternions(columns.matrices[table.rotation_matrix])
+    else:
+        expected = ", ".join(columns.matrices) or "an array of 3 by 3 matrices"
+        raise ConfigError(f"no rotations {table.rotation_matrix!r}", where=where, expected=expected)
+    p = _vectors(columns, table.position, 1.0, 0.0, where) if table.position else np.zeros((len(q_wxyz), 3))
+    if not table.position:
+        remarks.notes.append("the truth has no positions: those of its poses are zero")
+    if not len(t_ns) == len(q_wxyz) == len(p):
+        raise ConfigError(f"the truth has {len(t_ns)} times, {len(q_wxyz)} rotations and {len(p)} positions", where=where)
+    kept = in_order(t_ns, np.concatenate([p, q_wxyz], axis=1), "/ground_truth/pose")
+    remarks.notes.extend(kept.notes)
+    return {"/ground_truth/pose": Poses(kept.t_ns, kept.values[:, :3], unit_quaternions(kept.values[:, 3:]))}
+
+
+def _quaternions(matrices: Float64[np.ndarray, "n 3 3"]) -> Float64[np.ndarray, "n 4"]:
+    """Quaternions of rotation matrices."""
+    from scipy.spatial.transform import Rotation
+
+    return quaternion.unit(Rotation.from_matrix(matrices).as_quat()[:, [3, 0, 1, 2]])
+
+
+def _scalars(columns: Columns, used: set[str], t_ns: Int64[np.ndarray, " n"], remarks: Remarks) -> dict[str, Scalars]:
+    """Further columns of the table as topics, on the IMU's clock."""
+    rest = {c: v for c, v in columns.values.items() if c not in used and len(v) == len(t_ns)}
+    left = [c for c in columns.values if c not in used and c not in rest]
+    if left or len(rest) > MOST_SCALARS:
+        remarks.losses.append(f"columns of another length than the IMU's are left out: {', '.join(left[:20])}")
+    scalars = {}
+    for column, values in list(rest.items())[:MOST_SCALARS]:
+        kept = in_order(t_ns, values.astype(np.float64)[:, None], column)
+        if len(kept.t_ns):
+            unit = re.search(r"[\[(]([^\])]*)[\])]\s*$", column)
+            topic = re.sub(r"[^A-Za-z0-9_]+", "_", column).strip("_") or "column"
+            scalars[f"/{topic if topic[0].isalpha() else f'column_{topic}'}"] = Scalars(
+                kept.t_ns, kept.values, unit[1] if unit else ""
+            )
+    return scalars

@@ -1,0 +1,270 @@
+"""Decide which recording each block of a damaged file belongs to.
+
+One file may hold parts of several logs: each is a recording whose ids mean what its own records say. A block's recording
+follows from the definitions in the block, from a summary that lists it, from the unbroken chain of records to its log's begin,
+and last from what its messages decode as. What stays open is on no topic.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from typing import Any
+
+import numpy as np
+from mcap.opcode import Opcode
+from mcap.records import Channel
+
+from imutool.mcap_io.blocks import MessageBlock
+from imutool.mcap_io.codec import messages
+from imutool.mcap_io.codec.records import HEAD
+from imutool.mcap_io.codec.ros2_definition import decodes
+from imutool.mcap_io.recovery.definitions import ChunkKey, Recording, parsed, same_definition
+from imutool.mcap_io.recovery.losses import Losses
+from imutool.mcap_io.recovery.scan_events import Definition, Event, Gap, LogEnd, LogStart, ScannedBlock
+from imutool.mcap_io.recovery.summary import Summary
+
+CDR_HEADS = (b"\0\0", b"\0\1")  # other payloads are not what the channel says, and tell nothing
+SAMPLES = 4  # messages of a channel that must decode by a definition
+
+
+class Recordings:
+    """Recordings of a file, and which of them each block is of (`MessageBlock.recording`)."""
+
+    def __init__(
+        self, summaries: Sequence[Summary], losses: Losses, found_in: Callable[[MessageBlock], messages.Messages]
+    ) -> None:
+        self.losses, self.found_in = losses, found_in
+        self.each: list[Recording] = []
+        self.unproven: dict[int, dict[int, str]] = {}  # by a block's offset: its channels of which several topics are possible
+        self._current: Recording | None = None
+        self._named: Recording | None = None  # the last one that is not anonymous
+        self._early: list[ScannedBlock] = []  # blocks whose definitions, if any, come behind them
+        self._certain = False  # an unbroken chain of records leads from the definitions of the current one to here
+        for summary in summaries:
+            recording = Recording(summary.base)
+            if summary.chunks:
+                recording.lists = {(e.message_start_time, e.message_end_time, e.uncompressed_size) for e in summary.chunks}
+            definitions = parsed(summary.definitions, summary.base, losses)
+            twice = {key for key, number in Counter((type(d), d.id) for d in _different(definitions)).items() if number > 1}
+            for record in definitions:
+                if (type(record), record.id) not in twice:
+                    recording.define(record, proven=True)
+            for kind, number in sorted(twice, key=str):
+                losses.add_harmless(f"a summary defines {kind.__name__.lower()} {number} twice; neither is used")
+            self.each.append(recording)
+
+    def of(self, block: MessageBlock) -> Recording:
+        """The recording of a block."""
+        return self.each[block.recording]
+
+    def assign(self, events: Sequence[Event]) -> None:
+        """Finds the recording of every block, in file order."""
+        self._complete([event for event in events if isinstance(event, ScannedBlock)])
+        for event in events:
+            if isinstance(event, LogStart):
+                self._begin(event.offset)
+            elif isinstance(event, LogEnd):
+                if self._current is not None:
+                    self._current.ended = True
+                self._certain = False
+            elif isinstance(event, Gap):
+                event.recording = self.each.index(self._now)
+                self._current, self._certain = self._named, False
+            elif isinstance(event, Definition):
+                self._take_definition(event)
+            else:
+                self._assign(event)
+        for found in self._early:
+            self._verify(found, self.of(found.block))
+        self._name_logs([event.block for event in events if isinstance(event, ScannedBlock)])
+
+    def _complete(self, blocks: Sequence[ScannedBlock]) -> None:
+        """Completes what a summary says by what the chunks are that it lists."""
+        keys = {found.key for found in blocks}
+        for recording in self.each:
+            if recording.lists and not recording.lists & keys:  # one field of every entry is wrong; do the others agree?
+                pairs = {pair for key in recording.lists for pair in _pairs(key)}
+                recording.lists = {key for key in keys if not pairs.isdisjoint(_pairs(key))} or recording.lists
+        for found in blocks:  # a summary may leave definitions out; those of the chunks it lists are its own
+            own = parsed(found.definitions, found.block.offset, self.losses)
+            for recording in (r for r in self.each if own and found.key in (r.lists or ()) and r.agrees(own)):
+                for record in own:
+                    recording.define(record, proven=bool(found.crc))
+
+    def _name_logs(self, blocks: Sequence[MessageBlock]) -> None:
+        """Says where the blocks of another log begin."""
+        met: list[Recording] = []
+        for block in blocks:
+            recording = self.of(block)
+            if recording not in met:
+                if any(recording.meaning(i) not in (None, other.meaning(i)) for other in met for i in other.readable()):
+                    self.losses.add_harmless(f"another log begins at byte {block.offset}, or ahead of it")
+                met.append(recording)
+
+    def _assign(self, found: ScannedBlock) -> None:
+        recording = self._choose(found)
+        listed = found.key in (recording.lists or ())
+        known = {record.id for record in parsed(found.definitions, 0, self.losses) if isinstance(record, Channel)}
+        found.evidence = 3 if known >= set(found.block.counts or {}) else 2 if listed else int(self._certain)
+        found.block.recording = self.each.index(recording)
+        self._current = recording
+        self._named = self._named if recording.anonymous else recording
+        if not (found.block.counts or {}).keys() <= recording.readable():
+            self._early.append(found)
+        self._certain = self._certain or found.evidence > 1 or bool(known)
+        if found.evidence > 1:
+            self._adopt(found, recording)
+        else:
+            self._verify(found, recording)
+
+    def _adopt(self, found: ScannedBlock, recording: Recording) -> None:
+        """Notes the sizes of a recording's messages, and a block to compare others with."""
+        for channel, (low, high) in found.sizes.items():
+            least, most = recording.sizes.get(channel, (low, high))
+            recording.sizes[channel] = min(low, least), max(high, most)
+            recording.samples.setdefault(channel, found.block)
+
+    def _verify(self, found: ScannedBlock, recording: Recording) -> None:
+        """Checks that messages of unusual sizes decode; else they are of a log that nothing defines."""
+        unusual = [
+            channel
+            for channel, (low, high) in found.sizes.items()
+            if channel in recording.readable()
+            and not (channel in recording.sizes and recording.sizes[channel][0] <= low <= high <= recording.sizes[channel][1])
+        ]
+        misfits = any(not self._fits(found.block, channel, recording) for channel in unusual)
+        compared = [self._fits(block, channel, recording) for channel, block in recording.samples.items()] if misfits else []
+        if not misfits or (compared and not any(compared)):  # then the definitions never were those of the messages
+            self._adopt(found, recording)
+            return
+        self.losses.add_harmless(f"messages from byte {found.block.offset} on do not fit the definitions before them")
+        self._current = Recording(found.block.offset, anonymous=True)
+        self.each.append(self._current)
+        found.block.recording = len(self.each) - 1
+        self.unproven.pop(found.block.offset, None)
+
+    @property
+    def _now(self) -> Recording:
+        return self._current or self.each[-1]
+
+    def _begin(self, start: int) -> None:
+        """Begins the log whose Header stands at a byte."""
+        self._current = self._named = Recording(start)
+        self._certain = True
+        self.each.append(self._current)
+
+    def _take_definition(self, found: Definition) -> None:
+        """Takes in a definition outside chunks, unless it contradicts an earlier one."""
+        for record in parsed([(found.opcode, found.body)], found.offset, self.losses):
+            if not self._now.agrees([record]):
+                what = f"{type(record).__name__.lower()} {record.id} has two definitions, the second at byte {found.offset}"
+                key = int(found.opcode), record.id
+                self.losses.add_harmless(
+                    f"{what}; {'the one that a CRC covers' if key in self._now.proven else 'the first'} holds"
+                )
+            else:
+                self._now.define(record, proven=False)
+
+    def _choose(self, found: ScannedBlock) -> Recording:
+        """The recording of a block, which may be a new one."""
+        own = parsed(found.definitions, found.block.offset, self.losses) if found.definitions else []
+        rest = set(found.block.counts or {}) - {record.id for record in own if isinstance(record, Channel)}
+        agreeing = [r for r in (self._now, *self.each) if r.agrees(own)]
+        listed = [r for r in agreeing if r.lists and found.key in r.lists]
+        if not agreeing:
+            chosen = self._new(found.block.offset)
+        elif own and not rest:
+            chosen = (listed or agreeing)[0]
+        else:
+            chosen = self._among(found, rest, [r for r in listed if rest <= r.readable()] or agreeing)
+        for record in own:
+            chosen.define(record, proven=bool(found.crc))
+        return chosen
+
+    def _fits(self, block: MessageBlock, channel: int, recording: Recording) -> bool:
+        """Whether messages of a channel decode by the recording's definition; True if unknown."""
+        known = recording.channels.get(channel)
+        schema = recording.schemas.get(known.schema_id) if known else None
+        if known is None or schema is None or (schema.encoding, known.message_encoding) != ("ros2msg", "cdr"):
+            return True
+        found = self.found_in(block)
+        chosen = np.flatnonzero(found.heads["channel"] == channel)[:SAMPLES].tolist()
+        sizes = found.heads["length"].astype(np.int64) + HEAD.size
+        payloads = [found.data[found.offsets[i] + messages.MESSAGE.itemsize : found.offsets[i] + sizes[i]] for i in chosen]
+        plain = [raw for payload in payloads if (raw := payload.tobytes())[:2] in CDR_HEADS]
+        return all(decodes(raw, schema.name, schema.data) for raw in plain)
+
+    def drop_copies(self, blocks: Sequence[ScannedBlock]) -> None:
+        """Keeps of equal chunks the one whose recording is best known."""
+        kept: dict[object, ScannedBlock] = {}
+        for found in blocks:
+            if found.block.compression is None or not found.block.counts:
+                continue
+            before = kept.setdefault((found.key, found.crc), found)
+            if before is not found and self._same_contents(before, found):
+                better, worse = sorted((before, found), key=self._evidence, reverse=True)
+                kept[found.key, found.crc], worse.block.lost = better, True
+                self.losses.add_harmless(
+                    f"the chunk at byte {worse.block.offset} repeats the one at byte {better.block.offset}"
+                )
+
+    def _same_contents(self, a: ScannedBlock, b: ScannedBlock) -> bool:
+        return self.found_in(a.block).data.tobytes() == self.found_in(b.block).data.tobytes()
+
+    def _evidence(self, found: ScannedBlock) -> tuple[bool, int]:
+        """How well it is known what the messages of a block are."""
+        readable = self.of(found.block).readable()
+        unproven = self.unproven.get(found.block.offset, {})
+        return (found.block.counts or {}).keys() <= readable - unproven.keys(), found.evidence
+
+    def _new(self, start: int) -> Recording:
+        self.each.append(Recording(start))
+        return self.each[-1]
+
+    def _among(self, found: ScannedBlock, used: set[int], pool: Sequence[Recording]) -> Recording:
+        """The recording of a block that does not define all of its ids itself."""
+        pool = list({id(r): r for r in pool}.values())
+        unlisted = [r for r in pool if r.lists is None or found.key in r.lists]
+        if (self._certain or self._now.anonymous) and self._now in unlisted:
+            return self._now
+        for narrower in (
+            unlisted,
+            [r for r in pool if used <= r.readable()],
+            [r for r in pool if not r.ended],
+            [r for r in pool if r.start <= found.block.offset],
+        ):
+            pool = [r for r in pool if r in narrower] or pool
+        open_ids = {i for i in used if len(_topics(i, pool)) > 1}
+        chained = self._certain and used <= self._now.readable()
+        if chained and not any(used <= r.readable() for r in pool):
+            return self._now
+        if self._certain and self._now in pool:
+            return self._now
+        if not open_ids:  # of two definitions of one topic the proven holds
+            return max(pool, key=lambda r: sum((int(Opcode.CHANNEL), i) in r.proven for i in used))
+        fitting = [r for r in pool if all(self._fits(found.block, i, r) for i in open_ids)]
+        pool = fitting or pool
+        if still := {i: " or ".join(sorted(topics)) for i in open_ids if len(topics := _topics(i, pool)) > 1}:
+            self.unproven[found.block.offset] = still
+        return pool[0]
+
+
+def _topics(channel: int, pool: Iterable[Recording]) -> set[str]:
+    """The topics that a channel id has in some recordings."""
+    return {recording.channels[channel].topic for recording in pool if recording.meaning(channel) is not None}
+
+
+def _pairs(key: ChunkKey) -> tuple[object, ...]:
+    """Any two fields of a key, by which it is known again when one is wrong."""
+    start_ns, end_ns, size = key
+    return (0, start_ns, end_ns), (1, start_ns, size), (2, end_ns, size)
+
+
+def _different(definitions: Iterable[Any]) -> Iterator[Any]:
+    """Definitions without repetitions."""
+    seen: list[Any] = []
+    for record in definitions:
+        if not any(type(other) is type(record) and other.id == record.id and same_definition(other, record) for other in seen):
+            seen.append(record)
+            yield record

@@ -1,0 +1,124 @@
+"""Importer of MCAP logs with an IMU that Rerun finds on PATH: `rerun log.imu` shows what `imutool view` shows.
+
+Rerun runs every program on PATH whose name begins with `rerun-importer-`, and reads an .rrd from its standard output. It does
+so only for suffixes that it does not read itself, up to 0.41 not for .mcap: there the log needs a link of another name.
+https://rerun.io/docs/concepts/logging-and-ingestion/importers/overview
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple, NoReturn
+
+if TYPE_CHECKING:
+    from imutool.mcap_io.log import Log
+    from imutool.viewing.model.run_data import RunData
+
+INCOMPATIBLE = 66  # exit code by which Rerun knows that a file is not this importer's
+MAGIC = b"\x89MCAP0\r\n"  # a log begins with it, whatever its name
+METADATA = "imutool"  # record with the sensor of a converted log
+
+
+class Target(NamedTuple):
+    """Recording that Rerun proposes: its application, its id, and the entity below which to log."""
+
+    application: str | None = None
+    recording: str | None = None
+    prefix: str = ""
+
+
+def main() -> NoReturn:
+    """Write the .rrd of a log with an IMU to standard output; exit code 66 and no output for any other file."""
+    parser = argparse.ArgumentParser(prog="rerun-importer-imutool", description=__doc__)
+    parser.add_argument("file", type=Path)
+    parser.add_argument("--application-id")
+    parser.add_argument("--recording-id")
+    parser.add_argument("--entity-path-prefix", default="")
+    given, _ = parser.parse_known_args()
+    if not _is_mcap(given.file):  # before anything heavy is imported
+        sys.exit(INCOMPATIBLE)
+    from imutool.errors import ImutoolError
+
+    try:
+        content = rrd(given.file, Target(given.application_id, given.recording_id, given.entity_path_prefix))
+    except ImutoolError as error:
+        print(f"imutool: {error}", file=sys.stderr)
+        sys.exit(error.exit_code)
+    if content is None:
+        sys.exit(INCOMPATIBLE)
+    sys.stdout.buffer.write(content)
+    sys.exit(0)
+
+
+def rrd(path: Path, target: Target | None = None) -> bytes | None:
+    """Content of the .rrd for a log, for the recording that Rerun proposes; None without an IMU.
+
+    The log's own debiased channels are shown; without any, the model that ships for its sensor is applied, else raw is alone.
+
+    Raises:
+        ConfigError: Rerun is not installed, or the file cannot be opened.
+        LogError, DataError: nothing in the log is sound, or its IMU has fewer than two samples.
+    """
+    data = _load(path)
+    if data is None:
+        return None
+    from imutool.viewing.rerun import layout, scene, sdk
+
+    target = target or Target()
+    root = tuple(part for part in target.prefix.split("/") if part)
+    recording = sdk.new_stream(data.name, application=target.application, recording=target.recording)
+    import rerun as rr
+
+    written = rr.binary_stream(recording)
+    recording.send_blueprint(layout.blueprint([data], root=root))
+    scene.log([data], recording, root=root)
+    return written.read(flush_timeout_sec=sdk.FLUSH_S)
+
+
+def _is_mcap(path: Path) -> bool:
+    """Whether a file begins like an MCAP log."""
+    try:
+        with path.open("rb") as file:
+            return file.read(len(MAGIC)) == MAGIC
+    except OSError:
+        return False
+
+
+def _load(path: Path) -> RunData | None:
+    """Data of the first IMU of a log; None without an IMU."""
+    from imutool.errors import LogError
+    from imutool.mcap_io.log import Log
+    from imutool.mcap_io.recovery.recovered_log import RecoveredLog
+
+    try:
+        with Log(path) as log:
+            imu, model = _imu_and_model(log)
+    except LogError:
+        with RecoveredLog(path) as log:
+            imu, model = _imu_and_model(log)
+    if imu is None:
+        return None
+    from imutool.viewing.model.runs import load
+
+    return load(path, models=() if model is None else [model], imu=imu)
+
+
+def _imu_and_model(log: Log) -> tuple[str | None, str | None]:
+    """First IMU topic, and the model that ships for its sensor where the log holds no debiased channel of it."""
+    from imutool.bias.io import shipped_for
+    from imutool.mcap_io.codec import schemas
+    from imutool.mcap_io.topics import DERIVED_KEY
+
+    if not log.imu_topics:
+        return None, None
+    imu = log.imu_topics[0]
+    if any(topic.metadata.get(DERIVED_KEY) == imu for topic in log.with_schema((schemas.IMU,))):
+        return imu, None
+    about = dict(log.metadata_records()).get(METADATA, {})
+    return imu, shipped_for(about.get("sensor"), about.get("dataset"))
+
+
+if __name__ == "__main__":
+    main()

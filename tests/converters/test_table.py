@@ -1,0 +1,223 @@
+"""Tables of any origin: columns and units from their names, the rest from a map file, in every file format."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from imutool.converters import table
+from imutool.mcap_io.read import read
+
+RNG = np.random.default_rng(5)
+COUNT = 600
+T_NS = 1_600_000_000_000_000_123 + np.arange(COUNT) * 5_000_000
+GYRO = RNG.normal(0, 0.003, (COUNT, 3))
+ACCEL = RNG.normal(0, 0.02, (COUNT, 3)) + np.array([0.0, 0.0, 9.81])
+G = 9.80665
+CERTAIN = ["timestamp [ns]", *(f"gyro_{a} [rad/s]" for a in "xyz"), *(f"accel_{a} [m/s^2]" for a in "xyz")]
+
+
+def write_csv(path: Path, names: list[str], columns: list[np.ndarray], mark: str = ",") -> Path:
+    rows = [mark.join(map(repr, row)) for row in zip(*(c.tolist() for c in columns), strict=True)]
+    path.write_text("\n".join([mark.join(names), *rows]) + "\n")
+    return path
+
+
+def arrays(gyro: np.ndarray = GYRO, accel: np.ndarray = ACCEL, t: np.ndarray = T_NS) -> list[np.ndarray]:
+    return [t, *gyro.T, *accel.T]
+
+
+def same(log: Path, tolerance: float = 0.0) -> None:
+    imu = read(log).imu
+    assert np.array_equal(imu.t_ns, T_NS)
+    np.testing.assert_allclose(imu.gyro, GYRO, rtol=tolerance)
+    np.testing.assert_allclose(imu.accel, ACCEL, rtol=tolerance)
+
+
+HEADERS = {
+    "units in brackets": (CERTAIN, 1.0, 1.0),
+    "degrees and g": (
+        ["time (ns)", *(f"Gyroscope {a} (deg/s)" for a in "XYZ"), *(f"Accelerometer {a} (g)" for a in "XYZ")],
+        np.pi / 180,
+        G,
+    ),
+    "units at the end": (["t_ns", *(f"w{a}_dps" for a in "xyz"), *(f"acc_{a}_mg" for a in "xyz")], np.pi / 180, G / 1000),
+    "fields of ROS": (
+        [
+            "rosbagTimestamp",
+            *(f"field.angular_velocity.{a}" for a in "xyz"),
+            *(f"field.linear_acceleration.{a}" for a in "xyz"),
+        ],
+        1.0,
+        1.0,
+    ),
+    "gravity shows the unit": (["timestamp", *(f"gyro_{a}_rads" for a in "xyz"), "ax", "ay", "az"], 1.0, 1.0),
+}
+
+
+@pytest.mark.parametrize("header", HEADERS)
+def test_names_and_units_are_recognised(convert, tmp_path, header):
+    names, gyro_size, accel_size = HEADERS[header]
+    path = write_csv(tmp_path / "log.csv", names, arrays(GYRO / gyro_size, ACCEL / accel_size))
+    done = convert(path, tmp_path / "out.mcap")
+    assert done.returncode == 0, done.stderr
+    assert "columns: " in done.stderr  # what was recognised is shown
+    same(tmp_path / "out.mcap", 1e-12)
+
+
+def test_seconds_in_decimals_are_exact_and_further_columns_become_topics(convert, tmp_path):
+    names = ["time [s]", *CERTAIN[1:], "temperature [degC]"]
+    path = write_csv(tmp_path / "log.tsv", names, [*arrays(), np.full(COUNT, 25.5)], "\t")
+    for exact, rounded in ((f"{t // 10**9}.{t % 10**9:09d}", str(t)) for t in T_NS.tolist()):
+        path.write_text(path.read_text().replace(rounded, exact, 1))
+    assert convert(path, tmp_path / "out.mcap").returncode == 0
+    same(tmp_path / "out.mcap")
+    temperature = read(tmp_path / "out.mcap").scalars["/temperature_degC"]
+    assert (temperature.unit, temperature.values[9, 0]) == ("degC", 25.5)
+
+
+def test_what_is_in_doubt_is_asked_for_and_the_answer_settles_it(convert, imutool, tmp_path):
+    names = ["t", "gx", "gy", "gz", "ax", "ay", "az"]
+    path = write_csv(tmp_path / "log.csv", names, arrays(GYRO * 180 / np.pi))
+    done = convert(path, tmp_path / "out.mcap")
+    assert done.returncode == 3
+    assert "state no unit of the gyro" in done.stderr
+    assert "--map" in done.stderr
+    proposed = done.stderr.partition("\n\n")[2]
+    assert re.search(r'gyro_unit = "\?"  # please state: rad/s or deg/s', proposed)
+    (tmp_path / "map.toml").write_text(proposed.replace('gyro_unit = "?"', 'gyro_unit = "deg/s"'))
+    assert convert(path, tmp_path / "out.mcap", "--map", tmp_path / "map.toml").returncode == 0
+    same(tmp_path / "out.mcap", 1e-12)
+    assert imutool("debias", "out.mcap", "d.mcap", cwd=tmp_path).returncode == 0  # three commands, no Python
+
+
+def test_raw_counts_get_their_scale_from_the_map(convert, tmp_path):
+    counts = np.rint(np.column_stack([GYRO * 10_000 + 512, ACCEL * 20 + 300])).astype(np.int64)
+    np.savez(tmp_path / "raw.npz", ts=T_NS / 1e9 - 1.6e9, vals=counts.T.astype(np.uint16))
+    (tmp_path / "map.toml").write_text(
+        'time = "ts"\ntime_unit = "s"\ngyro = ["vals[0]", "-vals[1]", "vals[2]"]\ngyro_unit = "rad/s"\ngyro_offset = 512\n'
+        'gyro_scale = 0.0001\naccel = ["vals[3]", "vals[4]", "vals[5]"]\naccel_unit = "m/s^2"\naccel_scale = 0.05\n'
+        "accel_offset = [300.0, 300.0, 300.0]\n"
+    )
+    assert convert(tmp_path / "raw.npz", tmp_path / "out.mcap", "--map", tmp_path / "map.toml").returncode == 0
+    imu = read(tmp_path / "out.mcap").imu
+    np.testing.assert_allclose(imu.gyro, GYRO * [1, -1, 1], atol=0.00006)
+    np.testing.assert_allclose(imu.accel, ACCEL, atol=0.03)
+
+
+def as_npz(path: Path) -> None:
+    np.savez(path, **dict(zip(CERTAIN, arrays(), strict=True)))
+
+
+def as_parquet(path: Path) -> None:
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    pq.write_table(pa.table(dict(zip(CERTAIN, arrays(), strict=True))), path)
+
+
+def as_mat(path: Path) -> None:
+    from scipy.io import savemat
+
+    with path.open("wb") as file:
+        savemat(file, {"time_ns": T_NS, "angular_velocity": GYRO, "linear_acceleration": ACCEL.T})
+
+
+def as_hdf5(path: Path) -> None:
+    import h5py
+
+    with h5py.File(path, "w") as file:
+        file["imu/time_ns"], file["imu/angular_velocity"], file["imu/linear_acceleration"] = T_NS, GYRO, ACCEL
+
+
+@pytest.mark.parametrize("write", [as_npz, as_parquet, as_mat, as_hdf5])
+def test_every_file_format_gives_the_same_imu(convert, tmp_path, write):
+    with (tmp_path / "recording").open("wb"):
+        pass
+    write(tmp_path / ("recording.npz" if write is as_npz else "recording"))
+    source = tmp_path / ("recording.npz" if write is as_npz else "recording")
+    done = convert(source, tmp_path / "out.mcap")
+    assert done.returncode == 0, done.stderr
+    same(tmp_path / "out.mcap")
+
+
+def test_decimal_commas_are_read_and_named(convert, tmp_path):
+    path = write_csv(tmp_path / "log.csv", CERTAIN, arrays(), ";")
+    path.write_text(path.read_text().replace(".", ","))
+    done = convert(path, tmp_path / "out.mcap")
+    assert done.returncode == 0, done.stderr
+    assert "decimal commas are read as points" in done.stderr
+    same(tmp_path / "out.mcap")
+
+
+def test_an_hdf5_file_that_leads_to_another_file_is_refused(convert, tmp_path):
+    import h5py
+
+    as_hdf5(tmp_path / "other.h5")
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file["time_ns"] = T_NS
+        file.create_dataset("gyro", (COUNT, 3), "f8", external=[("/etc/hostname", 0, COUNT * 24)])
+        file["accel"] = h5py.ExternalLink("other.h5", "imu/linear_acceleration")
+    done = convert(tmp_path / "a.h5", tmp_path / "out.mcap")
+    assert done.returncode == 4
+    assert "gyro lies in another file" in done.stderr
+
+
+@pytest.mark.parametrize("start", [b"PAR1", b"\x89HDF\r\n\x1a\n", b"MATLAB 5.0 MAT-file, made up"])
+def test_damaged_files_are_refused_in_one_sentence(convert, tmp_path, start):
+    (tmp_path / "a").write_bytes(start + bytes(600))
+    done = convert(tmp_path / "a", tmp_path / "out.mcap")
+    assert done.returncode == 4
+    assert "Traceback" not in done.stderr
+
+
+def test_a_map_with_an_unknown_column_or_unit_says_which_exist(convert, tmp_path):
+    path = write_csv(tmp_path / "log.csv", CERTAIN, arrays())
+    text = (
+        'time = "t"\ntime_unit = "ns"\ngyro = ["a", "b", "c"]\ngyro_unit = "rad/s"\naccel = ["a", "b", "c"]\naccel_unit = "g"\n'
+    )
+    for broken, said in ((text, "no column 't'"), (text.replace('"ns"', '"hours"'), "expected one of s, ms, us, ns")):
+        (tmp_path / "map.toml").write_text(broken)
+        done = convert(path, tmp_path / "out.mcap", "--map", tmp_path / "map.toml")
+        assert done.returncode == 3
+        assert said in done.stderr
+
+
+def test_two_sensors_at_two_rates_become_one_imu(convert, tmp_path):
+    t_a = T_NS[0] + np.arange(200) * 17_000_000
+    slow = np.column_stack([np.zeros(200), np.zeros(200), 9.81 + (t_a - T_NS[0]) * 1e-9])
+    np.savez(tmp_path / "a.npz", t=T_NS, g=GYRO, ta=t_a, a=slow)
+    (tmp_path / "map.toml").write_text(
+        'time = "t"\ntime_unit = "ns"\naccel_time = "ta"\ngyro = ["g[0]", "g[1]", "g[2]"]\ngyro_unit = "rad/s"\n'
+        'accel = ["a[0]", "a[1]", "a[2]"]\naccel_unit = "m/s^2"\n'
+    )
+    done = convert(tmp_path / "a.npz", tmp_path / "out.mcap", "--map", tmp_path / "map.toml")
+    assert done.returncode == 0, done.stderr
+    assert "gyro at 200.0 Hz and accelerometer at 58.8 Hz became one IMU" in done.stderr
+    imu = read(tmp_path / "out.mcap").imu
+    np.testing.assert_allclose(imu.accel[:, 2], 9.81 + (imu.t_ns - T_NS[0]) * 1e-9, atol=1e-9)
+
+
+def test_text_without_numbers_is_no_table(tmp_path):
+    (tmp_path / "notes.txt").write_text("a, b, c, d\nthis, is, no, table\n")
+    assert table.sequences(tmp_path / "notes.txt") == []
+    assert table.sequences(tmp_path) == []
+
+
+def test_the_public_raw_counts_with_motion_capture(convert, tmp_path, data):
+    folder = data / "outside" / "upenn_vicon"
+    assert convert(folder / "imuRaw1.mat", tmp_path / "out.mcap").returncode == 3  # counts: asked for
+    (tmp_path / "map.toml").write_text(
+        'time = "ts"\ntime_unit = "s"\ngyro = ["vals[4]", "vals[5]", "vals[3]"]\ngyro_unit = "rad/s"\n'
+        "gyro_offset = [373.6, 375.2, 369.7]\ngyro_scale = 0.01745\n"
+        'accel = ["-vals[0]", "-vals[1]", "vals[2]"]\naccel_unit = "g"\n'
+        "accel_offset = [511.0, 501.0, 503.0]\naccel_scale = 0.0097\n"
+        f'truth_file = "{folder / "viconRot1.mat"}"\ntruth_time = "ts"\nrotation_matrix = "rots"\n'
+    )
+    assert convert(folder / "imuRaw1.mat", tmp_path / "out.mcap", "--map", tmp_path / "map.toml").returncode == 0
+    recording = read(tmp_path / "out.mcap")
+    assert len(recording.imu) == 5645
+    assert list(recording.truths) == ["/ground_truth/pose"]

@@ -1,0 +1,186 @@
+"""Where a log's index and its records contradict each other, the records that a CRC proves come back, once, on their topics."""
+
+from __future__ import annotations
+
+import os
+import struct
+import zlib
+from collections import Counter
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from support import log_damage
+
+from imutool.errors import LogError
+from imutool.mcap_io.codec.records import HEAD, MAGIC
+from imutool.mcap_io.log import Log
+from imutool.mcap_io.recovery.recovered_log import RecoveredLog
+from imutool.mcap_io.repair import RepairReport, repair
+
+Messages = list[tuple[str, str, int, int, int, bytes]]
+Foreign = Callable[..., Path]
+by_mcap, stretches = log_damage.by_mcap, log_damage.stretches
+
+# Messages that the CRCs of each file's chunks prove: an exhaustive search finds no more; and words of the report
+PROVEN = {
+    "new_log_over_older": (173, "a summary lists 5 chunks that are not in the file"),
+    "index_lengths_wrong": (340, ""),
+    "chunk_behind_damage": (313, "a summary lists 1 chunks that are not in the file"),
+    "two_logs_overlapped": (139, "the chunk at byte 11691 is damaged"),  # 152, of which 13 are there twice
+    "channel_65535": (324, ""),
+}
+
+
+@pytest.mark.parametrize("name", PROVEN)
+def test_of_files_that_were_answered_wrongly_all_proven_messages_come_back(data: Path, tmp_path: Path, name: str) -> None:
+    count, said = PROVEN[name]
+    report = repair(data / "damaged" / f"{name}.mcap", tmp_path / "out.mcap")
+    assert sum(report.messages.values()) == count == len(by_mcap(tmp_path / "out.mcap"))
+    assert not report.whole
+    reasons = [loss.reason for loss in report.losses.entries]
+    assert any(said in reason for reason in reasons) if said else reasons == []
+    times = [m[1] for m in by_mcap(tmp_path / "out.mcap")]
+    assert times == sorted(times)
+
+
+def test_messages_of_the_overlapping_log_stay_on_their_own_topics(data: Path, tmp_path: Path) -> None:
+    report = repair(data / "damaged" / "two_logs_overlapped.mcap", tmp_path / "out.mcap")
+    assert report.messages == {"/imu0": 80, "/pose": 40, "/talk": 16, "/imu1": 3}  # 53 of them were on the other's, once
+
+
+@pytest.fixture
+def log(foreign: Foreign, flight: Messages) -> Path:
+    """A log of some ten chunks with an index."""
+    return foreign(flight, chunk_size=20_000)
+
+
+def saved(path: Path) -> tuple[Counter[object], RepairReport]:
+    target = path.with_name("saved.mcap")
+    report = repair(path, target, overwrite=True)
+    return Counter(by_mcap(target)), report
+
+
+def test_exchanged_chunks_cost_nothing_and_stand_in_order_again(log: Path) -> None:
+    whole, raw = stretches(log), log.read_bytes()
+    (a, b, _), (c, d, _) = whole[2], whole[5]
+    log.write_bytes(raw[:a] + raw[c:d] + raw[b:c] + raw[a:b] + raw[d:])
+    found, report = saved(log)
+    assert found == Counter(m for _, _, each in whole for m in each)
+    assert not report.losses
+    assert any("put in order" in line for line in report.losses.harmless)
+    with Log(log.with_name("saved.mcap")) as after:
+        starts = [block.start_ns for block in after.index.blocks]
+    assert starts == sorted(starts)
+
+
+def test_an_old_index_never_wins_over_the_records(foreign: Foreign, log: Path, flight: Messages) -> None:
+    others = [(f"/other{m[0]}", m[1], m[2] + 10**15, *m[3:]) for m in flight]
+    other = foreign(others, chunk_size=15_000, name="other")
+    raw, newer = log.read_bytes(), other.read_bytes()
+    whole, mine = stretches(other), stretches(log)
+    stop = whole[3][1]  # the new recording's last whole chunk
+    log.write_bytes(newer[:stop] + raw[stop:])
+    found, report = saved(log)
+    theory = [m for _, end, each in whole if end <= stop for m in each] + [
+        m for at, _, each in mine if at >= stop for m in each
+    ]
+    assert found == Counter(theory)
+    assert report.losses
+
+
+def test_a_chunk_that_is_gone_is_lost_though_its_message_indexes_remain(log: Path) -> None:
+    whole, raw = stretches(log), log.read_bytes()
+    start, end, gone = whole[3]
+    log.write_bytes(raw[:start] + raw[end:])
+    found, report = saved(log)
+    assert found == Counter(m for at, _, each in whole if at != start for m in each)
+    assert report.losses.topics == Counter(m[0] for m in gone)
+
+
+def test_a_chunk_that_is_there_twice_is_kept_once(log: Path) -> None:
+    whole, raw = stretches(log), log.read_bytes()
+    start, end, _ = whole[3]
+    log.write_bytes(raw[:end] + raw[start:end] + raw[end:])
+    found, report = saved(log)
+    assert found == Counter(m for _, _, each in whole for m in each)
+    assert any("repeats the one" in line for line in report.losses.harmless)
+
+
+def test_a_chunk_that_begins_inside_the_record_before_it_is_found(log: Path) -> None:
+    whole, raw = stretches(log), log.read_bytes()
+    (_, end, _), (start, _, _) = whole[3], whole[4]
+    log.write_bytes(raw[: end + 20] + raw[start:])  # the first message index goes over into the next chunk
+    found, _ = saved(log)
+    assert found == Counter(m for _, _, each in whole for m in each)
+
+
+def test_messages_whose_topic_nothing_proves_are_on_none(foreign: Foreign, flight: Messages) -> None:
+    imu = [m for m in flight if m[0] == "/imu/data"]
+    first = foreign(imu[:300], "no-summary", chunk_size=20_000, name="first")
+    second = foreign([("/other", *m[1:]) for m in imu[300:600]], "no-summary", chunk_size=20_000, name="second")
+    a, b, raw = stretches(first), stretches(second), first.read_bytes()
+    hole = b[0][1]
+    cut = second.read_bytes()[:hole] + os.urandom(50)
+    first.write_bytes(raw[: a[2][1]] + cut + raw[a[3][0] :])  # behind the hole: of which of the two?
+    found, report = saved(first)
+    assert found == Counter([m for _, _, each in a[:3] for m in each] + b[0][2])
+    assert report.losses.unproven == sum(len(each) for _, _, each in a[3:])
+    assert "(/imu/data or /other)" in report.losses.topics
+
+
+def test_a_log_with_the_largest_channel_id_is_joined_to_another(foreign: Foreign, flight: Messages) -> None:
+    first = foreign(flight[:60], "no-summary", name="first")
+    second = foreign([(f"/b{m[0]}", *m[1:]) for m in flight[:60]], "no-summary", name="second")
+    raw = bytearray(first.read_bytes())
+    top = b"\x04" + struct.pack("<Q", 0)  # a Channel record outside chunks: id 65535, no schema
+    body = struct.pack("<HH", 65535, 0) + struct.pack("<I", 4) + b"/top" + struct.pack("<I", 4) + b"json" + struct.pack("<I", 0)
+    record = top[:1] + struct.pack("<Q", len(body)) + body
+    header = len(MAGIC) + HEAD.size + HEAD.unpack_from(raw, len(MAGIC))[1]
+    first.write_bytes(bytes(raw[:header]) + record + bytes(raw[header:]) + second.read_bytes())
+    found, _ = saved(first)
+    assert {m[0] for m in found} == {m[0] for m in flight[:60]} | {f"/b{m[0]}" for m in flight[:60]}
+
+
+# ── bounds ───────────────────────────────────────────────────────────────────────────────────────────────────────────
+
+
+def test_chunks_above_the_bound_are_refused_and_said(log: Path, imutool: Callable[..., object]) -> None:
+    report = repair(log, log.with_name("all.mcap"))
+    assert report.whole
+    done = imutool("repair", log.name, "few.mcap", "--max-chunk", "10000", cwd=log.parent)
+    assert done.returncode == 3
+    assert "at most 10000 (--max-chunk)" in done.stdout
+    with pytest.raises(LogError, match="10000"), Log(log, max_chunk=10_000) as opened:
+        opened.check()
+
+
+def test_a_chunk_of_zeros_is_refused_before_it_is_followed(tmp_path: Path) -> None:
+    path, size = tmp_path / "log.mcap", 64 << 20
+    import zstandard
+
+    packed = zstandard.ZstdCompressor().compress(bytes(size))
+    body = struct.pack("<QQQII", 0, 1, size, zlib.crc32(bytes(size)), 4) + b"zstd" + struct.pack("<Q", len(packed)) + packed
+    path.write_bytes(MAGIC + HEAD.pack(1, 8) + bytes(8) + HEAD.pack(6, len(body)) + body)
+    with RecoveredLog(path) as log:
+        assert "opcode 0" in log.losses.entries[0].reason
+
+
+def test_the_data_section_must_end_where_the_summary_begins(foreign: Foreign, flight: Messages) -> None:
+    path = foreign(flight, "no-summary", chunk_size=20_000)
+    raw, whole = path.read_bytes(), stretches(path)
+    path.write_bytes(raw[: whole[3][0]] + HEAD.pack(2, 20) + bytes(20) + raw[whole[3][0] :])
+    with pytest.raises(LogError, match="the data section ends at byte"):
+        Log(path)
+    found, _ = saved(path)
+    assert found == Counter(m for _, _, each in whole for m in each)
+
+
+def test_debias_says_what_no_crc_covers(log: Path, imutool: Callable[..., object]) -> None:
+    raw = bytearray(log.read_bytes())
+    for start, _, _ in stretches(log):
+        raw[start + HEAD.size + 24 : start + HEAD.size + 28] = bytes(4)  # the CRC of the chunk
+    log.write_bytes(raw)
+    done = imutool("debias", log.name, "out.mcap", "--init", "0,0,0,0,0,0", cwd=log.parent)
+    assert done.returncode == 0, done.stderr
+    assert "unchecked: 1180 messages lie where no CRC covers them" in done.stdout
