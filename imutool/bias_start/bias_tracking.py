@@ -53,7 +53,7 @@ def widened(std: Vector6, difference: Vector6, variance: Vector6) -> Vector6:
     """
     out = std.copy()
     for columns in COLUMNS.values():
-        shown = np.isfinite(variance[columns])
+        shown = np.isfinite(variance[columns]) & (std[columns] > 0)  # a prior of zero variance stays
         square = difference[columns][shown] ** 2
         chi_square = (square / (std[columns][shown] ** 2 + variance[columns][shown])).sum()
         if shown.any() and chi_square > CONTRADICTED[shown.sum() - 1]:
