@@ -89,16 +89,7 @@ def solve(
     Raises:
         DataError: a log has no window of that part that is free of gaps.
     """
-    sets = [_some(pool.starts(n, part, hop=max(1, n // 2)), n) for n in map(pool.samples, window_s)]
-    seen = torch.cat([pool.log[first] for first, _ in sets])
-    missing = [name for i, name in enumerate(pool.names) if not bool((seen == i).any())]
-    if missing:
-        where = f"the {part.replace('_', '-')} part of {', '.join(missing)}"
-        raise DataError(
-            f"no stretch of {min(window_s):g} s of truth without a gap in {where}",
-            expected="truth that covers at least one window",
-            fix="Shorten the windows (settings gyro_window_s, accel_window_s), or leave the log out",
-        )
+    sets = _window_sets(pool, window_s, part)
     rest, W, columns, known = rest.clone(), torch.zeros(3, 3).to(rest), COLUMNS[sensor], 9 if matrix else 0
     nuisance_prior = torch.tensor(NUISANCE_STD[sensor] if nuisances else ()).to(rest) ** -2.0
     own = torch.zeros(len(pool.names), 3 + len(nuisance_prior)).to(rest)  # rest bias, then nuisances
@@ -156,6 +147,25 @@ def nuisance_jacobian(
     by_lever = windows.R_start @ so3.hat(w_start) - windows.R_end @ so3.hat(w_end)
     tilt = torch.eye(3).to(R)[None, :, :2] * duration_s[:, None, None]
     return torch.cat([tilt, -force, change + force @ w_start[..., None], by_lever], dim=2)
+
+
+def _window_sets(pool: Pool, window_s: Sequence[float], part: Part) -> list[tuple[Int[Tensor, " k"], int]]:
+    """First samples of the windows of each length, and the length in samples.
+
+    Raises:
+        DataError: a log has no window of that part that is free of gaps.
+    """
+    sets = [_some(pool.starts(n, part, hop=max(1, n // 2)), n) for n in map(pool.samples, window_s)]
+    seen = torch.cat([pool.log[first] for first, _ in sets])
+    missing = [name for i, name in enumerate(pool.names) if not bool((seen == i).any())]
+    if missing:
+        where = f"the {part.replace('_', '-')} part of {', '.join(missing)}"
+        raise DataError(
+            f"no stretch of {min(window_s):g} s of truth without a gap in {where}",
+            expected="truth that covers at least one window",
+            fix="Shorten the windows (settings gyro_window_s, accel_window_s), or leave the log out",
+        )
+    return sets
 
 
 def _some(first: Int[Tensor, " m"], n: int) -> tuple[Int[Tensor, " k"], int]:
