@@ -63,5 +63,5 @@ $(READY_TEST): pyproject.toml constraints.txt | $(BIN)/python
 
 $(READY_DEMO): pyproject.toml constraints.txt | $(BIN)/python
 	@echo "set-up: imutool with viewer and report, into $(VENV) (some minutes the first time: torch is large)"
-	@$(PIP) -e '.[view,report]'
+	@$(PIP) -e '.[train,view,report]'
 	@touch $@

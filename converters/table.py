@@ -17,10 +17,10 @@ from imutool.errors import ConfigError, DataError
 from imutool.geometry import quaternion
 from imutool.recording import Poses, Scalars, unit_quaternions
 from imutool.recording.message_log import MessageLog, Remarks
+from imutool.recording.two_sensors import in_order, joined
 
 from . import Sequence
 from ._files import head, name
-from ._imu_columns import in_order, joined
 from ._table_files import Columns, kind_of, load
 from ._table_map import ACCEL_SI, GYRO_SI, TIME_NS, TableMap, propose, read_map
 

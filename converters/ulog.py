@@ -22,10 +22,10 @@ from imutool.errors import ConfigError, DataError
 from imutool.geometry import quaternion
 from imutool.recording import Imu, Poses
 from imutool.recording.message_log import Message, MessageLog, MessageTopic, Remarks, Table
+from imutool.recording.two_sensors import in_order, joined
 
 from . import Sequence
 from ._files import find_files, head
-from ._imu_columns import in_order, joined
 
 GENERAL = True
 MAGIC, ENCRYPTED = b"ULog\x01\x12\x35", b"ULogEnc"

@@ -22,6 +22,8 @@ class Settings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
 
 
 S = TypeVar("S", bound=Settings)
+NESTED = "nested too deeply"
+MOST_NESTED = 32  # tables and lists in each other; ours have five
 MOST_BYTES = 1 << 20  # of a TOML file: a physics.toml of twenty curves has 50 kB, and a megabyte takes a second to parse
 
 
@@ -53,11 +55,27 @@ def toml(path: Path, what: str) -> dict[str, Any]:
                 expected=f"a TOML file of at most {MOST_BYTES} bytes",
                 fix="See whether this is the file that was meant",
             )
-        return tomllib.loads(raw.decode())
-    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
-        raise ConfigError(f"{what} cannot be read ({error})", where=path, expected="a TOML file") from error
+        values = tomllib.loads(raw.decode())
+    except OSError as error:
+        raise ConfigError(f"{what} cannot be read ({error.strerror})", where=path, expected="a TOML file") from error
+    except ValueError as error:  # no UTF-8, no TOML, or an integer of thousands of digits
+        reason = "an integer has thousands of digits" if "integer string conversion" in str(error) else error
+        raise ConfigError(f"{what} cannot be read ({reason})", where=path, expected="a TOML file") from error
     except RecursionError as error:
-        raise ConfigError(f"{what} cannot be read (nested too deeply)", where=path, expected="a TOML file") from error
+        raise ConfigError(f"{what} cannot be read ({NESTED})", where=path, expected="a TOML file") from error
+    _refuse_nested(values, path, what)
+    return values
+
+
+def _refuse_nested(values: dict[str, Any], where: str | Path | None, what: str) -> None:
+    """Refuse tables and lists deeper than any setting, which later steps could not walk through."""
+    level: list[Any] = [values]
+    for _ in range(MOST_NESTED):
+        inner = [list(value.values()) if isinstance(value, dict) else value for value in level]
+        level = [value for items in inner for value in items if isinstance(value, dict | list)]
+        if not level:
+            return
+    raise ConfigError(f"{what} cannot be read ({NESTED})", where=where, expected=f"at most {MOST_NESTED} tables in each other")
 
 
 def build(cls: type[S], values: dict[str, Any], where: str | Path | None = None) -> S:
@@ -66,6 +84,7 @@ def build(cls: type[S], values: dict[str, Any], where: str | Path | None = None)
     Raises:
         ConfigError: unknown key (the nearest is named), wrong type, out of range, not finite.
     """
+    _refuse_nested(values, where or "settings", "settings")
     _refuse_unknown(cls, values, where)
     _refuse_infinite(values, where)
     try:
@@ -91,6 +110,8 @@ def _put(values: dict[str, Any], word: str) -> None:
     except (ValueError, RecursionError):  # no TOML, more than one line of it, or nested too deeply to be any setting's
         value = text
     *tables, last = key.split(".")
+    if len(tables) > MOST_NESTED:
+        raise ConfigError(f"the key has {len(tables)} dots", where="set", expected="the name of a setting")
     for table in tables:
         values = values.setdefault(table, {})
         if not isinstance(values, dict):

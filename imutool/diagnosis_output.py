@@ -7,9 +7,6 @@ files in the folder, the logs themselves for instance, stay as they are.
 from __future__ import annotations
 
 import contextlib
-import json
-import os
-import secrets
 import shutil
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -20,7 +17,8 @@ from typing import TYPE_CHECKING
 from imutool.diagnosis.result import Diagnosis
 from imutool.diagnosis.to_physics_file import to_physics_file
 from imutool.errors import ConfigError, ImutoolError
-from imutool.report import json_values
+from imutool.mcap_io.storage.local import remove_abandoned, temporary_path
+from imutool.report import json_text
 from imutool.sensor import physics_file
 
 if TYPE_CHECKING:
@@ -60,7 +58,8 @@ def write(
     """
     refuse(folder, overwrite=overwrite)
     target = folder.absolute()  # "." has no name of its own
-    partial = target.parent / f".{target.name}.{os.getpid()}.{secrets.token_hex(4)}.partial"
+    remove_abandoned(target)
+    partial = temporary_path(target)
     complete = partial / target.name  # what is written names the folder as it will be called
     with _told(folder):
         try:
@@ -78,8 +77,7 @@ def write(
 
 
 def _make(d: Diagnosis, folder: Path, logs: Callable[[Path], list[RunData]] | None) -> list[str]:
-    text = json.dumps(json_values(d.report), indent=2, allow_nan=False, ensure_ascii=False)
-    (folder / FINDINGS).write_text(text + "\n", encoding="utf-8")
+    (folder / FINDINGS).write_text(json_text(d.report), encoding="utf-8")
     physics_file.write(to_physics_file(d), folder / EFFECT)
     drawn: dict[str, Callable[[Path], None]] = {REPORT: lambda path: _page(d, path), VIEW: lambda path: _recording(d, path)}
     if logs is not None:  # before the report, which says where it is

@@ -20,13 +20,24 @@ a sentence (``fix="Give `model`"``, ``expected="`init=prior`"``). The command li
 
 from __future__ import annotations
 
+import re
 from typing import ClassVar
 
 INTERRUPTED = 130  # exit code after Ctrl-C
+# A path keeps one slash of a URL's two. What follows ? or # is a query of http, and of a store if it assigns something
+URL_LOGIN = re.compile(
+    r"(\b(?!az:|abfs:)[a-z][a-z0-9+.-]*:/{1,2}|\b(?:az|abfs):/{1,2}(?=[^/\s?#]*:))[^/\s?#]*@", re.IGNORECASE
+)  # CONTAINER@ACCOUNT is not secret
+URL_TAIL = re.compile(
+    r"(\b(?:https?:/{1,2}[^\s?#'\"]*[?#]|[a-z][a-z0-9]*:/{1,2}[^\s?#'\"]*[?#](?=[\w.-]+=)))[^\s'\"]+", re.IGNORECASE
+)
+SECRET = re.compile(r"((?:signature|sig|token|credential|password|secret)=)[^&\s\"']+", re.IGNORECASE)
 
 
 class ImutoolError(Exception):
     """Error with four parts: place, problem, expectation, fix.
+
+    Secrets in the URLs of a message are replaced by ***.
 
     Args:
         what: what happened, with the offending value in it.
@@ -38,8 +49,8 @@ class ImutoolError(Exception):
     exit_code: ClassVar[int] = 1
 
     def __init__(self, what: str, *, where: object = None, expected: str = "", fix: str = "") -> None:
-        self.what, self.where = what, None if where is None else str(where)  # as text: errors cross process borders
-        self.expected, self.fix = expected, fix
+        self.what, self.where = redact(what), None if where is None else redact(str(where))  # text crosses process borders
+        self.expected, self.fix = redact(expected), redact(fix)
         super().__init__(str(self))
 
     def __str__(self) -> str:
@@ -95,3 +106,17 @@ class NumericsError(ImutoolError):
     """A computation left the range in which its result is valid."""
 
     exit_code = 7
+
+
+def redact(text: str) -> str:
+    """Text without the users, passwords, queries and fragments of the URLs in it, and without signatures."""
+    if "://" in text or ":/" in text:
+        text = URL_TAIL.sub(r"\1***", URL_LOGIN.sub(r"\1***@", text))
+    return SECRET.sub(r"\1***", text) if "=" in text else text
+
+
+def was_interrupted(error: BaseException | None) -> bool:
+    """Whether an error came of Ctrl-C; an interrupted import may raise an ImportError."""
+    while error is not None and not isinstance(error, KeyboardInterrupt):
+        error = error.__cause__ or error.__context__
+    return error is not None

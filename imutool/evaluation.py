@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +21,7 @@ from imutool.bias_start.bias_tracking import BiasPrior
 from imutool.bias_start.correction import DebiasedImu, apply
 from imutool.bias_start.initial_bias import AT_REST_STD, LEAST_STD, InitialBias
 from imutool.bias_start.model_choice import check_smooth, estimate_at_rest, find_initial_bias, smooth_in_memory
+from imutool.bias_start.stretches import measured_imu
 from imutool.bias_start.zero_velocity import zero_velocity_trajectory
 from imutool.errors import ConfigError, DataError, ImutoolError, ModelError
 from imutool.inertial import metrics
@@ -55,13 +57,15 @@ def evaluate(
     log; with `zupt` a second result each is dead reckoning that knows its stops (`zero_velocity`), of the same samples.
 
     Raises:
-        ConfigError: `smooth` with another `init` than auto; two models of one name, or files that exist.
+        ConfigError: `smooth` with another `init` than auto; two models of one name, files that exist, or no sample that is a
+            measurement.
         LogError, DataError: no IMU, no truth, or the two share no time.
         ModelError: a model that cannot be used with this log.
     """
     if trajectories is not None:
         _refuse_twins(models)
     recording = read(log, imu=imu, truth=truth)
+    recording = replace(recording, imu=measured_imu(recording.imu, f"{log} {recording.imu_topic}"))
     if truth is None and recording.truths:
         recording = recording.with_truth(next(iter(recording.truths)))
     results = []

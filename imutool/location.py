@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO, ForwardRef, NamedTuple, TypeAlias
 from urllib.parse import urlsplit
 
-from imutool.errors import ConfigError
+from imutool.errors import ConfigError, redact
 
 if TYPE_CHECKING:
     from upath import UPath
@@ -126,14 +126,6 @@ def _refuse_secrets(scheme: str, text: str) -> None:
             expected="none: URLs are written into reports and logs",
             fix="Give the object by its store's own URL, such as s3://, or fetch it first",
         )
-
-
-def redact(text: str) -> str:
-    """Text without the users, passwords, queries and fragments of the URLs in it."""
-    text = re.sub(r"//[^/\s]*@", "//***@", text)
-    text = re.sub(r"(?i)(https?://[^\s\"'?#]*[?#])[^\s\"']+", r"\1***", text)
-    text = re.sub(r"(://[^\s\"'?#]*[?#])[\w.-]+=[^\s\"'/]*", r"\1***", text)
-    return re.sub(r"(?i)((?:signature|sig|token|credential)=)[^&\s\"']+", r"\1***", text)
 
 
 def io_errors(where: Location) -> type[Exception]:

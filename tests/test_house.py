@@ -349,6 +349,20 @@ def test_commands_that_infer_need_no_torch(tmp_path: Path, logs: Path) -> None:
     assert done.returncode == 0, done.stderr
 
 
+WITHOUT_TORCH = "import sys; sys.modules.update(torch=None, torchdiffeq=None); sys.argv[0] = 'imutool'\n"
+
+
+def test_without_torch_training_says_what_to_install_and_debias_works(tmp_path: Path, logs: Path) -> None:
+    def run(*words: str | Path) -> subprocess.CompletedProcess[str]:
+        line = [sys.executable, "-c", f"{WITHOUT_TORCH}from imutool.cli import main; main()", *map(str, words)]
+        return subprocess.run(line, cwd=tmp_path, capture_output=True, text=True, timeout=120, check=False)
+
+    refused = run("train", logs / "flight_1.mcap", "-o", "m.safetensors")
+    assert refused.returncode == 3
+    assert refused.stderr.endswith("Install it with: pip install 'imutool[train]'.\n")
+    assert run("debias", logs / "flight_2.mcap", "o.mcap", "--model", logs / "linear.safetensors").returncode == 0
+
+
 def test_help_is_quick(command: str) -> None:
     def seconds(*line: str) -> float:
         began = time.perf_counter()

@@ -17,8 +17,8 @@ import numpy as np
 import pytest
 
 from imutool.debiasing import debias
-from imutool.errors import ConfigError, LogError
-from imutool.location import BLOCK_BYTES, reason, redact, same_location, to_location
+from imutool.errors import ConfigError, LogError, redact
+from imutool.location import BLOCK_BYTES, reason, same_location, to_location
 from imutool.log_info.inspection import inspect
 from imutool.mcap_io.log import Log
 from imutool.mcap_io.rewrite import rewrite

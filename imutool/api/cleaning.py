@@ -9,7 +9,7 @@ from pathlib import Path
 from imutool.api.logs import Progress
 from imutool.bag.repair import NO_ATTACHMENTS, BagReport, is_bag, repair_bag
 from imutool.cleaning import CleaningSettings, Survey, look
-from imutool.cleaning.settings import chosen
+from imutool.cleaning.rule import chosen
 from imutool.errors import ConfigError, LogError
 from imutool.location import LogPath, location
 from imutool.mcap_io.recovery.losses import Losses

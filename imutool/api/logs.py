@@ -98,6 +98,7 @@ def convert(
     sensor: str = "",
     kinds: Sequence[str] = (),
     mapping: str | Path | None = None,
+    imu: str = "",
     workers: int | None = None,
     progress: NamedProgress | None = None,
 ) -> ConvertReport:
@@ -114,6 +115,7 @@ def convert(
         sensor: Name of the IMU, where the recording does not state it.
         kinds: What poses are worth, as `TOPIC=truth|estimate|odometry|unknown`.
         mapping: TOML file that states what the columns of a table mean.
+        imu: Two topics that become one IMU: `gyro=TOPIC,accel=TOPIC`.
         workers: Processes; by default one per core. A script that uses several needs `if __name__ == "__main__":`.
         progress: Callback with sequences done, sequences in all, and the name of the last one.
 
@@ -142,6 +144,7 @@ def convert(
         sensor=sensor,
         kinds=kinds,
         mapping=None if mapping is None else local(mapping, "mapping"),
+        imu=imu,
         workers=workers,
         progress=progress,
     )

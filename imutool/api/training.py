@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from imutool import evaluation
 from imutool.bias.model import BiasModel
@@ -12,9 +12,9 @@ from imutool.config import build
 from imutool.location import LogPath, local, locals_of
 from imutool.mcap_io.storage import outputs
 from imutool.mcap_io.storage.outputs import OutputFile, check_outputs
-from imutool.training import run
-from imutool.training.fit import Epoch
-from imutool.training.settings import settings_of
+
+if TYPE_CHECKING:
+    from imutool.training.fit import Epoch
 
 
 def train(
@@ -56,9 +56,12 @@ def train(
         >>> sorted(model.card["held_out"])
         ['accel', 'gyro']
     """
+    from imutool.training.run import train as run
+    from imutool.training.settings import settings_of
+
     chosen = None if settings is None else build(settings_of(method), dict(settings), where="settings")
     check_outputs([OutputFile("out", out, outputs.MODEL)], [logs], overwrite=overwrite)
-    return run.train(
+    return run(
         locals_of(logs, "logs"),
         local(out, "out"),
         method=method,

@@ -25,7 +25,6 @@ from typing import Annotated, ClassVar, Literal
 import msgspec
 import numpy as np
 from jaxtyping import Float64
-from scipy.special import erf
 
 from imutool.bias.model import COLUMNS, Array, BiasModel, DriftStream, Shapes, Vector6
 from imutool.bias.neural_stream import HALF_ROOT, Curves, CurveWeights, NeuralStream, gelu
@@ -210,6 +209,8 @@ def _perceptron(layers: list[tuple[Array, Array]], x: Array) -> Array:
 
 def _perceptron_slope(layers: list[tuple[Array, Array]], x: Array, J: Array) -> Array:
     """Derivative of a perceptron's output, if J is that of its input."""
+    from scipy.special import erf
+
     *hidden, before, last = layers
     for W, b in hidden:
         h = np.dot(x, W) + b

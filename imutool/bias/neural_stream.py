@@ -8,7 +8,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float64
-from scipy.special import erf
 
 from imutool.bias.model import COLUMNS, Array, Vector6
 from imutool.sensor.signals import low_pass
@@ -64,6 +63,10 @@ class Curves:
             self._second[k] = np.concatenate([HALF_ROOT * second, constant][:: 1 - 2 * k], axis=1)
             self._last[own, k * width : (k + 1) * width] = curve.size * last
             self._last[own, 2 * width + 1 :][:, own] = curve.W
+        if self._bent:
+            from scipy.special import erf
+
+            self._erf = erf
         self._buffers: dict[int, _Buffers] = {}
         self._last_and_rest = self._last.copy()
         self._last[:, -1] -= self.one(np.zeros(6), np.zeros(6), 0.0)
@@ -106,7 +109,7 @@ class Curves:
         np.multiply(slow, buffers.units, buffers.near_slow)
         np.arcsinh(buffers.near, buffers.near)
         self._first.dot(buffers.seen, a)
-        erf(a, b)
+        self._erf(a, b)
         b *= a
         b += a
         self._second[0].dot(buffers.b_gyro, buffers.c_gyro)
@@ -229,5 +232,7 @@ class NeuralStream:
 
 def gelu(x: Array) -> Array:
     """GELU x (1 + erf(x / sqrt 2)) / 2."""
+    from scipy.special import erf
+
     y: Array = 0.5 * x * (1.0 + erf(x * HALF_ROOT))
     return y

@@ -6,6 +6,7 @@ stretch, and counts as at most `MOST_GAP_S`.
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import NamedTuple
@@ -17,7 +18,7 @@ from imutool.bias.model import GAP_S
 from imutool.cleaning.cleaner import rows
 from imutool.errors import ConfigError, LogError
 from imutool.mcap_io.topics import CLEAN_FIX, ImuBatch
-from imutool.recording import nanoseconds
+from imutool.recording import Imu, nanoseconds
 
 MOST_GAP_S = 3600.0  # of a gap on the filters' clock: beyond, the time says nothing about the bias
 MOST = np.array([1e4] * 3 + [1e6] * 3)  # rad/s and m/s²: no gyro or accelerometer measures more
@@ -25,6 +26,7 @@ LEAST_FORCE_M_S2 = 1e-9  # on some axis: even in free fall a sensor's noise exce
 MOST_STRETCHES, MOST_WARNINGS = 1000, 5  # that a report lists, and that the terminal shows
 NOT_FINITE, OUT_OF_RANGE, ZERO_FORCE = "not_finite", "out_of_range", "zero_force"
 
+logger = logging.getLogger(__name__)
 Rows3 = Float64[np.ndarray, "n 3"]
 
 
@@ -54,6 +56,24 @@ def measured(gyro: Rows3, accel: Rows3) -> Bool[np.ndarray, " n"]:
     """Samples that are a measurement."""
     good: Bool[np.ndarray, " n"] = ~np.logical_or.reduce(list(unmeasured(gyro, accel).values()))
     return good
+
+
+def measured_imu(imu: Imu, where: str) -> Imu:
+    """Samples of an IMU that are a measurement; a warning counts the others.
+
+    Raises:
+        ConfigError: fewer than two are left.
+    """
+    reasons = unmeasured(imu.gyro, imu.accel)
+    left_out = {reason: int(mask.sum()) for reason, mask in reasons.items() if mask.any()}
+    if not left_out:
+        return imu
+    good = measured(imu.gyro, imu.accel)
+    if good.sum() < 2:
+        raise _nothing_measured(left_out, where)
+    logger.warning("%s: samples that are no measurement are left out: %s", where, described(left_out))
+    rows_left: Imu = imu.rows(good)
+    return rows_left
 
 
 class StretchClock:
@@ -127,12 +147,7 @@ class Sieve:
             ConfigError: fewer than two measured samples, others were left out.
         """
         if self.left_out and self.clock.count < 2:
-            raise ConfigError(
-                f"no sample is a measurement ({described(self.left_out)})",
-                where=self.where,
-                expected="finite samples with a specific force",
-                fix="Look at the sensor with imutool info, or name another IMU in `imus`",
-            )
+            raise _nothing_measured(self.left_out, self.where)
 
     def warnings(self) -> Iterator[str]:
         """Defects in words: samples that were left out, and jumps of the clock."""
@@ -152,6 +167,15 @@ class Sieve:
         if self.clock.stretches:
             out["stretches"] = ", ".join(f"{start_ns}: {step_s:.9g} s" for start_ns, step_s in self.clock.stretches)
         return out
+
+
+def _nothing_measured(left_out: Mapping[str, int], where: str) -> ConfigError:
+    return ConfigError(
+        f"no sample is a measurement ({described(left_out)})",
+        where=where,
+        expected="finite samples with a specific force",
+        fix="Look at the sensor with imutool info, or name another IMU in `imus`",
+    )
 
 
 WORDS = {

@@ -11,13 +11,14 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from imutool.bias.model import Vector6
 from imutool.bias_start.bias_tracking import BiasFilter, BiasPrior, FilteredBlock, smooth_blocks
+from imutool.bias_start.initial_bias import relative_samples
+from imutool.geometry import quaternion
 from imutool.inertial.inertial_filter import SIZE, State
 from imutool.inertial.strapdown import StartPose, dead_reckon
-from imutool.recording import Imu, Poses, seconds
+from imutool.recording import Imu, Poses
 
 START_STD = np.array([1e-3] * 3 + [1e-2] * 3 + [1e-3] * 3)  # rad, m/s, m: of the start pose
 
@@ -36,7 +37,7 @@ def zero_velocity_trajectory(imu: Imu, start: StartPose, prior: BiasPrior, *, sm
     """
     filter_ = BiasFilter(prior, ahead=smooth)
     filter_.state = _state(start, prior)
-    t_s = seconds(imu.t_ns, int(imu.t_ns[0]) if len(imu) else 0)
+    t_s = relative_samples(imu)[0]
     estimates = _estimates(filter_, imu, t_s, smooth)
     pieces, first, state = [], 0, filter_.state
     for end_s, resting, over, after in estimates:
@@ -74,7 +75,7 @@ def _estimates(filter_: BiasFilter, imu: Imu, t_s: np.ndarray, smooth: bool) -> 
 
 
 def _state(start: StartPose, prior: BiasPrior) -> State:
-    R_wb = Rotation.from_quat(start.q_wb_wxyz, scalar_first=True).as_matrix()
+    (R_wb,) = quaternion.matrix(quaternion.unit(start.q_wb_wxyz[None]))
     P = np.zeros((SIZE, SIZE))
     # invariant errors: an attitude error rotates velocity and position about the origin
     P[range(SIZE), range(SIZE)] = np.concatenate([START_STD, prior.std, prior.ground_std]) ** 2
@@ -84,6 +85,8 @@ def _state(start: StartPose, prior: BiasPrior) -> State:
 def _between(imu: Imu, state: State, resting: bool) -> Poses:
     """Pure integration over a block, with the filter's bias at its start."""
     bias: Vector6 = state.rest_bias(resting)
+    from scipy.spatial.transform import Rotation
+
     q_wb_wxyz = Rotation.from_matrix(state.R_wb).as_quat(scalar_first=True)
     corrected = Imu(imu.t_ns, imu.gyro - bias[:3], imu.accel - bias[3:])
     return dead_reckon(corrected, (q_wb_wxyz, state.p_wb, state.v_w))

@@ -7,7 +7,6 @@ reveal nothing: names, topics, metadata, message counts, sizes and the start tim
 from __future__ import annotations
 
 import json
-import os
 import secrets
 import shutil
 from collections.abc import Mapping, Sequence
@@ -29,6 +28,7 @@ from imutool.blind_cases.scene import SIM_SHARE, Scene, place_scene, stamps_ns
 from imutool.blind_cases.score import SCHEMA, Score, score
 from imutool.errors import ConfigError, DataError
 from imutool.mcap_io.read import read
+from imutool.mcap_io.storage.local import remove_abandoned, temporary_path
 from imutool.mcap_io.storage.target import Target
 from imutool.mcap_io.write import write
 from imutool.noise.datasheet import Noise
@@ -142,7 +142,8 @@ def write_case(folder: Path, sim: Recording, real: Recording, truth: ConcealedTr
     Raises:
         ConfigError: the system refuses to write; nothing is left behind.
     """
-    partial = folder.parent / f".{folder.name}.{os.getpid()}.{secrets.token_hex(4)}.partial"
+    remove_abandoned(folder)
+    partial = temporary_path(folder)
     try:
         partial.mkdir(parents=True)
         for name, recording in ((SIM, sim), (REAL, real)):

@@ -3,6 +3,6 @@
 from imutool.cleaning.cleaner import Cleaner, cleaned
 from imutool.cleaning.finding import Finding
 from imutool.cleaning.first_pass import Survey, UntrustedError, look, raw_batches, survey
-from imutool.cleaning.settings import CleaningSettings
+from imutool.cleaning.rule import CleaningSettings
 
 __all__ = ["Cleaner", "CleaningSettings", "Finding", "Survey", "UntrustedError", "cleaned", "look", "raw_batches", "survey"]

@@ -13,10 +13,9 @@ from jaxtyping import Bool, Float64
 
 from imutool import registry
 from imutool.cleaning.finding import Finding, FindingReport, Verdict, score, verdict
-from imutool.cleaning.rule import Rule, TopicSummary
+from imutool.cleaning.rule import GROUP, CleaningSettings, Rule, TopicSummary
 from imutool.cleaning.rules.gaps import MISSING
 from imutool.cleaning.samples import Motion, Samples, blocks
-from imutool.cleaning.settings import GROUP, CleaningSettings
 from imutool.cleaning.truth import Truth, read_truth
 from imutool.errors import LogError
 from imutool.location import Location

@@ -11,8 +11,6 @@ import sys
 from importlib import import_module
 from typing import TYPE_CHECKING
 
-from imutool.errors import INTERRUPTED
-
 if TYPE_CHECKING:
     from imutool.cli.app import App
 
@@ -30,7 +28,8 @@ MODULES = (
     "fleet",
     "shipped",
 )
-TERMINATED = 143  # what a shell reports of a program that SIGTERM ended
+REPEAT_S = 0.01
+INTERRUPTED, TERMINATED = 130, 143  # what a shell reports of a program that SIGTERM ended
 
 
 def load() -> App:
@@ -48,11 +47,26 @@ def main() -> None:
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     # A scheduler's SIGTERM would end the process where it stands, with its temporary files and parts of uploads left behind
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(TERMINATED))
+    sys.unraisablehook = _unraisable
     try:
         app = load()
         from imutool.cli.app import caught
-    except KeyboardInterrupt:  # Ctrl-C before there is anybody who could catch it in style
+    except BaseException as error:  # Ctrl-C before there is anybody who could catch it in style
+        from imutool.errors import was_interrupted
+
+        if not was_interrupted(error):
+            raise
         print("error: interrupted. Nothing was begun.", file=sys.stderr)
         sys.exit(INTERRUPTED)
     with caught():
         app()
+
+
+def _unraisable(unraisable: sys.UnraisableHookArgs) -> None:
+    """Repeat a Ctrl-C that came where nothing can be raised, as while an object is removed."""
+    if unraisable.exc_type is KeyboardInterrupt:
+        from threading import Timer
+
+        Timer(REPEAT_S, signal.raise_signal, [signal.SIGINT]).start()
+    else:
+        sys.__unraisablehook__(unraisable)

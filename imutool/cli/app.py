@@ -18,7 +18,7 @@ from typer.models import CommandFunctionType
 from imutool import __version__, registry
 from imutool.cli.parameters import current, error_with_flags, flags, with_flags
 from imutool.cli.terminal import plain, say, tell_error
-from imutool.errors import INTERRUPTED, ConfigError, ImutoolError
+from imutool.errors import INTERRUPTED, ConfigError, ImutoolError, redact, was_interrupted
 from imutool.mcap_io.storage import outputs
 from imutool.mcap_io.storage.outputs import OutputFile, check_outputs
 
@@ -33,7 +33,12 @@ class _Commands(TyperGroup):
 
     def invoke(self, ctx: Any) -> Any:
         with caught():
-            result = super().invoke(ctx)
+            try:
+                result = super().invoke(ctx)
+            except Exception as error:  # a wrong command line repeats its words
+                if hasattr(error, "format_message"):
+                    error.message = redact(error.message)  # type: ignore[attr-defined]
+                raise
             sys.stdout.flush()  # at the interpreter's end it would be too late to say anything
         return result
 
@@ -55,6 +60,10 @@ def caught() -> Iterator[None]:
             _forget_stdout()
         place = f"{error.filename}: " if error.filename else ""
         _fail(f"{place}{error.strerror or error}. Choose another place or make room.", ConfigError.exit_code)
+    except Exception as error:
+        if was_interrupted(error):
+            _fail(f"interrupted. {NOTHING_LEFT}.", INTERRUPTED)
+        raise
 
 
 @dataclass(frozen=True)

@@ -46,7 +46,7 @@ def clean(
 
     With OUT, write the log with a clean IMU beside the raw one.
     """
-    from imutool.cleaning.settings import chosen
+    from imutool.cleaning.rule import chosen
 
     rules = chosen(rule or (), no_rule or (), force)
     given = {

@@ -67,6 +67,7 @@ def convert(
         list[str] | None,
         typer.Option(metavar="TOPIC=KIND", help="What poses are worth: truth, estimate, odometry or unknown. Repeatable."),
     ] = None,
+    imu: Annotated[str, typer.Option(metavar="gyro=T,accel=T", help="Two topics that become one IMU.")] = "",
     map_: Annotated[
         Path | None, typer.Option("--map", metavar="F.toml", help="Meaning and units of a table's columns.")
     ] = None,
@@ -91,6 +92,7 @@ def convert(
             sensor=sensor,
             kinds=kind or (),
             mapping=map_,
+            imu=imu,
             workers=workers,
             progress=tell,
         )
@@ -136,3 +138,17 @@ def export(
     say(f"{target}: {counts}" + (f"; IMU from {report.imu}" if report.imu else ""))
     if report.left_out:
         say(f"left out: {', '.join(report.left_out)}")
+
+
+@app.command(epilog="Example: [bold]imutool new-converter my_logger[/]")
+def new_converter(
+    name: Annotated[str, typer.Argument(help="Name on the command line, such as my_logger.")],
+    folder: Annotated[Path | None, typer.Option("-o", "--folder", help="New folder; by default imutool-NAME.")] = None,
+) -> None:
+    """Write a template of a converter, with a test, as a package of its own."""
+    from imutool.conversion.converter_template import write_template
+
+    place = Path(f"imutool-{name}") if folder is None else folder
+    for path in write_template(name, place):
+        say(str(path))
+    say(f"Change imutool_{name}.py, run pytest {place}, then pip install -e {place}: imutool convert knows {name}.")

@@ -71,22 +71,18 @@ def evaluate(
             tell(done, len(logs), log.name)
             first = len(results)
             refused: dict[str, ImutoolError] = {}
-            results += run(
-                log,
-                models=model or (),
-                init=init,
-                smooth=smooth,
-                zupt=zupt,
-                truth=truth,
-                imu=imu,
-                trajectories=trajectories,
-                overwrite=overwrite,
-                refused=refused.__setitem__,
-            )
+            read: dict[str, Any] = {"init": init, "smooth": smooth, "truth": truth, "imu": imu}
+            more: dict[str, Any] = {
+                "zupt": zupt,
+                "trajectories": trajectories,
+                "overwrite": overwrite,
+                "refused": refused.__setitem__,
+            }
+            results += run(log, models=model or (), **read, **more)
             errors += [_of_model(name, error) for name, error in refused.items()]
             if report is not None:
                 scored = [name for name in model or () if name not in refused]
-                run_data = load(log, models=scored, init=init, smooth=smooth, truth=truth, imu=imu)
+                run_data = load(log, models=scored, **read)
                 loaded.append(replace(run_data, notes=(*run_data.notes, *_stops(results[first:]))))
         if report is not None:
             tell(len(logs), len(logs), "drawing")
@@ -97,6 +93,10 @@ def evaluate(
         figures(rows, aligned=aligned)
         if report is not None:
             say(f"Report: {report}")
+    _raise_first(errors)
+
+
+def _raise_first(errors: Sequence[ImutoolError]) -> None:
     for error in errors[1:]:
         logger.warning("%s", error)
     if errors:

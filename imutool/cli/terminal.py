@@ -16,7 +16,8 @@ from rich.progress import BarColumn, Progress, TextColumn
 from rich.table import Table
 
 from imutool.cli.parameters import with_flags
-from imutool.location import redact, to_location
+from imutool.errors import redact
+from imutool.location import to_location
 from imutool.mcap_io.recovery.losses import describe
 from imutool.mcap_io.storage.target import Target
 from imutool.report import Report, json_text

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
+from posixpath import commonpath
 
 from imutool.errors import ConfigError
 from imutool.mcap_io.codec import schemas
@@ -21,6 +23,7 @@ class Labels:
 
     sensor: str = ""
     kinds: tuple[tuple[str, str], ...] = ()
+    parts: tuple[str, str] | None = None  # topics of a gyro and an accelerometer that become one IMU
 
     def put_on(self, content: Recording | MessageLog) -> Recording | MessageLog:
         """Content with the labels.
@@ -31,6 +34,8 @@ class Labels:
         if self.sensor:
             own = {**content.metadata.get(RECORD, {}), "sensor": self.sensor}
             content = replace(content, metadata={**content.metadata, RECORD: own})
+        if self.parts is not None:
+            content = self._with_pair(content, self.parts)
         if not self.kinds:
             return content
         if isinstance(content, Recording):
@@ -41,6 +46,14 @@ class Labels:
         topics = [topic.name for topic in content.topics if schemas.canonical(topic.schema_name) in POSES]
         self._check([*content.poses, *topics], content.name)
         return replace(content, kinds={**content.kinds, **dict(self.kinds)})
+
+    def _with_pair(self, content: Recording | MessageLog, parts: tuple[str, str]) -> MessageLog:
+        """Log with the IMU that two topics make up, on `imu` in the folder they share."""
+        topics = [t.name for t in content.topics if t.schema_name == schemas.IMU] if isinstance(content, MessageLog) else []
+        if isinstance(content, Recording) or not set(parts) <= set(topics):
+            named, expected = " and ".join(parts), ", ".join(topics) or "a bag or a log with IMU topics"
+            raise ConfigError(f"no IMU messages to join on {named}", where="imu", expected=expected)
+        return replace(content, pairs={f"{commonpath(parts).rstrip('/')}/imu": parts})
 
     def _check(self, topics: Collection[str], name: str) -> None:
         for topic, _ in self.kinds:
@@ -61,3 +74,17 @@ def parse_kinds(texts: Sequence[str]) -> tuple[tuple[str, str], ...]:
             raise ConfigError(f"{text!r}", where="kinds", expected=f"TOPIC=KIND with one of {', '.join(KINDS)}")
         kinds.append((topic, kind))
     return tuple(kinds)
+
+
+def parse_parts(text: str) -> tuple[str, str] | None:
+    """Topics of `gyro=/a,accel=/b`; None of an empty text.
+
+    Raises:
+        ConfigError: no such text.
+    """
+    if not text:
+        return None
+    match = re.fullmatch(r"gyro=([^,\s]+),accel=([^,\s]+)", text.strip())
+    if match is None:
+        raise ConfigError(f"{text!r}", where="imu", expected="gyro=TOPIC,accel=TOPIC")
+    return match[1], match[2]

@@ -15,13 +15,14 @@ from typing import NamedTuple
 import numpy as np
 
 import imutool
+from imutool.conversion.sensor_pairs import SensorPairs
 from imutool.conversion.table_messages import encode_table, table_topic
 from imutool.errors import DataError
 from imutool.location import Location
 from imutool.mcap_io.codec import messages, schemas
 from imutool.mcap_io.codec.encode import encode_float, encode_imu, encode_pose, encode_vector3
 from imutool.mcap_io.read import RECORD, UNIT_KEY, VELOCITY_KEY
-from imutool.mcap_io.topics import KIND_KEY, MESSAGE_POSES
+from imutool.mcap_io.topics import KIND_KEY, MESSAGE_POSES, PART_KEY
 from imutool.mcap_io.write import BODY, CHUNK_BYTES, WORLD, Series, chunks
 from imutool.mcap_io.writer import Chunk, LogWriter
 from imutool.recording.message_log import MessageLog, MessageTopic
@@ -29,6 +30,9 @@ from imutool.recording.message_log import MessageLog, MessageTopic
 BULKY = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage", "sensor_msgs/msg/PointCloud2")
 SENSORS = (schemas.IMU, schemas.VECTOR3, schemas.TF, schemas.FLOAT, *MESSAGE_POSES)
 PACKED = ("sensor_msgs/msg/CompressedImage",)  # compressing these again costs time and saves nothing
+
+
+_encode_body = partial(encode_imu, frame_id=BODY)
 
 
 class Written(NamedTuple):
@@ -69,11 +73,16 @@ def write_log(source: MessageLog, path: Location, *, compression: str = "zstd", 
     """
     with LogWriter(path, compression=compression, overwrite=overwrite) as log:
         _write_metadata(log, source)
-        stream = _Stream(log, source)
+        pairs = SensorPairs(source)
+        stream = _Stream(log, source, pairs)
         groups = [_imus(log, source) + _poses(log, source) + _scalars(log, source), _tables(log, source)]
         streams: list[Iterator[tuple[Chunk, str | None]]] = [((chunk, None) for chunk in chunks(g)) for g in groups]
         for chunk, packing in heapq.merge(*streams, stream.chunks(), key=lambda item: item[0].start_ns):
             log.chunk(chunk, packing)
+        for topic, imu in pairs.joined(source.remarks):
+            series = Series(log.channel(topic, schemas.IMU), imu.t_ns, (imu.t_ns, imu.gyro, imu.accel), _encode_body)
+            for chunk in chunks([series]):
+                log.chunk(chunk)
         counts = _counts(log)
         if not sum(counts.values()):
             raise DataError("holds no messages", where=source.name, expected="a log with data")
@@ -87,8 +96,8 @@ def write_log(source: MessageLog, path: Location, *, compression: str = "zstd", 
 class _Stream:
     """Encoded messages of a source, gathered into chunks."""
 
-    def __init__(self, log: LogWriter, source: MessageLog) -> None:
-        self._log, self._source = log, source
+    def __init__(self, log: LogWriter, source: MessageLog, pairs: SensorPairs) -> None:
+        self._log, self._source, self._pairs = log, source, pairs
         self._channels: dict[MessageTopic, int] = {}
         self._buffers: dict[int, _Buffer] = {}  # by channel
         self._shared = _Buffer(packed=False), _Buffer(packed=False)  # of sensors, and of all others that are small
@@ -100,6 +109,8 @@ class _Stream:
     def _define(self, topic: MessageTopic) -> int:
         kind = self._source.kinds.get(topic.name)
         marked = topic if kind is None else replace(topic, metadata=(*topic.metadata, (KIND_KEY, kind)))
+        if (whole := self._pairs.whole_of(topic.name)) is not None:
+            marked = replace(marked, metadata=(*marked.metadata, (PART_KEY, whole)))
         number = self._channels[topic] = self._log.define(marked)
         name = schemas.canonical(topic.schema_name)
         if name in BULKY:
@@ -115,6 +126,7 @@ class _Stream:
                 number = self._define(topic)
             if log_time < 0:
                 raise DataError(f"a message of {topic.name} has the time {log_time} ns", expected="no time before 1970")
+            self._pairs.take(topic, payload)
             buffer = self._buffers[number]
             sequence = self._sequence[number]
             self._sequence[number] = sequence + 1
@@ -142,7 +154,7 @@ def _write_metadata(log: LogWriter, source: MessageLog) -> None:
 
 def _imus(log: LogWriter, source: MessageLog) -> list[Series]:
     return [
-        Series(log.channel(topic, schemas.IMU), imu.t_ns, (imu.t_ns, imu.gyro, imu.accel), partial(encode_imu, frame_id=BODY))
+        Series(log.channel(topic, schemas.IMU), imu.t_ns, (imu.t_ns, imu.gyro, imu.accel), _encode_body)
         for topic, imu in source.imus.items()
     ]
 

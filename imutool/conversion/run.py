@@ -14,7 +14,7 @@ from pathlib import Path
 from types import ModuleType
 
 from imutool import registry
-from imutool.conversion.labels import Labels, parse_kinds
+from imutool.conversion.labels import Labels, parse_kinds, parse_parts
 from imutool.conversion.workers import GROUP, Job, Outcome, run_jobs, write_content
 from imutool.errors import ConfigError, DataError, ImutoolError
 from imutool.recording import Recording
@@ -72,14 +72,16 @@ def convert(
     sensor: str = "",
     kinds: Sequence[str] = (),
     mapping: Path | None = None,
+    imu: str = "",
     workers: int | None = None,
     progress: Progress | None = None,
 ) -> ConvertReport:
     """Convert one sequence to the file `out`, or several sequences to the folder `out`.
 
     `sensor` names the IMU where the data set does not, and `kinds` (`TOPIC=truth|estimate|odometry|unknown`) says what poses
-    are worth. `mapping` is a file that states what the columns of a table mean. `workers` is the number of processes, by
-    default one a processor; with 1, or for one sequence, all happens here.
+    are worth. `mapping` is a file that states what the columns of a table mean.
+    `imu` (`gyro=TOPIC,accel=TOPIC`) joins two sensors to one IMU; pairs that differ in name by the sensor alone join unasked.
+    `workers` is the number of processes, by default one a processor; with 1, or for one sequence, all happens here.
 
     Raises:
         DataError: no converter recognises anything in the source.
@@ -87,7 +89,7 @@ def convert(
             be made.
         ImutoolError: the only sequence there is (or was asked for) failed; of several, failures go to the report.
     """
-    labels = Labels(sensor, parse_kinds(kinds))
+    labels = Labels(sensor, parse_kinds(kinds), parse_parts(imu))
     if format != AUTO and not hasattr(module := registry.load(GROUP, format), "sequences"):
         return _from_stream(module, source, out, sequences, labels, compression, images, overwrite, progress)
     source_sequences = _find(source, format)

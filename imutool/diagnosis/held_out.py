@@ -1,4 +1,4 @@
-"""Held-out residuals: root mean squares, gain of the findings, whiteness, resimulation."""
+"""Residuals behind the findings: held-out gain, whiteness, ringing, resimulation."""
 
 from __future__ import annotations
 
@@ -8,15 +8,17 @@ from dataclasses import replace
 import msgspec
 import numpy as np
 from jaxtyping import Float64
+from scipy.linalg import hankel
+from scipy.signal import welch
+from scipy.stats import chi2, ttest_1samp
 from scipy.stats import f as fisher
-from scipy.stats import ttest_1samp
 
 from imutool.diagnosis.estimation.aligned_log import AlignedLog, Pair
 from imutool.diagnosis.estimation.jacobians import Chosen, expected
 from imutool.diagnosis.estimation.noise_estimate import noise_std
 from imutool.diagnosis.estimation.whitening import WhitenedImu, WhitenedLog
-from imutool.diagnosis.result import Closer, HeldOut, Unexplained
-from imutool.diagnosis.settings import HeldOutSettings
+from imutool.diagnosis.result import Closer, Estimate, Finding, HeldOut, Unexplained
+from imutool.diagnosis.settings import HeldOutSettings, RingingSettings
 from imutool.errors import DataError
 from imutool.recording import Recording
 from imutool.sensor.effect import Acting, simulate_stretches
@@ -27,6 +29,7 @@ from imutool.sensor.trajectory import smooth_motion
 
 LEAST_NOISE = {"gyro": 1e-4, "accel": 1e-3}  # rad/s, m/s²: of a sensor without a usable axis
 AS_GOOD = 0.3  # of the noise: how far a simulation along the poses may be from the one that was given, and still stand for it
+MODES = 6  # order of the subspace model: the mode, and two that take up what is left
 MOST_OF_IT = 0.8  # of the held-out samples that the poses have to cover
 
 
@@ -138,6 +141,68 @@ def known_signals(logs: Sequence[WhitenedLog]) -> list[str]:
     """Signals with a usable axis."""
     axes = np.any([log.pair.axes for log in logs], axis=0)
     return [signal for signal, part in logs[0].pair.signals.items() if axes[part].any()]
+
+
+# ── what rings ──
+
+
+def ringing(logs: Sequence[WhitenedImu], after: Sequence[np.ndarray], settings: RingingSettings) -> list[Finding]:
+    """Finding of a mount that rings after shocks, from the residual of the accelerometer alone.
+
+    Shocks between two samples cannot be predicted; their free decay is seen all the same. Poles follow from the residual's
+    correlation (covariance-driven subspace identification: Peeters and De Roeck, MSSP 13, 1999), deviations from a jackknife.
+    """
+    if len(logs) != 1 or not logs[0].pair.exact or not logs[0].pair.axes[3:].any():
+        return []
+    (log,), rate_hz = logs, 1.0 / logs[0].pair.period_s
+    rows = np.asarray(log.pair.usable.any(axis=1))
+    residual = np.where(rows[:, None], log.pair.real - after[0], 0.0)[:, 3:][:, log.pair.axes[3:]]
+    residual = residual - residual.mean(axis=0)
+    f_hz, power = welch(residual, rate_hz, nperseg=min(settings.segment_samples, len(residual)), axis=0)
+    total = power.sum(axis=1)
+    seen = (f_hz >= settings.least_hz) & (f_hz <= 0.4 * rate_hz)
+    if not seen.any():
+        return []
+    peak = int(np.flatnonzero(seen)[np.argmax(total[seen])])
+    at = f_hz / f_hz[peak]
+    sides = [np.flatnonzero((at > low) & (at < high)) for low, high in ((0.4, 0.7), (1.4, 2.0))]
+    floor = max(float(np.median(total[side])) if len(side) else np.inf for side in sides)
+    if total[peak] < settings.peak_factor * floor:
+        return []
+    lags = int(np.clip(3.0 * rate_hz / f_hz[peak], 16, 256))
+    blocks = np.array([_correlation(block, 2 * lags) for block in np.array_split(residual, settings.blocks)])
+    poles = np.array([_pole(blocks.sum(axis=0) - left_out, rate_hz, float(f_hz[peak])) for left_out in [0.0, *blocks]])
+    (f0, zeta), others = poles[0], poles[1:]
+    std = np.sqrt((len(others) - 1) * ((others - others.mean(axis=0)) ** 2).mean(axis=0))
+    clear = np.isfinite(poles).all() and std[0] < 0.05 * f0 and 3.0 * std[1] < zeta
+    if not clear or not settings.least_damping < zeta < settings.most_damping:
+        return []
+    ratio = float(total[peak]) / floor
+    p_value = float(chi2.sf(2.0 * ratio * settings.blocks, 2 * settings.blocks))
+    parameters = {"f0": Estimate(float(f0), float(std[0]), "Hz"), "zeta": Estimate(float(zeta), float(std[1]), "-")}
+    text = "accel rings after shocks: exp(-zeta w0 t) cos(w0 sqrt(1 - zeta^2) t + phase), w0 = 2 pi f0; no sample predicts it"
+    length_s = round(float(rows.sum()) * log.pair.period_s, 1)
+    return [Finding("mount_resonance", "accel", 0.0, p_value, p_value, parameters, text, HeldOut(0.0, 0.0, "m/s^2", length_s))]
+
+
+def _correlation(x: Float64[np.ndarray, "n k"], lags: int) -> Float64[np.ndarray, " l"]:
+    """Correlation at lags from 1, summed over columns: without white noise, which is all at lag 0."""
+    return np.array([float((x[lag:] * x[:-lag]).sum()) for lag in range(1, lags + 1)])
+
+
+def _pole(c: Float64[np.ndarray, " l"], rate_hz: float, near_hz: float) -> tuple[float, float]:
+    """Frequency (Hz) and damping of the mode nearest to a frequency; NaN where there is none."""
+    n = len(c) // 2
+    now, later = (hankel(c[k : k + n], c[k + n - 1 : k + 2 * n - 1]) for k in (0, 1))
+    U, s, Vt = np.linalg.svd(now)
+    root = np.sqrt(s[:MODES])
+    A = (U[:, :MODES] / root).T @ later @ (Vt[:MODES].T / root)
+    z = np.log(np.linalg.eigvals(A).astype(complex)) * rate_hz
+    z = z[(z.imag > 0.0) & (z.real < 0.0)]
+    if not len(z):
+        return np.nan, np.nan
+    nearest = z[np.argmin(np.abs(np.abs(z) - 2.0 * np.pi * near_hz))]
+    return float(np.abs(nearest)) / (2.0 * np.pi), float(-nearest.real / np.abs(nearest))
 
 
 # ── a second simulation ──

@@ -219,7 +219,7 @@ def _runs(loud: np.ndarray, start_s: float, settings: ReferenceSettings) -> list
 
 
 def reference_caveat(recordings: Sequence[Recording]) -> str:
-    """Caveat on true poses that were estimated with the IMU itself, as their own description says; else empty."""
+    """Caveat on true poses that were estimated with the IMU, by their description; else empty."""
     texts = (str(text) for recording in recordings for record in recording.metadata.values() for text in record.values())
     if any("and IMU measurements" in text for text in texts):
         return "its poses were estimated with this very IMU, and hide errors of the gyro"

@@ -71,7 +71,7 @@ class SignificanceSettings(Settings, frozen=True):
 
 
 class TimestampSettings(Settings, frozen=True):
-    """Missing samples, jitter, digits and limits: by experience on blind cases and on the real logs."""
+    """Missing samples, jitter, digits, limits: by experience on blind cases and real logs."""
 
     median_samples: Count = 15  # of the running median that counts missing samples
     period_samples: Count = 500  # from which the period is found first
@@ -94,7 +94,7 @@ class TimestampSettings(Settings, frozen=True):
 
 
 class AlignmentSettings(Settings, frozen=True):
-    """Alignment of two IMUs in time: by experience on blind cases and on logs without a common epoch."""
+    """Alignment of two IMUs in time: by experience on blind cases and logs without an epoch."""
 
     least_s: Positive = 8.0  # of shared time: below, nothing can be fitted and tested
     align_hz: Positive = 100.0  # of the clock on which angular rates are correlated
@@ -216,6 +216,17 @@ class HeldOutSettings(Settings, frozen=True):
     few_samples_p_value: Share = 1e-3  # of a larger ratio, where few values are left
 
 
+class RingingSettings(Settings, frozen=True):
+    """Ringing of a mount in the residual: by experience on made-up shocks and on null cases."""
+
+    least_hz: Positive = 3.0  # of a mount
+    segment_samples: Count = 512  # of the spectrum
+    peak_factor: Positive = 8.0  # of the peak over the spectrum on both sides
+    blocks: Annotated[int, msgspec.Meta(ge=4)] = 8  # of the jackknife
+    least_damping: Positive = 0.005  # less is a line: a vibration
+    most_damping: Share = 0.35  # more is no peak
+
+
 class DiagnoseSettings(Settings, frozen=True):
     """All settings of `imutool diagnose`."""
 
@@ -231,3 +242,4 @@ class DiagnoseSettings(Settings, frozen=True):
     reference: ReferenceSettings = ReferenceSettings()
     localization: LocalizationSettings = LocalizationSettings()
     held_out: HeldOutSettings = HeldOutSettings()
+    ringing: RingingSettings = RingingSettings()

@@ -18,7 +18,15 @@ from imutool.diagnosis.estimation.jacobians import Chosen, expected
 from imutool.diagnosis.estimation.timestamps import late_stamps
 from imutool.diagnosis.estimation.unnamed_effects import SplineCurve
 from imutool.diagnosis.estimation.whitening import WhitenedImu, WhitenedLog
-from imutool.diagnosis.held_out import gains, held_out_rms, known_signals, noise_floor, unexplained_residuals, with_effects
+from imutool.diagnosis.held_out import (
+    gains,
+    held_out_rms,
+    known_signals,
+    noise_floor,
+    ringing,
+    unexplained_residuals,
+    with_effects,
+)
 from imutool.diagnosis.localization import locate_findings, locate_residual
 from imutool.diagnosis.reference import at_limit, unusable_axes
 from imutool.diagnosis.result import Curve, Diagnosis, Estimate, Finding, Located, Traces
@@ -28,6 +36,7 @@ from imutool.inertial.stationary import white_noise
 from imutool.sensor.physics_file import PhysicsFile
 from imutool.units import AXES, SENSORS, UNITS
 
+RESONANT = {"mount_resonance", "vibration", "timestamp_jitter"}
 JITTER, QUANTIZATION = "timestamp_jitter", "quantization"
 SHOWN_KNOTS = 41  # of a curve without a name in the report
 MOVES = 5.0  # times its noise: an axis should have moved so much to be called stuck
@@ -59,6 +68,8 @@ def summarize(
     )
     if not exact:
         all_findings += late_stamps(pairs)
+    elif not any(finding.effect in RESONANT for finding in all_findings):
+        all_findings += ringing(logs, after, settings.ringing)
     findings = [finding for finding in all_findings if not shared(finding, sim_findings)]
     both = zip(selection.selected, named, strict=True)
     expected_too = {effect.effect.key for effect, finding in both if shared(finding, sim_findings)}
@@ -71,9 +82,8 @@ def summarize(
     discounted = expected_too | {JITTER}  # where stamps are wrong, signals are not
     baseline = [with_effects(pair, tuple(entry for entry in chosen if entry[0].key in discounted)) for pair in pairs]
     unexplained = unexplained_residuals(logs, after, noise, settings.held_out)
-    if findings:
-        located = locate_findings(pairs, baseline, after, noise, findings, p_values, settings.localization)
-    else:  # where something is left all the same, it is said where
+    located = locate_findings(pairs, baseline, after, noise, findings, p_values, settings.localization) if findings else []
+    if not located:  # where something is left all the same, it is said where
         coloured = {signal for signal, residual in unexplained.items() if not residual.white}
         located = [at for at in locate_residual(pairs, after, noise, settings.localization) if at.signal in coloured]
     located += [place for pair in pairs for place in _stuck(pair, noise, several=len(reals) > 1)]

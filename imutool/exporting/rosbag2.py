@@ -10,6 +10,7 @@ from pathlib import Path
 
 from imutool.errors import ConfigError, LogError
 from imutool.exporting import ExportReport, Progress
+from imutool.location import identity
 from imutool.mcap_io.log import Log
 from imutool.mcap_io.storage.target import SIGNATURE, FolderTarget, writing
 
@@ -25,6 +26,7 @@ QOS_NUMBERS = {  # as rmw numbers them; names came with version 9
 
 def write(log: Path, out: Path, overwrite: bool, tell: Progress) -> ExportReport:
     """Writes the folder `out`; the arguments are those of `imutool.export`."""
+    before = identity(log)
     with Log(log) as opened:
         _check_readable(opened)
         name = f"{out.absolute().name}_0.mcap"
@@ -33,6 +35,8 @@ def write(log: Path, out: Path, overwrite: bool, tell: Progress) -> ExportReport
     holds = r"metadata\.yaml|.*_\d+\.mcap"
     with FolderTarget(out, log, signed="metadata.yaml", holds=holds, overwrite=overwrite) as folder, writing(out):
         _copy(log, folder / name, tell)
+        if identity(log) != before:  # the index and the bytes are of two logs
+            raise LogError("changed while it was copied", where=log, fix="Wait until it is complete")
         (folder / "metadata.yaml").write_text(text, encoding="utf-8", newline="\n")
     return ExportReport(out, "rosbag2", None, counts)
 

@@ -22,10 +22,9 @@ from typing import Any, Protocol
 import msgspec
 
 from imutool.conversion.worker_pool import ONE_THREAD, WorkerBugError, WorkerPool
-from imutool.errors import ConfigError, LogError
+from imutool.errors import ConfigError, LogError, redact
 from imutool.fleet.task import Result, Task
 from imutool.fleet.work import work
-from imutool.location import redact
 
 AHEAD = 2  # tasks in flight for each that can be worked on: the next one is there when one ends
 POLL_S = 0.5

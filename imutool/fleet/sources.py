@@ -9,9 +9,9 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from imutool.errors import ConfigError
+from imutool.errors import ConfigError, redact
 from imutool.fleet.task import Source
-from imutool.location import Location, identity, io_errors, reason, redact, size_and_etag, to_location
+from imutool.location import Location, identity, io_errors, reason, size_and_etag, to_location
 
 LOG, BAG = ".mcap", ".bag"
 PATTERN = re.compile(r"[*?\[]")

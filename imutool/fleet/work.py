@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
-import json
 import os
 import platform
 import resource
@@ -26,7 +25,7 @@ from imutool.location import Location, identity, to_location
 from imutool.mcap_io.log import Log
 from imutool.mcap_io.storage.source import sha256
 from imutool.mcap_io.storage.target import Target
-from imutool.report import UNSET, Report, UnsetType, json_values
+from imutool.report import UNSET, Report, UnsetType, json_text, json_values
 
 LOST = 3  # exit code: something of the log was lost
 MOST_LOSSES = 20  # stretches listed for a log; its metadata and its repair list all
@@ -282,7 +281,7 @@ def _simulation(folder: Location, name: str) -> Location:
 def write_json(report: Report, target: Location) -> None:
     """Write a report as JSON; an existing file is replaced."""
     with Target(target, overwrite=True) as out:
-        out.write(json.dumps(json_values(report), indent=2, allow_nan=False, ensure_ascii=False).encode() + b"\n")
+        out.write(json_text(report).encode())
 
 
 COMMANDS: dict[str, Callable[[_Job], dict[str, Any]]] = {

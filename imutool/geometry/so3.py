@@ -46,7 +46,7 @@ _SERIES = {
     torch.float64: _Series(below=0.25, terms=9, atan_below=1e-2, atan_terms=9),
 }
 
-# sin(x)/x, (1 - cos x)/x², (x - sin x)/x³ and 1/x² - cot(x/2)/(2x), each as a series in s = x².
+# sin(x)/x, (1 - cos x)/x² and 1/x² - cot(x/2)/(2x), each as a series in s = x².
 _SINC = (
     1.0,
     -1 / 6,
@@ -59,7 +59,6 @@ _SINC = (
     1 / 355687428096000,
 )
 _VERSINE = tuple(c / (2 * k + 2) for k, c in enumerate(_SINC))
-_DEFECT = tuple(c / ((2 * k + 2) * (2 * k + 3)) for k, c in enumerate(_SINC))
 _HALF_COT = (  # |B_2k+2| / (2k+2)!, Bernoulli numbers
     1 / 12,
     1 / 720,
@@ -98,15 +97,6 @@ def log(R: Rotations) -> Vectors:
     q = quaternion_wxyz_from_matrix(R)
     w, v = q[..., :1], q[..., 1:]
     return 2.0 * _atan2_over(_squared(v).unsqueeze(-1), w) * v
-
-
-def right_jacobian(xi: Vectors) -> Rotations:
-    """Right Jacobian J_r(xi) = I - (1 - cos a)/a² [xi]x + (a - sin a)/a³ [xi]x².
-
-    It is the mean of Exp(-u xi) over u in [0, 1].
-    """
-    s = _squared(xi)
-    return _quadratic(xi, s, -_versine(s), _defect(s))
 
 
 def right_jacobian_inverse(xi: Vectors) -> Rotations:
@@ -192,11 +182,6 @@ def _versine(s: Angles2) -> Angles2:
     small, value, angle = _branches(s, _VERSINE)
     half = 0.5 * angle
     return torch.where(small, value, 0.5 * (half.sin() / half).square())
-
-
-def _defect(s: Angles2) -> Angles2:
-    small, value, angle = _branches(s, _DEFECT)
-    return torch.where(small, value, (angle - angle.sin()) / angle**3)
 
 
 def _half_cot(s: Angles2) -> Angles2:

@@ -14,8 +14,6 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Float64
-from scipy.interpolate import BSpline, make_interp_spline, make_lsq_spline
-from scipy.spatial.transform import Rotation
 
 from imutool.errors import DataError, NumericsError
 from imutool.recording import GRAVITY_M_S2, Imu, Poses, Times, seconds
@@ -26,6 +24,7 @@ G_W = np.array([0.0, 0.0, -GRAVITY_M_S2])
 G_W.flags.writeable = False
 
 Vectors = Float64[np.ndarray, "n 3"]
+Spline = Any  # a BSpline: scipy.interpolate is imported where one is made, for its import takes 0.2 s
 
 
 def lever_acceleration(omega: Any, alpha: Any, arms: Any) -> tuple[Any, Any, Any]:
@@ -64,17 +63,19 @@ class Motion:
         """
         if r_b is None:
             return self.a_w
-        return self.a_w + self._rotation().apply(self._lever(r_b))
+        return np.asarray(self.a_w + self._rotation().apply(self._lever(r_b)))
 
     def specific_force(self, r_b: Float[np.ndarray, "3"] | None = None, g_w: Float[np.ndarray, "3"] = G_W) -> Vectors:
         """Specific force at `r_b` in the body frame (m/s²): R_wb^T (a_w - g_w); at rest +g up."""
         force = self._rotation().apply(self.a_w - g_w, inverse=True)
-        return force if r_b is None else force + self._lever(r_b)
+        return np.asarray(force if r_b is None else force + self._lever(r_b))
 
     def _lever(self, r_b: Float[np.ndarray, "3"]) -> Vectors:
         return np.stack(lever_acceleration(self.omega_b.T, self.alpha_b.T, (r_b, r_b, r_b)), axis=1)
 
-    def _rotation(self) -> Rotation:
+    def _rotation(self) -> Any:
+        from scipy.spatial.transform import Rotation
+
         return Rotation.from_quat(self.q_wb_wxyz, scalar_first=True)
 
 
@@ -86,8 +87,8 @@ class Trajectory:
     """
 
     start_ns: int
-    position: BSpline
-    quaternion: BSpline
+    position: Spline
+    quaternion: Spline
 
     def at(self, t_ns: Times) -> Motion:
         """Motion at some instants.
@@ -150,6 +151,8 @@ def fit_trajectory(poses: Poses, knot_spacing_s: float | None = None, degree: in
     Raises:
         DataError: too few poses, or a gap with knots but without poses.
     """
+    from scipy.interpolate import make_interp_spline, make_lsq_spline
+
     if len(poses) <= degree:
         raise DataError(f"{len(poses)} true poses", expected=f"more than {degree} for a spline of degree {degree}")
     t = seconds(poses.t_ns, int(poses.t_ns[0]))

@@ -25,7 +25,6 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float64, Int64
-from scipy.spatial.transform import Rotation
 
 from imutool.errors import DataError, NumericsError
 from imutool.geometry import quaternion
@@ -135,7 +134,7 @@ def relative(
     return {"roe_deg": roe, "rpe_m": rpe}
 
 
-def align(p: Points, p_target: Points) -> tuple[Rotation, Float64[np.ndarray, "3"]] | None:
+def align(p: Points, p_target: Points) -> tuple[Any, Float64[np.ndarray, "3"]] | None:
     """Rotation and shift of the least-squares alignment of points.
 
     Umeyama 1991, eq. 40-42, scale 1.
@@ -153,6 +152,8 @@ def align(p: Points, p_target: Points) -> tuple[Rotation, Float64[np.ndarray, "3
     if np.count_nonzero(size > FLAT) < 2:
         return None
     mirror = np.diag([1.0, 1.0, np.sign(np.linalg.det(u) * np.linalg.det(vt))])  # a rotation, not a reflection
+    from scipy.spatial.transform import Rotation
+
     turn = Rotation.from_matrix(u @ mirror @ vt)
     return turn, centre_target - turn.apply(centre)
 

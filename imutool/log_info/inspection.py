@@ -126,7 +126,7 @@ def _imu(log: Log, topic: Topic, truth: Truth | None) -> ImuInfo:
         "duplicated": len(t_ns) - len(np.unique(t_ns)),
         "missing": _missing(np.unique(t_ns)),
         "not_finite": int((~finite).sum()),
-        "saturated": int((_saturated(gyro) | _saturated(accel)).sum()),
+        "saturated": int((_saturated(gyro[finite]) | _saturated(accel[finite])).sum()),
     }
     rest = _rest(imu)
     return ImuInfo(
@@ -208,7 +208,7 @@ def _imu_warnings(counts: Mapping[str, int], imu: Imu, truth: Truth | None) -> l
         "out_of_order": "samples out of order",
         "duplicated": "samples with a repeated stamp",
         "missing": "samples missing",
-        "not_finite": "samples that are not finite",
+        "not_finite": "samples that are not finite, or beyond any sensor",
         "saturated": "samples saturated",
     }
     warnings = [f"{counts[key]} {text}" for key, text in words.items() if counts[key]]

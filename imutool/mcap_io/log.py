@@ -22,7 +22,17 @@ from imutool.mcap_io.codec.decode import decode_image
 from imutool.mcap_io.codec.records import HEAD, keep_buffers
 from imutool.mcap_io.index import LogIndex
 from imutool.mcap_io.storage.source import Source
-from imutool.mcap_io.topics import ENCODINGS, MESSAGE_POSES, SCALARS, ImuBatch, PoseBatch, ScalarBatch, StampCheck, Topic
+from imutool.mcap_io.topics import (
+    ENCODINGS,
+    MESSAGE_POSES,
+    PART_KEY,
+    SCALARS,
+    ImuBatch,
+    PoseBatch,
+    ScalarBatch,
+    StampCheck,
+    Topic,
+)
 
 
 class Log:
@@ -96,8 +106,8 @@ class Log:
 
     @property
     def imu_topics(self) -> list[str]:
-        """Topics with IMU messages, without those that imutool computed."""
-        return [t.name for t in self.with_schema((schemas.IMU,)) if not t.is_derived]
+        """Topics with IMU messages, without those that imutool computed, and without single sensors of an IMU."""
+        return [t.name for t in self.with_schema((schemas.IMU,)) if not t.is_derived and PART_KEY not in t.metadata]
 
     def only_imu(self) -> str:
         """The log's IMU, where there is exactly one.
@@ -187,7 +197,9 @@ class Log:
                     continue
                 indexed = sorted(channels & block.indexes.keys()) if block.trusted and not block.edited else []
                 entries = [self.index.entries(block, c) for c in indexed]
-                if indexed and all(len(entry) for entry in entries):
+                if len(entries) == 1 and len(entries[0]) == 1:
+                    yield messages.signed(entries[0][:, 0])
+                elif indexed and all(len(entry) for entry in entries):
                     table = np.concatenate(entries)
                     yield messages.signed(table[np.argsort(table[:, 1], kind="stable"), 0])
                 elif (found := self.index.unpack_or_lose(block)) is not None:

@@ -17,6 +17,7 @@ from imutool.mcap_io.codec.messages import Rows
 
 ENCODINGS = ("cdr", "ros1")
 DERIVED_KEY = "imutool_source_topic"  # channel metadata: computed by imutool from this topic
+PART_KEY = "imutool_part_of"  # channel metadata: one sensor of the IMU on that topic
 KIND_KEY = "imutool_kind"  # channel metadata of poses: truth, estimate, odometry or unknown
 KIND_WORDS = {  # in the names of topics
     "truth": "ground_truth|groundtruth|gt|truth|mocap|vicon|vrpn|optitrack|qualisys|natnet",

@@ -87,5 +87,6 @@ class MessageLog:
     scalars: Mapping[str, Scalars] = field(default_factory=dict)
     tables: Mapping[str, Table] = field(default_factory=dict)
     kinds: Mapping[str, str] = field(default_factory=dict)
+    pairs: Mapping[str, tuple[str, str]] = field(default_factory=dict)  # IMU topic: topics of its gyro and accelerometer
     metadata: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
     remarks: Remarks = field(default_factory=Remarks)

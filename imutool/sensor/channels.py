@@ -1,4 +1,4 @@
-"""Channels of a log that may drive a sensor: numeric fields of all messages but the reference's.
+"""Channels of a log that may drive a sensor: numeric fields of messages of any kind.
 
 Left out are poses and IMUs, constants, enumerations, counters and clocks, covariances, stamps, copies of another channel, and
 what the reference or imutool itself brings: a ground truth's bias estimate explains a misfit without being its cause.
@@ -30,7 +30,7 @@ REFERENCE_WORDS = ("ground_truth", "groundtruth")
 
 @dataclass(frozen=True)
 class Channels:
-    """Recording with its channels, names of the fields that were added, and of those that were not tried."""
+    """Recording with its channels; names of the fields that were added, and not tried."""
 
     recording: Recording
     added: tuple[str, ...]
@@ -50,7 +50,7 @@ class Channels:
 
 
 def with_channels(recording: Recording, path: Location) -> Channels:
-    """Recording whose scalars are all channels that may drive its sensor, as TOPIC or TOPIC.field.
+    """Recording with all channels that may drive its sensor, as TOPIC or TOPIC.field.
 
     Raises:
         ConfigError, LogError: the log cannot be opened, or is damaged.
@@ -68,7 +68,7 @@ def with_channels(recording: Recording, path: Location) -> Channels:
 
 
 def brought_by_reference(topic: str, recording: Recording) -> bool:
-    """Whether a topic belongs to a truth of the recording, or was computed by imutool from its IMU."""
+    """Whether a topic belongs to a truth of the recording, or was computed from its IMU."""
     folders = {truth.rpartition("/")[0] for truth in recording.truths} - {"", "/"}
     computed = (f"{recording.imu_topic}/debiased", f"{recording.imu_topic}/bias/") if recording.imu_topic else ()
     return (

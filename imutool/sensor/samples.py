@@ -11,11 +11,10 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from types import MappingProxyType
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float64
-from scipy.ndimage import spline_filter1d
-from scipy.sparse import csr_array
 
 from imutool.errors import DataError
 from imutool.recording import Recording, seconds
@@ -30,7 +29,7 @@ UNEVEN = 1e-2  # of a period: how far the even clock may be from even
 SAME_S = 1e-7  # a stamp's rounding; the fastest motion goes nowhere in it
 INSTANTS, RECENT = 3, 8  # entries that a sampler keeps: sets of instants, and columns
 NOTHING: Mapping[str, Float64[np.ndarray, " n"]] = MappingProxyType({})
-Instants = tuple[Float64[np.ndarray, " n"], Float64[np.ndarray, " m"], csr_array | None]
+Instants = tuple[Float64[np.ndarray, " n"], Float64[np.ndarray, " m"], Any]  # the last a csr_array or None
 
 
 class Sampler:
@@ -111,7 +110,7 @@ def _fixed(x: Float64[np.ndarray, "n k"]) -> Float64[np.ndarray, "n k"]:
     return x
 
 
-def _weights(t_s: Float64[np.ndarray, " n"], taken_s: Float64[np.ndarray, " m"]) -> csr_array:
+def _weights(t_s: Float64[np.ndarray, " n"], taken_s: Float64[np.ndarray, " m"]) -> Any:
     """The four cubic B-splines that reach each instant."""
     n, period_s = len(t_s), (t_s[-1] - t_s[0]) / (len(t_s) - 1)
     off = np.abs(t_s - (t_s[0] + period_s * np.arange(n)))
@@ -125,6 +124,8 @@ def _weights(t_s: Float64[np.ndarray, " n"], taken_s: Float64[np.ndarray, " m"])
     inner = [2.0 / 3.0 - x**2 + x**3 / 2.0 for x in (u, v)]
     values = np.stack([v**3 / 6.0, *inner, u**3 / 6.0], axis=1)
     columns = (first + PAD - 1)[:, None] + np.arange(4)
+    from scipy.sparse import csr_array
+
     return csr_array((values.ravel(), columns.ravel(), 4 * np.arange(len(at) + 1)), shape=(len(at), n + 2 * PAD))
 
 
@@ -134,6 +135,8 @@ def _coefficients(x: Float64[np.ndarray, "n k"]) -> Float64[np.ndarray, "m k"]:
     padded = np.concatenate([2.0 * x[0] - x[beyond[::-1]], x, 2.0 * x[-1] - x[len(x) - 1 - beyond]])
     if not x.shape[1]:
         return padded
+    from scipy.ndimage import spline_filter1d
+
     return np.ascontiguousarray(spline_filter1d(np.ascontiguousarray(padded.T), 3, axis=1).T)
 
 

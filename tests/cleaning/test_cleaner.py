@@ -10,8 +10,8 @@ from support.imu_defects import batch_of, cut, late, pick, repeated, with_values
 
 from imutool.cleaning.cleaner import Cleaner
 from imutool.cleaning.first_pass import Survey, examine
+from imutool.cleaning.rule import CleaningSettings, every
 from imutool.cleaning.samples import BLOCK, blocks, padded
-from imutool.cleaning.settings import CleaningSettings, every
 from imutool.errors import LogError
 from imutool.mcap_io.topics import ImuBatch, StampCheck
 from imutool.report import json_values

@@ -11,7 +11,7 @@ from support.imu_defects import batch_of, late, pick, repeated, with_values, wit
 
 from imutool.cleaning.finding import Finding
 from imutool.cleaning.first_pass import Survey, examine
-from imutool.cleaning.settings import CleaningSettings
+from imutool.cleaning.rule import CleaningSettings
 from imutool.cleaning.truth import Truth
 from imutool.mcap_io.topics import ImuBatch
 from imutool.recording import GRAVITY_M_S2, Poses

@@ -143,7 +143,7 @@ def test_a_diagnosis_stays_where_one_is(diagnosed: tuple[Path, Done]) -> None:
     before = {path.name: path.read_bytes() for path in place.iterdir()}
     said = run("diagnose", place.parent / "arm.mcap", "-o", place)
     assert said.exit_code == ConfigError.exit_code
-    assert "holds a diagnosis already" in said.stderr
+    assert "the target exists" in said.stderr
     assert {path.name: path.read_bytes() for path in place.iterdir()} == before
 
 
@@ -183,6 +183,12 @@ def test_a_setting_reaches_the_search(folder: Path, tmp_path: Path) -> None:
     done = run(*words, "--set", "search.false_discovery_rate=1e-300", "--quiet")
     assert done.exit_code == 0, done.output
     assert json.loads(done.stdout)["findings"] == []
+
+
+def test_a_setting_reaches_the_alignment(folder: Path) -> None:
+    done = run("diagnose", folder / "arm.mcap", "--set", "alignment.least_s=1000", "--quiet")
+    assert done.exit_code == 0, done.output
+    assert "no stretch of 1000 s" in done.stdout
 
 
 @pytest.mark.parametrize("word", ["search.false_discovery=1e-3", "search.false_discovery_rate=2", "band.sigma=none"])

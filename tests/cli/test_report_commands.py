@@ -8,18 +8,22 @@ from dataclasses import replace
 from pathlib import Path
 from urllib.parse import unquote
 
+import numpy as np
 import pytest
 from support import diagnoses
 from typer.testing import CliRunner, Result
 
 from imutool import diagnosis_output
 from imutool.cli import load
-from imutool.errors import DataError
+from imutool.errors import DataError, ModelError
 from imutool.fleet import page as fleet_page
 from imutool.fleet.task import Result as Done
 from imutool.fleet.task import Settings, Source, Task, with_model_hash
 from imutool.fleet.work import is_current, work
 from imutool.location import identity
+from imutool.mcap_io.read import read
+from imutool.mcap_io.write import write
+from imutool.recording import Imu
 from imutool.viewing.html import report, report_paths
 
 HOSTILE = "a#b?<b>&'%41"
@@ -123,3 +127,15 @@ def test_a_fleet_replaces_its_own_page_and_nobody_elses(task: Task, tmp_path: Pa
 def test_without_pages_a_summary_leads_nowhere() -> None:
     done = Done(key="k", source="a.mcap", target="a.mcap", status="ok")
     assert "<a " not in fleet_page.html([done], Settings(command="debias"), seconds=1.0, source="logs")
+
+
+def test_evaluate_scores_the_other_models_and_names_the_one_that_does_not_apply(logs: Path, tmp_path: Path) -> None:
+    flown = read(logs / "flight_2.mcap")
+    shaken = 0.5 * np.sin(np.arange(len(flown.imu)) / 20.0)[:, None]
+    write(replace(flown, imu=Imu(flown.imu.t_ns, flown.imu.gyro + shaken, flown.imu.accel)), tmp_path / "restless.mcap")
+    words = ["--model", "static", "--model", logs / "linear.safetensors", "--json", tmp_path / "said.json"]
+    done = run("evaluate", tmp_path / "restless.mcap", *words)
+    assert done.exit_code == ModelError.exit_code, done.output
+    results = json.loads((tmp_path / "said.json").read_text())["results"]
+    assert [row["model"] for row in results] == ["raw", "linear"]
+    assert "the model static is not scored" in done.output

@@ -17,6 +17,7 @@ from rosbags.rosbag1 import Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from imutool.converters import ros1_bag
+from imutool.mcap_io.read import read
 
 STORE = get_typestore(Stores.ROS1_NOETIC)
 STORE.register(
@@ -236,3 +237,37 @@ def test_a_kind_goes_to_the_poses_it_names(convert, tmp_path):
     assert wrong.returncode == 3
     assert "expected /husky/odom" in wrong.stderr
     assert "--kind" in wrong.stderr
+
+
+def write_split_bag(path: Path, gyro_topic: str, accel_topic: str) -> Path:
+    """A gyro at 200 Hz and an accelerometer at 62.5 Hz, two milliseconds late, each in messages with zeros for the other."""
+    with Writer(path) as bag:
+        gyro, accel = (bag.add_connection(topic, "sensor_msgs/msg/Imu", typestore=STORE) for topic in (gyro_topic, accel_topic))
+        samples = [(START_NS + n * 5_000_000, gyro, vector(0.1, 0.001 * n, 0.3), vector(0.0, 0.0, 0.0)) for n in range(400)]
+        for n in range(125):
+            t_ns = START_NS + 2_000_000 + n * 16_000_000
+            samples.append((t_ns, accel, vector(0.0, 0.0, 0.0), vector((t_ns - START_NS) * 1e-9, 0.5, 9.8)))
+        for t_ns, connection, rate, force in sorted(samples, key=lambda sample: sample[0]):
+            message = imu(t_ns, 0)
+            message.angular_velocity, message.linear_acceleration = rate, force
+            bag.write(connection, t_ns, STORE.serialize_ros1(message, message.__msgtype__))
+    return path
+
+
+@pytest.mark.parametrize(
+    ("topics", "options", "whole"),
+    [
+        (("/camera/gyro/sample", "/camera/accel/sample"), (), "/camera/imu"),
+        (("/a", "/b"), ("--imu", "gyro=/a,accel=/b"), "/imu"),
+    ],
+)
+def test_a_gyro_and_an_accelerometer_of_their_own_become_one_imu(convert, tmp_path, topics, options, whole):
+    done = convert(write_split_bag(tmp_path / "run.bag", *topics), tmp_path / "run.mcap", *options)
+    assert done.returncode == 0, done.stderr
+    assert "gyro at 200.0 Hz and accelerometer at 62.5 Hz became one IMU" in done.stderr
+    recording = read(tmp_path / "run.mcap")  # the only IMU: the two sensors are its parts
+    assert recording.imu_topic == whole
+    t_s = (recording.imu.t_ns - START_NS) * 1e-9
+    np.testing.assert_allclose(recording.imu.accel[:, 0], t_s, atol=1e-9)
+    np.testing.assert_allclose(recording.imu.gyro[:, 1], 0.001 * t_s / 0.005, atol=1e-9)
+    assert [len(decoded(tmp_path / "run.mcap")[topic]) for topic in topics] == [400, 125]

@@ -12,10 +12,9 @@ from typing import Any
 import numpy as np
 
 from imutool.cleaning.finding import Finding, Severity
-from imutool.cleaning.rule import Rule, TopicSummary
+from imutool.cleaning.rule import CleaningSettings, Rule, TopicSummary
 from imutool.cleaning.rules.axes import tilt_misfit
 from imutool.cleaning.samples import Motion, Samples
-from imutool.cleaning.settings import CleaningSettings
 from imutool.cleaning.truth import Truth, turning
 from imutool.recording import GRAVITY_M_S2, Imu, seconds
 

@@ -1,4 +1,4 @@
-"""Candidate effects: their score, by the gain of one linear step, and those that are selected."""
+"""Candidate effects: their score by the gain of one linear step, and the selected ones."""
 
 from __future__ import annotations
 

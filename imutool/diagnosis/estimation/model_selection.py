@@ -26,6 +26,7 @@ from imutool.diagnosis.estimation.observability import (
     plausible_part,
     unidentified,
     values_of,
+    with_free,
     without_implausible,
 )
 from imutool.diagnosis.estimation.significance import (
@@ -202,8 +203,9 @@ class _Search:
         share = self.settings.common_arm_share
         if without.objective - simple.objective < share * (without.objective - now.objective):
             return now
-        both = fit(self.logs, (*simple.chosen, (size_effect, size_effect.null_value.astype(float))), near=now)
-        return both if self.candidates.log_p(size_effect, simple.objective - both.objective) < self.threshold else simple
+        rest = with_free(size_effect, range(6))  # of the x and y axes against z, whose arm is the lever arm
+        both = fit(self.logs, (*simple.chosen, (rest, rest.null_value.astype(float))), near=simple)
+        return both if self.candidates.log_p(rest, simple.objective - both.objective) < self.threshold else simple
 
     def pruned(self, now: Fit) -> Fit:
         """The fit without effects that the others have made superfluous."""

@@ -12,6 +12,7 @@ from imutool.diagnosis.wording.effect_sentences import has_gain, label, named_se
 from imutool.diagnosis.wording.quantity import percent, symbol
 from imutool.units import UNITS
 
+NO_EXPLANATION = "has no explanation yet"
 QUIET = "nothing else stands above the noise"
 UNKNOWN = "What should have been read is not known, and by themselves the samples show nothing amiss."
 NULL = "Nothing but a constant bias and noise separates the two."
@@ -35,7 +36,7 @@ def conclusion(d: Diagnosis) -> str:
 
 
 def headline(d: Diagnosis) -> str:
-    """The answer in one sentence: what differs, how much of it the findings remove, what is left."""
+    """Answer in one sentence: what differs, how much the findings remove, what is left."""
     if not d.mismatch:
         return NULL if d.unexplained else UNKNOWN
     unnamed = _unnamed_place(d)
@@ -45,8 +46,10 @@ def headline(d: Diagnosis) -> str:
     elif all(_residual(d, signal) == QUIET for signal in d.unexplained):
         parts.append(QUIET)
     elif d.findings:
-        left = [signal for signal in d.unexplained if _residual(d, signal) != QUIET]
-        parts.append(f"{_the(' and '.join(left))} {'keep' if len(left) > 1 else 'keeps'} a misfit that has no name")
+        left = [signal for signal in d.unexplained if _residual(d, signal) != QUIET and not _rings(d, signal)]
+        parts += (
+            [f"{_the(' and '.join(left))} {'keep' if len(left) > 1 else 'keeps'} a misfit that has no name"] if left else []
+        )
     if d.caveat and d.sim is None:
         parts.append(d.caveat)
     return f"{_upper('; '.join(parts))}." if parts else NULL
@@ -129,7 +132,7 @@ def rms_text(held_out: HeldOut) -> str:
 
 
 def improvement(closer: Closer) -> str:
-    """`rms 0.52 to 0.19 m/s², 87 % of the misfit removed`, or `as before` where nothing was found."""
+    """`rms 0.52 to 0.19 m/s², 87 % of the misfit removed`, or `as before` without a change."""
     if not closer.rms_before > 0.0 or abs(closer.rms_after / closer.rms_before - 1.0) < AS_BEFORE:
         return f"rms {closer.rms_before:.3g} {symbol(closer.unit)}, as before".replace(" ,", ",")
     if closer.share is None or closer.share <= 0.0:
@@ -166,7 +169,7 @@ def residual_text(residual: Unexplained, unit: str, of: str = "") -> str:
     rms, floor = f"{residual.rms:.3g}", f"{residual.noise_floor:.3g} {symbol(unit)}".strip()
     what = f"what remains of {of}" if of else "what remains"
     if residual.rms > ABOVE * residual.noise_floor:
-        return f"{what} is {rms} against {floor} of noise, and has no explanation yet"
+        return f"{what} is {rms} against {floor} of noise, and {NO_EXPLANATION}"
     return QUIET if residual.white else f"{what} is as small as the noise, but not white"
 
 
@@ -210,10 +213,16 @@ def _unusable(place: Located) -> str:
     return f"{_upper(_the(place.signal))}'s {', '.join(place.axes)} is no measurement: {place.reason}."
 
 
+def _rings(d: Diagnosis, signal: str) -> bool:
+    """Whether a mount rings, which is a name for a residual that no sample predicts."""
+    return any(f.effect == "mount_resonance" and f.signal == signal and not has_gain(f) for f in d.findings)
+
+
 def _residual(d: Diagnosis, signal: str) -> str:
     """Residual of a signal as text."""
     units = {finding.signal: finding.held_out.unit for finding in d.findings} | UNITS
-    return residual_text(d.unexplained[signal], units.get(signal, ""), _the(signal))
+    text = residual_text(d.unexplained[signal], units.get(signal, ""), _the(signal))
+    return text.replace(NO_EXPLANATION, "rings") if _rings(d, signal) else text
 
 
 def _the(signal: str) -> str:

@@ -63,6 +63,13 @@ def _unknown(w: Words) -> str:
     return f"{w.finding.equation}, with {w.main.labelled}; this has no name among the known effects"
 
 
+def _mount_resonance(w: Words) -> str:
+    """A resonance that the motion excites, or one that shocks excite, which no sample predicts."""
+    if has_gain(w.finding):
+        return f"the mount swings at {w.main}"
+    return f"the mount rings after shocks at {w.main}, which no sample predicts"
+
+
 SENTENCES: Mapping[str, str | Callable[[Words], str]] = {
     "gyro_bias": "{w.it} reads a constant {w.main} too much",
     "accel_bias": "{w.it} reads a constant {w.main} too much",
@@ -89,7 +96,7 @@ SENTENCES: Mapping[str, str | Callable[[Words], str]] = {
     "gravity": "gravity differs from what {w.other} takes it for, {w.main.labelled}",
     "earth_rotation": "{w.it} feels the Earth turn, {w.main.labelled}",
     "vibration": "{w.it} vibrates at {w.main}",
-    "mount_resonance": "the mount swings at {w.main}",
+    "mount_resonance": _mount_resonance,
     "temperature": "{w.it} follows the temperature, with {w.main}",
     "dropped_samples": "samples are missing, {w.main.labelled}",
     "timestamp_jitter": "samples are late by turns, {w.main.labelled}",

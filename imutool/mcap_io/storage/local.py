@@ -76,12 +76,28 @@ class LocalFile:
         """Make all bytes readable under the temporary name."""
         self.file.flush()
 
-    def publish(self) -> None:
-        """Rename the file to its place, and settle both on the disk."""
+    def publish(self, *, replace: bool) -> None:
+        """Rename the file to its place, and settle both on the disk; without `replace`, a file that came meanwhile stays.
+
+        Raises:
+            FileExistsError: such a file came.
+        """
         os.fsync(self.file.fileno())
         self.file.close()
-        self.temporary.replace(self.path)
+        if replace or not self._link():
+            self.temporary.replace(self.path)
         _settle(self.path.parent)
+
+    def _link(self) -> bool:
+        """Link the file to its place, which no other can do at the same time; False if the file system has no links."""
+        try:
+            os.link(self.temporary, self.path)
+        except FileExistsError:
+            raise
+        except OSError:
+            return False
+        self.temporary.unlink(missing_ok=True)
+        return True
 
     def discard(self) -> None:
         """Remove the temporary file, silently if that fails."""
@@ -102,7 +118,7 @@ class Stream(LocalFile):
         """Open the temporary file."""
         self.file = self.temporary.open("xb")
 
-    def publish(self) -> None:
+    def publish(self, *, replace: bool) -> None:
         """Write everything to the device or pipe; a pipe waits for its reader."""
         sys.stdout.flush()
         number = STANDARD.get(str(self.path)) or _open_number(self.path)

@@ -57,6 +57,8 @@ class Target:
             yield
         except ConfigError:
             raise
+        except FileExistsError as error:
+            raise ConfigError("the target exists", where=self.path, fix="Another program wrote it meanwhile") from error
         except io_errors(self.path) as error:
             raise ConfigError(
                 f"cannot be written ({reason(error)})", where=self.path, fix="Choose a place that can be written and has room"
@@ -112,7 +114,7 @@ class Target:
             with self._system_errors():
                 self._medium.complete()
                 refuse_existing(self.path, overwrite=self.overwrite)
-                self._medium.publish()
+                self._medium.publish(replace=self.overwrite)
             self._remove.detach()
         except BaseException:
             self.abandon()

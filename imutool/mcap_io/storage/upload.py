@@ -51,7 +51,7 @@ class Upload:
             self.file.close()
             self.etag = self._check_size(self.temporary)
 
-    def publish(self) -> None:
+    def publish(self, *, replace: bool) -> None:
         """Copies the object to its own key, within the store, and removes the temporary one.
 
         Raises:
@@ -114,4 +114,4 @@ class Upload:
         with suppress(Exception):
             self.file.discard()
         with suppress(Exception):  # it is there if the upload was complete, or an answer was lost on its way
-            self.temporary.fs.rm_file(self.temporary.path)
+            self._remove_temporary()

@@ -6,8 +6,6 @@ from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Float64
-from scipy.ndimage import median_filter
-from scipy.signal import periodogram
 
 from imutool.inertial.stationary import white_noise
 from imutool.sensor.effect import Effect, Parameter, Stage, Theta, residual
@@ -37,6 +35,9 @@ def _starts(motion: IdealMotion, samples: SensorSamples) -> list[Theta]:
     error = error - error.mean(axis=0)
     noise = white_noise(error)
     rate_hz = (len(t_s) - 1) / (t_s[-1] - t_s[0])
+    from scipy.ndimage import median_filter
+    from scipy.signal import periodogram
+
     f_hz, each = periodogram(error, rate_hz, "hann", nfft=FINER * len(t_s), axis=0)
     level = np.log((each / np.maximum(noise, np.finfo(np.float64).tiny) ** 2).sum(axis=1) + np.finfo(np.float64).tiny)
     out = level - median_filter(level, min(ABOUT, len(level)))

@@ -26,6 +26,7 @@ HEADING_INCH = 0.45
 PER_DECADE = 40  # points of a spectrum
 LEGEND_LETTERS, HANDLE_LETTERS = 76, 8  # in a row of a legend at half width
 MAX_LETTERS = 48  # of a name in a legend
+EMPTY_DECADES = 0.1, 10.0
 MAX_DECADES = 5  # labels of a logarithmic axis
 BUCKETS = 400  # of a line at half width; each draws its lowest and its highest sample
 
@@ -204,6 +205,8 @@ def decades(axes: Any) -> None:
     from matplotlib.ticker import LogLocator
 
     low, high = axes.get_ylim()
+    if not 0.0 < low < high < np.inf:  # no curve above zero: a sensor that reads zero
+        low, high = EMPTY_DECADES
     first, last = np.floor(np.log10(low)), np.ceil(np.log10(high))
     axes.set_ylim(10.0**first, 10.0**last)
     axes.yaxis.set_major_locator(LogLocator(numticks=MAX_DECADES))

@@ -5,8 +5,6 @@ from __future__ import annotations
 import contextlib
 import html
 import http.server
-import os
-import secrets
 import shutil
 import urllib.request
 from collections.abc import Iterator, Mapping, Sequence
@@ -15,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from imutool.errors import ConfigError
+from imutool.mcap_io.storage.local import remove_abandoned, temporary_path
 from imutool.recording import nanoseconds
 from imutool.viewing import Output
 from imutool.viewing.model.run_data import RunData
@@ -194,7 +193,8 @@ def export(
     require_rerun()
     files = site(logs, source=source, at_s=at_s)
     place = folder.absolute()  # "." has no name
-    partial = place.with_name(f".{place.name}.{os.getpid()}.{secrets.token_hex(4)}.partial")
+    remove_abandoned(place)
+    partial = temporary_path(place)
     with _os_error_as_config_error(folder):
         try:
             partial.mkdir(parents=True)

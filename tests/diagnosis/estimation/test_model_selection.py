@@ -237,3 +237,15 @@ def test_a_low_pass_above_what_samples_can_show_is_told_by_its_delay() -> None:
     assert names(found) == ["low_pass"]
     assert sure(found, "low_pass", [48.0])
     assert names(asked(replace(pair, against="true poses", band_hz=7.0), beyond=False)) == ["clock_offset"]
+
+
+@pytest.mark.parametrize("arms_mm", [(107.0, 101.0, 107.0), (150.0, 120.0, 150.0)])
+def test_three_arms_that_agree_are_a_lever_arm_and_the_rest_a_size_effect(arms_mm: tuple[float, float, float]) -> None:
+    theta = [0.0, 0.0, arms_mm[0] * 1e-3, 0.0, 0.0, arms_mm[1] * 1e-3, 0.0, 0.0, arms_mm[2] * 1e-3]
+    pair = planted.pair(planted.shaken(), {"size_effect": theta}, 9)
+    found = asked(pair, beyond=False)
+    assert names(found)[0] == "lever_arm"
+    assert set(names(found)) <= {"lever_arm", "size_effect"}
+    arm = found.selected[0]
+    assert abs(arm.theta[2] - 1e-3 * arms_mm[2]) < 0.02
+    assert np.abs(arm.theta[:2]).max() < 0.02

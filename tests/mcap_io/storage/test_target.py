@@ -188,7 +188,7 @@ def test_a_rename_that_fails_leaves_nothing(tmp_path: Path, monkeypatch: pytest.
         raise OSError(errno.EIO, os.strerror(errno.EIO))
 
     monkeypatch.setattr(Path, "replace", refuse)
-    with pytest.raises(ConfigError, match="Input/output error"), Target(tmp_path / "out.mcap") as target:
+    with pytest.raises(ConfigError, match="Input/output error"), Target(tmp_path / "out.mcap", overwrite=True) as target:
         target.write(b"ours")
     assert list(tmp_path.iterdir()) == []
 

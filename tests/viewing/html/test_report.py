@@ -336,6 +336,12 @@ def test_without_truth_there_are_no_errors_and_it_is_said(flown: Recording) -> N
     assert "truth" not in curve_titles(content)
 
 
+def test_a_sensor_that_reads_zero_is_drawn(flown: Recording) -> None:
+    zeros = np.zeros_like(flown.imu.gyro)
+    dead = replace(flown, imu=Imu(flown.imu.t_ns, zeros, zeros))
+    assert not re.search(r"\bnan\b", Page(report.page([build(dead, [Run.raw(dead.imu)])])).text, re.IGNORECASE)
+
+
 def test_a_bare_log_has_no_empty_section(flown: Recording) -> None:
     data = build(replace(flown, truths={}, scalars={}), [Run.raw(flown.imu)])
     (trace,) = data.traces

@@ -1,4 +1,4 @@
-"""IMU from columns of two sensors: on the gyro's stamps, the accelerometer interpolated."""
+"""IMU from two sensors: on the gyro's stamps, the accelerometer interpolated."""
 
 from __future__ import annotations
 

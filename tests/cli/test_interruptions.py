@@ -1,0 +1,351 @@
+"""Every command under KILL, TERM, INT, a full disk, a locked folder, an input that changes, and two of the same at once.
+
+After each: a message and its exit code or the system's, no traceback, inputs unchanged, and no partial file left by a run
+that could still act; what KILL leaves, the next run on that target removes.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import os
+import resource
+import shutil
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from imutool.cli.demo import write_asl
+from imutool.errors import ConfigError
+from imutool.mcap_io.log import Log
+from imutool.mcap_io.storage.local import MARK_PART, PARTIAL, remove_abandoned, temporary_path
+from imutool.mcap_io.storage.target import Target
+from imutool.sensor.made_up_flight import flight
+
+Run = Callable[..., subprocess.CompletedProcess[str]]
+
+CONFIG, LOST, INTERRUPTED, TERMINATED, KILLED = 3, 3, 130, 143, -signal.SIGKILL
+WAIT_S, POLL_S, TRIES = 60.0, 0.002, 10
+SOON_S, SLACK_S = 2.0, 3.0  # after SIGTERM, for a process and all its children; for a machine busy with other tests
+DISK_BYTES = 1500  # less than any output here
+
+# words of each command that writes a file, and the file; in.mcap is a log of 20 s, seq a raw sequence
+WRITERS: dict[str, tuple[Sequence[str], str]] = {
+    "convert": (["convert", "seq", "out.mcap"], "out.mcap"),
+    "debias": (["debias", "in.mcap", "out.mcap"], "out.mcap"),
+    "clean": (["clean", "in.mcap", "out.mcap"], "out.mcap"),
+    "repair": (["repair", "in.mcap", "out.mcap"], "out.mcap"),
+    "simulate": (["simulate", "in.mcap", "out.mcap"], "out.mcap"),
+    "export": (["export", "in.mcap", "out", "--format", "rosbag2"], "out"),
+    "view": (["view", "in.mcap", "--html", "out.html"], "out.html"),
+    "save": (["view", "in.mcap", "--save", "out.rrd"], "out.rrd"),
+    "train": (["train", "in.mcap", "--method", "linear", "-o", "out.safetensors"], "out.safetensors"),
+    "trajectories": (["evaluate", "in.mcap", "--trajectories", "out"], "out"),
+}
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory, logs: Path) -> Path:
+    folder = tmp_path_factory.mktemp("interruptions")
+    write_asl(flight(3, duration_s=8.0), folder / "seq")
+    shutil.copy(logs / "flight_1.mcap", folder / "in.mcap")
+    return folder
+
+
+@pytest.fixture
+def here(made: Path, tmp_path: Path) -> Path:
+    shutil.copytree(made, tmp_path, dirs_exist_ok=True)
+    return tmp_path
+
+
+def digests(folder: Path) -> dict[str, str]:
+    files = [path for path in sorted(folder.rglob("*")) if path.is_file()]
+    return {str(path.relative_to(folder)): hashlib.sha256(path.read_bytes()).hexdigest() for path in files}
+
+
+def partials(folder: Path) -> list[str]:
+    return [path.name for path in folder.iterdir() if path.name.endswith(".partial")]
+
+
+def started(command: str, words: Sequence[str], cwd: Path, **options: Any) -> subprocess.Popen[str]:
+    return subprocess.Popen(
+        [command, *words, "-q"], cwd=cwd, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE,
+        text=True, start_new_session=True, **options,
+    )  # fmt: skip
+
+
+def stopped(command: str, words: Sequence[str], folder: Path, number: signal.Signals) -> tuple[int, str, float]:
+    """Exit code, stderr and time to the end of a command that a signal hits while its partial file is there.
+
+    The process stands still while this is looked at. Code 0: the moment passed between two looks, and it ended.
+    """
+    process = started(command, words, folder)
+    deadline = time.monotonic() + WAIT_S
+    while process.poll() is None and not partials(folder) and time.monotonic() < deadline:
+        time.sleep(POLL_S)
+    with contextlib.suppress(ProcessLookupError):
+        os.killpg(process.pid, signal.SIGSTOP)
+        os.kill(process.pid, number)
+        os.killpg(process.pid, signal.SIGCONT)
+    began = time.monotonic()
+    _, stderr = process.communicate(timeout=WAIT_S)
+    return process.returncode, stderr, time.monotonic() - began
+
+
+MOMENTS = [
+    *((name, signal.SIGINT) for name in ("export", "save")),
+    *((name, signal.SIGTERM) for name in ("convert", "debias", "save")),
+    *((name, signal.SIGKILL) for name in ("convert", "debias", "export")),
+]  # Ctrl-C in convert, debias and train: tests/test_bad_input.py
+
+
+@pytest.mark.parametrize(("name", "number"), MOMENTS, ids=lambda value: getattr(value, "name", value))
+def test_a_signal_in_the_middle(here: Path, command: str, imutool: Run, name: str, number: signal.Signals) -> None:
+    words, target = WRITERS[name]
+    before = digests(here)
+    for _ in range(TRIES):
+        code, stderr, seconds = stopped(command, words, here, number)
+        if code:
+            break
+        shutil.rmtree(here / target) if (here / target).is_dir() else (here / target).unlink()
+    assert "Traceback" not in stderr
+    assert code == {signal.SIGINT: INTERRUPTED, signal.SIGTERM: TERMINATED, signal.SIGKILL: KILLED}[number], stderr
+    assert seconds < SOON_S + SLACK_S
+    left = partials(here)
+    if number != signal.SIGKILL:
+        assert digests(here) == before
+        return
+    assert len(left) == 1
+    assert PARTIAL.fullmatch(left[0])
+    again = imutool(*words, "-q", cwd=here)
+    assert again.returncode == 0, again.stderr
+    assert partials(here) == []
+    assert {name: digest for name, digest in digests(here).items() if name in before} == before
+
+
+def session(pid: int) -> list[int]:
+    """Living processes of a session."""
+    members = []
+    for entry in Path("/proc").iterdir():
+        with contextlib.suppress(OSError, ValueError):
+            status = (entry / "stat").read_text().rpartition(")")[2].split()
+            if int(status[3]) == pid and status[0] not in "ZX":
+                members.append(int(entry.name))
+    return members
+
+
+def test_no_child_is_left_soon_after_sigterm(tmp_path: Path, command: str) -> None:
+    for seed in range(3):
+        write_asl(flight(seed, duration_s=30.0), tmp_path / "src" / f"s{seed}")
+    process = started(command, ["convert", "src", "out", "--workers", "2"], tmp_path)
+    deadline = time.monotonic() + WAIT_S
+    while len(session(process.pid)) < 3 and time.monotonic() < deadline:
+        time.sleep(POLL_S)
+    process.terminate()
+    began = time.monotonic()
+    while session(process.pid) and time.monotonic() - began < WAIT_S:
+        time.sleep(POLL_S)
+    assert time.monotonic() - began < SOON_S + SLACK_S
+    assert "Traceback" not in process.communicate(timeout=WAIT_S)[1]
+    assert process.returncode == TERMINATED
+    assert all(path.suffix == ".mcap" for path in (tmp_path / "out").rglob("*"))
+
+
+IMPORTED_FIRST = ("imutool.cli.parameters", "typer.core", "rich.console", "imutool.cli.app", "imutool.fleet.task")
+
+
+@pytest.mark.parametrize("module", IMPORTED_FIRST)
+def test_ctrl_c_while_modules_are_imported_is_an_interrupt(tmp_path: Path, command: str, module: str) -> None:
+    """Python says on stderr what it has imported."""
+    line = [sys.executable, "-X", "importtime", command, "info", "nowhere.mcap"]
+    said = ""
+    with subprocess.Popen(line, cwd=tmp_path, stderr=subprocess.PIPE, text=True) as process:
+        assert process.stderr is not None
+        for text in process.stderr:
+            said += text
+            if text.endswith(f" {module}\n"):
+                process.send_signal(signal.SIGINT)
+                break
+        said += process.stderr.read()
+    assert process.returncode == INTERRUPTED, said[-500:]
+    words = [text for text in said.splitlines() if not text.startswith("import time:")]
+    assert words[-1].startswith("error: interrupted.")
+    assert "Traceback" not in said
+
+
+# ── a full disk, a locked folder ──
+
+
+@contextlib.contextmanager
+def full_disk() -> Iterator[None]:
+    """The system refuses files beyond some size, as a full disk does."""
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (DISK_BYTES, limits[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+
+
+@pytest.mark.parametrize("name", [name for name in WRITERS if name != "save"])  # Rerun's files: tests/test_bad_input.py
+def test_a_full_disk_leaves_nothing(here: Path, imutool: Run, name: str) -> None:
+    before = digests(here)
+    words, _ = WRITERS[name]
+    imutool(*words[:1], "--help", cwd=here)  # what is imported is compiled, and may be written
+    with full_disk():
+        done = imutool(*words, "-q", cwd=here)
+    assert done.returncode == CONFIG, done.stderr
+    assert "cannot be written (File too large)" in done.stderr
+    assert digests(here) == before
+
+
+@pytest.mark.parametrize("name", WRITERS)
+def test_a_locked_folder_is_refused(here: Path, imutool: Run, name: str) -> None:
+    """Not even root makes a file in /proc."""
+    words, target = WRITERS[name]
+    locked = [f"/proc/{target}" if word == target else word for word in words]
+    before = digests(here)
+    done = imutool(*locked, "-q", cwd=here)
+    assert done.returncode == CONFIG, done.stderr
+    assert f"/proc/{target}" in done.stderr
+    assert digests(here) == before
+
+
+# ── an input that changes, two runs at once ──
+
+
+@pytest.mark.parametrize("change", ["grows", "vanishes", "is cut"])
+@pytest.mark.parametrize("name", ["debias", "repair", "export"])
+def test_an_input_that_changes_while_it_is_read(here: Path, command: str, name: str, change: str) -> None:
+    """The output is whole and of the bytes that were there, or there is none and a message says why."""
+    words, target = WRITERS[name]
+    process = started(command, words, here)
+    deadline = time.monotonic() + WAIT_S
+    while process.poll() is None and not partials(here) and time.monotonic() < deadline:
+        time.sleep(POLL_S)
+    with contextlib.suppress(ProcessLookupError):
+        os.killpg(process.pid, signal.SIGSTOP)
+    source = here / "in.mcap"
+    if change == "grows":
+        with source.open("ab") as file:
+            file.write(b"\0" * 100_000)
+    elif change == "vanishes":
+        source.unlink()
+    else:
+        os.truncate(source, source.stat().st_size // 2)
+    with contextlib.suppress(ProcessLookupError):
+        os.killpg(process.pid, signal.SIGCONT)
+    _, stderr = process.communicate(timeout=WAIT_S)
+    assert "Traceback" not in stderr
+    assert process.returncode in {0, 3, 4, 5}, stderr
+    assert partials(here) == []
+    if process.returncode == 0 or (name == "repair" and process.returncode == LOST):
+        logs = [here / target] if (here / target).is_file() else list((here / target).glob("*.mcap"))
+        for path in logs:
+            with Log(path) as log:
+                assert log.topics["/imu0"].count == 4001 or process.returncode == LOST
+                log.check()  # raises where a CRC is wrong
+    else:
+        assert stderr.startswith("error: ")
+        assert not (here / target).exists()
+
+
+@pytest.mark.parametrize("name", ["convert", "debias", "view", "train"])
+def test_of_two_runs_at_once_to_one_target_one_wins(here: Path, command: str, name: str) -> None:
+    words, target = WRITERS[name]
+    runs = [started(command, words, here) for _ in range(2)]
+    said = [run.communicate(timeout=WAIT_S)[1] for run in runs]
+    assert sorted(run.returncode for run in runs) == [0, CONFIG], said
+    (loser,) = (text for run, text in zip(runs, said, strict=True) if run.returncode)
+    assert "the target exists" in loser
+    assert (here / target).stat().st_size > DISK_BYTES or name == "train"
+    assert partials(here) == []
+
+
+def commit(target: Target, errors: list[ConfigError]) -> None:
+    target.write(b"whole")
+    try:
+        target.commit()
+    except ConfigError as error:
+        errors.append(error)
+
+
+def test_of_two_writers_that_end_together_one_is_refused(tmp_path: Path) -> None:
+    """Both have looked whether the target exists before either puts its file there."""
+    for _ in range(20):
+        targets = [Target(tmp_path / "out") for _ in range(2)]
+        errors: list[ConfigError] = []
+        threads = [threading.Thread(target=commit, args=[target, errors]) for target in targets]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join()
+        assert len(errors) == 1
+        assert [path.name for path in tmp_path.iterdir()] == ["out"]
+        (tmp_path / "out").unlink()
+
+
+# ── whose partial files are removed ──
+
+
+def renamed(path: Path, pid: int, part: int | None, digits: str = "") -> Path:
+    """A temporary name of another process, with a part of its mark (machine, boot, start) changed."""
+    match = PARTIAL.fullmatch(path.name)
+    assert match is not None
+    mark = match["mark"]
+    if part is not None:
+        mark = mark[: part * MARK_PART] + (digits or "0" * MARK_PART) + mark[(part + 1) * MARK_PART :]
+    return path.with_name(f".{match['name']}.{pid}.{mark}.partial")
+
+
+def test_partial_files_are_removed_by_the_rule_alone(tmp_path: Path) -> None:
+    place = tmp_path / "out.mcap"
+    ended = subprocess.Popen([sys.executable, "-c", ""])
+    ended.wait()
+    mine = temporary_path(place)
+    gone = renamed(mine, ended.pid, None)
+    reused = renamed(mine, os.getppid(), 2)  # the number lives, under a process that started at another time
+    folder = renamed(mine, ended.pid, 2, "abcdef")
+    elsewhere, of_another_name = renamed(mine, ended.pid, 0), Path(str(gone).replace("out.mcap", "other.mcap"))
+    old, fresh = renamed(mine, ended.pid, 1), renamed(mine, ended.pid + 1, 1)  # of an earlier boot
+    foreign = tmp_path / ".out.mcap.12.0123abcd.partial"
+    for path in (mine, gone, reused, elsewhere, of_another_name, old, fresh, foreign):
+        path.write_text("half")
+    folder.mkdir()
+    os.utime(old, (1e9, 1e9))  # before this machine started
+    remove_abandoned(place)
+    left = {path.name for path in tmp_path.iterdir()}
+    assert left == {path.name for path in (mine, elsewhere, of_another_name, fresh, foreign)}
+
+
+def test_a_living_process_keeps_its_partial_file(tmp_path: Path) -> None:
+    code = (
+        "import sys, pathlib; from imutool.mcap_io.storage.target import Target\n"
+        "t = Target(pathlib.Path('out')); print('open', flush=True); sys.stdin.read()"
+    )
+    line = [sys.executable, "-c", code]
+    with subprocess.Popen(line, cwd=tmp_path, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as other:
+        assert other.stdout is not None
+        assert other.stdout.readline() == "open\n"
+        with Target(tmp_path / "out") as target:
+            target.write(b"ours")
+        assert len(partials(tmp_path)) == 1
+        other.kill()
+        other.wait()
+    with Target(tmp_path / "out", overwrite=True) as target:
+        target.write(b"ours again")
+    assert [path.name for path in tmp_path.iterdir()] == ["out"]
+
+
+def test_a_long_name_can_be_written(tmp_path: Path) -> None:
+    name = "ü" * 120 + ".mcap"
+    with Target(tmp_path / name) as target:
+        target.write(b"whole")
+    assert [path.name for path in tmp_path.iterdir()] == [name]

@@ -1,0 +1,103 @@
+"""MCAP logs of other encodings: IMUs become CDR, all else stays byte for byte."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
+from mcap.reader import make_reader
+from mcap.writer import Writer
+
+from imutool.mcap_io.read import read
+
+START_NS = 1_600_000_000_000_000_123
+COUNT = 500
+GYRO = np.random.default_rng(3).normal(0, 0.003, (COUNT, 3))
+ACCEL = np.random.default_rng(4).normal(0, 0.02, (COUNT, 3)) + np.array([0.0, 0.0, 9.81])
+
+
+def as_json(n: int, t_ns: int) -> bytes:
+    xyz = [dict(zip("xyz", row.tolist(), strict=True)) for row in (GYRO[n], ACCEL[n])]
+    stamp = {"sec": t_ns // 10**9, "nsec": t_ns % 10**9}
+    return json.dumps({"timestamp": stamp, "frame_id": "imu", "angularVelocity": xyz[0], "linearAcceleration": xyz[1]}).encode()
+
+
+def protobuf_type() -> tuple[bytes, Any]:
+    """A made-up robot's own IMU message, as a descriptor set and a class."""
+    file = descriptor_pb2.FileDescriptorProto(name="robot.proto", package="robot", syntax="proto3")
+    fields = descriptor_pb2.FieldDescriptorProto
+    vector = file.message_type.add(name="Xyz")
+    for number, axis in enumerate("xyz", start=1):
+        vector.field.add(name=axis, number=number, type=fields.TYPE_DOUBLE, label=fields.LABEL_OPTIONAL)
+    stamp = file.message_type.add(name="Clock")
+    for number, part in enumerate(("seconds", "nanos"), start=1):
+        stamp.field.add(name=part, number=number, type=fields.TYPE_INT64, label=fields.LABEL_OPTIONAL)
+    imu = file.message_type.add(name="Inertial")
+    for number, (name, kind) in enumerate((("stamp", "Clock"), ("gyro", "Xyz"), ("accel", "Xyz")), start=1):
+        imu.field.add(
+            name=name, number=number, type=fields.TYPE_MESSAGE, type_name=f".robot.{kind}", label=fields.LABEL_OPTIONAL
+        )
+    pool = descriptor_pool.DescriptorPool()
+    pool.Add(file)
+    kind = message_factory.GetMessageClass(pool.FindMessageTypeByName("robot.Inertial"))
+    return descriptor_pb2.FileDescriptorSet(file=[file]).SerializeToString(), kind
+
+
+def as_protobuf(n: int, t_ns: int) -> bytes:
+    message = protobuf_type()[1]()
+    message.stamp.seconds, message.stamp.nanos = t_ns // 10**9, t_ns % 10**9
+    for vector, row in ((message.gyro, GYRO[n]), (message.accel, ACCEL[n])):
+        vector.x, vector.y, vector.z = row.tolist()
+    return message.SerializeToString()
+
+
+def write_log(path: Path, encoding: str) -> Path:
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start()
+        if encoding == "json":
+            schema = writer.register_schema("Imu", "jsonschema", b'{"type": "object"}')
+        else:
+            schema = writer.register_schema("robot.Inertial", "protobuf", protobuf_type()[0])
+        imu = writer.register_channel("/robot/imu", encoding, schema)
+        note = writer.register_channel("/notes", "text", 0)
+        make = as_json if encoding == "json" else as_protobuf
+        for n in range(COUNT):
+            t_ns = START_NS + n * 5_000_000
+            writer.add_message(imu, t_ns + 700, make(n, t_ns), t_ns + 300)
+            if n % 100 == 0:
+                writer.add_message(note, t_ns, b"hello", t_ns)
+        writer.finish()
+    return path
+
+
+@pytest.mark.parametrize("encoding", ["json", "protobuf"])
+def test_an_imu_in_another_encoding_becomes_one_that_every_command_reads(convert, imutool, tmp_path, encoding):
+    done = convert(write_log(tmp_path / "in.mcap", encoding), tmp_path / "out.mcap")
+    assert done.returncode == 0, done.stderr
+    assert f"/robot/imu: {encoding} became sensor_msgs/msg/Imu" in done.stderr
+    recording = read(tmp_path / "out.mcap")
+    assert recording.imu_topic == "/robot/imu"
+    assert recording.imu.t_ns.tolist() == [START_NS + n * 5_000_000 for n in range(COUNT)]
+    assert np.array_equal(recording.imu.gyro, GYRO)
+    assert np.array_equal(recording.imu.accel, ACCEL)
+    assert imutool("debias", "out.mcap", "d.mcap", cwd=tmp_path).returncode == 0
+    with (tmp_path / "in.mcap").open("rb") as a, (tmp_path / "out.mcap").open("rb") as b:
+        theirs = [(c.topic, m.log_time, m.publish_time, m.data) for _, c, m in make_reader(a).iter_messages()]
+        kept = {"/robot/imu/as_recorded": "/robot/imu", "/notes": "/notes"}
+        every = list(make_reader(b, validate_crcs=True).iter_messages())
+        ours = [(kept[c.topic], m.log_time, m.publish_time, m.data) for _, c, m in every if c.topic in kept]
+    assert sorted(ours) == sorted(theirs)
+
+
+def test_a_cut_log_is_refused_and_repair_is_named(convert, tmp_path):
+    log = write_log(tmp_path / "in.mcap", "json")
+    log.write_bytes(log.read_bytes()[:20_000])
+    done = convert(log, tmp_path / "out.mcap")
+    assert done.returncode == 4
+    assert "imutool repair" in done.stderr
+    assert not (tmp_path / "out.mcap").exists()
