@@ -387,7 +387,7 @@ def test_a_physics_file_of_which_hybrid_knows_nothing_is_refused(tmp_path: Path,
     file.write_text(entry("saturation", "gyro", "rad/s"))
     with pytest.raises(ConfigError, match="no effect that a bias model can correct"):
         settings_for(file)
-    words = ["train", "a.mcap", "-o", tmp_path / "m", "--method", "linear", "--physics", file]
+    words = ["train", "a.mcap", "-o", tmp_path / "m.safetensors", "--method", "linear", "--physics", file]
     said = imutool(*words, cwd=tmp_path)
     assert said.returncode == 3
     assert "linear knows no effects" in said.stderr
