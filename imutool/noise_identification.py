@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from imutool.config import build
-from imutool.errors import ConfigError, DataError
+from imutool.errors import DataError
 from imutool.inertial.stationary import rest_stretches, white_noise
 from imutool.location import Location
 from imutool.mcap_io.log import Log
@@ -136,11 +136,8 @@ def _in_motion(recording: Recording, model: str | Path | None, path: Location) -
         DataError: too little truth.
         ModelError: a model that does not fit this log.
     """
-    try:
-        from imutool.noise.residual import curves
-    except ModuleNotFoundError as error:
-        message = "noise in motion needs PyTorch, which is not installed"
-        raise ConfigError(message, where="noise", fix="Install it with: pip install 'imutool[train]'") from error
+    import imutool.training  # noqa: F401  refuses without PyTorch
+    from imutool.noise.residual import curves
 
     corrected, by = _by_model(recording, model, path) if model is not None else _by_fit(recording)
     both = dict(zip(SENSORS, curves(corrected, recording.truth), strict=True))

@@ -78,8 +78,7 @@ class MessageBlock:
         Raises:
             LogError: there is no chunk where the block says, or its lengths contradict one another.
         """
-        opcode, length = HEAD.unpack_from(raw)
-        if opcode != Opcode.CHUNK or length != self.length - HEAD.size:
+        if HEAD.unpack_from(raw) != (Opcode.CHUNK, self.length - HEAD.size):
             raise LogError(f"the summary lists a chunk at byte {self.offset}, and none begins there")
         return ChunkHead.of(bytes(raw[:HEAD_BYTES]), self.length, self.offset)
 
@@ -98,6 +97,14 @@ class MessageIndexes(NamedTuple):
         Raises:
             LogError: the records do not fill the bytes exactly; `offset` is that of the chunk in the file.
         """
+        if len(self.entries) == 1:
+            found, stated = messages.parse(data, offset), (*self.counts, *self.entries[0].tolist())
+            heads = found.heads
+            return found, len(heads) == 1 and (
+                int(heads["channel"][0]),
+                int(heads["log_time"][0]),
+                int(found.offsets[0]),
+            ) == stated
         order = self.entries[:, 1].argsort(kind="stable")
         times, offsets = self.entries[order].view(np.int64).T
         found = messages.parse_at(data, offsets) or messages.parse(data, offset)
@@ -117,6 +124,13 @@ def parse_message_indexes(raw: bytes | memoryview, block: MessageBlock, unpacked
     records, each channel's once and where the block says, and every entry lies within the chunk. Whether a message lies
     there, only the chunk itself can say.
     """
+    if len(raw) == messages.SINGLE_INDEX.size:
+        opcode, length, channel, size, time_ns, at = messages.SINGLE_INDEX.unpack(raw)
+        right = (
+            (opcode, length, size) == (Opcode.MESSAGE_INDEX, 22, 16) and at + MESSAGE.itemsize <= unpacked and time_ns < 2**63
+        )
+        if right and block.indexes == {channel: block.offset + block.length}:
+            return MessageIndexes({channel: 1}, np.frombuffer(raw, "<u8", 2, INDEX_HEAD.size).reshape(1, 2), time_ns, time_ns)
     counts: dict[int, int] = {}
     parts: list[bytes | memoryview] = []
     seen: dict[int, int] = {}
@@ -149,8 +163,7 @@ def read_message_indexes(source: Source, block: MessageBlock) -> tuple[ChunkHead
     Raises:
         LogError: there is no chunk where the block says, or its lengths contradict one another.
     """
-    start = block.offset + block.length
-    head = block.head(source.at(block.offset, min(block.length, HEAD_BYTES)))
+    head, start = block.head(source.at(block.offset, min(block.length, HEAD_BYTES))), block.offset + block.length
     return head, parse_message_indexes(source.at(start, block.end - start), block, head.size)
 
 

@@ -30,6 +30,7 @@ from imutool.mcap_io.codec import messages, records
 from imutool.mcap_io.codec.records import FOOTER_SIZE, HEAD, MAGIC, crc32
 from imutool.mcap_io.storage.source import Source
 
+SMALL = 4096  # bytes of a chunk in which messages are found sooner than in its message indexes
 MAX_SUMMARY = 1 << 29  # bytes; that of a 100 GB log has some 20 million
 
 
@@ -133,11 +134,10 @@ class LogIndex:
         """As `unpack`, from the block's bytes."""
         if block.compression is None:
             return messages.parse(raw, block.offset)
-        opcode, length = HEAD.unpack_from(raw)
-        if opcode != Opcode.CHUNK or length != block.length - HEAD.size:
+        if HEAD.unpack_from(raw) != (Opcode.CHUNK, block.length - HEAD.size):
             raise LogError(f"the summary lists a chunk at byte {block.offset}, and none begins there")
         data = records.unpack(raw, block.offset, self.max_chunk)
-        offsets = message_offsets(self.source, block, len(data))
+        offsets = message_offsets(self.source, block, len(data)) if len(data) > SMALL else None
         return (None if offsets is None else messages.parse_at(data, offsets)) or messages.parse(data, block.offset)
 
     def entries(self, block: MessageBlock, channel: int) -> UInt64[np.ndarray, "n 2"]:

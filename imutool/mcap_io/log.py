@@ -197,7 +197,9 @@ class Log:
                     continue
                 indexed = sorted(channels & block.indexes.keys()) if block.trusted and not block.edited else []
                 entries = [self.index.entries(block, c) for c in indexed]
-                if indexed and all(len(entry) for entry in entries):
+                if len(entries) == 1 and len(entries[0]) == 1:
+                    yield messages.signed(entries[0][:, 0])
+                elif indexed and all(len(entry) for entry in entries):
                     table = np.concatenate(entries)
                     yield messages.signed(table[np.argsort(table[:, 1], kind="stable"), 0])
                 elif (found := self.index.unpack_or_lose(block)) is not None:

@@ -191,12 +191,15 @@ class _Saver:
 
     def _write_chunk(self, start: bytes, packed: bytes, head: ChunkHead, found: messages.Messages) -> None:
         times = found.times()
+        start_ns, end_ns = (head.start_ns, head.end_ns) if not len(times) else (int(times[0]), int(times[-1]))
+        if len(times) > 1:
+            start_ns, end_ns = int(times.min()), int(times.max())
         entry = head.index_at(self.out.target.position, len(start) + len(packed))
-        self.out.target.write(start)
-        self.out.target.write(packed)
-        if len(times):
-            entry.message_start_time, entry.message_end_time = int(times.min()), int(times.max())
-        self.out.write_indexes(entry, found.heads["channel"].copy(), times, found.offsets)
+        self.out.target.write(start + packed if len(packed) < len(start) * 100 else start)
+        if len(packed) >= len(start) * 100:
+            self.out.target.write(packed)
+        entry.message_start_time, entry.message_end_time = start_ns, end_ns
+        self.out.write_indexes(entry, found.heads["channel"], times, found.offsets)
 
     def _copy_record(self, span: RecordSpan) -> None:
         """Copies any other record; definitions stand in front already, and indexes are rebuilt."""

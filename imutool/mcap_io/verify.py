@@ -15,7 +15,7 @@ from mcap.records import AttachmentIndex, DataEnd, MetadataIndex, SummaryOffset
 
 from imutool.errors import ConfigError, LogError
 from imutool.location import Location
-from imutool.mcap_io.blocks import Attachment, MessageBlock, RecordSpan, read_message_indexes
+from imutool.mcap_io.blocks import Attachment, MessageBlock, RecordSpan, parse_message_indexes, read_message_indexes
 from imutool.mcap_io.codec import records
 from imutool.mcap_io.codec.records import FOOTER_SIZE, HEAD, MAGIC
 from imutool.mcap_io.index import LogIndex
@@ -91,13 +91,21 @@ class _Sums:
         """Checks a block, with `whole` its messages too."""
         if block.compression is None:
             raise LogError(f"messages lie outside chunks at byte {block.offset}", expected="chunks alone")
-        _, listed = read_message_indexes(index.source, block)
+        raw = index.source.at(block.offset, block.end - block.offset) if whole else b""
+        if whole:
+            listed = parse_message_indexes(raw[block.length :], block, block.head(raw).size)
+        else:
+            _, listed = read_message_indexes(index.source, block)
         if listed is None:
             if index.unpack(block).offsets.size:
                 raise LogError(f"the message indexes behind the chunk at byte {block.offset} are damaged")
             return
-        raw = index.source.at(block.offset, block.length) if whole else b""
-        if whole and not listed.messages(records.unpack(raw, block.offset, index.max_chunk), block.offset)[1]:
+        if (
+            whole
+            and not listed.messages(
+                records.unpack(memoryview(raw)[: block.length], block.offset, index.max_chunk), block.offset
+            )[1]
+        ):
             raise LogError(f"the message indexes behind the chunk at byte {block.offset} list other messages than are in it")
         if (block.start_ns, block.end_ns) != (listed.start_ns, listed.end_ns):
             raise LogError(

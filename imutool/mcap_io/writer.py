@@ -161,7 +161,7 @@ class LogWriter:
             raise DataError(f"two channels would be written to {topic}", expected="one topic each")
         described = {"offered_qos_profiles": QOS, "topic_type_hash": schema.TYPE_HASHES[schema_name]}
         record = Channel(
-            id=_next(self.contents.channels, "channel"),
+            id=free_id(self.contents.channels, "channel"),
             topic=topic,
             message_encoding="cdr",
             metadata=described | dict(metadata or {}),
@@ -178,7 +178,7 @@ class LogWriter:
             DataError: no id is left.
         """
         record = Channel(
-            id=_next(self.contents.channels, "channel"),
+            id=free_id(self.contents.channels, "channel"),
             topic=topic.name,
             message_encoding=topic.message_encoding,
             metadata=_described(topic),
@@ -197,7 +197,7 @@ class LogWriter:
         for known in self.contents.schemas.values():
             if (known.name, known.encoding, known.data) == (topic.schema_name, topic.schema_encoding, topic.schema):
                 return int(known.id)
-        number = _next(self.contents.schemas, "schema")
+        number = free_id(self.contents.schemas, "schema")
         record = Schema(id=number, name=topic.schema_name, encoding=topic.schema_encoding, data=topic.schema)
         self.contents.schemas[number] = record
         self._write_schema(record)
@@ -210,7 +210,7 @@ class LogWriter:
             if known.name == schema_name and known.encoding == "ros2msg" and _bare(known.data) == _bare(text.encode()):
                 self._write_schema(known)  # once more: so far it may stand in a later chunk only
                 return int(known.id)
-        record = Schema(id=_next(self.contents.schemas, "schema"), name=schema_name, encoding="ros2msg", data=text.encode())
+        record = Schema(id=free_id(self.contents.schemas, "schema"), name=schema_name, encoding="ros2msg", data=text.encode())
         self.contents.schemas[record.id] = record
         self._write_schema(record)
         return record.id
@@ -247,16 +247,16 @@ class LogWriter:
         offsets: Int64[np.ndarray, " n"],
     ) -> None:
         """Writes the message indexes of the chunk just written, and enters it in the summary."""
-        first, counts = self.target.position, {}
-        for channel in np.unique(channels).tolist():
-            mask = channels == channel
-            counts[channel] = int(mask.sum())
+        first, counts = self.target.position, dict[int, int]()
+        for channel in (ids := np.unique(channels).tolist() if len(channels) != 1 else [int(channels[0])]):
+            mask = slice(None) if len(ids) == 1 else channels == channel
+            counts[channel] = len(times[mask])
             entry.message_index_offsets[channel] = self.target.position
             self.target.write(messages.message_index(channel, times[mask], offsets[mask]))
         entry.message_index_length = self.target.position - first
         self.contents.chunks.append(entry)
         if counts:
-            self.contents.add(counts, int(times.min()), int(times.max()))
+            self.contents.add(counts, *((int(times[0]),) * 2 if len(times) == 1 else (int(times.min()), int(times.max()))))
 
     def finish(self) -> None:
         """Ends the data section and writes the summary under the temporary name."""
@@ -286,12 +286,13 @@ def _described(topic: MessageTopic) -> dict[str, str]:
     return {"offered_qos_profiles": qos} | metadata if topic.message_encoding == "cdr" else metadata
 
 
-def _next(taken: Mapping[int, object], what: str) -> int:
-    """The largest id plus one."""
-    largest = max(taken, default=0)
-    if largest >= LARGEST_ID:
-        raise DataError(f"a {what} has the id {largest}", expected=f"less than {LARGEST_ID}, so that one more has room")
-    return largest + 1
+def free_id(taken: Mapping[int, object], what: str) -> int:
+    """The largest id of a channel or schema plus one, or else the smallest free one."""
+    if (largest := max(taken, default=0)) < LARGEST_ID:
+        return largest + 1
+    if free := next((i for i in range(1, LARGEST_ID) if i not in taken), 0):
+        return free
+    raise DataError(f"the log has {len(taken)} {what}s", expected="an id that is free")
 
 
 def _bare(definition: bytes) -> list[bytes]:

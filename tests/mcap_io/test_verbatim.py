@@ -31,12 +31,12 @@ from imutool.mcap_io.codec.encode import encode_imu
 from imutool.mcap_io.codec.messages import message_rows
 from imutool.mcap_io.log import Log
 from imutool.mcap_io.rewrite import rewrite
-from imutool.mcap_io.storage import target
+from imutool.mcap_io.storage import local
 from imutool.mcap_io.storage.source import Digest, Source, sha256
 from imutool.mcap_io.topics import ImuBatch
 from imutool.mcap_io.verify import Verified, verify
 from imutool.mcap_io.write import write
-from imutool.mcap_io.writer import Chunk, LogWriter
+from imutool.mcap_io.writer import Chunk, LogWriter, free_id
 from imutool.recording import Recording
 
 Message = tuple[str, int, int, int, bytes]  # topic, log time, publish time, sequence, payload
@@ -203,7 +203,7 @@ CALLS = {
     "sendfile": [(os, "copy_file_range", unable)],
     "bytes": [(os, "copy_file_range", unable), (os, "sendfile", unable)],
     "a call that stops": [(os, "copy_file_range", stuck)],
-    "files without numbers": [(target, "descriptor", without_a_number)],
+    "files without numbers": [(local, "descriptor", without_a_number)],
 }
 
 
@@ -370,7 +370,7 @@ def test_metadata_is_asked_for_when_it_is_known_what_is_checked(source: Path, tm
         assert log.metadata()["imutool"]["chunks"] == str(report.chunks)
 
 
-def test_a_log_whose_ids_are_used_up_is_refused(tmp_path: Path) -> None:
+def test_a_log_with_the_largest_id_gets_new_topics_under_free_ones(tmp_path: Path) -> None:
     path = tmp_path / "in.mcap"
     with LogWriter(path) as out:
         channel = out.channel("/imu0", schemas.IMU)
@@ -379,9 +379,13 @@ def test_a_log_whose_ids_are_used_up_is_refused(tmp_path: Path) -> None:
         payload = encode_imu(np.array([1]), np.zeros((1, 3)), np.zeros((1, 3)), "x")
         rows = message_rows(65535, np.array([1]), np.array([1]), np.zeros(1, np.uint32), payload)
         out.chunk(Chunk(rows.tobytes(), np.array([65535], np.uint16), np.array([1]), np.array([0])))
-    with pytest.raises(DataError, match="a channel has the id 65535"):
-        rewrite(path, tmp_path / "out.mcap", [Half("/imu0")], metadata={})
-    assert sorted(p.name for p in tmp_path.iterdir()) == ["in.mcap"]
+    rewrite(path, tmp_path / "out.mcap", [Half("/imu0")], metadata={})
+    with Log(tmp_path / "out.mcap") as log:
+        ids = {topic: log.channel_ids(topic) for topic in log.topics}
+    assert ids.pop("/imu0") == {1, 65535}  # its first record stands in the log as well
+    assert sorted(i for each in ids.values() for i in each) == list(range(2, len(ids) + 2))
+    with pytest.raises(DataError, match="the log has 65535 channels"):
+        free_id(dict.fromkeys(range(1, 65536)), "channel")
 
 
 # ── in place ─────────────────────────────────────────────────────────────────────────────────────────────────────────
@@ -426,7 +430,7 @@ def test_in_place_of_a_log_that_grows_is_refused(source: Path, tmp_path: Path) -
 KILLED = """
 import os, signal, sys
 from pathlib import Path
-from imutool.mcap_io.storage import target
+from imutool.mcap_io.storage import local, target
 from imutool.mcap_io.rewrite import rewrite
 place, count = sys.argv[2], int(sys.argv[3])
 
@@ -442,7 +446,7 @@ def dies(owner, name):
 
 if place != "never":
     owner, _, name = place.rpartition(".")
-    dies({"Target": target.Target, "os": os, "Path": Path, "target": target}[owner], name)
+    dies({"Target": target.Target, "os": os, "Path": Path, "local": local}[owner], name)
 rewrite(Path(sys.argv[1]), None, [], metadata={"imutool": {"new": "yes"}})
 """
 POINTS = [
@@ -452,7 +456,7 @@ POINTS = [
     ("Target.flush", 0),
     ("os.fsync", 0),
     ("Path.replace", 0),
-    ("target._settle", 0),
+    ("local._settle", 0),
     ("never", 0),
 ]
 

@@ -28,6 +28,8 @@ MESSAGE = np.dtype(
         ("publish_time", "<u8"),
     ]
 )
+SINGLE_INDEX = struct.Struct("<BQHIQQ")  # a MessageIndex record with one entry
+AT_ZERO = np.zeros(1, np.int64)
 FIXED = MESSAGE.itemsize - HEAD.size  # the part of a message's length that is not payload
 
 
@@ -71,6 +73,8 @@ def signed(times: UInt64[np.ndarray, " n"]) -> Int64[np.ndarray, " n"]:
     Raises:
         LogError: a time beyond 2^63 ns (the year 2262), which only a damaged or wrapped clock writes.
     """
+    if len(times) == 1 and int(times[0]) < 2**63:
+        return times.astype(np.int64)
     if len(times) and times.max() >= 2**63:
         raise LogError(f"a message has the log time {times.max()} ns", expected="less than 2^63")
     return times.astype(np.int64)
@@ -132,6 +136,10 @@ def parse(data: bytes | memoryview, offset: int) -> Messages:
     Raises:
         LogError: the records do not fill the bytes exactly; `offset` says where in the file they came from.
     """
+    if len(data) >= MESSAGE.itemsize and HEAD.unpack_from(data) == (Opcode.MESSAGE, len(data) - HEAD.size):
+        return Messages(
+            np.frombuffer(data, np.uint8), AT_ZERO, np.frombuffer(data, MESSAGE, 1), []
+        )  # in a hundredth of the time
     try:
         offsets, definitions, end = scan(data)
     except LogError as error:
@@ -242,6 +250,8 @@ def scatter(data: UInt8[np.ndarray, " b"], offsets: Int64[np.ndarray, " n"], row
 
 def message_index(channel: int, times: Int64[np.ndarray, " n"], offsets: Int64[np.ndarray, " n"]) -> bytes:
     """A MessageIndex record, its entries in order of log time, then of the file."""
+    if len(times) == 1:
+        return SINGLE_INDEX.pack(Opcode.MESSAGE_INDEX, 22, channel, 16, int(times[0]), int(offsets[0]))
     entries = np.empty((len(times), 2), "<u8")
     order = np.argsort(times, kind="stable")
     entries[:, 0], entries[:, 1] = times[order], offsets[order]

@@ -10,11 +10,10 @@ from __future__ import annotations
 import ctypes
 import struct
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from functools import cache
 from io import BytesIO
 from sys import intern
-from typing import Any
+from typing import Any, NamedTuple
 
 import lz4.frame
 import zstandard
@@ -68,8 +67,7 @@ def name_of(opcode: int) -> str:
 # ── reading ──────────────────────────────────────────────────────────────────────────────────────────────────────────
 
 
-@dataclass(frozen=True, slots=True)
-class ChunkHead:
+class ChunkHead(NamedTuple):
     """The fields of a Chunk record before its data."""
 
     start_ns: int

@@ -18,8 +18,7 @@ from imutool.mcap_io.blocks import MessageBlock
 from imutool.mcap_io.codec import messages, records
 from imutool.mcap_io.codec.records import HEAD
 from imutool.mcap_io.recovery.losses import LATEST_NS, Losses, reason
-
-MAX_ID = 2**16 - 1  # of a channel or a schema
+from imutool.mcap_io.writer import free_id
 
 ChunkKey = tuple[int, int, int]  # start and end in ns, unpacked bytes: what a summary says of a chunk wherever it lies
 
@@ -157,22 +156,9 @@ def _place(known: dict[int, Any], record: Any, same: Callable[[Any, Any], bool],
         for found, other in known.items():
             if same(other, record):
                 return found
-    identity: int = record.id if record.id not in known else free_id(known)
+    identity: int = record.id if record.id not in known else free_id(known, "definition")
     known[identity] = replace(record, id=identity)
     return identity
-
-
-def free_id(taken: Mapping[int, object]) -> int:
-    """The largest id plus one, or the smallest free one.
-
-    Raises:
-        LogError: none is left.
-    """
-    largest = max(taken, default=0)
-    found = largest + 1 if largest < MAX_ID else next((i for i in range(1, MAX_ID) if i not in taken), 0)
-    if not found:
-        raise LogError("the log has 65535 channels or schemas", expected="an id that is free")
-    return found
 
 
 def renumber_counts(recording: Recording, counts: Mapping[int, int]) -> dict[int, int]:

@@ -108,11 +108,12 @@ class Recordings:
         known = {record.id for record in parsed(found.definitions, 0, self.losses) if isinstance(record, Channel)}
         found.evidence = 3 if known >= set(found.block.counts or {}) else 2 if listed else int(self._certain)
         found.block.recording = self.each.index(recording)
+        foreign = recording is not self._now and not listed  # of another log, although no record says that one begins
         self._current = recording
         self._named = self._named if recording.anonymous else recording
         if not (found.block.counts or {}).keys() <= recording.readable():
             self._early.append(found)
-        self._certain = self._certain or found.evidence > 1 or bool(known)
+        self._certain = not foreign and (self._certain or found.evidence > 1 or bool(known))
         if found.evidence > 1:
             self._adopt(found, recording)
         else:

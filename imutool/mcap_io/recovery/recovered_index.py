@@ -55,6 +55,7 @@ class RecoveredIndex(LogIndex):
         self._repaired: dict[int, bytes] = {}  # heads of chunks as their contents prove them
         self._lost_spans: set[int] = set()
         self._stated: dict[int, int] = {}  # counts of an intact log
+        self._listed: dict[int, ChunkIndex] = {}  # until the heads are compared
         super().__init__(source, max_chunk)
 
     def _read(self) -> None:
@@ -64,8 +65,7 @@ class RecoveredIndex(LogIndex):
                 super()._read()
                 if self.footer.summary_crc and self.footer.summary_start:
                     self._compare_heads()
-                    self._stated = super().counts()
-                    self._ready = True
+                    self._stated, self._ready, self._listed = super().counts(), True, {}
                     return
             except LogError as error:
                 contradiction = reason(error)
@@ -93,12 +93,13 @@ class RecoveredIndex(LogIndex):
         for block in self.blocks:
             if block.compression is not None:
                 raw = self.source.at(block.offset, min(block.length, HEAD_BYTES))
-                head, entry = block.head(raw), self._listed.get(block.offset)
-                stated = (block.start_ns, block.end_ns, block.compression, entry.uncompressed_size if entry else head.size)
-                if (head.start_ns, head.end_ns, head.compression, head.size) != stated:
+                entry, fields = self._listed.get(block.offset), raw[HEAD.size : HEAD.size + CHUNK_HEAD.size]
+                *times, size, crc, _ = CHUNK_HEAD.unpack(fields)
+                stated = [block.start_ns, block.end_ns, entry.uncompressed_size if entry else size]
+                if [*times, size] != stated or block.head(raw).compression != block.compression:
                     raise LogError(f"the summary lists the chunk at byte {block.offset} otherwise than it is")
-                key = hash(raw[HEAD.size : HEAD.size + CHUNK_HEAD.size])
-                if head.crc and key in seen:
+                key = hash(fields)
+                if crc and key in seen:
                     raise LogError(f"the chunk at byte {block.offset} may repeat another")
                 seen.add(key)
 
@@ -130,7 +131,7 @@ class RecoveredIndex(LogIndex):
             found.times()
         else:
             found = self._parse(block, raw)
-        crc = 0 if block.compression is None else records.ChunkHead.of(raw[:HEAD_BYTES], len(raw), block.offset).crc
+        crc = 0 if block.compression is None else CHUNK_HEAD.unpack_from(raw, HEAD.size)[3]
         if not crc and len(found.heads) and not self.proven:
             self.losses.unchecked_in[block.offset] = len(found.heads)
         return self._readable(block, found) if self.by_records else found
@@ -213,7 +214,6 @@ class RecoveredIndex(LogIndex):
         self.items = [item for item in self.items if id(item) not in dropped]
 
     def _found_in(self, block: MessageBlock) -> messages.Messages:
-        """All messages in a block, by its own channel ids."""
         return self._parse(block, self.read(block))
 
     def _parse(self, block: MessageBlock, raw: bytes) -> messages.Messages:
@@ -237,8 +237,8 @@ class RecoveredIndex(LogIndex):
 
     def _add_gap(self, gap: Gap) -> None:
         ids = self.recordings.each[gap.recording].ids
-        counts = Counter({ids.get(local, -1 - local): count for local, count in gap.counts.items()})
-        self.losses.add(Loss(gap.offset, gap.length, gap.reason, self._by_topic(counts), gap.counted, gap.start_ns, gap.end_ns))
+        topics = self._by_topic({ids.get(local, -1 - local): count for local, count in gap.counts.items()})
+        self.losses.add(Loss(gap.offset, gap.length, gap.reason, topics, gap.counted, gap.start_ns, gap.end_ns))
 
     def _by_topic(self, counts: dict[int, int]) -> dict[str, int]:
         found: Counter[str] = Counter()
