@@ -23,7 +23,7 @@ FIELD = re.compile(r"(?!.*__)(?!.*_$)[a-z][a-z0-9_]*")
 TYPE = re.compile(r"[A-Z][A-Za-z0-9]*")
 CONSTANT_NAME = re.compile(r"[A-Z]([A-Z0-9_]?[A-Z0-9]+)*")
 CONSTANT = re.compile(r"^[ \t]*[a-z0-9]+[ \t]+\w+[ \t]*=.*$", re.MULTILINE)  # a line of a definition
-ToCdr = Callable[[bytes], "bytes | memoryview"]
+ToCdr = Callable[["bytes | memoryview"], "bytes | memoryview"]
 
 
 def need_rosbags(where: Path) -> None:

@@ -158,7 +158,7 @@ def _messages(path: Path, routes: dict[int, _Route], remarks: Remarks) -> Iterat
         )
 
 
-def _in_order(bag: Bag) -> Iterator[tuple[int, int, bytes]]:
+def _in_order(bag: Bag) -> Iterator[tuple[int, int, memoryview]]:
     """Times, connections and bytes in time order; of a bag without index, ordered within the buffer.
 
     A message waits until no later chunk can hold an earlier one.
@@ -168,11 +168,12 @@ def _in_order(bag: Bag) -> Iterator[tuple[int, int, bytes]]:
     for offset in sorted(starts, reverse=True):  # the earliest time in any chunk behind this one
         earliest[offset] = bound
         bound = min(bound, starts[offset])
-    waiting: list[tuple[int, int, int, bytes]] = []
+    waiting: list[tuple[int, int, int, memoryview]] = []
     size = order = 0
     for chunk in bag.chunks():
+        data = memoryview(chunk.data)
         for message in chunk.messages:
-            raw = chunk.data[message.data_at : message.end]
+            raw = data[message.data_at : message.end]
             heapq.heappush(waiting, (message.time_ns, order, message.connection, raw))
             order, size = order + 1, size + len(raw)
         until = earliest.get(chunk.offset, -1)

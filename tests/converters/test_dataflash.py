@@ -1,0 +1,87 @@
+"""ArduPilot DataFlash logs, made up message by message."""
+
+from __future__ import annotations
+
+import struct
+from pathlib import Path
+
+import numpy as np
+from mcap.reader import make_reader
+from mcap_ros2.decoder import DecoderFactory
+
+from imutool.mcap_io.log import Log
+from imutool.mcap_io.read import read
+
+CODES = {"Q": "Q", "B": "B", "f": "f", "c": "h", "C": "H", "n": "4s", "L": "i", "Z": "64s", "N": "16s"}
+
+
+class Writer:
+    """A DataFlash log: formats and messages as they come."""
+
+    def __init__(self) -> None:
+        self.raw, self.numbers = b"", {}
+        self.form(128, "FMT", "BBnNZ", "Type,Length,Name,Format,Columns", 89)
+
+    def form(self, number: int, name: str, letters: str, labels: str, size: int | None = None) -> None:
+        code = "<" + "".join(CODES.get(letter, "") for letter in letters)
+        self.numbers[name] = number, code
+        size = struct.calcsize(code) + 3 if size is None else size
+        self.raw += b"\xa3\x95\x80" + struct.pack("<BB4s16s64s", number, size, name.encode(), letters.encode(), labels.encode())
+
+    def add(self, name: str, *values: object) -> None:
+        number, code = self.numbers[name]
+        self.raw += b"\xa3\x95" + bytes([number]) + struct.pack(code, *values)
+
+
+def write_log(path: Path) -> Path:
+    log = Writer()
+    log.form(1, "IMU", "QBffffff", "TimeUS,I,GyrX,GyrY,GyrZ,AccX,AccY,AccZ")
+    log.form(2, "XKF1", "QBccCffffff", "TimeUS,C,Roll,Pitch,Yaw,VN,VE,VD,PN,PE,PD")
+    log.form(3, "GPS", "QBL", "TimeUS,Status,Lat")
+    log.form(4, "PARM", "QNf", "TimeUS,Name,Value")
+    log.form(5, "MSG", "QZ", "TimeUS,Message")
+    log.add("PARM", 1, b"INS_GYRO_RATE", 2.0)
+    log.add("MSG", 2, b"ArduCopter V4.5")
+    for n in range(500):
+        t_us = 7_000_000 + 5000 * n
+        for instance in (0, 1):
+            log.add("IMU", t_us + instance, instance, 0.1, 0.2, 0.3, 1.0, 2.0, -9.75)
+        log.add("XKF1", t_us, 0, 0, 0, 4500, 0.5, 0.25, -0.125, 1.0, 2.0, -3.0)
+    log.add("GPS", 8_000_000, 3, 473_977_418)
+    path.write_bytes(log.raw)
+    return path
+
+
+def test_imus_poses_and_every_message_arrive(convert, imutool, tmp_path):
+    done = convert(write_log(tmp_path / "00000042.BIN"), tmp_path / "out.mcap")
+    assert done.returncode == 0, done.stderr
+    with Log(tmp_path / "out.mcap") as log:
+        assert log.imu_topics == ["/imu0", "/imu1"]
+        assert {t.name: t.count for t in log.topics.values()} | {"/IMU": 1000, "/GPS": 1, "/XKF1": 500} == {
+            t.name: t.count for t in log.topics.values()
+        }
+    recording = read(tmp_path / "out.mcap", imu="/imu1", truth="/ekf/pose")
+    np.testing.assert_allclose(recording.imu.gyro[3], [0.1, -0.2, -0.3], rtol=1e-6)
+    np.testing.assert_allclose(recording.imu.accel[3], [1.0, -2.0, 9.75], rtol=1e-6)
+    assert recording.imu.t_ns[0] == 7_000_001_000
+    np.testing.assert_allclose(recording.truth.p_wb[0], [2.0, 1.0, 3.0])
+    np.testing.assert_allclose(np.abs(recording.truth.q_wb_wxyz[0]), [np.cos(np.pi / 8), 0, 0, np.sin(np.pi / 8)], atol=1e-6)
+    assert read(tmp_path / "out.mcap", imu="/imu0").other_poses == {"/ekf/pose": "estimate"}
+    with (tmp_path / "out.mcap").open("rb") as file:
+        reader = make_reader(file, decoder_factories=[DecoderFactory()])
+        (gps,) = [content for _, c, _, content in reader.iter_decoded_messages() if c.topic == "/GPS"]
+        metadata = {record.name: record.metadata for record in reader.iter_metadata()}
+    assert (gps.status, gps.lat) == (3, 473_977_418)
+    assert metadata["ardupilot/parameters"] == {"INS_GYRO_RATE": "2.0"}
+    assert metadata["ardupilot/messages"] == {"2 us": "ArduCopter V4.5"}
+    assert imutool("info", "out.mcap", cwd=tmp_path).returncode == 0
+
+
+def test_damage_is_passed_over_and_counted(convert, tmp_path):
+    log = write_log(tmp_path / "a.bin")
+    raw = log.read_bytes()
+    log.write_bytes(raw[:20_000] + bytes(33) + raw[20_000:-5])
+    done = convert(log, tmp_path / "out.mcap")
+    assert done.returncode == 3
+    assert "are no message that it describes" in done.stderr
+    assert len(read(tmp_path / "out.mcap", imu="/imu0").imu) >= 498
