@@ -76,3 +76,12 @@ def test_the_architecture_names_every_room() -> None:
     text = (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8")
     rooms = {path.parent.name for path in (ROOT / "imutool").glob("*/__init__.py")} | {"converters"}
     assert [room for room in sorted(rooms) if f"{room}/" not in text] == []
+
+
+def test_every_promise_names_a_test_that_exists() -> None:
+    text = (ROOT / "docs" / "promises.md").read_text(encoding="utf-8")
+    promises = re.findall(r"^\d+\. .*?(?=^\d+\. |^#|\Z)", text, re.MULTILINE | re.DOTALL)
+    assert len(promises) == 10
+    for promise in promises:
+        ((path, name),) = re.findall(r"`(tests/[\w/]+\.py)::(test_\w+)`", promise)
+        assert f"def {name}(" in (ROOT / path).read_text(encoding="utf-8"), promise
