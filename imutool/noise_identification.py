@@ -5,7 +5,7 @@ Rest has priority: there the samples hold only noise and vibration. A value that
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from imutool.config import build
-from imutool.errors import ConfigError, DataError
+from imutool.errors import DataError
 from imutool.inertial.stationary import rest_stretches, white_noise
 from imutool.location import Location
 from imutool.mcap_io.log import Log
@@ -27,7 +27,6 @@ from imutool.recording import Imu, Recording
 from imutool.units import SENSORS, Sensor
 
 KINDS = ("density", "walk", "instability")  # of each sensor, as `Noise` has them
-VIBRATES = 2.0  # times the white variance at shorter averaging times: more than any filter or misfit
 LEAST_FREEDOM = 10.0  # degrees of freedom that an averaging time needs to bound a density from above
 BOUND_RISK = 0.002  # probability that one averaging time puts the bound too low
 SHORT = 2.5  # samples: over longer windows vibration averages out, and no longer bounds the residual from below
@@ -122,27 +121,12 @@ def _at_rest(imu: Imu, remarks: list[str]) -> CurveSource | None:
     curves = {sensor: allan.curve([getattr(part, sensor) for part in parts], imu.period_s) for sensor in SENSORS}
     source = CurveSource.of(f"{_duration(total_s)} at rest", total_s, curves)
     for sensor in SENSORS:
-        if remark := vibration(sensor, source.slopes[sensor]):
+        if remark := allan.vibration(sensor, source.slopes[sensor]):
             remarks.append(f"at rest: {remark}")
         if all(walk is None for walk in source.axes(sensor, "walk")) and len(curves[sensor].tau_s):
             longest = float(curves[sensor].tau_s[-1])
             remarks.append(f"at rest: no bias walk of the {sensor} shows up to averages of {_duration(longest)}")
     return source
-
-
-def vibration(sensor: Sensor, slopes: Sequence[Slopes]) -> str:
-    """Remark where a deviation at rest is that of a vibration; empty where it is the sensor's noise."""
-    vibrating = ["xyz"[axis] for axis, of_axis in enumerate(slopes) if _vibrates(of_axis)]
-    if not vibrating:
-        return ""
-    return (
-        f"the {sensor}'s deviation on {', '.join(vibrating)} does not fall as tau^-1/2 from the shortest on: "
-        "something vibrates (idling motors?), so its noise is above the data sheet's"
-    )
-
-
-def _vibrates(slopes: Slopes) -> bool:
-    return slopes.excess > VIBRATES or "quantisation" in slopes.seen or not slopes.powers
 
 
 def _in_motion(recording: Recording, model: str | Path | None, path: Location) -> CurveSource:
@@ -152,11 +136,8 @@ def _in_motion(recording: Recording, model: str | Path | None, path: Location) -
         DataError: too little truth.
         ModelError: a model that does not fit this log.
     """
-    try:
-        from imutool.noise.residual import curves
-    except ModuleNotFoundError as error:
-        message = "noise in motion needs PyTorch, which is not installed"
-        raise ConfigError(message, where="noise", fix="Install it with: pip install 'imutool[train]'") from error
+    import imutool.training  # noqa: F401  refuses without PyTorch
+    from imutool.noise.residual import curves
 
     corrected, by = _by_model(recording, model, path) if model is not None else _by_fit(recording)
     both = dict(zip(SENSORS, curves(corrected, recording.truth), strict=True))

@@ -5,14 +5,16 @@ True rate zero, specific force g along an unknown direction.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float64
 
 from imutool.bias.model import BiasModel, Vector6
-from imutool.bias_start.bias_tracking import FilteredBlock, Samples, filter_blocks
+from imutool.bias_start.bias_tracking import BiasPrior, FilteredBlock, Samples, filter_blocks, widened
 from imutool.bias_start.initial_bias import (
     AT_REST_STD,
     TRACKED_BY,
@@ -31,7 +33,6 @@ from imutool.inertial.stationary import Blocks, rest_stretches, resting_blocks, 
 from imutool.recording import GRAVITY_M_S2, Imu, nanoseconds
 
 REST_BEGINS_WITHIN_S = 5.0  # a later stop would give a bias from the future
-MAD_TO_STD = 1.4826
 
 
 def auto(model: BiasModel, imu: Imu) -> InitialBias:
@@ -42,25 +43,41 @@ def auto(model: BiasModel, imu: Imu) -> InitialBias:
     Raises:
         DataError: an untrained model, and the log does not start at rest.
     """
-    rest_blocks: list[FilteredBlock] = []
-    before = bias_prior(model)
-    for block in filter_blocks(model, [relative_samples(imu)], before, ahead=True):
-        if not block.resting:
-            break
-        rest_blocks.append(block)
+    before = bias_prior(model, int(imu.t_ns[0]) if len(imu) else None)
+    rest_blocks = _first_stop(model, imu, before)
     if not rest_blocks:
         if not model.card:
             raise _no_rest()
-        return tracked_from_prior(model)
-    end_s, state = rest_blocks[-1].end_s, rest_blocks[-1].step.after
-    std = np.sqrt(np.diag(state.covariance(False)))  # in motion, where the bias is used
+        return tracked_from_prior(model, int(imu.t_ns[0]))
+    end_s = rest_blocks[-1].end_s
     stop = imu.rows(slice(0, int(np.searchsorted(imu.t_ns, imu.t_ns[0] + nanoseconds(end_s)))))
-    noise = white_noise(np.concatenate([stop.gyro, stop.accel], axis=1))
+    t_s, gyro, accel = relative_samples(stop)
+    u = np.concatenate([gyro, accel], axis=1)
+    difference = (u - model.stream(before.mean)(t_s, gyro, accel)).mean(axis=0)
+    wide = widened(before.std, difference, _at_rest_variance(model, u))
+    if (wide > before.std).any():
+        before = replace(before, std=wide)
+        rest_blocks = _first_stop(model, stop, before)
+    state = rest_blocks[-1].step.after
+    std = np.sqrt(np.diag(state.covariance(False)))  # in motion, where the bias is used
+    noise = white_noise(u)
     source = f"{end_s - rest_blocks[0].start_s:.1f} s at rest from 0.0 s on"
     if model.card:
         source = f"{source}, {training_source(model)}"
     how = f"{source}, {accuracy(std)}, then {TRACKED_BY}"
     return InitialBias(state.rest_bias(True), std, how, noise, follows=before, hold_s=end_s)
+
+
+def _first_stop(model: BiasModel, imu: Imu, before: BiasPrior) -> list[FilteredBlock]:
+    """Filtered blocks of the stop at the beginning of some samples; none if they begin in motion."""
+    return list(itertools.takewhile(lambda b: b.resting, filter_blocks(model, [relative_samples(imu)], before, ahead=True)))
+
+
+def _at_rest_variance(model: BiasModel, samples: Float64[np.ndarray, "n 6"]) -> Vector6:
+    """Variance of the mean of samples at rest about the gyro's bias in motion; nothing of the accelerometer's."""
+    variance: Vector6 = bias_prior(model).ground_std ** 2 + samples.var(axis=0) / len(samples)
+    variance[3:] = np.inf
+    return variance
 
 
 def at_rest(model: BiasModel, imu: Imu) -> InitialBias:
@@ -73,11 +90,12 @@ def at_rest(model: BiasModel, imu: Imu) -> InitialBias:
     bounds = next((bounds for bounds in rest_stretches(imu) if bounds[0] <= latest), None)
     if bounds is None:
         raise _no_rest()
-    start, samples = prior(model), imu.rows(slice(*bounds))
+    start, samples = prior(model, int(imu.t_ns[0])), imu.rows(slice(*bounds))
     residual = np.concatenate([samples.gyro, samples.accel], axis=1) - bias_over(model, samples, start.rest) + start.rest
     mean = residual.mean(axis=0)
     squares = ((residual - mean) ** 2).sum(axis=0)
     stretch = _RestStretch(mean, squares, len(samples), int(samples.t_ns[0]), int(samples.t_ns[-1]))
+    start = replace(start, std=widened(start.std, mean - start.rest, _at_rest_variance(model, residual)))
     return _combined(start, [stretch], int(imu.t_ns[0]))
 
 
@@ -101,23 +119,20 @@ def over_all_rest(model: BiasModel, blocks: Blocks) -> InitialBias:
     return _combined(prior(model), stretches, int(blocks.first_ns[0]))
 
 
-def rest_spread(model: BiasModel, logs: Sequence[Samples], rest: Float64[np.ndarray, "logs 6"]) -> Vector6:
-    """Robust standard deviation about zero of the bias at rest minus the bias in motion.
+def rest_differences(
+    model: BiasModel, logs: Sequence[Samples], rest: Float64[np.ndarray, "logs 6"]
+) -> list[Float64[np.ndarray, "stops 6"]]:
+    """Bias at each stop of each log minus the log's bias in motion, `rest`.
 
-    `rest` is the rest bias in motion of each log, from its truth. The gyro's figure is by axis; rest shows the accelerometer's
-    bias along gravity only, so its three axes share one figure. Never below `AT_REST_STD`, which also holds if no log rests.
+    Rest shows the accelerometer's bias along gravity only, so its three columns are the same.
     """
-    differences = []
+    out = []
     for (t_s, gyro, accel), in_motion in zip(logs, rest, strict=True):
         t_ns = np.round(t_s * 1e9).astype(np.int64)
         residual = np.concatenate([gyro, accel], axis=1) - model.stream(in_motion)(t_s, gyro, accel)
-        for first, last in rest_stretches(Imu(t_ns, gyro, accel)):
-            mean = residual[first:last].mean(axis=0)
-            differences.append([*mean[:3], *[np.linalg.norm(mean[3:]) - GRAVITY_M_S2] * 3])
-    if not differences:
-        return AT_REST_STD.copy()
-    spread: Vector6 = np.maximum(MAD_TO_STD * np.median(np.abs(differences), axis=0), AT_REST_STD)
-    return spread
+        means = [residual[first:last].mean(axis=0) for first, last in rest_stretches(Imu(t_ns, gyro, accel))]
+        out.append(np.array([[*m[:3], *[np.linalg.norm(m[3:]) - GRAVITY_M_S2] * 3] for m in means]).reshape(-1, 6))
+    return out
 
 
 class _RestStretch(NamedTuple):

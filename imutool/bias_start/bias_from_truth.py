@@ -11,7 +11,16 @@ import numpy as np
 from jaxtyping import Bool, Float64
 
 from imutool.bias.model import Array, BiasModel, Vector6
-from imutool.bias_start.initial_bias import LEAST_STD, TRACKED_BY, InitialBias, accuracy, bias_over, bias_prior, prior
+from imutool.bias_start.bias_tracking import widened
+from imutool.bias_start.initial_bias import (
+    LEAST_STD,
+    TRACKED_BY,
+    InitialBias,
+    accuracy,
+    bias_over,
+    bias_prior,
+    prior,
+)
 from imutool.errors import DataError
 from imutool.geometry import quaternion
 from imutool.inertial.strapdown import GRAVITY_W, with_velocity
@@ -49,10 +58,11 @@ def from_truth(model: BiasModel, recording: Recording, truth_s: float = TRUTH_S)
     rows = slice(int(usable[0]), int(usable[-1]) + 1)
     piece, poses = imu.rows(rows), poses.rows(rows)
     assert poses.v_w is not None
-    start = prior(model)
+    start = prior(model, int(imu.t_ns[0]))
     residual = np.concatenate([piece.gyro, piece.accel], axis=1) - bias_over(model, piece, start.rest)
     offset = bias_from_truth(t[rows], residual, quaternion.unit(poses.q_wb_wxyz), poses.v_w, trusted[rows])
     variance = model.truth_std**2 * (TRUTH_S / length_s) ** 2
+    start = replace(start, std=widened(start.std, offset, variance + WORLD_TILT_STD**2))
     rest, std = _updated(start, offset, variance)
     how = f"truth over {length_s:.1f} s{', weighed against the training runs' if model.card else ''}, {accuracy(std)}"
     if not model.card:

@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float64, Int64
 
-from imutool.bias.model import GAP_S, BiasEstimate, BiasModel, Vector6
+from imutool.bias.model import COLUMNS, GAP_S, BiasEstimate, BiasModel, Vector6
 from imutool.inertial import inertial_filter
 from imutool.inertial.inertial_filter import FilterSettings, State, Step
 from imutool.inertial.preintegration import integrate
@@ -24,6 +24,8 @@ from imutool.inertial.stationary import GAP_PERIODS, OnlineRestDetector
 BLOCK_S = 0.5
 USUAL_WALK = np.array([1e-4] * 3 + [2e-3] * 3)  # of a sensor without a trained model
 CHUNK_S, LOOK_AHEAD_S = 600.0, 600.0  # of smoothing: a bias ten minutes later says nothing about the present one
+
+CONTRADICTED = (10.8, 13.8, 16.3)  # chi-square of one, two, three differences that a true prior exceeds once in a thousand logs
 
 Samples = tuple[Float64[np.ndarray, " n"], Float64[np.ndarray, "n 3"], Float64[np.ndarray, "n 3"]]
 
@@ -41,6 +43,22 @@ class BiasPrior:
     std: Vector6
     ground_std: Vector6
     walk: Vector6 = field(default_factory=USUAL_WALK.copy)
+
+
+def widened(std: Vector6, difference: Vector6, variance: Vector6) -> Vector6:
+    """Standard deviation of a prior after comparison with what a log shows.
+
+    `difference` is the bias that the log shows minus the prior's mean, `variance` that of the measurement (infinite where it
+    shows nothing). A sensor whose chi-square exceeds `CONTRADICTED` gets the root mean square of its difference.
+    """
+    out = std.copy()
+    for columns in COLUMNS.values():
+        shown = np.isfinite(variance[columns]) & (std[columns] > 0)  # a prior of zero variance stays
+        square = difference[columns][shown] ** 2
+        chi_square = (square / (std[columns][shown] ** 2 + variance[columns][shown])).sum()
+        if shown.any() and chi_square > CONTRADICTED[shown.sum() - 1]:
+            out[columns] = np.maximum(std[columns], np.sqrt(square.mean()))
+    return out
 
 
 class BiasTrajectory(NamedTuple):
@@ -240,19 +258,3 @@ def smooth_blocks(blocks: Iterable[FilteredBlock]) -> Iterator[tuple[FilteredBlo
     if kept:
         states = inertial_filter.smooth([block.step for block in kept])
         yield from zip(kept, states, strict=False)  # the last state is that of the end
-
-
-def smooth_bias(model: BiasModel, batches: Iterable[Samples], prior: BiasPrior) -> tuple[BiasTrajectory, float]:
-    """Smoothed rest bias over a whole log, and the time at rest (s); memory.
-
-    Thirteen numbers per block.
-
-    The trajectory is empty for a log shorter than a block.
-    """
-    rows, rested_s = [], 0.0
-    for block, state in smooth_blocks(filter_blocks(model, batches, prior, ahead=True)):
-        std = np.sqrt(np.diag(state.covariance(block.resting)))
-        rows.append(np.concatenate([[block.start_s], state.rest_bias(block.resting), std]))
-        rested_s += (block.end_s - block.start_s) * block.resting
-    table = np.array(rows).reshape(-1, 13)
-    return BiasTrajectory(table[:, 0], table[:, 1:7], table[:, 7:]), rested_s

@@ -68,8 +68,7 @@ class OnlineDebiaser:
     """
 
     def __init__(self, model: BiasModel, start: InitialBias | None = None) -> None:
-        stream = (start or tracked_from_prior(model)).stream(model)
-        self._correct = stream.one if isinstance(stream, SampleStream) else _by_blocks(stream)
+        self._model, self._start = model, start
         self._start_ns, self._before_ns, self._bias = -1, -1, np.zeros(6)
 
     def __call__(
@@ -79,7 +78,8 @@ class OnlineDebiaser:
         u = np.concatenate((gyro, accel))
         size = np.abs(u)
         if (size <= MOST).all() and size[3:].max() >= LEAST_FORCE_M_S2:  # false for NaN
-            self._bias = self._correct(self._seconds(stamp_ns), u)
+            t_s = self._seconds(stamp_ns)
+            self._bias = self._correct(t_s, u)
         bias = self._bias.copy()
         clean = u - bias
         return clean[:3], clean[3:], bias
@@ -88,6 +88,8 @@ class OnlineDebiaser:
         """Seconds since the first sample; a jump of the clock counts as at most `stretches.MOST_GAP_S`."""
         if self._start_ns < 0:
             self._start_ns = self._before_ns = stamp_ns
+            stream = (self._start or tracked_from_prior(self._model, stamp_ns)).stream(self._model)
+            self._correct = stream.one if isinstance(stream, SampleStream) else _by_blocks(stream)
         step_ns = stamp_ns - self._before_ns
         if -GAP_NS < step_ns < 0:  # out of order: no time passes
             self._start_ns += step_ns

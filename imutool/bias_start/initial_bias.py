@@ -1,7 +1,9 @@
 """Initial bias of a run: the rest bias at its start, with standard deviation and source.
 
 A measurement (at rest: `bias_at_rest`; from true poses: `bias_from_truth`) and the prior of the training runs are combined by
-their variances, axis by axis; a measurement along one direction is a Kalman update. A model may add a motion-dependent part
+their variances, axis by axis; a measurement along one direction is a Kalman update. The prior is that of the training session
+within hours of the log, else that of a new session. It is held against the log first: where the log shows a bias that the
+prior all but rules out, the prior becomes as wide as that difference (`widened`). A model may add a motion-dependent part
 C(u): the measurement then uses the samples without that part.
 
 With `auto` and `truth` the rest bias is tracked after the start, by every stop and by gravity in motion
@@ -13,12 +15,21 @@ the measured stretch (the stop at the start of the log, or the first seconds of 
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float64
 
-from imutool.bias.model import GAP_S, BiasEstimate, BiasModel, Covariances, RestBiasEstimator, Stream, Vector6
+from imutool.bias.model import (
+    GAP_S,
+    BiasEstimate,
+    BiasModel,
+    Covariances,
+    RestBiasEstimator,
+    Stream,
+    Vector6,
+)
 from imutool.bias_start.bias_tracking import (
     USUAL_WALK,
     BiasPrior,
@@ -26,14 +37,19 @@ from imutool.bias_start.bias_tracking import (
     Samples,
     TrackedBiasStream,
     TrajectoryBiasStream,
-    smooth_bias,
+    filter_blocks,
+    smooth_blocks,
+    widened,
 )
 from imutool.bias_start.stretches import MOST, StretchClock, measured
 from imutool.errors import ConfigError, DataError
+from imutool.inertial.inertial_filter import State
 from imutool.recording import Imu, seconds
 
 AT_REST_STD = np.array([1e-4] * 3 + [0.03] * 3)  # earth's rotation; local gravity and a tilt of the sensor
 LEAST_STD = np.array([1e-6] * 3 + [1e-4] * 3)  # with a prior of zero variance nothing could be estimated
+SESSION_GAP_S = 6 * 3600.0  # a longer pause is another switching-on
+LEAST_SHOWN = 0.2  # precision from the log, of that of the prior, below which the log says nothing about the prior
 TRACKED_BY = "gravity in motion and every stop"
 
 STEP_S = 1.0  # of the covariance of a constant rest bias, whose dynamics take minutes
@@ -138,45 +154,56 @@ def _transition(F: Float64[np.ndarray, "6 6"]) -> Float64[np.ndarray, "6 6"]:
     return np.asarray(expm(F))
 
 
-def prior(model: BiasModel) -> InitialBias:
-    """Prior bias: mean and spread over the training runs."""
-    return InitialBias(model.prior_mean.copy(), model.prior_std.copy(), "prior of the training runs")
+def prior(model: BiasModel, first_ns: int | None = None) -> InitialBias:
+    """Prior bias of a log that begins at a stamp: of its session if training saw it, else of a new one."""
+    mean, std = model.prior_mean.copy(), model.prior_std.copy()
+    sessions = [] if first_ns is None else model.card.get("sessions", [])
+    apart = [max(0, session["start_ns"] - first_ns, first_ns - session["end_ns"]) for session in sessions]
+    if apart and min(apart) <= SESSION_GAP_S * 1e9:
+        session = sessions[apart.index(min(apart))]
+        mean, std = np.array(session["mean"]), np.array(session["std"])
+    return InitialBias(mean, std, "prior of the training runs")
 
 
-def bias_prior(model: BiasModel) -> BiasPrior:
+def bias_prior(model: BiasModel, first_ns: int | None = None) -> BiasPrior:
     """Prior of the bias filter from the training runs.
 
     The axes of a sensor share one random walk.
     """
+    start = prior(model, first_ns)
     ground = np.maximum(model.rest_std, AT_REST_STD)
     walk = np.repeat(np.sqrt(np.mean(model.walk_std.reshape(2, 3) ** 2, axis=1)), 3)
     walk = np.where(walk > 0, walk, USUAL_WALK)
-    return BiasPrior(model.prior_mean.copy(), np.maximum(model.prior_std, LEAST_STD), ground, walk)
+    return BiasPrior(start.rest, np.maximum(start.std, LEAST_STD), ground, walk)
 
 
-def tracked_from_prior(model: BiasModel) -> InitialBias:
+def tracked_from_prior(model: BiasModel, first_ns: int | None = None) -> InitialBias:
     """Prior bias, tracked from the first sample on: for a live node, which cannot look ahead."""
-    start = prior(model)
+    start = prior(model, first_ns)
     how = f"{training_source(model)}, {accuracy(start.std)}, then {TRACKED_BY}"
-    return InitialBias(start.rest, start.std, how, follows=bias_prior(model))
+    return InitialBias(start.rest, start.std, how, follows=bias_prior(model, first_ns))
 
 
-def smoothed_start(model: BiasModel, batches: Iterable[Samples], where: str = "") -> InitialBias:
+def smoothed_start(model: BiasModel, batches: Iterable[Samples], where: str = "", first_ns: int | None = None) -> InitialBias:
     """Smoothed rest bias in time from a whole log.
 
     All stops, gravity in motion and the training runs.
 
-    `batches` are seconds since the first sample, gyro and accel.
+    `batches` are seconds since the first sample, gyro and accel; they are iterated again if the log contradicts the prior.
 
     Raises:
         DataError: less than half a second of samples.
         NoRestError: an untrained model, and a log that never rests.
     """
-    track, rested_s = smooth_bias(model, batches, bias_prior(model))
+    before = bias_prior(model, first_ns)
+    track, rested_s, difference, variance = smooth_bias(model, batches, before)
     if not len(track.t_s):
         raise DataError("too short to be smoothed", where=where, expected="at least half a second of samples")
     if not model.card and not rested_s:
         raise NoRestError("the log never rests", where=where, expected="1.5 s or more without motion")
+    std = widened(before.std, difference, variance)
+    if (std > before.std).any():
+        track, *_ = smooth_bias(model, batches, replace(before, std=std))
     std = np.median(track.std, axis=0)
     parts = [f"{rested_s:.1f} s at rest in all"] * (rested_s > 0) + ["gravity in motion"]
     parts += [training_source(model)] * bool(model.card)
@@ -221,3 +248,40 @@ def relative_samples(imu: Imu) -> Samples:
 def bias_over(model: BiasModel, imu: Imu, rest: Vector6) -> Float64[np.ndarray, "n 6"]:
     """Bias of a model over some samples, from a rest bias."""
     return model.stream(rest)(*relative_samples(imu))
+
+
+class SmoothedBias(NamedTuple):
+    """Smoothed rest bias, time at rest, and what the log alone shows of the bias at its start.
+
+    `difference` is that bias minus the prior's mean, `variance` its variance: infinite where the log shows little.
+    """
+
+    track: BiasTrajectory
+    rested_s: float
+    difference: Vector6
+    variance: Vector6
+
+
+def smooth_bias(model: BiasModel, batches: Iterable[Samples], prior: BiasPrior) -> SmoothedBias:
+    """Smoothed rest bias over a whole log; memory: thirteen numbers per block.
+
+    The trajectory is empty for a log shorter than a block.
+    """
+    rows, rested_s, first = [], 0.0, None
+    for block, state in smooth_blocks(filter_blocks(model, batches, prior, ahead=True)):
+        first = state if first is None else first
+        std = np.sqrt(np.diag(state.covariance(block.resting)))
+        rows.append(np.concatenate([[block.start_s], state.rest_bias(block.resting), std]))
+        rested_s += (block.end_s - block.start_s) * block.resting
+    table = np.array(rows).reshape(-1, 13)
+    shown = (np.zeros(6), np.full(6, np.inf)) if first is None else _shown(first, prior)
+    return SmoothedBias(BiasTrajectory(table[:, 0], table[:, 1:7], table[:, 7:]), rested_s, *shown)
+
+
+def _shown(first: State, prior: BiasPrior) -> tuple[Vector6, Vector6]:
+    """Bias that a log shows without the prior: precision of the smoothed bias minus that of the prior, axis by axis."""
+    after, before = np.diag(first.covariance(False)), prior.std**2
+    precision = 1.0 / after - 1.0 / before
+    measured = precision > LEAST_SHOWN / before
+    gain = np.where(measured, 1.0 - after / before, 1.0)
+    return (first.bias - prior.mean) / gain, np.where(measured, 1.0 / np.where(measured, precision, 1.0), np.inf)

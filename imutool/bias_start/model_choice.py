@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -60,7 +60,7 @@ def find_initial_bias(init: str, model: BiasModel, recording: Recording) -> Init
             untrained model and no stationary stretch.
     """
     if init == "prior":
-        return prior(model)
+        return prior(model, int(recording.imu.t_ns[0]))
     if init == "truth" or init.startswith("truth:"):
         return from_truth(model, recording, _truth_s(init))
     if init == "stationary":
@@ -125,7 +125,10 @@ def choose_model_and_start(
     model: BiasModel = static.Model() if name is None or untrained else find_model(name, 1.0 / period_s)
     if not untrained:
         check_rate(model, 1.0 / period_s, log.path)
-    start = _smoothed(model, _batches(log, topic, survey), log.path) if smooth else find_initial_bias(init, model, first_minute)
+    if smooth:
+        start = _smoothed(model, _Batches(log, topic, survey), log.path, int(first_minute.imu.t_ns[0]))
+    else:
+        start = find_initial_bias(init, model, first_minute)
     return model, start if start.noise.any() else replace(start, noise=_noise(first_minute.imu))
 
 
@@ -136,12 +139,12 @@ def smooth_in_memory(model: BiasModel, imu: Imu, where: str | Location) -> Initi
         DataError: too few samples.
         ModelError: an untrained model, and no rest to measure a bias on.
     """
-    return _smoothed(model, [relative_samples(imu)], where)
+    return _smoothed(model, [relative_samples(imu)], where, int(imu.t_ns[0]) if len(imu) else 0)
 
 
-def _smoothed(model: BiasModel, batches: Iterable[Samples], where: str | Location) -> InitialBias:
+def _smoothed(model: BiasModel, batches: Iterable[Samples], where: str | Location, first_ns: int) -> InitialBias:
     try:
-        return smoothed_start(model, batches, str(where))
+        return smoothed_start(model, batches, str(where), first_ns)
     except NoRestError as error:
         raise _no_start(where) from error
 
@@ -158,13 +161,20 @@ def _imu_batches(
     sieve.refuse_nothing()
 
 
-def _batches(log: Log, topic: str, survey: Survey | None) -> Iterator[Samples]:
-    """IMU samples, with seconds since the first."""
-    start_ns = None
-    for batch, t_ns in _imu_batches(log, topic, survey):
-        if len(t_ns):
-            start_ns = int(t_ns[0]) if start_ns is None else start_ns
-            yield seconds(t_ns, start_ns), batch.gyro, batch.accel
+@dataclass(frozen=True)
+class _Batches:
+    """IMU samples with seconds since the first; every iteration reads the log again."""
+
+    log: Log
+    topic: str
+    survey: Survey | None
+
+    def __iter__(self) -> Iterator[Samples]:
+        start_ns = None
+        for batch, t_ns in _imu_batches(self.log, self.topic, self.survey):
+            if len(t_ns):
+                start_ns = int(t_ns[0]) if start_ns is None else start_ns
+                yield seconds(t_ns, start_ns), batch.gyro, batch.accel
 
 
 def _first_minute(log: Log, topic: str, init: str, survey: Survey | None) -> Recording:

@@ -11,7 +11,7 @@ import typer
 
 from imutool import registry
 from imutool.cli.app import MODEL, Imu, Json, Logs, Overwrite, Quiet, Truth, Verbose, app, listing
-from imutool.cli.terminal import epoch_line, progress, say, write_json
+from imutool.cli.terminal import epoch_line, progress, say, table, write_json
 from imutool.errors import ConfigError
 from imutool.report import UNSET, Report, Section, UnsetType
 
@@ -71,7 +71,29 @@ def train(
             progress=lambda epoch: tell(*epoch_line(epoch)),
         )
     if not write_json(training_report(model, trained.card), json_to, overwrite=overwrite or resume):
+        if "left_out" in trained.card:
+            left_out_table(trained.card["left_out"])
         say(str(model))
+
+
+def left_out_table(left_out: Mapping[str, Any]) -> None:
+    """Print the scores of left-out logs, one row for each log and start, and the models that were kept."""
+    scores = left_out["scores"]
+    models = list(dict.fromkeys(score["model"] for score in scores))
+    aoe = {(score["log"], score["start"], score["model"]): score["aoe_deg"] for score in scores}
+    raw = {score["log"]: score["aoe_deg"] for score in scores if score["model"] == "raw"}
+    starts = sorted({score["start"] for score in scores if score["start"]})
+    rows = [
+        (log, start, [aoe.get((log, start, model), raw[log] if model == "raw" else None) for model in models])
+        for start in starts
+        for log in raw
+    ]
+    for start in starts:
+        columns = zip(*(values for _, of, values in rows if of == start), strict=True)
+        rows.append(("mean", start, [None if None in column else sum(column) / len(column) for column in columns]))
+    cells = [(log, start, *("–" if value is None else f"{value:.2f}" for value in values)) for log, start, values in rows]
+    table([("left-out log", "start", *(f"{model}\nAOE °" for model in models)), *cells], keys=2)
+    say(", ".join(f"{sensor}: {kept}" for sensor, kept in left_out["kept"].items()) + " kept, the simplest that is not beaten")
 
 
 class TrainingLog(Section, frozen=True):
@@ -92,8 +114,10 @@ class TrainingReport(Report, frozen=True, kw_only=True, tag="imutool.training/1"
     training: dict[str, Any]
     logs: list[TrainingLog]
     held_out: dict[str, Any]
+    sessions: list[dict[str, Any]]
     compared: dict[str, Any] | UnsetType = UNSET
     physics: dict[str, Any] | UnsetType = UNSET
+    left_out: dict[str, Any] | UnsetType = UNSET
     sensor: str | None
     dataset: str | None
     name: str | UnsetType = UNSET

@@ -83,7 +83,7 @@ class ImuInfo(Section, frozen=True, kw_only=True):
 
 
 class TruthInfo(Section, frozen=True):
-    """Topic of poses: what they are worth, and the share of the IMU's samples between two close ones.
+    """Topic of poses: what they are worth, and the share of IMU samples that they cover.
 
     `kind` is `truth`, `estimate`, `odometry` or `unknown`.
     """

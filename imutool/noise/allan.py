@@ -23,6 +23,7 @@ import numpy as np
 from jaxtyping import Bool, Float64
 
 from imutool.errors import ConfigError
+from imutool.units import Sensor
 
 LONGEST = 4  # averaging times up to the stretch over this: beyond, a single disagreement decides
 MODEL_ERROR = 0.1  # of the variance: no sensor is a sum of powers to better than this
@@ -223,3 +224,21 @@ def _is_seen(name: str, powers: dict[str, float], tau_s: Float64[np.ndarray, " m
     """Whether a power makes up half of the variance over as many averaging times as its slope needs to show."""
     rules: Bool[np.ndarray, " m"] = part(name, powers[name], tau_s) ** 2 >= HALF * _sum(powers, tau_s)
     return int(rules.sum()) >= LEAST_TIMES_OF[name]
+
+
+VIBRATES = 2.0  # times the white variance at shorter averaging times: more than any filter or misfit
+
+
+def vibration(sensor: Sensor, slopes: Sequence[Slopes]) -> str:
+    """Remark on a vibration at rest; empty where the deviation is the sensor's noise."""
+    vibrating = ["xyz"[axis] for axis, of_axis in enumerate(slopes) if _vibrates(of_axis)]
+    if not vibrating:
+        return ""
+    return (
+        f"the {sensor}'s deviation on {', '.join(vibrating)} does not fall as tau^-1/2 from the shortest on: "
+        "something vibrates (idling motors?), so its noise is above the data sheet's"
+    )
+
+
+def _vibrates(slopes: Slopes) -> bool:
+    return slopes.excess > VIBRATES or "quantisation" in slopes.seen or not slopes.powers

@@ -7,7 +7,9 @@ try:
     import torchdiffeq
 except ImportError as error:
     raise ConfigError(
-        "training needs PyTorch, which is not installed", where="train", fix="Install it with: pip install 'imutool[train]'"
+        "training and noise in motion need PyTorch, which is not installed",
+        where="train",
+        fix="Install it with: pip install 'imutool[train]'",
     ) from error
 
 del torch, torchdiffeq

@@ -13,7 +13,6 @@ trained on recordings corrected for them. The model keeps the ODE if it lowers t
 from __future__ import annotations
 
 import json
-import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -37,14 +36,14 @@ from imutool.sensor import catalogue, physics_file
 from imutool.sensor.linear_form import LinearForm
 from imutool.sensor.signals import SignalFilter, Signals
 from imutool.training.closed_form import CORRELATED
-from imutool.training.fit import Epoch
+from imutool.training.fit import Epoch, note
 from imutool.training.normal_equations import Problem, Seen, linearise
 from imutool.training.segments import Part, Pool
 from imutool.training.settings import TrainSettings
 from imutool.units import SENSORS, Sensor
 
 BY_CHANCE = 0.01  # probability of finding any effect where there is none
-LEAST_GAIN = 0.03  # of the judged loss, for an effect to be worth its parameters
+LEAST_GAIN = 0.05  # of the judged loss, for an effect to be worth its parameters
 FOLDS = 3  # parts of a log where there are fewer logs than this
 LEAST_ODE_GAIN = 0.03  # of the held-out error, for an ODE to be worth its weights
 UNSEEN = 0.9  # of its prior's width: a parameter no narrower was not seen
@@ -54,7 +53,7 @@ UNSEEN = 0.9  # of its prior's width: a parameter no narrower was not seen
 class Calibration:
     """Chosen effects, their parameters in order, and the covariance of these.
 
-    `gains`: share of the loss that each effect took off logs that had no part in its fit, in the order of choice.
+    gains: share of the loss that each effect took off logs that had no part in its fit, in the order of choice.
     """
 
     effects: tuple[str, ...]
@@ -63,6 +62,9 @@ class Calibration:
     rest: Float[Tensor, "logs 3"]
     gains: Mapping[str, float]
     unseen: tuple[str, ...]
+    forms: tuple[LinearForm, ...]  # candidates
+    problem: Problem  # of all candidates, on the part that they were chosen on
+    named: bool  # by the settings
 
 
 def signals_of(pool: Pool) -> Signals:
@@ -94,9 +96,10 @@ def calibrate(
     """
     effects = catalogue.trained(sensor, names)
     seen = Seen(folded(pool, part), sensor, signals_of(pool) if signals is None else signals, gyro)
-    problem, gains = linearise(seen, effects, part), {}
+    every, gains = linearise(seen, effects, part), {}
+    forms, problem = effects, every
     if names is None:
-        gains = _choose(problem, effects)
+        gains = effects_beyond_chance(problem, effects)
         if len(gains) < len(effects):
             effects = tuple(effect for effect in effects if effect.name in gains)
             problem = linearise(seen, effects, part)
@@ -109,6 +112,9 @@ def calibrate(
         rest.reshape(len(pool.names), -1, 3).mean(1),
         gains,
         _unseen(effects, problem, covariance),
+        forms,
+        every,
+        names is not None,
     )
 
 
@@ -124,21 +130,22 @@ def folded(pool: Pool, part: Part) -> Pool:
     return replace(pool, names=tuple(f"{n} {k + 1}/{FOLDS}" for n in pool.names for k in range(FOLDS)), log=log)
 
 
-def _columns(effects: Sequence[LinearForm], names: Sequence[str]) -> list[int]:
+def parameter_columns(effects: Sequence[LinearForm], names: Sequence[str]) -> list[int]:
     """Columns of the parameters of some effects."""
     of = [effect.name for effect in effects for _ in effect.parameters]
     return [k for k, name in enumerate(of) if name in names]
 
 
-def _choose(problem: Problem, effects: Sequence[LinearForm]) -> dict[str, float]:
+def effects_beyond_chance(problem: Problem, effects: Sequence[LinearForm]) -> dict[str, float]:
     """Forward selection, by the gain on other logs; stops where the best gain is small."""
     gains: dict[str, float] = {}
     loss = problem.predicted([])
     while True:
         left = [effect.name for effect in effects if effect.name not in gains]
-        tried = {name: problem.predicted(_columns(effects, [*gains, name])) for name in left}
+        tried = {name: problem.predicted(parameter_columns(effects, [*gains, name])) for name in left}
         helped = {name: new for name, new in tried.items() if bool((new < loss).sum() > 0.5 * len(loss))}
-        agreed = {name: new for name, new in helped.items() if _beyond_chance(problem, effects, [*gains, name])}
+        fitted = {name: new for name, new in helped.items() if _beyond_chance(problem, effects, [*gains, name])}
+        agreed = {name: new for name, new in fitted.items() if float((loss - new).sum()) > _chance_gain(effects, name)}
         if not agreed:
             return gains
         best = min(agreed, key=lambda name: float(agreed[name].sum()))
@@ -154,12 +161,18 @@ def _beyond_chance(problem: Problem, effects: Sequence[LinearForm], names: Seque
     Windows count as independent here, though the covariance takes them as correlated: the test only keeps out effects without
     evidence; the held-out loss decides which come in.
     """
-    columns = _columns(effects, names)
+    columns = parameter_columns(effects, names)
     theta, covariance = problem.solve(columns)
-    own = [k for k, column in enumerate(columns) if column in _columns(effects, names[-1:])]
+    own = [k for k, column in enumerate(columns) if column in parameter_columns(effects, names[-1:])]
     last = theta[columns][own]
     wald = CORRELATED * float(last @ torch.linalg.solve(covariance[own][:, own], last))
     return wald > float(chi2.isf(BY_CHANCE / len(effects), len(own)))
+
+
+def _chance_gain(effects: Sequence[LinearForm], name: str) -> float:
+    """Gain on other logs that the parameters of one effect do not have by chance, in units of the loss."""
+    count = next(len(effect.parameters) for effect in effects if effect.name == name)
+    return float(chi2.isf(BY_CHANCE / len(effects), count)) / CORRELATED
 
 
 def _unseen(effects: Sequence[LinearForm], problem: Problem, covariance: Float[Tensor, "p p"]) -> tuple[str, ...]:
@@ -193,10 +206,11 @@ class PhysicsFirst:
         signals, fits = _online_signals(recordings, pool), {}
         gyro = pool.gyro
         for sensor in SENSORS:
-            report(Epoch(sensor, 0, 0, math.nan, math.nan, math.nan, 0.0, f"looking for effects on the {sensor}"))
+            report(note(f"looking for effects on the {sensor}"))
             chosen = calibrate(pool, sensor, gyro, model.config.effects(sensor), "train", signals)
             whole = calibrate(pool, sensor, gyro, chosen.effects, "all", signals)  # nothing is left to be chosen
-            fits[sensor] = replace(whole, gains=chosen.gains)
+            of_choice = ("gains", "forms", "problem", "named")
+            fits[sensor] = replace(whole, **{name: getattr(chosen, name) for name in of_choice})
             model.take(sensor, fits[sensor].effects, fits[sensor].theta, fits[sensor].covariance)
             if sensor == "gyro":
                 error = torch.from_numpy(model.error("gyro", signals)).to(pool.gyro)

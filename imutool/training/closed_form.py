@@ -1,9 +1,9 @@
 """Closed-form calibration: robust Gauss-Newton over windows between true poses.
 
-Unknown are one matrix W of the sensor and one rest bias a log. The residual of a window is what integration misses
-(`imutool.inertial.windows`), its derivative is exact, Huber's weights keep outliers of the truth from pulling, and
-everything has a
-prior, measured against the residuals' own noise, so that what the motion does not show stays at zero.
+Unknown are one matrix W of the sensor, the rest bias of each log, and the nuisances of each log (`Nuisances`): rotation, clock
+and lever arm between its poses and the sensor, and the tilt of its world. The residual of a window is what integration misses
+(`imutool.inertial.windows`), its derivative is exact, Huber's weights keep outliers of the truth from pulling, and everything
+has a prior, measured against the residuals' own noise, so that what the motion does not show stays at zero.
 """
 
 from __future__ import annotations
@@ -18,10 +18,11 @@ from torch import Tensor
 from imutool.bias.model import COLUMNS
 from imutool.bias.networks.network import BiasNetwork
 from imutool.errors import DataError
+from imutool.geometry import so3
 from imutool.inertial.strapdown import GRAVITY_W
 from imutool.inertial.windows import HUBER_MEDIANS, attitudes, huber_weight, rotation_residual, step_means, velocity_residual
 from imutool.training.segments import Part, Pool, Windows
-from imutool.units import Sensor
+from imutool.units import SENSORS, Sensor
 
 W_PRIOR = 0.05  # plausible misalignment; a scale error of 0.1 is two of these
 REST_PRIOR = {"gyro": 0.1, "accel": 1.0}  # rad/s, m/s²: plausible turn-on biases
@@ -31,12 +32,21 @@ ITERATIONS, REST_ITERATIONS = 6, 3  # the rest alone is nearly linear
 MAX_SAMPLES = 120_000  # of one window length, so that hours of logs cost no more memory than minutes
 
 
+NUISANCE_STD = {  # how far they differ from log to log
+    "gyro": (0.01,) * 3 + (5e-3,),  # rotation (rad), clock (s)
+    "accel": (0.1,) * 2 + (0.01,) * 3 + (5e-3,) + (0.02,) * 3,  # tilt (m/s² of gravity), rotation, clock, lever arm (m)
+}
+ROTATION = {"gyro": slice(3, 6), "accel": slice(5, 8)}  # of a log's unknowns, of which the rest bias comes first
+END_SAMPLES = 3  # whose mean is the rate at an end of a window
+
+
 @dataclass(frozen=True)
 class Solution:
-    """W and the rest bias of each log (rad/s or m/s²)."""
+    """W, and the rest bias of each log (rad/s or m/s²) with its standard deviation."""
 
     W: Float[Tensor, "3 3"]
     rest: Float[Tensor, "logs 3"]
+    std: Float[Tensor, "logs 3"]
 
 
 def sensor_residual(
@@ -68,10 +78,79 @@ def solve(
     *,
     matrix: bool,
     part: Part = "train",
+    nuisances: bool = True,
 ) -> Solution:
     """Rest biases of all logs by Gauss-Newton; with `matrix` also W on top of the model's.
 
+    Without `nuisances` a rest bias is the constant that fits best, which takes the nuisances of its log as far as it can.
+
     Windows of all lengths count together, each length against its own noise: short ones show the matrix, long ones the bias.
+
+    Raises:
+        DataError: a log has no window of that part that is free of gaps.
+    """
+    sets = _window_sets(pool, window_s, part)
+    rest, W, columns, known = rest.clone(), torch.zeros(3, 3).to(rest), COLUMNS[sensor], 9 if matrix else 0
+    nuisance_prior = torch.tensor(NUISANCE_STD[sensor] if nuisances else ()).to(rest) ** -2.0
+    own = torch.zeros(len(pool.names), 3 + len(nuisance_prior)).to(rest)  # rest bias, then nuisances
+    turns = ROTATION[sensor] if nuisances else slice(0, 0)
+    own_prior = torch.cat([torch.full((3,), REST_PRIOR[sensor] ** -2.0).to(rest), nuisance_prior]).repeat(len(own))
+    prior = torch.cat([torch.full((known,), W_PRIOR**-2.0).to(rest), own_prior])
+    for _ in range(ITERATIONS if matrix else REST_ITERATIONS):
+        own[:, :3] = rest[:, columns]
+        now = torch.cat([W.flatten()[:known], own.flatten()])
+        H, g = torch.diag(prior), prior * now
+        for first, n in sets:
+            if not len(first):
+                continue
+            windows = pool.windows(first, n, rest[pool.log[first]])
+            e, A = sensor_residual(model, sensor, windows, W if matrix else None)
+            rates, forces = (u - b[:, None] for u, b in map(windows.segment.of, SENSORS))
+            by_nuisance = nuisance_jacobian(sensor, windows, rates, forces)[..., : len(nuisance_prior)]
+            apart = own.clone()
+            apart[:, turns] -= own[:, turns].mean(0)  # what the rotations of all logs share is the matrix's
+            e = e + (by_nuisance @ apart[windows.log, 3:, None])[..., 0]
+            J = _by_log(torch.cat([A.sum(1), by_nuisance], dim=2), windows.log, len(own), turns)
+            if matrix:
+                u, _ = windows.segment.of(sensor)
+                J = torch.cat([_by_matrix(A, step_means(u) if sensor == "gyro" else u), J], dim=2)
+            weight = _weight(e, windows.log, len(own))
+            H += torch.einsum("m,mij,mik->jk", weight, J, J)
+            g += torch.einsum("m,mij,mi->j", weight, J, e)
+        step = -torch.linalg.solve(H, g)
+        if matrix:
+            W = W + step[:9].reshape(3, 3)
+        own = own + step[known:].reshape(own.shape)
+        rest[:, columns] = own[:, :3]
+    variance = torch.linalg.inv(H).diagonal()[known:].reshape(own.shape)
+    return Solution(W, rest[:, columns].clone(), variance[:, :3].sqrt())
+
+
+def nuisance_jacobian(
+    sensor: Sensor, windows: Windows, gyro: Float[Tensor, "m n 3"], accel: Float[Tensor, "m n 3"]
+) -> Float[Tensor, "m 3 k"]:
+    """Derivative of a window's residual by the nuisances of its log, in the order of `NUISANCE_STD`.
+
+    The poses are those of a frame turned by phi against the sensor, late by tau: R' = R(t - tau) Exp(phi), and so is their
+    velocity, of a point r away: v' = v + R [omega]x r. Only the ends of a window count, since nuisances cancel in between.
+    `gyro` and `accel` are the samples without their rest bias.
+    """
+    R = windows.R_start.mT @ windows.R_end
+    w_start, w_end = gyro[:, :END_SAMPLES].mean(1), gyro[:, -END_SAMPLES:].mean(1)
+    if sensor == "gyro":
+        by_clock = w_end - (R.mT @ w_start[..., None])[..., 0]
+        return torch.cat([R.mT - torch.eye(3).to(R), by_clock[..., None]], dim=2)
+    duration_s, g_w = windows.dt.sum(1), accel.new_tensor(GRAVITY_W)
+    force = so3.hat(windows.v_end - windows.v_start - g_w * duration_s[:, None]) @ windows.R_start
+    a_start, a_end = accel[:, :END_SAMPLES].mean(1), accel[:, -END_SAMPLES:].mean(1)
+    change = windows.R_end @ a_end[..., None] - windows.R_start @ a_start[..., None]
+    by_lever = windows.R_start @ so3.hat(w_start) - windows.R_end @ so3.hat(w_end)
+    tilt = torch.eye(3).to(R)[None, :, :2] * duration_s[:, None, None]
+    return torch.cat([tilt, -force, change + force @ w_start[..., None], by_lever], dim=2)
+
+
+def _window_sets(pool: Pool, window_s: Sequence[float], part: Part) -> list[tuple[Int[Tensor, " k"], int]]:
+    """First samples of the windows of each length, and the length in samples.
 
     Raises:
         DataError: a log has no window of that part that is free of gaps.
@@ -86,29 +165,7 @@ def solve(
             expected="truth that covers at least one window",
             fix="Shorten the windows (settings gyro_window_s, accel_window_s), or leave the log out",
         )
-    rest, W, columns, known = rest.clone(), torch.zeros(3, 3).to(rest), COLUMNS[sensor], 9 if matrix else 0
-    for _ in range(ITERATIONS if matrix else REST_ITERATIONS):
-        now = torch.cat([W.flatten()[:known], rest[:, columns].flatten()])
-        prior = torch.full_like(now, REST_PRIOR[sensor] ** -2)
-        prior[:known] = W_PRIOR**-2
-        H, g = torch.diag(prior), prior * now
-        for first, n in sets:
-            if not len(first):
-                continue
-            windows = pool.windows(first, n, rest[pool.log[first]])
-            e, A = sensor_residual(model, sensor, windows, W if matrix else None)
-            J = _by_rest(A, windows.log, len(pool.names))
-            if matrix:
-                u, _ = windows.segment.of(sensor)
-                J = torch.cat([_by_matrix(A, step_means(u) if sensor == "gyro" else u), J], dim=2)
-            weight = _weight(e, windows.log, len(pool.names))
-            H += torch.einsum("m,mij,mik->jk", weight, J, J)
-            g += torch.einsum("m,mij,mi->j", weight, J, e)
-        step = -torch.linalg.solve(H, g)
-        if matrix:
-            W = W + step[:9].reshape(3, 3)
-        rest[:, columns] += step[known:].reshape(-1, 3)
-    return Solution(W, rest[:, columns].clone())
+    return sets
 
 
 def _some(first: Int[Tensor, " m"], n: int) -> tuple[Int[Tensor, " k"], int]:
@@ -121,11 +178,12 @@ def _by_matrix(A: Float[Tensor, "m n 3 3"], u: Float[Tensor, "m n 3"]) -> Float[
     return torch.einsum("mkij,mkl->mijl", A, u).flatten(2)
 
 
-def _by_rest(A: Float[Tensor, "m n 3 3"], log: Int[Tensor, " m"], logs: int) -> Float[Tensor, "m 3 k"]:
-    """d e / d (rest of each log): taking a constant off all samples adds the sum of A_k times it."""
-    J = A.new_zeros(len(A), 3, logs, 3)
-    J[torch.arange(len(A), device=A.device), :, log] = A.sum(1)
-    return J.flatten(2)
+def _by_log(J: Float[Tensor, "m 3 k"], log: Int[Tensor, " m"], logs: int, turns: slice) -> Float[Tensor, "m 3 all"]:
+    """Derivative by the unknowns of every log: zero but for a window's own, and rotations about their mean."""
+    out = J.new_zeros(len(J), 3, logs, J.shape[2])
+    out[torch.arange(len(J), device=J.device), :, log] = J
+    out[..., turns] -= out[..., turns].mean(2, keepdim=True)
+    return out.flatten(2)
 
 
 def _weight(e: Float[Tensor, "m 3"], log: Int[Tensor, " m"], logs: int) -> Float[Tensor, " m"]:

@@ -12,7 +12,7 @@ from __future__ import annotations
 import copy
 import math
 import time
-from collections.abc import Generator, Iterator, Sequence
+from collections.abc import Collection, Generator, Iterator, Sequence
 from dataclasses import dataclass, field
 
 import torch
@@ -58,6 +58,11 @@ class Epoch:
     note: str = ""  # what is being done instead, where there are no steps to count
 
 
+def note(text: str) -> Epoch:
+    """Line of progress where there are no steps to count."""
+    return Epoch("gyro", 0, 0, math.nan, math.nan, math.nan, 0.0, text)
+
+
 @dataclass
 class Stage:
     """What one sensor's descent must remember to go on: also what a checkpoint holds."""
@@ -86,15 +91,22 @@ def check_device(device: str) -> None:
 class Training:
     """Training of one model on one sensor; `model` is final once `epochs` has ended.
 
+    The `constant` sensors get no matrix in closed form.
+
     Raises:
         DataError: recordings without truth, of different rates, too short, or standing still.
         ConfigError: a method that is not trained, settings it does not know, or settings with another method's defaults.
     """
 
     def __init__(
-        self, recordings: Sequence[Recording], method: str, settings: TrainSettings | None = None, device: str = "cpu"
+        self,
+        recordings: Sequence[Recording],
+        method: str,
+        settings: TrainSettings | None = None,
+        device: str = "cpu",
+        constant: Collection[Sensor] = (),
     ) -> None:
-        self.settings = settings_for(method, settings)
+        self.settings, self._constant = settings_for(method, settings), constant
         check_device(device)
         self.pool = Pool.of(recordings, device=device)
         torch.manual_seed(self.settings.seed)
@@ -108,6 +120,7 @@ class Training:
         self.generator = torch.Generator().manual_seed(self.settings.seed)
         self.done: dict[Sensor, float] = {}  # held-out error of each finished stage
         self.stage: Stage | None = None
+        self.sessions: list[statistics.Session] = []
 
     def epochs(self) -> Iterator[Epoch]:
         """Train and yield progress; a caller may stop and resume between two yields."""
@@ -124,7 +137,7 @@ class Training:
             self.done[sensor], self.stage = min(last, self.stage.before), None
         lengths: dict[Sensor, tuple[float, ...]] = {sensor: self._window_s(sensor) for sensor in SENSORS}
         self.model.eval()
-        statistics.store_statistics(self.model, self.pool, self.tracks.per_log().detach(), lengths)
+        self.sessions = statistics.store_statistics(self.model, self.pool, self.tracks.per_log().detach(), lengths)
         self.model.requires_grad_(False)
 
     def held_out(self, sensor: Sensor, model: BiasNetwork) -> float:
@@ -137,7 +150,7 @@ class Training:
         columns = COLUMNS[sensor]
         rest[:, columns] = model.rest_at_work(sensor, rest[:, columns])
         scored, pool = corrected(model, self.pool, "held_out", sensors_up_to(sensor))
-        solved = closed_form.solve(scored, sensor, pool, rest, lengths, matrix=False, part="held_out")
+        solved = closed_form.solve(scored, sensor, pool, rest, lengths, matrix=False, part="held_out", nuisances=False)
         rest[:, columns] = solved.rest
         with torch.no_grad():
             parts = torch.split(first, 64)
@@ -165,14 +178,16 @@ class Training:
         """Calibration and rest biases, as far as windows and a matrix show them."""
         rest = self.tracks.per_log().detach()
         scored, pool = corrected(self.model.eval(), self.pool, "train", sensors_up_to(sensor))
-        self._take(sensor, closed_form.solve(scored, sensor, pool, rest, self._window_s(sensor), matrix=True))
+        if sensor not in self._constant:
+            self.model.begin_at(sensor, closed_form.solve(scored, sensor, pool, rest, self._window_s(sensor), matrix=True).W)
+        # constants that take the nuisances of their logs: the descent knows none
+        scored, pool = corrected(self.model.eval(), self.pool, "train", sensors_up_to(sensor))
+        lengths = self._window_s(sensor)
+        constants = closed_form.solve(scored, sensor, pool, rest, lengths, matrix=False, nuisances=False)
+        self.tracks.set(sensor, constants.rest)
 
     def _window_s(self, sensor: Sensor) -> tuple[float, ...]:
         return self.settings.gyro_window_s if sensor == "gyro" else self.settings.accel_window_s
-
-    def _take(self, sensor: Sensor, solution: closed_form.Solution) -> None:
-        self.model.begin_at(sensor, solution.W)
-        self.tracks.set(sensor, solution.rest)
 
     def begin(self, sensor: Sensor) -> Stage:
         """Fresh stage from the current model and tracks: it moves the sensor's weights and the tracks."""

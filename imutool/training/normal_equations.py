@@ -1,15 +1,17 @@
 """Normal equations of windows between true poses, log by log, so that one can be left out.
 
-Unknowns are theta, the effect parameters that all logs share, and a few of each log: its rest bias and, for the accelerometer,
-the tilt of its truth's world against gravity. The latter are eliminated log by log (Schur's complement): a prediction of one
-log from all others is one solve of a matrix as small as theta. `imutool.inertial.windows` gives the residual of a window and
-its Jacobian by each sample. An effect's error is linear in its parameters, so the rest is a product of matrices.
+Unknowns are theta, the effect parameters that all logs share, and a few of each log: its rest bias and its nuisances
+(`imutool.training.closed_form`: rotation, clock and lever arm between poses and sensor, tilt of the poses' world). An effect of
+the same form as a nuisance is what the logs have in common. The unknowns of a log are eliminated log by log (Schur's
+complement): a prediction of one log from all others is one solve of a matrix as small as theta. `imutool.inertial.windows`
+gives the residual of a window and its Jacobian by each sample. An effect's error is linear in its parameters, so the rest is a
+product of matrices.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -22,13 +24,12 @@ from imutool.inertial.strapdown import GRAVITY_W
 from imutool.inertial.windows import HUBER_MEDIANS, attitudes, huber_weight, rotation_residual, velocity_residual
 from imutool.sensor.linear_form import LinearForm, patterns
 from imutool.sensor.signals import Signals
-from imutool.training.closed_form import CORRELATED, REST_PRIOR, median_per_log
+from imutool.training.closed_form import CORRELATED, NUISANCE_STD, REST_PRIOR, median_per_log, nuisance_jacobian
 from imutool.training.segments import Part, Pool, Windows
 from imutool.units import Sensor
 
 WINDOW_S: Mapping[Sensor, tuple[float, ...]] = {"gyro": (1.0, 4.0, 15.0, 40.0), "accel": (0.5, 2.0, 5.0)}
 JUDGED_FROM_S: Mapping[Sensor, float] = {"gyro": 4.0, "accel": 2.0}  # drift over short windows does not rank calibrations
-TILT_PRIOR = 0.1  # m/s² of gravity in the truth's horizontal plane: half a degree
 MAX_SAMPLES = 150_000  # of one window length
 CHUNK = 20_000  # samples at a time
 # Standard deviations of the priors, in the parameters' units, where they are not the plausible sizes of the diagnosis: training
@@ -86,6 +87,7 @@ class Problem:
     own: Float[Tensor, "logs o"]
     prior: Float[Tensor, " p"]  # one over the plausible variance of each parameter
     own_prior: Float[Tensor, " o"]
+    free: int  # of a log's own unknowns: those without a prior when the log is predicted
     fit: Equations
     judged: Equations  # what a solution is judged by
 
@@ -106,6 +108,12 @@ class Problem:
         at[columns] -= covariance @ v
         return Solution(at, covariance)
 
+    def without(self, index: int) -> Problem:
+        """The problem of all logs but one."""
+        kept = [i for i in range(len(self.own)) if i != index]
+        fit, judged = (Equations(e.H[kept], e.g[kept], e.c[kept]) for e in (self.fit, self.judged))
+        return replace(self, own=self.own[kept], fit=fit, judged=judged)
+
     def own_at(self, theta: Float[Tensor, " p"]) -> Float[Tensor, "logs o"]:
         """Unknowns of each log, for given parameters."""
         H, g = self._own_equations(self.fit.moved(theta - self.theta))
@@ -113,14 +121,15 @@ class Problem:
         return own
 
     def predicted(self, columns: Sequence[int]) -> Float[Tensor, " logs"]:
-        """Loss of each log with parameters from the other logs, its own unknowns solved for."""
+        """Loss of each log with parameters from the other logs, its own unknowns solved for; nuisances keep their prior."""
         p, losses = len(self.prior), []
-        for i in range(len(self.own)):
+        held = torch.where(torch.arange(len(self.own_prior)).to(self.prior) < self.free, 0.0, self.own_prior)
+        for i, at in enumerate(self.own):
             judged = self.judged.moved(self.solve(columns, without=i).theta - self.theta)
-            H, g = judged.H[i, p:, p:], judged.g[i, p:]
+            H, g = judged.H[i, p:, p:] + torch.diag(held), judged.g[i, p:] + held * at
             least = RIDGE * H.diagonal().mean().clamp_min(RIDGE)
             own = -torch.linalg.solve(H + least * torch.eye(len(g)).to(H), g)
-            losses.append(judged.c[i] + 2 * g @ own + own @ H @ own)
+            losses.append(judged.c[i] + held @ at.square() + 2 * g @ own + own @ H @ own)
         return torch.stack(losses)
 
     def _own_equations(self, fit: Equations) -> tuple[Float[Tensor, "logs o o"], Float[Tensor, "logs o"]]:
@@ -146,6 +155,11 @@ class Seen:
     @property
     def own_size(self) -> int:
         """Number of unknowns of each log."""
+        return 3 + len(NUISANCE_STD[self.sensor])
+
+    @property
+    def free(self) -> int:
+        """Number of those without a prior when a log is predicted: rest bias, and the tilt of its world."""
         return 3 if self.sensor == "gyro" else 5
 
 
@@ -167,8 +181,7 @@ def linearise(seen: Seen, effects: Sequence[LinearForm], part: Part) -> Problem:
     sets, logs = _window_sets(seen, part), len(seen.pool.names)
     std = np.concatenate([np.zeros(0), *(prior_std(effect) for effect in effects)])
     prior = torch.from_numpy(std**-2.0).to(seen.pool.t)
-    tilt_prior = [TILT_PRIOR**-2] * (seen.own_size - 3)
-    own_prior = torch.tensor([REST_PRIOR[seen.sensor] ** -2] * 3 + tilt_prior).to(seen.pool.t)
+    own_prior = torch.tensor([REST_PRIOR[seen.sensor]] * 3 + list(NUISANCE_STD[seen.sensor])).to(seen.pool.t) ** -2
     theta, own = torch.zeros_like(prior), prior.new_zeros(logs, seen.own_size)
     for step in range(len(sets) + 2):
         fit = judged = Equations.none(prior, logs, len(prior) + seen.own_size)
@@ -176,7 +189,7 @@ def linearise(seen: Seen, effects: Sequence[LinearForm], part: Part) -> Problem:
             equations = _equations(seen, effects, theta, own, windows)
             fit = fit + equations
             judged = judged + equations if windows.judged else judged
-        problem = Problem(theta, own, prior, own_prior, fit, judged)
+        problem = Problem(theta, own, prior, own_prior, seen.free, fit, judged)
         if step < len(sets) + 1:
             theta = problem.solve(range(len(prior))).theta
             own = problem.own_at(theta)
@@ -222,31 +235,33 @@ def _equations(
         cut = pool.windows(some, n, pool.t.new_zeros(len(some), 6))
         u = pool.gyro if seen.sensor == "gyro" else pool.accel
         true_u = u[index] - error[index] - own[cut.log, None, :3]
-        e, A, by_tilt = _residual(seen.sensor, cut, true_u, seen.gyro[index], own)
+        e, A, by_nuisance = _residual(seen, cut, true_u, index, own)
         terms = torch.from_numpy(_terms(seen.signals, effects, index.cpu().numpy())).to(pool.t)
         terms = 0.5 * (terms[:, :-1] + terms[:, 1:]) if seen.sensor == "gyro" else terms  # rates hold between samples
         S = A.permute(0, 2, 3, 1).flatten(1, 2) @ terms
         by_theta = torch.einsum("mijq,jqp->mip", S.reshape(len(S), 3, 3, S.shape[2]), pattern)
         residuals.append(e)
-        slopes.append(torch.cat([by_theta, A.sum(1), by_tilt], dim=2))
+        slopes.append(torch.cat([by_theta, A.sum(1), by_nuisance], dim=2))
     return _summed(torch.cat(residuals), torch.cat(slopes), pool.log[windows.first], len(pool.names))
 
 
 def _residual(
-    sensor: Sensor,
+    seen: Seen,
     windows: Windows,
     true_u: Float[Tensor, "m n 3"],
-    gyro: Float[Tensor, "m n 3"],
+    index: Int[Tensor, "m n"],
     own: Float[Tensor, "logs o"],
 ) -> tuple[Float[Tensor, "m 3"], Float[Tensor, "m k 3 3"], Float[Tensor, "m 3 _"]]:
-    """Residual, its Jacobian by minus each sample, and its Jacobian by the log's tilt."""
-    if sensor == "gyro":
+    """Residual, its Jacobian by minus each sample, and its Jacobian by the log's nuisances."""
+    if seen.sensor == "gyro":
         e, A = rotation_residual(true_u, windows.dt, windows.R_start.mT @ windows.R_end)
-        return e, A, e.new_zeros(len(e), 3, 0)
-    R_wb = attitudes(windows.R_start, gyro, windows.dt)
-    e, A = velocity_residual(true_u, windows.dt, R_wb, windows.v_end - windows.v_start, true_u.new_tensor(GRAVITY_W))
-    tilt = torch.eye(3).to(e)[None, :, :2] * windows.dt.sum(1)[:, None, None]
-    return e + (tilt @ own[windows.log, 3:, None])[..., 0], A, tilt
+        by_nuisance = nuisance_jacobian("gyro", windows, true_u, true_u)
+    else:
+        gyro = seen.gyro[index]
+        R_wb = attitudes(windows.R_start, gyro, windows.dt)
+        e, A = velocity_residual(true_u, windows.dt, R_wb, windows.v_end - windows.v_start, true_u.new_tensor(GRAVITY_W))
+        by_nuisance = nuisance_jacobian("accel", windows, gyro, true_u)
+    return e + (by_nuisance @ own[windows.log, 3:, None])[..., 0], A, by_nuisance
 
 
 def _summed(e: Float[Tensor, "m 3"], J: Float[Tensor, "m 3 k"], log: Int[Tensor, " m"], logs: int) -> Equations:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -11,7 +11,7 @@ import msgspec
 import torch
 
 from imutool import __version__, registry
-from imutool.bias import hybrid, io, neural_ode, static
+from imutool.bias import hybrid, io, linear, neural_ode, static
 from imutool.bias.model import BiasModel
 from imutool.bias.networks.network import BiasNetwork
 from imutool.config import plain
@@ -23,10 +23,11 @@ from imutool.mcap_io.storage.source import sha256
 from imutool.recording import Recording
 from imutool.training import checkpoint
 from imutool.training.calibration import PhysicsFirst, config_of, described, helps
-from imutool.training.fit import Epoch, Training, check_device
+from imutool.training.fit import Epoch, Training, check_device, note
+from imutool.training.left_out import LINEAR, compare, simpler_effects
 from imutool.training.segments import Pool
 from imutool.training.settings import TrainSettings, settings_for
-from imutool.units import SENSORS
+from imutool.units import SENSORS, Sensor
 
 UNITS = {"gyro": "rad", "accel": "m/s"}
 
@@ -86,9 +87,11 @@ def train(
     descent = _Descent(kept, resume, device, say)
     if method == hybrid.Model.method:
         model, about = _physics_first(recordings, chosen, descent)
+    elif method == linear.Model.method:
+        model, about = _linear(recordings, chosen, descent)
     else:
         training = descent(recordings, method, chosen)
-        model, about = training.model, {"held_out": _held_out(training)}
+        model, about = training.model, {"held_out": _held_out(training), "sessions": _sessions(training)}
     model.card = {
         **_card(method, chosen, recordings, logs),
         **about,
@@ -108,8 +111,10 @@ class _Descent:
     device: str
     say: Callable[[Epoch], None]
 
-    def __call__(self, recordings: Sequence[Recording], method: str, settings: TrainSettings) -> Training:
-        training = Training(recordings, method, settings, self.device)
+    def __call__(
+        self, recordings: Sequence[Recording], method: str, settings: TrainSettings, constant: Collection[Sensor] = ()
+    ) -> Training:
+        training = Training(recordings, method, settings, self.device, constant)
         if training.model.iterative:
             if self.resume:
                 checkpoint.restore(training, self.kept)
@@ -132,10 +137,19 @@ class _Descent:
 def _physics_first(
     recordings: Sequence[Recording], settings: TrainSettings, descent: _Descent
 ) -> tuple[BiasNetwork, dict[str, Any]]:
-    """Effects, then the neural ODE where it helps; what the card says of both."""
+    """Effects as far as they help left-out logs, then the neural ODE where it helps; the card's entries for both."""
     physics = PhysicsFirst.of(recordings, settings, descent.device, descent.say)
     alone = msgspec.structs.replace(settings, model={})
     without = descent(physics.recordings, static.Model.method, alone)
+    compared: dict[str, Any] = {}
+    if settings.compare:
+        descent.say(note("scoring left-out logs"))
+        comparison = compare(recordings, Pool.of(recordings), physics.fits, without.model)
+        compared["left_out"] = comparison.card()
+        if simpler := simpler_effects(physics.fits, comparison.kept):
+            named = msgspec.structs.replace(settings, model=settings.model | simpler)
+            physics = PhysicsFirst.of(recordings, named, descent.device, descent.say)
+            without = descent(physics.recordings, static.Model.method, alone)
     held_out: dict[str, Any] = {"effects": _held_out(without)}
     kept = without
     if physics.model.config.remainder:
@@ -143,7 +157,25 @@ def _physics_first(
         held_out["effects and neural_ode"] = _held_out(ode)
         kept = ode if helps(without.done, ode.done) else without
     model = physics.finish(kept.model)
-    return model, {"held_out": _held_out(kept), "compared": held_out, "physics": dict(described(physics.fits))}
+    about = {"held_out": _held_out(kept), "sessions": _sessions(kept)}
+    return model, about | {"compared": held_out, "physics": dict(described(physics.fits))} | compared
+
+
+def _linear(recordings: Sequence[Recording], settings: TrainSettings, descent: _Descent) -> tuple[BiasNetwork, dict[str, Any]]:
+    """A matrix for each sensor whose matrix helps left-out logs; the card's entries."""
+    compared: dict[str, Any] = {}
+    constant: set[Sensor] = set()
+    if settings.compare:
+        descent.say(note("scoring left-out logs"))
+        names = {f"{sensor}_effects": LINEAR[sensor] for sensor in SENSORS}
+        hybrid_settings = msgspec.structs.replace(settings, model=names)
+        physics = PhysicsFirst.of(recordings, hybrid_settings, descent.device, lambda epoch: None)
+        without = descent(physics.recordings, static.Model.method, msgspec.structs.replace(settings, model={}))
+        comparison = compare(recordings, Pool.of(recordings), physics.fits, without.model)
+        compared["left_out"] = comparison.card()
+        constant = {sensor for sensor, kept in comparison.kept.items() if kept == "constant"}
+    training = descent(recordings, linear.Model.method, settings, constant)
+    return training.model, {"held_out": _held_out(training), "sessions": _sessions(training)} | compared
 
 
 def _shared(recordings: Sequence[Recording], key: str) -> str | None:
@@ -154,6 +186,10 @@ def _shared(recordings: Sequence[Recording], key: str) -> str | None:
 
 def _held_out(training: Training) -> dict[str, Any]:
     return {sensor: {"error": training.done[sensor], "unit": UNITS[sensor]} for sensor in SENSORS}
+
+
+def _sessions(training: Training) -> list[dict[str, Any]]:
+    return [session.card() for session in training.sessions]
 
 
 def _card(method: str, settings: TrainSettings, recordings: Sequence[Recording], logs: Sequence[Path]) -> dict[str, Any]:

@@ -63,6 +63,7 @@ class Pool:
     trusted: Bool[Tensor, " n"]
     held_out: Bool[Tensor, " n"]
     late: Bool[Tensor, " n"]  # samples are missing just before this one
+    spans_ns: tuple[tuple[int, int], ...]  # stamps of the first and last sample of each log
 
     @classmethod
     def of(cls, recordings: Sequence[Recording], dtype: torch.dtype = torch.float64, device: str = "cpu") -> Pool:
@@ -78,7 +79,13 @@ class Pool:
             raise DataError(f"training logs at different rates ({listed} Hz)", expected="logs of one sensor")
         columns = {name: torch.cat([getattr(pool, name) for pool in pools]) for name in ("t", *SAMPLED, *FLAGS)}
         log = torch.cat([pool.log + i for i, pool in enumerate(pools)])
-        return cls(names=tuple(pool.names[0] for pool in pools), rate_hz=float(np.median(rates)), log=log, **columns)
+        return cls(
+            names=tuple(pool.names[0] for pool in pools),
+            rate_hz=float(np.median(rates)),
+            log=log,
+            spans_ns=tuple(pool.spans_ns[0] for pool in pools),
+            **columns,
+        )
 
     @classmethod
     def _of_log(cls, recording: Recording, dtype: torch.dtype, device: str) -> Pool:
@@ -96,6 +103,7 @@ class Pool:
         return cls(
             names=(recording.name,),
             rate_hz=1.0 / imu.period_s,
+            spans_ns=((int(imu.t_ns[0]), int(imu.t_ns[-1])),),
             t=torch.tensor(t, dtype=dtype, device=device),
             log=torch.zeros(len(t), dtype=torch.long, device=device),
             **{name: torch.tensor(np.asarray(x), dtype=dtype, device=device) for name, x in zip(SAMPLED, sampled, strict=True)},

@@ -45,6 +45,7 @@ class TrainSettings(Settings, frozen=True):
     weight_decay: Annotated[float, msgspec.Meta(ge=0)] = 1e-4
     track_knot_s: Positive = 20.0
     validate_every: Count = 100  # steps between two lines of progress, each with a checkpoint
+    compare: bool = True  # linear and hybrid: score left-out logs, and keep the simplest model that is not beaten
     increments: IncrementSettings = IncrementSettings()
     model: dict[str, Any] = msgspec.field(default_factory=dict)
 

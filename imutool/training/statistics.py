@@ -1,64 +1,132 @@
-"""Spread of rest biases from run to run, and uncertainty of a start from truth."""
+"""Spread of rest biases from session to session, and uncertainty of a start from truth."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Float64
+from scipy.stats import chi2
 from torch import Tensor
 
-from imutool.bias.model import COLUMNS
+from imutool.bias.model import COLUMNS, Vector6
 from imutool.bias.networks.network import BiasNetwork, Segment
-from imutool.bias_start.bias_at_rest import rest_spread
+from imutool.bias_start.bias_at_rest import rest_differences
 from imutool.bias_start.bias_from_truth import TRUTH_S, bias_from_truth
+from imutool.bias_start.initial_bias import AT_REST_STD, SESSION_GAP_S
 from imutool.geometry import so3
 from imutool.inertial.stationary import white_noise
+from imutool.recording import nanoseconds
 from imutool.training import closed_form
 from imutool.training.segments import Pool, corrected
 from imutool.units import SENSORS, Sensor
 
 MAD_TO_STD = 1.4826
-ONE_RUN_STD = {"gyro": 5e-3, "accel": 0.1}  # run-to-run spread when there is one run to judge by, rad/s and m/s²
-USUAL_STD = {"gyro": 5e-4, "accel": 2e-2}
+TURN_ON_STD = {"gyro": 5e-3, "accel": 0.1}  # of a switching-on: ADIS16448 2e-3 over four months, BMI160 up to 5e-2 (data sheet)
+USUAL_STD = {"gyro": 5e-4, "accel": 2e-2}  # between logs of one switching-on
+SESSION_STEP = {"gyro": 3e-3, "accel": 0.3}  # another switching-on: a larger step of the bias from one log to the next
 LEAST_TRUSTED, FEWEST_STARTS = 0.5, 4
 FLOOR_STD = {"gyro": 5e-5, "accel": 2e-3}
+BY_CHANCE = 0.01  # probability that logs seem to show a shift of the bias at rest where there is none
+
+
+@dataclass(frozen=True)
+class Session:
+    """Logs of one switching-on: their stamps, and the rest bias of its next log with standard deviation."""
+
+    start_ns: int
+    end_ns: int
+    mean: Float64[np.ndarray, "6"]
+    std: Float64[np.ndarray, "6"]
+
+    def card(self) -> dict[str, Any]:
+        """Entry of a model card."""
+        return {"start_ns": self.start_ns, "end_ns": self.end_ns, "mean": self.mean.tolist(), "std": self.std.tolist()}
 
 
 def store_statistics(
     model: BiasNetwork, pool: Pool, rest: Float[Tensor, "logs 6"], window_s: Mapping[Sensor, Sequence[float]]
-) -> None:
-    """Fills the model's prior, the spread of starts from truth, and the noise of a sample.
+) -> list[Session]:
+    """Fills the model's prior, the spread of starts from truth, and the noise of a sample; the sessions of the logs.
 
     From the training part.
     """
     scored, left = corrected(model, pool)
+    rest, std = rest.clone(), torch.zeros_like(rest)
     for sensor in SENSORS:
         columns = COLUMNS[sensor]
         solution = closed_form.solve(scored, sensor, left, rest, window_s[sensor], matrix=False, part="all")
-        rest = rest.clone()
-        rest[:, columns] = solution.rest
-        model.prior_mean[columns] = solution.rest.mean(0)
-        model.prior_std[columns] = _run_to_run(sensor, solution.rest)
+        rest[:, columns], std[:, columns] = solution.rest, solution.std
         u = pool.gyro if sensor == "gyro" else pool.accel
         model.noise_std[columns] = torch.from_numpy(white_noise(u.cpu().numpy())).to(rest)
+    biases = rest.cpu().double().numpy()
+    mean, spread, sessions = turn_on_prior(biases, pool.spans_ns)
+    model.prior_mean.copy_(torch.from_numpy(mean))
+    model.prior_std.copy_(torch.from_numpy(spread))
     model.truth_std.copy_(_start_spread(scored, left, rest))
     model.walk_std.copy_(_walk(scored, left, rest, window_s))
-    model.rest_std.copy_(torch.from_numpy(rest_spread(scored.frozen(), _samples(left), rest.cpu().double().numpy())))
+    at_rest = rest_differences(scored.frozen(), _samples(left), biases)
+    model.rest_std.copy_(torch.from_numpy(shift_at_rest(at_rest, std.cpu().double().numpy())))
+    return sessions
 
 
-def _run_to_run(sensor: Sensor, rest: Float[Tensor, "logs 3"]) -> Float[Tensor, "3"]:
-    """Spread of the next run about the mean of those seen: s sqrt(1 + 1/L), s from the runs and one more of a usual spread.
+def turn_on_prior(
+    rest: Float64[np.ndarray, "logs 6"], spans_ns: Sequence[tuple[int, int]]
+) -> tuple[Float64[np.ndarray, "6"], Float64[np.ndarray, "6"], list[Session]]:
+    """Mean and standard deviation of the rest bias of the next session, and the sessions of the logs.
 
-    The spread of two or three runs is itself unsure, and mostly too small.
+    Logs of one switching-on are one draw of the turn-on bias. From S sessions with means m_s the next one has the variance
+    (sum (m_s - m)^2 + TURN_ON_STD^2) / S (1 + 1/S): the size that sensors usually have counts as one session more.
     """
-    logs = len(rest)
-    if logs < 2:
-        return torch.full_like(rest[0], ONE_RUN_STD[sensor])
-    squares = (rest - rest.mean(0)).square().sum(0) + USUAL_STD[sensor] ** 2
-    return (squares / logs * (1 + 1 / logs)).sqrt()
+    groups = _sessions(rest, spans_ns)
+    means = np.stack([rest[group].mean(axis=0) for group in groups])
+    usual, turn_on = (np.repeat([size[sensor] for sensor in SENSORS], 3) for size in (USUAL_STD, TURN_ON_STD))
+    squares = sum(((rest[group] - mean) ** 2).sum(axis=0) for group, mean in zip(groups, means, strict=True))
+    within = (squares + usual**2) / (len(rest) - len(groups) + 1)
+    mean, count = means.mean(axis=0), len(groups)
+    between = (((means - mean) ** 2).sum(axis=0) + turn_on**2) / count * (1 + 1 / count)
+    sessions = [
+        Session(
+            min(spans_ns[log][0] for log in group),
+            max(spans_ns[log][1] for log in group),
+            of_group,
+            np.sqrt(within * (1 + 1 / len(group))),
+        )
+        for group, of_group in zip(groups, means, strict=True)
+    ]
+    return mean, np.sqrt(between + within), sessions
+
+
+def _sessions(rest: Float64[np.ndarray, "logs 6"], spans_ns: Sequence[tuple[int, int]]) -> list[list[int]]:
+    """Logs of each switching-on: hours apart at most, and biases alike."""
+    step = np.repeat([SESSION_STEP[sensor] for sensor in SENSORS], 3)
+    groups: list[list[int]] = []
+    for log in sorted(range(len(rest)), key=lambda log: spans_ns[log]):
+        before = groups[-1][-1] if groups else None
+        near = before is not None and spans_ns[log][0] - spans_ns[before][1] <= nanoseconds(SESSION_GAP_S)
+        if near and bool((np.abs(rest[log] - rest[before]) < step).all()):
+            groups[-1].append(log)
+        else:
+            groups.append([log])
+    return groups
+
+
+def shift_at_rest(differences: Sequence[Float64[np.ndarray, "stops 6"]], std: Float64[np.ndarray, "logs 6"]) -> Vector6:
+    """Standard deviation about zero of the bias at rest minus that in motion, where the logs together show a shift.
+
+    `std` is that of each log's bias in motion. Stops whose differences are no larger than that and `AT_REST_STD` show none.
+    """
+    out, stops = AT_REST_STD.copy(), np.concatenate(differences)
+    seen = np.repeat(std, [len(rows) for rows in differences], axis=0)
+    for first, count in ((0, 3), (3, 1)):  # rest shows one direction of the accelerometer's bias
+        columns, whole = slice(first, first + count), slice(first, first + 3)
+        chi_square = float((stops[:, columns] ** 2 / (seen[:, columns] ** 2 + AT_REST_STD[columns] ** 2)).sum())
+        if len(stops) and chi_square > chi2.isf(BY_CHANCE, len(stops) * count):
+            out[whole] = np.maximum(MAD_TO_STD * np.median(np.abs(stops[:, whole]), axis=0), out[whole])
+    return out
 
 
 def _walk(
@@ -98,7 +166,7 @@ def _start_spread(model: BiasNetwork, pool: Pool, rest: Float[Tensor, "logs 6"])
             seconds, q, v_w = (x.cpu().double().numpy() for x in (t, q_wb_wxyz, pool.v_w[some]))
             off.append(bias_from_truth(seconds, left, q, v_w, trusted.cpu().numpy()))
     if len(off) < FEWEST_STARTS:
-        return torch.tensor([ONE_RUN_STD["gyro"]] * 3 + [ONE_RUN_STD["accel"]] * 3).to(rest)
+        return torch.tensor([TURN_ON_STD["gyro"]] * 3 + [TURN_ON_STD["accel"]] * 3).to(rest)
     floor = torch.tensor([FLOOR_STD["gyro"]] * 3 + [FLOOR_STD["accel"]] * 3)
     spread = MAD_TO_STD * np.median(np.abs(off), axis=0)
     return torch.maximum(torch.from_numpy(spread), floor).to(rest)

@@ -57,7 +57,7 @@ def learned(recordings: list[Recording], words: list[str]) -> BiasModel:
     for _ in training.epochs():
         pass
     model = physics.finish(training.model)
-    model.card = {"logs": [r.name for r in recordings]}
+    model.card = {"logs": [r.name for r in recordings], "sessions": [session.card() for session in training.sessions]}
     return model.frozen()
 
 

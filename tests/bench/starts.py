@@ -107,7 +107,7 @@ def own_bias(model: BiasModel, recordings: list[Recording]) -> np.ndarray:
     rest = torch.from_numpy(model.prior_mean).expand(len(recordings), 6).clone()
     scored, pool = corrected(thawed(model), pool)
     for sensor, columns in (("gyro", slice(0, 3)), ("accel", slice(3, 6))):
-        solved = closed_form.solve(scored, sensor, pool, rest, WINDOW_S[sensor], matrix=False, part="all")  # type: ignore[arg-type]
+        solved = closed_form.solve(scored, sensor, pool, rest, WINDOW_S[sensor], matrix=False, part="all", nuisances=False)  # type: ignore[arg-type]
         rest[:, columns] = solved.rest
     return rest.numpy()
 

@@ -30,7 +30,7 @@ def main() -> None:
     for path in sys.argv[1:]:
         pool = Pool.of([read(Path(path))])
         rest = torch.zeros(1, 6, dtype=torch.float64)
-        rest[:, :3] = closed_form.solve(Network().double(), "gyro", pool, rest, (1.0, 4.0), matrix=False).rest
+        rest[:, :3] = closed_form.solve(Network().double(), "gyro", pool, rest, (1.0, 4.0), matrix=False, nuisances=False).rest
         n = pool.samples(WINDOW_S)
         first = pool.starts(n, "all", hop=n // 2)
         windows = pool.windows(first, n, rest.expand(len(first), 6))

@@ -19,9 +19,9 @@ from imutool.bias_start.bias_tracking import (
     FilteredBlock,
     TrackedBiasStream,
     filter_blocks,
-    smooth_bias,
     smooth_blocks,
 )
+from imutool.bias_start.initial_bias import smooth_bias
 from imutool.recording import Imu, seconds
 from imutool.sensor.made_up_flight import FlightSettings, TriadSettings, flight
 
@@ -116,7 +116,7 @@ def test_rest_at_the_end_is_seen_by_smoothing_and_not_before() -> None:
     imu = Imu(
         imu.t_ns, imu.gyro - np.where(np.arange(len(imu)) > len(imu) - 6 * RATE_HZ, 1, 0)[:, None] * ground[:3], imu.accel
     )
-    track, rested_s = smooth_bias(model(), [samples(imu)], sure)
+    track, rested_s, *_ = smooth_bias(model(), [samples(imu)], sure)
     assert 5.4 < rested_s < 6.6  # it comes to rest slowly
     causal = forward(imu, sure)
     half = len(causal) // 2
@@ -202,7 +202,7 @@ def test_less_than_a_block_says_nothing(count: int) -> None:
     t, gyro, accel = samples(imu) if count else (np.zeros(0), np.zeros((0, 3)), np.zeros((0, 3)))
     filter_ = BiasFilter(KNOWN, ahead=True)
     assert [*filter_.feed(t, gyro, accel), *filter_.finish()] == []
-    track, rested_s = smooth_bias(model(), [(t, gyro, accel)], KNOWN)
+    track, rested_s, *_ = smooth_bias(model(), [(t, gyro, accel)], KNOWN)
     assert (len(track.t_s), rested_s) == (0, 0.0)
 
 

@@ -13,9 +13,9 @@ from scipy.spatial.transform import Rotation
 from imutool.bias import linear, static
 from imutool.bias.model import BiasModel
 from imutool.bias_start import bias_at_rest
-from imutool.bias_start.bias_at_rest import at_rest, auto, over_all_rest, rest_spread
+from imutool.bias_start.bias_at_rest import at_rest, auto, over_all_rest, rest_differences
 from imutool.bias_start.bias_from_truth import TRUTH_S, from_truth
-from imutool.bias_start.bias_tracking import Samples
+from imutool.bias_start.bias_tracking import Samples, widened
 from imutool.bias_start.initial_bias import (
     AT_REST_STD,
     InitialBias,
@@ -114,10 +114,10 @@ def test_it_is_the_kalman_update_of_the_prior() -> None:
     np.testing.assert_allclose(start.std, np.sqrt(np.diag((np.eye(6) - K @ H) @ P)), rtol=1e-9)
 
 
-def test_a_prior_that_is_sure_is_kept_and_one_that_knows_nothing_gives_way() -> None:
+def test_a_prior_that_knows_nothing_gives_way_and_so_does_one_that_rest_rules_out() -> None:
     imu, attitude = resting()
     sure, unsure = (at_rest(model(mean=0.5, prior_std=std), imu) for std in (1e-9, 1e3))
-    np.testing.assert_allclose(sure.rest, 0.5, atol=1e-6)
+    np.testing.assert_allclose(sure.rest[:3], GYRO_BIAS, atol=5e-4)
     np.testing.assert_allclose(unsure.rest[:3], GYRO_BIAS, atol=5e-4)
     up_b = attitude[0].inv().apply([0.0, 0.0, 1.0])
     assert up_b @ unsure.rest[3:] == pytest.approx(up_b @ ACCEL_BIAS, abs=0.2)
@@ -354,19 +354,48 @@ def test_smoothing_needs_something_to_go_by() -> None:
         smoothed_start(trained(), [samples(imu.rows(slice(0, 20)))])
 
 
-def test_what_differs_at_rest_is_told_from_the_logs_own_bias() -> None:
+def test_the_bias_of_every_stop_is_compared_with_the_bias_in_motion() -> None:
     away = np.array([2e-3, -5e-4, 0.0])
-    logs, own = [], []
-    for seed in range(5):
-        imu, _ = resting([(0.0, 4.0), (15.0, 20.0)], seed=seed)
-        logs.append(samples(imu))
-        own.append(np.concatenate([GYRO_BIAS - away * (-1) ** seed, ACCEL_BIAS]))
-    spread = rest_spread(static.Model(), logs, np.array(own))
-    np.testing.assert_allclose(spread[:2], bias_at_rest.MAD_TO_STD * np.abs(away[:2]), rtol=0.2)
-    assert spread[2] < 2.5 * AT_REST_STD[2]
-    assert (spread >= AT_REST_STD).all()
-    moving = samples(resting([])[0])
-    np.testing.assert_array_equal(rest_spread(static.Model(), [moving], np.zeros((1, 6))), AT_REST_STD)
+    imu, _ = resting([(0.0, 4.0), (15.0, 20.0)])
+    own = np.concatenate([GYRO_BIAS - away, ACCEL_BIAS])
+    stopping, moving = rest_differences(static.Model(), [samples(imu), samples(resting([])[0])], np.array([own, own]))
+    np.testing.assert_allclose(stopping[:, :3], np.tile(away, (2, 1)), atol=2.5e-4)
+    assert moving.shape == (0, 6)
+
+
+# ── a prior that the log contradicts ───────────────────────────────────────────────────────────────────────────────
+
+
+def test_a_prior_that_the_log_contradicts_gives_way_and_one_that_it_bears_out_stays() -> None:
+    std = np.array([5e-4] * 3 + [0.02] * 3)
+    variance = np.array([1e-8] * 3 + [np.inf] * 3)
+    near, far = np.full(6, 1e-3), np.array([0.0, 0.0, 9e-3, 5.0, 5.0, 5.0])
+    np.testing.assert_array_equal(widened(std, near, variance), std)
+    wide = widened(std, far, variance)
+    np.testing.assert_allclose(wide[:3], 9e-3 / np.sqrt(3))
+    np.testing.assert_array_equal(wide[3:], std[3:]), "nothing was shown of the accelerometer"
+
+
+@pytest.mark.parametrize("start", ["auto", "stationary", "smooth"])
+def test_a_long_rest_outweighs_the_prior_of_another_switching_on(start: str) -> None:
+    imu, _ = resting([(0.0, 6.0), (20.0, 26.0)])
+    made = trained(mean=0.03, prior_std=5e-4)
+    if start == "smooth":
+        found = smoothed_start(made, [samples(imu)])
+    else:
+        found = auto(made, imu) if start == "auto" else at_rest(made, imu)
+    np.testing.assert_allclose(found.rest[:3], GYRO_BIAS, atol=3e-4)
+
+
+def test_a_log_of_a_session_that_training_saw_starts_from_its_prior() -> None:
+    made = model(mean=0.3, prior_std=0.2)
+    hour = 3600 * 10**9
+    session = {"start_ns": 100 * hour, "end_ns": 101 * hour, "mean": [0.1] * 6, "std": [1e-3] * 6}
+    made.card = {"sessions": [session, session | {"start_ns": 130 * hour, "end_ns": 131 * hour, "mean": [0.2] * 6}]}
+    assert prior(made, 104 * hour).rest[0] == 0.1
+    assert prior(made, 128 * hour).rest[0] == 0.2
+    assert prior(made, 115 * hour).rest[0] == pytest.approx(0.3)
+    np.testing.assert_array_equal(bias_prior(made, 104 * hour).std, [1e-3] * 6)
 
 
 def test_a_model_that_says_how_rest_differs_is_believed() -> None:

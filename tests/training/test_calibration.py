@@ -79,7 +79,8 @@ def test_a_planted_effect_is_found_and_named_and_no_other(flights: list[Recordin
     calibration = found(flights, sensor, effects)
     assert calibration.effects == (name,)
     assert list(calibration.gains) == [name]
-    assert calibration.gains[name] > 0.3
+    # a clock or an arm may be each log's own: only that all logs have the same one speaks for an effect
+    assert calibration.gains[name] > (0.05 if name in ("clock_offset", "lever_arm") else 0.3)
     z = z_scores(calibration, planted_theta(effects))
     assert np.abs(z).max() < SURE, z
     assert calibration.unseen == ()

@@ -26,7 +26,7 @@ def data() -> Data:
 PRIOR, OWN_PRIOR = torch.linspace(0.5, 2.0, SHARED).double(), torch.tensor([0.3, 0.7]).double()
 
 
-def problem(data: Data, theta: torch.Tensor, own: torch.Tensor) -> Problem:
+def problem(data: Data, theta: torch.Tensor, own: torch.Tensor, free: int = OWN) -> Problem:
     """The losses about a point."""
     H, g, c = [], [], []
     for i, (J, r) in enumerate(data):
@@ -35,7 +35,7 @@ def problem(data: Data, theta: torch.Tensor, own: torch.Tensor) -> Problem:
         g.append(J.T @ e)
         c.append(e @ e)
     equations = Equations(torch.stack(H), torch.stack(g), torch.stack(c))
-    return Problem(theta, own, PRIOR, OWN_PRIOR, equations, equations)
+    return Problem(theta, own, PRIOR, OWN_PRIOR, free, equations, equations)
 
 
 def at_once(data: Data, columns: list[int], logs: list[int]) -> tuple[torch.Tensor, torch.Tensor]:
@@ -84,6 +84,20 @@ def test_a_logs_loss_is_judged_at_what_the_others_say(data: Data) -> None:
         left = J[:, [1, 2]] @ theta + r
         own = torch.linalg.lstsq(J[:, SHARED:], -left[:, None]).solution[:, 0]
         assert float(losses[i]) == pytest.approx(float((left + J[:, SHARED:] @ own).square().sum()), rel=1e-8)
+
+
+@pytest.mark.parametrize("size", [0.0, 1.0])
+def test_a_nuisance_keeps_its_prior_in_a_log_that_is_judged(data: Data, size: float) -> None:
+    """From any point: the loss is that of the residuals and of the nuisance's prior together."""
+    made = problem(data, size * torch.ones(SHARED).double(), size * torch.ones(LOGS, OWN).double(), free=1)
+    losses = made.predicted([1, 2])
+    for i, (J, r) in enumerate(data):
+        theta, _ = at_once(data, [1, 2], [j for j in range(LOGS) if j != i])
+        left = torch.cat([J[:, [1, 2]] @ theta + r, torch.zeros(1).double()])
+        by_own = torch.cat([J[:, SHARED:], torch.tensor([[0.0, float(OWN_PRIOR[1]) ** 0.5]]).double()])
+        own = torch.linalg.lstsq(by_own, -left[:, None]).solution[:, 0]
+        assert float(losses[i]) == pytest.approx(float((left + by_own @ own).square().sum()), rel=1e-6)
+    assert len(made.without(0).own) == len(made.without(0).fit.H) == LOGS - 1
 
 
 def test_the_covariance_is_the_inverse_of_the_information(data: Data) -> None:

@@ -12,9 +12,7 @@ import msgspec
 import numpy as np
 import pytest
 import torch
-from typer.testing import CliRunner
 
-from imutool import cli
 from imutool.bias import hybrid
 from imutool.bias.io import load
 from imutool.config import build
@@ -384,12 +382,12 @@ def test_a_physics_file_says_which_effects_hybrid_takes_off_and_what_is_left(tmp
     assert left == ("saturation",)
 
 
-def test_a_physics_file_of_which_hybrid_knows_nothing_is_refused(tmp_path: Path) -> None:
+def test_a_physics_file_of_which_hybrid_knows_nothing_is_refused(tmp_path: Path, imutool: Any) -> None:
     file = tmp_path / "physics.toml"
     file.write_text(entry("saturation", "gyro", "rad/s"))
     with pytest.raises(ConfigError, match="no effect that a bias model can correct"):
         settings_for(file)
-    words = ["train", "a.mcap", "-o", str(tmp_path / "m.safetensors"), "--method", "linear", "--physics", str(file)]
-    said = CliRunner().invoke(cli.load(), words)
-    assert said.exit_code == 3
-    assert "linear knows no effects" in said.output
+    words = ["train", "a.mcap", "-o", tmp_path / "m.safetensors", "--method", "linear", "--physics", file]
+    said = imutool(*words, cwd=tmp_path)
+    assert said.returncode == 3
+    assert "linear knows no effects" in said.stderr

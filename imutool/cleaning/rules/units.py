@@ -145,7 +145,7 @@ def gravity_level(motion: Motion) -> tuple[float | None, bool]:
 
 
 def rate_ratio(motion: Motion, truth: Truth) -> float | None:
-    """Ratio of measured to true rate while the truth turns; None if it hardly does or shares no time.
+    """Ratio of measured to true rate while the truth turns; None if it hardly does.
 
     Both are lengths about their medians, which a bias does not change.
     """

@@ -148,7 +148,8 @@ def has_no_size(effect: Effect, theta: Theta, std: Theta) -> bool:
     vague = any(
         parameter.unit == "Hz" and s >= value for parameter, value, s in zip(effect.parameters, theta, std, strict=True)
     )
-    amounts = [k for k, parameter in enumerate(effect.parameters) if not parameter.positive and not parameter.begins]
+    # what has another null value than zero, a time constant or a frequency, has no size by itself
+    amounts = [k for k, n in enumerate(effect.parameters) if n.null_value == 0.0 and not n.begins]
     return vague or (bool(amounts) and bool((np.abs(theta[amounts]) < std[amounts]).all()))
 
 

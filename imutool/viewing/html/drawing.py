@@ -201,7 +201,7 @@ def at_least_three_ticks(axes: Any) -> None:
 
 
 def decades(axes: Any) -> None:
-    """Logarithmic vertical axis with limits at whole decades, and labels at three or more of its ticks."""
+    """Set limits of a logarithmic vertical axis to whole decades, with three or more labels."""
     from matplotlib.ticker import LogLocator
 
     low, high = axes.get_ylim()

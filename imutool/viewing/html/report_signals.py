@@ -13,7 +13,6 @@ from jaxtyping import Float64
 from imutool.inertial import stationary
 from imutool.noise import allan
 from imutool.noise.allan import Curve
-from imutool.noise_identification import vibration
 from imutool.recording import Imu
 from imutool.units import AXES, SENSORS, UNITS, Sensor
 from imutool.viewing.html.drawing import (
@@ -136,7 +135,7 @@ def allan_deviation(data: RunData) -> Picture | None:
         for sensor in SENSORS
     ]
     caption = f"Over {format_number(rest_s)} s at rest in {len(ranges)} stretch{'es' * (len(ranges) > 1)}; overlapping."
-    remarks = [vibration(sensor, allan.slopes(first)) for sensor, first in recorded.items()]
+    remarks = [allan.vibration(sensor, allan.slopes(first)) for sensor, first in recorded.items()]
     caption = " ".join([caption, *(f"{remark[0].upper()}{remark[1:]}." for remark in remarks if remark)])
     return Picture("allan", "Allan deviation at rest", caption, tuple(panels))
 

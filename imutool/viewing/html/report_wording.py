@@ -98,7 +98,7 @@ def conclusion(data: RunData) -> str:
 
 
 def start_text(trace: Trace) -> str:
-    """Start of a model's bias as part of a sentence: ` after a start from 15 s of truth`; empty if unknown."""
+    """Start of a bias as part of a sentence, ` after a start from 15 s of truth`, or empty."""
     method, _, length = trace.run.start.partition(":")
     if method == "truth":
         return f" after a start from {length} s of truth" if length else " after a start from truth"

@@ -1,4 +1,4 @@
-"""Importer of MCAP logs with an IMU that Rerun finds on PATH: `rerun log.imu` shows what `imutool view` shows.
+"""Importer that Rerun finds on PATH: `rerun log.imu` shows what `imutool view` shows.
 
 Rerun runs every program on PATH whose name begins with `rerun-importer-`, and reads an .rrd from its standard output. It does
 so only for suffixes that it does not read itself, up to 0.41 not for .mcap: there the log needs a link of another name.
@@ -30,7 +30,10 @@ class Target(NamedTuple):
 
 
 def main() -> NoReturn:
-    """Write the .rrd of a log with an IMU to standard output; exit code 66 and no output for any other file."""
+    """Write the .rrd of an MCAP log with an IMU to standard output.
+
+    Any other file gives exit code 66 and no output.
+    """
     parser = argparse.ArgumentParser(prog="rerun-importer-imutool", description=__doc__)
     parser.add_argument("file", type=Path)
     parser.add_argument("--application-id")

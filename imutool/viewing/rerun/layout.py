@@ -25,7 +25,7 @@ LIVE_WINDOW_S = 20.0  # of the plots in a live view
 
 
 def blueprint(logs: Sequence[RunData], *, source: bool = True, root: Scope = ()) -> rrb.Blueprint:
-    """Layout of what `scene.log` logs for the same logs, `source` and `root`; every view has content.
+    """Layout of what `scene.log` logs for the same arguments; every view has content.
 
     The cursor starts at the end of the log on `elapsed`, where whole paths are visible.
 

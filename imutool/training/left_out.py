@@ -1,0 +1,216 @@
+"""Candidate models on left-out logs: each log corrected by models that the other logs gave.
+
+Candidates, from the simplest: `constant` (the prior of the rest bias alone), `linear` (scale and misalignment), and `effects`
+(those that the other logs support). Each log is integrated from its first true pose with every start that users have; raw
+samples and `static`, the log's own rest bias without any training, are scored alike. The poses are first turned and shifted by
+the rotation and the clock that are fitted between them and the sensor for this log alone. The simplest candidate that is not
+beaten is kept, for the gyro by the orientation error (AOE), for the accelerometer by the velocity after 5 s from the truth.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float64
+from scipy.spatial.transform import Rotation
+
+from imutool.bias import static
+from imutool.bias.hybrid import Config
+from imutool.bias.model import BiasModel
+from imutool.bias.networks import hybrid
+from imutool.bias.networks.network import BiasNetwork
+from imutool.bias_start.correction import apply
+from imutool.bias_start.model_choice import estimate_at_rest, find_initial_bias, smooth_in_memory
+from imutool.errors import DataError, ModelError
+from imutool.inertial import metrics
+from imutool.inertial.strapdown import along_truth, drift
+from imutool.recording import Imu, Poses, Recording, nanoseconds
+from imutool.training.calibration import Calibration, effects_beyond_chance, parameter_columns
+from imutool.training.segments import Pool
+from imutool.training.statistics import turn_on_prior
+from imutool.units import SENSORS, Sensor
+
+STARTS = ("auto", "smooth", "truth")
+CANDIDATES = ("constant", "linear", "effects")  # from the simplest
+LINEAR: Mapping[Sensor, tuple[str, ...]] = {sensor: (f"{sensor}_misalignment", f"{sensor}_scale") for sensor in SENSORS}
+LEAST_GAIN = 0.03  # of the error, for a candidate to be worth its parameters
+LEAST_ERROR = 1e-6  # ° or m/s
+LONGEST_S = 120.0  # of a log that is scored
+DRIFT_S = 5.0
+
+
+@dataclass(frozen=True)
+class Score:
+    """Errors of one left-out log with one model and start: AOE (°), and velocity after 5 s from the truth (m/s)."""
+
+    log: str
+    model: str
+    start: str
+    aoe_deg: float
+    drift_m_s: float | None
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """Scores of all left-out logs, and the candidate that is kept for each sensor."""
+
+    scores: tuple[Score, ...]
+    kept: Mapping[Sensor, str]
+
+    def card(self) -> dict[str, Any]:
+        """Entry of a model card."""
+        return {"kept": dict(self.kept), "scores": [vars(score) for score in self.scores]}
+
+
+def compare(
+    recordings: Sequence[Recording], pool: Pool, fits: Mapping[Sensor, Calibration], trained: BiasNetwork
+) -> Comparison:
+    """Scores of every left-out log; `trained` has the statistics of all logs."""
+    scores: list[Score] = []
+    candidates = [c for c in CANDIDATES if all(_known(fit, c, sensor) for sensor, fit in fits.items())]
+    for index, recording in enumerate(_logs(recordings, pool, fits["gyro"])):
+        models = {c: left_out_model(fits, pool, trained, c, index) for c in candidates}
+        log = _without_nuisances(recording, fits["gyro"], "constant", index)
+        scores.append(_score(log, "raw", "", log.imu))
+        scores += [_score(log, "static", start, imu) for start in STARTS for imu in _corrected(log, None, start)]
+        for name, model in models.items():
+            log = _without_nuisances(recording, fits["gyro"], name, index)
+            scores += [_score(log, name, start, imu) for start in STARTS for imu in _corrected(log, model, start)]
+    return Comparison(tuple(scores), {sensor: keep(scores, sensor) for sensor in SENSORS})
+
+
+def keep(scores: Sequence[Score], sensor: Sensor) -> str:
+    """Simplest candidate that no other beats; `constant` for the gyro if `static` beats that one."""
+    logs = list(dict.fromkeys(score.log for score in scores))
+
+    def errors(model: str) -> Float64[np.ndarray, " logs"]:
+        """Mean over the starts of the logarithm of each log's error; NaN where there is none."""
+        out = []
+        for log in logs:
+            values = [_error(score, sensor) for score in scores if score.model == model and score.log == log]
+            known = [max(value, LEAST_ERROR) for value in values if value is not None]
+            out.append(float(np.mean(np.log(known))) if known else np.nan)
+        return np.array(out)
+
+    present = [candidate for candidate in CANDIDATES if any(score.model == candidate for score in scores)]
+    table = {model: errors(model) for model in (*present, "static")}
+    chosen = next(
+        candidate
+        for place, candidate in enumerate(present)
+        if not any(beaten(table[candidate], table[other]) for other in present[place + 1 :])
+    )
+    return present[0] if sensor == "gyro" and beaten(table[chosen], table["static"]) else chosen
+
+
+def beaten(errors: Float64[np.ndarray, " logs"], others: Float64[np.ndarray, " logs"]) -> bool:
+    """Whether the others' errors (logarithms) are smaller by `LEAST_GAIN` and by more than their scatter from log to log."""
+    gain = (errors - others)[np.isfinite(errors - others)]
+    if not len(gain):
+        return False
+    scatter = gain.std(ddof=1) / np.sqrt(len(gain)) if len(gain) > 1 else 0.0
+    return bool(gain.mean() > max(LEAST_GAIN, scatter))
+
+
+def _error(score: Score, sensor: Sensor) -> float | None:
+    return score.aoe_deg if sensor == "gyro" else score.drift_m_s
+
+
+def simpler_effects(fits: Mapping[Sensor, Calibration], kept: Mapping[Sensor, str]) -> dict[str, tuple[str, ...]]:
+    """Settings of `hybrid` that name the effects of the candidates kept, where they differ from those of the fits."""
+    effects: dict[str, tuple[str, ...]] = {}
+    for sensor, fit in fits.items():
+        names = {"constant": (), "linear": LINEAR[sensor], "effects": fit.effects}[kept[sensor]]
+        if not fit.named and set(names) != set(fit.effects):
+            effects[f"{sensor}_effects"] = names
+    return effects
+
+
+def left_out_model(
+    fits: Mapping[Sensor, Calibration], pool: Pool, trained: BiasNetwork, candidate: str, index: int
+) -> BiasModel:
+    """Model of a candidate from all logs but one, with the prior of the rest bias from these logs."""
+    network = hybrid.Network(Config(remainder=False), pool.rate_hz).double()
+    rest = []
+    for sensor, fit in fits.items():
+        names = _names(fit, candidate, sensor, index)
+        columns = parameter_columns(fit.forms, names)
+        theta, covariance = fit.problem.solve(columns, without=index)
+        network.take(sensor, names, theta[columns], covariance)
+        rest.append(np.delete(fit.problem.own_at(theta)[:, :3].cpu().numpy(), index, axis=0))
+    for name, value in trained.named_buffers(recurse=False):
+        getattr(network, name).copy_(value)
+    per_log = len(fits["gyro"].problem.own) // len(pool.names)
+    spans = [span for span in pool.spans_ns for _ in range(per_log)]
+    mean, std, sessions = turn_on_prior(np.concatenate(rest, axis=1), spans[:index] + spans[index + 1 :])
+    network.prior_mean.copy_(torch.from_numpy(mean))
+    network.prior_std.copy_(torch.from_numpy(std))
+    model = network.frozen()
+    model.card = {"logs": [{}] * (len(spans) - 1), "sessions": [session.card() for session in sessions]}
+    return model
+
+
+def _names(fit: Calibration, candidate: str, sensor: Sensor, index: int) -> tuple[str, ...]:
+    """Effects of a candidate; those that the other logs support are found anew without the log."""
+    if candidate == "constant":
+        return ()
+    if candidate == "linear":
+        return LINEAR[sensor]
+    if fit.named:
+        return fit.effects
+    gains = effects_beyond_chance(fit.problem.without(index), fit.forms)
+    return tuple(form.name for form in fit.forms if form.name in gains)
+
+
+def _without_nuisances(log: Recording, fit: Calibration, candidate: str, index: int) -> Recording:
+    """Recording whose poses are turned and shifted onto the sensor, as far as a log left out shows that to a candidate."""
+    columns = parameter_columns(fit.forms, _names(fit, candidate, "gyro", index))
+    own = fit.problem.own_at(fit.problem.solve(columns, without=index).theta)[index].cpu().numpy()
+    turn, late_s = Rotation.from_rotvec(-own[3:6]), float(own[6])
+    truth = log.truth
+    q_wb_wxyz = (Rotation.from_quat(truth.q_wb_wxyz, scalar_first=True) * turn).as_quat(scalar_first=True)
+    poses = Poses(truth.t_ns - nanoseconds(late_s), truth.p_wb, np.ascontiguousarray(q_wb_wxyz), truth.v_w)
+    return replace(log, truths={next(iter(log.truths)): poses})
+
+
+def _known(fit: Calibration, candidate: str, sensor: Sensor) -> bool:
+    """Whether a fit has the parameters of a candidate."""
+    return candidate != "linear" or set(LINEAR[sensor]) <= {form.name for form in fit.forms}
+
+
+def _logs(recordings: Sequence[Recording], pool: Pool, fit: Calibration) -> Iterator[Recording]:
+    """Recordings, or their parts where the logs of the fit are parts, of `LONGEST_S` at most."""
+    parts = len(fit.problem.own) // len(pool.names)
+    for log, recording in enumerate(recordings):
+        begin_ns = pool.spans_ns[log][0]
+        t = pool.t[(pool.log == log) & ~pool.held_out] if parts > 1 else pool.t[pool.log == log]
+        bounds = torch.linspace(0, len(t) - 1, parts + 1).long()
+        for part, (first, last) in enumerate(zip(t[bounds[:-1]].tolist(), t[bounds[1:]].tolist(), strict=True), start=1):
+            end_ns = begin_ns + nanoseconds(min(last, first + LONGEST_S))
+            start_ns = begin_ns + nanoseconds(first) if part > 1 else int(recording.imu.t_ns[0])
+            name = recording.name if parts == 1 else f"{recording.name} {part}/{parts}"
+            yield replace(recording, name=name, imu=recording.imu.between(start_ns, end_ns))
+
+
+def _corrected(log: Recording, model: BiasModel | None, start: str) -> list[Imu]:
+    """Samples corrected by a model, or by the log's own rest bias; empty if the log has no start of this kind."""
+    try:
+        if model is None and start == "auto":
+            static_model, initial = estimate_at_rest(log.imu, log.name)
+            return [apply(static_model, initial, log.imu).imu]
+        model = model or static.Model()
+        smooth = start == "smooth"
+        initial = smooth_in_memory(model, log.imu, log.name) if smooth else find_initial_bias(start, model, log)
+        return [apply(model, initial, log.imu).imu]
+    except (DataError, ModelError):
+        return []
+
+
+def _score(log: Recording, model: str, start: str, imu: Imu) -> Score:
+    path, truth, valid = along_truth(imu, log.truth, log.name)
+    speeds = drift(path, truth, valid, DRIFT_S).velocity_m_s
+    drift_m_s = float(np.sqrt(np.mean(speeds**2))) if len(speeds) else None
+    return Score(log.name, model, start, float(metrics.absolute(path, truth, valid)["aoe_deg"] or 0.0), drift_m_s)

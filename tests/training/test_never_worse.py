@@ -1,0 +1,74 @@
+"""A trained model is not worse than the simple thing on logs of other switchings-on; what is learned has evidence."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from support.switchings_on import Switchings, log
+
+from imutool.config import load
+from imutool.evaluation import evaluate
+from imutool.mcap_io.write import write
+from imutool.training.left_out import Score, beaten, keep
+from imutool.training.run import train
+from imutool.training.settings import settings_of
+
+KIND = Switchings(sensor_seed=0, rest_s=10.0, duration_s=30.0)
+TRAINING, TESTS = 6, 8
+
+
+@pytest.fixture(scope="module")
+def model(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Six logs of one switching-on, and the default method without its neural ODE."""
+    folder = tmp_path_factory.mktemp("one_switching_on")
+    logs = [folder / f"{seed}.mcap" for seed in range(TRAINING)]
+    for seed, path in enumerate(logs):
+        write(log(seed, 0, KIND), path)
+    train(logs, folder / "model.safetensors", settings=load(settings_of("hybrid"), None, ["model.remainder=false"]))
+    return folder / "model.safetensors"
+
+
+@pytest.fixture(scope="module")
+def tests(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
+    """Logs of eight other switchings-on."""
+    folder = tmp_path_factory.mktemp("other_switchings_on")
+    paths = [folder / f"{seed}.mcap" for seed in range(50, 50 + TESTS)]
+    for seed, path in enumerate(paths, start=50):
+        write(log(seed, seed, KIND), path)
+    return paths
+
+
+@pytest.mark.parametrize(("init", "smooth"), [("auto", False), ("stationary", False), ("auto", True)])
+def test_a_model_of_one_switching_on_is_better_than_static_on_others(
+    model: Path, tests: list[Path], init: str, smooth: bool
+) -> None:
+    results = [evaluate(path, models=["static", str(model)], init=init, smooth=smooth) for path in tests]
+    raw, static, trained = np.mean([[result["aoe_deg"] for result in log] for log in results], axis=0)
+    assert trained <= static
+    assert trained < 0.1 * raw
+
+
+def scores(**models: list[float]) -> list[Score]:
+    """One start, one error a log."""
+    table = [(str(log), model, error) for model, errors in models.items() for log, error in enumerate(errors)]
+    return [Score(log, model, "auto", error, error) for log, model, error in table]
+
+
+def test_the_simplest_candidate_that_is_not_beaten_is_kept() -> None:
+    constant = [1.0, 2.0, 1.5, 1.2]
+    better = [0.5 * error for error in constant]
+    assert keep(scores(constant=constant, linear=better, effects=better), "gyro") == "linear"
+    assert keep(scores(constant=constant, linear=constant, effects=better), "gyro") == "effects"
+    assert keep(scores(constant=constant, linear=[0.5, 4.0, 0.7, 2.5]), "gyro") == "constant", "the logs do not agree"
+    assert keep(scores(constant=constant, linear=better, static=[0.3] * 4), "gyro") == "constant", "static beats both"
+    assert keep(scores(constant=constant, linear=better, static=[0.3] * 4), "accel") == "linear"
+
+
+def test_a_gain_counts_beyond_its_scatter_from_log_to_log() -> None:
+    errors = np.log([1.0, 1.0, 1.0])
+    assert beaten(errors, errors - 0.1)
+    assert not beaten(errors, errors - 0.01), "too little"
+    assert not beaten(errors, errors - np.array([0.5, -0.4, 0.1])), "no agreement"
+    assert not beaten(errors, np.full(3, np.nan))

@@ -1,0 +1,57 @@
+"""Priors from few logs: logs of one switching-on are one draw of the turn-on bias."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from imutool.bias_start.initial_bias import AT_REST_STD
+from imutool.training.statistics import TURN_ON_STD, USUAL_STD, shift_at_rest, turn_on_prior
+
+HOUR_NS = 3600 * 10**9
+USUAL = np.array([USUAL_STD["gyro"]] * 3 + [USUAL_STD["accel"]] * 3)
+
+
+def spans(*hours: float) -> list[tuple[int, int]]:
+    """Logs of a minute that begin at some hours."""
+    return [(round(hour * HOUR_NS), round(hour * HOUR_NS) + 60 * 10**9) for hour in hours]
+
+
+def biases(*means: float, seed: int = 0) -> np.ndarray:
+    return np.array(means)[:, None] + 1e-4 * np.random.default_rng(seed).normal(size=(len(means), 6))
+
+
+def test_six_logs_of_one_switching_on_say_little_of_the_next_one() -> None:
+    rest = biases(*[0.01] * 6)
+    mean, std, sessions = turn_on_prior(rest, spans(*np.arange(6) / 4))
+    assert (std[:3] > TURN_ON_STD["gyro"]).all()
+    np.testing.assert_allclose(mean, rest.mean(axis=0))
+    (session,) = sessions
+    assert (session.std < USUAL).all(), "the next log of the same day is like them"
+    assert (session.start_ns, session.end_ns) == (0, spans(1.25)[0][1])
+
+
+def test_sessions_are_hours_apart_or_have_other_biases() -> None:
+    rest = biases(0.01, 0.01, 0.011, 0.03, 0.0, 0.0)
+    _, std, sessions = turn_on_prior(rest[[3, 0, 1, 2, 4, 5]], [spans(20.0, 0.0, 1.0, 2.0, 3.0, 50.0)[k] for k in range(6)])
+    assert [round(float(s.mean[0]), 2) for s in sessions] == [0.01, 0.0, 0.03, 0.0]
+    draws = np.array([0.01, 0.0, 0.03, 0.0])
+    between = (((draws - draws.mean()) ** 2).sum() + TURN_ON_STD["gyro"] ** 2) / 4 * 1.25
+    np.testing.assert_allclose(std[0], np.sqrt(between), rtol=0.03)
+
+
+def test_one_log_is_a_session_of_its_own() -> None:
+    _, std, (session,) = turn_on_prior(biases(0.01), spans(0.0))
+    np.testing.assert_allclose(std[:3], np.sqrt(2 * TURN_ON_STD["gyro"] ** 2 + USUAL[0] ** 2))
+    np.testing.assert_allclose(session.std, np.sqrt(2) * USUAL)
+
+
+def test_a_shift_at_rest_has_to_be_shown_by_the_logs_together() -> None:
+    std = np.full((6, 6), 1e-3)
+    noise = std[0, 0] * np.random.default_rng(1).normal(size=(6, 6))
+    stops = [noise[log : log + 1] for log in range(6)]
+    np.testing.assert_array_equal(shift_at_rest(stops, std), AT_REST_STD)
+    shifted = [rows + np.array([5e-3, 0.0, 0.0, 0.0, 0.0, 0.0]) for rows in stops]
+    shift = shift_at_rest(shifted, std)
+    assert shift[0] > 5e-3
+    np.testing.assert_array_equal(shift[3:], AT_REST_STD[3:])
+    np.testing.assert_array_equal(shift_at_rest([np.zeros((0, 6))], std[:1]), AT_REST_STD)
