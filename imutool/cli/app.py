@@ -164,7 +164,7 @@ app = App(
     no_args_is_help=True,
     rich_markup_mode="rich",
     pretty_exceptions_enable=False,
-    add_completion=False,
+    add_completion=True,
 )
 
 Logs = Annotated[list[Path], typer.Argument(metavar="LOG...", help="MCAP logs.")]

@@ -72,7 +72,11 @@ def _described(
     from imutool.log_info.inspection import describe
     from imutool.mcap_io.recovery.recovered_log import RecoveredLog
 
-    with RecoveredLog(to_location(log), max_chunk=max_chunk) as opened:
+    place = to_location(log)
+    if isinstance(place, Path) and place.is_dir():
+        fix = f"Name its logs, or report on all of them with: imutool fleet info {place} OUT"
+        raise ConfigError("is a folder", where=place, expected="an MCAP log", fix=fix)
+    with RecoveredLog(place, max_chunk=max_chunk) as opened:
         report = describe(opened, check=not quick)
         if not noise:
             return report, None
