@@ -31,7 +31,7 @@ def float_stamps(tree: Tree) -> bool:
 
 
 def identity(format: str, sequence: Sequence, sensor: str, known: bool) -> dict[str, str]:
-    """Metadata on a sequence's origin: the data set and the sensor only where the sequence shows them."""
+    """Metadata on a sequence's origin; data set and sensor only where it shows them."""
     origin = {"dataset": format} if known else {}
     return {"format": format, "sequence": sequence.name, **origin, **({"sensor": sensor} if sensor else {})}
 

@@ -28,7 +28,7 @@ COMMA_NUMBER = re.compile(r"[+-]?\d*,\d+([eE][+-]?\d+)?")
 
 @dataclass
 class Columns:
-    """Columns by name, stacks of rotation matrices, the texts that decimals come from, and notes."""
+    """Columns by name, rotation matrices, the texts of decimals, and notes."""
 
     values: dict[str, np.ndarray] = field(default_factory=dict)
     matrices: dict[str, np.ndarray] = field(default_factory=dict)

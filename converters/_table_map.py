@@ -77,7 +77,7 @@ def read_map(path: Path) -> TableMap:
         table = msgspec.convert(tomllib.loads(path.read_text(encoding="utf-8")), TableMap)
     except OSError as error:
         raise ConfigError(f"cannot be read ({error.strerror})", where=path) from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError, msgspec.ValidationError) as error:
+    except (ValueError, RecursionError, msgspec.ValidationError) as error:
         raise ConfigError(f"is no map of a table ({error})", where=path) from error
     for name, units in (("time", TIME_NS), ("gyro", GYRO_SI), ("accel", ACCEL_SI)):
         if (unit := getattr(table, f"{name}_unit")) not in units:

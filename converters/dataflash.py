@@ -1,4 +1,4 @@
-"""ArduPilot DataFlash (.bin): IMUs in FLU, the EKF's poses as an estimate, every message type.
+"""ArduPilot DataFlash (.bin): IMUs in FLU, EKF poses as an estimate, every message.
 
 The log describes its own messages (FMT); no library is needed. ArduPilot measures in FRD and its world is NED: the IMU and
 pose topics are written in FLU and ENU, the other topics keep its own frames. Stamps are the time since boot.

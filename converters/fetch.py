@@ -38,7 +38,7 @@ def recognises(sequence: Sequence) -> bool:
 
 
 def is_known(sequence: Sequence) -> bool:
-    """Whether a sequence shows its origin: only FETCH prints its stamps so, and its bags have these topics."""
+    """Whether a sequence shows its origin: by its stamps, or by its bag's topics."""
     return recognises(sequence)
 
 

@@ -1,4 +1,4 @@
-"""Table of any origin: CSV, TSV, Parquet, .npz, MATLAB .mat or HDF5, with a map of its columns.
+"""Table with a map of its columns: CSV, TSV, Parquet, .npz, MATLAB .mat or HDF5.
 
 Columns and units are recognised from their names. What stays open is asked for: the refusal holds a map file to complete.
 """

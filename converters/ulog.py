@@ -1,4 +1,4 @@
-"""PX4 ULog (.ulg): IMUs in FLU, the EKF's poses as an estimate, simulated truth as truth, every topic.
+"""PX4 ULog (.ulg): IMUs in FLU, EKF poses as an estimate, simulated truth, every topic.
 
 Frames: PX4 measures in FRD (x forward, y right, z down) and its world is NED. The IMU and pose topics are written in FLU (x
 forward, y left, z up) and ENU, as ROS has them: y and z of the body change sign. The topics of PX4 keep its own frames, as

@@ -27,7 +27,7 @@ from imutool.bias_start.model_choice import check_smooth, choose_imus, choose_mo
 from imutool.bias_start.stretches import Sieve
 from imutool.cleaning import Cleaner, CleaningSettings, Survey, look
 from imutool.config import plain
-from imutool.errors import LogError
+from imutool.errors import LogError, ModelError
 from imutool.location import Location
 from imutool.mcap_io.added_topics import DerivedBatch, NewTopic
 from imutool.mcap_io.codec import schemas
@@ -118,6 +118,8 @@ class Debiaser:
             self._start_ns = int(t_ns[0])
         t_s = seconds(t_ns, self._start_ns)
         bias, covariance = self._estimator(t_s, batch.gyro, batch.accel)
+        if not (np.isfinite(bias).all() and np.isfinite(covariance).all()):
+            raise ModelError("the model gives a bias that is not finite", where=self.source_topic, fix="Choose another `model`")
         total = covariance + self._white
         corrected = encode_imu(
             batch.stamp_ns,

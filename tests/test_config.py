@@ -131,6 +131,9 @@ def test_a_file_too_large_or_nested_without_end_is_refused_before_it_costs_anyth
     path.write_text("a = " + "[" * 100_000)
     with pytest.raises(ConfigError, match="nested too deeply"):
         read(path)
+    path.write_text("a = " + "9" * 5000)
+    with pytest.raises(ConfigError, match=r"huge.toml: .* cannot be read .*thousands of digits"):
+        read(path)
 
 
 def test_a_word_nested_without_end_is_text() -> None:

@@ -120,7 +120,7 @@ def convert(
         progress: Callback with sequences done, sequences in all, and the name of the last one.
 
     Returns:
-        `written`, the logs in the order of the source, `failures`, `notes`, and `losses`: what a log lacks of its source.
+        `written`, `failures`, `notes`, and `losses`: what a log lacks of its source.
 
     Raises:
         DataError: The source holds no known sequence.

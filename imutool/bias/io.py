@@ -23,8 +23,10 @@ from imutool.mcap_io.storage.target import Target
 FORMAT = "imutool.model/1"
 MAX_BYTES = 64 << 20  # the shipped models are under 2 MB
 MAX_RATE_HZ = 1e6
+MAX_WEIGHT = 1e6  # the largest of the shipped models is 10
 MAX_TOML = 1 << 20  # bytes of a physics.toml; usual files have a few thousand
 MAX_SETTINGS = 16 << 10  # characters; usual settings have a few hundred
+WITH_RATE = ("conv", "hybrid", "neural_ode")  # their networks count in samples
 BEST_FIRST = ("hybrid", "neural_ode", "linear")  # by published results and docs/accuracy.md
 RATE_TOLERANCE = 0.05  # a real rate differs from its nominal one by a few per mille (BMI160: 199.4 for 200)
 
@@ -122,6 +124,8 @@ def load(path: Path) -> BiasModel:
         raise ModelError(f"tensors {', '.join(wrong[:5])} do not fit", where=path, expected=f"those of {header.method}")
     if any(not np.isfinite(value).all() for value in tensors.values()):
         raise ModelError("holds numbers that are not finite", where=path)
+    if any((np.abs(value) > MAX_WEIGHT).any() for value in tensors.values()):
+        raise ModelError("holds numbers that no training gives", where=path, expected=f"at most {MAX_WEIGHT:g}")
     model = kind(settings, header.rate_hz, tensors)
     model.card = {**header.card, "name": path.stem, "sha256": digest(path)}
     return model
@@ -237,7 +241,7 @@ def _header(raw: Mapping[str, str], path: Path) -> _Header:
         if len(raw["settings"]) > MAX_SETTINGS:
             raise ValueError(f"{len(raw['settings'])} characters of settings, at most {MAX_SETTINGS}")
         rate_hz, settings, card = float(raw["rate_hz"]), json.loads(raw["settings"]), json.loads(raw["card"])
-        if not 0.0 <= rate_hz <= MAX_RATE_HZ:
+        if not 0.0 <= rate_hz <= MAX_RATE_HZ or (rate_hz == 0.0 and raw["method"] in WITH_RATE):
             raise ValueError(f"rate_hz {rate_hz}")
         if not isinstance(settings, dict) or not isinstance(card, dict):
             raise ValueError("settings and card are tables")

@@ -230,7 +230,7 @@ def training_source(model: BiasModel) -> str:
     if "prior" in model.card:  # a model that was not trained names the source of its bias
         return str(model.card["prior"])
     logs = model.card.get("logs", ())
-    return f"prior of {len(logs)} runs" if len(logs) > 1 else "prior of the training runs"
+    return f"prior of {len(logs)} runs" if isinstance(logs, list | tuple) and len(logs) > 1 else "prior of the training runs"
 
 
 def accuracy(std: Vector6) -> str:

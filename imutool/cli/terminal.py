@@ -25,6 +25,7 @@ from imutool.report import Report, json_text
 if TYPE_CHECKING:
     from imutool.training.fit import Epoch
 
+LONGEST = 2000  # letters of an error message
 NUMBER = re.compile(r"[-+]?[0-9.]+|[–?]")
 
 logger = logging.getLogger("imutool")
@@ -52,7 +53,9 @@ def say(line: str) -> None:
 
 
 def tell_error(message: str) -> None:
-    """Print a line that begins with "error:" on stderr."""
+    """Print a line that begins with "error:" on stderr; a text of thousands of letters, as of a damaged file, is cut."""
+    if len(message) > LONGEST:
+        message = f"{message[: LONGEST // 2]} … {message[-LONGEST // 2 :]}"
     err.print(f"[bold red]error:[/] {plain(redact(message))}", highlight=False, soft_wrap=True)
 
 

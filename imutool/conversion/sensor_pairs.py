@@ -1,4 +1,4 @@
-"""Gyroscope and accelerometer on topics of their own, joined to one IMU while a log is written."""
+"""Gyroscope and accelerometer on topics of their own, joined to one IMU."""
 
 from __future__ import annotations
 

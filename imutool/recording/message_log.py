@@ -41,7 +41,7 @@ class Message(NamedTuple):
 
 @dataclass(frozen=True)
 class Table:
-    """Columns of numbers on one clock, written as messages of a type made from the columns' names.
+    """Columns of numbers on one clock, written as messages of a type made from them.
 
     `columns` is a structured array. A field may have a subarray shape: `gyro_rad` of three numbers.
     """
@@ -70,7 +70,7 @@ def no_messages() -> Iterator[Message]:
 
 @dataclass(frozen=True)
 class MessageLog:
-    """Log of several topics: arrays by topic, and a stream of encoded messages in log-time order.
+    """Log of several topics: arrays by topic, and encoded messages in log-time order.
 
     `topics` are defined ahead of the messages; `messages` may use further ones. `counts` states how many messages of a
     topic the source says it has; the writer compares. `kinds` says what the poses of a topic are worth, where the source

@@ -2,8 +2,8 @@
 
 The logs are made up in the usual, worst layout: images and IMU messages side by side in every chunk of 1 MiB. In the same run,
 all from the page cache: a shell loop of `cp`, then `imutool fleet debias` with one and with two workers, as a user types it.
-The time of a fleet is told with and without the start of Ray and of python and torch in each worker: that is paid once. CPU
-seconds are those of the tasks, as each says them; the first of each worker, which imports torch, is left out of the figures.
+The time of a fleet is told with and without the start of the command and of its workers: that is paid once. CPU seconds are
+those of the tasks, as each says them; the first of each worker, which imports what it needs, is left out of the figures.
 
 A log four times as large tells what a byte costs and what a log costs. With that, `price` says what a fleet costs on a cluster,
 and what limits it: CPU (and of that how much is the codec) or network. Nothing of a cluster is measured here: prices, cores and
@@ -205,6 +205,8 @@ def measure(work: Path, logs: int, mb: float, compression: str) -> Cost:
         print(f"{one.work_s:17.2f}{gb * 1e3 * shares / one.work_s:9.0f}{cpu:13.3f}{peak / 1e6:9.0f}", flush=True)
     speeds = {workers: len(one.rows) / one.work_s for workers, one in spent.items()}
     print(f"two workers against one: {speeds[2] / speeds[1]:.2f} times the logs per second")
+    whole = {workers: logs / one.whole_s for workers, one in spent.items()}
+    print(f"logs per second, start included: {whole[1]:.1f} with one worker, {whole[2]:.1f} with two")
     larger = debiased(large, work / "out", 1)
     sizes = [statistics.median(row["source_bytes"] for row in rows) / 1e9 for rows in (spent[1].rows, larger.rows)]
     cpus = [statistics.median(row["cpu_seconds"] for row in rows) for rows in (spent[1].rows, larger.rows)]

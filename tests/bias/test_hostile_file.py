@@ -8,10 +8,12 @@ import resource
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from imutool.bias import linear
-from imutool.bias.io import MAX_SETTINGS, find_model, header_of, load, save
+from imutool.bias.io import MAX_SETTINGS, find_model, header_of, library, load, save
+from imutool.bias_start.initial_bias import training_source
 from imutool.errors import ModelError
 
 MEMORY_BOUND = 200 << 20  # of address space beyond what is used; the models asked for here would take gigabytes
@@ -124,3 +126,26 @@ def test_a_physics_file_beyond_all_sense_is_refused_unread(tmp_path: Path) -> No
         file.truncate(10 << 30)  # a hole: it takes no room on the disk
     with pytest.raises(ModelError, match="10737418240 bytes"):
         find_model(tmp_path / "physics.toml", 200.0)
+
+
+@pytest.mark.parametrize("weight", [1e30, -3e38, 2e6])
+def test_weights_that_no_training_gives_are_refused(saved: Path, weight: float) -> None:
+    header, data = parts(saved)
+    with pytest.raises(ModelError, match="holds numbers that no training gives"):
+        load(written(saved, header, np.full(len(data) // 4, weight, np.float32).tobytes()))
+
+
+@pytest.mark.parametrize("name", ["conv", "hybrid", "neural_ode"])
+def test_a_network_without_a_rate_is_refused(name: str, tmp_path: Path) -> None:
+    raw = next(path for path in sorted(library().glob("*.safetensors")) if header_of(path)["method"] == "hybrid")
+    header, data = parts(raw)
+    header["__metadata__"] |= {"rate_hz": "0.0", "method": name}
+    with pytest.raises(ModelError, match=r"invalid header \(rate_hz 0\.0\)"):
+        load(written(tmp_path / "m.safetensors", header, data))
+
+
+@pytest.mark.parametrize("logs", [1e308, True, None, "x", {}])
+def test_logs_of_a_card_that_are_no_list_are_not_counted(saved: Path, logs: object) -> None:
+    model = load(saved)
+    model.card = {**model.card, "logs": logs}
+    assert training_source(model) == "prior of the training runs"

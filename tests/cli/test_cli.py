@@ -15,7 +15,7 @@ import pytest
 from imutool import cli, errors, registry
 from imutool.cli import terminal
 from imutool.cli.demo import write_asl
-from imutool.cli.terminal import epoch_line
+from imutool.cli.terminal import epoch_line, tell_error
 from imutool.sensor.made_up_flight import flight
 from imutool.training.fit import Epoch
 
@@ -82,6 +82,14 @@ def test_a_bug_is_a_traceback(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_wrong_usage_exits_with_2(code: Code, capsys: pytest.CaptureFixture[str], words: list[str]) -> None:
     assert code(*words) == 2
     assert "Usage: " in capsys.readouterr().err
+
+
+def test_a_message_of_a_hostile_file_is_cut(capsys: pytest.CaptureFixture[str]) -> None:
+    tell_error(f"model.safetensors: is no model ({'x' * 100_000}). Choose another.")
+    said = capsys.readouterr().err
+    assert len(said) < 2100
+    assert said.startswith("error: model.safetensors: is no model (xxx")
+    assert said.endswith("xxx). Choose another.\n")
 
 
 def test_a_question_needs_no_full_stop() -> None:
