@@ -192,7 +192,7 @@ def _unpacked(record: bytes) -> bytes | None:
             contents = lz4.frame.decompress(record[start:])
         else:
             contents = record[start:] if not name else b""
-    except (zstandard.ZstdError, RuntimeError):
+    except (zstandard.ZstdError, RuntimeError, MemoryError):  # a flipped frame may state any size
         return None
     return contents if len(contents) == size and zlib.crc32(contents) == crc else None
 
