@@ -109,7 +109,7 @@ class NumericsError(ImutoolError):
 
 
 def redact(text: str) -> str:
-    """Text without the users, passwords, queries and fragments of the URLs in it, and without signatures."""
+    """Text without users, passwords, queries, fragments and signatures of the URLs in it."""
     if "://" in text or ":/" in text:
         text = URL_TAIL.sub(r"\1***", URL_LOGIN.sub(r"\1***@", text))
     return SECRET.sub(r"\1***", text) if "=" in text else text

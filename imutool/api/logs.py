@@ -104,6 +104,8 @@ def convert(
 ) -> ConvertReport:
     """Convert recordings of any format to MCAP logs, one log per sequence.
 
+    The report has `written`, `failures`, `notes`, and `losses`: what a log lacks of its source.
+
     Args:
         source: Bag, log, sequence folder or archive (.zip, .tar, .tar.gz), or a folder of these.
         out: Log file for one sequence, folder for several.
@@ -119,13 +121,9 @@ def convert(
         workers: Processes; by default one per core. A script that uses several needs `if __name__ == "__main__":`.
         progress: Callback with sequences done, sequences in all, and the name of the last one.
 
-    Returns:
-        `written`, `failures`, `notes`, and `losses`: what a log lacks of its source.
-
     Raises:
-        DataError: The source holds no known sequence.
         ConfigError: Unknown format or sequence, an existing log without `overwrite`.
-        ImutoolError: The only sequence failed. With several, failures are in the report.
+        ImutoolError: No known sequence, or the only one failed. With several, failures are in the report.
 
     Examples:
         >>> import imutool

@@ -155,7 +155,7 @@ def _transition(F: Float64[np.ndarray, "6 6"]) -> Float64[np.ndarray, "6 6"]:
 
 
 def prior(model: BiasModel, first_ns: int | None = None) -> InitialBias:
-    """Prior bias of a log that begins at a stamp: of its session if training saw it, else of a new one."""
+    """Prior bias of a log that begins at a stamp: that of its session, or of a new one."""
     mean, std = model.prior_mean.copy(), model.prior_std.copy()
     sessions = [] if first_ns is None else model.card.get("sessions", [])
     apart = [max(0, session["start_ns"] - first_ns, first_ns - session["end_ns"]) for session in sessions]
@@ -239,7 +239,7 @@ def accuracy(std: Vector6) -> str:
 
 
 def relative_samples(imu: Imu) -> Samples:
-    """Measured samples with float seconds since the first; a long gap counts as `stretches.MOST_GAP_S`."""
+    """Measured samples with seconds since the first; a long gap counts as `MOST_GAP_S`."""
     good = measured(imu.gyro, imu.accel)
     imu = imu if good.all() else imu.rows(good)
     return seconds(StretchClock()(imu.t_ns), int(imu.t_ns[0]) if len(imu) else 0), imu.gyro, imu.accel

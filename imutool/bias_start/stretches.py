@@ -1,4 +1,4 @@
-"""Stretches of samples: what is no measurement left out, and a clock that no jump of the stamps can carry away.
+"""Split samples into stretches at jumps of the clock, and leave out what is no measurement.
 
 Filters cost by samples and their times stay small: a step of the stamps of more than `GAP_S`, or back by as much, begins a new
 stretch, and counts as at most `MOST_GAP_S`.
@@ -31,7 +31,7 @@ Rows3 = Float64[np.ndarray, "n 3"]
 
 
 class Stretch(NamedTuple):
-    """Beginning of a stretch: its first stamp, and the step of the stamps to it (negative: the clock was set back)."""
+    """Beginning of a stretch: its first stamp, and the step to it (negative: set back)."""
 
     start_ns: int
     step_s: float
@@ -43,7 +43,7 @@ class Stretch(NamedTuple):
 
 
 def unmeasured(gyro: Rows3, accel: Rows3) -> Mapping[str, Bool[np.ndarray, " n"]]:
-    """Samples that are no measurement, by reason: not finite, beyond any sensor, or no specific force at all."""
+    """Samples that are no measurement: not finite, beyond any sensor, or without specific force."""
     u = np.concatenate([gyro, accel], axis=1)
     size = np.abs(u)
     not_finite = ~np.isfinite(u).all(axis=1)

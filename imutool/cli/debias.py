@@ -58,10 +58,7 @@ def debias(
     """Write a log with a debiased IMU topic; all other messages stay unchanged."""
     _refuse_contradictions(target, in_place, overwrite and save_view is None and report_to is None and json_to is None)
     models = assigned(model or ())
-    if report_to is not None:
-        from imutool.viewing.html.drawing import require_matplotlib
-
-        require_matplotlib()
+    _require_matplotlib(report_to)
     from imutool.cleaning import CleaningSettings
     from imutool.debiasing import debias as run
 
@@ -91,6 +88,14 @@ def debias(
         if not json_only:
             say(f"Report: {report_to}")
     raise typer.Exit(LOST if report.lossy else 0)
+
+
+def _require_matplotlib(report_to: Path | None) -> None:
+    """Refuse a report without matplotlib before the work."""
+    if report_to is not None:
+        from imutool.viewing.html.drawing import require_matplotlib
+
+        require_matplotlib()
 
 
 class StretchEntry(Section, frozen=True):

@@ -53,7 +53,7 @@ def say(line: str) -> None:
 
 
 def tell_error(message: str) -> None:
-    """Print a line that begins with "error:" on stderr; a text of thousands of letters, as of a damaged file, is cut."""
+    """Print a line that begins with "error:" on stderr, and cut a very long text."""
     if len(message) > LONGEST:
         message = f"{message[: LONGEST // 2]} … {message[-LONGEST // 2 :]}"
     err.print(f"[bold red]error:[/] {plain(redact(message))}", highlight=False, soft_wrap=True)

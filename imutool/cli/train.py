@@ -77,7 +77,7 @@ def train(
 
 
 def left_out_table(left_out: Mapping[str, Any]) -> None:
-    """Print the scores of left-out logs, one row for each log and start, and the models that were kept."""
+    """Print the scores of left-out logs by log and start, and the models that were kept."""
     scores = left_out["scores"]
     models = list(dict.fromkeys(score["model"] for score in scores))
     aoe = {(score["log"], score["start"], score["model"]): score["aoe_deg"] for score in scores}

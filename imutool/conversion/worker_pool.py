@@ -1,4 +1,4 @@
-"""Worker processes: a function applied to many items, side by side; a worker that dies takes nothing else with it.
+"""Apply a function to many items in worker processes; one that dies takes no other with it.
 
 A worker is a Python process of its own with a socket to this one; nothing is forked, and the caller's `__main__` is not run
 again. It has one item at a time, so that its death is known to be that item's, or to have come from outside. It ends when this

@@ -51,7 +51,7 @@ class Engine(Protocol):
 
 
 class ProcessEngine:
-    """Processes of this machine: at most `workers`, and as many as there is memory for, `memory_bytes` for each.
+    """Processes of this machine: at most `workers`, and no more than memory allows.
 
     Raises:
         ConfigError: the machine does not have that much memory.

@@ -85,7 +85,7 @@ def work(task: Task, model: bytes | None = None) -> Result:
 
 
 def peak_bytes() -> int:
-    """Most memory that this process has held; ru_maxrss of a new process begins with what its parent held."""
+    """Peak memory of this process; `ru_maxrss` would begin with that of its parent."""
     with contextlib.suppress(OSError, StopIteration):
         lines = Path("/proc/self/status").read_text().splitlines()
         return 1024 * next(int(line.split()[1]) for line in lines if line.startswith("VmHWM:"))

@@ -81,7 +81,7 @@ def matrix(q: Quaternions) -> Float64[np.ndarray, "n 3 3"]:
 
 
 def running_product(q: Quaternions) -> Quaternions:
-    """Products q_0, q_0 q_1, q_0 q_1 q_2, ...: recursively of pairs, then the even ones filled in."""
+    """Products q_0, q_0 q_1, q_0 q_1 q_2, ..., by recursion over pairs."""
     if len(q) <= 1:
         return q
     pairs = running_product(multiply(q[: len(q) // 2 * 2 : 2], q[1::2]))

@@ -32,6 +32,7 @@ from imutool.mcap_io.topics import (
     ScalarBatch,
     StampCheck,
     Topic,
+    topics_of,
 )
 
 
@@ -284,27 +285,3 @@ class Log:
             mask = inside & np.isin(found.heads["channel"], list(channels))
             for rows in messages.rows(found, mask):
                 yield topic, rows
-
-
-def topics_of(index: LogIndex) -> dict[str, Topic]:
-    """The topics of a log by their names, in order of their channel ids.
-
-    Raises:
-        LogError: two channels of one topic carry different messages.
-    """
-    found: dict[str, Topic] = {}
-    counts = index.counts()
-    for identity, channel in sorted(index.channels.items()):
-        schema, before = index.schemas.get(channel.schema_id), found.get(channel.topic)
-        topic = Topic(
-            channel.topic,
-            schemas.canonical(schema.name) if schema else "",
-            schema.encoding if schema else "",
-            channel.message_encoding,
-            counts.get(identity, 0) + (before.count if before else 0),
-            MappingProxyType(dict(channel.metadata)),
-        )
-        if before and (before.schema_name, before.message_encoding) != (topic.schema_name, topic.message_encoding):
-            raise LogError(f"{channel.topic} carries {before.schema_name} and {topic.schema_name}")
-        found[channel.topic] = topic
-    return found

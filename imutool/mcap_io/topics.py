@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
@@ -14,6 +15,7 @@ from imutool.errors import LogError
 from imutool.mcap_io.codec import schemas
 from imutool.mcap_io.codec.decode import TwistColumns, decode_imu, decode_poses, decode_scalars, decode_twist
 from imutool.mcap_io.codec.messages import Rows
+from imutool.mcap_io.index import LogIndex
 
 ENCODINGS = ("cdr", "ros1")
 DERIVED_KEY = "imutool_source_topic"  # channel metadata: computed by imutool from this topic
@@ -199,3 +201,27 @@ class StampCheck:
             self.check(batch.stamp_ns, batch.sequence)
         except LogError as error:
             raise LogError(error.what, expected=error.expected, fix=CLEAN_FIX) from error
+
+
+def topics_of(index: LogIndex) -> dict[str, Topic]:
+    """The topics of a log by their names, in order of their channel ids.
+
+    Raises:
+        LogError: two channels of one topic carry different messages.
+    """
+    found: dict[str, Topic] = {}
+    counts = index.counts()
+    for identity, channel in sorted(index.channels.items()):
+        schema, before = index.schemas.get(channel.schema_id), found.get(channel.topic)
+        topic = Topic(
+            channel.topic,
+            schemas.canonical(schema.name) if schema else "",
+            schema.encoding if schema else "",
+            channel.message_encoding,
+            counts.get(identity, 0) + (before.count if before else 0),
+            MappingProxyType(dict(channel.metadata)),
+        )
+        if before and (before.schema_name, before.message_encoding) != (topic.schema_name, topic.message_encoding):
+            raise LogError(f"{channel.topic} carries {before.schema_name} and {topic.schema_name}")
+        found[channel.topic] = topic
+    return found

@@ -297,5 +297,4 @@ def free_id(taken: Mapping[int, object], what: str) -> int:
 
 def _bare(definition: bytes) -> list[bytes]:
     """A message definition without comments, blank lines and spacing."""
-    lines = (b" ".join(line.partition(b"#")[0].split()) for line in definition.splitlines())
-    return [line for line in lines if line]
+    return [line for text in definition.splitlines() if (line := b" ".join(text.partition(b"#")[0].split()))]

@@ -129,7 +129,7 @@ def solve(
 def nuisance_jacobian(
     sensor: Sensor, windows: Windows, gyro: Float[Tensor, "m n 3"], accel: Float[Tensor, "m n 3"]
 ) -> Float[Tensor, "m 3 k"]:
-    """Derivative of a window's residual by the nuisances of its log, in the order of `NUISANCE_STD`.
+    """Derivative of a window's residual by its log's nuisances, in the order of `NUISANCE_STD`.
 
     The poses are those of a frame turned by phi against the sensor, late by tau: R' = R(t - tau) Exp(phi), and so is their
     velocity, of a point r away: v' = v + R [omega]x r. Only the ends of a window count, since nuisances cancel in between.

@@ -45,7 +45,7 @@ DRIFT_S = 5.0
 
 @dataclass(frozen=True)
 class Score:
-    """Errors of one left-out log with one model and start: AOE (°), and velocity after 5 s from the truth (m/s)."""
+    """Errors of a left-out log with one model and start: AOE (°), velocity after 5 s (m/s)."""
 
     log: str
     model: str
@@ -84,7 +84,7 @@ def compare(
 
 
 def keep(scores: Sequence[Score], sensor: Sensor) -> str:
-    """Simplest candidate that no other beats; `constant` for the gyro if `static` beats that one."""
+    """Simplest candidate that no other beats; `constant` for the gyro if `static` beats it."""
     logs = list(dict.fromkeys(score.log for score in scores))
 
     def errors(model: str) -> Float64[np.ndarray, " logs"]:
@@ -107,7 +107,7 @@ def keep(scores: Sequence[Score], sensor: Sensor) -> str:
 
 
 def beaten(errors: Float64[np.ndarray, " logs"], others: Float64[np.ndarray, " logs"]) -> bool:
-    """Whether the others' errors (logarithms) are smaller by `LEAST_GAIN` and by more than their scatter from log to log."""
+    """Whether errors are smaller by `LEAST_GAIN` and by more than their scatter between logs."""
     gain = (errors - others)[np.isfinite(errors - others)]
     if not len(gain):
         return False
@@ -120,7 +120,7 @@ def _error(score: Score, sensor: Sensor) -> float | None:
 
 
 def simpler_effects(fits: Mapping[Sensor, Calibration], kept: Mapping[Sensor, str]) -> dict[str, tuple[str, ...]]:
-    """Settings of `hybrid` that name the effects of the candidates kept, where they differ from those of the fits."""
+    """Settings of `hybrid` with the effects of the candidates kept, where they differ."""
     effects: dict[str, tuple[str, ...]] = {}
     for sensor, fit in fits.items():
         names = {"constant": (), "linear": LINEAR[sensor], "effects": fit.effects}[kept[sensor]]
@@ -132,7 +132,7 @@ def simpler_effects(fits: Mapping[Sensor, Calibration], kept: Mapping[Sensor, st
 def left_out_model(
     fits: Mapping[Sensor, Calibration], pool: Pool, trained: BiasNetwork, candidate: str, index: int
 ) -> BiasModel:
-    """Model of a candidate from all logs but one, with the prior of the rest bias from these logs."""
+    """Model of a candidate, with its prior of the rest bias, from all logs but one."""
     network = hybrid.Network(Config(remainder=False), pool.rate_hz).double()
     rest = []
     for sensor, fit in fits.items():

@@ -35,7 +35,7 @@ BY_CHANCE = 0.01  # probability that logs seem to show a shift of the bias at re
 
 @dataclass(frozen=True)
 class Session:
-    """Logs of one switching-on: their stamps, and the rest bias of its next log with standard deviation."""
+    """Session of one switching-on: stamps of its logs, and the rest bias of its next log."""
 
     start_ns: int
     end_ns: int
@@ -50,7 +50,7 @@ class Session:
 def store_statistics(
     model: BiasNetwork, pool: Pool, rest: Float[Tensor, "logs 6"], window_s: Mapping[Sensor, Sequence[float]]
 ) -> list[Session]:
-    """Fills the model's prior, the spread of starts from truth, and the noise of a sample; the sessions of the logs.
+    """Store the prior, the spread of starts from truth and the noise; return the sessions.
 
     From the training part.
     """
@@ -76,7 +76,7 @@ def store_statistics(
 def turn_on_prior(
     rest: Float64[np.ndarray, "logs 6"], spans_ns: Sequence[tuple[int, int]]
 ) -> tuple[Float64[np.ndarray, "6"], Float64[np.ndarray, "6"], list[Session]]:
-    """Mean and standard deviation of the rest bias of the next session, and the sessions of the logs.
+    """Mean and standard deviation of the next session's rest bias, and the sessions.
 
     Logs of one switching-on are one draw of the turn-on bias. From S sessions with means m_s the next one has the variance
     (sum (m_s - m)^2 + TURN_ON_STD^2) / S (1 + 1/S): the size that sensors usually have counts as one session more.
@@ -115,7 +115,7 @@ def _sessions(rest: Float64[np.ndarray, "logs 6"], spans_ns: Sequence[tuple[int,
 
 
 def shift_at_rest(differences: Sequence[Float64[np.ndarray, "stops 6"]], std: Float64[np.ndarray, "logs 6"]) -> Vector6:
-    """Standard deviation about zero of the bias at rest minus that in motion, where the logs together show a shift.
+    """RMS of the bias at rest minus that in motion, where the logs together show a shift.
 
     `std` is that of each log's bias in motion. Stops whose differences are no larger than that and `AT_REST_STD` show none.
     """

@@ -38,7 +38,7 @@ class Segment:
 
 
 class BiasNetwork(nn.Module, ABC):
-    """Bias network with the statistics of its sensor's training runs (`imutool.bias.model.BiasModel`).
+    """Bias network with the statistics of its sensor's training runs, for training.
 
     It computes in float64 (`imutool.training.fit`). Names and shapes of its state are those of the model.
     """

@@ -8,11 +8,12 @@ import numpy as np
 from mcap.opcode import Opcode
 
 from imutool.mcap_io.blocks import MessageBlock, RecordSpan
-from imutool.mcap_io.log import Log, topics_of
+from imutool.mcap_io.log import Log
 from imutool.mcap_io.recovery.losses import Loss, Losses
 from imutool.mcap_io.recovery.recovered_index import RecoveredIndex
 from imutool.mcap_io.recovery.summary import PRIVATE
 from imutool.mcap_io.storage.source import Source, crc_of
+from imutool.mcap_io.topics import topics_of
 from imutool.mcap_io.verify import stated_crc
 
 
