@@ -147,9 +147,9 @@ def started(
     With `refused` a model that does not apply to the recording is left out, and `refused` is called with it and the error.
     """
     check_smooth(init, smooth)
-    for given in models:
+    for given, loaded in [(given, _load(given, recording)) for given in models]:  # a model that is none ends it at once
         try:
-            model, start = _model_and_start(given, recording, init, where, smooth)
+            model, start = _model_and_start(loaded, recording, init, where, smooth)
         except (DataError, ModelError) as error:
             if refused is None:
                 raise
@@ -158,14 +158,18 @@ def started(
         yield str(model.card.get("name", model.method)), model, start
 
 
+def _load(given: str | Path, recording: Recording) -> BiasModel | None:
+    """Model of a file or that ships; None for `static`, which is not trained."""
+    return None if str(given) == static.Model.method else find_model(given, 1.0 / recording.imu.period_s)
+
+
 def _model_and_start(
-    given: str | Path, recording: Recording, init: str, where: str | Path, smooth: bool
+    trained: BiasModel | None, recording: Recording, init: str, where: str | Path, smooth: bool
 ) -> tuple[BiasModel, InitialBias]:
-    untrained = str(given) == static.Model.method
-    if untrained and init == "auto" and not smooth:
+    if trained is None and init == "auto" and not smooth:
         return estimate_at_rest(recording.imu, where)
-    model: BiasModel = static.Model() if untrained else find_model(given, 1.0 / recording.imu.period_s)
-    if not untrained:
+    model: BiasModel = static.Model() if trained is None else trained
+    if trained is not None:
         check_rate(model, 1.0 / recording.imu.period_s, where)
     if smooth:
         return model, smooth_in_memory(model, recording.imu, where)

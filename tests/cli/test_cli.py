@@ -8,6 +8,7 @@ import re
 import subprocess
 import sys
 from collections.abc import Callable, Sequence
+from importlib import import_module
 from pathlib import Path
 
 import pytest
@@ -22,7 +23,11 @@ from imutool.training.fit import Epoch
 Run = Callable[..., subprocess.CompletedProcess[str]]
 Code = Callable[..., int]
 
-COMMANDS = [command.name or command.callback.__name__ for command in cli.load().registered_commands if command.callback]
+COMMANDS = [
+    command.name or command.callback.__name__.replace("_", "-")
+    for command in cli.load().registered_commands
+    if command.callback
+]
 
 
 @pytest.fixture
@@ -58,9 +63,10 @@ def code(monkeypatch: pytest.MonkeyPatch) -> Code:
 def test_each_kind_of_error_has_its_code(
     code: Code, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], error: BaseException, expected: int
 ) -> None:
-    def opened(_: Path) -> None:
+    def opened(_: Path, **options: object) -> None:
         raise error
 
+    import_module("imutool.log_info.inspection")  # first, or it would keep what replaces the class here
     monkeypatch.setattr("imutool.mcap_io.recovery.recovered_log.RecoveredLog", opened)
     assert code("info", "log.mcap") == expected
     printed = capsys.readouterr()
@@ -69,9 +75,10 @@ def test_each_kind_of_error_has_its_code(
 
 
 def test_a_bug_is_a_traceback(monkeypatch: pytest.MonkeyPatch) -> None:
-    def opened(_: Path) -> None:
+    def opened(_: Path, **options: object) -> None:
         raise ZeroDivisionError
 
+    import_module("imutool.log_info.inspection")  # first, or it would keep what replaces the class here
     monkeypatch.setattr("imutool.mcap_io.recovery.recovered_log.RecoveredLog", opened)
     monkeypatch.setattr(sys, "argv", ["imutool", "info", "log.mcap"])
     with pytest.raises(ZeroDivisionError):  # nobody catches it: Python prints the traceback and leaves with 1

@@ -15,8 +15,8 @@ from imutool.cli.demo import write_asl
 from imutool.report import REPORTS, json_schema
 from imutool.sensor.made_up_flight import flight
 
-COMMANDS = [command.name or command.callback.__name__ for command in load().registered_commands if command.callback]
-SILENT = {"schema"}  # commands without --json
+COMMANDS = [c.name or c.callback.__name__.replace("_", "-") for c in load().registered_commands if c.callback]
+SILENT = {"schema", "new-converter"}  # commands without --json
 
 # words of the command; {} is the folder of the logs, and a test runs in a folder of its own
 LINES: dict[str, Sequence[str]] = {
