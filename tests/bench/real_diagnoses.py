@@ -201,7 +201,7 @@ def residual_to_truth(
         ConfigError, LogError, DataError: as `diagnose`.
     """
     settings = DiagnoseSettings()
-    aligned = align(read_log(real, imu=imu, truth=truth), None, truth, settings.reference)
+    aligned = align(read_log(real, imu=imu, truth=truth), None, truth, settings)
     pairs = [without_unusable(pair, settings.reference) for pair in aligned]
     candidates = candidates_for(pairs)
     logs = []

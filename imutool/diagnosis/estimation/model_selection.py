@@ -276,10 +276,11 @@ class _Search:
         rate = min(1.0, float(np.exp(min(0.0, log_p + np.log(self.tried)))))
         std = (whole.stds() if scattered is None else scattered.std)[effect.key]
         std = np.array([self.onset_std.get((effect.key, j), float(s)) for j, s in enumerate(std)])
-        beyond = beyond_the_band(effect, theta, self.logs, self.settings) or has_no_size(effect, theta, std)
+        curve = isinstance(effect.forward, SplineCurve)
+        beyond = beyond_the_band(effect, theta, self.logs, self.settings) or has_no_size(effect, theta, std, curve=curve)
         if held_out_p > self.settings.held_out_p_value or beyond:
             rate = 1.0
-        unseen = tuple(unidentified(effect, std, whole.settings.log_prior_std, curve=isinstance(effect.forward, SplineCurve)))
+        unseen = tuple(unidentified(effect, std, whole.settings.log_prior_std, curve=curve))
         return SelectedEffect(effect, theta, std, unseen, float(np.exp(max(log_p, -700.0))), rate, gain)
 
     def _beyond_model_error(self, verdicts: Sequence[SelectedEffect]) -> list[SelectedEffect]:

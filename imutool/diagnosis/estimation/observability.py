@@ -143,8 +143,14 @@ def below_model_error(gains: Mapping[str, float], denoised: bool, settings: Sear
     )
 
 
-def has_no_size(effect: Effect, theta: Theta, std: Theta) -> bool:
-    """Whether a fitted frequency is no larger than its deviation, or no amplitude than its own."""
+def has_no_size(effect: Effect, theta: Theta, std: Theta, *, curve: bool) -> bool:
+    """Whether a fitted frequency is no larger than its deviation, or no amplitude than its own.
+
+    A curve's coefficients move together by a constant, which the bias takes: each is as unsure as its prior, however sure
+    the curve.
+    """
+    if curve:
+        return False
     vague = any(
         parameter.unit == "Hz" and s >= value for parameter, value, s in zip(effect.parameters, theta, std, strict=True)
     )
