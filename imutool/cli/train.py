@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import logging
+import sys
 from collections.abc import Mapping
+from contextlib import redirect_stdout
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -71,8 +73,9 @@ def train(
             progress=lambda epoch: tell(*epoch_line(epoch)),
         )
     if not write_json(training_report(model, trained.card), json_to, overwrite=overwrite or resume):
-        if "left_out" in trained.card:
-            left_out_table(trained.card["left_out"])
+        if "left_out" in trained.card and not quiet:
+            with redirect_stdout(sys.stderr):  # how the model was chosen is no result
+                left_out_table(trained.card["left_out"])
         say(str(model))
 
 

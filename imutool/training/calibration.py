@@ -35,7 +35,6 @@ from imutool.recording import Imu, Recording, seconds
 from imutool.sensor import catalogue, physics_file
 from imutool.sensor.linear_form import LinearForm
 from imutool.sensor.signals import SignalFilter, Signals
-from imutool.training.closed_form import CORRELATED
 from imutool.training.fit import Epoch, note
 from imutool.training.normal_equations import Problem, Seen, linearise
 from imutool.training.segments import Part, Pool
@@ -144,8 +143,7 @@ def effects_beyond_chance(problem: Problem, effects: Sequence[LinearForm]) -> di
         left = [effect.name for effect in effects if effect.name not in gains]
         tried = {name: problem.predicted(parameter_columns(effects, [*gains, name])) for name in left}
         helped = {name: new for name, new in tried.items() if bool((new < loss).sum() > 0.5 * len(loss))}
-        fitted = {name: new for name, new in helped.items() if _beyond_chance(problem, effects, [*gains, name])}
-        agreed = {name: new for name, new in fitted.items() if float((loss - new).sum()) > _chance_gain(effects, name)}
+        agreed = {name: new for name, new in helped.items() if _beyond_chance(problem, effects, [*gains, name])}
         if not agreed:
             return gains
         best = min(agreed, key=lambda name: float(agreed[name].sum()))
@@ -158,21 +156,15 @@ def effects_beyond_chance(problem: Problem, effects: Sequence[LinearForm]) -> di
 def _beyond_chance(problem: Problem, effects: Sequence[LinearForm], names: Sequence[str]) -> bool:
     """Wald's test of the last effect's parameters, corrected for the number of candidates.
 
-    Windows count as independent here, though the covariance takes them as correlated: the test only keeps out effects without
-    evidence; the held-out loss decides which come in.
+    The covariance takes windows as correlated (`CORRELATED`): those of all lengths, half overlapping, hold each sample's noise
+    about that often. The test keeps out effects without evidence; the held-out loss decides which come in.
     """
     columns = parameter_columns(effects, names)
     theta, covariance = problem.solve(columns)
     own = [k for k, column in enumerate(columns) if column in parameter_columns(effects, names[-1:])]
     last = theta[columns][own]
-    wald = CORRELATED * float(last @ torch.linalg.solve(covariance[own][:, own], last))
+    wald = float(last @ torch.linalg.solve(covariance[own][:, own], last))
     return wald > float(chi2.isf(BY_CHANCE / len(effects), len(own)))
-
-
-def _chance_gain(effects: Sequence[LinearForm], name: str) -> float:
-    """Gain on other logs that the parameters of one effect do not have by chance, in units of the loss."""
-    count = next(len(effect.parameters) for effect in effects if effect.name == name)
-    return float(chi2.isf(BY_CHANCE / len(effects), count)) / CORRELATED
 
 
 def _unseen(effects: Sequence[LinearForm], problem: Problem, covariance: Float[Tensor, "p p"]) -> tuple[str, ...]:

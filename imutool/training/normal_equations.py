@@ -185,8 +185,9 @@ def linearise(seen: Seen, effects: Sequence[LinearForm], part: Part) -> Problem:
     theta, own = torch.zeros_like(prior), prior.new_zeros(logs, seen.own_size)
     for step in range(len(sets) + 2):
         fit = judged = Equations.none(prior, logs, len(prior) + seen.own_size)
+        size = prior.new_zeros(logs)
         for windows in sets[: step + 1]:
-            equations = _equations(seen, effects, theta, own, windows)
+            equations, size = _equations(seen, effects, theta, own, windows, size)
             fit = fit + equations
             judged = judged + equations if windows.judged else judged
         problem = Problem(theta, own, prior, own_prior, seen.free, fit, judged)
@@ -223,9 +224,14 @@ def _window_sets(seen: Seen, part: Part) -> list[WindowSet]:
 
 
 def _equations(
-    seen: Seen, effects: Sequence[LinearForm], theta: Float[Tensor, " p"], own: Float[Tensor, "logs o"], windows: WindowSet
-) -> Equations:
-    """Normal equations of the windows of one length."""
+    seen: Seen,
+    effects: Sequence[LinearForm],
+    theta: Float[Tensor, " p"],
+    own: Float[Tensor, "logs o"],
+    windows: WindowSet,
+    shorter: Float[Tensor, " logs"],
+) -> tuple[Equations, Float[Tensor, " logs"]]:
+    """Normal equations of the windows of one length, and their usual residual; `shorter` is that of shorter windows."""
     pool, n = seen.pool, windows.n
     error = _error(seen.signals, effects, theta.cpu().numpy()).to(pool.t)
     pattern = torch.from_numpy(patterns(effects)).to(pool.t)
@@ -242,7 +248,7 @@ def _equations(
         by_theta = torch.einsum("mijq,jqp->mip", S.reshape(len(S), 3, 3, S.shape[2]), pattern)
         residuals.append(e)
         slopes.append(torch.cat([by_theta, A.sum(1), by_nuisance], dim=2))
-    return _summed(torch.cat(residuals), torch.cat(slopes), pool.log[windows.first], len(pool.names))
+    return _summed(torch.cat(residuals), torch.cat(slopes), pool.log[windows.first], shorter)
 
 
 def _residual(
@@ -264,16 +270,22 @@ def _residual(
     return e + (by_nuisance @ own[windows.log, 3:, None])[..., 0], A, by_nuisance
 
 
-def _summed(e: Float[Tensor, "m 3"], J: Float[Tensor, "m 3 k"], log: Int[Tensor, " m"], logs: int) -> Equations:
-    """Normal equations with Huber's weights, in units of the median of the log and the length."""
-    size = e.norm(dim=1)
-    delta = HUBER_MEDIANS * median_per_log(size, log, logs)[log]
+def _summed(
+    e: Float[Tensor, "m 3"], J: Float[Tensor, "m 3 k"], log: Int[Tensor, " m"], shorter: Float[Tensor, " logs"]
+) -> tuple[Equations, Float[Tensor, " logs"]]:
+    """Normal equations with Huber's weights, in units of the median of the log and the length; and these medians.
+
+    Errors add up: a median below that of `shorter` windows comes from windows so few that a log's own unknowns fit their noise.
+    """
+    size, logs = e.norm(dim=1), len(shorter)
+    usual = torch.maximum(median_per_log(size, log, logs), shorter)
+    delta = HUBER_MEDIANS * usual[log]
     weight = huber_weight(size, delta) * 3 / delta**2 / CORRELATED
     parts = [log == i for i in range(logs)]
     H = torch.stack([torch.einsum("m,mij,mik->jk", weight[m], J[m], J[m]) for m in parts])
     g = torch.stack([torch.einsum("m,mij,mi->j", weight[m], J[m], e[m]) for m in parts])
     c = torch.stack([(weight[m] * e[m].square().sum(1)).sum() for m in parts])
-    return Equations(H, g, c)
+    return Equations(H, g, c), usual
 
 
 def _terms(

@@ -25,6 +25,10 @@ FLIGHT = {"rate_hz": RATE_HZ, "duration_s": 60.0, "still_s": 0.0}
 NOISE = {"gyro": 2e-3, "accel": 0.05}  # of a sample
 REST = {"gyro": 0.01, "accel": 0.1}
 SURE = 3.0  # standard deviations
+# A clock or an arm may be each log's own: only that all logs have the same one speaks for an effect. A drift shows in long
+# windows, of which such a flight has few.
+LEAST_GAIN = {"clock_offset": 0.05, "lever_arm": 0.05, "gyro_bias_drift": 0.2}
+OTHERS = (1, 13, 16, 19)  # first of three flights; long windows of some fit their log's own unknowns too well
 # what a flight of a quadrotor's kind shows: sizes that change its drift several times over
 GYRO = ("gyro_scale", "gyro_misalignment", "gyro_g_sensitivity", "gyro_quadratic", "gyro_bias_drift", "clock_offset")
 ACCEL = ("accel_scale", "accel_misalignment", "lever_arm", "clock_offset", "accel_bias_drift")
@@ -79,16 +83,16 @@ def test_a_planted_effect_is_found_and_named_and_no_other(flights: list[Recordin
     calibration = found(flights, sensor, effects)
     assert calibration.effects == (name,)
     assert list(calibration.gains) == [name]
-    # a clock or an arm may be each log's own: only that all logs have the same one speaks for an effect
-    assert calibration.gains[name] > (0.05 if name in ("clock_offset", "lever_arm") else 0.3)
+    assert calibration.gains[name] > LEAST_GAIN.get(name, 0.3)
     z = z_scores(calibration, planted_theta(effects))
     assert np.abs(z).max() < SURE, z
     assert calibration.unseen == ()
 
 
 @pytest.mark.parametrize("sensor", ["gyro", "accel"])
-def test_where_nothing_is_planted_nothing_is_found(flights: list[Recording], sensor: Sensor) -> None:
-    calibration = found(flights, sensor, ())
+@pytest.mark.parametrize("first", OTHERS)
+def test_where_nothing_is_planted_nothing_is_found(perfect: MakeRecording, sensor: Sensor, first: int) -> None:
+    calibration = found([perfect(first + k, **FLIGHT) for k in range(3)], sensor, ())
     assert calibration.effects == ()
     assert calibration.gains == {}
     assert calibration.theta.shape == (0,)
