@@ -197,7 +197,7 @@ class Recordings:
         if not agreeing:
             chosen = self._new(found.block.offset)
         elif own and not rest:
-            chosen = (listed or agreeing)[0]
+            chosen = (listed or [r for r in agreeing if r.lists is None] or agreeing)[0]  # a summary lists all of its log
         else:
             chosen = self._among(found, rest, [r for r in listed if rest <= r.readable()] or agreeing)
         for record in own:

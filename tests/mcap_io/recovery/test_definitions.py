@@ -59,3 +59,13 @@ def test_chunks_of_which_messages_are_left_out_stand_in_order_of_the_others(fore
     repair(log, tmp_path / "out.mcap")
     with Log(tmp_path / "out.mcap") as after:
         assert [block.start_ns for block in after.index.blocks] == [2, 200, 300]
+
+
+def test_chunks_that_no_summary_lists_keep_the_definitions_of_their_own_log(foreign: Foreign, tmp_path: Path) -> None:
+    first = foreign([text("/same", 100 + i) for i in range(5)], chunk_size=CHUNK_SIZE, name="first")
+    second = foreign([text("/same", 1000 + i) for i in range(4)], "no-summary", chunk_size=CHUNK_SIZE, name="second")
+    a, b, raw, other = stretches(first), stretches(second), first.read_bytes(), second.read_bytes()
+    inside = other[b[0][0] : b[0][1]] + b"\0" * 5 + other[b[1][0] : b[3][1]]
+    first.write_bytes(raw[: a[4][1]] + inside + raw[a[4][1] :])
+    repair(first, tmp_path / "out.mcap")
+    assert by_mcap(tmp_path / "out.mcap") == [m for _, _, each in a + b for m in each]
