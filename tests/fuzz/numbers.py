@@ -106,7 +106,8 @@ def _spike(rng: random.Random, t_ns: np.ndarray, gyro: np.ndarray, accel: np.nda
 
 def _scaled(rng: random.Random, t_ns: np.ndarray, gyro: np.ndarray, accel: np.ndarray) -> Arrays:
     factor = rng.choice((1e-300, 1e-9, 1e6, 1e30, 1e200, -1.0))
-    return t_ns, gyro * factor, accel * rng.choice((1.0, factor))
+    with np.errstate(over="ignore", invalid="ignore"):
+        return t_ns, gyro * factor, accel * rng.choice((1.0, factor))
 
 
 def _jump(rng: random.Random, t_ns: np.ndarray, gyro: np.ndarray, accel: np.ndarray) -> Arrays:

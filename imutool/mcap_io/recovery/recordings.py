@@ -9,11 +9,12 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from itertools import groupby
 from typing import Any
 
 import numpy as np
 from mcap.opcode import Opcode
-from mcap.records import Channel
+from mcap.records import Channel, Schema
 
 from imutool.mcap_io.blocks import MessageBlock
 from imutool.mcap_io.codec import messages
@@ -61,6 +62,7 @@ class Recordings:
     def assign(self, events: Sequence[Event]) -> None:
         """Finds the recording of every block, in file order."""
         self._complete([event for event in events if isinstance(event, ScannedBlock)])
+        runs = _runs(events)
         for event in events:
             if isinstance(event, LogStart):
                 self._begin(event.offset)
@@ -72,9 +74,11 @@ class Recordings:
                 event.recording = self.each.index(self._now)
                 self._current, self._certain = self._named, False
             elif isinstance(event, Definition):
-                self._take_definition(event)
+                self._take_definitions(runs.get(id(event), []))
             else:
                 self._assign(event)
+        for recording in self.each:
+            self._give_up_misfits(recording, [found for found in self._early if self.of(found.block) is recording])
         for found in self._early:
             self._verify(found, self.of(found.block))
         self._name_logs([event.block for event in events if isinstance(event, ScannedBlock)])
@@ -145,6 +149,13 @@ class Recordings:
         found.block.recording = len(self.each) - 1
         self.unproven.pop(found.block.offset, None)
 
+    def _give_up_misfits(self, recording: Recording, blocks: Sequence[ScannedBlock]) -> None:
+        """Takes definitions back that came behind messages of a log that nothing defines, where they fit some of them not."""
+        readable = recording.readable() if recording.anonymous else set[int]()
+        if any(not self._fits(found.block, i, recording) for found in blocks for i in readable & found.sizes.keys()):
+            recording.schemas.clear()
+            recording.channels.clear()
+
     @property
     def _now(self) -> Recording:
         return self._current or self.each[-1]
@@ -155,17 +166,27 @@ class Recordings:
         self._certain = True
         self.each.append(self._current)
 
-    def _take_definition(self, found: Definition) -> None:
-        """Takes in a definition outside chunks, unless it contradicts an earlier one."""
-        for record in parsed([(found.opcode, found.body)], found.offset, self.losses):
+    def _take_definitions(self, run: Sequence[Definition]) -> None:
+        """Takes in definitions outside chunks that follow one another, unless they contradict earlier ones.
+
+        Behind a log's end they are of another, as they are where most contradict proven ones: none of them then counts here.
+        """
+        found = [(d.offset, record) for d in run for record in parsed([(d.opcode, d.body)], d.offset, self.losses)]
+        if found and self._now.ended:
+            self._current = self._named = self._new(found[0][0])
+        agree = [
+            self._now.agrees([r]) for _, r in found if isinstance(r, Channel) and (Opcode.CHANNEL, r.id) in self._now.proven
+        ]
+        other = self._new(found[0][0]) if agree and 2 * sum(agree) <= len(agree) else None
+        for offset, record in found:
             if not self._now.agrees([record]):
-                what = f"{type(record).__name__.lower()} {record.id} has two definitions, the second at byte {found.offset}"
-                key = int(found.opcode), record.id
+                what = f"{type(record).__name__.lower()} {record.id} has two definitions, the second at byte {offset}"
+                key = int(Opcode.SCHEMA if isinstance(record, Schema) else Opcode.CHANNEL), record.id
                 self.losses.add_harmless(
                     f"{what}; {'the one that a CRC covers' if key in self._now.proven else 'the first'} holds"
                 )
-            else:
-                self._now.define(record, proven=False)
+            if other is not None or self._now.agrees([record]):
+                (other or self._now).define(record, proven=False)
 
     def _choose(self, found: ScannedBlock) -> Recording:
         """The recording of a block, which may be a new one."""
@@ -176,7 +197,7 @@ class Recordings:
         if not agreeing:
             chosen = self._new(found.block.offset)
         elif own and not rest:
-            chosen = (listed or agreeing)[0]
+            chosen = (listed or [r for r in agreeing if r.lists is None] or agreeing)[0]  # a summary lists all of its log
         else:
             chosen = self._among(found, rest, [r for r in listed if rest <= r.readable()] or agreeing)
         for record in own:
@@ -254,6 +275,12 @@ class Recordings:
 def _topics(channel: int, pool: Iterable[Recording]) -> set[str]:
     """The topics that a channel id has in some recordings."""
     return {recording.channels[channel].topic for recording in pool if recording.meaning(channel) is not None}
+
+
+def _runs(events: Sequence[Event]) -> dict[int, list[Definition]]:
+    """Definitions outside chunks that follow one another, by the identity of the first."""
+    runs = [[e for e in run if isinstance(e, Definition)] for kind, run in groupby(events, type) if kind is Definition]
+    return {id(run[0]): run for run in runs}
 
 
 def _pairs(key: ChunkKey) -> tuple[object, ...]:

@@ -7,6 +7,7 @@ the index then only helps to put damaged chunk heads right, and tells which chun
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Mapping
 from itertools import pairwise
 from pathlib import Path
 
@@ -21,14 +22,7 @@ from imutool.mcap_io.codec import messages, records
 from imutool.mcap_io.codec.records import CHUNK_HEAD, HEAD, MAGIC
 from imutool.mcap_io.index import LogIndex
 from imutool.mcap_io.recovery.chunk_repair import find_definitions
-from imutool.mcap_io.recovery.definitions import (
-    map_channels,
-    parsed,
-    remap,
-    renumber,
-    renumber_counts,
-    unproven_topics,
-)
+from imutool.mcap_io.recovery.definitions import map_channels, parsed, remap, renumber, renumber_counts, unproven_topics
 from imutool.mcap_io.recovery.gaps import counts_by_size, really_lost
 from imutool.mcap_io.recovery.losses import LATEST_NS, Loss, Losses, reason
 from imutool.mcap_io.recovery.recordings import Recordings
@@ -196,8 +190,9 @@ class RecoveredIndex(LogIndex):
         for gap in really_lost(scan, self.blocks, summaries, self.losses):
             self._add_gap(gap)
         unchecked = {e.block.offset for e in scan.events if isinstance(e, ScannedBlock) and not e.crc}
+        spans = {id(e.block): e.times for e in scan.events if isinstance(e, ScannedBlock)}
         for block in self.blocks:
-            self._edit(block)
+            self._edit(block, spans[id(block)])
             if block.offset in unchecked and block.counts:
                 self.losses.unchecked_in[block.offset] = sum(block.counts.values())
         self._set_header(scan)
@@ -247,7 +242,7 @@ class RecoveredIndex(LogIndex):
             found[known.topic if known else f"(channel {-1 - channel if channel < 0 else channel}, not defined)"] += count
         return dict(found)
 
-    def _edit(self, block: MessageBlock) -> None:
+    def _edit(self, block: MessageBlock, spans: Mapping[int, tuple[int, int]]) -> None:
         """Counts by the channel ids of the whole file; lists messages without a topic as lost."""
         local, recording = block.counts or {}, self.recordings.of(block)
         unproven = self.recordings.unproven.get(block.offset, {})
@@ -260,6 +255,9 @@ class RecoveredIndex(LogIndex):
             why = "messages in the chunk here have channels that no record defines"
             self.losses.add(Loss(block.offset, block.length, why, self._by_topic(undefined), True))
         block.counts = renumber_counts(recording, {i: n for i, n in local.items() if i not in unproven})
+        kept = [span for i, span in spans.items() if i in recording.ids and i not in unproven]
+        if kept:  # by these the chunks are put in order
+            block.start_ns, block.end_ns = min(first for first, _ in kept), max(last for _, last in kept)
 
     def _readable(self, block: MessageBlock, found: messages.Messages) -> messages.Messages:
         """The messages of defined channels at possible times, by the channel ids of the whole file."""

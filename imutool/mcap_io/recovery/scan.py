@@ -20,16 +20,11 @@ from imutool.mcap_io.codec.records import HEAD, MAGIC
 from imutool.mcap_io.recovery.chunk_repair import UnreadableError, prove
 from imutool.mcap_io.recovery.losses import LATEST_NS, Losses, reason
 from imutool.mcap_io.recovery.resync import LOG_START, MAX_CANDIDATES, RecordFrames
-from imutool.mcap_io.recovery.scan_events import (
-    Definition,
-    Gap,
-    LogEnd,
-    LogStart,
-    ScanResult,
-)
+from imutool.mcap_io.recovery.scan_events import Definition, Gap, LogEnd, LogStart, ScanResult
 from imutool.mcap_io.recovery.summary import DEFINITIONS, PRIVATE, SUMMARY, moved_summary
 from imutool.mcap_io.storage.source import Source
 
+MAX_STARTS = 8  # bytes at which a moved summary may begin, the last ones before its footer
 MAX_ITEMS = 5_000_000  # a 100 GB log has some 100 000 chunks; a file of nothing but empty ones would fill the memory
 
 
@@ -50,6 +45,8 @@ class Scan(ScanResult):
         self._closed = False  # past a footer
         self._ended = False  # past the data section of a log
         self._open_gap: Gap | None = None  # messages behind it may lie inside a damaged chunk
+        self._summary_starts: list[int] = []  # where one may begin
+        self._defined_until = -1  # where the last definition outside chunks ended
         self._unproven = -1  # where the last record began, if no CRC proves it
 
     def run(self) -> None:
@@ -202,17 +199,24 @@ class Scan(ScanResult):
         elif opcode in DEFINITIONS:
             body = self.source.at(position + HEAD.size, length)
             self.events.append(Definition(position, opcode, body))
+            if position != self._defined_until:  # another log's summary may follow a part of this one's
+                self._summary_starts.append(position)
+            self._defined_until = end
             self.used_channels |= {int.from_bytes(body[:2], "little")} if opcode == Opcode.CHANNEL else set()
             if not self._ended:
                 self.items.append(RecordSpan(opcode, position, end - position))
         elif opcode == Opcode.FOOTER:
-            if self._ended and not self.has_summary and (found := moved_summary(self.source, self.data_ends[-1], position)):
+            start, found = moved_summary(self.source, self._summary_starts[-MAX_STARTS:], position)
+            if found is not None and not self.has_summary:
                 self.summaries.append(found)
+                while found.chunks and isinstance(self.events[-1], Definition) and self.events[-1].offset >= start:
+                    self.events.pop()  # it says itself whose definitions these are
             self._closed = self.frames.is_magic(end)
             self.events.append(LogEnd(end))
         elif opcode == Opcode.DATA_END:
             self.data_ends.append(position)
             self._ended, self.last, self._open_gap = True, None, None
+            self._summary_starts.append(end)
         elif opcode in (Opcode.ATTACHMENT, Opcode.METADATA):
             self.items.append(RecordSpan(opcode, position, end - position))
         return end

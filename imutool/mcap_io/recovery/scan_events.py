@@ -27,6 +27,7 @@ class ScannedBlock:
     crc: int  # 0: nothing proves it
     definitions: list[tuple[int, bytes]]
     sizes: dict[int, tuple[int, int]]  # of the shortest and the longest message of a channel
+    times: dict[int, tuple[int, int]]  # the first and the last log time of a channel
     evidence: int = 0  # for the recording it is assigned to, the more the better
 
 
@@ -108,11 +109,14 @@ class ScanResult:
         defined = [(opcode, found.data[first : first + length].tobytes()) for opcode, first, length in found.definitions]
         self.items.append(block)
         size, crc = (head.size, head.crc) if head else (block.length, 0)
-        sizes = {}
+        sizes, spans = {}, {}
         for channel in block.counts:
-            lengths = found.heads["length"][found.heads["channel"] == channel]
-            sizes[channel] = int(lengths.min()), int(lengths.max())
-        self.events.append(ScannedBlock(block, (block.start_ns, block.end_ns, size), crc, defined, sizes))
+            own = found.heads[found.heads["channel"] == channel]
+            sizes[channel] = int(own["length"].min()), int(own["length"].max())
+            possible = own["log_time"][own["log_time"] < LATEST_NS]
+            if len(possible):
+                spans[channel] = int(possible.min()), int(possible.max())
+        self.events.append(ScannedBlock(block, (block.start_ns, block.end_ns, size), crc, defined, sizes, spans))
         self.used_channels.update(block.counts)
 
     def add_message_index(self, position: int, body: bytes) -> None:

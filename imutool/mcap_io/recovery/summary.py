@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from contextlib import suppress
 from typing import NamedTuple
 
@@ -68,14 +69,15 @@ def proven_summary(source: Source, losses: Losses) -> tuple[Footer, Summary | No
         return footer, None
 
 
-def moved_summary(source: Source, data_end: int, position: int) -> Summary | None:
-    """Summary between DataEnd and Footer that its CRC proves, although it was moved."""
+def moved_summary(source: Source, starts: Sequence[int], position: int) -> tuple[int, Summary | None]:
+    """Summary that begins at one of some bytes and that the CRC in the Footer proves, although it was moved; and that byte."""
     footer = records.parse(Footer, source.at(position + HEAD.size, FOOTER_SIZE - HEAD.size), position)
-    start, stop = data_end + HEAD.size + 4, position + FOOTER_SIZE - 4
-    if not footer.summary_crc or not footer.summary_start or stop - start > MAX_SUMMARY:
-        return None
-    raw = source.at(start, stop - start)
-    return parse_summary(raw[: position - start], start - footer.summary_start) if crc32(raw) == footer.summary_crc else None
+    stop = position + FOOTER_SIZE - 4
+    for start in starts if footer.summary_crc and footer.summary_start else ():
+        raw = source.at(start, stop - start) if stop - start <= MAX_SUMMARY else b""
+        if raw and crc32(raw) == footer.summary_crc:
+            return start, parse_summary(raw[: position - start], start - footer.summary_start)
+    return position, None
 
 
 def parse_summary(raw: bytes, base: int) -> Summary | None:

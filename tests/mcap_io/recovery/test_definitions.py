@@ -1,0 +1,71 @@
+"""Which log a definition is of, where a damaged file holds parts of several; and the order of chunks that lost messages."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from support.log_damage import by_mcap, stretches
+
+from imutool.mcap_io.log import Log
+from imutool.mcap_io.repair import repair
+
+Message = tuple[str, str, int, int, int, bytes]
+Foreign = Callable[..., Path]
+LONG, SHORT = 5000, 10  # bytes of a message that fills a chunk, and of one that does not
+CHUNK_SIZE = 3000
+
+
+def text(topic: str, t_ns: int, size: int = LONG) -> Message:
+    return topic, "std_msgs/msg/String", t_ns, t_ns, 0, b"\xff" * size
+
+
+def summary_of(path: Path) -> bytes:
+    raw = path.read_bytes()
+    return raw[struct.unpack_from("<Q", raw, len(raw) - 28)[0] :]
+
+
+def test_a_summary_that_follows_a_part_of_itself_says_whose_the_chunks_are(foreign: Foreign, tmp_path: Path) -> None:
+    first = foreign([text("/mine", 100 + i) for i in range(5)], chunk_size=CHUNK_SIZE, name="first")
+    second = foreign([text("/other", 1000 + i) for i in range(9)], chunk_size=CHUNK_SIZE, name="second")
+    a, b, raw, summary = stretches(first), stretches(second), second.read_bytes(), summary_of(second)
+    part = summary[: 9 + struct.unpack_from("<Q", summary, 1)[0]]  # its first record, a schema
+    data = raw[b[3][0] : -len(summary)]  # chunks without definitions
+    first.write_bytes(first.read_bytes()[: a[3][1]] + data + part + b"\0" * 5 + summary)
+    repair(first, tmp_path / "out.mcap")
+    assert by_mcap(tmp_path / "out.mcap") == [m for _, _, each in a[:4] + b[3:] for m in each]
+
+
+@pytest.mark.parametrize("ended", [True, False])
+def test_a_log_takes_no_definition_from_another_ones_summary(foreign: Foreign, tmp_path: Path, ended: bool) -> None:
+    mine = [text(("/gone", "/kept")[i % 2], 100 + i) for i in range(8)]
+    first = foreign(mine, "no-summary", chunk_size=CHUNK_SIZE, name="first")
+    second = foreign([text("/x", 1), text("/y", 2), text("/z", 3)], chunk_size=CHUNK_SIZE, name="second")
+    whole, raw, summary = stretches(first), first.read_bytes(), summary_of(second)
+    stop = len(raw) if ended else whole[-1][1]
+    first.write_bytes(raw[: whole[0][0]] + raw[whole[0][1] : stop] + b"\0" * 5 + summary[:-30])  # /gone is not defined
+    report = repair(first, tmp_path / "out.mcap")
+    assert report.messages == {"/kept": 4}
+    assert report.losses.topics == {"(channel 1, not defined)": 3}
+
+
+def test_chunks_of_which_messages_are_left_out_stand_in_order_of_the_others(foreign: Foreign, tmp_path: Path) -> None:
+    first_of_two = [text("/gone", 100, SHORT), text("/kept", 300)]  # in one chunk
+    log = foreign([text("/gone", 1), text("/kept", 2), *first_of_two, text("/kept", 200)], "no-summary", chunk_size=CHUNK_SIZE)
+    whole, raw = stretches(log), log.read_bytes()
+    log.write_bytes(raw[: whole[0][0]] + raw[whole[0][1] :])
+    repair(log, tmp_path / "out.mcap")
+    with Log(tmp_path / "out.mcap") as after:
+        assert [block.start_ns for block in after.index.blocks] == [2, 200, 300]
+
+
+def test_chunks_that_no_summary_lists_keep_the_definitions_of_their_own_log(foreign: Foreign, tmp_path: Path) -> None:
+    first = foreign([text("/same", 100 + i) for i in range(5)], chunk_size=CHUNK_SIZE, name="first")
+    second = foreign([text("/same", 1000 + i) for i in range(4)], "no-summary", chunk_size=CHUNK_SIZE, name="second")
+    a, b, raw, other = stretches(first), stretches(second), first.read_bytes(), second.read_bytes()
+    inside = other[b[0][0] : b[0][1]] + b"\0" * 5 + other[b[1][0] : b[3][1]]
+    first.write_bytes(raw[: a[4][1]] + inside + raw[a[4][1] :])
+    repair(first, tmp_path / "out.mcap")
+    assert by_mcap(tmp_path / "out.mcap") == [m for _, _, each in a + b for m in each]
