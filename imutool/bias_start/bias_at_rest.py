@@ -57,7 +57,9 @@ def auto(model: BiasModel, imu: Imu) -> InitialBias:
     wide = widened(before.std, difference, _at_rest_variance(model, u))
     if (wide > before.std).any():
         before = replace(before, std=wide)
-        rest_blocks = _first_stop(model, stop, before)
+        # a stop of a single block ends before the filter closes it: take as many blocks of the log itself
+        again = itertools.islice(filter_blocks(model, [relative_samples(imu)], before, ahead=True), len(rest_blocks))
+        rest_blocks = _first_stop(model, stop, before) or list(again)
     state = rest_blocks[-1].step.after
     std = np.sqrt(np.diag(state.covariance(False)))  # in motion, where the bias is used
     noise = white_noise(u)

@@ -387,6 +387,14 @@ def test_a_long_rest_outweighs_the_prior_of_another_switching_on(start: str) -> 
     np.testing.assert_allclose(found.rest[:3], GYRO_BIAS, atol=3e-4)
 
 
+@pytest.mark.parametrize("rest_s", np.arange(1.0, 3.0, 0.125).tolist())
+def test_a_short_rest_against_the_prior_gives_a_start_whatever_its_length(rest_s: float) -> None:
+    imu, _ = resting([(0.0, rest_s)], duration_s=4.0)
+    start = auto(trained(mean=0.03, prior_std=5e-4), imu)
+    assert np.isfinite(start.rest).all()
+    assert (start.std > 0).all()
+
+
 def test_a_log_of_a_session_that_training_saw_starts_from_its_prior() -> None:
     made = model(mean=0.3, prior_std=0.2)
     hour = 3600 * 10**9
