@@ -48,10 +48,7 @@ RIDGE = 1e-9  # of a diagonal, so that a log without information on its own unkn
 
 @dataclass(frozen=True)
 class Equations:
-    """Loss of each log to second order about a point.
-
-    c + 2 g.d + d.H.d, unknowns theta then the log's own.
-    """
+    """Loss of each log about a point, c + 2 g.d + d.H.d: unknowns theta, then the log's own."""
 
     H: Float[Tensor, "logs k k"]
     g: Float[Tensor, "logs k"]
@@ -273,10 +270,8 @@ def _residual(
 def _summed(
     e: Float[Tensor, "m 3"], J: Float[Tensor, "m 3 k"], log: Int[Tensor, " m"], shorter: Float[Tensor, " logs"]
 ) -> tuple[Equations, Float[Tensor, " logs"]]:
-    """Normal equations with Huber's weights, in units of the median of the log and the length; and these medians.
-
-    Errors add up: a median below that of `shorter` windows comes from windows so few that a log's own unknowns fit their noise.
-    """
+    """Normal equations with Huber's weights, in units of each log's median residual; and these medians."""
+    # errors add up: a median below that of shorter windows comes from so few that a log's own unknowns fit their noise
     size, logs = e.norm(dim=1), len(shorter)
     usual = torch.maximum(median_per_log(size, log, logs), shorter)
     delta = HUBER_MEDIANS * usual[log]

@@ -70,7 +70,7 @@ def proven_summary(source: Source, losses: Losses) -> tuple[Footer, Summary | No
 
 
 def moved_summary(source: Source, starts: Sequence[int], position: int) -> tuple[int, Summary | None]:
-    """Summary that begins at one of some bytes and that the CRC in the Footer proves, although it was moved; and that byte."""
+    """Moved summary that the CRC in the Footer proves, from one of some starts, and that start."""
     footer = records.parse(Footer, source.at(position + HEAD.size, FOOTER_SIZE - HEAD.size), position)
     stop = position + FOOTER_SIZE - 4
     for start in starts if footer.summary_crc and footer.summary_start else ():
