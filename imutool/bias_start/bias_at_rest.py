@@ -123,7 +123,7 @@ def over_all_rest(model: BiasModel, blocks: Blocks) -> InitialBias:
 
 def rest_differences(
     model: BiasModel, logs: Sequence[Samples], rest: Float64[np.ndarray, "logs 6"]
-) -> list[Float64[np.ndarray, "stops 6"]]:
+) -> list[Float64[np.ndarray, "_ 6"]]:
     """Bias at each stop of each log minus the log's bias in motion, `rest`.
 
     Rest shows the accelerometer's bias along gravity only, so its three columns are the same.

@@ -114,7 +114,7 @@ def _sessions(rest: Float64[np.ndarray, "logs 6"], spans_ns: Sequence[tuple[int,
     return groups
 
 
-def shift_at_rest(differences: Sequence[Float64[np.ndarray, "stops 6"]], std: Float64[np.ndarray, "logs 6"]) -> Vector6:
+def shift_at_rest(differences: Sequence[Float64[np.ndarray, "_ 6"]], std: Float64[np.ndarray, "logs 6"]) -> Vector6:
     """RMS of the bias at rest minus that in motion, where the logs together show a shift.
 
     `std` is that of each log's bias in motion. Stops whose differences are no larger than that and `AT_REST_STD` show none.
