@@ -450,3 +450,41 @@ def test_constraints_hold_all_we_depend_on() -> None:
     wanted = [*project["dependencies"], *(line for name in extras for line in extras[name])]
     names = {re.split(r"[<>=!~\[;]", line)[0].strip() for line in wanted}
     assert names - {"imutool"} <= dict(pins()).keys()
+
+
+def test_a_list_of_arrays_names_no_length() -> None:
+    """Arrays of several logs differ in length: a named one holds by chance, for the element that a check happens to draw."""
+    package = modules(ROOT / "imutool", "imutool")
+    aliases = {
+        f"{module}.{target.id}": node.value
+        for module, tree in package.items()
+        for node in tree.body
+        if isinstance(node, ast.Assign)
+        for target in node.targets
+        if isinstance(target, ast.Name)
+    }
+
+    def shapes(annotation: ast.expr, names: dict[str, str]) -> Iterator[str]:
+        for node in ast.walk(annotation):
+            if isinstance(node, ast.Name) and names.get(node.id) in aliases:
+                yield from shapes(aliases[names.pop(node.id)], names)
+            elif isinstance(node, ast.Constant) and isinstance(node.value, str):
+                yield node.value
+
+    named = []
+    for module, tree in package.items():
+        names = {name.rpartition(".")[2]: name for name in aliases if name.rpartition(".")[0] == module}
+        for node in ast.walk(tree):
+            if isinstance(node, ast.ImportFrom):
+                names |= {name.asname or name.name: f"{node.module}.{name.name}" for name in node.names}
+        for function in (node for node in ast.walk(tree) if isinstance(node, ast.FunctionDef)):
+            for argument in function.args.args + function.args.kwonlyargs:
+                for node in ast.walk(argument.annotation or ast.Constant(None)):
+                    if (
+                        isinstance(node, ast.Subscript)
+                        and isinstance(node.value, ast.Name)
+                        and node.value.id in {"Sequence", "list"}
+                    ):
+                        lengths = [shape.split()[0] for shape in shapes(node.slice, dict(names)) if " " in shape]
+                        named += [f"{module}.{function.name}: {argument.arg} has {name}" for name in lengths if name == "n"]
+    assert named == []

@@ -27,7 +27,7 @@ CHUNK_S, LOOK_AHEAD_S = 600.0, 600.0  # of smoothing: a bias ten minutes later s
 
 CONTRADICTED = (10.8, 13.8, 16.3)  # chi-square of one, two, three differences that a true prior exceeds once in a thousand logs
 
-Samples = tuple[Float64[np.ndarray, " n"], Float64[np.ndarray, "n 3"], Float64[np.ndarray, "n 3"]]
+Samples = tuple[Float64[np.ndarray, " _"], Float64[np.ndarray, "_ 3"], Float64[np.ndarray, "_ 3"]]  # logs differ in length
 
 
 @dataclass(frozen=True)

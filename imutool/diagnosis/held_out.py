@@ -94,7 +94,7 @@ def held_out_rms(
 
 def unexplained_residuals(
     logs: Sequence[WhitenedLog],
-    after: Sequence[Float64[np.ndarray, "n k"]],
+    after: Sequence[Float64[np.ndarray, "_ k"]],
     noises: Float64[np.ndarray, " k"],
     settings: HeldOutSettings,
 ) -> dict[str, Unexplained]:
@@ -117,7 +117,7 @@ def unexplained_residuals(
 
 def _p_value(
     logs: Sequence[WhitenedLog],
-    after: Sequence[Float64[np.ndarray, "n k"]],
+    after: Sequence[Float64[np.ndarray, "_ k"]],
     part: slice,
     noise: float,
     settings: HeldOutSettings,

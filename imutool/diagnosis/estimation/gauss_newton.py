@@ -280,7 +280,7 @@ def _onsets(problem: _Problem, now: _State) -> Iterator[Chosen]:
 def _normal(
     problem: _Problem,
     jacobians: Jacobians,
-    residuals: Sequence[Float64[np.ndarray, "n k"]] | None,
+    residuals: Sequence[Float64[np.ndarray, "_ k"]] | None,
     bias: Float64[np.ndarray, "logs k"],
 ) -> tuple[Float64[np.ndarray, "q q"], Float64[np.ndarray, " q"]]:
     """Normal equations of free parameters and biases; no right-hand side without residuals."""

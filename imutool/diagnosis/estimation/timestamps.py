@@ -221,7 +221,7 @@ def stuck(real: Float64[np.ndarray, "n 6"]) -> Bool[np.ndarray, "6"]:
     return np.asarray(np.ptp(real, axis=0) == 0.0)
 
 
-def saturated(pairs: Sequence[Pair], expected: Sequence[Float64[np.ndarray, "n 6"]], tried: int) -> list[Finding]:
+def saturated(pairs: Sequence[Pair], expected: Sequence[Float64[np.ndarray, "_ 6"]], tried: int) -> list[Finding]:
     """Finding of saturation: the expectation exceeds clipped samples (sign test)."""
     settings, parameters = pairs[0].settings.timestamps, dict[str, Estimate]()
     powers, signal_of, p = [0.0, 0.0, 0.0], "", 1.0

@@ -30,7 +30,7 @@ LINEAR_RATIO = 8.0  # of the largest errors of two runs; above it a scale is log
 MAX_RESETS = 60  # that stay distinguishable in a picture
 HEIGHTS_INCH = {1: 2.6, 3: 5.6, 4: 5.6}  # by number of rows: panels side by side have one height
 
-Line = Float64[np.ndarray, " n"]
+Line = Float64[np.ndarray, " _"]
 
 
 def error_curves(data: RunData) -> Picture | None:
