@@ -29,15 +29,15 @@ from imutool.cleaning import Cleaner, CleaningSettings, Survey, look
 from imutool.config import plain
 from imutool.errors import LogError, ModelError
 from imutool.location import Location
-from imutool.mcap_io.added_topics import DerivedBatch, NewTopic
 from imutool.mcap_io.codec import schemas
 from imutool.mcap_io.codec.encode import encode_imu, encode_twist, encode_vector3
 from imutool.mcap_io.log import Log
+from imutool.mcap_io.passthrough.added_topics import DerivedBatch, NewTopic
+from imutool.mcap_io.passthrough.source_digest import SourceDigest
 from imutool.mcap_io.recovery.losses import Losses
 from imutool.mcap_io.recovery.recovered_log import RecoveredLog
 from imutool.mcap_io.repair import repaired
 from imutool.mcap_io.rewrite import RewriteReport, Values, rewrite
-from imutool.mcap_io.storage.source import Digest
 from imutool.mcap_io.topics import ImuBatch
 from imutool.mcap_io.verify import Verified, check_mode
 from imutool.recording import seconds
@@ -78,7 +78,7 @@ BlockCallback = Callable[[DebiasedBlock], None]
 
 
 class Debiaser:
-    """Debiased topics of one IMU, computed by batches during the copy (`mcap_io.added_topics`).
+    """Debiased topics of one IMU, computed by batches during the copy (`mcap_io.passthrough.added_topics`).
 
     With a survey the samples are cleaned first. `watch` is called with every batch.
     """
@@ -232,7 +232,8 @@ def _debias(
     surveys = {} if options.clean is None else {topic: look(log, topic, options.clean).trusted() for topic in topics}
     default = given.get("") or (None if all(topic in given for topic in topics) else _model_of_log(about))
     derived, starts, models, records = [], {}, {}, {}
-    with Digest(source) as digest:
+    log.keep(topics)
+    with SourceDigest(log.index, source) as digest:
         for topic in topics:
             name, survey = given.get(topic, default), surveys.get(topic)
             chosen, start = choose_model_and_start(log, topic, name, options.init, options.smooth, survey)
@@ -243,7 +244,7 @@ def _debias(
         sieves = {debiaser.source_topic: debiaser.sieve for debiaser in derived}
 
         def metadata(verified: Verified) -> Values:
-            origin = {"source_file": source.name, "source_sha256": digest.result(), "source_size": str(source.stat().st_size)}
+            origin = {"source_file": source.name, "source_size": str(source.stat().st_size), **digest.result()}
             checked = {"verified": json.dumps(verified._asdict())}
             entries = {
                 _record_name("imutool", topic, records): v | origin | checked | sieves[topic].record()
@@ -257,7 +258,6 @@ def _debias(
     for topic, sieve in sieves.items():
         for text in sieve.warnings():
             logger.warning("%s %s: %s", source, topic, text)
-    losses.unchecked_in = losses.unchecked_in or {0: report.unchecked}
     losses.unchecked_in = losses.unchecked_in or {0: report.unchecked}
     return DebiasReport(models, starts, report, losses, surveys, sieves)
 

@@ -21,6 +21,7 @@ from imutool.mcap_io.codec import messages, records, schemas
 from imutool.mcap_io.codec.decode import decode_image
 from imutool.mcap_io.codec.records import HEAD, keep_buffers
 from imutool.mcap_io.index import LogIndex
+from imutool.mcap_io.passthrough.chunk_check import KeptChunks
 from imutool.mcap_io.storage.source import Source
 from imutool.mcap_io.topics import (
     ENCODINGS,
@@ -58,6 +59,7 @@ class Log:
         place = to_location(path) if isinstance(path, str) else path
         self._source = place if isinstance(place, Source) else Source(place)
         self._owns_source, self.path = True, self._source.path
+        self.kept: KeptChunks | None = None
         try:
             with self.named():
                 self.index = self._read_index(self._source)
@@ -260,6 +262,11 @@ class Log:
         """The channels of a topic."""
         return {i for i, channel in self.index.channels.items() if channel.topic == topic}
 
+    def keep(self, topics: Collection[str]) -> None:
+        """Keeps the chunks that are read for some topics from now on, so that a copy of the log need not read them again."""
+        channels = frozenset[int]().union(*(self.channel_ids(topic) for topic in topics))
+        self.kept = KeptChunks(self._source, channels, self.max_chunk)
+
     def rows(
         self, topics: Collection[str], start_ns: int | None = None, end_ns: int | None = None
     ) -> Iterator[tuple[str, messages.Rows]]:
@@ -276,6 +283,9 @@ class Log:
     def _rows_of(
         self, block: MessageBlock, wanted: Mapping[str, set[int]], first: int, last: int
     ) -> Iterator[tuple[str, messages.Rows]]:
+        if self.kept is not None and (kept := self.kept.rows(block, wanted, first, last)) is not None:
+            yield from kept
+            return
         found = self.index.unpack_or_lose(block)
         if found is None:
             return

@@ -1,10 +1,10 @@
 """Copy a log byte for byte and add topics to it, in one pass with one chunk in memory.
 
 A chunk without IMU messages is copied from file to file (`target.Target.copy`), and its message indexes say what to enter in
-the summary. A chunk that holds messages of a source IMU, or that its indexes do not describe, is unpacked and checked; the
-bytes that were checked are those that are written. Only the summary is new, and message indexes where the source has none
-or wrong ones. Messages outside chunks keep their bytes and are wrapped into chunks, because a reader that goes by chunk
-indexes would otherwise not find them beside the new ones.
+the summary. A chunk that holds messages of a source IMU, or that its indexes do not describe, is unpacked and checked, once:
+those that were checked before the copy began (`Log.keep`) are only copied. Only the summary is new, and message indexes where
+the source has none or wrong ones. Messages outside chunks keep their bytes and are wrapped into chunks, because a reader that
+goes by chunk indexes would otherwise not find them beside the new ones.
 
 Where the source states the CRC of its data section, it is checked and the copy states one, for which every byte passes through
 memory (1.3 instead of 1.2 of the CPU time of `cp`, `pass` in `tests/bench/rewrite.py`). Where the source states none, as most
@@ -14,7 +14,7 @@ recorders do, the copy states none.
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import nullcontext, suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -24,19 +24,19 @@ from mcap.records import Metadata, MetadataIndex
 
 from imutool.errors import ConfigError, LogError
 from imutool.location import Location, identity, same_location
-from imutool.mcap_io.added_topics import DerivedStream, DerivedTopics, check_new_topics
 from imutool.mcap_io.blocks import (
     Attachment,
     MessageBlock,
     MessageIndexes,
     RecordSpan,
-    parse_message_indexes,
     read_message_indexes,
 )
-from imutool.mcap_io.codec import messages, records
+from imutool.mcap_io.codec import records
 from imutool.mcap_io.codec.records import HEAD, ChunkHead
 from imutool.mcap_io.index import LogIndex
 from imutool.mcap_io.log import Log
+from imutool.mcap_io.passthrough.added_topics import DerivedStream, DerivedTopics, check_new_topics
+from imutool.mcap_io.passthrough.chunk_check import Part, check_chunk, parts_of
 from imutool.mcap_io.storage.target import PassThrough
 from imutool.mcap_io.topics import DERIVED_KEY
 from imutool.mcap_io.verify import Verified, check_data_crc, check_mode, stated_crc, verify
@@ -144,11 +144,8 @@ class _Rewrite:
         ]
         self.imu_channels = set().union(*(stream.sources for stream in self.streams)) if self.streams else set()
         self.passing = PassThrough(self.source, out.target)
-        self.checked, self.unchecked, self.new_chunks = (
-            0,
-            0,
-            set[int](),
-        )  # chunks unpacked while copying; offsets of the new ones
+        self.checked = self.unchecked = 0  # chunks unpacked before or while copying; messages that no CRC covers
+        self.new_chunks = set[int]()  # their offsets
 
     def run(self, metadata: Values | Callable[[Verified], Values]) -> RewriteReport:
         """Copies the log item by item with the new chunks between them, ends it, and verifies it.
@@ -214,6 +211,11 @@ class _Rewrite:
         if block.compression is None:
             self._wrap_run(block)
             return
+        if kept := self.log.kept and self.log.kept.pop(block, self.imu_channels):
+            self._add(kept.parts)
+            self.checked += 1
+            self._list_chunk(block, kept.head, kept.indexes, self.passing.defer(block.end))
+            return
         if self.index.definitions_known and block.indexes and self.imu_channels.isdisjoint(block.indexes):
             head, indexes = read_message_indexes(self.source, block)
             if indexes is not None:
@@ -225,8 +227,7 @@ class _Rewrite:
         """Writes messages outside chunks as a chunk."""
         raw = self.source.at(block.offset, block.length)
         found = self.index.unpack_bytes(block, raw)
-        for stream in self.streams:
-            stream.add(found)
+        self._add(parts_of(found, self.imu_channels))
         self.passing.flush()
         self.checked += 1
         self.unchecked += len(found.heads)
@@ -236,14 +237,8 @@ class _Rewrite:
     def _copy_unpacked(self, block: MessageBlock) -> None:
         """Copies a chunk that must be unpacked; wrong message indexes are replaced."""
         everything = memoryview(self.source.at(block.offset, block.end - block.offset))
-        raw, behind = everything[: block.length], everything[block.length :]
         try:
-            head = block.head(raw)
-            indexes, data = (
-                parse_message_indexes(behind, block, head.size),
-                records.unpack(raw, block.offset, self.index.max_chunk),
-            )
-            found, right = indexes.messages(data, block.offset) if indexes else (messages.parse(data, block.offset), False)
+            head, indexes, right, found = check_chunk(everything, block, self.index.max_chunk)
         except LogError as error:
             self.index.lose(block, error)
             self.passing.flush()
@@ -251,16 +246,21 @@ class _Rewrite:
             return
         for opcode, first, length in found.definitions:
             self._define(opcode, found.data[first : first + length].tobytes(), block.offset)
-        for stream in self.streams:
-            stream.add(found)
+        self._add(parts_of(found, self.imu_channels))
         self.checked += 1
         if indexes is not None and right:
             self._list_chunk(block, head, indexes, self.passing.write(everything) - block.offset)
         else:
             self.unchecked += 0 if head.crc else len(found.heads)
-            entry = head.index_at(self.passing.write(raw), block.length)
+            entry = head.index_at(self.passing.write(everything[: block.length]), block.length)
             self.out.write_indexes(entry, found.heads["channel"].copy(), found.times(), found.offsets)
             self.passing.skip(block.end)
+
+    def _add(self, parts: Iterable[Part]) -> None:
+        """Hands messages of the source IMUs to the topics computed from them."""
+        parts = list(parts)
+        for stream in self.streams:
+            stream.add(parts)
 
     def _list_chunk(self, block: MessageBlock, head: ChunkHead, indexes: MessageIndexes, moved: int) -> None:
         """Enters a chunk with its own message indexes in the summary."""

@@ -2,23 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
-from jaxtyping import Int64, Shaped, UInt8, UInt16
+from jaxtyping import Int64, UInt8, UInt16
 
 from imutool.errors import LogError
 from imutool.mcap_io.codec import messages, schemas
 from imutool.mcap_io.log import Log
+from imutool.mcap_io.passthrough.chunk_check import Part
 from imutool.mcap_io.topics import ImuBatch
 from imutool.mcap_io.writer import Chunk
 
 BATCH_BYTES = 1 << 18  # of IMU messages are decoded at once: one chunk holds too few among its images for numpy to be quick
-
-Heads = Shaped[np.ndarray, " n"]  # of dtype messages.MESSAGE
-Payload = UInt8[np.ndarray, "n L"]
 
 
 class NewTopic(NamedTuple):
@@ -80,7 +78,7 @@ class DerivedStream:
     derived: DerivedTopics
     sources: set[int]
     ids: list[int]
-    undecoded: list[tuple[Heads, Payload]] = field(default_factory=list)  # of the source, of equal size
+    undecoded: list[Part] = field(default_factory=list)  # of the source, of equal size
     undecoded_bytes: int = 0
     data: list[UInt8[np.ndarray, "n M"]] = field(default_factory=list)
     channels: list[UInt16[np.ndarray, " n"]] = field(default_factory=list)
@@ -88,11 +86,13 @@ class DerivedStream:
     offsets: list[Int64[np.ndarray, " n"]] = field(default_factory=list)
     size: int = 0
 
-    def add(self, found: messages.Messages) -> None:
-        """Takes in the IMU's messages of a source chunk, and decodes them once there are enough."""
-        of = found.heads["channel"]
-        mask = np.logical_or.reduce([of == channel for channel in self.sources])
-        for heads, payload in messages.cut(found, mask):
+    def add(self, parts: Iterable[Part]) -> None:
+        """Takes in messages of a source chunk, and decodes them once there are enough."""
+        for every, payloads in parts:
+            mine = np.logical_or.reduce([every["channel"] == channel for channel in self.sources])
+            if not mine.any():
+                continue
+            heads, payload = (every, payloads) if mine.all() else (every[mine], payloads[mine])  # else another stream's too
             if self.undecoded and self.undecoded[-1][1].shape[1] != payload.shape[1]:
                 self.decode()
             self.undecoded.append((heads, payload))
