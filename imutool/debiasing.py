@@ -78,7 +78,7 @@ BlockCallback = Callable[[DebiasedBlock], None]
 
 
 class Debiaser:
-    """Debiased topics of one IMU, computed by batches during the copy (`mcap_io.passthrough.added_topics`).
+    """Debiased topics of one IMU, computed by batches during the copy (`DerivedTopics`).
 
     With a survey the samples are cleaned first. `watch` is called with every batch.
     """
@@ -229,10 +229,10 @@ def _debias(
     given = dict(model) if isinstance(model, Mapping) else {} if model is None else {"": model}
     topics = choose_imus(log, options.imus, given)
     about = log.metadata().get("imutool", {})
+    log.keep(topics)
     surveys = {} if options.clean is None else {topic: look(log, topic, options.clean).trusted() for topic in topics}
     default = given.get("") or (None if all(topic in given for topic in topics) else _model_of_log(about))
     derived, starts, models, records = [], {}, {}, {}
-    log.keep(topics)
     with SourceDigest(log.index, source) as digest:
         for topic in topics:
             name, survey = given.get(topic, default), surveys.get(topic)

@@ -263,7 +263,7 @@ class Log:
         return {i for i, channel in self.index.channels.items() if channel.topic == topic}
 
     def keep(self, topics: Collection[str]) -> None:
-        """Keeps the chunks that are read for some topics from now on, so that a copy of the log need not read them again."""
+        """Keeps the chunks that are read for some topics from now on: a copy need not read them again."""
         channels = frozenset[int]().union(*(self.channel_ids(topic) for topic in topics))
         self.kept = KeptChunks(self._source, channels, self.max_chunk)
 

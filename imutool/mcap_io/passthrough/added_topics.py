@@ -92,11 +92,11 @@ class DerivedStream:
             mine = np.logical_or.reduce([every["channel"] == channel for channel in self.sources])
             if not mine.any():
                 continue
-            heads, payload = (every, payloads) if mine.all() else (every[mine], payloads[mine])  # else another stream's too
-            if self.undecoded and self.undecoded[-1][1].shape[1] != payload.shape[1]:
+            part = Part(every, payloads) if mine.all() else Part(every[mine], payloads[mine])  # else another stream's too
+            if self.undecoded and self.undecoded[-1].payload.shape[1] != part.payload.shape[1]:
                 self.decode()
-            self.undecoded.append((heads, payload))
-            self.undecoded_bytes += payload.size
+            self.undecoded.append(part)
+            self.undecoded_bytes += part.payload.size
         if self.undecoded_bytes >= BATCH_BYTES:
             self.decode()
 

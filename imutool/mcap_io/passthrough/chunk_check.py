@@ -1,4 +1,4 @@
-"""Check a chunk with its message indexes in one go, and keep what was read of it for the copy."""
+"""Check chunks with their message indexes, and keep what was read for the copy."""
 
 from __future__ import annotations
 
@@ -14,10 +14,16 @@ from imutool.mcap_io.codec.records import ChunkHead
 from imutool.mcap_io.storage.source import Source
 
 NO_ENTRIES = np.zeros((0, 2), np.uint64)
-KEPT_BYTES = 16 << 20  # of messages: the first minute of IMUs of 800 Hz together
+KEPT_BYTES = 6 << 20  # of messages: the first minute of a 200 Hz IMU, and all of a small log
 
 Heads = Shaped[np.ndarray, " n"]  # of dtype messages.MESSAGE
-Part = tuple[Heads, UInt8[np.ndarray, "n L"]]  # messages of one size: heads and payloads
+
+
+class Part(NamedTuple):
+    """Messages of one size, copied out of their chunk."""
+
+    heads: Heads
+    payload: UInt8[np.ndarray, "n L"]
 
 
 class CheckedChunk(NamedTuple):
@@ -30,7 +36,9 @@ class CheckedChunk(NamedTuple):
 
 
 def check_chunk(everything: memoryview, block: MessageBlock, max_chunk: int) -> CheckedChunk:
-    """Unpack a chunk and compare it with its CRC and its message indexes; `everything` is the chunk with these.
+    """Unpack a chunk and compare it with its CRC and its message indexes.
+
+    `everything` is the chunk with the message indexes behind it.
 
     Raises:
         LogError: the chunk is damaged.
@@ -46,7 +54,7 @@ def check_chunk(everything: memoryview, block: MessageBlock, max_chunk: int) -> 
 
 
 class KeptChunk(NamedTuple):
-    """What is left of a checked chunk: its head, its message indexes, and the messages of some channels."""
+    """Head, message indexes and messages of some channels of a checked chunk."""
 
     head: ChunkHead
     indexes: MessageIndexes
@@ -54,7 +62,7 @@ class KeptChunk(NamedTuple):
 
 
 class KeptChunks:
-    """Chunks that were read and checked before the copy, which then needs only their bytes in the new file.
+    """Chunks that were read and checked before the copy, and then are only copied.
 
     A chunk is kept if nothing is left to do about it: it is intact, its message indexes are right, and it defines nothing.
     Whoever copies it must make sure that the file is still the same (`location.identity`).
@@ -72,12 +80,12 @@ class KeptChunks:
     def rows(
         self, block: MessageBlock, wanted: Mapping[str, set[int]], first: int, last: int
     ) -> list[tuple[str, messages.Rows]] | None:
-        """Messages of some topics by log time, as `Log.rows`; None where the chunk must be read otherwise.
+        """Messages of some topics by log time, as `Log.rows`; None if the chunk is not kept.
 
         Raises:
             LogError: the chunk is damaged.
         """
-        if not self.channels.issuperset(*wanted.values()) or (parts := self._read(block)) is None:
+        if not all(self.channels >= channels for channels in wanted.values()) or (parts := self._read(block)) is None:
             return None
         found = []
         for topic, channels in wanted.items():
@@ -89,7 +97,7 @@ class KeptChunks:
         return found
 
     def _read(self, block: MessageBlock) -> Sequence[Part] | None:
-        """Messages of the channels in a chunk, which is kept; None if its indexes are wrong, or there is no room."""
+        """Messages in a chunk, which is kept; None if its indexes are wrong, or there is no room."""
         if (known := self._kept.get(block.offset)) is not None:
             return known.parts
         if block.compression is None or not block.indexes or block.end - block.offset > self._max_chunk or self._room <= 0:
@@ -105,11 +113,12 @@ class KeptChunks:
 
 
 def parts_of(found: messages.Messages, channels: frozenset[int] | set[int]) -> Iterator[Part]:
-    """Messages of some channels, in stretches of one size, copied out of their chunk."""
-    yield from messages.cut(found, _of(found.heads, channels))
+    """Messages of some channels, in stretches of one size."""
+    for heads, payload in messages.cut(found, _of(found.heads, channels)):
+        yield Part(heads, payload)
 
 
 def _of(heads: Heads, channels: frozenset[int] | set[int]) -> Bool[np.ndarray, " n"]:
-    """Whether each message is one of these channels'; `np.isin` takes ten times as long for the few there are."""
+    """Whether each message is of these channels; `np.isin` takes ten times as long for a few."""
     of = heads["channel"]
     return np.logical_or.reduce([of == channel for channel in channels]) if channels else np.zeros(len(of), bool)

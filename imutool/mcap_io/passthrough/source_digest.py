@@ -1,4 +1,4 @@
-"""Digest of the log that a copy comes from: SHA-256 of all its bytes, or of what states its contents."""
+"""Digest of a source log: SHA-256 of all its bytes, or of what states its contents."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ LARGEST_HASHED = 64 << 20
 
 
 class SourceDigest:
-    """Digest of a source for its copy's metadata; a context manager, because a thread may compute it.
+    """Digest of a source for its copy's metadata; a context manager, as a thread may compute it.
 
     `source_sha256` is that of the file. A log above `LARGEST_HASHED` bytes has `source_digest`: SHA-256 of the header, the head
     of every chunk with the CRC of its contents, and all bytes from the end of the data section on. Two logs that differ in a
