@@ -108,19 +108,21 @@ def _by_band(x: Float64[np.ndarray, "n 3"], t_s: Float64[np.ndarray, " n"]) -> M
 
 def _integrated(trace: Traces) -> tuple[float, float]:
     """Rotation (rad) and displacement (m) by which recorded and expected samples part within windows; root mean squares."""
-    period_s = float(np.median(np.diff(trace.t_s)))
-    count = round(WINDOW_S / period_s)
-    windows = max(1, len(trace.t_s) // count)
-    count = min(count, len(trace.t_s))
-    ends = []
-    for samples in (trace.real, trace.before):
-        x = samples[: windows * count].reshape(windows, count, 6)
-        R, v, p = Rotation.identity(windows), np.zeros((windows, 3)), np.zeros((windows, 3))
-        for k in range(count):
-            p = p + v * period_s
-            v = v + R.apply(x[:, k, 3:]) * period_s
-            R = R * Rotation.from_rotvec(x[:, k, :3] * period_s)
-        ends.append((R, p))
-    (R_real, p_real), (R_sim, p_sim) = ends
+    (R_real, p_real), (R_sim, p_sim) = (_window_ends(samples, trace.t_s) for samples in (trace.real, trace.before))
     angle = (R_real.inv() * R_sim).magnitude()
     return float(np.sqrt(np.mean(angle**2))), float(np.sqrt(((p_real - p_sim) ** 2).sum(axis=1).mean()))
+
+
+def _window_ends(
+    samples: Float64[np.ndarray, "n 6"], t_s: Float64[np.ndarray, " n"]
+) -> tuple[Rotation, Float64[np.ndarray, "w 3"]]:
+    """Attitude and displacement at the end of each window, from its own start, gravity included."""
+    period_s = float(np.median(np.diff(t_s)))
+    count = min(round(WINDOW_S / period_s), len(t_s))
+    x = samples[: len(t_s) // count * count].reshape(-1, count, 6)
+    R, v, p = Rotation.identity(len(x)), np.zeros((len(x), 3)), np.zeros((len(x), 3))
+    for k in range(count):
+        p = p + v * period_s
+        v = v + R.apply(x[:, k, 3:]) * period_s
+        R = R * Rotation.from_rotvec(x[:, k, :3] * period_s)
+    return R, p

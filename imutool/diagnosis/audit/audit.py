@@ -117,14 +117,12 @@ def _grouped(not_tested: Mapping[str, str]) -> dict[str, list[str]]:
 
 
 def _not_tested(real: Recording | None, sheet: datasheet.Noise) -> Iterator[tuple[str, str]]:
-    if real is None:
-        yield from ((name, "they need a recording (`real`)") for name in BY_RECORDING)
-        if not _has_noise(sheet):
-            yield from ((name, "they need a data sheet (`noise`) or a recording (`real`)") for name in BY_NOISE)
-    elif not real.truths:
-        yield "body_centre", "it needs true poses in the recording"
     if not _has_noise(sheet):
         yield "bias_never_walks", "it needs a data sheet (`noise`)"
+    if real is None:
+        yield from ((name, "they need a recording (`real`)") for name in BY_RECORDING)
+    if real is None and not _has_noise(sheet):
+        yield from ((name, "they need a data sheet (`noise`) or a recording (`real`)") for name in BY_NOISE)
 
 
 def _body_centre(fit: KinematicFit, real: Recording) -> list[FaultFound]:

@@ -12,6 +12,7 @@ tau_a delays the acceleration alone (a difference of velocities), tau_f the atti
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from itertools import permutations, product
 
@@ -37,6 +38,7 @@ ALIKE = 1.1  # times the least squares: hypotheses that explain as much, of whic
 CERTAIN = 6.0  # standard deviations
 NEAR = 0.15  # of a step, or of gravity, by which a number may differ from a whole one
 LEAST_DELAY = 0.05  # of a sample period: less is rounding
+PART, WHOLE = 0.7, 0.8  # of a sample period: up to the one a delay is a part, from the other a whole step
 LEAST_ARM_M = 5e-3
 LEAST_S = 5.0
 NAMES = ("m", "k", "c", "x", "y", "z", "tau_a", "tau_f")
@@ -119,23 +121,21 @@ def kinematic_fit(k: Kinematics) -> KinematicFit:
 
 def motion_faults(k: Kinematics, fit: KinematicFit) -> list[FaultFound]:
     """Faults of gravity, frame, axes, transport term, point and timing."""
-    out = _frame_faults(fit) + _force_faults(fit)
-    out += _timing_faults(fit.estimates, k.period_s)
-    arm = np.array([fit.estimates[axis].value for axis in AXES])
-    if np.linalg.norm(arm) > LEAST_ARM_M and any(_clear(fit.estimates[axis]) for axis in AXES):
-        out.append(found("lever_arm", "accel", **{axis: _with_unit(fit.estimates[axis], "m") for axis in AXES}))
-    return out
+    timing = _timing_faults(fit.estimates, k.period_s)
+    return [*_frame_faults(fit), *_force_faults(fit), *timing, *_arm_faults(fit.estimates)]
+
+
+def _arm_faults(estimates: Mapping[str, Estimate]) -> list[FaultFound]:
+    arm = {axis: _with_unit(estimates[axis], "m") for axis in AXES}
+    far = np.linalg.norm([r.value for r in arm.values()]) > LEAST_ARM_M
+    return [found("lever_arm", "accel", **arm)] if far and any(_clear(r) for r in arm.values()) else []
 
 
 def _frame_faults(fit: KinematicFit) -> list[FaultFound]:
-    out = [found("world_frame", signal) for signal in _which(fit.world)]
-    flipped = tuple(bool(np.linalg.det(P) < 0.0) for P in fit.axes)
-    turned = tuple(bool((np.eye(3) != P).any()) for P in fit.axes)
-    if any(flipped):
-        out += [found("left_handed", signal) for signal in _which(turned)]
-    else:
-        out += [found("permuted_axes", signal) for signal in _which(turned)]
-    return out
+    flipped = any(np.linalg.det(P) < 0.0 for P in fit.axes)
+    turned = tuple(not np.array_equal(P, np.eye(3)) for P in fit.axes)
+    name = "left_handed" if flipped else "permuted_axes"
+    return [found("world_frame", signal) for signal in _which(fit.world)] + [found(name, signal) for signal in _which(turned)]
 
 
 def _force_faults(fit: KinematicFit) -> list[FaultFound]:
@@ -173,12 +173,10 @@ def _timing_faults(estimates: dict[str, Estimate], period_s: float) -> list[Faul
 
 def _delay(tau: Estimate, period_s: float) -> str:
     """Name of a delay: half a step or less, a whole step, a step early; empty for none or another."""
-    steps = tau.value / period_s
-    if not _clear(tau) or abs(steps) < LEAST_DELAY:
-        return ""
-    if abs(steps) > 0.8:
+    steps = tau.value / period_s if _clear(tau) else 0.0
+    if abs(steps) > WHOLE:
         return "step_delay" if steps > 0.0 else "early_stamps"
-    return "backward_difference" if 0.0 < steps < 0.7 else ""
+    return "backward_difference" if LEAST_DELAY <= steps < PART else ""
 
 
 def _which(flags: tuple[bool, ...]) -> list[str]:
@@ -196,17 +194,11 @@ def _with_unit(estimate: Estimate, unit: str) -> Estimate:
     return Estimate(estimate.value, estimate.std, unit)
 
 
-def _signed_permutations() -> list[Matrix]:
-    """All 48, those that change fewest axes first."""
-    every = [
-        np.eye(3)[list(order)] * np.array(signs)[:, None]
-        for order in permutations(range(3))
-        for signs in product((1.0, -1.0), repeat=3)
-    ]
-    return sorted(every, key=lambda P: float(np.abs(P - np.eye(3)).sum()))
-
-
-PERMUTATIONS = _signed_permutations()
+AXES_ORDERS = product(permutations(range(3)), product((1.0, -1.0), repeat=3))
+PERMUTATIONS = sorted(  # all 48 signed permutations, those that change fewest axes first
+    (np.eye(3)[list(order)] * np.array(signs)[:, None] for order, signs in AXES_ORDERS),
+    key=lambda P: float(np.abs(P - np.eye(3)).sum()),
+)
 
 
 def _frame(k: Kinematics, y: Vectors, body: Float64[np.ndarray, "n 3 p"], *, free_bias: bool) -> tuple[bool, Matrix]:

@@ -31,6 +31,7 @@ CONSEQUENCES = {
     "clipping_absent": ("bandwidth_absent", "noise_density"),
     "bandwidth_absent": ("noise_density", "noise_per_sample"),
 }
+LEAST_LSB = 0.3  # of the noise: finer digits leave no trace
 LINES_P_VALUE = 1e-9
 LINES_FROM = 0.15  # of the rate: below, motion is left
 SEGMENT = 1024
@@ -81,7 +82,8 @@ def noise_faults(imu: Imu, residual: Six, expected: list[Expected]) -> list[Faul
             out += _density(sensor, own, rate_hz, float(np.nanmedian(reference.density[part])), reference.rate_hz)
             out += _walk(sensor, residual[:, part], rate_hz, own, reference.walk[part])
             if reference.samples is not None and reference.rate_hz is not None:
-                out += _converter(sensor, samples[:, part], reference.samples[:, part])
+                out += _clipping(sensor, samples[:, part], reference.samples[:, part])
+                out += _digits(sensor, samples[:, part], reference.samples[:, part])
                 out += _bandwidth(sensor, residual[:, part], rate_hz, reference.samples[:, part], reference.rate_hz)
     return [fault for fault in out if not _follows(fault, out)]
 
@@ -130,15 +132,18 @@ def _walk(
         yield found("bias_never_walks", sensor, expected_walk=Estimate(density, 0.0, f"{UNITS[sensor]}/s/√Hz"))
 
 
-def _converter(sensor: Sensor, sim: Float64[np.ndarray, "n 3"], real: Float64[np.ndarray, "m 3"]) -> Iterator[FaultFound]:
-    """Clipping and digits that the recording has and the simulation lacks."""
-    three = np.zeros_like(real)
-    limit = limits(np.concatenate([real, three] if sensor == "gyro" else [three, real], axis=1)).get(sensor)
+def _clipping(sensor: Sensor, sim: Float64[np.ndarray, "n 3"], real: Float64[np.ndarray, "m 3"]) -> Iterator[FaultFound]:
+    """Clipping that the recording has and the simulation lacks."""
+    limit = limits(np.tile(real, 2)).get(sensor)
     if limit is not None and np.abs(sim).max() > OVER_LIMIT * limit:
         yield found("clipping_absent", sensor, limit=Estimate(limit, 0.0, UNITS[sensor]))
+
+
+def _digits(sensor: Sensor, sim: Float64[np.ndarray, "n 3"], real: Float64[np.ndarray, "m 3"]) -> Iterator[FaultFound]:
+    """Digits that the recording has and the simulation lacks."""
     steps = [grid(column) for column in real.T]
     lsb = float(np.median(steps))
-    if min(steps) > 0.3 * float(np.median(fast_noise(real, 1.0))) and all(grid(column) < 0.5 * lsb for column in sim.T):
+    if min(steps) > LEAST_LSB * float(np.median(fast_noise(real, 1.0))) and all(grid(column) < 0.5 * lsb for column in sim.T):
         yield found("digits_absent", sensor, lsb=Estimate(lsb, 1e-3 * lsb, UNITS[sensor]))
 
 
@@ -146,16 +151,17 @@ def _bandwidth(
     sensor: Sensor, sim: Float64[np.ndarray, "n 3"], sim_hz: float, real: Float64[np.ndarray, "m 3"], real_hz: float
 ) -> Iterator[FaultFound]:
     """White noise near the recording's Nyquist frequency, where the recording's has fallen."""
-    nyquist = min(sim_hz, real_hz) / 2.0
-    left = []
-    for x, rate_hz in ((sim, sim_hz), (real, real_hz)):
-        f_hz, power = welch(x, rate_hz, nperseg=min(SEGMENT, len(x)), axis=0)
-        bands = [np.median(power[(f_hz > low * nyquist) & (f_hz < high * nyquist)]) for low, high in BANDS]
-        left.append((bands[1] / max(bands[0], 1e-300), bands[2] / max(bands[1], 1e-300)))
-    white, falls = left[0][0] * left[0][1] > WHITE, left[1][0] * left[1][1] < FALLS and max(left[1]) < STEP
-    if white and falls:
-        share = float(left[1][0] * left[1][1])
-        yield found("bandwidth_absent", sensor, left=Estimate(share, 0.1 * share, "-"))
+    nyquist_hz = min(sim_hz, real_hz) / 2.0
+    (sim_middle, sim_near), (middle, near) = (_left(x, hz, nyquist_hz) for x, hz in ((sim, sim_hz), (real, real_hz)))
+    if sim_middle * sim_near > WHITE and middle * near < FALLS and max(middle, near) < STEP:
+        yield found("bandwidth_absent", sensor, left=Estimate(middle * near, 0.1 * middle * near, "-"))
+
+
+def _left(x: Float64[np.ndarray, "n 3"], rate_hz: float, nyquist_hz: float) -> tuple[float, float]:
+    """Power that is left from band to band, towards a Nyquist frequency."""
+    f_hz, power = welch(x, rate_hz, nperseg=min(SEGMENT, len(x)), axis=0)
+    low, middle, near = (float(np.median(power[(f_hz > a * nyquist_hz) & (f_hz < b * nyquist_hz)])) for a, b in BANDS)
+    return middle / max(low, 1e-300), near / max(middle, 1e-300)
 
 
 BANDS = ((0.2, 0.35), (0.5, 0.65), (0.85, 0.97))  # of Nyquist
