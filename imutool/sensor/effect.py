@@ -185,7 +185,10 @@ def residual(motion: IdealMotion, samples: SensorSamples) -> tuple[Float64[np.nd
     return samples.gyro - ideal.gyro, samples.accel - ideal.accel
 
 
-WITHIN_STAGE = {"gain": -2, "dead_band": -1, "saturation": 1, "quantization": 2}
+WITHIN_STAGE = {
+    **{"gain": -2, "dead_band": -1, "saturation": 1, "quantization": 2},
+    **{"actuator_gain": 1, "actuator_dead_band": 2, "torque_saturation": 2},  # between what the motion needs and the command
+}
 Acting = Sequence[tuple[Effect, Theta]]
 
 

@@ -1,0 +1,1 @@
+"""Diagnosis of any signal that is no IMU: joints, wheels, fields, pressures, positions, plain numbers."""
