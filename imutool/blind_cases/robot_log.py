@@ -1,4 +1,4 @@
-"""Logs of robots for blind cases: ROS 2 messages of joints, fields, pressures, positions, ranges and odometry in MCAP."""
+"""Logs of robots for blind cases, as ROS 2 messages in MCAP."""
 
 from __future__ import annotations
 
@@ -31,7 +31,9 @@ ODOMETRY = (
     f"{SEPARATOR}\nMSG: geometry_msgs/Twist\ngeometry_msgs/Vector3 linear\ngeometry_msgs/Vector3 angular\n"
 )
 DEFINITIONS = {
-    "sensor_msgs/msg/JointState": f"std_msgs/Header header\nstring[] name\nfloat64[] position\nfloat64[] velocity\nfloat64[] effort\n{HEADER}",
+    "sensor_msgs/msg/JointState": (
+        f"std_msgs/Header header\nstring[] name\nfloat64[] position\nfloat64[] velocity\nfloat64[] effort\n{HEADER}"
+    ),
     "sensor_msgs/msg/MagneticField": (
         f"std_msgs/Header header\ngeometry_msgs/Vector3 magnetic_field\nfloat64[9] magnetic_field_covariance\n{VECTOR}{HEADER}"
     ),
@@ -109,7 +111,10 @@ def _message(kind: str, t_ns: int, row: Sequence[float], names: Sequence[str]) -
 
 
 def write(path: Path, topics: Mapping[str, tuple[str, Float64[np.ndarray, " _"], Numbers]], names: Sequence[str] = ()) -> None:
-    """Write topics as (message, seconds, rows of numbers); joints have position, velocity and effort in a row."""
+    """Write topics as (message, seconds, rows of numbers).
+
+    Joints have positions, velocities and efforts in a row.
+    """
     with path.open("wb") as file:
         writer = Writer(file, compression=CompressionType.ZSTD)
         writer.start(profile="ros2", library="imutool blind cases")
@@ -118,7 +123,9 @@ def write(path: Path, topics: Mapping[str, tuple[str, Float64[np.ndarray, " _"],
             schema = writer.register_schema(kind, "ros2msg", DEFINITIONS[kind].encode())
             channel = writer.register_channel(topic, "cdr", schema)
             stamps = START_NS + np.round(np.asarray(t_s) * 1e9).astype(np.int64)
-            messages += [(int(t), channel, _message(kind, int(t), row, names)) for t, row in zip(stamps, rows.tolist(), strict=True)]
+            messages += [
+                (int(t), channel, _message(kind, int(t), row, names)) for t, row in zip(stamps, rows.tolist(), strict=True)
+            ]
         for k, (t_ns, channel, data) in enumerate(sorted(messages, key=lambda entry: entry[0])):
             writer.add_message(channel, t_ns, data, t_ns, k)
-        writer.finish()
+        writer.finish()  # type: ignore[no-untyped-call]  # mcap has no annotation for it

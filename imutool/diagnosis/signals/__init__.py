@@ -1,1 +1,1 @@
-"""Diagnosis of any signal that is no IMU: joints, wheels, fields, pressures, positions, plain numbers."""
+"""Diagnosis of signals that are no IMU: joints, wheels, fields, pressures, positions."""

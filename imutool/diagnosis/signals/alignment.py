@@ -2,58 +2,36 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 from jaxtyping import Float64, Int64
-from scipy.interpolate import make_interp_spline
-from scipy.signal import correlate, correlation_lags, welch
+from scipy.signal import correlate, correlation_lags
 
 from imutool.diagnosis.estimation.aligned_log import AlignedLog, Blocks, Variables, split
-from imutool.diagnosis.estimation.alignment import wiener_filter
 from imutool.diagnosis.settings import DiagnoseSettings, SignalSettings
+from imutool.diagnosis.signals.ideal_signal import (
+    ENDS_S,
+    SignalPair,
+    at_recorded_motion,
+    band_hz,
+    from_simulation,
+    state_on,
+)
 from imutool.errors import DataError
+from imutool.inertial.stationary import white_noise
 from imutool.mcap_io.fields import Fields
 from imutool.recording import seconds
 from imutool.sensor.effect import SignalState
-from imutool.sensor.robot_effects.joint_dynamics import WELL_DETERMINED, Dynamics, identified
-from imutool.sensor.robot_effects.signal_samples import IdealSignal, Scale, SignalSamples, moved
-from imutool.sensor.robot_effects.wheel import WheelRelation
+from imutool.sensor.robot_effects.joint_dynamics import Dynamics
+from imutool.sensor.robot_effects.scale import Scale, moved
+from imutool.sensor.robot_effects.signal_samples import IdealSignal, SignalSamples
 
 MOVES = 1e-9  # of its largest value, below which a signal is constant
-MOST_FINE = 20_000_000  # samples
-ENDS_S = 0.5  # of a motion, where its derivatives are not known
 Column = Float64[np.ndarray, "_"]
-
-
-@dataclass(frozen=True, eq=False)
-class SignalPair:
-    """Columns of a recording and of its simulation that are compared together, by the stamps of one topic each.
-
-    `kind` chooses the effects. `state` is what the columns depend on in the recording (`q0`, `R00`, `speed`), and `sim_state` the
-    same in the simulation, from which the relation between the two is learnt. Columns that follow from the state by such a
-    relation are compared at the recorded motion, whatever the simulated one is.
-    """
-
-    name: str
-    names: tuple[str, ...]
-    units: tuple[str, ...]
-    real_ns: Int64[np.ndarray, " n"]
-    real: Float64[np.ndarray, "n k"]
-    sim_ns: Int64[np.ndarray, " m"]
-    sim: Float64[np.ndarray, "m k"]
-    kind: str = "number"
-    state: Mapping[str, Fields] = field(default_factory=dict)
-    sim_state: Mapping[str, Fields] = field(default_factory=dict)
-
-    @classmethod
-    def of_fields(cls, real: Fields, sim: Fields, name: str) -> SignalPair:
-        """One plain number."""
-        columns = (values.values[:, None] for values in (real, sim))
-        return cls(name, (name,), (real.unit or sim.unit,), real.t_ns, next(columns), sim.t_ns, next(columns))
+STATE_WORDS = {"dq": "speed of joint {}", "ddq": "acceleration of joint {}", "speed": "speed"}
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -130,12 +108,11 @@ class AlignedSignal(AlignedLog):
         state = {name: moved(values) for name, values in sampled.state.items()} | {
             name: moved(values) for name, (_, values) in self.ideal.channels.items()
         }
+        for k, name in enumerate(name for name in sampled.state if name.startswith("v")):
+            state[f"noise{k}"] = float(white_noise(sampled.state[name][:, None])[0])
         dynamics = relation if isinstance(relation, Dynamics) else None
         duration_s = float(self.stamp_s[-1] - self.stamp_s[0])
         return Scale(self.names, self.units, size, slope, self.lag_s, duration_s, state, dynamics)
-
-
-STATE_WORDS = {"dq": "speed of joint {}", "ddq": "acceleration of joint {}", "speed": "speed"}
 
 
 def aligned(pair: SignalPair, others: Mapping[str, Fields], settings: DiagnoseSettings) -> AlignedSignal:
@@ -153,7 +130,12 @@ def aligned(pair: SignalPair, others: Mapping[str, Fields], settings: DiagnoseSe
         name: (seconds(pair.real_ns, start_ns), pair.real[:, k]) for k, name in enumerate(pair.names) if pair.sim_state
     }
     if pair.sim_state:
-        return _at_recorded_motion(pair, channels, settings)
+        ideal, density = at_recorded_motion(pair, channels, settings)
+        end_s = ideal.start_s + len(ideal.fine) / ideal.rate_hz
+        t_real = seconds(pair.real_ns, start_ns)
+        rows = np.flatnonzero((t_real > ideal.start_s + ENDS_S) & (t_real < end_s - ENDS_S))
+        band = band_hz(ideal.rate_hz, settings.signal) if isinstance(ideal.relation, Dynamics) else None
+        return _aligned(pair, ideal, rows, t_real, density, settings, band_hz=band)
     t_real, t_sim = seconds(pair.real_ns, start_ns), seconds(pair.sim_ns, start_ns)
     lag_s, aligned_s = _lag(t_real, pair.real, t_sim, pair.sim, pair.names, settings)
     if aligned_s is not None:
@@ -161,123 +143,67 @@ def aligned(pair: SignalPair, others: Mapping[str, Fields], settings: DiagnoseSe
     period_real, period_sim = float(np.median(np.diff(t_real))), float(np.median(np.diff(t_sim)))
     early, late = min(0.0, lag_s), max(0.0, lag_s)
     rows = np.flatnonzero((t_real - late >= t_sim[0]) & (t_real - early <= t_sim[-1]))
-    _refuse_little(t_real[rows], pair.name, settings.signal)
-    part = slice(int(rows[0]), int(rows[-1]) + 1)
-    ideal, sim_density = _ideal(t_sim, pair.sim, period_sim, period_real, settings)
-    state = _state_on(ideal, pair.state, start_ns)
-    held_out, usable = split(t_real[part], settings.split)
-    step = np.diff(t_sim)
-    for k in np.flatnonzero(step > max(settings.split.gap_periods * period_sim, 0.1)):  # what was never simulated
-        usable &= (t_real[part] < t_sim[k] + early - settings.split.margin_s) | (
-            t_real[part] > t_sim[k + 1] + late + settings.split.margin_s
-        )
-    return AlignedSignal(
-        pair.name,
-        t_real[part],
-        pair.real[part],
-        usable & ~held_out,
-        usable & held_out,
-        aligned_s=aligned_s or 0.0,
-        start_ns=start_ns,
-        ideal=replace(ideal, channels=channels, state=state),
-        names=pair.names,
-        units=pair.units,
-        kind=pair.kind,
+    rate_hz = settings.signal.oversampling / min(period_sim, period_real)
+    ideal, density = from_simulation(t_sim, pair.sim, period_sim, rate_hz, settings)
+    ideal = replace(ideal, channels=channels, state=state_on(ideal, pair.state, start_ns))
+    signal = _aligned(
+        pair,
+        ideal,
+        rows,
+        t_real,
+        density,
+        settings,
         lag_s=lag_s,
-        sim_density=sim_density,
+        aligned_s=0.0 if aligned_s is None else aligned_s,
         shares_epoch=aligned_s is None,
-        settings=settings,
     )
+    step, usable = np.diff(t_sim), np.ones(len(signal.stamp_s), bool)
+    for gap in np.flatnonzero(step > max(settings.split.gap_periods * period_sim, 0.1)):  # what was never simulated
+        usable &= (signal.stamp_s < t_sim[gap] + early - settings.split.margin_s) | (
+            signal.stamp_s > t_sim[gap + 1] + late + settings.split.margin_s
+        )
+    return replace(signal, fitted=signal.fitted & usable, held_out=signal.held_out & usable)
 
 
-# ── columns that follow from a state ──
-
-
-def _at_recorded_motion(
-    pair: SignalPair, channels: Mapping[str, tuple[Column, Column]], settings: DiagnoseSettings
+def _aligned(
+    pair: SignalPair,
+    ideal: IdealSignal,
+    rows: Int64[np.ndarray, " r"],
+    t_real: Column,
+    density: Float64[np.ndarray, " k"],
+    settings: DiagnoseSettings,
+    *,
+    lag_s: float = 0.0,
+    aligned_s: float = 0.0,
+    shares_epoch: bool = True,
+    band_hz: float | None = None,
 ) -> AlignedSignal:
-    """The simulation's relation between state and columns, at the state of the recording.
+    """Recorded rows with their ideal signal.
 
     Raises:
-        DataError: the columns of the simulation do not follow from its state.
+        DataError: too few rows.
     """
-    sim_s, _, sim_state = motion(pair.sim_state, settings)
-    own_s = seconds(pair.sim_ns, int(next(iter(pair.sim_state.values())).t_ns[0]))
-    inside = (own_s > sim_s[0] + ENDS_S) & (own_s < sim_s[-1] - ENDS_S)
-    simulated = {name: np.interp(own_s[inside], sim_s, values) for name, values in sim_state.items()}
-    relation = RELATIONS[pair.kind](simulated, pair.sim[inside])
-    if relation is None:
-        raise DataError(
-            f"the {pair.name} of the simulation do not follow from its motion",
-            where=pair.name,
-            expected="efforts of an arm, or speeds of wheels, by the simulation's own motion",
-            fix="Record positions and velocities of all joints",
-        )
-    left = pair.sim[inside] - relation(simulated)
-    t_s, rate_hz, state = motion(pair.state, settings)
-    start_ns = int(pair.real_ns[0])
-    first_s = float(seconds(next(iter(pair.state.values())).t_ns[:1], start_ns)[0])
-    ideal = IdealSignal(float(t_s[0]) + first_s, rate_hz, relation(state), channels, state, relation)
-    t_real = seconds(pair.real_ns, start_ns)
-    covered = np.flatnonzero((t_real > ideal.start_s + ENDS_S) & (t_real < first_s + t_s[-1] - ENDS_S))
-    _refuse_little(t_real[covered], pair.name, settings.signal)
-    part = slice(int(covered[0]), int(covered[-1]) + 1)
+    _refuse_little(t_real[rows], pair.name, settings.signal)
+    part = slice(int(rows[0]), int(rows[-1]) + 1)
     held_out, usable = split(t_real[part], settings.split)
-    period_sim = float(np.median(np.diff(own_s)))
     return AlignedSignal(
         pair.name,
         t_real[part],
         pair.real[part],
         usable & ~held_out,
         usable & held_out,
-        start_ns=start_ns,
+        aligned_s=aligned_s,
+        band_hz=band_hz,
+        start_ns=int(pair.real_ns[0]),
         ideal=ideal,
         names=pair.names,
         units=pair.units,
         kind=pair.kind,
-        lag_s=0.0,
-        sim_density=2.0 * period_sim * left.var(axis=0),
-        shares_epoch=True,
+        lag_s=lag_s,
+        sim_density=density,
+        shares_epoch=shares_epoch,
         settings=settings,
     )
-
-
-def motion(fields: Mapping[str, Fields], settings: DiagnoseSettings) -> tuple[Column, float, dict[str, Column]]:
-    """State on a fine even clock (s from its first sample), without white noise, with accelerations.
-
-    Raises:
-        DataError: too few samples, or gaps.
-    """
-    first = next(iter(fields.values()))
-    t_s = seconds(first.t_ns, int(first.t_ns[0]))
-    period = float(np.median(np.diff(t_s)))
-    values = np.stack([own.values for own in fields.values()], axis=1)
-    ideal, _ = _ideal(t_s, values, period, period, settings)
-    at_s = ideal.start_s + np.arange(len(ideal.fine)) / ideal.rate_hz
-    state = dict(zip(fields, ideal.fine.T, strict=True))
-    out = dict(state)
-    for name, column in state.items():
-        if name.startswith("q") and f"d{name}" not in state:
-            out[f"d{name}"] = np.gradient(column) * ideal.rate_hz
-    for name in [name for name in out if name.startswith("dq")]:
-        out[f"d{name}"] = np.gradient(out[name]) * ideal.rate_hz
-    return at_s, ideal.rate_hz, out
-
-
-def _wheels(state: Mapping[str, Column], columns: Float64[np.ndarray, "_ k"]) -> WheelRelation | None:
-    speeds = np.stack(list(state.values()), axis=1)
-    weights, *_ = np.linalg.lstsq(speeds, columns, rcond=None)
-    left = (columns - speeds @ weights).std(axis=0)
-    return WheelRelation(weights) if (left < WELL_DETERMINED * columns.std(axis=0)).all() else None
-
-
-RELATIONS: Mapping[str, Callable[[Any, Any], Dynamics | WheelRelation | None]] = {"efforts": identified, "wheels": _wheels}
-
-
-def _state_on(ideal: IdealSignal, state: Mapping[str, Fields], start_ns: int) -> dict[str, Column]:
-    """State of the recording on the clock of the ideal signal."""
-    at_s = ideal.start_s + np.arange(len(ideal.fine)) / ideal.rate_hz
-    return {name: np.interp(at_s, seconds(own.t_ns, start_ns), own.values) for name, own in state.items()}
 
 
 def _refuse_little(t_s: Column, name: str, settings: SignalSettings) -> None:
@@ -325,37 +251,6 @@ def _check(t_ns: Int64[np.ndarray, " n"], values: Column, what: str, name: str, 
             expected="a signal that varies",
             fix=f"Choose another field: {why}",
         )
-
-
-def _ideal(
-    t_sim: Column, values: Float64[np.ndarray, "_ k"], period_sim: float, period_real: float, settings: DiagnoseSettings
-) -> tuple[IdealSignal, Float64[np.ndarray, " k"]]:
-    """The simulation without white noise on a fine clock, and the density of that noise, by column."""
-    t_even = t_sim[0] + period_sim * np.arange(int((t_sim[-1] - t_sim[0]) / period_sim) + 1)
-    rate_hz = min(settings.signal.oversampling / min(period_sim, period_real), MOST_FINE / (t_even[-1] - t_even[0]))
-    t_fine = t_even[0] + np.arange(int((t_even[-1] - t_even[0]) * rate_hz) + 1) / rate_hz
-    fine, density = [], []
-    for column in values.T:
-        even, jumps = _resampled(t_sim, column, t_even), _jumps(column)
-        f_hz, power = welch(even, 1.0 / period_sim, nperseg=min(settings.noise.segment_samples, len(even)), average="median")
-        top = (f_hz >= settings.signal.noise_band / period_sim) & (f_hz <= settings.signal.noise_band_end / period_sim)
-        clean = wiener_filter(even, settings.alignment)
-        fine.append(np.interp(t_fine, t_even, clean) if jumps else np.asarray(make_interp_spline(t_even, clean, k=3)(t_fine)))
-        density.append(float(np.median(power[top])))
-    return IdealSignal(float(t_fine[0]), rate_hz, np.stack(fine, axis=1), {}), np.array(density)
-
-
-def _resampled(t_s: Column, values: Column, at_s: Column) -> Column:
-    """On other times: along splines, or straight lines where a signal jumps."""
-    return np.interp(at_s, t_s, values) if _jumps(values) else np.asarray(make_interp_spline(t_s, values, k=3)(at_s))
-
-
-def _jumps(values: Column) -> bool:
-    """Whether a signal holds still for most samples, as a command does.
-
-    A spline would ring about its steps.
-    """
-    return float((np.diff(values) == 0.0).mean()) > 0.5
 
 
 def _lag(

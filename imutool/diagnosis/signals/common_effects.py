@@ -66,7 +66,7 @@ def delay(lag_s: float, step_s: float) -> Effect:
 
 def delay_step_s(signal: AlignedSignal) -> float:
     """A delay that moves the signal by `MOVED` of its size."""
-    return MOVED * min(signal.sampled.x.std(axis=0) / signal.sampled.dx.std(axis=0))
+    return MOVED * float(np.min(signal.sampled.x.std(axis=0) / signal.sampled.dx.std(axis=0)))
 
 
 def named(signal: AlignedSignal) -> Iterator[Effect]:
@@ -206,12 +206,12 @@ def _curve(
 
 
 def unknown(signal: AlignedSignal, k: int) -> Iterator[Effect]:
-    """A smooth curve of the simulated signal, of its derivative, of time, of the state, in one column."""
+    """Smooth curves of signal, derivative, time and state, in one column."""
     sampled, unit = signal.sampled, signal.units[k]
     size = float(sampled.x[:, k].std())
     units = {"x": unit, "dx/dt": f"{unit}/s", "t": "s"}
     for variable, values in variables_of(sampled, k).items():
-        if np.ptp(values) > 0 and not variable.startswith("R"):
+        if np.ptp(values) > 0 and not variable.startswith(("R", "v")):
             knots = KNOTS_OF_TIME if variable == "t" else KNOTS
             curve = _curve("unknown", "unknown", variable, units.get(variable, ""), values, knots, size, unit, k)
             yield on_column(curve, signal, k)

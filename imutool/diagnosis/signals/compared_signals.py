@@ -7,7 +7,7 @@ from dataclasses import replace
 
 from imutool.diagnosis.result import Closer, Diagnosis
 from imutool.diagnosis.settings import DiagnoseSettings
-from imutool.diagnosis.signals.alignment import SignalPair
+from imutool.diagnosis.signals.ideal_signal import SignalPair
 from imutool.diagnosis.signals.pairing import Pairing, paired
 from imutool.diagnosis.signals.signal_diagnosis import SignalDiagnosis, diagnose_signal
 from imutool.errors import DataError

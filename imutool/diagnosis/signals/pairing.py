@@ -1,4 +1,4 @@
-"""Pairs of signals that a recording and its simulation both hold, found by topic, message and field.
+"""Pairs of signals that a recording and its simulation both hold.
 
 Fields that belong together are compared together: efforts of an arm with its motion, speeds of a vehicle with its wheels, the
 three components of a field or a position. Left out are IMUs and poses (compared elsewhere), constants, enumerations, clocks,
@@ -12,19 +12,16 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Float64
 
-from imutool.diagnosis.signals.alignment import SignalPair
+from imutool.diagnosis.signals.ideal_signal import SignalPair
+from imutool.diagnosis.signals.quantities import in_one_unit, is_quantity, metres, unwrapped
 from imutool.geometry import quaternion
 from imutool.location import Location
 from imutool.mcap_io.codec.schemas import IMU, ODOMETRY, POSE, TF, TWIST
 from imutool.mcap_io.fields import Fields, others
 from imutool.mcap_io.log import Log
-from imutool.recording import seconds
 
 MOST_READ, MOST_COMPARED, MOST_DRIVERS = 400, 24, 6
-MOST_STATES = 16  # whole numbers of an enumeration
-CLOCK_CORRELATION = 0.9999  # with time, of a number that only counts
 SAME = 1e-12  # relative difference of two copies
 LISTED = 12
 JOINTS, MAGNETIC = "sensor_msgs/msg/JointState", "sensor_msgs/msg/MagneticField"
@@ -46,17 +43,6 @@ TRIPLES: Mapping[str, tuple[tuple[str, str, str], str, str]] = {
 JOINT_UNITS = {"position": "rad", "velocity": "rad/s", "effort": "N m"}
 SPEEDS = ("twist.twist.linear.x", "twist.twist.angular.z")
 UNIT_UNITS = {"linear": "m/s", "angular": "rad/s"}
-FACTORS = {
-    180.0 / np.pi: "degrees",
-    1000.0: "thousandths",
-    1e4: "gauss",
-    1e6: "millionths",
-    0.01: "hundreds",
-    1e-3: "thousands",
-}
-FACTOR_ERROR = 0.05
-TURNS = (2.0 * np.pi, 360.0)
-EARTH_M, FLATTENING = 6_378_137.0, 1.0 / 298.257223563  # WGS 84
 
 
 @dataclass(frozen=True)
@@ -97,14 +83,13 @@ def paired(real: Location, sim: Location) -> Pairing:
     own, other = _Side.of(real), _Side.of(sim)
     remarks, pairs, same = list[str](), list[SignalPair](), list[str]()
     topics = dict(_topics(own, other))
-    for topic, theirs in topics.items():
-        for pair in _of_topic(own, other, topic, theirs):
-            if len(pair.real) == len(pair.sim) and np.allclose(pair.real, pair.sim, rtol=SAME, atol=0.0):
-                same.extend(pair.names)
-            else:
-                pair, remark = _in_one_unit(pair)
-                remarks += [remark] if remark else []
-                pairs.append(pair)
+    for given in (pair for topic, theirs in topics.items() for pair in _of_topic(own, other, topic, theirs)):
+        if len(given.real) == len(given.sim) and np.allclose(given.real, given.sim, rtol=SAME, atol=0.0):
+            same.extend(given.names)
+        else:
+            pair, remark = in_one_unit(given)
+            remarks += [remark] if remark else []
+            pairs.append(pair)
     pairs.sort(key=lambda pair: pair.kind == "number")  # a sort keeps the log's order otherwise
     untried = [name for pair in pairs[MOST_COMPARED:] for name in pair.names]
     pairs = pairs[:MOST_COMPARED]
@@ -144,7 +129,7 @@ def _of_topic(real: _Side, sim: _Side, topic: str, theirs: str) -> Iterator[Sign
         if all(path in side for path in paths for side in (mine, other)):
             state = _attitude(real)
             if kind == "gnss":
-                mine, other = (_metres(side, other) for side in (mine, other))
+                mine, other = (metres(side, other) for side in (mine, other))
             yield _together(topic, paths, kind, (unit,) * 3, mine, other, state)
     else:
         values = VALUES.get(schema)
@@ -158,8 +143,8 @@ def _of_topic(real: _Side, sim: _Side, topic: str, theirs: str) -> Iterator[Sign
                 kind, unit = ("number", _unit(path)) if values is None else values[1:]
                 state = _speed(real) if kind == "pressure" else {}
                 pair = replace(SignalPair.of_fields(mine[path], other[path], f"{topic}.{path}"), kind=kind, state=state)
-                if _is_quantity(mine[path]):
-                    yield replace(_unwrapped(pair), units=(pair.units[0] or unit,))
+                if is_quantity(mine[path]):
+                    yield replace(unwrapped(pair), units=(pair.units[0] or unit,))
 
 
 def _unit(path: str) -> str:
@@ -208,7 +193,7 @@ def _joints(topic: str, mine: Mapping[str, Fields], other: Mapping[str, Fields])
         effort = mine.get(path.replace("position", "effort"))
         state = {"effort": effort} if kind == "positions" and effort is not None else {}
         pair = SignalPair.of_fields(mine[path], other[path], f"{topic}.{path}")
-        yield _unwrapped(replace(pair, kind=kind, state=state, units=(JOINT_UNITS[path.partition("[")[0]],)))
+        yield unwrapped(replace(pair, kind=kind, state=state, units=(JOINT_UNITS[path.partition("[")[0]],)))
 
 
 def _by_joint(fields: Mapping[str, Fields], wanted: list[str], given: list[str]) -> dict[str, Fields]:
@@ -287,63 +272,7 @@ def _drivers(side: _Side, compared: set[str], topics: Mapping[str, str]) -> dict
         for topic, fields in side.fields.items()
         if side.schemas[topic] not in ELSEWHERE | {JOINTS, ODOMETRY, *TRIPLES}
         for path, values in fields.items()
-        if f"{topic}.{path}" not in compared and _is_quantity(values) and (path == VALUES.get(side.schemas[topic], (path,))[0])
+        if f"{topic}.{path}" not in compared and is_quantity(values) and (path == VALUES.get(side.schemas[topic], (path,))[0])
     }
     temperatures_first = sorted(found, key=lambda name: "temperature" not in name.lower())
     return {name: found[name] for name in temperatures_first[:MOST_DRIVERS]}
-
-
-# ── numbers ──
-
-
-def _is_quantity(values: Fields) -> bool:
-    """Whether a number varies as a physical quantity does, and is no enumeration, counter or clock."""
-    v = values.values
-    if bool((v == np.rint(v)).all()) and len(np.unique(v)) <= MOST_STATES:
-        return False
-    t_s = seconds(values.t_ns, int(values.t_ns[0]))
-    rising = bool((np.diff(v) >= 0.0).all())
-    return not (rising and abs(float(np.corrcoef(t_s, v)[0, 1])) > CLOCK_CORRELATION)
-
-
-def _unwrapped(pair: SignalPair) -> SignalPair:
-    """Angles that wrap, as continuous ones."""
-
-    def whole(values: Float64[np.ndarray, "_ 1"]) -> Float64[np.ndarray, "_ 1"]:
-        steps = np.abs(np.diff(values[:, 0]))
-        for turn in TURNS:
-            if (
-                np.ptp(values) <= 1.001 * turn
-                and (np.abs(steps[steps > 0.5 * turn] - turn) < 0.2 * turn).all()
-                and (steps > 0.5 * turn).any()
-            ):
-                return np.asarray(np.unwrap(values, period=turn, axis=0))
-        return values
-
-    return replace(pair, real=whole(pair.real), sim=whole(pair.sim))
-
-
-def _in_one_unit(pair: SignalPair) -> tuple[SignalPair, str]:
-    """The recording in the simulation's unit, where the two differ by the factor of a known pair of units."""
-    if pair.sim_state:
-        return pair, ""
-    ratio = float(np.linalg.norm(np.std(pair.real, axis=0)) / max(np.linalg.norm(np.std(pair.sim, axis=0)), 1e-300))
-    for factor, word in FACTORS.items():
-        if abs(ratio / factor - 1.0) < FACTOR_ERROR:
-            text = f"{pair.name} is {factor:.4g} times larger than in the simulation, as {word} are; it was divided by that"
-            return replace(pair, real=pair.real / factor), text
-    return pair, ""
-
-
-def _metres(side: Mapping[str, Fields], origin: Mapping[str, Fields]) -> dict[str, Fields]:
-    """East, north and up (m) about the simulation's first position, under the names of the angles."""
-    lat0, lon0, up0 = (float(origin[name].values[0]) for name in ("latitude", "longitude", "altitude"))
-    e2, sin = FLATTENING * (2.0 - FLATTENING), float(np.sin(np.radians(lat0)))
-    along = EARTH_M * (1.0 - e2) / (1.0 - e2 * sin**2) ** 1.5
-    across = EARTH_M / np.sqrt(1.0 - e2 * sin**2) * np.cos(np.radians(lat0))
-    latitude, longitude, altitude = (side[name] for name in ("latitude", "longitude", "altitude"))
-    return {
-        "longitude": Fields(longitude.t_ns, np.radians(longitude.values - lon0) * across),
-        "latitude": Fields(latitude.t_ns, np.radians(latitude.values - lat0) * along),
-        "altitude": Fields(altitude.t_ns, altitude.values - up0),
-    }

@@ -1,4 +1,4 @@
-"""Diagnosis of one signal of a log, of one or several columns: aligned, whitened, searched, reported."""
+"""Diagnosis of one signal of a log, of one or several columns."""
 
 from __future__ import annotations
 
@@ -18,13 +18,14 @@ from imutool.diagnosis.estimation.noise_estimate import noise_std, ridge_fit
 from imutool.diagnosis.estimation.observability import unobservable
 from imutool.diagnosis.estimation.timestamps import grid
 from imutool.diagnosis.estimation.unnamed_effects import SplineBasis
-from imutool.diagnosis.estimation.whitening import WhitenedLog, Whitener, autoregression
+from imutool.diagnosis.estimation.whitening import Band, WhitenedLog, Whitener, autoregression
 from imutool.diagnosis.held_out import held_out_rms, noise_floor, unexplained_residuals, with_effects
 from imutool.diagnosis.localization import locate_findings
 from imutool.diagnosis.result import Estimate, Finding, HeldOut, Located, SignalTraces, Unexplained
 from imutool.diagnosis.settings import DiagnoseSettings, NoiseSettings
 from imutool.diagnosis.signals import common_effects as common
-from imutool.diagnosis.signals.alignment import AlignedSignal, Column, SignalPair, aligned
+from imutool.diagnosis.signals.alignment import AlignedSignal, Column, aligned
+from imutool.diagnosis.signals.ideal_signal import SignalPair
 from imutool.diagnosis.summarize import finding_of
 from imutool.mcap_io.fields import Fields
 from imutool.sensor.effect import Effect
@@ -63,7 +64,7 @@ CONSTANTS = {
 
 @dataclass(frozen=True, eq=False)
 class SignalDiagnosis:
-    """Diagnosis of a signal, in parts that a `Diagnosis` takes, by column; findings come strongest first."""
+    """Diagnosis of a signal, in parts that a `Diagnosis` takes; strongest findings first."""
 
     located: tuple[Located, ...]
     findings: tuple[Finding, ...]
@@ -122,22 +123,30 @@ def _whitened(pair: AlignedSignal, residual: Float64[np.ndarray, "n k"], lsb: Se
     modelled is not taken for noise; the simulation's own noise, which is in its band, comes on top. An error of rounding is no
     white noise where the signal is slow: the density is no less than that.
     """
-    usable, rate_hz, settings = pair.usable[:, 0], 1.0 / pair.period_s, pair.settings
-    top_hz, filters, stds = settings.signal.noise_band_end * rate_hz, [], []
-    for k, left in enumerate(residual.T):
-        edge = _edge_hz(pair.sampled.x[:, k], rate_hz, settings)
-        f_hz, power = _density(left, usable, rate_hz, settings.noise)
+    settings, band = pair.settings, None
+    if pair.band_hz is not None:
+        band = Band.below(pair.band_hz, 1.0 / pair.period_s, settings.noise)
+    every = 1 if band is None else band.every
+    usable, rate_hz, filters, stds = pair.usable[::every, 0], 1.0 / (pair.period_s * every), [], []
+    slow, expected_slow = (values if band is None else band(values) for values in (residual, pair.sampled.x))
+    top_hz = settings.signal.noise_band_end * rate_hz if pair.band_hz is None else 0.9 * pair.band_hz
+    for k in range(pair.columns):
+        edge = _edge_hz(expected_slow[:, k], rate_hz, settings)
+        f_hz, power = _density(slow[:, k], usable, rate_hz, settings.noise)
         near = (f_hz >= edge) & (f_hz <= min(2.0 * edge, top_hz))
         far = (f_hz >= edge) & (f_hz <= top_hz)
-        power[f_hz < edge] = max(float(np.median(power[near])), float(np.median(power[far]))) + pair.sim_density[k]
+        level = float(np.median(power[near]))
+        if band is None:  # the error of a motion grows with frequency
+            level = max(level, float(np.median(power[far])))
+        power[f_hz < edge] = level + pair.sim_density[k]
         if lsb[k]:
-            model = pair.real[:, k] - left
+            model = (pair.real - residual)[:, k]
             rounding = np.rint(model / lsb[k]) * lsb[k] - model
-            power = np.maximum(power, _density(rounding, usable, rate_hz, settings.noise)[1])
+            power = np.maximum(power, _density(rounding[::every], usable, rate_hz, settings.noise)[1])
         filter_, std = autoregression(power, rate_hz, settings.noise.order)
         filters.append(filter_)
         stds.append(std)
-    return WhitenedLog(pair, Whitener(np.stack(filters), np.array(stds)))
+    return WhitenedLog(pair, Whitener(np.stack(filters), np.array(stds), band))
 
 
 def _edge_hz(x: Column, rate_hz: float, settings: DiagnoseSettings) -> float:

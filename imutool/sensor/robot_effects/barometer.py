@@ -1,6 +1,7 @@
-"""Barometer: dynamic pressure at its port and temperature; its lag is the `low_pass` of any signal.
+"""Barometer: dynamic pressure and temperature; its lag is the `low_pass` of any signal.
 
-p = p_static + C rho v² / 2 (Bolanakis, MEMS barometers toward vertical position detection, 2017, section 4), and a share of the temperature.
+p = p_static + C rho v² / 2 (Bolanakis, MEMS barometers toward vertical position detection, 2017, section 4), and a share of
+the temperature.
 """
 
 from __future__ import annotations
@@ -9,7 +10,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 from imutool.sensor.effect import Effect, Parameter, Theta
-from imutool.sensor.robot_effects.signal_samples import Scale, SignalSamples
+from imutool.sensor.robot_effects.scale import Scale
+from imutool.sensor.robot_effects.signal_samples import SignalSamples
 
 AIR_KG_M3 = 1.225
 

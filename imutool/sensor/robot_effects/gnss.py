@@ -1,6 +1,7 @@
 """GNSS antenna: lever arm and latency of a position.
 
-p = p_body + R_wb r (Groves, Principles of GNSS, Inertial, and Multisensor Integrated Navigation, eq. 14.117), sampled `delay` before its stamp.
+p = p_body + R_wb r (Groves, Principles of GNSS, Inertial, and Multisensor Integrated Navigation Systems, section 14.3), sampled
+`delay` before its stamp.
 """
 
 from __future__ import annotations
@@ -11,7 +12,8 @@ import numpy as np
 
 from imutool.sensor.effect import Effect, Parameter, Theta
 from imutool.sensor.robot_effects.magnetometer import attitude, delay
-from imutool.sensor.robot_effects.signal_samples import Scale, SignalSamples
+from imutool.sensor.robot_effects.scale import Scale
+from imutool.sensor.robot_effects.signal_samples import SignalSamples
 from imutool.units import AXES
 
 
@@ -20,7 +22,7 @@ def _arm(s: SignalSamples, theta: Theta) -> SignalSamples:
 
 
 def effects(scale: Scale) -> Iterator[Effect]:
-    """Lever arm where the log has an attitude, and latency; turning shows the arm, moving the latency."""
+    """Lever arm where the log has an attitude, and latency."""
     if "R00" in scale.state:
         numbers = tuple(Parameter(axis, "m", 1.0) for axis in AXES)
         yield scale.effect("gnss_lever_arm", scale.columns, "position += R_wb r", numbers, _arm, "it turns")

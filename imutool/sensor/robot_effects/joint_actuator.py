@@ -1,4 +1,4 @@
-"""Actuator of a joint: delay, gain, dead band and limit between the effort commanded and the effort that acts.
+"""Actuator of a joint: delay, gain, dead band and limit of its effort.
 
 The log holds the commanded effort u; what acts is u some time later, less and limited (Slotine and Li, Applied Nonlinear
 Control, section 5.2). So u(t) = effort that the motion needs at t + delay, over the gain, plus what the actuator kept back.
@@ -12,7 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from imutool.sensor.effect import Effect, Parameter, Stage, Theta
-from imutool.sensor.robot_effects.signal_samples import Samples, Scale, SignalSamples
+from imutool.sensor.robot_effects.scale import Scale
+from imutool.sensor.robot_effects.signal_samples import Samples, SignalSamples
 
 PLAUSIBLE_S, MOVED = 0.05, 0.005
 WIDTHS = (0.05, 0.15, 0.4)  # of a dead band, over the effort's standard deviation
@@ -34,7 +35,7 @@ class _Kept:
 
 
 def _delayed(taken_s: Samples, theta: Theta) -> Samples:
-    return taken_s + theta[0]
+    return np.asarray(taken_s + theta[0])
 
 
 def effects(scale: Scale) -> Iterator[Effect]:

@@ -2,9 +2,9 @@
 
 Inverse dynamics are linear in the inertial parameters (Atkeson, An, Hollerbach, Estimation of inertial parameters of
 manipulator loads and links, IJRR 5, 1986). `chain_columns` holds for hinges with parallel axes, in absolute angles
-phi_i = sum of +-q_j, j <= i, of the links: D_i (kg m²) of a link, H_ij = conj(P_i) A_j (kg m²) between two, A_i (kg m) against gravity, with P_i
-the vector of a link in its own plane as a complex number. `general_columns` holds for other arms: accelerations, products of
-velocities and gravity, each times sines and cosines of sums of angles.
+phi_i = sum of +-q_j, j <= i, of the links: D_i (kg m²) of a link, H_ij = conj(P_i) A_j (kg m²) between two, A_i (kg m)
+against gravity, with P_i the vector of a link in its own plane as a complex number. `general_columns` holds for other arms:
+accelerations, products of velocities and gravity, each times sines and cosines of sums of angles.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from itertools import product
 
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Complex128, Float64
 
 from imutool.sensor.robot_effects.signal_samples import Column, Columns, State
 
@@ -61,7 +61,7 @@ class Dynamics:
 
 def unpacked(
     theta: Float64[np.ndarray, " _"], n: int
-) -> tuple[Float64[np.ndarray, " _"], Float64[np.ndarray, "_ _"], Float64[np.ndarray, " _"]]:
+) -> tuple[Float64[np.ndarray, " _"], Complex128[np.ndarray, "_ _"], Complex128[np.ndarray, " _"]]:
     """D, H and A of a chain from its coefficients; H and A are complex."""
     H, at = np.zeros((n, n), complex), n
     for i in range(n):
@@ -69,7 +69,7 @@ def unpacked(
             H[i, j] = theta[at] + 1j * theta[at + 1]
             at += 2
     A = theta[at : at + 2 * n : 2] + 1j * theta[at + 1 : at + 2 * n : 2]
-    return theta[:n], H, A  # type: ignore[return-value]  # complex: jaxtyping has no short name for both
+    return theta[:n], H, A
 
 
 def mass_coefficients(mass: float, links: Sequence[complex]) -> Float64[np.ndarray, " _"]:
@@ -115,7 +115,7 @@ def _own(state: State, k: int) -> Iterator[Column]:
     velocity = state[f"dq{k}"]
     yield state[f"ddq{k}"]
     yield velocity
-    yield np.clip(velocity / max(STEEP * float(np.std(velocity)), 1e-12), -1.0, 1.0)
+    yield np.clip(state[f"v{k}"] / max(STEEP * float(np.std(velocity)), 1e-12), -1.0, 1.0)
     yield np.ones(len(velocity))
 
 

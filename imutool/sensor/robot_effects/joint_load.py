@@ -11,23 +11,27 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
+from jaxtyping import Float64
 
 from imutool.sensor.effect import Effect, Parameter, Theta
 from imutool.sensor.robot_effects.joint_dynamics import chain_columns, mass_coefficients
-from imutool.sensor.robot_effects.signal_samples import Scale, SignalSamples
+from imutool.sensor.robot_effects.scale import Scale
+from imutool.sensor.robot_effects.signal_samples import SignalSamples, State
 
 USUAL_ARM_M = 0.3  # of a payload, where gravity shows no length
 PLAUSIBLE_KG = 2.0
 
 
-@dataclass(frozen=True)
 class _Payload:
-    signs: tuple[int, ...]
-    links: tuple[complex, ...]
+    def __init__(self, signs: tuple[int, ...], links: tuple[complex, ...]) -> None:
+        self.signs, self.links = signs, links
+        self._last: tuple[State, Float64[np.ndarray, "_ _ _"]] | None = None
 
     def __call__(self, s: SignalSamples, theta: Theta) -> SignalSamples:
+        if self._last is None or self._last[0] is not s.state:  # a fit asks for other masses at the same motion
+            self._last = s.state, chain_columns(s.state, self.signs)
         coefficients = mass_coefficients(theta[0], [*self.links, complex(theta[1], theta[2])])
-        return s.but(s.y + chain_columns(s.state, self.signs) @ coefficients)
+        return s.but(s.y + self._last[1] @ coefficients)
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""Transmission and encoder of a joint: gear ripple, encoder offset, eccentricity, backlash, compliance.
+"""Transmission and encoder of a joint: ripple, offset, eccentricity, backlash, compliance.
 
 A gear's torque ripples with its angle (Ghorbel, Gandhi, Alpeter, On the kinematic error in harmonic drive gears, 2001); an
 eccentric encoder disc reads q + a sin(q) + b cos(q); play and a spring lie between motor and link (Nordin and Gutman,
@@ -15,10 +15,12 @@ import numpy as np
 from jaxtyping import Float64
 
 from imutool.sensor.effect import Effect, Parameter, Stage, Theta
-from imutool.sensor.robot_effects.signal_samples import IdealSignal, Samples, Scale, SignalSamples
+from imutool.sensor.robot_effects.scale import Scale
+from imutool.sensor.robot_effects.signal_samples import IdealSignal, Samples, SignalSamples
 
 MOST_TEETH, LEAST_TURNS = 120.0, 3.0  # ripples a turn that are tried, and how many of them the motion has to show
 STARTS = 2
+BINS_A_RADIAN = 4.0 * MOST_TEETH / np.pi  # eight to the shortest ripple
 PLAUSIBLE_RAD = 0.05
 
 
@@ -50,7 +52,9 @@ class _Ripple:
         grid = self.grid(q)
         if not len(grid):
             return [np.array([0.0, 0.0, 2.0])]
-        waves = np.array([left @ np.exp(1j * n * q) for n in grid]) * 2.0 / len(q)
+        bins = np.unique(np.floor(q * BINS_A_RADIAN).astype(int), return_inverse=True)[1]
+        angle, sums = np.bincount(bins, q) / np.bincount(bins), np.bincount(bins, left)
+        waves = np.exp(1j * np.outer(grid, angle)) @ sums * 2.0 / len(q)
         best = np.argsort(-np.abs(waves))[:STARTS]
         return [np.array([waves[b].imag, waves[b].real, grid[b]]) for b in best]
 

@@ -1,7 +1,7 @@
 """Magnetometer: soft iron, misalignment and declination; a constant is hard iron.
 
-m = S R m_0 + h with S symmetric (Gebre-Egziabher and others, Calibration of strapdown magnetometers in the magnetic field domain, J.
-Aerospace Eng. 19, 2006, eq. 3); the declination turns the field about the vertical of the world.
+m = S R m_0 + h with S symmetric (Gebre-Egziabher and others, Calibration of strapdown magnetometers in the magnetic field
+domain, J. Aerospace Eng. 19, 2006); the declination turns the field about the vertical of the world.
 """
 
 from __future__ import annotations
@@ -12,7 +12,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from imutool.sensor.effect import Effect, Parameter, Stage, Theta
-from imutool.sensor.robot_effects.signal_samples import Scale, SignalSamples, Values
+from imutool.sensor.robot_effects.scale import Scale
+from imutool.sensor.robot_effects.signal_samples import SignalSamples, Values
 from imutool.units import AXES
 
 PAIRS = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
@@ -42,7 +43,7 @@ def _declined(s: SignalSamples, theta: Theta) -> SignalSamples:
 
 
 def effects(scale: Scale) -> Iterator[Effect]:
-    """Soft iron, misalignment, and with an attitude the declination; turns about several axes show them."""
+    """Soft iron, misalignment, and with an attitude the declination."""
     entries = tuple(Parameter(AXES[i] + AXES[j], "-", 0.1) for i, j in PAIRS)
     yield scale.effect(
         "soft_iron",

@@ -1,20 +1,15 @@
-"""Signals of any kind between effects: columns at their stamps, and the state that they depend on."""
+"""Signals of any kind between effects: columns, and the state that they depend on."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float64
 from scipy.ndimage import map_coordinates, spline_filter
-
-from imutool.sensor.effect import Effect, Parameter, Stage, Theta
-
-if TYPE_CHECKING:
-    from imutool.sensor.robot_effects.joint_dynamics import Dynamics
 
 Column = Float64[np.ndarray, "_"]
 Columns = Float64[np.ndarray, "_ k"]
@@ -60,9 +55,9 @@ class SignalSamples:
 
 @dataclass(frozen=True, eq=False)
 class IdealSignal:
-    """Ideal signal on a fine even clock, its state, and other channels by name with their times (s).
+    """Ideal signal on a fine even clock, its state, and other channels by name.
 
-    `relation` computes the signal from the state where the simulation showed how (none: the signal is the simulation's own).
+    Channels have times of their own (s). `relation` computes the signal from the state where the simulation showed how (none: the signal is the simulation's own).
     """
 
     start_s: float
@@ -93,54 +88,3 @@ class IdealSignal:
         assert self.relation is not None, "an effect on the state needs the relation"
         state = {**self.state, **changed}
         return replace(self, state=state, fine=self.relation(state))
-
-
-@dataclass(frozen=True)
-class Scale:
-    """Names, units and sizes of a signal's columns, from which effects take their plausible parameters.
-
-    `names` are TOPIC.field; `size` and `slope` (per second) are standard deviations, `lag_s` the lag at first sight,
-    `duration_s` the length of the log. `state` has the standard deviation of each state, `dynamics` is the relation of an
-    arm's efforts to its motion, where the simulation showed one.
-    """
-
-    names: tuple[str, ...]
-    units: tuple[str, ...]
-    size: tuple[float, ...]
-    slope: tuple[float, ...]
-    lag_s: float
-    duration_s: float
-    state: Mapping[str, float]
-    dynamics: Dynamics | None = None
-
-    @property
-    def columns(self) -> range:
-        """Indices of the columns."""
-        return range(len(self.names))
-
-    def effect(
-        self,
-        name: str,
-        columns: tuple[int, ...] | range,
-        equation: str,
-        parameters: tuple[Parameter, ...],
-        forward: Callable[[Any, Theta], Any],
-        observable_if: str,
-        *,
-        stage: Stage = Stage.SENSOR,
-        starts: list[Theta] | None = None,
-        variant: str = "",
-        **more: Any,
-    ) -> Effect:
-        """Effect on some columns; linear without `starts`."""
-        sensors: Any = () if len(self.names) == 1 else tuple(self.names[k] for k in columns)
-        label = ",".join([*(sensors if len(columns) < len(self.names) else ()), *([variant] if variant else [])])
-        given = None if starts is None else lambda ideal, real: starts
-        return Effect(
-            name, stage, sensors, equation, parameters, observable_if, forward, starts is None, given, variant=label, **more
-        )
-
-
-def moved(values: Any) -> float:
-    """Standard deviation of a state, or a tiny number for a constant one."""
-    return max(float(np.std(values)), 1e-12)

@@ -12,7 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from imutool.sensor.effect import Effect, Parameter, Stage, Theta
-from imutool.sensor.robot_effects.signal_samples import Columns, IdealSignal, Scale, SignalSamples, State
+from imutool.sensor.robot_effects.scale import Scale
+from imutool.sensor.robot_effects.signal_samples import Columns, IdealSignal, SignalSamples, State
 
 FORWARD, TURN = 0, 1
 PLAUSIBLE = 0.1
@@ -42,7 +43,7 @@ def _slip(s: SignalSamples, theta: Theta) -> SignalSamples:
 
 
 def effects(scale: Scale) -> Iterator[Effect]:
-    """Radius of each wheel, track and slip; the track shows in turns, slip where the vehicle speeds up and brakes."""
+    """Radius of each wheel, track and slip."""
     wheels = [name for name in scale.state if name.startswith("w")]
     yield scale.effect(
         "wheel_radius",
