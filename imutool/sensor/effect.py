@@ -27,7 +27,7 @@ from jaxtyping import Float64
 from imutool.errors import DataError
 from imutool.sensor.samples import IdealMotion, SensorSamples, Times
 from imutool.sensor.signals import Signals
-from imutool.units import AXES, Sensor
+from imutool.units import AXES
 
 Kind = Literal["catalogue", "driven", "unknown"]
 Three = tuple[float, float, float]
@@ -108,7 +108,7 @@ class Effect:
 
     name: str
     stage: Stage
-    sensors: tuple[Sensor, ...]
+    sensors: tuple[str, ...]  # gyro, accel, or the names of another signal's columns
     equation: str
     parameters: tuple[Parameter, ...]
     observable_if: str

@@ -53,7 +53,7 @@ def offset(signal: AlignedSignal, k: int) -> Effect:
     return replace(
         _effect("offset", Stage.SENSOR, "y += offset", numbers, lambda s, theta: s.with_added(k, theta[0]), [np.zeros(1)]),
         variant=signal.names[k] if signal.columns > 1 else "",
-        sensors=(signal.names[k],) if signal.columns > 1 else (),  # type: ignore[arg-type]  # any signal has a name
+        sensors=(signal.names[k],) if signal.columns > 1 else (),
     )
 
 
@@ -222,7 +222,7 @@ def on_column(effect: Effect, signal: AlignedSignal, k: int) -> Effect:
     if signal.columns == 1:
         return effect
     name = signal.names[k]
-    return replace(effect, sensors=(name,), variant=f"{name}:{effect.variant}")  # type: ignore[arg-type]  # any signal has a name
+    return replace(effect, sensors=(name,), variant=f"{name}:{effect.variant}")
 
 
 class _Driven:

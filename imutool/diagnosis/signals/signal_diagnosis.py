@@ -132,7 +132,7 @@ def _whitened(pair: AlignedSignal, residual: Float64[np.ndarray, "n k"], lsb: Se
     top_hz = settings.signal.noise_band_end * rate_hz if pair.band_hz is None else 0.9 * pair.band_hz
     for k in range(pair.columns):
         edge = _edge_hz(expected_slow[:, k], rate_hz, settings)
-        f_hz, power = _density(slow[:, k], usable, rate_hz, settings.noise)
+        f_hz, power = _density(slow[:, k], usable, rate_hz, settings.noise, "median" if band is None else "mean")
         near = (f_hz >= edge) & (f_hz <= min(2.0 * edge, top_hz))
         far = (f_hz >= edge) & (f_hz <= top_hz)
         level = float(np.median(power[near]))
@@ -159,10 +159,17 @@ def _edge_hz(x: Column, rate_hz: float, settings: DiagnoseSettings) -> float:
 
 
 def _density(
-    x: Float64[np.ndarray, " n"], usable: Bool[np.ndarray, " n"], rate_hz: float, settings: NoiseSettings
+    x: Float64[np.ndarray, " n"],
+    usable: Bool[np.ndarray, " n"],
+    rate_hz: float,
+    settings: NoiseSettings,
+    average: str = "median",
 ) -> tuple[Column, Column]:
-    """Frequencies, and the one-sided density of the usable part of a signal, without lines."""
-    f_hz, power = welch(np.where(usable, x, 0.0), rate_hz, nperseg=min(settings.segment_samples, len(x)), average="median")
+    """Frequencies, and the one-sided density of the usable part of a signal, without lines.
+
+    The mean counts what comes off and on, as a joint turns round, for noise.
+    """
+    f_hz, power = welch(np.where(usable, x, 0.0), rate_hz, nperseg=min(settings.segment_samples, len(x)), average=average)
     return f_hz, np.asarray(median_filter(power, settings.line_bins, mode="nearest")) / max(float(usable.mean()), 1e-3)
 
 

@@ -50,7 +50,7 @@ class Scale:
         **more: Any,
     ) -> Effect:
         """Effect on some columns; linear without `starts`."""
-        sensors: Any = () if len(self.names) == 1 else tuple(self.names[k] for k in columns)
+        sensors = () if len(self.names) == 1 else tuple(self.names[k] for k in columns)
         label = ",".join([*(sensors if len(columns) < len(self.names) else ()), *([variant] if variant else [])])
         given = None if starts is None else lambda ideal, real: starts
         return Effect(

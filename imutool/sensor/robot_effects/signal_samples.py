@@ -44,7 +44,7 @@ class SignalSamples:
         out[:, k] = y
         return replace(self, y=out)
 
-    def with_added(self, k: int, added: Samples) -> SignalSamples:
+    def with_added(self, k: int, added: Samples | float) -> SignalSamples:
         """The samples with something added to one column."""
         return self.with_column(k, self.y[:, k] + added)
 
@@ -57,7 +57,8 @@ class SignalSamples:
 class IdealSignal:
     """Ideal signal on a fine even clock, its state, and other channels by name.
 
-    Channels have times of their own (s). `relation` computes the signal from the state where the simulation showed how (none: the signal is the simulation's own).
+    Channels have times of their own (s). `relation` computes the signal from the state where the simulation showed how (none:
+    the signal is the simulation's own).
     """
 
     start_s: float
