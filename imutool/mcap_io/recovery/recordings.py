@@ -125,7 +125,8 @@ class Recordings:
 
     def _adopt(self, found: ScannedBlock, recording: Recording) -> None:
         """Notes the sizes of a recording's messages, and a block to compare others with."""
-        for channel, (low, high) in found.sizes.items():
+        for channel in found.sizes.keys() & recording.readable():  # what is not defined yet may be another log's
+            low, high = found.sizes[channel]
             least, most = recording.sizes.get(channel, (low, high))
             recording.sizes[channel] = min(low, least), max(high, most)
             recording.samples.setdefault(channel, found.block)
