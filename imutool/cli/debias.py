@@ -25,6 +25,7 @@ MODEL_HELP = (
 )
 CLEAN_HELP = "Drop invalid samples and convert units, as imutool clean does."
 REPORT_HELP = "Write an HTML page about the debiased log."
+ENCODING_HELP = "Encoding of the new IMU topic: that of its source, or CDR."
 VERIFY_HELP = "Chunks of OUT to read back: all, those with IMU messages (imu), or none."
 
 
@@ -43,6 +44,7 @@ def debias(
     verify: Annotated[str, typer.Option(metavar="all|imu|none", help=VERIFY_HELP)] = "imu",
     in_place: Annotated[bool, typer.Option("--in-place", help="Replace IN with the complete result.")] = False,
     clean: Annotated[bool, typer.Option("--clean", help=CLEAN_HELP)] = False,
+    encoding: Annotated[str, typer.Option(metavar="own|cdr", help=ENCODING_HELP)] = "own",
     view: Annotated[bool, typer.Option("--view", help="Show the progress in a new viewer.")] = False,
     connect: Annotated[
         str | None, typer.Option(metavar="URL", help="Show the progress in a running viewer: HOST:PORT.")
@@ -75,11 +77,11 @@ def debias(
             max_chunk=max_chunk,
             clean=CleaningSettings() if clean else None,
             overwrite=overwrite and not in_place,
+            encoding=encoding,
             progress=lambda done, total: tell(done, total, ""),
             watch=watch,
         )
-    shown = None if watch is None else watch.shown
-    summary = _summary(report, str(target or source), shown, report_to, clean)
+    summary = _summary(report, str(target or source), shown := watch and watch.shown, report_to, clean)
     if not (json_only := write_json(summary, json_to, overwrite=overwrite)):
         _say(report, summary, shown or ())
     if report_to is not None:  # last: should it fail, the log is there all the same, and that has been said
