@@ -81,9 +81,9 @@ def debias(
             progress=lambda done, total: tell(done, total, ""),
             watch=watch,
         )
-    summary = _summary(report, str(target or source), shown := watch and watch.shown, report_to, clean)
+    summary = _summary(report, str(target or source), None if watch is None else watch.shown, report_to, clean)
     if not (json_only := write_json(summary, json_to, overwrite=overwrite)):
-        _say(report, summary, shown or ())
+        _say(report, summary)
     if report_to is not None:  # last: should it fail, the log is there all the same, and that has been said
         with progress("Drawing", verbose, quiet):
             _draw(to_location(target or source), list(report.starts), report_to, overwrite)
@@ -169,7 +169,7 @@ def _summary(
     )
 
 
-def _say(report: DebiasReport, summary: DebiasSummary, shown: Sequence[Output]) -> None:
+def _say(report: DebiasReport, summary: DebiasSummary) -> None:
     """Print starts, counts and verification."""
     for topic, survey in report.surveys.items():
         say(f"{topic}: {survey.verdict}, score {survey.score:.3f}, {survey.valid} of {survey.messages} samples valid")
@@ -182,7 +182,7 @@ def _say(report: DebiasReport, summary: DebiasSummary, shown: Sequence[Output]) 
     verified = summary.verified
     chunks = f"{verified.chunks_checked} of {verified.chunks} chunks"
     say(f"checked: every index, and the contents of {chunks} (--verify {verified.mode})")
-    for output in shown:
+    for output in summary.shown if isinstance(summary.shown, list) else ():
         say(output.said)
     tell_losses(summary.losses)
 
