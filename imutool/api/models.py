@@ -77,7 +77,7 @@ def bias_at_rest(model: BiasModel, imu: Imu) -> InitialBias:
     return at_rest(model, imu)
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class DebiasedRecording:
     """Recording with debiased samples, and the bias that was subtracted.
 
@@ -94,6 +94,11 @@ class DebiasedRecording:
     std: Float64[np.ndarray, "n 6"]
     model: str
     start: InitialBias
+
+    def __repr__(self) -> str:
+        mean = ["(" + ", ".join(f"{x:+.5f}" for x in part) + ")" for part in self.bias.mean(axis=0).reshape(2, 3)]
+        bias = f"mean bias {mean[0]} rad/s, {mean[1]} m/s²" if len(self.bias) else "no samples"
+        return f"Debiased by {self.model} ({self.start.how}): {bias}\n{self.recording!r}"
 
     @property
     def imu(self) -> Imu:
