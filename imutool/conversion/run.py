@@ -147,7 +147,8 @@ def _find(source: Path, format: str) -> _Sequences:
         raise DataError(
             "no sequence found",
             where=source,
-            expected="a folder with mav0/imu0/data.csv, a .zip, .tar or .tar.gz of one, a ROS 1 .bag, or a folder of these",
+            expected="a ROS bag, an MCAP log, a PX4 or ArduPilot log, a table, a mav0 folder or its archive",
+            fix="Name the file itself: single logs and tables in a folder are not looked for" if source.is_dir() else "",
         )
     for place, jobs in claims.items():
         if len(jobs) > 1:
