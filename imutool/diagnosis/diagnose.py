@@ -26,17 +26,16 @@ from imutool.diagnosis.estimation.observability import unobservable, with_free
 from imutool.diagnosis.estimation.significance import scatter
 from imutool.diagnosis.estimation.whitening import WhitenedImu
 from imutool.diagnosis.held_out import resimulate
-from imutool.diagnosis.reference import (
+from imutool.diagnosis.reference.coverage import (
     align,
     align_all,
     check_without_reference,
     is_another_motion,
-    reference_caveat,
-    reference_errors,
     with_unique_names,
     without_unusable,
 )
-from imutool.diagnosis.result import Diagnosis, Finding
+from imutool.diagnosis.reference.errors import reference_caveat, reference_errors, turned_reference
+from imutool.diagnosis.result import Diagnosis, Finding, Located
 from imutool.diagnosis.settings import DiagnoseSettings
 from imutool.diagnosis.signals.compared_signals import with_signals
 from imutool.diagnosis.to_physics_file import NO_EFFECT
@@ -98,6 +97,7 @@ def diagnose(
     wrong, wrong_at = reference_errors(logs, settings.reference)
     named, unnamed_groups = ((), ()) if wrong else (candidates, unnamed_candidates(pairs))
     selection = select_effects(logs, named, unnamed_groups, lambda word: report(2, 4, f"trying {word}"))
+    wrong += turned_reference(logs, selection.whole.chosen, settings.reference)
     report(3, 4, "locating")
     paths = {recording.name: str(real) for recording, real in zip(recordings, reals, strict=True)}
     hidden = unobservable(logs, candidates, settings.search)
@@ -106,9 +106,8 @@ def diagnose(
         report(3, 4, "simulating again")
         diagnosis = _resimulated(diagnosis, logs, selection, simulated)
     caveat = reference_caveat(recordings) if simulated is None else ""
-    tried = dict.fromkeys(log.remark for log in logs_read if log.remark)
-    diagnosis = replace(diagnosis, remarks=(*another, *left_out, *diagnosis.remarks, *tried), caveat=caveat)
-    diagnosis = replace(diagnosis, findings=(*wrong, *diagnosis.findings), located=tuple(wrong_at) or diagnosis.located)
+    tried = tuple(dict.fromkeys(log.remark for log in logs_read if log.remark))
+    diagnosis = _with_reference(diagnosis, wrong, wrong_at, (*another, *left_out, *diagnosis.remarks, *tried), caveat)
     if sim is not None and len(reals) == 1 and (simulated is not None or signals):
         diagnosis = with_signals(diagnosis, reals[0], sim, signals, report, settings)
     report(4, 4, "")
@@ -130,6 +129,14 @@ def _resimulated(diagnosis: Diagnosis, logs: Sequence[WhitenedImu], selection: S
 def _has_imu(path: Location) -> bool:
     with Log(path) as log:
         return bool(log.imu_topics)
+
+
+def _with_reference(
+    diagnosis: Diagnosis, wrong: Sequence[Finding], wrong_at: Sequence[Located], remarks: tuple[str, ...], caveat: str
+) -> Diagnosis:
+    """Adds errors of the reference, with the remarks on it."""
+    findings, located = (*wrong, *diagnosis.findings), tuple(wrong_at) or diagnosis.located
+    return replace(diagnosis, findings=findings, located=located, remarks=remarks, caveat=caveat)
 
 
 def candidates_for(pairs: Sequence[Pair]) -> tuple[Effect, ...]:

@@ -43,7 +43,8 @@ def with_signals(
             expected="topics of one name and message in both logs",
             fix="Give both logs the topics of one robot",
         )
-    diagnosis = replace(diagnosis, remarks=(*diagnosis.remarks, *pairing.remarks))
+    if pairing.pairs:
+        diagnosis = replace(diagnosis, remarks=(*diagnosis.remarks, *pairing.remarks))
     for pair in pairing.pairs:
         report(3, 4, pair.name)
         diagnosis = _compared(diagnosis, pair, pairing, settings)

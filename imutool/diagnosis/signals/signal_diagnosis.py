@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Literal
 
 import msgspec
 import numpy as np
@@ -163,7 +164,7 @@ def _density(
     usable: Bool[np.ndarray, " n"],
     rate_hz: float,
     settings: NoiseSettings,
-    average: str = "median",
+    average: Literal["median", "mean"] = "median",
 ) -> tuple[Column, Column]:
     """Frequencies, and the one-sided density of the usable part of a signal, without lines.
 
