@@ -5,13 +5,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from jaxtyping import Bool, Float64
 
+from imutool.location import Location
 from imutool.recording import Poses
 from imutool.report import UNSET, Report, Section, UnsetType
 from imutool.units import ASCII_UNITS
@@ -248,6 +249,12 @@ class Diagnosis:
     signals: Mapping[str, SignalTraces] = field(default_factory=dict)  # by TOPIC.field
     caveat: str = ""
     closed: ClosedLoop | None = None
+
+    @classmethod
+    def without_imu(cls, reals: Sequence[Location], sim: Location) -> Diagnosis:
+        """A diagnosis to which only other signals are added."""
+        bias = np.full((len(reals), 6), np.nan)
+        return cls(tuple(map(str, reals)), str(sim), (), (), bias, (), {})
 
     @property
     def mismatch(self) -> bool:
