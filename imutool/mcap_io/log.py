@@ -33,14 +33,13 @@ from imutool.mcap_io.topics import (
     ScalarBatch,
     StampCheck,
     Topic,
+    reflected_topics,
     topics_of,
 )
 
 
 class Log:
     """An MCAP file or object in a store, open for reading.
-
-    It may have chunks, a summary and message indexes, or not.
 
     Memory is bounded by its largest chunk; one of more than `max_chunk` bytes is refused. An open `Source` can be given in
     place of a path. Times given to a method select by log time, both ends included. The first damage is an error;
@@ -64,12 +63,17 @@ class Log:
             with self.named():
                 self.index = self._read_index(self._source)
                 self.topics = MappingProxyType(topics_of(self.index))
+                imus = dict(reflected_topics(self.index, self.topics, self._first))
+                self.topics = MappingProxyType({**self.topics, **imus})
         except BaseException:
             self.close()
             raise
 
     def _read_index(self, source: Source) -> LogIndex:
         return LogIndex(source, self.max_chunk)
+
+    def _first(self, topic: str) -> bytes | None:
+        return next((bytes(rows.payload[0]) for _, rows in self.rows([topic])), None)
 
     def __enter__(self) -> Log:
         return self
@@ -120,10 +124,13 @@ class Log:
         """
         found = self.imu_topics
         if not found:
-            raise LogError("the log has no IMU topic", where=self.path, expected=f"{schemas.IMU} among {self.listing()}")
+            expected, fix = f"{schemas.IMU} among {self.listing()}", ""
+            if any(topic.message_encoding == "protobuf" for topic in self.topics.values()):
+                fix = "An IMU in protobuf is read with: pip install 'imutool[protobuf]'"
+            raise LogError("the log has no IMU topic", where=self.path, expected=expected, fix=fix)
         if len(found) > 1:
-            listed = ", ".join(found)
-            raise LogError(f"the log has {len(found)} IMU topics: {listed}", where=self.path, fix="Choose one with `imu`")
+            what = f"the log has {len(found)} IMU topics: {', '.join(found)}"
+            raise LogError(what, where=self.path, fix="Choose one with `imu`")
         return found[0]
 
     @property
@@ -152,9 +159,9 @@ class Log:
             raise LogError(f"there is no topic {name}", where=self.path, expected=self.listing())
         found = self.topics[name]
         if found.schema_name not in schema_names:
-            carried = found.schema_name or "messages without schema"
-            raise LogError(f"{name} carries {carried}", where=self.path, expected=" or ".join(schema_names))
-        if found.message_encoding not in ENCODINGS:
+            what = f"{name} carries {found.schema_name or 'messages without schema'}"
+            raise LogError(what, where=self.path, expected=" or ".join(schema_names))
+        if not found.is_read:
             raise LogError(f"{name} is encoded as {found.message_encoding!r}", where=self.path, expected=" or ".join(ENCODINGS))
         return found
 
@@ -254,9 +261,7 @@ class Log:
         encoding = self.topic(topic, (schemas.IMAGE,)).message_encoding
         for _, rows in self.rows([topic], start_ns, end_ns):
             with self.named(topic):
-                for payload in rows.payload:
-                    stamp_ns, _, image = decode_image(payload.tobytes(), encoding)
-                    yield stamp_ns, image
+                yield from (decode_image(payload.tobytes(), encoding)[::2] for payload in rows.payload)
 
     def channel_ids(self, topic: str) -> set[int]:
         """The channels of a topic."""
@@ -264,8 +269,7 @@ class Log:
 
     def keep(self, topics: Collection[str]) -> None:
         """Keeps the chunks that are read for some topics from now on: a copy need not read them again."""
-        channels = frozenset[int]().union(*(self.channel_ids(topic) for topic in topics))
-        self.kept = KeptChunks(self._source, channels, self.max_chunk)
+        self.kept = KeptChunks(self._source, {t: (self.topics[t], self.channel_ids(t)) for t in topics}, self.max_chunk)
 
     def rows(
         self, topics: Collection[str], start_ns: int | None = None, end_ns: int | None = None
@@ -273,8 +277,7 @@ class Log:
         """The messages of some topics in file order; each chunk is unpacked once for all topics."""
         wanted = {topic: self.channel_ids(topic) for topic in topics}
         every = set().union(*wanted.values()) if wanted else set()
-        first = -1 if start_ns is None else start_ns
-        last = 2**63 - 1 if end_ns is None else end_ns
+        first, last = -1 if start_ns is None else start_ns, 2**63 - 1 if end_ns is None else end_ns
         with self.named():
             for block in self.index.blocks:
                 if block.may_hold(every) and block.start_ns <= last and block.end_ns >= first:
@@ -293,5 +296,5 @@ class Log:
         inside = (times >= first) & (times <= last)
         for topic, channels in wanted.items():
             mask = inside & np.isin(found.heads["channel"], list(channels))
-            for rows in messages.rows(found, mask):
-                yield topic, rows
+            for heads, payload in self.topics[topic].cut(found, mask):
+                yield topic, messages.columns(heads, payload)

@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Shaped, UInt8
+from jaxtyping import Shaped, UInt8
 
 from imutool.mcap_io.blocks import MessageBlock, MessageIndexes, parse_message_indexes
 from imutool.mcap_io.codec import messages, records
 from imutool.mcap_io.codec.records import ChunkHead
 from imutool.mcap_io.storage.source import Source
+from imutool.mcap_io.topics import Topic
 
 NO_ENTRIES = np.zeros((0, 2), np.uint64)
 KEPT_BYTES = 6 << 20  # of messages: the first minute of a 200 Hz IMU, and all of a small log
@@ -58,7 +59,7 @@ class KeptChunk(NamedTuple):
 
     head: ChunkHead
     indexes: MessageIndexes
-    parts: Sequence[Part]
+    parts: Mapping[str, list[Part]]  # by topic
 
 
 class KeptChunks:
@@ -68,14 +69,15 @@ class KeptChunks:
     Whoever copies it must make sure that the file is still the same (`location.identity`).
     """
 
-    def __init__(self, source: Source, channels: frozenset[int], max_chunk: int) -> None:
-        self._source, self.channels, self._max_chunk = source, channels, max_chunk
+    def __init__(self, source: Source, topics: Mapping[str, tuple[Topic, set[int]]], max_chunk: int) -> None:
+        self._source, self._topics, self._max_chunk = source, topics, max_chunk
+        self._channels = set[int]().union(*(channels for _, channels in topics.values()))
         self._kept: dict[int, KeptChunk] = {}
         self._room = KEPT_BYTES
 
     def pop(self, block: MessageBlock, channels: set[int]) -> KeptChunk | None:
         """Hand over a chunk, if it was kept with the messages of these channels."""
-        return self._kept.pop(block.offset, None) if channels == self.channels else None
+        return self._kept.pop(block.offset, None) if channels == self._channels else None
 
     def rows(
         self, block: MessageBlock, wanted: Mapping[str, set[int]], first: int, last: int
@@ -85,18 +87,18 @@ class KeptChunks:
         Raises:
             LogError: the chunk is damaged.
         """
-        if not all(self.channels >= channels for channels in wanted.values()) or (parts := self._read(block)) is None:
+        if not wanted.keys() <= self._topics.keys() or (parts := self._read(block)) is None:
             return None
         found = []
-        for topic, channels in wanted.items():
-            for heads, payload in parts:
+        for topic in wanted:
+            for heads, payload in parts[topic]:
                 times = heads["log_time"].view(np.int64)
-                mask = _of(heads, channels) & (times >= first) & (times <= last)
+                mask = (times >= first) & (times <= last)
                 if mask.any():
                     found.append((topic, messages.columns(heads[mask], payload[mask])))
         return found
 
-    def _read(self, block: MessageBlock) -> Sequence[Part] | None:
+    def _read(self, block: MessageBlock) -> Mapping[str, list[Part]] | None:
         """Messages in a chunk, which is kept; None if its indexes are wrong, or there is no room."""
         if (known := self._kept.get(block.offset)) is not None:
             return known.parts
@@ -106,19 +108,14 @@ class KeptChunks:
         head, indexes, right, found = check_chunk(everything, block, self._max_chunk)
         if indexes is None or not right or found.definitions:
             return None
-        parts = list(parts_of(found, self.channels))
-        self._room -= sum(part.nbytes for pair in parts for part in pair)
+        parts = {name: list(parts_of(found, topic, channels)) for name, (topic, channels) in self._topics.items()}
+        self._room -= sum(column.nbytes for of_topic in parts.values() for part in of_topic for column in part)
         self._kept[block.offset] = KeptChunk(head, indexes._replace(entries=NO_ENTRIES), parts)
         return parts
 
 
-def parts_of(found: messages.Messages, channels: frozenset[int] | set[int]) -> Iterator[Part]:
-    """Messages of some channels, in stretches of one size."""
-    for heads, payload in messages.cut(found, _of(found.heads, channels)):
+def parts_of(found: messages.Messages, topic: Topic, channels: set[int]) -> Iterator[Part]:
+    """Messages of a topic's channels, in stretches of one size."""
+    of = found.heads["channel"]  # `np.isin` takes ten times as long for the few there are
+    for heads, payload in topic.cut(found, np.logical_or.reduce([of == channel for channel in channels])):
         yield Part(heads, payload)
-
-
-def _of(heads: Heads, channels: frozenset[int] | set[int]) -> Bool[np.ndarray, " n"]:
-    """Whether each message is of these channels; `np.isin` takes ten times as long for a few."""
-    of = heads["channel"]
-    return np.logical_or.reduce([of == channel for channel in channels]) if channels else np.zeros(len(of), bool)
