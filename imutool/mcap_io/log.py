@@ -213,8 +213,7 @@ class Log:
                     table = np.concatenate(entries)
                     yield messages.signed(table[np.argsort(table[:, 1], kind="stable"), 0])
                 elif (found := self.index.unpack_or_lose(block)) is not None:
-                    times = found.times()[np.isin(found.heads["channel"], list(channels))]
-                    if len(times):
+                    if len(times := found.times()[np.isin(found.heads["channel"], list(channels))]):
                         yield times
 
     def imu_batches(self, topic: str, start_ns: int | None = None, end_ns: int | None = None) -> Iterator[ImuBatch]:
@@ -269,7 +268,8 @@ class Log:
 
     def keep(self, topics: Collection[str]) -> None:
         """Keeps the chunks that are read for some topics from now on: a copy need not read them again."""
-        self.kept = KeptChunks(self._source, {t: (self.topics[t], self.channel_ids(t)) for t in topics}, self.max_chunk)
+        known = {t: (self.topics[t], self.channel_ids(t)) for t in topics if t in self.topics}
+        self.kept = KeptChunks(self._source, known, self.max_chunk)
 
     def rows(
         self, topics: Collection[str], start_ns: int | None = None, end_ns: int | None = None
