@@ -213,8 +213,8 @@ class Log:
                     table = np.concatenate(entries)
                     yield messages.signed(table[np.argsort(table[:, 1], kind="stable"), 0])
                 elif (found := self.index.unpack_or_lose(block)) is not None:
-                    if len(times := found.times()[np.isin(found.heads["channel"], list(channels))]):
-                        yield times
+                    times = found.times()[np.isin(found.heads["channel"], list(channels))]
+                    yield from [times] if len(times) else []
 
     def imu_batches(self, topic: str, start_ns: int | None = None, end_ns: int | None = None) -> Iterator[ImuBatch]:
         """The messages of an IMU topic in file order, a chunk at a time.
