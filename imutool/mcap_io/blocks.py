@@ -224,14 +224,16 @@ def too_large(what: str, offset: int, size: int, max_chunk: int) -> LogError:
 
 def cut_short(source: Source) -> LogError:
     """Where a log without an end stops, found by following its records."""
-    position, inside = len(MAGIC), "inside its first record"
+    position, last = len(MAGIC), -1
     while source.size - position >= HEAD.size:
         opcode, length = source.head(position)
         if length > source.size - position - HEAD.size:
             inside = f"inside the {records.name_of(opcode)} record that begins at byte {position}"
             break
-        position += HEAD.size + length
-        inside = f"after the {records.name_of(opcode)} record that ends at byte {position}"
+        position, last = position + HEAD.size + length, opcode
+    else:
+        inside = f"after the {records.name_of(last)} record that ends at byte {position}"
+        inside = inside if last >= 0 else "inside its first record"
     return LogError(f"the log is cut short at byte {source.size}, {inside}", expected="a log that ends", fix=CUT_SHORT)
 
 

@@ -1,17 +1,17 @@
 """Differences between operating systems: locks, memory, processes, copies by the kernel.
 
-
 Only this file uses what not every system has; elsewhere each function answers as well as the system allows.
 """
 
 from __future__ import annotations
 
 import contextlib
+import gc
 import os
 import signal
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import IO, Any
@@ -94,6 +94,18 @@ def opened(handle: int) -> Connection:
 
         return PipeConnection(handle)
     return Connection(handle)
+
+
+@contextlib.contextmanager
+def collector_paused() -> Iterator[None]:
+    """Pause Python's cycle collector, which would look again and again at millions of objects that stay."""
+    was_on = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if was_on:
+            gc.enable()
 
 
 def user() -> str:
