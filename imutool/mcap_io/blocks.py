@@ -232,8 +232,7 @@ def cut_short(source: Source) -> LogError:
             break
         position, last = position + HEAD.size + length, opcode
     else:
-        inside = f"after the {records.name_of(last)} record that ends at byte {position}"
-        inside = inside if last >= 0 else "inside its first record"
+        inside = "inside its first record" if last < 0 else f"after the {records.name_of(last)} record, at byte {position}"
     return LogError(f"the log is cut short at byte {source.size}, {inside}", expected="a log that ends", fix=CUT_SHORT)
 
 

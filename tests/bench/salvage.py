@@ -146,7 +146,7 @@ def hits(record: bytes, at: int) -> bool:
             found = messages.parse(unpacked, 0)
         except (zstandard.ZstdError, LogError):
             return False
-        contents.append([rows.payload.tobytes() for rows in messages.rows(found, found.heads["channel"] == 1)])
+        contents.append([payload.tobytes() for _, payload in messages.cut(found, found.heads["channel"] == 1)])
     return contents[0] != contents[1] and [len(one) for one in contents[0]] == [len(one) for one in contents[1]]
 
 

@@ -52,8 +52,10 @@ def problems(rng: random.Random, folder: Path) -> Iterator[str]:
     words = ["debias", "in.mcap", "out.mcap", "-q", "--init", rng.choice(STARTS)]
     words += ["--model", model] if model else []
     words += rng.choice(([], [], ["--smooth"], ["--clean"]))
-    with only_below(folder, "out.mcap") as wrong:
+    with only_below(folder, "out.mcap", "out") as wrong:
         commands = [words, ["info", "in.mcap", "--json", "-"], ["clean", "in.mcap", "--json", "-"]]
+        commands += [["evaluate", "in.mcap", *(["--model", model] if model else []), "--json", "-"]]
+        commands += [["export", "in.mcap", "out", "--format", "euroc", "-q"]]
         answers = [command(folder, *line) for line in rng.sample(commands, 2)]
     yield from wrong
     for done in answers:
