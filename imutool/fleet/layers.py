@@ -79,17 +79,23 @@ def _log(folder: Path, row: Mapping[str, Any]) -> FleetLog:
     """Log of a row: the debiased one where the fleet wrote it, else its source."""
     target = folder / row["target"]
     is_log = target.suffix == ".mcap" and target.is_file()
-    known = {name: row[name] for name in ("status", "score", "robot", "duration_s") if row[name] is not None}
-    facts = {**known, "losses": len(row["losses"])}
-    for bias in row["biases"][:1]:
-        facts["gyro_bias_deg_s"] = float(np.rad2deg(np.linalg.norm(bias["gyro_rad_s"])))
-        facts["accel_bias_m_s2"] = float(np.linalg.norm(bias["accel_m_s2"]))
-    if row["effects"] is not None:
-        facts["effects"] = len(row["effects"])
     diagnosis = target if row["effects"] is not None and target.is_file() else None
     place = str(target) if is_log else row["source"]
     name = str(Path(row["target"]).with_suffix("").as_posix())
-    return FleetLog(name, place, f"{row['target_sha256']}{row['key']}", diagnosis, facts)
+    return FleetLog(name, place, f"{row['target_sha256']}{row['key']}", diagnosis, _facts(row))
+
+
+def _facts(row: Mapping[str, Any]) -> dict[str, float | str]:
+    """Facts of a row: status, score, robot, counts, and the sizes of the first IMU's biases."""
+    facts = {name: row[name] for name in ("status", "score", "robot", "duration_s") if row[name] is not None}
+    facts |= {name: len(row[name]) for name in ("losses", "effects") if row[name] is not None}
+    return facts | _bias_sizes(row["biases"][0]) if row["biases"] else facts
+
+
+def _bias_sizes(bias: Mapping[str, Any]) -> dict[str, float]:
+    """Lengths of a gyro's and an accelerometer's bias."""
+    gyro, accel = (float(np.linalg.norm(bias[name])) for name in ("gyro_rad_s", "accel_m_s2"))
+    return {"gyro_bias_deg_s": float(np.rad2deg(gyro)), "accel_bias_m_s2": accel}
 
 
 def _joined(before: FleetLog | None, log: FleetLog) -> FleetLog:
@@ -145,11 +151,10 @@ def layers(log: FleetLog, cache: Path) -> Layers:
 def layer_of(entity: str) -> str:
     """Layer of an entity."""
     first, *rest = entity.strip("/").split("/")
-    if first == REMARKS or (first == "events" and rest == ["finding"]):
+    if first == REMARKS or (first, *rest) == ("events", "finding"):
         return "diagnosis"
-    if first == "legend" or "debiased" in rest or (first == "bias" and rest[-1:] != ["true"]) or rest == ["error_vec"]:
-        return "debiased"
-    return "raw"
+    of_model = first == "legend" or "debiased" in rest or (first == "bias" and rest[-1:] != ["true"]) or rest == ["error_vec"]
+    return "debiased" if of_model else "raw"
 
 
 def _write(log: FleetLog, data: RunData, cache: Path) -> None:

@@ -137,9 +137,7 @@ class _Session:
         """Keep a delay; of very many a random choice (reservoir sampling)."""
         if len(self._delays) < MAX_DELAYS:
             self._delays.append(delay_s)
-            return
-        place = int(self._random.integers(self._samples))
-        if place < MAX_DELAYS:
+        elif (place := int(self._random.integers(self._samples))) < MAX_DELAYS:
             self._delays[place] = delay_s
 
     def end(self, batches: _Batches) -> None:
@@ -160,15 +158,11 @@ class _Session:
                 f"the source sent no samples{why}", where="source", expected='{"t_ns": …, "gyro": […], "accel": […]}'
             )
         seconds = (self._last_ns - self._begin_ns) * 1e-9
-        delay = None
-        if self._delays:
-            median, p99, largest = np.percentile(self._delays, [50.0, 99.0, 100.0]) * 1e3
-            delay = Delay(float(median), float(p99), float(largest))
         return StreamStatistics(
             samples=self._samples,
             seconds=seconds,
             rate_hz=(self._samples - 1) / seconds if seconds > 0.0 else 0.0,
-            delay_ms=delay,
+            delay_ms=self._delay(),
             start=self._how,
             gaps=self._gaps,
             out_of_order=self._out_of_order,
@@ -178,6 +172,12 @@ class _Session:
             gyro_bias=self._bias[:3].tolist(),
             accel_bias=self._bias[3:].tolist(),
         )
+
+    def _delay(self) -> Delay | None:
+        """Percentiles of the delays; None where the stream ended before the start."""
+        if not self._delays:
+            return None
+        return Delay(*(np.percentile(self._delays, [50.0, 99.0, 100.0]) * 1e3).tolist())
 
     def _count(self, found: Sample) -> None:
         step_ns = found.stamp_ns - self._last_ns
@@ -242,10 +242,9 @@ class _Batches:
 
     def put(self, batch: list[Any]) -> None:
         """Hand a batch over without waiting."""
-        if not self.used or not batch:
-            return
         try:
-            self._queue.put_nowait(batch)
+            if self.used and batch:
+                self._queue.put_nowait(batch)
         except queue.Full:
             self.lost += len(batch)
 

@@ -24,15 +24,17 @@ ROSBRIDGE_PORT = 9090
 WAIT_S = 0.5  # for data, between looks at the time
 CONNECT_TIMEOUT_S = 5.0
 MAX_BYTES = 65_536  # of a message; a sample has some 200
-TYPES = ["sensor_msgs/Imu", "sensor_msgs/msg/Imu"]
+
+
+Vector = tuple[float, float, float]
 
 
 class Sample(NamedTuple):
     """Sample of an IMU: stamp (ns), rad/s, m/s², and the time of its arrival (s of `time.perf_counter`)."""
 
     stamp_ns: int
-    gyro: tuple[float, float, float]
-    accel: tuple[float, float, float]
+    gyro: Vector
+    accel: Vector
     arrival_s: float
 
 
@@ -41,7 +43,7 @@ class _Vector(msgspec.Struct):
     y: float
     z: float
 
-    def plain(self) -> tuple[float, float, float]:
+    def plain(self) -> Vector:
         return self.x, self.y, self.z
 
 
@@ -53,6 +55,11 @@ class _Stamp(msgspec.Struct):
     secs: int | None = None
     nsecs: int | None = None
 
+    def stamp_ns(self) -> int | None:
+        """Nanoseconds; None without a time."""
+        whole, rest = (self.sec, self.nanosec) if self.sec is not None else (self.secs, self.nsecs)
+        return None if whole is None else whole * 1_000_000_000 + (rest or 0)
+
 
 class _Header(msgspec.Struct):
     stamp: _Stamp
@@ -63,12 +70,23 @@ class _Message(msgspec.Struct):
 
     t_ns: int | None = None
     t_s: float | None = None
-    gyro: tuple[float, float, float] | None = None
-    accel: tuple[float, float, float] | None = None
+    gyro: Vector | None = None
+    accel: Vector | None = None
     header: _Header | None = None
     angular_velocity: _Vector | None = None
     linear_acceleration: _Vector | None = None
     msg: _Message | None = None
+
+    def stamp_ns(self) -> int | None:
+        """Nanoseconds; None without a time."""
+        if self.t_ns is not None or self.t_s is not None:
+            return self.t_ns if self.t_ns is not None else round(1e9 * (self.t_s or 0.0))
+        return None if self.header is None else self.header.stamp.stamp_ns()
+
+    def values(self) -> tuple[Vector | None, Vector | None]:
+        """Angular rate and specific force; None where there is none."""
+        rate = self.gyro or (self.angular_velocity and self.angular_velocity.plain())
+        return rate, self.accel or (self.linear_acceleration and self.linear_acceleration.plain())
 
 
 DECODER = msgspec.json.Decoder(_Message)
@@ -82,19 +100,12 @@ def sample(text: bytes | str, arrival_s: float) -> Sample:
     """
     message = DECODER.decode(text)
     message = message.msg or message
-    if message.gyro is not None and message.accel is not None:
-        if message.t_ns is None and message.t_s is None:
-            raise ValueError("no time: t_ns or t_s")
-        stamp_ns = message.t_ns if message.t_ns is not None else round(1e9 * (message.t_s or 0.0))
-        return Sample(stamp_ns, message.gyro, message.accel, arrival_s)
-    if message.header is None or message.angular_velocity is None or message.linear_acceleration is None:
+    stamp_ns, (gyro, accel) = message.stamp_ns(), message.values()
+    if gyro is None or accel is None:
         raise ValueError("neither gyro and accel nor a sensor_msgs/Imu")
-    stamp = message.header.stamp
-    whole, rest = (stamp.sec, stamp.nanosec) if stamp.sec is not None else (stamp.secs, stamp.nsecs)
-    if whole is None:
-        raise ValueError("no time in header.stamp")
-    stamp_ns = whole * 1_000_000_000 + (rest or 0)
-    return Sample(stamp_ns, message.angular_velocity.plain(), message.linear_acceleration.plain(), arrival_s)
+    if stamp_ns is None:
+        raise ValueError("no time: t_ns, t_s or header.stamp")
+    return Sample(stamp_ns, gyro, accel, arrival_s)
 
 
 @dataclass
@@ -248,10 +259,9 @@ def _rosbridge(name: str, malformed: Malformed) -> Samples:
 
 def _decoded(text: bytes | str, arrival_s: float, malformed: Malformed) -> Iterator[Sample]:
     """The sample of a message, if it holds one."""
-    if not text.strip():
-        return
     try:
-        yield sample(text, arrival_s)
+        if text.strip():
+            yield sample(text, arrival_s)
     except (msgspec.DecodeError, UnicodeDecodeError, ValueError, RecursionError) as error:
         malformed.add(text, error)
 
