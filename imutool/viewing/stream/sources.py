@@ -85,8 +85,8 @@ class _Message(msgspec.Struct):
 
     def values(self) -> tuple[Vector | None, Vector | None]:
         """Angular rate and specific force; None where there is none."""
-        rate = self.gyro or (self.angular_velocity and self.angular_velocity.plain())
-        return rate, self.accel or (self.linear_acceleration and self.linear_acceleration.plain())
+        rate, force = (None if v is None else v.plain() for v in (self.angular_velocity, self.linear_acceleration))
+        return self.gyro or rate, self.accel or force
 
 
 DECODER = msgspec.json.Decoder(_Message)
