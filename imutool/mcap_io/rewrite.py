@@ -13,9 +13,8 @@ recorders do, the copy states none.
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import nullcontext, suppress
+from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -37,6 +36,7 @@ from imutool.mcap_io.codec import messages, records
 from imutool.mcap_io.codec.records import HEAD, ChunkHead
 from imutool.mcap_io.index import LogIndex
 from imutool.mcap_io.log import Log
+from imutool.mcap_io.storage.system import give
 from imutool.mcap_io.storage.target import PassThrough
 from imutool.mcap_io.verify import Verified, check_data_crc, check_mode, stated_crc, verify
 from imutool.mcap_io.write import CHUNK_BYTES
@@ -113,8 +113,7 @@ def rewrite(
 def _copy_permissions(source: Path, target: Path) -> None:
     """Gives the target the mode of the source, and its owner where the system allows it."""
     status = source.stat()
-    with suppress(PermissionError):
-        os.chown(target, status.st_uid, status.st_gid)
+    give(target, status)
     target.chmod(status.st_mode & 0o7777)
 
 
