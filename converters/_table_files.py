@@ -5,6 +5,7 @@ A matrix of three columns `gyro` becomes the columns `gyro[0]`, `gyro[1]`, `gyro
 
 from __future__ import annotations
 
+import csv
 import re
 import zipfile
 from collections.abc import Callable, Iterator
@@ -15,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from imutool.errors import ConfigError, DataError
+from imutool.recording.message_log import Remarks
 
 from ._archive import refusing
 
@@ -28,12 +30,12 @@ COMMA_NUMBER = re.compile(r"[+-]?\d*,\d+([eE][+-]?\d+)?")
 
 @dataclass
 class Columns:
-    """Columns by name, rotation matrices, the texts of decimals, and notes."""
+    """Columns by name, rotation matrices, the texts of decimals, and remarks."""
 
     values: dict[str, np.ndarray] = field(default_factory=dict)
     matrices: dict[str, np.ndarray] = field(default_factory=dict)
     texts: dict[str, list[str]] = field(default_factory=dict)
-    notes: list[str] = field(default_factory=list)
+    remarks: Remarks = field(default_factory=Remarks)
 
     def add(self, name: str, array: Any) -> None:
         """Take in an array of numbers of one, two or three dimensions."""
@@ -117,26 +119,57 @@ def _is_number(text: str) -> bool:
 
 
 def _load_csv(path: Path, columns: Columns) -> None:
-    lines = [line for line in path.read_text(encoding="utf-8-sig", errors="replace").splitlines() if line.strip()]
+    read_csv(path.read_text(encoding="utf-8-sig", errors="replace"), columns, path)
+
+
+def read_csv(text: str, columns: Columns, path: Path) -> None:
+    """Add the columns of a table of text; `path` is its address for messages.
+
+    Raises:
+        DataError: a line is too long for a table.
+    """
+    lines = [line for line in text.splitlines() if line.strip()]
     if any(len(line) > MAX_LINE for line in lines):
         raise DataError("has a line of more than 65 536 characters", where=path, expected="a table of text")
     delimiter = _delimiter(lines)
     first = next((n for n, line in enumerate(lines) if sum(map(_is_number, line.split(delimiter))) >= 4), len(lines))
-    rows = [line.split(delimiter) for line in lines[first:]]
+    rows = _fields(lines[first:], delimiter)
     width = max(map(len, rows), default=0)
-    names = [name.strip().strip('"') for name in lines[first - 1].lstrip("# ").split(delimiter)] if first else []
+    names = _distinct([name.strip().strip('"') for name in lines[first - 1].lstrip("# ").split(delimiter)]) if first else []
     if len(names) != width:
         names = [f"column {number}" for number in range(1, width + 1)]
     whole = [row for row in rows if len(row) == width]
     if len(whole) < len(rows):
-        columns.notes.append(f"{len(rows) - len(whole)} rows do not have {width} fields and are left out")
+        columns.remarks.losses.append(f"{len(rows) - len(whole)} rows do not have {width} fields and are left out")
     for name, fields in zip(names, zip(*whole, strict=True), strict=True):
         texts = [text.strip().strip('"') for text in fields]
         if delimiter != "," and any(COMMA_NUMBER.fullmatch(text) for text in texts[:100]):
             texts[:] = [text.replace(",", ".") for text in texts]
-            columns.notes.append(f"{name}: decimal commas are read as points")
+            columns.remarks.notes.append(f"{name}: decimal commas are read as points")
         if (values := _numbers(texts)) is not None:
             columns.values[name], columns.texts[name] = values, texts
+
+
+def _fields(lines: list[str], delimiter: str | None) -> list[list[str]]:
+    """Fields of each line; in quotes the delimiter is text."""
+    if delimiter is not None and any('"' in line for line in lines[:20]):
+        return list(csv.reader(lines, delimiter=delimiter))
+    return [line.split(delimiter) for line in lines]
+
+
+def _distinct(names: list[str]) -> list[str]:
+    """Names of columns; one that repeats stands below the last that does not, as in a bag's messages written as a table.
+
+    `angular_velocity,x,y,z,linear_acceleration,x,y,z` has `angular_velocity.x`, `linear_acceleration.x`, ....
+    """
+    above, distinct = "", []
+    for text in names:
+        if names.count(text) > 1:
+            distinct.append(f"{above}.{text}" if above else text)
+        else:
+            above = text
+            distinct.append(text)
+    return distinct
 
 
 def _numbers(texts: list[str]) -> np.ndarray | None:

@@ -27,7 +27,7 @@ from imutool.bias_start.model_choice import check_smooth, choose_imus, choose_mo
 from imutool.bias_start.stretches import Sieve
 from imutool.cleaning import Cleaner, CleaningSettings, Survey, look
 from imutool.config import plain
-from imutool.errors import LogError, ModelError
+from imutool.errors import ConfigError, LogError, ModelError
 from imutool.location import Location
 from imutool.mcap_io.added_topics import DerivedBatch, NewTopic
 from imutool.mcap_io.codec import schemas
@@ -74,6 +74,7 @@ class DebiasedBlock(NamedTuple):
     std: Float64[np.ndarray, "n 6"]  # one standard deviation of it
 
 
+ENCODINGS = ("own", "cdr")  # of the new IMU topic
 BlockCallback = Callable[[DebiasedBlock], None]
 
 
@@ -153,6 +154,7 @@ def debias(
     max_chunk: int | None = None,
     clean: CleaningSettings | None = None,
     overwrite: bool = False,
+    encoding: str = "own",
     progress: Callable[[int, int], None] | None = None,
     watch: BlockCallback | None = None,
 ) -> DebiasReport:
@@ -165,6 +167,7 @@ def debias(
     Without a target the log itself is replaced; `check` is that of `mcap_io.rewrite`. The intact part of a damaged log is
     debiased from a repaired copy beside the target (`mcap_io.repair`), and `losses` lists the rest; it is not replaced. With
     `clean` a first pass finds samples to leave out or convert (`imutool.cleaning`); the record `imutool_clean` lists them.
+    The new IMU has the type and encoding of its source, or with `encoding` "cdr" those of ROS 2.
     A chunk of more than `max_chunk` bytes is not read into memory.
     `watch` is called with every batch of debiased samples, those of a damaged log again when its repaired copy is debiased.
 
@@ -177,7 +180,9 @@ def debias(
     """
     check_smooth(init, smooth)
     check_mode(check)
-    options = _Options(model, imus, init, smooth, clean, check, overwrite, watch)
+    if encoding not in ENCODINGS:
+        raise ConfigError(f"{encoding!r}", where="encoding", expected=" or ".join(ENCODINGS))
+    options = _Options(model, imus, init, smooth, clean, check, overwrite, encoding, watch)
     refusal: LogError | None = None
     try:
         if (log := _open_intact(source, max_chunk)) is not None:
@@ -213,6 +218,7 @@ class _Options:
     clean: CleaningSettings | None
     check: str
     overwrite: bool
+    encoding: str
     watch: BlockCallback | None
 
 
@@ -251,13 +257,11 @@ def _debias(
             }
             return entries | {_record_name(CLEAN_RECORD, topic, records): found.record() for topic, found in surveys.items()}
 
-        report = rewrite(
-            log, target, derived, metadata=metadata, overwrite=options.overwrite, check=options.check, progress=progress
-        )
+        chosen_ways = {"overwrite": options.overwrite, "own_encoding": options.encoding == "own"}
+        report = rewrite(log, target, derived, metadata=metadata, check=options.check, progress=progress, **chosen_ways)
     for topic, sieve in sieves.items():
         for text in sieve.warnings():
             logger.warning("%s %s: %s", source, topic, text)
-    losses.unchecked_in = losses.unchecked_in or {0: report.unchecked}
     losses.unchecked_in = losses.unchecked_in or {0: report.unchecked}
     return DebiasReport(models, starts, report, losses, surveys, sieves)
 

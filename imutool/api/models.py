@@ -77,7 +77,7 @@ def bias_at_rest(model: BiasModel, imu: Imu) -> InitialBias:
     return at_rest(model, imu)
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class DebiasedRecording:
     """Recording with debiased samples, and the bias that was subtracted.
 
@@ -94,6 +94,11 @@ class DebiasedRecording:
     std: Float64[np.ndarray, "n 6"]
     model: str
     start: InitialBias
+
+    def __repr__(self) -> str:
+        mean = ["(" + ", ".join(f"{x:+.5f}" for x in part) + ")" for part in self.bias.mean(axis=0).reshape(2, 3)]
+        bias = f"mean bias {mean[0]} rad/s, {mean[1]} m/s²" if len(self.bias) else "no samples"
+        return f"Debiased by {self.model} ({self.start.how}): {bias}\n{self.recording!r}"
 
     @property
     def imu(self) -> Imu:
@@ -118,6 +123,7 @@ def debias(
     imus: Sequence[str] = (),
     in_place: bool = False,
     check: str = "imu",
+    encoding: str = "own",
     overwrite: bool = False,
     progress: Progress | None = None,
 ) -> DebiasReport: ...
@@ -133,6 +139,7 @@ def debias(
     imus: Sequence[str] = (),
     in_place: bool = False,
     check: str = "imu",
+    encoding: str = "own",
     overwrite: bool = False,
     progress: Progress | None = None,
 ) -> DebiasedRecording | DebiasReport:
@@ -153,8 +160,9 @@ def debias(
         imus: IMU topics of a log to debias; by default the only one.
         in_place: Replace the log `source` instead of writing `target`.
         check: Chunks of a log whose CRC is compared: `imu`, `all` or `none`.
+        encoding: Of the new IMU topic: `own`, that of its source, or `cdr`.
         overwrite: Replace an existing `target`.
-        progress: Callback with bytes done and bytes in all.
+        progress: Callback with bytes done and in all.
 
     Raises:
         ConfigError: A file cannot be opened, `target` is missing or exists, or options contradict each other.
@@ -177,11 +185,10 @@ def debias(
         raise ConfigError("a loaded model", where="model", expected="a model file, whose digest goes into the log")
     if in_place == (target is not None):
         raise ConfigError("`target` and `in_place`", where="debias", expected="one of the two")
-    out = None if target is None else location(target)
-    given = list(model.values()) if isinstance(model, Mapping) else model
+    out, given = None if target is None else location(target), list(model.values()) if isinstance(model, Mapping) else model
     check_outputs([OutputFile("target", out, outputs.LOG)], [source, given], overwrite=overwrite)
-    run = partial(debiasing.debias, location(source), out, model=model, imus=imus, init=init, smooth=smooth)
-    return run(check=check, overwrite=overwrite, progress=progress)
+    run = partial(debiasing.debias, location(source), out, model=model, imus=imus, init=init, smooth=smooth, check=check)
+    return run(encoding=encoding, overwrite=overwrite, progress=progress)
 
 
 def _debias_recording(recording: Recording, model: object, init: str, smooth: bool) -> DebiasedRecording:

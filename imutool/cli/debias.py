@@ -25,6 +25,7 @@ MODEL_HELP = (
 )
 CLEAN_HELP = "Drop invalid samples and convert units, as imutool clean does."
 REPORT_HELP = "Write an HTML page about the debiased log."
+ENCODING_HELP = "Encoding of the new IMU topic: that of its source, or CDR."
 VERIFY_HELP = "Chunks of OUT to read back: all, those with IMU messages (imu), or none."
 
 
@@ -43,6 +44,7 @@ def debias(
     verify: Annotated[str, typer.Option(metavar="all|imu|none", help=VERIFY_HELP)] = "imu",
     in_place: Annotated[bool, typer.Option("--in-place", help="Replace IN with the complete result.")] = False,
     clean: Annotated[bool, typer.Option("--clean", help=CLEAN_HELP)] = False,
+    encoding: Annotated[str, typer.Option(metavar="own|cdr", help=ENCODING_HELP)] = "own",
     view: Annotated[bool, typer.Option("--view", help="Show the progress in a new viewer.")] = False,
     connect: Annotated[
         str | None, typer.Option(metavar="URL", help="Show the progress in a running viewer: HOST:PORT.")
@@ -75,13 +77,13 @@ def debias(
             max_chunk=max_chunk,
             clean=CleaningSettings() if clean else None,
             overwrite=overwrite and not in_place,
+            encoding=encoding,
             progress=lambda done, total: tell(done, total, ""),
             watch=watch,
         )
-    shown = None if watch is None else watch.shown
-    summary = _summary(report, str(target or source), shown, report_to, clean)
+    summary = _summary(report, str(target or source), None if watch is None else watch.shown, report_to, clean)
     if not (json_only := write_json(summary, json_to, overwrite=overwrite)):
-        _say(report, summary, shown or ())
+        _say(report, summary)
     if report_to is not None:  # last: should it fail, the log is there all the same, and that has been said
         with progress("Drawing", verbose, quiet):
             _draw(to_location(target or source), list(report.starts), report_to, overwrite)
@@ -167,7 +169,7 @@ def _summary(
     )
 
 
-def _say(report: DebiasReport, summary: DebiasSummary, shown: Sequence[Output]) -> None:
+def _say(report: DebiasReport, summary: DebiasSummary) -> None:
     """Print starts, counts and verification."""
     for topic, survey in report.surveys.items():
         say(f"{topic}: {survey.verdict}, score {survey.score:.3f}, {survey.valid} of {survey.messages} samples valid")
@@ -180,7 +182,7 @@ def _say(report: DebiasReport, summary: DebiasSummary, shown: Sequence[Output]) 
     verified = summary.verified
     chunks = f"{verified.chunks_checked} of {verified.chunks} chunks"
     say(f"checked: every index, and the contents of {chunks} (--verify {verified.mode})")
-    for output in shown:
+    for output in summary.shown if isinstance(summary.shown, list) else ():
         say(output.said)
     tell_losses(summary.losses)
 

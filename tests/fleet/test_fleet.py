@@ -8,6 +8,7 @@ import os
 import re
 import shutil
 import signal
+import socket
 import subprocess
 import sys
 import time
@@ -32,6 +33,7 @@ from imutool.fleet.run import Progress, run
 from imutool.fleet.task import Result, Settings, Task, with_model_hash
 from imutool.fleet.work import work
 from imutool.location import to_location
+from imutool.mcap_io.storage import system
 from imutool.mcap_io.storage.source import sha256
 from imutool.report import json_values
 
@@ -138,6 +140,22 @@ def test_somebody_elses_file_stays(fleet: Path, engine: Workers, tmp_path: Path)
     assert theirs.read_text() != "theirs"
 
 
+def test_a_target_of_which_every_note_was_hit_is_kept_and_with_overwrite_it_alone_is_done_again(
+    fleet: Path, engine: Workers, tmp_path: Path
+) -> None:
+    """Nothing says any more that the fleet wrote it; `resume` with `overwrite` goes on all the same."""
+    out = tmp_path / "out"
+    run(str(fleet), str(out), INFO, engine)
+    journal, before = out / NAME, sorted((path, path.read_bytes()) for path in out.rglob("*.json"))
+    journal.write_bytes(journal.read_bytes().replace(b"robot_a", b"r\0b\0t_a"))
+    kept = run(str(fleet), str(out), INFO, engine, resume=True)
+    assert dict(kept.progress.statuses) == {"failed": 1, "skipped": 1}
+    assert "robot_a/log.json: the target exists" in kept.not_whole[0].error
+    again = run(str(fleet), str(out), INFO, engine, resume=True, overwrite=True)
+    assert dict(again.progress.statuses) == {"ok": 1, "skipped": 1}
+    assert sorted((path, path.read_bytes()) for path in out.rglob("*.json")) == before
+
+
 @pytest.mark.parametrize("name", ["fleet.parquet", "fleet.json", "page.html"])
 def test_a_table_or_page_that_no_fleet_wrote_stays(fleet: Path, tmp_path: Path, name: str) -> None:
     out = tmp_path / "out"
@@ -164,7 +182,7 @@ def test_more_memory_than_there_is_is_refused(ray_started: None) -> None:
 def test_there_are_as_many_workers_as_there_is_memory_for(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     limit = tmp_path / "memory.max"
     limit.write_text(f"{3 << 30}\n")
-    monkeypatch.setattr(engines, "CGROUP_LIMITS", (str(limit),))
+    monkeypatch.setattr(system, "CGROUP_LIMITS", (str(limit),))
     assert ProcessEngine(workers=8, memory_bytes=1 << 30).workers == 3
     assert ProcessEngine(workers=2, memory_bytes=1 << 30).workers == 2
     with pytest.raises(ConfigError, match=r"at most 3\.00 GiB"):
@@ -188,6 +206,22 @@ def test_a_cluster_that_cannot_be_reached_is_told_without_its_secrets(
         with pytest.raises(ConfigError, match=r"address=.*127\.0\.0\.1:1: no answer") as error:
             RayEngine(address)
         assert "hush" not in str(error.value)
+
+
+def test_a_port_where_something_else_listens_is_refused_in_time(monkeypatch: pytest.MonkeyPatch, ray_started: None) -> None:
+    import ray
+
+    own = ray.get_runtime_context().gcs_address
+    monkeypatch.setattr(ray, "is_initialized", lambda: False)
+    monkeypatch.setattr(ray, "init", lambda **_: None)
+    monkeypatch.setattr(engines, "ANSWER_S", 0.3)
+    with socket.create_server(("127.0.0.1", 0)) as silent:
+        began = time.monotonic()
+        with pytest.raises(ConfigError, match=r"no answer \(timed out\).*expected a Ray cluster"):
+            RayEngine(f"127.0.0.1:{silent.getsockname()[1]}")
+        assert time.monotonic() - began < SOON_S
+    engine = RayEngine(own)  # a cluster's own port answers as it should
+    assert engine.slots >= 1
 
 
 @pytest.mark.parametrize("library", ["ray", "pyarrow"])

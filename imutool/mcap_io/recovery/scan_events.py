@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass, field
+from itertools import groupby
 from typing import NamedTuple
 
 import numpy as np
@@ -85,6 +87,12 @@ class Gap:
 Event = LogStart | LogEnd | Definition | ScannedBlock | Gap  # what decides whose log a block is, in file order
 
 
+def definition_runs(events: Sequence[Event]) -> dict[int, list[Definition]]:
+    """Definitions outside chunks that follow one another, by the identity of the first."""
+    runs = [[e for e in run if isinstance(e, Definition)] for kind, run in groupby(events, type) if kind is Definition]
+    return {id(run[0]): run for run in runs}
+
+
 class ScanResult:
     """Blocks, other records and gaps of a file as a scan meets them."""
 
@@ -102,20 +110,24 @@ class ScanResult:
 
     def add_block(self, block: MessageBlock, found: messages.Messages, head: records.ChunkHead | None) -> None:
         """Notes the counts, times and definitions of a block."""
-        times = found.heads["log_time"][found.heads["log_time"] < LATEST_NS]
-        block.counts = dict(Counter(found.heads["channel"].tolist()))
-        if len(times):
-            block.start_ns, block.end_ns = int(times.min()), int(times.max())
+        sizes, spans = {}, {}
+        if len(found.heads) == 1:  # in a tenth of the time; some logs have nothing else
+            _, length, channel, _, time_ns, _ = found.heads[0].item()
+            block.counts, sizes = {channel: 1}, {channel: (length, length)}
+            spans = {channel: (time_ns, time_ns)} if time_ns < LATEST_NS else {}
+        else:
+            block.counts = dict(Counter(found.heads["channel"].tolist()))
+            for channel in block.counts:
+                own = found.heads[found.heads["channel"] == channel]
+                sizes[channel] = int(own["length"].min()), int(own["length"].max())
+                possible = own["log_time"][own["log_time"] < LATEST_NS]
+                if len(possible):
+                    spans[channel] = int(possible.min()), int(possible.max())
+        if spans:
+            block.start_ns, block.end_ns = min(first for first, _ in spans.values()), max(last for _, last in spans.values())
         defined = [(opcode, found.data[first : first + length].tobytes()) for opcode, first, length in found.definitions]
         self.items.append(block)
         size, crc = (head.size, head.crc) if head else (block.length, 0)
-        sizes, spans = {}, {}
-        for channel in block.counts:
-            own = found.heads[found.heads["channel"] == channel]
-            sizes[channel] = int(own["length"].min()), int(own["length"].max())
-            possible = own["log_time"][own["log_time"] < LATEST_NS]
-            if len(possible):
-                spans[channel] = int(possible.min()), int(possible.max())
         self.events.append(ScannedBlock(block, (block.start_ns, block.end_ns, size), crc, defined, sizes, spans))
         self.used_channels.update(block.counts)
 
@@ -140,6 +152,8 @@ class ScanResult:
 
     def cut_back(self, start: int, end: int) -> None:
         """Gives up the last record, which a proven chunk shows to be cut off."""
+        if isinstance(self.events[-1], Definition) and self.events[-1].offset == start:
+            self.events.pop()
         for block in reversed(self.items[-1:]):
             if isinstance(block, MessageBlock) and block.compression is None and block.offset + block.length == end:
                 block.length, block.end = start - block.offset, start
