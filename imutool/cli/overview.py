@@ -17,13 +17,14 @@ COMMANDS: Mapping[str, tuple[str, str]] = {  # by name: the module, and the firs
     "evaluate": ("evaluate", "Integrate the IMU from the true start, raw and debiased, and score it on the truth."),
     "vio": ("evaluate", "Score a visual-inertial estimate on the log's IMU, raw and with each model."),
     "view": ("view", "Show truth, raw and debiased: in the Rerun viewer, in a browser, or as files."),
+    "live": ("live", "Debias a stream of samples as it comes, show it, and measure the delay."),
     "simulate": ("simulate", "Simulate an IMU along the poses of a log, with a sensor's physics and noise."),
     "conceal": ("simulate", "Make a sealed blind case, or open one and score the findings."),
     "diagnose": ("diagnose", "Find physics that a simulation leaves out, by comparison with a recording."),
     "models": ("shipped", "List the models that ship, their sensor and their card."),
     "schema": ("shipped", "Print the JSON Schema of a report, or list the reports."),
     "demo": ("shipped", "Run a demo without download: convert, train, debias, evaluate, view."),
-    "fleet": ("fleet", "Process many logs on all cores of this machine, or on a Ray cluster."),
+    "fleet": ("fleet_view", "Process many logs on all cores of this machine, or on a Ray cluster."),
 }
 MODULES = tuple(dict.fromkeys(module for module, _ in COMMANDS.values()))
 ABOUT = "Convert IMU recordings to MCAP, train bias models, debias logs, diagnose and view them."

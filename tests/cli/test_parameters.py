@@ -21,7 +21,7 @@ def test_the_page_of_help_lists_every_command_with_its_own_words(capsys: pytest.
     own = {name: (command.help or "").splitlines()[0] for name, command in COMMANDS.items()}
     assert {name: text for name, (_, text) in overview.COMMANDS.items()} == own
     homes = {c.callback.__module__: c.name for c in cli.load().registered_commands if c.callback is not None}
-    assert {f"imutool.cli.{module}" for module in overview.MODULES} == homes.keys() | {"imutool.cli.fleet"}
+    assert {f"imutool.cli.{module}" for module in overview.MODULES} == homes.keys() | {"imutool.cli.fleet_view"}
     overview.show()
     shown = capsys.readouterr().out
     assert all(name in shown for name in own)
