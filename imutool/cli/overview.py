@@ -21,6 +21,7 @@ COMMANDS: Mapping[str, tuple[str, str]] = {  # by name: the module, and the firs
     "simulate": ("simulate", "Simulate an IMU along the poses of a log, with a sensor's physics and noise."),
     "conceal": ("simulate", "Make a sealed blind case, or open one and score the findings."),
     "diagnose": ("diagnose", "Find physics that a simulation leaves out, by comparison with a recording."),
+    "audit": ("diagnose", "Find what a simulator's IMU does wrong by itself."),
     "models": ("shipped", "List the models that ship, their sensor and their card."),
     "schema": ("shipped", "Print the JSON Schema of a report, or list the reports."),
     "demo": ("shipped", "Run a demo without download: convert, train, debias, evaluate, view."),
