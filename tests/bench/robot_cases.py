@@ -42,7 +42,10 @@ def compared(folder: Path) -> dict[str, Any]:
             continue
         rest.remove(match)
         if effect["effect"] == "unknown":
-            named += match.variable in effect["parameters"]
+            right = match.variable in effect["parameters"]
+            named += right
+            if not right:
+                rest.append(match)
             continue
         named += 1
         for name, value in effect["parameters"].items():
@@ -54,7 +57,7 @@ def compared(folder: Path) -> dict[str, Any]:
         "kind": truth["kind"],
         "effects": len(truth["effects"]),
         "named": named,
-        "false": [(f.effect, f.signal, f.variable) for f in rest],
+        "false": [(f.effect, f.signal, f.variable, round(f.share, 5)) for f in rest],
         "values": values,
         "inside": sum(abs(estimate - value) <= DEVIATIONS * std for _, value, estimate, std in values),
         "seconds": round(time.perf_counter() - began, 1),

@@ -31,12 +31,12 @@ FLIGHT_EFFECTS = (
 EFFECTS = {"arm": ARM_EFFECTS, "wheels": WHEEL_EFFECTS, "flight": FLIGHT_EFFECTS}
 Torque = Callable[[Any, Any], Any]
 UNNAMED: Mapping[str, tuple[str, Callable[[float], Torque]]] = {
-    "dq0 |dq0|": ("square drag", lambda c: lambda q, dq: np.array([c * dq[0] * abs(dq[0]), 0.0])),
-    "sin(3 q0)": ("detent", lambda c: lambda q, dq: np.array([c * np.sin(3.0 * q[0]), 0.0])),
-    "q0^3": ("hardening spring", lambda c: lambda q, dq: np.array([c * q[0] ** 3, 0.0])),
-    "dq0^3": ("cubic drag", lambda c: lambda q, dq: np.array([c * dq[0] ** 3, 0.0])),
-    "q0 dq0": ("drag by angle", lambda c: lambda q, dq: np.array([c * q[0] * dq[0], 0.0])),
-    "1/(1 + dq0^2)": ("lubrication", lambda c: lambda q, dq: np.array([2.0 * c / (1.0 + dq[0] ** 2), 0.0])),
+    "velocity[0] |velocity[0]|": ("square drag", lambda c: lambda q, dq: np.array([c * dq[0] * abs(dq[0]), 0.0])),
+    "sin(3 position[0])": ("detent", lambda c: lambda q, dq: np.array([c * np.sin(3.0 * q[0]), 0.0])),
+    "position[0]^3": ("hardening spring", lambda c: lambda q, dq: np.array([c * q[0] ** 3, 0.0])),
+    "velocity[0]^3": ("cubic drag", lambda c: lambda q, dq: np.array([c * dq[0] ** 3, 0.0])),
+    "position[0] velocity[0]": ("drag by angle", lambda c: lambda q, dq: np.array([c * q[0] * dq[0], 0.0])),
+    "1/(1 + (velocity[0]/s)^2)": ("lubrication", lambda c: lambda q, dq: np.array([2.0 * c / (1.0 + dq[0] ** 2), 0.0])),
 }
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import msgspec
@@ -13,6 +13,7 @@ from scipy.ndimage import median_filter
 from scipy.signal import welch
 
 from imutool.diagnosis.estimation.candidate_score import Selection
+from imutool.diagnosis.estimation.gauss_newton import fit
 from imutool.diagnosis.estimation.jacobians import Chosen, expected
 from imutool.diagnosis.estimation.model_selection import select_effects
 from imutool.diagnosis.estimation.noise_estimate import noise_std, ridge_fit
@@ -26,6 +27,7 @@ from imutool.diagnosis.result import Estimate, Finding, HeldOut, Located, Signal
 from imutool.diagnosis.settings import DiagnoseSettings, NoiseSettings
 from imutool.diagnosis.signals import common_effects as common
 from imutool.diagnosis.signals.alignment import AlignedSignal, Column, aligned
+from imutool.diagnosis.signals.equations import terms
 from imutool.diagnosis.signals.ideal_signal import SignalPair
 from imutool.diagnosis.summarize import finding_of
 from imutool.mcap_io.fields import Fields
@@ -42,6 +44,9 @@ from imutool.sensor.robot_effects import (
 )
 
 EXACT = 1e-3
+MODEL_ERROR = 0.01  # of a misfit, that the error of learnt dynamics may be
+SMALL_GAIN = 1e-3  # of the largest effect's squares, which such an error may take (3 % of its size)
+CURVE_SHARE = 0.03  # of the misfit that a curve has to explain beyond an equation
 RICH_KNOTS = 12
 CERTAIN = 6.0  # deviations from which a constant is a finding
 NO_EPOCH = "{}: the two clocks share no epoch; aligned by the signal ({:+.3f} s), so that a delay between them cannot be seen"
@@ -97,14 +102,29 @@ def diagnose_signal(
         always = ((common.delay(0.0, common.delay_step_s(signal)), np.zeros(1)), *always)
         candidates = [effect for effect in candidates if effect.name not in DELAYS]
     columns = range(signal.columns)
-    later = [[e for k in columns for e in common.driven(signal, k)], [e for k in columns for e in common.unknown(signal, k)]]
     log = _whitened(signal, np.stack([_rich_residual(signal, k) for k in columns], axis=1), lsb)
-    selection = select_effects([log], candidates, later, always=always)
+    selection = _selected(log, candidates, always)
     rewhitened = _whitened(signal, signal.real - expected(signal, selection.whole.chosen), lsb)
     if (noise_std(rewhitened.whiten) < settings.signal.better_noise * noise_std(log.whiten)).any():
         log = rewhitened  # the effects' own high frequencies were taken for noise
-        selection = select_effects([log], candidates, later, always=always)
+        selection = _selected(log, candidates, always)
     return _summarized(log, candidates, selection, lsb, settings)
+
+
+def _selected(log: WhitenedLog, candidates: Sequence[Effect], always: Chosen) -> Selection:
+    """Effects of the catalogue, channels that drive and terms of equations; a curve where none of them stands out."""
+    signal: AlignedSignal = log.pair  # type: ignore[assignment]  # it was made of one
+    columns = range(signal.columns)
+    driven = [effect for k in columns for effect in common.driven(signal, k)]
+    equations = [effect for k in columns for effect in terms(signal, k)]
+    selection = select_effects([log], candidates, [driven, equations], always=always)
+    if selection.whole.reduced_chi_square < signal.settings.search.explained_chi_square:
+        return selection
+    curves = [effect for k in columns for effect in common.unknown(signal, k)]
+    curved = select_effects([log], candidates, [driven, curves], always=always)
+    before = fit([log], always, part="all").objective
+    gain = selection.whole.objective - curved.whole.objective
+    return curved if gain > CURVE_SHARE * (before - selection.whole.objective) else selection
 
 
 def catalogue(signal: AlignedSignal) -> list[Effect]:
@@ -211,6 +231,7 @@ def _summarized(
 ) -> SignalDiagnosis:
     pair: AlignedSignal = log.pair  # type: ignore[assignment]  # it was made of one
     level, logs, names = noise_floor([log]), [log], pair.names
+    selection, small = _above_model_error(pair, selection)
     before, after = with_effects(pair, ()), with_effects(pair, selection.whole.chosen)
     findings = [finding_of(logs, selection, selected, level) for selected in selection.selected]
     p_values = {name: min((f.p_value for f in findings if f.signal in (name, pair.name)), default=1.0) for name in names}
@@ -224,9 +245,13 @@ def _summarized(
             floor[k] = np.hypot(level[k], lsb[k] / np.sqrt(12.0))
     offsets = dict(_offsets(pair, selection))
     findings += _constants(pair, offsets, level)
+    if pair.band_hz is not None:  # dynamics that were learnt are known to a per cent
+        floor = level = np.hypot(
+            level, MODEL_ERROR * np.array([held_out_rms(logs, [before], [before], n).rms_before for n in names])
+        )
     unexplained = unexplained_residuals(logs, [after], floor, settings.held_out)
     hidden = () if pair.shares_epoch else tuple(f"{name}.delay" for name in names)
-    unseen = [] if pair.columns == 1 else _unseen(log, candidates, selection, settings)
+    unseen = [] if pair.columns == 1 else [*small, *_unseen(log, candidates, selection, settings)]
     return SignalDiagnosis(
         located=tuple(located),
         findings=tuple(findings),
@@ -242,6 +267,16 @@ def _summarized(
             for k, name in enumerate(names)
         },
     )
+
+
+def _above_model_error(pair: AlignedSignal, selection: Selection) -> tuple[Selection, list[str]]:
+    """Selection without effects as small as the error of learnt dynamics, and those effects."""
+    if pair.band_hz is None or not selection.selected:
+        return selection, []
+    least = SMALL_GAIN * max(selected.gain for selected in selection.selected)
+    kept = tuple(selected for selected in selection.selected if selected.gain >= least)
+    small = [selected.effect for selected in selection.selected if selected.gain < least]
+    return replace(selection, selected=kept), [f"{effect.name} of {', '.join(effect.sensors)}" for effect in small]
 
 
 def _unseen(log: WhitenedLog, candidates: Sequence[Effect], selection: Selection, settings: DiagnoseSettings) -> Iterator[str]:
