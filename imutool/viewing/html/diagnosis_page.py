@@ -85,7 +85,7 @@ def _findings(d: Diagnosis) -> Iterator[str]:
         cells = [
             f"<strong>{text(label(finding))}</strong> {text(finding.signal)}"
             f"<br>{text(effect_sentence(d, finding))}{_similar(finding)}",
-            f"<code>{text(finding.equation)}</code>{_entries(finding)}",
+            f"<code>{text(finding.equation)}</code>{_python(finding)}{_entries(finding)}",
             _gain(finding),
             f"<span class=entry>{text(chance_text(finding.false_discovery_rate, short=True))}</span>",
         ]
@@ -117,6 +117,10 @@ def _entries(finding: Finding) -> str:
             listed = "; ".join(f"<span class=entry>{text(entry)}</span>" for entry in entries)
             out.append(f"<br>{text(quantity.label)} {listed} {text(unit)}".rstrip())
     return "".join(out)
+
+
+def _python(finding: Finding) -> str:
+    return f"<pre>{text(finding.python)}</pre>" if finding.python else ""
 
 
 def _locations(d: Diagnosis) -> Iterator[str]:
