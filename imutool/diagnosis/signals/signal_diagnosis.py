@@ -41,6 +41,7 @@ from imutool.sensor.robot_effects import (
 
 EXACT = 1e-3
 MODEL_ERROR = 0.01  # of a misfit, that the error of learnt dynamics may be
+LEARNT_ERROR = 0.003  # of the efforts themselves
 SMALL_GAIN = 1e-3  # of the largest effect's squares, which such an error may take (3 % of its size)
 CURVE_SHARE = 0.03  # of the misfit that a curve has to explain beyond an equation
 CERTAIN = 6.0  # deviations from which a constant is a finding
@@ -137,7 +138,7 @@ def _summarized(
 ) -> SignalDiagnosis:
     pair: AlignedSignal = log.pair  # type: ignore[assignment]  # it was made of one
     level, logs, names = noise_floor([log]), [log], pair.names
-    selection, small = _above_model_error(pair, selection)
+    selection, small = _above_model_error(log, selection, level)
     before, after = with_effects(pair, ()), with_effects(pair, selection.whole.chosen)
     findings = [_with_python(finding_of(logs, selection, selected, level)) for selected in selection.selected]
     p_values = {name: min((f.p_value for f in findings if f.signal in (name, pair.name)), default=1.0) for name in names}
@@ -182,14 +183,21 @@ def _with_python(finding: Finding) -> Finding:
     return msgspec.structs.replace(finding, python=python(finding.variable, finding.signal.rpartition(".")[2]))
 
 
-def _above_model_error(pair: AlignedSignal, selection: Selection) -> tuple[Selection, list[str]]:
+def _above_model_error(log: WhitenedLog, selection: Selection, level: Float64[np.ndarray, " k"]) -> tuple[Selection, list[str]]:
     """Selection without effects as small as the error of learnt dynamics, and those effects."""
+    pair: AlignedSignal = log.pair  # type: ignore[assignment]  # it was made of one
     if pair.band_hz is None or not selection.selected:
         return selection, []
     least = SMALL_GAIN * max(selected.gain for selected in selection.selected)
-    kept = tuple(selected for selected in selection.selected if selected.gain >= least)
-    small = [selected.effect for selected in selection.selected if selected.gain < least]
-    return replace(selection, selected=kept), [f"{effect.name} of {', '.join(effect.sensors)}" for effect in small]
+    kept, small, scale = [], [], pair.scale()
+    for selected in selection.selected:
+        held_out = finding_of([log], selection, selected, level).held_out
+        size = float(np.sqrt(max(held_out.rms_before**2 - held_out.rms_after**2, 0.0)))
+        columns = [pair.names.index(name) for name in selected.effect.sensors] or list(range(pair.columns))
+        large = selected.gain >= least and size >= LEARNT_ERROR * min(scale.size[k] for k in columns)
+        (kept if large else small).append(selected)
+    names = [f"{selected.effect.name} of {', '.join(selected.effect.sensors)}" for selected in small]
+    return replace(selection, selected=tuple(kept)), names
 
 
 def _unseen(log: WhitenedLog, candidates: Sequence[Effect], selection: Selection, settings: DiagnoseSettings) -> Iterator[str]:

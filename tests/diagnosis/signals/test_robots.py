@@ -50,7 +50,7 @@ def test_a_vehicle_lacks_what_was_planted_and_nothing_else(robot: str, kind: str
 def test_an_arm_is_diagnosed_from_the_command_line_with_its_page(imutool: Run, tmp_path: Path) -> None:
     """A dry friction in MuJoCo: the command finds topics and fields by itself, and the page draws them."""
     conceal_robot(tmp_path, 3, "arm", "single", "coulomb_friction")
-    done = imutool("diagnose", tmp_path / "real.mcap", "--sim", tmp_path / "sim.mcap", "-o", tmp_path / "out")
+    done = imutool("diagnose", tmp_path / "real.mcap", "--sim", tmp_path / "sim.mcap", "-o", tmp_path / "out", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     found = json.loads((tmp_path / "out" / "findings.json").read_text())
     (planted,) = json.loads((tmp_path / "truth.json").read_text())["effects"]
@@ -86,15 +86,15 @@ def test_fields_are_paired_by_topic_message_and_joint_and_the_rest_is_left_out(t
     numbers = "std_msgs/msg/Float64"
     both = {"/mode": (numbers, t, mode[:, None]), "/still": (numbers, t, still[:, None])}
     joints = np.stack([a, np.mod(turning, 2 * np.pi), *np.zeros((2, len(t))), *np.zeros((2, len(t)))], axis=1)
-    swapped = np.stack([turning, 1.1 * a, *np.zeros((2, len(t))), *np.zeros((2, len(t)))], axis=1)
+    swapped = np.stack([1.01 * turning, 1.1 * a, *np.zeros((2, len(t))), *np.zeros((2, len(t)))], axis=1)
     degrees = (numbers, t, np.degrees(b)[:, None])
     write(tmp_path / "real.mcap", {**both, "/arm/joint_states": (JOINTS, t, joints), "/angle": degrees}, ("hip", "knee"))
     radians = (numbers, t, 1.001 * b[:, None])
     write(tmp_path / "sim.mcap", {**both, "/joint_states": (JOINTS, t, swapped), "/angle": radians}, ("knee", "hip"))
     pairing = paired(tmp_path / "real.mcap", tmp_path / "sim.mcap")
     pairs = {pair.name: pair for pair in pairing.pairs}
-    assert set(pairs) == {"/arm/joint_states.position[0]", "/arm/joint_states.position[1]", "/angle"}
+    assert set(pairs) == {"/arm/joint_states.position[0]", "/arm/joint_states.position[1]", "/angle.data"}
     assert np.allclose(pairs["/arm/joint_states.position[0]"].sim[:, 0], 1.1 * a)
     assert np.allclose(pairs["/arm/joint_states.position[1]"].real[:, 0], turning)
-    assert np.allclose(pairs["/angle"].real[:, 0], b)
+    assert np.allclose(pairs["/angle.data"].real[:, 0], b)
     assert any("degrees" in remark for remark in pairing.remarks)
