@@ -9,7 +9,7 @@ import msgspec
 import numpy as np
 from jaxtyping import Float64
 
-from imutool.diagnosis.estimation.candidate_score import Selection
+from imutool.diagnosis.estimation.candidate_score import SelectedEffect, Selection
 from imutool.diagnosis.estimation.gauss_newton import fit
 from imutool.diagnosis.estimation.jacobians import Chosen, expected
 from imutool.diagnosis.estimation.model_selection import select_effects
@@ -189,7 +189,7 @@ def _above_model_error(log: WhitenedLog, selection: Selection, level: Float64[np
     if pair.band_hz is None or not selection.selected:
         return selection, []
     least = SMALL_GAIN * max(selected.gain for selected in selection.selected)
-    kept, small, scale = [], [], pair.scale()
+    kept, small, scale = list[SelectedEffect](), list[SelectedEffect](), pair.scale()
     for selected in selection.selected:
         held_out = finding_of([log], selection, selected, level).held_out
         size = float(np.sqrt(max(held_out.rms_before**2 - held_out.rms_after**2, 0.0)))
