@@ -63,7 +63,7 @@ class Log:
             with self.named():
                 self.index = self._read_index(self._source)
                 self.topics = MappingProxyType(topics_of(self.index))
-                imus = dict(reflected_topics(self.index, self.topics, self._first))
+                imus = reflected_topics(self.index, self.topics, self._first)
                 self.topics = MappingProxyType({**self.topics, **imus})
         except BaseException:
             self.close()
