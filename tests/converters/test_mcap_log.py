@@ -167,6 +167,17 @@ def test_a_ros2_type_with_rates_and_accelerations_is_an_imu_where_the_log_has_no
         assert log.topics["/fmu/out/sensor_combined/debiased"].reflected is None
 
 
+def test_a_log_cut_in_its_summary_is_debiased_in_its_encoding(imutool, tmp_path):
+    log = write_log(tmp_path / "in.mcap", "protobuf")
+    log.write_bytes(log.read_bytes()[:-60])
+    done = imutool("debias", "in.mcap", "d.mcap", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert "mended: the log ends inside its summary" in done.stdout
+    with Log(tmp_path / "d.mcap") as made:
+        assert made.topics["/robot/imu/debiased"].message_encoding == "protobuf"
+    assert len(read(tmp_path / "d.mcap", imu="/robot/imu/debiased").imu) == COUNT
+
+
 def test_a_cut_log_is_refused_and_repair_is_named(convert, tmp_path):
     log = write_log(tmp_path / "in.mcap", "json")
     log.write_bytes(log.read_bytes()[:20_000])
