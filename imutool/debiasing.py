@@ -22,8 +22,9 @@ from imutool.bias import static
 from imutool.bias.io import shipped, shipped_for
 from imutool.bias.model import BiasModel
 from imutool.bias_start.bias_covariance import BiasEstimator
+from imutool.bias_start.fitness import Fitness
 from imutool.bias_start.initial_bias import InitialBias
-from imutool.bias_start.model_choice import check_smooth, choose_imus, choose_model_and_start
+from imutool.bias_start.model_choice import check_smooth, choose_imus, choose_model_and_start, fitness_in_log
 from imutool.bias_start.stretches import Sieve
 from imutool.cleaning import Cleaner, CleaningSettings, Survey, look
 from imutool.config import plain
@@ -58,6 +59,7 @@ class DebiasReport:
     losses: Losses  # of a damaged source; empty as far as it was looked at (`check`)
     surveys: Mapping[str, Survey]  # of what was cleaned
     sieves: Mapping[str, Sieve]  # samples that are no measurement, and jumps of the clock
+    fits: Mapping[str, Fitness]  # of the model for this log
 
     @property
     def lossy(self) -> bool:
@@ -152,6 +154,7 @@ def debias(
     check: str = "imu",
     max_chunk: int | None = None,
     clean: CleaningSettings | None = None,
+    force: bool = False,
     overwrite: bool = False,
     progress: Callable[[int, int], None] | None = None,
     watch: BlockCallback | None = None,
@@ -165,7 +168,8 @@ def debias(
     Without a target the log itself is replaced; `check` is that of `mcap_io.rewrite`. The intact part of a damaged log is
     debiased from a repaired copy beside the target (`mcap_io.repair`), and `losses` lists the rest; it is not replaced. With
     `clean` a first pass finds samples to leave out or convert (`imutool.cleaning`); the record `imutool_clean` lists them.
-    A chunk of more than `max_chunk` bytes is not read into memory.
+    A chunk of more than `max_chunk` bytes is not read into memory. A model that does not fit the log
+    (`imutool.bias_start.fitness`) is used only with `force`.
     `watch` is called with every batch of debiased samples, those of a damaged log again when its repaired copy is debiased.
 
     Raises:
@@ -173,11 +177,11 @@ def debias(
             or a model is given for an IMU that is not to be debiased.
         LogError: nothing in the log can be saved, it has no such IMU, is debiased already, is damaged and its own target,
             or cannot be trusted, with `clean`.
-        ModelError: no model and no time at rest; a model for another rate; a damaged model file.
+        ModelError: no model and no time at rest; a model for another rate, or one that does not fit; a damaged model file.
     """
     check_smooth(init, smooth)
     check_mode(check)
-    options = _Options(model, imus, init, smooth, clean, check, overwrite, watch)
+    options = _Options(model, imus, init, smooth, clean, check, force, overwrite, watch)
     refusal: LogError | None = None
     try:
         if (log := _open_intact(source, max_chunk)) is not None:
@@ -212,6 +216,7 @@ class _Options:
     smooth: bool
     clean: CleaningSettings | None
     check: str
+    force: bool
     overwrite: bool
     watch: BlockCallback | None
 
@@ -231,11 +236,12 @@ def _debias(
     about = log.metadata().get("imutool", {})
     surveys = {} if options.clean is None else {topic: look(log, topic, options.clean).trusted() for topic in topics}
     default = given.get("") or (None if all(topic in given for topic in topics) else _model_of_log(about))
-    derived, starts, models, records = [], {}, {}, {}
+    derived, starts, models, records, fits = [], {}, {}, {}, {}
     with Digest(source) as digest:
         for topic in topics:
             name, survey = given.get(topic, default), surveys.get(topic)
             chosen, start = choose_model_and_start(log, topic, name, options.init, options.smooth, survey)
+            fits[topic] = fitness_in_log(log, topic, chosen, start, survey).report(chosen, topic, force=options.force)
             derived.append(Debiaser(topic, chosen, start, survey, options.watch))
             starts[topic], models[topic] = start, str(chosen.card.get("name", chosen.method))
             records[topic] = _provenance(topic, chosen, start, options.init, options.smooth)
@@ -258,8 +264,7 @@ def _debias(
         for text in sieve.warnings():
             logger.warning("%s %s: %s", source, topic, text)
     losses.unchecked_in = losses.unchecked_in or {0: report.unchecked}
-    losses.unchecked_in = losses.unchecked_in or {0: report.unchecked}
-    return DebiasReport(models, starts, report, losses, surveys, sieves)
+    return DebiasReport(models, starts, report, losses, surveys, sieves, fits)
 
 
 def _record_name(name: str, topic: str, records: Mapping[str, object]) -> str:

@@ -18,7 +18,8 @@ from imutool.bias.io import find_model, shipped_for
 from imutool.bias.model import BiasModel
 from imutool.bias_start.bias_at_rest import at_rest
 from imutool.bias_start.correction import apply_with_std
-from imutool.bias_start.initial_bias import InitialBias
+from imutool.bias_start.fitness import Fitness, judge
+from imutool.bias_start.initial_bias import InitialBias, relative_samples
 from imutool.bias_start.model_choice import check_smooth, find_initial_bias, smooth_in_memory
 from imutool.debiasing import DebiasReport
 from imutool.errors import ConfigError
@@ -87,6 +88,7 @@ class DebiasedRecording:
         std: One standard deviation of `bias`.
         model: Name of the model.
         start: Initial bias: `rest`, `std` and, in words, `how`.
+        fitness: Whether the model fits the recording: `verdict` (`fits`, `doubtful` or `unfit`) and `reasons`.
     """
 
     recording: Recording
@@ -94,6 +96,7 @@ class DebiasedRecording:
     std: Float64[np.ndarray, "n 6"]
     model: str
     start: InitialBias
+    fitness: Fitness
 
     @property
     def imu(self) -> Imu:
@@ -103,7 +106,13 @@ class DebiasedRecording:
 
 @overload
 def debias(
-    source: Recording, target: Model | None = None, *, model: Model | None = None, init: str = "auto", smooth: bool = False
+    source: Recording,
+    target: Model | None = None,
+    *,
+    model: Model | None = None,
+    init: str = "auto",
+    smooth: bool = False,
+    force: bool = False,
 ) -> DebiasedRecording: ...
 
 
@@ -118,6 +127,7 @@ def debias(
     imus: Sequence[str] = (),
     in_place: bool = False,
     check: str = "imu",
+    force: bool = False,
     overwrite: bool = False,
     progress: Progress | None = None,
 ) -> DebiasReport: ...
@@ -133,14 +143,14 @@ def debias(
     imus: Sequence[str] = (),
     in_place: bool = False,
     check: str = "imu",
+    force: bool = False,
     overwrite: bool = False,
     progress: Progress | None = None,
 ) -> DebiasedRecording | DebiasReport:
     """Subtract the IMU's bias from a recording, or write a debiased log.
 
-    `debias(recording, model)` returns arrays. `debias("in.mcap", "out.mcap", model=...)` writes a log with every record of
-    the old one, `/imu0/debiased`, the subtracted bias and its covariance. The bias at a sample depends on that sample and
-    earlier ones, unless `smooth` is true.
+    `debias(recording, model)` returns arrays. `debias("in.mcap", "out.mcap", model=...)` writes a log with every record of the
+    old one, `/imu0/debiased`, the bias and its covariance; without `smooth` it depends on no later sample.
 
     Args:
         source: Recording, or MCAP log: a file or a URL.
@@ -150,16 +160,17 @@ def debias(
             also a loaded model.
         init: Initial bias: `auto`, `stationary`, `prior`, `truth`, `truth:SECONDS`, or six numbers.
         smooth: Estimate the initial bias from the whole log, forward and backward.
-        imus: IMU topics of a log to debias; by default the only one.
+        imus: IMU topics of a log; by default the only one.
         in_place: Replace the log `source` instead of writing `target`.
         check: Chunks of a log whose CRC is compared: `imu`, `all` or `none`.
+        force: Use a model although it does not fit the log.
         overwrite: Replace an existing `target`.
         progress: Callback with bytes done and bytes in all.
 
     Raises:
         ConfigError: A file cannot be opened, `target` is missing or exists, or options contradict each other.
         LogError: No such IMU, a log that is debiased already, or damage that cannot be repaired.
-        ModelError: No model and no time at rest, another sample rate, or a damaged model file.
+        ModelError: No model and no time at rest, a model for another rate or that does not fit the log, a damaged model file.
 
     Examples:
         >>> import imutool
@@ -172,7 +183,7 @@ def debias(
         4001
     """
     if isinstance(source, Recording):
-        return _debias_recording(source, model if target is None else target, init, smooth)
+        return _debias_recording(source, model if target is None else target, init, smooth, force)
     if isinstance(model, BiasModel) or isinstance(target, BiasModel):
         raise ConfigError("a loaded model", where="model", expected="a model file, whose digest goes into the log")
     if in_place == (target is not None):
@@ -181,15 +192,17 @@ def debias(
     given = list(model.values()) if isinstance(model, Mapping) else model
     check_outputs([OutputFile("target", out, outputs.LOG)], [source, given], overwrite=overwrite)
     run = partial(debiasing.debias, location(source), out, model=model, imus=imus, init=init, smooth=smooth)
-    return run(check=check, overwrite=overwrite, progress=progress)
+    return run(check=check, force=force, overwrite=overwrite, progress=progress)
 
 
-def _debias_recording(recording: Recording, model: object, init: str, smooth: bool) -> DebiasedRecording:
+def _debias_recording(recording: Recording, model: object, init: str, smooth: bool, force: bool) -> DebiasedRecording:
     if not isinstance(model, Model | None):
         raise ConfigError(f"{type(model).__name__}", where="model", expected="one model: a file, a name or a loaded model")
     name, chosen, start = _model_and_start(recording, model, init, smooth)
+    about = recording.metadata.get("imutool", {})
+    fitness = judge(chosen, start, [relative_samples(recording.imu)], about).report(chosen, recording.name, force=force)
     debiased, std = apply_with_std(chosen, start, recording.imu)
-    return DebiasedRecording(replace(recording, imu=debiased.imu), debiased.bias, std, name, start)
+    return DebiasedRecording(replace(recording, imu=debiased.imu), debiased.bias, std, name, start, fitness)
 
 
 def _model_and_start(recording: Recording, model: Model | None, init: str, smooth: bool) -> tuple[str, BiasModel, InitialBias]:

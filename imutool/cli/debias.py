@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
@@ -25,6 +25,7 @@ MODEL_HELP = (
 )
 CLEAN_HELP = "Drop invalid samples and convert units, as imutool clean does."
 REPORT_HELP = "Write an HTML page about the debiased log."
+FORCE_HELP = "Use a model although it does not fit the log; a warning says why it does not."
 VERIFY_HELP = "Chunks of OUT to read back: all, those with IMU messages (imu), or none."
 
 
@@ -50,6 +51,7 @@ def debias(
     save_view: Annotated[Path | None, typer.Option(metavar="F.rrd", help="Save the viewer's data to a file."), RRD] = None,
     report_to: Annotated[Path | None, typer.Option("--report", metavar="F.html", help=REPORT_HELP), HTML] = None,
     max_chunk: MaxChunk = None,
+    force: Annotated[bool, typer.Option("--force", help=FORCE_HELP)] = False,
     overwrite: Overwrite = False,
     json_to: Json = None,
     verbose: Verbose = False,
@@ -74,14 +76,14 @@ def debias(
             check=verify,
             max_chunk=max_chunk,
             clean=CleaningSettings() if clean else None,
+            force=force,
             overwrite=overwrite and not in_place,
             progress=lambda done, total: tell(done, total, ""),
             watch=watch,
         )
-    shown = None if watch is None else watch.shown
-    summary = _summary(report, str(target or source), shown, report_to, clean)
+    summary = _summary(report, str(target or source), None if watch is None else watch.shown, report_to, clean)
     if not (json_only := write_json(summary, json_to, overwrite=overwrite)):
-        _say(report, summary, shown or ())
+        _say(report, summary)
     if report_to is not None:  # last: should it fail, the log is there all the same, and that has been said
         with progress("Drawing", verbose, quiet):
             _draw(to_location(target or source), list(report.starts), report_to, overwrite)
@@ -105,6 +107,13 @@ class StretchEntry(Section, frozen=True):
     step_s: float
 
 
+class Fit(Section, frozen=True):
+    """Verdict on a model for a log, `fits`, `doubtful` or `unfit`, and its reasons."""
+
+    verdict: Literal["fits", "doubtful", "unfit"]
+    reasons: list[str]
+
+
 class DebiasedImu(Section, frozen=True):
     """Model and start bias of an IMU (gyro rad/s, accel m/s²) with its standard deviation."""
 
@@ -113,6 +122,7 @@ class DebiasedImu(Section, frozen=True):
     gyro_bias: list[float]
     accel_bias: list[float]
     std: list[float]
+    fit: Fit
     left_out: dict[str, int] | UnsetType = UNSET  # samples that are no measurement, by reason
     stretches: list[StretchEntry] | UnsetType = UNSET  # each but the first: gaps and jumps of the clock
 
@@ -149,6 +159,7 @@ def _summary(
             start.rest[:3].tolist(),
             start.rest[3:].tolist(),
             start.std.tolist(),
+            Fit(report.fits[topic].verdict, list(report.fits[topic].reasons)),
             report.sieves[topic].left_out or UNSET,
             [StretchEntry(*stretch) for stretch in report.sieves[topic].clock.stretches] or UNSET,
         )
@@ -167,7 +178,7 @@ def _summary(
     )
 
 
-def _say(report: DebiasReport, summary: DebiasSummary, shown: Sequence[Output]) -> None:
+def _say(report: DebiasReport, summary: DebiasSummary) -> None:
     """Print starts, counts and verification."""
     for topic, survey in report.surveys.items():
         say(f"{topic}: {survey.verdict}, score {survey.score:.3f}, {survey.valid} of {survey.messages} samples valid")
@@ -175,12 +186,14 @@ def _say(report: DebiasReport, summary: DebiasSummary, shown: Sequence[Output]) 
         gyro = ", ".join(f"{b:+.5f}" for b in imu.gyro_bias)
         accel = ", ".join(f"{b:+.4f}" for b in imu.accel_bias)
         say(f"{topic}: {imu.model}, start bias {gyro} rad/s; {accel} m/s² ({imu.init_how})")
+        verdict = "fits" if imu.fit.verdict == "fits" else f"is {imu.fit.verdict}"
+        say(f"{topic}: the model {verdict}: {imu.fit.reasons[0]}")
     counts = ", ".join(f"{count} on {name}" for name, count in summary.added.items())
     say(f"{summary.output}: {summary.copied} messages as they were, {counts}")
     verified = summary.verified
     chunks = f"{verified.chunks_checked} of {verified.chunks} chunks"
     say(f"checked: every index, and the contents of {chunks} (--verify {verified.mode})")
-    for output in shown:
+    for output in summary.shown or ():
         say(output.said)
     tell_losses(summary.losses)
 
