@@ -22,6 +22,7 @@ from pathlib import Path, PurePosixPath
 from imutool.errors import DataError
 
 SUFFIXES = (".zip", ".tar", ".tar.gz", ".tgz")
+BAG = ".bag"
 ROOT = "mav0"  # the folder of an ASL sequence
 
 MIB = 1 << 20
@@ -228,6 +229,14 @@ class _Bounded:
     def _check(self, offset: int) -> None:
         if self._limit is not None and offset > self._limit:
             raise DataError(f"unpacks to more than {self._limit} bytes", where=self._path, expected=f"at most {MAX_RATIO} to 1")
+
+
+def stem(path: Path) -> str:
+    """Archive name without its endings."""
+    for ending in (*SUFFIXES, BAG):
+        if path.name.lower().endswith(ending):
+            return path.name[: -len(ending)]
+    return path.name
 
 
 @contextmanager

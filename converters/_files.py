@@ -8,8 +8,9 @@ from pathlib import Path
 from imutool.errors import DataError
 
 from . import Sequence
-from ._archive import HEAD, ROOT
-from ._source import DEPTH, stem
+from ._archive import HEAD, ROOT, stem
+
+DEPTH = 4  # folders below the source that are searched
 
 
 def find_files(source: Path, suffixes: Collection[str], is_mine: Callable[[bytes], bool]) -> list[Sequence]:
@@ -19,8 +20,8 @@ def find_files(source: Path, suffixes: Collection[str], is_mine: Callable[[bytes
         DataError: the source does not exist.
     """
     if source.is_dir():
-        folder = source.absolute() if ".." not in source.parts else source.resolve()
-        return [Sequence(name(path), path) for path in _walk(folder, suffixes, DEPTH) if is_mine(head(path))]
+        paths = (path for path in each_path(named_folder(source)) if path.suffix.lower() in suffixes)
+        return [Sequence(name(path), path) for path in paths if is_mine(head(path))]
     if not source.exists():
         raise DataError("does not exist", where=source, expected="a file or a folder")
     return [Sequence(name(source), source)] if is_mine(head(source)) else []
@@ -30,8 +31,7 @@ def find_folders(source: Path, is_mine: Callable[[Path], bool]) -> list[Sequence
     """Find folders of one kind: the source itself, or those in it."""
     if not source.is_dir():
         return []
-    folder = source.absolute() if ".." not in source.parts else source.resolve()
-    return [Sequence(path.name, path) for path in _folders(folder, DEPTH, is_mine)]
+    return [Sequence(path.name, path) for path in _folders(named_folder(source), DEPTH, is_mine)]
 
 
 def _folders(folder: Path, depth: int, is_mine: Callable[[Path], bool]) -> Iterator[Path]:
@@ -59,8 +59,19 @@ def head(path: Path, size: int = HEAD) -> bytes:
         return b""
 
 
-def _walk(folder: Path, suffixes: Collection[str], depth: int) -> Iterator[Path]:
+def named_folder(source: Path) -> Path:
+    """Folder with a name of its own: `.` and `..` have none."""
+    return source.absolute() if ".." not in source.parts else source.resolve()
+
+
+def each_path(folder: Path, depth: int = DEPTH) -> Iterator[Path]:
+    """Files below a folder, in order, and sequences in ASL folders, whose own files are not listed.
+
+    Raises:
+        DataError: a folder cannot be listed.
+    """
     if (folder / ROOT).is_dir() or folder.name == ROOT:
+        yield folder
         return
     try:
         children = sorted(folder.iterdir())
@@ -69,8 +80,7 @@ def _walk(folder: Path, suffixes: Collection[str], depth: int) -> Iterator[Path]
     for child in children:
         if child.name.startswith((".", "__MACOSX")):
             continue
-        if child.is_dir():
-            if depth > 0:
-                yield from _walk(child, suffixes, depth - 1)
-        elif child.suffix.lower() in suffixes:
+        if not child.is_dir():
             yield child
+        elif depth > 0:
+            yield from each_path(child, depth - 1)

@@ -15,6 +15,7 @@ from imutool.errors import DataError
 
 from . import Sequence
 from ._archive import (
+    BAG,
     HEAD,
     ROOT,
     SUFFIXES,
@@ -27,10 +28,9 @@ from ._archive import (
     plain_name,
     read_bounded,
     refusing,
+    stem,
 )
-
-BAG = ".bag"
-DEPTH = 4  # folders below the source that are searched
+from ._files import each_path, named_folder
 
 
 def find(source: Path) -> list[Sequence]:
@@ -42,8 +42,8 @@ def find(source: Path) -> list[Sequence]:
         DataError: the source does not exist, or is itself an archive that cannot be read.
     """
     if source.is_dir():
-        folder = source.absolute() if ".." not in source.parts else source.resolve()
-        return [Sequence(folder.parent.name, folder.parent)] if folder.name == ROOT else list(_walk(folder, DEPTH))
+        folder = named_folder(source)
+        return [Sequence(folder.parent.name, folder.parent)] if folder.name == ROOT else list(_in_folder(folder))
     if not source.exists():
         raise DataError("does not exist", where=source, expected="a folder, an archive or a bag")
     return _in_file(source)
@@ -54,33 +54,12 @@ def is_bag(path: Path) -> bool:
     return path.suffix.lower() == BAG
 
 
-def stem(path: Path) -> str:
-    """Archive name without its endings."""
-    for ending in (*SUFFIXES, BAG):
-        if path.name.lower().endswith(ending):
-            return path.name[: -len(ending)]
-    return path.name
-
-
-def _walk(folder: Path, depth: int) -> Iterator[Sequence]:
-    if (folder / ROOT).is_dir():
-        yield Sequence(folder.name, folder)
-        return
-    try:
-        children = sorted(folder.iterdir())
-    except OSError as error:
-        raise DataError(f"cannot be listed ({error.strerror})", where=folder) from error
-    for child in children:
-        if child.name.startswith((".", "__MACOSX")):
-            continue
-        if child.is_dir():
-            if depth > 0:
-                yield from _walk(child, depth - 1)
-            continue
+def _in_folder(folder: Path) -> Iterator[Sequence]:
+    for path in each_path(folder):
         try:
-            yield from _in_file(child)
+            yield from [Sequence(path.name, path)] if path.is_dir() else _in_file(path)
         except DataError:  # said again, with its reason, when the sequence is read: the others go on
-            yield Sequence(stem(child), child)
+            yield Sequence(stem(path), path)
 
 
 def _in_file(path: Path) -> list[Sequence]:

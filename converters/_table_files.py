@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from imutool.errors import ConfigError, DataError
+from imutool.recording.message_log import Remarks
 
 from ._archive import refusing
 
@@ -28,12 +29,12 @@ COMMA_NUMBER = re.compile(r"[+-]?\d*,\d+([eE][+-]?\d+)?")
 
 @dataclass
 class Columns:
-    """Columns by name, rotation matrices, the texts of decimals, and notes."""
+    """Columns by name, rotation matrices, the texts of decimals, and remarks."""
 
     values: dict[str, np.ndarray] = field(default_factory=dict)
     matrices: dict[str, np.ndarray] = field(default_factory=dict)
     texts: dict[str, list[str]] = field(default_factory=dict)
-    notes: list[str] = field(default_factory=list)
+    remarks: Remarks = field(default_factory=Remarks)
 
     def add(self, name: str, array: Any) -> None:
         """Take in an array of numbers of one, two or three dimensions."""
@@ -129,12 +130,12 @@ def _load_csv(path: Path, columns: Columns) -> None:
         names = [f"column {number}" for number in range(1, width + 1)]
     whole = [row for row in rows if len(row) == width]
     if len(whole) < len(rows):
-        columns.notes.append(f"{len(rows) - len(whole)} rows do not have {width} fields and are left out")
+        columns.remarks.losses.append(f"{len(rows) - len(whole)} rows do not have {width} fields and are left out")
     for name, fields in zip(names, zip(*whole, strict=True), strict=True):
         texts = [text.strip().strip('"') for text in fields]
         if delimiter != "," and any(COMMA_NUMBER.fullmatch(text) for text in texts[:100]):
             texts[:] = [text.replace(",", ".") for text in texts]
-            columns.notes.append(f"{name}: decimal commas are read as points")
+            columns.remarks.notes.append(f"{name}: decimal commas are read as points")
         if (values := _numbers(texts)) is not None:
             columns.values[name], columns.texts[name] = values, texts
 

@@ -10,6 +10,7 @@ from collections.abc import Iterator
 from decimal import Decimal, InvalidOperation
 from pathlib import Path
 
+import msgspec
 import numpy as np
 from jaxtyping import Float64, Int64
 
@@ -52,7 +53,7 @@ def read_sequence(sequence: Sequence, *, images: bool = True, mapping: Path | No
     """
     path = sequence.path
     columns = load(path, kind_of(head(path), path))
-    remarks = Remarks(notes=list(columns.notes))
+    remarks = columns.remarks
     table = _proposed(columns, path, remarks) if mapping is None else read_map(mapping)
     place = path if mapping is None else mapping
     gyro_ns = _times(columns, table.time, table.time_unit, place)
@@ -103,8 +104,6 @@ def _proposed(columns: Columns, path: Path, remarks: Remarks) -> TableMap:
         + ", ".join(f"{key} = {value if isinstance(value, str) else '/'.join(value)}" for key, value in entries.items())
     )
     remarks.notes.extend(proposal.reasons)
-    import msgspec
-
     return msgspec.convert(entries, TableMap)
 
 
@@ -186,8 +185,10 @@ def _scalars(columns: Columns, used: set[str], t_ns: Int64[np.ndarray, " n"], re
     """Further columns of the table as topics, on the IMU's clock."""
     rest = {c: v for c, v in columns.values.items() if c not in used and len(v) == len(t_ns)}
     left = [c for c in columns.values if c not in used and c not in rest]
-    if left or len(rest) > MOST_SCALARS:
+    if left:
         remarks.losses.append(f"columns of another length than the IMU's are left out: {', '.join(left[:20])}")
+    if len(rest) > MOST_SCALARS:
+        remarks.losses.append(f"the table has {len(rest)} further columns: {len(rest) - MOST_SCALARS} of them are left out")
     scalars = {}
     for column, values in list(rest.items())[:MOST_SCALARS]:
         kept = in_order(t_ns, values.astype(np.float64)[:, None], column)

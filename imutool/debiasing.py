@@ -1,8 +1,7 @@
 """Debias a log: copy it and add debiased samples, biases and their covariance.
 
-Causal throughout, unless `smooth` is asked for: the bias at a sample comes from that sample and earlier ones, once the start
-is known (`imutool.bias_start.initial_bias`). Smoothing reads the log twice; of the first pass it keeps thirteen numbers for
-each half second.
+Causal, unless `smooth` is asked for: the bias at a sample comes from that sample and earlier ones, once the start is known
+(`imutool.bias_start.initial_bias`). Smoothing reads the log twice, and keeps thirteen numbers for each half second.
 """
 
 from __future__ import annotations
@@ -28,7 +27,7 @@ from imutool.bias_start.model_choice import check_smooth, choose_imus, choose_mo
 from imutool.bias_start.stretches import Sieve
 from imutool.cleaning import Cleaner, CleaningSettings, Survey, look
 from imutool.config import plain
-from imutool.errors import LogError, ModelError
+from imutool.errors import ConfigError, LogError, ModelError
 from imutool.location import Location
 from imutool.mcap_io.added_topics import DerivedBatch, NewTopic
 from imutool.mcap_io.codec import schemas
@@ -76,6 +75,7 @@ class DebiasedBlock(NamedTuple):
     std: Float64[np.ndarray, "n 6"]  # one standard deviation of it
 
 
+ENCODINGS = ("own", "cdr")  # of the new IMU topic
 BlockCallback = Callable[[DebiasedBlock], None]
 
 
@@ -156,32 +156,33 @@ def debias(
     clean: CleaningSettings | None = None,
     force: bool = False,
     overwrite: bool = False,
+    encoding: str = "own",
     progress: Callable[[int, int], None] | None = None,
     watch: BlockCallback | None = None,
 ) -> DebiasReport:
     """Writes `target`: all of `source`, and for each IMU its debiased samples and the bias.
 
-    One model serves every IMU, or each has its own by topic, "" being that of all others. An IMU without one gets the
-    one the log's metadata names, else the one that ships for its sensor, else the mean over time at rest. The IMUs are
-    those in `imus`, else those with a model of their own, else the log's only one.
-    With `smooth` the initial bias at every time comes from the whole log, also from later samples.
+    One model serves every IMU, or each has its own by topic, "" being that of all others. An IMU without one gets the one the
+    log's metadata names, else the one that ships for its very sensor, else the mean at rest. The IMUs are those in `imus`, else
+    those with a model of their own, else the log's only one. With `smooth` the initial bias comes from the whole log.
     Without a target the log itself is replaced; `check` is that of `mcap_io.rewrite`. The intact part of a damaged log is
     debiased from a repaired copy beside the target (`mcap_io.repair`), and `losses` lists the rest; it is not replaced. With
     `clean` a first pass finds samples to leave out or convert (`imutool.cleaning`); the record `imutool_clean` lists them.
-    A chunk of more than `max_chunk` bytes is not read into memory. A model that does not fit the log
-    (`imutool.bias_start.fitness`) is used only with `force`.
-    `watch` is called with every batch of debiased samples, those of a damaged log again when its repaired copy is debiased.
+    The new IMU has the type and encoding of its source, or with `encoding` "cdr" those of ROS 2.
+    A chunk of more than `max_chunk` bytes is not read. A model that does not fit (`fitness`) is used only with `force`.
+    `watch` is called with every batch of debiased samples, again when the copy of a damaged log is debiased.
 
     Raises:
-        ConfigError: source or target cannot be opened, `init` makes no sense, `smooth` is asked for with another `init`,
-            or a model is given for an IMU that is not to be debiased.
+        ConfigError: a file cannot be opened, or options contradict each other.
         LogError: nothing in the log can be saved, it has no such IMU, is debiased already, is damaged and its own target,
             or cannot be trusted, with `clean`.
         ModelError: no model and no time at rest; a model for another rate, or one that does not fit; a damaged model file.
     """
     check_smooth(init, smooth)
     check_mode(check)
-    options = _Options(model, imus, init, smooth, clean, check, force, overwrite, watch)
+    if encoding not in ENCODINGS:
+        raise ConfigError(f"{encoding!r}", where="encoding", expected=" or ".join(ENCODINGS))
+    options = _Options(model, imus, init, smooth, clean, check, force, overwrite, encoding, watch)
     refusal: LogError | None = None
     try:
         if (log := _open_intact(source, max_chunk)) is not None:
@@ -218,6 +219,7 @@ class _Options:
     check: str
     force: bool
     overwrite: bool
+    encoding: str
     watch: BlockCallback | None
 
 
@@ -257,9 +259,8 @@ def _debias(
             }
             return entries | {_record_name(CLEAN_RECORD, topic, records): found.record() for topic, found in surveys.items()}
 
-        report = rewrite(
-            log, target, derived, metadata=metadata, overwrite=options.overwrite, check=options.check, progress=progress
-        )
+        chosen_ways = {"overwrite": options.overwrite, "own_encoding": options.encoding == "own"}
+        report = rewrite(log, target, derived, metadata=metadata, check=options.check, progress=progress, **chosen_ways)
     for topic, sieve in sieves.items():
         for text in sieve.warnings():
             logger.warning("%s %s: %s", source, topic, text)
@@ -274,7 +275,7 @@ def _record_name(name: str, topic: str, records: Mapping[str, object]) -> str:
 
 def _model_of_log(about: Mapping[str, str]) -> str | Path | None:
     """The shipped model that a log's metadata name: a log may come from anybody."""
-    return shipped(about["model"]) if about.get("model") else shipped_for(about.get("sensor"), about.get("dataset"))
+    return shipped(about["model"]) if about.get("model") else next(iter(shipped_for(about)), None)
 
 
 def _provenance(topic: str, model: BiasModel, start: InitialBias, init: str, smooth: bool) -> dict[str, str]:

@@ -402,3 +402,19 @@ def test_quaternions_are_made_unit_where_they_are_not_and_refused_where_they_are
         spoiled[7] *= bad
         with pytest.raises(DataError, match=r"in row 7 has norm .*; expected norm 1"):
             unit_quaternions(spoiled)
+
+
+def test_a_recording_prints_a_line_for_each_topic_and_no_array() -> None:
+    recording = replace(
+        make_recording(), other_poses={"/odom": "odometry"}, frames={"/cam": Frames("png", 3, lambda: iter(()))}
+    )
+    assert repr(recording).splitlines() == [
+        "Recording 'r'",
+        "  /imu0: Imu(20 rows at 200 Hz, 0.095 s; gyro [20, 3], accel [20, 3])",
+        "  /a: Poses(20 rows at 100 Hz, 0.190 s; p_wb [20, 3], q_wb_wxyz [20, 4], v_w [20, 3])",
+        "  /b: Poses(5 rows at 100 Hz, 0.040 s; p_wb [5, 3], q_wb_wxyz [5, 4], v_w [5, 3])",
+        "  /t: Scalars(5 rows at 50 Hz, 0.080 s; values [5, 1])",
+        "  /cam: 3 frames, png",
+        "  /odom: poses (odometry), not read",
+    ]
+    assert repr(make_imu(1)) == "Imu(1 rows, 0.000 s; gyro [1, 3], accel [1, 3])"

@@ -78,7 +78,7 @@ def bias_at_rest(model: BiasModel, imu: Imu) -> InitialBias:
     return at_rest(model, imu)
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class DebiasedRecording:
     """Recording with debiased samples, and the bias that was subtracted.
 
@@ -97,6 +97,11 @@ class DebiasedRecording:
     model: str
     start: InitialBias
     fitness: Fitness
+
+    def __repr__(self) -> str:
+        mean = ["(" + ", ".join(f"{x:+.5f}" for x in part) + ")" for part in self.bias.mean(axis=0).reshape(2, 3)]
+        bias = f"mean bias {mean[0]} rad/s, {mean[1]} m/s²" if len(self.bias) else "no samples"
+        return f"Debiased by {self.model} ({self.start.how}): {bias}\n{self.recording!r}"
 
     @property
     def imu(self) -> Imu:
@@ -128,6 +133,7 @@ def debias(
     in_place: bool = False,
     check: str = "imu",
     force: bool = False,
+    encoding: str = "own",
     overwrite: bool = False,
     progress: Progress | None = None,
 ) -> DebiasReport: ...
@@ -144,6 +150,7 @@ def debias(
     in_place: bool = False,
     check: str = "imu",
     force: bool = False,
+    encoding: str = "own",
     overwrite: bool = False,
     progress: Progress | None = None,
 ) -> DebiasedRecording | DebiasReport:
@@ -156,16 +163,16 @@ def debias(
         source: Recording, or MCAP log: a file or a URL.
         target: Log to write. With a recording, the second argument is the model.
         model: Model file, name of a model that ships, `static`, or a dictionary from IMU topic to model. By default the
-            model that the log names or that ships for its sensor, otherwise the mean bias at rest. With a recording,
-            also a loaded model.
+            model that ships for the log's very sensor, else the mean at rest. With a recording, also a loaded model.
         init: Initial bias: `auto`, `stationary`, `prior`, `truth`, `truth:SECONDS`, or six numbers.
         smooth: Estimate the initial bias from the whole log, forward and backward.
         imus: IMU topics of a log; by default the only one.
         in_place: Replace the log `source` instead of writing `target`.
         check: Chunks of a log whose CRC is compared: `imu`, `all` or `none`.
         force: Use a model although it does not fit the log.
+        encoding: Of the new IMU topic: `own`, that of its source, or `cdr`.
         overwrite: Replace an existing `target`.
-        progress: Callback with bytes done and bytes in all.
+        progress: Callback with bytes done and in all.
 
     Raises:
         ConfigError: A file cannot be opened, `target` is missing or exists, or options contradict each other.
@@ -188,11 +195,10 @@ def debias(
         raise ConfigError("a loaded model", where="model", expected="a model file, whose digest goes into the log")
     if in_place == (target is not None):
         raise ConfigError("`target` and `in_place`", where="debias", expected="one of the two")
-    out = None if target is None else location(target)
-    given = list(model.values()) if isinstance(model, Mapping) else model
+    out, given = None if target is None else location(target), list(model.values()) if isinstance(model, Mapping) else model
     check_outputs([OutputFile("target", out, outputs.LOG)], [source, given], overwrite=overwrite)
-    run = partial(debiasing.debias, location(source), out, model=model, imus=imus, init=init, smooth=smooth)
-    return run(check=check, force=force, overwrite=overwrite, progress=progress)
+    run = partial(debiasing.debias, location(source), out, model=model, imus=imus, init=init, smooth=smooth, check=check)
+    return run(encoding=encoding, force=force, overwrite=overwrite, progress=progress)
 
 
 def _debias_recording(recording: Recording, model: object, init: str, smooth: bool, force: bool) -> DebiasedRecording:
@@ -207,8 +213,7 @@ def _debias_recording(recording: Recording, model: object, init: str, smooth: bo
 
 def _model_and_start(recording: Recording, model: Model | None, init: str, smooth: bool) -> tuple[str, BiasModel, InitialBias]:
     if model is None:
-        about = recording.metadata.get("imutool", {})
-        model = shipped_for(about.get("sensor"), about.get("dataset")) or static.Model.method
+        model = next(iter(shipped_for(recording.metadata.get("imutool", {}))), static.Model.method)
     if not isinstance(model, BiasModel) or model.method == static.Model.method:
         given = static.Model.method if isinstance(model, BiasModel) else model
         ((name, chosen, start),) = evaluation.started(recording, [given], init, recording.name, smooth=smooth)

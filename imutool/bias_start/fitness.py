@@ -22,6 +22,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 from imutool.bias import static
+from imutool.bias.io import library, shipped_for
 from imutool.bias.model import BiasModel, Vector6
 from imutool.bias_start.bias_tracking import BiasPrior, FilteredBlock, Samples, filter_blocks
 from imutool.bias_start.initial_bias import AT_REST_STD, LEAST_STD, InitialBias, bias_prior
@@ -95,7 +96,8 @@ def judge(model: BiasModel, start: InitialBias, batches: Iterable[Samples], abou
     `about` is what the log says of its origin: `sensor`, `dataset`.
     """
     if model.method == static.Model.method:
-        return Fitness("fits", ("no trained model: a constant bias, measured on this log",))
+        units = sorted({path.stem.rpartition("-")[0] for path in library().glob("*.safetensors")})
+        return Fitness("fits", (f"no trained model but a constant bias of this log; models ship for {', '.join(units)}",))
     samples = _head(batches)
     if len(samples[0]) < 2:
         return Fitness("doubtful", ("the log is too short to be judged",))
@@ -237,8 +239,9 @@ def _other_unit(model: BiasModel, about: Mapping[str, str]) -> Iterator[str]:
 
 
 def _same_unit(model: BiasModel, about: Mapping[str, str]) -> bool:
-    """Whether a log names the model's sensor and data set."""
-    return all(model.card.get(key) and model.card.get(key) == about.get(key) for key in ("sensor", "dataset"))
+    """Whether the log is of the very unit for which a model ships, or was in its training."""
+    names = [log.get("name") for log in model.card.get("logs", ()) if isinstance(log, dict)]
+    return model.card.get("name") in shipped_for(about) or about.get("sequence") in names
 
 
 def _telling(found: _Evidence, prior: BiasPrior) -> bool:

@@ -23,9 +23,11 @@ if TYPE_CHECKING:
 MODEL_HELP = (
     "Model file, physics.toml or a name that ships; else a static estimate. TOPIC=MODEL sets the model of one IMU. Repeatable."
 )
+CONNECT_HELP = "Show the progress in a running viewer: HOST:PORT."
 CLEAN_HELP = "Drop invalid samples and convert units, as imutool clean does."
 REPORT_HELP = "Write an HTML page about the debiased log."
 FORCE_HELP = "Use a model although it does not fit the log; a warning says why it does not."
+ENCODING_HELP = "Encoding of the new IMU topic: that of its source, or CDR."
 VERIFY_HELP = "Chunks of OUT to read back: all, those with IMU messages (imu), or none."
 
 
@@ -44,10 +46,9 @@ def debias(
     verify: Annotated[str, typer.Option(metavar="all|imu|none", help=VERIFY_HELP)] = "imu",
     in_place: Annotated[bool, typer.Option("--in-place", help="Replace IN with the complete result.")] = False,
     clean: Annotated[bool, typer.Option("--clean", help=CLEAN_HELP)] = False,
+    encoding: Annotated[str, typer.Option(metavar="own|cdr", help=ENCODING_HELP)] = "own",
     view: Annotated[bool, typer.Option("--view", help="Show the progress in a new viewer.")] = False,
-    connect: Annotated[
-        str | None, typer.Option(metavar="URL", help="Show the progress in a running viewer: HOST:PORT.")
-    ] = None,
+    connect: Annotated[str | None, typer.Option(metavar="URL", help=CONNECT_HELP)] = None,
     save_view: Annotated[Path | None, typer.Option(metavar="F.rrd", help="Save the viewer's data to a file."), RRD] = None,
     report_to: Annotated[Path | None, typer.Option("--report", metavar="F.html", help=REPORT_HELP), HTML] = None,
     max_chunk: MaxChunk = None,
@@ -78,6 +79,7 @@ def debias(
             clean=CleaningSettings() if clean else None,
             force=force,
             overwrite=overwrite and not in_place,
+            encoding=encoding,
             progress=lambda done, total: tell(done, total, ""),
             watch=watch,
         )
@@ -193,7 +195,7 @@ def _say(report: DebiasReport, summary: DebiasSummary) -> None:
     verified = summary.verified
     chunks = f"{verified.chunks_checked} of {verified.chunks} chunks"
     say(f"checked: every index, and the contents of {chunks} (--verify {verified.mode})")
-    for output in summary.shown or ():
+    for output in summary.shown if isinstance(summary.shown, list) else ():
         say(output.said)
     tell_losses(summary.losses)
 

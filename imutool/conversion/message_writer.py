@@ -10,19 +10,19 @@ from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import NamedTuple
 
 import numpy as np
 
 import imutool
 from imutool.conversion.sensor_pairs import SensorPairs
 from imutool.conversion.table_messages import encode_table, table_topic
-from imutool.errors import DataError
+from imutool.errors import ConfigError, DataError
 from imutool.location import Location
 from imutool.mcap_io.codec import messages, schemas
 from imutool.mcap_io.codec.encode import encode_float, encode_imu, encode_pose, encode_vector3
+from imutool.mcap_io.codec.reflection import ReflectedImu, reflect
 from imutool.mcap_io.read import RECORD, UNIT_KEY, VELOCITY_KEY
-from imutool.mcap_io.topics import KIND_KEY, MESSAGE_POSES, PART_KEY
+from imutool.mcap_io.topics import KIND_KEY, MESSAGE_POSES, PART_KEY, RECORDED_KEY
 from imutool.mcap_io.write import BODY, CHUNK_BYTES, WORLD, Series, chunks
 from imutool.mcap_io.writer import Chunk, LogWriter
 from imutool.recording.message_log import MessageLog, MessageTopic
@@ -33,12 +33,6 @@ PACKED = ("sensor_msgs/msg/CompressedImage",)  # compressing these again costs t
 
 
 _encode_body = partial(encode_imu, frame_id=BODY)
-
-
-class Written(NamedTuple):
-    """Messages written, by topic."""
-
-    counts: dict[str, int]
 
 
 @dataclass
@@ -62,8 +56,8 @@ class _Buffer:
         return chunk, "none" if self.packed else None
 
 
-def write_log(source: MessageLog, path: Location, *, compression: str = "zstd", overwrite: bool = False) -> Written:
-    """Write every topic of a message log; return the messages written by topic.
+def write_log(source: MessageLog, path: Location, *, compression: str = "zstd", overwrite: bool = False) -> None:
+    """Write every topic of a message log.
 
     What the source counts differently goes to its remarks.
 
@@ -83,14 +77,12 @@ def write_log(source: MessageLog, path: Location, *, compression: str = "zstd", 
             series = Series(log.channel(topic, schemas.IMU), imu.t_ns, (imu.t_ns, imu.gyro, imu.accel), _encode_body)
             for chunk in chunks([series]):
                 log.chunk(chunk)
-        counts = _counts(log)
-        if not sum(counts.values()):
+        if not log.contents.counts.total():
             raise DataError("holds no messages", where=source.name, expected="a log with data")
         _compare(source, stream.counts)
         if source.remarks.notes or source.remarks.losses:
             lines = [*source.remarks.losses, *source.remarks.notes]
             log.metadata("imutool/remarks", {f"{number:03d}": line for number, line in enumerate(lines, start=1)})
-    return Written(counts)
 
 
 class _Stream:
@@ -102,11 +94,23 @@ class _Stream:
         self._buffers: dict[int, _Buffer] = {}  # by channel
         self._shared = _Buffer(packed=False), _Buffer(packed=False)  # of sensors, and of all others that are small
         self._sequence = Counter[int]()
+        self._reflected: dict[int, tuple[int, ReflectedImu]] = {}  # channel of the CDR, by that of the original
+        self._lacking = Counter[str]()  # messages without a sample, by topic
         self.counts = Counter[str]()
         for topic in source.topics:
             self._define(topic)
 
-    def _define(self, topic: MessageTopic) -> int:
+    def _define(self, topic: MessageTopic, first: bytes | memoryview | None = None) -> int:
+        """Define a topic; an IMU in protobuf or JSON becomes CDR under its name, and its original gets another."""
+        if first is not None and (imu := _reflected(topic, bytes(first))) is not None:
+            cdr = self._define(MessageTopic(topic.name, schemas.IMU, "ros2msg", b"", "cdr"))
+            recorded = (*topic.metadata, (RECORDED_KEY, topic.name))
+            number = self._define(replace(topic, name=f"{topic.name}/as_recorded", metadata=recorded))
+            self._channels[topic] = number
+            self._reflected[number] = cdr, imu
+            note = f"{topic.name}: {topic.message_encoding} became {schemas.IMU}, taken as rad/s and m/s^2"
+            self._source.remarks.notes.append(note)
+            return number
         kind = self._source.kinds.get(topic.name)
         marked = topic if kind is None else replace(topic, metadata=(*topic.metadata, (KIND_KEY, kind)))
         if (whole := self._pairs.whole_of(topic.name)) is not None:
@@ -123,18 +127,13 @@ class _Stream:
         """Chunks of about 1 MiB as they fill, and the rest at the end."""
         for topic, log_time, publish_time, payload in self._source.messages():
             if (number := self._channels.get(topic)) is None:
-                number = self._define(topic)
+                number = self._define(topic, payload)
             if log_time < 0:
                 raise DataError(f"a message of {topic.name} has the time {log_time} ns", expected="no time before 1970")
             self._pairs.take(topic, payload)
-            buffer = self._buffers[number]
-            sequence = self._sequence[number]
-            self._sequence[number] = sequence + 1
-            buffer.parts += messages.message_head(number, sequence, log_time, publish_time, len(payload)), payload
-            buffer.channels.append(number)
-            buffer.times.append(log_time)
-            buffer.offsets.append(buffer.size)
-            buffer.size += messages.MESSAGE.itemsize + len(payload)
+            if number in self._reflected:
+                self._put_as_cdr(number, topic, log_time, publish_time, bytes(payload))
+            buffer = self._put(number, log_time, publish_time, payload)
             if buffer.size >= CHUNK_BYTES:
                 yield buffer.pop()
         for buffer in {id(b): b for b in (*self._shared, *self._buffers.values())}.values():
@@ -142,6 +141,43 @@ class _Stream:
                 yield buffer.pop()
         for topic, number in self._channels.items():
             self.counts[topic.name] += self._sequence[number]
+        for name, count in self._lacking.items():
+            self._source.remarks.losses.append(f"{count} messages of {name} hold no sample of an IMU: see {name}/as_recorded")
+
+    def _put(self, number: int, log_time: int, publish_time: int, payload: bytes | memoryview) -> _Buffer:
+        buffer = self._buffers[number]
+        sequence = self._sequence[number]
+        self._sequence[number] = sequence + 1
+        buffer.parts += messages.message_head(number, sequence, log_time, publish_time, len(payload)), payload
+        buffer.channels.append(number)
+        buffer.times.append(log_time)
+        buffer.offsets.append(buffer.size)
+        buffer.size += messages.MESSAGE.itemsize + len(payload)
+        return buffer
+
+    def _put_as_cdr(self, number: int, topic: MessageTopic, log_time: int, publish_time: int, payload: bytes) -> None:
+        """Put the sample in a message of a reflected IMU, ahead of the message itself."""
+        channel, imu = self._reflected[number]
+        try:
+            stamp_ns, frame, values = imu.sample(payload, log_time)
+        except ValueError:
+            self._lacking[topic.name] += 1
+            return
+        row = np.array([values])
+        self._put(channel, log_time, publish_time, encode_imu(np.array([stamp_ns]), row[:, :3], row[:, 3:], frame).tobytes())
+
+
+def _reflected(topic: MessageTopic, first: bytes) -> ReflectedImu | None:
+    """Fields of an IMU in a topic of another encoding.
+
+    Raises:
+        ConfigError: its messages are protobuf, which is not installed.
+    """
+    try:
+        return reflect(topic.message_encoding, topic.schema_name, topic.schema, first)
+    except ImportError as error:
+        fix = "Install it with: pip install 'imutool[protobuf]'"
+        raise ConfigError("reading protobuf messages needs protobuf", where=topic.name, fix=fix) from error
 
 
 def _write_metadata(log: LogWriter, source: MessageLog) -> None:
@@ -190,13 +226,6 @@ def _tables(log: LogWriter, source: MessageLog) -> list[Series]:
         Series(log.define(table_topic(topic, table)), table.t_ns, (table.columns,), encode_table)
         for topic, table in source.tables.items()
     ]
-
-
-def _counts(log: LogWriter) -> dict[str, int]:
-    counts: Counter[str] = Counter()
-    for number, channel in log.contents.channels.items():
-        counts[channel.topic] += log.contents.counts[number]
-    return dict(counts)
 
 
 def _compare(source: MessageLog, written: Counter[str]) -> None:

@@ -6,7 +6,6 @@ Sequences convert in worker processes, one log a sequence; a sequence that fails
 from __future__ import annotations
 
 import difflib
-import os
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import chain, islice
@@ -17,6 +16,7 @@ from imutool import registry
 from imutool.conversion.labels import Labels, parse_kinds, parse_parts
 from imutool.conversion.workers import GROUP, Job, Outcome, run_jobs, write_content
 from imutool.errors import ConfigError, DataError, ImutoolError
+from imutool.mcap_io.storage.system import processors
 from imutool.recording import Recording
 from imutool.recording.message_log import MessageLog
 
@@ -147,7 +147,8 @@ def _find(source: Path, format: str) -> _Sequences:
         raise DataError(
             "no sequence found",
             where=source,
-            expected="a folder with mav0/imu0/data.csv, a .zip, .tar or .tar.gz of one, a ROS 1 .bag, or a folder of these",
+            expected="a ROS bag, an MCAP log, a PX4 or ArduPilot log, a table, a mav0 folder or its archive",
+            fix="Name the file itself: single logs and tables in a folder are not looked for" if source.is_dir() else "",
         )
     for place, jobs in claims.items():
         if len(jobs) > 1:
@@ -241,8 +242,7 @@ def _is_part_of(target: Path, source: Path) -> bool:
 def _worker_count(workers: int | None, jobs: int) -> int:
     if workers is not None and workers < 1:
         raise ConfigError(f"workers is {workers}", expected="at least 1")
-    processors = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    return min(jobs, processors if workers is None else workers)
+    return min(jobs, processors() if workers is None else workers)
 
 
 def _from_stream(

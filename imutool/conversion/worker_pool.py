@@ -31,13 +31,13 @@ from types import FrameType
 from typing import Any, NamedTuple, NoReturn
 
 from imutool.errors import ConfigError
+from imutool.mcap_io.storage.system import KILLED, inherited, opened
 
 POLL_S = 0.5
 GRACE_S = 1.2  # for a worker to remove what it has half written
 STARTS = 3  # deaths of workers one after the other before they are ready
 TERMINATED = 143
 READY = b"ready"
-KILLED = (-signal.SIGKILL, -signal.SIGTERM)
 ONE_THREAD = {"OMP_NUM_THREADS": "1", "OMP_WAIT_POLICY": "PASSIVE", "OPENBLAS_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
 START = """
 import sys, json
@@ -192,9 +192,8 @@ class WorkerPool:
                 [sys.executable, "-c", START, str(theirs.fileno()), json.dumps(sys.path)],
                 stdin=subprocess.DEVNULL,
                 stdout=subprocess.DEVNULL,
-                pass_fds=[theirs.fileno()],
-                process_group=0,
                 env={**os.environ, **ONE_THREAD},
+                **inherited(theirs.fileno()),
             )
         except OSError as error:
             raise ConfigError(f"a worker process cannot be started ({error.strerror})", where="workers") from error
@@ -251,7 +250,7 @@ def serve(descriptor: int) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     with contextlib.suppress(OSError):  # when memory runs out a worker ends, not the process that keeps the results
         Path("/proc/self/oom_score_adj").write_text("500")
-    connection, items = Connection(descriptor), queue.SimpleQueue[Any]()
+    connection, items = opened(descriptor), queue.SimpleQueue[Any]()
     with contextlib.suppress(EOFError, OSError, SystemExit):  # the other end has gone, or wants this one to end
         function = pickle.loads(connection.recv_bytes())  # noqa: S301  from the process that started this one
         connection.send_bytes(READY)

@@ -26,17 +26,16 @@ from imutool.diagnosis.estimation.observability import unobservable, with_free
 from imutool.diagnosis.estimation.significance import scatter
 from imutool.diagnosis.estimation.whitening import WhitenedImu
 from imutool.diagnosis.held_out import resimulate
-from imutool.diagnosis.reference import (
+from imutool.diagnosis.reference.coverage import (
     align,
     align_all,
     check_without_reference,
     is_another_motion,
-    reference_caveat,
-    reference_errors,
     with_unique_names,
     without_unusable,
 )
-from imutool.diagnosis.result import Closer, Diagnosis, Finding
+from imutool.diagnosis.reference.errors import reference_caveat, reference_errors, turned_reference
+from imutool.diagnosis.result import Closer, Diagnosis, Finding, Located
 from imutool.diagnosis.settings import DiagnoseSettings
 from imutool.diagnosis.signal_diagnosis import SignalDiagnosis, diagnose_signal
 from imutool.diagnosis.to_physics_file import NO_EFFECT
@@ -97,6 +96,7 @@ def diagnose(
     wrong, wrong_at = reference_errors(logs, settings.reference)
     named, unnamed_groups = ((), ()) if wrong else (candidates, unnamed_candidates(pairs))
     selection = select_effects(logs, named, unnamed_groups, lambda word: report(2, 4, f"trying {word}"))
+    wrong += turned_reference(logs, selection.whole.chosen, settings.reference)
     report(3, 4, "locating")
     paths = {recording.name: str(real) for recording, real in zip(recordings, reals, strict=True)}
     hidden = unobservable(logs, candidates, settings.search)
@@ -105,9 +105,8 @@ def diagnose(
         report(3, 4, "simulating again")
         diagnosis = _resimulated(diagnosis, logs, selection, simulated)
     caveat = reference_caveat(recordings) if simulated is None else ""
-    tried = dict.fromkeys(log.remark for log in logs_read if log.remark)
-    diagnosis = replace(diagnosis, remarks=(*another, *left_out, *diagnosis.remarks, *tried), caveat=caveat)
-    diagnosis = replace(diagnosis, findings=(*wrong, *diagnosis.findings), located=tuple(wrong_at) or diagnosis.located)
+    tried = tuple(dict.fromkeys(log.remark for log in logs_read if log.remark))
+    diagnosis = _with_reference(diagnosis, wrong, wrong_at, (*another, *left_out, *diagnosis.remarks, *tried), caveat)
     for signal, real, simulated_field in signal_fields:
         report(3, 4, signal)
         diagnosis = _with_signal(diagnosis, diagnose_signal(real, simulated_field, others(reals[0], signal), signal, settings))
@@ -125,6 +124,14 @@ def _resimulated(diagnosis: Diagnosis, logs: Sequence[WhitenedImu], selection: S
         why = f"How much closer it comes is computed, not simulated again: {error}"
         return replace(diagnosis, remarks=(*diagnosis.remarks, why))
     return replace(diagnosis, closer=closer)
+
+
+def _with_reference(
+    diagnosis: Diagnosis, wrong: Sequence[Finding], wrong_at: Sequence[Located], remarks: tuple[str, ...], caveat: str
+) -> Diagnosis:
+    """Adds errors of the reference, with the remarks on it."""
+    findings, located = (*wrong, *diagnosis.findings), tuple(wrong_at) or diagnosis.located
+    return replace(diagnosis, findings=findings, located=located, remarks=remarks, caveat=caveat)
 
 
 def _with_signal(diagnosis: Diagnosis, added: SignalDiagnosis) -> Diagnosis:

@@ -193,6 +193,11 @@ class ReferenceSettings(Settings, frozen=True):
     longest_s: Positive = 4.0  # of one interval
     quiet_chi_square: Positive = 1.1  # reduced: up to it all the rest is noise
     join_s: Positive = 0.6  # intervals closer than this are joined
+    turned_block_s: Positive = 5.0  # of a mean: slower than poses follow the gyro (EuRoC V1_01)
+    least_turned_blocks: Count = 8
+    least_turned_rad: Positive = 5e-3  # of a rotation that is reported
+    least_turned_share: Share = 0.6  # of the slow misfit that it has to remove
+    turned_alike_p_value: Share = 1e-3  # below which gyro and gravity show two rotations
 
 
 class LocalizationSettings(Settings, frozen=True):

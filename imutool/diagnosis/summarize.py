@@ -28,7 +28,7 @@ from imutool.diagnosis.held_out import (
     with_effects,
 )
 from imutool.diagnosis.localization import locate_findings, locate_residual
-from imutool.diagnosis.reference import at_limit, unusable_axes
+from imutool.diagnosis.reference.coverage import at_limit, unusable_axes
 from imutool.diagnosis.result import Curve, Diagnosis, Estimate, Finding, Located, Traces
 from imutool.diagnosis.settings import DiagnoseSettings
 from imutool.diagnosis.to_physics_file import to_physics_file
@@ -251,11 +251,11 @@ def _resting(pairs: Sequence[Pair], hidden: Sequence[str]) -> Iterator[str]:
 def _remarks(pairs: Sequence[Pair]) -> Iterator[str]:
     for pair in pairs:
         if axes := unusable_axes(pair):
-            yield f"{pair.name}: {'; '.join(axes)}. What was felt there nobody knows, so the answer rests on all other samples"
+            yield f"{pair.name}: {'; '.join(axes)}. These samples are no measurement; the diagnosis uses all others"
         if pair.aligned_s:
             yield (
                 f"{pair.name}: the two clocks share no epoch; aligned by the motion ({pair.aligned_s:+.3f} s), "
                 "so that a constant offset between them cannot be seen"
             )
         if pair.ideal.R_wb is None:
-            yield f"{pair.name}: no attitude is known, so that gravity and the earth's rotation were not asked"
+            yield f"{pair.name}: no attitude is known, so gravity and the earth's rotation were not tried"

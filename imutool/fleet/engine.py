@@ -15,7 +15,6 @@ import warnings
 from collections.abc import Callable, Generator, Iterable, Iterator
 from contextlib import contextmanager
 from functools import partial
-from pathlib import Path
 from types import FrameType
 from typing import Any, Protocol
 
@@ -25,12 +24,14 @@ from imutool.conversion.worker_pool import ONE_THREAD, WorkerBugError, WorkerPoo
 from imutool.errors import ConfigError, LogError, redact
 from imutool.fleet.task import Result, Task
 from imutool.fleet.work import work
+from imutool.mcap_io.storage import system
 
 AHEAD = 2  # tasks in flight for each that can be worked on: the next one is there when one ends
 POLL_S = 0.5
 ANSWER_S = 5.0
 BUG = 1
-CGROUP_LIMITS = ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory/memory.limit_in_bytes")
+SETTINGS = bytes((0, 0, 0, 4, 0, 0, 0, 0, 0))  # an empty SETTINGS frame of HTTP/2, the first that either side sends
+GREETING = b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n" + SETTINGS  # RFC 9113, section 3.4; gRPC is HTTP/2
 Tick = Callable[[int], None]
 _decode = msgspec.json.Decoder(Task).decode
 _decode_result = msgspec.json.Decoder(Result).decode
@@ -58,10 +59,9 @@ class ProcessEngine:
     """
 
     def __init__(self, *, workers: int | None = None, memory_bytes: int = 1 << 30, retries: int = 3) -> None:
-        memory = _memory_bytes()
+        memory = system.memory_bytes()
         _refuse_too_much(memory_bytes, memory)
-        cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-        self.workers = max(1, min(workers or cores, memory // max(memory_bytes, 1)))
+        self.workers = max(1, min(workers or system.processors(), memory // max(memory_bytes, 1)))
         self._retries = retries
 
     def __enter__(self) -> ProcessEngine:
@@ -87,15 +87,6 @@ def _work_quietly(task: Task, model: bytes | None) -> Result:
     logging.lastResort = None
     warnings.simplefilter("ignore")
     return work(task, model)
-
-
-def _memory_bytes() -> int:
-    """Memory of this machine, or of the container that this process runs in."""
-    limits = [os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")]
-    for name in CGROUP_LIMITS:
-        with contextlib.suppress(OSError, ValueError):  # no container, or one without a limit
-            limits.append(int(Path(name).read_text()))
-    return min(limits)
 
 
 def _refuse_too_much(wanted: int, most: int) -> None:
@@ -276,7 +267,7 @@ def _interrupts_kept() -> Iterator[Callable[[], None]]:
 
 
 def _refuse_silence(address: str) -> None:
-    """Check that HOST:PORT accepts connections; Ray itself would wait for minutes.
+    """Check that a gRPC server answers at HOST:PORT; Ray itself would wait for minutes, or for ever.
 
     Raises:
         ConfigError: nobody does.
@@ -285,7 +276,11 @@ def _refuse_silence(address: str) -> None:
     if not host or not port.isdecimal():
         return  # a word such as auto, which Ray itself makes out
     try:
-        socket.create_connection((host.strip("[]"), int(port)), timeout=ANSWER_S).close()
+        with socket.create_connection((host.strip("[]"), int(port)), timeout=ANSWER_S) as connection:
+            if "RAY_USE_TLS" not in os.environ:
+                connection.sendall(GREETING)
+                if connection.recv(4)[3:] != SETTINGS[3:4]:
+                    raise OSError("what listens there does not speak gRPC")
     except (OSError, OverflowError) as error:
         raise ConfigError(f"no answer ({error})", where=f"address={redact(address)}", expected="a Ray cluster") from error
 

@@ -11,7 +11,6 @@ more until it is large enough for the next to begin, and what is read is a copy.
 from __future__ import annotations
 
 import contextlib
-import fcntl
 import os
 import platform
 import re
@@ -28,6 +27,7 @@ from imutool import __version__
 from imutool.errors import ConfigError
 from imutool.fleet.task import Result, Settings
 from imutool.location import Location, io_errors, reason
+from imutool.mcap_io.storage.system import lock
 
 NAME = "fleet.journal"
 NOTED_AGAIN = 32  # targets in a second note
@@ -164,14 +164,10 @@ class Journal:
         return at, len(raw)
 
     def _lock(self) -> None:
-        try:
-            fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError as error:
+        if not lock(self._file):
             runs = [line for _, _, line in self._lines() if isinstance(line, Run)]
             who = f" ({runs[-1].process})" if runs and runs[-1].process else ""
-            raise ConfigError(
-                f"another run is at work here{who}", where=self.path, fix="Wait for it, or choose another `out`"
-            ) from error
+            raise ConfigError(f"another run is at work here{who}", where=self.path, fix="Wait for it, or choose another `out`")
 
     def _read(self) -> Run | None:
         """Read the journal, and return the last run's line."""

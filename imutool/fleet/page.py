@@ -121,7 +121,7 @@ def _numbers(statistics: Statistics, seconds: float) -> Iterator[str]:
     if statistics.statuses["skipped"]:
         cells.append((f"{statistics.statuses['skipped']:,}", "done by an earlier run"))
     if statistics.seconds:
-        cells.append((f"{np.median(statistics.speeds):.3g} MB/s", "of one worker, in the middle"))
+        cells.append((f"{np.median(statistics.speeds):.3g} MB/s", "median speed of a worker"))
     if statistics.peak_bytes:
         cells.append((size(statistics.peak_bytes), "most memory of a worker"))
     yield cards(cells)

@@ -2,12 +2,8 @@
 
 from __future__ import annotations
 
-import contextlib
 import hashlib
-import os
 import platform
-import resource
-import sys
 import tempfile
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -24,13 +20,13 @@ from imutool.fleet.task import Imu, Parameter, Result, Settings, Task
 from imutool.location import Location, identity, to_location
 from imutool.mcap_io.log import Log
 from imutool.mcap_io.storage.source import sha256
+from imutool.mcap_io.storage.system import peak_bytes, user
 from imutool.mcap_io.storage.target import Target
 from imutool.report import UNSET, Report, UnsetType, json_text, json_values
 
 LOST = 3  # exit code: something of the log was lost
 MOST_LOSSES = 20  # stretches listed for a log; its metadata and its repair list all
 MOST_LETTERS = 300  # of what a page says
-MAXRSS = 1 if sys.platform == "darwin" else 1024  # bytes in what the system counts memory in
 
 
 @dataclass(frozen=True)
@@ -84,14 +80,6 @@ def work(task: Task, model: bytes | None = None) -> Result:
     return msgspec.structs.replace(result, **spent, peak_bytes=peak_bytes())
 
 
-def peak_bytes() -> int:
-    """Peak memory of this process; `ru_maxrss` would begin with that of its parent."""
-    with contextlib.suppress(OSError, StopIteration):
-        lines = Path("/proc/self/status").read_text().splitlines()
-        return 1024 * next(int(line.split()[1]) for line in lines if line.startswith("VmHWM:"))
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * MAXRSS
-
-
 def page_name(log: str) -> str:
     """Name of the page about a log."""
     return log.removesuffix(".mcap") + ".html"
@@ -125,7 +113,7 @@ def _at_hand(settings: Settings, model: bytes | None) -> Settings:
         return settings
     if hashlib.sha256(model).hexdigest() != settings.model_sha256:
         raise ModelError("has changed since the fleet was begun", where=settings.model, fix="Begin again with `overwrite`")
-    copy = Path(tempfile.gettempdir(), f"imutool-models.{os.getuid()}", settings.model_sha256, Path(settings.model).name)
+    copy = Path(tempfile.gettempdir(), f"imutool-models.{user()}", settings.model_sha256, Path(settings.model).name)
     if not copy.is_file() or sha256(copy) != settings.model_sha256:
         copy.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
         with Target(copy, overwrite=True) as out:

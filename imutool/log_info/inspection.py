@@ -23,7 +23,7 @@ from imutool.log_info.report import Clock, ImuInfo, ImuNoise, Interval, LogInfo,
 from imutool.mcap_io.codec import schemas
 from imutool.mcap_io.log import Log
 from imutool.mcap_io.recovery.recovered_log import RecoveredLog
-from imutool.mcap_io.topics import DERIVED_KEY, ENCODINGS, Topic
+from imutool.mcap_io.topics import DERIVED_KEY, Topic
 from imutool.recording import GAP_FACTOR, MIN_GAP_S, Imu, nanoseconds
 from imutool.report import UNSET
 from imutool.units import SENSORS
@@ -90,7 +90,8 @@ def _joined(parts: Iterable[Int64[np.ndarray, " n"]]) -> Int64[np.ndarray, " m"]
 
 
 def _topic(topic: Topic, log_times: Int64[np.ndarray, " n"]) -> TopicInfo:
-    return TopicInfo(topic.name, topic.schema_name, topic.message_encoding, len(log_times), *_clock(log_times))
+    schema = topic.own_schema or topic.schema_name
+    return TopicInfo(topic.name, schema, topic.message_encoding, len(log_times), *_clock(log_times))
 
 
 def _clock(t_ns: Int64[np.ndarray, " n"]) -> Clock:
@@ -111,7 +112,7 @@ def _clock(t_ns: Int64[np.ndarray, " n"]) -> Clock:
 def _imu(log: Log, topic: Topic, truth: Truth | None) -> ImuInfo:
     """Defects, rest and noise of an IMU; only a warning if its encoding is unknown."""
     derived_from = topic.metadata.get(DERIVED_KEY, UNSET)
-    if topic.message_encoding not in ENCODINGS:
+    if not topic.is_read:
         warnings = [f"encoding {topic.message_encoding!r} is not read"]
         return ImuInfo(topic=topic.name, warnings=warnings, derived_from=derived_from)
     batches = list(raw_batches(log, topic.name))

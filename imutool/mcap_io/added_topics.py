@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from typing import NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
@@ -11,14 +12,17 @@ from jaxtyping import Int64, Shaped, UInt8, UInt16
 
 from imutool.errors import LogError
 from imutool.mcap_io.codec import messages, schemas
+from imutool.mcap_io.codec.encode import as_ros1
 from imutool.mcap_io.log import Log
-from imutool.mcap_io.topics import ImuBatch
-from imutool.mcap_io.writer import Chunk
+from imutool.mcap_io.topics import DERIVED_KEY, ImuBatch, Topic
+from imutool.mcap_io.writer import Chunk, LogWriter
+from imutool.recording.message_log import MessageTopic
 
 BATCH_BYTES = 1 << 18  # of IMU messages are decoded at once: one chunk holds too few among its images for numpy to be quick
 
 Heads = Shaped[np.ndarray, " n"]  # of dtype messages.MESSAGE
 Payload = UInt8[np.ndarray, "n L"]
+Translate = Callable[[UInt8[np.ndarray, "..."]], UInt8[np.ndarray, "..."] | list[bytes]]  # from CDR
 
 
 class NewTopic(NamedTuple):
@@ -72,6 +76,26 @@ def check_new_topics(log: Log, derived: Sequence[DerivedTopics]) -> None:
                 )
 
 
+def define(out: LogWriter, new: NewTopic, log: Log, source: Topic, *, own: bool) -> tuple[int, Translate | None]:
+    """Define a new topic; return its channel id, and the translation of its messages out of CDR.
+
+    With `own` an IMU has the type and encoding of its source, and the types of ROS have the encoding of ROS 1 where the source
+    has it.
+    """
+    metadata = {DERIVED_KEY: source.name}
+    if own and source.message_encoding == "ros1":
+        text, name = schemas.ros1_definition(new.schema_name).encode(), new.schema_name.replace("/msg/", "/")
+        topic = MessageTopic(new.name, name, "ros1msg", text, "ros1", tuple(metadata.items()))
+        return out.define(topic), partial(as_ros1, schema_name=new.schema_name)
+    if own and source.reflected is not None and new.schema_name == schemas.IMU:
+        channel = next(channel for channel in log.index.channels.values() if channel.topic == source.name)
+        schema = log.index.schemas.get(channel.schema_id)
+        data = schema.data if schema else b""
+        described = source.own_schema, source.schema_encoding, data, source.message_encoding, tuple(metadata.items())
+        return out.define(MessageTopic(new.name, *described)), source.reflected.from_cdr
+    return out.channel(new.name, new.schema_name, metadata), None
+
+
 @dataclass
 class DerivedStream:
     """Queues of one `DerivedTopics`: source messages to decode, computed messages to write."""
@@ -79,20 +103,25 @@ class DerivedStream:
     log: Log
     derived: DerivedTopics
     sources: set[int]
-    ids: list[int]
+    defined: Sequence[tuple[int, Translate | None]]  # channel ids, and translations out of CDR
     undecoded: list[tuple[Heads, Payload]] = field(default_factory=list)  # of the source, of equal size
     undecoded_bytes: int = 0
-    data: list[UInt8[np.ndarray, "n M"]] = field(default_factory=list)
+    data: list[UInt8[np.ndarray, "..."]] = field(default_factory=list)
     channels: list[UInt16[np.ndarray, " n"]] = field(default_factory=list)
     times: list[Int64[np.ndarray, " n"]] = field(default_factory=list)
     offsets: list[Int64[np.ndarray, " n"]] = field(default_factory=list)
     size: int = 0
 
+    @property
+    def ids(self) -> list[int]:
+        """Channel ids of the new topics."""
+        return [number for number, _ in self.defined]
+
     def add(self, found: messages.Messages) -> None:
         """Takes in the IMU's messages of a source chunk, and decodes them once there are enough."""
         of = found.heads["channel"]
         mask = np.logical_or.reduce([of == channel for channel in self.sources])
-        for heads, payload in messages.cut(found, mask):
+        for heads, payload in self.log.topics[self.derived.source_topic].cut(found, mask):
             if self.undecoded and self.undecoded[-1][1].shape[1] != payload.shape[1]:
                 self.decode()
             self.undecoded.append((heads, payload))
@@ -115,6 +144,9 @@ class DerivedStream:
         """Computes the new messages of a batch, side by side for each source message."""
         batch, payloads = self.derived(batch)
         assert len(payloads) == len(self.ids), f"{len(payloads)} arrays for {len(self.ids)} topics"
+        if any(translate for _, translate in self.defined) and len(batch.log_time):
+            self._put_one_by_one(batch, [p if t is None else t(p) for (_, t), p in zip(self.defined, payloads, strict=True)])
+            return
         widths = [messages.MESSAGE.itemsize + payload.shape[1] for payload in payloads]
         count, stride, ends = len(batch.log_time), sum(widths), np.cumsum(widths)
         data = np.empty((count, stride), np.uint8)
@@ -126,6 +158,22 @@ class DerivedStream:
         self.times.append(np.repeat(batch.log_time, len(widths)))
         self.offsets.append((self.size + stride * np.arange(count)[:, None] + ends - widths).reshape(-1))
         self.size += count * stride
+
+    def _put_one_by_one(self, batch: ImuBatch, payloads: Sequence[UInt8[np.ndarray, "..."] | list[bytes]]) -> None:
+        """Put messages of differing sizes, side by side for each source message."""
+        parts: list[bytes] = []
+        sizes: list[int] = []
+        times = batch.sequence.tolist(), batch.log_time.tolist(), batch.publish_time.tolist()
+        for n, (sequence, log_ns, publish_ns) in enumerate(zip(*times, strict=True)):
+            for channel, of_topic in zip(self.ids, payloads, strict=True):
+                payload = bytes(of_topic[n])
+                parts += messages.message_head(channel, sequence, log_ns, publish_ns, len(payload)), payload
+                sizes.append(messages.MESSAGE.itemsize + len(payload))
+        self.data.append(np.frombuffer(b"".join(parts), np.uint8))
+        self.channels.append(np.tile(np.array(self.ids, np.uint16), len(batch.log_time)))
+        self.times.append(np.repeat(batch.log_time, len(self.ids)))
+        self.offsets.append(self.size + np.cumsum([0, *sizes[:-1]]))
+        self.size += sum(sizes)
 
     def pop_chunk(self) -> Chunk:
         """Hands over the computed messages as one chunk."""

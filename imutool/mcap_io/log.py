@@ -32,6 +32,7 @@ from imutool.mcap_io.topics import (
     ScalarBatch,
     StampCheck,
     Topic,
+    reflected_topics,
     topics_of,
 )
 
@@ -62,12 +63,20 @@ class Log:
             with self.named():
                 self.index = self._read_index(self._source)
                 self.topics = MappingProxyType(topics_of(self.index))
+                imus = dict(reflected_topics(self.index, self.topics, self._first))
+                self.topics = MappingProxyType({**self.topics, **imus})
         except BaseException:
             self.close()
             raise
 
     def _read_index(self, source: Source) -> LogIndex:
         return LogIndex(source, self.max_chunk)
+
+    def _first(self, topic: str) -> bytes | None:
+        """Bytes of a topic's first message."""
+        for _, rows in self.rows([topic]):
+            return bytes(rows.payload[0])
+        return None
 
     def __enter__(self) -> Log:
         return self
@@ -118,10 +127,13 @@ class Log:
         """
         found = self.imu_topics
         if not found:
-            raise LogError("the log has no IMU topic", where=self.path, expected=f"{schemas.IMU} among {self.listing()}")
+            expected, fix = f"{schemas.IMU} among {self.listing()}", ""
+            if any(topic.message_encoding == "protobuf" for topic in self.topics.values()):
+                fix = "An IMU in protobuf is read with: pip install 'imutool[protobuf]'"
+            raise LogError("the log has no IMU topic", where=self.path, expected=expected, fix=fix)
         if len(found) > 1:
-            listed = ", ".join(found)
-            raise LogError(f"the log has {len(found)} IMU topics: {listed}", where=self.path, fix="Choose one with `imu`")
+            what = f"the log has {len(found)} IMU topics: {', '.join(found)}"
+            raise LogError(what, where=self.path, fix="Choose one with `imu`")
         return found[0]
 
     @property
@@ -150,9 +162,9 @@ class Log:
             raise LogError(f"there is no topic {name}", where=self.path, expected=self.listing())
         found = self.topics[name]
         if found.schema_name not in schema_names:
-            carried = found.schema_name or "messages without schema"
-            raise LogError(f"{name} carries {carried}", where=self.path, expected=" or ".join(schema_names))
-        if found.message_encoding not in ENCODINGS:
+            what = f"{name} carries {found.schema_name or 'messages without schema'}"
+            raise LogError(what, where=self.path, expected=" or ".join(schema_names))
+        if not found.is_read:
             raise LogError(f"{name} is encoded as {found.message_encoding!r}", where=self.path, expected=" or ".join(ENCODINGS))
         return found
 
@@ -283,5 +295,5 @@ class Log:
         inside = (times >= first) & (times <= last)
         for topic, channels in wanted.items():
             mask = inside & np.isin(found.heads["channel"], list(channels))
-            for rows in messages.rows(found, mask):
-                yield topic, rows
+            for heads, payload in self.topics[topic].cut(found, mask):
+                yield topic, messages.columns(heads, payload)

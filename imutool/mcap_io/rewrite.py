@@ -13,9 +13,8 @@ recorders do, the copy states none.
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import nullcontext, suppress
+from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -24,7 +23,7 @@ from mcap.records import Metadata, MetadataIndex
 
 from imutool.errors import ConfigError, LogError
 from imutool.location import Location, identity, same_location
-from imutool.mcap_io.added_topics import DerivedStream, DerivedTopics, check_new_topics
+from imutool.mcap_io.added_topics import DerivedStream, DerivedTopics, check_new_topics, define
 from imutool.mcap_io.blocks import (
     Attachment,
     MessageBlock,
@@ -37,8 +36,8 @@ from imutool.mcap_io.codec import messages, records
 from imutool.mcap_io.codec.records import HEAD, ChunkHead
 from imutool.mcap_io.index import LogIndex
 from imutool.mcap_io.log import Log
+from imutool.mcap_io.storage.system import give
 from imutool.mcap_io.storage.target import PassThrough
-from imutool.mcap_io.topics import DERIVED_KEY
 from imutool.mcap_io.verify import Verified, check_data_crc, check_mode, stated_crc, verify
 from imutool.mcap_io.write import CHUNK_BYTES
 from imutool.mcap_io.writer import Chunk, LogWriter
@@ -68,11 +67,12 @@ def rewrite(
     metadata: Values | Callable[[Verified], Values],
     overwrite: bool = False,
     check: str = "imu",
+    own_encoding: bool = False,
     progress: Callable[[int, int], None] | None = None,
 ) -> RewriteReport:
     """Writes all of `source` to `target`, with derived topics and metadata records.
 
-    Derived messages are in chunks of their own.
+    Derived messages are in chunks of their own; with `own_encoding` in their source's encoding (`added_topics.define`).
 
     A derived message has log time, publish time and sequence of its source message. Where the source has a metadata record of
     the same name, both stand in the target; a function as `metadata` is called when all else is written.
@@ -102,7 +102,7 @@ def rewrite(
         crc, packing = bool(stated_crc(log.index)), _compression(log.index)
         header, replace = log.index.header_bytes, overwrite or target is None
         with LogWriter(place, compression=packing, overwrite=replace, header=header, data_crc=crc) as out:
-            report = _Rewrite(log, out, derived, check, progress or (lambda done, total: None)).run(metadata)
+            report = _Rewrite(log, out, derived, check, own_encoding, progress or (lambda *_: None)).run(metadata)
             if target is None and isinstance(path, Path) and isinstance(out.target.temporary, Path):
                 _copy_permissions(path, out.target.temporary)
             if identity(path) != log.index.source.identity:
@@ -113,8 +113,7 @@ def rewrite(
 def _copy_permissions(source: Path, target: Path) -> None:
     """Gives the target the mode of the source, and its owner where the system allows it."""
     status = source.stat()
-    with suppress(PermissionError):
-        os.chown(target, status.st_uid, status.st_gid)
+    give(target, status)
     target.chmod(status.st_mode & 0o7777)
 
 
@@ -127,28 +126,28 @@ class _Rewrite:
     """One pass over the source, and the verification of the target."""
 
     def __init__(
-        self, log: Log, out: LogWriter, derived: Sequence[DerivedTopics], check: str, tell: Callable[[int, int], None]
+        self,
+        log: Log,
+        out: LogWriter,
+        derived: Sequence[DerivedTopics],
+        check: str,
+        own: bool,
+        tell: Callable[[int, int], None],
     ) -> None:
         self.log, self.index, self.source, self.out = log, log.index, log.index.source, out
         self.check, self.tell = check, tell
         out.contents.schemas.update(sorted(self.index.schemas.items()))
         out.contents.channels.update(sorted(self.index.channels.items()))
-        self.streams = [
-            DerivedStream(
-                log,
-                topics,
-                log.channel_ids(topics.source_topic),
-                [out.channel(t.name, t.schema_name, {DERIVED_KEY: topics.source_topic}) for t in topics.topics],
-            )
-            for topics in derived
-        ]
+        self.streams = [self._stream(topics, own) for topics in derived]
         self.imu_channels = set().union(*(stream.sources for stream in self.streams)) if self.streams else set()
         self.passing = PassThrough(self.source, out.target)
-        self.checked, self.unchecked, self.new_chunks = (
-            0,
-            0,
-            set[int](),
-        )  # chunks unpacked while copying; offsets of the new ones
+        self.checked = self.unchecked = 0  # chunks unpacked while copying
+        self.new_chunks = set[int]()  # their offsets
+
+    def _stream(self, topics: DerivedTopics, own: bool) -> DerivedStream:
+        source = self.log.topics[topics.source_topic]
+        defined = [define(self.out, new, self.log, source, own=own) for new in topics.topics]
+        return DerivedStream(self.log, topics, self.log.channel_ids(source.name), defined)
 
     def run(self, metadata: Values | Callable[[Verified], Values]) -> RewriteReport:
         """Copies the log item by item with the new chunks between them, ends it, and verifies it.

@@ -3,23 +3,26 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, replace
 from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float64, Int64, UInt32
+from jaxtyping import Bool, Float64, Int64, Shaped, UInt8, UInt32
 
 from imutool.errors import LogError
-from imutool.mcap_io.codec import schemas
+from imutool.mcap_io.codec import messages, schemas
 from imutool.mcap_io.codec.decode import TwistColumns, decode_imu, decode_poses, decode_scalars, decode_twist
-from imutool.mcap_io.codec.messages import Rows
+from imutool.mcap_io.codec.messages import Messages, Rows
+from imutool.mcap_io.codec.reflection import ReflectedImu, reflect
 from imutool.mcap_io.index import LogIndex
 
 ENCODINGS = ("cdr", "ros1")
+REFLECTED = ("protobuf", "json")  # encodings whose messages are searched for those of an IMU
 DERIVED_KEY = "imutool_source_topic"  # channel metadata: computed by imutool from this topic
 PART_KEY = "imutool_part_of"  # channel metadata: one sensor of the IMU on that topic
+RECORDED_KEY = "imutool_recorded_as"  # channel metadata: the original of the IMU on that topic
 KIND_KEY = "imutool_kind"  # channel metadata of poses: truth, estimate, odometry or unknown
 KIND_WORDS = {  # in the names of topics
     "truth": "ground_truth|groundtruth|gt|truth|mocap|vicon|vrpn|optitrack|qualisys|natnet",
@@ -72,7 +75,10 @@ class ScalarBatch(NamedTuple):
 
 @dataclass(frozen=True)
 class Topic:
-    """A topic as its Channel record describes it; several channels of one topic count as one."""
+    """A topic as its Channel record describes it; several channels of one topic count as one.
+
+    An IMU in a type of its own (`reflected`) counts as sensor_msgs/msg/Imu, and its messages come as CDR.
+    """
 
     name: str
     schema_name: str  # in ROS 2 spelling; empty where the channel has no schema
@@ -80,6 +86,8 @@ class Topic:
     message_encoding: str
     count: int
     metadata: Mapping[str, str]
+    reflected: ReflectedImu | None = None
+    own_schema: str = ""  # name in the log of the type of a reflected IMU
 
     @property
     def is_derived(self) -> bool:
@@ -100,15 +108,27 @@ class Topic:
                 return kind
         return "odometry" if self.schema_name == schemas.ODOMETRY else "unknown"
 
+    @property
+    def is_read(self) -> bool:
+        """Whether imutool reads the topic's encoding."""
+        return self.reflected is not None or self.message_encoding in ENCODINGS
+
+    def cut(
+        self, found: Messages, mask: Bool[np.ndarray, " n"]
+    ) -> Iterator[tuple[Shaped[np.ndarray, " n"], UInt8[np.ndarray, "n L"]]]:
+        """Heads and payloads of the chosen messages, per stretch of equal size."""
+        yield from messages.cut(found, mask) if self.reflected is None else self.reflected.cut(found, mask)
+
     def decode_imu(self, rows: Rows) -> Iterator[ImuBatch]:
         """IMU messages from their bytes, one batch per stretch with one frame, unchecked.
 
         Raises:
             LogError: a payload that is no such message.
         """
-        for part, layout in schemas.runs(rows.payload, schemas.IMU, self.message_encoding):
+        encoding = self.message_encoding if self.reflected is None else "cdr"
+        for part, layout in schemas.runs(rows.payload, schemas.IMU, encoding):
             cut = rows.where(part)
-            columns = decode_imu(cut.payload, self.message_encoding, layout)
+            columns = decode_imu(cut.payload, encoding, layout)
             yield ImuBatch(cut.log_time, cut.publish_time, cut.sequence, *columns)
 
     def decode_poses(self, rows: Rows) -> Iterator[PoseBatch]:
@@ -225,3 +245,21 @@ def topics_of(index: LogIndex) -> dict[str, Topic]:
             raise LogError(f"{channel.topic} carries {before.schema_name} and {topic.schema_name}")
         found[channel.topic] = topic
     return found
+
+
+def reflected_topics(
+    index: LogIndex, topics: Mapping[str, Topic], first: Callable[[str], bytes | None]
+) -> Iterator[tuple[str, Topic]]:
+    """IMUs among the topics whose type is none of ROS; `first` gives the first message of a topic."""
+    definitions = {channel.topic: index.schemas.get(channel.schema_id) for channel in index.channels.values()}
+    for name, topic in topics.items():
+        if topic.message_encoding not in REFLECTED or RECORDED_KEY in topic.metadata:
+            continue
+        definition = definitions[name]
+        try:
+            raw = first(name) if topic.message_encoding == "json" else None
+            imu = reflect(topic.message_encoding, topic.schema_name, definition.data if definition else b"", raw)
+        except ImportError:
+            continue
+        if imu is not None:
+            yield name, replace(topic, schema_name=schemas.IMU, reflected=imu, own_schema=topic.schema_name)

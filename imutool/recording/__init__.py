@@ -36,7 +36,7 @@ def nanoseconds(duration_s: float) -> int:
     return round(duration_s * 1e9)
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Imu(Columns):
     """Angular rate (rad/s) and specific force (m/s²) in the body frame b, as measured.
 
@@ -52,7 +52,7 @@ class Imu(Columns):
         self.check(gyro=(3,), accel=(3,))
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Poses(Columns):
     """Poses of the body in the world (m); `q_wb` takes body vectors to world.
 
@@ -99,7 +99,7 @@ class Poses(Columns):
         return Poses(t_ns, p_wb, q_wb_wxyz, v_w), valid
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Scalars(Columns):
     """Numeric channel on its own clock.
 
@@ -135,7 +135,7 @@ def _dict(value: Any) -> Any:
     return {k: _dict(v) for k, v in value.items()} if isinstance(value, MappingProxyType) else value
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Recording:
     """Recording of one IMU with its true poses, scalar channels, camera frames and metadata.
 
@@ -156,6 +156,13 @@ class Recording:
     def __post_init__(self) -> None:
         for name in ("other_poses", "truths", "scalars", "frames", "metadata"):
             object.__setattr__(self, name, _mapping(getattr(self, name)))
+
+    def __repr__(self) -> str:
+        """A line for each topic."""
+        topics: list[tuple[str, object]] = [(self.imu_topic, self.imu), *self.truths.items(), *self.scalars.items()]
+        topics += [(topic, f"{frames.count} frames, {frames.format}") for topic, frames in self.frames.items()]
+        topics += [(topic, f"poses ({kind}), not read") for topic, kind in self.other_poses.items()]
+        return "\n".join([f"Recording {self.name!r}", *(f"  {topic}: {content}" for topic, content in topics)])
 
     def __eq__(self, other: object) -> bool:
         if not isinstance(other, Recording):

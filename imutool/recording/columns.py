@@ -61,6 +61,12 @@ class Columns:
     def __len__(self) -> int:
         return len(self.t_ns)
 
+    def __repr__(self) -> str:
+        """Size, rate and time span: arrays of a recording fill a terminal."""
+        rate = f" at {1 / self.period_s:.4g} Hz" if len(self) > 1 else ""
+        columns = [f"{c.name} {list(v.shape)}" for c in fields(self)[1:] if isinstance(v := getattr(self, c.name), np.ndarray)]  # type: ignore[arg-type]
+        return f"{type(self).__name__}({len(self)} rows{rate}, {self.duration_s:.3f} s; {', '.join(columns)})"
+
     def __eq__(self, other: object) -> bool:
         if type(other) is not type(self):
             return NotImplemented

@@ -129,7 +129,7 @@ def test_where_nothing_is_recognised_the_message_says_what_was_looked_for(tmp_pa
         source.mkdir()
         if kind == "folder of notes":
             (source / "notes.txt").write_text("notes")
-    with pytest.raises(DataError, match=r"no sequence found; expected a folder with mav0.*\.zip.*ROS 1 \.bag"):
+    with pytest.raises(DataError, match=r"no sequence found; expected a ROS bag, an MCAP log.* Name the file itself"):
         convert(source, tmp_path / "out")
     assert not (tmp_path / "out").exists()
 

@@ -1,4 +1,4 @@
-"""MCAP logs of other encodings: IMUs become CDR, all else stays byte for byte."""
+"""MCAP logs of other encodings: every command reads their IMUs, and conversion makes them CDR."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
 from mcap.reader import make_reader
 from mcap.writer import Writer
 
+from imutool.mcap_io.log import Log
 from imutool.mcap_io.read import read
 
 START_NS = 1_600_000_000_000_000_123
@@ -55,7 +56,8 @@ def as_protobuf(n: int, t_ns: int) -> bytes:
     return message.SerializeToString()
 
 
-def write_log(path: Path, encoding: str) -> Path:
+def write_log(path: Path, encoding: str, *, lacking: int | None = None) -> Path:
+    """Log of an IMU with a topic beside it; the message `lacking` has no acceleration."""
     with path.open("wb") as file:
         writer = Writer(file)
         writer.start()
@@ -68,7 +70,8 @@ def write_log(path: Path, encoding: str) -> Path:
         make = as_json if encoding == "json" else as_protobuf
         for n in range(COUNT):
             t_ns = START_NS + n * 5_000_000
-            writer.add_message(imu, t_ns + 700, make(n, t_ns), t_ns + 300)
+            payload = make(n, t_ns) if n != lacking else b"{}" if encoding == "json" else b""
+            writer.add_message(imu, t_ns + 700, payload, t_ns + 300)
             if n % 100 == 0:
                 writer.add_message(note, t_ns, b"hello", t_ns)
         writer.finish()
@@ -92,6 +95,50 @@ def test_an_imu_in_another_encoding_becomes_one_that_every_command_reads(convert
         every = list(make_reader(b, validate_crcs=True).iter_messages())
         ours = [(kept[c.topic], m.log_time, m.publish_time, m.data) for _, c, m in every if c.topic in kept]
     assert sorted(ours) == sorted(theirs)
+
+
+def test_a_message_without_a_sample_is_a_loss(convert, tmp_path):
+    done = convert(write_log(tmp_path / "in.mcap", "protobuf", lacking=7), tmp_path / "out.mcap")
+    assert done.returncode == 3
+    assert "1 messages of /robot/imu hold no sample of an IMU: see /robot/imu/as_recorded" in done.stderr
+    assert len(read(tmp_path / "out.mcap").imu) == COUNT - 1
+
+
+@pytest.mark.parametrize("encoding", ["json", "protobuf"])
+def test_a_log_in_another_encoding_is_read_and_debiased_without_conversion(imutool, tmp_path, encoding):
+    source = write_log(tmp_path / "in.mcap", encoding)
+    recording = read(source)
+    assert recording.imu_topic == "/robot/imu"
+    assert recording.imu.t_ns.tolist() == [START_NS + n * 5_000_000 for n in range(COUNT)]
+    assert np.array_equal(recording.imu.gyro, GYRO)
+    assert np.array_equal(recording.imu.accel, ACCEL)
+    done = imutool("info", "in.mcap", "--json", "-", cwd=tmp_path)
+    report = json.loads(done.stdout)
+    assert [(t["name"], t["encoding"]) for t in report["topics"]] == [("/robot/imu", encoding), ("/notes", "text")]
+    assert report["imu"][0]["samples"] == COUNT
+    assert "is not read" not in done.stdout
+
+    assert imutool("debias", "in.mcap", "own.mcap", cwd=tmp_path).returncode == 0
+    assert imutool("debias", "in.mcap", "ros.mcap", "--encoding", "cdr", cwd=tmp_path).returncode == 0
+    own, ros = (read(tmp_path / f"{name}.mcap", imu="/robot/imu/debiased").imu for name in ("own", "ros"))
+    assert np.array_equal(own.t_ns, recording.imu.t_ns)
+    assert np.array_equal(own.gyro, ros.gyro)
+    assert np.array_equal(own.accel, ros.accel)
+    assert not np.array_equal(own.gyro, recording.imu.gyro)
+    with Log(tmp_path / "own.mcap") as log:
+        made, recorded = log.topics["/robot/imu/debiased"], log.topics["/robot/imu"]
+        assert (made.message_encoding, made.own_schema) == (encoding, recorded.own_schema)
+        assert log.imu_topics == ["/robot/imu"]
+    with Log(tmp_path / "ros.mcap") as log:
+        assert log.topics["/robot/imu/debiased"].message_encoding == "cdr"
+
+
+def test_debias_leaves_out_what_holds_no_sample_and_counts_it(imutool, tmp_path):
+    write_log(tmp_path / "in.mcap", "json", lacking=7)
+    done = imutool("debias", "in.mcap", "d.mcap", cwd=tmp_path)
+    assert done.returncode == 3
+    assert "1 not finite" in done.stderr
+    assert len(read(tmp_path / "d.mcap", imu="/robot/imu/debiased").imu) == COUNT - 1
 
 
 def test_a_cut_log_is_refused_and_repair_is_named(convert, tmp_path):

@@ -29,14 +29,14 @@ def load(t_ns: int, n: int) -> Any:
     return TYPES["my_robot/msg/Load"](n / 7, ["a"] * (n % 3))
 
 
-def write_bag(path: Path, storage: StoragePlugin, compression: CompressionMode | None = None) -> Path:
+def write_bag(path: Path, storage: StoragePlugin, compression: CompressionMode | None = None, start: int = 0) -> Path:
     writer = Writer(path, version=9, storage_plugin=storage)
     if compression is not None:
         writer.set_compression(compression, CompressionFormat.ZSTD)
     with writer as bag:
         topics = {"/left/imu": imu, "/right/imu": imu, "/load": load}
         connections = {t: bag.add_connection(t, make(0, 0).__msgtype__, typestore=STORE) for t, make in topics.items()}
-        for n in range(COUNT):
+        for n in range(start, start + COUNT):
             t_ns = START_NS + n * 10_000_000
             for topic, make in topics.items():
                 message = make(t_ns, n)
@@ -56,6 +56,35 @@ FORMS = {
     "sqlite3 by file": (StoragePlugin.SQLITE3, CompressionMode.FILE),
     "sqlite3 by message": (StoragePlugin.SQLITE3, CompressionMode.MESSAGE),
 }
+
+
+def split_bag(path: Path, *form: Any) -> Path:
+    """A bag of three storage files, as the recorder splits one by size."""
+    parts = [write_bag(path.parent / f"part_{n}", *form, start=n * COUNT) for n in range(3)]
+    path.mkdir()
+    files = [file.rename(path / f"{n}_{file.name}") for n, part in enumerate(parts) for file in part.glob("part_*")]
+    text = (parts[0] / "metadata.yaml").read_text()
+    (listed,) = (line for line in text.splitlines() if line.strip() == f"- {files[0].name[2:]}")
+    text = text.replace(listed, "\n".join(listed.replace(files[0].name[2:], file.name) for file in files))
+    text = text.replace(f"message_count: {COUNT}\n", f"message_count: {3 * COUNT}\n")
+    (path / "metadata.yaml").write_text(text)
+    return path
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_a_split_bag_arrives_whole(convert, tmp_path, form):
+    bag, log = split_bag(tmp_path / "bag", *FORMS[form]), tmp_path / "bag.mcap"
+    done = convert(bag, log)
+    assert (done.returncode, done.stderr.strip()) == (0, "")
+    ours, _ = messages_of(log)
+    assert len(ours) == 9 * COUNT
+    assert {t: sum(topic == t for topic, _, _ in ours) for t in ("/left/imu", "/right/imu", "/load")} == dict.fromkeys(
+        ("/left/imu", "/right/imu", "/load"), 3 * COUNT
+    )
+    with Reader(bag) as reader:
+        theirs = [(c.topic, t_ns, bytes(data)) for c, t_ns, data in reader.messages()]
+    assert sorted(ours) == sorted(theirs)
+    assert [t for _, t, _ in ours] == sorted(t for _, t, _ in theirs)
 
 
 @pytest.mark.parametrize("form", FORMS)

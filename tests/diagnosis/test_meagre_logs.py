@@ -197,7 +197,7 @@ def test_poses_too_slow_to_be_differentiated_leave_what_samples_show_by_themselv
     assert effects(d) == []
     (said,) = d.remarks
     assert "can be differentiated" in said
-    assert "Only what stamps and digits show by themselves could be asked" in said
+    assert "Only the checks of stamps and digits were possible" in said
     assert {"lever_arm", "gyro_scale", "clock_offset"} <= set(d.not_identifiable)
     assert to_physics_file(d).bias is None  # nobody knows it
     assert json_values(d.report)["bias"] == {"gyro": None, "accel": None}

@@ -75,7 +75,7 @@ def test_of_many_findings_the_three_strongest_are_named() -> None:
 
 
 def test_poses_made_with_the_gyro_are_a_caveat_of_the_headline_and_of_no_simulation() -> None:
-    caveat = "its poses were estimated with this very IMU, and hide errors of the gyro"
+    caveat = "its poses were estimated with this IMU, and hide errors of the gyro"
     assert headline(replace(diagnoses.BOTH, caveat=caveat)).endswith(f"; {caveat}.")
     assert caveat not in headline(replace(diagnoses.LATE, caveat=caveat))
 
@@ -124,7 +124,7 @@ def test_what_cannot_be_told_apart_is_said_beside_the_name() -> None:
 
 def test_a_place_without_a_name_is_not_passed_over() -> None:
     said = conclusion(diagnoses.UNEXPLAINED)
-    assert "The accel differs at angular rate above 0.4 rad/s, and what was left out could not be named." in said
+    assert "The accel differs at angular rate above 0.4 rad/s, and no known effect explains it." in said
     assert "What remains of the accel is 0.2 against 0.05 m/s² of noise, and has no explanation yet." in said
 
 
@@ -250,6 +250,10 @@ def test_a_sentence_leaves_no_quantity_of_a_real_effect_out(one: SimpleNamespace
 def test_an_effect_nobody_wrote_a_sentence_for_is_still_said_with_its_equation_and_numbers() -> None:
     one = finding("vendor_effect", {"k": Estimate(3.25, 0.02, "K")}, equation="accel += k T")
     assert named_sentence(diagnoses.ARM, one) == "it shows vendor_effect, accel += k T, k 3.25 ± 0.02 K (vendor_effect)"
+    turned = {f"turned_{axis}": Estimate(size, 0.002, "rad") for axis, size in (("x", 0.0), ("y", 0.0), ("z", 0.046))}
+    assert named_sentence(diagnoses.BOTH, finding("reference_error", turned, "both")).startswith(
+        "the attitude of the true poses is wrong, not the sensor: it is turned by 2.64 ± 0.11° against gyro and gravity"
+    )
     bare = finding("reference_error", {}, equation="the truth is late")
     assert named_sentence(diagnoses.ARM, bare) == "it shows reference_error, the truth is late (reference_error)"
 

@@ -8,6 +8,7 @@ import os
 import re
 import shutil
 import signal
+import socket
 import subprocess
 import sys
 import time
@@ -32,6 +33,7 @@ from imutool.fleet.run import Progress, run
 from imutool.fleet.task import Result, Settings, Task, with_model_hash
 from imutool.fleet.work import work
 from imutool.location import to_location
+from imutool.mcap_io.storage import system
 from imutool.mcap_io.storage.source import sha256
 from imutool.report import json_values
 
@@ -164,7 +166,7 @@ def test_more_memory_than_there_is_is_refused(ray_started: None) -> None:
 def test_there_are_as_many_workers_as_there_is_memory_for(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     limit = tmp_path / "memory.max"
     limit.write_text(f"{3 << 30}\n")
-    monkeypatch.setattr(engines, "CGROUP_LIMITS", (str(limit),))
+    monkeypatch.setattr(system, "CGROUP_LIMITS", (str(limit),))
     assert ProcessEngine(workers=8, memory_bytes=1 << 30).workers == 3
     assert ProcessEngine(workers=2, memory_bytes=1 << 30).workers == 2
     with pytest.raises(ConfigError, match=r"at most 3\.00 GiB"):
@@ -188,6 +190,22 @@ def test_a_cluster_that_cannot_be_reached_is_told_without_its_secrets(
         with pytest.raises(ConfigError, match=r"address=.*127\.0\.0\.1:1: no answer") as error:
             RayEngine(address)
         assert "hush" not in str(error.value)
+
+
+def test_a_port_where_something_else_listens_is_refused_in_time(monkeypatch: pytest.MonkeyPatch, ray_started: None) -> None:
+    import ray
+
+    own = ray.get_runtime_context().gcs_address
+    monkeypatch.setattr(ray, "is_initialized", lambda: False)
+    monkeypatch.setattr(ray, "init", lambda **_: None)
+    monkeypatch.setattr(engines, "ANSWER_S", 0.3)
+    with socket.create_server(("127.0.0.1", 0)) as silent:
+        began = time.monotonic()
+        with pytest.raises(ConfigError, match=r"no answer \(timed out\).*expected a Ray cluster"):
+            RayEngine(f"127.0.0.1:{silent.getsockname()[1]}")
+        assert time.monotonic() - began < SOON_S
+    engine = RayEngine(own)  # a cluster's own port answers as it should
+    assert engine.slots >= 1
 
 
 @pytest.mark.parametrize("library", ["ray", "pyarrow"])

@@ -346,7 +346,7 @@ DAMAGES: tuple[Damage, ...] = (
     *(flip, overwrite, cut, length, remove, duplicate, exchange, record),
     *(newer, join, overlap, old_index, wrong_index, no_crc, bomb),
 )
-ALONE = (flip, overwrite, cut, length, remove, duplicate, exchange, wrong_index)  # of these the other log is no part
+ALONE = (flip, cut, length, remove, duplicate, exchange, wrong_index)  # of these the other log is no part
 
 
 # ── the oracle ───────────────────────────────────────────────────────────────────────────────────────────────────────

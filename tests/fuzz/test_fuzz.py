@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from fuzz import kinds
+from fuzz import kinds, run_case
 
 TOTAL_S = float(os.environ.get("IMUTOOL_FUZZ_SECONDS", "60" if os.environ.get("CI") else "15"))  # over all kinds
 SEED = os.environ.get("IMUTOOL_FUZZ_SEED", datetime.datetime.now(datetime.UTC).date().isoformat())
@@ -24,3 +24,20 @@ def test_no_input_breaks_a_promise(kind: str) -> None:
     line = [sys.executable, BENCH, kind, "--seed", SEED, "--seconds", str(seconds)]
     done = subprocess.run(line, capture_output=True, text=True, timeout=300 + seconds, check=False)
     assert done.returncode == 0, done.stdout + done.stderr
+
+
+# inputs that broke a promise once: what they are, with the draw that makes them
+FOUND = {
+    "a chunk of another log before all definitions": ("logs", "2026-11-21", 522),
+    "a definition of a damaged chunk whose topic got another name": ("logs", "2026-11-24", 217),
+    "a channel and its schema of two logs": ("logs", "2026-11-24", 76),
+    "the same summary twice, the first one cut off": ("logs", "2026-11-24", 230),
+    "another log behind a gap, whose first channel the log does not have": ("logs", "2026-11-25", 65),
+    "a schema that was cut off by a chunk": ("logs", "2026-11-25", 412),
+    "another log behind a gap, of which a channel is not defined": ("logs", "2026-11-26", 99),
+}
+
+
+@pytest.mark.parametrize("name", FOUND)
+def test_what_was_found_stays_mended(name: str) -> None:
+    assert run_case(*FOUND[name]) == []

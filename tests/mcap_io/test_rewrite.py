@@ -8,6 +8,7 @@ import sys
 import tracemalloc
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,7 +16,9 @@ from mcap.reader import NonSeekingReader, make_reader
 from mcap.records import Attachment, Channel, Chunk, ChunkIndex, Metadata, Schema
 from mcap.stream_reader import StreamReader
 from rosbags.highlevel import AnyReader
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
+from imutool.debiasing import debias
 from imutool.errors import ConfigError, LogError
 from imutool.mcap_io.added_topics import DerivedBatch, NewTopic
 from imutool.mcap_io.codec import schemas as schema
@@ -377,3 +380,37 @@ def test_verify_finds_a_changed_byte_and_a_missing_message(recording: Recording,
     path.write_bytes(whole)
     with pytest.raises(LogError, match=f"the message indexes behind the chunk at byte {blocks[0].offset} are damaged"):
         verify(path, counts, unpacked=())
+
+
+def test_debias_keeps_the_encoding_of_ros1(foreign: Foreign, make: Callable[..., bytes], tmp_path: Path) -> None:
+    stamps = [10**18 + 10**7 * i for i in range(300)]
+    at_rest = np.random.default_rng(1).normal([0.01, 0.0, 0.0, 0.0, 0.0, 9.81], 1e-3, (300, 6))
+    messages = [
+        ("/imu", schema.IMU, t, t, 0, make(schema.IMU, t, row[:3], row[3:], ros1=True))
+        for t, row in zip(stamps, at_rest, strict=True)
+    ]
+    source = foreign(messages, ros1=True)
+    for encoding, target in (("own", tmp_path / "own.mcap"), ("cdr", tmp_path / "cdr.mcap")):
+        debias(source, target, encoding=encoding)
+    own, cdr = tmp_path / "own.mcap", tmp_path / "cdr.mcap"
+    store = get_typestore(Stores.ROS1_NOETIC)
+    with own.open("rb") as file:
+        for schema_, channel, message in make_reader(file).iter_messages():
+            assert schema_ is not None
+            kind = schema.canonical(schema_.name)
+            if channel.topic == "/imu/bias/gyro":
+                assert store.deserialize_ros1(message.data, kind).vector.x == pytest.approx(0.01, abs=1e-3)
+            assert channel.message_encoding == "ros1"
+            parsed = get_types_from_msg(schema_.data.decode(), kind)
+            assert store.generate_msgdef(kind, ros_version=1)[1] == _md5(parsed, kind)
+    a, b = read(own, imu="/imu/debiased").imu, read(cdr, imu="/imu/debiased").imu
+    assert np.array_equal(a.gyro, b.gyro)
+    assert np.array_equal(a.accel, b.accel)
+    assert np.array_equal(a.t_ns, b.t_ns)
+
+
+def _md5(parsed: Any, kind: str) -> str:
+    """Hash by which ROS 1 compares definitions."""
+    store = get_typestore(Stores.EMPTY)
+    store.register(parsed)
+    return str(store.generate_msgdef(kind, ros_version=1)[1])

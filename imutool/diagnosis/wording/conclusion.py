@@ -14,7 +14,7 @@ from imutool.units import UNITS
 
 NO_EXPLANATION = "has no explanation yet"
 QUIET = "nothing else stands above the noise"
-UNKNOWN = "What should have been read is not known, and by themselves the samples show nothing amiss."
+UNKNOWN = "This log has no reference, and its samples alone show no defect."
 NULL = "Nothing but a constant bias and noise separates the two."
 SHOWN = 3  # intervals in a line
 WITH_ALL = "With everything that was found"
@@ -206,7 +206,7 @@ def _unnamed_place(d: Diagnosis) -> str:
     if not places:
         return ""
     differing = list(dict.fromkeys(place.signal for place in places))
-    return f"{_differs(' and '.join(differing))}{_regime(places, differing[0])}, and what was left out could not be named"
+    return f"{_differs(' and '.join(differing))}{_regime(places, differing[0])}, and no known effect explains it"
 
 
 def _unusable(place: Located) -> str:

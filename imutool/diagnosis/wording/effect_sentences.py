@@ -70,6 +70,13 @@ def _mount_resonance(w: Words) -> str:
     return f"the mount rings after shocks at {w.main}, which no sample predicts"
 
 
+def _reference_error(w: Words) -> str:
+    """Short wrong intervals, or an attitude that is turned throughout."""
+    if any(name.startswith("turned_") for name in w.finding.parameters):
+        return f"the attitude of {w.other} is wrong, not the sensor: it is turned by {w.main} against gyro and gravity"
+    return f"the reference is wrong, not the sensor, {w.main.labelled}"
+
+
 SENTENCES: Mapping[str, str | Callable[[Words], str]] = {
     "gyro_bias": "{w.it} reads a constant {w.main} too much",
     "accel_bias": "{w.it} reads a constant {w.main} too much",
@@ -100,7 +107,7 @@ SENTENCES: Mapping[str, str | Callable[[Words], str]] = {
     "temperature": "{w.it} follows the temperature, with {w.main}",
     "dropped_samples": "samples are missing, {w.main.labelled}",
     "timestamp_jitter": "samples are late by turns, {w.main.labelled}",
-    "reference_error": "the reference is wrong, not the sensor, {w.main.labelled}",
+    "reference_error": _reference_error,
     "gain": "its gain is off by {w.main}",
     "offset": "{w.it} reads a constant {w.main} too much",
     "delay": _delay,

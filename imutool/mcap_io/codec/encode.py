@@ -169,6 +169,21 @@ def encode_twist(
     return rows
 
 
+def as_ros1(rows: UInt8[np.ndarray, "n L"], schema_name: str) -> UInt8[np.ndarray, "n M"]:
+    """CDR messages of one layout in the encoding of ROS 1: header and numbers, no alignment; `seq` is zero."""
+    source = layout_of(schema_name, "cdr", message=rows[0].tobytes())
+    target = layout_of(schema_name, "ros1", texts=list(source.texts))
+    made = _blank(len(rows), target)
+    for (ours, size), (theirs, _) in zip(_places(target), _places(source), strict=True):
+        made[:, ours : ours + size] = rows[:, theirs : theirs + size]
+    return made
+
+
+def _places(layout: Layout) -> list[tuple[int, int]]:
+    """First bytes and sizes of stamps and numbers."""
+    return [*((at, 8) for at in layout.stamps), *((at, 8 * count) for at, count in layout.numbers)]
+
+
 def encode_float(values: Float64[np.ndarray, " n"]) -> UInt8[np.ndarray, "n L"]:
     """One Float64 message per row, without a stamp: the log time carries it."""
     layout = layout_of(FLOAT, "cdr")

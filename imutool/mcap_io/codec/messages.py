@@ -182,12 +182,6 @@ def _matrix(view: UInt8[np.ndarray, " b"], offsets: Int64[np.ndarray, " n"], wid
     return cut
 
 
-def rows(found: Messages, mask: Bool[np.ndarray, " n"]) -> Iterator[Rows]:
-    """The chosen messages as columns, one entry per stretch of equal size, in file order."""
-    for heads, payload in cut(found, mask):
-        yield columns(heads, payload)
-
-
 def cut(found: Messages, mask: Bool[np.ndarray, " n"]) -> Iterator[tuple[Shaped[np.ndarray, " n"], UInt8[np.ndarray, "n L"]]]:
     """Heads (dtype MESSAGE) and payloads of the chosen messages, per stretch of equal size."""
     heads, offsets = found.heads[mask], found.offsets[mask]

@@ -83,6 +83,13 @@ def _collect(name: str, order: list[str]) -> None:
             _collect(nested, order)
 
 
+def ros1_definition(schema_name: str) -> str:
+    """The `ros1msg` text of a message and of its nested messages."""
+    parts = definition(schema_name).split(separator := f"{'=' * 80}\nMSG: ")
+    known = [part.replace("builtin_interfaces/Time stamp", "uint32 seq\ntime stamp") for part in parts]
+    return separator.join(part for part in known if not part.startswith("builtin_interfaces/Time"))
+
+
 def canonical(schema_name: str) -> str:
     """ROS 2 spelling of a schema's name: `sensor_msgs/msg/Imu` for `sensor_msgs/Imu`."""
     package, slash, name = schema_name.partition("/")

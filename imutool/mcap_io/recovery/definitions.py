@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import chain, count
 from typing import Any
@@ -92,6 +92,21 @@ def same_definition(a: Any, b: Any) -> bool:
     return bool((a.topic, a.schema_id) == (b.topic, b.schema_id))
 
 
+def key_pairs(key: ChunkKey) -> tuple[object, ...]:
+    """Any two fields of a key, by which it is known again when one is wrong."""
+    start_ns, end_ns, size = key
+    return (0, start_ns, end_ns), (1, start_ns, size), (2, end_ns, size)
+
+
+def different(definitions: Iterable[Any]) -> Iterator[Any]:
+    """Definitions without repetitions."""
+    seen: list[Any] = []
+    for record in definitions:
+        if not any(type(other) is type(record) and other.id == record.id and same_definition(other, record) for other in seen):
+            seen.append(record)
+            yield record
+
+
 def renumber(recordings: Sequence[Recording], losses: Losses) -> tuple[dict[int, Schema], dict[int, Channel]]:
     """Schemas and channels of the whole file; the first recording keeps its ids.
 
@@ -133,7 +148,7 @@ def unproven_topics(recordings: Sequence[Recording]) -> list[str]:
         for channel in (recording.channels[local] for local in recording.ids):
             keys = {(int(Opcode.CHANNEL), channel.id), (int(Opcode.SCHEMA), channel.schema_id)}
             if not keys - {(int(Opcode.SCHEMA), 0)} <= recording.proven:
-                topics.add(channel.topic)
+                topics.add(recording.renamed.get(channel.topic, channel.topic))
     return sorted(topics)
 
 

@@ -8,9 +8,7 @@ and last from what its messages decode as. What stays open is on no topic.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from itertools import groupby
-from typing import Any
+from collections.abc import Callable, Iterable, Sequence
 
 import numpy as np
 from mcap.opcode import Opcode
@@ -20,9 +18,9 @@ from imutool.mcap_io.blocks import MessageBlock
 from imutool.mcap_io.codec import messages
 from imutool.mcap_io.codec.records import HEAD
 from imutool.mcap_io.codec.ros2_definition import decodes
-from imutool.mcap_io.recovery.definitions import ChunkKey, Recording, parsed, same_definition
+from imutool.mcap_io.recovery.definitions import Recording, different, key_pairs, parsed
 from imutool.mcap_io.recovery.losses import Losses
-from imutool.mcap_io.recovery.scan_events import Definition, Event, Gap, LogEnd, LogStart, ScannedBlock
+from imutool.mcap_io.recovery.scan_events import Definition, Event, Gap, LogEnd, LogStart, ScannedBlock, definition_runs
 from imutool.mcap_io.recovery.summary import Summary
 
 CDR_HEADS = (b"\0\0", b"\0\1")  # other payloads are not what the channel says, and tell nothing
@@ -42,12 +40,13 @@ class Recordings:
         self._named: Recording | None = None  # the last one that is not anonymous
         self._early: list[ScannedBlock] = []  # blocks whose definitions, if any, come behind them
         self._certain = False  # an unbroken chain of records leads from the definitions of the current one to here
+        self._behind_gap: list[ScannedBlock] | None = None  # blocks since the last gap, where one came since the log began
         for summary in summaries:
             recording = Recording(summary.base)
             if summary.chunks:
                 recording.lists = {(e.message_start_time, e.message_end_time, e.uncompressed_size) for e in summary.chunks}
             definitions = parsed(summary.definitions, summary.base, losses)
-            twice = {key for key, number in Counter((type(d), d.id) for d in _different(definitions)).items() if number > 1}
+            twice = {key for key, number in Counter((type(d), d.id) for d in different(definitions)).items() if number > 1}
             for record in definitions:
                 if (type(record), record.id) not in twice:
                     recording.define(record, proven=True)
@@ -62,7 +61,7 @@ class Recordings:
     def assign(self, events: Sequence[Event]) -> None:
         """Finds the recording of every block, in file order."""
         self._complete([event for event in events if isinstance(event, ScannedBlock)])
-        runs = _runs(events)
+        runs = definition_runs(events)
         for event in events:
             if isinstance(event, LogStart):
                 self._begin(event.offset)
@@ -72,11 +71,12 @@ class Recordings:
                 self._certain = False
             elif isinstance(event, Gap):
                 event.recording = self.each.index(self._now)
-                self._current, self._certain = self._named, False
+                self._current, self._certain, self._behind_gap = self._named, False, []
             elif isinstance(event, Definition):
                 self._take_definitions(runs.get(id(event), []))
             else:
                 self._assign(event)
+        self._behind_gap = None
         for recording in self.each:
             self._give_up_misfits(recording, [found for found in self._early if self.of(found.block) is recording])
         for found in self._early:
@@ -88,8 +88,8 @@ class Recordings:
         keys = {found.key for found in blocks}
         for recording in self.each:
             if recording.lists and not recording.lists & keys:  # one field of every entry is wrong; do the others agree?
-                pairs = {pair for key in recording.lists for pair in _pairs(key)}
-                recording.lists = {key for key in keys if not pairs.isdisjoint(_pairs(key))} or recording.lists
+                pairs = {pair for key in recording.lists for pair in key_pairs(key)}
+                recording.lists = {key for key in keys if not pairs.isdisjoint(key_pairs(key))} or recording.lists
         for found in blocks:  # a summary may leave definitions out; those of the chunks it lists are its own
             own = parsed(found.definitions, found.block.offset, self.losses)
             for recording in (r for r in self.each if own and found.key in (r.lists or ()) and r.agrees(own)):
@@ -107,9 +107,13 @@ class Recordings:
                 met.append(recording)
 
     def _assign(self, found: ScannedBlock) -> None:
+        if self._behind_gap is not None:
+            self._behind_gap.append(found)
         recording = self._choose(found)
         listed = found.key in (recording.lists or ())
-        known = {record.id for record in parsed(found.definitions, 0, self.losses) if isinstance(record, Channel)}
+        own = parsed(found.definitions, 0, self.losses)
+        kinds = {0} | {record.id for record in own if isinstance(record, Schema)}
+        known = {record.id for record in own if isinstance(record, Channel) and record.schema_id in kinds}
         found.evidence = 3 if known >= set(found.block.counts or {}) else 2 if listed else int(self._certain)
         found.block.recording = self.each.index(recording)
         foreign = recording is not self._now and not listed  # of another log, although no record says that one begins
@@ -125,7 +129,8 @@ class Recordings:
 
     def _adopt(self, found: ScannedBlock, recording: Recording) -> None:
         """Notes the sizes of a recording's messages, and a block to compare others with."""
-        for channel, (low, high) in found.sizes.items():
+        for channel in found.sizes.keys() & recording.readable():  # what is not defined yet may be another log's
+            low, high = found.sizes[channel]
             least, most = recording.sizes.get(channel, (low, high))
             recording.sizes[channel] = min(low, least), max(high, most)
             recording.samples.setdefault(channel, found.block)
@@ -144,8 +149,9 @@ class Recordings:
             self._adopt(found, recording)
             return
         self.losses.add_harmless(f"messages from byte {found.block.offset} on do not fit the definitions before them")
-        self._current = Recording(found.block.offset, anonymous=True)
-        self.each.append(self._current)
+        self._current = self._new_behind_gap(found)
+        self._current.anonymous = True
+        self._give_up_misfits(self._current, [found])
         found.block.recording = len(self.each) - 1
         self.unproven.pop(found.block.offset, None)
 
@@ -163,7 +169,7 @@ class Recordings:
     def _begin(self, start: int) -> None:
         """Begins the log whose Header stands at a byte."""
         self._current = self._named = Recording(start)
-        self._certain = True
+        self._certain, self._behind_gap = True, None
         self.each.append(self._current)
 
     def _take_definitions(self, run: Sequence[Definition]) -> None:
@@ -195,7 +201,7 @@ class Recordings:
         agreeing = [r for r in (self._now, *self.each) if r.agrees(own)]
         listed = [r for r in agreeing if r.lists and found.key in r.lists]
         if not agreeing:
-            chosen = self._new(found.block.offset)
+            chosen = self._new_behind_gap(found)
         elif own and not rest:
             chosen = (listed or [r for r in agreeing if r.lists is None] or agreeing)[0]  # a summary lists all of its log
         else:
@@ -244,6 +250,15 @@ class Recordings:
         self.each.append(Recording(start))
         return self.each[-1]
 
+    def _new_behind_gap(self, found: ScannedBlock) -> Recording:
+        """A recording of which a block is, with what others since the last gap define that do not contradict the block."""
+        new = self._new(found.block.offset)
+        for block in (found, *(self._behind_gap or ())):
+            own = parsed(block.definitions, block.block.offset, self.losses)
+            for record in own if new.agrees(own) else ():
+                new.define(record, proven=bool(block.crc))
+        return new
+
     def _among(self, found: ScannedBlock, used: set[int], pool: Sequence[Recording]) -> Recording:
         """The recording of a block that does not define all of its ids itself."""
         pool = list({id(r): r for r in pool}.values())
@@ -275,24 +290,3 @@ class Recordings:
 def _topics(channel: int, pool: Iterable[Recording]) -> set[str]:
     """The topics that a channel id has in some recordings."""
     return {recording.channels[channel].topic for recording in pool if recording.meaning(channel) is not None}
-
-
-def _runs(events: Sequence[Event]) -> dict[int, list[Definition]]:
-    """Definitions outside chunks that follow one another, by the identity of the first."""
-    runs = [[e for e in run if isinstance(e, Definition)] for kind, run in groupby(events, type) if kind is Definition]
-    return {id(run[0]): run for run in runs}
-
-
-def _pairs(key: ChunkKey) -> tuple[object, ...]:
-    """Any two fields of a key, by which it is known again when one is wrong."""
-    start_ns, end_ns, size = key
-    return (0, start_ns, end_ns), (1, start_ns, size), (2, end_ns, size)
-
-
-def _different(definitions: Iterable[Any]) -> Iterator[Any]:
-    """Definitions without repetitions."""
-    seen: list[Any] = []
-    for record in definitions:
-        if not any(type(other) is type(record) and other.id == record.id and same_definition(other, record) for other in seen):
-            seen.append(record)
-            yield record

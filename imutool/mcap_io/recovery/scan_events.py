@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass, field
+from itertools import groupby
 from typing import NamedTuple
 
 import numpy as np
@@ -85,6 +87,12 @@ class Gap:
 Event = LogStart | LogEnd | Definition | ScannedBlock | Gap  # what decides whose log a block is, in file order
 
 
+def definition_runs(events: Sequence[Event]) -> dict[int, list[Definition]]:
+    """Definitions outside chunks that follow one another, by the identity of the first."""
+    runs = [[e for e in run if isinstance(e, Definition)] for kind, run in groupby(events, type) if kind is Definition]
+    return {id(run[0]): run for run in runs}
+
+
 class ScanResult:
     """Blocks, other records and gaps of a file as a scan meets them."""
 
@@ -140,6 +148,8 @@ class ScanResult:
 
     def cut_back(self, start: int, end: int) -> None:
         """Gives up the last record, which a proven chunk shows to be cut off."""
+        if isinstance(self.events[-1], Definition) and self.events[-1].offset == start:
+            self.events.pop()
         for block in reversed(self.items[-1:]):
             if isinstance(block, MessageBlock) and block.compression is None and block.offset + block.length == end:
                 block.length, block.end = start - block.offset, start

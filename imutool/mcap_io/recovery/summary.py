@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from typing import NamedTuple
 
@@ -18,6 +18,7 @@ from imutool.mcap_io.storage.source import Source
 
 DEFINITIONS = (Opcode.SCHEMA, Opcode.CHANNEL)
 PRIVATE = 0x80  # opcodes from here on belong to whoever writes them
+OFFSET_SIZE = HEAD.size + 17  # bytes of a SummaryOffset record
 SUMMARY = {
     Opcode.CHUNK_INDEX,
     Opcode.ATTACHMENT_INDEX,
@@ -70,14 +71,25 @@ def proven_summary(source: Source, losses: Losses) -> tuple[Footer, Summary | No
 
 
 def moved_summary(source: Source, starts: Sequence[int], position: int) -> tuple[int, Summary | None]:
-    """Moved summary that the CRC in the Footer proves, from one of some starts, and that start."""
+    """Moved summary that the CRC in the Footer proves, and its start; `starts` are possible ones."""
     footer = records.parse(Footer, source.at(position + HEAD.size, FOOTER_SIZE - HEAD.size), position)
     stop = position + FOOTER_SIZE - 4
-    for start in starts if footer.summary_crc and footer.summary_start else ():
+    stated = [at for at in _stated_starts(source, footer, position) if at >= 0]
+    for start in (*stated, *starts) if footer.summary_crc and footer.summary_start else ():
         raw = source.at(start, stop - start) if stop - start <= MAX_SUMMARY else b""
         if raw and crc32(raw) == footer.summary_crc:
             return start, parse_summary(raw[: position - start], start - footer.summary_start)
     return position, None
+
+
+def _stated_starts(source: Source, footer: Footer, position: int) -> Iterator[int]:
+    """Starts by the length that the Footer states and the SummaryOffset records in front of the Footer."""
+    size = footer.summary_offset_start - footer.summary_start
+    while footer.summary_offset_start and 0 < size <= position:
+        yield position - size
+        position -= OFFSET_SIZE
+        if position < 0 or source.head(position) != (Opcode.SUMMARY_OFFSET, OFFSET_SIZE - HEAD.size):
+            return
 
 
 def parse_summary(raw: bytes, base: int) -> Summary | None:

@@ -23,12 +23,13 @@ import shutil
 import stat
 import sys
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from itertools import islice
 from pathlib import Path
 from typing import BinaryIO
 
 from imutool.mcap_io.storage.source import Source, descriptor
+from imutool.mcap_io.storage.system import copy_by_kernel
 
 PAGE_BYTES = 1 << 12  # of a file system
 PARTIAL = re.compile(r"\.(?P<name>.+)\.(?P<pid>\d+)\.(?P<mark>[0-9a-f]{24})\.partial", re.DOTALL)
@@ -61,14 +62,8 @@ class LocalFile:
         theirs, ours = descriptor(source.file), descriptor(self.file)
         if theirs is None or ours is None or (start - self.file.tell()) % PAGE_BYTES:
             return start
-        calls: tuple[Callable[[int], int], ...] = (
-            lambda at: os.copy_file_range(theirs, ours, end - at, offset_src=at),
-            lambda at: os.sendfile(ours, theirs, at, end - at),
-        )
         self.file.flush()
-        for call in calls:
-            while start < end and (count := _tried(call, start)):
-                start += count
+        start = copy_by_kernel(theirs, ours, start, end)
         self.file.seek(0, os.SEEK_END)
         return start
 
@@ -244,11 +239,3 @@ def _settle(folder: Path) -> None:
             os.fsync(handle)
         finally:
             os.close(handle)
-
-
-def _tried(call: Callable[[int], int], at: int) -> int:
-    """Bytes copied by the call; 0 if the call fails, then reading and writing show why."""
-    try:
-        return call(at)
-    except OSError:
-        return 0

@@ -129,6 +129,19 @@ def test_messages_whose_topic_nothing_proves_are_on_none(foreign: Foreign, fligh
     assert "(/imu/data or /other)" in report.losses.topics
 
 
+def test_a_chunk_of_another_log_before_all_definitions_is_not_on_their_topics(foreign: Foreign, flight: Messages) -> None:
+    first = foreign(flight[:300], "no-summary", chunk_size=20_000, name="first")
+    poses = [m for m in flight if m[0] == "/mocap"]
+    second = foreign(poses, "no-summary", chunk_size=3_000, name="second")  # its id 1 is the first one's IMU
+    raw, (start, end, _) = first.read_bytes(), stretches(second)[2]
+    whole = stretches(first)
+    at = whole[0][0]
+    first.write_bytes(raw[:at] + second.read_bytes()[start:end] + raw[at:])
+    found, report = saved(first)
+    assert found == Counter(m for _, _, each in whole for m in each)
+    assert "(channel 1, not defined)" in report.losses.topics
+
+
 def test_a_log_with_the_largest_channel_id_is_joined_to_another(foreign: Foreign, flight: Messages) -> None:
     first = foreign(flight[:60], "no-summary", name="first")
     second = foreign([(f"/b{m[0]}", *m[1:]) for m in flight[:60]], "no-summary", name="second")

@@ -1,8 +1,4 @@
-"""Reference of a recording: alignment, unusable axes, wrong intervals, checks without one.
-
-Poses that were lost and bridged give a simulation, or a truth, another motion there. No effect of a sensor lasts two seconds
-and leaves no trace, so where all the rest is noise, the reference is wrong.
-"""
+"""Coverage of a recording by its reference: alignment, unusable axes, checks without one."""
 
 from __future__ import annotations
 
@@ -10,15 +6,12 @@ from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
-from jaxtyping import Bool, Float64
-from scipy.stats import chi2
+from jaxtyping import Bool
 
 from imutool.diagnosis.estimation import timestamps
 from imutool.diagnosis.estimation.aligned_log import Pair
 from imutool.diagnosis.estimation.alignment import same_motion, with_simulation, with_truth
-from imutool.diagnosis.estimation.jacobians import expected
-from imutool.diagnosis.estimation.whitening import WhitenedImu
-from imutool.diagnosis.result import Diagnosis, Estimate, Finding, HeldOut, Located
+from imutool.diagnosis.result import Diagnosis, Estimate, Finding, HeldOut
 from imutool.diagnosis.settings import AlignmentSettings, DiagnoseSettings, ReferenceSettings
 from imutool.diagnosis.wording.quantity import percent
 from imutool.errors import DataError, ImutoolError, NumericsError
@@ -27,7 +20,7 @@ from imutool.recording import Recording, seconds
 from imutool.sensor import catalogue
 from imutool.sensor.samples import IdealMotion
 from imutool.sensor.trajectory import smooth_motion
-from imutool.units import ASCII_UNITS, AXES, SENSORS, UNITS
+from imutool.units import AXES, SENSORS, UNITS
 
 SOME = 0.05  # of the samples of an axis at its limit, from which it is reported
 BY_THEMSELVES = frozenset({"saturation", "quantization"})  # of the catalogue
@@ -145,87 +138,6 @@ def without_unusable(pair: Pair, settings: ReferenceSettings) -> Pair:
     return reduced
 
 
-def reference_errors(logs: Sequence[WhitenedImu], settings: ReferenceSettings) -> tuple[list[Finding], list[Located]]:
-    """Intervals of a wrong reference, as a finding and locations; none for another misfit."""
-    if len(logs) != 1:
-        return [], []
-    (log,), block_s, p_value = logs, settings.block_s, settings.p_value
-    rows = log.rows("all")
-    if not rows.any():
-        return [], []
-    t_s = log.pair.stamp_s[:: log.whiten.every][rows]
-    white = log.whiten(log.pair.real - expected(log.pair, ()))[rows]
-    constant = log.constants[rows]
-    white = (
-        white - np.median(white / np.where(constant == 0, 1.0, constant), axis=0) * constant
-    )  # a mean would carry the misfit
-    block = np.floor((t_s - t_s[0]) / block_s).astype(int)
-    count = np.maximum(np.bincount(block), 1)
-    power = np.stack([np.bincount(block, weights=(white[:, k : k + 3] ** 2).sum(axis=1)) for k in (0, 3)])
-    loud = chi2.logsf(power, 3 * count) < np.log(p_value)
-    runs = _runs(loud.any(axis=0), float(t_s[0]), settings)
-    inside = (
-        np.any([(t_s >= a - block_s) & (t_s <= b + block_s) for a, b in runs], axis=0) if runs else np.zeros(len(t_s), bool)
-    )
-    outside = white[~inside]
-    at = t_s[0] + block_s * np.arange(len(count))
-    both = all(loud[:, (at >= a - 1e-6) & (at < b)].any(axis=1).all() and b - a <= settings.longest_s for a, b in runs)
-    few = len(runs) <= settings.most_intervals and inside.mean() <= settings.most_of_time
-    if not runs or not both or not few or (outside**2).mean() > settings.quiet_chi_square:
-        return [], []
-    length = float(np.mean([b - a for a, b in runs]))
-    parameters = {"length": Estimate(length, block_s / np.sqrt(6.0 * len(runs)) + 0.1 * length, "s")}
-    parameters |= {f"t_{k}": Estimate(a, block_s, "s") for k, (a, _) in enumerate(runs)}
-    excess = (white[inside] ** 2).sum() - 6.0 * inside.sum()
-    share = float(np.clip(excess / max(float((white**2).sum() - 6.0 * len(white)), 1e-300), 0.0, 1.0))
-    residual = log.pair.real - expected(log.pair, ())
-    residual = residual - np.median(residual, axis=0)
-    held_rows = log.pair.held_out
-    t_all = log.pair.stamp_s
-    away = held_rows & ~np.any([(t_all >= a - block_s) & (t_all <= b + block_s) for a, b in runs], axis=0)
-    before, after = (float(np.sqrt((residual[mask, 3:] ** 2).mean())) for mask in (held_rows, away))
-    held_out = HeldOut(before, after, ASCII_UNITS["accel"], round(float(held_rows.sum()) * log.pair.period_s, 1))
-    finding = Finding("reference_error", "both", share, p_value, p_value, parameters, "the reference is wrong there", held_out)
-    return [finding], [
-        _where(signal, white[:, 3 * k : 3 * k + 3], inside, runs, share, p_value) for k, signal in enumerate(SENSORS)
-    ]
-
-
-def _where(
-    signal: str,
-    white: Float64[np.ndarray, "n 3"],
-    inside: np.ndarray,
-    runs: list[tuple[float, float]],
-    share: float,
-    p_value: float,
-) -> Located:
-    power = (white[inside] ** 2).mean(axis=0)
-    axes = tuple(axis for axis, value in zip(AXES, power, strict=True) if value > 1.3)
-    regime = "no regime: the reference's own moments"
-    return Located(signal, axes or AXES, tuple(runs), regime, share, p_value, extent="intermittent")
-
-
-def _runs(loud: np.ndarray, start_s: float, settings: ReferenceSettings) -> list[tuple[float, float]]:
-    """Stretches of loud blocks (s), those close to one another joined."""
-    edges = np.diff(np.concatenate([[0], loud.astype(int), [0]]))
-    out: list[tuple[float, float]] = []
-    for first, last in zip(np.flatnonzero(edges == 1), np.flatnonzero(edges == -1), strict=True):
-        begin, end = start_s + float(first) * settings.block_s, start_s + float(last) * settings.block_s
-        if out and begin - out[-1][1] < settings.join_s:
-            out[-1] = out[-1][0], end
-        else:
-            out.append((begin, end))
-    return out
-
-
-def reference_caveat(recordings: Sequence[Recording]) -> str:
-    """Caveat on true poses that were estimated with the IMU, by their description; else empty."""
-    texts = (str(text) for recording in recordings for record in recording.metadata.values() for text in record.values())
-    if any("and IMU measurements" in text for text in texts):
-        return "its poses were estimated with this very IMU, and hide errors of the gyro"
-    return ""
-
-
 # ── without a reference ──
 
 
@@ -239,7 +151,7 @@ def check_without_reference(real: Recording, path: str, why: str, settings: Diag
     no_motion = IdealMotion(stamp_s, *np.zeros((3, len(stamp_s), 3)))
     pair = Pair(real.name, stamp_s, samples, no_rows, no_rows, ideal=no_motion, settings=settings)
     findings = [*timestamps.dropped([pair]), *timestamps.rounded([pair], white_noise(samples)), *_limits(pair)]
-    remark = f"{why.rstrip('.')}. Only what stamps and digits show by themselves could be asked"
+    remark = f"{why.rstrip('.')}. Only the checks of stamps and digits were possible"
     hidden = tuple(effect.name for effect in catalogue.diagnosed() if effect.name not in BY_THEMSELVES)
     return Diagnosis((path,), None, (), tuple(findings), np.full((1, 6), np.nan), hidden, {}, (remark,))
 

@@ -1,0 +1,1 @@
+"""Reference of a recording: what it covers, and where it is wrong."""

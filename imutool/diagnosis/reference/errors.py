@@ -1,0 +1,179 @@
+"""Errors of a reference: short wrong intervals, and an attitude that is turned throughout.
+
+Poses that were lost and bridged give a simulation, or a truth, another motion there. No effect of a sensor lasts two seconds
+and leaves no trace, so where all the rest is noise, the reference is wrong.
+
+Poses that were estimated with the gyro follow it from one second to the next, and their own sensor over many. If that sensor
+is misaligned, R_ref = R_wb Exp(turned): means of the gyro over seconds are turned by Exp(turned), fast motion is not. No
+mount does that, which turns slow and fast motion alike.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Float64
+from scipy.stats import chi2
+
+from imutool.diagnosis.estimation.gauss_newton import fit
+from imutool.diagnosis.estimation.jacobians import Chosen, expected
+from imutool.diagnosis.estimation.whitening import WhitenedImu
+from imutool.diagnosis.result import Estimate, Finding, HeldOut, Located
+from imutool.diagnosis.settings import ReferenceSettings
+from imutool.recording import Recording
+from imutool.sensor import catalogue
+from imutool.units import ASCII_UNITS, AXES, SENSORS
+
+CLEAR = 3.0  # deviations from which a component of the rotation counts
+MOSTLY = 0.8  # of the samples of a block that have to be usable
+Matrix = Float64[np.ndarray, "3 3"]
+Vector = Float64[np.ndarray, "3"]
+
+
+def reference_errors(logs: Sequence[WhitenedImu], settings: ReferenceSettings) -> tuple[list[Finding], list[Located]]:
+    """Intervals of a wrong reference, as a finding and locations; none for another misfit."""
+    if len(logs) != 1:
+        return [], []
+    (log,), block_s, p_value = logs, settings.block_s, settings.p_value
+    rows = log.rows("all")
+    if not rows.any():
+        return [], []
+    t_s = log.pair.stamp_s[:: log.whiten.every][rows]
+    white = log.whiten(log.pair.real - expected(log.pair, ()))[rows]
+    constant = log.constants[rows]
+    white = (
+        white - np.median(white / np.where(constant == 0, 1.0, constant), axis=0) * constant
+    )  # a mean would carry the misfit
+    block = np.floor((t_s - t_s[0]) / block_s).astype(int)
+    count = np.maximum(np.bincount(block), 1)
+    power = np.stack([np.bincount(block, weights=(white[:, k : k + 3] ** 2).sum(axis=1)) for k in (0, 3)])
+    loud = chi2.logsf(power, 3 * count) < np.log(p_value)
+    runs = _runs(loud.any(axis=0), float(t_s[0]), settings)
+    inside = (
+        np.any([(t_s >= a - block_s) & (t_s <= b + block_s) for a, b in runs], axis=0) if runs else np.zeros(len(t_s), bool)
+    )
+    outside = white[~inside]
+    at = t_s[0] + block_s * np.arange(len(count))
+    both = all(loud[:, (at >= a - 1e-6) & (at < b)].any(axis=1).all() and b - a <= settings.longest_s for a, b in runs)
+    few = len(runs) <= settings.most_intervals and inside.mean() <= settings.most_of_time
+    if not runs or not both or not few or (outside**2).mean() > settings.quiet_chi_square:
+        return [], []
+    length = float(np.mean([b - a for a, b in runs]))
+    parameters = {"length": Estimate(length, block_s / np.sqrt(6.0 * len(runs)) + 0.1 * length, "s")}
+    parameters |= {f"t_{k}": Estimate(a, block_s, "s") for k, (a, _) in enumerate(runs)}
+    excess = (white[inside] ** 2).sum() - 6.0 * inside.sum()
+    share = float(np.clip(excess / max(float((white**2).sum() - 6.0 * len(white)), 1e-300), 0.0, 1.0))
+    residual = log.pair.real - expected(log.pair, ())
+    residual = residual - np.median(residual, axis=0)
+    held_rows = log.pair.held_out
+    t_all = log.pair.stamp_s
+    away = held_rows & ~np.any([(t_all >= a - block_s) & (t_all <= b + block_s) for a, b in runs], axis=0)
+    before, after = (float(np.sqrt((residual[mask, 3:] ** 2).mean())) for mask in (held_rows, away))
+    held_out = HeldOut(before, after, ASCII_UNITS["accel"], round(float(held_rows.sum()) * log.pair.period_s, 1))
+    finding = Finding("reference_error", "both", share, p_value, p_value, parameters, "the reference is wrong there", held_out)
+    return [finding], [
+        _where(signal, white[:, 3 * k : 3 * k + 3], inside, runs, share, p_value) for k, signal in enumerate(SENSORS)
+    ]
+
+
+def _where(
+    signal: str,
+    white: Float64[np.ndarray, "n 3"],
+    inside: np.ndarray,
+    runs: list[tuple[float, float]],
+    share: float,
+    p_value: float,
+) -> Located:
+    power = (white[inside] ** 2).mean(axis=0)
+    axes = tuple(axis for axis, value in zip(AXES, power, strict=True) if value > 1.3)
+    regime = "no regime: the reference's own moments"
+    return Located(signal, axes or AXES, tuple(runs), regime, share, p_value, extent="intermittent")
+
+
+def _runs(loud: np.ndarray, start_s: float, settings: ReferenceSettings) -> list[tuple[float, float]]:
+    """Stretches of loud blocks (s), those close to one another joined."""
+    edges = np.diff(np.concatenate([[0], loud.astype(int), [0]]))
+    out: list[tuple[float, float]] = []
+    for first, last in zip(np.flatnonzero(edges == 1), np.flatnonzero(edges == -1), strict=True):
+        begin, end = start_s + float(first) * settings.block_s, start_s + float(last) * settings.block_s
+        if out and begin - out[-1][1] < settings.join_s:
+            out[-1] = out[-1][0], end
+        else:
+            out.append((begin, end))
+    return out
+
+
+def reference_caveat(recordings: Sequence[Recording]) -> str:
+    """Caveat on true poses that were estimated with the IMU, by their description; else empty."""
+    texts = (str(text) for recording in recordings for record in recording.metadata.values() for text in record.values())
+    if any("and IMU measurements" in text for text in texts):
+        return "its poses were estimated with this IMU, and hide errors of the gyro"
+    return ""
+
+
+# ── an attitude that is turned throughout ──
+
+
+def turned_reference(logs: Sequence[WhitenedImu], chosen: Chosen, settings: ReferenceSettings) -> list[Finding]:
+    """Finding of poses whose attitude is turned by a constant rotation; none for another misfit.
+
+    Means over seconds of the gyro's residual are r = b + turned x omega, those of the accelerometer b + turned x f; the two
+    have to agree, and the samples themselves must not follow the rotation (then it is the mount's).
+    """
+    if any(log.pair.exact or log.pair.ideal.R_wb is None for log in logs) or len({log.pair.name for log in logs}) > 1:
+        return []
+    means = [_slow_means(log, chosen, settings.turned_block_s) for log in logs]
+    residual, signal = (np.concatenate([part[k] for part in means]) for k in (0, 1))
+    if len(residual) < settings.least_turned_blocks:
+        return []
+    turned, C_gyro, share = _rotation(residual[:, :3], signal[:, :3])
+    by_gravity, C_gravity, _ = _rotation(residual[:, 3:], signal[:, 3:])
+    p_value = float(chi2.sf(turned @ np.linalg.solve(C_gyro, turned), 3))
+    off = turned - by_gravity
+    alike = chi2.sf(off @ np.linalg.solve(C_gyro + C_gravity, off), 3) > settings.turned_alike_p_value
+    std = np.sqrt(np.diag(C_gyro))
+    clear = np.where(np.abs(turned) > CLEAR * std, turned, 0.0)
+    large = np.linalg.norm(clear) > settings.least_turned_rad and share > settings.least_turned_share
+    if p_value > settings.p_value or not alike or not large:
+        return []
+    (mount,) = catalogue.diagnosed(["mount_rotation"])
+    others = tuple(entry for entry in chosen if entry[0].name != mount.name)
+    fitted = fit(logs, (*others, (mount, mount.null_value.astype(float))), part="all")
+    off = turned + fitted.chosen[-1][1]
+    C_both = C_gyro + np.diag(np.square(fitted.stds()[mount.key]))
+    if chi2.sf(off @ np.linalg.solve(C_both, off), 3) > settings.p_value:
+        return []
+    parameters = {f"turned_{axis}": Estimate(float(a), float(s), "rad") for axis, a, s in zip(AXES, turned, std, strict=True)}
+    seconds = round(len(residual) * settings.turned_block_s, 1)
+    held_out = HeldOut(0.0, 0.0, ASCII_UNITS["gyro"], seconds)
+    return [Finding("reference_error", "both", share, p_value, p_value, parameters, "R_ref = R_wb Exp(turned)", held_out)]
+
+
+def _slow_means(
+    log: WhitenedImu, chosen: Chosen, block_s: float
+) -> tuple[Float64[np.ndarray, "b 6"], Float64[np.ndarray, "b 6"]]:
+    """Means of the residual and of the expected samples over blocks that are usable throughout."""
+    pair, model = log.pair, expected(log.pair, chosen)
+    count = round(block_s / pair.period_s)
+    blocks = len(model) // count
+    usable = np.asarray(pair.usable.all(axis=1), dtype=float)[: blocks * count]
+    used = np.flatnonzero(usable.reshape(blocks, count).mean(axis=1) > MOSTLY)
+
+    def means(x: Float64[np.ndarray, "n 6"]) -> Float64[np.ndarray, "b 6"]:
+        return np.asarray(x[: blocks * count].reshape(blocks, count, 6).mean(axis=1)[used])
+
+    return means(pair.real - model), means(model)
+
+
+def _rotation(residual: Float64[np.ndarray, "b 3"], signal: Float64[np.ndarray, "b 3"]) -> tuple[Vector, Matrix, float]:
+    """Rotation with residual = constant + rotation x signal, its covariance by blocks, its share of the squares."""
+    J = np.stack([np.cross(axis, signal) for axis in np.eye(3)], axis=2)
+    J, y = J - J.mean(axis=0), residual - residual.mean(axis=0)
+    information = np.einsum("bkp,bkq->pq", J, J)
+    information += 1e-9 * np.trace(information) * np.eye(3)
+    rotation = np.linalg.solve(information, np.einsum("bkp,bk->p", J, y))
+    left = y - np.einsum("bkp,p->bk", J, rotation)
+    scores = np.einsum("bkp,bk->bp", J, left)
+    C = np.linalg.solve(information, np.linalg.solve(information, scores.T @ scores).T) * len(y) / max(len(y) - 2, 1)
+    return rotation, C, 1.0 - float((left**2).sum() / max((y**2).sum(), 1e-300))

@@ -1,0 +1,90 @@
+"""Protobuf messages by the descriptors in a log's schema. Needs protobuf."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
+from google.protobuf.message import DecodeError
+
+MOST_FIELDS = 5000  # of a schema that are searched: one can nest without end
+
+
+@dataclass(frozen=True)
+class Protobuf:
+    """Messages of one type, made from its descriptor."""
+
+    kind: Any
+
+    @staticmethod
+    def of(name: str, schema: bytes) -> Protobuf | None:
+        """Type of that name in a FileDescriptorSet; None where the schema is damaged or lacks it."""
+        pool = descriptor_pool.DescriptorPool()
+        try:
+            for file in descriptor_pb2.FileDescriptorSet.FromString(schema).file:
+                pool.Add(file)
+            return Protobuf(message_factory.GetMessageClass(pool.FindMessageTypeByName(name)))
+        except (DecodeError, KeyError, TypeError, ValueError):
+            return None
+
+    def tree(self, depth: int) -> dict[str, Any]:
+        """Tree of the fields, as `reflection` has it."""
+        return _tree(self.kind.DESCRIPTOR, depth, [MOST_FIELDS])
+
+    def parse(self, raw: bytes) -> Any:
+        """Message from its bytes.
+
+        Raises:
+            ValueError: they are no such message.
+        """
+        try:
+            return self.kind.FromString(raw)
+        except DecodeError as error:
+            raise ValueError(str(error)) from error
+
+    def at(self, message: Any, path: Sequence[str | int]) -> Any:
+        """Value of a field.
+
+        Raises:
+            KeyError: a message on the way is not set.
+        """
+        for key in path[:-1]:
+            field = message.DESCRIPTOR.fields_by_name[key]
+            if field.message_type is not None and not message.HasField(key):
+                raise KeyError(key)
+            message = getattr(message, str(key))
+        return message[path[-1]] if isinstance(path[-1], int) else getattr(message, path[-1])
+
+    def new(self, values: Sequence[tuple[Sequence[str | int], Any]]) -> bytes:
+        """Bytes of a message with these fields; all others keep their default."""
+        message = self.kind()
+        for path, value in values:
+            inner = message
+            for key in path[:-1]:
+                inner = getattr(inner, str(key))
+                if hasattr(inner, "SetInParent"):
+                    inner.SetInParent()  # also where all in it is zero
+            if isinstance(path[-1], int):
+                inner.append(value)
+            else:
+                setattr(inner, path[-1], value)
+        return bytes(message.SerializeToString())
+
+
+def _tree(descriptor: Any, depth: int, left: list[int]) -> dict[str, Any]:
+    """Tree of a message's fields; `left` counts down those that may still be searched."""
+    fields: dict[str, Any] = {}
+    for field in descriptor.fields:
+        left[0] -= 1
+        if left[0] < 0:
+            break
+        numeric = field.cpp_type not in (field.CPPTYPE_STRING, field.CPPTYPE_MESSAGE, field.CPPTYPE_BOOL, field.CPPTYPE_ENUM)
+        if field.is_repeated:
+            fields[field.name] = ("matrix" if "covariance" in field.name.lower() else "vector") if numeric else ""
+        elif field.message_type is not None:
+            fields[field.name] = _tree(field.message_type, depth - 1, left) if depth else ""
+        else:
+            fields[field.name] = "number" if numeric else "text" if field.cpp_type == field.CPPTYPE_STRING else ""
+    return fields

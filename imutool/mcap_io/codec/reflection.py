@@ -1,0 +1,251 @@
+"""IMU messages of other encodings, found by reflection: protobuf by its descriptors, JSON by its first message.
+
+A message is that of an IMU if it holds an angular velocity and a linear acceleration of three numbers each, by the names of its
+fields. Values count as rad/s and m/s². A message that lacks them has NaN, so that `clean` can leave it out.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import groupby, pairwise
+from typing import Any, NamedTuple, Protocol, runtime_checkable
+
+import numpy as np
+from jaxtyping import Bool, Shaped, UInt8
+
+from imutool.mcap_io.codec.decode import decode_imu
+from imutool.mcap_io.codec.encode import encode_imu
+from imutool.mcap_io.codec.messages import FIXED, MESSAGE, Messages
+from imutool.mcap_io.codec.schemas import GYRO_COVARIANCE, IMU, NS_PER_S, runs
+
+UNIT = r"(_?(rad(_?p?_?s)?|rads|m_?s_?2|mps2|si))?"
+GYRO = rf"(angular_?velocity|gyro(scope)?|ang_?vel|rotation_?rate|angular_?rate|omega){UNIT}"
+ACCEL = rf"(linear_?acceleration|accel(eration|erometer)?|acc|specific_?force){UNIT}"
+STAMP = r"timestamp|stamp|time|sensor_?time"
+COUNTED = {r"(time|timestamp|stamp|t)_?ns(ec)?": 1, r"(time|timestamp|stamp|t)_?us(ec)?|utime": 1000}  # stamps of one number
+FRAME = r"frame_?id|frame"
+SECONDS, NANOSECONDS = ("sec", "seconds", "secs"), ("nsec", "nanos", "nanosec", "nsecs", "nanoseconds")
+DEPTH = 4  # messages within messages that are searched
+NUMBER, VECTOR, MATRIX, TEXT = "number", "vector", "matrix", "text"
+
+Path = tuple[str | int, ...]  # of a field; a number of a list has its place at the end
+Tree = Mapping[str, Any]  # of fields: NUMBER, VECTOR, MATRIX, TEXT or a tree
+
+
+@runtime_checkable
+class Format(Protocol):
+    """Encoding of messages, with access to their fields by path."""
+
+    def parse(self, raw: bytes) -> Any:
+        """Message from its bytes; ValueError where they are none."""
+
+    def at(self, message: Any, path: Path) -> Any:
+        """Value of a field; KeyError, IndexError or ValueError where the message lacks it."""
+
+    def new(self, values: Sequence[tuple[Path, Any]]) -> bytes:
+        """Bytes of a message with these fields; of numbers in a list the path ends with their place."""
+
+
+class Sample(NamedTuple):
+    """IMU sample in a message: stamp in ns, frame, rates and accelerations."""
+
+    stamp_ns: int
+    frame_id: str
+    values: Sequence[float]
+
+
+@dataclass(frozen=True)
+class ReflectedImu:
+    """Fields of an IMU in the messages of a topic, and the translation from and to CDR."""
+
+    format: Format
+    vectors: tuple[Path, ...]  # of six numbers: rates, then accelerations
+    stamp: tuple[tuple[Path, int], ...]  # fields that add up to the stamp, with their nanoseconds
+    frame: Path | None
+    covariances: tuple[Path | None, Path | None]
+
+    def sample(self, raw: bytes, log_time: int) -> Sample:
+        """Sample in a message; at its log time where it has no stamp.
+
+        Raises:
+            ValueError: the bytes are no such message, or it lacks a field.
+        """
+        try:
+            message, at = self.format.parse(raw), self.format.at
+            stamp_ns = sum(int(at(message, path)) * size for path, size in self.stamp)
+            frame = "" if self.frame is None else str(at(message, self.frame))
+            return Sample(stamp_ns or log_time, frame, [float(at(message, path)) for path in self.vectors])
+        except (KeyError, IndexError, TypeError, AttributeError, OverflowError) as error:
+            raise ValueError(f"the message lacks {error}") from error
+
+    def cut(
+        self, found: Messages, mask: Bool[np.ndarray, " n"]
+    ) -> Iterator[tuple[Shaped[np.ndarray, " n"], UInt8[np.ndarray, "n L"]]]:
+        """Heads of the chosen messages, and their samples as CDR, per stretch of one frame."""
+        heads, offsets = found.heads[mask], found.offsets[mask]
+        samples = []
+        for offset, size, time in zip(offsets.tolist(), heads["length"].tolist(), heads["log_time"].tolist(), strict=True):
+            first = offset + MESSAGE.itemsize
+            try:
+                samples.append(self.sample(found.data[first : first + size - FIXED].tobytes(), time))
+            except ValueError:
+                samples.append(Sample(time, "", [np.nan] * 6))
+        start = 0
+        for frame, group in groupby(samples, key=lambda sample: sample.frame_id):
+            part = list(group)
+            values = np.array([sample.values for sample in part])
+            stamps = np.array([sample.stamp_ns for sample in part], np.int64)
+            yield heads[start : start + len(part)], encode_imu(stamps, values[:, :3], values[:, 3:], frame)
+            start += len(part)
+
+    def from_cdr(self, rows: UInt8[np.ndarray, "n L"]) -> list[bytes]:
+        """Messages of the topic's own type for Imu messages in CDR; fields that an Imu lacks stay unset."""
+        messages: list[bytes] = []
+        for part, layout in runs(rows, IMU):
+            cut = rows[part]
+            columns = decode_imu(cut, "cdr", layout)
+            at = layout.numbers[0][0]
+            covariances = [
+                np.ascontiguousarray(cut[:, at + 8 * first : at + 8 * (first + 9)]).view("<f8")
+                for first in (GYRO_COVARIANCE.start, GYRO_COVARIANCE.start + 12)
+            ]
+            for n, stamp_ns in enumerate(columns.stamp_ns.tolist()):
+                values = [*columns.gyro[n].tolist(), *columns.accel[n].tolist()]
+                fields = [*_parts(stamp_ns, self.stamp), *zip(self.vectors, values, strict=True)]
+                if self.frame is not None:
+                    fields.append((self.frame, columns.frame_id))
+                for path, matrix in zip(self.covariances, covariances, strict=True):
+                    if path is not None:
+                        fields += [((*path, k), value) for k, value in enumerate(matrix[n].tolist())]
+                messages.append(self.format.new(fields))
+        return messages
+
+
+def _parts(stamp_ns: int, places: Sequence[tuple[Path, int]]) -> Iterator[tuple[Path, int]]:
+    """Stamp in its fields, the largest unit first."""
+    for path, size in places:
+        count, stamp_ns = divmod(stamp_ns, size)
+        yield path, count
+
+
+def reflect(encoding: str, schema_name: str, schema: bytes, first: bytes | None) -> ReflectedImu | None:
+    """Fields of an IMU in messages of a schema; None of any other message.
+
+    JSON goes by the `first` message, protobuf by the descriptors in the schema.
+
+    Raises:
+        ImportError: the schema is of protobuf, which is not installed.
+    """
+    if encoding == "json" and first is not None:
+        try:
+            tree, form = _tree_of(json.loads(first), DEPTH), _Json()
+        except (ValueError, RecursionError):
+            return None
+        return _found(tree, form) if isinstance(tree, Mapping) else None
+    if encoding == "protobuf":
+        from imutool.mcap_io.codec.protobuf import Protobuf
+
+        protobuf = Protobuf.of(schema_name, schema)
+        return None if protobuf is None else _found(protobuf.tree(DEPTH), protobuf)
+    return None
+
+
+def _found(tree: Tree, form: Format) -> ReflectedImu | None:
+    """Fields of an IMU in the tree of a message's fields."""
+    fields = [(path, _spelled(path[-1]), node) for path, node in _walk(tree, ())]
+    gyro, accel = (_vector(fields, pattern) for pattern in (GYRO, ACCEL))
+    if gyro is None or accel is None:
+        return None
+    frame = next((path for path, name, node in fields if node == TEXT and re.fullmatch(FRAME, name)), None)
+    covariances = [
+        next((path for path, name, node in fields if node == MATRIX and re.fullmatch(rf"{pattern}_?covariance", name)), None)
+        for pattern in (GYRO, ACCEL)
+    ]
+    return ReflectedImu(form, (*gyro, *accel), _stamp(fields), frame, (covariances[0], covariances[1]))
+
+
+def _walk(tree: Tree, above: Path) -> Iterator[tuple[Path, Any]]:
+    for name, node in tree.items():
+        yield (*above, name), node
+        if isinstance(node, Mapping):
+            yield from _walk(node, (*above, name))
+
+
+def _spelled(name: str | int) -> str:
+    """Name of a field in lower case with underscores."""
+    return re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", str(name)).lower()
+
+
+def _vector(fields: Sequence[tuple[Path, str, Any]], pattern: str) -> tuple[Path, Path, Path] | None:
+    """Paths of three numbers: an object with x, y and z, a list, or three fields."""
+    for path, name, node in fields:
+        if re.fullmatch(pattern, name):
+            if isinstance(node, Mapping) and all(node.get(axis) == NUMBER for axis in "xyz"):
+                return (*path, "x"), (*path, "y"), (*path, "z")
+            if node == VECTOR:
+                return (*path, 0), (*path, 1), (*path, 2)
+    axes = [
+        next((path for path, name, node in fields if node == NUMBER and re.fullmatch(rf"{pattern}_?{axis}", name)), None)
+        for axis in "xyz"
+    ]
+    x, y, z = axes
+    return None if x is None or y is None or z is None else (x, y, z)
+
+
+def _stamp(fields: Sequence[tuple[Path, str, Any]]) -> tuple[tuple[Path, int], ...]:
+    """Fields that make up the stamp; none where the message has no stamp of a known unit."""
+    for path, name, node in fields:
+        if isinstance(node, Mapping) and re.fullmatch(STAMP, name):
+            parts = [next((key for key in keys if node.get(key) == NUMBER), None) for keys in (SECONDS, NANOSECONDS)]
+            if parts[0] is not None and parts[1] is not None:
+                return ((*path, parts[0]), NS_PER_S), ((*path, parts[1]), 1)
+        for pattern, size in COUNTED.items():
+            if node == NUMBER and re.fullmatch(pattern, name):
+                return ((path, size),)
+    return ()
+
+
+def _tree_of(value: Any, depth: int) -> Any:
+    """Tree of the fields of a JSON value."""
+    if isinstance(value, bool) or value is None:
+        return ""
+    if isinstance(value, int | float):
+        return NUMBER
+    if isinstance(value, str):
+        return TEXT
+    if isinstance(value, list):
+        numbers = all(isinstance(part, int | float) and not isinstance(part, bool) for part in value)
+        return {3: VECTOR, 9: MATRIX}.get(len(value), "") if numbers else ""
+    return {name: _tree_of(part, depth - 1) for name, part in value.items()} if depth else ""
+
+
+class _Json:
+    """Messages in JSON."""
+
+    def parse(self, raw: bytes) -> Any:
+        try:
+            return json.loads(raw)
+        except RecursionError as error:
+            raise ValueError("nests too deep") from error
+
+    def at(self, message: Any, path: Path) -> Any:
+        for key in path:
+            message = message[key]
+        if isinstance(message, bool):
+            raise ValueError("a truth value is no number")
+        return message
+
+    def new(self, values: Sequence[tuple[Path, Any]]) -> bytes:
+        message: dict[str, Any] = {}
+        for path, value in values:
+            inner: Any = message
+            for key, following in pairwise(path):
+                inner = inner.setdefault(key, [] if isinstance(following, int) else {})
+            if isinstance(path[-1], int):
+                inner.append(value)
+            else:
+                inner[path[-1]] = value
+        return json.dumps(message).encode()

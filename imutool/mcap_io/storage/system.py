@@ -1,0 +1,130 @@
+"""Differences between operating systems: locks, memory, processes, copies by the kernel.
+
+
+Only this file uses what not every system has; elsewhere each function answers as well as the system allows.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Callable
+from multiprocessing.connection import Connection
+from pathlib import Path
+from typing import IO, Any
+
+CGROUP_LIMITS = ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory/memory.limit_in_bytes")
+KILLED = (-signal.SIGKILL, -signal.SIGTERM) if sys.platform != "win32" else (1, 1)  # exit codes of a process that was killed
+LOCKED_AT = 1 << 62  # byte that Windows locks, behind all content: locked bytes could not be read
+
+
+def lock(file: IO[bytes]) -> bool:
+    """Lock a file for this process until it is closed; False if another process has it.
+
+    A system or a file system without locks says True.
+    """
+    try:
+        if sys.platform == "win32":
+            import msvcrt
+
+            at = file.tell()
+            file.seek(LOCKED_AT)
+            try:
+                msvcrt.locking(file.fileno(), msvcrt.LK_NBLCK, 1)
+            finally:
+                file.seek(at)
+        else:
+            import fcntl
+
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except (BlockingIOError, PermissionError):
+        return False
+    except (ImportError, OSError):
+        return True
+    return True
+
+
+def peak_bytes() -> int:
+    """Peak memory of this process; 0 if unknown. The `ru_maxrss` of Linux would begin with that of its parent."""
+    with contextlib.suppress(OSError, StopIteration):
+        lines = Path("/proc/self/status").read_text(encoding="utf-8").splitlines()
+        return 1024 * next(int(line.split()[1]) for line in lines if line.startswith("VmHWM:"))
+    try:
+        import resource
+    except ImportError:
+        return 0
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024)
+
+
+def memory_bytes() -> int:
+    """Memory of this machine, or of the container that this process runs in; a large number if unknown."""
+    limits = []
+    with contextlib.suppress(AttributeError, OSError, ValueError):
+        limits.append(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"))
+    for name in CGROUP_LIMITS:
+        with contextlib.suppress(OSError, ValueError):  # no container, or one without a limit
+            limits.append(int(Path(name).read_text(encoding="ascii")))
+    return min(limits, default=sys.maxsize)
+
+
+def processors() -> int:
+    """Processors that this process may use."""
+    try:
+        return len(os.sched_getaffinity(0))
+    except AttributeError:
+        return os.cpu_count() or 1
+
+
+def inherited(handle: int) -> dict[str, Any]:
+    """Options of `subprocess.Popen`: a process in a group of its own that inherits one end of a connection."""
+    if sys.platform == "win32":
+        os.set_handle_inheritable(handle, True)
+        start = subprocess.STARTUPINFO(lpAttributeList={"handle_list": [handle]})
+        return {"startupinfo": start, "creationflags": subprocess.CREATE_NEW_PROCESS_GROUP}
+    return {"pass_fds": [handle], "process_group": 0}
+
+
+def opened(handle: int) -> Connection:
+    """Connection whose end this process has inherited."""
+    if sys.platform == "win32":
+        from multiprocessing.connection import PipeConnection
+
+        return PipeConnection(handle)
+    return Connection(handle)
+
+
+def user() -> str:
+    """Number of the user, or the name where users have none."""
+    try:
+        return str(os.getuid())
+    except AttributeError:
+        return os.environ.get("USERNAME", "user")
+
+
+def give(path: Path, status: os.stat_result) -> None:
+    """Give a file the owner and the group of another, where the system allows it."""
+    with contextlib.suppress(AttributeError, PermissionError):
+        os.chown(path, status.st_uid, status.st_gid)
+
+
+def copy_by_kernel(source: int, target: int, start: int, end: int) -> int:
+    """Copy bytes from one open file to the end of another; return where the kernel stopped, `start` if it cannot."""
+    calls: tuple[Callable[[int], int], ...] = (
+        lambda at: os.copy_file_range(source, target, end - at, offset_src=at),
+        lambda at: os.sendfile(target, source, at, end - at),
+    )
+    for call in calls:
+        while start < end and (count := _tried(call, start)):
+            start += count
+    return start
+
+
+def _tried(call: Callable[[int], int], at: int) -> int:
+    """Bytes copied by the call; 0 if the call fails, then reading and writing show why."""
+    try:
+        return call(at)
+    except (AttributeError, OSError):
+        return 0

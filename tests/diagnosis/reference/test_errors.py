@@ -1,0 +1,58 @@
+"""Poses that are turned against gyro and gravity for seconds, and follow the gyro from one sample to the next."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import numpy as np
+import pytest
+from scipy.ndimage import gaussian_filter1d
+from scipy.spatial.transform import Rotation
+from support import planted
+
+from imutool.diagnosis.estimation.noise_estimate import whitened
+from imutool.diagnosis.reference.coverage import align
+from imutool.diagnosis.reference.errors import turned_reference
+from imutool.diagnosis.result import Finding
+from imutool.diagnosis.settings import DiagnoseSettings
+from imutool.recording import Poses
+from imutool.sensor import catalogue
+
+DURATION_S, SLOW_S = 90.0, 1.0
+TURNED = np.array([-0.01, 0.02, 0.045])
+SETTINGS = DiagnoseSettings()
+
+
+@cache
+def found(slow: float, fast: float) -> list[Finding]:
+    """Findings of a log whose poses are turned by a share of TURNED in slow motion, and by another in fast motion."""
+    felt = planted.rich(3, DURATION_S)
+    rates = felt.gyro @ Rotation.from_rotvec(TURNED).as_matrix() - felt.gyro
+    lagged = gaussian_filter1d(rates, SLOW_S * planted.RATE_HZ, axis=0)
+    middle = 0.5 * (felt.gyro + slow * lagged + fast * (rates - lagged))
+    steps = Rotation.from_rotvec((middle[1:] + middle[:-1]) / planted.RATE_HZ).as_matrix()
+    R = [Rotation.from_matrix(felt.R_wb[0]).as_matrix() @ Rotation.from_rotvec(slow * TURNED).as_matrix()]
+    for step in steps:
+        R.append(R[-1] @ step)
+    t_ns = planted.START_NS + np.round(felt.t_s * 1e9).astype(np.int64)
+    path = planted.moving(3, DURATION_S)
+    p_wb = path.poses(path.start_ns + np.round(felt.t_s * 1e9).astype(np.int64)).p_wb
+    poses = Poses(t_ns, p_wb, Rotation.from_matrix(np.array(R)).as_quat(scalar_first=True))
+    samples = planted.ideal(felt) + planted.noise(len(felt.t_s), 1) + planted.BIAS
+    log = planted.recording("log", felt.t_s, samples, poses=poses)
+    mount = catalogue.diagnosed(["mount_rotation"])
+    logs = [whitened(pair, mount, SETTINGS.band) for pair in align(log, None, None, SETTINGS)]
+    return turned_reference(logs, (), SETTINGS.reference)
+
+
+def test_poses_that_are_turned_against_slow_motion_alone_are_wrong_by_that_rotation() -> None:
+    (wrong,) = found(1.0, 0.0)
+    assert wrong.effect == "reference_error"
+    for value, axis in zip(TURNED, "xyz", strict=True):
+        estimate = wrong.parameters[f"turned_{axis}"]
+        assert abs(estimate.value - value) < max(4.0 * estimate.std, 0.1 * np.abs(TURNED).max())
+
+
+@pytest.mark.parametrize("share", [0.0, 1.0])
+def test_right_poses_and_a_mount_that_is_turned_are_no_error_of_the_reference(share: float) -> None:
+    assert found(share, share) == []
