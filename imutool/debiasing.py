@@ -174,8 +174,7 @@ def debias(
 
     Raises:
         ConfigError: a file cannot be opened, or options contradict each other.
-        LogError: nothing in the log can be saved, it has no such IMU, is debiased already, is damaged and its own target,
-            or cannot be trusted, with `clean`.
+        LogError: nothing can be saved, no such IMU, one debiased already, damaged and its own target, or not to be trusted.
         ModelError: no model and no time at rest; a model for another rate, or one that does not fit; a damaged model file.
     """
     check_smooth(init, smooth)

@@ -184,10 +184,10 @@ def shipped(name: str) -> Path:
 
 
 def shipped_for(about: Mapping[str, str]) -> list[str]:
-    """Names of the shipped models for the very unit of a log, best method first, from what the log says of its origin.
+    """Names of the shipped models for the very unit of a log, best method first.
 
-    A calibration belongs to one unit of a sensor, not to its type: another ADIS16448 needs its own model. The unit is known by
-    sensor, data set, and a name of the data set's own sequences.
+    A calibration belongs to one unit of a sensor, not to its type: another ADIS16448 needs its own model. `about` is what
+    the log says of its origin; the unit is known by sensor, data set, and the name of one of the data set's sequences.
     """
     names = UNITS.get((about.get("sensor", ""), about.get("dataset", "")))
     if names is None or not re.fullmatch(names, about.get("sequence", "")):
